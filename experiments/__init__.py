@@ -1,0 +1,1 @@
+"""Experiment files: absl flags -> one call. Run with `python -m experiments.X`."""

@@ -1,0 +1,91 @@
+"""What the experiment files share: running, reading flags, provenance."""
+
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+
+from absl import app, flags
+
+from rcirl_jax.errors import InputError
+
+EXIT_BAD_INPUT = 2
+
+
+def run(main: Callable[[], None]) -> None:
+    """Run a main; bad input becomes one line on stderr and exit status 2."""
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+
+    def guarded(argv: list[str]) -> None:
+        try:
+            if len(argv) > 1:
+                raise InputError(f"{argv[1]}: unexpected argument: expected --flags")
+            main()
+        except InputError as error:
+            print(f"error: {error}", file=sys.stderr)
+            sys.exit(EXIT_BAD_INPUT)
+
+    app.run(guarded, flags_parser=_parse)
+
+
+def _parse(argv: list[str]) -> list[str]:
+    """absl's parser, with its complaints as one line."""
+    try:
+        return app.parse_flags_with_usage(argv)
+    except flags.Error as error:  # pragma: no cover - absl exits by itself
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(EXIT_BAD_INPUT)
+
+
+def floats(values: list[str], flag: str) -> tuple[float, ...]:
+    """A comma list of numbers, with the flag's name on error."""
+    try:
+        return tuple(float(value) for value in values)
+    except ValueError as error:
+        raise InputError(f"--{flag}: {values}: expected numbers") from error
+
+
+def hidden_sizes(values: list[str]) -> tuple[int, ...]:
+    """--hidden_size: "15", "32,16", or "0" for the linear reward."""
+    try:
+        sizes = tuple(int(value) for value in values)
+    except ValueError as error:
+        raise InputError(f"--hidden_size: {values}: expected integers") from error
+    if sizes == (0,) or not sizes:
+        return ()
+    if any(not 1 <= size <= 4096 for size in sizes):
+        raise InputError(f"--hidden_size: {values}: expected 1 to 4096, or 0 alone")
+    return sizes
+
+
+def provenance(flag_module: str) -> dict:
+    """Flags of one experiment file, git commit, versions and machine."""
+    own = flags.FLAGS.flags_by_module_dict().get(flag_module, [])
+    packages = ("jax", "flax", "optax", "orbax-checkpoint", "numpy", "tensorstore")
+    return {
+        "flags": {flag.name: flag.value for flag in own},
+        "git_commit": git_commit(),
+        "versions": {
+            "python": platform.python_version(),
+            **{name: metadata.version(name) for name in packages},
+        },
+        "machine": platform.machine(),
+    }
+
+
+def git_commit() -> str:
+    """The checkout's commit, with "+" when it has changes; "" outside git."""
+    root = Path(__file__).resolve().parents[1]
+
+    def git(*words: str) -> str:
+        done = subprocess.run(
+            ["git", "-C", str(root), *words], capture_output=True, text=True, check=False
+        )
+        return done.stdout.strip() if done.returncode == 0 else ""
+
+    commit = git("rev-parse", "HEAD")
+    dirty = git("status", "--porcelain", "--untracked-files=no")
+    return commit + ("+" if commit and dirty else "")

@@ -1,0 +1,82 @@
+"""Train the Siamese value network on a dataset.
+
+    python -m experiments.train --data=DATASET --workdir=RUN
+
+Resumes from RUN/checkpoints when it is run again with the same settings.
+"""
+
+from pathlib import Path
+
+from absl import flags
+
+from experiments.common import hidden_sizes, provenance, run
+from rcirl_jax.data.store import open_dataset
+from rcirl_jax.reward import LOSSES, RewardConfig
+from rcirl_jax.sampling import SamplerConfig
+from rcirl_jax.train.loop import train
+from rcirl_jax.train.parallel import PARALLEL
+from rcirl_jax.train.state import TrainConfig
+
+_DATA = flags.DEFINE_string("data", None, "dataset made by import_logs", required=True)
+_WORKDIR = flags.DEFINE_string("workdir", None, "run folder", required=True)
+_FEATURES = flags.DEFINE_string("features", "paper21", "preset in data_specs/features")
+_MODE = flags.DEFINE_enum(
+    "mode", "speed", ["speed", "path_speed"], "what the sampler varies"
+)
+_LOSS = flags.DEFINE_enum("loss", "rank", sorted(LOSSES), "loss on value differences")
+_LEAKY = flags.DEFINE_float("leaky_rate", 0.05, "a of the rank loss")
+_HIDDEN = flags.DEFINE_list("hidden_size", ["15"], "units per layer; 0 is linear")
+_ACTIVATION = flags.DEFINE_enum(
+    "activation", "tanh", ["tanh", "relu", "leaky_relu"], "of the hidden layers"
+)
+_PIN = flags.DEFINE_enum("pin", "unit", ["unit", "none"], "scale pinning")
+_OPTIMIZER = flags.DEFINE_enum(
+    "optimizer", "adam", ["sgd", "adam", "rmsprop"], "gradient method"
+)
+_RATE = flags.DEFINE_float("learning_rate", 3e-3, "step size")
+_DECAY = flags.DEFINE_float("weight_decay", 0.0, "L2 pull on the weights")
+_BATCH = flags.DEFINE_integer("batch_size", 64, "scenes per step, all devices")
+_EPOCHS = flags.DEFINE_integer("epochs", 20, "passes over the training scenes")
+_NEGATIVES = flags.DEFINE_integer("hard_negatives", 0, "near negatives per scene")
+_SEED = flags.DEFINE_integer("seed", 0, "of initial weights, batches, candidates")
+_PARALLEL = flags.DEFINE_enum("parallel", "jit", PARALLEL, "how local devices share")
+
+
+def main() -> None:
+    """Flags -> one training run."""
+    config = TrainConfig(
+        features=_FEATURES.value,
+        loss=_LOSS.value,
+        leaky_rate=_LEAKY.value,
+        optimizer=_OPTIMIZER.value,
+        learning_rate=_RATE.value,
+        weight_decay=_DECAY.value,
+        batch_size=_BATCH.value,
+        epochs=_EPOCHS.value,
+        hard_negatives=_NEGATIVES.value,
+        seed=_SEED.value,
+        reward=RewardConfig(
+            hidden=hidden_sizes(_HIDDEN.value),
+            activation=_ACTIVATION.value,
+            pin=_PIN.value,
+        ),
+        sampler=SamplerConfig(mode=_MODE.value),
+    )
+    result = train(
+        open_dataset(_DATA.value),
+        Path(_WORKDIR.value),
+        config,
+        parallel=_PARALLEL.value,
+        provenance=provenance(__name__),
+    )
+    for epoch in result.epochs[-1:]:
+        print(
+            f"epoch {epoch['epoch']}: loss {epoch['loss']:.4f}, "
+            f"pairs won {epoch['pair_accuracy']:.1%}"
+        )
+    rate = result.queries / max(result.seconds, 1e-9)
+    print(f"{result.queries:,.0f} queries, {rate:,.0f} queries/s; run: {_WORKDIR.value}")
+
+
+if __name__ == "__main__":
+    run(main)

@@ -1,0 +1,29 @@
+"""How scenes are cut out of recordings."""
+
+import dataclasses
+
+from rcirl_jax.units import HORIZON_S
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CollectConfig:
+    """How scenes are cut out of recordings."""
+
+    # s, window of the Savitzky-Golay filter on positions
+    smoothing_s: float = 2.1
+    # s between planning frames of one driver
+    stride_s: float = 0.5
+    # s of recording before a planning frame
+    min_history_s: float = 0.5
+    # s of recording after it (5 s and one more point of the time axis)
+    min_future_s: float = 5.2
+    # the paper's two filters
+    require_obstacles: bool = True
+    require_speed_change: bool = True
+
+    def __post_init__(self) -> None:
+        """Reject what cannot be meant."""
+        if not 0.0 < self.min_future_s <= HORIZON_S:
+            raise ValueError(f"min_future_s: {self.min_future_s}: expected (0, 8]")
+        if self.stride_s <= 0.0:
+            raise ValueError(f"stride_s: {self.stride_s}: expected > 0")

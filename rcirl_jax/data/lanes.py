@@ -1,0 +1,229 @@
+"""The lane graph of a recording: matching, chains of lanes, Frenet frames.
+
+A chain is the sequence of lanes a driver follows: the lane at the planning
+frame, its predecessors behind and, at every fork ahead, the branch the driver
+took. Its centre line is the scene's reference line. Scenes of many drivers
+share a chain, so everything that depends on it alone is computed once.
+"""
+
+import dataclasses
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from rcirl_jax.geometry.frenet import (
+    ReferenceLine,
+    project_points,
+    reference_line_from_polyline,
+)
+from rcirl_jax.types import Lane, Recording
+
+BEHIND_M = 100.0  # m of chain kept behind the lane at the planning frame
+AHEAD_M = 400.0  # m of chain kept ahead of its start
+MAX_HEADING_GAP = np.deg2rad(60.0)  # rad, a car heads along its lane within this
+MATCH_NEIGHBOURS = 12  # nearest centre points looked at per position
+LINE_STEP_M = 1.0  # m, grid of the reference line
+LINE_SIZES = (256, 512, 1024, 2048, 4096)  # static sizes; few compilations
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LaneFrame:
+    """A chain's reference line with its lane tables along the station."""
+
+    chain: tuple[str, ...]
+    line: ReferenceLine
+    length: float  # m, of the chain
+    heading: np.ndarray  # [M] rad on the LINE_STEP_M grid, unwrapped
+    kappa: np.ndarray  # [M] 1/m on the LINE_STEP_M grid
+    station: np.ndarray  # [q] m, stations of the tables below
+    speed_limit: np.ndarray  # [q] m/s
+    lane_left: np.ndarray  # [q] m
+    lane_right: np.ndarray  # [q] m, negative
+    road_left: np.ndarray  # [q] m
+    road_right: np.ndarray  # [q] m, negative
+    # (station m, lane) of every stop line on the chain
+    stop_lines: tuple[tuple[float, Lane], ...]
+
+    def table(self, name: str, stations: np.ndarray) -> np.ndarray:
+        """One of the lane tables at stations [m]."""
+        return np.interp(stations, self.station, getattr(self, name))
+
+    def on_grid(self, name: str, stations: np.ndarray) -> np.ndarray:
+        """`heading` or `kappa` at stations [m]."""
+        values = getattr(self, name)
+        return np.interp(stations, np.arange(values.size) * LINE_STEP_M, values)
+
+
+class LaneGraph:
+    """Lanes of one recording with matching and chain building."""
+
+    def __init__(self, recording: Recording) -> None:
+        self.lanes = {lane.id: lane for lane in recording.lanes}
+        self.default_limit = recording.default_speed_limit
+        self.predecessors: dict[str, list[str]] = {name: [] for name in self.lanes}
+        for lane in recording.lanes:
+            for successor in lane.successors:
+                if successor in self.predecessors:
+                    self.predecessors[successor].append(lane.id)
+        points, headings, owners = [], [], []
+        for lane in recording.lanes:
+            dense = _densify(lane.centre, 1.0)
+            direction = np.gradient(dense, axis=0)
+            points.append(dense)
+            headings.append(np.arctan2(direction[:, 1], direction[:, 0]))
+            owners += [lane.id] * len(dense)
+        self._owner = np.array(owners)
+        self._heading = np.concatenate(headings) if headings else np.zeros(0)
+        self._points = np.concatenate(points) if points else np.zeros((0, 2))
+        self._tree = cKDTree(self._points) if len(self._points) else None
+        self._frames: dict[tuple[str, ...], LaneFrame] = {}
+
+    def match(self, x: np.ndarray, y: np.ndarray, heading: np.ndarray) -> np.ndarray:
+        """Lane id per position ("" where the car is on none).
+
+        The nearest lane centre among those that head the car's way, no farther
+        than the lane's half width plus half a metre.
+        """
+        if self._tree is None:
+            return np.full(x.shape, "", object)
+        count = min(MATCH_NEIGHBOURS, len(self._points))
+        distance, index = self._tree.query(np.stack([x, y], 1), k=count)
+        distance, index = distance.reshape(-1, count), index.reshape(-1, count)
+        gap = np.abs(_wrap(self._heading[index] - heading[:, None]))
+        cost = np.where(gap < MAX_HEADING_GAP, distance, np.inf)
+        best = np.argmin(cost, axis=1)
+        rows = np.arange(len(best))
+        lane_id = self._owner[index[rows, best]].astype(object)
+        reach = np.array([self._half_width(name) + 0.5 for name in lane_id])
+        return np.where(cost[rows, best] <= reach, lane_id, "")
+
+    def _half_width(self, lane_id: str) -> float:
+        lane = self.lanes[lane_id]
+        return float(max(lane.left_width.max(), lane.right_width.max()))
+
+    def chain(self, start: str, visited: list[str]) -> tuple[str, ...]:
+        """The chain through lane `start` for a driver who visits these lanes."""
+        seen = set(visited)
+        ahead = [start]
+        travelled = self._length(start)
+        while travelled < AHEAD_M:
+            options = [s for s in self.lanes[ahead[-1]].successors if s in self.lanes]
+            following = self._pick(options, ahead[-1], seen, forward=True)
+            if following is None or following in ahead:
+                break
+            ahead.append(following)
+            travelled += self._length(following)
+        behind: list[str] = []
+        travelled = 0.0
+        while travelled < BEHIND_M:
+            first = behind[0] if behind else start
+            before = self._pick(self.predecessors[first], first, seen, forward=False)
+            if before is None or before in ahead or before in behind:
+                break
+            behind.insert(0, before)
+            travelled += self._length(before)
+        return tuple(behind + ahead)
+
+    def _length(self, lane_id: str) -> float:
+        return float(_arc(self.lanes[lane_id].centre)[-1])
+
+    def _pick(
+        self, options: list[str], here: str, seen: set[str], forward: bool
+    ) -> str | None:
+        """The option visited; else one whose neighbour is; else the straightest."""
+        if not options:
+            return None
+        for name in options:
+            if name in seen:
+                return name
+        for name in options:
+            lane = self.lanes[name]
+            if lane.left in seen or lane.right in seen:
+                return name
+        end = -1 if forward else 0
+        here_heading = _end_heading(self.lanes[here].centre, end)
+
+        def bend(name: str) -> float:
+            other = _end_heading(self.lanes[name].centre, end)
+            return abs(float(_wrap(other - here_heading)))
+
+        return min(options, key=bend)
+
+    def frame(self, chain: tuple[str, ...]) -> LaneFrame:
+        """The Frenet frame of a chain (cached)."""
+        if chain not in self._frames:
+            self._frames[chain] = self._build_frame(chain)
+        return self._frames[chain]
+
+    def _build_frame(self, chain: tuple[str, ...]) -> LaneFrame:
+        lanes = [self.lanes[name] for name in chain]
+        points = np.concatenate([lane.centre for lane in lanes])
+        length = float(_arc(points)[-1])
+        size = next((n for n in LINE_SIZES if n > length + 1), LINE_SIZES[-1])
+        line = reference_line_from_polyline(points, size=size, step=LINE_STEP_M)
+        station = np.maximum.accumulate(_project(line, points)[0])
+        left = np.concatenate([lane.left_width for lane in lanes])
+        right = np.concatenate([lane.right_width for lane in lanes])
+        counts = [len(lane.centre) for lane in lanes]
+        limits = [lane.speed_limit or self.default_limit for lane in lanes]
+        extra_left = [self._beside(lane, "left") for lane in lanes]
+        extra_right = [self._beside(lane, "right") for lane in lanes]
+        stops = [
+            (float(_project(line, lane.stop_line.mean(axis=0)[None])[0][0]), lane)
+            for lane in lanes
+            if lane.stop_line is not None
+        ]
+        return LaneFrame(
+            chain=chain,
+            line=line,
+            length=length,
+            heading=np.unwrap(np.asarray(line.heading, np.float64)),
+            kappa=np.asarray(line.kappa, np.float64),
+            station=station,
+            speed_limit=np.repeat(limits, counts).astype(np.float64),
+            lane_left=left,
+            lane_right=-right,
+            road_left=left + np.repeat(extra_left, counts),
+            road_right=-right - np.repeat(extra_right, counts),
+            stop_lines=tuple(stops),
+        )
+
+    def _beside(self, lane: Lane, side: str) -> float:
+        """Width [m] of all same-direction lanes on one side."""
+        total, name, seen = 0.0, getattr(lane, side), {lane.id}
+        while name in self.lanes and name not in seen:
+            seen.add(name)
+            other = self.lanes[name]
+            total += float(np.median(other.left_width + other.right_width))
+            name = getattr(other, side)
+        return total
+
+
+def _project(line: ReferenceLine, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    s, l = project_points(line, points)
+    return np.asarray(s, np.float64), np.asarray(l, np.float64)
+
+
+def project(frame: LaneFrame, x: np.ndarray, y: np.ndarray) -> tuple:
+    """Station and lateral offset [m] of positions in the chain's frame."""
+    return _project(frame.line, np.stack([x, y], axis=1))
+
+
+def _arc(points: np.ndarray) -> np.ndarray:
+    steps = np.hypot(*np.diff(points, axis=0).T)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def _densify(points: np.ndarray, step: float) -> np.ndarray:
+    arc = _arc(points)
+    grid = np.linspace(0.0, arc[-1], max(int(arc[-1] / step) + 1, 2))
+    return np.stack([np.interp(grid, arc, points[:, i]) for i in (0, 1)], axis=1)
+
+
+def _end_heading(points: np.ndarray, end: int) -> float:
+    step = points[-1] - points[-2] if end == -1 else points[1] - points[0]
+    return float(np.arctan2(step[1], step[0]))
+
+
+def _wrap(angle: np.ndarray) -> np.ndarray:
+    return (angle + np.pi) % (2 * np.pi) - np.pi

@@ -1,0 +1,126 @@
+"""Stop lines, signals and destinations as obstacles of a scene."""
+
+import numpy as np
+
+from rcirl_jax.data.lanes import LaneFrame, LaneGraph, project
+from rcirl_jax.data.motion import Motion
+from rcirl_jax.types import Kind, Recording, Signal, Track
+from rcirl_jax.units import EGO_LENGTH_M, TIMES_S
+
+LOOK_AHEAD_M = 120.0  # m, lines farther ahead are not collected
+LINE_HALF_WIDTH_M = 20.0  # m, a line spans the whole road
+STOP_SIGN_WAIT_S = 1.0  # s, a stop sign is obeyed after standing this long
+MAX_RED_RUNNING = 0.1  # share of crossings on red above which a cycle is not true
+MIN_CROSSINGS = 3  # crossings needed to judge a cycle
+
+
+def signal_state(signal: Signal, times: np.ndarray) -> np.ndarray:
+    """State string at each time [s]."""
+    index = np.searchsorted(signal.start, times + 1e-9, side="right") - 1
+    return np.array(signal.state, object)[np.clip(index, 0, None)]
+
+
+def trusted_signals(
+    recording: Recording, graph: LaneGraph
+) -> tuple[dict[str, Signal], list[str]]:
+    """Signals whose phases agree with what the drivers did, and notes on others.
+
+    Cycles written by a converter need not match the recording. Every crossing
+    of a governed stop line is looked up in the cycle; if more than a tenth of
+    at least three crossings happen on red, the signal is not used.
+    """
+    by_id = {signal.id: signal for signal in recording.signals}
+    counts = {name: [0, 0] for name in by_id}
+    for lane in recording.lanes:
+        if lane.stop_line is None:
+            continue
+        names = [name for name in lane.signal_ids if name in by_id]
+        if not names:
+            continue
+        for track in recording.tracks:
+            time = _crossing(track, lane.stop_line)
+            if time is None:
+                continue
+            for name in names:
+                state = signal_state(by_id[name], np.array([time]))[0]
+                counts[name][0] += 1
+                counts[name][1] += state == "red"
+    trusted, notes = {}, []
+    for name, signal in by_id.items():
+        crossings, reds = counts[name]
+        wrong = crossings >= MIN_CROSSINGS and reds > MAX_RED_RUNNING * crossings
+        unproved = not signal.is_recorded and crossings < MIN_CROSSINGS
+        if wrong or unproved:
+            why = "disagrees with the crossings" if wrong else "has too few crossings"
+            notes.append(f"signal {name}: {why} ({reds} on red of {crossings}); unused")
+        else:
+            trusted[name] = signal
+    return trusted, notes
+
+
+def _crossing(track: Track, line: np.ndarray) -> float | None:
+    """Time at which a track's front first crosses the segment `line` [2, 2]."""
+    front_x = track.x + 0.5 * track.length * np.cos(track.heading)
+    front_y = track.y + 0.5 * track.length * np.sin(track.heading)
+    (x0, y0), (x1, y1) = line
+    dx, dy = x1 - x0, y1 - y0
+    side = (front_x - x0) * dy - (front_y - y0) * dx
+    along = ((front_x - x0) * dx + (front_y - y0) * dy) / max(dx * dx + dy * dy, 1e-9)
+    flips = (np.sign(side[1:]) != np.sign(side[:-1])) & (side[:-1] != 0.0)
+    flips &= (along[1:] > 0.0) & (along[1:] < 1.0)
+    where = np.flatnonzero(flips)
+    return float(track.t[where[0] + 1]) if where.size else None
+
+
+def line_obstacles(
+    frame: LaneFrame,
+    track: Track,
+    signals: dict[str, Signal],
+    clock: np.ndarray,
+    motion: Motion,
+) -> list[dict]:
+    """Stop lines ahead, by time of demand, and the destination.
+
+    A red light demands a stop while it is red. A stop sign does until a car
+    that brakes evenly to the line has stood for a second.
+    """
+    rows = []
+    front = 0.5 * track.length
+    for station, lane in frame.stop_lines:
+        ahead = station - motion.s0
+        if not front <= ahead <= LOOK_AHEAD_M:
+            continue
+        demand = np.zeros(TIMES_S.size, bool)
+        for name in lane.signal_ids:
+            if name in signals:
+                demand |= signal_state(signals[name], clock) == "red"
+        if lane.stop_sign:
+            arrival = 2.0 * (ahead - front) / max(motion.v0, 0.5)
+            demand |= arrival + STOP_SIGN_WAIT_S > TIMES_S
+        if demand.any():
+            rows.append(_line(ahead, demand, Kind.STOP))
+    if track.destination is not None:
+        rows += _destination(frame, track, motion)
+    return rows[:4]
+
+
+def _destination(frame: LaneFrame, track: Track, motion: Motion) -> list[dict]:
+    x, y = track.destination or (0.0, 0.0)
+    s, l = project(frame, np.array([x]), np.array([y]))
+    # the car stands ON its destination: the line lies at its front bumper
+    ahead = float(s[0]) - motion.s0 + 0.5 * (track.length or EGO_LENGTH_M)
+    if abs(l[0]) > LINE_HALF_WIDTH_M or not 0.0 < ahead <= LOOK_AHEAD_M:
+        return []
+    return [_line(ahead, np.ones(TIMES_S.size, bool), Kind.VIRTUAL)]
+
+
+def _line(station: float, demand: np.ndarray, kind: Kind) -> dict:
+    return {
+        "s_lower": station,
+        "s_upper": station,
+        "l_lower": -LINE_HALF_WIDTH_M,
+        "l_upper": LINE_HALF_WIDTH_M,
+        "speed": 0.0,
+        "valid": demand,
+        "kind": int(kind),
+    }

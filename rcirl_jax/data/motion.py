@@ -1,0 +1,81 @@
+"""The human's motion and path in the Frenet frame of a chain of lanes."""
+
+import dataclasses
+
+import numpy as np
+
+from rcirl_jax.data.smoothing import savgol
+from rcirl_jax.units import HORIZON_S, NUM_STATIONS, STATION_STEP_M, TIMES_S
+
+GRID_M = np.arange(NUM_STATIONS) * STATION_STEP_M  # [P] m, the station grid
+MIN_PATH_ADVANCE_M = 0.5  # m between recorded points that shape the path
+ACCELERATION_WINDOW_S = 0.7  # s, smoothing of the ego's acceleration
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FrameTracks:
+    """All samples of a recording in one chain's Frenet frame."""
+
+    s: list[np.ndarray]  # per track [n] m
+    l: list[np.ndarray]  # per track [n] m
+    tilt: list[np.ndarray]  # per track [n] rad, heading minus the line's
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Motion:
+    """What the human did after the planning frame, in the scene's frame."""
+
+    s0: float  # m, station of the planning frame on the chain
+    s: np.ndarray  # [T] m since s0; continued at constant speed after the future
+    l: np.ndarray  # [T] m
+    v0: float  # m/s
+    a0: float  # m/s^2
+    dl0: float  # 1, dl/ds at the planning frame
+    future_s: float  # s of recording after the frame, <= 8
+    s_at_5s: float  # m
+
+
+def human_motion(
+    view: FrameTracks, number: int, start: int, rate: float, length: float
+) -> Motion | None:
+    """The human's positions at TIMES_S and the ego's state at the frame.
+
+    v0 and a0 are the first and second derivative of the cubic fitted by the
+    smoothing filter; all later derivatives are made by `sampling.kinematics`.
+    None if the driver leaves the chain's stations.
+    """
+    s, l = view.s[number], view.l[number]
+    future = s[start:]
+    if future[0] <= 0.0 or future[-1] >= length:
+        return None
+    seconds = np.arange(future.size) / rate
+    future_s = float(min(seconds[-1], HORIZON_S))
+    speed = np.gradient(s) * rate
+    acceleration = savgol(np.gradient(speed) * rate, rate, ACCELERATION_WINDOW_S)
+    monotone = np.maximum.accumulate(future) - future[0]
+    v_end = max(float(np.mean(speed[-3:])), 0.0)
+    beyond = np.maximum(TIMES_S - seconds[-1], 0.0)
+    v0 = max(float(speed[start]), 0.0)
+    l_dot = float(np.gradient(l)[start] * rate)
+    return Motion(
+        s0=float(future[0]),
+        s=np.interp(TIMES_S, seconds, monotone) + v_end * beyond,
+        l=np.interp(TIMES_S, seconds, l[start:]),
+        v0=v0,
+        a0=float(acceleration[start]),
+        dl0=float(np.clip(l_dot / v0, -0.3, 0.3)) if v0 > 1.0 else 0.0,
+        future_s=future_s,
+        s_at_5s=float(np.interp(5.0, seconds, monotone)),
+    )
+
+
+def given_path(view: FrameTracks, number: int, start: int, s0: float) -> np.ndarray:
+    """Lateral offset [P] m of the human's own path on the station grid.
+
+    The whole rest of the track shapes it, not only the scene's horizon; after
+    its end the last offset is kept.
+    """
+    s = np.maximum.accumulate(view.s[number][start:]) - s0
+    l = view.l[number][start:]
+    keep = np.concatenate([[True], np.diff(s // MIN_PATH_ADVANCE_M) > 0])
+    return np.interp(GRID_M, s[keep], l[keep])

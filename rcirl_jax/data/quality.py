@@ -1,0 +1,168 @@
+"""The data-quality report of an import: counts, noise, headways, labels, drops."""
+
+import collections
+import dataclasses
+
+import numpy as np
+
+from rcirl_jax.data.collect import Collector
+from rcirl_jax.data.filters import REASONS
+from rcirl_jax.data.smoothing import HARSH_MPS2, harsh_share
+from rcirl_jax.types import Decision, Demonstration, Kind, Tag
+
+HEADWAY_EDGES_S = (0.5, 1.0, 1.5, 2.0, 3.0)  # s, bins of the headway histogram
+
+
+@dataclasses.dataclass
+class QualityReport:
+    """Accumulates over recordings; `as_dict` is what the manifest stores."""
+
+    recordings: int = 0
+    tracks: int = 0
+    states: int = 0
+    scenes: int = 0
+    harsh_raw: int = 0
+    harsh_smooth: int = 0
+    accelerations: int = 0
+    dropped: collections.Counter = dataclasses.field(
+        default_factory=collections.Counter
+    )
+    tags: collections.Counter = dataclasses.field(default_factory=collections.Counter)
+    decisions: collections.Counter = dataclasses.field(
+        default_factory=collections.Counter
+    )
+    headways: list[float] = dataclasses.field(default_factory=list)
+    speeds: list[float] = dataclasses.field(default_factory=list)
+    futures: list[float] = dataclasses.field(default_factory=list)
+    notes: list[str] = dataclasses.field(default_factory=list)
+
+    def add_recording(self, collector: Collector) -> None:
+        """Count a recording's tracks, noise, drop reasons and notes."""
+        recording = collector.recording
+        self.recordings += 1
+        self.tracks += len(recording.tracks)
+        for smooth in collector.tracks:
+            self.states += smooth.num_frames
+            raw, count = harsh_share(smooth.raw_x, smooth.raw_y, collector.rate)
+            self.harsh_raw += raw
+            self.harsh_smooth += harsh_share(smooth.x, smooth.y, collector.rate)[0]
+            self.accelerations += count
+        self.dropped.update(collector.dropped)
+        notes = [*recording.notes, *collector.signal_notes]
+        self.notes += [f"{recording.name}: {note}" for note in notes]
+
+    def add_scenes(self, demonstrations: Demonstration) -> None:
+        """Count scenes, tags, decisions, headways, speeds and futures."""
+        scene = demonstrations.scene
+        count = int(np.shape(demonstrations.vehicle)[0])
+        self.scenes += count
+        for tag in Tag:
+            self.tags[tag.name.lower()] += int(np.sum(scene.tags[:, tag]))
+        known = np.asarray(scene.obstacles.kind) != Kind.NONE
+        for decision in Decision:
+            chosen = (np.asarray(demonstrations.decisions) == decision) & known
+            self.decisions[decision.name.lower()] += int(np.sum(chosen))
+        self.headways += _headways(demonstrations).tolist()
+        self.speeds += np.asarray(scene.ego.v).tolist()
+        self.futures += np.asarray(demonstrations.future_s).tolist()
+
+    def state(self) -> dict:
+        """All sums and lists, JSON-ready; `merge` takes it back."""
+        return {
+            name: dict(found) if isinstance(found, collections.Counter) else found
+            for name, found in vars(self).items()
+        }
+
+    def merge(self, state: dict) -> None:
+        """Add another report's `state()`."""
+        for name, found in state.items():
+            mine = getattr(self, name)
+            if isinstance(mine, collections.Counter):
+                mine.update(found)
+            elif isinstance(mine, list):
+                mine.extend(found)
+            else:
+                setattr(self, name, mine + found)
+
+    def as_dict(self) -> dict:
+        """JSON-ready summary."""
+        total = max(self.accelerations, 1)
+        return {
+            "recordings": self.recordings,
+            "tracks": self.tracks,
+            "states": self.states,
+            "scenes": self.scenes,
+            "harsh_threshold_mps2": HARSH_MPS2,
+            "harsh_share_raw": self.harsh_raw / total,
+            "harsh_share_smoothed": self.harsh_smooth / total,
+            "headway_s": _quantiles(self.headways),
+            "headway_histogram": _histogram(self.headways),
+            "speed_mps": _quantiles(self.speeds),
+            "future_s": _quantiles(self.futures),
+            "tags": dict(self.tags),
+            "decisions": dict(self.decisions),
+            "dropped": {name: self.dropped.get(name, 0) for name in REASONS},
+            "notes": self.notes[:200],
+            "num_notes": len(self.notes),
+        }
+
+
+def _headways(demonstrations: Demonstration) -> np.ndarray:
+    """Time headway [s] to the followed car at the planning frame, if any."""
+    scene = demonstrations.scene
+    follows = np.asarray(demonstrations.decisions) == Decision.FOLLOW
+    front = 0.5 * np.asarray(scene.ego.length)[:, None]
+    gap = np.asarray(scene.obstacles.s_lower)[:, :, 0] - front
+    speed = np.maximum(np.asarray(scene.ego.v), 1e-3)[:, None]
+    usable = follows & (gap > 0.0) & (speed > 2.0)
+    headway = np.min(np.where(usable, gap / speed, np.inf), axis=1)
+    return headway[np.isfinite(headway)]
+
+
+def _quantiles(values: list[float]) -> dict | None:
+    if not values:
+        return None
+    names = ("p05", "p50", "p95")
+    return dict(zip(names, np.percentile(values, [5, 50, 95]).tolist(), strict=True))
+
+
+def _histogram(values: list[float]) -> dict[str, int]:
+    edges = (0.0, *HEADWAY_EDGES_S, np.inf)
+    counts = np.histogram(values, edges)[0]
+    return {
+        f"{low:g}-{high:g} s": int(n)
+        for low, high, n in zip(edges[:-1], edges[1:], counts, strict=True)
+    }
+
+
+def format_quality(report: dict) -> str:
+    """The report as a terminal table."""
+    lines = [
+        f"{'recordings':<28}{report['recordings']:>10,}",
+        f"{'tracks':<28}{report['tracks']:>10,}",
+        f"{'states':<28}{report['states']:>10,}",
+        f"{'scenes kept':<28}{report['scenes']:>10,}",
+        f"{'|a| > 3 m/s^2, raw':<28}{report['harsh_share_raw']:>10.1%}",
+        f"{'|a| > 3 m/s^2, smoothed':<28}{report['harsh_share_smoothed']:>10.1%}",
+    ]
+    for name, label in (
+        ("speed_mps", "speed, m/s (5/50/95 %)"),
+        ("headway_s", "headway, s (5/50/95 %)"),
+        ("future_s", "future, s (5/50/95 %)"),
+    ):
+        if report[name] is not None:
+            values = " / ".join(f"{value:.1f}" for value in report[name].values())
+            lines.append(f"{label:<28}{values:>20}")
+    lines.append("")
+    lines.append("tags                         scenes   dropped because")
+    tags = sorted(report["tags"].items(), key=lambda item: -item[1])
+    drops = sorted(report["dropped"].items(), key=lambda item: -item[1])
+    for row in range(max(len(tags), len(drops))):
+        left = f"{tags[row][0]:<26}{tags[row][1]:>9,}" if row < len(tags) else " " * 35
+        right = f"   {drops[row][0]:<24}{drops[row][1]:>9,}" if row < len(drops) else ""
+        lines.append(left + right)
+    decisions = ", ".join(f"{k} {v:,}" for k, v in report["decisions"].items())
+    lines += ["", f"decisions per obstacle: {decisions}"]
+    if report["num_notes"]:
+        lines.append(f"{report['num_notes']} notes; first: {report['notes'][0]}")
+    return "\n".join(lines)

@@ -1,0 +1,103 @@
+"""The raw feature generator F: (Scene, Trajectory) -> [T, F].
+
+Which columns, in which order, with which units and caps, is read from
+data_specs/features/<preset>.toml; how a column is computed stands in
+`columns.py`. Human and sampled trajectories go through the same function.
+"""
+
+import dataclasses
+import functools
+import math
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.features.columns import COLUMNS, make_frame
+from rcirl_jax.specs import load_toml, spec_root
+from rcirl_jax.types import Candidates, Scene, Trajectory
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FeatureSpec:
+    """One declared feature; see data_specs/features/paper21.toml."""
+
+    name: str  # key of COLUMNS
+    unit: str
+    none: float  # value without an obstacle of the class
+    lower: float  # the normaliser clips below
+    upper: float  # and above
+    meaning: str
+
+
+@dataclasses.dataclass(frozen=True)
+class FeatureMap:
+    """F with its declared columns; hashable, so it may be a static argument."""
+
+    preset: str
+    specs: tuple[FeatureSpec, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Feature names in column order."""
+        return tuple(spec.name for spec in self.specs)
+
+    @property
+    def num_features(self) -> int:
+        """F, the number of columns."""
+        return len(self.specs)
+
+    def __call__(
+        self, scene: Scene, trajectory: Trajectory
+    ) -> Float[Array, "times features"]:
+        """F of one trajectory in one scene, [T, F]; finite for finite inputs."""
+        with jax.named_scope("features"):
+            frame = make_frame(scene, trajectory)
+            columns = [COLUMNS[spec.name](frame) for spec in self.specs]
+            return jnp.stack(columns, axis=-1)
+
+    def of_candidates(
+        self, scene: Scene, candidates: Candidates
+    ) -> Float[Array, "candidates times features"]:
+        """F of all K candidates of one scene, [K, T, F]."""
+        return jax.vmap(self, in_axes=(None, 0))(scene, candidates.trajectory)
+
+
+@functools.cache
+def feature_map(preset: str) -> FeatureMap:
+    """The feature map declared in data_specs/features/<preset>.toml.
+
+    Raises:
+      InputError: no such preset, an unknown column, or a value out of order.
+    """
+    path = spec_root() / "features" / f"{preset}.toml"
+    if not path.is_file():
+        known = sorted(item.stem for item in path.parent.glob("*.toml"))
+        raise InputError(f"--features: {preset}: expected one of {', '.join(known)}")
+    rows = load_toml(path).get("feature", [])
+    specs = tuple(_read_spec(path, row) for row in rows)
+    names = [spec.name for spec in specs]
+    if not names or len(set(names)) != len(names):
+        raise InputError(f"{path}: feature: {names}: expected distinct names")
+    return FeatureMap(preset, specs)
+
+
+def _read_spec(path: Path, row: dict) -> FeatureSpec:
+    name = row.get("name", "(no name)")
+    expected = {field.name for field in dataclasses.fields(FeatureSpec)}
+    if set(row) != expected:
+        raise InputError(
+            f"{path}: feature {name}: {sorted(row)}: expected {sorted(expected)}"
+        )
+    if name not in COLUMNS:
+        raise InputError(
+            f"{path}: feature {name}: unknown: expected one of {sorted(COLUMNS)}"
+        )
+    bounds = [row["lower"], row["none"], row["upper"]]
+    if not all(isinstance(b, float) and math.isfinite(b) for b in bounds):
+        raise InputError(f"{path}: feature {name}: {bounds}: expected finite floats")
+    if not bounds[0] <= bounds[1] <= bounds[2] or bounds[0] == bounds[2]:
+        raise InputError(f"{path}: feature {name}: {bounds}: lower <= none <= upper")
+    return FeatureSpec(**row)

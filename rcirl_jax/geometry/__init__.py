@@ -1,0 +1,1 @@
+"""Frenet frames, polynomials, boxes."""

@@ -1,0 +1,162 @@
+"""Frenet frame of a reference line: (s, l) <-> (x, y), curvature, lookups.
+
+A point is r(s) + l n(s): r a cubic Hermite curve through the grid points, n
+the left normal of the interpolated heading. Both directions use this one map,
+so the round trip is exact up to the Newton iteration's end.
+"""
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.interpolate import make_smoothing_spline
+
+NEWTON_STEPS = 6  # iterations of to_frenet after the nearest grid point
+CHUNK = 1024  # points per device call of project_points
+SMOOTHING = 30.0  # penalty of the smoothing spline on second derivatives
+
+
+class ReferenceLine(flax.struct.PyTreeNode, kw_only=True):
+    """A line on a uniform arc-length grid, extended straight beyond its end."""
+
+    x: jax.Array  # [M] m
+    y: jax.Array  # [M] m
+    heading: jax.Array  # [M] rad, unwrapped
+    kappa: jax.Array  # [M] 1/m
+    step: jax.Array  # [] m between grid points
+    num_valid: jax.Array  # [] int32, grid points on the polyline itself
+
+
+def reference_line_from_polyline(
+    points: np.ndarray, *, size: int, step: float
+) -> ReferenceLine:
+    """Smooth a noisy polyline [m, 2] and resample it every `step` metres.
+
+    A cubic smoothing spline in arc length (Reinsch) on points thinned to one
+    metre; heading and curvature come from its derivatives.
+    """
+    points = np.asarray(points, np.float64)
+    keep = np.concatenate([[True], np.hypot(*np.diff(points, axis=0).T) > 1e-3])
+    points = points[keep]
+    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    dense = np.linspace(0.0, arc[-1], max(int(arc[-1]) + 1, 5))
+    xs = np.interp(dense, arc, points[:, 0])
+    ys = np.interp(dense, arc, points[:, 1])
+    curve_x = make_smoothing_spline(dense, xs, lam=SMOOTHING)
+    curve_y = make_smoothing_spline(dense, ys, lam=SMOOTHING)
+    fine = np.linspace(0.0, arc[-1], 8 * dense.size)
+    length = np.concatenate(
+        [[0.0], np.cumsum(np.hypot(np.diff(curve_x(fine)), np.diff(curve_y(fine))))]
+    )
+    grid = np.arange(size) * step
+    inside = np.minimum(grid, length[-1])
+    u = np.interp(inside, length, fine)
+    dx, dy = curve_x.derivative()(u), curve_y.derivative()(u)
+    ddx, ddy = curve_x.derivative(2)(u), curve_y.derivative(2)(u)
+    heading = np.unwrap(np.arctan2(dy, dx))
+    kappa = (dx * ddy - dy * ddx) / np.maximum(np.hypot(dx, dy), 1e-9) ** 3
+    beyond = grid - inside
+    kappa = np.where(beyond > 0.0, 0.0, kappa)
+    as_array = lambda v: jnp.asarray(v, jnp.float32)  # noqa: E731
+    return ReferenceLine(
+        x=as_array(curve_x(u) + beyond * np.cos(heading)),
+        y=as_array(curve_y(u) + beyond * np.sin(heading)),
+        heading=as_array(heading),
+        kappa=as_array(kappa),
+        step=as_array(step),
+        num_valid=jnp.asarray(int(length[-1] / step) + 1, jnp.int32),
+    )
+
+
+def lookup(
+    table: Float[Array, " p"], s: Float[Array, ""] | float, step: float
+) -> Float[Array, ""]:
+    """Linear interpolation on a uniform grid from 0; clamped at both ends."""
+    position = jnp.clip(s / step, 0.0, table.shape[0] - 1.0)
+    low = jnp.minimum(position.astype(jnp.int32), table.shape[0] - 2)
+    share = position - low
+    return table[low] + share * (table[low + 1] - table[low])
+
+
+def _curve(line: ReferenceLine, s: jax.Array) -> tuple:
+    """r(s) (x, y) and heading, straight beyond both ends."""
+    size = line.x.shape[0]
+    position = s / line.step
+    low = jnp.clip(jnp.floor(position).astype(jnp.int32), 0, size - 2)
+    u = jnp.clip(position - low, 0.0, 1.0)
+    h00, h10 = (1 + 2 * u) * (1 - u) ** 2, u * (1 - u) ** 2
+    h01, h11 = u**2 * (3 - 2 * u), u**2 * (u - 1)
+    a, b = line.heading[low], line.heading[low + 1]
+    beyond = (position - low - u) * line.step
+    heading = a + u * (b - a)
+    x = h00 * line.x[low] + h01 * line.x[low + 1]
+    y = h00 * line.y[low] + h01 * line.y[low + 1]
+    x = x + line.step * (h10 * jnp.cos(a) + h11 * jnp.cos(b))
+    y = y + line.step * (h10 * jnp.sin(a) + h11 * jnp.sin(b))
+    return x + beyond * jnp.cos(heading), y + beyond * jnp.sin(heading), heading
+
+
+def to_cartesian(
+    line: ReferenceLine, s: Float[Array, ""], l: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """(x, y) m of a Frenet point, the line's heading rad and curvature 1/m."""
+    x, y, heading = _curve(line, s)
+    kappa = lookup(line.kappa, s, line.step)
+    return x - l * jnp.sin(heading), y + l * jnp.cos(heading), heading, kappa
+
+
+def to_frenet(
+    line: ReferenceLine, x: Float[Array, ""], y: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """(s, l) m of a point: nearest grid point, then Newton on t(s).(p - r(s))."""
+    nearest = jnp.argmin((line.x - x) ** 2 + (line.y - y) ** 2)
+
+    def improve(s: jax.Array, _: None) -> tuple[jax.Array, None]:
+        rx, ry, heading = _curve(line, s)
+        along = (x - rx) * jnp.cos(heading) + (y - ry) * jnp.sin(heading)
+        across = (y - ry) * jnp.cos(heading) - (x - rx) * jnp.sin(heading)
+        shrink = 1.0 - lookup(line.kappa, s, line.step) * across
+        return s + along / jnp.maximum(shrink, 0.2), None
+
+    s, _ = jax.lax.scan(improve, nearest * line.step, None, length=NEWTON_STEPS)
+    rx, ry, heading = _curve(line, s)
+    return s, (y - ry) * jnp.cos(heading) - (x - rx) * jnp.sin(heading)
+
+
+_project = jax.jit(jax.vmap(to_frenet, in_axes=(None, 0, 0)))
+
+
+def project_points(
+    line: ReferenceLine, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(s, l) of points [q, 2], numpy; padded so that few sizes compile."""
+    parts = []
+    for start in range(0, len(points), CHUNK):
+        block = np.zeros((CHUNK, 2), np.float32)
+        taken = points[start : start + CHUNK]
+        block[: len(taken)] = taken
+        s, l = _project(line, block[:, 0], block[:, 1])
+        parts.append(np.stack([s, l])[:, : len(taken)])
+    both = np.concatenate(parts, axis=1) if parts else np.zeros((2, 0), np.float32)
+    return both[0], both[1]
+
+
+def path_curvature(
+    kappa: Float[Array, ""],
+    dkappa: Float[Array, ""],
+    l: Float[Array, ""],
+    dl: Float[Array, ""],
+    ddl: Float[Array, ""],
+) -> Float[Array, ""]:
+    """Curvature 1/m of a path given in Frenet coordinates (Werling 2010, app. I).
+
+        tan(d) = dl / (1 - kappa l)
+        kappa_x = [ (ddl + (dkappa l + kappa dl) tan d) cos^2 d / (1 - kappa l)
+                    + kappa ] cos d / (1 - kappa l)
+    """
+    shrink = jnp.maximum(1.0 - kappa * l, 0.1)
+    tangent = dl / shrink
+    cosine = 1.0 / jnp.sqrt(1.0 + tangent**2)
+    inner = (ddl + (dkappa * l + kappa * dl) * tangent) * cosine**2 / shrink
+    return (inner + kappa) * cosine / shrink

@@ -1,0 +1,27 @@
+"""The learned reward: network, normaliser, losses, and the hand-set rival."""
+
+from rcirl_jax.reward.hand import LatticeCost, lattice_cost
+from rcirl_jax.reward.losses import LOSSES, pair_sums
+from rcirl_jax.reward.network import (
+    RewardConfig,
+    RewardParams,
+    init_reward,
+    pinned,
+    value,
+)
+from rcirl_jax.reward.normaliser import Normaliser, fit_normaliser, normalise
+
+__all__ = [
+    "LOSSES",
+    "LatticeCost",
+    "Normaliser",
+    "RewardConfig",
+    "RewardParams",
+    "fit_normaliser",
+    "init_reward",
+    "lattice_cost",
+    "normalise",
+    "pair_sums",
+    "pinned",
+    "value",
+]

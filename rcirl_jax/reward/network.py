@@ -1,0 +1,128 @@
+"""The value functional: V(xi) = sum_t gamma_t R_theta(f_t).
+
+R_theta maps one point's F normalised features to a reward and is shared by all
+times; gamma is a free learnable vector, not an exponential (the paper, section
+IV-A). `hidden = ()` is the linear reward, `(15,)` the paper's 21-15-1 network.
+Human and candidate go through the same parameters (Siamese).
+"""
+
+import dataclasses
+from typing import Literal
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from rcirl_jax.reward.normaliser import Normaliser, normalise
+from rcirl_jax.units import NUM_TIMES
+
+LEAKY_SLOPE = 0.01  # negative slope of the leaky-ReLU hidden activation
+
+ACTIVATIONS = {
+    "tanh": jnp.tanh,
+    "relu": jax.nn.relu,
+    "leaky_relu": lambda x: jax.nn.leaky_relu(x, LEAKY_SLOPE),
+    "identity": lambda x: x,
+}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RewardConfig:
+    """Shape of the value network; hashable."""
+
+    # units of each hidden layer; () is linear
+    hidden: tuple[int, ...] = (15,)
+    activation: Literal["tanh", "relu", "leaky_relu", "identity"] = "tanh"
+    # "unit": output kernel and gamma have unit norm (see `pinned`); "none": free
+    pin: Literal["unit", "none"] = "unit"
+
+
+class RewardParams(flax.struct.PyTreeNode, kw_only=True):
+    """Trainable parameters. There is no output bias: it cancels in differences."""
+
+    gamma: jax.Array  # [T] weight of each time
+    kernels: tuple[jax.Array, ...]  # [F, H1], ..., [H, 1]
+    biases: tuple[jax.Array, ...]  # [H1], ... one per hidden layer
+
+
+def init_reward(
+    key: jax.Array, num_features: int, config: RewardConfig
+) -> RewardParams:
+    """Random kernels (Glorot uniform), zero biases, equal gamma. Key consumed."""
+    sizes = (num_features, *config.hidden, 1)
+    keys = jax.random.split(key, len(sizes) - 1)
+    glorot = jax.nn.initializers.glorot_uniform()
+    kernels = [
+        glorot(k, (fan_in, fan_out), jnp.float32)
+        for k, fan_in, fan_out in zip(keys, sizes[:-1], sizes[1:], strict=True)
+    ]
+    return RewardParams(
+        gamma=jnp.full((NUM_TIMES,), NUM_TIMES**-0.5, jnp.float32),
+        kernels=tuple(kernels),
+        biases=tuple(jnp.zeros((h,), jnp.float32) for h in config.hidden),
+    )
+
+
+def pinned(params: RewardParams, config: RewardConfig) -> RewardParams:
+    """The effective parameters: scale pinned, ranking unchanged.
+
+        gamma <- gamma / |gamma|_2
+        W_out <- W_out / |W_out|_2
+        for homogeneous activations also each hidden unit's [W; b] to unit norm
+
+    The rank loss is positively homogeneous in the output layer (and through
+    ReLUs in every layer): once the mean margin has the right sign it falls
+    without bound by growing the weights. With the scale pinned, and with tanh
+    units bounded by themselves, V is bounded and the loss measures ranking
+    only. Every pin divides by a positive number, so it never changes an order.
+    """
+    if config.pin == "none":
+        return params
+    kernels, biases = list(params.kernels), list(params.biases)
+    if config.activation != "tanh":
+        for layer, bias in enumerate(biases):
+            norm = jnp.sqrt(jnp.sum(kernels[layer] ** 2, axis=0) + bias**2 + 1e-12)
+            kernels[layer], biases[layer] = kernels[layer] / norm, bias / norm
+    kernels[-1] = _unit(kernels[-1])
+    return RewardParams(
+        gamma=_unit(params.gamma), kernels=tuple(kernels), biases=tuple(biases)
+    )
+
+
+def _unit(x: jax.Array) -> jax.Array:
+    return x / jnp.sqrt(jnp.sum(x**2) + 1e-12)
+
+
+def point_rewards(
+    params: RewardParams, x: Float[Array, "*batch f"], activation: str
+) -> Float[Array, "*batch"]:
+    """R_theta of normalised features, any leading axes."""
+    for kernel, bias in zip(params.kernels[:-1], params.biases, strict=True):
+        x = ACTIVATIONS[activation](x @ kernel + bias)
+    return (x @ params.kernels[-1])[..., 0]
+
+
+def value(
+    params: RewardParams,
+    normaliser: Normaliser,
+    features: Float[Array, "*batch t f"],
+    time_valid: Bool[Array, "*batch t"],
+    config: RewardConfig,
+) -> Float[Array, "*batch"]:
+    """V(xi) = sum over valid t of gamma_t R(f_t); higher is better.
+
+    Args:
+      params: raw parameters; the pin is applied here.
+      normaliser: frozen, fitted on the training split.
+      features: [..., T, F] in declared units.
+      time_valid: [..., T], shared by the trajectories that are compared.
+      config: static.
+
+    Returns:
+      Value [...], no unit.
+    """
+    effective = pinned(params, config)
+    x = normalise(normaliser, features)
+    rewards = point_rewards(effective, x, config.activation)
+    return jnp.sum(jnp.where(time_valid, effective.gamma * rewards, 0.0), axis=-1)

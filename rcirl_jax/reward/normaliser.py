@@ -1,0 +1,52 @@
+"""The frozen robust normaliser of features, stored with the weights."""
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from rcirl_jax.features import FeatureMap
+
+SCALE_FLOOR = 1e-3  # share of a feature's declared range; the smallest scale
+
+
+class Normaliser(flax.struct.PyTreeNode, kw_only=True):
+    """x = (clip(f, lower, upper) - location) / scale, per feature."""
+
+    lower: jax.Array  # [F] in the feature's unit
+    upper: jax.Array  # [F]
+    location: jax.Array  # [F]
+    scale: jax.Array  # [F] > 0
+
+
+def normalise(
+    normaliser: Normaliser, features: Float[Array, "*batch f"]
+) -> Float[Array, "*batch f"]:
+    """Apply the normaliser; any leading axes."""
+    clipped = jnp.clip(features, normaliser.lower, normaliser.upper)
+    return (clipped - normaliser.location) / normaliser.scale
+
+
+def fit_normaliser(features: np.ndarray, feature_map: FeatureMap) -> Normaliser:
+    """Robust location and scale over rows [n, F] of the TRAINING split.
+
+        location = median,  scale = (q95 - q05) / 2
+
+    A feature that sits at its "none" value most of the time has no spread
+    between the quantiles; its standard deviation is used, and at least
+    SCALE_FLOOR of the declared range, so that no scale is near zero.
+    """
+    lower = np.array([spec.lower for spec in feature_map.specs])
+    upper = np.array([spec.upper for spec in feature_map.specs])
+    rows = np.clip(np.asarray(features, np.float64), lower, upper)
+    low, middle, high = np.quantile(rows, [0.05, 0.5, 0.95], axis=0)
+    spread = np.maximum(0.5 * (high - low), rows.std(axis=0))
+    scale = np.maximum(spread, SCALE_FLOOR * (upper - lower))
+    as_array = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
+    return Normaliser(
+        lower=as_array(lower),
+        upper=as_array(upper),
+        location=as_array(middle),
+        scale=as_array(scale),
+    )

@@ -1,0 +1,16 @@
+"""Candidate trajectories: one sampler, offline and online."""
+
+from rcirl_jax.sampling.config import SamplerConfig
+from rcirl_jax.sampling.kinematics import trajectory_from_positions, trajectory_on_path
+from rcirl_jax.sampling.sampler import hard_negatives, num_candidates, sample
+from rcirl_jax.sampling.speed import FAMILIES
+
+__all__ = [
+    "FAMILIES",
+    "SamplerConfig",
+    "hard_negatives",
+    "num_candidates",
+    "sample",
+    "trajectory_from_positions",
+    "trajectory_on_path",
+]
