@@ -1,0 +1,1 @@
+"""Recordings, scenes, labels, datasets."""

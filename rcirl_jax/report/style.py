@@ -1,0 +1,51 @@
+"""One look for all pictures: colour-blind safe colours, names, sizes."""
+
+from pathlib import Path
+
+import matplotlib as mpl
+
+mpl.use("Agg")
+
+import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+# Okabe-Ito colours
+HUMAN = "#000000"
+CHOSEN = "#D55E00"
+CANDIDATE = "#999999"
+CLASS_COLOURS = {
+    "follow": "#0072B2",
+    "overtake": "#009E73",
+    "stop": "#CC0000",
+    "virtual": "#CC79A7",
+    "nudge": "#E69F00",
+    "other": "#56B4E9",
+}
+
+
+def figure(rows: int, columns: int, width: float, height: float) -> tuple:
+    """A figure and its axes (2-D array), with quiet grids."""
+    made, axes = plt.subplots(
+        rows, columns, figsize=(width, height), squeeze=False, layout="constrained"
+    )
+    for axis in axes.ravel():
+        axis.grid(True, linewidth=0.4, alpha=0.5)
+        axis.spines[["top", "right"]].set_visible(False)
+    return made, axes
+
+
+def label(axis: Axes, title: str, x: str, y: str) -> None:
+    """Title and axis labels with units."""
+    axis.set_title(title, fontsize=10, loc="left")
+    axis.set_xlabel(x, fontsize=9)
+    axis.set_ylabel(y, fontsize=9)
+    axis.tick_params(labelsize=8)
+
+
+def save(made: Figure, path: Path) -> Path:
+    """Write the PNG (folder made if missing) and free the figure."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    made.savefig(path, dpi=130)
+    plt.close(made)
+    return path

@@ -1,0 +1,207 @@
+"""Conformance of F: every feature of every preset."""
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.features import feature_map
+from rcirl_jax.features.columns import COLUMNS
+from rcirl_jax.sampling import SamplerConfig, sample, trajectory_from_positions
+from rcirl_jax.types import Kind
+from rcirl_jax.units import TIMES_S
+from tests.features.oracle import point
+from tests.scenes import batch, random_positions, random_scene, scene
+
+PRESETS = ("paper21", "apollo21")
+UNITS = {"m", "1", "1/m", "s", "m/s", "m/s^2", "m/s^3"}
+
+
+def drive(seed):
+    made = random_scene(seed)
+    return made, trajectory_from_positions(made, *random_positions(seed, made))
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_declared(preset):
+    features = feature_map(preset)
+    assert features.num_features == 21
+    for spec in features.specs:
+        assert spec.unit in UNITS
+        assert spec.meaning
+        assert spec.lower <= spec.none <= spec.upper
+
+
+def test_apollo_column_order_is_the_interchange_fact():
+    names = feature_map("apollo21").names
+    assert names[:6] == (
+        "velocity",
+        "speed_limit",
+        "acceleration",
+        "jerk",
+        "lateral_acceleration",
+        "collision",
+    )
+    assert names[6:10] == (
+        "follow_distance",
+        "follow_speed",
+        "overtake_distance",
+        "overtake_speed",
+    )
+    assert names[10:13] == ("nudge_distance", "nudge_speed", "nudge_lateral")
+    assert names[17] == "sidepass_front_distance"
+
+
+def test_every_column_is_used_by_a_preset():
+    used = {name for preset in PRESETS for name in feature_map(preset).names}
+    assert used == set(COLUMNS)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@given(seed=st.integers(0, 10_000))
+def test_equals_the_oracle(preset, seed):
+    features = feature_map(preset)
+    made, trajectory = drive(seed)
+    found = np.asarray(features(made, trajectory))
+    assert np.isfinite(found).all()
+    for i in range(TIMES_S.size):
+        expected = point(made, trajectory, i)
+        for column, name in enumerate(features.names):
+            assert found[i, column] == pytest.approx(
+                expected[name], rel=2e-4, abs=2e-3
+            ), (name, i)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_none_values_without_obstacles(preset):
+    features = feature_map(preset)
+    empty = scene()
+    s = empty.ego.v * jnp.asarray(TIMES_S)
+    found = np.asarray(
+        features(empty, trajectory_from_positions(empty, s, jnp.zeros_like(s)))
+    )
+    for column, spec in enumerate(features.specs):
+        if "distance" in spec.name or spec.name.startswith(
+            ("follow", "overtake", "stop", "virtual", "nudge", "sidepass", "collision")
+        ):
+            assert (found[:, column] == spec.none).all(), spec.name
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_vmap_equals_loop_and_jit_equals_eager(preset):
+    features = feature_map(preset)
+    drives = [drive(seed) for seed in range(4)]
+    scenes = batch([made for made, _ in drives])
+    trajectories = batch([trajectory for _, trajectory in drives])
+    vmapped = np.asarray(jax.jit(jax.vmap(features))(scenes, trajectories))
+    for row, (made, trajectory) in zip(vmapped, drives, strict=True):
+        np.testing.assert_allclose(
+            row, np.asarray(features(made, trajectory)), rtol=1e-5, atol=1e-4
+        )
+        np.testing.assert_allclose(
+            row, np.asarray(jax.jit(features)(made, trajectory)), rtol=1e-5, atol=1e-4
+        )
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("mode", ["speed", "path_speed"])
+def test_human_equal_to_a_candidate_has_the_same_bits(preset, mode):
+    """The human enters as positions, like a candidate, and nothing differs."""
+    features, config = feature_map(preset), SamplerConfig(mode=mode)
+    made = random_scene(3)
+    candidates = sample(jax.random.key(0), made, config)
+    all_features = features.of_candidates(made, candidates)
+
+    def of_human(s, l):
+        return features(made, trajectory_from_positions(made, s, l))
+
+    picks = jnp.arange(0, candidates.family.size, 7)
+    human = jax.vmap(of_human)(
+        candidates.trajectory.s[picks], candidates.trajectory.l[picks]
+    )
+    np.testing.assert_array_equal(
+        np.asarray(all_features)[np.asarray(picks)], np.asarray(human)
+    )
+
+
+def test_order_of_obstacles_does_not_matter():
+    features = feature_map("paper21")
+    made, trajectory = drive(11)
+    order = np.random.default_rng(0).permutation(made.obstacles.kind.size)
+    shuffled = made.replace(
+        obstacles=jax.tree.map(lambda x: x[order], made.obstacles)
+    )
+    np.testing.assert_allclose(
+        features(made, trajectory), features(shuffled, trajectory), atol=1e-6
+    )
+
+
+def test_classes_by_hand():
+    """Ego at s = 0, 4.9 m long, standing; one obstacle of each class."""
+    features = feature_map("paper21")
+    still = jnp.zeros(TIMES_S.size)
+
+    def at(name, **box):
+        made = scene(v=0.0, boxes=[box])
+        found = features(made, trajectory_from_positions(made, still, still))
+        return float(found[0, features.names.index(name)])
+
+    assert at("follow_distance", s=20.0, length=4.0) == pytest.approx(15.55)
+    assert at("overtake_distance", s=-20.0, length=4.0) == pytest.approx(15.55)
+    assert at("nudge_lateral", s=0.0, l=3.0, width=2.0) == pytest.approx(1.0)
+    assert at("collision_distance", s=4.0, length=4.0) == pytest.approx(-0.45)
+    assert at("collision_distance", s=20.0, l=9.0) > 10.0
+    line = {"length": 0.0, "width": 40.0}
+    assert at("stop_distance", s=12.45, kind=Kind.STOP, **line) == pytest.approx(10.0)
+    virtual = at("virtual_distance", s=12.45, kind=Kind.VIRTUAL, **line)
+    assert virtual == pytest.approx(10.0)
+
+
+def test_running_a_red_light_counts_once_and_only_on_red():
+    features = feature_map("paper21")
+    column = features.names.index("collision_distance")
+    red = np.zeros(TIMES_S.size, bool)
+    red[:9] = True
+
+    def closest(v, valid):
+        made = scene(
+            v=v,
+            boxes=[
+                {"s": 30.0, "kind": Kind.STOP, "length": 0.0, "width": 40.0, "valid": valid}
+            ],
+        )
+        s = v * jnp.asarray(TIMES_S)
+        drive = trajectory_from_positions(made, s, jnp.zeros_like(s))
+        return np.asarray(features(made, drive))[:, column]
+
+    assert (closest(10.0, red) < 0.0).sum() == 1
+    assert (closest(10.0, ~red) < 0.0).sum() == 0
+    assert (closest(1.0, red) < 0.0).sum() == 0
+
+
+def test_gradients_are_finite_where_boxes_touch():
+    features = feature_map("paper21")
+    made = scene(v=0.0, boxes=[{"s": 4.7, "length": 4.5}, {"s": 0.0, "l": 1.9}])
+
+    def total(s):
+        return jnp.sum(features(made, trajectory_from_positions(made, s, 0.0 * s)))
+
+    gradient = jax.grad(total)(jnp.zeros(TIMES_S.size))
+    assert np.isfinite(np.asarray(gradient)).all()
+
+
+def test_compiles_once_for_many_scenes():
+    features = feature_map("paper21")
+    counted = chex.assert_max_traces(features.__call__, n=1)
+    run = jax.jit(counted)
+    for seed in range(4):
+        run(*drive(seed))
+
+
+def test_unknown_preset_is_one_line():
+    with pytest.raises(InputError, match=r"--features: nope: expected one of"):
+        feature_map("nope")
