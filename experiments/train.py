@@ -75,7 +75,9 @@ def main() -> None:
             f"pairs won {epoch['pair_accuracy']:.1%}"
         )
     rate = result.queries / max(result.seconds, 1e-9)
-    print(f"{result.queries:,.0f} queries, {rate:,.0f} queries/s; run: {_WORKDIR.value}")
+    print(
+        f"{result.queries:,.0f} queries, {rate:,.0f} queries/s; run: {_WORKDIR.value}"
+    )
 
 
 if __name__ == "__main__":

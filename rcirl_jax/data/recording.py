@@ -1,52 +1,96 @@
-"""Invariants that every importer's Recording satisfies, checked in one place."""
+"""Invariants that every importer's Recording satisfies, checked in one place.
+
+They catch what a wrong column or unit does to a log: feet read as metres, km/h
+read as m/s, frames read as seconds. Each violation is one line that names the
+file, the field, the value found and what was expected.
+"""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Kind, Lane, Recording, Track
-from rcirl_jax.units import FOOT_M
+from rcirl_jax.types import Ghost, Kind, Lane, Recording, Signal, Track
+from rcirl_jax.units import FOOT_M, MPH_MPS
 
 MAX_SPEED_MPS = 90.0  # m/s, faster than any road user
 LENGTH_RANGE_M = (0.2, 40.0)  # m
 WIDTH_RANGE_M = (0.2, 6.0)  # m
+STATIC_RANGE_M = (0.01, 1000.0)  # m, standing objects: from posts to long walls
 MAX_MEDIAN_CAR_M = 9.0  # m; a median above it means feet (a car is 4-5 m)
-MOVING_MPS = 2.0  # m/s, speeds compared with positions only above this
+MIN_CARS = 3  # vehicles needed to judge the median; two lorries are no error
+MOVING_MPS = 2.0  # m/s, speeds are compared only above this
+SPEED_WINDOW_S = 0.5  # s, position noise averages out over it
 SPEED_RATIO_RANGE = (0.5, 2.0)  # recorded speed over speed from positions
-MIN_MOVING_SAMPLES = 20  # samples needed to judge the ratio
+MIN_MOVING_SAMPLES = 10  # samples needed to judge the ratio
+RATE_TOLERANCE = 0.12  # relative; timestamps rounded to 10 ms at 30 Hz pass
+# what a ratio near one of these means (recorded speed over that of positions)
+RATIO_HINTS = {
+    FOOT_M: "feet taken for metres?",
+    1.0 / FOOT_M: "feet taken for metres?",
+    3.6: "km/h taken for m/s?",
+    1.0 / MPH_MPS: "mph taken for m/s?",
+}
+HINT_TOLERANCE = 0.08  # relative; 3.28 and 3.6 stay apart
+SERIES = ("t", "x", "y", "heading", "speed")
+STATES = ("red", "yellow", "green", "off")
 
 
-def validate_recording(recording: Recording) -> Recording:
-    """The recording with unknown lane references dropped.
+def validate_recording(
+    recording: Recording, file: str | Path | None = None
+) -> Recording:
+    """The recording with references to unknown lanes and signals dropped.
+
+    Args:
+      recording: what an importer read.
+      file: named in errors; default: the recording's name.
 
     Raises:
-      InputError: the first violation, as "RECORDING: field: value: expected".
+      InputError: the first violation, as "FILE: field: value: expected".
     """
-    name = recording.name
+    name = str(file or recording.name)
+    if not (np.isfinite(recording.rate_hz) and recording.rate_hz > 0.0):
+        raise InputError(f"{name}: rate_hz: {recording.rate_hz}: expected > 0")
     if not recording.tracks:
         raise InputError(f"{name}: tracks: none: expected at least one road user")
-    ids = [track.id for track in recording.tracks]
-    if len(set(ids)) != len(ids):
-        twice = next(i for i in ids if ids.count(i) > 1)
-        raise InputError(f"{name}: id: {twice}: met twice: expected unique ids")
+    _check_unique(name, "track id", [track.id for track in recording.tracks])
+    _check_unique(name, "lane id", [lane.id for lane in recording.lanes])
+    _check_unique(name, "signal id", [signal.id for signal in recording.signals])
     for track in recording.tracks:
-        _check_track(name, track, recording.rate_hz)
+        _check_track(name, track)
+    _check_rate(name, recording)
     _check_lengths(name, recording.tracks)
-    _check_speeds(name, recording.tracks)
-    known = {lane.id for lane in recording.lanes}
-    if len(known) != len(recording.lanes):
-        raise InputError(f"{name}: lanes: an id is met twice: expected unique ids")
-    lanes = tuple(_check_lane(name, lane, known) for lane in recording.lanes)
-    return dataclasses.replace(recording, lanes=lanes)
+    _check_speeds(name, recording)
+    begin = min(float(track.t[0]) for track in recording.tracks)
+    for signal in recording.signals:
+        _check_signal(name, signal, begin)
+    for ghost in recording.ghosts:
+        _check_ghost(name, ghost)
+    lanes = {lane.id for lane in recording.lanes}
+    signals = {signal.id for signal in recording.signals}
+    return dataclasses.replace(
+        recording,
+        lanes=tuple(
+            _check_lane(name, lane, lanes, signals) for lane in recording.lanes
+        ),
+    )
 
 
-def _check_track(name: str, track: Track, rate_hz: float) -> None:
+def _check_unique(name: str, field: str, ids: list[str]) -> None:
+    seen: set[str] = set()
+    for item in ids:
+        if item in seen:
+            raise InputError(f"{name}: {field}: {item}: met twice: expected once")
+        seen.add(item)
+
+
+def _check_track(name: str, track: Track) -> None:
     where = f"{name}: track {track.id}"
-    sizes = {getattr(track, k).shape for k in ("t", "x", "y", "heading", "speed")}
-    if len(sizes) != 1 or track.t.size == 0:
+    sizes = sorted({getattr(track, field).shape for field in SERIES})
+    if len(sizes) != 1 or track.t.ndim != 1 or track.t.size == 0:
         raise InputError(f"{where}: samples: {sizes}: expected equal, at least one")
-    for field in ("t", "x", "y", "heading", "speed"):
+    for field in SERIES:
         values = getattr(track, field)
         bad = np.flatnonzero(~np.isfinite(values))
         if bad.size:
@@ -58,7 +102,9 @@ def _check_track(name: str, track: Track, rate_hz: float) -> None:
         raise InputError(
             f"{where}: t: {after:g} s after {before:g} s: expected increasing times"
         )
-    for field, (low, high) in (("length", LENGTH_RANGE_M), ("width", WIDTH_RANGE_M)):
+    static = track.kind == Kind.STATIC
+    for field, moving in (("length", LENGTH_RANGE_M), ("width", WIDTH_RANGE_M)):
+        low, high = STATIC_RANGE_M if static else moving
         size = getattr(track, field)
         if not low <= size <= high:
             raise InputError(
@@ -67,63 +113,128 @@ def _check_track(name: str, track: Track, rate_hz: float) -> None:
     fastest = float(np.max(np.abs(track.speed)))
     if fastest > MAX_SPEED_MPS:
         raise InputError(
-            f"{where}: speed: {fastest:g} m/s: expected below {MAX_SPEED_MPS:g}"
+            f"{where}: speed: {fastest:g} m/s: expected below {MAX_SPEED_MPS:g} m/s"
         )
-    if track.t.size > 1:
-        step = float(np.median(np.diff(track.t)))
-        if abs(step * rate_hz - 1.0) > 0.1:
-            raise InputError(
-                f"{where}: t: steps of {step:g} s: expected {1 / rate_hz:g} s"
-            )
+
+
+def _check_rate(name: str, recording: Recording) -> None:
+    steps = np.concatenate([np.diff(track.t) for track in recording.tracks])
+    if steps.size == 0:
+        return
+    step, expected = float(np.median(steps)), 1.0 / recording.rate_hz
+    if abs(step / expected - 1.0) > RATE_TOLERANCE:
+        raise InputError(
+            f"{name}: t: median step {step:g} s: expected {expected:g} s "
+            f"(rate_hz {recording.rate_hz:g})"
+        )
 
 
 def _check_lengths(name: str, tracks: tuple[Track, ...]) -> None:
     lengths = [track.length for track in tracks if track.kind == Kind.VEHICLE]
-    if lengths and np.median(lengths) > MAX_MEDIAN_CAR_M:
+    if len(lengths) < MIN_CARS:
+        return
+    median = float(np.median(lengths))
+    if median > MAX_MEDIAN_CAR_M:
         raise InputError(
-            f"{name}: length: median {np.median(lengths):.1f} m: expected 3 to 9 m; "
-            "feet taken for metres?"
+            f"{name}: length: median {median:.1f} m: "
+            f"expected below {MAX_MEDIAN_CAR_M:g} m; feet taken for metres?"
         )
 
 
-def _check_speeds(name: str, tracks: tuple[Track, ...]) -> None:
-    """Recorded speed against differences of positions, over all moving samples."""
-    ratios = []
-    for track in tracks:
-        if track.t.size < 2:
-            continue
-        moved = np.hypot(np.diff(track.x), np.diff(track.y)) / np.diff(track.t)
-        recorded = 0.5 * (track.speed[1:] + track.speed[:-1])
-        moving = (moved > MOVING_MPS) & (recorded > 0.0)
-        ratios.append(recorded[moving] / moved[moving])
-    both = np.concatenate(ratios) if ratios else np.zeros(0)
-    if both.size < MIN_MOVING_SAMPLES:
+def _speed_ratios(track: Track, rate_hz: float) -> np.ndarray:
+    """Recorded speed over speed from positions, over windows where it moves.
+
+    ratio = integral of |speed| dt / distance between the window's ends
+    """
+    span = min(max(int(round(SPEED_WINDOW_S * rate_hz)), 1), track.t.size - 1)
+    if span < 1:
+        return np.zeros(0)
+    speed = np.abs(track.speed)
+    mean = 0.5 * (speed[1:] + speed[:-1])
+    path = np.concatenate([[0.0], np.cumsum(mean * np.diff(track.t))])
+    recorded = path[span:] - path[:-span]
+    moved = np.hypot(track.x[span:] - track.x[:-span], track.y[span:] - track.y[:-span])
+    moving = np.maximum(recorded, moved) > MOVING_MPS * (
+        track.t[span:] - track.t[:-span]
+    )
+    return recorded[moving] / np.maximum(moved[moving], 1e-9)
+
+
+def _check_speeds(name: str, recording: Recording) -> None:
+    ratios = np.concatenate(
+        [
+            _speed_ratios(track, recording.rate_hz)
+            for track in recording.tracks
+            if track.kind != Kind.STATIC
+        ]
+        or [np.zeros(0)]
+    )
+    if ratios.size < MIN_MOVING_SAMPLES:
         return
-    ratio = float(np.median(both))
+    ratio = float(np.median(ratios))
     low, high = SPEED_RATIO_RANGE
     if not low <= ratio <= high:
-        foot = min(abs(ratio - FOOT_M), abs(ratio - 1.0 / FOOT_M)) < 0.4
-        hint = "; feet taken for metres?" if foot else ""
+        known = min(RATIO_HINTS, key=lambda value: abs(ratio / value - 1.0))
+        near = abs(ratio / known - 1.0) < HINT_TOLERANCE
         raise InputError(
-            f"{name}: speed: {ratio:.2f} times the speed of the positions: "
-            f"expected about 1{hint}"
+            f"{name}: speed: {ratio:.4g} times the speed of the positions: "
+            f"expected {low:g} to {high:g}{'; ' + RATIO_HINTS[known] if near else ''}"
         )
 
 
-def _check_lane(name: str, lane: Lane, known: set[str]) -> Lane:
+def _check_signal(name: str, signal: Signal, begin: float) -> None:
+    where = f"{name}: signal {signal.id}"
+    if signal.start.size != len(signal.state) or signal.start.size == 0:
+        raise InputError(
+            f"{where}: state: {len(signal.state)} for {signal.start.size} starts: "
+            "expected one each, at least one"
+        )
+    unknown = set(signal.state) - set(STATES)
+    if unknown:
+        raise InputError(f"{where}: state: {min(unknown)}: expected one of {STATES}")
+    if not np.isfinite(signal.start).all() or np.any(np.diff(signal.start) <= 0.0):
+        raise InputError(f"{where}: start: not increasing: expected increasing times")
+    if signal.start[0] > begin:
+        raise InputError(
+            f"{where}: start: {signal.start[0]:g} s: "
+            f"expected at or before the first track, {begin:g} s"
+        )
+
+
+def _check_ghost(name: str, ghost: Ghost) -> None:
+    values = (ghost.t0, ghost.t1, *ghost.start, *ghost.end)
+    if not np.isfinite(values).all() or ghost.t1 < ghost.t0:
+        raise InputError(f"{name}: ghost: {values}: expected finite, t1 >= t0")
+
+
+def _check_lane(name: str, lane: Lane, lanes: set[str], signals: set[str]) -> Lane:
     where = f"{name}: lane {lane.id}"
-    if lane.centre.ndim != 2 or lane.centre.shape[0] < 2 or lane.centre.shape[1] != 2:
-        raise InputError(f"{where}: centre: {lane.centre.shape}: expected [m >= 2, 2]")
+    shape = lane.centre.shape
+    if len(shape) != 2 or shape[0] < 2 or shape[1] != 2:
+        raise InputError(f"{where}: centre: {shape}: expected [m >= 2, 2] points")
     for field in ("centre", "left_width", "right_width"):
         values = getattr(lane, field)
         if len(values) != len(lane.centre) or not np.isfinite(values).all():
-            raise InputError(f"{where}: {field}: expected finite, one per point")
+            raise InputError(
+                f"{where}: {field}: {values.shape}: expected finite, one per point"
+            )
+    if not np.any(np.diff(lane.centre, axis=0)):
+        raise InputError(f"{where}: centre: all points equal: expected a line")
     narrow = min(float(lane.left_width.min()), float(lane.right_width.min()))
     if narrow <= 0.0:
         raise InputError(f"{where}: width: {narrow:g} m: expected > 0")
+    limit = lane.speed_limit
+    if limit is not None and not 0.0 < limit < MAX_SPEED_MPS:
+        raise InputError(
+            f"{where}: speed_limit: {limit:g} m/s: expected 0 to {MAX_SPEED_MPS:g} m/s"
+        )
+    line = lane.stop_line
+    if line is not None and (line.shape != (2, 2) or not np.isfinite(line).all()):
+        raise InputError(f"{where}: stop_line: {line.shape}: expected two points")
     return dataclasses.replace(
         lane,
-        successors=tuple(s for s in lane.successors if s in known),
-        left=lane.left if lane.left in known else None,
-        right=lane.right if lane.right in known else None,
+        successors=tuple(s for s in lane.successors if s in lanes),
+        left=lane.left if lane.left in lanes else None,
+        right=lane.right if lane.right in lanes else None,
+        signal_ids=tuple(s for s in lane.signal_ids if s in signals),
     )

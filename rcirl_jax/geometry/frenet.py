@@ -151,9 +151,9 @@ def path_curvature(
 ) -> Float[Array, ""]:
     """Curvature 1/m of a path given in Frenet coordinates (Werling 2010, app. I).
 
-        tan(d) = dl / (1 - kappa l)
-        kappa_x = [ (ddl + (dkappa l + kappa dl) tan d) cos^2 d / (1 - kappa l)
-                    + kappa ] cos d / (1 - kappa l)
+    tan(d) = dl / (1 - kappa l)
+    kappa_x = [ (ddl + (dkappa l + kappa dl) tan d) cos^2 d / (1 - kappa l)
+                + kappa ] cos d / (1 - kappa l)
     """
     shrink = jnp.maximum(1.0 - kappa * l, 0.1)
     tangent = dl / shrink

@@ -41,8 +41,8 @@ def quintic(
 ) -> Float[Array, "6"]:
     """Coefficients of the quintic from (s0, v0, a0) to (s1, v1, a1).
 
-        s(t) = sum_i c_i t^i, i = 0..5, matching value and two derivatives at
-        both ends. Ascending powers of t; units follow the inputs.
+    s(t) = sum_i c_i t^i, i = 0..5, matching value and two derivatives at
+    both ends. Ascending powers of t; units follow the inputs.
     """
     d = jnp.maximum(jnp.asarray(duration, jnp.float32), MIN_DURATION)
     p = s1 - s0 - v0 * d - 0.5 * a0 * d**2

@@ -132,9 +132,7 @@ def test_order_of_obstacles_does_not_matter():
     features = feature_map("paper21")
     made, trajectory = drive(11)
     order = np.random.default_rng(0).permutation(made.obstacles.kind.size)
-    shuffled = made.replace(
-        obstacles=jax.tree.map(lambda x: x[order], made.obstacles)
-    )
+    shuffled = made.replace(obstacles=jax.tree.map(lambda x: x[order], made.obstacles))
     np.testing.assert_allclose(
         features(made, trajectory), features(shuffled, trajectory), atol=1e-6
     )
@@ -171,7 +169,13 @@ def test_running_a_red_light_counts_once_and_only_on_red():
         made = scene(
             v=v,
             boxes=[
-                {"s": 30.0, "kind": Kind.STOP, "length": 0.0, "width": 40.0, "valid": valid}
+                {
+                    "s": 30.0,
+                    "kind": Kind.STOP,
+                    "length": 0.0,
+                    "width": 40.0,
+                    "valid": valid,
+                }
             ],
         )
         s = v * jnp.asarray(TIMES_S)

@@ -4,10 +4,11 @@ An importer is a function (input path, source spec) -> iterator of Recording.
 The spec is the TOML of data_specs/sources (or the user's own).
 """
 
+import importlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from rcirl_jax.data.importers import commonroad, csv_table, ngsim, synthetic
+from rcirl_jax.data.importers import commonroad, csv_table, ngsim
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.specs import load_toml, spec_root
@@ -15,11 +16,18 @@ from rcirl_jax.types import Recording
 
 Importer = Callable[[Path, dict], Iterator[Recording]]
 
+
+def _synthetic(path: Path, spec: dict) -> Iterator[Recording]:
+    """Synthetic traffic; its module is loaded only when it is asked for."""
+    synthetic = importlib.import_module("rcirl_jax.data.importers.synthetic")
+    return map(validate_recording, synthetic.recordings(path, spec))
+
+
 IMPORTERS: dict[str, Importer] = {
     "commonroad": commonroad.recordings,
     "csv": csv_table.recordings,
     "ngsim": ngsim.recordings,
-    "synthetic": synthetic.recordings,
+    "synthetic": _synthetic,
 }
 
 
@@ -45,5 +53,5 @@ def read_recordings(
             raise InputError("--input: not given: expected a file or folder")
         input_path = spec_path
     if not input_path.exists():
-        raise InputError(f"{input_path}: no such file or folder")
-    return map(validate_recording, IMPORTERS[name](input_path, spec))
+        raise InputError(f"{input_path}: input: missing: expected a file or folder")
+    return IMPORTERS[name](input_path, spec)

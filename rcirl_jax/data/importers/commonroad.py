@@ -7,9 +7,9 @@ removed that car from the traffic).
 """
 
 import csv
-from collections.abc import Callable, Iterator
+import dataclasses
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
 from xml.etree.ElementTree import Element, ParseError
 
 import numpy as np
@@ -17,11 +17,14 @@ import numpy as np
 from rcirl_jax.data.importers.files import input_files
 from rcirl_jax.data.importers.lanelets import read_lanes
 from rcirl_jax.data.importers.xml_fields import Fields
+from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Ghost, Kind, Recording, Signal, Track
+from rcirl_jax.types import Ghost, Kind, Lane, Recording, Signal, Track
 
 VERSIONS = ("2018b", "2020a")
 MAX_FILE_BYTES = 512 * 1024**2  # bytes, larger files are refused
+DEFAULT_LIMIT_MPS = 29.06  # m/s, 65 mph, where the source TOML names none
+MIN_LIMIT_MPS = 5.0  # m/s, likewise; lower signs are converter artefacts
 COLOURS = {
     "red": "red",
     "redyellow": "red",
@@ -29,17 +32,28 @@ COLOURS = {
     "green": "green",
     "inactive": "off",
 }
+# obstacle types; any other type that moves is a vehicle
 KINDS = {
     "bicycle": Kind.CYCLIST,
-    "motorcycle": Kind.VEHICLE,
     "pedestrian": Kind.PEDESTRIAN,
-    "car": Kind.VEHICLE,
-    "truck": Kind.VEHICLE,
-    "bus": Kind.VEHICLE,
-    "taxi": Kind.VEHICLE,
-    "priorityvehicle": Kind.VEHICLE,
-    "train": Kind.VEHICLE,
+    "parkedvehicle": Kind.STATIC,
+    "constructionzone": Kind.STATIC,
+    "roadboundary": Kind.STATIC,
+    "building": Kind.STATIC,
+    "pillar": Kind.STATIC,
+    "median_strip": Kind.STATIC,
 }
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Box:
+    """A shape's box in the obstacle's own frame."""
+
+    length: float  # m
+    width: float  # m
+    x: float = 0.0  # m, of the box centre, ahead of the obstacle's position
+    y: float = 0.0  # m, to its left
+    turn: float = 0.0  # rad, of the box against the obstacle's heading
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
@@ -47,19 +61,25 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     files = input_files(path, spec.get("pattern", "*.xml"))
     groups = _read_groups(path, spec.get("groups", ""))
     for file in files:
-        yield _read_file(file, spec, groups)
+        yield validate_recording(_read_file(file, spec, groups), file)
 
 
 def _read_groups(path: Path, name: str) -> dict[str, str]:
-    folder = path if path.is_dir() else path.parent
+    """File name -> vehicle-disjoint group, from a CSV beside or above the files."""
+    folder = (path if path.is_dir() else path.parent).resolve()
     for place in (folder, folder.parent):
         table = place / name
-        if name and table.is_file():
-            with table.open(newline="", encoding="utf-8") as handle:
-                rows = list(csv.DictReader(handle))
-            if rows and not {"file", "group"} <= set(rows[0]):
-                raise InputError(f"{table}: columns: expected file,group")
-            return {row["file"]: row["group"] for row in rows}
+        if not (name and table.is_file()):
+            continue
+        try:
+            with table.open(newline="", encoding="utf-8-sig") as handle:
+                reader = csv.DictReader(handle)
+                rows, header = list(reader), list(reader.fieldnames or [])
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise InputError(f"{table}: {error}: expected a CSV") from error
+        if not {"file", "group"} <= set(header):
+            raise InputError(f"{table}: columns: {header}: expected file,group")
+        return {row["file"]: row["group"] for row in rows}
     return {}
 
 
@@ -69,14 +89,19 @@ def parse_xml(path: Path) -> Element:
     from defusedxml import ElementTree as Safe
 
     if path.stat().st_size > MAX_FILE_BYTES:
-        raise InputError(f"{path}: larger than {MAX_FILE_BYTES} bytes: refused")
+        raise InputError(
+            f"{path}: size: {path.stat().st_size} bytes: "
+            f"expected at most {MAX_FILE_BYTES}"
+        )
     try:
         root = Safe.parse(path, forbid_dtd=True).getroot()
     except DefusedXmlException as error:
         kind = type(error).__name__
-        raise InputError(f"{path}: {kind}: expected XML without DTD") from error
-    except (ParseError, UnicodeDecodeError, ValueError) as error:
-        raise InputError(f"{path}: {error}: expected well-formed XML") from error
+        raise InputError(
+            f"{path}: xml: {kind}: expected no DTD, entities or external references"
+        ) from error
+    except (ParseError, ValueError, LookupError) as error:
+        raise InputError(f"{path}: xml: {error}: expected well-formed XML") from error
     if root is None or root.tag != "commonRoad":
         tag = "nothing" if root is None else root.tag
         raise InputError(f"{path}: root: {tag}: expected commonRoad")
@@ -91,29 +116,47 @@ def _read_file(path: Path, spec: dict, groups: dict[str, str]) -> Recording:
             f"{path}: commonRoadVersion: {version}: expected one of {VERSIONS}"
         )
     dt = _time_step(path, root)
-    tracks = _read_tracks(root, fields, dt)
-    if not tracks:
-        raise InputError(f"{path}: dynamicObstacle: none: expected road users")
-    last = max(float(track.t[-1]) for track in tracks)
-    notes = []
+    tracks, notes = _read_tracks(root, fields, dt)
+    last = max((float(track.t[-1]) for track in tracks), default=0.0)
     group = groups.get(path.name)
     if group is None:
         group = path.stem
         notes.append("no vehicle-disjoint group given; the file is its own group")
-    lanes, lane_notes = read_lanes(root, fields, spec)
+    lanes, lane_notes = read_lanes(
+        root, fields, {"min_speed_limit": MIN_LIMIT_MPS, **spec}
+    )
+    centres = {lane.id: lane.centre for lane in lanes}
+    source, licence = _provenance(root.get("source", "CommonRoad"), spec)
     return Recording(
         name=path.stem,
-        source=root.get("source", "CommonRoad") + f" ({version})",
-        licence=spec.get("licence", "unknown"),
+        source=f"{source} (CommonRoad {version})",
+        licence=licence,
         rate_hz=1.0 / dt,
         tracks=tuple(tracks),
         lanes=lanes,
         signals=tuple(_read_signals(root, fields, dt, last)),
-        ghosts=tuple(_read_ghosts(root, fields, dt)),
+        ghosts=tuple(_read_ghosts(root, fields, dt, centres)),
         group=group,
-        default_speed_limit=float(spec.get("default_speed_limit", 29.06)),
+        default_speed_limit=_usual_limit(lanes, spec),
         notes=tuple(notes + lane_notes),
     )
+
+
+def _provenance(attribute: str, spec: dict) -> tuple[str, str]:
+    """Source and licence texts by the file's own source attribute."""
+    for rule in spec.get("provenance", []):
+        if rule.get("match", "") in attribute:
+            source = f"{attribute}: {rule['source']}" if "source" in rule else attribute
+            return source, rule.get("licence", "unknown")
+    return attribute, spec.get("licence", "unknown")
+
+
+def _usual_limit(lanes: tuple[Lane, ...], spec: dict) -> float:
+    """Limit [m/s] of lanes without one: the median of the file's, if any."""
+    limits = [lane.speed_limit for lane in lanes if lane.speed_limit is not None]
+    if limits:
+        return float(np.median(limits))
+    return float(spec.get("default_speed_limit", DEFAULT_LIMIT_MPS))
 
 
 def _time_step(path: Path, root: Element) -> float:
@@ -127,31 +170,49 @@ def _time_step(path: Path, root: Element) -> float:
     return dt
 
 
-def _read_tracks(root: Element, fields: Fields, dt: float) -> list[Track]:
-    tracks, standing = [], []
+def _is_standing(element: Element, fields: Fields) -> bool | None:
+    """Whether an obstacle element stands for ever; None for other elements."""
+    if element.tag == "obstacle":
+        role = (element.findtext("role") or "none").strip()
+        if role not in ("dynamic", "static"):
+            raise InputError(
+                f"{fields.path}: obstacle {element.get('id')}: role: {role}: "
+                "expected dynamic or static"
+            )
+    elif element.tag in ("dynamicObstacle", "staticObstacle"):
+        role = element.tag.removesuffix("Obstacle")
+    else:
+        return None
+    kind = (element.findtext("type") or "").strip().lower()
+    return role == "static" or KINDS.get(kind) == Kind.STATIC
+
+
+def _read_tracks(
+    root: Element, fields: Fields, dt: float
+) -> tuple[list[Track], list[str]]:
+    tracks, standing, unrecorded = [], [], 0
     for element in root:
-        role = (element.findtext("role") or "").strip()
-        if element.tag == "dynamicObstacle" or role == "dynamic":
-            tracks.append(_read_moving(element, fields, dt))
-        elif element.tag == "staticObstacle" or role == "static":
+        stands = _is_standing(element, fields)
+        if stands:
             standing.append(element)
+        elif stands is False and element.find("trajectory") is not None:
+            tracks.append(_read_moving(element, fields, dt))
+        elif stands is False:
+            unrecorded += 1
+    first = min((float(track.t[0]) for track in tracks), default=0.0)
     last = max((float(track.t[-1]) for track in tracks), default=0.0)
-    tracks += [_read_standing(element, fields, dt, last) for element in standing]
-    seen: set[str] = set()
-    for track in tracks:
-        if track.id in seen:
-            raise InputError(f"{fields.path}: obstacle id: {track.id}: met twice")
-        seen.add(track.id)
-    return tracks
+    clock = np.arange(round(first / dt), round(last / dt) + 1) * dt
+    tracks += [_read_standing(element, fields, clock) for element in standing]
+    notes = []
+    if unrecorded:
+        notes.append(f"{unrecorded} obstacles without a trajectory left out")
+    return tracks, notes
 
 
 def _read_moving(element: Element, fields: Fields, dt: float) -> Track:
-    name = element.get("id", "(no id)")
-    where = f"obstacle {name}"
+    where = f"obstacle {element.get('id')}"
     states = [fields.child(element, "initialState", where)]
-    trajectory = element.find("trajectory")
-    if trajectory is not None:
-        states += trajectory.findall("state")
+    states += element.iterfind("trajectory/state")
     rows = np.array([_read_state(state, fields, where, dt) for state in states])
     backwards = np.flatnonzero(np.diff(rows[:, 0]) <= 0.0)
     if backwards.size:
@@ -159,71 +220,84 @@ def _read_moving(element: Element, fields: Fields, dt: float) -> Track:
         raise InputError(
             f"{fields.path}: {where}: time: {step:g}: expected increasing steps"
         )
-    length, width = _read_shape(element, fields, where)
     kind = (element.findtext("type") or "unknown").strip().lower()
-    return Track(
-        id=name,
-        kind=KINDS.get(kind, Kind.STATIC if kind == "parkedvehicle" else Kind.VEHICLE),
-        length=length,
-        width=width,
-        t=rows[:, 0],
-        x=rows[:, 1],
-        y=rows[:, 2],
-        heading=rows[:, 3],
-        speed=rows[:, 4],
-    )
+    return _track(element, fields, KINDS.get(kind, Kind.VEHICLE), rows.T.copy())
 
 
 def _read_state(state: Element, fields: Fields, where: str, dt: float) -> tuple:
     step = fields.scalar(state, "time", where)
     where = f"{where}: state {step:g}"
-    place = fields.child(state, "position", where)
-    point = place.find("point")
-    if point is None:
-        point = place.find("*/center")
-    if point is None:
-        raise InputError(f"{fields.path}: {where}: position: expected a point")
-    x, y = fields.point(point, where)
+    x, y = _position(state, fields, where)
     heading = fields.scalar(state, "orientation", where)
     return step * dt, x, y, heading, fields.scalar(state, "velocity", where)
 
 
-def _read_shape(element: Element, fields: Fields, where: str) -> tuple[float, float]:
+def _position(state: Element, fields: Fields, where: str) -> tuple[float, float]:
+    place = fields.child(state, "position", where)
+    return fields.point(fields.child(place, "point", f"{where}: position"), where)
+
+
+def _read_standing(element: Element, fields: Fields, clock: np.ndarray) -> Track:
+    where = f"obstacle {element.get('id')}"
+    state = fields.child(element, "initialState", where)
+    x, y = _position(state, fields, where)
+    heading = fields.scalar(state, "orientation", where)
+    still = [np.full(clock.shape, value) for value in (x, y, heading, 0.0)]
+    return _track(element, fields, Kind.STATIC, (clock, *still))
+
+
+def _track(element: Element, fields: Fields, kind: Kind, series: Iterable) -> Track:
+    """A track whose positions are those of the box centre."""
+    name = element.get("id")
+    if name is None:
+        raise InputError(f"{fields.path}: {element.tag}: id: missing: expected it")
+    box = _read_shape(element, fields, f"obstacle {name}")
+    t, x, y, heading, speed = series
+    return Track(
+        id=name,
+        kind=kind,
+        length=box.length,
+        width=box.width,
+        t=t,
+        x=x + box.x * np.cos(heading) - box.y * np.sin(heading),
+        y=y + box.x * np.sin(heading) + box.y * np.cos(heading),
+        heading=heading + box.turn,
+        speed=speed,
+    )
+
+
+def _read_shape(element: Element, fields: Fields, where: str) -> _Box:
+    where = f"{where}: shape"
     shape = fields.child(element, "shape", where)
     box, circle = shape.find("rectangle"), shape.find("circle")
     if box is not None:
-        length = fields.number(fields.child(box, "length", where), where)
-        return length, fields.number(fields.child(box, "width", where), where)
+        x, y = _centre(box, fields, where)
+        turn = box.find("orientation")
+        return _Box(
+            length=fields.number(fields.child(box, "length", where), where),
+            width=fields.number(fields.child(box, "width", where), where),
+            x=x,
+            y=y,
+            turn=0.0 if turn is None else fields.number(turn, where),
+        )
     if circle is not None:
-        radius = fields.number(fields.child(circle, "radius", where), where)
-        return 2.0 * radius, 2.0 * radius
+        size = 2.0 * fields.number(fields.child(circle, "radius", where), where)
+        x, y = _centre(circle, fields, where)
+        return _Box(length=size, width=size, x=x, y=y)
     points = [fields.point(point, where) for point in shape.iterfind("polygon/point")]
     if not points:
-        raise InputError(f"{fields.path}: {where}: shape: expected a rectangle")
-    spread = np.ptp(np.array(points), axis=0)
-    return float(spread[0]), float(spread[1])
+        found = ", ".join(child.tag for child in shape) or "nothing"
+        raise InputError(
+            f"{fields.path}: {where}: {found}: expected rectangle, circle or polygon"
+        )
+    low, high = np.min(points, axis=0), np.max(points, axis=0)
+    (length, width), (x, y) = high - low, 0.5 * (high + low)
+    return _Box(length=float(length), width=float(width), x=float(x), y=float(y))
 
 
-def _read_standing(element: Element, fields: Fields, dt: float, last: float) -> Track:
-    name = element.get("id", "(no id)")
-    where = f"obstacle {name}"
-    state = fields.child(element, "initialState", where)
-    point = fields.child(fields.child(state, "position", where), "point", where)
-    x, y = fields.point(point, where)
-    heading = fields.scalar(state, "orientation", where)
-    t = np.arange(int(round(last / dt)) + 1) * dt
-    length, width = _read_shape(element, fields, where)
-    return Track(
-        id=name,
-        kind=Kind.STATIC,
-        length=length,
-        width=width,
-        t=t,
-        x=np.full(t.shape, x),
-        y=np.full(t.shape, y),
-        heading=np.full(t.shape, heading),
-        speed=np.zeros(t.shape),
-    )
+def _centre(shape: Element, fields: Fields, where: str) -> tuple[float, float]:
+    centre = shape.find("center")
+    return (0.0, 0.0) if centre is None else fields.point(centre, where)
 
 
 def _read_signals(
@@ -232,28 +306,30 @@ def _read_signals(
     for light in root.iterfind("trafficLight"):
         name = light.get("id", "(no id)")
         where = f"trafficLight {name}"
-        cycle = light.find("cycle")
-        if cycle is None:
-            continue
         phases = []
-        for element in cycle.iterfind("cycleElement"):
-            colour = (element.findtext("color") or "").strip().lower()
+        for element in light.iterfind("cycle/cycleElement"):
+            colour = (element.findtext("color") or "none").strip()
             duration = fields.number(fields.child(element, "duration", where), where)
-            if colour not in COLOURS or duration <= 0:
+            if colour.lower() not in COLOURS or duration <= 0.0:
                 raise InputError(
-                    f"{fields.path}: {where}: cycleElement: {colour} {duration:g}: "
+                    f"{fields.path}: {where}: cycleElement: {colour} for {duration:g}: "
                     f"expected a colour of {sorted(COLOURS)} and a duration > 0"
                 )
-            phases.append((COLOURS[colour], duration * dt))
-        if not phases:
-            continue
+            phases.append((COLOURS[colour.lower()], duration * dt))
+        if not phases or (light.findtext("active") or "true").strip() == "false":
+            phases = [("off", max(last, 1.0))]
         offset = light.find("cycle/timeOffset")
         start = fields.number(offset, where) * dt if offset is not None else 0.0
         yield _unroll(name, phases, start, last)
 
 
-def _unroll(name: str, phases: list, offset: float, last: float) -> Signal:
-    """A repeating cycle as intervals from before 0 to after `last`."""
+def _unroll(
+    name: str, phases: list[tuple[str, float]], offset: float, last: float
+) -> Signal:
+    """A repeating cycle as intervals from before 0 to after `last`.
+
+    The phase at time t is that at (t - offset) modulo the period.
+    """
     period = sum(duration for _, duration in phases)
     t = offset - period * (np.floor(offset / period) + 1.0)
     starts, states = [], []
@@ -267,27 +343,58 @@ def _unroll(name: str, phases: list, offset: float, last: float) -> Signal:
     )
 
 
-def _read_ghosts(root: Element, fields: Fields, dt: float) -> Iterator[Ghost]:
+def _read_ghosts(
+    root: Element, fields: Fields, dt: float, lanes: dict[str, np.ndarray]
+) -> Iterator[Ghost]:
     for problem in root.iterfind("planningProblem"):
         where = f"planningProblem {problem.get('id', '(no id)')}"
         initial = fields.child(problem, "initialState", where)
-        place = fields.child(initial, "position", where)
-        start = fields.point(fields.child(place, "point", where), where)
+        start = _position(initial, fields, where)
         t0 = fields.scalar(initial, "time", where) * dt
-        goal = problem.find("goalState")
-        centre = None if goal is None else goal.find("position/*/center")
-        end = _extrapolate(initial, fields, where, start)
-        t1 = t0 + 1.0
-        if goal is not None and centre is not None:
-            end = fields.point(centre, where)
-            t1 = max(fields.scalar(goal, "time", where) * dt, t0 + dt)
-        yield Ghost(t0=t0, t1=t1, start=start, end=end)
+        goals = problem.findall("goalState")
+        if not goals:
+            raise InputError(f"{fields.path}: {where}: goalState: missing: expected it")
+        placed = [goal for goal in goals if goal.find("position") is not None]
+        goal = (placed or goals)[0]
+        t1 = max(fields.scalar(goal, "time", where) * dt, t0 + dt)
+        speed = fields.scalar(initial, "velocity", where)
+        heading = fields.scalar(initial, "orientation", where)
+        ahead = speed * (t1 - t0) * np.array([np.cos(heading), np.sin(heading)])
+        end = _goal_point(goal, fields, where, np.array(start) + ahead, lanes)
+        yield Ghost(t0=t0, t1=t1, start=start, end=(float(end[0]), float(end[1])))
 
 
-def _extrapolate(
-    initial: Element, fields: Fields, where: str, start: tuple[float, float]
-) -> tuple[float, float]:
-    """Where the missing car is one second later, by its initial velocity."""
-    read: Callable[[str], Any] = lambda tag: fields.scalar(initial, tag, where)  # noqa: E731
-    speed, heading = read("velocity"), read("orientation")
-    return start[0] + speed * np.cos(heading), start[1] + speed * np.sin(heading)
+def _goal_point(
+    goal: Element,
+    fields: Fields,
+    where: str,
+    coasted: np.ndarray,
+    lanes: dict[str, np.ndarray],
+) -> np.ndarray:
+    """[2] m, where the missing car is at the goal's time.
+
+    A goal shape's centre; inside goal lanelets the centre-line point nearest to
+    where the car gets at its initial speed (the lanelet's end would mean up to
+    75 m/s in the NGSIM files); without a position, the coasted point itself.
+    """
+    centre = goal.find("position/*/center")
+    if centre is not None:
+        return np.array(fields.point(centre, where))
+    corners = [
+        fields.point(point, where) for point in goal.iterfind("position/polygon/point")
+    ]
+    if corners:
+        return np.mean(corners, axis=0)
+    names = [ref.get("ref", "") for ref in goal.iterfind("position/lanelet")]
+    points = [_densify(lanes[name]) for name in names if name in lanes]
+    if not points:
+        return coasted
+    near = np.concatenate(points)
+    return near[np.argmin(np.hypot(*(near - coasted).T))]
+
+
+def _densify(line: np.ndarray) -> np.ndarray:
+    """[n, 2] m, about one point a metre along a polyline."""
+    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    at = np.linspace(0.0, arc[-1], int(arc[-1]) + 2)
+    return np.stack([np.interp(at, arc, line[:, i]) for i in (0, 1)], axis=1)

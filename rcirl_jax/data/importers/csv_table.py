@@ -1,0 +1,372 @@
+"""Generic CSV with a TOML mapping: a user's own logs need no code.
+
+data_specs/sources/csv_example.toml explains every option of the mapping. Large
+coordinates and clocks lose their origin here, in float64: the package computes
+in float32 later.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from rcirl_jax.data.importers.files import input_files
+from rcirl_jax.data.importers.tables import (
+    StraightLane,
+    number,
+    read_table,
+    split_tracks,
+    straight_lanes,
+    travel_heading,
+    unit_factor,
+)
+from rcirl_jax.data.recording import validate_recording
+from rcirl_jax.errors import InputError
+from rcirl_jax.types import Kind, Lane, Recording, Track
+
+NEEDED = ("t", "id", "x", "y")
+OPTIONAL = ("heading", "speed", "length", "width", "kind", "lane", "recording")
+TEXT = ("id", "kind", "lane", "recording")
+LENGTH_UNITS = ("m", "ft")
+ALLOWED_UNITS = {
+    "t": ("s", "ms", "frame"),
+    "x": LENGTH_UNITS,
+    "y": LENGTH_UNITS,
+    "length": LENGTH_UNITS,
+    "width": LENGTH_UNITS,
+    "speed": ("m/s", "km/h", "mph", "ft/s"),
+    "heading": ("rad", "deg"),
+}
+KINDS = ("vehicle", "cyclist", "pedestrian", "static")
+# box centre ahead of the recorded position, in box lengths
+REFERENCE = {"centre": 0.0, "front": -0.5, "rear": 0.5}
+SIZE_M = {"length": 4.5, "width": 1.8}  # m, a car
+RATE_HZ = 10.0  # 1/s
+LIMIT_MPS = 29.06  # m/s, 65 mph
+LANE_WIDTH_M = 3.5  # m
+MAX_GAP_STEPS = 5.5  # missing rows bridged inside one track
+MARGIN_M = 50.0  # m of fitted lane beyond the first and last position
+FAR_M = 1e4  # m; coordinates beyond it (UTM) are moved to a local origin
+ORIGIN_STEP_M = 1000.0  # m, local origins are multiples of it
+PATH_STEP_M = 5.0  # m between points of a lane fitted to a path
+MAX_PATHS = 200  # longest tracks tried as lanes
+LANE_COLUMNS = ("id", "x", "y")
+LANE_OPTIONAL = ("width", "speed_limit", "left", "right", "successor")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Table:
+    """One recording's rows in SI units, in local coordinates."""
+
+    path: Path
+    values: dict[str, np.ndarray]
+    rate_hz: float
+    origin: np.ndarray  # [2] m, subtracted from x, y
+    notes: tuple[str, ...]
+
+
+def recordings(path: Path, spec: dict) -> Iterator[Recording]:
+    """One Recording per file, or per value of the `recording` column."""
+    lane_file = _lane_file(spec)
+    pattern = spec.get("pattern", "*.csv")
+    files = [f for f in input_files(path, pattern) if f.name != lane_file]
+    if not files:
+        raise InputError(f"{path}: files: only {lane_file}: expected logs beside it")
+    for file in files:
+        for name, table in _read_tables(file, spec):
+            yield validate_recording(_recording(name, table, spec), file)
+
+
+def _lane_file(spec: dict) -> str:
+    lanes = spec.get("lanes", [])
+    return str(lanes.get("file", "")) if isinstance(lanes, dict) else ""
+
+
+def _columns(path: Path, spec: dict) -> dict[str, tuple[str, float]]:
+    """Field -> column name and sign ("-name" turns an axis round)."""
+    columns = spec.get("columns", {})
+    unknown = sorted(set(columns) - set(NEEDED) - set(OPTIONAL))
+    if unknown:
+        raise InputError(
+            f"{path}: columns.{unknown[0]}: unknown: "
+            f"expected {', '.join((*NEEDED, *OPTIONAL))}"
+        )
+    for field in NEEDED:
+        if field not in columns:
+            raise InputError(f"{path}: columns.{field}: missing: expected a column")
+    found = {}
+    for field, column in columns.items():
+        if not isinstance(column, str) or not column:
+            raise InputError(f"{path}: columns.{field}: {column}: expected a name")
+        turned = column.startswith("-") and field not in TEXT
+        found[field] = (column[1:], -1.0) if turned else (column, 1.0)
+    return found
+
+
+def _rate(spec: dict) -> float:
+    rate = number({**spec, **spec.get("defaults", {})}, "rate_hz", RATE_HZ)
+    if rate <= 0.0:
+        raise InputError(f"source TOML: rate_hz: {rate:g}: expected > 0")
+    return rate
+
+
+def _read_tables(path: Path, spec: dict) -> Iterator[tuple[str, _Table]]:
+    """(name, table) of every recording in a file."""
+    columns = _columns(path, spec)
+    raw = read_table(
+        path,
+        [columns[field][0] for field in NEEDED],
+        [columns[field][0] for field in OPTIONAL if field in columns],
+        [columns[field][0] for field in TEXT if field in columns],
+    )
+    rate = _rate(spec)
+    units = _factors(path, spec, rate)
+    values, notes = {}, []
+    for field, (column, sign) in columns.items():
+        if column not in raw:
+            notes.append(f"no column '{column}': {field} computed or by default")
+        elif field in TEXT:
+            values[field] = raw[column]
+        else:
+            values[field] = sign * units.get(field, 1.0) * raw[column]
+    names = values.pop("recording", None)
+    parts = np.unique(names) if names is not None else [None]
+    for part in parts:
+        rows = slice(None) if names is None else names == part
+        found = {field: column[rows] for field, column in values.items()}
+        name = path.stem if part is None else f"{path.stem}-{part}"
+        yield name, _localise(path, found, rate, notes)
+
+
+def _factors(path: Path, spec: dict, rate: float) -> dict[str, float]:
+    factors = {}
+    for field, unit in spec.get("units", {}).items():
+        if field not in ALLOWED_UNITS:
+            raise InputError(
+                f"{path}: units.{field}: unknown: expected {', '.join(ALLOWED_UNITS)}"
+            )
+        if field == "t" and unit == "frame":
+            factors[field] = 1.0 / rate
+        else:
+            factors[field] = unit_factor(path, field, unit, ALLOWED_UNITS[field])
+    return factors
+
+
+def _localise(path: Path, values: dict, rate: float, notes: list[str]) -> _Table:
+    """Start the clock at 0 and move far coordinates near the origin."""
+    notes = list(notes)
+    values["t"] = values["t"] - values["t"].min()
+    middle = np.array([np.median(values["x"]), np.median(values["y"])])
+    origin = np.zeros(2)
+    if np.any(np.abs(middle) > FAR_M):
+        origin = np.round(middle / ORIGIN_STEP_M) * ORIGIN_STEP_M
+        notes.append(f"local origin at x = {origin[0]:.0f} m, y = {origin[1]:.0f} m")
+    values["x"], values["y"] = values["x"] - origin[0], values["y"] - origin[1]
+    return _Table(
+        path=path, values=values, rate_hz=rate, origin=origin, notes=tuple(notes)
+    )
+
+
+def _recording(name: str, table: _Table, spec: dict) -> Recording:
+    pieces = split_tracks(
+        table.path,
+        table.values["id"],
+        table.values["t"],
+        MAX_GAP_STEPS / table.rate_hz,
+    )
+    tracks = tuple(_track(label, table, rows, spec) for label, rows in pieces)
+    lanes, notes = _lanes(table, spec, tracks)
+    return Recording(
+        name=name,
+        source=str(spec.get("source", "CSV log")),
+        licence=str(spec.get("licence", "unknown")),
+        rate_hz=table.rate_hz,
+        tracks=tracks,
+        lanes=lanes,
+        default_speed_limit=number(spec, "speed_limit", LIMIT_MPS),
+        notes=(*table.notes, *notes),
+    )
+
+
+def _track(name: str, table: _Table, rows: np.ndarray, spec: dict) -> Track:
+    defaults = spec.get("defaults", {})
+    values = {field: column[rows] for field, column in table.values.items()}
+    t, x, y = values["t"], values["x"], values["y"]
+    heading = values.get("heading")
+    if heading is None:
+        heading = travel_heading(t, x, y)
+    speed = values.get("speed")
+    if speed is None:
+        speed = (
+            np.hypot(np.gradient(x, t), np.gradient(y, t))
+            if t.size > 1
+            else np.zeros(t.shape)
+        )
+    size = {
+        field: float(np.median(values[field]))
+        if field in values
+        else number(defaults, field, SIZE_M[field])
+        for field in SIZE_M
+    }
+    reference = spec.get("reference_point", "centre")
+    if reference not in REFERENCE:
+        raise InputError(
+            f"source TOML: reference_point: {reference}: "
+            f"expected one of {', '.join(REFERENCE)}"
+        )
+    ahead = REFERENCE[reference] * size["length"]
+    found = str(values["kind"][0] if "kind" in values else defaults.get("kind", ""))
+    return Track(
+        id=name,
+        kind=_kind(table.path, name, found, spec),
+        length=size["length"],
+        width=size["width"],
+        t=t,
+        x=x + ahead * np.cos(heading),
+        y=y + ahead * np.sin(heading),
+        heading=heading,
+        speed=speed,
+    )
+
+
+def _kind(path: Path, name: str, found: str, spec: dict) -> Kind:
+    kind = str(spec.get("kinds", {}).get(found, found or "vehicle")).lower()
+    if kind not in KINDS:
+        raise InputError(
+            f"{path}: id {name}: kind: {found}: expected one of {', '.join(KINDS)}, "
+            "or an entry in [kinds]"
+        )
+    return Kind[kind.upper()]
+
+
+def _lanes(
+    table: _Table, spec: dict, tracks: tuple[Track, ...]
+) -> tuple[tuple[Lane, ...], list[str]]:
+    """The lanes given; else straight ones from the lane column; else paths."""
+    given = spec.get("lanes", [])
+    if isinstance(given, dict):
+        given = _lanes_from_file(table.path, _lane_file(spec))
+    limit = number(spec, "speed_limit", LIMIT_MPS)
+    width = number(spec, "lane_width_m", LANE_WIDTH_M)
+    if given:
+        return tuple(_given_lane(table, lane, width) for lane in given), []
+    if "lane" in table.values:
+        found = _straight(table, tracks, width)
+        if found is not None:
+            lanes = straight_lanes(found, width, limit)
+            return lanes, ["straight lanes fitted to the lane column"]
+    lanes = _paths(tracks, width, limit)
+    return lanes, [f"no lanes given; {len(lanes)} fitted to the longest paths"]
+
+
+def _lanes_from_file(path: Path, name: str) -> list[dict]:
+    """Polylines from a CSV beside the log: id, x, y and perhaps width, ..."""
+    places = [folder / name for folder in (path.parent, path.parent.parent)]
+    table_path = next((place for place in places if place.is_file()), None)
+    if not name or table_path is None:
+        raise InputError(
+            f"{path}: lanes.file: {name}: expected this CSV beside the log"
+        )
+    text = ("id", "left", "right", "successor")
+    table = read_table(table_path, LANE_COLUMNS, LANE_OPTIONAL, text)
+    lanes = []
+    for lane in dict.fromkeys(table["id"].tolist()):
+        rows = np.flatnonzero(table["id"] == lane)
+        found = {key: table[key][rows] for key in table if key not in LANE_COLUMNS}
+        lanes.append(
+            {
+                "id": lane,
+                "points": np.stack([table["x"][rows], table["y"][rows]], axis=1),
+                "successors": sorted(set(found.pop("successor", [])) - {""}),
+                **{k: v[0] for k, v in found.items() if k != "width" and v[0] != ""},
+                **({"width": found["width"]} if "width" in found else {}),
+            }
+        )
+    return lanes
+
+
+def _given_lane(table: _Table, lane: dict, default_width: float) -> Lane:
+    name = str(lane.get("id", "(no id)"))
+    where = f"{table.path}: lanes {name}"
+    try:
+        points = np.array(lane.get("points", []), np.float64)
+        half = 0.5 * np.array(lane.get("width", default_width), np.float64)
+        limit = lane.get("speed_limit")
+        speed_limit = None if limit is None else float(limit)
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{where}: {error}: expected numbers") from error
+    if points.ndim != 2 or points.shape[1] != 2 or len(points) < 2:
+        raise InputError(
+            f"{where}: points: {points.shape}: expected at least two [x, y]"
+        )
+    if half.shape not in ((), (len(points),)):
+        raise InputError(f"{where}: width: {half.shape}: expected one, or one a point")
+    left, right = lane.get("left"), lane.get("right")
+    return Lane(
+        id=name,
+        centre=points - table.origin,
+        left_width=np.broadcast_to(half, (len(points),)).copy(),
+        right_width=np.broadcast_to(half, (len(points),)).copy(),
+        speed_limit=speed_limit,
+        successors=tuple(str(s) for s in lane.get("successors", [])),
+        left=None if left is None else str(left),
+        right=None if right is None else str(right),
+    )
+
+
+def _straight(
+    table: _Table, tracks: tuple[Track, ...], width: float
+) -> list[StraightLane] | None:
+    """Lanes parallel to the x axis, or None where the rows of one are not."""
+    x, y, names = (table.values[field] for field in ("x", "y", "lane"))
+    towards = {}
+    for track in tracks:
+        towards[track.id.split("#")[0]] = float(track.x[-1] - track.x[0])
+    travel = np.array([towards.get(str(i), 0.0) for i in table.values["id"]])
+    found = []
+    for name in np.unique(names):
+        rows = names == name
+        centre = float(np.median(y[rows]))
+        if np.median(np.abs(y[rows] - centre)) > 0.5 * width:
+            return None
+        found.append(
+            StraightLane(
+                id=str(name),
+                y=centre,
+                lower=float(x[rows].min()) - MARGIN_M,
+                upper=float(x[rows].max()) + MARGIN_M,
+                forward=bool(np.median(travel[rows]) >= 0.0),
+            )
+        )
+    return found
+
+
+def _paths(tracks: tuple[Track, ...], width: float, limit: float) -> tuple[Lane, ...]:
+    """The paths of the longest tracks as lanes, none within a lane's width."""
+    longest = sorted(tracks, key=lambda t: -np.hypot(np.ptp(t.x), np.ptp(t.y)))
+    lanes: list[Lane] = []
+    for track in longest[:MAX_PATHS]:
+        points = np.stack([track.x, track.y], axis=1)
+        arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+        keep = points[np.unique(arc // PATH_STEP_M, return_index=True)[1]]
+        if len(keep) < 3 or any(_near(keep, lane.centre, width) for lane in lanes):
+            continue
+        half = np.full(len(keep), 0.5 * width)
+        lanes.append(
+            Lane(
+                id=f"path-{len(lanes)}",
+                centre=keep,
+                left_width=half,
+                right_width=half,
+                speed_limit=limit,
+            )
+        )
+    return tuple(lanes)
+
+
+def _near(points: np.ndarray, line: np.ndarray, width: float) -> bool:
+    """Whether most of a path runs within a lane width of a line, the same way."""
+    apart = np.hypot(*(points[:, None] - line[None]).transpose(2, 0, 1))
+    along = (points[-1] - points[0]) @ (line[-1] - line[0])
+    return bool(along > 0.0 and np.median(apart.min(axis=1)) < width)

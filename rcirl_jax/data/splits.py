@@ -1,0 +1,130 @@
+"""Splits by vehicle-disjoint group, never by row.
+
+Rows of one drive resemble each other: with rows of one vehicle on both sides a
+held-out score measures memory. A group holds every row of its vehicles, so
+splitting groups splits vehicles. The result depends on names, counts and seed
+only: ties and the "random" order come from sha256, which is the same on every
+machine, Python and numpy.
+"""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from rcirl_jax.errors import InputError
+
+TRAIN = "train"
+TEST = "test"
+
+
+def _by_size(counts: Mapping[str, int], seed: int) -> list[str]:
+    """Names in seeded random order, then stable-sorted by size, largest first."""
+    for name, count in counts.items():
+        if count < 1:
+            raise ValueError(f"group {name}: {count} rows: expected at least 1")
+    shuffled = sorted(
+        counts, key=lambda name: hashlib.sha256(f"{seed}/{name}".encode()).digest()
+    )
+    return sorted(shuffled, key=lambda name: -counts[name])
+
+
+def assign_groups(
+    counts: Mapping[str, int], *, test_fraction: float, seed: int
+) -> dict[str, list[str]]:
+    """Assign whole groups to the training and the test split.
+
+    Largest group first, each to the split that still lacks most rows:
+    deficit = share * total - rows it has; the training split wins ties. Where
+    a split stays empty, it takes the smallest group.
+
+    Args:
+      counts: rows per group, each at least 1.
+      test_fraction: share of rows wanted in the test split, 0 <= f < 1.
+      seed: of the random order among groups of one size.
+
+    Returns:
+      {"train": names, "test": names}, sorted; every group in exactly one. With
+      `test_fraction` 0 the test split is empty.
+
+    Raises:
+      InputError: no group, one group to be split in two, or a bad fraction.
+    """
+    if not 0.0 <= test_fraction < 1.0:
+        raise InputError(f"test_fraction: {test_fraction}: expected 0 <= f < 1")
+    if not counts:
+        raise InputError("splits: groups: 0: expected at least one group of scenes")
+    if test_fraction == 0.0:
+        return {TRAIN: sorted(counts), TEST: []}
+    if len(counts) < 2:
+        raise InputError(
+            f"splits: groups: 1 ({next(iter(counts))}): expected at least two "
+            f"vehicle-disjoint groups for test_fraction {test_fraction}"
+        )
+    order = _by_size(counts, seed)
+    total = sum(counts.values())
+    deficit = {TRAIN: (1.0 - test_fraction) * total, TEST: test_fraction * total}
+    chosen: dict[str, list[str]] = {TRAIN: [], TEST: []}
+    for name in order:
+        split = TRAIN if deficit[TRAIN] >= deficit[TEST] else TEST
+        chosen[split].append(name)
+        deficit[split] -= counts[name]
+    for empty, other in ((TRAIN, TEST), (TEST, TRAIN)):
+        if not chosen[empty]:
+            chosen[empty].append(chosen[other].pop())  # the smallest comes last
+    return {split: sorted(names) for split, names in chosen.items()}
+
+
+def check_disjoint(
+    groups: np.ndarray, vehicles: np.ndarray, split: Mapping[str, Sequence[int]]
+) -> None:
+    """Check that no vehicle has rows in two splits.
+
+    Args:
+      groups: [n] group number per row.
+      vehicles: [n] vehicle number per row.
+      split: group numbers of each split, e.g. {"train": [0, 2], "test": [1]}.
+
+    Raises:
+      InputError: names the first vehicle number found in two splits.
+    """
+    owner: dict[int, str] = {}
+    for name, members in split.items():
+        rows = np.isin(groups, np.asarray(members, np.int64))
+        for vehicle in np.unique(vehicles[rows]).tolist():
+            if vehicle in owner:
+                raise InputError(
+                    f"splits: vehicle {vehicle}: in {owner[vehicle]} and {name}: "
+                    "expected every vehicle in one split only"
+                )
+            owner[vehicle] = name
+
+
+def folds(counts: Mapping[str, int], num_folds: int, seed: int) -> list[list[str]]:
+    """Cut groups into folds of nearly equal numbers of rows.
+
+    Largest group first, each to the fold with the fewest rows (first of equals).
+
+    Args:
+      counts: rows per group, each at least 1.
+      num_folds: number of folds, 2 .. number of groups.
+      seed: of the random order among groups of one size.
+
+    Returns:
+      Sorted group names per fold; no fold is empty, every group in exactly one.
+
+    Raises:
+      InputError: more folds than groups, or fewer than two folds.
+    """
+    if not 2 <= num_folds <= len(counts):
+        raise InputError(
+            f"folds: num_folds: {num_folds}: expected 2 to {len(counts)} "
+            "(the number of vehicle-disjoint groups)"
+        )
+    rows = [0] * num_folds
+    members: list[list[str]] = [[] for _ in range(num_folds)]
+    for name in _by_size(counts, seed):
+        smallest = rows.index(min(rows))
+        members[smallest].append(name)
+        rows[smallest] += counts[name]
+    return [sorted(names) for names in members]

@@ -1,0 +1,365 @@
+"""Ranking metrics of one scorer on held-out scenes, one number per scene.
+
+A scorer gives every candidate and the human a value (higher is better). All
+scorers are judged on the same candidates, held in `Outcomes`. The rules follow
+`peers.md` sections 1.6 and 4, where the defects of older protocols are listed:
+
+- No scene is dropped. Where no candidate is feasible the planner has failed:
+  the scene is charged with candidate 0 and the worst value of every share.
+- A chosen candidate that crashes while the human does not is a failure. It
+  may end close to the human, so its FDE is reported plain and charged.
+- Infeasible candidates are never chosen and never compared.
+- Ties are broken by the lowest index wherever one candidate must be chosen,
+  and count half wherever candidates are counted.
+
+Host numpy, float64. Axes: `S` scenes, `K` candidates.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+
+from rcirl_jax.errors import InputError
+
+FAILURE_M = 10.0  # m, least FDE charged for a failure; above every miss limit
+TOP_COUNT = 3  # candidates among which top-3 looks (Driving-IRL-NGSIM)
+HORIZON_S = 5.0  # s, horizon of the US-101 benchmark (Driving-IRL-NGSIM)
+
+# Limit on the final displacement: 6 m at 5 s and 8 m at 8 s, on a line through
+# both. Named after nuPlan's miss rate but tighter: nuPlan allows 8 m and 16 m.
+MISS_TIMES_S = (5.0, 8.0)  # s
+MISS_LIMITS_M = (6.0, 8.0)  # m
+
+# Bounds of a fitted temperature, in units of the values' spread within scenes.
+TEMPERATURE_RANGE = (1e-4, 1e4)  # 1
+NEWTON_STEPS = 60  # safeguarded: bisection alone reaches 1e-16 of the bracket
+NEWTON_TOLERANCE = 1e-13  # step in log temperature at which the fit is done
+
+
+@dataclasses.dataclass(frozen=True)
+class Metric:
+    """How a metric of `scene_metrics` is named, printed and judged."""
+
+    title: str
+    unit: str  # "%", "m", "nat" or "1"; values of "%" are stored as shares
+    higher_is_better: bool
+    compared: bool = False  # appears among the paired differences
+    weight: str | None = None  # metric that weighs the scenes, for ratios
+
+
+METRICS: dict[str, Metric] = {
+    "percentile_rank": Metric("human rank", "%", True, compared=True),
+    "pairwise_accuracy": Metric("pairwise acc.", "%", True, weight="num_pairs"),
+    "human_top1": Metric("human first", "%", True),
+    "top1_fde_failure": Metric("top-1 FDE+fail", "m", False, compared=True),
+    "top1_fde": Metric("top-1 FDE", "m", False, compared=True),
+    "top1_ade": Metric("top-1 ADE", "m", False),
+    "top3_fde_failure": Metric("top-3 FDE+fail", "m", False),
+    "top3_fde": Metric("top-3 FDE", "m", False, compared=True),
+    "mrr": Metric("MRR nearest", "1", True, compared=True),
+    "nll": Metric("NLL nearest", "nat", False),
+    "crash_rate": Metric("crash", "%", False, compared=True),
+    "failure_rate": Metric("failure", "%", False),
+    "miss": Metric("miss", "%", False),
+}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Outcomes:
+    """What happens with each candidate; shared by all scorers.
+
+    Distances are between the candidate and the recorded human.
+    """
+
+    fde: np.ndarray  # [S, K] m, at the horizon
+    ade: np.ndarray  # [S, K] m, mean over the times up to the horizon
+    crash: np.ndarray  # [S, K] bool, meets something up to the horizon
+    feasible: np.ndarray  # [S, K] bool, inside the vehicle's limits
+    cluster: np.ndarray  # [S] int, vehicle the scene was recorded from
+    human_crash: np.ndarray  # [S] bool, the recorded human meets something
+    horizon_s: float = HORIZON_S  # s, horizon of the distances
+    failure_m: float = FAILURE_M  # m, least FDE charged for a failure
+
+    def __post_init__(self) -> None:
+        """Refuse shapes that disagree and distances that are not finite."""
+        shape = np.shape(self.fde)
+        if len(shape) != 2 or min(shape) < 1:
+            raise InputError(
+                f"Outcomes: fde: shape {shape}: expected [S, K], not empty"
+            )
+        for name in ("ade", "crash", "feasible"):
+            _expect_shape("Outcomes", name, getattr(self, name), shape)
+        for name in ("cluster", "human_crash"):
+            _expect_shape("Outcomes", name, getattr(self, name), shape[:1])
+        for name in ("fde", "ade"):
+            if not np.all(np.isfinite(getattr(self, name))):
+                raise InputError(f"Outcomes: {name}: NaN or infinity: expected metres")
+        for name in ("horizon_s", "failure_m"):
+            if not getattr(self, name) > 0.0:
+                raise InputError(
+                    f"Outcomes: {name}: {getattr(self, name)}: expected more than 0"
+                )
+
+
+def miss_threshold(horizon_s: float) -> float:
+    """Largest FDE that is not a miss, m: a line through `MISS_LIMITS_M`."""
+    (t0, t1), (d0, d1) = MISS_TIMES_S, MISS_LIMITS_M
+    return d0 + (d1 - d0) * (horizon_s - t0) / (t1 - t0)
+
+
+def scene_metrics(
+    values: np.ndarray,
+    human_value: np.ndarray,
+    outcomes: Outcomes,
+    temperature: float = 1.0,
+) -> dict[str, np.ndarray]:
+    """All ranking metrics of one scorer, per scene.
+
+    `percentile_rank` and `pairwise_accuracy` are the same share in a single
+    scene: of the feasible candidates, those valued below the human, ties half.
+    They differ in how scenes are pooled. The percentile rank weighs scenes
+    alike; the pairwise accuracy weighs comparisons alike, that is, each scene
+    by `num_pairs`. They agree where every scene has as many feasible
+    candidates. Neither says how well candidates are chosen (`peers.md` 1.7).
+
+    Args:
+      values: [S, K] value of each candidate; read where feasible only.
+      human_value: [S] value of the human trajectory.
+      outcomes: what happens with each candidate.
+      temperature: in units of the values; see `fit_temperature`.
+
+    Returns:
+      Metric -> [S] float64. In a scene without feasible candidates: see below.
+        percentile_rank, pairwise_accuracy: share in [0, 1]; there 0.
+        num_pairs: feasible candidates, the weight of pairwise_accuracy; there
+          1, so that the failed scene is still counted.
+        human_top1: 1 where the human is strictly above all; there 0.
+        top1_fde, top1_ade: m, of the best-valued; there candidate 0.
+        top3_fde: m, least FDE of the three best-valued; there candidate 0.
+        top1_fde_failure, top3_fde_failure: m, the same, but a failure is
+          charged max(FDE, outcomes.failure_m).
+        mrr: 1 / rank of the feasible candidate nearest to the human by ADE,
+          ties by average rank; there 0.
+        nll: nats, -log softmax(values / temperature) of that nearest one over
+          the feasible; there log K.
+        crash_rate: 1 where the chosen crashes and the human does not.
+        failure_rate: 1 where it does, or where nothing is feasible.
+        miss: 1 where top1_fde is above `miss_threshold`; there 1.
+    """
+    values, human_value = _checked(values, human_value, outcomes)
+    if not (np.isfinite(temperature) and temperature > 0.0):
+        raise InputError(
+            f"scene_metrics: temperature: {temperature}: expected a number above 0"
+        )
+    some = np.asarray(np.any(outcomes.feasible, axis=1))
+    order = np.argsort(-values, axis=1, kind="stable")  # infeasible ones last
+    top = order[:, :TOP_COUNT]
+    chosen = np.where(some, order[:, 0], 0)
+    crash = (
+        np.asarray(outcomes.crash, bool) & ~np.asarray(outcomes.human_crash)[:, None]
+    )
+    fde = np.asarray(outcomes.fde, np.float64)
+    failed = crash | ~some[:, None]
+    charged = np.where(failed, np.maximum(fde, outcomes.failure_m), fde)
+    top1_fde, chosen_crash = _pick(fde, chosen), _pick(crash, chosen)
+    miss = (top1_fde > miss_threshold(outcomes.horizon_s)) | ~some
+    nearest = _nearest(outcomes)
+    return {
+        **_human_metrics(values, human_value, outcomes.feasible),
+        "top1_fde": top1_fde,
+        "top1_fde_failure": _pick(charged, chosen),
+        "top1_ade": _pick(np.asarray(outcomes.ade, np.float64), chosen),
+        "top3_fde": _best_of(fde, top, outcomes.feasible),
+        "top3_fde_failure": _best_of(charged, top, outcomes.feasible),
+        "mrr": np.where(some, 1.0 / _average_rank(values, nearest), 0.0),
+        "nll": _nll(values, nearest, some, 1.0 / temperature),
+        "crash_rate": chosen_crash.astype(np.float64),
+        "failure_rate": (chosen_crash | ~some).astype(np.float64),
+        "miss": miss.astype(np.float64),
+    }
+
+
+def random_scorer(seed: int, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Values of a scorer that knows nothing: uniform in [0, 1), Philox.
+
+    Args:
+      seed: non-negative; the same seed gives the same values everywhere.
+      shape: (S, K).
+
+    Returns:
+      values [S, K] and human_value [S].
+    """
+    generator = np.random.Generator(np.random.Philox(seed))
+    drawn = generator.random((shape[0], shape[1] + 1))
+    return drawn[:, 1:], drawn[:, 0]
+
+
+def oracle_fde(outcomes: Outcomes) -> np.ndarray:
+    """[S] m, FDE of the best feasible candidate; of candidate 0 if none is."""
+    fde = np.asarray(outcomes.fde, np.float64)
+    order = np.broadcast_to(np.arange(fde.shape[1]), fde.shape)
+    return _best_of(fde, order, outcomes.feasible)
+
+
+def oracle_scorer(outcomes: Outcomes) -> tuple[np.ndarray, np.ndarray]:
+    """Values [S, K] and [S] of a scorer that sees the FDE: the floor of top1_fde.
+
+    V = -FDE, and 0 for the human. No scorer of the same candidates has a lower
+    `top1_fde`; what is left is what the sampler cannot express.
+    """
+    values = -np.asarray(outcomes.fde, np.float64)
+    return values, np.zeros(values.shape[0])
+
+
+def fit_temperature(values: np.ndarray, outcomes: Outcomes) -> float:
+    """Temperature with the least mean NLL of the nearest candidate.
+
+    With b = 1 / temperature, NLL(b) = mean[log sum_k exp(b v_k) - b v_nearest]
+    is convex in b, and NLL'(b) = mean[E_b(v) - v_nearest] grows with slope
+    mean[Var_b(v)]. The root is found by Newton steps in log b, inside a bracket
+    that shrinks by bisection where a step would leave it. Values are divided by
+    their spread first, so that fit(c v) = c fit(v). Use TRAINING scenes only.
+
+    Args:
+      values: [S, K] values of the training scenes' candidates.
+      outcomes: of the same scenes; those without feasible candidates are left
+        out, since no temperature can change them.
+
+    Returns:
+      Temperature in units of the values. The upper end of `TEMPERATURE_RANGE`
+      (times the spread) where the values do not help, the lower end where the
+      nearest candidate always wins; 1 where all values in each scene are equal.
+    """
+    values, _ = _checked(values, np.zeros(np.shape(values)[:1]), outcomes)
+    feasible = np.asarray(outcomes.feasible, bool)
+    some = feasible.any(axis=1)
+    if not some.any():
+        raise InputError(
+            "fit_temperature: feasible: no scene has a candidate: expected at least one"
+        )
+    values, feasible = values[some], feasible[some]
+    count = feasible.sum(axis=1, keepdims=True)
+    centre = np.where(feasible, values, 0.0).sum(axis=1, keepdims=True) / count
+    centred = np.where(feasible, values - centre, 0.0)
+    largest = np.abs(centred).max()
+    if largest <= 1e-14 * np.abs(centre).max() or largest == 0.0:
+        return 1.0
+    spread = largest * np.sqrt(np.sum((centred / largest) ** 2) / feasible.sum())
+    scaled = centred / spread
+    target = _pick(scaled, _nearest(outcomes)[some])
+
+    def slope(log_b: float) -> tuple[float, float]:
+        """NLL'(b) and the Newton step of its root in log b."""
+        b = np.exp(log_b)
+        logits = np.where(feasible, b * scaled, -np.inf)
+        weight = np.exp(logits - logits.max(axis=1, keepdims=True))
+        weight /= weight.sum(axis=1, keepdims=True)
+        mean = np.sum(weight * scaled, axis=1)
+        variance = np.sum(weight * (scaled - mean[:, None]) ** 2)
+        first = float(np.sum(mean - target))
+        return first, -first / max(float(b * variance), 1e-300)
+
+    low, high = (-np.log(x) for x in reversed(TEMPERATURE_RANGE))
+    return float(spread * np.exp(-_root(slope, float(low), float(high))))
+
+
+def _root(
+    slope: Callable[[float], tuple[float, float]], low: float, high: float
+) -> float:
+    """Root of an increasing function in [low, high], or the end next to it."""
+    if slope(low)[0] >= 0.0:
+        return low
+    if slope(high)[0] <= 0.0:
+        return high
+    at = 0.5 * (low + high)
+    for _ in range(NEWTON_STEPS):
+        first, step = slope(at)
+        low, high = (at, high) if first < 0.0 else (low, at)
+        proposed = at + step
+        if not low < proposed < high:
+            proposed = 0.5 * (low + high)
+        moved, at = abs(proposed - at), proposed
+        if moved < NEWTON_TOLERANCE:
+            break
+    return at
+
+
+def _expect_shape(where: str, name: str, array: np.ndarray, shape: tuple) -> None:
+    if np.shape(array) != shape:
+        raise InputError(
+            f"{where}: {name}: shape {np.shape(array)}: expected {tuple(shape)}"
+        )
+
+
+def _checked(
+    values: np.ndarray, human_value: np.ndarray, outcomes: Outcomes
+) -> tuple[np.ndarray, np.ndarray]:
+    """Float64 values with -inf at infeasible candidates, and the human's."""
+    _expect_shape("scorer", "values", values, np.shape(outcomes.fde))
+    _expect_shape("scorer", "human_value", human_value, np.shape(outcomes.fde)[:1])
+    human_value = np.asarray(human_value, np.float64)
+    feasible = np.asarray(outcomes.feasible, bool)
+    values = np.where(feasible, np.asarray(values, np.float64), -np.inf)
+    bad = (feasible & ~np.isfinite(values)).any(axis=1) | ~np.isfinite(human_value)
+    if bad.any():
+        raise InputError(
+            f"scorer: values: NaN or infinity in {int(bad.sum())} scenes, first"
+            f" {int(np.argmax(bad))}: expected finite values"
+        )
+    return values, human_value
+
+
+def _pick(array: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """[S] the entry of each row at its index."""
+    return np.take_along_axis(array, index[:, None], axis=1)[:, 0]
+
+
+def _nearest(outcomes: Outcomes) -> np.ndarray:
+    """[S] index of the feasible candidate with the least ADE; 0 if none."""
+    ade = np.where(outcomes.feasible, np.asarray(outcomes.ade, np.float64), np.inf)
+    return np.argmin(ade, axis=1)
+
+
+def _human_metrics(
+    values: np.ndarray, human_value: np.ndarray, feasible: np.ndarray
+) -> dict[str, np.ndarray]:
+    """How the human ranks among the feasible; -inf values are the others."""
+    human = human_value[:, None]
+    below = np.sum(feasible & (values < human), axis=1)
+    equal = np.sum(feasible & (values == human), axis=1)
+    count = np.sum(feasible, axis=1)
+    share = (below + 0.5 * equal) / np.maximum(count, 1)
+    top = (below == count) & (count > 0)
+    return {
+        "percentile_rank": share,
+        "pairwise_accuracy": share.copy(),
+        "num_pairs": np.maximum(count, 1).astype(np.float64),
+        "human_top1": top.astype(np.float64),
+    }
+
+
+def _best_of(distance: np.ndarray, top: np.ndarray, feasible: np.ndarray) -> np.ndarray:
+    """[S] least distance of the feasible ones in `top`; candidate 0 if none."""
+    taken = np.take_along_axis(distance, top, axis=1)
+    allowed = np.take_along_axis(np.asarray(feasible, bool), top, axis=1)
+    least = np.where(allowed, taken, np.inf).min(axis=1)
+    return np.where(np.isfinite(least), least, distance[:, 0])
+
+
+def _average_rank(values: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """[S] rank from 1 of one candidate per scene; ties share the mean rank."""
+    own = _pick(values, index)[:, None]
+    above = np.sum(values > own, axis=1)
+    equal = np.sum(values == own, axis=1)
+    return above + 0.5 * (equal + 1.0)
+
+
+def _nll(
+    values: np.ndarray, nearest: np.ndarray, some: np.ndarray, beta: float
+) -> np.ndarray:
+    """[S] nats, -log softmax(beta values)[nearest]; log K where none is feasible."""
+    known = np.where(some[:, None], values, 0.0)
+    # differences first: a large common offset must not cost digits
+    shifted = beta * (known - known.max(axis=1, keepdims=True))
+    return np.log(np.exp(shifted).sum(axis=1)) - _pick(shifted, nearest)

@@ -1,0 +1,386 @@
+"""Intervals and tests that respect how the data were made.
+
+Scenes of one vehicle resemble each other, so vehicles (clusters) are resampled,
+not scenes; training runs differ by their seed, so runs are resampled too. Host
+numpy, float64. Axes: `R` runs, `S` scenes, `C` clusters, `n` resamples.
+
+Sources: Davison and Hinkley, Bootstrap Methods and their Application (1997),
+chapter 5 (percentile intervals) and 3.8 (clusters); Clopper and Pearson,
+Biometrika 26 (1934); McNemar, Psychometrika 12 (1947), in its exact binomial
+form; Holm, Scand. J. Statist. 6 (1979).
+"""
+
+import dataclasses
+import math
+
+import numpy as np
+
+from rcirl_jax.errors import InputError
+
+CONFIDENCE = 0.95  # 1, of all intervals unless said
+NUM_RESAMPLES = 2000  # n; the ends of a 95 % interval rest on 50 draws each
+BOOTSTRAP_SEED = 20180814  # one fixed seed: the same data give the same table
+_CHUNK_CELLS = 4_000_000  # cells of a temporary array, 32 MB of float64
+_FRACTION_TERMS = 100_000  # 1; about sqrt(n) are needed for counts out of n
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """A number with its interval; units are those of the values."""
+
+    value: float
+    low: float
+    high: float
+    se: float  # standard error: spread of the bootstrap replicates
+    seed_sd: float | None = None  # between runs; None with a single run
+    seed_se: float | None = None  # seed_sd / sqrt(runs)
+    exact: bool = False  # the interval is an exact bound, not a bootstrap
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Difference:
+    """Mean of a - b over the same scenes."""
+
+    mean: float
+    low: float
+    high: float
+    se: float
+    p: float  # two-sided, for a difference of zero
+
+
+class ClusterBootstrap:
+    """Resampled vehicles, drawn once and shared by every statistic.
+
+    Each resample draws C clusters with replacement, which gives every cluster
+    a multinomial weight. Sharing the draws makes all rows of a table face the
+    same resampled road, so their differences are paired.
+
+    Args:
+      cluster: [S] int, the vehicle of each scene; at least 2 different ones.
+      num_resamples: n.
+      seed: of the Philox generator.
+    """
+
+    def __init__(
+        self,
+        cluster: np.ndarray,
+        num_resamples: int = NUM_RESAMPLES,
+        seed: int = BOOTSTRAP_SEED,
+    ) -> None:
+        found, index = np.unique(np.asarray(cluster), return_inverse=True)
+        if found.size < 2:
+            raise InputError(
+                f"bootstrap: cluster: {found.size} vehicles: expected at least 2,"
+                " one vehicle alone says nothing about others"
+            )
+        self.num_clusters = int(found.size)
+        self.num_resamples = num_resamples
+        self._index = index.reshape(-1)
+        self._seed = seed
+        self._weights = self._draw(found.size, 0)
+
+    def _draw(self, count: int, stream: int) -> np.ndarray:
+        """[n, count] multinomial weights, `count` draws each."""
+        key = np.random.SeedSequence([self._seed, stream])
+        generator = np.random.Generator(np.random.Philox(key))
+        weights = np.empty((self.num_resamples, count), np.uint16)
+        for rows in _chunks(self.num_resamples, count):
+            size = rows.stop - rows.start
+            drawn = generator.integers(count, size=(size, count))
+            drawn += count * np.arange(size)[:, None]
+            counted = np.bincount(drawn.reshape(-1), minlength=size * count)
+            weights[rows] = counted.reshape(size, count)
+        return weights
+
+    def _sums(self, values: np.ndarray) -> np.ndarray:
+        """[n, M] weighted sums over the scenes of values [S, M]."""
+        totals = np.stack(
+            [
+                np.bincount(self._index, column, minlength=self.num_clusters)
+                for column in values.T
+            ],
+            axis=1,
+        )
+        out = np.empty((self.num_resamples, values.shape[1]))
+        for rows in _chunks(self.num_resamples, self.num_clusters):
+            out[rows] = self._weights[rows].astype(np.float64) @ totals
+        return out
+
+    def means(
+        self, values: np.ndarray, weight: np.ndarray | None = None, stream: int = 1
+    ) -> np.ndarray:
+        """[n] replicates of the mean over runs and scenes.
+
+        Per run a ratio of weighted sums, sum(w x) / sum(w); then the mean over
+        resampled runs. The plain bootstrap of R runs has only (R - 1) / R of
+        the variance of their mean, which matters with few runs, so the run
+        weights are stretched about 1 by sqrt(R / (R - 1)).
+
+        Args:
+          values: [R, S] or [S].
+          weight: [S] >= 0, of the scenes; None weighs them alike.
+          stream: of the run draws; rows to be compared need different ones.
+        """
+        runs, weight = self._inputs(values, weight)
+        sums = self._sums(np.concatenate([runs * weight, weight[None]]).T)
+        ratios = sums[:, :-1] / sums[:, -1:]
+        count = runs.shape[0]
+        if count == 1:
+            return ratios[:, 0]
+        draws = self._draw(count, stream).astype(np.float64)
+        stretched = 1.0 + (draws - 1.0) * math.sqrt(count / (count - 1))
+        return np.mean(stretched * ratios, axis=1)
+
+    def mean(self, values: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
+        """[R] mean of each run over the scenes."""
+        runs, weight = self._inputs(values, weight)
+        return runs @ weight / weight.sum()
+
+    def medians(self, values: np.ndarray) -> np.ndarray:
+        """[n] replicates of the median over scenes of values [S]."""
+        order = np.argsort(values, kind="stable")
+        ranked = np.asarray(values, np.float64)[order]
+        index = self._index[order]
+        out = np.empty(self.num_resamples)
+        for rows in _chunks(self.num_resamples, ranked.size):
+            reach = np.cumsum(self._weights[rows][:, index], axis=1, dtype=np.int64)
+            total = reach[:, -1:]
+            lower = np.sum(reach <= (total - 1) // 2, axis=1)
+            upper = np.sum(reach <= total // 2, axis=1)
+            out[rows] = 0.5 * (ranked[lower] + ranked[upper])
+        return out
+
+    def _inputs(
+        self, values: np.ndarray, weight: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        runs = np.atleast_2d(np.asarray(values, np.float64))
+        count = self._index.size
+        if runs.ndim != 2 or runs.shape[1] != count or not np.isfinite(runs).all():
+            raise InputError(
+                f"bootstrap: values: shape {runs.shape}: expected [runs, {count}],"
+                " all finite"
+            )
+        if weight is None:
+            return runs, np.ones(count)
+        weight = np.asarray(weight, np.float64)
+        totals = np.bincount(self._index, weight, minlength=self.num_clusters)
+        if weight.shape != (count,) or weight.min() < 0.0 or totals.min() <= 0.0:
+            raise InputError(
+                "bootstrap: weight: negative, or zero for a whole vehicle:"
+                f" expected [{count}] weights with a positive sum per vehicle"
+            )
+        return runs, weight
+
+
+def _chunks(rows: int, columns: int) -> list[slice]:
+    """Slices over the rows that keep a temporary array small."""
+    step = max(1, _CHUNK_CELLS // max(columns, 1))
+    return [slice(at, min(at + step, rows)) for at in range(0, rows, step)]
+
+
+def _bootstrap(cluster: np.ndarray | ClusterBootstrap) -> ClusterBootstrap:
+    return (
+        cluster if isinstance(cluster, ClusterBootstrap) else ClusterBootstrap(cluster)
+    )
+
+
+def _interval(replicates: np.ndarray, confidence: float) -> tuple[float, float, float]:
+    """(low, high, standard error) of bootstrap replicates."""
+    tail = 0.5 * (1.0 - confidence)
+    low, high = np.quantile(replicates, [tail, 1.0 - tail])
+    return float(low), float(high), float(np.std(replicates, ddof=1))
+
+
+def combine_seeds(
+    values: np.ndarray,
+    cluster: np.ndarray | ClusterBootstrap,
+    *,
+    weight: np.ndarray | None = None,
+    confidence: float = CONFIDENCE,
+) -> Estimate:
+    """Mean over runs and scenes, with an interval that covers both.
+
+    Vehicles and runs are resampled jointly. With one run only the vehicles are,
+    and the result says nothing about other seeds.
+
+    Args:
+      values: [R, S], or [S] for a single run.
+      cluster: [S] int, or the bootstrap to share.
+      weight: [S] weights of the scenes, for a ratio of sums.
+      confidence: of the percentile interval.
+
+    Returns:
+      Estimate; `seed_sd` is the standard deviation of the runs' means.
+    """
+    bootstrap = _bootstrap(cluster)
+    means = bootstrap.mean(values, weight)
+    low, high, se = _interval(bootstrap.means(values, weight), confidence)
+    value, count = float(means.mean()), means.size
+    if count == 1:
+        return Estimate(value=value, low=low, high=high, se=se)
+    seed_sd = float(np.std(means, ddof=1))
+    seed_se = seed_sd / math.sqrt(count)
+    return Estimate(
+        value=value, low=low, high=high, se=se, seed_sd=seed_sd, seed_se=seed_se
+    )
+
+
+def bootstrap_median(
+    values: np.ndarray,
+    cluster: np.ndarray | ClusterBootstrap,
+    *,
+    confidence: float = CONFIDENCE,
+) -> Estimate:
+    """Median over scenes [S] of one run, with the interval of resampled vehicles."""
+    bootstrap = _bootstrap(cluster)
+    low, high, se = _interval(bootstrap.medians(values), confidence)
+    return Estimate(value=float(np.median(values)), low=low, high=high, se=se)
+
+
+def paired_difference(
+    a: np.ndarray,
+    b: np.ndarray,
+    cluster: np.ndarray | ClusterBootstrap,
+    *,
+    weight: np.ndarray | None = None,
+    confidence: float = CONFIDENCE,
+) -> Difference:
+    """Mean of a - b on the same scenes; the vehicles are resampled together.
+
+    Runs of a and of b are resampled independently: run i of the one has
+    nothing in common with run i of the other. The p value counts replicates on
+    the other side of zero, 2 min(P(d <= 0), P(d >= 0)), each with one added to
+    count and total, so that it is never below 2 / (n + 1).
+
+    Args:
+      a: [R, S] or [S]; the numbers of runs may differ.
+      b: [R', S] or [S].
+      cluster: [S] int, or the bootstrap to share.
+      weight: [S] weights of the scenes, for a difference of ratios.
+      confidence: of the percentile interval.
+    """
+    bootstrap = _bootstrap(cluster)
+    mean = bootstrap.mean(a, weight).mean() - bootstrap.mean(b, weight).mean()
+    replicates = bootstrap.means(a, weight, 1) - bootstrap.means(b, weight, 2)
+    low, high, se = _interval(replicates, confidence)
+    total = replicates.size + 1
+    below = (1 + np.count_nonzero(replicates <= 0.0)) / total
+    above = (1 + np.count_nonzero(replicates >= 0.0)) / total
+    return Difference(
+        mean=float(mean),
+        low=low,
+        high=high,
+        se=se,
+        p=float(min(1.0, 2.0 * min(below, above))),
+    )
+
+
+def rule_of_three(n: int) -> float:
+    """Upper 95 % bound of a rate that was 0 in n trials: 3 / n.
+
+    The exact one-sided bound is 1 - 0.05^(1/n) < -ln(0.05) / n < 3 / n.
+    """
+    if n < 1:
+        raise InputError(f"rule_of_three: n: {n}: expected at least 1")
+    return min(1.0, 3.0 / n)
+
+
+def clopper_pearson(
+    k: int, n: int, confidence: float = CONFIDENCE
+) -> tuple[float, float]:
+    """Exact two-sided interval of a rate with k events in n trials.
+
+    low solves P(X >= k; low) = alpha / 2, that is I_low(k, n - k + 1), and high
+    solves P(X <= k; high) = alpha / 2; both by bisection on the regularised
+    incomplete beta function I. The ends are 0 for k = 0 and 1 for k = n.
+    """
+    if not 0 <= k <= n or n < 1 or not 0.0 < confidence < 1.0:
+        raise InputError(
+            f"clopper_pearson: k, n, confidence: {k}, {n}, {confidence}:"
+            " expected 0 <= k <= n, n >= 1 and confidence in (0, 1)"
+        )
+    tail = 0.5 * (1.0 - confidence)
+    low = 0.0 if k == 0 else _beta_quantile(tail, k, n - k + 1)
+    high = 1.0 if k == n else 1.0 - _beta_quantile(tail, n - k, k + 1)
+    return low, high
+
+
+def mcnemar_exact(b: int, c: int) -> float:
+    """Two-sided exact p value for b against c discordant pairs.
+
+    Under the null hypothesis each discordant pair falls to either side with
+    probability 1/2: p = min(1, 2 P(X <= min(b, c))), X ~ Binomial(b + c, 1/2).
+    """
+    if min(b, c) < 0:
+        raise InputError(f"mcnemar_exact: b, c: {b}, {c}: expected counts >= 0")
+    n, k = b + c, min(b, c)
+    if 2 * k == n:
+        return 1.0
+    return min(1.0, 2.0 * incomplete_beta(0.5, n - k, k + 1))
+
+
+def holm(p_values: np.ndarray) -> np.ndarray:
+    """Holm's step-down adjusted p values, in the order given.
+
+    With p sorted upwards, adjusted_i = max over j <= i of min(1, (m - j) p_j),
+    j from 0. Rejecting where adjusted <= alpha keeps the family-wise error.
+    """
+    p = np.asarray(p_values, np.float64).reshape(-1)
+    if not np.all((p >= 0.0) & (p <= 1.0)):
+        raise InputError("holm: p_values: NaN or outside [0, 1]: expected p values")
+    order = np.argsort(p, kind="stable")
+    scaled = p[order] * (p.size - np.arange(p.size))
+    adjusted = np.empty_like(p)
+    adjusted[order] = np.minimum(1.0, np.maximum.accumulate(scaled))
+    return adjusted
+
+
+def incomplete_beta(x: float, a: float, b: float) -> float:
+    """Regularised incomplete beta function I_x(a, b), a, b > 0.
+
+    x^a (1 - x)^b / (a B(a, b)) times the continued fraction 8.17.22 of the NIST
+    Digital Library of Mathematical Functions, evaluated by Lentz's method; it
+    converges fast for x < (a + 1) / (a + b + 2), else I_x(a, b) =
+    1 - I_{1-x}(b, a) is used.
+    """
+    if x <= 0.0 or x >= 1.0:
+        return 0.0 if x <= 0.0 else 1.0
+    if x > (a + 1.0) / (a + b + 2.0):
+        return 1.0 - incomplete_beta(1.0 - x, b, a)
+    log_front = (
+        math.lgamma(a + b)
+        - math.lgamma(a)
+        - math.lgamma(b)
+        + a * math.log(x)
+        + b * math.log1p(-x)
+    )
+    return math.exp(log_front) / (a * _fraction(x, a, b))
+
+
+def _fraction(x: float, a: float, b: float) -> float:
+    """1 + d1/(1 + d2/(1 + ...)) of DLMF 8.17.22, by Lentz's method."""
+    tiny = 1e-300  # keeps the recurrences off zero
+    value, up, down = 1.0, 1.0, 0.0
+    for i in range(1, _FRACTION_TERMS):
+        m, at = i // 2, a + i  # d_{2m} and d_{2m+1}
+        top = -(a + m) * (a + b + m) if i % 2 else m * (b - m)
+        term = top * x / ((at - 1.0) * at)
+        down = 1.0 / ((1.0 + term * down) or tiny)
+        up = (1.0 + term / up) or tiny
+        value *= up * down
+        if abs(up * down - 1.0) < 1e-15:
+            break
+    return value
+
+
+def _beta_quantile(probability: float, a: float, b: float) -> float:
+    """Solve I_x(a, b) = probability for x, by bisection to the last digits."""
+    low, high = 0.0, 1.0
+    while True:
+        middle = 0.5 * (low + high)
+        if middle in (low, high) or high - low < 1e-14 * high:
+            return middle
+        if incomplete_beta(middle, a, b) < probability:
+            low = middle
+        else:
+            high = middle

@@ -1,0 +1,24 @@
+"""The exported reward: one file of weights, its writer and its reader."""
+
+from rcirl_jax.export.reader import Reward, WeightsError, decode_weights, load_weights
+from rcirl_jax.export.weights import (
+    PROVENANCE_KEYS,
+    FeatureSpec,
+    RewardWeights,
+    pack,
+    save,
+    to_json,
+)
+
+__all__ = [
+    "PROVENANCE_KEYS",
+    "FeatureSpec",
+    "Reward",
+    "RewardWeights",
+    "WeightsError",
+    "decode_weights",
+    "load_weights",
+    "pack",
+    "save",
+    "to_json",
+]

@@ -1,0 +1,267 @@
+"""Writer of `weights.msgpack`, the one file that a planner is handed.
+
+    outer map: magic, schema_version, body (bytes), sha256 of the body
+    body map:  features, normaliser, times, gamma, layers, ..., samples
+
+The layout and the scoring equation are in docs/weights_format.md. The same input
+gives the same bytes: keys have a fixed or sorted order, and nothing (no clock, no
+host name) is added. Every file is read back by `reader` before it is handed out,
+so a file that would be refused is never written.
+"""
+
+import base64
+import contextlib
+import dataclasses
+import hashlib
+import os
+import secrets
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import msgpack
+import numpy as np
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.export import reader
+
+PROVENANCE_KEYS = (
+    "dataset_sha256",  # text, hash of the data manifest
+    "git_commit",  # text
+    "seed",  # integer
+    "flags",  # map, the flags of the training run
+    "metrics",  # map, name -> number
+    "versions",  # map, package -> version
+    "created",  # text, ISO 8601
+)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FeatureSpec:
+    """One column of the feature matrix, as the planner must deliver it."""
+
+    name: str
+    unit: str  # SI; "1" for a pure number
+    none_value: float  # value when nothing of the class is there
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class RewardWeights:
+    """A reward in its effective weights: any scale pinning is already applied.
+
+    x = (clip(f, lower, upper) - location) / scale, then the layers, the last one
+    linear with one output; V = sum_t gamma_t * time_valid_t * r_t, higher is
+    better. Arrays are anything numpy can turn into float32.
+    """
+
+    preset: str  # of data_specs/features
+    features: tuple[FeatureSpec, ...]  # [F]
+    lower: np.ndarray  # [F] in the feature's unit
+    upper: np.ndarray  # [F]
+    location: np.ndarray  # [F]
+    scale: np.ndarray  # [F] > 0
+    times: np.ndarray  # [T] s, increasing from 0
+    gamma: np.ndarray  # [T]
+    kernels: tuple[np.ndarray, ...]  # [F, H1], ..., [H, 1]
+    biases: tuple[np.ndarray, ...]  # [H1], ..., [1]; one for every kernel
+    activation: str  # of the hidden layers: tanh, relu, leaky_relu, identity
+    leaky_slope: float  # negative slope of the hidden leaky_relu
+    loss: Mapping[str, Any]  # name; leaky_rate of the rank loss, or None
+    provenance: Mapping[str, Any]  # the PROVENANCE_KEYS and what the caller adds
+
+
+def pack(
+    weights: RewardWeights,
+    samples_x: np.ndarray,
+    samples_valid: np.ndarray,
+    samples_value: np.ndarray,
+) -> bytes:
+    """The bytes of the file, checked by reading them back.
+
+    Args:
+      weights: effective weights.
+      samples_x: [m, T, F] raw features of the verification samples (before the
+        clip and the normaliser, so that a reader checks those too), m <= 256.
+      samples_valid: [m, T] bool.
+      samples_value: [m] V as the trainer computes it, in full float32: on an
+        accelerator under `jax.default_matmul_precision("highest")`.
+
+    Returns:
+      The same bytes for the same input.
+
+    Raises:
+      InputError: a reader would refuse the file, or the samples' values are not
+        those of the weights.
+    """
+    samples = (samples_x, samples_valid, samples_value)
+    return _pack_checked("weights", weights, samples)[0]
+
+
+def save(
+    path: str | os.PathLike[str],
+    weights: RewardWeights,
+    samples_x: np.ndarray,
+    samples_valid: np.ndarray,
+    samples_value: np.ndarray,
+) -> reader.Reward:
+    """Write the file atomically; the folder must exist. Arguments as `pack`.
+
+    A reader sees the old file or the new one, also after a power cut.
+
+    Returns:
+      The reward as a reader of the file sees it, with the hash that names it.
+    """
+    target = Path(path)
+    samples = (samples_x, samples_valid, samples_value)
+    data, reward = _pack_checked(str(target), weights, samples)
+    # The folder is the target's own: os.replace is atomic on one file system only.
+    temporary = target.parent / f".{target.name}.{secrets.token_hex(8)}.tmp"
+    try:
+        _write(temporary, target, data)
+    except OSError as error:
+        reason = error.strerror or error
+        message = f"{target}: path: {reason}: expected a writable file"
+        raise InputError(message) from error
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+    return reward
+
+
+def to_json(data: bytes) -> dict[str, Any]:
+    """The body as JSON types: what data_specs/reward_weights.schema.json describes.
+
+    An array keeps its map {shape, dtype, data}; `data` turns from bytes into
+    base64 text, so nothing is lost.
+
+    Args:
+      data: bytes of a file.
+
+    Raises:
+      WeightsError: a reader would refuse the file.
+    """
+    reader.decode_weights(data)
+    return _json(msgpack.unpackb(msgpack.unpackb(data)["body"]))
+
+
+def _json(value: Any) -> Any:  # noqa: ANN401
+    if isinstance(value, dict):
+        return {key: _json(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_json(item) for item in value]
+    return base64.b64encode(value).decode() if isinstance(value, bytes) else value
+
+
+def _write(temporary: Path, target: Path, data: bytes) -> None:
+    with temporary.open("xb") as stream:
+        stream.write(data)
+        stream.flush()
+        os.fsync(stream.fileno())
+    os.replace(temporary, target)
+    # The new name lives in the folder; it is on disk once the folder is.
+    folder = os.open(target.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def _pack_checked(
+    file: str, weights: RewardWeights, samples: tuple[np.ndarray, ...]
+) -> tuple[bytes, reader.Reward]:
+    try:
+        body = _dump(_body(weights, samples))
+        outer = {
+            "magic": reader.MAGIC,
+            "schema_version": reader.SCHEMA_VERSION,
+            "body": body,
+            "sha256": hashlib.sha256(body).hexdigest(),
+        }
+        data = _dump(outer)
+    except (_FieldError, OverflowError, TypeError, ValueError) as error:
+        # msgpack itself refuses integers over 64 bits and lone surrogates.
+        raise InputError(f"{file}: {error}") from error
+    try:
+        return data, reader.decode_weights(data, file)
+    except reader.WeightsError as error:
+        raise InputError(str(error)) from error
+
+
+def _dump(value: dict[str, Any]) -> bytes:
+    return cast("bytes", msgpack.packb(value, use_bin_type=True))
+
+
+class _FieldError(Exception):
+    """A field that cannot be packed; the caller puts the file's name in front."""
+
+
+def _body(weights: RewardWeights, samples: tuple[np.ndarray, ...]) -> dict[str, Any]:
+    """The body map, in the order of `reader.BODY_KEYS`."""
+    if len(weights.kernels) != len(weights.biases):
+        found = f"{len(weights.biases)} biases"
+        raise _FieldError(f"biases: {found}: expected one for each kernel")
+    for key in PROVENANCE_KEYS:
+        if key not in weights.provenance:
+            raise _FieldError(f"provenance.{key}: missing: expected a value or None")
+    layers = zip(weights.kernels, weights.biases, strict=True)
+    names = ("features", "valid", "value")
+    return {
+        "preset": weights.preset,
+        "features": [_plain("features", vars(spec), 1) for spec in weights.features],
+        "normaliser": {
+            key: _array(f"normaliser.{key}", getattr(weights, key))
+            for key in reader.RANGES
+        },
+        "times": _array("times", weights.times),
+        "gamma": _array("gamma", weights.gamma),
+        "layers": [
+            {
+                "kernel": _array(f"layers[{index}].kernel", kernel),
+                "bias": _array(f"layers[{index}].bias", bias),
+            }
+            for index, (kernel, bias) in enumerate(layers)
+        ],
+        "activation": weights.activation,
+        "leaky_slope": _plain("leaky_slope", weights.leaky_slope, 0),
+        "loss": _plain("loss", weights.loss, 1),
+        "provenance": _plain("provenance", weights.provenance, reader.MAX_DEPTH),
+        "samples": {
+            name: _array(f"samples.{name}", sample)
+            for name, sample in zip(names, samples, strict=True)
+        },
+    }
+
+
+def _array(field: str, value: np.ndarray) -> dict[str, Any]:
+    """{shape, dtype, data}: float32, little endian; `tobytes` gives C order."""
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise _FieldError(f"{field}: {error}: expected an array") from error
+    if array.dtype.kind not in "fiub":
+        raise _FieldError(f"{field}: {array.dtype}: expected an array of numbers")
+    with np.errstate(over="ignore"):  # to inf, which the reader refuses by place
+        array = array.astype("<f4")
+    return {"shape": list(array.shape), "dtype": "<f4", "data": array.tobytes()}
+
+
+def _plain(field: str, value: Any, depth: int) -> Any:  # noqa: ANN401
+    """Plain msgpack types, map keys sorted, numpy scalars as Python numbers."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is None or isinstance(value, str | bool | int | float):
+        return value
+    if depth == 0 or not isinstance(value, Mapping | list | tuple):
+        kind = type(value).__name__
+        raise _FieldError(
+            f"{field}: {kind}: expected texts, numbers, lists and maps, "
+            f"at most {reader.MAX_DEPTH} levels"
+        )
+    if not isinstance(value, Mapping):
+        return [_plain(field, item, depth - 1) for item in value]
+    for key in value:
+        if not isinstance(key, str):
+            raise _FieldError(f"{field}: key {key!r}: expected a text")
+    return {
+        key: _plain(f"{field}.{key}", value[key], depth - 1) for key in sorted(value)
+    }

@@ -1,0 +1,150 @@
+import hashlib
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rcirl_jax.data.splits import assign_groups, check_disjoint, folds
+from rcirl_jax.errors import InputError
+
+COUNTS = st.dictionaries(
+    st.text(min_size=1, max_size=6), st.integers(1, 500), min_size=2, max_size=30
+)
+FRACTIONS = st.floats(0.01, 0.99)
+SEEDS = st.integers(0, 2**32)
+
+
+@given(counts=COUNTS, fraction=FRACTIONS, seed=SEEDS)
+def test_every_group_is_in_exactly_one_split_and_none_is_empty(counts, fraction, seed):
+    made = assign_groups(counts, test_fraction=fraction, seed=seed)
+    assert set(made) == {"train", "test"}
+    assert made["train"]
+    assert made["test"]
+    assert sorted(made["train"] + made["test"]) == sorted(counts)
+
+
+@given(counts=COUNTS, fraction=FRACTIONS, seed=SEEDS)
+def test_the_order_of_the_table_does_not_matter(counts, fraction, seed):
+    turned = dict(reversed(counts.items()))
+    assert assign_groups(counts, test_fraction=fraction, seed=seed) == assign_groups(
+        turned, test_fraction=fraction, seed=seed
+    )
+    assert folds(counts, 2, seed) == folds(turned, 2, seed)
+
+
+@given(counts=COUNTS, fraction=FRACTIONS, seed=SEEDS)
+def test_share_is_off_by_at_most_the_largest_group(counts, fraction, seed):
+    made = assign_groups(counts, test_fraction=fraction, seed=seed)
+    rows = sum(counts[name] for name in made["test"])
+    error = abs(rows - fraction * sum(counts.values()))
+    assert error <= max(counts.values()) + 1e-6
+
+
+def test_shares_of_many_small_groups_are_close():
+    counts = {f"g{i}": 10 + i % 7 for i in range(200)}
+    made = assign_groups(counts, test_fraction=0.25, seed=3)
+    share = sum(counts[name] for name in made["test"]) / sum(counts.values())
+    assert share == pytest.approx(0.25, abs=0.01)
+
+
+def test_against_the_rule_done_by_hand():
+    # deficits start at 75 and 25: a 40 -> train (35), b 30 -> train (5),
+    # c 20 -> test (5), d 10 -> train, which wins the tie
+    counts = {"d": 10, "b": 30, "a": 40, "c": 20}
+    made = assign_groups(counts, test_fraction=0.25, seed=0)
+    assert made == {"train": ["a", "b", "d"], "test": ["c"]}
+
+
+def test_an_empty_split_takes_the_smallest_group():
+    assert assign_groups({"a": 9, "b": 7}, test_fraction=0.01, seed=0) == {
+        "train": ["a"],
+        "test": ["b"],
+    }
+    assert assign_groups({"a": 9, "b": 7}, test_fraction=0.99, seed=0) == {
+        "train": ["b"],
+        "test": ["a"],
+    }
+
+
+def test_seed_decides_among_equals_by_sha256():
+    counts = dict.fromkeys("abcdefgh", 5)
+    made = [assign_groups(counts, test_fraction=0.5, seed=seed) for seed in range(8)]
+    assert len({tuple(split["test"]) for split in made}) > 1
+    first = min(counts, key=lambda n: hashlib.sha256(f"0/{n}".encode()).digest())
+    assert first in made[0]["train"]
+
+
+def test_same_in_a_process_with_another_hash_seed():
+    code = (
+        "from rcirl_jax.data.splits import assign_groups, folds\n"
+        "counts = {f'g{i}': 5 + i % 3 for i in range(40)}\n"
+        "print(assign_groups(counts, test_fraction=0.3, seed=9), folds(counts, 3, 9))"
+    )
+    counts = {f"g{i}": 5 + i % 3 for i in range(40)}
+    here = f"{assign_groups(counts, test_fraction=0.3, seed=9)} {folds(counts, 3, 9)}"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env={"PYTHONHASHSEED": "12345", "PYTHONPATH": ":".join(sys.path)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.strip() == here
+
+
+@pytest.mark.parametrize(
+    ("counts", "fraction", "words"),
+    [
+        ({"only": 5}, 0.25, "groups: 1"),
+        ({}, 0.25, "groups: 0"),
+        ({"a": 1, "b": 1}, 1.0, "test_fraction: 1.0"),
+        ({"a": 1, "b": 1}, float("nan"), "test_fraction: nan"),
+    ],
+)
+def test_bad_input_is_one_line(counts, fraction, words):
+    with pytest.raises(InputError, match=words) as caught:
+        assign_groups(counts, test_fraction=fraction, seed=0)
+    assert "\n" not in str(caught.value)
+
+
+def test_one_group_without_a_test_split_is_fine():
+    made = assign_groups({"only": 5}, test_fraction=0.0, seed=0)
+    assert made == {"train": ["only"], "test": []}
+
+
+def test_empty_groups_are_refused():
+    with pytest.raises(ValueError, match="group b: 0 rows"):
+        assign_groups({"a": 3, "b": 0}, test_fraction=0.5, seed=0)
+
+
+@given(counts=COUNTS, seed=SEEDS, data=st.data())
+def test_folds_cover_and_are_balanced(counts, seed, data):
+    number = data.draw(st.integers(2, len(counts)))
+    made = folds(counts, number, seed)
+    assert len(made) == number
+    assert all(made)
+    assert sorted(name for fold in made for name in fold) == sorted(counts)
+    rows = [sum(counts[name] for name in fold) for fold in made]
+    assert max(rows) - min(rows) <= max(counts.values())
+
+
+@pytest.mark.parametrize("number", [0, 1, 4])
+def test_bad_numbers_of_folds(number):
+    with pytest.raises(InputError, match="num_folds"):
+        folds({"a": 1, "b": 2, "c": 3}, number, 0)
+
+
+@given(seed=st.integers(0, 10_000))
+def test_check_disjoint_against_sets(seed):
+    rng = np.random.default_rng(seed)
+    groups, vehicles = rng.integers(0, 4, 6), rng.integers(0, 12, 6)
+    split = {"train": [0, 1], "test": [2, 3]}
+    sides = [set(vehicles[groups < 2].tolist()), set(vehicles[groups >= 2].tolist())]
+    if sides[0] & sides[1]:
+        with pytest.raises(InputError, match=f"vehicle {min(sides[0] & sides[1])}:"):
+            check_disjoint(groups, vehicles, split)
+    else:
+        check_disjoint(groups, vehicles, split)

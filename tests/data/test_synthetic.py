@@ -1,0 +1,408 @@
+"""Synthetic traffic: deterministic, collision free, human, lawful."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rcirl_jax.data.importers import synthetic
+from rcirl_jax.data.recording import validate_recording
+from rcirl_jax.data.synthetic import ROADS, RunConfig
+from rcirl_jax.data.synthetic.drivers import DRIVER, idm_acceleration
+from rcirl_jax.data.synthetic.roads import to_world
+from rcirl_jax.data.synthetic.state import Neighbours, State
+from rcirl_jax.data.synthetic.stops import schedule
+from rcirl_jax.data.synthetic.traffic import Traffic
+from rcirl_jax.errors import InputError
+from rcirl_jax.specs import load_toml, spec_root
+from rcirl_jax.types import Recording, Track
+
+DEFAULT = spec_root() / "sources" / "synthetic.toml"
+SMALL = """
+source = "test"
+licence = "none"
+rate_hz = 10.0
+warmup_s = 5.0
+position_noise_m = {noise}
+[[recordings]]
+road = "{road}"
+count = {count}
+duration_s = {duration}
+density_veh_per_km = 14.0
+seed = {seed}
+"""
+
+
+def make(folder: Path, **changes) -> list[Recording]:
+    values = {"noise": 0.0, "road": "urban_turn_left", "count": 1}
+    values |= {"duration": 10.0, "seed": 3} | changes
+    path = folder / "small.toml"
+    path.write_text(SMALL.format(**values))
+    return list(synthetic.recordings(path, load_toml(DEFAULT)))
+
+
+@pytest.fixture(scope="module")
+def default() -> list[Recording]:
+    return list(synthetic.recordings(DEFAULT, load_toml(DEFAULT)))
+
+
+def positions(recording: Recording) -> np.ndarray:
+    return np.concatenate([np.stack([t.x, t.y]) for t in recording.tracks], axis=1)
+
+
+def boxes(track: Track) -> np.ndarray:
+    """Oriented boxes as shapely polygons, one per sample."""
+    corners = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * 0.5
+    along, across = corners[:, 0] * track.length, corners[:, 1] * track.width
+    c, s = np.cos(track.heading)[:, None], np.sin(track.heading)[:, None]
+    x = track.x[:, None] + along * c - across * s
+    y = track.y[:, None] + along * s + across * c
+    return shapely.polygons(np.stack([x, y], axis=-1))
+
+
+def overlaps(recording: Recording) -> int:
+    """Pairs of touching boxes over all samples, by shapely."""
+    frame = np.concatenate([np.round(t.t * 10).astype(int) for t in recording.tracks])
+    centre = positions(recording).T
+    reach = np.concatenate([np.full(t.t.size, t.length) for t in recording.tracks])
+    shapes = np.concatenate([boxes(track) for track in recording.tracks])
+    found = 0
+    for now in np.unique(frame):
+        rows = np.flatnonzero(frame == now)
+        apart = np.linalg.norm(centre[rows, None] - centre[None, rows], axis=-1)
+        near = apart < 0.5 * (reach[rows, None] + reach[None, rows]) + 3.0
+        a, b = np.nonzero(np.triu(near, k=1))
+        found += int(shapely.intersects(shapes[rows[a]], shapes[rows[b]]).sum())
+    return found
+
+
+def front_crossing(track: Track, line: np.ndarray) -> float | None:
+    """Time of the front bumper's path across a stop line, by shapely."""
+    half = 0.5 * track.length
+    x = track.x + half * np.cos(track.heading)
+    y = track.y + half * np.sin(track.heading)
+    steps = np.stack([np.stack([x[:-1], y[:-1]], 1), np.stack([x[1:], y[1:]], 1)], 1)
+    hit = shapely.intersects(shapely.linestrings(steps), shapely.linestrings(line))
+    return float(track.t[1:][hit][0]) if hit.any() else None
+
+
+def test_same_seed_is_identical_and_another_is_not(tmp_path):
+    first, again = make(tmp_path, noise=0.03), make(tmp_path, noise=0.03)
+    other = make(tmp_path, noise=0.03, seed=4)
+    np.testing.assert_array_equal(positions(first[0]), positions(again[0]))
+    assert [t.id for t in first[0].tracks] == [t.id for t in again[0].tracks]
+    assert positions(first[0]).shape != positions(other[0]).shape or not np.allclose(
+        positions(first[0]), positions(other[0])
+    )
+
+
+def test_recording_does_not_depend_on_its_batch(tmp_path):
+    alone = make(tmp_path, count=1)[0]
+    together = make(tmp_path, count=3)
+    np.testing.assert_allclose(positions(alone), positions(together[0]), atol=1e-6)
+    names = [recording.name for recording in together]
+    assert len(set(names)) == 3
+    assert [recording.group for recording in together] == names
+
+
+def test_default_is_large_and_valid(default):
+    assert len(default) == 25
+    assert {r.name.split("-")[0] for r in default} == set(ROADS)
+    for recording in default:
+        validate_recording(recording)
+    long = sum(t.t.size >= 200 for r in default for t in r.tracks)
+    assert long >= 500
+
+
+def test_boxes_never_overlap(default):
+    for recording in default:
+        assert overlaps(recording) == 0, recording.name
+
+
+@pytest.mark.parametrize("road", sorted(ROADS))
+def test_boxes_never_overlap_with_other_seeds(tmp_path, road):
+    for recording in make(tmp_path, road=road, duration=20.0, count=2, seed=77):
+        assert overlaps(recording) == 0, recording.name
+
+
+def test_accelerations_and_jerks_are_human(default):
+    tracks = [t for r in default for t in r.tracks if t.t.size > 5]
+    a = np.concatenate([np.gradient(t.speed, 0.1) for t in tracks])
+    j = np.concatenate([np.gradient(np.gradient(t.speed, 0.1), 0.1) for t in tracks])
+    assert a.min() > -8.0
+    assert a.max() < 2.6
+    # hard braking is rare in human driving, but everyday braking is there
+    assert np.mean(a < -4.0) < 2e-3
+    assert np.mean(a < -1.0) > 0.01
+    assert np.mean(np.abs(j) > 5.0) < 2e-3
+
+
+def test_lateral_acceleration_in_turns_is_comfortable(default):
+    for recording in default:
+        for track in recording.tracks:
+            if track.t.size < 10 or "turn" not in recording.name:
+                continue
+            yaw_rate = np.gradient(np.unwrap(track.heading), 0.1)
+            lateral = np.abs(yaw_rate * track.speed)
+            assert lateral.max() < 3.0, (recording.name, track.id)
+
+
+def test_positions_agree_with_heading_speed_and_clock(tmp_path):
+    for road in ROADS:
+        for track in make(tmp_path, road=road)[0].tracks:
+            np.testing.assert_allclose(np.diff(track.t), 0.1, atol=1e-9)
+            vx, vy = np.gradient(track.x, 0.1), np.gradient(track.y, 0.1)
+            moving = slice(1, -1)
+            speed = np.hypot(vx, vy)[moving]
+            np.testing.assert_allclose(speed, track.speed[moving], atol=0.12)
+            fast = speed > 1.0
+            gap = np.arctan2(vy, vx)[moving][fast] - track.heading[moving][fast]
+            wrapped = (gap + np.pi) % (2 * np.pi) - np.pi
+            assert np.all(np.abs(wrapped) < 0.05), (road, track.id)
+
+
+def test_position_noise_is_added_to_positions_only(tmp_path):
+    clean, noisy = make(tmp_path)[0], make(tmp_path, noise=0.05)[0]
+    assert np.std(positions(noisy) - positions(clean)) == pytest.approx(0.05, rel=0.1)
+    for a, b in zip(clean.tracks, noisy.tracks, strict=True):
+        np.testing.assert_array_equal(a.speed, b.speed)
+
+
+def test_red_lights_are_respected(default):
+    crossings = {"green": 0, "yellow": 0, "red": 0}
+    for recording in default:
+        signals = {signal.id: signal for signal in recording.signals}
+        for lane in recording.lanes:
+            for name in lane.signal_ids:
+                signal = signals[name]
+                assert signal.is_recorded
+                assert signal.start[0] <= 0.0
+                for track in recording.tracks:
+                    time = front_crossing(track, lane.stop_line)
+                    if time is not None:
+                        at = np.searchsorted(signal.start, time, side="right") - 1
+                        crossings[signal.state[at]] += 1
+    assert crossings["green"] > 50
+    assert crossings["yellow"] > 0
+    assert crossings["red"] == 0
+
+
+def test_stop_signs_are_obeyed(default):
+    crossed = stood = 0
+    for recording in default:
+        for lane in recording.lanes:
+            if not lane.stop_sign:
+                continue
+            for track in recording.tracks:
+                time = front_crossing(track, lane.stop_line)
+                # earlier ones may have stood before the recording began
+                if time is not None and time > 6.0:
+                    crossed += 1
+                    before = (track.t < time) & (track.t > time - 5.0)
+                    stood += bool(np.any(track.speed[before] < 0.1))
+    assert crossed > 10
+    assert stood == crossed
+
+
+def test_lane_changes_happen_and_are_smooth(default):
+    changes = 0
+    for recording in default:
+        if "highway_straight" not in recording.name:
+            continue
+        for track in recording.tracks:
+            offset = track.y - track.y[0]
+            changes += int(abs(offset[-1]) > 2.5)
+            assert np.abs(np.diff(track.y)).max() < 0.45
+    assert changes > 30
+
+
+def test_some_drivers_reach_their_destination(default):
+    tracks = [t for r in default for t in r.tracks if t.destination is not None]
+    assert len(tracks) >= 15
+    share = len(tracks) / sum(len(r.tracks) for r in default)
+    assert 0.01 < share < 0.08
+    gaps = []
+    for track in tracks:
+        if track.speed[-1] < 0.1:
+            x, y = track.destination
+            gaps.append(np.hypot(track.x[-1] - x, track.y[-1] - y))
+    assert np.sum(np.array(gaps) < 2.0) >= 10
+
+
+def homogeneous() -> dict:
+    """One driver and car for everybody; values inside the human ranges."""
+    return {
+        "speed_factor": 1.0,
+        "headway": 1.3,
+        "jam_gap": 2.0,
+        "acceleration": 1.8,
+        "deceleration": 2.0,
+        "delay": 0.0,
+        "lateral": 2.0,
+        "threshold": 1e6,
+        "length": 4.5,
+        "width": 1.8,
+        "destination": np.inf,
+        "drift": 0.0,
+    }
+
+
+def closed_form_gap(v: float, v0: float) -> float:
+    """s_e = (s0 + v T) / sqrt(1 - (v / v0)^4), m."""
+    return (2.0 + 1.3 * v) / np.sqrt(1.0 - (v / v0) ** 4)
+
+
+def test_platoon_settles_at_the_equilibrium_gap():
+    config = synthetic._driver_config(DEFAULT, load_toml(DEFAULT)["drivers"])
+    config = dataclasses.replace(config, noise_mps2=0.0)
+    run = RunConfig(
+        road="highway_straight",
+        duration_s=10.0,
+        density_veh_per_km=5.0,
+        seed=(0,),
+        warmup_s=0.0,
+    )
+    traffic = Traffic([run], config)
+    source, state = traffic.sources[0], traffic.state
+    state.vehicle[:] = -1
+    for name, value in homogeneous().items():
+        source.pool[name] = value
+    v, v0 = 15.0, 30.0
+    source.pool["speed_factor"][source.used] = v / v0  # the leader
+    gap = closed_form_gap(v, v0)
+    for place in range(5):
+        traffic.add(0, 1, 330.0 - place * (4.5 + 1.2 * gap), v)
+    source.next_arrival[:] = np.inf
+    while state.s.max() < 1090.0 and state.alive.sum() == 5:
+        traffic.step()
+    order = np.sort(state.s[state.alive])[::-1]
+    np.testing.assert_allclose(-np.diff(order) - 4.5, gap, rtol=0.01)
+
+
+@settings(max_examples=20)
+@given(st.floats(0.0, 28.0))
+def test_idm_is_at_rest_in_its_equilibrium_gap(v):
+    driver = np.zeros((), DRIVER)
+    for name, value in homogeneous().items():
+        driver[name] = value
+    now = np.array(v)
+    gap = np.array(closed_form_gap(v, 30.0))
+    assert abs(idm_acceleration(now, np.array(30.0), gap, now, driver)) < 1e-9
+    closer = idm_acceleration(now, np.array(30.0), 0.9 * gap, now, driver)
+    assert closer < 0.0
+
+
+def test_neighbour_search_equals_brute_force():
+    rng = np.random.default_rng(0)
+    state = State(3, 12)
+    state.s = rng.uniform(0.0, 300.0, state.s.shape)
+    state.lane = rng.integers(0, 3, state.s.shape)
+    state.old_lane = rng.integers(0, 3, state.s.shape)
+    state.phase = rng.choice([0.5, 1.0], state.s.shape)
+    state.vehicle = rng.integers(-1, 9, state.s.shape)
+    around = Neighbours(state, 3)
+    lanes = state.occupied()
+    leader, ahead = around.leader(lanes)
+    _, behind = around.follower(lanes)
+    for r, i in np.ndindex(*state.s.shape):
+        rest = [j for j in range(12) if lanes[r, i] & lanes[r, j] and j != i]
+        steps = np.array([state.s[r, j] - state.s[r, i] for j in rest])
+        front, back = steps[steps > 0], -steps[steps < 0]
+        assert ahead[r, i] == (front.min() if front.size else np.inf)
+        assert behind[r, i] == (back.min() if back.size else np.inf)
+        if front.size:
+            assert state.s[r, leader[r, i]] - state.s[r, i] == ahead[r, i]
+
+
+@pytest.mark.parametrize("name", sorted(ROADS))
+def test_roads_are_what_they_say(name):
+    road = ROADS[name]()
+    s = np.linspace(1.0, road.length - 1.0, 4000)
+    x, y, heading = to_world(road, s, np.zeros_like(s), np.zeros_like(s))
+    step = np.hypot(np.diff(x), np.diff(y)) / np.diff(s)
+    np.testing.assert_allclose(step, 1.0, atol=1e-3)
+    chord = np.unwrap(np.arctan2(np.diff(y), np.diff(x)))
+    middle = 0.5 * (heading[1:] + heading[:-1])
+    np.testing.assert_allclose(chord, middle, atol=2e-3)
+    turn = {"urban_turn_left": 0.5, "urban_turn_right": -0.5}
+    if name in turn:
+        assert heading[-1] == pytest.approx(turn[name] * np.pi, abs=0.01)
+        assert 15.0 <= 1.0 / np.abs(road.kappa).max() <= 25.0
+    if name == "highway_s_curve":
+        assert 290.0 <= 1.0 / np.abs(road.kappa).max() <= 800.0
+        assert road.kappa.min() < 0.0 < road.kappa.max()
+
+
+def test_lanes_are_linked_and_parallel(default):
+    for recording in default[::4]:
+        lanes = {lane.id: lane for lane in recording.lanes}
+        for lane in recording.lanes:
+            steps = np.linalg.norm(np.diff(lane.centre, axis=0), axis=1)
+            assert steps.max() < 2.7
+            for following in lane.successors:
+                gap = lanes[following].centre[0] - lane.centre[-1]
+                np.testing.assert_allclose(gap, 0.0, atol=1e-9)
+            if lane.left is not None:
+                assert lanes[lane.left].right == lane.id
+                apart = np.linalg.norm(lanes[lane.left].centre - lane.centre, axis=1)
+                width = lane.left_width + lanes[lane.left].right_width
+                np.testing.assert_allclose(apart, width, atol=1e-6)
+
+
+@settings(max_examples=20)
+@given(st.floats(0.0, 49.9), st.floats(5.0, 300.0))
+def test_schedule_covers_the_recording(offset, end):
+    start, state = schedule((22.0, 4.0, 24.0), offset, end)
+    assert start[0] == 0.0
+    assert start[-1] <= end
+    assert np.all(np.diff(start) > 0.0)
+    for t in np.linspace(0.0, end, 40):
+        into = (t + offset) % 50.0
+        if min(abs(into - edge) for edge in (0.0, 22.0, 26.0, 50.0)) < 1e-6:
+            continue
+        colour = "green" if into < 22.0 else "yellow" if into < 26.0 else "red"
+        assert state[np.searchsorted(start, t, side="right") - 1] == colour
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "field"),
+    [
+        ("rate_hz = 10.0", "rate_hz = -1.0", "rate_hz"),
+        ("rate_hz = 10.0", 'rate_hz = "fast"', "rate_hz"),
+        ("warmup_s", "warm_up_s", "warm_up_s"),
+        ('road = "stop_sign"', 'road = "moon"', "recordings[7].road"),
+        ("count = 6", "count = 1.5", "recordings[4].count"),
+        ("count = 6", "count = 0", "recordings[4].count"),
+        ("seed = 7", "sead = 7", "recordings[7].sead"),
+        ("density_veh_per_km = 12.0\n", "", "recordings[4].density_veh_per_km"),
+        ("duration_s = 60.0", "duration_s = nan", "recordings[1].duration_s"),
+        ("[1.0, 0.1, 0.7, 1.3]", "[1.0, 0.1]", "drivers.speed_factor"),
+        ("jam_gap_m = [1.0, 4.0]", "jam_gap_m = [4.0, 1.0]", "drivers.jam_gap_m"),
+        ("jam_gap_m = [1.0", "jam_gap_m = [0.0", "drivers.jam_gap_m"),
+        ("jerk_mps3 = 3.0", "jerk_mps3 = true", "drivers.jerk_mps3"),
+        ("politeness", "rudeness", "drivers.rudeness"),
+        ("destination_share = 0.05", "destination_share = 2.0", "destination_share"),
+        ('source = "', "source = 1 # ", "source"),
+    ],
+)
+def test_bad_toml_is_one_clear_line(tmp_path, old, new, field):
+    text = DEFAULT.read_text()
+    assert old in text
+    path = tmp_path / "bad.toml"
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError) as error:
+        synthetic.recordings(path, load_toml(path))
+    assert str(path) in str(error.value)
+    assert field in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_broken_toml_names_the_file(tmp_path):
+    path = tmp_path / "broken.toml"
+    path.write_text("rate_hz = = 1")
+    with pytest.raises(InputError, match=r"broken\.toml"):
+        synthetic.recordings(path, {})

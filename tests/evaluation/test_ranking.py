@@ -1,0 +1,286 @@
+"""Ranking metrics against loops over scenes and candidates, written apart."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import minimize_scalar
+from scipy.special import log_softmax
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.ranking import (
+    METRICS,
+    Outcomes,
+    fit_temperature,
+    miss_threshold,
+    oracle_fde,
+    oracle_scorer,
+    random_scorer,
+    scene_metrics,
+)
+
+
+def make(seed, scenes=30, candidates=7, feasible=0.7):
+    rng = np.random.default_rng(seed)
+    shape = (scenes, candidates)
+    return Outcomes(
+        fde=rng.gamma(2.0, 3.0, shape),
+        ade=np.round(rng.gamma(2.0, 1.0, shape), 1),  # some ties
+        crash=rng.random(shape) < 0.3,
+        feasible=rng.random(shape) < feasible,
+        cluster=rng.integers(0, 8, scenes),
+        human_crash=rng.random(scenes) < 0.1,
+    )
+
+
+def integer_values(seed, outcomes):
+    """Values with many ties, also with the human."""
+    rng = np.random.default_rng(seed)
+    shape = outcomes.fde.shape
+    values = rng.integers(0, 4, shape).astype(float)
+    values[~outcomes.feasible] = np.nan  # must never be read
+    return values, rng.integers(0, 4, shape[0]).astype(float)
+
+
+def one_scene(values, human, o, s, temperature):
+    """The definitions, one scene at a time, with lists."""
+    allowed = [k for k in range(o.fde.shape[1]) if o.feasible[s, k]]
+    limit = 6.0 + (o.horizon_s - 5.0) * 2.0 / 3.0
+    if not allowed:
+        fde = o.fde[s, 0]
+        zero = dict.fromkeys(("percentile_rank", "pairwise_accuracy", "mrr"), 0.0)
+        return zero | {
+            "num_pairs": 1.0,
+            "human_top1": 0.0,
+            "top1_fde": fde,
+            "top1_ade": o.ade[s, 0],
+            "top3_fde": fde,
+            "top1_fde_failure": max(fde, o.failure_m),
+            "top3_fde_failure": max(fde, o.failure_m),
+            "nll": math.log(o.fde.shape[1]),
+            "crash_rate": float(o.crash[s, 0] and not o.human_crash[s]),
+            "failure_rate": 1.0,
+            "miss": 1.0,
+        }
+
+    def charged(k):
+        crash = o.crash[s, k] and not o.human_crash[s]
+        return max(o.fde[s, k], o.failure_m) if crash else o.fde[s, k]
+
+    points = sum(
+        1.0 if values[s, k] < human[s] else 0.5 if values[s, k] == human[s] else 0.0
+        for k in allowed
+    )
+    ranked = sorted(allowed, key=lambda k: (-values[s, k], k))
+    near = min(allowed, key=lambda k: (o.ade[s, k], k))
+    places = [i + 1 for i, k in enumerate(ranked) if values[s, k] == values[s, near]]
+    chances = log_softmax([values[s, k] / temperature for k in allowed])
+    crash = float(o.crash[s, ranked[0]] and not o.human_crash[s])
+    return {
+        "percentile_rank": points / len(allowed),
+        "pairwise_accuracy": points / len(allowed),
+        "num_pairs": float(len(allowed)),
+        "human_top1": float(all(values[s, k] < human[s] for k in allowed)),
+        "top1_fde": o.fde[s, ranked[0]],
+        "top1_ade": o.ade[s, ranked[0]],
+        "top3_fde": min(o.fde[s, k] for k in ranked[:3]),
+        "top1_fde_failure": charged(ranked[0]),
+        "top3_fde_failure": min(charged(k) for k in ranked[:3]),
+        "mrr": 1.0 / (sum(places) / len(places)),
+        "nll": -chances[allowed.index(near)],
+        "crash_rate": crash,
+        "failure_rate": crash,
+        "miss": float(o.fde[s, ranked[0]] > limit),
+    }
+
+
+@given(
+    seed=st.integers(0, 10**6),
+    candidates=st.integers(1, 9),
+    feasible=st.sampled_from([0.1, 0.5, 1.0]),
+    horizon=st.sampled_from([3.0, 5.0, 8.0]),
+)
+def test_every_metric_equals_the_loop(seed, candidates, feasible, horizon):
+    o = make(seed, scenes=12, candidates=candidates, feasible=feasible)
+    o = dataclasses.replace(o, horizon_s=horizon)
+    values, human = integer_values(seed + 1, o)
+    got = scene_metrics(values, human, o, temperature=0.7)
+    for s in range(12):
+        want = one_scene(values, human, o, s, 0.7)
+        assert set(want) == set(got)
+        for name, number in want.items():
+            assert got[name][s] == pytest.approx(number, abs=1e-12), (name, s)
+
+
+def test_every_named_metric_is_made():
+    o = make(0)
+    got = scene_metrics(*integer_values(1, o), o)
+    assert set(METRICS) | {"num_pairs"} == set(got)
+    assert all(x.shape == (30,) and x.dtype == np.float64 for x in got.values())
+
+
+@given(seed=st.integers(0, 10**6))
+def test_increasing_maps_change_no_rank_metric(seed):
+    o = make(seed)
+    values, human = random_scorer(seed, o.fde.shape)
+    before = scene_metrics(values, human, o)
+    after = scene_metrics(np.exp(3.0 * values), np.exp(3.0 * human), o)
+    for name in set(before) - {"nll"}:
+        np.testing.assert_array_equal(before[name], after[name], err_msg=name)
+
+
+def test_infeasible_candidates_do_not_matter():
+    o = make(3)
+    values, human = random_scorer(3, o.fde.shape)
+    some = o.feasible.any(axis=1, keepdims=True)
+    off = ~o.feasible & some
+    other = dataclasses.replace(
+        o,
+        fde=np.where(off, 99.0, o.fde),
+        ade=np.where(off, 0.0, o.ade),
+        crash=o.crash | off,
+    )
+    before = scene_metrics(values, human, o)
+    after = scene_metrics(np.where(off, 1e9, values), human, other)
+    for name, column in before.items():
+        np.testing.assert_array_equal(column, after[name], err_msg=name)
+
+
+def test_a_crash_that_ends_near_the_human_is_charged():
+    o = Outcomes(
+        fde=np.array([[0.5, 4.0], [0.5, 4.0], [12.0, 4.0]]),
+        ade=np.array([[0.5, 4.0], [0.5, 4.0], [12.0, 4.0]]),
+        crash=np.array([[True, False]] * 3),
+        feasible=np.ones((3, 2), bool),
+        cluster=np.arange(3),
+        human_crash=np.array([False, True, False]),
+    )
+    got = scene_metrics(np.array([[1.0, 0.0]] * 3), np.zeros(3), o)
+    np.testing.assert_array_equal(got["top1_fde"], [0.5, 0.5, 12.0])
+    np.testing.assert_array_equal(got["top1_fde_failure"], [10.0, 0.5, 12.0])
+    np.testing.assert_array_equal(got["crash_rate"], [1.0, 0.0, 1.0])
+    np.testing.assert_array_equal(got["top3_fde_failure"], [4.0, 0.5, 4.0])
+
+
+def test_equal_values_choose_the_lowest_index():
+    o = make(5, feasible=0.6)
+    got = scene_metrics(np.zeros(o.fde.shape), np.zeros(30), o)
+    first = np.argmax(o.feasible, axis=1)
+    np.testing.assert_array_equal(got["top1_fde"], o.fde[np.arange(30), first])
+    some = o.feasible.any(axis=1)
+    np.testing.assert_array_equal(got["percentile_rank"], np.where(some, 0.5, 0.0))
+
+
+def test_random_scorer_is_at_chance_and_repeats():
+    o = make(7, scenes=4000, candidates=20, feasible=1.0)
+    values, human = random_scorer(11, o.fde.shape)
+    again, _ = random_scorer(11, o.fde.shape)
+    other, _ = random_scorer(12, o.fde.shape)
+    np.testing.assert_array_equal(values, again)
+    assert np.mean(values == other) < 1e-3
+    got = scene_metrics(values, human, o)
+    assert got["percentile_rank"].mean() == pytest.approx(0.5, abs=0.02)
+    assert got["human_top1"].mean() == pytest.approx(1 / 21, abs=0.015)
+    harmonic = np.mean(1.0 / np.arange(1, 21))
+    assert got["mrr"].mean() == pytest.approx(harmonic, abs=0.02)
+
+
+@given(seed=st.integers(0, 10**6))
+def test_no_scorer_beats_the_oracle(seed):
+    o = make(seed)
+    best = scene_metrics(*oracle_scorer(o), o)["top1_fde"]
+    np.testing.assert_array_equal(best, oracle_fde(o))
+    other = scene_metrics(*random_scorer(seed, o.fde.shape), o)
+    assert np.all(other["top1_fde"] >= best)
+    assert np.all(other["top3_fde"] >= best)
+
+
+def test_miss_threshold_at_its_two_points():
+    assert miss_threshold(5.0) == 6.0
+    assert miss_threshold(8.0) == 8.0
+    assert miss_threshold(6.5) == pytest.approx(7.0)
+
+
+def mean_nll(values, o, temperature):
+    some = o.feasible.any(axis=1)
+    found = scene_metrics(values, np.zeros(len(values)), o, temperature)
+    return found["nll"][some].mean()
+
+
+@settings(max_examples=10)
+@given(seed=st.integers(0, 10**6), noise=st.floats(0.3, 3.0))
+def test_fitted_temperature_is_where_scipy_finds_it(seed, noise):
+    o = make(seed, scenes=200)
+    rng = np.random.default_rng(seed)
+    values = -o.ade + noise * rng.normal(size=o.ade.shape)
+    found = minimize_scalar(
+        lambda u: mean_nll(values, o, math.exp(u)),
+        bounds=(-6.0, 8.0),
+        method="bounded",
+        options={"xatol": 1e-9},
+    )
+    got = fit_temperature(values, o)
+    assert math.log(got) == pytest.approx(found.x, abs=1e-5)
+
+
+@given(
+    seed=st.integers(0, 10**6), scale=st.floats(1e-8, 1e8), shift=st.floats(-5.0, 5.0)
+)
+def test_fitted_temperature_scales_with_the_values(seed, scale, shift):
+    o = make(seed, scenes=60)
+    rng = np.random.default_rng(seed)
+    values = -o.ade + rng.normal(size=o.ade.shape)
+    before = fit_temperature(values, o)
+    after = fit_temperature(scale * (values + shift), o)
+    assert after == pytest.approx(scale * before, rel=1e-7)
+    np.testing.assert_allclose(
+        scene_metrics(scale * values, np.zeros(60), o, scale * before)["nll"],
+        scene_metrics(values, np.zeros(60), o, before)["nll"],
+        rtol=1e-9,
+        atol=1e-12,
+    )
+
+
+def test_temperature_recovers_the_one_that_made_the_choices():
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=(20_000, 6))
+    noise = rng.gumbel(size=values.shape)
+    chosen = np.argmax(values / 0.4 + noise, axis=1)
+    ade = np.ones(values.shape)
+    ade[np.arange(chosen.size), chosen] = 0.0
+    o = dataclasses.replace(make(0, scenes=20_000, candidates=6, feasible=1.1), ade=ade)
+    assert fit_temperature(values, o) == pytest.approx(0.4, rel=0.03)
+
+
+def test_temperature_stays_finite_at_both_ends():
+    o = make(2, feasible=1.1)
+    sure = np.zeros(o.ade.shape)
+    sure[np.arange(30), np.argmin(o.ade, axis=1)] = 1.0
+    spread = sure.std(axis=1).mean()
+    assert fit_temperature(sure, o) == pytest.approx(1e-4 * spread, rel=1e-9)
+    assert fit_temperature(-sure, o) == pytest.approx(1e4 * spread, rel=1e-9)
+    assert fit_temperature(np.full(sure.shape, 3.3), o) == 1.0
+
+
+def test_bad_input_is_one_clear_line():
+    o = make(1)
+    values, human = random_scorer(0, o.fde.shape)
+    broken = values.copy()
+    broken[4] = np.nan
+    o = dataclasses.replace(o, feasible=np.ones_like(o.feasible))
+    with pytest.raises(InputError, match="NaN or infinity in 1 scenes, first 4"):
+        scene_metrics(broken, human, o)
+    with pytest.raises(InputError, match="values: shape"):
+        scene_metrics(values[:, :2], human, o)
+    with pytest.raises(InputError, match="temperature"):
+        scene_metrics(values, human, o, 0.0)
+    with pytest.raises(InputError, match="ade: shape"):
+        dataclasses.replace(o, ade=o.ade[:2])
+    with pytest.raises(InputError, match="fde: NaN"):
+        dataclasses.replace(o, fde=np.where(o.crash, np.nan, o.fde))
+    nothing = dataclasses.replace(o, feasible=np.zeros_like(o.feasible))
+    with pytest.raises(InputError, match="no scene has a candidate"):
+        fit_temperature(values, nothing)

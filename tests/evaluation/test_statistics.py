@@ -1,0 +1,273 @@
+"""Intervals and tests against scipy, closed forms and plain loops."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+from scipy.special import betainc
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.statistics import (
+    ClusterBootstrap,
+    bootstrap_median,
+    clopper_pearson,
+    combine_seeds,
+    holm,
+    incomplete_beta,
+    mcnemar_exact,
+    paired_difference,
+    rule_of_three,
+)
+
+
+def drawn_clusters(bootstrap, clusters):
+    """[n, C] how often each cluster was drawn, read through the public means."""
+    names = np.unique(clusters)
+    sizes = np.array([np.sum(clusters == c) for c in names])
+    assert np.all(sizes == sizes[0])  # then a mean is a share of draws
+    shares = [bootstrap.means((clusters == c).astype(float)) for c in names]
+    return np.stack(shares, axis=1) * names.size
+
+
+def test_resamples_are_multinomial_draws_of_whole_vehicles():
+    clusters = np.repeat(np.arange(6), 3)
+    drawn = drawn_clusters(ClusterBootstrap(clusters, 4000), clusters)
+    np.testing.assert_allclose(drawn, np.round(drawn), atol=1e-9)
+    np.testing.assert_allclose(drawn.sum(axis=1), 6.0)
+    np.testing.assert_allclose(drawn.mean(axis=0), 1.0, atol=0.08)
+    covariance = np.cov(drawn.T)
+    want = np.eye(6) - 1.0 / 6.0
+    np.testing.assert_allclose(covariance, want, atol=0.08)
+
+
+@given(seed=st.integers(0, 10**6), runs=st.integers(1, 4))
+def test_replicates_equal_a_loop_over_expanded_scenes(seed, runs):
+    rng = np.random.default_rng(seed)
+    size = 3
+    clusters = rng.permutation(np.repeat([7, -2, 40, 5], size))
+    values = rng.normal(size=(runs, clusters.size))
+    weight = rng.integers(1, 5, clusters.size).astype(float)
+    bootstrap = ClusterBootstrap(clusters, 8, seed)
+    drawn = np.round(drawn_clusters(bootstrap, clusters)).astype(int)
+    ones = np.zeros((runs, runs, clusters.size))
+    ones[np.arange(runs), np.arange(runs)] = 1.0
+    run_weight = np.stack([bootstrap.means(x) for x in ones], axis=1) * runs
+    got = bootstrap.means(values, weight)
+    medians = bootstrap.medians(values[0])
+    for i in range(8):
+        picked = [
+            s
+            for name, times in zip(np.unique(clusters), drawn[i], strict=True)
+            for _ in range(times)
+            for s in np.flatnonzero(clusters == name)
+        ]
+        ratios = [np.average(v[picked], weights=weight[picked]) for v in values]
+        want = np.mean([u * x for u, x in zip(run_weight[i], ratios, strict=True)])
+        assert got[i] == pytest.approx(want, abs=1e-12)
+        assert medians[i] == pytest.approx(np.median(values[0, picked]), abs=1e-12)
+
+
+def test_standard_error_of_single_scene_vehicles_is_the_textbook_one():
+    x = np.random.default_rng(0).normal(size=400)
+    found = combine_seeds(x, ClusterBootstrap(np.arange(400), 8000))
+    textbook = x.std() / np.sqrt(400)
+    assert found.value == pytest.approx(x.mean())
+    assert found.se == pytest.approx(textbook, rel=0.04)
+    assert found.low == pytest.approx(x.mean() - 1.96 * textbook, abs=0.1 * textbook)
+    assert found.high == pytest.approx(x.mean() + 1.96 * textbook, abs=0.1 * textbook)
+    assert found.seed_sd is None
+    assert found.seed_se is None
+
+
+def test_copies_of_a_scene_add_no_certainty():
+    x = np.random.default_rng(1).normal(size=50)
+    once = combine_seeds(x, np.arange(50))
+    copied = combine_seeds(np.repeat(x, 10), np.repeat(np.arange(50), 10))
+    assert copied.low == pytest.approx(once.low)
+    assert copied.high == pytest.approx(once.high)
+
+
+@pytest.mark.parametrize("runs", [2, 3, 10])
+def test_spread_between_runs_enters_the_interval_unbiased(runs):
+    offsets = np.random.default_rng(2).normal(size=runs)
+    values = np.repeat(offsets[:, None], 40, axis=1)
+    found = combine_seeds(values, ClusterBootstrap(np.arange(40), 8000))
+    assert found.seed_sd == pytest.approx(offsets.std(ddof=1))
+    assert found.seed_se == pytest.approx(offsets.std(ddof=1) / np.sqrt(runs))
+    assert found.se == pytest.approx(found.seed_se, rel=0.04)
+
+
+def test_runs_and_vehicles_add_in_variance():
+    rng = np.random.default_rng(3)
+    offsets, scenes = rng.normal(size=(8, 1)), rng.normal(size=(1, 60)) * 4.0
+    found = combine_seeds(offsets + scenes, ClusterBootstrap(np.arange(60), 8000))
+    want = np.hypot(offsets.std(ddof=1) / np.sqrt(8), scenes.std() / np.sqrt(60))
+    assert found.se == pytest.approx(want, rel=0.04)
+
+
+def clustered(rng, vehicles=40):
+    """Scenes of mean 0: a vehicle effect of sd 1 and scene noise of sd 1."""
+    sizes = rng.integers(2, 9, vehicles)
+    clusters = np.repeat(np.arange(vehicles), sizes)
+    return rng.normal(size=vehicles)[clusters] + rng.normal(size=sizes.sum()), clusters
+
+
+def test_interval_covers_the_truth_as_often_as_it_says():
+    rng = np.random.default_rng(4)
+    hits = naive = 0
+    for i in range(300):
+        x, clusters = clustered(rng)
+        found = combine_seeds(x, ClusterBootstrap(clusters, 400, seed=i))
+        hits += found.low <= 0.0 <= found.high
+        wrong = combine_seeds(x, ClusterBootstrap(np.arange(x.size), 400, seed=i))
+        naive += wrong.low <= 0.0 <= wrong.high
+    assert 0.90 <= hits / 300 <= 0.99
+    assert naive / 300 < 0.80  # scenes taken for independent: far too sure
+
+
+def test_interval_over_runs_and_vehicles_covers_the_truth():
+    rng = np.random.default_rng(5)
+    hits = 0
+    for i in range(250):
+        x, clusters = clustered(rng)
+        values = x + 0.3 * rng.normal(size=(8, 1)) + rng.normal(size=(8, x.size))
+        found = combine_seeds(values, ClusterBootstrap(clusters, 400, seed=i))
+        hits += found.low <= 0.0 <= found.high
+    assert 0.89 <= hits / 250 <= 0.99
+
+
+def test_paired_difference_sees_what_the_scenes_share():
+    rng = np.random.default_rng(6)
+    clusters = np.repeat(np.arange(60), 4)
+    hard = 5.0 * rng.normal(size=240)
+    a, b = hard + 0.1 * rng.normal(size=240), hard + 0.1 * rng.normal(size=240) + 0.05
+    found = paired_difference(a, b, clusters)
+    assert found.mean == pytest.approx(np.mean(a - b))
+    assert found.high < 0.0
+    assert found.p == pytest.approx(2 / 2001)
+    apart = np.hypot(*(combine_seeds(x, clusters).se for x in (a, b)))
+    assert found.se < 0.1 * apart
+    mirrored = paired_difference(b, a, clusters)
+    assert mirrored.mean == -found.mean
+    assert mirrored.low == pytest.approx(-found.high)
+    assert mirrored.p == found.p
+
+
+def test_no_difference_has_p_one_and_null_p_values_are_uniform():
+    clusters = np.repeat(np.arange(30), 2)
+    x = np.random.default_rng(7).normal(size=60)
+    same = paired_difference(x, x, clusters)
+    assert (same.mean, same.se, same.p) == (0.0, 0.0, 1.0)
+    rng = np.random.default_rng(8)
+    p = []
+    for i in range(250):
+        d, vehicles = clustered(rng)
+        bootstrap = ClusterBootstrap(vehicles, 400, seed=i)
+        p.append(paired_difference(d, np.zeros(d.size), bootstrap).p)
+    assert 0.01 <= np.mean(np.array(p) < 0.05) <= 0.11
+    assert np.mean(np.array(p) < 0.5) == pytest.approx(0.5, abs=0.1)
+
+
+@pytest.mark.parametrize("others", [5, 7])
+def test_paired_difference_counts_the_runs_of_both_sides(others):
+    rng = np.random.default_rng(9)
+    a, b = rng.normal(size=(5, 1)), rng.normal(size=(others, 1))
+    bootstrap = ClusterBootstrap(np.arange(20), 8000)
+    wide = np.ones((1, 20))
+    found = paired_difference(a * wide, b * wide, bootstrap)
+    want = np.hypot(a.std(ddof=1) / np.sqrt(5), b.std(ddof=1) / np.sqrt(others))
+    assert found.mean == pytest.approx(a.mean() - b.mean())
+    assert found.se == pytest.approx(want, rel=0.04)
+
+
+def test_median_interval_holds_the_median():
+    x, clusters = clustered(np.random.default_rng(10))
+    found = bootstrap_median(x, clusters)
+    assert found.value == np.median(x)
+    assert found.low < found.value < found.high
+    # binomial order statistics for independent scenes, as a closed form
+    y = np.sort(np.random.default_rng(11).exponential(size=200))
+    got = bootstrap_median(y, np.arange(200))
+    low, high = stats.binom.ppf([0.025, 0.975], 200, 0.5).astype(int)
+    assert y[low - 4] <= got.low <= y[low + 3]
+    assert y[high - 4] <= got.high <= y[high + 3]
+
+
+def test_same_seed_same_interval():
+    x, clusters = clustered(np.random.default_rng(12))
+    assert combine_seeds(x, clusters) == combine_seeds(x, clusters)
+    other = combine_seeds(x, ClusterBootstrap(clusters, seed=1))
+    assert other.low != combine_seeds(x, clusters).low
+
+
+@given(
+    x=st.floats(0.0, 1.0),
+    a=st.floats(0.05, 3000.0),
+    b=st.floats(0.05, 3000.0),
+)
+def test_incomplete_beta_equals_scipy(x, a, b):
+    assert incomplete_beta(x, a, b) == pytest.approx(betainc(a, b, x), abs=1e-11)
+
+
+@given(
+    n=st.integers(1, 20_000),
+    share=st.floats(0.0, 1.0),
+    confidence=st.sampled_from([0.8, 0.9, 0.95, 0.999]),
+)
+def test_clopper_pearson_equals_scipy(n, share, confidence):
+    k = round(share * n)
+    want = stats.binomtest(k, n).proportion_ci(confidence, method="exact")
+    low, high = clopper_pearson(k, n, confidence)
+    assert low == pytest.approx(want.low, rel=1e-7, abs=1e-12)
+    assert high == pytest.approx(want.high, rel=1e-7, abs=1e-12)
+
+
+@pytest.mark.parametrize("n", [1, 2, 20, 3420])
+def test_nothing_seen_in_n_trials(n):
+    exact = 1.0 - 0.05 ** (1.0 / n)
+    assert clopper_pearson(0, n, 0.90)[1] == pytest.approx(exact, rel=1e-10)
+    assert clopper_pearson(n, n, 0.90)[0] == pytest.approx(1.0 - exact, rel=1e-10)
+    assert exact <= rule_of_three(n) <= 1.0
+    assert rule_of_three(n) == min(1.0, 3.0 / n)
+
+
+@given(b=st.integers(0, 400), c=st.integers(0, 400))
+def test_mcnemar_equals_the_binomial_test(b, c):
+    want = stats.binomtest(b, b + c).pvalue if b + c else 1.0
+    assert mcnemar_exact(b, c) == pytest.approx(want, rel=1e-9, abs=1e-300)
+    assert mcnemar_exact(b, c) == mcnemar_exact(c, b)
+
+
+@given(st.lists(st.floats(0.0, 1.0), min_size=0, max_size=8))
+def test_holm_equals_the_step_down_rule(p):
+    adjusted = holm(np.array(p))
+    order = sorted(range(len(p)), key=lambda i: p[i])
+    for alpha in (0.01, 0.05, 0.3):
+        rejected = set()
+        for step, i in enumerate(order):
+            if p[i] * (len(p) - step) > alpha:
+                break
+            rejected.add(i)
+        assert {i for i in range(len(p)) if adjusted[i] <= alpha} == rejected
+
+
+def test_bad_input_is_refused():
+    with pytest.raises(InputError, match="at least 2"):
+        ClusterBootstrap(np.zeros(5, int))
+    bootstrap = ClusterBootstrap(np.arange(5))
+    with pytest.raises(InputError, match="expected"):
+        bootstrap.means(np.ones(4))
+    with pytest.raises(InputError, match="all finite"):
+        bootstrap.means(np.full(5, np.nan))
+    with pytest.raises(InputError, match="weight"):
+        bootstrap.means(np.ones(5), np.array([1.0, 1.0, 1.0, 1.0, 0.0]))
+    for bad in ((-1, 3), (4, 3), (0, 0)):
+        with pytest.raises(InputError, match="clopper_pearson"):
+            clopper_pearson(*bad)
+    with pytest.raises(InputError, match="holm"):
+        holm(np.array([0.2, np.nan]))
+    with pytest.raises(InputError, match="mcnemar"):
+        mcnemar_exact(-1, 2)
+    with pytest.raises(InputError, match="rule_of_three"):
+        rule_of_three(0)

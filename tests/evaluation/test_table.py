@@ -1,0 +1,247 @@
+"""The report: numbers traced back to the scenes, text that lines up."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation import (
+    Difference,
+    Outcomes,
+    build_report,
+    fit_temperature,
+    format_table,
+    oracle_scorer,
+    random_scorer,
+    scene_metrics,
+    to_json,
+)
+from rcirl_jax.evaluation.ranking import METRICS
+from rcirl_jax.evaluation.table import RIVALS, verdict
+
+SCENES, CANDIDATES, VEHICLES = 240, 12, 40
+
+
+@pytest.fixture(scope="module")
+def outcomes():
+    rng = np.random.default_rng(0)
+    shape = (SCENES, CANDIDATES)
+    fde = rng.gamma(2.0, 2.0, shape)
+    return Outcomes(
+        fde=fde,
+        ade=0.4 * fde,
+        crash=rng.random(shape) < 0.2,
+        feasible=rng.random(shape) < 0.8,
+        cluster=rng.permutation(np.arange(SCENES) % VEHICLES),
+        human_crash=np.zeros(SCENES, bool),
+    )
+
+
+def scored(outcomes, noise, seed, crash_weight=0.0):
+    rng = np.random.default_rng(seed)
+    values = -outcomes.fde - crash_weight * outcomes.crash
+    values = values + noise * rng.normal(size=values.shape)
+    human = noise * rng.normal(size=SCENES)
+    return scene_metrics(values, human, outcomes, fit_temperature(values, outcomes))
+
+
+@pytest.fixture(scope="module")
+def scorers(outcomes):
+    return {
+        "rc-irl": [scored(outcomes, 1.0, s, 100.0) for s in range(3)],
+        "twin": [scored(outcomes, 2.0, 50)],
+        "random": [scene_metrics(*random_scorer(0, outcomes.fde.shape), outcomes)],
+        "constant speed": [scored(outcomes, 4.0, 60)],
+        "IDM": [scored(outcomes, 3.0, 70)],
+        "hand-set": [scored(outcomes, 2.0, 80)],
+        "oracle": [scene_metrics(*oracle_scorer(outcomes), outcomes)],
+    }
+
+
+@pytest.fixture(scope="module")
+def report(scorers, outcomes):
+    group = outcomes.cluster % 5
+    return build_report(scorers, outcomes, group=group, num_resamples=500)
+
+
+def test_estimates_are_plain_means_over_runs_and_scenes(report, scorers):
+    for name, runs in scorers.items():
+        for metric, how in METRICS.items():
+            weight = runs[0][how.weight] if how.weight else None
+            means = [np.average(run[metric], weights=weight) for run in runs]
+            found = report.rows[name][metric]
+            assert found.value == pytest.approx(np.mean(means), abs=1e-12)
+            assert found.low <= found.value + 1e-12
+            assert found.high >= found.value - 1e-12
+            if len(runs) == 1:
+                assert found.seed_sd is None
+            else:
+                assert found.seed_sd == pytest.approx(np.std(means, ddof=1))
+
+
+def test_counts_and_oracle_floor(report, outcomes):
+    assert report.counts == {
+        "scenes": SCENES,
+        "vehicles": VEHICLES,
+        "groups": 5,
+        "candidates": SCENES * CANDIDATES,
+        "feasible": int(outcomes.feasible.sum()),
+    }
+    best = [min(d[ok]) for d, ok in zip(outcomes.fde, outcomes.feasible, strict=True)]
+    assert report.oracle_floor.value == pytest.approx(np.mean(best))
+    assert report.oracle_floor_median.value == pytest.approx(np.median(best))
+    assert report.rows["oracle"]["top1_fde"].value == report.oracle_floor.value
+
+
+def test_differences_are_row_minus_reference(report, scorers):
+    compared = [name for name, how in METRICS.items() if how.compared]
+    pairs = {(c.row, c.reference) for c in report.comparisons}
+    assert pairs == {
+        (row, name) for name in ("hand-set", "random") for row in scorers if row != name
+    }
+    assert len(report.comparisons) == len(pairs) * len(compared)
+    for c in report.comparisons:
+        ours = np.mean([run[c.metric].mean() for run in scorers[c.row]])
+        theirs = np.mean([run[c.metric].mean() for run in scorers[c.reference]])
+        assert c.difference.mean == pytest.approx(ours - theirs, abs=1e-12)
+        assert c.p_holm >= c.difference.p
+    found = {(c.row, c.reference, c.metric): c.verdict for c in report.comparisons}
+    assert found["rc-irl", "random", "top1_fde"] == "better"
+    assert found["rc-irl", "random", "percentile_rank"] == "better"
+    assert found["twin", "hand-set", "top1_fde"] == "no difference"
+    assert found["random", "hand-set", "mrr"] == "worse"
+
+
+@pytest.mark.parametrize(
+    ("mean", "higher_is_better", "word"),
+    [
+        (0.21, True, "better"),
+        (0.21, False, "worse"),
+        (-0.21, True, "worse"),
+        (-0.21, False, "better"),
+        (0.19, True, "no difference"),
+        (-0.19, False, "no difference"),
+    ],
+)
+def test_a_word_needs_more_than_two_standard_errors(mean, higher_is_better, word):
+    d = Difference(mean=mean, low=-1.0, high=1.0, se=0.1, p=0.5)
+    assert verdict(d, higher_is_better) == word
+
+
+def test_no_spread_and_no_difference_is_no_difference():
+    d = Difference(mean=0.0, low=0.0, high=0.0, se=0.0, p=1.0)
+    assert verdict(d, True) == "no difference"
+
+
+def test_rates_at_the_ends_carry_the_exact_bound_of_vehicles(report):
+    bound = 1.0 - 0.05 ** (1.0 / VEHICLES)
+    crash = report.rows["rc-irl"]["crash_rate"]
+    assert crash.exact
+    assert (crash.value, crash.low) == (0.0, 0.0)
+    assert crash.high == pytest.approx(bound)
+    rank = report.rows["oracle"]["percentile_rank"]
+    assert rank.exact
+    assert (rank.value, rank.high) == (1.0, 1.0)
+    assert rank.low == pytest.approx(1.0 - bound)
+    assert not report.rows["random"]["crash_rate"].exact
+    text = format_table(report)
+    assert f"0 (<= {100 * bound:.1f})" in text
+    assert f"100 (>= {100 - 100 * bound:.1f})" in text
+
+
+@pytest.mark.parametrize("width", [100, 110, 120])
+def test_table_fits_lines_up_and_orders_its_rows(report, width):
+    lines = format_table(report, width).splitlines()
+    assert max(len(line) for line in lines) <= width
+    table = lines[: next(i for i, x in enumerate(lines) if x.startswith("Paired"))]
+    assert max(len(line) for line in table) <= width
+    rules = [i for i, line in enumerate(table) if line.startswith("---")]
+    assert len(rules) >= 2
+    for at in rules:
+        block = table[at - 2 : at + 1 + len(report.rows) + 1]  # one spread line
+        names = [line[:24].strip() for line in block[3:]]
+        starts = [n for n in names if not n.startswith("sd over")]
+        order = ("rc-irl", "twin", *RIVALS)
+        assert all(n.startswith(o) for n, o in zip(starts, order, strict=True))
+        ends = {len(line) for line in block if not line.startswith("  sd")}
+        assert ends == {len(table[at])}  # right-aligned to the rule
+    for how in METRICS.values():
+        assert how.title in "\n".join(table)
+
+
+def test_table_prints_the_numbers_of_the_report(report):
+    text = format_table(report)
+    found = report.rows["hand-set"]["top1_fde"]
+    assert f"{found.value:.2f} [{found.low:.2f}, {found.high:.2f}]" in text
+    assert "rc-irl (3 runs)" in text
+    assert "sd over runs" in text
+    for c in report.comparisons:
+        if c.row not in RIVALS and c.metric == "top1_fde":
+            assert f"{c.difference.mean:+.3f} [" in text
+    assert "rc-irl minus hand-set" in text
+    assert "IDM minus hand-set" not in text
+
+
+def test_rivals_alone_are_compared_with_each_other(scorers, outcomes):
+    some = {name: scorers[name] for name in ("random", "hand-set")}
+    text = format_table(build_report(some, outcomes, num_resamples=100))
+    assert "random minus hand-set" in text
+    assert "hand-set minus random" in text
+    alone = build_report({"IDM": scorers["IDM"]}, outcomes, num_resamples=100)
+    assert alone.comparisons == ()
+    assert "Paired" not in format_table(alone)
+
+
+def test_a_tiny_rate_is_not_printed_as_zero(report):
+    rows = {name: dict(row) for name, row in report.rows.items()}
+    rows["IDM"]["miss"] = dataclasses.replace(
+        rows["IDM"]["miss"], value=0.0003, low=0.0, high=0.9999, exact=False
+    )
+    text = format_table(dataclasses.replace(report, rows=rows))
+    assert "0.03 [0.0, 99.99]" in text
+
+
+def test_few_vehicles_are_said(scorers, outcomes):
+    few = dataclasses.replace(outcomes, cluster=outcomes.cluster % 6)
+    text = format_table(build_report(scorers, few, num_resamples=100))
+    assert "Fewer than 20 vehicles" in text
+
+
+def test_json_is_plain_versioned_and_complete(report):
+    made = to_json(report)
+    again = json.loads(json.dumps(made, allow_nan=False))
+    assert again == made
+    assert made["schema"] == "rcirl-jax/ranking-report"
+    assert made["schema_version"] == 1
+    assert made["miss_threshold_m"] == 6.0
+    assert made["failure_m"] == 10.0
+    assert set(made["rows"]["rc-irl"]) == set(METRICS) == set(made["metrics"])
+    found = report.rows["rc-irl"]["top1_fde"]
+    assert made["rows"]["rc-irl"]["top1_fde"] == dataclasses.asdict(found)
+    assert made["rows"]["IDM"]["top1_fde"]["seed_sd"] is None
+    assert len(made["comparisons"]) == len(report.comparisons)
+
+
+def test_json_refuses_what_is_not_finite(report):
+    broken = dataclasses.replace(report.oracle_floor, se=float("nan"))
+    with pytest.raises(InputError, match=r"oracle_floor\.se: nan"):
+        to_json(dataclasses.replace(report, oracle_floor=broken))
+
+
+def test_bad_input_is_refused(scorers, outcomes, report):
+    with pytest.raises(InputError, match="at least one row"):
+        build_report({}, outcomes)
+    with pytest.raises(InputError, match="references: nobody"):
+        build_report(scorers, outcomes, references=["nobody"])
+    with pytest.raises(InputError, match="IDM: no runs"):
+        build_report({"IDM": []}, outcomes)
+    lacking = {k: v for k, v in scorers["IDM"][0].items() if k != "mrr"}
+    with pytest.raises(InputError, match="IDM: mrr: missing"):
+        build_report({"IDM": [lacking]}, outcomes)
+    short = {k: v[:5] for k, v in scorers["IDM"][0].items()}
+    with pytest.raises(InputError, match="not of 240 scenes"):
+        build_report({"IDM": [scorers["IDM"][0], short]}, outcomes)
+    with pytest.raises(InputError, match="width"):
+        format_table(report, 99)

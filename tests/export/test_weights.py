@@ -1,0 +1,432 @@
+"""The written file: same input same bytes, atomic, exact, described by its schema."""
+
+import base64
+import dataclasses
+import hashlib
+import json
+import math
+import os
+import stat
+import struct
+from itertools import pairwise
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import jsonschema
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.export import (
+    FeatureSpec,
+    RewardWeights,
+    WeightsError,
+    decode_weights,
+    load_weights,
+    pack,
+    reader,
+    save,
+    to_json,
+)
+from rcirl_jax.features.mapping import feature_map
+from rcirl_jax.reward.network import LEAKY_SLOPE, RewardConfig, init_reward, pinned
+from rcirl_jax.reward.network import value as trained_value
+from rcirl_jax.reward.normaliser import Normaliser
+from rcirl_jax.specs import spec_root
+from rcirl_jax.units import TIMES_S
+
+ACTIVATIONS = tuple(reader.ACTIVATIONS)
+
+
+def provenance():
+    return {
+        "dataset_sha256": "0" * 64,
+        "git_commit": "2fe49aa",
+        "seed": 7,
+        "flags": {"loss": "rank", "hidden": [15], "resume": False},
+        "metrics": {"pairwise_accuracy": np.float32(0.75), "steps": np.int64(10)},
+        "versions": {"rcirl_jax": "0.1.0"},
+        "created": "2026-11-21T00:00:00Z",
+    }
+
+
+def example_weights(seed=0, features=3, times=4, hidden=(5,), activation="tanh"):
+    rng = np.random.default_rng(seed)
+    sizes = (features, *hidden, 1)
+    draw = lambda *shape: rng.normal(size=shape).astype(np.float32)  # noqa: E731
+    return RewardWeights(
+        preset="test",
+        features=tuple(
+            FeatureSpec(
+                name=f"feature{i}", unit="m/s²" if i else "m", none_value=10 * i
+            )
+            for i in range(features)
+        ),
+        lower=-1.0 - rng.random(features, np.float32),
+        upper=1.0 + rng.random(features, np.float32),
+        location=draw(features),
+        scale=0.5 + rng.random(features, np.float32),
+        times=np.linspace(0.0, 8.0, times, dtype=np.float32),
+        gamma=draw(times),
+        kernels=tuple(draw(*pair) for pair in pairwise(sizes)),
+        biases=tuple(draw(size) for size in sizes[1:]),
+        activation=activation,
+        leaky_slope=0.01,
+        loss={"name": "rank", "leaky_rate": 0.05},
+        provenance=provenance(),
+    )
+
+
+def example_samples(weights, count=4, seed=1):
+    """Features that often leave [lower, upper], masks, float64 values."""
+    rng = np.random.default_rng(seed)
+    size = (count, len(weights.times), len(weights.features))
+    features = rng.normal(scale=2.0, size=size).astype(np.float32)
+    valid = rng.random(size[:2]) < 0.7
+    values = [loop_value(weights, *one) for one in zip(features, valid, strict=True)]
+    return features, valid, np.array(values)
+
+
+def packed(**changes):
+    weights = example_weights(**changes)
+    return pack(weights, *example_samples(weights))
+
+
+def loop_value(weights, features, valid):
+    """V by plain float64 loops, from the equation and nothing else."""
+    act = {
+        "tanh": math.tanh,
+        "relu": lambda x: x if x > 0.0 else 0.0,
+        "leaky_relu": lambda x: x if x > 0.0 else float(weights.leaky_slope) * x,
+        "identity": lambda x: x,
+    }[weights.activation]
+    total = 0.0
+    for t in range(len(weights.times)):
+        x = []
+        for f in range(len(weights.features)):
+            clipped = max(float(features[t, f]), float(weights.lower[f]))
+            clipped = min(clipped, float(weights.upper[f]))
+            x.append((clipped - float(weights.location[f])) / float(weights.scale[f]))
+        for layer in range(len(weights.kernels)):
+            kernel, bias = weights.kernels[layer], weights.biases[layer]
+            y = []
+            for column in range(kernel.shape[1]):
+                start = float(bias[column])
+                products = [
+                    x[row] * float(kernel[row, column]) for row in range(len(x))
+                ]
+                y.append(start + sum(products))
+            last = layer == len(weights.kernels) - 1
+            x = y if last else [act(item) for item in y]
+        total += float(weights.gamma[t]) * x[0] if valid[t] else 0.0
+    return total
+
+
+@settings(max_examples=40)
+@given(
+    seed=st.integers(0, 10**6),
+    features=st.integers(1, 6),
+    times=st.integers(1, 5),
+    hidden=st.lists(st.integers(1, 5), max_size=3),
+    activation=st.sampled_from(ACTIVATIONS),
+)
+def test_file_scores_as_the_float64_loops(seed, features, times, hidden, activation):
+    weights = example_weights(seed, features, times, tuple(hidden), activation)
+    own = example_samples(weights, seed=seed)
+    reward = decode_weights(pack(weights, *own))
+    other, valid, values = example_samples(weights, count=6, seed=seed + 1)
+    found = reward.value(other, valid)
+    assert found.dtype == np.float32
+    assert np.all(np.abs(found - values) <= 1e-5 * np.maximum(1.0, np.abs(values)))
+
+
+@pytest.mark.parametrize("hidden", [(), (15,), (16, 8)])
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+def test_thousand_inputs_equal_the_trained_network(activation, hidden):
+    """The file carries the EFFECTIVE weights: the trainer pins raw ones itself."""
+    specs = feature_map("paper21").specs
+    rng = np.random.default_rng(3)
+    lower = np.array([spec.lower for spec in specs], np.float32)
+    upper = np.array([spec.upper for spec in specs], np.float32)
+    location = rng.uniform(lower, upper).astype(np.float32)
+    scale = (0.2 * (upper - lower)).astype(np.float32)
+    config = RewardConfig(hidden=hidden, activation=activation, pin="unit")
+    raw = init_reward(jax.random.key(5), len(specs), config)
+    raw = raw.replace(gamma=jnp.asarray(rng.normal(size=18), jnp.float32))
+    effective = pinned(raw, config)
+    normaliser = Normaliser(
+        lower=jnp.asarray(lower),
+        upper=jnp.asarray(upper),
+        location=jnp.asarray(location),
+        scale=jnp.asarray(scale),
+    )
+    wide = 0.5 * (upper - lower)
+    features = rng.uniform(lower - wide, upper + wide, (1000, 18, len(specs)))
+    features = features.astype(np.float32)
+    valid = np.arange(18) < rng.integers(11, 19, (1000, 1))
+    expected = np.asarray(
+        trained_value(
+            raw, normaliser, jnp.asarray(features), jnp.asarray(valid), config
+        )
+    )
+    weights = dataclasses.replace(
+        example_weights(),
+        features=tuple(
+            FeatureSpec(name=spec.name, unit=spec.unit, none_value=spec.none)
+            for spec in specs
+        ),
+        lower=normaliser.lower,
+        upper=normaliser.upper,
+        location=normaliser.location,
+        scale=normaliser.scale,
+        times=TIMES_S,
+        gamma=effective.gamma,
+        kernels=effective.kernels,
+        biases=(*effective.biases, np.zeros(1)),
+        activation=activation,
+        leaky_slope=LEAKY_SLOPE,
+    )
+    data = pack(weights, features[:16], valid[:16], expected[:16])
+    found = decode_weights(data).value(features, valid)
+    assert np.ptp(expected) > 0.1
+    assert np.all(np.abs(found - expected) <= 1e-5 * np.maximum(1.0, np.abs(expected)))
+
+
+def test_everything_comes_back_as_it_was_given():
+    weights = example_weights(hidden=(4, 2), activation="leaky_relu")
+    reward = decode_weights(pack(weights, *example_samples(weights)))
+    for name in ("lower", "upper", "location", "scale", "times", "gamma"):
+        np.testing.assert_array_equal(getattr(reward, name), getattr(weights, name))
+        assert not getattr(reward, name).flags.writeable
+    for name in ("kernels", "biases"):
+        for found, given_array in zip(
+            getattr(reward, name), getattr(weights, name), strict=True
+        ):
+            np.testing.assert_array_equal(found, given_array)
+    assert reward.names == tuple(spec.name for spec in weights.features)
+    assert reward.units == tuple(spec.unit for spec in weights.features)
+    assert reward.none_values == tuple(spec.none_value for spec in weights.features)
+    assert (reward.activation, reward.leaky_slope) == ("leaky_relu", 0.01)
+    assert reward.preset == "test"
+    assert reward.loss == weights.loss
+    assert reward.provenance == provenance()
+    assert type(reward.provenance["metrics"]["steps"]) is int
+
+
+def test_same_input_same_bytes_whatever_the_order_of_keys(tmp_path):
+    weights = example_weights()
+    samples = example_samples(weights)
+    turned = {key: provenance()[key] for key in reversed(provenance())}
+    turned["flags"] = dict(reversed(list(turned["flags"].items())))
+    other = dataclasses.replace(
+        weights, provenance=turned, loss={"leaky_rate": 0.05, "name": "rank"}
+    )
+    first, second = tmp_path / "a.msgpack", tmp_path / "b.msgpack"
+    reward = save(first, weights, *samples)
+    save(second, other, *samples)
+    assert first.read_bytes() == second.read_bytes() == pack(weights, *samples)
+    assert reward.sha256 == load_weights(second).sha256
+    assert pack(example_weights(seed=9), *example_samples(example_weights(seed=9))) != (
+        first.read_bytes()
+    )
+
+
+def test_layout_is_the_documented_one():
+    data = packed()
+    # 14 fixed bytes, so that `file` and a hex dump tell the format.
+    assert data[:15] == b"\x84\xa5magic\xa6RCIRLW\xae"
+    outer = msgpack.unpackb(data)
+    assert tuple(outer) == ("magic", "schema_version", "body", "sha256")
+    assert (outer["magic"], outer["schema_version"]) == ("RCIRLW", 1)
+    assert outer["sha256"] == hashlib.sha256(outer["body"]).hexdigest()
+    body = msgpack.unpackb(outer["body"])
+    assert tuple(body) == reader.BODY_KEYS
+    kernel = body["layers"][0]["kernel"]
+    assert (kernel["shape"], kernel["dtype"]) == ([3, 5], "<f4")
+    weights = example_weights()
+    found = np.frombuffer(kernel["data"], "<f4").reshape(3, 5)
+    np.testing.assert_array_equal(found, weights.kernels[0])
+
+
+def test_a_reader_written_from_the_page_scores_the_samples():
+    """docs/weights_format.md and nothing else: msgpack, struct, loops."""
+    outer = msgpack.unpackb(packed(hidden=(4, 2), activation="leaky_relu"))
+    body = msgpack.unpackb(outer["body"])
+
+    def numbers(box):
+        count = math.prod(box["shape"])
+        return np.reshape(struct.unpack(f"<{count}f", box["data"]), box["shape"])
+
+    found = SimpleNamespace(
+        features=body["features"],
+        times=numbers(body["times"]),
+        gamma=numbers(body["gamma"]),
+        **{key: numbers(box) for key, box in body["normaliser"].items()},
+        kernels=[numbers(layer["kernel"]) for layer in body["layers"]],
+        biases=[numbers(layer["bias"]) for layer in body["layers"]],
+        activation=body["activation"],
+        leaky_slope=body["leaky_slope"],
+    )
+    features, valid, values = (numbers(box) for box in body["samples"].values())
+    scored = [loop_value(found, *one) for one in zip(features, valid, strict=True)]
+    np.testing.assert_allclose(scored, values, rtol=1e-5, atol=1e-5)
+
+
+def test_arrays_in_another_memory_order_are_the_same_file():
+    weights = example_weights()
+    turned = tuple(np.asfortranarray(kernel) for kernel in weights.kernels)
+    other = dataclasses.replace(weights, kernels=turned)
+    assert pack(other, *example_samples(weights)) == packed()
+
+
+def test_schema_describes_the_body_and_refuses_others():
+    path = spec_root() / "reward_weights.schema.json"
+    schema = json.loads(path.read_text(encoding="utf-8"))
+    jsonschema.Draft202012Validator.check_schema(schema)
+    validator = jsonschema.Draft202012Validator(schema)
+    body = to_json(packed(hidden=(4, 2)))
+    validator.validate(body)
+    json.dumps(body, allow_nan=False)
+    gamma = np.frombuffer(base64.b64decode(body["gamma"]["data"]), "<f4")
+    np.testing.assert_array_equal(gamma, example_weights(hidden=(4, 2)).gamma)
+    assert set(schema["required"]) == set(schema["properties"]) == set(reader.BODY_KEYS)
+    assert schema["properties"]["activation"]["enum"] == sorted(ACTIVATIONS)
+    for key in reader.BODY_KEYS:
+        assert not validator.is_valid({k: v for k, v in body.items() if k != key})
+        assert not validator.is_valid({**body, key: True})
+    assert not validator.is_valid({**body, "extra": 1})
+    assert not validator.is_valid({**body, "gamma": {**body["gamma"], "dtype": "<f8"}})
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"scale": np.array([1.0, 0.0, 1.0])}, "normaliser.scale[1]: 0: expected over"),
+        ({"lower": np.array([0.0, 99.0, 0.0])}, "normaliser.lower[1]: 99: expected at"),
+        ({"gamma": np.ones(5)}, "gamma.shape: [5]: expected [4]"),
+        ({"gamma": np.array([1.0, 1.0, 1e39, 1.0])}, "gamma[2]: inf: expected finite"),
+        ({"gamma": "many"}, "gamma: <U4: expected an array of numbers"),
+        ({"gamma": [[1.0], [1.0, 2.0]]}, "gamma: setting an array element"),
+        ({"times": np.array([0.0, 1.0, 1.0, 2.0])}, "times[1]: 1: expected increasing"),
+        ({"times": np.arange(1.0, 5.0)}, "times[0]: 1: expected 0 s first"),
+        ({"activation": "gelu"}, "activation: gelu: expected one of tanh"),
+        ({"biases": ()}, "biases: 0 biases: expected one for each kernel"),
+        ({"preset": 3}, "preset: 3: expected a text"),
+        ({"preset": object()}, "can not serialize"),
+        ({"features": ()}, "features: list of 0: expected a list of 1 to 64"),
+        ({"loss": {"name": "rank"}}, "loss.leaky_rate: missing: expected the keys"),
+        ({"provenance": {}}, "provenance.dataset_sha256: missing: expected a value"),
+        (
+            {"provenance": {**provenance(), "metrics": {"fde": math.nan}}},
+            "provenance: nan: expected texts, finite numbers",
+        ),
+        (
+            {"provenance": {**provenance(), "seed": 2**70}},
+            "Integer value out of range",
+        ),
+        (
+            {"provenance": {**provenance(), "flags": {1: 2}}},
+            "provenance.flags: key 1: expected a text",
+        ),
+        (
+            {"provenance": {**provenance(), "flags": {"a": b"x"}}},
+            "provenance.flags.a: bytes: expected texts, numbers",
+        ),
+    ],
+)
+def test_what_a_reader_would_refuse_is_never_written(changes, message, tmp_path):
+    weights = example_weights()
+    samples = example_samples(weights)
+    path = tmp_path / "weights.msgpack"
+    with pytest.raises(InputError) as caught:
+        save(path, dataclasses.replace(weights, **changes), *samples)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert message in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_samples_of_other_weights_are_refused():
+    weights = example_weights()
+    features, valid, values = example_samples(weights)
+    values[2] += 1e-4 * max(1.0, abs(values[2]))
+    with pytest.raises(InputError, match=r"weights: samples\[2\]: scored"):
+        pack(weights, features, valid, values)
+    none = (features[:0], valid[:0], values[:0])
+    with pytest.raises(InputError, match=r"samples.value.shape: \[0\]: expected"):
+        pack(weights, *none)
+
+
+def test_deep_or_endless_provenance_is_one_clear_line():
+    endless: dict = {}
+    endless["self"] = endless
+    weights = dataclasses.replace(
+        example_weights(), provenance={**provenance(), "flags": endless}
+    )
+    with pytest.raises(InputError, match="at most 8 levels"):
+        pack(weights, *example_samples(weights))
+
+
+def test_interrupted_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
+    path = tmp_path / "weights.msgpack"
+    weights = example_weights()
+    save(path, weights, *example_samples(weights))
+    before = path.read_bytes()
+    seen = []
+
+    def fail(source, target):
+        seen.append((source.parent, target, source.read_bytes()))
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", fail)
+    other = example_weights(seed=8)
+    with pytest.raises(InputError, match="path: No space left on device: expected"):
+        save(path, other, *example_samples(other))
+    # The whole file was there, in the same folder, before it took the name.
+    assert seen == [(tmp_path, path, pack(other, *example_samples(other)))]
+    assert [item.name for item in tmp_path.iterdir()] == ["weights.msgpack"]
+    assert path.read_bytes() == before
+
+
+def test_file_and_folder_are_on_disk_before_save_returns(tmp_path, monkeypatch):
+    synced = []
+    real = os.fsync
+
+    def record(descriptor):
+        mode = os.fstat(descriptor).st_mode
+        synced.append("folder" if stat.S_ISDIR(mode) else "file")
+        real(descriptor)
+
+    monkeypatch.setattr(os, "fsync", record)
+    weights = example_weights()
+    save(tmp_path / "weights.msgpack", weights, *example_samples(weights))
+    assert synced == ["file", "folder"]
+    assert (tmp_path / "weights.msgpack").stat().st_mode & 0o077 == (
+        0o077 & 0o666 & ~_umask()
+    )
+
+
+def _umask():
+    mask = os.umask(0o022)
+    os.umask(mask)
+    return mask
+
+
+@pytest.mark.parametrize("where", ["missing/weights.msgpack", "folder", "file/weights"])
+def test_bad_places_are_one_line(tmp_path, where):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").write_text("x")
+    weights = example_weights()
+    with pytest.raises(InputError) as caught:
+        save(tmp_path / where, weights, *example_samples(weights))
+    assert str(caught.value).startswith(f"{tmp_path / where}: path: ")
+    assert "\n" not in str(caught.value)
+    assert len(list(tmp_path.rglob("*"))) == 2
+
+
+def test_to_json_refuses_what_the_reader_refuses():
+    with pytest.raises(WeightsError, match="weights: size"):
+        to_json(b"")
