@@ -32,7 +32,7 @@ def run(main: Callable[[], None]) -> None:
 
 
 def _parse(argv: list[str]) -> list[str]:
-    """absl's parser, with its complaints as one line."""
+    """Absl's parser, with its complaints as one line."""
     try:
         return app.parse_flags_with_usage(argv)
     except flags.Error as error:  # pragma: no cover - absl exits by itself

@@ -29,7 +29,7 @@ _OUTPUT = flags.DEFINE_string("output", None, "dataset to write", required=True)
 _OVERWRITE = flags.DEFINE_bool("overwrite", False, "replace a finished dataset")
 _STRIDE = flags.DEFINE_float("stride", 0.5, "s between planning frames of a driver")
 _MIN_FUTURE = flags.DEFINE_float("min_future", 5.2, "s of recording a scene needs")
-_SMOOTHING = flags.DEFINE_float("smoothing", 2.1, "s, window of the position filter")
+_SMOOTHING = flags.DEFINE_float("smoothing", 4.1, "s, window of the position filter")
 _KEEP_STEADY = flags.DEFINE_bool(
     "keep_steady", False, "keep scenes without speed change (the paper drops them)"
 )

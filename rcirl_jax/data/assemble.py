@@ -1,6 +1,7 @@
 """Flat rows of one scene each -> one batched Demonstration of numpy arrays."""
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,11 +16,11 @@ CHUNK = 512  # scenes per device call; padded, so that it compiles once
 def stack_scenes(rows: list[dict]) -> Scene:
     """Scenes [n, ...] from flat rows; floats become float32."""
 
-    def leaf(name: str) -> np.ndarray:
+    def leaf(name: str) -> Any:  # noqa: ANN401
         values = np.array([row[name] for row in rows])
         return values.astype(np.float32) if values.dtype.kind == "f" else values
 
-    def node(kind: type, prefix: str) -> object:
+    def node(kind: type, prefix: str) -> Any:  # noqa: ANN401
         names = kind.__dataclass_fields__
         return kind(**{name: leaf(f"{prefix}.{name}") for name in names})
 
@@ -67,14 +68,17 @@ def assemble(
     scene = stack_scenes(rows)
     s = np.array([row["human.s"] for row in rows], np.float32)
     l = np.array([row["human.l"] for row in rows], np.float32)
+    leaves: dict[str, Any] = {
+        "decisions": np.array([row["decisions"] for row in rows], np.int32),
+        "future_s": np.array([row["future_s"] for row in rows], np.float32),
+        "s_at_5s": np.array([row["s_at_5s"] for row in rows], np.float32),
+        "vehicle": np.array(vehicles, np.int32),
+        "recording": np.full(len(rows), recording, np.int32),
+        "group": np.array(groups, np.int32),
+        "frame": np.array([row["frame"] for row in rows], np.int32),
+    }
     return Demonstration(
         scene=scene,
         human=human_trajectories(scene, s, l),
-        decisions=np.array([row["decisions"] for row in rows], np.int32),
-        future_s=np.array([row["future_s"] for row in rows], np.float32),
-        s_at_5s=np.array([row["s_at_5s"] for row in rows], np.float32),
-        vehicle=np.array(vehicles, np.int32),
-        recording=np.full(len(rows), recording, np.int32),
-        group=np.array(groups, np.int32),
-        frame=np.array([row["frame"] for row in rows], np.int32),
+        **leaves,
     )

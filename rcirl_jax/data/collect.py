@@ -128,7 +128,7 @@ class Collector:
             "ego.length": smooth.track.length,
             "ego.width": smooth.track.width,
             "path.kappa": frame.on_grid("kappa", stations),
-            "path.l": given_path(view, number, start, motion.s0),
+            "path.l": given_path(view, number, start, motion.s0, frame.length),
             "time_valid": motion.future_s + 1e-6 >= TIMES_S,
             "human.s": motion.s,
             "human.l": motion.l,
@@ -159,7 +159,7 @@ class Collector:
         )
         seen[number] = False
         boxes = [
-            self._box(view, other, clock, motion) for other in np.flatnonzero(seen)
+            self._box(view, int(other), clock, motion) for other in np.flatnonzero(seen)
         ]
         found = [box for box in boxes if box is not None]
         found.sort(key=lambda box: box["relevance"])

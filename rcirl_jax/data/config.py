@@ -10,7 +10,7 @@ class CollectConfig:
     """How scenes are cut out of recordings."""
 
     # s, window of the Savitzky-Golay filter on positions
-    smoothing_s: float = 2.1
+    smoothing_s: float = 4.1
     # s between planning frames of one driver
     stride_s: float = 0.5
     # s of recording before a planning frame

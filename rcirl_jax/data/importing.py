@@ -10,6 +10,7 @@ import dataclasses
 import hashlib
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -105,7 +106,10 @@ class _Import:
         rows = list(collector.scenes())
         report = QualityReport()
         report.add_recording(collector)
-        entry = {"name": recording.name, "sha256": digest(recording)}
+        entry: dict[str, Any] = {
+            "name": recording.name,
+            "sha256": self._digest(recording),
+        }
         entry["vehicles"], entry["groups"] = self._names(recording, rows)
         if rows:
             block = assemble(
@@ -123,6 +127,12 @@ class _Import:
             self._close_shard()
         return len(rows)
 
+    def _digest(self, recording: Recording) -> str:
+        """Of the recording and of how it is cut, so that no import mixes both."""
+        return hashlib.sha256(
+            (digest(recording) + repr(self.config.collect)).encode()
+        ).hexdigest()
+
     def _names(self, recording: Recording, rows: list[dict]) -> tuple[list, list]:
         tracks = [recording.tracks[row["track"]] for row in rows]
         vehicles = [f"{group_name(recording, t.t[0])}:{t.id}" for t in tracks]
@@ -136,10 +146,11 @@ class _Import:
 
     def _replay(self, entry: dict, recording: Recording) -> int:
         """Take over what a committed shard already holds of this recording."""
-        if entry["name"] != recording.name or entry["sha256"] != digest(recording):
+        expected = (recording.name, self._digest(recording))
+        if (entry["name"], entry["sha256"]) != expected:
             raise InputError(
-                f"{recording.name}: input changed since the interrupted import: "
-                "expected the same files; start over with --overwrite"
+                f"{recording.name}: input or settings changed since the interrupted "
+                "import: expected the same; use another --output"
             )
         for vehicle, group in zip(entry["vehicles"], entry["groups"], strict=True):
             self.vehicles.of(vehicle)

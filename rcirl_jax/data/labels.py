@@ -41,7 +41,7 @@ def add_labels(row: dict) -> None:
     """Add `decisions` [N] and `tags` [G] to a scene's row in place."""
     blocks = blocking(row) & row["time_valid"]
     decisions = np.full(row["obstacles.kind"].shape, Decision.IGNORE, np.int32)
-    for slot in np.flatnonzero(row["obstacles.kind"] != Kind.NONE):
+    for slot in np.flatnonzero(row["obstacles.kind"] != Kind.NONE).tolist():
         decisions[slot] = _decide(row, slot, blocks[slot])
     row["decisions"] = decisions
     row["tags"] = _tags(row, decisions, blocks)

@@ -9,7 +9,7 @@ share a chain, so everything that depends on it alone is computed once.
 import dataclasses
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from rcirl_jax.geometry.frenet import (
     ReferenceLine,
@@ -19,7 +19,7 @@ from rcirl_jax.geometry.frenet import (
 from rcirl_jax.types import Lane, Recording
 
 BEHIND_M = 100.0  # m of chain kept behind the lane at the planning frame
-AHEAD_M = 400.0  # m of chain kept ahead of its start
+AHEAD_M = 400.0  # m of chain kept beyond that lane
 MAX_HEADING_GAP = np.deg2rad(60.0)  # rad, a car heads along its lane within this
 MATCH_NEIGHBOURS = 12  # nearest centre points looked at per position
 LINE_STEP_M = 1.0  # m, grid of the reference line
@@ -75,7 +75,7 @@ class LaneGraph:
         self._owner = np.array(owners)
         self._heading = np.concatenate(headings) if headings else np.zeros(0)
         self._points = np.concatenate(points) if points else np.zeros((0, 2))
-        self._tree = cKDTree(self._points) if len(self._points) else None
+        self._tree = KDTree(self._points) if len(self._points) else None
         self._frames: dict[tuple[str, ...], LaneFrame] = {}
 
     def match(self, x: np.ndarray, y: np.ndarray, heading: np.ndarray) -> np.ndarray:
@@ -105,7 +105,7 @@ class LaneGraph:
         """The chain through lane `start` for a driver who visits these lanes."""
         seen = set(visited)
         ahead = [start]
-        travelled = self._length(start)
+        travelled = 0.0
         while travelled < AHEAD_M:
             options = [s for s in self.lanes[ahead[-1]].successors if s in self.lanes]
             following = self._pick(options, ahead[-1], seen, forward=True)
@@ -145,7 +145,7 @@ class LaneGraph:
 
         def bend(name: str) -> float:
             other = _end_heading(self.lanes[name].centre, end)
-            return abs(float(_wrap(other - here_heading)))
+            return float(np.abs(_wrap(np.array(other - here_heading))))
 
         return min(options, key=bend)
 

@@ -46,7 +46,8 @@ def human_motion(
     """
     s, l = view.s[number], view.l[number]
     future = s[start:]
-    if future[0] <= 0.0 or future[-1] >= length:
+    within = future[: int(HORIZON_S * rate) + 2]
+    if within[0] <= 0.0 or within[-1] >= length:
         return None
     seconds = np.arange(future.size) / rate
     future_s = float(min(seconds[-1], HORIZON_S))
@@ -69,13 +70,16 @@ def human_motion(
     )
 
 
-def given_path(view: FrameTracks, number: int, start: int, s0: float) -> np.ndarray:
+def given_path(
+    view: FrameTracks, number: int, start: int, s0: float, length: float
+) -> np.ndarray:
     """Lateral offset [P] m of the human's own path on the station grid.
 
-    The whole rest of the track shapes it, not only the scene's horizon; after
-    its end the last offset is kept.
+    The whole rest of the track on the chain shapes it, not only the scene's
+    horizon; after its end the last offset is kept.
     """
     s = np.maximum.accumulate(view.s[number][start:]) - s0
     l = view.l[number][start:]
     keep = np.concatenate([[True], np.diff(s // MIN_PATH_ADVANCE_M) > 0])
+    keep &= s + s0 < length
     return np.interp(GRID_M, s[keep], l[keep])

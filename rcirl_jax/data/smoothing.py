@@ -69,7 +69,8 @@ def savgol(values: np.ndarray, rate_hz: float, window_s: float) -> np.ndarray:
     window = min(window, values.size - 1 + values.size % 2)
     if window <= POLYNOMIAL_ORDER + 1:
         return values.copy()
-    return savgol_filter(values, window, POLYNOMIAL_ORDER, mode="interp")
+    smooth = savgol_filter(values, window, POLYNOMIAL_ORDER, mode="interp")
+    return np.asarray(smooth, np.float64)
 
 
 def harsh_share(x: np.ndarray, y: np.ndarray, rate_hz: float) -> tuple[int, int]:

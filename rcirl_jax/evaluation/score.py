@@ -6,7 +6,7 @@ recorded human in the scene's Frenet frame, at the chosen horizon.
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -36,16 +36,17 @@ BASELINES = ("constant speed", "IDM", "hand-set")
 class Scored:
     """Arrays of S scenes with K candidates each (numpy)."""
 
-    features_human: np.ndarray  # [S, T, F]
-    features: np.ndarray  # [S, K, T, F]
     feasible: np.ndarray  # [S, K]
     fde: np.ndarray  # [S, K] m at the horizon
     ade: np.ndarray  # [S, K] m, mean over times up to the horizon
     crash: np.ndarray  # [S, K] the candidate meets something up to the horizon
     human_crash: np.ndarray  # [S]
-    time_valid: np.ndarray  # [S, T] up to the horizon
-    baseline: dict[str, np.ndarray]  # name -> [S, K]
-    baseline_human: dict[str, np.ndarray]  # name -> [S]
+    values: dict[str, np.ndarray]  # scorer -> [S, K], higher is better
+    human_values: dict[str, np.ndarray]  # scorer -> [S]
+
+
+# (features [..., T, F], time_valid [..., T]) -> value [...]
+Scorer = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def horizon_mask(scene: Scene, horizon_s: float) -> jax.Array:
@@ -120,8 +121,8 @@ def _score_one(
         "crash": jax.vmap(lambda x: _crashes(scene, x, mask))(everyone),
         "human_crash": _crashes(scene, human, mask),
         "time_valid": mask,
-        "baseline": {name: jax.vmap(f)(everyone) for name, f in rivals.items()},
-        "baseline_human": {name: f(human) for name, f in rivals.items()},
+        "values": {name: jax.vmap(f)(everyone) for name, f in rivals.items()},
+        "human_values": {name: f(human) for name, f in rivals.items()},
     }
 
 
@@ -143,16 +144,18 @@ def score_scenes(
     preset: str,
     sampler: SamplerConfig,
     horizon_s: float,
+    scorers: Mapping[str, Scorer],
 ) -> Scored:
-    """Sample, featurise and measure S scenes.
+    """Sample, featurise, measure and value S scenes, in chunks of bounded memory.
 
     Args:
-      rows: S demonstrations (numpy). Only scenes whose recorded future covers
-        the horizon may be passed; see `covers`.
+      rows: S demonstrations (numpy) whose recorded future covers the horizon;
+        see `covers`.
       index: [S] dataset rows; they seed the candidates.
       preset: feature preset.
       sampler: sampler configuration.
       horizon_s: 5 or 8 s (any in (0, 8]).
+      scorers: rewards to apply to the features; the baselines are added.
 
     Returns:
       Scored, numpy.
@@ -164,9 +167,21 @@ def score_scenes(
         taken = jax.tree.map(lambda x, picked=picked: jnp.asarray(x[picked]), rows)
         made = batch(jnp.asarray(index[picked], jnp.int32), taken)
         keep = min(CHUNK, count - start)
-        parts.append(jax.tree.map(lambda x, keep=keep: np.asarray(x[:keep]), made))
+        made = jax.tree.map(lambda x, keep=keep: np.asarray(x[:keep]), made)
+        parts.append(_with_values(made, scorers))
     joined = jax.tree.map(lambda *x: np.concatenate(x), *parts)
     return Scored(**joined)
+
+
+def _with_values(made: dict, scorers: Mapping[str, Scorer]) -> dict:
+    """Replace the features of a chunk by the scorers' values."""
+    valid = made.pop("time_valid")
+    of_candidates, of_human = made.pop("features"), made.pop("features_human")
+    spread = np.broadcast_to(valid[:, None], of_candidates.shape[:3])
+    for name, scorer in scorers.items():
+        made["values"][name] = scorer(of_candidates, spread)
+        made["human_values"][name] = scorer(of_human, valid)
+    return made
 
 
 def covers(rows: Demonstration, horizon_s: float) -> np.ndarray:

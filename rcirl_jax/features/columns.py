@@ -44,7 +44,7 @@ def driven_curvature(scene: Scene, trajectory: Trajectory) -> jax.Array:
     """Curvature [T] 1/m of the path driven: reference line plus lateral motion."""
     table = scene.path.kappa
     at = jax.vmap(lookup, in_axes=(None, 0, None))
-    slope = jnp.gradient(table, STATION_STEP_M)
+    slope = jnp.asarray(jnp.gradient(table, STATION_STEP_M))
     kappa = at(table, trajectory.s, STATION_STEP_M)
     dkappa = at(slope, trajectory.s, STATION_STEP_M)
     return jax.vmap(path_curvature)(

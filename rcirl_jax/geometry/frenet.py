@@ -70,7 +70,9 @@ def reference_line_from_polyline(
 
 
 def lookup(
-    table: Float[Array, " p"], s: Float[Array, ""] | float, step: float
+    table: Float[Array, " p"],
+    s: Float[Array, ""] | float,
+    step: Float[Array, ""] | float,
 ) -> Float[Array, ""]:
     """Linear interpolation on a uniform grid from 0; clamped at both ends."""
     position = jnp.clip(s / step, 0.0, table.shape[0] - 1.0)

@@ -7,17 +7,19 @@ Human and candidate go through the same parameters (Siamese).
 """
 
 import dataclasses
-from typing import Literal
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from rcirl_jax.errors import InputError
 from rcirl_jax.reward.normaliser import Normaliser, normalise
 from rcirl_jax.units import NUM_TIMES
 
 LEAKY_SLOPE = 0.01  # negative slope of the leaky-ReLU hidden activation
+
+PINS = ("unit", "none")
 
 ACTIVATIONS = {
     "tanh": jnp.tanh,
@@ -33,9 +35,20 @@ class RewardConfig:
 
     # units of each hidden layer; () is linear
     hidden: tuple[int, ...] = (15,)
-    activation: Literal["tanh", "relu", "leaky_relu", "identity"] = "tanh"
+    # key of ACTIVATIONS
+    activation: str = "tanh"
     # "unit": output kernel and gamma have unit norm (see `pinned`); "none": free
-    pin: Literal["unit", "none"] = "unit"
+    pin: str = "unit"
+
+    def __post_init__(self) -> None:
+        """Reject unknown names."""
+        if self.activation not in ACTIVATIONS:
+            raise InputError(
+                f"--activation: {self.activation}: expected one of "
+                f"{sorted(ACTIVATIONS)}"
+            )
+        if self.pin not in PINS:
+            raise InputError(f"--pin: {self.pin}: expected one of {PINS}")
 
 
 class RewardParams(flax.struct.PyTreeNode, kw_only=True):

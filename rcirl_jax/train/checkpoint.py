@@ -1,6 +1,7 @@
 """Checkpoints: orbax behind three functions. Nobody else imports orbax."""
 
 from pathlib import Path
+from typing import Any
 
 import jax
 from orbax.checkpoint import v1 as ocp
@@ -21,9 +22,10 @@ class Checkpoints:
     def __init__(self, folder: Path) -> None:
         self._folder = folder.resolve()
         self._folder.mkdir(parents=True, exist_ok=True)
+        keep: Any = ocp.training.preservation_policies.LatestN(KEEP_LATEST)
         self._checkpointer = ocp.training.Checkpointer(
             str(self._folder),
-            preservation_policy=ocp.training.preservation_policies.LatestN(KEEP_LATEST),
+            preservation_policy=keep,
             cleanup_tmp_directories=True,
         )
 
@@ -60,7 +62,7 @@ class Checkpoints:
                 f"{self._folder}: checkpoint {step}: {first}: "
                 "expected the same features, hidden size and optimiser"
             ) from error
-        metadata = self._checkpointer.metadata(step).custom_metadata or {}
+        metadata: Any = self._checkpointer.metadata(step).custom_metadata or {}
         return state, dict(metadata.get("position", {}))
 
     def close(self) -> None:

@@ -19,7 +19,7 @@ from rcirl_jax.features import FeatureMap, feature_map
 from rcirl_jax.reward import Normaliser, fit_normaliser
 from rcirl_jax.train.checkpoint import Checkpoints
 from rcirl_jax.train.metrics import MetricsWriter, Progress
-from rcirl_jax.train.parallel import parallelise
+from rcirl_jax.train.parallel import Step, parallelise
 from rcirl_jax.train.state import Batch, FeatureBatch, TrainConfig, TrainState
 from rcirl_jax.train.step import StepMetrics, featurise, init_state, make_train_step
 from rcirl_jax.types import Demonstration
@@ -122,6 +122,21 @@ def train(
     )
 
 
+def restore_run(workdir: Path, config: TrainConfig) -> TrainState:
+    """The newest checkpoint of a run.
+
+    Raises:
+      InputError: there is none, or it is of another structure.
+    """
+    checkpoints = Checkpoints(workdir / "checkpoints")
+    try:
+        if checkpoints.latest_step() is None:
+            raise InputError(f"{workdir}: checkpoints: none: expected a trained run")
+        return checkpoints.restore(_like(config, feature_map(config.features)))[0]
+    finally:
+        checkpoints.close()
+
+
 def _like(config: TrainConfig, features: FeatureMap) -> TrainState:
     ones = jnp.ones(features.num_features)
     return init_state(
@@ -155,7 +170,7 @@ class _Run:
         self,
         state: TrainState,
         batches: BatchIterator,
-        step: object,
+        step: Step,
         checkpoints: Checkpoints,
     ) -> TrainState:
         for epoch in range(int(state.step) // self.per_epoch, self.config.epochs):

@@ -5,6 +5,7 @@ import math
 import time
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import tqdm
 
@@ -53,7 +54,7 @@ def _step_of(line: str) -> int:
         return 1 << 62  # a line cut short by a crash is dropped
 
 
-def _tensorboard(folder: Path, purge_step: int) -> "object | None":
+def _tensorboard(folder: Path, purge_step: int) -> Any:  # noqa: ANN401
     try:
         from tensorboardX import SummaryWriter
     except ImportError:

@@ -6,6 +6,7 @@ three and B must be a multiple of the number of devices.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import numpy as np
@@ -79,7 +80,7 @@ def parallelise(step: Step, how: str, batch_size: int) -> Step:
     raise InputError(f"--parallel: {how}: expected one of {', '.join(PARALLEL)}")
 
 
-def _devices(count: int) -> list[jax.Device]:
+def _devices(count: int) -> list[Any]:
     devices = jax.local_devices()
     if count > len(devices):
         raise InputError(f"devices: {count}: expected at most {len(devices)}")

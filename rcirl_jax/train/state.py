@@ -1,7 +1,7 @@
 """What training carries: state, batch, configuration."""
 
 import dataclasses
-from typing import Literal
+from collections.abc import Callable
 
 import flax.struct
 import jax
@@ -11,6 +11,12 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.reward import LOSSES, Normaliser, RewardConfig, RewardParams
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.types import Demonstration
+
+OPTIMIZERS: dict[str, Callable[[float], optax.GradientTransformation]] = {
+    "sgd": lambda rate: optax.sgd(rate, momentum=0.9),
+    "adam": optax.adam,
+    "rmsprop": optax.rmsprop,
+}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -24,7 +30,7 @@ class TrainConfig:
     # a of the rank loss (the paper: 0.05)
     leaky_rate: float = 0.05
     # optimiser; the paper found no substantial difference between these
-    optimizer: Literal["sgd", "adam", "rmsprop"] = "adam"
+    optimizer: str = "adam"
     # 1/step
     learning_rate: float = 3e-3
     # L2 pull on kernels and biases, per step
@@ -43,6 +49,10 @@ class TrainConfig:
         """Reject values out of range with the flag's name."""
         if self.loss not in LOSSES:
             raise InputError(f"--loss: {self.loss}: expected one of {sorted(LOSSES)}")
+        if self.optimizer not in OPTIMIZERS:
+            raise InputError(
+                f"--optimizer: {self.optimizer}: expected one of {sorted(OPTIMIZERS)}"
+            )
         for name, low in (("leaky_rate", 0.0), ("learning_rate", 0.0)):
             if not low < getattr(self, name) < 1.0:
                 found = getattr(self, name)
@@ -83,10 +93,5 @@ class FeatureBatch(flax.struct.PyTreeNode, kw_only=True):
 
 def make_optimizer(config: TrainConfig) -> optax.GradientTransformation:
     """The optimiser named in the configuration."""
-    makers = {
-        "sgd": lambda rate: optax.sgd(rate, momentum=0.9),
-        "adam": optax.adam,
-        "rmsprop": optax.rmsprop,
-    }
     decay = optax.add_decayed_weights(config.weight_decay)
-    return optax.chain(decay, makers[config.optimizer](config.learning_rate))
+    return optax.chain(decay, OPTIMIZERS[config.optimizer](config.learning_rate))

@@ -5,6 +5,7 @@ is wrong when shards hold different numbers of pairs.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import flax.struct
 import jax
@@ -137,6 +138,11 @@ def _nonfinite(batch: FeatureBatch) -> tuple[jax.Array, jax.Array]:
     return jnp.sum(per_scene, axis=0), row
 
 
+def as_tree(params: RewardParams) -> Any:  # noqa: ANN401
+    """The same object under optax's type for parameter trees."""
+    return params
+
+
 def make_train_step(
     config: TrainConfig,
 ) -> Callable[..., tuple[TrainState, StepMetrics]]:
@@ -173,8 +179,9 @@ def make_train_step(
         grads = jax.tree.map(lambda g: g / jnp.maximum(pairs, 1.0), grads)
         norm = optax.global_norm(grads)
         finite = jnp.isfinite(loss) & jnp.isfinite(norm)
-        updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
-        params = optax.apply_updates(state.params, updates)
+        before = as_tree(state.params)
+        updates, opt_state = optimizer.update(grads, state.opt_state, before)
+        params = optax.apply_updates(before, updates)
         keep = lambda new, old: jnp.where(finite, new, old)  # noqa: E731
         new_state = TrainState(
             step=state.step + 1,
@@ -205,7 +212,7 @@ def init_state(config: TrainConfig, normaliser: Normaliser) -> TrainState:
     return TrainState(
         step=jnp.zeros((), jnp.int32),
         params=params,
-        opt_state=make_optimizer(config).init(params),
+        opt_state=make_optimizer(config).init(as_tree(params)),
         key=train_key,
         normaliser=normaliser,
     )

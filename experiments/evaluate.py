@@ -1,0 +1,47 @@
+"""Rank held-out scenes with exported rewards beside all baselines.
+
+    python -m experiments.evaluate --weights=FILE[,FILE...] --data=DATASET \
+        --output=ranking.json
+
+Several files are the seeds of one row. Prints the table with intervals.
+"""
+
+import json
+from pathlib import Path
+
+from absl import flags
+
+from experiments.common import run
+from rcirl_jax.data.store import open_dataset
+from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.evaluate import RankingSetup, evaluate_ranking
+from rcirl_jax.evaluation.table import format_table, to_json
+from rcirl_jax.export.loading import load_runs
+
+_WEIGHTS = flags.DEFINE_list("weights", None, "weights files", required=True)
+_DATA = flags.DEFINE_string("data", None, "dataset", required=True)
+_OUTPUT = flags.DEFINE_string("output", None, "JSON to write")
+_HORIZON = flags.DEFINE_float("horizon", 5.0, "s at which distances are taken")
+_SPLIT = flags.DEFINE_string("split", "test", "split that is ranked")
+_WIDTH = flags.DEFINE_integer("width", 118, "columns of the printed table")
+
+
+def main() -> None:
+    """Flags -> one report."""
+    if not 0.0 < _HORIZON.value <= 8.0:
+        raise InputError(f"--horizon: {_HORIZON.value}: expected above 0, at most 8 s")
+    learned, preset, sampler = load_runs(_WEIGHTS.value)
+    setup = RankingSetup(
+        preset=preset, sampler=sampler, horizon_s=_HORIZON.value, split=_SPLIT.value
+    )
+    report = evaluate_ranking(open_dataset(_DATA.value), learned, setup)
+    print(format_table(report, _WIDTH.value))
+    if _OUTPUT.value:
+        output = Path(_OUTPUT.value)
+        output.parent.mkdir(parents=True, exist_ok=True)
+        output.write_text(json.dumps(to_json(report), indent=2) + "\n")
+        print(f"report: {output}")
+
+
+if __name__ == "__main__":
+    run(main)

@@ -1,0 +1,44 @@
+"""Export a trained run as weights.msgpack.
+
+    python -m experiments.export_weights --workdir=RUN --data=DATASET --output=FILE
+
+The file carries verification samples from the dataset's training split; a
+reader recomputes them before it accepts the file.
+"""
+
+import json
+from pathlib import Path
+
+from absl import flags
+
+from experiments.common import run
+from rcirl_jax.data.store import open_dataset
+from rcirl_jax.errors import InputError
+from rcirl_jax.export.from_run import export_run
+
+_WORKDIR = flags.DEFINE_string("workdir", None, "run folder", required=True)
+_DATA = flags.DEFINE_string("data", None, "dataset (default: the run's own)")
+_OUTPUT = flags.DEFINE_string("output", None, "file (default: RUN/weights.msgpack)")
+
+
+def main() -> None:
+    """Flags -> one file."""
+    workdir = Path(_WORKDIR.value)
+    output = Path(_OUTPUT.value or workdir / "weights.msgpack")
+    reward = export_run(workdir, open_dataset(_DATA.value or _own(workdir)), output)
+    print(f"{output}: {len(reward.names)} features, sha256 {reward.sha256[:16]}...")
+
+
+def _own(workdir: Path) -> str:
+    """The dataset named in the run's own flags."""
+    path = workdir / "run.json"
+    if not path.is_file():
+        raise InputError(f"{path}: missing: expected a run made by experiments.train")
+    found = json.loads(path.read_text()).get("flags", {}).get("data")
+    if not found:
+        raise InputError("--data: not given and not in run.json: expected a dataset")
+    return found
+
+
+if __name__ == "__main__":
+    run(main)

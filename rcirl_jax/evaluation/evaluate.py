@@ -1,0 +1,155 @@
+"""The ranking report of exported rewards on a dataset's held-out split."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import jax
+import numpy as np
+
+from rcirl_jax.data.store import Dataset
+from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.ranking import (
+    Outcomes,
+    fit_temperature,
+    oracle_scorer,
+    random_scorer,
+    scene_metrics,
+)
+from rcirl_jax.evaluation.score import BASELINES, Scored, Scorer, covers, score_scenes
+from rcirl_jax.evaluation.table import RankingReport, build_report
+from rcirl_jax.sampling import SamplerConfig
+from rcirl_jax.types import Demonstration
+
+TEMPERATURE_SCENES = 512  # training scenes on which NLL temperatures are fitted
+RANDOM_RUNS = 5  # random orders averaged in the random row
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RankingSetup:
+    """What all scorers share in one evaluation."""
+
+    preset: str = "paper21"
+    sampler: SamplerConfig = dataclasses.field(default_factory=SamplerConfig)
+    horizon_s: float = 5.0  # s
+    split: str = "test"
+
+
+def _rows(
+    dataset: Dataset, split: str, horizon_s: float
+) -> tuple[Demonstration, np.ndarray]:
+    """Scenes of a split whose recording covers the horizon, and their rows."""
+    rows, index = dataset.load(split), dataset.indices(split)
+    keep = np.flatnonzero(covers(rows, horizon_s))
+    if keep.size == 0:
+        raise InputError(
+            f"--horizon: {horizon_s:g}: no scene of split {split} is recorded so "
+            "long: expected a shorter horizon"
+        )
+    return jax.tree.map(lambda x: x[keep], rows), index[keep]
+
+
+def _outcomes(scored: Scored, rows: Demonstration, horizon_s: float) -> Outcomes:
+    return Outcomes(
+        fde=scored.fde,
+        ade=scored.ade,
+        crash=scored.crash,
+        feasible=scored.feasible,
+        cluster=np.asarray(rows.vehicle),
+        human_crash=scored.human_crash,
+        horizon_s=horizon_s,
+    )
+
+
+def _temperatures(
+    dataset: Dataset, setup: RankingSetup, scorers: Mapping[str, Scorer]
+) -> dict[str, float]:
+    """Scale of each scorer's values, fitted on TRAINING scenes."""
+    rows, index = _rows(dataset, "train", setup.horizon_s)
+    chosen = np.random.default_rng(0).permutation(index.size)[:TEMPERATURE_SCENES]
+    rows, index = jax.tree.map(lambda x: x[chosen], rows), index[chosen]
+    scored = _score(rows, index, setup, scorers)
+    outcomes = _outcomes(scored, rows, setup.horizon_s)
+    return {name: fit_temperature(v, outcomes) for name, v in scored.values.items()}
+
+
+def _score(
+    rows: Demonstration,
+    index: np.ndarray,
+    setup: RankingSetup,
+    scorers: Mapping[str, Scorer],
+) -> Scored:
+    return score_scenes(
+        rows,
+        index,
+        preset=setup.preset,
+        sampler=setup.sampler,
+        horizon_s=setup.horizon_s,
+        scorers=scorers,
+    )
+
+
+def evaluate_ranking(
+    dataset: Dataset, learned: Mapping[str, Sequence[Scorer]], setup: RankingSetup
+) -> RankingReport:
+    """Rank the held-out scenes with learned rewards beside all baselines.
+
+    Rows: every learned reward (its runs are seeds), random, constant speed, IDM,
+    hand-set (Apollo's lattice weights) and the oracle, on the same candidates.
+
+    Args:
+      dataset: an open dataset.
+      learned: row name -> one scorer per training run.
+      setup: features, sampler, horizon, split.
+
+    Raises:
+      InputError: no scene of the split covers the horizon.
+    """
+    flat = {f"{n}#{i}": f for n, runs in learned.items() for i, f in enumerate(runs)}
+    temperatures = _temperatures(dataset, setup, flat)
+    rows, index = _rows(dataset, setup.split, setup.horizon_s)
+    scored = _score(rows, index, setup, flat)
+    outcomes = _outcomes(scored, rows, setup.horizon_s)
+
+    def metrics(name: str) -> dict[str, np.ndarray]:
+        values, human = scored.values[name], scored.human_values[name]
+        return scene_metrics(values, human, outcomes, temperatures[name])
+
+    shape = scored.fde.shape
+    table = {
+        n: [metrics(f"{n}#{i}") for i in range(len(r))] for n, r in learned.items()
+    }
+    table["random"] = [
+        scene_metrics(*random_scorer(seed, shape), outcomes)
+        for seed in range(RANDOM_RUNS)
+    ]
+    for name in BASELINES:
+        table[name] = [metrics(name)]
+    table["oracle"] = [scene_metrics(*oracle_scorer(outcomes), outcomes)]
+    return build_report(table, outcomes, group=np.asarray(rows.group))
+
+
+def oracle_floor(dataset: Dataset, setup: RankingSetup, max_scenes: int) -> dict:
+    """How close the best candidate comes to the human, over all splits.
+
+    Returns:
+      mode, horizon, scenes, mean and median FDE and ADE [m] of the best
+      feasible candidate, share of scenes without a feasible one.
+    """
+    rows = dataset.load(None)
+    keep = np.flatnonzero(covers(rows, setup.horizon_s))
+    keep = np.random.default_rng(0).permutation(keep)[:max_scenes]
+    taken = jax.tree.map(lambda x: x[keep], rows)
+    scored = _score(taken, keep, setup, {})
+    fde = np.where(scored.feasible, scored.fde, np.inf).min(axis=1)
+    ade = np.where(scored.feasible, scored.ade, np.inf).min(axis=1)
+    some = np.isfinite(fde)
+    return {
+        "mode": setup.sampler.mode,
+        "horizon_s": setup.horizon_s,
+        "scenes": int(keep.size),
+        "candidates": int(scored.fde.shape[1]),
+        "best_fde_mean_m": float(fde[some].mean()),
+        "best_fde_median_m": float(np.median(fde[some])),
+        "best_ade_mean_m": float(ade[some].mean()),
+        "nothing_feasible": float(1.0 - some.mean()),
+    }

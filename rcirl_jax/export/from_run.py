@@ -1,0 +1,151 @@
+"""A training run -> weights.msgpack with verification samples."""
+
+import datetime
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rcirl_jax.data.store import Dataset
+from rcirl_jax.errors import InputError
+from rcirl_jax.export.reader import Reward
+from rcirl_jax.export.weights import FeatureSpec, RewardWeights, save
+from rcirl_jax.features import feature_map
+from rcirl_jax.reward import RewardConfig, pinned, value
+from rcirl_jax.reward.network import LEAKY_SLOPE
+from rcirl_jax.sampling import SamplerConfig
+from rcirl_jax.train.loop import restore_run, to_device_batch
+from rcirl_jax.train.state import TrainConfig, TrainState
+from rcirl_jax.train.step import featurise
+from rcirl_jax.units import TIMES_S
+
+NUM_SAMPLES = 32  # verification samples in the file
+
+
+def read_config(workdir: Path) -> tuple[TrainConfig, dict]:
+    """The configuration a run was made with, and all of run.json."""
+    path = workdir / "run.json"
+    if not path.is_file():
+        raise InputError(f"{path}: missing: expected a run made by experiments.train")
+    try:
+        run = json.loads(path.read_text())
+        settings = dict(run["config"])
+        reward = dict(settings.pop("reward"))
+        sampler = dict(settings.pop("sampler"))
+        lists = {k: tuple(v) for k, v in sampler.items() if isinstance(v, list)}
+        config = TrainConfig(
+            reward=RewardConfig(**{**reward, "hidden": tuple(reward["hidden"])}),
+            sampler=SamplerConfig(**{**sampler, **lists}),
+            **settings,
+        )
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: {error}: expected a run of this version") from error
+    return config, run
+
+
+def reward_weights(
+    state: TrainState, config: TrainConfig, provenance: dict
+) -> RewardWeights:
+    """The effective weights of a trained state, as the file holds them."""
+    features = feature_map(config.features)
+    effective = pinned(state.params, config.reward)
+    return RewardWeights(
+        preset=config.features,
+        features=tuple(
+            FeatureSpec(name=s.name, unit=s.unit, none_value=s.none)
+            for s in features.specs
+        ),
+        lower=np.asarray(state.normaliser.lower),
+        upper=np.asarray(state.normaliser.upper),
+        location=np.asarray(state.normaliser.location),
+        scale=np.asarray(state.normaliser.scale),
+        times=TIMES_S,
+        gamma=np.asarray(effective.gamma),
+        kernels=tuple(np.asarray(kernel) for kernel in effective.kernels),
+        biases=(*(np.asarray(bias) for bias in effective.biases), np.zeros(1)),
+        activation=config.reward.activation if config.reward.hidden else "identity",
+        leaky_slope=LEAKY_SLOPE,
+        loss={
+            "name": config.loss,
+            "leaky_rate": config.leaky_rate if config.loss == "rank" else None,
+        },
+        provenance=provenance,
+    )
+
+
+def export_run(workdir: Path, dataset: Dataset, output: Path) -> Reward:
+    """Write weights.msgpack from a run's newest checkpoint.
+
+    Verification samples are humans and candidates of the training split, with
+    their values as the trainer computes them.
+
+    Args:
+      workdir: run folder of experiments.train.
+      dataset: the dataset of the run (its hash has to match).
+      output: file to write, atomically.
+
+    Raises:
+      InputError: no run, no checkpoint, or another dataset.
+    """
+    config, run = read_config(workdir)
+    if run.get("dataset_hash") != dataset.hash:
+        raise InputError(
+            f"{workdir / 'run.json'}: dataset_hash: {run.get('dataset_hash')}: "
+            f"expected that of the given dataset, {dataset.hash}"
+        )
+    state = restore_run(workdir, config)
+    x, valid = _samples(dataset, config)
+    with jax.default_matmul_precision("highest"):
+        values = value(
+            state.params,
+            state.normaliser,
+            jnp.asarray(x),
+            jnp.asarray(valid),
+            config.reward,
+        )
+    weights = reward_weights(state, config, _provenance(workdir, state, config, run))
+    output.parent.mkdir(parents=True, exist_ok=True)
+    return save(output, weights, x, valid, np.asarray(values))
+
+
+def _samples(dataset: Dataset, config: TrainConfig) -> tuple[np.ndarray, np.ndarray]:
+    """[m, T, F] features and [m, T] masks: half humans, half candidates."""
+    count = min(NUM_SAMPLES // 2, dataset.indices("train").size)
+    index = dataset.indices("train")[:count]
+    batch = to_device_batch(dataset.read(index), np.ones(count), index)
+    key = jax.random.key(config.seed)
+    made = featurise(key, batch, config, feature_map(config.features))
+    human, candidates = np.asarray(made.human), np.asarray(made.candidates)
+    picked = candidates[np.arange(count), np.arange(count) % candidates.shape[1]]
+    valid = np.asarray(made.time_valid)
+    return np.concatenate([human, picked]), np.concatenate([valid, valid])
+
+
+def _provenance(
+    workdir: Path, state: TrainState, config: TrainConfig, run: dict
+) -> dict:
+    return {
+        "dataset_sha256": run["dataset_hash"],
+        "git_commit": run.get("git_commit"),
+        "seed": config.seed,
+        "flags": run.get("flags", {}),
+        "metrics": last_metrics(workdir),
+        "versions": run.get("versions", {}),
+        "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "steps": int(state.step),
+        "mode": config.sampler.mode,
+        "config": run["config"],
+    }
+
+
+def last_metrics(workdir: Path) -> dict:
+    """The last line of metrics.jsonl, or nothing."""
+    path = workdir / "metrics.jsonl"
+    lines = path.read_text().splitlines() if path.is_file() else []
+    try:
+        found = json.loads(lines[-1]) if lines else {}
+    except ValueError:
+        found = {}
+    return {k: v for k, v in found.items() if isinstance(v, int | float)}

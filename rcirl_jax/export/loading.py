@@ -1,0 +1,59 @@
+"""Weights files -> scorers, with the features and sampler they were made for."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.export.reader import Reward, WeightsError, load_weights
+from rcirl_jax.features import feature_map
+from rcirl_jax.sampling import SamplerConfig
+
+Scorer = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def open_reward(path: str) -> Reward:
+    """A weights file whose features are those this package computes.
+
+    Raises:
+      InputError: unreadable or damaged file, or other features or units.
+    """
+    try:
+        reward = load_weights(path)
+        features = feature_map(str(reward.preset))
+        reward.check_features(features.names, [s.unit for s in features.specs])
+    except WeightsError as error:
+        raise InputError(str(error)) from error
+    return reward
+
+
+def row_name(reward: Reward) -> str:
+    """Name of a reward's row in the tables: loss and network."""
+    hidden = [str(kernel.shape[1]) for kernel in reward.kernels[:-1]]
+    shape = f"{len(reward.names)}-{'-'.join([*hidden, '1'])}"
+    name = {"rank": "RC-IRL", "logistic": "logistic"}
+    loss = str(reward.loss.get("name"))
+    return f"{name.get(loss, loss)} {shape if hidden else 'linear'}"
+
+
+def load_runs(
+    paths: Sequence[str],
+) -> tuple[dict[str, list[Scorer]], str, SamplerConfig]:
+    """Scorers by row (files of one loss and shape are its seeds).
+
+    Raises:
+      InputError: the files need different features or sampler modes.
+    """
+    if not paths:
+        raise InputError("--weights: none: expected at least one file")
+    rewards = [open_reward(path) for path in paths]
+    settings = {(r.preset, str(r.provenance.get("mode", "speed"))) for r in rewards}
+    if len(settings) > 1:
+        raise InputError(
+            f"--weights: {sorted(settings)}: expected files of one preset and mode"
+        )
+    preset, mode = settings.pop()
+    runs: dict[str, list[Scorer]] = {}
+    for reward in rewards:
+        runs.setdefault(row_name(reward), []).append(reward.value)
+    return runs, preset, SamplerConfig(mode=mode)

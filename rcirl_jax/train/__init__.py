@@ -1,0 +1,1 @@
+"""Training: state, step, parallel, checkpoint, loop."""
