@@ -8,7 +8,7 @@ from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
 
-from absl import app, flags
+from absl import app, flags, logging
 
 from rcirl_jax.errors import InputError
 
@@ -19,6 +19,8 @@ def run(main: Callable[[], None]) -> None:
     """Run a main; bad input becomes one line on stderr and exit status 2."""
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
+    logging.set_verbosity(logging.WARNING)
+
     def guarded(argv: list[str]) -> None:
         try:
             if len(argv) > 1:
@@ -26,6 +28,9 @@ def run(main: Callable[[], None]) -> None:
             main()
         except InputError as error:
             print(f"error: {error}", file=sys.stderr)
+            sys.exit(EXIT_BAD_INPUT)
+        except OSError as error:
+            print(f"error: {error.filename or ''}: {error}", file=sys.stderr)
             sys.exit(EXIT_BAD_INPUT)
 
     app.run(guarded, flags_parser=_parse)

@@ -15,6 +15,10 @@ from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import IMPORTERS, read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.data.quality import format_quality
+from rcirl_jax.data.store import open_dataset
+from rcirl_jax.evaluation.evaluate import RankingSetup, oracle_floor
+from rcirl_jax.sampling import SamplerConfig
+from rcirl_jax.sampling.config import MODES
 
 _FORMAT = flags.DEFINE_enum(
     "format", "synthetic", sorted(IMPORTERS), "log format to read"
@@ -39,6 +43,7 @@ _KEEP_ALONE = flags.DEFINE_bool(
 _TEST_FRACTION = flags.DEFINE_float(
     "test_fraction", 0.25, "share of scenes held out, by vehicle-disjoint group"
 )
+_FLOOR = flags.DEFINE_float("horizon", 5.0, "s at which the oracle floor is taken")
 _SPLIT_SEED = flags.DEFINE_integer("split_seed", 0, "order in which groups are dealt")
 
 
@@ -65,6 +70,16 @@ def main() -> None:
         recordings, _OUTPUT.value, config, overwrite=_OVERWRITE.value
     )
     print(format_quality(manifest.quality))
+    dataset = open_dataset(_OUTPUT.value)
+    for mode in MODES:
+        setup = RankingSetup(sampler=SamplerConfig(mode=mode), horizon_s=_FLOOR.value)
+        floor = oracle_floor(dataset, setup, max_scenes=512)
+        mean, median = floor["best_fde_mean_m"], floor["best_fde_median_m"]
+        print(
+            f"oracle floor, {mode}: best of {floor['candidates']} candidates ends "
+            f"{mean:.2f} m (median {median:.2f}) from the human at "
+            f"{floor['horizon_s']:g} s, {floor['scenes']} scenes"
+        )
     print(f"dataset: {_OUTPUT.value}")
 
 

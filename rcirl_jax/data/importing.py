@@ -225,7 +225,9 @@ def import_logs(
             for recording in recordings:
                 bar.update(work.add(recording))
                 dropped = sum(work.quality.dropped.values())
-                bar.set_postfix(recording=recording.name, dropped=dropped)
+                bar.set_postfix(
+                    recording=recording.name, dropped=dropped, refresh=False
+                )
         return work.finish()
     except InputError:
         writer.abort()

@@ -1,0 +1,55 @@
+"""One self-contained HTML page of an evaluation: tables, pictures, provenance."""
+
+import base64
+import html
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+PAGE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{title}</title>
+<style>
+body {{ font: 16px/1.5 system-ui, sans-serif; margin: 0 auto; max-width: 76rem;
+       padding: 1rem; color: #111; background: #fff; }}
+h1 {{ font-size: 1.5rem; }} h2 {{ font-size: 1.15rem; margin-top: 2rem; }}
+pre {{ overflow-x: auto; font-size: .8rem; background: #f6f6f6; padding: .8rem; }}
+img {{ max-width: 100%; height: auto; }}
+figure {{ margin: 1rem 0; }} figcaption {{ color: #444; font-size: .9rem; }}
+</style></head><body>
+<h1>{title}</h1>
+<p>{lead}</p>
+{body}
+</body></html>
+"""
+
+
+def table_section(heading: str, text: str) -> str:
+    """A section with preformatted text."""
+    return f"<h2>{html.escape(heading)}</h2>\n<pre>{html.escape(text)}</pre>"
+
+
+def picture_section(heading: str, pictures: Sequence[tuple[Path, str]]) -> str:
+    """A section of PNGs, embedded, each with its caption."""
+    figures = []
+    for path, caption in pictures:
+        data = base64.b64encode(path.read_bytes()).decode()
+        words = html.escape(caption)
+        figures.append(
+            f'<figure><img alt="{words}" src="data:image/png;base64,{data}">'
+            f"<figcaption>{words}</figcaption></figure>"
+        )
+    return f"<h2>{html.escape(heading)}</h2>\n" + "\n".join(figures)
+
+
+def write_page(path: Path, title: str, lead: str, sections: Sequence[str]) -> Path:
+    """Write the page atomically; nothing in it refers to another file."""
+    page = PAGE.format(
+        title=html.escape(title), lead=html.escape(lead), body="\n".join(sections)
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(".tmp")
+    temporary.write_text(page, encoding="utf-8")
+    os.replace(temporary, path)
+    return path
