@@ -66,9 +66,9 @@ def hidden_sizes(values: list[str]) -> tuple[int, ...]:
     return sizes
 
 
-def provenance(flag_module: str) -> dict:
+def provenance() -> dict:
     """Flags of one experiment file, git commit, versions and machine."""
-    own = flags.FLAGS.flags_by_module_dict().get(flag_module, [])
+    own = flags.FLAGS.get_key_flags_for_module(sys.argv[0])
     packages = ("jax", "flax", "optax", "orbax-checkpoint", "numpy", "tensorstore")
     return {
         "flags": {flag.name: flag.value for flag in own},

@@ -17,7 +17,7 @@ from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.data.quality import format_quality
 from rcirl_jax.data.store import open_dataset
 from rcirl_jax.evaluation.evaluate import RankingSetup, evaluate_ranking
-from rcirl_jax.evaluation.table import format_table
+from rcirl_jax.evaluation.format import format_table
 from rcirl_jax.export.from_run import export_run
 from rcirl_jax.export.loading import load_runs
 from rcirl_jax.report.ranking_page import write_ranking_page
@@ -40,7 +40,7 @@ def main() -> None:
         import_logs(read_recordings("synthetic", None), data, config)
     dataset = open_dataset(data)
     print(format_quality(dataset.manifest.quality))
-    facts = provenance("experiments.demo")
+    facts = provenance()
     train(dataset, workdir, TrainConfig(epochs=_EPOCHS.value), provenance=facts)
     reward = export_run(workdir, dataset, output / "weights.msgpack")
     learned, preset, _ = load_runs([reward.file])

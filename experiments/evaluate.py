@@ -15,7 +15,8 @@ from experiments.common import run
 from rcirl_jax.data.store import open_dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.evaluate import RankingSetup, evaluate_ranking
-from rcirl_jax.evaluation.table import format_table, to_json
+from rcirl_jax.evaluation.format import format_table
+from rcirl_jax.evaluation.table import to_json
 from rcirl_jax.export.loading import load_runs
 
 _WEIGHTS = flags.DEFINE_list("weights", None, "weights files", required=True)

@@ -33,6 +33,9 @@ _OUTPUT = flags.DEFINE_string("output", None, "dataset to write", required=True)
 _OVERWRITE = flags.DEFINE_bool("overwrite", False, "replace a finished dataset")
 _STRIDE = flags.DEFINE_float("stride", 0.5, "s between planning frames of a driver")
 _MIN_FUTURE = flags.DEFINE_float("min_future", 5.2, "s of recording a scene needs")
+_MIN_HISTORY = flags.DEFINE_float(
+    "min_history", 0.5, "s of recording before a planning frame"
+)
 _SMOOTHING = flags.DEFINE_float("smoothing", 4.1, "s, window of the position filter")
 _KEEP_STEADY = flags.DEFINE_bool(
     "keep_steady", False, "keep scenes without speed change (the paper drops them)"
@@ -55,6 +58,7 @@ def main() -> None:
             smoothing_s=_SMOOTHING.value,
             stride_s=_STRIDE.value,
             min_future_s=_MIN_FUTURE.value,
+            min_history_s=_MIN_HISTORY.value,
             require_obstacles=not _KEEP_ALONE.value,
             require_speed_change=not _KEEP_STEADY.value,
         ),

@@ -67,7 +67,7 @@ def main() -> None:
         Path(_WORKDIR.value),
         config,
         parallel=_PARALLEL.value,
-        provenance=provenance(__name__),
+        provenance=provenance(),
     )
     for epoch in result.epochs[-1:]:
         print(

@@ -1,5 +1,6 @@
 """Ranking metrics, honest intervals and the table that shows them."""
 
+from rcirl_jax.evaluation.format import format_table
 from rcirl_jax.evaluation.ranking import (
     Outcomes,
     fit_temperature,
@@ -21,12 +22,7 @@ from rcirl_jax.evaluation.statistics import (
     paired_difference,
     rule_of_three,
 )
-from rcirl_jax.evaluation.table import (
-    RankingReport,
-    build_report,
-    format_table,
-    to_json,
-)
+from rcirl_jax.evaluation.table import RankingReport, build_report, to_json
 
 __all__ = [
     "ClusterBootstrap",

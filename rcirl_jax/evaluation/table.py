@@ -7,7 +7,6 @@ runs), so rows can be compared; the comparison itself is the paired difference.
 
 import dataclasses
 import math
-import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
@@ -62,6 +61,8 @@ class RankingReport:
     runs: dict[str, int]  # row -> training runs
     rows: dict[str, dict[str, Estimate]]  # row -> metric -> estimate
     comparisons: tuple[Comparison, ...]
+    # row -> median over scenes of the percentile rank (mean over runs per scene)
+    human_rank_median: dict[str, Estimate]
     oracle_floor: Estimate  # m, mean FDE of the best candidate per scene
     oracle_floor_median: Estimate  # m
     confidence: float
@@ -128,6 +129,14 @@ def build_report(
             for family in _families(scorers, name)
             for comparison in _compare(stacked, family, name, bootstrap, confidence)
         ),
+        human_rank_median={
+            name: bootstrap_median(
+                np.mean(values["percentile_rank"], axis=0),
+                bootstrap,
+                confidence=confidence,
+            )
+            for name, values in stacked.items()
+        },
         oracle_floor=combine_seeds(floor, bootstrap, confidence=confidence),
         oracle_floor_median=bootstrap_median(floor, bootstrap, confidence=confidence),
         confidence=confidence,
@@ -265,132 +274,3 @@ def _plain(node: object, where: str) -> "dict | list | str | float | int | bool 
     if not math.isfinite(number):
         raise InputError(f"report: {where}: {number}: expected a finite number")
     return number
-
-
-def format_table(report: RankingReport, width: int = 110) -> str:
-    """The report as aligned plain text for a terminal.
-
-    Rows: learned scorers first, then the rivals; columns wrap into blocks that
-    fit. A share of 0 or 100 % is printed with its exact bound. Below: learned
-    rows minus each reference row (all rows, if none is learned).
-
-    Args:
-      report: from `build_report`.
-      width: characters per line, at least `MIN_WIDTH`.
-    """
-    if width < MIN_WIDTH:
-        raise InputError(f"format_table: width: {width}: expected at least {MIN_WIDTH}")
-    learned = [name for name in report.rows if name not in RIVALS]
-    rivals = [name for name in RIVALS if name in report.rows]
-    lines = [line for text in _heading(report) for line in textwrap.wrap(text, width)]
-    labels = [_label(report, name) for name in [*learned, *rivals]]
-    first = max(len(label) for label in labels)
-    columns = {name: _column(report, name, [*learned, *rivals]) for name in METRICS}
-    labels = ["", "", *(x for label in labels for x in (label, "  sd over runs"))]
-    first = max(first, len("  sd over runs"))
-    block: list[str] = []
-    for name in METRICS:
-        used = sum(len(columns[x][0]) + 2 for x in [*block, name])
-        if block and first + used > width:
-            lines += _block(labels, first, [columns[x] for x in block])
-            block = []
-        block.append(name)
-    lines += _block(labels, first, [columns[x] for x in block])
-    return "\n".join([*lines, *_differences(report, learned or rivals)]) + "\n"
-
-
-def _heading(report: RankingReport) -> list[str]:
-    counts = ", ".join(f"{n:,} {name}" for name, n in report.counts.items())
-    mean, median = report.oracle_floor, report.oracle_floor_median
-    level = f"{100.0 * report.confidence:g} %"
-    heading = [
-        f"Ranking at {report.horizon_s:g} s: {counts}.",
-        "Oracle floor, FDE of the best candidate: "
-        f"mean {mean.value:.2f} [{mean.low:.2f}, {mean.high:.2f}] m, "
-        f"median {median.value:.2f} [{median.low:.2f}, {median.high:.2f}] m.",
-        f"Cells: value [{level} interval over vehicles and runs]; (<= or >=): exact "
-        f"{level} bound; high, low: which is better. +fail: a failure (crash of the "
-        f"chosen, or nothing feasible) is charged at least {report.failure_m:g} m. "
-        f"Miss: FDE above {report.miss_threshold_m:.2g} m.",
-    ]
-    if report.counts["vehicles"] < FEW_VEHICLES:
-        heading.append(
-            f"Fewer than {FEW_VEHICLES} vehicles: bootstrap intervals are too short."
-        )
-    return heading
-
-
-def _label(report: RankingReport, name: str) -> str:
-    runs = report.runs[name]
-    return name if runs == 1 else f"{name} ({runs} runs)"
-
-
-def _column(report: RankingReport, metric: str, names: Sequence[str]) -> list[str]:
-    """Title, unit, then per row its cell and its spread; all of one width."""
-    how = METRICS[metric]
-    cells = [how.title, f"{how.unit}, {'high' if how.higher_is_better else 'low'}"]
-    for name in names:
-        found = report.rows[name][metric]
-        cells.append(_cell(found, how.unit))
-        spread = found.seed_sd
-        cells.append("" if spread is None else _number(spread, how.unit))
-    wide = max(len(cell) for cell in cells)
-    return [cell.rjust(wide) for cell in cells]
-
-
-def _block(labels: list[str], first: int, columns: list[list[str]]) -> list[str]:
-    """Lines of one block of columns; spread lines of single runs are left out."""
-    lines = [""]
-    for i, label in enumerate(labels):
-        cells = [column[i] for column in columns]
-        if any(cell.strip() for cell in cells):
-            lines.append("  ".join([label.ljust(first), *cells]).rstrip())
-    rule = "-" * (first + sum(len(column[0]) + 2 for column in columns))
-    return [*lines[:3], rule, *lines[3:]]
-
-
-def _cell(found: Estimate, unit: str) -> str:
-    if found.exact:
-        bound = found.high if found.value == 0.0 else found.low
-        sign = "<=" if found.value == 0.0 else ">="
-        return f"{100.0 * found.value:.0f} ({sign} {_number(bound, unit)})"
-    low, high = _number(found.low, unit), _number(found.high, unit)
-    return f"{_number(found.value, unit)} [{low}, {high}]"
-
-
-def _number(value: float, unit: str) -> str:
-    """Fixed digits; a share that is not 0 or 100 % is never printed as if it were."""
-    if unit != "%":
-        return f"{value:.2f}" if unit == "m" else f"{value:.3f}"
-    percent = 100.0 * value
-    for digits in range(1, 6):
-        text = f"{percent:.{digits}f}"
-        if float(text) not in (0.0, 100.0):
-            return text
-    return f"{percent:.1f}"
-
-
-def _differences(report: RankingReport, names: Sequence[str]) -> list[str]:
-    shown = [c for c in report.comparisons if c.row in names]
-    if not shown:
-        return []
-    lines = [
-        "",
-        "Paired differences on the same scenes; a difference has a name beyond "
-        f"{SIGNIFICANT_SE:g} s.e.",
-    ]
-    wide = max(len(METRICS[c.metric].title) for c in shown)
-    last = ("", "")
-    for c in shown:
-        if (c.row, c.reference) != last:
-            last = (c.row, c.reference)
-            lines.append(f"{c.row} minus {c.reference}")
-        d, unit = c.difference, METRICS[c.metric].unit
-        scale, name = (100.0, "points") if unit == "%" else (1.0, unit)
-        mean, low, high, se = (scale * x for x in (d.mean, d.low, d.high, d.se))
-        interval = f"[{low:+.3f}, {high:+.3f}]"
-        lines.append(
-            f"  {METRICS[c.metric].title:<{wide}}  {mean:+8.3f} {interval:<18}"
-            f" {name:<6}  s.e. {se:.3f}  p {d.p:.3f}, Holm {c.p_holm:.3f}  {c.verdict}"
-        )
-    return lines

@@ -20,14 +20,14 @@ from rcirl_jax.report.style import (
     label,
     save,
 )
-from rcirl_jax.types import Candidates, Demonstration, Kind, Trajectory
+from rcirl_jax.types import Candidates, Demonstration, Kind
 from rcirl_jax.units import TIMES_S
 
 SHOWN_CANDIDATES = 120  # at most so many profiles are drawn
 DISTANCES = (
-    ("follow_distance", "gap to the car followed", "follow"),
-    ("overtake_distance", "gap to the car overtaken", "overtake"),
-    ("stop_distance", "gap to the stop line", "stop"),
+    ("follow_distance", "gap to the car followed (100: none)", "follow"),
+    ("overtake_distance", "gap to the car overtaken (100: none)", "overtake"),
+    ("stop_distance", "gap to the stop line (60: none)", "stop"),
     ("collision_distance", "distance to the closest obstacle", "other"),
 )
 
@@ -130,7 +130,7 @@ def example_frame(
     made, axes = figure(2, 3, 13.0, 7.2)
     valid = np.asarray(demonstration.scene.time_valid)
     draw_st_graph(axes[0, 0], demonstration, candidates, chosen)
-    _draw_speeds(axes[0, 1], demonstration, candidates.trajectory, chosen)
+    _draw_speeds(axes[0, 1], demonstration, candidates, chosen)
     panels = [axes[0, 2], *axes[1]]
     for axis, (name, title, kind) in zip(panels, DISTANCES, strict=True):
         if name not in names:
@@ -148,12 +148,13 @@ def example_frame(
 
 
 def _draw_speeds(
-    axis: Axes, demonstration: Demonstration, sampled: Trajectory, chosen: int
+    axis: Axes, demonstration: Demonstration, candidates: Candidates, chosen: int
 ) -> None:
     valid = np.asarray(demonstration.scene.time_valid)
-    speeds = np.asarray(sampled.v)
-    step = max(len(speeds) // SHOWN_CANDIDATES, 1)
-    for row in speeds[::step]:
+    speeds = np.asarray(candidates.trajectory.v)
+    feasible = np.flatnonzero(np.asarray(candidates.feasible))
+    step = max(len(feasible) // SHOWN_CANDIDATES, 1)
+    for row in speeds[feasible[::step]]:
         axis.plot(TIMES_S, _mask(row, valid), color=CANDIDATE, lw=0.4, alpha=0.4)
     axis.plot(
         TIMES_S, _mask(np.asarray(demonstration.human.v), valid), color=HUMAN, lw=2

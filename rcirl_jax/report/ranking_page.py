@@ -7,7 +7,8 @@ import numpy as np
 
 from rcirl_jax.data.quality import format_quality
 from rcirl_jax.data.store import Dataset
-from rcirl_jax.evaluation.table import RankingReport, format_table
+from rcirl_jax.evaluation.format import format_table
+from rcirl_jax.evaluation.table import RankingReport
 from rcirl_jax.export.loading import row_name
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.report import html, plots

@@ -34,6 +34,9 @@ class LatticeCost:
     overtake_buffer: float = 5.0  # m
     offset_scale: float = 3.0  # m
     comfort_braking: float = 3.0  # m/s^2, half of the 6 m/s^2 limit
+    # Apollo drops colliding trajectories after sorting; here they cost this much
+    # more, which sorts them last
+    collision_check: float = 1000.0
 
 
 def _ratio(x: jax.Array, valid: jax.Array) -> jax.Array:
@@ -51,7 +54,8 @@ def lattice_cost(
         cost = 10 objective + 1 jerk + 5 collision + 1.5 centripetal
                + 2 lateral_offset + 10 lateral_comfort
 
-    with v_ref = min(limit, sqrt(2 * 3 * distance to a stop)).
+    with v_ref = min(limit, sqrt(2 * 3 * distance to a stop)); a trajectory that
+    collides costs 1000 more, so that it comes last as in Apollo.
     """
     frame, valid = make_frame(scene, trajectory), scene.time_valid
     column = {name: COLUMNS[name](frame) for name in _READ}
@@ -76,8 +80,10 @@ def lattice_cost(
     distance = jnp.where(column["collision"] > 0.0, 0.0, distance)
     near = jnp.exp(-0.5 * (distance / weights.collision_sigma) ** 2)
     comfort = jnp.abs(trajectory.ddl * trajectory.v**2 + trajectory.dl * trajectory.a)
+    collides = jnp.any((column["collision"] > 0.0) & valid)
     return (
-        weights.objective * objective
+        weights.collision_check * collides
+        + weights.objective * objective
         + weights.jerk * _ratio(trajectory.j / weights.jerk_bound, valid)
         + weights.collision * _ratio(near, valid)
         + weights.centripetal * _ratio(column["lateral_acceleration"], valid)

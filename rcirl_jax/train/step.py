@@ -177,7 +177,7 @@ def make_train_step(
             first_bad = jax.lax.pmax(first_bad, axis_name)
         loss, wins, pairs, grads, nonfinite = sums
         grads = jax.tree.map(lambda g: g / jnp.maximum(pairs, 1.0), grads)
-        norm = optax.global_norm(grads)
+        norm = optax.tree.norm(grads)
         finite = jnp.isfinite(loss) & jnp.isfinite(norm)
         before = as_tree(state.params)
         updates, opt_state = optimizer.update(grads, state.opt_state, before)

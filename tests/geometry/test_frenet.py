@@ -1,0 +1,140 @@
+"""Frenet frames: round trips, shapely as an oracle, closed-form curvature."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rcirl_jax.geometry.frenet import (
+    lookup,
+    path_curvature,
+    project_points,
+    reference_line_from_polyline,
+    to_cartesian,
+    to_frenet,
+)
+
+
+def curve(kind, noise=0.0, seed=0):
+    """A polyline of about 200 m with points every 2 m."""
+    s = np.arange(0.0, 200.0, 2.0)
+    kappa = {
+        "straight": 0.0 * s,
+        "circle": np.full(s.shape, 1 / 60.0),
+        "clothoid": s / 200.0 / 40.0,
+        "s_curve": np.sin(s / 30.0) / 50.0,
+    }[kind]
+    heading = np.cumsum(kappa) * 2.0
+    points = np.stack([np.cumsum(np.cos(heading)), np.cumsum(np.sin(heading))], 1) * 2.0
+    return points + np.random.default_rng(seed).normal(0.0, noise, points.shape)
+
+
+def line_of(points, size=256):
+    return reference_line_from_polyline(points, size=size, step=1.0)
+
+
+@pytest.mark.parametrize("kind", ["straight", "circle", "clothoid", "s_curve"])
+@pytest.mark.parametrize("noise", [0.0, 0.03])
+def test_round_trip_within_a_centimetre(kind, noise):
+    line = line_of(curve(kind, noise))
+    rng = np.random.default_rng(1)
+    s = jnp.asarray(rng.uniform(2.0, 190.0, 300), jnp.float32)
+    l = jnp.asarray(rng.uniform(-8.0, 8.0, 300), jnp.float32)
+    x, y, _, _ = jax.vmap(to_cartesian, in_axes=(None, 0, 0))(line, s, l)
+    s_back, l_back = jax.vmap(to_frenet, in_axes=(None, 0, 0))(line, x, y)
+    np.testing.assert_allclose(s_back, s, atol=0.01)
+    np.testing.assert_allclose(l_back, l, atol=0.01)
+
+
+@given(seed=st.integers(0, 1000))
+def test_round_trip_from_cartesian(seed):
+    line = line_of(curve("s_curve"))
+    rng = np.random.default_rng(seed)
+    base = curve("s_curve")[rng.integers(5, 90)]
+    x, y = base + rng.uniform(-5.0, 5.0, 2)
+    s, l = to_frenet(line, jnp.float32(x), jnp.float32(y))
+    x_back, y_back, _, _ = to_cartesian(line, s, l)
+    assert float(x_back) == pytest.approx(x, abs=0.01)
+    assert float(y_back) == pytest.approx(y, abs=0.01)
+
+
+@pytest.mark.parametrize("kind", ["straight", "circle", "s_curve"])
+def test_shapely_projects_to_the_same_station(kind):
+    points = curve(kind)
+    line = line_of(points)
+    dense = shapely.LineString(
+        np.stack([np.asarray(line.x), np.asarray(line.y)], 1)[: int(line.num_valid)]
+    )
+    rng = np.random.default_rng(2)
+    queries = points[rng.integers(5, 90, 100)] + rng.uniform(-4.0, 4.0, (100, 2))
+    s, l = project_points(line, queries)
+    for query, station, offset in zip(queries, s, l, strict=True):
+        point = shapely.Point(query)
+        # the oracle walks straight chords: up to 1 % of a metre per metre short
+        assert station == pytest.approx(dense.project(point), abs=0.15)
+        assert abs(offset) == pytest.approx(dense.distance(point), abs=0.02)
+
+
+def test_left_is_positive():
+    line = line_of(curve("straight"))
+    _, l = to_frenet(line, jnp.float32(50.0), jnp.float32(2.0))
+    assert float(l) == pytest.approx(2.0, abs=1e-3)
+
+
+def test_curvature_of_a_circle_and_of_noise_on_a_straight():
+    inside = slice(15, 180)
+    kappa = np.asarray(line_of(curve("circle")).kappa)[inside]
+    np.testing.assert_allclose(kappa, 1 / 60.0, rtol=0.03)
+    noisy = np.asarray(line_of(curve("straight", 0.03)).kappa)[inside]
+    assert np.abs(noisy).max() < 0.01
+
+
+def test_straight_beyond_the_end():
+    line = line_of(curve("straight"), size=512)
+    x, y, heading, kappa = to_cartesian(line, jnp.float32(400.0), jnp.float32(0.0))
+    assert float(x) - float(line.x[0]) == pytest.approx(400.0, abs=0.1)
+    assert float(y) == pytest.approx(0.0, abs=0.1)
+    assert float(kappa) == 0.0
+    assert float(heading) == pytest.approx(0.0, abs=1e-3)
+
+
+def test_duplicate_points_and_short_lines():
+    points = np.array([[0.0, 0.0], [0.0, 0.0], [3.0, 0.0], [3.0, 0.0], [9.0, 0.0]])
+    s, l = project_points(line_of(points), np.array([[4.0, 1.0]]))
+    assert s[0] == pytest.approx(4.0, abs=1e-2)
+    assert l[0] == pytest.approx(1.0, abs=1e-2)
+    assert project_points(line_of(points), np.zeros((0, 2)))[0].shape == (0,)
+
+
+@given(s=st.floats(-10, 300), seed=st.integers(0, 100))
+def test_lookup_is_numpy_interp(s, seed):
+    table = np.random.default_rng(seed).normal(size=64).astype(np.float32)
+    found = float(lookup(jnp.asarray(table), jnp.float32(s), 2.0))
+    assert found == pytest.approx(np.interp(s, np.arange(64) * 2.0, table), abs=1e-3)
+
+
+def test_curvature_of_a_path_against_finite_differences():
+    """l(s) = 2 sin(s / 30) along a circle, differentiated in x and y."""
+    line = line_of(curve("circle"))
+    s = np.linspace(60.0, 120.0, 4001)
+    offset = 2.0 * np.sin(s / 30.0)
+    radius = 60.0
+    angle = s / radius
+    x = (radius - offset) * np.sin(angle)
+    y = radius - (radius - offset) * np.cos(angle)
+    dx, dy = np.gradient(x, s), np.gradient(y, s)
+    ddx, ddy = np.gradient(dx, s), np.gradient(dy, s)
+    expected = (dx * ddy - dy * ddx) / np.hypot(dx, dy) ** 3
+    for i in (500, 2000, 3500):
+        found = path_curvature(
+            jnp.float32(1 / radius),
+            jnp.float32(0.0),
+            jnp.float32(offset[i]),
+            jnp.float32(2.0 / 30.0 * np.cos(s[i] / 30.0)),
+            jnp.float32(-2.0 / 900.0 * np.sin(s[i] / 30.0)),
+        )
+        assert float(found) == pytest.approx(expected[i], abs=2e-5)
+    assert float(line.step) == 1.0

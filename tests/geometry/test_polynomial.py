@@ -1,0 +1,67 @@
+"""Polynomials against a float64 linear solve and automatic derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rcirl_jax.geometry.polynomial import evaluate, quartic, quintic
+
+speeds = st.floats(-5, 40, width=32)
+accelerations = st.floats(-8, 4, width=32)
+durations = st.floats(0.5, 10, width=32)
+
+
+def powers(t, order, size):
+    """Row of the Vandermonde matrix of the order-th derivative."""
+    row = np.zeros(size)
+    for i in range(order, size):
+        factor = np.prod(np.arange(i, i - order, -1)) if order else 1.0
+        row[i] = factor * t ** (i - order)
+    return row
+
+
+@given(v0=speeds, a0=accelerations, v1=speeds, d=durations)
+def test_quartic_solves_its_conditions(v0, a0, v1, d):
+    rows = [powers(0, k, 5) for k in range(3)] + [powers(d, k, 5) for k in (1, 2)]
+    expected = np.linalg.solve(np.array(rows), [3.0, v0, a0, v1, 0.5])
+    found = np.asarray(quartic(3.0, v0, a0, v1, 0.5, d), np.float64)
+    scale = d ** np.arange(5)
+    np.testing.assert_allclose(found * scale, expected * scale, rtol=1e-4, atol=1e-2)
+
+
+@given(v0=speeds, a0=accelerations, s1=st.floats(0, 200, width=32), d=durations)
+def test_quintic_meets_both_ends(v0, a0, s1, d):
+    curve = quintic(0.0, v0, a0, s1, 4.0, -1.0, d)
+    rows = [powers(0, k, 6) for k in range(3)] + [powers(d, k, 6) for k in range(3)]
+    expected = np.linalg.solve(np.array(rows), [0.0, v0, a0, s1, 4.0, -1.0])
+    scale = d ** np.arange(6)
+    np.testing.assert_allclose(
+        np.asarray(curve) * scale, expected * scale, rtol=1e-3, atol=0.05
+    )
+    value, first, second, _ = evaluate(curve, jnp.float32(d))
+    assert float(value) == pytest.approx(s1, abs=0.02)
+    assert float(first) == pytest.approx(4.0, abs=0.05)
+    assert float(second) == pytest.approx(-1.0, abs=0.2)
+
+
+def test_derivatives_are_those_of_jax():
+    curve = quintic(0.0, 10.0, 1.0, 60.0, 8.0, 0.0, 6.0)
+    position = lambda t: evaluate(curve, t)[0]  # noqa: E731
+    for t in (0.0, 1.3, 5.9):
+        at = jnp.float32(t)
+        _, first, second, third = evaluate(curve, at)
+        assert float(first) == pytest.approx(float(jax.grad(position)(at)), abs=1e-3)
+        slope = jax.grad(jax.grad(position))
+        assert float(second) == pytest.approx(float(slope(at)), abs=1e-3)
+        assert float(third) == pytest.approx(float(jax.grad(slope)(at)), abs=1e-2)
+
+
+@pytest.mark.parametrize("duration", [0.0, 1e-6, -1.0])
+def test_tiny_durations_stay_finite(duration):
+    assert np.isfinite(np.asarray(quartic(0.0, 1.0, 0.0, 2.0, 0.0, duration))).all()
+    assert np.isfinite(
+        np.asarray(quintic(0.0, 1.0, 0.0, 1.0, 2.0, 0.0, duration))
+    ).all()

@@ -1,0 +1,165 @@
+"""The sampler: fixed K, feasibility, families, determinism."""
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.sampling import (
+    FAMILIES,
+    SamplerConfig,
+    hard_negatives,
+    num_candidates,
+    sample,
+    trajectory_on_path,
+)
+from rcirl_jax.types import Kind
+from rcirl_jax.units import TIMES_S
+from tests.scenes import batch, random_scene, scene
+
+CONFIGS = {mode: SamplerConfig(mode=mode) for mode in ("speed", "path_speed")}
+SAMPLE = {
+    mode: jax.jit(lambda key, made, c=config: sample(key, made, c))
+    for mode, config in CONFIGS.items()
+}
+
+
+def family(candidates, name):
+    return np.flatnonzero(np.asarray(candidates.family) == FAMILIES.index(name))
+
+
+@pytest.mark.parametrize("mode", CONFIGS)
+@given(seed=st.integers(0, 10_000))
+def test_any_scene_gives_k_finite_candidates(mode, seed):
+    made = random_scene(seed)
+    candidates = SAMPLE[mode](jax.random.key(seed), made)
+    count = num_candidates(CONFIGS[mode])
+    assert candidates.trajectory.s.shape == (count, TIMES_S.size)
+    for leaf in jax.tree.leaves(candidates.trajectory):
+        assert np.isfinite(np.asarray(leaf)).all()
+    stations = np.asarray(candidates.trajectory.s)
+    assert (np.diff(stations, axis=1) >= 0.0).all()
+    assert np.asarray(candidates.feasible)[family(candidates, "emergency")][:3].all()
+
+
+@pytest.mark.parametrize("mode", CONFIGS)
+def test_all_start_in_the_ego_state(mode):
+    made = random_scene(4)
+    trajectory = SAMPLE[mode](jax.random.key(0), made).trajectory
+    np.testing.assert_allclose(trajectory.s[:, 0], 0.0, atol=1e-5)
+    np.testing.assert_allclose(trajectory.v[:, 0], made.ego.v)
+    np.testing.assert_allclose(trajectory.a[:, 0], made.ego.a)
+
+
+@pytest.mark.parametrize("mode", CONFIGS)
+def test_feasible_means_inside_the_limits(mode):
+    config = CONFIGS[mode]
+    for seed in range(5):
+        made = random_scene(seed)
+        candidates = SAMPLE[mode](jax.random.key(seed), made)
+        valid = np.asarray(made.time_valid).copy()
+        valid[0] = False
+        emergency = np.asarray(candidates.family) == FAMILIES.index("emergency")
+        keep = np.asarray(candidates.feasible) & ~emergency
+        a = np.asarray(candidates.trajectory.a)[keep][:, valid]
+        j = np.asarray(candidates.trajectory.j)[keep][:, valid]
+        assert a.min() >= config.min_acceleration
+        assert a.max() <= config.max_acceleration
+        assert np.abs(j).max() <= config.max_jerk
+
+
+def test_families_do_what_they_are_named_for():
+    leader = {"s": 40.0, "speed": 8.0}
+    made = scene(v=12.0, boxes=[leader])
+    candidates = SAMPLE["speed"](jax.random.key(0), made)
+    stations = np.asarray(candidates.trajectory.s)
+    speeds = np.asarray(candidates.trajectory.v)
+    np.testing.assert_allclose(
+        stations[family(candidates, "constant_speed")[0]], 12.0 * TIMES_S, rtol=1e-5
+    )
+    rear = 40.0 + 8.0 * 8.0 - 2.25
+    followers = family(candidates, "follow")
+    at_end = stations[followers, -1] + 2.45
+    gaps = rear - at_end
+    assert ((gaps > 2.0) & (gaps < 20.0)).sum() >= 4
+    assert stations[family(candidates, "overtake"), -1].max() > rear + 4.5
+    assert np.abs(speeds[family(candidates, "emergency"), -1]).max() < 0.5
+
+
+def test_stops_before_the_line():
+    line = {"s": 40.0, "kind": Kind.STOP, "length": 0.0, "width": 40.0}
+    made = scene(v=10.0, boxes=[line])
+    candidates = SAMPLE["speed"](jax.random.key(0), made)
+    fronts = np.asarray(candidates.trajectory.s)[family(candidates, "stop"), -1] + 2.45
+    assert ((fronts > 36.0) & (fronts <= 40.0)).sum() >= 4
+
+
+def test_lateral_profiles_reach_the_neighbouring_lanes():
+    made = scene(v=15.0)
+    candidates = SAMPLE["path_speed"](jax.random.key(0), made)
+    ends = np.asarray(candidates.trajectory.l)[np.asarray(candidates.feasible), -1]
+    for target in (0.0, 3.6, -3.6, 0.4, -0.8):
+        assert np.abs(ends - target).min() < 0.05
+
+
+def test_lanes_beyond_the_road_are_not_feasible():
+    made = scene(v=15.0)
+    narrow = made.replace(
+        path=made.path.replace(
+            road_left=made.path.lane_left, road_right=made.path.lane_right
+        )
+    )
+    candidates = SAMPLE["path_speed"](jax.random.key(0), narrow)
+    ends = np.asarray(candidates.trajectory.l)[np.asarray(candidates.feasible), -1]
+    assert np.abs(ends).max() < 1.0
+
+
+def test_only_the_random_family_depends_on_the_key():
+    made = random_scene(2)
+    one = SAMPLE["speed"](jax.random.key(0), made)
+    same = SAMPLE["speed"](jax.random.key(0), made)
+    other = SAMPLE["speed"](jax.random.key(1), made)
+    np.testing.assert_array_equal(one.trajectory.s, same.trajectory.s)
+    differs = np.any(one.trajectory.s != other.trajectory.s, axis=1)
+    assert set(np.flatnonzero(differs)) <= set(family(one, "random"))
+    assert differs.sum() > 40
+
+
+def test_vmap_equals_loop():
+    scenes = [random_scene(seed) for seed in range(3)]
+    keys = jax.random.split(jax.random.key(0), 3)
+    together = jax.vmap(SAMPLE["speed"])(keys, batch(scenes))
+    for i, made in enumerate(scenes):
+        alone = SAMPLE["speed"](keys[i], made)
+        np.testing.assert_allclose(
+            together.trajectory.s[i], alone.trajectory.s, rtol=1e-5, atol=1e-3
+        )
+        np.testing.assert_array_equal(together.feasible[i], alone.feasible)
+
+
+def test_compiles_once():
+    config = CONFIGS["speed"]
+    counted = chex.assert_max_traces(lambda k, made: sample(k, made, config), n=1)
+    run = jax.jit(counted)
+    for seed in range(3):
+        run(jax.random.key(seed), random_scene(seed))
+
+
+def test_hard_negatives_depart_from_the_human_with_time():
+    made = scene(v=12.0)
+    human = trajectory_on_path(made, 12.0 * jnp.asarray(TIMES_S))
+    near = hard_negatives(jax.random.key(0), made, human, CONFIGS["speed"], 16)
+    apart = np.abs(np.asarray(near.trajectory.s - human.s))
+    assert (apart[:, 0] == 0.0).all()
+    assert ((apart[:, -1] >= 0.99) & (apart[:, -1] <= 6.01)).all()
+    signs = np.sign(np.asarray(near.trajectory.s - human.s)[:, -1])
+    assert (signs > 0).sum() == 8
+
+
+def test_unknown_mode_is_one_line():
+    with pytest.raises(InputError, match="--mode: sideways: expected one of"):
+        SamplerConfig(mode="sideways")

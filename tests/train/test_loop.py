@@ -1,0 +1,184 @@
+"""A whole run on a small dataset: resume, export, rank, report, command lines."""
+
+import json
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.importing import ImportConfig, import_logs
+from rcirl_jax.data.store import open_dataset
+from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.evaluate import RankingSetup, evaluate_ranking, oracle_floor
+from rcirl_jax.evaluation.format import format_table
+from rcirl_jax.export.from_run import export_run, read_config
+from rcirl_jax.export.loading import load_runs, open_reward
+from rcirl_jax.report.ranking_page import write_ranking_page
+from rcirl_jax.sampling import SamplerConfig
+from rcirl_jax.train.loop import train
+from rcirl_jax.train.state import TrainConfig
+from tests.conftest import REPO
+
+SMALL = SamplerConfig(num_random=4, cruise_times=(4.0,), edge_times=(4.0,))
+CONFIG = TrainConfig(batch_size=8, epochs=3, sampler=SMALL)
+
+ROADS = """
+source = "test"
+licence = "none"
+rate_hz = 10.0
+[[recordings]]
+road = "arterial_signals"
+count = 2
+duration_s = 25.0
+density_veh_per_km = 18.0
+seed = 3
+"""
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("loop")
+    spec = folder / "roads.toml"
+    spec.write_text(ROADS)
+    import_logs(
+        read_recordings("synthetic", spec),
+        folder / "dataset",
+        ImportConfig(format="synthetic", test_fraction=0.5),
+    )
+    return open_dataset(folder / "dataset")
+
+
+@pytest.fixture(scope="module")
+def run(dataset, tmp_path_factory):
+    workdir = tmp_path_factory.mktemp("run")
+    result = train(dataset, workdir, CONFIG, provenance={"git_commit": "abc"})
+    return workdir, result
+
+
+def leaves(state):
+    plain = state.replace(key=jax.random.key_data(state.key))
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(plain)]
+
+
+def test_resume_is_bitwise(dataset, run, tmp_path):
+    """One epoch, a new process' worth of objects, then the other two."""
+    workdir = tmp_path / "resumed"
+    one = TrainConfig(batch_size=8, epochs=1, sampler=SMALL)
+    train(dataset, workdir, one)
+    resumed = train(dataset, workdir, CONFIG)
+    for a, b in zip(leaves(resumed.state), leaves(run[1].state), strict=True):
+        np.testing.assert_array_equal(a, b)
+    lines = [
+        json.loads(line)
+        for line in (workdir / "metrics.jsonl").read_text().splitlines()
+    ]
+    steps = [line["step"] for line in lines]
+    assert steps == list(range(1, len(steps) + 1))
+
+
+def test_other_settings_may_not_resume(dataset, run):
+    with pytest.raises(InputError, match=r"leaky_rate: 0\.05: expected 0\.1"):
+        train(dataset, run[0], TrainConfig(batch_size=8, leaky_rate=0.1, sampler=SMALL))
+
+
+def test_run_writes_what_it_should(run):
+    workdir, result = run
+    assert (workdir / "run.json").is_file()
+    assert list((workdir / "tensorboard").iterdir())
+    assert result.epochs[-1]["epoch"] == 3
+    assert result.queries > 0
+    config, _ = read_config(workdir)
+    assert config == CONFIG
+
+
+def test_export_rank_report(dataset, run, tmp_path):
+    reward = export_run(run[0], dataset, tmp_path / "weights.msgpack")
+    learned, preset, _ = load_runs([reward.file])
+    setup = RankingSetup(preset=preset, sampler=SMALL)
+    report = evaluate_ranking(dataset, learned, setup)
+    assert set(report.rows) == {
+        "RC-IRL 21-15-1",
+        "random",
+        "constant speed",
+        "IDM",
+        "hand-set",
+        "oracle",
+    }
+    floor = report.rows["oracle"]["top1_fde"].value
+    assert all(row["top1_fde"].value >= floor - 1e-6 for row in report.rows.values())
+    assert max(len(line) for line in format_table(report, 118).splitlines()) <= 118
+    page = write_ranking_page(
+        tmp_path / "report.html",
+        dataset=dataset,
+        rewards=[open_reward(reward.file)],
+        report=report,
+        workdir=run[0],
+    )
+    text = page.read_text()
+    assert text.count("data:image/png;base64,") >= 5
+    assert 'src="http' not in text
+
+
+def test_exported_values_are_the_trainers(dataset, run, tmp_path):
+    """The numpy reader and the JAX network agree on fresh scenes to 1e-5."""
+    import jax.numpy as jnp
+
+    from rcirl_jax.features import feature_map
+    from rcirl_jax.reward import value
+    from rcirl_jax.train.loop import to_device_batch
+    from rcirl_jax.train.step import featurise
+
+    reward = export_run(run[0], dataset, tmp_path / "weights.msgpack")
+    index = dataset.indices("test")[:8]
+    batch = to_device_batch(dataset.read(index), np.ones(8), index)
+    made = featurise(jax.random.key(9), batch, CONFIG, feature_map("paper21"))
+    valid = jnp.broadcast_to(made.time_valid[:, None], made.candidates.shape[:3])
+    state = run[1].state
+    expected = value(
+        state.params, state.normaliser, made.candidates, valid, CONFIG.reward
+    )
+    found = reward.value(np.asarray(made.candidates), np.asarray(valid))
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_oracle_floor_is_reported(dataset):
+    floor = oracle_floor(dataset, RankingSetup(sampler=SMALL), 64)
+    assert 0.0 <= floor["best_fde_median_m"] <= floor["best_fde_mean_m"] + 5.0
+    assert floor["candidates"] > 0
+
+
+def test_a_horizon_nobody_covers_is_one_line(dataset):
+    setup = RankingSetup(sampler=SMALL, horizon_s=8.0, split="nowhere")
+    with pytest.raises(InputError):
+        evaluate_ranking(dataset, {}, setup)
+
+
+@pytest.mark.multiprocess
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        (["import_logs", "--format=commonroad", "--input=nowhere", "--output=o"], "no"),
+        (["train", "--data=nowhere", "--workdir=w"], "nowhere"),
+        (["evaluate", "--weights=nowhere", "--data=nowhere"], "nowhere"),
+        (["export_weights", "--workdir=nowhere"], "run.json: missing"),
+    ],
+)
+def test_command_lines_answer_bad_input_in_one_line(command, message, tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", f"experiments.{command[0]}", *command[1:]],
+        cwd=tmp_path,
+        env={"PYTHONPATH": str(REPO), "JAX_PLATFORMS": "cpu", "PATH": "/usr/bin:/bin"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2
+    errors = done.stderr.strip().splitlines()
+    assert len(errors) == 1
+    assert errors[0].startswith("error: ")
+    assert message in errors[0]
+    assert "Traceback" not in done.stderr
+    assert not list(tmp_path.iterdir())
