@@ -156,6 +156,23 @@ class Demonstration(flax.struct.PyTreeNode, kw_only=True):
     frame: jax.Array  # [] int32, frame number inside the recording
 
 
+class Normaliser(flax.struct.PyTreeNode, kw_only=True):
+    """x = (clip(f, lower, upper) - location) / scale, per feature."""
+
+    lower: jax.Array  # [F] in the feature's unit
+    upper: jax.Array  # [F]
+    location: jax.Array  # [F]
+    scale: jax.Array  # [F] > 0
+
+
+class RewardParams(flax.struct.PyTreeNode, kw_only=True):
+    """Trainable parameters. There is no output bias: it cancels in differences."""
+
+    gamma: jax.Array  # [T] weight of each time
+    kernels: tuple[jax.Array, ...]  # [F, H1], ..., [H, 1]
+    biases: tuple[jax.Array, ...]  # [H1], ... one per hidden layer
+
+
 # ----------------------------------------------------------------------- host
 
 

@@ -4,12 +4,12 @@ from rcirl_jax.reward.hand import LatticeCost, lattice_cost
 from rcirl_jax.reward.losses import LOSSES, pair_sums
 from rcirl_jax.reward.network import (
     RewardConfig,
-    RewardParams,
     init_reward,
     pinned,
     value,
 )
-from rcirl_jax.reward.normaliser import Normaliser, fit_normaliser, normalise
+from rcirl_jax.reward.normaliser import fit_normaliser, normalise
+from rcirl_jax.types import Normaliser, RewardParams
 
 __all__ = [
     "LOSSES",

@@ -8,13 +8,13 @@ Human and candidate go through the same parameters (Siamese).
 
 import dataclasses
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.reward.normaliser import Normaliser, normalise
+from rcirl_jax.reward.normaliser import normalise
+from rcirl_jax.types import Normaliser, RewardParams
 from rcirl_jax.units import NUM_TIMES
 
 LEAKY_SLOPE = 0.01  # negative slope of the leaky-ReLU hidden activation
@@ -49,14 +49,6 @@ class RewardConfig:
             )
         if self.pin not in PINS:
             raise InputError(f"--pin: {self.pin}: expected one of {PINS}")
-
-
-class RewardParams(flax.struct.PyTreeNode, kw_only=True):
-    """Trainable parameters. There is no output bias: it cancels in differences."""
-
-    gamma: jax.Array  # [T] weight of each time
-    kernels: tuple[jax.Array, ...]  # [F, H1], ..., [H, 1]
-    biases: tuple[jax.Array, ...]  # [H1], ... one per hidden layer
 
 
 def init_reward(

@@ -1,23 +1,13 @@
 """The frozen robust normaliser of features, stored with the weights."""
 
-import flax.struct
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from rcirl_jax.features import FeatureMap
+from rcirl_jax.types import Normaliser
 
 SCALE_FLOOR = 1e-3  # share of a feature's declared range; the smallest scale
-
-
-class Normaliser(flax.struct.PyTreeNode, kw_only=True):
-    """x = (clip(f, lower, upper) - location) / scale, per feature."""
-
-    lower: jax.Array  # [F] in the feature's unit
-    upper: jax.Array  # [F]
-    location: jax.Array  # [F]
-    scale: jax.Array  # [F] > 0
 
 
 def normalise(

@@ -13,8 +13,7 @@ import jax.numpy as jnp
 import optax
 
 from rcirl_jax.features import FeatureMap, feature_map
-from rcirl_jax.reward import RewardParams, init_reward, pair_sums, value
-from rcirl_jax.reward.normaliser import Normaliser
+from rcirl_jax.reward import init_reward, pair_sums, value
 from rcirl_jax.sampling import (
     SamplerConfig,
     hard_negatives,
@@ -29,7 +28,13 @@ from rcirl_jax.train.state import (
     TrainState,
     make_optimizer,
 )
-from rcirl_jax.types import Candidates, Demonstration, Trajectory
+from rcirl_jax.types import (
+    Candidates,
+    Demonstration,
+    Normaliser,
+    RewardParams,
+    Trajectory,
+)
 
 SAMPLER_STREAM = 0  # fold_in number of the sampler's key
 NEGATIVE_STREAM = 1  # fold_in number of the hard negatives' key

@@ -60,14 +60,19 @@ def test_eight_devices_equal_one(how, masked):
     weight = np.ones(16)
     if masked:
         weight[[1, 2, 3, 4, 5, 9, 10, 11, 15]] = 0.0
-    step = make_train_step(CONFIG)
+    # plain gradient steps: Adam would hide a wrong scale of the gradient
+    config = dataclasses.replace(CONFIG, optimizer="sgd", learning_rate=0.3)
+    step = make_train_step(config)
     one, many = single(step), how(step, 8)
-    a = b = init_state(CONFIG, normaliser())
+    a = b = init_state(config, normaliser())
     for _ in range(3):
         a, metrics_a = one(a, batch(weight))
         b, metrics_b = many(b, batch(weight))
         np.testing.assert_allclose(weights_of(a), weights_of(b), rtol=2e-4, atol=2e-5)
         assert float(metrics_a.pairs) == float(metrics_b.pairs)
+        assert float(metrics_a.grad_norm) == pytest.approx(
+            float(metrics_b.grad_norm), rel=1e-3
+        )
         assert float(metrics_a.loss_sum) == pytest.approx(
             float(metrics_b.loss_sum), rel=1e-3, abs=1e-3
         )

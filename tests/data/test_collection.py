@@ -1,0 +1,440 @@
+"""Recordings made by hand -> scenes: labels, tags, drop reasons, import."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from rcirl_jax.data import importing
+from rcirl_jax.data.assemble import assemble
+from rcirl_jax.data.collect import Collector
+from rcirl_jax.data.config import CollectConfig
+from rcirl_jax.data.filters import REASONS
+from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.importing import ImportConfig, import_logs
+from rcirl_jax.data.lanes import LaneGraph
+from rcirl_jax.data.quality import QualityReport, format_quality
+from rcirl_jax.data.recording import validate_recording
+from rcirl_jax.data.smoothing import harsh_share, savgol
+from rcirl_jax.data.store import open_dataset
+from rcirl_jax.errors import InputError
+from rcirl_jax.sampling import trajectory_from_positions
+from rcirl_jax.types import Decision, Ghost, Kind, Lane, Recording, Signal, Tag, Track
+from rcirl_jax.units import TIMES_S
+
+WIDTH = 3.6
+NO_FILTER = CollectConfig(require_obstacles=False, require_speed_change=False)
+
+
+def road(stop_line=None, signals=(), length=500.0):
+    x = np.arange(0.0, length + 1.0, 5.0)
+    half = np.full(x.shape, WIDTH / 2)
+    names = ("left", "mid", "right")
+    return tuple(
+        Lane(
+            id=name,
+            centre=np.stack([x, np.full(x.shape, (1 - i) * WIDTH)], 1),
+            left_width=half,
+            right_width=half,
+            speed_limit=25.0,
+            left=names[i - 1] if i else None,
+            right=names[i + 1] if i < 2 else None,
+            stop_line=None
+            if stop_line is None
+            else np.array(
+                [[stop_line, (1 - i) * WIDTH + side] for side in (1.8, -1.8)]
+            ),
+            signal_ids=signals,
+        )
+        for i, name in enumerate(names)
+    )
+
+
+def car(name, s, y=0.0, seconds=12.0, kind=Kind.VEHICLE, **more):
+    """A track from callables of time s(t), y(t)."""
+    t = np.arange(0.0, seconds + 1e-9, 0.1)
+    x = np.asarray(s(t), float) * np.ones_like(t)
+    y = (y(t) if callable(y) else y) * np.ones_like(t)
+    vx, vy = np.gradient(x, t), np.gradient(y, t)
+    moving = np.hypot(vx, vy) > 0.3
+    return Track(
+        id=name,
+        kind=kind,
+        length=4.5,
+        width=1.8,
+        t=t,
+        x=x,
+        y=y,
+        heading=np.where(moving, np.arctan2(vy, np.maximum(vx, 1e-3)), 0.0),
+        speed=np.hypot(vx, vy),
+        **more,
+    )
+
+
+def recording(*tracks, lanes=None, **more):
+    return Recording(
+        name="hand",
+        source="test",
+        licence="none",
+        rate_hz=10.0,
+        tracks=tracks,
+        lanes=lanes or road(),
+        **more,
+    )
+
+
+def speeding_up(start, v=12.0, a=0.3):
+    return lambda t: start + v * t + 0.5 * a * t**2
+
+
+def first_scene(made, ego="ego", config=NO_FILTER):
+    """The first scene of the ego, or the counted drop reasons."""
+    collector = Collector(made, config)
+    number = [track.id for track in made.tracks].index(ego)
+    rows = [row for row in collector.scenes() if row["track"] == number]
+    return rows[0] if rows else dict(collector.dropped)
+
+
+def decision_of(row, at_s):
+    """Decision about the obstacle whose rear end starts at station `at_s`."""
+    slot = np.argmin(np.abs(row["obstacles.s_lower"][:, 0] - at_s))
+    return Decision(row["decisions"][slot])
+
+
+def test_smoothing_keeps_cubics_and_cuts_noise():
+    t = np.arange(0.0, 10.0, 0.1)
+    cubic = 3.0 + 2.0 * t - 0.4 * t**2 + 0.03 * t**3
+    np.testing.assert_allclose(savgol(cubic, 10.0, 2.1), cubic, atol=1e-9)
+    noisy = 12.0 * t + np.random.default_rng(0).normal(0.0, 0.05, t.size)
+    before = harsh_share(noisy, 0 * t, 10.0)[0]
+    after = harsh_share(savgol(noisy, 10.0, 2.1), 0 * t, 10.0)[0]
+    assert after < 0.1 * before
+
+
+def test_follow():
+    made = recording(
+        car("ego", speeding_up(20.0)), car("lead", speeding_up(50.0), seconds=12.0)
+    )
+    row = first_scene(made)
+    assert row["ego.v"] == pytest.approx(12.15, abs=0.02)
+    assert row["ego.a"] == pytest.approx(0.3, abs=0.02)
+    assert decision_of(row, 30.0 - 2.25) == Decision.FOLLOW
+    assert row["tags"][Tag.FOLLOWING]
+    np.testing.assert_allclose(
+        row["obstacles.s_lower"][0], row["human.s"] + 27.75, atol=0.05
+    )
+    np.testing.assert_allclose(row["obstacles.l_upper"][0], 0.9, atol=0.02)
+    np.testing.assert_allclose(
+        row["obstacles.speed"][0][:10], 12.15 + 0.3 * TIMES_S[:10], atol=0.05
+    )
+
+
+def smooth_step(t, start, duration):
+    u = np.clip((t - start) / duration, 0.0, 1.0)
+    return u**3 * (10 - 15 * u + 6 * u**2)
+
+
+def entering(t):
+    """From the left lane into the middle one between 2 and 5 s."""
+    return WIDTH * (1.0 - smooth_step(t, 2, 3))
+
+
+def test_cut_in_and_yield():
+    """A car from the left lane enters ahead after three seconds."""
+    made = recording(
+        car("ego", speeding_up(20.0)),
+        car("cutter", speeding_up(38.0), y=entering),
+    )
+    row = first_scene(made)
+    assert decision_of(row, 18.0 - 2.25) == Decision.YIELD
+    assert row["tags"][Tag.CUT_IN]
+    assert row["tags"][Tag.YIELDING]
+
+
+def test_overtake_of_a_car_that_enters_behind():
+    made = recording(
+        car("ego", speeding_up(40.0)),
+        car("late", speeding_up(25.0), y=entering),
+    )
+    row = first_scene(made)
+    assert decision_of(row, -15.0 - 2.25) == Decision.OVERTAKE
+    assert row["tags"][Tag.OVERTAKING]
+
+
+def test_a_car_behind_from_the_start_is_ignored():
+    made = recording(car("ego", speeding_up(40.0)), car("rear", speeding_up(15.0)))
+    assert decision_of(first_scene(made), -25.0 - 2.25) == Decision.IGNORE
+
+
+@pytest.mark.parametrize(
+    ("side", "expected"), [(-2.6, Decision.NUDGE_LEFT), (2.6, Decision.NUDGE_RIGHT)]
+)
+def test_nudge_past_a_parked_car(side, expected):
+    made = recording(
+        car("ego", speeding_up(20.0)),
+        car("parked", lambda t: 70.0, y=side, kind=Kind.STATIC),
+    )
+    row = first_scene(made)
+    assert decision_of(row, 70 - row["human.s"][0] - 26.08 - 2.25) == expected
+    assert row["tags"][Tag.NUDGING]
+
+
+def test_lane_change():
+    made = recording(
+        car("ego", speeding_up(20.0), y=lambda t: WIDTH * smooth_step(t, 1, 5)),
+        car("lead", speeding_up(60.0)),
+    )
+    row = first_scene(made)
+    assert row["tags"][Tag.LANE_CHANGE]
+    assert row["human.l"][-1] - row["human.l"][0] == pytest.approx(WIDTH, abs=0.3)
+    assert row["path.l"][60] == pytest.approx(WIDTH, abs=0.1)
+
+
+def braking_to(start, line, v=12.0, after=1.0):
+    """Even braking to a standstill with the front at the line."""
+    distance = line - 2.25 - start - v * after
+    b = v**2 / (2.0 * distance)
+
+    def s(t):
+        u = np.clip(t - after, 0.0, v / b)
+        return start + v * np.minimum(t, after) + v * u - 0.5 * b * u**2
+
+    return s
+
+
+def red_light(always="red"):
+    return Signal(id="s1", start=np.array([0.0]), state=(always,))
+
+
+def test_stop_at_a_red_light():
+    made = recording(
+        car("ego", braking_to(20.0, 61.5, after=0.2)),
+        lanes=road(stop_line=62.0, signals=("s1",)),
+        signals=(red_light(),),
+    )
+    row = first_scene(made)
+    slot = int(np.flatnonzero(row["obstacles.kind"] == Kind.STOP)[0])
+    assert row["obstacles.s_lower"][slot, 0] == pytest.approx(36.0, abs=0.4)
+    assert row["decisions"][slot] == Decision.STOP
+    assert row["tags"][Tag.RED_LIGHT]
+
+
+def test_a_green_light_demands_nothing():
+    made = recording(
+        car("ego", speeding_up(20.0)),
+        lanes=road(stop_line=80.0, signals=("s1",)),
+        signals=(red_light("green"),),
+    )
+    assert not (first_scene(made)["obstacles.kind"] == Kind.STOP).any()
+
+
+def test_a_written_cycle_that_drivers_contradict_is_not_used():
+    """Four cars cross on what a converter says is red."""
+    cars = [car(f"c{i}", speeding_up(10.0 * i), y=0.0) for i in range(4)]
+    written = dataclasses.replace(red_light(), is_recorded=False)
+    made = recording(
+        *cars, lanes=road(stop_line=90.0, signals=("s1",)), signals=(written,)
+    )
+    collector = Collector(made, NO_FILTER)
+    assert not collector.signals
+    assert "disagrees" in collector.signal_notes[0]
+
+
+def test_destination_is_a_virtual_obstacle():
+    made = recording(
+        car("ego", braking_to(20.0, 62.25, after=0.2), destination=(60.0, 0.0)),
+    )
+    row = first_scene(made)
+    slot = int(np.flatnonzero(row["obstacles.kind"] == Kind.VIRTUAL)[0])
+    assert row["decisions"][slot] == Decision.STOP
+    assert row["obstacles.s_lower"][slot, 0] == pytest.approx(36.25, abs=0.4)
+
+
+def test_time_mask_of_a_short_track():
+    made = recording(car("ego", speeding_up(20.0), seconds=6.5))
+    row = first_scene(made)
+    assert row["future_s"] == pytest.approx(6.0)
+    assert row["time_valid"].sum() == np.sum(TIMES_S <= 6.0)
+    assert row["s_at_5s"] == pytest.approx(12.15 * 5 + 0.5 * 0.3 * 25, abs=0.05)
+
+
+def test_the_branch_that_was_driven():
+    straight = np.stack([np.arange(0, 101, 5.0), np.zeros(21)], 1)
+    half = np.full(21, 1.8)
+
+    def lane(name, points, successors=()):
+        return Lane(
+            id=name,
+            centre=points,
+            left_width=half,
+            right_width=half,
+            speed_limit=10.0,
+            successors=successors,
+        )
+
+    ahead = straight + np.array([100.0, 0.0])
+    along = np.arange(0, 101, 5.0)
+    bent = np.stack([100 + along, along**2 / 100], 1)
+    made = recording(
+        car("ego", speeding_up(0.0)),
+        lanes=(
+            lane("in", straight, ("on", "off")),
+            lane("on", ahead),
+            lane("off", bent),
+        ),
+    )
+    graph = LaneGraph(made)
+    assert graph.chain("in", ["in"]) == ("in", "on")
+    assert graph.chain("in", ["in", "off"]) == ("in", "off")
+    assert graph.chain("off", ["off"]) == ("in", "off")
+
+
+def hard(name):
+    """A recording, settings and ego for each drop reason."""
+    lead = car("lead", speeding_up(60.0))
+    ego = car("ego", speeding_up(20.0))
+    steady = car("ego", lambda t: 20.0 + 12.0 * t)
+    jerky = car("ego", lambda t: 20 + 12 * t + 4.0 * np.sin(2 * t))
+    ghost = Ghost(t0=0.0, t1=10.0, start=(45.0, 0.0), end=(190.0, 0.0))
+    table = {
+        "future_too_short": recording(car("ego", speeding_up(20.0), seconds=3.0)),
+        "off_map": recording(car("ego", speeding_up(20.0), y=40.0), lead),
+        "far_from_road": recording(
+            car("ego", speeding_up(20.0), y=lambda t: 9.0 * smooth_step(t, 1, 5)), lead
+        ),
+        "no_obstacles": recording(ego),
+        "no_speed_change": recording(steady, lead),
+        "too_noisy": recording(jerky, lead),
+        "overlapping_boxes": recording(ego, car("twin", speeding_up(22.0))),
+        "follows_missing_car": recording(ego, lead, ghosts=(ghost,)),
+    }
+    return table[name]
+
+
+@pytest.mark.parametrize("reason", REASONS)
+def test_every_drop_reason_is_counted(reason):
+    dropped = first_scene(hard(reason), config=CollectConfig())
+    assert isinstance(dropped, dict)
+    assert dropped.get(reason, 0) >= 1
+
+
+def test_assembled_human_is_the_shared_operators():
+    made = recording(car("ego", speeding_up(20.0)), car("lead", speeding_up(60.0)))
+    rows = list(Collector(made, NO_FILTER).scenes())
+    zeros = [0] * len(rows)
+    block = assemble(rows, vehicles=zeros, groups=zeros, recording=0)
+    again = jax.jit(jax.vmap(trajectory_from_positions))(
+        block.scene, block.human.s, block.human.l
+    )
+    for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(block.human), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-5)
+
+
+def test_quality_report_fits_a_terminal():
+    made = recording(car("ego", speeding_up(20.0)), car("lead", speeding_up(60.0)))
+    collector = Collector(made, NO_FILTER)
+    rows = list(collector.scenes())
+    report = QualityReport()
+    report.add_recording(collector)
+    report.add_scenes(
+        assemble(rows, vehicles=[0] * len(rows), groups=[0] * len(rows), recording=0)
+    )
+    again = QualityReport()
+    again.merge(report.state())
+    assert again.as_dict() == report.as_dict()
+    text = format_quality(report.as_dict())
+    assert set(report.as_dict()["dropped"]) == set(REASONS)
+    assert max(len(line) for line in text.splitlines()[:-1]) <= 100
+
+
+def three_recordings():
+    for i in range(3):
+        made = recording(
+            car("ego", speeding_up(20.0 + i)), car("lead", speeding_up(60.0))
+        )
+        yield validate_recording(dataclasses.replace(made, name=f"r{i}", group=f"g{i}"))
+
+
+CONFIG = ImportConfig(format="test", collect=NO_FILTER, test_fraction=0.4)
+
+
+def files_of(folder):
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return {path.relative_to(folder): path.read_bytes() for path in files}
+
+
+def test_interrupted_import_resumes_to_the_same_bytes(tmp_path, monkeypatch):
+    monkeypatch.setattr(importing, "SHARD_SCENES", 1)
+    import_logs(three_recordings(), tmp_path / "whole", CONFIG)
+
+    def interrupted():
+        yield from list(three_recordings())[:2]
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        import_logs(interrupted(), tmp_path / "part", CONFIG)
+    with pytest.raises(InputError, match="interrupted"):
+        open_dataset(tmp_path / "part")
+    import_logs(three_recordings(), tmp_path / "part", CONFIG)
+    assert files_of(tmp_path / "part") == files_of(tmp_path / "whole")
+
+
+def test_resume_with_other_settings_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(importing, "SHARD_SCENES", 1)
+
+    def interrupted():
+        yield from list(three_recordings())[:1]
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        import_logs(interrupted(), tmp_path / "part", CONFIG)
+    other = dataclasses.replace(
+        CONFIG, collect=dataclasses.replace(NO_FILTER, stride_s=1.0)
+    )
+    with pytest.raises(InputError, match="settings changed"):
+        import_logs(three_recordings(), tmp_path / "part", other)
+
+
+def test_bad_input_in_the_middle_leaves_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(importing, "SHARD_SCENES", 1)
+
+    def broken():
+        yield from list(three_recordings())[:2]
+        raise InputError("r2: x: nan: expected a finite number")
+
+    with pytest.raises(InputError, match="r2: x: nan"):
+        import_logs(broken(), tmp_path / "out", CONFIG)
+    assert not (tmp_path / "out").exists() or not files_of(tmp_path / "out")
+
+
+def test_nothing_kept_says_why(tmp_path):
+    lonely = recording(car("ego", speeding_up(20.0), seconds=3.0))
+    with pytest.raises(InputError, match="0 scenes kept of 1 tracks"):
+        import_logs([lonely], tmp_path / "out", CONFIG)
+    assert not (tmp_path / "out").exists()
+
+
+def test_no_vehicle_in_both_splits(tmp_path):
+    import_logs(three_recordings(), tmp_path / "data", CONFIG)
+    dataset = open_dataset(tmp_path / "data")
+    train, test = dataset.load("train"), dataset.load("test")
+    assert not set(train.vehicle.tolist()) & set(test.vehicle.tolist())
+    assert not set(train.group.tolist()) & set(test.group.tolist())
+
+
+@pytest.mark.dataset
+def test_us101(data_dir, tmp_path):
+    manifest = import_logs(
+        read_recordings("commonroad", data_dir / "ngsim_us101_commonroad" / "xml"),
+        tmp_path / "us101",
+        ImportConfig(format="commonroad"),
+    )
+    quality = manifest.quality
+    assert quality["recordings"] == 36
+    assert quality["tracks"] == 996
+    assert quality["scenes"] > 2500
+    assert quality["harsh_share_smoothed"] < 0.05 < quality["harsh_share_raw"]
+    dataset = open_dataset(tmp_path / "us101")
+    train, test = dataset.load("train"), dataset.load("test")
+    assert not set(train.vehicle.tolist()) & set(test.vehicle.tolist())
