@@ -24,6 +24,9 @@ _DATA = flags.DEFINE_string("data", None, "dataset", required=True)
 _OUTPUT = flags.DEFINE_string("output", None, "JSON to write")
 _HORIZON = flags.DEFINE_float("horizon", 5.0, "s at which distances are taken")
 _SPLIT = flags.DEFINE_string("split", "test", "split that is ranked")
+_FILTER = flags.DEFINE_bool(
+    "drop_collisions", False, "rank only candidates that meet nothing, in every row"
+)
 _WIDTH = flags.DEFINE_integer("width", 118, "columns of the printed table")
 
 
@@ -33,7 +36,11 @@ def main() -> None:
         raise InputError(f"--horizon: {_HORIZON.value}: expected above 0, at most 8 s")
     learned, preset, sampler = load_runs(_WEIGHTS.value)
     setup = RankingSetup(
-        preset=preset, sampler=sampler, horizon_s=_HORIZON.value, split=_SPLIT.value
+        preset=preset,
+        sampler=sampler,
+        horizon_s=_HORIZON.value,
+        split=_SPLIT.value,
+        drop_collisions=_FILTER.value,
     )
     report = evaluate_ranking(open_dataset(_DATA.value), learned, setup)
     print(format_table(report, _WIDTH.value))

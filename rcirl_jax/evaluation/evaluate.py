@@ -32,6 +32,8 @@ class RankingSetup:
     sampler: SamplerConfig = dataclasses.field(default_factory=SamplerConfig)
     horizon_s: float = 5.0  # s
     split: str = "test"
+    # rank only among candidates that meet nothing: the same safety filter for all
+    drop_collisions: bool = False
 
 
 def _rows(
@@ -48,15 +50,18 @@ def _rows(
     return jax.tree.map(lambda x: x[keep], rows), index[keep]
 
 
-def _outcomes(scored: Scored, rows: Demonstration, horizon_s: float) -> Outcomes:
+def _outcomes(scored: Scored, rows: Demonstration, setup: RankingSetup) -> Outcomes:
+    feasible = scored.feasible
+    if setup.drop_collisions:
+        feasible = feasible & ~scored.crash
     return Outcomes(
         fde=scored.fde,
         ade=scored.ade,
         crash=scored.crash,
-        feasible=scored.feasible,
+        feasible=feasible,
         cluster=np.asarray(rows.vehicle),
         human_crash=scored.human_crash,
-        horizon_s=horizon_s,
+        horizon_s=setup.horizon_s,
     )
 
 
@@ -68,7 +73,7 @@ def _temperatures(
     chosen = np.random.default_rng(0).permutation(index.size)[:TEMPERATURE_SCENES]
     rows, index = jax.tree.map(lambda x: x[chosen], rows), index[chosen]
     scored = _score(rows, index, setup, scorers)
-    outcomes = _outcomes(scored, rows, setup.horizon_s)
+    outcomes = _outcomes(scored, rows, setup)
     return {name: fit_temperature(v, outcomes) for name, v in scored.values.items()}
 
 
@@ -108,7 +113,7 @@ def evaluate_ranking(
     temperatures = _temperatures(dataset, setup, flat)
     rows, index = _rows(dataset, setup.split, setup.horizon_s)
     scored = _score(rows, index, setup, flat)
-    outcomes = _outcomes(scored, rows, setup.horizon_s)
+    outcomes = _outcomes(scored, rows, setup)
 
     def metrics(name: str) -> dict[str, np.ndarray]:
         values, human = scored.values[name], scored.human_values[name]
