@@ -9,8 +9,9 @@ import tensorstore as ts
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rcirl_jax.data import store
-from rcirl_jax.data.store import DatasetWriter, open_dataset, row_spec
+from rcirl_jax.data import files, manifest
+from rcirl_jax.data.rows import row_spec
+from rcirl_jax.data.store import DatasetWriter, open_dataset
 from rcirl_jax.errors import InputError
 from tests import scenes
 
@@ -303,7 +304,7 @@ def reseal(folder, change):
     payload = json.loads(path.read_text())
     del payload["hash"]
     change(payload)
-    path.write_bytes(store._seal(payload, "hash"))
+    path.write_bytes(manifest.seal(payload, "hash"))
 
 
 @pytest.mark.parametrize(
@@ -358,7 +359,7 @@ class Interrupted(BaseException):
 def interrupt_after(monkeypatch, writes):
     """Let so many files through, then raise; the rest is never written."""
     left = [writes]
-    original = store._put
+    original = files.put
 
     def put(kv, key, value):
         left[0] -= 1
@@ -366,7 +367,7 @@ def interrupt_after(monkeypatch, writes):
             raise Interrupted
         return original(kv, key, value)
 
-    monkeypatch.setattr(store, "_put", put)
+    monkeypatch.setattr(files, "put", put)
 
 
 # a shard has 2 files per leaf and its mark: cut in the first shard, right before
@@ -505,7 +506,7 @@ def test_a_full_disk_keeps_the_shards_before(tmp_path, monkeypatch):
 
     writer = DatasetWriter(tmp_path / "d")
     writer.write_shard(0, make_rows(3), [])
-    monkeypatch.setattr(store, "_put", fail)
+    monkeypatch.setattr(files, "put", fail)
     with pytest.raises(OSError, match="cannot be written: no space left"):
         writer.write_shard(1, make_rows(3), [])
     assert len(DatasetWriter(tmp_path / "d").committed()) == 1

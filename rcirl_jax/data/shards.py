@@ -1,0 +1,96 @@
+"""One shard: its arrays as zarr3 bytes, and its verification."""
+
+import hashlib
+from collections.abc import Mapping
+
+import numpy as np
+import tensorstore as ts
+
+from rcirl_jax.data.files import MARK, SHARDS, Files
+from rcirl_jax.data.manifest import ShardInfo, unseal
+from rcirl_jax.errors import InputError
+
+BLOCK_ROWS = 256  # rows of a separately compressed block: ~2.5 MB of scenes, unpacked
+ZSTD_LEVEL = 3  # zstd's own default
+
+
+def shard_key(index: int) -> str:
+    """Prefix of all keys of a shard."""
+    return f"{SHARDS}{index:05d}/"
+
+
+def _metadata(shape: tuple[int, ...], dtype: np.dtype) -> dict:
+    """zarr3 metadata: one storage chunk per array, cut into blocks of rows."""
+    rows, rest = min(shape[0], BLOCK_ROWS), list(shape[1:])
+    plain = {"name": "bytes", "configuration": {"endian": "little"}}
+    zstd = {"level": ZSTD_LEVEL, "checksum": False}  # crc32c checks already
+    sharding = {
+        "chunk_shape": [rows, *rest],
+        "codecs": [
+            plain if dtype.itemsize > 1 else {"name": "bytes"},
+            {"name": "zstd", "configuration": zstd},
+            {"name": "crc32c"},
+        ],
+        "index_codecs": [plain, {"name": "crc32c"}],
+    }
+    chunk = [-(-shape[0] // rows) * rows, *rest]
+    return {
+        "shape": list(shape),
+        "data_type": dtype.name,
+        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": chunk}},
+        "codecs": [{"name": "sharding_indexed", "configuration": sharding}],
+    }
+
+
+def encode(leaves: Mapping[str, np.ndarray]) -> dict[str, bytes]:
+    """zarr3 files of a shard in memory, so that they can be hashed as written."""
+    context = ts.Context()
+    opened = {
+        name: ts.open(
+            {
+                "driver": "zarr3",
+                "kvstore": {"driver": "memory", "path": f"{name}/"},
+                "metadata": _metadata(leaf.shape, leaf.dtype),
+                "store_data_equal_to_fill_value": True,
+                "create": True,
+            },
+            context=context,
+        )
+        for name, leaf in leaves.items()
+    }
+    writes = [opened[name].result().write(leaf) for name, leaf in leaves.items()]
+    for write in writes:
+        write.result()
+    memory = ts.KvStore.open("memory://", context=context).result()
+    futures = {key: memory.read(key) for key in sorted(memory.list().result())}
+    return {key.decode(): future.result().value for key, future in futures.items()}
+
+
+def describe(data: bytes | None) -> dict:
+    """Size and sha256 of a file, or that it is missing."""
+    if data is None:
+        return {"bytes": 0, "sha256": "missing"}
+    return {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+
+
+def verify_shard(files: Files, index: int, sha256: str | None = None) -> ShardInfo:
+    """Read all of a shard against its checksums; InputError names what is wrong."""
+    key = shard_key(index)
+    name = files.path(key + MARK)
+    mark = files.read(key + MARK)
+    if mark is None:
+        raise InputError(f"{name}: shard {index}: missing: expected sha256 {sha256}")
+    info = ShardInfo(**unseal(mark, "sha256", name))
+    if sha256 is not None and info.sha256 != sha256:
+        raise InputError(
+            f"{name}: shard {index}: sha256 {info.sha256}: expected {sha256}"
+        )
+    for path, data in files.read_many(key + file for file in info.files):
+        found, expected = describe(data), info.files[path.removeprefix(key)]
+        if found != expected:
+            raise InputError(
+                f"{files.path(path)}: shard {index}: {found['bytes']} bytes, sha256 "
+                f"{found['sha256']}: expected {expected['bytes']} bytes, sha256 "
+                f"{expected['sha256']}; import the logs again"
+            )
+    return info
