@@ -39,9 +39,9 @@ def run(main: Callable[[], None]) -> None:
 def _parse(argv: list[str]) -> list[str]:
     """Absl's parser, with its complaints as one line."""
     try:
-        return app.parse_flags_with_usage(argv)
-    except flags.Error as error:  # pragma: no cover - absl exits by itself
-        print(f"error: {error}", file=sys.stderr)
+        return flags.FLAGS(argv)
+    except flags.Error as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(EXIT_BAD_INPUT)
 
 

@@ -6,6 +6,7 @@ Prints the data-quality report and writes it into DATASET/manifest.json. An
 interrupted import resumes; bad input leaves nothing behind.
 """
 
+import json
 from pathlib import Path
 
 from absl import flags
@@ -75,15 +76,20 @@ def main() -> None:
     )
     print(format_quality(manifest.quality))
     dataset = open_dataset(_OUTPUT.value)
+    floors = []
     for mode in MODES:
         setup = RankingSetup(sampler=SamplerConfig(mode=mode), horizon_s=_FLOOR.value)
         floor = oracle_floor(dataset, setup, max_scenes=512)
+        floors.append(floor)
         mean, median = floor["best_fde_mean_m"], floor["best_fde_median_m"]
         print(
             f"oracle floor, {mode}: best of {floor['candidates']} candidates ends "
             f"{mean:.2f} m (median {median:.2f}) from the human at "
             f"{floor['horizon_s']:g} s, {floor['scenes']} scenes"
         )
+    if "://" not in _OUTPUT.value:
+        beside = Path(_OUTPUT.value) / "oracle_floor.json"
+        beside.write_text(json.dumps(floors, indent=2) + "\n")
     print(f"dataset: {_OUTPUT.value}")
 
 

@@ -164,6 +164,10 @@ def test_a_horizon_nobody_covers_is_one_line(dataset):
         (["train", "--data=nowhere", "--workdir=w"], "nowhere"),
         (["evaluate", "--weights=nowhere", "--data=nowhere"], "nowhere"),
         (["export_weights", "--workdir=nowhere"], "run.json: missing"),
+        (["train", "--data=d", "--workdir=w", "--loss=hope"], "loss"),
+        (["train", "--workdir=w"], "data"),
+        (["train", "--data=d", "--workdir=w", "--epoch=3"], "epoch"),
+        (["train", "--data=d", "--workdir=w", "more"], "more"),
     ],
 )
 def test_command_lines_answer_bad_input_in_one_line(command, message, tmp_path):
