@@ -12,14 +12,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rcirl_jax.evaluation.baselines import (
+from rcirl_jax.features import FeatureMap, feature_map
+from rcirl_jax.features.columns import COLUMNS, make_frame
+from rcirl_jax.planner.baselines import (
     Idm,
     closeness,
     constant_speed_trajectory,
     idm_trajectory,
 )
-from rcirl_jax.features import FeatureMap, feature_map
-from rcirl_jax.features.columns import COLUMNS, make_frame
 from rcirl_jax.reward import lattice_cost
 from rcirl_jax.sampling import SamplerConfig, sample
 from rcirl_jax.train.step import human_of

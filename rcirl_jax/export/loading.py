@@ -2,12 +2,14 @@
 
 from collections.abc import Callable, Sequence
 
+import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.reader import Reward, WeightsError, load_weights
 from rcirl_jax.features import feature_map
 from rcirl_jax.sampling import SamplerConfig
+from rcirl_jax.types import Normaliser, RewardParams
 
 Scorer = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -25,6 +27,28 @@ def open_reward(path: str) -> Reward:
     except WeightsError as error:
         raise InputError(str(error)) from error
     return reward
+
+
+def reward_params(reward: Reward) -> tuple[RewardParams, Normaliser]:
+    """A weights file's numbers as the pytrees that JAX code takes.
+
+    Files hold effective (pinned) parameters; the output bias, 0 in every file
+    of ours, cancels between the candidates of a scene.
+    """
+    tables = lambda arrays: tuple(jnp.asarray(x, jnp.float32) for x in arrays)  # noqa: E731
+    return (
+        RewardParams(
+            gamma=jnp.asarray(reward.gamma, jnp.float32),
+            kernels=tables(reward.kernels),
+            biases=tables(reward.biases[:-1]),
+        ),
+        Normaliser(
+            lower=jnp.asarray(reward.lower, jnp.float32),
+            upper=jnp.asarray(reward.upper, jnp.float32),
+            location=jnp.asarray(reward.location, jnp.float32),
+            scale=jnp.asarray(reward.scale, jnp.float32),
+        ),
+    )
 
 
 def row_name(reward: Reward) -> str:

@@ -10,10 +10,10 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
+from rcirl_jax.features.path import path_view
 from rcirl_jax.features.relations import Relations, closest_body, nearest, relate
-from rcirl_jax.geometry.frenet import lookup, path_curvature
 from rcirl_jax.types import Scene, Trajectory
-from rcirl_jax.units import STATION_STEP_M, TIMES_S
+from rcirl_jax.units import TIMES_S
 
 OBSTACLE_CAP_M = 100.0  # m, Apollo: follow, overtake, side-pass "none" distance
 LINE_CAP_M = 60.0  # m, Apollo: stop, virtual and nudge "none" distance
@@ -42,19 +42,11 @@ def make_frame(scene: Scene, trajectory: Trajectory) -> Frame:
 
 def driven_curvature(scene: Scene, trajectory: Trajectory) -> jax.Array:
     """Curvature [T] 1/m of the path driven: reference line plus lateral motion."""
-    table = scene.path.kappa
-    at = jax.vmap(lookup, in_axes=(None, 0, None))
-    slope = jnp.asarray(jnp.gradient(table, STATION_STEP_M))
-    kappa = at(table, trajectory.s, STATION_STEP_M)
-    dkappa = at(slope, trajectory.s, STATION_STEP_M)
-    return jax.vmap(path_curvature)(
-        kappa, dkappa, trajectory.l, trajectory.dl, trajectory.ddl
-    )
+    return path_view(scene, trajectory.s).curvature(trajectory)
 
 
 def _speed_limit(frame: Frame) -> jax.Array:
-    at = jax.vmap(lookup, in_axes=(None, 0, None))
-    return at(frame.scene.path.speed_limit, frame.trajectory.s, STATION_STEP_M)
+    return path_view(frame.scene, frame.trajectory.s).speed_limit
 
 
 def _collision_distance(frame: Frame) -> jax.Array:

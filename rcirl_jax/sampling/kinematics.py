@@ -6,13 +6,12 @@ used: every trajectory enters as stations and lateral offsets on the time axis
 and leaves with derivatives made here.
 """
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from rcirl_jax.geometry.frenet import lookup
+from rcirl_jax.features.path import path_view
 from rcirl_jax.types import Scene, Trajectory
-from rcirl_jax.units import DT_S, STATION_STEP_M
+from rcirl_jax.units import DT_S
 
 MIN_ADVANCE_M = 1.0  # m between neighbours below which dl/ds is taken as 0
 
@@ -101,6 +100,19 @@ def trajectory_from_positions(
 
 
 def trajectory_on_path(scene: Scene, s: Float[Array, " t"]) -> Trajectory:
-    """The Trajectory with stations `s` [T] m on the scene's given path."""
-    l = jax.vmap(lookup, in_axes=(None, 0, None))(scene.path.l, s, STATION_STEP_M)
-    return trajectory_from_positions(scene, s, l)
+    """The Trajectory with stations `s` [T] m on the scene's given path.
+
+    l, dl and ddl are the path's own at the station (the ego's at t = 0), so
+    each depends on the station alone: what Bellman's principle needs.
+    """
+    v, a, j = differentiate(s, scene.ego.v, scene.ego.a, scene.time_valid)
+    view = path_view(scene, s)
+    return Trajectory(
+        s=s,
+        v=v,
+        a=a,
+        j=j,
+        l=view.l,
+        dl=view.dl.at[0].set(scene.ego.dl),
+        ddl=view.ddl.at[0].set(scene.ego.ddl),
+    )

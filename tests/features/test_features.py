@@ -11,7 +11,12 @@ from hypothesis import strategies as st
 from rcirl_jax.errors import InputError
 from rcirl_jax.features import feature_map
 from rcirl_jax.features.columns import COLUMNS
-from rcirl_jax.sampling import SamplerConfig, sample, trajectory_from_positions
+from rcirl_jax.sampling import (
+    SamplerConfig,
+    sample,
+    trajectory_from_positions,
+    trajectory_on_path,
+)
 from rcirl_jax.types import Kind
 from rcirl_jax.units import TIMES_S
 from tests.features.oracle import point
@@ -117,6 +122,8 @@ def test_human_equal_to_a_candidate_has_the_same_bits(preset, mode):
     all_features = features.of_candidates(made, candidates)
 
     def of_human(s, l):
+        if mode == "speed":
+            return features(made, trajectory_on_path(made, s))
         return features(made, trajectory_from_positions(made, s, l))
 
     picks = jnp.arange(0, candidates.family.size, 7)

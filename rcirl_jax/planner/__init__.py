@@ -1,0 +1,1 @@
+"""The online planner: safety filter, ranking, ST-graph dynamic programming."""

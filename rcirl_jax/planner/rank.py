@@ -1,0 +1,168 @@
+"""The ranking planner: sample, filter, value all candidates at once, take the best.
+
+Every policy here is a pure function `(params, scene, key) -> Plan`; a policy
+differs from another by its score only, so the safety filter, the candidates
+and the tracking are the same for a learned, a hand-set and a random reward.
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from rcirl_jax.features import FeatureMap
+from rcirl_jax.planner.baselines import Idm, idm_acceleration
+from rcirl_jax.planner.plan import Plan
+from rcirl_jax.planner.safety import SafetyConfig, check, choose
+from rcirl_jax.reward.hand import lattice_cost
+from rcirl_jax.reward.network import ACTIVATIONS, point_rewards
+from rcirl_jax.reward.normaliser import normalise
+from rcirl_jax.sampling import SamplerConfig, sample
+from rcirl_jax.sampling.speed import family_index
+from rcirl_jax.types import Candidates, Kind, Normaliser, RewardParams, Scene
+from rcirl_jax.units import DT_S, TIMES_S
+
+Params = Any  # a score's weights: any pytree
+Score = Callable[[Params, Scene, Candidates], jax.Array]  # -> [K], higher is better
+Policy = Callable[[Params, Scene, jax.Array], Plan]
+
+ACTUATOR_LAG_S = 0.2  # s, of the drive train; the command leads the plan by it
+
+
+# The closed loop's grid: 64 candidates, all families of the offline sampler.
+ONLINE = SamplerConfig(
+    cruise_times=(2.0, 3.0, 5.0, 8.0),
+    cruise_levels=(-1.0, -0.6, -0.3, -0.1, 0.0, 0.1, 0.3, 0.6),
+    edge_times=(4.0, 8.0),
+    follow_headways=(0.8, 1.3, 2.0),
+    num_followed=1,
+    stop_times=(3.0, 5.0, 8.0),
+    stop_gaps=(0.5, 2.0),
+    stop_brakings=(0.8, 1.5, 2.5),
+    num_random=11,
+)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RankConfig:
+    """Static parts of a ranking planner; hashable."""
+
+    sampler: SamplerConfig = ONLINE
+    safety: SafetyConfig = dataclasses.field(default_factory=SafetyConfig)
+    # s a command stays in force
+    period: float = 0.1
+
+
+def learned_score(features: FeatureMap, activation: str) -> Score:
+    """Score of (effective RewardParams, Normaliser): V, as in `reward.value`."""
+    if activation not in ACTIVATIONS:
+        raise KeyError(activation)
+
+    def score(
+        params: tuple[RewardParams, Normaliser], scene: Scene, candidates: Candidates
+    ) -> jax.Array:
+        effective, normaliser = params
+        raw = features.of_candidates(scene, candidates)
+        rewards = point_rewards(effective, normalise(normaliser, raw), activation)
+        weight = jnp.where(scene.time_valid, effective.gamma, 0.0)
+        return jnp.sum(weight * rewards, axis=-1)
+
+    return score
+
+
+def hand_score(_: Params, scene: Scene, candidates: Candidates) -> jax.Array:
+    """Minus Apollo's lattice cost with its published weights."""
+    cost = jax.vmap(lattice_cost, in_axes=(None, 0))(scene, candidates.trajectory)
+    return -cost
+
+
+def lead_time(period: float) -> float:
+    """How far ahead [s] of now the plan's acceleration is commanded.
+
+    Under a lag tau a command held for h moves the acceleration by
+    (1 - exp(-h / tau)) of the way, so a plan with jerk j is met after h when
+    the command leads by j h / (1 - exp(-h / tau)).
+    """
+    return period / (1.0 - math.exp(-period / ACTUATOR_LAG_S))
+
+
+def command(a: jax.Array, braking_now: jax.Array, period: float) -> jax.Array:
+    """Acceleration command m/s^2 of a planned acceleration a [T].
+
+    The lag is led as in `lead_time`; an emergency asks for its braking at once.
+    """
+    share = min(lead_time(period) / DT_S, 1.0)
+    return jnp.where(braking_now, a[1], a[0] + share * (a[1] - a[0]))
+
+
+@functools.lru_cache(maxsize=64)
+def rank_policy(score: Score, config: RankConfig) -> Policy:
+    """The planner that drives the admissible candidate of the highest score."""
+    emergency = family_index("emergency")
+
+    def policy(params: Params, scene: Scene, key: jax.Array) -> Plan:
+        candidates = sample(key, scene, config.sampler)
+        verdict = check(scene, candidates, config.safety)
+        index, fallback = choose(verdict, score(params, scene, candidates))
+        chosen = jax.tree.map(lambda x: x[index], candidates.trajectory)
+        hard = fallback | (candidates.family[index] == emergency)
+        return Plan(
+            acceleration=command(chosen.a, hard, config.period),
+            s=chosen.s,
+            fallback=fallback,
+            admissible=jnp.sum(verdict.admissible, dtype=jnp.int32),
+        )
+
+    return policy
+
+
+@functools.lru_cache(maxsize=8)
+def idm_policy(idm: Idm) -> Policy:
+    """IDM behind the nearest body or line in the ego's corridor now."""
+
+    def policy(params: Params, scene: Scene, key: jax.Array) -> Plan:
+        del params, key
+        obstacles, ego = scene.obstacles, scene.ego
+        front = ego.s + 0.5 * ego.length
+        aside = jnp.maximum(
+            obstacles.l_lower[:, 0] - ego.l, ego.l - obstacles.l_upper[:, 0]
+        )
+        gap = obstacles.s_lower[:, 0] - front
+        in_way = aside < 0.5 * ego.width + 0.2
+        known = obstacles.valid[:, 0] & (obstacles.kind != Kind.NONE)
+        leads = known & in_way & (obstacles.s_upper[:, 0] > ego.s)
+        nearest = jnp.argmin(jnp.where(leads, gap, jnp.inf))
+        found = leads[nearest]
+        a = idm_acceleration(
+            ego.v,
+            jnp.where(found, gap[nearest], 1e3),
+            jnp.where(found, ego.v - obstacles.speed[nearest, 0], 0.0),
+            scene.path.speed_limit[0],
+            idm,
+        )
+        return _held(scene, a)
+
+    return policy
+
+
+def constant_speed_policy(params: Params, scene: Scene, key: jax.Array) -> Plan:
+    """Nobody drives: the acceleration stays 0."""
+    del params, key
+    return _held(scene, jnp.zeros(()))
+
+
+def _held(scene: Scene, a: jax.Array) -> Plan:
+    """A plan that holds an acceleration until standing."""
+    times = jnp.asarray(TIMES_S)
+    braking = jnp.minimum(a, -1e-6)
+    until = jnp.where(a < 0.0, jnp.minimum(times, scene.ego.v / -braking), times)
+    return Plan(
+        acceleration=a,
+        s=scene.ego.s + scene.ego.v * until + 0.5 * a * until**2,
+        fallback=jnp.zeros((), bool),
+        admissible=jnp.zeros((), jnp.int32),
+    )

@@ -1,0 +1,1 @@
+"""The closed loop: road, agents, vehicle, observation, judge, catalogue, rollout."""

@@ -1,0 +1,248 @@
+"""Types of the closed-loop simulator on one page: the case, the world, the log.
+
+Axis legend beyond that of `rcirl_jax.types`: `A` = 14 agent slots, `R` points
+of the road grid, `L` stop lines, `P` phases of a speed script, `M` lateral
+moves, `S` steps of the run, `H` steps of perception history, `D` steps of
+reaction delay.
+
+A case is data only: two cases of one suite differ in arrays, never in code or
+shapes, so thousands of them run in one compiled program. Everything lives in
+the road's Frenet frame: station `s` along the reference line (the ego's lane
+centre at the start of the road), lateral offset `l` to the left, heading
+relative to the reference line (0 = with the ego, pi = oncoming).
+"""
+
+import enum
+
+import flax.struct
+import jax
+
+STEP_S = 0.1  # s, the simulator's clock and the fastest planning rate
+NUM_AGENTS = 14  # A
+ROAD_STEP_M = 2.0  # m between points of the road grid
+NUM_ROAD = 2304  # R: 4.6 km, 120 s at 36 m/s plus the planner's view
+NUM_LINES = 6  # L
+NUM_PHASES = 8  # P
+NUM_MOVES = 2  # M
+NUM_HISTORY = 4  # H: latencies of 0 to 0.3 s
+NUM_DELAY = 9  # D: reaction delays of 0 to 0.8 s
+
+
+class LineKind(enum.IntEnum):
+    """What a stop line demands. Stored in `Lines.kind`."""
+
+    NONE = 0  # an empty slot
+    LIGHT = 1  # a traffic light with a cycle
+    STOP_SIGN = 2  # stand once, then go
+
+
+class Road(flax.struct.PyTreeNode, kw_only=True):
+    """The ego's road on a uniform station grid; point r lies at `r * ROAD_STEP_M`."""
+
+    kappa: jax.Array  # [R] 1/m, curvature of the reference line, left positive
+    speed_limit: jax.Array  # [R] m/s, posted limit
+    path_l: jax.Array  # [R] m, lateral offset of the path given to the ego
+    lane_width: jax.Array  # [] m; lane k has its centre at l = k * lane_width
+    lanes_left: jax.Array  # [] int32, same-direction lanes left of lane 0
+    lanes_right: jax.Array  # [] int32, same-direction lanes right of lane 0
+    edge_left: jax.Array  # [] m, l of the drivable area's left edge
+    edge_right: jax.Array  # [] m, l of its right edge (negative)
+    destination: jax.Array  # [] m, station where the route ends
+
+
+class Lines(flax.struct.PyTreeNode, kw_only=True):
+    """Stop lines across the ego's road. Lights cycle green, yellow, red."""
+
+    kind: jax.Array  # [L] int32, `LineKind`
+    s: jax.Array  # [L] m
+    offset: jax.Array  # [L] s, the cycle's phase at t = 0 (0: green starts)
+    green: jax.Array  # [L] s
+    yellow: jax.Array  # [L] s
+    red: jax.Array  # [L] s
+
+
+class Driver(flax.struct.PyTreeNode, kw_only=True):
+    """How an agent drives by itself: IDM along its heading, MOBIL across lanes."""
+
+    desired: jax.Array  # [A] m/s, v0 of the IDM
+    headway: jax.Array  # [A] s, T
+    standstill: jax.Array  # [A] m, s0
+    acceleration: jax.Array  # [A] m/s^2, a
+    braking: jax.Array  # [A] m/s^2, comfortable b
+    delay: jax.Array  # [A] s, reaction delay, at most (D - 1) * 0.1
+    reacts: jax.Array  # [A] bool: brakes for what is in its way (else blind)
+    obeys_lines: jax.Array  # [A] bool: stops at the lines of the ego's road
+    changes_lane: jax.Array  # [A] bool: MOBIL is on
+    politeness: jax.Array  # [A] 1, MOBIL p
+    threshold: jax.Array  # [A] m/s^2, MOBIL gain below which it stays
+    lapse_start: jax.Array  # [A] s after activation: begins not to react
+    lapse_end: jax.Array  # [A] s after activation
+
+
+class Script(flax.struct.PyTreeNode, kw_only=True):
+    """What an agent does at given times after its activation.
+
+    Phase p holds from `start[p]` until the next phase starts: the agent drives
+    its speed towards `speed[p]` at `rate[p]`, whatever the IDM wants to do
+    with free road; if it `reacts`, the IDM may still brake harder. An unused
+    phase has start = inf. A move leads the agent to another lateral offset.
+    """
+
+    start: jax.Array  # [A, P] s after activation, increasing; inf = unused
+    speed: jax.Array  # [A, P] m/s, target
+    rate: jax.Array  # [A, P] m/s^2 > 0, how fast it is approached
+    move_start: jax.Array  # [A, M] s after activation; inf = unused
+    move_l: jax.Array  # [A, M] m, target lateral offset
+    move_speed: jax.Array  # [A, M] m/s, largest lateral speed of the move
+
+
+class Agents(flax.struct.PyTreeNode, kw_only=True):
+    """Everybody else: who they are, where they appear, how they act.
+
+    An agent appears when the ego's station has reached `appear_s` and the
+    clock `appear_t` (and, if it appears relative to the ego, its place is
+    free). Its own clock starts, and with it its motion, when the ego's time
+    to arrival at the agent's station has fallen to `arrival_s` (inf: at once).
+    """
+
+    kind: jax.Array  # [A] int32, `rcirl_jax.types.Kind`; NONE = empty slot
+    length: jax.Array  # [A] m
+    width: jax.Array  # [A] m
+    appear_s: jax.Array  # [A] m, ego station; -inf = from the start
+    appear_t: jax.Array  # [A] s
+    relative: jax.Array  # [A] bool: `s` is measured from the ego's station
+    s: jax.Array  # [A] m, station of the centre where it appears
+    l: jax.Array  # [A] m, lateral offset where it appears
+    heading: jax.Array  # [A] rad, relative to the reference line
+    v: jax.Array  # [A] m/s along its heading at activation
+    v_share: jax.Array  # [A] 1: v += v_share * (ego's speed when it appears)
+    arrival_s: jax.Array  # [A] s, ego's time to arrival that activates it
+    driver: Driver
+    script: Script
+
+
+class Perception(flax.struct.PyTreeNode, kw_only=True):
+    """What the planner gets instead of the truth about the agents."""
+
+    sigma_position: jax.Array  # [] m, noise of s and l, per step and agent
+    sigma_speed: jax.Array  # [] 1, relative noise of the speed
+    latency: jax.Array  # [] s, age of what is seen, at most (H - 1) * 0.1
+    dropout: jax.Array  # [] 1, probability that an agent is missed in a step
+
+
+class Replay(flax.struct.PyTreeNode, kw_only=True):
+    """Recorded motion of the agents and of the human ego on the step grid."""
+
+    s: jax.Array  # [A, S + 1] m, recorded station of the centre
+    l: jax.Array  # [A, S + 1] m
+    heading: jax.Array  # [A, S + 1] rad, relative to the reference line
+    v: jax.Array  # [A, S + 1] m/s
+    present: jax.Array  # [A, S + 1] bool
+    ego_s: jax.Array  # [S + 1] m, the human's station
+    ego_l: jax.Array  # [S + 1] m
+    ego_v: jax.Array  # [S + 1] m/s
+    # bool: agents leave the log for the IDM once the ego has departed from its
+    # own log by more than 2 m, or a conflict is nearer than 3 s
+    turns_reactive: jax.Array  # []
+
+
+class Case(flax.struct.PyTreeNode, kw_only=True):
+    """One simulated drive."""
+
+    seed: jax.Array  # [] uint32, of the perception noise and the sampler
+    steps: jax.Array  # [] int32, steps that count (the rest is padding)
+    ego_v: jax.Array  # [] m/s at t = 0; the ego starts at s = 0 on its path
+    ego_length: jax.Array  # [] m
+    ego_width: jax.Array  # [] m
+    road: Road
+    lines: Lines
+    agents: Agents
+    perception: Perception
+    replay: Replay | None = None
+
+
+class EgoState(flax.struct.PyTreeNode, kw_only=True):
+    """The ego's centre in the road's Frenet frame, with its actuators."""
+
+    s: jax.Array  # [] m
+    l: jax.Array  # [] m
+    heading: jax.Array  # [] rad, relative to the reference line
+    v: jax.Array  # [] m/s >= 0
+    a: jax.Array  # [] m/s^2, what the drive train delivers now
+    curvature: jax.Array  # [] 1/m, what the steering delivers now
+
+
+class AgentState(flax.struct.PyTreeNode, kw_only=True):
+    """All agents now."""
+
+    s: jax.Array  # [A] m, centre
+    l: jax.Array  # [A] m
+    heading: jax.Array  # [A] rad, relative to the reference line
+    v: jax.Array  # [A] m/s along the heading, >= 0
+    a: jax.Array  # [A] m/s^2
+    l_dot: jax.Array  # [A] m/s, lateral speed of lane keepers
+    l_target: jax.Array  # [A] m, lateral offset steered to
+    clock: jax.Array  # [A] s since activation; negative before it
+    present: jax.Array  # [A] bool: has appeared and not left
+    gone: jax.Array  # [A] bool: will not appear (again)
+    queue: jax.Array  # [A, D] m/s^2, commands decided, newest first
+
+
+class Seen(flax.struct.PyTreeNode, kw_only=True):
+    """What perception remembers of the agents; leaves [H, A], newest first."""
+
+    s: jax.Array  # [H, A] m
+    l: jax.Array  # [H, A] m
+    heading: jax.Array  # [H, A] rad
+    v: jax.Array  # [H, A] m/s
+    a: jax.Array  # [H, A] m/s^2
+    present: jax.Array  # [H, A] bool
+
+
+class World(flax.struct.PyTreeNode, kw_only=True):
+    """The state that one step maps to the next."""
+
+    step: jax.Array  # [] int32
+    ego: EgoState
+    agents: AgentState
+    seen: Seen
+    served: jax.Array  # [L] bool: the ego has stood at this stop sign
+    stopped: jax.Array  # [] bool: an at-fault collision has ended the drive
+    reactive: jax.Array  # [] bool: replayed agents have left their logs
+
+
+class Record(flax.struct.PyTreeNode, kw_only=True):
+    """One step's log of one case; every leaf gains a leading [S]."""
+
+    valid: jax.Array  # [] bool: inside the case's steps, before an ending crash
+    s: jax.Array  # [] m
+    l: jax.Array  # [] m
+    heading: jax.Array  # [] rad
+    v: jax.Array  # [] m/s
+    a: jax.Array  # [] m/s^2, along the path
+    curvature: jax.Array  # [] 1/m of the path driven
+    speed_limit: jax.Array  # [] m/s, posted, at the ego's station
+    path_l: jax.Array  # [] m, given path at the ego's station
+    clearance: jax.Array  # [] m to the nearest agent; < 0 while overlapping
+    ttc: jax.Array  # [] s, constant speeds and headings; inf if never
+    ttc_counts: jax.Array  # [] bool: nuPlan's TTC looks at that agent
+    headway: jax.Array  # [] s to the agent ahead in the own corridor; inf
+    collision: jax.Array  # [] int32, number of agents hit in this step
+    at_fault: jax.Array  # [] int32, of them by the ego's fault
+    at_fault_vru: jax.Array  # [] int32, of them pedestrians or cyclists
+    at_fault_object: jax.Array  # [] int32, of them static objects
+    impact_speed: jax.Array  # [] m/s, largest relative speed of these hits
+    red_light: jax.Array  # [] bool: front bumper crossed a line while red
+    stop_sign: jax.Array  # [] bool: crossed a stop sign without standing
+    off_road: jax.Array  # [] m, farthest corner outside the drivable area, >= 0
+    induced_braking: jax.Array  # [] m/s^2 >= 0, hardest braking for the ego
+    fallback: jax.Array  # [] bool, of the plan in force
+    command: jax.Array  # [] m/s^2, of the plan in force
+
+
+class Snapshot(flax.struct.PyTreeNode, kw_only=True):
+    """What a picture needs beyond the Record; every leaf gains [S]."""
+
+    agents: AgentState
+    plan_s: jax.Array  # [T] m, absolute planned stations
+    line_red: jax.Array  # [L] bool: the line demands a stop now

@@ -1,0 +1,47 @@
+"""Stop lines: what the light shows, and who has to stop."""
+
+import jax
+import jax.numpy as jnp
+
+from rcirl_jax.simulation.cases import LineKind, Lines
+
+# m/s^2: at yellow one stops if this braking suffices (dilemma-zone practice)
+YELLOW_BRAKING_MPS2 = 3.0
+STOP_WINDOW_M = 5.0  # m before a stop sign within which standing counts (nuPlan)
+STOP_SPEED_MPS = 0.1  # m/s, standing (nuPlan)
+
+
+def colours(lines: Lines, time: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """(yellow, red) [L] bool of all lines at a time [s]."""
+    is_light = lines.kind == LineKind.LIGHT
+    cycle = jnp.maximum(lines.green + lines.yellow + lines.red, 1e-3)
+    phase = jnp.mod(time + lines.offset, cycle)
+    yellow = is_light & (phase >= lines.green) & (phase < lines.green + lines.yellow)
+    red = is_light & (phase >= lines.green + lines.yellow)
+    return yellow, red
+
+
+def demands(
+    lines: Lines, time: jax.Array, distance: jax.Array, v: jax.Array
+) -> jax.Array:
+    """Whether lights demand a stop of a driver: bool, shape of `distance`.
+
+    Red always does; yellow where the driver can still stop with 3 m/s^2.
+
+    Args:
+      lines: [L].
+      time: [] s.
+      distance: [..., L] m from the driver's front to the lines.
+      v: [..., 1] m/s, the driver's speed.
+    """
+    yellow, red = colours(lines, time)
+    can_stop = v**2 <= 2.0 * YELLOW_BRAKING_MPS2 * jnp.maximum(distance, 0.0)
+    return red | (yellow & can_stop)
+
+
+def serve(
+    lines: Lines, served: jax.Array, distance: jax.Array, v: jax.Array
+) -> jax.Array:
+    """Stop signs at which the ego has stood: within 5 m before it, below 0.1 m/s."""
+    stands = (v < STOP_SPEED_MPS) & (distance >= 0.0) & (distance <= STOP_WINDOW_M)
+    return served | (stands & (lines.kind == LineKind.STOP_SIGN))

@@ -1,0 +1,136 @@
+"""Closed loop: scan over time, vmap over cases, chunks to bound memory.
+
+The only file of the simulator that names `jit`, `vmap` or `scan` over cases
+and time. A policy is a pure function `(params, scene, key) -> Plan`; weights
+are arguments, so the compiled program serves every weights file of one shape.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.planner.plan import Plan
+from rcirl_jax.simulation import lines as signals
+from rcirl_jax.simulation.cases import STEP_S, Case, Record, Snapshot, World
+from rcirl_jax.simulation.observe import observe, planning_limit
+from rcirl_jax.simulation.vehicle import Vehicle
+from rcirl_jax.simulation.world import start, step
+from rcirl_jax.types import Scene
+
+Params = Any  # a policy's weights: any pytree
+Policy = Callable[[Params, Scene, jax.Array], Plan]
+Logs = Any  # what a rollout returns: records, or what `reduce` made of them
+
+SAMPLER_STREAM = 7  # fold_in number of the sampler's key
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RolloutConfig:
+    """How a case is driven; hashable, a static argument."""
+
+    # steps between two plans: 1 plans at 10 Hz
+    plan_every: int = 1
+    # steps of the run; cases with fewer are padded
+    steps: int = 1200
+    # the ego is the recorded human (cases with a replay only)
+    follow_log: bool = False
+    # keep the agents and plans for pictures
+    snapshots: bool = False
+    vehicle: Vehicle = dataclasses.field(default_factory=Vehicle)
+
+    def __post_init__(self) -> None:
+        """Reject what does not divide."""
+        if not 1 <= self.plan_every <= 50:
+            raise InputError(
+                f"--plan_every: {self.plan_every}: expected 1 to 50 steps of 0.1 s"
+            )
+        if self.steps < 1 or self.steps % self.plan_every:
+            raise InputError(
+                f"--plan_every: {self.plan_every}: expected a divisor of the "
+                f"{self.steps} steps"
+            )
+
+
+def drive_case(
+    policy: Policy,
+    params: Params,
+    case: Case,
+    config: RolloutConfig,
+) -> tuple[Record, Snapshot | None]:
+    """One case from start to end; leaves of the records are [S]."""
+    limit = planning_limit(case.road)
+    key = jax.random.fold_in(jax.random.key(case.seed), SAMPLER_STREAM)
+
+    def plan_and_drive(world: World, _: None) -> tuple[World, tuple]:
+        scene = observe(case, world, limit)
+        with jax.named_scope("policy"):
+            plan = policy(params, scene, jax.random.fold_in(key, world.step))
+
+        def tick(now: World, _: None) -> tuple[World, tuple]:
+            after, record = step(
+                case,
+                now,
+                plan.acceleration,
+                plan.fallback,
+                config.vehicle,
+                config.follow_log,
+            )
+            shot = _snapshot(case, world, after, plan) if config.snapshots else None
+            return after, (record, shot)
+
+        return jax.lax.scan(tick, world, None, length=config.plan_every)
+
+    plans = config.steps // config.plan_every
+    _, logs = jax.lax.scan(plan_and_drive, start(case), None, length=plans)
+    return jax.tree.map(lambda x: x.reshape(config.steps, *x.shape[2:]), logs)
+
+
+def _snapshot(case: Case, planned: World, after: World, plan: Plan) -> Snapshot:
+    time = after.step * STEP_S
+    _, red = signals.colours(case.lines, time)
+    sign = ~after.served & (case.lines.kind == 2)
+    return Snapshot(
+        agents=after.agents, plan_s=plan.s + planned.ego.s, line_red=red | sign
+    )
+
+
+@functools.lru_cache(maxsize=32)
+def _compiled(
+    policy: Policy,
+    reduce: Callable[[Record], Logs] | None,
+    config: RolloutConfig,
+) -> Callable:
+    def run(params: Params, case: Case) -> Logs:
+        record, shot = drive_case(policy, params, case, config)
+        return (record, shot) if reduce is None else reduce(record)
+
+    return jax.jit(jax.vmap(run, in_axes=(None, 0)))
+
+
+def drive_cases(
+    policy: Policy,
+    params: Params,
+    cases: Case,
+    config: RolloutConfig,
+    reduce: Callable[[Record], Logs] | None = None,
+) -> Logs:
+    """All cases [B] at once; with `reduce` the records never leave the device."""
+    return _compiled(policy, reduce, config)(params, cases)
+
+
+def chunks(cases: Case, size: int) -> Iterator[tuple[Case, int]]:
+    """Cases in chunks of one size; the last is filled up with its first case.
+
+    Yields:
+      (chunk, count): only the first `count` cases of the chunk are new.
+    """
+    total = cases.steps.shape[0]
+    for first in range(0, total, size):
+        count = min(size, total - first)
+        index = jnp.minimum(jnp.arange(size) + first, first + count - 1)
+        yield jax.tree.map(lambda x, i=index: jnp.asarray(x)[i], cases), count
