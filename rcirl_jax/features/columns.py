@@ -1,7 +1,9 @@
-"""One pure function per feature: (frame) -> [T].
+"""One pure function per feature: (frame of one point) -> scalar.
 
 `COLUMNS` maps the name used in data_specs/features/*.toml to the function that
-computes it. To add a feature: write a function here, name it there.
+computes it. To add a feature: write a function here, name it there. The
+functions are elementwise, so a Frame whose leaves carry further axes gives a
+column with these axes.
 """
 
 from collections.abc import Callable
@@ -10,33 +12,76 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from rcirl_jax.features.path import path_view
-from rcirl_jax.features.relations import Relations, closest_body, nearest, relate
-from rcirl_jax.types import Scene, Trajectory
+from rcirl_jax.features.path import PathView, path_view
+from rcirl_jax.features.relations import (
+    LATERAL_CAP_M,
+    LINE_CAP_M,
+    OBSTACLE_CAP_M,
+    Nearest,
+    Relations,
+    relate,
+    slots,
+)
+from rcirl_jax.types import Candidates, Scene, Trajectory
 from rcirl_jax.units import TIMES_S
 
-OBSTACLE_CAP_M = 100.0  # m, Apollo: follow, overtake, side-pass "none" distance
-LINE_CAP_M = 60.0  # m, Apollo: stop, virtual and nudge "none" distance
-LATERAL_CAP_M = 10.0  # m, Apollo: lateral "none" distance
 MIN_COLLISION_M = -10.0  # m, deepest penetration told apart
+BEFORE_M = 1e6  # m, how far back the ego is taken to be before the first time
+
+__all__ = ["COLUMNS", "LINE_CAP_M", "OBSTACLE_CAP_M", "Frame", "make_frame"]
 
 
 class Frame(flax.struct.PyTreeNode, kw_only=True):
-    """What the columns read: the inputs and what several of them share."""
+    """What the columns read at one point; all leaves scalars."""
 
-    scene: Scene
-    trajectory: Trajectory
+    time: jax.Array  # s
+    advance: jax.Array  # m, station since t = 0
+    point: Trajectory  # leaves [] instead of [T]
     relations: Relations
-    kappa: jax.Array  # [T] 1/m, curvature of the path driven
+    path: PathView
+    kappa: jax.Array  # 1/m, curvature of the path driven
 
 
 def make_frame(scene: Scene, trajectory: Trajectory) -> Frame:
-    """Compute the shared quantities once for one trajectory."""
+    """The frames of one trajectory; every leaf is [T]."""
+    view = path_view(scene, trajectory.s)
+    points = jax.tree.map(lambda x: x[:, None], (trajectory, view))
+    frame = _grid(scene, *points)
+    return jax.tree.map(lambda x: x[:, 0], frame)
+
+
+def candidate_frames(scene: Scene, candidates: Candidates) -> Frame:
+    """The frames of all candidates of a scene; every leaf is [T, K].
+
+    Candidates run along the last axis, so that XLA's loops are long and all
+    lanes of the processor's vectors are filled.
+    """
+    view = jax.vmap(path_view, in_axes=(None, 0))(scene, candidates.trajectory.s)
+    points = jax.tree.map(jnp.transpose, (candidates.trajectory, view))
+    return _grid(scene, *points)
+
+
+def _grid(scene: Scene, trajectory: Trajectory, view: PathView) -> Frame:
+    """Frames of a [T, K] grid of points; the one place that maps over points."""
+    s = trajectory.s
+    before = jnp.concatenate([jnp.full_like(s[:1], -BEFORE_M), s[:-1]])
+    kappa = view.curvature(trajectory)
+
+    def row(time: jax.Array, obstacles: tuple, s: jax.Array, *rest: jax.Array) -> tuple:
+        one = jax.vmap(relate, in_axes=(None, 0, 0, 0, 0))
+        return jnp.broadcast_to(time, s.shape), one(obstacles, s, *rest)
+
+    everyone = slots(scene.ego, scene.obstacles)
+    time, relations = jax.vmap(row)(
+        jnp.asarray(TIMES_S), everyone, s, trajectory.l, trajectory.v, before
+    )
     return Frame(
-        scene=scene,
-        trajectory=trajectory,
-        relations=relate(scene, trajectory),
-        kappa=driven_curvature(scene, trajectory),
+        time=time,
+        advance=s - scene.ego.s,
+        point=trajectory,
+        relations=relations,
+        path=view,
+        kappa=kappa,
     )
 
 
@@ -45,71 +90,55 @@ def driven_curvature(scene: Scene, trajectory: Trajectory) -> jax.Array:
     return path_view(scene, trajectory.s).curvature(trajectory)
 
 
-def _speed_limit(frame: Frame) -> jax.Array:
-    return path_view(frame.scene, frame.trajectory.s).speed_limit
-
-
 def _collision_distance(frame: Frame) -> jax.Array:
-    overrun = frame.relations.line_overrun
-    signed = closest_body(frame.relations)
+    overrun, signed = frame.relations.line_overrun, frame.relations.body
     signed = jnp.where(overrun > 0.0, jnp.minimum(signed, -overrun), signed)
     return jnp.clip(signed, MIN_COLLISION_M, OBSTACLE_CAP_M)
 
 
-def _collision(frame: Frame) -> jax.Array:
-    return (_collision_distance(frame) < 0.0).astype(jnp.float32)
-
-
-def _longitudinal(name: str, cap: float, index: int) -> Callable[[Frame], jax.Array]:
-    """Distance (index 0) or relative speed (index 1) of the nearest of a class."""
+def _nearest(name: str, attribute: str) -> Callable[[Frame], jax.Array]:
+    """Distance or relative speed of the nearest of a class."""
 
     def column(frame: Frame) -> jax.Array:
-        relations = frame.relations
-        member = getattr(relations, name)
-        distance = jnp.maximum(relations.gap, 0.0)
-        return nearest(member, distance, relations.speed, cap)[index]
+        nearest: Nearest = getattr(frame.relations, name)
+        return getattr(nearest, attribute)
 
     return column
 
 
-def _nudge(index: int) -> Callable[[Frame], jax.Array]:
-    """Lateral gap (0) or relative speed (1) of the laterally nearest abreast."""
-
-    def column(frame: Frame) -> jax.Array:
-        relations = frame.relations
-        distance = jnp.maximum(relations.lateral_gap, 0.0)
-        return nearest(relations.nudge, distance, relations.speed, LATERAL_CAP_M)[index]
-
-    return column
+def _nudge_distance(frame: Frame) -> jax.Array:
+    """Along the road: 0 while something is abreast, the cap otherwise."""
+    abreast = frame.relations.nudge.distance < LATERAL_CAP_M
+    return jnp.where(abreast, 0.0, LINE_CAP_M)
 
 
 COLUMNS: dict[str, Callable[[Frame], jax.Array]] = {
-    "l": lambda frame: frame.trajectory.l,
-    "dl": lambda frame: frame.trajectory.dl,
-    "ddl": lambda frame: frame.trajectory.ddl,
+    "l": lambda frame: frame.point.l,
+    "dl": lambda frame: frame.point.dl,
+    "ddl": lambda frame: frame.point.ddl,
     "curvature": lambda frame: frame.kappa,
-    "station": lambda frame: frame.trajectory.s - frame.scene.ego.s,
-    "time": lambda frame: jnp.asarray(TIMES_S),
-    "velocity": lambda frame: frame.trajectory.v,
-    "speed_limit": _speed_limit,
-    "acceleration": lambda frame: frame.trajectory.a,
-    "jerk": lambda frame: frame.trajectory.j,
-    "lateral_acceleration": lambda frame: frame.trajectory.v**2 * frame.kappa,
+    "station": lambda frame: frame.advance,
+    "time": lambda frame: frame.time,
+    "velocity": lambda frame: frame.point.v,
+    "speed_limit": lambda frame: frame.path.speed_limit,
+    "acceleration": lambda frame: frame.point.a,
+    "jerk": lambda frame: frame.point.j,
+    "lateral_acceleration": lambda frame: frame.point.v**2 * frame.kappa,
     "collision_distance": _collision_distance,
-    "collision": _collision,
-    "follow_distance": _longitudinal("follow", OBSTACLE_CAP_M, 0),
-    "follow_speed": _longitudinal("follow", OBSTACLE_CAP_M, 1),
-    "overtake_distance": _longitudinal("overtake", OBSTACLE_CAP_M, 0),
-    "overtake_speed": _longitudinal("overtake", OBSTACLE_CAP_M, 1),
-    "stop_distance": _longitudinal("stop", LINE_CAP_M, 0),
-    "stop_speed": _longitudinal("stop", LINE_CAP_M, 1),
-    "virtual_distance": _longitudinal("virtual", LINE_CAP_M, 0),
-    "virtual_speed": _longitudinal("virtual", LINE_CAP_M, 1),
-    "nudge_distance": _longitudinal("nudge", LINE_CAP_M, 0),
-    "nudge_lateral": _nudge(0),
-    "nudge_speed": _nudge(1),
-    "sidepass_front_distance": _longitudinal("sidepass_front", OBSTACLE_CAP_M, 0),
-    "sidepass_front_speed": _longitudinal("sidepass_front", OBSTACLE_CAP_M, 1),
-    "sidepass_rear_distance": _longitudinal("sidepass_rear", OBSTACLE_CAP_M, 0),
-    "sidepass_rear_speed": _longitudinal("sidepass_rear", OBSTACLE_CAP_M, 1),
+    "collision": lambda frame: (_collision_distance(frame) < 0.0).astype(jnp.float32),
+    "follow_distance": _nearest("follow", "distance"),
+    "follow_speed": _nearest("follow", "speed"),
+    "overtake_distance": _nearest("overtake", "distance"),
+    "overtake_speed": _nearest("overtake", "speed"),
+    "stop_distance": _nearest("stop", "distance"),
+    "stop_speed": _nearest("stop", "speed"),
+    "virtual_distance": _nearest("virtual", "distance"),
+    "virtual_speed": _nearest("virtual", "speed"),
+    "nudge_distance": _nudge_distance,
+    "nudge_lateral": _nearest("nudge", "distance"),
+    "nudge_speed": _nearest("nudge", "speed"),
+    "sidepass_front_distance": _nearest("sidepass_front", "distance"),
+    "sidepass_front_speed": _nearest("sidepass_front", "speed"),
+    "sidepass_rear_distance": _nearest("sidepass_rear", "distance"),
+    "sidepass_rear_speed": _nearest("sidepass_rear", "speed"),
 }

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.features.columns import COLUMNS, make_frame
+from rcirl_jax.features.columns import COLUMNS, candidate_frames, make_frame
 from rcirl_jax.specs import load_toml, spec_root
 from rcirl_jax.types import Candidates, Scene, Trajectory
 
@@ -62,7 +62,18 @@ class FeatureMap:
         self, scene: Scene, candidates: Candidates
     ) -> Float[Array, "candidates times features"]:
         """F of all K candidates of one scene, [K, T, F]."""
-        return jax.vmap(self, in_axes=(None, 0))(scene, candidates.trajectory)
+        return jnp.moveaxis(jnp.stack(self.rows(scene, candidates), axis=-1), 0, 1)
+
+    def rows(
+        self, scene: Scene, candidates: Candidates
+    ) -> tuple[Float[Array, "times candidates"], ...]:
+        """F of all K candidates, feature by feature: F arrays [T, K].
+
+        The layout for speed: no [K, T, F] array is ever written.
+        """
+        with jax.named_scope("features"):
+            frames = candidate_frames(scene, candidates)
+            return tuple(COLUMNS[spec.name](frames) for spec in self.specs)
 
 
 @functools.cache

@@ -28,10 +28,11 @@ class PathView(flax.struct.PyTreeNode, kw_only=True):
     speed_limit: jax.Array  # m/s
 
     def curvature(self, trajectory: Trajectory) -> jax.Array:
-        """Curvature [T] 1/m of the path that the trajectory drives."""
-        return jax.vmap(path_curvature)(
-            self.kappa, self.dkappa, trajectory.l, trajectory.dl, trajectory.ddl
-        )
+        """Curvature 1/m of the path that the trajectory drives; any equal shape."""
+        at = path_curvature
+        for _ in range(self.kappa.ndim):
+            at = jax.vmap(at)
+        return at(self.kappa, self.dkappa, trajectory.l, trajectory.dl, trajectory.ddl)
 
 
 def _slope(table: Float[Array, " p"], points: int) -> Float[Array, " p"]:

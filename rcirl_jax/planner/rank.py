@@ -19,8 +19,7 @@ from rcirl_jax.planner.baselines import Idm, idm_acceleration
 from rcirl_jax.planner.plan import Plan
 from rcirl_jax.planner.safety import SafetyConfig, check, choose
 from rcirl_jax.reward.hand import lattice_cost
-from rcirl_jax.reward.network import ACTIVATIONS, point_rewards
-from rcirl_jax.reward.normaliser import normalise
+from rcirl_jax.reward.network import ACTIVATIONS, rows_value
 from rcirl_jax.sampling import SamplerConfig, sample
 from rcirl_jax.sampling.speed import family_index
 from rcirl_jax.types import Candidates, Kind, Normaliser, RewardParams, Scene
@@ -66,10 +65,8 @@ def learned_score(features: FeatureMap, activation: str) -> Score:
         params: tuple[RewardParams, Normaliser], scene: Scene, candidates: Candidates
     ) -> jax.Array:
         effective, normaliser = params
-        raw = features.of_candidates(scene, candidates)
-        rewards = point_rewards(effective, normalise(normaliser, raw), activation)
-        weight = jnp.where(scene.time_valid, effective.gamma, 0.0)
-        return jnp.sum(weight * rewards, axis=-1)
+        rows = features.rows(scene, candidates)
+        return rows_value(effective, normaliser, rows, scene.time_valid, activation)
 
     return score
 

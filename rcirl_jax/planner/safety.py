@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 
 from rcirl_jax.features.path import path_view
-from rcirl_jax.geometry.boxes import frenet_extent, overlap_times
+from rcirl_jax.geometry.boxes import frenet_extent
 from rcirl_jax.geometry.frenet import lookup
 from rcirl_jax.types import Candidates, Kind, Scene, Trajectory
 from rcirl_jax.units import DT_S, STATION_STEP_M, TIMES_S
@@ -72,9 +72,10 @@ def check(
     scene: Scene, candidates: Candidates, config: SafetyConfig = SafetyConfig()
 ) -> Verdict:
     """Judge all candidates [K] of one scene."""
-    return jax.vmap(lambda x, ok: _check_one(scene, x, ok, config))(
-        candidates.trajectory, candidates.feasible
-    )
+    trajectory = candidates.trajectory
+    body = first_contact(scene, jax.tree.map(jnp.transpose, trajectory), config)
+    judge = jax.vmap(lambda x, ok, hit: _check_one(scene, x, ok, hit, config))
+    return judge(trajectory, candidates.feasible, body)
 
 
 def choose(verdict: Verdict, scores: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -93,9 +94,12 @@ def choose(verdict: Verdict, scores: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def _check_one(
-    scene: Scene, x: Trajectory, feasible: jax.Array, config: SafetyConfig
+    scene: Scene,
+    x: Trajectory,
+    feasible: jax.Array,
+    body: jax.Array,
+    config: SafetyConfig,
 ) -> Verdict:
-    body = _first_contact(scene, x, config)
     line = _first_crossing(scene, x, config)
     contact = jnp.minimum(body, line)
     margin, gains = _rss(scene, x, config)
@@ -111,40 +115,46 @@ def _check_one(
     )
 
 
-def _first_contact(scene: Scene, x: Trajectory, config: SafetyConfig) -> jax.Array:
-    """Time [s] of the first contact with a body; inf without one.
+def first_contact(scene: Scene, x: Trajectory, config: SafetyConfig) -> jax.Array:
+    """Start [s] of the first interval with a contact, [K]; inf without one.
 
-    On each axis the distance of the centres runs linearly between two times;
-    the boxes touch while both axes overlap (`overlap_times`). Boxes that are
-    tilted enter with their extents along the axes, which contain them.
+    Between two times the centres' distance runs on a straight segment with
+    middle m and half extent h; the boxes, added up to half sides e, touch it
+    if and only if no axis separates them (segment against box, exact):
+
+        |m_s| <= e_s + |h_s|,   |m_l| <= e_l + |h_l|,
+        |m_s h_l - m_l h_s| <= e_s |h_l| + e_l |h_s|
+
+    Boxes that are tilted enter with their extents along the axes, which
+    contain them. A body that overlaps the ego's corridor from behind is not
+    the plan's to avoid. Every leaf of `x` is [T, K] here: long loops.
     """
     obstacles, ego = scene.obstacles, scene.ego
-    half_s, half_l = jax.vmap(frenet_extent, in_axes=(None, None, 0))(
-        ego.length, ego.width, jnp.arctan(x.dl)
-    )
-    mid_s = 0.5 * (obstacles.s_lower + obstacles.s_upper)
-    mid_l = 0.5 * (obstacles.l_lower + obstacles.l_upper)
-    reach_s = 0.5 * (obstacles.s_upper - obstacles.s_lower) + half_s
-    reach_l = 0.5 * (obstacles.l_upper - obstacles.l_lower) + half_l
-    ds, dl = mid_s - x.s, mid_l - x.l
-    wide = lambda r, margin: jnp.maximum(r[:, :-1], r[:, 1:]) + margin  # noqa: E731
-    from_s, to_s = overlap_times(
-        ds[:, :-1], ds[:, 1:] - ds[:, :-1], wide(reach_s, config.margin_along)
-    )
-    from_l, to_l = overlap_times(
-        dl[:, :-1], dl[:, 1:] - dl[:, :-1], wide(reach_l, config.margin_across)
-    )
-    enter = jnp.maximum(jnp.maximum(from_s, from_l), 0.0)
-    leave = jnp.minimum(jnp.minimum(to_s, to_l), 1.0)
-    kind = obstacles.kind[:, None]
-    body = (kind >= Kind.VEHICLE) & (kind <= Kind.STATIC)
-    known = body & obstacles.valid[:, :-1] & obstacles.valid[:, 1:]
-    # a body that runs into the ego from behind is not the plan's to avoid
-    from_behind = (ds[:, :1] < 0.0) & (jnp.abs(dl[:, :1]) < reach_l[:, :1])
-    touches = known & (enter <= leave) & ~from_behind
-    # a contact that exists already may dissolve: only closing in counts
-    when = jnp.asarray(TIMES_S)[None, :-1] + DT_S * enter
-    return jnp.min(jnp.where(touches, when, jnp.inf))
+    extent = jax.vmap(jax.vmap(frenet_extent, (None, None, 0)), (None, None, 0))
+    half_s, half_l = extent(ego.length, ego.width, jnp.arctan(x.dl))
+    wide_s = jnp.maximum(half_s[:-1], half_s[1:]) + config.margin_along
+    wide_l = jnp.maximum(half_l[:-1], half_l[1:]) + config.margin_across
+    starts = jnp.asarray(TIMES_S)[:-1, None]
+    touched = jnp.zeros(wide_s.shape, bool)
+    for n in range(obstacles.kind.shape[0]):
+        o = jax.tree.map(lambda a, n=n: a[n], obstacles)
+        size_s = 0.5 * (o.s_upper - o.s_lower)[:, None]
+        size_l = 0.5 * (o.l_upper - o.l_lower)[:, None]
+        ds = 0.5 * (o.s_upper + o.s_lower)[:, None] - x.s
+        dl = 0.5 * (o.l_upper + o.l_lower)[:, None] - x.l
+        m_s, h_s = 0.5 * (ds[1:] + ds[:-1]), 0.5 * (ds[1:] - ds[:-1])
+        m_l, h_l = 0.5 * (dl[1:] + dl[:-1]), 0.5 * (dl[1:] - dl[:-1])
+        e_s = wide_s + jnp.maximum(size_s[1:], size_s[:-1])
+        e_l = wide_l + jnp.maximum(size_l[1:], size_l[:-1])
+        h_s, h_l = jnp.abs(h_s), jnp.abs(h_l)
+        cross = jnp.abs(m_s * (dl[1:] - dl[:-1]) - m_l * (ds[1:] - ds[:-1]))
+        near = (jnp.abs(m_s) <= e_s + h_s) & (jnp.abs(m_l) <= e_l + h_l)
+        near = near & (0.5 * cross <= e_s * h_l + e_l * h_s)
+        behind = (ds[:1] < 0.0) & (jnp.abs(dl[:1]) < size_l[:1] + half_l[:1])
+        is_body = (o.kind >= Kind.VEHICLE) & (o.kind <= Kind.STATIC)
+        known = is_body & (o.valid[1:] & o.valid[:-1])[:, None]
+        touched = touched | (near & known & ~behind)
+    return jnp.min(jnp.where(touched, starts, jnp.inf), axis=0)
 
 
 def _first_crossing(scene: Scene, x: Trajectory, config: SafetyConfig) -> jax.Array:

@@ -7,6 +7,7 @@ Human and candidate go through the same parameters (Siamese).
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -106,6 +107,44 @@ def point_rewards(
     for kernel, bias in zip(params.kernels[:-1], params.biases, strict=True):
         x = ACTIVATIONS[activation](x @ kernel + bias)
     return (x @ params.kernels[-1])[..., 0]
+
+
+def rows_value(
+    effective: RewardParams,
+    normaliser: Normaliser,
+    rows: Sequence[Float[Array, "t k"]],
+    time_valid: Bool[Array, " t"],
+    activation: str,
+) -> Float[Array, " k"]:
+    """V of all K candidates of a scene from features laid out row by row.
+
+    The same sum as `value`, feature-major: the points run along the long axis
+    of every matrix product, and the normaliser's shift and scale go into the
+    first layer. On a CPU it takes a third of the time of `value`, most of it
+    because no [K, T, F] array is written.
+
+    Args:
+      effective: pinned parameters (`pinned`, or a weights file's).
+      normaliser: [F].
+      rows: F arrays [T, K] of `FeatureMap.rows`.
+      time_valid: [T].
+      activation: key of ACTIVATIONS.
+    """
+    clipped = [
+        jnp.clip(row, normaliser.lower[i], normaliser.upper[i])
+        for i, row in enumerate(rows)
+    ]
+    x = jnp.stack(clipped).reshape(len(rows), -1)
+    first = effective.kernels[0] / normaliser.scale[:, None]
+    shift = normaliser.location @ first
+    kernels = (first, *effective.kernels[1:])
+    offsets = [*effective.biases, jnp.zeros((1,))]
+    offsets[0] = offsets[0] - shift
+    for kernel, offset in zip(kernels[:-1], offsets[:-1], strict=True):
+        x = ACTIVATIONS[activation](kernel.T @ x + offset[:, None])
+    rewards = (kernels[-1].T @ x + offsets[-1][:, None]).reshape(rows[0].shape)
+    weight = jnp.where(time_valid, effective.gamma, 0.0)
+    return weight @ rewards
 
 
 def value(

@@ -84,7 +84,7 @@ def point(scene, trajectory, i):
         if not rows:
             return cap, 0.0
         low = min(row[by] for row in rows)
-        return low, float(np.mean([row[1] for row in rows if row[by] == low]))
+        return low, min(row[1] for row in rows if row[by] == low)
 
     out = {
         "l": x["l"][i],
