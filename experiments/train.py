@@ -15,7 +15,7 @@ from rcirl_jax.reward import LOSSES, RewardConfig
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.parallel import PARALLEL
-from rcirl_jax.train.state import TrainConfig
+from rcirl_jax.train.state import POSITIVES, TrainConfig
 
 _DATA = flags.DEFINE_string("data", None, "dataset made by import_logs", required=True)
 _WORKDIR = flags.DEFINE_string("workdir", None, "run folder", required=True)
@@ -37,6 +37,12 @@ _RATE = flags.DEFINE_float("learning_rate", 3e-3, "step size")
 _DECAY = flags.DEFINE_float("weight_decay", 0.0, "L2 pull on the weights")
 _BATCH = flags.DEFINE_integer("batch_size", 64, "scenes per step, all devices")
 _EPOCHS = flags.DEFINE_integer("epochs", 20, "passes over the training scenes")
+_POSITIVE = flags.DEFINE_enum(
+    "positive",
+    "human",
+    POSITIVES,
+    "ranked first: the human curve or its nearest candidate",
+)
 _NEGATIVES = flags.DEFINE_integer("hard_negatives", 0, "near negatives per scene")
 _SEED = flags.DEFINE_integer("seed", 0, "of initial weights, batches, candidates")
 _PARALLEL = flags.DEFINE_enum("parallel", "jit", PARALLEL, "how local devices share")
@@ -53,6 +59,7 @@ def main() -> None:
         weight_decay=_DECAY.value,
         batch_size=_BATCH.value,
         epochs=_EPOCHS.value,
+        positive=_POSITIVE.value,
         hard_negatives=_NEGATIVES.value,
         seed=_SEED.value,
         reward=RewardConfig(

@@ -56,6 +56,7 @@ class RankConfig:
     period: float = 0.1
 
 
+@functools.lru_cache(maxsize=16)
 def learned_score(features: FeatureMap, activation: str) -> Score:
     """Score of (effective RewardParams, Normaliser): V, as in `reward.value`."""
     if activation not in ACTIVATIONS:

@@ -19,6 +19,9 @@ OPTIMIZERS: dict[str, Callable[[float], optax.GradientTransformation]] = {
 }
 
 
+POSITIVES = ("human", "nearest")
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TrainConfig:
     """Everything that decides the result of training; hashable, in provenance."""
@@ -39,6 +42,9 @@ class TrainConfig:
     batch_size: int = 64
     # passes over the training scenes
     epochs: int = 20
+    # what is ranked above the candidates: the "human" curve itself, or the
+    # "nearest" feasible candidate to it (what a planner could have driven)
+    positive: str = "human"
     # offline negatives near the human per scene (0: none)
     hard_negatives: int = 0
     seed: int = 0
@@ -52,6 +58,10 @@ class TrainConfig:
         if self.optimizer not in OPTIMIZERS:
             raise InputError(
                 f"--optimizer: {self.optimizer}: expected one of {sorted(OPTIMIZERS)}"
+            )
+        if self.positive not in POSITIVES:
+            raise InputError(
+                f"--positive: {self.positive}: expected one of {POSITIVES}"
             )
         for name, low in (("leaky_rate", 0.0), ("learning_rate", 0.0)):
             if not low < getattr(self, name) < 1.0:

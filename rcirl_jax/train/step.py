@@ -83,6 +83,21 @@ def candidates_of(
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), sampled, near)
 
 
+def nearest_candidate(
+    demonstration: Demonstration, driven: Trajectory, candidates: Candidates
+) -> jax.Array:
+    """Index of the feasible candidate with the least mean distance to the human.
+
+    Ranking this one above the rest asks for what a planner can choose, and
+    leaves nothing to learn from how the human's curve was recorded.
+    """
+    valid = demonstration.scene.time_valid
+    apart = jnp.abs(candidates.trajectory.s - driven.s)
+    apart = apart + jnp.abs(candidates.trajectory.l - driven.l)
+    mean = jnp.sum(jnp.where(valid, apart, 0.0), axis=1) / jnp.sum(valid)
+    return jnp.argmin(jnp.where(candidates.feasible, mean, jnp.inf))
+
+
 def featurise(
     key: jax.Array, batch: Batch, config: TrainConfig, features: FeatureMap
 ) -> FeatureBatch:
@@ -91,8 +106,13 @@ def featurise(
     def one(index: jax.Array, demonstration: Demonstration) -> tuple:
         own_key = jax.random.fold_in(key, index)
         candidates = candidates_of(own_key, demonstration, config)
-        human = features(demonstration.scene, human_of(demonstration, config.sampler))
+        driven = human_of(demonstration, config.sampler)
         of_candidates = features.of_candidates(demonstration.scene, candidates)
+        if config.positive == "nearest":
+            near = nearest_candidate(demonstration, driven, candidates)
+            feasible = candidates.feasible.at[near].set(False)
+            return of_candidates[near], of_candidates, feasible
+        human = features(demonstration.scene, driven)
         return human, of_candidates, candidates.feasible
 
     human, of_candidates, feasible = jax.vmap(one)(batch.index, batch.demonstrations)

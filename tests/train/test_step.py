@@ -210,3 +210,23 @@ def test_linear_reward_has_no_hidden_layer():
     state = init_state(config, normaliser())
     assert [k.shape for k in state.params.kernels] == [(21, 1)]
     assert state.params.biases == ()
+
+
+def test_nearest_positive_is_a_feasible_candidate_and_not_its_own_rival():
+    config = dataclasses.replace(CONFIG, positive="nearest")
+    features = feature_map("paper21")
+    key = init_state(config, normaliser()).key
+    made = featurise(key, batch(), config, features)
+    plain = featurise(key, batch(), CONFIG, features)
+    for b in range(made.human.shape[0]):
+        same = np.all(np.asarray(made.candidates[b]) == made.human[b], axis=(1, 2))
+        before, after = np.asarray(plain.feasible[b]), np.asarray(made.feasible[b])
+        (changed,) = np.nonzero(before != after)
+        assert changed.size == 1
+        assert same[changed[0]]
+        # no feasible rival ends nearer to the human over the valid times
+        scene_s = np.asarray(made.candidates[b, :, :, features.names.index("station")])
+        human_s = np.asarray(plain.human[b, :, features.names.index("station")])
+        valid = np.asarray(made.time_valid[b])
+        apart = np.abs(scene_s - human_s)[:, valid].mean(axis=1)
+        assert apart[changed[0]] <= apart[after].min() + 0.05

@@ -1,0 +1,82 @@
+"""The rows of a closed-loop table: a name, a policy, its weights, how it drives.
+
+Every row drives the same cases behind the same safety filter (where it has
+candidates at all), so that rows differ by what chooses and nothing else.
+"""
+
+import dataclasses
+
+import jax
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.features import feature_map
+from rcirl_jax.planner.baselines import Idm
+from rcirl_jax.planner.rank import (
+    Params,
+    Policy,
+    RankConfig,
+    constant_speed_policy,
+    hand_score,
+    idm_policy,
+    learned_score,
+    rank_policy,
+)
+from rcirl_jax.reward.network import RewardConfig, init_reward, pinned
+from rcirl_jax.types import Normaliser, RewardParams
+
+BASELINES = ("hand-set", "IDM", "constant speed", "random weights")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Row:
+    """One driver of a table."""
+
+    name: str
+    policy: Policy
+    params: Params = None
+    # the ego is the recorded human; only for cases with a replay
+    follow_log: bool = False
+    # steps between two plans, where a row needs its own (DP); None: the run's
+    plan_every: int | None = None
+    # seed of the training run, where rows of one name differ by it
+    seed: int = 0
+
+
+def learned_row(
+    name: str,
+    weights: tuple[RewardParams, Normaliser],
+    preset: str,
+    activation: str,
+    config: RankConfig,
+    seed: int = 0,
+) -> Row:
+    """A learned reward, ranking; weights are effective (pinned) parameters."""
+    score = learned_score(feature_map(preset), activation)
+    return Row(name=name, policy=rank_policy(score, config), params=weights, seed=seed)
+
+
+def baseline_row(
+    name: str, preset: str, normaliser: Normaliser, config: RankConfig, seed: int = 0
+) -> Row:
+    """A baseline by its name in `BASELINES`.
+
+    Args:
+      name: which one.
+      preset: feature preset of the random weights.
+      normaliser: of the learned reward; random weights see the same inputs.
+      config: of the ranking planner.
+      seed: of the random weights.
+    """
+    if name == "hand-set":
+        return Row(name=name, policy=rank_policy(hand_score, config))
+    if name == "IDM":
+        return Row(name=name, policy=idm_policy(Idm()))
+    if name == "constant speed":
+        return Row(name=name, policy=constant_speed_policy)
+    if name == "random weights":
+        shape = RewardConfig()
+        count = feature_map(preset).num_features
+        params = init_reward(jax.random.key(seed), count, shape)
+        weights = (pinned(params, shape), normaliser)
+        return learned_row(name, weights, preset, shape.activation, config, seed)
+    raise InputError(f"--baselines: {name}: expected some of {', '.join(BASELINES)}")

@@ -1,0 +1,191 @@
+"""Every family file of the catalogue: budgets, sane roads, room to react at the start."""
+
+import functools
+import pathlib
+import tomllib
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+
+from rcirl_jax.simulation.cases import NUM_AGENTS, NUM_LINES, NUM_ROAD, Case
+from rcirl_jax.simulation.catalogue import build_cases, family_names, load_family
+from rcirl_jax.types import Kind
+
+ROOT = pathlib.Path(__file__).parents[2]
+FILES = sorted((ROOT / "data_specs" / "scenarios").glob("*.toml"))
+NAMES = [file.stem for file in FILES]
+CASES = 180  # of a family in the suite `full`
+MAX_CURVATURE = 0.1  # 1/m, simulation.md 3.8 row 1
+LANE_TILT = 0.17  # sin of the heading below which an agent keeps a lane
+DISTRIBUTIONS = {"uniform", "normal", "lognormal", "choice"}
+
+
+@functools.cache
+def text(name: str) -> dict[str, Any]:
+    """The file as written, without the loader."""
+    with (ROOT / "data_specs" / "scenarios" / f"{name}.toml").open("rb") as file:
+        return tomllib.load(file)
+
+
+@functools.cache
+def cases(name: str) -> Case:
+    """All cases of a family; too many agents or lines raise here."""
+    return build_cases(load_family(name), range(CASES))
+
+
+def box(x: float, y: float, heading: float, length: float, width: float) -> Any:
+    """An oriented rectangle, built by shapely."""
+    flat = shapely.box(-length / 2, -width / 2, length / 2, width / 2)
+    turned = shapely.affinity.rotate(flat, heading, origin=(0, 0), use_radians=True)
+    return shapely.affinity.translate(turned, x, y)
+
+
+def test_the_catalogue_lists_all_files() -> None:
+    assert len(NAMES) >= 23
+    assert sorted(family_names()) == NAMES
+    assert sum(text(name)["cases"] for name in NAMES) >= 3420
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_file_describes_itself(name: str) -> None:
+    spec = text(name)
+    assert spec["family"] == name
+    assert spec["cases"] == CASES
+    assert len(spec["title"]) > 5
+    assert len(spec["source"]) > 5
+    for parameter, entry in spec["parameters"].items():
+        assert len(DISTRIBUTIONS & set(entry)) == 1, parameter
+        assert entry["unit"], parameter
+        assert len(entry["meaning"]) > 5, parameter
+        if "uniform" in entry:
+            lower, upper = entry["uniform"]
+            assert lower < upper, parameter
+        if {"normal", "lognormal"} & set(entry):
+            lower, upper = entry["clip"]
+            assert lower < upper, parameter
+    for part in spec.get("compound", []):
+        assert part in NAMES
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_sixteen_cases_are_finite_and_differ(name: str) -> None:
+    batch = build_cases(load_family(name), range(16))
+    assert batch.road.kappa.shape == (16, NUM_ROAD)
+    assert batch.agents.kind.shape == (16, NUM_AGENTS)
+    assert batch.lines.kind.shape == (16, NUM_LINES)
+    for field in ("kappa", "speed_limit", "path_l", "edge_left", "edge_right"):
+        assert np.isfinite(getattr(batch.road, field)).all(), field
+    for field in ("length", "width", "s", "l", "heading", "v", "v_share"):
+        assert np.isfinite(getattr(batch.agents, field)).all(), field
+    assert np.unique(batch.ego_v).size == 16
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_road_is_sane(name: str) -> None:
+    road = cases(name).road
+    assert road.speed_limit.min() >= 3.0
+    assert road.speed_limit.max() <= 40.0
+    assert np.abs(road.kappa).max() <= MAX_CURVATURE + 1e-6
+    # Apollo's 2 m/s^2 leaves at least a walking-to-running pace in every bend
+    comfortable = np.sqrt(2.0 / np.maximum(np.abs(road.kappa), 1e-6))
+    assert comfortable.min() > 4.4
+    # the given path stays inside the drivable area, with the ego's half width
+    inside_left = road.edge_left[:, None] - road.path_l
+    inside_right = road.path_l - road.edge_right[:, None]
+    assert min(inside_left.min(), inside_right.min()) > 1.055
+    assert (cases(name).ego_v <= 1.001 * road.speed_limit[:, 0]).all()
+
+
+def test_posted_bend_speeds_respect_their_advice() -> None:
+    """Where curve_speed posts a lower limit, v^2 |kappa| <= 3 m/s^2."""
+    road = cases("curve_speed").road
+    posted = road.speed_limit < 0.999 * road.speed_limit[:, :1]
+    lateral = road.speed_limit**2 * np.abs(road.kappa)
+    assert posted.any()
+    assert lateral[posted].max() <= 3.0 + 1e-3
+    # and some bends are not posted: there the driver must see to it alone
+    assert lateral[~posted].max() > 4.0
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_nobody_appears_inside_the_ego_at_the_start(name: str) -> None:
+    batch = cases(name)
+    agents = batch.agents
+    here = (agents.kind != Kind.NONE) & (agents.appear_s <= 0) & (agents.appear_t <= 0)
+    for b, a in np.argwhere(here & (np.abs(agents.s) < 20.0)):
+        length, width = float(batch.ego_length[b]), float(batch.ego_width[b])
+        ego = box(0.0, float(batch.road.path_l[b, 0]), 0.0, length, width)
+        place = (agents.s, agents.l, agents.heading, agents.length, agents.width)
+        other = box(*(float(field[b, a]) for field in place))
+        assert ego.distance(other) > 0.3, (b, a)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_who_appears_beside_the_ego_leaves_room(name: str) -> None:
+    agents = cases(name).agents
+    relative = (agents.kind != Kind.NONE) & agents.relative
+    near = relative & (np.abs(agents.s) <= 6.0)
+    assert (np.abs(agents.l[near]) > 2.5).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_agents_move_as_their_kind_does(name: str) -> None:
+    agents = cases(name).agents
+    used = agents.kind != Kind.NONE
+    assert used.sum(axis=1).max() <= NUM_AGENTS
+    assert agents.v[used].min() >= 0.0
+    assert agents.v[used].max() <= 45.0
+    walkers = agents.kind == Kind.PEDESTRIAN
+    assert ((agents.v[walkers] >= 0.8) & (agents.v[walkers] <= 2.0)).all()
+    standing = agents.kind == Kind.STATIC
+    assert (agents.v[standing] == 0.0).all()
+    assert (agents.script.speed[standing] == 0.0).all()
+    crossing = used & (np.abs(np.sin(agents.heading)) > LANE_TILT)
+    outside = np.abs(agents.l) - 0.5 * agents.length
+    assert (outside[crossing] > 1.2).all()
+    towards = -np.sign(agents.l) * np.sign(np.sin(agents.heading))
+    assert (towards[crossing] > 0.0).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_scripts_are_in_order(name: str) -> None:
+    script = cases(name).agents.script
+    used = np.isfinite(script.start)
+    later = np.where(used[..., 1:], script.start[..., 1:] - script.start[..., :-1], 1.0)
+    assert later.min() > 0.0
+    assert (script.rate[used] > 0.0).all()
+    assert script.speed[used].min() >= 0.0
+    moves = np.isfinite(script.move_start)
+    assert (script.move_speed[moves] > 0.0).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_delays_do_not_make_crossing_agents_swing(name: str) -> None:
+    """Delayed free-road IDM is stable for 4 a delay / v0 < pi / 2 (slope at v0)."""
+    agents = cases(name).agents
+    crossing = np.abs(np.sin(agents.heading)) > LANE_TILT
+    crossing &= agents.kind != Kind.NONE
+    driver = agents.driver
+    loop = 4.0 * driver.acceleration * driver.delay / np.maximum(driver.desired, 0.1)
+    assert (loop[crossing] < 0.5 * np.pi).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_first_event_is_within_the_drive(name: str) -> None:
+    """120 s at the posted speed reach something to deal with."""
+    batch = cases(name)
+    reach = 120.0 * batch.road.speed_limit.mean(axis=1)
+    agents, lines = batch.agents, batch.lines
+    meets = ((agents.kind != Kind.NONE) & (agents.appear_s < reach[:, None])).any(1)
+    meets |= ((lines.kind != 0) & (lines.s < reach[:, None])).any(1)
+    road = batch.road
+    meets |= (np.ptp(road.kappa, axis=1) > 0) | (np.ptp(road.speed_limit, axis=1) > 0)
+    assert meets.mean() > 0.95
+
+
+def test_the_documentation_names_every_family() -> None:
+    page = (ROOT / "docs" / "scenarios.md").read_text(encoding="utf-8")
+    for name in NAMES:
+        assert f"`{name}`" in page
