@@ -12,12 +12,14 @@ from pathlib import Path
 from absl import flags
 
 from experiments.common import run
-from rcirl_jax.data.store import open_dataset
+from rcirl_jax.data.joined import open_datasets
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.from_run import export_run
 
 _WORKDIR = flags.DEFINE_string("workdir", None, "run folder", required=True)
-_DATA = flags.DEFINE_string("data", None, "dataset (default: the run's own)")
+_DATA = flags.DEFINE_list(
+    "data", None, "dataset (default: the run's own); several are joined"
+)
 _OUTPUT = flags.DEFINE_string("output", None, "file (default: RUN/weights.msgpack)")
 
 
@@ -25,19 +27,19 @@ def main() -> None:
     """Flags -> one file."""
     workdir = Path(_WORKDIR.value)
     output = Path(_OUTPUT.value or workdir / "weights.msgpack")
-    reward = export_run(workdir, open_dataset(_DATA.value or _own(workdir)), output)
+    reward = export_run(workdir, open_datasets(_DATA.value or _own(workdir)), output)
     print(f"{output}: {len(reward.names)} features, sha256 {reward.sha256[:16]}...")
 
 
-def _own(workdir: Path) -> str:
-    """The dataset named in the run's own flags."""
+def _own(workdir: Path) -> list[str]:
+    """The datasets named in the run's own flags."""
     path = workdir / "run.json"
     if not path.is_file():
         raise InputError(f"{path}: missing: expected a run made by experiments.train")
     found = json.loads(path.read_text()).get("flags", {}).get("data")
     if not found:
         raise InputError("--data: not given and not in run.json: expected a dataset")
-    return found
+    return found if isinstance(found, list) else [found]
 
 
 if __name__ == "__main__":

@@ -10,14 +10,16 @@ from pathlib import Path
 from absl import flags
 
 from experiments.common import hidden_sizes, provenance, run
-from rcirl_jax.data.store import open_dataset
+from rcirl_jax.data.joined import open_datasets
 from rcirl_jax.reward import LOSSES, RewardConfig
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.parallel import PARALLEL
 from rcirl_jax.train.state import POSITIVES, TrainConfig
 
-_DATA = flags.DEFINE_string("data", None, "dataset made by import_logs", required=True)
+_DATA = flags.DEFINE_list(
+    "data", None, "dataset made by import_logs; several are joined", required=True
+)
 _WORKDIR = flags.DEFINE_string("workdir", None, "run folder", required=True)
 _FEATURES = flags.DEFINE_string("features", "paper21", "preset in data_specs/features")
 _MODE = flags.DEFINE_enum(
@@ -70,7 +72,7 @@ def main() -> None:
         sampler=SamplerConfig(mode=_MODE.value),
     )
     result = train(
-        open_dataset(_DATA.value),
+        open_datasets(_DATA.value),
         Path(_WORKDIR.value),
         config,
         parallel=_PARALLEL.value,

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rcirl_jax.data.store import Dataset
+from rcirl_jax.data.joined import Demonstrations
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.export.weights import FeatureSpec, RewardWeights, save
@@ -75,7 +75,7 @@ def reward_weights(
     )
 
 
-def export_run(workdir: Path, dataset: Dataset, output: Path) -> Reward:
+def export_run(workdir: Path, dataset: Demonstrations, output: Path) -> Reward:
     """Write weights.msgpack from a run's newest checkpoint.
 
     Verification samples are humans and candidates of the training split, with
@@ -110,7 +110,9 @@ def export_run(workdir: Path, dataset: Dataset, output: Path) -> Reward:
     return save(output, weights, x, valid, np.asarray(values))
 
 
-def _samples(dataset: Dataset, config: TrainConfig) -> tuple[np.ndarray, np.ndarray]:
+def _samples(
+    dataset: Demonstrations, config: TrainConfig
+) -> tuple[np.ndarray, np.ndarray]:
     """[m, T, F] features and [m, T] masks: half humans, half candidates."""
     count = min(NUM_SAMPLES // 2, dataset.indices("train").size)
     index = dataset.indices("train")[:count]

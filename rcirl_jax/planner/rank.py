@@ -105,7 +105,8 @@ def rank_policy(score: Score, config: RankConfig) -> Policy:
     def policy(params: Params, scene: Scene, key: jax.Array) -> Plan:
         candidates = sample(key, scene, config.sampler)
         verdict = check(scene, candidates, config.safety)
-        index, fallback = choose(verdict, score(params, scene, candidates))
+        scores = score(params, scene, candidates)
+        index, fallback = choose(verdict, candidates, scores)
         chosen = jax.tree.map(lambda x: x[index], candidates.trajectory)
         hard = fallback | (candidates.family[index] == emergency)
         return Plan(

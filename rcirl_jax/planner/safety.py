@@ -78,18 +78,22 @@ def check(
     return judge(trajectory, candidates.feasible, body)
 
 
-def choose(verdict: Verdict, scores: jax.Array) -> tuple[jax.Array, jax.Array]:
+def choose(
+    verdict: Verdict, candidates: Candidates, scores: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """Index of the best admissible candidate, and whether there was none.
 
     Without an admissible one, the latest contact wins; among equals the
-    larger margin to the leader, then the lower speed at the contact.
+    larger margin to the leader, then the lower speed at the contact, then the
+    shorter way: with nothing to gain, braking.
     """
     best = jnp.argmax(jnp.where(verdict.admissible, scores, -jnp.inf))
     nothing = ~jnp.any(verdict.admissible)
     late = jnp.minimum(verdict.contact_s, TIMES_S[-1] + 1.0)
-    fallback = jnp.argmax(
+    urgency = (
         1e3 * late + jnp.clip(verdict.rss_margin, -400.0, 0.0) - 0.1 * verdict.contact_v
     )
+    fallback = jnp.argmax(jnp.where(candidates.feasible, urgency, -jnp.inf))
     return jnp.where(nothing, fallback, best), nothing
 
 

@@ -44,7 +44,7 @@ LEAVE_BEHIND_M = 150.0  # m behind the ego where an agent leaves the drive
 LEAVE_AHEAD_M = 400.0  # m ahead, for agents that appeared relative to the ego
 LEAVE_ASIDE_M = 150.0  # m, lateral
 APPEAR_MARGIN_M = 2.0  # m around a body where nobody appears
-FREE = -1e3  # m/s^2 ratio standing for "no lane there"
+NO_LIMIT = 1e3  # m/s^2, nothing holds the agent back
 
 
 class Bodies(flax.struct.PyTreeNode, kw_only=True):
@@ -162,8 +162,12 @@ def _changing_aside(
 
 def accelerations(
     case: Case, bodies: Bodies, state: AgentState, pairs: Corridor, time: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Decided accelerations [A] m/s^2, and what each does because of the ego [A]."""
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """(own wish, limit set by others, the ego's part in that limit), [A] m/s^2.
+
+    The wish (free road or script) is the driver's own and acts at once; the
+    limit is a reaction and acts after the reaction delay.
+    """
     agents, driver = case.agents, case.agents.driver
     v = state.v[:, None]
     keeps = jnp.abs(jnp.sin(state.heading)) < 3.0 * LANE_TILT
@@ -180,11 +184,10 @@ def accelerations(
     lapse = (state.clock >= driver.lapse_start) & (state.clock < driver.lapse_end)
     attends = driver.reacts & ~lapse
     held = driver.acceleration * (1.0 - share**IDM_EXPONENT - strongest)
-    decided = jnp.where(attends, jnp.minimum(wanted, held), wanted)
+    limit = jnp.where(attends, jnp.maximum(held, -MAX_BRAKING_MPS2), NO_LIMIT)
     for_ego = driver.acceleration * (1.0 - share**IDM_EXPONENT - ratio[:, 0])
     because = jnp.where(attends & (ratio[:, 0] >= strongest), for_ego, 0.0)
-    cap = lambda x: jnp.maximum(x, -MAX_BRAKING_MPS2)  # noqa: E731
-    return cap(decided), cap(because)
+    return wanted, limit, jnp.maximum(because, -MAX_BRAKING_MPS2)
 
 
 def mobil(
@@ -256,7 +259,8 @@ def move(
 ) -> AgentState:
     """Everybody one step on, under the accelerations [A] that act now."""
     agents, h = case.agents, time_step
-    runs = state.present & (state.clock >= 0.0)
+    stands = agents.kind == Kind.STATIC
+    runs = state.present & (state.clock >= 0.0) & ~stands
     v = jnp.maximum(state.v + applied * h, 0.0)
     v = jnp.where(runs, v, state.v)
     a = (v - state.v) / h
@@ -344,7 +348,7 @@ def come_and_go(
         l_target=pick(agents.l, state.l_target),
         clock=pick(zero - 1.0, state.clock),
         present=state.present | new,
-        queue=jnp.where(new[:, None], 0.0, state.queue),
+        queue=jnp.where(new[:, None], NO_LIMIT, state.queue),
     )
     gap = jnp.maximum(state.s - ego.s - 0.5 * case.ego_length, 0.0)
     arrival = gap / jnp.maximum(ego.v, 1.0)

@@ -185,7 +185,7 @@ class AgentState(flax.struct.PyTreeNode, kw_only=True):
     clock: jax.Array  # [A] s since activation; negative before it
     present: jax.Array  # [A] bool: has appeared and not left
     gone: jax.Array  # [A] bool: will not appear (again)
-    queue: jax.Array  # [A, D] m/s^2, commands decided, newest first
+    queue: jax.Array  # [A, D] m/s^2, limits set by others, newest first
 
 
 class Seen(flax.struct.PyTreeNode, kw_only=True):

@@ -56,7 +56,7 @@ def start(case: Case) -> World:
         clock=zero - 1.0,
         present=no,
         gone=no,
-        queue=jnp.zeros((NUM_AGENTS, NUM_DELAY)),
+        queue=jnp.full((NUM_AGENTS, NUM_DELAY), others.NO_LIMIT),
     )
     step = jnp.zeros((), jnp.int32)
     state = others.come_and_go(case, ego, state, step)
@@ -112,17 +112,17 @@ def _advance_agents(case: Case, world: World) -> tuple[AgentState, jax.Array]:
         state.heading,
     )
     pairs = others.corridors(case, bodies, looks)
-    decided, because = others.accelerations(case, bodies, state, pairs, time)
+    wish, limit, because = others.accelerations(case, bodies, state, pairs, time)
     target = others.steer_targets(case.agents, state)
     target = others.mobil(
         case, bodies, state.replace(l_target=target), pairs, world.step
     )
-    queue = jnp.concatenate([decided[:, None], state.queue[:, :-1]], axis=1)
+    queue = jnp.concatenate([limit[:, None], state.queue[:, :-1]], axis=1)
     late = jnp.round(case.agents.driver.delay / STEP_S).astype(jnp.int32)
     late = jnp.clip(late, 0, NUM_DELAY - 1)
-    applied = jnp.take_along_axis(queue, late[:, None], axis=1)[:, 0]
+    reaction = jnp.take_along_axis(queue, late[:, None], axis=1)[:, 0]
     state = state.replace(l_target=target, queue=queue)
-    moved = others.move(case, state, applied)
+    moved = others.move(case, state, jnp.minimum(wish, reaction))
     induced = jnp.max(jnp.where(state.present, -because, 0.0))
     return moved, jnp.maximum(induced, 0.0)
 
@@ -191,7 +191,7 @@ def step(
     if case.replay is None:
         state = others.come_and_go(case, moved_ego, state, world.step + 1)
     reactive = world.reactive
-    if case.replay is not None:
+    if case.replay is not None and not follow_log:
         ttc = jnp.min(jnp.where(found.ahead, found.ttc, jnp.inf))
         reactive = _turns_reactive(case, case.replay, world, ttc)
     return World(
@@ -207,11 +207,11 @@ def step(
 
 def _human(replay: Replay, ego: EgoState, step: jax.Array) -> EgoState:
     """The recorded human's state at a step; a and curvature by differences."""
-    last = replay.ego_s.shape[0] - 1
-    index = jnp.minimum(step, last)
+    index = jnp.minimum(step, replay.ego_s.shape[0] - 1)
     s, l, v = replay.ego_s[index], replay.ego_l[index], replay.ego_v[index]
     advance = jnp.maximum(s - ego.s, 1e-3)
-    moves = v > 0.5
+    # the direction of a few centimetres says nothing about the car's
+    moves = v > 2.0
     heading = jnp.where(moves, jnp.arctan2(l - ego.l, advance), ego.heading)
     return EgoState(
         s=s, l=l, heading=heading, v=v, a=(v - ego.v) / STEP_S, curvature=ego.curvature

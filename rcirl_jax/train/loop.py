@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rcirl_jax.data.joined import Demonstrations
 from rcirl_jax.data.pipeline import BatchIterator
-from rcirl_jax.data.store import Dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.features import FeatureMap, feature_map
 from rcirl_jax.reward import Normaliser, fit_normaliser
@@ -76,7 +76,7 @@ class TrainResult:
 
 
 def train(
-    dataset: Dataset,
+    dataset: Demonstrations,
     workdir: Path,
     config: TrainConfig,
     *,
@@ -232,7 +232,7 @@ def guard(metrics: StepMetrics, features: FeatureMap, step: int) -> None:
 
 
 def describe_run(
-    workdir: Path, config: TrainConfig, dataset: Dataset, provenance: dict
+    workdir: Path, config: TrainConfig, dataset: Demonstrations, provenance: dict
 ) -> None:
     """Write run.json, or check that an existing one says the same.
 

@@ -1,0 +1,90 @@
+"""Several datasets as one: a reward that has to drive everywhere learns from all."""
+
+import hashlib
+from collections.abc import Sequence
+from typing import Protocol
+
+import jax
+import numpy as np
+
+from rcirl_jax.data.store import Dataset, open_dataset
+from rcirl_jax.errors import InputError
+from rcirl_jax.types import Demonstration
+
+
+class Demonstrations(Protocol):
+    """What training and export need of a dataset."""
+
+    @property
+    def hash(self) -> str:
+        """Identity of the whole contents."""
+        ...
+
+    def indices(self, split: str | None) -> np.ndarray:
+        """Row numbers of a split in ascending order."""
+        ...
+
+    def load(self, split: str | None) -> Demonstration:
+        """All rows of a split in memory."""
+        ...
+
+    def read(self, indices: np.ndarray) -> Demonstration:
+        """Rows by number, in the order asked for."""
+        ...
+
+
+class JoinedDatasets:
+    """Datasets one after the other; row numbers run on.
+
+    Vehicle, recording and group numbers keep their meaning inside each part
+    only, which is enough here: splits are those of the parts.
+    """
+
+    def __init__(self, parts: Sequence[Dataset]) -> None:
+        self._parts = tuple(parts)
+        self._starts = np.cumsum([0, *(part.count for part in parts)])
+
+    @property
+    def hash(self) -> str:
+        """sha256 of the parts' hashes in order."""
+        text = "\n".join(part.hash for part in self._parts)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    @property
+    def count(self) -> int:
+        """Number of rows."""
+        return int(self._starts[-1])
+
+    def indices(self, split: str | None) -> np.ndarray:
+        """[m] int64 row numbers of a split in ascending order."""
+        pairs = zip(self._parts, self._starts[:-1], strict=True)
+        return np.concatenate([part.indices(split) + start for part, start in pairs])
+
+    def load(self, split: str | None) -> Demonstration:
+        """All rows of a split (None: of all splits) in memory."""
+        return self.read(self.indices(split))
+
+    def read(self, indices: np.ndarray) -> Demonstration:
+        """Rows by number, numpy leaves [m, ...], in the order asked for."""
+        rows = np.asarray(indices, np.int64)
+        owner = np.searchsorted(self._starts, rows, side="right") - 1
+        found, places = [], []
+        for number in np.unique(owner).tolist():
+            at = np.flatnonzero(owner == number)
+            found.append(self._parts[number].read(rows[at] - self._starts[number]))
+            places.append(at)
+        back = np.argsort(np.concatenate(places))
+        join = lambda *leaves: np.concatenate(leaves)[back]  # noqa: E731
+        return jax.tree.map(join, *found)
+
+
+def open_datasets(urls: Sequence[str]) -> Dataset | JoinedDatasets:
+    """One dataset as it is, or several joined.
+
+    Raises:
+      InputError: none named, one named twice, or one that does not open.
+    """
+    if not urls or len(set(urls)) != len(urls):
+        raise InputError(f"--data: {list(urls)}: expected distinct datasets")
+    parts = [open_dataset(url) for url in urls]
+    return parts[0] if len(parts) == 1 else JoinedDatasets(parts)

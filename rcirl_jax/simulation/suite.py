@@ -1,0 +1,170 @@
+"""Suites: which cases are driven, and driving them row by row in bounded memory.
+
+    full        every family of data_specs/scenarios, as many cases as it declares
+    smoke       one case of every family, 20 s
+    FAMILY[,F]  all cases of the named families
+
+Cases are built, driven and reduced to metrics chunk by chunk, so memory does
+not depend on how many there are; every chunk has the same shapes, so a row
+compiles once.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import jax
+import numpy as np
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.simulation.cases import STEP_S, Case
+from rcirl_jax.simulation.catalogue import (
+    build_cases,
+    case_id,
+    family_names,
+    load_family,
+    parse_case_id,
+)
+from rcirl_jax.simulation.metrics import CaseMetrics, MetricsConfig, case_metrics
+from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases
+from rcirl_jax.simulation.rows import Row
+
+SMOKE_S = 20.0  # s of a smoke case
+FULL_S = 120.0  # s of a case of the paper's suite
+
+Progress = Callable[[int], None]  # called with the number of cases just driven
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CaseRef:
+    """One case by name: the same on every machine."""
+
+    family: str
+    index: int
+    seed: int = 0
+
+    @property
+    def id(self) -> str:
+        """For example "cut_in/017@0"."""
+        return case_id(self.family, self.index, self.seed)
+
+
+def case_ref(text: str) -> CaseRef:
+    """The case of an id.
+
+    Raises:
+      InputError: not an id, or no such family or index.
+    """
+    family, index, seed = parse_case_id(text)
+    if family not in family_names():
+        raise InputError(
+            f"--case: {text}: family: expected one of {', '.join(family_names())}"
+        )
+    return CaseRef(family=family, index=index, seed=seed)
+
+
+def suite_refs(
+    suite: str, per_family: int | None = None, seed: int = 0
+) -> tuple[CaseRef, ...]:
+    """The cases of a suite, family by family.
+
+    Args:
+      suite: "full", "smoke" or family names separated by commas.
+      per_family: cases of each family; None: as its file declares (smoke: 1).
+      seed: of the catalogue.
+
+    Raises:
+      InputError: an unknown suite or family, or a count below 1.
+    """
+    known = family_names()
+    names = known if suite in ("full", "smoke") else tuple(suite.split(","))
+    for name in names:
+        if name not in known:
+            raise InputError(
+                f"--suite: {name}: expected full, smoke or some of {', '.join(known)}"
+            )
+    if per_family is not None and per_family < 1:
+        raise InputError(f"--cases: {per_family}: expected at least 1")
+    refs = []
+    for name in names:
+        declared = 1 if suite == "smoke" else load_family(name).cases
+        count = per_family or declared
+        refs += [CaseRef(family=name, index=i, seed=seed) for i in range(count)]
+    return tuple(refs)
+
+
+def build(refs: Sequence[CaseRef], duration_s: float) -> Case:
+    """The cases of refs, stacked [B, ...] in their order; numpy leaves."""
+    places: dict[tuple[str, int], list[int]] = {}
+    for place, ref in enumerate(refs):
+        places.setdefault((ref.family, ref.seed), []).append(place)
+    parts, order = [], []
+    for (name, seed), members in places.items():
+        indices = [refs[place].index for place in members]
+        family = load_family(name)
+        parts.append(build_cases(family, indices, seed, duration_s=duration_s))
+        order += members
+    joined = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    back = np.argsort(order)
+    return jax.tree.map(lambda leaf: leaf[back], joined)
+
+
+def rollout_config(
+    row: Row, duration_s: float, plan_every: int, snapshots: bool = False
+) -> RolloutConfig:
+    """How a row drives cases of a duration."""
+    every = row.plan_every or plan_every
+    steps = round(duration_s / STEP_S)
+    return RolloutConfig(
+        plan_every=every,
+        steps=-(-steps // every) * every,
+        follow_log=row.follow_log,
+        snapshots=snapshots,
+    )
+
+
+class _Reduce:
+    """Record -> CaseMetrics; one object per thresholds, so programs are reused."""
+
+    made: dict[MetricsConfig, Callable] = {}  # noqa: RUF012
+
+    @classmethod
+    def of(cls, config: MetricsConfig) -> Callable:
+        if config not in cls.made:
+            cls.made[config] = lambda record: case_metrics(record, config)
+        return cls.made[config]
+
+
+def drive_row(
+    row: Row,
+    cases_of: Callable[[int, int], Case],
+    total: int,
+    config: RolloutConfig,
+    *,
+    chunk: int,
+    metrics: MetricsConfig | None = None,
+    progress: Progress | None = None,
+) -> CaseMetrics:
+    """Drive `total` cases with one row; metrics with numpy leaves [total].
+
+    Args:
+      row: who drives.
+      cases_of: (first, last) -> cases of that range, stacked.
+      total: number of cases.
+      config: of the rollouts.
+      chunk: cases that are driven together.
+      metrics: thresholds.
+      progress: told how many cases have been driven since the last call.
+    """
+    reduce = _Reduce.of(metrics or MetricsConfig())
+    size = min(chunk, total)
+    parts = []
+    for first in range(0, total, size):
+        count = min(size, total - first)
+        cases = cases_of(first, first + count)
+        fill = np.minimum(np.arange(size), count - 1)
+        full = jax.tree.map(lambda leaf, f=fill: np.asarray(leaf)[f], cases)
+        found = drive_cases(row.policy, row.params, full, config, reduce)
+        parts.append(jax.tree.map(lambda leaf, n=count: np.asarray(leaf)[:n], found))
+        if progress is not None:
+            progress(count)
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
