@@ -18,12 +18,13 @@ from rcirl_jax.features import FeatureMap
 from rcirl_jax.planner.baselines import Idm, idm_acceleration
 from rcirl_jax.planner.plan import Plan
 from rcirl_jax.planner.safety import SafetyConfig, check, choose
+from rcirl_jax.planner.yielding import held
 from rcirl_jax.reward.hand import lattice_cost
 from rcirl_jax.reward.network import ACTIVATIONS, rows_value
 from rcirl_jax.sampling import SamplerConfig, sample
 from rcirl_jax.sampling.speed import family_index
 from rcirl_jax.types import Candidates, Kind, Normaliser, RewardParams, Scene
-from rcirl_jax.units import DT_S, TIMES_S
+from rcirl_jax.units import DT_S
 
 Params = Any  # a score's weights: any pytree
 Score = Callable[[Params, Scene, Candidates], jax.Array]  # -> [K], higher is better
@@ -143,7 +144,7 @@ def idm_policy(idm: Idm) -> Policy:
             scene.path.speed_limit[0],
             idm,
         )
-        return _held(scene, a)
+        return held(scene, a)
 
     return policy
 
@@ -151,17 +152,4 @@ def idm_policy(idm: Idm) -> Policy:
 def constant_speed_policy(params: Params, scene: Scene, key: jax.Array) -> Plan:
     """Nobody drives: the acceleration stays 0."""
     del params, key
-    return _held(scene, jnp.zeros(()))
-
-
-def _held(scene: Scene, a: jax.Array) -> Plan:
-    """A plan that holds an acceleration until standing."""
-    times = jnp.asarray(TIMES_S)
-    braking = jnp.minimum(a, -1e-6)
-    until = jnp.where(a < 0.0, jnp.minimum(times, scene.ego.v / -braking), times)
-    return Plan(
-        acceleration=a,
-        s=scene.ego.s + scene.ego.v * until + 0.5 * a * until**2,
-        fallback=jnp.zeros((), bool),
-        admissible=jnp.zeros((), jnp.int32),
-    )
+    return held(scene, jnp.zeros(()))

@@ -41,6 +41,8 @@ class RolloutConfig:
     follow_log: bool = False
     # keep the agents and plans for pictures
     snapshots: bool = False
+    # keep the planning frames, one per plan
+    scenes: bool = False
     vehicle: Vehicle = dataclasses.field(default_factory=Vehicle)
 
     def __post_init__(self) -> None:
@@ -61,8 +63,13 @@ def drive_case(
     params: Params,
     case: Case,
     config: RolloutConfig,
-) -> tuple[Record, Snapshot | None]:
-    """One case from start to end; leaves of the records are [S]."""
+) -> tuple[Record, Snapshot | None, Scene | None]:
+    """One case from start to end.
+
+    Returns:
+      The record [S], and where the configuration asks for them the snapshots
+      [S] and the planning frames [S / plan_every].
+    """
     limit = planning_limit(case.road)
     key = jax.random.fold_in(jax.random.key(case.seed), SAMPLER_STREAM)
 
@@ -83,11 +90,13 @@ def drive_case(
             shot = _snapshot(case, world, after, plan) if config.snapshots else None
             return after, (record, shot)
 
-        return jax.lax.scan(tick, world, None, length=config.plan_every)
+        after, logs = jax.lax.scan(tick, world, None, length=config.plan_every)
+        return after, (logs, scene if config.scenes else None)
 
     plans = config.steps // config.plan_every
-    _, logs = jax.lax.scan(plan_and_drive, start(case), None, length=plans)
-    return jax.tree.map(lambda x: x.reshape(config.steps, *x.shape[2:]), logs)
+    _, (logs, scenes) = jax.lax.scan(plan_and_drive, start(case), None, length=plans)
+    flat = lambda x: x.reshape(config.steps, *x.shape[2:])  # noqa: E731
+    return *jax.tree.map(flat, logs), scenes
 
 
 def _snapshot(case: Case, planned: World, after: World, plan: Plan) -> Snapshot:
@@ -106,8 +115,8 @@ def _compiled(
     config: RolloutConfig,
 ) -> Callable:
     def run(params: Params, case: Case) -> Logs:
-        record, shot = drive_case(policy, params, case, config)
-        return (record, shot) if reduce is None else reduce(record)
+        logs = drive_case(policy, params, case, config)
+        return logs if reduce is None else reduce(logs[0])
 
     return jax.jit(jax.vmap(run, in_axes=(None, 0)))
 
@@ -119,7 +128,10 @@ def drive_cases(
     config: RolloutConfig,
     reduce: Callable[[Record], Logs] | None = None,
 ) -> Logs:
-    """All cases [B] at once; with `reduce` the records never leave the device."""
+    """All cases [B] at once: (records, snapshots, scenes), or what `reduce` makes.
+
+    With `reduce` the records never leave the device.
+    """
     return _compiled(policy, reduce, config)(params, cases)
 
 

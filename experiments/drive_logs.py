@@ -1,0 +1,46 @@
+"""Make a dataset by letting a driver model drive the scenario catalogue.
+
+    python -m experiments.drive_logs --output=DATASET [--cases=30 --catalogue_seed=1000]
+
+For families of road that nobody has recorded. The cases are of another seed
+than those of experiments.simulate, so a reward is never tested where it learned.
+"""
+
+from absl import flags
+
+from experiments.common import run
+from rcirl_jax.data.quality import format_quality
+from rcirl_jax.errors import InputError
+from rcirl_jax.simulation.demonstrations import DriveConfig, drive_catalogue
+from rcirl_jax.simulation.suite import suite_refs
+
+_OUTPUT = flags.DEFINE_string("output", None, "dataset to write", required=True)
+_SUITE = flags.DEFINE_string("suite", "full", "full, or family names with commas")
+_CASES = flags.DEFINE_integer("cases", 30, "cases of each family")
+_SEED = flags.DEFINE_integer(
+    "catalogue_seed", 1000, "seed of the cases; 0 is the suite's and refused"
+)
+_STRIDE = flags.DEFINE_float("stride", 3.0, "s between scenes of a drive")
+_DURATION = flags.DEFINE_float("duration", 120.0, "s of a drive")
+_OVERWRITE = flags.DEFINE_bool("overwrite", False, "replace a finished dataset")
+
+
+def main() -> None:
+    """Flags -> one dataset."""
+    if _SEED.value == 0:
+        raise InputError("--catalogue_seed: 0: expected another than the suite's")
+    if not 0.5 <= _STRIDE.value <= 60.0:
+        raise InputError(f"--stride: {_STRIDE.value}: expected 0.5 to 60 s")
+    if not 15.0 <= _DURATION.value <= 120.0:
+        raise InputError(f"--duration: {_DURATION.value}: expected 15 to 120 s")
+    config = DriveConfig(stride_s=_STRIDE.value, duration_s=_DURATION.value)
+    refs = suite_refs(_SUITE.value, _CASES.value, _SEED.value)
+    manifest = drive_catalogue(
+        refs, _OUTPUT.value, config, overwrite=_OVERWRITE.value
+    )
+    print(format_quality(manifest.quality))
+    print(f"dataset: {_OUTPUT.value}")
+
+
+if __name__ == "__main__":
+    run(main)
