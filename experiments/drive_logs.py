@@ -35,9 +35,7 @@ def main() -> None:
         raise InputError(f"--duration: {_DURATION.value}: expected 15 to 120 s")
     config = DriveConfig(stride_s=_STRIDE.value, duration_s=_DURATION.value)
     refs = suite_refs(_SUITE.value, _CASES.value, _SEED.value)
-    manifest = drive_catalogue(
-        refs, _OUTPUT.value, config, overwrite=_OVERWRITE.value
-    )
+    manifest = drive_catalogue(refs, _OUTPUT.value, config, overwrite=_OVERWRITE.value)
     print(format_quality(manifest.quality))
     print(f"dataset: {_OUTPUT.value}")
 

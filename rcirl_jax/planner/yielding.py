@@ -113,6 +113,21 @@ def acceleration(scene: Scene, driver: Yielding) -> jax.Array:
     return jnp.minimum(jnp.min(behind), jnp.min(blocked))
 
 
+def bodies_in_path(scene: Scene, driver: Yielding) -> tuple[jax.Array, jax.Array]:
+    """Gap [N] m (inf if none) and speed [N] m/s along the road of bodies ahead.
+
+    Bodies in the ego's path now or within the driver's `entering` time, and
+    lines that demand a stop.
+    """
+    o = scene.obstacles
+    leads = _leaders(scene, _in_path(scene, driver.margin), driver)
+    gap = o.s_lower[:, 0] - scene.ego.s - 0.5 * scene.ego.length
+    sideways = jnp.abs(o.l_lower[:, 1] - o.l_lower[:, 0]) / DT_S
+    in_way_now = sideways < driver.crossing_speed
+    counts = leads & in_way_now
+    return jnp.where(counts, gap, jnp.inf), jnp.where(counts, o.speed[:, 0], 0.0)
+
+
 def _drives_along(o: Obstacles) -> jax.Array:
     """[N] bool: moves mainly along the road, with the ego."""
     sideways = jnp.abs(o.l_lower[:, 1] - o.l_lower[:, 0]) / DT_S

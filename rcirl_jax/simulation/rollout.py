@@ -7,6 +7,7 @@ are arguments, so the compiled program serves every weights file of one shape.
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -39,6 +40,10 @@ class RolloutConfig:
     steps: int = 1200
     # the ego is the recorded human (cases with a replay only)
     follow_log: bool = False
+    # steps by which the ego's commands are late: a driver's reaction time
+    command_delay: int = 0
+    # m/s^3, how fast the ego's braking may build up; None: as the actuator does
+    braking_jerk: float | None = None
     # keep the agents and plans for pictures
     snapshots: bool = False
     # keep the planning frames, one per plan
@@ -73,30 +78,44 @@ def drive_case(
     limit = planning_limit(case.road)
     key = jax.random.fold_in(jax.random.key(case.seed), SAMPLER_STREAM)
 
-    def plan_and_drive(world: World, _: None) -> tuple[World, tuple]:
+    def plan_and_drive(carry: tuple, _: None) -> tuple[tuple, tuple]:
+        world, queue = carry
         scene = observe(case, world, limit)
         with jax.named_scope("policy"):
             plan = policy(params, scene, jax.random.fold_in(key, world.step))
 
-        def tick(now: World, _: None) -> tuple[World, tuple]:
+        def tick(carry: tuple, _: None) -> tuple[tuple, tuple]:
+            now, waiting = carry
+            waiting = jnp.concatenate([plan.acceleration[None], waiting])
+            command, waiting = waiting[-1], waiting[:-1]
             after, record = step(
                 case,
                 now,
-                plan.acceleration,
+                _build_up(command, now.ego.a, config),
                 plan.fallback,
                 config.vehicle,
                 config.follow_log,
             )
             shot = _snapshot(case, world, after, plan) if config.snapshots else None
-            return after, (record, shot)
+            return (after, waiting), (record, shot)
 
-        after, logs = jax.lax.scan(tick, world, None, length=config.plan_every)
-        return after, (logs, scene if config.scenes else None)
+        carry, logs = jax.lax.scan(tick, (world, queue), None, length=config.plan_every)
+        return carry, (logs, scene if config.scenes else None)
 
     plans = config.steps // config.plan_every
-    _, (logs, scenes) = jax.lax.scan(plan_and_drive, start(case), None, length=plans)
+    begin = (start(case), jnp.zeros((config.command_delay,)))
+    _, (logs, scenes) = jax.lax.scan(plan_and_drive, begin, None, length=plans)
     flat = lambda x: x.reshape(config.steps, *x.shape[2:])  # noqa: E731
     return *jax.tree.map(flat, logs), scenes
+
+
+def _build_up(command: jax.Array, a: jax.Array, config: RolloutConfig) -> jax.Array:
+    """The command, no farther below the present acceleration than the jerk allows."""
+    if config.braking_jerk is None:
+        return command
+    lag = config.vehicle.acceleration_lag
+    reach = STEP_S / (1.0 - math.exp(-STEP_S / lag))
+    return jnp.maximum(command, a - config.braking_jerk * reach)
 
 
 def _snapshot(case: Case, planned: World, after: World, plan: Plan) -> Snapshot:

@@ -21,10 +21,11 @@ from rcirl_jax.planner.rank import (
     learned_score,
     rank_policy,
 )
+from rcirl_jax.planner.yielding import Yielding, yielding_policy
 from rcirl_jax.reward.network import RewardConfig, init_reward, pinned
 from rcirl_jax.types import Normaliser, RewardParams
 
-BASELINES = ("hand-set", "IDM", "constant speed", "random weights")
+BASELINES = ("hand-set", "IDM", "IDM yielding", "constant speed", "random weights")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -38,6 +39,9 @@ class Row:
     follow_log: bool = False
     # steps between two plans, where a row needs its own (DP); None: the run's
     plan_every: int | None = None
+    # the driver's reaction time, in steps, and its braking build-up, m/s^3
+    command_delay: int = 0
+    braking_jerk: float | None = None
     # seed of the training run, where rows of one name differ by it
     seed: int = 0
 
@@ -71,6 +75,8 @@ def baseline_row(
         return Row(name=name, policy=rank_policy(hand_score, config))
     if name == "IDM":
         return Row(name=name, policy=idm_policy(Idm()))
+    if name == "IDM yielding":
+        return Row(name=name, policy=yielding_policy(Yielding()))
     if name == "constant speed":
         return Row(name=name, policy=constant_speed_policy)
     if name == "random weights":

@@ -118,6 +118,8 @@ def rollout_config(
         plan_every=every,
         steps=-(-steps // every) * every,
         follow_log=row.follow_log,
+        command_delay=row.command_delay,
+        braking_jerk=row.braking_jerk,
         snapshots=snapshots,
     )
 
