@@ -31,7 +31,7 @@ from rcirl_jax.simulation.rows import Row
 SMOKE_S = 20.0  # s of a smoke case
 FULL_S = 120.0  # s of a case of the paper's suite
 
-Progress = Callable[[int], None]  # called with the number of cases just driven
+Progress = Callable[[int], object]  # called with the number of cases just driven
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

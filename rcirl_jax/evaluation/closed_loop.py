@@ -1,0 +1,136 @@
+"""A suite from weights to report: classify the cases, drive every row, summarise."""
+
+import dataclasses
+import resource
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import tqdm
+
+from rcirl_jax.evaluation.suite_output import (
+    format_families,
+    format_suite,
+    result_hash,
+    write_csv,
+    write_json,
+)
+from rcirl_jax.evaluation.suite_summary import SuiteReport, summarise
+from rcirl_jax.simulation.careful import judges, preventable, trivial
+from rcirl_jax.simulation.catalogue import load_family, parameters_of
+from rcirl_jax.simulation.metrics import CaseMetrics
+from rcirl_jax.simulation.rows import Row
+from rcirl_jax.simulation.suite import CaseRef, build, drive_row, rollout_config
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SuiteConfig:
+    """How a suite is driven."""
+
+    # s of every case
+    duration_s: float = 120.0
+    # steps of 0.1 s between two plans
+    plan_every: int = 1
+    # cases driven together; bounds memory
+    chunk: int = 180
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SuiteResult:
+    """Everything a run of a suite leaves."""
+
+    report: SuiteReport
+    runs: Mapping[str, CaseMetrics]
+    refs: tuple[CaseRef, ...]
+    preventable: np.ndarray
+    facts: Mapping[str, object]  # hashes, timings, memory
+
+
+def _drive(row: Row, refs: Sequence[CaseRef], config: SuiteConfig) -> CaseMetrics:
+    rollout = rollout_config(row, config.duration_s, config.plan_every)
+    with tqdm.tqdm(total=len(refs), desc=row.name, unit="case", mininterval=0.5) as bar:
+        return drive_row(
+            row,
+            lambda first, last: build(refs[first:last], config.duration_s),
+            len(refs),
+            rollout,
+            chunk=config.chunk,
+            progress=bar.update,
+        )
+
+
+def run_suite(
+    rows: Sequence[Row], refs: Sequence[CaseRef], config: SuiteConfig
+) -> SuiteResult:
+    """Drive every row over the cases and judge them.
+
+    The careful drivers and IDM drive first: they say which cases are
+    preventable and how far one gets.
+    """
+    classified = {row.name: _drive(row, refs, config) for row in judges()}
+    avoidable = preventable([classified["CC"], classified["FSM"]])
+    calm = trivial([classified["IDM"], classified["constant speed"]])
+    runs: dict[str, CaseMetrics] = {}
+    timings, hashes = {}, {}
+    for row in rows:
+        begin = time.perf_counter()
+        known = classified.get(row.name)
+        runs[row.name] = _drive(row, refs, config) if known is None else known
+        seconds = time.perf_counter() - begin
+        hashes[row.name] = result_hash(runs[row.name])
+        if known is None:
+            every = row.plan_every or config.plan_every
+            plans = len(refs) * round(config.duration_s / 0.1) / every
+            timings[row.name] = {
+                "seconds": round(seconds, 2),
+                "plans_per_s": round(plans / seconds, 1),
+                "plan_every_steps": every,
+            }
+    report = summarise(
+        runs, [ref.family for ref in refs], avoidable, calm, classified["IDM"]
+    )
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    return SuiteResult(
+        report=report,
+        runs=runs,
+        refs=tuple(refs),
+        preventable=avoidable,
+        facts={
+            "duration_s": config.duration_s,
+            "chunk": config.chunk,
+            "timings": timings,
+            "peak_memory_gib": round(peak, 2),
+            "result_sha256": hashes,
+        },
+    )
+
+
+def write_suite(
+    result: SuiteResult, folder: Path, provenance: Mapping[str, object]
+) -> str:
+    """suite.json, cases.csv, table.txt in a folder; returns the table."""
+    folder.mkdir(parents=True, exist_ok=True)
+    first = next(iter(result.runs))
+    text = format_suite(result.report) + "\n" + format_families(result.report, first)
+    (folder / "table.txt").write_text(text)
+    write_json(
+        folder / "suite.json", result.report, {**result.facts, "made_by": provenance}
+    )
+    ids = [ref.id for ref in result.refs]
+    drawn = [parameters_of(load_family(r.family), r.index, r.seed) for r in result.refs]
+    write_csv(folder / "cases.csv", result.runs, ids, result.preventable, drawn)
+    return text
+
+
+def worst_cases(result: SuiteResult, row: str, count: int = 10) -> list[str]:
+    """Ids of the cases of a row to look at first: faults, red lights, low progress."""
+    metrics = result.runs[row]
+    key = (
+        1000.0 * (np.asarray(metrics.at_fault) > 0)
+        + 100.0 * (np.asarray(metrics.red_lights) > 0)
+        + 100.0 * (np.asarray(metrics.stop_signs) > 0)
+        + np.asarray(metrics.max_j) / 100.0
+    )
+    order = np.argsort(-key, kind="stable")[:count]
+    return [result.refs[i].id for i in order.tolist()]

@@ -1,0 +1,196 @@
+"""The closed-loop report as terminal text, JSON, CSV and one hash."""
+
+import csv
+import dataclasses
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from rcirl_jax.evaluation.suite_summary import PAPER, Rate, RowSummary, SuiteReport
+from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics
+
+SHORT = {
+    "collision_free": "no fault",
+    "speed_limit": "V<limit",
+    "a_station": "|a|<4",
+    "a_lateral": "|a_lat|<4",
+    "j_station": "|j|<6",
+    "j_lateral": "|j_lat|<6",
+}
+
+
+def _percent(found: Rate) -> str:
+    """98.76 [98.1, 99.2], or 100 [>= 99.91] with the rule of three."""
+    if found.bound is not None:
+        return f"100 (>={100 * found.bound:.2f})"
+    low, high = 100 * found.low, 100 * found.high
+    return f"{100 * found.rate:.2f} [{low:.1f},{high:.1f}]"
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
+    lines = []
+    for row in [header, *rows]:
+        cells = [row[0].ljust(widths[0])]
+        cells += [cell.rjust(w) for cell, w in zip(row[1:], widths[1:], strict=True)]
+        lines.append("  ".join(cells).rstrip())
+    return lines
+
+
+def format_suite(report: SuiteReport) -> str:
+    """The paper's table per case and per sample, safety and progress, differences."""
+    lines = [
+        f"{report.cases:,} cases of {len(report.families)} families; "
+        f"{report.preventable:,} preventable by a careful driver, "
+        f"{report.trivial:,} trivial.",
+        "Cells: % [exact 95 % interval]; (>=): rule of three where nothing failed.",
+        "",
+        "Per case (every sample of a drive inside the bound, no crash of own fault)",
+    ]
+    header = ["", *(SHORT[c] for c in COLUMNS)]
+    paper = ["the paper, RC-IRL", *(f"{PAPER[c]:.2f}" for c in COLUMNS)]
+    for kind in ("per_case", "per_sample"):
+        if kind == "per_sample":
+            lines += ["", "Per sample (10 Hz, samples before a crash)"]
+        rows = [
+            [name, *(_percent(getattr(row, kind)[c]) for c in COLUMNS)]
+            for name, row in report.rows.items()
+        ]
+        lines += _table(header, [*rows, paper])
+    lines += ["", "Jerk filtered as in nuPlan, safety and progress"]
+    lines += _table(
+        ["", "|j| case", "|j| sample", "faults", "prevent.", "VRU", "hits", "red",
+         "stop", "off road", "progress", "nuPlan [95 %]"],
+        [_safety(name, row) for name, row in report.rows.items()],
+    )  # fmt: skip
+    lines += ["", *_differences(report)]
+    return "\n".join(lines) + "\n"
+
+
+def _safety(name: str, row: RowSummary) -> list[str]:
+    return [
+        name,
+        f"{100 * row.filtered_case['j_station'].rate:.1f}",
+        f"{100 * row.filtered_sample['j_station'].rate:.2f}",
+        str(row.at_fault),
+        str(row.at_fault_preventable),
+        str(row.at_fault_vru),
+        str(row.collisions),
+        str(row.red_lights),
+        str(row.stop_signs),
+        str(row.off_road),
+        f"{100 * row.progress_ratio:.1f} %",
+        f"{100 * row.nuplan:.1f} [{100 * row.nuplan_low:.1f},"
+        f"{100 * row.nuplan_high:.1f}]",
+    ]
+
+
+def _differences(report: SuiteReport) -> list[str]:
+    if not report.comparisons:
+        return []
+    first = report.comparisons[0].a
+    lines = [
+        f"{first} against each row on the same cases: drives only it passes - only "
+        "the other passes (* : Holm-adjusted exact McNemar p < 0.05)"
+    ]
+    rows = []
+    for item in report.comparisons:
+        cells = [
+            f"+{wins} -{losses}{'*' if adjusted < 0.05 else ''}"
+            for wins, losses, _, adjusted in item.columns.values()
+        ]
+        way, score = item.progress_m, item.nuplan
+        cells.append(f"{way.mean:+.0f} [{way.low:+.0f},{way.high:+.0f}]")
+        cells.append(f"{100 * score.mean:+.1f} +-{200 * score.se:.1f}")
+        rows.append([item.b, *cells])
+    header = ["", *(SHORT[c] for c in COLUMNS), "progress m", "nuPlan"]
+    return lines + _table(header, rows)
+
+
+def format_families(report: SuiteReport, row: str) -> str:
+    """The per-family table of one row."""
+    header = ["family", "cases", "faults", "prevent.", *(SHORT[c] for c in COLUMNS[1:])]
+    header += ["progress", "nuPlan"]
+    rows = []
+    for name, found in report.rows[row].families.items():
+        cells = [name, *(f"{found[k]:.0f}" for k in ("cases", "at_fault"))]
+        cells.append(f"{found['at_fault_preventable']:.0f}")
+        cells += [f"{100 * found[f'{c}_sample']:.2f}" for c in COLUMNS[1:]]
+        cells.append(f"{100 * found['progress_ratio']:.0f} %")
+        cells.append(f"{100 * found['nuplan']:.1f}")
+        rows.append(cells)
+    title = f"{row}: per family (rates per sample, progress against IDM)"
+    return "\n".join([title, *_table(header, rows)]) + "\n"
+
+
+def _plain(node: object) -> object:
+    """JSON-ready: dataclasses to dicts, numpy to Python, infinities to None."""
+    if dataclasses.is_dataclass(node) and not isinstance(node, type):
+        return {f.name: _plain(getattr(node, f.name)) for f in dataclasses.fields(node)}
+    if isinstance(node, Mapping):
+        return {str(key): _plain(value) for key, value in node.items()}
+    if isinstance(node, list | tuple):
+        return [_plain(value) for value in node]
+    if isinstance(node, np.generic):
+        node = node.item()
+    if isinstance(node, float) and not math.isfinite(node):
+        return None
+    return node
+
+
+def write_json(path: Path, report: SuiteReport, facts: Mapping[str, object]) -> None:
+    """The whole report with `facts` (hashes, timings, provenance) beside it."""
+    body = {**dict(facts), "report": _plain(report)}
+    path.write_text(json.dumps(_plain(body), indent=2, allow_nan=False) + "\n")
+
+
+def write_csv(
+    path: Path,
+    runs: Mapping[str, CaseMetrics],
+    ids: Sequence[str],
+    preventable: np.ndarray,
+    parameters: Sequence[Mapping[str, float]],
+) -> None:
+    """One line per row and case: id, every metric, the case's parameters."""
+    fields = dataclasses.fields(CaseMetrics)
+    names = []
+    for field in fields:
+        value = np.asarray(getattr(next(iter(runs.values())), field.name))
+        names += _column_names(field.name, value)
+    keys = sorted({key for found in parameters for key in found})
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["row", "case", "preventable", *names, *keys])
+        for row, metrics in runs.items():
+            columns = [np.asarray(getattr(metrics, f.name)) for f in fields]
+            for i, case in enumerate(ids):
+                cells = [x for column in columns for x in np.atleast_1d(column[i])]
+                drawn = [parameters[i].get(key, "") for key in keys]
+                flag = int(preventable[i])
+                plain = [x.item() if hasattr(x, "item") else x for x in cells]
+                writer.writerow([row, case, flag, *plain, *drawn])
+
+
+def _column_names(name: str, value: np.ndarray) -> list[str]:
+    if value.ndim == 1:
+        return [name]
+    labels = COLUMNS if value.shape[1] == len(COLUMNS) else COLUMNS[4:]
+    return [f"{name}.{label}" for label in labels]
+
+
+def result_hash(metrics: CaseMetrics) -> str:
+    """sha256 over all metrics of all cases in order.
+
+    Equal for two runs and for two batch sizes, or something is not
+    reproducible.
+    """
+    total = hashlib.sha256()
+    for field in dataclasses.fields(CaseMetrics):
+        values = np.ascontiguousarray(getattr(metrics, field.name))
+        total.update(f"{field.name} {values.dtype} {values.shape}".encode())
+        total.update(values.tobytes())
+    return total.hexdigest()

@@ -1,0 +1,53 @@
+"""Weights files and names -> the rows of a closed-loop table."""
+
+from collections.abc import Sequence
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.export.loading import open_reward, reward_params, row_name
+from rcirl_jax.planner.rank import RankConfig
+from rcirl_jax.simulation.cases import STEP_S
+from rcirl_jax.simulation.rows import BASELINES, Row, baseline_row, learned_row
+
+
+def table_rows(
+    weights: Sequence[str],
+    baselines: Sequence[str],
+    plan_every: int = 1,
+    *,
+    dp: bool = False,
+) -> list[Row]:
+    """Learned rows first, in the order of the files, then the baselines.
+
+    Files of one loss and shape are told apart by their seed.
+
+    Raises:
+      InputError: no file, an unreadable one, path_speed weights, or an unknown
+        baseline.
+    """
+    if not weights:
+        raise InputError("--weights: none: expected at least one file")
+    rewards = [open_reward(path) for path in weights]
+    config = RankConfig(period=plan_every * STEP_S)
+    rows: list[Row] = []
+    for reward, path in zip(rewards, weights, strict=True):
+        mode = str(reward.provenance.get("mode", "speed"))
+        if mode != "speed":
+            raise InputError(f"{path}: mode: {mode}: the closed loop plans speed")
+        name, seed = row_name(reward), int(reward.provenance.get("seed", 0))
+        taken = {row.name for row in rows}
+        if name in taken:
+            name = f"{name} (seed {seed})"
+        if name in taken:
+            raise InputError(f"{path}: {name}: met twice: expected distinct runs")
+        params = reward_params(reward)
+        preset = str(reward.preset)
+        rows.append(learned_row(name, params, preset, reward.activation, config, seed))
+    first = rewards[0]
+    normaliser = reward_params(first)[1]
+    for name in baselines:
+        if name not in BASELINES:
+            raise InputError(
+                f"--baselines: {name}: expected some of {', '.join(BASELINES)}"
+            )
+        rows.append(baseline_row(name, str(first.preset), normaliser, config))
+    return rows
