@@ -23,13 +23,23 @@ from rcirl_jax.reward.hand import lattice_cost
 from rcirl_jax.reward.network import ACTIVATIONS, rows_value
 from rcirl_jax.sampling import SamplerConfig, sample
 from rcirl_jax.sampling.speed import family_index
-from rcirl_jax.types import Candidates, Kind, Normaliser, RewardParams, Scene
+from rcirl_jax.types import (
+    Candidates,
+    Kind,
+    Normaliser,
+    RewardParams,
+    Scene,
+    Trajectory,
+)
 from rcirl_jax.units import DT_S
 
 Params = Any  # a score's weights: any pytree
 Score = Callable[[Params, Scene, Candidates], jax.Array]  # -> [K], higher is better
 Policy = Callable[[Params, Scene, jax.Array], Plan]
 
+EASED_MPS2 = 0.3  # m/s^2, braking left at standstill in an ordinary stop
+EASING_S = 0.5  # s, time constant of the last part of an ordinary stop
+MIN_WAY_M = 0.01  # m, keeps v^2 / 2s finite at rest
 ACTUATOR_LAG_S = 0.2  # s, of the drive train; the command leads the plan by it
 
 
@@ -89,13 +99,22 @@ def lead_time(period: float) -> float:
     return period / (1.0 - math.exp(-period / ACTUATOR_LAG_S))
 
 
-def command(a: jax.Array, braking_now: jax.Array, period: float) -> jax.Array:
-    """Acceleration command m/s^2 of a planned acceleration a [T].
+def command(chosen: Trajectory, braking_now: jax.Array, period: float) -> jax.Array:
+    """Acceleration command m/s^2 that starts a planned trajectory.
 
     The lag is led as in `lead_time`; an emergency asks for its braking at once.
+    A plan that comes to rest within the first interval shows only a part of its
+    braking in second differences: there the braking is the one that stops on
+    the planned way, v^2 / 2s, eased off towards standstill unless it is urgent.
     """
+    a, v, way = chosen.a, chosen.v[0], chosen.s[1] - chosen.s[0]
     share = min(lead_time(period) / DT_S, 1.0)
-    return jnp.where(braking_now, a[1], a[0] + share * (a[1] - a[0]))
+    wanted = jnp.where(braking_now, a[1], a[0] + share * (a[1] - a[0]))
+    rests = way < 0.5 * v * DT_S
+    stopping = -(v**2) / (2.0 * jnp.maximum(way, MIN_WAY_M))
+    eased = jnp.maximum(stopping, -(EASED_MPS2 + v / EASING_S))
+    stopping = jnp.where(braking_now, stopping, eased)
+    return jnp.where(rests, jnp.minimum(wanted, stopping), wanted)
 
 
 @functools.lru_cache(maxsize=64)
@@ -111,7 +130,7 @@ def rank_policy(score: Score, config: RankConfig) -> Policy:
         chosen = jax.tree.map(lambda x: x[index], candidates.trajectory)
         hard = fallback | (candidates.family[index] == emergency)
         return Plan(
-            acceleration=command(chosen.a, hard, config.period),
+            acceleration=command(chosen, hard, config.period),
             s=chosen.s,
             fallback=fallback,
             admissible=jnp.sum(verdict.admissible, dtype=jnp.int32),

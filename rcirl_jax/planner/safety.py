@@ -63,7 +63,7 @@ class Verdict(flax.struct.PyTreeNode, kw_only=True):
     """What the filter found; all [K]."""
 
     admissible: jax.Array  # bool
-    contact_s: jax.Array  # s, first contact with a body or line; inf if none
+    contact_s: jax.Array  # s, first contact with a body; inf if none
     contact_v: jax.Array  # m/s, speed at that time
     rss_margin: jax.Array  # m, smallest distance beyond the RSS distance
 
@@ -83,9 +83,9 @@ def choose(
 ) -> tuple[jax.Array, jax.Array]:
     """Index of the best admissible candidate, and whether there was none.
 
-    Without an admissible one, the latest contact wins; among equals the
-    larger margin to the leader, then the lower speed at the contact, then the
-    shorter way: with nothing to gain, braking.
+    Without an admissible one, the latest contact with a body wins; among equals
+    the larger margin to the leader, then the lower speed at the contact, then
+    the shorter way: with nothing to gain, braking.
     """
     best = jnp.argmax(jnp.where(verdict.admissible, scores, -jnp.inf))
     nothing = ~jnp.any(verdict.admissible)
@@ -105,15 +105,15 @@ def _check_one(
     config: SafetyConfig,
 ) -> Verdict:
     line = _first_crossing(scene, x, config)
-    contact = jnp.minimum(body, line)
     margin, gains = _rss(scene, x, config)
     inside = _inside_limits(scene, x, config)
-    moment = jnp.clip(jnp.round(contact / DT_S), 0, x.v.shape[0] - 1).astype(jnp.int32)
-    speed = jnp.where(jnp.isfinite(contact), x.v[moment], 0.0)
+    moment = jnp.clip(jnp.round(body / DT_S), 0, x.v.shape[0] - 1).astype(jnp.int32)
+    speed = jnp.where(jnp.isfinite(body), x.v[moment], 0.0)
+    clear = jnp.isinf(body) & jnp.isinf(line)
     keeps = (margin >= 0.0) | gains
     return Verdict(
-        admissible=feasible & jnp.isinf(contact) & inside & keeps,
-        contact_s=contact,
+        admissible=feasible & clear & inside & keeps,
+        contact_s=body,
         contact_v=speed,
         rss_margin=margin,
     )
@@ -167,8 +167,10 @@ def _first_crossing(scene: Scene, x: Trajectory, config: SafetyConfig) -> jax.Ar
     front = x.s + 0.5 * scene.ego.length
     before = front[0] <= obstacles.s_lower[:, :1]
     is_line = (obstacles.kind == Kind.STOP)[:, None] & obstacles.valid & before
-    slack = jnp.minimum(config.line_margin, obstacles.s_lower[:, :1] - front[0])
-    passed = is_line & (front > obstacles.s_lower - slack + 1e-3)
+    # nearer than twice the margin, half of the way that is left
+    left = obstacles.s_lower[:, :1] - front[0]
+    slack = jnp.minimum(config.line_margin, 0.5 * left)
+    passed = is_line & (front > obstacles.s_lower - slack)
     return jnp.min(jnp.where(passed, jnp.asarray(TIMES_S), jnp.inf))
 
 
