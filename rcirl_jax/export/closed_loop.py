@@ -4,9 +4,18 @@ from collections.abc import Sequence
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.loading import open_reward, reward_params, row_name
+from rcirl_jax.planner.grid import DpConfig
 from rcirl_jax.planner.rank import RankConfig
 from rcirl_jax.simulation.cases import STEP_S
-from rcirl_jax.simulation.rows import BASELINES, Row, baseline_row, learned_row
+from rcirl_jax.simulation.rows import (
+    BASELINES,
+    Row,
+    baseline_row,
+    dp_row,
+    learned_row,
+)
+
+DP_EVERY = 10  # steps between two plans of the DP row: it costs 1,000 rankings
 
 
 def table_rows(
@@ -43,6 +52,20 @@ def table_rows(
         preset = str(reward.preset)
         rows.append(learned_row(name, params, preset, reward.activation, config, seed))
     first = rewards[0]
+    if dp:
+        slow = max(plan_every, DP_EVERY)
+        rows.insert(
+            1,
+            dp_row(
+                f"{rows[0].name} DP",
+                reward_params(first),
+                str(first.preset),
+                first.activation,
+                RankConfig(period=slow * STEP_S),
+                DpConfig(),
+                slow,
+            ),
+        )
     normaliser = reward_params(first)[1]
     for name in baselines:
         if name not in BASELINES:

@@ -40,9 +40,9 @@ CHUNK = 46  # cases driven together; two of each of 23 families
 
 # Drivers of different temper: headway s, acceleration m/s^2, share of the limit.
 DRIVERS = (
-    Yielding(idm=Idm(headway=1.2, acceleration=1.7, braking=2.0), limit_share=0.99),
-    Yielding(idm=Idm(headway=1.5, acceleration=1.4, braking=1.8), limit_share=0.97),
-    Yielding(idm=Idm(headway=1.8, acceleration=1.2, braking=1.6), limit_share=0.95),
+    Yielding(idm=Idm(headway=1.1, acceleration=2.0, braking=2.0), limit_share=1.0),
+    Yielding(idm=Idm(headway=1.4, acceleration=1.7, braking=1.8), limit_share=0.99),
+    Yielding(idm=Idm(headway=1.7, acceleration=1.4, braking=1.6), limit_share=0.98),
 )
 
 
