@@ -1,0 +1,68 @@
+"""Drive one case of the suite again and draw it: picture, animation, page.
+
+    python -m experiments.replay --weights=FILE --case=cut_in/017@0 --output=DIR
+
+`--row` names who drives: learned (default), dp, or a baseline. Looks at the
+worst moment of the drive; open case.html.
+"""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+from absl import flags
+
+from experiments.common import run
+from rcirl_jax.errors import InputError
+from rcirl_jax.export.closed_loop import table_rows
+from rcirl_jax.report.case_picture import animate_case, draw_case, write_case_page
+from rcirl_jax.simulation.metrics import MetricsConfig, case_metrics
+from rcirl_jax.simulation.rollout import drive_cases
+from rcirl_jax.simulation.rows import BASELINES, Row
+from rcirl_jax.simulation.suite import FULL_S, build, case_ref, rollout_config
+
+_WEIGHTS = flags.DEFINE_string("weights", None, "weights file", required=True)
+_CASE = flags.DEFINE_string("case", None, "id, for example cut_in/017@0", required=True)
+_ROW = flags.DEFINE_enum("row", "learned", ["learned", "dp", *BASELINES], "who drives")
+_DURATION = flags.DEFINE_float("duration", FULL_S, "s of the drive")
+_EVERY = flags.DEFINE_integer("plan_every", 1, "steps of 0.1 s between two plans")
+_OUTPUT = flags.DEFINE_string("output", None, "folder to write", required=True)
+
+
+def _row() -> Row:
+    names = [_ROW.value] if _ROW.value in BASELINES else []
+    wants_dp = _ROW.value == "dp"
+    rows = table_rows([_WEIGHTS.value], names, _EVERY.value, dp=wants_dp)
+    return rows[0] if _ROW.value == "learned" else rows[1]
+
+
+def main() -> None:
+    """Flags -> case.png, case.gif, case.html."""
+    if not 1.0 <= _DURATION.value <= FULL_S:
+        raise InputError(f"--duration: {_DURATION.value}: expected 1 to {FULL_S:g} s")
+    ref, row, folder = case_ref(_CASE.value), _row(), Path(_OUTPUT.value)
+    cases = build([ref], _DURATION.value)
+    config = rollout_config(row, _DURATION.value, _EVERY.value, snapshots=True)
+    logs = drive_cases(row.policy, row.params, cases, config)
+    one = lambda x: np.asarray(x)[0]  # noqa: E731
+    case, record, shot = (jax.tree.map(one, x) for x in (cases, logs[0], logs[1]))
+    found = jax.tree.map(np.asarray, case_metrics(record, MetricsConfig()))
+    title = f"{ref.id} driven by {row.name}"
+    folder.mkdir(parents=True, exist_ok=True)
+    picture = draw_case(case, record, shot, folder / "case.png", title)
+    animation = animate_case(case, record, shot, folder / "case.gif", title)
+    scalars = {k: v for k, v in vars(found).items() if np.ndim(v) == 0}
+    page = write_case_page(
+        folder / "case.html",
+        title,
+        f"{float(found.progress):.0f} m driven, {int(found.at_fault)} collisions of own "
+        f"fault, closest {float(found.min_clearance):.2f} m.",
+        picture=picture,
+        animation=animation,
+        metrics={name: float(value) for name, value in scalars.items()},
+    )
+    print(f"{title}: page to open: {page}")
+
+
+if __name__ == "__main__":
+    run(main)

@@ -1,0 +1,30 @@
+"""Short drives of hand-made cases; one compiled program per policy and length."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rcirl_jax.planner.plan import Plan
+from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases
+
+
+def constant(params, scene, key):
+    """The ego's acceleration is the parameter."""
+    return Plan(
+        acceleration=params + 0.0 * scene.ego.v,
+        s=jnp.zeros(18),
+        fallback=jnp.zeros((), bool),
+        admissible=jnp.zeros((), jnp.int32),
+    )
+
+
+def stack(cases):
+    return jax.tree.map(lambda *x: np.stack(x), *cases)
+
+
+def drive(cases, steps=300, policy=constant, params=0.0, **config):
+    """(record, snapshot) with numpy leaves [B, S, ...]."""
+    config = RolloutConfig(steps=steps, snapshots=True, **config)
+    params = jnp.asarray(params) if isinstance(params, float) else params
+    record, shot, _ = drive_cases(policy, params, stack(cases), config)
+    return jax.tree.map(np.asarray, record), jax.tree.map(np.asarray, shot)

@@ -1,0 +1,215 @@
+"""Agents against closed forms, their own scripts, and symmetries."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from rcirl_jax.simulation.agents import MAX_BRAKING_MPS2
+from rcirl_jax.types import Kind
+from tests.simulation.drives import drive
+from tests.simulation.worlds import make_case
+
+FAR = 400.0  # m, agents appear ahead of a standing ego
+
+
+def follower(headway=1.4, standstill=2.0, desired=15.0, delay=0.0, **more):
+    return {
+        "s": FAR - 40.0,
+        "v": 8.0,
+        "headway": headway,
+        "standstill": standstill,
+        "desired": desired,
+        "delay": delay,
+        **more,
+    }
+
+
+def leader(speed, **more):
+    return {"s": FAR, "v": speed, "phases": [(0.0, speed, 2.0)], **more}
+
+
+def test_idm_settles_at_the_equilibrium_gap():
+    """s_e = (s0 + v T) / sqrt(1 - (v / v0)^4), Treiber et al. 2000."""
+    settings = [(8.0, 1.0, 2.0, 15.0), (12.0, 1.5, 3.0, 20.0), (4.0, 2.0, 1.0, 14.0)]
+    cases = [
+        make_case([leader(v), follower(t, s0, v0)], speed=0.0)
+        for v, t, s0, v0 in settings
+    ]
+    _, shot = drive(cases, steps=1200)
+    for i, (v, t, s0, v0) in enumerate(settings):
+        gap = shot.agents.s[i, -1, 0] - shot.agents.s[i, -1, 1] - 4.6
+        expected = (s0 + v * t) / np.sqrt(1.0 - (v / v0) ** 4)
+        assert gap == pytest.approx(expected, rel=0.01)
+        assert shot.agents.v[i, -1, 1] == pytest.approx(v, abs=0.02)
+
+
+def test_braking_is_capped_and_delayed():
+    wall = {"s": FAR, "v": 0.0, "kind": Kind.STATIC}
+    runs = [make_case([wall, follower(delay=d, v=14.0)], speed=0.0) for d in (0.0, 0.6)]
+    _, shot = drive(runs, steps=300)
+    a = shot.agents.a[:, :, 1]
+    assert a.min() >= -MAX_BRAKING_MPS2 - 1e-4
+    assert a[1].min() < -5.0
+    first = [int(np.argmax(row < -0.5)) for row in a]
+    assert first[1] - first[0] == pytest.approx(6, abs=1)
+
+
+def test_a_lapse_hides_the_leader_for_its_time():
+    slow = leader(3.0)
+    cases = [
+        make_case([slow, follower(v=15.0)], speed=0.0),
+        make_case([slow, follower(v=15.0, lapse_start=0.0, lapse_end=2.0)], speed=0.0),
+    ]
+    _, shot = drive(cases, steps=300)
+    attentive, lapsed = shot.agents.a[0, :, 1], shot.agents.a[1, :, 1]
+    assert attentive[:15].min() < -1.0
+    assert lapsed[:15].min() > -0.6
+    assert lapsed[25:60].min() < -1.0
+
+
+def test_phases_reach_their_speeds_at_their_rates():
+    car = {"s": FAR, "v": 10.0, "phases": [(2.0, 4.0, 3.0), (8.0, 12.0, 1.5)]}
+    car["reacts"] = False  # a reacting one never exceeds its IDM acceleration
+    _, shot = drive([make_case([car], speed=0.0)], steps=300)
+    v, a = shot.agents.v[0, :, 0], shot.agents.a[0, :, 0]
+    assert a[22:35].mean() == pytest.approx(-3.0, abs=0.1)
+    assert v[75] == pytest.approx(4.0, abs=0.1)
+    assert a[85:120].mean() == pytest.approx(1.5, abs=0.1)
+    assert v[-1] == pytest.approx(12.0, abs=0.1)
+
+
+def test_moves_end_at_their_offset_and_keep_their_speed():
+    car = {"s": FAR, "v": 10.0, "l": 3.5, "moves": [(3.0, 0.0, 0.8)]}
+    _, shot = drive([make_case([car], speed=0.0, lanes=(1, 0))], steps=300)
+    l = shot.agents.l[0, :, 0]
+    assert l[25] == pytest.approx(3.5, abs=1e-3)
+    assert l[-1] == pytest.approx(0.0, abs=0.02)
+    assert np.abs(np.diff(l)).max() <= 0.8 * 0.1 + 1e-4
+
+
+def test_obeying_agents_stop_at_red_and_go_at_green():
+    line = {"kind": 1, "s": FAR + 60.0, "green": 20.0, "yellow": 3.0, "red": 17.0}
+    line["offset"] = 23.0  # red from t = 0 to 17 s
+    obeys = {"s": FAR, "v": 10.0, "desired": 10.0}
+    runs = {**obeys, "obeys_lines": False}
+    _, shot = drive([make_case([c], [line], speed=0.0) for c in (obeys, runs)])
+    front = shot.agents.s[:, :, 0] + 2.3
+    assert front[0, 160] < FAR + 60.0
+    assert shot.agents.v[0, 160, 0] < 0.3
+    assert front[0, -1] > FAR + 60.0
+    assert front[1, 100] > FAR + 60.0
+
+
+def test_mobil_changes_when_it_pays_and_only_then():
+    slow = leader(4.0)
+    quick = follower(v=8.0, desired=15.0, changes_lane=True)
+    close = {"s": FAR - 45.0, "l": 3.5, "v": 14.0, "desired": 16.0}
+    cases = [
+        make_case([slow, quick], speed=0.0, lanes=(1, 0)),  # free lane on the left
+        make_case([slow, quick], speed=0.0, lanes=(0, 0)),  # no lane
+        make_case([quick], speed=0.0, lanes=(1, 0)),  # nobody ahead
+    ]
+    unsafe = make_case([slow, quick, close], speed=0.0, lanes=(1, 0))
+    _, shot = drive([*cases, unsafe], steps=300)
+    ends = [shot.agents.l[i, -1, j] for i, j in ((0, 1), (1, 1), (2, 0))]
+    assert ends[0] == pytest.approx(3.5, abs=0.05)
+    assert ends[1] == pytest.approx(0.0, abs=1e-3)
+    assert ends[2] == pytest.approx(0.0, abs=1e-3)
+    # with a fast car close behind in the target lane it waits at first
+    assert abs(shot.agents.l[3, 20, 1]) < 0.3
+
+
+def test_crossing_agents_wait_for_the_ego_only_if_they_react():
+    walker = {
+        "kind": Kind.PEDESTRIAN,
+        "length": 0.5,
+        "width": 0.5,
+        "s": 0.0,
+        "l": -8.0,
+        "heading": np.pi / 2,
+        "v": 1.5,
+        "desired": 1.5,
+        "standstill": 0.5,
+        "headway": 0.5,
+    }
+    blind = {**walker, "reacts": False}
+    _, shot = drive([make_case([w], speed=0.0) for w in (walker, blind)])
+    assert shot.agents.l[0, -1, 0] < -1.0  # stands beside the standing ego
+    assert not shot.agents.present[1, -1, 0]  # walked into it and was taken out
+
+
+def some_traffic(mirror=1.0):
+    rng = np.random.default_rng(4)
+    cars = [
+        {
+            "s": 20.0 + 14.0 * i,
+            "l": mirror * 3.5 * (i % 3 - 1),
+            "v": 8.0 + float(rng.uniform(0, 4)),
+            "desired": 12.0 + float(rng.uniform(0, 6)),
+            "changes_lane": True,
+            "headway": 1.0 + 0.1 * i,
+        }
+        for i in range(7)
+    ]
+    walker = {
+        "kind": Kind.PEDESTRIAN,
+        "length": 0.5,
+        "width": 0.5,
+        "s": 90.0,
+        "l": mirror * 9.0,
+        "heading": -mirror * np.pi / 2,
+        "v": 1.4,
+        "arrival_s": 4.0,
+    }
+    return [*cars, walker]
+
+
+def test_a_mirrored_case_gives_the_mirrored_drive():
+    left = make_case(some_traffic(), speed=10.0, kappa=0.004, lanes=(1, 1))
+    right = make_case(some_traffic(-1.0), speed=10.0, kappa=-0.004, lanes=(1, 1))
+    record, shot = drive([left, right], steps=300)
+    for name in ("s", "v", "a", "clearance"):
+        one, two = getattr(record, name)
+        np.testing.assert_allclose(one, two, atol=2e-3, rtol=1e-3)
+    np.testing.assert_allclose(shot.agents.s[0], shot.agents.s[1], atol=0.01)
+    np.testing.assert_allclose(shot.agents.l[0], -shot.agents.l[1], atol=0.01)
+
+
+def test_permuting_the_agents_permutes_the_drive():
+    """MOBIL's turn to decide goes by slot, so lane changes are left out here."""
+    cars = [{**car, "changes_lane": False} for car in some_traffic()]
+    order = [3, 0, 7, 5, 1, 6, 2, 4]
+    cases = [
+        make_case(cars, speed=10.0, lanes=(1, 1)),
+        make_case([cars[i] for i in order], speed=10.0, lanes=(1, 1)),
+    ]
+    record, shot = drive(cases, steps=300)
+    np.testing.assert_allclose(record.clearance[0], record.clearance[1], atol=1e-3)
+    there = shot.agents.s[1][:, : len(order)]
+    np.testing.assert_allclose(shot.agents.s[0][:, order], there, atol=1e-3)
+
+
+def test_static_things_never_move():
+    parked = {"kind": Kind.STATIC, "s": 60.0, "l": 3.0, "v": 0.0, "desired": 15.0}
+    _, shot = drive([make_case([parked], speed=0.0)], steps=300)
+    assert np.all(shot.agents.s[0, :, 0] == 60.0)
+
+
+def test_agents_wait_for_a_free_place_and_leave_when_left_behind():
+    first = {"s": 20.0, "v": 0.0, "kind": Kind.STATIC, "l": 0.0}
+    late = {"s": 20.0, "v": 5.0, "relative": True, "appear_t": 1.0}
+    _, shot = drive([make_case([first, late], speed=0.0)], steps=300)
+    assert not shot.agents.present[0, :, 1].any()
+    parked = {"s": 10.0, "l": 6.0, "v": 0.0, "kind": Kind.STATIC}
+    _, shot = drive([make_case([parked], speed=20.0)], steps=300)
+    assert shot.agents.present[0, 10, 0]
+    assert not shot.agents.present[0, -1, 0]
+
+
+def test_worlds_helper_rejects_nothing_silently():
+    names = {f.name for f in dataclasses.fields(make_case().agents)}
+    assert {"kind", "driver", "script"} <= names
+    assert all(np.isfinite(x).all() or x.dtype.kind == "f"
+               for x in jax.tree.leaves(make_case()))  # fmt: skip

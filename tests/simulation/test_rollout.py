@@ -1,0 +1,168 @@
+"""The closed loop: reproducible, independent of batches, padded, seeded."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.planner.baselines import Idm
+from rcirl_jax.planner.rank import idm_policy
+from rcirl_jax.simulation.cases import NUM_AGENTS, Replay
+from rcirl_jax.simulation.metrics import MetricsConfig, case_metrics
+from rcirl_jax.simulation.rollout import RolloutConfig
+from rcirl_jax.simulation.rows import Row
+from rcirl_jax.simulation.suite import build, drive_row, suite_refs
+from tests.simulation.drives import constant, drive, stack
+from tests.simulation.worlds import make_case
+
+CONFIG = RolloutConfig(steps=100)
+IDM = Row(name="IDM", policy=idm_policy(Idm()))
+
+
+def metrics_of(chunk):
+    refs = suite_refs("cut_in,pedestrian", 3)
+    cases = lambda a, b: build(refs[a:b], 10.0)  # noqa: E731
+    return drive_row(IDM, cases, len(refs), CONFIG, chunk=chunk)
+
+
+def test_batch_size_and_repetition_change_no_bit():
+    first = metrics_of(6)
+    for chunk in (6, 4, 2):
+        again = metrics_of(chunk)
+        same = jax.tree.map(np.array_equal, first, again)
+        assert all(jax.tree.leaves(same)), chunk
+
+
+def test_chunks_report_every_case_once():
+    seen = []
+    refs = suite_refs("cut_in", 5)
+    found = drive_row(
+        IDM, lambda a, b: build(refs[a:b], 10.0), 5, CONFIG, chunk=2,
+        progress=seen.append,
+    )  # fmt: skip
+    assert seen == [2, 2, 1]
+    assert found.progress.shape == (5,)
+
+
+def test_padding_steps_do_not_count():
+    long, short = make_case(speed=10.0, steps=300), make_case(speed=10.0, steps=50)
+    record, _ = drive([long, short])
+    assert record.valid[0].all()
+    assert record.valid[1].sum() == 50
+    found = jax.vmap(lambda r: case_metrics(r, MetricsConfig()))(record)
+    assert float(found.progress[1]) == pytest.approx(50.0, rel=1e-3)
+    assert int(found.samples[1]) == 50
+
+
+def test_a_plan_stays_in_force_until_the_next():
+    calls = []
+
+    def policy(params, scene, key):
+        calls.append(1)  # counts traces, not plans
+        plan = constant(jnp.float32(0.0), scene, key)
+        return plan.replace(acceleration=scene.ego.v - 10.0 + 1.0)
+
+    record, _ = drive([make_case(speed=10.0)], steps=20, policy=policy, plan_every=5)
+    commands = record.command[0]
+    assert np.unique(commands[:5]).size == 1
+    assert commands[5] != commands[4]
+    assert np.unique(commands[5:10]).size == 1
+    assert len(calls) == 1
+
+
+def test_new_weights_do_not_compile_again():
+    traces = []
+
+    def policy(params, scene, key):
+        traces.append(1)
+        return constant(params, scene, key)
+
+    for value in (0.0, 0.5, -0.5):
+        drive([make_case(speed=10.0)], steps=20, policy=policy, params=value)
+    assert len(traces) == 1
+
+
+def test_commands_may_be_delayed_and_built_up():
+    record, _ = drive([make_case(speed=10.0)], steps=20, params=-6.0)
+    late, _ = drive([make_case(speed=10.0)], steps=20, params=-6.0, command_delay=5)
+    soft, _ = drive([make_case(speed=10.0)], steps=20, params=-6.0, braking_jerk=5.0)
+    np.testing.assert_allclose(late.a[0, 5:], record.a[0, :-5], atol=1e-4)
+    assert np.all(late.a[0, :5] == 0.0)
+    assert np.diff(soft.a[0]).min() / 0.1 == pytest.approx(-5.0, abs=0.1)
+
+
+def seen_by_planner(**perception):
+    """What the planner sees of one car ahead: its rear in every step."""
+    from rcirl_jax.simulation.rollout import drive_cases
+
+    car = {"s": 40.0, "v": 10.0, "phases": [(0.0, 14.0, 4.0)]}
+    case = make_case([car], speed=10.0, seed=perception.pop("seed", 1), **perception)
+    config = RolloutConfig(steps=60, scenes=True)
+    _, _, scenes = drive_cases(constant, jnp.zeros(()), stack([case]), config)
+    obstacles = jax.tree.map(np.asarray, scenes.obstacles)
+    return obstacles.s_lower[0, :, 0, 0], obstacles.valid[0, :, 0, 0]
+
+
+def test_latency_noise_and_dropouts_act_and_are_seeded():
+    clear, known = seen_by_planner()
+    assert known.all()
+    late, _ = seen_by_planner(latency=0.3)
+    # the car pulls away, so the past shows it nearer: 0.3 s at its own speed
+    shift = (clear - late)[20:]
+    assert shift.mean() == pytest.approx(0.3 * 13.5, abs=0.6)
+    noisy, _ = seen_by_planner(sigma_position=0.3)
+    assert np.std(noisy - clear) == pytest.approx(0.3, rel=0.35)
+    again, _ = seen_by_planner(sigma_position=0.3)
+    np.testing.assert_array_equal(noisy, again)
+    other, _ = seen_by_planner(sigma_position=0.3, seed=2)
+    assert np.abs(noisy - other).max() > 0.1
+    _, kept = seen_by_planner(dropout=0.3)
+    assert 0.4 < kept.mean() < 0.95
+
+
+def replay_case(turns_reactive):
+    steps = 300
+    t = 0.1 * np.arange(steps + 1, dtype=np.float32)
+    tables = {k: np.zeros((NUM_AGENTS, steps + 1), np.float32) for k in "slhv"}
+    tables["s"][0] = -20.0 + 10.0 * t  # follows at 10 m/s
+    tables["v"][0] = 10.0
+    present = np.zeros((NUM_AGENTS, steps + 1), bool)
+    present[0] = True
+    agent = {"appear_s": np.inf, "delay": 0.0, "headway": 1.0}
+    case = make_case([agent], speed=10.0)
+    return case.replace(
+        replay=Replay(
+            s=tables["s"], l=tables["l"], heading=tables["h"], v=tables["v"],
+            present=present, ego_s=10.0 * t, ego_l=0.0 * t,
+            ego_v=np.full_like(t, 10.0), turns_reactive=np.bool_(turns_reactive),
+        )
+    )  # fmt: skip
+
+
+def test_replayed_agents_follow_the_log_or_turn_reactive():
+    """The ego brakes to a stop in front of a logged follower."""
+    record, shot = drive(
+        [replay_case(False), replay_case(True)], steps=150, params=-3.0
+    )
+    log = -20.0 + 10.0 * 0.1 * np.arange(1, 151)
+    upto = int(np.argmax(record.collision[0] > 0))
+    assert record.collision[0].sum() == 1
+    np.testing.assert_allclose(
+        shot.agents.s[0, : upto - 1, 0], log[: upto - 1], atol=1e-3
+    )
+    assert record.at_fault[0].sum() == 0
+    assert record.collision[1].sum() == 0
+    assert shot.agents.v[1, -1, 0] < 1.0
+
+
+def test_the_recorded_human_drives_its_log():
+    record, _ = drive([replay_case(True)], steps=150, follow_log=True)
+    np.testing.assert_allclose(record.s[0], np.arange(1, 151) * 1.0, atol=1e-3)
+    assert record.collision[0].sum() == 0
+
+
+@pytest.mark.parametrize("bad", [{"plan_every": 0}, {"plan_every": 7, "steps": 100}])
+def test_plan_every_has_to_divide_the_steps(bad):
+    with pytest.raises(InputError, match="plan_every"):
+        RolloutConfig(**bad)

@@ -1,0 +1,106 @@
+"""The ego against exact solutions, an integrator and its own path."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from rcirl_jax.simulation.cases import NUM_ROAD, ROAD_STEP_M, EgoState
+from rcirl_jax.simulation.vehicle import Vehicle, drive, steering
+from tests.simulation.worlds import make_case
+
+
+def ego(v=10.0, l=0.0, a=0.0, curvature=0.0):
+    f = jnp.float32
+    return EgoState(
+        s=f(0.0), l=f(l), heading=f(0.0), v=f(v), a=f(a), curvature=f(curvature)
+    )
+
+
+PLAIN = Vehicle()
+
+
+def road_of(**more):
+    return jax.tree.map(jnp.asarray, make_case(**more).road)
+
+
+def run(state, road, command, steps, vehicle=PLAIN):
+    def step(x, u):
+        after = drive(x, road, u, vehicle)
+        return after, after
+
+    commands = jnp.broadcast_to(jnp.asarray(command, jnp.float32), (steps,))
+    return jax.jit(lambda x: jax.lax.scan(step, x, commands)[1])(state)
+
+
+def test_acceleration_follows_the_exact_first_order_lag():
+    log = run(ego(), road_of(), 2.0, 20)
+    t = 0.1 * np.arange(1, 21)
+    np.testing.assert_allclose(log.a, 2.0 * (1.0 - np.exp(-t / 0.2)), rtol=1e-4)
+
+
+def test_speed_never_turns_negative_and_the_car_then_stands():
+    log = run(ego(v=4.0), road_of(), -6.0, 60)
+    assert float(log.v.min()) == 0.0
+    assert float(log.s[-1]) == float(log.s[-20])
+    assert float(log.a[-1]) == 0.0
+
+
+@pytest.mark.parametrize("kappa", [0.01, -0.03, 0.05])
+def test_a_bend_is_driven_on_its_centre_line(kappa):
+    log = run(ego(v=8.0), road_of(kappa=kappa), 0.0, 200)
+    assert float(jnp.abs(log.l).max()) < 0.25
+    assert float(log.curvature[-1]) == pytest.approx(kappa, rel=0.02)
+
+
+def test_a_lane_shift_is_tracked():
+    stations = np.arange(NUM_ROAD) * ROAD_STEP_M
+    u = np.clip((stations - 60.0) / 60.0, 0.0, 1.0)
+    path = 3.5 * u**3 * (10 - 15 * u + 6 * u**2)
+    road = road_of(path_l=path, lanes=(1, 0))
+    log = run(ego(v=15.0), road, 0.0, 200)
+    there = np.interp(np.asarray(log.s), stations, path)
+    assert float(np.abs(np.asarray(log.l) - there).max()) < 0.25
+
+
+def test_integration_converges_with_the_substeps():
+    """Braking into a bend with an offset to recover from."""
+    road = road_of(kappa=0.02)
+
+    def end(substeps):
+        vehicle = Vehicle(substeps=substeps)
+        log = run(ego(v=14.0, l=1.0), road, -2.0, 30, vehicle)
+        return np.array([log.s[-1], log.l[-1], log.heading[-1]], np.float64)
+
+    truth = end(64)
+    errors = [np.abs(end(n) - truth).max() for n in (1, 2, 4, 8)]
+    assert errors[0] > errors[1] > errors[2] > errors[3]
+    assert errors[3] < errors[0] / 4.0
+    assert errors[1] < 0.05  # m, at the two substeps that are used
+
+
+def test_equals_an_independent_integration_of_the_equations():
+    road = road_of(kappa=0.015)
+    vehicle = Vehicle(substeps=64)
+    log = run(ego(v=12.0, l=0.8), road, 1.0, 20, vehicle)
+
+    def rates(_, x, target):
+        _, l, h, v, a, c = x
+        shrink = 1.0 - 0.015 * l
+        way = v * math.cos(h) / shrink
+        return [way, v * math.sin(h), v * c - 0.015 * way, a,
+                (1.0 - a) / 0.2, (target - c) / 0.05]  # fmt: skip
+
+    x = np.array([0.0, 0.8, 0.0, 12.0, 0.0, 0.0])
+    for _ in range(20):
+        now = ego().replace(
+            s=jnp.float32(x[0]), l=jnp.float32(x[1]), heading=jnp.float32(x[2]),
+            v=jnp.float32(x[3]), a=jnp.float32(x[4]), curvature=jnp.float32(x[5]),
+        )  # fmt: skip
+        target = float(steering(now, road, vehicle))
+        x = solve_ivp(rates, (0, 0.1), x, args=(target,), rtol=1e-9, atol=1e-9).y[:, -1]
+    found = [log.s[-1], log.l[-1], log.heading[-1], log.v[-1], log.a[-1]]
+    np.testing.assert_allclose(np.array(found, np.float64), x[:5], atol=5e-3)
