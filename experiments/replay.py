@@ -55,8 +55,8 @@ def main() -> None:
     page = write_case_page(
         folder / "case.html",
         title,
-        f"{float(found.progress):.0f} m driven, {int(found.at_fault)} collisions of own "
-        f"fault, closest {float(found.min_clearance):.2f} m.",
+        f"{float(found.progress):.0f} m driven, {int(found.at_fault)} collisions of "
+        f"own fault, closest {float(found.min_clearance):.2f} m.",
         picture=picture,
         animation=animation,
         metrics={name: float(value) for name, value in scalars.items()},

@@ -41,6 +41,8 @@ from rcirl_jax.sampling.speed import family_index
 from rcirl_jax.types import Candidates, Scene, Trajectory
 from rcirl_jax.units import DT_S, NUM_TIMES
 
+MAX_ACTIVATION = 43.0  # 1, exp of twice it is still a normal float32
+
 
 class DpPlan(flax.struct.PyTreeNode, kw_only=True):
     """The best plan of the lattice."""
@@ -51,97 +53,166 @@ class DpPlan(flax.struct.PyTreeNode, kw_only=True):
     n: jax.Array  # [T] int32, stations on the lattice
 
 
-def _rewards(
-    base: jax.Array,
+def _reward(
+    rows: jax.Array, layers: Layers, a: jax.Array, before: jax.Array, activation: str
+) -> jax.Array:
+    """R [...] of pre-activations [..., H] under a after `before`, m/s^2 [...]."""
+    motion = motion_activation(layers, a, (a - before) / DT_S)
+    return rest_of_network(layers, rows + motion, activation)
+
+
+def _prepare(base: jax.Array, layers: Layers, activation: str) -> jax.Array:
+    """Pre-activations [N, U, H] in the layout of `_edge_rewards`."""
+    if _is_rational(layers, activation):
+        x = jnp.clip(base, -MAX_ACTIVATION, MAX_ACTIVATION)
+        return jnp.exp(2.0 * jnp.transpose(x, (2, 1, 0)))
+    return jnp.transpose(base, (1, 0, 2))
+
+
+def _is_rational(layers: Layers, activation: str) -> bool:
+    return activation == "tanh" and len(layers.kernels) == 1
+
+
+def _edge_rewards(
+    table: jax.Array,
     layers: Layers,
     k: int,
     before: jax.Array,
     config: DpConfig,
     activation: str,
 ) -> jax.Array:
-    """R [N, M] of acceleration k after `before` (m/s^2, []) at one time."""
-    a = jnp.asarray(k * config.step)
-    u = 2 * jnp.arange(config.num_speeds) + k  # 2 v / speed_step
-    rows = jnp.take(base, jnp.clip(u, 0, base.shape[1] - 1), axis=1)
+    """R [B, M, N] of acceleration k after `before` [B] m/s^2 at one time.
+
+    This is where the time goes. With one layer of tanh, base x and motion y,
+
+        tanh(x + y) = 1 - 2 / (1 + exp(2x) exp(2y))
+
+    so an edge costs one division per hidden unit and no transcendental. It
+    holds through overflow and underflow of the product.
+
+    Args:
+      table: [H, U, N] exp(2x), or [U, N, H] x of any other network.
+      layers: of `make_layers`.
+      k: the action.
+      before: accelerations that may come before it.
+      config: static.
+      activation: static.
+    """
+    speeds = config.num_speeds
+    lowest = min(0, config.actions[0])  # u < 0: rows of negative speeds, not taken
+    rows = slice(k - lowest, k - lowest + 2 * speeds - 1, 2)
+    pad = ((-lowest, 0), (0, 0))
+    a = jnp.full(before.shape, k * config.step)
+    if not _is_rational(layers, activation):
+        x = jnp.pad(table, (*pad, (0, 0)), mode="edge")[rows]
+        lift = lambda y: y[:, None, None]  # noqa: E731
+        return _reward(x[None], layers, lift(a), lift(before), activation)
     motion = motion_activation(layers, a, (a - before) / DT_S)
-    return rest_of_network(layers, rows + motion, activation)
+    motion = jnp.exp(2.0 * jnp.clip(motion, -MAX_ACTIVATION, MAX_ACTIVATION))
+    weights = layers.kernels[0][:, 0]
+    total = jnp.sum(weights)
+    for h in range(weights.shape[0]):
+        x = jnp.pad(table[h], pad, mode="edge")[rows]
+        total = total - 2.0 * weights[h] / (1.0 + x[None] * motion[:, h, None, None])
+    return total
 
 
 def _keeps_speed(lattice: Lattice, t: jax.Array, k: int, config: DpConfig) -> jax.Array:
-    """[N, M] bool: v = w + a dt / 2 at time t is not negative and keeps the cap."""
-    v = (jnp.arange(config.num_speeds) + 0.5 * k) * config.speed_step
-    return (v[None] >= 0.0) & (v[None] <= lattice.speed_cap[t][:, None] + 1e-4)
+    """[M, N] bool: v = w + a dt / 2 at time t is not negative and keeps the cap."""
+    v = ((jnp.arange(config.num_speeds) + 0.5 * k) * config.speed_step)[:, None]
+    return (v >= 0.0) & (v <= lattice.speed_cap[t][None] + 1e-4)
 
 
-def _next_values(values: jax.Array, blocked: jax.Array, k: int) -> jax.Array:
-    """V_{i+1} [N, M] seen from (n, m) under action k; FORBIDDEN off the lattice.
+def _next_values(values: jax.Array, blocked: jax.Array) -> jax.Array:
+    """V_{i+1} [K, M, N] seen from where it is entered: at (m', n + m') for (m', n).
 
-    Args:
-      values: [N, M, K] of the next time, at the action index of k already [N, M].
-      blocked: [N] bool: that station may not be entered.
-      k: the action.
+    Shifting row m' by m' is a change of row length: in memory (m', n + m') of
+    rows of length L is (m', n) of rows of length L + 1. FORBIDDEN off the lattice
+    and where `blocked` [N].
     """
-    count, speeds = values.shape
-    entered = jnp.where(blocked[:, None], FORBIDDEN, values)
-    n = jnp.arange(count)[:, None]
-    m = jnp.arange(speeds)[None] + k
-    inside = (m >= 0) & (m < speeds) & (n + m < count)
-    row = jnp.clip(n + m, 0, count - 1)
-    column = jnp.clip(m, 0, speeds - 1)
-    return jnp.where(inside, entered[row, column], FORBIDDEN)
+    actions, speeds, count = values.shape
+    entered = jnp.where(blocked, FORBIDDEN, values)
+    length = count + speeds
+    padding = ((0, 0), (0, 0), (0, speeds))
+    entered = jnp.pad(entered, padding, constant_values=FORBIDDEN)
+    flat = jnp.pad(entered.reshape(actions, -1), ((0, 0), (0, speeds)))
+    return flat.reshape(actions, speeds, length + 1)[..., :count]
+
+
+def _shift(x: jax.Array, k: int) -> jax.Array:
+    """Row m of the result is row m + k of x [M, N]; FORBIDDEN off the lattice."""
+    size = x.shape[0]
+    padded = jnp.pad(x, ((max(-k, 0), max(k, 0)), (0, 0)), constant_values=FORBIDDEN)
+    start = max(k, 0)
+    return padded[start : start + size]
+
+
+def _before(config: DpConfig, i: int) -> slice:
+    """Indices of the accelerations from which action i is within the jerk limit."""
+    reach = config.jerk_reach
+    return slice(max(i - reach, 0), min(i + reach + 1, len(config.actions)))
+
+
+def _carried(
+    lattice: Lattice,
+    table: jax.Array,
+    layers: Layers,
+    t: jax.Array,
+    config: DpConfig,
+    activation: str,
+) -> jax.Array:
+    """Gamma R [K, M, N] of the last counted time: the acceleration is carried over."""
+
+    def of(k: int) -> jax.Array:
+        a = jnp.full((1,), k * config.step)
+        reward = _edge_rewards(table, layers, k, a, config, activation)[0]
+        # the limits after the weight, which may be small or negative
+        keeps = _keeps_speed(lattice, t, k, config)
+        return jnp.where(keeps, lattice.weight[t] * reward, FORBIDDEN)
+
+    return jnp.stack([of(k) for k in config.actions])
 
 
 def backward(
     lattice: Lattice, layers: Layers, config: DpConfig, activation: str
 ) -> tuple[jax.Array, jax.Array]:
-    """Values at time 2 [N, M, K] and policies [T - 3, N, M, K] (times 2 .. T - 2)."""
-    actions = config.actions
-    last = NUM_TIMES - 1
-    accelerations = jnp.asarray(actions, jnp.float32) * config.step
+    """Values at time 2 [K, M, N] and policies [T - 3, K, M, N] (times 2 .. T - 2).
 
-    def stage_rewards(t: jax.Array) -> jax.Array:
-        """Q rewards [K(next), N, M, K(before)] of time t, gamma included."""
+    Cost: T N M (K pairs within the jerk limit) edges with H divisions each; at
+    step 1 m/s^2 that is 1.2e8 edges.
+    """
+    accelerations = jnp.asarray(config.actions, jnp.float32) * config.step
+
+    def prepared(t: jax.Array) -> jax.Array:
         base = base_activation(lattice, layers, t, config)
-        of = lambda k, a: _rewards(base, layers, k, a, config, activation)  # noqa: E731
-        rows = [
-            jnp.stack([of(k, accelerations[i]) for i in range(len(actions))], axis=-1)
-            for k in actions
-        ]
-        # at the last valid time the acceleration is carried over
-        kept = [_keeps_speed(lattice, t, k, config) for k in actions]
-        carried = jnp.stack(
-            [jnp.where(kept[i], rows[i][..., i], FORBIDDEN) for i in range(len(kept))],
-            axis=-1,
-        )
-        moved = jnp.stack(rows)
-        found = jnp.where(lattice.has_next[t], moved, carried[None])
-        return lattice.weight[t] * found
+        return _prepare(base, layers, activation)
 
     def stage(values: jax.Array, t: jax.Array) -> tuple[jax.Array, jax.Array]:
-        rewards = stage_rewards(t)
-        best = jnp.full(values.shape, 2.0 * FORBIDDEN)
+        table = prepared(t)
+        ahead = _next_values(values, lattice.blocked[t + 1])
+        weight = jnp.where(lattice.has_next[t], lattice.weight[t], 0.0)
+        best = jnp.full(values.shape, FORBIDDEN)
         choice = jnp.zeros(values.shape, jnp.int8)
-        for i, k in enumerate(actions):
-            ahead = _next_values(values[..., i], lattice.blocked[t + 1], k)
+        for i, k in enumerate(config.actions):
+            span = _before(config, i)
+            reward = _edge_rewards(
+                table, layers, k, accelerations[span], config, activation
+            )
             keeps = _keeps_speed(lattice, t, k, config)
-            ahead = jnp.where(keeps, ahead, FORBIDDEN)
-            q = rewards[i] + ahead[..., None]
-            steady = jnp.abs(jnp.asarray(actions) - k) <= config.jerk_reach
-            q = jnp.where(steady, q, FORBIDDEN)
-            choice = jnp.where(q > best, jnp.int8(i), choice)
-            best = jnp.maximum(q, best)
+            free = jnp.where(keeps, _shift(ahead[i], k), FORBIDDEN)
+            q = weight * reward + free
+            choice = choice.at[span].set(
+                jnp.where(q > best[span], jnp.int8(i), choice[span])
+            )
+            best = best.at[span].max(q)
+        ends = lattice.has_next[t - 1] & ~lattice.has_next[t]
+        carried = _carried(lattice, table, layers, t, config, activation)
+        best = best + jnp.where(ends, carried, 0.0)
         return jnp.maximum(best, FORBIDDEN), choice
 
-    base = base_activation(lattice, layers, jnp.asarray(last), config)
-    ends = [
-        _rewards(base, layers, k, accelerations[i], config, activation)
-        for i, k in enumerate(actions)
-    ]
-    at_end = jnp.asarray(last)
-    keeps = [_keeps_speed(lattice, at_end, k, config) for k in actions]
-    terminal = lattice.weight[last] * jnp.stack(ends, axis=-1)
-    terminal = jnp.where(jnp.stack(keeps, axis=-1), terminal, FORBIDDEN)
-    times = jnp.arange(2, last)
+    last = jnp.asarray(NUM_TIMES - 1)
+    terminal = _carried(lattice, prepared(last), layers, last, config, activation)
+    times = jnp.arange(2, NUM_TIMES - 1)
     return jax.lax.scan(stage, terminal, times, reverse=True)
 
 
@@ -155,29 +226,31 @@ def _first_step(
     """Value, mean speed m_1 and action index of the best beginning.
 
     At time 1 the acceleration before is the ego's own, a_0, which lies off the
-    lattice; the jerk of time 0 is that of time 1.
+    lattice; the jerk of time 0 is that of time 1. Station and mean speed are the
+    same number there, n_1 = m_1.
     """
     a0, v0 = lattice.first.a, lattice.first.v
     base = base_activation(lattice, layers, jnp.asarray(1), config)
     m = jnp.arange(config.num_speeds)
-    free = ~lattice.blocked[1, m]
-    expected = v0 + 0.5 * a0 * DT_S
-    near = jnp.abs(m * config.speed_step - expected) <= config.first_reach
-    near = near | (m == jnp.argmin(jnp.abs(m * config.speed_step - expected)))
-    norm_row = jnp.clip(lattice.first_row, layers.lower, layers.upper)
-    start = norm_row @ layers.first + layers.offset
+    off = jnp.abs(m * config.speed_step - (v0 + 0.5 * a0 * DT_S))
+    near = (off <= config.first_reach) | (m == jnp.argmin(off))
+    free = near & ~lattice.blocked[1, m]
+    clipped = jnp.clip(lattice.first_row, layers.lower, layers.upper)
+    start = clipped @ layers.first + layers.offset
+    ahead = _next_values(values, lattice.blocked[2])
     scores = []
     for i, k in enumerate(config.actions):
-        rewards = _rewards(base, layers, k, a0, config, activation)[m, m]
-        ahead = _next_values(values[..., i], lattice.blocked[2], k)[m, m]
-        keeps = _keeps_speed(lattice, jnp.asarray(1), k, config)[m, m]
-        j = (k * config.step - a0) / DT_S
-        r0 = rest_of_network(
+        a = jnp.asarray(k * config.step)
+        rows = base[m, jnp.maximum(2 * m + k, 0)]
+        j = (a - a0) / DT_S
+        of_start = rest_of_network(
             layers, start + motion_activation(layers, a0, j), activation
         )
-        q = lattice.weight[0] * r0 + lattice.weight[1] * rewards + ahead
+        now = lattice.weight[1] * _reward(rows, layers, a, a0, activation)
+        q = lattice.weight[0] * of_start + now + _shift(ahead[i], k)[m, m]
         steady = jnp.abs(j) <= jnp.maximum(config.max_jerk, config.step / DT_S)
-        scores.append(jnp.where(near & free & keeps & steady, q, FORBIDDEN))
+        keeps = _keeps_speed(lattice, jnp.asarray(1), k, config)[m, m]
+        scores.append(jnp.where(free & keeps & steady, q, FORBIDDEN))
     table = jnp.stack(scores, axis=-1)  # [M, K]
     best = jnp.argmax(table)
     return table.reshape(-1)[best], best // table.shape[1], best % table.shape[1]
@@ -196,7 +269,7 @@ def solve(
 
     def read(state: tuple, policy: jax.Array) -> tuple[tuple, jax.Array]:
         n, m, i = state
-        chosen = policy[n, m, i].astype(jnp.int32)
+        chosen = policy[i, m, n].astype(jnp.int32)
         m_next = jnp.clip(m + actions[chosen], 0, config.num_speeds - 1)
         n_next = jnp.clip(n + m_next, 0, config.num_stations - 1)
         return (n_next, m_next, chosen), n_next

@@ -85,7 +85,8 @@ class Script(flax.struct.PyTreeNode, kw_only=True):
     Phase p holds from `start[p]` until the next phase starts: the agent drives
     its speed towards `speed[p]` at `rate[p]`, whatever the IDM wants to do
     with free road; if it `reacts`, the IDM's acceleration stays the upper bound,
-    so it still brakes for what is in its way. An unused phase has start = inf. A move leads the agent to another lateral offset.
+    so it still brakes for what is in its way. An unused phase has start = inf.
+    A move leads the agent to another lateral offset.
     """
 
     start: jax.Array  # [A, P] s after activation, increasing; inf = unused

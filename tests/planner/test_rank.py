@@ -1,0 +1,117 @@
+"""The ranking planner: argmax of admissible scores, exact lag, IDM by hand."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rcirl_jax.features import feature_map
+from rcirl_jax.planner.baselines import Idm, idm_acceleration
+from rcirl_jax.planner.rank import (
+    ACTUATOR_LAG_S,
+    ONLINE,
+    RankConfig,
+    command,
+    hand_score,
+    idm_policy,
+    lead_time,
+    learned_score,
+    rank_policy,
+)
+from rcirl_jax.planner.safety import check
+from rcirl_jax.reward import RewardConfig, value
+from rcirl_jax.reward.network import pinned
+from rcirl_jax.sampling import num_candidates, sample
+from rcirl_jax.types import Kind
+from tests.planner.test_dp import weights
+from tests.planner.test_safety import with_obstacle
+from tests.scenes import random_scene
+
+FEATURES = feature_map("paper21")
+SCORE = learned_score(FEATURES, "tanh")
+POLICY = jax.jit(rank_policy(SCORE, RankConfig()))
+
+
+def scene_of(seed):
+    return jax.tree.map(jnp.asarray, random_scene(seed))
+
+
+def test_the_online_sampler_offers_64_candidates():
+    assert num_candidates(ONLINE) == 64
+    assert math.isclose(lead_time(1e-6), ACTUATOR_LAG_S, rel_tol=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_drives_the_best_admissible_candidate(seed):
+    made, key = scene_of(seed), jax.random.key(seed)
+    plan = POLICY(weights(), made, key)
+    candidates = sample(key, made, ONLINE)
+    ok = np.asarray(check(made, candidates).admissible)
+    scores = np.asarray(SCORE(weights(), made, candidates))
+    assert int(plan.admissible) == ok.sum()
+    assert bool(plan.fallback) is (not ok.any())
+    if ok.any():
+        best = int(np.argmax(np.where(ok, scores, -np.inf)))
+        np.testing.assert_allclose(plan.s, candidates.trajectory.s[best], atol=1e-3)
+
+
+def test_scores_are_the_reward_of_training():
+    made = scene_of(2)
+    candidates = sample(jax.random.key(0), made, ONLINE)
+    params, norm = weights()
+    mask = jnp.broadcast_to(made.time_valid, (64, 18))
+    shape = RewardConfig(pin="none")
+    expected = value(
+        params, norm, FEATURES.of_candidates(made, candidates), mask, shape
+    )
+    np.testing.assert_allclose(
+        SCORE((params, norm), made, candidates), expected, rtol=1e-5, atol=1e-5
+    )
+    twice = pinned(params, RewardConfig())
+    np.testing.assert_allclose(twice.gamma, params.gamma, rtol=1e-5)
+
+
+def test_order_of_the_obstacles_does_not_matter():
+    made, key = scene_of(3), jax.random.key(3)
+    order = jnp.asarray(np.random.default_rng(0).permutation(16))
+    shuffled = made.replace(obstacles=jax.tree.map(lambda x: x[order], made.obstacles))
+    one, two = POLICY(weights(), made, key), POLICY(weights(), shuffled, key)
+    np.testing.assert_allclose(one.s, two.s, atol=1e-3)
+
+
+def test_command_leads_the_lag_so_that_the_plan_is_met():
+    made = with_obstacle(Kind.NONE, 0.0, 0.0)
+    candidates = sample(jax.random.key(0), made, ONLINE)
+    x = jax.tree.map(lambda a: a[4], candidates.trajectory)
+    x = x.replace(a=x.a.at[0].set(0.5).at[1].set(1.5), s=x.s.at[1].set(8.0))
+    for period in (0.1, 0.3):
+        asked = float(command(x, jnp.asarray(False), period))
+        reached = 0.5 + (asked - 0.5) * (1 - math.exp(-period / ACTUATOR_LAG_S))
+        assert reached == pytest.approx(0.5 + period / (8 / 17), rel=1e-3)
+
+
+def test_a_plan_that_rests_within_the_first_interval_is_braked_to_rest():
+    made = with_obstacle(Kind.NONE, 0.0, 0.0, v=0.5)
+    x = jax.tree.map(lambda a: a[0], sample(jax.random.key(0), made, ONLINE).trajectory)
+    still = x.replace(s=jnp.full_like(x.s, 0.03).at[0].set(0.0), a=x.a * 0.0)
+    urgent = float(command(still, jnp.asarray(True), 0.1))
+    assert urgent == pytest.approx(-0.25 / 0.06, rel=0.05)
+    assert urgent < float(command(still, jnp.asarray(False), 0.1)) < -0.3
+
+
+def test_idm_policy_is_the_formula():
+    made = with_obstacle(Kind.VEHICLE, 30.0, 0.0, v=12.0, speed=8.0)
+    plan = idm_policy(Idm())(None, made, jax.random.key(0))
+    gap = 28.0 - 0.5 * float(made.ego.length)
+    f = jnp.float32
+    expected = idm_acceleration(f(12.0), f(gap), f(4.0), f(30.0), Idm())
+    assert float(plan.acceleration) == pytest.approx(float(expected), rel=1e-4)
+
+
+def test_the_hand_set_row_uses_the_same_machine():
+    policy = jax.jit(rank_policy(hand_score, dataclasses.replace(RankConfig())))
+    plan = policy(None, scene_of(1), jax.random.key(1))
+    assert np.isfinite(float(plan.acceleration))

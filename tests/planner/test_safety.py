@@ -1,0 +1,189 @@
+"""The safety filter against dense sampling, and its rules one by one."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rcirl_jax.planner.rank import ONLINE
+from rcirl_jax.planner.safety import SafetyConfig, Verdict, check, choose, first_contact
+from rcirl_jax.sampling import sample
+from rcirl_jax.sampling.kinematics import trajectory_on_path
+from rcirl_jax.types import Candidates, Kind
+from rcirl_jax.units import DT_S, TIMES_S
+from tests.scenes import random_scene, scene
+
+BARE = SafetyConfig(margin_along=0.0, margin_across=0.0)
+
+
+@functools.cache
+def sampled(seed):
+    made = jax.tree.map(jnp.asarray, random_scene(seed))
+    return made, sample(jax.random.key(seed), made, ONLINE)
+
+
+contact = jax.jit(
+    lambda s, c: first_contact(s, jax.tree.map(jnp.transpose, c.trajectory), BARE)
+)
+judge = jax.jit(lambda s, c: check(s, c))
+
+
+def dense_contact(made, x, steps=40):
+    """Whether boxes overlap anywhere between the times, by linear sub-sampling."""
+    o, ego = made.obstacles, made.ego
+    half = 0.5 * float(ego.length), 0.5 * float(ego.width)
+    kind = np.asarray(o.kind)
+    tilt = np.arctan(np.asarray(x.dl))
+    half_s = half[0] * np.cos(tilt) + half[1] * np.abs(np.sin(tilt))
+    half_l = half[0] * np.abs(np.sin(tilt)) + half[1] * np.cos(tilt)
+    for n in np.flatnonzero((kind >= Kind.VEHICLE) & (kind <= Kind.STATIC)):
+        low, high = np.asarray(o.s_lower[n]), np.asarray(o.s_upper[n])
+        right, left = np.asarray(o.l_lower[n]), np.asarray(o.l_upper[n])
+        s, l = np.asarray(x.s), np.asarray(x.l)
+        middle, across = 0.5 * (low + high), 0.5 * (right + left)
+        if (
+            middle[0] < s[0]
+            and abs(across[0] - l[0]) < half_l[0] + (left - right)[0] / 2
+        ):
+            continue
+        for i in range(17):
+            if not (o.valid[n, i] and o.valid[n, i + 1]):
+                continue
+            u = np.linspace(0, 1, steps)
+            at = lambda a, i=i, u=u: a[i] + u * (a[i + 1] - a[i])  # noqa: E731
+            wide = lambda a, i=i: max(a[i], a[i + 1])  # noqa: E731
+            near_s = np.abs(at(middle) - at(s)) <= wide(half_s) + wide((high - low) / 2)
+            near_l = np.abs(at(across) - at(l)) <= wide(half_l) + wide(
+                (left - right) / 2
+            )
+            if np.any(near_s & near_l):
+                return TIMES_S[i]
+    return np.inf
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_swept_boxes_equal_dense_sampling(seed):
+    made, candidates = sampled(seed)
+    found = np.asarray(contact(made, candidates))
+    for k in range(0, 64, 5):
+        x = jax.tree.map(lambda a, k=k: a[k], candidates.trajectory)
+        expected = dense_contact(made, x)
+        # sampling can only miss a graze; a found contact must be there
+        if np.isfinite(expected):
+            assert found[k] <= expected + 1e-5
+        elif np.isfinite(found[k]):
+            assert np.isfinite(dense_contact(made, x, steps=4000))
+
+
+def straight(made, v):
+    """One candidate of constant speed."""
+    x = trajectory_on_path(made, v * jnp.asarray(TIMES_S))
+    return Candidates(
+        trajectory=jax.tree.map(lambda a: a[None], x),
+        feasible=jnp.ones(1, bool),
+        family=jnp.zeros(1, jnp.int32),
+    )
+
+
+def with_obstacle(kind, s, l, v=10.0, speed=0.0, sideways=0.0, length=4.0, width=1.8):
+    """A straight empty road with one obstacle; the ego drives v."""
+    made = jax.tree.map(jnp.asarray, scene())
+    o, t = made.obstacles, jnp.asarray(TIMES_S)
+    empty = jnp.zeros_like(o.s_lower)
+    row = lambda x: empty.at[0].set(x)  # noqa: E731
+    return made.replace(
+        ego=made.ego.replace(v=jnp.float32(v), a=jnp.float32(0), l=jnp.float32(0),
+                             dl=jnp.float32(0), ddl=jnp.float32(0)),
+        path=made.path.replace(
+            l=jnp.zeros_like(made.path.l), kappa=jnp.zeros_like(made.path.kappa),
+            speed_limit=jnp.full_like(made.path.l, 30.0),
+            road_left=jnp.full_like(made.path.l, 6.0),
+            road_right=jnp.full_like(made.path.l, -6.0),
+        ),
+        obstacles=o.replace(
+            s_lower=row(s - length / 2 + speed * t),
+            s_upper=row(s + length / 2 + speed * t),
+            l_lower=row(l - width / 2 + sideways * t),
+            l_upper=row(l + width / 2 + sideways * t),
+            speed=row(speed + 0.0 * t), valid=jnp.zeros_like(o.valid).at[0].set(True),
+            kind=jnp.zeros_like(o.kind).at[0].set(int(kind)),
+        ),
+        time_valid=jnp.ones_like(made.time_valid),
+    )  # fmt: skip
+
+
+def test_a_body_that_slips_through_between_two_times_is_caught():
+    """It crosses the ego's corridor inside one interval of 0.47 s."""
+    meet = 4.5 * DT_S
+    made = with_obstacle(
+        Kind.VEHICLE, 10.0 * meet, -20.0 * meet, sideways=20.0, length=1.0, width=1.0
+    )
+    at_times = np.asarray(made.obstacles.l_lower[0])
+    assert not np.any((at_times > -1.5) & (at_times < 1.1))  # no time shows it
+    found = contact(made, straight(made, 10.0))
+    assert float(found[0]) == pytest.approx(float(TIMES_S[4]))
+
+
+def test_lines_are_walls_until_they_are_passed():
+    wall = with_obstacle(Kind.STOP, 30.0, 0.0, length=0.1, width=40.0)
+    assert not bool(judge(wall, straight(wall, 10.0)).admissible[0])
+    assert bool(judge(wall, straight(wall, 2.0)).admissible[0])
+    passed = with_obstacle(Kind.STOP, 1.0, 0.0, length=0.1, width=40.0)
+    assert bool(judge(passed, straight(passed, 10.0)).admissible[0])
+
+
+def test_road_edge_and_speed_limit():
+    free = with_obstacle(Kind.NONE, 0.0, 0.0)
+    assert bool(judge(free, straight(free, 10.0)).admissible[0])
+    narrow = free.replace(path=free.path.replace(
+        road_right=jnp.where(jnp.arange(128) > 15, -0.5, -6.0)))  # fmt: skip
+    assert not bool(judge(narrow, straight(narrow, 10.0)).admissible[0])
+    slow = free.replace(path=free.path.replace(
+        speed_limit=jnp.full_like(free.path.l, 8.0)))  # fmt: skip
+    assert not bool(judge(slow, straight(slow, 10.0)).admissible[0])
+    assert bool(judge(slow, straight(slow, 7.9)).admissible[0])
+
+
+def test_distance_to_the_leader_follows_rss():
+    """v rho + v^2 / 2b - v_l^2 / 2b_l + standstill, judged after 0.94 s."""
+    c = SafetyConfig()
+    needed = 10 * c.reaction + 100 / (2 * c.ego_braking)
+    needed += -100 / (2 * c.leader_braking) + c.standstill
+    for extra, ok in ((0.3, True), (-0.3, False)):
+        gap = needed + extra
+        place = 0.5 * 4.933 + gap + 2.0
+        made = with_obstacle(Kind.VEHICLE, place, 0.0, speed=10.0)
+        made = made.replace(ego=made.ego.replace(length=jnp.float32(4.933)))
+        verdict = judge(made, straight(made, 10.0))
+        assert bool(verdict.admissible[0]) is ok
+        assert float(verdict.rss_margin[0]) == pytest.approx(extra, abs=0.02)
+
+
+def test_without_an_admissible_candidate_the_hardest_brake_is_chosen():
+    made = with_obstacle(Kind.VEHICLE, 6.0, 0.0, v=12.0, length=4.0)
+    candidates = sample(jax.random.key(0), made, ONLINE)
+    verdict = judge(made, candidates)
+    assert not bool(verdict.admissible.any())
+    index, nothing = choose(verdict, candidates, jnp.arange(64.0))
+    assert bool(nothing)
+    assert float(candidates.trajectory.s[index, -1]) <= float(
+        candidates.trajectory.s[:, -1].min() + 1.0
+    )
+
+
+def test_the_later_contact_is_preferred_and_scores_decide_the_rest():
+    _, candidates = sampled(0)
+    two = jax.tree.map(lambda x: x[:3], candidates).replace(feasible=jnp.ones(3, bool))
+    verdict = Verdict(
+        admissible=jnp.array([False, False, False]),
+        contact_s=jnp.array([1.0, 3.0, 2.0]),
+        contact_v=jnp.zeros(3),
+        rss_margin=jnp.zeros(3),
+    )
+    assert int(choose(verdict, two, jnp.array([9.0, 0.0, 0.0]))[0]) == 1
+    some = verdict.replace(admissible=jnp.array([True, False, True]))
+    index, nothing = choose(some, two, jnp.array([1.0, 9.0, 2.0]))
+    assert int(index) == 2
+    assert not bool(nothing)
