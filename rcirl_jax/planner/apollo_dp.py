@@ -270,7 +270,8 @@ def _columns(scene: Scene, config: ApolloDpConfig) -> tuple[jax.Array, jax.Array
     )
 
     def step(column: Column, x: tuple) -> tuple[Column, tuple]:
-        after, move = _advance(column, *x, graph, config)
+        blocked, obstacle = x
+        after, move = _advance(column, blocked, obstacle, graph, config)
         return after, (after.cost, move)
 
     _, (costs, moves) = jax.lax.scan(step, start, (graph.blocked, graph.obstacle[1:]))

@@ -90,9 +90,11 @@ def choose(
     best = jnp.argmax(jnp.where(verdict.admissible, scores, -jnp.inf))
     nothing = ~jnp.any(verdict.admissible)
     late = jnp.minimum(verdict.contact_s, TIMES_S[-1] + 1.0)
-    urgency = (
-        1e3 * late + jnp.clip(verdict.rss_margin, -400.0, 0.0) - 0.1 * verdict.contact_v
-    )
+    # who drives through the leader has none ahead: its margin means nothing
+    free = jnp.isinf(verdict.contact_s)
+    margin = jnp.where(free, jnp.clip(verdict.rss_margin, -400.0, 0.0), -400.0)
+    way = candidates.trajectory.s[:, -1]
+    urgency = 1e3 * late + margin - 0.1 * verdict.contact_v - 0.01 * way
     fallback = jnp.argmax(jnp.where(candidates.feasible, urgency, -jnp.inf))
     return jnp.where(nothing, fallback, best), nothing
 

@@ -407,7 +407,7 @@ def _coast(params, scene, key):
 def test_the_simulator_replays_the_human(turning):
     config = dataclasses.replace(RAW, max_cases=3, steps=60)
     cases, _ = recorded_cases([turning], config)
-    record, _ = drive_cases(
+    record, *_ = drive_cases(
         _coast, None, cases, RolloutConfig(steps=60, follow_log=True)
     )
     assert bool(np.all(record.valid))
@@ -448,5 +448,5 @@ def test_us101(data_dir):
     config = RecordedConfig(steps=100, turns_reactive=False)
     cases, _ = recorded_cases(found, config)
     rollout = RolloutConfig(steps=100, follow_log=True)
-    record, _ = drive_cases(_coast, None, cases, rollout)
+    record, *_ = drive_cases(_coast, None, cases, rollout)
     assert not np.any(np.asarray(record.collision) * np.asarray(record.valid))
