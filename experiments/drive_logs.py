@@ -4,6 +4,11 @@
 
 For families of road that nobody has recorded. The cases are of another seed
 than those of experiments.simulate, so a reward is never tested where it learned.
+
+    python -m experiments.drive_logs --learner=weights.msgpack --output=DATASET
+
+The learner and the driver take turns; what the driver does after a takeover is
+kept. Train on both sets: experiments.train --data=FIRST,TAKEOVERS.
 """
 
 from absl import flags
@@ -11,6 +16,8 @@ from absl import flags
 from experiments.common import run
 from rcirl_jax.data.quality import format_quality
 from rcirl_jax.errors import InputError
+from rcirl_jax.export.closed_loop import table_rows
+from rcirl_jax.simulation.cases import STEP_S
 from rcirl_jax.simulation.demonstrations import DriveConfig, drive_catalogue
 from rcirl_jax.simulation.suite import suite_refs
 
@@ -22,6 +29,7 @@ _SEED = flags.DEFINE_integer(
 )
 _STRIDE = flags.DEFINE_float("stride", 3.0, "s between scenes of a drive")
 _DURATION = flags.DEFINE_float("duration", 120.0, "s of a drive")
+_LEARNER = flags.DEFINE_string("learner", None, "weights with which to take turns")
 _OVERWRITE = flags.DEFINE_bool("overwrite", False, "replace a finished dataset")
 
 
@@ -35,7 +43,13 @@ def main() -> None:
         raise InputError(f"--duration: {_DURATION.value}: expected 15 to 120 s")
     config = DriveConfig(stride_s=_STRIDE.value, duration_s=_DURATION.value)
     refs = suite_refs(_SUITE.value, _CASES.value, _SEED.value)
-    manifest = drive_catalogue(refs, _OUTPUT.value, config, overwrite=_OVERWRITE.value)
+    learner = None
+    if _LEARNER.value:
+        row = table_rows([_LEARNER.value], (), round(config.period_s / STEP_S))[0]
+        learner = row.policy, row.params
+    manifest = drive_catalogue(
+        refs, _OUTPUT.value, config, learner=learner, overwrite=_OVERWRITE.value
+    )
     print(format_quality(manifest.quality))
     print(f"dataset: {_OUTPUT.value}")
 

@@ -24,6 +24,11 @@ from rcirl_jax.units import TIMES_S
 NUM_SAMPLES = 32  # verification samples in the file
 
 
+def _tuples(value: object) -> object:
+    """Lists as tuples, at every depth."""
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+
+
 def read_config(workdir: Path) -> tuple[TrainConfig, dict]:
     """The configuration a run was made with, and all of run.json."""
     path = workdir / "run.json"
@@ -34,7 +39,7 @@ def read_config(workdir: Path) -> tuple[TrainConfig, dict]:
         settings = dict(run["config"])
         reward = dict(settings.pop("reward"))
         sampler = dict(settings.pop("sampler"))
-        lists = {k: tuple(v) for k, v in sampler.items() if isinstance(v, list)}
+        lists = {k: _tuples(v) for k, v in sampler.items() if isinstance(v, list)}
         config = TrainConfig(
             reward=RewardConfig(**{**reward, "hidden": tuple(reward["hidden"])}),
             sampler=SamplerConfig(**{**sampler, **lists}),

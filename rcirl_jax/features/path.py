@@ -35,7 +35,7 @@ class PathView(flax.struct.PyTreeNode, kw_only=True):
         return at(self.kappa, self.dkappa, trajectory.l, trajectory.dl, trajectory.ddl)
 
 
-def _slope(table: Float[Array, " p"], points: int) -> Float[Array, " p"]:
+def table_slope(table: Float[Array, " p"], points: int) -> Float[Array, " p"]:
     """Central difference over `points` grid points on each side, by station."""
     padded = jnp.pad(table, points, mode="edge")
     return (padded[2 * points :] - padded[: -2 * points]) / (
@@ -46,13 +46,13 @@ def _slope(table: Float[Array, " p"], points: int) -> Float[Array, " p"]:
 def path_view(scene: Scene, s: Float[Array, " t"]) -> PathView:
     """The path at stations s [T] m; linear between grid points, held at the ends."""
     path = scene.path
-    dl = _slope(path.l, SLOPE_POINTS)
+    dl = table_slope(path.l, SLOPE_POINTS)
     columns = (
         path.l,
         dl,
-        _slope(dl, SLOPE_POINTS),
+        table_slope(dl, SLOPE_POINTS),
         path.kappa,
-        _slope(path.kappa, 1),
+        table_slope(path.kappa, 1),
         path.speed_limit,
     )
     table = jnp.stack(columns, axis=1)

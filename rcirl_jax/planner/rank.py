@@ -53,7 +53,7 @@ ONLINE = SamplerConfig(
     stop_times=(3.0, 5.0, 8.0),
     stop_gaps=(0.5, 2.0),
     stop_brakings=(0.8, 1.5, 2.5),
-    num_random=11,
+    num_random=8,
 )
 
 

@@ -215,7 +215,9 @@ def _inside_limits(scene: Scene, x: Trajectory, config: SafetyConfig) -> jax.Arr
     """Speed limit, lateral acceleration and road edges at all later times."""
     view = path_view(scene, x.s)
     times = jnp.asarray(TIMES_S)
-    limit = view.speed_limit + config.speed_slack
+    # the lower limit of an interval's two ends holds for all of it
+    before = jnp.concatenate([view.speed_limit[:1], view.speed_limit[:-1]])
+    limit = jnp.minimum(view.speed_limit, before) + config.speed_slack
     allowed = jnp.maximum(limit, scene.ego.v - config.speed_recovery * times)
     slow = x.v <= allowed
     at = jax.vmap(lookup, in_axes=(None, 0, None))

@@ -39,6 +39,15 @@ class SamplerConfig:
     stop_gaps: tuple[float, ...] = (0.5, 2.5)
     # m/s^2, mean braking of stops without a line
     stop_brakings: tuple[float, ...] = (0.8, 1.5, 2.5)
+    # drives up to the speed envelope: share of it (1), acceleration, braking
+    # and, in bends, lateral acceleration in m/s^2
+    envelopes: tuple[tuple[float, float, float, float], ...] = (
+        (0.985, 2.0, 0.9, 3.0),
+        (0.965, 1.3, 0.8, 2.5),
+        (0.9, 0.8, 0.6, 1.8),
+    )
+    # m/s^3, how fast their acceleration changes
+    envelope_jerk: float = 3.0
     # m/s^2, emergency stops, always offered
     emergency_brakings: tuple[float, ...] = (4.0, 6.0, 8.0)
     # number of random two-phase profiles

@@ -23,6 +23,7 @@ def _speed_families(config: SamplerConfig) -> np.ndarray:
         "stop": num_stop + len(config.stop_brakings),
         "follow": num_edge * config.num_followed * len(config.follow_headways),
         "overtake": num_edge,
+        "envelope": len(config.envelopes),
         "emergency": len(config.emergency_brakings),
         "random": config.num_random,
     }
@@ -104,6 +105,7 @@ def speed_profiles(
             speed.stop(scene, config),
             speed.follow(scene, config),
             speed.overtake(scene, config),
+            speed.envelope(scene, config),
             speed.emergency(scene, config),
             speed.random_two_phase(key, scene, config),
         ]

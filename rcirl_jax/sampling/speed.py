@@ -10,11 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from rcirl_jax.features.path import SLOPE_POINTS, table_slope
 from rcirl_jax.geometry.frenet import lookup
 from rcirl_jax.geometry.polynomial import evaluate, quartic, quintic
 from rcirl_jax.sampling.config import SamplerConfig
 from rcirl_jax.types import Kind, Scene
-from rcirl_jax.units import HORIZON_S, STATION_STEP_M, TIMES_S
+from rcirl_jax.units import DT_S, HORIZON_S, STATION_STEP_M, TIMES_S
 
 FAMILIES = (
     "constant_speed",
@@ -22,6 +23,7 @@ FAMILIES = (
     "stop",
     "follow",
     "overtake",
+    "envelope",
     "emergency",
     "random",
     "hard_negative",
@@ -208,6 +210,61 @@ def overtake(scene: Scene, config: SamplerConfig) -> Float[Array, "m t"]:
         duration = jnp.asarray(TIMES_S[index])
         profiles.append(_to_state(scene, station, jnp.maximum(speed, 0.0), duration))
     return jnp.stack(profiles)
+
+
+def speed_envelope(
+    scene: Scene, lateral: Float[Array, " m"], braking: Float[Array, " m"]
+) -> Float[Array, "m p"]:
+    """Highest speed m/s at each grid station from which all later caps are kept.
+
+        v(s)^2 = min over s' >= s of cap(s')^2 + 2 b (s' - s)
+        cap(s) = min(limit(s), sqrt(a_lat / |kappa(s)|))
+
+    One reverse running minimum of cap^2 + 2 b s for each (a_lat, b).
+    """
+    path = scene.path
+    bend = table_slope(table_slope(path.l, SLOPE_POINTS), SLOPE_POINTS)
+    kappa = jnp.maximum(jnp.abs(path.kappa + bend), 1e-5)
+    cap = jnp.minimum(path.speed_limit**2, lateral[:, None] / kappa)
+    stations = jnp.arange(path.l.shape[0]) * STATION_STEP_M
+    ramp = 2.0 * braking[:, None] * stations
+    lowest = jax.lax.cummin(cap + ramp, axis=1, reverse=True)
+    return jnp.sqrt(jnp.maximum(lowest - ramp, 0.0))
+
+
+def envelope(scene: Scene, config: SamplerConfig) -> Float[Array, "m t"]:
+    """Driving up to the speed envelope: brisk, usual and calm, without a leader.
+
+    The quartics know one end speed and the limit at the ego; where limits and
+    bends change within the horizon none of them keeps up with the road. Here
+
+        a = min(a_max (1 - (v / u)^4), (u - v) / dt) below u, (u - v) / dt above,
+
+    u the envelope's lower value here and one step ahead; |a| and its change per
+    step are bounded.
+    """
+    grid = np.asarray(config.envelopes, np.float32)
+    share, top, braking, lateral = jnp.asarray(grid.T)
+    table = share[:, None] * speed_envelope(scene, lateral, braking)
+    at = jax.vmap(lookup, in_axes=(0, 0, None))
+    ego = scene.ego
+    s = jnp.full(share.shape, ego.s)
+    v, a = jnp.full(share.shape, ego.v), jnp.full(share.shape, ego.a)
+    stations = [s]
+    for _ in range(TIMES_S.size - 1):
+        ahead = at(table, s + v * DT_S, STATION_STEP_M)
+        ahead = jnp.minimum(ahead, at(table, s, STATION_STEP_M))
+        reach = (ahead - v) / DT_S
+        free = top * (1.0 - (v / jnp.maximum(ahead, 0.1)) ** 4)
+        wanted = jnp.where(v <= ahead, jnp.minimum(free, reach), reach)
+        wanted = jnp.clip(wanted, -config.reach_braking, top)
+        most = config.envelope_jerk * DT_S
+        a = jnp.clip(wanted, a - most, a + most)
+        after = jnp.maximum(v + a * DT_S, 0.0)
+        s = s + 0.5 * (v + after) * DT_S
+        v = after
+        stations.append(s)
+    return jnp.stack(stations, axis=1)
 
 
 def emergency(scene: Scene, config: SamplerConfig) -> Float[Array, "m t"]:

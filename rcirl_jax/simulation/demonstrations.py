@@ -8,6 +8,11 @@ dataset like any import: scenes as the planner sees them online (predicted, not
 recorded futures) with what the driver did in the following 8 s.
 
 It is a stand-in for human logs and says so in its manifest's source.
+
+With a learner the two take turns, as in a test car with a safety driver: the
+learner drives 8 s, the driver takes over for 14 s, and only scenes whose whole
+future was driven by the driver are kept. They show what to do where the
+learner's own mistakes lead (Ross et al. 2011, "DAgger", on takeovers).
 """
 
 import dataclasses
@@ -27,7 +32,12 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.planner.yielding import Yielding, yielding_policy
 from rcirl_jax.simulation.cases import STEP_S, Record
-from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases
+from rcirl_jax.simulation.rollout import (
+    Params,
+    Policy,
+    RolloutConfig,
+    drive_cases,
+)
 from rcirl_jax.simulation.suite import CaseRef, build
 from rcirl_jax.types import Ego, Kind, Obstacles, Scene
 from rcirl_jax.types import Path as ScenePath
@@ -58,10 +68,12 @@ class DriveConfig:
     period_s: float = 0.5
     test_fraction: float = 0.2
     split_seed: int = 0
+    # s that the learner, then the driver drive in turn (with a learner only)
+    turns_s: tuple[float, float] = (8.0, 14.0)
 
 
 def _rows(
-    record: Record, scenes: Scene, config: DriveConfig
+    record: Record, scenes: Scene, config: DriveConfig, takeovers: bool
 ) -> Iterator[dict[str, np.ndarray | float | int]]:
     """Flat rows of one clean drive, every `stride_s`, with 8 s of future."""
     valid = np.asarray(record.valid)
@@ -72,10 +84,16 @@ def _rows(
     s, l = np.asarray(record.s)[:steps], np.asarray(record.l)[:steps]
     stride = round(config.stride_s / config.period_s)
     plans = scenes.ego.v.shape[0]
-    for plan in range(stride, plans, stride):
+    learner_s, driver_s = config.turns_s if takeovers else (0.0, clock[-1])
+    for plan in range(1 if takeovers else stride, plans):
         now = plan * config.period_s
         if now + HORIZON_S > clock[-1]:
             return
+        driven = now % (learner_s + driver_s) - learner_s
+        if driven < 0.0 or driven + HORIZON_S > driver_s:
+            continue
+        if round(driven / config.period_s) % stride:
+            continue
         origin = np.interp(now, clock, s)
         row = _flat(jax.tree.map(lambda x, p=plan: np.asarray(x[p]), scenes))
         row["human.s"] = np.interp(now + TIMES_S, clock, s) - origin
@@ -112,6 +130,7 @@ def drive_catalogue(
     output: str | Path,
     config: DriveConfig,
     *,
+    learner: tuple[Policy, Params] | None = None,
     overwrite: bool = False,
 ) -> Manifest:
     """Drive cases with the driver models and write the drives as a dataset.
@@ -123,6 +142,8 @@ def drive_catalogue(
       refs: the cases, each driven by one driver in turn.
       output: dataset folder or tensorstore URL.
       config: duration, stride, split.
+      learner: a policy planning every `period_s`, and its weights, with which
+        the drivers take turns.
       overwrite: replace a finished dataset.
 
     Raises:
@@ -130,8 +151,12 @@ def drive_catalogue(
     """
     writer = DatasetWriter(str(output), overwrite=overwrite)
     every = round(config.period_s / STEP_S)
+    learner_s, driver_s = config.turns_s
     rollout = RolloutConfig(
-        steps=round(config.duration_s / STEP_S), plan_every=every, scenes=True
+        steps=round(config.duration_s / STEP_S),
+        plan_every=every,
+        scenes=True,
+        turns=(round(learner_s / STEP_S), round(driver_s / STEP_S)),
     )
     quality, pending, lineage = QualityReport(), [], []
     names: list[str] = []
@@ -143,7 +168,7 @@ def drive_catalogue(
                 part = refs[first : first + CHUNK]
                 driver = DRIVERS[first // CHUNK % len(DRIVERS)]
                 for ref, rows in zip(
-                    part, _drives(part, driver, rollout, config), strict=True
+                    part, _drives(part, driver, learner, rollout, config), strict=True
                 ):
                     number = len(names)
                     names.append(ref.id)
@@ -171,6 +196,7 @@ def drive_catalogue(
 def _drives(
     refs: Sequence[CaseRef],
     driver: Yielding,
+    learner: tuple[Policy, Params] | None,
     rollout: RolloutConfig,
     config: DriveConfig,
 ) -> Iterator[list[dict]]:
@@ -178,12 +204,15 @@ def _drives(
     cases = build(refs, config.duration_s)
     fill = np.minimum(np.arange(CHUNK), len(refs) - 1)
     full = jax.tree.map(lambda leaf: leaf[fill], cases)
+    policy, params = learner or (yielding_policy(driver), None)
+    relief = yielding_policy(driver) if learner else None
     record, _, scenes = jax.tree.map(
-        np.asarray, drive_cases(yielding_policy(driver), None, full, rollout)
+        np.asarray, drive_cases(policy, params, full, rollout, relief=relief)
     )
     for i in range(len(refs)):
         one = lambda x, i=i: x[i]  # noqa: E731
-        yield list(_rows(jax.tree.map(one, record), jax.tree.map(one, scenes), config))
+        logs = jax.tree.map(one, record), jax.tree.map(one, scenes)
+        yield list(_rows(*logs, config, learner is not None))
 
 
 def _close(writer: DatasetWriter, shard: int, pending: list, lineage: list) -> int:

@@ -44,13 +44,15 @@ def planning_limit(road: Road) -> jax.Array:
         v(s) = min over s' >= s of sqrt(limit(s')^2 + 2 b (s' - s)),  b = 1 m/s^2,
         limit(s) = min(posted, sqrt(2 / |kappa|))          (Apollo, 2 m/s^2)
 
-    One reverse running minimum of limit^2 + 2 b s.
+    One reverse running minimum of limit^2 + 2 b s. A lower limit counts from
+    one grid point before it: between points the planner interpolates.
     """
     slope = jnp.asarray(jnp.gradient(road.path_l, ROAD_STEP_M))
     bend = jnp.asarray(jnp.gradient(slope, ROAD_STEP_M))
     kappa = jnp.abs(road.kappa + bend)
     curve = jnp.sqrt(CENTRIPETAL_MPS2 / jnp.maximum(kappa, 1e-5))
     limit = jnp.minimum(road.speed_limit, curve)
+    limit = jnp.minimum(limit, jnp.concatenate([limit[1:], limit[-1:]]))
     stations = jnp.arange(limit.shape[0]) * ROAD_STEP_M
     ramp = 2.0 * COMFORT_BRAKING_MPS2 * stations
     lowest = jax.lax.cummin(limit**2 + ramp, axis=0, reverse=True)

@@ -44,6 +44,8 @@ class RolloutConfig:
     command_delay: int = 0
     # m/s^3, how fast the ego's braking may build up; None: as the actuator does
     braking_jerk: float | None = None
+    # steps that the policy, then the relief drive in turn (with a relief only)
+    turns: tuple[int, int] = (80, 140)
     # keep the agents and plans for pictures
     snapshots: bool = False
     # keep the planning frames, one per plan
@@ -68,8 +70,12 @@ def drive_case(
     params: Params,
     case: Case,
     config: RolloutConfig,
+    relief: Policy | None = None,
 ) -> tuple[Record, Snapshot | None, Scene | None]:
     """One case from start to end.
+
+    With a `relief`, which takes no weights, the two drive in turn: the policy
+    for `turns[0]` steps, then the relief for `turns[1]`.
 
     Returns:
       The record [S], and where the configuration asks for them the snapshots
@@ -82,7 +88,14 @@ def drive_case(
         world, queue = carry
         scene = observe(case, world, limit)
         with jax.named_scope("policy"):
-            plan = policy(params, scene, jax.random.fold_in(key, world.step))
+            draw = jax.random.fold_in(key, world.step)
+            plan = policy(params, scene, draw)
+            if relief is not None:
+                relieved = world.step % sum(config.turns) >= config.turns[0]
+                other = relief(None, scene, draw)
+                plan = jax.tree.map(
+                    lambda yes, no: jnp.where(relieved, yes, no), other, plan
+                )
 
         def tick(carry: tuple, _: None) -> tuple[tuple, tuple]:
             now, waiting = carry
@@ -132,9 +145,10 @@ def _compiled(
     policy: Policy,
     reduce: Callable[[Record], Logs] | None,
     config: RolloutConfig,
+    relief: Policy | None,
 ) -> Callable:
     def run(params: Params, case: Case) -> Logs:
-        logs = drive_case(policy, params, case, config)
+        logs = drive_case(policy, params, case, config, relief)
         return logs if reduce is None else reduce(logs[0])
 
     return jax.jit(jax.vmap(run, in_axes=(None, 0)))
@@ -146,12 +160,13 @@ def drive_cases(
     cases: Case,
     config: RolloutConfig,
     reduce: Callable[[Record], Logs] | None = None,
+    relief: Policy | None = None,
 ) -> Logs:
     """All cases [B] at once: (records, snapshots, scenes), or what `reduce` makes.
 
     With `reduce` the records never leave the device.
     """
-    return _compiled(policy, reduce, config)(params, cases)
+    return _compiled(policy, reduce, config, relief)(params, cases)
 
 
 def chunks(cases: Case, size: int) -> Iterator[tuple[Case, int]]:
