@@ -36,6 +36,7 @@ _OPTIMIZER = flags.DEFINE_enum(
     "optimizer", "adam", ["sgd", "adam", "rmsprop"], "gradient method"
 )
 _RATE = flags.DEFINE_float("learning_rate", 3e-3, "step size")
+_HALVE = flags.DEFINE_integer("halve_every", 0, "steps per halving; 0: never")
 _DECAY = flags.DEFINE_float("weight_decay", 0.0, "L2 pull on the weights")
 _BATCH = flags.DEFINE_integer("batch_size", 64, "scenes per step, all devices")
 _EPOCHS = flags.DEFINE_integer("epochs", 20, "passes over the training scenes")
@@ -58,6 +59,7 @@ def main() -> None:
         leaky_rate=_LEAKY.value,
         optimizer=_OPTIMIZER.value,
         learning_rate=_RATE.value,
+        halve_every=_HALVE.value,
         weight_decay=_DECAY.value,
         batch_size=_BATCH.value,
         epochs=_EPOCHS.value,

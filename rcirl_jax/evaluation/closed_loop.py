@@ -18,18 +18,16 @@ from rcirl_jax.evaluation.suite_output import (
 )
 from rcirl_jax.evaluation.suite_summary import SuiteReport, summarise
 from rcirl_jax.simulation.careful import judges, preventable, trivial
-from rcirl_jax.simulation.catalogue import load_family, parameters_of
+from rcirl_jax.simulation.cases import STEP_S
 from rcirl_jax.simulation.metrics import CaseMetrics
-from rcirl_jax.simulation.rows import Row
-from rcirl_jax.simulation.suite import CaseRef, build, drive_row, rollout_config
+from rcirl_jax.simulation.rows import RECORDED_HUMAN, Row
+from rcirl_jax.simulation.suite import CaseSet, drive_row, rollout_config
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SuiteConfig:
     """How a suite is driven."""
 
-    # s of every case
-    duration_s: float = 120.0
     # steps of 0.1 s between two plans
     plan_every: int = 1
     # cases driven together; bounds memory
@@ -42,33 +40,35 @@ class SuiteResult:
 
     report: SuiteReport
     runs: Mapping[str, CaseMetrics]
-    refs: tuple[CaseRef, ...]
+    cases: CaseSet
     preventable: np.ndarray
-    facts: Mapping[str, object]  # hashes, timings, memory
+    # by row: seconds, plans per second, steps between plans
+    timings: Mapping[str, Mapping[str, float]]
+    facts: Mapping[str, object]  # hashes, memory
 
 
-def _drive(row: Row, refs: Sequence[CaseRef], config: SuiteConfig) -> CaseMetrics:
-    rollout = rollout_config(row, config.duration_s, config.plan_every)
-    with tqdm.tqdm(total=len(refs), desc=row.name, unit="case", mininterval=0.5) as bar:
+def _drive(row: Row, cases: CaseSet, config: SuiteConfig) -> CaseMetrics:
+    rollout = rollout_config(row, cases.duration_s, config.plan_every)
+    total = len(cases.ids)
+    with tqdm.tqdm(total=total, desc=row.name, unit="case", mininterval=0.5) as bar:
         return drive_row(
             row,
-            lambda first, last: build(refs[first:last], config.duration_s),
-            len(refs),
+            cases.build,
+            total,
             rollout,
             chunk=config.chunk,
             progress=bar.update,
         )
 
 
-def run_suite(
-    rows: Sequence[Row], refs: Sequence[CaseRef], config: SuiteConfig
-) -> SuiteResult:
+def run_suite(rows: Sequence[Row], cases: CaseSet, config: SuiteConfig) -> SuiteResult:
     """Drive every row over the cases and judge them.
 
     The careful drivers and IDM drive first: they say which cases are
-    preventable and how far one gets.
+    preventable and how far one gets. Where the recorded human is a row, its
+    distance is the reference instead of IDM's.
     """
-    classified = {row.name: _drive(row, refs, config) for row in judges()}
+    classified = {row.name: _drive(row, cases, config) for row in judges()}
     avoidable = preventable([classified["CC"], classified["FSM"]])
     calm = trivial([classified["IDM"], classified["constant speed"]])
     runs: dict[str, CaseMetrics] = {}
@@ -76,30 +76,36 @@ def run_suite(
     for row in rows:
         begin = time.perf_counter()
         known = classified.get(row.name)
-        runs[row.name] = _drive(row, refs, config) if known is None else known
+        runs[row.name] = _drive(row, cases, config) if known is None else known
         seconds = time.perf_counter() - begin
         hashes[row.name] = result_hash(runs[row.name])
         if known is None:
             every = row.plan_every or config.plan_every
-            plans = len(refs) * round(config.duration_s / 0.1) / every
+            plans = len(cases.ids) * round(cases.duration_s / STEP_S) / every
             timings[row.name] = {
                 "seconds": round(seconds, 2),
                 "plans_per_s": round(plans / seconds, 1),
                 "plan_every_steps": every,
             }
+    reference = RECORDED_HUMAN if RECORDED_HUMAN in runs else "IDM"
     report = summarise(
-        runs, [ref.family for ref in refs], avoidable, calm, classified["IDM"]
+        runs,
+        cases.groups,
+        avoidable,
+        calm,
+        reference,
+        {**classified, **runs}[reference],
     )
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     return SuiteResult(
         report=report,
         runs=runs,
-        refs=tuple(refs),
+        cases=cases,
         preventable=avoidable,
+        timings=timings,
         facts={
-            "duration_s": config.duration_s,
+            "duration_s": cases.duration_s,
             "chunk": config.chunk,
-            "timings": timings,
             "peak_memory_gib": round(peak, 2),
             "result_sha256": hashes,
         },
@@ -115,11 +121,17 @@ def write_suite(
     text = format_suite(result.report) + "\n" + format_families(result.report, first)
     (folder / "table.txt").write_text(text)
     write_json(
-        folder / "suite.json", result.report, {**result.facts, "made_by": provenance}
+        folder / "suite.json",
+        result.report,
+        {**result.facts, "timings": result.timings, "made_by": provenance},
     )
-    ids = [ref.id for ref in result.refs]
-    drawn = [parameters_of(load_family(r.family), r.index, r.seed) for r in result.refs]
-    write_csv(folder / "cases.csv", result.runs, ids, result.preventable, drawn)
+    write_csv(
+        folder / "cases.csv",
+        result.runs,
+        result.cases.ids,
+        result.preventable,
+        result.cases.parameters,
+    )
     return text
 
 
@@ -133,4 +145,4 @@ def worst_cases(result: SuiteResult, row: str, count: int = 10) -> list[str]:
         + np.asarray(metrics.max_j) / 100.0
     )
     order = np.argsort(-key, kind="stable")[:count]
-    return [result.refs[i].id for i in order.tolist()]
+    return [result.cases.ids[i] for i in order.tolist()]

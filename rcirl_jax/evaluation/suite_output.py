@@ -44,7 +44,7 @@ def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 def format_suite(report: SuiteReport) -> str:
     """The paper's table per case and per sample, safety and progress, differences."""
     lines = [
-        f"{report.cases:,} cases of {len(report.families)} families; "
+        f"{report.cases:,} cases of {len(report.families)} groups; "
         f"{report.preventable:,} preventable by a careful driver, "
         f"{report.trivial:,} trivial.",
         "Cells: % [exact 95 % interval]; (>=): rule of three where nothing failed.",
@@ -61,7 +61,10 @@ def format_suite(report: SuiteReport) -> str:
             for name, row in report.rows.items()
         ]
         lines += _table(header, [*rows, paper])
-    lines += ["", "Jerk filtered as in nuPlan, safety and progress"]
+    lines += [
+        "",
+        f"Jerk filtered as in nuPlan; safety; progress against {report.reference}",
+    ]
     lines += _table(
         ["", "|j| case", "|j| sample", "faults", "prevent.", "VRU", "hits", "red",
          "stop", "off road", "progress", "nuPlan [95 %]"],
@@ -123,7 +126,7 @@ def format_families(report: SuiteReport, row: str) -> str:
         cells.append(f"{100 * found['progress_ratio']:.0f} %")
         cells.append(f"{100 * found['nuplan']:.1f}")
         rows.append(cells)
-    title = f"{row}: per family (rates per sample, progress against IDM)"
+    title = f"{row}: per family (rates per sample, progress against {report.reference})"
     return "\n".join([title, *_table(header, rows)]) + "\n"
 
 

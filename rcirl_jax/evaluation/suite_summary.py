@@ -23,7 +23,6 @@ from rcirl_jax.evaluation.statistics import (
 )
 from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics, nuplan_score
 
-REFERENCE = "IDM"  # the row whose distance is nuPlan's "expert route"
 PAPER = {  # %, the paper's Table II, RC-IRL row
     "collision_free": 100.0,
     "speed_limit": 100.0,
@@ -91,6 +90,8 @@ class SuiteReport:
     families: tuple[str, ...]
     preventable: int
     trivial: int
+    # the row whose distance is nuPlan's "expert route"
+    reference: str
     rows: Mapping[str, RowSummary]
     comparisons: tuple[Comparison, ...]
 
@@ -107,6 +108,7 @@ def summarise(
     families: Sequence[str],
     preventable: np.ndarray,
     trivial: np.ndarray,
+    reference_name: str,
     reference: CaseMetrics,
 ) -> SuiteReport:
     """The report of all rows.
@@ -116,7 +118,8 @@ def summarise(
       families: [C] family of every case.
       preventable: [C] bool, of `simulation.careful`.
       trivial: [C] bool.
-      reference: metrics [C] of the row that sets the distance (IDM).
+      reference_name: the row that sets the distance.
+      reference: its metrics [C].
     """
     names = np.asarray(families)
     scores = {
@@ -137,6 +140,7 @@ def summarise(
         families=tuple(dict.fromkeys(families)),
         preventable=int(preventable.sum()),
         trivial=int(trivial.sum()),
+        reference=reference_name,
         rows=rows,
         comparisons=comparisons,
     )

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 from rcirl_jax.features import FeatureMap
 from rcirl_jax.types import Normaliser
 
-SCALE_FLOOR = 1e-3  # share of a feature's declared range; the smallest scale
+SCALE_FLOOR = 0.03  # share of a feature's declared range; the smallest scale
 
 
 def normalise(
@@ -25,7 +25,8 @@ def fit_normaliser(features: np.ndarray, feature_map: FeatureMap) -> Normaliser:
 
     A feature that sits at its "none" value most of the time has no spread
     between the quantiles; its standard deviation is used, and at least
-    SCALE_FLOOR of the declared range, so that no scale is near zero.
+    SCALE_FLOOR of the declared range: a feature that is seldom active must not
+    arrive at the network as 20 or 1,000 of its own standard deviations.
     """
     lower = np.array([spec.lower for spec in feature_map.specs])
     upper = np.array([spec.upper for spec in feature_map.specs])

@@ -27,6 +27,7 @@ from rcirl_jax.planner.yielding import Yielding, yielding_policy
 from rcirl_jax.reward.network import RewardConfig, init_reward, pinned
 from rcirl_jax.types import Normaliser, RewardParams
 
+RECORDED_HUMAN = "recorded human"
 BASELINES = ("hand-set", "IDM", "IDM yielding", "constant speed", "random weights")
 
 
@@ -73,6 +74,11 @@ def dp_row(
     """A learned reward planning by dynamic programming, every `plan_every` steps."""
     policy = dp_policy(feature_map(preset), activation, config, dp)
     return Row(name=name, policy=policy, params=weights, plan_every=plan_every)
+
+
+def human_row() -> Row:
+    """The recorded human; only for cases with a replay. Its policy never acts."""
+    return Row(name=RECORDED_HUMAN, policy=constant_speed_policy, follow_log=True)
 
 
 def baseline_row(

@@ -3,6 +3,7 @@
     full        every family of data_specs/scenarios, as many cases as it declares
     smoke       one case of every family, 20 s
     FAMILY[,F]  all cases of the named families
+    recorded    drives cut out of recordings; the others leave the log if need be
 
 Cases are built, driven and reduced to metrics chunk by chunk, so memory does
 not depend on how many there are; every chunk has the same shapes, so a row
@@ -10,11 +11,12 @@ compiles once.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import jax
 import numpy as np
 
+from rcirl_jax.data.recording import Recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.simulation.cases import STEP_S, Case
 from rcirl_jax.simulation.catalogue import (
@@ -22,9 +24,11 @@ from rcirl_jax.simulation.catalogue import (
     case_id,
     family_names,
     load_family,
+    parameters_of,
     parse_case_id,
 )
 from rcirl_jax.simulation.metrics import CaseMetrics, MetricsConfig, case_metrics
+from rcirl_jax.simulation.recorded import RecordedConfig, recorded_cases
 from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases
 from rcirl_jax.simulation.rows import Row
 
@@ -106,6 +110,50 @@ def build(refs: Sequence[CaseRef], duration_s: float) -> Case:
     joined = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
     back = np.argsort(order)
     return jax.tree.map(lambda leaf: leaf[back], joined)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CaseSet:
+    """The cases of a suite, by place 0 .. C - 1, built when they are needed."""
+
+    ids: tuple[str, ...]
+    # what belongs together: the family, or the recording
+    groups: tuple[str, ...]
+    # drawn parameters of each case, for the CSV
+    parameters: tuple[Mapping[str, float], ...]
+    # (first, last) -> cases of that range, stacked
+    build: Callable[[int, int], Case]
+    duration_s: float
+
+
+def catalogue_set(refs: Sequence[CaseRef], duration_s: float) -> CaseSet:
+    """Cases of the catalogue."""
+    drawn = [parameters_of(load_family(r.family), r.index, r.seed) for r in refs]
+    return CaseSet(
+        ids=tuple(ref.id for ref in refs),
+        groups=tuple(ref.family for ref in refs),
+        parameters=tuple(drawn),
+        build=lambda first, last: build(refs[first:last], duration_s),
+        duration_s=duration_s,
+    )
+
+
+def recorded_set(recordings: Iterable[Recording], config: RecordedConfig) -> CaseSet:
+    """Drives of recordings, all of them in memory; grouped by recording.
+
+    Raises:
+      InputError: no drive is suitable.
+    """
+    cases, ids = recorded_cases(recordings, config)
+    assert cases.replay is not None
+    steps = cases.replay.ego_s.shape[1] - 1
+    return CaseSet(
+        ids=ids,
+        groups=tuple(name.rsplit(":", 1)[0] for name in ids),
+        parameters=tuple({} for _ in ids),
+        build=lambda first, last: jax.tree.map(lambda x: x[first:last], cases),
+        duration_s=steps * STEP_S,
+    )
 
 
 def rollout_config(

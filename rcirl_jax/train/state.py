@@ -12,7 +12,9 @@ from rcirl_jax.reward import LOSSES, Normaliser, RewardConfig, RewardParams
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.types import Demonstration
 
-OPTIMIZERS: dict[str, Callable[[float], optax.GradientTransformation]] = {
+OPTIMIZERS: dict[
+    str, Callable[[optax.ScalarOrSchedule], optax.GradientTransformation]
+] = {
     "sgd": lambda rate: optax.sgd(rate, momentum=0.9),
     "adam": optax.adam,
     "rmsprop": optax.rmsprop,
@@ -36,6 +38,8 @@ class TrainConfig:
     optimizer: str = "adam"
     # 1/step
     learning_rate: float = 3e-3
+    # steps after which the step size has halved, smoothly (0: it stays)
+    halve_every: int = 0
     # L2 pull on kernels and biases, per step
     weight_decay: float = 0.0
     # scenes per step, over all devices
@@ -67,6 +71,8 @@ class TrainConfig:
             if not low < getattr(self, name) < 1.0:
                 found = getattr(self, name)
                 raise InputError(f"--{name}: {found}: expected between 0 and 1")
+        if self.halve_every < 0:
+            raise InputError(f"--halve_every: {self.halve_every}: expected >= 0")
         for name in ("batch_size", "epochs"):
             if getattr(self, name) < 1:
                 raise InputError(f"--{name}: {getattr(self, name)}: expected >= 1")
@@ -102,6 +108,9 @@ class FeatureBatch(flax.struct.PyTreeNode, kw_only=True):
 
 
 def make_optimizer(config: TrainConfig) -> optax.GradientTransformation:
-    """The optimiser named in the configuration."""
+    """The optimiser named in the configuration, its step size halved as asked."""
     decay = optax.add_decayed_weights(config.weight_decay)
-    return optax.chain(decay, OPTIMIZERS[config.optimizer](config.learning_rate))
+    rate: optax.ScalarOrSchedule = config.learning_rate
+    if config.halve_every:
+        rate = optax.exponential_decay(rate, config.halve_every, 0.5)
+    return optax.chain(decay, OPTIMIZERS[config.optimizer](rate))

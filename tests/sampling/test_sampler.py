@@ -17,8 +17,9 @@ from rcirl_jax.sampling import (
     sample,
     trajectory_on_path,
 )
+from rcirl_jax.sampling.speed import speed_envelope
 from rcirl_jax.types import Kind
-from rcirl_jax.units import TIMES_S
+from rcirl_jax.units import STATION_STEP_M, TIMES_S
 from tests.scenes import batch, random_scene, scene
 
 CONFIGS = {mode: SamplerConfig(mode=mode) for mode in ("speed", "path_speed")}
@@ -163,3 +164,41 @@ def test_hard_negatives_depart_from_the_human_with_time():
 def test_unknown_mode_is_one_line():
     with pytest.raises(InputError, match="--mode: sideways: expected one of"):
         SamplerConfig(mode="sideways")
+
+
+def stepped_scene(first=15.0, second=8.0, station=60.0, **changes):
+    """The limit changes at a station."""
+    made = scene(speed_limit=first, **changes)
+    stations = STATION_STEP_M * jnp.arange(made.path.speed_limit.shape[0])
+    limit = jnp.where(stations < station, first, second)
+    return made.replace(path=made.path.replace(speed_limit=limit))
+
+
+def test_speed_envelope_equals_its_definition():
+    made = stepped_scene(kappa=0.01)
+    lateral, braking = np.array([2.0, 0.5]), np.array([1.0, 0.7])
+    found = speed_envelope(made, jnp.asarray(lateral), jnp.asarray(braking))
+    stations = STATION_STEP_M * np.arange(found.shape[1])
+    limit = np.asarray(made.path.speed_limit)
+    for row, a, b in zip(np.asarray(found), lateral, braking, strict=True):
+        cap = np.minimum(limit**2, a / 0.01)
+        for i in range(0, stations.size, 7):
+            ways = stations[i:] - stations[i]
+            expected = np.sqrt(np.min(cap[i:] + 2.0 * b * ways))
+            assert row[i] == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("change", [(15.0, 8.0), (8.0, 15.0)])
+def test_envelope_drives_up_to_a_changing_limit(change):
+    """Below it throughout, and close to it where there was time to get there."""
+    first, second = change
+    made = stepped_scene(first, second, v=0.95 * first)
+    candidates = SAMPLE["speed"](jax.random.key(0), made)
+    index = family(candidates, "envelope")[0]
+    s, v = candidates.trajectory.s[index], np.asarray(candidates.trajectory.v[index])
+    limit = np.asarray(jnp.interp(s, STATION_STEP_M * jnp.arange(made.path.l.size),
+                                  made.path.speed_limit))  # fmt: skip
+    assert (v[1:] <= limit[1:] + 0.1).all()
+    assert v[-1] > 0.85 * second
+    assert np.asarray(candidates.feasible)[index]
+    assert np.abs(candidates.trajectory.a[index]).max() < 2.5

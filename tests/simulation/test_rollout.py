@@ -10,7 +10,7 @@ from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.planner.rank import idm_policy
 from rcirl_jax.simulation.cases import NUM_AGENTS, Replay
 from rcirl_jax.simulation.metrics import MetricsConfig, case_metrics
-from rcirl_jax.simulation.rollout import RolloutConfig
+from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases
 from rcirl_jax.simulation.rows import Row
 from rcirl_jax.simulation.suite import build, drive_row, suite_refs
 from tests.simulation.drives import constant, drive, stack
@@ -166,3 +166,22 @@ def test_the_recorded_human_drives_its_log():
 def test_plan_every_has_to_divide_the_steps(bad):
     with pytest.raises(InputError, match="plan_every"):
         RolloutConfig(**bad)
+
+
+def test_policy_and_relief_take_turns():
+    """The policy brakes for 3 s, the relief accelerates for 2 s, and again."""
+    config = RolloutConfig(steps=100, turns=(30, 20))
+
+    def faster(params, scene, key):
+        return constant(jnp.float32(1.0), scene, key)
+
+    record, *_ = drive_cases(
+        constant,
+        jnp.float32(-1.0),
+        stack([make_case(speed=20.0)]),
+        config,
+        relief=faster,
+    )
+    command = np.asarray(record.command)[0]
+    expected = np.where(np.arange(100) % 50 < 30, -1.0, 1.0)
+    np.testing.assert_array_equal(command, expected)

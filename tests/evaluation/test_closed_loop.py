@@ -1,0 +1,91 @@
+"""A small suite from rows to files: the numbers, their hash, what is refused."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from rcirl_jax.evaluation.closed_loop import (
+    SuiteConfig,
+    run_suite,
+    worst_cases,
+    write_suite,
+)
+from rcirl_jax.planner.baselines import Idm
+from rcirl_jax.planner.rank import constant_speed_policy, idm_policy
+from rcirl_jax.simulation.metrics import COLUMNS
+from rcirl_jax.simulation.rows import Row
+from rcirl_jax.simulation.suite import catalogue_set, suite_refs
+
+FAMILIES = "free_cruise,stopped_lead"
+ROWS = [
+    Row(name="careful", policy=idm_policy(Idm(headway=2.5, standstill_gap=5.0))),
+    Row(name="IDM", policy=idm_policy(Idm())),
+    Row(name="constant speed", policy=constant_speed_policy),
+]
+
+
+def run(chunk):
+    cases = catalogue_set(suite_refs(FAMILIES, 3), 30.0)
+    return run_suite(ROWS, cases, SuiteConfig(plan_every=2, chunk=chunk))
+
+
+@pytest.fixture(scope="module")
+def result():
+    return run(4)
+
+
+def test_rates_are_those_of_the_metrics(result):
+    report = result.report
+    assert report.cases == 6
+    assert set(report.rows) == {row.name for row in ROWS}
+    for name, row in report.rows.items():
+        metrics = result.runs[name]
+        for i, column in enumerate(COLUMNS):
+            found = row.per_case[column]
+            assert (found.k, found.n) == (metrics.holds[:, i].sum(), 6)
+            assert found.low <= found.rate <= found.high
+            assert row.per_sample[column].k == metrics.inside[:, i].sum()
+        assert row.at_fault == (metrics.at_fault > 0).sum()
+    assert report.rows["IDM"].progress_ratio == pytest.approx(1.0)
+    assert report.rows["constant speed"].at_fault == 3  # the standing leaders
+
+
+def test_differences_are_paired(result):
+    first = result.runs["careful"].holds
+    for item in result.report.comparisons:
+        other = result.runs[item.b].holds
+        for i, (wins, losses, p, adjusted) in enumerate(item.columns.values()):
+            assert wins == (first[:, i] & ~other[:, i]).sum()
+            assert losses == (~first[:, i] & other[:, i]).sum()
+            assert p <= adjusted <= 1.0
+
+
+def test_the_hash_does_not_depend_on_run_or_chunk(result):
+    for chunk in (4, 6):
+        again = run(chunk)
+        assert again.facts["result_sha256"] == result.facts["result_sha256"]
+    hashes = result.facts["result_sha256"]
+    assert len(set(hashes.values())) == len(ROWS)
+
+
+def test_files_say_the_same(result, tmp_path):
+    text = write_suite(result, tmp_path, {"git": "none"})
+    assert (tmp_path / "table.txt").read_text() == text
+    assert "constant speed" in text
+    assert "the paper, RC-IRL" in text
+    body = json.loads((tmp_path / "suite.json").read_text())
+    assert body["report"]["cases"] == 6
+    with (tmp_path / "cases.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 6 * len(ROWS)
+    of_one = [r for r in rows if r["row"] == "constant speed"]
+    faults = np.array([int(r["at_fault"]) for r in of_one])
+    np.testing.assert_array_equal(faults, result.runs["constant speed"].at_fault)
+    assert {r["case"] for r in rows} == set(result.cases.ids)
+
+
+def test_the_worst_cases_come_first(result):
+    worst = worst_cases(result, "constant speed", 3)
+    assert all(name.startswith("stopped_lead/") for name in worst)

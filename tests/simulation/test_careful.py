@@ -1,0 +1,89 @@
+"""Careful drivers: their formulas, and the verdict per case."""
+
+import types
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rcirl_jax.simulation.careful import (
+    Careful,
+    cc_braking,
+    fsm_braking,
+    judges,
+    preventable,
+    trivial,
+)
+from rcirl_jax.types import Kind
+from tests.simulation.drives import drive
+from tests.simulation.worlds import make_case
+
+C = Careful()
+
+
+def test_cc_brakes_at_two_seconds():
+    v, lead = jnp.float32(20.0), jnp.float32(10.0)
+    assert cc_braking(jnp.float32(20.1), v, lead, C) == 0.0
+    assert cc_braking(jnp.float32(19.9), v, lead, C) == pytest.approx(7.59)
+    assert cc_braking(jnp.float32(5.0), v, jnp.float32(21.0), C) == 0.0
+
+
+def test_fsm_grows_as_the_gap_shrinks():
+    gaps = jnp.linspace(120.0, 1.0, 60)
+    brakes = np.array(
+        [
+            fsm_braking(g, jnp.float32(20.0), jnp.float32(0.0), jnp.float32(5.0), C)
+            for g in gaps
+        ]
+    )
+    assert brakes[0] == 0.0
+    assert (np.diff(brakes) >= -1e-5).all()
+    assert brakes[-1] == pytest.approx(C.b_max)
+    proactive = brakes[(brakes > 0.0) & (brakes <= C.b_min)]
+    assert proactive.size > 0  # it brakes before the conflict is critical
+
+
+def test_a_visible_standing_car_is_avoided_by_both():
+    case = make_case([{"s": 120.0, "v": 0.0, "kind": Kind.STATIC}], speed=15.0)
+    for row in judges()[:2]:
+        record, _ = drive(
+            [case],
+            policy=row.policy,
+            params=None,
+            command_delay=row.command_delay,
+            braking_jerk=row.braking_jerk,
+        )
+        assert record.collision.sum() == 0
+        assert record.v[0, -1] < 0.1
+
+
+def test_a_wall_out_of_nowhere_is_avoided_by_neither():
+    case = make_case(
+        [{"s": 60.0, "v": 0.0, "kind": Kind.STATIC, "appear_s": 50.0}], speed=15.0
+    )
+    crashed = []
+    for row in judges()[:2]:
+        record, _ = drive(
+            [case],
+            policy=row.policy,
+            params=None,
+            command_delay=row.command_delay,
+            braking_jerk=row.braking_jerk,
+        )
+        crashed.append(record.collision.sum() > 0)
+    assert all(crashed)
+
+
+def metrics(**values):
+    return types.SimpleNamespace(**{k: np.array(v) for k, v in values.items()})
+
+
+def test_preventable_unless_both_crash():
+    one, other = metrics(at_fault=[0, 1, 0, 1]), metrics(at_fault=[0, 0, 1, 1])
+    np.testing.assert_array_equal(preventable([one, other]), [True, True, True, False])
+
+
+def test_trivial_only_where_nobody_comes_near():
+    one = metrics(collisions=[0, 0, 1], min_ttc=[9.0, 1.0, 9.0])
+    other = metrics(collisions=[0, 0, 0], min_ttc=[np.inf, 9.0, 9.0])
+    np.testing.assert_array_equal(trivial([one, other]), [True, False, False])

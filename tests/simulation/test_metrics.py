@@ -1,0 +1,148 @@
+"""Metrics of hand-made records, and the filter against scipy's."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.signal import savgol_filter
+
+from rcirl_jax.simulation.cases import STEP_S, Record
+from rcirl_jax.simulation.filters import savitzky_golay
+from rcirl_jax.simulation.metrics import (
+    COLUMNS,
+    MetricsConfig,
+    case_metrics,
+    nuplan_score,
+)
+
+S = 100
+NEVER = ("ttc", "headway", "clearance")
+FLAGS = ("ttc_counts", "red_light", "stop_sign", "fallback")
+COUNTS = ("collision", "at_fault", "at_fault_vru", "at_fault_object")
+MEASURE = jax.jit(lambda record: case_metrics(record, MetricsConfig()))
+
+
+def record(**changes):
+    """10 m/s on a straight empty road under a limit of 15 m/s."""
+    leaves = {
+        field.name: np.zeros(S, np.float32) for field in dataclasses.fields(Record)
+    }
+    leaves |= {name: np.full(S, np.inf, np.float32) for name in NEVER}
+    leaves |= {name: np.zeros(S, bool) for name in FLAGS}
+    leaves |= {name: np.zeros(S, np.int32) for name in COUNTS}
+    leaves |= {
+        "valid": np.ones(S, bool),
+        "v": np.full(S, 10.0, np.float32),
+        "s": np.arange(1, S + 1, dtype=np.float32),
+        "speed_limit": np.full(S, 15.0, np.float32),
+    }
+    return Record(**{k: jnp.asarray(v) for k, v in (leaves | changes).items()})
+
+
+def at(step, value, base=0.0, kind=np.float32):
+    out = np.full(S, base, kind)
+    out[step] = value
+    return out
+
+
+def measured(**changes):
+    return jax.tree.map(np.asarray, MEASURE(record(**changes)))
+
+
+@pytest.mark.parametrize("window", [5, 8, 15])
+@pytest.mark.parametrize("derivative", [0, 1])
+def test_filter_equals_scipy_inside(window, derivative):
+    x = np.random.default_rng(window).normal(size=200).astype(np.float32)
+    odd = window | 1
+    ours = savitzky_golay(jnp.asarray(x), window, derivative=derivative)
+    theirs = savgol_filter(x, odd, 2, deriv=derivative, delta=STEP_S)
+    half = odd // 2
+    np.testing.assert_allclose(
+        np.asarray(ours)[half:-half], theirs[half:-half], atol=2e-4
+    )
+
+
+def test_a_calm_drive_holds_every_column():
+    found = measured()
+    assert found.holds.all()
+    assert found.holds_filtered.all()
+    np.testing.assert_array_equal(found.inside, S)
+    assert found.progress == S
+    assert found.samples == S
+    for part in ("no_fault", "drivable", "direction", "ttc_bound", "comfort"):
+        assert getattr(found, part) == 1.0
+    score, ratio = nuplan_score(found, np.float32(S))
+    assert score == pytest.approx(1.0)
+    assert ratio == 1.0
+
+
+@pytest.mark.parametrize(
+    ("column", "changes"),
+    [
+        ("speed_limit", {"v": at(40, 15.2, 10.0)}),
+        ("a_station", {"a": at(slice(40, 43), -4.1)}),
+        ("a_lateral", {"curvature": at(slice(40, 43), 0.041)}),
+        ("j_station", {"a": at(slice(40, None), 0.61)}),
+        ("j_lateral", {"curvature": at(slice(40, None), 0.0061)}),
+    ],
+)
+def test_each_column_sees_its_own_excess(column, changes):
+    index = COLUMNS.index(column)
+    found = measured(**changes)
+    assert not found.holds[index]
+    assert S - 4 <= found.inside[index] < S
+    jerks = {COLUMNS.index("j_station"), COLUMNS.index("j_lateral")}
+    for other in set(range(len(COLUMNS))) - jerks - {index}:
+        assert found.holds[other]
+
+
+def test_raw_jerk_of_a_pulse_is_hidden_by_the_filter():
+    found = measured(a=at(50, 0.8))
+    assert not found.holds[COLUMNS.index("j_station")]
+    assert found.holds_filtered[0]
+    assert found.max_j == pytest.approx(8.0, rel=1e-4)
+
+
+def test_a_crash_of_own_fault_fails_every_column_and_the_score():
+    found = measured(
+        collision=at(60, 1, 0, np.int32),
+        at_fault=at(60, 1, 0, np.int32),
+        valid=np.arange(S) <= 60,
+    )
+    assert not found.holds.any()
+    assert not found.holds_filtered.any()
+    assert found.samples == 61
+    assert found.at_fault == 1
+    assert nuplan_score(found, np.float32(S))[0] == 0.0
+
+
+def test_samples_after_the_end_do_not_count():
+    found = measured(valid=np.arange(S) < 30, v=np.where(np.arange(S) < 30, 10.0, 99.0))
+    assert found.holds.all()
+    assert found.samples == 30
+    assert found.mean_speed == pytest.approx(10.0)
+
+
+def test_ttc_counts_only_where_nuplan_looks():
+    ttc = at(50, 0.5, np.inf)
+    assert measured(ttc=ttc).ttc_bound == 1.0
+    found = measured(ttc=ttc, ttc_counts=at(50, True, False, bool))
+    assert found.ttc_bound == 0.0
+    assert found.tet == pytest.approx(0.1)
+    assert found.tit == pytest.approx(0.1)
+
+
+def test_brake_taps_are_turns_of_the_acceleration():
+    a = np.zeros(S, np.float32)
+    a[20:25], a[25:30] = 0.8, -0.8
+    assert measured(a=a).brake_taps == 1
+    assert measured(a=at(slice(25, 30), -0.8)).brake_taps == 0
+
+
+def test_little_progress_zeroes_the_score():
+    assert nuplan_score(measured(), np.float32(10.0 * S))[0] == 0.0
+    half, ratio = nuplan_score(measured(), np.float32(2.0 * S))
+    assert ratio == 0.5
+    assert half == pytest.approx((16.0 - 2.5) / 16.0)
