@@ -10,7 +10,7 @@ recorded futures) with what the driver did in the following 8 s.
 It is a stand-in for human logs and says so in its manifest's source.
 
 With a learner the two take turns, as in a test car with a safety driver: the
-learner drives 8 s, the driver takes over for 14 s, and only scenes whose whole
+learner drives 25 s, the driver takes over for 13 s, and only scenes whose whole
 future was driven by the driver are kept. They show what to do where the
 learner's own mistakes lead (Ross et al. 2011, "DAgger", on takeovers).
 """
@@ -69,7 +69,7 @@ class DriveConfig:
     test_fraction: float = 0.2
     split_seed: int = 0
     # s that the learner, then the driver drive in turn (with a learner only)
-    turns_s: tuple[float, float] = (8.0, 14.0)
+    turns_s: tuple[float, float] = (25.0, 13.0)
 
 
 def _rows(

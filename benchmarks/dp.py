@@ -1,0 +1,112 @@
+"""Time of one DP plan, and how much value it finds beyond ranking.
+
+    taskset -c 0 python -m benchmarks.dp
+
+The lattice at two resolutions and ranking (64 and 512 candidates) in turn on
+the same scenes, one core. Value gained by the DP is given in the unit of the
+spread between the best and the median candidate of each scene.
+"""
+
+import dataclasses
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from absl import app, flags
+
+from benchmarks.common import percentiles, write
+from rcirl_jax.export.loading import open_reward, reward_params
+from rcirl_jax.features import feature_map
+from rcirl_jax.planner.dp import plan_dp
+from rcirl_jax.planner.grid import DpConfig
+from rcirl_jax.planner.rank import ONLINE, learned_score
+from rcirl_jax.planner.safety import check
+from rcirl_jax.reward import RewardConfig, init_reward, pinned
+from rcirl_jax.sampling import num_candidates, sample
+from rcirl_jax.types import Normaliser, Scene
+from tests.scenes import random_scene
+
+_WEIGHTS = flags.DEFINE_string("weights", None, "weights file (default: random)")
+_SCENES = flags.DEFINE_integer("scenes", 24, "scenes")
+_OUTPUT = flags.DEFINE_string("output", "benchmarks/results", "folder of the JSON")
+
+
+def _reward() -> tuple:
+    """(weights, activation) of the file, or random ones with declared scales."""
+    if _WEIGHTS.value:
+        reward = open_reward(_WEIGHTS.value)
+        return reward_params(reward), reward.activation
+    shape = RewardConfig()
+    specs = feature_map("paper21").specs
+    lower = jnp.asarray([s.lower for s in specs])
+    upper = jnp.asarray([s.upper for s in specs])
+    middle, scale = 0.5 * (lower + upper), 0.25 * (upper - lower)
+    normaliser = Normaliser(lower=lower, upper=upper, location=middle, scale=scale)
+    params = pinned(init_reward(jax.random.key(0), 21, shape), shape)
+    return (params, normaliser), shape.activation
+
+
+def main(_: list[str]) -> None:
+    """Alternate the planners over the scenes."""
+    weights, activation = _reward()
+    features = feature_map("paper21")
+    score = learned_score(features, activation)
+
+    def best_of(count: int) -> object:
+        more = ONLINE.num_random + count - num_candidates(ONLINE)
+        config = dataclasses.replace(ONLINE, num_random=more)
+
+        def plan(scene: Scene) -> tuple[jax.Array, jax.Array]:
+            candidates = sample(jax.random.key(0), scene, config)
+            values = score(weights, scene, candidates)
+            fine = check(scene, candidates).admissible
+            middle = jnp.nanmedian(jnp.where(candidates.feasible, values, jnp.nan))
+            return jnp.max(jnp.where(fine, values, -jnp.inf)), middle
+
+        return jax.jit(plan)
+
+    def lattice(step: float) -> object:
+        config = DpConfig(step=step)
+
+        def plan(scene: Scene) -> tuple[jax.Array, jax.Array]:
+            found = plan_dp(scene, weights, features, activation, config)
+            return jnp.where(found.feasible, found.value, -jnp.inf), found.value
+
+        return jax.jit(plan)
+
+    planners = {
+        "rank_64": best_of(64),
+        "rank_512": best_of(512),
+        "dp_step_2": lattice(2.0),
+        "dp_step_1": lattice(1.0),
+    }
+    scenes = [jax.tree.map(jnp.asarray, random_scene(i)) for i in range(_SCENES.value)]
+    seconds: dict[str, list[float]] = {name: [] for name in planners}
+    values: dict[str, list[float]] = {name: [] for name in planners}
+    medians = []
+    for plan in planners.values():
+        jax.block_until_ready(plan(scenes[0]))  # type: ignore[operator]
+    for scene in scenes:
+        for name, plan in planners.items():
+            begin = time.perf_counter()
+            best, middle = jax.block_until_ready(plan(scene))  # type: ignore[operator]
+            seconds[name].append(time.perf_counter() - begin)
+            values[name].append(float(best))
+            if name == "rank_64":
+                medians.append(float(middle))
+    result: dict = {name: percentiles(found) for name, found in seconds.items()}
+    table = {name: np.array(found) for name, found in values.items()}
+    spread = table["rank_64"] - np.array(medians)
+    for name in ("rank_512", "dp_step_2", "dp_step_1"):
+        both = np.isfinite(table[name]) & np.isfinite(table["rank_64"]) & (spread > 0.0)
+        gain = (table[name] - table["rank_64"])[both] / spread[both]
+        result[name]["value_gain_median"] = round(float(np.median(gain)), 4)
+        result[name]["scenes"] = int(both.sum())
+    for name, found in result.items():
+        print(f"{name}: {found}")
+    print(f"written: {write('dp', result, _OUTPUT.value)}")
+
+
+if __name__ == "__main__":
+    app.run(main)

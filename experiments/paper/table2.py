@@ -1,0 +1,124 @@
+"""Table II of the paper: closed-loop rates of every row, from drives to table.
+
+    python -m experiments.paper.table2 --output=DIR [--quick]
+
+    drives     a driver model drives catalogue cases of another seed
+    weights    RC-IRL 21-15-1 and its linear form are trained on them; the first
+               drives, the driver takes over, both are trained again on both sets
+    table      every row over the suite; DP rows on `--dp_cases` of each family
+    recorded   with --input: the same rows and the recorded human on its drives
+
+Finished parts are kept and reused. Expected: about 90 minutes on two cores, most
+of it the suite; RC-IRL without collisions and above the paper's row per sample,
+hand-set behind it in acceleration and jerk per case. `--quick` makes the same
+files from a few cases in about four minutes; its numbers mean nothing.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from absl import flags
+
+from experiments.common import provenance, run
+from rcirl_jax.data.importers import IMPORTERS, read_recordings
+from rcirl_jax.data.joined import open_datasets
+from rcirl_jax.evaluation.closed_loop import SuiteConfig, run_suite, write_suite
+from rcirl_jax.export.closed_loop import table_rows
+from rcirl_jax.export.from_run import export_run
+from rcirl_jax.reward import RewardConfig
+from rcirl_jax.simulation.cases import STEP_S
+from rcirl_jax.simulation.demonstrations import DriveConfig, drive_catalogue
+from rcirl_jax.simulation.recorded import RecordedConfig
+from rcirl_jax.simulation.rows import BASELINES, human_row
+from rcirl_jax.simulation.suite import (
+    FULL_S,
+    CaseSet,
+    catalogue_set,
+    recorded_set,
+    suite_refs,
+)
+from rcirl_jax.train.loop import train
+from rcirl_jax.train.state import TrainConfig
+
+_OUTPUT = flags.DEFINE_string("output", "out/table2", "folder for everything")
+_WEIGHTS = flags.DEFINE_list("weights", None, "weights files instead of training")
+_INPUT = flags.DEFINE_string("input", None, "recordings for the recorded rows")
+_FORMAT = flags.DEFINE_enum("format", "commonroad", sorted(IMPORTERS), "of --input")
+_DP_CASES = flags.DEFINE_integer("dp_cases", 2, "cases per family of the DP rows")
+_EVERY = flags.DEFINE_integer("plan_every", 1, "steps of 0.1 s between two plans")
+_SEED = flags.DEFINE_integer("seed", 0, "of training")
+_QUICK = flags.DEFINE_bool("quick", False, "a few short cases and one epoch")
+
+SHAPES = {"rcirl": (15,), "linear": ()}
+
+
+def _drives(folder: Path, seed: int, learner: Path | None) -> Path:
+    """The demonstrations, made once."""
+    if not (folder / "manifest.json").exists():
+        duration = 40.0 if _QUICK.value else FULL_S
+        config = DriveConfig(duration_s=duration, stride_s=1.0 if learner else 3.0)
+        refs = suite_refs("full", 1 if _QUICK.value else 60, seed)
+        row = None
+        if learner:
+            row = table_rows([str(learner)], (), round(config.period_s / STEP_S))[0]
+        by = (row.policy, row.params) if row else None
+        drive_catalogue(refs, folder, config, learner=by)
+    return folder
+
+
+def _weights(folder: Path, name: str, data: Sequence[Path]) -> Path:
+    """One shape trained on drives and exported, made once."""
+    file = folder / f"{name}.msgpack"
+    if not file.exists():
+        dataset = open_datasets([str(path) for path in data])
+        config = TrainConfig(
+            positive="nearest",
+            learning_rate=4e-3,
+            halve_every=900,
+            epochs=1 if _QUICK.value else 4,
+            seed=_SEED.value,
+            reward=RewardConfig(hidden=SHAPES[name.split("-")[0]]),
+        )
+        train(dataset, folder / name, config, provenance=provenance())
+        export_run(folder / name, dataset, file)
+    return file
+
+
+def _trained(folder: Path) -> list[str]:
+    first = _drives(folder / "drives", 1000, None)
+    start = _weights(folder, "rcirl-first", [first])
+    takeovers = _drives(folder / "takeovers", 2000, start)
+    return [str(_weights(folder, name, [first, takeovers])) for name in SHAPES]
+
+
+def _table(
+    name: str, cases: CaseSet, weights: Sequence[str], *, dp: bool, human: bool
+) -> None:
+    rivals = ("hand-set", "IDM") if dp else BASELINES
+    rows = table_rows(weights, rivals, _EVERY.value, dp=dp)
+    rows += [human_row()] if human else []
+    result = run_suite(rows, cases, SuiteConfig(plan_every=_EVERY.value))
+    print(
+        f"--- {name}\n{write_suite(result, Path(_OUTPUT.value) / name, provenance())}"
+    )
+
+
+def main() -> None:
+    """All tables, one folder each."""
+    folder = Path(_OUTPUT.value)
+    folder.mkdir(parents=True, exist_ok=True)
+    weights = _WEIGHTS.value or _trained(folder)
+    duration = 10.0 if _QUICK.value else FULL_S
+    full = suite_refs("full", 1 if _QUICK.value else None)
+    _table("suite", catalogue_set(full, duration), weights, dp=False, human=False)
+    few = suite_refs("full", 1 if _QUICK.value else _DP_CASES.value)
+    _table("dp", catalogue_set(few, duration), weights[:1], dp=True, human=False)
+    if _INPUT.value:
+        recordings = read_recordings(_FORMAT.value, Path(_INPUT.value))
+        config = RecordedConfig(max_cases=5 if _QUICK.value else None)
+        cases = recorded_set(recordings, config)
+        _table("recorded", cases, weights, dp=False, human=True)
+
+
+if __name__ == "__main__":
+    run(main)
