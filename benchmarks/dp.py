@@ -9,6 +9,7 @@ spread between the best and the median candidate of each scene.
 
 import dataclasses
 import time
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -19,8 +20,8 @@ from benchmarks.common import percentiles, write
 from rcirl_jax.export.loading import open_reward, reward_params
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.dp import plan_dp
-from rcirl_jax.planner.grid import DpConfig
-from rcirl_jax.planner.rank import ONLINE, learned_score
+from rcirl_jax.planner.grid import DpConfig, Weights
+from rcirl_jax.planner.rank import ONLINE, Score, learned_score
 from rcirl_jax.planner.safety import check
 from rcirl_jax.reward import RewardConfig, init_reward, pinned
 from rcirl_jax.sampling import num_candidates, sample
@@ -30,6 +31,9 @@ from tests.scenes import random_scene
 _WEIGHTS = flags.DEFINE_string("weights", None, "weights file (default: random)")
 _SCENES = flags.DEFINE_integer("scenes", 24, "scenes")
 _OUTPUT = flags.DEFINE_string("output", "benchmarks/results", "folder of the JSON")
+
+
+Planner = Callable[[Scene], tuple[jax.Array, jax.Array]]
 
 
 def _reward() -> tuple:
@@ -47,60 +51,59 @@ def _reward() -> tuple:
     return (params, normaliser), shape.activation
 
 
+def _ranking(count: int, weights: Weights, score: Score) -> Planner:
+    """Best admissible value of `count` candidates, and the median of all."""
+    more = ONLINE.num_random + count - num_candidates(ONLINE)
+    config = dataclasses.replace(ONLINE, num_random=more)
+
+    def plan(scene: Scene) -> tuple[jax.Array, jax.Array]:
+        candidates = sample(jax.random.key(0), scene, config)
+        values = score(weights, scene, candidates)
+        fine = check(scene, candidates).admissible
+        middle = jnp.nanmedian(jnp.where(candidates.feasible, values, jnp.nan))
+        return jnp.max(jnp.where(fine, values, -jnp.inf)), middle
+
+    return jax.jit(plan)
+
+
+def _lattice(step: float, weights: Weights, activation: str) -> Planner:
+    """Value of the lattice's plan, twice."""
+    config, features = DpConfig(step=step), feature_map("paper21")
+
+    def plan(scene: Scene) -> tuple[jax.Array, jax.Array]:
+        found = plan_dp(scene, weights, features, activation, config)
+        return jnp.where(found.feasible, found.value, -jnp.inf), found.value
+
+    return jax.jit(plan)
+
+
 def main(_: list[str]) -> None:
     """Alternate the planners over the scenes."""
     weights, activation = _reward()
-    features = feature_map("paper21")
-    score = learned_score(features, activation)
-
-    def best_of(count: int) -> object:
-        more = ONLINE.num_random + count - num_candidates(ONLINE)
-        config = dataclasses.replace(ONLINE, num_random=more)
-
-        def plan(scene: Scene) -> tuple[jax.Array, jax.Array]:
-            candidates = sample(jax.random.key(0), scene, config)
-            values = score(weights, scene, candidates)
-            fine = check(scene, candidates).admissible
-            middle = jnp.nanmedian(jnp.where(candidates.feasible, values, jnp.nan))
-            return jnp.max(jnp.where(fine, values, -jnp.inf)), middle
-
-        return jax.jit(plan)
-
-    def lattice(step: float) -> object:
-        config = DpConfig(step=step)
-
-        def plan(scene: Scene) -> tuple[jax.Array, jax.Array]:
-            found = plan_dp(scene, weights, features, activation, config)
-            return jnp.where(found.feasible, found.value, -jnp.inf), found.value
-
-        return jax.jit(plan)
-
+    score = learned_score(feature_map("paper21"), activation)
     planners = {
-        "rank_64": best_of(64),
-        "rank_512": best_of(512),
-        "dp_step_2": lattice(2.0),
-        "dp_step_1": lattice(1.0),
+        "rank_64": _ranking(64, weights, score),
+        "rank_512": _ranking(512, weights, score),
+        "dp_step_2": _lattice(2.0, weights, activation),
+        "dp_step_1": _lattice(1.0, weights, activation),
     }
     scenes = [jax.tree.map(jnp.asarray, random_scene(i)) for i in range(_SCENES.value)]
     seconds: dict[str, list[float]] = {name: [] for name in planners}
-    values: dict[str, list[float]] = {name: [] for name in planners}
-    medians = []
+    values: dict[str, list[tuple[float, float]]] = {name: [] for name in planners}
     for plan in planners.values():
-        jax.block_until_ready(plan(scenes[0]))  # type: ignore[operator]
+        jax.block_until_ready(plan(scenes[0]))
     for scene in scenes:
         for name, plan in planners.items():
             begin = time.perf_counter()
-            best, middle = jax.block_until_ready(plan(scene))  # type: ignore[operator]
+            best, middle = jax.block_until_ready(plan(scene))
             seconds[name].append(time.perf_counter() - begin)
-            values[name].append(float(best))
-            if name == "rank_64":
-                medians.append(float(middle))
+            values[name].append((float(best), float(middle)))
     result: dict = {name: percentiles(found) for name, found in seconds.items()}
-    table = {name: np.array(found) for name, found in values.items()}
-    spread = table["rank_64"] - np.array(medians)
+    ranked, middle = np.array(values["rank_64"]).T
     for name in ("rank_512", "dp_step_2", "dp_step_1"):
-        both = np.isfinite(table[name]) & np.isfinite(table["rank_64"]) & (spread > 0.0)
-        gain = (table[name] - table["rank_64"])[both] / spread[both]
+        found, spread = np.array(values[name])[:, 0], ranked - middle
+        both = np.isfinite(found) & np.isfinite(ranked) & (spread > 0.0)
+        gain = (found - ranked)[both] / spread[both]
         result[name]["value_gain_median"] = round(float(np.median(gain)), 4)
         result[name]["scenes"] = int(both.sum())
     for name, found in result.items():

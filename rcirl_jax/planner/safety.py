@@ -26,6 +26,7 @@ from rcirl_jax.geometry.frenet import lookup
 from rcirl_jax.types import Candidates, Kind, Scene, Trajectory
 from rcirl_jax.units import DT_S, STATION_STEP_M, TIMES_S
 
+MOVING_MPS = 1.0  # m/s, above which a body's prediction is uncertain
 CROSSING_MPS = 1.0  # m/s, sideways speed above which a body crosses and leads nobody
 
 
@@ -35,6 +36,9 @@ class SafetyConfig:
 
     # m added along the road on each side of an obstacle
     margin_along: float = 0.6
+    # m/s by which that margin grows with time for bodies that move: their
+    # drivers do not keep the predicted speed
+    margin_growth: float = 0.3
     # m added across
     margin_across: float = 0.25
     # m of front bumper kept before a line that demands a stop
@@ -150,7 +154,9 @@ def first_contact(scene: Scene, x: Trajectory, config: SafetyConfig) -> jax.Arra
         dl = 0.5 * (o.l_upper + o.l_lower)[:, None] - x.l
         m_s, h_s = 0.5 * (ds[1:] + ds[:-1]), 0.5 * (ds[1:] - ds[:-1])
         m_l, h_l = 0.5 * (dl[1:] + dl[:-1]), 0.5 * (dl[1:] - dl[:-1])
-        e_s = wide_s + jnp.maximum(size_s[1:], size_s[:-1])
+        moving = (jnp.abs(o.speed[0]) > MOVING_MPS) & (o.kind != Kind.STATIC)
+        grown = jnp.where(moving, config.margin_growth * starts, 0.0)
+        e_s = wide_s + grown + jnp.maximum(size_s[1:], size_s[:-1])
         e_l = wide_l + jnp.maximum(size_l[1:], size_l[:-1])
         h_s, h_l = jnp.abs(h_s), jnp.abs(h_l)
         cross = jnp.abs(m_s * (dl[1:] - dl[:-1]) - m_l * (ds[1:] - ds[:-1]))
