@@ -55,7 +55,7 @@ def row_name(reward: Reward) -> str:
     """Name of a reward's row in the tables: loss and network."""
     hidden = [str(kernel.shape[1]) for kernel in reward.kernels[:-1]]
     shape = f"{len(reward.names)}-{'-'.join([*hidden, '1'])}"
-    name = {"rank": "RC-IRL", "logistic": "logistic"}
+    name = {"rank": "RC-IRL", "logistic": "RC-IRL logistic"}
     loss = str(reward.loss.get("name"))
     return f"{name.get(loss, loss)} {shape if hidden else 'linear'}"
 
