@@ -1,9 +1,18 @@
-"""Shared fixtures: eight CPU devices, hypothesis profiles, the recorded data."""
+"""Shared fixtures: eight CPU devices, hypothesis profiles, the recorded data.
+
+Programs are compiled once for all workers and runs: most of the tests' time
+would otherwise go into compiling the same ones again.
+"""
 
 import os
 from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault(
+    "JAX_COMPILATION_CACHE_DIR",
+    str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "compiled"),
+)
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 
 import jax
 import pytest

@@ -15,7 +15,7 @@ from rcirl_jax.types import Candidates, Kind
 from rcirl_jax.units import DT_S, TIMES_S
 from tests.scenes import random_scene, scene
 
-BARE = SafetyConfig(margin_along=0.0, margin_across=0.0)
+BARE = SafetyConfig(margin_along=0.0, margin_growth=0.0, margin_across=0.0)
 
 
 @functools.cache

@@ -188,11 +188,11 @@ def test_speed_envelope_equals_its_definition():
             assert row[i] == pytest.approx(expected, rel=1e-3)
 
 
-@pytest.mark.parametrize("change", [(15.0, 8.0), (8.0, 15.0)])
+@pytest.mark.parametrize("change", [(15.0, 8.0, 60.0), (8.0, 15.0, 20.0)])
 def test_envelope_drives_up_to_a_changing_limit(change):
     """Below it throughout, and close to it where there was time to get there."""
-    first, second = change
-    made = stepped_scene(first, second, v=0.95 * first)
+    first, second, station = change
+    made = stepped_scene(first, second, station, v=0.95 * first)
     candidates = SAMPLE["speed"](jax.random.key(0), made)
     index = family(candidates, "envelope")[0]
     s, v = candidates.trajectory.s[index], np.asarray(candidates.trajectory.v[index])
