@@ -103,7 +103,7 @@ def main(_: list[str]) -> None:
     for name in ("rank_512", "dp_step_2", "dp_step_1"):
         found, spread = np.array(values[name])[:, 0], ranked - middle
         both = np.isfinite(found) & np.isfinite(ranked) & (spread > 0.0)
-        gain = (found - ranked)[both] / spread[both]
+        gain = (found[both] - ranked[both]) / spread[both]
         result[name]["value_gain_median"] = round(float(np.median(gain)), 4)
         result[name]["scenes"] = int(both.sum())
     for name, found in result.items():

@@ -29,7 +29,7 @@ from rcirl_jax.simulation.catalogue import (
 )
 from rcirl_jax.simulation.metrics import CaseMetrics, MetricsConfig, case_metrics
 from rcirl_jax.simulation.recorded import RecordedConfig, recorded_cases
-from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases
+from rcirl_jax.simulation.rollout import LANES, RolloutConfig, drive_cases
 from rcirl_jax.simulation.rows import Row
 
 SMOKE_S = 20.0  # s of a smoke case
@@ -201,12 +201,13 @@ def drive_row(
       cases_of: (first, last) -> cases of that range, stacked.
       total: number of cases.
       config: of the rollouts.
-      chunk: cases that are driven together.
+      chunk: cases in memory at a time, rounded up to whole groups of `LANES`;
+        the metrics do not depend on it.
       metrics: thresholds.
       progress: told how many cases have been driven since the last call.
     """
     reduce = _Reduce.of(metrics or MetricsConfig())
-    size = min(chunk, total)
+    size = -(-min(chunk, total) // LANES) * LANES
     parts = []
     for first in range(0, total, size):
         count = min(size, total - first)

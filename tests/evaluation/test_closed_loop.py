@@ -15,6 +15,7 @@ from rcirl_jax.evaluation.closed_loop import (
 from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.planner.rank import constant_speed_policy, idm_policy
 from rcirl_jax.simulation.metrics import COLUMNS
+from rcirl_jax.simulation.rollout import LANES
 from rcirl_jax.simulation.rows import Row
 from rcirl_jax.simulation.suite import catalogue_set, suite_refs
 
@@ -26,8 +27,8 @@ ROWS = [
 ]
 
 
-def run(chunk):
-    cases = catalogue_set(suite_refs(FAMILIES, 3), 30.0)
+def run(chunk, count=3):
+    cases = catalogue_set(suite_refs(FAMILIES, count), 30.0)
     return run_suite(ROWS, cases, SuiteConfig(plan_every=2, chunk=chunk))
 
 
@@ -62,12 +63,16 @@ def test_differences_are_paired(result):
             assert p <= adjusted <= 1.0
 
 
-def test_the_hash_does_not_depend_on_run_or_chunk(result):
-    for chunk in (4, 6):
-        again = run(chunk)
-        assert again.facts["result_sha256"] == result.facts["result_sha256"]
-    hashes = result.facts["result_sha256"]
+def test_the_hash_does_not_depend_on_run_chunk_or_company(result):
+    first = run(2 * LANES, LANES // 2 + 2)
+    hashes = first.facts["result_sha256"]
     assert len(set(hashes.values())) == len(ROWS)
+    for chunk in (7, 2 * LANES):
+        again = run(chunk, LANES // 2 + 2)
+        assert again.facts["result_sha256"] == hashes
+    few = run(6).runs["IDM"]
+    assert np.array_equal(few.distance[:3], first.runs["IDM"].distance[:3])
+    assert np.array_equal(few.distance, result.runs["IDM"].distance)
 
 
 def test_files_say_the_same(result, tmp_path):
