@@ -9,9 +9,12 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments.common import hidden_sizes, provenance, run
+from experiments.common import floats, hidden_sizes, provenance, run
 from rcirl_jax.data.joined import open_datasets
+from rcirl_jax.errors import InputError
+from rcirl_jax.features import feature_map
 from rcirl_jax.reward import LOSSES, RewardConfig
+from rcirl_jax.reward.network import CONSTRAINTS
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.parallel import PARALLEL
@@ -26,10 +29,17 @@ _MODE = flags.DEFINE_enum(
     "mode", "speed", ["speed", "path_speed"], "what the sampler varies"
 )
 _LOSS = flags.DEFINE_enum("loss", "rank", sorted(LOSSES), "loss on value differences")
+_MARGINS = flags.DEFINE_list(
+    "margins", ["0.2", "4", "2"], "hinge: per metre from the human, collision, rule"
+)
+_SOFT = flags.DEFINE_float("soft_distance", 1.0, "m, temperature of soft labels")
 _LEAKY = flags.DEFINE_float("leaky_rate", 0.05, "a of the rank loss")
 _HIDDEN = flags.DEFINE_list("hidden_size", ["15"], "units per layer; 0 is linear")
 _ACTIVATION = flags.DEFINE_enum(
     "activation", "tanh", ["tanh", "relu", "leaky_relu"], "of the hidden layers"
+)
+_CONSTRAINT = flags.DEFINE_enum(
+    "constraint", "none", CONSTRAINTS, "nonnegative costs (linear), monotone in safety"
 )
 _PIN = flags.DEFINE_enum("pin", "unit", ["unit", "none"], "scale pinning")
 _OPTIMIZER = flags.DEFINE_enum(
@@ -47,16 +57,27 @@ _POSITIVE = flags.DEFINE_enum(
     "ranked first: the human curve or its nearest candidate",
 )
 _NEGATIVES = flags.DEFINE_integer("hard_negatives", 0, "near negatives per scene")
+_POOL = flags.DEFINE_integer(
+    "hard_pool", 1, "near negatives drawn for each that the present reward keeps"
+)
 _SEED = flags.DEFINE_integer("seed", 0, "of initial weights, batches, candidates")
 _PARALLEL = flags.DEFINE_enum("parallel", "jit", PARALLEL, "how local devices share")
 
 
 def main() -> None:
     """Flags -> one training run."""
+    if len(_MARGINS.value) != 3:
+        raise InputError(f"--margins: {_MARGINS.value}: expected three numbers")
+    margins = floats(_MARGINS.value, "margins")
+    signs = feature_map(_FEATURES.value).signs
     config = TrainConfig(
         features=_FEATURES.value,
         loss=_LOSS.value,
         leaky_rate=_LEAKY.value,
+        margin_distance=margins[0],
+        margin_collision=margins[1],
+        margin_rule=margins[2],
+        soft_distance=_SOFT.value,
         optimizer=_OPTIMIZER.value,
         learning_rate=_RATE.value,
         halve_every=_HALVE.value,
@@ -65,11 +86,14 @@ def main() -> None:
         epochs=_EPOCHS.value,
         positive=_POSITIVE.value,
         hard_negatives=_NEGATIVES.value,
+        hard_pool=_POOL.value,
         seed=_SEED.value,
         reward=RewardConfig(
             hidden=hidden_sizes(_HIDDEN.value),
             activation=_ACTIVATION.value,
             pin=_PIN.value,
+            constraint=_CONSTRAINT.value,
+            signs=signs if _CONSTRAINT.value == "monotone" else (),
         ),
         sampler=SamplerConfig(mode=_MODE.value),
     )

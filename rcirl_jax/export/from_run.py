@@ -3,6 +3,7 @@
 import datetime
 import json
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +25,7 @@ from rcirl_jax.units import TIMES_S
 NUM_SAMPLES = 32  # verification samples in the file
 
 
-def _tuples(value: object) -> object:
+def _tuples(value: Any) -> Any:  # noqa: ANN401
     """Lists as tuples, at every depth."""
     return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
@@ -41,7 +42,7 @@ def read_config(workdir: Path) -> tuple[TrainConfig, dict]:
         sampler = dict(settings.pop("sampler"))
         lists = {k: _tuples(v) for k, v in sampler.items() if isinstance(v, list)}
         config = TrainConfig(
-            reward=RewardConfig(**{**reward, "hidden": tuple(reward["hidden"])}),
+            reward=RewardConfig(**{k: _tuples(v) for k, v in reward.items()}),
             sampler=SamplerConfig(**{**sampler, **lists}),
             **settings,
         )
@@ -70,7 +71,7 @@ def reward_weights(
         gamma=np.asarray(effective.gamma),
         kernels=tuple(np.asarray(kernel) for kernel in effective.kernels),
         biases=(*(np.asarray(bias) for bias in effective.biases), np.zeros(1)),
-        activation=config.reward.activation if config.reward.hidden else "identity",
+        activation=config.reward.hidden_activation,
         leaky_slope=LEAKY_SLOPE,
         loss={
             "name": config.loss,

@@ -38,6 +38,8 @@ class FeatureMap:
 
     preset: str
     specs: tuple[FeatureSpec, ...]
+    # safety terms: 1 the reward may not fall with it, -1 may not rise, 0 free
+    signs: tuple[int, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -87,12 +89,21 @@ def feature_map(preset: str) -> FeatureMap:
     if not path.is_file():
         known = sorted(item.stem for item in path.parent.glob("*.toml"))
         raise InputError(f"--features: {preset}: expected one of {', '.join(known)}")
-    rows = load_toml(path).get("feature", [])
+    table = load_toml(path)
+    rows = table.get("feature", [])
     specs = tuple(_read_spec(path, row) for row in rows)
     names = [spec.name for spec in specs]
     if not names or len(set(names)) != len(names):
         raise InputError(f"{path}: feature: {names}: expected distinct names")
-    return FeatureMap(preset, specs)
+    safety = table.get("safety", {})
+    rises, falls = safety.get("rises", []), safety.get("falls", [])
+    for name in (*rises, *falls):
+        if name not in names or (name in rises and name in falls):
+            raise InputError(
+                f"{path}: safety: {name}: expected a feature above, in one list"
+            )
+    signs = tuple((n in rises) - (n in falls) for n in names)
+    return FeatureMap(preset, specs, signs)
 
 
 def _read_spec(path: Path, row: dict) -> FeatureSpec:

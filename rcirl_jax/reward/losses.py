@@ -1,17 +1,66 @@
-"""Losses on value differences, y = V(candidate) - V(human).
+"""Losses between the human and the candidates of a scene, as values of one option.
 
-Each is a value of one option: a pure function of one difference. Sums and
-counts are carried apart, so that uneven shards add up correctly.
+Pair losses are functions of y = V(candidate) - V(human). Listwise losses are
+functions of the whole set {human} + candidates. The GAN loss compares nothing
+within a scene. All are linear sums over scenes: sums and counts are carried
+apart, so that uneven shards add up correctly.
 """
 
+import dataclasses
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 
-def rank_loss(y: Float[Array, "*n"], leaky_rate: float) -> Float[Array, "*n"]:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LossConfig:
+    """Constants of the losses. Each loss reads its own; sweeps may trace them."""
+
+    # rank: a, the slope for candidates below the human
+    leaky_rate: ArrayLike = 0.05
+    # hinge: margin per metre of mean distance to the human, and its ceiling (m)
+    margin_distance: float = 0.2
+    margin_ceiling: float = 10.0
+    # hinge: margin of a candidate that collides, and of one against the rules
+    margin_collision: float = 4.0
+    margin_rule: float = 2.0
+    # soft: m, temperature of the labels softmax(-distance / tau)
+    soft_distance: float = 1.0
+
+
+class Compared(NamedTuple):
+    """Values of B scenes and what the losses know about their candidates."""
+
+    human: Float[Array, " b"]  # V of the positive
+    candidates: Float[Array, "b k"]  # V
+    counts: Bool[Array, "b k"]  # feasible candidates
+    weight: Float[Array, " b"]  # 0 for padding rows
+    # m, mean distance to the recorded human; the positive's own is 0 unless it
+    # is the nearest candidate
+    human_distance: Float[Array, " b"]
+    distance: Float[Array, "b k"]
+    collides: Bool[Array, "b k"]
+    breaks_rule: Float[Array, "b k"]  # share of times over the limit or the line
+    # log of the proposal's density at each trajectory, up to a constant per scene
+    human_density: Float[Array, " b"]
+    density: Float[Array, "b k"]
+    offset: Float[Array, ""]  # of the discriminator
+
+
+class LossSums(NamedTuple):
+    """Scalars to be added over shards; divide only afterwards."""
+
+    loss: jax.Array
+    terms: jax.Array  # what `loss` is divided by: pairs or scenes
+    wins: jax.Array  # pairs the human wins, ties half
+    pairs: jax.Array
+
+
+def rank_loss(y: Float[Array, "*n"], leaky_rate: ArrayLike) -> Float[Array, "*n"]:
     """The paper's leaky-ReLU rank loss: L(y) = y if y >= 0 else a y, a = 0.05.
 
     A candidate valued above the human costs its lead; one below earns a small
@@ -20,41 +69,131 @@ def rank_loss(y: Float[Array, "*n"], leaky_rate: float) -> Float[Array, "*n"]:
     return jnp.where(y >= 0.0, y, leaky_rate * y)
 
 
-def logistic_loss(y: Float[Array, "*n"], leaky_rate: float) -> Float[Array, "*n"]:
-    """Bradley-Terry: L(y) = log(1 + exp(y)); `leaky_rate` is not used."""
-    del leaky_rate
+def logistic_loss(y: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Bradley-Terry: L(y) = log(1 + exp(y))."""
     return jax.nn.softplus(y)
 
 
-LOSSES: dict[str, Callable[[jax.Array, float], jax.Array]] = {
-    "rank": rank_loss,
-    "logistic": logistic_loss,
+def task_margin(c: Compared, config: LossConfig) -> Float[Array, "b k"]:
+    """Lead that the human must have: far, colliding and unlawful ones more.
+
+        margin = m_d min(distance, ceiling) + m_c collides + m_r breaks_rule
+
+    Source: Ratliff et al. (ICML 2006), with the task loss of Sadat et al. (2019).
+    """
+    near = jnp.minimum(c.distance, config.margin_ceiling)
+    return (
+        config.margin_distance * near
+        + config.margin_collision * c.collides
+        + config.margin_rule * c.breaks_rule
+    )
+
+
+def _over_pairs(c: Compared, per_pair: jax.Array) -> tuple[jax.Array, jax.Array]:
+    share = c.counts * c.weight[:, None]
+    return jnp.sum(jnp.where(c.counts, per_pair, 0.0) * share), jnp.sum(share)
+
+
+def _over_scenes(c: Compared, per_scene: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Scenes without a feasible candidate compare nothing."""
+    share = jnp.where(jnp.any(c.counts, axis=1), c.weight, 0.0)
+    return jnp.sum(jnp.where(share > 0.0, per_scene, 0.0) * share), jnp.sum(share)
+
+
+def _all(human: jax.Array, candidates: jax.Array) -> jax.Array:
+    """[B, 1 + K], the positive first."""
+    return jnp.concatenate([human[:, None], candidates], axis=1)
+
+
+def _counted(c: Compared) -> jax.Array:
+    return _all(jnp.ones(c.human.shape, bool), c.counts)
+
+
+def _rank(c: Compared, config: LossConfig) -> tuple[jax.Array, jax.Array]:
+    y = c.candidates - c.human[:, None]
+    return _over_pairs(c, rank_loss(y, config.leaky_rate))
+
+
+def _logistic(c: Compared, config: LossConfig) -> tuple[jax.Array, jax.Array]:
+    del config
+    return _over_pairs(c, logistic_loss(c.candidates - c.human[:, None]))
+
+
+def _hinge(c: Compared, config: LossConfig) -> tuple[jax.Array, jax.Array]:
+    """L = max(0, y + margin), mean over pairs."""
+    y = c.candidates - c.human[:, None]
+    return _over_pairs(c, jax.nn.relu(y + task_margin(c, config)))
+
+
+def _listwise(c: Compared, config: LossConfig) -> tuple[jax.Array, jax.Array]:
+    """MaxEnt IRL: -log of the human's share of a sampled partition function.
+
+        P(human) = exp(V_h) / Z,   Z = sum over {human} + candidates of exp(V) / q
+
+    with the proposal's density q, so that a dense corner of the sampler does not
+    count more than a sparse one (Finn et al. 2016; Wu et al., RA-L 2020).
+    """
+    del config
+    counted = _counted(c)
+    log_q = jnp.where(counted, _all(c.human_density, c.density), 0.0)
+    mean = jnp.sum(log_q, axis=1) / jnp.sum(counted, axis=1)
+    logits = _all(c.human, c.candidates) - (log_q - mean[:, None])
+    log_z = jax.nn.logsumexp(jnp.where(counted, logits, -jnp.inf), axis=1)
+    return _over_scenes(c, log_z - c.human)
+
+
+def _soft(c: Compared, config: LossConfig) -> tuple[jax.Array, jax.Array]:
+    """Cross-entropy with labels softmax(-distance / tau) over the whole set.
+
+    Near candidates share the label; with the nearest one as the positive, the
+    human curve itself is not in the set.
+    """
+    counted = _counted(c)
+    apart = _all(c.human_distance, c.distance) / config.soft_distance
+    labels = jax.nn.softmax(jnp.where(counted, -apart, -jnp.inf), axis=1)
+    values = jnp.where(counted, _all(c.human, c.candidates), -jnp.inf)
+    log_p = jnp.where(counted, jax.nn.log_softmax(values, axis=1), 0.0)
+    return _over_scenes(c, -jnp.sum(labels * log_p, axis=1))
+
+
+def _gan(c: Compared, config: LossConfig) -> tuple[jax.Array, jax.Array]:
+    """The paper's GAN baseline: a discriminator that never compares in a scene.
+
+        L = log(1 + exp(-(V_h + b))) + mean_k log(1 + exp(V_k + b))
+
+    Human 1, sample 0, one threshold -b for all scenes: background that differs
+    from scene to scene ends up in V.
+    """
+    del config
+    real = jax.nn.softplus(-(c.human + c.offset))
+    fake = jnp.where(c.counts, jax.nn.softplus(c.candidates + c.offset), 0.0)
+    mean = jnp.sum(fake, axis=1) / jnp.maximum(jnp.sum(c.counts, axis=1), 1)
+    return _over_scenes(c, real + mean)
+
+
+LOSSES: dict[str, Callable[[Compared, LossConfig], tuple[jax.Array, jax.Array]]] = {
+    "rank": _rank,
+    "logistic": _logistic,
+    "hinge": _hinge,
+    "listwise": _listwise,
+    "soft": _soft,
+    "gan": _gan,
 }
 
 
-def pair_sums(
-    name: str,
-    human_value: Float[Array, " b"],
-    candidate_values: Float[Array, "b k"],
-    counts: Bool[Array, "b k"],
-    weight: Float[Array, " b"],
-    leaky_rate: float,
-) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """Sum of losses, sum of pairs the human wins (ties half), number of pairs.
+def loss_sums(name: str, compared: Compared, config: LossConfig) -> LossSums:
+    """A loss with its count, and how many pairs the human wins.
 
     Args:
       name: key of `LOSSES`.
-      human_value: [B].
-      candidate_values: [B, K].
-      counts: [B, K] whether a pair counts (feasible candidate).
-      weight: [B] 0 for padding rows.
-      leaky_rate: a of the rank loss.
+      compared: values and facts of B scenes.
+      config: constants.
 
     Returns:
-      Three scalars; divide only after summing over all shards.
+      Scalars; divide only after summing over all shards.
     """
-    y = candidate_values - human_value[:, None]
-    share = counts * weight[:, None]
-    loss = jnp.sum(jnp.where(counts, LOSSES[name](y, leaky_rate), 0.0) * share)
+    loss, terms = LOSSES[name](compared, config)
+    y = compared.candidates - compared.human[:, None]
+    share = compared.counts * compared.weight[:, None]
     wins = jnp.sum(share * jnp.where(y < 0.0, 1.0, jnp.where(y == 0.0, 0.5, 0.0)))
-    return loss, wins, jnp.sum(share)
+    return LossSums(loss=loss, terms=terms, wins=wins, pairs=jnp.sum(share))

@@ -22,6 +22,8 @@ LEAKY_SLOPE = 0.01  # negative slope of the leaky-ReLU hidden activation
 
 PINS = ("unit", "none")
 
+CONSTRAINTS = ("none", "nonnegative", "monotone")
+
 ACTIVATIONS = {
     "tanh": jnp.tanh,
     "relu": jax.nn.relu,
@@ -40,6 +42,10 @@ class RewardConfig:
     activation: str = "tanh"
     # "unit": output kernel and gamma have unit norm (see `pinned`); "none": free
     pin: str = "unit"
+    # "nonnegative": weights of costs, `hidden` must be (); "monotone": `signs`
+    constraint: str = "none"
+    # per feature: 1 the reward may not fall with it, -1 may not rise, 0 free
+    signs: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         """Reject unknown names."""
@@ -50,13 +56,30 @@ class RewardConfig:
             )
         if self.pin not in PINS:
             raise InputError(f"--pin: {self.pin}: expected one of {PINS}")
+        if self.constraint not in CONSTRAINTS:
+            raise InputError(
+                f"--constraint: {self.constraint}: expected one of {CONSTRAINTS}"
+            )
+        if self.constraint == "nonnegative" and self.hidden:
+            raise InputError(
+                f"--hidden_size: {self.hidden}: expected 0 under "
+                "--constraint=nonnegative, which is linear in its costs"
+            )
+
+    @property
+    def hidden_activation(self) -> str:
+        """Activation of the effective network (see `pinned`)."""
+        if self.constraint == "nonnegative":
+            return "relu"
+        return self.activation if self.hidden else "identity"
 
 
 def init_reward(
     key: jax.Array, num_features: int, config: RewardConfig
 ) -> RewardParams:
     """Random kernels (Glorot uniform), zero biases, equal gamma. Key consumed."""
-    sizes = (num_features, *config.hidden, 1)
+    first = 2 * num_features if config.constraint == "nonnegative" else num_features
+    sizes = (first, *config.hidden, 1)
     keys = jax.random.split(key, len(sizes) - 1)
     glorot = jax.nn.initializers.glorot_uniform()
     kernels = [
@@ -71,7 +94,7 @@ def init_reward(
 
 
 def pinned(params: RewardParams, config: RewardConfig) -> RewardParams:
-    """The effective parameters: scale pinned, ranking unchanged.
+    """The effective parameters: signs constrained, then the scale pinned.
 
         gamma <- gamma / |gamma|_2
         W_out <- W_out / |W_out|_2
@@ -83,7 +106,8 @@ def pinned(params: RewardParams, config: RewardConfig) -> RewardParams:
     units bounded by themselves, V is bounded and the loss measures ranking
     only. Every pin divides by a positive number, so it never changes an order.
     """
-    if config.pin == "none":
+    params = _constrained(params, config)
+    if config.pin == "none" or config.constraint == "nonnegative":
         return params
     kernels, biases = list(params.kernels), list(params.biases)
     if config.activation != "tanh":
@@ -91,9 +115,40 @@ def pinned(params: RewardParams, config: RewardConfig) -> RewardParams:
             norm = jnp.sqrt(jnp.sum(kernels[layer] ** 2, axis=0) + bias**2 + 1e-12)
             kernels[layer], biases[layer] = kernels[layer] / norm, bias / norm
     kernels[-1] = _unit(kernels[-1])
-    return RewardParams(
+    return params.replace(
         gamma=_unit(params.gamma), kernels=tuple(kernels), biases=tuple(biases)
     )
+
+
+def _constrained(params: RewardParams, config: RewardConfig) -> RewardParams:
+    """Parameters whose signs are those of the constraint.
+
+    nonnegative  R = -sum_i u_i max(x_i, 0) + w_i max(-x_i, 0),  u, w >= 0: what
+                 departs from the training median costs, each side at its own
+                 weight; the form of Apollo's tuned cost before RC-IRL. Written
+                 as a network with fixed first layer [I, -I] and ReLUs.
+    monotone     first-layer rows of a signed feature have its sign, all later
+                 kernels and gamma are non-negative. With tanh, an odd function,
+                 non-negative output weights leave one hidden layer as free as
+                 before in the unsigned features.
+    """
+    if config.constraint == "none":
+        return params
+    gamma = jnp.abs(params.gamma)
+    if config.constraint == "nonnegative":
+        costs = jnp.abs(params.kernels[0])
+        if config.pin == "unit":
+            gamma, costs = _unit(gamma), _unit(costs)
+        eye = jnp.eye(costs.shape[0] // 2)
+        return params.replace(
+            gamma=gamma,
+            kernels=(jnp.concatenate([eye, -eye], axis=1), -costs),
+            biases=(jnp.zeros(costs.shape[0]),),
+        )
+    first, signs = params.kernels[0], jnp.asarray(config.signs)[:, None]
+    first = jnp.where(signs == 0, first, signs * jnp.abs(first))
+    later = tuple(jnp.abs(kernel) for kernel in params.kernels[1:])
+    return params.replace(gamma=gamma, kernels=(first, *later))
 
 
 def _unit(x: jax.Array) -> jax.Array:
@@ -168,5 +223,5 @@ def value(
     """
     effective = pinned(params, config)
     x = normalise(normaliser, features)
-    rewards = point_rewards(effective, x, config.activation)
+    rewards = point_rewards(effective, x, config.hidden_activation)
     return jnp.sum(jnp.where(time_valid, effective.gamma * rewards, 0.0), axis=-1)

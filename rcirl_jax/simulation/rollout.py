@@ -153,6 +153,7 @@ def _compiled(
 
     return jax.jit(jax.vmap(run, in_axes=(None, 0)))
 
+
 # Cases a CPU drives side by side. XLA compiles other code for other shapes and
 # rounds the last digit differently, and traffic is chaotic: only with one shape
 # does a case come out the same in every batch.

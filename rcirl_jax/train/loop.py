@@ -174,7 +174,7 @@ class _Run:
         checkpoints: Checkpoints,
     ) -> TrainState:
         for epoch in range(int(state.step) // self.per_epoch, self.config.epochs):
-            sums = np.zeros(3)
+            sums = np.zeros(4)
             for _ in range(self.per_epoch - int(state.step) % self.per_epoch):
                 rows, weight, local = next(batches)
                 batch = to_device_batch(rows, weight, self.index[local])
@@ -188,7 +188,7 @@ class _Run:
         guard(metrics, self.features, step)
         pairs = max(float(metrics.pairs), 1.0)
         shown = {
-            "loss": float(metrics.loss_sum) / pairs,
+            "loss": float(metrics.loss_sum) / max(float(metrics.terms), 1.0),
             "pair_accuracy": float(metrics.wins) / pairs,
         }
         self.progress.advance(pairs, **shown)
@@ -201,15 +201,16 @@ class _Run:
                 "queries_per_s": self.progress.queries / self.progress.seconds,
             },
         )
-        return np.array([float(metrics.loss_sum), float(metrics.wins), pairs])
+        counted = (metrics.loss_sum, metrics.terms, metrics.wins, metrics.pairs)
+        return np.array([float(x) for x in counted])
 
 
 def _summary(epoch: int, sums: np.ndarray) -> dict:
-    pairs = max(sums[2], 1.0)
+    loss, terms, wins, pairs = sums
     return {
         "epoch": epoch + 1,
-        "loss": sums[0] / pairs,
-        "pair_accuracy": sums[1] / pairs,
+        "loss": loss / max(terms, 1.0),
+        "pair_accuracy": wins / max(pairs, 1.0),
         "pairs": int(sums[2]),
     }
 

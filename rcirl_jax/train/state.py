@@ -8,7 +8,13 @@ import jax
 import optax
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.reward import LOSSES, Normaliser, RewardConfig, RewardParams
+from rcirl_jax.reward import (
+    LOSSES,
+    LossConfig,
+    Normaliser,
+    RewardConfig,
+    RewardParams,
+)
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.types import Demonstration
 
@@ -34,6 +40,12 @@ class TrainConfig:
     loss: str = "rank"
     # a of the rank loss (the paper: 0.05)
     leaky_rate: float = 0.05
+    # hinge: margin per metre from the human, of a collision, of a broken rule
+    margin_distance: float = 0.2
+    margin_collision: float = 4.0
+    margin_rule: float = 2.0
+    # soft: m, temperature of the labels
+    soft_distance: float = 1.0
     # optimiser; the paper found no substantial difference between these
     optimizer: str = "adam"
     # 1/step
@@ -51,31 +63,41 @@ class TrainConfig:
     positive: str = "human"
     # offline negatives near the human per scene (0: none)
     hard_negatives: int = 0
+    # so many times more are drawn each time; those that the reward values most
+    # just then are kept (1: all are)
+    hard_pool: int = 1
     seed: int = 0
     reward: RewardConfig = dataclasses.field(default_factory=RewardConfig)
     sampler: SamplerConfig = dataclasses.field(default_factory=SamplerConfig)
 
     def __post_init__(self) -> None:
         """Reject values out of range with the flag's name."""
-        if self.loss not in LOSSES:
-            raise InputError(f"--loss: {self.loss}: expected one of {sorted(LOSSES)}")
-        if self.optimizer not in OPTIMIZERS:
-            raise InputError(
-                f"--optimizer: {self.optimizer}: expected one of {sorted(OPTIMIZERS)}"
-            )
-        if self.positive not in POSITIVES:
-            raise InputError(
-                f"--positive: {self.positive}: expected one of {POSITIVES}"
-            )
-        for name, low in (("leaky_rate", 0.0), ("learning_rate", 0.0)):
-            if not low < getattr(self, name) < 1.0:
+        known = {"loss": LOSSES, "optimizer": OPTIMIZERS, "positive": POSITIVES}
+        for name, values in known.items():
+            if getattr(self, name) not in values:
+                raise InputError(
+                    f"--{name}: {getattr(self, name)}: expected one of {sorted(values)}"
+                )
+        for name in ("leaky_rate", "learning_rate"):
+            if not 0.0 < getattr(self, name) < 1.0:
                 found = getattr(self, name)
                 raise InputError(f"--{name}: {found}: expected between 0 and 1")
-        if self.halve_every < 0:
-            raise InputError(f"--halve_every: {self.halve_every}: expected >= 0")
-        for name in ("batch_size", "epochs"):
+        margins = ("margin_distance", "margin_collision", "margin_rule")
+        for name in ("halve_every", "hard_negatives", *margins):
+            if getattr(self, name) < 0:
+                raise InputError(f"--{name}: {getattr(self, name)}: expected >= 0")
+        for name in ("batch_size", "epochs", "hard_pool"):
             if getattr(self, name) < 1:
                 raise InputError(f"--{name}: {getattr(self, name)}: expected >= 1")
+        if not self.soft_distance > 0.0:
+            found = self.soft_distance
+            raise InputError(f"--soft_distance: {found}: expected > 0 m")
+
+    @property
+    def loss_config(self) -> LossConfig:
+        """Constants of the losses."""
+        names = [field.name for field in dataclasses.fields(LossConfig)]
+        return LossConfig(**{n: getattr(self, n) for n in names if hasattr(self, n)})
 
 
 class TrainState(flax.struct.PyTreeNode, kw_only=True):
@@ -96,13 +118,25 @@ class Batch(flax.struct.PyTreeNode, kw_only=True):
     index: jax.Array  # [B] int32, row in the dataset; seeds the sampler
 
 
+class Facts(flax.struct.PyTreeNode, kw_only=True):
+    """What losses know about the trajectories besides their values."""
+
+    human_distance: jax.Array  # [B] m, the positive's mean distance to the human
+    distance: jax.Array  # [B, K] m, the candidates'
+    collides: jax.Array  # [B, K] bool, meets a body at a valid time
+    breaks_rule: jax.Array  # [B, K] share of times over the limit or a line
+    human_density: jax.Array  # [B] log of the proposal's density
+    density: jax.Array  # [B, K]
+
+
 class FeatureBatch(flax.struct.PyTreeNode, kw_only=True):
     """The same with features already made (a feature cache)."""
 
-    human: jax.Array  # [B, T, F]
+    human: jax.Array  # [B, T, F] of the positive
     candidates: jax.Array  # [B, K, T, F]
     feasible: jax.Array  # [B, K] bool
     time_valid: jax.Array  # [B, T] bool
+    facts: Facts
     weight: jax.Array  # [B]
     index: jax.Array  # [B] int32
 

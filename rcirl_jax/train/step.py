@@ -13,7 +13,16 @@ import jax.numpy as jnp
 import optax
 
 from rcirl_jax.features import FeatureMap, feature_map
-from rcirl_jax.reward import init_reward, pair_sums, value
+from rcirl_jax.features.columns import candidate_frames
+from rcirl_jax.reward import (
+    Compared,
+    LossConfig,
+    LossSums,
+    RewardConfig,
+    init_reward,
+    loss_sums,
+    value,
+)
 from rcirl_jax.sampling import (
     SamplerConfig,
     hard_negatives,
@@ -23,6 +32,7 @@ from rcirl_jax.sampling import (
 )
 from rcirl_jax.train.state import (
     Batch,
+    Facts,
     FeatureBatch,
     TrainConfig,
     TrainState,
@@ -44,6 +54,7 @@ class StepMetrics(flax.struct.PyTreeNode, kw_only=True):
     """Sums over the step's pairs; the loop divides."""
 
     loss_sum: jax.Array  # []
+    terms: jax.Array  # [] what the loss is divided by: pairs or scenes
     wins: jax.Array  # [] pairs the human wins, ties half
     pairs: jax.Array  # [] feasible pairs (queries)
     grad_norm: jax.Array  # []
@@ -78,79 +89,168 @@ def candidates_of(
         demonstration.scene,
         human_of(demonstration, config.sampler),
         config.sampler,
-        config.hard_negatives,
+        config.hard_negatives * config.hard_pool,
     )
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), sampled, near)
 
 
-def nearest_candidate(
-    demonstration: Demonstration, driven: Trajectory, candidates: Candidates
-) -> jax.Array:
-    """Index of the feasible candidate with the least mean distance to the human.
+OVER_LIMIT_MPS = 0.5  # m/s above the limit that counts as breaking it
+KERNEL_M = 2.0  # m, bandwidth of the proposal's density
 
-    Ranking this one above the rest asks for what a planner can choose, and
-    leaves nothing to learn from how the human's curve was recorded.
+
+def facts_of(
+    demonstration: Demonstration,
+    driven: Trajectory,
+    candidates: Candidates,
+    config: TrainConfig,
+) -> Facts:
+    """Distances, collisions, broken rules and densities of one scene, leaves [K].
+
+    The human's own are of the recorded curve.
     """
-    valid = demonstration.scene.time_valid
-    apart = jnp.abs(candidates.trajectory.s - driven.s)
-    apart = apart + jnp.abs(candidates.trajectory.l - driven.l)
-    mean = jnp.sum(jnp.where(valid, apart, 0.0), axis=1) / jnp.sum(valid)
-    return jnp.argmin(jnp.where(candidates.feasible, mean, jnp.inf))
+    scene, x = demonstration.scene, candidates.trajectory
+    valid = scene.time_valid
+    count = jnp.sum(valid)
+
+    def apart(a: Trajectory, b: Trajectory) -> jax.Array:
+        """Mean distance [m] over valid times."""
+        distance = jnp.sqrt((a.s - b.s) ** 2 + (a.l - b.l) ** 2 + 1e-9)
+        return jnp.sum(jnp.where(valid, distance, 0.0), axis=-1) / count
+
+    frames = candidate_frames(scene, candidates)
+    seen = valid[:, None]
+    fast = frames.point.v > frames.path.speed_limit + OVER_LIMIT_MPS
+    unlawful = (fast | (frames.relations.line_overrun > 0.0)) & seen
+    human_density, density = jnp.zeros(()), jnp.zeros(x.s.shape[:1])
+    if config.loss == "listwise":
+        row = jax.vmap(lambda one: apart(x, one))
+        density = _log_density(row(x), candidates.feasible)
+        human_density = _log_density(apart(x, driven)[None], candidates.feasible)[0]
+    return Facts(
+        human_distance=jnp.zeros(()),
+        distance=apart(x, driven),
+        collides=jnp.any((frames.relations.body < 0.0) & seen, axis=0),
+        breaks_rule=jnp.sum(unlawful, axis=0) / count,
+        human_density=human_density,
+        density=density,
+    )
+
+
+def _log_density(distance: jax.Array, feasible: jax.Array) -> jax.Array:
+    """Log of the kernel density of the candidates [n]; distance [n, K] in m.
+
+    Each trajectory counts as one sample of its own, so that none has density 0.
+    """
+    kernel = -0.5 * (distance / KERNEL_M) ** 2
+    own = jnp.zeros((distance.shape[0], 1))
+    others = jnp.where(feasible & (distance > 1e-3), kernel, -jnp.inf)
+    return jax.nn.logsumexp(jnp.concatenate([own, others], axis=1), axis=1)
 
 
 def featurise(
     key: jax.Array, batch: Batch, config: TrainConfig, features: FeatureMap
 ) -> FeatureBatch:
-    """Candidates and features of a batch; each scene's key comes from its row."""
+    """Candidates and features of a batch; each scene's key comes from its row.
+
+    With `positive="nearest"` the feasible candidate nearest to the human takes
+    the human's place: ranking it above the rest asks for what a planner can
+    choose, and leaves nothing to learn from how the human's curve was recorded.
+    """
 
     def one(index: jax.Array, demonstration: Demonstration) -> tuple:
         own_key = jax.random.fold_in(key, index)
         candidates = candidates_of(own_key, demonstration, config)
         driven = human_of(demonstration, config.sampler)
         of_candidates = features.of_candidates(demonstration.scene, candidates)
-        if config.positive == "nearest":
-            near = nearest_candidate(demonstration, driven, candidates)
-            feasible = candidates.feasible.at[near].set(False)
-            return of_candidates[near], of_candidates, feasible
-        human = features(demonstration.scene, driven)
-        return human, of_candidates, candidates.feasible
+        facts = facts_of(demonstration, driven, candidates, config)
+        feasible = candidates.feasible
+        if config.positive == "human":
+            human = features(demonstration.scene, driven)
+            return human, of_candidates, feasible, facts
+        near = jnp.argmin(jnp.where(feasible, facts.distance, jnp.inf))
+        facts = facts.replace(
+            human_distance=facts.distance[near], human_density=facts.density[near]
+        )
+        return of_candidates[near], of_candidates, feasible.at[near].set(False), facts
 
-    human, of_candidates, feasible = jax.vmap(one)(batch.index, batch.demonstrations)
+    made = jax.vmap(one)(batch.index, batch.demonstrations)
+    human, of_candidates, feasible, facts = made
     return FeatureBatch(
         human=human,
         candidates=of_candidates,
         feasible=feasible,
         time_valid=batch.demonstrations.scene.time_valid,
+        facts=facts,
         weight=batch.weight,
         index=batch.index,
     )
 
 
-def batch_sums(
+def compare(
+    params: RewardParams,
+    normaliser: Normaliser,
+    batch: FeatureBatch,
+    reward: RewardConfig,
+) -> Compared:
+    """Values of a batch under the Siamese network, with what losses need beside."""
+    valid, facts = batch.time_valid, batch.facts
+    spread = jnp.broadcast_to(valid[:, None], batch.candidates.shape[:3])
+    return Compared(
+        human=value(params, normaliser, batch.human, valid, reward),
+        candidates=value(params, normaliser, batch.candidates, spread, reward),
+        counts=batch.feasible,
+        weight=batch.weight,
+        human_distance=facts.human_distance,
+        distance=facts.distance,
+        collides=facts.collides,
+        breaks_rule=facts.breaks_rule,
+        human_density=facts.human_density,
+        density=facts.density,
+        offset=jnp.zeros(()) if params.offset is None else params.offset,
+    )
+
+
+def mined(
     params: RewardParams,
     normaliser: Normaliser,
     batch: FeatureBatch,
     config: TrainConfig,
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Loss sum, wins and pairs of a batch under the Siamese network."""
-    valid = batch.time_valid
-    human_value = value(params, normaliser, batch.human, valid, config.reward)
-    shape = batch.candidates.shape[:3]
-    candidate_values = value(
-        params,
-        normaliser,
-        batch.candidates,
-        jnp.broadcast_to(valid[:, None], shape),
-        config.reward,
+) -> FeatureBatch:
+    """Of the hard negatives drawn, only those the present reward values most.
+
+    The pool stands last among the candidates; the others stop counting.
+    """
+    pool = config.hard_negatives * config.hard_pool
+    values = compare(params, normaliser, batch, config.reward).candidates[:, -pool:]
+    feasible = batch.feasible[:, -pool:]
+    values = jnp.where(feasible, values, -jnp.inf)
+    least = jax.lax.top_k(values, config.hard_negatives)[0][:, -1:]
+    kept = feasible & (values >= least)
+    return batch.replace(
+        feasible=jnp.concatenate([batch.feasible[:, :-pool], kept], axis=1)
     )
-    return pair_sums(
-        config.loss,
-        human_value,
-        candidate_values,
-        batch.feasible,
-        batch.weight,
-        config.leaky_rate,
-    )
+
+
+def gradient_sums(
+    params: RewardParams,
+    normaliser: Normaliser,
+    batch: FeatureBatch,
+    config: TrainConfig,
+    constants: LossConfig | None = None,
+) -> tuple[RewardParams, LossSums]:
+    """Gradient of the loss sum, and the sums; divide by `terms` afterwards.
+
+    `constants` replaces those of the configuration and may hold tracers.
+    """
+    if config.hard_negatives and config.hard_pool > 1:
+        batch = mined(params, normaliser, batch, config)
+
+    def total(params: RewardParams) -> tuple[jax.Array, LossSums]:
+        compared = compare(params, normaliser, batch, config.reward)
+        sums = loss_sums(config.loss, compared, constants or config.loss_config)
+        return sums.loss, sums
+
+    return jax.grad(total, has_aux=True)(params)
 
 
 def _nonfinite(batch: FeatureBatch) -> tuple[jax.Array, jax.Array]:
@@ -188,22 +288,14 @@ def make_train_step(
             key = jax.random.fold_in(state.key, state.step)
             batch = featurise(key, batch, config, features)
 
-        def loss_sum(params: RewardParams) -> tuple[jax.Array, tuple]:
-            loss, wins, pairs = batch_sums(params, state.normaliser, batch, config)
-            return loss, (wins, pairs)
-
-        (loss, (wins, pairs)), grads = jax.value_and_grad(loss_sum, has_aux=True)(
-            state.params
-        )
+        grads, sums = gradient_sums(state.params, state.normaliser, batch, config)
         nonfinite, first_bad = _nonfinite(batch)
-        sums = (loss, wins, pairs, grads, nonfinite)
         if axis_name is not None:
-            sums = jax.lax.psum(sums, axis_name)
+            sums, grads, nonfinite = jax.lax.psum((sums, grads, nonfinite), axis_name)
             first_bad = jax.lax.pmax(first_bad, axis_name)
-        loss, wins, pairs, grads, nonfinite = sums
-        grads = jax.tree.map(lambda g: g / jnp.maximum(pairs, 1.0), grads)
+        grads = jax.tree.map(lambda g: g / jnp.maximum(sums.terms, 1.0), grads)
         norm = optax.tree.norm(grads)
-        finite = jnp.isfinite(loss) & jnp.isfinite(norm)
+        finite = jnp.isfinite(sums.loss) & jnp.isfinite(norm)
         before = as_tree(state.params)
         updates, opt_state = optimizer.update(grads, state.opt_state, before)
         params = optax.apply_updates(before, updates)
@@ -216,9 +308,10 @@ def make_train_step(
             normaliser=state.normaliser,
         )
         metrics = StepMetrics(
-            loss_sum=loss,
-            wins=wins,
-            pairs=pairs,
+            loss_sum=sums.loss,
+            terms=sums.terms,
+            wins=sums.wins,
+            pairs=sums.pairs,
             grad_norm=norm,
             nonfinite=nonfinite,
             first_bad=first_bad,
@@ -229,11 +322,19 @@ def make_train_step(
     return train_step
 
 
+def init_params(key: jax.Array, num_features: int, config: TrainConfig) -> RewardParams:
+    """Random parameters, with the discriminator's offset for the GAN loss."""
+    params = init_reward(key, num_features, config.reward)
+    if config.loss == "gan":
+        params = params.replace(offset=jnp.zeros(()))
+    return params
+
+
 def init_state(config: TrainConfig, normaliser: Normaliser) -> TrainState:
     """A fresh state; everything random comes from `config.seed`."""
     features = feature_map(config.features)
     init_key, train_key = jax.random.split(jax.random.key(config.seed))
-    params = init_reward(init_key, features.num_features, config.reward)
+    params = init_params(init_key, features.num_features, config)
     return TrainState(
         step=jnp.zeros((), jnp.int32),
         params=params,

@@ -71,8 +71,8 @@ def test_the_hash_does_not_depend_on_run_chunk_or_company(result):
         again = run(chunk, LANES // 2 + 2)
         assert again.facts["result_sha256"] == hashes
     few = run(6).runs["IDM"]
-    assert np.array_equal(few.distance[:3], first.runs["IDM"].distance[:3])
-    assert np.array_equal(few.distance, result.runs["IDM"].distance)
+    assert np.array_equal(few.progress[:3], first.runs["IDM"].progress[:3])
+    assert np.array_equal(few.progress, result.runs["IDM"].progress)
 
 
 def test_files_say_the_same(result, tmp_path):

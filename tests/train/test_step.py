@@ -11,11 +11,11 @@ import pytest
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.features import feature_map
-from rcirl_jax.reward import Normaliser, RewardConfig, pinned
+from rcirl_jax.reward import LOSSES, Normaliser, RewardConfig, pinned
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train.loop import guard, to_device_batch
 from rcirl_jax.train.parallel import parallelise, pmapped, sharded, single
-from rcirl_jax.train.state import FeatureBatch, TrainConfig
+from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.train.step import featurise, init_state, make_train_step
 from tests.scenes import demonstration
 
@@ -128,17 +128,15 @@ def human_is_better():
         noise = 0.05 * width * rng.normal(size=shape)
         return jnp.asarray(middle + shift + noise, jnp.float32)
 
-    return FeatureBatch(
+    return base.replace(
         human=around(base.human.shape, direction),
         candidates=around(base.candidates.shape, -direction),
         feasible=jnp.ones_like(base.feasible),
         time_valid=jnp.ones_like(base.time_valid),
-        weight=base.weight,
-        index=base.index,
     )
 
 
-@pytest.mark.parametrize("loss", ["rank", "logistic"])
+@pytest.mark.parametrize("loss", sorted(LOSSES))
 @pytest.mark.parametrize("optimizer", ["sgd", "adam", "rmsprop"])
 def test_learns_a_direction(loss, optimizer):
     config = dataclasses.replace(CONFIG, loss=loss, optimizer=optimizer)

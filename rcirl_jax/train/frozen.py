@@ -1,0 +1,155 @@
+"""Training on candidates that are made once, several members side by side.
+
+All learners of a comparison see the same candidates, and a sweep pays for
+sampling and features once. Members of one call share network shape, loss and
+batches; they differ in seed, step size and leaky rate, which are arrays, so the
+whole grid is one compiled program.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from rcirl_jax.features import feature_map
+from rcirl_jax.reward import Normaliser, RewardParams
+from rcirl_jax.train.loop import to_device_batch
+from rcirl_jax.train.state import OPTIMIZERS, FeatureBatch, TrainConfig
+from rcirl_jax.train.step import as_tree, featurise, gradient_sums, init_params
+from rcirl_jax.types import Demonstration
+
+CHUNK = 128  # scenes featurised per call
+ORDER_STREAM = 3  # fold_in number of the batch order's key
+
+
+class Members(flax.struct.PyTreeNode, kw_only=True):
+    """What differs between the members of one training; all [M]."""
+
+    seed: jax.Array  # of the initial weights
+    learning_rate: jax.Array
+    leaky_rate: jax.Array
+
+
+class Fitted(flax.struct.PyTreeNode, kw_only=True):
+    """Trained members."""
+
+    params: RewardParams  # leaves [M, ...]
+    loss: jax.Array  # [M, epochs] mean loss of each epoch
+    wins: jax.Array  # [M, epochs] share of pairs the human wins
+    finite: jax.Array  # [M] bool, no step was refused for a NaN or infinity
+
+
+def members_of(config: TrainConfig, seeds: Sequence[int]) -> Members:
+    """Members that differ in nothing but the seed."""
+    full = lambda x: jnp.full((len(seeds),), x, jnp.float32)  # noqa: E731
+    return Members(
+        seed=jnp.asarray(seeds, jnp.uint32),
+        learning_rate=full(config.learning_rate),
+        leaky_rate=full(config.leaky_rate),
+    )
+
+
+def freeze(rows: Demonstration, index: np.ndarray, config: TrainConfig) -> FeatureBatch:
+    """Candidates and features of S scenes, made once.
+
+    Args:
+      rows: S demonstrations (numpy).
+      index: [S] dataset rows; with `config.seed` they seed the candidates.
+      config: sampler, positive, features; the loss decides which facts.
+    """
+    features, key = feature_map(config.features), jax.random.key(config.seed)
+    make = jax.jit(lambda batch: featurise(key, batch, config, features))
+    parts = []
+    for start in range(0, index.size, CHUNK):
+        at = np.minimum(np.arange(start, start + CHUNK), index.size - 1)
+        taken = jax.tree.map(lambda x, at=at: x[at], rows)
+        made = make(to_device_batch(taken, np.ones(CHUNK), index[at]))
+        keep = min(CHUNK, index.size - start)
+        parts.append(jax.tree.map(lambda x, n=keep: np.asarray(x[:n]), made))
+    return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)), *parts)
+
+
+def fit(
+    frozen: FeatureBatch, normaliser: Normaliser, config: TrainConfig, members: Members
+) -> Fitted:
+    """Train all members on a frozen set.
+
+    The same steps as `make_train_step`, except that candidates do not change
+    from epoch to epoch. The batch order comes from `config.seed` and is shared.
+
+    Args:
+      frozen: of `freeze`, leaves [S, ...].
+      normaliser: fitted on the same scenes.
+      config: everything that the members share.
+      members: what they do not.
+    """
+    shared = dataclasses.replace(config, learning_rate=0.5, leaky_rate=0.5, seed=0)
+    order = jax.random.fold_in(jax.random.key(config.seed), ORDER_STREAM)
+    return _fit(frozen, normaliser, order, members, shared)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _fit(
+    frozen: FeatureBatch,
+    normaliser: Normaliser,
+    order: jax.Array,
+    members: Members,
+    config: TrainConfig,
+) -> Fitted:
+    """`config.seed`, step size and leaky rate are not read: one compile for all."""
+    count = frozen.weight.shape[0]
+    size = min(config.batch_size, count)
+    batches = -(-count // size)
+    # the direction of a step of size 1; members scale it
+    decay = optax.add_decayed_weights(config.weight_decay)
+    optimizer = optax.chain(decay, OPTIMIZERS[config.optimizer](1.0))
+    init = lambda seed: init_params(  # noqa: E731
+        jax.random.split(jax.random.key(seed))[0], frozen.human.shape[-1], config
+    )
+    params = jax.vmap(init)(members.seed)
+    state = jax.vmap(lambda p: optimizer.init(as_tree(p)))(params)
+
+    def one_step(batch: FeatureBatch, step: jax.Array, member: tuple) -> tuple:
+        who, params, state = member
+        constants = dataclasses.replace(config.loss_config, leaky_rate=who.leaky_rate)
+        grads, sums = gradient_sums(params, normaliser, batch, config, constants)
+        grads = jax.tree.map(lambda g: g / jnp.maximum(sums.terms, 1.0), grads)
+        updates, after = optimizer.update(grads, state, as_tree(params))
+        rate = who.learning_rate
+        if config.halve_every:
+            rate = rate * 0.5 ** (step / config.halve_every)
+        moved = jax.tree.map(lambda p, u: p + rate * u, params, updates)
+        fine = jnp.isfinite(sums.loss) & jnp.isfinite(optax.tree.norm(grads))
+        keep = lambda new, old: jnp.where(fine, new, old)  # noqa: E731
+        params = jax.tree.map(keep, moved, params)
+        return params, jax.tree.map(keep, after, state), (sums, fine)
+
+    def step(carry: tuple, at: tuple) -> tuple:
+        params, state = carry
+        number, rows, weight = at
+        batch = jax.tree.map(lambda x: x[rows], frozen).replace(weight=weight)
+        member = (members, params, state)
+        params, state, seen = jax.vmap(lambda m: one_step(batch, number, m))(member)
+        return (params, state), seen
+
+    def epoch(carry: tuple, number: jax.Array) -> tuple:
+        key = jax.random.fold_in(order, number)
+        padded = jnp.resize(jax.random.permutation(key, count), (batches, size))
+        real = jnp.arange(batches * size).reshape(batches, size) < count
+        steps = number * batches + jnp.arange(batches)
+        carry, (sums, fine) = jax.lax.scan(
+            step, carry, (steps, padded, real.astype(jnp.float32))
+        )
+        sums = jax.tree.map(lambda x: jnp.sum(x, axis=0), sums)
+        terms, pairs = jnp.maximum(sums.terms, 1.0), jnp.maximum(sums.pairs, 1.0)
+        return carry, (sums.loss / terms, sums.wins / pairs, jnp.all(fine, axis=0))
+
+    (params, _), (loss, wins, fine) = jax.lax.scan(
+        epoch, (params, state), jnp.arange(config.epochs)
+    )
+    return Fitted(params=params, loss=loss.T, wins=wins.T, finite=jnp.all(fine, axis=0))

@@ -1,0 +1,158 @@
+"""Every loss against float64 loops over its definition, and what it leaves out."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rcirl_jax.reward import LOSSES, LossConfig, loss_sums
+from tests.reward.compared import compared
+
+CONFIG = LossConfig()
+B, K = 6, 9
+
+
+def drawn(seed=0):
+    rng = np.random.default_rng(seed)
+    return compared(
+        rng.normal(0, 2, B),
+        rng.normal(0, 2, (B, K)),
+        counts=rng.random((B, K)) < 0.8,
+        weight=np.array([1.0, 1.0, 0.0, 1.0, 1.0, 1.0]),
+        human_distance=jnp.asarray(rng.uniform(0, 1, B)),
+        distance=jnp.asarray(rng.uniform(0, 20, (B, K))),
+        collides=jnp.asarray(rng.random((B, K)) < 0.3),
+        breaks_rule=jnp.asarray(rng.uniform(0, 1, (B, K))),
+        human_density=jnp.asarray(rng.normal(0, 1, B)),
+        density=jnp.asarray(rng.normal(0, 1, (B, K))),
+        offset=jnp.asarray(0.3),
+    )
+
+
+def pair_oracle(name, c, b, k):
+    y = c.candidates[b, k] - c.human[b]
+    if name == "rank":
+        return y if y >= 0 else CONFIG.leaky_rate * y
+    if name == "logistic":
+        return np.log1p(np.exp(y))
+    margin = CONFIG.margin_distance * min(c.distance[b, k], CONFIG.margin_ceiling)
+    margin += CONFIG.margin_collision * c.collides[b, k]
+    return max(0.0, y + margin + CONFIG.margin_rule * c.breaks_rule[b, k])
+
+
+def scene_oracle(name, c, b, ks):
+    v, h = c.candidates[b], c.human[b]
+    values = np.array([h, *v[ks]])
+    if name == "listwise":
+        share = np.exp(values - np.array([c.human_density[b], *c.density[b, ks]]))
+        mean = np.exp(np.mean([c.human_density[b], *c.density[b, ks]]))
+        return -np.log(np.exp(h) / (mean * share.sum()))
+    if name == "soft":
+        apart = np.array([c.human_distance[b], *c.distance[b, ks]])
+        label = np.exp(-apart / CONFIG.soft_distance)
+        label /= label.sum()
+        return -np.sum(label * np.log(np.exp(values) / np.exp(values).sum()))
+    real = -np.log(1 / (1 + np.exp(-(h + c.offset))))
+    fake = [-np.log(1 - 1 / (1 + np.exp(-(v[k] + c.offset)))) for k in ks]
+    return real + np.mean(fake)
+
+
+def oracle(name, c):
+    """Mean loss by loops in float64."""
+    c = jax.tree.map(lambda x: np.asarray(x, np.float64), c)
+    terms = []
+    for b in np.flatnonzero(c.weight):
+        ks = np.flatnonzero(c.counts[b])
+        if name in ("rank", "logistic", "hinge"):
+            terms += [pair_oracle(name, c, b, k) for k in ks]
+        else:
+            terms.append(scene_oracle(name, c, b, ks))
+    return np.mean(terms)
+
+
+@pytest.mark.parametrize("name", sorted(LOSSES))
+@pytest.mark.parametrize("seed", [0, 1])
+def test_equals_its_definition(name, seed):
+    sums = loss_sums(name, drawn(seed), CONFIG)
+    assert float(sums.loss / sums.terms) == pytest.approx(
+        oracle(name, drawn(seed)), rel=1e-5
+    )
+
+
+@pytest.mark.parametrize("name", sorted(LOSSES))
+def test_padding_and_infeasible_candidates_count_nothing(name):
+    whole = drawn()
+    keep = np.array([0, 1, 3, 4, 5])
+    part = type(whole)(*[x[keep] if x.ndim else x for x in whole])
+    for a, b in zip(
+        loss_sums(name, whole, CONFIG), loss_sums(name, part, CONFIG), strict=True
+    ):
+        assert float(a) == pytest.approx(float(b), rel=1e-6)
+    wild = whole._replace(
+        candidates=jnp.where(whole.counts, whole.candidates, jnp.inf),
+    )
+    assert float(loss_sums(name, wild, CONFIG).loss) == pytest.approx(
+        float(loss_sums(name, whole, CONFIG).loss), rel=1e-6
+    )
+
+
+@pytest.mark.parametrize("name", sorted(LOSSES))
+def test_gradient_is_finite_and_lifts_the_human(name):
+    """Also where a scene has no feasible candidate."""
+    c = drawn()._replace(distance=jnp.full((B, K), 30.0), human_distance=jnp.zeros(B))
+    c = c._replace(counts=c.counts.at[1].set(False))
+    grad = jax.grad(lambda h: loss_sums(name, c._replace(human=h), CONFIG).loss)
+    slope = np.asarray(grad(c.human))
+    assert np.isfinite(slope).all()
+    assert (slope[[0, 3, 4, 5]] < 0.0).all()
+    assert slope[1] == 0.0
+    assert slope[2] == 0.0
+
+
+@given(y=st.floats(-20, 20, width=32), a=st.sampled_from([0.01, 0.05, 0.3]))
+def test_rank_loss_is_the_papers(y, a):
+    found = loss_sums("rank", compared([0.0], [[y]]), LossConfig(leaky_rate=a)).loss
+    assert float(found) == pytest.approx(y if y >= 0 else a * y, rel=1e-5, abs=1e-6)
+
+
+@given(y=st.floats(-20, 20, width=32))
+def test_logistic_loss_is_antisymmetric_up_to_y(y):
+    one, other = (
+        float(loss_sums("logistic", compared([0.0], [[x]]), CONFIG).loss)
+        for x in (y, -y)
+    )
+    assert one - other == pytest.approx(y, abs=1e-4)
+
+
+def test_only_pairs_won_are_wins():
+    sums = loss_sums("rank", compared([1.0, 1.0], [[2.0, 0.0, 1.0], [5.0] * 3],
+                                      weight=[1.0, 0.0]), CONFIG)  # fmt: skip
+    assert [float(x) for x in sums] == pytest.approx([0.95, 3.0, 1.5, 3.0])
+
+
+def test_a_common_shift_of_a_scene_moves_the_gan_loss_only():
+    """Conditioning on the scene is what the discriminator lacks."""
+    c = drawn()
+    shift = jnp.linspace(-3, 3, B)
+    moved = c._replace(human=c.human + shift, candidates=c.candidates + shift[:, None])
+    for name in LOSSES:
+        before, after = (float(loss_sums(name, x, CONFIG).loss) for x in (c, moved))
+        if name == "gan":
+            assert abs(before - after) > 0.1
+        else:
+            assert before == pytest.approx(after, rel=1e-4)
+
+
+def test_denser_sampling_of_one_place_does_not_move_the_maxent_loss():
+    """Ten copies of a candidate, each with ten times the density, count as one."""
+    once = compared([1.0], [[0.5, -1.0]])
+    values = jnp.asarray([[0.5, *[-1.0] * 10]])
+    log_q = jnp.asarray([[0.0, *[np.log(10.0)] * 10]])
+    copies = compared([1.0], values, density=log_q)
+    mean = float(jnp.mean(jnp.concatenate([jnp.zeros(1), log_q[0]])))
+    expected = float(loss_sums("listwise", once, CONFIG).loss) + mean
+    assert float(loss_sums("listwise", copies, CONFIG).loss) == pytest.approx(
+        expected, rel=1e-5
+    )

@@ -1,0 +1,92 @@
+"""Members trained side by side on frozen candidates."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rcirl_jax.train.frozen import Members, fit, freeze, members_of
+from rcirl_jax.train.state import TrainState
+from rcirl_jax.train.step import init_state, make_train_step
+from tests.train.test_step import CONFIG, batch, human_is_better, normaliser, rows
+
+SHORT = dataclasses.replace(CONFIG, epochs=3)
+
+
+def test_freezing_equals_featurising():
+    made = freeze(rows(), np.arange(16), CONFIG)
+    assert made.candidates.shape[0] == 16
+    again = freeze(jax.tree.map(lambda x: x[4:7], rows()), np.arange(4, 7), CONFIG)
+    np.testing.assert_allclose(
+        again.candidates, made.candidates[4:7], rtol=1e-5, atol=1e-4
+    )
+    assert (np.asarray(made.facts.distance) >= 0.0).all()
+
+
+@pytest.mark.parametrize("optimizer", ["sgd", "adam", "rmsprop"])
+def test_a_member_takes_the_steps_of_the_training_step(optimizer):
+    """Full batches, so that the order of scenes does not matter."""
+    config = dataclasses.replace(
+        SHORT, optimizer=optimizer, learning_rate=0.01, weight_decay=0.01
+    )
+    made = human_is_better()
+    fitted = fit(made, normaliser(), config, members_of(config, [config.seed]))
+    state: TrainState = init_state(config, normaliser())
+    step = jax.jit(make_train_step(config))
+    for epoch in range(3):
+        state, metrics = step(state, made)
+        assert float(fitted.loss[0, epoch]) == pytest.approx(
+            float(metrics.loss_sum / metrics.terms), rel=1e-3, abs=1e-5
+        )
+    for a, b in zip(
+        jax.tree.leaves(fitted.params), jax.tree.leaves(state.params), strict=True
+    ):
+        np.testing.assert_allclose(a[0], b, rtol=2e-3, atol=2e-5)
+    assert bool(fitted.finite.all())
+
+
+def test_members_do_not_know_of_each_other():
+    grid = Members(
+        seed=jnp.asarray([0, 1, 1], jnp.uint32),
+        learning_rate=jnp.asarray([0.003, 0.003, 0.03]),
+        leaky_rate=jnp.asarray([0.05, 0.3, 0.05]),
+    )
+    together = fit(human_is_better(), normaliser(), SHORT, grid)
+    for m in range(3):
+        one = jax.tree.map(lambda x, m=m: x[m : m + 1], grid)
+        alone = fit(human_is_better(), normaliser(), SHORT, one)
+        for a, b in zip(
+            jax.tree.leaves(alone.params), jax.tree.leaves(together.params), strict=True
+        ):
+            np.testing.assert_allclose(a[0], b[m], rtol=1e-3, atol=1e-5)
+    assert len({float(x) for x in together.loss[:, -1]}) == 3
+
+
+def test_the_last_batch_may_be_short_and_counts_every_scene_once():
+    config = dataclasses.replace(SHORT, batch_size=5, epochs=1, learning_rate=1e-9)
+    made = human_is_better()
+    fitted = fit(made, normaliser(), config, members_of(config, [0]))
+    whole = dataclasses.replace(config, batch_size=16)
+    once = fit(made, normaliser(), whole, members_of(whole, [0]))
+    assert float(fitted.loss[0, 0]) == pytest.approx(float(once.loss[0, 0]), rel=1e-4)
+
+
+def test_mining_keeps_what_the_reward_values_most():
+    config = dataclasses.replace(CONFIG, hard_negatives=2, hard_pool=3)
+    made = freeze(rows(), np.arange(16), config)
+    state = init_state(config, normaliser())
+    from rcirl_jax.train.step import compare, mined
+
+    kept = mined(state.params, normaliser(), made, config)
+    values = compare(state.params, normaliser(), made, config.reward).candidates
+    pool = np.asarray(made.feasible)[:, -6:]
+    chosen = np.asarray(kept.feasible)[:, -6:]
+    assert (chosen.sum(axis=1) == np.minimum(2, pool.sum(axis=1))).all()
+    for v, p, c in zip(np.asarray(values)[:, -6:], pool, chosen, strict=True):
+        if c.any() and (p & ~c).any():
+            assert v[c].min() >= v[p & ~c].max()
+    np.testing.assert_array_equal(kept.feasible[:, :-6], made.feasible[:, :-6])
+    _, metrics = jax.jit(make_train_step(config))(state, batch())
+    assert bool(metrics.finite)
