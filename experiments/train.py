@@ -56,6 +56,7 @@ _POSITIVE = flags.DEFINE_enum(
     POSITIVES,
     "ranked first: the human curve or its nearest candidate",
 )
+_HORIZON = flags.DEFINE_float("train_horizon", 8.0, "s that are compared")
 _NEGATIVES = flags.DEFINE_integer("hard_negatives", 0, "near negatives per scene")
 _POOL = flags.DEFINE_integer(
     "hard_pool", 1, "near negatives drawn for each that the present reward keeps"
@@ -85,6 +86,7 @@ def main() -> None:
         batch_size=_BATCH.value,
         epochs=_EPOCHS.value,
         positive=_POSITIVE.value,
+        train_horizon=_HORIZON.value,
         hard_negatives=_NEGATIVES.value,
         hard_pool=_POOL.value,
         seed=_SEED.value,

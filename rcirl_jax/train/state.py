@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import flax.struct
 import jax
+import numpy as np
 import optax
 
 from rcirl_jax.errors import InputError
@@ -28,6 +29,24 @@ OPTIMIZERS: dict[
 
 
 POSITIVES = ("human", "nearest")
+
+
+# least, most, in words
+RANGES: dict[str, tuple[float, float, str]] = {
+    **dict.fromkeys(
+        ("leaky_rate", "learning_rate"), (1e-12, 1.0 - 1e-6, "between 0 and 1")
+    ),
+    **dict.fromkeys(
+        (
+            *("halve_every", "hard_negatives", "weight_decay"),
+            *("margin_distance", "margin_collision", "margin_rule"),
+        ),
+        (0.0, np.inf, ">= 0"),
+    ),
+    **dict.fromkeys(("batch_size", "epochs", "hard_pool"), (1, np.inf, ">= 1")),
+    "soft_distance": (1e-6, np.inf, "> 0 m"),
+    "train_horizon": (0.4, 8.0, "0.4 to 8 s"),
+}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -61,6 +80,8 @@ class TrainConfig:
     # what is ranked above the candidates: the "human" curve itself, or the
     # "nearest" feasible candidate to it (what a planner could have driven)
     positive: str = "human"
+    # s, times after it are not compared, nor their weights learned
+    train_horizon: float = 8.0
     # offline negatives near the human per scene (0: none)
     hard_negatives: int = 0
     # so many times more are drawn each time; those that the reward values most
@@ -78,20 +99,9 @@ class TrainConfig:
                 raise InputError(
                     f"--{name}: {getattr(self, name)}: expected one of {sorted(values)}"
                 )
-        for name in ("leaky_rate", "learning_rate"):
-            if not 0.0 < getattr(self, name) < 1.0:
-                found = getattr(self, name)
-                raise InputError(f"--{name}: {found}: expected between 0 and 1")
-        margins = ("margin_distance", "margin_collision", "margin_rule")
-        for name in ("halve_every", "hard_negatives", *margins):
-            if getattr(self, name) < 0:
-                raise InputError(f"--{name}: {getattr(self, name)}: expected >= 0")
-        for name in ("batch_size", "epochs", "hard_pool"):
-            if getattr(self, name) < 1:
-                raise InputError(f"--{name}: {getattr(self, name)}: expected >= 1")
-        if not self.soft_distance > 0.0:
-            found = self.soft_distance
-            raise InputError(f"--soft_distance: {found}: expected > 0 m")
+        for name, (low, high, text) in RANGES.items():
+            if not low <= getattr(self, name) <= high:
+                raise InputError(f"--{name}: {getattr(self, name)}: expected {text}")
 
     @property
     def loss_config(self) -> LossConfig:

@@ -45,6 +45,7 @@ from rcirl_jax.types import (
     RewardParams,
     Trajectory,
 )
+from rcirl_jax.units import TIMES_S
 
 SAMPLER_STREAM = 0  # fold_in number of the sampler's key
 NEGATIVE_STREAM = 1  # fold_in number of the hard negatives' key
@@ -102,14 +103,14 @@ def facts_of(
     demonstration: Demonstration,
     driven: Trajectory,
     candidates: Candidates,
+    valid: jax.Array,
     config: TrainConfig,
 ) -> Facts:
     """Distances, collisions, broken rules and densities of one scene, leaves [K].
 
-    The human's own are of the recorded curve.
+    Over the times in `valid` [T]; the human's own are of the recorded curve.
     """
     scene, x = demonstration.scene, candidates.trajectory
-    valid = scene.time_valid
     count = jnp.sum(valid)
 
     def apart(a: Trajectory, b: Trajectory) -> jax.Array:
@@ -156,30 +157,33 @@ def featurise(
     the human's place: ranking it above the rest asks for what a planner can
     choose, and leaves nothing to learn from how the human's curve was recorded.
     """
+    seen = jnp.asarray(TIMES_S) <= config.train_horizon + 1e-6
 
     def one(index: jax.Array, demonstration: Demonstration) -> tuple:
         own_key = jax.random.fold_in(key, index)
+        valid = demonstration.scene.time_valid & seen
         candidates = candidates_of(own_key, demonstration, config)
         driven = human_of(demonstration, config.sampler)
         of_candidates = features.of_candidates(demonstration.scene, candidates)
-        facts = facts_of(demonstration, driven, candidates, config)
+        facts = facts_of(demonstration, driven, candidates, valid, config)
         feasible = candidates.feasible
         if config.positive == "human":
             human = features(demonstration.scene, driven)
-            return human, of_candidates, feasible, facts
+            return human, of_candidates, feasible, facts, valid
         near = jnp.argmin(jnp.where(feasible, facts.distance, jnp.inf))
         facts = facts.replace(
             human_distance=facts.distance[near], human_density=facts.density[near]
         )
-        return of_candidates[near], of_candidates, feasible.at[near].set(False), facts
+        feasible = feasible.at[near].set(False)
+        return of_candidates[near], of_candidates, feasible, facts, valid
 
     made = jax.vmap(one)(batch.index, batch.demonstrations)
-    human, of_candidates, feasible, facts = made
+    human, of_candidates, feasible, facts, valid = made
     return FeatureBatch(
         human=human,
         candidates=of_candidates,
         feasible=feasible,
-        time_valid=batch.demonstrations.scene.time_valid,
+        time_valid=valid,
         facts=facts,
         weight=batch.weight,
         index=batch.index,

@@ -1,0 +1,97 @@
+"""Another split of the same scenes: by vehicle, by recording, or smaller.
+
+Rows keep their numbers, and so their candidates.
+"""
+
+import hashlib
+from collections.abc import Mapping
+
+import numpy as np
+
+from rcirl_jax.data.joined import Demonstrations
+from rcirl_jax.errors import InputError
+from rcirl_jax.types import Demonstration
+
+
+class Resplit:
+    """A dataset seen through other splits.
+
+    Args:
+      dataset: any dataset.
+      splits: name -> row numbers; a row may be in one split at most.
+    """
+
+    def __init__(
+        self, dataset: Demonstrations, splits: Mapping[str, np.ndarray]
+    ) -> None:
+        self._dataset = dataset
+        self._splits = {
+            name: np.unique(np.asarray(rows, np.int64)) for name, rows in splits.items()
+        }
+        total = np.concatenate(list(self._splits.values()))
+        if np.unique(total).size != total.size:
+            raise InputError("split: rows: one is in two splits: expected one split")
+        for name, rows in self._splits.items():
+            if rows.size == 0:
+                raise InputError(f"split: {name}: no rows: expected at least one")
+
+    @property
+    def hash(self) -> str:
+        """sha256 of the dataset's hash and the rows of every split."""
+        text = hashlib.sha256(self._dataset.hash.encode())
+        for name in sorted(self._splits):
+            text.update(name.encode() + self._splits[name].tobytes())
+        return text.hexdigest()
+
+    def indices(self, split: str | None) -> np.ndarray:
+        """[m] row numbers of a split (None: of all) in ascending order."""
+        if split is None:
+            return np.sort(np.concatenate(list(self._splits.values())))
+        return self._splits[split]
+
+    def load(self, split: str | None) -> Demonstration:
+        """All rows of a split in memory."""
+        return self._dataset.read(self.indices(split))
+
+    def read(self, indices: np.ndarray) -> Demonstration:
+        """Rows by number, in the order asked for."""
+        return self._dataset.read(indices)
+
+
+def by_vehicle(dataset: Demonstrations, share: float, seed: int) -> Resplit:
+    """Hold out about `share` of the vehicles, drawn by the seed.
+
+    Held-out vehicles may still drive beside the training ones; where that
+    matters, use the dataset's own split by vehicle-disjoint groups.
+    """
+    vehicle = np.asarray(dataset.load(None).vehicle)
+    known = np.unique(vehicle)
+    drawn = np.random.default_rng([seed, 17]).permutation(known)
+    held = np.isin(vehicle, drawn[: max(round(share * known.size), 1)])
+    rows = dataset.indices(None)
+    return Resplit(dataset, {"train": rows[~held], "test": rows[held]})
+
+
+def by_recording(dataset: Demonstrations, recording: int) -> Resplit:
+    """Hold out one recording; its vehicles leave the training scenes too."""
+    every = dataset.load(None)
+    vehicle, where = np.asarray(every.vehicle), np.asarray(every.recording)
+    held = where == recording
+    clear = ~np.isin(vehicle, vehicle[held])
+    rows = dataset.indices(None)
+    return Resplit(dataset, {"train": rows[clear], "test": rows[held]})
+
+
+def fewer(dataset: Demonstrations, count: int, seed: int) -> Resplit:
+    """The same test split, and `count` training scenes drawn by vehicle.
+
+    Whole vehicles are taken in a drawn order until the count is reached, so
+    that few scenes also means few drivers; nested: more scenes contain fewer.
+    """
+    rows = dataset.indices("train")
+    vehicle = np.asarray(dataset.load("train").vehicle)
+    order = np.random.default_rng([seed, 23]).permutation(np.unique(vehicle))
+    place = np.empty(int(vehicle.max()) + 1, np.int64)
+    place[order] = np.arange(order.size)
+    taken = np.argsort(place[vehicle], kind="stable")[:count]
+    return Resplit(dataset, {"train": rows[taken], "test": dataset.indices("test")})

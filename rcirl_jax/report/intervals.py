@@ -1,0 +1,79 @@
+"""Charts of numbers with intervals: rows of a table, curves with bands."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from rcirl_jax.evaluation.table import RankingReport
+from rcirl_jax.report.style import CLASS_COLOURS, figure, label, save
+
+LEARNED = CLASS_COLOURS["follow"]
+RIVAL = "#777777"
+CURVES = (
+    CLASS_COLOURS["follow"],
+    "#D55E00",
+    CLASS_COLOURS["overtake"],
+    CLASS_COLOURS["virtual"],
+    CLASS_COLOURS["nudge"],
+    "#000000",
+    CLASS_COLOURS["other"],
+    "#777777",
+)
+RIVALS = ("random", "constant speed", "IDM", "hand-set", "hand-set, tuned", "oracle")
+PANELS = {
+    "top1_fde": ("distance of the chosen at the horizon", "m, lower is better"),
+    "top3_fde": ("best of the three highest", "m, lower is better"),
+    "percentile_rank": ("rank of the human's curve", "share below, higher is better"),
+}
+
+Interval = tuple[float, float, float]  # value, low, high
+
+
+def interval_panel(axis: Axes, rows: Mapping[str, Interval]) -> None:
+    """One dot with its interval per row, first row on top, value written out."""
+    for place, (name, (value, low, high)) in enumerate(rows.items()):
+        colour = RIVAL if name in RIVALS else LEARNED
+        axis.plot([low, high], [-place, -place], color=colour, lw=2)
+        axis.plot([value], [-place], "o", color=colour, ms=5)
+        axis.annotate(
+            f"{value:.3g}", (value, -place), (0, 4), textcoords="offset points",
+            fontsize=7, ha="center",
+        )  # fmt: skip
+    axis.set_yticks(-np.arange(len(rows)), list(rows))
+    axis.set_ylim(-len(rows) + 0.4, 0.7)
+
+
+def ranking_chart(path: Path, report: RankingReport) -> Path:
+    """PNG of the main columns of a ranking report, all rows, 95 % intervals."""
+    height = 1.2 + 0.34 * len(report.rows)
+    made, axes = figure(1, len(PANELS), 13.5, height)
+    for axis, (metric, (title, unit)) in zip(axes[0], PANELS.items(), strict=True):
+        rows = {}
+        for name, row in report.rows.items():
+            estimate = row[metric]
+            rows[name] = (estimate.value, estimate.low, estimate.high)
+        interval_panel(axis, rows)
+        label(axis, title, unit, "")
+        if axis is not axes[0, 0]:
+            axis.set_yticklabels([])
+    return save(made, path)
+
+
+def curves_panel(
+    axis: Axes, x: Sequence[float], curves: Mapping[str, np.ndarray]
+) -> None:
+    """Mean of each curve's runs [R, X] with a band of two standard errors."""
+    at = np.asarray(x, float)
+    for number, (name, runs) in enumerate(curves.items()):
+        colour = CURVES[number % len(CURVES)]
+        runs = np.atleast_2d(np.asarray(runs, float))
+        mean = np.nanmean(runs, axis=0)
+        axis.plot(at, mean, "o-", color=colour, ms=3, lw=1.6, label=name)
+        if runs.shape[0] > 1:
+            error = 2.0 * np.nanstd(runs, axis=0, ddof=1) / np.sqrt(runs.shape[0])
+            axis.fill_between(
+                at, mean - error, mean + error, color=colour, alpha=0.18, lw=0
+            )
+    axis.legend(fontsize=8, frameon=False)

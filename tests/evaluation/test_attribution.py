@@ -1,0 +1,164 @@
+"""Attribution against closed forms, completeness, and the paper's axioms."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.attribution import attribute
+from rcirl_jax.reward import (
+    Normaliser,
+    RewardConfig,
+    RewardParams,
+    normalise,
+    value,
+)
+from rcirl_jax.units import NUM_TIMES
+
+T, F = NUM_TIMES, 21
+VALID = np.arange(T) < T - 3
+
+run = jax.jit(attribute, static_argnames=("activation", "steps"))
+value_of = jax.jit(value, static_argnames="config")
+
+
+def floats(x):
+    return jnp.asarray(x, jnp.float32)
+
+
+def normaliser():
+    rng = np.random.default_rng(5)
+    return Normaliser(
+        lower=jnp.full(F, -6.0),
+        upper=jnp.full(F, 7.0),
+        location=floats(rng.normal(0, 1, F)),
+        scale=floats(rng.uniform(0.5, 3.0, F)),
+    )
+
+
+def network(hidden=(15,), seed=0):
+    """Random weights of about the size that keeps units out of saturation."""
+    rng = np.random.default_rng(seed)
+    sizes = (F, *hidden, 1)
+    return RewardParams(
+        gamma=floats(rng.uniform(0.1, 0.4, T)),
+        kernels=tuple(
+            floats(rng.normal(0, i**-0.5, (i, o))) for i, o in itertools.pairwise(sizes)
+        ),
+        biases=tuple(floats(rng.normal(0, 0.3, h)) for h in hidden),
+    )
+
+
+def difference(params, a, b, activation="tanh"):
+    """V(a) - V(b) as the package has it."""
+    config = RewardConfig(hidden=(1,), activation=activation, pin="none")
+    both = jnp.stack([a, b])
+    worth = value_of(params, normaliser(), both, jnp.stack([VALID] * 2), config)
+    return float(worth[0] - worth[1])
+
+
+def trajectories(seed=1):
+    """Two [T, F] of normalised features with variance 1, some beyond the bounds."""
+    rng = np.random.default_rng(seed)
+    norm = normaliser()
+    a, b = rng.normal(0, 1, (2, T, F))
+    return (floats(norm.location + norm.scale * x) for x in (a, b))
+
+
+def test_linear_reward_gives_the_terms_of_its_sum():
+    params = network(())
+    a, b = trajectories()
+    x_a, x_b = (np.asarray(normalise(normaliser(), f), np.float64) for f in (a, b))
+    gamma = np.asarray(params.gamma, np.float64)[:, None] * VALID[:, None]
+    want = gamma * np.asarray(params.kernels[0])[:, 0] * (x_a - x_b)
+    got = run(params, normaliser(), a, b, VALID, "identity", steps=1)
+    np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_contributions_add_up_for_the_papers_network(seed):
+    params = network(seed=seed)
+    a, b = trajectories(seed)
+    got = run(params, normaliser(), a, b, VALID, "tanh")
+    assert float(got.sum()) == pytest.approx(difference(params, a, b), rel=1e-3)
+
+
+def test_relus_add_up_more_slowly():
+    params = network((8, 4), seed=1)
+    a, b = trajectories()
+    want = difference(params, a, b, "relu")
+    for steps in (64, 1024):
+        got = float(run(params, normaliser(), a, b, VALID, "relu", steps=steps).sum())
+        assert got == pytest.approx(want, rel=1.0 / steps)
+
+
+def test_exchanging_the_trajectories_changes_the_sign():
+    params = network()
+    a, b = trajectories()
+    there = run(params, normaliser(), a, b, VALID, "tanh")
+    back = run(params, normaliser(), b, a, VALID, "tanh")
+    np.testing.assert_allclose(there, -back, atol=1e-5)
+
+
+def test_a_feature_that_does_not_differ_gets_nothing():
+    params = network()
+    a, b = trajectories()
+    a = a.at[:, 4].set(b[:, 4])
+    # beyond its upper bound in both: the network sees no difference either
+    a, b = a.at[:, 9].set(8.0), b.at[:, 9].set(50.0)
+    got = np.asarray(run(params, normaliser(), a, b, VALID, "tanh"))
+    np.testing.assert_array_equal(got[:, [4, 9]], 0.0)
+    assert np.all(np.abs(got[VALID][:, [0, 3]]) > 0.0)
+
+
+def test_a_clipped_feature_counts_up_to_its_bound():
+    params = network()
+    _, b = trajectories()
+    at_bound, beyond = b.at[:, 2].set(7.0), b.at[:, 2].set(700.0)
+    np.testing.assert_array_equal(
+        run(params, normaliser(), at_bound, b, VALID, "tanh"),
+        run(params, normaliser(), beyond, b, VALID, "tanh"),
+    )
+
+
+def test_invalid_times_contribute_nothing_whatever_is_there():
+    params = network()
+    a, b = trajectories()
+    a, b = a.at[~VALID].set(jnp.nan), b.at[~VALID].set(1e6)
+    got = np.asarray(run(params, normaliser(), a, b, VALID, "tanh"))
+    np.testing.assert_array_equal(got[~VALID], 0.0)
+    assert np.all(np.isfinite(got))
+    assert float(got.sum()) == pytest.approx(difference(params, a, b), rel=1e-3)
+
+
+def test_several_pairs_by_vmap():
+    params = network()
+    first, second = tuple(trajectories(1)), tuple(trajectories(2))
+    a, b = (jnp.stack(rows) for rows in zip(first, second, strict=True))
+    mapped = jax.jit(
+        jax.vmap(lambda x, y: attribute(params, normaliser(), x, y, VALID, "tanh"))
+    )
+    one = run(params, normaliser(), *second, VALID, "tanh")
+    np.testing.assert_allclose(mapped(a, b)[1], one, atol=1e-5)
+
+
+def test_input_that_does_not_fit_is_refused():
+    params, norm = network(), normaliser()
+    a, b = trajectories()
+    fewer = r"features: shape .*T, F = \(18, 21\)"
+    cases = (
+        (r"features: shapes .*expected \[T, F\]", a, b[:-1], VALID, "tanh", 64),
+        (fewer, a[:, 1:], b[:, 1:], VALID, "tanh", 64),
+        ("time_valid: shape", a, b, VALID[1:], "tanh", 64),
+        ("activation: sine: expected one of", a, b, VALID, "sine", 64),
+        ("steps: 0: expected at least 1", a, b, VALID, "tanh", 0),
+    )
+    for message, x, y, valid, name, steps in cases:
+        with pytest.raises(InputError, match="^attribute: " + message):
+            attribute(params, norm, x, y, valid, name, steps)
+    short = jax.tree.map(lambda leaf: leaf[1:], norm)
+    with pytest.raises(InputError, match="normaliser: shape"):
+        attribute(params, short, a, b, VALID, "tanh")
