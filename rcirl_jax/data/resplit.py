@@ -95,3 +95,16 @@ def fewer(dataset: Demonstrations, count: int, seed: int) -> Resplit:
     place[order] = np.arange(order.size)
     taken = np.argsort(place[vehicle], kind="stable")[:count]
     return Resplit(dataset, {"train": rows[taken], "test": dataset.indices("test")})
+
+
+def halves(dataset: Demonstrations) -> tuple[Resplit, Resplit]:
+    """Two disjoint datasets with every other vehicle of each split."""
+    found = []
+    for half in (0, 1):
+        splits = {}
+        for name in ("train", "test"):
+            vehicle = np.asarray(dataset.load(name).vehicle)
+            odd = np.unique(vehicle, return_inverse=True)[1].reshape(-1) % 2
+            splits[name] = dataset.indices(name)[odd == half]
+        found.append(Resplit(dataset, splits))
+    return found[0], found[1]

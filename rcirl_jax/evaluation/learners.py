@@ -8,6 +8,7 @@ import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import tqdm
 
@@ -15,10 +16,17 @@ from rcirl_jax.data.joined import Demonstrations
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.score import Scorer
 from rcirl_jax.features import feature_map
-from rcirl_jax.reward import Normaliser, RewardConfig, RewardParams, value
-from rcirl_jax.train.frozen import fit, freeze, members_of
-from rcirl_jax.train.loop import fit_normaliser_on
+from rcirl_jax.reward import (
+    Normaliser,
+    RewardConfig,
+    RewardParams,
+    fit_normaliser,
+    value,
+)
+from rcirl_jax.train.frozen import Fitted, fit, freeze, members_of
+from rcirl_jax.train.loop import NORMALISER_SCENES, rows_that_count
 from rcirl_jax.train.state import FeatureBatch, TrainConfig
+from rcirl_jax.train.step import compare
 
 LINEAR = RewardConfig(hidden=(), pin="none")
 
@@ -92,14 +100,23 @@ def learner_config(name: str, base: TrainConfig) -> TrainConfig:
 
 
 class FrozenSets:
-    """Frozen training sets of one dataset, made once for all that share them."""
+    """Frozen scenes of one split, made once for all configurations that share them.
 
-    def __init__(self, dataset: Demonstrations) -> None:
-        self.rows, self.index = dataset.load("train"), dataset.indices("train")
-        self._made: dict[TrainConfig, tuple[FeatureBatch, Normaliser]] = {}
+    Args:
+      dataset: any dataset.
+      split: which scenes.
+      near_only: leave nothing but the hard negatives among the candidates.
+    """
 
-    def of(self, config: TrainConfig) -> tuple[FeatureBatch, Normaliser]:
-        """Features and normaliser for a configuration."""
+    def __init__(
+        self, dataset: Demonstrations, split: str = "train", *, near_only: bool = False
+    ) -> None:
+        self.rows, self.index = dataset.load(split), dataset.indices(split)
+        self.near_only = near_only
+        self._made: dict[TrainConfig, FeatureBatch] = {}
+
+    def of(self, config: TrainConfig) -> FeatureBatch:
+        """Features for a configuration."""
         key = TrainConfig(
             features=config.features,
             loss="listwise" if config.loss == "listwise" else "rank",
@@ -110,32 +127,94 @@ class FrozenSets:
             sampler=config.sampler,
         )
         if key not in self._made:
-            normaliser = fit_normaliser_on(self.rows, key, feature_map(key.features))
-            self._made[key] = freeze(self.rows, self.index, key), normaliser
+            made = freeze(self.rows, self.index, key)
+            if self.near_only:
+                pool = key.hard_negatives * key.hard_pool
+                far = jnp.arange(made.feasible.shape[1]) < made.feasible.shape[1] - pool
+                made = made.replace(feasible=made.feasible & ~far)
+            self._made[key] = made
         return self._made[key]
 
 
+def normaliser_of(
+    frozen: FeatureBatch, config: TrainConfig, keep: Sequence[str] | None = None
+) -> Normaliser:
+    """Fitted on a frozen set; features that are not kept lose all spread.
+
+    An infinite scale turns a feature into 0 for the network.
+    """
+    features = feature_map(config.features)
+    count = frozen.weight.shape[0]
+    chosen = np.random.default_rng(config.seed).permutation(count)
+    some = jax.tree.map(lambda x: np.asarray(x)[chosen[:NORMALISER_SCENES]], frozen)
+    made = fit_normaliser(rows_that_count(some), features)
+    if keep is None:
+        return made
+    kept = jnp.asarray([name in keep for name in features.names])
+    return made.replace(scale=jnp.where(kept, made.scale, jnp.inf))
+
+
+def train_grid(
+    frozen: FeatureBatch,
+    config: TrainConfig,
+    leaky_rates: Sequence[float],
+    seeds: Sequence[int],
+    *,
+    keep: Sequence[str] | None = None,
+) -> dict[float, list[Learned]]:
+    """Leaky rates x seeds as members of one program; they share the batch order."""
+    normaliser = normaliser_of(frozen, config, keep)
+    grid = [(rate, seed) for rate in leaky_rates for seed in seeds]
+    members = members_of(config, [seed for _, seed in grid])
+    members = members.replace(leaky_rate=jnp.asarray([rate for rate, _ in grid]))
+    fitted = fit(frozen, normaliser, config, members)
+    found: dict[float, list[Learned]] = {rate: [] for rate in leaky_rates}
+    for number, (rate, seed) in enumerate(grid):
+        own = dataclasses.replace(config, seed=seed, leaky_rate=rate)
+        one = jax.tree.map(lambda leaf, n=number: leaf[n], fitted)
+        found[rate].append(_learned(one, normaliser, own))
+    return found
+
+
 def train_learner(
-    sets: FrozenSets, config: TrainConfig, seeds: Iterable[int]
+    frozen: FeatureBatch,
+    config: TrainConfig,
+    seeds: Iterable[int],
+    *,
+    keep: Sequence[str] | None = None,
 ) -> list[Learned]:
     """One configuration trained with several seeds (weights and batch order)."""
-    frozen, normaliser = sets.of(config)
+    normaliser = normaliser_of(frozen, config, keep)
     found = []
     for seed in seeds:
         own = dataclasses.replace(config, seed=seed)
         fitted = fit(frozen, normaliser, own, members_of(own, [seed]))
-        first = jax.tree.map(lambda leaf: leaf[0], fitted)
-        found.append(
-            Learned(
-                params=first.params,
-                normaliser=normaliser,
-                config=own,
-                loss=np.asarray(first.loss),
-                wins=np.asarray(first.wins),
-                finite=bool(first.finite),
-            )
-        )
+        one = jax.tree.map(lambda leaf: leaf[0], fitted)
+        found.append(_learned(one, normaliser, own))
     return found
+
+
+def _learned(one: Fitted, normaliser: Normaliser, config: TrainConfig) -> Learned:
+    return Learned(
+        params=one.params,
+        normaliser=normaliser,
+        config=config,
+        loss=np.asarray(one.loss),
+        wins=np.asarray(one.wins),
+        finite=bool(one.finite),
+    )
+
+
+def pair_wins(
+    frozen: FeatureBatch, runs: Sequence[Learned]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs that the positive wins (ties half), [R, S], and pairs [S]."""
+    won = []
+    for run in runs:
+        c = compare(run.params, run.normaliser, frozen, run.config.reward)
+        y = np.asarray(c.candidates - c.human[:, None])
+        won.append(np.sum(((y < 0.0) + 0.5 * (y == 0.0)) * frozen.feasible, axis=1))
+    return np.array(won), np.asarray(frozen.feasible).sum(axis=1)
 
 
 def train_learners(
@@ -148,7 +227,7 @@ def train_learners(
     with tqdm.tqdm(configs.items(), desc="train", unit="learner") as bar:
         for name, config in bar:
             bar.set_postfix_str(name)
-            found[name] = train_learner(sets, config, seeds)
+            found[name] = train_learner(sets.of(config), config, seeds)
     return found
 
 

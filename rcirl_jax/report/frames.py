@@ -1,5 +1,6 @@
 """Pictures of example frames under an exported reward."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -41,49 +42,92 @@ def pick_frames(dataset: Dataset, count: int) -> np.ndarray:
     return index[np.array(chosen[:count], int)]
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DrawnFrame:
+    """What stands in one example-frame figure."""
+
+    picture: Path
+    caption: str
+    chosen: int  # candidate with the highest value
+    values: np.ndarray  # [K]
+    feasible: np.ndarray  # [K] bool
+    human_value: float
+    human_s: np.ndarray  # [T] m
+    chosen_s: np.ndarray  # [T] m
+
+
+def draw_frame(
+    dataset: Dataset,
+    reward: Reward,
+    sampler: SamplerConfig,
+    row: int,
+    picture: Path,
+    *,
+    st_graph: Path | None = None,
+) -> DrawnFrame:
+    """The six-panel figure of one scene, and its ST graph if a path is given."""
+    features = feature_map(reward.preset)
+    rows = dataset.read(np.array([row]))
+    one = jax.tree.map(lambda x: jnp.asarray(x[0]), rows)
+    key = jax.random.fold_in(jax.random.key(EVALUATION_SEED), row)
+    candidates = sample(key, one.scene, sampler)
+    human = human_of(one, sampler)
+    x = np.asarray(features.of_candidates(one.scene, candidates))
+    x_human = np.asarray(features(one.scene, human))
+    valid = np.asarray(one.scene.time_valid)
+    values = reward.value(x, np.broadcast_to(valid, x.shape[:2]))
+    feasible = np.asarray(candidates.feasible)
+    chosen = int(np.argmax(np.where(feasible, values, -np.inf)))
+    drawn = one.replace(human=human)
+    names = [tag.name.lower() for tag in Tag if bool(one.scene.tags[tag])]
+    plots.example_frame(
+        picture,
+        drawn,
+        candidates,
+        chosen,
+        human_features=x_human,
+        chosen_features=x[chosen],
+        names=features.names,
+    )
+    if st_graph is not None:
+        plots.st_graph(st_graph, drawn, candidates, chosen)
+    return DrawnFrame(
+        picture=picture,
+        caption=(
+            f"scene {row} ({', '.join(names) or 'no tag'}): human (black), chosen "
+            "(orange, dashed) and candidates (grey)"
+        ),
+        chosen=chosen,
+        values=values,
+        feasible=feasible,
+        human_value=float(reward.value(x_human[None], valid[None])[0]),
+        human_s=np.asarray(human.s),
+        chosen_s=np.asarray(candidates.trajectory.s[chosen]),
+    )
+
+
 def draw_frames(
     dataset: Dataset, reward: Reward, sampler: SamplerConfig, folder: Path, count: int
 ) -> list[tuple[Path, str]]:
     """The paper's example-frame figure for some held-out scenes.
 
     Returns:
-      (PNG, caption) per frame: the first two also as a large ST graph.
+      (PNG, caption) per frame: the first also as a large ST graph.
     """
-    features = feature_map(reward.preset)
     pictures = []
     for number, row in enumerate(pick_frames(dataset, count)):
-        rows = dataset.read(np.array([row]))
-        one = jax.tree.map(lambda x: jnp.asarray(x[0]), rows)
-        key = jax.random.fold_in(jax.random.key(EVALUATION_SEED), int(row))
-        candidates = sample(key, one.scene, sampler)
-        human = human_of(one, sampler)
-        x = np.asarray(features.of_candidates(one.scene, candidates))
-        x_human = np.asarray(features(one.scene, human))
-        valid = np.asarray(one.scene.time_valid)
-        values = reward.value(x, np.broadcast_to(valid, x.shape[:2]))
-        feasible = np.asarray(candidates.feasible)
-        chosen = int(np.argmax(np.where(feasible, values, -np.inf)))
-        drawn = one.replace(human=human)
-        names = [tag.name.lower() for tag in Tag if bool(one.scene.tags[tag])]
-        caption = (
-            f"scene {int(row)} ({', '.join(names) or 'no tag'}): human (black), chosen "
-            "(orange, dashed) and candidates (grey)"
-        )
-        path = folder / f"frame_{number}.png"
-        plots.example_frame(
+        path, graph = folder / f"frame_{number}.png", folder / "st_graph.png"
+        frame = draw_frame(
+            dataset,
+            reward,
+            sampler,
+            int(row),
             path,
-            drawn,
-            candidates,
-            chosen,
-            human_features=x_human,
-            chosen_features=x[chosen],
-            names=features.names,
+            st_graph=graph if number == 0 else None,
         )
-        pictures.append((path, caption))
+        pictures.append((path, frame.caption))
         if number == 0:
-            path = folder / "st_graph.png"
-            plots.st_graph(path, drawn, candidates, chosen)
-            pictures.append((path, f"station-time graph of scene {int(row)}"))
+            pictures.append((graph, f"station-time graph of scene {int(row)}"))
     return pictures
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from numpy.typing import ArrayLike
 
 from rcirl_jax.evaluation.table import RankingReport
 from rcirl_jax.report.style import CLASS_COLOURS, figure, label, save
@@ -61,9 +62,7 @@ def ranking_chart(path: Path, report: RankingReport) -> Path:
     return save(made, path)
 
 
-def curves_panel(
-    axis: Axes, x: Sequence[float], curves: Mapping[str, np.ndarray]
-) -> None:
+def curves_panel(axis: Axes, x: ArrayLike, curves: Mapping[str, np.ndarray]) -> None:
     """Mean of each curve's runs [R, X] with a band of two standard errors."""
     at = np.asarray(x, float)
     for number, (name, runs) in enumerate(curves.items()):
@@ -76,4 +75,17 @@ def curves_panel(
             axis.fill_between(
                 at, mean - error, mean + error, color=colour, alpha=0.18, lw=0
             )
+    axis.legend(fontsize=8, frameon=False)
+
+
+def interval_curves(
+    axis: Axes, x: ArrayLike, curves: Mapping[str, Sequence[Interval]]
+) -> None:
+    """Curves of estimates with their intervals as bands."""
+    at = np.asarray(x, float)
+    for number, (name, points) in enumerate(curves.items()):
+        value, low, high = np.array(points, float).T
+        colour = CURVES[number % len(CURVES)]
+        axis.plot(at, value, "o-", color=colour, ms=3, lw=1.6, label=name)
+        axis.fill_between(at, low, high, color=colour, alpha=0.15, lw=0)
     axis.legend(fontsize=8, frameon=False)

@@ -19,7 +19,7 @@ import optax
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import Normaliser, RewardParams
 from rcirl_jax.train.loop import to_device_batch
-from rcirl_jax.train.state import OPTIMIZERS, FeatureBatch, TrainConfig
+from rcirl_jax.train.state import OPTIMIZERS, Batch, FeatureBatch, TrainConfig
 from rcirl_jax.train.step import as_tree, featurise, gradient_sums, init_params
 from rcirl_jax.types import Demonstration
 
@@ -62,16 +62,21 @@ def freeze(rows: Demonstration, index: np.ndarray, config: TrainConfig) -> Featu
       index: [S] dataset rows; with `config.seed` they seed the candidates.
       config: sampler, positive, features; the loss decides which facts.
     """
-    features, key = feature_map(config.features), jax.random.key(config.seed)
-    make = jax.jit(lambda batch: featurise(key, batch, config, features))
-    parts = []
+    key, parts = jax.random.key(config.seed), []
+    shared = dataclasses.replace(config, seed=0, epochs=1)
     for start in range(0, index.size, CHUNK):
         at = np.minimum(np.arange(start, start + CHUNK), index.size - 1)
         taken = jax.tree.map(lambda x, at=at: x[at], rows)
-        made = make(to_device_batch(taken, np.ones(CHUNK), index[at]))
+        batch = to_device_batch(taken, np.ones(CHUNK), index[at])
+        made = _featurise(key, batch, shared)
         keep = min(CHUNK, index.size - start)
         parts.append(jax.tree.map(lambda x, n=keep: np.asarray(x[:n]), made))
     return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)), *parts)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _featurise(key: jax.Array, batch: Batch, config: TrainConfig) -> FeatureBatch:
+    return featurise(key, batch, config, feature_map(config.features))
 
 
 def fit(

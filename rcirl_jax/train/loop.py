@@ -53,11 +53,11 @@ def fit_normaliser_on(
         picked = np.resize(chosen[start : start + config.batch_size], config.batch_size)
         taken = jax.tree.map(lambda x, picked=picked: x[picked], rows)
         batch = make(to_device_batch(taken, np.ones(picked.size), picked))
-        parts.append(_rows_that_count(batch))
+        parts.append(rows_that_count(batch))
     return fit_normaliser(np.concatenate(parts), features)
 
 
-def _rows_that_count(batch: FeatureBatch) -> np.ndarray:
+def rows_that_count(batch: FeatureBatch) -> np.ndarray:
     """[n, F] features at valid times of humans and feasible candidates."""
     valid = np.asarray(batch.time_valid)
     human = np.asarray(batch.human)[valid]

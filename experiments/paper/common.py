@@ -1,0 +1,81 @@
+"""What the paper's experiments share: flags, data, training, files."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+from absl import flags
+
+from experiments.common import provenance
+from rcirl_jax.data.config import CollectConfig
+from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.importing import ImportConfig, import_logs
+from rcirl_jax.data.store import Dataset, open_dataset
+from rcirl_jax.evaluation.evaluate import RankingSetup
+from rcirl_jax.evaluation.table import RankingReport
+from rcirl_jax.report.intervals import Interval
+from rcirl_jax.train.state import TrainConfig
+
+DATA = flags.DEFINE_string("data", None, "dataset (default: synthetic traffic)")
+OUTPUT = flags.DEFINE_string("output", "out/paper", "folder to write")
+SEEDS = flags.DEFINE_integer("seeds", 10, "training runs of each row")
+EPOCHS = flags.DEFINE_integer("epochs", 10, "passes over the training scenes")
+HORIZON = flags.DEFINE_float("horizon", 5.0, "s at which distances are taken")
+QUICK = flags.DEFINE_bool("quick", False, "few scenes, two seeds, two epochs")
+
+QUICK_STRIDE_S = 20.0  # s between planning frames of the small synthetic dataset
+
+
+def dataset() -> Dataset:
+    """--data, or synthetic traffic, made once beside the output."""
+    if DATA.value:
+        return open_dataset(DATA.value)
+    stride = QUICK_STRIDE_S if QUICK.value else 2.0
+    folder = Path(OUTPUT.value) / f"synthetic_{stride:g}s"
+    if not (folder / "manifest.json").exists():
+        config = ImportConfig(
+            format="synthetic", collect=CollectConfig(stride_s=stride)
+        )
+        import_logs(read_recordings("synthetic", None), folder, config)
+    return open_dataset(folder)
+
+
+def seeds() -> range:
+    """Seeds of the training runs."""
+    return range(2 if QUICK.value else SEEDS.value)
+
+
+def base(**changes: object) -> TrainConfig:
+    """The shared training configuration with some changes."""
+    shared: dict = {
+        "loss": "logistic",
+        "positive": "nearest",
+        "epochs": 2 if QUICK.value else EPOCHS.value,
+        "train_horizon": HORIZON.value,
+    }
+    return TrainConfig(**{**shared, **changes})
+
+
+def setup() -> RankingSetup:
+    """How held-out scenes are ranked."""
+    return RankingSetup(horizon_s=HORIZON.value)
+
+
+def intervals(report: RankingReport, metric: str) -> dict[str, Interval]:
+    """Row -> (value, low, high) of one metric."""
+    found = {name: row[metric] for name, row in report.rows.items()}
+    return {name: (e.value, e.low, e.high) for name, e in found.items()}
+
+
+def write(name: str, body: Mapping[str, object]) -> None:
+    """OUTPUT/name.json with provenance; says where."""
+    folder = Path(OUTPUT.value)
+    folder.mkdir(parents=True, exist_ok=True)
+    made = {**body, "quick": QUICK.value, "made_by": provenance()}
+    (folder / f"{name}.json").write_text(json.dumps(made, indent=2) + "\n")
+    print(f"written: {folder}/{name}.json, {name}.png")
+
+
+def picture(name: str) -> Path:
+    """OUTPUT/name.png."""
+    return Path(OUTPUT.value) / f"{name}.png"

@@ -1,0 +1,78 @@
+"""Quality against the number of training scenes.
+
+    python -m experiments.paper.data_scaling --data=DATASET --output=DIR [--quick]
+
+Whole vehicles are added until a count of scenes is reached; the held-out scenes
+stay the same, and so does the number of optimiser steps. Rows: logistic pairs
+with 21-15-1, linear and non-negative. Expected: 15 minutes on two cores; the
+network needs a few hundred scenes before it beats the non-negative linear
+reward. `--quick`: a minute.
+"""
+
+import dataclasses
+
+import jax
+import numpy as np
+from absl import flags
+
+from experiments.common import run
+from experiments.paper.common import (
+    QUICK,
+    base,
+    dataset,
+    intervals,
+    picture,
+    seeds,
+    setup,
+    write,
+)
+from rcirl_jax.data.resplit import fewer
+from rcirl_jax.evaluation.evaluate import evaluate_ranking
+from rcirl_jax.evaluation.learners import (
+    FrozenSets,
+    learner_config,
+    scorers,
+    train_learner,
+)
+from rcirl_jax.evaluation.table import to_json
+from rcirl_jax.report.intervals import interval_curves
+from rcirl_jax.report.style import figure, label, save
+
+_COUNTS = flags.DEFINE_list(
+    "counts", ["30", "100", "300", "1000", "3000"], "training scenes"
+)
+ROWS = ("RC-IRL logistic", "logistic non-negative", "logistic linear")
+
+
+def main() -> None:
+    """Train on ever more scenes, rank the same ones, draw."""
+    data, most = dataset(), dataset().indices("train").size
+    counts = sorted({min(int(count), most) for count in _COUNTS.value})
+    counts = counts[:2] if QUICK.value else counts
+    sets, learned = FrozenSets(data), {}
+    for count in counts:
+        for name in ROWS:
+            config = learner_config(name, base())
+            epochs = round(config.epochs * most / count)
+            config = dataclasses.replace(config, epochs=max(epochs, 1))
+            learned[f"{name}, {count}"] = []
+            for seed in seeds():
+                rows = fewer(data, count, seed).indices("train")
+                at = np.searchsorted(sets.index, rows)
+                part = jax.tree.map(lambda x, at=at: x[at], sets.of(config))
+                learned[f"{name}, {count}"] += train_learner(part, config, [seed])
+    report = evaluate_ranking(data, scorers(learned), setup())
+    found = intervals(report, "top1_fde")
+    made, axes = figure(1, 1, 6.8, 4.4)
+    curves = {name: [found[f"{name}, {count}"] for count in counts] for name in ROWS}
+    interval_curves(axes[0, 0], counts, curves)
+    axes[0, 0].set_xscale("log")
+    label(axes[0, 0], "distance of the chosen", "training scenes", "m, lower is better")
+    save(made, picture("data_scaling"))
+    for name in learned:
+        print(f"{name:30s} top-1 FDE {found[name][0]:.2f} m")
+    write("data_scaling", {"counts": counts, "ranking": to_json(report)})
+
+
+if __name__ == "__main__":
+    run(main)

@@ -1,0 +1,60 @@
+"""The learned time weights gamma_t of RC-IRL and of the GAN, with seed bands.
+
+    python -m experiments.paper.discount_factors --data=DATASET --output=DIR [--quick]
+
+The paper's figure: gamma_t is a free vector, not an exponential; conditional
+learning weighs the near future and lets the far one fade, the discriminator has
+no such reason. All eight seconds are compared. Expected: about 5 minutes on two
+cores with 10 seeds; the reward's share that falls on the first four seconds is
+printed for each learner. `--quick`: under a minute, its shape means nothing.
+"""
+
+import numpy as np
+
+from experiments.common import run
+from experiments.paper.common import base, dataset, picture, seeds, write
+from rcirl_jax.evaluation.learners import Learned, learner_config, train_learners
+from rcirl_jax.report.intervals import curves_panel
+from rcirl_jax.report.style import figure, label, save
+from rcirl_jax.reward import pinned
+from rcirl_jax.units import TIMES_S
+
+ROWS = ("RC-IRL rank", "RC-IRL logistic", "GAN")
+NEAR_S = 4.0  # s, where "near" ends
+
+
+def time_weights(runs: list[Learned]) -> np.ndarray:
+    """[R, T] gamma of each run, its sign such that the sum is positive.
+
+    The network's output may change sign together with gamma; only the product
+    counts, so the sign is a convention.
+    """
+    found = np.array([pinned(r.params, r.config.reward).gamma for r in runs])
+    return found * np.sign(found.sum(axis=1, keepdims=True))
+
+
+def main() -> None:
+    """Train, read gamma, draw."""
+    configs = {name: learner_config(name, base(train_horizon=8.0)) for name in ROWS}
+    learned = train_learners(dataset(), configs, seeds())
+    gamma = {name: time_weights(runs) for name, runs in learned.items()}
+    made, axes = figure(1, 1, 6.8, 4.4)
+    curves_panel(axes[0, 0], TIMES_S, gamma)
+    axes[0, 0].axhline(0.0, color="#999999", lw=0.8)
+    label(axes[0, 0], "learned time weights, band: 2 s.e.", "t, s", "gamma_t (norm 1)")
+    save(made, picture("discount_factors"))
+    near = TIMES_S <= NEAR_S
+    body = {}
+    for name, runs in gamma.items():
+        share = np.abs(runs[:, near]).sum(axis=1) / np.abs(runs).sum(axis=1)
+        error = share.std(ddof=1) / np.sqrt(share.size)
+        print(f"{name}: {share.mean():.2f} +- {error:.2f} of |gamma| up to {NEAR_S} s")
+        body[name] = {
+            "gamma": runs.round(5).tolist(),
+            "near_share": [float(share.mean()), float(error)],
+        }
+    write("discount_factors", {"times_s": TIMES_S.tolist(), "rows": body})
+
+
+if __name__ == "__main__":
+    run(main)

@@ -1,0 +1,70 @@
+"""Other splits: disjoint, whole vehicles, nested."""
+
+import numpy as np
+import pytest
+
+from rcirl_jax.data.resplit import Resplit, by_recording, by_vehicle, fewer, halves
+from rcirl_jax.errors import InputError
+
+
+class Rows:
+    """A dataset of vehicle and recording numbers only."""
+
+    hash = "rows"
+
+    def __init__(self):
+        rng = np.random.default_rng(0)
+        self.vehicle = np.repeat(np.arange(40), 5)
+        self.recording = self.vehicle // 10
+        self.test = np.flatnonzero(np.isin(self.vehicle, rng.permutation(40)[:8]))
+
+    def indices(self, split):
+        every = np.arange(self.vehicle.size)
+        if split is None:
+            return every
+        return self.test if split == "test" else np.setdiff1d(every, self.test)
+
+    def read(self, rows):
+        return type("Rows", (), {"vehicle": self.vehicle[rows],
+                                 "recording": self.recording[rows]})  # fmt: skip
+
+    def load(self, split):
+        return self.read(self.indices(split))
+
+
+@pytest.mark.parametrize(
+    "split", [by_vehicle(Rows(), 0.25, 3), by_recording(Rows(), 2), *halves(Rows())]
+)
+def test_no_vehicle_is_on_both_sides(split):
+    train, test = (set(split.load(name).vehicle) for name in ("train", "test"))
+    assert train
+    assert test
+    assert not train & test
+
+
+def test_a_quarter_of_the_vehicles_by_seed():
+    one, again, other = (by_vehicle(Rows(), 0.25, seed) for seed in (1, 1, 2))
+    assert np.unique(one.load("test").vehicle).size == 10
+    np.testing.assert_array_equal(one.indices("test"), again.indices("test"))
+    assert one.hash == again.hash != other.hash
+
+
+def test_fewer_is_nested_and_keeps_the_test_rows():
+    few, more = fewer(Rows(), 20, 0), fewer(Rows(), 60, 0)
+    assert few.indices("train").size == 20
+    assert set(few.indices("train")) <= set(more.indices("train"))
+    assert np.unique(few.load("train").vehicle).size == 4
+    np.testing.assert_array_equal(few.indices("test"), Rows().test)
+
+
+def test_halves_are_disjoint_and_complete():
+    a, b = halves(Rows())
+    both = np.sort(np.concatenate([a.indices(None), b.indices(None)]))
+    np.testing.assert_array_equal(both, np.arange(200))
+
+
+def test_overlap_and_nothing_are_refused():
+    with pytest.raises(InputError, match="in two splits"):
+        Resplit(Rows(), {"train": np.array([1, 2]), "test": np.array([2])})
+    with pytest.raises(InputError, match="test: no rows"):
+        Resplit(Rows(), {"train": np.array([1, 2]), "test": np.array([], int)})
