@@ -1,0 +1,104 @@
+"""Recovery of a reward that is known: experts who follow it, learners who do not.
+
+The recorded human of every frozen scene is replaced by the candidate that a
+hidden reward values most (or nearly: Boltzmann experts). What a learner is asked
+for is to choose as the hidden reward does on scenes it has not seen.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rcirl_jax.evaluation.learners import Learned
+from rcirl_jax.reward import Normaliser, RewardConfig, RewardParams, init_reward, value
+from rcirl_jax.train.state import FeatureBatch
+
+HIDDEN_SPREAD = 3.0  # std of the hidden kernels relative to Glorot's
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class HiddenReward:
+    """A reward that only the experts know."""
+
+    params: RewardParams
+    normaliser: Normaliser
+    config: RewardConfig
+
+    def values(self, frozen: FeatureBatch) -> jax.Array:
+        """[S, K] of the candidates; -inf where infeasible."""
+        shape = frozen.candidates.shape[:3]
+        valid = jnp.broadcast_to(frozen.time_valid[:, None], shape)
+        found = value(
+            self.params, self.normaliser, frozen.candidates, valid, self.config
+        )
+        return jnp.where(frozen.feasible, found, -jnp.inf)
+
+
+def hidden_reward(
+    seed: int, normaliser: Normaliser, hidden: tuple[int, ...] = (15,)
+) -> HiddenReward:
+    """A random network with saturating units and fading time weights."""
+    config = RewardConfig(hidden=hidden)
+    count = int(normaliser.scale.shape[0])
+    params = init_reward(jax.random.key(seed), count, config)
+    kernels = tuple(HIDDEN_SPREAD * kernel for kernel in params.kernels[:-1])
+    fading = jnp.exp(-jnp.arange(params.gamma.shape[0]) / 8.0)
+    params = params.replace(
+        kernels=(*kernels, params.kernels[-1]), gamma=fading * params.gamma
+    )
+    return HiddenReward(params=params, normaliser=normaliser, config=config)
+
+
+def experts(
+    frozen: FeatureBatch, hidden: HiddenReward, temperature: float, seed: int
+) -> FeatureBatch:
+    """The same scenes with the hidden reward's choice in the human's place.
+
+        P(choice = k) = softmax(V_hidden / temperature)
+
+    Args:
+      frozen: scenes whose own positive is dropped; every feasible candidate may
+        be chosen.
+      hidden: whom the experts follow.
+      temperature: in units of V; 0 chooses the best.
+      seed: of the experts' draws.
+    """
+    values = hidden.values(frozen)
+    if temperature > 0.0:
+        key = jax.random.key(seed)
+        noise = jax.random.gumbel(key, values.shape)
+        values = values + temperature * noise
+    chosen = jnp.argmax(values, axis=1)
+    rows = jnp.arange(chosen.shape[0])
+    facts = frozen.facts.replace(
+        human_distance=frozen.facts.distance[rows, chosen],
+        human_density=frozen.facts.density[rows, chosen],
+    )
+    return frozen.replace(
+        human=frozen.candidates[rows, chosen],
+        feasible=frozen.feasible.at[rows, chosen].set(False),
+        facts=facts,
+    )
+
+
+def agreement(
+    frozen: FeatureBatch, hidden: HiddenReward, learned: Learned
+) -> tuple[np.ndarray, np.ndarray]:
+    """How a learned reward chooses where the hidden one would.
+
+    Returns:
+      same [S]: whether the choice is the same, and regret [S]: the share of the
+      hidden value between the scene's median and best candidate that is lost.
+    """
+    truth = np.asarray(hidden.values(frozen), np.float64)
+    shape = frozen.candidates.shape[:3]
+    valid = jnp.broadcast_to(frozen.time_valid[:, None], shape)
+    own = np.asarray(learned.scorer(frozen.candidates, valid), np.float64)
+    own = np.where(np.isfinite(truth), own, -np.inf)
+    chosen, best = own.argmax(axis=1), truth.argmax(axis=1)
+    rows = np.arange(best.size)
+    middle = np.nanmedian(np.where(np.isfinite(truth), truth, np.nan), axis=1)
+    spread = np.maximum(truth[rows, best] - middle, 1e-9)
+    return chosen == best, (truth[rows, best] - truth[rows, chosen]) / spread
