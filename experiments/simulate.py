@@ -24,6 +24,7 @@ from rcirl_jax.evaluation.closed_loop import (
     write_suite,
 )
 from rcirl_jax.export.closed_loop import table_rows
+from rcirl_jax.export.hand_weights import load_hand_weights
 from rcirl_jax.simulation.recorded import RecordedConfig
 from rcirl_jax.simulation.rows import BASELINES, human_row
 from rcirl_jax.simulation.suite import (
@@ -44,6 +45,7 @@ _INPUT = flags.DEFINE_string("input", None, "recordings of --suite=recorded")
 _SMOOTHING = flags.DEFINE_float("smoothing", 4.1, "s, window on recorded positions")
 _OUTPUT = flags.DEFINE_string("output", None, "folder to write", required=True)
 _BASELINES = flags.DEFINE_list("baselines", ",".join(BASELINES), "rival rows, or empty")
+_HAND = flags.DEFINE_string("hand_weights", None, "of tune_hand_set: a further row")
 _DP = flags.DEFINE_bool("dp", False, "also drive the first weights by DP")
 _CASES = flags.DEFINE_integer("cases", None, "cases per family, or recorded in all")
 _DURATION = flags.DEFINE_float("duration", None, "s per case at most (smoke 20)")
@@ -74,7 +76,13 @@ def main() -> None:
     """Flags -> one suite."""
     if _CHUNK.value < 1:
         raise InputError(f"--chunk: {_CHUNK.value}: expected at least 1")
-    rows = table_rows(_WEIGHTS.value, _BASELINES.value, _EVERY.value, dp=_DP.value)
+    rows = table_rows(
+        _WEIGHTS.value,
+        _BASELINES.value,
+        _EVERY.value,
+        dp=_DP.value,
+        hand_set=load_hand_weights(_HAND.value) if _HAND.value else None,
+    )
     cases = _cases()
     if _SUITE.value == "recorded":
         rows.append(human_row())

@@ -4,12 +4,15 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
 from absl import flags
 
 from experiments.common import provenance
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
+from rcirl_jax.data.joined import Demonstrations
+from rcirl_jax.data.resplit import Resplit
 from rcirl_jax.data.store import Dataset, open_dataset
 from rcirl_jax.evaluation.evaluate import RankingSetup
 from rcirl_jax.evaluation.table import RankingReport
@@ -23,13 +26,28 @@ EPOCHS = flags.DEFINE_integer("epochs", 10, "passes over the training scenes")
 HORIZON = flags.DEFINE_float("horizon", 5.0, "s at which distances are taken")
 QUICK = flags.DEFINE_bool("quick", False, "few scenes, two seeds, two epochs")
 
-QUICK_STRIDE_S = 20.0  # s between planning frames of the small synthetic dataset
+QUICK_STRIDE_S = 60.0  # s between planning frames of the small synthetic dataset
+QUICK_SCENES = 128  # of each split
 
 
-def dataset() -> Dataset:
-    """--data, or synthetic traffic, made once beside the output."""
-    if DATA.value:
-        return open_dataset(DATA.value)
+def dataset() -> Demonstrations:
+    """--data, or synthetic traffic, made once beside the output; few under --quick."""
+    found = open_dataset(DATA.value) if DATA.value else _synthetic()
+    if not QUICK.value:
+        return found
+    return Resplit(
+        found,
+        {name: _spread(found.indices(name)) for name in ("train", "test")},
+    )
+
+
+def _spread(rows: np.ndarray) -> np.ndarray:
+    """At most QUICK_SCENES rows, evenly spread."""
+    count = min(rows.size, QUICK_SCENES)
+    return rows[np.linspace(0, rows.size - 1, count).astype(int)]
+
+
+def _synthetic() -> Dataset:
     stride = QUICK_STRIDE_S if QUICK.value else 2.0
     folder = Path(OUTPUT.value) / f"synthetic_{stride:g}s"
     if not (folder / "manifest.json").exists():

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 import jax
 import numpy as np
 
-from rcirl_jax.data.store import Dataset
+from rcirl_jax.data.joined import Demonstrations
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking import (
     Outcomes,
@@ -17,6 +17,7 @@ from rcirl_jax.evaluation.ranking import (
 )
 from rcirl_jax.evaluation.score import BASELINES, Scored, Scorer, covers, score_scenes
 from rcirl_jax.evaluation.table import RankingReport, build_report
+from rcirl_jax.reward import LatticeCost
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.types import Demonstration
 
@@ -34,12 +35,18 @@ class RankingSetup:
     split: str = "test"
     # rank only among candidates that meet nothing: the same safety filter for all
     drop_collisions: bool = False
+    # further hand-set costs that are ranked, by row
+    hand_set: Mapping[str, LatticeCost] = dataclasses.field(default_factory=dict)
 
 
-def _rows(
-    dataset: Dataset, split: str, horizon_s: float
+def covered_rows(
+    dataset: Demonstrations, split: str, horizon_s: float
 ) -> tuple[Demonstration, np.ndarray]:
-    """Scenes of a split whose recording covers the horizon, and their rows."""
+    """Scenes of a split whose recording covers the horizon, and their rows.
+
+    Raises:
+      InputError: there is none.
+    """
     rows, index = dataset.load(split), dataset.indices(split)
     keep = np.flatnonzero(covers(rows, horizon_s))
     if keep.size == 0:
@@ -66,10 +73,10 @@ def _outcomes(scored: Scored, rows: Demonstration, setup: RankingSetup) -> Outco
 
 
 def _temperatures(
-    dataset: Dataset, setup: RankingSetup, scorers: Mapping[str, Scorer]
+    dataset: Demonstrations, setup: RankingSetup, scorers: Mapping[str, Scorer]
 ) -> dict[str, float]:
     """Scale of each scorer's values, fitted on TRAINING scenes."""
-    rows, index = _rows(dataset, "train", setup.horizon_s)
+    rows, index = covered_rows(dataset, "train", setup.horizon_s)
     chosen = np.random.default_rng(0).permutation(index.size)[:TEMPERATURE_SCENES]
     rows, index = jax.tree.map(lambda x: x[chosen], rows), index[chosen]
     scored = _score(rows, index, setup, scorers)
@@ -90,16 +97,20 @@ def _score(
         sampler=setup.sampler,
         horizon_s=setup.horizon_s,
         scorers=scorers,
+        hand_set=setup.hand_set,
     )
 
 
 def evaluate_ranking(
-    dataset: Dataset, learned: Mapping[str, Sequence[Scorer]], setup: RankingSetup
+    dataset: Demonstrations,
+    learned: Mapping[str, Sequence[Scorer]],
+    setup: RankingSetup,
 ) -> RankingReport:
     """Rank the held-out scenes with learned rewards beside all baselines.
 
     Rows: every learned reward (its runs are seeds), random, constant speed, IDM,
-    hand-set (Apollo's lattice weights) and the oracle, on the same candidates.
+    hand-set (Apollo's lattice weights), further hand-set costs of the setup and the
+    oracle, on the same candidates.
 
     Args:
       dataset: an open dataset.
@@ -111,7 +122,7 @@ def evaluate_ranking(
     """
     flat = {f"{n}#{i}": f for n, runs in learned.items() for i, f in enumerate(runs)}
     temperatures = _temperatures(dataset, setup, flat)
-    rows, index = _rows(dataset, setup.split, setup.horizon_s)
+    rows, index = covered_rows(dataset, setup.split, setup.horizon_s)
     scored = _score(rows, index, setup, flat)
     outcomes = _outcomes(scored, rows, setup)
 
@@ -127,13 +138,13 @@ def evaluate_ranking(
         scene_metrics(*random_scorer(seed, shape), outcomes)
         for seed in range(RANDOM_RUNS)
     ]
-    for name in BASELINES:
+    for name in (*BASELINES, *setup.hand_set):
         table[name] = [metrics(name)]
     table["oracle"] = [scene_metrics(*oracle_scorer(outcomes), outcomes)]
     return build_report(table, outcomes, group=np.asarray(rows.group))
 
 
-def oracle_floor(dataset: Dataset, setup: RankingSetup, max_scenes: int) -> dict:
+def oracle_floor(dataset: Demonstrations, setup: RankingSetup, max_scenes: int) -> dict:
     """How close the best candidate comes to the human, over all splits.
 
     Returns:

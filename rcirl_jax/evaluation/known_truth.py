@@ -95,7 +95,9 @@ def agreement(
     truth = np.asarray(hidden.values(frozen), np.float64)
     shape = frozen.candidates.shape[:3]
     valid = jnp.broadcast_to(frozen.time_valid[:, None], shape)
-    own = np.asarray(learned.scorer(frozen.candidates, valid), np.float64)
+    own = np.asarray(
+        learned.scorer(np.asarray(frozen.candidates), np.asarray(valid)), np.float64
+    )
     own = np.where(np.isfinite(truth), own, -np.inf)
     chosen, best = own.argmax(axis=1), truth.argmax(axis=1)
     rows = np.arange(best.size)

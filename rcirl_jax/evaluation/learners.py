@@ -23,10 +23,9 @@ from rcirl_jax.reward import (
     fit_normaliser,
     value,
 )
-from rcirl_jax.train.frozen import Fitted, fit, freeze, members_of
+from rcirl_jax.train.frozen import CHUNK, Fitted, fit, freeze, members_of
 from rcirl_jax.train.loop import NORMALISER_SCENES, rows_that_count
 from rcirl_jax.train.state import FeatureBatch, TrainConfig
-from rcirl_jax.train.step import compare
 
 LINEAR = RewardConfig(hidden=(), pin="none")
 
@@ -73,13 +72,23 @@ class Learned:
 
     @property
     def scorer(self) -> Scorer:
-        """(features [..., T, F], time_valid [..., T]) -> value [...]."""
+        """(features [S, ..., T, F], time_valid [S, ..., T]) -> value [S, ...].
+
+        In calls of `CHUNK` scenes: jaxlib 0.10.2 sums wrongly on CPUs in some
+        fusions with more than 32,768 results (jax-ml/jax issue 39103).
+        """
         apply = jax.jit(
             lambda x, valid: value(
                 self.params, self.normaliser, x, valid, self.config.reward
             )
         )
-        return lambda x, valid: np.asarray(apply(x, valid))
+
+        def scorer(x: np.ndarray, valid: np.ndarray) -> np.ndarray:
+            starts = range(0, len(x), CHUNK)
+            parts = [apply(x[i : i + CHUNK], valid[i : i + CHUNK]) for i in starts]
+            return np.concatenate([np.asarray(part) for part in parts])
+
+        return scorer
 
 
 def learner_config(name: str, base: TrainConfig) -> TrainConfig:
@@ -209,12 +218,14 @@ def pair_wins(
     frozen: FeatureBatch, runs: Sequence[Learned]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Pairs that the positive wins (ties half), [R, S], and pairs [S]."""
-    won = []
+    won, feasible = [], np.asarray(frozen.feasible)
+    shape = frozen.candidates.shape[:3]
+    spread = np.broadcast_to(np.asarray(frozen.time_valid)[:, None], shape)
     for run in runs:
-        c = compare(run.params, run.normaliser, frozen, run.config.reward)
-        y = np.asarray(c.candidates - c.human[:, None])
-        won.append(np.sum(((y < 0.0) + 0.5 * (y == 0.0)) * frozen.feasible, axis=1))
-    return np.array(won), np.asarray(frozen.feasible).sum(axis=1)
+        human = run.scorer(np.asarray(frozen.human), np.asarray(frozen.time_valid))
+        y = run.scorer(np.asarray(frozen.candidates), spread) - human[:, None]
+        won.append(np.sum(((y < 0.0) + 0.5 * (y == 0.0)) * feasible, axis=1))
+    return np.array(won), feasible.sum(axis=1)
 
 
 def train_learners(

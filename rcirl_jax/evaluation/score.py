@@ -20,7 +20,7 @@ from rcirl_jax.planner.baselines import (
     constant_speed_trajectory,
     idm_trajectory,
 )
-from rcirl_jax.reward import lattice_cost
+from rcirl_jax.reward import LatticeCost, lattice_cost
 from rcirl_jax.sampling import SamplerConfig, sample
 from rcirl_jax.train.step import human_of
 from rcirl_jax.types import Demonstration, Scene, Trajectory
@@ -47,6 +47,8 @@ class Scored:
 
 # (features [..., T, F], time_valid [..., T]) -> value [...]
 Scorer = Callable[[np.ndarray, np.ndarray], np.ndarray]
+# row -> `LatticeCost.fields()`
+HandSet = Mapping[str, Mapping[str, jax.Array]]
 
 
 def horizon_mask(scene: Scene, horizon_s: float) -> jax.Array:
@@ -69,12 +71,13 @@ def position_at(trajectory: Trajectory, horizon_s: float) -> tuple:
     return s, trajectory.l[low] + u * (trajectory.l[low + 1] - trajectory.l[low])
 
 
-def _distances(
+def distances(
     demonstration: Demonstration,
     human: Trajectory,
     candidate: Trajectory,
     horizon_s: float,
 ) -> tuple[jax.Array, jax.Array]:
+    """(FDE, ADE) [m] of a candidate to the human, at and up to the horizon."""
     mask = horizon_mask(demonstration.scene, horizon_s)
     apart = jnp.sqrt((candidate.s - human.s) ** 2 + (candidate.l - human.l) ** 2)
     ade = jnp.sum(jnp.where(mask, apart, 0.0)) / jnp.sum(mask)
@@ -92,6 +95,7 @@ def _crashes(scene: Scene, trajectory: Trajectory, mask: jax.Array) -> jax.Array
 def _score_one(
     key: jax.Array,
     demonstration: Demonstration,
+    hand_set: HandSet,
     features: FeatureMap,
     sampler: SamplerConfig,
     horizon_s: float,
@@ -101,7 +105,7 @@ def _score_one(
     human = human_of(demonstration, sampler)
     candidates = sample(key, scene, sampler)
     everyone = candidates.trajectory
-    fde, ade = jax.vmap(lambda x: _distances(demonstration, human, x, horizon_s))(
+    fde, ade = jax.vmap(lambda x: distances(demonstration, human, x, horizon_s))(
         everyone
     )
     on_path = sampler.mode == "speed"
@@ -110,8 +114,12 @@ def _score_one(
             x, constant_speed_trajectory(scene, on_path), mask
         ),
         "IDM": lambda x: closeness(x, idm_trajectory(scene, on_path, Idm()), mask),
-        "hand-set": lambda x: -lattice_cost(scene.replace(time_valid=mask), x),
     }
+    cut = scene.replace(time_valid=mask)
+    costs = {"hand-set": LatticeCost()}
+    costs |= {name: LatticeCost(**fields) for name, fields in hand_set.items()}
+    for name, cost in costs.items():
+        rivals[name] = lambda x, cost=cost: -lattice_cost(cut, x, cost)
     return {
         "features_human": features(scene, human),
         "features": features.of_candidates(scene, candidates),
@@ -126,15 +134,20 @@ def _score_one(
     }
 
 
+def candidates_key(index: jax.Array) -> jax.Array:
+    """Sampler's key of a dataset row: every evaluation ranks the same candidates."""
+    return jax.random.fold_in(jax.random.key(EVALUATION_SEED), index)
+
+
 @functools.cache
 def _score_batch(preset: str, sampler: SamplerConfig, horizon_s: float) -> Callable:
     features = feature_map(preset)
 
-    def one(index: jax.Array, demonstration: Demonstration) -> dict:
-        key = jax.random.fold_in(jax.random.key(EVALUATION_SEED), index)
-        return _score_one(key, demonstration, features, sampler, horizon_s)
+    def one(hand_set: HandSet, index: jax.Array, demonstration: Demonstration) -> dict:
+        key = candidates_key(index)
+        return _score_one(key, demonstration, hand_set, features, sampler, horizon_s)
 
-    return jax.jit(jax.vmap(one))
+    return jax.jit(jax.vmap(one, in_axes=(None, 0, 0)))
 
 
 def score_scenes(
@@ -145,6 +158,7 @@ def score_scenes(
     sampler: SamplerConfig,
     horizon_s: float,
     scorers: Mapping[str, Scorer],
+    hand_set: Mapping[str, LatticeCost] | None = None,
 ) -> Scored:
     """Sample, featurise, measure and value S scenes, in chunks of bounded memory.
 
@@ -156,16 +170,18 @@ def score_scenes(
       sampler: sampler configuration.
       horizon_s: 5 or 8 s (any in (0, 8]).
       scorers: rewards to apply to the features; the baselines are added.
+      hand_set: further hand-set costs by name, beside Apollo's.
 
     Returns:
       Scored, numpy.
     """
     batch = _score_batch(preset, sampler, float(horizon_s))
+    costs = {name: cost.fields() for name, cost in (hand_set or {}).items()}
     count, parts = index.size, []
     for start in range(0, count, CHUNK):
         picked = np.minimum(np.arange(start, start + CHUNK), count - 1)
         taken = jax.tree.map(lambda x, picked=picked: jnp.asarray(x[picked]), rows)
-        made = batch(jnp.asarray(index[picked], jnp.int32), taken)
+        made = batch(costs, jnp.asarray(index[picked], jnp.int32), taken)
         keep = min(CHUNK, count - start)
         made = jax.tree.map(lambda x, keep=keep: np.asarray(x[:keep]), made)
         parts.append(_with_values(made, scorers))

@@ -25,13 +25,15 @@ from rcirl_jax.evaluation.statistics import (
     holm,
     paired_difference,
 )
+from rcirl_jax.reward import TUNED_ROW
 
 SCHEMA = "rcirl-jax/ranking-report"
 SCHEMA_VERSION = 1
 
 # Rows that are not learned, in the order printed below the learned ones.
-RIVALS = ("random", "constant speed", "IDM", "hand-set", "oracle")
-REFERENCES = ("hand-set", "random")  # rows that the others are compared with
+RIVALS = ("random", "constant speed", "IDM", "hand-set", TUNED_ROW, "oracle")
+# rows that the others are compared with
+REFERENCES = ("hand-set", TUNED_ROW, "random")
 
 SIGNIFICANT_SE = 2.0  # 1, standard errors beyond which a difference has a name
 MIN_WIDTH = 100  # characters; a line of the paired differences needs them

@@ -6,6 +6,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.export.loading import open_reward, reward_params, row_name
 from rcirl_jax.planner.grid import DpConfig
 from rcirl_jax.planner.rank import RankConfig
+from rcirl_jax.reward import LatticeCost
 from rcirl_jax.simulation.cases import STEP_S
 from rcirl_jax.simulation.rows import (
     BASELINES,
@@ -13,6 +14,7 @@ from rcirl_jax.simulation.rows import (
     baseline_row,
     dp_row,
     learned_row,
+    tuned_row,
 )
 
 DP_EVERY = 10  # steps between two plans of the DP row: it costs 1,000 rankings
@@ -24,10 +26,12 @@ def table_rows(
     plan_every: int = 1,
     *,
     dp: bool = False,
+    hand_set: LatticeCost | None = None,
 ) -> list[Row]:
     """Learned rows first, in the order of the files, then the baselines.
 
-    Files of one loss and shape are told apart by their seed.
+    Files of one loss and shape are told apart by their seed. A tuned `hand_set`
+    cost comes last.
 
     Raises:
       InputError: no file, an unreadable one, path_speed weights, or an unknown
@@ -73,4 +77,6 @@ def table_rows(
                 f"--baselines: {name}: expected some of {', '.join(BASELINES)}"
             )
         rows.append(baseline_row(name, str(first.preset), normaliser, config))
+    if hand_set is not None:
+        rows.append(tuned_row(hand_set, config))
     return rows

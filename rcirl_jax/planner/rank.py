@@ -19,7 +19,7 @@ from rcirl_jax.planner.baselines import Idm, idm_acceleration
 from rcirl_jax.planner.plan import Plan
 from rcirl_jax.planner.safety import SafetyConfig, check, choose
 from rcirl_jax.planner.yielding import held
-from rcirl_jax.reward.hand import lattice_cost
+from rcirl_jax.reward.hand import LatticeCost, lattice_cost
 from rcirl_jax.reward.network import ACTIVATIONS, rows_value
 from rcirl_jax.sampling import SamplerConfig, sample
 from rcirl_jax.sampling.speed import family_index
@@ -83,9 +83,18 @@ def learned_score(features: FeatureMap, activation: str) -> Score:
     return score
 
 
-def hand_score(_: Params, scene: Scene, candidates: Candidates) -> jax.Array:
-    """Minus Apollo's lattice cost with its published weights."""
-    cost = jax.vmap(lattice_cost, in_axes=(None, 0))(scene, candidates.trajectory)
+def hand_score(
+    params: dict[str, jax.Array] | None, scene: Scene, candidates: Candidates
+) -> jax.Array:
+    """Minus Apollo's lattice cost.
+
+    Args:
+      params: `LatticeCost.fields()`; None: the published weights.
+      scene: of the candidates.
+      candidates: K of them.
+    """
+    weights = LatticeCost(**(params or {}))
+    cost = jax.vmap(lambda x: lattice_cost(scene, x, weights))(candidates.trajectory)
     return -cost
 
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rcirl_jax.data.store import Dataset
+from rcirl_jax.data.joined import Demonstrations
 from rcirl_jax.evaluation.score import EVALUATION_SEED
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.features import feature_map
@@ -27,7 +27,7 @@ WANTED = (
 )
 
 
-def pick_frames(dataset: Dataset, count: int) -> np.ndarray:
+def pick_frames(dataset: Demonstrations, count: int) -> np.ndarray:
     """Held-out rows to draw: one per interesting tag, then any."""
     index = dataset.indices("test")
     rows = dataset.read(index)
@@ -57,7 +57,7 @@ class DrawnFrame:
 
 
 def draw_frame(
-    dataset: Dataset,
+    dataset: Demonstrations,
     reward: Reward,
     sampler: SamplerConfig,
     row: int,
@@ -107,7 +107,11 @@ def draw_frame(
 
 
 def draw_frames(
-    dataset: Dataset, reward: Reward, sampler: SamplerConfig, folder: Path, count: int
+    dataset: Demonstrations,
+    reward: Reward,
+    sampler: SamplerConfig,
+    folder: Path,
+    count: int,
 ) -> list[tuple[Path, str]]:
     """The paper's example-frame figure for some held-out scenes.
 

@@ -1,6 +1,14 @@
 """The learned reward: network, normaliser, losses, and the hand-set rival."""
 
-from rcirl_jax.reward.hand import LatticeCost, lattice_cost
+from rcirl_jax.reward.hand import (
+    TUNABLE,
+    TUNED_ROW,
+    LatticeCost,
+    lattice_cost,
+    lattice_terms,
+    tuned,
+    weighted_cost,
+)
 from rcirl_jax.reward.losses import (
     LOSSES,
     Compared,
@@ -19,6 +27,8 @@ from rcirl_jax.types import Normaliser, RewardParams
 
 __all__ = [
     "LOSSES",
+    "TUNABLE",
+    "TUNED_ROW",
     "Compared",
     "LatticeCost",
     "LossConfig",
@@ -29,8 +39,11 @@ __all__ = [
     "fit_normaliser",
     "init_reward",
     "lattice_cost",
+    "lattice_terms",
     "loss_sums",
     "normalise",
     "pinned",
+    "tuned",
     "value",
+    "weighted_cost",
 ]

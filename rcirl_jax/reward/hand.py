@@ -3,40 +3,108 @@
 Source: Apollo's TrajectoryEvaluator; six terms whose weights have stood as
 command-line constants since 2018. It is a functional of the whole trajectory
 (ratios of sums), so it is computed from features, not per point.
+
+The weights may be traced: `lattice_terms` is what does not depend on them, and
+`tuned` reads them from a vector, so one compiled program scores any weights.
 """
 
 import dataclasses
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float
 
 from rcirl_jax.features.columns import COLUMNS, LINE_CAP_M, make_frame
 from rcirl_jax.types import Scene, Trajectory
 from rcirl_jax.units import TIMES_S
 
+TUNED_ROW = "hand-set, tuned"  # name of the tuned cost's row in all tables
+
+# What a tuner may change, in the order of its vector; all but the last two
+# stand before a term of the sum.
+TUNABLE = (
+    "objective",
+    "jerk",
+    "collision",
+    "centripetal",
+    "lateral_offset",
+    "lateral_comfort",
+    "objective_speed",
+    "speed_share",
+)
+NUM_TERMS = 6  # 1, of TUNABLE, weights of terms
+LARGEST_LOG = 7.0  # a tuned weight is within a factor exp(7) = 1,097 of Apollo's
+SPEED_SHARES = (0.3, 1.2)  # 1, least and largest tuned speed_share
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LatticeCost:
-    """Weights and constants of Apollo's lattice cost."""
+    """Weights and constants of Apollo's lattice cost; any field may be traced."""
 
-    objective: float = 10.0
-    jerk: float = 1.0
-    collision: float = 5.0
-    centripetal: float = 1.5
-    lateral_offset: float = 2.0
-    lateral_comfort: float = 10.0
+    objective: ArrayLike = 10.0
+    jerk: ArrayLike = 1.0
+    collision: ArrayLike = 5.0
+    centripetal: ArrayLike = 1.5
+    lateral_offset: ArrayLike = 2.0
+    lateral_comfort: ArrayLike = 10.0
     # inside the objective: speed against distance travelled
-    objective_speed: float = 1.0
-    objective_distance: float = 10.0
-    jerk_bound: float = 4.0  # m/s^3
-    collision_sigma: float = 0.5  # m
-    yield_buffer: float = 1.0  # m
-    overtake_buffer: float = 5.0  # m
-    offset_scale: float = 3.0  # m
-    comfort_braking: float = 3.0  # m/s^2, half of the 6 m/s^2 limit
+    objective_speed: ArrayLike = 1.0
+    objective_distance: ArrayLike = 10.0
+    # the speed wanted on a free road, as a share of the limit (Apollo: the limit)
+    speed_share: ArrayLike = 1.0
+    jerk_bound: ArrayLike = 4.0  # m/s^3
+    collision_sigma: ArrayLike = 0.5  # m
+    yield_buffer: ArrayLike = 1.0  # m
+    overtake_buffer: ArrayLike = 5.0  # m
+    offset_scale: ArrayLike = 3.0  # m
+    comfort_braking: ArrayLike = 3.0  # m/s^2, half of the 6 m/s^2 limit
     # Apollo drops colliding trajectories after sorting; here they cost this much
     # more, which sorts them last
-    collision_check: float = 1000.0
+    collision_check: ArrayLike = 1000.0
+
+    def fields(self) -> dict[str, jax.Array]:
+        """Field -> float32 [], a pytree; `LatticeCost(**fields)` is the inverse."""
+        pairs = dataclasses.asdict(self).items()
+        return {name: jnp.asarray(value, jnp.float32) for name, value in pairs}
+
+
+class LatticeTerms(NamedTuple):
+    """What the cost of one trajectory is made of, before any tunable weight."""
+
+    limit: Float[Array, " t"]  # m/s, speed limit where the ego is
+    approach: Float[Array, " t"]  # m/s, from which it can stop in time; or inf
+    speed: Float[Array, " t"]  # m/s
+    early: Float[Array, " t"]  # s^2, t^2 at valid times, else 0
+    travelled: Float[Array, ""]  # m
+    jerk: Float[Array, ""]  # 1, and so are the next three
+    collision: Float[Array, ""]
+    centripetal: Float[Array, ""]  # m/s^2
+    lateral_offset: Float[Array, ""]
+    lateral_comfort: Float[Array, ""]  # m/s^2
+    collides: Bool[Array, ""]
+
+
+def tuned(vector: Float[Array, " d"]) -> LatticeCost:
+    """The cost of a tuner's vector of log-weights; zeros are Apollo's, exactly.
+
+        weight_i = Apollo's_i exp(clip(x_i, -7, 7)),  speed_share in [0.3, 1.2]
+
+    The charge of a collision grows with the largest weight of a term, so that
+    colliding trajectories stay last.
+
+    Args:
+      vector: [8] x, in the order of `TUNABLE`; may be traced.
+    """
+    if vector.shape != (len(TUNABLE),):
+        raise ValueError(f"vector: shape {vector.shape}: expected {len(TUNABLE)}")
+    apollo = LatticeCost()
+    factor = jnp.exp(jnp.clip(vector, -LARGEST_LOG, LARGEST_LOG))
+    fields = {name: getattr(apollo, name) * factor[i] for i, name in enumerate(TUNABLE)}
+    fields["speed_share"] = jnp.clip(fields["speed_share"], *SPEED_SHARES)
+    largest = jnp.maximum(jnp.max(factor[:NUM_TERMS]), 1.0)
+    return LatticeCost(**fields, collision_check=apollo.collision_check * largest)
 
 
 def _ratio(x: jax.Array, valid: jax.Array) -> jax.Array:
@@ -44,6 +112,56 @@ def _ratio(x: jax.Array, valid: jax.Array) -> jax.Array:
     square = jnp.sum(jnp.where(valid, x**2, 0.0))
     size = jnp.sum(jnp.where(valid, jnp.abs(x), 0.0))
     return square / (size + 1e-6)
+
+
+def lattice_terms(
+    scene: Scene, trajectory: Trajectory, weights: LatticeCost = LatticeCost()
+) -> LatticeTerms:
+    """The terms of one trajectory; reads only fields that `TUNABLE` does not name."""
+    frame, valid = make_frame(scene, trajectory), scene.time_valid
+    column = {name: COLUMNS[name](frame) for name in _READ}
+    times = jnp.asarray(TIMES_S)
+    to_stop = jnp.minimum(column["stop_distance"], column["virtual_distance"])
+    braking = jnp.sqrt(jnp.multiply(2.0, weights.comfort_braking) * to_stop)
+    distance = jnp.minimum(
+        jnp.maximum(column["follow_distance"] - weights.yield_buffer, 0.0),
+        jnp.maximum(column["overtake_distance"] - weights.overtake_buffer, 0.0),
+    )
+    distance = jnp.where(column["collision"] > 0.0, 0.0, distance)
+    near = jnp.exp(-0.5 * (distance / weights.collision_sigma) ** 2)
+    comfort = jnp.abs(trajectory.ddl * trajectory.v**2 + trajectory.dl * trajectory.a)
+    return LatticeTerms(
+        limit=column["speed_limit"],
+        approach=jnp.where(to_stop >= LINE_CAP_M, jnp.inf, braking),
+        speed=trajectory.v,
+        early=jnp.where(valid, times**2, 0.0),
+        travelled=jnp.max(jnp.where(valid, trajectory.s, 0.0)),
+        jerk=_ratio(trajectory.j / weights.jerk_bound, valid),
+        collision=_ratio(near, valid),
+        centripetal=_ratio(column["lateral_acceleration"], valid),
+        lateral_offset=_ratio(trajectory.l / weights.offset_scale, valid),
+        lateral_comfort=jnp.max(jnp.where(valid, comfort, 0.0)),
+        collides=jnp.any((column["collision"] > 0.0) & valid),
+    )
+
+
+def weighted_cost(terms: LatticeTerms, weights: LatticeCost) -> Float[Array, ""]:
+    """The cost of one trajectory's terms under some weights; see `lattice_cost`."""
+    reference = jnp.minimum(terms.limit * weights.speed_share, terms.approach)
+    off_speed = jnp.sum(terms.early * jnp.abs(reference - terms.speed))
+    off_speed = off_speed / jnp.sum(terms.early)
+    far = weights.objective_distance / (1.0 + terms.travelled)
+    total = jnp.add(weights.objective_speed, weights.objective_distance)
+    objective = (off_speed * weights.objective_speed + far) / total
+    return (
+        terms.collides * weights.collision_check
+        + objective * weights.objective
+        + terms.jerk * weights.jerk
+        + terms.collision * weights.collision
+        + terms.centripetal * weights.centripetal
+        + terms.lateral_offset * weights.lateral_offset
+        + terms.lateral_comfort * weights.lateral_comfort
+    )
 
 
 def lattice_cost(
@@ -54,42 +172,10 @@ def lattice_cost(
         cost = 10 objective + 1 jerk + 5 collision + 1.5 centripetal
                + 2 lateral_offset + 10 lateral_comfort
 
-    with v_ref = min(limit, sqrt(2 * 3 * distance to a stop)); a trajectory that
-    collides costs 1000 more, so that it comes last as in Apollo.
+    with v_ref = min(speed_share * limit, sqrt(2 * 3 * distance to a stop)); a
+    trajectory that collides costs 1000 more, so that it comes last as in Apollo.
     """
-    frame, valid = make_frame(scene, trajectory), scene.time_valid
-    column = {name: COLUMNS[name](frame) for name in _READ}
-    times = jnp.asarray(TIMES_S)
-    to_stop = jnp.minimum(column["stop_distance"], column["virtual_distance"])
-    braking = jnp.sqrt(2.0 * weights.comfort_braking * to_stop)
-    free = to_stop >= LINE_CAP_M
-    limit = column["speed_limit"]
-    reference = jnp.where(free, limit, jnp.minimum(limit, braking))
-    early = jnp.where(valid, times**2, 0.0)
-    off_speed = jnp.sum(early * jnp.abs(reference - trajectory.v)) / jnp.sum(early)
-    travelled = jnp.max(jnp.where(valid, trajectory.s, 0.0))
-    total = weights.objective_speed + weights.objective_distance
-    objective = (
-        weights.objective_speed * off_speed
-        + weights.objective_distance / (1.0 + travelled)
-    ) / total
-    distance = jnp.minimum(
-        jnp.maximum(column["follow_distance"] - weights.yield_buffer, 0.0),
-        jnp.maximum(column["overtake_distance"] - weights.overtake_buffer, 0.0),
-    )
-    distance = jnp.where(column["collision"] > 0.0, 0.0, distance)
-    near = jnp.exp(-0.5 * (distance / weights.collision_sigma) ** 2)
-    comfort = jnp.abs(trajectory.ddl * trajectory.v**2 + trajectory.dl * trajectory.a)
-    collides = jnp.any((column["collision"] > 0.0) & valid)
-    return (
-        weights.collision_check * collides
-        + weights.objective * objective
-        + weights.jerk * _ratio(trajectory.j / weights.jerk_bound, valid)
-        + weights.collision * _ratio(near, valid)
-        + weights.centripetal * _ratio(column["lateral_acceleration"], valid)
-        + weights.lateral_offset * _ratio(trajectory.l / weights.offset_scale, valid)
-        + weights.lateral_comfort * jnp.max(jnp.where(valid, comfort, 0.0))
-    )
+    return weighted_cost(lattice_terms(scene, trajectory, weights), weights)
 
 
 _READ = (

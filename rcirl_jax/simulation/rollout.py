@@ -5,9 +5,11 @@ and time. A policy is a pure function `(params, scene, key) -> Plan`; weights
 are arguments, so the compiled program serves every weights file of one shape.
 """
 
+import concurrent.futures
 import dataclasses
 import functools
 import math
+import os
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -177,10 +179,15 @@ def drive_cases(
     total = cases.steps.shape[0]
     if total % LANES or jax.default_backend() != "cpu":
         return drive(params, cases)
-    groups = [
-        drive(params, jax.tree.map(lambda leaf, i=first: leaf[i : i + LANES], cases))
-        for first in range(0, total, LANES)
-    ]
+
+    def group(first: int) -> Logs:
+        lanes = slice(first, first + LANES)
+        part = jax.tree.map(lambda leaf: leaf[lanes], cases)
+        return jax.block_until_ready(drive(params, part))
+
+    # a group keeps one core busy: its operations are too small to be shared
+    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+        groups = list(pool.map(group, range(0, total, LANES)))
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *groups)
 
 

@@ -163,7 +163,7 @@ def test_table_fits_lines_up_and_orders_its_rows(report, width):
         block = table[at - 2 : at + 1 + len(report.rows) + 1]  # one spread line
         names = [line[:24].strip() for line in block[3:]]
         starts = [n for n in names if not n.startswith("sd over")]
-        order = ("rc-irl", "twin", *RIVALS)
+        order = ("rc-irl", "twin", *(x for x in RIVALS if x in report.rows))
         assert all(n.startswith(o) for n, o in zip(starts, order, strict=True))
         ends = {len(line) for line in block if not line.startswith("  sd")}
         assert ends == {len(table[at])}  # right-aligned to the rule

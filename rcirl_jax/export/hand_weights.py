@@ -1,0 +1,86 @@
+"""Weights of a hand-set cost as a JSON file that people can read and edit.
+
+    {"schema": "rcirl-jax/hand-weights", "schema_version": 1,
+     "weights": {every field of `LatticeCost`: number}, ...}
+
+What else is in the file (history of a search, provenance) is for people.
+"""
+
+import dataclasses
+import json
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.reward import LatticeCost
+
+SCHEMA = "rcirl-jax/hand-weights"
+SCHEMA_VERSION = 1
+# divisors and shares; all other fields may be 0
+_POSITIVE = ("speed_share", "jerk_bound", "collision_sigma", "offset_scale")
+
+
+def write_hand_weights(
+    path: str | os.PathLike[str], cost: LatticeCost, facts: Mapping[str, object]
+) -> None:
+    """Write the file, whole or not at all; its folder is made.
+
+    Args:
+      path: of the file.
+      cost: its fields are written as float32 numbers.
+      facts: further JSON-ready entries.
+    """
+    body = {
+        "schema": SCHEMA,
+        "schema_version": SCHEMA_VERSION,
+        "weights": {name: float(x) for name, x in cost.fields().items()},
+        **facts,
+    }
+    text = json.dumps(body, indent=2, allow_nan=False) + "\n"
+    file = Path(path)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    temporary = file.with_name(file.name + ".tmp")
+    temporary.write_text(text)
+    os.replace(temporary, file)
+
+
+def load_hand_weights(path: str | os.PathLike[str]) -> LatticeCost:
+    """The cost of a file.
+
+    Raises:
+      InputError: unreadable, of another schema, or a weight that is missing,
+        unknown, not a number, not finite, or negative; one line naming it.
+    """
+    try:
+        body = json.loads(Path(path).read_text())
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}: expected hand weights") from error
+    except ValueError as error:
+        raise InputError(f"{path}: {error}: expected JSON") from error
+    found = body if isinstance(body, dict) else {}
+    for name, expected in {"schema": SCHEMA, "schema_version": SCHEMA_VERSION}.items():
+        if found.get(name) != expected:
+            raise InputError(f"{path}: {name}: {found.get(name)}: expected {expected}")
+    weights = found.get("weights")
+    names = [field.name for field in dataclasses.fields(LatticeCost)]
+    if not isinstance(weights, dict) or set(weights) != set(names):
+        given = set(weights) if isinstance(weights, dict) else set()
+        wrong = ", ".join(sorted(given ^ set(names)))
+        raise InputError(f"{path}: weights: {wrong}: expected the cost's fields")
+    return LatticeCost(**{name: _number(path, name, weights[name]) for name in names})
+
+
+def _number(path: str | os.PathLike[str], name: str, value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        number = math.nan
+    else:
+        number = float(value)
+    if not math.isfinite(number) or number < 0.0:
+        raise InputError(
+            f"{path}: weights: {name}: {value}: expected a finite number, 0 or more"
+        )
+    if name in _POSITIVE and number == 0.0:
+        raise InputError(f"{path}: weights: {name}: 0: expected above 0")
+    return number

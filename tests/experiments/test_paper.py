@@ -1,0 +1,72 @@
+"""Every figure and table of the paper by its command, small."""
+
+import json
+import math
+import os
+import subprocess
+import sys
+
+import pytest
+
+from rcirl_jax.data.config import CollectConfig
+from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.importing import ImportConfig, import_logs
+
+RANKED = (
+    "artefact_audit",
+    "cross_site",
+    "data_scaling",
+    "discount_factors",
+    "feature_ablation",
+    "known_truth",
+    "leaky_rate_and_hidden_size",
+    "linear_vs_network",
+    "one_frame",
+    "optimisers",
+)
+
+
+@pytest.fixture(scope="session")
+def dataset(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("paper") / "synthetic"
+    config = ImportConfig(format="synthetic", collect=CollectConfig(stride_s=60.0))
+    import_logs(read_recordings("synthetic", None), folder, config)
+    return folder
+
+
+def command(name, *flags):
+    return subprocess.run(
+        [sys.executable, "-m", f"experiments.paper.{name}", *flags],
+        capture_output=True, text=True, check=False, timeout=600,
+        env={**os.environ, "JAX_PLATFORMS": "cpu"},
+    )  # fmt: skip
+
+
+def numbers(item):
+    if isinstance(item, dict):
+        for value in item.values():
+            yield from numbers(value)
+    elif isinstance(item, list):
+        for value in item:
+            yield from numbers(value)
+    elif isinstance(item, float):
+        yield item
+
+
+@pytest.mark.parametrize("name", RANKED)
+def test_writes_numbers_and_a_picture(name, dataset, tmp_path):
+    done = command(name, "--quick", f"--data={dataset}", f"--output={tmp_path}")
+    assert done.returncode == 0, done.stderr[-2000:]
+    body = json.loads((tmp_path / f"{name}.json").read_text())
+    found = list(numbers(body))
+    assert found
+    assert all(math.isfinite(x) for x in found)
+    assert body["quick"] is True
+    assert body["made_by"]["versions"]
+    assert (tmp_path / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_wrong_site_is_one_line(tmp_path):
+    done = command("cross_site", "--sites=a", f"--output={tmp_path}")
+    assert done.returncode == 2
+    assert done.stderr.strip().splitlines()[-1].startswith("error: --sites: ['a']")
