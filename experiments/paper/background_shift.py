@@ -68,9 +68,9 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     target = folder / "background_shift.json"
     target.write_text(json.dumps(body, indent=2, allow_nan=False) + "\n")
-    first = jax.tree.map(lambda x: np.asarray(x[0]), (frames, found))
+    one, directions = jax.tree.map(lambda x: np.asarray(x[0]), (frames, found))
     picture = folder / "background_shift.png"
-    background_figure(picture, *first, body["by_size"], body["by_frames"])
+    background_figure(picture, one, directions, body["by_size"], body["by_frames"])
     print(summary(body))
     print(f"written: {target} and {picture.name}")
 

@@ -5,12 +5,14 @@ asks for, what pooling both finds, and what comparing within a frame finds. Belo
 how the hidden reward's choices are met as the background grows, and with data.
 """
 
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from numpy.typing import ArrayLike
 
 from rcirl_jax.evaluation.background import TRUTH, Frames, Learned
 from rcirl_jax.report.style import CANDIDATE, CHOSEN, CLASS_COLOURS, HUMAN, label, save
@@ -47,7 +49,7 @@ def _points(axis: Axes, frames: Frames) -> None:
         axis.plot(*human, "*", color=colour, ms=15, mec=HUMAN, mew=1.0)
 
 
-def _arrow(axis: Axes, start: np.ndarray, direction: np.ndarray, colour: str) -> None:
+def _arrow(axis: Axes, start: np.ndarray, direction: ArrayLike, colour: str) -> None:
     end = start + ARROW * np.asarray(direction)
     axis.annotate(
         "",
@@ -128,7 +130,7 @@ def _spread(values: np.ndarray, apart: float) -> np.ndarray:
     """The values in their order, moved up until they lie apart."""
     placed = np.array(values, float)
     order = np.argsort(placed, kind="stable")
-    for below, above in zip(order[:-1], order[1:], strict=True):
+    for below, above in itertools.pairwise(order):
         placed[above] = max(placed[above], placed[below] + apart)
     return placed
 
@@ -187,7 +189,8 @@ def background_figure(
       by_frames: the same over the number of training frames.
     """
     made = pyplot.figure(figsize=(13.5, 9.0), layout="constrained")
-    above, below = made.subfigures(2, 1, height_ratios=(1.15, 1.0))
+    halves: Any = made.subfigures(2, 1, height_ratios=(1.15, 1.0))
+    above, below = halves
     example = above.subplots(1, 3)
     charts = below.subplots(1, 2)
     for axis in (*example, *charts):

@@ -53,6 +53,16 @@ def numbers(item):
         yield item
 
 
+def test_background_shift(tmp_path):
+    done = command("background_shift", "--quick", f"--output={tmp_path}")
+    assert done.returncode == 0, done.stderr[-2000:]
+    body = json.loads((tmp_path / "background_shift.json").read_text())
+    assert all(math.isfinite(x) for x in numbers(body))
+    angles = body["example"]["angle_to_truth_deg"]
+    assert angles["conditional, logistic"]["mean"] < angles["pooled"]["mean"]
+    assert (tmp_path / "background_shift.png").read_bytes()[:4] == b"\x89PNG"
+
+
 @pytest.mark.parametrize("name", RANKED)
 def test_writes_numbers_and_a_picture(name, dataset, tmp_path):
     done = command(name, "--quick", f"--data={dataset}", f"--output={tmp_path}")
