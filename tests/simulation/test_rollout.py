@@ -10,7 +10,7 @@ from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.planner.rank import idm_policy
 from rcirl_jax.simulation.cases import NUM_AGENTS, Replay
 from rcirl_jax.simulation.metrics import MetricsConfig, case_metrics
-from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases
+from rcirl_jax.simulation.rollout import LANES, RolloutConfig, drive_cases
 from rcirl_jax.simulation.rows import Row
 from rcirl_jax.simulation.suite import build, drive_row, suite_refs
 from tests.simulation.drives import constant, drive, stack
@@ -21,14 +21,14 @@ IDM = Row(name="IDM", policy=idm_policy(Idm()))
 
 
 def metrics_of(chunk):
-    refs = suite_refs("cut_in,pedestrian", 3)
+    refs = suite_refs("cut_in,pedestrian", 20)
     cases = lambda a, b: build(refs[a:b], 10.0)  # noqa: E731
     return drive_row(IDM, cases, len(refs), CONFIG, chunk=chunk)
 
 
 def test_batch_size_and_repetition_change_no_bit():
-    first = metrics_of(6)
-    for chunk in (6, 4, 2):
+    first = metrics_of(2 * LANES)
+    for chunk in (2 * LANES, LANES, 7):
         again = metrics_of(chunk)
         same = jax.tree.map(np.array_equal, first, again)
         assert all(jax.tree.leaves(same)), chunk
@@ -36,13 +36,14 @@ def test_batch_size_and_repetition_change_no_bit():
 
 def test_chunks_report_every_case_once():
     seen = []
-    refs = suite_refs("cut_in", 5)
+    total = 2 * LANES + 5
+    refs = suite_refs("cut_in", total)
     found = drive_row(
-        IDM, lambda a, b: build(refs[a:b], 10.0), 5, CONFIG, chunk=2,
+        IDM, lambda a, b: build(refs[a:b], 10.0), total, CONFIG, chunk=2,
         progress=seen.append,
     )  # fmt: skip
-    assert seen == [2, 2, 1]
-    assert found.progress.shape == (5,)
+    assert seen == [LANES, LANES, 5]
+    assert found.progress.shape == (total,)
 
 
 def test_padding_steps_do_not_count():
