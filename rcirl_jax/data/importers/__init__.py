@@ -1,33 +1,26 @@
 """Importers: one module per log format, each yielding valid Recordings.
 
 An importer is a function (input path, source spec) -> iterator of Recording.
-The spec is the TOML of data_specs/sources (or the user's own).
+The spec is the TOML of data_specs/sources (or the user's own). Each passes its
+recordings through `validate_recording` with the file's name.
 """
 
 import importlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from rcirl_jax.data.importers import commonroad, csv_table, ngsim
-from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.specs import load_toml, spec_root
 from rcirl_jax.types import Recording
 
 Importer = Callable[[Path, dict], Iterator[Recording]]
 
-
-def _synthetic(path: Path, spec: dict) -> Iterator[Recording]:
-    """Synthetic traffic; its module is loaded only when it is asked for."""
-    synthetic = importlib.import_module("rcirl_jax.data.importers.synthetic")
-    return map(validate_recording, synthetic.recordings(path, spec))
-
-
-IMPORTERS: dict[str, Importer] = {
-    "commonroad": commonroad.recordings,
-    "csv": csv_table.recordings,
-    "ngsim": ngsim.recordings,
-    "synthetic": _synthetic,
+# format -> module; loaded only when the format is asked for
+IMPORTERS: dict[str, str] = {
+    "commonroad": "commonroad",
+    "csv": "csv_table",
+    "ngsim": "ngsim",
+    "synthetic": "synthetic",
 }
 
 
@@ -54,4 +47,6 @@ def read_recordings(
         input_path = spec_path
     if not input_path.exists():
         raise InputError(f"{input_path}: input: missing: expected a file or folder")
-    return IMPORTERS[name](input_path, spec)
+    module = importlib.import_module(f"{__name__}.{IMPORTERS[name]}")
+    importer: Importer = module.recordings
+    return importer(input_path, spec)

@@ -13,6 +13,7 @@ from typing import Any, get_args
 
 import numpy as np
 
+from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.data.synthetic import ROADS, DriverConfig, RunConfig, simulate
 from rcirl_jax.data.synthetic.roads import lanes, to_world
 from rcirl_jax.data.synthetic.stops import schedule
@@ -73,7 +74,7 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     _check_keys(path, "", settings, TOP_KEYS)
     drivers = _driver_config(path, settings["drivers"])
     jobs = _jobs(path, settings)
-    return _simulated(jobs, drivers, settings)
+    return map(validate_recording, _simulated(jobs, drivers, settings))
 
 
 def _table(spec: dict, key: str) -> dict:

@@ -1,0 +1,42 @@
+"""Fixtures in the layout of each log format, written by the tests themselves.
+
+One module per format of `IMPORTERS`, with `write(folder) -> Fixture`. The
+conformance suite reads each back and compares it with what was written.
+"""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from rcirl_jax.types import Kind
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Written:
+    """One road user as the fixture's author meant it, in SI units, box centre."""
+
+    kind: Kind
+    length: float  # m
+    width: float  # m
+    t: np.ndarray  # [n] s, first sample of the recording is 0
+    x: np.ndarray  # [n] m
+    y: np.ndarray  # [n] m
+    heading: np.ndarray  # [n] rad
+    speed: np.ndarray  # [n] m/s
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Fixture:
+    """What a fixture holds and what an importer has to find in it."""
+
+    input: Path  # for --input
+    rate_hz: float
+    tracks: dict[str, Written]  # by the id that the importer gives
+    num_lanes: int  # at least so many lanes; 0 if the format has none
+    num_signals: int = 0
+    # position error allowed by the format's rounding
+    tolerance_m: float = 0.02
+    has_heading: bool = True  # False: computed from the positions
+    # files whose truncation, garbling or removal has to be one clear line
+    files: tuple[Path, ...] = ()
