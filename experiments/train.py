@@ -41,6 +41,9 @@ _ACTIVATION = flags.DEFINE_enum(
 _CONSTRAINT = flags.DEFINE_enum(
     "constraint", "none", CONSTRAINTS, "nonnegative costs (linear), monotone in safety"
 )
+_BY_CONTEXT = flags.DEFINE_bool(
+    "by_context", False, "scale the features by what the scene is like at t = 0"
+)
 _PIN = flags.DEFINE_enum("pin", "unit", ["unit", "none"], "scale pinning")
 _OPTIMIZER = flags.DEFINE_enum(
     "optimizer", "adam", ["sgd", "adam", "rmsprop"], "gradient method"
@@ -70,7 +73,7 @@ def main() -> None:
     if len(_MARGINS.value) != 3:
         raise InputError(f"--margins: {_MARGINS.value}: expected three numbers")
     margins = floats(_MARGINS.value, "margins")
-    signs = feature_map(_FEATURES.value).signs
+    features = feature_map(_FEATURES.value)
     config = TrainConfig(
         features=_FEATURES.value,
         loss=_LOSS.value,
@@ -95,7 +98,8 @@ def main() -> None:
             activation=_ACTIVATION.value,
             pin=_PIN.value,
             constraint=_CONSTRAINT.value,
-            signs=signs if _CONSTRAINT.value == "monotone" else (),
+            context=features.context if _BY_CONTEXT.value else (),
+            signs=features.signs if _CONSTRAINT.value == "monotone" else (),
         ),
         sampler=SamplerConfig(mode=_MODE.value),
     )

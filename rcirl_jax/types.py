@@ -171,6 +171,8 @@ class RewardParams(flax.struct.PyTreeNode, kw_only=True):
     gamma: jax.Array  # [T] weight of each time
     kernels: tuple[jax.Array, ...]  # [F, H1], ..., [H, 1]
     biases: tuple[jax.Array, ...]  # [H1], ... one per hidden layer
+    # [F, F] gains of the features by the scene (`reward.conditioned`); None: none
+    context: jax.Array | None = None
     # [] logit of the discriminator's prior, of the GAN loss only; ranks nothing
     offset: jax.Array | None = None
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.reward import Normaliser, RewardParams, normalise
-from rcirl_jax.reward.network import ACTIVATIONS, point_rewards
+from rcirl_jax.reward.network import ACTIVATIONS, conditioned, point_rewards
 
 STEPS = 64  # points on the line from b to a
 
@@ -120,6 +120,7 @@ def attribute(
     weight = jnp.where(time_valid, effective_params.gamma, 0.0)
 
     def total(x: jax.Array) -> jax.Array:
+        x = conditioned(effective_params, x)
         return jnp.sum(weight * point_rewards(effective_params, x, activation))
 
     shares = (jnp.arange(steps) + 0.5) / steps

@@ -24,7 +24,7 @@ from scipy.special import expit
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.attribution import check_network_inputs
 from rcirl_jax.reward import Normaliser, RewardParams, normalise
-from rcirl_jax.reward.network import ACTIVATIONS
+from rcirl_jax.reward.network import ACTIVATIONS, conditioned
 
 
 def last_layer_features(
@@ -62,7 +62,7 @@ def last_layer_features(
         time_valid,
         activation,
     )
-    x = normalise(normaliser, features)
+    x = conditioned(effective_params, normalise(normaliser, features))
     hidden = zip(effective_params.kernels[:-1], effective_params.biases, strict=True)
     for kernel, bias in hidden:
         x = ACTIVATIONS[activation](x @ kernel + bias)

@@ -38,6 +38,7 @@ LEARNERS: dict[str, dict] = {
     "hinge": {"loss": "hinge"},
     "MaxEnt": {"loss": "listwise"},
     "MaxEnt linear": {"loss": "listwise", "reward": LINEAR},
+    "MaxEnt 64": {"loss": "listwise", "reward": RewardConfig(hidden=(64,))},
     "soft labels": {"loss": "soft"},
     "soft labels linear": {"loss": "soft", "reward": LINEAR},
     "GAN": {"loss": "gan"},
@@ -51,12 +52,20 @@ LEARNERS: dict[str, dict] = {
         "loss": "logistic",
         "reward": RewardConfig(constraint="monotone"),
     },
+    "logistic by context": {"loss": "logistic"},
+    "non-negative by context": {
+        "loss": "logistic",
+        "reward": RewardConfig(hidden=(), pin="none", constraint="nonnegative"),
+    },
     "logistic, hard negatives": {
         "loss": "logistic",
         "hard_negatives": 12,
         "hard_pool": 3,
     },
 }
+
+# learners whose features are scaled by the scene; the columns come from the preset
+BY_CONTEXT = ("logistic by context", "non-negative by context")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -100,12 +109,13 @@ def learner_config(name: str, base: TrainConfig) -> TrainConfig:
     if name not in LEARNERS:
         raise InputError(f"--learners: {name}: expected some of {sorted(LEARNERS)}")
     config = dataclasses.replace(base, **LEARNERS[name])
-    if config.reward.constraint != "monotone":
-        return config
-    signs = feature_map(config.features).signs
-    return dataclasses.replace(
-        config, reward=dataclasses.replace(config.reward, signs=signs)
-    )
+    features = feature_map(config.features)
+    reward = config.reward
+    if reward.constraint == "monotone":
+        reward = dataclasses.replace(reward, signs=features.signs)
+    if name in BY_CONTEXT:
+        reward = dataclasses.replace(reward, context=features.context)
+    return dataclasses.replace(config, reward=reward)
 
 
 class FrozenSets:

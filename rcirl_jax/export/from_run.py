@@ -70,6 +70,7 @@ def reward_weights(
         times=TIMES_S,
         gamma=np.asarray(effective.gamma),
         kernels=tuple(np.asarray(kernel) for kernel in effective.kernels),
+        context=None if effective.context is None else np.asarray(effective.context),
         biases=(*(np.asarray(bias) for bias in effective.biases), np.zeros(1)),
         activation=config.reward.hidden_activation,
         leaky_slope=LEAKY_SLOPE,

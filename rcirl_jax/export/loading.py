@@ -41,6 +41,9 @@ def reward_params(reward: Reward) -> tuple[RewardParams, Normaliser]:
             gamma=jnp.asarray(reward.gamma, jnp.float32),
             kernels=tables(reward.kernels),
             biases=tables(reward.biases[:-1]),
+            context=None
+            if reward.context is None
+            else jnp.asarray(reward.context, jnp.float32),
         ),
         Normaliser(
             lower=jnp.asarray(reward.lower, jnp.float32),
@@ -55,9 +58,16 @@ def row_name(reward: Reward) -> str:
     """Name of a reward's row in the tables: loss and network."""
     hidden = [str(kernel.shape[1]) for kernel in reward.kernels[:-1]]
     shape = f"{len(reward.names)}-{'-'.join([*hidden, '1'])}"
-    name = {"rank": "RC-IRL", "logistic": "RC-IRL logistic"}
+    name = {
+        "rank": "RC-IRL",
+        "logistic": "RC-IRL logistic",
+        "listwise": "MaxEnt",
+        "soft": "soft labels",
+        "gan": "GAN",
+    }
     loss = str(reward.loss.get("name"))
-    return f"{name.get(loss, loss)} {shape if hidden else 'linear'}"
+    by_scene = "" if reward.context is None else ", by context"
+    return f"{name.get(loss, loss)} {shape if hidden else 'linear'}{by_scene}"
 
 
 def load_runs(

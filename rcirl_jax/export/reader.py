@@ -4,6 +4,7 @@ This one file may be copied into a planner's repository. docs/weights_format.md
 gives the byte layout; the equation is
 
     x_t = (clip(f_t, lower, upper) - location) / scale       f [T, F]
+    x_t <- x_t * 2 / (1 + exp(-x_0 C))                       version 2 only
     r_t = act(... act(x_t W_1 + b_1) ...) W_L + b_L          last layer linear
     V   = sum_t gamma_t * time_valid_t * r_t                 higher is better
 
@@ -24,7 +25,7 @@ import msgpack
 import numpy as np
 
 MAGIC = "RCIRLW"  # first value of the outer map
-SCHEMA_VERSION = 1  # the layout this reader knows
+SCHEMA_VERSIONS = (1, 2)  # the layouts this reader knows
 TOLERANCE = 1e-5  # of max(1, |V|), on a verification sample, float32
 
 # Limits, far above any sensible reward (the paper's network is 21 -> 15 -> 1).
@@ -81,6 +82,7 @@ class Reward:
     biases: tuple[np.ndarray, ...]  # [H1], ..., [1]
     activation: str
     leaky_slope: float  # negative slope of "leaky_relu"
+    context: np.ndarray | None  # [F, F] C of version 2, gains by the scene
     loss: dict[str, Any]
     provenance: dict[str, Any]
 
@@ -95,13 +97,19 @@ class Reward:
     def point_rewards(self, features: np.ndarray) -> np.ndarray:
         """R(f) of single points, before gamma.
 
+        A conditioned reward (version 2) has no reward of a point without its
+        scene: it raises.
+
         Args:
           features: [..., F] raw features in the file's order and units.
 
         Returns:
           float32 [...]; a NaN among a point's features gives NaN.
         """
-        return self._network(self._numbers(features, (len(self.names),)))
+        if self.context is not None:
+            _fail(f"{self.file}: context", "conditioned", "whole trajectories: value()")
+        points = self._numbers(features, (len(self.names),))
+        return self._network(self._normalise(points))
 
     def value(
         self, features: np.ndarray, time_valid: np.ndarray | None = None
@@ -127,15 +135,21 @@ class Reward:
 
     @np.errstate(all="ignore")
     def _values(self, features: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
-        terms = self.gamma * self._network(features)
+        x = self._normalise(features)
+        if self.context is not None:
+            x = x * (np.float32(2.0) / (1.0 + np.exp(-(x[..., :1, :] @ self.context))))
+        terms = self.gamma * self._network(x)
         if valid is not None:
             terms = np.where(valid, terms, np.float32(0.0))
         return np.asarray(np.sum(terms, axis=-1, dtype=np.float32))
 
     @np.errstate(all="ignore")
-    def _network(self, features: np.ndarray) -> np.ndarray:
+    def _normalise(self, features: np.ndarray) -> np.ndarray:
+        return (np.clip(features, self.lower, self.upper) - self.location) / self.scale
+
+    @np.errstate(all="ignore")
+    def _network(self, x: np.ndarray) -> np.ndarray:
         activate, slope = ACTIVATIONS[self.activation], np.float32(self.leaky_slope)
-        x = (np.clip(features, self.lower, self.upper) - self.location) / self.scale
         for kernel, bias in zip(self.kernels[:-1], self.biases[:-1], strict=True):
             x = activate(x @ kernel + bias, slope)
         return (x @ self.kernels[-1] + self.biases[-1])[..., 0]
@@ -163,7 +177,7 @@ class Reward:
 
 
 def load_weights(path: str | os.PathLike[str]) -> Reward:
-    """Read and verify one file, schema version 1.
+    """Read and verify one file, schema version 1 or 2.
 
     Raises:
       WeightsError: the file is missing, damaged, of another version, out of
@@ -196,14 +210,16 @@ def _decode(data: bytes, file: str) -> Reward:
     if not isinstance(outer, dict) or outer.get("magic") != MAGIC:
         _fail("magic", "missing or another", repr(MAGIC))
     version = outer.get("schema_version")
-    if type(version) is not int or version != SCHEMA_VERSION:
-        _fail("schema_version", version, f"{SCHEMA_VERSION}, all this reader supports")
+    if type(version) is not int or version not in SCHEMA_VERSIONS:
+        known = " or ".join(map(str, SCHEMA_VERSIONS))
+        _fail("schema_version", version, f"{known}, all this reader supports")
     _map("file", outer, OUTER_KEYS)
     body = outer["body"]
     found = hashlib.sha256(body).hexdigest() if isinstance(body, bytes) else "no bytes"
     if outer["sha256"] != found or not isinstance(body, bytes):
         _fail("sha256", found, f"{_show(outer['sha256'])}; the file is damaged")
-    fields = _map("body", _unpack("body", body), BODY_KEYS)
+    keys = BODY_KEYS if version == 1 else (*BODY_KEYS, "context")
+    fields = _map("body", _unpack("body", body), keys)
     reward = Reward(file=file, sha256=found, **_fields(fields))
     _verify(reward, fields["samples"])
     return reward
@@ -224,6 +240,9 @@ def _fields(body: dict[str, Any]) -> dict[str, Any]:
     activation = _text("activation", body["activation"])
     if activation not in ACTIVATIONS:
         _fail("activation", activation, f"one of {', '.join(ACTIVATIONS)}")
+    context = body.get("context")
+    if "context" in body:
+        context = _array("context", context, (size, size))
     loss = _map("loss", body["loss"], ("name", "leaky_rate"))
     _text("loss.name", loss["name"])
     if loss["leaky_rate"] is not None:
@@ -237,6 +256,7 @@ def _fields(body: dict[str, Any]) -> dict[str, Any]:
         **_layers(body["layers"], size),
         "activation": activation,
         "leaky_slope": _number("leaky_slope", body["leaky_slope"]),
+        "context": context,
         "loss": loss,
         "provenance": _plain("provenance", body["provenance"], MAX_DEPTH),
     }

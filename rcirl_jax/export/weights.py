@@ -49,9 +49,10 @@ class FeatureSpec:
 class RewardWeights:
     """A reward in its effective weights: any scale pinning is already applied.
 
-    x = (clip(f, lower, upper) - location) / scale, then the layers, the last one
-    linear with one output; V = sum_t gamma_t * time_valid_t * r_t, higher is
-    better. Arrays are anything numpy can turn into float32.
+    x = (clip(f, lower, upper) - location) / scale, scaled by the scene's gains if
+    there is a context, then the layers, the last one linear with one output;
+    V = sum_t gamma_t * time_valid_t * r_t, higher is better. Arrays are anything
+    numpy can turn into float32.
     """
 
     preset: str  # of data_specs/features
@@ -64,6 +65,7 @@ class RewardWeights:
     gamma: np.ndarray  # [T]
     kernels: tuple[np.ndarray, ...]  # [F, H1], ..., [H, 1]
     biases: tuple[np.ndarray, ...]  # [H1], ..., [1]; one for every kernel
+    context: np.ndarray | None = None  # [F, F], gains by scene; None: one reward
     activation: str  # of the hidden layers: tanh, relu, leaky_relu, identity
     leaky_slope: float  # negative slope of the hidden leaky_relu
     loss: Mapping[str, Any]  # name; leaky_rate of the rank loss, or None
@@ -173,7 +175,7 @@ def _pack_checked(
         body = _dump(_body(weights, samples))
         outer = {
             "magic": reader.MAGIC,
-            "schema_version": reader.SCHEMA_VERSION,
+            "schema_version": 1 if weights.context is None else 2,
             "body": body,
             "sha256": hashlib.sha256(body).hexdigest(),
         }
@@ -196,13 +198,16 @@ class _FieldError(Exception):
 
 
 def _body(weights: RewardWeights, samples: tuple[np.ndarray, ...]) -> dict[str, Any]:
-    """The body map, in the order of `reader.BODY_KEYS`."""
+    """The body map, in the order of `reader.BODY_KEYS`; then the context, if any."""
     if len(weights.kernels) != len(weights.biases):
         found = f"{len(weights.biases)} biases"
         raise _FieldError(f"biases: {found}: expected one for each kernel")
     for key in PROVENANCE_KEYS:
         if key not in weights.provenance:
             raise _FieldError(f"provenance.{key}: missing: expected a value or None")
+    gated = {}
+    if weights.context is not None:
+        gated = {"context": _array("context", weights.context)}
     layers = zip(weights.kernels, weights.biases, strict=True)
     names = ("features", "valid", "value")
     return {
@@ -229,6 +234,7 @@ def _body(weights: RewardWeights, samples: tuple[np.ndarray, ...]) -> dict[str, 
             name: _array(f"samples.{name}", sample)
             for name, sample in zip(names, samples, strict=True)
         },
+        **gated,
     }
 
 

@@ -42,6 +42,11 @@ class FeatureMap:
     signs: tuple[int, ...] = ()
 
     @property
+    def context(self) -> tuple[int, ...]:
+        """Per feature: 1 if all candidates of a scene share it at t = 0."""
+        return tuple(int(n not in ("acceleration", "jerk")) for n in self.names)
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Feature names in column order."""
         return tuple(spec.name for spec in self.specs)

@@ -301,7 +301,7 @@ def plan_dp(
     """
     with jax.named_scope("dp"):
         lattice = make_lattice(scene, weights, features, config)
-        layers = make_layers(weights, features)
+        layers = make_layers(weights, features, lattice.first_row)
         value, n = solve(lattice, layers, config, activation)
         s = scene.ego.s + n * config.station_step
         return DpPlan(

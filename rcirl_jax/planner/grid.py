@@ -31,7 +31,8 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.features import FeatureMap
 from rcirl_jax.features.path import path_view
 from rcirl_jax.planner.safety import SafetyConfig
-from rcirl_jax.reward.network import ACTIVATIONS
+from rcirl_jax.reward import normalise
+from rcirl_jax.reward.network import ACTIVATIONS, gains
 from rcirl_jax.sampling.kinematics import trajectory_on_path
 from rcirl_jax.types import (
     Candidates,
@@ -211,10 +212,15 @@ class Layers(flax.struct.PyTreeNode, kw_only=True):
     biases: tuple[jax.Array, ...]
 
 
-def make_layers(weights: Weights, features: FeatureMap) -> Layers:
-    """Fold the normaliser into the first layer and take a and j out of it."""
+def make_layers(weights: Weights, features: FeatureMap, first_row: jax.Array) -> Layers:
+    """Fold the normaliser into the first layer and take a and j out of it.
+
+    `first_row` [F], the features at t = 0, sets the gains of a conditioned reward.
+    """
     params, norm = weights
     first = params.kernels[0] / norm.scale[:, None]
+    if params.context is not None:
+        first = gains(params.context, normalise(norm, first_row))[:, None] * first
     bias = params.biases[0] if params.biases else jnp.zeros((1,))
     none, open_bounds = jnp.zeros(first.shape[1]), jnp.array([-jnp.inf, jnp.inf])
     parts = {"acceleration": (none, open_bounds), "jerk": (none, open_bounds)}

@@ -114,7 +114,7 @@ def plan_time_station(
 ) -> DpPlan:
     """The plan of the (t, s)-only recursion; arguments as `dp.plan_dp`."""
     lattice = make_lattice(scene, weights, features, config)
-    layers = make_layers(weights, features)
+    layers = make_layers(weights, features, lattice.first_row)
     count = config.num_stations
 
     def forward(nodes: tuple, t: jax.Array) -> tuple[tuple, jax.Array]:

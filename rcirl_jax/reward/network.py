@@ -46,6 +46,9 @@ class RewardConfig:
     constraint: str = "none"
     # per feature: 1 the reward may not fall with it, -1 may not rise, 0 free
     signs: tuple[int, ...] = ()
+    # per feature: 1 if its value at t = 0 is part of the context that sets the
+    # gains of all features (see `conditioned`); () for one reward in all scenes
+    context: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         """Reject unknown names."""
@@ -78,6 +81,10 @@ def init_reward(
     key: jax.Array, num_features: int, config: RewardConfig
 ) -> RewardParams:
     """Random kernels (Glorot uniform), zero biases, equal gamma. Key consumed."""
+    if config.context and len(config.context) != num_features:
+        raise InputError(
+            f"context: {len(config.context)} columns: expected {num_features}"
+        )
     first = 2 * num_features if config.constraint == "nonnegative" else num_features
     sizes = (first, *config.hidden, 1)
     keys = jax.random.split(key, len(sizes) - 1)
@@ -90,6 +97,7 @@ def init_reward(
         gamma=jnp.full((NUM_TIMES,), NUM_TIMES**-0.5, jnp.float32),
         kernels=tuple(kernels),
         biases=tuple(jnp.zeros((h,), jnp.float32) for h in config.hidden),
+        context=jnp.zeros((num_features,) * 2) if config.context else None,
     )
 
 
@@ -107,6 +115,9 @@ def pinned(params: RewardParams, config: RewardConfig) -> RewardParams:
     only. Every pin divides by a positive number, so it never changes an order.
     """
     params = _constrained(params, config)
+    if config.context and params.context is not None:
+        mask = jnp.asarray(config.context, jnp.float32)[:, None]
+        params = params.replace(context=mask * params.context)
     if config.pin == "none" or config.constraint == "nonnegative":
         return params
     kernels, biases = list(params.kernels), list(params.biases)
@@ -155,6 +166,31 @@ def _unit(x: jax.Array) -> jax.Array:
     return x / jnp.sqrt(jnp.sum(x**2) + 1e-12)
 
 
+def conditioned(
+    params: RewardParams, x: Float[Array, "*batch t f"]
+) -> Float[Array, "*batch t f"]:
+    """Normalised features scaled by what the scene is like at t = 0.
+
+        x_t <- g * x_t,   g = 2 sigmoid(x_0 C) in (0, 2)
+
+    A gain never turns a feature's sign, so constraints on signs hold in every
+    scene; C = 0 is the unconditioned reward. C's rows of features that the
+    candidates of a scene do not share at t = 0 (jerk) are 0, so candidates are
+    compared under one gain. Idea: situation-dependent weights (Rosbach et al.,
+    arXiv 1912.03509).
+    """
+    if params.context is None:
+        return x
+    return x * gains(params.context, x[..., :1, :])
+
+
+def gains(
+    context: Float[Array, "f f"], x0: Float[Array, "*batch f"]
+) -> Float[Array, "*batch f"]:
+    """G = 2 sigmoid(x_0 C) from normalised features at t = 0."""
+    return 2.0 * jax.nn.sigmoid(x0 @ context)
+
+
 def point_rewards(
     params: RewardParams, x: Float[Array, "*batch f"], activation: str
 ) -> Float[Array, "*batch"]:
@@ -189,9 +225,15 @@ def rows_value(
         jnp.clip(row, normaliser.lower[i], normaliser.upper[i])
         for i, row in enumerate(rows)
     ]
-    x = jnp.stack(clipped).reshape(len(rows), -1)
+    x = jnp.stack(clipped)
     first = effective.kernels[0] / normaliser.scale[:, None]
     shift = normaliser.location @ first
+    if effective.context is not None:
+        columns = lambda v: v[:, None, None]  # noqa: E731
+        x = (x - columns(normaliser.location)) / columns(normaliser.scale)
+        x = x * 2.0 * jax.nn.sigmoid(effective.context.T @ x[:, 0])[:, None]
+        first, shift = effective.kernels[0], 0.0
+    x = x.reshape(len(rows), -1)
     kernels = (first, *effective.kernels[1:])
     offsets = [*effective.biases, jnp.zeros((1,))]
     offsets[0] = offsets[0] - shift
@@ -209,7 +251,9 @@ def value(
     time_valid: Bool[Array, "*batch t"],
     config: RewardConfig,
 ) -> Float[Array, "*batch"]:
-    """V(xi) = sum over valid t of gamma_t R(f_t); higher is better.
+    """V(xi) = sum over valid t of gamma_t R(g * f_t); higher is better.
+
+    The gains g are 1 unless the reward is conditioned (see `conditioned`).
 
     Args:
       params: raw parameters; the pin is applied here.
@@ -222,6 +266,6 @@ def value(
       Value [...], no unit.
     """
     effective = pinned(params, config)
-    x = normalise(normaliser, features)
+    x = conditioned(effective, normalise(normaliser, features))
     rewards = point_rewards(effective, x, config.hidden_activation)
     return jnp.sum(jnp.where(time_valid, effective.gamma * rewards, 0.0), axis=-1)

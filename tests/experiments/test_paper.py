@@ -16,6 +16,7 @@ RANKED = (
     "artefact_audit",
     "cross_site",
     "data_scaling",
+    "data_support",
     "discount_factors",
     "feature_ablation",
     "known_truth",
@@ -23,6 +24,7 @@ RANKED = (
     "linear_vs_network",
     "one_frame",
     "optimisers",
+    "stability",
 )
 
 

@@ -315,10 +315,22 @@ def test_a_wrong_field_is_named(path, value, message):
         (b"\x82\xa1a\x01\xa1a\x02", "file: a key used twice"),
         (sealed(body_of(), magic="RCIRLX"), "magic: missing or another"),
         (
-            sealed(body_of(), schema_version=2),
-            "schema_version: 2: expected 1, all this reader supports",
+            sealed(body_of(), schema_version=3),
+            "schema_version: 3: expected 1 or 2, all this reader supports",
         ),
-        (sealed(body_of(), schema_version=True), "schema_version: True: expected 1"),
+        (
+            sealed(body_of(), schema_version=2),
+            "body.context: missing: expected the keys",
+        ),
+        (
+            sealed({**body_of(), "context": array(2, 2)}),
+            "body.context: unknown: expected the keys",
+        ),
+        (
+            sealed({**body_of(), "context": array(1, 2)}, schema_version=2),
+            "context.shape: [1, 2]: expected",
+        ),
+        (sealed(body_of(), schema_version=True), "schema_version: True: expected 1 or"),
         (sealed(body_of(), extra=1), "file.extra: unknown"),
         (sealed(body_of(), sha256="0" * 64), "sha256: "),
         (sealed(body_of(), sha256=5), "expected 5; the file is damaged"),

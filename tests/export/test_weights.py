@@ -54,7 +54,9 @@ def provenance():
     }
 
 
-def example_weights(seed=0, features=3, times=4, hidden=(5,), activation="tanh"):
+def example_weights(
+    seed=0, features=3, times=4, hidden=(5,), activation="tanh", by_context=False
+):
     rng = np.random.default_rng(seed)
     sizes = (features, *hidden, 1)
     draw = lambda *shape: rng.normal(size=shape).astype(np.float32)  # noqa: E731
@@ -72,6 +74,7 @@ def example_weights(seed=0, features=3, times=4, hidden=(5,), activation="tanh")
         scale=0.5 + rng.random(features, np.float32),
         times=np.linspace(0.0, 8.0, times, dtype=np.float32),
         gamma=draw(times),
+        context=draw(features, features) if by_context else None,
         kernels=tuple(draw(*pair) for pair in pairwise(sizes)),
         biases=tuple(draw(size) for size in sizes[1:]),
         activation=activation,
@@ -104,13 +107,24 @@ def loop_value(weights, features, valid):
         "leaky_relu": lambda x: x if x > 0.0 else float(weights.leaky_slope) * x,
         "identity": lambda x: x,
     }[weights.activation]
-    total = 0.0
-    for t in range(len(weights.times)):
+    count = len(weights.features)
+
+    def normalised(t):
         x = []
-        for f in range(len(weights.features)):
+        for f in range(count):
             clipped = max(float(features[t, f]), float(weights.lower[f]))
             clipped = min(clipped, float(weights.upper[f]))
             x.append((clipped - float(weights.location[f])) / float(weights.scale[f]))
+        return x
+
+    gain, first = [1.0] * count, normalised(0)
+    if weights.context is not None:
+        for f in range(count):
+            sums = [first[i] * float(weights.context[i, f]) for i in range(count)]
+            gain[f] = 2.0 / (1.0 + math.exp(-sum(sums)))
+    total = 0.0
+    for t in range(len(weights.times)):
+        x = [g * v for g, v in zip(gain, normalised(t), strict=True)]
         for layer in range(len(weights.kernels)):
             kernel, bias = weights.kernels[layer], weights.biases[layer]
             y = []
@@ -133,9 +147,12 @@ def loop_value(weights, features, valid):
     times=st.integers(1, 5),
     hidden=st.lists(st.integers(1, 5), max_size=3),
     activation=st.sampled_from(ACTIVATIONS),
+    gated=st.booleans(),
 )
-def test_file_scores_as_the_float64_loops(seed, features, times, hidden, activation):
-    weights = example_weights(seed, features, times, tuple(hidden), activation)
+def test_file_scores_as_the_float64_loops(
+    seed, features, times, hidden, activation, gated
+):
+    weights = example_weights(seed, features, times, tuple(hidden), activation, gated)
     own = example_samples(weights, seed=seed)
     reward = decode_weights(pack(weights, *own))
     other, valid, values = example_samples(weights, count=6, seed=seed + 1)
@@ -144,9 +161,10 @@ def test_file_scores_as_the_float64_loops(seed, features, times, hidden, activat
     assert np.all(np.abs(found - values) <= 1e-5 * np.maximum(1.0, np.abs(values)))
 
 
+@pytest.mark.parametrize("by_context", [False, True])
 @pytest.mark.parametrize("hidden", [(), (15,), (16, 8)])
 @pytest.mark.parametrize("activation", ACTIVATIONS)
-def test_thousand_inputs_equal_the_trained_network(activation, hidden):
+def test_thousand_inputs_equal_the_trained_network(activation, hidden, by_context):
     """The file carries the EFFECTIVE weights: the trainer pins raw ones itself."""
     specs = feature_map("paper21").specs
     rng = np.random.default_rng(3)
@@ -154,8 +172,15 @@ def test_thousand_inputs_equal_the_trained_network(activation, hidden):
     upper = np.array([spec.upper for spec in specs], np.float32)
     location = rng.uniform(lower, upper).astype(np.float32)
     scale = (0.2 * (upper - lower)).astype(np.float32)
-    config = RewardConfig(hidden=hidden, activation=activation, pin="unit")
+    config = RewardConfig(
+        hidden=hidden,
+        activation=activation,
+        context=feature_map("paper21").context if by_context else (),
+    )
     raw = init_reward(jax.random.key(5), len(specs), config)
+    if by_context:
+        drawn = rng.normal(scale=0.2, size=(len(specs),) * 2)
+        raw = raw.replace(context=jnp.asarray(drawn, jnp.float32))
     raw = raw.replace(gamma=jnp.asarray(rng.normal(size=18), jnp.float32))
     effective = pinned(raw, config)
     normaliser = Normaliser(
@@ -185,6 +210,7 @@ def test_thousand_inputs_equal_the_trained_network(activation, hidden):
         scale=normaliser.scale,
         times=TIMES_S,
         gamma=effective.gamma,
+        context=effective.context,
         kernels=effective.kernels,
         biases=(*effective.biases, np.zeros(1)),
         activation=activation,
@@ -245,6 +271,9 @@ def test_layout_is_the_documented_one():
     assert outer["sha256"] == hashlib.sha256(outer["body"]).hexdigest()
     body = msgpack.unpackb(outer["body"])
     assert tuple(body) == reader.BODY_KEYS
+    gated = msgpack.unpackb(packed(by_context=True))
+    assert gated["schema_version"] == 2
+    assert tuple(msgpack.unpackb(gated["body"])) == (*reader.BODY_KEYS, "context")
     kernel = body["layers"][0]["kernel"]
     assert (kernel["shape"], kernel["dtype"]) == ([3, 5], "<f4")
     weights = example_weights()
@@ -252,9 +281,12 @@ def test_layout_is_the_documented_one():
     np.testing.assert_array_equal(found, weights.kernels[0])
 
 
-def test_a_reader_written_from_the_page_scores_the_samples():
+@pytest.mark.parametrize("by_context", [False, True])
+def test_a_reader_written_from_the_page_scores_the_samples(by_context):
     """docs/weights_format.md and nothing else: msgpack, struct, loops."""
-    outer = msgpack.unpackb(packed(hidden=(4, 2), activation="leaky_relu"))
+    outer = msgpack.unpackb(
+        packed(hidden=(4, 2), activation="leaky_relu", by_context=by_context)
+    )
     body = msgpack.unpackb(outer["body"])
 
     def numbers(box):
@@ -270,6 +302,7 @@ def test_a_reader_written_from_the_page_scores_the_samples():
         biases=[numbers(layer["bias"]) for layer in body["layers"]],
         activation=body["activation"],
         leaky_slope=body["leaky_slope"],
+        context=numbers(body["context"]) if by_context else None,
     )
     features, valid, values = (numbers(box) for box in body["samples"].values())
     scored = [loop_value(found, *one) for one in zip(features, valid, strict=True)]
@@ -293,7 +326,12 @@ def test_schema_describes_the_body_and_refuses_others():
     json.dumps(body, allow_nan=False)
     gamma = np.frombuffer(base64.b64decode(body["gamma"]["data"]), "<f4")
     np.testing.assert_array_equal(gamma, example_weights(hidden=(4, 2)).gamma)
-    assert set(schema["required"]) == set(schema["properties"]) == set(reader.BODY_KEYS)
+    keys = set(reader.BODY_KEYS)
+    assert set(schema["required"]) == keys
+    assert set(schema["properties"]) == {*keys, "context"}
+    gated = to_json(packed(by_context=True))
+    validator.validate(gated)
+    assert not validator.is_valid({**gated, "context": 1})
     assert schema["properties"]["activation"]["enum"] == sorted(ACTIVATIONS)
     for key in reader.BODY_KEYS:
         assert not validator.is_valid({k: v for k, v in body.items() if k != key})

@@ -27,8 +27,13 @@ MIDDLE = DpConfig(step=2.0, max_speed=26.0, max_way=160.0)
 
 
 @functools.cache
-def weights(seed=0):
-    params = pinned(init_reward(jax.random.key(seed), 21, SHAPE), SHAPE)
+def weights(seed=0, by_context=False):
+    params = init_reward(jax.random.key(seed), 21, SHAPE)
+    if by_context:
+        drawn = np.random.default_rng(seed).normal(0.0, 0.3, (21, 21))
+        drawn *= np.asarray(FEATURES.context)[:, None]
+        params = params.replace(context=jnp.asarray(drawn, jnp.float32))
+    params = pinned(params, SHAPE)
     lower = np.array([s.lower for s in FEATURES.specs])
     upper = np.array([s.upper for s in FEATURES.specs])
     return params, Normaliser(
@@ -72,14 +77,15 @@ def scene_of(seed):
     )
 
 
+@pytest.mark.parametrize("by_context", [False, True])
 @pytest.mark.parametrize("seed", range(12))
-def test_value_of_the_plan_is_the_networks_own(seed):
-    made = scene_of(seed)
-    plan = planner(MIDDLE)(made, weights(seed))
+def test_value_of_the_plan_is_the_networks_own(seed, by_context):
+    made, own = scene_of(seed), weights(seed, by_context)
+    plan = planner(MIDDLE)(made, own)
     if not bool(plan.feasible):
         assert float(plan.value) < -1e4
         return
-    again = float(network_value(made, plan.trajectory, weights(seed)))
+    again = float(network_value(made, plan.trajectory, own))
     assert float(plan.value) == pytest.approx(again, rel=1e-4, abs=1e-4)
 
 

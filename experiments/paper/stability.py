@@ -1,0 +1,62 @@
+"""Does any learner train to NaN, with any optimiser, at the default flags?
+
+    python -m experiments.paper.stability --data=DATASET --output=DIR [--quick]
+
+Every learner of `LEARNERS` with every optimiser at the defaults of
+`experiments.train` (20 epochs, step size 0.003, the human's curve as the
+positive) on one dataset. A step whose loss or gradient is not finite is refused
+by the trainer and counts as a failure here. Expected: no failure, pairs won rise
+from one half; exit code 1 otherwise. 20 minutes on two cores with US-101;
+`--quick`: two minutes.
+"""
+
+import sys
+
+import numpy as np
+import tqdm
+
+from experiments.common import run
+from experiments.paper.common import QUICK, dataset, picture, write
+from rcirl_jax.evaluation.learners import (
+    LEARNERS,
+    FrozenSets,
+    learner_config,
+    train_learner,
+)
+from rcirl_jax.report.style import figure, label, save
+from rcirl_jax.train.state import OPTIMIZERS, TrainConfig
+
+
+def main() -> None:
+    """Train all, say which stayed finite, draw."""
+    sets, rows = FrozenSets(dataset()), {}
+    grid = [(name, how) for name in LEARNERS for how in sorted(OPTIMIZERS)]
+    grid = grid[::5] if QUICK.value else grid
+    for name, how in tqdm.tqdm(grid, desc="train", unit="run"):
+        epochs = 2 if QUICK.value else TrainConfig().epochs
+        base = TrainConfig(optimizer=how, epochs=epochs)
+        config = learner_config(name, base)
+        (learned,) = train_learner(sets.of(config), config, [0])
+        rows[f"{name}, {how}"] = {
+            "finite": learned.finite and bool(np.isfinite(learned.loss).all()),
+            "loss": learned.loss.tolist(),
+            "wins": learned.wins.tolist(),
+        }
+    failed = [name for name, row in rows.items() if not row["finite"]]
+    made, axes = figure(1, 1, 7.0, 1.2 + 0.2 * len(rows))
+    axis = axes[0, 0]
+    for place, (name, row) in enumerate(rows.items()):
+        colour = "#D55E00" if name in failed else "#0072B2"
+        axis.plot([row["wins"][0], row["wins"][-1]], [-place] * 2, color=colour, lw=1)
+        axis.plot([row["wins"][-1]], [-place], "o", color=colour, ms=4)
+    axis.set_yticks(-np.arange(len(rows)), list(rows), fontsize=7)
+    label(axis, "training: first epoch to last", "share of pairs won", "")
+    save(made, picture("stability"))
+    print(f"{len(rows)} runs, not finite: {len(failed)} {failed or ''}")
+    write("stability", {"rows": rows, "failed": failed})
+    if failed:
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    run(main)

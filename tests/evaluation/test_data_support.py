@@ -1,0 +1,117 @@
+"""What the data support: sums over time, choices, doubts, reasons."""
+
+import dataclasses
+import functools
+
+import jax
+import numpy as np
+import pytest
+
+from rcirl_jax.evaluation.data_support import (
+    choices_of,
+    rank_correlation,
+    reasons,
+    sums_over_time,
+    weights_supported,
+)
+from rcirl_jax.evaluation.learners import Learned, train_learner
+from rcirl_jax.features import feature_map
+from rcirl_jax.reward import RewardConfig, pinned
+from rcirl_jax.train.frozen import freeze
+from tests.train.test_step import CONFIG, rows
+
+FREE = dataclasses.replace(
+    CONFIG,
+    loss="logistic",
+    positive="nearest",
+    epochs=3,
+    reward=RewardConfig(pin="none"),
+)
+LINEAR = dataclasses.replace(FREE, reward=RewardConfig(hidden=(), pin="none"))
+NAMES = feature_map("paper21").names
+
+
+@functools.cache
+def frozen():
+    return freeze(rows(), np.arange(16), FREE)
+
+
+@functools.cache
+def trained(config, seeds=(0, 1)):
+    return train_learner(frozen(), config, list(seeds))
+
+
+def values(run: Learned):
+    made = frozen()
+    shape = made.candidates.shape[:3]
+    spread = np.broadcast_to(np.asarray(made.time_valid)[:, None], shape)
+    return run.scorer(np.asarray(made.candidates), spread)
+
+
+@pytest.mark.parametrize("config", [FREE, LINEAR], ids=["network", "linear"])
+def test_sums_over_time_times_the_output_weights_are_the_values(config):
+    (run, _) = trained(config)
+    w = np.asarray(pinned(run.params, config.reward).kernels[-1])[:, 0]
+    human, candidates = sums_over_time(run, frozen())
+    np.testing.assert_allclose(candidates @ w, values(run), rtol=1e-4, atol=1e-4)
+    assert human.shape == (16, w.size)
+
+
+def test_reasons_add_up_to_the_gap():
+    (run, _) = trained(FREE)
+    a, b = np.arange(16) % 7, np.arange(16) % 5 + 7
+    v, at = values(run), np.arange(16)
+    got = reasons(run, frozen(), a, b)
+    assert got.shape == (16, len(NAMES))
+    np.testing.assert_allclose(got.sum(axis=1), v[at, a] - v[at, b], atol=2e-3)
+
+
+def test_the_choice_is_the_best_feasible_one_and_its_error_its_distance():
+    runs = trained(FREE)
+    made = choices_of(runs, frozen(), frozen())
+    mean = np.mean([values(run) for run in runs], axis=0)
+    distance = np.asarray(frozen().facts.distance)
+    near = distance == np.asarray(frozen().facts.human_distance)[:, None]
+    allowed = np.asarray(frozen().feasible) | near
+    for s in range(16):
+        best = max(np.flatnonzero(allowed[s]), key=lambda k, s=s: mean[s, k])
+        assert mean[s, made.chosen[s]] == pytest.approx(mean[s, best], abs=1e-4)
+        assert near[s, made.nearest[s]]
+        assert made.error[s] == distance[s, made.chosen[s]]
+        last = int(np.asarray(frozen().time_valid)[s].sum()) - 1
+        station = frozen().candidates[s, made.chosen[s], last, NAMES.index("station")]
+        assert made.station[s] == float(station)
+    assert (made.spread_of_posterior >= 0.0).all()
+
+
+def test_equal_runs_never_disagree():
+    (run, _) = trained(FREE)
+    assert not choices_of([run, run], frozen(), frozen()).spread_of_seeds.any()
+
+
+def test_more_data_leave_less_doubt():
+    """Every scene counted fifty times: the posterior must shrink."""
+    runs, made = trained(FREE), frozen()
+    many = jax.tree.map(lambda x: np.repeat(np.asarray(x), 50, axis=0), made)
+    once = choices_of(runs, made, made).spread_of_posterior
+    often = choices_of(runs, many, made).spread_of_posterior
+    assert often.mean() < 0.6 * once.mean()
+
+
+def test_supported_weights_name_the_presets_features():
+    (run, _) = trained(LINEAR)
+    report = weights_supported(run, frozen(), np.arange(16) // 2)
+    assert [row.name for row in report.features] == list(NAMES)
+    assert report.pairs == int(np.asarray(frozen().feasible).sum())
+    assert report.clusters == 8
+
+
+def test_rank_correlation_of_known_cases():
+    x, vehicle = np.arange(40.0), np.arange(40) // 2
+    rho, low, high = rank_correlation(x, np.exp(0.1 * x), vehicle)
+    assert (rho, low, high) == pytest.approx((1.0, 1.0, 1.0))
+    assert rank_correlation(x, -x, vehicle)[0] == pytest.approx(-1.0)
+    rng = np.random.default_rng(3)
+    rho, low, high = rank_correlation(x, rng.normal(size=40), vehicle)
+    assert low < 0.0 < high
+    assert low < rho < high
