@@ -12,9 +12,11 @@ from pathlib import Path
 from absl import flags
 
 from experiments.common import run
+from experiments.executor import executor
 from rcirl_jax.data.config import CollectConfig
-from rcirl_jax.data.importers import IMPORTERS, read_recordings
-from rcirl_jax.data.importing import ImportConfig, import_logs
+from rcirl_jax.data.cut import Part
+from rcirl_jax.data.importers import IMPORTERS, parts
+from rcirl_jax.data.importing import ImportConfig, import_parts
 from rcirl_jax.data.quality import format_quality
 from rcirl_jax.data.store import open_dataset
 from rcirl_jax.evaluation.evaluate import RankingSetup, oracle_floor
@@ -66,13 +68,17 @@ def main() -> None:
         test_fraction=_TEST_FRACTION.value,
         split_seed=_SPLIT_SEED.value,
     )
-    recordings = read_recordings(
+    found, spec = parts(
         _FORMAT.value,
         Path(_INPUT.value) if _INPUT.value else None,
         Path(_SOURCE.value) if _SOURCE.value else None,
     )
-    manifest = import_logs(
-        recordings, _OUTPUT.value, config, overwrite=_OVERWRITE.value
+    manifest = import_parts(
+        [Part(format=_FORMAT.value, input=path, spec=spec) for path in found],
+        _OUTPUT.value,
+        config,
+        executor=executor(),
+        overwrite=_OVERWRITE.value,
     )
     print(format_quality(manifest.quality))
     dataset = open_dataset(_OUTPUT.value)

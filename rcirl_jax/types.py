@@ -199,6 +199,13 @@ class Track:
     speed: np.ndarray  # [n] m/s, float64, as recorded
     # where the driver wants to end, if the log says so: (x, y) m
     destination: tuple[float, float] | None = None
+    # s, when the log first saw it, where that is before t[0] (a log read in pieces)
+    seen_since: float | None = None
+
+    @property
+    def first_seen_s(self) -> float:
+        """When the log first saw it."""
+        return float(self.t[0]) if self.seen_since is None else self.seen_since
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -261,3 +268,7 @@ class Recording:
     group: str | None = None
     default_speed_limit: float = 29.06  # m/s, where a lane has none (65 mph)
     notes: tuple[str, ...] = ()  # shown in the quality report
+    # a piece of a log too long for memory: the log's name, and the times [s] from
+    # the first to before the second at which scenes begin; tracks reach beyond
+    piece_of: str | None = None
+    scenes_within: tuple[float, float] | None = None

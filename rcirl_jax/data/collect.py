@@ -23,10 +23,11 @@ from rcirl_jax.data.motion import (
     human_motion,
 )
 from rcirl_jax.data.smoothing import SmoothTrack, smooth_track
-from rcirl_jax.types import Kind, Recording
+from rcirl_jax.types import Ghost, Kind, Recording
 from rcirl_jax.units import NUM_OBSTACLES, TIMES_S
 
 VIEW_BEHIND_M = 60.0  # m, obstacles farther behind are not collected
+MAX_GHOST_POINTS = 1000  # of the line that a missing road user is taken to drive
 VIEW_BESIDE_M = 12.0  # m, obstacles farther beside are not collected
 
 
@@ -45,12 +46,16 @@ class Collector:
         self.signals, self.signal_notes = trusted_signals(recording, self.graph)
         self.dropped: collections.Counter[str] = collections.Counter()
         self._views: dict[tuple[str, ...], FrameTracks] = {}
+        self._ghost_views: dict[tuple[str, ...], list[tuple[np.ndarray, ...]]] = {}
         counts = [track.num_frames for track in self.tracks]
         self._first = np.array([track.first_frame for track in self.tracks])
         self._last = self._first + np.array(counts) - 1
         self._ends = np.cumsum(counts)[:-1]
-        self._x = np.concatenate([t.x for t in self.tracks]) if counts else np.zeros(0)
-        self._y = np.concatenate([t.y for t in self.tracks]) if counts else np.zeros(0)
+        self._x = np.concatenate([t.x for t in self.tracks] or [[]])
+        self._y = np.concatenate([t.y for t in self.tracks] or [[]])
+        self._heading = np.concatenate([t.heading for t in self.tracks] or [[]])
+        self._offset = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(int)
+        self._size = np.array([(t.track.length, t.track.width) for t in self.tracks])
 
     def scenes(self) -> Iterator[dict]:
         """Rows of one scene each, as flat dicts of numpy arrays."""
@@ -62,9 +67,19 @@ class Collector:
         config, rate = self.config, self.rate
         first = int(np.ceil(config.min_history_s * rate))
         last = smooth.num_frames - 1 - int(np.ceil(config.min_future_s * rate))
-        starts = np.arange(first, last + 1, max(int(round(config.stride_s * rate)), 1))
+        stride = max(int(round(config.stride_s * rate)), 1)
+        # frames of the track before this piece of the log
+        before = smooth.first_frame - int(round(smooth.track.first_seen_s * rate))
+        starts = np.arange(first, last + 1 + before, stride) - before
+        starts = starts[starts >= first] if before else starts
         if starts.size == 0:
             self.dropped["future_too_short"] += 1
+            return
+        if self.recording.scenes_within is not None:
+            low, high = self.recording.scenes_within
+            times = (smooth.first_frame + starts) / rate
+            starts = starts[(times >= low - 1e-6) & (times < high - 1e-6)]
+        if starts.size == 0:
             return
         lane_ids = self.graph.match(smooth.x, smooth.y, smooth.heading)
         visited = list(dict.fromkeys(lane_ids[lane_ids != ""]))
@@ -83,12 +98,19 @@ class Collector:
         """All tracks in the chain's frame (cached per chain)."""
         if frame.chain not in self._views:
             s, l = project(frame, self._x, self._y)
-            heading = np.concatenate([t.heading for t in self.tracks])
-            tilt = heading - frame.on_grid("heading", s)
+            tilt = self._heading - frame.on_grid("heading", s)
+            split_s, rate = np.split(s, self._ends), self.rate
+            speeds = [
+                np.gradient(one) * rate if one.size > 1 else 0.0 * one
+                for one in split_s
+            ]
+            tilts = [np.unwrap(one) for one in np.split(tilt, self._ends)]
+            columns = (s, l, np.concatenate(tilts), np.concatenate(speeds))
             self._views[frame.chain] = FrameTracks(
-                s=np.split(s, self._ends),
+                s=split_s,
                 l=np.split(l, self._ends),
-                tilt=np.split(tilt, self._ends),
+                tilt=tilts,
+                table=np.stack(columns, axis=1),
             )
         return self._views[frame.chain]
 
@@ -158,11 +180,7 @@ class Collector:
             self._last >= clock[0] * self.rate
         )
         seen[number] = False
-        boxes = [
-            self._box(view, int(other), clock, motion) for other in np.flatnonzero(seen)
-        ]
-        found = [box for box in boxes if box is not None]
-        found.sort(key=lambda box: box["relevance"])
+        found = self._boxes(view, np.flatnonzero(seen), clock, motion)
         lines = line_obstacles(frame, smooth.track, self.signals, clock, motion)
         chosen = lines + found[: NUM_OBSTACLES - len(lines)]
         shape = (NUM_OBSTACLES, TIMES_S.size)
@@ -178,52 +196,65 @@ class Collector:
         row["obstacles.is_recorded"] = kind != Kind.NONE
         row["num_bodies"] = len(found)
 
-    def _box(
-        self, view: FrameTracks, other: int, clock: np.ndarray, motion: Motion
-    ) -> dict | None:
-        """One other road user at the T times in the scene's frame, or None."""
-        track = self.tracks[other]
-        frames = clock * self.rate - track.first_frame
-        valid = (frames >= -1e-6) & (frames <= track.num_frames - 1 + 1e-6)
-        if not valid.any():
-            return None
-        index = np.arange(track.num_frames)
-        at = np.clip(frames, 0, track.num_frames - 1)
-        s = np.interp(at, index, view.s[other]) - motion.s0
-        l = np.interp(at, index, view.l[other])
+    def _boxes(
+        self, view: FrameTracks, others: np.ndarray, clock: np.ndarray, motion: Motion
+    ) -> list[dict]:
+        """Other road users in view as boxes at the T times, the most relevant first."""
+        frames = clock * self.rate - self._first[others, None]  # [n, T]
+        last = (self._last - self._first)[others, None]
+        valid = (frames >= -1e-6) & (frames <= last + 1e-6)
+        at = np.clip(frames, 0.0, last)
+        low = np.minimum(at.astype(int), np.maximum(last - 1, 0))
+        share = np.where(last > 0, at - low, 0.0)
+        s, l, tilt, speed = view.at(self._offset[others, None] + low, share)
+        s = s - motion.s0
         seen = valid & (s > -VIEW_BEHIND_M) & (s < GRID_M[-1])
         seen &= np.abs(l - motion.l[0]) < VIEW_BESIDE_M
-        if not seen.any():
-            return None
-        tilt = np.interp(at, index, np.unwrap(view.tilt[other]))
         along, across = np.abs(np.cos(tilt)), np.abs(np.sin(tilt))
-        length, width = track.track.length, track.track.width
+        length, width = self._size[others].T[..., None]
         half_s = 0.5 * (length * along + width * across)
         half_l = 0.5 * (length * across + width * along)
-        speed = np.gradient(view.s[other]) * self.rate if index.size > 1 else [0.0]
-        coasting = motion.v0 * TIMES_S
-        apart = np.abs(s - coasting) + 4.0 * np.abs(l - motion.l[0])
-        return {
-            "s_lower": s - half_s,
-            "s_upper": s + half_s,
-            "l_lower": l - half_l,
-            "l_upper": l + half_l,
-            "speed": np.interp(at, index, speed),
-            "valid": seen,
-            "kind": int(track.track.kind),
-            "relevance": float(np.min(np.where(seen, apart, np.inf))),
-        }
+        apart = np.abs(s - motion.v0 * TIMES_S) + 4.0 * np.abs(l - motion.l[0])
+        relevance = np.min(np.where(seen, apart, np.inf), axis=1)
+        order = np.argsort(relevance, kind="stable")
+        return [
+            {
+                "s_lower": s[i] - half_s[i],
+                "s_upper": s[i] + half_s[i],
+                "l_lower": l[i] - half_l[i],
+                "l_upper": l[i] + half_l[i],
+                "speed": speed[i],
+                "valid": seen[i],
+                "kind": int(self.tracks[others[i]].track.kind),
+            }
+            for i in order
+            if np.isfinite(relevance[i])
+        ]
 
     def _ghosts(self, frame: LaneFrame, start: int, number: int) -> np.ndarray:
         """[g, T, 2] station and offset of road users missing from the file."""
         smooth = self.tracks[number]
         clock = (smooth.first_frame + start) / self.rate + TIMES_S
         s0 = self.view(frame).s[number][start]
-        rows = []
-        for ghost in self.recording.ghosts:
-            share = np.clip((clock - ghost.t0) / max(ghost.t1 - ghost.t0, 1e-6), 0, 1)
-            x = ghost.start[0] + share * (ghost.end[0] - ghost.start[0])
-            y = ghost.start[1] + share * (ghost.end[1] - ghost.start[1])
-            s, l = project(frame, x, y)
-            rows.append(np.stack([s - s0, l], axis=1))
-        return np.array(rows).reshape(-1, TIMES_S.size, 2)
+        found = np.empty((len(self.recording.ghosts), TIMES_S.size, 2))
+        for row, (times, s, l) in zip(found, self._ghost_view(frame), strict=True):
+            row[:, 0] = np.interp(clock, times, s) - s0
+            row[:, 1] = np.interp(clock, times, l)
+        return found
+
+    def _ghost_view(self, frame: LaneFrame) -> list[tuple[np.ndarray, ...]]:
+        """(times, s, l) of each missing road user in a chain's frame (cached)."""
+        if frame.chain not in self._ghost_views:
+            self._ghost_views[frame.chain] = [
+                self._ghost(frame, ghost) for ghost in self.recording.ghosts
+            ]
+        return self._ghost_views[frame.chain]
+
+    def _ghost(self, frame: LaneFrame, ghost: Ghost) -> tuple[np.ndarray, ...]:
+        count = int((ghost.t1 - ghost.t0) * self.rate) + 2
+        share = np.linspace(0.0, 1.0, min(count, MAX_GHOST_POINTS))
+        x, y = (
+            low + share * (high - low)
+            for low, high in zip(ghost.start, ghost.end, strict=True)
+        )
+        return ghost.t0 + share * (ghost.t1 - ghost.t0), *project(frame, x, y)

@@ -1,14 +1,17 @@
 """Import: log files -> a dataset on disk; resumable; all or nothing on bad input.
 
-The unit of work is a recording: parsed, cut into scenes, labelled. Consecutive
-recordings fill a shard. A shard's lineage holds what later recordings need to
-continue as if nothing had happened (names and quality sums), so an interrupted
-import resumes to the same bytes.
+Recordings are cut into scenes wherever the executor runs them, and arrive here in
+their order. Consecutive ones fill a shard. A shard's lineage holds what later
+recordings need to continue as if nothing had happened (names and quality sums),
+so an interrupted import resumes to the same bytes, and a parallel one writes the
+bytes of a local one.
 """
 
+import collections
 import dataclasses
-import hashlib
-from collections.abc import Iterable
+import functools
+import time
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +19,15 @@ import jax
 import numpy as np
 import tqdm
 
-from rcirl_jax.data.assemble import assemble
-from rcirl_jax.data.collect import Collector
 from rcirl_jax.data.config import CollectConfig
+from rcirl_jax.data.cut import Cut, Part, cut, cut_part
 from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.data.splits import assign_groups
 from rcirl_jax.data.store import DatasetWriter, Manifest
 from rcirl_jax.errors import InputError
+from rcirl_jax.executor import Executor, Here
 from rcirl_jax.types import Demonstration, Recording
 
-GROUP_BLOCK_S = 60.0  # s; vehicles first seen in one block share a group
 SHARD_SCENES = 4096  # scenes after which a shard is closed
 
 
@@ -53,25 +55,43 @@ class _Numbers:
         return list(self.table)
 
 
-def digest(recording: Recording) -> str:
-    """sha256 over what a recording holds; equal inputs give equal datasets."""
-    total = hashlib.sha256(f"{recording.name} {recording.rate_hz}".encode())
-    for track in recording.tracks:
-        total.update(f"{track.id} {track.kind} {track.length} {track.width}".encode())
-        for values in (track.t, track.x, track.y, track.heading, track.speed):
-            total.update(np.ascontiguousarray(values, np.float64).tobytes())
-    for lane in recording.lanes:
-        total.update(lane.id.encode())
-        total.update(np.ascontiguousarray(lane.centre, np.float64).tobytes())
-    return total.hexdigest()
+class Progress:
+    """A bar of the files read: scenes, scenes/s, drop reasons, time left."""
 
+    NUM_REASONS = 2  # drop reasons shown, the most frequent ones
 
-def group_name(recording: Recording, first_seen_s: float) -> str:
-    """Vehicle-disjoint group: the recording's own, or a block of a minute."""
-    if recording.group is not None:
-        return recording.group
-    block = int(first_seen_s // GROUP_BLOCK_S)
-    return f"{recording.name}/minute-{block:04d}"
+    def __init__(self, total: int | None) -> None:
+        self._bar = tqdm.tqdm(
+            total=total, desc="import", unit=" files", mininterval=0.5
+        )
+        self._start, self._part = time.monotonic(), None
+        self._known = 0  # scenes taken over from an interrupted import
+
+    def __enter__(self) -> "Progress":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._part is not None:
+            self._bar.update()
+        self._bar.close()
+
+    def show(self, made: Cut, quality: QualityReport) -> None:
+        """After a recording: its part and all scenes so far."""
+        part = made.part or made.name
+        if self._part is not None and part != self._part:
+            self._bar.update()
+        self._part = part
+        if made.known:
+            self._known = quality.scenes
+        seconds = max(time.monotonic() - self._start, 1e-9)
+        rate = (quality.scenes - self._known) / seconds
+        reasons = quality.dropped.most_common(self.NUM_REASONS)
+        dropped = " ".join(f"{name} {count:,}" for name, count in reasons)
+        self._bar.set_postfix_str(
+            f"{quality.scenes:,} scenes, {rate:.0f}/s"
+            + (f", dropped: {dropped}" if dropped else ""),
+            refresh=False,
+        )
 
 
 class _Import:
@@ -86,77 +106,68 @@ class _Import:
         self.pending: list[Demonstration] = []
         self.lineage: list[dict] = []
         self.sources: dict[str, str] = {}
-        self.rates: list[float] = []
+        self.rates: set[float] = set()
         self.next_shard = 0
         self.done: list[dict] = []
         for info in writer.committed():
             self.done += info.lineage
             self.next_shard += 1
 
-    def add(self, recording: Recording) -> int:
-        """Process one recording; returns the number of scenes kept."""
-        if recording.name in self.recordings.table:
-            raise InputError(f"{recording.name}: name: met twice: expected once")
-        self.sources[recording.source] = recording.licence
-        self.rates.append(recording.rate_hz)
-        number = self.recordings.of(recording.name)
+    @property
+    def known(self) -> dict[str, str]:
+        """sha256 by name of the recordings that committed shards hold."""
+        return {entry["name"]: entry["sha256"] for entry in self.done}
+
+    def add(self, made: Cut) -> None:
+        """Take over one recording's scenes."""
+        if made.name in self.recordings.table:
+            raise InputError(f"{made.name}: name: met twice: expected once")
+        self.sources[made.source] = made.licence
+        self.rates.add(made.rate_hz)
+        number = self.recordings.of(made.name)
         if self.done:
-            return self._replay(self.done.pop(0), recording)
-        collector = Collector(recording, self.config.collect)
-        rows = list(collector.scenes())
-        report = QualityReport()
-        report.add_recording(collector)
-        entry: dict[str, Any] = {
-            "name": recording.name,
-            "sha256": self._digest(recording),
+            self._replay(self.done.pop(0), made)
+            return
+        entry = {
+            "name": made.name,
+            "sha256": made.sha256,
+            "vehicles": list(dict.fromkeys(made.vehicles)),
+            "groups": dict(collections.Counter(made.groups)),
+            "quality": made.quality,
         }
-        entry["vehicles"], entry["groups"] = self._names(recording, rows)
-        if rows:
-            block = assemble(
-                rows,
-                vehicles=[self.vehicles.of(name) for name in entry["vehicles"]],
-                groups=[self.groups.of(name) for name in entry["groups"]],
-                recording=number,
+        if made.scenes is not None:
+            self.pending.append(
+                made.scenes.replace(
+                    vehicle=self._numbers(self.vehicles, made.vehicles),
+                    group=self._numbers(self.groups, made.groups),
+                    recording=np.full_like(made.scenes.recording, number),
+                )
             )
-            report.add_scenes(block)
-            self.pending.append(block)
-        entry["quality"] = report.state()
         self._count(entry)
         self.lineage.append(entry)
         if sum(block.vehicle.shape[0] for block in self.pending) >= SHARD_SCENES:
             self._close_shard()
-        return len(rows)
 
-    def _digest(self, recording: Recording) -> str:
-        """Of the recording and of how it is cut, so that no import mixes both."""
-        return hashlib.sha256(
-            (digest(recording) + repr(self.config.collect)).encode()
-        ).hexdigest()
-
-    def _names(self, recording: Recording, rows: list[dict]) -> tuple[list, list]:
-        tracks = [recording.tracks[row["track"]] for row in rows]
-        vehicles = [f"{group_name(recording, t.t[0])}:{t.id}" for t in tracks]
-        groups = [group_name(recording, t.t[0]) for t in tracks]
-        return vehicles, groups
+    def _numbers(self, numbers: _Numbers, names: list[str]) -> Any:  # noqa: ANN401
+        return np.array([numbers.of(name) for name in names], np.int32)
 
     def _count(self, entry: dict) -> None:
         self.quality.merge(entry["quality"])
-        for name in entry["groups"]:
-            self.sizes[name] = self.sizes.get(name, 0) + 1
+        for name, scenes in entry["groups"].items():
+            self.sizes[name] = self.sizes.get(name, 0) + scenes
 
-    def _replay(self, entry: dict, recording: Recording) -> int:
+    def _replay(self, entry: dict, made: Cut) -> None:
         """Take over what a committed shard already holds of this recording."""
-        expected = (recording.name, self._digest(recording))
-        if (entry["name"], entry["sha256"]) != expected:
+        if entry["name"] != made.name:
             raise InputError(
-                f"{recording.name}: input or settings changed since the interrupted "
+                f"{made.name}: input or settings changed since the interrupted "
                 "import: expected the same; use another --output"
             )
-        for vehicle, group in zip(entry["vehicles"], entry["groups"], strict=True):
+        for vehicle in entry["vehicles"]:
             self.vehicles.of(vehicle)
+        for group in entry["groups"]:
             self.groups.of(group)
         self._count(entry)
-        return len(entry["vehicles"])
 
     def _close_shard(self) -> None:
         if not self.pending:
@@ -181,7 +192,7 @@ class _Import:
         )
         return self.writer.finish(
             {
-                "rate_hz": sorted(set(self.rates)),
+                "rate_hz": sorted(self.rates),
                 "sources": [
                     {"source": source, "licence": licence}
                     for source, licence in sorted(self.sources.items())
@@ -203,7 +214,7 @@ def import_logs(
     *,
     overwrite: bool = False,
 ) -> Manifest:
-    """Import recordings into a dataset; shows scenes/s.
+    """Import recordings into a dataset, one after the other; shows scenes/s.
 
     Args:
       recordings: from `importers.read_recordings`.
@@ -218,16 +229,60 @@ def import_logs(
       InputError: bad input. Nothing of this import stays on disk then; an
         interrupt keeps finished shards, and the next run resumes from them.
     """
+
+    def cuts(known: dict[str, str]) -> Iterable[Cut]:
+        return (cut(recording, config.collect, known) for recording in recordings)
+
+    return _import(cuts, None, output, config, overwrite)
+
+
+def import_parts(
+    parts: Sequence[Part],
+    output: str | Path,
+    config: ImportConfig,
+    *,
+    executor: Executor | None = None,
+    overwrite: bool = False,
+) -> Manifest:
+    """Import parts wherever the executor runs them; bytes do not depend on it.
+
+    Args:
+      parts: of `importers.parts`, in order.
+      output: dataset folder or tensorstore URL.
+      config: collection and split settings.
+      executor: default: this process.
+      overwrite: replace a finished dataset.
+
+    Returns:
+      The manifest of the finished dataset.
+
+    Raises:
+      InputError: as `import_logs`.
+    """
+    places = executor or Here()
+
+    def cuts(known: dict[str, str]) -> Iterable[Cut]:
+        piece = functools.partial(cut_part, config=config.collect, done=known)
+        return places.stream(piece, parts)
+
+    return _import(cuts, len(parts), output, config, overwrite)
+
+
+def _import(
+    cuts: Callable[[dict[str, str]], Iterable[Cut]],
+    total: int | None,
+    output: str | Path,
+    config: ImportConfig,
+    overwrite: bool,
+) -> Manifest:
+    """Write the cuts in their order; `total` recordings or parts are expected."""
     writer = DatasetWriter(str(output), overwrite=overwrite)
     try:
         work = _Import(writer, config)
-        with tqdm.tqdm(desc="import", unit="scene", mininterval=0.5) as bar:
-            for recording in recordings:
-                bar.update(work.add(recording))
-                dropped = sum(work.quality.dropped.values())
-                bar.set_postfix(
-                    recording=recording.name, dropped=dropped, refresh=False
-                )
+        with Progress(total) as progress:
+            for made in cuts(work.known):
+                work.add(made)
+                progress.show(made, work.quality)
         return work.finish()
     except InputError:
         writer.abort()

@@ -4,6 +4,12 @@ The decision is read from the station-time graph with the human's own s(t) as
 the profile (Apollo's SpeedDecider rules, with the recorded drive in place of a
 planned one): an obstacle that blocks the driver's path is above or below the
 profile when it first blocks it.
+
+A recorded drive shows what a plan does not. Recorded positions jitter, so a
+standing car is "not moving towards the ego" within a tolerance. And the path is
+the driver's own: a lead that is overtaken by a lane change blocks it at first,
+below the profile, and yet ends up above it.
+`evaluation.label_truth` measures these rules on drives of known decisions.
 """
 
 import numpy as np
@@ -24,11 +30,20 @@ TURN_RAD = np.deg2rad(30.0)  # rad of heading change along the path
 STOP_REACH_M = 12.0  # m from the line within which standing is a stop at it
 
 
+def _middle(row: dict, axis: str) -> np.ndarray:
+    """[N, T] m, centres of the boxes along `axis`, "s" or "l"."""
+    return 0.5 * (row[f"obstacles.{axis}_lower"] + row[f"obstacles.{axis}_upper"])
+
+
+def _path_at(row: dict, s: np.ndarray) -> np.ndarray:
+    """[N, T] m, lateral offset of the driver's own path at stations s."""
+    grid = np.arange(row["path.l"].size) * STATION_STEP_M
+    return np.interp(s, grid, row["path.l"])
+
+
 def blocking(row: dict) -> np.ndarray:
     """[N, T] bool: the obstacle's box overlaps the driver's own path laterally."""
-    grid = np.arange(row["path.l"].size) * STATION_STEP_M
-    middle = 0.5 * (row["obstacles.s_lower"] + row["obstacles.s_upper"])
-    path_l = np.interp(middle, grid, row["path.l"])
+    path_l = _path_at(row, _middle(row, "s"))
     reach = 0.5 * row["ego.width"] + LATERAL_BUFFER_M
     beside = np.maximum(
         row["obstacles.l_lower"] - path_l, path_l - row["obstacles.l_upper"]
@@ -55,26 +70,71 @@ def _decide(row: dict, slot: int, blocks: np.ndarray) -> Decision:
     kind = row["obstacles.kind"][slot]
     if kind in (Kind.STOP, Kind.VIRTUAL):
         return _decide_line(row, slot)
-    if not blocks.any():
-        return _decide_beside(row, slot)
+    swerve = _swerve_past(row, slot)
+    if swerve > 0.0:
+        lane = row["path.lane_left"][0] - row["path.lane_right"][0]
+        beside = _decide_beside(row, slot)
+        if swerve > 0.5 * lane and row["obstacles.speed"][slot, 0] > STANDING_MPS:
+            return Decision.OVERTAKE
+        if beside != Decision.IGNORE:
+            return beside
+    # who is abreast of the driver and yet not hit is beside, whatever the buffer
+    if not blocks.any() or (blocks & _abreast(row, slot)).any():
+        beside = _decide_beside(row, slot)
+        if beside != Decision.IGNORE or not blocks.any():
+            return beside
+    return _decide_ahead(row, slot, blocks)
+
+
+def _decide_ahead(row: dict, slot: int, blocks: np.ndarray) -> Decision:
+    """Apollo's rules for what blocks the path: which side of the profile."""
     human, half = row["human.s"], 0.5 * row["ego.length"]
+    lower, upper = row["obstacles.s_lower"][slot], row["obstacles.s_upper"][slot]
     first = int(np.argmax(blocks))
-    if row["obstacles.s_lower"][slot, first] < human[first]:
-        came_from_ahead = row["obstacles.s_lower"][slot, 0] > human[0] + half
+    if lower[first] < human[first]:
+        came_from_ahead = lower[0] > human[0] + half
         enters_later = first > 0 and row["obstacles.valid"][slot, 0]
         passed = came_from_ahead or enters_later
         return Decision.OVERTAKE if passed else Decision.IGNORE
-    lasts = np.count_nonzero(blocks) * (TIMES_S[1] - TIMES_S[0])
-    onset = TIMES_S[first]
     last = len(blocks) - 1 - int(np.argmax(blocks[::-1]))
-    same_way = (
-        row["obstacles.s_lower"][slot, last] >= row["obstacles.s_lower"][slot, first]
-    )
-    if human[last] > row["obstacles.s_upper"][slot, last]:
+    if human[last] > upper[last]:
         return Decision.OVERTAKE
-    if onset <= FOLLOW_ONSET_S and lasts >= FOLLOW_DURATION_S and same_way:
+    lasts = np.count_nonzero(blocks) * (TIMES_S[1] - TIMES_S[0])
+    back = STANDING_MPS * (TIMES_S[last] - TIMES_S[first])  # m, as of standing
+    same_way = lower[last] >= lower[first] - back
+    if TIMES_S[first] <= FOLLOW_ONSET_S and lasts >= FOLLOW_DURATION_S and same_way:
         return Decision.FOLLOW
     return Decision.YIELD
+
+
+def _swerve_past(row: dict, slot: int) -> float:
+    """Lateral move [m] by which the driver got past who was in the way; else 0.
+
+    In the way: ahead at the frame, with boxes that overlap laterally. A lead
+    that turns off is passed too, but then it moved aside, not the driver.
+    """
+    human, half = row["human.s"], 0.5 * row["ego.length"]
+    l = _middle(row, "l")[slot]
+    aside = np.maximum(
+        row["obstacles.l_lower"][slot, 0] - row["human.l"][0],
+        row["human.l"][0] - row["obstacles.l_upper"][slot, 0],
+    )
+    valid = row["obstacles.valid"][slot] & row["time_valid"]
+    ahead = row["obstacles.s_lower"][slot, 0] > human[0] + half
+    if not (valid[0] and ahead and aside < 0.5 * row["ego.width"]):
+        return 0.0
+    driver = np.abs(row["human.l"] - row["human.l"][0])
+    passed = valid & (human - half > row["obstacles.s_upper"][slot])
+    passed &= driver > np.abs(l - l[0])
+    return float(driver[int(np.argmax(passed))]) if passed.any() else 0.0
+
+
+def _abreast(row: dict, slot: int) -> np.ndarray:
+    """[T] bool: beside each other, bumper to bumper."""
+    human, half = row["human.s"], 0.5 * row["ego.length"]
+    before = row["obstacles.s_lower"][slot] < human + half
+    abreast = before & (row["obstacles.s_upper"][slot] > human - half)
+    return abreast & row["obstacles.valid"][slot] & row["time_valid"]
 
 
 def _decide_line(row: dict, slot: int) -> Decision:
@@ -89,12 +149,11 @@ def _decide_line(row: dict, slot: int) -> Decision:
 
 
 def _decide_beside(row: dict, slot: int) -> Decision:
-    """NUDGE if the human drives past a slower one within the nudge range."""
-    human, half = row["human.s"], 0.5 * row["ego.length"]
-    abreast = (row["obstacles.s_lower"][slot] < human + half) & (
-        row["obstacles.s_upper"][slot] > human - half
-    )
-    centre = 0.5 * (row["obstacles.l_lower"][slot] + row["obstacles.l_upper"][slot])
+    """NUDGE if the human drives past a slower one within the nudge range.
+
+    Oncoming traffic is slower as well; it is met, not nudged.
+    """
+    speed = row["obstacles.speed"][slot]
     gap = (
         np.maximum(
             row["obstacles.l_lower"][slot] - row["human.l"],
@@ -102,14 +161,33 @@ def _decide_beside(row: dict, slot: int) -> Decision:
         )
         - 0.5 * row["ego.width"]
     )
-    slower = _speed(row) - row["obstacles.speed"][slot] > NUDGE_SPEED_MPS
-    passes = abreast & (gap < NUDGE_RANGE_M) & slower
-    passes &= row["obstacles.valid"][slot] & row["time_valid"]
+    slower = (_speed(row) - speed > NUDGE_SPEED_MPS) & (speed > -MOVING_MPS)
+    passes = _abreast(row, slot) & (gap < NUDGE_RANGE_M) & slower
     if not passes.any():
         return Decision.IGNORE
     at = int(np.argmax(passes))
-    to_left = row["human.l"][at] > centre[at]
+    to_left = row["human.l"][at] > _middle(row, "l")[slot, at]
     return Decision.NUDGE_LEFT if to_left else Decision.NUDGE_RIGHT
+
+
+def _cuts_in(row: dict, blocks: np.ndarray) -> bool:
+    """Somebody enters the path ahead, along the road, by moving sideways.
+
+    A crossing road user moves across more than along; a car that comes to block
+    because the driver changes lane does not move sideways itself.
+    """
+    s, l = _middle(row, "s"), _middle(row, "l")
+    kind, valid = row["obstacles.kind"][:, None], row["obstacles.valid"]
+    body = (kind >= Kind.VEHICLE) & (kind <= Kind.STATIC)
+    ahead = row["obstacles.s_lower"] > row["human.s"]
+    later = blocks & ahead & body & (TIMES_S > FOLLOW_ONSET_S)
+    enters = later[:, 1:] & ~blocks[:, :-1] & valid[:, :-1]
+    along = np.diff(s, axis=1) > np.abs(np.diff(l, axis=1))
+    rows, first = np.arange(len(s)), np.argmax(valid, axis=1)
+    path_l = _path_at(row, s)
+    own = np.abs(l - l[rows, first][:, None])
+    drivers = np.abs(path_l - path_l[rows, first][:, None])
+    return bool(np.any(enters & along & (own > drivers)[:, 1:]))
 
 
 def _tags(row: dict, decisions: np.ndarray, blocks: np.ndarray) -> np.ndarray:
@@ -121,22 +199,20 @@ def _tags(row: dict, decisions: np.ndarray, blocks: np.ndarray) -> np.ndarray:
     bend = np.abs(np.sum(row["path.kappa"][driven]) * STATION_STEP_M)
     lane = row["path.lane_left"][0] - row["path.lane_right"][0]
     kind = row["obstacles.kind"]
-    ahead = row["obstacles.s_lower"] > row["human.s"]
-    body = (kind >= Kind.VEHICLE) & (kind <= Kind.STATIC)
-    later = blocks & ahead & body[:, None] & (TIMES_S > FOLLOW_ONSET_S)
-    enters = later[:, 1:] & ~blocks[:, :-1] & row["obstacles.valid"][:, :-1]
     tags = np.zeros(NUM_TAGS, bool)
     tags[Tag.STOPPING] = speed[0] > MOVING_MPS and speed[-1] < STANDING_MPS
     tags[Tag.STARTING] = speed[0] < STANDING_MPS and speed[-1] > MOVING_MPS
     tags[Tag.CRUISING] = np.ptp(speed) < CRUISE_RANGE_MPS and speed.min() > CRUISE_MPS
     tags[Tag.FOLLOWING] = np.any(decisions == Decision.FOLLOW)
     tags[Tag.TURNING] = bend > TURN_RAD
-    tags[Tag.LANE_CHANGE] = np.abs(l[-1] - l[0]) > 0.5 * lane
+    tags[Tag.LANE_CHANGE] = np.max(np.abs(l - l[0])) > 0.5 * lane
     tags[Tag.YIELDING] = np.any(decisions == Decision.YIELD)
     tags[Tag.OVERTAKING] = np.any(decisions == Decision.OVERTAKE)
     tags[Tag.NUDGING] = np.any(decisions >= Decision.NUDGE_LEFT)
-    tags[Tag.CUT_IN] = enters.any()
-    stop = (kind == Kind.STOP)[:, None] & row["obstacles.valid"]
+    tags[Tag.CUT_IN] = _cuts_in(row, blocks)
+    # without `is_light` a stop sign cannot be told from a red light
+    light = row.get("obstacles.is_light", kind == Kind.STOP) & (kind == Kind.STOP)
+    stop = light[:, None] & row["obstacles.valid"]
     tags[Tag.RED_LIGHT] = stop[:, 0].any()
     tags[Tag.STANDING] = speed.max() < STANDING_MPS
     return tags

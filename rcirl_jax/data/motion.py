@@ -18,7 +18,22 @@ class FrameTracks:
 
     s: list[np.ndarray]  # per track [n] m
     l: list[np.ndarray]  # per track [n] m
-    tilt: list[np.ndarray]  # per track [n] rad, heading minus the line's
+    tilt: list[np.ndarray]  # per track [n] rad, heading minus the line's, unwrapped
+    # all samples, track after track, for reading many tracks at once: station m,
+    # offset m, tilt rad, speed along the line m/s
+    table: np.ndarray  # [samples, 4]
+
+    def at(self, row: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, ...]:
+        """(s, l, tilt, speed), each [...], between sample `row` and the next.
+
+        Args:
+          row: [...] int, index into `table`.
+          share: [...] in [0, 1] of the way to the next sample; 0 at a track's last.
+        """
+        after = np.minimum(row + 1, len(self.table) - 1)
+        mixed = self.table[row] * (1.0 - share[..., None])
+        mixed += self.table[after] * share[..., None]
+        return tuple(np.moveaxis(mixed, -1, 0))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

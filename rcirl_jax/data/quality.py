@@ -10,6 +10,9 @@ from rcirl_jax.data.filters import REASONS
 from rcirl_jax.data.smoothing import HARSH_MPS2, harsh_share
 from rcirl_jax.types import Decision, Demonstration, Kind, Tag
 
+HEADWAY_STEP_S = 0.01  # s, to which headways are counted
+SPEED_STEP_MPS = 0.05  # m/s, likewise
+FUTURE_STEP_S = 0.05  # s, likewise
 HEADWAY_EDGES_S = (0.5, 1.0, 1.5, 2.0, 3.0)  # s, bins of the headway histogram
 
 
@@ -31,9 +34,14 @@ class QualityReport:
     decisions: collections.Counter = dataclasses.field(
         default_factory=collections.Counter
     )
-    headways: list[float] = dataclasses.field(default_factory=list)
-    speeds: list[float] = dataclasses.field(default_factory=list)
-    futures: list[float] = dataclasses.field(default_factory=list)
+    # how often each multiple of a step was met; the key is the multiple as text
+    headways: collections.Counter = dataclasses.field(
+        default_factory=collections.Counter
+    )
+    speeds: collections.Counter = dataclasses.field(default_factory=collections.Counter)
+    futures: collections.Counter = dataclasses.field(
+        default_factory=collections.Counter
+    )
     notes: list[str] = dataclasses.field(default_factory=list)
 
     def add_recording(self, collector: Collector) -> None:
@@ -62,9 +70,12 @@ class QualityReport:
         for decision in Decision:
             chosen = (np.asarray(demonstrations.decisions) == decision) & known
             self.decisions[decision.name.lower()] += int(np.sum(chosen))
-        self.headways += _headways(demonstrations).tolist()
-        self.speeds += np.asarray(scene.ego.v).tolist()
-        self.futures += np.asarray(demonstrations.future_s).tolist()
+        for counts, values, step in (
+            (self.headways, _headways(demonstrations), HEADWAY_STEP_S),
+            (self.speeds, np.asarray(scene.ego.v), SPEED_STEP_MPS),
+            (self.futures, np.asarray(demonstrations.future_s), FUTURE_STEP_S),
+        ):
+            counts.update(map(str, np.round(values / step).astype(int).tolist()))
 
     def state(self) -> dict:
         """All sums and lists, JSON-ready; `merge` takes it back."""
@@ -95,10 +106,10 @@ class QualityReport:
             "harsh_threshold_mps2": HARSH_MPS2,
             "harsh_share_raw": self.harsh_raw / total,
             "harsh_share_smoothed": self.harsh_smooth / total,
-            "headway_s": _quantiles(self.headways),
-            "headway_histogram": _histogram(self.headways),
-            "speed_mps": _quantiles(self.speeds),
-            "future_s": _quantiles(self.futures),
+            "headway_s": _quantiles(self.headways, HEADWAY_STEP_S),
+            "headway_histogram": _histogram(self.headways, HEADWAY_STEP_S),
+            "speed_mps": _quantiles(self.speeds, SPEED_STEP_MPS),
+            "future_s": _quantiles(self.futures, FUTURE_STEP_S),
             "tags": dict(self.tags),
             "decisions": dict(self.decisions),
             "dropped": {name: self.dropped.get(name, 0) for name in REASONS},
@@ -119,19 +130,30 @@ def _headways(demonstrations: Demonstration) -> np.ndarray:
     return headway[np.isfinite(headway)]
 
 
-def _quantiles(values: list[float]) -> dict | None:
-    if not values:
+def _sorted(counts: collections.Counter, step: float) -> tuple[np.ndarray, np.ndarray]:
+    """Values in ascending order, and how often each was met."""
+    pairs = sorted((int(key), count) for key, count in counts.items())
+    keys, times = np.array(pairs, float).reshape(-1, 2).T
+    return keys * step, times
+
+
+def _quantiles(counts: collections.Counter, step: float) -> dict | None:
+    """5, 50 and 95 % points, to half a step; None of nothing."""
+    if not counts:
         return None
-    names = ("p05", "p50", "p95")
-    return dict(zip(names, np.percentile(values, [5, 50, 95]).tolist(), strict=True))
+    values, times = _sorted(counts, step)
+    share = (np.cumsum(times) - 0.5 * times) / times.sum()
+    found = np.interp([0.05, 0.5, 0.95], share, values)
+    return dict(zip(("p05", "p50", "p95"), found.tolist(), strict=True))
 
 
-def _histogram(values: list[float]) -> dict[str, int]:
+def _histogram(counts: collections.Counter, step: float) -> dict[str, int]:
     edges = (0.0, *HEADWAY_EDGES_S, np.inf)
-    counts = np.histogram(values, edges)[0]
+    values, times = _sorted(counts, step)
+    found = np.histogram(values, edges, weights=times)[0]
     return {
         f"{low:g}-{high:g} s": int(n)
-        for low, high, n in zip(edges[:-1], edges[1:], counts, strict=True)
+        for low, high, n in zip(edges[:-1], edges[1:], found, strict=True)
     }
 
 

@@ -6,9 +6,9 @@ raw positions of camera data gives noise: in NGSIM 8 % of the raw |a| exceed
 """
 
 import dataclasses
+import functools
 
 import numpy as np
-from scipy.signal import savgol_filter
 
 from rcirl_jax.types import Track
 
@@ -69,8 +69,25 @@ def savgol(values: np.ndarray, rate_hz: float, window_s: float) -> np.ndarray:
     window = min(window, values.size - 1 + values.size % 2)
     if window <= POLYNOMIAL_ORDER + 1:
         return values.copy()
-    smooth = savgol_filter(values, window, POLYNOMIAL_ORDER, mode="interp")
-    return np.asarray(smooth, np.float64)
+    half, (inner, first, last) = window // 2, _filters(window)
+    smooth = np.empty(values.size)
+    smooth[half : values.size - half] = np.convolve(values, inner, mode="valid")
+    smooth[:half] = first @ values[:window]
+    smooth[values.size - half :] = last @ values[-window:]
+    return smooth
+
+
+@functools.cache
+def _filters(window: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Weights of the middle [w], and of the first and last w // 2 samples [w//2, w].
+
+    All are rows of the matrix that fits a polynomial to a window and evaluates it.
+    """
+    half = window // 2
+    at = np.arange(-half, half + 1) / half
+    powers = np.vander(at, POLYNOMIAL_ORDER + 1)
+    smoother = powers @ np.linalg.pinv(powers)  # [w, w], symmetric
+    return smoother[half][::-1].copy(), smoother[:half], smoother[half + 1 :]
 
 
 def harsh_share(x: np.ndarray, y: np.ndarray, rate_hz: float) -> tuple[int, int]:

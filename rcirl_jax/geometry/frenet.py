@@ -14,6 +14,7 @@ from scipy.interpolate import make_smoothing_spline
 
 NEWTON_STEPS = 6  # iterations of to_frenet after the nearest grid point
 CHUNK = 1024  # points per device call of project_points
+SMALL_CHUNK = 128  # likewise, where there are no more
 SMOOTHING = 30.0  # penalty of the smoothing spline on second derivatives
 
 
@@ -135,8 +136,9 @@ def project_points(
     """(s, l) of points [q, 2], numpy; padded so that few sizes compile."""
     parts = []
     for start in range(0, len(points), CHUNK):
-        block = np.zeros((CHUNK, 2), np.float32)
         taken = points[start : start + CHUNK]
+        size = SMALL_CHUNK if len(taken) <= SMALL_CHUNK else CHUNK
+        block = np.zeros((size, 2), np.float32)
         block[: len(taken)] = taken
         s, l = _project(line, block[:, 0], block[:, 1])
         parts.append(np.stack([s, l])[:, : len(taken)])

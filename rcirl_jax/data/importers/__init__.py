@@ -6,6 +6,7 @@ recordings through `validate_recording` with the file's name.
 """
 
 import importlib
+import itertools
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -17,17 +18,36 @@ Importer = Callable[[Path, dict], Iterator[Recording]]
 
 # format -> module; loaded only when the format is asked for
 IMPORTERS: dict[str, str] = {
+    "apollo": "apollo",
+    "argoverse2": "argoverse2",
     "commonroad": "commonroad",
     "csv": "csv_table",
+    "interaction": "interaction",
+    "l5": "l5",
+    "levelx": "levelx",
     "ngsim": "ngsim",
+    "ngsim_pairs": "ngsim_pairs",
+    "nuplan": "nuplan",
+    "openacc": "openacc",
     "synthetic": "synthetic",
+    "waymo": "waymo",
 }
 
 
-def read_recordings(
+def read_part(name: str, path: Path, spec: dict) -> Iterator[Recording]:
+    """All recordings of one part, each validated; arguments as of `parts`."""
+    module = importlib.import_module(f"{__name__}.{IMPORTERS[name]}")
+    importer: Importer = module.recordings
+    return importer(path, spec)
+
+
+def parts(
     name: str, input_path: Path | None, source: Path | None = None
-) -> Iterator[Recording]:
-    """All recordings of an input, each validated.
+) -> tuple[list[Path], dict]:
+    """Inputs that can be read apart from each other, in order, and the spec.
+
+    The recordings of all parts, one part after the other, are those of the whole
+    input. A format whose module has no `parts(path, spec)` is one part.
 
     Args:
       name: key of `IMPORTERS`.
@@ -35,7 +55,7 @@ def read_recordings(
       source: TOML of columns, units and licence; default: the packaged one.
 
     Raises:
-      InputError: unknown format, missing path, nothing to read, or bad data.
+      InputError: unknown format, missing path, or nothing to read.
     """
     if name not in IMPORTERS:
         raise InputError(f"--format: {name}: expected one of {sorted(IMPORTERS)}")
@@ -48,5 +68,13 @@ def read_recordings(
     if not input_path.exists():
         raise InputError(f"{input_path}: input: missing: expected a file or folder")
     module = importlib.import_module(f"{__name__}.{IMPORTERS[name]}")
-    importer: Importer = module.recordings
-    return importer(input_path, spec)
+    split = getattr(module, "parts", None)
+    return ([input_path] if split is None else split(input_path, spec)), spec
+
+
+def read_recordings(
+    name: str, input_path: Path | None, source: Path | None = None
+) -> Iterator[Recording]:
+    """All recordings of an input, each validated; arguments and errors as `parts`."""
+    found, spec = parts(name, input_path, source)
+    return itertools.chain.from_iterable(read_part(name, path, spec) for path in found)

@@ -56,9 +56,14 @@ class _Box:
     turn: float = 0.0  # rad, of the box against the obstacle's heading
 
 
+def parts(path: Path, spec: dict) -> list[Path]:
+    """The XML files; each can be read alone."""
+    return input_files(path, spec.get("pattern", "*.xml"))
+
+
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """One Recording per XML file."""
-    files = input_files(path, spec.get("pattern", "*.xml"))
+    files = parts(path, spec)
     groups = _read_groups(path, spec.get("groups", ""))
     for file in files:
         yield validate_recording(_read_file(file, spec, groups), file)

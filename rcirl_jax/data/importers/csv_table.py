@@ -66,14 +66,19 @@ class _Table:
     notes: tuple[str, ...]
 
 
-def recordings(path: Path, spec: dict) -> Iterator[Recording]:
-    """One Recording per file, or per value of the `recording` column."""
+def parts(path: Path, spec: dict) -> list[Path]:
+    """The CSV files; each can be read alone."""
     lane_file = _lane_file(spec)
     pattern = spec.get("pattern", "*.csv")
     files = [f for f in input_files(path, pattern) if f.name != lane_file]
     if not files:
         raise InputError(f"{path}: files: only {lane_file}: expected logs beside it")
-    for file in files:
+    return files
+
+
+def recordings(path: Path, spec: dict) -> Iterator[Recording]:
+    """One Recording per file, or per value of the `recording` column."""
+    for file in parts(path, spec):
         for name, table in _read_tables(file, spec):
             yield validate_recording(_recording(name, table, spec), file)
 

@@ -46,15 +46,20 @@ LIMIT_MPS = 29.06  # m/s, 65 mph
 SIZE_M = (4.5, 1.8)  # m, a car
 
 
-def recordings(path: Path, spec: dict) -> Iterator[Recording]:
-    """One Recording per file and site."""
+def parts(path: Path, spec: dict) -> list[Path]:
+    """The text and CSV files; each can be read alone."""
     patterns = spec.get("pattern", ["*.txt", "*.csv"])
     files = [path] if path.is_file() else []
     for pattern in [] if files else patterns:
         files += [f for f in path.glob(pattern) if "notice" not in f.name.lower()]
     if not files:
         files = input_files(path, " or ".join(patterns))
-    for file in sorted(files):
+    return sorted(files)
+
+
+def recordings(path: Path, spec: dict) -> Iterator[Recording]:
+    """One Recording per file and site."""
+    for file in parts(path, spec):
         for recording in _read_file(file, spec):
             yield validate_recording(recording, file)
 

@@ -1,0 +1,131 @@
+"""One recording cut into scenes: the piece of work of an import.
+
+`cut` is a pure function of the recording and the settings; where it runs does not
+matter. Numbers inside the dataset (of vehicles, groups, recordings) are given
+later, by the one process that sees all cuts in order.
+"""
+
+import dataclasses
+import hashlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from rcirl_jax.data.assemble import assemble
+from rcirl_jax.data.collect import Collector
+from rcirl_jax.data.config import CollectConfig
+from rcirl_jax.data.importers import read_part
+from rcirl_jax.data.quality import QualityReport
+from rcirl_jax.errors import InputError
+from rcirl_jax.types import Demonstration, Recording
+
+GROUP_BLOCK_S = 60.0  # s; vehicles first seen in one block share a group
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Part:
+    """One input that can be read without the others."""
+
+    format: str
+    input: Path
+    spec: dict
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Cut:
+    """The scenes of one recording."""
+
+    name: str
+    source: str
+    licence: str
+    rate_hz: float
+    sha256: str  # of the recording and of how it is cut
+    # numbers of vehicle, group and recording are 0; None: no scene, or known
+    scenes: Demonstration | None
+    vehicles: list[str]  # name per scene
+    groups: list[str]  # vehicle-disjoint group per scene
+    quality: dict  # `QualityReport.state()`
+    known: bool = False  # a committed shard holds it already
+    part: str = ""  # the input it was read from
+
+
+def digest(recording: Recording) -> str:
+    """sha256 over what a recording holds; equal inputs give equal datasets."""
+    piece = f"{recording.piece_of} {recording.scenes_within}"
+    total = hashlib.sha256(f"{recording.name} {recording.rate_hz} {piece}".encode())
+    for track in recording.tracks:
+        total.update(f"{track.id} {track.kind} {track.length} {track.width}".encode())
+        for values in (track.t, track.x, track.y, track.heading, track.speed):
+            total.update(np.ascontiguousarray(values, np.float64).tobytes())
+    for lane in recording.lanes:
+        total.update(lane.id.encode())
+        total.update(np.ascontiguousarray(lane.centre, np.float64).tobytes())
+    return total.hexdigest()
+
+
+def group_name(recording: Recording, first_seen_s: float) -> str:
+    """Vehicle-disjoint group: the recording's own, or a block of a minute."""
+    if recording.group is not None:
+        return recording.group
+    block = int(first_seen_s // GROUP_BLOCK_S)
+    return f"{recording.piece_of or recording.name}/minute-{block:04d}"
+
+
+def cut(
+    recording: Recording, config: CollectConfig, done: Mapping[str, str] | None = None
+) -> Cut:
+    """All scenes of a recording.
+
+    Args:
+      recording: validated.
+      config: what is collected.
+      done: sha256 by name of recordings that committed shards hold.
+
+    Raises:
+      InputError: `done` has a recording of this name cut from another input or
+        with other settings.
+    """
+    sha256 = hashlib.sha256((digest(recording) + repr(config)).encode()).hexdigest()
+    about = {
+        "name": recording.name,
+        "source": recording.source,
+        "licence": recording.licence,
+        "rate_hz": recording.rate_hz,
+        "sha256": sha256,
+    }
+    nothing = {"scenes": None, "vehicles": [], "groups": [], "quality": {}}
+    if recording.name in (done or {}):
+        if done and done[recording.name] != sha256:
+            raise InputError(
+                f"{recording.name}: input or settings changed since the interrupted "
+                "import: expected the same; use another --output"
+            )
+        return Cut(**about, **nothing, known=True)
+    collector = Collector(recording, config)
+    rows = list(collector.scenes())
+    report = QualityReport()
+    report.add_recording(collector)
+    if not rows:
+        return Cut(**about, **{**nothing, "quality": report.state()})
+    none = [0] * len(rows)
+    scenes = assemble(rows, vehicles=none, groups=none, recording=0)
+    report.add_scenes(scenes)
+    tracks = [recording.tracks[row["track"]] for row in rows]
+    groups = [group_name(recording, track.first_seen_s) for track in tracks]
+    return Cut(
+        **about,
+        scenes=scenes,
+        vehicles=[f"{g}:{t.id}" for g, t in zip(groups, tracks, strict=True)],
+        groups=groups,
+        quality=report.state(),
+    )
+
+
+def cut_part(
+    part: Part, config: CollectConfig, done: Mapping[str, str] | None = None
+) -> Iterator[Cut]:
+    """All recordings of a part, one at a time; arguments as `cut`."""
+    for recording in read_part(part.format, part.input, part.spec):
+        made = cut(recording, config, done)
+        yield dataclasses.replace(made, part=str(part.input))

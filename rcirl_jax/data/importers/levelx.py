@@ -1,0 +1,312 @@
+"""leveLXData drone recordings: highD, inD, rounD, exiD and uniD.
+
+Each recording is three CSV files, XX_tracks, XX_tracksMeta, XX_recordingMeta;
+the header of the first tells the two layouts apart. Specification: the format
+pages of www.highd-dataset.com and levelxdata.com, and the tools
+RobertKrajewski/highD-dataset and ika-rwth-aachen/drone-dataset-tools.
+
+Traps, highD: x, y is the bounding box's upper-left corner, `width` is the
+length along x, `height` the width of the car, y points down (ours up), frames
+start at 1, speedLimit -1 means none. inD and its sisters: x, y is the centre,
+heading is in degrees, width and length of pedestrians and cyclists are 0, lists
+are separated by semicolons, the map is a Lanelet2 file of the location in
+degrees, moved by the recording's UTM origin.
+"""
+
+import csv
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from rcirl_jax.data.importers.files import input_files
+from rcirl_jax.data.importers.lanelet2 import read_lanelet2
+from rcirl_jax.data.importers.levelx_lanes import find_map, marked_lanes
+from rcirl_jax.data.importers.paths import path_lanes
+from rcirl_jax.data.importers.projection import utm, utm_zone
+from rcirl_jax.data.importers.tables import (
+    MAX_PLACE_M,
+    MAX_TIME,
+    MAX_VELOCITY_MPS,
+    check_range,
+    number,
+    read_header,
+    read_table,
+    split_tracks,
+    travel_heading,
+)
+from rcirl_jax.data.recording import validate_recording
+from rcirl_jax.errors import InputError
+from rcirl_jax.types import Kind, Lane, Recording, Track
+
+SUFFIX = "_tracks.csv"
+CORNER = ("frame", "id", "x", "y", "width", "height", "xVelocity", "yVelocity")
+CENTRE = (
+    *("frame", "trackId", "xCenter", "yCenter", "heading", "width", "length"),
+    *("xVelocity", "yVelocity"),
+)
+KINDS = {
+    "pedestrian": Kind.PEDESTRIAN,
+    "bicycle": Kind.CYCLIST,
+    "bicyclist": Kind.CYCLIST,
+}
+MAX_GAP_FRAMES = 5.5  # frames missing inside one track
+MAX_ID = 2**53  # beyond it float64 does not count
+FAR_M = 200.0  # m; a map that far from all tracks is not theirs
+LANE_WIDTH_M = 3.5  # m, of lanes fitted to paths
+LIMIT_MPS = 36.11  # m/s, 130 km/h, advised where German motorways have no limit
+SIZE_M = (0.5, 0.5)  # m, length and width of a road user without a box
+
+
+def parts(path: Path, spec: dict) -> list[Path]:
+    """The XX_tracks.csv of a folder, or of its folder data."""
+    folder = path
+    if path.is_dir() and not any(path.glob("*" + SUFFIX)) and (path / "data").is_dir():
+        folder = path / "data"
+    return input_files(folder, "*" + SUFFIX)
+
+
+def recordings(path: Path, spec: dict) -> Iterator[Recording]:
+    """One Recording per XX_tracks.csv."""
+    for file in parts(path, spec):
+        if not file.name.endswith(SUFFIX):
+            raise InputError(f"{file}: name: {file.name}: expected XX{SUFFIX}")
+        header = read_header(file)
+        read = _read_centres if "xCenter" in header else _read_corners
+        yield validate_recording(read(file, spec), file)
+
+
+def _beside(path: Path, suffix: str) -> Path:
+    """The file of the same recording with another ending."""
+    other = path.with_name(path.name.removesuffix(SUFFIX) + suffix)
+    if not other.is_file():
+        raise InputError(f"{other}: input: missing: expected it beside {path.name}")
+    return other
+
+
+def _read_meta(path: Path) -> dict[str, str]:
+    """The one row of a recordingMeta.csv, as text."""
+    names = read_header(path)
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as handle:
+            rows = [row for row in csv.reader(handle) if row][1:]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: text: {error}: expected CSV text") from error
+    if len(rows) != 1 or len(rows[0]) != len(names):
+        sizes = [len(row) for row in rows][:3]
+        raise InputError(
+            f"{path}: rows: {len(rows)} of {sizes} cells: expected one of {len(names)}"
+        )
+    return dict(zip(names, (cell.strip() for cell in rows[0]), strict=True))
+
+
+def _meta_number(
+    path: Path, meta: dict[str, str], field: str, limit: float = np.inf
+) -> float:
+    """A number of a recordingMeta.csv, finite and within a limit."""
+    try:
+        value = float(meta[field])
+    except (KeyError, ValueError):
+        value = float("nan")
+    if not (np.isfinite(value) and abs(value) <= limit):
+        found = meta.get(field, "missing")[:40]
+        kind = "finite number" if limit == np.inf else f"number within {limit:g}"
+        raise InputError(f"{path}: {field}: '{found}': expected a {kind}")
+    return value
+
+
+def _rate(path: Path, meta: dict[str, str]) -> float:
+    rate = _meta_number(path, meta, "frameRate")
+    if not 1.0 <= rate <= 1000.0:
+        raise InputError(f"{path}: frameRate: {rate:g}: expected 1 to 1000 1/s")
+    return rate
+
+
+def _limit(path: Path, meta: dict[str, str]) -> float | None:
+    """The recording's speed limit [m/s]; -1 stands for none."""
+    if meta.get("speedLimit", "").lower() in ("", "nan"):
+        return None
+    limit = _meta_number(path, meta, "speedLimit")
+    return limit if limit > 0.0 else None
+
+
+def _read_rows(
+    path: Path, columns: tuple[str, ...], metres: tuple[str, ...]
+) -> dict[str, np.ndarray]:
+    rows = read_table(path, columns, (), ())
+    check_range(path, rows, metres, MAX_PLACE_M)
+    check_range(path, rows, ("xVelocity", "yVelocity"), MAX_VELOCITY_MPS)
+    check_range(path, rows, ("frame",), MAX_TIME)
+    return rows
+
+
+def _read_corners(path: Path, spec: dict) -> Recording:
+    """highD: corners of boxes, lanes by the y of their markings."""
+    rows = _read_rows(path, CORNER, ("x", "y", "width", "height"))
+    users = _read_users(_beside(path, "_tracksMeta.csv"), "id", "drivingDirection")
+    meta_path = _beside(path, "_recordingMeta.csv")
+    meta = _read_meta(meta_path)
+    rate = _rate(meta_path, meta)
+    t = (rows["frame"] - rows["frame"].min()) / rate
+    x = rows["x"] + 0.5 * rows["width"]
+    y = -(rows["y"] + 0.5 * rows["height"])
+    speed = np.hypot(rows["xVelocity"], rows["yVelocity"])
+    ids, pieces = _pieces(path, rows["id"], rows["frame"], users)
+    tracks = []
+    for name, part in pieces:
+        kind, direction = users[int(ids[part[0]])]
+        standing = np.pi if direction == 1.0 else 0.0
+        heading = travel_heading(t[part], x[part], y[part], standing)
+        tracks.append(
+            Track(
+                id=name,
+                kind=KINDS.get(kind, Kind.VEHICLE),
+                length=float(np.median(rows["width"][part])),
+                width=float(np.median(rows["height"][part])),
+                t=t[part],
+                x=x[part],
+                y=y[part],
+                heading=heading,
+                speed=speed[part],
+            )
+        )
+    limit = _limit(meta_path, meta)
+    along = (float(x.min()), float(x.max()))
+    lanes = marked_lanes(meta_path, meta, along, limit, (y, rows["xVelocity"]))
+    return _recording(path, spec, rate, tracks, lanes, limit, _absent(ids, users))
+
+
+def _read_centres(path: Path, spec: dict) -> Recording:
+    """inD, rounD, exiD, uniD: centres of boxes, lanes from a map."""
+    rows = _read_rows(path, CENTRE, ("xCenter", "yCenter", "width", "length"))
+    users = _read_users(_beside(path, "_tracksMeta.csv"), "trackId", None)
+    meta_path = _beside(path, "_recordingMeta.csv")
+    meta = _read_meta(meta_path)
+    rate = _rate(meta_path, meta)
+    rows["t"] = (rows["frame"] - rows["frame"].min()) / rate
+    ids, pieces = _pieces(path, rows["trackId"], rows["frame"], users)
+    tracks = [
+        _centred_track(name, part, rows, users[int(ids[part[0]])][0], spec)
+        for name, part in pieces
+    ]
+    limit = _limit(meta_path, meta)
+    lanes, notes = _mapped_lanes(path, meta_path, meta, tracks, spec)
+    notes += _absent(ids, users)
+    trailers = sum(users[int(i)][0] == "trailer" for i in np.unique(ids))
+    if trailers:
+        notes.append(f"{trailers} trailers are tracks of their own")
+    return _recording(path, spec, rate, tracks, lanes, limit, notes)
+
+
+def _centred_track(
+    name: str, part: np.ndarray, rows: dict[str, np.ndarray], kind: str, spec: dict
+) -> Track:
+    t, x, y = (rows[field][part] for field in ("t", "xCenter", "yCenter"))
+    heading = np.deg2rad(rows["heading"][part])
+    size = [float(np.median(rows[field][part])) for field in ("length", "width")]
+    if min(size) <= 0.0:
+        default = spec.get("sizes", {}).get(kind, SIZE_M)
+        size = [
+            found or float(given) for found, given in zip(size, default, strict=True)
+        ]
+        if np.ptp(heading) == 0.0:
+            # a road user without a box has no heading either
+            heading = travel_heading(t, x, y, float(heading[0]))
+    return Track(
+        id=name,
+        kind=KINDS.get(kind, Kind.VEHICLE),
+        length=size[0],
+        width=size[1],
+        t=t,
+        x=x,
+        y=y,
+        heading=heading,
+        speed=np.hypot(rows["xVelocity"][part], rows["yVelocity"][part]),
+    )
+
+
+def _read_users(
+    path: Path, key: str, direction: str | None
+) -> dict[int, tuple[str, float]]:
+    """Track number -> (class in lower case, driving direction or 0)."""
+    wanted = [key, "class", *([direction] if direction else [])]
+    table = read_table(path, wanted, (), ["class"])
+    towards = table[direction] if direction else np.zeros(table[key].size)
+    kinds = np.char.lower(table["class"])
+    return {
+        int(name): (str(kind), float(way))
+        for name, kind, way in zip(table[key], kinds, towards, strict=True)
+    }
+
+
+def _pieces(
+    path: Path, names: np.ndarray, frames: np.ndarray, users: dict
+) -> tuple[np.ndarray, list[tuple[str, np.ndarray]]]:
+    """Track numbers per row, and the rows of each track without a gap."""
+    wrong = np.flatnonzero((names != np.round(names)) | (np.abs(names) > MAX_ID))
+    if wrong.size:
+        raise InputError(
+            f"{path}: track number: {names[wrong[0]]:g}: expected a whole number"
+        )
+    ids = names.astype(np.int64)
+    unknown = sorted(set(np.unique(ids).tolist()) - set(users))
+    if unknown:
+        raise InputError(
+            f"{path}: track {unknown[0]}: no row in the tracksMeta file: "
+            "expected one per track"
+        )
+    return ids, split_tracks(path, ids, frames, MAX_GAP_FRAMES)
+
+
+def _absent(ids: np.ndarray, users: dict) -> list[str]:
+    missing = len(set(users) - set(np.unique(ids).tolist()))
+    return [f"{missing} tracks of tracksMeta have no rows"] if missing else []
+
+
+def _mapped_lanes(
+    path: Path, meta_path: Path, meta: dict[str, str], tracks: list[Track], spec: dict
+) -> tuple[tuple[Lane, ...], list[str]]:
+    """Lanes of the location's Lanelet2 map; else fitted to the paths driven."""
+    place = find_map(path, meta.get("locationId", ""), spec)
+    why = "no map found"
+    if place is not None:
+        longitude = _meta_number(meta_path, meta, "lonLocation", 180.0)
+        fields = ("xUtmOrigin", "yUtmOrigin")
+        found = [_meta_number(meta_path, meta, f, MAX_PLACE_M) for f in fields]
+        origin = np.array(found)
+        zone = utm_zone(longitude)
+        lanes, notes = read_lanelet2(place, lambda a, b: utm(a, b, zone) - origin)
+        if _apart(lanes, tracks) < FAR_M:
+            return lanes, notes
+        why = f"{place.name} lies elsewhere"
+    width = number(spec, "lane_width_m", LANE_WIDTH_M)
+    lanes = path_lanes(tracks, width, None)
+    return lanes, [f"{why}; {len(lanes)} lanes fitted to the longest paths"]
+
+
+def _apart(lanes: tuple[Lane, ...], tracks: list[Track]) -> float:
+    """m, from the middle of all tracks to the nearest lane point."""
+    middle = [np.median([np.median(getattr(t, c)) for t in tracks]) for c in "xy"]
+    return min(float(np.min(np.hypot(*(ln.centre - middle).T))) for ln in lanes)
+
+
+def _recording(
+    path: Path,
+    spec: dict,
+    rate: float,
+    tracks: list[Track],
+    lanes: tuple[Lane, ...],
+    limit: float | None,
+    notes: list[str],
+) -> Recording:
+    default = number(spec, "default_speed_limit", LIMIT_MPS)
+    return Recording(
+        name=path.name.removesuffix(SUFFIX),
+        source=str(spec.get("source", "leveLXData")),
+        licence=str(spec.get("licence", "leveLXData terms: non-commercial use")),
+        rate_hz=rate,
+        tracks=tuple(tracks),
+        lanes=lanes,
+        default_speed_limit=limit if limit is not None else default,
+        notes=tuple(notes),
+    )

@@ -1,0 +1,141 @@
+"""Lanes of leveLXData recordings: highD's markings, and where a map lies."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.types import Lane
+
+MARGIN_M = 50.0  # m of lane beyond the first and last position
+STEP_M = 5.0  # m between points of a lane
+MAP_FOLDERS = ("maps", "lanelets", "lanelet2")
+
+
+def marked_lanes(
+    path: Path,
+    meta: dict[str, str],
+    along: tuple[float, float],
+    limit: float | None,
+    rows: tuple[np.ndarray, np.ndarray],
+) -> tuple[Lane, ...]:
+    """highD: straight lanes between the markings, named as `laneId` names them.
+
+    Args:
+      path: the recordingMeta.csv, for errors.
+      meta: its row.
+      along: m, first and last x.
+      limit: m/s, or None.
+      rows: y [n] m (up) and x velocity [n] m/s of all rows; a carriageway is
+        driven the way its rows are.
+    """
+    sides = [_markings(path, meta, f"{side}LaneMarkings") for side in SIDES]
+    lanes: list[Lane] = []
+    number = 1  # lane 1 lies above the first marking
+    for side, marks in zip(SIDES, sides, strict=True):
+        y, velocity = rows
+        inside = (y <= marks[0]) & (y >= marks[-1])
+        travel = np.median(velocity[inside]) if inside.any() else SIDES[side]
+        lanes += _carriageway(marks, number + 1, travel > 0.0, along, limit)
+        number += len(marks)
+    return tuple(lanes)
+
+
+# highD: the upper carriageway is driven towards -x, the lower towards +x
+SIDES = {"upper": -1.0, "lower": 1.0}
+
+
+def _markings(path: Path, meta: dict[str, str], field: str) -> np.ndarray:
+    """[m] m, y of the markings from top to bottom (y up)."""
+    text = meta.get(field, "")
+    try:
+        marks = -np.array([float(mark) for mark in text.split(";") if mark.strip()])
+    except ValueError:
+        marks = np.zeros(0)
+    if marks.size < 2 or not np.isfinite(marks).all() or np.any(np.diff(marks) >= 0.0):
+        raise InputError(
+            f"{path}: {field}: '{text[:60]}': expected at least two increasing "
+            "numbers separated by ;"
+        )
+    return marks
+
+
+def _carriageway(
+    marks: np.ndarray,
+    first: int,
+    forward: bool,
+    along: tuple[float, float],
+    limit: float | None,
+) -> list[Lane]:
+    x = np.linspace(
+        along[0] - MARGIN_M,
+        along[1] + MARGIN_M,
+        int((along[1] - along[0] + 2.0 * MARGIN_M) / STEP_M) + 2,
+    )
+    x = x if forward else x[::-1]
+    count = len(marks) - 1
+    # the lane above (smaller number) is to the left of one driven towards +x
+    left, right = (-1, 1) if forward else (1, -1)
+    lanes = []
+    for place in range(count):
+        half = np.full(x.shape, 0.5 * (marks[place] - marks[place + 1]))
+        y = 0.5 * (marks[place] + marks[place + 1])
+        sides = [place + left, place + right]
+        names = [str(first + s) if 0 <= s < count else None for s in sides]
+        lanes.append(
+            Lane(
+                id=str(first + place),
+                centre=np.stack([x, np.full(x.shape, y)], axis=1),
+                left_width=half,
+                right_width=half,
+                speed_limit=limit,
+                left=names[0],
+                right=names[1],
+            )
+        )
+    return lanes
+
+
+def find_map(path: Path, location: str, spec: dict) -> Path | None:
+    """The Lanelet2 map of a recording's location, or None.
+
+    The releases keep maps/lanelets/04_aseag/location4.osm (or
+    lanelets/location4.osm) beside the folder `data`. The option `map` names a
+    file, or a folder to look into.
+    """
+    if spec.get("map"):
+        given = Path(str(spec["map"]))
+        if not given.exists():
+            raise InputError(f"{given}: map: missing: expected a file or folder")
+        if given.is_file():
+            return given
+        return _of_location(sorted(given.rglob("*.osm")), location)
+    folder = path.resolve().parent
+    for place in (folder, folder.parent):
+        folders = [place / name for name in MAP_FOLDERS]
+        found = [file for inside in folders for file in sorted(inside.rglob("*.osm"))]
+        match = _of_location([*sorted(place.glob("*.osm")), *found], location)
+        if match is not None:
+            return match
+    return None
+
+
+def _of_location(files: list[Path], location: str) -> Path | None:
+    """locationN.osm; else the only map in a folder named N_...; else *_N.osm."""
+    digits = location.split(".")[0].lstrip("0") or "0"
+    if not digits.isdigit():
+        return None
+    patterns = (
+        (rf"location_?0*{digits}", "stem"),
+        (rf"0*{digits}_.*", "parent"),
+        (rf".*_0*{digits}", "stem"),
+    )
+    for pattern, part in patterns:
+        for file in files:
+            if part == "parent" and file.stem.lower().startswith("location"):
+                continue
+            name = file.parent.name if part == "parent" else file.stem
+            if re.fullmatch(pattern, name, flags=re.IGNORECASE):
+                return file
+    return None

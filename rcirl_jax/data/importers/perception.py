@@ -1,0 +1,170 @@
+"""What logs of a car's own perception share: boxes, gaps, outliers.
+
+L5, nuPlan and Apollo logs hold what one car saw while it drove: boxes with an
+id, a class that may be unknown, and gaps where the view was blocked. An importer
+gathers them as `Boxes`; this module makes tracks of them.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from rcirl_jax.data.importers.tables import number, split_tracks
+from rcirl_jax.data.recording import LENGTH_RANGE_M, MAX_SPEED_MPS, WIDTH_RANGE_M
+from rcirl_jax.errors import InputError
+from rcirl_jax.types import Kind, Track
+
+UNKNOWN = -1  # kind of a box whose class the log does not know
+UNKNOWN_CHOICES = ("auto", "drop", "static", "vehicle")
+STANDING_M = 1.0  # m, an unknown object that moves less than this is static
+MAX_OUTLIERS = 0.1  # share of tracks dropped as outliers; more is an error
+MAX_SIZE_M = 200.0  # m, of a box; beyond it the file is wrong, not the tracker
+FIELDS = ("t", "x", "y", "heading", "length", "width")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Boxes:
+    """Boxes of all road users of one recording, in any order."""
+
+    ids: np.ndarray  # [n] int, the same for all boxes of one road user
+    names: Sequence[str]  # name of each id: `names[ids]`
+    t: np.ndarray  # [n] s
+    x: np.ndarray  # [n] m, of the box centre
+    y: np.ndarray  # [n] m
+    heading: np.ndarray  # [n] rad
+    speed: np.ndarray  # [n] m/s; NaN: from the positions
+    length: np.ndarray  # [n] m
+    width: np.ndarray  # [n] m
+    kind: np.ndarray  # [n] int, `Kind` or UNKNOWN
+
+
+def tracks_of(
+    path: Path, boxes: Boxes, max_gap_s: float, unknown: str = "auto"
+) -> tuple[list[Track], list[str]]:
+    """Tracks of the boxes, in the order of their ids, and notes on what was left out.
+
+    A gap longer than `max_gap_s` starts another track, "id#2". Size and class
+    are the median and the most frequent of a track. Trackers lose objects now
+    and then: tracks with an impossible size or speed are left out, unless they
+    are more than a tenth, which points at a wrong file.
+
+    Args:
+      path: named in errors.
+      boxes: at least none.
+      max_gap_s: s without a box inside one track.
+      unknown: what objects of unknown class become: "drop", "static",
+        "vehicle", or by whether they moved ("auto").
+
+    Raises:
+      InputError: a number that is not finite, an absurd size, or a time met
+        twice by one id.
+    """
+    if unknown not in UNKNOWN_CHOICES:
+        raise InputError(
+            f"source TOML: unknown: {unknown}: expected one of {UNKNOWN_CHOICES}"
+        )
+    if boxes.t.size == 0:
+        return [], []
+    _check(path, boxes)
+    tracks, dropped, seen = [], 0, {}
+    for _, rows in split_tracks(path, boxes.ids, boxes.t, max_gap_s):
+        name = boxes.names[int(boxes.ids[rows[0]])]
+        seen[name] = seen.get(name, 0) + 1
+        label = name if seen[name] == 1 else f"{name}#{seen[name]}"
+        track = _track(label, boxes, rows, unknown)
+        dropped += track is None
+        tracks += [] if track is None else [track]
+    tracks, notes = _without_outliers(tracks)
+    if dropped:
+        notes.append(f"{dropped} tracks of unknown class left out")
+    return tracks, notes
+
+
+def _check(path: Path, boxes: Boxes) -> None:
+    for field in FIELDS:
+        values = getattr(boxes, field)
+        bad = np.flatnonzero(~np.isfinite(values))
+        if bad.size:
+            name = boxes.names[int(boxes.ids[bad[0]])]
+            raise InputError(
+                f"{path}: id {name}: {field}: {values[bad[0]]}: "
+                "expected a finite number"
+            )
+    for field in ("length", "width"):
+        values = getattr(boxes, field)
+        bad = np.flatnonzero((values < 0.0) | (values > MAX_SIZE_M))
+        if bad.size:
+            name = boxes.names[int(boxes.ids[bad[0]])]
+            raise InputError(
+                f"{path}: id {name}: {field}: {values[bad[0]]:g} m: "
+                f"expected 0 to {MAX_SIZE_M:g} m"
+            )
+
+
+def _track(name: str, boxes: Boxes, rows: np.ndarray, unknown: str) -> Track | None:
+    """One track, or None where its class is unknown and such are dropped."""
+    t, x, y = boxes.t[rows], boxes.x[rows], boxes.y[rows]
+    # most frequent class; the shift makes UNKNOWN a count of its own
+    kind = int(np.argmax(np.bincount(boxes.kind[rows] - UNKNOWN))) + UNKNOWN
+    if kind == UNKNOWN:
+        if unknown == "drop":
+            return None
+        moved = np.hypot(np.ptp(x), np.ptp(y)) > STANDING_M
+        choice = ("vehicle" if moved else "static") if unknown == "auto" else unknown
+        kind = int(Kind[choice.upper()])
+    speed = boxes.speed[rows]
+    lost = ~np.isfinite(speed)
+    if lost.any():
+        speed = np.where(lost, speed_of(t, x, y), speed)
+    return Track(
+        id=name,
+        kind=Kind(kind),
+        length=max(float(np.median(boxes.length[rows])), LENGTH_RANGE_M[0]),
+        width=max(float(np.median(boxes.width[rows])), WIDTH_RANGE_M[0]),
+        t=t,
+        x=x,
+        y=y,
+        heading=boxes.heading[rows],
+        speed=speed,
+    )
+
+
+def speed_of(t: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Speed [n] m/s from positions: central differences."""
+    if t.size < 2:
+        return np.zeros(t.shape)
+    return np.hypot(np.gradient(x, t), np.gradient(y, t))
+
+
+def _without_outliers(tracks: list[Track]) -> tuple[list[Track], list[str]]:
+    good = [track for track in tracks if _is_possible(track)]
+    lost = len(tracks) - len(good)
+    if lost == 0 or lost > MAX_OUTLIERS * len(tracks):
+        return tracks, []
+    return good, [f"{lost} tracks with an impossible size or speed left out"]
+
+
+def _is_possible(track: Track) -> bool:
+    if np.max(np.abs(track.speed)) > MAX_SPEED_MPS:
+        return False
+    if track.kind == Kind.STATIC:
+        return True
+    return track.length <= LENGTH_RANGE_M[1] and track.width <= WIDTH_RANGE_M[1]
+
+
+def positive(spec: dict, key: str, default: float) -> float:
+    """A number > 0 from a source TOML."""
+    value = number(spec, key, default)
+    if value <= 0.0:
+        raise InputError(f"source TOML: {key}: {value:g}: expected > 0")
+    return value
+
+
+def section(spec: dict, key: str) -> dict:
+    """A table of a source TOML; empty where there is none."""
+    found = spec.get(key, {})
+    if not isinstance(found, dict):
+        raise InputError(f"source TOML: {key}: {found}: expected a table [{key}]")
+    return found

@@ -1,0 +1,125 @@
+"""Local origins and polylines, shared by the importers of vector maps."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from rcirl_jax.errors import InputError
+
+FAR_M = 1e4  # m; coordinates beyond it are moved to a local origin
+ORIGIN_STEP_M = 1000.0  # m, local origins are multiples of it
+MAX_COORDINATE_M = 1e8  # m, farther than any map projection on Earth reaches
+MIN_HALF_WIDTH_M = 0.1  # m, lanes taper to a point at forks
+FRACTION_DIGITS = 7  # fractions of a line that differ by less are one
+
+
+def local_origin(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Origin [2] m to subtract: zero unless the positions lie far from (0, 0).
+
+    The package computes in float32 later, which resolves 1 mm at 10 km only.
+    """
+    middle = np.array([np.median(x), np.median(y)]) if x.size else np.zeros(2)
+    if np.all(np.abs(middle) <= FAR_M):
+        return np.zeros(2)
+    return np.round(middle / ORIGIN_STEP_M) * ORIGIN_STEP_M
+
+
+def origin_notes(origin: np.ndarray) -> list[str]:
+    """The note that says where a local origin lies; none for (0, 0)."""
+    if not origin.any():
+        return []
+    return [f"local origin at x = {origin[0]:.0f} m, y = {origin[1]:.0f} m"]
+
+
+def check_coordinates(
+    path: Path | str, where: str, fields: Sequence[str], values: np.ndarray
+) -> None:
+    """Every coordinate is finite and on Earth.
+
+    Args:
+      path: file, named in errors.
+      where: what the coordinates belong to.
+      fields: names of the columns of `values`.
+      values: [n, len(fields)] m.
+    """
+    # NaN compares false
+    bad = np.argwhere(~(np.abs(values) <= MAX_COORDINATE_M))
+    if bad.size:
+        row, column = bad[0]
+        raise InputError(
+            f"{path}: {where}: {fields[column]}: {values[row, column]:g} at point "
+            f"{row}: expected a number within {MAX_COORDINATE_M:g} m"
+        )
+
+
+def fractions(points: np.ndarray) -> np.ndarray:
+    """Arc length at each point over the line's length, [n] from 0 to 1."""
+    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    return arc / max(arc[-1], 1e-9)
+
+
+def resample(points: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Points [len(at), 2] of a polyline at fractions of its length."""
+    share = fractions(points)
+    return np.stack([np.interp(at, share, points[:, i]) for i in (0, 1)], axis=1)
+
+
+def moves(points: np.ndarray) -> np.ndarray:
+    """Mask [n] of points that differ from the one before; the first does."""
+    return np.concatenate([[True], np.any(np.diff(points, axis=0) != 0.0, axis=1)])
+
+
+def between_bounds(
+    left: np.ndarray, right: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Centre line [m, 2] and half width [m] of a lane between two polylines.
+
+    Both bounds run in driving direction; points at equal fractions of their
+    lengths face each other.
+    """
+    at = np.concatenate([fractions(left), fractions(right)])
+    at = np.unique(np.round(at, FRACTION_DIGITS))
+    left, right = resample(left, at), resample(right, at)
+    centre = 0.5 * (left + right)
+    half = np.maximum(0.5 * np.hypot(*(left - right).T), MIN_HALF_WIDTH_M)
+    keep = moves(centre)
+    return centre[keep], half[keep]
+
+
+def distance_to_line(points: np.ndarray, line: np.ndarray) -> np.ndarray:
+    """Distance [n] m of points [n, 2] from a polyline [m >= 1, 2]."""
+    if len(line) == 1:
+        return np.hypot(*(points - line[0]).T)
+    start, step = line[:-1], np.diff(line, axis=0)
+    offset = points[:, None] - start[None]
+    square = np.maximum(np.sum(step * step, axis=1), 1e-12)
+    share = np.clip(np.einsum("nmk,mk->nm", offset, step) / square, 0.0, 1.0)
+    offset -= share[..., None] * step
+    return np.sqrt(np.einsum("nmk,nmk->nm", offset, offset).min(axis=1))
+
+
+def line_across(
+    centre: np.ndarray, left: np.ndarray, right: np.ndarray, point: np.ndarray
+) -> np.ndarray:
+    """End points [2, 2] m, left first, of a line across a lane near a point.
+
+    It lies where the point's projection falls on the centre line, which is its
+    first or last point if the given one lies before or behind the lane.
+
+    Args:
+      centre: [m >= 2, 2] m, consecutive points differ.
+      left: [m] m, distance of the left bound.
+      right: [m] m, of the right one.
+      point: [2] m.
+    """
+    start, step = centre[:-1], np.diff(centre, axis=0)
+    square = np.sum(step * step, axis=1)
+    share = np.clip(np.sum((point - start) * step, axis=1) / square, 0.0, 1.0)
+    foot = start + share[:, None] * step
+    nearest = int(np.argmin(np.hypot(*(foot - point).T)))
+    ahead = step[nearest] / np.sqrt(square[nearest])
+    normal = np.array([-ahead[1], ahead[0]])
+    at = nearest + share[nearest]
+    sides = [np.interp(at, np.arange(len(centre)), width) for width in (left, right)]
+    return foot[nearest] + np.array([sides[0], -sides[1]])[:, None] * normal

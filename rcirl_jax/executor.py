@@ -1,0 +1,198 @@
+"""Where independent pieces of work run: here, in other processes, on a Ray cluster.
+
+A piece is an item; `function(item)` yields its results. Every executor gives the
+results of all items in the order of the items, so what comes out does not depend
+on where it was made. Pieces have to be idempotent: one that is lost with its
+process or node is done again.
+
+Ray does the scheduling, the transport and the retries; this module only keeps
+the order and bounds what is in flight.
+"""
+
+import collections
+import concurrent.futures as futures
+import importlib
+import itertools
+import multiprocessing
+import socket
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures.process import BrokenProcessPool
+from typing import Any, Protocol, TypeVar
+
+from rcirl_jax.errors import InputError
+
+EXECUTORS = ("local", "ray")
+AHEAD = 2  # pieces in flight per worker: one running, one waiting
+REACH_S = 5.0  # s, for the head of a cluster to answer
+ATTEMPTS = 3  # pools tried before a piece that kills its process is given up
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+class Executor(Protocol):
+    """Runs pieces; `workers` is how many can run at once."""
+
+    @property
+    def workers(self) -> int:
+        """Pieces that run side by side."""
+        ...
+
+    def stream(
+        self, function: Callable[[Item], Iterable[Result]], items: Iterable[Item]
+    ) -> Iterator[Result]:
+        """Results of all items, in their order."""
+        ...
+
+
+class Here:
+    """In this process, one after the other; results as they come."""
+
+    workers = 1
+
+    def stream(
+        self, function: Callable[[Item], Iterable[Result]], items: Iterable[Item]
+    ) -> Iterator[Result]:
+        """Results of all items, in their order."""
+        for item in items:
+            yield from function(item)
+
+
+class Processes:
+    """In processes of this machine. Items, results and function are sent."""
+
+    def __init__(self, workers: int) -> None:
+        self.workers = workers
+
+    def stream(
+        self, function: Callable[[Item], Iterable[Result]], items: Iterable[Item]
+    ) -> Iterator[Result]:
+        """Results of all items, in their order.
+
+        Raises:
+          InputError: a piece killed its process ATTEMPTS times (out of memory).
+        """
+        rest: collections.deque[Item] = collections.deque()
+        source, failures = iter(items), 0
+        while True:
+            try:
+                for result in self._one_pool(function, source, rest):
+                    failures = 0
+                    yield from result
+                return
+            except BrokenProcessPool as error:
+                failures += 1
+                if failures >= ATTEMPTS:
+                    raise InputError(
+                        f"--workers: {self.workers}: a process was killed {ATTEMPTS} "
+                        f"times at {str(rest[0])[:200]}: expected enough memory; "
+                        "use fewer workers"
+                    ) from error
+
+    def _one_pool(
+        self,
+        function: Callable[[Item], Iterable[Result]],
+        source: Iterator[Item],
+        rest: "collections.deque[Item]",
+    ) -> Iterator[list[Result]]:
+        """Work off `rest`, then `source`; `rest` keeps what has no result yet."""
+        # forking a process that runs JAX's threads can hang
+        start = multiprocessing.get_context("spawn")
+        with futures.ProcessPoolExecutor(self.workers, mp_context=start) as pool:
+            running = collections.deque(
+                pool.submit(_listed, function, item) for item in rest
+            )
+            try:
+                while True:
+                    room = self.workers * AHEAD - len(running)
+                    for item in itertools.islice(source, max(room, 0)):
+                        rest.append(item)
+                        running.append(pool.submit(_listed, function, item))
+                    if not running:
+                        return
+                    result = running.popleft().result()
+                    rest.popleft()
+                    yield result
+            finally:
+                pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _listed(function: Callable[[Item], Iterable[Result]], item: Item) -> list[Result]:
+    return list(function(item))
+
+
+class Ray:
+    """On a Ray cluster. Every node needs this package and sees the same files."""
+
+    def __init__(self, address: str) -> None:
+        try:
+            self._ray = importlib.import_module("ray")
+        except ImportError as error:
+            raise InputError(
+                "--executor: ray: not installed: expected the extra rcirl-jax[ray]"
+            ) from error
+        if not self._ray.is_initialized():
+            self._connect(address)
+        cpus = self._ray.cluster_resources().get("CPU", 1.0)
+        self.workers = max(int(cpus), 1)
+
+    def _connect(self, address: str) -> None:
+        # numbers must not depend on which accelerator a node has
+        environment = {"env_vars": {"JAX_PLATFORMS": "cpu"}}
+        try:
+            host, _, port = address.rpartition(":")
+            if port.isdigit() and "/" not in host:  # Ray itself would try for minutes
+                socket.create_connection((host, int(port)), REACH_S).close()
+            self._ray.init(
+                address=address,
+                runtime_env=environment,
+                log_to_driver=False,
+                logging_level="ERROR",
+            )
+        except (OSError, RuntimeError, ValueError) as error:
+            raise InputError(
+                f"--ray_address: {address}: {error}: expected a running cluster"
+            ) from error
+
+    def stream(
+        self, function: Callable[[Item], Iterable[Result]], items: Iterable[Item]
+    ) -> Iterator[Result]:
+        """Results of all items, in their order; lost pieces are done again."""
+        # -1: as often as nodes or processes are lost; errors of the function,
+        # which would come again, are not retried
+        remote = self._ray.remote(max_retries=-1)(_listed)
+        shared = self._ray.put(function)
+        source, running = iter(items), collections.deque()
+        while True:
+            room = self.workers * AHEAD - len(running)
+            for item in itertools.islice(source, max(room, 0)):
+                running.append(remote.remote(shared, item))
+            if not running:
+                return
+            yield from self._result(running.popleft())
+
+    def _result(self, reference: Any) -> list:  # noqa: ANN401
+        """The value, or the function's own error in place of Ray's."""
+        try:
+            return self._ray.get(reference)
+        except self._ray.exceptions.RayTaskError as error:
+            if isinstance(error.cause, Exception):
+                raise error.cause from None
+            raise
+
+
+def make_executor(
+    name: str, *, workers: int = 1, ray_address: str = "auto"
+) -> Executor:
+    """The executor of the flags --executor, --workers, --ray_address.
+
+    Raises:
+      InputError: unknown name, fewer than one worker, no Ray or no cluster.
+    """
+    if name not in EXECUTORS:
+        raise InputError(f"--executor: {name}: expected one of {EXECUTORS}")
+    if workers < 1:
+        raise InputError(f"--workers: {workers}: expected at least 1")
+    if name == "ray":
+        return Ray(ray_address)
+    return Here() if workers == 1 else Processes(workers)

@@ -1,0 +1,180 @@
+"""Imports in other processes, on a Ray cluster, and killed: the same bytes."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from rcirl_jax.data import importing
+from rcirl_jax.data.importing import import_parts
+from rcirl_jax.errors import InputError
+from rcirl_jax.executor import Processes, Ray
+from tests.data.small_logs import CONFIG, files_of, write_logs
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    return write_logs(tmp_path_factory.mktemp("logs"))
+
+
+@pytest.fixture(scope="module")
+def local(logs, tmp_path_factory):
+    """What an import in this process writes, in shards of few scenes."""
+    folder = tmp_path_factory.mktemp("local") / "data"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(importing, "SHARD_SCENES", 30)
+        import_parts(logs, folder, CONFIG)
+    assert len(list(folder.rglob("shard.json"))) > 2
+    return files_of(folder)
+
+
+@pytest.mark.multiprocess
+def test_two_processes_write_the_bytes_of_one(logs, local, tmp_path, monkeypatch):
+    monkeypatch.setattr(importing, "SHARD_SCENES", 30)
+    import_parts(logs, tmp_path / "data", CONFIG, executor=Processes(2))
+    assert files_of(tmp_path / "data") == local
+
+
+@pytest.mark.multiprocess
+def test_bad_input_elsewhere_is_the_same_line_and_leaves_nothing(logs, tmp_path):
+    broken = tmp_path / "logs"
+    parts = write_logs(broken)
+    (broken / "log03.csv").write_text("t,id,x,y\n0.0,a,far,0\n")
+    with pytest.raises(InputError, match=r"log03\.csv: line 2: x: 'far': expected a"):
+        import_parts(parts, tmp_path / "data", CONFIG, executor=Processes(2))
+    assert not (tmp_path / "data").exists()
+
+
+RAY = """
+import sys, time
+from pathlib import Path
+import ray
+from ray.cluster_utils import Cluster
+from rcirl_jax.data import importing
+from rcirl_jax.executor import Ray
+from tests.data.small_logs import CONFIG, write_logs
+
+importing.SHARD_SCENES = 30
+cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0})
+nodes = [cluster.add_node(num_cpus=1) for _ in range(2)]
+cluster.wait_for_nodes()
+executor = Ray(cluster.address)
+assert executor.workers == 2, executor.workers
+
+class Killing:
+    workers = 2
+    def stream(self, function, items):
+        for number, result in enumerate(executor.stream(function, items)):
+            if number == 1:
+                cluster.remove_node(nodes[0], allow_graceful=False)
+            yield result
+
+parts = write_logs(Path(sys.argv[1]))
+importing.import_parts(parts, sys.argv[2], CONFIG, executor=Killing())
+deadline = time.monotonic() + 90.0  # the loss of a node is noticed late
+while sum(node["Alive"] for node in ray.nodes()) != 2:  # the head and the other
+    assert time.monotonic() < deadline, "no node was lost"
+    time.sleep(0.5)
+ray.shutdown()
+cluster.shutdown()
+"""
+
+
+@pytest.mark.ray
+def test_a_ray_cluster_that_loses_a_node_writes_the_bytes_of_one_process(
+    local, tmp_path
+):
+    """A head and two nodes, each its own processes; one node is killed midway."""
+    pytest.importorskip("ray")
+    done = subprocess.run(
+        [sys.executable, "-c", RAY, str(tmp_path / "logs"), str(tmp_path / "data")],
+        capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert files_of(tmp_path / "data") == local
+
+
+@pytest.mark.ray
+def test_no_cluster_is_one_line():
+    pytest.importorskip("ray")
+    with pytest.raises(InputError, match=r"--ray_address: 127\.0\.0\.1:1: "):
+        Ray("127.0.0.1:1")
+
+
+KILLED = """
+import sys
+from pathlib import Path
+from rcirl_jax.data import importing
+from tests.data.small_logs import CONFIG, write_logs
+importing.SHARD_SCENES = 30
+parts = write_logs(Path(sys.argv[1]))
+print("ready", flush=True)
+importing.import_parts(parts, sys.argv[2], CONFIG)
+"""
+
+
+def start(logs, data):
+    """The import in a process of its own, once it is about to start."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", KILLED, str(logs), str(data)],
+        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+    )  # fmt: skip
+    assert process.stdout.readline() == "ready\n"
+    return process
+
+
+def killed_and_resumed(logs, data, moments, local):
+    """Kill at the moments [s after the start], then let it end; same bytes."""
+    kills = 0
+    for moment in moments:
+        process = start(logs, data)
+        try:
+            process.wait(timeout=moment)
+        except subprocess.TimeoutExpired:
+            os.kill(process.pid, signal.SIGKILL)
+            kills += 1
+        process.wait()
+        process.stdout.close()
+        if (data / "manifest.json").exists():
+            break
+    last = start(logs, data) if not (data / "manifest.json").exists() else None
+    if last is not None:
+        assert last.wait(timeout=300) == 0
+        last.stdout.close()
+    assert files_of(data) == local
+    return kills
+
+
+def duration(logs, data):
+    begin = time.monotonic()
+    process = start(logs, data)
+    begin = time.monotonic()
+    assert process.wait(timeout=300) == 0
+    process.stdout.close()
+    return time.monotonic() - begin
+
+
+@pytest.mark.multiprocess
+def test_a_killed_import_resumes_to_the_same_bytes(logs, local, tmp_path):
+    whole = duration(tmp_path / "logs", tmp_path / "whole")
+    assert files_of(tmp_path / "whole") == local
+    moments = np.random.default_rng(0).uniform(0.1, 1.0, 2) * whole
+    assert killed_and_resumed(tmp_path / "logs", tmp_path / "data", moments, local)
+
+
+@pytest.mark.slow
+def test_twenty_kills_at_random_moments(logs, local, tmp_path):
+    whole = duration(tmp_path / "logs", tmp_path / "whole")
+    rng, kills = np.random.default_rng(1), 0
+    for attempt in range(40):
+        moment = [float(rng.uniform(0.0, 1.1) * whole)]
+        kills += killed_and_resumed(
+            tmp_path / "logs", tmp_path / f"data{attempt}", moment, local
+        )
+        if kills >= 20:
+            return
+    pytest.fail(f"only {kills} imports were killed before they ended")

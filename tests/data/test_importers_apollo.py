@@ -1,0 +1,510 @@
+"""Apollo cyber records: topics, clocks, parts of a drive, malformed records."""
+
+import os
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rcirl_jax.data.importers import apollo, cyber_record, parts, read_recordings
+from rcirl_jax.data.importers.wire import (
+    ENUM_NAME,
+    Schema,
+    WireError,
+    decode,
+    fields,
+)
+from rcirl_jax.errors import InputError
+from rcirl_jax.specs import load_toml, spec_root
+from rcirl_jax.types import Kind
+from tests.data.formats import apollo as fixture
+from tests.data.formats.waymo import Packed, Single, message, varint
+
+SHARED = Path(__file__).parents[3] / "shared" / "data"
+DATA = Path(os.environ.get("RCIRL_DATA", SHARED))
+EXAMPLE = DATA / "formats" / "apollo_record" / "example.record.00000"
+LOCALIZATION = "/apollo/localization/pose"
+CHASSIS = "/apollo/canbus/chassis"
+PERCEPTION = "/apollo/perception/obstacles"
+
+
+def read(path, **options):
+    spec = load_toml(spec_root() / "sources" / "apollo.toml")
+    return list(apollo.recordings(path, {**spec, **options}))
+
+
+def write(path, messages, **options):
+    path.write_bytes(fixture.record(messages, **options))
+    return path
+
+
+def only(path, messages=None, *, channels=None, **options):
+    if messages is not None:
+        path = write(path / "a.record", messages, channels=channels)
+    (recording,) = read(path, **options)
+    return recording
+
+
+def track(recording, name):
+    return next(found for found in recording.tracks if found.id == name)
+
+
+def ego_only(seconds=2.0, **options):
+    return [
+        (LOCALIZATION, 0.1 * k, fixture.localization(0.1 * k, **options))
+        for k in range(round(10 * seconds) + 1)
+    ]
+
+
+# ---------------------------------------------------------------- well-formed
+
+
+def test_drive_of_two_parts(tmp_path):
+    recording = only(fixture.write(tmp_path).input)
+    assert recording.name == "20210723091215"
+    assert recording.rate_hz == 10.0
+    assert {t.id for t in recording.tracks} == {
+        *("ego", "12", "15", "17", "19", "19#2", "23", "27", "31")
+    }
+    ego = track(recording, "ego")
+    assert (ego.length, ego.width) == (4.933, 2.11)
+    # across the border of the files
+    np.testing.assert_allclose(ego.t, fixture.GRID, atol=1e-9)
+    assert ego.destination == pytest.approx((300.0, 1.0))
+    assert any("x = 587000 m, y = 4141000 m" in note for note in recording.notes)
+    assert any("records hold no map" in note for note in recording.notes)
+    assert recording.lanes
+
+
+def test_obstacles_are_where_they_were_measured(tmp_path):
+    """80 ms pass before perception publishes what it saw."""
+    recording = only(fixture.write(tmp_path).input)
+    expected = fixture.expected()["12"]
+    found = track(recording, "12")
+    np.testing.assert_allclose(found.t, expected.t, atol=1e-9)
+    np.testing.assert_allclose(found.x, expected.x, atol=5e-3)
+
+
+def test_part_reads_those_that_follow(tmp_path):
+    first, second = fixture.write(tmp_path).files
+    assert only(first).tracks[0].t.size == 81
+    assert only(second).tracks[0].t.size < 81
+
+
+def test_parts_are_drives(tmp_path):
+    fixture.write(tmp_path)
+    write(tmp_path / "demo_3.5.record", ego_only())
+    write(tmp_path / "x.record.00007", ego_only())
+    write(tmp_path / "x.record.00009", ego_only())  # a part is missing: another drive
+    (tmp_path / "notes.record.txt").write_text("not a record")
+    found, _ = parts("apollo", tmp_path)
+    assert [part.name for part in found] == [
+        *("20210723091215.record.00000", "demo_3.5.record", "x.record.00007")
+    ]
+    names = [recording.name for recording in read_recordings("apollo", tmp_path)]
+    assert names == ["20210723091215", "demo_3.5", "x"]
+
+
+def test_prediction_where_perception_is_missing(tmp_path):
+    found = only(tmp_path, fixture.drive(obstacles="prediction"))
+    expected = fixture.expected()["15"]
+    np.testing.assert_allclose(track(found, "15").x, expected.x, atol=5e-3)
+    assert any("those of prediction" in note for note in found.notes)
+
+
+def test_heading_from_the_quaternion(tmp_path):
+    ego = only(tmp_path, ego_only(heading=False)).tracks[0]
+    np.testing.assert_allclose(ego.heading, 0.0, atol=1e-9)
+    np.testing.assert_allclose(ego.x, 0.8 * np.arange(21), atol=1e-3)
+
+
+def test_speed_of_the_chassis(tmp_path):
+    """Where localization has none; else differences of positions."""
+    messages = ego_only(velocity=False)
+    np.testing.assert_allclose(only(tmp_path, messages).tracks[0].speed, 8.0, atol=1e-3)
+    for k in range(0, 21, 5):
+        content = message([(5, Single(7.5)), (25, fixture.stamped(0.1 * k))])
+        messages.append((CHASSIS, 0.1 * k, content))
+    np.testing.assert_allclose(only(tmp_path, messages).tracks[0].speed, 7.5)
+
+
+def test_drive_of_the_planner_is_noted(tmp_path):
+    messages = ego_only()
+    messages += [(CHASSIS, 0.1, fixture.chassis(0.1, manual=k > 2)) for k in range(4)]
+    notes = only(tmp_path, messages).notes
+    assert any("75% of the drive not in COMPLETE_MANUAL" in note for note in notes)
+
+
+def test_obstacles_without_localization(tmp_path):
+    messages = [item for item in fixture.drive() if item[0] == PERCEPTION]
+    recording = only(tmp_path, messages)
+    assert "ego" not in {found.id for found in recording.tracks}
+    assert any("no ego track" in note for note in recording.notes)
+
+
+def perceived(changes, count=11):
+    """The ego and one obstacle with other fields."""
+    messages = ego_only()
+    for k in range(count):
+        t = 0.1 * k
+        item = [(n, v) for n, v in fixture.seen_at(t)[0] if n not in changes]
+        item += [(n, v) for n, v in changes.items() if v is not None]
+        content = message([(1, item), (2, fixture.stamped(t))])
+        messages.append((PERCEPTION, t, content))
+    return messages
+
+
+@pytest.mark.parametrize(
+    ("choice", "number", "kind"),
+    [
+        ("auto", 0, Kind.VEHICLE),
+        ("auto", 1, Kind.VEHICLE),
+        ("static", 0, Kind.STATIC),
+        ("drop", 0, None),
+        ("auto", 2, Kind.STATIC),
+        ("auto", 77, Kind.VEHICLE),
+    ],
+)
+def test_unknown_class(tmp_path, choice, number, kind):
+    found = only(tmp_path, perceived({10: number}), unknown=choice).tracks
+    assert [t.kind for t in found if t.id == "12"] == ([] if kind is None else [kind])
+
+
+def test_size_that_was_not_measured(tmp_path):
+    found = track(only(tmp_path, perceived({5: None, 6: 0.0})), "12")
+    assert (found.length, found.width) == (4.5, 1.8)
+
+
+def test_states_that_are_none_are_left_out(tmp_path):
+    messages = perceived({1: -1}) + perceived({2: None})[21:]
+    recording = only(tmp_path, messages)
+    assert [found.id for found in recording.tracks] == ["ego"]
+    assert any("22 obstacle states without" in note for note in recording.notes)
+
+
+def test_message_twice_and_out_of_order(tmp_path):
+    messages = ego_only()
+    found = only(tmp_path, [*messages[::-1], *messages[3:9]]).tracks[0]
+    np.testing.assert_allclose(found.x, 0.8 * np.arange(21), atol=1e-3)
+
+
+def test_heading_across_the_wrap():
+    boxes = apollo._uniform(
+        ids=np.zeros(4, np.int64),
+        names=("a",),
+        t=np.array([0.05, 0.15, 0.25, 0.35]),
+        columns=(*[np.zeros(4)] * 2, np.array([3.13, -3.13] * 2), *[np.ones(4)] * 3),
+        kind=np.ones(4, np.int64),
+        rate=10.0,
+    )
+    np.testing.assert_allclose(np.cos(boxes.heading), -1.0, atol=1e-4)
+
+
+def test_topics_stamped_on_different_clocks(tmp_path):
+    """Simulated and real time: the times of recording are common to both."""
+    messages = [
+        (name, t, content)
+        if name == PERCEPTION
+        else (name, t, content + message([(1, [(1, 12.0 + t)])]))
+        for name, t, content in perceived({})
+    ]
+    recording = only(tmp_path, messages)
+    assert any("different clocks" in note for note in recording.notes)
+    assert track(recording, "12").t[0] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_channels_of_other_names(tmp_path):
+    messages = [("/my/pose", t, content) for _, t, content in ego_only()]
+    channels = {"/my/pose": fixture.CHANNELS[LOCALIZATION]}
+    found = only(
+        tmp_path, messages, channels=channels, topics={"localization": "/my/pose"}
+    )
+    assert found.tracks[0].id == "ego"
+    with pytest.raises(InputError, match=r"source TOML: topics\.pose: unknown"):
+        only(tmp_path, messages, channels=channels, topics={"pose": "/my/pose"})
+
+
+def test_record_that_was_never_closed(tmp_path):
+    """Written while the computer lost power: no index, header not completed."""
+    path = write(tmp_path / "a.record", ego_only(), complete=False)
+    content = path.read_bytes()
+    index = len(fixture.section(3, message([(1, [(1, 4), (2, 2064)])])))
+    path.write_bytes(content[:-index])
+    recording = only(path)
+    assert any("never closed" in note for note in recording.notes)
+
+
+def test_options(tmp_path):
+    found = only(
+        tmp_path,
+        ego_only(),
+        rate_hz=5.0,
+        ego={"length": 4.0, "width": 1.7, "rear_axle_to_centre": 0.0},
+        speed_limit=8.0,
+    )
+    ego = found.tracks[0]
+    assert (ego.t.size, ego.length, ego.width) == (11, 4.0, 1.7)
+    assert ego.x[0] == pytest.approx(-fixture.AHEAD)
+    assert found.default_speed_limit == 8.0
+    for bad in ({"rate_hz": 0}, {"ego": 1}, {"unknown": "x"}, {"topics": 3}):
+        with pytest.raises(InputError, match="source TOML"):
+            only(tmp_path, perceived({10: 0}), **bad)
+
+
+@pytest.mark.dataset
+@pytest.mark.skipif(not EXAMPLE.exists(), reason="needs the recorded data")
+def test_example_record_of_apollo():
+    """34 messages of a simulated car that stands; values read with cyber_record."""
+    recording = only(EXAMPLE)
+    (ego,) = recording.tracks
+    assert recording.name == "example"
+    assert ego.t.size == 2
+    heading = -2.25563014963147
+    x = 315323.44588835048 + fixture.AHEAD * np.cos(heading)
+    np.testing.assert_allclose(ego.x, x - 315000.0, atol=1e-6)
+    np.testing.assert_allclose(ego.heading, heading)
+    np.testing.assert_array_equal(ego.speed, 0.0)
+    assert ego.destination == pytest.approx((314.98923, 388.09329), abs=1e-4)
+    assert any("no obstacles" in note for note in recording.notes)
+    assert any("100% of the drive" in note for note in recording.notes)
+
+
+@pytest.mark.dataset
+@pytest.mark.skipif(not EXAMPLE.exists(), reason="needs the recorded data")
+def test_same_messages_as_cyber_record():
+    package = pytest.importorskip("cyber_record.record")
+    expected = [
+        (topic, time, found.header.timestamp_sec)
+        for topic, found, time in package.Record(str(EXAMPLE)).read_messages()
+    ]
+    found = []
+    with cyber_record.Record(EXAMPLE) as record:
+        for topic, time, content in record.messages(lambda _: True):
+            kind, schema = record.channels[topic]
+            plan = schema.plan(kind, {"header": {"timestamp_sec": None}})
+            found.append(
+                (topic, time, decode(plan, content)["header"]["timestamp_sec"])
+            )
+    assert sorted(found) == sorted(expected)
+
+
+# ------------------------------------------------------------------ malformed
+
+
+def pose_with(**changes):
+    """Localization whose position or heading is absurd."""
+    pose = [(1, fixture.point(changes.get("x", 587000.0), 4141000.0))]
+    pose += [(6, changes.get("heading", 0.0))]
+    return message([(1, fixture.stamped(changes.get("t", 0.0))), (2, pose)])
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (pose_with(x=float("nan")), r"pose: x: nan"),
+        (pose_with(x=1e300), r"pose: x: 1e\+300"),
+        (pose_with(heading=float("inf")), r"pose: heading: inf"),
+        (pose_with(t=1e9), r"timestamp_sec: .* s from first to last"),
+        (b"", r"timestamp_sec: .* s from first to last"),
+        (message([(1, fixture.stamped(0.3))]), r"pose: x: nan"),
+        (b"\xff\xff", r"message 3: varint: no end .*expected an Apollo message"),
+        (b"\x0a\x05\x00", r"message 3: field 1: 5 bytes of 1 left"),
+        (b"\x0b", r"message 3: field 1: wire type 3"),
+        (message([(1, 7)]), r"message 3: field header: wire type 0: not of type 11"),
+        (message([(2, [(1, [(1, 5)])])]), r"message 3: field x: wire type 0"),
+        (message([(2, [(6, Single(0.0))])]), r"message 3: field heading: wire type 5"),
+    ],
+)
+def test_absurd_messages(tmp_path, content, expected):
+    messages = ego_only()
+    messages[3] = (LOCALIZATION, 0.3, content)
+    with pytest.raises(InputError, match=expected) as error:
+        only(tmp_path, messages)
+    assert f"a.record: {LOCALIZATION}: " in str(error.value) or "timestamp" in expected
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({2: fixture.point(1e300, 0.0)}, r"obstacles: .*x: 1e\+300"),
+        ({3: float("nan")}, r"obstacles: .*theta: nan"),
+        ({4: fixture.point(500.0, 0.0)}, r"speed: 500"),
+        ({5: -2.0}, r"length: -2 m: expected 0 to"),
+        ({5: float("inf")}, r"length: inf"),
+        ({6: 1e9}, r"width: 1e\+09 m"),
+    ],
+)
+def test_absurd_obstacles(tmp_path, changes, expected):
+    with pytest.raises(InputError, match=expected):
+        only(tmp_path, perceived(changes))
+
+
+def test_nothing_to_read(tmp_path):
+    with pytest.raises(
+        InputError, match=rf"{LOCALIZATION}: no messages, nor obstacles: expected"
+    ):
+        only(tmp_path, [(CHASSIS, 0.0, fixture.chassis(0.0))])
+    with pytest.raises(InputError, match="no messages, nor obstacles"):
+        only(tmp_path, [])
+
+
+def test_rows_are_limited(tmp_path, monkeypatch):
+    from rcirl_jax.data.importers import apollo_messages
+
+    monkeypatch.setattr(apollo_messages, "MAX_ROWS", 5)
+    with pytest.raises(InputError, match="more than 5 obstacle states"):
+        only(tmp_path, perceived({}))
+
+
+HEADER = fixture.header()
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (b"", "expected a cyber record"),
+        (b"\x00" * 15, "truncated"),
+        (bytes(3000), "type 0, 0 bytes: expected type 1 to 4"),
+        (HEADER[:100], "header: type 0, .*: expected that of a cyber record"),
+        (struct.pack("<i4xq", 9, 5) + bytes(3000), "header: type 9, 5 bytes"),
+        (struct.pack("<i4xq", 0, -5) + bytes(3000), "header: type 0, -5 bytes"),
+        (struct.pack("<i4xq", 0, 2**62) + bytes(3000), "header: type 0"),
+        (fixture.header(compress=1), "header: compress: BZ2: expected none"),
+        (fixture.header(compress=2), "header: compress: LZ4: expected none"),
+        (HEADER + bytes(7), "section at byte 2064: .*truncated"),
+        (HEADER + struct.pack("<i4xq", 2, 2**62), "section at byte .*truncated"),
+        (HEADER + struct.pack("<i4xq", 2, -1), "type 2, -1 bytes: expected type 1"),
+        (HEADER + struct.pack("<i4xq", 7, 0), "type 7, 0 bytes: expected type 1 to 4"),
+        (HEADER + fixture.section(2, b"\x0a\x7f"), "127 bytes of 0 left"),
+        (HEADER + fixture.section(2, message([(1, 5)])), "message: number"),
+        (HEADER + fixture.section(2, message([(1, [(1, b"\xff")])])), "text: invalid"),
+        (HEADER + fixture.section(4, message([(3, 5)])), "message: number"),
+        (HEADER + fixture.section(4, message([(3, b"\x0a\x05")])), "5 bytes of 0 left"),
+    ],
+)
+def test_malformed_record(tmp_path, content, expected):
+    path = tmp_path / "a.record"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=expected) as error:
+        read(path)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def channel(desc, kind="apollo.localization.LocalizationEstimate"):
+    return {LOCALIZATION: (kind, desc)}
+
+
+def estimate(*parts):
+    """Descriptors with a LocalizationEstimate of other fields."""
+    types = [fixture.type_of("LocalizationEstimate", list(parts))]
+    return fixture.proto_desc(fixture.file_of("x.proto", "apollo.localization", types))
+
+
+@pytest.mark.parametrize(
+    ("channels", "expected"),
+    [
+        ({}, "no descriptor before its first message"),
+        (channel(b""), "LocalizationEstimate: not among the descriptors"),
+        (channel(estimate(), "a.B"), "message type a.B: not among"),
+        (
+            channel(estimate(fixture.field_of("header", 1, fixture.INT32))),
+            "LocalizationEstimate.header: type 5: another is known",
+        ),
+        (
+            channel(estimate(fixture.field_of("measurement_time", 4, fixture.STRING))),
+            "measurement_time: type 9: another is known",
+        ),
+        (
+            channel(
+                estimate(
+                    fixture.field_of("pose", 2, 11, type_name=".x.Y", repeated=True)
+                )
+            ),
+            "pose: type 11: another is known",
+        ),
+        (
+            channel(estimate(fixture.field_of("pose", 2, 11, type_name=".x.Y"))),
+            "message type x.Y: not among the descriptors",
+        ),
+        (channel(message([(1, b"\xff\xff")])), "varint: no end"),
+        (channel(message([(1, [(4, [(2, [(3, b"x")])])])])), "descriptor: field"),
+    ],
+)
+def test_hostile_descriptors(tmp_path, channels, expected):
+    with pytest.raises(InputError, match=expected) as error:
+        only(tmp_path, ego_only(), channels=channels)
+    assert "a.record: " in str(error.value)
+
+
+def nest(number, depth, inner=b""):
+    for _ in range(depth):
+        inner = varint(number << 3 | 2) + varint(len(inner)) + inner
+    return inner
+
+
+@pytest.mark.parametrize(
+    "desc",
+    [nest(2, 3000), message([(1, message([(4, nest(3, 3000))]))])],
+)
+def test_deeply_nested_descriptors(tmp_path, desc):
+    with pytest.raises(InputError, match="descriptor"):
+        only(tmp_path, ego_only(), channels=channel(desc))
+
+
+def test_descriptor_that_contains_itself(tmp_path):
+    """The depth of what is decoded is that of what is wanted."""
+    me = ".apollo.localization.LocalizationEstimate"
+    desc = estimate(fixture.field_of("pose", 2, 11, type_name=me))
+    with pytest.raises(InputError, match="pose: x: nan"):
+        only(tmp_path, ego_only(), channels=channel(desc))
+
+
+def test_numbers_of_every_type():
+    """Against the encoding's specification: zigzag, two's complement, fixed."""
+    kinds = {"a": 3, "b": 17, "c": 15, "d": 16, "e": 7, "f": 6, "g": 2, "h": 8, "i": 14}
+    entries = [
+        fixture.field_of(n, k + 1, kind) for k, (n, kind) in enumerate(kinds.items())
+    ]
+    entries[-1] = fixture.field_of("i", 9, 14, type_name=".p.M.E")
+    types = [fixture.type_of("M", entries, enums=[fixture.enum_of("E", [("UP", -1)])])]
+    schema = Schema()
+    schema.add(memoryview(fixture.file_of("m.proto", "p", types)))
+    wanted = {**dict.fromkeys("abcdefgh"), "i": ENUM_NAME}
+    raw = message([(1, -5), (2, 9)])
+    raw += varint(3 << 3 | 5) + struct.pack("<i", -7)
+    raw += varint(4 << 3 | 1) + struct.pack("<q", -8)
+    raw += varint(5 << 3 | 5) + struct.pack("<I", 2**32 - 1)
+    raw += varint(6 << 3 | 1) + struct.pack("<Q", 2**64 - 1)
+    raw += message([(7, Single(0.5)), (8, True), (9, 3)])
+    assert decode(schema.plan("p.M", wanted), memoryview(raw)) == {
+        **{"a": -5, "b": -5, "c": -7, "d": -8, "e": 2**32 - 1, "f": 2**64 - 1},
+        **{"g": 0.5, "h": 1, "i": "3"},
+    }
+
+
+def test_unknown_fields_are_stepped_over():
+    raw = message([(1, 5), (2, 1.5), (3, Single(2.0)), (4, Packed([1, 2])), (5, "x")])
+    assert [number for number, _, _ in fields(memoryview(raw))] == [1, 2, 3, 4, 5]
+    for bad in (b"\x09\x00", b"\x0d\x00", b"\x80" * 11, b"\x0f"):
+        with pytest.raises(WireError):
+            list(fields(memoryview(bad)))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_flipped_bytes_are_one_line(tmp_path, seed):
+    content = fixture.record(perceived({}))
+    rng = np.random.default_rng(seed)
+    path = tmp_path / "a.record"
+    for _ in range(30):
+        damaged = bytearray(content)
+        for place in rng.integers(0, len(content), 8):
+            damaged[place] = rng.integers(0, 256)
+        path.write_bytes(damaged)
+        try:
+            read(path)
+        except InputError as error:
+            line = str(error)
+            assert "\n" not in line

@@ -1,0 +1,85 @@
+"""Executors: order, errors, and pieces that are lost with their process."""
+
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.executor import Here, Processes, make_executor
+
+
+def twice(item):
+    yield item
+    yield -item
+
+
+def fails(item):
+    if item == 3:
+        raise InputError("three.csv: x: 3: expected another number")
+    yield item
+
+
+def dies_once(folder):
+    """Kills its own process the first time."""
+
+    marked = Path(folder)
+    if not marked.exists():
+        marked.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    yield marked.name
+
+
+def dies(item):
+    os.kill(os.getpid(), signal.SIGKILL)
+    yield item
+
+
+@pytest.mark.parametrize("make", [Here, lambda: Processes(2)], ids=["here", "two"])
+def test_results_keep_the_order_of_the_items(make):
+    got = list(make().stream(twice, range(1, 9)))
+    assert got == [x for item in range(1, 9) for x in (item, -item)]
+
+
+@pytest.mark.parametrize("make", [Here, lambda: Processes(2)], ids=["here", "two"])
+def test_an_error_of_a_piece_arrives_as_it_is(make):
+    results = make().stream(fails, range(6))
+    assert [next(results) for _ in range(3)] == [0, 1, 2]
+    with pytest.raises(InputError, match=r"^three\.csv: x: 3"):
+        next(results)
+
+
+def test_a_piece_lost_with_its_process_is_done_again(tmp_path):
+    items = [tmp_path / name for name in ("a", "b", "c")]
+    for item in items[::2]:
+        item.touch()  # these live
+    assert list(Processes(2).stream(dies_once, items)) == ["a", "b", "c"]
+
+
+def test_a_piece_that_always_kills_its_process_is_one_line():
+    with pytest.raises(InputError, match=r"a process was killed 3 times at 7: exp"):
+        list(Processes(1).stream(dies, [7]))
+
+
+def test_no_more_items_are_taken_than_the_workers_need():
+    taken = []
+
+    def items():
+        for item in range(100):
+            taken.append(item)
+            yield item
+
+    results = Processes(1).stream(twice, items())
+    next(results)
+    assert len(taken) <= 4
+    results.close()
+
+
+def test_wrong_flags_are_one_line():
+    with pytest.raises(InputError, match=r"--executor: x: expected one of"):
+        make_executor("x")
+    with pytest.raises(InputError, match=r"--workers: 0: expected at least 1"):
+        make_executor("local", workers=0)
+    assert isinstance(make_executor("local"), Here)
+    assert make_executor("local", workers=3).workers == 3
