@@ -15,7 +15,7 @@ import numpy as np
 from rcirl_jax.data.assemble import assemble
 from rcirl_jax.data.collect import Collector
 from rcirl_jax.data.config import CollectConfig
-from rcirl_jax.data.importers import read_part
+from rcirl_jax.data.importers import csv_stream, read_part
 from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Demonstration, Recording
@@ -126,6 +126,26 @@ def cut_part(
     part: Part, config: CollectConfig, done: Mapping[str, str] | None = None
 ) -> Iterator[Cut]:
     """All recordings of a part, one at a time; arguments as `cut`."""
-    for recording in read_part(part.format, part.input, part.spec):
-        made = cut(recording, config, done)
-        yield dataclasses.replace(made, part=str(part.input))
+    for recording in recordings_of(part):
+        yield from cut_one((part, recording), config, done)
+
+
+def cut_one(
+    item: tuple[Part, Recording],
+    config: CollectConfig,
+    done: Mapping[str, str] | None = None,
+) -> Iterator[Cut]:
+    """One recording of a part; arguments as `cut`."""
+    part, recording = item
+    made = cut(recording, config, done)
+    yield dataclasses.replace(made, part=str(part.input))
+
+
+def recordings_of(part: Part) -> Iterator[Recording]:
+    """All recordings of a part, one at a time."""
+    return read_part(part.format, part.input, part.spec)
+
+
+def is_long(part: Part) -> bool:
+    """Whether a part holds more than fits into memory at once."""
+    return part.format == "csv" and csv_stream.is_long(part.input, part.spec)

@@ -20,7 +20,15 @@ import numpy as np
 import tqdm
 
 from rcirl_jax.data.config import CollectConfig
-from rcirl_jax.data.cut import Cut, Part, cut, cut_part
+from rcirl_jax.data.cut import (
+    Cut,
+    Part,
+    cut,
+    cut_one,
+    cut_part,
+    is_long,
+    recordings_of,
+)
 from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.data.splits import assign_groups
 from rcirl_jax.data.store import DatasetWriter, Manifest
@@ -262,8 +270,12 @@ def import_parts(
     places = executor or Here()
 
     def cuts(known: dict[str, str]) -> Iterable[Cut]:
-        piece = functools.partial(cut_part, config=config.collect, done=known)
-        return places.stream(piece, parts)
+        settings = {"config": config.collect, "done": known}
+        if len(parts) >= places.workers and not any(map(is_long, parts)):
+            return places.stream(functools.partial(cut_part, **settings), parts)
+        # few or long files: read here, one recording at a time, and cut there
+        whole = ((part, one) for part in parts for one in recordings_of(part))
+        return places.stream(functools.partial(cut_one, **settings), whole)
 
     return _import(cuts, len(parts), output, config, overwrite)
 

@@ -27,6 +27,7 @@ STANDING_MPS = 0.5  # m/s
 CRUISE_MPS = 5.0  # m/s
 CRUISE_RANGE_MPS = 1.5  # m/s of change while cruising
 TURN_RAD = np.deg2rad(30.0)  # rad of heading change along the path
+CUT_IN_M = 0.5  # m sideways, at least, of who cuts in; position noise is less
 STOP_REACH_M = 12.0  # m from the line within which standing is a stop at it
 
 
@@ -70,7 +71,7 @@ def _decide(row: dict, slot: int, blocks: np.ndarray) -> Decision:
     kind = row["obstacles.kind"][slot]
     if kind in (Kind.STOP, Kind.VIRTUAL):
         return _decide_line(row, slot)
-    swerve = _swerve_past(row, slot)
+    swerve = _swerve_past(row, slot, blocks)
     if swerve > 0.0:
         lane = row["path.lane_left"][0] - row["path.lane_right"][0]
         beside = _decide_beside(row, slot)
@@ -107,10 +108,10 @@ def _decide_ahead(row: dict, slot: int, blocks: np.ndarray) -> Decision:
     return Decision.YIELD
 
 
-def _swerve_past(row: dict, slot: int) -> float:
+def _swerve_past(row: dict, slot: int, blocks: np.ndarray) -> float:
     """Lateral move [m] by which the driver got past who was in the way; else 0.
 
-    In the way: ahead at the frame, with boxes that overlap laterally. A lead
+    In the way: ahead at the frame, within the lateral buffer. A lead
     that turns off is passed too, but then it moved aside, not the driver.
     """
     human, half = row["human.s"], 0.5 * row["ego.length"]
@@ -121,7 +122,8 @@ def _swerve_past(row: dict, slot: int) -> float:
     )
     valid = row["obstacles.valid"][slot] & row["time_valid"]
     ahead = row["obstacles.s_lower"][slot, 0] > human[0] + half
-    if not (valid[0] and ahead and aside < 0.5 * row["ego.width"]):
+    reach = 0.5 * row["ego.width"] + LATERAL_BUFFER_M
+    if not (valid[0] and ahead and (aside < reach or blocks[0])):
         return 0.0
     driver = np.abs(row["human.l"] - row["human.l"][0])
     passed = valid & (human - half > row["obstacles.s_upper"][slot])
@@ -187,7 +189,8 @@ def _cuts_in(row: dict, blocks: np.ndarray) -> bool:
     path_l = _path_at(row, s)
     own = np.abs(l - l[rows, first][:, None])
     drivers = np.abs(path_l - path_l[rows, first][:, None])
-    return bool(np.any(enters & along & (own > drivers)[:, 1:]))
+    moves = np.max(np.where(valid, own, 0.0), axis=1, keepdims=True) > CUT_IN_M
+    return bool(np.any(enters & along & (moves & (own > drivers))[:, 1:]))
 
 
 def _tags(row: dict, decisions: np.ndarray, blocks: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ import numpy as np
 
 from rcirl_jax.data.collect import Collector
 from rcirl_jax.data.config import CollectConfig
+from rcirl_jax.data.labels import add_labels
 from rcirl_jax.evaluation.label_cases import clear
 from rcirl_jax.evaluation.label_signals import (
     STANDING_MPS,
@@ -22,7 +23,7 @@ from rcirl_jax.evaluation.label_signals import (
     stands_in_reach,
 )
 from rcirl_jax.evaluation.label_truth import ClassScore, format_scores
-from rcirl_jax.types import Decision, Kind, Recording, Tag, Track
+from rcirl_jax.types import Decision, Demonstration, Kind, Recording, Tag, Track
 from rcirl_jax.units import HORIZON_S
 
 MOVING_MPS = 2.0  # m/s, as the definition of the tags
@@ -165,3 +166,38 @@ def format_stops(report: StopReport) -> str:
         f" {report.trusted} of {report.signals} written signals used"
     )
     return "\n".join([head, *format_scores("observed", report.scores)])
+
+
+def compare_stored(stored: Demonstration) -> tuple[ClassScore, ...]:
+    """A dataset's stored labels against today's rules, which count as the truth.
+
+    Args:
+      stored: demonstrations [S]; their scenes are labelled again.
+    """
+    leaves = {
+        f"{part}.{name}": np.asarray(values)
+        for part in ("ego", "path", "obstacles")
+        for name, values in vars(getattr(stored.scene, part)).items()
+    }
+    leaves["human.s"] = np.asarray(stored.human.s)
+    leaves["human.l"] = np.asarray(stored.human.l)
+    leaves["time_valid"] = np.asarray(stored.scene.time_valid)
+    before, kind = np.asarray(stored.decisions), leaves["obstacles.kind"]
+    decisions, tags = np.zeros_like(before), np.zeros_like(stored.scene.tags)
+    for i in range(len(before)):
+        row = {name: values[i] for name, values in leaves.items()}
+        add_labels(row)
+        decisions[i], tags[i] = row["decisions"], row["tags"]
+    known = kind != Kind.NONE
+    pairs = [(d.name, decisions[known] == d, before[known] == d) for d in Decision]
+    old = np.asarray(stored.scene.tags)
+    pairs += [(f"tag {t.name}", tags[:, t], old[:, t]) for t in Tag]
+    return tuple(
+        ClassScore(
+            name=name.lower(),
+            right=int(np.sum(now & then)),
+            wrong=int(np.sum(then & ~now)),
+            missed=int(np.sum(now & ~then)),
+        )
+        for name, now, then in pairs
+    )

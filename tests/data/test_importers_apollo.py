@@ -7,7 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rcirl_jax.data.importers import apollo, cyber_record, parts, read_recordings
+from rcirl_jax.data.importers import (
+    apollo,
+    apollo_messages,
+    apollo_obstacles,
+    cyber_record,
+    parts,
+    read_recordings,
+)
 from rcirl_jax.data.importers.wire import (
     ENUM_NAME,
     Schema,
@@ -183,6 +190,65 @@ def test_states_that_are_none_are_left_out(tmp_path):
     assert any("22 obstacle states without" in note for note in recording.notes)
 
 
+@pytest.mark.parametrize("size", [0, 3000, 9000])
+def test_obstacles_with_long_contours(tmp_path, size):
+    """Large obstacles are read one by one; fields of no interest are skipped."""
+    contour = message([(8, fixture.point(1.0, 2.0))] * (size // 30))
+    messages = ego_only()
+    for k in range(11):
+        item = message(fixture.seen_at(0.1 * k)[0]) + contour
+        other = message(fixture.seen_at(0.1 * k)[1])
+        content = message([(1, item), (1, other), (2, fixture.stamped(0.1 * k))])
+        messages.append((PERCEPTION, 0.1 * k, content))
+    found = track(only(tmp_path, messages), "12")
+    np.testing.assert_allclose(found.x, 25.0 + 0.8 * np.arange(11), atol=1e-6)
+    assert (found.kind, found.length, found.width) == (Kind.VEHICLE, 4.5, 1.9)
+    np.testing.assert_allclose(found.speed, 8.0)
+
+
+def test_batches(tmp_path, monkeypatch):
+    whole = only(tmp_path, perceived({}))
+    monkeypatch.setattr(apollo_obstacles, "BATCH_BYTES", 300)
+    apart = only(tmp_path, perceived({}))
+    np.testing.assert_array_equal(track(apart, "12").x, track(whole, "12").x)
+
+
+@pytest.mark.parametrize(
+    ("types", "expected"),
+    [
+        ([("id", 1, 5)], "field position: not among"),
+        ([("id", 1, 9)], "id: type 9: another is known"),
+        ([("id", 1, 7)], "field velocity: not among"),
+    ],
+)
+def test_descriptors_of_other_obstacles(tmp_path, types, expected):
+    parts = [fixture.field_of(*entry) for entry in types]
+    if types[0][2] == 7:
+        parts.append(fixture.common("position", 2, "Point3D"))
+    kinds = [
+        fixture.type_of("PerceptionObstacle", parts),
+        fixture.type_of(
+            "PerceptionObstacles",
+            [
+                fixture.field_of(
+                    *("perception_obstacle", 1, 11),
+                    type_name=f".{fixture.OBSTACLE}",
+                    repeated=True,
+                ),
+                fixture.header_field(2),
+            ],
+        ),
+    ]
+    file = fixture.file_of("p.proto", "apollo.perception", kinds)
+    desc = fixture.proto_desc(file, fixture._HEADER, fixture._GEOMETRY)
+    channels = {
+        **fixture.CHANNELS,
+        PERCEPTION: ("apollo.perception.PerceptionObstacles", desc),
+    }
+    with pytest.raises(InputError, match=expected):
+        only(tmp_path, perceived({}), channels=channels)
+
+
 def test_message_twice_and_out_of_order(tmp_path):
     messages = ego_only()
     found = only(tmp_path, [*messages[::-1], *messages[3:9]]).tracks[0]
@@ -351,8 +417,6 @@ def test_nothing_to_read(tmp_path):
 
 
 def test_rows_are_limited(tmp_path, monkeypatch):
-    from rcirl_jax.data.importers import apollo_messages
-
     monkeypatch.setattr(apollo_messages, "MAX_ROWS", 5)
     with pytest.raises(InputError, match="more than 5 obstacle states"):
         only(tmp_path, perceived({}))

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import sys
 
 import numpy as np
 import pyarrow as pa
@@ -293,6 +294,15 @@ def test_sizes_are_limited_before_reading(tmp_path, monkeypatch):
     assert "columns: 18" in message(path)
 
 
+def test_a_small_file_of_many_rows(tmp_path):
+    """Six million equal cells take 20 kB on disk."""
+    path, _ = w.write_scenario(tmp_path)
+    cells = pa.array(np.zeros(6_000_000, np.int8))
+    pq.write_table(pa.table({"timestep": cells}), path, row_group_size=6_000_000)
+    assert path.stat().st_size < 50_000
+    assert "rows: 6000000 in row groups of [6000000]" in message(path)
+
+
 def test_a_long_text_in_every_row_exists_once(tmp_path):
     """100 MB when written out, refused without that."""
     table = w.columns()
@@ -330,6 +340,13 @@ def test_garbled_parquet(tmp_path):
             errors.append(str(error))
     assert all(error.startswith(str(path)) for error in errors)
     assert len(errors) > 20
+
+
+def test_a_missing_package_is_one_line(tmp_path, monkeypatch):
+    path = w.write(tmp_path).input
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    assert "pyarrow: not installed" in message(path)
+    assert "rcirl-jax[logs]" in message(path)
 
 
 def test_no_parquet_at_all(tmp_path):

@@ -416,6 +416,12 @@ def test_chunk_that_claims_gigabytes(dataset):
         read(path)
 
 
+def test_read_is_limited(dataset, monkeypatch):
+    monkeypatch.setattr(zarr2, "MAX_READ_BYTES", 1000)
+    with pytest.raises(InputError, match=r"frames: records 0 to 100: .*at most 1000"):
+        read(dataset[0])
+
+
 def test_damaged_chunk(dataset):
     path, _ = dataset
     chunk = path / "agents" / "0"

@@ -419,6 +419,12 @@ def test_malformed_map(folder, statement, expected):
     assert "\n" not in str(error.value)
 
 
+def test_lines_are_limited(folder, monkeypatch):
+    monkeypatch.setattr(geopackage, "MAX_POINTS", 11)
+    with pytest.raises(InputError, match=r"geom: \d+ points: expected at most 11"):
+        only(folder)
+
+
 def test_map_off_the_earth(folder):
     path = folder.parents[2] / "maps" / fixture.CITY / "9.15.1915" / "map.gpkg"
     wild = fixture.geometry(2, [[500.0, 95.0], [0.0, 0.0]], to=np.asarray)

@@ -26,6 +26,7 @@ from rcirl_jax.data.importers.apollo_messages import (
     Drive,
     read_drive,
 )
+from rcirl_jax.data.importers.apollo_obstacles import COLUMNS
 from rcirl_jax.data.importers.cyber_record import (
     drive_name,
     first_parts,
@@ -75,13 +76,13 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
 
 def _recording(path: Path, drive: Drive, spec: dict) -> Recording:
     rate = positive(spec, "rate_hz", RATE_HZ)
-    key = "perception" if drive.perception else "prediction"
+    key = "perception" if any(map(len, drive.perception)) else "prediction"
     rows = {
         "localization": _table(drive.localization, 7),
         "chassis": _table(drive.chassis, 3),
-        key: _table(drive.perception or drive.prediction, 11),
+        key: np.concatenate([np.zeros((0, COLUMNS)), *getattr(drive, key)]),
     }
-    _check_present(path, drive, rows)
+    _check_present(path, drive, key, len(rows[key]))
     clocks = _clocks(rows, drive.notes)
     seen = [clocks[name] for name in ("localization", key) if clocks[name].size]
     start = min(float(clock.min()) for clock in seen)
@@ -127,9 +128,8 @@ def _table(rows: list[tuple], columns: int) -> np.ndarray:
     return np.array(rows, np.float64).reshape(-1, columns)
 
 
-def _check_present(path: Path, drive: Drive, rows: dict[str, np.ndarray]) -> None:
+def _check_present(path: Path, drive: Drive, key: str, obstacles: int) -> None:
     """Say what is missing; without any position there is nothing to read."""
-    obstacles = drive.perception or drive.prediction
     if not drive.localization and not obstacles:
         raise InputError(
             f"{path}: {TOPICS['localization']}: no messages, nor obstacles: "
@@ -139,7 +139,7 @@ def _check_present(path: Path, drive: Drive, rows: dict[str, np.ndarray]) -> Non
         drive.notes.append("no localization recorded; no ego track")
     if not obstacles:
         drive.notes.append("no obstacles recorded; the ego is alone")
-    elif not drive.perception:
+    elif key == "prediction":
         drive.notes.append("no perception recorded; obstacles are those of prediction")
     automatic = 1.0 - float(np.mean(drive.modes)) if drive.modes else 0.0
     if automatic > 0.0:

@@ -1,21 +1,21 @@
 """Messages of an Apollo record as rows of numbers.
 
 Fields are looked up by name in the record's own descriptors; those that a
-release of Apollo lacks are NaN or 0. Obstacles that perception could not measure
-get the size of their class.
+release of Apollo lacks are NaN or 0.
 """
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from rcirl_jax.data.importers.apollo_obstacles import Obstacles
 from rcirl_jax.data.importers.cyber_record import Record
-from rcirl_jax.data.importers.perception import UNKNOWN, section
+from rcirl_jax.data.importers.perception import section
 from rcirl_jax.data.importers.wire import ENUM_NAME, Plan, WireError, decode
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Kind
 
 TOPICS = {
     "localization": "/apollo/localization/pose",
@@ -58,19 +58,6 @@ WANTED = {
     "routing": ROUTE,
     "routing_history": ROUTE,
 }
-KIND_NAMES = {
-    "PEDESTRIAN": Kind.PEDESTRIAN,
-    "BICYCLE": Kind.CYCLIST,
-    "VEHICLE": Kind.VEHICLE,
-    "UNKNOWN_UNMOVABLE": Kind.STATIC,
-}
-# m, [length, width] where perception measured none
-SIZES_M = {
-    Kind.VEHICLE: (4.5, 1.8),
-    Kind.CYCLIST: (1.8, 0.6),
-    Kind.PEDESTRIAN: (0.5, 0.5),
-}
-OTHER_SIZE_M = (1.0, 1.0)  # m
 MANUAL = "COMPLETE_MANUAL"  # driving mode of a human driver
 MAX_ROWS = 20_000_000  # obstacle states of one drive
 NAN = float("nan")
@@ -78,18 +65,18 @@ NAN = float("nan")
 
 @dataclasses.dataclass(kw_only=True)
 class Drive:
-    """Rows of each topic; the first three columns are times [s].
+    """Rows of each topic; the first columns are times [s].
 
-    Times of the header, of the recording and, but for the chassis, of the
-    measurement itself. Then: x, y [m], heading [rad], speed [m/s] of the
-    localization; speed of the chassis; id, x, y, heading, speed, length, width
-    [m], kind of obstacles.
+    Times of the header and of the recording; of the localization and of obstacles
+    also that of the measurement. Then: x, y [m], heading [rad], speed [m/s] of the
+    localization; speed of the chassis; `Obstacles.rows`.
     """
 
     localization: list[tuple] = dataclasses.field(default_factory=list)
     chassis: list[tuple] = dataclasses.field(default_factory=list)
-    perception: list[tuple] = dataclasses.field(default_factory=list)
-    prediction: list[tuple] = dataclasses.field(default_factory=list)
+    # rows of the obstacles of each part, see `Obstacles.rows`
+    perception: list[np.ndarray] = dataclasses.field(default_factory=list)
+    prediction: list[np.ndarray] = dataclasses.field(default_factory=list)
     destination: tuple[float, float] | None = None
     modes: list[bool] = dataclasses.field(default_factory=list)  # is manual
     counts: dict[str, int] = dataclasses.field(default_factory=dict)
@@ -116,27 +103,48 @@ def read_drive(parts: list[Path], spec: dict) -> Drive:
 
 def _read_part(record: Record, names: dict[str, str], drive: Drive) -> None:
     plans: dict[str, Plan] = {}
+    obstacles: dict[str, Obstacles] = {}
     for topic, time, content in record.messages(names.__contains__):
         key = names[topic]
+        number = drive.counts[key] = drive.counts.get(key, -1) + 1
         try:
             if topic not in plans:
-                if topic not in record.channels:
-                    raise WireError("no descriptor before its first message")
-                message, schema = record.channels[topic]
-                plans[topic] = schema.plan(message, WANTED[key])
-            found = decode(plans[topic], content)
+                plans[topic] = _plan(record, topic, key)
+                if key in ("perception", "prediction"):
+                    where = f"{record.path}: {topic}"
+                    obstacles[topic] = Obstacles(where, plans[topic])
+            if topic in obstacles:
+                obstacles[topic].add(time * 1e-9, content)
+                _check_count(record, topic, drive, obstacles)
+            else:
+                _add(drive, key, time * 1e-9, decode(plans[topic], content))
         except WireError as error:
             raise InputError(
-                f"{record.path}: {topic}: message {drive.counts.get(key, 0)}: {error}: "
+                f"{record.path}: {topic}: message {number}: {error}: "
                 "expected an Apollo message"
             ) from error
-        drive.counts[key] = drive.counts.get(key, 0) + 1
-        _add(drive, key, time * 1e-9, found)
-        if len(drive.perception) + len(drive.prediction) > MAX_ROWS:
-            raise InputError(
-                f"{record.path}: {topic}: more than {MAX_ROWS} obstacle states: "
-                "expected one drive"
-            )
+    for topic, found in obstacles.items():
+        getattr(drive, names[topic]).append(found.rows())
+        found.count = 0
+        _check_count(record, topic, drive, obstacles)
+
+
+def _plan(record: Record, topic: str, key: str) -> Plan:
+    if topic not in record.channels:
+        raise WireError("no descriptor before its first message")
+    message, schema = record.channels[topic]
+    return schema.plan(message, WANTED[key])
+
+
+def _check_count(
+    record: Record, topic: str, drive: Drive, obstacles: dict[str, Obstacles]
+) -> None:
+    done = [len(rows) for rows in (*drive.perception, *drive.prediction)]
+    if sum(done) + sum(found.count for found in obstacles.values()) > MAX_ROWS:
+        raise InputError(
+            f"{record.path}: {topic}: more than {MAX_ROWS} obstacle states: "
+            "expected one drive"
+        )
 
 
 def _add(drive: Drive, key: str, time: float, found: dict[str, Any]) -> None:
@@ -151,19 +159,12 @@ def _add(drive: Drive, key: str, time: float, found: dict[str, Any]) -> None:
                 found.get("measurement_time", 0.0),
                 *_point(pose, "position"),
                 _heading(pose),
-                np.hypot(*_point(pose, "linear_velocity")),
+                math.hypot(*_point(pose, "linear_velocity")),
             )
         )
     elif key == "chassis":
         drive.chassis.append((stamp, time, found.get("speed_mps", NAN)))
         drive.modes.append(found.get("driving_mode", MANUAL) == MANUAL)
-    elif key == "perception":
-        for obstacle in found.get("perception_obstacle", []):
-            drive.perception.append((stamp, time, *_obstacle(obstacle)))
-    elif key == "prediction":
-        for predicted in found.get("prediction_obstacle", []):
-            obstacle = predicted.get("perception_obstacle", {})
-            drive.prediction.append((stamp, time, *_obstacle(obstacle)))
     else:
         waypoints = found.get("routing_request", {}).get("waypoint", [])
         x, y = _point(waypoints[-1], "pose") if waypoints else (NAN, NAN)
@@ -184,19 +185,3 @@ def _heading(pose: dict[str, Any]) -> float:
     qx, qy, qz, qw = (q.get(name, NAN) for name in ("qx", "qy", "qz", "qw"))
     yaw = np.arctan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz))
     return float(yaw + 0.5 * np.pi)
-
-
-def _obstacle(obstacle: dict[str, Any]) -> tuple:
-    """Own time, id, x, y, theta, speed, length, width, kind."""
-    kind = int(KIND_NAMES.get(obstacle.get("type", "UNKNOWN"), UNKNOWN))
-    length, width = SIZES_M.get(Kind(max(kind, 0)), OTHER_SIZE_M)
-    return (
-        obstacle.get("timestamp", 0.0),
-        obstacle.get("id", -1),
-        *_point(obstacle, "position"),
-        obstacle.get("theta", 0.0),
-        np.hypot(*_point(obstacle, "velocity")),
-        obstacle.get("length") or length,
-        obstacle.get("width") or width,
-        kind,
-    )

@@ -68,7 +68,9 @@ def parts(path: Path, spec: dict) -> list[Path]:
     if path.is_file():
         return [path]
     wanted = patterns(spec, [f"{PREFIX}*{SUFFIX}"])
-    found = {file for pattern in wanted for file in path.rglob(pattern)}
+    found = {
+        file for pattern in wanted for file in path.rglob(pattern) if file.is_file()
+    }
     if not found:
         raise InputError(
             f"{path}: no file matches {', '.join(wanted)}: expected scenario files"

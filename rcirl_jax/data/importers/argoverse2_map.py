@@ -17,7 +17,7 @@ from rcirl_jax.data.importers.shapes import between_bounds, check_coordinates
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane
 
-MAX_FILE_BYTES = 256 * 1024**2  # bytes of a map
+MAX_FILE_BYTES = 64 * 1024**2  # bytes of a map; published ones have 0.1 to 1 MB
 LANE_TYPES = ("VEHICLE", "BUS", "BIKE")
 DRIVEN = ("VEHICLE", "BUS")  # read unless the source TOML says otherwise
 

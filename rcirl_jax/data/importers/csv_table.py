@@ -11,10 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.data.importers import csv_stream
 from rcirl_jax.data.importers.files import input_files
 from rcirl_jax.data.importers.tables import (
     StraightLane,
     number,
+    read_header,
     read_table,
     split_tracks,
     straight_lanes,
@@ -79,8 +81,47 @@ def parts(path: Path, spec: dict) -> list[Path]:
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """One Recording per file, or per value of the `recording` column."""
     for file in parts(path, spec):
+        if csv_stream.is_long(file, spec):
+            yield from _long_recordings(file, spec)
+            continue
         for name, table in _read_tables(file, spec):
             yield validate_recording(_recording(name, table, spec), file)
+
+
+def _long_recordings(path: Path, spec: dict) -> Iterator[Recording]:
+    """One Recording per minute of a file too long for memory."""
+    columns, rate, header = _columns(path, spec), _rate(spec), read_header(path)
+    units, notes, fields = _factors(path, spec, rate), [], []
+    for field, (column, sign) in columns.items():
+        if column in header:
+            factor = sign * units.get(field, 1.0)
+            fields.append(
+                csv_stream.Field(
+                    name=field, column=column, factor=factor, text=field in TEXT
+                )
+            )
+        elif field in NEEDED:
+            raise InputError(
+                f"{path}: column {column}: missing: expected it among {header}"
+            )
+        else:
+            notes.append(f"no column '{column}': {field} computed or by default")
+    for piece in csv_stream.pieces(path, fields):
+        log = path.stem if piece.recording is None else f"{path.stem}-{piece.recording}"
+        table = _localise(path, piece.values, rate, notes, start=0.0)
+        made = _recording(f"{log}-{piece.number:05d}", table, spec)
+        if not made.tracks:
+            continue
+        tracks = tuple(
+            dataclasses.replace(
+                track, seen_since=piece.seen_since[track.id.split("#")[0]]
+            )
+            for track in made.tracks
+        )
+        made = dataclasses.replace(
+            made, tracks=tracks, piece_of=log, scenes_within=piece.within
+        )
+        yield validate_recording(made, path)
 
 
 def _lane_file(spec: dict) -> str:
@@ -158,10 +199,16 @@ def _factors(path: Path, spec: dict, rate: float) -> dict[str, float]:
     return factors
 
 
-def _localise(path: Path, values: dict, rate: float, notes: list[str]) -> _Table:
-    """Start the clock at 0 and move far coordinates near the origin."""
+def _localise(
+    path: Path,
+    values: dict,
+    rate: float,
+    notes: list[str],
+    start: float | None = None,
+) -> _Table:
+    """Start the clock at 0 (or at `start`), move far coordinates near the origin."""
     notes = list(notes)
-    values["t"] = values["t"] - values["t"].min()
+    values["t"] = values["t"] - (values["t"].min() if start is None else start)
     middle = np.array([np.median(values["x"]), np.median(values["y"])])
     origin = np.zeros(2)
     if np.any(np.abs(middle) > FAR_M):

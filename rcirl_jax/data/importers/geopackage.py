@@ -17,6 +17,7 @@ from rcirl_jax.data.importers.sqlite_ro import Database
 
 ENVELOPE_BYTES = (0, 32, 48, 48, 64)  # by the flags' envelope code
 LINE, POLYGON, MULTI_LINE, MULTI_POLYGON = 2, 3, 5, 6
+MAX_POINTS = 20_000  # of one line; a city's longest has some 1e3
 EWKB_Z, EWKB_M = 0x80000000, 0x40000000
 GEOGRAPHIC = 4326  # WGS84 longitude and latitude in degrees
 EPSG = re.compile(r"(?:epsg:)?(\d{4,6})", re.IGNORECASE)
@@ -109,6 +110,9 @@ class Layers:
             found = [points_of(blob) for blob in blobs]
         except ValueError as error:
             raise database.error(where, str(error), "a GeoPackage geometry") from error
+        longest = max(map(len, found), default=0)
+        if longest > MAX_POINTS:
+            raise database.error(where, f"{longest} points", f"at most {MAX_POINTS}")
         every = np.concatenate([np.zeros((0, 2)), *found])
         system = self._srs.get(table, GEOGRAPHIC)
         is_degrees = system == GEOGRAPHIC

@@ -23,14 +23,16 @@ from rcirl_jax.data.importers.files import input_files
 from rcirl_jax.data.importers.lanelet2 import read_lanelet2
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.projection import utm, utm_zone
-from rcirl_jax.data.importers.tables import (
+from rcirl_jax.data.importers.sparse_tables import (
     MAX_PLACE_M,
     MAX_TIME,
     MAX_VELOCITY_MPS,
     check_range,
+    read_sparse_table,
+)
+from rcirl_jax.data.importers.tables import (
     number,
     read_header,
-    read_sparse_table,
     split_tracks,
     travel_heading,
 )

@@ -24,11 +24,13 @@ from rcirl_jax.data.importers.lanelet2 import read_lanelet2
 from rcirl_jax.data.importers.levelx_lanes import find_map, marked_lanes
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.projection import utm, utm_zone
-from rcirl_jax.data.importers.tables import (
+from rcirl_jax.data.importers.sparse_tables import (
     MAX_PLACE_M,
     MAX_TIME,
     MAX_VELOCITY_MPS,
     check_range,
+)
+from rcirl_jax.data.importers.tables import (
     number,
     read_header,
     read_table,

@@ -20,12 +20,14 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.importers.files import input_files
-from rcirl_jax.data.importers.tables import (
+from rcirl_jax.data.importers.sparse_tables import (
     MAX_PLACE_M,
     MAX_TIME,
     MAX_VELOCITY_MPS,
-    StraightLane,
     check_range,
+)
+from rcirl_jax.data.importers.tables import (
+    StraightLane,
     number,
     read_table,
     split_tracks,

@@ -34,6 +34,7 @@ MAX_HALF_WIDTH_M = 6.0  # m; a bound farther off is another lane's
 MAX_LIMIT_MPS = 60.0  # m/s; faster "limits" are none
 STOP_SIGN = 1  # stop_polygon_type_fid
 NONE = -1  # no feature's number
+BLOCK = 256  # points measured at once; memory grows with it and the bound
 FOLDERS_UP = 6  # folders above a log in which "maps" is looked for
 SAFE_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,99}")
 CENTRES = ("geom", "lane_fid", "lane_connector_fid")
@@ -164,7 +165,8 @@ class NuplanMap:
         (line,) = self._layers.lines("boundaries", "geom", [self._bounds[fid]])
         if not len(line):
             return default
-        apart = distance_to_line(centre, line)
+        blocks = np.split(centre, np.arange(BLOCK, len(centre), BLOCK))
+        apart = np.concatenate([distance_to_line(block, line) for block in blocks])
         return np.clip(apart, MIN_HALF_WIDTH_M, MAX_HALF_WIDTH_M)
 
     def _read_centres(

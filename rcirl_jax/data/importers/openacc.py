@@ -25,13 +25,15 @@ import numpy as np
 from rcirl_jax.data.importers.files import input_files
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.projection import utm, utm_zone
-from rcirl_jax.data.importers.tables import (
+from rcirl_jax.data.importers.sparse_tables import (
     MAX_PLACE_M,
     MAX_TIME,
     MAX_VELOCITY_MPS,
     check_range,
-    number,
     read_sparse_table,
+)
+from rcirl_jax.data.importers.tables import (
+    number,
     split_tracks,
     travel_heading,
 )

@@ -87,8 +87,8 @@ def _read(
             )
         if metadata.num_rows == 0:
             raise InputError(f"{path}: rows: none: expected at least one")
-        wanted = _wanted(path, file.schema_arrow, numbers, text, optional)
         _check_sizes(path, metadata)
+        wanted = _wanted(path, file.schema_arrow, numbers, text, optional)
     words = [name for name in text if name in wanted]
     with open_file(path, metadata=metadata, read_dictionary=words, **limits) as file:
         return file.read(columns=wanted, use_threads=False)

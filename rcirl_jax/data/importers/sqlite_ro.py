@@ -35,9 +35,13 @@ class Database:
         uri = f"{self.path.resolve().as_uri()}?mode=ro&immutable=1"
         try:
             self._connection = sqlite3.connect(uri, uri=True, isolation_level=None)
+        except sqlite3.Error as error:
+            raise self.error("database", str(error), "a SQLite file") from error
+        try:
             for pragma in ("trusted_schema=OFF", "query_only=ON", "cell_size_check=ON"):
                 self._connection.execute(f"PRAGMA {pragma}")
         except sqlite3.Error as error:
+            self._connection.close()
             raise self.error("database", str(error), "a SQLite file") from error
         limit = self._connection.setlimit
         limit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_VALUE_BYTES)

@@ -76,12 +76,14 @@ def parts(path: Path, spec: dict) -> list[Path]:
     if path.is_file():
         return [path]
     wanted = patterns(spec, PATTERNS)
-    found = {file for pattern in wanted for file in path.rglob(pattern)}
+    found = {
+        file for pattern in wanted for file in path.rglob(pattern) if file.is_file()
+    }
     if not found:
         raise InputError(
             f"{path}: no file matches {', '.join(wanted)}: expected TFRecord files"
         )
-    return sorted(file for file in found if file.is_file())
+    return sorted(found)
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:

@@ -19,6 +19,7 @@ from rcirl_jax.errors import InputError
 MAX_METADATA_BYTES = 1024**2  # bytes of a .zarray
 MAX_RECORD_BYTES = 64 * 1024  # bytes of one record
 MAX_CHUNK_BYTES = 256 * 1024**2  # bytes of one chunk, decompressed
+MAX_READ_BYTES = 2 * 1024**3  # bytes read at once
 MAX_RECORDS = 10**11  # records of an array; the largest public set has 4 * 10^9
 CACHE_BYTES = 64 * 1024**2  # bytes of decompressed chunks kept
 BLOSC_HEADER = 16  # bytes; uint32 at 4: size decompressed, at 12: compressed
@@ -55,6 +56,12 @@ class StructuredArray:
         """Records start .. stop - 1."""
         if start >= stop:
             return np.zeros(0, self.dtype)
+        if (stop - start) * self.dtype.itemsize > MAX_READ_BYTES:
+            raise InputError(
+                f"{self.path}: records {start} to {stop}: "
+                f"{(stop - start) * self.dtype.itemsize} bytes: "
+                f"expected at most {MAX_READ_BYTES}"
+            )
         for number in range(start // self.chunk, (stop - 1) // self.chunk + 1):
             if number not in self._checked:
                 self._check_chunk(number)

@@ -47,7 +47,8 @@ def family(function: Callable[[Rng], Case]) -> Callable[[Rng], Case]:
     return function
 
 
-def need(condition: bool | np.bool_) -> None:
+def need(condition: bool | np.bool_ | np.ndarray) -> None:
+    """Draw the plan again unless the condition (a scalar) holds."""
     if not condition:
         raise RedrawError
 
@@ -65,6 +66,7 @@ def bend(rng: Rng) -> np.ndarray:
 
 
 def lane_width(rng: Rng) -> float:
+    """Width of a lane, m."""
     return float(rng.uniform(3.2, 3.8))
 
 
@@ -82,6 +84,7 @@ def drift(rng: Rng) -> np.ndarray:
 
 
 def ego_of(rng: Rng, s: np.ndarray, l: np.ndarray | None = None) -> Mover:
+    """The driver, of random size; wanders inside the lane unless `l` is given."""
     return Mover(
         id="ego",
         s=s,
@@ -143,6 +146,7 @@ def bumper_gap(ahead: Mover, behind: Mover) -> np.ndarray:
 
 
 def braking(rng: Rng) -> np.ndarray:
+    """A drive [n] m that ends at a stand within the eight seconds."""
     v0, b = rng.uniform(6.0, 14.0), rng.uniform(1.2, 2.8)
     start = rng.uniform(0.0, 1.5)
     need(start + v0 / b < 7.3)

@@ -1,0 +1,77 @@
+"""Are the automatic labels right? Precision and recall against known truth.
+
+    python -m experiments.label_check --cases=100 --noise=ngsim,none --output=DIR
+    python -m experiments.label_check --format=commonroad --input=DIR --output=DIR
+
+Without --input: drives planned by `evaluation.label_cases`, whose decisions and
+tags are known, are labelled and compared; position noise as in NGSIM, or none.
+With --input (any recorded format): the written cycle of every signal is tested
+against crossings and stands, and the stop labels against observed stands, with
+the signals that an import trusts and with all of them. With --data the labels
+stored in a dataset are compared with today's rules.
+
+Writes labels.json and labels.png. On two cores 100 cases of each of the 38
+families take about 5 minutes per noise; the urban CommonRoad files 3 minutes.
+Expected: above 98 % everywhere, but for red_light (stop signs count as one).
+"""
+
+import json
+from pathlib import Path
+
+from absl import flags
+
+from experiments.common import provenance, run
+from rcirl_jax.data.importers import IMPORTERS, read_recordings
+from rcirl_jax.data.store import open_dataset
+from rcirl_jax.evaluation.label_signals import check_phases, format_phases
+from rcirl_jax.evaluation.label_stops import check_stops, compare_stored, format_stops
+from rcirl_jax.evaluation.label_truth import format_labels, format_scores, measure
+from rcirl_jax.report.label_picture import label_chart
+
+_CASES = flags.DEFINE_integer("cases", 100, "planned drives of each family")
+_NOISE = flags.DEFINE_list("noise", ["ngsim", "none"], "none, white, ngsim, rough")
+_SEED = flags.DEFINE_integer("seed", 0, "of the planned drives")
+_OUTPUT = flags.DEFINE_string("output", "out/label_check", "folder to write")
+_DATA = flags.DEFINE_string("data", None, "dataset whose stored labels are compared")
+_FORMAT = flags.DEFINE_enum("format", "commonroad", sorted(IMPORTERS), "of --input")
+_INPUT = flags.DEFINE_string("input", None, "recorded file or folder")
+_SOURCE = flags.DEFINE_string("source", None, "TOML of columns and units of --input")
+_QUICK = flags.DEFINE_bool("quick", False, "4 cases of each family, one noise")
+
+
+def main() -> None:
+    """Flags -> tables, labels.json, labels.png."""
+    body, tables = {}, {}
+    if _INPUT.value:
+        source = Path(_SOURCE.value) if _SOURCE.value else None
+        found = list(read_recordings(_FORMAT.value, Path(_INPUT.value), source))
+        phases = check_phases(found)
+        print(format_phases(phases))
+        body["phases"] = [check.as_dict() for check in phases]
+        for name, everything in (("trusted signals", False), ("all signals", True)):
+            stops = check_stops(found, trust_all=everything)
+            print(f"\n{name}: {format_stops(stops)}")
+            body[name], tables[f"recorded, {name}"] = stops.as_dict(), stops.scores
+    if _DATA.value:
+        scores = compare_stored(open_dataset(_DATA.value).load(None))
+        print("\n".join(format_scores("stored", scores)))
+        body["stored"] = [score.as_dict() for score in scores]
+        tables["stored against today's rules"] = scores
+    if not body:
+        noises = _NOISE.value[:1] if _QUICK.value else _NOISE.value
+        for noise in noises:
+            report = measure(4 if _QUICK.value else _CASES.value, noise, _SEED.value)
+            print(f"{format_labels(report)}\n")
+            body[noise] = report.as_dict()
+            tables[f"noise {noise}, decisions"] = report.decisions
+            tables[f"noise {noise}, tags"] = report.tags
+    folder = Path(_OUTPUT.value)
+    folder.mkdir(parents=True, exist_ok=True)
+    picture = label_chart(folder / "labels.png", tables)
+    body["made_by"] = provenance()
+    (folder / "labels.json").write_text(json.dumps(body, indent=2) + "\n")
+    print(f"written: {folder}/labels.json, {picture.name}")
+
+
+if __name__ == "__main__":
+    run(main)
