@@ -12,6 +12,7 @@ from pathlib import Path
 from absl import flags
 
 from experiments.common import run
+from experiments.executor import executor
 from rcirl_jax.data.store import open_dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.evaluate import RankingSetup, evaluate_ranking
@@ -47,7 +48,7 @@ def main() -> None:
         drop_collisions=_FILTER.value,
         hand_set=tuned,
     )
-    report = evaluate_ranking(open_dataset(_DATA.value), learned, setup)
+    report = evaluate_ranking(open_dataset(_DATA.value), learned, setup, executor())
     print(format_table(report, _WIDTH.value))
     if _OUTPUT.value:
         output = Path(_OUTPUT.value)

@@ -42,6 +42,7 @@ _OUTPUT = flags.DEFINE_string("output", "out/likeness", "folder to write")
 _LEARNERS = flags.DEFINE_list("learners", list(LEARNERS), "rows to train")
 _SEEDS = flags.DEFINE_integer("seeds", 10, "training runs per learner")
 _EPOCHS = flags.DEFINE_integer("epochs", 10, "passes over the training scenes")
+_HALVE = flags.DEFINE_integer("halve_every", 0, "steps per halving of the step size")
 _HORIZON = flags.DEFINE_float("horizon", 5.0, "s at which distances are taken")
 _MODE = flags.DEFINE_enum(
     "mode", "speed", ["speed", "path_speed"], "what the sampler varies"
@@ -64,6 +65,7 @@ def main() -> None:
     base = TrainConfig(
         positive="nearest",
         epochs=_EPOCHS.value,
+        halve_every=_HALVE.value,
         train_horizon=_HORIZON.value,
         sampler=sampler,
     )

@@ -15,23 +15,23 @@ from pathlib import Path
 from absl import flags
 
 from experiments.common import provenance, run
+from experiments.executor import executor
 from rcirl_jax.data.importers import IMPORTERS, read_recordings
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop import (
     SuiteConfig,
+    drive_here,
     run_suite,
     worst_cases,
     write_suite,
 )
-from rcirl_jax.export.closed_loop import table_rows
-from rcirl_jax.export.hand_weights import load_hand_weights
+from rcirl_jax.export.spread import SuiteJob, spread
 from rcirl_jax.simulation.recorded import RecordedConfig
 from rcirl_jax.simulation.rows import BASELINES, human_row
 from rcirl_jax.simulation.suite import (
     FULL_S,
     SMOKE_S,
     CaseSet,
-    catalogue_set,
     recorded_set,
     suite_refs,
 )
@@ -54,40 +54,52 @@ _CHUNK = flags.DEFINE_integer("chunk", 180, "cases driven together; bounds memor
 _SEED = flags.DEFINE_integer("catalogue_seed", 0, "seed of the cases")
 
 
-def _cases() -> CaseSet:
-    """The cases that the flags name."""
-    if _SUITE.value == "recorded":
-        config = RecordedConfig(
-            smoothing_s=_SMOOTHING.value,
-            max_cases=_CASES.value,
-            max_duration_s=_DURATION.value or FULL_S,
-        )
-        if not _INPUT.value:
-            raise InputError("--input: not given: expected the recordings to replay")
-        return recorded_set(read_recordings(_FORMAT.value, Path(_INPUT.value)), config)
+def _recorded() -> CaseSet:
+    """Drives cut out of recordings."""
+    config = RecordedConfig(
+        smoothing_s=_SMOOTHING.value,
+        max_cases=_CASES.value,
+        max_duration_s=_DURATION.value or FULL_S,
+    )
+    if not _INPUT.value:
+        raise InputError("--input: not given: expected the recordings to replay")
+    return recorded_set(read_recordings(_FORMAT.value, Path(_INPUT.value)), config)
+
+
+def _job() -> SuiteJob:
+    """Rows and catalogue cases that the flags name."""
+    recorded = _SUITE.value == "recorded"
     duration = _DURATION.value or (SMOKE_S if _SUITE.value == "smoke" else FULL_S)
     if not 1.0 <= duration <= FULL_S:
         raise InputError(f"--duration: {duration}: expected 1 to {FULL_S:g} s")
-    refs = suite_refs(_SUITE.value, _CASES.value, _SEED.value)
-    return catalogue_set(refs, duration)
+    if recorded and _CASES.value is not None and _CASES.value < 1:
+        raise InputError(f"--cases: {_CASES.value}: expected at least 1")
+    return SuiteJob(
+        weights=tuple(_WEIGHTS.value),
+        baselines=tuple(_BASELINES.value),
+        refs=() if recorded else suite_refs(_SUITE.value, _CASES.value, _SEED.value),
+        duration_s=duration,
+        plan_every=_EVERY.value,
+        dp=_DP.value,
+        hand_weights=_HAND.value,
+    )
 
 
 def main() -> None:
     """Flags -> one suite."""
     if _CHUNK.value < 1:
         raise InputError(f"--chunk: {_CHUNK.value}: expected at least 1")
-    rows = table_rows(
-        _WEIGHTS.value,
-        _BASELINES.value,
-        _EVERY.value,
-        dp=_DP.value,
-        hand_set=load_hand_weights(_HAND.value) if _HAND.value else None,
-    )
-    cases = _cases()
+    job, places = _job(), executor()
+    rows, drive = job.rows(), drive_here
     if _SUITE.value == "recorded":
+        cases = _recorded()
         rows.append(human_row())
+    else:
+        cases = job.cases()
+        if places.workers > 1:
+            drive = spread(places, job)
     config = SuiteConfig(plan_every=_EVERY.value, chunk=_CHUNK.value)
-    result = run_suite(rows, cases, config)
+    result = run_suite(rows, cases, config, drive)
     print(write_suite(result, Path(_OUTPUT.value), provenance()))
     for name, facts in result.timings.items():
         print(f"{name}: {facts['seconds']} s, {facts['plans_per_s']:,} plans/s")

@@ -82,7 +82,7 @@ class Collector:
         if starts.size == 0:
             return
         lane_ids = self.graph.match(smooth.x, smooth.y, smooth.heading)
-        visited = list(dict.fromkeys(lane_ids[lane_ids != ""]))
+        visited = collections.Counter(lane_ids[lane_ids != ""].tolist())
         for start in starts:
             if lane_ids[start] == "":
                 self.dropped["off_map"] += 1

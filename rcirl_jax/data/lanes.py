@@ -6,7 +6,9 @@ took. Its centre line is the scene's reference line. Scenes of many drivers
 share a chain, so everything that depends on it alone is computed once.
 """
 
+import collections
 import dataclasses
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -21,6 +23,8 @@ from rcirl_jax.types import Lane, Recording
 BEHIND_M = 100.0  # m of chain kept behind the lane at the planning frame
 AHEAD_M = 400.0  # m of chain kept beyond that lane
 MAX_HEADING_GAP = np.deg2rad(60.0)  # rad, a car heads along its lane within this
+SAME_PLACE_M = 0.75  # m, lanes no farther apart at a place lie on each other there
+FAR = 1e6  # m, more than any distance
 MATCH_NEIGHBOURS = 12  # nearest centre points looked at per position
 LINE_STEP_M = 1.0  # m, grid of the reference line
 LINE_SIZES = (256, 512, 1024, 2048, 4096)  # static sizes; few compilations
@@ -71,18 +75,21 @@ class LaneGraph:
             direction = np.gradient(dense, axis=0)
             points.append(dense)
             headings.append(np.arctan2(direction[:, 1], direction[:, 0]))
-            owners += [lane.id] * len(dense)
-        self._owner = np.array(owners)
+            owners += [len(points) - 1] * len(dense)
+        self._owner = np.array(owners, int)
+        self._names = np.array(list(self.lanes), object)
         self._heading = np.concatenate(headings) if headings else np.zeros(0)
         self._points = np.concatenate(points) if points else np.zeros((0, 2))
         self._tree = KDTree(self._points) if len(self._points) else None
         self._frames: dict[tuple[str, ...], LaneFrame] = {}
 
     def match(self, x: np.ndarray, y: np.ndarray, heading: np.ndarray) -> np.ndarray:
-        """Lane id per position ("" where the car is on none).
+        """Lane id per position of one track ("" where the car is on none).
 
         The nearest lane centre among those that head the car's way, no farther
-        than the lane's half width plus half a metre.
+        than the lane's half width plus half a metre. Where lanes lie on each
+        other (the branches of a fork), the one that the track is on most of the
+        time.
         """
         if self._tree is None:
             return np.full(x.shape, "", object)
@@ -93,7 +100,13 @@ class LaneGraph:
         cost = np.where(gap < MAX_HEADING_GAP, distance, np.inf)
         best = np.argmin(cost, axis=1)
         rows = np.arange(len(best))
-        lane_id = self._owner[index[rows, best]].astype(object)
+        owners = self._owner[index]
+        counts = np.bincount(owners[rows, best], minlength=len(self.lanes))[owners]
+        together = cost <= cost[rows, best][:, None] + SAME_PLACE_M
+        # the most frequent of those at this place, the nearest point of it
+        rank = np.where(together, -counts, 1) * FAR + np.minimum(cost, FAR / 2)
+        best = np.where(np.isfinite(cost[rows, best]), np.argmin(rank, axis=1), best)
+        lane_id = self._names[owners[rows, best]]
         reach = np.array([self._half_width(name) + 0.5 for name in lane_id])
         return np.where(cost[rows, best] <= reach, lane_id, "")
 
@@ -101,9 +114,15 @@ class LaneGraph:
         lane = self.lanes[lane_id]
         return float(max(lane.left_width.max(), lane.right_width.max()))
 
-    def chain(self, start: str, visited: list[str]) -> tuple[str, ...]:
-        """The chain through lane `start` for a driver who visits these lanes."""
-        seen = set(visited)
+    def chain(
+        self, start: str, visited: Iterable[str] | Mapping[str, int]
+    ) -> tuple[str, ...]:
+        """The chain through lane `start` for a driver on these lanes.
+
+        `visited` may name a lane as often as the driver was seen on it: at a fork
+        that counts.
+        """
+        seen = collections.Counter(visited)
         ahead = [start]
         travelled = 0.0
         while travelled < AHEAD_M:
@@ -128,14 +147,14 @@ class LaneGraph:
         return float(_arc(self.lanes[lane_id].centre)[-1])
 
     def _pick(
-        self, options: list[str], here: str, seen: set[str], forward: bool
+        self, options: list[str], here: str, seen: Mapping[str, int], forward: bool
     ) -> str | None:
-        """The option visited; else one whose neighbour is; else the straightest."""
+        """The option visited most; else one with a visited neighbour; else straight."""
         if not options:
             return None
-        for name in options:
-            if name in seen:
-                return name
+        most = max(options, key=lambda name: seen.get(name, 0))
+        if most in seen:
+            return most
         for name in options:
             lane = self.lanes[name]
             if lane.left in seen or lane.right in seen:

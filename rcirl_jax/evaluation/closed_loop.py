@@ -3,7 +3,7 @@
 import dataclasses
 import resource
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +34,9 @@ class SuiteConfig:
     chunk: int = 180
 
 
+Drive = Callable[[Row, CaseSet, SuiteConfig], CaseMetrics]
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SuiteResult:
     """Everything a run of a suite leaves."""
@@ -47,7 +50,8 @@ class SuiteResult:
     facts: Mapping[str, object]  # hashes, memory
 
 
-def _drive(row: Row, cases: CaseSet, config: SuiteConfig) -> CaseMetrics:
+def drive_here(row: Row, cases: CaseSet, config: SuiteConfig) -> CaseMetrics:
+    """All cases with one row, in this process."""
     rollout = rollout_config(row, cases.duration_s, config.plan_every)
     total = len(cases.ids)
     with tqdm.tqdm(total=total, desc=row.name, unit="case", mininterval=0.5) as bar:
@@ -61,14 +65,19 @@ def _drive(row: Row, cases: CaseSet, config: SuiteConfig) -> CaseMetrics:
         )
 
 
-def run_suite(rows: Sequence[Row], cases: CaseSet, config: SuiteConfig) -> SuiteResult:
-    """Drive every row over the cases and judge them.
+def run_suite(
+    rows: Sequence[Row],
+    cases: CaseSet,
+    config: SuiteConfig,
+    drive: Drive = drive_here,
+) -> SuiteResult:
+    """Drive every row over the cases and judge them; `drive` says where.
 
     The careful drivers and IDM drive first: they say which cases are
     preventable and how far one gets. Where the recorded human is a row, its
     distance is the reference instead of IDM's.
     """
-    classified = {row.name: _drive(row, cases, config) for row in judges()}
+    classified = {row.name: drive(row, cases, config) for row in judges()}
     avoidable = preventable([classified["CC"], classified["FSM"]])
     calm = trivial([classified["IDM"], classified["constant speed"]])
     runs: dict[str, CaseMetrics] = {}
@@ -76,7 +85,7 @@ def run_suite(rows: Sequence[Row], cases: CaseSet, config: SuiteConfig) -> Suite
     for row in rows:
         begin = time.perf_counter()
         known = classified.get(row.name)
-        runs[row.name] = _drive(row, cases, config) if known is None else known
+        runs[row.name] = drive(row, cases, config) if known is None else known
         seconds = time.perf_counter() - begin
         hashes[row.name] = result_hash(runs[row.name])
         if known is None:

@@ -17,6 +17,7 @@ from rcirl_jax.evaluation.ranking import (
 )
 from rcirl_jax.evaluation.score import BASELINES, Scored, Scorer, covers, score_scenes
 from rcirl_jax.evaluation.table import RankingReport, build_report
+from rcirl_jax.executor import Executor
 from rcirl_jax.reward import LatticeCost
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.types import Demonstration
@@ -73,13 +74,16 @@ def _outcomes(scored: Scored, rows: Demonstration, setup: RankingSetup) -> Outco
 
 
 def _temperatures(
-    dataset: Demonstrations, setup: RankingSetup, scorers: Mapping[str, Scorer]
+    dataset: Demonstrations,
+    setup: RankingSetup,
+    scorers: Mapping[str, Scorer],
+    executor: Executor | None,
 ) -> dict[str, float]:
     """Scale of each scorer's values, fitted on TRAINING scenes."""
     rows, index = covered_rows(dataset, "train", setup.horizon_s)
     chosen = np.random.default_rng(0).permutation(index.size)[:TEMPERATURE_SCENES]
     rows, index = jax.tree.map(lambda x: x[chosen], rows), index[chosen]
-    scored = _score(rows, index, setup, scorers)
+    scored = _score(rows, index, setup, scorers, executor)
     outcomes = _outcomes(scored, rows, setup)
     return {name: fit_temperature(v, outcomes) for name, v in scored.values.items()}
 
@@ -89,6 +93,7 @@ def _score(
     index: np.ndarray,
     setup: RankingSetup,
     scorers: Mapping[str, Scorer],
+    executor: Executor | None = None,
 ) -> Scored:
     return score_scenes(
         rows,
@@ -98,6 +103,7 @@ def _score(
         horizon_s=setup.horizon_s,
         scorers=scorers,
         hand_set=setup.hand_set,
+        executor=executor,
     )
 
 
@@ -105,6 +111,7 @@ def evaluate_ranking(
     dataset: Demonstrations,
     learned: Mapping[str, Sequence[Scorer]],
     setup: RankingSetup,
+    executor: Executor | None = None,
 ) -> RankingReport:
     """Rank the held-out scenes with learned rewards beside all baselines.
 
@@ -116,14 +123,15 @@ def evaluate_ranking(
       dataset: an open dataset.
       learned: row name -> one scorer per training run.
       setup: features, sampler, horizon, split.
+      executor: where scenes are scored; default: this process.
 
     Raises:
       InputError: no scene of the split covers the horizon.
     """
     flat = {f"{n}#{i}": f for n, runs in learned.items() for i, f in enumerate(runs)}
-    temperatures = _temperatures(dataset, setup, flat)
+    temperatures = _temperatures(dataset, setup, flat, executor)
     rows, index = covered_rows(dataset, setup.split, setup.horizon_s)
-    scored = _score(rows, index, setup, flat)
+    scored = _score(rows, index, setup, flat, executor)
     outcomes = _outcomes(scored, rows, setup)
 
     def metrics(name: str) -> dict[str, np.ndarray]:

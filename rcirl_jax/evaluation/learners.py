@@ -39,9 +39,21 @@ LEARNERS: dict[str, dict] = {
     "MaxEnt": {"loss": "listwise"},
     "MaxEnt linear": {"loss": "listwise", "reward": LINEAR},
     "MaxEnt 64": {"loss": "listwise", "reward": RewardConfig(hidden=(64,))},
+    "MaxEnt monotone": {
+        "loss": "listwise",
+        "reward": RewardConfig(constraint="monotone"),
+    },
+    "MaxEnt monotone 64": {
+        "loss": "listwise",
+        "reward": RewardConfig(hidden=(64,), constraint="monotone"),
+    },
     "soft labels": {"loss": "soft"},
     "soft labels linear": {"loss": "soft", "reward": LINEAR},
     "GAN": {"loss": "gan"},
+    # as in the paper: the recorded curve itself is the positive
+    "RC-IRL rank on curves": {"loss": "rank", "positive": "human"},
+    "RC-IRL logistic on curves": {"loss": "logistic", "positive": "human"},
+    "GAN on curves": {"loss": "gan", "positive": "human"},
     "logistic linear": {"loss": "logistic", "reward": LINEAR},
     "logistic non-negative": {
         "loss": "logistic",

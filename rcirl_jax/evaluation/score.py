@@ -6,12 +6,13 @@ recorded human in the scene's Frenet frame, at the chosen horizon.
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rcirl_jax.executor import Executor, Here
 from rcirl_jax.features import FeatureMap, feature_map
 from rcirl_jax.features.columns import COLUMNS, make_frame
 from rcirl_jax.planner.baselines import (
@@ -159,6 +160,7 @@ def score_scenes(
     horizon_s: float,
     scorers: Mapping[str, Scorer],
     hand_set: Mapping[str, LatticeCost] | None = None,
+    executor: Executor | None = None,
 ) -> Scored:
     """Sample, featurise, measure and value S scenes, in chunks of bounded memory.
 
@@ -169,24 +171,43 @@ def score_scenes(
       preset: feature preset.
       sampler: sampler configuration.
       horizon_s: 5 or 8 s (any in (0, 8]).
-      scorers: rewards to apply to the features; the baselines are added.
+      scorers: rewards to apply to the features; the baselines are added. They are
+        sent to other processes, if the executor has any.
       hand_set: further hand-set costs by name, beside Apollo's.
+      executor: where chunks are scored; the result does not depend on it.
 
     Returns:
       Scored, numpy.
     """
-    batch = _score_batch(preset, sampler, float(horizon_s))
-    costs = {name: cost.fields() for name, cost in (hand_set or {}).items()}
-    count, parts = index.size, []
-    for start in range(0, count, CHUNK):
-        picked = np.minimum(np.arange(start, start + CHUNK), count - 1)
-        taken = jax.tree.map(lambda x, picked=picked: jnp.asarray(x[picked]), rows)
-        made = batch(costs, jnp.asarray(index[picked], jnp.int32), taken)
-        keep = min(CHUNK, count - start)
-        made = jax.tree.map(lambda x, keep=keep: np.asarray(x[:keep]), made)
-        parts.append(_with_values(made, scorers))
-    joined = jax.tree.map(lambda *x: np.concatenate(x), *parts)
-    return Scored(**joined)
+    count = index.size
+
+    def chunks() -> Iterator[tuple[Demonstration, np.ndarray, int]]:
+        for start in range(0, count, CHUNK):
+            at = np.minimum(np.arange(start, start + CHUNK), count - 1)
+            taken = jax.tree.map(lambda x, at=at: np.asarray(x[at]), rows)
+            yield taken, index[at].astype(np.int32), min(CHUNK, count - start)
+
+    piece = functools.partial(
+        _score_chunk,
+        shared=(preset, sampler, float(horizon_s)),
+        scorers=scorers,
+        costs={name: cost.fields() for name, cost in (hand_set or {}).items()},
+    )
+    parts = (executor or Here()).stream(piece, chunks())
+    return Scored(**jax.tree.map(lambda *x: np.concatenate(x), *parts))
+
+
+def _score_chunk(
+    item: tuple[Demonstration, np.ndarray, int],
+    shared: tuple[str, SamplerConfig, float],
+    scorers: Mapping[str, Scorer],
+    costs: HandSet,
+) -> Iterator[dict]:
+    """The arrays of one padded chunk; (rows, index, how many are real)."""
+    rows, index, keep = item
+    made = _score_batch(*shared)(costs, index, rows)
+    made = jax.tree.map(lambda x: np.asarray(x[:keep]), made)
+    yield _with_values(made, scorers)
 
 
 def _with_values(made: dict, scorers: Mapping[str, Scorer]) -> dict:

@@ -438,3 +438,31 @@ def test_us101(data_dir, tmp_path):
     dataset = open_dataset(tmp_path / "us101")
     train, test = dataset.load("train"), dataset.load("test")
     assert not set(train.vehicle.tolist()) & set(test.vehicle.tolist())
+
+
+def test_on_overlapping_branches_the_track_keeps_to_one():
+    """A fork whose branches lie within centimetres for thirty metres."""
+    x = np.arange(0.0, 81.0, 2.0)
+    half = np.full(x.shape, 1.8)
+
+    def lane(name, y, shift=0.0, successors=()):
+        return Lane(
+            id=name,
+            centre=np.stack([x + shift, y], 1),
+            left_width=half,
+            right_width=half,
+            speed_limit=10.0,
+            successors=successors,
+        )
+
+    lanes = (
+        lane("in", 0.0 * x, -80.0, ("left", "right")),
+        lane("left", 0.002 * x**2),
+        lane("right", -0.002 * x**2),
+    )
+    graph = LaneGraph(recording(car("ego", speeding_up(20.0)), lanes=lanes))
+    rng = np.random.default_rng(0)
+    y = 0.002 * x**2 + rng.normal(0.0, 0.1, x.size)
+    got = graph.match(x, y, np.arctan(0.004 * x))
+    assert set(got[2:]) == {"left"}
+    assert graph.chain("in", ["in", "right", "left", "left"]) == ("in", "left")

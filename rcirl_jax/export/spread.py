@@ -1,0 +1,101 @@
+"""A closed-loop suite in pieces: each a range of cases with one row.
+
+Rows hold compiled functions and cases come from files, so neither is sent to
+other processes: a piece names them, and whoever drives it builds them again.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Iterator
+
+import jax
+import numpy as np
+import tqdm
+
+from rcirl_jax.evaluation.closed_loop import Drive, SuiteConfig
+from rcirl_jax.executor import Executor
+from rcirl_jax.export.closed_loop import table_rows
+from rcirl_jax.export.hand_weights import load_hand_weights
+from rcirl_jax.simulation.careful import judges
+from rcirl_jax.simulation.metrics import CaseMetrics
+from rcirl_jax.simulation.rollout import LANES
+from rcirl_jax.simulation.rows import Row
+from rcirl_jax.simulation.suite import (
+    CaseRef,
+    CaseSet,
+    catalogue_set,
+    drive_row,
+    rollout_config,
+)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SuiteJob:
+    """The rows and cases of a suite by name; hashable and small."""
+
+    weights: tuple[str, ...]
+    baselines: tuple[str, ...]
+    refs: tuple[CaseRef, ...]
+    duration_s: float
+    plan_every: int = 1
+    dp: bool = False
+    hand_weights: str | None = None
+
+    def rows(self) -> list[Row]:
+        """Learned rows, then the baselines."""
+        return table_rows(
+            self.weights,
+            self.baselines,
+            self.plan_every,
+            dp=self.dp,
+            hand_set=load_hand_weights(self.hand_weights)
+            if self.hand_weights
+            else None,
+        )
+
+    def cases(self) -> CaseSet:
+        """The cases of the catalogue."""
+        return catalogue_set(self.refs, self.duration_s)
+
+
+@functools.lru_cache(maxsize=2)
+def _made(job: SuiteJob) -> tuple[dict[str, Row], CaseSet]:
+    rows = {row.name: row for row in [*judges(), *job.rows()]}
+    return rows, job.cases()
+
+
+def drive_piece(
+    piece: tuple[str, int, int], job: SuiteJob, config: SuiteConfig
+) -> Iterator[CaseMetrics]:
+    """Metrics of the cases first .. last - 1 with the row of a name."""
+    name, first, last = piece
+    rows, cases = _made(job)
+    row = rows[name]
+    yield drive_row(
+        row,
+        lambda a, b: cases.build(first + a, first + b),
+        last - first,
+        rollout_config(row, cases.duration_s, config.plan_every),
+        chunk=config.chunk,
+    )
+
+
+def spread(executor: Executor, job: SuiteJob) -> Drive:
+    """A `Drive` that sends ranges of cases to an executor; same result as here."""
+
+    def drive(row: Row, cases: CaseSet, config: SuiteConfig) -> CaseMetrics:
+        total, size = len(cases.ids), -(-config.chunk // LANES) * LANES
+        # a rest that is shorter would be another shape for the compiler
+        pieces = [
+            (row.name, first, min(first + size, total))
+            for first in range(0, total, size)
+        ]
+        piece = functools.partial(drive_piece, job=job, config=config)
+        parts = []
+        with tqdm.tqdm(total=total, desc=row.name, unit="case", mininterval=0.5) as bar:
+            for made in executor.stream(piece, pieces):
+                parts.append(made)
+                bar.update(len(np.asarray(jax.tree.leaves(made)[0])))
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+    return drive
