@@ -46,6 +46,9 @@ _KEEP_STEADY = flags.DEFINE_bool(
 _KEEP_ALONE = flags.DEFINE_bool(
     "keep_alone", False, "keep scenes without obstacles (the paper drops them)"
 )
+_TRUST = flags.DEFINE_bool(
+    "trust_signals", False, "use cycles a converter wrote, unless crossings contradict"
+)
 _TEST_FRACTION = flags.DEFINE_float(
     "test_fraction", 0.25, "share of scenes held out, by vehicle-disjoint group"
 )
@@ -64,6 +67,7 @@ def main() -> None:
             min_history_s=_MIN_HISTORY.value,
             require_obstacles=not _KEEP_ALONE.value,
             require_speed_change=not _KEEP_STEADY.value,
+            trust_signals=_TRUST.value,
         ),
         test_fraction=_TEST_FRACTION.value,
         split_seed=_SPLIT_SEED.value,

@@ -19,6 +19,7 @@ from experiments.common import run
 from experiments.paper.common import base, dataset, picture, seeds, write
 from rcirl_jax.evaluation.data_support import (
     choices_of,
+    growth,
     rank_correlation,
     reasons,
     weights_supported,
@@ -28,6 +29,7 @@ from rcirl_jax.evaluation.learners import FrozenSets, learner_config, train_lear
 from rcirl_jax.features import feature_map
 from rcirl_jax.report.support_picture import support_picture
 from rcirl_jax.reward import RewardConfig
+from rcirl_jax.units import TIMES_S
 
 
 def main() -> None:
@@ -56,6 +58,10 @@ def main() -> None:
             f"correlation with its error {rho:.2f} [{low:.2f}, {high:.2f}]"
         )
     print(f"error of the chosen, mean over time: {made.error.mean():.2f} m")
+    over_time = growth(made.ahead, np.asarray(test.time_valid))
+    for t, (size, bias, worth) in zip(TIMES_S, over_time, strict=True):
+        if np.isfinite(size):
+            print(f"{t:.1f} s: {size:.2f} m, bias {bias:+.2f} m, {worth:.2f} m/s^2")
     support_picture(
         picture("data_support"),
         weights=weights,
@@ -67,6 +73,7 @@ def main() -> None:
         "weights": to_json(weights),
         "choices": {k: v.tolist() for k, v in dataclasses.asdict(made).items()},
         "warns_of_error": warns,
+        "error_over_time": np.nan_to_num(over_time).tolist(),
         "reasons": {n: float(np.abs(shares[:, i]).mean()) for i, n in enumerate(names)},
     }
     write("data_support", body)

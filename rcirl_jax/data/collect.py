@@ -43,7 +43,9 @@ class Collector:
             for track in recording.tracks
         ]
         self.graph = LaneGraph(recording)
-        self.signals, self.signal_notes = trusted_signals(recording, self.graph)
+        self.signals, self.signal_notes = trusted_signals(
+            recording, self.graph, config.trust_signals
+        )
         self.dropped: collections.Counter[str] = collections.Counter()
         self._views: dict[tuple[str, ...], FrameTracks] = {}
         self._ghost_views: dict[tuple[str, ...], list[tuple[np.ndarray, ...]]] = {}
@@ -194,6 +196,11 @@ class Collector:
             valid[slot], kind[slot] = box["valid"], box["kind"]
         row["obstacles.valid"], row["obstacles.kind"] = valid, kind
         row["obstacles.is_recorded"] = kind != Kind.NONE
+        # for the labels only: what demands the stop is not stored
+        row["obstacles.is_light"] = np.array(
+            [box.get("is_light", False) for box in chosen]
+            + [False] * (NUM_OBSTACLES - len(chosen))
+        )
         row["num_bodies"] = len(found)
 
     def _boxes(

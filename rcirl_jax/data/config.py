@@ -20,6 +20,8 @@ class CollectConfig:
     # the paper's two filters
     require_obstacles: bool = True
     require_speed_change: bool = True
+    # use cycles that a converter wrote, unless the file's own crossings contradict
+    trust_signals: bool = False
 
     def __post_init__(self) -> None:
         """Reject what cannot be meant."""

@@ -21,13 +21,15 @@ def signal_state(signal: Signal, times: np.ndarray) -> np.ndarray:
 
 
 def trusted_signals(
-    recording: Recording, graph: LaneGraph
+    recording: Recording, graph: LaneGraph, trust_written: bool = False
 ) -> tuple[dict[str, Signal], list[str]]:
     """Signals whose phases agree with what the drivers did, and notes on others.
 
     Cycles written by a converter need not match the recording. Every crossing
     of a governed stop line is looked up in the cycle; if more than a tenth of
-    at least three crossings happen on red, the signal is not used.
+    at least three crossings happen on red, the signal is not used. Cycles with
+    fewer crossings are used only if `trust_written`: a short file alone cannot
+    confirm them, many together can (`experiments.label_check`).
     """
     by_id = {signal.id: signal for signal in recording.signals}
     counts = {name: [0, 0] for name in by_id}
@@ -49,7 +51,8 @@ def trusted_signals(
     for name, signal in by_id.items():
         crossings, reds = counts[name]
         wrong = crossings >= MIN_CROSSINGS and reds > MAX_RED_RUNNING * crossings
-        unproved = not signal.is_recorded and crossings < MIN_CROSSINGS
+        judged = signal.is_recorded or trust_written
+        unproved = not judged and crossings < MIN_CROSSINGS
         if wrong or unproved:
             why = "disagrees with the crossings" if wrong else "has too few crossings"
             notes.append(f"signal {name}: {why} ({reds} on red of {crossings}); unused")
@@ -81,8 +84,9 @@ def line_obstacles(
 ) -> list[dict]:
     """Stop lines ahead, by time of demand, and the destination.
 
-    A red light demands a stop while it is red. A stop sign does until a car
-    that brakes evenly to the line has stood for a second.
+    A red light demands a stop while it is red and no other light of the line (for
+    another direction) lets the driver pass. A stop sign does until a car that
+    brakes evenly to the line has stood for a second.
     """
     rows = []
     front = 0.5 * track.length
@@ -90,15 +94,18 @@ def line_obstacles(
         ahead = station - motion.s0
         if not front <= ahead <= LOOK_AHEAD_M:
             continue
+        lights = [signals[name] for name in lane.signal_ids if name in signals]
+        states = np.array([signal_state(light, clock) for light in lights], object)
         demand = np.zeros(TIMES_S.size, bool)
-        for name in lane.signal_ids:
-            if name in signals:
-                demand |= signal_state(signals[name], clock) == "red"
+        if lights:
+            passable = np.isin(states, ("green", "yellow")).any(axis=0)
+            demand = (states == "red").any(axis=0) & ~passable
+        is_light = bool(demand.any())
         if lane.stop_sign:
             arrival = 2.0 * (ahead - front) / max(motion.v0, 0.5)
             demand |= arrival + STOP_SIGN_WAIT_S > TIMES_S
         if demand.any():
-            rows.append(_line(ahead, demand, Kind.STOP))
+            rows.append(_line(ahead, demand, Kind.STOP, is_light))
     if track.destination is not None:
         rows += _destination(frame, track, motion)
     return rows[:4]
@@ -114,8 +121,11 @@ def _destination(frame: LaneFrame, track: Track, motion: Motion) -> list[dict]:
     return [_line(ahead, np.ones(TIMES_S.size, bool), Kind.VIRTUAL)]
 
 
-def _line(station: float, demand: np.ndarray, kind: Kind) -> dict:
+def _line(
+    station: float, demand: np.ndarray, kind: Kind, is_light: bool = False
+) -> dict:
     return {
+        "is_light": is_light,
         "s_lower": station,
         "s_upper": station,
         "l_lower": -LINE_HALF_WIDTH_M,

@@ -27,6 +27,7 @@ from rcirl_jax.evaluation.statistics import ClusterBootstrap
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import pinned
 from rcirl_jax.train.state import FeatureBatch
+from rcirl_jax.units import TIMES_S
 
 CHUNK = 64  # scenes per call; more may meet jax-ml/jax issue 39103 on CPUs
 DRAWS = 64  # of the posterior
@@ -41,6 +42,7 @@ class Choices:
     nearest: np.ndarray  # [S] index of the candidate nearest to the human
     error: np.ndarray  # [S] m, mean distance of the chosen to the human
     station: np.ndarray  # [S] m, where the chosen ends
+    ahead: np.ndarray  # [S, T] m, station of the chosen minus that of the nearest
     # m, standard deviation of the chosen one's end ...
     spread_of_seeds: np.ndarray  # [S] ... over the runs
     spread_of_posterior: np.ndarray  # [S] ... over draws of the first run's weights
@@ -113,15 +115,20 @@ def choices_of(
         PRIOR_PRECISION,
     )
     drawn = _posterior_draws(weights[0], precision)
-    station = _last_stations(test, feature_map(runs[0].config.features).names)
+    place = feature_map(runs[0].config.features).names.index("station")
+    stations = np.asarray(test.candidates[..., place])
+    last = np.asarray(test.time_valid).sum(axis=1) - 1
+    station = np.take_along_axis(stations, last[:, None, None], axis=2)[..., 0]
     best = lambda v: np.where(feasible, v, -np.inf).argmax(axis=-1)  # noqa: E731
     ends = lambda v: np.take_along_axis(station, best(v)[:, None], 1)[:, 0]  # noqa: E731
     chosen, rows = best(np.mean(values, axis=0)), np.arange(station.shape[0])
+    nearest = near.argmax(axis=1)
     return Choices(
         chosen=chosen,
-        nearest=near.argmax(axis=1),
+        nearest=nearest,
         error=np.asarray(facts.distance)[rows, chosen],
         station=station[rows, chosen],
+        ahead=stations[rows, chosen] - stations[rows, nearest],
         spread_of_seeds=np.std([ends(v) for v in values], axis=0, ddof=1),
         spread_of_posterior=np.std([ends(phis[0] @ w) for w in drawn], axis=0, ddof=1),
     )
@@ -138,13 +145,6 @@ def _posterior_draws(mean: np.ndarray, precision: np.ndarray) -> np.ndarray:
     return mean + solve_triangular(factor, noise, lower=True, trans=1).T
 
 
-def _last_stations(frozen: FeatureBatch, names: Sequence[str]) -> np.ndarray:
-    """[S, K] m, station at the last time that is compared."""
-    last = np.asarray(frozen.time_valid).sum(axis=1) - 1
-    s = np.asarray(frozen.candidates[..., names.index("station")])
-    return np.take_along_axis(s, last[:, None, None], axis=2)[..., 0]
-
-
 def rank_correlation(
     a: np.ndarray, b: np.ndarray, vehicle: np.ndarray
 ) -> tuple[float, float, float]:
@@ -159,6 +159,23 @@ def rank_correlation(
     rho = (xy - mx * my) / np.sqrt((xx - mx**2) * (yy - my**2))
     low, high = np.quantile(rho, [0.025, 0.975]).tolist()
     return float(np.sum(x * y) / np.sqrt(np.sum(x * x) * np.sum(y * y))), low, high
+
+
+def growth(ahead: np.ndarray, time_valid: np.ndarray) -> np.ndarray:
+    """[T, 3] mean |ahead| m, mean ahead m, and the steady acceleration it is worth.
+
+    2 |ahead| / t^2 m/s^2 (0 at t = 0): what the choice gets wrong if the error were
+    one of acceleration, held from the start. NaN at times that no scene has.
+    """
+    seen = np.where(time_valid, ahead, np.nan)
+    some = time_valid.any(axis=0)
+    size, bias = np.full(some.shape, np.nan), np.full(some.shape, np.nan)
+    size[some] = np.nanmean(np.abs(seen[:, some]), axis=0)
+    bias[some] = np.nanmean(seen[:, some], axis=0)
+    worth = np.divide(
+        2.0 * size, TIMES_S**2, out=np.zeros(some.shape), where=TIMES_S > 0
+    )
+    return np.stack([size, bias, worth], axis=1)
 
 
 def reasons(

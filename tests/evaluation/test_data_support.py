@@ -9,6 +9,7 @@ import pytest
 
 from rcirl_jax.evaluation.data_support import (
     choices_of,
+    growth,
     rank_correlation,
     reasons,
     sums_over_time,
@@ -18,6 +19,7 @@ from rcirl_jax.evaluation.learners import Learned, train_learner
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import RewardConfig, pinned
 from rcirl_jax.train.frozen import freeze
+from rcirl_jax.units import TIMES_S
 from tests.train.test_step import CONFIG, rows
 
 FREE = dataclasses.replace(
@@ -81,7 +83,20 @@ def test_the_choice_is_the_best_feasible_one_and_its_error_its_distance():
         last = int(np.asarray(frozen().time_valid)[s].sum()) - 1
         station = frozen().candidates[s, made.chosen[s], last, NAMES.index("station")]
         assert made.station[s] == float(station)
+        gap = frozen().candidates[s, made.chosen[s]] - frozen().human[s]
+        np.testing.assert_array_equal(made.ahead[s], gap[:, NAMES.index("station")])
     assert (made.spread_of_posterior >= 0.0).all()
+
+
+def test_growth_of_a_constant_error_of_acceleration():
+    ahead = np.stack([0.5 * 0.4 * TIMES_S**2, -0.5 * 0.4 * TIMES_S**2])
+    valid = np.tile(TIMES_S < 6.0, (2, 1))
+    size, bias, worth = growth(ahead, valid).T
+    seen = valid[0]
+    np.testing.assert_allclose(size[seen], 0.2 * TIMES_S[seen] ** 2, rtol=1e-6)
+    np.testing.assert_allclose(bias[seen], 0.0, atol=1e-6)
+    np.testing.assert_allclose(worth[seen][1:], 0.4, rtol=1e-5)
+    assert np.isnan(size[~seen]).all()
 
 
 def test_equal_runs_never_disagree():

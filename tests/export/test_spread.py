@@ -63,6 +63,7 @@ def leaves(made):
     return [np.asarray(leaf) for leaf in jax.tree.leaves(made)]
 
 
+@pytest.mark.slow
 @pytest.mark.multiprocess
 def test_a_suite_does_not_depend_on_where_it_is_driven(weights):
     job, config = job_of(weights), SuiteConfig(chunk=1)
