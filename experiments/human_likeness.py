@@ -4,8 +4,9 @@
 
 Every learner of `LEARNERS` is trained with every seed on the same candidates of
 the training scenes and ranks the same candidates of the held-out scenes, beside
-random, constant speed, IDM, hand-set and oracle rows. No scene is dropped; a
-crash of the chosen candidate is charged. `--holdout`:
+random, constant speed, IDM, hand-set and oracle rows. Of the scenes recorded as
+long as the horizon none is dropped; a crash of the chosen candidate is charged.
+`--holdout`:
 
     groups      the dataset's split by vehicle-disjoint groups
     vehicles    a quarter of the vehicles (drawn by --split_seed)

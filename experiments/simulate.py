@@ -92,6 +92,8 @@ def main() -> None:
     job, places = _job(), executor()
     rows, drive = job.rows(), drive_here
     if _SUITE.value == "recorded":
+        if places.workers > 1:
+            raise InputError("--suite: recorded: expected --workers=1: drives run here")
         cases = _recorded()
         rows.append(human_row())
     else:

@@ -14,6 +14,7 @@ import concurrent.futures as futures
 import importlib
 import itertools
 import multiprocessing
+import os
 import socket
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures.process import BrokenProcessPool
@@ -24,6 +25,7 @@ from rcirl_jax.errors import InputError
 EXECUTORS = ("local", "ray")
 AHEAD = 2  # pieces in flight per worker: one running, one waiting
 REACH_S = 5.0  # s, for the head of a cluster to answer
+RETRIES = 10  # of a piece whose node or process is lost, on a cluster
 ATTEMPTS = 3  # pools tried before a piece that kills its process is given up
 
 Item = TypeVar("Item")
@@ -59,7 +61,7 @@ class Here:
 
 
 class Processes:
-    """In processes of this machine. Items, results and function are sent."""
+    """In processes of this machine, on its CPUs. Items, results, function are sent."""
 
     def __init__(self, workers: int) -> None:
         self.workers = workers
@@ -75,18 +77,22 @@ class Processes:
         rest: collections.deque[Item] = collections.deque()
         source, failures = iter(items), 0
         while True:
+            # after a loss one piece at a time, so that the guilty one is known
+            width = self.workers * AHEAD if failures == 0 else 1
             try:
-                for result in self._one_pool(function, source, rest):
+                for result in self._one_pool(function, source, rest, width):
                     failures = 0
                     yield from result
-                return
+                    if width == 1:
+                        break
+                else:
+                    return
             except BrokenProcessPool as error:
                 failures += 1
                 if failures >= ATTEMPTS:
                     raise InputError(
-                        f"--workers: {self.workers}: a process was killed {ATTEMPTS} "
-                        f"times at {str(rest[0])[:200]}: expected enough memory; "
-                        "use fewer workers"
+                        f"{_name(rest[0])}: its process was killed {failures} times: "
+                        "expected enough memory; use fewer --workers"
                     ) from error
 
     def _one_pool(
@@ -94,19 +100,20 @@ class Processes:
         function: Callable[[Item], Iterable[Result]],
         source: Iterator[Item],
         rest: "collections.deque[Item]",
+        width: int,
     ) -> Iterator[list[Result]]:
         """Work off `rest`, then `source`; `rest` keeps what has no result yet."""
         # forking a process that runs JAX's threads can hang
         start = multiprocessing.get_context("spawn")
-        with futures.ProcessPoolExecutor(self.workers, mp_context=start) as pool:
-            running = collections.deque(
-                pool.submit(_listed, function, item) for item in rest
-            )
+        with futures.ProcessPoolExecutor(
+            min(self.workers, width), mp_context=start, initializer=_on_cpu
+        ) as pool:
+            running: collections.deque[futures.Future] = collections.deque()
             try:
                 while True:
-                    room = self.workers * AHEAD - len(running)
-                    for item in itertools.islice(source, max(room, 0)):
+                    for item in itertools.islice(source, max(width - len(rest), 0)):
                         rest.append(item)
+                    for item in itertools.islice(rest, len(running), width):
                         running.append(pool.submit(_listed, function, item))
                     if not running:
                         return
@@ -117,8 +124,19 @@ class Processes:
                 pool.shutdown(wait=False, cancel_futures=True)
 
 
+def _on_cpu() -> None:
+    """Numbers must not depend on an accelerator, nor processes fight over one."""
+    os.environ["JAX_PLATFORMS"] = "cpu"
+
+
 def _listed(function: Callable[[Item], Iterable[Result]], item: Item) -> list[Result]:
     return list(function(item))
+
+
+def _name(item: object) -> str:
+    """A piece in a message: its input file, if it has one."""
+    first = item[0] if isinstance(item, tuple) and item else item
+    return str(getattr(first, "input", first))[:200]
 
 
 class Ray:
@@ -158,20 +176,20 @@ class Ray:
         self, function: Callable[[Item], Iterable[Result]], items: Iterable[Item]
     ) -> Iterator[Result]:
         """Results of all items, in their order; lost pieces are done again."""
-        # -1: as often as nodes or processes are lost; errors of the function,
-        # which would come again, are not retried
-        remote = self._ray.remote(max_retries=-1)(_listed)
+        # where nodes or processes are lost; errors of the function, which would
+        # come again, are not retried
+        remote = self._ray.remote(max_retries=RETRIES)(_listed)
         shared = self._ray.put(function)
         source, running = iter(items), collections.deque()
         while True:
             room = self.workers * AHEAD - len(running)
             for item in itertools.islice(source, max(room, 0)):
-                running.append(remote.remote(shared, item))
+                running.append((_name(item), remote.remote(shared, item)))
             if not running:
                 return
-            yield from self._result(running.popleft())
+            yield from self._result(*running.popleft())
 
-    def _result(self, reference: Any) -> list:  # noqa: ANN401
+    def _result(self, name: str, reference: Any) -> list:  # noqa: ANN401
         """The value, or the function's own error in place of Ray's."""
         try:
             return self._ray.get(reference)
@@ -179,6 +197,11 @@ class Ray:
             if isinstance(error.cause, Exception):
                 raise error.cause from None
             raise
+        except self._ray.exceptions.RayError as error:
+            raise InputError(
+                f"{name}: lost {RETRIES} times ({type(error).__name__}): expected "
+                "nodes with enough memory that stay up"
+            ) from error
 
 
 def make_executor(

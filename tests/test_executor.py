@@ -2,6 +2,7 @@
 
 import os
 import signal
+import time
 from pathlib import Path
 
 import pytest
@@ -58,8 +59,22 @@ def test_a_piece_lost_with_its_process_is_done_again(tmp_path):
 
 
 def test_a_piece_that_always_kills_its_process_is_one_line():
-    with pytest.raises(InputError, match=r"a process was killed 3 times at 7: exp"):
+    with pytest.raises(InputError, match=r"^7: its process was killed 3 times: exp"):
         list(Processes(1).stream(dies, [7]))
+
+
+def slow_or_deadly(item):
+    if item == "killer":
+        os.kill(os.getpid(), signal.SIGKILL)
+    time.sleep(0.5)
+    yield item
+
+
+def test_the_guilty_piece_is_named_and_the_others_are_done():
+    results = Processes(2).stream(slow_or_deadly, ["healthy", "killer", "later"])
+    assert next(results) == "healthy"
+    with pytest.raises(InputError, match=r"^killer: its process was killed"):
+        next(results)
 
 
 def test_no_more_items_are_taken_than_the_workers_need():

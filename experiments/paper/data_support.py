@@ -73,7 +73,7 @@ def main() -> None:
         "weights": to_json(weights),
         "choices": {k: v.tolist() for k, v in dataclasses.asdict(made).items()},
         "warns_of_error": warns,
-        "error_over_time": np.nan_to_num(over_time).tolist(),
+        "error_over_time": over_time[np.isfinite(over_time[:, 0])].tolist(),
         "reasons": {n: float(np.abs(shares[:, i]).mean()) for i, n in enumerate(names)},
     }
     write("data_support", body)

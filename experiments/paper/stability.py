@@ -5,9 +5,9 @@
 Every learner of `LEARNERS` with every optimiser at the defaults of
 `experiments.train` (20 epochs, step size 0.003, the human's curve as the
 positive) on one dataset. A step whose loss or gradient is not finite is refused
-by the trainer and counts as a failure here. Expected: no failure, pairs won rise
-from one half; exit code 1 otherwise. 20 minutes on two cores with US-101;
-`--quick`: two minutes.
+by the trainer and counts as a failure here. Expected: no failure; exit code 1
+otherwise. How many pairs each wins is drawn, not judged. 20 minutes on two cores
+with US-101; `--quick`: two minutes.
 """
 
 import sys
@@ -30,7 +30,9 @@ from rcirl_jax.train.state import OPTIMIZERS, TrainConfig
 def main() -> None:
     """Train all, say which stayed finite, draw."""
     sets, rows = FrozenSets(dataset()), {}
-    grid = [(name, how) for name in LEARNERS for how in sorted(OPTIMIZERS)]
+    # "on curves" names the default positive: those are the same runs
+    names = [name for name in LEARNERS if not name.endswith("on curves")]
+    grid = [(name, how) for name in names for how in sorted(OPTIMIZERS)]
     grid = grid[::5] if QUICK.value else grid
     for name, how in tqdm.tqdm(grid, desc="train", unit="run"):
         epochs = 2 if QUICK.value else TrainConfig().epochs

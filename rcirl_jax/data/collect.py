@@ -59,6 +59,27 @@ class Collector:
         self._offset = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(int)
         self._size = np.array([(t.track.length, t.track.width) for t in self.tracks])
 
+    def own_frames(self, smooth: SmoothTrack) -> slice:
+        """The samples of a track that are the recording's own, not surroundings.
+
+        All of them, unless the recording is a piece of a longer log.
+        """
+        if self.recording.scenes_within is None:
+            return slice(0, smooth.num_frames)
+        low, high = (
+            int(np.ceil(time * self.rate - 1e-6)) - smooth.first_frame
+            for time in self.recording.scenes_within
+        )
+        start = min(max(low, 0), smooth.num_frames)
+        return slice(start, min(max(high, start), smooth.num_frames))
+
+    def begins_here(self, smooth: SmoothTrack) -> bool:
+        """Whether the log first saw this track inside the recording's own time."""
+        if self.recording.scenes_within is None:
+            return True
+        low, high = self.recording.scenes_within
+        return low - 1e-6 <= smooth.track.first_seen_s < high - 1e-6
+
     def scenes(self) -> Iterator[dict]:
         """Rows of one scene each, as flat dicts of numpy arrays."""
         for number, smooth in enumerate(self.tracks):
@@ -73,14 +94,11 @@ class Collector:
         # frames of the track before this piece of the log
         before = smooth.first_frame - int(round(smooth.track.first_seen_s * rate))
         starts = np.arange(first, last + 1 + before, stride) - before
-        starts = starts[starts >= first] if before else starts
         if starts.size == 0:
-            self.dropped["future_too_short"] += 1
+            self.dropped["future_too_short"] += self.begins_here(smooth)
             return
-        if self.recording.scenes_within is not None:
-            low, high = self.recording.scenes_within
-            times = (smooth.first_frame + starts) / rate
-            starts = starts[(times >= low - 1e-6) & (times < high - 1e-6)]
+        own = self.own_frames(smooth)
+        starts = starts[(starts >= own.start) & (starts < own.stop)]
         if starts.size == 0:
             return
         lane_ids = self.graph.match(smooth.x, smooth.y, smooth.heading)

@@ -15,7 +15,7 @@ import numpy as np
 from rcirl_jax.data.assemble import assemble
 from rcirl_jax.data.collect import Collector
 from rcirl_jax.data.config import CollectConfig
-from rcirl_jax.data.importers import csv_stream, read_part
+from rcirl_jax.data.importers import SMALL_PARTS, csv_stream, read_part
 from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Demonstration, Recording
@@ -51,17 +51,27 @@ class Cut:
 
 
 def digest(recording: Recording) -> str:
-    """sha256 over what a recording holds; equal inputs give equal datasets."""
-    piece = f"{recording.piece_of} {recording.scenes_within}"
-    total = hashlib.sha256(f"{recording.name} {recording.rate_hz} {piece}".encode())
-    for track in recording.tracks:
-        total.update(f"{track.id} {track.kind} {track.length} {track.width}".encode())
-        for values in (track.t, track.x, track.y, track.heading, track.speed):
-            total.update(np.ascontiguousarray(values, np.float64).tobytes())
-    for lane in recording.lanes:
-        total.update(lane.id.encode())
-        total.update(np.ascontiguousarray(lane.centre, np.float64).tobytes())
+    """sha256 over every field of a recording; equal inputs give equal datasets."""
+    total = hashlib.sha256()
+    _hash(total, recording)
     return total.hexdigest()
+
+
+def _hash(total: "hashlib._Hash", value: object) -> None:
+    """Type, length and content, so that no two values run into each other."""
+    if dataclasses.is_dataclass(value):
+        for field in dataclasses.fields(value):
+            total.update(f"{field.name}:".encode())
+            _hash(total, getattr(value, field.name))
+    elif isinstance(value, np.ndarray):
+        total.update(f"{value.dtype}{value.shape}".encode())
+        total.update(np.ascontiguousarray(value).tobytes())
+    elif isinstance(value, tuple | list):
+        total.update(f"({len(value)}".encode())
+        for item in value:
+            _hash(total, item)
+    else:
+        total.update(f"{type(value).__name__}={value!r};".encode())
 
 
 def group_name(recording: Recording, first_seen_s: float) -> str:
@@ -147,5 +157,7 @@ def recordings_of(part: Part) -> Iterator[Recording]:
 
 
 def is_long(part: Part) -> bool:
-    """Whether a part holds more than fits into memory at once."""
-    return part.format == "csv" and csv_stream.is_long(part.input, part.spec)
+    """Whether a part's recordings may be too many to be held at once."""
+    if part.format == "csv":
+        return csv_stream.is_long(part.input, part.spec)
+    return part.format not in SMALL_PARTS

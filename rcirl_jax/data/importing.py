@@ -187,6 +187,11 @@ class _Import:
 
     def finish(self) -> Manifest:
         """Close the last shard and commit the dataset."""
+        if self.done:
+            raise InputError(
+                f"{self.done[0]['name']}: missing: expected all recordings of the "
+                "interrupted import; use another --output"
+            )
         self._close_shard()
         if self.quality.scenes == 0:
             drops = {k: v for k, v in self.quality.dropped.items() if v}

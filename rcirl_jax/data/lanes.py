@@ -23,8 +23,7 @@ from rcirl_jax.types import Lane, Recording
 BEHIND_M = 100.0  # m of chain kept behind the lane at the planning frame
 AHEAD_M = 400.0  # m of chain kept beyond that lane
 MAX_HEADING_GAP = np.deg2rad(60.0)  # rad, a car heads along its lane within this
-SAME_PLACE_M = 0.75  # m, lanes no farther apart at a place lie on each other there
-FAR = 1e6  # m, more than any distance
+SAME_PLACE_M = 1.0  # m, points of lanes that are nearer lie on each other
 MATCH_NEIGHBOURS = 12  # nearest centre points looked at per position
 LINE_STEP_M = 1.0  # m, grid of the reference line
 LINE_SIZES = (256, 512, 1024, 2048, 4096)  # static sizes; few compilations
@@ -78,6 +77,7 @@ class LaneGraph:
             owners += [len(points) - 1] * len(dense)
         self._owner = np.array(owners, int)
         self._names = np.array(list(self.lanes), object)
+        self._reach = np.array([self._half_width(n) + 0.5 for n in self.lanes])
         self._heading = np.concatenate(headings) if headings else np.zeros(0)
         self._points = np.concatenate(points) if points else np.zeros((0, 2))
         self._tree = KDTree(self._points) if len(self._points) else None
@@ -97,18 +97,18 @@ class LaneGraph:
         distance, index = self._tree.query(np.stack([x, y], 1), k=count)
         distance, index = distance.reshape(-1, count), index.reshape(-1, count)
         gap = np.abs(_wrap(self._heading[index] - heading[:, None]))
-        cost = np.where(gap < MAX_HEADING_GAP, distance, np.inf)
+        owners, rows = self._owner[index], np.arange(len(x))
+        on = (gap < MAX_HEADING_GAP) & (distance <= self._reach[owners])
+        cost = np.where(on, distance, np.inf)
         best = np.argmin(cost, axis=1)
-        rows = np.arange(len(best))
-        owners = self._owner[index]
-        counts = np.bincount(owners[rows, best], minlength=len(self.lanes))[owners]
-        together = cost <= cost[rows, best][:, None] + SAME_PLACE_M
-        # the most frequent of those at this place, the nearest point of it
-        rank = np.where(together, -counts, 1) * FAR + np.minimum(cost, FAR / 2)
-        best = np.where(np.isfinite(cost[rows, best]), np.argmin(rank, axis=1), best)
-        lane_id = self._names[owners[rows, best]]
-        reach = np.array([self._half_width(name) + 0.5 for name in lane_id])
-        return np.where(cost[rows, best] <= reach, lane_id, "")
+        found = on[rows, best]
+        often = np.bincount(owners[rows, best][found], minlength=len(self.lanes))
+        # points of other lanes that lie where the nearest point lies
+        here = self._points[index[rows, best]]
+        apart = np.hypot(*(self._points[index] - here[:, None]).transpose(2, 0, 1))
+        together = on & (apart <= SAME_PLACE_M)
+        best = np.argmax(np.where(together, often[owners], -1), axis=1)
+        return np.where(found, self._names[owners[rows, best]], "")
 
     def _half_width(self, lane_id: str) -> float:
         lane = self.lanes[lane_id]

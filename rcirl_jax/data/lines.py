@@ -11,6 +11,7 @@ LOOK_AHEAD_M = 120.0  # m, lines farther ahead are not collected
 LINE_HALF_WIDTH_M = 20.0  # m, a line spans the whole road
 STOP_SIGN_WAIT_S = 1.0  # s, a stop sign is obeyed after standing this long
 MAX_RED_RUNNING = 0.1  # share of crossings on red above which a cycle is not true
+PASSABLE = ("green", "yellow")  # states that let a driver pass
 MIN_CROSSINGS = 3  # crossings needed to judge a cycle
 
 
@@ -43,10 +44,12 @@ def trusted_signals(
             time = _crossing(track, lane.stop_line)
             if time is None:
                 continue
-            for name in names:
-                state = signal_state(by_id[name], np.array([time]))[0]
+            states = [signal_state(by_id[n], np.array([time]))[0] for n in names]
+            # another light of the line let the driver pass
+            passable = any(state in PASSABLE for state in states)
+            for name, state in zip(names, states, strict=True):
                 counts[name][0] += 1
-                counts[name][1] += state == "red"
+                counts[name][1] += state == "red" and not passable
     trusted, notes = {}, []
     for name, signal in by_id.items():
         crossings, reds = counts[name]
@@ -98,9 +101,9 @@ def line_obstacles(
         states = np.array([signal_state(light, clock) for light in lights], object)
         demand = np.zeros(TIMES_S.size, bool)
         if lights:
-            passable = np.isin(states, ("green", "yellow")).any(axis=0)
+            passable = np.isin(states, PASSABLE).any(axis=0)
             demand = (states == "red").any(axis=0) & ~passable
-        is_light = bool(demand.any())
+        is_light = bool(demand[0])
         if lane.stop_sign:
             arrival = 2.0 * (ahead - front) / max(motion.v0, 0.5)
             demand |= arrival + STOP_SIGN_WAIT_S > TIMES_S

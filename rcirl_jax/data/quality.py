@@ -48,12 +48,16 @@ class QualityReport:
         """Count a recording's tracks, noise, drop reasons and notes."""
         recording = collector.recording
         self.recordings += 1
-        self.tracks += len(recording.tracks)
         for smooth in collector.tracks:
-            self.states += smooth.num_frames
-            raw, count = harsh_share(smooth.raw_x, smooth.raw_y, collector.rate)
+            own = collector.own_frames(smooth)
+            self.tracks += collector.begins_here(smooth)
+            self.states += own.stop - own.start
+            raw, count = harsh_share(
+                smooth.raw_x[own], smooth.raw_y[own], collector.rate
+            )
             self.harsh_raw += raw
-            self.harsh_smooth += harsh_share(smooth.x, smooth.y, collector.rate)[0]
+            smoothed = harsh_share(smooth.x[own], smooth.y[own], collector.rate)
+            self.harsh_smooth += smoothed[0]
             self.accelerations += count
         self.dropped.update(collector.dropped)
         notes = [*recording.notes, *collector.signal_notes]
@@ -142,8 +146,8 @@ def _quantiles(counts: collections.Counter, step: float) -> dict | None:
     if not counts:
         return None
     values, times = _sorted(counts, step)
-    share = (np.cumsum(times) - 0.5 * times) / times.sum()
-    found = np.interp([0.05, 0.5, 0.95], share, values)
+    at = np.searchsorted(np.cumsum(times), np.array([0.05, 0.5, 0.95]) * times.sum())
+    found = values[np.minimum(at, values.size - 1)]
     return dict(zip(("p05", "p50", "p95"), found.tolist(), strict=True))
 
 

@@ -171,8 +171,8 @@ def score_scenes(
       preset: feature preset.
       sampler: sampler configuration.
       horizon_s: 5 or 8 s (any in (0, 8]).
-      scorers: rewards to apply to the features; the baselines are added. They are
-        sent to other processes, if the executor has any.
+      scorers: rewards to apply to the features; the baselines are added. An executor
+        with other processes sends them: `reader.Reward.value` can be sent.
       hand_set: further hand-set costs by name, beside Apollo's.
       executor: where chunks are scored; the result does not depend on it.
 

@@ -123,10 +123,13 @@ class Reward:
 
         Returns:
           float32 [...]. A value that is not finite raises: `argmax` would pick a
-          NaN. Features at times that are not valid may be anything.
+          NaN. Features at times that are not valid may be anything. The first time
+          has to be valid in a conditioned reward (version 2): it sets the gains.
         """
         numbers = self._numbers(features, (len(self.times), len(self.names)))
         valid = None if time_valid is None else self._mask(time_valid, numbers.shape)
+        if self.context is not None and valid is not None and not valid[..., 0].all():
+            _fail(f"{self.file}: time_valid", "0 at the first time", "1: gains need it")
         values = self._values(numbers, valid)
         bad = np.argwhere(~np.isfinite(values)).tolist()
         if bad:
@@ -310,6 +313,9 @@ def _verify(reward: Reward, samples: object) -> None:
     features = _array("samples.features", found["features"], shape)
     valid = _array("samples.valid", found["valid"], shape[:2])
     _every("samples.valid", valid, (valid == 0.0) | (valid == 1.0), "0 or 1")
+    if reward.context is not None:
+        first = valid[:, :1]
+        _every("samples.valid", first, first == 1.0, "1 at the first time")
     # One sample at a time: little memory, however wide the layers are.
     for index, one in enumerate(zip(features, valid == 1.0, wanted, strict=True)):
         scored, want = float(reward._values(*one[:2])), float(one[2])

@@ -306,9 +306,7 @@ def _draw_body(axis: Axes, view: _View, slot: int) -> None:
         words += f" ({TIMES_S[at]:.1f} s)"
     # to the right of the box on the paper
     place = (float(right[at]) - 0.25, 0.5 * float(low[at] + high[at]))
-    axis.text(
-        *place, words, fontsize=7, va="center", ha="left", zorder=5, clip_on=True
-    )
+    axis.text(*place, words, fontsize=7, va="center", ha="left", zorder=5, clip_on=True)
 
 
 def _draw_line(axis: Axes, view: _View, slot: int) -> None:

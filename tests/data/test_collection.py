@@ -10,6 +10,7 @@ from rcirl_jax.data import importing
 from rcirl_jax.data.assemble import assemble
 from rcirl_jax.data.collect import Collector
 from rcirl_jax.data.config import CollectConfig
+from rcirl_jax.data.cut import digest
 from rcirl_jax.data.filters import REASONS
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
@@ -466,3 +467,74 @@ def test_on_overlapping_branches_the_track_keeps_to_one():
     got = graph.match(x, y, np.arctan(0.004 * x))
     assert set(got[2:]) == {"left"}
     assert graph.chain("in", ["in", "right", "left", "left"]) == ("in", "left")
+
+
+def other(value):
+    """Something of the same type that is not equal."""
+    if isinstance(value, bool):
+        return not value
+    if isinstance(value, np.ndarray):
+        return value + 1.0
+    if isinstance(value, int | float):
+        return type(value)(value + 1)
+    if isinstance(value, str):
+        return value + "x"
+    if isinstance(value, tuple):
+        return (*value, value[-1]) if value else ("x",)
+    return "x"
+
+
+@pytest.mark.parametrize("kind", [Recording, Track, Lane, Signal])
+def test_every_field_changes_the_digest(kind):
+    signal = Signal(id="s", start=np.array([0.0, 5.0]), state=("red", "green"))
+    made = recording(
+        car("ego", speeding_up(20.0)), lanes=road(50.0, ("s",)), signals=(signal,)
+    )
+    places = {Track: "tracks", Lane: "lanes", Signal: "signals"}
+    before = digest(made)
+    assert before == digest(dataclasses.replace(made))
+    for field in dataclasses.fields(kind):
+        if kind is Recording:
+            changed = {field.name: other(getattr(made, field.name))}
+        else:
+            first, *rest = getattr(made, places[kind])
+            value = other(getattr(first, field.name))
+            first = dataclasses.replace(first, **{field.name: value})
+            changed = {places[kind]: (first, *rest)}
+        assert digest(dataclasses.replace(made, **changed)) != before, field.name
+
+
+def test_quantiles_of_values_that_are_met_often():
+    report = QualityReport()
+    report.futures.update({"104": 10, "160": 90})  # 5.2 s and 8 s
+    report.speeds.update({"0": 60, **{str(k): 1 for k in range(60, 100)}})
+    made = report.as_dict()
+    assert made["future_s"] == pytest.approx({"p05": 5.2, "p50": 8.0, "p95": 8.0})
+    assert made["speed_mps"]["p50"] == 0.0
+
+
+def test_a_resume_without_a_recording_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(importing, "SHARD_SCENES", 1)
+
+    def interrupted():
+        yield from list(three_recordings())[:2]
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        import_logs(interrupted(), tmp_path / "part", CONFIG)
+    fewer = list(three_recordings())[:1]
+    with pytest.raises(InputError, match="r1: missing: expected all recordings"):
+        import_logs(fewer, tmp_path / "part", CONFIG)
+
+
+def test_a_red_light_that_another_light_of_the_line_overrules():
+    """Left-turners on their green arrow do not disprove the red light ahead."""
+    arrow = Signal(id="arrow", start=np.array([0.0]), state=("green",))
+    light = Signal(id="light", start=np.array([0.0]), state=("red",))
+    cars = [car(f"c{i}", speeding_up(10.0 * i)) for i in range(4)]
+    made = recording(
+        *cars, lanes=road(90.0, ("arrow", "light")), signals=(arrow, light)
+    )
+    collector = Collector(made, NO_FILTER)
+    assert set(collector.signals) == {"arrow", "light"}
+    assert not any(row["tags"][Tag.RED_LIGHT] for row in collector.scenes())

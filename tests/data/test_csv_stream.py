@@ -28,7 +28,10 @@ def rows_of(shuffled=False, seconds=SECONDS, cars=24):
         phase = np.random.default_rng(car).uniform(0.0, 6.0)
         speed = 11.0 + 2.0 * np.sin(0.35 * own + phase)
         x = np.cumsum(speed) * 0.1
-        y = np.full(own.shape, 0.1)
+        y = 0.4 * np.sin(x / 25.0)
+        if car % 3 == 0:  # unseen for three seconds, another fragment
+            seen = (own < begin + 40.0) | (own > begin + 43.0)
+            own, x, y = own[seen], x[seen], y[seen]
         found.append(np.stack([own, np.full(own.shape, car), x, y], axis=1))
     rows = np.concatenate(found)
     if not shuffled:
@@ -67,6 +70,14 @@ def test_pieces_hold_the_scenes_of_the_whole(tmp_path, by_car):
     apart = scenes_by_name(pieces)
     assert len(whole) > 500
     assert set(apart) == set(whole)
+    assert any("#2" in name for name, _ in whole)
+    parts_of = lambda made: (made.quality["tracks"], made.quality["states"])  # noqa: E731
+    (one,) = cuts(path, spec)
+    totals = np.sum([parts_of(made) for made in pieces], axis=0)
+    assert tuple(totals) == parts_of(one)
+    for reason in ("future_too_short", "off_map"):
+        found = sum(made.quality["dropped"].get(reason, 0) for made in pieces)
+        assert found == one.quality["dropped"].get(reason, 0)
     for key, (scenes, row) in apart.items():
         other, at = whole[key]
         for leaf in ("s", "v", "a"):
@@ -91,6 +102,9 @@ def test_a_vehicle_is_in_one_group_whatever_the_piece(tmp_path):
     assert not set(train.vehicle.tolist()) & set(test.vehicle.tolist())
     names = dataset.manifest.vehicles
     assert len({name.split(":")[1] for name in names}) == len(names)
+    whole = Part(format="csv", input=path, spec={**spec, "long_bytes": 10**9})
+    import_parts([whole], tmp_path / "whole", CONFIG)
+    assert set(open_dataset(tmp_path / "whole").manifest.vehicles) == set(names)
 
 
 def test_recordings_of_one_file_stay_apart(tmp_path):
@@ -142,6 +156,22 @@ def test_a_wrong_unit_of_time_is_found(tmp_path, monkeypatch):
         cuts(path, spec)
 
 
+def test_names_with_a_hash_and_padded_headers_are_read(tmp_path):
+    path = tmp_path / "log.csv"
+    spec = {**write(path, rows_of(seconds=30.0, cars=3)), "long_bytes": 1}
+    text = path.read_text().replace("t,id,x,y", " t , id,x, y").replace(",c", ",c#")
+    path.write_text(text)
+    (made,) = read_part("csv", path, spec)
+    assert {track.id for track in made.tracks} == {"c#0", "c#1", "c#2"}
+
+
+def test_a_wrong_limit_is_one_line(tmp_path):
+    path = tmp_path / "log.csv"
+    spec = {**write(path, rows_of(seconds=30.0, cars=3)), "long_bytes": "256MB"}
+    with pytest.raises(InputError, match="long_bytes: 256MB: expected a number"):
+        cuts(path, spec)
+
+
 def test_settings_change_the_digest_of_a_piece(tmp_path):
     path = tmp_path / "log.csv"
     spec = {**write(path, rows_of(seconds=70.0, cars=4)), "long_bytes": 1}
@@ -157,7 +187,8 @@ from rcirl_jax.data.cut import Part
 from rcirl_jax.data.importers import parts
 from rcirl_jax.data.importers.csv_stream import Field, pieces
 fields = [Field(name=n, column=n, text=n == "id") for n in ("t", "id", "x", "y")]
-rows = sum(len(piece.values["t"]) for piece in pieces(Path(sys.argv[1]), fields))
+found = pieces(Path(sys.argv[1]), fields, 0.55)
+rows = sum(len(piece.values["t"]) for piece in found)
 print(rows, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """
 

@@ -14,7 +14,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rcirl_jax.export import WeightsError, decode_weights, load_weights, reader, save
+from rcirl_jax.errors import InputError
+from rcirl_jax.export import (
+    WeightsError,
+    decode_weights,
+    load_weights,
+    pack,
+    reader,
+    save,
+)
 from tests.export.test_weights import (
     ACTIVATIONS,
     example_samples,
@@ -478,3 +486,17 @@ def flipped(data, bits):
     for bit in bits:
         changed[bit // 8] ^= 1 << (bit % 8)
     return bytes(changed)
+
+
+def test_a_conditioned_reward_needs_the_first_time():
+    weights = example_weights(by_context=True)
+    features, valid, values = example_samples(weights)
+    reward = decode_weights(pack(weights, features, valid, values))
+    late = np.array(valid)
+    late[1, 0] = False
+    with pytest.raises(WeightsError, match=r"time_valid: 0 at the first time: exp"):
+        reward.value(features, late)
+    with pytest.raises(WeightsError, match=r"context: conditioned: expected whole"):
+        reward.point_rewards(features)
+    with pytest.raises(InputError, match=r"samples\.valid\[1, 0\]: 0: expected 1 at"):
+        pack(weights, features, late, values)

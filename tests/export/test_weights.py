@@ -90,6 +90,7 @@ def example_samples(weights, count=4, seed=1):
     size = (count, len(weights.times), len(weights.features))
     features = rng.normal(scale=2.0, size=size).astype(np.float32)
     valid = rng.random(size[:2]) < 0.7
+    valid[:, 0] |= weights.context is not None
     values = [loop_value(weights, *one) for one in zip(features, valid, strict=True)]
     return features, valid, np.array(values)
 

@@ -34,6 +34,18 @@ IMPORTERS: dict[str, str] = {
 }
 
 
+# formats of which one part (see `parts`) is a file with a few recordings
+SMALL_PARTS = (
+    "argoverse2",
+    "commonroad",
+    "interaction",
+    "levelx",
+    "ngsim",
+    "ngsim_pairs",
+    "openacc",
+)
+
+
 def read_part(name: str, path: Path, spec: dict) -> Iterator[Recording]:
     """All recordings of one part, each validated; arguments as of `parts`."""
     module = importlib.import_module(f"{__name__}.{IMPORTERS[name]}")

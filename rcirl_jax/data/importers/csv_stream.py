@@ -2,12 +2,13 @@
 
 The file is read once, a few MiB at a time, and its rows are written to scratch
 files by recording and minute. Each minute is then a Recording of its own, with
-rows before and after it so that no scene, filter or path ends at the border.
-Which minute a road user was first seen in is kept for the whole log, so that
-vehicles and their groups are the same as if the log had been read at once.
+rows before and after it, so that scenes and filters do not end at the border.
+When each road user was first seen, also after gaps, is found for the whole log
+first, so that vehicles and their groups are those of a log read at once.
 
 What differs from a file that fits: lanes that are not given are fitted minute by
-minute, and a row out of order is found inside a minute only. Rows may come in any
+minute, the given path is known for 28 s beyond the minute only, and a row out of
+order is found inside a minute only. Rows may come in any
 order of road users; scratch space of about the file's size is needed.
 
 pyarrow reads the text (extra `[logs]`).
@@ -22,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from rcirl_jax.data.importers.tables import number, read_header
 from rcirl_jax.errors import InputError
 
 LONG_BYTES = 256 * 2**20  # bytes; a longer file is read in pieces
@@ -51,16 +53,23 @@ class Piece:
     number: int  # of the minute, from the recording's first
     values: dict[str, np.ndarray]  # field -> [n], t since the recording's start
     within: tuple[float, float]  # s, the minute itself
-    seen_since: dict[str, float]  # id -> s, when the whole log first saw it
+    # id -> s, when the whole log first saw it, and when again after each gap
+    fragments: dict[str, list[float]]
 
 
 def is_long(path: Path, spec: dict) -> bool:
     """Whether a file is read in pieces; `long_bytes` of the TOML sets from where."""
-    return path.is_file() and path.stat().st_size > spec.get("long_bytes", LONG_BYTES)
+    limit = number(spec, "long_bytes", LONG_BYTES)
+    return path.is_file() and path.stat().st_size > limit
 
 
-def pieces(path: Path, fields: list[Field]) -> Iterator[Piece]:
+def pieces(path: Path, fields: list[Field], max_gap_s: float) -> Iterator[Piece]:
     """All pieces of a file, recording by recording in the order of time.
+
+    Args:
+      path: CSV with a header.
+      fields: at least t, id, x, y.
+      max_gap_s: a road user unseen for longer is another fragment.
 
     Raises:
       InputError: unreadable text, a cell that is no finite number, or more
@@ -70,7 +79,7 @@ def pieces(path: Path, fields: list[Field]) -> Iterator[Piece]:
         spill = _Spill(path, fields, Path(folder))
         for batch in _batches(path, fields):
             spill.add(batch)
-        yield from spill.pieces()
+        yield from spill.pieces(max_gap_s)
 
 
 def _batches(path: Path, fields: list[Field]) -> Iterator[dict[str, np.ndarray]]:
@@ -82,10 +91,13 @@ def _batches(path: Path, fields: list[Field]) -> Iterator[dict[str, np.ndarray]]
             f"{path}: pyarrow: not installed: expected the extra rcirl-jax[logs]"
         ) from error
     kinds = {f.column: arrow.string() if f.text else arrow.float64() for f in fields}
+    names = read_header(path)
     try:
         reader = csv.open_csv(
             path,
-            read_options=csv.ReadOptions(block_size=READ_BYTES),
+            read_options=csv.ReadOptions(
+                block_size=READ_BYTES, column_names=names, skip_rows=1
+            ),
             convert_options=csv.ConvertOptions(
                 column_types=kinds,
                 include_columns=list(dict.fromkeys(f.column for f in fields)),
@@ -96,7 +108,7 @@ def _batches(path: Path, fields: list[Field]) -> Iterator[dict[str, np.ndarray]]
         for batch in reader:
             yield {f.name: _column(path, batch, f, start) for f in fields}
             start += batch.num_rows
-    except arrow.ArrowInvalid as error:
+    except arrow.ArrowException as error:
         raise InputError(
             f"{path}: {str(error)[:200]}: expected rows as the header says"
         ) from error
@@ -124,7 +136,6 @@ class _Spill:
         self.path, self.folder = path, folder
         self.names = [field.name for field in fields]
         self.texts = {field.name: {} for field in fields if field.text}
-        self.first: dict[tuple[int, int], float] = {}  # (recording, id) -> s
         self.blocks: dict[tuple[int, int], None] = {}
         self.buffers: dict[tuple[int, int], list[np.ndarray]] = {}
         self.held = 0  # bytes in the buffers
@@ -134,11 +145,9 @@ class _Spill:
         columns = [self._numbers(name, batch[name]) for name in self.names]
         rows = np.stack(columns, axis=1)
         t = rows[:, self.names.index("t")]
-        user = rows[:, self.names.index("id")].astype(np.int64)
         recording = np.zeros(len(rows), np.int64)
         if "recording" in self.names:
             recording = rows[:, self.names.index("recording")].astype(np.int64)
-        self._see(recording, user, t)
         minute = np.floor(t / BLOCK_S).astype(np.int64)
         order = np.lexsort((minute, recording))  # stable: the file's order inside
         keys = np.stack([recording, minute], axis=1)[order]
@@ -165,14 +174,6 @@ class _Spill:
         mine = [known.setdefault(text.strip(), len(known)) for text in texts]
         return np.array(mine, np.float64)[codes]
 
-    def _see(self, recording: np.ndarray, user: np.ndarray, t: np.ndarray) -> None:
-        both = recording << 40 | user
-        order = np.lexsort((t, both))
-        found, start = np.unique(both[order], return_index=True)
-        for key, seen in zip(found.tolist(), t[order][start].tolist(), strict=True):
-            pair = (key >> 40, key & ((1 << 40) - 1))
-            self.first[pair] = min(seen, self.first.get(pair, np.inf))
-
     def _flush(self) -> None:
         for (recording, minute), rows in self.buffers.items():
             with (self.folder / f"{recording}_{minute}").open("ab") as file:
@@ -186,13 +187,34 @@ class _Spill:
         raw = np.fromfile(self.folder / f"{recording}_{minute}", np.float64)
         return raw.reshape(-1, len(self.names))
 
-    def pieces(self) -> Iterator[Piece]:
+    def _fragments(self, max_gap_s: float) -> dict[tuple[int, int], list[float]]:
+        """(recording, id) -> times [s] at which it is first seen, or again."""
+        found: dict[tuple[int, int], list[float]] = {}
+        last: dict[tuple[int, int], float] = {}
+        t, user = self.names.index("t"), self.names.index("id")
+        for recording, minute in sorted(self.blocks):
+            rows = self._rows(recording, minute)[:, [user, t]]
+            rows = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
+            same = np.diff(rows[:, 0]) == 0.0
+            later = same & (np.diff(rows[:, 1]) > max_gap_s)
+            starts = np.flatnonzero(np.concatenate([[True], ~same | later]))
+            ends = np.concatenate([starts[1:] - 1, [len(rows) - 1]])
+            for low, high in zip(starts.tolist(), ends.tolist(), strict=True):
+                key = (recording, int(rows[low, 0]))
+                begin = float(rows[low, 1])
+                if begin - last.get(key, -np.inf) > max_gap_s:
+                    found.setdefault(key, []).append(begin)
+                last[key] = float(rows[high, 1])
+        return found
+
+    def pieces(self, max_gap_s: float) -> Iterator[Piece]:
         """Every minute with its surroundings."""
         self._flush()
         names = {key: list(table) for key, table in self.texts.items()}
-        t = self.names.index("t")
+        t, user = self.names.index("t"), self.names.index("id")
+        fragments = self._fragments(max_gap_s)
         begin: dict[int, float] = {}
-        for (recording, _), seen in self.first.items():
+        for (recording, _), (seen, *_) in fragments.items():
             begin[recording] = min(seen, begin.get(recording, np.inf))
         for recording, minute in sorted(self.blocks):
             low, high = minute * BLOCK_S, (minute + 1) * BLOCK_S
@@ -207,14 +229,14 @@ class _Spill:
                     column = np.array(names[name])[column.astype(np.int64)]
                 values[name] = column
             values["t"] = values["t"] - start
-            users = np.unique(rows[:, self.names.index("id")]).astype(int)
             named = values.pop("recording", None)
             yield Piece(
                 recording=None if named is None else names["recording"][recording],
                 number=minute - int(np.floor(start / BLOCK_S)),
                 values=values,
                 within=(low - start, high - start),
-                seen_since={
-                    names["id"][u]: self.first[recording, int(u)] - start for u in users
+                fragments={
+                    names["id"][u]: [s - start for s in fragments[recording, u]]
+                    for u in np.unique(rows[:, user]).astype(int).tolist()
                 },
             )

@@ -106,22 +106,29 @@ def _long_recordings(path: Path, spec: dict) -> Iterator[Recording]:
             )
         else:
             notes.append(f"no column '{column}': {field} computed or by default")
-    for piece in csv_stream.pieces(path, fields):
+    for piece in csv_stream.pieces(path, fields, MAX_GAP_STEPS / rate):
         log = path.stem if piece.recording is None else f"{path.stem}-{piece.recording}"
         table = _localise(path, piece.values, rate, notes, start=0.0)
         made = _recording(f"{log}-{piece.number:05d}", table, spec)
-        if not made.tracks:
-            continue
-        tracks = tuple(
-            dataclasses.replace(
-                track, seen_since=piece.seen_since[track.id.split("#")[0]]
-            )
-            for track in made.tracks
-        )
         made = dataclasses.replace(
-            made, tracks=tracks, piece_of=log, scenes_within=piece.within
+            made,
+            tracks=tuple(_of_log(track, piece.fragments) for track in made.tracks),
+            piece_of=log,
+            scenes_within=piece.within,
         )
         yield validate_recording(made, path)
+
+
+def _of_log(track: Track, fragments: dict[str, list[float]]) -> Track:
+    """A track of a piece under the name that it has in the whole log."""
+    user = track.id if track.id in fragments else track.id.rpartition("#")[0]
+    starts = fragments[user]
+    number = int(np.searchsorted(starts, track.t[0] + 1e-6, side="right"))
+    return dataclasses.replace(
+        track,
+        id=user if number <= 1 else f"{user}#{number}",
+        seen_since=starts[max(number - 1, 0)],
+    )
 
 
 def _lane_file(spec: dict) -> str:

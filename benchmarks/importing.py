@@ -1,0 +1,81 @@
+"""Scenes per second of an import, parsing and cutting apart, on one core and on two.
+
+    python -m benchmarks.importing --data=DIR [--processes=2]
+
+For every folder of recordings under DIR that is there: seconds to parse all of it,
+then scenes per second when its recordings are cut in this process, and in
+`--processes` processes. Programs are compiled before the clock starts, in every
+process. Goal: 500 scenes/s after parsing, on two cores.
+"""
+
+import functools
+import time
+from pathlib import Path
+
+from absl import flags
+
+from benchmarks.common import write
+from experiments.common import run
+from rcirl_jax.data.config import CollectConfig
+from rcirl_jax.data.cut import Part, cut_one
+from rcirl_jax.data.importers import parts, read_part
+from rcirl_jax.executor import Executor, Here, Processes
+
+_DATA = flags.DEFINE_string("data", "../shared/data", "folder of the recordings")
+_PROCESSES = flags.DEFINE_integer("processes", 2, "processes side by side")
+_OUTPUT = flags.DEFINE_string("output", "benchmarks/results", "folder of the JSON")
+
+FOLDERS = {
+    "US-101": ("commonroad", "ngsim_us101_commonroad/xml"),
+    "urban": ("commonroad", "ngsim_urban_commonroad/xml"),
+    "I-80": ("ngsim", "ngsim_i80_native"),
+    "I-80 pairs": ("ngsim_pairs", "ngsim_i80_pairs"),
+    "Argoverse 2": ("argoverse2", "formats/argoverse2_motion"),
+}
+
+
+def rate(executor: Executor, items: list, config: CollectConfig) -> dict:
+    """Scenes per second; the first pass compiles and is not timed."""
+    piece = functools.partial(cut_one, config=config)
+    for _ in executor.stream(piece, items[:1] * executor.workers):
+        pass
+    begin = time.perf_counter()
+    made = list(executor.stream(piece, items))
+    seconds = time.perf_counter() - begin
+    scenes = sum(len(one.vehicles) for one in made)
+    return {"scenes": scenes, "seconds": seconds, "scenes_per_s": scenes / seconds}
+
+
+def main() -> None:
+    """Every folder that is there."""
+    found = {}
+    for name, (format_, place) in FOLDERS.items():
+        path = Path(_DATA.value) / place
+        if not path.exists():
+            print(f"{name}: {path} is not there")
+            continue
+        inputs, spec = parts(format_, path)
+        begin = time.perf_counter()
+        items = [
+            (Part(format=format_, input=one, spec=spec), made)
+            for one in inputs
+            for made in read_part(format_, one, spec)
+        ]
+        parsing = time.perf_counter() - begin
+        states = sum(t.t.size for _, made in items for t in made.tracks)
+        row = {"states": states, "parsing_s": parsing, "states_per_s": states / parsing}
+        row["one_process"] = rate(Here(), items, CollectConfig())
+        row["processes"] = rate(Processes(_PROCESSES.value), items, CollectConfig())
+        found[name] = row
+        print(
+            f"{name}: {states:,} states parsed at {row['states_per_s']:,.0f}/s; "
+            f"{row['one_process']['scenes']:,} scenes cut at "
+            f"{row['one_process']['scenes_per_s']:.0f}/s, in {_PROCESSES.value} "
+            f"processes {row['processes']['scenes_per_s']:.0f}/s (start included)",
+            flush=True,
+        )
+    write("importing", {"processes": _PROCESSES.value, "folders": found}, _OUTPUT.value)
+
+
+if __name__ == "__main__":
+    run(main)
