@@ -67,12 +67,14 @@ class Progress:
     """A bar of the files read: scenes, scenes/s, drop reasons, time left."""
 
     NUM_REASONS = 2  # drop reasons shown, the most frequent ones
+    EVERY_S = 0.5  # s between two drawings
 
     def __init__(self, total: int | None) -> None:
         self._bar = tqdm.tqdm(
             total=total, desc="import", unit=" files", mininterval=0.5
         )
         self._start, self._part = time.monotonic(), None
+        self._shown = self._start
         self._known = 0  # scenes taken over from an interrupted import
 
     def __enter__(self) -> "Progress":
@@ -100,6 +102,10 @@ class Progress:
             + (f", dropped: {dropped}" if dropped else ""),
             refresh=False,
         )
+        # one long file: the bar itself does not move for minutes
+        if time.monotonic() - self._shown > self.EVERY_S:
+            self._shown = time.monotonic()
+            self._bar.refresh()
 
 
 class _Import:
