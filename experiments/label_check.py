@@ -12,7 +12,7 @@ stored in a dataset are compared with today's rules.
 
 Writes labels.json and labels.png. On two cores 100 cases of each of the 38
 families take about 5 minutes per noise; the urban CommonRoad files 3 minutes.
-Expected: above 98 % everywhere, but for red_light (stop signs count as one).
+Expected: above 98 % everywhere.
 """
 
 import json

@@ -27,8 +27,6 @@ from rcirl_jax.types import Decision, Signal, Tag
 
 CASES = 2  # of every family
 FLOOR = 0.9  # precision and recall of a class with some 10 cases
-# a stop sign is labelled as a red light: the scene does not tell them apart
-WORSE = {("red_light", "precision"): 0.6}
 
 
 @functools.cache
@@ -45,8 +43,7 @@ def test_every_class_is_found(noise):
         assert score.true >= CASES, score.name
         for what in ("precision", "recall"):
             value, low, high = getattr(score, what)()
-            floor = WORSE.get((score.name, what), FLOOR)
-            assert value >= floor, (score, what, format_labels(found))
+            assert value >= FLOOR, (score, what, format_labels(found))
             assert low <= value <= high
 
 
