@@ -65,6 +65,8 @@ class Processes:
 
     def __init__(self, workers: int) -> None:
         self.workers = workers
+        # kept from stream to stream: what a process has compiled stays compiled
+        self._pool: futures.ProcessPoolExecutor | None = None
 
     def stream(
         self, function: Callable[[Item], Iterable[Result]], items: Iterable[Item]
@@ -80,7 +82,7 @@ class Processes:
             # after a loss one piece at a time, so that the guilty one is known
             width = self.workers * AHEAD if failures == 0 else 1
             try:
-                for result in self._one_pool(function, source, rest, width):
+                for result in self._results(function, source, rest, width):
                     failures = 0
                     yield from result
                     if width == 1:
@@ -95,7 +97,7 @@ class Processes:
                         "expected enough memory; use fewer --workers"
                     ) from error
 
-    def _one_pool(
+    def _results(
         self,
         function: Callable[[Item], Iterable[Result]],
         source: Iterator[Item],
@@ -103,25 +105,31 @@ class Processes:
         width: int,
     ) -> Iterator[list[Result]]:
         """Work off `rest`, then `source`; `rest` keeps what has no result yet."""
-        # forking a process that runs JAX's threads can hang
-        start = multiprocessing.get_context("spawn")
-        with futures.ProcessPoolExecutor(
-            min(self.workers, width), mp_context=start, initializer=_on_cpu
-        ) as pool:
-            running: collections.deque[futures.Future] = collections.deque()
-            try:
-                while True:
-                    for item in itertools.islice(source, max(width - len(rest), 0)):
-                        rest.append(item)
-                    for item in itertools.islice(rest, len(running), width):
-                        running.append(pool.submit(_listed, function, item))
-                    if not running:
-                        return
-                    result = running.popleft().result()
-                    rest.popleft()
-                    yield result
-            finally:
-                pool.shutdown(wait=False, cancel_futures=True)
+        if self._pool is None:
+            # forking a process that runs JAX's threads can hang
+            start = multiprocessing.get_context("spawn")
+            self._pool = futures.ProcessPoolExecutor(
+                self.workers, mp_context=start, initializer=_on_cpu
+            )
+        pool = self._pool
+        running: collections.deque[futures.Future] = collections.deque()
+        try:
+            while True:
+                for item in itertools.islice(source, max(width - len(rest), 0)):
+                    rest.append(item)
+                for item in itertools.islice(rest, len(running), width):
+                    running.append(pool.submit(_listed, function, item))
+                if not running:
+                    return
+                result = running.popleft().result()
+                rest.popleft()
+                yield result
+        except BrokenProcessPool:
+            self._pool = None
+            raise
+        finally:
+            for future in running:
+                future.cancel()
 
 
 def _on_cpu() -> None:
