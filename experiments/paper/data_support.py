@@ -6,9 +6,9 @@ Three answers on the same frozen candidates. Which weights of the linear reward
 the data support, per unit of the feature, with intervals from vehicles. How far
 apart seeds, and draws of the last layer's Laplace posterior, choose (m), and
 whether unsure choices are worse ones. Which features speak for the chosen
-candidate against the one nearest to the human. Expected on two cores with
-US-101: 8 minutes; seeds disagree by less than they err, so more data would not
-help as much as better features. `--quick`: a minute.
+candidate against the one nearest to the human, and how its error grows. Expected
+on two cores with US-101: 6 minutes; 8 of 21 weights supported, neither doubt warns
+of errors, the error is worth a steady 0.2 m/s^2. `--quick`: a minute.
 """
 
 import dataclasses
