@@ -4,6 +4,7 @@ Programs are compiled once for all workers and runs: most of the tests' time
 would otherwise go into compiling the same ones again.
 """
 
+import gc
 import os
 from pathlib import Path
 
@@ -40,3 +41,24 @@ def data_dir() -> Path:
     if not path.is_dir():
         pytest.skip(f"recorded data not found: set RCIRL_DATA (looked at {path})")
     return path
+
+
+MAX_RESIDENT_BYTES = 3 * 2**30  # of one test process, between two files
+
+
+def _resident_bytes() -> int:
+    """Memory of this process; 0 where /proc does not say."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except (OSError, IndexError):
+        return 0
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def bounded_memory():
+    """Forget compiled programs when many have piled up; the cache on disk has them."""
+    yield
+    if _resident_bytes() > MAX_RESIDENT_BYTES:
+        jax.clear_caches()
+        gc.collect()
