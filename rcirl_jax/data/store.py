@@ -36,6 +36,7 @@ from rcirl_jax.data.manifest import (
 )
 from rcirl_jax.data.rows import checked_leaves, leaf_specs, row_spec
 from rcirl_jax.data.shards import (
+    BLOCK_ROWS,
     describe,
     encode,
     shard_key,
@@ -49,6 +50,7 @@ from rcirl_jax.types import (
 from rcirl_jax.units import TIMES_S
 
 SHARDS_END = "shards0"  # first key after all that begin with "shards/"
+OPEN_SHARDS = 256  # shards whose arrays are kept open, 60 kB each
 # what the import hands to `DatasetWriter.finish`; the writer knows the rest
 IMPORT_FIELDS = (
     "rate_hz",
@@ -255,6 +257,8 @@ class Dataset:
                     f"{found[1]}: expected {expected[0]} {expected[1]}"
                 )
             arrays[name] = array
+        if len(self._open) >= OPEN_SHARDS:
+            self._open.pop(next(iter(self._open)))
         self._open[shard] = arrays
         return arrays
 
@@ -304,6 +308,13 @@ class Dataset:
     def _groups(self) -> np.ndarray:
         return self._read(np.arange(self.count), ("group",))["group"]
 
+    def blocks(self, indices: np.ndarray) -> np.ndarray:
+        """[m] number of the block of rows, unpacked together, that each lies in."""
+        shard = np.searchsorted(self._starts, indices, side="right") - 1
+        counts = -(-np.diff(self._starts) // BLOCK_ROWS)
+        before = np.cumsum([0, *counts])[shard]
+        return before + (indices - self._starts[shard]) // BLOCK_ROWS
+
     def load(self, split: str | None) -> Demonstration:
         """All rows of a split (None: of all splits) in memory."""
         return self.read(self.indices(split))
@@ -312,6 +323,10 @@ class Dataset:
         """Rows by number, numpy leaves [m, ...], in the order asked for."""
         leaves = self._read(indices, tuple(leaf_specs()))
         return jax.tree.unflatten(jax.tree.structure(row_spec()), leaves.values())
+
+    def column(self, name: str) -> np.ndarray:
+        """One leaf of all rows, e.g. "scene.tags", numpy [n, ...]."""
+        return self._read(np.arange(self.count), (name,))[name]
 
     def _read(
         self, indices: np.ndarray, names: tuple[str, ...]

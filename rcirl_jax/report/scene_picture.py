@@ -6,23 +6,28 @@ decision; numbers are the slots of `Obstacles`, so that a box, its boundary on
 the graph and the row of the array can be told to be the same.
 """
 
-import dataclasses
 import itertools
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
-import jax
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
+from matplotlib.ticker import MaxNLocator
 
-from rcirl_jax.data.labels import blocking
-from rcirl_jax.errors import InputError
+from rcirl_jax.report.scene_view import (
+    KIND_WORDS,
+    LINE_KINDS,
+    View,
+    spoken,
+    tag_names,
+    view_of,
+)
 from rcirl_jax.report.style import CANDIDATE, CHOSEN, CLASS_COLOURS, HUMAN, label, save
 from rcirl_jax.report.style import plt as pyplot
-from rcirl_jax.types import Decision, Demonstration, Kind, Tag
+from rcirl_jax.types import Decision, Demonstration, Kind
 from rcirl_jax.units import DT_S, HORIZON_S, STATION_STEP_M, TIMES_S
 
 DECISION_COLOURS = {
@@ -34,64 +39,18 @@ DECISION_COLOURS = {
     Decision.NUDGE_RIGHT: CLASS_COLOURS["nudge"],
     Decision.IGNORE: CANDIDATE,
 }
-KIND_WORDS = {
-    Kind.VEHICLE: "vehicle",
-    Kind.CYCLIST: "cyclist",
-    Kind.PEDESTRIAN: "pedestrian",
-    Kind.STATIC: "standing object",
-    Kind.STOP: "stop line",
-    Kind.VIRTUAL: "destination",
-}
-LINE_KINDS = (Kind.STOP, Kind.VIRTUAL)
 ROAD_COLOUR = "#444444"
 OFF_ROAD_COLOUR = "#EEEEEE"
-WIDTH_INCHES, HEIGHT_INCHES = 5.6, 7.4  # inches without the legend
-BEHIND_M = (12.0, 40.0)  # m behind the ego, at least and at most
-AHEAD_M, SPARE_M = 15.0, 40.0  # m beyond the human's end; more for the ignored
-LEAST_VIEW_M = 60.0  # m of road that is shown at least
+WIDTH_INCHES, HEIGHT_INCHES = 5.6, 7.9  # inches without the legend
+GRAPH_INCHES, MOTION_INCHES = (2.45, 7.15), (0.6, 1.75)  # above the legend
+LINE_INCHES = 0.175  # of the legend
+Rect = tuple[float, float, float, float]  # left, bottom, width, height
 ASIDE_M = 1.5  # m beside the road and the boxes
 BEND_SHOWN_DEG = 15.0  # deg of bend along the driven way that is worth a word
 LABEL_HIGH = 0.034  # height of a line of text, share of the station axis
 LETTER_S = 0.185  # s, width of a letter on the time axis
+SHORT_CHARS = 2  # letters of a slot number alone
 LEGEND_CHARS = 84  # letters in a line of the legend
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _View:
-    """One scene as numpy arrays, and the window that is drawn."""
-
-    rows: Demonstration
-    blocks: np.ndarray  # [N, T] bool, in the driver's path
-    slots: list[int]  # filled slots that are known at some time
-    low: float  # m, lowest station drawn
-    high: float  # m, highest
-
-    def first(self, slot: int) -> int:
-        """Index of the first time at which the slot is known."""
-        return int(np.argmax(self.rows.scene.obstacles.valid[slot]))
-
-    def decision(self, slot: int) -> Decision:
-        return Decision(int(self.rows.decisions[slot]))
-
-    def kind(self, slot: int) -> Kind:
-        return Kind(int(self.rows.scene.obstacles.kind[slot]))
-
-    def inside(self, slot: int) -> bool:
-        """Whether the first box, or a line, lies in the window."""
-        at, obstacles = self.first(slot), self.rows.scene.obstacles
-        ends = obstacles.s_lower[slot, at], obstacles.s_upper[slot, at]
-        return bool(ends[1] >= self.low and ends[0] <= self.high)
-
-
-def tag_names(demonstration: Demonstration) -> list[str]:
-    """Names of the scene's tags in their order, lower case, as in the manifest."""
-    tags = np.asarray(demonstration.scene.tags)
-    return [tag.name.lower() for tag in Tag if bool(tags[tag])]
-
-
-def spoken(name: str) -> str:
-    """A name of a tag, a decision or a reason as words."""
-    return name.replace("_", " ").lower()
 
 
 def draw_scene(path: Path, demonstration: Demonstration, row: int) -> Path:
@@ -105,20 +64,23 @@ def draw_scene(path: Path, demonstration: Demonstration, row: int) -> Path:
     Raises:
       InputError: it holds numbers that are not finite, or no valid time.
     """
-    view = _view(demonstration, row)
+    view = view_of(demonstration, row)
     entries = _legend(view)
     lines = sum(1 + str(entry.get_label()).count("\n") for entry in entries)
-    made = pyplot.figure(figsize=(WIDTH_INCHES, HEIGHT_INCHES + 0.16 * lines))
-    made.set_layout_engine("constrained")
-    made.suptitle("\n".join(_heading(view, row)), fontsize=10, x=0.02, ha="left")
-    # the legend has its own row: outside legends are measured before wrapping
-    grid = made.add_gridspec(3, 12, height_ratios=[5.0, 1.5, 0.02])
-    above = made.add_subplot(grid[0, :5])
-    graph = made.add_subplot(grid[0, 5:], sharey=above)
-    speed, acceleration = (
-        made.add_subplot(grid[1, :6]),
-        made.add_subplot(grid[1, 6:]),
-    )
+    below = LINE_INCHES * lines  # inches of the legend
+    height = HEIGHT_INCHES + below
+    made = pyplot.figure(figsize=(WIDTH_INCHES, height))
+    heading = "\n".join(_heading(view, row))
+    made.suptitle(heading, fontsize=10, x=0.02, y=1.0 - 0.08 / height, ha="left")
+
+    # by hand: automatic layouts fail on a legend that may be half the picture
+    def place(left: float, right: float, low: float, high: float) -> Rect:
+        return left, (low + below) / height, right - left, (high - low) / height
+
+    above = made.add_axes(place(0.11, 0.44, *GRAPH_INCHES))
+    graph = made.add_axes(place(0.47, 0.97, *GRAPH_INCHES), sharey=above)
+    speed = made.add_axes(place(0.11, 0.47, *MOTION_INCHES))
+    acceleration = made.add_axes(place(0.61, 0.97, *MOTION_INCHES))
     for axis in (above, graph, speed, acceleration):
         axis.grid(True, linewidth=0.4, alpha=0.5)
         axis.spines[["top", "right"]].set_visible(False)
@@ -126,93 +88,12 @@ def draw_scene(path: Path, demonstration: Demonstration, row: int) -> Path:
     _draw_graph(graph, view)
     _draw_motion(speed, acceleration, view)
     made.legend(
-        handles=entries, loc="outside lower left", fontsize=8, frameon=False, ncols=1
+        handles=entries, loc="lower left", fontsize=8, frameon=False, borderaxespad=0.2
     )
     return save(made, path)
 
 
-def describe_scene(demonstration: Demonstration, row: int) -> str:
-    """The scene in words, for those who do not see its picture."""
-    view = _view(demonstration, row)
-    human, valid = view.rows.human, view.rows.scene.time_valid
-    words = [
-        f"Scene {row}, {', '.join(map(spoken, tag_names(view.rows))) or 'no tag'}: "
-        f"the human drives {float(human.s[valid][-1]):.0f} m in "
-        f"{float(TIMES_S[valid][-1]):.1f} s, from {float(human.v[0]):.1f} to "
-        f"{float(human.v[valid][-1]):.1f} m/s."
-    ]
-    ignored = 0
-    for slot in view.slots:
-        if view.decision(slot) == Decision.IGNORE:
-            ignored += 1
-        else:
-            name = spoken(view.decision(slot).name)
-            words.append(f"{_place(view, slot)}: {name}.")
-    words.append(f"{ignored} ignored." if ignored else "Nothing is ignored.")
-    return " ".join(words)
-
-
-def _place(view: _View, slot: int) -> str:
-    """Kind and place of an obstacle when it is first known."""
-    obstacles, at = view.rows.scene.obstacles, view.first(slot)
-    s = 0.5 * float(obstacles.s_lower[slot, at] + obstacles.s_upper[slot, at])
-    where = f"{abs(s):.0f} m {'ahead' if s >= 0.0 else 'behind'}"
-    if view.kind(slot) not in LINE_KINDS:
-        l = 0.5 * float(obstacles.l_lower[slot, at] + obstacles.l_upper[slot, at])
-        aside = l - float(view.rows.scene.ego.l)
-        if abs(aside) > 1.0:
-            where += f", {abs(aside):.0f} m to the {'left' if aside > 0 else 'right'}"
-    when = f" at {TIMES_S[at]:.1f} s" if at else ""
-    return f"{KIND_WORDS[view.kind(slot)].capitalize()} {slot}, {where}{when}"
-
-
-def _view(demonstration: Demonstration, row: int) -> _View:
-    rows = jax.tree.map(np.asarray, demonstration)
-    _check(rows, row)
-    scene, obstacles = rows.scene, rows.scene.obstacles
-    known = (obstacles.kind != Kind.NONE) & obstacles.valid.any(axis=1)
-    flat = {f"obstacles.{k}": v for k, v in vars(obstacles).items()}
-    flat |= {"path.l": scene.path.l, "ego.width": scene.ego.width}
-    slots = np.flatnonzero(known).tolist()
-    low, high = _window(rows, slots)
-    return _View(rows=rows, blocks=blocking(flat), slots=slots, low=low, high=high)
-
-
-def _check(rows: Demonstration, row: int) -> None:
-    """One line for what cannot be drawn."""
-    valid, obstacles = rows.scene.time_valid, rows.scene.obstacles
-    if valid.ndim != 1 or not valid.any():
-        raise InputError(
-            f"scene {row}: time_valid: {int(valid.sum())} valid times of shape "
-            f"{valid.shape}: expected one scene with at least one"
-        )
-    used = {f"human.{n}": getattr(rows.human, n)[valid] for n in "slva"}
-    known = obstacles.valid & (obstacles.kind != Kind.NONE)[:, None]
-    for name in ("s_lower", "s_upper", "l_lower", "l_upper"):
-        used[f"obstacles.{name}"] = getattr(obstacles, name)[known]
-    used |= {f"path.{name}": leaf for name, leaf in vars(rows.scene.path).items()}
-    for name, values in used.items():
-        if not np.isfinite(values).all():
-            raise InputError(f"scene {row}: {name}: not finite: expected numbers")
-
-
-def _window(rows: Demonstration, slots: Sequence[int]) -> tuple[float, float]:
-    """Stations to draw: the human's way, all that mattered, what fits besides."""
-    obstacles = rows.scene.obstacles
-    first = np.argmax(obstacles.valid, axis=1)
-    number = np.arange(first.size)
-    rear, front = obstacles.s_lower[number, first], obstacles.s_upper[number, first]
-    matters = [k for k in slots if rows.decisions[k] != Decision.IGNORE]
-    end = float(rows.human.s[rows.scene.time_valid].max())
-    behind = min([0.0, *(float(rear[k]) - 3.0 for k in slots)])
-    low = -min(max(-behind, BEHIND_M[0]), BEHIND_M[1])
-    low = min([low, *(float(rear[k]) - 3.0 for k in matters)])
-    high = max([end + AHEAD_M, *(float(front[k]) + 5.0 for k in matters)])
-    others = max([high, *(float(front[k]) + 5.0 for k in slots)])
-    return low, max(min(others, high + SPARE_M), low + LEAST_VIEW_M)
-
-
-def _heading(view: _View, row: int) -> list[str]:
+def _heading(view: View, row: int) -> list[str]:
     """Tags, speed, limit, bend and length of the recording."""
     scene, valid = view.rows.scene, view.rows.scene.time_valid
     tags = ", ".join(map(spoken, tag_names(view.rows))) or "no tag"
@@ -232,7 +113,7 @@ def _heading(view: _View, row: int) -> list[str]:
 # ------------------------------------------------------------------- from above
 
 
-def _draw_above(axis: Axes, view: _View) -> None:
+def _draw_above(axis: Axes, view: View) -> None:
     """Road, path, human, ego and all obstacles; station up, left is left."""
     rows, path = view.rows, view.rows.scene.path
     grid = np.arange(path.l.size) * STATION_STEP_M
@@ -259,10 +140,11 @@ def _draw_above(axis: Axes, view: _View) -> None:
     left, right = _aside(view)
     axis.set_xlim(left, right)  # left of the road is left on the paper
     axis.set_ylim(view.low, view.high)
-    label(axis, "from above, lane coordinates", "lateral offset, m", "station, m")
+    axis.xaxis.set_major_locator(MaxNLocator(4, integer=True, prune="both"))
+    label(axis, "from above", "lateral offset, m", "station, m")
 
 
-def _aside(view: _View) -> tuple[float, float]:
+def _aside(view: View) -> tuple[float, float]:
     """Lateral offsets at the left and right edge of the view from above."""
     path, obstacles = view.rows.scene.path, view.rows.scene.obstacles
     grid = np.arange(path.l.size) * STATION_STEP_M
@@ -277,7 +159,7 @@ def _aside(view: _View) -> tuple[float, float]:
     return max(left) + ASIDE_M, min(right) - ASIDE_M
 
 
-def _draw_body(axis: Axes, view: _View, slot: int) -> None:
+def _draw_body(axis: Axes, view: View, slot: int) -> None:
     """Box when first known, trail over all known times, number."""
     obstacles, at = view.rows.scene.obstacles, view.first(slot)
     colour, valid = DECISION_COLOURS[view.decision(slot)], obstacles.valid[slot]
@@ -304,12 +186,15 @@ def _draw_body(axis: Axes, view: _View, slot: int) -> None:
         words += f" {KIND_WORDS[view.kind(slot)]}"
     if at:
         words += f" ({TIMES_S[at]:.1f} s)"
-    # to the right of the box on the paper
-    place = (float(right[at]) - 0.25, 0.5 * float(low[at] + high[at]))
-    axis.text(*place, words, fontsize=7, va="center", ha="left", zorder=5, clip_on=True)
+    middle = 0.5 * float(low[at] + high[at])
+    # beside the box, long words towards the middle of the picture
+    inwards = len(words) > SHORT_CHARS and l[at] < sum(_aside(view)) / 2.0
+    beside = float(left[at]) + 0.25 if inwards else float(right[at]) - 0.25
+    text = axis.text(beside, middle, words, fontsize=7, va="center", zorder=5)
+    text.set(ha="right" if inwards else "left", clip_on=True)
 
 
-def _draw_line(axis: Axes, view: _View, slot: int) -> None:
+def _draw_line(axis: Axes, view: View, slot: int) -> None:
     """A stop line or the destination across the road."""
     path, at = view.rows.scene.path, view.first(slot)
     s = float(view.rows.scene.obstacles.s_lower[slot, at])
@@ -332,7 +217,7 @@ def _draw_line(axis: Axes, view: _View, slot: int) -> None:
 # ----------------------------------------------------------- station-time graph
 
 
-def _draw_graph(axis: Axes, view: _View) -> None:
+def _draw_graph(axis: Axes, view: View) -> None:
     """The human's s(t) between the boundaries of what blocks the driver's path."""
     rows, valid = view.rows, view.rows.scene.time_valid
     end = float(TIMES_S[valid][-1])
@@ -361,7 +246,7 @@ def _draw_graph(axis: Axes, view: _View) -> None:
     axis.tick_params(labelleft=False)
 
 
-def _draw_boundary(axis: Axes, view: _View, slot: int, shown: np.ndarray) -> None:
+def _draw_boundary(axis: Axes, view: View, slot: int, shown: np.ndarray) -> None:
     """Bars at the times themselves, filled between neighbours."""
     obstacles = view.rows.scene.obstacles
     colour = DECISION_COLOURS[view.decision(slot)]
@@ -381,7 +266,7 @@ def _draw_boundary(axis: Axes, view: _View, slot: int, shown: np.ndarray) -> Non
 
 def _label_boundary(
     axis: Axes,
-    view: _View,
+    view: View,
     slot: int,
     shown: np.ndarray,
     taken: list[tuple[float, float, float]],
@@ -416,7 +301,7 @@ def _label_boundary(
 # ------------------------------------------------------------ signals and words
 
 
-def _draw_motion(speed: Axes, acceleration: Axes, view: _View) -> None:
+def _draw_motion(speed: Axes, acceleration: Axes, view: View) -> None:
     """The human's speed beside the limit, and acceleration."""
     rows, valid = view.rows, view.rows.scene.time_valid
     human, path, t = rows.human, rows.scene.path, TIMES_S[valid]
@@ -436,7 +321,7 @@ def _draw_motion(speed: Axes, acceleration: Axes, view: _View) -> None:
     label(acceleration, "acceleration", "t, s", "m/s²")
 
 
-def _legend(view: _View) -> list[Patch | Line2D]:
+def _legend(view: View) -> list[Patch | Line2D]:
     """Lines, and one row per decision with the slots that it was made for."""
     rows: list[Patch | Line2D] = [
         Line2D([], [], color=HUMAN, marker="o", ms=3, label="human; box: ego at t = 0"),

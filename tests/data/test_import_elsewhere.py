@@ -185,7 +185,7 @@ def test_an_import_that_dies_while_it_writes_resumes_to_the_same_bytes(local, tm
     data = tmp_path / "data"
     for writes in (0, 3, 2):
         done = subprocess.run(
-            [sys.executable, "-c", DYING, str(tmp_path / "logs"), str(data), str(writes)],
+            [sys.executable, "-c", DYING, tmp_path / "logs", data, str(writes)],
             capture_output=True, text=True, timeout=300, check=False,
         )  # fmt: skip
         assert done.returncode == -signal.SIGKILL, done.stderr[-2000:]

@@ -1,0 +1,174 @@
+"""The page of a dataset: complete, self-contained, safe, and true to the manifest."""
+
+import dataclasses
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rcirl_jax.data.filters import REASONS
+from rcirl_jax.data.importing import import_parts
+from rcirl_jax.data.store import open_dataset
+from rcirl_jax.errors import InputError
+from rcirl_jax.report.data_page import TAG_NAMES, choose_rows, write_data_page
+from rcirl_jax.types import Tag
+from tests.data.small_logs import CONFIG, write_logs
+
+REPO = Path(__file__).resolve().parents[2]
+HOSTILE = '"><script>alert(1)</script><img src=x onerror=alert(2)>'
+
+
+class Page(HTMLParser):
+    """Tags, and the text of the cells by row."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.rows, self.in_cell = [], [], False
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th"):
+            self.rows[-1].append("")
+            self.in_cell = True
+
+    def handle_endtag(self, tag):
+        self.in_cell &= tag not in ("td", "th")
+
+    def handle_data(self, data):
+        if self.in_cell:
+            self.rows[-1][-1] += data.strip()
+
+    def of(self, tag):
+        return [attrs for name, attrs in self.tags if name == tag]
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data")
+    import_parts(write_logs(folder / "logs", 2), folder / "set", CONFIG)
+    return open_dataset(folder / "set")
+
+
+@pytest.fixture(scope="module")
+def page(dataset, tmp_path_factory):
+    output = tmp_path_factory.mktemp("page") / "index.html"
+    return write_data_page(output, dataset, [0, 3, 5], "Dataset a").read_text()
+
+
+def test_it_is_one_file_that_needs_no_other(page):
+    found = Page(page)
+    assert not found.of("script")
+    assert not found.of("link")
+    for _, attrs in found.tags:
+        for name in ("src", "href", "srcset", "action", "data"):
+            assert attrs.get(name, "data:").startswith("data:")
+        assert not any(name.startswith("on") for name in attrs)
+    assert "url(" not in page
+    assert len(found.of("img")) == 3
+    for image, row in zip(found.of("img"), (0, 3, 5), strict=True):
+        assert image["alt"].startswith(f"Scene {row}, ")
+
+
+def test_counts_and_reasons_are_those_of_the_manifest(page, dataset):
+    rows = Page(page).rows
+    quality = dataset.manifest.quality
+    for name, words in REASONS.items():
+        (row,) = [row for row in rows if row and row[-1] == words]
+        assert row[1] == f"{quality['dropped'][name]:,}"
+    assert ["kept", f"{quality['scenes']:,}", "", ""] in rows
+    first = {row[0]: row[1] for row in rows if len(row) == 4}
+    for name, count in quality["tags"].items():
+        assert first[name.replace("_", " ")] == f"{count:,}"
+    for name, count in quality["decisions"].items():
+        assert first[name.replace("_", " ")] == f"{count:,}"
+
+
+def test_each_filter_hides_the_scenes_without_its_tag(page):
+    found = Page(page)
+    shown = [attrs["data-tags"].split() for attrs in found.of("figure")]
+    buttons = [attrs["id"] for attrs in found.of("input") if "id" in attrs]
+    assert buttons == [f"only-{n}" for n in TAG_NAMES if any(n in s for s in shown)]
+    for name in TAG_NAMES:
+        rule = rf"#only-{name}:checked\) \.gallery figure:not\(\[data-tags~=\"{name}\""
+        assert re.search(rule, page)
+
+
+def test_names_from_the_logs_are_text(dataset, tmp_path):
+    manifest = dataset.manifest
+    quality = manifest.quality | {"notes": [HOSTILE], "num_notes": 1}
+    hostile = dataclasses.replace(
+        manifest,
+        quality=quality,
+        sources=[{"source": HOSTILE, "licence": HOSTILE}],
+        recordings=[HOSTILE] * len(manifest.recordings),
+        vehicles=[HOSTILE] * len(manifest.vehicles),
+    )
+    other = open_dataset(dataset._files.folder)
+    other.manifest = hostile
+    page = Page(write_data_page(tmp_path / "a.html", other, [0], HOSTILE).read_text())
+    assert not page.of("script")
+    assert len(page.of("img")) == 1
+    assert not any("onerror" in attrs for _, attrs in page.tags)
+
+
+def test_chosen_rows_cover_the_tags_and_are_the_same_each_time():
+    rng = np.random.default_rng(0)
+    tags = rng.random((5000, len(Tag))) < 0.3
+    tags[:, Tag.STANDING] = False
+    tags[4321, Tag.STANDING] = True
+    rows = choose_rows(tags, 24)
+    assert rows == choose_rows(tags, 24)
+    assert rows == sorted(set(rows))
+    assert len(rows) == 24
+    assert tags[rows].any(axis=0).all()
+    assert 4321 in rows
+    only = choose_rows(tags, 50, ["turning"])
+    assert len(only) == 50
+    assert tags[only, Tag.TURNING].all()
+    assert max(only) - min(only) > 2500
+    assert choose_rows(tags[:3], 24) == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("wanted", "line"),
+    [
+        (["turnig"], r"--tags: turnig: expected stopping, "),
+        (["standing"], r"--tags: standing: no such scene in the dataset"),
+    ],
+)
+def test_a_tag_that_nobody_has_is_one_line(wanted, line):
+    with pytest.raises(InputError, match=line):
+        choose_rows(np.zeros((9, len(Tag)), bool), 5, wanted)
+
+
+def test_rows_beyond_the_end_are_one_line(dataset, tmp_path):
+    with pytest.raises(InputError, match=r"--rows: 100000: expected 0 to \d+"):
+        write_data_page(tmp_path / "a.html", dataset, [100000], "Dataset a")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.multiprocess
+def test_by_command(dataset, tmp_path):
+    def inspect(*flags):
+        return subprocess.run(
+            [sys.executable, "-m", "experiments.inspect_data", *flags,
+             f"--data={dataset._files.folder}", f"--output={tmp_path / 'out'}"],
+            capture_output=True, text=True, check=False, cwd=REPO,
+        )  # fmt: skip
+
+    bad = inspect("--rows=1,two")
+    assert bad.returncode == 2
+    assert bad.stderr.strip().endswith("expected row numbers")
+    assert not (tmp_path / "out").exists()
+    done = inspect("--rows=1,2")
+    assert done.returncode == 0, done.stderr
+    assert "page: " in done.stdout
+    names = sorted(path.name for path in (tmp_path / "out" / "scenes").iterdir())
+    assert names == ["scene0000001.png", "scene0000002.png"]

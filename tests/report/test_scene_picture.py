@@ -1,0 +1,160 @@
+"""The picture of a recorded scene shows what its arrays say."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from matplotlib import pyplot
+from matplotlib.colors import to_hex
+
+from rcirl_jax.data.rows import row_spec
+from rcirl_jax.errors import InputError
+from rcirl_jax.report import scene_picture
+from rcirl_jax.report.scene_picture import DECISION_COLOURS, draw_scene
+from rcirl_jax.report.scene_view import describe_scene
+from rcirl_jax.types import Decision, Kind, Tag
+from rcirl_jax.units import TIMES_S
+
+CAR, LIGHT, PEDESTRIAN, FAR = range(4)  # slots
+TIMES = TIMES_S.size
+
+
+def scene(**changes):
+    """A car ahead at 8 m/s, a stop line, a pedestrian aside, somebody far ahead."""
+    rows = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), row_spec())
+    path, obstacles = rows.scene.path, rows.scene.obstacles
+    shape, grid = obstacles.s_lower.shape, path.l.shape
+    kind, decisions = np.zeros(shape[0], np.int32), np.zeros(shape[0], np.int32)
+    kind[:4] = Kind.VEHICLE, Kind.STOP, Kind.PEDESTRIAN, Kind.VEHICLE
+    decisions[:4] = Decision.FOLLOW, Decision.STOP, Decision.NUDGE_LEFT, Decision.IGNORE
+    s = np.zeros(shape, np.float32)
+    s[CAR], s[LIGHT], s[PEDESTRIAN], s[FAR] = 20.0 + 8.0 * TIMES_S, 70.0, 30.0, 400.0
+    l = np.zeros(shape, np.float32)
+    l[PEDESTRIAN] = -2.5
+    half = np.where(kind == Kind.STOP, 0.0, 2.0)[:, None].astype(np.float32)
+    tags = np.zeros(len(Tag), bool)
+    tags[[Tag.FOLLOWING, Tag.STOPPING]] = True
+    valid = np.broadcast_to((kind != Kind.NONE)[:, None], shape).copy()
+    full = lambda value: np.full(grid, value, np.float32)  # noqa: E731
+    human = dataclasses.replace(
+        rows.human, s=(8.0 * TIMES_S).astype(np.float32), v=np.full(TIMES, 8.0)
+    )
+    ego = dataclasses.replace(
+        rows.scene.ego, v=np.float32(8.0), length=np.float32(4), width=np.float32(2)
+    )
+    made = dataclasses.replace(
+        rows.scene,
+        ego=ego,
+        tags=tags,
+        time_valid=TIMES_S < 6.3,
+        path=dataclasses.replace(
+            path,
+            speed_limit=full(13.9),
+            lane_left=full(1.75),
+            lane_right=full(-1.75),
+            road_left=full(5.25),
+            road_right=full(-1.75),
+        ),
+        obstacles=dataclasses.replace(
+            obstacles,
+            s_lower=s - half,
+            s_upper=s + half,
+            l_lower=l - 1.0,
+            l_upper=l + 1.0,
+            valid=valid,
+            kind=kind,
+        ),
+    )
+    made = dataclasses.replace(made, **changes)
+    return dataclasses.replace(
+        rows, scene=made, human=human, decisions=decisions, future_s=np.float32(6.4)
+    )
+
+
+@pytest.fixture
+def drawn(tmp_path, monkeypatch):
+    """The figure of a scene, before it is saved."""
+    kept = []
+    monkeypatch.setattr(scene_picture, "save", lambda made, _: kept.append(made))
+    yield lambda rows: (draw_scene(tmp_path / "a.png", rows, 7), kept[-1])[1]
+    for made in kept:
+        pyplot.close(made)
+
+
+def of_slot(axis, slot):
+    name = f"slot {slot}"
+    return [artist for artist in axis.get_children() if artist.get_gid() == name]
+
+
+def test_the_file_is_a_picture(tmp_path):
+    path = draw_scene(tmp_path / "new" / "scene.png", scene(), 7)
+    assert path.read_bytes().startswith(b"\x89PNG")
+
+
+def test_boxes_stand_where_the_obstacles_are(drawn):
+    above = drawn(scene()).axes[0]
+    (box,) = of_slot(above, CAR)
+    assert box.get_bbox().bounds == pytest.approx((-1.0, 18.0, 2.0, 4.0))
+    (person,) = of_slot(above, PEDESTRIAN)
+    assert person.get_bbox().bounds == pytest.approx((-3.5, 28.0, 2.0, 4.0))
+    (line,) = of_slot(above, LIGHT)
+    np.testing.assert_allclose(line.get_ydata(), [70.0, 70.0])
+    np.testing.assert_allclose(line.get_xdata(), [5.25, -1.75])
+    left, right = above.get_xlim()
+    assert left > right  # left of the road is left on the paper
+
+
+def test_the_graph_holds_the_human_and_who_is_in_the_way(drawn):
+    rows = scene()
+    graph = drawn(rows).axes[1]
+    valid = rows.scene.time_valid
+    human = [line for line in graph.lines if line.get_color() == "#000000"]
+    np.testing.assert_allclose(human[0].get_ydata(), rows.human.s[valid])
+    (bars,) = of_slot(graph, CAR)
+    ends = np.array([path.vertices for path in bars.get_paths()])
+    np.testing.assert_allclose(ends[:, 0, 0], TIMES_S[valid], rtol=1e-6)
+    np.testing.assert_allclose(ends[:, 0, 1], rows.scene.obstacles.s_lower[CAR][valid])
+    np.testing.assert_allclose(ends[:, 1, 1], rows.scene.obstacles.s_upper[CAR][valid])
+    colour = to_hex(bars.get_colors()[0]).upper()
+    assert colour == DECISION_COLOURS[Decision.FOLLOW]
+    assert not of_slot(graph, PEDESTRIAN)  # beside the driver's path
+    words = [text.get_text() for text in graph.texts]
+    assert "0 follow" in words
+    assert "1 stop" in words
+
+
+def test_the_legend_names_every_slot_once_and_covers_nothing(drawn):
+    made = drawn(scene())
+    (legend,) = made.legends
+    words = [text.get_text() for text in legend.get_texts()]
+    for expected in ("follow: 0", "stop: 1", "nudge left: 2", "ignore: 3"):
+        assert expected in words
+    assert any(word.startswith("not in view: 3 at 398 m") for word in words)
+    made.canvas.draw()
+    renderer = made.canvas.get_renderer()
+    top = legend.get_window_extent(renderer).y1
+    boxes = [axis.get_tightbbox(renderer) for axis in made.axes]
+    assert all(box.y0 >= top - 1.0 for box in boxes)
+    for i, one in enumerate(boxes):
+        assert not any(one.overlaps(other) for other in boxes[i + 1 :])
+    assert all(box.x0 >= 0 and box.x1 <= made.bbox.x1 for box in boxes)
+
+
+def test_the_words_say_what_the_picture_shows():
+    words = describe_scene(scene(), 7)
+    assert words.startswith("Scene 7, stopping, following: the human drives 49 m")
+    assert "Vehicle 0, 20 m ahead: follow." in words
+    assert "Pedestrian 2, 30 m ahead, 2 m to the right: nudge left." in words
+    assert words.endswith("1 ignored.")
+
+
+def test_what_cannot_be_drawn_is_one_line(tmp_path):
+    bad = scene()
+    bad.human.s[2] = np.nan
+    with pytest.raises(InputError, match=r"scene 7: human\.s: not finite: expected"):
+        draw_scene(tmp_path / "a.png", bad, 7)
+    never = scene(time_valid=np.zeros(TIMES, bool))
+    with pytest.raises(InputError, match=r"scene 7: time_valid: 0 valid times"):
+        draw_scene(tmp_path / "a.png", never, 7)
+    assert not list(tmp_path.iterdir())
