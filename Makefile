@@ -22,7 +22,7 @@ demo: setup
 	$(BIN)/python -m experiments.demo --output=$(OUT)
 
 test: setup
-	$(BIN)/python -m pytest -q -n $(WORKERS) -m "not slow and not dataset"
+	$(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal -m "not slow and not dataset"
 
 test-dataset: setup
 	$(BIN)/python -m pytest -q -m "dataset"

@@ -247,24 +247,25 @@ def envelope(scene: Scene, config: SamplerConfig) -> Float[Array, "m t"]:
     share, top, braking, lateral = jnp.asarray(grid.T)
     table = share[:, None] * speed_envelope(scene, lateral, braking)
     at = jax.vmap(lookup, in_axes=(0, 0, None))
-    ego = scene.ego
-    s = jnp.full(share.shape, ego.s)
-    v, a = jnp.full(share.shape, ego.v), jnp.full(share.shape, ego.a)
-    stations = [s]
-    for _ in range(TIMES_S.size - 1):
+    most = config.envelope_jerk * DT_S
+
+    def advance(state: tuple, _: None) -> tuple[tuple, jax.Array]:
+        s, v, a = state
         ahead = at(table, s + v * DT_S, STATION_STEP_M)
         ahead = jnp.minimum(ahead, at(table, s, STATION_STEP_M))
         reach = (ahead - v) / DT_S
         free = top * (1.0 - (v / jnp.maximum(ahead, 0.1)) ** 4)
         wanted = jnp.where(v <= ahead, jnp.minimum(free, reach), reach)
         wanted = jnp.clip(wanted, -config.reach_braking, top)
-        most = config.envelope_jerk * DT_S
         a = jnp.clip(wanted, a - most, a + most)
         after = jnp.maximum(v + a * DT_S, 0.0)
         s = s + 0.5 * (v + after) * DT_S
-        v = after
-        stations.append(s)
-    return jnp.stack(stations, axis=1)
+        return (s, after, a), s
+
+    ego = scene.ego
+    start = tuple(jnp.full(share.shape, x) for x in (ego.s, ego.v, ego.a))
+    _, later = jax.lax.scan(advance, start, length=TIMES_S.size - 1)
+    return jnp.concatenate([start[0][None], later]).T
 
 
 def emergency(scene: Scene, config: SamplerConfig) -> Float[Array, "m t"]:

@@ -39,6 +39,9 @@ class Vehicle:
     tracking_damping: float = 1.0  # 1, critically damped
 
 
+UNROLLED = 4  # substeps that are written out instead of looped over
+
+
 def _at(table: jax.Array, s: jax.Array) -> jax.Array:
     return lookup(table, s, ROAD_STEP_M)
 
@@ -84,7 +87,8 @@ def drive(
     take_a = 1.0 - math.exp(-h / vehicle.acceleration_lag)
     take_c = 1.0 - math.exp(-h / vehicle.steering_lag)
     target = steering(ego, road, vehicle)
-    for _ in range(vehicle.substeps):
+
+    def substep(_: int, ego: EgoState) -> EgoState:
         a = ego.a + take_a * (command - ego.a)
         c = ego.curvature + take_c * (target - ego.curvature)
         v = jnp.maximum(ego.v + 0.5 * (ego.a + a) * h, 0.0)
@@ -95,7 +99,7 @@ def drive(
         rate = mean_v * jnp.cos(ego.heading) / shrink
         turn = (mean_v * mean_c - kappa * rate) * h
         middle = ego.heading + 0.5 * turn
-        ego = EgoState(
+        return EgoState(
             s=ego.s + mean_v * jnp.cos(middle) / shrink * h,
             l=ego.l + mean_v * jnp.sin(middle) * h,
             heading=ego.heading + turn,
@@ -103,4 +107,6 @@ def drive(
             a=a,
             curvature=c,
         )
-    return ego
+
+    unroll = vehicle.substeps <= UNROLLED
+    return jax.lax.fori_loop(0, vehicle.substeps, substep, ego, unroll=unroll)
