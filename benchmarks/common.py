@@ -1,4 +1,4 @@
-"""What the benchmarks share: hardware and versions, percentiles, the JSON."""
+"""What the benchmarks share: hardware, percentiles, made datasets, the JSON."""
 
 import json
 import os
@@ -10,6 +10,9 @@ from pathlib import Path
 
 import jax
 import numpy as np
+
+from rcirl_jax.data.store import Dataset, DatasetWriter, open_dataset
+from rcirl_jax.types import Demonstration
 
 
 def machine() -> dict:
@@ -59,3 +62,37 @@ def write(name: str, result: dict, folder: str) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps({**result, "machine": machine()}, indent=2) + "\n")
     return path
+
+
+def resident_mb() -> float:
+    """Memory of this process now, MiB."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def stored_scenes(
+    folder: Path, rows: Demonstration, count: int, shard: int = 4096
+) -> Dataset:
+    """A dataset of `count` scenes, all for training, that repeat `rows`.
+
+    Speed at the start differs by a thousandth and the frame is the row's number.
+    """
+    writer, rng = DatasetWriter(folder), np.random.default_rng(0)
+    for start in range(0, count, shard):
+        number = np.arange(start, min(start + shard, count))
+        picked = jax.tree.map(lambda x, n=number: x[n % x.shape[0]], rows)
+        ego, zero = picked.scene.ego, np.zeros(number.size, np.int32)
+        speed = ego.v * (1.0 + 1e-3 * rng.standard_normal(number.size))
+        scene = picked.scene.replace(ego=ego.replace(v=speed.astype(np.float32)))
+        picked = picked.replace(
+            scene=scene,
+            vehicle=zero,
+            group=zero,
+            recording=zero,
+            frame=number.astype(np.int32),
+        )
+        writer.write_shard(start // shard, picked, [])
+    names: dict = {key: ["made"] for key in ("recordings", "groups", "vehicles")}
+    rest: dict = {"rate_hz": [10.0], "sources": [], "quality": {}, "import": {}}
+    writer.finish({**names, **rest, "splits": {"train": ["made"]}})
+    return open_dataset(folder, verify=False)

@@ -3,6 +3,11 @@
     python -m experiments.train --data=DATASET --workdir=RUN
 
 Resumes from RUN/checkpoints when it is run again with the same settings.
+Several processes (RUN and DATASET on a file system that all of them see), each with
+its own --process_id:
+
+    python -m experiments.train --data=DATASET --workdir=RUN --parallel=jit_sharded
+        --coordinator_address=HOST:PORT --num_processes=2 --process_id=0
 """
 
 from pathlib import Path
@@ -18,6 +23,8 @@ from rcirl_jax.reward.network import CONSTRAINTS
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.parallel import PARALLEL
+from rcirl_jax.train.processes import is_first, join_processes
+from rcirl_jax.train.running import Running
 from rcirl_jax.train.state import POSITIVES, TrainConfig
 
 _DATA = flags.DEFINE_list(
@@ -65,11 +72,27 @@ _POOL = flags.DEFINE_integer(
     "hard_pool", 1, "near negatives drawn for each that the present reward keeps"
 )
 _SEED = flags.DEFINE_integer("seed", 0, "of initial weights, batches, candidates")
-_PARALLEL = flags.DEFINE_enum("parallel", "jit", PARALLEL, "how local devices share")
+_PARALLEL = flags.DEFINE_enum("parallel", "jit", PARALLEL, "how the devices share")
+_IN_MEMORY = flags.DEFINE_float(
+    "in_memory_mb", 1024.0, "MiB up to which the split is loaded whole, else streamed"
+)
+_VERIFY = flags.DEFINE_bool(
+    "verify", True, "read every byte of the data against its checksum first"
+)
+_PREFETCH = flags.DEFINE_integer("prefetch", 4, "batches read ahead")
+_SAVE = flags.DEFINE_integer(
+    "checkpoint_every", 0, "steps, besides the end of each epoch; 0: none"
+)
+_COORDINATOR = flags.DEFINE_string(
+    "coordinator_address", None, "host:port of process 0, with several processes"
+)
+_PROCESSES = flags.DEFINE_integer("num_processes", None, "how many there are")
+_PROCESS = flags.DEFINE_integer("process_id", None, "number of this one")
 
 
 def main() -> None:
     """Flags -> one training run."""
+    join_processes(_COORDINATOR.value, _PROCESSES.value, _PROCESS.value)
     if len(_MARGINS.value) != 3:
         raise InputError(f"--margins: {_MARGINS.value}: expected three numbers")
     margins = floats(_MARGINS.value, "margins")
@@ -103,21 +126,31 @@ def main() -> None:
         ),
         sampler=SamplerConfig(mode=_MODE.value),
     )
+    running = Running(
+        parallel=_PARALLEL.value,
+        in_memory_mb=_IN_MEMORY.value,
+        prefetch=_PREFETCH.value,
+        checkpoint_every=_SAVE.value,
+    )
     result = train(
-        open_datasets(_DATA.value),
+        open_datasets(_DATA.value, verify=_VERIFY.value),
         Path(_WORKDIR.value),
         config,
-        parallel=_PARALLEL.value,
+        running=running,
         provenance=provenance(),
     )
+    if not is_first():
+        return
     for epoch in result.epochs[-1:]:
         print(
             f"epoch {epoch['epoch']}: loss {epoch['loss']:.4f}, "
             f"pairs won {epoch['pair_accuracy']:.1%}"
         )
     rate = result.queries / max(result.seconds, 1e-9)
+    waited = result.waited_s / max(result.seconds, 1e-9)
     print(
-        f"{result.queries:,.0f} queries, {rate:,.0f} queries/s; run: {_WORKDIR.value}"
+        f"{result.queries:,.0f} queries, {rate:,.0f} queries/s, "
+        f"{waited:.1%} waiting for data; run: {_WORKDIR.value}"
     )
 
 

@@ -24,6 +24,10 @@ class Demonstrations(Protocol):
         """Row numbers of a split in ascending order."""
         ...
 
+    def blocks(self, indices: np.ndarray) -> np.ndarray:
+        """Number of the block, unpacked together, that each row lies in."""
+        ...
+
     def load(self, split: str | None) -> Demonstration:
         """All rows of a split in memory."""
         ...
@@ -60,6 +64,16 @@ class JoinedDatasets:
         pairs = zip(self._parts, self._starts[:-1], strict=True)
         return np.concatenate([part.indices(split) + start for part, start in pairs])
 
+    def blocks(self, indices: np.ndarray) -> np.ndarray:
+        """[m] number of the block of rows, unpacked together, that each lies in."""
+        numbers, first = np.empty(indices.size, np.int64), 0
+        for part, start in zip(self._parts, self._starts[:-1], strict=True):
+            own = part.blocks(np.arange(part.count))
+            at = np.flatnonzero((indices >= start) & (indices < start + part.count))
+            numbers[at] = first + own[indices[at] - start]
+            first += int(own[-1]) + 1
+        return numbers
+
     def load(self, split: str | None) -> Demonstration:
         """All rows of a split (None: of all splits) in memory."""
         return self.read(self.indices(split))
@@ -78,13 +92,17 @@ class JoinedDatasets:
         return jax.tree.map(join, *found)
 
 
-def open_datasets(urls: Sequence[str]) -> Dataset | JoinedDatasets:
+def open_datasets(urls: Sequence[str], verify: bool = True) -> Dataset | JoinedDatasets:
     """One dataset as it is, or several joined.
+
+    Args:
+      urls: dataset folders or tensorstore URLs.
+      verify: read every byte against its checksum first.
 
     Raises:
       InputError: none named, one named twice, or one that does not open.
     """
     if not urls or len(set(urls)) != len(urls):
         raise InputError(f"--data: {list(urls)}: expected distinct datasets")
-    parts = [open_dataset(url) for url in urls]
+    parts = [open_dataset(url, verify) for url in urls]
     return parts[0] if len(parts) == 1 else JoinedDatasets(parts)

@@ -1,48 +1,114 @@
 """Batches: seeded, endless, resumable to the bit, shared between processes."""
 
+import math
 from collections.abc import Mapping
 
 import jax
 import numpy as np
 
-from rcirl_jax.data.store import Dataset
+from rcirl_jax.data.joined import Demonstrations
+from rcirl_jax.data.rows import leaf_specs
+from rcirl_jax.data.stream import RowStream
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Demonstration
+
+# blocks over which rows are mixed; it decides the order, so it is no setting.
+# Half of them are in memory at a time: 32,768 rows, 340 MB.
+WINDOW_BLOCKS = 256
+ROW_BYTES = sum(math.prod(x.shape) * x.dtype.itemsize for x in leaf_specs().values())
+
+
+def epoch_order(seed: int, epoch: int, blocks: np.ndarray) -> np.ndarray:
+    """[n] the order in which an epoch visits n rows.
+
+        key(row) = place(block of row) + WINDOW_BLOCKS * u(row),   u ~ U(0, 1)
+
+    sorted by key, `place` being a permutation of the blocks: a window slides over
+    shuffled blocks, so that a block is needed for a while, once an epoch. Rows of
+    a batch come from WINDOW_BLOCKS blocks, fewer at both ends of an epoch. When
+    there are no more blocks than that, the order is a permutation of all rows.
+
+    Args:
+      seed: of the run.
+      epoch: number of the epoch.
+      blocks: [n] number of each row's block, as `Dataset.blocks` gives it.
+    """
+    rng = np.random.default_rng([seed, epoch])
+    numbers, block = np.unique(blocks, return_inverse=True)
+    if numbers.size <= WINDOW_BLOCKS:
+        return rng.permutation(blocks.size)
+    key = rng.permutation(numbers.size)[block] + WINDOW_BLOCKS * rng.random(blocks.size)
+    return np.argsort(key, kind="stable")
+
+
+def split_batches(
+    dataset: Demonstrations,
+    split: str,
+    *,
+    in_memory_mb: float,
+    batch_size: int,
+    seed: int,
+    shard_index: int = 0,
+    num_shards: int = 1,
+) -> "BatchIterator":
+    """Batches of a split, named by their rows in the dataset.
+
+    A split of at most `in_memory_mb` MiB is loaded, a larger one is read as the
+    batches need it: the batches are the same to the bit.
+    """
+    index = dataset.indices(split)
+    blocks = dataset.blocks(index)
+    small = index.size * ROW_BYTES <= in_memory_mb * 2**20
+    return BatchIterator(
+        dataset.load(split) if small else dataset,
+        indices=None if small else index,
+        blocks=blocks,
+        numbers=index,
+        batch_size=batch_size,
+        seed=seed,
+        shard_index=shard_index,
+        num_shards=num_shards,
+    )
 
 
 class BatchIterator:
     """Endless batches over rows in memory or on disk.
 
-    Epoch e visits the rows in the order `default_rng([seed, e]).permutation(n)`:
-    any position can be computed without the ones before it, so the whole state
-    is three integers. The last batch of an epoch is filled up with rows of the
-    epoch's beginning at weight 0. With `num_shards` processes, each is given its
-    contiguous part of the same global batches, whatever their number.
+    Epoch e visits the rows in `epoch_order(seed, e, blocks)`: any position can be
+    computed without the ones before it, so the whole state is three integers. The
+    last batch of an epoch is filled up with rows of the epoch's beginning at
+    weight 0. With `num_shards` processes, each is given its contiguous part of the
+    same global batches, whatever their number, and holds no other rows in memory.
 
     `next` gives (batch, weight, index): numpy rows `[b, ...]`; float32 `[b]`, 1
-    for a row and 0 for padding; int64 `[b]`, row numbers inside `rows`; with
+    for a row and 0 for padding; int64 `[b]`, row numbers; with
     b = batch_size / num_shards.
     """
 
     def __init__(
         self,
-        rows: Demonstration | Dataset,
+        rows: Demonstration | Demonstrations,
         *,
         batch_size: int,
         seed: int,
         indices: np.ndarray | None = None,
+        blocks: np.ndarray | None = None,
+        numbers: np.ndarray | None = None,
         shard_index: int = 0,
         num_shards: int = 1,
     ) -> None:
         """Start at epoch 0, position 0.
 
         Args:
-          rows: Demonstration with numpy leaves [n, ...], or an open Dataset, which
-            is read batch by batch.
+          rows: Demonstration with numpy leaves [n, ...], or an open dataset, which
+            is read as the batches need it.
           batch_size: rows of a batch over all processes.
           seed: of the order of rows, >= 0.
           indices: [m] row numbers to visit, e.g. `dataset.indices("train")`;
             all rows when absent.
+          blocks: [m] block of each row to visit; the dataset's own when absent,
+            and one for all rows in memory. Equal blocks, equal order.
+          numbers: [m] what `next` calls each row to visit; `indices` when absent.
           shard_index: number of this process.
           num_shards: number of processes; divides `batch_size`.
 
@@ -50,8 +116,14 @@ class BatchIterator:
           InputError: no rows, or a size or seed out of range.
         """
         self._rows = rows
-        total = rows.count if isinstance(rows, Dataset) else rows.vehicle.shape[0]
+        stored = not isinstance(rows, Demonstration)
+        total = rows.indices(None).size if stored else rows.vehicle.shape[0]
         self._chosen = np.arange(total) if indices is None else np.asarray(indices)
+        if blocks is None:
+            alone = np.zeros(self._chosen.size, np.int64)
+            blocks = rows.blocks(self._chosen) if stored else alone
+        self._blocks = blocks
+        self._numbers = self._chosen if numbers is None else numbers
         if self._chosen.size == 0:
             raise InputError("batches: rows: 0: expected at least one scene")
         if batch_size < 1 or num_shards < 1 or batch_size % num_shards:
@@ -67,9 +139,10 @@ class BatchIterator:
             raise InputError(f"batches: seed: {seed}: expected >= 0")
         self._batch_size, self._seed = batch_size, seed
         local = batch_size // num_shards
-        self._part = slice(shard_index * local, (shard_index + 1) * local)
+        self._part = np.arange(shard_index * local, (shard_index + 1) * local)
         self._epoch = self._position = 0
         self._order: tuple[int, np.ndarray] | None = None
+        self._stream: RowStream | None = None
 
     @property
     def batches_per_epoch(self) -> int:
@@ -104,29 +177,37 @@ class BatchIterator:
                 f"{self.batches_per_epoch}: same dataset and batch size"
             )
         self._epoch, self._position = int(state["epoch"]), int(state["position"])
+        self._stream = None
 
     def __iter__(self) -> "BatchIterator":
         return self
 
     def __next__(self) -> tuple[Demonstration, np.ndarray, np.ndarray]:
-        count = self._chosen.size
-        start = self._position * self._batch_size
-        places = np.arange(start, start + self._batch_size)[self._part]
-        index = self._chosen[self._permutation()[places % count]]
-        weight = (places < count).astype(np.float32)
-        batch = self._take(index)
+        places = self._position * self._batch_size + self._part
+        visited = self._visited(places)
+        weight = (places < self._chosen.size).astype(np.float32)
+        batch = self._take(self._chosen[visited])
         self._position += 1
         if self._position == self.batches_per_epoch:
             self._epoch, self._position = self._epoch + 1, 0
-        return batch, weight, index
+            self._stream = None
+        return batch, weight, self._numbers[visited]
 
-    def _permutation(self) -> np.ndarray:
+    def _visited(self, places: np.ndarray) -> np.ndarray:
+        """Which of the chosen rows stand at some places of the present epoch."""
         if self._order is None or self._order[0] != self._epoch:
-            rng = np.random.default_rng([self._seed, self._epoch])
-            self._order = (self._epoch, rng.permutation(self._chosen.size))
-        return self._order[1]
+            order = epoch_order(self._seed, self._epoch, self._blocks)
+            self._order = (self._epoch, order)
+        return self._order[1][places % self._chosen.size]
 
     def _take(self, index: np.ndarray) -> Demonstration:
-        if isinstance(self._rows, Dataset):
-            return self._rows.read(index)
-        return jax.tree.map(lambda leaf: leaf[index], self._rows)
+        if isinstance(self._rows, Demonstration):
+            return jax.tree.map(lambda leaf: leaf[index], self._rows)
+        if self._stream is None:
+            batches = np.arange(self._position, self.batches_per_epoch)
+            places = batches[:, None] * self._batch_size + self._part
+            ahead = self._visited(places.reshape(-1))
+            self._stream = RowStream(
+                self._rows, self._chosen[ahead], self._blocks[ahead], self._part.size
+            )
+        return next(self._stream)

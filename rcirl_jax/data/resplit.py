@@ -9,6 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from rcirl_jax.data.joined import Demonstrations
+from rcirl_jax.data.splits import TEST, TRAIN, assign_groups
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Demonstration
 
@@ -48,6 +49,10 @@ class Resplit:
         if split is None:
             return np.sort(np.concatenate(list(self._splits.values())))
         return self._splits[split]
+
+    def blocks(self, indices: np.ndarray) -> np.ndarray:
+        """[m] number of the block of rows, unpacked together, that each lies in."""
+        return self._dataset.blocks(indices)
 
     def load(self, split: str | None) -> Demonstration:
         """All rows of a split in memory."""
@@ -95,6 +100,51 @@ def fewer(dataset: Demonstrations, count: int, seed: int) -> Resplit:
     place[order] = np.arange(order.size)
     taken = np.argsort(place[vehicle], kind="stable")[:count]
     return Resplit(dataset, {"train": rows[taken], "test": dataset.indices("test")})
+
+
+def with_validation(
+    dataset: Demonstrations, share: float, seed: int
+) -> tuple[Resplit, str]:
+    """Cut the training split into scenes to fit and scenes to choose by.
+
+    By vehicle-disjoint group, if that holds out between half and twice the share
+    and at least two vehicles; else, as where one group holds nearly all scenes, by
+    vehicle: those held out may then have driven beside those of the fit. Equal
+    numbers in joined datasets are taken for one vehicle or group, which never puts
+    one on both sides.
+
+    Args:
+      dataset: any dataset with a test split, which stays as it is.
+      share: of the training scenes, wanted for validation.
+      seed: of the order among groups or vehicles of one size.
+
+    Returns:
+      (splits "train", "validation", "test"; "group" or "vehicle").
+
+    Raises:
+      InputError: the training split has fewer than three vehicles.
+    """
+    rows, own = dataset.indices(TRAIN), dataset.load(TRAIN)
+    vehicle = np.asarray(own.vehicle)
+    if np.unique(vehicle).size < 3:
+        raise InputError(
+            f"split: {TRAIN}: {np.unique(vehicle).size} vehicles: expected at least 3,"
+            " of which some are held out to choose by"
+        )
+    held, by = np.zeros(rows.size, bool), ""
+    for by in ("group", "vehicle"):
+        number = np.asarray(getattr(own, by))
+        names, counts = np.unique(number, return_counts=True)
+        if names.size < 2:
+            continue
+        sizes = dict(zip(map(str, names), counts.tolist(), strict=True))
+        parts = assign_groups(sizes, test_fraction=share, seed=seed)
+        held = np.isin(number, [int(name) for name in parts[TEST]])
+        enough = 0.5 * share <= held.mean() <= 2.0 * share
+        if enough and np.unique(vehicle[held]).size > 1:
+            break
+    splits = {TRAIN: rows[~held], "validation": rows[held], TEST: dataset.indices(TEST)}
+    return Resplit(dataset, splits), by
 
 
 def halves(dataset: Demonstrations) -> tuple[Resplit, Resplit]:

@@ -58,7 +58,8 @@ def covered_rows(
     return jax.tree.map(lambda x: x[keep], rows), index[keep]
 
 
-def _outcomes(scored: Scored, rows: Demonstration, setup: RankingSetup) -> Outcomes:
+def outcomes_of(scored: Scored, rows: Demonstration, setup: RankingSetup) -> Outcomes:
+    """What happens with each candidate, for metrics of the scored scenes."""
     feasible = scored.feasible
     if setup.drop_collisions:
         feasible = feasible & ~scored.crash
@@ -84,7 +85,7 @@ def _temperatures(
     chosen = np.random.default_rng(0).permutation(index.size)[:TEMPERATURE_SCENES]
     rows, index = jax.tree.map(lambda x: x[chosen], rows), index[chosen]
     scored = _score(rows, index, setup, scorers, executor)
-    outcomes = _outcomes(scored, rows, setup)
+    outcomes = outcomes_of(scored, rows, setup)
     return {name: fit_temperature(v, outcomes) for name, v in scored.values.items()}
 
 
@@ -132,7 +133,7 @@ def evaluate_ranking(
     temperatures = _temperatures(dataset, setup, flat, executor)
     rows, index = covered_rows(dataset, setup.split, setup.horizon_s)
     scored = _score(rows, index, setup, flat, executor)
-    outcomes = _outcomes(scored, rows, setup)
+    outcomes = outcomes_of(scored, rows, setup)
 
     def metrics(name: str) -> dict[str, np.ndarray]:
         values, human = scored.values[name], scored.human_values[name]

@@ -14,7 +14,13 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.export.weights import FeatureSpec, RewardWeights, save
 from rcirl_jax.features import feature_map
-from rcirl_jax.reward import RewardConfig, pinned, value
+from rcirl_jax.reward import (
+    Normaliser,
+    RewardConfig,
+    RewardParams,
+    pinned,
+    value,
+)
 from rcirl_jax.reward.network import LEAKY_SLOPE
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train.loop import restore_run, to_device_batch
@@ -52,21 +58,21 @@ def read_config(workdir: Path) -> tuple[TrainConfig, dict]:
 
 
 def reward_weights(
-    state: TrainState, config: TrainConfig, provenance: dict
+    params: RewardParams, normaliser: Normaliser, config: TrainConfig, provenance: dict
 ) -> RewardWeights:
-    """The effective weights of a trained state, as the file holds them."""
+    """The effective weights of trained parameters, as the file holds them."""
     features = feature_map(config.features)
-    effective = pinned(state.params, config.reward)
+    effective = pinned(params, config.reward)
     return RewardWeights(
         preset=config.features,
         features=tuple(
             FeatureSpec(name=s.name, unit=s.unit, none_value=s.none)
             for s in features.specs
         ),
-        lower=np.asarray(state.normaliser.lower),
-        upper=np.asarray(state.normaliser.upper),
-        location=np.asarray(state.normaliser.location),
-        scale=np.asarray(state.normaliser.scale),
+        lower=np.asarray(normaliser.lower),
+        upper=np.asarray(normaliser.upper),
+        location=np.asarray(normaliser.location),
+        scale=np.asarray(normaliser.scale),
         times=TIMES_S,
         gamma=np.asarray(effective.gamma),
         kernels=tuple(np.asarray(kernel) for kernel in effective.kernels),
@@ -103,21 +109,44 @@ def export_run(workdir: Path, dataset: Demonstrations, output: Path) -> Reward:
             f"expected that of the given dataset, {dataset.hash}"
         )
     state = restore_run(workdir, config)
-    x, valid = _samples(dataset, config)
+    return write_weights(
+        output,
+        state.params,
+        state.normaliser,
+        config,
+        verification_samples(dataset, config),
+        _provenance(workdir, state, config, run),
+    )
+
+
+def write_weights(
+    output: Path,
+    params: RewardParams,
+    normaliser: Normaliser,
+    config: TrainConfig,
+    samples: tuple[np.ndarray, np.ndarray],
+    provenance: dict,
+) -> Reward:
+    """Write trained parameters as weights.msgpack, atomically.
+
+    Args:
+      output: file; its folder is made if missing.
+      params: trained, raw.
+      normaliser: of the training.
+      config: of the training.
+      samples: of `verification_samples`; their values are computed here as the
+        trainer computes them.
+      provenance: `weights.PROVENANCE_KEYS` and more.
+    """
+    x, valid = map(jnp.asarray, samples)
     with jax.default_matmul_precision("highest"):
-        values = value(
-            state.params,
-            state.normaliser,
-            jnp.asarray(x),
-            jnp.asarray(valid),
-            config.reward,
-        )
-    weights = reward_weights(state, config, _provenance(workdir, state, config, run))
+        values = value(params, normaliser, x, valid, config.reward)
+    weights = reward_weights(params, normaliser, config, provenance)
     output.parent.mkdir(parents=True, exist_ok=True)
-    return save(output, weights, x, valid, np.asarray(values))
+    return save(output, weights, *samples, np.asarray(values))
 
 
-def _samples(
+def verification_samples(
     dataset: Demonstrations, config: TrainConfig
 ) -> tuple[np.ndarray, np.ndarray]:
     """[m, T, F] features and [m, T] masks: half humans, half candidates."""

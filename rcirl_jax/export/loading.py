@@ -1,13 +1,17 @@
 """Weights files -> scorers, with the features and sampler they were made for."""
 
+import functools
 from collections.abc import Callable, Sequence
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.reader import Reward, WeightsError, load_weights
 from rcirl_jax.features import feature_map
+from rcirl_jax.reward.network import conditioned, point_rewards
+from rcirl_jax.reward.normaliser import normalise
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.types import Normaliser, RewardParams
 
@@ -52,6 +56,38 @@ def reward_params(reward: Reward) -> tuple[RewardParams, Normaliser]:
             scale=jnp.asarray(reward.scale, jnp.float32),
         ),
     )
+
+
+def compiled_scorer(reward: Reward) -> Scorer:
+    """`reward.value` as a compiled program, one for all rewards of a shape.
+
+    Can be sent to other processes. For calls with up to 32,768 trajectories: see
+    BUILD.md on jaxlib's sums.
+    """
+    return functools.partial(_score, *reward_params(reward), reward.activation)
+
+
+def _score(
+    effective: RewardParams,
+    normaliser: Normaliser,
+    activation: str,
+    x: np.ndarray,
+    valid: np.ndarray,
+) -> np.ndarray:
+    return np.asarray(_value(effective, normaliser, x, valid, activation))
+
+
+@functools.partial(jax.jit, static_argnames="activation")
+def _value(
+    effective: RewardParams,
+    normaliser: Normaliser,
+    x: jax.Array,
+    valid: jax.Array,
+    activation: str,
+) -> jax.Array:
+    x = conditioned(effective, normalise(normaliser, x))
+    rewards = point_rewards(effective, x, activation)
+    return jnp.sum(jnp.where(valid, effective.gamma * rewards, 0.0), axis=-1)
 
 
 def row_name(reward: Reward) -> str:

@@ -35,12 +35,13 @@ class Checkpoints:
         return None if latest is None else int(latest.step)
 
     def save(self, state: TrainState, position: dict) -> None:
-        """Start saving; returns before the files are complete."""
-        step = int(state.step)
-        if self.latest_step() == step:
-            return
+        """Start saving; returns before the files are complete.
+
+        Once a step. With several processes all of them call it, and the state has
+        to be on the devices of all.
+        """
         self._checkpointer.save_async(
-            step, state, force=True, custom_metadata={"position": position}
+            int(state.step), state, force=True, custom_metadata={"position": position}
         )
 
     def restore(self, like: TrainState) -> tuple[TrainState, dict]:

@@ -4,11 +4,16 @@ All learners of a comparison see the same candidates, and a sweep pays for
 sampling and features once. Members of one call share network shape, loss and
 batches; they differ in seed, step size and leaky rate, which are arrays, so the
 whole grid is one compiled program.
+
+A batch is worked off in pieces of scenes whose gradient sums add up. A piece is
+gathered and normalised once for all members and stays in a CPU's cache while they
+use it; memory does not grow with batch size times members.
 """
 
+import contextlib
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import flax.struct
 import jax
@@ -17,7 +22,7 @@ import numpy as np
 import optax
 
 from rcirl_jax.features import feature_map
-from rcirl_jax.reward import Normaliser, RewardParams
+from rcirl_jax.reward import LossSums, Normaliser, RewardParams
 from rcirl_jax.train.loop import to_device_batch
 from rcirl_jax.train.state import OPTIMIZERS, Batch, FeatureBatch, TrainConfig
 from rcirl_jax.train.step import as_tree, featurise, gradient_sums, init_params
@@ -25,6 +30,15 @@ from rcirl_jax.types import Demonstration
 
 CHUNK = 128  # scenes featurised per call
 ORDER_STREAM = 3  # fold_in number of the batch order's key
+
+# hidden values of all members in one piece of a batch: 2 MB on a CPU, of the order
+# of its second-level cache; elsewhere 1 GB, for large kernels in little memory
+PIECE_VALUES = {"cpu": 1 << 19}
+PIECE_VALUES_ELSEWHERE = 1 << 28
+# trajectory values of all members in one piece on a CPU: with more, jaxlib 0.10.2
+# sums wrongly in some fusions (jax-ml/jax issue 39103)
+PIECE_SUMS = 1 << 15
+COMPILED = "/jax/core/compile/backend_compile_duration"
 
 
 class Members(flax.struct.PyTreeNode, kw_only=True):
@@ -95,21 +109,84 @@ def fit(
     """
     shared = dataclasses.replace(config, learning_rate=0.5, leaky_rate=0.5, seed=0)
     order = jax.random.fold_in(jax.random.key(config.seed), ORDER_STREAM)
-    return _fit(frozen, normaliser, order, members, shared)
+    seen = np.flatnonzero(np.any(np.asarray(frozen.time_valid), axis=0))
+    times = int(np.max(seen, initial=0)) + 1
+    return _fit(frozen, normaliser, order, members, shared, times)
 
 
-@functools.partial(jax.jit, static_argnames="config")
+@contextlib.contextmanager
+def compiles() -> Iterator[list[float]]:
+    """Seconds of each compile of the members' program inside the `with` block."""
+    found: list[float] = []
+
+    def listen(event: str, duration_secs: float, **kwargs: str | int) -> None:
+        if event == COMPILED and kwargs.get("fun_name") == "jit(_fit)":
+            found.append(duration_secs)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        yield found
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+
+
+def piece_size(size: int, members: int, candidates: int, times: int, units: int) -> int:
+    """Scenes of a batch that are worked off together: a divisor of the batch size.
+
+    Args:
+      size: B, scenes in a batch.
+      members: M.
+      candidates: K of a scene.
+      times: T that are compared.
+      units: of the widest hidden layer; 1 for a linear reward.
+    """
+    device = jax.default_backend()
+    values = PIECE_VALUES.get(device, PIECE_VALUES_ELSEWHERE)
+    most = min(size, values // (members * candidates * times * units))
+    if device == "cpu":
+        most = min(most, PIECE_SUMS // (members * (candidates + 1)))
+    return next((n for n in range(most, 1, -1) if size % n == 0), 1)
+
+
+def _taken(frozen: FeatureBatch, part: tuple, times: int) -> FeatureBatch:
+    """Some scenes of the set, (rows, weights), without times valid in none of it."""
+    batch = jax.tree.map(lambda x: x[part[0]], frozen)
+    return batch.replace(
+        weight=part[1],
+        human=batch.human[:, :times],
+        candidates=batch.candidates[:, :, :times],
+        time_valid=batch.time_valid[:, :times],
+    )
+
+
+def _added(
+    sums_of: Callable[[tuple], tuple[RewardParams, LossSums]], parts: tuple
+) -> tuple[RewardParams, LossSums]:
+    """Sums over parts [n, ...], one after the other."""
+    like = jax.eval_shape(sums_of, jax.tree.map(lambda x: x[0], parts))
+    zero = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+    add = lambda total, part: (  # noqa: E731
+        jax.tree.map(jnp.add, total, sums_of(part)),
+        None,
+    )
+    return jax.lax.scan(add, zero, parts)[0]
+
+
+@functools.partial(jax.jit, static_argnames=("config", "times"))
 def _fit(
     frozen: FeatureBatch,
     normaliser: Normaliser,
     order: jax.Array,
     members: Members,
     config: TrainConfig,
+    times: int,
 ) -> Fitted:
     """`config.seed`, step size and leaky rate are not read: one compile for all."""
-    count = frozen.weight.shape[0]
+    count, candidates = frozen.feasible.shape
     size = min(config.batch_size, count)
     batches = -(-count // size)
+    units = max(config.reward.hidden, default=1)
+    piece = piece_size(size, members.seed.size, candidates, times, units)
     # the direction of a step of size 1; members scale it
     decay = optax.add_decayed_weights(config.weight_decay)
     optimizer = optax.chain(decay, OPTIMIZERS[config.optimizer](1.0))
@@ -119,10 +196,13 @@ def _fit(
     params = jax.vmap(init)(members.seed)
     state = jax.vmap(lambda p: optimizer.init(as_tree(p)))(params)
 
-    def one_step(batch: FeatureBatch, step: jax.Array, member: tuple) -> tuple:
+    def one_step(batch: tuple, step: jax.Array, member: tuple) -> tuple:
         who, params, state = member
         constants = dataclasses.replace(config.loss_config, leaky_rate=who.leaky_rate)
-        grads, sums = gradient_sums(params, normaliser, batch, config, constants)
+        sums_of = lambda part: gradient_sums(  # noqa: E731
+            params, normaliser, _taken(frozen, part, times), config, constants
+        )
+        grads, sums = _added(sums_of, batch)
         grads = jax.tree.map(lambda g: g / jnp.maximum(sums.terms, 1.0), grads)
         updates, after = optimizer.update(grads, state, as_tree(params))
         rate = who.learning_rate
@@ -137,7 +217,7 @@ def _fit(
     def step(carry: tuple, at: tuple) -> tuple:
         params, state = carry
         number, rows, weight = at
-        batch = jax.tree.map(lambda x: x[rows], frozen).replace(weight=weight)
+        batch = (rows.reshape(-1, piece), weight.reshape(-1, piece))
         member = (members, params, state)
         params, state, seen = jax.vmap(lambda m: one_step(batch, number, m))(member)
         return (params, state), seen

@@ -1,25 +1,30 @@
 """Training from a dataset: sequence only, no mathematics.
 
 restore or init -> for each batch: step, guard, log -> checkpoint every epoch.
+With several processes (`train.processes`) each reads and computes its part of every
+batch; process 0 alone writes run.json and metrics.
 """
 
 import dataclasses
-import json
-import os
+from collections.abc import Iterator
 from pathlib import Path
+from typing import cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.data.joined import Demonstrations
-from rcirl_jax.data.pipeline import BatchIterator
+from rcirl_jax.data.pipeline import split_batches
+from rcirl_jax.data.stream import Prefetch
 from rcirl_jax.errors import InputError
 from rcirl_jax.features import FeatureMap, feature_map
 from rcirl_jax.reward import Normaliser, fit_normaliser
 from rcirl_jax.train.checkpoint import Checkpoints
 from rcirl_jax.train.metrics import MetricsWriter, Progress
-from rcirl_jax.train.parallel import Step, parallelise
+from rcirl_jax.train.parallel import Parallel, parallelise
+from rcirl_jax.train.processes import is_first
+from rcirl_jax.train.running import Running, describe_run
 from rcirl_jax.train.state import Batch, FeatureBatch, TrainConfig, TrainState
 from rcirl_jax.train.step import StepMetrics, featurise, init_state, make_train_step
 from rcirl_jax.types import Demonstration
@@ -32,27 +37,38 @@ def to_device_batch(
     demonstrations: Demonstration, weight: np.ndarray, index: np.ndarray
 ) -> Batch:
     """Numpy rows -> a Batch on the default device."""
+    return jax.device_put(host_batch(demonstrations, weight, index))
+
+
+def host_batch(
+    demonstrations: Demonstration, weight: np.ndarray, index: np.ndarray
+) -> Batch:
+    """Numpy rows -> a Batch of numpy arrays of the step's types."""
+    weight, index = np.asarray(weight, np.float32), np.asarray(index, np.int32)
     return Batch(
-        demonstrations=jax.tree.map(jnp.asarray, demonstrations),
-        weight=jnp.asarray(weight, jnp.float32),
-        index=jnp.asarray(index, jnp.int32),
+        demonstrations=demonstrations,
+        weight=cast(jax.Array, weight),
+        index=cast(jax.Array, index),
     )
 
 
 def fit_normaliser_on(
-    rows: Demonstration, config: TrainConfig, features: FeatureMap
+    dataset: Demonstrations, config: TrainConfig, features: FeatureMap
 ) -> Normaliser:
     """The frozen normaliser from humans and feasible candidates of some scenes."""
-    count = int(rows.vehicle.shape[0])
+    index = dataset.indices("train")
+    count = index.size
     chosen = np.random.default_rng([config.seed, NORMALISER_STREAM]).permutation(count)
     chosen = np.sort(chosen[:NORMALISER_SCENES])
+    rows = dataset.read(index[chosen])
     key = jax.random.fold_in(jax.random.key(config.seed), NORMALISER_STREAM)
     make = jax.jit(lambda batch: featurise(key, batch, config, features))
     parts = []
     for start in range(0, chosen.size, config.batch_size):
-        picked = np.resize(chosen[start : start + config.batch_size], config.batch_size)
-        taken = jax.tree.map(lambda x, picked=picked: x[picked], rows)
-        batch = make(to_device_batch(taken, np.ones(picked.size), picked))
+        some = np.arange(start, min(start + config.batch_size, chosen.size))
+        some = np.resize(some, config.batch_size)
+        taken = jax.tree.map(lambda x, some=some: x[some], rows)
+        batch = make(to_device_batch(taken, np.ones(some.size), chosen[some]))
         parts.append(rows_that_count(batch))
     return fit_normaliser(np.concatenate(parts), features)
 
@@ -73,6 +89,7 @@ class TrainResult:
     epochs: list[dict]  # one summary per epoch of this process
     queries: float  # pairs compared in this process
     seconds: float  # wall time of the steps in this process
+    waited_s: float  # of it, waiting for rows
 
 
 def train(
@@ -80,7 +97,7 @@ def train(
     workdir: Path,
     config: TrainConfig,
     *,
-    parallel: str = "jit",
+    running: Running | None = None,
     provenance: dict | None = None,
 ) -> TrainResult:
     """Train on the dataset's training split; resumes from the last checkpoint.
@@ -89,28 +106,44 @@ def train(
       dataset: an open dataset.
       workdir: run folder: run.json, checkpoints/, metrics.jsonl, tensorboard/.
       config: everything that decides the result.
-      parallel: "jit", "pmap" or "shard_map" over the local devices.
+      running: what does not: devices, memory, checkpoints.
       provenance: extra facts for run.json.
 
     Raises:
       InputError: the workdir belongs to other settings or another dataset, or
         a feature turns NaN or infinite (names scene and feature).
     """
+    running = running or Running()
+    parallel = parallelise(make_train_step(config), running.parallel, config.batch_size)
     describe_run(workdir, config, dataset, provenance or {})
     features = feature_map(config.features)
-    rows = dataset.load("train")
-    index = dataset.indices("train")
+    batches = split_batches(
+        dataset,
+        "train",
+        in_memory_mb=running.in_memory_mb,
+        batch_size=config.batch_size,
+        seed=config.seed,
+        shard_index=jax.process_index(),
+        num_shards=jax.process_count(),
+    )
     checkpoints = Checkpoints(workdir / "checkpoints")
-    batches = BatchIterator(rows, batch_size=config.batch_size, seed=config.seed)
     if checkpoints.latest_step() is None:
-        state = init_state(config, fit_normaliser_on(rows, config, features))
+        made = init_state(config, fit_normaliser_on(dataset, config, features))
+        state = parallel.replicate(made)
     else:
-        state, position = checkpoints.restore(_like(config, features))
+        like = parallel.replicate(_like(config, features))
+        state, position = checkpoints.restore(like)
         batches.restore(position)
-    run = _Run(config, features, index, workdir, int(state.step))
-    step = parallelise(make_train_step(config), parallel, config.batch_size)
+    run = _Run(config, running, features, batches.batches_per_epoch, workdir, state)
+
+    def produce() -> tuple:
+        if batches.state()["epoch"] >= config.epochs:
+            raise StopIteration
+        return next(batches), batches.state()
+
     try:
-        state = run.epochs_from(state, batches, step, checkpoints)
+        with Prefetch(produce, running.prefetch) as ahead:
+            state = run.epochs_from(state, ahead, parallel, checkpoints)
     finally:
         checkpoints.close()
         run.close()
@@ -119,6 +152,7 @@ def train(
         epochs=run.summaries,
         queries=run.progress.queries,
         seconds=run.progress.seconds,
+        waited_s=ahead.waited_s,
     )
 
 
@@ -145,44 +179,53 @@ def _like(config: TrainConfig, features: FeatureMap) -> TrainState:
 
 
 class _Run:
-    """The loop's bookkeeping: metrics, progress, guard."""
+    """The loop's bookkeeping: metrics, progress, guard, when to save."""
 
     def __init__(
         self,
         config: TrainConfig,
+        running: Running,
         features: FeatureMap,
-        index: np.ndarray,
+        per_epoch: int,
         workdir: Path,
-        first_step: int,
+        state: TrainState,
     ) -> None:
-        self.config, self.features, self.index = config, features, index
-        self.per_epoch = -(-index.size // config.batch_size)
+        self.config, self.running, self.features = config, running, features
+        self.per_epoch, first_step = per_epoch, int(state.step)
         total = self.per_epoch * config.epochs
-        self.writer = MetricsWriter(workdir, first_step)
-        self.progress = Progress(total, first_step, "train")
+        self.writer = MetricsWriter(workdir, first_step) if is_first() else None
+        self.progress = Progress(total, first_step, "train", shown=is_first())
         self.summaries: list[dict] = []
 
     def close(self) -> None:
-        self.writer.close()
+        if self.writer is not None:
+            self.writer.close()
         self.progress.__exit__(None, None, None)
 
     def epochs_from(
         self,
         state: TrainState,
-        batches: BatchIterator,
-        step: Step,
+        batches: Iterator[tuple],
+        parallel: Parallel,
         checkpoints: Checkpoints,
     ) -> TrainState:
         for epoch in range(int(state.step) // self.per_epoch, self.config.epochs):
             sums = np.zeros(4)
             for _ in range(self.per_epoch - int(state.step) % self.per_epoch):
-                rows, weight, local = next(batches)
-                batch = to_device_batch(rows, weight, self.index[local])
-                state, metrics = step(state, batch)
-                sums += self._after_step(int(state.step), metrics)
+                (rows, weight, number), position = next(batches)
+                batch = parallel.place(host_batch(rows, weight, number))
+                state, metrics = parallel.step(state, batch)
+                step = int(state.step)
+                sums += self._after_step(step, metrics)
+                if self._is_due(step):
+                    checkpoints.save(state, position)
+                self.running.on_step(step)
             self.summaries.append(_summary(epoch, sums))
-            checkpoints.save(state, batches.state())
         return state
+
+    def _is_due(self, step: int) -> bool:
+        every = self.running.checkpoint_every
+        return step % self.per_epoch == 0 or (every > 0 and step % every == 0)
 
     def _after_step(self, step: int, metrics: StepMetrics) -> np.ndarray:
         guard(metrics, self.features, step)
@@ -192,15 +235,11 @@ class _Run:
             "pair_accuracy": float(metrics.wins) / pairs,
         }
         self.progress.advance(pairs, **shown)
-        self.writer.write(
-            step,
-            {
-                **shown,
-                "grad_norm": float(metrics.grad_norm),
-                "pairs": pairs,
-                "queries_per_s": self.progress.queries / self.progress.seconds,
-            },
-        )
+        if self.writer is not None:
+            rate = self.progress.queries / self.progress.seconds
+            norm = float(metrics.grad_norm)
+            more = {"grad_norm": norm, "pairs": pairs, "queries_per_s": rate}
+            self.writer.write(step, {**shown, **more})
         counted = (metrics.loss_sum, metrics.terms, metrics.wins, metrics.pairs)
         return np.array([float(x) for x in counted])
 
@@ -230,33 +269,3 @@ def guard(metrics: StepMetrics, features: FeatureMap, step: int) -> None:
         f"train: step {step}: loss or gradient: not finite: features are finite; "
         "lower --learning_rate; the state before is kept"
     )
-
-
-def describe_run(
-    workdir: Path, config: TrainConfig, dataset: Demonstrations, provenance: dict
-) -> None:
-    """Write run.json, or check that an existing one says the same.
-
-    Raises:
-      InputError: the folder holds a run with other settings (names the first).
-    """
-    path = workdir / "run.json"
-    described = {
-        "config": json.loads(json.dumps(dataclasses.asdict(config))),
-        "dataset_hash": dataset.hash,
-    }
-    if path.exists():
-        found = json.loads(path.read_text())
-        if found.get("dataset_hash") != dataset.hash:
-            raise InputError(f"{path}: dataset_hash: made from another dataset")
-        for name, setting in described["config"].items():
-            before = found["config"].get(name)
-            if before != setting and name != "epochs":
-                raise InputError(
-                    f"{path}: {name}: {before}: expected {setting} to resume; "
-                    "use another --workdir for other settings"
-                )
-    workdir.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(json.dumps({**described, **provenance}, indent=2) + "\n")
-    os.replace(temporary, path)

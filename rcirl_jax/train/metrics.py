@@ -65,9 +65,16 @@ def _tensorboard(folder: Path, purge_step: int) -> Any:  # noqa: ANN401
 class Progress:
     """A progress bar with queries/s and ETA on stderr."""
 
-    def __init__(self, total: int, start: int, label: str) -> None:
+    def __init__(
+        self, total: int, start: int, label: str, *, shown: bool = True
+    ) -> None:
         self._bar = tqdm.tqdm(
-            total=total, initial=start, desc=label, unit="step", mininterval=0.5
+            total=total,
+            initial=start,
+            desc=label,
+            unit="step",
+            mininterval=0.5,
+            disable=not shown,
         )
         self._since = time.perf_counter()
         self._queries = 0.0

@@ -1,20 +1,34 @@
 """One step on one or many devices. The only file that names pmap or a mesh.
 
-`single`, `pmapped` and `sharded` turn the same pure step into a function of
-(state, batch) with replicated state in and out; the batch is [B, ...] in all
-three and B must be a multiple of the number of devices.
+The same pure step becomes a function of (state, batch) with replicated state in
+and out; the batch is [B, ...] in all cases and B must be a multiple of the number
+of devices, which are those of all processes together. A process holds its
+contiguous part of the batch; `place` makes one global batch of the parts.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.experimental import multihost_utils
 
 from rcirl_jax.errors import InputError
 
 AXIS = "data"  # the one mesh axis: data parallel
 Step = Callable[..., tuple]
+Place = Callable[[Any], Any]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Parallel:
+    """A step and how its arguments get to its devices."""
+
+    step: Step  # (state, batch) -> (state, metrics)
+    place: Place  # this process's rows [B / processes, ...], numpy -> the batch
+    replicate: Place  # state made in every process -> the state of process 0 in all
 
 
 def single(step: Step) -> Step:
@@ -23,30 +37,30 @@ def single(step: Step) -> Step:
 
 
 def pmapped(step: Step, num_devices: int) -> Step:
-    """The step under pmap over `num_devices` local devices."""
-    devices = _devices(num_devices)
+    """The step under pmap, which takes this process's rows only."""
+    here = len(_local(num_devices))
+    everywhere, _ = _shardings(num_devices)
     mapped = jax.pmap(
         lambda state, batch: step(state, batch, axis_name=AXIS),
         axis_name=AXIS,
         in_axes=(None, 0),
         out_axes=None,
-        devices=devices,
+        devices=_devices(num_devices),
     )
 
     def run(state: object, batch: object) -> tuple:
         split = jax.tree.map(
-            lambda x: x.reshape(num_devices, x.shape[0] // num_devices, *x.shape[1:]),
-            batch,
+            lambda x: x.reshape(here, x.shape[0] // here, *x.shape[1:]), batch
         )
-        return mapped(state, split)
+        # pmap gives copies on the devices of this process: name all of them
+        return jax.tree.map(lambda x: _global(x, everywhere), mapped(state, split))
 
     return run
 
 
 def sharded(step: Step, num_devices: int) -> Step:
     """The step under jit(shard_map) over a one-axis mesh."""
-    mesh = jax.sharding.Mesh(np.array(_devices(num_devices)), (AXIS,))
-    spec = jax.sharding.PartitionSpec
+    mesh, spec = _mesh(num_devices), jax.sharding.PartitionSpec
     return jax.jit(
         jax.shard_map(
             lambda state, batch: step(state, batch, axis_name=AXIS),
@@ -60,31 +74,94 @@ def sharded(step: Step, num_devices: int) -> Step:
     )
 
 
-PARALLEL = ("jit", "pmap", "shard_map")
+def jit_sharded(step: Step, num_devices: int) -> Step:
+    """The step under jit with shardings: the compiler splits it and adds the sums."""
+    everywhere, rows = _shardings(num_devices)
+    return jax.jit(step, in_shardings=(everywhere, rows), out_shardings=everywhere)
 
 
-def parallelise(step: Step, how: str, batch_size: int) -> Step:
-    """The step run as `how` on all local devices.
+MANY = {"pmap": pmapped, "shard_map": sharded, "jit_sharded": jit_sharded}
+PARALLEL = ("jit", *MANY)
+
+
+def parallelise(step: Step, how: str, batch_size: int) -> Parallel:
+    """The step run as `how` on all devices of all processes.
 
     Raises:
-      InputError: unknown `how`, or a batch that does not divide evenly.
+      InputError: unknown `how`, one device for several processes, or a batch that
+        does not divide evenly.
     """
+    if how not in PARALLEL:
+        raise InputError(f"--parallel: {how}: expected one of {', '.join(PARALLEL)}")
     if how == "jit":
-        return single(step)
-    count = jax.local_device_count()
+        if jax.process_count() > 1:
+            raise InputError(
+                f"--parallel: jit: {jax.process_count()} processes: "
+                f"expected one of {', '.join(MANY)}"
+            )
+        return Parallel(step=single(step), place=jax.device_put, replicate=lambda x: x)
+    count = jax.device_count()
     if batch_size % count:
         raise InputError(
             f"--batch_size: {batch_size}: expected a multiple of {count} devices"
         )
-    if how == "pmap":
-        return pmapped(step, count)
-    if how == "shard_map":
-        return sharded(step, count)
-    raise InputError(f"--parallel: {how}: expected one of {', '.join(PARALLEL)}")
+    everywhere, rows = _shardings(count)
+
+    def place(batch: Any) -> Any:  # noqa: ANN401
+        return jax.make_array_from_process_local_data(rows, batch)
+
+    return Parallel(
+        step=MANY[how](step, count),
+        # pmap takes each process's own rows
+        place=jax.device_put if how == "pmap" else place,
+        replicate=lambda state: _replicate(state, everywhere),
+    )
+
+
+def _replicate(state: Any, everywhere: jax.NamedSharding) -> Any:  # noqa: ANN401
+    """The state of process 0 on every device; typed keys travel as numbers."""
+    numbers = jax.tree.map(
+        lambda x: np.asarray(jax.random.key_data(x) if _is_key(x) else x), state
+    )
+    numbers = multihost_utils.broadcast_one_to_all(numbers)
+
+    def put(leaf: jax.Array, value: np.ndarray) -> jax.Array:
+        made = jax.make_array_from_process_local_data(everywhere, value, value.shape)
+        if not _is_key(leaf):
+            return made
+        return jax.random.wrap_key_data(made, impl=jax.random.key_impl(leaf))
+
+    return jax.tree.map(put, state, numbers)
+
+
+def _global(leaf: jax.Array, everywhere: jax.NamedSharding) -> jax.Array:
+    """Copies on the devices of this process as part of those on all devices."""
+    copies = [shard.data for shard in leaf.addressable_shards]
+    return jax.make_array_from_single_device_arrays(leaf.shape, everywhere, copies)
+
+
+def _is_key(leaf: jax.Array) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _shardings(num_devices: int) -> tuple[jax.NamedSharding, jax.NamedSharding]:
+    """(a copy on every device, rows split over the devices)."""
+    mesh, spec = _mesh(num_devices), jax.sharding.PartitionSpec
+    return jax.NamedSharding(mesh, spec()), jax.NamedSharding(mesh, spec(AXIS))
+
+
+def _mesh(num_devices: int) -> jax.sharding.Mesh:
+    return jax.sharding.Mesh(np.array(_devices(num_devices)), (AXIS,))
 
 
 def _devices(count: int) -> list[Any]:
-    devices = jax.local_devices()
+    devices = jax.devices()
     if count > len(devices):
         raise InputError(f"devices: {count}: expected at most {len(devices)}")
     return devices[:count]
+
+
+def _local(count: int) -> list[Any]:
+    """Those of the first devices that belong to this process."""
+    own = jax.process_index()
+    return [device for device in _devices(count) if device.process_index == own]

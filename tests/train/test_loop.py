@@ -168,6 +168,8 @@ def test_a_horizon_nobody_covers_is_one_line(dataset):
         (["train", "--workdir=w"], "data"),
         (["train", "--data=d", "--workdir=w", "--epoch=3"], "epoch"),
         (["train", "--data=d", "--workdir=w", "more"], "more"),
+        (["train", "--data=d", "--workdir=w", "--num_processes=2"], "all three"),
+        (["train", "--data=d", "--workdir=w", "--parallel=ring"], "parallel"),
     ],
 )
 def test_command_lines_answer_bad_input_in_one_line(command, message, tmp_path):

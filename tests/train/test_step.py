@@ -14,7 +14,13 @@ from rcirl_jax.features import feature_map
 from rcirl_jax.reward import LOSSES, Normaliser, RewardConfig, pinned
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train.loop import guard, to_device_batch
-from rcirl_jax.train.parallel import parallelise, pmapped, sharded, single
+from rcirl_jax.train.parallel import (
+    jit_sharded,
+    parallelise,
+    pmapped,
+    sharded,
+    single,
+)
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.train.step import featurise, init_state, make_train_step
 from tests.scenes import demonstration
@@ -53,7 +59,7 @@ def weights_of(state):
     return np.concatenate([np.ravel(x) for x in jax.tree.leaves(state.params)])
 
 
-@pytest.mark.parametrize("how", [pmapped, sharded])
+@pytest.mark.parametrize("how", [pmapped, sharded, jit_sharded])
 @pytest.mark.parametrize("masked", [False, True])
 def test_eight_devices_equal_one(how, masked):
     """Also with uneven shards: weights that leave some devices nearly empty."""

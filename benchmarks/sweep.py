@@ -1,0 +1,128 @@
+"""A sweep of 64 members against 64 single runs in turn.
+
+    python -m benchmarks.sweep
+
+Members are leaky rates x seeds of the paper's network on the same candidates, made
+once. Per round, in turn: all members in the chunks of a sweep; a few single runs by
+`fit` with one member, already compiled; and a few steps as experiments.train takes
+them, which make candidates and features anew in every step. Single runs are scaled
+to 64; compiling is reported apart. Medians over the rounds.
+"""
+
+import dataclasses
+import time
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from absl import app, flags
+
+from benchmarks.common import write
+from rcirl_jax.evaluation.learners import normaliser_of
+from rcirl_jax.evaluation.sweep import MEMBERS_AT_ONCE
+from rcirl_jax.reward import RewardConfig
+from rcirl_jax.train.frozen import Members, compiles, fit, freeze, members_of
+from rcirl_jax.train.loop import to_device_batch
+from rcirl_jax.train.state import TrainConfig
+from rcirl_jax.train.step import init_state, make_train_step
+from tests.scenes import demonstration
+
+LEAKY_RATES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
+
+_MEMBERS = flags.DEFINE_integer("members", 64, "members, a multiple of 8")
+_SCENES = flags.DEFINE_integer("scenes", 256, "training scenes")
+_EPOCHS = flags.DEFINE_integer("epochs", 1, "passes over them")
+_HIDDEN = flags.DEFINE_list("hidden_size", ["15"], "units per layer")
+_SINGLE = flags.DEFINE_integer("single", 4, "single runs per round")
+_STEPS = flags.DEFINE_integer("steps", 2, "training steps per round")
+_ROUNDS = flags.DEFINE_integer("rounds", 5, "rounds")
+_OUTPUT = flags.DEFINE_string("output", "benchmarks/results", "folder of the JSON")
+
+
+def _seconds(call: Callable[[], object]) -> float:
+    begin = time.perf_counter()
+    jax.block_until_ready(call())
+    return time.perf_counter() - begin
+
+
+def _grid(config: TrainConfig) -> list[Members]:
+    """The members in chunks as a sweep trains them."""
+    seeds = range(_MEMBERS.value // len(LEAKY_RATES))
+    every = members_of(config, [seed for _ in LEAKY_RATES for seed in seeds])
+    rates = jnp.repeat(jnp.asarray(LEAKY_RATES, jnp.float32), len(seeds))
+    every = every.replace(leaky_rate=rates)
+    starts = range(0, _MEMBERS.value, MEMBERS_AT_ONCE)
+    size = MEMBERS_AT_ONCE
+    return [jax.tree.map(lambda x, at=at: x[at : at + size], every) for at in starts]
+
+
+def main(_: list[str]) -> None:
+    """Alternate the three ways."""
+    hidden = tuple(int(units) for units in _HIDDEN.value)
+    config = TrainConfig(
+        positive="nearest",
+        train_horizon=5.0,
+        epochs=_EPOCHS.value,
+        reward=RewardConfig(hidden=hidden),
+    )
+    made = [demonstration(seed % 64) for seed in range(_SCENES.value)]
+    rows = jax.tree.map(lambda *x: np.stack(x), *made)
+    index = np.arange(_SCENES.value)
+    frozen = freeze(rows, index, config)
+    normaliser, chunks = normaliser_of(frozen, config), _grid(config)
+    single = dataclasses.replace(config, seed=0)
+    state, step = init_state(config, normaliser), jax.jit(make_train_step(config))
+    batch = to_device_batch(
+        jax.tree.map(lambda x: x[: config.batch_size], rows),
+        np.ones(config.batch_size),
+        index[: config.batch_size],
+    )
+
+    def sweep() -> list:
+        return [fit(frozen, normaliser, config, members) for members in chunks]
+
+    def alone() -> list:
+        runs = [members_of(single, [seed]) for seed in range(_SINGLE.value)]
+        return [fit(frozen, normaliser, single, run) for run in runs]
+
+    def steps() -> list:
+        return [step(state, batch)[1] for _ in range(_STEPS.value)]
+
+    ways, compiled = {"sweep": sweep, "single": alone, "train": steps}, {}
+    for name, way in ways.items():
+        with compiles() as found:
+            jax.block_until_ready(way())
+        compiled[name] = found
+    taken: dict[str, list[float]] = {name: [] for name in ways}
+    for _ in range(_ROUNDS.value):
+        for name, way in ways.items():
+            taken[name].append(_seconds(way))
+    each_run = -(-_SCENES.value // config.batch_size) * _EPOCHS.value
+    times = {
+        "sweep": 1.0,
+        "single": _MEMBERS.value / _SINGLE.value,
+        "train": _MEMBERS.value * each_run / _STEPS.value,
+    }
+    median = {name: float(np.median(x)) * times[name] for name, x in taken.items()}
+    result = {
+        "members": _MEMBERS.value,
+        "hidden": hidden,
+        "scenes": _SCENES.value,
+        "candidates": int(frozen.feasible.shape[1]),
+        "epochs": _EPOCHS.value,
+        "members_at_once": MEMBERS_AT_ONCE,
+        "seconds_of_all_members": {n: round(x, 4) for n, x in median.items()},
+        "rounds": {n: [round(x, 4) for x in found] for n, found in taken.items()},
+        "compiles": {name: len(found) for name, found in compiled.items()},
+        "compile_seconds": {n: round(sum(found), 3) for n, found in compiled.items()},
+        "single_to_sweep": round(median["single"] / median["sweep"], 2),
+        "train_to_sweep": round(median["train"] / median["sweep"], 2),
+    }
+    for name, found in result.items():
+        print(f"{name}: {found}")
+    print(f"written: {write('sweep', result, _OUTPUT.value)}")
+
+
+if __name__ == "__main__":
+    app.run(main)

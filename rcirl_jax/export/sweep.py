@@ -1,0 +1,344 @@
+"""A sweep in its folder: trained once, resumed, chosen, written.
+
+DIR/settings.json         what the folder belongs to
+DIR/weights/NAME.msgpack  every member
+DIR/groups/SHAPE.json     the group is finished; written after its members
+DIR/sweep.json            all members with their metrics, and the choice
+DIR/best.msgpack          the chosen member, a copy of its file
+"""
+
+import collections
+import dataclasses
+import datetime
+import functools
+import json
+import os
+import resource
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import tqdm
+
+from rcirl_jax.data.joined import Demonstrations
+from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.ranking import METRICS
+from rcirl_jax.evaluation.statistics import ClusterBootstrap
+from rcirl_jax.evaluation.sweep import (
+    Hidden,
+    Part,
+    Scores,
+    SweepConfig,
+    best,
+    estimates,
+    held_out_scores,
+    member_name,
+    open_split,
+    row_name,
+    seed_means,
+    shape_name,
+    train_group,
+)
+from rcirl_jax.executor import Executor
+from rcirl_jax.export.from_run import verification_samples, write_weights
+from rcirl_jax.export.loading import compiled_scorer, open_reward
+from rcirl_jax.train.state import TrainConfig
+
+Rows = Mapping[str, Sequence[TrainConfig]]  # configuration -> its members
+
+
+def run_sweep(
+    config: SweepConfig,
+    folder: Path,
+    executor: Executor,
+    provenance: Mapping[str, object],
+) -> dict:
+    """Train what is not there yet, choose, score the chosen, write everything.
+
+    Args:
+      config: the sweep.
+      folder: its folder; a finished group in it is not trained again.
+      executor: where groups train and scenes are scored.
+      provenance: of `experiments.common`; kept in every file.
+
+    Returns:
+      The contents of sweep.json.
+
+    Raises:
+      InputError: the folder belongs to other settings or data; bad data; no
+        configuration that trains.
+    """
+    dataset, split, by = open_split(config)
+    created = _claim(config, folder, dataset.hash)
+    made_by = {**provenance, "dataset_sha256": dataset.hash, "created": created}
+    groups = _train(config, folder, split, executor, made_by)
+    rows: dict[str, list[TrainConfig]] = collections.defaultdict(list)
+    for one in config.members():
+        rows[row_name(one)].append(one)
+    body = {
+        "settings": _settings(config),
+        "validation_by": by,
+        "scenes": {n: split.indices(n).size for n in ("train", "validation", "test")},
+        "groups": {name: group["facts"] for name, group in groups.items()},
+        **_judged(config, folder, split, rows, groups, executor),
+        "peak_memory_gib": _peak_memory_gib(),
+        "made_by": made_by,
+    }
+    chosen = folder / "weights" / f"{body['chosen']['member']}.msgpack"
+    shutil.copyfile(chosen, folder / "best.tmp")
+    os.replace(folder / "best.tmp", folder / "best.msgpack")
+    _write_json(folder / "sweep.json", body)
+    return body
+
+
+def _settings(config: SweepConfig) -> dict:
+    """What decides the result, as JSON; where the data lie does not."""
+    made = json.loads(json.dumps(dataclasses.asdict(config)))
+    return {n: v for n, v in made.items() if n not in ("base", "data")} | made["base"]
+
+
+def _claim(config: SweepConfig, folder: Path, dataset_hash: str) -> str:
+    """Write settings.json, or check the one that is there; when it was written.
+
+    Raises:
+      InputError: the folder is of a sweep with other settings (names the first).
+    """
+    path = folder / "settings.json"
+    own = {**_settings(config), "dataset_sha256": dataset_hash}
+    if path.exists():
+        try:
+            found = json.loads(path.read_text())
+        except ValueError as error:
+            raise InputError(
+                f"{path}: {error}: expected the file of a sweep"
+            ) from error
+        for name, setting in own.items():
+            if found.get(name) != setting:
+                raise InputError(
+                    f"{path}: {name}: {found.get(name)}: expected {setting} to "
+                    "resume; use another --output for other settings"
+                )
+        return found["created"]
+    created = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    _write_json(path, {**own, "created": created})
+    return created
+
+
+def _train(
+    config: SweepConfig,
+    folder: Path,
+    split: Demonstrations,
+    executor: Executor,
+    made_by: Mapping[str, object],
+) -> dict[str, dict]:
+    """The groups' files by shape, after training those that are missing."""
+    groups = {h: _finished(config, folder, h) for h in config.hidden_sizes}
+    todo = [hidden for hidden, group in groups.items() if group is None]
+    samples = verification_samples(split, config.base) if todo else ()
+    total = len(config.members())
+    done = total - sum(len(config.group(hidden)) for hidden in todo)
+    parts: dict[Hidden, list[Part]] = collections.defaultdict(list)
+    with tqdm.tqdm(total=total, initial=done, desc="sweep", unit="member") as bar:
+        piece = functools.partial(train_group, config=config)
+        for part in executor.stream(piece, todo):
+            for number, member in enumerate(part.members):
+                _export(folder, part, number, member, samples, made_by)
+            parts[part.hidden].append(part)
+            bar.update(len(part.members))
+            if sum(len(p.members) for p in parts[part.hidden]) == len(
+                config.group(part.hidden)
+            ):
+                groups[part.hidden] = _finish(folder, parts[part.hidden])
+    return {shape_name(hidden): group or {} for hidden, group in groups.items()}
+
+
+def _weights(folder: Path, member: TrainConfig) -> Path:
+    return folder / "weights" / f"{member_name(member)}.msgpack"
+
+
+def _export(
+    folder: Path,
+    part: Part,
+    number: int,
+    member: TrainConfig,
+    samples: tuple,
+    made_by: Mapping[str, object],
+) -> None:
+    """One member's weights file."""
+    metrics = {"loss": part.loss[number], "pair_accuracy": part.wins[number]}
+    provenance = {
+        "git_commit": None,
+        "flags": {},
+        "versions": {},
+        **made_by,
+        "seed": member.seed,
+        "metrics": {name: float(x) for name, x in metrics.items()},
+        "mode": member.sampler.mode,
+        "config": json.loads(json.dumps(dataclasses.asdict(member))),
+    }
+    params = jax.tree.map(lambda x: jnp.asarray(x[number]), part.params)
+    normaliser = jax.tree.map(jnp.asarray, part.normaliser)
+    output = _weights(folder, member)
+    write_weights(output, params, normaliser, member, samples, provenance)
+
+
+def _finish(folder: Path, parts: Sequence[Part]) -> dict:
+    """Write and return the file of a finished group."""
+    members = {
+        member_name(member): {
+            "sha256": open_reward(str(_weights(folder, member))).sha256,
+            "loss": float(part.loss[number]),
+            "pairs_won": float(part.wins[number]),
+            "finite": bool(part.finite[number]),
+        }
+        for part in parts
+        for number, member in enumerate(part.members)
+    }
+    compiled = [seconds for part in parts for seconds in part.compile_s]
+    facts = {
+        "members": len(members),
+        "seconds": round(sum(part.seconds for part in parts), 3),
+        "compiles": len(compiled),
+        "compile_seconds": round(sum(compiled), 3),
+    }
+    group = {"facts": facts, "members": members}
+    _write_json(folder / "groups" / f"{shape_name(parts[0].hidden)}.json", group)
+    return group
+
+
+def _finished(config: SweepConfig, folder: Path, hidden: Hidden) -> dict | None:
+    """A group's file, if it and all its members' files are whole."""
+    path = folder / "groups" / f"{shape_name(hidden)}.json"
+    try:
+        group = json.loads(path.read_text())
+        for member in config.group(hidden):
+            reward = open_reward(str(_weights(folder, member)))
+            if reward.sha256 != group["members"][member_name(member)]["sha256"]:
+                return None
+    except (OSError, ValueError, KeyError, InputError):
+        return None
+    return group
+
+
+def _judged(
+    config: SweepConfig,
+    folder: Path,
+    split: Demonstrations,
+    rows: Rows,
+    groups: Mapping[str, dict],
+    executor: Executor,
+) -> dict:
+    """Members and configurations on the validation split; the chosen on the test."""
+
+    def scores(name: str, rows: Rows) -> tuple[Scores, ClusterBootstrap]:
+        runs = {
+            row: [compiled_scorer(open_reward(str(_weights(folder, m)))) for m in of]
+            for row, of in rows.items()
+        }
+        return held_out_scores(split, name, runs, config.setup, executor)
+
+    members = {n: m for group in groups.values() for n, m in group["members"].items()}
+    found, vehicles = scores("validation", rows)
+    configurations = {}
+    for row, of in rows.items():
+        names = [member_name(one) for one in of]
+        values = estimates(found[row], vehicles)
+        configurations[row] = {
+            **_values_of(of[0]),
+            "members": names,
+            "finite": all(members[name]["finite"] for name in names),
+            "validation": {n: dataclasses.asdict(e) for n, e in values.items()},
+        }
+        for name, one, means in zip(
+            names, of, seed_means(found[row], vehicles), strict=True
+        ):
+            members[name] |= {**_values_of(one), "seed": one.seed, "validation": means}
+    metric = config.choose_by
+    fine = {row: c for row, c in configurations.items() if c["finite"]}
+    row = best({r: c["validation"][metric]["value"] for r, c in fine.items()}, metric)
+    names = configurations[row]["members"]
+    member = best({n: members[n]["validation"][metric] for n in names}, metric)
+    tested, vehicles = scores("test", {row: rows[row]})
+    return {
+        "choose_by": {"metric": metric, **dataclasses.asdict(METRICS[metric])},
+        "members": members,
+        "configurations": configurations,
+        "chosen": {
+            "configuration": row,
+            "member": member,
+            "validation": configurations[row]["validation"],
+            "test": {
+                name: dataclasses.asdict(estimate)
+                for name, estimate in estimates(tested[row], vehicles).items()
+            },
+            "member_test": seed_means(tested[row], vehicles)[names.index(member)],
+        },
+    }
+
+
+def _values_of(config: TrainConfig) -> dict:
+    return {
+        "hidden": shape_name(config.reward.hidden),
+        "leaky_rate": config.leaky_rate,
+        "learning_rate": config.learning_rate,
+    }
+
+
+def _peak_memory_gib() -> float:
+    """Of this process; that of workers is theirs."""
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2)
+
+
+def _write_json(path: Path, body: Mapping[str, object]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(".tmp")
+    temporary.write_text(json.dumps(body, indent=2, allow_nan=False) + "\n")
+    os.replace(temporary, path)
+
+
+def table(report: Mapping) -> str:
+    """The configurations as text, best first, then the choice with its test score.
+
+    Args:
+      report: of `run_sweep`.
+    """
+    how, chosen = report["choose_by"], report["chosen"]
+    metric = how["metric"]
+    sign = -1.0 if how["higher_is_better"] else 1.0
+    unit = "" if how["unit"] == "1" else f" {how['unit']}"
+    scale = 100.0 if how["unit"] == "%" else 1.0
+
+    def text(estimate: Mapping) -> str:
+        value, low, high = (scale * estimate[k] for k in ("value", "low", "high"))
+        apart = estimate["seed_sd"]
+        seeds = "" if apart is None else f"  seeds ±{scale * apart:.3f}"
+        return f"{value:8.3f}{unit}  [{low:.3f}, {high:.3f}]{seeds}"
+
+    rows = sorted(
+        report["configurations"].items(),
+        key=lambda item: sign * item[1]["validation"][metric]["value"],
+    )
+    lines = [
+        f"{how['title']} on {report['scenes']['validation']} validation scenes, held "
+        f"out by {report['validation_by']}; 95 % interval, spread of seeds",
+        f"{'hidden':>10s} {'leaky rate':>10s} {'step size':>10s}",
+    ]
+    for name, row in rows:
+        mark = "  <- chosen" if name == chosen["configuration"] else ""
+        failed = "" if row["finite"] else "  NaN or infinity"
+        values = f"{row['hidden']:>10s} {row['leaky_rate']:>10g} "
+        values += f"{row['learning_rate']:>10g} "
+        lines.append(values + text(row["validation"][metric]) + failed + mark)
+    lines.append(
+        f"chosen: {chosen['configuration']}, its test score "
+        f"({report['scenes']['test']} scenes, not chosen by): "
+        f"{text(chosen['test'][metric]).strip()}"
+    )
+    for name, facts in report["groups"].items():
+        lines.append(
+            f"group {name}: {facts['members']} members in {facts['seconds']:.1f} s, "
+            f"{facts['compiles']} compile of {facts['compile_seconds']:.1f} s"
+        )
+    return "\n".join(lines)

@@ -1,0 +1,52 @@
+"""Several processes, perhaps on several machines, as one training."""
+
+import re
+
+import jax
+
+from rcirl_jax.errors import InputError
+
+
+def join_processes(
+    coordinator_address: str | None,
+    num_processes: int | None,
+    process_id: int | None,
+) -> None:
+    """Connect to the other processes; nothing when all three are None.
+
+    Comes before anything that asks JAX for its devices. Afterwards `jax.devices()`
+    are those of all processes, in the order of their numbers. On CPUs the
+    processes exchange by gloo.
+
+    Args:
+      coordinator_address: host:port that process 0 listens on.
+      num_processes: how many processes there are.
+      process_id: number of this one.
+
+    Raises:
+      InputError: one given without the others, or out of range.
+    """
+    given = (coordinator_address, num_processes, process_id)
+    if given == (None, None, None):
+        return
+    if coordinator_address is None or num_processes is None or process_id is None:
+        raise InputError(
+            f"--coordinator_address, --num_processes, --process_id: {given}: "
+            "expected all three or none"
+        )
+    if not re.fullmatch(r".+:\d+", coordinator_address):
+        raise InputError(
+            f"--coordinator_address: {coordinator_address}: expected host:port"
+        )
+    if num_processes < 1:
+        raise InputError(f"--num_processes: {num_processes}: expected >= 1")
+    if not 0 <= process_id < num_processes:
+        raise InputError(
+            f"--process_id: {process_id}: expected 0 to {num_processes - 1}"
+        )
+    jax.distributed.initialize(coordinator_address, num_processes, process_id)
+
+
+def is_first() -> bool:
+    """Whether this process writes what a run writes once."""
+    return jax.process_index() == 0

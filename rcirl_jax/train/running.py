@@ -1,0 +1,68 @@
+"""How a run goes about its work, and the file that says what it is."""
+
+import dataclasses
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from rcirl_jax.data.joined import Demonstrations
+from rcirl_jax.errors import InputError
+from rcirl_jax.train.processes import is_first
+from rcirl_jax.train.state import TrainConfig
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Running:
+    """How a run goes about its work; nothing here changes its result."""
+
+    # "jit", or over the devices of all processes "pmap", "shard_map", "jit_sharded"
+    parallel: str = "jit"
+    # MiB of scenes up to which the training split is loaded whole
+    in_memory_mb: float = 1024.0
+    # batches read ahead of the step
+    prefetch: int = 4
+    # steps between checkpoints, besides those at the end of each epoch (0: none)
+    checkpoint_every: int = 0
+    # called with the number of each finished step
+    on_step: Callable[[int], None] = lambda step: None
+
+    def __post_init__(self) -> None:
+        """Reject values out of range with the flag's name."""
+        least = {"in_memory_mb": 0, "prefetch": 1, "checkpoint_every": 0}
+        for name, low in least.items():
+            value = getattr(self, name)
+            if not value >= low:
+                raise InputError(f"--{name}: {value}: expected >= {low}")
+
+
+def describe_run(
+    workdir: Path, config: TrainConfig, dataset: Demonstrations, provenance: dict
+) -> None:
+    """Write run.json (process 0), or check that an existing one says the same.
+
+    Raises:
+      InputError: the folder holds a run with other settings (names the first).
+    """
+    path = workdir / "run.json"
+    described = {
+        "config": json.loads(json.dumps(dataclasses.asdict(config))),
+        "dataset_hash": dataset.hash,
+    }
+    if path.exists():
+        found = json.loads(path.read_text())
+        if found.get("dataset_hash") != dataset.hash:
+            raise InputError(f"{path}: dataset_hash: made from another dataset")
+        for name, setting in described["config"].items():
+            before = found["config"].get(name)
+            if before != setting and name != "epochs":
+                raise InputError(
+                    f"{path}: {name}: {before}: expected {setting} to resume; "
+                    "use another --workdir for other settings"
+                )
+    if not is_first():
+        return
+    workdir.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(".tmp")
+    temporary.write_text(json.dumps({**described, **provenance}, indent=2) + "\n")
+    os.replace(temporary, path)

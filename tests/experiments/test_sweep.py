@@ -1,0 +1,62 @@
+"""The sweep by its command."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from rcirl_jax.data.config import CollectConfig
+from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.importing import ImportConfig, import_logs
+from rcirl_jax.export.loading import open_reward
+
+
+def command(*flags):
+    return subprocess.run(
+        [sys.executable, "-m", "experiments.sweep", *flags],
+        capture_output=True, text=True, check=False, timeout=600,
+        env={**os.environ, "JAX_PLATFORMS": "cpu"},
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.multiprocess
+def test_a_small_sweep(tmp_path):
+    config = ImportConfig(format="synthetic", collect=CollectConfig(stride_s=60.0))
+    import_logs(read_recordings("synthetic", None), tmp_path / "d", config)
+    flags = (
+        "--quick", f"--data={tmp_path}/d", f"--output={tmp_path}/out",
+        "--leaky_rates=0.05,0.3", "--hidden_sizes=0,6x3",
+    )  # fmt: skip
+    done = command(*flags, "--workers=2")
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert "member" in done.stderr
+    assert done.stdout.count("<- chosen") == 1
+    report = json.loads((tmp_path / "out" / "sweep.json").read_text())
+    assert len(report["members"]) == 8
+    assert report["made_by"]["flags"]["quick"] is True
+    assert (tmp_path / "out" / "sweep.png").read_bytes()[:4] == b"\x89PNG"
+    best = open_reward(str(tmp_path / "out" / "best.msgpack"))
+    assert best.sha256 == report["members"][report["chosen"]["member"]]["sha256"]
+    other = command(*flags, "--epochs=2", "--batch_size=32")
+    assert other.returncode == 2
+    assert len(other.stderr.strip().splitlines()) == 1
+    assert "batch_size: 64: expected 32 to resume" in other.stderr
+
+
+@pytest.mark.multiprocess
+@pytest.mark.parametrize(
+    ("flag", "message"),
+    [
+        ("--leaky_rates=0.05,much", "leaky_rates"),
+        ("--hidden_sizes=15,32xb", "hidden_size"),
+    ],
+)
+def test_wrong_flags_are_one_line(flag, message, tmp_path):
+    done = command("--data=d", f"--output={tmp_path}/out", flag)
+    assert done.returncode == 2
+    (line,) = done.stderr.strip().splitlines()
+    assert line.startswith(f"error: --{message}: [")
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,195 @@
+"""Training by several processes on loopback, also killed and started again."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+from rcirl_jax.data.store import DatasetWriter
+from rcirl_jax.errors import InputError
+from rcirl_jax.train.loop import restore_run
+from rcirl_jax.train.processes import join_processes
+from tests.conftest import REPO
+from tests.data.test_store import finish_fields, lineage
+from tests.scenes import batch, demonstration
+from tests.train.worker import CONFIG
+
+pytestmark = pytest.mark.multiprocess
+# compiled four times as fast; what is compared is compiled alike
+QUICK = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+STEPS = 6  # 21 rows, batches of 8, two epochs: the last batch of an epoch has 5
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("processes") / "d"
+    writer = DatasetWriter(folder)
+    for index in range(4):
+        rows = [demonstration(seed) for seed in range(7 * index, 7 * index + 7)]
+        stacked = jax.tree.map(np.asarray, batch(rows))
+        writer.write_shard(index, stacked, lineage(index))
+    writer.finish(finish_fields())
+    return folder
+
+
+def free_port():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        return taken.getsockname()[1]
+
+
+def start(data, workdir, parallel, processes, devices, kill_after=-1, in_memory_mb=0.0):
+    """The processes of one training; devices are those of each."""
+    workdir.mkdir(parents=True, exist_ok=True)
+    several = processes > 1
+    job = {
+        "data": str(data),
+        "workdir": str(workdir),
+        "parallel": parallel,
+        "address": f"127.0.0.1:{free_port()}" if several else None,
+        "num_processes": processes if several else None,
+        "kill_after": kill_after,
+        "in_memory_mb": in_memory_mb,
+    }
+    env = {
+        **os.environ,
+        "JAX_PLATFORMS": "cpu",
+        "JAX_NUM_CPU_DEVICES": str(devices),
+        "XLA_FLAGS": QUICK,
+    }
+    workers = []
+    for number in range(processes):
+        own = json.dumps({**job, "process_id": number if several else None})
+        with (workdir / f"stderr_{number}").open("w") as stderr:
+            worker = subprocess.Popen(
+                [sys.executable, "-m", "tests.train.worker", own],
+                cwd=REPO,
+                env=env,
+                stdout=subprocess.DEVNULL,
+                stderr=stderr,
+            )
+        workers.append(worker)
+    return workers
+
+
+def finished(workers, workdir):
+    """Wait; what each process saw."""
+    for number, worker in enumerate(workers):
+        code = worker.wait(600)
+        assert code == 0, (workdir / f"stderr_{number}").read_text()[-3000:]
+    names = sorted(workdir.glob("process_*.json"))
+    assert len(names) == len(workers)
+    return [json.loads(name.read_text()) for name in names]
+
+
+def leaves(workdir):
+    state = restore_run(workdir, CONFIG)
+    plain = state.replace(key=jax.random.key_data(state.key))
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(plain)]
+
+
+@pytest.fixture(scope="module")
+def undisturbed(data, tmp_path_factory):
+    """(folder, what it saw) of one device, four in a process, two in each of two."""
+    root = tmp_path_factory.mktemp("runs")
+    shapes = {
+        "1x1": ("jit", 1, 1),
+        "1x4": ("jit_sharded", 1, 4),
+        "2x2": ("jit_sharded", 2, 2),
+    }
+    runs = {name: start(data, root / name, *how) for name, how in shapes.items()}
+    return {
+        name: (root / name, finished(workers, root / name))
+        for name, workers in runs.items()
+    }
+
+
+def assert_equal_runs(one, other):
+    """Sums over devices are added in another order: equal to rounding, no further."""
+    for a, b in zip(leaves(one), leaves(other), strict=True):
+        np.testing.assert_allclose(a, b, rtol=2e-4, atol=2e-5)
+
+
+@pytest.mark.parametrize("name", ["1x4", "2x2"])
+def test_many_devices_equal_one(undisturbed, name):
+    one, (single,) = undisturbed["1x1"]
+    folder, seen = undisturbed[name]
+    assert_equal_runs(one, folder)
+    for process in seen:
+        assert process["devices"] == 4
+        assert process["steps"] == STEPS
+        assert process["pairs"] == single["pairs"]
+        np.testing.assert_allclose(process["loss"], single["loss"], rtol=1e-3)
+
+
+def test_nothing_compiles_after_the_first_step(undisturbed):
+    """Batches, the padded one and checkpoints included, in every process."""
+    for name, (_, seen) in undisturbed.items():
+        assert [process["compiled_later"] for process in seen] == [0] * len(seen), name
+
+
+def test_one_process_writes_what_is_written_once(undisturbed):
+    folder, _ = undisturbed["2x2"]
+    lines = (folder / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(line)["step"] for line in lines] == list(range(1, STEPS + 1))
+    assert len(list((folder / "tensorboard").iterdir())) == 1
+    assert (folder / "run.json").is_file()
+    assert "%" not in (folder / "stderr_1").read_text()  # no second progress bar
+
+
+def assert_same_bits(one, other):
+    for a, b in zip(leaves(one), leaves(other), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_streamed_and_loaded_rows_give_the_same_weights(data, undisturbed, tmp_path):
+    finished(start(data, tmp_path, "jit", 1, 1, in_memory_mb=100.0), tmp_path)
+    assert_same_bits(tmp_path, undisturbed["1x1"][0])
+
+
+@pytest.mark.slow
+def test_killed_processes_resume_to_the_bit(data, undisturbed, tmp_path):
+    """Both die inside the second epoch; then again, with the rows in memory."""
+    workers = start(data, tmp_path, "jit_sharded", 2, 2, kill_after=4)
+    codes = [workers[0].wait(600)]
+    # the other one may have lost its peer just before its own signal
+    workers[1].kill()
+    codes.append(workers[1].wait(60))
+    assert codes[0] == -signal.SIGKILL
+    assert codes[1] != 0
+    assert not list(tmp_path.glob("process_*.json"))
+    again = start(data, tmp_path, "jit_sharded", 2, 2, in_memory_mb=100.0)
+    seen = finished(again, tmp_path)
+    assert [process["steps"] for process in seen] == [STEPS - 4, STEPS - 4]
+    assert_same_bits(tmp_path, undisturbed["2x2"][0])
+    lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(line)["step"] for line in lines] == list(range(1, STEPS + 1))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("parallel", ["pmap", "shard_map"])
+def test_other_ways_of_sharing(data, undisturbed, tmp_path, parallel):
+    seen = finished(start(data, tmp_path, parallel, 2, 2), tmp_path)
+    assert [process["compiled_later"] for process in seen] == [0, 0]
+    assert_equal_runs(tmp_path, undisturbed["1x1"][0])
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (("host:1", 2, None), "expected all three or none"),
+        ((None, 2, 1), "expected all three or none"),
+        (("host", 2, 1), "--coordinator_address: host: expected host:port"),
+        (("host:1", 0, 0), "--num_processes: 0: expected >= 1"),
+        (("host:1", 2, 2), "--process_id: 2: expected 0 to 1"),
+    ],
+)
+def test_bad_flags_are_one_line(given, message):
+    with pytest.raises(InputError, match=message):
+        join_processes(*given)

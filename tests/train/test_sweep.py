@@ -1,0 +1,373 @@
+"""Sweeps: members are single runs, one compile a group, resume, the choice."""
+
+import dataclasses
+import functools
+import json
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rcirl_jax.data.resplit import Resplit, with_validation
+from rcirl_jax.data.store import DatasetWriter, open_dataset
+from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation import sweep
+from rcirl_jax.evaluation.sweep import (
+    SweepConfig,
+    best,
+    member_name,
+    open_split,
+    train_group,
+)
+from rcirl_jax.executor import Here, Processes
+from rcirl_jax.export import sweep as folders
+from rcirl_jax.export.loading import compiled_scorer, open_reward
+from rcirl_jax.export.sweep import run_sweep, table
+from rcirl_jax.report.sweep_picture import sweep_picture
+from rcirl_jax.reward import RewardConfig
+from rcirl_jax.train import frozen
+from rcirl_jax.train.frozen import fit, freeze, members_of, piece_size
+from rcirl_jax.train.state import Facts, FeatureBatch, TrainConfig
+from rcirl_jax.units import HORIZON_S
+from tests.conftest import REPO
+from tests.data.test_store import finish_fields, lineage
+from tests.scenes import batch, demonstration
+from tests.train.test_step import SMALL, normaliser
+
+BASE = TrainConfig(
+    batch_size=8, epochs=2, sampler=SMALL, positive="nearest", train_horizon=5.0
+)
+SCENES = 40
+MADE_BY = {"git_commit": "abc"}
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """Random scenes, one vehicle each, in four groups of which one is the test."""
+    folder = tmp_path_factory.mktemp("sweep") / "d"
+    rows = jax.tree.map(np.asarray, batch([demonstration(i) for i in range(SCENES)]))
+    rows = rows.replace(future_s=np.full(SCENES, HORIZON_S, np.float32))
+    writer = DatasetWriter(folder)
+    writer.write_shard(0, rows, lineage(0))
+    writer.finish(finish_fields())
+    return folder
+
+
+def config_of(data, **changes):
+    settings = {
+        "data": (str(data),),
+        "base": BASE,
+        "hidden_sizes": ((6,), ()),
+        "leaky_rates": (0.05, 0.3),
+        "learning_rates": (0.003, 0.03),
+        "seeds": 2,
+        "validation": 0.3,
+    }
+    return SweepConfig(**{**settings, **changes})
+
+
+@pytest.fixture(scope="module")
+def finished(data, tmp_path_factory):
+    """(folder, report) of a sweep in this process."""
+    folder = tmp_path_factory.mktemp("finished")
+    frozen._fit.clear_cache()
+    return folder, run_sweep(config_of(data), folder, Here(), MADE_BY)
+
+
+def untimed(report):
+    """A report without what a clock or the process' caches say."""
+    kept = json.loads(json.dumps(report))
+    del kept["groups"]
+    for member in kept["members"].values():
+        del member["sha256"]  # of a file that says when it was made
+    del kept["peak_memory_gib"], kept["made_by"]
+    return kept
+
+
+def test_members_equal_single_runs(data, monkeypatch):
+    monkeypatch.setattr(sweep, "MEMBERS_AT_ONCE", 5)
+    config = config_of(data)
+    parts = list(train_group((6,), config))
+    assert [len(part.members) for part in parts] == [4, 4]
+    split = open_split(config)[1]
+    made = freeze(split.load("train"), split.indices("train"), BASE)
+    for part in parts:
+        for number, member in list(enumerate(part.members))[::3]:
+            alone = fit(made, part.normaliser, member_base(member), one(member))
+            for a, b in zip(
+                jax.tree.leaves(part.params), jax.tree.leaves(alone.params), strict=True
+            ):
+                np.testing.assert_allclose(a[number], b[0], rtol=1e-3, atol=2e-5)
+            assert part.loss[number] == pytest.approx(float(alone.loss[0, -1]), 1e-3)
+    assert len({float(x) for part in parts for x in part.loss}) == 8
+
+
+def member_base(member):
+    """Batches and candidates are the sweep's, whatever the member's seed."""
+    return dataclasses.replace(member, seed=BASE.seed)
+
+
+def one(member):
+    return members_of(member, [member.seed])
+
+
+def test_a_group_is_one_compile_however_many_chunks(data, monkeypatch):
+    monkeypatch.setattr(sweep, "MEMBERS_AT_ONCE", 3)
+    frozen._fit.clear_cache()
+    config = config_of(data, leaky_rates=(0.05, 0.1, 0.3), seeds=1)
+    parts = list(train_group((7,), config)) + list(train_group((3, 2), config))
+    assert [len(part.members) for part in parts] == [3, 3, 3, 3]
+    assert [len(part.compile_s) for part in parts] == [1, 0, 1, 0]
+
+
+def test_many_members_fit():
+    """Pieces bound what members hold while a step runs; their number hardly counts."""
+    members, batch_size = 64, 64
+    reward = RewardConfig(hidden=(64,))
+    config = dataclasses.replace(BASE, batch_size=batch_size, reward=reward)
+    who = members_of(config, range(members))
+    order = jax.random.key(0)
+    lowered = frozen._fit.lower(many(64), normaliser(), order, who, config, 18)
+    held = lowered.compile().memory_analysis().temp_size_in_bytes
+    one_layer = 4 * members * batch_size * 128 * 18 * 64
+    assert one_layer > 2e9
+    assert held < 200e6
+
+
+@functools.cache
+def many(scenes=16, candidates=128):
+    """Made-up features with as many candidates as the default sampler draws."""
+    rng = np.random.default_rng(0)
+    middle, width = normaliser().location, normaliser().scale
+    shape, pairs = (scenes, candidates, 18, middle.size), (scenes, candidates)
+    around = lambda *x: middle + 0.1 * width * rng.normal(size=x)  # noqa: E731
+    distance = jnp.asarray(rng.uniform(0.0, 9.0, pairs), jnp.float32)
+    return FeatureBatch(
+        human=jnp.asarray(around(scenes, *shape[2:]), jnp.float32),
+        candidates=jnp.asarray(around(*shape), jnp.float32),
+        feasible=jnp.asarray(rng.random(pairs) < 0.8),
+        time_valid=jnp.ones((scenes, 18), bool),
+        facts=Facts(
+            human_distance=jnp.zeros(scenes),
+            distance=distance,
+            collides=distance > 8.0,
+            breaks_rule=jnp.zeros(pairs),
+            human_density=jnp.zeros(scenes),
+            density=jnp.zeros(pairs),
+        ),
+        weight=jnp.ones(scenes),
+        index=jnp.arange(scenes, dtype=jnp.int32),
+    )
+
+
+def test_pieces_divide_the_batch_and_stay_in_bounds():
+    for size, members in ((64, 1), (64, 16), (64, 64), (7, 1), (60, 2)):
+        piece = piece_size(size, members, 122, 11, 15)
+        assert size % piece == 0
+        assert piece == 1 or piece * members * 123 <= 32768
+    assert piece_size(64, 1, 30, 11, 15) == 64
+    assert piece_size(64, 1000, 122, 18, 64) == 1
+
+
+def test_times_that_no_scene_compares_change_nothing():
+    made = many()
+    early = jnp.arange(18) < 7
+    masked = made.replace(time_valid=made.time_valid & early)
+    loud = masked.replace(
+        candidates=jnp.where(early[:, None], made.candidates, 1e3),
+        human=jnp.where(early[:, None], made.human, -1e3),
+    )
+    config = dataclasses.replace(BASE, epochs=1)
+    a = fit(masked, normaliser(), config, members_of(config, [0]))
+    b = fit(loud, normaliser(), config, members_of(config, [0]))
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_array_equal(x, y)
+    assert np.isfinite(np.asarray(a.loss)).all()
+
+
+def test_everything_is_written_and_loads(finished, tmp_path):
+    folder, report = finished
+    assert json.loads((folder / "sweep.json").read_text()) == report
+    assert len(report["members"]) == 16
+    for name, member in report["members"].items():
+        reward = open_reward(str(folder / "weights" / f"{name}.msgpack"))
+        assert reward.sha256 == member["sha256"]
+        assert reward.provenance["seed"] == member["seed"]
+        assert reward.provenance["git_commit"] == "abc"
+        assert reward.loss["leaky_rate"] == member["leaky_rate"]
+    chosen = report["chosen"]
+    assert (folder / "best.msgpack").read_bytes() == (
+        folder / "weights" / f"{chosen['member']}.msgpack"
+    ).read_bytes()
+    assert {n: g["compiles"] for n, g in report["groups"].items()} == {
+        "6": 1,
+        "linear": 1,
+    }
+    means = {
+        n: np.mean(
+            [report["members"][m]["validation"]["top1_fde"] for m in c["members"]]
+        )
+        for n, c in report["configurations"].items()
+    }
+    assert min(means, key=means.get) == chosen["configuration"]
+    text = table(report)
+    assert text.count("<- chosen") == 1
+    assert f"{chosen['test']['top1_fde']['value']:.3f}" in text
+    picture = sweep_picture(tmp_path / "sweep.png", report)
+    assert picture.read_bytes()[:4] == b"\x89PNG"
+
+
+def test_the_compiled_scorer_is_the_readers(finished):
+    reward = open_reward(str(finished[0] / "best.msgpack"))
+    x = np.asarray(many().candidates[:4])
+    valid = np.ones(x.shape[:-1], bool)
+    np.testing.assert_allclose(
+        compiled_scorer(reward)(x, valid), reward.value(x, valid), rtol=1e-5, atol=1e-5
+    )
+
+
+def test_a_finished_group_is_not_trained_again(data, finished, tmp_path, monkeypatch):
+    folder, report = finished
+    trained = []
+    real = folders.train_group
+
+    def seen(hidden, config):
+        trained.append(hidden)
+        return real(hidden, config)
+
+    monkeypatch.setattr(folders, "train_group", seen)
+    again = run_sweep(config_of(data), folder, Here(), MADE_BY)
+    assert trained == []
+    assert untimed(again) == untimed(report)
+    lost = next(m for m in report["members"] if m.startswith("h6_"))
+    (folder / "weights" / f"{lost}.msgpack").write_bytes(b"cut short")
+    again = run_sweep(config_of(data), folder, Here(), MADE_BY)
+    assert trained == [(6,)]
+    assert untimed(again) == untimed(report)
+
+
+def test_other_settings_or_data_in_the_folder_are_one_line(data, finished):
+    folder = finished[0]
+    with pytest.raises(InputError, match=r"settings\.json: leaky_rates: \[0\.05, 0\.3"):
+        run_sweep(config_of(data, leaky_rates=(0.05,)), folder, Here(), {})
+    longer = dataclasses.replace(BASE, epochs=9)
+    with pytest.raises(InputError, match=r"settings\.json: epochs: 2: expected 9 to"):
+        run_sweep(config_of(data, base=longer), folder, Here(), {})
+
+
+RAY = """
+import sys
+from pathlib import Path
+import ray
+from rcirl_jax.executor import Ray
+from rcirl_jax.export.sweep import run_sweep
+from tests.train.test_sweep import MADE_BY, config_of
+ray.init(num_cpus=2, log_to_driver=False, logging_level="ERROR")
+run_sweep(config_of(sys.argv[1]), Path(sys.argv[2]), Ray("auto"), MADE_BY)
+ray.shutdown()
+"""
+
+
+def on_ray(data, folder):
+    pytest.importorskip("ray")
+    done = subprocess.run(
+        [sys.executable, "-c", RAY, str(data), str(folder)],
+        capture_output=True, text=True, timeout=500, check=False, cwd=REPO,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+def in_processes(data, folder):
+    run_sweep(config_of(data), folder, Processes(2), MADE_BY)
+
+
+@pytest.mark.slow
+@pytest.mark.multiprocess
+@pytest.mark.parametrize(
+    "elsewhere", [in_processes, pytest.param(on_ray, marks=pytest.mark.ray)]
+)
+def test_the_result_does_not_depend_on_the_executor(
+    data, finished, tmp_path, elsewhere
+):
+    elsewhere(data, tmp_path)
+    there = json.loads((tmp_path / "sweep.json").read_text())
+    assert untimed(there) == untimed(finished[1])
+    for name in there["members"]:
+        files = [f / "weights" / f"{name}.msgpack" for f in (finished[0], tmp_path)]
+        a, b = (open_reward(str(file)) for file in files)
+        for x, y in zip((*a.kernels, a.gamma), (*b.kernels, b.gamma), strict=True):
+            np.testing.assert_array_equal(x, y)
+
+
+def test_the_choice_never_sees_the_test_split(data, finished, tmp_path, monkeypatch):
+    """Other test scenes: the same choice and validation, another test score."""
+    real = folders.open_split
+
+    def fewer_tests(config):
+        dataset, split, by = real(config)
+        splits = {name: split.indices(name) for name in ("train", "validation")}
+        tests = split.indices("test")[::3]
+        return dataset, Resplit(dataset, {**splits, "test": tests}), by
+
+    monkeypatch.setattr(folders, "open_split", fewer_tests)
+    other = untimed(run_sweep(config_of(data), tmp_path, Here(), MADE_BY))
+    first = untimed(finished[1])
+    assert other["chosen"]["test"] != first["chosen"]["test"]
+    for report in (other, first):
+        del report["chosen"]["test"], report["chosen"]["member_test"], report["scenes"]
+    assert other == first
+
+
+def test_a_refused_step_is_never_chosen():
+    assert best({"a": 2.0, "b": 1.0, "c": 1.0}, "top1_fde") == "b"
+    assert best({"a": 0.2, "b": 0.1}, "percentile_rank") == "a"
+    with pytest.raises(InputError, match="NaN or infinity in every configuration"):
+        best({}, "top1_fde")
+
+
+def test_validation_shares_no_vehicle_with_the_fit(data):
+    dataset = open_dataset(data)
+    split, by = with_validation(dataset, 0.3, 0)
+    assert by == "group"
+    parts = [split.load(name) for name in ("train", "validation", "test")]
+    groups = [set(np.asarray(part.group).tolist()) for part in parts]
+    assert not groups[0] & groups[1]
+    assert not (groups[0] | groups[1]) & groups[2]
+    everything = np.concatenate([split.indices(n) for n in ("train", "validation")])
+    np.testing.assert_array_equal(np.sort(everything), dataset.indices("train"))
+    np.testing.assert_array_equal(split.indices("test"), dataset.indices("test"))
+    again, by = with_validation(dataset, 0.1, 0)
+    assert by == "vehicle"
+    cars = [set(np.asarray(again.load(n).vehicle)) for n in ("train", "validation")]
+    assert not cars[0] & cars[1]
+    assert 2 <= len(cars[1]) <= 0.2 * SCENES
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"leaky_rates": (0.05, 0.05)}, "twice: expected distinct values"),
+        ({"leaky_rates": (1.5,)}, "--leaky_rate: 1.5: expected between 0 and 1"),
+        ({"hidden_sizes": ()}, "--hidden_sizes: none: expected at least one"),
+        ({"seeds": 0}, "--seeds: 0: expected >= 1"),
+        ({"validation": 0.9}, "--validation: 0.9: expected 0 to 0.5"),
+        ({"choose_by": "luck"}, "--choose_by: luck: expected one of"),
+        (
+            {"base": dataclasses.replace(BASE, loss="logistic")},
+            "--leaky_rates: .* only --loss=rank has a leaky rate",
+        ),
+    ],
+)
+def test_wrong_settings_are_one_line(changes, message):
+    with pytest.raises(InputError, match=message):
+        config_of("d", **changes)
+
+
+def test_names_tell_members_apart():
+    names = [member_name(one) for one in config_of("d").members()]
+    assert len(set(names)) == 16
+    assert names[0] == "h6_a0.05_r0.003_s0"
+    assert names[-1] == "hlinear_a0.3_r0.03_s1"

@@ -1,0 +1,78 @@
+"""One process of a training that a test starts: `python -m tests.train.worker JSON`."""
+
+import json
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+import jax
+
+from rcirl_jax.data import pipeline
+from rcirl_jax.data.store import open_dataset
+from rcirl_jax.sampling import SamplerConfig
+from rcirl_jax.train.loop import train
+from rcirl_jax.train.processes import join_processes
+from rcirl_jax.train.running import Running
+from rcirl_jax.train.state import TrainConfig
+
+# plain gradient steps: Adam would hide a wrong scale of the gradient
+CONFIG = TrainConfig(
+    batch_size=8,
+    epochs=2,
+    optimizer="sgd",
+    learning_rate=0.1,
+    sampler=SamplerConfig(num_random=4, cruise_times=(4.0,), edge_times=(4.0,)),
+)
+LOWERED = "/jax/core/compile/jaxpr_to_mlir_module_duration"
+
+
+class Compilations:
+    """Counts programs that JAX compiles, or would without its cache on disk."""
+
+    def __init__(self):
+        self.count = 0
+        jax.monitoring.register_event_duration_secs_listener(self._heard)
+
+    def _heard(self, event, seconds, **_):
+        self.count += event == LOWERED
+
+    def close(self):
+        jax.monitoring.unregister_event_duration_listener(self._heard)
+
+
+def main():
+    job = json.loads(sys.argv[1])
+    number, workdir = job["process_id"] or 0, Path(job["workdir"])
+    saved = workdir / "checkpoints" / str(job["kill_after"])
+    join_processes(job["address"], job["num_processes"], job["process_id"])
+    compilations, after_first = Compilations(), []
+
+    def on_step(step):
+        after_first.append(compilations.count)
+        if step == job["kill_after"] + 1:
+            while not saved.is_dir():  # it is being written while the steps go on
+                time.sleep(0.02)
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    pipeline.WINDOW_BLOCKS = 2  # half of the test's data: rows slide through it
+    running = Running(
+        parallel=job["parallel"],
+        in_memory_mb=job["in_memory_mb"],
+        checkpoint_every=2,
+        on_step=on_step,
+    )
+    result = train(open_dataset(job["data"]), workdir, CONFIG, running=running)
+    seen = {
+        "compiled_later": after_first[-1] - after_first[0],
+        "steps": len(after_first),
+        "loss": [epoch["loss"] for epoch in result.epochs],
+        "pairs": [epoch["pairs"] for epoch in result.epochs],
+        "devices": jax.device_count(),
+    }
+    (workdir / f"process_{number}.json").write_text(json.dumps(seen))
+
+
+if __name__ == "__main__":
+    main()
