@@ -62,11 +62,8 @@ def sums_over_time(run: Learned, frozen: FeatureBatch) -> tuple[np.ndarray, np.n
     human, candidates = [], []
     for start in range(0, frozen.weight.shape[0], CHUNK):
         part = jax.tree.map(lambda x, a=start: x[a : a + CHUNK], frozen)
-        spread = jnp.broadcast_to(
-            part.time_valid[:, None], (*part.feasible.shape, part.time_valid.shape[1])
-        )
         human.append(np.asarray(of(part.human, part.time_valid)))
-        candidates.append(np.asarray(of(part.candidates, spread)))
+        candidates.append(np.asarray(of(part.points, part.points_valid)))
     return np.concatenate(human), np.concatenate(candidates)
 
 
@@ -116,7 +113,7 @@ def choices_of(
     )
     drawn = _posterior_draws(weights[0], precision)
     place = feature_map(runs[0].config.features).names.index("station")
-    stations = np.asarray(test.candidates[..., place])
+    stations = np.asarray(test.points[..., place])
     last = np.asarray(test.time_valid).sum(axis=1) - 1
     station = np.take_along_axis(stations, last[:, None, None], axis=2)[..., 0]
     best = lambda v: np.where(feasible, v, -np.inf).argmax(axis=-1)  # noqa: E731
@@ -199,7 +196,7 @@ def reasons(
         )
         return jnp.sum(jax.vmap(one)(xa, xb, valid), axis=1)
 
-    candidates = np.asarray(frozen.candidates)
+    candidates = np.asarray(frozen.points)
     pairs = candidates[rows, a], candidates[rows, b], np.asarray(frozen.time_valid)
     parts = [
         np.asarray(of(*(x[i : i + CHUNK] for x in pairs)))

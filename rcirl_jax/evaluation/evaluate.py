@@ -156,15 +156,18 @@ def evaluate_ranking(
 def oracle_floor(dataset: Demonstrations, setup: RankingSetup, max_scenes: int) -> dict:
     """How close the best candidate comes to the human, over all splits.
 
+    Reads no more scenes at once than `max_scenes`, drawn at random.
+
     Returns:
       mode, horizon, scenes, mean and median FDE and ADE [m] of the best
       feasible candidate, share of scenes without a feasible one.
     """
-    rows = dataset.load(None)
-    keep = np.flatnonzero(covers(rows, setup.horizon_s))
-    keep = np.random.default_rng(0).permutation(keep)[:max_scenes]
-    taken = jax.tree.map(lambda x: x[keep], rows)
-    scored = _score(taken, keep, setup, {})
+    order, parts = np.random.default_rng(0).permutation(dataset.indices(None)), []
+    while order.size and sum(map(len, parts)) < max_scenes:
+        some, order = np.sort(order[:max_scenes]), order[max_scenes:]
+        parts.append(some[covers(dataset.read(some), setup.horizon_s)])
+    keep = np.concatenate(parts)[:max_scenes]
+    scored = _score(dataset.read(keep), keep, setup, {})
     fde = np.where(scored.feasible, scored.fde, np.inf).min(axis=1)
     ade = np.where(scored.feasible, scored.ade, np.inf).min(axis=1)
     some = np.isfinite(fde)

@@ -28,10 +28,12 @@ class HiddenReward:
 
     def values(self, frozen: FeatureBatch) -> jax.Array:
         """[S, K] of the candidates; -inf where infeasible."""
-        shape = frozen.candidates.shape[:3]
-        valid = jnp.broadcast_to(frozen.time_valid[:, None], shape)
         found = value(
-            self.params, self.normaliser, frozen.candidates, valid, self.config
+            self.params,
+            self.normaliser,
+            frozen.points,
+            frozen.points_valid,
+            self.config,
         )
         return jnp.where(frozen.feasible, found, -jnp.inf)
 
@@ -77,7 +79,7 @@ def experts(
         human_density=frozen.facts.density[rows, chosen],
     )
     return frozen.replace(
-        human=frozen.candidates[rows, chosen],
+        human=frozen.points[rows, chosen],
         feasible=frozen.feasible.at[rows, chosen].set(False),
         facts=facts,
     )
@@ -93,11 +95,8 @@ def agreement(
       hidden value between the scene's median and best candidate that is lost.
     """
     truth = np.asarray(hidden.values(frozen), np.float64)
-    shape = frozen.candidates.shape[:3]
-    valid = jnp.broadcast_to(frozen.time_valid[:, None], shape)
-    own = np.asarray(
-        learned.scorer(np.asarray(frozen.candidates), np.asarray(valid)), np.float64
-    )
+    points, valid = np.asarray(frozen.points), np.asarray(frozen.points_valid)
+    own = np.asarray(learned.scorer(points, valid), np.float64)
     own = np.where(np.isfinite(truth), own, -np.inf)
     chosen, best = own.argmax(axis=1), truth.argmax(axis=1)
     rows = np.arange(best.size)

@@ -241,11 +241,10 @@ def pair_wins(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Pairs that the positive wins (ties half), [R, S], and pairs [S]."""
     won, feasible = [], np.asarray(frozen.feasible)
-    shape = frozen.candidates.shape[:3]
-    spread = np.broadcast_to(np.asarray(frozen.time_valid)[:, None], shape)
+    points, spread = np.asarray(frozen.points), np.asarray(frozen.points_valid)
     for run in runs:
         human = run.scorer(np.asarray(frozen.human), np.asarray(frozen.time_valid))
-        y = run.scorer(np.asarray(frozen.candidates), spread) - human[:, None]
+        y = run.scorer(points, spread) - human[:, None]
         won.append(np.sum(((y < 0.0) + 0.5 * (y == 0.0)) * feasible, axis=1))
     return np.array(won), feasible.sum(axis=1)
 

@@ -155,7 +155,7 @@ def verification_samples(
     batch = to_device_batch(dataset.read(index), np.ones(count), index)
     key = jax.random.key(config.seed)
     made = featurise(key, batch, config, feature_map(config.features))
-    human, candidates = np.asarray(made.human), np.asarray(made.candidates)
+    human, candidates = np.asarray(made.human), np.asarray(made.points)
     picked = candidates[np.arange(count), np.arange(count) % candidates.shape[1]]
     valid = np.asarray(made.time_valid)
     return np.concatenate([human, picked]), np.concatenate([valid, valid])

@@ -22,7 +22,7 @@ from rcirl_jax.features.relations import (
     relate,
     slots,
 )
-from rcirl_jax.types import Candidates, Scene, Trajectory
+from rcirl_jax.types import Scene, Trajectory
 from rcirl_jax.units import TIMES_S
 
 MIN_COLLISION_M = -10.0  # m, deepest penetration told apart
@@ -50,14 +50,14 @@ def make_frame(scene: Scene, trajectory: Trajectory) -> Frame:
     return jax.tree.map(lambda x: x[:, 0], frame)
 
 
-def candidate_frames(scene: Scene, candidates: Candidates) -> Frame:
-    """The frames of all candidates of a scene; every leaf is [T, K].
+def candidate_frames(scene: Scene, trajectories: Trajectory) -> Frame:
+    """The frames of K trajectories [K, T] of a scene; every leaf is [T, K].
 
     Candidates run along the last axis, so that XLA's loops are long and all
     lanes of the processor's vectors are filled.
     """
-    view = jax.vmap(path_view, in_axes=(None, 0))(scene, candidates.trajectory.s)
-    points = jax.tree.map(jnp.transpose, (candidates.trajectory, view))
+    view = jax.vmap(path_view, in_axes=(None, 0))(scene, trajectories.s)
+    points = jax.tree.map(jnp.transpose, (trajectories, view))
     return _grid(scene, *points)
 
 

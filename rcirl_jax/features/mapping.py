@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.features.columns import COLUMNS, candidate_frames, make_frame
+from rcirl_jax.features.columns import COLUMNS, Frame, candidate_frames, make_frame
 from rcirl_jax.specs import load_toml, spec_root
 from rcirl_jax.types import Candidates, Scene, Trajectory
 
@@ -79,8 +79,11 @@ class FeatureMap:
         The layout for speed: no [K, T, F] array is ever written.
         """
         with jax.named_scope("features"):
-            frames = candidate_frames(scene, candidates)
-            return tuple(COLUMNS[spec.name](frames) for spec in self.specs)
+            return self.of_frames(candidate_frames(scene, candidates.trajectory))
+
+    def of_frames(self, frames: Frame) -> tuple[jax.Array, ...]:
+        """F arrays of the frames' shape, from `candidate_frames`."""
+        return tuple(COLUMNS[spec.name](frames) for spec in self.specs)
 
 
 @functools.cache

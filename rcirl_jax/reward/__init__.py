@@ -20,6 +20,7 @@ from rcirl_jax.reward.network import (
     RewardConfig,
     init_reward,
     pinned,
+    scenes_value,
     value,
 )
 from rcirl_jax.reward.normaliser import fit_normaliser, normalise
@@ -43,6 +44,7 @@ __all__ = [
     "loss_sums",
     "normalise",
     "pinned",
+    "scenes_value",
     "tuned",
     "value",
     "weighted_cost",

@@ -215,11 +215,6 @@ def rows_value(
 ) -> Float[Array, " k"]:
     """V of all K candidates of a scene from features laid out row by row.
 
-    The same sum as `value`, feature-major: the points run along the long axis
-    of every matrix product, and the normaliser's shift and scale go into the
-    first layer. On a CPU it takes a third of the time of `value`, most of it
-    because no [K, T, F] array is written.
-
     Args:
       effective: pinned parameters (`pinned`, or a weights file's).
       normaliser: [F].
@@ -227,27 +222,51 @@ def rows_value(
       time_valid: [T].
       activation: key of ACTIVATIONS.
     """
-    clipped = [
-        jnp.clip(row, normaliser.lower[i], normaliser.upper[i])
-        for i, row in enumerate(rows)
-    ]
-    x = jnp.stack(clipped)
+    x = jnp.stack(rows)[None]
+    return scenes_value(effective, normaliser, x, time_valid[None], activation)[0]
+
+
+def scenes_value(
+    effective: RewardParams,
+    normaliser: Normaliser,
+    features: Float[Array, "b f t k"],
+    time_valid: Bool[Array, "b t"],
+    activation: str,
+) -> Float[Array, "b k"]:
+    """V of all K candidates of B scenes, features before points.
+
+    The same sum as `value`: the points run along the long axis of every matrix
+    product, and the normaliser's shift and scale go into the first layer. On a
+    CPU it takes a third of the time of `value`; least with one scene at a time,
+    whose features stay in the cache and need no transposition.
+
+    Args:
+      effective: pinned parameters (`pinned`, or a weights file's).
+      normaliser: [F].
+      features: in declared units; the first T times of gamma.
+      time_valid: [B, T].
+      activation: key of ACTIVATIONS.
+    """
+    columns = lambda v: v[:, None, None, None]  # noqa: E731
+    x = jnp.moveaxis(features, 1, 0)
+    x = jnp.clip(x, columns(normaliser.lower), columns(normaliser.upper))
     first = effective.kernels[0] / normaliser.scale[:, None]
     shift = normaliser.location @ first
     if effective.context is not None:
-        columns = lambda v: v[:, None, None]  # noqa: E731
         x = (x - columns(normaliser.location)) / columns(normaliser.scale)
-        x = x * 2.0 * jax.nn.sigmoid(effective.context.T @ x[:, 0])[:, None]
+        gain = jnp.einsum("fg,fbk->gbk", effective.context, x[:, :, 0])
+        x = x * 2.0 * jax.nn.sigmoid(gain)[:, :, None]
         first, shift = effective.kernels[0], 0.0
-    x = x.reshape(len(rows), -1)
+    x = x.reshape(x.shape[0], -1)
     kernels = (first, *effective.kernels[1:])
     offsets = [*effective.biases, jnp.zeros((1,))]
     offsets[0] = offsets[0] - shift
     for kernel, offset in zip(kernels[:-1], offsets[:-1], strict=True):
         x = ACTIVATIONS[activation](kernel.T @ x + offset[:, None])
-    rewards = (kernels[-1].T @ x + offsets[-1][:, None]).reshape(rows[0].shape)
-    weight = jnp.where(time_valid, effective.gamma, 0.0)
-    return weight @ rewards
+    scenes, _, times, count = features.shape
+    rewards = kernels[-1].T @ x + offsets[-1][:, None]
+    weight = jnp.where(time_valid, effective.gamma[:times], 0.0)
+    return jnp.einsum("bt,btk->bk", weight, rewards.reshape(scenes, times, count))
 
 
 def value(

@@ -13,7 +13,7 @@ use it; memory does not grow with batch size times members.
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import flax.struct
 import jax
@@ -22,10 +22,16 @@ import numpy as np
 import optax
 
 from rcirl_jax.features import feature_map
-from rcirl_jax.reward import LossSums, Normaliser, RewardParams
+from rcirl_jax.reward import Normaliser, RewardParams
 from rcirl_jax.train.loop import to_device_batch
 from rcirl_jax.train.state import OPTIMIZERS, Batch, FeatureBatch, TrainConfig
-from rcirl_jax.train.step import as_tree, featurise, gradient_sums, init_params
+from rcirl_jax.train.step import (
+    added,
+    as_tree,
+    featurise,
+    gradient_sums,
+    init_params,
+)
 from rcirl_jax.types import Demonstration
 
 CHUNK = 128  # scenes featurised per call
@@ -159,19 +165,6 @@ def _taken(frozen: FeatureBatch, part: tuple, times: int) -> FeatureBatch:
     )
 
 
-def _added(
-    sums_of: Callable[[tuple], tuple[RewardParams, LossSums]], parts: tuple
-) -> tuple[RewardParams, LossSums]:
-    """Sums over parts [n, ...], one after the other."""
-    like = jax.eval_shape(sums_of, jax.tree.map(lambda x: x[0], parts))
-    zero = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
-    add = lambda total, part: (  # noqa: E731
-        jax.tree.map(jnp.add, total, sums_of(part)),
-        None,
-    )
-    return jax.lax.scan(add, zero, parts)[0]
-
-
 @functools.partial(jax.jit, static_argnames=("config", "times"))
 def _fit(
     frozen: FeatureBatch,
@@ -202,7 +195,7 @@ def _fit(
         sums_of = lambda part: gradient_sums(  # noqa: E731
             params, normaliser, _taken(frozen, part, times), config, constants
         )
-        grads, sums = _added(sums_of, batch)
+        grads, sums = added(sums_of, batch)
         grads = jax.tree.map(lambda g: g / jnp.maximum(sums.terms, 1.0), grads)
         updates, after = optimizer.update(grads, state, as_tree(params))
         rate = who.learning_rate

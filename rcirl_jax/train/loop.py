@@ -78,7 +78,7 @@ def rows_that_count(batch: FeatureBatch) -> np.ndarray:
     valid = np.asarray(batch.time_valid)
     human = np.asarray(batch.human)[valid]
     both = np.asarray(batch.feasible)[:, :, None] & valid[:, None, :]
-    return np.concatenate([human, np.asarray(batch.candidates)[both]])
+    return np.concatenate([human, np.asarray(batch.points)[both]])
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

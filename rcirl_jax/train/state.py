@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import flax.struct
 import jax
+import jax.numpy as jnp
 import numpy as np
 import optax
 
@@ -143,12 +144,23 @@ class FeatureBatch(flax.struct.PyTreeNode, kw_only=True):
     """The same with features already made (a feature cache)."""
 
     human: jax.Array  # [B, T, F] of the positive
-    candidates: jax.Array  # [B, K, T, F]
+    candidates: jax.Array  # [B, F, T, K]: points run along the long axes
     feasible: jax.Array  # [B, K] bool
     time_valid: jax.Array  # [B, T] bool
     facts: Facts
     weight: jax.Array  # [B]
     index: jax.Array  # [B] int32
+
+    @property
+    def points(self) -> jax.Array:
+        """The candidates as [B, K, T, F], the layout of `reward.value`."""
+        return self.candidates.transpose(0, 3, 2, 1)
+
+    @property
+    def points_valid(self) -> jax.Array:
+        """[B, K, T] bool, `time_valid` for every candidate."""
+        shape = (*self.feasible.shape, self.time_valid.shape[-1])
+        return jnp.broadcast_to(self.time_valid[:, None], shape)
 
 
 def make_optimizer(config: TrainConfig) -> optax.GradientTransformation:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import optax
 
 from rcirl_jax.features import FeatureMap, feature_map
-from rcirl_jax.features.columns import candidate_frames
+from rcirl_jax.features.columns import Frame, candidate_frames
 from rcirl_jax.reward import (
     Compared,
     LossConfig,
@@ -21,7 +21,8 @@ from rcirl_jax.reward import (
     RewardConfig,
     init_reward,
     loss_sums,
-    value,
+    pinned,
+    scenes_value,
 )
 from rcirl_jax.sampling import (
     SamplerConfig,
@@ -100,17 +101,18 @@ KERNEL_M = 2.0  # m, bandwidth of the proposal's density
 
 
 def facts_of(
-    demonstration: Demonstration,
     driven: Trajectory,
     candidates: Candidates,
+    frames: Frame,
     valid: jax.Array,
     config: TrainConfig,
 ) -> Facts:
     """Distances, collisions, broken rules and densities of one scene, leaves [K].
 
     Over the times in `valid` [T]; the human's own are of the recorded curve.
+    `frames` are those of the candidates, [T, K].
     """
-    scene, x = demonstration.scene, candidates.trajectory
+    x = candidates.trajectory
     count = jnp.sum(valid)
 
     def apart(a: Trajectory, b: Trajectory) -> jax.Array:
@@ -118,7 +120,6 @@ def facts_of(
         distance = jnp.sqrt((a.s - b.s) ** 2 + (a.l - b.l) ** 2 + 1e-9)
         return jnp.sum(jnp.where(valid, distance, 0.0), axis=-1) / count
 
-    frames = candidate_frames(scene, candidates)
     seen = valid[:, None]
     fast = frames.point.v > frames.path.speed_limit + OVER_LIMIT_MPS
     unlawful = (fast | (frames.relations.line_overrun > 0.0)) & seen
@@ -164,24 +165,29 @@ def featurise(
         valid = demonstration.scene.time_valid & seen
         candidates = candidates_of(own_key, demonstration, config)
         driven = human_of(demonstration, config.sampler)
-        of_candidates = features.of_candidates(demonstration.scene, candidates)
-        facts = facts_of(demonstration, driven, candidates, valid, config)
+        # the human stands last among the candidates: one pass for all
+        join = lambda many, one: jnp.concatenate([many, one[None]])  # noqa: E731
+        everyone = jax.tree.map(join, candidates.trajectory, driven)
+        frames = candidate_frames(demonstration.scene, everyone)
+        both = jnp.stack(features.of_frames(frames))
+        human, rows = both[:, :, -1].T, both[:, :, :-1]
+        frames = jax.tree.map(lambda x: x[:, :-1], frames)
+        facts = facts_of(driven, candidates, frames, valid, config)
         feasible = candidates.feasible
         if config.positive == "human":
-            human = features(demonstration.scene, driven)
-            return human, of_candidates, feasible, facts, valid
+            return human, rows, feasible, facts, valid
         near = jnp.argmin(jnp.where(feasible, facts.distance, jnp.inf))
         facts = facts.replace(
             human_distance=facts.distance[near], human_density=facts.density[near]
         )
         feasible = feasible.at[near].set(False)
-        return of_candidates[near], of_candidates, feasible, facts, valid
+        return rows[:, :, near].T, rows, feasible, facts, valid
 
     made = jax.vmap(one)(batch.index, batch.demonstrations)
-    human, of_candidates, feasible, facts, valid = made
+    human, rows, feasible, facts, valid = made
     return FeatureBatch(
         human=human,
-        candidates=of_candidates,
+        candidates=rows,
         feasible=feasible,
         time_valid=valid,
         facts=facts,
@@ -198,10 +204,13 @@ def compare(
 ) -> Compared:
     """Values of a batch under the Siamese network, with what losses need beside."""
     valid, facts = batch.time_valid, batch.facts
-    spread = jnp.broadcast_to(valid[:, None], batch.candidates.shape[:3])
+    both = jnp.concatenate([batch.human.swapaxes(1, 2)[..., None], batch.candidates], 3)
+    values = scenes_value(
+        pinned(params, reward), normaliser, both, valid, reward.hidden_activation
+    )
     return Compared(
-        human=value(params, normaliser, batch.human, valid, reward),
-        candidates=value(params, normaliser, batch.candidates, spread, reward),
+        human=values[:, 0],
+        candidates=values[:, 1:],
         counts=batch.feasible,
         weight=batch.weight,
         human_distance=facts.human_distance,
@@ -257,11 +266,32 @@ def gradient_sums(
     return jax.grad(total, has_aux=True)(params)
 
 
+def in_pieces(batch: FeatureBatch) -> FeatureBatch:
+    """Leaves [n, B / n, ...]: scene by scene on a CPU, all at once elsewhere.
+
+    A scene's features (0.2 MB) and hidden units stay in a core's cache from the
+    forward to the backward pass; those of a batch do not.
+    """
+    size = 1 if jax.default_backend() == "cpu" else batch.weight.shape[0]
+    return jax.tree.map(lambda x: x.reshape(-1, size, *x.shape[1:]), batch)
+
+
+def added(sums_of: Callable[[Any], Any], parts: Any) -> Any:  # noqa: ANN401
+    """Sum of `sums_of(part)` over parts, leaves [n, ...], one after the other."""
+    like = jax.eval_shape(sums_of, jax.tree.map(lambda x: x[0], parts))
+    zero = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+    add = lambda total, part: (  # noqa: E731
+        jax.tree.map(jnp.add, total, sums_of(part)),
+        None,
+    )
+    return jax.lax.scan(add, zero, parts)[0]
+
+
 def _nonfinite(batch: FeatureBatch) -> tuple[jax.Array, jax.Array]:
     """Bad values per feature, and the row of one bad scene (or -1)."""
     bad = ~jnp.isfinite(batch.candidates)
     bad_human = ~jnp.isfinite(batch.human)
-    per_scene = jnp.any(bad, axis=(1, 2)) | jnp.any(bad_human, axis=1)  # [B, F]
+    per_scene = jnp.any(bad, axis=(2, 3)) | jnp.any(bad_human, axis=1)  # [B, F]
     per_scene = per_scene & (batch.weight > 0.0)[:, None]
     row = jnp.max(jnp.where(jnp.any(per_scene, axis=1), batch.index, -1))
     return jnp.sum(per_scene, axis=0), row
@@ -292,7 +322,10 @@ def make_train_step(
             key = jax.random.fold_in(state.key, state.step)
             batch = featurise(key, batch, config, features)
 
-        grads, sums = gradient_sums(state.params, state.normaliser, batch, config)
+        sums_of = lambda part: gradient_sums(  # noqa: E731
+            state.params, state.normaliser, part, config
+        )
+        grads, sums = added(sums_of, in_pieces(batch))
         nonfinite, first_bad = _nonfinite(batch)
         if axis_name is not None:
             sums, grads, nonfinite = jax.lax.psum((sums, grads, nonfinite), axis_name)

@@ -45,9 +45,7 @@ def trained(config, seeds=(0, 1)):
 
 def values(run: Learned):
     made = frozen()
-    shape = made.candidates.shape[:3]
-    spread = np.broadcast_to(np.asarray(made.time_valid)[:, None], shape)
-    return run.scorer(np.asarray(made.candidates), spread)
+    return run.scorer(np.asarray(made.points), np.asarray(made.points_valid))
 
 
 @pytest.mark.parametrize("config", [FREE, LINEAR], ids=["network", "linear"])
@@ -81,9 +79,9 @@ def test_the_choice_is_the_best_feasible_one_and_its_error_its_distance():
         assert near[s, made.nearest[s]]
         assert made.error[s] == distance[s, made.chosen[s]]
         last = int(np.asarray(frozen().time_valid)[s].sum()) - 1
-        station = frozen().candidates[s, made.chosen[s], last, NAMES.index("station")]
+        station = frozen().points[s, made.chosen[s], last, NAMES.index("station")]
         assert made.station[s] == float(station)
-        gap = frozen().candidates[s, made.chosen[s]] - frozen().human[s]
+        gap = frozen().points[s, made.chosen[s]] - frozen().human[s]
         np.testing.assert_array_equal(made.ahead[s], gap[:, NAMES.index("station")])
     assert (made.spread_of_posterior >= 0.0).all()
 

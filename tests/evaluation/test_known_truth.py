@@ -19,7 +19,7 @@ def frozen(count, seed=0):
     """Made-up features of many scenes in the shapes of a real frozen set."""
     rng, base = np.random.default_rng(seed), cached()
     k = 12
-    shape = (count, k, *base.candidates.shape[2:])
+    shape = (count, k, *base.points.shape[2:])
     per_candidate = rng.normal(size=(count, k, 1, 21))
     x = per_candidate + 0.3 * rng.normal(size=shape)
     wide = lambda leaf: jnp.zeros((count, *leaf.shape[1:]), leaf.dtype)  # noqa: E731
@@ -28,7 +28,7 @@ def frozen(count, seed=0):
         lambda leaf: leaf[:, :k] if leaf.ndim == 2 else leaf, made.facts
     )
     return made.replace(
-        candidates=jnp.asarray(x, jnp.float32),
+        candidates=jnp.asarray(x, jnp.float32).transpose(0, 3, 2, 1),
         human=jnp.asarray(x[:, 0], jnp.float32),
         feasible=jnp.ones((count, k), bool).at[:, 3].set(False),
         time_valid=jnp.ones((count, 18), bool),
@@ -44,7 +44,7 @@ def test_experts_choose_the_best_feasible():
     best = np.asarray(hidden.values(scenes)).argmax(axis=1)
     assert (best != 3).all()
     np.testing.assert_array_equal(
-        shown.human, np.asarray(scenes.candidates)[np.arange(20), best]
+        shown.human, np.asarray(scenes.points)[np.arange(20), best]
     )
     assert (np.asarray(shown.feasible).sum(axis=1) == 10).all()
     noisy = experts(scenes, hidden, 100.0, 0)

@@ -124,7 +124,6 @@ def test_export_rank_report(dataset, run, tmp_path):
 
 def test_exported_values_are_the_trainers(dataset, run, tmp_path):
     """The numpy reader and the JAX network agree on fresh scenes to 1e-5."""
-    import jax.numpy as jnp
 
     from rcirl_jax.features import feature_map
     from rcirl_jax.reward import value
@@ -135,12 +134,11 @@ def test_exported_values_are_the_trainers(dataset, run, tmp_path):
     index = dataset.indices("test")[:8]
     batch = to_device_batch(dataset.read(index), np.ones(8), index)
     made = featurise(jax.random.key(9), batch, CONFIG, feature_map("paper21"))
-    valid = jnp.broadcast_to(made.time_valid[:, None], made.candidates.shape[:3])
     state = run[1].state
     expected = value(
-        state.params, state.normaliser, made.candidates, valid, CONFIG.reward
+        state.params, state.normaliser, made.points, made.points_valid, CONFIG.reward
     )
-    found = reward.value(np.asarray(made.candidates), np.asarray(valid))
+    found = reward.value(np.asarray(made.points), np.asarray(made.points_valid))
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
 
 

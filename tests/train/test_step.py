@@ -136,7 +136,7 @@ def human_is_better():
 
     return base.replace(
         human=around(base.human.shape, direction),
-        candidates=around(base.candidates.shape, -direction),
+        candidates=around(base.points.shape, -direction).transpose(0, 3, 2, 1),
         feasible=jnp.ones_like(base.feasible),
         time_valid=jnp.ones_like(base.time_valid),
     )
@@ -171,7 +171,7 @@ def test_many_epochs_neither_diverge_nor_change_the_ranking():
 def test_not_finite_features_are_named_and_the_state_is_kept():
     made = cached()
     broken = made.replace(
-        candidates=made.candidates.at[3, 0, 2, 9].set(jnp.nan), index=100 + made.index
+        candidates=made.candidates.at[3, 9, 2, 0].set(jnp.nan), index=100 + made.index
     )
     state = init_state(CONFIG, normaliser())
     after, metrics = jax.jit(make_train_step(CONFIG))(state, broken)
@@ -223,13 +223,13 @@ def test_nearest_positive_is_a_feasible_candidate_and_not_its_own_rival():
     made = featurise(key, batch(), config, features)
     plain = featurise(key, batch(), CONFIG, features)
     for b in range(made.human.shape[0]):
-        same = np.all(np.asarray(made.candidates[b]) == made.human[b], axis=(1, 2))
+        same = np.all(np.asarray(made.points[b]) == made.human[b], axis=(1, 2))
         before, after = np.asarray(plain.feasible[b]), np.asarray(made.feasible[b])
         (changed,) = np.nonzero(before != after)
         assert changed.size == 1
         assert same[changed[0]]
         # no feasible rival ends nearer to the human over the valid times
-        scene_s = np.asarray(made.candidates[b, :, :, features.names.index("station")])
+        scene_s = np.asarray(made.points[b, :, :, features.names.index("station")])
         human_s = np.asarray(plain.human[b, :, features.names.index("station")])
         valid = np.asarray(made.time_valid[b])
         apart = np.abs(scene_s - human_s)[:, valid].mean(axis=1)

@@ -177,7 +177,7 @@ def test_times_that_no_scene_compares_change_nothing():
     early = jnp.arange(18) < 7
     masked = made.replace(time_valid=made.time_valid & early)
     loud = masked.replace(
-        candidates=jnp.where(early[:, None], made.candidates, 1e3),
+        candidates=jnp.where(early[:, None], made.candidates, 1e3),  # [.., T, K]
         human=jnp.where(early[:, None], made.human, -1e3),
     )
     config = dataclasses.replace(BASE, epochs=1)
@@ -222,7 +222,7 @@ def test_everything_is_written_and_loads(finished, tmp_path):
 
 def test_the_compiled_scorer_is_the_readers(finished):
     reward = open_reward(str(finished[0] / "best.msgpack"))
-    x = np.asarray(many().candidates[:4])
+    x = np.asarray(many().points[:4])
     valid = np.ones(x.shape[:-1], bool)
     np.testing.assert_allclose(
         compiled_scorer(reward)(x, valid), reward.value(x, valid), rtol=1e-5, atol=1e-5
