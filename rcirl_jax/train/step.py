@@ -50,6 +50,7 @@ from rcirl_jax.units import TIMES_S
 
 SAMPLER_STREAM = 0  # fold_in number of the sampler's key
 NEGATIVE_STREAM = 1  # fold_in number of the hard negatives' key
+PIECE_VALUES = 1 << 16  # feature values worked off together on a CPU
 
 
 class StepMetrics(flax.struct.PyTreeNode, kw_only=True):
@@ -267,12 +268,16 @@ def gradient_sums(
 
 
 def in_pieces(batch: FeatureBatch) -> FeatureBatch:
-    """Leaves [n, B / n, ...]: scene by scene on a CPU, all at once elsewhere.
+    """Leaves [n, B / n, ...]: few scenes at a time on a CPU, all at once elsewhere.
 
-    A scene's features (0.2 MB) and hidden units stay in a core's cache from the
-    forward to the backward pass; those of a batch do not.
+    The features (0.2 MB for 122 candidates) and hidden units of one scene stay in
+    a core's cache from the forward to the backward pass; those of a batch do not.
     """
-    size = 1 if jax.default_backend() == "cpu" else batch.weight.shape[0]
+    scenes, values = batch.weight.shape[0], batch.candidates[0].size
+    most = scenes
+    if jax.default_backend() == "cpu":
+        most = min(scenes, max(1, PIECE_VALUES // values))
+    size = next(n for n in range(most, 0, -1) if scenes % n == 0)
     return jax.tree.map(lambda x: x.reshape(-1, size, *x.shape[1:]), batch)
 
 
