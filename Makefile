@@ -5,8 +5,10 @@ BIN    := $(VENV)/bin
 OUT    ?= out/demo
 # parallel test workers
 WORKERS ?= 2
+# folder of recordings for `make bench`; what is not there is left out
+RECORDINGS ?= ../shared/data
 
-.PHONY: demo test test-dataset lint setup clean
+.PHONY: demo test test-dataset lint bench setup clean
 
 setup: $(VENV)/.installed
 
@@ -32,6 +34,20 @@ lint: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 	$(BIN)/lint-imports
+
+$(VENV)/.bench: pyproject.toml | setup
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[bench]'
+	@touch $@
+
+# Benchmarks of a few minutes; wants a quiet machine. Writes benchmarks/results and docs/performance.png.
+bench: export JAX_PLATFORMS = cpu
+bench: $(VENV)/.bench
+	$(BIN)/python -m benchmarks.training
+	$(BIN)/python -m benchmarks.sweep
+	taskset -c 0 $(BIN)/python -m benchmarks.dp
+	taskset -c 0 $(BIN)/python -m benchmarks.single_plan
+	$(BIN)/python -m benchmarks.importing --data=$(RECORDINGS)
+	$(BIN)/python -m benchmarks.plots
 
 clean:
 	rm -rf $(VENV) out build dist
