@@ -29,7 +29,7 @@ def main() -> None:
     if _ROWS.value and _TAGS.value:
         raise InputError("--rows: given with --tags: expected one of them")
     try:
-        rows = [int(row) for row in _ROWS.value]
+        rows = sorted({int(row) for row in _ROWS.value})
     except ValueError as error:
         raise InputError(f"--rows: {_ROWS.value}: expected row numbers") from error
     tags = dataset.column("scene.tags")

@@ -161,12 +161,20 @@ def oracle_floor(dataset: Demonstrations, setup: RankingSetup, max_scenes: int) 
     Returns:
       mode, horizon, scenes, mean and median FDE and ADE [m] of the best
       feasible candidate, share of scenes without a feasible one.
+
+    Raises:
+      InputError: no scene is recorded up to the horizon.
     """
     order, parts = np.random.default_rng(0).permutation(dataset.indices(None)), []
     while order.size and sum(map(len, parts)) < max_scenes:
-        some, order = np.sort(order[:max_scenes]), order[max_scenes:]
+        some, order = order[:max_scenes], order[max_scenes:]
         parts.append(some[covers(dataset.read(some), setup.horizon_s)])
-    keep = np.concatenate(parts)[:max_scenes]
+    keep = np.sort(np.concatenate(parts)[:max_scenes])
+    if not keep.size:
+        raise InputError(
+            f"--horizon: {setup.horizon_s}: no scene is recorded that long: "
+            "expected a shorter one"
+        )
     scored = _score(dataset.read(keep), keep, setup, {})
     fde = np.where(scored.feasible, scored.fde, np.inf).min(axis=1)
     ade = np.where(scored.feasible, scored.ade, np.inf).min(axis=1)

@@ -285,6 +285,7 @@ def best(values: Mapping[str, float], metric: str) -> str:
     Raises:
       InputError: nothing to choose from.
     """
+    values = {name: value for name, value in values.items() if np.isfinite(value)}
     if not values:
         raise InputError(
             "sweep: members: NaN or infinity in every configuration: expected one "

@@ -20,10 +20,12 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import tqdm
 
 from rcirl_jax.data.joined import Demonstrations
 from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.evaluate import covered_rows
 from rcirl_jax.evaluation.ranking import METRICS
 from rcirl_jax.evaluation.statistics import ClusterBootstrap
 from rcirl_jax.evaluation.sweep import (
@@ -73,6 +75,9 @@ def run_sweep(
     dataset, split, by = open_split(config)
     created = _claim(config, folder, dataset.hash)
     made_by = {**provenance, "dataset_sha256": dataset.hash, "created": created}
+    for name in ("validation", "test"):  # what would fail only after the training
+        held_out, _ = covered_rows(split, name, config.setup.horizon_s)
+        ClusterBootstrap(np.asarray(held_out.vehicle))
     groups = _train(config, folder, split, executor, made_by)
     rows: dict[str, list[TrainConfig]] = collections.defaultdict(list)
     for one in config.members():
@@ -110,9 +115,10 @@ def _claim(config: SweepConfig, folder: Path, dataset_hash: str) -> str:
     if path.exists():
         try:
             found = json.loads(path.read_text())
-        except ValueError as error:
+            created = str(found["created"])
+        except (ValueError, KeyError, TypeError) as error:
             raise InputError(
-                f"{path}: {error}: expected the file of a sweep"
+                f"{path}: {type(error).__name__}: {error}: expected the file of a sweep"
             ) from error
         for name, setting in own.items():
             if found.get(name) != setting:
@@ -120,7 +126,7 @@ def _claim(config: SweepConfig, folder: Path, dataset_hash: str) -> str:
                     f"{path}: {name}: {found.get(name)}: expected {setting} to "
                     "resume; use another --output for other settings"
                 )
-        return found["created"]
+        return created
     created = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     _write_json(path, {**own, "created": created})
     return created
@@ -134,7 +140,7 @@ def _train(
     made_by: Mapping[str, object],
 ) -> dict[str, dict]:
     """The groups' files by shape, after training those that are missing."""
-    groups = {h: _finished(config, folder, h) for h in config.hidden_sizes}
+    groups = {h: _finished(config, folder, h, made_by) for h in config.hidden_sizes}
     todo = [hidden for hidden, group in groups.items() if group is None]
     samples = verification_samples(split, config.base) if todo else ()
     total = len(config.members())
@@ -150,7 +156,8 @@ def _train(
             if sum(len(p.members) for p in parts[part.hidden]) == len(
                 config.group(part.hidden)
             ):
-                groups[part.hidden] = _finish(folder, parts[part.hidden])
+                settings = {**_settings(config), **_data(made_by)}
+                groups[part.hidden] = _finish(folder, parts[part.hidden], settings)
     return {shape_name(hidden): group or {} for hidden, group in groups.items()}
 
 
@@ -184,7 +191,7 @@ def _export(
     write_weights(output, params, normaliser, member, samples, provenance)
 
 
-def _finish(folder: Path, parts: Sequence[Part]) -> dict:
+def _finish(folder: Path, parts: Sequence[Part], settings: dict) -> dict:
     """Write and return the file of a finished group."""
     members = {
         member_name(member): {
@@ -203,23 +210,32 @@ def _finish(folder: Path, parts: Sequence[Part]) -> dict:
         "compiles": len(compiled),
         "compile_seconds": round(sum(compiled), 3),
     }
-    group = {"facts": facts, "members": members}
+    group = {"facts": facts, "members": members, "settings": settings}
     _write_json(folder / "groups" / f"{shape_name(parts[0].hidden)}.json", group)
     return group
 
 
-def _finished(config: SweepConfig, folder: Path, hidden: Hidden) -> dict | None:
+def _finished(
+    config: SweepConfig, folder: Path, hidden: Hidden, made_by: Mapping[str, object]
+) -> dict | None:
     """A group's file, if it and all its members' files are whole."""
     path = folder / "groups" / f"{shape_name(hidden)}.json"
     try:
         group = json.loads(path.read_text())
+        if group["settings"] != {**_settings(config), **_data(made_by)}:
+            return None
         for member in config.group(hidden):
             reward = open_reward(str(_weights(folder, member)))
             if reward.sha256 != group["members"][member_name(member)]["sha256"]:
                 return None
-    except (OSError, ValueError, KeyError, InputError):
+    except (OSError, ValueError, KeyError, TypeError, InputError):
         return None
     return group
+
+
+def _data(made_by: Mapping[str, object]) -> dict:
+    """The data and the code a group was made from."""
+    return {name: made_by.get(name) for name in ("dataset_sha256", "git_commit")}
 
 
 def _judged(

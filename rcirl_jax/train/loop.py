@@ -24,7 +24,7 @@ from rcirl_jax.train.checkpoint import Checkpoints
 from rcirl_jax.train.metrics import MetricsWriter, Progress
 from rcirl_jax.train.parallel import Parallel, parallelise
 from rcirl_jax.train.processes import is_first
-from rcirl_jax.train.running import Running, describe_run
+from rcirl_jax.train.running import Running, check_run, describe_run
 from rcirl_jax.train.state import Batch, FeatureBatch, TrainConfig, TrainState
 from rcirl_jax.train.step import StepMetrics, featurise, init_state, make_train_step
 from rcirl_jax.types import Demonstration
@@ -114,8 +114,9 @@ def train(
         a feature turns NaN or infinite (names scene and feature).
     """
     running = running or Running()
-    parallel = parallelise(make_train_step(config), running.parallel, config.batch_size)
-    describe_run(workdir, config, dataset, provenance or {})
+    train_step = make_train_step(config, whole=running.parallel == "jit_sharded")
+    parallel = parallelise(train_step, running.parallel, config.batch_size)
+    check_run(workdir, config, dataset)
     features = feature_map(config.features)
     batches = split_batches(
         dataset,
@@ -134,6 +135,7 @@ def train(
         like = parallel.replicate(_like(config, features))
         state, position = checkpoints.restore(like)
         batches.restore(position)
+    describe_run(workdir, config, dataset, provenance or {})
     run = _Run(config, running, features, batches.batches_per_epoch, workdir, state)
 
     def produce() -> tuple:

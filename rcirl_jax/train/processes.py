@@ -1,7 +1,5 @@
 """Several processes, perhaps on several machines, as one training."""
 
-import re
-
 import jax
 
 from rcirl_jax.errors import InputError
@@ -34,9 +32,11 @@ def join_processes(
             f"--coordinator_address, --num_processes, --process_id: {given}: "
             "expected all three or none"
         )
-    if not re.fullmatch(r".+:\d+", coordinator_address):
+    host, _, port = coordinator_address.rpartition(":")
+    if not host or not port.isdecimal() or not 1 <= int(port) <= 65535:
         raise InputError(
-            f"--coordinator_address: {coordinator_address}: expected host:port"
+            f"--coordinator_address: {coordinator_address}: expected host:port, "
+            "port 1 to 65535"
         )
     if num_processes < 1:
         raise InputError(f"--num_processes: {num_processes}: expected >= 1")

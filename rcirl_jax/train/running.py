@@ -36,33 +36,56 @@ class Running:
                 raise InputError(f"--{name}: {value}: expected >= {low}")
 
 
-def describe_run(
-    workdir: Path, config: TrainConfig, dataset: Demonstrations, provenance: dict
-) -> None:
-    """Write run.json (process 0), or check that an existing one says the same.
+def check_run(workdir: Path, config: TrainConfig, dataset: Demonstrations) -> None:
+    """Check that an existing run.json says the same.
 
     Raises:
       InputError: the folder holds a run with other settings (names the first).
     """
     path = workdir / "run.json"
-    described = {
+    if not path.exists():
+        return
+    found = _read_run(path)
+    described = _described(config, dataset)
+    if found.get("dataset_hash") != described["dataset_hash"]:
+        raise InputError(f"{path}: dataset_hash: made from another dataset")
+    for name, setting in described["config"].items():
+        before = found["config"].get(name)
+        if before != setting and name != "epochs":
+            raise InputError(
+                f"{path}: {name}: {before}: expected {setting} to resume; "
+                "use another --workdir for other settings"
+            )
+
+
+def describe_run(
+    workdir: Path, config: TrainConfig, dataset: Demonstrations, provenance: dict
+) -> None:
+    """Write run.json (process 0)."""
+    if not is_first():
+        return
+    path = workdir / "run.json"
+    workdir.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(".tmp")
+    text = json.dumps({**_described(config, dataset), **provenance}, indent=2)
+    temporary.write_text(text + "\n")
+    os.replace(temporary, path)
+
+
+def _described(config: TrainConfig, dataset: Demonstrations) -> dict:
+    return {
         "config": json.loads(json.dumps(dataclasses.asdict(config))),
         "dataset_hash": dataset.hash,
     }
-    if path.exists():
+
+
+def _read_run(path: Path) -> dict:
+    """The contents of run.json; one line if it is not the file of a run."""
+    try:
         found = json.loads(path.read_text())
-        if found.get("dataset_hash") != dataset.hash:
-            raise InputError(f"{path}: dataset_hash: made from another dataset")
-        for name, setting in described["config"].items():
-            before = found["config"].get(name)
-            if before != setting and name != "epochs":
-                raise InputError(
-                    f"{path}: {name}: {before}: expected {setting} to resume; "
-                    "use another --workdir for other settings"
-                )
-    if not is_first():
-        return
-    workdir.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(json.dumps({**described, **provenance}, indent=2) + "\n")
-    os.replace(temporary, path)
+        if isinstance(found["config"], dict):
+            return found
+        reason = "config: not a table"
+    except (ValueError, KeyError, TypeError) as error:
+        reason = f"{type(error).__name__}: {error}"
+    raise InputError(f"{path}: {reason}: expected the file of a training run")

@@ -45,6 +45,7 @@ RANGES: dict[str, tuple[float, float, str]] = {
         (0.0, np.inf, ">= 0"),
     ),
     **dict.fromkeys(("batch_size", "epochs", "hard_pool"), (1, np.inf, ">= 1")),
+    "seed": (0, 2**31 - 1, "0 to 2147483647"),
     "soft_distance": (1e-6, np.inf, "> 0 m"),
     "train_horizon": (0.4, 8.0, "0.4 to 8 s"),
 }

@@ -308,14 +308,15 @@ def as_tree(params: RewardParams) -> Any:  # noqa: ANN401
 
 
 def make_train_step(
-    config: TrainConfig,
+    config: TrainConfig, *, whole: bool = False
 ) -> Callable[..., tuple[TrainState, StepMetrics]]:
     """`train_step(state, batch, *, axis_name=None) -> (state, metrics)`.
 
     `batch` is a Batch (everything is made on the device) or a FeatureBatch.
     With `axis_name` the step runs inside pmap or shard_map and sums over that
-    axis. A step whose loss or gradient is not finite leaves the state as it
-    was and says so in the metrics.
+    axis. `whole` works the batch off at once, for a compiler that shares it over
+    devices by itself and would gather it for a loop. A step whose loss or gradient
+    is not finite leaves the state as it was and says so in the metrics.
     """
     features = feature_map(config.features)
     optimizer = make_optimizer(config)
@@ -330,7 +331,7 @@ def make_train_step(
         sums_of = lambda part: gradient_sums(  # noqa: E731
             state.params, state.normaliser, part, config
         )
-        grads, sums = added(sums_of, in_pieces(batch))
+        grads, sums = sums_of(batch) if whole else added(sums_of, in_pieces(batch))
         nonfinite, first_bad = _nonfinite(batch)
         if axis_name is not None:
             sums, grads, nonfinite = jax.lax.psum((sums, grads, nonfinite), axis_name)

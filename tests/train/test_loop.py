@@ -1,5 +1,6 @@
 """A whole run on a small dataset: resume, export, rank, report, command lines."""
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from rcirl_jax.export.loading import load_runs, open_reward
 from rcirl_jax.report.ranking_page import write_ranking_page
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train.loop import train
+from rcirl_jax.train.running import check_run
 from rcirl_jax.train.state import TrainConfig
 from tests.conftest import REPO
 
@@ -146,6 +148,31 @@ def test_oracle_floor_is_reported(dataset):
     floor = oracle_floor(dataset, RankingSetup(sampler=SMALL), 64)
     assert 0.0 <= floor["best_fde_median_m"] <= floor["best_fde_mean_m"] + 5.0
     assert floor["candidates"] > 0
+
+
+def test_the_oracle_floor_is_of_scenes_that_cover_the_horizon(dataset):
+    """A sample of part of them is as likely to hold late rows as early ones."""
+    setup = RankingSetup(sampler=SMALL, horizon_s=5.0)
+    future = dataset.read(dataset.indices(None)).future_s
+    covering = int(np.sum(future >= 5.0 - 1e-3))
+    assert oracle_floor(dataset, setup, 10_000)["scenes"] == covering
+    assert oracle_floor(dataset, setup, 7)["scenes"] == 7
+    long = dataclasses.replace(setup, horizon_s=8.5)
+    with pytest.raises(InputError, match=r"--horizon: 8\.5: no scene is recorded"):
+        oracle_floor(dataset, long, 64)
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"config": 3}'])
+def test_a_broken_run_file_is_one_line(dataset, tmp_path, text):
+    (tmp_path / "run.json").write_text(text)
+    with pytest.raises(InputError, match=r"run\.json: .*: expected the file of a tr"):
+        check_run(tmp_path, CONFIG, dataset)
+
+
+@pytest.mark.parametrize("seed", [-1, 2**31])
+def test_a_seed_out_of_range_names_its_flag(seed):
+    with pytest.raises(InputError, match=r"--seed: .*: expected 0 to 2147483647"):
+        dataclasses.replace(CONFIG, seed=seed)
 
 
 def test_a_horizon_nobody_covers_is_one_line(dataset):

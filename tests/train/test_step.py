@@ -22,7 +22,12 @@ from rcirl_jax.train.parallel import (
     single,
 )
 from rcirl_jax.train.state import TrainConfig
-from rcirl_jax.train.step import featurise, init_state, make_train_step
+from rcirl_jax.train.step import (
+    featurise,
+    in_pieces,
+    init_state,
+    make_train_step,
+)
 from tests.scenes import demonstration
 
 SMALL = SamplerConfig(num_random=4, cruise_times=(4.0,), edge_times=(4.0,))
@@ -111,6 +116,18 @@ def test_cached_features_give_the_same_step():
         rtol=1e-4,
         atol=1e-5,
     )
+
+
+def test_scene_by_scene_is_the_step_of_the_whole_batch():
+    state, made = init_state(CONFIG, normaliser()), cached()
+    assert in_pieces(made).weight.shape[0] > 1
+    pieces, a = jax.jit(make_train_step(CONFIG))(state, made)
+    whole, b = jax.jit(make_train_step(CONFIG, whole=True))(state, made)
+    np.testing.assert_allclose(
+        weights_of(pieces), weights_of(whole), rtol=1e-4, atol=1e-5
+    )
+    np.testing.assert_allclose(a.loss_sum, b.loss_sum, rtol=1e-5)
+    assert (a.wins, a.pairs, a.terms) == (b.wins, b.pairs, b.terms)
 
 
 def test_candidates_of_a_scene_do_not_depend_on_the_batch():

@@ -147,7 +147,7 @@ def many(scenes=16, candidates=128):
     distance = jnp.asarray(rng.uniform(0.0, 9.0, pairs), jnp.float32)
     return FeatureBatch(
         human=jnp.asarray(around(scenes, *shape[2:]), jnp.float32),
-        candidates=jnp.asarray(around(*shape), jnp.float32),
+        candidates=jnp.asarray(around(*shape), jnp.float32).transpose(0, 3, 2, 1),
         feasible=jnp.asarray(rng.random(pairs) < 0.8),
         time_valid=jnp.ones((scenes, 18), bool),
         facts=Facts(
@@ -324,6 +324,7 @@ def test_the_choice_never_sees_the_test_split(data, finished, tmp_path, monkeypa
 def test_a_refused_step_is_never_chosen():
     assert best({"a": 2.0, "b": 1.0, "c": 1.0}, "top1_fde") == "b"
     assert best({"a": 0.2, "b": 0.1}, "percentile_rank") == "a"
+    assert best({"a": float("nan"), "b": 0.1}, "top1_fde") == "b"
     with pytest.raises(InputError, match="NaN or infinity in every configuration"):
         best({}, "top1_fde")
 
