@@ -29,7 +29,7 @@ _OUTPUT = flags.DEFINE_string("output", None, "folder to write", required=True)
 _LEAKY = flags.DEFINE_list("leaky_rates", ["0.01", "0.05", "0.2"], "values of a")
 _RATES = flags.DEFINE_list("learning_rates", ["0.003"], "step sizes")
 _HIDDEN = flags.DEFINE_list("hidden_sizes", ["15"], "networks: 15, 32x16; 0 is linear")
-_SEEDS = flags.DEFINE_integer("seeds", 4, "training runs of each configuration")
+_SEEDS = flags.DEFINE_integer("seeds", 4, "initial weights tried of each configuration")
 _LOSS = flags.DEFINE_enum("loss", "rank", sorted(LOSSES), "loss on value differences")
 _FEATURES = flags.DEFINE_string("features", "paper21", "preset in data_specs/features")
 _MODE = flags.DEFINE_enum(
