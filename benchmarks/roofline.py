@@ -5,12 +5,13 @@ The network is counted by hand, sampler and features from their jaxprs.
 """
 
 import math
-import time
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+
+from benchmarks.common import timed
 
 MATRIX = 2048  # rows of the product
 TRIAD = 1 << 26  # values of the update: 256 MB each, far more than any cache
@@ -25,13 +26,7 @@ FREE = (
 
 
 def _best(call: Callable[[], object]) -> float:
-    jax.block_until_ready(call())
-    taken = []
-    for _ in range(REPEATS):
-        begin = time.perf_counter()
-        jax.block_until_ready(call())
-        taken.append(time.perf_counter() - begin)
-    return min(taken)
+    return min(timed(call, REPEATS, warm_up=1))
 
 
 def peaks() -> dict[str, float]:

@@ -201,9 +201,20 @@ def point_rewards(
     of a sweep look at the same points.
     """
     points = x.reshape(-1, x.shape[-1]).T
-    for kernel, bias in zip(params.kernels[:-1], params.biases, strict=True):
-        points = ACTIVATIONS[activation](kernel.T @ points + bias[:, None])
-    return (params.kernels[-1].T @ points).reshape(x.shape[:-1])
+    offsets = (*params.biases, jnp.zeros((1,)))
+    return _layers(params.kernels, offsets, points, activation).reshape(x.shape[:-1])
+
+
+def _layers(
+    kernels: Sequence[jax.Array],
+    offsets: Sequence[jax.Array],
+    points: Float[Array, "f n"],
+    activation: str,
+) -> Float[Array, "1 n"]:
+    """The network on points that stand side by side."""
+    for kernel, offset in zip(kernels[:-1], offsets[:-1], strict=True):
+        points = ACTIVATIONS[activation](kernel.T @ points + offset[:, None])
+    return kernels[-1].T @ points + offsets[-1][:, None]
 
 
 def rows_value(
@@ -261,10 +272,8 @@ def scenes_value(
     kernels = (first, *effective.kernels[1:])
     offsets = [*effective.biases, jnp.zeros((1,))]
     offsets[0] = offsets[0] - shift
-    for kernel, offset in zip(kernels[:-1], offsets[:-1], strict=True):
-        x = ACTIVATIONS[activation](kernel.T @ x + offset[:, None])
     scenes, _, times, count = features.shape
-    rewards = kernels[-1].T @ x + offsets[-1][:, None]
+    rewards = _layers(kernels, offsets, x, activation)
     weight = jnp.where(time_valid, effective.gamma[:times], 0.0)
     return jnp.einsum("bt,btk->bk", weight, rewards.reshape(scenes, times, count))
 

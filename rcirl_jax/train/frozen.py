@@ -28,6 +28,7 @@ from rcirl_jax.train.state import OPTIMIZERS, Batch, FeatureBatch, TrainConfig
 from rcirl_jax.train.step import (
     added,
     as_tree,
+    divisor_at_most,
     featurise,
     gradient_sums,
     init_params,
@@ -151,7 +152,7 @@ def piece_size(size: int, members: int, candidates: int, times: int, units: int)
     most = min(size, values // (members * candidates * times * units))
     if device == "cpu":
         most = min(most, PIECE_SUMS // (members * (candidates + 1)))
-    return next((n for n in range(most, 1, -1) if size % n == 0), 1)
+    return divisor_at_most(size, most)
 
 
 def _taken(frozen: FeatureBatch, part: tuple, times: int) -> FeatureBatch:

@@ -267,6 +267,11 @@ def gradient_sums(
     return jax.grad(total, has_aux=True)(params)
 
 
+def divisor_at_most(size: int, most: int) -> int:
+    """The largest divisor of `size` that is at most `most`, or 1."""
+    return next((n for n in range(most, 1, -1) if size % n == 0), 1)
+
+
 def in_pieces(batch: FeatureBatch) -> FeatureBatch:
     """Leaves [n, B / n, ...]: few scenes at a time on a CPU, all at once elsewhere.
 
@@ -277,7 +282,7 @@ def in_pieces(batch: FeatureBatch) -> FeatureBatch:
     most = scenes
     if jax.default_backend() == "cpu":
         most = min(scenes, max(1, PIECE_VALUES // values))
-    size = next(n for n in range(most, 0, -1) if scenes % n == 0)
+    size = divisor_at_most(scenes, most)
     return jax.tree.map(lambda x: x.reshape(-1, size, *x.shape[1:]), batch)
 
 
