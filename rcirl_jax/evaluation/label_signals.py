@@ -18,7 +18,13 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from rcirl_jax.data.lines import MAX_RED_RUNNING, MIN_CROSSINGS, signal_state
+from rcirl_jax.data.lines import (
+    MAX_RED_RUNNING,
+    MIN_CROSSINGS,
+    OVER_M,
+    STANDING_MPS,
+    signal_state,
+)
 from rcirl_jax.types import Lane, Recording, Signal, Track
 
 ORDER = ("green", "yellow", "red", "off")
@@ -26,8 +32,6 @@ TURNS = 2000  # random turns of the cycles; p is known to 1 / 2001
 STEP_S = 1.0  # s between the offsets that are tried
 MAX_P = 0.05  # 1, above it a phase is not confirmed
 REACH_M = 12.0  # m before a line within which standing is a stop at it
-OVER_M = 1.5  # m, a car may stand that far over the line
-STANDING_MPS = 0.5  # m/s
 MIN_STAND_S = 1.0  # s at rest, at least
 TURN_S = 6.0  # s after the line within which a right turn shows
 RIGHT_RAD = np.deg2rad(30.0)  # rad to the right that make a right turn

@@ -15,6 +15,7 @@ from rcirl_jax.data.filters import REASONS
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.data.lanes import LaneGraph
+from rcirl_jax.data.lines import CREEP_M
 from rcirl_jax.data.quality import QualityReport, format_quality
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.data.smoothing import harsh_share, savgol
@@ -219,6 +220,26 @@ def test_stop_at_a_red_light():
     assert row["obstacles.s_lower"][slot, 0] == pytest.approx(36.0, abs=0.4)
     assert row["decisions"][slot] == Decision.STOP
     assert row["tags"][Tag.RED_LIGHT]
+
+
+@pytest.mark.parametrize(("over", "waits"), [(-1.0, True), (1.2, True), (2.0, False)])
+def test_a_car_standing_over_its_line_waits_for_the_light(over, waits):
+    """The front is `over` m beyond the line while the light is red."""
+    light = Signal(id="s1", start=np.array([0.0, 6.0]), state=("red", "green"))
+    place = 60.0 + over - 4.5 / 2
+    made = recording(
+        car("ego", lambda t: place + 0.5 * np.maximum(t - 7.0, 0.0) ** 2),
+        lanes=road(stop_line=60.0, signals=("s1",)),
+        signals=(light,),
+    )
+    row = first_scene(made)
+    slots = np.flatnonzero(row["obstacles.kind"] == Kind.STOP)
+    assert bool(slots.size) == waits == bool(row["tags"][Tag.RED_LIGHT])
+    if waits:
+        assert row["decisions"][slots[0]] == Decision.STOP
+        gap = row["obstacles.s_lower"][slots[0], 0] - 4.5 / 2
+        assert gap == pytest.approx(max(-over, CREEP_M), abs=0.1)
+        assert not row["obstacles.valid"][slots[0], -1]
 
 
 def test_a_green_light_demands_nothing():
