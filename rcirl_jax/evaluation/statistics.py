@@ -7,11 +7,12 @@ numpy, float64. Axes: `R` runs, `S` scenes, `C` clusters, `n` resamples.
 Sources: Davison and Hinkley, Bootstrap Methods and their Application (1997),
 chapter 5 (percentile intervals) and 3.8 (clusters); Clopper and Pearson,
 Biometrika 26 (1934); McNemar, Psychometrika 12 (1947), in its exact binomial
-form; Holm, Scand. J. Statist. 6 (1979).
+form; Tango, Statistics in Medicine 17 (1998); Holm, Scand. J. Statist. 6 (1979).
 """
 
 import dataclasses
 import math
+import statistics
 
 import numpy as np
 
@@ -317,6 +318,55 @@ def mcnemar_exact(b: int, c: int) -> float:
     if 2 * k == n:
         return 1.0
     return min(1.0, 2.0 * incomplete_beta(0.5, n - k, k + 1))
+
+
+def tango(
+    b: int, c: int, n: int, confidence: float = CONFIDENCE
+) -> tuple[float, float]:
+    """Score interval of (b - c) / n, a difference of two rates of paired trials.
+
+    The ends are where the score statistic
+
+        z(d) = (b - c - n d) / sqrt(n (2 q + d (1 - d)))
+
+    is +-z of the confidence; q is the likelihood's best probability of a pair of
+    kind c, given the difference d. It does not shrink to nothing where no pair is
+    discordant (b = c = 0), and so can prove non-inferiority of rare events.
+
+    Args:
+      b: pairs that only the first passes.
+      c: pairs that only the second passes.
+      n: all pairs.
+      confidence: of the interval; its one-sided ends have (1 + confidence) / 2.
+    """
+    if min(b, c) < 0 or b + c > n or n < 1:
+        raise InputError(f"tango: b, c, n: {b}, {c}, {n}: expected b + c <= n, n >= 1")
+    z = statistics.NormalDist().inv_cdf(0.5 * (1.0 + confidence))
+    middle = (b - c) / n
+
+    def end(outer: float) -> float:
+        inner = middle
+        while True:
+            d = 0.5 * (inner + outer)
+            if d in (inner, outer) or abs(outer - inner) < 1e-12:
+                return d
+            if abs(_score(b, c, n, d)) < z:
+                inner = d
+            else:
+                outer = d
+
+    return end(-1.0), end(1.0)
+
+
+def _score(b: int, c: int, n: int, d: float) -> float:
+    """Tango's statistic for a difference of d."""
+    linear = (2 * n - b + c) * d - b - c
+    q = (math.sqrt(linear**2 + 8 * n * c * d * (1.0 - d)) - linear) / (4 * n)
+    variance = n * (2.0 * q + d * (1.0 - d))
+    over = b - c - n * d
+    if variance <= 0.0:
+        return math.copysign(math.inf, over) if over else 0.0
+    return over / math.sqrt(variance)
 
 
 def holm(p_values: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +32,8 @@ def _percent(found: Rate) -> str:
     return f"{100 * found.rate:.2f} [{low:.1f},{high:.1f}]"
 
 
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+def text_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table whose columns are as wide as they need; numbers to the right."""
     widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
     lines = []
     for row in [header, *rows]:
@@ -60,12 +62,12 @@ def format_suite(report: SuiteReport) -> str:
             [name, *(_percent(getattr(row, kind)[c]) for c in COLUMNS)]
             for name, row in report.rows.items()
         ]
-        lines += _table(header, [*rows, paper])
+        lines += text_table(header, [*rows, paper])
     lines += [
         "",
         f"Jerk filtered as in nuPlan; safety; progress against {report.reference}",
     ]
-    lines += _table(
+    lines += text_table(
         ["", "|j| case", "|j| sample", "faults", "prevent.", "VRU", "hits", "red",
          "stop", "off road", "progress", "nuPlan [95 %]"],
         [_safety(name, row) for name, row in report.rows.items()],
@@ -111,7 +113,7 @@ def _differences(report: SuiteReport) -> list[str]:
         cells.append(f"{100 * score.mean:+.1f} +-{200 * score.se:.1f}")
         rows.append([item.b, *cells])
     header = ["", *(SHORT[c] for c in COLUMNS), "progress m", "nuPlan"]
-    return lines + _table(header, rows)
+    return lines + text_table(header, rows)
 
 
 def format_families(report: SuiteReport, row: str) -> str:
@@ -127,17 +129,17 @@ def format_families(report: SuiteReport, row: str) -> str:
         cells.append(f"{100 * found['nuplan']:.1f}")
         rows.append(cells)
     title = f"{row}: per family (rates per sample, progress against {report.reference})"
-    return "\n".join([title, *_table(header, rows)]) + "\n"
+    return "\n".join([title, *text_table(header, rows)]) + "\n"
 
 
-def _plain(node: object) -> object:
+def plain(node: Any) -> Any:  # noqa: ANN401
     """JSON-ready: dataclasses to dicts, numpy to Python, infinities to None."""
     if dataclasses.is_dataclass(node) and not isinstance(node, type):
-        return {f.name: _plain(getattr(node, f.name)) for f in dataclasses.fields(node)}
+        return {f.name: plain(getattr(node, f.name)) for f in dataclasses.fields(node)}
     if isinstance(node, Mapping):
-        return {str(key): _plain(value) for key, value in node.items()}
+        return {str(key): plain(value) for key, value in node.items()}
     if isinstance(node, list | tuple):
-        return [_plain(value) for value in node]
+        return [plain(value) for value in node]
     if isinstance(node, np.generic):
         node = node.item()
     if isinstance(node, float) and not math.isfinite(node):
@@ -147,8 +149,8 @@ def _plain(node: object) -> object:
 
 def write_json(path: Path, report: SuiteReport, facts: Mapping[str, object]) -> None:
     """The whole report with `facts` (hashes, timings, provenance) beside it."""
-    body = {**dict(facts), "report": _plain(report)}
-    path.write_text(json.dumps(_plain(body), indent=2, allow_nan=False) + "\n")
+    body = {**dict(facts), "report": plain(report)}
+    path.write_text(json.dumps(plain(body), indent=2, allow_nan=False) + "\n")
 
 
 def write_csv(

@@ -27,11 +27,12 @@ def table_rows(
     *,
     dp: bool = False,
     hand_set: LatticeCost | None = None,
+    names: Sequence[str] = (),
 ) -> list[Row]:
     """Learned rows first, in the order of the files, then the baselines.
 
-    Files of one loss and shape are told apart by their seed. A tuned `hand_set`
-    cost comes last.
+    Files of one loss and shape are told apart by their seed, or rows bear `names`, one
+    per file. A tuned `hand_set` cost comes last.
 
     Raises:
       InputError: no file, an unreadable one, path_speed weights, or an unknown
@@ -42,11 +43,12 @@ def table_rows(
     rewards = [open_reward(path) for path in weights]
     config = RankConfig(period=plan_every * STEP_S)
     rows: list[Row] = []
-    for reward, path in zip(rewards, weights, strict=True):
+    for number, (reward, path) in enumerate(zip(rewards, weights, strict=True)):
         mode = str(reward.provenance.get("mode", "speed"))
         if mode != "speed":
             raise InputError(f"{path}: mode: {mode}: the closed loop plans speed")
-        name, seed = row_name(reward), int(reward.provenance.get("seed", 0))
+        seed = int(reward.provenance.get("seed", 0))
+        name = names[number] if names else row_name(reward)
         taken = {row.name for row in rows}
         if name in taken:
             name = f"{name} (seed {seed})"

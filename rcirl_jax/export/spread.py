@@ -40,6 +40,7 @@ class SuiteJob:
     plan_every: int = 1
     dp: bool = False
     hand_weights: str | None = None
+    names: tuple[str, ...] = ()  # of the learned rows; else after loss and shape
 
     def rows(self) -> list[Row]:
         """Learned rows, then the baselines."""
@@ -51,6 +52,7 @@ class SuiteJob:
             hand_set=load_hand_weights(self.hand_weights)
             if self.hand_weights
             else None,
+            names=self.names,
         )
 
     def cases(self) -> CaseSet:

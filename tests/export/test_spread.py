@@ -1,6 +1,5 @@
 """Suites and rankings in other processes: the same numbers as in this one."""
 
-import dataclasses
 import functools
 
 import jax
@@ -10,44 +9,17 @@ import pytest
 from rcirl_jax.evaluation.closed_loop import SuiteConfig, drive_here, run_suite
 from rcirl_jax.evaluation.score import score_scenes
 from rcirl_jax.executor import Here, Processes
-from rcirl_jax.export import save
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.spread import SuiteJob, drive_piece, spread
-from rcirl_jax.features import feature_map
-from rcirl_jax.reward.network import LEAKY_SLOPE
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.simulation.suite import suite_refs
-from rcirl_jax.units import TIMES_S
-from tests.export.test_weights import FeatureSpec, example_weights, loop_value
 from tests.train.test_step import rows
-
-SPECS = feature_map("paper21").specs
+from tests.weights_files import random_weights
 
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
-    """A file with random weights and the planner's own features."""
-    rng = np.random.default_rng(2)
-    made = example_weights(features=len(SPECS), times=TIMES_S.size, hidden=(15,))
-    made = dataclasses.replace(
-        made,
-        preset="paper21",
-        features=tuple(
-            FeatureSpec(name=s.name, unit=s.unit, none_value=s.none) for s in SPECS
-        ),
-        lower=np.array([s.lower for s in SPECS]),
-        upper=np.array([s.upper for s in SPECS]),
-        location=np.array([0.5 * (s.lower + s.upper) for s in SPECS]),
-        scale=np.array([0.3 * (s.upper - s.lower) for s in SPECS]),
-        times=TIMES_S,
-        leaky_slope=LEAKY_SLOPE,
-    )
-    x = rng.normal(size=(3, TIMES_S.size, len(SPECS))).astype(np.float32)
-    valid = np.ones(x.shape[:2], bool)
-    values = [loop_value(made, *one) for one in zip(x, valid, strict=True)]
-    path = tmp_path_factory.mktemp("weights") / "w.msgpack"
-    save(path, made, x, valid, np.array(values))
-    return path
+    return random_weights(tmp_path_factory.mktemp("weights") / "w.msgpack")
 
 
 def job_of(weights):

@@ -1,0 +1,96 @@
+"""May a candidate replace the incumbent? Exit status 0 only to ship.
+
+    python -m experiments.gate --candidate=FILE --incumbent=FILE --output=verdict.json
+    python -m experiments.gate --candidate=FILE --incumbent=hand-set --output=FILE
+
+Both drive the same closed-loop cases; never is a learned reward the judge. Refused (3)
+if the candidate is at fault, or runs a red light or stop sign, in a case in which the
+incumbent does not; if rates or way are worse than the margins allow; if a family
+loses; or if nothing is better. 2: could not judge: bad input, or too few cases. With
+no fault anywhere, a margin of 0.1 % takes 3,838 cases: the full suite.
+"""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+from absl import flags
+
+from experiments.common import provenance, run
+from experiments.executor import executor
+from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.closed_loop import SuiteConfig, drive_here, run_suite
+from rcirl_jax.evaluation.gate import GateConfig, judge
+from rcirl_jax.evaluation.gate_output import format_verdict, write_verdict
+from rcirl_jax.evaluation.gate_runs import CANDIDATE, INCUMBENT, pair_of, repeats
+from rcirl_jax.export.spread import SuiteJob, spread
+from rcirl_jax.simulation.rows import BASELINES
+from rcirl_jax.simulation.suite import FULL_S, SMOKE_S, suite_refs
+
+_CANDIDATE = flags.DEFINE_string("candidate", None, "weights file", required=True)
+_INCUMBENT = flags.DEFINE_string(
+    "incumbent", "hand-set", "weights file, or a baseline: " + ", ".join(BASELINES)
+)
+_OUTPUT = flags.DEFINE_string("output", None, "JSON to write", required=True)
+_SUITE = flags.DEFINE_string("suite", "full", "full, smoke, or families with commas")
+_CASES = flags.DEFINE_integer("cases", None, "cases per family")
+_DURATION = flags.DEFINE_float("duration", None, "s per case at most (smoke 20)")
+_SEED = flags.DEFINE_integer("catalogue_seed", 0, "seed of the cases")
+_EVERY = flags.DEFINE_integer("plan_every", 1, "steps of 0.1 s between two plans")
+_PRIMARY = flags.DEFINE_list(
+    "primary", list(GateConfig().primary), "metrics that may gain"
+)
+_MARGINS = {
+    name: flags.DEFINE_float(f"{name}_margin", getattr(GateConfig(), name), text)
+    for name, text in {
+        "collision_free": "largest loss of fault-free cases, share",
+        "min_ttc": "of cases above 0.95 s to collision",
+        "speed_limit": "of cases within the limit",
+        "on_road": "of cases on the road",
+        "progress": "of the incumbent's way",
+        "family_progress": "of its way in one family",
+    }.items()
+}
+
+
+def _job() -> SuiteJob:
+    """Candidate and incumbent by name, and IDM, whose way the score refers to."""
+    learned = Path(_INCUMBENT.value).suffix != "" or _INCUMBENT.value not in BASELINES
+    files = (_CANDIDATE.value, *((_INCUMBENT.value,) if learned else ()))
+    duration = _DURATION.value or (SMOKE_S if _SUITE.value == "smoke" else FULL_S)
+    if not 1.0 <= duration <= FULL_S:
+        raise InputError(f"--duration: {duration}: expected 1 to {FULL_S:g} s")
+    return SuiteJob(
+        weights=files,
+        names=(CANDIDATE, INCUMBENT)[: len(files)],
+        baselines=tuple({"IDM", *(() if learned else (_INCUMBENT.value,))}),
+        refs=suite_refs(_SUITE.value, _CASES.value, _SEED.value),
+        duration_s=duration,
+        plan_every=_EVERY.value,
+    )
+
+
+def main() -> None:
+    """Flags -> one verdict."""
+    margins = {name: flag.value for name, flag in _MARGINS.items()}
+    config = dataclasses.replace(
+        GateConfig(), primary=tuple(_PRIMARY.value or ()), **margins
+    )
+    job, places = _job(), executor()
+    drive = spread(places, job) if places.workers > 1 else drive_here
+    rows, cases = job.rows(), job.cases()
+    suite = SuiteConfig(plan_every=_EVERY.value)
+    result = run_suite(rows, cases, suite, drive)
+    repeats(rows[0], result, suite)
+    incumbent = INCUMBENT if INCUMBENT in result.runs else _INCUMBENT.value
+    verdict = judge(pair_of(result, incumbent), config)
+    files = {"candidate": _CANDIDATE.value, "incumbent": _INCUMBENT.value}
+    facts = {"files": files, **result.facts, "made_by": provenance()}
+    write_verdict(Path(_OUTPUT.value), verdict, config, facts)
+    print(format_verdict(verdict))
+    print(f"written: {_OUTPUT.value}; exit status {verdict.exit_code}")
+    sys.exit(verdict.exit_code)
+
+
+if __name__ == "__main__":
+    run(main)

@@ -1,0 +1,88 @@
+"""The gate's verdict as terminal text and JSON."""
+
+import json
+import textwrap
+from collections.abc import Mapping
+from pathlib import Path
+
+from rcirl_jax.evaluation.gate import Check, GateConfig, Verdict
+from rcirl_jax.evaluation.suite_output import plain, text_table
+
+MARKS = {"pass": "ok", "fail": "FAIL", "open": "open"}
+WIDTH = 100  # columns of wrapped text
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:+.2f}"
+
+
+def _cells(check: Check) -> list[str]:
+    pairs = "" if check.lost is None else f"+{check.gained} -{check.lost}"
+    return [
+        check.name,
+        MARKS[check.outcome] if check.kind != "gain" else _gain(check),
+        _percent(check.difference),
+        f"[{_percent(check.low)}, {_percent(check.high)}]",
+        "" if check.margin is None else f"-{100.0 * check.margin:g}",
+        pairs,
+        "" if check.p is None else f"{check.p:.3f}",
+    ]
+
+
+def _gain(check: Check) -> str:
+    return "better" if check.outcome == "pass" else "-"
+
+
+TITLES = {
+    "safety": "Nothing new that is unsafe",
+    "no loss": "No loss beyond the margin, all cases",
+    "families": "No family that loses (Holm over families; worst ten)",
+    "gain": "Better somewhere (Holm over the primary metrics)",
+}
+WORST_FAMILIES = 10  # rows of the terminal table; the JSON has all
+
+
+def _shown(kind: str, checks: list[Check]) -> list[Check]:
+    """All, or of the families those that failed or lost most."""
+    if kind != "families":
+        return checks
+    ranked = sorted(checks, key=lambda c: (c.outcome != "fail", c.difference))
+    return ranked[:WORST_FAMILIES]
+
+
+def format_verdict(verdict: Verdict) -> str:
+    """Decision first, then every kind of check as a table."""
+    lines = [f"verdict: {verdict.decision.upper()}"]
+    lines += [
+        line
+        for reason in verdict.reasons
+        for line in textwrap.wrap(
+            reason, WIDTH, initial_indent="  - ", subsequent_indent="    "
+        )
+    ]
+    lines += ["", f"{verdict.cases:,} cases of {verdict.families} families; % of cases"]
+    header = ["", "", "difference", "95 %", "margin", "cases", "p"]
+    for kind, title in TITLES.items():
+        checks = [check for check in verdict.checks if check.kind == kind]
+        rows = [_cells(check) for check in _shown(kind, checks)]
+        if rows:
+            lines += ["", title, *text_table(header, rows)]
+    if verdict.look_at:
+        named = ", ".join(verdict.look_at)
+        lines += ["", *textwrap.wrap(f"look first at: {named}", WIDTH)]
+    return "\n".join(lines) + "\n"
+
+
+def write_verdict(
+    path: Path, verdict: Verdict, config: GateConfig, facts: Mapping[str, object]
+) -> None:
+    """Verdict, margins and `facts` (files, hashes, provenance) as JSON."""
+    body = {
+        "decision": verdict.decision,
+        "exit_code": verdict.exit_code,
+        **{k: v for k, v in plain(verdict).items() if k != "decision"},
+        "config": plain(config),
+        **facts,
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(plain(body), indent=2, allow_nan=False) + "\n")

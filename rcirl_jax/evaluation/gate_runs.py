@@ -1,0 +1,42 @@
+"""From a driven suite to what the gate compares."""
+
+import jax
+import numpy as np
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.closed_loop import SuiteConfig, SuiteResult
+from rcirl_jax.evaluation.gate import Pair
+from rcirl_jax.evaluation.suite_output import result_hash
+from rcirl_jax.simulation.rollout import LANES
+from rcirl_jax.simulation.rows import Row
+from rcirl_jax.simulation.suite import drive_row, rollout_config
+
+CANDIDATE, INCUMBENT = "candidate", "incumbent"
+
+
+def pair_of(result: SuiteResult, incumbent: str = INCUMBENT) -> Pair:
+    """Candidate and incumbent of a suite that IDM also drove."""
+    return Pair(
+        candidate=result.runs[CANDIDATE],
+        incumbent=result.runs[incumbent],
+        families=result.cases.groups,
+        ids=result.cases.ids,
+        reference=np.asarray(result.runs["IDM"].progress, np.float64),
+    )
+
+
+def repeats(row: Row, result: SuiteResult, config: SuiteConfig) -> None:
+    """Drive the first cases once more; a verdict needs drives that repeat.
+
+    Raises:
+      InputError: another result than in the suite.
+    """
+    cases, count = result.cases, min(LANES, len(result.cases.ids))
+    rollout = rollout_config(row, cases.duration_s, config.plan_every)
+    again = drive_row(row, cases.build, count, rollout, chunk=LANES)
+    before = jax.tree.map(lambda x: x[:count], result.runs[row.name])
+    if result_hash(again) != result_hash(before):
+        raise InputError(
+            f"gate: {row.name}: the first {count} cases, driven twice, differ:"
+            " expected one result"
+        )

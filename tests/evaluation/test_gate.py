@@ -1,0 +1,186 @@
+"""The gate: worse is refused, the same is no difference, better ships."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.gate import EXIT_CODES, GateConfig, Pair, judge
+from rcirl_jax.evaluation.gate_output import format_verdict, write_verdict
+from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics
+
+FAMILIES, EACH = 20, 200  # 4,000 cases: enough for a margin of 0.1 %
+CASES = FAMILIES * EACH
+A, J = COLUMNS.index("a_station"), COLUMNS.index("j_station")
+
+
+def drives(seed=0, jerky=0.4, hard=0.15, way=1000.0):
+    """Faultless drives of which shares are jerky and brake or accelerate hard."""
+    rng = np.random.default_rng(seed)
+    values = {f.name: np.zeros(CASES) for f in dataclasses.fields(CaseMetrics)}
+    holds = np.ones((CASES, len(COLUMNS)), bool)
+    holds[:, J] = rng.uniform(size=CASES) >= jerky
+    holds[:, A] = rng.uniform(size=CASES) >= hard
+    ones = np.ones(CASES)
+    values.update(
+        holds=holds,
+        progress=way * rng.uniform(0.8, 1.2, size=CASES),
+        no_fault=ones,
+        drivable=ones,
+        direction=ones,
+        ttc_bound=ones,
+        speed_compliance=ones,
+        comfort=holds[:, J].astype(float),
+    )
+    return CaseMetrics(**values)
+
+
+def pair(candidate, incumbent):
+    names = [f"family{i:02d}" for i in range(FAMILIES) for _ in range(EACH)]
+    return Pair(
+        candidate=candidate,
+        incumbent=incumbent,
+        families=names,
+        ids=[f"{name}/{i % EACH:03d}@0" for i, name in enumerate(names)],
+        reference=np.full(CASES, 1000.0),
+    )
+
+
+def broken(metrics, cases, **values):
+    """Another value in some cases."""
+    changed = {}
+    for name, value in values.items():
+        array = np.array(getattr(metrics, name))
+        array[cases] = value
+        changed[name] = array
+    return metrics.replace(**changed)
+
+
+def decide(candidate, incumbent, **config):
+    return judge(pair(candidate, incumbent), GateConfig(**config))
+
+
+def failed(verdict):
+    return {check.name for check in verdict.checks if check.outcome == "fail"}
+
+
+def test_the_same_reward_is_no_difference():
+    verdict = decide(drives(), drives())
+    assert verdict.decision == "no difference"
+    assert verdict.exit_code == 3
+    assert not verdict.look_at
+    assert all(check.outcome != "fail" for check in verdict.checks)
+
+
+def test_a_smoother_reward_ships():
+    candidate = drives()
+    holds = np.array(candidate.holds)
+    holds[::11, J] = True  # gains where it had failed
+    verdict = decide(candidate.replace(holds=holds), drives())
+    assert verdict.decision == "ship"
+    assert verdict.exit_code == 0
+    assert any("j_station" in reason for reason in verdict.reasons)
+
+
+@pytest.mark.parametrize(
+    ("field", "name"),
+    [
+        ("at_fault", "collision_free"),
+        ("red_lights", "red_light"),
+        ("stop_signs", "stop_sign"),
+    ],
+)
+def test_one_new_offence_refuses_however_smooth(field, name):
+    candidate = drives()
+    candidate = candidate.replace(holds=np.ones_like(candidate.holds))
+    verdict = decide(broken(candidate, [1234], **{field: 1}), drives())
+    assert verdict.decision == "do not ship"
+    assert failed(verdict) == {name}
+    assert "family06/034@0" in verdict.reasons[0]
+    assert verdict.look_at[0] == "family06/034@0"
+
+
+def test_an_offence_of_both_is_not_new():
+    both = broken(drives(), [7], at_fault=1)
+    assert decide(both, both).decision == "no difference"
+
+
+def test_a_slower_reward_is_refused():
+    slow = drives()
+    slow = slow.replace(progress=0.9 * np.array(slow.progress))
+    verdict = decide(slow, drives())
+    assert verdict.decision == "do not ship"
+    assert "progress" in failed(verdict)
+
+
+def test_a_loss_in_one_family_alone_is_found():
+    """One family of twenty drives 40 % slower, all others a little faster."""
+    some = slice(3 * EACH, 4 * EACH)
+    base = drives()
+    way = 1.03 * np.array(base.progress)
+    way[some] *= 0.6
+    verdict = decide(base.replace(progress=way), base)
+    assert failed(verdict) == {"family03, progress"}
+    near = broken(base, np.arange(3 * EACH, 3 * EACH + 15), ttc_bound=0)
+    assert "family03, clean drives" in failed(decide(near, base))
+
+
+def test_too_few_cases_cannot_be_judged():
+    whole = pair(drives(), drives())
+    keep = slice(0, 600)
+
+    def part(metrics):
+        fields = dataclasses.fields(CaseMetrics)
+        cut = {f.name: np.asarray(getattr(metrics, f.name))[keep] for f in fields}
+        return CaseMetrics(**cut)
+
+    few = Pair(
+        candidate=part(whole.candidate),
+        incumbent=part(whole.incumbent),
+        families=whole.families[keep],
+        ids=whole.ids[keep],
+        reference=whole.reference[keep],
+    )
+    verdict = judge(few, GateConfig())
+    assert verdict.decision == "could not judge"
+    assert verdict.exit_code == 2
+    assert "600 cases can never prove" in verdict.reasons[0]
+    assert judge(few, GateConfig(collision_free=0.01, min_ttc=0.01, speed_limit=0.01,
+                                 on_road=0.01)).decision == "no difference"  # fmt: skip
+
+
+def test_exchangeable_rewards_hardly_ever_ship():
+    """Two rewards of one quality, drawn anew: gains are false alarms."""
+    shipped = refused = 0
+    for seed in range(40):
+        verdict = decide(drives(2 * seed), drives(2 * seed + 1), primary=("j_station",))
+        shipped += verdict.decision == "ship"
+        refused += verdict.decision == "do not ship"
+    assert shipped <= 4  # expected 1 of 40, 2.5 %
+    assert refused <= 6  # expected 2 of 40: 5 % by families
+
+
+def test_bad_input_is_one_line():
+    good = drives()
+    with pytest.raises(InputError, match="family00/003@0: progress: not a finite"):
+        pair(broken(good, [3], progress=np.nan), good)
+    with pytest.raises(InputError, match="--min_ttc: 0: expected within"):
+        GateConfig(min_ttc=0)
+    with pytest.raises(InputError, match="--primary: reward: expected some of"):
+        GateConfig(primary=("reward",))
+
+
+def test_text_and_json_say_the_same(tmp_path):
+    config = GateConfig()
+    verdict = judge(pair(broken(drives(), [5], at_fault=1), drives()), config)
+    text = format_verdict(verdict)
+    assert text.startswith("verdict: DO NOT SHIP")
+    assert max(map(len, text.splitlines())) <= 120
+    write_verdict(tmp_path / "verdict.json", verdict, config, {"files": {}})
+    body = json.loads((tmp_path / "verdict.json").read_text())
+    assert body["decision"] == verdict.decision
+    assert body["exit_code"] == EXIT_CODES[verdict.decision] == 3
+    assert len(body["checks"]) == len(verdict.checks)
+    assert body["config"]["collision_free"] == config.collision_free

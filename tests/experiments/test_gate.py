@@ -1,0 +1,56 @@
+"""The gate by its command."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from tests.weights_files import random_weights
+
+SHORT = ("--suite=free_cruise,stopped_lead", "--cases=20", "--duration=3")
+
+
+def command(*flags):
+    return subprocess.run(
+        [sys.executable, "-m", "experiments.gate", *flags],
+        capture_output=True, text=True, check=False, timeout=600,
+        env={**os.environ, "JAX_PLATFORMS": "cpu"},
+    )  # fmt: skip
+
+
+@pytest.mark.multiprocess
+def test_a_reward_against_itself(tmp_path):
+    file, out = random_weights(tmp_path / "w.msgpack"), tmp_path / "verdict.json"
+    names = ("collision_free", "min_ttc", "speed_limit", "on_road")
+    margins = [f"--{name}_margin=0.2" for name in names]  # 40 cases prove no less
+    flags = (f"--candidate={file}", f"--incumbent={file}", f"--output={out}", *SHORT)
+    done = command(*flags, *margins)
+    assert done.returncode == 3, done.stderr[-2000:]
+    assert "verdict: NO DIFFERENCE" in done.stdout
+    body = json.loads(out.read_text())
+    assert body["decision"] == "no difference"
+    assert body["cases"] == 40
+    hashes = body["result_sha256"]
+    assert hashes["candidate"] == hashes["incumbent"] != hashes["IDM"]
+    assert body["made_by"]["flags"]["cases"] == 20
+
+
+@pytest.mark.multiprocess
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (("--incumbent=nobody",), "nobody"),
+        (("--progress_margin=-1",), "progress: -1.0: expected within (0, 1)"),
+        (("--duration=0.1",), "--duration: 0.1: expected 1 to 120 s"),
+    ],
+)
+def test_wrong_flags_are_one_line(flags, message, tmp_path):
+    file = random_weights(tmp_path / "w.msgpack")
+    out = f"--output={tmp_path}/v.json"
+    done = command(f"--candidate={file}", out, *SHORT, *flags)
+    assert done.returncode == 2
+    (line,) = done.stderr.strip().splitlines()
+    assert message in line
+    assert not (tmp_path / "v.json").exists()
