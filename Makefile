@@ -8,7 +8,7 @@ WORKERS ?= 2
 # folder of recordings for `make bench`; what is not there is left out
 RECORDINGS ?= ../shared/data
 
-.PHONY: demo test test-dataset lint bench setup clean
+.PHONY: demo test test-dataset lint bench onboard setup clean
 
 setup: $(VENV)/.installed
 
@@ -46,8 +46,15 @@ bench: $(VENV)/.bench
 	$(BIN)/python -m benchmarks.sweep
 	taskset -c 0 $(BIN)/python -m benchmarks.dp
 	taskset -c 0 $(BIN)/python -m benchmarks.single_plan
+	taskset -c 0 $(BIN)/python -m benchmarks.onboard
 	$(BIN)/python -m benchmarks.importing --data=$(RECORDINGS)
 	$(BIN)/python -m benchmarks.plots
+
+# C++ reader; needs cmake, a C++17 compiler and libmsgpack-dev
+onboard:
+	cmake -S onboard -B build/onboard -DRCIRL_WERROR=ON
+	cmake --build build/onboard --parallel $(WORKERS)
+	cd build/onboard && ctest --output-on-failure
 
 clean:
 	rm -rf $(VENV) out build dist

@@ -1,0 +1,79 @@
+// libFuzzer target: any bytes are refused with one line, or score without harm.
+//
+// The first byte chooses what the rest is: 0 a whole file, 1 or 2 the body of a file of
+// that schema version, wrapped with the right hash (which no mutation would hit).
+#include <cmath>
+#include <cstdint>
+#include <cstdlib>
+#include <cstring>
+#include <limits>
+#include <string>
+#include <string_view>
+#include <vector>
+
+#include "rcirl/reward.hpp"
+
+namespace {
+
+void require(bool good) {
+  if (!good) std::abort();
+}
+
+std::string sealed(std::string_view body, int version) {
+  std::string file = "\x84\xa5magic\xa6RCIRLW\xaeschema_version";
+  file += static_cast<char>(version);
+  file += "\xa4" "body\xc6";
+  for (int shift = 24; shift >= 0; shift -= 8) file += static_cast<char>(body.size() >> shift);
+  file += body;
+  file += "\xa6sha256\xd9\x40";
+  return file + rcirl::detail::sha256_hex(body.data(), body.size());
+}
+
+// Features of any bits, a mask of any bits: values are finite, or -infinity and counted.
+void score(const rcirl::Reward& reward, std::string_view bits) {
+  constexpr std::size_t kCount = 3;
+  const std::size_t times = reward.times().size();
+  std::vector<float> features(kCount * times * reward.features().size());
+  std::vector<std::uint8_t> marks(kCount * times);
+  for (std::size_t i = 0; i < features.size(); ++i) {
+    const std::size_t at = 4 * i % bits.size();
+    std::memcpy(&features[i], &bits[at], std::min<std::size_t>(4, bits.size() - at));
+  }
+  for (std::size_t i = 0; i < marks.size(); ++i) {
+    marks[i] = static_cast<std::uint8_t>(bits[i % bits.size()] & 1);
+  }
+  rcirl::Workspace workspace = reward.workspace();
+  const rcirl::Mask masks[] = {{nullptr, rcirl::Mask::kShared},
+                               {marks.data(), rcirl::Mask::kShared},
+                               {marks.data(), rcirl::Mask::kEach}};
+  for (const rcirl::Mask mask : masks) {
+    float values[kCount];
+    const std::size_t refused =
+        reward.score(features.data(), kCount, mask, &workspace, values);
+    std::size_t none = 0;
+    for (const float value : values) {
+      require(!std::isnan(value) && value != std::numeric_limits<float>::infinity());
+      none += std::isinf(value);
+    }
+    require(none == refused);
+  }
+}
+
+}  // namespace
+
+extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size) {
+  if (size < 1) return 0;
+  const std::string_view rest(reinterpret_cast<const char*>(data) + 1, size - 1);
+  const int version = data[0] % 3;
+  const std::string file = version == 0 ? std::string(rest) : sealed(rest, version);
+  rcirl::Reward reward;
+  const rcirl::Status status = rcirl::decode(file, "fuzz", &reward);
+  if (status.ok()) {
+    score(reward, file);
+  } else {
+    require(status.message().rfind("fuzz: ", 0) == 0);
+    require(status.message().find(": expected ") != std::string::npos);
+    require(status.message().find_first_of("\r\n") == std::string::npos);
+  }
+  return 0;
+}

@@ -1,0 +1,188 @@
+// Reader and scorer of `weights.msgpack`, the learned reward, for a planner in C++17.
+//
+//   rcirl::Reward reward;
+//   rcirl::Status status = rcirl::load("weights.msgpack", &reward);
+//   if (status.ok()) status = reward.check_features(names, units);
+//   if (!status.ok()) { log(status.message()); return; }
+//   rcirl::Workspace workspace = reward.workspace();           // one for each thread
+//   reward.score(features, count, {}, &workspace, values);     // [K, T, F] -> [K]
+//   std::size_t best = rcirl::best(values, count);             // count: none is usable
+//
+// Headers only, on top of msgpack-c's C headers; compiles with -fno-exceptions and
+// -fno-rtti. Loading allocates. Scoring allocates nothing, throws nothing, takes no lock,
+// and one reward may be scored by many threads, each with its own workspace.
+// The file and the equation: docs/weights_format.md.
+#ifndef RCIRL_REWARD_HPP_
+#define RCIRL_REWARD_HPP_
+
+#include <sys/stat.h>
+
+#include <algorithm>
+#include <cerrno>
+#include <cstddef>
+#include <cstdint>
+#include <cstdio>
+#include <cstring>
+#include <limits>
+#include <string>
+#include <string_view>
+#include <utility>
+#include <vector>
+
+#include "rcirl/detail/decode.hpp"
+
+namespace rcirl {
+
+// Success, or one line "FILE: field: value: expected ...".
+class [[nodiscard]] Status {
+ public:
+  Status() = default;
+  explicit Status(std::string_view message) : message_(detail::one_line(message)) {}
+
+  bool ok() const { return message_.empty(); }
+  const std::string& message() const { return message_; }
+
+ private:
+  std::string message_;
+};
+
+// Which times of which trajectories count: bytes of 0 and 1.
+struct Mask {
+  enum Shape { kShared, kEach };  // [T], the same for all; [K, T]
+
+  const std::uint8_t* data = nullptr;  // null: every time is valid
+  Shape shape = kShared;
+};
+
+// Scratch memory of `Reward::score`; belongs to one thread at a time.
+class Workspace {
+ public:
+  Workspace() = default;
+
+ private:
+  friend class Reward;
+  explicit Workspace(std::size_t lanes) : lanes_(lanes) {}
+
+  std::vector<detail::Lanes> lanes_;
+};
+
+// A verified reward. Empty (no features, scores nothing) until it is loaded.
+class Reward {
+ public:
+  int version() const { return weights_.version; }                   // of the schema
+  const std::string& file() const { return file_; }                  // as it was named
+  const std::string& sha256() const { return weights_.sha256; }      // names the reward
+  const std::string& preset() const { return weights_.preset; }      // of the features
+  const std::vector<Feature>& features() const { return weights_.features; }  // [F]
+  const std::vector<float>& times() const { return weights_.times; }          // [T] s
+
+  // Refuses columns that are not the file's, in the file's order and units.
+  Status check_features(const std::vector<std::string>& names,
+                        const std::vector<std::string>& units) const;
+
+  // Memory for `score`, to be made once for each thread.
+  Workspace workspace() const { return Workspace(weights_.network.work_size()); }
+
+  // V of trajectories; higher is better.
+  //
+  //   features   [K, T, F] raw, in the file's order and units, at `times()`; C order:
+  //              feature f of candidate k at time t is features[(k * T + t) * F + f]
+  //   valid      which times count; only candidates with the same mask compare
+  //   workspace  of this reward
+  //   values     [K], written
+  //
+  // Returns how many candidates were refused. Their value is -infinity: a NaN at a valid
+  // time, a mask that is not 0 and 1, a sum beyond float32, or, with a reward by context
+  // (version 2), a first time that is not valid. Infinite features are clipped; at times
+  // that are not valid, features may be anything. Without a reward, or with a workspace
+  // of another one that is too small, all are refused.
+  std::size_t score(const float* features, std::size_t count, Mask valid,
+                    Workspace* workspace, float* values) const noexcept;
+
+ private:
+  friend Status decode(std::string_view data, const std::string& file, Reward* reward);
+
+  std::string file_;
+  detail::Weights weights_;
+};
+
+// Reads and verifies the bytes of a file, schema version 1 or 2; `file` is their name
+// in messages. A failure leaves `reward` as it was.
+inline Status decode(std::string_view data, const std::string& file, Reward* reward) {
+  Reward read;
+  const std::string error = detail::decode(data, &read.weights_);
+  if (!error.empty()) return Status(file + ": " + error);
+  read.file_ = file;
+  *reward = std::move(read);
+  return Status();
+}
+
+// As `decode`, from a regular file.
+inline Status load(const std::string& path, Reward* reward) {
+  const auto refuse = [&path](const char* reason) {
+    return Status(path + ": path: " + reason + ": expected a file");
+  };
+  struct stat found;
+  if (path.find('\0') != std::string::npos) return refuse("a NUL byte");
+  if (stat(path.c_str(), &found) != 0 || !S_ISREG(found.st_mode)) return refuse("no such file");
+  std::FILE* stream = std::fopen(path.c_str(), "rb");
+  if (stream == nullptr) return refuse(std::strerror(errno));
+  // One byte more than allowed: an oversize file is seen, not read.
+  const std::uint64_t most = detail::kMaxFileBytes + 1;
+  std::vector<char> data(
+      static_cast<std::size_t>(std::min(static_cast<std::uint64_t>(found.st_size), most)));
+  const std::size_t size =
+      data.empty() ? 0 : std::fread(data.data(), 1, data.size(), stream);
+  std::fclose(stream);
+  return decode(std::string_view(data.data(), size), path, reward);
+}
+
+// Index of the largest value; `count` if no candidate has one.
+inline std::size_t best(const float* values, std::size_t count) noexcept {
+  std::size_t index = count;
+  float most = -std::numeric_limits<float>::infinity();
+  for (std::size_t k = 0; k < count; ++k) {
+    if (values[k] > most) {
+      most = values[k];
+      index = k;
+    }
+  }
+  return index;
+}
+
+inline Status Reward::check_features(const std::vector<std::string>& names,
+                                     const std::vector<std::string>& units) const {
+  const auto quoted = [](const std::vector<std::string>& texts, std::size_t i) {
+    return i < texts.size() ? "'" + texts[i] + "'" : std::string("None");
+  };
+  const std::vector<Feature>& own = features();
+  const std::size_t given = std::max(names.size(), units.size());
+  for (std::size_t i = 0; i < std::max(given, own.size()); ++i) {
+    const bool both = i < own.size() && i < names.size() && i < units.size();
+    if (both && names[i] == own[i].name && units[i] == own[i].unit) continue;
+    std::string found = "none", wanted = "none";
+    if (i < given) found = "(" + quoted(names, i) + ", " + quoted(units, i) + ")";
+    if (i < own.size()) wanted = "('" + own[i].name + "', '" + own[i].unit + "')";
+    return Status(file_ + ": " + detail::index_text("features", i) + ": " + found +
+                  ": expected " + wanted);
+  }
+  return Status();
+}
+
+inline std::size_t Reward::score(const float* features, std::size_t count, Mask valid,
+                                 Workspace* workspace, float* values) const noexcept {
+  const detail::Network& network = weights_.network;
+  constexpr float kNone = -std::numeric_limits<float>::infinity();
+  if (network.layers.empty() || workspace->lanes_.size() < network.work_size()) {
+    std::fill(values, values + count, kNone);
+    return count;
+  }
+  const std::size_t stride = valid.shape == Mask::kEach ? network.times() : 0;
+  detail::score(network, features, count, {valid.data, stride}, workspace->lanes_.data(),
+                values);
+  return static_cast<std::size_t>(std::count(values, values + count, kNone));
+}
+
+}  // namespace rcirl
+
+#endif  // RCIRL_REWARD_HPP_

@@ -1,0 +1,318 @@
+"""The C++ reader: scores as Python and JAX do, refuses what the Python reader refuses.
+
+Built with the sanitizers, so a read past the end of any file here is a failure; an
+allocation over 256 MB too. Needs cmake, a C++17 compiler and msgpack-c's C headers.
+"""
+
+import dataclasses
+import os
+import re
+import shutil
+import struct
+import subprocess
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import msgpack
+import numpy as np
+import pytest
+
+from rcirl_jax.export import (
+    FeatureSpec,
+    WeightsError,
+    decode_weights,
+    load_weights,
+    reader,
+    save,
+)
+from rcirl_jax.features.mapping import feature_map
+from rcirl_jax.reward.network import LEAKY_SLOPE, RewardConfig, init_reward, pinned
+from rcirl_jax.reward.network import value as trained_value
+from rcirl_jax.reward.normaliser import Normaliser
+from rcirl_jax.units import TIMES_S
+from tests.export import test_reader
+from tests.export.test_weights import example_weights, packed
+
+ONBOARD = Path(__file__).resolve().parents[2] / "onboard"
+VALID = packed(features=2, times=3, hidden=(4,))
+GATED = packed(features=2, times=3, hidden=(4,), by_context=True)
+
+
+def run(*command, **options):
+    done = subprocess.run(
+        [str(part) for part in command], capture_output=True, check=False, **options
+    )
+    assert done.returncode == 0, (done.stdout + done.stderr).decode()[-4000:]
+    return done.stdout
+
+
+def configured(folder, *flags):
+    """A build folder, or a skip with the reason."""
+    compiler = os.environ.get("CXX", "c++")
+    for tool in ("cmake", compiler):
+        if shutil.which(tool) is None:
+            pytest.skip(f"{tool} not found")
+    probe = '#if !__has_include(<msgpack/unpack_template.h>)\n#error "none"\n#endif\n'
+    flag = ("-x", "c++", "-fsyntax-only", "-")
+    headers = subprocess.run(
+        [compiler, *flag], input=probe.encode(), capture_output=True, check=False
+    )
+    if headers.returncode:
+        pytest.skip("msgpack/unpack_template.h not found: install libmsgpack-dev")
+    run("cmake", "-S", ONBOARD, "-B", folder, "-DRCIRL_WERROR=ON", *flags)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def programs(tmp_path_factory):
+    flags = ("-DRCIRL_SANITIZE=ON", "-DCMAKE_CXX_FLAGS_RELEASE=-O1")
+    folder = configured(tmp_path_factory.mktemp("onboard"), *flags)
+    run("cmake", "--build", folder, "--parallel", 2, "--target", "reader", "choose")
+    return folder
+
+
+def verdicts(programs, files, folder):
+    """The C++ reader's line for each file: "ok" or its refusal."""
+    batch = folder / "batch"
+    batch.write_bytes(b"".join(struct.pack("<Q", len(data)) + data for data in files))
+    options = {**os.environ, "ASAN_OPTIONS": "max_allocation_size_mb=256"}
+    lines = run(programs / "reader", "check", batch, env=options).decode().splitlines()
+    assert len(lines) == len(files)
+    return lines
+
+
+def is_valid(data):
+    try:
+        decode_weights(data)
+    except WeightsError:
+        return False
+    return True
+
+
+# ------------------------------------------------------------------------ scores
+
+
+def trained_file(path, hidden, activation, by_context):
+    """A file of a random network, with 10,000 inputs, masks and JAX's values."""
+    specs, rng = feature_map("paper21").specs, np.random.default_rng(3)
+    lower = np.array([spec.lower for spec in specs], np.float32)
+    upper = np.array([spec.upper for spec in specs], np.float32)
+    normaliser = Normaliser(
+        lower=jnp.asarray(lower),
+        upper=jnp.asarray(upper),
+        location=jnp.asarray(rng.uniform(lower, upper), jnp.float32),
+        scale=jnp.asarray(0.2 * (upper - lower)),
+    )
+    context = feature_map("paper21").context if by_context else ()
+    config = RewardConfig(hidden=hidden, activation=activation, context=context)
+    raw = init_reward(jax.random.key(5), len(specs), config)
+    raw = raw.replace(gamma=jnp.asarray(rng.normal(size=18), jnp.float32))
+    if by_context:
+        drawn = rng.normal(scale=0.2, size=(len(specs),) * 2)
+        raw = raw.replace(context=jnp.asarray(drawn, jnp.float32))
+    effective = pinned(raw, config)
+    wide = 0.5 * (upper - lower)
+    features = rng.uniform(lower - wide, upper + wide, (10_000, 18, len(specs)))
+    features = features.astype(np.float32)
+    valid = np.arange(18) < rng.integers(11, 19, (10_000, 1))
+    expected = np.asarray(
+        trained_value(
+            raw, normaliser, jnp.asarray(features), jnp.asarray(valid), config
+        )
+    )
+    weights = dataclasses.replace(
+        example_weights(),
+        features=tuple(
+            FeatureSpec(name=spec.name, unit=spec.unit, none_value=spec.none)
+            for spec in specs
+        ),
+        **{name: getattr(normaliser, name) for name in reader.RANGES},
+        times=TIMES_S,
+        gamma=effective.gamma,
+        context=effective.context,
+        kernels=effective.kernels,
+        biases=(*effective.biases, np.zeros(1)),
+        activation=activation,
+        leaky_slope=LEAKY_SLOPE,
+    )
+    reward = save(path, weights, features[:16], valid[:16], expected[:16])
+    return reward, features, valid, expected
+
+
+@pytest.mark.parametrize(
+    ("hidden", "activation", "by_context"),
+    [
+        ((), "identity", False),
+        ((), "identity", True),
+        ((15,), "tanh", False),
+        ((15,), "tanh", True),
+        ((15,), "leaky_relu", False),
+        ((64,), "tanh", False),
+        ((64,), "relu", True),
+        ((32, 16), "tanh", True),
+        ((32, 16), "relu", False),
+    ],
+)
+def test_ten_thousand_scores_equal_python_and_jax(
+    programs, tmp_path, hidden, activation, by_context
+):
+    path = tmp_path / "weights.msgpack"
+    reward, features, valid, jax_values = trained_file(
+        path, hidden, activation, by_context
+    )
+    features.tofile(tmp_path / "features")
+    valid.astype(np.uint8).tofile(tmp_path / "valid")
+    command = (programs / "reader", "score", path, tmp_path / "features")
+    for mask in ((), (tmp_path / "valid",)):
+        found = np.frombuffer(run(*command, *mask), np.float32)
+        expected = reward.value(features, valid if mask else None)
+        close = 1e-5 * np.maximum(1.0, np.abs(expected))
+        assert np.ptp(expected) > 0.1
+        assert np.all(np.abs(found - expected) <= close)
+        if mask:
+            assert np.all(np.abs(found - jax_values) <= close)
+
+
+def test_choose_takes_the_best_candidate_that_has_a_value(programs, tmp_path):
+    path = tmp_path / "weights.msgpack"
+    path.write_bytes(VALID)
+    reward = load_weights(path)
+    features = np.random.default_rng(0).normal(size=(50, 3, 2)).astype(np.float32)
+    order = np.argsort(reward.value(features))
+    features[order[-1], 1, 0] = np.nan
+    line = run(programs / "choose", path, input=features.tobytes()).decode()
+    found = re.fullmatch(r"candidate (\d+) of 50, value (\S+), 1 refused\n", line)
+    assert found is not None
+    assert int(found[1]) == order[-2]
+    second = reward.value(features[order[-2]])
+    assert float(found[2]) == pytest.approx(float(second), abs=1e-5)
+    for data, message, code in (
+        (features[:1].tobytes()[4:], "stdin: candidates: 5 numbers: expected a mul", 2),
+        (np.full(6, np.nan, "f4").tobytes(), "stdin: candidates: all 1 refused", 1),
+    ):
+        done = subprocess.run(
+            [programs / "choose", path], input=data, capture_output=True, check=False
+        )
+        assert (done.returncode, done.stdout) == (code, b"")
+        assert done.stderr.decode().startswith(message)
+
+
+def test_a_missing_file_has_the_line_of_the_python_reader(programs, tmp_path):
+    missing = tmp_path / "missing"
+    done = subprocess.run(
+        [programs / "choose", missing], capture_output=True, check=False
+    )
+    with pytest.raises(WeightsError) as caught:
+        load_weights(missing)
+    assert (done.returncode, done.stderr.decode()) == (2, f"{caught.value}\n")
+
+
+# ----------------------------------------------------------------------- refuses
+
+
+def test_damaged_files_are_refused_with_one_line(programs, tmp_path):
+    rng = np.random.default_rng(1)
+    files = [VALID[:length] for length in range(0, len(VALID), 3)]
+    for _ in range(2000):
+        bits = rng.integers(0, 8 * len(GATED), rng.integers(1, 9))
+        files.append(test_reader.flipped(GATED, set(bits.tolist())))
+    files += [rng.bytes(int(size)) for size in rng.integers(1, 200, 500)]
+    files.append(VALID.replace(b"sha256\xd9\x40", b"sha256\xd9\x40" + b"0" * 64)[:-64])
+    for line in verdicts(programs, files, tmp_path):
+        assert line.startswith("w: ")
+        assert ": expected " in line
+        assert line.isprintable()
+    assert verdicts(programs, [VALID, GATED], tmp_path) == ["ok", "ok"]
+
+
+def test_wrong_fields_are_named_as_by_the_python_reader(programs, tmp_path):
+    """The cases of the Python reader's own tests."""
+    fields = [
+        test_reader.tampered(path, value)
+        for path, value, _ in _cases(test_reader.test_a_wrong_field_is_named)
+    ]
+    files = [data for data, _ in _cases(test_reader.test_a_wrong_file_is_refused)]
+    assert len(fields) > 50
+    assert len(files) > 20
+    lines = verdicts(programs, fields + files, tmp_path)
+    for data, line in zip(fields + files, lines, strict=True):
+        field = test_reader.refusal(data).split(": ")[0]
+        # The Python reader counts times that do not increase from the second one.
+        place = "times[1]" if "increasing" in line else field
+        assert line.startswith(f"w: {place}: ")
+
+
+def _cases(test):
+    return next(mark.args[1] for mark in test.pytestmark if mark.name == "parametrize")
+
+
+def test_bodies_changed_and_hashed_again_get_the_verdict_of_the_python_reader(
+    programs, tmp_path
+):
+    rng, files = np.random.default_rng(2), []
+    for version, data in ((1, VALID), (2, GATED)):
+        body = msgpack.unpackb(data)["body"]
+        for _ in range(1500):
+            changed = bytearray(body)
+            for _ in range(rng.integers(1, 4)):
+                at = int(rng.integers(0, len(changed)))
+                match rng.integers(0, 4):
+                    case 0:
+                        changed[at] ^= 1 << int(rng.integers(0, 8))
+                    case 1:
+                        changed[at] = int(rng.integers(0, 256))
+                    case 2:
+                        del changed[at]
+                    case _:
+                        changed.insert(at, int(rng.integers(0, 256)))
+            files.append(test_reader.sealed(bytes(changed), schema_version=version))
+    expected = [is_valid(data) for data in files]
+    assert 100 < sum(expected) < len(files) - 1000
+    found = [line == "ok" for line in verdicts(programs, files, tmp_path)]
+    assert found == expected
+
+
+def test_huge_lengths_and_deep_nesting_cost_nothing(programs, tmp_path):
+    """A length allocated before its bytes have come would end the reader."""
+    bombs = [
+        tag + size
+        for tag in (b"\xdd", b"\xdf", b"\xdb", b"\xc6", b"\xc9")
+        for size in (b"\xff\xff\xff\xff", b"\x7f\xff\xff\xff", b"\x10\0\0\0")
+    ]
+    bombs += [bomb * 1000 for bomb in (b"\x91", b"\xdd\0\0\0\2", b"\x81\xa1a")]
+    bombs += [b"\x91" * 10**6, b"\xdc\x0f\xff" * 10**5, b"\xdc\x10\0" + b"\x90" * 4096]
+    bombs += [b"\xdc\x10\0" + (b"\xdc\x10\0" + b"\0" * 4096) * 4096]
+    size = {"shape": [4096, 4096], "dtype": "<f4", "data": b""}
+    bombs += [test_reader.sealed(bomb) for bomb in bombs]
+    bombs.append(test_reader.tampered(["layers", 0, "kernel"], size))
+    for line in verdicts(programs, bombs, tmp_path):
+        assert line.startswith("w: ")
+        assert len(line) < 400
+
+
+# -------------------------------------------------------------------- build system
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("compiler", ["g++", "clang++"])
+def test_own_tests_pass_and_an_installed_copy_is_found(compiler, tmp_path):
+    if shutil.which(compiler) is None:
+        pytest.skip(f"{compiler} not found")
+    prefix = tmp_path / "installed"
+    flags = (f"-DCMAKE_CXX_COMPILER={compiler}", f"-DCMAKE_INSTALL_PREFIX={prefix}")
+    folder = configured(tmp_path / "build", *flags)
+    run("cmake", "--build", folder, "--parallel", 2)
+    run("ctest", "--output-on-failure", cwd=folder)
+    run("cmake", "--install", folder)
+    planner = tmp_path / "planner"
+    planner.mkdir()
+    shutil.copy(ONBOARD / "example/choose.cpp", planner)
+    (planner / "CMakeLists.txt").write_text(
+        "cmake_minimum_required(VERSION 3.16)\nproject(planner CXX)\n"
+        "find_package(rcirl 0.1 REQUIRED)\nadd_executable(planner choose.cpp)\n"
+        "target_link_libraries(planner PRIVATE rcirl::rcirl)\n"
+    )
+    run("cmake", "-S", planner, "-B", planner / "build", *flags)
+    run("cmake", "--build", planner / "build")
+    assert (planner / "build/planner").is_file()
