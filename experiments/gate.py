@@ -18,14 +18,14 @@ from absl import flags
 
 from experiments.common import provenance, run
 from experiments.executor import executor
-from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop import SuiteConfig, drive_here, run_suite
 from rcirl_jax.evaluation.gate import GateConfig, judge
 from rcirl_jax.evaluation.gate_output import format_verdict, write_verdict
-from rcirl_jax.evaluation.gate_runs import CANDIDATE, INCUMBENT, pair_of, repeats
-from rcirl_jax.export.spread import SuiteJob, spread
+from rcirl_jax.evaluation.gate_runs import pair_of, repeats
+from rcirl_jax.evaluation.suite_files import runs_of
+from rcirl_jax.export.gate_job import gate_job
+from rcirl_jax.export.spread import spread
 from rcirl_jax.simulation.rows import BASELINES
-from rcirl_jax.simulation.suite import FULL_S, SMOKE_S, suite_refs
 
 _CANDIDATE = flags.DEFINE_string("candidate", None, "weights file", required=True)
 _INCUMBENT = flags.DEFINE_string(
@@ -53,37 +53,28 @@ _MARGINS = {
 }
 
 
-def _job() -> SuiteJob:
-    """Candidate and incumbent by name, and IDM, whose way the score refers to."""
-    learned = Path(_INCUMBENT.value).suffix != "" or _INCUMBENT.value not in BASELINES
-    files = (_CANDIDATE.value, *((_INCUMBENT.value,) if learned else ()))
-    duration = _DURATION.value or (SMOKE_S if _SUITE.value == "smoke" else FULL_S)
-    if not 1.0 <= duration <= FULL_S:
-        raise InputError(f"--duration: {duration}: expected 1 to {FULL_S:g} s")
-    return SuiteJob(
-        weights=files,
-        names=(CANDIDATE, INCUMBENT)[: len(files)],
-        baselines=tuple({"IDM", *(() if learned else (_INCUMBENT.value,))}),
-        refs=suite_refs(_SUITE.value, _CASES.value, _SEED.value),
-        duration_s=duration,
-        plan_every=_EVERY.value,
-    )
-
-
 def main() -> None:
     """Flags -> one verdict."""
     margins = {name: flag.value for name, flag in _MARGINS.items()}
     config = dataclasses.replace(
         GateConfig(), primary=tuple(_PRIMARY.value or ()), **margins
     )
-    job, places = _job(), executor()
+    places = executor()
+    job, incumbent = gate_job(
+        _CANDIDATE.value,
+        _INCUMBENT.value,
+        suite=_SUITE.value,
+        cases=_CASES.value,
+        duration_s=_DURATION.value,
+        catalogue_seed=_SEED.value,
+        plan_every=_EVERY.value,
+    )
     drive = spread(places, job) if places.workers > 1 else drive_here
     rows, cases = job.rows(), job.cases()
     suite = SuiteConfig(plan_every=_EVERY.value)
     result = run_suite(rows, cases, suite, drive)
     repeats(rows[0], result, suite)
-    incumbent = INCUMBENT if INCUMBENT in result.runs else _INCUMBENT.value
-    verdict = judge(pair_of(result, incumbent), config)
+    verdict = judge(pair_of(runs_of(result), incumbent), config)
     files = {"candidate": _CANDIDATE.value, "incumbent": _INCUMBENT.value}
     facts = {"files": files, **result.facts, "made_by": provenance()}
     write_verdict(Path(_OUTPUT.value), verdict, config, facts)

@@ -16,6 +16,7 @@ from absl import flags
 
 from experiments.common import floats, hidden_sizes, provenance, run
 from rcirl_jax.data.joined import open_datasets
+from rcirl_jax.data.preferences import read_preferences
 from rcirl_jax.errors import InputError
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import LOSSES, RewardConfig
@@ -71,6 +72,12 @@ _NEGATIVES = flags.DEFINE_integer("hard_negatives", 0, "near negatives per scene
 _POOL = flags.DEFINE_integer(
     "hard_pool", 1, "near negatives drawn for each that the present reward keeps"
 )
+_PREFERENCES = flags.DEFINE_string(
+    "preferences", None, "JSON Lines: in a scene, A is better than B"
+)
+_PREFERENCE_WEIGHT = flags.DEFINE_float(
+    "preference_weight", 1.0, "of their mean loss beside that of the demonstrations"
+)
 _SEED = flags.DEFINE_integer("seed", 0, "of initial weights, batches, candidates")
 _PARALLEL = flags.DEFINE_enum("parallel", "jit", PARALLEL, "how the devices share")
 _IN_MEMORY = flags.DEFINE_float(
@@ -97,6 +104,10 @@ def main() -> None:
         raise InputError(f"--margins: {_MARGINS.value}: expected three numbers")
     margins = floats(_MARGINS.value, "margins")
     features = feature_map(_FEATURES.value)
+    dataset = open_datasets(_DATA.value, verify=_VERIFY.value)
+    judged = None
+    if _PREFERENCES.value:
+        judged = read_preferences(Path(_PREFERENCES.value), dataset)
     config = TrainConfig(
         features=_FEATURES.value,
         loss=_LOSS.value,
@@ -115,6 +126,8 @@ def main() -> None:
         train_horizon=_HORIZON.value,
         hard_negatives=_NEGATIVES.value,
         hard_pool=_POOL.value,
+        preferences=judged.sha256 if judged else "",
+        preference_weight=_PREFERENCE_WEIGHT.value,
         seed=_SEED.value,
         reward=RewardConfig(
             hidden=hidden_sizes(_HIDDEN.value),
@@ -133,11 +146,12 @@ def main() -> None:
         checkpoint_every=_SAVE.value,
     )
     result = train(
-        open_datasets(_DATA.value, verify=_VERIFY.value),
+        dataset,
         Path(_WORKDIR.value),
         config,
         running=running,
         provenance=provenance(),
+        preferences=judged,
     )
     if not is_first():
         return

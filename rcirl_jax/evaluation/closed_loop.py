@@ -45,6 +45,10 @@ class SuiteResult:
     runs: Mapping[str, CaseMetrics]
     cases: CaseSet
     preventable: np.ndarray
+    trivial: np.ndarray
+    # who sets the distance of the progress, and how far it got [C]
+    reference: str
+    way: np.ndarray
     # by row: seconds, plans per second, steps between plans
     timings: Mapping[str, Mapping[str, float]]
     facts: Mapping[str, object]  # hashes, memory
@@ -97,20 +101,17 @@ def run_suite(
                 "plan_every_steps": every,
             }
     reference = RECORDED_HUMAN if RECORDED_HUMAN in runs else "IDM"
-    report = summarise(
-        runs,
-        cases.groups,
-        avoidable,
-        calm,
-        reference,
-        {**classified, **runs}[reference],
-    )
+    way = np.asarray({**classified, **runs}[reference].progress)
+    report = summarise(runs, cases.groups, avoidable, calm, reference, way)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     return SuiteResult(
         report=report,
         runs=runs,
         cases=cases,
         preventable=avoidable,
+        trivial=calm,
+        reference=reference,
+        way=way,
         timings=timings,
         facts={
             "duration_s": cases.duration_s,

@@ -113,6 +113,7 @@ def evaluate_ranking(
     learned: Mapping[str, Sequence[Scorer]],
     setup: RankingSetup,
     executor: Executor | None = None,
+    references: Sequence[str] | None = None,
 ) -> RankingReport:
     """Rank the held-out scenes with learned rewards beside all baselines.
 
@@ -125,6 +126,7 @@ def evaluate_ranking(
       learned: row name -> one scorer per training run.
       setup: features, sampler, horizon, split.
       executor: where scenes are scored; default: this process.
+      references: rows that the others are compared with; default: the usual rivals.
 
     Raises:
       InputError: no scene of the split covers the horizon.
@@ -150,7 +152,8 @@ def evaluate_ranking(
     for name in (*BASELINES, *setup.hand_set):
         table[name] = [metrics(name)]
     table["oracle"] = [scene_metrics(*oracle_scorer(outcomes), outcomes)]
-    return build_report(table, outcomes, group=np.asarray(rows.group))
+    groups = np.asarray(rows.group)
+    return build_report(table, outcomes, group=groups, references=references)
 
 
 def oracle_floor(dataset: Demonstrations, setup: RankingSetup, max_scenes: int) -> dict:

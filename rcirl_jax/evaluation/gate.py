@@ -49,6 +49,7 @@ EXIT_CODES: dict[Decision, int] = {
 }
 WORST = 20  # cases named for a person to look at
 MIN_CASES = 30  # below, no interval means anything
+MIN_FAMILY = 10  # cases of a family below which its bootstrap means nothing
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -374,16 +375,19 @@ def _families(pair: Pair, config: GateConfig) -> list[Check]:
             )
         )
         short = way.mean < -config.family_progress and way_p[i] < level
-        found.append(
-            _continuous(
-                "families",
-                f"{name}, progress",
-                way,
-                "fail" if short else "pass",
-                config.family_progress,
-                float(way_p[i]),
-            )
+        outcome: Outcome = "fail" if short else "pass"
+        check = _continuous(
+            "families",
+            f"{name}, progress",
+            way,
+            outcome if total >= MIN_FAMILY else "open",
+            config.family_progress,
+            float(way_p[i]),
         )
+        if total < MIN_FAMILY:
+            note = f"{total} cases: expected at least {MIN_FAMILY}"
+            check = dataclasses.replace(check, note=note)
+        found.append(check)
     return found
 
 

@@ -6,6 +6,7 @@ import numpy as np
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop import SuiteConfig, SuiteResult
 from rcirl_jax.evaluation.gate import Pair
+from rcirl_jax.evaluation.suite_files import SuiteRuns
 from rcirl_jax.evaluation.suite_output import result_hash
 from rcirl_jax.simulation.rollout import LANES
 from rcirl_jax.simulation.rows import Row
@@ -14,14 +15,21 @@ from rcirl_jax.simulation.suite import drive_row, rollout_config
 CANDIDATE, INCUMBENT = "candidate", "incumbent"
 
 
-def pair_of(result: SuiteResult, incumbent: str = INCUMBENT) -> Pair:
-    """Candidate and incumbent of a suite that IDM also drove."""
+def pair_of(runs: SuiteRuns, incumbent: str = INCUMBENT) -> Pair:
+    """Candidate and incumbent of a driven suite.
+
+    Raises:
+      InputError: the suite has no such rows.
+    """
+    for name in (CANDIDATE, incumbent):
+        if name not in runs.rows:
+            raise InputError(f"gate: {name}: expected a row of {', '.join(runs.rows)}")
     return Pair(
-        candidate=result.runs[CANDIDATE],
-        incumbent=result.runs[incumbent],
-        families=result.cases.groups,
-        ids=result.cases.ids,
-        reference=np.asarray(result.runs["IDM"].progress, np.float64),
+        candidate=runs.rows[CANDIDATE],
+        incumbent=runs.rows[incumbent],
+        families=runs.groups,
+        ids=runs.ids,
+        reference=np.asarray(runs.way, np.float64),
     )
 
 

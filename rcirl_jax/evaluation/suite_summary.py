@@ -9,6 +9,7 @@ too short: it is printed because the paper does not say which it means.
 import dataclasses
 from collections.abc import Mapping, Sequence
 
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -109,7 +110,7 @@ def summarise(
     preventable: np.ndarray,
     trivial: np.ndarray,
     reference_name: str,
-    reference: CaseMetrics,
+    way: np.ndarray,
 ) -> SuiteReport:
     """The report of all rows.
 
@@ -119,16 +120,15 @@ def summarise(
       preventable: [C] bool, of `simulation.careful`.
       trivial: [C] bool.
       reference_name: the row that sets the distance.
-      reference: its metrics [C].
+      way: [C] m, how far it got.
     """
     names = np.asarray(families)
     scores = {
-        row: np.asarray(nuplan_score(m, reference.progress)[0])
-        for row, m in runs.items()
+        row: np.asarray(nuplan_score(m, jnp.asarray(way))[0]) for row, m in runs.items()
     }
     _, cluster = np.unique(names, return_inverse=True)
     rows = {
-        row: _row(metrics, scores[row], names, cluster, preventable, reference)
+        row: _row(metrics, scores[row], names, cluster, preventable, way)
         for row, metrics in runs.items()
     }
     first = next(iter(runs))
@@ -185,13 +185,13 @@ def _row(
     names: np.ndarray,
     cluster: np.ndarray,
     preventable: np.ndarray,
-    reference: CaseMetrics,
+    way: np.ndarray,
 ) -> RowSummary:
     low, high = _interval(scores, cluster)
     fault = np.asarray(m.at_fault) > 0
     jerks = COLUMNS[4:]
     parts = ("no_fault", "drivable", "direction", "ttc_bound", "speed_compliance")
-    ratio = float(m.progress.sum() / max(float(reference.progress.sum()), 1e-9))
+    ratio = float(m.progress.sum() / max(float(way.sum()), 1e-9))
     return RowSummary(
         per_case=_rates(m.holds, COLUMNS),
         per_sample=_sample_rates(m.inside, m.samples, COLUMNS),
@@ -226,7 +226,7 @@ def _row(
             "fallback_share": float(np.mean(m.fallback_share)),
             "standing_share": float(np.mean(m.standing_share)),
         },
-        families=_by_family(m, scores, names, preventable, reference),
+        families=_by_family(m, scores, names, preventable, way),
     )
 
 
@@ -235,7 +235,7 @@ def _by_family(
     scores: np.ndarray,
     names: np.ndarray,
     preventable: np.ndarray,
-    reference: CaseMetrics,
+    way: np.ndarray,
 ) -> dict[str, dict[str, float]]:
     found = {}
     for name in dict.fromkeys(names.tolist()):
@@ -244,7 +244,7 @@ def _by_family(
         samples = max(int(m.samples[at].sum()), 1)
         shares = m.inside[at].sum(axis=0) / samples
         passes = m.holds[at].mean(axis=0)
-        reached = float(reference.progress[at].sum())
+        reached = float(way[at].sum())
         found[name] = {
             "cases": float(at.sum()),
             "at_fault": float(fault.sum()),

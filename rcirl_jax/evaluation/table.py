@@ -8,6 +8,7 @@ runs), so rows can be compared; the comparison itself is the paired difference.
 import dataclasses
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -193,7 +194,9 @@ def _estimate(
     if np.all(values[metric] == 1.0):
         low = clopper_pearson(vehicles, vehicles, two_sided)[0]
         return dataclasses.replace(found, value=1.0, low=low, high=1.0, exact=True)
-    return found
+    # stretched run weights can push an end of a share over 0 or 1
+    low, high = max(found.low, 0.0), min(found.high, 1.0)
+    return dataclasses.replace(found, low=low, high=high)
 
 
 def _families(names: Iterable[str], reference: str) -> list[list[str]]:
@@ -262,6 +265,37 @@ def to_json(report: RankingReport) -> dict:
         **dataclasses.asdict(report),
     }
     return {name: _plain(node, name) for name, node in content.items()}
+
+
+def from_json(body: Mapping[str, Any]) -> RankingReport:
+    """The report of `to_json`.
+
+    Raises:
+      InputError: another schema, or a field that is missing or of another kind.
+    """
+    version = (body.get("schema"), body.get("schema_version"))
+    if version != (SCHEMA, SCHEMA_VERSION):
+        raise InputError(
+            f"report: schema: {version}: expected {(SCHEMA, SCHEMA_VERSION)}"
+        )
+    try:
+        estimate = lambda found: Estimate(**found)  # noqa: E731
+        fields = {f.name: body[f.name] for f in dataclasses.fields(RankingReport)}
+        fields["rows"] = {
+            row: {metric: estimate(found) for metric, found in metrics.items()}
+            for row, metrics in body["rows"].items()
+        }
+        fields["comparisons"] = tuple(
+            Comparison(**{**found, "difference": Difference(**found["difference"])})
+            for found in body["comparisons"]
+        )
+        medians = body["human_rank_median"]
+        fields["human_rank_median"] = {row: estimate(x) for row, x in medians.items()}
+        for name in ("oracle_floor", "oracle_floor_median"):
+            fields[name] = estimate(body[name])
+    except (KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"report: {error}: expected a ranking report") from error
+    return RankingReport(**fields)
 
 
 def _plain(node: object, where: str) -> "dict | list | str | float | int | bool | None":

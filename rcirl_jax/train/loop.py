@@ -16,6 +16,7 @@ import numpy as np
 
 from rcirl_jax.data.joined import Demonstrations
 from rcirl_jax.data.pipeline import split_batches
+from rcirl_jax.data.preferences import Preferences
 from rcirl_jax.data.stream import Prefetch
 from rcirl_jax.errors import InputError
 from rcirl_jax.features import FeatureMap, feature_map
@@ -23,6 +24,7 @@ from rcirl_jax.reward import Normaliser, fit_normaliser
 from rcirl_jax.train.checkpoint import Checkpoints
 from rcirl_jax.train.metrics import MetricsWriter, Progress
 from rcirl_jax.train.parallel import Parallel, parallelise
+from rcirl_jax.train.preferences import featurise_preferences, pairs_of_step
 from rcirl_jax.train.processes import is_first
 from rcirl_jax.train.running import Running, check_run, describe_run
 from rcirl_jax.train.state import Batch, FeatureBatch, TrainConfig, TrainState
@@ -41,7 +43,10 @@ def to_device_batch(
 
 
 def host_batch(
-    demonstrations: Demonstration, weight: np.ndarray, index: np.ndarray
+    demonstrations: Demonstration,
+    weight: np.ndarray,
+    index: np.ndarray,
+    preferences: FeatureBatch | None = None,
 ) -> Batch:
     """Numpy rows -> a Batch of numpy arrays of the step's types."""
     weight, index = np.asarray(weight, np.float32), np.asarray(index, np.int32)
@@ -49,6 +54,7 @@ def host_batch(
         demonstrations=demonstrations,
         weight=cast(jax.Array, weight),
         index=cast(jax.Array, index),
+        preferences=preferences,
     )
 
 
@@ -99,6 +105,7 @@ def train(
     *,
     running: Running | None = None,
     provenance: dict | None = None,
+    preferences: Preferences | None = None,
 ) -> TrainResult:
     """Train on the dataset's training split; resumes from the last checkpoint.
 
@@ -108,12 +115,16 @@ def train(
       config: everything that decides the result.
       running: what does not: devices, memory, checkpoints.
       provenance: extra facts for run.json.
+      preferences: pairs that people judged, of this dataset; `config.preferences`
+        is their hash.
 
     Raises:
       InputError: the workdir belongs to other settings or another dataset, or
         a feature turns NaN or infinite (names scene and feature).
     """
     running = running or Running()
+    if config.preferences != (preferences.sha256 if preferences else ""):
+        raise ValueError("config.preferences: expected the hash of the preferences")
     train_step = make_train_step(config, whole=running.parallel == "jit_sharded")
     parallel = parallelise(train_step, running.parallel, config.batch_size)
     check_run(workdir, config, dataset)
@@ -137,6 +148,8 @@ def train(
         batches.restore(position)
     describe_run(workdir, config, dataset, provenance or {})
     run = _Run(config, running, features, batches.batches_per_epoch, workdir, state)
+    if preferences is not None:
+        run.judged = featurise_preferences(preferences, dataset, config)
 
     def produce() -> tuple:
         if batches.state()["epoch"] >= config.epochs:
@@ -198,6 +211,7 @@ class _Run:
         self.writer = MetricsWriter(workdir, first_step) if is_first() else None
         self.progress = Progress(total, first_step, "train", shown=is_first())
         self.summaries: list[dict] = []
+        self.judged: FeatureBatch | None = None  # preferences, all of them
 
     def close(self) -> None:
         if self.writer is not None:
@@ -215,7 +229,8 @@ class _Run:
             sums = np.zeros(4)
             for _ in range(self.per_epoch - int(state.step) % self.per_epoch):
                 (rows, weight, number), position = next(batches)
-                batch = parallel.place(host_batch(rows, weight, number))
+                judged = self._judged_at(int(state.step))
+                batch = parallel.place(host_batch(rows, weight, number, judged))
                 state, metrics = parallel.step(state, batch)
                 step = int(state.step)
                 sums += self._after_step(step, metrics)
@@ -224,6 +239,18 @@ class _Run:
                 self.running.on_step(step)
             self.summaries.append(_summary(epoch, sums))
         return state
+
+    def _judged_at(self, step: int) -> FeatureBatch | None:
+        if self.judged is None:
+            return None
+        return pairs_of_step(
+            self.judged,
+            step,
+            most=self.config.batch_size,
+            devices=jax.device_count(),
+            process=jax.process_index(),
+            processes=jax.process_count(),
+        )
 
     def _is_due(self, step: int) -> bool:
         every = self.running.checkpoint_every
@@ -241,6 +268,9 @@ class _Run:
             rate = self.progress.queries / self.progress.seconds
             norm = float(metrics.grad_norm)
             more = {"grad_norm": norm, "pairs": pairs, "queries_per_s": rate}
+            if self.judged is not None:
+                won, all_of = (float(x) for x in metrics.preferred)
+                more["preferences_won"] = won / max(all_of, 1.0)
             self.writer.write(step, {**shown, **more})
         counted = (metrics.loss_sum, metrics.terms, metrics.wins, metrics.pairs)
         return np.array([float(x) for x in counted])

@@ -47,10 +47,11 @@ def check_run(workdir: Path, config: TrainConfig, dataset: Demonstrations) -> No
         return
     found = _read_run(path)
     described = _described(config, dataset)
+    usual = _described(TrainConfig(), dataset)["config"]  # of settings added since
     if found.get("dataset_hash") != described["dataset_hash"]:
         raise InputError(f"{path}: dataset_hash: made from another dataset")
     for name, setting in described["config"].items():
-        before = found["config"].get(name)
+        before = found["config"].get(name, usual[name])
         if before != setting and name != "epochs":
             raise InputError(
                 f"{path}: {name}: {before}: expected {setting} to resume; "

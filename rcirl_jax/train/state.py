@@ -47,6 +47,7 @@ RANGES: dict[str, tuple[float, float, str]] = {
     **dict.fromkeys(("batch_size", "epochs", "hard_pool"), (1, np.inf, ">= 1")),
     "seed": (0, 2**31 - 1, "0 to 2147483647"),
     "soft_distance": (1e-6, np.inf, "> 0 m"),
+    "preference_weight": (1e-9, np.inf, "> 0"),
     "train_horizon": (0.4, 8.0, "0.4 to 8 s"),
 }
 
@@ -89,6 +90,9 @@ class TrainConfig:
     # so many times more are drawn each time; those that the reward values most
     # just then are kept (1: all are)
     hard_pool: int = 1
+    # sha256 of the file of human preferences, "" without; their loss counts so much
+    preferences: str = ""
+    preference_weight: float = 1.0
     seed: int = 0
     reward: RewardConfig = dataclasses.field(default_factory=RewardConfig)
     sampler: SamplerConfig = dataclasses.field(default_factory=SamplerConfig)
@@ -120,14 +124,6 @@ class TrainState(flax.struct.PyTreeNode, kw_only=True):
     opt_state: optax.OptState
     key: jax.Array  # typed PRNG key; folded, never split away
     normaliser: Normaliser
-
-
-class Batch(flax.struct.PyTreeNode, kw_only=True):
-    """Scenes of one step; candidates and features are made on the device."""
-
-    demonstrations: Demonstration  # [B, ...]
-    weight: jax.Array  # [B] 1, or 0 for padding
-    index: jax.Array  # [B] int32, row in the dataset; seeds the sampler
 
 
 class Facts(flax.struct.PyTreeNode, kw_only=True):
@@ -162,6 +158,16 @@ class FeatureBatch(flax.struct.PyTreeNode, kw_only=True):
         """[B, K, T] bool, `time_valid` for every candidate."""
         shape = (*self.feasible.shape, self.time_valid.shape[-1])
         return jnp.broadcast_to(self.time_valid[:, None], shape)
+
+
+class Batch(flax.struct.PyTreeNode, kw_only=True):
+    """Scenes of one step; candidates and features are made on the device."""
+
+    demonstrations: Demonstration  # [B, ...]
+    weight: jax.Array  # [B] 1, or 0 for padding
+    index: jax.Array  # [B] int32, row in the dataset; seeds the sampler
+    # pairs that people judged, K = 1, of any scenes
+    preferences: FeatureBatch | None = None
 
 
 def make_optimizer(config: TrainConfig) -> optax.GradientTransformation:

@@ -4,6 +4,7 @@ Shards carry (sum, count) and divide once after `psum`: a mean of shard means
 is wrong when shards hold different numbers of pairs.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -60,6 +61,7 @@ class StepMetrics(flax.struct.PyTreeNode, kw_only=True):
     terms: jax.Array  # [] what the loss is divided by: pairs or scenes
     wins: jax.Array  # [] pairs the human wins, ties half
     pairs: jax.Array  # [] feasible pairs (queries)
+    preferred: jax.Array  # [2] preferences that the better one wins, and all
     grad_norm: jax.Array  # []
     nonfinite: jax.Array  # [F] values that are NaN or infinite, per feature
     first_bad: jax.Array  # [] dataset row of a scene with such a value, or -1
@@ -321,14 +323,17 @@ def make_train_step(
     With `axis_name` the step runs inside pmap or shard_map and sums over that
     axis. `whole` works the batch off at once, for a compiler that shares it over
     devices by itself and would gather it for a loop. A step whose loss or gradient
-    is not finite leaves the state as it was and says so in the metrics.
+    is not finite leaves the state as it was and says so in the metrics. Preferences
+    of a Batch add their own mean loss, times `preference_weight`.
     """
     features = feature_map(config.features)
     optimizer = make_optimizer(config)
+    alone = dataclasses.replace(config, hard_negatives=0)  # preferences are as given
 
     def train_step(
         state: TrainState, batch: Batch | FeatureBatch, *, axis_name: str | None = None
     ) -> tuple[TrainState, StepMetrics]:
+        judged = batch.preferences if isinstance(batch, Batch) else None
         if isinstance(batch, Batch):
             key = jax.random.fold_in(state.key, state.step)
             batch = featurise(key, batch, config, features)
@@ -342,6 +347,14 @@ def make_train_step(
             sums, grads, nonfinite = jax.lax.psum((sums, grads, nonfinite), axis_name)
             first_bad = jax.lax.pmax(first_bad, axis_name)
         grads = jax.tree.map(lambda g: g / jnp.maximum(sums.terms, 1.0), grads)
+        preferred = jnp.zeros(2)
+        if judged is not None:
+            more, wanted = gradient_sums(state.params, state.normaliser, judged, alone)
+            if axis_name is not None:
+                more, wanted = jax.lax.psum((more, wanted), axis_name)
+            scale = config.preference_weight / jnp.maximum(wanted.terms, 1.0)
+            grads = jax.tree.map(lambda g, m: g + scale * m, grads, more)
+            preferred = jnp.stack([wanted.wins, wanted.pairs])
         norm = optax.tree.norm(grads)
         finite = jnp.isfinite(sums.loss) & jnp.isfinite(norm)
         before = as_tree(state.params)
@@ -360,6 +373,7 @@ def make_train_step(
             terms=sums.terms,
             wins=sums.wins,
             pairs=sums.pairs,
+            preferred=preferred,
             grad_norm=norm,
             nonfinite=nonfinite,
             first_bad=first_bad,

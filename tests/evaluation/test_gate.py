@@ -147,6 +147,9 @@ def test_too_few_cases_cannot_be_judged():
     assert verdict.decision == "could not judge"
     assert verdict.exit_code == 2
     assert "600 cases can never prove" in verdict.reasons[0]
+    names = [f"family{i // 8}" for i in range(600)]
+    scattered = judge(dataclasses.replace(few, families=names), GateConfig())
+    assert any("8 cases: expected at least 10" in r for r in scattered.reasons)
     assert judge(few, GateConfig(collision_free=0.01, min_ttc=0.01, speed_limit=0.01,
                                  on_road=0.01)).decision == "no difference"  # fmt: skip
 

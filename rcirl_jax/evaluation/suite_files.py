@@ -1,0 +1,110 @@
+"""A driven suite on disk: every metric of every case, for tables and gates later.
+
+One npz without pickled objects: `row<i>.<metric>` arrays [C, ...], the rows' names,
+ids and groups of the cases, and what the summary needs besides.
+"""
+
+import dataclasses
+import os
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.closed_loop import SuiteResult
+from rcirl_jax.evaluation.suite_summary import SuiteReport, summarise
+from rcirl_jax.simulation.metrics import CaseMetrics
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SuiteRuns:
+    """Metrics of all rows on the same C cases."""
+
+    rows: Mapping[str, CaseMetrics]  # leaves [C, ...]
+    ids: tuple[str, ...]
+    groups: tuple[str, ...]
+    preventable: np.ndarray  # [C] bool
+    trivial: np.ndarray  # [C] bool
+    reference: str  # who sets the distance
+    way: np.ndarray  # [C] m, how far it got
+
+    def report(self) -> SuiteReport:
+        """The table."""
+        return summarise(
+            self.rows,
+            self.groups,
+            self.preventable,
+            self.trivial,
+            self.reference,
+            self.way,
+        )
+
+
+def runs_of(result: SuiteResult) -> SuiteRuns:
+    """What is kept of a suite just driven."""
+    return SuiteRuns(
+        rows=result.runs,
+        ids=result.cases.ids,
+        groups=result.cases.groups,
+        preventable=result.preventable,
+        trivial=result.trivial,
+        reference=result.reference,
+        way=result.way,
+    )
+
+
+def write_runs(path: Path, runs: SuiteRuns) -> None:
+    """Write the file, atomically."""
+    arrays = {
+        "names": np.array(list(runs.rows)),
+        "ids": np.array(runs.ids),
+        "groups": np.array(runs.groups),
+        "preventable": np.asarray(runs.preventable, bool),
+        "trivial": np.asarray(runs.trivial, bool),
+        "reference": np.array(runs.reference),
+        "way": np.asarray(runs.way),
+    }
+    for number, metrics in enumerate(runs.rows.values()):
+        for field in dataclasses.fields(CaseMetrics):
+            value = np.asarray(getattr(metrics, field.name))
+            arrays[f"row{number}.{field.name}"] = value
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(path.name + ".tmp")
+    with part.open("wb") as file:
+        np.savez_compressed(file, **arrays)
+    os.replace(part, path)
+
+
+def read_runs(path: Path) -> SuiteRuns:
+    """The suite of a file.
+
+    Raises:
+      InputError: missing, damaged, or not such a file.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as found:
+            arrays = {name: found[name] for name in found.files}
+        names = arrays["names"].tolist()
+        rows = {
+            name: CaseMetrics(
+                **{
+                    field.name: arrays[f"row{number}.{field.name}"]
+                    for field in dataclasses.fields(CaseMetrics)
+                }
+            )
+            for number, name in enumerate(names)
+        }
+        return SuiteRuns(
+            rows=rows,
+            ids=tuple(arrays["ids"].tolist()),
+            groups=tuple(arrays["groups"].tolist()),
+            preventable=arrays["preventable"],
+            trivial=arrays["trivial"],
+            reference=str(arrays["reference"]),
+            way=arrays["way"],
+        )
+    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        why = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"{path}: {why}: expected the metrics of a suite") from error

@@ -1,0 +1,57 @@
+"""Which rows and cases a gate drives, by names and files."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.gate_runs import CANDIDATE, INCUMBENT
+from rcirl_jax.export.spread import SuiteJob
+from rcirl_jax.simulation.rows import BASELINES
+from rcirl_jax.simulation.suite import FULL_S, SMOKE_S, suite_refs
+
+
+def gate_job(
+    candidate: str,
+    incumbent: str,
+    *,
+    suite: str,
+    cases: int | None,
+    duration_s: float | None,
+    catalogue_seed: int,
+    plan_every: int,
+    rivals: Sequence[str] = ("IDM",),
+) -> tuple[SuiteJob, str]:
+    """The suite that both drive, and the name of the incumbent's row.
+
+    Args:
+      candidate: weights file.
+      incumbent: weights file, or the name of a baseline.
+      suite: full, smoke, or families with commas.
+      cases: per family; None: as declared.
+      duration_s: of a case; None: 120 s, smoke 20 s.
+      catalogue_seed: of the cases.
+      plan_every: steps of 0.1 s between two plans.
+      rivals: further baselines.
+
+    Raises:
+      InputError: a duration, suite or count that cannot be.
+    """
+    learned = incumbent not in BASELINES
+    duration = duration_s or (SMOKE_S if suite == "smoke" else FULL_S)
+    if not 1.0 <= duration <= FULL_S:
+        raise InputError(f"--duration: {duration}: expected 1 to {FULL_S:g} s")
+    if learned and not Path(incumbent).is_file():
+        raise InputError(
+            f"--incumbent: {incumbent}: expected a weights file or one of "
+            + ", ".join(BASELINES)
+        )
+    baselines = dict.fromkeys([*([] if learned else [incumbent]), *rivals])
+    job = SuiteJob(
+        weights=(candidate, incumbent) if learned else (candidate,),
+        names=(CANDIDATE, INCUMBENT) if learned else (CANDIDATE,),
+        baselines=tuple(baselines),
+        refs=suite_refs(suite, cases, catalogue_seed),
+        duration_s=duration,
+        plan_every=plan_every,
+    )
+    return job, INCUMBENT if learned else incumbent

@@ -1,0 +1,135 @@
+"""Stages of a run: each is done once for its inputs, and again when they change.
+
+RUN/stages.json names, for every finished stage, the settings and hashes it was made
+from and the sha256 of what it made. A stage is skipped if both are as they were; a
+killed run goes on with the first stage that is not. One process at a time.
+"""
+
+import contextlib
+import dataclasses
+import fcntl
+import hashlib
+import json
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rcirl_jax.errors import InputError
+
+FILE = "stages.json"
+SCHEMA_VERSION = 1
+
+
+def file_sha256(path: Path) -> str:
+    """Of a file's bytes."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def digest(node: Any) -> str:  # noqa: ANN401
+    """Sha256 of anything that JSON can say."""
+    text = json.dumps(node, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Stages:
+    """The stages of one run folder."""
+
+    folder: Path
+
+    def run(
+        self,
+        name: str,
+        inputs: Mapping[str, Any],
+        outputs: Sequence[Path],
+        work: Callable[[], object],
+    ) -> bool:
+        """Do the work unless it has been done from these inputs.
+
+        Args:
+          name: of the stage.
+          inputs: settings and hashes that decide the outputs; JSON.
+          outputs: files that the work writes, below the folder.
+          work: writes them.
+
+        Returns:
+          Whether it was done now.
+
+        Raises:
+          InputError: the work left an output unwritten.
+        """
+        known = self.read().get(name, {})
+        if known.get("key") == digest(inputs) and self._intact(known, outputs):
+            return False
+        begin = time.monotonic()
+        work()
+        made = {}
+        for path in outputs:
+            if not path.is_file():
+                raise InputError(f"{path}: missing after stage {name}")
+            made[str(path.relative_to(self.folder))] = file_sha256(path)
+        record = {
+            "key": digest(inputs),
+            "inputs": dict(inputs),
+            "outputs": made,
+            "seconds": round(time.monotonic() - begin, 1),
+        }
+        self._write({**self.read(), name: record})
+        return True
+
+    def _intact(self, known: Mapping[str, Any], outputs: Sequence[Path]) -> bool:
+        made = known.get("outputs", {})
+        names = [str(path.relative_to(self.folder)) for path in outputs]
+        return sorted(made) == sorted(names) and all(
+            path.is_file() and file_sha256(path) == made[name]
+            for path, name in zip(outputs, names, strict=True)
+        )
+
+    def read(self) -> dict[str, Any]:
+        """Finished stages by name.
+
+        Raises:
+          InputError: the file is not one of this version.
+        """
+        path = self.folder / FILE
+        if not path.exists():
+            return {}
+        try:
+            body = json.loads(path.read_text())
+            version, stages = body["schema_version"], dict(body["stages"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise InputError(
+                f"{path}: damaged: expected the stages of a run"
+            ) from error
+        if version != SCHEMA_VERSION:
+            raise InputError(
+                f"{path}: schema_version: {version}: expected {SCHEMA_VERSION}"
+            )
+        return stages
+
+    def _write(self, stages: Mapping[str, Any]) -> None:
+        body = {"schema_version": SCHEMA_VERSION, "stages": dict(stages)}
+        part = self.folder / (FILE + ".tmp")
+        part.write_text(json.dumps(body, indent=2, allow_nan=False) + "\n")
+        os.replace(part, self.folder / FILE)
+
+
+@contextlib.contextmanager
+def only_one(folder: Path) -> Iterator[None]:
+    """Hold a folder for this process.
+
+    Raises:
+      InputError: another process holds it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / ".lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise InputError(
+                f"{folder}: in use by another process: expected one run at a time"
+            ) from error
+        yield

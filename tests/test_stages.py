@@ -1,0 +1,88 @@
+"""Stages: done once for their inputs, again when inputs or outputs change."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.stages import FILE, Stages, only_one
+
+
+@pytest.fixture
+def stages(tmp_path):
+    return Stages(folder=tmp_path)
+
+
+def step(stages, text, inputs, name="one"):
+    """One stage that writes a file; whether it ran."""
+    path = stages.folder / f"{name}.txt"
+    return stages.run(name, inputs, [path], lambda: path.write_text(text))
+
+
+def test_a_stage_is_done_once_for_its_inputs(stages):
+    assert step(stages, "a", {"x": 1})
+    assert not step(stages, "b", {"x": 1})
+    assert (stages.folder / "one.txt").read_text() == "a"
+    assert step(stages, "c", {"x": 2})
+    assert (stages.folder / "one.txt").read_text() == "c"
+
+
+@pytest.mark.parametrize("harm", ["edit", "delete"])
+def test_a_harmed_output_is_made_again(stages, harm):
+    step(stages, "a", {"x": 1})
+    path = stages.folder / "one.txt"
+    path.write_text("other") if harm == "edit" else path.unlink()
+    assert step(stages, "a", {"x": 1})
+    assert path.read_text() == "a"
+
+
+def test_what_fails_is_not_noted(stages):
+    def fail():
+        (stages.folder / "one.txt").write_text("half")
+        raise InputError("no")
+
+    with pytest.raises(InputError, match="no"):
+        stages.run("one", {}, [stages.folder / "one.txt"], fail)
+    assert step(stages, "a", {})
+    with pytest.raises(InputError, match=r"two\.txt: missing after stage two"):
+        stages.run("two", {}, [stages.folder / "two.txt"], lambda: None)
+
+
+def test_stages_do_not_disturb_each_other(stages):
+    step(stages, "a", {"x": 1}, "one")
+    step(stages, "b", {"x": 1}, "two")
+    assert not step(stages, "a", {"x": 1}, "one")
+    found = stages.read()
+    assert list(found) == ["one", "two"]
+    assert found["one"]["inputs"] == {"x": 1}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "damaged"),
+        ("[]", "damaged"),
+        (json.dumps({"schema_version": 9, "stages": {}}), "9: expected 1"),
+    ],
+)
+def test_a_damaged_file_is_one_line(stages, text, message):
+    (stages.folder / FILE).write_text(text)
+    with pytest.raises(InputError, match=message):
+        step(stages, "a", {})
+
+
+@pytest.mark.multiprocess
+def test_a_second_process_is_refused(tmp_path):
+    code = (
+        "import sys; from pathlib import Path; from rcirl_jax.stages import only_one\n"
+        "with only_one(Path(sys.argv[1])): print('held')"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path)]
+    with only_one(tmp_path):
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode != 0
+        assert "in use by another process" in done.stderr
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.stdout == "held\n"
