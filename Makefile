@@ -19,9 +19,9 @@ $(VENV)/.installed: pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
 	@touch $@
 
-# The main job, end to end, on synthetic human traffic: import, train, rank, export, draw.
+# The main job, end to end, on synthetic human traffic: import, train, rank, simulate, gate, report.
 demo: setup
-	$(BIN)/python -m experiments.demo --output=$(OUT)
+	$(BIN)/python -m experiments.autotune --workdir=$(OUT) --stride=6 --epochs=6 --cases=10 --duration=20
 
 test: setup
 	$(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal -m "not slow and not dataset"

@@ -1,7 +1,9 @@
 """Pictures of example frames under an exported reward."""
 
 import dataclasses
+import functools
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -9,13 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.data.joined import Demonstrations
-from rcirl_jax.evaluation.score import EVALUATION_SEED
+from rcirl_jax.evaluation.score import candidates_key
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.features import feature_map
 from rcirl_jax.report import plots
 from rcirl_jax.sampling import SamplerConfig, sample
 from rcirl_jax.train.step import human_of
-from rcirl_jax.types import Decision, Tag
+from rcirl_jax.types import Decision, Demonstration, Tag
 
 WANTED = (
     Tag.STOPPING,
@@ -56,6 +58,19 @@ class DrawnFrame:
     chosen_s: np.ndarray  # [T] m
 
 
+@functools.cache
+def _sampled(preset: str, sampler: SamplerConfig) -> Callable:
+    """One scene -> candidates, human, and the features of both; one program."""
+    features = feature_map(preset)
+
+    def made(key: jax.Array, one: Demonstration) -> tuple:
+        candidates, human = sample(key, one.scene, sampler), human_of(one, sampler)
+        x = features.of_candidates(one.scene, candidates)
+        return candidates, human, x, features(one.scene, human)
+
+    return jax.jit(made)
+
+
 def draw_frame(
     dataset: Demonstrations,
     reward: Reward,
@@ -66,14 +81,11 @@ def draw_frame(
     st_graph: Path | None = None,
 ) -> DrawnFrame:
     """The six-panel figure of one scene, and its ST graph if a path is given."""
-    features = feature_map(reward.preset)
     rows = dataset.read(np.array([row]))
     one = jax.tree.map(lambda x: jnp.asarray(x[0]), rows)
-    key = jax.random.fold_in(jax.random.key(EVALUATION_SEED), row)
-    candidates = sample(key, one.scene, sampler)
-    human = human_of(one, sampler)
-    x = np.asarray(features.of_candidates(one.scene, candidates))
-    x_human = np.asarray(features(one.scene, human))
+    made = _sampled(reward.preset, sampler)(candidates_key(jnp.asarray(row)), one)
+    candidates, human = made[:2]
+    x, x_human = map(np.asarray, made[2:])
     valid = np.asarray(one.scene.time_valid)
     values = reward.value(x, np.broadcast_to(valid, x.shape[:2]))
     feasible = np.asarray(candidates.feasible)
@@ -87,7 +99,7 @@ def draw_frame(
         chosen,
         human_features=x_human,
         chosen_features=x[chosen],
-        names=features.names,
+        names=feature_map(reward.preset).names,
     )
     if st_graph is not None:
         plots.st_graph(st_graph, drawn, candidates, chosen)

@@ -17,7 +17,7 @@ h1 {{ font-size: 1.5rem; }} h2 {{ font-size: 1.15rem; margin-top: 2rem; }}
 pre {{ overflow-x: auto; font-size: .8rem; background: #f6f6f6; padding: .8rem; }}
 img {{ max-width: 100%; height: auto; }}
 figure {{ margin: 1rem 0; }} figcaption {{ color: #444; font-size: .9rem; }}
-</style></head><body>
+</style>{head}</head><body>
 <h1>{title}</h1>
 <p>{lead}</p>
 {body}
@@ -43,10 +43,23 @@ def picture_section(heading: str, pictures: Sequence[tuple[Path, str]]) -> str:
     return f"<h2>{html.escape(heading)}</h2>\n" + "\n".join(figures)
 
 
-def write_page(path: Path, title: str, lead: str, sections: Sequence[str]) -> Path:
-    """Write the page atomically; nothing in it refers to another file."""
+def write_page(
+    path: Path, title: str, lead: str, sections: Sequence[str], head: str = ""
+) -> Path:
+    """Write the page atomically; nothing in it refers to another file.
+
+    Args:
+      path: HTML to write.
+      title: heading, escaped here.
+      lead: first paragraph, escaped here.
+      sections: HTML of the body.
+      head: HTML that is added to the head: style, policies.
+    """
     page = PAGE.format(
-        title=html.escape(title), lead=html.escape(lead), body="\n".join(sections)
+        title=html.escape(title),
+        lead=html.escape(lead),
+        body="\n".join(sections),
+        head=head,
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(".tmp")

@@ -1,0 +1,381 @@
+"""The tuning loop: data -> rewards -> ranking -> simulation -> verdict -> report.
+
+RUN/dataset-KEY/       the import, unless a dataset is given
+RUN/train-KEY/seed-N/  training runs; KEY changes with what they are made from
+RUN/seeds/N.msgpack    every seed's reward
+RUN/weights.msgpack    the candidate: of the seeds the one with the median share of
+                       training pairs won
+RUN/ranking.json       held-out scenes, all seeds beside rivals and incumbent
+RUN/suite/             metrics.npz, suite.json, cases.csv, table.txt
+RUN/verdict.json       of the gate
+RUN/report.html        all of it to look at
+RUN/stages.json        what made what (`stages`)
+"""
+
+import dataclasses
+import json
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from rcirl_jax.data.cut import Part
+from rcirl_jax.data.importers import parts
+from rcirl_jax.data.importing import ImportConfig, import_parts
+from rcirl_jax.data.store import Dataset, open_dataset
+from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.closed_loop import (
+    SuiteConfig,
+    drive_here,
+    run_suite,
+    write_suite,
+)
+from rcirl_jax.evaluation.evaluate import RankingSetup, evaluate_ranking
+from rcirl_jax.evaluation.format import format_table
+from rcirl_jax.evaluation.gate import GateConfig, Verdict, judge
+from rcirl_jax.evaluation.gate_output import format_verdict, write_verdict
+from rcirl_jax.evaluation.gate_runs import CANDIDATE, INCUMBENT, pair_of, repeats
+from rcirl_jax.evaluation.suite_files import read_runs, runs_of, write_runs
+from rcirl_jax.evaluation.table import from_json, to_json
+from rcirl_jax.executor import Executor
+from rcirl_jax.export.from_run import export_run
+from rcirl_jax.export.gate_job import gate_job
+from rcirl_jax.export.loading import open_reward
+from rcirl_jax.export.reader import Reward
+from rcirl_jax.export.spread import SuiteJob, spread
+from rcirl_jax.report.replays import make_replays
+from rcirl_jax.report.tuning_page import TuningReport, write_tuning_page
+from rcirl_jax.sampling import SamplerConfig
+from rcirl_jax.simulation.rows import BASELINES
+from rcirl_jax.stages import Stages, digest, file_sha256
+from rcirl_jax.train.loop import train
+from rcirl_jax.train.running import Running
+from rcirl_jax.train.state import TrainConfig
+
+STAGES = ("import", "train", "rank", "simulate", "gate", "report")
+RIVALS = ("hand-set", "IDM", "random weights")
+REPLAYS = 6  # cases to play in the report
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TuneConfig:
+    """Everything that decides the outcome, besides the data."""
+
+    train: TrainConfig
+    gate: GateConfig
+    incumbent: str = "hand-set"  # weights file or baseline
+    seeds: int = 1
+    horizon_s: float = 5.0
+    suite: str = "full"
+    cases: int | None = None  # per family
+    duration_s: float | None = None
+    catalogue_seed: int = 0
+    plan_every: int = 1
+
+    def __post_init__(self) -> None:
+        """Reject what would fail only after the training."""
+        if self.seeds < 1:
+            raise InputError(f"--seeds: {self.seeds}: expected at least 1")
+        if self.train.sampler.mode != "speed":
+            raise InputError(
+                f"--mode: {self.train.sampler.mode}: the closed loop plans speed"
+            )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Logs:
+    """Recordings to import: as `experiments.import_logs` takes them."""
+
+    format: str
+    input: Path | None
+    source: Path | None
+    config: ImportConfig
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Loop:
+    """One run folder with its settings."""
+
+    folder: Path
+    config: TuneConfig
+    executor: Executor
+    running: Running
+    facts: Mapping[str, Any]  # provenance: commit, versions, flags
+    say: Callable[[str], object] = print
+
+    @property
+    def stages(self) -> Stages:
+        """What has been done."""
+        return Stages(folder=self.folder)
+
+    @property
+    def weights(self) -> Path:
+        """The candidate."""
+        return self.folder / "weights.msgpack"
+
+    def _run(
+        self,
+        name: str,
+        inputs: Mapping[str, Any],
+        outputs: list[Path],
+        work: Callable[[], object],
+    ) -> None:
+        code = {"commit": self.facts["git_commit"], "versions": self.facts["versions"]}
+        done = self.stages.run(name, {**inputs, **code}, outputs, work)
+        self.say(f"[{name}] {'done' if done else 'as before, kept'}")
+
+    def until(self, last: str, given: str | Logs) -> None:
+        """Run the stages in order, up to and with `last`; says what comes of it."""
+        # what would fail only after hours of work
+        if self.config.incumbent not in BASELINES:
+            open_reward(self.config.incumbent)
+        self._job()
+        dataset = self.data(given)
+        steps: dict[str, Callable[[], object]] = {
+            "import": lambda: None,
+            "train": lambda: self.train(dataset),
+            "rank": lambda: self.rank(dataset),
+            "simulate": self.simulate,
+            "gate": self.gate,
+            "report": lambda: self.report(dataset),
+        }
+        for name in STAGES[: STAGES.index(last) + 1]:
+            steps[name]()
+        if last in ("gate", "report"):
+            self.say(self.verdict_text())
+        if last != "import":
+            self.say(f"weights: {self.weights}")
+        if last == "report":
+            self.say(f"report to open: {self.folder / 'report.html'}")
+
+    # ---------------------------------------------------------------- the stages
+
+    def data(self, given: str | Logs) -> Dataset:
+        """Open the dataset, or import the logs."""
+        if isinstance(given, str):
+            return open_dataset(given)
+        found, spec = parts(given.format, given.input, given.source)
+        inputs = {
+            "config": dataclasses.asdict(given.config),
+            "spec": digest(spec),
+            "files": [_listing(path) for path in found],
+        }
+        folder = self.folder / f"dataset-{digest(inputs)[:8]}"
+
+        def work() -> None:
+            if (folder / "manifest.json").exists():
+                return  # finished, but not noted: killed in between
+            pieces = [Part(format=given.format, input=p, spec=spec) for p in found]
+            import_parts(pieces, folder, given.config, executor=self.executor)
+
+        self._run("import", inputs, [folder / "manifest.json"], work)
+        return open_dataset(folder)
+
+    def train(self, dataset: Dataset) -> None:
+        """Train every seed, export it, choose the median one."""
+        inputs, files = self._train_inputs(dataset), self._seed_files()
+
+        def one(number: int) -> None:
+            config = dataclasses.replace(self.config.train, seed=number)
+            workdir = self._workdir(dataset, number)
+            train(
+                dataset,
+                workdir,
+                config,
+                running=self.running,
+                provenance=dict(self.facts),
+            )
+            export_run(workdir, dataset, files[number])
+
+        for number, file in enumerate(files):
+            named = {**inputs, "seed": number}
+            self._run(f"train {number}", named, [file], lambda n=number: one(n))
+        hashes = [file_sha256(file) for file in files]
+        self._run("export", {"seeds": hashes}, [self.weights], self._choose)
+
+    def _train_inputs(self, dataset: Dataset) -> dict:
+        settings = dataclasses.asdict(self.config.train)
+        return {"config": settings, "dataset": dataset.hash}
+
+    def _workdir(self, dataset: Dataset, seed: int) -> Path:
+        key = digest(self._train_inputs(dataset))[:8]
+        return self.folder / f"train-{key}" / f"seed-{seed}"
+
+    def _seed_files(self) -> list[Path]:
+        numbers = range(self.config.seeds)
+        return [self.folder / "seeds" / f"{number}.msgpack" for number in numbers]
+
+    def _choose(self) -> None:
+        """The seed with the median share of training pairs won becomes candidate."""
+
+        def won(file: Path) -> float:
+            metrics = dict(open_reward(str(file)).provenance.get("metrics") or {})
+            return float(metrics.get("pair_accuracy", 0.0))
+
+        ranked = sorted(self._seed_files(), key=won)
+        shutil.copyfile(ranked[(len(ranked) - 1) // 2], self.weights)
+
+    def rank(self, dataset: Dataset) -> None:
+        """Held-out scenes, all seeds beside incumbent and rivals."""
+        config, path = self.config, self.folder / "ranking.json"
+        inputs = {
+            "dataset": dataset.hash,
+            "seeds": [file_sha256(file) for file in self._seed_files()],
+            "incumbent": self._incumbent_hash(),
+            "horizon_s": config.horizon_s,
+        }
+
+        def work() -> None:
+            rewards = [open_reward(str(file)) for file in self._seed_files()]
+            learned = {CANDIDATE: [reward.value for reward in rewards]}
+            known = self._incumbent_reward()
+            if known is not None:
+                if known.preset != rewards[0].preset:
+                    raise InputError(
+                        f"--incumbent: preset {known.preset}: expected that of the"
+                        f" candidate, {rewards[0].preset}"
+                    )
+                learned[INCUMBENT] = [known.value]
+            setup = RankingSetup(
+                preset=str(rewards[0].preset),
+                sampler=SamplerConfig(mode=config.train.sampler.mode),
+                horizon_s=config.horizon_s,
+            )
+            references = [*([INCUMBENT] if known else []), "hand-set", "random"]
+            report = evaluate_ranking(
+                dataset, learned, setup, self.executor, references
+            )
+            (self.folder / "ranking.txt").write_text(format_table(report, 118) + "\n")
+            _write_json(path, {**to_json(report), "made_by": dict(self.facts)})
+
+        self._run("rank", inputs, [path], work)
+
+    def simulate(self) -> None:
+        """Candidate, incumbent and rivals on the same closed-loop cases."""
+        job, _ = self._job()
+        folder = self.folder / "suite"
+
+        def work() -> None:
+            drive = spread(self.executor, job)
+            rows, cases = job.rows(), job.cases()
+            suite = SuiteConfig(plan_every=self.config.plan_every)
+            drive = drive if self.executor.workers > 1 else drive_here
+            result = run_suite(rows, cases, suite, drive)
+            repeats(rows[0], result, suite)
+            write_suite(result, folder, self.facts)
+            write_runs(folder / "metrics.npz", runs_of(result))
+
+        inputs = {"job": self._job_inputs()}
+        self._run("simulate", inputs, [folder / "metrics.npz"], work)
+
+    def gate(self) -> None:
+        """The verdict."""
+        path = self.folder / "verdict.json"
+        metrics = self.folder / "suite" / "metrics.npz"
+        inputs = {
+            "metrics": file_sha256(metrics),
+            "gate": dataclasses.asdict(self.config.gate),
+        }
+
+        def work() -> None:
+            files = {"candidate": str(self.weights), "incumbent": self.config.incumbent}
+            facts = {"files": files, "made_by": dict(self.facts)}
+            write_verdict(path, self._verdict(), self.config.gate, facts)
+
+        self._run("gate", inputs, [path], work)
+
+    def report(self, dataset: Dataset) -> Path:
+        """report.html from everything above."""
+        path = self.folder / "report.html"
+        made_from = ("ranking.json", "suite/metrics.npz", "verdict.json")
+        inputs = {
+            "files": [file_sha256(self.folder / name) for name in made_from],
+            "weights": file_sha256(self.weights),
+            "incumbent": self._incumbent_hash(),
+            "dataset": dataset.hash,
+        }
+        self._run("report", inputs, [path], lambda: self._draw(path, dataset))
+        return path
+
+    # -------------------------------------------------------------------- helpers
+
+    def verdict_text(self) -> str:
+        """For the terminal."""
+        return format_verdict(self._verdict())
+
+    def _verdict(self) -> Verdict:
+        runs = read_runs(self.folder / "suite" / "metrics.npz")
+        return judge(pair_of(runs, self._job()[1]), self.config.gate)
+
+    def _draw(self, path: Path, dataset: Dataset) -> None:
+        job, incumbent = self._job()
+        verdict = self._verdict()
+        made = {k: v for k, v in self.stages.read().items() if k != "report"}
+        rewards = {CANDIDATE: open_reward(str(self.weights))}
+        if known := self._incumbent_reward():
+            rewards[INCUMBENT] = known
+        drivers = [row for row in job.rows() if row.name in (CANDIDATE, incumbent)]
+        shown = verdict.look_at[:REPLAYS] or job.cases().ids[:2]
+        seed = int(rewards[CANDIDATE].provenance["seed"])
+        write_tuning_page(
+            path,
+            TuningReport(
+                verdict=verdict,
+                gate=self.config.gate,
+                suite=read_runs(self.folder / "suite" / "metrics.npz").report(),
+                incumbent=incumbent,
+                ranking=from_json(
+                    json.loads((self.folder / "ranking.json").read_text())
+                ),
+                rewards=rewards,
+                dataset=dataset,
+                replays=make_replays(
+                    drivers, job.cases(), shown, self.config.plan_every
+                ),
+                workdir=self._workdir(dataset, seed),
+                sweep=None,
+                facts={**self.facts, "stages": made},
+            ),
+        )
+
+    def _incumbent_reward(self) -> Reward | None:
+        name = self.config.incumbent
+        return None if name in BASELINES else open_reward(name)
+
+    def _incumbent_hash(self) -> str:
+        name = self.config.incumbent
+        return name if name in BASELINES else file_sha256(Path(name))
+
+    def _job(self) -> tuple[SuiteJob, str]:
+        config = self.config
+        return gate_job(
+            str(self.weights),
+            config.incumbent,
+            suite=config.suite,
+            cases=config.cases,
+            duration_s=config.duration_s,
+            catalogue_seed=config.catalogue_seed,
+            plan_every=config.plan_every,
+            rivals=RIVALS,
+        )
+
+    def _job_inputs(self) -> dict:
+        job, _ = self._job()
+        return {
+            **dataclasses.asdict(job),
+            "refs": digest([ref.id for ref in job.refs]),
+            "weights": [file_sha256(Path(file)) for file in job.weights],
+        }
+
+
+def _listing(path: Path) -> list:
+    """Names, sizes and times of change of a file or of the files of a folder."""
+    files = sorted(path.rglob("*")) if path.is_dir() else [path]
+    stats = [(file, file.stat()) for file in files if file.is_file()]
+    return [[str(file), stat.st_size, stat.st_mtime_ns] for file, stat in stats]
+
+
+def _write_json(path: Path, body: Mapping[str, Any]) -> None:
+    part = path.with_name(path.name + ".tmp")
+    part.write_text(json.dumps(body, indent=2, allow_nan=False) + "\n")
+    part.replace(path)

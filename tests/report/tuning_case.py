@@ -1,0 +1,166 @@
+"""A small tuning report with everything in it: two rewards, drives, a sweep."""
+
+import dataclasses
+import json
+
+import numpy as np
+
+from rcirl_jax.data.importing import import_parts
+from rcirl_jax.data.store import open_dataset
+from rcirl_jax.evaluation import Outcomes, build_report, scene_metrics
+from rcirl_jax.evaluation.gate import GateConfig, Pair, judge
+from rcirl_jax.evaluation.ranking import random_scorer
+from rcirl_jax.evaluation.suite_summary import summarise
+from rcirl_jax.export.loading import open_reward
+from rcirl_jax.planner.baselines import Idm
+from rcirl_jax.planner.rank import constant_speed_policy, idm_policy
+from rcirl_jax.report.tuning_page import TuningReport
+from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics
+from rcirl_jax.simulation.rows import Row
+from rcirl_jax.simulation.suite import catalogue_set, suite_refs
+from tests.data.small_logs import CONFIG, write_logs
+from tests.weights_files import random_weights
+
+FAMILIES, EACH = ("stop_and_go", "cut_in", "red_light"), 40
+PLAYED = ("stop_and_go/001@0", "red_light/000@0")
+SECONDS = 5.0
+IDM = Idm()
+
+
+def metrics(seed, spoiled=None):
+    """Made-up numbers of faultless drives; one family may be spoiled."""
+    rng, count = np.random.default_rng(seed), len(FAMILIES) * EACH
+    samples = 1200 * np.ones(count)
+    values = {f.name: np.zeros(count) for f in dataclasses.fields(CaseMetrics)}
+    holds = rng.uniform(size=(count, len(COLUMNS))) < 0.9
+    holds[:, :2] = True
+    faults = np.zeros(count)
+    if spoiled is not None:
+        first = FAMILIES.index(spoiled) * EACH
+        faults[first : first + 12] = 1
+    holds[faults > 0] = False
+    values.update(
+        samples=samples,
+        inside=(samples[:, None] - 9 * ~holds).astype(int),
+        inside_filtered=np.tile(samples[:, None], 2).astype(int),
+        holds=holds,
+        holds_filtered=holds[:, 4:],
+        at_fault=faults,
+        collisions=faults,
+        progress=1000.0 * rng.uniform(0.8, 1.2, size=count),
+        min_ttc=rng.uniform(1.0, 9.0, size=count),
+    )
+    for name in ("drivable", "direction", "ttc_bound", "speed_compliance", "comfort"):
+        values[name] = np.ones(count)
+    values["no_fault"] = 1.0 - faults
+    return CaseMetrics(**values)
+
+
+def suite_and_verdict():
+    """The suite's report and the gate's verdict of the same made-up drives."""
+    names = [name for name in FAMILIES for _ in range(EACH)]
+    ids = [f"{name}/{i % EACH:03d}@0" for i, name in enumerate(names)]
+    runs = {
+        "candidate": metrics(0, "stop_and_go"),
+        "hand-set": metrics(1),
+        "IDM": metrics(2),
+    }
+    none, way = np.zeros(len(names), bool), np.full(len(names), 1100.0)
+    suite = summarise(runs, names, none, none, "IDM", way)
+    pair = Pair(
+        candidate=runs["candidate"],
+        incumbent=runs["hand-set"],
+        families=names,
+        ids=ids,
+        reference=way,
+    )
+    verdict = judge(pair, GateConfig())
+    return suite, dataclasses.replace(verdict, look_at=(*PLAYED, *verdict.look_at[:4]))
+
+
+def ranking():
+    rng, shape = np.random.default_rng(0), (60, 8)
+    fde = rng.gamma(2.0, 2.0, shape)
+    outcomes = Outcomes(
+        fde=fde,
+        ade=0.4 * fde,
+        crash=np.zeros(shape, bool),
+        feasible=np.ones(shape, bool),
+        cluster=np.arange(60) % 12,
+        human_crash=np.zeros(60, bool),
+    )
+    table = {"candidate": [scene_metrics(-fde, np.ones(60), outcomes)]}
+    table["random"] = [scene_metrics(*random_scorer(0, shape), outcomes)]
+    return build_report(table, outcomes, num_resamples=200)
+
+
+def sweep():
+    """What `export.sweep` writes, as far as the page reads it."""
+    found = lambda v: {"value": v, "low": v - 0.3, "high": v + 0.3, "seed_sd": None}  # noqa: E731
+    rows, members = {}, {}
+    for rate, value in ((0.01, 2.0), (0.05, 1.5), (0.2, 1.8)):
+        rows[f"rate {rate}"] = {
+            "hidden": "15",
+            "leaky_rate": rate,
+            "learning_rate": 1e-3,
+            "members": [f"m{rate}"],
+            "finite": True,
+            "validation": {"top1_fde": found(value)},
+        }
+        members[f"m{rate}"] = {"validation": {"top1_fde": value}}
+    return {
+        "choose_by": {
+            "metric": "top1_fde",
+            "title": "top-1 FDE",
+            "unit": "m",
+            "higher_is_better": False,
+        },
+        "chosen": {"configuration": "rate 0.05", "test": {"top1_fde": found(1.6)}},
+        "configurations": rows,
+        "members": members,
+        "scenes": {"train": 30, "validation": 10, "test": 10},
+        "validation_by": "vehicle",
+        "groups": {},
+    }
+
+
+def small_report(folder, replays):
+    """The report; everything but the drives, the frames and the features is made up."""
+    import_parts(write_logs(folder / "logs", 4), folder / "set", CONFIG)
+    candidate = open_reward(str(random_weights(folder / "candidate.msgpack", 2)))
+    kernels = (np.roll(candidate.kernels[0], 3, axis=0), *candidate.kernels[1:])
+    incumbent = dataclasses.replace(
+        candidate, kernels=kernels, gamma=candidate.gamma[::-1], file="incumbent"
+    )
+    workdir = folder / "run"
+    workdir.mkdir()
+    lines = [
+        {"step": i, "loss": 1.0 / i, "pair_accuracy": 0.8, "queries_per_s": 1e5}
+        for i in range(1, 9)
+    ]
+    (workdir / "metrics.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    suite, verdict = suite_and_verdict()
+    return TuningReport(
+        verdict=verdict,
+        gate=GateConfig(),
+        suite=suite,
+        incumbent="hand-set",
+        ranking=ranking(),
+        rewards={"candidate": candidate, "incumbent": incumbent},
+        dataset=open_dataset(folder / "set"),
+        replays=replays,
+        workdir=workdir,
+        sweep=sweep(),
+        facts={"flags": {"seed": 3}, "git_commit": "abc", "stages": {"train": "12ef"}},
+    )
+
+
+def cheap_rows():
+    """Rows that compile fast; the candidate drives blindly on and crashes."""
+    candidate = Row(name="candidate", policy=constant_speed_policy)
+    return [candidate, Row(name="hand-set", policy=idm_policy(IDM))]
+
+
+def small_cases():
+    refs = [ref for ref in suite_refs("stop_and_go,red_light", 2) if ref.id in PLAYED]
+    return catalogue_set(refs, SECONDS)
