@@ -8,7 +8,7 @@ WORKERS ?= 2
 # folder of recordings for `make bench`; what is not there is left out
 RECORDINGS ?= ../shared/data
 
-.PHONY: demo test test-dataset lint bench onboard setup clean
+.PHONY: demo test test-dataset lint bench docs onboard setup clean
 
 setup: $(VENV)/.installed
 
@@ -49,6 +49,12 @@ bench: $(VENV)/.bench
 	taskset -c 0 $(BIN)/python -m benchmarks.onboard
 	$(BIN)/python -m benchmarks.importing --data=$(RECORDINGS)
 	$(BIN)/python -m benchmarks.plots
+
+# Documentation as a site; warnings are errors
+docs: export NO_MKDOCS_2_WARNING = 1
+docs: setup
+	$(BIN)/python -m mkdocs build --strict --quiet
+	@echo "site: build/site/index.html"
 
 # C++ reader; needs cmake, a C++17 compiler and libmsgpack-dev
 onboard:

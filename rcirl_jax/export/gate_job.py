@@ -45,11 +45,11 @@ def gate_job(
             f"--incumbent: {incumbent}: expected a weights file or one of "
             + ", ".join(BASELINES)
         )
-    baselines = dict.fromkeys([*([] if learned else [incumbent]), *rivals])
+    names = [*rivals] if learned else [incumbent, *rivals]
     job = SuiteJob(
         weights=(candidate, incumbent) if learned else (candidate,),
         names=(CANDIDATE, INCUMBENT) if learned else (CANDIDATE,),
-        baselines=tuple(baselines),
+        baselines=tuple(dict.fromkeys(names)),
         refs=suite_refs(suite, cases, catalogue_seed),
         duration_s=duration,
         plan_every=plan_every,

@@ -77,17 +77,20 @@ def _score(
     return np.asarray(_value(effective, normaliser, x, valid, activation))
 
 
-@functools.partial(jax.jit, static_argnames="activation")
-def _value(
+def scored(
     effective: RewardParams,
     normaliser: Normaliser,
     x: jax.Array,
     valid: jax.Array,
     activation: str,
 ) -> jax.Array:
+    """V [...] of raw features [..., T, F] under a mask [..., T]."""
     x = conditioned(effective, normalise(normaliser, x))
     rewards = point_rewards(effective, x, activation)
     return jnp.sum(jnp.where(valid, effective.gamma * rewards, 0.0), axis=-1)
+
+
+_value = jax.jit(scored, static_argnames="activation")
 
 
 def row_name(reward: Reward) -> str:

@@ -7,6 +7,7 @@ as it takes a human and a candidate; its own mean is added to that of the step:
 """
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -38,23 +39,23 @@ def featurise_preferences(
         parts.append(jax.tree.map(lambda x, n=count - start: np.asarray(x[:n]), made))
     human, candidates, valid = jax.tree.map(lambda *x: np.concatenate(x), *parts)
     one = np.zeros((count, 1), np.float32)
-    facts = Facts(
-        human_distance=one[:, 0],
-        distance=one + APART_M,
-        collides=one > 0.0,
-        breaks_rule=one,
-        human_density=one[:, 0],
-        density=one,
-    )
-    return FeatureBatch(
-        human=human,
-        candidates=candidates,
-        feasible=np.ones((count, 1), bool),
-        time_valid=valid,
-        facts=facts,
-        weight=preferences.weight,
-        index=preferences.row.astype(np.int32),
-    )
+    facts: dict[str, Any] = {
+        "human_distance": one[:, 0],
+        "distance": one + APART_M,
+        "collides": one > 0.0,
+        "breaks_rule": one,
+        "human_density": one[:, 0],
+        "density": one,
+    }
+    leaves: dict[str, Any] = {
+        "human": human,
+        "candidates": candidates,
+        "feasible": np.ones((count, 1), bool),
+        "time_valid": valid,
+        "weight": preferences.weight,
+        "index": preferences.row.astype(np.int32),
+    }
+    return FeatureBatch(facts=Facts(**facts), **leaves)
 
 
 @functools.partial(jax.jit, static_argnames=("config", "features"))

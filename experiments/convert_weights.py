@@ -1,0 +1,59 @@
+"""A weights file in other forms, for planners that read neither it nor Python.
+
+    python -m experiments.convert_weights --weights=FILE --onnx=FILE --stablehlo=FILE
+    python -m experiments.convert_weights --weights=LINEAR --yaml=FILE
+    python -m experiments.convert_weights --hand_weights=TUNED --yaml=FILE
+
+--onnx and --jax_export need the extra [export]. Each form scores as the file does;
+only weights.msgpack carries samples that a reader checks itself against.
+"""
+
+from pathlib import Path
+
+from absl import flags
+
+from experiments.common import run
+from rcirl_jax.errors import InputError
+from rcirl_jax.export.hand_weights import load_hand_weights
+from rcirl_jax.export.linear_yaml import lattice_yaml, reward_yaml, write_text
+from rcirl_jax.export.loading import open_reward
+from rcirl_jax.export.onnx_model import write_onnx
+from rcirl_jax.export.stablehlo import write_stablehlo
+
+_WEIGHTS = flags.DEFINE_string("weights", None, "weights file")
+_HAND = flags.DEFINE_string("hand_weights", None, "of tune_hand_set, for --yaml")
+_ONNX = flags.DEFINE_string("onnx", None, "ONNX model to write")
+_STABLEHLO = flags.DEFINE_string("stablehlo", None, "StableHLO bytecode to write")
+_JAX = flags.DEFINE_string("jax_export", None, "bytes of jax.export to write")
+_YAML = flags.DEFINE_string("yaml", None, "linear costs to write")
+
+
+def main() -> None:
+    """Flags -> files."""
+    wanted = {"onnx": _ONNX, "stablehlo": _STABLEHLO, "jax_export": _JAX}
+    files = {name: Path(flag.value) for name, flag in wanted.items() if flag.value}
+    if bool(_WEIGHTS.value) == bool(_HAND.value):
+        raise InputError("--weights, --hand_weights: expected one of them")
+    if not files and not _YAML.value:
+        raise InputError("--onnx, --stablehlo, --jax_export, --yaml: expected one")
+    if _HAND.value:
+        if files:
+            raise InputError(f"--{next(iter(files))}: expected --weights with it")
+        text = lattice_yaml(load_hand_weights(_HAND.value), Path(_HAND.value).name)
+    else:
+        reward = open_reward(_WEIGHTS.value)
+        text = reward_yaml(reward) if _YAML.value else ""
+        for name, path in files.items():
+            if name == "onnx":
+                write_onnx(path, reward)
+            else:
+                form = "jax" if name == "jax_export" else "stablehlo"
+                write_stablehlo(path, reward, form)
+            print(f"written: {path}")
+    if _YAML.value:
+        write_text(Path(_YAML.value), text)
+        print(f"written: {_YAML.value}")
+
+
+if __name__ == "__main__":
+    run(main)

@@ -1,0 +1,243 @@
+"""The pages name things that exist: pages, anchors, files, commands, flags, numbers."""
+
+import functools
+import importlib.util
+import json
+import os
+import re
+import subprocess
+import sys
+import tomllib
+
+import pytest
+
+from rcirl_jax.evaluation.gate import EXIT_CODES, GateConfig
+from rcirl_jax.evaluation.statistics import tango
+from tests.docs.pages import (
+    ALL,
+    DOCS,
+    PAGES,
+    REPO,
+    anchors,
+    code,
+    links,
+    name_of,
+    section,
+    spans,
+    table,
+)
+
+PRESETS = sorted((REPO / "data_specs" / "features").glob("*.toml"))
+MODULE = r"(?<![\w/.])((?:experiments|benchmarks)(?:\.[a-z_0-9]+)+)\b"
+COMMAND = re.compile(MODULE + r"([^\n|&]*)")
+FLAG = re.compile(r"(?<!\S)--([a-z_0-9]+)")
+PATH = re.compile(r"[\w.-]+/[\w./*-]*")
+PLACEHOLDER = re.compile(r"[A-Z]{3}")  # NAME.toml, SCENE.csv
+BUILT_IN = {"help", "helpfull"}
+# what has a path's shape in prose, but is made by a command or by the reader
+ELSEWHERE = {"out", "build"}
+
+
+# ------------------------------------------------------------- links and paths
+
+
+@pytest.mark.parametrize("page", ALL, ids=name_of)
+def test_links_resolve(page):
+    for link in links(page.read_text()):
+        if link.startswith(("http://", "https://")):
+            continue
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        assert target.exists(), f"{name_of(page)}: {link}"
+        if page in PAGES:  # a page of the site cannot link out of it
+            assert target.is_relative_to(DOCS), f"{name_of(page)}: {link}"
+        if anchor:
+            assert anchor in anchors(target.read_text()), f"{name_of(page)}: {link}"
+
+
+def rooms():
+    """Names that begin a path of this repository, and where they may be."""
+    top = {item.name for item in REPO.iterdir() if item.is_dir()} - ELSEWHERE
+    package = {item.name for item in (REPO / "rcirl_jax").iterdir() if item.is_dir()}
+    return top | package
+
+
+@pytest.mark.parametrize("page", ALL, ids=name_of)
+def test_named_files_exist(page):
+    known = rooms()
+    for span in spans(page.read_text()):
+        if not PATH.fullmatch(span) or span.split("/")[0] not in known:
+            continue
+        if PLACEHOLDER.search(span.replace("README", "")):
+            continue
+        places = (REPO, REPO / "rcirl_jax", page.parent)
+        found = any(any(place.glob(span.rstrip("/"))) for place in places)
+        assert found, f"{name_of(page)}: `{span}`"
+
+
+def test_the_navigation_has_every_page():
+    text = (REPO / "mkdocs.yml").read_text()
+    named = re.findall(r"^ +- (?:[^:\n]+: )?(\S+\.md)$", text, re.M)
+    assert sorted(named) == [str(page.relative_to(DOCS)) for page in PAGES]
+
+
+@pytest.mark.parametrize("page", ALL, ids=name_of)
+def test_make_targets_exist(page):
+    makefile = (REPO / "Makefile").read_text()
+    for block in code(page.read_text()):
+        for target in re.findall(r"^make ([a-z-]+)\b", block, re.M):
+            assert re.search(rf"^{target}:", makefile, re.M), target
+
+
+# ------------------------------------------------------------------- commands
+
+LIST_FLAGS = """
+import importlib, json, sys
+from absl import flags
+OURS = ("experiments", "benchmarks")
+found = {}
+for name in sys.argv[1:]:
+    for flag in list(flags.FLAGS):
+        if flags.FLAGS.find_module_defining_flag(flag, "").startswith(OURS):
+            delattr(flags.FLAGS, flag)
+    for module in [m for m in sys.modules if m.startswith(OURS)]:
+        del sys.modules[module]
+    importlib.import_module(name)
+    found[name] = [
+        flag for flag in flags.FLAGS
+        if flags.FLAGS.find_module_defining_flag(flag, "").startswith(OURS)
+    ]
+print(json.dumps(found))
+"""
+
+
+def commands():
+    """(page, module, text behind it) of every command that a page names."""
+    return [
+        (name_of(page), match[1], match[2])
+        for page in ALL
+        for block in code(page.read_text())
+        for match in COMMAND.finditer(block)
+    ]
+
+
+def is_main(module):
+    path = REPO / (module.replace(".", "/") + ".py")
+    return path.is_file() and 'if __name__ == "__main__"' in path.read_text()
+
+
+@functools.cache
+def known_flags():
+    """Module -> its flags; one process imports all that the pages name."""
+    named = sorted({module for _, module, _ in commands() if is_main(module)})
+    done = subprocess.run(
+        [sys.executable, "-c", LIST_FLAGS, *named],
+        capture_output=True, text=True, check=False, cwd=REPO, timeout=300,
+        env={**os.environ, "JAX_PLATFORMS": "cpu"},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def test_commands_name_modules_and_flags():
+    wrong = []
+    for page, module, rest in commands():
+        path = REPO / module.replace(".", "/")
+        if not path.with_suffix(".py").is_file() and not path.is_dir():
+            wrong.append(f"{page}: {module}: no such module")
+        elif is_main(module):
+            flags = set(known_flags()[module]) | BUILT_IN
+            names = {name.removeprefix("no") if name not in flags else name
+                     for name in FLAG.findall(rest)}  # fmt: skip
+            wrong += [f"{page}: {module}: --{name}" for name in sorted(names - flags)]
+    assert not wrong, "\n".join(wrong)
+    assert len(commands()) > 50
+    assert len({module for _, module, _ in commands() if is_main(module)}) > 20
+
+
+# -------------------------------------------------------------------- numbers
+
+
+@pytest.mark.parametrize("preset", PRESETS, ids=lambda path: path.stem)
+def test_the_feature_dictionary_is_the_preset(preset):
+    text = (DOCS / "features.md").read_text()
+    rows = table(section(text, f"## `{preset.stem}`"))
+    declared = tomllib.loads(preset.read_text())["feature"]
+    assert len(rows) == len(declared)
+    for number, (row, spec) in enumerate(zip(rows, declared, strict=True)):
+        assert row[:3] == [str(number), spec["name"], spec["unit"]]
+        assert [float(cell) for cell in row[3:]] == [
+            spec[key] for key in ("none", "lower", "upper")
+        ], spec["name"]
+
+
+def test_every_feature_is_defined_once():
+    text = (DOCS / "features.md").read_text()
+    names = [
+        spec["name"]
+        for preset in PRESETS
+        for spec in tomllib.loads(preset.read_text())["feature"]
+    ]
+    headings = re.findall(r"^### `(\w+)`$", text, re.M)
+    assert sorted(headings) == sorted(set(names))
+    for name in headings:
+        assert "Source:" in section(text, f"### `{name}`"), name
+
+
+def test_the_gates_margins_are_those_of_the_code():
+    rows = table(section((DOCS / "gate.md").read_text(), "## Margins"))
+    stated = {row[0].removeprefix("--").removesuffix("_margin"): row[1] for row in rows}
+    config = vars(GateConfig())
+    margins = {name: config[name] for name in config if name != "primary"}
+    assert {name: float(value) for name, value in stated.items()} == margins
+
+
+def needed(margin, gained, lost):
+    """Fewest cases with Tango's lower end above -margin; it rises with the cases."""
+    low, high = gained + lost, 1
+    while high <= low or tango(gained, lost, high)[0] <= -margin:
+        high *= 2
+    while high - low > 1:
+        middle = (low + high) // 2
+        if tango(gained, lost, middle)[0] > -margin:
+            high = middle
+        else:
+            low = middle
+    return high
+
+
+def test_the_gates_numbers_of_cases_are_tangos():
+    text = (DOCS / "gate.md").read_text()
+    rows = table(section(text, "## How many cases a margin takes"))
+    pairs = [(0, 0), (0, 1), (1, 1), (0, 2), (5, 5)]
+    for row in rows:
+        margin = float(row[0].removesuffix(" %")) / 100.0
+        found = [int(cell.replace(",", "")) for cell in row[1:]]
+        assert found == [needed(margin, *pair) for pair in pairs], row
+
+
+def test_the_verdicts_exit_status_is_the_codes():
+    rows = table(section((DOCS / "gate.md").read_text(), "## Verdicts and exit status"))
+    assert {row[0]: int(row[2]) for row in rows} == EXIT_CODES
+
+
+# ----------------------------------------------------------------------- site
+
+
+def test_the_site_builds_and_needs_no_network(tmp_path):
+    if importlib.util.find_spec("material") is None:
+        pytest.skip("mkdocs-material not installed: pip install 'rcirl-jax[docs]'")
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "-d", tmp_path],
+        capture_output=True, text=True, check=False, cwd=REPO,
+        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    pages = list(tmp_path.rglob("*.html"))
+    assert len(pages) > len(PAGES)
+    loaded = re.compile(r"<(?:script|img|iframe)[^>]+src=\"(?:https?:)?//")
+    styles = re.compile(r"<link[^>]+rel=\"(?:stylesheet|preconnect)\"[^>]+//")
+    for page in pages:
+        text = page.read_text()
+        assert not loaded.search(text), page
+        assert not styles.search(text), page

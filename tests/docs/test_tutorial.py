@@ -1,0 +1,117 @@
+"""docs/tutorial.md: its files, its errors, and all of its commands in order."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.errors import InputError
+from rcirl_jax.types import Kind
+from tests.docs.pages import DOCS, REPO, fences, section, table
+
+PAGE = (DOCS / "tutorial.md").read_text()
+FILES = {title: content for _, title, content in fences(PAGE) if title}
+COMMANDS = [
+    " ".join(line.split())
+    for language, _, content in fences(PAGE)
+    if language == "bash"
+    for line in re.sub(r"\\\n", " ", content).strip().splitlines()
+]
+
+HEADER = Path("/usr/include/msgpack/unpack_template.h")
+CAN_BUILD = shutil.which("cmake") is not None and HEADER.is_file()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The page's files and its log."""
+    made = tmp_path_factory.mktemp("tutorial")
+    for name, content in FILES.items():
+        (made / name).write_text(content)
+    (made / "onboard").symlink_to(REPO / "onboard")
+    command(COMMANDS[0], made)
+    return made
+
+
+def command(line, folder):
+    """Run one line of the page; returns what it printed."""
+    done = subprocess.run(
+        line.replace(".venv/bin/python", sys.executable),
+        shell=True, capture_output=True, text=True, check=False, cwd=folder,
+        env={**os.environ, "JAX_PLATFORMS": "cpu"}, timeout=1800,
+    )  # fmt: skip
+    # 40 cases prove no margin of the gate
+    expected = 2 if "experiments.gate" in line else 0
+    said = done.stdout + done.stderr
+    assert done.returncode == expected, f"{line}\n{said[-3000:]}"
+    return said
+
+
+def test_the_small_log_is_what_the_page_says(folder):
+    found = read_recordings("csv", folder / "small.csv", folder / "my_logs.toml")
+    (recording,) = found
+    assert recording.name == "small-morning"
+    car, truck = recording.tracks
+    assert (car.id, car.length, car.width) == ("17", 4.61, 1.84)
+    assert car.kind == truck.kind == Kind.VEHICLE
+    assert car.t.tolist() == pytest.approx([0.0, 0.1, 0.2])
+    assert car.speed[0] == pytest.approx(22.0)
+    assert car.heading[0] == pytest.approx(0.3 * 3.14159265 / 180.0)
+    assert len(recording.lanes) == 1
+
+
+def test_every_column_of_the_log_is_explained(folder):
+    header = FILES["small.csv"].splitlines()[0].split(",")
+    log = (folder / "LOGS" / "drives.csv").read_text()
+    assert log.splitlines()[0].split(",") == header
+    rows = table(section(PAGE, "## 1. The log").split("```\n\n")[1])
+    named = [name.strip("` ") for row in rows for name in row[0].split(", ")]
+    assert sorted(named) == sorted(header)
+
+
+ERRORS = table(section(PAGE, "### What errors look like"))
+
+
+@pytest.mark.parametrize(("old", "new", "line"), ERRORS, ids=[row[1] for row in ERRORS])
+def test_errors_are_those_shown(old, new, line, folder, tmp_path):
+    text = FILES["my_logs.toml"]
+    source = tmp_path / "my_logs.toml"
+    assert old in text
+    source.write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError) as found:
+        list(read_recordings("csv", folder / "LOGS", source))
+    assert line in str(found.value)
+    assert "\n" not in str(found.value)
+
+
+@pytest.mark.slow
+@pytest.mark.multiprocess
+def test_all_commands_run_in_order(folder):
+    said = {}
+    for line in COMMANDS[1:]:
+        if CAN_BUILD or not line.startswith(("cmake", "out/onboard")):
+            said[line] = command(line, folder)
+
+    def of(part):
+        return "".join(text for line, text in said.items() if part in line)
+
+    assert "scenes kept" in of("import_logs")
+    assert "oracle floor, speed" in of("import_logs")
+    assert "top-1 FDE" in of("evaluate")
+    assert "verdict: DO NOT SHIP" in of("autotune")
+    assert "verdict: COULD NOT JUDGE" in of("experiments.gate")
+    for made in ("look/index.html", "tune/report.html", "case/case.html"):
+        assert (folder / "out" / made).stat().st_size > 1000, made
+    assert (folder / "out" / "verdict.json").is_file()
+    chosen = re.match(r"candidate (\d) of 3, value (\S+)", of("choose.py"))
+    if CAN_BUILD:
+        theirs = re.match(r"candidate (\d) of 3, value ([^,]+), 0", of("choose out"))
+        assert chosen
+        assert theirs
+        assert theirs[1] == chosen[1]
+        assert float(theirs[2]) == pytest.approx(float(chosen[2]), abs=1e-3)

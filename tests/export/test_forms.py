@@ -1,0 +1,164 @@
+"""Other forms of a weights file score as it does."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import onnx
+import pytest
+import yaml
+from onnx.reference import ReferenceEvaluator
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.export import save
+from rcirl_jax.export.linear_yaml import APOLLO, lattice_yaml, reward_yaml
+from rcirl_jax.export.onnx_model import write_onnx
+from rcirl_jax.export.reader import load_weights
+from rcirl_jax.export.stablehlo import exported, write_stablehlo
+from rcirl_jax.reward import LatticeCost
+from tests.export.test_weights import example_weights, loop_value
+
+F, T = 5, 7
+
+
+def reward(folder, hidden=(15,), activation="tanh", by_context=False, kernels=None):
+    """A verified file of random weights, without an output bias."""
+    made = example_weights(
+        features=F, times=T, hidden=hidden, activation=activation, by_context=by_context
+    )
+    biases = (*made.biases[:-1], np.zeros(1, np.float32))
+    made = dataclasses.replace(made, biases=biases)
+    if kernels is not None:
+        zeros = tuple(np.zeros(kernel.shape[1], np.float32) for kernel in kernels)
+        made = dataclasses.replace(made, kernels=kernels, biases=zeros)
+    x = np.random.default_rng(0).normal(size=(3, T, F)).astype(np.float32)
+    valid = np.ones((3, T), bool)
+    values = [loop_value(made, *one) for one in zip(x, valid, strict=True)]
+    save(folder / "w.msgpack", made, x, valid, np.array(values))
+    return load_weights(folder / "w.msgpack")
+
+
+def inputs():
+    rng = np.random.default_rng(1)
+    x = (3.0 * rng.normal(size=(200, T, F))).astype(np.float32)
+    valid = rng.uniform(size=T) < 0.7
+    valid[0] = True
+    x[:, ~valid] = np.nan  # harmless there
+    return x, valid
+
+
+SHAPES = [
+    ((), "tanh", False),
+    ((15,), "tanh", False),
+    ((6, 4), "relu", False),
+    ((6,), "leaky_relu", False),
+    ((15,), "tanh", True),
+]
+
+
+@pytest.mark.parametrize(("hidden", "activation", "by_context"), SHAPES)
+def test_onnx_scores_as_the_file(tmp_path, hidden, activation, by_context):
+    made, (x, valid) = reward(tmp_path, hidden, activation, by_context), inputs()
+    write_onnx(tmp_path / "w.onnx", made)
+    model = onnx.load(tmp_path / "w.onnx")
+    (found,) = ReferenceEvaluator(model).run(None, {"features": x, "valid": valid})
+    want = made.value(x, np.broadcast_to(valid, x.shape[:2]))
+    np.testing.assert_allclose(found, want, rtol=1e-5, atol=1e-5)
+    facts = {prop.key: prop.value for prop in model.metadata_props}
+    assert facts["weights_sha256"] == made.sha256
+
+
+@pytest.mark.parametrize(("hidden", "activation", "by_context"), SHAPES)
+def test_jax_export_scores_as_the_file(tmp_path, hidden, activation, by_context):
+    made, (x, valid) = reward(tmp_path, hidden, activation, by_context), inputs()
+    write_stablehlo(tmp_path / "w.jax", made, "jax")
+    again = jax.export.deserialize(bytearray((tmp_path / "w.jax").read_bytes()))
+    want = made.value(x, np.broadcast_to(valid, x.shape[:2]))
+    for count in (1, 200):  # any number of candidates
+        found = again.call(x[:count], valid)
+        np.testing.assert_allclose(found, want[:count], rtol=1e-5, atol=1e-5)
+
+
+def test_stablehlo_is_portable_bytecode(tmp_path):
+    made = reward(tmp_path)
+    write_stablehlo(tmp_path / "w.stablehlo", made, "stablehlo")
+    assert (tmp_path / "w.stablehlo").read_bytes()[:4] == b"ML\xefR"  # MLIR bytecode
+    assert "stablehlo.tanh" in exported(made).mlir_module()
+
+
+def value_of(document, x, valid):
+    """The cost that the YAML describes, by hand."""
+    total = np.zeros(len(x))
+    for i, facts in enumerate(document["features"].values()):
+        f = np.clip(x[..., i], facts["lower"], facts["upper"]) - facts["usual"]
+        part = facts["above"] * np.maximum(f, 0) + facts["below"] * np.maximum(-f, 0)
+        total += np.sum(
+            np.where(valid, part * np.array(document["gamma"]), 0.0), axis=1
+        )
+    return total
+
+
+@pytest.mark.parametrize("nonnegative", [False, True])
+def test_yaml_of_a_linear_reward_is_its_cost(tmp_path, nonnegative):
+    kernels = None
+    if nonnegative:
+        weights = -np.random.default_rng(3).uniform(0.1, 1.0, size=(2 * F, 1))
+        both = np.concatenate([np.eye(F), -np.eye(F)], axis=1)
+        kernels = (both.astype(np.float32), weights.astype(np.float32))
+    made = reward(
+        tmp_path,
+        (2 * F,) if nonnegative else (),
+        "relu" if nonnegative else "tanh",
+        kernels=kernels,
+    )
+    document = yaml.safe_load(reward_yaml(made))
+    x, valid = inputs()
+    want = -made.value(x, np.broadcast_to(valid, x.shape[:2]))
+    np.testing.assert_allclose(value_of(document, x, valid), want, rtol=1e-4, atol=1e-4)
+    terms = document["frenetix"]["cost_weights"]
+    assert len(terms) == 13
+    assert all(weight >= 0.0 for weight in terms.values())
+
+
+def test_a_network_is_no_linear_cost(tmp_path):
+    with pytest.raises(InputError, match="expected a linear reward"):
+        reward_yaml(reward(tmp_path))
+
+
+def test_yaml_of_a_hand_set_cost_has_apollos_names():
+    cost = LatticeCost(objective=12.5, jerk=1e-7)
+    document = yaml.safe_load(lattice_yaml(cost, "tuned.json"))["apollo_lattice"]
+    assert set(document) == set(APOLLO)
+    assert document["weight_lon_objective"] == 12.5
+    assert document["weight_lon_jerk"] == 1e-7
+
+
+@pytest.mark.multiprocess
+def test_the_command(tmp_path):
+    from tests.weights_files import random_weights
+
+    file = random_weights(tmp_path / "w.msgpack")
+
+    def command(*flags):
+        return subprocess.run(
+            [sys.executable, "-m", "experiments.convert_weights", *flags],
+            capture_output=True, text=True, check=False, timeout=300,
+            env={**os.environ, "JAX_PLATFORMS": "cpu"},
+        )  # fmt: skip
+
+    names = ("onnx", "stablehlo", "jax_export")
+    done = command(f"--weights={file}", *(f"--{n}={tmp_path}/{n}" for n in names))
+    assert done.returncode == 0, done.stderr
+    assert all((tmp_path / name).stat().st_size > 1000 for name in names)
+    for flags, message in (
+        ((f"--weights={file}", f"--yaml={tmp_path}/y"), "expected a linear reward"),
+        ((f"--weights={file}",), "--onnx, --stablehlo"),
+        ((f"--onnx={tmp_path}/o",), "--weights, --hand_weights: expected one"),
+    ):
+        done = command(*flags)
+        assert done.returncode == 2
+        (line,) = done.stderr.strip().splitlines()
+        assert message in line
