@@ -9,7 +9,7 @@ import pytest
 
 from tests.weights_files import random_weights
 
-SHORT = ("--suite=free_cruise,stopped_lead", "--cases=20", "--duration=3")
+SHORT = ("--suite=free_cruise,stopped_lead", "--cases=20", "--duration=2")
 
 
 def command(*flags):
