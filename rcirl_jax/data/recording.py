@@ -18,7 +18,9 @@ MAX_SPEED_MPS = 90.0  # m/s, faster than any road user
 LENGTH_RANGE_M = (0.2, 40.0)  # m
 WIDTH_RANGE_M = (0.2, 6.0)  # m
 STATIC_RANGE_M = (0.01, 1000.0)  # m, standing objects: from posts to long walls
-MAX_MEDIAN_CAR_M = 9.0  # m; a median above it means feet (a car is 4-5 m)
+# m, of the median vehicle: above it lengths are in feet, below it they were taken for
+# feet (a car is 4-5 m)
+MEDIAN_CAR_M = (2.0, 9.0)
 MIN_CARS = 3  # vehicles needed to judge the median; two lorries are no error
 MOVING_MPS = 2.0  # m/s, speeds are compared only above this
 SPEED_WINDOW_S = 0.5  # s, position noise averages out over it
@@ -134,10 +136,12 @@ def _check_lengths(name: str, tracks: tuple[Track, ...]) -> None:
     if len(lengths) < MIN_CARS:
         return
     median = float(np.median(lengths))
-    if median > MAX_MEDIAN_CAR_M:
+    low, high = MEDIAN_CAR_M
+    if not low <= median <= high:
+        wrong = "feet taken for metres" if median > high else "metres taken for feet"
         raise InputError(
             f"{name}: length: median {median:.1f} m: "
-            f"expected below {MAX_MEDIAN_CAR_M:g} m; feet taken for metres?"
+            f"expected {low:g} to {high:g} m; {wrong}?"
         )
 
 

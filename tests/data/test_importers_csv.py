@@ -229,6 +229,7 @@ def scaled(column, factor):
         ([*w.csv_rows(), w.csv_rows()[-1]], "id car2: t: 3.9: met twice"),
         (w.csv_rows(feet=1 / 0.3048), "feet taken for metres"),
         (scaled(5, 1 / 0.3048), "length: median 14.8 m"),
+        (scaled(5, 0.3048), "length: median 1.4 m: expected 2 to 9 m; metres taken"),
         (scaled(4, 3.6), "km/h taken for m/s"),
         (scaled(4, 1 / 0.44704), "mph taken for m/s"),
         (scaled(4, 0.0), "speed: 0 times"),
