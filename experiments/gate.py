@@ -23,7 +23,7 @@ from rcirl_jax.evaluation.gate import GateConfig, judge
 from rcirl_jax.evaluation.gate_output import format_verdict, write_verdict
 from rcirl_jax.evaluation.gate_runs import pair_of, repeats
 from rcirl_jax.evaluation.suite_files import runs_of
-from rcirl_jax.export.gate_job import gate_job
+from rcirl_jax.export.gate_job import gate_job, left_out
 from rcirl_jax.export.spread import spread
 from rcirl_jax.simulation.rows import BASELINES
 
@@ -55,6 +55,7 @@ _MARGINS = {
 
 def main() -> None:
     """Flags -> one verdict."""
+    Path(_OUTPUT.value).unlink(missing_ok=True)  # of another gate: not this verdict
     margins = {name: flag.value for name, flag in _MARGINS.items()}
     config = dataclasses.replace(
         GateConfig(), primary=tuple(_PRIMARY.value or ()), **margins
@@ -74,7 +75,7 @@ def main() -> None:
     suite = SuiteConfig(plan_every=_EVERY.value)
     result = run_suite(rows, cases, suite, drive)
     repeats(rows[0], result, suite)
-    verdict = judge(pair_of(runs_of(result), incumbent), config)
+    verdict = judge(pair_of(runs_of(result), incumbent), config, left_out(job))
     files = {"candidate": _CANDIDATE.value, "incumbent": _INCUMBENT.value}
     facts = {"files": files, **result.facts, "made_by": provenance()}
     write_verdict(Path(_OUTPUT.value), verdict, config, facts)

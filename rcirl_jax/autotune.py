@@ -39,7 +39,7 @@ from rcirl_jax.evaluation.suite_files import read_runs, runs_of, write_runs
 from rcirl_jax.evaluation.table import from_json, to_json
 from rcirl_jax.executor import Executor
 from rcirl_jax.export.from_run import export_run
-from rcirl_jax.export.gate_job import gate_job
+from rcirl_jax.export.gate_job import gate_job, left_out
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.export.spread import SuiteJob, spread
@@ -47,13 +47,14 @@ from rcirl_jax.report.replays import make_replays
 from rcirl_jax.report.tuning_page import TuningReport, write_tuning_page
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.simulation.rows import BASELINES
-from rcirl_jax.stages import Stages, digest, file_sha256
+from rcirl_jax.stages import Stages, code_sha256, digest, file_sha256
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.running import Running
 from rcirl_jax.train.state import TrainConfig
 
 STAGES = ("import", "train", "rank", "simulate", "gate", "report")
 RIVALS = ("hand-set", "IDM", "random weights")
+READ_BESIDE = (".csv", ".json", ".toml", ".xml", ".osm", ".gpkg")  # by importers
 REPLAYS = 6  # cases to play in the report
 
 
@@ -120,16 +121,18 @@ class Loop:
         outputs: list[Path],
         work: Callable[[], object],
     ) -> None:
-        code = {"commit": self.facts["git_commit"], "versions": self.facts["versions"]}
-        done = self.stages.run(name, {**inputs, **code}, outputs, work)
+        done = self.stages.run(name, {**inputs, **self._code()}, outputs, work)
         self.say(f"[{name}] {'done' if done else 'as before, kept'}")
+
+    def _code(self) -> dict:
+        """What made a stage besides its inputs."""
+        return {"code": code_sha256(), "versions": self.facts["versions"]}
 
     def until(self, last: str, given: str | Logs) -> None:
         """Run the stages in order, up to and with `last`; says what comes of it."""
         # what would fail only after hours of work
-        if self.config.incumbent not in BASELINES:
-            open_reward(self.config.incumbent)
         self._job()
+        self._check_incumbent()
         dataset = self.data(given)
         steps: dict[str, Callable[[], object]] = {
             "import": lambda: None,
@@ -158,9 +161,10 @@ class Loop:
         inputs = {
             "config": dataclasses.asdict(given.config),
             "spec": digest(spec),
-            "files": [_listing(path) for path in found],
+            "files": _listing(given.input) if given.input else [],
         }
-        folder = self.folder / f"dataset-{digest(inputs)[:8]}"
+        key = digest({**inputs, **self._code()})[:8]
+        folder = self.folder / f"dataset-{key}"
 
         def work() -> None:
             if (folder / "manifest.json").exists():
@@ -191,11 +195,12 @@ class Loop:
             named = {**inputs, "seed": number}
             self._run(f"train {number}", named, [file], lambda n=number: one(n))
         hashes = [file_sha256(file) for file in files]
-        self._run("export", {"seeds": hashes}, [self.weights], self._choose)
+        choose = lambda: self._choose(dataset)  # noqa: E731
+        self._run("export", {"seeds": hashes}, [self.weights], choose)
 
     def _train_inputs(self, dataset: Dataset) -> dict:
         settings = dataclasses.asdict(self.config.train)
-        return {"config": settings, "dataset": dataset.hash}
+        return {"config": settings, "dataset": dataset.hash, **self._code()}
 
     def _workdir(self, dataset: Dataset, seed: int) -> Path:
         key = digest(self._train_inputs(dataset))[:8]
@@ -205,15 +210,21 @@ class Loop:
         numbers = range(self.config.seeds)
         return [self.folder / "seeds" / f"{number}.msgpack" for number in numbers]
 
-    def _choose(self) -> None:
+    def _choose(self, dataset: Dataset) -> None:
         """The seed with the median share of training pairs won becomes candidate."""
+        config = self.config.train
+        steps = -(-dataset.indices("train").size // config.batch_size)
 
-        def won(file: Path) -> float:
-            metrics = dict(open_reward(str(file)).provenance.get("metrics") or {})
-            return float(metrics.get("pair_accuracy", 0.0))
+        def won(number: int) -> float:
+            """Over the last epoch."""
+            path = self._workdir(dataset, number) / "metrics.jsonl"
+            lines = [json.loads(x) for x in path.read_text().splitlines()[-steps:]]
+            pairs = sum(line["pairs"] for line in lines)
+            return sum(x["pair_accuracy"] * x["pairs"] for x in lines) / max(pairs, 1.0)
 
-        ranked = sorted(self._seed_files(), key=won)
-        shutil.copyfile(ranked[(len(ranked) - 1) // 2], self.weights)
+        ranked = sorted(range(self.config.seeds), key=won)
+        median = self._seed_files()[ranked[(len(ranked) - 1) // 2]]
+        shutil.copyfile(median, self.weights)
 
     def rank(self, dataset: Dataset) -> None:
         """Held-out scenes, all seeds beside incumbent and rivals."""
@@ -230,11 +241,6 @@ class Loop:
             learned = {CANDIDATE: [reward.value for reward in rewards]}
             known = self._incumbent_reward()
             if known is not None:
-                if known.preset != rewards[0].preset:
-                    raise InputError(
-                        f"--incumbent: preset {known.preset}: expected that of the"
-                        f" candidate, {rewards[0].preset}"
-                    )
                 learned[INCUMBENT] = [known.value]
             setup = RankingSetup(
                 preset=str(rewards[0].preset),
@@ -248,7 +254,7 @@ class Loop:
             (self.folder / "ranking.txt").write_text(format_table(report, 118) + "\n")
             _write_json(path, {**to_json(report), "made_by": dict(self.facts)})
 
-        self._run("rank", inputs, [path], work)
+        self._run("rank", inputs, [path, self.folder / "ranking.txt"], work)
 
     def simulate(self) -> None:
         """Candidate, incumbent and rivals on the same closed-loop cases."""
@@ -266,7 +272,8 @@ class Loop:
             write_runs(folder / "metrics.npz", runs_of(result))
 
         inputs = {"job": self._job_inputs()}
-        self._run("simulate", inputs, [folder / "metrics.npz"], work)
+        names = ("metrics.npz", "suite.json", "cases.csv", "table.txt")
+        self._run("simulate", inputs, [folder / name for name in names], work)
 
     def gate(self) -> None:
         """The verdict."""
@@ -305,7 +312,8 @@ class Loop:
 
     def _verdict(self) -> Verdict:
         runs = read_runs(self.folder / "suite" / "metrics.npz")
-        return judge(pair_of(runs, self._job()[1]), self.config.gate)
+        job, incumbent = self._job()
+        return judge(pair_of(runs, incumbent), self.config.gate, left_out(job))
 
     def _draw(self, path: Path, dataset: Dataset) -> None:
         job, incumbent = self._job()
@@ -338,6 +346,17 @@ class Loop:
             ),
         )
 
+    def _check_incumbent(self) -> None:
+        known = self._incumbent_reward()
+        if known is None:
+            return
+        found = (str(known.preset), str(known.provenance.get("mode", "speed")))
+        wanted = (self.config.train.features, self.config.train.sampler.mode)
+        if found != wanted:
+            raise InputError(
+                f"--incumbent: {known.file}: preset and mode {found}: expected {wanted}"
+            )
+
     def _incumbent_reward(self) -> Reward | None:
         name = self.config.incumbent
         return None if name in BASELINES else open_reward(name)
@@ -369,9 +388,17 @@ class Loop:
 
 
 def _listing(path: Path) -> list:
-    """Names, sizes and times of change of a file or of the files of a folder."""
-    files = sorted(path.rglob("*")) if path.is_dir() else [path]
-    stats = [(file, file.stat()) for file in files if file.is_file()]
+    """Names, sizes and times of change of all that an importer may read.
+
+    The input, what lies beside it (groups of vehicles, lanes), and folders of maps
+    above it.
+    """
+    files = set(path.rglob("*")) if path.is_dir() else {path}
+    beside = path.absolute().parent.glob("*")
+    files |= {file for file in beside if file.suffix in READ_BESIDE}
+    for above in path.absolute().parents[:4]:
+        files |= set((above / "maps").rglob("*"))
+    stats = [(file, file.stat()) for file in sorted(files) if file.is_file()]
     return [[str(file), stat.st_size, stat.st_mtime_ns] for file, stat in stats]
 
 

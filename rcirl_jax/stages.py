@@ -8,6 +8,7 @@ killed run goes on with the first stage that is not. One process at a time.
 import contextlib
 import dataclasses
 import fcntl
+import functools
 import hashlib
 import json
 import os
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from rcirl_jax.errors import InputError
+from rcirl_jax.specs import spec_root
 
 FILE = "stages.json"
 SCHEMA_VERSION = 1
@@ -32,6 +34,14 @@ def digest(node: Any) -> str:  # noqa: ANN401
     """Sha256 of anything that JSON can say."""
     text = json.dumps(node, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+@functools.cache
+def code_sha256() -> str:
+    """Of this package's sources and of the specs that users edit."""
+    package = Path(__file__).parent
+    files = [*package.rglob("*.py"), *spec_root().rglob("*.toml")]
+    return digest({str(file): file_sha256(file) for file in sorted(files)})
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

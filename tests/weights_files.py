@@ -27,6 +27,7 @@ def random_weights(path, seed=2):
         scale=np.array([0.3 * (s.upper - s.lower) for s in specs]),
         times=TIMES_S,
         leaky_slope=LEAKY_SLOPE,
+        biases=(*made.biases[:-1], np.zeros(1, np.float32)),  # as training leaves it
     )
     x = rng.normal(size=(3, TIMES_S.size, len(specs))).astype(np.float32)
     valid = np.ones(x.shape[:2], bool)

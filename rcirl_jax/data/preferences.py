@@ -59,16 +59,17 @@ def read_preferences(path: Path, dataset: Demonstrations) -> Preferences:
         raise InputError(f"{path}: size: expected at most {MAX_BYTES >> 20} MiB")
     raw = path.read_bytes()
     try:
-        lines = [line for line in raw.decode().splitlines() if line.strip()]
+        numbered = enumerate(raw.decode().splitlines(), start=1)
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: bytes: expected UTF-8 text") from error
+    lines = [(number, line) for number, line in numbered if line.strip()]
     if len(lines) < 2:
         raise InputError(f"{path}: {len(lines)} lines: expected a head and preferences")
-    _check_head(path, _object(path, 1, lines[0]), dataset.hash)
+    _check_head(path, _object(path, *lines[0]), dataset.hash)
     training = set(dataset.indices("train").tolist())
     found = [
         _preference(f"{path}: line {number}", _object(path, number, line), training)
-        for number, line in enumerate(lines[1:], start=2)
+        for number, line in lines[1:]
     ]
     rows = np.array([one[0] for one in found], np.int64)
     s, l = (np.array([one[i] for one in found], np.float32) for i in (1, 2))

@@ -2,20 +2,25 @@
 
 Four kinds of check, none of them on a learned reward:
 
-    safety      no case in which only the candidate is at fault, runs a red light
-                or a stop sign: zero, not few
+    safety      no case in which the candidate has more faults, hits more people, runs
+                more red lights or stop signs than the incumbent: zero, not few
     no loss     rates and progress over all cases are not worse than the incumbent's
                 by more than a declared margin: the lower end of the paired 97.5 %
                 interval lies above it. Rates by Tango's score interval and by the
-                bootstrap with families as clusters, both; progress by the latter
-    families    in no family drives are lost (exact McNemar) or way is lost (paired
-                bootstrap), Holm over families
-    gain        better in one primary metric, at least: McNemar or bootstrap, Holm
-                over the primary metrics
+                clusters (families), both; progress by the latter
+    families    in no family a loss of drives (exact McNemar) or of way (Student's t
+                over cases) is detected, Holm over families
+    gain        better in one primary metric, at least: McNemar and clusters, or
+                clusters alone, Holm over the primary metrics
+
+Over clusters means the paired bootstrap and Student's t with families - 1 degrees of
+freedom, of both the wider interval and the larger p: with few families the bootstrap
+alone takes chance for certainty.
 
 A check passes, fails, or is open: too few cases to prove it either way. Ship needs
-every check passed and a gain; one failed check refuses; else, open checks make the
-gate unable to judge. Host numpy, float64. `C` cases.
+every check passed, a gain and the full suite; one failed check refuses; else, open
+checks, or a part of the suite only, make the gate unable to judge. Host numpy,
+float64. `C` cases.
 """
 
 import dataclasses
@@ -30,6 +35,7 @@ from rcirl_jax.evaluation.statistics import (
     CONFIDENCE,
     ClusterBootstrap,
     Difference,
+    cluster_t,
     holm,
     mcnemar_exact,
     paired_difference,
@@ -143,16 +149,20 @@ class Pair:
                     raise InputError(
                         f"gate: {name}: {bad}: {field}: not a finite number"
                     )
+        if len(set(self.ids)) != count:
+            twice = next(name for name in self.ids if self.ids.count(name) > 1)
+            raise InputError(f"gate: {twice}: met twice: expected distinct cases")
         if len(self.families) != count or len(self.reference) != count:
             raise InputError(f"gate: families, reference: expected {count} each")
 
 
-def judge(pair: Pair, config: GateConfig) -> Verdict:
+def judge(pair: Pair, config: GateConfig, part: str = "") -> Verdict:
     """All checks on one pair of rows.
 
     Args:
       pair: the drives.
       config: margins.
+      part: what was left out of the suite, in words; then nothing ships.
 
     Raises:
       InputError: fewer than `MIN_CASES` cases.
@@ -167,6 +177,9 @@ def judge(pair: Pair, config: GateConfig) -> Verdict:
         *_gains(pair, config),
     )
     decision, reasons = _decide(checks)
+    if part and decision == "ship":
+        decision = "could not judge"
+        reasons = (f"{part}: nothing ships on a part of the suite", *reasons)
     return Verdict(
         decision=decision,
         reasons=reasons,
@@ -220,6 +233,14 @@ def _passes(metrics: CaseMetrics) -> dict[str, np.ndarray]:
 CLEAN = ("collision_free", "red_light", "stop_sign", "min_ttc", "speed_limit")
 
 
+OFFENCES = {
+    "collision_free": "at_fault",
+    "vulnerable": "at_fault_vru",  # pedestrians and cyclists
+    "red_light": "red_lights",
+    "stop_sign": "stop_signs",
+}
+
+
 def _clean(passes: Mapping[str, np.ndarray]) -> np.ndarray:
     """[C] bool: nothing of `CLEAN` is broken, and the car stays on the road."""
     return np.all([passes[name] for name in (*CLEAN, "on_road")], axis=0)
@@ -239,13 +260,31 @@ def _clusters(pair: Pair) -> np.ndarray:
 # ------------------------------------------------------------------------ checks
 
 
+def _over_clusters(
+    a: np.ndarray, b: np.ndarray, clusters: ClusterBootstrap
+) -> Difference:
+    """Mean of a - b over families: the wider interval and larger p of two methods."""
+    drawn = paired_difference(a, b, clusters)
+    student = cluster_t(a, b, clusters.cluster)
+    return Difference(
+        mean=drawn.mean,
+        low=min(drawn.low, student.low),
+        high=max(drawn.high, student.high),
+        se=max(drawn.se, student.se),
+        p=max(drawn.p, student.p),
+    )
+
+
 def _safety(pair: Pair) -> list[Check]:
-    mine, theirs = _passes(pair.candidate), _passes(pair.incumbent)
     found = []
-    for name in ("collision_free", "red_light", "stop_sign"):
-        gained, lost = _discordant(mine[name], theirs[name])
+    for name, field in OFFENCES.items():
+        mine, theirs = (
+            np.asarray(getattr(metrics, field))
+            for metrics in (pair.candidate, pair.incumbent)
+        )
+        gained, lost = int(np.sum(mine < theirs)), int(np.sum(mine > theirs))
         low, high = tango(gained, lost, len(pair.ids), CONFIDENCE)
-        new = np.flatnonzero(~mine[name] & theirs[name])
+        new = np.flatnonzero(mine > theirs)
         named = ", ".join(pair.ids[int(i)] for i in new[:3])
         found.append(
             Check(
@@ -280,7 +319,7 @@ def _no_loss(pair: Pair, config: GateConfig) -> list[Check]:
         margin = getattr(config, name)
         gained, lost = _discordant(mine[name], theirs[name])
         score = tango(gained, lost, count, CONFIDENCE)
-        drawn = paired_difference(
+        drawn = _over_clusters(
             mine[name].astype(float), theirs[name].astype(float), bootstrap
         )
         low, high = min(score[0], drawn.low), max(score[1], drawn.high)
@@ -303,24 +342,18 @@ def _no_loss(pair: Pair, config: GateConfig) -> list[Check]:
                 else f"{count} cases can never prove a loss below {100 * margin:g} %",
             )
         )
-    way = _way_of_all(pair, bootstrap)
+    way = _over_clusters(*_ways(pair, np.ones(count, bool)), bootstrap)
     outcome = _proved(way.low, way.high, config.progress)
     found.append(_continuous("no loss", "progress", way, outcome, config.progress))
     return found
 
 
-def _way(
-    pair: Pair, at: np.ndarray, cluster: np.ndarray | ClusterBootstrap
-) -> Difference:
+def _ways(pair: Pair, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Progress as a share of the incumbent's mean, over the cases in `at`."""
     mine = np.asarray(pair.candidate.progress, np.float64)[at]
     theirs = np.asarray(pair.incumbent.progress, np.float64)[at]
     scale = max(float(theirs.mean()), 1.0)
-    return paired_difference(mine / scale, theirs / scale, cluster)
-
-
-def _way_of_all(pair: Pair, bootstrap: ClusterBootstrap) -> Difference:
-    return _way(pair, np.ones(len(pair.ids), bool), bootstrap)
+    return mine / scale, theirs / scale
 
 
 def _continuous(
@@ -349,10 +382,13 @@ def _families(pair: Pair, config: GateConfig) -> list[Check]:
     """Per family: clean drives lost, and way lost; each Holm over families."""
     mine, theirs = _clean(_passes(pair.candidate)), _clean(_passes(pair.incumbent))
     names = np.asarray(pair.families)
-    order = [name for name in dict.fromkeys(pair.families) if np.sum(names == name) > 1]
+    order = [n for n in dict.fromkeys(pair.families) if np.sum(names == n) > 1]
     counts = [_discordant(mine[names == n], theirs[names == n]) for n in order]
     clean_p = holm(np.array([mcnemar_exact(*pairs) for pairs in counts]))
-    ways = [_way(pair, names == n, np.arange(np.sum(names == n))) for n in order]
+    ways = [
+        cluster_t(*_ways(pair, names == n), np.arange(np.sum(names == n)))
+        for n in order
+    ]
     way_p = holm(np.array([way.p for way in ways]))
     found, level = [], 1.0 - CONFIDENCE
     for i, name in enumerate(order):
@@ -360,11 +396,12 @@ def _families(pair: Pair, config: GateConfig) -> list[Check]:
         total = int(np.sum(names == name))
         low, high = tango(gained, lost, total, CONFIDENCE)
         worse = lost > gained and clean_p[i] < level
+        seen = len(order) * mcnemar_exact(0, total) < level  # if all were lost
         found.append(
             Check(
                 kind="families",
                 name=f"{name}, clean drives",
-                outcome="fail" if worse else "pass",
+                outcome="fail" if worse else "pass" if seen else "open",
                 difference=(gained - lost) / total,
                 low=low,
                 high=high,
@@ -399,12 +436,15 @@ def _gains(pair: Pair, config: GateConfig) -> list[Check]:
         if name in COLUMNS:
             a, b = mine[name].astype(float), theirs[name].astype(float)
             pairs = _discordant(mine[name], theirs[name])
-            found = paired_difference(a, b, bootstrap)
+            found = _over_clusters(a, b, bootstrap)
             # both tests have to see it: cases, and families as clusters
             p = max(mcnemar_exact(*pairs), found.p)
         else:
             pairs = None
-            found = (_way_of_all if name == "progress" else _scores)(pair, bootstrap)
+            both = _scores(pair)
+            if name == "progress":
+                both = _ways(pair, np.ones(len(pair.ids), bool))
+            found = _over_clusters(*both, bootstrap)
             p = found.p
         rows.append((name, found, pairs, p))
     adjusted = holm(np.array([row[3] for row in rows]))
@@ -419,14 +459,14 @@ def _gains(pair: Pair, config: GateConfig) -> list[Check]:
     return checks
 
 
-def _scores(pair: Pair, bootstrap: ClusterBootstrap) -> Difference:
-    """NuPlan's score."""
+def _scores(pair: Pair) -> tuple[np.ndarray, np.ndarray]:
+    """NuPlan's score of both."""
     reference = jnp.asarray(pair.reference)
     mine, theirs = (
         np.asarray(nuplan_score(metrics, reference)[0], np.float64)
         for metrics in (pair.candidate, pair.incumbent)
     )
-    return paired_difference(mine, theirs, bootstrap)
+    return mine, theirs
 
 
 def _look_at(pair: Pair) -> tuple[str, ...]:

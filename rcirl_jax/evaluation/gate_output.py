@@ -1,6 +1,7 @@
 """The gate's verdict as terminal text and JSON."""
 
 import json
+import os
 import textwrap
 from collections.abc import Mapping
 from pathlib import Path
@@ -85,4 +86,6 @@ def write_verdict(
         **facts,
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(plain(body), indent=2, allow_nan=False) + "\n")
+    part = path.with_name(path.name + ".tmp")
+    part.write_text(json.dumps(plain(body), indent=2, allow_nan=False) + "\n")
+    os.replace(part, path)

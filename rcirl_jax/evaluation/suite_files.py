@@ -7,6 +7,7 @@ ids and groups of the cases, and what the summary needs besides.
 import dataclasses
 import os
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -96,6 +97,11 @@ def read_runs(path: Path) -> SuiteRuns:
             )
             for number, name in enumerate(names)
         }
+        count = len(arrays["ids"])
+        whole = {name: value for name, value in arrays.items() if value.ndim}
+        short = [n for n, v in whole.items() if n != "names" and len(v) != count]
+        if short:
+            raise ValueError(f"{short[0]}: not {count} cases")
         return SuiteRuns(
             rows=rows,
             ids=tuple(arrays["ids"].tolist()),
@@ -105,6 +111,9 @@ def read_runs(path: Path) -> SuiteRuns:
             reference=str(arrays["reference"]),
             way=arrays["way"],
         )
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+    except (
+        *(OSError, KeyError, ValueError, NotImplementedError, IndexError),
+        *(zipfile.BadZipFile, zlib.error),
+    ) as error:
         why = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path}: {why}: expected the metrics of a suite") from error

@@ -1,5 +1,6 @@
 """Which rows and cases a gate drives, by names and files."""
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -7,7 +8,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.gate_runs import CANDIDATE, INCUMBENT
 from rcirl_jax.export.spread import SuiteJob
 from rcirl_jax.simulation.rows import BASELINES
-from rcirl_jax.simulation.suite import FULL_S, SMOKE_S, suite_refs
+from rcirl_jax.simulation.suite import FULL_S, SMOKE_S, CaseRef, suite_refs
 
 
 def gate_job(
@@ -55,3 +56,19 @@ def gate_job(
         plan_every=plan_every,
     )
     return job, INCUMBENT if learned else incumbent
+
+
+def left_out(job: SuiteJob) -> str:
+    """What of the full suite a job does not drive, in words; "" if nothing."""
+    full = suite_refs("full")
+    missing = len({ref.id for ref in full} - {_first(ref).id for ref in job.refs})
+    if missing:
+        return f"{len(job.refs):,} cases, {missing:,} of the full suite's left out"
+    if job.duration_s < FULL_S:
+        return f"cases of {job.duration_s:g} s instead of {FULL_S:g} s"
+    return ""
+
+
+def _first(ref: CaseRef) -> CaseRef:
+    """The same case of the catalogue's seed 0."""
+    return dataclasses.replace(ref, seed=0)

@@ -8,7 +8,8 @@ A linear reward, free or non-negative, is exact in `features`:
 f_i clipped to [lower_i, upper_i]; costs are per unit of the feature. `frenetix` names
 the nearest terms of that planner's cost.yaml. Its terms are integrals of squares or
 of absolute values over seconds, so the weights are matched where a feature departs from
-the usual by its spread: a start for its planner, not the same cost.
+the usual by its spread: a start for its planner, not the same cost. A free linear
+reward has none: it wants more of a feature or less, never the usual.
 
 A tuned hand-set cost is exact in `apollo_lattice`: the names of Apollo's flags.
 """
@@ -103,6 +104,10 @@ def reward_yaml(reward: Reward) -> str:
         }
         body = ", ".join(f"{key}: {value}" for key, value in facts.items())
         lines.append(f"  {name}: {{{body}}}")
+    if len(reward.kernels) == 1:
+        # a free linear reward wants more of a feature or less, never the usual: a
+        # cost of departures, as Frenetix has them, cannot say so
+        return "\n".join(lines) + "\n"
     lines += [
         "# nearest terms of Frenetix's cost.yaml, matched at one spread of the",
         "# feature: a start for its planner, not the same cost",

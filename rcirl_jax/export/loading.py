@@ -10,7 +10,7 @@ import numpy as np
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.reader import Reward, WeightsError, load_weights
 from rcirl_jax.features import feature_map
-from rcirl_jax.reward.network import conditioned, point_rewards
+from rcirl_jax.reward.network import LEAKY_SLOPE, conditioned, point_rewards
 from rcirl_jax.reward.normaliser import normalise
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.types import Normaliser, RewardParams
@@ -38,7 +38,14 @@ def reward_params(reward: Reward) -> tuple[RewardParams, Normaliser]:
 
     Files hold effective (pinned) parameters; the output bias, 0 in every file
     of ours, cancels between the candidates of a scene.
+
+    Raises:
+      InputError: a leaky ReLU of another slope than this package's.
     """
+    if reward.activation == "leaky_relu" and reward.leaky_slope != LEAKY_SLOPE:
+        raise InputError(
+            f"{reward.file}: leaky_slope: {reward.leaky_slope}: expected {LEAKY_SLOPE}"
+        )
     tables = lambda arrays: tuple(jnp.asarray(x, jnp.float32) for x in arrays)  # noqa: E731
     return (
         RewardParams(

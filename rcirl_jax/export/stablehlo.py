@@ -13,6 +13,7 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.loading import reward_params, scored
@@ -22,7 +23,14 @@ Form = Literal["jax", "stablehlo"]
 
 
 def exported(reward: Reward) -> jax.export.Exported:
-    """The scorer with K left open, for CPUs and NVIDIA GPUs."""
+    """The scorer with K left open, for CPUs and NVIDIA GPUs.
+
+    Raises:
+      InputError: a file with an output bias, which this package never writes and
+        its own scorers leave out because it cancels.
+    """
+    if np.any(reward.biases[-1]):
+        raise InputError(f"{reward.file}: layers: output bias: expected 0")
     effective, normaliser = reward_params(reward)
     program = functools.partial(
         scored, effective, normaliser, activation=reward.activation
@@ -33,7 +41,8 @@ def exported(reward: Reward) -> jax.export.Exported:
         jax.ShapeDtypeStruct((count, times, features), jnp.float32),
         jax.ShapeDtypeStruct((times,), jnp.bool_),
     )
-    return jax.export.export(jax.jit(program), platforms=("cpu", "cuda"))(*shapes)
+    with jax.default_matmul_precision("highest"):
+        return jax.export.export(jax.jit(program), platforms=("cpu", "cuda"))(*shapes)
 
 
 def write_stablehlo(path: Path, reward: Reward, form: Form) -> None:

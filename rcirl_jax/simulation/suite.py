@@ -81,6 +81,8 @@ def suite_refs(
     """
     known = family_names()
     names = known if suite in ("full", "smoke") else tuple(suite.split(","))
+    if len(set(names)) < len(names):
+        raise InputError(f"--suite: {suite}: a family twice: expected distinct ones")
     for name in names:
         if name not in known:
             raise InputError(

@@ -15,6 +15,7 @@ import numpy as np
 
 from rcirl_jax.data.joined import Demonstrations
 from rcirl_jax.data.preferences import Preferences
+from rcirl_jax.errors import InputError
 from rcirl_jax.features import FeatureMap, feature_map
 from rcirl_jax.features.columns import candidate_frames
 from rcirl_jax.sampling import trajectory_from_positions, trajectory_on_path
@@ -29,8 +30,20 @@ APART_M = 10.0  # m from the positive, what the losses that ask are told of the 
 def featurise_preferences(
     preferences: Preferences, dataset: Demonstrations, config: TrainConfig
 ) -> FeatureBatch:
-    """Features of N preferences, numpy leaves [N, ...], K = 1."""
+    """Features of N preferences, numpy leaves [N, ...], K = 1.
+
+    Raises:
+      InputError: a pair that differs in nothing that the sampler's mode varies.
+    """
     count, parts = preferences.row.size, []
+    if config.sampler.mode == "speed":
+        better, worse = preferences.s[:, 0], preferences.s[:, 1]
+        same = np.flatnonzero(np.all(better == worse, axis=1))
+        if same.size:
+            raise InputError(
+                f"--preferences: scene {preferences.row[same[0]]}: better, worse: the"
+                " same s: expected others, for l does not count in mode speed"
+            )
     features = feature_map(config.features)
     for start in range(0, count, CHUNK):
         at = np.minimum(np.arange(start, start + CHUNK), count - 1)

@@ -343,6 +343,9 @@ def make_train_step(
         )
         grads, sums = sums_of(batch) if whole else added(sums_of, in_pieces(batch))
         nonfinite, first_bad = _nonfinite(batch)
+        if judged is not None:
+            also, bad = _nonfinite(judged)
+            nonfinite, first_bad = nonfinite + also, jnp.maximum(first_bad, bad)
         if axis_name is not None:
             sums, grads, nonfinite = jax.lax.psum((sums, grads, nonfinite), axis_name)
             first_bad = jax.lax.pmax(first_bad, axis_name)
@@ -352,7 +355,8 @@ def make_train_step(
             more, wanted = gradient_sums(state.params, state.normaliser, judged, alone)
             if axis_name is not None:
                 more, wanted = jax.lax.psum((more, wanted), axis_name)
-            scale = config.preference_weight / jnp.maximum(wanted.terms, 1.0)
+            terms = jnp.where(wanted.terms > 0.0, wanted.terms, 1.0)
+            scale = config.preference_weight / terms
             grads = jax.tree.map(lambda g, m: g + scale * m, grads, more)
             preferred = jnp.stack([wanted.wins, wanted.pairs])
         norm = optax.tree.norm(grads)

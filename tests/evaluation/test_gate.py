@@ -37,13 +37,13 @@ def drives(seed=0, jerky=0.4, hard=0.15, way=1000.0):
     return CaseMetrics(**values)
 
 
-def pair(candidate, incumbent):
-    names = [f"family{i:02d}" for i in range(FAMILIES) for _ in range(EACH)]
+def pair(candidate, incumbent, families=FAMILIES):
+    names = [f"family{i * families // CASES:02d}" for i in range(CASES)]
     return Pair(
         candidate=candidate,
         incumbent=incumbent,
         families=names,
-        ids=[f"{name}/{i % EACH:03d}@0" for i, name in enumerate(names)],
+        ids=[f"{name}/{i % EACH:03d}@{i // EACH}" for i, name in enumerate(names)],
         reference=np.full(CASES, 1000.0),
     )
 
@@ -58,8 +58,8 @@ def broken(metrics, cases, **values):
     return metrics.replace(**changed)
 
 
-def decide(candidate, incumbent, **config):
-    return judge(pair(candidate, incumbent), GateConfig(**config))
+def decide(candidate, incumbent, families=FAMILIES, **config):
+    return judge(pair(candidate, incumbent, families), GateConfig(**config))
 
 
 def failed(verdict):
@@ -98,8 +98,16 @@ def test_one_new_offence_refuses_however_smooth(field, name):
     verdict = decide(broken(candidate, [1234], **{field: 1}), drives())
     assert verdict.decision == "do not ship"
     assert failed(verdict) == {name}
-    assert "family06/034@0" in verdict.reasons[0]
-    assert verdict.look_at[0] == "family06/034@0"
+    assert "family06/034@6" in verdict.reasons[0]
+    assert verdict.look_at[0] == "family06/034@6"
+
+
+def test_more_of_an_offence_that_both_commit_is_new():
+    """A cone touched by both is no excuse for a pedestrian hit by one."""
+    both = broken(drives(), [7], at_fault=1, red_lights=1)
+    worse = broken(both, [7], at_fault_vru=1)
+    assert failed(decide(worse, both)) == {"vulnerable"}
+    assert failed(decide(broken(both, [7], red_lights=3), both)) == {"red_light"}
 
 
 def test_an_offence_of_both_is_not_new():
@@ -154,21 +162,36 @@ def test_too_few_cases_cannot_be_judged():
                                  on_road=0.01)).decision == "no difference"  # fmt: skip
 
 
-def test_exchangeable_rewards_hardly_ever_ship():
-    """Two rewards of one quality, drawn anew: gains are false alarms."""
-    shipped = refused = 0
-    for seed in range(40):
-        verdict = decide(drives(2 * seed), drives(2 * seed + 1), primary=("j_station",))
-        shipped += verdict.decision == "ship"
-        refused += verdict.decision == "do not ship"
-    assert shipped <= 4  # expected 1 of 40, 2.5 %
-    assert refused <= 6  # expected 2 of 40: 5 % by families
+@pytest.mark.parametrize("families", [2, 3, 5, 20])
+def test_exchangeable_rewards_hardly_ever_ship(families):
+    """Two rewards of one quality, drawn anew: gains are false alarms, 5 % at most."""
+    wide = dict.fromkeys(("collision_free", "min_ttc", "speed_limit", "on_road"), 0.5)
+    wide |= {"progress": 0.5, "family_progress": 0.5}
+    drawn, shipped = 24, 0
+    for seed in range(drawn):
+        a, b = drives(2 * seed), drives(2 * seed + 1)
+        shipped += decide(a, b, families, **wide).decision == "ship"
+    # P(more than 4 of 24 at 5 %) = 0.6 %; the seeds are fixed
+    assert shipped <= 4
+
+
+def test_nothing_ships_on_a_part_of_the_suite():
+    candidate = drives()
+    better = candidate.replace(holds=np.ones_like(candidate.holds))
+    both = pair(better, candidate)
+    assert judge(both, GateConfig()).decision == "ship"
+    verdict = judge(both, GateConfig(), "cases of 2 s instead of 120 s")
+    assert verdict.decision == "could not judge"
+    assert verdict.reasons[0].startswith("cases of 2 s instead of 120 s")
 
 
 def test_bad_input_is_one_line():
     good = drives()
     with pytest.raises(InputError, match="family00/003@0: progress: not a finite"):
         pair(broken(good, [3], progress=np.nan), good)
+    twice = [*pair(good, good).ids[:-1], "family00/003@0"]
+    with pytest.raises(InputError, match="family00/003@0: met twice"):
+        dataclasses.replace(pair(good, good), ids=twice)
     with pytest.raises(InputError, match="--min_ttc: 0: expected within"):
         GateConfig(min_ttc=0)
     with pytest.raises(InputError, match="--primary: reward: expected some of"):

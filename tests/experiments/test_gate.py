@@ -44,11 +44,13 @@ def test_a_reward_against_itself(tmp_path):
         (("--incumbent=nobody",), "nobody"),
         (("--progress_margin=-1",), "progress: -1.0: expected within (0, 1)"),
         (("--duration=0.1",), "--duration: 0.1: expected 1 to 120 s"),
+        (("--suite=cut_in,cut_in",), "a family twice"),
     ],
 )
 def test_wrong_flags_are_one_line(flags, message, tmp_path):
     file = random_weights(tmp_path / "w.msgpack")
     out = f"--output={tmp_path}/v.json"
+    (tmp_path / "v.json").write_text("the verdict of another candidate")
     done = command(f"--candidate={file}", out, *SHORT, *flags)
     assert done.returncode == 2
     (line,) = done.stderr.strip().splitlines()

@@ -118,9 +118,44 @@ def test_yaml_of_a_linear_reward_is_its_cost(tmp_path, nonnegative):
     x, valid = inputs()
     want = -made.value(x, np.broadcast_to(valid, x.shape[:2]))
     np.testing.assert_allclose(value_of(document, x, valid), want, rtol=1e-4, atol=1e-4)
-    terms = document["frenetix"]["cost_weights"]
+    assert ("frenetix" in document) == nonnegative
+
+
+def test_frenetix_terms_match_at_one_spread(tmp_path):
+    """Features a (spread 2, 0.3 either side) and v (0.4 above, 0.2 below)."""
+    made = reward(tmp_path)
+    made = dataclasses.replace(
+        made,
+        names=("acceleration", "velocity"),
+        units=("m/s^2", "m/s"),
+        lower=np.full(2, -9.0),
+        upper=np.full(2, 9.0),
+        location=np.zeros(2),
+        scale=np.array([2.0, 1.0]),
+        times=np.array([0.0, 0.5, 1.0]),
+        gamma=np.ones(3),
+        activation="relu",
+        kernels=(
+            np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -1.0]]),
+            -np.array([[0.6], [0.6], [0.4], [0.2]]),
+        ),
+        biases=(np.zeros(4), np.zeros(1)),
+    )
+    terms = yaml.safe_load(reward_yaml(made))["frenetix"]["cost_weights"]
     assert len(terms) == 13
-    assert all(weight >= 0.0 for weight in terms.values())
+    # a departure of 2 m/s^2 costs 0.6 a time, 1.2 a second: w 2^2 = 1.2
+    assert terms.pop("acceleration") == pytest.approx(0.3)
+    assert terms.pop("velocity_offset") == pytest.approx(0.3 * 2.0)
+    assert not any(terms.values())
+
+
+def test_what_scores_otherwise_is_refused(tmp_path):
+    made = reward(tmp_path, (6,), "leaky_relu")
+    with pytest.raises(InputError, match=r"leaky_slope: 0\.2: expected 0\.01"):
+        exported(dataclasses.replace(made, leaky_slope=0.2))
+    biased = (*made.biases[:-1], np.ones(1, np.float32))
+    with pytest.raises(InputError, match="output bias: expected 0"):
+        exported(dataclasses.replace(made, biases=biased))
 
 
 def test_a_network_is_no_linear_cost(tmp_path):

@@ -148,7 +148,7 @@ const KEYS = {
 
 root.addEventListener("keydown", (event) => {
   const within = event.target.tagName;
-  const own = within === "SELECT" || (event.key === " " && within === "BUTTON");
+  const own = within === "SELECT" || (event.key === " " && (within === "BUTTON" || within === "SUMMARY"));
   if (!(event.key in KEYS) || own || event.ctrlKey || event.altKey || event.metaKey) return;
   event.preventDefault();
   KEYS[event.key]();
