@@ -41,7 +41,7 @@ def main() -> None:
             raise InputError(f"--{next(iter(files))}: expected --weights with it")
         text = lattice_yaml(load_hand_weights(_HAND.value), Path(_HAND.value).name)
     else:
-        reward = open_reward(_WEIGHTS.value)
+        reward = open_reward(str(_WEIGHTS.value))
         text = reward_yaml(reward) if _YAML.value else ""
         for name, path in files.items():
             if name == "onnx":

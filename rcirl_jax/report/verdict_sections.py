@@ -109,7 +109,7 @@ def forest(title: str, checks: Sequence[Check], names: Sequence[str]) -> str:
             100.0 * x for x in (check.difference, check.low, check.high)
         )
         numbers = interval((value, low, high), 2, signed=True) + " %"
-        word, kind = _outcome(check)
+        word, kind = outcome_of(check)
         if kind == "fail":
             failing.append(name)
         cell = interval_cell(
@@ -127,7 +127,7 @@ def forest(title: str, checks: Sequence[Check], names: Sequence[str]) -> str:
     return table(title, heads, rows, kind="forest", marked=failing)
 
 
-def _outcome(check: Check) -> tuple[str, str]:
+def outcome_of(check: Check) -> tuple[str, str]:
     """Word and class; a gain that is missing is no failure of the gate."""
     if check.kind != "gain":
         return OUTCOMES[check.outcome], check.outcome

@@ -21,6 +21,7 @@ from rcirl_jax.report.frames import _sampled
 from rcirl_jax.report.markup import interval
 from rcirl_jax.report.replays import AHEAD_M, BEHIND_M, FRAME_STEPS, make_replays
 from rcirl_jax.report.tuning_page import write_tuning_page
+from rcirl_jax.report.verdict_sections import outcome_of
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.simulation.cases import STEP_S
 from rcirl_jax.simulation.metrics import COLUMNS
@@ -266,15 +267,19 @@ def test_every_check_is_there_with_its_interval(page, report):
     )
 
 
-def test_a_loss_is_never_called_no_difference(page, report):
-    gains = {c.name: c for c in report.verdict.checks if c.kind == "gain"}
-    found = forest_rows(page)
-    said = {name: found[name.replace("_", " ")][-1][3] for name in gains}
-    assert set(said.values()) == {"worse", "no difference"}
-    for name, check in gains.items():
-        if said[name] == "worse":
-            assert check.difference < 0.0
-            assert check.p < 0.05
+@pytest.mark.parametrize(
+    ("difference", "p", "word"),
+    [
+        (-0.02, 0.004, "worse"),
+        (-0.02, 0.2, "no difference"),
+        (0.02, 0.2, "no difference"),
+    ],
+)
+def test_a_loss_is_never_called_no_difference(report, difference, p, word):
+    gains = [check for check in report.verdict.checks if check.kind == "gain"]
+    for check in gains:
+        seen = dataclasses.replace(check, difference=difference, p=p, outcome="open")
+        assert outcome_of(seen) == (word, "open")
 
 
 def test_the_papers_table_is_the_suites(page, report):
