@@ -21,7 +21,7 @@ from rcirl_jax.autotune import STAGES, Logs, Loop, TuneConfig
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import IMPORTERS
 from rcirl_jax.data.importing import ImportConfig
-from rcirl_jax.evaluation.gate import GateConfig
+from rcirl_jax.evaluation.gate_types import GateConfig
 from rcirl_jax.reward import LOSSES, RewardConfig
 from rcirl_jax.stages import only_one
 from rcirl_jax.train.running import Running

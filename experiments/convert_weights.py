@@ -15,10 +15,11 @@ from absl import flags
 from experiments.common import run
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.hand_weights import load_hand_weights
-from rcirl_jax.export.linear_yaml import lattice_yaml, reward_yaml, write_text
+from rcirl_jax.export.linear_yaml import lattice_yaml, reward_yaml
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.onnx_model import write_onnx
 from rcirl_jax.export.stablehlo import write_stablehlo
+from rcirl_jax.whole import write_whole
 
 _WEIGHTS = flags.DEFINE_string("weights", None, "weights file")
 _HAND = flags.DEFINE_string("hand_weights", None, "of tune_hand_set, for --yaml")
@@ -51,7 +52,7 @@ def main() -> None:
                 write_stablehlo(path, reward, form)
             print(f"written: {path}")
     if _YAML.value:
-        write_text(Path(_YAML.value), text)
+        write_whole(Path(_YAML.value), text)
         print(f"written: {_YAML.value}")
 
 

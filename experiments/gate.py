@@ -4,10 +4,10 @@
     python -m experiments.gate --candidate=FILE --incumbent=hand-set --output=FILE
 
 Both drive the same closed-loop cases; never is a learned reward the judge. Refused (3)
-if the candidate is at fault, or runs a red light or stop sign, in a case in which the
-incumbent does not; if rates or way are worse than the margins allow; if a family
-loses; or if nothing is better. 2: could not judge: bad input, or too few cases. With
-no fault anywhere, a margin of 0.1 % takes 3,838 cases: the full suite.
+if the candidate has more faults, or runs more red lights or stop signs, in any case
+than the incumbent; if rates or way are worse than the margins allow; if a family
+loses; or if nothing is better. 2: could not judge: bad input, too few cases, or a part
+of the suite. With no fault anywhere, a margin of 0.1 % takes 3,838 cases.
 """
 
 import dataclasses
@@ -18,13 +18,13 @@ from absl import flags
 
 from experiments.common import provenance, run
 from experiments.executor import executor
-from rcirl_jax.evaluation.closed_loop import SuiteConfig, drive_here, run_suite
-from rcirl_jax.evaluation.gate import GateConfig, judge
+from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.gate import judge
 from rcirl_jax.evaluation.gate_output import format_verdict, write_verdict
-from rcirl_jax.evaluation.gate_runs import pair_of, repeats
+from rcirl_jax.evaluation.gate_runs import pair_of
+from rcirl_jax.evaluation.gate_types import GateConfig
 from rcirl_jax.evaluation.suite_files import runs_of
-from rcirl_jax.export.gate_job import gate_job, left_out
-from rcirl_jax.export.spread import spread
+from rcirl_jax.export.gate_job import drive_job, gate_job, left_out
 from rcirl_jax.simulation.rows import BASELINES
 
 _CANDIDATE = flags.DEFINE_string("candidate", None, "weights file", required=True)
@@ -55,12 +55,14 @@ _MARGINS = {
 
 def main() -> None:
     """Flags -> one verdict."""
-    Path(_OUTPUT.value).unlink(missing_ok=True)  # of another gate: not this verdict
+    output = Path(_OUTPUT.value)
+    if output.suffix != ".json":
+        raise InputError(f"--output: {output}: expected a name that ends in .json")
+    output.unlink(missing_ok=True)  # of another gate: not this verdict
     margins = {name: flag.value for name, flag in _MARGINS.items()}
     config = dataclasses.replace(
         GateConfig(), primary=tuple(_PRIMARY.value or ()), **margins
     )
-    places = executor()
     job, incumbent = gate_job(
         _CANDIDATE.value,
         _INCUMBENT.value,
@@ -70,17 +72,13 @@ def main() -> None:
         catalogue_seed=_SEED.value,
         plan_every=_EVERY.value,
     )
-    drive = spread(places, job) if places.workers > 1 else drive_here
-    rows, cases = job.rows(), job.cases()
-    suite = SuiteConfig(plan_every=_EVERY.value)
-    result = run_suite(rows, cases, suite, drive)
-    repeats(rows[0], result, suite)
+    result = drive_job(job, executor())
     verdict = judge(pair_of(runs_of(result), incumbent), config, left_out(job))
     files = {"candidate": _CANDIDATE.value, "incumbent": _INCUMBENT.value}
     facts = {"files": files, **result.facts, "made_by": provenance()}
-    write_verdict(Path(_OUTPUT.value), verdict, config, facts)
+    write_verdict(output, verdict, config, facts)
     print(format_verdict(verdict))
-    print(f"written: {_OUTPUT.value}; exit status {verdict.exit_code}")
+    print(f"written: {output}; exit status {verdict.exit_code}")
     sys.exit(verdict.exit_code)
 
 

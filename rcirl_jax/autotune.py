@@ -13,36 +13,33 @@ RUN/stages.json        what made what (`stages`)
 """
 
 import dataclasses
+import functools
 import json
-import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from rcirl_jax.data.cut import Part
 from rcirl_jax.data.importers import parts
+from rcirl_jax.data.importers.files import listing
 from rcirl_jax.data.importing import ImportConfig, import_parts
 from rcirl_jax.data.store import Dataset, open_dataset
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.closed_loop import (
-    SuiteConfig,
-    drive_here,
-    run_suite,
-    write_suite,
-)
+from rcirl_jax.evaluation.closed_loop import write_suite
 from rcirl_jax.evaluation.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.evaluation.format import format_table
-from rcirl_jax.evaluation.gate import GateConfig, Verdict, judge
+from rcirl_jax.evaluation.gate import judge
 from rcirl_jax.evaluation.gate_output import format_verdict, write_verdict
-from rcirl_jax.evaluation.gate_runs import CANDIDATE, INCUMBENT, pair_of, repeats
-from rcirl_jax.evaluation.suite_files import read_runs, runs_of, write_runs
+from rcirl_jax.evaluation.gate_runs import CANDIDATE, INCUMBENT, pair_of
+from rcirl_jax.evaluation.gate_types import GateConfig, Verdict
+from rcirl_jax.evaluation.suite_files import SuiteRuns, read_runs, runs_of, write_runs
 from rcirl_jax.evaluation.table import from_json, to_json
 from rcirl_jax.executor import Executor
 from rcirl_jax.export.from_run import export_run
-from rcirl_jax.export.gate_job import gate_job, left_out
+from rcirl_jax.export.gate_job import drive_job, gate_job, left_out
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.reader import Reward
-from rcirl_jax.export.spread import SuiteJob, spread
+from rcirl_jax.export.spread import SuiteJob
 from rcirl_jax.report.replays import make_replays
 from rcirl_jax.report.tuning_page import TuningReport, write_tuning_page
 from rcirl_jax.sampling import SamplerConfig
@@ -51,10 +48,10 @@ from rcirl_jax.stages import Stages, code_sha256, digest, file_sha256
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.running import Running
 from rcirl_jax.train.state import TrainConfig
+from rcirl_jax.whole import write_json, write_whole
 
 STAGES = ("import", "train", "rank", "simulate", "gate", "report")
 RIVALS = ("hand-set", "IDM", "random weights")
-READ_BESIDE = (".csv", ".json", ".toml", ".xml", ".osm", ".gpkg")  # by importers
 REPLAYS = 6  # cases to play in the report
 
 
@@ -145,7 +142,7 @@ class Loop:
         for name in STAGES[: STAGES.index(last) + 1]:
             steps[name]()
         if last in ("gate", "report"):
-            self.say(self.verdict_text())
+            self.say(format_verdict(self._verdict))
         if last != "import":
             self.say(f"weights: {self.weights}")
         if last == "report":
@@ -161,7 +158,7 @@ class Loop:
         inputs = {
             "config": dataclasses.asdict(given.config),
             "spec": digest(spec),
-            "files": _listing(given.input) if given.input else [],
+            "files": listing(given.input) if given.input else [],
         }
         key = digest({**inputs, **self._code()})[:8]
         folder = self.folder / f"dataset-{key}"
@@ -224,7 +221,7 @@ class Loop:
 
         ranked = sorted(range(self.config.seeds), key=won)
         median = self._seed_files()[ranked[(len(ranked) - 1) // 2]]
-        shutil.copyfile(median, self.weights)
+        write_whole(self.weights, median.read_bytes())
 
     def rank(self, dataset: Dataset) -> None:
         """Held-out scenes, all seeds beside incumbent and rivals."""
@@ -252,7 +249,7 @@ class Loop:
                 dataset, learned, setup, self.executor, references
             )
             (self.folder / "ranking.txt").write_text(format_table(report, 118) + "\n")
-            _write_json(path, {**to_json(report), "made_by": dict(self.facts)})
+            write_json(path, {**to_json(report), "made_by": dict(self.facts)})
 
         self._run("rank", inputs, [path, self.folder / "ranking.txt"], work)
 
@@ -262,12 +259,7 @@ class Loop:
         folder = self.folder / "suite"
 
         def work() -> None:
-            drive = spread(self.executor, job)
-            rows, cases = job.rows(), job.cases()
-            suite = SuiteConfig(plan_every=self.config.plan_every)
-            drive = drive if self.executor.workers > 1 else drive_here
-            result = run_suite(rows, cases, suite, drive)
-            repeats(rows[0], result, suite)
+            result = drive_job(job, self.executor)
             write_suite(result, folder, self.facts)
             write_runs(folder / "metrics.npz", runs_of(result))
 
@@ -282,12 +274,14 @@ class Loop:
         inputs = {
             "metrics": file_sha256(metrics),
             "gate": dataclasses.asdict(self.config.gate),
+            "incumbent": self._job()[1],
+            "left_out": left_out(self._job()[0]),
         }
 
         def work() -> None:
             files = {"candidate": str(self.weights), "incumbent": self.config.incumbent}
             facts = {"files": files, "made_by": dict(self.facts)}
-            write_verdict(path, self._verdict(), self.config.gate, facts)
+            write_verdict(path, self._verdict, self.config.gate, facts)
 
         self._run("gate", inputs, [path], work)
 
@@ -306,18 +300,19 @@ class Loop:
 
     # -------------------------------------------------------------------- helpers
 
-    def verdict_text(self) -> str:
-        """For the terminal."""
-        return format_verdict(self._verdict())
+    @functools.cached_property
+    def _runs(self) -> SuiteRuns:
+        """Of the finished simulation."""
+        return read_runs(self.folder / "suite" / "metrics.npz")
 
+    @functools.cached_property
     def _verdict(self) -> Verdict:
-        runs = read_runs(self.folder / "suite" / "metrics.npz")
         job, incumbent = self._job()
-        return judge(pair_of(runs, incumbent), self.config.gate, left_out(job))
+        return judge(pair_of(self._runs, incumbent), self.config.gate, left_out(job))
 
     def _draw(self, path: Path, dataset: Dataset) -> None:
         job, incumbent = self._job()
-        verdict = self._verdict()
+        verdict = self._verdict
         made = {k: v for k, v in self.stages.read().items() if k != "report"}
         rewards = {CANDIDATE: open_reward(str(self.weights))}
         if known := self._incumbent_reward():
@@ -330,7 +325,7 @@ class Loop:
             TuningReport(
                 verdict=verdict,
                 gate=self.config.gate,
-                suite=read_runs(self.folder / "suite" / "metrics.npz").report(),
+                suite=self._runs.report(),
                 incumbent=incumbent,
                 ranking=from_json(
                     json.loads((self.folder / "ranking.json").read_text())
@@ -385,24 +380,3 @@ class Loop:
             "refs": digest([ref.id for ref in job.refs]),
             "weights": [file_sha256(Path(file)) for file in job.weights],
         }
-
-
-def _listing(path: Path) -> list:
-    """Names, sizes and times of change of all that an importer may read.
-
-    The input, what lies beside it (groups of vehicles, lanes), and folders of maps
-    above it.
-    """
-    files = set(path.rglob("*")) if path.is_dir() else {path}
-    beside = path.absolute().parent.glob("*")
-    files |= {file for file in beside if file.suffix in READ_BESIDE}
-    for above in path.absolute().parents[:4]:
-        files |= set((above / "maps").rglob("*"))
-    stats = [(file, file.stat()) for file in sorted(files) if file.is_file()]
-    return [[str(file), stat.st_size, stat.st_mtime_ns] for file, stat in stats]
-
-
-def _write_json(path: Path, body: Mapping[str, Any]) -> None:
-    part = path.with_name(path.name + ".tmp")
-    part.write_text(json.dumps(body, indent=2, allow_nan=False) + "\n")
-    part.replace(path)

@@ -11,7 +11,6 @@ import fcntl
 import functools
 import hashlib
 import json
-import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -19,6 +18,7 @@ from typing import Any
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.specs import spec_root
+from rcirl_jax.whole import write_json
 
 FILE = "stages.json"
 SCHEMA_VERSION = 1
@@ -122,9 +122,7 @@ class Stages:
 
     def _write(self, stages: Mapping[str, Any]) -> None:
         body = {"schema_version": SCHEMA_VERSION, "stages": dict(stages)}
-        part = self.folder / (FILE + ".tmp")
-        part.write_text(json.dumps(body, indent=2, allow_nan=False) + "\n")
-        os.replace(part, self.folder / FILE)
+        write_json(self.folder / FILE, body)
 
 
 @contextlib.contextmanager

@@ -1,5 +1,11 @@
 """Ranking metrics, honest intervals and the table that shows them."""
 
+from rcirl_jax.evaluation.exact import (
+    clopper_pearson,
+    holm,
+    mcnemar_exact,
+    rule_of_three,
+)
 from rcirl_jax.evaluation.format import format_table
 from rcirl_jax.evaluation.ranking import (
     Outcomes,
@@ -15,12 +21,8 @@ from rcirl_jax.evaluation.statistics import (
     Difference,
     Estimate,
     bootstrap_median,
-    clopper_pearson,
     combine_seeds,
-    holm,
-    mcnemar_exact,
     paired_difference,
-    rule_of_three,
 )
 from rcirl_jax.evaluation.table import RankingReport, build_report, to_json
 

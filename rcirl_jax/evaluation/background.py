@@ -28,8 +28,8 @@ import numpy as np
 import optax
 
 from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.exact import clopper_pearson
 from rcirl_jax.evaluation.statistics import (
-    clopper_pearson,
     combine_seeds,
     paired_difference,
 )

@@ -1,15 +1,14 @@
 """The gate's verdict as terminal text and JSON."""
 
-import json
-import os
 import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 
-from rcirl_jax.evaluation.gate import Check, GateConfig, Verdict
+from rcirl_jax.evaluation.gate_types import Check, GateConfig, Verdict
 from rcirl_jax.evaluation.suite_output import plain, text_table
+from rcirl_jax.whole import write_json
 
-MARKS = {"pass": "ok", "fail": "FAIL", "open": "open"}
+OUTCOMES = {"pass": "ok", "fail": "FAIL", "open": "open"}
 WIDTH = 100  # columns of wrapped text
 
 
@@ -21,7 +20,7 @@ def _cells(check: Check) -> list[str]:
     pairs = "" if check.lost is None else f"+{check.gained} -{check.lost}"
     return [
         check.name,
-        MARKS[check.outcome] if check.kind != "gain" else _gain(check),
+        OUTCOMES[check.outcome] if check.kind != "gain" else _gain(check),
         _percent(check.difference),
         f"[{_percent(check.low)}, {_percent(check.high)}]",
         "" if check.margin is None else f"-{100.0 * check.margin:g}",
@@ -36,7 +35,7 @@ def _gain(check: Check) -> str:
 
 TITLES = {
     "safety": "Nothing new that is unsafe",
-    "no loss": "No loss beyond the margin, all cases",
+    "no loss": "No loss beyond the margin, over all cases",
     "families": "No family that loses (Holm over families; worst ten)",
     "gain": "Better somewhere (Holm over the primary metrics)",
 }
@@ -85,7 +84,4 @@ def write_verdict(
         "config": plain(config),
         **facts,
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".tmp")
-    part.write_text(json.dumps(plain(body), indent=2, allow_nan=False) + "\n")
-    os.replace(part, path)
+    write_json(path, plain(body))

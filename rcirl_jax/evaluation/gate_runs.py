@@ -5,7 +5,7 @@ import numpy as np
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop import SuiteConfig, SuiteResult
-from rcirl_jax.evaluation.gate import Pair
+from rcirl_jax.evaluation.gate_types import Pair
 from rcirl_jax.evaluation.suite_files import SuiteRuns
 from rcirl_jax.evaluation.suite_output import result_hash
 from rcirl_jax.simulation.rollout import LANES

@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike
 from scipy.special import expit, stdtrit
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.statistics import CONFIDENCE
+from rcirl_jax.evaluation.exact import CONFIDENCE
 from rcirl_jax.evaluation.table import FEW_VEHICLES
 
 RIDGE = 1e-8  # of the mean loss; so small that it decides only what data cannot

@@ -18,6 +18,7 @@ from rcirl_jax.data.collect import Collector
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.smoothing import harsh_share
 from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.exact import clopper_pearson
 from rcirl_jax.evaluation.label_cases import (
     FAMILIES,
     HISTORY_S,
@@ -29,7 +30,6 @@ from rcirl_jax.evaluation.label_cases import (
     draw,
     to_recording,
 )
-from rcirl_jax.evaluation.statistics import clopper_pearson
 from rcirl_jax.types import Decision, Kind, Tag
 from rcirl_jax.units import TIMES_S
 

@@ -5,7 +5,7 @@ ids and groups of the cases, and what the summary needs besides.
 """
 
 import dataclasses
-import os
+import io
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -17,6 +17,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop import SuiteResult
 from rcirl_jax.evaluation.suite_summary import SuiteReport, summarise
 from rcirl_jax.simulation.metrics import CaseMetrics
+from rcirl_jax.whole import write_whole
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -71,11 +72,9 @@ def write_runs(path: Path, runs: SuiteRuns) -> None:
         for field in dataclasses.fields(CaseMetrics):
             value = np.asarray(getattr(metrics, field.name))
             arrays[f"row{number}.{field.name}"] = value
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".tmp")
-    with part.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **arrays)
-    os.replace(part, path)
+    packed = io.BytesIO()
+    np.savez_compressed(packed, allow_pickle=False, **arrays)
+    write_whole(path, packed.getvalue())
 
 
 def read_runs(path: Path) -> SuiteRuns:
@@ -112,8 +111,9 @@ def read_runs(path: Path) -> SuiteRuns:
             way=arrays["way"],
         )
     except (
-        *(OSError, KeyError, ValueError, NotImplementedError, IndexError),
-        *(zipfile.BadZipFile, zlib.error),
+        # of files and arrays; of zip: damaged, packed or locked in ways not known
+        *(OSError, LookupError, ValueError),
+        *(zipfile.BadZipFile, zlib.error, RuntimeError),
     ) as error:
         why = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path}: {why}: expected the metrics of a suite") from error

@@ -13,14 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rcirl_jax.evaluation.statistics import (
-    ClusterBootstrap,
-    Difference,
+from rcirl_jax.evaluation.exact import (
     clopper_pearson,
     holm,
     mcnemar_exact,
-    paired_difference,
     rule_of_three,
+)
+from rcirl_jax.evaluation.statistics import (
+    ClusterBootstrap,
+    Difference,
+    paired_difference,
 )
 from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics, nuplan_score
 

@@ -13,17 +13,15 @@ from typing import Any
 import numpy as np
 
 from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.exact import CONFIDENCE, clopper_pearson, holm
 from rcirl_jax.evaluation.ranking import METRICS, Outcomes, miss_threshold, oracle_fde
 from rcirl_jax.evaluation.statistics import (
-    CONFIDENCE,
     NUM_RESAMPLES,
     ClusterBootstrap,
     Difference,
     Estimate,
     bootstrap_median,
-    clopper_pearson,
     combine_seeds,
-    holm,
     paired_difference,
 )
 from rcirl_jax.reward import TUNED_ROW

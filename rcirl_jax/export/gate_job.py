@@ -5,8 +5,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.gate_runs import CANDIDATE, INCUMBENT
-from rcirl_jax.export.spread import SuiteJob
+from rcirl_jax.evaluation.closed_loop import (
+    SuiteConfig,
+    SuiteResult,
+    drive_here,
+    run_suite,
+)
+from rcirl_jax.evaluation.gate_runs import CANDIDATE, INCUMBENT, repeats
+from rcirl_jax.executor import Executor
+from rcirl_jax.export.spread import SuiteJob, spread
 from rcirl_jax.simulation.rows import BASELINES
 from rcirl_jax.simulation.suite import FULL_S, SMOKE_S, CaseRef, suite_refs
 
@@ -56,6 +63,19 @@ def gate_job(
         plan_every=plan_every,
     )
     return job, INCUMBENT if learned else incumbent
+
+
+def drive_job(job: SuiteJob, executor: Executor) -> SuiteResult:
+    """Drive the suite wherever the executor runs it, and the first cases twice.
+
+    Raises:
+      InputError: the candidate's drives do not repeat.
+    """
+    rows, config = job.rows(), SuiteConfig(plan_every=job.plan_every)
+    drive = spread(executor, job) if executor.workers > 1 else drive_here
+    result = run_suite(rows, job.cases(), config, drive)
+    repeats(rows[0], result, config)
+    return result
 
 
 def left_out(job: SuiteJob) -> str:

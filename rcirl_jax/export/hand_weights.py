@@ -15,6 +15,7 @@ from pathlib import Path
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.reward import LatticeCost
+from rcirl_jax.whole import write_json
 
 SCHEMA = "rcirl-jax/hand-weights"
 SCHEMA_VERSION = 1
@@ -38,12 +39,7 @@ def write_hand_weights(
         "weights": {name: float(x) for name, x in cost.fields().items()},
         **facts,
     }
-    text = json.dumps(body, indent=2, allow_nan=False) + "\n"
-    file = Path(path)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    temporary = file.with_name(file.name + ".tmp")
-    temporary.write_text(text)
-    os.replace(temporary, file)
+    write_json(Path(path), body)
 
 
 def load_hand_weights(path: str | os.PathLike[str]) -> LatticeCost:

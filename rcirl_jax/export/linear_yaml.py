@@ -14,9 +14,7 @@ reward has none: it wants more of a feature or less, never the usual.
 A tuned hand-set cost is exact in `apollo_lattice`: the names of Apollo's flags.
 """
 
-import os
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 
@@ -138,14 +136,6 @@ def lattice_yaml(cost: LatticeCost, source: str) -> str:
     for flag, field in APOLLO.items():
         lines.append(f"  {flag}: {_number(float(getattr(cost, field)))}")
     return "\n".join(lines) + "\n"
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write the document, whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".tmp")
-    part.write_text(text)
-    os.replace(part, path)
 
 
 def _head(source: Mapping[str, str]) -> list[str]:

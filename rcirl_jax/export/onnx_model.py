@@ -16,6 +16,7 @@ import numpy as np
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.reader import Reward
+from rcirl_jax.whole import write_whole
 
 if TYPE_CHECKING:
     import onnx
@@ -38,8 +39,7 @@ def write_onnx(path: Path, reward: Reward) -> None:
         ) from error
     model = _model(onnx, reward)
     onnx.checker.check_model(model, full_check=True)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(model.SerializeToString())
+    write_whole(path, model.SerializeToString())
 
 
 class _Graph:

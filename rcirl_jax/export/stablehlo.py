@@ -18,6 +18,7 @@ import numpy as np
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.loading import reward_params, scored
 from rcirl_jax.export.reader import Reward
+from rcirl_jax.whole import write_whole
 
 Form = Literal["jax", "stablehlo"]
 
@@ -61,5 +62,4 @@ def write_stablehlo(path: Path, reward: Reward, form: Form) -> None:
             raise InputError(
                 "--jax_export: flatbuffers: not installed: expected the extra [export]"
             ) from error
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(content)
+    write_whole(path, content)

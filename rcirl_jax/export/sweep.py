@@ -12,9 +12,7 @@ import dataclasses
 import datetime
 import functools
 import json
-import os
 import resource
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -47,6 +45,7 @@ from rcirl_jax.executor import Executor
 from rcirl_jax.export.from_run import verification_samples, write_weights
 from rcirl_jax.export.loading import compiled_scorer, open_reward
 from rcirl_jax.train.state import TrainConfig
+from rcirl_jax.whole import write_json, write_whole
 
 Rows = Mapping[str, Sequence[TrainConfig]]  # configuration -> its members
 
@@ -92,9 +91,8 @@ def run_sweep(
         "made_by": made_by,
     }
     chosen = folder / "weights" / f"{body['chosen']['member']}.msgpack"
-    shutil.copyfile(chosen, folder / "best.tmp")
-    os.replace(folder / "best.tmp", folder / "best.msgpack")
-    _write_json(folder / "sweep.json", body)
+    write_whole(folder / "best.msgpack", chosen.read_bytes())
+    write_json(folder / "sweep.json", body)
     return body
 
 
@@ -128,7 +126,7 @@ def _claim(config: SweepConfig, folder: Path, dataset_hash: str) -> str:
                 )
         return created
     created = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    _write_json(path, {**own, "created": created})
+    write_json(path, {**own, "created": created})
     return created
 
 
@@ -211,7 +209,7 @@ def _finish(folder: Path, parts: Sequence[Part], settings: dict) -> dict:
         "compile_seconds": round(sum(compiled), 3),
     }
     group = {"facts": facts, "members": members, "settings": settings}
-    _write_json(folder / "groups" / f"{shape_name(parts[0].hidden)}.json", group)
+    write_json(folder / "groups" / f"{shape_name(parts[0].hidden)}.json", group)
     return group
 
 
@@ -305,13 +303,6 @@ def _values_of(config: TrainConfig) -> dict:
 def _peak_memory_gib() -> float:
     """Of this process; that of workers is theirs."""
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2)
-
-
-def _write_json(path: Path, body: Mapping[str, object]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(json.dumps(body, indent=2, allow_nan=False) + "\n")
-    os.replace(temporary, path)
 
 
 def table(report: Mapping) -> str:

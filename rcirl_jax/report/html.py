@@ -2,9 +2,10 @@
 
 import base64
 import html
-import os
 from collections.abc import Sequence
 from pathlib import Path
+
+from rcirl_jax.whole import write_whole
 
 PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8">
@@ -61,8 +62,5 @@ def write_page(
         body="\n".join(sections),
         head=head,
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(page, encoding="utf-8")
-    os.replace(temporary, path)
+    write_whole(path, page)
     return path

@@ -12,7 +12,7 @@ from rcirl_jax.data.joined import Demonstrations
 from rcirl_jax.data.quality import format_quality
 from rcirl_jax.data.store import Dataset
 from rcirl_jax.evaluation.format import format_table
-from rcirl_jax.evaluation.gate import GateConfig, Verdict
+from rcirl_jax.evaluation.gate_types import GateConfig, Verdict
 from rcirl_jax.evaluation.ranking import METRICS
 from rcirl_jax.evaluation.statistics import Difference
 from rcirl_jax.evaluation.suite_output import plain

@@ -2,8 +2,9 @@
 
 from collections.abc import Mapping, Sequence
 
-from rcirl_jax.evaluation.gate import Check, GateConfig, Verdict
-from rcirl_jax.evaluation.statistics import CONFIDENCE
+from rcirl_jax.evaluation.exact import CONFIDENCE
+from rcirl_jax.evaluation.gate_output import OUTCOMES, TITLES
+from rcirl_jax.evaluation.gate_types import Check, GateConfig, Verdict
 from rcirl_jax.evaluation.suite_output import SHORT
 from rcirl_jax.evaluation.suite_summary import (
     PAPER,
@@ -35,12 +36,7 @@ DECISIONS = {  # class, what it means
         "incumbent, or drive more cases.",
     ),
 }
-KINDS = {
-    "safety": "Nothing new that is unsafe",
-    "no loss": "No loss beyond the margin, over all cases",
-    "gain": "Better somewhere (Holm over the primary metrics)",
-}
-OUTCOMES = {"pass": "ok", "fail": "FAIL", "open": "open"}
+KINDS = ("safety", "no loss", "gain")  # families have a section of their own
 
 
 def verdict_section(
@@ -64,11 +60,11 @@ def verdict_section(
         f"in % of cases or of the incumbent's way, with {LEVEL} intervals.</p>",
         _look_at(verdict, played),
     ]
-    for name, title in KINDS.items():
+    for name in KINDS:
         checks = [check for check in verdict.checks if check.kind == name]
         if checks:
             names = [check.name.replace("_", " ") for check in checks]
-            parts.append(forest(title, checks, names))
+            parts.append(forest(TITLES[name], checks, names))
     rows = [(name.replace("_", " "), value) for name, value in _margins(gate)]
     parts.append(folded("Margins, declared before", table("", ("", ""), rows)))
     return "\n".join(parts)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,6 +9,7 @@ from rcirl_jax.data.joined import Demonstrations
 from rcirl_jax.errors import InputError
 from rcirl_jax.train.processes import is_first
 from rcirl_jax.train.state import TrainConfig
+from rcirl_jax.whole import write_whole
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -66,11 +66,8 @@ def describe_run(
     if not is_first():
         return
     path = workdir / "run.json"
-    workdir.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".tmp")
     text = json.dumps({**_described(config, dataset), **provenance}, indent=2)
-    temporary.write_text(text + "\n")
-    os.replace(temporary, path)
+    write_whole(path, text + "\n")
 
 
 def _described(config: TrainConfig, dataset: Demonstrations) -> dict:

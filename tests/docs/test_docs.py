@@ -11,8 +11,8 @@ import tomllib
 
 import pytest
 
-from rcirl_jax.evaluation.gate import EXIT_CODES, GateConfig
-from rcirl_jax.evaluation.statistics import tango
+from rcirl_jax.evaluation.exact import tango
+from rcirl_jax.evaluation.gate_types import EXIT_CODES, GateConfig
 from tests.docs.pages import (
     ALL,
     DOCS,

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.gate import EXIT_CODES, GateConfig, Pair, judge
+from rcirl_jax.evaluation.gate import judge
 from rcirl_jax.evaluation.gate_output import format_verdict, write_verdict
+from rcirl_jax.evaluation.gate_types import EXIT_CODES, GateConfig, Pair
 from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics
 
 FAMILIES, EACH = 20, 200  # 4,000 cases: enough for a margin of 0.1 %
@@ -192,7 +193,7 @@ def test_bad_input_is_one_line():
     twice = [*pair(good, good).ids[:-1], "family00/003@0"]
     with pytest.raises(InputError, match="family00/003@0: met twice"):
         dataclasses.replace(pair(good, good), ids=twice)
-    with pytest.raises(InputError, match="--min_ttc: 0: expected within"):
+    with pytest.raises(InputError, match="--min_ttc_margin: 0: expected within"):
         GateConfig(min_ttc=0)
     with pytest.raises(InputError, match="--primary: reward: expected some of"):
         GateConfig(primary=("reward",))

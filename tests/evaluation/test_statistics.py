@@ -8,16 +8,18 @@ from scipy import stats
 from scipy.special import betainc
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.statistics import (
-    ClusterBootstrap,
-    bootstrap_median,
+from rcirl_jax.evaluation.exact import (
     clopper_pearson,
-    combine_seeds,
     holm,
     incomplete_beta,
     mcnemar_exact,
-    paired_difference,
     rule_of_three,
+)
+from rcirl_jax.evaluation.statistics import (
+    ClusterBootstrap,
+    bootstrap_median,
+    combine_seeds,
+    paired_difference,
 )
 
 

@@ -1,24 +1,15 @@
 """The loop by its command: once, again, changed, damaged."""
 
 import json
-import os
-import subprocess
-import sys
 
 import pytest
+
+from tests.commands import command
 
 SMALL = (
     "--stride=60", "--epochs=1", "--suite=free_cruise,stopped_lead", "--cases=15",
     "--duration=2",
 )  # fmt: skip
-
-
-def command(*flags):
-    return subprocess.run(
-        [sys.executable, "-m", "experiments.autotune", *flags],
-        capture_output=True, text=True, check=False, timeout=900,
-        env={**os.environ, "JAX_PLATFORMS": "cpu"},
-    )  # fmt: skip
 
 
 def kept(done):
@@ -31,7 +22,7 @@ def kept(done):
 def test_a_small_loop(tmp_path):
     run = tmp_path / "run"
     flags = (f"--workdir={run}", *SMALL)
-    done = command(*flags)
+    done = command("experiments.autotune", *flags)
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.rstrip().endswith(f"report to open: {run}/report.html")
     assert "verdict: " in done.stdout
@@ -44,11 +35,11 @@ def test_a_small_loop(tmp_path):
     assert verdict["decision"] in page
     assert list(json.loads((run / "stages.json").read_text())["stages"]) == stages
 
-    again = command(*flags)
+    again = command("experiments.autotune", *flags)
     assert all(kept(again).values()), again.stdout
 
     (run / "report.html").write_text("damaged")
-    mended = command(*flags)
+    mended = command("experiments.autotune", *flags)
     assert [name for name, was in kept(mended).items() if not was] == ["report"]
     assert (run / "report.html").read_text() == page
 
@@ -64,7 +55,7 @@ def test_a_small_loop(tmp_path):
     ],
 )
 def test_what_cannot_be_is_one_line_before_any_work(flags, message, tmp_path):
-    done = command(f"--workdir={tmp_path}/run", *SMALL, *flags)
+    done = command("experiments.autotune", f"--workdir={tmp_path}/run", *SMALL, *flags)
     assert done.returncode == 2, done.stdout
     (line,) = done.stderr.strip().splitlines()
     assert message in line

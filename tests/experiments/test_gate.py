@@ -1,23 +1,13 @@
 """The gate by its command."""
 
 import json
-import os
-import subprocess
-import sys
 
 import pytest
 
+from tests.commands import command
 from tests.weights_files import random_weights
 
 SHORT = ("--suite=free_cruise,stopped_lead", "--cases=20", "--duration=2")
-
-
-def command(*flags):
-    return subprocess.run(
-        [sys.executable, "-m", "experiments.gate", *flags],
-        capture_output=True, text=True, check=False, timeout=600,
-        env={**os.environ, "JAX_PLATFORMS": "cpu"},
-    )  # fmt: skip
 
 
 @pytest.mark.multiprocess
@@ -26,7 +16,7 @@ def test_a_reward_against_itself(tmp_path):
     names = ("collision_free", "min_ttc", "speed_limit", "on_road")
     margins = [f"--{name}_margin=0.2" for name in names]  # 40 cases prove no less
     flags = (f"--candidate={file}", f"--incumbent={file}", f"--output={out}", *SHORT)
-    done = command(*flags, *margins)
+    done = command("experiments.gate", *flags, *margins)
     assert done.returncode == 3, done.stderr[-2000:]
     assert "verdict: NO DIFFERENCE" in done.stdout
     body = json.loads(out.read_text())
@@ -42,7 +32,7 @@ def test_a_reward_against_itself(tmp_path):
     ("flags", "message"),
     [
         (("--incumbent=nobody",), "nobody"),
-        (("--progress_margin=-1",), "progress: -1.0: expected within (0, 1)"),
+        (("--progress_margin=-1",), "--progress_margin: -1.0: expected within (0, 1)"),
         (("--duration=0.1",), "--duration: 0.1: expected 1 to 120 s"),
         (("--suite=cut_in,cut_in",), "a family twice"),
     ],
@@ -51,7 +41,7 @@ def test_wrong_flags_are_one_line(flags, message, tmp_path):
     file = random_weights(tmp_path / "w.msgpack")
     out = f"--output={tmp_path}/v.json"
     (tmp_path / "v.json").write_text("the verdict of another candidate")
-    done = command(f"--candidate={file}", out, *SHORT, *flags)
+    done = command("experiments.gate", f"--candidate={file}", out, *SHORT, *flags)
     assert done.returncode == 2
     (line,) = done.stderr.strip().splitlines()
     assert message in line

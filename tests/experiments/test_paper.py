@@ -2,15 +2,13 @@
 
 import json
 import math
-import os
-import subprocess
-import sys
 
 import pytest
 
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
+from tests import commands
 
 RANKED = (
     "artefact_audit",
@@ -37,11 +35,7 @@ def dataset(tmp_path_factory):
 
 
 def command(name, *flags):
-    return subprocess.run(
-        [sys.executable, "-m", f"experiments.paper.{name}", *flags],
-        capture_output=True, text=True, check=False, timeout=600,
-        env={**os.environ, "JAX_PLATFORMS": "cpu"},
-    )  # fmt: skip
+    return commands.command(f"experiments.paper.{name}", *flags)
 
 
 def numbers(item):

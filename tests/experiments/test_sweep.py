@@ -1,9 +1,6 @@
 """The sweep by its command."""
 
 import json
-import os
-import subprocess
-import sys
 
 import pytest
 
@@ -11,14 +8,7 @@ from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.export.loading import open_reward
-
-
-def command(*flags):
-    return subprocess.run(
-        [sys.executable, "-m", "experiments.sweep", *flags],
-        capture_output=True, text=True, check=False, timeout=600,
-        env={**os.environ, "JAX_PLATFORMS": "cpu"},
-    )  # fmt: skip
+from tests.commands import command
 
 
 @pytest.mark.slow
@@ -30,7 +20,7 @@ def test_a_small_sweep(tmp_path):
         "--quick", f"--data={tmp_path}/d", f"--output={tmp_path}/out",
         "--leaky_rates=0.05,0.3", "--hidden_sizes=0,6x3",
     )  # fmt: skip
-    done = command(*flags, "--workers=2")
+    done = command("experiments.sweep", *flags, "--workers=2")
     assert done.returncode == 0, done.stderr[-2000:]
     assert "member" in done.stderr
     assert done.stdout.count("<- chosen") == 1
@@ -40,7 +30,7 @@ def test_a_small_sweep(tmp_path):
     assert (tmp_path / "out" / "sweep.png").read_bytes()[:4] == b"\x89PNG"
     best = open_reward(str(tmp_path / "out" / "best.msgpack"))
     assert best.sha256 == report["members"][report["chosen"]["member"]]["sha256"]
-    other = command(*flags, "--epochs=2", "--batch_size=32")
+    other = command("experiments.sweep", *flags, "--epochs=2", "--batch_size=32")
     assert other.returncode == 2
     assert len(other.stderr.strip().splitlines()) == 1
     assert "batch_size: 64: expected 32 to resume" in other.stderr
@@ -55,7 +45,7 @@ def test_a_small_sweep(tmp_path):
     ],
 )
 def test_wrong_flags_are_one_line(flag, message, tmp_path):
-    done = command("--data=d", f"--output={tmp_path}/out", flag)
+    done = command("experiments.sweep", "--data=d", f"--output={tmp_path}/out", flag)
     assert done.returncode == 2
     (line,) = done.stderr.strip().splitlines()
     assert line.startswith(f"error: --{message}: [")

@@ -1,9 +1,6 @@
 """Other forms of a weights file score as it does."""
 
 import dataclasses
-import os
-import subprocess
-import sys
 
 import jax
 import numpy as np
@@ -19,7 +16,8 @@ from rcirl_jax.export.onnx_model import write_onnx
 from rcirl_jax.export.reader import load_weights
 from rcirl_jax.export.stablehlo import exported, write_stablehlo
 from rcirl_jax.reward import LatticeCost
-from tests.export.test_weights import example_weights, loop_value
+from tests.commands import command
+from tests.weights_files import example_weights, loop_value, random_weights
 
 F, T = 5, 7
 
@@ -173,19 +171,14 @@ def test_yaml_of_a_hand_set_cost_has_apollos_names():
 
 @pytest.mark.multiprocess
 def test_the_command(tmp_path):
-    from tests.weights_files import random_weights
-
     file = random_weights(tmp_path / "w.msgpack")
 
-    def command(*flags):
-        return subprocess.run(
-            [sys.executable, "-m", "experiments.convert_weights", *flags],
-            capture_output=True, text=True, check=False, timeout=300,
-            env={**os.environ, "JAX_PLATFORMS": "cpu"},
-        )  # fmt: skip
-
     names = ("onnx", "stablehlo", "jax_export")
-    done = command(f"--weights={file}", *(f"--{n}={tmp_path}/{n}" for n in names))
+    done = command(
+        "experiments.convert_weights",
+        f"--weights={file}",
+        *(f"--{n}={tmp_path}/{n}" for n in names),
+    )
     assert done.returncode == 0, done.stderr
     assert all((tmp_path / name).stat().st_size > 1000 for name in names)
     for flags, message in (
@@ -193,7 +186,7 @@ def test_the_command(tmp_path):
         ((f"--weights={file}",), "--onnx, --stablehlo"),
         ((f"--onnx={tmp_path}/o",), "--weights, --hand_weights: expected one"),
     ):
-        done = command(*flags)
+        done = command("experiments.convert_weights", *flags)
         assert done.returncode == 2
         (line,) = done.stderr.strip().splitlines()
         assert message in line

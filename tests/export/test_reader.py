@@ -23,7 +23,7 @@ from rcirl_jax.export import (
     reader,
     save,
 )
-from tests.export.test_weights import (
+from tests.weights_files import (
     ACTIVATIONS,
     example_samples,
     example_weights,

@@ -4,7 +4,6 @@ Built with the sanitizers, so a read past the end of any file here is a failure;
 allocation over 256 MB too. Needs cmake, a C++17 compiler and msgpack-c's C headers.
 """
 
-import dataclasses
 import os
 import re
 import shutil
@@ -12,27 +11,18 @@ import struct
 import subprocess
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import msgpack
 import numpy as np
 import pytest
 
 from rcirl_jax.export import (
-    FeatureSpec,
     WeightsError,
     decode_weights,
     load_weights,
-    reader,
     save,
 )
-from rcirl_jax.features.mapping import feature_map
-from rcirl_jax.reward.network import LEAKY_SLOPE, RewardConfig, init_reward, pinned
-from rcirl_jax.reward.network import value as trained_value
-from rcirl_jax.reward.normaliser import Normaliser
-from rcirl_jax.units import TIMES_S
 from tests.export import test_reader
-from tests.export.test_weights import example_weights, packed
+from tests.weights_files import packed, trained_network
 
 ONBOARD = Path(__file__).resolve().parents[2] / "onboard"
 VALID = packed(features=2, times=3, hidden=(4,))
@@ -95,47 +85,8 @@ def is_valid(data):
 
 def trained_file(path, hidden, activation, by_context):
     """A file of a random network, with 10,000 inputs, masks and JAX's values."""
-    specs, rng = feature_map("paper21").specs, np.random.default_rng(3)
-    lower = np.array([spec.lower for spec in specs], np.float32)
-    upper = np.array([spec.upper for spec in specs], np.float32)
-    normaliser = Normaliser(
-        lower=jnp.asarray(lower),
-        upper=jnp.asarray(upper),
-        location=jnp.asarray(rng.uniform(lower, upper), jnp.float32),
-        scale=jnp.asarray(0.2 * (upper - lower)),
-    )
-    context = feature_map("paper21").context if by_context else ()
-    config = RewardConfig(hidden=hidden, activation=activation, context=context)
-    raw = init_reward(jax.random.key(5), len(specs), config)
-    raw = raw.replace(gamma=jnp.asarray(rng.normal(size=18), jnp.float32))
-    if by_context:
-        drawn = rng.normal(scale=0.2, size=(len(specs),) * 2)
-        raw = raw.replace(context=jnp.asarray(drawn, jnp.float32))
-    effective = pinned(raw, config)
-    wide = 0.5 * (upper - lower)
-    features = rng.uniform(lower - wide, upper + wide, (10_000, 18, len(specs)))
-    features = features.astype(np.float32)
-    valid = np.arange(18) < rng.integers(11, 19, (10_000, 1))
-    expected = np.asarray(
-        trained_value(
-            raw, normaliser, jnp.asarray(features), jnp.asarray(valid), config
-        )
-    )
-    weights = dataclasses.replace(
-        example_weights(),
-        features=tuple(
-            FeatureSpec(name=spec.name, unit=spec.unit, none_value=spec.none)
-            for spec in specs
-        ),
-        **{name: getattr(normaliser, name) for name in reader.RANGES},
-        times=TIMES_S,
-        gamma=effective.gamma,
-        context=effective.context,
-        kernels=effective.kernels,
-        biases=(*effective.biases, np.zeros(1)),
-        activation=activation,
-        leaky_slope=LEAKY_SLOPE,
-    )
+    made = trained_network(hidden, activation, by_context, 10_000)
+    weights, features, valid, expected = made
     reward = save(path, weights, features[:16], valid[:16], expected[:16])
     return reward, features, valid, expected
 

@@ -8,7 +8,8 @@ import numpy as np
 from rcirl_jax.data.importing import import_parts
 from rcirl_jax.data.store import open_dataset
 from rcirl_jax.evaluation import Outcomes, build_report, scene_metrics
-from rcirl_jax.evaluation.gate import GateConfig, Pair, judge
+from rcirl_jax.evaluation.gate import judge
+from rcirl_jax.evaluation.gate_types import GateConfig, Pair
 from rcirl_jax.evaluation.ranking import random_scorer
 from rcirl_jax.evaluation.suite_summary import summarise
 from rcirl_jax.export.loading import open_reward
