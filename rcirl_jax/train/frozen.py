@@ -24,11 +24,10 @@ import optax
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import Normaliser, RewardParams
 from rcirl_jax.train.loop import to_device_batch
+from rcirl_jax.train.pieces import added, divisor_at_most
 from rcirl_jax.train.state import OPTIMIZERS, Batch, FeatureBatch, TrainConfig
 from rcirl_jax.train.step import (
-    added,
     as_tree,
-    divisor_at_most,
     featurise,
     gradient_sums,
     init_params,

@@ -21,10 +21,10 @@ from rcirl_jax.train.parallel import (
     sharded,
     single,
 )
+from rcirl_jax.train.pieces import in_pieces
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.train.step import (
     featurise,
-    in_pieces,
     init_state,
     make_train_step,
 )
