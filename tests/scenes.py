@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rcirl_jax.sampling import sample
 from rcirl_jax.types import (
     NUM_TAGS,
     Demonstration,
@@ -17,6 +18,9 @@ from rcirl_jax.types import (
 from rcirl_jax.units import NUM_OBSTACLES, NUM_STATIONS, NUM_TIMES, TIMES_S
 
 N, P, T = NUM_OBSTACLES, NUM_STATIONS, NUM_TIMES
+
+# as one program: its hundreds of operations one by one take half a minute to compile
+sampled = jax.jit(sample, static_argnums=2)
 
 
 def _f(value):

@@ -25,7 +25,7 @@ from rcirl_jax.reward.network import LEAKY_SLOPE
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train.loop import restore_run, to_device_batch
 from rcirl_jax.train.state import TrainConfig, TrainState
-from rcirl_jax.train.step import featurise
+from rcirl_jax.train.step import featurised
 from rcirl_jax.units import TIMES_S
 
 NUM_SAMPLES = 32  # verification samples in the file
@@ -154,7 +154,7 @@ def verification_samples(
     index = dataset.indices("train")[:count]
     batch = to_device_batch(dataset.read(index), np.ones(count), index)
     key = jax.random.key(config.seed)
-    made = featurise(key, batch, config, feature_map(config.features))
+    made = featurised(key, batch, config)
     human, candidates = np.asarray(made.human), np.asarray(made.points)
     picked = candidates[np.arange(count), np.arange(count) % candidates.shape[1]]
     valid = np.asarray(made.time_valid)

@@ -21,14 +21,13 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from rcirl_jax.features import feature_map
 from rcirl_jax.reward import Normaliser, RewardParams
 from rcirl_jax.train.loop import to_device_batch
 from rcirl_jax.train.pieces import added, divisor_at_most
-from rcirl_jax.train.state import OPTIMIZERS, Batch, FeatureBatch, TrainConfig
+from rcirl_jax.train.state import OPTIMIZERS, FeatureBatch, TrainConfig
 from rcirl_jax.train.step import (
     as_tree,
-    featurise,
+    featurised,
     gradient_sums,
     init_params,
 )
@@ -88,15 +87,10 @@ def freeze(rows: Demonstration, index: np.ndarray, config: TrainConfig) -> Featu
         at = np.minimum(np.arange(start, start + CHUNK), index.size - 1)
         taken = jax.tree.map(lambda x, at=at: x[at], rows)
         batch = to_device_batch(taken, np.ones(CHUNK), index[at])
-        made = _featurise(key, batch, shared)
+        made = featurised(key, batch, shared)
         keep = min(CHUNK, index.size - start)
         parts.append(jax.tree.map(lambda x, n=keep: np.asarray(x[:n]), made))
     return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)), *parts)
-
-
-@functools.partial(jax.jit, static_argnames="config")
-def _featurise(key: jax.Array, batch: Batch, config: TrainConfig) -> FeatureBatch:
-    return featurise(key, batch, config, feature_map(config.features))
 
 
 def fit(

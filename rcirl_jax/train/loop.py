@@ -28,7 +28,7 @@ from rcirl_jax.train.preferences import featurise_preferences, pairs_of_step
 from rcirl_jax.train.processes import is_first
 from rcirl_jax.train.running import Running, check_run, describe_run
 from rcirl_jax.train.state import Batch, FeatureBatch, TrainConfig, TrainState
-from rcirl_jax.train.step import StepMetrics, featurise, init_state, make_train_step
+from rcirl_jax.train.step import StepMetrics, featurised, init_state, make_train_step
 from rcirl_jax.types import Demonstration
 
 NORMALISER_SCENES = 512  # training scenes whose features fit the normaliser
@@ -68,14 +68,13 @@ def fit_normaliser_on(
     chosen = np.sort(chosen[:NORMALISER_SCENES])
     rows = dataset.read(index[chosen])
     key = jax.random.fold_in(jax.random.key(config.seed), NORMALISER_STREAM)
-    make = jax.jit(lambda batch: featurise(key, batch, config, features))
     parts = []
     for start in range(0, chosen.size, config.batch_size):
         some = np.arange(start, min(start + config.batch_size, chosen.size))
         some = np.resize(some, config.batch_size)
         taken = jax.tree.map(lambda x, some=some: x[some], rows)
-        batch = make(to_device_batch(taken, np.ones(some.size), chosen[some]))
-        parts.append(rows_that_count(batch))
+        batch = to_device_batch(taken, np.ones(some.size), chosen[some])
+        parts.append(rows_that_count(featurised(key, batch, config)))
     return fit_normaliser(np.concatenate(parts), features)
 
 

@@ -5,6 +5,7 @@ is wrong when shards hold different numbers of pairs.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -197,6 +198,12 @@ def featurise(
         weight=batch.weight,
         index=batch.index,
     )
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def featurised(key: jax.Array, batch: Batch, config: TrainConfig) -> FeatureBatch:
+    """`featurise` as one program, for what is made outside of a step."""
+    return featurise(key, batch, config, feature_map(config.features))
 
 
 def compare(

@@ -15,10 +15,9 @@ from rcirl_jax.planner.rank import ONLINE, learned_score
 from rcirl_jax.planner.refine import refine
 from rcirl_jax.planner.time_station import plan_time_station
 from rcirl_jax.reward import RewardConfig, init_reward, pinned
-from rcirl_jax.sampling import sample
 from rcirl_jax.sampling.kinematics import trajectory_on_path
 from rcirl_jax.types import Candidates, Normaliser
-from tests.scenes import random_scene
+from tests.scenes import random_scene, sampled
 
 FEATURES = feature_map("paper21")
 SHAPE = RewardConfig()
@@ -44,9 +43,10 @@ def weights(seed=0, by_context=False):
     )
 
 
-SCORE = learned_score(FEATURES, SHAPE.activation)
+SCORE = jax.jit(learned_score(FEATURES, SHAPE.activation))
 
 
+@functools.cache
 @functools.cache
 def planner(config, kind=plan_dp):
     return jax.jit(lambda s, w: kind(s, w, FEATURES, SHAPE.activation, config))
@@ -130,7 +130,7 @@ def enumerate_best(made, config, depth, w):
             if len(stations) == 18 and n < config.num_stations:
                 plans.append(stations)
     s = jnp.asarray(plans, jnp.float32) * step_s + made.ego.s
-    trajectory = jax.vmap(trajectory_on_path, (None, 0))(made, s)
+    trajectory = jax.jit(jax.vmap(trajectory_on_path, (None, 0)))(made, s)
     many = Candidates(
         trajectory=trajectory,
         feasible=jnp.ones(len(plans), bool),
@@ -204,7 +204,7 @@ def test_refinement_never_lowers_the_value_and_raises_some():
     gains = []
     for seed in (1, 3, 4, 5):
         made, w = scene_of(seed), weights(seed)
-        candidates = sample(jax.random.key(0), made, ONLINE)
+        candidates = sampled(jax.random.key(0), made, ONLINE)
         start = jax.tree.map(lambda x: x[3], candidates.trajectory)
         before = float(network_value(made, start, w))
         after, value = climb(made, start, w)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from rcirl_jax.evaluation.robustness import Disturbance, decision, disturbed, steadiness
-from rcirl_jax.planner.dp import plan_dp
 from rcirl_jax.planner.optimality import GapConfig, emergency_stop, optimality_gap
 from rcirl_jax.planner.rank import (
     ONLINE,
@@ -17,11 +16,10 @@ from rcirl_jax.planner.rank import (
     rank_policy,
 )
 from rcirl_jax.planner.refine import RefineConfig
-from rcirl_jax.planner.safety import check
-from rcirl_jax.sampling import sample
 from rcirl_jax.units import TIMES_S
-from tests.planner.test_dp import COARSE, FEATURES, SCORE, SHAPE, one, weights
-from tests.scenes import batch, random_scene, scene
+from tests.planner.test_dp import COARSE, FEATURES, SCORE, SHAPE, one, planner, weights
+from tests.planner.test_safety import judge
+from tests.scenes import batch, random_scene, sampled, scene
 
 GAP = GapConfig(
     lattice=dataclasses.replace(COARSE, step=4.0), refinement=RefineConfig(steps=6)
@@ -35,7 +33,7 @@ FREE = scene(v=14.0)
 def test_the_best_known_plan_has_no_gap_and_others_have():
     """A plan of the gap's own lattice loses only what local ascent adds."""
     w = weights()
-    plan = plan_dp(FREE, w, FEATURES, SHAPE.activation, GAP.lattice)
+    plan = planner(GAP.lattice)(FREE, w)
     found = MEASURE(FREE, plan.trajectory, w)
     assert found["known"]
     assert found["gap"] >= -1e-6
@@ -48,8 +46,8 @@ def test_the_best_known_plan_has_no_gap_and_others_have():
 def test_no_admissible_candidate_beats_the_best_known_by_much():
     """Every sampled plan's gap is what its value says: G(x) - G(y) = V(y) - V(x)."""
     w = weights()
-    candidates = sample(jax.random.key(0), FREE, ONLINE)
-    fine = np.flatnonzero(check(FREE, candidates).admissible)[[0, 7]]
+    candidates = sampled(jax.random.key(0), FREE, ONLINE)
+    fine = np.flatnonzero(judge(FREE, candidates).admissible)[[0, 7]]
     values = np.asarray(SCORE(w, FREE, candidates))[fine]
     picked = [jax.tree.map(lambda x, i=i: x[i], candidates.trajectory) for i in fine]
     found = [MEASURE(FREE, x, w) for x in picked]
@@ -57,7 +55,7 @@ def test_no_admissible_candidate_beats_the_best_known_by_much():
         assert gap["value"] == pytest.approx(float(v), abs=1e-4)
         assert gap["gap"] >= -1e-6
         assert gap["value"] + gap["gap"] == pytest.approx(float(gap["best_value"]))
-        assert bool(check(FREE, one(x)).admissible[0])
+        assert bool(judge(FREE, one(x)).admissible[0])
 
 
 def test_disturbances_move_bodies_and_nothing_else():

@@ -21,17 +21,16 @@ from rcirl_jax.planner.rank import (
     learned_score,
     rank_policy,
 )
-from rcirl_jax.planner.safety import check
 from rcirl_jax.reward import RewardConfig, value
 from rcirl_jax.reward.network import pinned
-from rcirl_jax.sampling import num_candidates, sample
+from rcirl_jax.sampling import num_candidates
 from rcirl_jax.types import Kind
 from tests.planner.test_dp import weights
-from tests.planner.test_safety import with_obstacle
-from tests.scenes import random_scene
+from tests.planner.test_safety import judge, with_obstacle
+from tests.scenes import random_scene, sampled
 
 FEATURES = feature_map("paper21")
-SCORE = learned_score(FEATURES, "tanh")
+SCORE = jax.jit(learned_score(FEATURES, "tanh"))
 POLICY = jax.jit(rank_policy(SCORE, RankConfig()))
 
 
@@ -48,8 +47,8 @@ def test_the_online_sampler_offers_64_candidates():
 def test_drives_the_best_admissible_candidate(seed):
     made, key = scene_of(seed), jax.random.key(seed)
     plan = POLICY(weights(), made, key)
-    candidates = sample(key, made, ONLINE)
-    ok = np.asarray(check(made, candidates).admissible)
+    candidates = sampled(key, made, ONLINE)
+    ok = np.asarray(judge(made, candidates).admissible)
     scores = np.asarray(SCORE(weights(), made, candidates))
     assert int(plan.admissible) == ok.sum()
     assert bool(plan.fallback) is (not ok.any())
@@ -60,7 +59,7 @@ def test_drives_the_best_admissible_candidate(seed):
 
 def test_scores_are_the_reward_of_training():
     made = scene_of(2)
-    candidates = sample(jax.random.key(0), made, ONLINE)
+    candidates = sampled(jax.random.key(0), made, ONLINE)
     params, norm = weights()
     mask = jnp.broadcast_to(made.time_valid, (64, 18))
     shape = RewardConfig(pin="none")
@@ -84,7 +83,7 @@ def test_order_of_the_obstacles_does_not_matter():
 
 def test_command_leads_the_lag_so_that_the_plan_is_met():
     made = with_obstacle(Kind.NONE, 0.0, 0.0)
-    candidates = sample(jax.random.key(0), made, ONLINE)
+    candidates = sampled(jax.random.key(0), made, ONLINE)
     x = jax.tree.map(lambda a: a[4], candidates.trajectory)
     x = x.replace(a=x.a.at[0].set(0.5).at[1].set(1.5), s=x.s.at[1].set(8.0))
     for period in (0.1, 0.3):
@@ -95,7 +94,8 @@ def test_command_leads_the_lag_so_that_the_plan_is_met():
 
 def test_a_plan_that_rests_within_the_first_interval_is_braked_to_rest():
     made = with_obstacle(Kind.NONE, 0.0, 0.0, v=0.5)
-    x = jax.tree.map(lambda a: a[0], sample(jax.random.key(0), made, ONLINE).trajectory)
+    plans = sampled(jax.random.key(0), made, ONLINE).trajectory
+    x = jax.tree.map(lambda a: a[0], plans)
     still = x.replace(s=jnp.full_like(x.s, 0.03).at[0].set(0.0), a=x.a * 0.0)
     urgent = float(command(still, jnp.asarray(True), 0.1))
     assert urgent == pytest.approx(-0.25 / 0.06, rel=0.05)

@@ -9,19 +9,18 @@ import pytest
 
 from rcirl_jax.planner.rank import ONLINE
 from rcirl_jax.planner.safety import SafetyConfig, Verdict, check, choose, first_contact
-from rcirl_jax.sampling import sample
 from rcirl_jax.sampling.kinematics import trajectory_on_path
 from rcirl_jax.types import Candidates, Kind
 from rcirl_jax.units import DT_S, TIMES_S
-from tests.scenes import random_scene, scene
+from tests.scenes import random_scene, sampled, scene
 
 BARE = SafetyConfig(margin_along=0.0, margin_growth=0.0, margin_across=0.0)
 
 
 @functools.cache
-def sampled(seed):
+def scene_and_candidates(seed):
     made = jax.tree.map(jnp.asarray, random_scene(seed))
-    return made, sample(jax.random.key(seed), made, ONLINE)
+    return made, sampled(jax.random.key(seed), made, ONLINE)
 
 
 contact = jax.jit(
@@ -65,7 +64,7 @@ def dense_contact(made, x, steps=40):
 
 @pytest.mark.parametrize("seed", range(6))
 def test_swept_boxes_equal_dense_sampling(seed):
-    made, candidates = sampled(seed)
+    made, candidates = scene_and_candidates(seed)
     found = np.asarray(contact(made, candidates))
     for k in range(0, 64, 5):
         x = jax.tree.map(lambda a, k=k: a[k], candidates.trajectory)
@@ -163,7 +162,7 @@ def test_distance_to_the_leader_follows_rss():
 
 def test_without_an_admissible_candidate_the_hardest_brake_is_chosen():
     made = with_obstacle(Kind.VEHICLE, 6.0, 0.0, v=12.0, length=4.0)
-    candidates = sample(jax.random.key(0), made, ONLINE)
+    candidates = sampled(jax.random.key(0), made, ONLINE)
     verdict = judge(made, candidates)
     assert not bool(verdict.admissible.any())
     index, nothing = choose(verdict, candidates, jnp.arange(64.0))
@@ -174,7 +173,7 @@ def test_without_an_admissible_candidate_the_hardest_brake_is_chosen():
 
 
 def test_the_later_contact_is_preferred_and_scores_decide_the_rest():
-    _, candidates = sampled(0)
+    _, candidates = scene_and_candidates(0)
     two = jax.tree.map(lambda x: x[:3], candidates).replace(feasible=jnp.ones(3, bool))
     verdict = Verdict(
         admissible=jnp.array([False, False, False]),

@@ -127,15 +127,14 @@ def test_export_rank_report(dataset, run, tmp_path):
 def test_exported_values_are_the_trainers(dataset, run, tmp_path):
     """The numpy reader and the JAX network agree on fresh scenes to 1e-5."""
 
-    from rcirl_jax.features import feature_map
     from rcirl_jax.reward import value
     from rcirl_jax.train.loop import to_device_batch
-    from rcirl_jax.train.step import featurise
+    from rcirl_jax.train.step import featurised
 
     reward = export_run(run[0], dataset, tmp_path / "weights.msgpack")
     index = dataset.indices("test")[:8]
     batch = to_device_batch(dataset.read(index), np.ones(8), index)
-    made = featurise(jax.random.key(9), batch, CONFIG, feature_map("paper21"))
+    made = featurised(jax.random.key(9), batch, CONFIG)
     state = run[1].state
     expected = value(
         state.params, state.normaliser, made.points, made.points_valid, CONFIG.reward

@@ -24,7 +24,7 @@ from rcirl_jax.train.parallel import (
 from rcirl_jax.train.pieces import in_pieces
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.train.step import (
-    featurise,
+    featurised,
     init_state,
     make_train_step,
 )
@@ -57,7 +57,7 @@ def batch(weight=None):
 @functools.cache
 def cached():
     state = init_state(CONFIG, normaliser())
-    return featurise(state.key, batch(), CONFIG, feature_map("paper21"))
+    return featurised(state.key, batch(), CONFIG)
 
 
 def weights_of(state):
@@ -109,7 +109,7 @@ def test_cached_features_give_the_same_step():
     state = init_state(CONFIG, normaliser())
     step = jax.jit(make_train_step(CONFIG))
     key = jax.random.fold_in(state.key, state.step)
-    made = featurise(key, batch(), CONFIG, feature_map("paper21"))
+    made = featurised(key, batch(), CONFIG)
     np.testing.assert_allclose(
         weights_of(step(state, batch())[0]),
         weights_of(step(state, made)[0]),
@@ -133,7 +133,7 @@ def test_scene_by_scene_is_the_step_of_the_whole_batch():
 def test_candidates_of_a_scene_do_not_depend_on_the_batch():
     state = init_state(CONFIG, normaliser())
     some = jax.tree.map(lambda x: x[4:8], batch())
-    alone = featurise(state.key, some, CONFIG, feature_map("paper21"))
+    alone = featurised(state.key, some, CONFIG)
     np.testing.assert_allclose(
         alone.candidates, cached().candidates[4:8], rtol=1e-5, atol=1e-4
     )
@@ -237,8 +237,8 @@ def test_nearest_positive_is_a_feasible_candidate_and_not_its_own_rival():
     config = dataclasses.replace(CONFIG, positive="nearest")
     features = feature_map("paper21")
     key = init_state(config, normaliser()).key
-    made = featurise(key, batch(), config, features)
-    plain = featurise(key, batch(), CONFIG, features)
+    made = featurised(key, batch(), config)
+    plain = featurised(key, batch(), CONFIG)
     for b in range(made.human.shape[0]):
         same = np.all(np.asarray(made.points[b]) == made.human[b], axis=(1, 2))
         before, after = np.asarray(plain.feasible[b]), np.asarray(made.feasible[b])
