@@ -36,6 +36,7 @@ REFERENCES = ("hand-set", TUNED_ROW, "GAN", "random")
 
 SIGNIFICANT_SE = 2.0  # 1, standard errors beyond which a difference has a name
 MIN_WIDTH = 100  # characters; a line of the paired differences needs them
+SMALLEST_P = 0.01  # that the resamples let a Holm-adjusted p value reach
 FEW_VEHICLES = 20  # below, percentile intervals are noticeably too short
 
 
@@ -77,7 +78,7 @@ def build_report(
     group: np.ndarray | None = None,
     references: Sequence[str] | None = None,
     confidence: float = CONFIDENCE,
-    num_resamples: int = NUM_RESAMPLES,
+    num_resamples: int | None = None,
 ) -> RankingReport:
     """Estimates with intervals, and paired differences, of several scorers.
 
@@ -91,7 +92,8 @@ def build_report(
       group: [S] int, vehicle-disjoint group of each scene, to be counted.
       references: rows to compare with; by default those of `REFERENCES` present.
       confidence: of all intervals.
-      num_resamples: bootstrap resamples.
+      num_resamples: bootstrap resamples; by default as many as it takes for the
+        largest family of differences to reach an adjusted p of `SMALLEST_P`.
     """
     if not scorers:
         raise InputError("report: scorers: none: expected at least one row")
@@ -104,6 +106,8 @@ def build_report(
             )
     scenes = len(outcomes.cluster)
     stacked = {name: _stack(name, runs, scenes) for name, runs in scorers.items()}
+    if num_resamples is None:
+        num_resamples = _enough_resamples(scorers, references)
     bootstrap = ClusterBootstrap(outcomes.cluster, num_resamples)
     floor = oracle_fde(outcomes)
     counts = {"scenes": scenes, "vehicles": bootstrap.num_clusters}
@@ -202,6 +206,14 @@ def _families(names: Iterable[str], reference: str) -> list[list[str]]:
     others = [name for name in names if name != reference]
     learned = [name for name in others if name not in RIVALS]
     return [learned, [name for name in others if name in RIVALS]]
+
+
+def _enough_resamples(names: Iterable[str], references: Sequence[str]) -> int:
+    """Resamples n with m * 2 / (n + 1) <= `SMALLEST_P` for the largest family of m."""
+    per_row = sum(how.compared for how in METRICS.values())
+    families = [part for name in references for part in _families(names, name)]
+    largest = per_row * max(map(len, families), default=0)
+    return max(NUM_RESAMPLES, math.ceil(2 * largest / SMALLEST_P) - 1)
 
 
 def _compare(

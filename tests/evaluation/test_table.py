@@ -114,6 +114,16 @@ def test_differences_are_row_minus_reference(report, scorers):
     assert found["random", "hand-set", "mrr"] == "worse"
 
 
+def test_many_rows_can_still_differ_after_holms_correction(outcomes):
+    """With a fixed number of resamples, rows enough make every adjusted p large."""
+    many = {f"learner {i}": [scored(outcomes, 0.1, i)] for i in range(12)}
+    many["random"] = [scene_metrics(*random_scorer(0, outcomes.fde.shape), outcomes)]
+    found = build_report(many, outcomes)
+    assert max(c.p_holm for c in found.comparisons if c.metric == "top1_fde") <= 0.01
+    fixed = build_report(many, outcomes, num_resamples=500)
+    assert min(c.p_holm for c in fixed.comparisons) > 0.01
+
+
 @pytest.mark.parametrize(
     ("mean", "higher_is_better", "word"),
     [
