@@ -59,7 +59,7 @@ def main() -> None:
                 own = learner_config(name, base(epochs=epochs, positive="human"))
                 (learned,) = train_learner(part, own, [seed])
                 found = agreement(test, hidden, learned)
-                same[name][i, j], regret[name][i, j] = (x.mean() for x in found)
+                same[name][i, j], regret[name][i, j] = found
     made, axes = figure(1, 2, 11.0, 4.2)
     curves_panel(axes[0, 0], counts, same)
     label(axes[0, 0], "same choice as the hidden reward", "scenes", "share, 2 s.e.")

@@ -87,12 +87,17 @@ def experts(
 
 def agreement(
     frozen: FeatureBatch, hidden: HiddenReward, learned: Learned
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[float, float]:
     """How a learned reward chooses where the hidden one would.
 
+        lost = sum over scenes (V* - V(chosen)) / sum over scenes (V* - median V)
+
+    V is the hidden reward, V* its best. A ratio of sums: scenes in which all
+    candidates are worth the same have nothing to lose and must not count.
+
     Returns:
-      same [S]: whether the choice is the same, and regret [S]: the share of the
-      hidden value between the scene's median and best candidate that is lost.
+      share of scenes with the same choice, and the share lost of the hidden value
+      (0: none; 1: as the median candidate).
     """
     truth = np.asarray(hidden.values(frozen), np.float64)
     points, valid = np.asarray(frozen.points), np.asarray(frozen.points_valid)
@@ -101,5 +106,6 @@ def agreement(
     chosen, best = own.argmax(axis=1), truth.argmax(axis=1)
     rows = np.arange(best.size)
     middle = np.nanmedian(np.where(np.isfinite(truth), truth, np.nan), axis=1)
-    spread = np.maximum(truth[rows, best] - middle, 1e-9)
-    return chosen == best, (truth[rows, best] - truth[rows, chosen]) / spread
+    best_value = truth[rows, best]
+    lost, stake = best_value - truth[rows, chosen], best_value - middle
+    return float(np.mean(chosen == best)), float(lost.sum() / stake.sum())

@@ -61,9 +61,21 @@ def test_the_hidden_reward_agrees_with_itself():
         normaliser=hidden.normaliser,
         config=dataclasses.replace(CONFIG, reward=hidden.config),
     )
-    same, regret = agreement(scenes, hidden, own)
-    assert same.all()
-    assert np.abs(regret).max() < 1e-6
+    assert agreement(scenes, hidden, own) == (1.0, 0.0)
+    # its opposite loses more than the median candidate
+    *first, last = hidden.params.kernels
+    opposite = hidden.params.replace(kernels=(*first, -last))
+    worst = dataclasses.replace(own, params=opposite)
+    same, lost = agreement(scenes, hidden, worst)
+    assert same < 0.2
+    assert lost > 1.0
+    # a scene whose candidates are all alike has nothing to lose
+    alike = scenes.candidates.at[0].set(scenes.candidates[0, :, :, :1])
+    alike = scenes.replace(candidates=alike)
+    rest = jax.tree.map(lambda x: x[1:], scenes)
+    assert agreement(alike, hidden, worst)[1] == pytest.approx(
+        agreement(rest, hidden, worst)[1], rel=1e-5
+    )
 
 
 @pytest.mark.parametrize("loss", ["logistic", "rank"])
@@ -76,6 +88,6 @@ def test_agreement_rises_with_data(loss):
         config = dataclasses.replace(CONFIG, loss=loss, epochs=4000 // count)
         (learned,) = train_learner(part, config, [0])
         assert learned.finite
-        share.append(agreement(test, hidden, learned)[0].mean())
+        share.append(agreement(test, hidden, learned)[0])
     assert share[1] > share[0] + 0.15
     assert share[1] > 0.6
