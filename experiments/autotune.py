@@ -15,18 +15,19 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments.common import hidden_sizes, provenance, run
+from experiments import margins, training
+from experiments.common import provenance, run
 from experiments.executor import executor
 from rcirl_jax.autotune import STAGES, Logs, Loop, TuneConfig
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import IMPORTERS
 from rcirl_jax.data.importing import ImportConfig
-from rcirl_jax.evaluation.gate_types import GateConfig
-from rcirl_jax.reward import LOSSES, RewardConfig
-from rcirl_jax.stages import only_one
+from rcirl_jax.stages import file_sha256, only_one
 from rcirl_jax.train.running import Running
-from rcirl_jax.train.state import POSITIVES, TrainConfig
 
+flags.adopt_module_key_flags(training)
+flags.adopt_module_key_flags(margins)
+flags.set_default(training.POSITIVE, "nearest")  # what a planner can choose
 _WORKDIR = flags.DEFINE_string("workdir", None, "folder of the run", required=True)
 _DATA = flags.DEFINE_string("data", None, "dataset, instead of an import")
 _FORMAT = flags.DEFINE_enum("format", "synthetic", sorted(IMPORTERS), "of --input")
@@ -36,13 +37,6 @@ _STRIDE = flags.DEFINE_float("stride", 0.5, "s between planning frames of a driv
 _INCUMBENT = flags.DEFINE_string(
     "incumbent", "hand-set", "weights file that drives today, or a baseline"
 )
-_LOSS = flags.DEFINE_enum("loss", "rank", sorted(LOSSES), "loss on value differences")
-_HIDDEN = flags.DEFINE_list("hidden_size", ["15"], "units per layer; 0 is linear")
-_POSITIVE = flags.DEFINE_enum(
-    "positive", "nearest", POSITIVES, "ranked first: the human or its nearest candidate"
-)
-_RATE = flags.DEFINE_float("learning_rate", 3e-3, "step size")
-_EPOCHS = flags.DEFINE_integer("epochs", 20, "passes over the training scenes")
 _SEEDS = flags.DEFINE_integer("seeds", 1, "training runs; the median one drives")
 _PARALLEL = flags.DEFINE_string("parallel", "jit", "how the devices share a batch")
 _HORIZON = flags.DEFINE_float("horizon", 5.0, "s at which distances are taken")
@@ -56,15 +50,12 @@ _UNTIL = flags.DEFINE_enum("until", "report", STAGES, "last stage")
 
 def main() -> None:
     """Flags -> one run of the loop."""
+    judged = training.PREFERENCES.value
+    path = Path(judged) if judged else None
     config = TuneConfig(
-        train=TrainConfig(
-            loss=_LOSS.value,
-            positive=_POSITIVE.value,
-            learning_rate=_RATE.value,
-            epochs=_EPOCHS.value,
-            reward=RewardConfig(hidden=hidden_sizes(_HIDDEN.value)),
-        ),
-        gate=GateConfig(),
+        train=training.training_config(preferences=file_sha256(path) if path else ""),
+        preferences=path,
+        gate=margins.gate_config(),
         incumbent=_INCUMBENT.value,
         seeds=_SEEDS.value,
         horizon_s=_HORIZON.value,

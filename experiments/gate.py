@@ -10,23 +10,23 @@ loses; or if nothing is better. 2: could not judge: bad input, too few cases, or
 of the suite. With no fault anywhere, a margin of 0.1 % takes 3,838 cases.
 """
 
-import dataclasses
 import sys
 from pathlib import Path
 
 from absl import flags
 
+from experiments import margins
 from experiments.common import provenance, run
 from experiments.executor import executor
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.gate import judge
 from rcirl_jax.evaluation.gate_output import format_verdict, write_verdict
 from rcirl_jax.evaluation.gate_runs import pair_of
-from rcirl_jax.evaluation.gate_types import GateConfig
 from rcirl_jax.evaluation.suite_files import runs_of
 from rcirl_jax.export.gate_job import drive_job, gate_job, left_out
 from rcirl_jax.simulation.rows import BASELINES
 
+flags.adopt_module_key_flags(margins)
 _CANDIDATE = flags.DEFINE_string("candidate", None, "weights file", required=True)
 _INCUMBENT = flags.DEFINE_string(
     "incumbent", "hand-set", "weights file, or a baseline: " + ", ".join(BASELINES)
@@ -37,20 +37,6 @@ _CASES = flags.DEFINE_integer("cases", None, "cases per family")
 _DURATION = flags.DEFINE_float("duration", None, "s per case at most (smoke 20)")
 _SEED = flags.DEFINE_integer("catalogue_seed", 0, "seed of the cases")
 _EVERY = flags.DEFINE_integer("plan_every", 1, "steps of 0.1 s between two plans")
-_PRIMARY = flags.DEFINE_list(
-    "primary", list(GateConfig().primary), "metrics that may gain"
-)
-_MARGINS = {
-    name: flags.DEFINE_float(f"{name}_margin", getattr(GateConfig(), name), text)
-    for name, text in {
-        "collision_free": "largest loss of fault-free cases, share",
-        "min_ttc": "of cases above 0.95 s to collision",
-        "speed_limit": "of cases within the limit",
-        "on_road": "of cases on the road",
-        "progress": "of the incumbent's way",
-        "family_progress": "of its way in one family",
-    }.items()
-}
 
 
 def main() -> None:
@@ -59,10 +45,7 @@ def main() -> None:
     if output.suffix != ".json":
         raise InputError(f"--output: {output}: expected a name that ends in .json")
     output.unlink(missing_ok=True)  # of another gate: not this verdict
-    margins = {name: flag.value for name, flag in _MARGINS.items()}
-    config = dataclasses.replace(
-        GateConfig(), primary=tuple(_PRIMARY.value or ()), **margins
-    )
+    config = margins.gate_config()
     job, incumbent = gate_job(
         _CANDIDATE.value,
         _INCUMBENT.value,

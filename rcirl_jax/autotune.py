@@ -23,6 +23,7 @@ from rcirl_jax.data.cut import Part
 from rcirl_jax.data.importers import parts
 from rcirl_jax.data.importers.files import listing
 from rcirl_jax.data.importing import ImportConfig, import_parts
+from rcirl_jax.data.preferences import read_preferences
 from rcirl_jax.data.store import Dataset, open_dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop import write_suite
@@ -61,6 +62,7 @@ class TuneConfig:
 
     train: TrainConfig
     gate: GateConfig
+    preferences: Path | None = None  # whose hash `train.preferences` is
     incumbent: str = "hand-set"  # weights file or baseline
     seeds: int = 1
     horizon_s: float = 5.0
@@ -179,12 +181,14 @@ class Loop:
         def one(number: int) -> None:
             config = dataclasses.replace(self.config.train, seed=number)
             workdir = self._workdir(dataset, number)
+            judged = self.config.preferences
             train(
                 dataset,
                 workdir,
                 config,
                 running=self.running,
                 provenance=dict(self.facts),
+                preferences=read_preferences(judged, dataset) if judged else None,
             )
             export_run(workdir, dataset, files[number])
 

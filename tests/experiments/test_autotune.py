@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from rcirl_jax.data.store import open_dataset
 from tests.commands import command
 
 SMALL = (
@@ -43,6 +44,21 @@ def test_a_small_loop(tmp_path):
     assert [name for name, was in kept(mended).items() if not was] == ["report"]
     assert (run / "report.html").read_text() == page
 
+    # what people said of two ways through a scene trains with the rest
+    dataset = open_dataset(*run.glob("dataset-*"))
+    head = {
+        "schema": "rcirl-jax/preferences",
+        "schema_version": 1,
+        "dataset_sha256": dataset.hash,
+    }
+    scene = int(dataset.indices("train")[0])
+    judged = {"scene": scene, "better": "human", "worse": {"s": [0.0] * 18}}
+    file = tmp_path / "judged.jsonl"
+    file.write_text(f"{json.dumps(head)}\n{json.dumps(judged)}\n")
+    more = (f"--preferences={file}", "--until=train")
+    told = command("experiments.autotune", *flags, *more)
+    assert kept(told) == {"import": True, "train 0": False, "export": False}
+
 
 @pytest.mark.multiprocess
 @pytest.mark.parametrize(
@@ -52,6 +68,9 @@ def test_a_small_loop(tmp_path):
         (("--seeds=0",), "--seeds: 0: expected at least 1"),
         (("--format=ngsim",), "--input: not given"),
         (("--suite=everything",), "--suite: everything: expected full"),
+        (("--features=mine",), "mine"),
+        (("--mode=path_speed",), "--mode: path_speed: the closed loop plans speed"),
+        (("--preferences=nowhere.jsonl",), "nowhere.jsonl"),
     ],
 )
 def test_what_cannot_be_is_one_line_before_any_work(flags, message, tmp_path):
