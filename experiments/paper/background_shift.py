@@ -28,12 +28,10 @@ from experiments.common import provenance, run
 from rcirl_jax.evaluation.background import (
     Learning,
     TwoFrames,
-    World,
     draw_examples,
     example_numbers,
-    summary,
-    sweep,
 )
+from rcirl_jax.evaluation.background_world import World, summary, sweep
 from rcirl_jax.report.background_picture import background_figure
 
 _OUTPUT = flags.DEFINE_string("output", "out/background_shift", "folder to write")

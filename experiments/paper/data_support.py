@@ -24,7 +24,8 @@ from rcirl_jax.evaluation.data_support import (
     reasons,
     weights_supported,
 )
-from rcirl_jax.evaluation.identify import format_report, to_json
+from rcirl_jax.evaluation.identify import to_json
+from rcirl_jax.evaluation.identify_text import format_report
 from rcirl_jax.evaluation.learners import FrozenSets, learner_config, train_learner
 from rcirl_jax.features import feature_map
 from rcirl_jax.report.support_picture import support_picture

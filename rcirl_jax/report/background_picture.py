@@ -185,7 +185,7 @@ def background_figure(
       path: PNG to write.
       frames: one draw of the two frames, human [2, 2], candidates [2, K, 2].
       found: its directions by name.
-      by_size: of `evaluation.background.sweep`, over sigma_b.
+      by_size: of `evaluation.background_world.sweep`, over sigma_b.
       by_frames: the same over the number of training frames.
     """
     made = pyplot.figure(figsize=(13.5, 9.0), layout="constrained")
