@@ -130,8 +130,9 @@ def facts_of(
     human_density, density = jnp.zeros(()), jnp.zeros(x.s.shape[:1])
     if config.loss == "listwise":
         row = jax.vmap(lambda one: apart(x, one))
-        density = _log_density(row(x), candidates.feasible)
-        human_density = _log_density(apart(x, driven)[None], candidates.feasible)[0]
+        others = candidates.feasible & ~jnp.eye(density.size, dtype=bool)
+        density = log_density(row(x), others)
+        human_density = log_density(apart(x, driven), candidates.feasible)
     return Facts(
         human_distance=jnp.zeros(()),
         distance=apart(x, driven),
@@ -142,15 +143,19 @@ def facts_of(
     )
 
 
-def _log_density(distance: jax.Array, feasible: jax.Array) -> jax.Array:
-    """Log of the kernel density of the candidates [n]; distance [n, K] in m.
+def log_density(distance: jax.Array, others: jax.Array) -> jax.Array:
+    """Log of the kernel density of the candidates [...].
 
     Each trajectory counts as one sample of its own, so that none has density 0.
+
+    Args:
+      distance: [..., K] in m, to every candidate.
+      others: [..., K] bool, candidates that count besides it; a twin of it does.
     """
     kernel = -0.5 * (distance / KERNEL_M) ** 2
-    own = jnp.zeros((distance.shape[0], 1))
-    others = jnp.where(feasible & (distance > 1e-3), kernel, -jnp.inf)
-    return jax.nn.logsumexp(jnp.concatenate([own, others], axis=1), axis=1)
+    own = jnp.zeros_like(distance[..., :1])
+    logits = jnp.where(others, kernel, -jnp.inf)
+    return jax.nn.logsumexp(jnp.concatenate([own, logits], axis=-1), axis=-1)
 
 
 def featurise(
@@ -158,7 +163,7 @@ def featurise(
 ) -> FeatureBatch:
     """Candidates and features of a batch; each scene's key comes from its row.
 
-    With `positive="nearest"` the feasible candidate nearest to the human takes
+    With `positive="nearest"` the feasible sampled candidate nearest to the human takes
     the human's place: ranking it above the rest asks for what a planner can
     choose, and leaves nothing to learn from how the human's curve was recorded.
     """
@@ -180,7 +185,10 @@ def featurise(
         feasible = candidates.feasible
         if config.positive == "human":
             return human, rows, feasible, facts, valid
-        near = jnp.argmin(jnp.where(feasible, facts.distance, jnp.inf))
+        # a planner can choose what the sampler made, not a hard negative
+        sampled = feasible.size - config.hard_negatives * config.hard_pool
+        choice = feasible & (jnp.arange(feasible.size) < sampled)
+        near = jnp.argmin(jnp.where(choice, facts.distance, jnp.inf))
         facts = facts.replace(
             human_distance=facts.distance[near], human_density=facts.density[near]
         )

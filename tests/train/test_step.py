@@ -26,6 +26,7 @@ from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.train.step import (
     featurised,
     init_state,
+    log_density,
     make_train_step,
 )
 from tests.scenes import demonstration
@@ -231,6 +232,31 @@ def test_linear_reward_has_no_hidden_layer():
     state = init_state(config, normaliser())
     assert [k.shape for k in state.params.kernels] == [(21, 1)]
     assert state.params.biases == ()
+
+
+def test_a_hard_negative_is_never_the_positive():
+    """They are nearer to the human than any sampled candidate."""
+    config = dataclasses.replace(CONFIG, positive="nearest", hard_negatives=12)
+    key = init_state(config, normaliser()).key
+    made = featurised(key, batch(), config)
+    plain = featurised(key, batch(), dataclasses.replace(config, hard_negatives=0))
+    np.testing.assert_allclose(made.human, plain.human, rtol=1e-4, atol=1e-4)
+    sampled = plain.feasible.shape[1]
+    assert made.feasible.shape[1] == sampled + 12
+    np.testing.assert_array_equal(made.feasible[:, :sampled], plain.feasible)
+    own = np.asarray(made.facts.distance)
+    ok = np.asarray(made.feasible)
+    near = np.where(ok, own, np.inf)
+    # else the test shows nothing: some hard negatives are nearer than the positive
+    assert (near[:, sampled:].min(1) < made.facts.human_distance).any()
+
+
+def test_twins_count_as_often_as_they_are_drawn():
+    """Candidates at 0, 0 and 100 m: the twins have twice the density of the third."""
+    place = jnp.array([0.0, 0.0, 100.0])
+    distance = jnp.abs(place[:, None] - place)
+    found = log_density(distance, ~jnp.eye(3, dtype=bool))
+    np.testing.assert_allclose(np.exp(found), [2.0, 2.0, 1.0], rtol=1e-6)
 
 
 def test_nearest_positive_is_a_feasible_candidate_and_not_its_own_rival():
