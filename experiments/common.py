@@ -53,6 +53,13 @@ def floats(values: list[str], flag: str) -> tuple[float, ...]:
         raise InputError(f"--{flag}: {values}: expected numbers") from error
 
 
+def whole_numbers(values: list[str], flag: str) -> list[int]:
+    """A comma list of numbers above zero, with the flag's name on error."""
+    if not values or not all(value.isdecimal() and int(value) for value in values):
+        raise InputError(f"--{flag}: {values}: expected whole numbers above 0")
+    return [int(value) for value in values]
+
+
 def hidden_sizes(values: list[str]) -> tuple[int, ...]:
     """--hidden_size: "15", "32,16", or "0" for the linear reward."""
     try:

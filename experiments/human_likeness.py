@@ -34,17 +34,23 @@ from rcirl_jax.evaluation.learners import (
     train_learners,
 )
 from rcirl_jax.evaluation.table import to_json
+from rcirl_jax.export.hand_weights import load_hand_weights
 from rcirl_jax.report.intervals import ranking_chart
+from rcirl_jax.reward import TUNED_ROW
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train.state import TrainConfig
 
 _DATA = flags.DEFINE_string("data", None, "dataset of import_logs", required=True)
 _OUTPUT = flags.DEFINE_string("output", "out/likeness", "folder to write")
 _LEARNERS = flags.DEFINE_list("learners", list(LEARNERS), "rows to train")
-_SEEDS = flags.DEFINE_integer("seeds", 10, "training runs per learner")
-_EPOCHS = flags.DEFINE_integer("epochs", 10, "passes over the training scenes")
+_SEEDS = flags.DEFINE_integer("seeds", 10, "training runs per learner", lower_bound=1)
+_EPOCHS = flags.DEFINE_integer(
+    "epochs", 10, "passes over the training scenes", lower_bound=1
+)
 _HALVE = flags.DEFINE_integer("halve_every", 0, "steps per halving of the step size")
-_HORIZON = flags.DEFINE_float("horizon", 5.0, "s at which distances are taken")
+_HORIZON = flags.DEFINE_float(
+    "horizon", 5.0, "s at which distances are taken", lower_bound=0.4, upper_bound=8.0
+)
 _MODE = flags.DEFINE_enum(
     "mode", "speed", ["speed", "path_speed"], "what the sampler varies"
 )
@@ -52,6 +58,7 @@ _HOLDOUT = flags.DEFINE_enum(
     "holdout", "groups", ["groups", "vehicles", "recording"], "what is held out"
 )
 _SPLIT = flags.DEFINE_integer("split_seed", 0, "draws the held-out vehicles")
+_HAND = flags.DEFINE_string("hand_weights", None, "of tune_hand_set: a further row")
 _RECORDING = flags.DEFINE_integer("recording", 0, "recording that is held out")
 
 
@@ -72,7 +79,8 @@ def main() -> None:
     )
     configs = {name: learner_config(name, base) for name in _LEARNERS.value}
     learned = train_learners(dataset, configs, range(_SEEDS.value))
-    setup = RankingSetup(sampler=sampler, horizon_s=_HORIZON.value)
+    tuned = {TUNED_ROW: load_hand_weights(_HAND.value)} if _HAND.value else {}
+    setup = RankingSetup(sampler=sampler, horizon_s=_HORIZON.value, hand_set=tuned)
     report = evaluate_ranking(dataset, scorers(learned), setup)
     folder = Path(_OUTPUT.value)
     folder.mkdir(parents=True, exist_ok=True)

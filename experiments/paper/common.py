@@ -14,6 +14,7 @@ from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.data.joined import Demonstrations
 from rcirl_jax.data.resplit import Resplit
 from rcirl_jax.data.store import Dataset, open_dataset
+from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.evaluate import RankingSetup
 from rcirl_jax.evaluation.table import RankingReport
 from rcirl_jax.report.intervals import Interval
@@ -21,9 +22,13 @@ from rcirl_jax.train.state import TrainConfig
 
 DATA = flags.DEFINE_string("data", None, "dataset (default: synthetic traffic)")
 OUTPUT = flags.DEFINE_string("output", "out/paper", "folder to write")
-SEEDS = flags.DEFINE_integer("seeds", 10, "training runs of each row")
-EPOCHS = flags.DEFINE_integer("epochs", 10, "passes over the training scenes")
-HORIZON = flags.DEFINE_float("horizon", 5.0, "s at which distances are taken")
+SEEDS = flags.DEFINE_integer("seeds", 10, "training runs of each row", lower_bound=1)
+EPOCHS = flags.DEFINE_integer(
+    "epochs", 10, "passes over the training scenes", lower_bound=1
+)
+HORIZON = flags.DEFINE_float(
+    "horizon", 5.0, "s at which distances are taken", lower_bound=0.4, upper_bound=8.0
+)
 QUICK = flags.DEFINE_bool("quick", False, "few scenes, two seeds, two epochs")
 
 QUICK_STRIDE_S = 60.0  # s between planning frames of the small synthetic dataset
@@ -58,8 +63,10 @@ def _synthetic() -> Dataset:
     return open_dataset(folder)
 
 
-def seeds() -> range:
-    """Seeds of the training runs."""
+def seeds(least: int = 1) -> range:
+    """Seeds of the training runs; a spread between them needs at least two."""
+    if SEEDS.value < least:
+        raise InputError(f"--seeds: {SEEDS.value}: expected at least {least}")
     return range(2 if QUICK.value else SEEDS.value)
 
 

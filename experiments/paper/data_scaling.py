@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from absl import flags
 
-from experiments.common import run
+from experiments.common import run, whole_numbers
 from experiments.paper.common import (
     QUICK,
     base,
@@ -47,7 +47,8 @@ ROWS = ("RC-IRL logistic", "logistic non-negative", "logistic linear")
 def main() -> None:
     """Train on ever more scenes, rank the same ones, draw."""
     data, most = dataset(), dataset().indices("train").size
-    counts = sorted({min(int(count), most) for count in _COUNTS.value})
+    asked = whole_numbers(_COUNTS.value, "counts")
+    counts = sorted({min(count, most) for count in asked})
     counts = counts[:2] if QUICK.value else counts
     sets, learned = FrozenSets(data), {}
     for count in counts:

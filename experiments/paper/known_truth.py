@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from absl import flags
 
-from experiments.common import run
+from experiments.common import run, whole_numbers
 from experiments.paper.common import (
     QUICK,
     base,
@@ -44,10 +44,11 @@ def main() -> None:
     data, config = dataset(), learner_config("MaxEnt", base(positive="human"))
     train, test = (FrozenSets(data, name).of(config) for name in ("train", "test"))
     most = train.weight.shape[0]
-    counts = sorted({min(int(count), most) for count in _COUNTS.value})
+    asked = whole_numbers(_COUNTS.value, "counts")
+    counts = sorted({min(count, most) for count in asked})
     counts = counts[:2] if QUICK.value else counts
-    same = {name: np.zeros((len(seeds()), len(counts))) for name in ROWS}
-    regret = {name: np.zeros((len(seeds()), len(counts))) for name in ROWS}
+    same = {name: np.zeros((len(seeds(least=2)), len(counts))) for name in ROWS}
+    regret = {name: np.zeros((len(seeds(least=2)), len(counts))) for name in ROWS}
     for i, seed in enumerate(seeds()):
         hidden = hidden_reward(1000 + seed, normaliser_of(train, config))
         shown = experts(train, hidden, _TEMPERATURE.value, seed)

@@ -78,10 +78,17 @@ def by_vehicle(dataset: Demonstrations, share: float, seed: int) -> Resplit:
 
 
 def by_recording(dataset: Demonstrations, recording: int) -> Resplit:
-    """Hold out one recording; its vehicles leave the training scenes too."""
+    """Hold out one recording; its vehicles leave the training scenes too.
+
+    Raises:
+      InputError: no scene is of that recording.
+    """
     every = dataset.load(None)
     vehicle, where = np.asarray(every.vehicle), np.asarray(every.recording)
     held = where == recording
+    if not held.any():
+        found = ", ".join(str(x) for x in np.unique(where))
+        raise InputError(f"--recording: {recording}: expected one of {found}")
     clear = ~np.isin(vehicle, vehicle[held])
     rows = dataset.indices(None)
     return Resplit(dataset, {"train": rows[clear], "test": rows[held]})

@@ -194,16 +194,19 @@ def train_grid(
     keep: Sequence[str] | None = None,
 ) -> dict[float, list[Learned]]:
     """Leaky rates x seeds as members of one program; they share the batch order."""
+    grid = [
+        dataclasses.replace(config, seed=seed, leaky_rate=rate)
+        for rate in leaky_rates
+        for seed in seeds
+    ]
     normaliser = normaliser_of(frozen, config, keep)
-    grid = [(rate, seed) for rate in leaky_rates for seed in seeds]
-    members = members_of(config, [seed for _, seed in grid])
-    members = members.replace(leaky_rate=jnp.asarray([rate for rate, _ in grid]))
+    members = members_of(config, [own.seed for own in grid])
+    members = members.replace(leaky_rate=jnp.asarray([x.leaky_rate for x in grid]))
     fitted = fit(frozen, normaliser, config, members)
     found: dict[float, list[Learned]] = {rate: [] for rate in leaky_rates}
-    for number, (rate, seed) in enumerate(grid):
-        own = dataclasses.replace(config, seed=seed, leaky_rate=rate)
+    for number, own in enumerate(grid):
         one = jax.tree.map(lambda leaf, n=number: leaf[n], fitted)
-        found[rate].append(_learned(one, normaliser, own))
+        found[own.leaky_rate].append(_learned(one, normaliser, own))
     return found
 
 

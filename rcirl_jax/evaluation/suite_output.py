@@ -54,7 +54,7 @@ def format_suite(report: SuiteReport) -> str:
         "Per case (every sample of a drive inside the bound, no crash of own fault)",
     ]
     header = ["", *(SHORT[c] for c in COLUMNS)]
-    paper = ["the paper, RC-IRL", *(f"{PAPER[c]:.2f}" for c in COLUMNS)]
+    paper = [[name, *(f"{x:.2f}" for x in row)] for name, row in PAPER.items()]
     for kind in ("per_case", "per_sample"):
         if kind == "per_sample":
             lines += ["", "Per sample (10 Hz, samples before a crash)"]
@@ -62,7 +62,7 @@ def format_suite(report: SuiteReport) -> str:
             [name, *(_percent(getattr(row, kind)[c]) for c in COLUMNS)]
             for name, row in report.rows.items()
         ]
-        lines += text_table(header, [*rows, paper])
+        lines += text_table(header, [*rows, *paper])
     lines += [
         "",
         f"Jerk filtered as in nuPlan; safety; progress against {report.reference}",

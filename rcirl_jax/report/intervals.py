@@ -7,8 +7,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
 
+from rcirl_jax.evaluation.suite_output import SHORT
+from rcirl_jax.evaluation.suite_summary import SuiteReport
 from rcirl_jax.evaluation.table import RankingReport
 from rcirl_jax.report.style import CLASS_COLOURS, figure, label, save
+from rcirl_jax.simulation.metrics import COLUMNS
 
 LEARNED = CLASS_COLOURS["follow"]
 RIVAL = "#777777"
@@ -22,7 +25,10 @@ CURVES = (
     CLASS_COLOURS["other"],
     "#777777",
 )
-RIVALS = ("random", "constant speed", "IDM", "hand-set", "hand-set, tuned", "oracle")
+RIVALS = (
+    *("random", "random weights", "constant speed", "IDM", "IDM yielding"),
+    *("hand-set", "hand-set, tuned", "oracle"),
+)
 PANELS = {
     "top1_fde": ("distance of the chosen at the horizon", "m, lower is better"),
     "top3_fde": ("best of the three highest", "m, lower is better"),
@@ -57,6 +63,26 @@ def ranking_chart(path: Path, report: RankingReport) -> Path:
             rows[name] = (estimate.value, estimate.low, estimate.high)
         interval_panel(axis, rows)
         label(axis, title, unit, "")
+        if axis is not axes[0, 0]:
+            axis.set_yticklabels([])
+    return save(made, path)
+
+
+def suite_chart(path: Path, report: SuiteReport) -> Path:
+    """PNG of the closed-loop table per case, all rows, 95 % intervals."""
+    made, axes = figure(1, len(COLUMNS) + 1, 20.0, 1.2 + 0.34 * len(report.rows))
+    panels = {name: SHORT[name] for name in COLUMNS} | {"nuplan": "nuPlan score"}
+    for axis, (name, title) in zip(axes[0], panels.items(), strict=True):
+        rows = {}
+        for row, found in report.rows.items():
+            if name == "nuplan":
+                score = np.array([found.nuplan, found.nuplan_low, found.nuplan_high])
+                rows[row] = tuple(100 * score)
+            else:
+                rate = found.per_case[name]
+                rows[row] = (100 * rate.rate, 100 * rate.low, 100 * rate.high)
+        interval_panel(axis, rows)
+        label(axis, title, "higher is better" if name == "nuplan" else "% of cases", "")
         if axis is not axes[0, 0]:
             axis.set_yticklabels([])
     return save(made, path)

@@ -176,7 +176,7 @@ def suite_section(suite: SuiteReport, marked: Sequence[str]) -> str:
         "nothing failed.</p>"
     ]
     heads = ("", *(SHORT[name] for name in COLUMNS))
-    paper = ("the paper, RC-IRL", *(f"{PAPER[name]:.2f}" for name in COLUMNS))
+    paper = [(name, *(f"{x:.2f}" for x in row)) for name, row in PAPER.items()]
     for field, title in (
         (
             "per_case",
@@ -188,7 +188,7 @@ def suite_section(suite: SuiteReport, marked: Sequence[str]) -> str:
             (name, *(_rate(getattr(row, field)[c]) for c in COLUMNS))
             for name, row in suite.rows.items()
         ]
-        parts.append(table(title, heads, [*rows, paper], marked=marked))
+        parts.append(table(title, heads, [*rows, *paper], marked=marked))
     parts.append(_safety(suite.rows, suite.reference, marked))
     if suite.comparisons:
         parts.append(_comparisons(suite.comparisons))

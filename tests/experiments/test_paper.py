@@ -8,6 +8,7 @@ import pytest
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
+from rcirl_jax.simulation.suite import family_names
 from tests import commands
 
 RANKED = (
@@ -70,6 +71,60 @@ def test_writes_numbers_and_a_picture(name, dataset, tmp_path):
     assert body["quick"] is True
     assert body["made_by"]["versions"]
     assert (tmp_path / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_table2(tmp_path):
+    """From drives to the table: every row over every family."""
+    done = command("table2", "--quick", f"--output={tmp_path}")
+    assert done.returncode == 0, done.stderr[-2000:]
+    body = json.loads((tmp_path / "suite" / "suite.json").read_text())["report"]
+    learned = ("RC-IRL 21-15-1", "GAN 21-15-1", "RC-IRL linear")
+    rivals = ("hand-set", "IDM", "IDM yielding", "constant speed", "random weights")
+    assert set(body["rows"]) == {*learned, *rivals}
+    assert body["cases"] == len(body["families"]) == len(family_names())
+    assert "the paper, GAN" in (tmp_path / "suite" / "table.txt").read_text()
+    dp = json.loads((tmp_path / "dp" / "suite.json").read_text())["report"]
+    assert "RC-IRL 21-15-1 DP" in dp["rows"]
+    for folder in ("suite", "dp"):
+        assert (tmp_path / folder / "table.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_human_likeness_beside_a_tuned_hand_set_cost(dataset, tmp_path):
+    tuned, data = tmp_path / "tuned.json", f"--data={dataset}"
+    small = ("--budget=8", "--scenes=16", f"--output={tuned}")
+    done = commands.command("experiments.tune_hand_set", data, *small)
+    assert done.returncode == 0, done.stderr[-2000:]
+    few = ("--learners=RC-IRL rank", "--seeds=2", "--epochs=1")
+    rest = (f"--hand_weights={tuned}", f"--output={tmp_path}")
+    done = commands.command("experiments.human_likeness", data, *few, *rest)
+    assert done.returncode == 0, done.stderr[-2000:]
+    body = json.loads((tmp_path / "ranking.json").read_text())
+    assert body["runs"]["RC-IRL rank"] == 2
+    assert {"random", "IDM", "hand-set", "hand-set, tuned", "oracle"} <= set(
+        body["rows"]
+    )
+    assert (tmp_path / "ranking.png").read_bytes()[:4] == b"\x89PNG"
+
+
+@pytest.mark.parametrize(
+    ("module", "flag", "line"),
+    [
+        (
+            "experiments.paper.known_truth",
+            "--counts=abc",
+            "--counts: ['abc']",
+        ),
+        ("experiments.paper.discount_factors", "--seeds=1", "--seeds: 1: expected at"),
+        ("experiments.human_likeness", "--horizon=9", "--horizon"),
+        ("experiments.human_likeness", "--recording=99", "--recording: 99: expected"),
+    ],
+)
+def test_bad_flags_are_one_line(module, flag, line, dataset):
+    more = ("--holdout=recording",) if "recording" in flag else ()
+    done = commands.command(module, f"--data={dataset}", flag, *more)
+    assert done.returncode == 2
+    (said,) = done.stderr.strip().splitlines()
+    assert line in said
 
 
 def test_a_wrong_site_is_one_line(tmp_path):
