@@ -18,9 +18,8 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.evaluation.format import format_table
 from rcirl_jax.evaluation.table import to_json
-from rcirl_jax.export.hand_weights import load_hand_weights
+from rcirl_jax.export.hand_weights import tuned_row
 from rcirl_jax.export.loading import load_runs
-from rcirl_jax.reward import TUNED_ROW
 
 _WEIGHTS = flags.DEFINE_list("weights", None, "weights files", required=True)
 _DATA = flags.DEFINE_string("data", None, "dataset", required=True)
@@ -39,14 +38,13 @@ def main() -> None:
     if not 0.0 < _HORIZON.value <= 8.0:
         raise InputError(f"--horizon: {_HORIZON.value}: expected above 0, at most 8 s")
     learned, preset, sampler = load_runs(_WEIGHTS.value)
-    tuned = {TUNED_ROW: load_hand_weights(_HAND.value)} if _HAND.value else {}
     setup = RankingSetup(
         preset=preset,
         sampler=sampler,
         horizon_s=_HORIZON.value,
         split=_SPLIT.value,
         drop_collisions=_FILTER.value,
-        hand_set=tuned,
+        hand_set=tuned_row(_HAND.value),
     )
     report = evaluate_ranking(open_dataset(_DATA.value), learned, setup, executor())
     print(format_table(report, _WIDTH.value))

@@ -34,9 +34,8 @@ from rcirl_jax.evaluation.learners import (
     train_learners,
 )
 from rcirl_jax.evaluation.table import to_json
-from rcirl_jax.export.hand_weights import load_hand_weights
+from rcirl_jax.export.hand_weights import tuned_row
 from rcirl_jax.report.intervals import ranking_chart
-from rcirl_jax.reward import TUNED_ROW
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train.state import TrainConfig
 
@@ -79,8 +78,9 @@ def main() -> None:
     )
     configs = {name: learner_config(name, base) for name in _LEARNERS.value}
     learned = train_learners(dataset, configs, range(_SEEDS.value))
-    tuned = {TUNED_ROW: load_hand_weights(_HAND.value)} if _HAND.value else {}
-    setup = RankingSetup(sampler=sampler, horizon_s=_HORIZON.value, hand_set=tuned)
+    setup = RankingSetup(
+        sampler=sampler, horizon_s=_HORIZON.value, hand_set=tuned_row(_HAND.value)
+    )
     report = evaluate_ranking(dataset, scorers(learned), setup)
     folder = Path(_OUTPUT.value)
     folder.mkdir(parents=True, exist_ok=True)

@@ -47,9 +47,10 @@ def main() -> None:
     asked = whole_numbers(_COUNTS.value, "counts")
     counts = sorted({min(count, most) for count in asked})
     counts = counts[:2] if QUICK.value else counts
-    same = {name: np.zeros((len(seeds(least=2)), len(counts))) for name in ROWS}
-    regret = {name: np.zeros((len(seeds(least=2)), len(counts))) for name in ROWS}
-    for i, seed in enumerate(seeds()):
+    runs = seeds(least=2)
+    same = {name: np.zeros((len(runs), len(counts))) for name in ROWS}
+    regret = {name: np.zeros((len(runs), len(counts))) for name in ROWS}
+    for i, seed in enumerate(runs):
         hidden = hidden_reward(1000 + seed, normaliser_of(train, config))
         shown = experts(train, hidden, _TEMPERATURE.value, seed)
         order = np.random.default_rng(seed).permutation(most)

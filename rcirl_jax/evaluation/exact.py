@@ -9,11 +9,11 @@ import math
 import statistics
 
 import numpy as np
+from scipy.special import betainc, betaincinv
 
 from rcirl_jax.errors import InputError
 
 CONFIDENCE = 0.95  # 1, of all intervals unless said
-_FRACTION_TERMS = 100_000  # 1; about sqrt(n) are needed for counts out of n
 
 
 def rule_of_three(n: int) -> float:
@@ -32,8 +32,8 @@ def clopper_pearson(
     """Exact two-sided interval of a rate with k events in n trials.
 
     low solves P(X >= k; low) = alpha / 2, that is I_low(k, n - k + 1), and high
-    solves P(X <= k; high) = alpha / 2; both by bisection on the regularised
-    incomplete beta function I. The ends are 0 for k = 0 and 1 for k = n.
+    solves P(X <= k; high) = alpha / 2, with the regularised incomplete beta
+    function I. The ends are 0 for k = 0 and 1 for k = n.
     """
     if not 0 <= k <= n or n < 1 or not 0.0 < confidence < 1.0:
         raise InputError(
@@ -41,8 +41,8 @@ def clopper_pearson(
             " expected 0 <= k <= n, n >= 1 and confidence in (0, 1)"
         )
     tail = 0.5 * (1.0 - confidence)
-    low = 0.0 if k == 0 else beta_quantile(tail, k, n - k + 1)
-    high = 1.0 if k == n else 1.0 - beta_quantile(tail, n - k, k + 1)
+    low = 0.0 if k == 0 else float(betaincinv(k, n - k + 1, tail))
+    high = 1.0 if k == n else 1.0 - float(betaincinv(n - k, k + 1, tail))
     return low, high
 
 
@@ -57,7 +57,7 @@ def mcnemar_exact(b: int, c: int) -> float:
     n, k = b + c, min(b, c)
     if 2 * k == n:
         return 1.0
-    return min(1.0, 2.0 * incomplete_beta(0.5, n - k, k + 1))
+    return min(1.0, 2.0 * float(betainc(n - k, k + 1, 0.5)))
 
 
 def tango(
@@ -123,54 +123,3 @@ def holm(p_values: np.ndarray) -> np.ndarray:
     adjusted = np.empty_like(p)
     adjusted[order] = np.minimum(1.0, np.maximum.accumulate(scaled))
     return adjusted
-
-
-def incomplete_beta(x: float, a: float, b: float) -> float:
-    """Regularised incomplete beta function I_x(a, b), a, b > 0.
-
-    x^a (1 - x)^b / (a B(a, b)) times the continued fraction 8.17.22 of the NIST
-    Digital Library of Mathematical Functions, evaluated by Lentz's method; it
-    converges fast for x < (a + 1) / (a + b + 2), else I_x(a, b) =
-    1 - I_{1-x}(b, a) is used.
-    """
-    if x <= 0.0 or x >= 1.0:
-        return 0.0 if x <= 0.0 else 1.0
-    if x > (a + 1.0) / (a + b + 2.0):
-        return 1.0 - incomplete_beta(1.0 - x, b, a)
-    log_front = (
-        math.lgamma(a + b)
-        - math.lgamma(a)
-        - math.lgamma(b)
-        + a * math.log(x)
-        + b * math.log1p(-x)
-    )
-    return math.exp(log_front) / (a * _fraction(x, a, b))
-
-
-def _fraction(x: float, a: float, b: float) -> float:
-    """1 + d1/(1 + d2/(1 + ...)) of DLMF 8.17.22, by Lentz's method."""
-    tiny = 1e-300  # keeps the recurrences off zero
-    value, up, down = 1.0, 1.0, 0.0
-    for i in range(1, _FRACTION_TERMS):
-        m, at = i // 2, a + i  # d_{2m} and d_{2m+1}
-        top = -(a + m) * (a + b + m) if i % 2 else m * (b - m)
-        term = top * x / ((at - 1.0) * at)
-        down = 1.0 / ((1.0 + term * down) or tiny)
-        up = (1.0 + term / up) or tiny
-        value *= up * down
-        if abs(up * down - 1.0) < 1e-15:
-            break
-    return value
-
-
-def beta_quantile(probability: float, a: float, b: float) -> float:
-    """Solve I_x(a, b) = probability for x, by bisection to the last digits."""
-    low, high = 0.0, 1.0
-    while True:
-        middle = 0.5 * (low + high)
-        if middle in (low, high) or high - low < 1e-14 * high:
-            return middle
-        if incomplete_beta(middle, a, b) < probability:
-            low = middle
-        else:
-            high = middle

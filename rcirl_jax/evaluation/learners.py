@@ -148,20 +148,12 @@ class FrozenSets:
 
     def of(self, config: TrainConfig) -> FeatureBatch:
         """Features for a configuration."""
-        key = TrainConfig(
-            features=config.features,
-            loss="listwise" if config.loss == "listwise" else "rank",
-            positive=config.positive,
-            train_horizon=config.train_horizon,
-            hard_negatives=config.hard_negatives,
-            hard_pool=config.hard_pool,
-            sampler=config.sampler,
-        )
+        key = config.for_features
         if key not in self._made:
             made = freeze(self.rows, self.index, key)
             if self.near_only:
-                pool = key.hard_negatives * key.hard_pool
-                far = jnp.arange(made.feasible.shape[1]) < made.feasible.shape[1] - pool
+                count = made.feasible.shape[1]
+                far = jnp.arange(count) < count - key.hard_drawn
                 made = made.replace(feasible=made.feasible & ~far)
             self._made[key] = made
         return self._made[key]

@@ -12,9 +12,10 @@ import dataclasses
 import math
 
 import numpy as np
+from scipy.special import stdtr, stdtrit
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.exact import CONFIDENCE, beta_quantile, incomplete_beta
+from rcirl_jax.evaluation.exact import CONFIDENCE
 
 NUM_RESAMPLES = 2000  # n; the ends of a 95 % interval rest on 50 draws each
 BOOTSTRAP_SEED = 20180814  # one fixed seed: the same data give the same table
@@ -299,8 +300,6 @@ def cluster_t(
     df = groups - 1
     if se == 0.0:
         return Difference(mean=mean, low=mean, high=mean, se=0.0, p=float(mean == 0.0))
-    # P(|T| > t) = I_x(df / 2, 1 / 2) with x = df / (df + t^2)
-    x = beta_quantile(1.0 - confidence, 0.5 * df, 0.5)
-    reach = se * math.sqrt(df * (1.0 - x) / x)
-    p = incomplete_beta(df / (df + (mean / se) ** 2), 0.5 * df, 0.5)
+    reach = se * float(stdtrit(df, 0.5 * (1.0 + confidence)))
+    p = 2.0 * float(stdtr(df, -abs(mean) / se))
     return Difference(mean=mean, low=mean - reach, high=mean + reach, se=se, p=p)

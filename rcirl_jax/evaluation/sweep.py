@@ -28,11 +28,7 @@ from rcirl_jax.evaluation.evaluate import RankingSetup, covered_rows, outcomes_o
 from rcirl_jax.evaluation.learners import normaliser_of
 from rcirl_jax.evaluation.ranking import METRICS, scene_metrics
 from rcirl_jax.evaluation.score import Scorer, score_scenes
-from rcirl_jax.evaluation.statistics import (
-    ClusterBootstrap,
-    Estimate,
-    combine_seeds,
-)
+from rcirl_jax.evaluation.statistics import ClusterBootstrap, Estimate, combine_seeds
 from rcirl_jax.executor import Executor
 from rcirl_jax.reward import Normaliser, RewardParams
 from rcirl_jax.train.frozen import Members, compiles, fit, freeze

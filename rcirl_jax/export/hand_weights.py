@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.reward import LatticeCost
+from rcirl_jax.reward import TUNED_ROW, LatticeCost
 from rcirl_jax.whole import write_json
 
 SCHEMA = "rcirl-jax/hand-weights"
@@ -40,6 +40,11 @@ def write_hand_weights(
         **facts,
     }
     write_json(Path(path), body)
+
+
+def tuned_row(path: str | None) -> dict[str, LatticeCost]:
+    """The tuned cost as a row of a table; none without a file."""
+    return {TUNED_ROW: load_hand_weights(path)} if path else {}
 
 
 def load_hand_weights(path: str | os.PathLike[str]) -> LatticeCost:

@@ -9,9 +9,10 @@ from numpy.typing import ArrayLike
 
 from rcirl_jax.evaluation.suite_output import SHORT
 from rcirl_jax.evaluation.suite_summary import SuiteReport
-from rcirl_jax.evaluation.table import RankingReport
+from rcirl_jax.evaluation.table import RIVALS, RankingReport
 from rcirl_jax.report.style import CLASS_COLOURS, figure, label, save
 from rcirl_jax.simulation.metrics import COLUMNS
+from rcirl_jax.simulation.rows import BASELINES
 
 LEARNED = CLASS_COLOURS["follow"]
 RIVAL = "#777777"
@@ -25,10 +26,7 @@ CURVES = (
     CLASS_COLOURS["other"],
     "#777777",
 )
-RIVALS = (
-    *("random", "random weights", "constant speed", "IDM", "IDM yielding"),
-    *("hand-set", "hand-set, tuned", "oracle"),
-)
+NOT_LEARNED = {*RIVALS, *BASELINES}
 PANELS = {
     "top1_fde": ("distance of the chosen at the horizon", "m, lower is better"),
     "top3_fde": ("best of the three highest", "m, lower is better"),
@@ -41,7 +39,7 @@ Interval = tuple[float, float, float]  # value, low, high
 def interval_panel(axis: Axes, rows: Mapping[str, Interval]) -> None:
     """One dot with its interval per row, first row on top, value written out."""
     for place, (name, (value, low, high)) in enumerate(rows.items()):
-        colour = RIVAL if name in RIVALS else LEARNED
+        colour = RIVAL if name in NOT_LEARNED else LEARNED
         axis.plot([low, high], [-place, -place], color=colour, lw=2)
         axis.plot([value], [-place], "o", color=colour, ms=5)
         axis.annotate(
@@ -54,35 +52,42 @@ def interval_panel(axis: Axes, rows: Mapping[str, Interval]) -> None:
 
 def ranking_chart(path: Path, report: RankingReport) -> Path:
     """PNG of the main columns of a ranking report, all rows, 95 % intervals."""
-    height = 1.2 + 0.34 * len(report.rows)
-    made, axes = figure(1, len(PANELS), 13.5, height)
-    for axis, (metric, (title, unit)) in zip(axes[0], PANELS.items(), strict=True):
-        rows = {}
-        for name, row in report.rows.items():
-            estimate = row[metric]
-            rows[name] = (estimate.value, estimate.low, estimate.high)
-        interval_panel(axis, rows)
-        label(axis, title, unit, "")
-        if axis is not axes[0, 0]:
-            axis.set_yticklabels([])
-    return save(made, path)
+    rows = {
+        name: {m: (row[m].value, row[m].low, row[m].high) for m in PANELS}
+        for name, row in report.rows.items()
+    }
+    return _panels(path, PANELS, rows, 4.5)
 
 
 def suite_chart(path: Path, report: SuiteReport) -> Path:
     """PNG of the closed-loop table per case, all rows, 95 % intervals."""
-    made, axes = figure(1, len(COLUMNS) + 1, 20.0, 1.2 + 0.34 * len(report.rows))
-    panels = {name: SHORT[name] for name in COLUMNS} | {"nuplan": "nuPlan score"}
-    for axis, (name, title) in zip(axes[0], panels.items(), strict=True):
-        rows = {}
-        for row, found in report.rows.items():
-            if name == "nuplan":
-                score = np.array([found.nuplan, found.nuplan_low, found.nuplan_high])
-                rows[row] = tuple(100 * score)
-            else:
-                rate = found.per_case[name]
-                rows[row] = (100 * rate.rate, 100 * rate.low, 100 * rate.high)
-        interval_panel(axis, rows)
-        label(axis, title, "higher is better" if name == "nuplan" else "% of cases", "")
+    panels = {name: (SHORT[name], "% of cases") for name in COLUMNS}
+    panels["nuplan"] = ("nuPlan score", "of 100, higher is better")
+
+    def percent(value: float, low: float, high: float) -> Interval:
+        return 100 * value, 100 * low, 100 * high
+
+    rows = {
+        name: {
+            **{m: percent(x.rate, x.low, x.high) for m, x in row.per_case.items()},
+            "nuplan": percent(row.nuplan, row.nuplan_low, row.nuplan_high),
+        }
+        for name, row in report.rows.items()
+    }
+    return _panels(path, panels, rows, 2.9)
+
+
+def _panels(
+    path: Path,
+    panels: Mapping[str, tuple[str, str]],
+    rows: Mapping[str, Mapping[str, Interval]],
+    width: float,
+) -> Path:
+    """Metrics side by side, `width` inches each; the rows are named once."""
+    made, axes = figure(1, len(panels), width * len(panels), 1.2 + 0.34 * len(rows))
+    for axis, (metric, (title, unit)) in zip(axes[0], panels.items(), strict=True):
+        interval_panel(axis, {name: row[metric] for name, row in rows.items()})
+        label(axis, title, unit, "")
         if axis is not axes[0, 0]:
             axis.set_yticklabels([])
     return save(made, path)

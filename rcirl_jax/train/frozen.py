@@ -82,12 +82,11 @@ def freeze(rows: Demonstration, index: np.ndarray, config: TrainConfig) -> Featu
       config: sampler, positive, features; the loss decides which facts.
     """
     key, parts = jax.random.key(config.seed), []
-    shared = dataclasses.replace(config, seed=0, epochs=1)
     for start in range(0, index.size, CHUNK):
         at = np.minimum(np.arange(start, start + CHUNK), index.size - 1)
         taken = jax.tree.map(lambda x, at=at: x[at], rows)
         batch = to_device_batch(taken, np.ones(CHUNK), index[at])
-        made = featurised(key, batch, shared)
+        made = featurised(key, batch, config)
         keep = min(CHUNK, index.size - start)
         parts.append(jax.tree.map(lambda x, n=keep: np.asarray(x[:n]), made))
     return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)), *parts)

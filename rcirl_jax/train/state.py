@@ -110,6 +110,25 @@ class TrainConfig:
                 raise InputError(f"--{name}: {getattr(self, name)}: expected {text}")
 
     @property
+    def hard_drawn(self) -> int:
+        """Hard negatives made per scene; they stand last among the candidates."""
+        return self.hard_negatives * self.hard_pool
+
+    @property
+    def for_features(self) -> "TrainConfig":
+        """What decides candidates, features and facts; all else at its default."""
+        return TrainConfig(
+            features=self.features,
+            # the only loss that asks for densities
+            loss="listwise" if self.loss == "listwise" else "rank",
+            positive=self.positive,
+            train_horizon=self.train_horizon,
+            hard_negatives=self.hard_negatives,
+            hard_pool=self.hard_pool,
+            sampler=self.sampler,
+        )
+
+    @property
     def loss_config(self) -> LossConfig:
         """Constants of the losses."""
         names = [field.name for field in dataclasses.fields(LossConfig)]

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import optax
 
 from rcirl_jax.features import FeatureMap, feature_map
-from rcirl_jax.features.columns import Frame, candidate_frames
+from rcirl_jax.features.columns import candidate_frames
 from rcirl_jax.reward import (
     Compared,
     LossConfig,
@@ -33,10 +33,11 @@ from rcirl_jax.sampling import (
     trajectory_from_positions,
     trajectory_on_path,
 )
+from rcirl_jax.sampling.speed import family_index
+from rcirl_jax.train.facts import facts_of
 from rcirl_jax.train.pieces import added, in_pieces
 from rcirl_jax.train.state import (
     Batch,
-    Facts,
     FeatureBatch,
     TrainConfig,
     TrainState,
@@ -95,67 +96,9 @@ def candidates_of(
         demonstration.scene,
         human_of(demonstration, config.sampler),
         config.sampler,
-        config.hard_negatives * config.hard_pool,
+        config.hard_drawn,
     )
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), sampled, near)
-
-
-OVER_LIMIT_MPS = 0.5  # m/s above the limit that counts as breaking it
-KERNEL_M = 2.0  # m, bandwidth of the proposal's density
-
-
-def facts_of(
-    driven: Trajectory,
-    candidates: Candidates,
-    frames: Frame,
-    valid: jax.Array,
-    config: TrainConfig,
-) -> Facts:
-    """Distances, collisions, broken rules and densities of one scene, leaves [K].
-
-    Over the times in `valid` [T]; the human's own are of the recorded curve.
-    `frames` are those of the candidates, [T, K].
-    """
-    x = candidates.trajectory
-    count = jnp.sum(valid)
-
-    def apart(a: Trajectory, b: Trajectory) -> jax.Array:
-        """Mean distance [m] over valid times."""
-        distance = jnp.sqrt((a.s - b.s) ** 2 + (a.l - b.l) ** 2 + 1e-9)
-        return jnp.sum(jnp.where(valid, distance, 0.0), axis=-1) / count
-
-    seen = valid[:, None]
-    fast = frames.point.v > frames.path.speed_limit + OVER_LIMIT_MPS
-    unlawful = (fast | (frames.relations.line_overrun > 0.0)) & seen
-    human_density, density = jnp.zeros(()), jnp.zeros(x.s.shape[:1])
-    if config.loss == "listwise":
-        row = jax.vmap(lambda one: apart(x, one))
-        others = candidates.feasible & ~jnp.eye(density.size, dtype=bool)
-        density = log_density(row(x), others)
-        human_density = log_density(apart(x, driven), candidates.feasible)
-    return Facts(
-        human_distance=jnp.zeros(()),
-        distance=apart(x, driven),
-        collides=jnp.any((frames.relations.body < 0.0) & seen, axis=0),
-        breaks_rule=jnp.sum(unlawful, axis=0) / count,
-        human_density=human_density,
-        density=density,
-    )
-
-
-def log_density(distance: jax.Array, others: jax.Array) -> jax.Array:
-    """Log of the kernel density of the candidates [...].
-
-    Each trajectory counts as one sample of its own, so that none has density 0.
-
-    Args:
-      distance: [..., K] in m, to every candidate.
-      others: [..., K] bool, candidates that count besides it; a twin of it does.
-    """
-    kernel = -0.5 * (distance / KERNEL_M) ** 2
-    own = jnp.zeros_like(distance[..., :1])
-    logits = jnp.where(others, kernel, -jnp.inf)
-    return jax.nn.logsumexp(jnp.concatenate([own, logits], axis=-1), axis=-1)
 
 
 def featurise(
@@ -186,8 +129,7 @@ def featurise(
         if config.positive == "human":
             return human, rows, feasible, facts, valid
         # a planner can choose what the sampler made, not a hard negative
-        sampled = feasible.size - config.hard_negatives * config.hard_pool
-        choice = feasible & (jnp.arange(feasible.size) < sampled)
+        choice = feasible & (candidates.family != family_index("hard_negative"))
         near = jnp.argmin(jnp.where(choice, facts.distance, jnp.inf))
         facts = facts.replace(
             human_distance=facts.distance[near], human_density=facts.density[near]
@@ -208,9 +150,16 @@ def featurise(
     )
 
 
-@functools.partial(jax.jit, static_argnames="config")
 def featurised(key: jax.Array, batch: Batch, config: TrainConfig) -> FeatureBatch:
-    """`featurise` as one program, for what is made outside of a step."""
+    """`featurise` as one program, for what is made outside of a step.
+
+    Runs that differ in seed, step size or loss share it.
+    """
+    return _featurised(key, batch, config.for_features)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _featurised(key: jax.Array, batch: Batch, config: TrainConfig) -> FeatureBatch:
     return featurise(key, batch, config, feature_map(config.features))
 
 
@@ -251,7 +200,7 @@ def mined(
 
     The pool stands last among the candidates; the others stop counting.
     """
-    pool = config.hard_negatives * config.hard_pool
+    pool = config.hard_drawn
     values = compare(params, normaliser, batch, config.reward).candidates[:, -pool:]
     feasible = batch.feasible[:, -pool:]
     values = jnp.where(feasible, values, -jnp.inf)

@@ -5,13 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
-from scipy.special import betainc
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.exact import (
     clopper_pearson,
     holm,
-    incomplete_beta,
     mcnemar_exact,
     rule_of_three,
 )
@@ -201,15 +199,6 @@ def test_same_seed_same_interval():
     assert combine_seeds(x, clusters) == combine_seeds(x, clusters)
     other = combine_seeds(x, ClusterBootstrap(clusters, seed=1))
     assert other.low != combine_seeds(x, clusters).low
-
-
-@given(
-    x=st.floats(0.0, 1.0),
-    a=st.floats(0.05, 3000.0),
-    b=st.floats(0.05, 3000.0),
-)
-def test_incomplete_beta_equals_scipy(x, a, b):
-    assert incomplete_beta(x, a, b) == pytest.approx(betainc(a, b, x), abs=1e-11)
 
 
 @given(

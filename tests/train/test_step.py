@@ -13,6 +13,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import LOSSES, Normaliser, RewardConfig, pinned
 from rcirl_jax.sampling import SamplerConfig
+from rcirl_jax.train.facts import log_density
 from rcirl_jax.train.loop import guard, to_device_batch
 from rcirl_jax.train.parallel import (
     jit_sharded,
@@ -24,9 +25,9 @@ from rcirl_jax.train.parallel import (
 from rcirl_jax.train.pieces import in_pieces
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.train.step import (
+    _featurised,
     featurised,
     init_state,
-    log_density,
     make_train_step,
 )
 from tests.scenes import demonstration
@@ -117,6 +118,17 @@ def test_cached_features_give_the_same_step():
         rtol=1e-4,
         atol=1e-5,
     )
+
+
+def test_runs_that_differ_in_other_settings_share_the_program_of_features():
+    key, made = jax.random.key(0), cached()
+    size = _featurised._cache_size()
+    other = dataclasses.replace(CONFIG, seed=7, learning_rate=0.1, loss="logistic")
+    same = featurised(init_state(CONFIG, normaliser()).key, batch(), other)
+    assert _featurised._cache_size() == size
+    np.testing.assert_array_equal(same.candidates, made.candidates)
+    featurised(key, batch(), dataclasses.replace(CONFIG, train_horizon=5.0))
+    assert _featurised._cache_size() == size + 1
 
 
 def test_scene_by_scene_is_the_step_of_the_whole_batch():
