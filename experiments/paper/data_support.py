@@ -26,7 +26,12 @@ from rcirl_jax.evaluation.data_support import (
 )
 from rcirl_jax.evaluation.identify import to_json
 from rcirl_jax.evaluation.identify_text import format_report
-from rcirl_jax.evaluation.learners import FrozenSets, learner_config, train_learner
+from rcirl_jax.evaluation.learners import (
+    FrozenSets,
+    learner_config,
+    train_grid,
+    train_learner,
+)
 from rcirl_jax.features import feature_map
 from rcirl_jax.report.support_picture import support_picture
 from rcirl_jax.reward import RewardConfig
@@ -42,7 +47,7 @@ def main() -> None:
     linear = learner_config("logistic linear", base())
     (reward,) = train_learner(train, linear, [0])
     weights = weights_supported(reward, train, vehicle["train"])
-    runs = train_learner(train, config, seeds())
+    (runs,) = train_grid(train, config, [config.leaky_rate], seeds()).values()
     made = choices_of(runs, train, test)
     spreads = {"seeds": made.spread_of_seeds, "posterior": made.spread_of_posterior}
     warns = {

@@ -13,6 +13,9 @@ from rcirl_jax.data.splits import TEST, TRAIN, assign_groups
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Demonstration
 
+HOLDOUTS = ("groups", "vehicles", "recording", "validation")
+HELD_OUT = 0.25  # share of the vehicles, or of the training scenes
+
 
 class Resplit:
     """A dataset seen through other splits.
@@ -152,6 +155,26 @@ def with_validation(
             break
     splits = {TRAIN: rows[~held], "validation": rows[held], TEST: dataset.indices(TEST)}
     return Resplit(dataset, splits), by
+
+
+def held_out(
+    dataset: Demonstrations, how: str, *, seed: int = 0, recording: int = 0
+) -> Demonstrations:
+    """The dataset split anew, as one of `HOLDOUTS` says.
+
+    groups leaves the dataset's split; vehicles holds out `HELD_OUT` of them;
+    recording holds out one; validation holds out `HELD_OUT` of the training scenes
+    and leaves the dataset's test scenes unseen, so that a learner can be chosen.
+    """
+    if how == "vehicles":
+        return by_vehicle(dataset, HELD_OUT, seed)
+    if how == "recording":
+        return by_recording(dataset, recording)
+    if how == "validation":
+        parts, _ = with_validation(dataset, HELD_OUT, seed)
+        splits = {TRAIN: parts.indices(TRAIN), TEST: parts.indices("validation")}
+        return Resplit(dataset, splits)
+    return dataset
 
 
 def halves(dataset: Demonstrations) -> tuple[Resplit, Resplit]:

@@ -1,4 +1,4 @@
-"""The ranking report as aligned plain text for a terminal."""
+"""The ranking report as aligned plain text for a terminal, or as Markdown."""
 
 import textwrap
 from collections.abc import Sequence
@@ -12,6 +12,17 @@ from rcirl_jax.evaluation.table import (
     RIVALS,
     SIGNIFICANT_SE,
     RankingReport,
+)
+
+_IN_MARKDOWN = (
+    "top1_fde",
+    "top1_fde_failure",
+    "top3_fde",
+    "top1_ade",
+    "mrr",
+    "nll",
+    "percentile_rank",
+    "crash_rate",
 )
 
 
@@ -28,12 +39,12 @@ def format_table(report: RankingReport, width: int = 110) -> str:
     """
     if width < MIN_WIDTH:
         raise InputError(f"format_table: width: {width}: expected at least {MIN_WIDTH}")
-    learned = [name for name in report.rows if name not in RIVALS]
-    rivals = [name for name in RIVALS if name in report.rows]
+    names = _order(report)
+    learned = [name for name in names if name not in RIVALS]
     lines = [line for text in _heading(report) for line in textwrap.wrap(text, width)]
-    labels = [_label(report, name) for name in [*learned, *rivals]]
+    labels = [_label(report, name) for name in names]
     first = max(len(label) for label in labels)
-    columns = {name: _column(report, name, [*learned, *rivals]) for name in METRICS}
+    columns = {name: _column(report, name, names) for name in METRICS}
     labels = ["", "", *(x for label in labels for x in (label, "  sd over runs"))]
     first = max(first, len("  sd over runs"))
     block: list[str] = []
@@ -44,8 +55,37 @@ def format_table(report: RankingReport, width: int = 110) -> str:
             block = []
         block.append(name)
     lines += _block(labels, first, [columns[x] for x in block])
-    lines += _medians(report, [*learned, *rivals])
-    return "\n".join([*lines, *_differences(report, learned or rivals)]) + "\n"
+    lines += _medians(report, names)
+    return "\n".join([*lines, *_differences(report, learned or names)]) + "\n"
+
+
+def markdown_table(report: RankingReport, against: str = "GAN") -> str:
+    """The report's main columns as one Markdown table, a line per row.
+
+    The last column is the paired difference in top-1 FDE to the row `against`, if
+    there is one, with its p value after Holm's correction.
+    """
+    titles = ["row", *(f"{METRICS[x].title}, {METRICS[x].unit}" for x in _IN_MARKDOWN)]
+    apart = {
+        c.row: f"{c.difference.mean:+.2f} [{c.difference.low:+.2f}, "
+        f"{c.difference.high:+.2f}], p {c.p_holm:.2f}"
+        for c in report.comparisons
+        if c.reference == against and c.metric == "top1_fde"
+    }
+    titles += [f"top-1 minus {against}, m, Holm"] if apart else []
+    lines = [titles, ["---"] * len(titles)]
+    for name in _order(report):
+        runs = report.runs[name]
+        cells = [name if runs == 1 else f"{name}, {runs} runs"]
+        cells += [_cell(report.rows[name][x], METRICS[x].unit) for x in _IN_MARKDOWN]
+        lines.append(cells + ([apart.get(name, "")] if apart else []))
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+
+
+def _order(report: RankingReport) -> list[str]:
+    """Learned rows first, then the rivals in their order."""
+    learned = [name for name in report.rows if name not in RIVALS]
+    return [*learned, *(name for name in RIVALS if name in report.rows)]
 
 
 def _heading(report: RankingReport) -> list[str]:

@@ -47,6 +47,11 @@ LEARNERS: dict[str, dict] = {
         "loss": "listwise",
         "reward": RewardConfig(hidden=(64,), constraint="monotone"),
     },
+    "MaxEnt 32-16": {"loss": "listwise", "reward": RewardConfig(hidden=(32, 16))},
+    "MaxEnt monotone 32-16": {
+        "loss": "listwise",
+        "reward": RewardConfig(hidden=(32, 16), constraint="monotone"),
+    },
     "soft labels": {"loss": "soft"},
     "soft labels linear": {"loss": "soft", "reward": LINEAR},
     "GAN": {"loss": "gan"},
@@ -60,6 +65,7 @@ LEARNERS: dict[str, dict] = {
         "reward": RewardConfig(hidden=(), pin="none", constraint="nonnegative"),
     },
     "logistic 64": {"loss": "logistic", "reward": RewardConfig(hidden=(64,))},
+    "logistic 32-16": {"loss": "logistic", "reward": RewardConfig(hidden=(32, 16))},
     "logistic monotone": {
         "loss": "logistic",
         "reward": RewardConfig(constraint="monotone"),

@@ -145,12 +145,14 @@ def _listwise(c: Compared, config: LossConfig) -> tuple[jax.Array, jax.Array]:
 def _soft(c: Compared, config: LossConfig) -> tuple[jax.Array, jax.Array]:
     """Cross-entropy with labels softmax(-distance / tau) over the whole set.
 
-    Near candidates share the label; with the nearest one as the positive, the
-    human curve itself is not in the set.
+    Near candidates share the label unless they collide, which is no good answer
+    however near; the positive always has its part. With the nearest candidate as
+    the positive, the human curve itself is not in the set.
     """
     counted = _counted(c)
+    good = counted & ~_all(jnp.zeros(c.human.shape, bool), c.collides)
     apart = _all(c.human_distance, c.distance) / config.soft_distance
-    labels = jax.nn.softmax(jnp.where(counted, -apart, -jnp.inf), axis=1)
+    labels = jax.nn.softmax(jnp.where(good, -apart, -jnp.inf), axis=1)
     values = jnp.where(counted, _all(c.human, c.candidates), -jnp.inf)
     log_p = jnp.where(counted, jax.nn.log_softmax(values, axis=1), 0.0)
     return _over_scenes(c, -jnp.sum(labels * log_p, axis=1))

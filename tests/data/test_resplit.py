@@ -3,7 +3,15 @@
 import numpy as np
 import pytest
 
-from rcirl_jax.data.resplit import Resplit, by_recording, by_vehicle, fewer, halves
+from rcirl_jax.data.resplit import (
+    HOLDOUTS,
+    Resplit,
+    by_recording,
+    by_vehicle,
+    fewer,
+    halves,
+    held_out,
+)
 from rcirl_jax.errors import InputError
 
 
@@ -16,6 +24,7 @@ class Rows:
         rng = np.random.default_rng(0)
         self.vehicle = np.repeat(np.arange(40), 5)
         self.recording = self.vehicle // 10
+        self.group = self.vehicle // 2
         self.test = np.flatnonzero(np.isin(self.vehicle, rng.permutation(40)[:8]))
 
     def indices(self, split):
@@ -25,8 +34,8 @@ class Rows:
         return self.test if split == "test" else np.setdiff1d(every, self.test)
 
     def read(self, rows):
-        return type("Rows", (), {"vehicle": self.vehicle[rows],
-                                 "recording": self.recording[rows]})  # fmt: skip
+        names = ("vehicle", "recording", "group")
+        return type("Rows", (), {name: getattr(self, name)[rows] for name in names})
 
     def load(self, split):
         return self.read(self.indices(split))
@@ -40,6 +49,21 @@ def test_no_vehicle_is_on_both_sides(split):
     assert train
     assert test
     assert not train & test
+
+
+@pytest.mark.parametrize("how", HOLDOUTS)
+def test_what_is_held_out(how):
+    split = held_out(Rows(), how, recording=1)
+    train, test = split.load("train"), split.load("test")
+    assert not set(train.vehicle) & set(test.vehicle)
+    unseen = np.isin(split.indices(None), Rows().test).sum()
+    if how == "validation":  # to choose by: the scenes to judge by are in neither part
+        assert unseen == 0
+        assert 15 <= test.vehicle.size <= 60
+    elif how == "groups":
+        np.testing.assert_array_equal(split.indices("test"), Rows().test)
+    elif how == "recording":
+        assert set(test.recording) == {1}
 
 
 def test_a_quarter_of_the_vehicles_by_seed():

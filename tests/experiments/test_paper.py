@@ -95,7 +95,7 @@ def test_human_likeness_beside_a_tuned_hand_set_cost(dataset, tmp_path):
     done = commands.command("experiments.tune_hand_set", data, *small)
     assert done.returncode == 0, done.stderr[-2000:]
     few = ("--learners=RC-IRL rank", "--seeds=2", "--epochs=1")
-    rest = (f"--hand_weights={tuned}", f"--output={tmp_path}")
+    rest = (f"--hand_weights={tuned}", "--holdout=validation", f"--output={tmp_path}")
     done = commands.command("experiments.human_likeness", data, *few, *rest)
     assert done.returncode == 0, done.stderr[-2000:]
     body = json.loads((tmp_path / "ranking.json").read_text())
@@ -103,6 +103,9 @@ def test_human_likeness_beside_a_tuned_hand_set_cost(dataset, tmp_path):
     assert {"random", "IDM", "hand-set", "hand-set, tuned", "oracle"} <= set(
         body["rows"]
     )
+    rows = (tmp_path / "table.md").read_text().splitlines()
+    assert rows[2].startswith("| RC-IRL rank, 2 runs | ")
+    assert {line.count("|") for line in rows} == {10}
     assert (tmp_path / "ranking.png").read_bytes()[:4] == b"\x89PNG"
 
 

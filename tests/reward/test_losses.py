@@ -52,6 +52,7 @@ def scene_oracle(name, c, b, ks):
     if name == "soft":
         apart = np.array([c.human_distance[b], *c.distance[b, ks]])
         label = np.exp(-apart / CONFIG.soft_distance)
+        label[1:] *= 1.0 - c.collides[b, ks]  # near is no excuse for a collision
         label /= label.sum()
         return -np.sum(label * np.log(np.exp(values) / np.exp(values).sum()))
     real = -np.log(1 / (1 + np.exp(-(h + c.offset))))
