@@ -6,29 +6,34 @@ Planning frames are taken from the planner's own drives through every family.
 In each: how much value is left on the table against a finer lattice with local
 ascent, and what perception errors do to the plan and to its decisions. Rows:
 ranking, dynamic programming, Apollo's (t, s)-only recursion (gap only) and the
-hand-set cost (steadiness only: it has another value). Expected: 20 minutes on
-two cores; the DP's gap is near 0, ranking pays for its 64 candidates with about
-a tenth of the value of not braking. `--quick`: a few frames, three minutes.
+hand-set cost (steadiness only: it has another value). Writes robustness.json,
+optimality.png and robustness.png. Expected: an hour on one core; the DP's gap is
+near 0, ranking pays for its 64 candidates with about a tenth of the value of not
+braking. `--quick`: a few frames on coarse lattices, two minutes.
 """
 
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from absl import flags
 
 from experiments.common import provenance, run
-from rcirl_jax.evaluation.robustness import Disturbance, frames, gaps, steadiness
-from rcirl_jax.evaluation.statistics import ClusterBootstrap
+from rcirl_jax.evaluation.robustness import (
+    Disturbance,
+    frames,
+    gaps,
+    spread_over,
+    steadiness,
+    summary,
+)
 from rcirl_jax.export.loading import open_reward, reward_params
-from rcirl_jax.features import FeatureMap, feature_map
+from rcirl_jax.features import feature_map
 from rcirl_jax.planner.dp import dp_policy
-from rcirl_jax.planner.grid import DpConfig, Weights
+from rcirl_jax.planner.grid import DpConfig
 from rcirl_jax.planner.optimality import GapConfig
-from rcirl_jax.planner.plan import Plan
 from rcirl_jax.planner.rank import (
     Policy,
     RankConfig,
@@ -36,101 +41,89 @@ from rcirl_jax.planner.rank import (
     learned_score,
     rank_policy,
 )
-from rcirl_jax.planner.time_station import plan_time_station
+from rcirl_jax.planner.refine import RefineConfig
+from rcirl_jax.planner.time_station import time_station_policy
+from rcirl_jax.report.intervals import interval_chart
 from rcirl_jax.simulation.suite import build, suite_refs
-from rcirl_jax.types import Scene
 
 _WEIGHTS = flags.DEFINE_string("weights", None, "weights file", required=True)
 _OUTPUT = flags.DEFINE_string("output", "out/robustness", "folder to write")
-_FRAMES = flags.DEFINE_integer("frames", 69, "planning frames")
+_FRAMES = flags.DEFINE_integer("frames", 69, "planning frames", lower_bound=2)
 _QUICK = flags.DEFINE_bool("quick", False, "a few frames, coarse lattices")
 
+CATALOGUE_SEED = 500  # no suite and no training has these cases
+EVERY_S = 4.0  # s between two frames of a drive
+GAPS = {
+    "normalised": ("value left", "1: as bad as braking for nothing"),
+    "jerk_regret": ("RMS jerk above the best plan's", "m/s^3"),
+    "progress_regret": ("way below the best plan's", "m"),
+}
+SPREADS = {
+    "acceleration_std": ("spread of the next acceleration", "m/s^2"),
+    "end_station_std": ("spread of the plan's end", "m"),
+    "flip_rate": ("other decision", "share of disturbed plans"),
+    "fallback_rate": ("nothing admissible", "share of disturbed plans"),
+}
 
-def _time_station(features: FeatureMap, activation: str, lattice: DpConfig) -> Policy:
-    """Apollo's recursion on the learned reward, as a policy that is never driven."""
-
-    def policy(params: Weights, scene: Scene, key: jax.Array) -> Plan:
-        del key
-        plan = plan_time_station(scene, params, features, activation, lattice)
-        return Plan(
-            acceleration=plan.trajectory.a[0],
-            s=plan.trajectory.s,
-            fallback=~plan.feasible,
-            admissible=plan.feasible.astype(jnp.int32),
-        )
-
-    return policy
+Table = dict[str, dict[str, dict[str, float]]]  # row -> metric -> numbers
 
 
-def _line(values: np.ndarray) -> dict[str, float]:
-    """Mean with its 95 % bootstrap interval, and quantiles, of finite values."""
-    finite = values[np.isfinite(values)].astype(float)
-    if finite.size < 2:
-        return {"n": float(finite.size)}
-    low, high = np.quantile(
-        ClusterBootstrap(np.arange(finite.size)).means(finite), [0.025, 0.975]
-    )
-    return {
-        "n": float(finite.size),
-        "mean": float(finite.mean()),
-        "low": float(low),
-        "high": float(high),
-        "median": float(np.median(finite)),
-        "p95": float(np.quantile(finite, 0.95)),
+def _shown(
+    folder: Path, name: str, panels: dict[str, tuple[str, str]], table: Table
+) -> None:
+    """One line per row and metric on the terminal, and a picture."""
+    triples = {
+        row: {key: (x[key]["mean"], x[key]["low"], x[key]["high"]) for key in panels}
+        for row, x in table.items()
     }
+    for row, found in triples.items():
+        for key, (mean, low, high) in found.items():
+            title, unit = panels[key]
+            n = table[row][key]["n"]
+            print(
+                f"{row:<12} {title:<32} {mean:8.3f} [{low:.3f}, {high:.3f}] {unit}"
+                f" ({n:.0f} frames)"
+            )
+    interval_chart(folder / f"{name}.png", panels, triples, 3.2)
 
 
 def main() -> None:
-    """Frames, gaps, steadiness; table on the terminal, numbers as JSON."""
+    """Frames, gaps, steadiness; table on the terminal, numbers as JSON, pictures."""
+    quick, folder = _QUICK.value, Path(_OUTPUT.value)
     reward = open_reward(_WEIGHTS.value)
     params, config = reward_params(reward), RankConfig(period=0.2)
     features, activation = feature_map(str(reward.preset)), reward.activation
     rank = rank_policy(learned_score(features, activation), config)
-    coarse = DpConfig(step=4.0 if _QUICK.value else 2.0)
-    fine = DpConfig(step=2.0 if _QUICK.value else 1.0)
-    count = 4 if _QUICK.value else _FRAMES.value
-    refs = suite_refs("full", 1, 500)
-    cases, duration = build(refs, 60.0), 60.0
-    met = frames(rank, params, cases, duration, 4.0)
-    chosen = np.linspace(0, met.ego.v.shape[0] - 1, count).astype(int)
-    scenes = jax.tree.map(lambda leaf: leaf[chosen], met)
+    coarse = DpConfig(step=4.0 if quick else 2.0)
+    few, duration = ("free_cruise,stopped_lead", 20.0) if quick else ("full", 60.0)
+    cases = build(suite_refs(few, 1, CATALOGUE_SEED), duration)
+    count = 4 if quick else _FRAMES.value
+    met, case = spread_over(count, *frames(rank, params, cases, duration, EVERY_S))
     dp = dp_policy(features, activation, config, coarse)
-    baseline = _time_station(features, activation, coarse)
-    gap = GapConfig(lattice=fine)
-    result: dict = {"optimality": {}, "robustness": {}, "frames": count}
-    for name, policy in {"rank": rank, "dp": dp, "(t, s) only": baseline}.items():
-        found = gaps(policy, params, scenes, features, activation, gap)
-        of = np.where(found["known"] & found["admissible"], 1.0, np.nan)
-        result["optimality"][name] = {
-            key: _line(found[key] * of)
-            for key in ("normalised", "gap", "jerk_regret", "progress_regret")
-        }
-        print(f"optimality, {name}: {_text(result['optimality'][name])}", flush=True)
-    noise = Disturbance(samples=8 if _QUICK.value else 32)
-    hand = rank_policy(hand_score, config)
-    rows = {"rank": (rank, params), "hand-set": (hand, None)}
-    if not _QUICK.value:
-        rows["dp"] = (dp, params)
-        noise = dataclasses.replace(noise, samples=16)
+    states = time_station_policy(features, activation, coarse)
+    gap = GapConfig(lattice=DpConfig(step=2.0 if quick else 1.0))
+    if quick:
+        gap = dataclasses.replace(gap, refinement=RefineConfig(steps=6))
+    optimality: Table = {}
+    for name, policy in {"rank": rank, "DP": dp, "(t, s) only": states}.items():
+        found = gaps(policy, params, met, features, activation, gap)
+        judged = found["known"] & found["admissible"]
+        left = {key: np.where(judged, found[key], np.nan) for key in ("gap", *GAPS)}
+        optimality[name] = {key: summary(x, case) for key, x in left.items()}
+    _shown(folder, "optimality", GAPS, optimality)
+    noise = Disturbance(samples=8 if quick else 16)
+    rows: dict[str, tuple[Policy, Any]] = {"rank": (rank, params), "DP": (dp, params)}
+    rows["hand-set"] = (rank_policy(hand_score, config), None)
+    robustness: Table = {}
     for name, (policy, weights) in rows.items():
-        found = steadiness(policy, weights, scenes, noise)
-        result["robustness"][name] = {key: _line(x) for key, x in found.items()}
-        print(f"robustness, {name}: {_text(result['robustness'][name])}", flush=True)
-    folder = Path(_OUTPUT.value)
-    folder.mkdir(parents=True, exist_ok=True)
-    body = {**result, "disturbance": dataclasses.asdict(noise)}
+        found = steadiness(policy, weights, met, noise)
+        robustness[name] = {key: summary(x, case) for key, x in found.items()}
+    _shown(folder, "robustness", SPREADS, robustness)
+    body = {"optimality": optimality, "robustness": robustness, "frames": case.size}
+    body |= {"disturbance": dataclasses.asdict(noise), "quick": quick}
     body["made_by"] = provenance()
     (folder / "robustness.json").write_text(json.dumps(body, indent=2) + "\n")
-    print(f"written: {folder}/robustness.json")
-
-
-def _text(lines: dict[str, dict[str, float]]) -> str:
-    return "; ".join(
-        f"{key} {x['mean']:.3f} [{x['low']:.3f}, {x['high']:.3f}] "
-        f"(median {x['median']:.3f}, n {x['n']:.0f})"
-        for key, x in lines.items()
-        if "mean" in x
-    )
+    print(f"written: {folder}/robustness.json, optimality.png, robustness.png")
 
 
 if __name__ == "__main__":

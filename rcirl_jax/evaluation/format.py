@@ -63,12 +63,13 @@ def markdown_table(report: RankingReport, against: str = "GAN") -> str:
     """The report's main columns as one Markdown table, a line per row.
 
     The last column is the paired difference in top-1 FDE to the row `against`, if
-    there is one, with its p value after Holm's correction.
+    there is one, with its p value by Holm's correction over rows and metrics.
     """
     titles = ["row", *(f"{METRICS[x].title}, {METRICS[x].unit}" for x in _IN_MARKDOWN)]
     apart = {
         c.row: f"{c.difference.mean:+.2f} [{c.difference.low:+.2f}, "
-        f"{c.difference.high:+.2f}], p {c.p_holm:.2f}"
+        f"{c.difference.high:+.2f}], p "
+        + ("< 0.01" if c.p_holm < 0.01 else f"{c.p_holm:.2f}")
         for c in report.comparisons
         if c.reference == against and c.metric == "top1_fde"
     }

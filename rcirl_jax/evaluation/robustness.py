@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rcirl_jax.evaluation.statistics import ClusterBootstrap
 from rcirl_jax.features import FeatureMap
 from rcirl_jax.planner.grid import Weights
 from rcirl_jax.planner.optimality import GapConfig, optimality_gap
@@ -88,17 +89,18 @@ def decision(scene: Scene, s: jax.Array) -> jax.Array:
 def _steadiness(policy: Policy, config: Disturbance) -> Callable:
     def measure(params: Weights, scene: Scene, key: jax.Array) -> dict[str, jax.Array]:
         draw, plan_key = jax.random.split(key)
-        calm: Plan = policy(params, scene, plan_key)
         keys = jax.random.split(draw, config.samples)
         many = jax.vmap(lambda k: disturbed(k, scene, config))(keys)
-        plans = jax.vmap(lambda x: policy(params, x, plan_key))(many)
-        same = jax.vmap(decision)(many, plans.s) == decision(scene, calm.s)[None]
-        apart = plans.s[:, -1] - calm.s[-1]
+        # the scene as it is comes first; one call of the policy for all
+        first = lambda one, rest: jnp.concatenate([one[None], rest])  # noqa: E731
+        scenes = jax.tree.map(first, scene, many)
+        plans: Plan = jax.vmap(lambda x: policy(params, x, plan_key))(scenes)
+        taken = jax.vmap(decision)(scenes, plans.s)
         return {
-            "acceleration_std": jnp.std(plans.acceleration),
-            "end_station_std": jnp.std(apart),
-            "flip_rate": 1.0 - jnp.mean(jnp.all(same, axis=1)),
-            "fallback_rate": jnp.mean(plans.fallback),
+            "acceleration_std": jnp.std(plans.acceleration[1:]),
+            "end_station_std": jnp.std(plans.s[1:, -1]),
+            "flip_rate": 1.0 - jnp.mean(jnp.all(taken[1:] == taken[0], axis=1)),
+            "fallback_rate": jnp.mean(plans.fallback[1:]),
         }
 
     return jax.jit(jax.vmap(measure, in_axes=(None, 0, 0)))
@@ -124,13 +126,19 @@ def steadiness(
 
 
 @functools.lru_cache(maxsize=8)
-def _gaps(
-    policy: Policy, features: FeatureMap, activation: str, config: GapConfig
-) -> Callable:
-    def measure(params: Weights, scene: Scene, key: jax.Array) -> dict[str, jax.Array]:
-        plan = policy(params, scene, key)
-        trajectory = trajectory_on_path(scene, plan.s)
-        return optimality_gap(scene, trajectory, params, features, activation, config)
+def _planned(policy: Policy) -> Callable:
+    return jax.jit(
+        jax.vmap(lambda p, scene, key: policy(p, scene, key).s, (None, 0, None))
+    )
+
+
+@functools.lru_cache(maxsize=8)
+def _gap(features: FeatureMap, activation: str, config: GapConfig) -> Callable:
+    """The finer solver, compiled once for all policies."""
+
+    def measure(params: Weights, scene: Scene, s: jax.Array) -> dict[str, jax.Array]:
+        plan = trajectory_on_path(scene, s)
+        return optimality_gap(scene, plan, params, features, activation, config)
 
     return jax.jit(measure)
 
@@ -147,12 +155,11 @@ def gaps(
 
     The policy must plan along the scene's path, as all of ours do.
     """
-    run = _gaps(policy, features, activation, config)
-    key = jax.random.key(0)
-    found = []
-    for i in range(scenes.ego.v.shape[0]):
+    plans = _planned(policy)(params, scenes, jax.random.key(0))
+    measure, found = _gap(features, activation, config), []
+    for i in range(plans.shape[0]):
         one = jax.tree.map(lambda leaf, i=i: leaf[i], scenes)
-        found.append(jax.tree.map(np.asarray, run(params, one, key)))
+        found.append(jax.tree.map(np.asarray, measure(params, one, plans[i])))
     return {name: np.stack([one[name] for one in found]) for name in found[0]}
 
 
@@ -162,11 +169,41 @@ def frames(
     cases: Case,
     duration_s: float,
     every_s: float,
-) -> Scene:
-    """Planning frames [B] that a policy meets in cases, one each `every_s`."""
+) -> tuple[Scene, np.ndarray]:
+    """Planning frames [B] that a policy meets in cases, one each `every_s`.
+
+    Returns:
+      The scenes, and the number of the case that each comes from.
+    """
     steps = round(duration_s / STEP_S)
     config = RolloutConfig(steps=steps, plan_every=round(every_s / STEP_S), scenes=True)
     record, _, scenes = drive_cases(policy, params, cases, config)
-    valid = np.asarray(record.valid)[:, :: config.plan_every].reshape(-1)
-    flat = jax.tree.map(lambda x: np.asarray(x).reshape(-1, *x.shape[2:]), scenes)
-    return jax.tree.map(lambda x: x[valid], flat)
+    valid = np.asarray(record.valid)[:, :: config.plan_every]
+    met = jax.tree.map(lambda x: np.asarray(x)[valid], scenes)
+    return met, np.nonzero(valid)[0]
+
+
+def spread_over(
+    count: int, scenes: Scene, case: np.ndarray
+) -> tuple[Scene, np.ndarray]:
+    """At most `count` of the frames, evenly spread."""
+    chosen = np.unique(np.linspace(0, case.size - 1, count).astype(int))
+    return jax.tree.map(lambda leaf: leaf[chosen], scenes), case[chosen]
+
+
+def summary(values: np.ndarray, case: np.ndarray) -> dict[str, float]:
+    """Mean over frames [B] with its 95 % interval over cases, and quantiles.
+
+    Frames where the value is not defined (NaN) are left out and `n` says how many
+    remain; with fewer than two cases there is no interval, and nothing else.
+    """
+    defined = np.isfinite(values)
+    found, where = np.asarray(values[defined], float), case[defined]
+    body = {"n": float(found.size), "cases": float(np.unique(where).size)}
+    if body["cases"] < 2.0:
+        return body
+    means = ClusterBootstrap(where).means(found)
+    low, high = np.quantile(means, [0.025, 0.975])
+    body |= {"mean": float(found.mean()), "low": float(low), "high": float(high)}
+    median, p95 = np.quantile(found, [0.5, 0.95])
+    return {**body, "median": float(median), "p95": float(p95)}

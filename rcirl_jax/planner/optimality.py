@@ -56,9 +56,10 @@ def best_known(
     # a lattice plan that breaks something must not be the start of an ascent
     start = _where(plan.feasible, plan.trajectory, trajectory)
     climb = lambda x: refine(scene, x, score, weights, config.refinement)[0]  # noqa: E731
-    starts = (trajectory, start)
-    found = (*starts, *(climb(x) for x in starts), emergency_stop(scene))
-    many = _candidates(jax.tree.map(lambda *x: jnp.stack(x), *found))
+    starts = jax.tree.map(lambda *x: jnp.stack(x), trajectory, start)
+    found = (starts, jax.vmap(climb)(starts))
+    stop = jax.tree.map(lambda x: x[None], emergency_stop(scene))
+    many = _candidates(jax.tree.map(lambda *x: jnp.concatenate(x), *found, stop))
     values = score(weights, scene, many)
     admissible = check(scene, many, config.safety).admissible
     best = jnp.argmax(jnp.where(admissible, values, -jnp.inf))

@@ -26,6 +26,8 @@ from rcirl_jax.planner.grid import (
     motion_activation,
     rest_of_network,
 )
+from rcirl_jax.planner.plan import Plan
+from rcirl_jax.planner.rank import Policy
 from rcirl_jax.sampling.kinematics import trajectory_on_path
 from rcirl_jax.types import Scene
 from rcirl_jax.units import DT_S, NUM_TIMES
@@ -157,3 +159,21 @@ def plan_time_station(
         feasible=best[end] > FEASIBLE,
         n=stations,
     )
+
+
+def time_station_policy(
+    features: FeatureMap, activation: str, config: DpConfig
+) -> Policy:
+    """The recursion as a planner without a filter: to be measured, not driven."""
+
+    def policy(params: Weights, scene: Scene, key: jax.Array) -> Plan:
+        del key
+        plan = plan_time_station(scene, params, features, activation, config)
+        return Plan(
+            acceleration=plan.trajectory.a[0],
+            s=plan.trajectory.s,
+            fallback=~plan.feasible,
+            admissible=plan.feasible.astype(jnp.int32),
+        )
+
+    return policy

@@ -56,7 +56,7 @@ def ranking_chart(path: Path, report: RankingReport) -> Path:
         name: {m: (row[m].value, row[m].low, row[m].high) for m in PANELS}
         for name, row in report.rows.items()
     }
-    return _panels(path, PANELS, rows, 4.5)
+    return interval_chart(path, PANELS, rows, 4.5)
 
 
 def suite_chart(path: Path, report: SuiteReport) -> Path:
@@ -74,16 +74,19 @@ def suite_chart(path: Path, report: SuiteReport) -> Path:
         }
         for name, row in report.rows.items()
     }
-    return _panels(path, panels, rows, 2.9)
+    return interval_chart(path, panels, rows, 2.9)
 
 
-def _panels(
+def interval_chart(
     path: Path,
     panels: Mapping[str, tuple[str, str]],
     rows: Mapping[str, Mapping[str, Interval]],
     width: float,
 ) -> Path:
-    """Metrics side by side, `width` inches each; the rows are named once."""
+    """PNG of metrics (title, unit) side by side, `width` inches each.
+
+    Every row has every metric as (value, low, high); the rows are named once.
+    """
     made, axes = figure(1, len(panels), width * len(panels), 1.2 + 0.34 * len(rows))
     for axis, (metric, (title, unit)) in zip(axes[0], panels.items(), strict=True):
         interval_panel(axis, {name: row[metric] for name, row in rows.items()})

@@ -18,6 +18,7 @@ from rcirl_jax.evaluation import (
     scene_metrics,
     to_json,
 )
+from rcirl_jax.evaluation.format import markdown_table
 from rcirl_jax.evaluation.ranking import METRICS
 from rcirl_jax.evaluation.table import RIVALS, verdict
 
@@ -255,3 +256,26 @@ def test_bad_input_is_refused(scorers, outcomes, report):
         build_report({"IDM": [scorers["IDM"][0], short]}, outcomes)
     with pytest.raises(InputError, match="width"):
         format_table(report, 99)
+
+
+def test_markdown_has_the_report_s_numbers_and_the_difference_to_one_row(
+    scorers, outcomes
+):
+    report = build_report(scorers, outcomes, references=["twin"])
+    head, rule, *rows = markdown_table(report, "twin").splitlines()
+    cells = {
+        line.split(" | ")[0].strip("| "): line.strip("| ").split(" | ") for line in rows
+    }
+    assert len(rule.split("|")) == len(head.split("|"))
+    assert len(rows) == len(scorers)
+    found = report.rows["rc-irl"]["top1_fde"]
+    assert cells["rc-irl, 3 runs"][1] == (
+        f"{found.value:.2f} [{found.low:.2f}, {found.high:.2f}]"
+    )
+    (apart,) = (
+        c for c in report.comparisons if (c.row, c.metric) == ("rc-irl", "top1_fde")
+    )
+    said = cells["rc-irl, 3 runs"][-1]
+    assert said.startswith(f"{apart.difference.mean:+.2f} [")
+    assert ("p < 0.01" in said) == (apart.p_holm < 0.01)
+    assert "minus" not in markdown_table(report, "nobody")

@@ -10,6 +10,7 @@ from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.simulation.suite import family_names
 from tests import commands
+from tests.weights_files import random_weights
 
 RANKED = (
     "artefact_audit",
@@ -87,6 +88,19 @@ def test_table2(tmp_path):
     assert "RC-IRL 21-15-1 DP" in dp["rows"]
     for folder in ("suite", "dp"):
         assert (tmp_path / folder / "table.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_robustness(tmp_path):
+    weights = random_weights(tmp_path / "random.msgpack")
+    flags = ("--quick", f"--weights={weights}", f"--output={tmp_path}")
+    done = command("robustness", *flags)
+    assert done.returncode == 0, done.stderr[-2000:]
+    body = json.loads((tmp_path / "robustness.json").read_text())
+    assert set(body["optimality"]) == {"rank", "DP", "(t, s) only"}
+    assert set(body["robustness"]) == {"rank", "DP", "hand-set"}
+    assert body["optimality"]["rank"]["gap"]["mean"] >= -1e-5
+    for name in ("optimality", "robustness"):
+        assert (tmp_path / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_human_likeness_beside_a_tuned_hand_set_cost(dataset, tmp_path):

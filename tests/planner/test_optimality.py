@@ -7,7 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.evaluation.robustness import Disturbance, decision, disturbed, steadiness
+from rcirl_jax.evaluation.robustness import (
+    Disturbance,
+    decision,
+    disturbed,
+    spread_over,
+    steadiness,
+    summary,
+)
 from rcirl_jax.planner.optimality import GapConfig, emergency_stop, optimality_gap
 from rcirl_jax.planner.rank import (
     ONLINE,
@@ -96,3 +103,26 @@ def test_who_does_not_look_is_steady():
     )
     assert ((learned["flip_rate"] >= 0.0) & (learned["flip_rate"] <= 1.0)).all()
     assert learned["acceleration_std"].max() > 0.0
+
+
+def test_a_summary_counts_cases_and_leaves_out_what_is_not_defined():
+    case = np.repeat(np.arange(10), 3)
+    values = case + np.tile([-0.1, 0.0, 0.1], 10)
+    values[0] = np.nan
+    found = summary(values, case)
+    assert found["n"] == 29
+    assert found["cases"] == 10
+    assert found["mean"] == pytest.approx(np.nanmean(values))
+    assert found["low"] < found["mean"] < found["high"]
+    # frames of one drive are alike: as many independent frames would say more
+    alone = summary(values, np.arange(30))
+    assert found["high"] - found["low"] > 1.3 * (alone["high"] - alone["low"])
+    assert summary(values, np.zeros(30, int)) == {"n": 29.0, "cases": 1.0}
+
+
+def test_frames_are_thinned_with_their_cases():
+    many = batch([random_scene(seed) for seed in range(7)])
+    few, case = spread_over(3, many, np.arange(7))
+    assert case.tolist() == [0, 3, 6]
+    np.testing.assert_array_equal(few.ego.v, np.asarray(many.ego.v)[case])
+    assert spread_over(50, many, np.arange(7))[1].size == 7
