@@ -15,7 +15,8 @@ from absl import flags
 from experiments.common import run
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.closed_loop import table_rows
-from rcirl_jax.report.case_picture import animate_case, draw_case, write_case_page
+from rcirl_jax.report.case_page import write_case_page
+from rcirl_jax.report.case_picture import animate_case, draw_case
 from rcirl_jax.simulation.metrics import MetricsConfig, case_metrics
 from rcirl_jax.simulation.rollout import drive_cases
 from rcirl_jax.simulation.rows import BASELINES, Row

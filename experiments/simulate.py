@@ -26,7 +26,7 @@ from rcirl_jax.evaluation.closed_loop import (
     write_suite,
 )
 from rcirl_jax.export.spread import SuiteJob, spread
-from rcirl_jax.simulation.recorded import RecordedConfig
+from rcirl_jax.simulation.recorded_config import RecordedConfig
 from rcirl_jax.simulation.rows import BASELINES, human_row
 from rcirl_jax.simulation.suite import (
     FULL_S,

@@ -29,7 +29,7 @@ from rcirl_jax.report.intervals import suite_chart
 from rcirl_jax.reward import RewardConfig
 from rcirl_jax.simulation.cases import STEP_S
 from rcirl_jax.simulation.demonstrations import DriveConfig, drive_catalogue
-from rcirl_jax.simulation.recorded import RecordedConfig
+from rcirl_jax.simulation.recorded_config import RecordedConfig
 from rcirl_jax.simulation.rows import BASELINES, human_row
 from rcirl_jax.simulation.suite import (
     FULL_S,

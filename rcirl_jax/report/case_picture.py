@@ -1,26 +1,28 @@
-"""Pictures of one simulated drive: a PNG, a GIF, and a page that holds both.
+"""Pictures of one simulated drive: a PNG and a GIF.
 
 Everything is drawn around the drive's worst moment: the first collision by the
 ego's fault, else the first collision, else the smallest clearance. Step k of a
 record is the moment (k + 1) * 0.1 s.
 """
 
-import base64
-import dataclasses
-import html as escape
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from matplotlib.animation import PillowWriter
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 
-from rcirl_jax.errors import InputError
-from rcirl_jax.report.html import table_section, write_page
+from rcirl_jax.report.case_drive import (
+    VIEW_AHEAD_M,
+    VIEW_BEHIND_M,
+    CaseDrive,
+    on_host,
+    plan_start,
+    present_at,
+    window,
+)
 from rcirl_jax.report.style import CANDIDATE, CHOSEN, CLASS_COLOURS, HUMAN, label, save
 from rcirl_jax.report.style import plt as pyplot
 from rcirl_jax.simulation.cases import (
@@ -46,7 +48,6 @@ GO_COLOUR = CLASS_COLOURS["overtake"]
 NUM_INSTANTS = 5  # strips
 INSTANTS_S = 6.0  # s from the first strip to the last
 ST_BEFORE_S, ST_AFTER_S = 6.0, 9.0  # s, the ST graph's window around the moment
-VIEW_BEHIND_M, VIEW_AHEAD_M = 30.0, 70.0  # m of road in a strip
 ASIDE_MARGIN_M, MAX_ASIDE_M = 3.0, 26.0  # m beyond the road; m shown at most
 STRIP_INCHES = 13.0  # inches, width of a strip in the PNG
 NOSE_LENGTH_M = 1.0  # m, shorter boxes have no wedge at their front
@@ -57,112 +58,6 @@ MAX_JERK_MPS3 = 6.0  # m/s^3, bound of the paper's table
 SHOWN_CLEARANCE_M = 30.0  # m, larger clearances are cut off
 GIF_FPS = 5  # 1/s, real time
 GIF_BEFORE_S, GIF_AFTER_S = 7.0, 3.0  # s of drive around the moment
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _Drive:
-    """One drive as numpy arrays, with its road in x and y."""
-
-    case: Case
-    record: Record
-    shot: Snapshot
-    last: int  # last valid step
-    worst: int  # step of the worst moment
-    heading: np.ndarray  # [R] rad, of the reference line
-    x: np.ndarray  # [R] m
-    y: np.ndarray  # [R] m
-
-    def time(self, step: int) -> float:
-        return (step + 1) * STEP_S
-
-    def place(
-        self, s: np.ndarray, l: np.ndarray, station: float
-    ) -> tuple[np.ndarray, ...]:
-        """(x, y, line heading) of Frenet points, seen from the line at `station`."""
-        x, y, heading = self._world(s, l)
-        x0, y0, heading0 = self._world(np.array(station), np.array(0.0))
-        cosine, sine = np.cos(heading0), np.sin(heading0)
-        dx, dy = x - x0, y - y0
-        return dx * cosine + dy * sine, dy * cosine - dx * sine, heading - heading0
-
-    def _world(self, s: np.ndarray, l: np.ndarray) -> tuple[np.ndarray, ...]:
-        grid = np.arange(self.x.size) * ROAD_STEP_M
-        at = np.clip(s, 0.0, grid[-1])
-        x, y, heading = (np.interp(at, grid, v) for v in (self.x, self.y, self.heading))
-        beyond = s - at  # straight beyond both ends
-        x = x + beyond * np.cos(heading) - l * np.sin(heading)
-        return x, y + beyond * np.sin(heading) + l * np.cos(heading), heading
-
-
-def worst_step(record: Record) -> int:
-    """The step to look at: an at-fault crash, a crash, the smallest clearance.
-
-    Without anybody near it is the hardest braking.
-    """
-    valid = np.asarray(record.valid, bool)
-    for hits in (record.at_fault, record.collision):
-        found = np.flatnonzero(valid & (np.asarray(hits) > 0))
-        if found.size:
-            return int(found[0])
-    clearance = np.where(valid, np.asarray(record.clearance), np.inf)
-    if np.isfinite(clearance).any():
-        return int(np.argmin(clearance))
-    return int(np.argmin(np.where(valid, np.asarray(record.a), np.inf)))
-
-
-def road_in_plane(kappa: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(x, y, heading) [R] of the reference line from its curvature [R] 1/m.
-
-    heading' = kappa, x' = cos(heading), y' = sin(heading); trapezoids on the
-    ROAD_STEP_M grid, chords at the mean heading.
-    """
-    kappa = np.asarray(kappa, np.float64)
-    turn = 0.5 * (kappa[1:] + kappa[:-1]) * ROAD_STEP_M
-    heading = np.append(0.0, np.cumsum(turn))
-    chord = ROAD_STEP_M * np.sinc(0.5 * turn / np.pi)
-    middle = heading[:-1] + 0.5 * turn
-    x = np.append(0.0, np.cumsum(chord * np.cos(middle)))
-    return x, np.append(0.0, np.cumsum(chord * np.sin(middle))), heading
-
-
-def _host(path: Path, case: Case, record: Record, snapshot: Snapshot) -> _Drive:
-    case, record, snapshot = jax.tree.map(np.asarray, (case, record, snapshot))
-    if np.ndim(record.valid) != 1 or not np.any(record.valid):
-        raise InputError(
-            f"{path}: record.valid: shape {np.shape(record.valid)}, "
-            f"{int(np.sum(record.valid))} valid steps: expected one drive's [S], >= 1"
-        )
-    x, y, heading = road_in_plane(np.asarray(case.road.kappa))
-    return _Drive(
-        case=case,
-        record=record,
-        shot=snapshot,
-        last=int(np.flatnonzero(record.valid)[-1]),
-        worst=worst_step(record),
-        heading=heading,
-        x=x,
-        y=y,
-    )
-
-
-def _window(drive: _Drive, before_s: float, after_s: float) -> tuple[int, int]:
-    """First and last step of a window around the moment, moved into the drive."""
-    size = int(round((before_s + after_s) / STEP_S))
-    first = drive.worst - int(round(before_s / STEP_S))
-    first = min(max(first, 0), max(drive.last - size, 0))
-    return first, min(first + size, drive.last)
-
-
-def _present(drive: _Drive, step: int) -> np.ndarray:
-    """[A] agents to draw; whom the ego hits in this step has left the world."""
-    agents = drive.shot.agents
-    present = np.asarray(agents.present[step], bool)
-    if drive.record.collision[step] > 0:
-        before = np.asarray(agents.gone[max(step - 1, 0)], bool)
-        fresh = np.asarray(agents.gone[step], bool) & ~(before & (step > 0))
-        near = np.abs(agents.s[step] - drive.record.s[step]) < VIEW_BEHIND_M
-        present = present | (fresh & near)
-    return present & (np.asarray(drive.case.agents.kind) != Kind.NONE)
 
 
 def _box(
@@ -182,7 +77,7 @@ def _box(
         axis.add_patch(shape)
 
 
-def _draw_road(axis: Axes, drive: _Drive, station: float, step: int) -> None:
+def _draw_road(axis: Axes, drive: CaseDrive, station: float, step: int) -> None:
     road, lines = drive.case.road, drive.case.lines
     s = np.arange(station - VIEW_BEHIND_M - 20.0, station + VIEW_AHEAD_M + 20.0, 1.0)
 
@@ -207,7 +102,7 @@ def _draw_road(axis: Axes, drive: _Drive, station: float, step: int) -> None:
             axis.plot(x, y, color=STOP_COLOUR if red else GO_COLOUR, lw=3, zorder=2)
 
 
-def _aside(drive: _Drive, steps: np.ndarray) -> tuple[float, float]:
+def _aside(drive: CaseDrive, steps: np.ndarray) -> tuple[float, float]:
     """Lowest and highest y [m] of a strip that holds the road at all these steps."""
     road, low, high = drive.case.road, 0.0, 0.0
     for station in np.asarray(drive.record.s)[steps]:
@@ -220,7 +115,7 @@ def _aside(drive: _Drive, steps: np.ndarray) -> tuple[float, float]:
 
 
 def _draw_strip(
-    axis: Axes, drive: _Drive, step: int, aside: tuple[float, float]
+    axis: Axes, drive: CaseDrive, step: int, aside: tuple[float, float]
 ) -> None:
     """Bird's-eye view at one step; the ego's road station is at x = 0."""
     record, agents, who = drive.record, drive.shot.agents, drive.case.agents
@@ -229,7 +124,7 @@ def _draw_strip(
     s, l = np.asarray(agents.s[step]), np.asarray(agents.l[step])
     x, y, line = drive.place(s, l, station)
     heading = line + agents.heading[step]
-    for a in np.flatnonzero(_present(drive, step)):
+    for a in np.flatnonzero(present_at(drive, step)):
         size = (float(who.length[a]), float(who.width[a]))
         colour = KIND_COLOURS.get(Kind(int(who.kind[a])), CANDIDATE)
         nose = int(who.kind[a]) != Kind.STATIC and size[0] > NOSE_LENGTH_M
@@ -252,12 +147,12 @@ def _draw_strip(
     label(axis, words, "", "m")
 
 
-def _bands(axis: Axes, drive: _Drive, steps: np.ndarray) -> None:
+def _bands(axis: Axes, drive: CaseDrive, steps: np.ndarray) -> None:
     """Agents in the ego's path, by station over time."""
     case, agents, who = drive.case, drive.shot.agents, drive.case.agents
     grid = np.arange(case.road.path_l.shape[0]) * ROAD_STEP_M
     time = (steps + 1) * STEP_S
-    present = np.stack([_present(drive, int(step)) for step in steps])
+    present = np.stack([present_at(drive, int(step)) for step in steps])
     for a in np.flatnonzero(present.any(axis=0)):
         s, l, heading = (
             np.asarray(v)[steps, a] for v in (agents.s, agents.l, agents.heading)
@@ -279,23 +174,9 @@ def _bands(axis: Axes, drive: _Drive, steps: np.ndarray) -> None:
         )
 
 
-def plan_start(record: Record, snapshot: Snapshot, step: int) -> float:
-    """Time [s] at which the plan in force at a step was made.
-
-    A held plan repeats; it begins where the ego was when it was made.
-    """
-    plans, s = np.asarray(snapshot.plan_s), np.append(0.0, np.asarray(record.s))
-    k = step
-    while k > 0 and abs(s[k] - plans[step, 0]) > 1e-3:
-        if not np.array_equal(plans[k - 1], plans[step]):
-            break
-        k -= 1
-    return k * STEP_S
-
-
-def _draw_st(axis: Axes, drive: _Drive) -> None:
+def _draw_st(axis: Axes, drive: CaseDrive) -> None:
     """Station-time graph around the moment."""
-    first, last = _window(drive, ST_BEFORE_S, ST_AFTER_S)
+    first, last = window(drive, ST_BEFORE_S, ST_AFTER_S)
     steps = np.arange(first, last + 1)
     time, s = (steps + 1) * STEP_S, np.asarray(drive.record.s)[steps]
     _bands(axis, drive, steps)
@@ -317,7 +198,7 @@ def _draw_st(axis: Axes, drive: _Drive) -> None:
     label(axis, "station-time graph", "t, s", "station, m")
 
 
-def _draw_series(axes: list[Axes], drive: _Drive) -> None:
+def _draw_series(axes: list[Axes], drive: CaseDrive) -> None:
     """Speed, acceleration, jerk and clearance over the whole drive."""
     record, time = drive.record, (np.arange(drive.last + 1) + 1) * STEP_S
     cut = lambda leaf: np.asarray(leaf)[: drive.last + 1]  # noqa: E731
@@ -345,7 +226,7 @@ def _draw_series(axes: list[Axes], drive: _Drive) -> None:
     axes[3].set_ylim(min(-0.5, float(np.nanmin(np.append(clearance, 0.0)))), None)
 
 
-def _legend(drive: _Drive) -> list[Patch | Line2D]:
+def _legend(drive: CaseDrive) -> list[Patch | Line2D]:
     kinds = {int(k) for k in np.asarray(drive.case.agents.kind)}
     rows: list[Patch | Line2D] = [Patch(color=EGO_COLOUR, label="ego")]
     rows += [
@@ -382,8 +263,8 @@ def draw_case(
     Raises:
       InputError: the record holds no valid step, or several drives.
     """
-    drive = _host(path, case, record, snapshot)
-    first, last = _window(drive, INSTANTS_S / 2.0, INSTANTS_S / 2.0)
+    drive = on_host(path, case, record, snapshot)
+    first, last = window(drive, INSTANTS_S / 2.0, INSTANTS_S / 2.0)
     steps = np.round(np.linspace(first, last, NUM_INSTANTS)).astype(int)
     steps[np.argmin(np.abs(steps - drive.worst))] = drive.worst
     aside = [_aside(drive, np.array([step])) for step in steps]
@@ -417,8 +298,8 @@ def animate_case(
 
     Args: as `draw_case`; `path` is the GIF to write.
     """
-    drive = _host(path, case, record, snapshot)
-    first, last = _window(drive, GIF_BEFORE_S, GIF_AFTER_S)
+    drive = on_host(path, case, record, snapshot)
+    first, last = window(drive, GIF_BEFORE_S, GIF_AFTER_S)
     stride = int(round(1.0 / (GIF_FPS * STEP_S)))
     # the worst moment is one of the frames
     steps = np.arange(first + (drive.worst - first) % stride, last + 1, stride)
@@ -438,54 +319,3 @@ def animate_case(
             writer.grab_frame()
     pyplot.close(made)
     return path
-
-
-def write_case_page(
-    path: Path,
-    title: str,
-    lead: str,
-    *,
-    picture: Path,
-    animation: Path | None,
-    metrics: Mapping[str, Any],
-) -> Path:
-    """One HTML file of a drive: GIF, PNG and metrics; it needs no other file.
-
-    Args:
-      path: HTML to write.
-      title: heading.
-      lead: one sentence below it.
-      picture: PNG of `draw_case`.
-      animation: GIF of `animate_case`, if there is one.
-      metrics: name -> value (a number or text), in the order to be shown.
-    """
-    sections = []
-    for heading, file in (("drive", animation), ("picture", picture)):
-        if file is not None:
-            sections.append(_embedded(heading, file))
-    wide = max((len(name) for name in metrics), default=0)
-    rows = [f"{name:<{wide}}  {_value(value)}" for name, value in metrics.items()]
-    sections.append(table_section("metrics", "\n".join(rows)))
-    return write_page(path, title, lead, sections)
-
-
-def _embedded(heading: str, file: Path) -> str:
-    """A section with one picture as a data URI."""
-    if not file.is_file():
-        raise InputError(f"{file}: picture: missing: expected a PNG or GIF")
-    kind = file.suffix.lstrip(".").lower()
-    data = base64.b64encode(file.read_bytes()).decode()
-    words = escape.escape(heading)
-    return (
-        f'<h2>{words}</h2>\n<figure><img alt="{words}" '
-        f'src="data:image/{kind};base64,{data}"></figure>'
-    )
-
-
-def _value(value: Any) -> str:  # noqa: ANN401
-    """A metric as text; numbers with four digits."""
-    if isinstance(value, str) or np.ndim(value):
-        return str(value)
-    if np.asarray(value).dtype.kind in "bui":
-        return str(value)
-    return f"{float(value):.4g}"

@@ -9,7 +9,6 @@ numpy stream of its own per case. All of it is float64 on the host and becomes
 float32 at the end.
 """
 
-import dataclasses
 import functools
 import hashlib
 import itertools
@@ -24,26 +23,26 @@ from scipy.special import ndtri
 from scipy.stats import qmc
 
 from rcirl_jax.errors import InputError
+from rcirl_jax.simulation.case_tables import (
+    STATIONS,
+    Parts,
+    agents_of,
+    lines_of,
+    road_of,
+    single,
+    whole,
+)
 from rcirl_jax.simulation.cases import (
     NUM_AGENTS,
     NUM_LINES,
-    NUM_MOVES,
-    NUM_PHASES,
     NUM_ROAD,
     ROAD_STEP_M,
     STEP_S,
-    Agents,
     Case,
-    Driver,
     LineKind,
-    Lines,
     Perception,
-    Road,
-    Script,
 )
 from rcirl_jax.simulation.families import (
-    DRIVER,
-    FLAGS,
     AgentSpec,
     Element,
     Family,
@@ -73,7 +72,6 @@ SIZES = {  # m, length and width by kind
     "static": (4.6, 1.9),
 }
 HEADINGS = {"lane": 0.0, "oncoming": math.pi}  # rad; crossing has its own
-STATIONS = np.arange(NUM_ROAD) * ROAD_STEP_M  # m, the road grid
 ID = re.compile(r"^([A-Za-z0-9_]+)/(\d{1,6})@(\d{1,9})$")
 
 
@@ -157,22 +155,11 @@ def _derive(family: Family, variables: dict[str, float], strict: bool) -> None:
             variables[name] = expression(variables)
 
 
-@dataclasses.dataclass
-class _Parts:
-    """What the events of a case add up to."""
-
-    kappa: np.ndarray
-    limits: list[tuple[float, float]]
-    shifts: list[tuple[float, float, float]]
-    lines: list[dict[str, float]]
-    agents: list[dict]
-
-
 def _wanted(item: Element | AgentSpec, variables: Mapping[str, float]) -> bool:
     return item.when is None or bool(item.when(variables))
 
 
-def _add_elements(family: Family, variables: dict[str, float], parts: _Parts) -> None:
+def _add_elements(family: Family, variables: dict[str, float], parts: Parts) -> None:
     values = {
         kind: [
             (element, {k: e(variables) for k, e in element.fields.items()})
@@ -195,7 +182,7 @@ def _add_elements(family: Family, variables: dict[str, float], parts: _Parts) ->
 def _add_agents(
     family: Family,
     variables: dict[str, float],
-    parts: _Parts,
+    parts: Parts,
     rng: np.random.Generator,
 ) -> None:
     for spec in family.agents:
@@ -224,9 +211,9 @@ def _events(
     rng: np.random.Generator,
     index: int,
     seed: int,
-) -> _Parts:
+) -> Parts:
     """Play through the events along the road."""
-    parts = _Parts(kappa=np.zeros(NUM_ROAD), limits=[], shifts=[], lines=[], agents=[])
+    parts = Parts(kappa=np.zeros(NUM_ROAD), limits=[], shifts=[], lines=[], agents=[])
     members = {}
     for event in range(int(road["events"])):
         source, own = family, draws.event(event)
@@ -248,113 +235,7 @@ def _events(
     return parts
 
 
-def _float(x: float) -> Any:  # noqa: ANN401
-    """A float32 scalar leaf."""
-    return np.float32(x)
-
-
-def _int(x: float, kind: type = np.int32) -> Any:  # noqa: ANN401
-    """An integer scalar leaf."""
-    return kind(x)
-
-
-def _table(x: np.ndarray) -> Any:  # noqa: ANN401
-    """A float32 array leaf."""
-    return x.astype(np.float32)
-
-
-def _road(road: dict[str, float], parts: _Parts) -> Road:
-    limit = np.full(NUM_ROAD, road["speed_limit"])
-    for at, speed in sorted(parts.limits):
-        limit[at <= STATIONS] = speed
-    path = np.zeros(NUM_ROAD)
-    for at, length, target in sorted(parts.shifts):
-        begin = float(np.interp(at, STATIONS, path))
-        u = np.clip((STATIONS - at) / max(length, ROAD_STEP_M), 0.0, 1.0)
-        smooth = u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
-        path = np.where(at <= STATIONS, begin + (target - begin) * smooth, path)
-    width = road["lane_width"]
-    f = _float
-    return Road(
-        kappa=_table(parts.kappa),
-        speed_limit=_table(limit),
-        path_l=_table(path),
-        lane_width=f(width),
-        lanes_left=_int(road["lanes_left"]),
-        lanes_right=_int(road["lanes_right"]),
-        edge_left=f(
-            (road["lanes_left"] + road["oncoming"] + 0.5) * width + road["shoulder"]
-        ),
-        edge_right=f(-((road["lanes_right"] + 0.5) * width + road["shoulder"])),
-        destination=f(road["destination"]),
-    )
-
-
-def _lines(parts: _Parts) -> Lines:
-    names = {"s": "at", "offset": "offset", "green": "green", "yellow": "yellow"}
-    names["red"] = "red"
-    made: dict[str, Any] = {}
-    for leaf, key in names.items():
-        made[leaf] = np.zeros(NUM_LINES, np.float32)
-        made[leaf][: len(parts.lines)] = [line[key] for line in parts.lines]
-    kind: Any = np.zeros(NUM_LINES, np.int32)
-    kind[: len(parts.lines)] = [int(line["kind"]) for line in parts.lines]
-    return Lines(kind=kind, **made)
-
-
-def _column(rows: list[dict], name: str, empty: float) -> Any:  # noqa: ANN401
-    out = np.full(NUM_AGENTS, empty, np.float32)
-    out[: len(rows)] = [row[name] for row in rows]
-    return out
-
-
-def _agents(rows: list[dict]) -> Agents:
-    flags: dict[str, Any] = {name: np.zeros(NUM_AGENTS, bool) for name in FLAGS}
-    for name, values in flags.items():
-        values[: len(rows)] = [row[name] for row in rows]
-    kind: Any = np.full(NUM_AGENTS, Kind.NONE, np.int32)
-    kind[: len(rows)] = [row["kind"] for row in rows]
-    neutral = {"headway": 1.4, "standstill": 2.0, "acceleration": 1.4, "braking": 2.0}
-    neutral |= {"desired": 10.0, "lapse_start": np.inf, "lapse_end": np.inf}
-    plain = ("s", "l", "heading", "v", "v_share", "appear_t")
-    return Agents(
-        kind=kind,
-        length=_column(rows, "length", 1.0),
-        width=_column(rows, "width", 1.0),
-        appear_s=_column(rows, "appear_s", np.inf),
-        arrival_s=_column(rows, "arrival_s", np.inf),
-        relative=flags.pop("relative"),
-        **{name: _column(rows, name, 0.0) for name in plain},
-        driver=Driver(
-            **flags,
-            **{name: _column(rows, name, neutral.get(name, 0.0)) for name in DRIVER},
-        ),
-        script=_script(rows),
-    )
-
-
-def _script(rows: list[dict]) -> Script:
-    f = np.float32
-    start: Any = np.full((NUM_AGENTS, NUM_PHASES), np.inf, f)
-    speed, rate = np.zeros_like(start), np.ones_like(start)
-    move_start: Any = np.full((NUM_AGENTS, NUM_MOVES), np.inf, f)
-    move_l, move_speed = np.zeros_like(move_start), np.ones_like(move_start)
-    for i, row in enumerate(rows):
-        for p, phase in enumerate(row["phases"]):
-            start[i, p], speed[i, p], rate[i, p] = phase
-        for m, move in enumerate(row["moves"]):
-            move_start[i, m], move_l[i, m], move_speed[i, m] = move
-    return Script(
-        start=start,
-        speed=speed,
-        rate=rate,
-        move_start=move_start,
-        move_l=move_l,
-        move_speed=move_speed,
-    )
-
-
-def _check(family: Family, name: str, road: dict[str, float], parts: _Parts) -> None:
+def _check(family: Family, name: str, road: dict[str, float], parts: Parts) -> None:
     """One line for what no case may be."""
     where = f"{family.path}: {name}"
     found = {
@@ -396,16 +277,16 @@ def build_case(
     parts = _events(family, draws, shared, road, rng, index, seed)
     _check(family, case_id(family.name, index, seed), road, parts)
     stream = hashlib.sha256(case_id(family.name, index, seed).encode()).digest()
-    f = _float
+    f = single
     return Case(
-        seed=_int(int.from_bytes(stream[:4], "big"), np.uint32),
-        steps=_int(round(duration_s / STEP_S)),
+        seed=whole(int.from_bytes(stream[:4], "big"), np.uint32),
+        steps=whole(round(duration_s / STEP_S)),
         ego_v=f(road["ego_speed"]),
         ego_length=f(EGO_LENGTH_M),
         ego_width=f(EGO_WIDTH_M),
-        road=_road(road, parts),
-        lines=_lines(parts),
-        agents=_agents(parts.agents),
+        road=road_of(road, parts),
+        lines=lines_of(parts),
+        agents=agents_of(parts.agents),
         perception=Perception(
             **{k: f(e({**variables, **shared})) for k, e in family.perception.items()}
         ),

@@ -28,7 +28,8 @@ from rcirl_jax.simulation.catalogue import (
     parse_case_id,
 )
 from rcirl_jax.simulation.metrics import CaseMetrics, MetricsConfig, case_metrics
-from rcirl_jax.simulation.recorded import RecordedConfig, recorded_cases
+from rcirl_jax.simulation.recorded import recorded_cases
+from rcirl_jax.simulation.recorded_config import RecordedConfig
 from rcirl_jax.simulation.rollout import LANES, RolloutConfig, drive_cases
 from rcirl_jax.simulation.rows import Row
 

@@ -12,14 +12,16 @@ from scipy.integrate import solve_ivp
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.report import case_picture
-from rcirl_jax.report.case_picture import (
-    animate_case,
-    draw_case,
+from rcirl_jax.report.case_drive import (
+    on_host,
     plan_start,
+    present_at,
     road_in_plane,
+    window,
     worst_step,
-    write_case_page,
 )
+from rcirl_jax.report.case_page import write_case_page
+from rcirl_jax.report.case_picture import animate_case, draw_case
 from rcirl_jax.simulation.cases import (
     NUM_AGENTS,
     NUM_LINES,
@@ -164,7 +166,7 @@ def test_road_in_plane_against_an_integrator():
 def test_frenet_points_lie_where_geometry_says():
     case, record, shot = drive()
     circle = case.replace(road=case.road.replace(kappa=np.full(NUM_ROAD, 0.02)))
-    host = case_picture._host(None, circle, record, shot)
+    host = on_host(None, circle, record, shot)
     angle = np.array([0.0, 0.5, 1.0])
     x, y, line = host.place(30.0 + angle * 50.0, np.array([0.0, 2.0, -3.0]), 30.0)
     radius = 50.0 - np.array([0.0, 2.0, -3.0])
@@ -177,10 +179,10 @@ def test_frenet_points_lie_where_geometry_says():
 
 
 def test_the_hit_agent_is_drawn_at_the_crash():
-    host = case_picture._host(None, *drive(crash=True))
-    assert list(np.flatnonzero(case_picture._present(host, HIT))) == [0, 1, 2, 3]
+    host = on_host(None, *drive(crash=True))
+    assert list(np.flatnonzero(present_at(host, HIT))) == [0, 1, 2, 3]
     assert host.last == HIT
-    assert case_picture._window(host, 3.0, 3.0) == (HIT - 60, HIT)
+    assert window(host, 3.0, 3.0) == (HIT - 60, HIT)
 
 
 def test_windows_stay_inside_the_drive():
@@ -188,10 +190,8 @@ def test_windows_stay_inside_the_drive():
     for last, worst in ((199, 0), (199, 199), (20, 10), (0, 0)):
         valid = np.arange(STEPS) <= last
         near = np.where(np.arange(STEPS) == worst, 0.0, 9.0)
-        host = case_picture._host(
-            None, case, record.replace(valid=valid, clearance=near), shot
-        )
-        first, end = case_picture._window(host, 6.0, 9.0)
+        host = on_host(None, case, record.replace(valid=valid, clearance=near), shot)
+        first, end = window(host, 6.0, 9.0)
         assert 0 <= first <= worst <= end <= last
         assert end - first == min(150, last)
 

@@ -25,7 +25,7 @@ from rcirl_jax.report.verdict_sections import outcome_of
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.simulation.cases import STEP_S
 from rcirl_jax.simulation.metrics import COLUMNS
-from rcirl_jax.simulation.recorded import RecordedConfig
+from rcirl_jax.simulation.recorded_config import RecordedConfig
 from rcirl_jax.simulation.rollout import LANES, drive_cases
 from rcirl_jax.simulation.suite import (
     catalogue_set,

@@ -15,13 +15,9 @@ from rcirl_jax.data.importers import read_recordings, synthetic
 from rcirl_jax.errors import InputError
 from rcirl_jax.planner.plan import Plan
 from rcirl_jax.simulation.cases import NUM_AGENTS, NUM_ROAD, STEP_S, LineKind
-from rcirl_jax.simulation.recorded import (
-    REASONS,
-    RecordedConfig,
-    drives,
-    light_cycle,
-    recorded_cases,
-)
+from rcirl_jax.simulation.recorded import drives, recorded_cases
+from rcirl_jax.simulation.recorded_config import REASONS, RecordedConfig
+from rcirl_jax.simulation.recorded_drive import light_cycle
 from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases
 from rcirl_jax.specs import load_toml, spec_root
 from rcirl_jax.types import Kind, Lane, Recording, Signal, Track
