@@ -103,7 +103,7 @@ def _steadiness(policy: Policy, config: Disturbance) -> Callable:
             "fallback_rate": jnp.mean(plans.fallback[1:]),
         }
 
-    return jax.jit(jax.vmap(measure, in_axes=(None, 0, 0)))
+    return jax.jit(measure)
 
 
 def steadiness(
@@ -120,16 +120,23 @@ def steadiness(
       of disturbed plans with another decision, and without an admissible
       candidate.
     """
-    keys = jax.random.split(jax.random.key(seed), scenes.ego.v.shape[0])
-    found = _steadiness(policy, config)(params, scenes, keys)
-    return {name: np.asarray(value) for name, value in found.items()}
+    measure, key = _steadiness(policy, config), jax.random.key(seed)
+    of_scene = lambda i, x: measure(params, x, jax.random.fold_in(key, i))  # noqa: E731
+    return _one_by_one(of_scene, scenes)
+
+
+def _one_by_one(measure: Callable, scenes: Scene) -> dict[str, np.ndarray]:
+    """`measure(i, scene)` of every scene, stacked: a lattice's tables are large."""
+    found = []
+    for i in range(scenes.ego.v.shape[0]):
+        one = jax.tree.map(lambda leaf, i=i: leaf[i], scenes)
+        found.append(jax.tree.map(np.asarray, measure(i, one)))
+    return {name: np.stack([one[name] for one in found]) for name in found[0]}
 
 
 @functools.lru_cache(maxsize=8)
 def _planned(policy: Policy) -> Callable:
-    return jax.jit(
-        jax.vmap(lambda p, scene, key: policy(p, scene, key).s, (None, 0, None))
-    )
+    return jax.jit(lambda params, scene, key: policy(params, scene, key).s)
 
 
 @functools.lru_cache(maxsize=8)
@@ -155,12 +162,9 @@ def gaps(
 
     The policy must plan along the scene's path, as all of ours do.
     """
-    plans = _planned(policy)(params, scenes, jax.random.key(0))
-    measure, found = _gap(features, activation, config), []
-    for i in range(plans.shape[0]):
-        one = jax.tree.map(lambda leaf, i=i: leaf[i], scenes)
-        found.append(jax.tree.map(np.asarray, measure(params, one, plans[i])))
-    return {name: np.stack([one[name] for one in found]) for name in found[0]}
+    plan, measure = _planned(policy), _gap(features, activation, config)
+    key = jax.random.key(0)
+    return _one_by_one(lambda _, x: measure(params, x, plan(params, x, key)), scenes)
 
 
 def frames(
