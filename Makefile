@@ -27,7 +27,7 @@ test: setup
 	$(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal -m "not slow and not dataset"
 
 test-dataset: setup
-	$(BIN)/python -m pytest -q -m "dataset"
+	$(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal -m "dataset"
 
 lint: setup
 	$(BIN)/ruff check .

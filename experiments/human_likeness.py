@@ -16,7 +16,7 @@ long as the horizon none is dropped; a crash of the chosen candidate is charged.
 
 Writes ranking.json, table.txt, table.md and ranking.png. US-101 on two cores:
 about 15 minutes with 5 learners, an hour with all; expected at 5 s: networks with
-a top-1 FDE of 2.3 to 3.1 m, GAN among them, IDM 4.4, hand-set 8.8, oracle 0.2 m.
+a top-1 FDE of 2.2 to 3.1 m, GAN among them, IDM 4.4, hand-set 8.8, oracle 0.2 m.
 """
 
 import json
@@ -27,6 +27,7 @@ from absl import flags
 from experiments.common import provenance, run
 from rcirl_jax.data.resplit import HOLDOUTS, held_out
 from rcirl_jax.data.store import open_dataset
+from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.evaluation.format import format_table, markdown_table
 from rcirl_jax.evaluation.learners import (
@@ -64,7 +65,12 @@ _RECORDING = flags.DEFINE_integer("recording", 0, "recording that is held out")
 def main() -> None:
     """Flags -> one comparison."""
     whole = open_dataset(_DATA.value)
-    dataset = held_out(
+    if _HAND.value and _HOLDOUT.value != "groups":
+        raise InputError(
+            f"--hand_weights: with --holdout={_HOLDOUT.value}: expected groups, for"
+            " tune_hand_set tunes on the dataset's own training scenes"
+        )
+    dataset, split = held_out(
         whole, _HOLDOUT.value, seed=_SPLIT.value, recording=_RECORDING.value
     )
     sampler = SamplerConfig(mode=_MODE.value)
@@ -86,7 +92,7 @@ def main() -> None:
     text = format_table(report, 118)
     (folder / "table.txt").write_text(text + "\n")
     (folder / "table.md").write_text(markdown_table(report))
-    body = {**to_json(report), "made_by": provenance()}
+    body = {**to_json(report), "split": split, "made_by": provenance()}
     (folder / "ranking.json").write_text(json.dumps(body, indent=2) + "\n")
     picture = ranking_chart(folder / "ranking.png", report)
     print(text)

@@ -92,11 +92,18 @@ def intervals(report: RankingReport, metric: str) -> dict[str, Interval]:
     return {name: (e.value, e.low, e.high) for name, e in found.items()}
 
 
-def write(name: str, body: Mapping[str, object]) -> None:
-    """OUTPUT/name.json with provenance; says where."""
+def write(
+    name: str, body: Mapping[str, object], data: Demonstrations | None = None
+) -> None:
+    """OUTPUT/name.json with provenance, also of the scenes; says where."""
     folder = Path(OUTPUT.value)
     folder.mkdir(parents=True, exist_ok=True)
-    made = {**body, "quick": QUICK.value, "made_by": provenance()}
+    made_by = provenance()
+    shared = (DATA, OUTPUT, SEEDS, EPOCHS, HORIZON, QUICK)
+    made_by["flags"] |= {flag.name: flag.value for flag in shared}
+    if data is not None:
+        made_by["data_hash"] = data.hash
+    made = {**body, "quick": QUICK.value, "made_by": made_by}
     (folder / f"{name}.json").write_text(json.dumps(made, indent=2) + "\n")
     print(f"written: {folder}/{name}.json, {name}.png")
 

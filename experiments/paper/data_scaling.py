@@ -72,7 +72,7 @@ def main() -> None:
     save(made, picture("data_scaling"))
     for name in learned:
         print(f"{name:30s} top-1 FDE {found[name][0]:.2f} m")
-    write("data_scaling", {"counts": counts, "ranking": to_json(report)})
+    write("data_scaling", {"counts": counts, "ranking": to_json(report)}, data)
 
 
 if __name__ == "__main__":

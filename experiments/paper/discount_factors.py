@@ -36,7 +36,8 @@ def time_weights(runs: list[Learned]) -> np.ndarray:
 def main() -> None:
     """Train, read gamma, draw."""
     configs = {name: learner_config(name, base(train_horizon=8.0)) for name in ROWS}
-    learned = train_learners(dataset(), configs, seeds(least=2))
+    data = dataset()
+    learned = train_learners(data, configs, seeds(least=2))
     gamma = {name: time_weights(runs) for name, runs in learned.items()}
     made, axes = figure(1, 1, 6.8, 4.4)
     curves_panel(axes[0, 0], TIMES_S, gamma)
@@ -53,7 +54,7 @@ def main() -> None:
             "gamma": runs.round(5).tolist(),
             "near_share": [float(share.mean()), float(error)],
         }
-    write("discount_factors", {"times_s": TIMES_S.tolist(), "rows": body})
+    write("discount_factors", {"times_s": TIMES_S.tolist(), "rows": body}, data)
 
 
 if __name__ == "__main__":

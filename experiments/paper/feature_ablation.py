@@ -49,7 +49,7 @@ def main() -> None:
     report = evaluate_ranking(data, scorers(learned), setup())
     print(format_table(report, 118))
     ranking_chart(picture("feature_ablation"), report)
-    write("feature_ablation", {"kept": keeps, "ranking": to_json(report)})
+    write("feature_ablation", {"kept": keeps, "ranking": to_json(report)}, data)
 
 
 if __name__ == "__main__":

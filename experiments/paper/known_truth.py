@@ -24,14 +24,18 @@ from experiments.paper.common import (
     seeds,
     write,
 )
-from rcirl_jax.evaluation.known_truth import agreement, experts, hidden_reward
+from rcirl_jax.evaluation.known_truth import (
+    agreement,
+    differences,
+    experts,
+    hidden_reward,
+)
 from rcirl_jax.evaluation.learners import (
     FrozenSets,
     learner_config,
     normaliser_of,
     train_learner,
 )
-from rcirl_jax.evaluation.statistics import cluster_t
 from rcirl_jax.report.intervals import curves_panel
 from rcirl_jax.report.style import figure, label, save
 
@@ -77,17 +81,12 @@ def main() -> None:
         print(f"{name:16s} same choice " + "  ".join(
             f"{n}: {x:.2f}" for n, x in zip(counts, same[name].mean(0), strict=True)
         ))  # fmt: skip
-    against = {}
-    for name in ROWS[:-1]:
-        pair = (same[name][:, -1], same["GAN"][:, -1])
-        d = cluster_t(*pair, np.arange(len(runs)))
-        against[name] = dataclasses.asdict(d)
-        print(
-            f"{name} minus GAN, {counts[-1]} scenes, {len(runs)} hidden rewards: "
-            f"{d.mean:+.3f} [{d.low:+.3f}, {d.high:+.3f}], p {d.p:.3f}"
-        )
+    tested = differences(same, against="GAN")
+    for words, (d, p) in tested.items():
+        print(f"{words}: {d.mean:+.3f} [{d.low:+.3f}, {d.high:+.3f}], Holm p {p:.3f}")
     body = {n: {"same": same[n].tolist(), "regret": regret[n].tolist()} for n in ROWS}
-    write("known_truth", {"counts": counts, "rows": body, "minus_gan": against})
+    tests = {w: {**dataclasses.asdict(d), "p_holm": p} for w, (d, p) in tested.items()}
+    write("known_truth", {"counts": counts, "rows": body, "tests": tests}, data)
 
 
 if __name__ == "__main__":

@@ -65,7 +65,7 @@ def main() -> None:
     for name in learned:
         value, low, high = intervals(report, "top1_fde")[name]
         print(f"{name:22s} top-1 FDE {value:.2f} m [{low:.2f}, {high:.2f}]")
-    write("leaky_rate_and_hidden_size", {"ranking": to_json(report)})
+    write("leaky_rate_and_hidden_size", {"ranking": to_json(report)}, data)
 
 
 if __name__ == "__main__":

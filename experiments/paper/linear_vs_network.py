@@ -31,14 +31,14 @@ def main() -> None:
         "non-negative linear": learner_config("logistic non-negative", base()),
         "21-5-1": base(reward=RewardConfig(hidden=(5,))),
         "21-15-1": base(),
-        "21-64-1": base(reward=RewardConfig(hidden=(64,))),
-        "21-32-16-1": base(reward=RewardConfig(hidden=(32, 16))),
+        "21-64-1": learner_config("logistic 64", base()),
+        "21-32-16-1": learner_config("logistic 32-16", base()),
     }
     learned = train_learners(data, configs, seeds())
     report = evaluate_ranking(data, scorers(learned), setup())
     print(format_table(report, 118))
     ranking_chart(picture("linear_vs_network"), report)
-    write("linear_vs_network", {"ranking": to_json(report)})
+    write("linear_vs_network", {"ranking": to_json(report)}, data)
 
 
 if __name__ == "__main__":

@@ -55,6 +55,7 @@ def main() -> None:
             "human_s": frame.human_s.tolist(),
             "chosen_s": frame.chosen_s.tolist(),
         },
+        data,
     )
 
 

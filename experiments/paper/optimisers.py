@@ -57,6 +57,7 @@ def main() -> None:
             "finite": {n: all(r.finite for r in runs) for n, runs in learned.items()},
             "ranking": to_json(report),
         },
+        data,
     )
 
 

@@ -35,7 +35,8 @@ _LEARNERS = flags.DEFINE_list(
 
 def main() -> None:
     """Train all, say which stayed finite, draw."""
-    sets, rows = FrozenSets(dataset()), {}
+    data = dataset()
+    sets, rows = FrozenSets(data), {}
     grid = [(name, how) for name in _LEARNERS.value for how in sorted(OPTIMIZERS)]
     grid = grid[::5] if QUICK.value else grid
     for name, how in tqdm.tqdm(grid, desc="train", unit="run"):
@@ -59,7 +60,7 @@ def main() -> None:
     label(axis, "training: first epoch to last", "share of pairs won", "")
     save(made, picture("stability"))
     print(f"{len(rows)} runs, not finite: {len(failed)} {failed or ''}")
-    write("stability", {"rows": rows, "failed": failed})
+    write("stability", {"rows": rows, "failed": failed}, data)
     if failed:
         sys.exit(1)
 

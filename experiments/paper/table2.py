@@ -14,6 +14,7 @@ hand-set behind it in acceleration and jerk per case. `--quick` makes the same
 files from a few cases in about three minutes; its numbers mean nothing.
 """
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from absl import flags
 from experiments.common import provenance, run
 from rcirl_jax.data.importers import IMPORTERS, read_recordings
 from rcirl_jax.data.joined import open_datasets
+from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop import SuiteConfig, run_suite, write_suite
 from rcirl_jax.export.closed_loop import table_rows
 from rcirl_jax.export.from_run import export_run
@@ -40,6 +42,7 @@ from rcirl_jax.simulation.suite import (
 )
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.state import TrainConfig
+from rcirl_jax.whole import write_json
 
 _OUTPUT = flags.DEFINE_string("output", "out/table2", "folder for everything")
 _WEIGHTS = flags.DEFINE_list("weights", None, "weights files instead of training")
@@ -56,6 +59,18 @@ LEARNED: dict[str, dict] = {
     "gan": {"loss": "gan"},
     "linear": {"reward": RewardConfig(hidden=())},
 }
+
+
+def _same_run(folder: Path) -> None:
+    """Parts are reused, but not those of a quick run or of another seed."""
+    made, file = {"quick": _QUICK.value, "seed": _SEED.value}, folder / "run.json"
+    found = json.loads(file.read_text()) if file.exists() else made
+    if found != made:
+        raise InputError(
+            f"{folder}: made with {found}: expected {made}, or a new folder"
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(file, made)
 
 
 def _drives(folder: Path, seed: int, learner: Path | None) -> Path:
@@ -112,7 +127,7 @@ def _table(
 def main() -> None:
     """All tables, one folder each."""
     folder = Path(_OUTPUT.value)
-    folder.mkdir(parents=True, exist_ok=True)
+    _same_run(folder)
     weights = _WEIGHTS.value or _trained(folder)
     duration = 10.0 if _QUICK.value else FULL_S
     full = suite_refs("full", 1 if _QUICK.value else None)

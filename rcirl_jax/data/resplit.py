@@ -159,22 +159,25 @@ def with_validation(
 
 def held_out(
     dataset: Demonstrations, how: str, *, seed: int = 0, recording: int = 0
-) -> Demonstrations:
+) -> tuple[Demonstrations, str]:
     """The dataset split anew, as one of `HOLDOUTS` says.
 
     groups leaves the dataset's split; vehicles holds out `HELD_OUT` of them;
     recording holds out one; validation holds out `HELD_OUT` of the training scenes
     and leaves the dataset's test scenes unseen, so that a learner can be chosen.
+
+    Returns:
+      The dataset, and in words how it is split.
     """
     if how == "vehicles":
-        return by_vehicle(dataset, HELD_OUT, seed)
+        return by_vehicle(dataset, HELD_OUT, seed), f"vehicles, seed {seed}"
     if how == "recording":
-        return by_recording(dataset, recording)
+        return by_recording(dataset, recording), f"recording {recording}"
     if how == "validation":
-        parts, _ = with_validation(dataset, HELD_OUT, seed)
+        parts, by = with_validation(dataset, HELD_OUT, seed)
         splits = {TRAIN: parts.indices(TRAIN), TEST: parts.indices("validation")}
-        return Resplit(dataset, splits)
-    return dataset
+        return Resplit(dataset, splits), f"validation by {by}, seed {seed}"
+    return dataset, "as imported"
 
 
 def halves(dataset: Demonstrations) -> tuple[Resplit, Resplit]:

@@ -73,6 +73,7 @@ def _compared(weights: jax.Array, offset: jax.Array, frames: Frames) -> Compared
         counts=frames.counts,
         weight=frames.weight,
         human_distance=table[:, 0],
+        human_collides=table[:, 0] > 0.0,
         distance=table,
         collides=table > 0.0,
         breaks_rule=table,

@@ -63,7 +63,8 @@ def markdown_table(report: RankingReport, against: str = "GAN") -> str:
     """The report's main columns as one Markdown table, a line per row.
 
     The last column is the paired difference in top-1 FDE to the row `against`, if
-    there is one, with its p value by Holm's correction over rows and metrics.
+    there is one, with its p value by Holm's correction over the learned rows (the
+    rivals apart) and all compared metrics.
     """
     titles = ["row", *(f"{METRICS[x].title}, {METRICS[x].unit}" for x in _IN_MARKDOWN)]
     apart = {

@@ -6,12 +6,15 @@ for is to choose as the hidden reward does on scenes it has not seen.
 """
 
 import dataclasses
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rcirl_jax.evaluation.exact import holm
 from rcirl_jax.evaluation.learners import Learned
+from rcirl_jax.evaluation.statistics import Difference, cluster_t
 from rcirl_jax.reward import Normaliser, RewardConfig, RewardParams, init_reward, value
 from rcirl_jax.train.state import FeatureBatch
 
@@ -76,6 +79,7 @@ def experts(
     rows = jnp.arange(chosen.shape[0])
     facts = frozen.facts.replace(
         human_distance=frozen.facts.distance[rows, chosen],
+        human_collides=frozen.facts.collides[rows, chosen],
         human_density=frozen.facts.density[rows, chosen],
     )
     return frozen.replace(
@@ -109,3 +113,38 @@ def agreement(
     best_value = truth[rows, best]
     lost, stake = best_value - truth[rows, chosen], best_value - middle
     return float(np.mean(chosen == best)), float(lost.sum() / stake.sum())
+
+
+def differences(
+    same: Mapping[str, np.ndarray], against: str
+) -> dict[str, tuple[Difference, float]]:
+    """Does agreement rise with data, and is it above another learner's?
+
+    Paired over hidden rewards, Student's intervals, p values by Holm's correction
+    over all of these questions.
+
+    Args:
+      same: learner -> [H, C] agreement with each hidden reward, from few scenes to
+        many.
+      against: the learner that the others are compared with, at most scenes.
+
+    Returns:
+      Question in words -> (difference, adjusted p).
+    """
+    pairs = {
+        f"{name}, most scenes minus fewest": (runs[:, -1], runs[:, 0])
+        for name, runs in same.items()
+    }
+    pairs |= {
+        f"{name} minus {against}, most scenes": (runs[:, -1], same[against][:, -1])
+        for name, runs in same.items()
+        if name != against
+    }
+    found = {
+        words: cluster_t(a, b, np.arange(a.size)) for words, (a, b) in pairs.items()
+    }
+    adjusted = holm(np.array([d.p for d in found.values()]))
+    return {
+        words: (d, float(p))
+        for (words, d), p in zip(found.items(), adjusted, strict=True)
+    }

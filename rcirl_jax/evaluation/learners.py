@@ -142,14 +142,14 @@ class FrozenSets:
     Args:
       dataset: any dataset.
       split: which scenes.
-      near_only: leave nothing but the hard negatives among the candidates.
+      nearest: leave only so many candidates, those nearest to the human; 0: all.
     """
 
     def __init__(
-        self, dataset: Demonstrations, split: str = "train", *, near_only: bool = False
+        self, dataset: Demonstrations, split: str = "train", *, nearest: int = 0
     ) -> None:
         self.rows, self.index = dataset.load(split), dataset.indices(split)
-        self.near_only = near_only
+        self.nearest = nearest
         self._made: dict[TrainConfig, FeatureBatch] = {}
 
     def of(self, config: TrainConfig) -> FeatureBatch:
@@ -157,10 +157,10 @@ class FrozenSets:
         key = config.for_features
         if key not in self._made:
             made = freeze(self.rows, self.index, key)
-            if self.near_only:
-                count = made.feasible.shape[1]
-                far = jnp.arange(count) < count - key.hard_drawn
-                made = made.replace(feasible=made.feasible & ~far)
+            if self.nearest:
+                apart = jnp.where(made.feasible, made.facts.distance, jnp.inf)
+                place = jnp.argsort(jnp.argsort(apart, axis=1), axis=1)
+                made = made.replace(feasible=made.feasible & (place < self.nearest))
             self._made[key] = made
         return self._made[key]
 

@@ -9,18 +9,20 @@ perception disturbed M times,
     delta v_ego ~ N(0, sigma_ego^2),
 
 gives M plans; reported are the spread of what is driven next and how often the
-decision (which side of each body the plan passes) differs from the undisturbed.
+decision (which side of each body the plan passes) differs from the undisturbed
+plan's, both judged in the scene as it is.
 """
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rcirl_jax.evaluation.statistics import ClusterBootstrap
+from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.statistics import combine_seeds
 from rcirl_jax.features import FeatureMap
 from rcirl_jax.planner.grid import Weights
 from rcirl_jax.planner.optimality import GapConfig, optimality_gap
@@ -31,6 +33,11 @@ from rcirl_jax.simulation.cases import STEP_S, Case
 from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases
 from rcirl_jax.types import Kind, Scene
 from rcirl_jax.units import TIMES_S
+
+# of `optimality_gap`, in the order in which they are shown
+GAPS = ("normalised", "jerk_regret", "progress_regret")
+
+Table = dict[str, dict[str, dict[str, float]]]  # row -> metric -> numbers
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -95,7 +102,8 @@ def _steadiness(policy: Policy, config: Disturbance) -> Callable:
         first = lambda one, rest: jnp.concatenate([one[None], rest])  # noqa: E731
         scenes = jax.tree.map(first, scene, many)
         plans: Plan = jax.vmap(lambda x: policy(params, x, plan_key))(scenes)
-        taken = jax.vmap(decision)(scenes, plans.s)
+        # judged in the true scene: a body that was seen elsewhere is no decision
+        taken = jax.vmap(lambda s: decision(scene, s))(plans.s)
         return {
             "acceleration_std": jnp.std(plans.acceleration[1:]),
             "end_station_std": jnp.std(plans.s[1:, -1]),
@@ -172,18 +180,29 @@ def frames(
     params: Weights,
     cases: Case,
     duration_s: float,
+    *,
+    period_s: float,
     every_s: float,
 ) -> tuple[Scene, np.ndarray]:
-    """Planning frames [B] that a policy meets in cases, one each `every_s`.
+    """Scenes [B] that a policy meets when it drives cases.
+
+    Args:
+      policy: plans every `period_s`, as it is built for.
+      params: of the policy.
+      cases: what it drives.
+      duration_s: of each drive.
+      period_s: s between two plans.
+      every_s: s between two scenes that are kept, a multiple of it.
 
     Returns:
       The scenes, and the number of the case that each comes from.
     """
-    steps = round(duration_s / STEP_S)
-    config = RolloutConfig(steps=steps, plan_every=round(every_s / STEP_S), scenes=True)
+    steps, every = round(duration_s / STEP_S), round(every_s / period_s)
+    plan_every = round(period_s / STEP_S)
+    config = RolloutConfig(steps=steps, plan_every=plan_every, scenes=True)
     record, _, scenes = drive_cases(policy, params, cases, config)
-    valid = np.asarray(record.valid)[:, :: config.plan_every]
-    met = jax.tree.map(lambda x: np.asarray(x)[valid], scenes)
+    valid = np.asarray(record.valid)[:, :: plan_every * every]
+    met = jax.tree.map(lambda x: np.asarray(x)[:, ::every][valid], scenes)
     return met, np.nonzero(valid)[0]
 
 
@@ -195,19 +214,49 @@ def spread_over(
     return jax.tree.map(lambda leaf: leaf[chosen], scenes), case[chosen]
 
 
-def summary(values: np.ndarray, case: np.ndarray) -> dict[str, float]:
-    """Mean over frames [B] with its 95 % interval over cases, and quantiles.
+def optimality_rows(
+    policies: Mapping[str, Policy],
+    params: Weights,
+    scenes: Scene,
+    case: np.ndarray,
+    features: FeatureMap,
+    activation: str,
+    config: GapConfig,
+) -> Table:
+    """Gaps of several policies on the frames where all of them may be judged.
 
-    Frames where the value is not defined (NaN) are left out and `n` says how many
-    remain; with fewer than two cases there is no interval, and nothing else.
+    `admissible` is the share of all frames in which a policy's own plan passes the
+    safety filter; gaps are of the frames in which every policy's does and the best
+    known plan is admissible too, so that all rows speak of the same frames.
     """
-    defined = np.isfinite(values)
-    found, where = np.asarray(values[defined], float), case[defined]
-    body = {"n": float(found.size), "cases": float(np.unique(where).size)}
-    if body["cases"] < 2.0:
-        return body
-    means = ClusterBootstrap(where).means(found)
-    low, high = np.quantile(means, [0.025, 0.975])
-    body |= {"mean": float(found.mean()), "low": float(low), "high": float(high)}
-    median, p95 = np.quantile(found, [0.5, 0.95])
-    return {**body, "median": float(median), "p95": float(p95)}
+    found = {
+        name: gaps(policy, params, scenes, features, activation, config)
+        for name, policy in policies.items()
+    }
+    judged = np.all([x["known"] & x["admissible"] for x in found.values()], axis=0)
+    if np.unique(case[judged]).size < 2:
+        raise InputError(
+            f"frames: {judged.sum()} in which every policy has an admissible plan:"
+            " expected some in at least two cases"
+        )
+    rows: Table = {}
+    for name, x in found.items():
+        rows[name] = {"admissible": summary(x["admissible"].astype(float), case)}
+        for key in ("gap", *GAPS):
+            defined = judged & np.isfinite(x[key])
+            rows[name][key] = summary(x[key][defined], case[defined])
+    return rows
+
+
+def summary(values: np.ndarray, case: np.ndarray) -> dict[str, float]:
+    """Mean over frames [B] with its 95 % interval over cases, and quantiles."""
+    found = combine_seeds(values, case)
+    median, p95 = np.quantile(values, [0.5, 0.95])
+    return {
+        "frames": float(values.size),
+        "mean": found.value,
+        "low": found.low,
+        "high": found.high,
+        "median": float(median),
+        "p95": float(p95),
+    }

@@ -42,6 +42,7 @@ class Compared(NamedTuple):
     # m, mean distance to the recorded human; the positive's own is 0 unless it
     # is the nearest candidate
     human_distance: Float[Array, " b"]
+    human_collides: Bool[Array, " b"]
     distance: Float[Array, "b k"]
     collides: Bool[Array, "b k"]
     breaks_rule: Float[Array, "b k"]  # share of times over the limit or the line
@@ -146,11 +147,12 @@ def _soft(c: Compared, config: LossConfig) -> tuple[jax.Array, jax.Array]:
     """Cross-entropy with labels softmax(-distance / tau) over the whole set.
 
     Near candidates share the label unless they collide, which is no good answer
-    however near; the positive always has its part. With the nearest candidate as
-    the positive, the human curve itself is not in the set.
+    however near; where all do, they share it all the same. With the nearest
+    candidate as the positive, the human curve itself is not in the set.
     """
     counted = _counted(c)
-    good = counted & ~_all(jnp.zeros(c.human.shape, bool), c.collides)
+    good = counted & ~_all(c.human_collides, c.collides)
+    good = jnp.where(jnp.any(good, axis=1, keepdims=True), good, counted)
     apart = _all(c.human_distance, c.distance) / config.soft_distance
     labels = jax.nn.softmax(jnp.where(good, -apart, -jnp.inf), axis=1)
     values = jnp.where(counted, _all(c.human, c.candidates), -jnp.inf)

@@ -42,6 +42,7 @@ def facts_of(
         human_density = log_density(apart(x, driven), candidates.feasible)
     return Facts(
         human_distance=jnp.zeros(()),
+        human_collides=jnp.zeros((), bool),
         distance=apart(x, driven),
         collides=jnp.any((frames.relations.body < 0.0) & seen, axis=0),
         breaks_rule=jnp.sum(unlawful, axis=0) / count,

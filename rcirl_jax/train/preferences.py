@@ -54,6 +54,7 @@ def featurise_preferences(
     one = np.zeros((count, 1), np.float32)
     facts: dict[str, Any] = {
         "human_distance": one[:, 0],
+        "human_collides": one[:, 0] > 0.0,
         "distance": one + APART_M,
         "collides": one > 0.0,
         "breaks_rule": one,

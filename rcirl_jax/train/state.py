@@ -149,6 +149,7 @@ class Facts(flax.struct.PyTreeNode, kw_only=True):
     """What losses know about the trajectories besides their values."""
 
     human_distance: jax.Array  # [B] m, the positive's mean distance to the human
+    human_collides: jax.Array  # [B] bool, of the positive; a recorded curve's is False
     distance: jax.Array  # [B, K] m, the candidates'
     collides: jax.Array  # [B, K] bool, meets a body at a valid time
     breaks_rule: jax.Array  # [B, K] share of times over the limit or a line

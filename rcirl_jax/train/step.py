@@ -131,8 +131,12 @@ def featurise(
         # a planner can choose what the sampler made, not a hard negative
         choice = feasible & (candidates.family != family_index("hard_negative"))
         near = jnp.argmin(jnp.where(choice, facts.distance, jnp.inf))
+        # a hard negative that is nearer than the positive is no worse than it
+        feasible = feasible & (choice | (facts.distance > facts.distance[near]))
         facts = facts.replace(
-            human_distance=facts.distance[near], human_density=facts.density[near]
+            human_distance=facts.distance[near],
+            human_collides=facts.collides[near],
+            human_density=facts.density[near],
         )
         feasible = feasible.at[near].set(False)
         return rows[:, :, near].T, rows, feasible, facts, valid
@@ -181,6 +185,7 @@ def compare(
         counts=batch.feasible,
         weight=batch.weight,
         human_distance=facts.human_distance,
+        human_collides=facts.human_collides,
         distance=facts.distance,
         collides=facts.collides,
         breaks_rule=facts.breaks_rule,

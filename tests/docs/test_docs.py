@@ -12,7 +12,9 @@ import tomllib
 import pytest
 
 from rcirl_jax.evaluation.exact import tango
+from rcirl_jax.evaluation.format import markdown_table
 from rcirl_jax.evaluation.gate_types import EXIT_CODES, GateConfig
+from rcirl_jax.evaluation.table import from_json
 from tests.docs.pages import (
     ALL,
     DOCS,
@@ -241,3 +243,14 @@ def test_the_site_builds_and_needs_no_network(tmp_path):
         text = page.read_text()
         assert not loaded.search(text), page
         assert not styles.search(text), page
+
+
+# ------------------------------------------------------------- printed results
+
+RANKINGS = sorted((REPO / "benchmarks" / "results").glob("human_likeness_*.json"))
+
+
+@pytest.mark.parametrize("file", RANKINGS, ids=lambda file: file.stem)
+def test_rankings_are_printed_as_they_are_stored(file):
+    report = from_json(json.loads(file.read_text()))
+    assert markdown_table(report) in (DOCS / "results.md").read_text()

@@ -7,7 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.evaluation.known_truth import agreement, experts, hidden_reward
+from rcirl_jax.evaluation.known_truth import (
+    agreement,
+    differences,
+    experts,
+    hidden_reward,
+)
 from rcirl_jax.evaluation.learners import normaliser_of, train_learner
 from rcirl_jax.train.state import TrainConfig
 from tests.train.test_step import cached
@@ -91,3 +96,24 @@ def test_agreement_rises_with_data(loss):
         share.append(agreement(test, hidden, learned)[0])
     assert share[1] > share[0] + 0.15
     assert share[1] > 0.6
+
+
+def test_differences_are_paired_over_hidden_rewards():
+    """Rewards differ by far more than learners do; pairing sees through that."""
+    rng = np.random.default_rng(0)
+    hidden = rng.uniform(0.1, 0.9, (8, 1))
+    noise = lambda: rng.normal(0.0, 0.01, (8, 2))  # noqa: E731
+    rises = hidden + np.array([0.0, 0.1]) + noise()
+    found = differences({"A": rises, "B": hidden + noise()}, against="B")
+    assert set(found) == {
+        "A, most scenes minus fewest",
+        "B, most scenes minus fewest",
+        "A minus B, most scenes",
+    }
+    d, p = found["A, most scenes minus fewest"]
+    assert d.low > 0.0
+    assert p < 0.01
+    assert found["A minus B, most scenes"][0].mean == pytest.approx(0.1, abs=0.02)
+    d, p = found["B, most scenes minus fewest"]
+    assert d.low < 0.0 < d.high
+    assert p >= d.p

@@ -98,6 +98,10 @@ def test_who_does_not_look_is_steady():
     np.testing.assert_allclose(found["acceleration_std"], 0.0, atol=1e-6)
     ego = 8.0 * Disturbance().sigma_ego
     assert (found["end_station_std"] < 3.0 * ego).all()
+    # wherever the others are seen: what is decided is where the own plan goes
+    blind = Disturbance(samples=8, sigma_ego=0.0)
+    found = steadiness(constant_speed_policy, None, scenes, blind)
+    np.testing.assert_array_equal(found["flip_rate"], 0.0)
     learned = steadiness(
         rank_policy(SCORE, RankConfig()), weights(), scenes, Disturbance(samples=8)
     )
@@ -105,19 +109,14 @@ def test_who_does_not_look_is_steady():
     assert learned["acceleration_std"].max() > 0.0
 
 
-def test_a_summary_counts_cases_and_leaves_out_what_is_not_defined():
+def test_a_summary_takes_frames_of_one_drive_for_alike():
     case = np.repeat(np.arange(10), 3)
     values = case + np.tile([-0.1, 0.0, 0.1], 10)
-    values[0] = np.nan
-    found = summary(values, case)
-    assert found["n"] == 29
-    assert found["cases"] == 10
-    assert found["mean"] == pytest.approx(np.nanmean(values))
+    found, alone = summary(values, case), summary(values, np.arange(30))
+    assert found["frames"] == 30
+    assert found["mean"] == pytest.approx(values.mean())
     assert found["low"] < found["mean"] < found["high"]
-    # frames of one drive are alike: as many independent frames would say more
-    alone = summary(values, np.arange(30))
     assert found["high"] - found["low"] > 1.3 * (alone["high"] - alone["low"])
-    assert summary(values, np.zeros(30, int)) == {"n": 29.0, "cases": 1.0}
 
 
 def test_frames_are_thinned_with_their_cases():

@@ -13,6 +13,7 @@ def compared(human, candidates, counts=None, weight=None, **facts):
         "counts": jnp.ones(shape, bool) if counts is None else jnp.asarray(counts),
         "weight": jnp.ones(shape[0]) if weight is None else jnp.asarray(weight),
         "human_distance": jnp.zeros(shape[0]),
+        "human_collides": jnp.zeros(shape[0], bool),
         "distance": jnp.zeros(shape),
         "collides": jnp.zeros(shape, bool),
         "breaks_rule": jnp.zeros(shape),

@@ -52,7 +52,8 @@ def scene_oracle(name, c, b, ks):
     if name == "soft":
         apart = np.array([c.human_distance[b], *c.distance[b, ks]])
         label = np.exp(-apart / CONFIG.soft_distance)
-        label[1:] *= 1.0 - c.collides[b, ks]  # near is no excuse for a collision
+        # near is no excuse for a collision
+        label *= 1.0 - np.array([c.human_collides[b], *c.collides[b, ks]])
         label /= label.sum()
         return -np.sum(label * np.log(np.exp(values) / np.exp(values).sum()))
     real = -np.log(1 / (1 + np.exp(-(h + c.offset))))
@@ -80,6 +81,17 @@ def test_equals_its_definition(name, seed):
     assert float(sums.loss / sums.terms) == pytest.approx(
         oracle(name, drawn(seed)), rel=1e-5
     )
+
+
+def test_soft_labels_of_collisions():
+    """A colliding positive has no label, unless everything collides."""
+    c = drawn()
+    hit = c._replace(human_collides=jnp.ones(B, bool))
+    sums = loss_sums("soft", hit, CONFIG)
+    assert float(sums.loss / sums.terms) == pytest.approx(oracle("soft", hit), rel=1e-5)
+    all_hit = hit._replace(collides=jnp.ones((B, K), bool))
+    none_hit = c._replace(collides=jnp.zeros((B, K), bool))
+    assert loss_sums("soft", all_hit, CONFIG) == loss_sums("soft", none_hit, CONFIG)
 
 
 @pytest.mark.parametrize("name", sorted(LOSSES))

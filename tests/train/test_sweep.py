@@ -152,6 +152,7 @@ def many(scenes=16, candidates=128):
         time_valid=jnp.ones((scenes, 18), bool),
         facts=Facts(
             human_distance=jnp.zeros(scenes),
+            human_collides=jnp.zeros(scenes, bool),
             distance=distance,
             collides=distance > 8.0,
             breaks_rule=jnp.zeros(pairs),
