@@ -149,6 +149,14 @@ def test_bad_flags_are_one_line(module, flag, line, dataset):
     assert line in said
 
 
+def test_table2_never_reuses_the_parts_of_a_quick_run(tmp_path):
+    (tmp_path / "run.json").write_text('{"quick": true, "seed": 0}')
+    done = command("table2", f"--output={tmp_path}")
+    assert done.returncode == 2
+    (said,) = done.stderr.strip().splitlines()
+    assert "made with {'quick': True, 'seed': 0}" in said
+
+
 def test_a_wrong_site_is_one_line(tmp_path):
     done = command("cross_site", "--sites=a", f"--output={tmp_path}")
     assert done.returncode == 2
