@@ -25,8 +25,6 @@ from rcirl_jax.data.importing import ImportConfig
 from rcirl_jax.stages import file_sha256, only_one
 from rcirl_jax.train.running import Running
 
-flags.adopt_module_key_flags(training)
-flags.adopt_module_key_flags(margins)
 flags.set_default(training.POSITIVE, "nearest")  # what a planner can choose
 _WORKDIR = flags.DEFINE_string("workdir", None, "folder of the run", required=True)
 _DATA = flags.DEFINE_string("data", None, "dataset, instead of an import")

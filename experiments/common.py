@@ -20,6 +20,7 @@ def run(main: Callable[[], None]) -> None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
     logging.set_verbosity(logging.WARNING)
+    _own_the_shared_flags()
 
     def guarded(argv: list[str]) -> None:
         try:
@@ -34,6 +35,17 @@ def run(main: Callable[[], None]) -> None:
             sys.exit(EXIT_BAD_INPUT)
 
     app.run(guarded, flags_parser=_parse)
+
+
+def _own_the_shared_flags() -> None:
+    """Flags that a main imports from other experiment files count as its own.
+
+    --help then shows them, and provenance records them.
+    """
+    for module, found in flags.FLAGS.flags_by_module_dict().items():
+        if module.startswith("experiments."):
+            for flag in found:
+                flags.FLAGS.register_key_flag_for_module(sys.argv[0], flag)
 
 
 def _parse(argv: list[str]) -> list[str]:

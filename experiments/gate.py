@@ -26,7 +26,6 @@ from rcirl_jax.evaluation.suite_files import runs_of
 from rcirl_jax.export.gate_job import drive_job, gate_job, left_out
 from rcirl_jax.simulation.rows import BASELINES
 
-flags.adopt_module_key_flags(margins)
 _CANDIDATE = flags.DEFINE_string("candidate", None, "weights file", required=True)
 _INCUMBENT = flags.DEFINE_string(
     "incumbent", "hand-set", "weights file, or a baseline: " + ", ".join(BASELINES)

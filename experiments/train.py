@@ -23,7 +23,6 @@ from rcirl_jax.train.parallel import PARALLEL
 from rcirl_jax.train.processes import is_first, join_processes
 from rcirl_jax.train.running import Running
 
-flags.adopt_module_key_flags(training)
 _DATA = flags.DEFINE_list(
     "data", None, "dataset made by import_logs; several are joined", required=True
 )

@@ -17,7 +17,7 @@ import numpy as np
 from experiments.common import run
 from experiments.paper.common import base, dataset, picture, seeds, write
 from rcirl_jax.evaluation.learners import FrozenSets, pair_wins, train_learner
-from rcirl_jax.evaluation.statistics import ClusterBootstrap
+from rcirl_jax.evaluation.statistics import ClusterBootstrap, combine_seeds
 from rcirl_jax.features import feature_map
 from rcirl_jax.report.intervals import interval_panel
 from rcirl_jax.report.style import figure, label, save
@@ -39,11 +39,9 @@ def main() -> None:
             keep = kept or feature_map(config.features).names
             runs = train_learner(frozen, config, seeds(), keep=keep)
             wins, pairs = pair_wins(held, runs)
-            low, high = np.quantile(
-                bootstrap.means(wins / np.maximum(pairs, 1), pairs), [0.025, 0.975]
-            )
-            share = float(np.mean(wins.sum(axis=1) / pairs.sum()))
-            rows[f"{positive}: {name}"] = (share, float(low), float(high))
+            won = combine_seeds(wins / np.maximum(pairs, 1), bootstrap, weight=pairs)
+            share, low, high = won.value, won.low, won.high
+            rows[f"{positive}: {name}"] = (share, low, high)
             print(f"{positive}: {name}: {share:.3f} [{low:.3f}, {high:.3f}] pairs won")
     made, axes = figure(1, 1, 7.0, 3.0)
     interval_panel(axes[0, 0], rows)

@@ -99,8 +99,6 @@ def write(
     folder = Path(OUTPUT.value)
     folder.mkdir(parents=True, exist_ok=True)
     made_by = provenance()
-    shared = (DATA, OUTPUT, SEEDS, EPOCHS, HORIZON, QUICK)
-    made_by["flags"] |= {flag.name: flag.value for flag in shared}
     if data is not None:
         made_by["data_hash"] = data.hash
     made = {**body, "quick": QUICK.value, "made_by": made_by}

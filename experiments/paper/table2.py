@@ -64,7 +64,10 @@ LEARNED: dict[str, dict] = {
 def _same_run(folder: Path) -> None:
     """Parts are reused, but not those of a quick run or of another seed."""
     made, file = {"quick": _QUICK.value, "seed": _SEED.value}, folder / "run.json"
-    found = json.loads(file.read_text()) if file.exists() else made
+    try:
+        found = json.loads(file.read_text()) if file.exists() else made
+    except ValueError as error:
+        raise InputError(f"{file}: {error}: expected JSON") from error
     if found != made:
         raise InputError(
             f"{folder}: made with {found}: expected {made}, or a new folder"

@@ -77,8 +77,7 @@ def markdown_table(report: RankingReport, against: str = "GAN") -> str:
     titles += [f"top-1 minus {against}, m, Holm"] if apart else []
     lines = [titles, ["---"] * len(titles)]
     for name in _order(report):
-        runs = report.runs[name]
-        cells = [name if runs == 1 else f"{name}, {runs} runs"]
+        cells = [_label(report, name)]
         cells += [_cell(report.rows[name][x], METRICS[x].unit) for x in _IN_MARKDOWN]
         lines.append(cells + ([apart.get(name, "")] if apart else []))
     return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)

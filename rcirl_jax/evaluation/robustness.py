@@ -148,31 +148,40 @@ def _planned(policy: Policy) -> Callable:
 
 
 @functools.lru_cache(maxsize=8)
-def _gap(features: FeatureMap, activation: str, config: GapConfig) -> Callable:
-    """The finer solver, compiled once for all policies."""
+def _gaps(features: FeatureMap, activation: str, config: GapConfig) -> Callable:
+    """Of several plans [P, T]: the finer lattice's does not depend on them."""
 
     def measure(params: Weights, scene: Scene, s: jax.Array) -> dict[str, jax.Array]:
         plan = trajectory_on_path(scene, s)
         return optimality_gap(scene, plan, params, features, activation, config)
 
-    return jax.jit(measure)
+    return jax.jit(jax.vmap(measure, in_axes=(None, None, 0)))
 
 
 def gaps(
-    policy: Policy,
+    policies: Mapping[str, Policy],
     params: Weights,
     scenes: Scene,
     features: FeatureMap,
     activation: str,
     config: GapConfig,
-) -> dict[str, np.ndarray]:
-    """`optimality_gap` of a policy's plan in each scene, stacked [B].
+) -> dict[str, dict[str, np.ndarray]]:
+    """`optimality_gap` of the policies' plans: policy -> number -> [B].
 
-    The policy must plan along the scene's path, as all of ours do.
+    The policies must plan along the scene's path, as all of ours do.
     """
-    plan, measure = _planned(policy), _gap(features, activation, config)
-    key = jax.random.key(0)
-    return _one_by_one(lambda _, x: measure(params, x, plan(params, x, key)), scenes)
+    key, measure = jax.random.key(0), _gaps(features, activation, config)
+    planned = [_planned(policy) for policy in policies.values()]
+
+    def of_scene(_: int, scene: Scene) -> dict[str, jax.Array]:
+        plans = jnp.stack([plan(params, scene, key) for plan in planned])
+        return measure(params, scene, plans)
+
+    found = _one_by_one(of_scene, scenes)  # number -> [B, P]
+    return {
+        name: {key: x[:, number] for key, x in found.items()}
+        for number, name in enumerate(policies)
+    }
 
 
 def frames(
@@ -229,10 +238,7 @@ def optimality_rows(
     safety filter; gaps are of the frames in which every policy's does and the best
     known plan is admissible too, so that all rows speak of the same frames.
     """
-    found = {
-        name: gaps(policy, params, scenes, features, activation, config)
-        for name, policy in policies.items()
-    }
+    found = gaps(policies, params, scenes, features, activation, config)
     judged = np.all([x["known"] & x["admissible"] for x in found.values()], axis=0)
     if np.unique(case[judged]).size < 2:
         raise InputError(

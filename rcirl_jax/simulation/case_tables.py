@@ -1,7 +1,6 @@
 """What the events of a case add up to, as the fixed arrays of a `Case`."""
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from rcirl_jax.simulation.cases import (
     Lines,
     Road,
     Script,
+    node,
 )
 from rcirl_jax.simulation.families import (
     DRIVER,
@@ -38,21 +38,6 @@ class Parts:
     agents: list[dict]
 
 
-def single(x: float) -> Any:  # noqa: ANN401
-    """A float32 scalar leaf."""
-    return np.float32(x)
-
-
-def whole(x: float, kind: type = np.int32) -> Any:  # noqa: ANN401
-    """An integer scalar leaf."""
-    return kind(x)
-
-
-def _table(x: np.ndarray) -> Any:  # noqa: ANN401
-    """A float32 array leaf."""
-    return x.astype(np.float32)
-
-
 def road_of(road: dict[str, float], parts: Parts) -> Road:
     """The road grid: curvature, limits and the given path along it."""
     limit = np.full(NUM_ROAD, road["speed_limit"])
@@ -65,14 +50,15 @@ def road_of(road: dict[str, float], parts: Parts) -> Road:
         smooth = u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
         path = np.where(at <= STATIONS, begin + (target - begin) * smooth, path)
     width = road["lane_width"]
-    f = single
-    return Road(
-        kappa=_table(parts.kappa),
-        speed_limit=_table(limit),
-        path_l=_table(path),
+    f = np.float32
+    return node(
+        Road,
+        kappa=parts.kappa.astype(f),
+        speed_limit=limit.astype(f),
+        path_l=path.astype(f),
         lane_width=f(width),
-        lanes_left=whole(road["lanes_left"]),
-        lanes_right=whole(road["lanes_right"]),
+        lanes_left=np.int32(road["lanes_left"]),
+        lanes_right=np.int32(road["lanes_right"]),
         edge_left=f(
             (road["lanes_left"] + road["oncoming"] + 0.5) * width + road["shoulder"]
         ),
@@ -85,16 +71,16 @@ def lines_of(parts: Parts) -> Lines:
     """Lights and stop signs; empty slots have kind NONE."""
     names = {"s": "at", "offset": "offset", "green": "green", "yellow": "yellow"}
     names["red"] = "red"
-    made: dict[str, Any] = {}
+    made = {}
     for leaf, key in names.items():
         made[leaf] = np.zeros(NUM_LINES, np.float32)
         made[leaf][: len(parts.lines)] = [line[key] for line in parts.lines]
-    kind: Any = np.zeros(NUM_LINES, np.int32)
+    kind = np.zeros(NUM_LINES, np.int32)
     kind[: len(parts.lines)] = [int(line["kind"]) for line in parts.lines]
-    return Lines(kind=kind, **made)
+    return node(Lines, kind=kind, **made)
 
 
-def _column(rows: list[dict], name: str, empty: float) -> Any:  # noqa: ANN401
+def _column(rows: list[dict], name: str, empty: float) -> np.ndarray:
     out = np.full(NUM_AGENTS, empty, np.float32)
     out[: len(rows)] = [row[name] for row in rows]
     return out
@@ -102,15 +88,16 @@ def _column(rows: list[dict], name: str, empty: float) -> Any:  # noqa: ANN401
 
 def agents_of(rows: list[dict]) -> Agents:
     """Agents with their drivers and scripts; empty slots have kind NONE."""
-    flags: dict[str, Any] = {name: np.zeros(NUM_AGENTS, bool) for name in FLAGS}
+    flags = {name: np.zeros(NUM_AGENTS, bool) for name in FLAGS}
     for name, values in flags.items():
         values[: len(rows)] = [row[name] for row in rows]
-    kind: Any = np.full(NUM_AGENTS, Kind.NONE, np.int32)
+    kind = np.full(NUM_AGENTS, Kind.NONE, np.int32)
     kind[: len(rows)] = [row["kind"] for row in rows]
     neutral = {"headway": 1.4, "standstill": 2.0, "acceleration": 1.4, "braking": 2.0}
     neutral |= {"desired": 10.0, "lapse_start": np.inf, "lapse_end": np.inf}
     plain = ("s", "l", "heading", "v", "v_share", "appear_t")
-    return Agents(
+    return node(
+        Agents,
         kind=kind,
         length=_column(rows, "length", 1.0),
         width=_column(rows, "width", 1.0),
@@ -118,7 +105,8 @@ def agents_of(rows: list[dict]) -> Agents:
         arrival_s=_column(rows, "arrival_s", np.inf),
         relative=flags.pop("relative"),
         **{name: _column(rows, name, 0.0) for name in plain},
-        driver=Driver(
+        driver=node(
+            Driver,
             **flags,
             **{name: _column(rows, name, neutral.get(name, 0.0)) for name in DRIVER},
         ),
@@ -128,16 +116,17 @@ def agents_of(rows: list[dict]) -> Agents:
 
 def _script(rows: list[dict]) -> Script:
     f = np.float32
-    start: Any = np.full((NUM_AGENTS, NUM_PHASES), np.inf, f)
+    start = np.full((NUM_AGENTS, NUM_PHASES), np.inf, f)
     speed, rate = np.zeros_like(start), np.ones_like(start)
-    move_start: Any = np.full((NUM_AGENTS, NUM_MOVES), np.inf, f)
+    move_start = np.full((NUM_AGENTS, NUM_MOVES), np.inf, f)
     move_l, move_speed = np.zeros_like(move_start), np.ones_like(move_start)
     for i, row in enumerate(rows):
         for p, phase in enumerate(row["phases"]):
             start[i, p], speed[i, p], rate[i, p] = phase
         for m, move in enumerate(row["moves"]):
             move_start[i, m], move_l[i, m], move_speed[i, m] = move
-    return Script(
+    return node(
+        Script,
         start=start,
         speed=speed,
         rate=rate,

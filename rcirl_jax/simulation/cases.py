@@ -13,6 +13,7 @@ relative to the reference line (0 = with the ego, pi = oncoming).
 """
 
 import enum
+from typing import Any, TypeVar
 
 import flax.struct
 import jax
@@ -26,6 +27,13 @@ NUM_PHASES = 8  # P
 NUM_MOVES = 2  # M
 NUM_HISTORY = 4  # H: latencies of 0 to 0.3 s
 NUM_DELAY = 9  # D: reaction delays of 0 to 0.8 s
+
+_T = TypeVar("_T")
+
+
+def node(kind: type[_T], /, **leaves: Any) -> _T:  # noqa: ANN401
+    """One of the types below with numpy leaves; the types say jax.Array."""
+    return kind(**leaves)
 
 
 class LineKind(enum.IntEnum):

@@ -29,8 +29,6 @@ from rcirl_jax.simulation.case_tables import (
     agents_of,
     lines_of,
     road_of,
-    single,
-    whole,
 )
 from rcirl_jax.simulation.cases import (
     NUM_AGENTS,
@@ -41,6 +39,7 @@ from rcirl_jax.simulation.cases import (
     Case,
     LineKind,
     Perception,
+    node,
 )
 from rcirl_jax.simulation.families import (
     AgentSpec,
@@ -277,18 +276,20 @@ def build_case(
     parts = _events(family, draws, shared, road, rng, index, seed)
     _check(family, case_id(family.name, index, seed), road, parts)
     stream = hashlib.sha256(case_id(family.name, index, seed).encode()).digest()
-    f = single
-    return Case(
-        seed=whole(int.from_bytes(stream[:4], "big"), np.uint32),
-        steps=whole(round(duration_s / STEP_S)),
+    f = np.float32
+    return node(
+        Case,
+        seed=np.uint32(int.from_bytes(stream[:4], "big")),
+        steps=np.int32(round(duration_s / STEP_S)),
         ego_v=f(road["ego_speed"]),
         ego_length=f(EGO_LENGTH_M),
         ego_width=f(EGO_WIDTH_M),
         road=road_of(road, parts),
         lines=lines_of(parts),
         agents=agents_of(parts.agents),
-        perception=Perception(
-            **{k: f(e({**variables, **shared})) for k, e in family.perception.items()}
+        perception=node(
+            Perception,
+            **{k: f(e({**variables, **shared})) for k, e in family.perception.items()},
         ),
     )
 

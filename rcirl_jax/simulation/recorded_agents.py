@@ -1,7 +1,5 @@
 """The other road users of a recorded drive, as agents of its case."""
 
-from typing import Any, TypeVar
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,17 +12,12 @@ from rcirl_jax.simulation.cases import (
     Agents,
     Driver,
     Script,
+    node,
 )
 from rcirl_jax.simulation.recorded_config import RecordedConfig
 from rcirl_jax.types import Kind
 
 KEEPS_LANE = 0.17  # sin of 10 degrees; who heads so keeps a lane (agents.LANE_TILT)
-_T = TypeVar("_T")
-
-
-def node(kind: type[_T], /, **leaves: Any) -> _T:  # noqa: ANN401
-    """A pytree node of numpy leaves."""
-    return kind(**leaves)
 
 
 def agents_of(tables: dict, limit: np.ndarray, config: RecordedConfig) -> Agents:

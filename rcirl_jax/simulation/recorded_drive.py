@@ -24,8 +24,9 @@ from rcirl_jax.simulation.cases import (
     Perception,
     Replay,
     Road,
+    node,
 )
-from rcirl_jax.simulation.recorded_agents import agents_of, node, touches
+from rcirl_jax.simulation.recorded_agents import agents_of, touches
 from rcirl_jax.simulation.recorded_config import RecordedConfig
 from rcirl_jax.types import Recording
 

@@ -269,13 +269,13 @@ def test_markdown_has_the_report_s_numbers_and_the_difference_to_one_row(
     assert len(rule.split("|")) == len(head.split("|"))
     assert len(rows) == len(scorers)
     found = report.rows["rc-irl"]["top1_fde"]
-    assert cells["rc-irl, 3 runs"][1] == (
+    assert cells["rc-irl (3 runs)"][1] == (
         f"{found.value:.2f} [{found.low:.2f}, {found.high:.2f}]"
     )
     (apart,) = (
         c for c in report.comparisons if (c.row, c.metric) == ("rc-irl", "top1_fde")
     )
-    said = cells["rc-irl, 3 runs"][-1]
+    said = cells["rc-irl (3 runs)"][-1]
     assert said.startswith(f"{apart.difference.mean:+.2f} [")
     assert ("p < 0.01" in said) == (apart.p_holm < 0.01)
     assert "minus" not in markdown_table(report, "nobody")

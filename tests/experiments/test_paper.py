@@ -121,7 +121,7 @@ def test_human_likeness_beside_a_tuned_hand_set_cost(dataset, tmp_path):
         body["rows"]
     )
     rows = (tmp_path / "table.md").read_text().splitlines()
-    assert rows[2].startswith("| RC-IRL rank, 2 runs | ")
+    assert rows[2].startswith("| RC-IRL rank (2 runs) | ")
     assert {line.count("|") for line in rows} == {10}
     assert (tmp_path / "ranking.png").read_bytes()[:4] == b"\x89PNG"
 
