@@ -72,16 +72,16 @@ def whole_numbers(values: list[str], flag: str) -> list[int]:
     return [int(value) for value in values]
 
 
-def hidden_sizes(values: list[str]) -> tuple[int, ...]:
-    """--hidden_size: "15", "32,16", or "0" for the linear reward."""
+def hidden_sizes(values: list[str], flag: str = "hidden_size") -> tuple[int, ...]:
+    """Units per layer: "15", "32,16", or "0" for the linear reward."""
     try:
         sizes = tuple(int(value) for value in values)
     except ValueError as error:
-        raise InputError(f"--hidden_size: {values}: expected integers") from error
+        raise InputError(f"--{flag}: {values}: expected integers") from error
     if sizes == (0,) or not sizes:
         return ()
     if any(not 1 <= size <= 4096 for size in sizes):
-        raise InputError(f"--hidden_size: {values}: expected 1 to 4096, or 0 alone")
+        raise InputError(f"--{flag}: {values}: expected 1 to 4096, or 0 alone")
     return sizes
 
 

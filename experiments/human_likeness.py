@@ -32,7 +32,7 @@ from rcirl_jax.evaluation.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.evaluation.format import format_table, markdown_table
 from rcirl_jax.evaluation.learners import (
     LEARNERS,
-    learner_config,
+    learner_configs,
     scorers,
     train_learners,
 )
@@ -57,7 +57,7 @@ _MODE = flags.DEFINE_enum(
     "mode", "speed", ["speed", "path_speed"], "what the sampler varies"
 )
 _HOLDOUT = flags.DEFINE_enum("holdout", "groups", HOLDOUTS, "what is held out")
-_SPLIT = flags.DEFINE_integer("split_seed", 0, "draws the vehicles held out")
+_SPLIT = flags.DEFINE_integer("split_seed", 0, "draws the vehicles held out", 0)
 _HAND = flags.DEFINE_string("hand_weights", None, "of tune_hand_set: a further row")
 _RECORDING = flags.DEFINE_integer("recording", 0, "recording that is held out")
 
@@ -81,14 +81,14 @@ def main() -> None:
         train_horizon=_HORIZON.value,
         sampler=sampler,
     )
-    configs = {name: learner_config(name, base) for name in _LEARNERS.value}
-    learned = train_learners(dataset, configs, range(_SEEDS.value))
+    configs = learner_configs(_LEARNERS.value, base)
     setup = RankingSetup(
         sampler=sampler, horizon_s=_HORIZON.value, hand_set=tuned_row(_HAND.value)
     )
-    report = evaluate_ranking(dataset, scorers(learned), setup)
     folder = Path(_OUTPUT.value)
     folder.mkdir(parents=True, exist_ok=True)
+    learned = train_learners(dataset, configs, range(_SEEDS.value))
+    report = evaluate_ranking(dataset, scorers(learned), setup)
     text = format_table(report, 118)
     (folder / "table.txt").write_text(text + "\n")
     (folder / "table.md").write_text(markdown_table(report))

@@ -67,7 +67,9 @@ def main() -> None:
     config = SweepConfig(
         data=tuple(_DATA.value),
         base=base,
-        hidden_sizes=tuple(hidden_sizes(s.split("x")) for s in _HIDDEN.value),
+        hidden_sizes=tuple(
+            hidden_sizes(s.split("x"), "hidden_sizes") for s in _HIDDEN.value
+        ),
         leaky_rates=floats(_LEAKY.value, "leaky_rates"),
         learning_rates=floats(_RATES.value, "learning_rates"),
         seeds=2 if _QUICK.value else _SEEDS.value,

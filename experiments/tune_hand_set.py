@@ -7,6 +7,8 @@
 file is a row of experiments.evaluate and experiments.simulate (--hand_weights).
 """
 
+from pathlib import Path
+
 from absl import flags
 
 from experiments.common import provenance, run
@@ -21,8 +23,10 @@ _DATA = flags.DEFINE_list("data", [], "datasets, of ranking and --epochs")
 _OBJECTIVE = flags.DEFINE_enum(
     "objective", "ranking", ["ranking", "smoke"], "held-out: test split; other cases"
 )
-_BUDGET = flags.DEFINE_integer("budget", 0, "evaluations of one weight vector at most")
-_EPOCHS = flags.DEFINE_integer("epochs", 0, "instead: a learner's, same queries")
+_BUDGET = flags.DEFINE_integer(
+    "budget", 0, "evaluations of one weight vector at most", 0
+)
+_EPOCHS = flags.DEFINE_integer("epochs", 0, "instead: a learner's, same queries", 0)
 _SCENES = flags.DEFINE_integer("scenes", 256, "training scenes at most", 1)
 _HORIZON = flags.DEFINE_float("horizon", 5.0, "s at which distances are taken")
 _SUITE = flags.DEFINE_string("suite", "smoke", "smoke, or families with commas")
@@ -52,6 +56,7 @@ def main() -> None:
     budget, epochs, learner = _BUDGET.value, _EPOCHS.value, SamplerConfig()
     if (budget > 0) == (epochs > 0):
         raise InputError("--budget, --epochs: expected one of them, above 0")
+    Path(_OUTPUT.value).parent.mkdir(parents=True, exist_ok=True)
     problem = _problem(False)
     if epochs > 0:
         data = open_datasets(_DATA.value)

@@ -37,7 +37,11 @@ QUICK_SCENES = 128  # of each split
 
 def dataset() -> Demonstrations:
     """--data, or synthetic traffic, made once beside the output; few under --quick."""
-    found = open_dataset(DATA.value) if DATA.value else _synthetic()
+    return few(open_dataset(DATA.value) if DATA.value else _synthetic())
+
+
+def few(found: Demonstrations) -> Demonstrations:
+    """The dataset; under --quick at most `QUICK_SCENES` of each split."""
     if not QUICK.value:
         return found
     return Resplit(

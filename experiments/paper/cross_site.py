@@ -15,12 +15,14 @@ from experiments.common import run
 from experiments.paper.common import (
     base,
     dataset,
+    few,
     intervals,
     picture,
     seeds,
     setup,
     write,
 )
+from rcirl_jax.data.joined import Demonstrations
 from rcirl_jax.data.resplit import halves
 from rcirl_jax.data.store import open_dataset
 from rcirl_jax.errors import InputError
@@ -33,15 +35,18 @@ from rcirl_jax.report.style import figure, label, save
 _SITES = flags.DEFINE_list("sites", [], "NAME=DATASET, at least two")
 
 
-def sites() -> dict:
+def sites() -> dict[str, Demonstrations]:
     """Datasets by name."""
     if not _SITES.value:
         first, second = halves(dataset())
         return {"half A": first, "half B": second}
     pairs = [item.partition("=") for item in _SITES.value]
-    if len(pairs) < 2 or not all(path for _, _, path in pairs):
-        raise InputError(f"--sites: {_SITES.value}: expected two or more NAME=DATASET")
-    return {name: open_dataset(path) for name, _, path in pairs}
+    named = {name: path for name, _, path in pairs}
+    if len(pairs) < 2 or len(named) < len(pairs) or not all(named.values()):
+        raise InputError(
+            f"--sites: {_SITES.value}: expected two or more NAME=DATASET, named apart"
+        )
+    return {name: few(open_dataset(path)) for name, path in named.items()}
 
 
 def main() -> None:
@@ -64,7 +69,8 @@ def main() -> None:
         for row, (value, low, high) in rows.items():
             print(f"on {name}: {row}: top-1 FDE {value:.2f} m [{low:.2f}, {high:.2f}]")
     save(made, picture("cross_site"))
-    write("cross_site", {"tested_on": reports})
+    hashes = {name: data.hash for name, data in found.items()}
+    write("cross_site", {"tested_on": reports, "data_hashes": hashes})
 
 
 if __name__ == "__main__":

@@ -39,7 +39,8 @@ def main() -> None:
     data, rates = dataset(), floats(_RATES.value, "leaky_rates")
     sets, learned = FrozenSets(data), {}
     for size in _SIZES.value:
-        config = base(loss="rank", reward=RewardConfig(hidden=hidden_sizes([size])))
+        hidden = hidden_sizes([size], "hidden_sizes")
+        config = base(loss="rank", reward=RewardConfig(hidden=hidden))
         for rate, runs in train_grid(sets.of(config), config, rates, seeds()).items():
             learned[f"a {rate:g}, {size} hidden"] = runs
     report = evaluate_ranking(data, scorers(learned), setup())

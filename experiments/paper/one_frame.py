@@ -17,6 +17,7 @@ from absl import flags
 
 from experiments.common import provenance, run
 from experiments.paper.common import OUTPUT, base, dataset, picture, write
+from rcirl_jax.errors import InputError
 from rcirl_jax.export.from_run import export_run
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.report.frames import draw_frame, pick_frames
@@ -29,13 +30,20 @@ _ROW = flags.DEFINE_integer("row", None, "dataset row of the scene")
 
 def main() -> None:
     """One scene under one reward."""
-    data, folder = dataset(), Path(OUTPUT.value)
+    data, folder, row = dataset(), Path(OUTPUT.value), _ROW.value
+    if row is None:
+        row = int(pick_frames(data, 1)[0])
+    elif row not in data.indices(None):
+        known = data.indices(None)
+        raise InputError(
+            f"--row: {row}: expected one of the dataset's {known.size:,} rows, "
+            f"{known.min()} to {known.max()}"
+        )
     file = _WEIGHTS.value
     if not file:
         workdir, file = folder / "one_frame_run", str(folder / "one_frame.msgpack")
         train(data, workdir, base(train_horizon=8.0), provenance=provenance())
         export_run(workdir, data, Path(file))
-    row = int(pick_frames(data, 1)[0]) if _ROW.value is None else _ROW.value
     reward = open_reward(file)
     mode = str(reward.provenance.get("mode", "speed"))
     frame = draw_frame(

@@ -21,7 +21,7 @@ from experiments.paper.common import QUICK, dataset, picture, write
 from rcirl_jax.evaluation.learners import (
     LEARNERS,
     FrozenSets,
-    learner_config,
+    learner_configs,
     train_learner,
 )
 from rcirl_jax.report.style import figure, label, save
@@ -37,12 +37,16 @@ def main() -> None:
     """Train all, say which stayed finite, draw."""
     data = dataset()
     sets, rows = FrozenSets(data), {}
-    grid = [(name, how) for name in _LEARNERS.value for how in sorted(OPTIMIZERS)]
+    epochs = 2 if QUICK.value else TrainConfig().epochs
+    grid = [
+        (name, how, config)
+        for how in sorted(OPTIMIZERS)
+        for name, config in learner_configs(
+            _LEARNERS.value, TrainConfig(optimizer=how, epochs=epochs)
+        ).items()
+    ]
     grid = grid[::5] if QUICK.value else grid
-    for name, how in tqdm.tqdm(grid, desc="train", unit="run"):
-        epochs = 2 if QUICK.value else TrainConfig().epochs
-        base = TrainConfig(optimizer=how, epochs=epochs)
-        config = learner_config(name, base)
+    for name, how, config in tqdm.tqdm(grid, desc="train", unit="run"):
         (learned,) = train_learner(sets.of(config), config, [0])
         rows[f"{name}, {how}"] = {
             "finite": learned.finite and bool(np.isfinite(learned.loss).all()),

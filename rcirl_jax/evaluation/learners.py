@@ -136,6 +136,17 @@ def learner_config(name: str, base: TrainConfig) -> TrainConfig:
     return dataclasses.replace(config, reward=reward)
 
 
+def learner_configs(names: Sequence[str], base: TrainConfig) -> dict[str, TrainConfig]:
+    """The configurations of some learners, by name.
+
+    Raises:
+      InputError: no name, or one that is not known.
+    """
+    if not names:
+        raise InputError(f"--learners: none: expected some of {sorted(LEARNERS)}")
+    return {name: learner_config(name, base) for name in names}
+
+
 class FrozenSets:
     """Frozen scenes of one split, made once for all configurations that share them.
 

@@ -32,7 +32,7 @@ SCHEMA_VERSION = 1
 # Rows that are not learned, in the order printed below the learned ones.
 RIVALS = ("random", "constant speed", "IDM", "hand-set", TUNED_ROW, "oracle")
 # rows that the others are compared with
-REFERENCES = ("hand-set", TUNED_ROW, "GAN", "random")
+REFERENCES = ("hand-set", TUNED_ROW, "IDM", "GAN", "GAN on curves", "random")
 
 SIGNIFICANT_SE = 2.0  # 1, standard errors beyond which a difference has a name
 MIN_WIDTH = 100  # characters; a line of the paired differences needs them

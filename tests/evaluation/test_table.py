@@ -100,7 +100,10 @@ def test_differences_are_row_minus_reference(report, scorers):
     compared = [name for name, how in METRICS.items() if how.compared]
     pairs = {(c.row, c.reference) for c in report.comparisons}
     assert pairs == {
-        (row, name) for name in ("hand-set", "random") for row in scorers if row != name
+        (row, name)
+        for name in ("hand-set", "IDM", "random")
+        for row in scorers
+        if row != name
     }
     assert len(report.comparisons) == len(pairs) * len(compared)
     for c in report.comparisons:

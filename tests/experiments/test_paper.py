@@ -58,12 +58,23 @@ def test_background_shift(tmp_path):
     assert all(math.isfinite(x) for x in numbers(body))
     angles = body["example"]["angle_to_truth_deg"]
     assert angles["conditional, logistic"]["mean"] < angles["pooled"]["mean"]
+    rows = body["by_size"]["rows"]
+    gan = [x["high"] for x in rows["GAN"]["agreement"]]
+    for conditional in ("RC-IRL logistic", "RC-IRL rank"):
+        ours = [x["low"] for x in rows[conditional]["agreement"]]
+        # conditional comparison keeps its agreement, average comparison loses it
+        assert ours[-1] > 2.0 * gan[-1]
+        assert ours[-1] > 0.9 * ours[0]
+    assert gan[-1] < 0.6 * gan[0]
     assert (tmp_path / "background_shift.png").read_bytes()[:4] == b"\x89PNG"
 
 
 @pytest.mark.parametrize("name", RANKED)
 def test_writes_numbers_and_a_picture(name, dataset, tmp_path):
-    done = command(name, "--quick", f"--data={dataset}", f"--output={tmp_path}")
+    scenes = f"--data={dataset}"
+    if name == "cross_site":
+        scenes = f"--sites=here={dataset},there={dataset}"
+    done = command(name, "--quick", scenes, f"--output={tmp_path}")
     assert done.returncode == 0, done.stderr[-2000:]
     body = json.loads((tmp_path / f"{name}.json").read_text())
     found = list(numbers(body))
@@ -72,7 +83,12 @@ def test_writes_numbers_and_a_picture(name, dataset, tmp_path):
     assert body["quick"] is True
     assert body["made_by"]["versions"]
     assert body["made_by"]["flags"]["seeds"]
-    assert name == "cross_site" or body["made_by"]["data_hash"]
+    if name == "cross_site":
+        assert set(body["data_hashes"]) == set(body["tested_on"]) == {"here", "there"}
+        trained = {row for row in body["tested_on"]["here"]["rows"] if "on" in row}
+        assert {"trained on here", "trained on there"} <= trained
+    else:
+        assert body["made_by"]["data_hash"]
     assert (tmp_path / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
 
 
@@ -134,7 +150,12 @@ def test_human_likeness_beside_a_tuned_hand_set_cost(dataset, tmp_path):
             "--counts=abc",
             "--counts: ['abc']",
         ),
+        ("experiments.paper.known_truth", "--counts=5", "expected two that differ"),
+        ("experiments.paper.known_truth", "--temperature=-1", "--temperature"),
         ("experiments.paper.discount_factors", "--seeds=1", "--seeds: 1: expected at"),
+        ("experiments.paper.stability", "--learners=", "--learners: none: expected"),
+        ("experiments.paper.one_frame", "--row=-5", "--row: -5: expected one of"),
+        ("experiments.human_likeness", "--split_seed=-1", "--split_seed"),
         ("experiments.human_likeness", "--horizon=9", "--horizon"),
         ("experiments.human_likeness", "--hand_weights=x", "expected groups"),
         ("experiments.human_likeness", "--recording=99", "--recording: 99: expected"),
@@ -157,7 +178,19 @@ def test_table2_never_reuses_the_parts_of_a_quick_run(tmp_path):
     assert "made with {'quick': True, 'seed': 0}" in said
 
 
-def test_a_wrong_site_is_one_line(tmp_path):
-    done = command("cross_site", "--sites=a", f"--output={tmp_path}")
+@pytest.mark.parametrize(
+    ("name", "flag", "line"),
+    [
+        ("cross_site", "--sites=a", "--sites: ['a']: expected two"),
+        ("cross_site", "--sites=a=x,a=y", "named apart"),
+        ("table2", "--input=missing", "missing"),
+        ("background_shift", "--seed=-1", "--seed"),
+    ],
+)
+def test_bad_flags_without_data_are_one_line(name, flag, line, tmp_path):
+    done = command(name, flag, f"--output={tmp_path / 'out'}")
     assert done.returncode == 2
-    assert done.stderr.strip().splitlines()[-1].startswith("error: --sites: ['a']")
+    (said,) = done.stderr.strip().splitlines()
+    assert said.startswith("error: ")
+    assert line in said
+    assert not (tmp_path / "out").exists()
