@@ -7,7 +7,8 @@ The station-time graph, speeds, and the distances to the followed, overtaken,
 stop-line and closest obstacles of one held-out scene (by default one with a
 leader and an interesting tag). Without --weights a reward is trained first.
 Writes one_frame.png (six panels), the large ST graph, and the drawn numbers as
-JSON. Expected: two minutes; human and chosen close together. `--quick`: less.
+JSON, with what each feature says for the chosen trajectory against the human's.
+Expected: two minutes; human and chosen close together. `--quick`: less.
 """
 
 from pathlib import Path
@@ -26,6 +27,7 @@ from rcirl_jax.train.loop import train
 
 _WEIGHTS = flags.DEFINE_string("weights", None, "weights file instead of training")
 _ROW = flags.DEFINE_integer("row", None, "dataset row of the scene")
+REASONS = 6  # features named on the terminal
 
 
 def main() -> None:
@@ -52,6 +54,9 @@ def main() -> None:
     )  # fmt: skip
     rank = float(np.mean(frame.values[frame.feasible] < frame.human_value))
     print(f"scene {row}: {frame.caption}; human above {rank:.0%} of the candidates")
+    most = sorted(frame.reasons.items(), key=lambda item: -abs(item[1]))[:REASONS]
+    told = ", ".join(f"{name} {part:+.3g}" for name, part in most if part)
+    print(f"value of the chosen minus the human's, by feature: {told or 'the same'}")
     write(
         "one_frame",
         {
@@ -60,6 +65,7 @@ def main() -> None:
             "human_value": frame.human_value,
             "chosen_value": float(frame.values[frame.chosen]),
             "human_above_share": rank,
+            "reasons": frame.reasons,
             "human_s": frame.human_s.tolist(),
             "chosen_s": frame.chosen_s.tolist(),
         },

@@ -11,7 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.data.joined import Demonstrations
+from rcirl_jax.evaluation.attribution import attribute
 from rcirl_jax.evaluation.score import candidates_key
+from rcirl_jax.export.loading import reward_params
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.features import feature_map
 from rcirl_jax.report import plots
@@ -56,6 +58,11 @@ class DrawnFrame:
     human_value: float
     human_s: np.ndarray  # [T] m
     chosen_s: np.ndarray  # [T] m
+    # feature -> its part of V(chosen) - V(human), over all times
+    reasons: dict[str, float]
+
+
+_attributed = jax.jit(attribute, static_argnames="activation")
 
 
 @functools.cache
@@ -92,6 +99,9 @@ def draw_frame(
     chosen = int(np.argmax(np.where(feasible, values, -np.inf)))
     drawn = one.replace(human=human)
     names = [tag.name.lower() for tag in Tag if bool(one.scene.tags[tag])]
+    weights = reward_params(reward)
+    parts = _attributed(*weights, x[chosen], x_human, valid, reward.activation)
+    reasons = np.asarray(parts, np.float64).sum(axis=0).tolist()
     plots.example_frame(
         picture,
         drawn,
@@ -115,6 +125,7 @@ def draw_frame(
         human_value=float(reward.value(x_human[None], valid[None])[0]),
         human_s=np.asarray(human.s),
         chosen_s=np.asarray(candidates.trajectory.s[chosen]),
+        reasons=dict(zip(reward.names, reasons, strict=True)),
     )
 
 

@@ -92,6 +92,18 @@ def test_writes_numbers_and_a_picture(name, dataset, tmp_path):
     assert (tmp_path / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
 
 
+def test_the_example_frame_says_why(dataset, tmp_path):
+    weights = random_weights(tmp_path / "random.msgpack")
+    flags = ("--quick", f"--data={dataset}", f"--weights={weights}", "--row=0")
+    done = command("one_frame", *flags, f"--output={tmp_path}")
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert "value of the chosen minus the human's, by feature: " in done.stdout
+    body = json.loads((tmp_path / "one_frame.json").read_text())
+    apart = body["chosen_value"] - body["human_value"]
+    assert sum(body["reasons"].values()) == pytest.approx(apart, rel=0.02, abs=1e-4)
+    assert body["row"] == 0
+
+
 def test_table2(tmp_path):
     """From drives to the table: every row over every family."""
     done = command("table2", "--quick", f"--output={tmp_path}")
