@@ -4,6 +4,11 @@ Library code raises `InputError("FILE: field: value: what was expected")`; the
 experiment files turn it into that line on stderr and exit status 2.
 """
 
+import contextlib
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+
 
 class InputError(ValueError):
     """Something the user gave is wrong: file, field, value, expectation.
@@ -14,3 +19,39 @@ class InputError(ValueError):
 
     def __init__(self, message: str) -> None:
         super().__init__(" ".join(str(message).split()))
+
+
+# what reading an unforeseen file may end in; anything else is a fault of ours
+UNFORESEEN = (
+    ArithmeticError,
+    AttributeError,
+    LookupError,
+    MemoryError,
+    TypeError,
+    ValueError,
+)
+
+
+@contextlib.contextmanager
+def reading(what: str, expected: str) -> Iterator[None]:
+    """A last net: errors that no check foresaw become one line as well.
+
+    The line names the place in the code, for a report of the fault.
+
+    Args:
+      what: file or recording that is read, first in the line.
+      expected: what was expected of it.
+
+    Raises:
+      InputError: from one of `UNFORESEEN`.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except UNFORESEEN as error:
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        raise InputError(
+            f"{what}: {type(error).__name__}: {str(error)[:200]} "
+            f"({Path(place.filename).name}:{place.lineno}): expected {expected}"
+        ) from error

@@ -17,7 +17,7 @@ from rcirl_jax.data.collect import Collector
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import SMALL_PARTS, csv_stream, read_part
 from rcirl_jax.data.quality import QualityReport
-from rcirl_jax.errors import InputError
+from rcirl_jax.errors import InputError, reading
 from rcirl_jax.types import Demonstration, Recording
 
 GROUP_BLOCK_S = 60.0  # s; vehicles first seen in one block share a group
@@ -112,8 +112,9 @@ def cut(
                 "import: expected the same; use another --output"
             )
         return Cut(**about, **nothing, known=True)
-    collector = Collector(recording, config)
-    rows = list(collector.scenes())
+    with reading(recording.name, "a sound recording"):
+        collector = Collector(recording, config)
+        rows = list(collector.scenes())
     report = QualityReport()
     report.add_recording(collector)
     if not rows:

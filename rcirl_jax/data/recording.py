@@ -17,6 +17,8 @@ from rcirl_jax.units import FOOT_M, MPH_MPS
 MAX_SPEED_MPS = 90.0  # m/s, faster than any road user
 LENGTH_RANGE_M = (0.2, 40.0)  # m
 WIDTH_RANGE_M = (0.2, 6.0)  # m
+MAX_SPAN_M = 1e6  # m between any two places of one recording
+MAX_LANES_M = 1e7  # m, all lanes of one recording together
 STATIC_RANGE_M = (0.01, 1000.0)  # m, standing objects: from posts to long walls
 # m, of the median vehicle: above it lengths are in feet, below it they were taken for
 # feet (a car is 4-5 m)
@@ -71,12 +73,9 @@ def validate_recording(
         _check_ghost(name, ghost)
     lanes = {lane.id for lane in recording.lanes}
     signals = {signal.id for signal in recording.signals}
-    return dataclasses.replace(
-        recording,
-        lanes=tuple(
-            _check_lane(name, lane, lanes, signals) for lane in recording.lanes
-        ),
-    )
+    checked = [_check_lane(name, lane, lanes, signals) for lane in recording.lanes]
+    _check_places(name, recording)
+    return dataclasses.replace(recording, lanes=tuple(checked))
 
 
 def _check_unique(name: str, field: str, ids: list[str]) -> None:
@@ -116,6 +115,39 @@ def _check_track(name: str, track: Track) -> None:
     if fastest > MAX_SPEED_MPS:
         raise InputError(
             f"{where}: speed: {fastest:g} m/s: expected below {MAX_SPEED_MPS:g} m/s"
+        )
+
+
+def check_span(where: str, field: str, values: np.ndarray) -> None:
+    """No place [m] is absurdly far from the others, as one wrong cell would be.
+
+    Raises:
+      InputError: naming the value farthest from the median.
+    """
+    if not values.size or np.ptp(values) <= MAX_SPAN_M:
+        return
+    middle = float(np.median(values))
+    worst = values[np.argmax(np.abs(values - middle))]
+    raise InputError(
+        f"{where}: {field}: {worst:g} m, the median is {middle:g} m: expected places "
+        f"within {MAX_SPAN_M:g} m"
+    )
+
+
+def _check_places(name: str, recording: Recording) -> None:
+    """Tracks and lanes lie near each other, and lanes are no longer than roads are."""
+    for place, axis in enumerate(("x", "y")):
+        driven = [getattr(track, axis) for track in recording.tracks]
+        check_span(f"{name}: tracks", axis, np.concatenate(driven))
+        lanes = [lane.centre[:, place] for lane in recording.lanes]
+        check_span(f"{name}: lanes", axis, np.concatenate([*lanes, np.zeros(0)]))
+    total = sum(
+        float(np.hypot(*np.diff(lane.centre, axis=0).T).sum())
+        for lane in recording.lanes
+    )
+    if total > MAX_LANES_M:
+        raise InputError(
+            f"{name}: lanes: {total:g} m long in all: expected up to {MAX_LANES_M:g} m"
         )
 
 

@@ -28,6 +28,7 @@ from rcirl_jax.types import Kind, Lane, Recording, Track
 
 VERSIONS = ("2018b", "2020a")
 MAX_FILE_BYTES = 512 * 1024**2  # bytes, larger files are refused
+MAX_STEP = 1e6  # of the clock: a day at 10 Hz
 DEFAULT_LIMIT_MPS = 29.06  # m/s, 65 mph, where the source TOML names none
 MIN_LIMIT_MPS = 5.0  # m/s, likewise; lower signs are converter artefacts
 # obstacle types; any other type that moves is a vehicle
@@ -229,6 +230,10 @@ def _read_moving(element: Element, fields: Fields, dt: float) -> Track:
 
 def _read_state(state: Element, fields: Fields, where: str, dt: float) -> tuple:
     step = fields.scalar(state, "time", where)
+    if abs(step) > MAX_STEP:
+        raise InputError(
+            f"{fields.path}: {where}: time: {step:g}: expected steps up to {MAX_STEP:g}"
+        )
     where = f"{where}: state {step:g}"
     x, y = position(state, fields, where)
     heading = fields.scalar(state, "orientation", where)

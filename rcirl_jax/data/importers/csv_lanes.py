@@ -49,12 +49,14 @@ def lanes_of(
         given = _lanes_from_file(table.path, lane_file_of(spec))
     limit = number(spec, "speed_limit", LIMIT_MPS)
     width = number(spec, "lane_width_m", LANE_WIDTH_M)
+    if not all(isinstance(lane, dict) for lane in given):
+        raise InputError(f"source TOML: lanes: {given}: expected tables [[lanes]]")
     if given:
         return tuple(_given_lane(table, lane, width) for lane in given), []
     if "lane" in table.values:
         found = _straight(table, tracks, width)
         if found is not None:
-            lanes = straight_lanes(found, width, limit)
+            lanes = straight_lanes(table.path, found, width, limit)
             return lanes, ["straight lanes fitted to the lane column"]
     lanes = _paths(tracks, width, limit)
     return lanes, [f"no lanes given; {len(lanes)} fitted to the longest paths"]

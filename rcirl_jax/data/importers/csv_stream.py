@@ -43,6 +43,7 @@ class Field:
     column: str
     factor: float = 1.0
     text: bool = False
+    limit: float = np.inf  # in the file's unit; beyond it a number is absurd
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -120,11 +121,12 @@ def _column(path: Path, batch: Any, field: Field, start: int) -> Any:  # noqa: A
         coded = found.dictionary_encode()
         return coded.indices.to_numpy(), coded.dictionary.to_pylist()
     values = found.to_numpy(zero_copy_only=False)
-    bad = np.flatnonzero(~np.isfinite(values))
+    # NaN compares false
+    bad = np.flatnonzero(~(np.isfinite(values) & (np.abs(values) <= field.limit)))
     if bad.size:
         raise InputError(
             f"{path}: line {start + bad[0]}: {field.column}: {values[bad[0]]}: "
-            "expected a finite number"
+            f"expected a finite number within {field.limit:g}"
         )
     return values * field.factor
 

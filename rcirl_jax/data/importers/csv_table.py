@@ -19,6 +19,13 @@ from rcirl_jax.data.importers.csv_lanes import (
     lanes_of,
 )
 from rcirl_jax.data.importers.files import input_files
+from rcirl_jax.data.importers.options import patterns, section
+from rcirl_jax.data.importers.sparse_tables import (
+    MAX_PLACE_M,
+    MAX_TIME,
+    MAX_VELOCITY_MPS,
+    check_range,
+)
 from rcirl_jax.data.importers.tables import (
     number,
     read_header,
@@ -44,6 +51,14 @@ ALLOWED_UNITS = {
     "speed": ("m/s", "km/h", "mph", "ft/s"),
     "heading": ("rad", "deg"),
 }
+# in the file's unit: what no log can mean
+LIMITS = {
+    "t": MAX_TIME,
+    "x": MAX_PLACE_M,
+    "y": MAX_PLACE_M,
+    "speed": MAX_VELOCITY_MPS,
+    "heading": MAX_PLACE_M,
+}
 KINDS = ("vehicle", "cyclist", "pedestrian", "static")
 # box centre ahead of the recorded position, in box lengths
 REFERENCE = {"centre": 0.0, "front": -0.5, "rear": 0.5}
@@ -57,8 +72,12 @@ ORIGIN_STEP_M = 1000.0  # m, local origins are multiples of it
 def parts(path: Path, spec: dict) -> list[Path]:
     """The CSV files; each can be read alone."""
     lane_file = lane_file_of(spec)
-    pattern = spec.get("pattern", "*.csv")
-    files = [f for f in input_files(path, pattern) if f.name != lane_file]
+    files = [
+        file
+        for pattern in patterns(spec, ("*.csv",))
+        for file in input_files(path, pattern)
+        if file.name != lane_file
+    ]
     if not files:
         raise InputError(f"{path}: files: only {lane_file}: expected logs beside it")
     return files
@@ -83,7 +102,11 @@ def _long_recordings(path: Path, spec: dict) -> Iterator[Recording]:
             factor = sign * units.get(field, 1.0)
             fields.append(
                 csv_stream.Field(
-                    name=field, column=column, factor=factor, text=field in TEXT
+                    name=field,
+                    column=column,
+                    factor=factor,
+                    text=field in TEXT,
+                    limit=LIMITS.get(field, np.inf),
                 )
             )
         elif field in NEEDED:
@@ -119,7 +142,7 @@ def _of_log(track: Track, fragments: dict[str, list[float]]) -> Track:
 
 def _columns(path: Path, spec: dict) -> dict[str, tuple[str, float]]:
     """Field -> column name and sign ("-name" turns an axis round)."""
-    columns = spec.get("columns", {})
+    columns = section(spec, "columns")
     unknown = sorted(set(columns) - set(NEEDED) - set(OPTIONAL))
     if unknown:
         raise InputError(
@@ -139,7 +162,7 @@ def _columns(path: Path, spec: dict) -> dict[str, tuple[str, float]]:
 
 
 def _rate(spec: dict) -> float:
-    rate = number({**spec, **spec.get("defaults", {})}, "rate_hz", RATE_HZ)
+    rate = number({**spec, **section(spec, "defaults")}, "rate_hz", RATE_HZ)
     if rate <= 0.0:
         raise InputError(f"source TOML: rate_hz: {rate:g}: expected > 0")
     return rate
@@ -163,6 +186,7 @@ def _read_tables(path: Path, spec: dict) -> Iterator[tuple[str, LogTable]]:
         elif field in TEXT:
             values[field] = raw[column]
         else:
+            check_range(path, raw, (column,), LIMITS.get(field, np.inf))
             values[field] = sign * units.get(field, 1.0) * raw[column]
     names = values.pop("recording", None)
     parts = np.unique(names) if names is not None else [None]
@@ -175,7 +199,7 @@ def _read_tables(path: Path, spec: dict) -> Iterator[tuple[str, LogTable]]:
 
 def _factors(path: Path, spec: dict, rate: float) -> dict[str, float]:
     factors = {}
-    for field, unit in spec.get("units", {}).items():
+    for field, unit in section(spec, "units").items():
         if field not in ALLOWED_UNITS:
             raise InputError(
                 f"{path}: units.{field}: unknown: expected {', '.join(ALLOWED_UNITS)}"
@@ -230,7 +254,7 @@ def _recording(name: str, table: LogTable, spec: dict) -> Recording:
 
 
 def _track(name: str, table: LogTable, rows: np.ndarray, spec: dict) -> Track:
-    defaults = spec.get("defaults", {})
+    defaults = section(spec, "defaults")
     values = {field: column[rows] for field, column in table.values.items()}
     t, x, y = values["t"], values["x"], values["y"]
     heading = values.get("heading")
@@ -271,7 +295,7 @@ def _track(name: str, table: LogTable, rows: np.ndarray, spec: dict) -> Track:
 
 
 def _kind(path: Path, name: str, found: str, spec: dict) -> Kind:
-    kind = str(spec.get("kinds", {}).get(found, found or "vehicle")).lower()
+    kind = str(section(spec, "kinds").get(found, found or "vehicle")).lower()
     if kind not in KINDS:
         raise InputError(
             f"{path}: id {name}: kind: {found}: expected one of {', '.join(KINDS)}, "

@@ -199,10 +199,8 @@ def _message(
     for number, _, value in fields(buffer):
         if number == 1:
             name = text(value)
-            if not wanted(name):
-                return None
         elif number == 2 and isinstance(value, int):
             time = value
         elif number == 3:
             content = nested(value)
-    return name, time, content
+    return (name, time, content) if wanted(name) else None

@@ -105,6 +105,8 @@ class Layers:
           InputError: a blob that is no geometry, an unknown system, or a place
             outside of it.
         """
+        if not blobs:
+            return []
         database, where = self.database, f"{table}.{column}"
         try:
             found = [points_of(blob) for blob in blobs]

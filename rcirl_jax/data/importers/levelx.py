@@ -37,7 +37,7 @@ from rcirl_jax.data.importers.tables import (
     split_tracks,
     travel_heading,
 )
-from rcirl_jax.data.recording import validate_recording
+from rcirl_jax.data.recording import check_span, validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Lane, Recording, Track
 
@@ -173,6 +173,7 @@ def _read_corners(path: Path, spec: dict) -> Recording:
             )
         )
     limit = _limit(meta_path, meta)
+    check_span(str(path), "x", x)
     along = (float(x.min()), float(x.max()))
     lanes = marked_lanes(meta_path, meta, along, limit, (y, rows["xVelocity"]))
     return _recording(path, spec, rate, tracks, lanes, limit, _absent(ids, users))

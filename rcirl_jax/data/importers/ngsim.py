@@ -114,7 +114,7 @@ def _read_site(
         licence=spec.get("licence", "unknown"),
         rate_hz=1.0 / frame_s,
         tracks=tuple(tracks),
-        lanes=_lanes(table, spec, lateral),
+        lanes=_lanes(path, table, spec, lateral),
         default_speed_limit=number(spec, "speed_limit", LIMIT_MPS),
         notes=tuple(notes),
     )
@@ -245,7 +245,7 @@ def _lateral_from_lanes(lane: np.ndarray, spec: dict) -> np.ndarray:
     return y
 
 
-def _lanes(table: dict, spec: dict, lateral: bool) -> tuple[Lane, ...]:
+def _lanes(path: Path, table: dict, spec: dict, lateral: bool) -> tuple[Lane, ...]:
     """One straight lane per lane number, over where it was driven +- 50 m."""
     width = number(spec, "lane_width_m", LANE_WIDTH_M)
     found = []
@@ -261,4 +261,4 @@ def _lanes(table: dict, spec: dict, lateral: bool) -> tuple[Lane, ...]:
                 upper=float(along.max()) + MARGIN_M,
             )
         )
-    return straight_lanes(found, width, number(spec, "speed_limit", LIMIT_MPS))
+    return straight_lanes(path, found, width, number(spec, "speed_limit", LIMIT_MPS))

@@ -160,7 +160,7 @@ def _read_pair(
         licence=str(spec.get("licence", "NGSIM: U.S. DOT FHWA, doi 10.21949/1504477")),
         rate_hz=rate,
         tracks=tracks,
-        lanes=straight_lanes([lane], width, limit),
+        lanes=straight_lanes(path, [lane], width, limit),
         group=group,
         ghosts=(_ghost(tracks, lane.upper),),
         default_speed_limit=limit,

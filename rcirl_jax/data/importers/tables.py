@@ -9,6 +9,7 @@ from typing import NoReturn
 
 import numpy as np
 
+from rcirl_jax.data.recording import check_span
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane
 from rcirl_jax.units import FOOT_M, MPH_MPS
@@ -258,7 +259,7 @@ def travel_heading(
 
 
 def straight_lanes(
-    found: Sequence[StraightLane], width: float, limit: float | None
+    path: Path, found: Sequence[StraightLane], width: float, limit: float | None
 ) -> tuple[Lane, ...]:
     """Lanes parallel to the x axis, with bounds midway between neighbours.
 
@@ -267,6 +268,8 @@ def straight_lanes(
     """
     lanes = []
     for lane in found:
+        ends = np.array([lane.lower, lane.upper])
+        check_span(f"{path}: lane {lane.id}", "position along the road", ends)
         above = _beside(lane, found, width, +1.0)
         below = _beside(lane, found, width, -1.0)
         up = 0.5 * width if above is None else 0.5 * (above.y - lane.y)

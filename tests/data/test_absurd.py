@@ -1,0 +1,151 @@
+"""Numbers in range for a parser and absurd for a road; faults no check foresaw."""
+
+import re
+import sqlite3
+
+import numpy as np
+import pytest
+
+from rcirl_jax.data import importers
+from rcirl_jax.data.config import CollectConfig
+from rcirl_jax.data.cut import cut
+from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.errors import InputError, reading
+from tests.data.formats import (
+    commonroad,
+    csv,
+    levelx_highd,
+    ngsim,
+    nuplan,
+    openacc,
+)
+
+
+def only_line(name, path, source=None):
+    with pytest.raises(InputError) as caught:
+        list(read_recordings(name, path, source))
+    (line,) = str(caught.value).splitlines()
+    return line
+
+
+def made(folder):
+    folder.mkdir(parents=True)
+    return folder
+
+
+def replace_cell(file, row, column, value, separator=","):
+    """Overwrites one cell of a text table; the column by name or number."""
+    lines = file.read_text().splitlines()
+    place = column
+    if isinstance(column, str):
+        place = lines[0].split(separator).index(column)
+    cells = lines[row].split(separator)
+    cells[place] = value
+    lines[row] = separator.join(cells)
+    file.write_text("\n".join(lines) + "\n")
+
+
+def test_a_clock_of_a_century_beside_a_standing_obstacle(tmp_path):
+    fixture = commonroad.write(tmp_path)
+    (file,) = fixture.files
+    text = file.read_text()
+    latest = max(map(int, re.findall(r"<exact>(\d+)</exact>", text)))
+    before, _, after = text.rpartition(f"<exact>{latest}</exact>")
+    file.write_text(f"{before}<exact>20000000000</exact>{after}")
+    line = only_line("commonroad", fixture.input)
+    assert "time: 2e+10: expected steps up to 1e+06" in line
+
+
+def test_one_wrong_cell_does_not_make_a_lane_across_the_globe(tmp_path):
+    fixture = levelx_highd.write(made(tmp_path / "highd"))
+    (tracks,) = [f for f in fixture.files if f.name.endswith("_tracks.csv")]
+    replace_cell(tracks, 50, "x", "9e7")
+    line = only_line("levelx", fixture.input)
+    assert "x: 9e+07 m, the median is " in line
+    fixture = ngsim.write(made(tmp_path / "ngsim"))
+    replace_cell(fixture.files[0], 50, 5, "1e12", " ")
+    assert "expected" in only_line("ngsim", fixture.input)
+    fixture = openacc.write(made(tmp_path / "openacc"))
+    file = fixture.files[0]
+    rows = file.read_text().splitlines()
+    head = next(i for i, row in enumerate(rows) if row.startswith("Time"))
+    cells = rows[head + 60].split(",")
+    cells[rows[head].split(",").index("N1")] = "-9e7"
+    rows[head + 60] = ",".join(cells)
+    file.write_text("\n".join(rows) + "\n")
+    assert "y: -9e+07 m, the median is " in only_line("openacc", file)
+
+
+@pytest.mark.parametrize("long_bytes", [1, 10**9])
+@pytest.mark.parametrize(
+    ("cell", "column"), [("1e300", "t"), ("1e200", "x"), ("-9e9", "y")]
+)
+def test_a_csv_cell_beyond_any_place_or_time(long_bytes, cell, column, tmp_path):
+    rows = ["t,id,x,y,lane"]
+    rows += [f"{k / 10:.1f},a,{k}.0,0.0,1" for k in range(120)]
+    log, source = tmp_path / "log.csv", tmp_path / "source.toml"
+    log.write_text("\n".join(rows) + "\n")
+    replace_cell(log, 60, column, cell)
+    columns = "\n".join(f'{name} = "{name}"' for name in ("t", "id", "x", "y", "lane"))
+    source.write_text(f"long_bytes = {long_bytes}\n[columns]\n{columns}\n")
+    line = only_line("csv", log, source)
+    assert f"{column}: {float(cell):g}" in line or f"{column}: {float(cell)}" in line
+    assert "expected" in line
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("columns = 3", "columns: 3: expected a table"),
+        ("pattern = 3", "pattern: 3: expected file names"),
+        ("units = 3", "units: 3: expected a table"),
+        ("lanes = [3]", "lanes: [3]: expected tables"),
+        ("defaults = 3", "defaults: 3: expected a table"),
+    ],
+)
+def test_options_of_another_type(text, line, tmp_path):
+    log, source = tmp_path / "log.csv", tmp_path / "source.toml"
+    rows = [f"{k / 10:.1f},a,{k}.0,0.0" for k in range(40)]
+    log.write_text("\n".join(["t,id,x,y", *rows]) + "\n")
+    columns = "\n".join(f'{name} = "{name}"' for name in ("t", "id", "x", "y"))
+    rest = "" if text.startswith("columns") else f"[columns]\n{columns}\n"
+    source.write_text(f"{text}\n{rest}")
+    assert line in only_line("csv", log, source)
+
+
+def test_a_map_without_stop_polygons(tmp_path):
+    fixture = nuplan.write(tmp_path)
+    whole = list(read_recordings("nuplan", fixture.input))
+    (layers,) = tmp_path.rglob("*.gpkg")
+    with sqlite3.connect(layers) as database:
+        database.execute("DELETE FROM stop_polygons")
+    found = list(read_recordings("nuplan", fixture.input))
+    assert [len(x.tracks) for x in found] == [len(x.tracks) for x in whole]
+
+
+def test_what_no_check_foresaw_is_one_line_that_names_the_place(tmp_path, monkeypatch):
+    fixture = csv.write(tmp_path)
+
+    def broken(path, spec):
+        yield from ()
+        raise KeyError("stations")
+
+    module = importers.importlib.import_module("rcirl_jax.data.importers.csv_table")
+    monkeypatch.setattr(module, "recordings", broken)
+    line = only_line("csv", fixture.input)
+    assert "KeyError: 'stations' (test_absurd.py:" in line
+    assert line.endswith("expected a sound log of format csv")
+
+
+def test_a_recording_that_cannot_be_cut_is_one_line(monkeypatch):
+    recording = next(read_recordings("synthetic", None))
+    monkeypatch.setattr("rcirl_jax.data.lanes._densify", lambda *_: np.zeros(2**62))
+    with pytest.raises(InputError, match=r"expected a sound recording"):
+        cut(recording, CollectConfig())
+
+
+def test_faults_of_other_kinds_pass():
+    with pytest.raises(OSError, match="disk"), reading("file", "anything"):
+        raise OSError("disk")
+    with pytest.raises(InputError, match=r"^own line$"), reading("file", "anything"):
+        raise InputError("own line")
