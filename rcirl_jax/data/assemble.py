@@ -4,7 +4,6 @@ import functools
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.sampling.kinematics import trajectory_from_positions
@@ -44,10 +43,10 @@ def human_trajectories(scene: Scene, s: np.ndarray, l: np.ndarray) -> Trajectory
     parts = []
     for start in range(0, count, CHUNK):
         index = np.minimum(np.arange(start, start + CHUNK), count - 1)
-        chunk = jax.tree.map(lambda x, index=index: jnp.asarray(x[index]), scene)
-        full = _complete()(chunk, jnp.asarray(s[index]), jnp.asarray(l[index]))
+        chunk = jax.tree.map(lambda x, index=index: x[index], scene)
+        full = _complete()(chunk, s[index], l[index])
         keep = min(CHUNK, count - start)
-        parts.append(jax.tree.map(lambda x, keep=keep: np.asarray(x[:keep]), full))
+        parts.append(jax.tree.map(lambda x, keep=keep: np.asarray(x)[:keep], full))
     return jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
 

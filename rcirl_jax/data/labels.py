@@ -56,32 +56,30 @@ def blocking(row: dict) -> np.ndarray:
 def add_labels(row: dict) -> None:
     """Add `decisions` [N] and `tags` [G] to a scene's row in place."""
     blocks = blocking(row) & row["time_valid"]
+    speed = np.gradient(row["human.s"], TIMES_S)
     decisions = np.full(row["obstacles.kind"].shape, Decision.IGNORE, np.int32)
     for slot in np.flatnonzero(row["obstacles.kind"] != Kind.NONE).tolist():
-        decisions[slot] = _decide(row, slot, blocks[slot])
+        decisions[slot] = _decide(row, slot, blocks[slot], speed)
     row["decisions"] = decisions
-    row["tags"] = _tags(row, decisions, blocks)
+    row["tags"] = _tags(row, decisions, blocks, speed)
 
 
-def _speed(row: dict) -> np.ndarray:
-    return np.gradient(row["human.s"], TIMES_S)
-
-
-def _decide(row: dict, slot: int, blocks: np.ndarray) -> Decision:
+def _decide(row: dict, slot: int, blocks: np.ndarray, human: np.ndarray) -> Decision:
+    """One obstacle's label; `blocks` [T] of it, `human` [T] m/s, the driver's speed."""
     kind = row["obstacles.kind"][slot]
     if kind in (Kind.STOP, Kind.VIRTUAL):
-        return _decide_line(row, slot)
+        return _decide_line(row, slot, human)
     swerve = _swerve_past(row, slot, blocks)
     if swerve > 0.0:
         lane = row["path.lane_left"][0] - row["path.lane_right"][0]
-        beside = _decide_beside(row, slot)
+        beside = _decide_beside(row, slot, human)
         if swerve > 0.5 * lane and row["obstacles.speed"][slot, 0] > STANDING_MPS:
             return Decision.OVERTAKE
         if beside != Decision.IGNORE:
             return beside
     # who is abreast of the driver and yet not hit is beside, whatever the buffer
     if not blocks.any() or (blocks & _abreast(row, slot)).any():
-        beside = _decide_beside(row, slot)
+        beside = _decide_beside(row, slot, human)
         if beside != Decision.IGNORE or not blocks.any():
             return beside
     return _decide_ahead(row, slot, blocks)
@@ -139,18 +137,18 @@ def _abreast(row: dict, slot: int) -> np.ndarray:
     return abreast & row["obstacles.valid"][slot] & row["time_valid"]
 
 
-def _decide_line(row: dict, slot: int) -> Decision:
+def _decide_line(row: dict, slot: int, human: np.ndarray) -> Decision:
     """STOP if the human stands before the line (or at the destination)."""
     valid = row["time_valid"]
     front = row["human.s"] + 0.5 * row["ego.length"]
     line = row["obstacles.s_lower"][slot]
     gap = line - front
     near = (gap > -2.0) & (gap < STOP_REACH_M)
-    stands = (_speed(row) < STANDING_MPS) & near & valid
+    stands = (human < STANDING_MPS) & near & valid
     return Decision.STOP if stands.any() else Decision.IGNORE
 
 
-def _decide_beside(row: dict, slot: int) -> Decision:
+def _decide_beside(row: dict, slot: int, human: np.ndarray) -> Decision:
     """NUDGE if the human drives past a slower one within the nudge range.
 
     Oncoming traffic is slower as well; it is met, not nudged.
@@ -163,7 +161,7 @@ def _decide_beside(row: dict, slot: int) -> Decision:
         )
         - 0.5 * row["ego.width"]
     )
-    slower = (_speed(row) - speed > NUDGE_SPEED_MPS) & (speed > -MOVING_MPS)
+    slower = (human - speed > NUDGE_SPEED_MPS) & (speed > -MOVING_MPS)
     passes = _abreast(row, slot) & (gap < NUDGE_RANGE_M) & slower
     if not passes.any():
         return Decision.IGNORE
@@ -193,9 +191,11 @@ def _cuts_in(row: dict, blocks: np.ndarray) -> bool:
     return bool(np.any(enters & along & (moves & (own > drivers))[:, 1:]))
 
 
-def _tags(row: dict, decisions: np.ndarray, blocks: np.ndarray) -> np.ndarray:
+def _tags(
+    row: dict, decisions: np.ndarray, blocks: np.ndarray, human: np.ndarray
+) -> np.ndarray:
     valid = row["time_valid"]
-    speed = _speed(row)[valid]
+    speed = human[valid]
     s, l = row["human.s"][valid], row["human.l"][valid]
     grid = np.arange(row["path.kappa"].size) * STATION_STEP_M
     driven = grid <= s[-1]

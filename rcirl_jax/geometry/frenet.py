@@ -59,7 +59,7 @@ def reference_line_from_polyline(
     kappa = (dx * ddy - dy * ddx) / np.maximum(np.hypot(dx, dy), 1e-9) ** 3
     beyond = grid - inside
     kappa = np.where(beyond > 0.0, 0.0, kappa)
-    as_array = lambda v: jnp.asarray(v, jnp.float32)  # noqa: E731
+    as_array = lambda v: jnp.asarray(np.asarray(v, np.float32))  # noqa: E731
     return ReferenceLine(
         x=as_array(curve_x(u) + beyond * np.cos(heading)),
         y=as_array(curve_y(u) + beyond * np.sin(heading)),
