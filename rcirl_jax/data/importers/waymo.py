@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.importers.options import kind_of, patterns, section
+from rcirl_jax.data.importers.perception import without_outliers
 from rcirl_jax.data.importers.shapes import (
     check_coordinates,
     local_origin,
@@ -215,7 +216,9 @@ def _tracks(
         else:
             name = str(head.whole(TRACK_ID))
             tracks += _pieces(record, name, kind, states, row, seen, spec)
-    notes = [f"{unset} tracks of unset type left out"] if unset else []
+    tracks, notes = without_outliers(tracks)
+    if unset:
+        notes.append(f"{unset} tracks of unset type left out")
     if unseen:
         notes.append(f"{unseen} tracks without a valid state left out")
     return tuple(tracks), notes
