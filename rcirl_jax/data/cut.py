@@ -48,10 +48,11 @@ class Cut:
     quality: dict  # `QualityReport.state()`
     known: bool = False  # a committed shard holds it already
     part: str = ""  # the input it was read from
+    progress: float | None = None  # share of the part read after it, if known
 
 
 def digest(recording: Recording) -> str:
-    """sha256 over every field of a recording; equal inputs give equal datasets."""
+    """sha256 over every compared field; equal inputs give equal datasets."""
     total = hashlib.sha256()
     _hash(total, recording)
     return total.hexdigest()
@@ -60,7 +61,7 @@ def digest(recording: Recording) -> str:
 def _hash(total: "hashlib._Hash", value: object) -> None:
     """Type, length and content, so that no two values run into each other."""
     if dataclasses.is_dataclass(value):
-        for field in dataclasses.fields(value):
+        for field in filter(lambda field: field.compare, dataclasses.fields(value)):
             total.update(f"{field.name}:".encode())
             _hash(total, getattr(value, field.name))
     elif isinstance(value, np.ndarray):
@@ -103,6 +104,7 @@ def cut(
         "licence": recording.licence,
         "rate_hz": recording.rate_hz,
         "sha256": sha256,
+        "progress": recording.progress,
     }
     nothing = {"scenes": None, "vehicles": [], "groups": [], "quality": {}}
     if recording.name in (done or {}):
