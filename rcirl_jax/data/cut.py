@@ -15,7 +15,12 @@ import numpy as np
 from rcirl_jax.data.assemble import assemble
 from rcirl_jax.data.collect import Collector
 from rcirl_jax.data.config import CollectConfig
-from rcirl_jax.data.importers import SMALL_PARTS, csv_stream, read_part
+from rcirl_jax.data.importers import (
+    SHARD_BYTES,
+    SMALL_PARTS,
+    csv_stream,
+    read_part,
+)
 from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Demonstration, Recording
@@ -134,12 +139,17 @@ def cut(
     )
 
 
-def cut_part(
-    part: Part, config: CollectConfig, done: Mapping[str, str] | None = None
+def cut_item(
+    item: Part | tuple[Part, Recording],
+    config: CollectConfig,
+    done: Mapping[str, str] | None = None,
 ) -> Iterator[Cut]:
-    """All recordings of a part, one at a time; arguments as `cut`."""
-    for recording in recordings_of(part):
-        yield from cut_one((part, recording), config, done)
+    """A part, read here, or one recording of it; other arguments as `cut`."""
+    if not isinstance(item, Part):
+        yield from cut_one(item, config, done)
+        return
+    for recording in recordings_of(item):
+        yield from cut_one((item, recording), config, done)
 
 
 def cut_one(
@@ -162,4 +172,6 @@ def is_long(part: Part) -> bool:
     """Whether a part's recordings may be too many to be held at once."""
     if part.format == "csv":
         return csv_stream.is_long(part.input, part.spec)
+    if part.format in SHARD_BYTES and part.input.is_file():
+        return part.input.stat().st_size > SHARD_BYTES[part.format]
     return part.format not in SMALL_PARTS

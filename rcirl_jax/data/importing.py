@@ -11,7 +11,7 @@ import collections
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,7 @@ from rcirl_jax.data.cut import (
     Cut,
     Part,
     cut,
-    cut_one,
-    cut_part,
+    cut_item,
     is_long,
     recordings_of,
 )
@@ -296,13 +295,22 @@ def import_parts(
 
     def cuts(known: dict[str, str]) -> Iterable[Cut]:
         settings = {"config": config.collect, "done": known}
-        if len(parts) >= places.workers and not any(map(is_long, parts)):
-            return places.stream(functools.partial(cut_part, **settings), parts)
-        # few or long files: read here, one recording at a time, and cut there
-        whole = ((part, one) for part in parts for one in recordings_of(part))
-        return places.stream(functools.partial(cut_one, **settings), whole)
+        items = _items(parts, places.workers)
+        return places.stream(functools.partial(cut_item, **settings), items)
 
     return _import(cuts, len(parts), output, config, overwrite)
+
+
+def _items(
+    parts: Sequence[Part], workers: int
+) -> Iterator[Part | tuple[Part, Recording]]:
+    """Parts, to be read where they are cut; of few or long ones, each recording."""
+    is_few = len(parts) < workers
+    for part in parts:
+        if is_few or is_long(part):
+            yield from ((part, recording) for recording in recordings_of(part))
+        else:
+            yield part
 
 
 def _import(
