@@ -272,3 +272,6 @@ class Recording:
     # the first to before the second at which scenes begin; tracks reach beyond
     piece_of: str | None = None
     scenes_within: tuple[float, float] | None = None
+    # share in (0, 1] of its input that is read after it, where the importer knows;
+    # for the progress bar only, no part of what was recorded
+    progress: float | None = dataclasses.field(default=None, compare=False)

@@ -15,7 +15,12 @@ import numpy as np
 from rcirl_jax.data.assemble import assemble
 from rcirl_jax.data.collect import Collector
 from rcirl_jax.data.config import CollectConfig
-from rcirl_jax.data.importers import SMALL_PARTS, csv_stream, read_part
+from rcirl_jax.data.importers import (
+    SHARD_BYTES,
+    SMALL_PARTS,
+    csv_stream,
+    read_part,
+)
 from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.errors import InputError, reading
 from rcirl_jax.types import Demonstration, Recording
@@ -48,10 +53,11 @@ class Cut:
     quality: dict  # `QualityReport.state()`
     known: bool = False  # a committed shard holds it already
     part: str = ""  # the input it was read from
+    progress: float | None = None  # share of the part read after it, if known
 
 
 def digest(recording: Recording) -> str:
-    """sha256 over every field of a recording; equal inputs give equal datasets."""
+    """sha256 over every compared field; equal inputs give equal datasets."""
     total = hashlib.sha256()
     _hash(total, recording)
     return total.hexdigest()
@@ -60,7 +66,7 @@ def digest(recording: Recording) -> str:
 def _hash(total: "hashlib._Hash", value: object) -> None:
     """Type, length and content, so that no two values run into each other."""
     if dataclasses.is_dataclass(value):
-        for field in dataclasses.fields(value):
+        for field in filter(lambda field: field.compare, dataclasses.fields(value)):
             total.update(f"{field.name}:".encode())
             _hash(total, getattr(value, field.name))
     elif isinstance(value, np.ndarray):
@@ -103,6 +109,7 @@ def cut(
         "licence": recording.licence,
         "rate_hz": recording.rate_hz,
         "sha256": sha256,
+        "progress": recording.progress,
     }
     nothing = {"scenes": None, "vehicles": [], "groups": [], "quality": {}}
     if recording.name in (done or {}):
@@ -133,12 +140,17 @@ def cut(
     )
 
 
-def cut_part(
-    part: Part, config: CollectConfig, done: Mapping[str, str] | None = None
+def cut_item(
+    item: Part | tuple[Part, Recording],
+    config: CollectConfig,
+    done: Mapping[str, str] | None = None,
 ) -> Iterator[Cut]:
-    """All recordings of a part, one at a time; arguments as `cut`."""
-    for recording in recordings_of(part):
-        yield from cut_one((part, recording), config, done)
+    """A part, read here, or one recording of it; other arguments as `cut`."""
+    if not isinstance(item, Part):
+        yield from cut_one(item, config, done)
+        return
+    for recording in recordings_of(item):
+        yield from cut_one((item, recording), config, done)
 
 
 def cut_one(
@@ -161,4 +173,6 @@ def is_long(part: Part) -> bool:
     """Whether a part's recordings may be too many to be held at once."""
     if part.format == "csv":
         return csv_stream.is_long(part.input, part.spec)
+    if part.format in SHARD_BYTES and part.input.is_file():
+        return part.input.stat().st_size > SHARD_BYTES[part.format]
     return part.format not in SMALL_PARTS

@@ -11,7 +11,7 @@ import collections
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,7 @@ from rcirl_jax.data.cut import (
     Cut,
     Part,
     cut,
-    cut_one,
-    cut_part,
+    cut_item,
     is_long,
     recordings_of,
 )
@@ -64,32 +63,48 @@ class _Numbers:
 
 
 class Progress:
-    """A bar of the files read: scenes, scenes/s, drop reasons, time left."""
+    """A bar of the share read: scenes, scenes/s, drop reasons, time left.
+
+    All parts count alike. Inside a part the bar moves as its recordings say how
+    much of it is read.
+
+    Args:
+      total: parts; None: unknown, recordings are counted then.
+    """
 
     NUM_REASONS = 2  # drop reasons shown, the most frequent ones
     EVERY_S = 0.5  # s between two drawings
+    FORMAT = "{desc}: {percentage:.0f}% [{elapsed}<{remaining}{postfix}]"
 
     def __init__(self, total: int | None) -> None:
         self._bar = tqdm.tqdm(
-            total=total, desc="import", unit=" files", mininterval=0.5
+            total=total,
+            desc="import",
+            unit=" recordings",
+            mininterval=self.EVERY_S,
+            miniters=0,  # drawn by time alone
+            bar_format=self.FORMAT if total else None,
         )
         self._start, self._part = time.monotonic(), None
-        self._shown = self._start
+        self._finished = 0  # parts
         self._known = 0  # scenes taken over from an interrupted import
 
     def __enter__(self) -> "Progress":
         return self
 
-    def __exit__(self, *_: object) -> None:
-        if self._part is not None:
-            self._bar.update()
+    def __exit__(self, failure: type[BaseException] | None, *_: object) -> None:
+        if failure is None and self._bar.total:
+            self._move(self._bar.total)
         self._bar.close()
+
+    def _move(self, position: float) -> None:
+        self._bar.update(max(position - self._bar.n, 0.0))
 
     def show(self, made: Cut, quality: QualityReport) -> None:
         """After a recording: its part and all scenes so far."""
         part = made.part or made.name
         if self._part is not None and part != self._part:
-            self._bar.update()
+            self._finished += 1
         self._part = part
         if made.known:
             self._known = quality.scenes
@@ -102,10 +117,8 @@ class Progress:
             + (f", dropped: {dropped}" if dropped else ""),
             refresh=False,
         )
-        # one long file: the bar itself does not move for minutes
-        if time.monotonic() - self._shown > self.EVERY_S:
-            self._shown = time.monotonic()
-            self._bar.refresh()
+        share = (made.progress or 0.0) if self._bar.total else 1.0
+        self._move(self._finished + share)
 
 
 class _Import:
@@ -282,13 +295,22 @@ def import_parts(
 
     def cuts(known: dict[str, str]) -> Iterable[Cut]:
         settings = {"config": config.collect, "done": known}
-        if len(parts) >= places.workers and not any(map(is_long, parts)):
-            return places.stream(functools.partial(cut_part, **settings), parts)
-        # few or long files: read here, one recording at a time, and cut there
-        whole = ((part, one) for part in parts for one in recordings_of(part))
-        return places.stream(functools.partial(cut_one, **settings), whole)
+        items = _items(parts, places.workers)
+        return places.stream(functools.partial(cut_item, **settings), items)
 
     return _import(cuts, len(parts), output, config, overwrite)
+
+
+def _items(
+    parts: Sequence[Part], workers: int
+) -> Iterator[Part | tuple[Part, Recording]]:
+    """Parts, to be read where they are cut; of few or long ones, each recording."""
+    is_few = len(parts) < workers
+    for part in parts:
+        if is_few or is_long(part):
+            yield from ((part, recording) for recording in recordings_of(part))
+        else:
+            yield part
 
 
 def _import(

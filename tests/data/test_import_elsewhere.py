@@ -9,11 +9,21 @@ import time
 import numpy as np
 import pytest
 
-from rcirl_jax.data import importing
-from rcirl_jax.data.importing import import_parts
+from rcirl_jax.data import cut, importing
+from rcirl_jax.data.config import CollectConfig
+from rcirl_jax.data.cut import Part, recordings_of
+from rcirl_jax.data.importers import parts
+from rcirl_jax.data.importing import ImportConfig, import_parts
 from rcirl_jax.errors import InputError
 from rcirl_jax.executor import Processes, Ray
+from tests.data.formats import nuplan, waymo
 from tests.data.small_logs import CONFIG, files_of, write_logs
+
+ALL_SCENES = ImportConfig(
+    format="waymo",
+    collect=CollectConfig(require_speed_change=False, require_obstacles=False),
+)
+TWO = Processes(2)
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +47,80 @@ def test_two_processes_write_the_bytes_of_one(logs, local, tmp_path, monkeypatch
     monkeypatch.setattr(importing, "SHARD_SCENES", 30)
     import_parts(logs, tmp_path / "data", CONFIG, executor=Processes(2))
     assert files_of(tmp_path / "data") == local
+
+
+def reads_of_this_process(monkeypatch):
+    """Names of the inputs that the importing process reads itself, as it does."""
+    read = []
+
+    def noted(part):
+        read.append(part.input.name)
+        return recordings_of(part)
+
+    monkeypatch.setattr(importing, "recordings_of", noted)
+    return read
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory):
+    """Four Waymo shards of two scenarios each, and a nuPlan log."""
+    folder = tmp_path_factory.mktemp("shards")
+    waymo.write_shards(folder / "waymo")
+    made = []
+    places = ("waymo", folder / "waymo"), ("nuplan", nuplan.write(folder).input)
+    for name, place in places:
+        found, spec = parts(name, place)
+        made += [Part(format=name, input=path, spec=spec) for path in found]
+    return made
+
+
+@pytest.fixture(scope="module")
+def here(shards, tmp_path_factory):
+    """What an import of the shards in this process writes."""
+    folder = tmp_path_factory.mktemp("here") / "data"
+    import_parts(shards, folder, ALL_SCENES)
+    return files_of(folder)
+
+
+@pytest.mark.multiprocess
+def test_shards_are_read_by_the_workers(shards, here, tmp_path, monkeypatch):
+    read = reads_of_this_process(monkeypatch)
+    manifest = import_parts(shards, tmp_path / "data", ALL_SCENES, executor=TWO)
+    assert read == []
+    assert files_of(tmp_path / "data") == here
+    waymos = [f"scenario-{shard}-{letter}" for shard in range(4) for letter in "ab"]
+    assert manifest.recordings[:-1] == waymos
+
+
+@pytest.mark.multiprocess
+def test_long_shards_are_read_here_between_others(shards, here, tmp_path, monkeypatch):
+    """One shard is longer than the limit: it alone is read in this process."""
+    long = shards[1].input
+    monkeypatch.setattr(importing, "is_long", lambda part: part.input == long)
+    read = reads_of_this_process(monkeypatch)
+    import_parts(shards, tmp_path / "data", ALL_SCENES, executor=TWO)
+    assert read == [long.name]
+    assert files_of(tmp_path / "data") == here
+
+
+@pytest.mark.multiprocess
+def test_fewer_shards_than_workers_are_read_here(shards, tmp_path, monkeypatch):
+    read = reads_of_this_process(monkeypatch)
+    import_parts(shards[:1], tmp_path / "data", ALL_SCENES, executor=TWO)
+    assert read == [shards[0].input.name]
+
+
+def test_a_shard_is_long_beyond_its_formats_limit(shards, monkeypatch):
+    assert not any(map(cut.is_long, shards))
+    sizes = [part.input.stat().st_size for part in shards]
+    monkeypatch.setitem(cut.SHARD_BYTES, "waymo", sizes[0] - 1)
+    assert [cut.is_long(part) for part in shards] == [True] * 4 + [False]
+    monkeypatch.setitem(cut.SHARD_BYTES, "nuplan", sizes[-1])
+    assert not cut.is_long(shards[-1])
+    monkeypatch.setitem(cut.SHARD_BYTES, "nuplan", sizes[-1] - 1)
+    assert cut.is_long(shards[-1])
+    folder = Part(format="waymo", input=shards[0].input.parent, spec={})
+    assert cut.is_long(folder)  # any number of shards
 
 
 @pytest.mark.multiprocess

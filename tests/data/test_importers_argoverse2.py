@@ -198,6 +198,25 @@ def test_wild_fragments_are_left_out_and_other_tracks_refused(tmp_path):
     )
 
 
+def test_up_to_a_tenth_of_the_tracks_may_be_too_fast(tmp_path):
+    """One state of one track in twelve; sizes of the source TOML are no outliers."""
+    table = w.columns()
+    rows = [row for row, name in enumerate(table["track_id"]) if name == "AV"]
+    for copy in range(12):
+        for key, values in table.items():
+            values += [f"c{copy}" if key == "track_id" else values[r] for r in rows]
+    table["velocity_x"][-5] = 95.0
+    path = w.write_scenario(tmp_path, table=table)[0]
+    recording = only(path)
+    names = {track.id for track in recording.tracks}
+    assert "c10" in names
+    assert "c11" not in names
+    note = "1 tracks with an impossible size or speed left out"
+    assert note in recording.notes
+    source = spec(tmp_path, "bus = [", "bus = [1")
+    assert "length: 11" in message(path, source)
+
+
 def test_stamps_that_are_not_10_hz_are_noted(tmp_path):
     table = w.columns()
     table["end_timestamp"] = [w.START_NS + 4.9e9] * len(table["timestep"])

@@ -130,6 +130,41 @@ def test_sizes_are_medians_and_small_ones_are_clipped(tmp_path):
     assert (track.length, track.width) == (4.0, 0.2)
 
 
+OUTLIERS = {  # field of all states, or of one -> its value and what is wrong
+    "width": ({6: w.Single(6.4)}, range(91), "width: 6.4 m"),
+    "length": ({5: w.Single(41.0)}, range(91), "length: 41 m"),
+    "no size": ({5: w.Single(0.0)}, range(91), "length: 0 m"),
+    "one speed": ({9: w.Single(95.0)}, range(40, 41), "speed: 95"),
+}
+
+
+def traffic(cars, outliers, change, rows):
+    """Cars side by side of which the first ones are outliers."""
+    tracks = []
+    for car in range(cars):
+        user = straight(w.T, (w.EAST, w.NORTH + 4.0 * car), 0.0, 8.0)
+        states = [dict(w.state(user, row)) for row in range(w.NUM_STEPS)]
+        for row in rows if car < outliers else ():
+            states[row] |= change
+        states = [(3, list(state.items())) for state in states]
+        tracks.append([(1, 100 + car), (2, 1), *states])
+    return tracks
+
+
+@pytest.mark.parametrize("name", OUTLIERS)
+def test_up_to_a_tenth_of_the_tracks_may_be_impossible(tmp_path, name):
+    """As from other trackers; more of them point at a wrong file."""
+    change, rows, wrong = OUTLIERS[name]
+    few = scenario(tmp_path, f2=traffic(20, 2, change, rows))
+    assert [track.id for track in few.tracks] == [str(102 + k) for k in range(18)]
+    assert "2 tracks with an impossible size or speed left out" in few.notes
+    none = scenario(tmp_path / "none", f2=traffic(20, 0, change, rows))
+    assert len(none.tracks) == 20
+    assert not any("impossible" in note for note in none.notes)
+    many = put(tmp_path / "many", w.scenario(f2=traffic(20, 3, change, rows)))
+    assert f"record 0: track 100: {wrong}" in message(many)
+
+
 def test_history_only_as_in_the_testing_files(tmp_path):
     """11 states, and dynamic map states of the same steps."""
     users = {1: straight(w.T[:11], (w.EAST, w.NORTH), 0.0, 5.0)}

@@ -44,6 +44,9 @@ SMALL_PARTS = (
     "ngsim_pairs",
     "openacc",
 )
+# formats of which one part is a file with many recordings, and the bytes of the
+# longest one whose scenes may be held at once (docs/formats, "Large inputs")
+SHARD_BYTES = {"nuplan": 2**28, "waymo": 2**30}
 
 
 def read_part(name: str, path: Path, spec: dict) -> Iterator[Recording]:

@@ -6,6 +6,7 @@ release of Apollo lacks are NaN or 0.
 
 import dataclasses
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 from rcirl_jax.data.importers.apollo_obstacles import Obstacles
 from rcirl_jax.data.importers.cyber_record import Record
 from rcirl_jax.data.importers.perception import section
+from rcirl_jax.data.importers.reading import reading
 from rcirl_jax.data.importers.wire import ENUM_NAME, Plan, WireError, decode
 from rcirl_jax.errors import InputError
 
@@ -93,18 +95,21 @@ def read_drive(parts: list[Path], spec: dict) -> Drive:
         )
     names = {str(topic): key for key, topic in topics.items()}
     drive = Drive()
-    for part in parts:
-        with Record(part) as record:
-            _read_part(record, names, drive)
-            if not record.is_complete:
-                drive.notes.append(f"{part.name} was never closed; read to its end")
+    with reading(parts[0], parts) as show:
+        for part in parts:
+            with Record(part) as record:
+                _read_part(record, names, drive, show)
+                if not record.is_complete:
+                    drive.notes.append(f"{part.name} was never closed; read to its end")
     return drive
 
 
-def _read_part(record: Record, names: dict[str, str], drive: Drive) -> None:
+def _read_part(
+    record: Record, names: dict[str, str], drive: Drive, show: Callable[[int], object]
+) -> None:
     plans: dict[str, Plan] = {}
     obstacles: dict[str, Obstacles] = {}
-    for topic, time, content in record.messages(names.__contains__):
+    for topic, time, content in record.messages(names.__contains__, show):
         key = names[topic]
         number = drive.counts[key] = drive.counts.get(key, -1) + 1
         try:

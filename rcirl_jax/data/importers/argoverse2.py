@@ -21,6 +21,10 @@ import numpy as np
 from rcirl_jax.data.importers.argoverse2_map import read_lanes
 from rcirl_jax.data.importers.options import kind_of, patterns, section
 from rcirl_jax.data.importers.parquet import read_columns
+from rcirl_jax.data.importers.perception import (
+    has_possible_speed,
+    without_outliers,
+)
 from rcirl_jax.data.importers.shapes import (
     check_coordinates,
     local_origin,
@@ -174,11 +178,14 @@ def _read_tracks(
             wild += 1
         else:
             tracks.append(_track(file, name, table, rows, clock, spec))
+    # sizes are the source TOML's, so that a wrong one is no outlier
+    tracks, outliers = without_outliers(tracks, has_possible_speed)
     if low:
         notes.append(f"{low} tracks below category {least:g} left out")
     if wild:
         notes.append(f"{wild} track fragments of impossible speed left out")
-    return tuple(tracks), [*notes, "box sizes by object type: the log has none"]
+    notes += [*outliers, "box sizes by object type: the log has none"]
+    return tuple(tracks), notes
 
 
 def _track(

@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from rcirl_jax.data.importers.reading import reading
 from rcirl_jax.data.importers.tables import number, read_header
 from rcirl_jax.errors import InputError
 
@@ -56,6 +57,7 @@ class Piece:
     within: tuple[float, float]  # s, the minute itself
     # id -> s, when the whole log first saw it, and when again after each gap
     fragments: dict[str, list[float]]
+    progress: float  # share of the file's pieces up to this one
 
 
 def is_long(path: Path, spec: dict) -> bool:
@@ -78,8 +80,10 @@ def pieces(path: Path, fields: list[Field], max_gap_s: float) -> Iterator[Piece]
     """
     with tempfile.TemporaryDirectory(prefix="rcirl-") as folder:
         spill = _Spill(path, fields, Path(folder))
-        for batch in _batches(path, fields):
-            spill.add(batch)
+        with reading(path, [path]) as show:
+            for batch in _batches(path, fields):  # one per READ_BYTES of text
+                spill.add(batch)
+                show(READ_BYTES)
         yield from spill.pieces(max_gap_s)
 
 
@@ -218,7 +222,7 @@ class _Spill:
         begin: dict[int, float] = {}
         for (recording, _), (seen, *_) in fragments.items():
             begin[recording] = min(seen, begin.get(recording, np.inf))
-        for recording, minute in sorted(self.blocks):
+        for done, (recording, minute) in enumerate(sorted(self.blocks), start=1):
             low, high = minute * BLOCK_S, (minute + 1) * BLOCK_S
             near = [self._rows(recording, minute + k) for k in (-1, 0, 1)]
             rows = np.concatenate(near)
@@ -241,4 +245,5 @@ class _Spill:
                     names["id"][u]: [s - start for s in fragments[recording, u]]
                     for u in np.unique(rows[:, user]).astype(int).tolist()
                 },
+                progress=done / len(self.blocks),
             )

@@ -124,6 +124,7 @@ def _long_recordings(path: Path, spec: dict) -> Iterator[Recording]:
             tracks=tuple(_of_log(track, piece.fragments) for track in made.tracks),
             piece_of=log,
             scenes_within=piece.within,
+            progress=piece.progress,
         )
         yield validate_recording(made, path)
 

@@ -97,9 +97,16 @@ class Record:
             self._map.close()
 
     def messages(
-        self, wanted: Callable[[str], bool]
+        self,
+        wanted: Callable[[str], bool],
+        show: Callable[[int], object] = lambda _: None,
     ) -> Iterator[tuple[str, int, memoryview]]:
-        """(channel, time ns, content) of the messages on the wanted channels."""
+        """(channel, time ns, content) of the messages on the wanted channels.
+
+        Args:
+          wanted: whether a channel is.
+          show: called with the bytes of each section that has been read.
+        """
         try:
             for kind, section in self._sections():
                 if kind == CHANNEL:
@@ -110,6 +117,7 @@ class Record:
                             found = _message(nested(value), wanted)
                             if found is not None:
                                 yield found
+                show(len(section))
         except WireError as error:
             raise InputError(
                 f"{self.path}: {error}: expected a cyber record"

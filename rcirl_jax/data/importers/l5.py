@@ -104,7 +104,9 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
             recording = _recording(
                 dataset, name, scene, maps[file] if file else None, spec
             )
-            recording = dataclasses.replace(recording, group=groups[index])
+            recording = dataclasses.replace(
+                recording, group=groups[index], progress=(index + 1) / len(scenes)
+            )
             yield validate_recording(recording, f"{folder}: scene {index}")
 
 

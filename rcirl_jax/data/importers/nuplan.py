@@ -168,7 +168,9 @@ def _windows(log: _Log) -> Iterator[Recording]:
     pieces = np.searchsorted(clock, np.linspace(clock[0], clock[-1], count + 1)[1:-1])
     filled = [piece for piece in np.split(log.poses, pieces) if len(piece)]
     for index, poses in enumerate(filled):
-        recording = _recording(log, poses)
+        recording = dataclasses.replace(
+            _recording(log, poses), progress=(index + 1) / len(filled)
+        )
         if len(filled) > 1:
             # neighbouring windows show the same vehicles
             name = f"{log.name}-{index:03d}"

@@ -6,7 +6,7 @@ gathers them as `Boxes`; this module makes tracks of them.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -76,7 +76,7 @@ def tracks_of(
         track = _track(label, boxes, rows, unknown)
         dropped += track is None
         tracks += [] if track is None else [track]
-    tracks, notes = _without_outliers(tracks)
+    tracks, notes = without_outliers(tracks)
     if dropped:
         notes.append(f"{dropped} tracks of unknown class left out")
     return tracks, notes
@@ -138,20 +138,36 @@ def speed_of(t: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.hypot(np.gradient(x, t), np.gradient(y, t))
 
 
-def _without_outliers(tracks: list[Track]) -> tuple[list[Track], list[str]]:
-    good = [track for track in tracks if _is_possible(track)]
+def without_outliers(
+    tracks: list[Track], is_possible: Callable[[Track], bool] | None = None
+) -> tuple[list[Track], list[str]]:
+    """Tracks without the impossible ones, and a note of their number.
+
+    All of them where more than MAX_OUTLIERS are: validation refuses them then.
+
+    Args:
+      tracks: of one recording.
+      is_possible: default: by size and speed.
+    """
+    good = [track for track in tracks if (is_possible or _is_possible)(track)]
     lost = len(tracks) - len(good)
     if lost == 0 or lost > MAX_OUTLIERS * len(tracks):
         return tracks, []
     return good, [f"{lost} tracks with an impossible size or speed left out"]
 
 
+def has_possible_speed(track: Track) -> bool:
+    """Whether no sample is faster than any road user."""
+    return not np.max(np.abs(track.speed)) > MAX_SPEED_MPS
+
+
 def _is_possible(track: Track) -> bool:
-    if np.max(np.abs(track.speed)) > MAX_SPEED_MPS:
+    if not has_possible_speed(track):
         return False
     if track.kind == Kind.STATIC:
         return True
-    return track.length <= LENGTH_RANGE_M[1] and track.width <= WIDTH_RANGE_M[1]
+    sizes = ((track.length, LENGTH_RANGE_M), (track.width, WIDTH_RANGE_M))
+    return all(low <= size <= high for size, (low, high) in sizes)
 
 
 def positive(spec: dict, key: str, default: float) -> float:

@@ -74,7 +74,10 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     _check_keys(path, "", settings, TOP_KEYS)
     drivers = _driver_config(path, settings["drivers"])
     jobs = _jobs(path, settings)
-    return map(validate_recording, _simulated(jobs, drivers, settings))
+    return (
+        dataclasses.replace(validate_recording(made), progress=number / len(jobs))
+        for number, made in enumerate(_simulated(jobs, drivers, settings), start=1)
+    )
 
 
 def _table(spec: dict, key: str) -> dict:

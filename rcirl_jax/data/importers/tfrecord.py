@@ -18,6 +18,7 @@ MAX_RECORD_BYTES = 256 * 1024**2  # bytes of a record
 MASK_DELTA = 0xA282EAD8
 HEADER = struct.Struct("<QI")
 FOOTER = struct.Struct("<I")
+FRAME_BYTES = HEADER.size + FOOTER.size  # around the data of a record
 GZIP_MAGIC = b"\x1f\x8b"
 
 
@@ -43,7 +44,7 @@ def read_records(path: Path, limit: int = MAX_RECORD_BYTES) -> Iterator[bytes]:
                 if len(data) + len(end) < length + FOOTER.size:
                     raise InputError(f"{where}: data: cut off: expected {length} bytes")
                 _check(where, "data", crc32c(data), *FOOTER.unpack(end))
-                left -= HEADER.size + length + FOOTER.size
+                left -= FRAME_BYTES + length
                 count += 1
                 yield data
     except OSError as error:
@@ -74,7 +75,7 @@ def _length(
         )
     length, stored = HEADER.unpack(header)
     _check(where, "length", crc32c(header[:8]), stored)
-    rest = left - HEADER.size - FOOTER.size
+    rest = left - FRAME_BYTES
     if length > min(rest, limit):
         raise InputError(
             f"{where}: length: {length} bytes: expected at most {limit}, and "

@@ -21,13 +21,14 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.importers.options import kind_of, patterns, section
+from rcirl_jax.data.importers.perception import without_outliers
 from rcirl_jax.data.importers.shapes import (
     check_coordinates,
     local_origin,
     origin_notes,
 )
 from rcirl_jax.data.importers.tables import number
-from rcirl_jax.data.importers.tfrecord import read_records
+from rcirl_jax.data.importers.tfrecord import FRAME_BYTES, read_records
 from rcirl_jax.data.importers.waymo_map import read_map
 from rcirl_jax.data.importers.wire_columns import Fields, Record
 from rcirl_jax.data.recording import LENGTH_RANGE_M, WIDTH_RANGE_M, validate_recording
@@ -90,10 +91,13 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """One Recording per scenario, one record in memory at a time."""
     limit = int(number(spec, "max_record_mib", 256) * MIB)
     for file in parts(path, spec):
+        size, done = file.stat().st_size, 0
         for count, data in enumerate(read_records(file, limit)):
             where = f"{file}: record {count}"
             name = f"{file.name}-{count}"
-            yield validate_recording(_read_scenario(where, name, data, spec), where)
+            made = validate_recording(_read_scenario(where, name, data, spec), where)
+            done += FRAME_BYTES + len(data)
+            yield dataclasses.replace(made, progress=done / size)
 
 
 def _read_scenario(where: str, default: str, data: bytes, spec: dict) -> Recording:
@@ -215,7 +219,9 @@ def _tracks(
         else:
             name = str(head.whole(TRACK_ID))
             tracks += _pieces(record, name, kind, states, row, seen, spec)
-    notes = [f"{unset} tracks of unset type left out"] if unset else []
+    tracks, notes = without_outliers(tracks)
+    if unset:
+        notes.append(f"{unset} tracks of unset type left out")
     if unseen:
         notes.append(f"{unseen} tracks without a valid state left out")
     return tuple(tracks), notes

@@ -267,6 +267,15 @@ def expected():
     return tracks
 
 
+def write_shards(folder, shards=4):
+    """Files of two scenarios each, in a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for shard in range(shards):
+        records = [scenario(f5=[f"scenario-{shard}-{letter}"]) for letter in "ab"]
+        name = f"training_20s.tfrecord-{shard:05d}-of-01000"
+        (folder / name).write_bytes(tfrecord(records))
+
+
 def write(folder):
     """A folder of shards, as published, with one scenario."""
     place = folder / "scenario" / "training"
