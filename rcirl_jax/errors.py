@@ -33,7 +33,7 @@ UNFORESEEN = (
 
 
 @contextlib.contextmanager
-def reading(what: str, expected: str) -> Iterator[None]:
+def as_input_error(what: str, expected: str) -> Iterator[None]:
     """A last net: errors that no check foresaw become one line as well.
 
     The line names the place in the code, for a report of the fault.

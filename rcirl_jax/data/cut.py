@@ -22,7 +22,7 @@ from rcirl_jax.data.importers import (
     read_part,
 )
 from rcirl_jax.data.quality import QualityReport
-from rcirl_jax.errors import InputError, reading
+from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.types import Demonstration, Recording
 
 GROUP_BLOCK_S = 60.0  # s; vehicles first seen in one block share a group
@@ -119,7 +119,7 @@ def cut(
                 "import: expected the same; use another --output"
             )
         return Cut(**about, **nothing, known=True)
-    with reading(recording.name, "a sound recording"):
+    with as_input_error(recording.name, "a sound recording"):
         collector = Collector(recording, config)
         rows = list(collector.scenes())
     report = QualityReport()

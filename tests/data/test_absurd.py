@@ -10,7 +10,7 @@ from rcirl_jax.data import importers
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.cut import cut
 from rcirl_jax.data.importers import read_recordings
-from rcirl_jax.errors import InputError, reading
+from rcirl_jax.errors import InputError, as_input_error
 from tests.data.formats import (
     commonroad,
     csv,
@@ -145,7 +145,10 @@ def test_a_recording_that_cannot_be_cut_is_one_line(monkeypatch):
 
 
 def test_faults_of_other_kinds_pass():
-    with pytest.raises(OSError, match="disk"), reading("file", "anything"):
+    with pytest.raises(OSError, match="disk"), as_input_error("file", "anything"):
         raise OSError("disk")
-    with pytest.raises(InputError, match=r"^own line$"), reading("file", "anything"):
+    with (
+        pytest.raises(InputError, match=r"^own line$"),
+        as_input_error("file", "anything"),
+    ):
         raise InputError("own line")

@@ -10,7 +10,7 @@ import itertools
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from rcirl_jax.errors import InputError, reading
+from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.specs import load_toml, spec_root
 from rcirl_jax.types import Recording
 
@@ -53,7 +53,7 @@ def read_part(name: str, path: Path, spec: dict) -> Iterator[Recording]:
     """All recordings of one part, each validated; arguments as of `parts`."""
     module = importlib.import_module(f"{__name__}.{IMPORTERS[name]}")
     importer: Importer = module.recordings
-    with reading(str(path), f"a sound log of format {name}"):
+    with as_input_error(str(path), f"a sound log of format {name}"):
         yield from importer(path, spec)
 
 
@@ -85,7 +85,9 @@ def parts(
         raise InputError(f"{input_path}: input: missing: expected a file or folder")
     module = importlib.import_module(f"{__name__}.{IMPORTERS[name]}")
     split = getattr(module, "parts", None)
-    with reading(str(input_path), f"logs of format {name}, and options as in its TOML"):
+    with as_input_error(
+        str(input_path), f"logs of format {name}, and options as in its TOML"
+    ):
         return ([input_path] if split is None else split(input_path, spec)), spec
 
 
