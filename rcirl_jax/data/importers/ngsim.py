@@ -7,7 +7,7 @@ without lateral positions (Local_X = 0) get them from the lane number.
 
 The portal's CSV holds several sites and periods; vehicle and frame numbers
 start anew in each. Sites become Recordings of their own; where the file has
-Global_Time, it is the clock, else Frame_ID.
+Global_Time, it is the clock and rows may come in any order, else Frame_ID.
 """
 
 from collections.abc import Iterator
@@ -100,11 +100,13 @@ def _read_site(
         missing = len(np.unique(table["Vehicle_ID"][table[column] <= 0.0]))
         if missing:
             notes.append(f"{missing} vehicles without {field}; default by class")
-    table["frame"] = _clock(table, frame_s)
+    stamped = _has_stamps(table)
+    table["frame"] = _clock(table, frame_s, stamped)
     repeated = _drop_repeated(table)
     if repeated:
         notes.append(f"{repeated} rows met twice, used once")
-    reuse = REUSE_S / frame_s
+    # rows with stamps may come in any order: no step back has a meaning
+    reuse = 0.0 if stamped else REUSE_S / frame_s
     vehicles = table["Vehicle_ID"].astype(np.int64)
     pieces = split_tracks(path, vehicles, table["frame"], MAX_FRAME_GAP, reuse)
     tracks = [_track(name, table, rows, spec, lateral) for name, rows in pieces]
@@ -120,10 +122,16 @@ def _read_site(
     )
 
 
-def _clock(table: dict, frame_s: float) -> np.ndarray:
-    """Whole frames since the recording's first, from Global_Time if it is there."""
+def _has_stamps(table: dict) -> bool:
+    """Whether Global_Time [ms] is the clock: positive, and not one for all rows."""
     stamps = table["Global_Time"]
-    if stamps.min() > 0.0 and len(np.unique(stamps)) > 1:
+    return bool(stamps.min() > 0.0 and stamps.max() > stamps.min())
+
+
+def _clock(table: dict, frame_s: float, stamped: bool) -> np.ndarray:
+    """Whole frames since the recording's first, from Global_Time if it is there."""
+    if stamped:
+        stamps = table["Global_Time"]
         frames = np.round((stamps - stamps.min()) / (1000.0 * frame_s))
     else:
         frames = table["Frame_ID"] - table["Frame_ID"].min()
