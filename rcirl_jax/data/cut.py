@@ -15,7 +15,7 @@ import numpy as np
 from rcirl_jax.data.assemble import assemble
 from rcirl_jax.data.collect import Collector
 from rcirl_jax.data.config import CollectConfig
-from rcirl_jax.data.importers import SMALL_PARTS, csv_stream, read_part
+from rcirl_jax.data.importers import CSV_PARTS, SMALL_PARTS, csv_stream, read_part
 from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Demonstration, Recording
@@ -158,6 +158,6 @@ def recordings_of(part: Part) -> Iterator[Recording]:
 
 def is_long(part: Part) -> bool:
     """Whether a part's recordings may be too many to be held at once."""
-    if part.format == "csv":
+    if part.format in CSV_PARTS:
         return csv_stream.is_long(part.input, part.spec)
     return part.format not in SMALL_PARTS
