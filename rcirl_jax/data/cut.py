@@ -16,6 +16,7 @@ from rcirl_jax.data.assemble import assemble
 from rcirl_jax.data.collect import Collector
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import (
+    CSV_PARTS,
     SHARD_BYTES,
     SMALL_PARTS,
     csv_stream,
@@ -171,7 +172,7 @@ def recordings_of(part: Part) -> Iterator[Recording]:
 
 def is_long(part: Part) -> bool:
     """Whether a part's recordings may be too many to be held at once."""
-    if part.format == "csv":
+    if part.format in CSV_PARTS:
         return csv_stream.is_long(part.input, part.spec)
     if part.format in SHARD_BYTES and part.input.is_file():
         return part.input.stat().st_size > SHARD_BYTES[part.format]

@@ -5,6 +5,7 @@ import time
 import numpy as np
 import pytest
 
+from rcirl_jax.data.cut import digest
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.errors import InputError
 from rcirl_jax.specs import spec_root
@@ -139,6 +140,35 @@ def test_portal_sites_and_periods(tmp_path):
     assert [recording.name for recording in found] == ["all-i-80", "all-us-101"]
     assert [len(recording.tracks) for recording in found] == [1, 2]
     assert all("lankershim" in recording.notes[0] for recording in found)
+
+
+def stamped(rows, begin=8e11):
+    """Rows with Global_Time: 100 ms a frame."""
+    return [[*row[:3], begin + 100 * row[1], *row[4:]] for row in rows]
+
+
+def periods():
+    """Two periods an hour apart with the same vehicle and frame numbers."""
+    rows = []
+    for begin in (8e11, 8e11 + 3.6e6):
+        for vehicle in (1, 2, 3):
+            own = w.ngsim_rows(vehicle=vehicle, local_x=12.0 * vehicle)
+            rows += stamped(own[:20] + own[23:], begin)
+    return rows
+
+
+@pytest.mark.parametrize("writer", [w.ngsim_text, w.ngsim_csv])
+def test_stamped_rows_may_come_in_any_order(tmp_path, writer):
+    rows = periods()
+    rows += rows[7:9]  # repeated rows lie anywhere too
+    (tmp_path / "shuffled").mkdir()
+    order = np.random.default_rng(1).permutation(len(rows))
+    whole = only(writer(tmp_path / "a.csv", rows))
+    shuffled = only(writer(tmp_path / "shuffled" / "a.csv", [rows[k] for k in order]))
+    assert digest(shuffled) == digest(whole)
+    names = [f"{car}{piece}" for car in "123" for piece in ("", "#2", "#3", "#4")]
+    assert [track.id for track in whole.tracks] == names
+    assert whole.tracks[2].t[0] == 3600.0
 
 
 def test_repeated_rows_are_used_once(tmp_path):

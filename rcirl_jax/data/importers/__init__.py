@@ -10,6 +10,7 @@ import itertools
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from rcirl_jax.data.importers.files import with_log_names
 from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.specs import load_toml, spec_root
 from rcirl_jax.types import Recording
@@ -40,13 +41,14 @@ SMALL_PARTS = (
     "commonroad",
     "interaction",
     "levelx",
-    "ngsim",
     "ngsim_pairs",
     "openacc",
 )
 # formats of which one part is a file with many recordings, and the bytes of the
 # longest one whose scenes may be held at once (docs/formats, "Large inputs")
 SHARD_BYTES = {"nuplan": 2**28, "waymo": 2**30}
+# formats of which one part is a file that is read in pieces where it is long
+CSV_PARTS = ("csv", "ngsim")
 
 
 def read_part(name: str, path: Path, spec: dict) -> Iterator[Recording]:
@@ -63,7 +65,8 @@ def parts(
     """Inputs that can be read apart from each other, in order, and the spec.
 
     The recordings of all parts, one part after the other, are those of the whole
-    input. A format whose module has no `parts(path, spec)` is one part.
+    input. A format whose module has no `parts(path, spec)` is one part. Where it has
+    `own_name(file)`, logs that are called alike in several folders are told apart.
 
     Args:
       name: key of `IMPORTERS`.
@@ -88,7 +91,11 @@ def parts(
     with as_input_error(
         str(input_path), f"logs of format {name}, and options as in its TOML"
     ):
-        return ([input_path] if split is None else split(input_path, spec)), spec
+        found = [input_path] if split is None else split(input_path, spec)
+        name_of = getattr(module, "own_name", None)
+        if name_of is not None:
+            spec = with_log_names(input_path, found, spec, name_of)
+    return found, spec
 
 
 def read_recordings(

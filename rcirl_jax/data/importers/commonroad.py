@@ -19,7 +19,7 @@ from rcirl_jax.data.importers.commonroad_extras import (
     read_ghosts,
     read_signals,
 )
-from rcirl_jax.data.importers.files import input_files
+from rcirl_jax.data.importers.files import files_below, log_name, with_log_names
 from rcirl_jax.data.importers.lanelets import read_lanes
 from rcirl_jax.data.importers.xml_fields import Fields
 from rcirl_jax.data.recording import validate_recording
@@ -27,6 +27,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Lane, Recording, Track
 
 VERSIONS = ("2018b", "2020a")
+GROUPS_UP = 4  # folders above a file in which the table of groups is looked for
 MAX_FILE_BYTES = 512 * 1024**2  # bytes, larger files are refused
 MAX_STEP = 1e6  # of the clock: a day at 10 Hz
 DEFAULT_LIMIT_MPS = 29.06  # m/s, 65 mph, where the source TOML names none
@@ -57,12 +58,18 @@ class _Box:
 
 def parts(path: Path, spec: dict) -> list[Path]:
     """The XML files; each can be read alone."""
-    return input_files(path, spec.get("pattern", "*.xml"))
+    return files_below(path, spec.get("pattern", "*.xml"))
+
+
+def own_name(file: Path) -> str:
+    """Name of a log, as long as no other folder has one called alike."""
+    return file.stem
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """One Recording per XML file."""
     files = parts(path, spec)
+    spec = with_log_names(path, files, spec, own_name)
     groups = _read_groups(path, spec.get("groups", ""))
     for file in files:
         yield validate_recording(_read_file(file, spec, groups), file)
@@ -71,7 +78,7 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
 def _read_groups(path: Path, name: str) -> dict[str, str]:
     """File name -> vehicle-disjoint group, from a CSV beside or above the files."""
     folder = (path if path.is_dir() else path.parent).resolve()
-    for place in (folder, folder.parent):
+    for place in (folder, *folder.parents[:GROUPS_UP]):
         table = place / name
         if not (name and table.is_file()):
             continue
@@ -132,7 +139,7 @@ def _read_file(path: Path, spec: dict, groups: dict[str, str]) -> Recording:
     centres = {lane.id: lane.centre for lane in lanes}
     source, licence = _provenance(root.get("source", "CommonRoad"), spec)
     return Recording(
-        name=path.stem,
+        name=log_name(path, spec, own_name(path)),
         source=f"{source} (CommonRoad {version})",
         licence=licence,
         rate_hz=1.0 / dt,

@@ -9,23 +9,26 @@ first, so that vehicles and their groups are those of a log read at once.
 What differs from a file that fits: lanes that are not given are fitted minute by
 minute, the given path is known for 28 s beyond the minute only, and a row out of
 order is found inside a minute only. Rows may come in any
-order of road users; scratch space of about the file's size is needed.
+order of road users; scratch space of about the file's size is needed. An importer
+that needs something of the whole recording finds it in `Spill.minutes`.
 
 pyarrow reads the text (extra `[logs]`).
 """
 
+import contextlib
 import dataclasses
 import importlib
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
 from rcirl_jax.data.importers.reading import reading
-from rcirl_jax.data.importers.tables import number, read_header
+from rcirl_jax.data.importers.tables import check_cells, number, read_header
 from rcirl_jax.errors import InputError
+from rcirl_jax.types import Recording, Track
 
 LONG_BYTES = 256 * 2**20  # bytes; a longer file is read in pieces
 READ_BYTES = 8 * 2**20  # bytes of text parsed at a time
@@ -44,6 +47,7 @@ class Field:
     column: str
     factor: float = 1.0
     text: bool = False
+    lower: bool = False  # text in small letters
     limit: float = np.inf  # in the file's unit; beyond it a number is absurd
 
 
@@ -66,28 +70,67 @@ def is_long(path: Path, spec: dict) -> bool:
     return path.is_file() and path.stat().st_size > limit
 
 
-def pieces(path: Path, fields: list[Field], max_gap_s: float) -> Iterator[Piece]:
-    """All pieces of a file, recording by recording in the order of time.
+@contextlib.contextmanager
+def spilled(
+    path: Path, fields: list[Field], wanted: Container[str] | None = None
+) -> Iterator["Spill"]:
+    """The rows of a file in scratch files, removed afterwards.
 
     Args:
       path: CSV with a header.
-      fields: at least t, id, x, y.
-      max_gap_s: a road user unseen for longer is another fragment.
+      fields: at least t [s], id.
+      wanted: values of the `recording` field whose rows are kept; None: all.
 
     Raises:
       InputError: unreadable text, a cell that is no finite number, or more
         than MAX_BLOCKS minutes.
     """
     with tempfile.TemporaryDirectory(prefix="rcirl-") as folder:
-        spill = _Spill(path, fields, Path(folder))
+        spill = Spill(path, fields, Path(folder), wanted)
         with reading(path, [path]) as show:
-            for batch in _batches(path, fields):  # one per READ_BYTES of text
+            for batch in batches(path, fields):  # one per READ_BYTES of text
                 spill.add(batch)
                 show(READ_BYTES)
-        yield from spill.pieces(max_gap_s)
+        if not any(spill.recordings()) and not spill.blocks:
+            raise InputError(f"{path}: rows: none: expected rows below the header")
+        spill.flush()
+        yield spill
 
 
-def _batches(path: Path, fields: list[Field]) -> Iterator[dict[str, np.ndarray]]:
+def pieces(path: Path, fields: list[Field], max_gap_s: float) -> Iterator[Piece]:
+    """All pieces of a file, recording by recording in the order of time.
+
+    Arguments and errors as of `spilled` and `Spill.pieces`.
+    """
+    with spilled(path, fields) as spill:
+        for recording in spill.recordings():
+            yield from spill.pieces(recording, max_gap_s)
+
+
+def piece_of(log: str, made: Recording, piece: Piece) -> Recording:
+    """A piece's Recording as a part of the log: its tracks named as in the whole."""
+    return dataclasses.replace(
+        made,
+        tracks=tuple(_of_log(track, piece.fragments) for track in made.tracks),
+        piece_of=log,
+        scenes_within=piece.within,
+        progress=piece.progress,
+    )
+
+
+def _of_log(track: Track, fragments: dict[str, list[float]]) -> Track:
+    """A track of a piece under the name that it has in the whole log."""
+    user = track.id if track.id in fragments else track.id.rpartition("#")[0]
+    starts = fragments[user]
+    number = int(np.searchsorted(starts, track.t[0] + 1e-6, side="right"))
+    return dataclasses.replace(
+        track,
+        id=user if number <= 1 else f"{user}#{number}",
+        seen_since=starts[max(number - 1, 0)],
+    )
+
+
+def batches(path: Path, fields: list[Field]) -> Iterator[dict[str, np.ndarray]]:
     """Columns of a few MiB of the file; text as (codes, names) pairs."""
     try:
         arrow, csv = (importlib.import_module(n) for n in ("pyarrow", "pyarrow.csv"))
@@ -97,6 +140,7 @@ def _batches(path: Path, fields: list[Field]) -> Iterator[dict[str, np.ndarray]]
         ) from error
     kinds = {f.column: arrow.string() if f.text else arrow.float64() for f in fields}
     names = read_header(path)
+    numeric = [f.column for f in fields if not f.text]
     try:
         reader = csv.open_csv(
             path,
@@ -109,67 +153,86 @@ def _batches(path: Path, fields: list[Field]) -> Iterator[dict[str, np.ndarray]]
                 strings_can_be_null=False,
             ),
         )
-        start = 2
+        start = 1
         for batch in reader:
-            yield {f.name: _column(path, batch, f, start) for f in fields}
+            columns = {f.name: _column(path, batch, f, start) for f in fields}
             start += batch.num_rows
+            if any(column is None for column in columns.values()):
+                _refuse(path, names, numeric, "a cell that is no finite number")
+            yield columns
     except arrow.ArrowException as error:
-        raise InputError(
-            f"{path}: {str(error)[:200]}: expected rows as the header says"
-        ) from error
+        _refuse(path, names, numeric, str(error)[:200])
 
 
 def _column(path: Path, batch: Any, field: Field, start: int) -> Any:  # noqa: ANN401
+    """Numbers [n], or (codes, names) of a text; None: not all are finite."""
     found = batch.column(field.column)
     if field.text:
         coded = found.dictionary_encode()
-        return coded.indices.to_numpy(), coded.dictionary.to_pylist()
+        names = [name.strip() for name in coded.dictionary.to_pylist()]
+        names = [name.lower() if field.lower else name for name in names]
+        return coded.indices.to_numpy(), names
     values = found.to_numpy(zero_copy_only=False)
-    # NaN compares false
-    bad = np.flatnonzero(~(np.isfinite(values) & (np.abs(values) <= field.limit)))
-    if bad.size:
+    if not np.isfinite(values).all():
+        return None
+    far = np.flatnonzero(np.abs(values) > field.limit)
+    if far.size:
         raise InputError(
-            f"{path}: line {start + bad[0]}: {field.column}: {values[bad[0]]}: "
-            f"expected a finite number within {field.limit:g}"
+            f"{path}: row {start + far[0]}: {field.column}: {values[far[0]]:g}: "
+            f"expected within {field.limit:g}"
         )
     return values * field.factor
 
 
-class _Spill:
+def _refuse(path: Path, names: list[str], numeric: list[str], why: str) -> NoReturn:
+    """Read slowly and name the first line that is wrong."""
+    check_cells(path, names, numeric)
+    reason = " ".join(why.split())
+    raise InputError(f"{path}: {reason}: expected rows as the header says")
+
+
+class Spill:
     """Rows by recording and minute in scratch files of float64."""
 
-    def __init__(self, path: Path, fields: list[Field], folder: Path) -> None:
-        self.path, self.folder = path, folder
+    def __init__(
+        self,
+        path: Path,
+        fields: list[Field],
+        folder: Path,
+        wanted: Container[str] | None = None,
+    ) -> None:
+        self.path, self.folder, self.wanted = path, folder, wanted
         self.names = [field.name for field in fields]
         self.texts = {field.name: {} for field in fields if field.text}
-        self.blocks: dict[tuple[int, int], None] = {}
+        self.blocks: dict[int, set[int]] = {}  # number of a recording -> minutes
         self.buffers: dict[tuple[int, int], list[np.ndarray]] = {}
         self.held = 0  # bytes in the buffers
+        self.given = 0  # pieces
 
     def add(self, batch: dict) -> None:
         """Sort a batch's rows into their minutes."""
         columns = [self._numbers(name, batch[name]) for name in self.names]
         rows = np.stack(columns, axis=1)
-        t = rows[:, self.names.index("t")]
         recording = np.zeros(len(rows), np.int64)
         if "recording" in self.names:
             recording = rows[:, self.names.index("recording")].astype(np.int64)
-        minute = np.floor(t / BLOCK_S).astype(np.int64)
+            rows, recording = self._of_wanted(rows, recording)
+        minute = np.floor(rows[:, self.names.index("t")] / BLOCK_S).astype(np.int64)
         order = np.lexsort((minute, recording))  # stable: the file's order inside
         keys = np.stack([recording, minute], axis=1)[order]
         changes = np.flatnonzero(np.any(np.diff(keys, axis=0), axis=1)) + 1
-        for part in np.split(order, changes):
+        for part in np.split(order, changes) if order.size else []:
             key = (int(recording[part[0]]), int(minute[part[0]]))
-            self.blocks[key] = None
+            self.blocks.setdefault(key[0], set()).add(key[1])
             self.buffers.setdefault(key, []).append(rows[part])
-        if len(self.blocks) > MAX_BLOCKS:
+        if sum(map(len, self.blocks.values())) > MAX_BLOCKS:
             raise InputError(
                 f"{self.path}: t: more than {MAX_BLOCKS} minutes: expected seconds; "
                 "wrong unit of time?"
             )
         self.held += rows.nbytes
         if self.held > BUFFER_BYTES:
-            self._flush()
+            self.flush()
 
     def _numbers(self, name: str, column: Any) -> np.ndarray:  # noqa: ANN401
         """A column as float64; texts as their numbers in order of appearance."""
@@ -177,73 +240,103 @@ class _Spill:
             return column
         codes, texts = column
         known = self.texts[name]
-        mine = [known.setdefault(text.strip(), len(known)) for text in texts]
+        mine = [known.setdefault(text, len(known)) for text in texts]
         return np.array(mine, np.float64)[codes]
 
-    def _flush(self) -> None:
+    def _of_wanted(
+        self, rows: np.ndarray, recording: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        if self.wanted is None:
+            return rows, recording
+        kept = np.array([name in self.wanted for name in self.texts["recording"]])
+        return rows[kept[recording]], recording[kept[recording]]
+
+    def flush(self) -> None:
+        """Write what is held to the scratch files."""
         for (recording, minute), rows in self.buffers.items():
             with (self.folder / f"{recording}_{minute}").open("ab") as file:
                 for part in rows:
                     file.write(np.ascontiguousarray(part).tobytes())
         self.buffers, self.held = {}, 0
 
-    def _rows(self, recording: int, minute: int) -> np.ndarray:
-        if (recording, minute) not in self.blocks:
+    def recordings(self) -> list[str | None]:
+        """Values of `recording` met, left out ones too; [None] without the field."""
+        return list(self.texts.get("recording", [None]))
+
+    def _minutes(self, recording: str | None) -> tuple[int, list[int]]:
+        """A recording's number, and its minutes in the order of time."""
+        code = 0 if recording is None else self.texts["recording"][recording]
+        return code, sorted(self.blocks.get(code, ()))
+
+    def _rows(self, code: int, minute: int) -> np.ndarray:
+        if minute not in self.blocks[code]:
             return np.zeros((0, len(self.names)))
-        raw = np.fromfile(self.folder / f"{recording}_{minute}", np.float64)
+        raw = np.fromfile(self.folder / f"{code}_{minute}", np.float64)
         return raw.reshape(-1, len(self.names))
 
-    def _fragments(self, max_gap_s: float) -> dict[tuple[int, int], list[float]]:
-        """(recording, id) -> times [s] at which it is first seen, or again."""
-        found: dict[tuple[int, int], list[float]] = {}
-        last: dict[tuple[int, int], float] = {}
+    def minutes(self, recording: str | None) -> Iterator[dict[str, np.ndarray]]:
+        """Field -> [n] of each minute alone, t as in the file."""
+        code, minutes = self._minutes(recording)
+        for minute in minutes:
+            yield self._values(self._rows(code, minute))
+
+    def _values(self, rows: np.ndarray) -> dict[str, np.ndarray]:
+        values = {name: rows[:, place] for place, name in enumerate(self.names)}
+        values.pop("recording", None)
+        for name, table in self.texts.items():
+            if name in values:
+                values[name] = np.array(list(table))[values[name].astype(np.int64)]
+        return values
+
+    def _fragments(
+        self, code: int, minutes: list[int], max_gap_s: float
+    ) -> dict[int, list[float]]:
+        """Number of id -> times [s] at which it is first seen, or again."""
+        found: dict[int, list[float]] = {}
+        last: dict[int, float] = {}
         t, user = self.names.index("t"), self.names.index("id")
-        for recording, minute in sorted(self.blocks):
-            rows = self._rows(recording, minute)[:, [user, t]]
+        for minute in minutes:
+            rows = self._rows(code, minute)[:, [user, t]]
             rows = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
             same = np.diff(rows[:, 0]) == 0.0
             later = same & (np.diff(rows[:, 1]) > max_gap_s)
             starts = np.flatnonzero(np.concatenate([[True], ~same | later]))
             ends = np.concatenate([starts[1:] - 1, [len(rows) - 1]])
             for low, high in zip(starts.tolist(), ends.tolist(), strict=True):
-                key = (recording, int(rows[low, 0]))
-                begin = float(rows[low, 1])
+                key, begin = int(rows[low, 0]), float(rows[low, 1])
                 if begin - last.get(key, -np.inf) > max_gap_s:
                     found.setdefault(key, []).append(begin)
                 last[key] = float(rows[high, 1])
         return found
 
-    def pieces(self, max_gap_s: float) -> Iterator[Piece]:
-        """Every minute with its surroundings."""
-        self._flush()
-        names = {key: list(table) for key, table in self.texts.items()}
+    def pieces(self, recording: str | None, max_gap_s: float) -> Iterator[Piece]:
+        """Every minute of a recording with its surroundings, in the order of time.
+
+        Args:
+          recording: one of `recordings()`.
+          max_gap_s: a road user unseen for longer is another fragment.
+        """
+        code, minutes = self._minutes(recording)
+        users: list[str] = list(self.texts.get("id", {}))
         t, user = self.names.index("t"), self.names.index("id")
-        fragments = self._fragments(max_gap_s)
-        begin: dict[int, float] = {}
-        for (recording, _), (seen, *_) in fragments.items():
-            begin[recording] = min(seen, begin.get(recording, np.inf))
-        for done, (recording, minute) in enumerate(sorted(self.blocks), start=1):
+        fragments = self._fragments(code, minutes, max_gap_s)
+        start = min(seen for seen, *_ in fragments.values()) if fragments else 0.0
+        total = sum(map(len, self.blocks.values()))
+        for minute in minutes:
+            self.given += 1
             low, high = minute * BLOCK_S, (minute + 1) * BLOCK_S
-            near = [self._rows(recording, minute + k) for k in (-1, 0, 1)]
-            rows = np.concatenate(near)
+            rows = np.concatenate([self._rows(code, minute + k) for k in (-1, 0, 1)])
             rows = rows[(rows[:, t] >= low - BEFORE_S) & (rows[:, t] < high + AFTER_S)]
-            start = begin[recording]
-            values: dict[str, np.ndarray] = {}
-            for place, name in enumerate(self.names):
-                column = rows[:, place]
-                if name in names:
-                    column = np.array(names[name])[column.astype(np.int64)]
-                values[name] = column
+            values = self._values(rows)
             values["t"] = values["t"] - start
-            named = values.pop("recording", None)
             yield Piece(
-                recording=None if named is None else names["recording"][recording],
+                recording=recording,
                 number=minute - int(np.floor(start / BLOCK_S)),
                 values=values,
                 within=(low - start, high - start),
                 fragments={
-                    names["id"][u]: [s - start for s in fragments[recording, u]]
+                    users[u] if users else str(u): [s - start for s in fragments[u]]
                     for u in np.unique(rows[:, user]).astype(int).tolist()
                 },
-                progress=done / len(self.blocks),
+                progress=self.given / total,
             )

@@ -5,7 +5,6 @@ coordinates and clocks lose their origin here, in float64: the package computes
 in float32 later.
 """
 
-import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -119,26 +118,7 @@ def _long_recordings(path: Path, spec: dict) -> Iterator[Recording]:
         log = path.stem if piece.recording is None else f"{path.stem}-{piece.recording}"
         table = _localise(path, piece.values, rate, notes, start=0.0)
         made = _recording(f"{log}-{piece.number:05d}", table, spec)
-        made = dataclasses.replace(
-            made,
-            tracks=tuple(_of_log(track, piece.fragments) for track in made.tracks),
-            piece_of=log,
-            scenes_within=piece.within,
-            progress=piece.progress,
-        )
-        yield validate_recording(made, path)
-
-
-def _of_log(track: Track, fragments: dict[str, list[float]]) -> Track:
-    """A track of a piece under the name that it has in the whole log."""
-    user = track.id if track.id in fragments else track.id.rpartition("#")[0]
-    starts = fragments[user]
-    number = int(np.searchsorted(starts, track.t[0] + 1e-6, side="right"))
-    return dataclasses.replace(
-        track,
-        id=user if number <= 1 else f"{user}#{number}",
-        seen_since=starts[max(number - 1, 0)],
-    )
+        yield validate_recording(csv_stream.piece_of(log, made, piece), path)
 
 
 def _columns(path: Path, spec: dict) -> dict[str, tuple[str, float]]:

@@ -1,5 +1,7 @@
 """Which files of an input an importer reads."""
 
+import collections
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from rcirl_jax.errors import InputError
@@ -16,6 +18,46 @@ def input_files(path: Path, pattern: str) -> list[Path]:
     if not found:
         raise InputError(f"{path}: no file matches {pattern}: expected log files")
     return found
+
+
+def files_below(path: Path, pattern: str) -> list[Path]:
+    """The file itself, or matching files at any depth, sorted by relative path.
+
+    What unpacking leaves of another system (__MACOSX) is passed over.
+    """
+    if path.is_dir():
+        found = {file for file in path.rglob(pattern) if file.is_file()}
+        found = {f for f in found if "__MACOSX" not in f.relative_to(path).parts}
+        if found:
+            return sorted(found)
+    return input_files(path, pattern)
+
+
+def with_log_names(
+    path: Path, files: Sequence[Path], spec: dict, name_of: Callable[[Path], str]
+) -> dict:
+    """The spec, with names for logs that are called alike in several folders.
+
+    Their relative folder comes first (FOLDER/NAME); every other log keeps its name.
+
+    Args:
+      path: folder of the input.
+      files: its logs.
+      spec: source TOML.
+      name_of: name of a log by its file.
+    """
+    met = collections.Counter(name_of(file) for file in files)
+    names = {
+        str(file): (file.relative_to(path).parent / name_of(file)).as_posix()
+        for file in files
+        if met[name_of(file)] > 1
+    }
+    return {**spec, "log_names": names} if names else spec
+
+
+def log_name(file: Path, spec: Mapping, name: str) -> str:
+    """`name`, or the one that tells a log from others called alike."""
+    return spec.get("log_names", {}).get(str(file), name)
 
 
 def listing(path: Path) -> list:

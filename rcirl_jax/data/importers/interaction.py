@@ -19,7 +19,11 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.importers.files import input_files
+from rcirl_jax.data.importers.files import (
+    input_files,
+    log_name,
+    with_log_names,
+)
 from rcirl_jax.data.importers.lanelet2 import read_lanelet2
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.projection import utm, utm_zone
@@ -80,7 +84,9 @@ class _Scene:
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """One Recording per vehicle file, or per case of a challenge file."""
-    for file in parts(path, spec):
+    files = parts(path, spec)
+    spec = with_log_names(path, files, spec, own_name)
+    for file in files:
         header = read_header(file)
         table = _read(file, header)
         scene = _scene(file, spec)
@@ -92,15 +98,18 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
             extra = _read(partner, read_header(partner))
             table = {k: np.concatenate([table[k], extra[k]]) for k in table}
         number_ = file.stem.removeprefix(VEHICLES).removeprefix(PEDESTRIANS)
-        name = f"{_scene_name(file)}-{number_}"
-        yield validate_recording(_recording(name, table, scene, None), file)
+        own = f"{_scene_name(file)}-{number_}"
+        name = log_name(file, spec, own)
+        # logs of one name may be copies of each other
+        group = None if name == own else own
+        yield validate_recording(_recording(name, table, scene, group), file)
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
-    """The log files below a folder; pedestrians come with their vehicles."""
+    """The log files below a folder, no other tables; pedestrians with vehicles."""
     if path.is_file():
         return [path]
-    found = [f for f in sorted(path.rglob("*.csv")) if not f.name.endswith(LEFT_OUT)]
+    found = [file for file in sorted(path.rglob("*.csv")) if _is_log(file)]
     names = set(found)
     kept = [
         file
@@ -109,6 +118,27 @@ def parts(path: Path, spec: dict) -> list[Path]:
         or file.with_name(file.name.replace(PEDESTRIANS, VEHICLES, 1)) not in names
     ]
     return kept or input_files(path, "**/*.csv")
+
+
+def _is_log(path: Path) -> bool:
+    """Whether a file has a log's name, or its columns under another name."""
+    if path.name.endswith(LEFT_OUT):
+        return False
+    if path.name.startswith((VEHICLES, PEDESTRIANS)) or path.stem.endswith(SETS):
+        return True
+    try:
+        header = read_header(path)
+    except InputError:
+        return False
+    return {"track_id", "timestamp_ms"} <= set(header)
+
+
+def own_name(file: Path) -> str:
+    """Name of a log, as long as no other folder has one called alike."""
+    if not file.name.startswith((VEHICLES, PEDESTRIANS)):
+        return file.stem
+    number_ = file.stem.removeprefix(VEHICLES).removeprefix(PEDESTRIANS)
+    return f"{_scene_name(file)}-{number_}"
 
 
 def _scene_name(path: Path) -> str:
@@ -196,7 +226,8 @@ def _cases(table: dict[str, np.ndarray], scene: _Scene) -> Iterator[Recording]:
         raise InputError(f"{scene.path}: case_id: '': expected a number in every row")
     for rows in np.split(order, np.flatnonzero(np.diff(case)) + 1):
         part = {field: values[rows] for field, values in table.items()}
-        name = f"{scene.path.stem}-case{part['case_id'][0]:g}"
+        log = log_name(scene.path, scene.spec, scene.path.stem)
+        name = f"{log}-case{part['case_id'][0]:g}"
         recording = _recording(name, part, scene, scene.path.stem)
         yield validate_recording(recording, scene.path)
 

@@ -7,43 +7,54 @@ without lateral positions (Local_X = 0) get them from the lane number.
 
 The portal's CSV holds several sites and periods; vehicle and frame numbers
 start anew in each. Sites become Recordings of their own; where the file has
-Global_Time, it is the clock, else Frame_ID.
+Global_Time, it is the clock and rows may come in any order, else Frame_ID. A CSV
+longer than `long_bytes` becomes a Recording per site and minute (`csv_stream`).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
 
+from rcirl_jax.data.importers import csv_stream
 from rcirl_jax.data.importers.files import input_files
+from rcirl_jax.data.importers.ngsim_site import (
+    FRAME_S,
+    MAX_FRAME_GAP,
+    SITE,
+    Survey,
+    Table,
+    drop_repeated,
+    site_recording,
+)
+from rcirl_jax.data.importers.sparse_tables import (
+    MAX_PLACE_M,
+    MAX_TIME,
+    check_range,
+)
 from rcirl_jax.data.importers.tables import (
-    StraightLane,
     check_row,
     load_rows,
     number,
     read_header,
     read_table,
-    split_tracks,
-    straight_lanes,
-    travel_heading,
     unit_factor,
 )
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Kind, Lane, Recording, Track
+from rcirl_jax.types import Recording
 
 NEEDED = ("Vehicle_ID", "Frame_ID", "Local_Y", "v_Class", "v_Vel", "Lane_ID")
 OPTIONAL = ("Local_X", "v_Length", "v_Width", "Global_Time")
 LENGTHS = ("Local_X", "Local_Y", "v_Length", "v_Width", "v_Vel")
-SITE = "Location"
-MAX_FRAME_GAP = 1  # frames; a larger gap starts a new track
-REUSE_S = 60.0  # s; a step back by more is a number given to another vehicle
-MARGIN_M = 50.0  # m of lane beyond the first and last position
-LANE_WIDTH_M = 3.6576  # m, 12 ft, US freeway
-SWITCH_S = 4.0  # s, a lane change takes 3 to 6 s
-LIMIT_MPS = 29.06  # m/s, 65 mph
-SIZE_M = (4.5, 1.8)  # m, a car
+MAX_NUMBER = 1e12  # of a vehicle or lane; larger ones are no numbers of anything
+# in the file's unit: what no log can mean
+LIMITS = {
+    **dict.fromkeys(("Vehicle_ID", "Lane_ID", "v_Class"), MAX_NUMBER),
+    **dict.fromkeys(("Frame_ID", "Global_Time"), MAX_TIME),
+    **dict.fromkeys(LENGTHS, MAX_PLACE_M),
+}
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
@@ -58,91 +69,144 @@ def parts(path: Path, spec: dict) -> list[Path]:
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
-    """One Recording per file and site."""
+    """One Recording per file and site; of a long CSV, per site and minute."""
     for file in parts(path, spec):
-        for recording in _read_file(file, spec):
+        factor = unit_factor(file, "unit", spec.get("unit", "ft"), ("ft", "m"))
+        is_csv = _has_header(file)
+        if is_csv and csv_stream.is_long(file, spec):
+            found = _long_recordings(file, spec, factor)
+        else:
+            table = _read_csv(file) if is_csv else _read_text(file, spec)
+            found = _whole_recordings(file, spec, factor, table)
+        for recording in found:
             yield validate_recording(recording, file)
 
 
-def _read_file(path: Path, spec: dict) -> Iterator[Recording]:
-    table = _read_csv(path) if _has_header(path) else _read_text(path, spec)
-    factor = unit_factor(path, "unit", spec.get("unit", "ft"), ("ft", "m"))
+def _whole_recordings(
+    path: Path, spec: dict, factor: float, table: Table
+) -> Iterator[Recording]:
+    for name, limit in LIMITS.items():
+        check_range(path, table, (name,), limit)
     for name in LENGTHS:
         table[name] = table[name] * factor
-    if SITE not in table:
-        yield _read_site(path, path.stem, table, spec, [])
-        return
-    sites = np.unique(table[SITE])
-    known = [site for site in sites if site in spec.get("locations", sites)]
+    sites = np.unique(table[SITE]).tolist() if SITE in table else [None]
+    known, left_out = _known_sites(path, sites, spec)
+    frame_s = number(spec, "frame_s", FRAME_S)
+    for site in known:
+        rows = slice(None) if site is None else table[SITE] == site
+        part = {name: values[rows] for name, values in table.items() if name != SITE}
+        stamped = _has_stamps(part["Global_Time"])
+        part["frame"] = _clock(part, frame_s, stamped)
+        survey = Survey()
+        survey.add(part)
+        notes = [*left_out, *survey.notes()]
+        name = _name(path, site, sites)
+        yield site_recording(
+            path, name, part, spec, survey, stamped=stamped, notes=notes
+        )
+
+
+def _long_recordings(path: Path, spec: dict, factor: float) -> Iterator[Recording]:
+    """One Recording per site and minute; lanes and notes are the site's."""
+    frame_s = number(spec, "frame_s", FRAME_S)
+    names, header = _columns(path), read_header(path)
+    for name in NEEDED:
+        if names[name] not in header:
+            raise InputError(
+                f"{path}: column {names[name]}: missing: expected it among {header}"
+            )
+    stamped = names["Global_Time"] in header and _has_stamps_long(
+        path, names["Global_Time"]
+    )
+    clock, step = ("Global_Time", 1e-3) if stamped else ("Frame_ID", frame_s)
+    fields = [
+        csv_stream.Field(
+            name="t", column=names[clock], factor=step, limit=LIMITS[clock]
+        ),
+        csv_stream.Field(name="id", column=names["Vehicle_ID"]),
+        *(
+            csv_stream.Field(
+                name=n,
+                column=names[n],
+                factor=factor if n in LENGTHS else 1.0,
+                limit=LIMITS.get(n, np.inf),
+            )
+            for n in (*NEEDED, *OPTIONAL)
+            if names[n] in header
+        ),
+    ]
+    if names[SITE] in header:
+        fields.append(
+            csv_stream.Field(
+                name="recording", column=names[SITE], text=True, lower=True
+            )
+        )
+
+    def table_of(values: Table) -> Table:
+        return _complete({**values, "frame": np.round(values["t"] / frame_s)})
+
+    gap_s = (MAX_FRAME_GAP + 0.5) * frame_s
+    with csv_stream.spilled(path, fields, spec.get("locations")) as spill:
+        sites = spill.recordings()
+        known, left_out = _known_sites(path, sites, spec)
+        for site in known:
+            survey, log = Survey(), _name(path, site, sites)
+            for values in spill.minutes(site):
+                survey.add(table_of(values))
+            notes = [*left_out, *survey.notes()]  # once, with the first minute
+            for piece in spill.pieces(site, gap_s):
+                table, name = table_of(piece.values), f"{log}-{piece.number:05d}"
+                drop_repeated(table)
+                made = site_recording(
+                    path, name, table, spec, survey, stamped=stamped, notes=notes
+                )
+                yield csv_stream.piece_of(log, made, piece)
+                notes = []
+
+
+def _known_sites(
+    path: Path, sites: Sequence[str | None], spec: dict
+) -> tuple[list[str | None], list[str]]:
+    """Sites that are read, in order, and a note about the others."""
+    if list(sites) == [None]:
+        return [None], []
+    names = sorted(str(site) for site in sites)
+    known = [site for site in names if site in spec.get("locations", names)]
     if not known:
         raise InputError(
-            f"{path}: {SITE}: {', '.join(sites)}: "
+            f"{path}: {SITE}: {', '.join(names)}: "
             f"expected one of {', '.join(spec['locations'])}"
         )
-    left_out = [str(site) for site in sites if site not in known]
-    notes = [f"left out, no freeway: {', '.join(left_out)}"] if left_out else []
-    for site in known:
-        rows = table[SITE] == site
-        part = {name: values[rows] for name, values in table.items()}
-        name = path.stem if len(sites) == 1 else f"{path.stem}-{site}"
-        yield _read_site(path, name, part, spec, notes)
+    left_out = [site for site in names if site not in known]
+    return [*known], [f"left out, no freeway: {', '.join(left_out)}"][: len(left_out)]
 
 
-def _read_site(
-    path: Path, name: str, table: dict, spec: dict, notes: list[str]
-) -> Recording:
-    frame_s = number(spec, "frame_s", 0.1)
-    lateral = bool(np.any(table["Local_X"] != 0.0))
-    notes = list(notes)
-    if not lateral:
-        notes.append("no lateral positions; built from lane numbers")
-    for field, column in (("length", "v_Length"), ("width", "v_Width")):
-        missing = len(np.unique(table["Vehicle_ID"][table[column] <= 0.0]))
-        if missing:
-            notes.append(f"{missing} vehicles without {field}; default by class")
-    table["frame"] = _clock(table, frame_s)
-    repeated = _drop_repeated(table)
-    if repeated:
-        notes.append(f"{repeated} rows met twice, used once")
-    reuse = REUSE_S / frame_s
-    vehicles = table["Vehicle_ID"].astype(np.int64)
-    pieces = split_tracks(path, vehicles, table["frame"], MAX_FRAME_GAP, reuse)
-    tracks = [_track(name, table, rows, spec, lateral) for name, rows in pieces]
-    return Recording(
-        name=name,
-        source=spec.get("source", "NGSIM"),
-        licence=spec.get("licence", "unknown"),
-        rate_hz=1.0 / frame_s,
-        tracks=tuple(tracks),
-        lanes=_lanes(path, table, spec, lateral),
-        default_speed_limit=number(spec, "speed_limit", LIMIT_MPS),
-        notes=tuple(notes),
-    )
+def _name(path: Path, site: str | None, sites: Sequence[str | None]) -> str:
+    """Of a site's recording: the file's alone where it has one site."""
+    return path.stem if len(sites) == 1 else f"{path.stem}-{site}"
 
 
-def _clock(table: dict, frame_s: float) -> np.ndarray:
+def _has_stamps(stamps: np.ndarray) -> bool:
+    """Whether Global_Time [ms] is the clock: positive, and not one for all rows."""
+    return bool(stamps.min() > 0.0 and stamps.max() > stamps.min())
+
+
+def _has_stamps_long(path: Path, column: str) -> bool:
+    """`_has_stamps` of a whole file, read a few MiB at a time."""
+    field = csv_stream.Field(name="stamps", column=column)
+    found = (batch["stamps"] for batch in csv_stream.batches(path, [field]))
+    ends = [(part.min(), part.max()) for part in found if part.size]
+    return bool(ends) and _has_stamps(np.array(ends))
+
+
+def _clock(table: Table, frame_s: float, stamped: bool) -> np.ndarray:
     """Whole frames since the recording's first, from Global_Time if it is there."""
-    stamps = table["Global_Time"]
-    if stamps.min() > 0.0 and len(np.unique(stamps)) > 1:
+    if stamped:
+        stamps = table["Global_Time"]
         frames = np.round((stamps - stamps.min()) / (1000.0 * frame_s))
     else:
         frames = table["Frame_ID"] - table["Frame_ID"].min()
     return np.round(frames)
-
-
-def _drop_repeated(table: dict[str, np.ndarray]) -> int:
-    """Remove rows that repeat another in every value; returns how many."""
-    values = [column for name, column in table.items() if name != SITE]
-    order = np.lexsort((np.arange(values[0].size), table["frame"], table["Vehicle_ID"]))
-    stacked = np.stack(values, axis=1)[order]
-    repeated = np.all(stacked[1:] == stacked[:-1], axis=1)
-    if not repeated.any():
-        return 0
-    keep = np.ones(order.size, bool)
-    keep[order[1:][repeated]] = False
-    for name in table:
-        table[name] = table[name][keep]
-    return int(repeated.sum())
 
 
 def _has_header(path: Path) -> bool:
@@ -157,24 +221,33 @@ def _has_header(path: Path) -> bool:
     return "," in first
 
 
-def _read_csv(path: Path) -> dict[str, np.ndarray]:
-    """CSV: header names are matched without regard to case."""
+def _columns(path: Path) -> dict[str, str]:
+    """Column -> its name in the CSV's header, without regard to case."""
     actual = {name.lower(): name for name in read_header(path)}
-    names = {n: actual.get(n.lower(), n) for n in (*NEEDED, *OPTIONAL, SITE)}
+    return {n: actual.get(n.lower(), n) for n in (*NEEDED, *OPTIONAL, SITE)}
+
+
+def _read_csv(path: Path) -> Table:
+    names = _columns(path)
     found = read_table(
         path,
         [names[n] for n in NEEDED],
         [names[n] for n in (*OPTIONAL, SITE)],
         [names[SITE]],
     )
-    count = found[names["Frame_ID"]].size
-    table = {n: found.get(names[n], np.zeros(count)) for n in (*NEEDED, *OPTIONAL)}
-    if names[SITE] in found:
-        table[SITE] = np.char.lower(found[names[SITE]])
+    table = _complete({n: found[names[n]] for n in names if names[n] in found})
+    if SITE in table:
+        table[SITE] = np.char.lower(table[SITE])
     return table
 
 
-def _read_text(path: Path, spec: dict) -> dict[str, np.ndarray]:
+def _complete(table: Table) -> Table:
+    """Zeros for optional columns that a file has not."""
+    none = np.zeros(table["Frame_ID"].size)
+    return {name: table.get(name, none) for name in (*NEEDED, *OPTIONAL)} | table
+
+
+def _read_text(path: Path, spec: dict) -> Table:
     columns = spec.get("columns", [])
     for name in NEEDED:
         if name not in columns:
@@ -186,8 +259,7 @@ def _read_text(path: Path, spec: dict) -> dict[str, np.ndarray]:
         values = np.zeros((0, 0))
     if values.shape[1:] != (len(columns),) or not np.isfinite(values).all():
         _find_bad_line(path, columns)
-    table = {name: values[:, columns.index(name)] for name in wanted}
-    return {n: table.get(n, np.zeros(len(values))) for n in (*NEEDED, *OPTIONAL)}
+    return _complete({name: values[:, columns.index(name)] for name in wanted})
 
 
 def _find_bad_line(path: Path, columns: list[str]) -> NoReturn:
@@ -197,68 +269,3 @@ def _find_bad_line(path: Path, columns: list[str]) -> NoReturn:
             if text.strip():
                 check_row(path, line, text.split(), columns, columns)
     raise InputError(f"{path}: rows: unreadable: expected {len(columns)} numbers each")
-
-
-def _track(
-    name: str, table: dict, rows: np.ndarray, spec: dict, lateral: bool
-) -> Track:
-    frame_s = number(spec, "frame_s", 0.1)
-    sizes = spec.get("sizes", {})
-    kind = str(int(table["v_Class"][rows[0]]))
-    default = sizes.get(kind, sizes.get("0", SIZE_M))
-    length = float(table["v_Length"][rows[0]]) or float(default[0])
-    width = float(table["v_Width"][rows[0]]) or float(default[1])
-    x = table["Local_Y"][rows] - 0.5 * length
-    if lateral:
-        y = -table["Local_X"][rows]
-    else:
-        y = _lateral_from_lanes(table["Lane_ID"][rows], spec)
-    t = table["frame"][rows] * frame_s
-    return Track(
-        id=name,
-        kind=Kind.VEHICLE,
-        length=length,
-        width=width,
-        t=t,
-        x=x,
-        y=y,
-        heading=travel_heading(t, x, y),
-        speed=table["v_Vel"][rows],
-    )
-
-
-def _lateral_from_lanes(lane: np.ndarray, spec: dict) -> np.ndarray:
-    """Lane centres [n] m, each switch spread over `lane_switch_s`.
-
-        y = y_0 + sum_k (y_k - y_{k-1}) S((t - t_k) / 4 s + 1/2),  S(u) = 3u^2 - 2u^3
-
-    with t_k midway between the last sample in the old lane and the first in the
-    new one.
-    """
-    width = number(spec, "lane_width_m", LANE_WIDTH_M)
-    span = number(spec, "lane_switch_s", SWITCH_S) / number(spec, "frame_s", 0.1)
-    y = np.full(lane.shape, -width * (lane[0] - 0.5))
-    samples = np.arange(lane.size)
-    for at in np.flatnonzero(np.diff(lane) != 0.0):
-        u = np.clip((samples - at - 0.5) / max(span, 1e-9) + 0.5, 0.0, 1.0)
-        y -= width * (lane[at + 1] - lane[at]) * u**2 * (3.0 - 2.0 * u)
-    return y
-
-
-def _lanes(path: Path, table: dict, spec: dict, lateral: bool) -> tuple[Lane, ...]:
-    """One straight lane per lane number, over where it was driven +- 50 m."""
-    width = number(spec, "lane_width_m", LANE_WIDTH_M)
-    found = []
-    for lane in np.unique(table["Lane_ID"].astype(int)):
-        rows = table["Lane_ID"].astype(int) == lane
-        along = table["Local_Y"][rows]
-        across = float(np.median(table["Local_X"][rows])) if lateral else 0.0
-        found.append(
-            StraightLane(
-                id=str(lane),
-                y=-across if lateral else -width * (int(lane) - 0.5),
-                lower=float(along.min()) - MARGIN_M,
-                upper=float(along.max()) + MARGIN_M,
-            )
-        )
-    return straight_lanes(path, found, width, number(spec, "speed_limit", LIMIT_MPS))

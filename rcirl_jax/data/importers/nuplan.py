@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.importers.files import input_files
+from rcirl_jax.data.importers.files import files_below, log_name, with_log_names
 from rcirl_jax.data.importers.nuplan_map import NuplanMap, find_map
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.perception import Boxes, positive, section, tracks_of
@@ -87,6 +87,7 @@ class _Log:
 
     database: Database
     name: str
+    group: str  # logs of one name may be copies of each other
     poses: np.ndarray  # [n, 10] as POSE, in the order of time
     kinds: dict[bytes, int]  # token of a track -> Kind
     road: NuplanMap | None
@@ -95,13 +96,20 @@ class _Log:
 
 def parts(path: Path, spec: dict) -> list[Path]:
     """The databases: each can be read without the others."""
-    return input_files(path, str(spec.get("pattern", "*.db")))
+    return files_below(path, str(spec.get("pattern", "*.db")))
+
+
+def own_name(file: Path) -> str:
+    """Name of a log, as long as no other folder has one called alike."""
+    return file.stem
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """One Recording per log, or per window of a long one."""
     roads: dict[Path, NuplanMap] = {}
-    for file in parts(path, spec):
+    files = parts(path, spec)
+    spec = with_log_names(path, files, spec, own_name)
+    for file in files:
         with Database(file) as database:
             for table, columns in TABLES.items():
                 database.need(table, columns)
@@ -110,7 +118,8 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
                 roads = {map_file: NuplanMap(map_file)}  # one city at a time
             log = _Log(
                 database=database,
-                name=file.stem,
+                name=log_name(file, spec, own_name(file)),
+                group=own_name(file),
                 poses=_poses(database),
                 kinds=_kinds(database),
                 road=roads[map_file] if map_file is not None else None,
@@ -174,7 +183,9 @@ def _windows(log: _Log) -> Iterator[Recording]:
         if len(filled) > 1:
             # neighbouring windows show the same vehicles
             name = f"{log.name}-{index:03d}"
-            recording = dataclasses.replace(recording, name=name, group=log.name)
+            recording = dataclasses.replace(recording, name=name, group=log.group)
+        elif log.name != log.group:
+            recording = dataclasses.replace(recording, group=log.group)
         yield recording
 
 

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.importers.files import input_files
+from rcirl_jax.data.importers.files import files_below, log_name, with_log_names
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.projection import utm, utm_zone
 from rcirl_jax.data.importers.sparse_tables import (
@@ -70,15 +70,22 @@ class _Drive:
 
 def parts(path: Path, spec: dict) -> list[Path]:
     """The drives; specifications and notes beside them are none."""
-    files = input_files(path, str(spec.get("pattern", "*.csv")))
+    files = files_below(path, str(spec.get("pattern", "*.csv")))
     if path.is_dir():
         files = [file for file in files if not NOT_LOGS.fullmatch(file.name)] or files
     return files
 
 
+def own_name(file: Path) -> str:
+    """Name of a log, as long as no other folder has one called alike."""
+    return file.stem
+
+
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """Recordings of `block_s` seconds, file by file."""
-    for file in parts(path, spec):
+    files = parts(path, spec)
+    spec = with_log_names(path, files, spec, own_name)
+    for file in files:
         drive = _read_drive(file)
         for block in _blocks(drive, spec):
             yield validate_recording(block, file)
@@ -186,7 +193,7 @@ def _blocks(drive: _Drive, spec: dict) -> Iterator[Recording]:
         if not tracks:
             continue
         found = True
-        stem = drive.path.stem
+        stem = log_name(drive.path, spec, own_name(drive.path))
         name = stem if numbers.size == 1 else f"{stem}-{int(block):04d}"
         yield _recording(name, drive, tracks, spec, rate, [*notes, *origin])
     if not found:

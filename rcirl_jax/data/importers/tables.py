@@ -127,6 +127,12 @@ def load_rows(
 
 def _find_bad_cell(path: Path, header: list[str], numeric: list[str]) -> NoReturn:
     """Read slowly and name the first line that is wrong."""
+    check_cells(path, header, numeric)
+    raise InputError(f"{path}: rows: unreadable: expected comma-separated cells")
+
+
+def check_cells(path: Path, header: list[str], numeric: list[str]) -> None:
+    """Every row of a CSV is as `check_row` says; slow, to explain a failure."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as handle:
             reader = csv.reader(handle)
@@ -136,7 +142,6 @@ def _find_bad_cell(path: Path, header: list[str], numeric: list[str]) -> NoRetur
                     check_row(path, reader.line_num, row, header, numeric)
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: text: {error}: expected CSV text") from error
-    raise InputError(f"{path}: rows: unreadable: expected comma-separated cells")
 
 
 def check_row(
