@@ -41,7 +41,7 @@ def test_a_small_sweep(tmp_path):
     ("flag", "message"),
     [
         ("--leaky_rates=0.05,much", "leaky_rates"),
-        ("--hidden_sizes=15,32xb", "hidden_size"),
+        ("--hidden_sizes=15,32xb", "hidden_sizes"),
     ],
 )
 def test_wrong_flags_are_one_line(flag, message, tmp_path):
