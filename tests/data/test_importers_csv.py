@@ -39,6 +39,13 @@ def test_rows_become_tracks_and_lanes(tmp_path):
     assert recording.group is None
 
 
+def test_several_patterns_read_each_file_once(tmp_path):
+    source = w.csv_spec(tmp_path / "s.toml")
+    source.write_text('pattern = ["*.csv", "log*"]\n' + source.read_text())
+    log(tmp_path)
+    assert [made.name for made in read(tmp_path, source)] == ["log"]
+
+
 @given(
     length=st.sampled_from([("m", 1.0), ("ft", 0.3048)]),
     speed=st.sampled_from(

@@ -5,6 +5,7 @@ coordinates and clocks lose their origin here, in float64: the package computes
 in float32 later.
 """
 
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -71,12 +72,9 @@ ORIGIN_STEP_M = 1000.0  # m, local origins are multiples of it
 def parts(path: Path, spec: dict) -> list[Path]:
     """The CSV files; each can be read alone."""
     lane_file = lane_file_of(spec)
-    files = [
-        file
-        for pattern in patterns(spec, ("*.csv",))
-        for file in input_files(path, pattern)
-        if file.name != lane_file
-    ]
+    found = [input_files(path, pattern) for pattern in patterns(spec, ("*.csv",))]
+    every = dict.fromkeys(itertools.chain.from_iterable(found))  # each file once
+    files = [file for file in every if file.name != lane_file]
     if not files:
         raise InputError(f"{path}: files: only {lane_file}: expected logs beside it")
     return files
