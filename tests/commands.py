@@ -12,3 +12,16 @@ def command(module, *flags):
         capture_output=True, text=True, check=False, timeout=900,
         env={**os.environ, "JAX_PLATFORMS": "cpu"},
     )  # fmt: skip
+
+
+def count_and_peak(script, path):
+    """What a script that reads `path` in a process of its own prints: two numbers.
+
+    The scripts print what they counted and the most memory they held.
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(path)],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    counted, peak = map(int, done.stdout.split())
+    return counted, peak

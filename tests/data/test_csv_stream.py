@@ -1,8 +1,6 @@
 """Long CSV files in pieces: the scenes of a file read at once, in bounded memory."""
 
 import dataclasses
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -12,6 +10,7 @@ from rcirl_jax.data.importers import csv_stream, parts, read_part
 from rcirl_jax.data.importing import import_parts
 from rcirl_jax.data.store import open_dataset
 from rcirl_jax.errors import InputError
+from tests.commands import count_and_peak
 from tests.data.small_logs import CONFIG
 
 SECONDS = 200.0
@@ -206,11 +205,7 @@ def test_memory_does_not_grow_with_the_file(tmp_path):
                     f"{frame * 0.1:.1f},c{frame // 600}-{car},{frame * 0.5},{car}\n"
                     for car in range(80)
                 )
-        done = subprocess.run(
-            [sys.executable, "-c", MEMORY, str(path)],
-            capture_output=True, text=True, check=True,
-        )  # fmt: skip
-        rows, peak = map(int, done.stdout.split())
+        rows, peak = count_and_peak(MEMORY, path)
         assert rows >= minutes * 600 * 80
         peaks.append(peak)
     assert peaks[1] < 1.3 * peaks[0]

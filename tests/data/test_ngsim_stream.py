@@ -1,8 +1,5 @@
 """The portal's CSV in pieces: the scenes of the file read at once."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
@@ -11,6 +8,7 @@ from rcirl_jax.data.importers import parts, read_part
 from rcirl_jax.data.importing import import_parts
 from rcirl_jax.data.store import open_dataset
 from rcirl_jax.errors import InputError
+from tests.commands import count_and_peak
 from tests.data import writers as w
 from tests.data.small_logs import CONFIG
 from tests.data.test_csv_stream import scenes_by_name
@@ -199,11 +197,7 @@ def test_memory_does_not_grow_with_the_file(tmp_path):
             for number in range(minutes * 10):
                 rows = vehicle(number, 60 * number, 1.2e12, 1200)
                 file.writelines(f"{','.join(map(str, r))},i-80\n" for r in rows)
-        done = subprocess.run(
-            [sys.executable, "-c", MEMORY, str(path)],
-            capture_output=True, text=True, check=True,
-        )  # fmt: skip
-        made, peak = map(int, done.stdout.split())
+        made, peak = count_and_peak(MEMORY, path)
         assert made >= minutes
         peaks.append(peak)
     assert peaks[1] < 1.3 * peaks[0]

@@ -19,7 +19,7 @@ from rcirl_jax.data.importers.commonroad_extras import (
     read_ghosts,
     read_signals,
 )
-from rcirl_jax.data.importers.files import files_below, log_name, with_log_names
+from rcirl_jax.data.importers.files import files_below, log_name
 from rcirl_jax.data.importers.lanelets import read_lanes
 from rcirl_jax.data.importers.xml_fields import Fields
 from rcirl_jax.data.recording import validate_recording
@@ -68,10 +68,8 @@ def own_name(file: Path) -> str:
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """One Recording per XML file."""
-    files = parts(path, spec)
-    spec = with_log_names(path, files, spec, own_name)
     groups = _read_groups(path, spec.get("groups", ""))
-    for file in files:
+    for file in parts(path, spec):
         yield validate_recording(_read_file(file, spec, groups), file)
 
 

@@ -22,7 +22,6 @@ import numpy as np
 from rcirl_jax.data.importers.files import (
     input_files,
     log_name,
-    with_log_names,
 )
 from rcirl_jax.data.importers.lanelet2 import read_lanelet2
 from rcirl_jax.data.importers.paths import path_lanes
@@ -84,9 +83,7 @@ class _Scene:
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """One Recording per vehicle file, or per case of a challenge file."""
-    files = parts(path, spec)
-    spec = with_log_names(path, files, spec, own_name)
-    for file in files:
+    for file in parts(path, spec):
         header = read_header(file)
         table = _read(file, header)
         scene = _scene(file, spec)

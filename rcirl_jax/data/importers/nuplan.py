@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.importers.files import files_below, log_name, with_log_names
+from rcirl_jax.data.importers.files import files_below, log_name
 from rcirl_jax.data.importers.nuplan_map import NuplanMap, find_map
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.perception import Boxes, positive, section, tracks_of
@@ -107,9 +107,7 @@ def own_name(file: Path) -> str:
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """One Recording per log, or per window of a long one."""
     roads: dict[Path, NuplanMap] = {}
-    files = parts(path, spec)
-    spec = with_log_names(path, files, spec, own_name)
-    for file in files:
+    for file in parts(path, spec):
         with Database(file) as database:
             for table, columns in TABLES.items():
                 database.need(table, columns)

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.importers.files import files_below, log_name, with_log_names
+from rcirl_jax.data.importers.files import files_below, log_name
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.projection import utm, utm_zone
 from rcirl_jax.data.importers.sparse_tables import (
@@ -83,9 +83,7 @@ def own_name(file: Path) -> str:
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """Recordings of `block_s` seconds, file by file."""
-    files = parts(path, spec)
-    spec = with_log_names(path, files, spec, own_name)
-    for file in files:
+    for file in parts(path, spec):
         drive = _read_drive(file)
         for block in _blocks(drive, spec):
             yield validate_recording(block, file)
