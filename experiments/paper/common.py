@@ -1,7 +1,7 @@
 """What the paper's experiments share: flags, data, training, files."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,8 @@ from rcirl_jax.data.joined import Demonstrations
 from rcirl_jax.data.resplit import Resplit
 from rcirl_jax.data.store import Dataset, open_dataset
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.evaluate import RankingSetup
+from rcirl_jax.evaluation.evaluate import RankingSetup, evaluate_ranking
+from rcirl_jax.evaluation.learners import Learned, scorers
 from rcirl_jax.evaluation.table import RankingReport
 from rcirl_jax.report.intervals import Interval
 from rcirl_jax.train.state import TrainConfig
@@ -85,9 +86,30 @@ def base(**changes: object) -> TrainConfig:
     return TrainConfig(**{**shared, **changes})
 
 
-def setup() -> RankingSetup:
-    """How held-out scenes are ranked."""
-    return RankingSetup(horizon_s=HORIZON.value)
+def ranked(
+    data: Demonstrations,
+    learned: Mapping[str, Sequence[Learned]],
+    against: Sequence[str],
+) -> RankingReport:
+    """Learned rows beside the baselines on held-out scenes.
+
+    Paired differences are to the rows of `against`, which the experiment asks about,
+    and to IDM, hand-set and random.
+    """
+    references = (*against, "IDM", "hand-set", "random")
+    setup = RankingSetup(horizon_s=HORIZON.value)
+    return evaluate_ranking(data, scorers(learned), setup, references=references)
+
+
+def print_differences(report: RankingReport, pairs: Iterable[tuple[str, str]]) -> None:
+    """A line per (row, reference): the paired difference in top-1 FDE."""
+    found = {
+        (c.row, c.reference): c for c in report.comparisons if c.metric == "top1_fde"
+    }
+    for pair in pairs:
+        d, p = found[pair].difference, found[pair].p_holm
+        apart = f"{d.mean:+.2f} m [{d.low:+.2f}, {d.high:+.2f}], Holm p {p:.3f}"
+        print(f"{' minus '.join(pair)}: top-1 FDE {apart}")
 
 
 def intervals(report: RankingReport, metric: str) -> dict[str, Interval]:

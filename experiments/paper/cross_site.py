@@ -18,16 +18,16 @@ from experiments.paper.common import (
     few,
     intervals,
     picture,
+    print_differences,
+    ranked,
     seeds,
-    setup,
     write,
 )
 from rcirl_jax.data.joined import Demonstrations
 from rcirl_jax.data.resplit import halves
 from rcirl_jax.data.store import open_dataset
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.evaluate import evaluate_ranking
-from rcirl_jax.evaluation.learners import FrozenSets, scorers, train_learner
+from rcirl_jax.evaluation.learners import FrozenSets, train_learner
 from rcirl_jax.evaluation.table import to_json
 from rcirl_jax.report.intervals import interval_panel
 from rcirl_jax.report.style import figure, label, save
@@ -61,13 +61,15 @@ def main() -> None:
     made, axes = figure(1, len(found), 5.5 * len(found), 3.6)
     reports = {}
     for axis, (name, data) in zip(axes[0], found.items(), strict=True):
-        report = evaluate_ranking(data, scorers(learned), setup())
+        own = f"trained on {name}"
+        report = ranked(data, learned, [own])
         reports[name] = to_json(report)
         rows = intervals(report, "top1_fde")
         interval_panel(axis, rows)
         label(axis, f"held-out scenes of {name}", "top-1 distance, m", "")
         for row, (value, low, high) in rows.items():
             print(f"on {name}: {row}: top-1 FDE {value:.2f} m [{low:.2f}, {high:.2f}]")
+        print_differences(report, [(other, own) for other in learned if other != own])
     save(made, picture("cross_site"))
     hashes = {name: data.hash for name, data in found.items()}
     write("cross_site", {"tested_on": reports, "data_hashes": hashes})

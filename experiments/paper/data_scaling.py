@@ -22,16 +22,15 @@ from experiments.paper.common import (
     dataset,
     intervals,
     picture,
+    print_differences,
+    ranked,
     seeds,
-    setup,
     write,
 )
 from rcirl_jax.data.resplit import fewer
-from rcirl_jax.evaluation.evaluate import evaluate_ranking
 from rcirl_jax.evaluation.learners import (
     FrozenSets,
     learner_config,
-    scorers,
     train_learner,
 )
 from rcirl_jax.evaluation.table import to_json
@@ -62,7 +61,8 @@ def main() -> None:
                 at = np.searchsorted(sets.index, rows)
                 part = jax.tree.map(lambda x, at=at: x[at], sets.of(config))
                 learned[f"{name}, {count}"] += train_learner(part, config, [seed])
-    report = evaluate_ranking(data, scorers(learned), setup())
+    networks = [f"{ROWS[0]}, {count}" for count in counts]
+    report = ranked(data, learned, networks)
     found = intervals(report, "top1_fde")
     made, axes = figure(1, 1, 6.8, 4.4)
     curves = {name: [found[f"{name}, {count}"] for count in counts] for name in ROWS}
@@ -72,6 +72,9 @@ def main() -> None:
     save(made, picture("data_scaling"))
     for name in learned:
         print(f"{name:30s} top-1 FDE {found[name][0]:.2f} m")
+    # linear rewards with as much data, then networks with less
+    alike = [(f"{name}, {n}", f"{ROWS[0]}, {n}") for n in counts for name in ROWS[1:]]
+    print_differences(report, alike + [(less, networks[-1]) for less in networks[:-1]])
     write("data_scaling", {"counts": counts, "ranking": to_json(report)}, data)
 
 

@@ -19,12 +19,12 @@ from experiments.paper.common import (
     dataset,
     intervals,
     picture,
+    print_differences,
+    ranked,
     seeds,
-    setup,
     write,
 )
-from rcirl_jax.evaluation.evaluate import evaluate_ranking
-from rcirl_jax.evaluation.learners import FrozenSets, scorers, train_grid
+from rcirl_jax.evaluation.learners import FrozenSets, train_grid
 from rcirl_jax.evaluation.table import to_json
 from rcirl_jax.report.intervals import interval_curves
 from rcirl_jax.report.style import figure, label, save
@@ -32,6 +32,9 @@ from rcirl_jax.reward import RewardConfig
 
 _RATES = flags.DEFINE_list("leaky_rates", ["0.01", "0.05", "0.2", "0.5"], "values of a")
 _SIZES = flags.DEFINE_list("hidden_sizes", ["5", "15", "45"], "units; 0 is linear")
+
+
+PAPERS = "a 0.05, 15 hidden"  # the row with the paper's values
 
 
 def main() -> None:
@@ -43,7 +46,8 @@ def main() -> None:
         config = base(loss="rank", reward=RewardConfig(hidden=hidden))
         for rate, runs in train_grid(sets.of(config), config, rates, seeds()).items():
             learned[f"a {rate:g}, {size} hidden"] = runs
-    report = evaluate_ranking(data, scorers(learned), setup())
+    own = [PAPERS] if PAPERS in learned else []
+    report = ranked(data, learned, own)
     made, axes = figure(1, 2, 11.0, 4.2)
     for axis, metric, title, unit in (
         (axes[0, 0], "top1_fde", "distance of the chosen", "m, lower is better"),
@@ -66,6 +70,7 @@ def main() -> None:
     for name in learned:
         value, low, high = intervals(report, "top1_fde")[name]
         print(f"{name:22s} top-1 FDE {value:.2f} m [{low:.2f}, {high:.2f}]")
+    print_differences(report, [(x, ref) for ref in own for x in learned if x != ref])
     write("leaky_rate_and_hidden_size", {"ranking": to_json(report)}, data)
 
 

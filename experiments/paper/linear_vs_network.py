@@ -9,13 +9,11 @@ linear in departures from the usual, is close to the network. `--quick`: a minut
 """
 
 from experiments.common import run
-from experiments.paper.common import base, dataset, picture, seeds, setup, write
-from rcirl_jax.evaluation.evaluate import evaluate_ranking
+from experiments.paper.common import base, dataset, picture, ranked, seeds, write
 from rcirl_jax.evaluation.format import format_table
 from rcirl_jax.evaluation.learners import (
     LINEAR,
     learner_config,
-    scorers,
     train_learners,
 )
 from rcirl_jax.evaluation.table import to_json
@@ -35,7 +33,7 @@ def main() -> None:
         "21-32-16-1": learner_config("logistic 32-16", base()),
     }
     learned = train_learners(data, configs, seeds())
-    report = evaluate_ranking(data, scorers(learned), setup())
+    report = ranked(data, learned, ["21-15-1"])
     print(format_table(report, 118))
     ranking_chart(picture("linear_vs_network"), report)
     write("linear_vs_network", {"ranking": to_json(report)}, data)

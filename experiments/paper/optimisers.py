@@ -17,13 +17,12 @@ from experiments.paper.common import (
     dataset,
     intervals,
     picture,
+    ranked,
     seeds,
-    setup,
     write,
 )
-from rcirl_jax.evaluation.evaluate import evaluate_ranking
 from rcirl_jax.evaluation.format import format_table
-from rcirl_jax.evaluation.learners import scorers, train_learners
+from rcirl_jax.evaluation.learners import train_learners
 from rcirl_jax.evaluation.table import to_json
 from rcirl_jax.report.intervals import curves_panel, interval_panel
 from rcirl_jax.report.style import figure, label, save
@@ -39,7 +38,7 @@ def main() -> None:
         for name, rate in RATES.items()
     }
     learned = train_learners(data, configs, seeds())
-    report = evaluate_ranking(data, scorers(learned), setup())
+    report = ranked(data, learned, ["adam"])
     print(format_table(report, 118))
     made, axes = figure(1, 2, 11.0, 4.2)
     wins = {n: np.array([r.wins for r in runs]) for n, runs in learned.items()}

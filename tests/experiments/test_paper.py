@@ -26,6 +26,14 @@ RANKED = (
     "optimisers",
     "stability",
 )
+# what the paired differences have to be to, beside IDM, hand-set and random
+ASKED = {
+    "data_scaling": ("RC-IRL logistic, 30", "RC-IRL logistic, 100"),
+    "feature_ablation": ("all 21",),
+    "leaky_rate_and_hidden_size": ("a 0.05, 15 hidden",),
+    "linear_vs_network": ("21-15-1",),
+    "optimisers": ("adam",),
+}
 
 
 @pytest.fixture(scope="session")
@@ -49,6 +57,10 @@ def numbers(item):
             yield from numbers(value)
     elif isinstance(item, float):
         yield item
+
+
+def references(report):
+    return {comparison["reference"] for comparison in report["comparisons"]}
 
 
 def test_background_shift(tmp_path):
@@ -87,8 +99,13 @@ def test_writes_numbers_and_a_picture(name, dataset, tmp_path):
         assert set(body["data_hashes"]) == set(body["tested_on"]) == {"here", "there"}
         trained = {row for row in body["tested_on"]["here"]["rows"] if "on" in row}
         assert {"trained on here", "trained on there"} <= trained
+        for site, report in body["tested_on"].items():
+            assert f"trained on {site}" in references(report)
     else:
         assert body["made_by"]["data_hash"]
+    if name in ASKED:
+        expected = {*ASKED[name], "IDM", "hand-set", "random"}
+        assert references(body["ranking"]) == expected
     assert (tmp_path / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
 
 
