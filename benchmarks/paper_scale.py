@@ -64,8 +64,10 @@ def batch_of(rows: Demonstration, first: jax.Array, size: int) -> Batch:
     """Frames `first` to `first + size` made from the stored scenes."""
     frame = first + jnp.arange(size, dtype=jnp.int32)
     taken = jax.tree.map(lambda x: x[frame % x.shape[0]], rows)
-    # golden ratio: spread evenly over any run of frames
-    share = jnp.mod(frame.astype(jnp.float32) * 0.618034, 1.0) - 0.5
+    # multiples of the golden ratio, mod 1: spread evenly over any run of frames; whole
+    # numbers, as float32 cannot tell late frames apart
+    turn = frame.astype(jnp.uint32) * jnp.uint32(round(2**32 * 0.6180339887))
+    share = turn.astype(jnp.float32) / 2.0**32 - 0.5
     scene, ego = taken.scene, taken.scene.ego
     speed = ego.v * (1.0 + SPEED_SPREAD * share)
     taken = taken.replace(scene=scene.replace(ego=ego.replace(v=speed)))
