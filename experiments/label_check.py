@@ -8,25 +8,27 @@ tags are known, are labelled and compared; position noise as in NGSIM, or none.
 With --input (any recorded format): the written cycle of every signal is tested
 against crossings and stands, and the stop labels against observed stands, with
 the signals that an import trusts and with all of them. With --data the labels
-stored in a dataset are compared with today's rules.
+stored in a dataset are compared with today's rules. --workers and --executor
+spread the planned drives.
 
 Writes labels.json and labels.png. On two cores 100 cases of each of the 38
 families take about 5 minutes per noise; the urban CommonRoad files 3 minutes.
 Expected: above 98 % everywhere.
 """
 
-import json
 from pathlib import Path
 
 from absl import flags
 
 from experiments.common import provenance, run
+from experiments.executor import executor
 from rcirl_jax.data.importers import IMPORTERS, read_recordings
 from rcirl_jax.data.store import open_dataset
 from rcirl_jax.evaluation.label_signals import check_phases, format_phases
 from rcirl_jax.evaluation.label_stops import check_stops, compare_stored, format_stops
 from rcirl_jax.evaluation.label_truth import format_labels, format_scores, measure
 from rcirl_jax.report.label_picture import label_chart
+from rcirl_jax.whole import write_json
 
 _CASES = flags.DEFINE_integer("cases", 100, "planned drives of each family")
 _NOISE = flags.DEFINE_list("noise", ["ngsim", "none"], "none, white, ngsim, rough")
@@ -59,8 +61,10 @@ def main() -> None:
         tables["stored against today's rules"] = scores
     if not body:
         noises = _NOISE.value[:1] if _QUICK.value else _NOISE.value
+        places = executor()
         for noise in noises:
-            report = measure(4 if _QUICK.value else _CASES.value, noise, _SEED.value)
+            cases = 4 if _QUICK.value else _CASES.value
+            report = measure(cases, noise, _SEED.value, executor=places)
             print(f"{format_labels(report)}\n")
             body[noise] = report.as_dict()
             tables[f"noise {noise}, decisions"] = report.decisions
@@ -69,7 +73,7 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     picture = label_chart(folder / "labels.png", tables)
     body["made_by"] = provenance()
-    (folder / "labels.json").write_text(json.dumps(body, indent=2) + "\n")
+    write_json(folder / "labels.json", body)
     print(f"written: {folder}/labels.json, {picture.name}")
 
 

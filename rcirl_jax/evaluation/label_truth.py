@@ -10,9 +10,11 @@ family counts alike, which is harder than traffic.
 
 import collections
 import dataclasses
-from collections.abc import Iterable, Sequence
+import functools
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
+import tqdm
 
 from rcirl_jax.data.collect import Collector
 from rcirl_jax.data.config import CollectConfig
@@ -30,6 +32,7 @@ from rcirl_jax.evaluation.label_cases import (
     draw,
     to_recording,
 )
+from rcirl_jax.executor import Executor, Here
 from rcirl_jax.types import Decision, Kind, Tag
 from rcirl_jax.units import TIMES_S
 
@@ -109,7 +112,11 @@ def _rate(k: int, n: int) -> tuple[float, float, float] | None:
 
 
 def measure(
-    cases: int, noise: str = "ngsim", seed: int = 0, families: Sequence[str] = ()
+    cases: int,
+    noise: str = "ngsim",
+    seed: int = 0,
+    families: Sequence[str] = (),
+    executor: Executor | None = None,
 ) -> LabelReport:
     """Draw `cases` drives of every family, label them, compare.
 
@@ -118,6 +125,7 @@ def measure(
       noise: key of `NOISES`.
       seed: of all draws.
       families: names of `FAMILIES`; empty: all.
+      executor: where they are labelled; default: this process.
 
     Raises:
       InputError: no cases, an unknown noise or family.
@@ -132,16 +140,24 @@ def measure(
         raise InputError(f"families: {unknown[0]}: expected of {', '.join(FAMILIES)}")
     verdicts: list[Verdict] = []
     dropped: collections.Counter[str] = collections.Counter()
-    for name in names:
-        for number in range(cases):
-            index = list(FAMILIES).index(name)
-            rng = np.random.default_rng((seed, index, number))
-            found = judge(draw(name, rng), noise, rng)
-            if isinstance(found, str):
-                dropped[found] += 1
-            else:
-                verdicts += found
-    return _report(noise, cases * len(names), dict(dropped), verdicts)
+    work = functools.partial(_judged, cases=cases, noise=noise, seed=seed)
+    judged = (executor or Here()).stream(work, names)
+    total = cases * len(names)
+    for found in tqdm.tqdm(judged, desc=f"label {noise}", total=total, unit="case"):
+        if isinstance(found, str):
+            dropped[found] += 1
+        else:
+            verdicts += found
+    return _report(noise, total, dict(dropped), verdicts)
+
+
+def _judged(
+    family: str, cases: int, noise: str, seed: int
+) -> Iterator[list[Verdict] | str]:
+    """`judge` of every case of a family; independent of other families."""
+    for number in range(cases):
+        rng = np.random.default_rng((seed, list(FAMILIES).index(family), number))
+        yield judge(draw(family, rng), noise, rng)
 
 
 def judge(case: Case, noise: str, rng: np.random.Generator) -> list[Verdict] | str:

@@ -23,6 +23,7 @@ from rcirl_jax.evaluation.label_signals import (
 )
 from rcirl_jax.evaluation.label_stops import check_stops, format_stops
 from rcirl_jax.evaluation.label_truth import format_labels, measure
+from rcirl_jax.executor import Processes
 from rcirl_jax.types import Decision, Signal, Tag
 
 CASES = 2  # of every family
@@ -45,6 +46,13 @@ def test_every_class_is_found(noise):
             value, low, high = getattr(score, what)()
             assert value >= FLOOR, (score, what, format_labels(found))
             assert low <= value <= high
+
+
+@pytest.mark.multiprocess
+def test_labels_do_not_depend_on_where_they_are_made():
+    some = ["follow", "cut_in", "red_light"]
+    here = measure(2, "ngsim", families=some)
+    assert measure(2, "ngsim", families=some, executor=Processes(2)) == here
 
 
 def test_the_table_names_every_class():
