@@ -18,7 +18,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.evaluation.format import format_table
 from rcirl_jax.evaluation.table import to_json
-from rcirl_jax.export.hand_weights import tuned_row
+from rcirl_jax.export.hand_weights import tuned_rows
 from rcirl_jax.export.loading import load_runs
 
 _WEIGHTS = flags.DEFINE_list("weights", None, "weights files", required=True)
@@ -29,7 +29,7 @@ _SPLIT = flags.DEFINE_string("split", "test", "split that is ranked")
 _FILTER = flags.DEFINE_bool(
     "drop_collisions", False, "rank only candidates that meet nothing, in every row"
 )
-_HAND = flags.DEFINE_string("hand_weights", None, "of tune_hand_set: a further row")
+_HAND = flags.DEFINE_list("hand_weights", [], "of tune_hand_set: runs of a further row")
 _WIDTH = flags.DEFINE_integer("width", 118, "columns of the printed table")
 
 
@@ -44,7 +44,7 @@ def main() -> None:
         horizon_s=_HORIZON.value,
         split=_SPLIT.value,
         drop_collisions=_FILTER.value,
-        hand_set=tuned_row(_HAND.value),
+        hand_set=tuned_rows(_HAND.value),
     )
     report = evaluate_ranking(open_dataset(_DATA.value), learned, setup, executor())
     print(format_table(report, _WIDTH.value))

@@ -25,9 +25,8 @@ from pathlib import Path
 from absl import flags
 
 from experiments.common import provenance, run
-from rcirl_jax.data.resplit import HOLDOUTS, held_out
+from experiments.holdout import split
 from rcirl_jax.data.store import open_dataset
-from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.evaluation.format import format_table, markdown_table
 from rcirl_jax.evaluation.learners import (
@@ -37,7 +36,7 @@ from rcirl_jax.evaluation.learners import (
     train_learners,
 )
 from rcirl_jax.evaluation.table import to_json
-from rcirl_jax.export.hand_weights import tuned_row
+from rcirl_jax.export.hand_weights import tuned_rows
 from rcirl_jax.report.intervals import ranking_chart
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train.state import TrainConfig
@@ -56,23 +55,15 @@ _HORIZON = flags.DEFINE_float(
 _MODE = flags.DEFINE_enum(
     "mode", "speed", ["speed", "path_speed"], "what the sampler varies"
 )
-_HOLDOUT = flags.DEFINE_enum("holdout", "groups", HOLDOUTS, "what is held out")
-_SPLIT = flags.DEFINE_integer("split_seed", 0, "draws the vehicles held out", 0)
-_HAND = flags.DEFINE_string("hand_weights", None, "of tune_hand_set: a further row")
-_RECORDING = flags.DEFINE_integer("recording", 0, "recording that is held out")
+_HAND = flags.DEFINE_list(
+    "hand_weights", [], "of tune_hand_set with the same split: runs of a further row"
+)
 
 
 def main() -> None:
     """Flags -> one comparison."""
-    whole = open_dataset(_DATA.value)
-    if _HAND.value and _HOLDOUT.value != "groups":
-        raise InputError(
-            f"--hand_weights: with --holdout={_HOLDOUT.value}: expected groups, for"
-            " tune_hand_set tunes on the dataset's own training scenes"
-        )
-    dataset, split = held_out(
-        whole, _HOLDOUT.value, seed=_SPLIT.value, recording=_RECORDING.value
-    )
+    dataset, words = split(open_dataset(_DATA.value))
+    tuned = tuned_rows(_HAND.value, dataset.hash)
     sampler = SamplerConfig(mode=_MODE.value)
     base = TrainConfig(
         positive="nearest",
@@ -82,9 +73,7 @@ def main() -> None:
         sampler=sampler,
     )
     configs = learner_configs(_LEARNERS.value, base)
-    setup = RankingSetup(
-        sampler=sampler, horizon_s=_HORIZON.value, hand_set=tuned_row(_HAND.value)
-    )
+    setup = RankingSetup(sampler=sampler, horizon_s=_HORIZON.value, hand_set=tuned)
     folder = Path(_OUTPUT.value)
     folder.mkdir(parents=True, exist_ok=True)
     learned = train_learners(dataset, configs, range(_SEEDS.value))
@@ -92,10 +81,11 @@ def main() -> None:
     text = format_table(report, 118)
     (folder / "table.txt").write_text(text + "\n")
     (folder / "table.md").write_text(markdown_table(report))
-    body = {**to_json(report), "split": split, "made_by": provenance()}
+    made_by = {**provenance(), "data_hash": dataset.hash}
+    body = {**to_json(report), "split": words, "made_by": made_by}
     (folder / "ranking.json").write_text(json.dumps(body, indent=2) + "\n")
     picture = ranking_chart(folder / "ranking.png", report)
-    print(text)
+    print(f"{text}\nsplit: {words}")
     print(f"written: {folder}/ranking.json, table.txt, table.md, {picture.name}")
 
 

@@ -3,16 +3,19 @@
     python -m experiments.tune_hand_set --data=DATASET --epochs=20 --output=tuned.json
     python -m experiments.tune_hand_set --objective=smoke --budget=200 --output=FILE
 
---epochs: as many queries as so many epochs of experiments.train on --data. The
-file is a row of experiments.evaluate and experiments.simulate (--hand_weights).
+--epochs: as many queries as so many epochs of experiments.train on --data, split by
+--holdout as in experiments.human_likeness. The file is a row of experiments.evaluate,
+human_likeness and simulate (--hand_weights); files of several --seed are its runs.
 """
 
+import functools
 from pathlib import Path
 
 from absl import flags
 
 from experiments.common import provenance, run
-from rcirl_jax.data.joined import open_datasets
+from experiments.holdout import split
+from rcirl_jax.data.joined import Demonstrations, open_datasets
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation import objectives
 from rcirl_jax.evaluation.evaluate import RankingSetup
@@ -40,15 +43,20 @@ _SEED = flags.DEFINE_integer("seed", 0, "of the search and the drawn scenes", 0)
 _OUTPUT = flags.DEFINE_string("output", None, "JSON to write", required=True)
 
 
+@functools.cache
+def _data() -> Demonstrations:
+    """--data, split by --holdout."""
+    return split(open_datasets(_DATA.value))[0]
+
+
 def _problem(held_out: bool) -> objectives.Problem:
     """What is tuned on, or what is not."""
     if _OBJECTIVE.value == "smoke":
         cases = (_SUITE.value, _CASES.value, _DURATION.value)
         return objectives.suite_problem(*cases, _CATALOGUE.value + held_out)
-    split, count = ("test", None) if held_out else ("train", _SCENES.value)
-    setup = RankingSetup(split=split, horizon_s=_HORIZON.value)
-    data = open_datasets(_DATA.value)
-    return objectives.ranking_problem(data, setup, count, _SEED.value)
+    name, count = ("test", None) if held_out else ("train", _SCENES.value)
+    setup = RankingSetup(split=name, horizon_s=_HORIZON.value)
+    return objectives.ranking_problem(_data(), setup, count, _SEED.value)
 
 
 def main() -> None:
@@ -59,11 +67,16 @@ def main() -> None:
     Path(_OUTPUT.value).parent.mkdir(parents=True, exist_ok=True)
     problem = _problem(False)
     if epochs > 0:
-        data = open_datasets(_DATA.value)
-        budget = objectives.learner_budget(data, learner, epochs, problem)
+        budget = objectives.learner_budget(_data(), learner, epochs, problem)
     cost, facts = objectives.tune_hand_set(
-        problem, _problem(True), budget=budget, sigma=_SIGMA.value, seed=_SEED.value
+        problem,
+        _problem(True),
+        budget=budget,
+        sigma=_SIGMA.value,
+        seed=_SEED.value,
     )
+    if _OBJECTIVE.value == "ranking":
+        facts["data_hash"] = _data().hash  # of the split too
     write_hand_weights(_OUTPUT.value, cost, {**facts, "made_by": provenance()})
     print(f"{facts['objective_is']}, low is better")
     for name, pair in facts["objective"].items():

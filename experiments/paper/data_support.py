@@ -49,7 +49,7 @@ def main() -> None:
     (reward,) = train_learner(train, linear, [0])
     weights = weights_supported(reward, train, vehicle["train"])
     (runs,) = train_grid(train, config, [config.leaky_rate], seeds(least=2)).values()
-    made = choices_of(runs, train, test)
+    made = choices_of(runs, train, test, vehicle["train"])
     spreads = {"seeds": made.spread_of_seeds, "posterior": made.spread_of_posterior}
     warns = {
         name: rank_correlation(spread, made.error, vehicle["test"])

@@ -9,10 +9,15 @@ and no clear difference (0.42 to 0.47 of the weight in the first half, a peak at
 5 s, where recordings begin to end). `--quick`: under a minute.
 """
 
+import itertools
+from typing import Any
+
 import numpy as np
+from scipy.stats import ttest_ind
 
 from experiments.common import run
 from experiments.paper.common import base, dataset, picture, seeds, write
+from rcirl_jax.evaluation.exact import holm
 from rcirl_jax.evaluation.learners import Learned, learner_config, train_learners
 from rcirl_jax.report.intervals import curves_panel
 from rcirl_jax.report.style import figure, label, save
@@ -33,6 +38,30 @@ def time_weights(runs: list[Learned]) -> np.ndarray:
     return found * np.sign(found.sum(axis=1, keepdims=True))
 
 
+def near_share(gamma: np.ndarray) -> np.ndarray:
+    """[R] share of |gamma| [R, T] up to NEAR_S."""
+    size = np.abs(gamma)
+    return size[:, TIMES_S <= NEAR_S].sum(axis=1) / size.sum(axis=1)
+
+
+def differences(shares: dict[str, np.ndarray]) -> list[dict]:
+    """Welch's t between the runs of every two rows, Holm over the pairs."""
+    found = []
+    for row, reference in itertools.combinations(shares, 2):
+        test: Any = ttest_ind(shares[row], shares[reference], equal_var=False)
+        found.append(
+            {
+                "row": row,
+                "reference": reference,
+                "difference": float(shares[row].mean() - shares[reference].mean()),
+                "interval": [float(x) for x in test.confidence_interval(0.95)],
+                "p": float(test.pvalue),
+            }
+        )
+    adjusted = holm(np.array([one["p"] for one in found]))
+    return [{**one, "p_holm": float(p)} for one, p in zip(found, adjusted, strict=True)]
+
+
 def main() -> None:
     """Train, read gamma, draw."""
     configs = {name: learner_config(name, base(train_horizon=8.0)) for name in ROWS}
@@ -44,17 +73,23 @@ def main() -> None:
     axes[0, 0].axhline(0.0, color="#999999", lw=0.8)
     label(axes[0, 0], "learned time weights, band: 2 s.e.", "t, s", "gamma_t (norm 1)")
     save(made, picture("discount_factors"))
-    near = TIMES_S <= NEAR_S
-    body = {}
-    for name, runs in gamma.items():
-        share = np.abs(runs[:, near]).sum(axis=1) / np.abs(runs).sum(axis=1)
+    body, shares = {}, {name: near_share(runs) for name, runs in gamma.items()}
+    for name, share in shares.items():
         error = share.std(ddof=1) / np.sqrt(share.size)
         print(f"{name}: {share.mean():.2f} +- {error:.2f} of |gamma| up to {NEAR_S} s")
         body[name] = {
-            "gamma": runs.round(5).tolist(),
+            "gamma": gamma[name].round(5).tolist(),
             "near_share": [float(share.mean()), float(error)],
         }
-    write("discount_factors", {"times_s": TIMES_S.tolist(), "rows": body}, data)
+    apart = differences(shares)
+    for one in apart:
+        low, high = one["interval"]
+        print(
+            f"{one['row']} minus {one['reference']}: {one['difference']:+.3f} "
+            f"[{low:+.3f}, {high:+.3f}], Holm p {one['p_holm']:.3f}"
+        )
+    made = {"times_s": TIMES_S.tolist(), "rows": body, "differences": apart}
+    write("discount_factors", made, data)
 
 
 if __name__ == "__main__":

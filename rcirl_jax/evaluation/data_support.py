@@ -73,11 +73,13 @@ def weights_supported(
     """Which weights of a trained linear reward the data support.
 
     Args:
-      run: trained with `hidden = ()`; its gamma is taken as known.
+      run: trained with `hidden = ()`; its gamma is taken as known, with a mean of
+        1 over the times: only the product with the weights is in the reward.
       frozen: scenes, positive against candidates.
       vehicle: [S], scenes of one vehicle are dependent.
     """
-    human, candidates = sums_over_time(run, frozen)
+    gauge = float(np.mean(pinned(run.params, run.config.reward).gamma))
+    human, candidates = (phi / gauge for phi in sums_over_time(run, frozen))
     specs = feature_map(run.config.features).specs
     return identify(
         candidates - human[:, None],
@@ -90,7 +92,10 @@ def weights_supported(
 
 
 def choices_of(
-    runs: Sequence[Learned], train: FeatureBatch, test: FeatureBatch
+    runs: Sequence[Learned],
+    train: FeatureBatch,
+    test: FeatureBatch,
+    vehicle: np.ndarray,
 ) -> Choices:
     """What the mean of several runs chooses, and how unsure it is.
 
@@ -98,6 +103,7 @@ def choices_of(
       runs: of one configuration with a free scale (`pin="none"`), other seeds.
       train: what they were trained on; gives the Laplace posterior.
       test: scenes to choose in, with the positive `nearest`.
+      vehicle: [S] of the training scenes; those of one are dependent.
     """
     facts = test.facts
     near = np.asarray(facts.distance == facts.human_distance[:, None])
@@ -110,10 +116,12 @@ def choices_of(
         np.asarray(train.feasible),
         weights[0],
         PRIOR_PRECISION,
+        vehicle,
     )
     drawn = _posterior_draws(weights[0], precision)
     place = feature_map(runs[0].config.features).names.index("station")
-    stations = np.asarray(test.points[..., place])
+    # float64: equal ends have no spread at all
+    stations = np.asarray(test.points[..., place], np.float64)
     last = np.asarray(test.time_valid).sum(axis=1) - 1
     station = np.take_along_axis(stations, last[:, None, None], axis=2)[..., 0]
     best = lambda v: np.where(feasible, v, -np.inf).argmax(axis=-1)  # noqa: E731

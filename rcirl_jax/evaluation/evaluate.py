@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import TypeVar
 
 import jax
 import numpy as np
@@ -22,6 +23,8 @@ from rcirl_jax.reward import LatticeCost
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.types import Demonstration
 
+Run = TypeVar("Run")
+
 TEMPERATURE_SCENES = 512  # training scenes on which NLL temperatures are fitted
 RANDOM_RUNS = 5  # random orders averaged in the random row
 
@@ -36,8 +39,10 @@ class RankingSetup:
     split: str = "test"
     # rank only among candidates that meet nothing: the same safety filter for all
     drop_collisions: bool = False
-    # further hand-set costs that are ranked, by row
-    hand_set: Mapping[str, LatticeCost] = dataclasses.field(default_factory=dict)
+    # further hand-set costs that are ranked: row -> runs
+    hand_set: Mapping[str, Sequence[LatticeCost]] = dataclasses.field(
+        default_factory=dict
+    )
 
 
 def covered_rows(
@@ -80,13 +85,23 @@ def _temperatures(
     scorers: Mapping[str, Scorer],
     executor: Executor | None,
 ) -> dict[str, float]:
-    """Scale of each scorer's values, fitted on TRAINING scenes."""
+    """Scale of each row's values, fitted on TRAINING scenes."""
     rows, index = covered_rows(dataset, "train", setup.horizon_s)
     chosen = np.random.default_rng(0).permutation(index.size)[:TEMPERATURE_SCENES]
     rows, index = jax.tree.map(lambda x: x[chosen], rows), index[chosen]
     scored = _score(rows, index, setup, scorers, executor)
     outcomes = outcomes_of(scored, rows, setup)
-    return {name: fit_temperature(v, outcomes) for name, v in scored.values.items()}
+    values = {
+        **scored.values,
+        "random": random_scorer(RANDOM_RUNS, scored.fde.shape)[0],
+        "oracle": oracle_scorer(outcomes)[0],
+    }
+    return {name: fit_temperature(v, outcomes) for name, v in values.items()}
+
+
+def _numbered(rows: Mapping[str, Sequence[Run]]) -> dict[str, Run]:
+    """Each run by itself: row -> runs becomes "row#0" -> run, ..."""
+    return {f"{n}#{i}": x for n, runs in rows.items() for i, x in enumerate(runs)}
 
 
 def _score(
@@ -103,7 +118,7 @@ def _score(
         sampler=setup.sampler,
         horizon_s=setup.horizon_s,
         scorers=scorers,
-        hand_set=setup.hand_set,
+        hand_set=_numbered(setup.hand_set),
         executor=executor,
     )
 
@@ -131,7 +146,7 @@ def evaluate_ranking(
     Raises:
       InputError: no scene of the split covers the horizon.
     """
-    flat = {f"{n}#{i}": f for n, runs in learned.items() for i, f in enumerate(runs)}
+    flat = _numbered(learned)
     temperatures = _temperatures(dataset, setup, flat, executor)
     rows, index = covered_rows(dataset, setup.split, setup.horizon_s)
     scored = _score(rows, index, setup, flat, executor)
@@ -142,16 +157,20 @@ def evaluate_ranking(
         return scene_metrics(values, human, outcomes, temperatures[name])
 
     shape = scored.fde.shape
-    table = {
-        n: [metrics(f"{n}#{i}") for i in range(len(r))] for n, r in learned.items()
-    }
+
+    def runs(some: Mapping[str, Sequence[object]]) -> dict[str, list[dict]]:
+        return {
+            n: [metrics(f"{n}#{i}") for i in range(len(r))] for n, r in some.items()
+        }
+
+    table = runs(learned)
     table["random"] = [
-        scene_metrics(*random_scorer(seed, shape), outcomes)
+        scene_metrics(*random_scorer(seed, shape), outcomes, temperatures["random"])
         for seed in range(RANDOM_RUNS)
     ]
-    for name in (*BASELINES, *setup.hand_set):
-        table[name] = [metrics(name)]
-    table["oracle"] = [scene_metrics(*oracle_scorer(outcomes), outcomes)]
+    table |= {name: [metrics(name)] for name in BASELINES} | runs(setup.hand_set)
+    best = oracle_scorer(outcomes)
+    table["oracle"] = [scene_metrics(*best, outcomes, temperatures["oracle"])]
     groups = np.asarray(rows.group)
     return build_report(table, outcomes, group=groups, references=references)
 

@@ -10,7 +10,7 @@ from rcirl_jax.evaluation.table import (
     FEW_VEHICLES,
     MIN_WIDTH,
     RIVALS,
-    SIGNIFICANT_SE,
+    SIGNIFICANT,
     RankingReport,
 )
 
@@ -178,8 +178,8 @@ def _differences(report: RankingReport, names: Sequence[str]) -> list[str]:
         return []
     lines = [
         "",
-        "Paired differences on the same scenes; a difference has a name beyond "
-        f"{SIGNIFICANT_SE:g} s.e.",
+        "Paired differences on the same scenes; named where Holm's p is below "
+        f"{SIGNIFICANT:g}",
     ]
     wide = max(len(METRICS[c.metric].title) for c in shown)
     last = ("", "")

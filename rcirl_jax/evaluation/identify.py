@@ -45,7 +45,7 @@ class FeatureWeight:
 
     name: str
     unit: str  # of the feature
-    # value per unit of the feature at time weight gamma = 1, and its interval
+    # value per unit of the feature at a time weight of 1, and its interval
     weight: float
     low: float
     high: float

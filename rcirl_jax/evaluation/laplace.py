@@ -5,10 +5,11 @@ Gaussian prior their posterior is nearly Gaussian, with the Hessian of the loss
 as its precision. That gives every difference of values a standard deviation. All
 layers below are taken as exact: the figure is a lower bound of the uncertainty.
 
-Two conditions. The pair loss must have been trained with a free scale
-(`pin="none"`): on a pinned scale the loss is not a likelihood at its minimum.
-And pairs are counted as independent; candidates of one scene are not, so with
-many candidates per scene the standard deviations are too small.
+The pair loss must have been trained with a free scale (`pin="none"`): on a pinned
+scale the loss is not a likelihood at its minimum. Candidates of one scene, and
+scenes of one vehicle, are not independent: with the vehicles given, the spread of
+their scores takes the place of the pairs' (the sandwich of Huber and White), and
+the precision is that of as many vehicles, not of as many pairs.
 
 Sources: MacKay, Neural Computation 4 (1992), 448 and 720; Kristiadi, Hein and
 Hennig, Being Bayesian, Even Just a Bit (ICML 2020) for the last layer alone.
@@ -76,6 +77,7 @@ def laplace(
     feasible: ArrayLike,
     w: ArrayLike,
     prior_precision: float,
+    cluster: ArrayLike | None = None,
 ) -> np.ndarray:
     """Posterior precision of the output weights under the logistic pair loss.
 
@@ -83,7 +85,12 @@ def laplace(
         d = Phi_candidate - Phi_human,   y = d . w,   s the logistic function
 
     This is the Hessian of sum log(1 + exp(y)) + prior / 2 |w|^2 at w, which
-    should be its minimum. Host numpy, float64: the condition number of P can be
+    should be its minimum. With C clusters
+
+        P (prior I + C / (C - 1) sum over clusters of (g_c - g)(g_c - g)^T)^-1 P
+        g_c = sum over the cluster's pairs of s(y) d,   g their mean over clusters
+
+    Host numpy, float64: the condition number of P can be
     beyond float32.
 
     Args:
@@ -92,9 +99,10 @@ def laplace(
       feasible: [S, K] bool.
       w: [H] output weights, kernels[-1][:, 0].
       prior_precision: > 0, 1 / variance of each weight before the data.
+      cluster: [S] int, scenes that depend on each other; None: pairs do not.
 
     Returns:
-      P [H, H], symmetric, positive definite.
+      Precision [H, H], symmetric, positive definite.
 
     Raises:
       InputError: a shape that does not fit, a feasible feature that is not
@@ -115,7 +123,29 @@ def laplace(
         )
     chance = expit(pairs @ weights)
     curvature = pairs.T @ (pairs * (chance * (1.0 - chance))[:, None])
-    return prior_precision * np.eye(weights.size) + 0.5 * (curvature + curvature.T)
+    prior = prior_precision * np.eye(weights.size)
+    precision = prior + 0.5 * (curvature + curvature.T)
+    if cluster is None:
+        return precision
+    scores = np.zeros((human.shape[0], weights.size))  # of scenes
+    np.add.at(scores, np.nonzero(mask)[0], pairs * chance[:, None])
+    return _sandwich(precision, scores, np.asarray(cluster), prior)
+
+
+def _sandwich(
+    precision: np.ndarray, scores: np.ndarray, cluster: np.ndarray, prior: np.ndarray
+) -> np.ndarray:
+    """Precision of the weights whose scores [S, H] spread as their clusters say."""
+    found, index = np.unique(cluster, return_inverse=True)
+    if found.size < 2:
+        raise InputError(
+            f"laplace: cluster: {found.size} clusters: expected at least 2"
+        )
+    sums = np.zeros((found.size, scores.shape[1]))
+    np.add.at(sums, index.reshape(-1), scores)
+    meat = prior + found.size * np.cov(sums, rowvar=False).reshape(prior.shape)
+    made = precision @ np.linalg.solve(meat, precision)
+    return 0.5 * (made + made.T)
 
 
 def _check_pairs(

@@ -45,6 +45,11 @@ class Difference:
     se: float
     p: float  # two-sided, for a difference of zero
 
+    @property
+    def is_apart(self) -> bool:
+        """Whether the interval leaves out 0."""
+        return not self.low <= 0.0 <= self.high
+
 
 class ClusterBootstrap:
     """Resampled vehicles, drawn once and shared by every statistic.

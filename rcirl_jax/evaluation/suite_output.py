@@ -100,13 +100,16 @@ def _differences(report: SuiteReport) -> list[str]:
     first = report.comparisons[0].a
     lines = [
         f"{first} against each row on the same cases: drives only it passes - only "
-        "the other passes (* : Holm-adjusted exact McNemar p < 0.05)"
+        "the other passes (*: Holm-adjusted exact McNemar p < 0.05; **: and the "
+        "interval over families is apart from 0); progress, nuPlan: over families"
     ]
     rows = []
     for item in report.comparisons:
         cells = [
-            f"+{wins} -{losses}{'*' if adjusted < 0.05 else ''}"
-            for wins, losses, _, adjusted in item.columns.values()
+            f"+{wins} -{losses}{'*' * (adjusted < 0.05) * (1 + over.is_apart)}"
+            for (wins, losses, _, adjusted), over in zip(
+                item.columns.values(), item.over_families.values(), strict=True
+            )
         ]
         way, score = item.progress_m, item.nuplan
         cells.append(f"{way.mean:+.0f} [{way.low:+.0f},{way.high:+.0f}]")

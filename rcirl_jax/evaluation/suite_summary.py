@@ -22,7 +22,7 @@ from rcirl_jax.evaluation.exact import (
 from rcirl_jax.evaluation.statistics import (
     ClusterBootstrap,
     Difference,
-    paired_difference,
+    cluster_t,
 )
 from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics, nuplan_score
 
@@ -72,12 +72,18 @@ class RowSummary:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """Row a minus row b on the same cases."""
+    """Row a minus row b on the same cases.
+
+    McNemar's test takes cases for independent; cases of one family are not. What
+    holds beyond these families is said by the differences over families (Student's,
+    `statistics.cluster_t`; of a single family: over its cases).
+    """
 
     a: str
     b: str
     # per column: cases only a passes, only b passes, McNemar p, Holm-adjusted p
     columns: Mapping[str, tuple[int, int, float, float]]
+    over_families: Mapping[str, Difference]  # per column, share of cases passed
     progress_m: Difference
     nuplan: Difference
 
@@ -132,7 +138,7 @@ def summarise(
     }
     first = next(iter(runs))
     comparisons = tuple(
-        _compare(first, other, runs, scores) for other in list(runs)[1:]
+        _compare(first, other, runs, scores, cluster) for other in list(runs)[1:]
     )
     return SuiteReport(
         cases=len(names),
@@ -261,20 +267,14 @@ def _compare(
     b: str,
     runs: Mapping[str, CaseMetrics],
     scores: Mapping[str, np.ndarray],
+    cluster: np.ndarray,
 ) -> Comparison:
-    """McNemar per column with Holm over the columns; bootstrap over cases."""
+    """McNemar per column with Holm over the columns; differences over families."""
     mine, theirs = runs[a].holds, runs[b].holds
     wins = (mine & ~theirs).sum(axis=0)
     losses = (~mine & theirs).sum(axis=0)
     raw = [mcnemar_exact(int(w), int(x)) for w, x in zip(wins, losses, strict=True)]
     adjusted = holm(np.array(raw))
-    cases = np.arange(mine.shape[0])
-    if cases.size < 2:
-        flat = lambda x, y: Difference(  # noqa: E731
-            mean=float(x[0] - y[0]), low=-np.inf, high=np.inf, se=np.inf, p=1.0
-        )
-    else:
-        flat = lambda x, y: paired_difference(x, y, cases)  # noqa: E731
     return Comparison(
         a=a,
         b=b,
@@ -282,11 +282,19 @@ def _compare(
             name: (int(wins[i]), int(losses[i]), raw[i], float(adjusted[i]))
             for i, name in enumerate(COLUMNS)
         },
-        progress_m=flat(
-            np.asarray(runs[a].progress, np.float64),
-            np.asarray(runs[b].progress, np.float64),
-        ),
-        nuplan=flat(
-            np.asarray(scores[a], np.float64), np.asarray(scores[b], np.float64)
-        ),
+        over_families={
+            name: _apart(mine[:, i], theirs[:, i], cluster)
+            for i, name in enumerate(COLUMNS)
+        },
+        progress_m=_apart(runs[a].progress, runs[b].progress, cluster),
+        nuplan=_apart(scores[a], scores[b], cluster),
     )
+
+
+def _apart(a: ArrayLike, b: ArrayLike, cluster: np.ndarray) -> Difference:
+    """Mean of a - b [C] over families; of one family over cases; of one case alone."""
+    x, y = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    if x.size < 2:
+        mean = float(x[0] - y[0])
+        return Difference(mean=mean, low=-np.inf, high=np.inf, se=np.inf, p=1.0)
+    return cluster_t(x, y, cluster if cluster.max() > 0 else np.arange(x.size))

@@ -32,9 +32,12 @@ SCHEMA_VERSION = 1
 # Rows that are not learned, in the order printed below the learned ones.
 RIVALS = ("random", "constant speed", "IDM", "hand-set", TUNED_ROW, "oracle")
 # rows that the others are compared with
-REFERENCES = ("hand-set", TUNED_ROW, "IDM", "GAN", "GAN on curves", "random")
+REFERENCES = (
+    *("hand-set", TUNED_ROW, "IDM", "GAN", "GAN on curves", "random"),
+    *("RC-IRL logistic", "MaxEnt monotone 32-16"),
+)
 
-SIGNIFICANT_SE = 2.0  # 1, standard errors beyond which a difference has a name
+SIGNIFICANT = 0.05  # Holm-adjusted p below which a difference has a name
 MIN_WIDTH = 100  # characters; a line of the paired differences needs them
 SMALLEST_P = 0.01  # that the resamples let a Holm-adjusted p value reach
 FEW_VEHICLES = 20  # below, percentile intervals are noticeably too short
@@ -49,7 +52,7 @@ class Comparison:
     metric: str
     difference: Difference
     p_holm: float  # adjusted over the rows of its kind with the same reference
-    verdict: str  # "better", "worse" or "no difference", by SIGNIFICANT_SE
+    verdict: str  # "better", "worse" or "no difference", by SIGNIFICANT
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -243,15 +246,15 @@ def _compare(
             metric=metric,
             difference=difference,
             p_holm=float(p),
-            verdict=verdict(difference, METRICS[metric].higher_is_better),
+            verdict=verdict(difference, p, METRICS[metric].higher_is_better),
         )
         for (row, metric), difference, p in zip(pairs, found, adjusted, strict=True)
     ]
 
 
-def verdict(difference: Difference, higher_is_better: bool) -> str:
-    """Name a difference "better" or "worse" if |mean| is above 2 s.e., else not."""
-    if abs(difference.mean) <= SIGNIFICANT_SE * difference.se:
+def verdict(difference: Difference, p_holm: float, higher_is_better: bool) -> str:
+    """Name a difference "better" or "worse" if its adjusted p is small, else not."""
+    if p_holm >= SIGNIFICANT:
         return "no difference"
     return "better" if (difference.mean > 0.0) == higher_is_better else "worse"
 

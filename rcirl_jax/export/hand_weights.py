@@ -10,7 +10,7 @@ import dataclasses
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rcirl_jax.errors import InputError
@@ -42,9 +42,28 @@ def write_hand_weights(
     write_json(Path(path), body)
 
 
-def tuned_row(path: str | None) -> dict[str, LatticeCost]:
-    """The tuned cost as a row of a table; none without a file."""
-    return {TUNED_ROW: load_hand_weights(path)} if path else {}
+def tuned_rows(
+    paths: Sequence[str], data_hash: str | None = None
+) -> dict[str, list[LatticeCost]]:
+    """Tuned costs, one of each search, as the runs of a row; none without files.
+
+    Args:
+      paths: files of searches that differ in their seed.
+      data_hash: of the scenes and their split; a file that was tuned on others may
+        know the held-out ones.
+
+    Raises:
+      InputError: as `load_hand_weights`, or a file tuned on other scenes.
+    """
+    costs = [load_hand_weights(path) for path in paths]
+    for path in paths:
+        found = json.loads(Path(path).read_text()).get("data_hash")
+        if data_hash and found and found != data_hash:
+            raise InputError(
+                f"{path}: data_hash: {str(found)[:12]}: expected {data_hash[:12]}, "
+                "weights tuned with the same --data and --holdout"
+            )
+    return {TUNED_ROW: costs} if costs else {}
 
 
 def load_hand_weights(path: str | os.PathLike[str]) -> LatticeCost:

@@ -17,7 +17,7 @@ from rcirl_jax.evaluation.ranking import METRICS
 from rcirl_jax.evaluation.statistics import Difference
 from rcirl_jax.evaluation.suite_output import plain
 from rcirl_jax.evaluation.suite_summary import SuiteReport
-from rcirl_jax.evaluation.table import RIVALS, SIGNIFICANT_SE, RankingReport
+from rcirl_jax.evaluation.table import RIVALS, SIGNIFICANT, RankingReport
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.export.sweep import table as sweep_table
 from rcirl_jax.report import html
@@ -211,8 +211,8 @@ def _ranking_differences(ranking: RankingReport, learned: Sequence[str]) -> str:
         return ""
     heads = ("", "", "difference", "p, Holm", "")
     title = (
-        "Paired differences on the same scenes; one has a name beyond "
-        f"{SIGNIFICANT_SE:g} standard errors"
+        "Paired differences on the same scenes; named where Holm's p is below "
+        f"{SIGNIFICANT:g}"
     )
     return table(title, heads, rows)
 

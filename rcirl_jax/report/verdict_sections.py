@@ -238,15 +238,17 @@ def _comparisons(comparisons: Sequence[Comparison]) -> str:
         cells: list[object] = [one.b]
         for name in COLUMNS:
             wins, losses, _, p = one.columns[name]
-            said = "" if p < SIGNIFICANT else " no difference"
+            is_known = p < SIGNIFICANT and one.over_families[name].is_apart
+            said = "" if is_known else " no difference"
             cells.append(f"+{wins} −{losses}, {_p(p)}{said}")
         for found, scale in ((one.progress_m, 1.0), (one.nuplan, 100.0)):
             values = (found.mean, found.low, found.high)
-            none = " no difference" if found.low <= 0.0 <= found.high else ""
+            none = "" if found.is_apart else " no difference"
             cells.append(interval(values, 1, scale=scale, signed=True) + none)
         rows.append(cells)
     title = (
         f"{first} against each row on the same cases: drives only it passes, only the "
-        "other passes (exact McNemar, Holm over the columns)"
+        "other passes (exact McNemar, Holm over the columns); no difference also where "
+        "the interval over families contains 0"
     )
     return table(title, heads, rows, kind="wrap")

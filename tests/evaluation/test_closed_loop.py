@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+import scipy.stats
 
 from rcirl_jax.evaluation.closed_loop import (
     SuiteConfig,
@@ -61,6 +62,23 @@ def test_differences_are_paired(result):
             assert wins == (first[:, i] & ~other[:, i]).sum()
             assert losses == (~first[:, i] & other[:, i]).sum()
             assert p <= adjusted <= 1.0
+
+
+def test_differences_over_families_are_those_of_family_means(result):
+    """Two families of three cases each: Student's t with one degree of freedom."""
+    groups = np.asarray(result.cases.groups)
+    first = result.runs["careful"]
+    for item in result.report.comparisons:
+        other = result.runs[item.b]
+        apart = first.progress - other.progress
+        means = [apart[groups == name].mean() for name in np.unique(groups)]
+        found = scipy.stats.ttest_1samp(means, 0.0)
+        low, high = found.confidence_interval(0.95)
+        assert item.progress_m.p == pytest.approx(found.pvalue)
+        assert (item.progress_m.low, item.progress_m.high) == pytest.approx((low, high))
+        share = (first.holds.mean(axis=0) - other.holds.mean(axis=0)).tolist()
+        over = [found.mean for found in item.over_families.values()]
+        assert over == pytest.approx(share)
 
 
 def test_the_hash_does_not_depend_on_run_chunk_or_company(result):

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 
+from rcirl_jax.evaluation import data_support
 from rcirl_jax.evaluation.data_support import (
     choices_of,
     growth,
@@ -31,6 +32,7 @@ FREE = dataclasses.replace(
 )
 LINEAR = dataclasses.replace(FREE, reward=RewardConfig(hidden=(), pin="none"))
 NAMES = feature_map("paper21").names
+VEHICLE = np.arange(16) // 2
 
 
 @functools.cache
@@ -68,7 +70,7 @@ def test_reasons_add_up_to_the_gap():
 
 def test_the_choice_is_the_best_feasible_one_and_its_error_its_distance():
     runs = trained(FREE)
-    made = choices_of(runs, frozen(), frozen())
+    made = choices_of(runs, frozen(), frozen(), VEHICLE)
     mean = np.mean([values(run) for run in runs], axis=0)
     distance = np.asarray(frozen().facts.distance)
     near = distance == np.asarray(frozen().facts.human_distance)[:, None]
@@ -81,7 +83,8 @@ def test_the_choice_is_the_best_feasible_one_and_its_error_its_distance():
         last = int(np.asarray(frozen().time_valid)[s].sum()) - 1
         station = frozen().points[s, made.chosen[s], last, NAMES.index("station")]
         assert made.station[s] == float(station)
-        gap = frozen().points[s, made.chosen[s]] - frozen().human[s]
+        chosen, human = frozen().points[s, made.chosen[s]], frozen().human[s]
+        gap = np.asarray(chosen, np.float64) - np.asarray(human, np.float64)
         np.testing.assert_array_equal(made.ahead[s], gap[:, NAMES.index("station")])
     assert (made.spread_of_posterior >= 0.0).all()
 
@@ -99,24 +102,46 @@ def test_growth_of_a_constant_error_of_acceleration():
 
 def test_equal_runs_never_disagree():
     (run, _) = trained(FREE)
-    assert not choices_of([run, run], frozen(), frozen()).spread_of_seeds.any()
+    assert not choices_of([run, run], frozen(), frozen(), VEHICLE).spread_of_seeds.any()
 
 
-def test_more_data_leave_less_doubt():
-    """Every scene counted fifty times: the posterior must shrink."""
+def test_a_sure_posterior_has_no_spread_at_all(monkeypatch):
+    """Not the rounding of equal float32 ends, which would rank scenes by station."""
+    monkeypatch.setattr(data_support, "PRIOR_PRECISION", 1e14)
+    made = choices_of(trained(FREE), frozen(), frozen(), VEHICLE)
+    assert not made.spread_of_posterior.any()
+
+
+def test_more_drivers_leave_less_doubt_but_not_the_same_ones_again():
+    """Every scene counted fifty times: as of others, and as of the same vehicles."""
     runs, made = trained(FREE), frozen()
     many = jax.tree.map(lambda x: np.repeat(np.asarray(x), 50, axis=0), made)
-    once = choices_of(runs, made, made).spread_of_posterior
-    often = choices_of(runs, many, made).spread_of_posterior
-    assert often.mean() < 0.6 * once.mean()
+    once = choices_of(runs, made, made, VEHICLE).spread_of_posterior
+    others = choices_of(runs, many, made, np.arange(800)).spread_of_posterior
+    same = choices_of(runs, many, made, np.repeat(VEHICLE, 50)).spread_of_posterior
+    assert others.mean() < 0.6 * once.mean()
+    assert same.mean() > 0.8 * once.mean()
 
 
 def test_supported_weights_name_the_presets_features():
     (run, _) = trained(LINEAR)
-    report = weights_supported(run, frozen(), np.arange(16) // 2)
+    report = weights_supported(run, frozen(), VEHICLE)
     assert [row.name for row in report.features] == list(NAMES)
     assert report.pairs == int(np.asarray(frozen().feasible).sum())
     assert report.clusters == 8
+
+
+def test_supported_weights_do_not_depend_on_the_size_and_sign_of_gamma():
+    """Gamma and the weights change together; their product is the reward."""
+    (run, _) = trained(LINEAR)
+    other = run.params.replace(gamma=-3.0 * run.params.gamma)
+    a, b = (
+        weights_supported(one, frozen(), VEHICLE).features
+        for one in (run, dataclasses.replace(run, params=other))
+    )
+    for x, y in zip(a, b, strict=True):
+        assert x.verdict == y.verdict
+        assert x.low == pytest.approx(y.low, rel=1e-3, abs=1e-9)
 
 
 def test_rank_correlation_of_known_cases():

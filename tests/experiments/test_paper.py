@@ -157,11 +157,20 @@ def test_human_likeness_beside_a_tuned_hand_set_cost(dataset, tmp_path):
     done = commands.command("experiments.tune_hand_set", data, *small)
     assert done.returncode == 0, done.stderr[-2000:]
     few = ("--learners=RC-IRL rank", "--seeds=2", "--epochs=1")
-    rest = (f"--hand_weights={tuned}", f"--output={tmp_path}")
+    again = tmp_path / "again.json"
+    again.write_text(tuned.read_text())
+    rest = (f"--hand_weights={tuned},{again}", f"--output={tmp_path}")
+    other = commands.command(
+        "experiments.human_likeness", data, *few, *rest, "--holdout=vehicles"
+    )
+    assert other.returncode == 2
+    assert "weights tuned with the same --data and --holdout" in other.stderr
+    assert not (tmp_path / "ranking.json").exists()
     done = commands.command("experiments.human_likeness", data, *few, *rest)
     assert done.returncode == 0, done.stderr[-2000:]
     body = json.loads((tmp_path / "ranking.json").read_text())
-    assert body["runs"]["RC-IRL rank"] == 2
+    assert body["runs"]["RC-IRL rank"] == body["runs"]["hand-set, tuned"] == 2
+    assert body["made_by"]["data_hash"] == json.loads(tuned.read_text())["data_hash"]
     assert {"random", "IDM", "hand-set", "hand-set, tuned", "oracle"} <= set(
         body["rows"]
     )
@@ -186,7 +195,8 @@ def test_human_likeness_beside_a_tuned_hand_set_cost(dataset, tmp_path):
         ("experiments.paper.one_frame", "--row=-5", "--row: -5: expected one of"),
         ("experiments.human_likeness", "--split_seed=-1", "--split_seed"),
         ("experiments.human_likeness", "--horizon=9", "--horizon"),
-        ("experiments.human_likeness", "--hand_weights=x", "expected groups"),
+        ("experiments.human_likeness", "--hand_weights=x", "x: No such file"),
+        ("experiments.tune_hand_set", "--output=x/t", "--budget, --epochs: expected"),
         ("experiments.human_likeness", "--recording=99", "--recording: 99: expected"),
     ],
 )

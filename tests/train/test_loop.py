@@ -111,6 +111,9 @@ def test_export_rank_report(dataset, run, tmp_path):
     }
     floor = report.rows["oracle"]["top1_fde"].value
     assert all(row["top1_fde"].value >= floor - 1e-6 for row in report.rows.values())
+    # its scale is fitted as everybody's: random values must come to no preference
+    each = report.counts["feasible"] / report.counts["scenes"]
+    assert report.rows["random"]["nll"].value == pytest.approx(np.log(each), abs=0.1)
     assert max(len(line) for line in format_table(report, 118).splitlines()) <= 118
     page = write_ranking_page(
         tmp_path / "report.html",
