@@ -9,8 +9,9 @@ long as the horizon none is dropped; a crash of the chosen candidate is charged.
 `--holdout`:
 
     groups      the dataset's split by vehicle-disjoint groups
-    vehicles    a quarter of the vehicles (drawn by --split_seed)
-    recording   one recording (number --recording) and its vehicles
+    vehicles    a quarter of the vehicles (drawn by --split_seed), which drove
+                beside those of the training scenes
+    recording   recordings (numbers --recording) and their vehicles
     validation  a quarter of the training scenes, by group or vehicle; the
                 dataset's held-out scenes stay unseen: to choose a learner by
 

@@ -4,7 +4,7 @@ Rows keep their numbers, and so their candidates.
 """
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -80,18 +80,19 @@ def by_vehicle(dataset: Demonstrations, share: float, seed: int) -> Resplit:
     return Resplit(dataset, {"train": rows[~held], "test": rows[held]})
 
 
-def by_recording(dataset: Demonstrations, recording: int) -> Resplit:
-    """Hold out one recording; its vehicles leave the training scenes too.
+def by_recording(dataset: Demonstrations, recordings: Sequence[int]) -> Resplit:
+    """Hold out recordings; their vehicles leave the training scenes too.
 
     Raises:
-      InputError: no scene is of that recording.
+      InputError: none is named, or one has no scene.
     """
     every = dataset.load(None)
     vehicle, where = np.asarray(every.vehicle), np.asarray(every.recording)
-    held = where == recording
-    if not held.any():
-        found = ", ".join(str(x) for x in np.unique(where))
-        raise InputError(f"--recording: {recording}: expected one of {found}")
+    found, named = np.unique(where), list(recordings)
+    if not named or not np.isin(named, found).all():
+        known = ", ".join(map(str, found))
+        raise InputError(f"--recording: {named}: expected of {known}")
+    held = np.isin(where, named)
     clear = ~np.isin(vehicle, vehicle[held])
     rows = dataset.indices(None)
     return Resplit(dataset, {"train": rows[clear], "test": rows[held]})
@@ -158,12 +159,16 @@ def with_validation(
 
 
 def held_out(
-    dataset: Demonstrations, how: str, *, seed: int = 0, recording: int = 0
+    dataset: Demonstrations,
+    how: str,
+    *,
+    seed: int = 0,
+    recordings: Sequence[int] = (0,),
 ) -> tuple[Demonstrations, str]:
     """The dataset split anew, as one of `HOLDOUTS` says.
 
     groups leaves the dataset's split; vehicles holds out `HELD_OUT` of them;
-    recording holds out one; validation holds out `HELD_OUT` of the training scenes
+    recording holds out some; validation holds out `HELD_OUT` of the training scenes
     and leaves the dataset's test scenes unseen, so that a learner can be chosen.
 
     Returns:
@@ -172,7 +177,8 @@ def held_out(
     if how == "vehicles":
         return by_vehicle(dataset, HELD_OUT, seed), f"vehicles, seed {seed}"
     if how == "recording":
-        return by_recording(dataset, recording), f"recording {recording}"
+        named = ", ".join(map(str, recordings))
+        return by_recording(dataset, recordings), f"recording {named}"
     if how == "validation":
         parts, by = with_validation(dataset, HELD_OUT, seed)
         splits = {TRAIN: parts.indices(TRAIN), TEST: parts.indices("validation")}

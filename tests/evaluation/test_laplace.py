@@ -213,3 +213,26 @@ def test_input_that_does_not_fit_is_refused():
     features, valid, _ = scenes()
     with pytest.raises(InputError, match="last_layer_features: time_valid"):
         last_layer_features(params, NORMALISER, features, valid[0], "tanh")
+
+
+def test_clusters_give_the_sandwich():
+    """By a loop over scenes; many pairs of one scene are no more than the scene."""
+    rng = np.random.default_rng(8)
+    human, candidates = rng.normal(size=(S, 3)), rng.normal(size=(S, K, 3))
+    feasible, w = rng.random((S, K)) < 0.8, rng.normal(size=3)
+    cluster = np.arange(S) // 3
+    scores = np.zeros((cluster.max() + 1, 3))
+    hessian = PRIOR * np.eye(3)
+    for s in range(S):
+        for k in range(K):
+            d = (candidates[s, k] - human[s]) * feasible[s, k]
+            chance = expit(d @ w)
+            scores[cluster[s]] += chance * d
+            hessian += chance * (1.0 - chance) * np.outer(d, d)
+    count = len(scores)
+    spread = count * np.cov(scores, rowvar=False) + PRIOR * np.eye(3)
+    want = hessian @ np.linalg.inv(spread) @ hessian
+    got = laplace(human, candidates, feasible, w, PRIOR, cluster)
+    np.testing.assert_allclose(got, want, rtol=1e-9)
+    with pytest.raises(InputError, match="cluster: 1 clusters: expected at least 2"):
+        laplace(human, candidates, feasible, w, PRIOR, np.zeros(S))

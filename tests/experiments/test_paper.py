@@ -197,7 +197,8 @@ def test_human_likeness_beside_a_tuned_hand_set_cost(dataset, tmp_path):
         ("experiments.human_likeness", "--horizon=9", "--horizon"),
         ("experiments.human_likeness", "--hand_weights=x", "x: No such file"),
         ("experiments.tune_hand_set", "--output=x/t", "--budget, --epochs: expected"),
-        ("experiments.human_likeness", "--recording=99", "--recording: 99: expected"),
+        ("experiments.human_likeness", "--recording=99", "--recording: [99]: expected"),
+        ("experiments.human_likeness", "--recording=a", "--recording: ['a']: inv"),
     ],
 )
 def test_bad_flags_are_one_line(module, flag, line, dataset):

@@ -1,6 +1,8 @@
 """Suites and rankings in other processes: the same numbers as in this one."""
 
-import functools
+import subprocess
+import sys
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -15,6 +17,8 @@ from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.simulation.suite import suite_refs
 from tests.train.test_step import rows
 from tests.weights_files import random_weights
+
+REPO = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -35,13 +39,33 @@ def leaves(made):
     return [np.asarray(leaf) for leaf in jax.tree.leaves(made)]
 
 
+def driven(weights, executor):
+    """What identifies the result of a small suite."""
+    job, config = job_of(weights), SuiteConfig(chunk=1)
+    made = run_suite(job.rows(), job.cases(), config, spread(executor, job))
+    return made.facts["result_sha256"]
+
+
+def scored(weights, executor):
+    """All arrays of a ranking of 16 scenes."""
+    made = score_scenes(
+        rows(),
+        np.arange(16),
+        preset="paper21",
+        sampler=SamplerConfig(),
+        horizon_s=5.0,
+        scorers={"learned": open_reward(str(weights)).value},
+        executor=executor,
+    )
+    return leaves(vars(made))
+
+
 @pytest.mark.slow
 @pytest.mark.multiprocess
 def test_a_suite_does_not_depend_on_where_it_is_driven(weights):
     job, config = job_of(weights), SuiteConfig(chunk=1)
     here = run_suite(job.rows(), job.cases(), config, drive_here)
-    there = run_suite(job.rows(), job.cases(), config, spread(Processes(2), job))
-    assert here.facts["result_sha256"] == there.facts["result_sha256"]
+    assert here.facts["result_sha256"] == driven(weights, Processes(2))
 
 
 def test_a_piece_is_its_part_of_the_whole(weights):
@@ -55,16 +79,33 @@ def test_a_piece_is_its_part_of_the_whole(weights):
 
 @pytest.mark.multiprocess
 def test_a_ranking_does_not_depend_on_where_it_is_scored(weights):
-    reward = open_reward(str(weights))
-    score = functools.partial(
-        score_scenes,
-        rows(),
-        np.arange(16),
-        preset="paper21",
-        sampler=SamplerConfig(),
-        horizon_s=5.0,
-        scorers={"learned": reward.value},
-    )
-    here, there = score(executor=Here()), score(executor=Processes(2))
-    for a, b in zip(leaves(vars(here)), leaves(vars(there)), strict=True):
+    here, there = scored(weights, Here()), scored(weights, Processes(2))
+    for a, b in zip(here, there, strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+RAY = """
+import sys
+import numpy as np
+import ray
+from rcirl_jax.executor import Here, Ray
+from tests.export.test_spread import driven, scored
+ray.init(num_cpus=2, log_to_driver=False, logging_level="ERROR")
+weights, cluster = sys.argv[1], Ray("auto")
+assert driven(weights, cluster) == driven(weights, Here()), "suite"
+for a, b in zip(scored(weights, cluster), scored(weights, Here()), strict=True):
+    np.testing.assert_array_equal(a, b)
+ray.shutdown()
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.ray
+def test_neither_depends_on_ray(weights):
+    """Suites (simulate, gate) and rankings (evaluate) on a cluster of two CPUs."""
+    pytest.importorskip("ray")
+    done = subprocess.run(
+        [sys.executable, "-c", RAY, str(weights)],
+        capture_output=True, text=True, timeout=900, check=False, cwd=REPO,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
