@@ -5,9 +5,10 @@
 A hidden random 21-15-1 reward replaces the human in every scene; learners see
 only its choices (best, or Boltzmann at --temperature) and are asked to choose on
 held-out scenes. One hidden reward per seed. Expected with --counts=30,300,3000
---epochs=40 --seeds=8: 40 minutes on one core; agreement rises with the number of
-scenes and recovery is partial; the logistic and listwise losses are above the GAN,
-which compares across scenes, the leaky-ReLU loss is not. `--quick`: a minute.
+--epochs=40 --seeds=8: 40 minutes on one core; under the logistic and listwise losses
+agreement rises with the number of scenes and is above that of the GAN, which
+compares across scenes; under the leaky-ReLU loss neither shows. Recovery is partial.
+`--quick`: a minute.
 """
 
 import dataclasses
