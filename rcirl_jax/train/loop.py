@@ -32,6 +32,7 @@ from rcirl_jax.train.step import StepMetrics, featurised, init_state, make_train
 from rcirl_jax.types import Demonstration
 
 NORMALISER_SCENES = 512  # training scenes whose features fit the normaliser
+NORMALISER_CHUNK = 64  # of them per call
 NORMALISER_STREAM = 7  # fold_in number of the key that samples for the normaliser
 
 
@@ -69,12 +70,14 @@ def fit_normaliser_on(
     rows = dataset.read(index[chosen])
     key = jax.random.fold_in(jax.random.key(config.seed), NORMALISER_STREAM)
     parts = []
-    for start in range(0, chosen.size, config.batch_size):
-        some = np.arange(start, min(start + config.batch_size, chosen.size))
-        some = np.resize(some, config.batch_size)
+    for start in range(0, chosen.size, NORMALISER_CHUNK):
+        some = np.arange(start, start + NORMALISER_CHUNK)
+        some = np.minimum(some, chosen.size - 1)  # one shape to compile
         taken = jax.tree.map(lambda x, some=some: x[some], rows)
         batch = to_device_batch(taken, np.ones(some.size), chosen[some])
-        parts.append(rows_that_count(featurised(key, batch, config)))
+        made = featurised(key, batch, config)
+        own = jax.tree.map(lambda x, n=chosen.size - start: x[:n], made)
+        parts.append(rows_that_count(own))
     return fit_normaliser(np.concatenate(parts), features)
 
 

@@ -17,9 +17,11 @@ from rcirl_jax.evaluation.evaluate import RankingSetup, evaluate_ranking, oracle
 from rcirl_jax.evaluation.format import format_table
 from rcirl_jax.export.from_run import export_run, read_config
 from rcirl_jax.export.loading import load_runs, open_reward
+from rcirl_jax.features import feature_map
 from rcirl_jax.report.ranking_page import write_ranking_page
 from rcirl_jax.sampling import SamplerConfig
-from rcirl_jax.train.loop import train
+from rcirl_jax.train import loop
+from rcirl_jax.train.loop import fit_normaliser_on, train
 from rcirl_jax.train.running import check_run
 from rcirl_jax.train.state import TrainConfig
 from tests.conftest import REPO
@@ -175,6 +177,17 @@ def test_a_broken_run_file_is_one_line(dataset, tmp_path, text):
 def test_a_seed_out_of_range_names_its_flag(seed):
     with pytest.raises(InputError, match=r"--seed: .*: expected 0 to 2147483647"):
         dataclasses.replace(CONFIG, seed=seed)
+
+
+def test_every_scene_counts_once_for_the_normaliser(dataset, monkeypatch):
+    """Whatever the batch, and where the last call is not full."""
+    features = feature_map(CONFIG.features)
+    whole = fit_normaliser_on(dataset, CONFIG, features)
+    other = dataclasses.replace(CONFIG, batch_size=3)
+    monkeypatch.setattr(loop, "NORMALISER_CHUNK", dataset.indices("train").size - 1)
+    again = fit_normaliser_on(dataset, other, features)
+    for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 def test_a_horizon_nobody_covers_is_one_line(dataset):
