@@ -1,6 +1,6 @@
 """What the benchmarks share: hardware, percentiles, made datasets, the JSON."""
 
-import json
+import datetime
 import os
 import platform
 import time
@@ -11,8 +11,10 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from experiments.common import git_commit
 from rcirl_jax.data.store import Dataset, DatasetWriter, open_dataset
 from rcirl_jax.types import Demonstration
+from rcirl_jax.whole import write_json
 
 
 def machine() -> dict:
@@ -28,7 +30,9 @@ def machine() -> dict:
     return {
         "cpu": model,
         "cores": len(os.sched_getaffinity(0)),
+        "load": round(os.getloadavg()[0], 2),
         "device": jax.devices()[0].device_kind,
+        "devices": jax.device_count(),
         "python": platform.python_version(),
         **{name: metadata.version(name) for name in ("jax", "jaxlib", "numpy")},
     }
@@ -59,8 +63,8 @@ def timed(call: Callable[[], object], count: int, warm_up: int = 20) -> list[flo
 def write(name: str, result: dict, folder: str) -> Path:
     """The result with its machine as JSON under `folder`."""
     path = Path(folder) / f"{name}.json"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({**result, "machine": machine()}, indent=2) + "\n")
+    made = {"git_commit": git_commit(), "date": datetime.date.today().isoformat()}
+    write_json(path, {**result, "made_by": made, "machine": machine()})
     return path
 
 

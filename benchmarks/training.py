@@ -327,6 +327,11 @@ def main(_: list[str]) -> None:
     """One core and all of them, or what --cores says."""
     if torch is None:
         raise SystemExit("error: torch: not installed: expected the extra [bench]")
+    if (backend := jax.default_backend()) != "cpu":
+        raise SystemExit(
+            f"error: jax: {backend}: PyTorch's rows run on the CPU: expected "
+            "JAX_PLATFORMS=cpu"
+        )
     size = CONFIG.batch_size
     if _SCENES.value < size or _SCENES.value % size:
         raise SystemExit(
