@@ -6,6 +6,7 @@ batch; process 0 alone writes run.json and metrics.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import cast
@@ -23,7 +24,7 @@ from rcirl_jax.features import FeatureMap, feature_map
 from rcirl_jax.reward import Normaliser, fit_normaliser
 from rcirl_jax.train.checkpoint import Checkpoints
 from rcirl_jax.train.metrics import MetricsWriter, Progress
-from rcirl_jax.train.parallel import Parallel, parallelise
+from rcirl_jax.train.parallel import Step, parallelise
 from rcirl_jax.train.preferences import featurise_preferences, pairs_of_step
 from rcirl_jax.train.processes import is_first
 from rcirl_jax.train.running import Running, check_run, describe_run
@@ -153,14 +154,18 @@ def train(
     if preferences is not None:
         run.judged = featurise_preferences(preferences, dataset, config)
 
+    steps = itertools.count(int(state.step))
+
     def produce() -> tuple:
+        """The next batch, on its devices before its step, and where it stands."""
         if batches.state()["epoch"] >= config.epochs:
             raise StopIteration
-        return next(batches), batches.state()
+        made = host_batch(*next(batches), run.judged_at(next(steps)))
+        return parallel.place(made), batches.state()
 
     try:
         with Prefetch(produce, running.prefetch) as ahead:
-            state = run.epochs_from(state, ahead, parallel, checkpoints)
+            state = run.epochs_from(state, ahead, parallel.step, checkpoints)
     finally:
         checkpoints.close()
         run.close()
@@ -224,25 +229,25 @@ class _Run:
         self,
         state: TrainState,
         batches: Iterator[tuple],
-        parallel: Parallel,
+        take_step: Step,
         checkpoints: Checkpoints,
     ) -> TrainState:
-        for epoch in range(int(state.step) // self.per_epoch, self.config.epochs):
+        step = int(state.step)
+        for epoch in range(step // self.per_epoch, self.config.epochs):
             sums = np.zeros(4)
-            for _ in range(self.per_epoch - int(state.step) % self.per_epoch):
-                (rows, weight, number), position = next(batches)
-                judged = self._judged_at(int(state.step))
-                batch = parallel.place(host_batch(rows, weight, number, judged))
-                state, metrics = parallel.step(state, batch)
-                step = int(state.step)
-                sums += self._after_step(step, metrics)
+            for _ in range(self.per_epoch - step % self.per_epoch):
+                batch, position = next(batches)
+                state, metrics = take_step(state, batch)
+                step += 1
+                sums += self._after_step(step, jax.device_get(metrics))
                 if self._is_due(step):
                     checkpoints.save(state, position)
                 self.running.on_step(step)
             self.summaries.append(_summary(epoch, sums))
         return state
 
-    def _judged_at(self, step: int) -> FeatureBatch | None:
+    def judged_at(self, step: int) -> FeatureBatch | None:
+        """This process's preferences of a step."""
         if self.judged is None:
             return None
         return pairs_of_step(
