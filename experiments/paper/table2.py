@@ -8,9 +8,9 @@
     table      every row over the suite; DP rows on `--dp_cases` of each family
     recorded   with --input: the same rows and the recorded human on its drives
 
-Finished parts are kept and reused. Expected: two and a half hours on one busy core,
-most of it the suite; RC-IRL above the paper's row per sample, with few faults, and
-hand-set behind it in acceleration and jerk per case. `--quick` makes the same
+Finished parts are kept and reused. Expected: a hundred minutes on one core,
+most of it the suite; RC-IRL above the paper's row per sample, with few faults, over
+families ahead of IDM and not to be told from hand-set. `--quick` makes the same
 files from a few cases in about three minutes; its numbers mean nothing.
 """
 
