@@ -8,7 +8,7 @@
     table      every row over the suite; DP rows on `--dp_cases` of each family
     recorded   with --input: the same rows and the recorded human on its drives
 
-Finished parts are kept and reused. Expected: a hundred minutes on one core,
+Finished parts are kept and reused. Expected: two hours on one core,
 most of it the suite; RC-IRL above the paper's row per sample, with few faults, over
 families ahead of IDM and not to be told from hand-set. `--quick` makes the same
 files from a few cases in about three minutes; its numbers mean nothing.
