@@ -8,8 +8,9 @@ apart the members of an ensemble (21-15-1, logistic pairs; other initial weights
 the same batches), and draws of the last layer's Laplace posterior, choose (m), and
 whether unsure choices are worse ones. Which features speak for the chosen
 candidate against the one nearest to the human, and how its error grows. Expected
-on two cores with US-101: 6 minutes; 8 of 21 weights supported, neither doubt warns
-of errors, the error is worth a steady 0.2 m/s^2. `--quick`: a minute.
+with US-101: two minutes on one core; 8 of 21 weights supported, that either doubt
+warns of errors is not shown, the error is worth a steady 0.2 m/s^2. `--quick`: a
+minute.
 """
 
 import dataclasses
