@@ -79,15 +79,15 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     learned = train_learners(dataset, configs, range(_SEEDS.value))
     report = evaluate_ranking(dataset, scorers(learned), setup)
-    text = format_table(report, 118)
-    (folder / "table.txt").write_text(text + "\n")
+    (folder / "table.txt").write_text(format_table(report, 118))
     (folder / "table.md").write_text(markdown_table(report))
     made_by = {**provenance(), "data_hash": dataset.hash}
     body = {**to_json(report), "split": words, "made_by": made_by}
     (folder / "ranking.json").write_text(json.dumps(body, indent=2) + "\n")
     picture = ranking_chart(folder / "ranking.png", report)
-    print(f"{text}\nsplit: {words}")
-    print(f"written: {folder}/ranking.json, table.txt, table.md, {picture.name}")
+    print(f"{format_table(report, 118, differences=False)}\nsplit: {words}")
+    print(f"written: {folder}/ranking.json, table.md, {picture.name}")
+    print(f"with paired differences: {folder}/table.txt")
 
 
 if __name__ == "__main__":

@@ -26,7 +26,9 @@ _IN_MARKDOWN = (
 )
 
 
-def format_table(report: RankingReport, width: int = 110) -> str:
+def format_table(
+    report: RankingReport, width: int = 110, *, differences: bool = True
+) -> str:
     """The report as aligned plain text for a terminal.
 
     Rows: learned scorers first, then the rivals; columns wrap into blocks that
@@ -36,6 +38,7 @@ def format_table(report: RankingReport, width: int = 110) -> str:
     Args:
       report: from `build_report`.
       width: characters per line, at least `MIN_WIDTH`.
+      differences: with the paired differences; many rows make thousands of lines.
     """
     if width < MIN_WIDTH:
         raise InputError(f"format_table: width: {width}: expected at least {MIN_WIDTH}")
@@ -56,7 +59,8 @@ def format_table(report: RankingReport, width: int = 110) -> str:
         block.append(name)
     lines += _block(labels, first, [columns[x] for x in block])
     lines += _medians(report, names)
-    return "\n".join([*lines, *_differences(report, learned or names)]) + "\n"
+    lines += _differences(report, learned or names) if differences else []
+    return "\n".join(lines) + "\n"
 
 
 def markdown_table(report: RankingReport, against: str = "GAN") -> str:

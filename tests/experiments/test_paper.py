@@ -168,6 +168,8 @@ def test_human_likeness_beside_a_tuned_hand_set_cost(dataset, tmp_path):
     assert not (tmp_path / "ranking.json").exists()
     done = commands.command("experiments.human_likeness", data, *few, *rest)
     assert done.returncode == 0, done.stderr[-2000:]
+    assert "Paired differences" not in done.stdout
+    assert "RC-IRL rank minus hand-set, tuned" in (tmp_path / "table.txt").read_text()
     body = json.loads((tmp_path / "ranking.json").read_text())
     assert body["runs"]["RC-IRL rank"] == body["runs"]["hand-set, tuned"] == 2
     assert body["made_by"]["data_hash"] == json.loads(tuned.read_text())["data_hash"]
