@@ -12,6 +12,7 @@ from rcirl_jax.evaluation.statistics import (
     ClusterBootstrap,
     Difference,
     cluster_t,
+    family_clusters,
     paired_difference,
 )
 from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics, nuplan_score
@@ -58,12 +59,6 @@ def is_clean(metrics: CaseMetrics) -> np.ndarray:
 def _discordant(mine: np.ndarray, theirs: np.ndarray) -> tuple[int, int]:
     """(cases only mine passes, cases only theirs passes)."""
     return int(np.sum(mine & ~theirs)), int(np.sum(~mine & theirs))
-
-
-def _clusters(pair: Pair) -> np.ndarray:
-    """[C] family of a case; single cases where there is one family."""
-    _, index = np.unique(np.asarray(pair.families), return_inverse=True)
-    return index if index.max() > 0 else np.arange(index.size)
 
 
 def _over_clusters(
@@ -142,7 +137,7 @@ def no_loss(pair: Pair, config: GateConfig) -> list[Check]:
     """Rates and progress of all cases, within their margins."""
     mine, theirs = passes_of(pair.candidate), passes_of(pair.incumbent)
     count, found = len(pair.ids), []
-    bootstrap = ClusterBootstrap(_clusters(pair))
+    bootstrap = ClusterBootstrap(family_clusters(pair.families))
     for name in ("collision_free", "min_ttc", "speed_limit", "on_road"):
         margin = getattr(config, name)
         pairs = _discordant(mine[name], theirs[name])
@@ -234,7 +229,7 @@ def families(pair: Pair, config: GateConfig) -> list[Check]:
 def gains(pair: Pair, config: GateConfig) -> list[Check]:
     """Primary metrics that are better; Holm over them."""
     mine, theirs = passes_of(pair.candidate), passes_of(pair.incumbent)
-    bootstrap = ClusterBootstrap(_clusters(pair))
+    bootstrap = ClusterBootstrap(family_clusters(pair.families))
     rows: list[tuple[str, Difference, tuple[int, int] | None, float]] = []
     for name in config.primary:
         if name in COLUMNS:

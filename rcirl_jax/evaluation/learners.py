@@ -23,8 +23,8 @@ from rcirl_jax.reward import (
     fit_normaliser,
     value,
 )
-from rcirl_jax.train.frozen import CHUNK, Fitted, fit, freeze, members_of
-from rcirl_jax.train.loop import NORMALISER_SCENES, rows_that_count
+from rcirl_jax.train.frozen import Fitted, fit, freeze, members_of
+from rcirl_jax.train.loop import CHUNK, NORMALISER_SCENES, rows_that_count
 from rcirl_jax.train.state import FeatureBatch, TrainConfig
 
 LINEAR = RewardConfig(hidden=(), pin="none")

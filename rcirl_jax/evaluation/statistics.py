@@ -10,6 +10,7 @@ chapter 5 (percentile intervals) and 3.8 (clusters). Tests of counts: `exact`.
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.special import stdtr, stdtrit
@@ -277,6 +278,12 @@ def paired_difference(
         se=se,
         p=float(min(1.0, 2.0 * min(below, above))),
     )
+
+
+def family_clusters(families: Sequence[str] | np.ndarray) -> np.ndarray:
+    """[C] number of each case's family; each case its own where there is one family."""
+    _, index = np.unique(np.asarray(families), return_inverse=True)
+    return index if index.max() > 0 else np.arange(index.size)
 
 
 def cluster_t(

@@ -23,6 +23,7 @@ from rcirl_jax.evaluation.statistics import (
     ClusterBootstrap,
     Difference,
     cluster_t,
+    family_clusters,
 )
 from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics, nuplan_score
 
@@ -131,7 +132,7 @@ def summarise(
     scores = {
         row: np.asarray(nuplan_score(m, jnp.asarray(way))[0]) for row, m in runs.items()
     }
-    _, cluster = np.unique(names, return_inverse=True)
+    cluster = family_clusters(names)
     rows = {
         row: _row(metrics, scores[row], names, cluster, preventable, way)
         for row, metrics in runs.items()
@@ -169,10 +170,8 @@ def _sample_rates(
 
 
 def _interval(scores: np.ndarray, cluster: np.ndarray) -> tuple[float, float]:
-    """95 % bootstrap interval of the mean; families are resampled if there are two."""
-    if np.unique(cluster).size < 2:
-        cluster = np.arange(scores.size)
-    if np.unique(cluster).size < 2:
+    """95 % bootstrap interval of the mean over clusters."""
+    if scores.size < 2:
         return float(scores.mean()), float(scores.mean())
     draws = ClusterBootstrap(cluster).means(scores)
     low, high = np.quantile(draws, [0.025, 0.975])
@@ -292,9 +291,9 @@ def _compare(
 
 
 def _apart(a: ArrayLike, b: ArrayLike, cluster: np.ndarray) -> Difference:
-    """Mean of a - b [C] over families; of one family over cases; of one case alone."""
+    """Mean of a - b [C] over clusters; of one case alone."""
     x, y = np.asarray(a, np.float64), np.asarray(b, np.float64)
     if x.size < 2:
         mean = float(x[0] - y[0])
         return Difference(mean=mean, low=-np.inf, high=np.inf, se=np.inf, p=1.0)
-    return cluster_t(x, y, cluster if cluster.max() > 0 else np.arange(x.size))
+    return cluster_t(x, y, cluster)

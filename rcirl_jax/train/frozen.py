@@ -22,18 +22,16 @@ import numpy as np
 import optax
 
 from rcirl_jax.reward import Normaliser, RewardParams
-from rcirl_jax.train.loop import to_device_batch
+from rcirl_jax.train.loop import in_chunks
 from rcirl_jax.train.pieces import added, divisor_at_most
 from rcirl_jax.train.state import OPTIMIZERS, FeatureBatch, TrainConfig
 from rcirl_jax.train.step import (
     as_tree,
-    featurised,
     gradient_sums,
     init_params,
 )
 from rcirl_jax.types import Demonstration
 
-CHUNK = 128  # scenes featurised per call
 ORDER_STREAM = 3  # fold_in number of the batch order's key
 
 # hidden values of all members in one piece of a batch: 2 MB on a CPU, of the order
@@ -81,14 +79,7 @@ def freeze(rows: Demonstration, index: np.ndarray, config: TrainConfig) -> Featu
       index: [S] dataset rows; with `config.seed` they seed the candidates.
       config: sampler, positive, features; the loss decides which facts.
     """
-    key, parts = jax.random.key(config.seed), []
-    for start in range(0, index.size, CHUNK):
-        at = np.minimum(np.arange(start, start + CHUNK), index.size - 1)
-        taken = jax.tree.map(lambda x, at=at: x[at], rows)
-        batch = to_device_batch(taken, np.ones(CHUNK), index[at])
-        made = featurised(key, batch, config)
-        keep = min(CHUNK, index.size - start)
-        parts.append(jax.tree.map(lambda x, n=keep: np.asarray(x[:n]), made))
+    parts = in_chunks(jax.random.key(config.seed), rows, index, config)
     return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)), *parts)
 
 

@@ -32,8 +32,8 @@ from rcirl_jax.train.state import Batch, FeatureBatch, TrainConfig, TrainState
 from rcirl_jax.train.step import StepMetrics, featurised, init_state, make_train_step
 from rcirl_jax.types import Demonstration
 
+CHUNK = 128  # scenes featurised per call where no batch sets their number
 NORMALISER_SCENES = 512  # training scenes whose features fit the normaliser
-NORMALISER_CHUNK = 64  # of them per call
 NORMALISER_STREAM = 7  # fold_in number of the key that samples for the normaliser
 
 
@@ -70,16 +70,30 @@ def fit_normaliser_on(
     chosen = np.sort(chosen[:NORMALISER_SCENES])
     rows = dataset.read(index[chosen])
     key = jax.random.fold_in(jax.random.key(config.seed), NORMALISER_STREAM)
-    parts = []
-    for start in range(0, chosen.size, NORMALISER_CHUNK):
-        some = np.arange(start, start + NORMALISER_CHUNK)
-        some = np.minimum(some, chosen.size - 1)  # one shape to compile
-        taken = jax.tree.map(lambda x, some=some: x[some], rows)
-        batch = to_device_batch(taken, np.ones(some.size), chosen[some])
-        made = featurised(key, batch, config)
-        own = jax.tree.map(lambda x, n=chosen.size - start: x[:n], made)
-        parts.append(rows_that_count(own))
-    return fit_normaliser(np.concatenate(parts), features)
+    parts = map(rows_that_count, in_chunks(key, rows, chosen, config))
+    return fit_normaliser(np.concatenate(list(parts)), features)
+
+
+def in_chunks(
+    key: jax.Array, rows: Demonstration, index: np.ndarray, config: TrainConfig
+) -> Iterator[FeatureBatch]:
+    """Features (numpy) of S scenes, CHUNK at a time; each scene once.
+
+    Args:
+      key: of the candidates, with the numbers of `index`.
+      rows: S demonstrations (numpy).
+      index: [S] number of each scene.
+      config: sampler, positive, features.
+    """
+    for start in range(0, index.size, CHUNK):
+        # the last chunk is filled up: one shape to compile
+        at = np.minimum(np.arange(start, start + CHUNK), index.size - 1)
+        taken = jax.tree.map(lambda x, at=at: x[at], rows)
+        made = featurised(
+            key, to_device_batch(taken, np.ones(CHUNK), index[at]), config
+        )
+        keep = min(CHUNK, index.size - start)
+        yield jax.tree.map(lambda x, n=keep: np.asarray(x[:n]), made)
 
 
 def rows_that_count(batch: FeatureBatch) -> np.ndarray:

@@ -184,7 +184,7 @@ def test_every_scene_counts_once_for_the_normaliser(dataset, monkeypatch):
     features = feature_map(CONFIG.features)
     whole = fit_normaliser_on(dataset, CONFIG, features)
     other = dataclasses.replace(CONFIG, batch_size=3)
-    monkeypatch.setattr(loop, "NORMALISER_CHUNK", dataset.indices("train").size - 1)
+    monkeypatch.setattr(loop, "CHUNK", dataset.indices("train").size - 1)
     again = fit_normaliser_on(dataset, other, features)
     for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(a, b)
