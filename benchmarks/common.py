@@ -9,11 +9,14 @@ from importlib import metadata
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from experiments.common import git_commit
 from rcirl_jax.data.store import Dataset, DatasetWriter, open_dataset
-from rcirl_jax.types import Demonstration
+from rcirl_jax.features import feature_map
+from rcirl_jax.reward import RewardConfig, init_reward, pinned
+from rcirl_jax.types import Demonstration, Normaliser, RewardParams
 from rcirl_jax.whole import write_json
 
 
@@ -72,6 +75,18 @@ def resident_mb() -> float:
     """Memory of this process now, MiB."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def untrained(preset: str = "paper21") -> tuple[RewardParams, Normaliser]:
+    """A reward of the paper's shape with drawn weights; what it costs is as learned."""
+    shape, specs = RewardConfig(), feature_map(preset).specs
+    params = pinned(init_reward(jax.random.key(0), len(specs), shape), shape)
+    lower = jnp.asarray([spec.lower for spec in specs])
+    upper = jnp.asarray([spec.upper for spec in specs])
+    location = jnp.zeros(len(specs))
+    return params, Normaliser(
+        lower=lower, upper=upper, location=location, scale=upper - lower
+    )
 
 
 def stored_scenes(

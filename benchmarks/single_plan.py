@@ -13,12 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from absl import app, flags
 
-from benchmarks.common import percentiles, timed, write
+from benchmarks.common import percentiles, timed, untrained, write
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.rank import ONLINE, RankConfig, learned_score, rank_policy
-from rcirl_jax.reward import RewardConfig, init_reward, pinned
+from rcirl_jax.reward import RewardConfig
 from rcirl_jax.sampling import num_candidates
-from rcirl_jax.types import Normaliser
 from tests.scenes import random_scene
 
 _CALLS = flags.DEFINE_integer("calls", 2000, "plans that are timed")
@@ -33,16 +32,8 @@ def sampler_of(count: int) -> object:
 
 def main(_: list[str]) -> None:
     """Time 512 and 64 candidates."""
-    shape = RewardConfig()
-    params = pinned(init_reward(jax.random.key(0), 21, shape), shape)
-    specs = feature_map("paper21").specs
-    normaliser = Normaliser(
-        lower=jnp.asarray([s.lower for s in specs]),
-        upper=jnp.asarray([s.upper for s in specs]),
-        location=jnp.zeros(len(specs)),
-        scale=jnp.asarray([s.upper - s.lower for s in specs]),
-    )
-    score = learned_score(feature_map("paper21"), shape.activation)
+    weights = untrained()
+    score = learned_score(feature_map("paper21"), RewardConfig().activation)
     scenes = [jax.tree.map(jnp.asarray, random_scene(i)) for i in range(32)]
     result = {}
     for count in (64, 512):
@@ -52,7 +43,7 @@ def main(_: list[str]) -> None:
         key = jax.random.key(0)
 
         def call(plan=plan, turn=turn, key=key) -> object:  # noqa: ANN001
-            return plan((params, normaliser), scenes[next(turn) % len(scenes)], key)
+            return plan(weights, scenes[next(turn) % len(scenes)], key)
 
         result[f"rank_{count}"] = percentiles(timed(call, _CALLS.value))
         print(f"rank, {count} candidates: {result[f'rank_{count}']}")
