@@ -7,8 +7,6 @@ OUT    ?= out/demo
 WORKERS ?= 2
 # folder of recordings for `make bench`; what is not there is left out
 RECORDINGS ?= ../shared/data
-# imported dataset for the paper-scale slice of `make bench`
-DATA ?=
 
 .PHONY: demo test test-dataset lint bench docs onboard setup clean
 
@@ -41,8 +39,8 @@ $(VENV)/.bench: pyproject.toml | setup
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[bench]'
 	@touch $@
 
-# All benchmarks, three quarters of an hour; wants a quiet machine. Writes benchmarks/results and the pictures of
-# docs/performance.md. Without a dataset in DATA the paper-scale slice is left out.
+# All benchmarks, three quarters of an hour; wants a quiet machine. Writes benchmarks/results and
+# the pictures of docs/performance.md.
 bench: export JAX_PLATFORMS = cpu
 bench: $(VENV)/.bench
 	$(BIN)/python -m benchmarks.training
@@ -56,7 +54,7 @@ bench: $(VENV)/.bench
 	$(BIN)/python -m benchmarks.importing --data=$(RECORDINGS)
 	$(BIN)/python -m benchmarks.streaming
 	$(BIN)/python -m benchmarks.memory
-	$(if $(DATA),$(BIN)/python -m benchmarks.paper_scale --data=$(DATA))
+	$(BIN)/python -m benchmarks.paper_scale
 	$(BIN)/python -m benchmarks.plots
 
 # Documentation as a site; warnings are errors

@@ -1,10 +1,12 @@
 """What the benchmarks share: hardware, percentiles, made datasets, the JSON."""
 
+import contextlib
 import datetime
 import os
 import platform
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib import metadata
 from pathlib import Path
 
@@ -13,11 +15,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.common import git_commit
+from rcirl_jax.data.config import CollectConfig
+from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.data.store import Dataset, DatasetWriter, open_dataset
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import RewardConfig, init_reward, pinned
 from rcirl_jax.types import Demonstration, Normaliser, RewardParams
 from rcirl_jax.whole import write_json
+
+STRIDE_S = 60.0  # s between planning frames of the synthetic dataset
 
 
 def machine() -> dict:
@@ -75,6 +82,20 @@ def resident_mb() -> float:
     """Memory of this process now, MiB."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+@contextlib.contextmanager
+def dataset_or_synthetic(path: str | None) -> Iterator[str]:
+    """The path of a dataset: the given one, or synthetic traffic while this lasts."""
+    if path:
+        yield path
+        return
+    collect = CollectConfig(stride_s=STRIDE_S)
+    with tempfile.TemporaryDirectory() as folder:
+        made = Path(folder) / "synthetic"
+        config = ImportConfig(format="synthetic", collect=collect)
+        import_logs(read_recordings("synthetic", None), made, config)
+        yield str(made)
 
 
 def untrained(preset: str = "paper21") -> tuple[RewardParams, Normaliser]:

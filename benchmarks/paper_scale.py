@@ -1,30 +1,31 @@
 """The paper's amount of training: 718 million frames, 2.8 billion queries, 2 epochs.
 
-    python -m benchmarks.paper_scale --data=DATASET          # a slice of 60 s
-    python -m benchmarks.paper_scale --data=DATASET --full   # all, on accelerators
+    python -m benchmarks.paper_scale [--data=DATASET]          # a slice of 60 s
+    python -m benchmarks.paper_scale [--data=DATASET] --full   # all, on accelerators
 
-Each frame is a stored scene, cycled (frame f shows scene f mod n; n is printed),
-whose ego starts a little faster or slower by f, with candidates drawn for that
-frame and epoch alone: sampling and features are computed anew every time, and
-nothing but the n scenes is kept, on every device. A call of the compiled program
-makes the frames of several steps and takes the steps; nothing else moves between
-host and device. With 718 million frames the paper's 2.8 billion queries are four per
-frame: the sampler is cut to one candidate of each of its eight families, which makes
-5.6 queries on US-101. They are counted, not assumed, and a run is complete only when
-frames and queries both are.
+Each frame is a scene of the dataset (default: synthetic traffic), cycled (frame f
+shows scene f mod n; n is printed), whose ego starts a little faster or slower by f,
+with candidates drawn for that frame and epoch alone: sampling and features are
+computed anew every time, and nothing but the n scenes is kept, on every device. A
+call of the compiled program makes the frames of several steps and takes the steps;
+nothing else moves between host and device. With 718 million frames the paper's 2.8
+billion queries are four per frame: the sampler is cut to one candidate of each of its
+eight families, which makes 5.6 queries on US-101. They are counted, not assumed, and
+a run is complete only when frames and queries both are.
 The loss and the share of pairs the human wins are kept over the run. Without --full,
 the rate of a slice is extrapolated, and the result says so.
 """
 
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from absl import flags
 
-from benchmarks.common import write
+from benchmarks.common import dataset_or_synthetic, write
 from experiments.common import run
 from rcirl_jax.data.store import open_dataset
 from rcirl_jax.errors import InputError
@@ -36,9 +37,7 @@ from rcirl_jax.train.state import Batch, TrainConfig, TrainState
 from rcirl_jax.train.step import init_state, make_train_step
 from rcirl_jax.types import Demonstration
 
-_DATA = flags.DEFINE_string(
-    "data", None, "dataset whose scenes are cycled", required=True
-)
+_DATA = flags.DEFINE_string("data", None, "scenes to cycle (default: synthetic)")
 _FULL = flags.DEFINE_bool("full", False, "run everything instead of a slice")
 _SECONDS = flags.DEFINE_float("seconds", 60.0, "length of the slice")
 _BATCH = flags.DEFINE_integer("batch_size", 0, "frames; 0: 256, accelerators 65536")
@@ -111,10 +110,11 @@ def main() -> None:
     size = _BATCH.value or (256 if on_cpu else 65536)
     steps = 1 if on_cpu else STEPS
     config = TrainConfig(batch_size=size, sampler=FEW, learning_rate=1e-3)
-    dataset = open_dataset(_DATA.value)
-    features = feature_map(config.features)
-    normaliser = fit_normaliser_on(dataset, config, features)
-    rows = dataset.load("train")
+    with dataset_or_synthetic(_DATA.value) as path:
+        dataset = open_dataset(path)
+        features = feature_map(config.features)
+        normaliser = fit_normaliser_on(dataset, config, features)
+        rows = dataset.load("train")
     parallel = parallelise(make_steps(config, _HOW.value, steps), _HOW.value, size)
     held = parallel.replicate((init_state(config, normaliser), rows))
 
@@ -148,6 +148,7 @@ def main() -> None:
         "frames_per_s": frames / seconds,
         "queries_per_s": queries / seconds,
         "candidates_per_frame": num_candidates(FEW),
+        "scenes": Path(_DATA.value or "synthetic traffic").name,
         "stored_scenes_cycled": int(rows.vehicle.shape[0]),
         "batch_size": size,
         "parallel": _HOW.value,

@@ -28,10 +28,7 @@ import numpy as np
 from absl import app, flags
 
 from benchmarks import roofline
-from benchmarks.common import write
-from rcirl_jax.data.config import CollectConfig
-from rcirl_jax.data.importers import read_recordings
-from rcirl_jax.data.importing import ImportConfig, import_logs
+from benchmarks.common import dataset_or_synthetic, write
 from rcirl_jax.data.store import open_dataset
 from rcirl_jax.evaluation.learners import normaliser_of
 from rcirl_jax.features import feature_map
@@ -54,7 +51,6 @@ try:  # the rival's extra; without it, one line from `main`
 except ModuleNotFoundError:
     torch = None
 
-STRIDE_S = 60.0  # s between planning frames of the synthetic dataset
 QUIET = 1.0  # load average up to which rows on all cores can be compared
 AGREE = 1e-4  # most that a step of theirs may differ from ours
 CONFIG = TrainConfig()
@@ -337,13 +333,7 @@ def main(_: list[str]) -> None:
         raise SystemExit(
             f"error: --scenes: {_SCENES.value}: expected a multiple of {size}"
         )
-    with tempfile.TemporaryDirectory() as folder:
-        path = _DATA.value or str(Path(folder) / "synthetic")
-        if not _DATA.value:
-            config = ImportConfig(
-                format="synthetic", collect=CollectConfig(stride_s=STRIDE_S)
-            )
-            import_logs(read_recordings("synthetic", None), Path(path), config)
+    with dataset_or_synthetic(_DATA.value) as path:
         number = _CORES.value
         result = {f"cores_{number}": _here(path, number)} if number else _both(path)
     result = {**result, "torch": torch.__version__, "scenes": _SCENES.value}
