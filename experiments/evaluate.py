@@ -6,7 +6,6 @@
 Several files are the seeds of one row. Prints the table with intervals.
 """
 
-import json
 from pathlib import Path
 
 from absl import flags
@@ -20,6 +19,7 @@ from rcirl_jax.evaluation.format import format_table
 from rcirl_jax.evaluation.table import to_json
 from rcirl_jax.export.hand_weights import tuned_rows
 from rcirl_jax.export.loading import load_runs
+from rcirl_jax.whole import write_json
 
 _WEIGHTS = flags.DEFINE_list("weights", None, "weights files", required=True)
 _DATA = flags.DEFINE_string("data", None, "dataset", required=True)
@@ -50,8 +50,7 @@ def main() -> None:
     print(format_table(report, _WIDTH.value))
     if _OUTPUT.value:
         output = Path(_OUTPUT.value)
-        output.parent.mkdir(parents=True, exist_ok=True)
-        output.write_text(json.dumps(to_json(report), indent=2) + "\n")
+        write_json(output, to_json(report))
         print(f"report: {output}")
 
 

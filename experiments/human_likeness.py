@@ -20,7 +20,6 @@ about 15 minutes with 5 learners, an hour with all; expected at 5 s: networks wi
 a top-1 FDE of 2.2 to 3.1 m, GAN among them, IDM 4.4, hand-set 8.8, oracle 0.2 m.
 """
 
-import json
 from pathlib import Path
 
 from absl import flags
@@ -41,6 +40,7 @@ from rcirl_jax.export.hand_weights import tuned_rows
 from rcirl_jax.report.intervals import ranking_chart
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train.state import TrainConfig
+from rcirl_jax.whole import write_json, write_whole
 
 _DATA = flags.DEFINE_string("data", None, "dataset of import_logs", required=True)
 _OUTPUT = flags.DEFINE_string("output", "out/likeness", "folder to write")
@@ -76,14 +76,13 @@ def main() -> None:
     configs = learner_configs(_LEARNERS.value, base)
     setup = RankingSetup(sampler=sampler, horizon_s=_HORIZON.value, hand_set=tuned)
     folder = Path(_OUTPUT.value)
-    folder.mkdir(parents=True, exist_ok=True)
     learned = train_learners(dataset, configs, range(_SEEDS.value))
     report = evaluate_ranking(dataset, scorers(learned), setup)
-    (folder / "table.txt").write_text(format_table(report, 118))
-    (folder / "table.md").write_text(markdown_table(report))
+    write_whole(folder / "table.txt", format_table(report, 118))
+    write_whole(folder / "table.md", markdown_table(report))
     made_by = {**provenance(), "data_hash": dataset.hash}
     body = {**to_json(report), "split": words, "made_by": made_by}
-    (folder / "ranking.json").write_text(json.dumps(body, indent=2) + "\n")
+    write_json(folder / "ranking.json", body)
     picture = ranking_chart(folder / "ranking.png", report)
     print(f"{format_table(report, 118, differences=False)}\nsplit: {words}")
     print(f"written: {folder}/ranking.json, table.md, {picture.name}")

@@ -6,7 +6,6 @@ Prints the data-quality report and writes it into DATASET/manifest.json. An
 interrupted import resumes; bad input leaves nothing behind.
 """
 
-import json
 from pathlib import Path
 
 from absl import flags
@@ -22,6 +21,7 @@ from rcirl_jax.data.store import open_dataset
 from rcirl_jax.evaluation.evaluate import RankingSetup, oracle_floor
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.sampling.config import MODES
+from rcirl_jax.whole import write_json
 
 _FORMAT = flags.DEFINE_enum(
     "format", "synthetic", sorted(IMPORTERS), "log format to read"
@@ -99,7 +99,7 @@ def main() -> None:
         )
     if "://" not in _OUTPUT.value:
         beside = Path(_OUTPUT.value) / "oracle_floor.json"
-        beside.write_text(json.dumps(floors, indent=2) + "\n")
+        write_json(beside, floors)
     print(f"dataset: {_OUTPUT.value}")
 
 

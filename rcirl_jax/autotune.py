@@ -252,7 +252,7 @@ class Loop:
             report = evaluate_ranking(
                 dataset, learned, setup, self.executor, references
             )
-            (self.folder / "ranking.txt").write_text(format_table(report, 118) + "\n")
+            write_whole(self.folder / "ranking.txt", format_table(report, 118) + "\n")
             write_json(path, {**to_json(report), "made_by": dict(self.facts)})
 
         self._run("rank", inputs, [path, self.folder / "ranking.txt"], work)

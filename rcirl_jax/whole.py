@@ -1,9 +1,14 @@
 """Files that are there whole or not at all."""
 
+import dataclasses
 import json
+import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
@@ -17,6 +22,21 @@ def write_whole(path: Path, content: str | bytes) -> None:
     os.replace(part, path)
 
 
-def write_json(path: Path, body: Mapping[str, object]) -> None:
-    """The body as JSON of finite numbers, whole."""
-    write_whole(path, json.dumps(body, indent=2, allow_nan=False) + "\n")
+def plain(node: Any) -> Any:  # noqa: ANN401
+    """JSON-ready: dataclasses to dicts, numpy to Python, infinities and NaN to None."""
+    if dataclasses.is_dataclass(node) and not isinstance(node, type):
+        return {f.name: plain(getattr(node, f.name)) for f in dataclasses.fields(node)}
+    if isinstance(node, Mapping):
+        return {str(key): plain(value) for key, value in node.items()}
+    if isinstance(node, list | tuple):
+        return [plain(value) for value in node]
+    if isinstance(node, np.generic):
+        node = node.item()
+    if isinstance(node, float) and not math.isfinite(node):
+        return None
+    return node
+
+
+def write_json(path: Path, body: Mapping[str, object] | Sequence[object]) -> None:
+    """The body as JSON (see `plain`), whole."""
+    write_whole(path, json.dumps(plain(body), indent=2, allow_nan=False) + "\n")

@@ -17,7 +17,6 @@ Two minutes on two busy cores; `--quick`, few draws, seeds and points: 30 second
 """
 
 import dataclasses
-import json
 from pathlib import Path
 
 import jax
@@ -33,6 +32,7 @@ from rcirl_jax.evaluation.background import (
 )
 from rcirl_jax.evaluation.background_world import World, summary, sweep
 from rcirl_jax.report.background_picture import background_figure
+from rcirl_jax.whole import write_json
 
 _OUTPUT = flags.DEFINE_string("output", "out/background_shift", "folder to write")
 _SEED = flags.DEFINE_integer("seed", 0, "seed of the draws, and the first seed", 0)
@@ -65,7 +65,7 @@ def main() -> None:
         "made_by": provenance(),
     }
     target = folder / "background_shift.json"
-    target.write_text(json.dumps(body, indent=2, allow_nan=False) + "\n")
+    write_json(target, body)
     one, directions = jax.tree.map(lambda x: np.asarray(x[0]), (frames, found))
     picture = folder / "background_shift.png"
     background_figure(picture, one, directions, body["by_size"], body["by_frames"])

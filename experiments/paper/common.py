@@ -1,6 +1,5 @@
 """What the paper's experiments share: flags, data, training, files."""
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from rcirl_jax.evaluation.learners import Learned, scorers
 from rcirl_jax.evaluation.table import RankingReport
 from rcirl_jax.report.intervals import Interval
 from rcirl_jax.train.state import TrainConfig
+from rcirl_jax.whole import write_json
 
 DATA = flags.DEFINE_string("data", None, "dataset (default: synthetic traffic)")
 OUTPUT = flags.DEFINE_string("output", "out/paper", "folder to write")
@@ -123,12 +123,11 @@ def write(
 ) -> None:
     """OUTPUT/name.json with provenance, also of the scenes; says where."""
     folder = Path(OUTPUT.value)
-    folder.mkdir(parents=True, exist_ok=True)
     made_by = provenance()
     if data is not None:
         made_by["data_hash"] = data.hash
     made = {**body, "quick": QUICK.value, "made_by": made_by}
-    (folder / f"{name}.json").write_text(json.dumps(made, indent=2) + "\n")
+    write_json(folder / f"{name}.json", made)
     print(f"written: {folder}/{name}.json, {name}.png")
 
 

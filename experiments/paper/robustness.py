@@ -13,7 +13,6 @@ candidates. `--quick`: a few frames on coarse lattices, two minutes.
 """
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +44,7 @@ from rcirl_jax.planner.refine import RefineConfig
 from rcirl_jax.planner.time_station import time_station_policy
 from rcirl_jax.report.intervals import interval_chart
 from rcirl_jax.simulation.suite import build, suite_refs
+from rcirl_jax.whole import write_json
 
 _WEIGHTS = flags.DEFINE_string("weights", None, "weights file", required=True)
 _OUTPUT = flags.DEFINE_string("output", "out/robustness", "folder to write")
@@ -118,7 +118,7 @@ def main() -> None:
     body = {"optimality": optimality, "robustness": robustness, "frames": case.size}
     body |= {"disturbance": dataclasses.asdict(noise), "quick": quick}
     body["made_by"] = provenance()
-    (folder / "robustness.json").write_text(json.dumps(body, indent=2) + "\n")
+    write_json(folder / "robustness.json", body)
     print(f"written: {folder}/robustness.json, optimality.png, robustness.png")
 
 

@@ -14,7 +14,6 @@ from rcirl_jax.evaluation.suite_output import (
     format_suite,
     result_hash,
     write_csv,
-    write_json,
 )
 from rcirl_jax.evaluation.suite_summary import SuiteReport, summarise
 from rcirl_jax.simulation.careful import judges, preventable, trivial
@@ -22,6 +21,7 @@ from rcirl_jax.simulation.cases import STEP_S
 from rcirl_jax.simulation.metrics import CaseMetrics
 from rcirl_jax.simulation.rows import RECORDED_HUMAN, Row
 from rcirl_jax.simulation.suite import CaseSet, drive_row, rollout_config
+from rcirl_jax.whole import write_json, write_whole
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -126,15 +126,11 @@ def write_suite(
     result: SuiteResult, folder: Path, provenance: Mapping[str, object]
 ) -> str:
     """suite.json, cases.csv, table.txt in a folder; returns the table."""
-    folder.mkdir(parents=True, exist_ok=True)
     first = next(iter(result.runs))
     text = format_suite(result.report) + "\n" + format_families(result.report, first)
-    (folder / "table.txt").write_text(text)
-    write_json(
-        folder / "suite.json",
-        result.report,
-        {**result.facts, "timings": result.timings, "made_by": provenance},
-    )
+    write_whole(folder / "table.txt", text)
+    facts = {**result.facts, "timings": result.timings, "made_by": provenance}
+    write_json(folder / "suite.json", {**facts, "report": result.report})
     write_csv(
         folder / "cases.csv",
         result.runs,

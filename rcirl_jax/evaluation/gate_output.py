@@ -5,8 +5,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from rcirl_jax.evaluation.gate_types import Check, GateConfig, Verdict
-from rcirl_jax.evaluation.suite_output import plain, text_table
-from rcirl_jax.whole import write_json
+from rcirl_jax.evaluation.suite_output import text_table
+from rcirl_jax.whole import plain, write_json
 
 OUTCOMES = {"pass": "ok", "fail": "FAIL", "open": "open"}
 WIDTH = 100  # columns of wrapped text
@@ -84,4 +84,4 @@ def write_verdict(
         "config": plain(config),
         **facts,
     }
-    write_json(path, plain(body))
+    write_json(path, body)

@@ -3,16 +3,15 @@
 import csv
 import dataclasses
 import hashlib
-import json
-import math
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from rcirl_jax.evaluation.suite_summary import PAPER, Rate, RowSummary, SuiteReport
 from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics
+from rcirl_jax.whole import write_whole
 
 SHORT = {
     "collision_free": "no fault",
@@ -135,27 +134,6 @@ def format_families(report: SuiteReport, row: str) -> str:
     return "\n".join([title, *text_table(header, rows)]) + "\n"
 
 
-def plain(node: Any) -> Any:  # noqa: ANN401
-    """JSON-ready: dataclasses to dicts, numpy to Python, infinities to None."""
-    if dataclasses.is_dataclass(node) and not isinstance(node, type):
-        return {f.name: plain(getattr(node, f.name)) for f in dataclasses.fields(node)}
-    if isinstance(node, Mapping):
-        return {str(key): plain(value) for key, value in node.items()}
-    if isinstance(node, list | tuple):
-        return [plain(value) for value in node]
-    if isinstance(node, np.generic):
-        node = node.item()
-    if isinstance(node, float) and not math.isfinite(node):
-        return None
-    return node
-
-
-def write_json(path: Path, report: SuiteReport, facts: Mapping[str, object]) -> None:
-    """The whole report with `facts` (hashes, timings, provenance) beside it."""
-    body = {**dict(facts), "report": plain(report)}
-    path.write_text(json.dumps(plain(body), indent=2, allow_nan=False) + "\n")
-
-
 def write_csv(
     path: Path,
     runs: Mapping[str, CaseMetrics],
@@ -170,17 +148,18 @@ def write_csv(
         value = np.asarray(getattr(next(iter(runs.values())), field.name))
         names += _column_names(field.name, value)
     keys = sorted({key for found in parameters for key in found})
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["row", "case", "preventable", *names, *keys])
-        for row, metrics in runs.items():
-            columns = [np.asarray(getattr(metrics, f.name)) for f in fields]
-            for i, case in enumerate(ids):
-                cells = [x for column in columns for x in np.atleast_1d(column[i])]
-                drawn = [parameters[i].get(key, "") for key in keys]
-                flag = int(preventable[i])
-                plain = [x.item() if hasattr(x, "item") else x for x in cells]
-                writer.writerow([row, case, flag, *plain, *drawn])
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    writer.writerow(["row", "case", "preventable", *names, *keys])
+    for row, metrics in runs.items():
+        columns = [np.asarray(getattr(metrics, f.name)) for f in fields]
+        for i, case in enumerate(ids):
+            cells = [x for column in columns for x in np.atleast_1d(column[i])]
+            drawn = [parameters[i].get(key, "") for key in keys]
+            flag = int(preventable[i])
+            plain = [x.item() if hasattr(x, "item") else x for x in cells]
+            writer.writerow([row, case, flag, *plain, *drawn])
+    write_whole(path, text.getvalue())
 
 
 def _column_names(name: str, value: np.ndarray) -> list[str]:

@@ -15,7 +15,6 @@ from rcirl_jax.evaluation.format import format_table
 from rcirl_jax.evaluation.gate_types import GateConfig, Verdict
 from rcirl_jax.evaluation.ranking import METRICS
 from rcirl_jax.evaluation.statistics import Difference
-from rcirl_jax.evaluation.suite_output import plain
 from rcirl_jax.evaluation.suite_summary import SuiteReport
 from rcirl_jax.evaluation.table import RIVALS, SIGNIFICANT, RankingReport
 from rcirl_jax.export.reader import Reward
@@ -44,6 +43,7 @@ from rcirl_jax.report.verdict_sections import (
     verdict_section,
 )
 from rcirl_jax.sampling import SamplerConfig
+from rcirl_jax.whole import plain
 
 NUM_FRAMES = 2  # example frames
 RANKED = ("percentile_rank", "top1_fde", "top3_fde", "mrr", "crash_rate", "miss")

@@ -9,6 +9,8 @@ from typing import Any
 
 import tqdm
 
+from rcirl_jax.whole import write_whole
+
 
 class MetricsWriter:
     """Appends one JSON object a line to metrics.jsonl, and to TensorBoard.
@@ -28,7 +30,7 @@ class MetricsWriter:
                 for line in self._path.read_text().splitlines()
                 if _step_of(line) <= resume_step
             ]
-        self._path.write_text("".join(line + "\n" for line in kept))
+        write_whole(self._path, "".join(line + "\n" for line in kept))
         self._file = self._path.open("a", buffering=1)
         self._board = _tensorboard(folder / "tensorboard", resume_step)
 
