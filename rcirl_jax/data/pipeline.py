@@ -1,5 +1,7 @@
 """Batches: seeded, endless, resumable to the bit, shared between processes."""
 
+import concurrent.futures
+import dataclasses
 import math
 from collections.abc import Mapping
 
@@ -15,6 +17,7 @@ from rcirl_jax.types import Demonstration
 # blocks over which rows are mixed; it decides the order, so it is no setting.
 # Half of them are in memory at a time: 32,768 rows, 340 MB.
 WINDOW_BLOCKS = 256
+PLAN_AHEAD = 0.1  # share of an epoch before whose end the next one is planned
 ROW_BYTES = sum(math.prod(x.shape) * x.dtype.itemsize for x in leaf_specs().values())
 
 
@@ -31,14 +34,21 @@ def epoch_order(seed: int, epoch: int, blocks: np.ndarray) -> np.ndarray:
     Args:
       seed: of the run.
       epoch: number of the epoch.
-      blocks: [n] number of each row's block, as `Dataset.blocks` gives it.
+      blocks: [n] number of each row's block, from 0 without gaps.
     """
-    rng = np.random.default_rng([seed, epoch])
-    numbers, block = np.unique(blocks, return_inverse=True)
-    if numbers.size <= WINDOW_BLOCKS:
+    rng, count = np.random.default_rng([seed, epoch]), int(blocks.max()) + 1
+    if count <= WINDOW_BLOCKS:
         return rng.permutation(blocks.size)
-    key = rng.permutation(numbers.size)[block] + WINDOW_BLOCKS * rng.random(blocks.size)
+    key = rng.permutation(count)[blocks] + WINDOW_BLOCKS * rng.random(blocks.size)
     return np.argsort(key, kind="stable")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Epoch:
+    """The plan of an epoch: its order, and what reads it from disk."""
+
+    order: np.ndarray  # [n] which of the chosen rows are visited
+    stream: RowStream | None  # from the position on that it was planned for
 
 
 def split_batches(
@@ -122,7 +132,7 @@ class BatchIterator:
         if blocks is None:
             alone = np.zeros(self._chosen.size, np.int64)
             blocks = rows.blocks(self._chosen) if stored else alone
-        self._blocks = blocks
+        self._blocks = np.unique(blocks, return_inverse=True)[1].astype(np.int32)
         self._numbers = self._chosen if numbers is None else numbers
         if self._chosen.size == 0:
             raise InputError("batches: rows: 0: expected at least one scene")
@@ -141,8 +151,9 @@ class BatchIterator:
         local = batch_size // num_shards
         self._part = np.arange(shard_index * local, (shard_index + 1) * local)
         self._epoch = self._position = 0
-        self._order: tuple[int, np.ndarray] | None = None
-        self._stream: RowStream | None = None
+        self._plan: _Epoch | None = None
+        self._planner = concurrent.futures.ThreadPoolExecutor(1)
+        self._later: concurrent.futures.Future[_Epoch] | None = None
 
     @property
     def batches_per_epoch(self) -> int:
@@ -177,37 +188,49 @@ class BatchIterator:
                 f"{self.batches_per_epoch}: same dataset and batch size"
             )
         self._epoch, self._position = int(state["epoch"]), int(state["position"])
-        self._stream = None
+        self._plan = self._later = None
 
     def __iter__(self) -> "BatchIterator":
         return self
 
     def __next__(self) -> tuple[Demonstration, np.ndarray, np.ndarray]:
+        plan = self._plan or self._planned(self._epoch, self._position)
+        self._plan = plan
         places = self._position * self._batch_size + self._part
-        visited = self._visited(places)
+        visited = self._visited(plan.order, places)
         weight = (places < self._chosen.size).astype(np.float32)
-        batch = self._take(self._chosen[visited])
+        batch = self._take(plan, self._chosen[visited])
         self._position += 1
         if self._position == self.batches_per_epoch:
             self._epoch, self._position = self._epoch + 1, 0
-            self._stream = None
+            self._plan = self._later.result() if self._later else None
+            self._later = None
+        elif self._later is None and self._is_late():
+            # the step need not wait for the plan of the next epoch
+            self._later = self._planner.submit(self._planned, self._epoch + 1, 0)
         return batch, weight, self._numbers[visited]
 
-    def _visited(self, places: np.ndarray) -> np.ndarray:
-        """Which of the chosen rows stand at some places of the present epoch."""
-        if self._order is None or self._order[0] != self._epoch:
-            order = epoch_order(self._seed, self._epoch, self._blocks)
-            self._order = (self._epoch, order)
-        return self._order[1][places % self._chosen.size]
+    def _is_late(self) -> bool:
+        return self._position >= (1.0 - PLAN_AHEAD) * self.batches_per_epoch
 
-    def _take(self, index: np.ndarray) -> Demonstration:
-        if isinstance(self._rows, Demonstration):
-            return jax.tree.map(lambda leaf: leaf[index], self._rows)
-        if self._stream is None:
-            batches = np.arange(self._position, self.batches_per_epoch)
+    def _visited(self, order: np.ndarray, places: np.ndarray) -> np.ndarray:
+        """Which of the chosen rows stand at some places of an epoch's order."""
+        return order[places % self._chosen.size]
+
+    def _planned(self, epoch: int, position: int) -> _Epoch:
+        """An epoch, to be read from a position on."""
+        order, stream = epoch_order(self._seed, epoch, self._blocks), None
+        if not isinstance(self._rows, Demonstration):
+            batches = np.arange(position, self.batches_per_epoch)
             places = batches[:, None] * self._batch_size + self._part
-            ahead = self._visited(places.reshape(-1))
-            self._stream = RowStream(
+            ahead = self._visited(order, places.reshape(-1))
+            stream = RowStream(
                 self._rows, self._chosen[ahead], self._blocks[ahead], self._part.size
             )
-        return next(self._stream)
+        return _Epoch(order=order, stream=stream)
+
+    def _take(self, plan: _Epoch, index: np.ndarray) -> Demonstration:
+        if isinstance(self._rows, Demonstration):
+            return jax.tree.map(lambda leaf: leaf[index], self._rows)
+        assert plan.stream is not None
+        return next(plan.stream)

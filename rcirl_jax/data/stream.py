@@ -40,19 +40,18 @@ class RowStream:
         Args:
           dataset: the open dataset.
           rows: [m] row numbers in the order of use, repeats allowed.
-          blocks: [m] the block that each of them lies in.
+          blocks: [m] number of the block that each of them lies in.
           size: rows given at a time; divides m.
         """
         self._dataset, self._rows, self._size = dataset, rows, size
-        _, first, block = np.unique(blocks, return_index=True, return_inverse=True)
-        due = (first // size)[block]  # turn in which the row is read
+        first = np.zeros(int(blocks.max()) + 1, np.int64)
+        first[blocks[::-1]] = np.arange(blocks.size)[::-1]  # the last written stays
+        due = (first // size)[blocks]  # turn in which the row is read
         self._by_turn = np.argsort(due, kind="stable")
         loaded = np.cumsum(np.bincount(due, minlength=rows.size // size))
         self._bounds = np.concatenate([[0], loaded])
         self.capacity = int(np.max(loaded - size * np.arange(loaded.size)))
-        self._held = jax.tree.map(
-            lambda leaf: np.empty((self.capacity, *leaf.shape), leaf.dtype), row_spec()
-        )
+        self._held: Demonstration | None = None  # allocated when the first row is due
         self._slot = np.empty(rows.size, np.int32)  # where a row in memory stands
         self._free = np.arange(self.capacity, dtype=np.int32)
         self._turn = 0
@@ -62,6 +61,8 @@ class RowStream:
 
     def __next__(self) -> Demonstration:
         turn, size = self._turn, self._size
+        if self._held is None:
+            self._held = self._allocated()
         if turn * size >= self._rows.size:
             raise StopIteration
         new = self._by_turn[self._bounds[turn] : self._bounds[turn + 1]]
@@ -73,6 +74,11 @@ class RowStream:
         self._free = np.concatenate([self._free, slots])
         self._turn += 1
         return given
+
+    def _allocated(self) -> Demonstration:
+        """Room for the rows in memory."""
+        room = lambda leaf: np.empty((self.capacity, *leaf.shape), leaf.dtype)  # noqa: E731
+        return jax.tree.map(room, row_spec())
 
     def _read(self, places: np.ndarray) -> None:
         slots, self._free = np.split(self._free, [places.size])
