@@ -139,8 +139,7 @@ def write_weights(
       provenance: `weights.PROVENANCE_KEYS` and more.
     """
     x, valid = map(jnp.asarray, samples)
-    with jax.default_matmul_precision("highest"):
-        values = value(params, normaliser, x, valid, config.reward)
+    values = value(params, normaliser, x, valid, config.reward)
     weights = reward_weights(params, normaliser, config, provenance)
     output.parent.mkdir(parents=True, exist_ok=True)
     return save(output, weights, *samples, np.asarray(values))

@@ -42,8 +42,7 @@ def exported(reward: Reward) -> jax.export.Exported:
         jax.ShapeDtypeStruct((count, times, features), jnp.float32),
         jax.ShapeDtypeStruct((times,), jnp.bool_),
     )
-    with jax.default_matmul_precision("highest"):
-        return jax.export.export(jax.jit(program), platforms=("cpu", "cuda"))(*shapes)
+    return jax.export.export(jax.jit(program), platforms=("cpu", "cuda"))(*shapes)
 
 
 def write_stablehlo(path: Path, reward: Reward, form: Form) -> None:

@@ -85,8 +85,7 @@ def pack(
       samples_x: [m, T, F] raw features of the verification samples (before the
         clip and the normaliser, so that a reader checks those too), m <= 256.
       samples_valid: [m, T] bool.
-      samples_value: [m] V as the trainer computes it, in full float32: on an
-        accelerator under `jax.default_matmul_precision("highest")`.
+      samples_value: [m] V as the trainer computes it, in full float32.
 
     Returns:
       The same bytes for the same input.

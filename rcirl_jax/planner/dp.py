@@ -35,6 +35,7 @@ from rcirl_jax.planner.grid import (
 from rcirl_jax.planner.plan import Plan
 from rcirl_jax.planner.rank import Policy, RankConfig, command, learned_score
 from rcirl_jax.planner.safety import check, choose
+from rcirl_jax.reward.network import product
 from rcirl_jax.sampling import sample
 from rcirl_jax.sampling.kinematics import trajectory_on_path
 from rcirl_jax.sampling.speed import family_index
@@ -236,7 +237,7 @@ def _first_step(
     near = (off <= config.first_reach) | (m == jnp.argmin(off))
     free = near & ~lattice.blocked[1, m]
     clipped = jnp.clip(lattice.first_row, layers.lower, layers.upper)
-    start = clipped @ layers.first + layers.offset
+    start = product(clipped, layers.first) + layers.offset
     ahead = _next_values(values, lattice.blocked[2])
     scores = []
     for i, k in enumerate(config.actions):

@@ -32,7 +32,7 @@ from rcirl_jax.features import FeatureMap
 from rcirl_jax.features.path import path_view
 from rcirl_jax.planner.safety import SafetyConfig
 from rcirl_jax.reward import normalise
-from rcirl_jax.reward.network import ACTIVATIONS, gains
+from rcirl_jax.reward.network import ACTIVATIONS, gains, product
 from rcirl_jax.sampling.kinematics import trajectory_on_path
 from rcirl_jax.types import (
     Candidates,
@@ -224,7 +224,7 @@ def make_layers(weights: Weights, features: FeatureMap, first_row: jax.Array) ->
     bias = params.biases[0] if params.biases else jnp.zeros((1,))
     none, open_bounds = jnp.zeros(first.shape[1]), jnp.array([-jnp.inf, jnp.inf])
     parts = {"acceleration": (none, open_bounds), "jerk": (none, open_bounds)}
-    offset = bias - norm.location @ first
+    offset = bias - product(norm.location, first)
     for name in parts:
         if name in features.names:
             i = features.names.index(name)
@@ -249,8 +249,8 @@ def rest_of_network(layers: Layers, x: jax.Array, activation: str) -> jax.Array:
     if not layers.kernels:
         return x[..., 0]
     for kernel, bias in zip(layers.kernels[:-1], layers.biases, strict=True):
-        x = ACTIVATIONS[activation](x) @ kernel + bias
-    return (ACTIVATIONS[activation](x) @ layers.kernels[-1])[..., 0]
+        x = product(ACTIVATIONS[activation](x), kernel) + bias
+    return product(ACTIVATIONS[activation](x), layers.kernels[-1])[..., 0]
 
 
 def base_activation(
@@ -263,7 +263,7 @@ def base_activation(
     v = v[None, :, None]
     x = c0[:, None] + c1[:, None] * v + c2[:, None] * v**2
     x = jnp.clip(x, layers.lower, layers.upper)
-    return x @ layers.first + layers.offset
+    return product(x, layers.first) + layers.offset
 
 
 def motion_activation(layers: Layers, a: jax.Array, j: jax.Array) -> jax.Array:

@@ -28,6 +28,7 @@ from rcirl_jax.planner.grid import (
 )
 from rcirl_jax.planner.plan import Plan
 from rcirl_jax.planner.rank import Policy
+from rcirl_jax.reward.network import product
 from rcirl_jax.sampling.kinematics import trajectory_on_path
 from rcirl_jax.types import Scene
 from rcirl_jax.units import DT_S, NUM_TIMES
@@ -86,7 +87,7 @@ def _spread(
     count = config.num_stations
     n, a0 = jnp.arange(count), lattice.first.a
     clipped = jnp.clip(lattice.first_row, layers.lower, layers.upper)
-    start = clipped @ layers.first + layers.offset
+    start = product(clipped, layers.first) + layers.offset
     scores, targets = [], []
     for k in config.actions:
         action = jnp.full((count,), k)

@@ -18,6 +18,9 @@ from rcirl_jax.reward.normaliser import normalise
 from rcirl_jax.types import Normaliser, RewardParams
 from rcirl_jax.units import NUM_TIMES
 
+# products in float32 on accelerators too (not TF32), as the onboard reader makes them
+EXACT = jax.lax.Precision.HIGHEST
+
 LEAKY_SLOPE = 0.01  # negative slope of the leaky-ReLU hidden activation
 
 PINS = ("unit", "none")
@@ -162,6 +165,11 @@ def _constrained(params: RewardParams, config: RewardConfig) -> RewardParams:
     return params.replace(gamma=gamma, kernels=(first, *later))
 
 
+def product(a: jax.Array, b: jax.Array) -> jax.Array:
+    """The matrix product a b in float32 everywhere (see `EXACT`)."""
+    return jnp.matmul(a, b, precision=EXACT)
+
+
 def _unit(x: jax.Array) -> jax.Array:
     return x / jnp.sqrt(jnp.sum(x**2) + 1e-12)
 
@@ -188,7 +196,7 @@ def gains(
     context: Float[Array, "f f"], x0: Float[Array, "*batch f"]
 ) -> Float[Array, "*batch f"]:
     """G = 2 sigmoid(x_0 C) from normalised features at t = 0."""
-    return 2.0 * jax.nn.sigmoid(x0 @ context)
+    return 2.0 * jax.nn.sigmoid(product(x0, context))
 
 
 def point_rewards(
@@ -213,8 +221,8 @@ def _layers(
 ) -> Float[Array, "1 n"]:
     """The network on points that stand side by side."""
     for kernel, offset in zip(kernels[:-1], offsets[:-1], strict=True):
-        points = ACTIVATIONS[activation](kernel.T @ points + offset[:, None])
-    return kernels[-1].T @ points + offsets[-1][:, None]
+        points = ACTIVATIONS[activation](product(kernel.T, points) + offset[:, None])
+    return product(kernels[-1].T, points) + offsets[-1][:, None]
 
 
 def rows_value(
@@ -262,10 +270,10 @@ def scenes_value(
     x = jnp.moveaxis(features, 1, 0)
     x = jnp.clip(x, columns(normaliser.lower), columns(normaliser.upper))
     first = effective.kernels[0] / normaliser.scale[:, None]
-    shift = normaliser.location @ first
+    shift = product(normaliser.location, first)
     if effective.context is not None:
         x = (x - columns(normaliser.location)) / columns(normaliser.scale)
-        gain = jnp.einsum("fg,fbk->gbk", effective.context, x[:, :, 0])
+        gain = jnp.einsum("fg,fbk->gbk", effective.context, x[:, :, 0], precision=EXACT)
         x = x * 2.0 * jax.nn.sigmoid(gain)[:, :, None]
         first, shift = effective.kernels[0], 0.0
     x = x.reshape(x.shape[0], -1)
@@ -275,7 +283,8 @@ def scenes_value(
     scenes, _, times, count = features.shape
     rewards = _layers(kernels, offsets, x, activation)
     weight = jnp.where(time_valid, effective.gamma[:times], 0.0)
-    return jnp.einsum("bt,btk->bk", weight, rewards.reshape(scenes, times, count))
+    rewards = rewards.reshape(scenes, times, count)
+    return jnp.einsum("bt,btk->bk", weight, rewards, precision=EXACT)
 
 
 def value(
