@@ -21,6 +21,10 @@ class InputError(ValueError):
         super().__init__(" ".join(str(message).split()))
 
 
+class LostWorkError(InputError):
+    """Where work was done is gone (memory, nodes); what is finished stays valid."""
+
+
 # what reading an unforeseen file may end in; anything else is a fault of ours
 UNFORESEEN = (
     ArithmeticError,

@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, Protocol, TypeVar
 
-from rcirl_jax.errors import InputError
+from rcirl_jax.errors import InputError, LostWorkError
 
 EXECUTORS = ("local", "ray")
 AHEAD = 2  # pieces in flight per worker: one running, one waiting
@@ -74,7 +74,7 @@ class Processes:
         """Results of all items, in their order.
 
         Raises:
-          InputError: a piece killed its process ATTEMPTS times (out of memory).
+          LostWorkError: a piece killed its process ATTEMPTS times (out of memory).
         """
         rest: collections.deque[Item] = collections.deque()
         source, failures = iter(items), 0
@@ -92,7 +92,7 @@ class Processes:
             except BrokenProcessPool as error:
                 failures += 1
                 if failures >= ATTEMPTS:
-                    raise InputError(
+                    raise LostWorkError(
                         f"{_name(rest[0])}: its process was killed {failures} times: "
                         "expected enough memory; use fewer --workers"
                     ) from error
@@ -135,6 +135,14 @@ class Processes:
 def _on_cpu() -> None:
     """Numbers must not depend on an accelerator, nor processes fight over one."""
     os.environ["JAX_PLATFORMS"] = "cpu"
+
+
+def _listed_in(
+    folder: str, function: Callable[[Item], Iterable[Result]], item: Item
+) -> list[Result]:
+    """As from `folder`, so that relative paths mean the same files on every node."""
+    os.chdir(folder)
+    return _listed(function, item)
 
 
 def _listed(function: Callable[[Item], Iterable[Result]], item: Item) -> list[Result]:
@@ -186,13 +194,13 @@ class Ray:
         """Results of all items, in their order; lost pieces are done again."""
         # where nodes or processes are lost; errors of the function, which would
         # come again, are not retried
-        remote = self._ray.remote(max_retries=RETRIES)(_listed)
-        shared = self._ray.put(function)
+        remote = self._ray.remote(max_retries=RETRIES)(_listed_in)
+        shared, folder = self._ray.put(function), os.getcwd()
         source, running = iter(items), collections.deque()
         while True:
             room = self.workers * AHEAD - len(running)
             for item in itertools.islice(source, max(room, 0)):
-                running.append((_name(item), remote.remote(shared, item)))
+                running.append((_name(item), remote.remote(folder, shared, item)))
             if not running:
                 return
             yield from self._result(*running.popleft())
@@ -206,7 +214,7 @@ class Ray:
                 raise error.cause from None
             raise
         except self._ray.exceptions.RayError as error:
-            raise InputError(
+            raise LostWorkError(
                 f"{name}: lost {RETRIES} times ({type(error).__name__}): expected "
                 "nodes with enough memory that stay up"
             ) from error

@@ -29,6 +29,8 @@ from rcirl_jax.units import NUM_OBSTACLES, TIMES_S
 VIEW_BEHIND_M = 60.0  # m, obstacles farther behind are not collected
 MAX_GHOST_POINTS = 1000  # of the line that a missing road user is taken to drive
 VIEW_BESIDE_M = 12.0  # m, obstacles farther beside are not collected
+VIEW_NUMBERS = 7  # float64 of a sample in a frame: s, l, tilt and the table of four
+VIEWS_BYTES = 256 * 2**20  # of tracks kept in the frames of chains
 
 
 class Collector:
@@ -115,8 +117,13 @@ class Collector:
                 yield row
 
     def view(self, frame: LaneFrame) -> FrameTracks:
-        """All tracks in the chain's frame (cached per chain)."""
-        if frame.chain not in self._views:
+        """All tracks in the chain's frame (cached for the chains last asked for)."""
+        if frame.chain in self._views:
+            self._views[frame.chain] = self._views.pop(frame.chain)
+        else:
+            each = VIEW_NUMBERS * 8 * max(self._x.size, 1)
+            while len(self._views) >= max(VIEWS_BYTES // each, 1):
+                self._views.pop(next(iter(self._views)))
             s, l = project(frame, self._x, self._y)
             tilt = self._heading - frame.on_grid("heading", s)
             split_s, rate = np.split(s, self._ends), self.rate

@@ -7,12 +7,14 @@ later, by the one process that sees all cuts in order.
 
 import dataclasses
 import hashlib
+import itertools
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+import jax
 import numpy as np
 
-from rcirl_jax.data.assemble import assemble
+from rcirl_jax.data.assemble import CHUNK, assemble
 from rcirl_jax.data.collect import Collector
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import (
@@ -24,9 +26,10 @@ from rcirl_jax.data.importers import (
 )
 from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.errors import InputError, as_input_error
-from rcirl_jax.types import Demonstration, Recording
+from rcirl_jax.types import Demonstration, Recording, Track
 
 GROUP_BLOCK_S = 60.0  # s; vehicles first seen in one block share a group
+MINUTE = "/minute-"  # between a recording's name and the number of a block
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -86,7 +89,12 @@ def group_name(recording: Recording, first_seen_s: float) -> str:
     if recording.group is not None:
         return recording.group
     block = int(first_seen_s // GROUP_BLOCK_S)
-    return f"{recording.piece_of or recording.name}/minute-{block:04d}"
+    return f"{recording.piece_of or recording.name}{MINUTE}{block:04d}"
+
+
+def whole_of(group: str) -> str:
+    """The recording of which a group is a minute; the group itself if it is none."""
+    return group.rpartition(MINUTE)[0] or group
 
 
 def cut(
@@ -122,15 +130,13 @@ def cut(
         return Cut(**about, **nothing, known=True)
     with as_input_error(recording.name, "a sound recording"):
         collector = Collector(recording, config)
-        rows = list(collector.scenes())
+        parts, tracks = _assembled(recording, collector)
     report = QualityReport()
     report.add_recording(collector)
-    if not rows:
+    if not tracks:
         return Cut(**about, **{**nothing, "quality": report.state()})
-    none = [0] * len(rows)
-    scenes = assemble(rows, vehicles=none, groups=none, recording=0)
+    scenes = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
     report.add_scenes(scenes)
-    tracks = [recording.tracks[row["track"]] for row in rows]
     groups = [group_name(recording, track.first_seen_s) for track in tracks]
     return Cut(
         **about,
@@ -139,6 +145,21 @@ def cut(
         groups=groups,
         quality=report.state(),
     )
+
+
+def _assembled(
+    recording: Recording, collector: Collector
+) -> tuple[list[Demonstration], list[Track]]:
+    """Scenes as they are stored, a few at a time, and the track of each.
+
+    A row before it is assembled takes more than twice the memory.
+    """
+    parts, tracks, rows = [], [], collector.scenes()
+    while some := list(itertools.islice(rows, CHUNK)):
+        none = [0] * len(some)
+        parts.append(assemble(some, vehicles=none, groups=none, recording=0))
+        tracks += [recording.tracks[row["track"]] for row in some]
+    return parts, tracks
 
 
 def cut_item(

@@ -27,11 +27,12 @@ from rcirl_jax.data.cut import (
     cut_item,
     is_long,
     recordings_of,
+    whole_of,
 )
 from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.data.splits import assign_groups
 from rcirl_jax.data.store import DatasetWriter, Manifest
-from rcirl_jax.errors import InputError
+from rcirl_jax.errors import InputError, LostWorkError
 from rcirl_jax.executor import Executor, Here
 from rcirl_jax.types import Demonstration, Recording
 
@@ -218,10 +219,6 @@ class _Import:
                 f"import: 0 scenes kept of {self.quality.tracks} tracks: "
                 f"dropped because {drops}: expected at least one scene"
             )
-        fraction = self.config.test_fraction if len(self.sizes) > 1 else 0.0
-        splits = assign_groups(
-            self.sizes, test_fraction=fraction, seed=self.config.split_seed
-        )
         return self.writer.finish(
             {
                 "rate_hz": sorted(self.rates),
@@ -232,11 +229,32 @@ class _Import:
                 "recordings": self.recordings.names(),
                 "groups": self.groups.names(),
                 "vehicles": self.vehicles.names(),
-                "splits": splits,
+                "splits": self._splits(),
                 "quality": self.quality.as_dict(),
                 "import": dataclasses.asdict(self.config),
             }
         )
+
+    def _splits(self) -> dict[str, list[str]]:
+        """Groups per split: whole recordings, or minutes where there is only one."""
+        wholes: collections.Counter[str] = collections.Counter()
+        for group, scenes in self.sizes.items():
+            wholes[whole_of(group)] += scenes
+        is_one = len(wholes) == 1
+        counts = self.sizes if is_one else wholes
+        chosen = assign_groups(
+            counts,
+            test_fraction=self.config.test_fraction if len(counts) > 1 else 0.0,
+            seed=self.config.split_seed,
+        )
+        return {
+            split: sorted(
+                group
+                for group in self.sizes
+                if (group if is_one else whole_of(group)) in names
+            )
+            for split, names in chosen.items()
+        }
 
 
 def import_logs(
@@ -259,7 +277,8 @@ def import_logs(
 
     Raises:
       InputError: bad input. Nothing of this import stays on disk then; an
-        interrupt keeps finished shards, and the next run resumes from them.
+        interrupt, and the loss of workers or nodes (LostWorkError), keeps finished
+        shards, and the next run resumes from them.
     """
 
     def cuts(known: dict[str, str]) -> Iterable[Cut]:
@@ -329,6 +348,8 @@ def _import(
                 work.add(made)
                 progress.show(made, work.quality)
         return work.finish()
+    except LostWorkError:
+        raise  # as after an interrupt, the next run goes on from the shards
     except InputError:
         writer.abort()
         raise

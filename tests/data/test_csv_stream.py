@@ -1,6 +1,7 @@
 """Long CSV files in pieces: the scenes of a file read at once, in bounded memory."""
 
 import dataclasses
+import fcntl
 
 import numpy as np
 import pytest
@@ -106,6 +107,22 @@ def test_a_vehicle_is_in_one_group_whatever_the_piece(tmp_path):
     assert set(open_dataset(tmp_path / "whole").manifest.vehicles) == set(names)
 
 
+def test_a_recording_is_on_one_side_where_there_are_several(tmp_path):
+    """Minutes of it are groups of their own, and share traffic at their borders."""
+    found = []
+    for name in ("one", "two", "three"):
+        path = tmp_path / f"{name}.csv"
+        spec = write(path, rows_of(seconds=140.0, cars=12))
+        found.append(Part(format="csv", input=path, spec=spec))
+    import_parts(found, tmp_path / "data", CONFIG)
+    dataset = open_dataset(tmp_path / "data")
+    assert len(dataset.manifest.groups) > 3
+    train, test = (set(dataset.load(x).recording.tolist()) for x in ("train", "test"))
+    assert len(train) == 2
+    assert len(test) == 1
+    assert not train & test
+
+
 def test_recordings_of_one_file_stay_apart(tmp_path):
     path = tmp_path / "log.csv"
     rows = rows_of(seconds=90.0, cars=6)
@@ -190,6 +207,22 @@ found = pieces(Path(sys.argv[1]), fields, 0.55)
 rows = sum(len(piece.values["t"]) for piece in found)
 print(rows, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """
+
+
+def test_scratch_files_of_killed_imports_are_removed(tmp_path, monkeypatch):
+    monkeypatch.setattr(csv_stream.tempfile, "tempdir", str(tmp_path))
+    left, used = (tmp_path / f"{csv_stream.SCRATCH}{name}" for name in "ab")
+    for folder in (left, used):
+        folder.mkdir()
+        (folder / csv_stream.LOCK).touch()
+        (folder / "0_0").write_bytes(b"rows")
+    with (used / csv_stream.LOCK).open() as file:
+        fcntl.flock(file, fcntl.LOCK_EX)  # by an import that still runs
+        with csv_stream.scratch() as own:
+            assert own.parent == tmp_path
+            assert not left.exists()
+            assert (used / "0_0").exists()
+    assert not own.exists()
 
 
 @pytest.mark.slow

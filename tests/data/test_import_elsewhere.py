@@ -14,8 +14,8 @@ from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.cut import Part, recordings_of
 from rcirl_jax.data.importers import parts
 from rcirl_jax.data.importing import ImportConfig, import_parts
-from rcirl_jax.errors import InputError
-from rcirl_jax.executor import Processes, Ray
+from rcirl_jax.errors import InputError, LostWorkError
+from rcirl_jax.executor import Here, Processes, Ray
 from tests.data.formats import nuplan, waymo
 from tests.data.small_logs import CONFIG, files_of, write_logs
 
@@ -134,7 +134,7 @@ def test_bad_input_elsewhere_is_the_same_line_and_leaves_nothing(logs, tmp_path)
 
 
 RAY = """
-import sys, time
+import os, sys, time
 from pathlib import Path
 import ray
 from ray.cluster_utils import Cluster
@@ -157,8 +157,9 @@ class Killing:
                 cluster.remove_node(nodes[0], allow_graceful=False)
             yield result
 
-parts = write_logs(Path(sys.argv[1]))
-importing.import_parts(parts, sys.argv[2], CONFIG, executor=Killing())
+os.chdir(sys.argv[1])  # the nodes were started elsewhere
+parts = write_logs(Path("logs"))
+importing.import_parts(parts, "data", CONFIG, executor=Killing())
 deadline = time.monotonic() + 90.0  # the loss of a node is noticed late
 while sum(node["Alive"] for node in ray.nodes()) != 2:  # the head and the other
     assert time.monotonic() < deadline, "no node was lost"
@@ -175,11 +176,39 @@ def test_a_ray_cluster_that_loses_a_node_writes_the_bytes_of_one_process(
     """A head and two nodes, each its own processes; one node is killed midway."""
     pytest.importorskip("ray")
     done = subprocess.run(
-        [sys.executable, "-c", RAY, str(tmp_path / "logs"), str(tmp_path / "data")],
+        [sys.executable, "-c", RAY, str(tmp_path)],
         capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-2000:]
     assert files_of(tmp_path / "data") == local
+
+
+class Losing:
+    """Loses its workers for good before a result; until then as in this process."""
+
+    workers = 1
+
+    def __init__(self, before):
+        self.before = before
+
+    def stream(self, function, items):
+        for number, result in enumerate(Here().stream(function, items)):
+            if number == self.before:
+                raise LostWorkError("log: its process was killed: expected memory")
+            yield result
+
+
+def test_lost_workers_leave_what_is_finished(logs, local, tmp_path, monkeypatch):
+    monkeypatch.setattr(importing, "SHARD_SCENES", 30)
+    data = tmp_path / "data"
+    with pytest.raises(LostWorkError):
+        import_parts(logs, data, CONFIG, executor=Losing(4))
+    kept = {path: path.stat().st_mtime_ns for path in data.rglob("shard.json")}
+    assert kept
+    assert not (data / "manifest.json").exists()
+    import_parts(logs, data, CONFIG)
+    assert all(path.stat().st_mtime_ns == when for path, when in kept.items())
+    assert files_of(data) == local
 
 
 @pytest.mark.ray

@@ -17,7 +17,9 @@ pyarrow reads the text (extra `[logs]`).
 
 import contextlib
 import dataclasses
+import fcntl
 import importlib
+import shutil
 import tempfile
 from collections.abc import Container, Iterator
 from pathlib import Path
@@ -30,12 +32,15 @@ from rcirl_jax.data.importers.tables import check_cells, number, read_header
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Recording, Track
 
-LONG_BYTES = 256 * 2**20  # bytes; a longer file is read in pieces
+# bytes; a longer file is read in pieces (at once it takes ten times as much)
+LONG_BYTES = 64 * 2**20
 READ_BYTES = 8 * 2**20  # bytes of text parsed at a time
 BLOCK_S = 60.0  # s of a piece
 BEFORE_S = 5.0  # s of rows before it: history and the smoothing window
 AFTER_S = 28.0  # s after it: the future of 8 s, smoothing, and the path beyond
 MAX_BLOCKS = 200_000  # pieces of one file; more mean a wrong unit of time
+SCRATCH = "rcirl-scratch-"  # how folders of scratch files begin
+LOCK = "lock"  # in such a folder, held while it is in use
 BUFFER_BYTES = 64 * 2**20  # bytes of rows held before they go to scratch files
 
 
@@ -85,8 +90,8 @@ def spilled(
       InputError: unreadable text, a cell that is no finite number, or more
         than MAX_BLOCKS minutes.
     """
-    with tempfile.TemporaryDirectory(prefix="rcirl-") as folder:
-        spill = Spill(path, fields, Path(folder), wanted)
+    with scratch() as folder:
+        spill = Spill(path, fields, folder, wanted)
         with reading(path, [path]) as show:
             for batch in batches(path, fields):  # one per READ_BYTES of text
                 spill.add(batch)
@@ -95,6 +100,20 @@ def spilled(
             raise InputError(f"{path}: rows: none: expected rows below the header")
         spill.flush()
         yield spill
+
+
+@contextlib.contextmanager
+def scratch() -> Iterator[Path]:
+    """A locked folder for scratch files; removes those that killed imports left."""
+    for left in Path(tempfile.gettempdir()).glob(f"{SCRATCH}*/{LOCK}"):
+        with contextlib.suppress(OSError), left.open() as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # not while in use
+            shutil.rmtree(left.parent, ignore_errors=True)
+    with tempfile.TemporaryDirectory(prefix=SCRATCH) as name:
+        folder = Path(name)
+        with (folder / LOCK).open("w") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            yield folder
 
 
 def pieces(path: Path, fields: list[Field], max_gap_s: float) -> Iterator[Piece]:
@@ -208,6 +227,7 @@ class Spill:
         self.buffers: dict[tuple[int, int], list[np.ndarray]] = {}
         self.held = 0  # bytes in the buffers
         self.given = 0  # pieces
+        self._tables: dict[str, np.ndarray] = {}
 
     def add(self, batch: dict) -> None:
         """Sort a batch's rows into their minutes."""
@@ -283,10 +303,17 @@ class Spill:
     def _values(self, rows: np.ndarray) -> dict[str, np.ndarray]:
         values = {name: rows[:, place] for place, name in enumerate(self.names)}
         values.pop("recording", None)
-        for name, table in self.texts.items():
+        for name in self.texts:
             if name in values:
-                values[name] = np.array(list(table))[values[name].astype(np.int64)]
+                codes = values[name].astype(np.int64)
+                values[name] = self._table(name)[codes].astype(str)
         return values
+
+    def _table(self, name: str) -> np.ndarray:
+        """Texts of a field by number; all of them are known once the file is read."""
+        if name not in self._tables:
+            self._tables[name] = np.array(list(self.texts[name]), object)
+        return self._tables[name]
 
     def _fragments(
         self, code: int, minutes: list[int], max_gap_s: float
