@@ -256,6 +256,23 @@ def test_malformed_rows(tmp_path, rows, field):
     assert "\n" not in message
 
 
+@pytest.mark.parametrize("long_bytes", [1, 10**9])
+@pytest.mark.parametrize("cells", [1, 4, 7, 8])
+def test_a_file_cut_inside_its_last_line(tmp_path, cells, long_bytes):
+    """Fewer cells than the header are refused; a whole line needs no newline."""
+    path = w.table(tmp_path / "log.csv", w.CSV_COLUMNS, w.csv_rows())
+    source = w.csv_spec(tmp_path / "s.toml")
+    source.write_text(f"long_bytes = {long_bytes}\n" + source.read_text())
+    *lines, last = path.read_text().splitlines()
+    path.write_text("\n".join([*lines, ",".join(last.split(",")[:cells])]))
+    if cells == len(w.CSV_COLUMNS):
+        assert sum(track.t.size for r in read(path, source) for track in r.tracks) > 0
+        return
+    with pytest.raises(InputError) as error:
+        read(path, source)
+    assert str(error.value) == f"{path}: line 121: {cells} cells: expected 8"
+
+
 def test_two_lorries_are_no_error(tmp_path):
     rows = [row for row in scaled(5, 3.6) if row[1] != "car2"]
     recording = only(log(tmp_path, rows), w.csv_spec(tmp_path / "s.toml"))

@@ -5,12 +5,15 @@ import time
 import numpy as np
 import pytest
 
+from rcirl_jax.data.collect import Collector
+from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind
 from tests.data.formats import levelx as ind
 from tests.data.formats import levelx_highd as highd
 from tests.data.formats import osm
+from tests.data.formats.drives import straight
 
 
 def read(path, source=None):
@@ -175,7 +178,33 @@ def test_exid_columns_with_lists_and_holes(tmp_path):
     recording = only(tmp_path)
     assert len(recording.tracks) == 6
     assert recording.default_speed_limit == 36.11
-    assert "1 trailers are tracks of their own" in recording.notes
+    assert "1 trailers are obstacles of kind cyclist, no experts" in recording.notes
+
+
+def test_a_trailer_is_an_obstacle_but_no_expert(tmp_path):
+    """It follows its tractor half a metre behind; a car follows the trailer."""
+    frames = np.arange(ind.FRAMES)
+    users = {
+        str(number): (kind, straight(ind.T, (x, -41.75), 0.0, 15.0, size=size), frames)
+        for number, (kind, x, size) in enumerate(
+            [
+                ("car", 60.0, (4.5, 1.9)),
+                ("trailer", 54.25, (6.0, 2.2)),
+                ("car", 20.0, (4.5, 1.9)),
+            ]
+        )
+    }
+    ind.write_tracks(tmp_path, "00", users)
+    ind.write_meta(tmp_path, "00")
+    recording = only(tmp_path)
+    collect = CollectConfig(require_speed_change=False)
+    scenes = list(Collector(recording, collect).scenes())
+    drivers = {recording.tracks[scene["track"]].id for scene in scenes}
+    assert drivers == {"0", "2"}
+    for scene in scenes:
+        if recording.tracks[scene["track"]].id == "2":
+            length = scene["obstacles.s_upper"] - scene["obstacles.s_lower"]
+            assert np.any(np.abs(length[:, 0] - 6.0) < 0.05)
 
 
 @pytest.mark.parametrize(
@@ -240,20 +269,67 @@ def test_meta_without_the_utm_origin(junction):
         read(junction)
 
 
-def test_part_of_the_rows_is_enough(junction):
-    """Published samples hold the first rows only, and all of the meta data."""
+def rows_of(path, kept):
+    """Keep the lines of a table for which `kept(line number, cells)`."""
+    lines = path.read_text().splitlines()
+    found = [x for k, x in enumerate(lines) if k == 0 or kept(k, x.split(","))]
+    path.write_text("\n".join(found) + "\n")
+
+
+@pytest.mark.parametrize(
+    ("kept", "found"),
+    [
+        (lambda k, _: k < 400, "track 1: numFrames: 99: expected 235"),
+        (lambda k, _: k < 301, "track 1: numFrames: 0: expected 235"),
+        (lambda k, _: k != 50, "track 0: numFrames: 299: expected 300"),
+        (lambda _, cells: cells[1] != "5", "track 5: numFrames: 0: expected 300"),
+    ],
+)
+def test_truncated_at_the_border_of_lines(junction, kept, found):
     path = junction / "data" / "07_tracks.csv"
-    path.write_text("\n".join(path.read_text().splitlines()[:400]) + "\n")
-    recording = only(junction)
+    rows_of(path, kept)
+    with pytest.raises(InputError) as error:
+        read(junction)
+    assert str(error.value) == (
+        f"{path}: {found} as in 07_tracksMeta.csv; truncated file?"
+    )
+
+
+@pytest.mark.parametrize(
+    ("row", "other", "found"),
+    [
+        ("0,299,300", "1,300,300", "track 0: initialFrame: 0: expected 1"),
+        ("0,299,300", "0,300,300", "track 0: finalFrame: 299: expected 300"),
+        ("0,299,300", "0,299,299", "track 0: numFrames: 300: expected 299"),
+    ],
+)
+def test_lives_of_tracks(junction, row, other, found):
+    edit(junction / "data" / "07_tracksMeta.csv", row, other)
+    with pytest.raises(InputError, match=found):
+        read(junction)
+
+
+def test_without_a_number_of_frames_the_ends_count(junction):
+    edit(junction / "data" / "07_tracksMeta.csv", "numFrames", "lifetime")
+    assert len(only(junction).tracks) == 6
+    rows_of(junction / "data" / "07_tracks.csv", lambda k, _: k != 50)
+    with pytest.raises(InputError, match="track 0: numFrames: 299: expected 300"):
+        read(junction)
+
+
+def test_a_part_of_the_rows_on_request(junction, tmp_path):
+    """Published samples hold the first rows only, and all of the meta data."""
+    rows_of(junction / "data" / "07_tracks.csv", lambda k, _: k < 400)
+    source = tmp_path / "s.toml"
+    source.write_text("partial = true\n")
+    recording = only(junction, source)
     assert len(recording.tracks) == 2
     assert "4 tracks of tracksMeta have no rows" in recording.notes
 
 
 def test_gap_splits_a_track(junction):
-    path = junction / "data" / "07_tracks.csv"
-    lines = path.read_text().splitlines()
-    kept = [line for k, line in enumerate(lines) if not 100 < k < 120]
-    path.write_text("\n".join(kept) + "\n")
+    rows_of(junction / "data" / "07_tracks.csv", lambda k, _: not 100 < k < 120)
+    edit(junction / "data" / "07_tracksMeta.csv", "0,299,300", "0,299,281")
     assert [track.id for track in only(junction).tracks][:2] == ["0", "0#2"]
 
 
@@ -280,7 +356,7 @@ def test_missing_companion(motorway, kind):
     [
         ("tracks", "xVelocity", "vx", "column xVelocity: missing"),
         ("tracks", "frame,id", "frame,frame", "column frame: met twice"),
-        ("tracks", "\n1,1,", "\n1,77,", "track 77: no row in the tracksMeta"),
+        ("tracks", "\n1,1,", "\n1,77,", "track 77: no row in 01_tracksMeta.csv"),
         ("tracks", "\n1,1,", "\n1,1.5,", "track number: 1.5"),
         ("tracks", "\n1,1,", "\nx,1,", "line 2: frame: 'x'"),
         ("tracks", "\n1,1,", "\n1e300,1,", "frame: 1e+300"),

@@ -10,10 +10,11 @@ length along x, `height` the width of the car, y points down (ours up), frames
 start at 1, speedLimit -1 means none. inD and its sisters: x, y is the centre,
 heading is in degrees, width and length of pedestrians and cyclists are 0, lists
 are separated by semicolons, the map is a Lanelet2 file of the location in
-degrees, moved by the recording's UTM origin.
+degrees, moved by the recording's UTM origin, a trailer is a track of its own.
 """
 
 import csv
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -42,6 +43,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Lane, Recording, Track
 
 SUFFIX = "_tracks.csv"
+USERS = "_tracksMeta.csv"
 CORNER = ("frame", "id", "x", "y", "width", "height", "xVelocity", "yVelocity")
 CENTRE = (
     *("frame", "trackId", "xCenter", "yCenter", "heading", "width", "length"),
@@ -51,13 +53,26 @@ KINDS = {
     "pedestrian": Kind.PEDESTRIAN,
     "bicycle": Kind.CYCLIST,
     "bicyclist": Kind.CYCLIST,
+    # in the way of others like any body that moves, but nobody drives it: only
+    # vehicles are experts (Argoverse 2's "unknown" and Waymo's "other" likewise)
+    "trailer": Kind.CYCLIST,
 }
+LIFE = ("numFrames", "initialFrame", "finalFrame")  # of a track, in tracksMeta
 MAX_GAP_FRAMES = 5.5  # frames missing inside one track
 MAX_ID = 2**53  # beyond it float64 does not count
 FAR_M = 200.0  # m; a map that far from all tracks is not theirs
 LANE_WIDTH_M = 3.5  # m, of lanes fitted to paths
 LIMIT_MPS = 36.11  # m/s, 130 km/h, advised where German motorways have no limit
 SIZE_M = (0.5, 0.5)  # m, length and width of a road user without a box
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _User:
+    """One row of a tracksMeta.csv."""
+
+    kind: str  # class in lower case
+    direction: float  # highD's drivingDirection, 1 towards -x; else 0
+    life: tuple[float, float, float]  # its LIFE
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
@@ -78,9 +93,13 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
         yield validate_recording(read(file, spec), file)
 
 
+def _other(path: Path, suffix: str) -> Path:
+    return path.with_name(path.name.removesuffix(SUFFIX) + suffix)
+
+
 def _beside(path: Path, suffix: str) -> Path:
     """The file of the same recording with another ending."""
-    other = path.with_name(path.name.removesuffix(SUFFIX) + suffix)
+    other = _other(path, suffix)
     if not other.is_file():
         raise InputError(f"{other}: input: missing: expected it beside {path.name}")
     return other
@@ -145,7 +164,7 @@ def _read_rows(
 def _read_corners(path: Path, spec: dict) -> Recording:
     """highD: corners of boxes, lanes by the y of their markings."""
     rows = _read_rows(path, CORNER, ("x", "y", "width", "height"))
-    users = _read_users(_beside(path, "_tracksMeta.csv"), "id", "drivingDirection")
+    users = _read_users(_beside(path, USERS), "id", "drivingDirection")
     meta_path = _beside(path, "_recordingMeta.csv")
     meta = _read_meta(meta_path)
     rate = _rate(meta_path, meta)
@@ -153,16 +172,16 @@ def _read_corners(path: Path, spec: dict) -> Recording:
     x = rows["x"] + 0.5 * rows["width"]
     y = -(rows["y"] + 0.5 * rows["height"])
     speed = np.hypot(rows["xVelocity"], rows["yVelocity"])
-    ids, pieces = _pieces(path, rows["id"], rows["frame"], users)
+    ids, pieces = _pieces(path, rows["id"], rows["frame"], users, spec)
     tracks = []
     for name, part in pieces:
-        kind, direction = users[int(ids[part[0]])]
-        standing = np.pi if direction == 1.0 else 0.0
+        user = users[int(ids[part[0]])]
+        standing = np.pi if user.direction == 1.0 else 0.0
         heading = travel_heading(t[part], x[part], y[part], standing)
         tracks.append(
             Track(
                 id=name,
-                kind=KINDS.get(kind, Kind.VEHICLE),
+                kind=KINDS.get(user.kind, Kind.VEHICLE),
                 length=float(np.median(rows["width"][part])),
                 width=float(np.median(rows["height"][part])),
                 t=t[part],
@@ -182,22 +201,22 @@ def _read_corners(path: Path, spec: dict) -> Recording:
 def _read_centres(path: Path, spec: dict) -> Recording:
     """inD, rounD, exiD, uniD: centres of boxes, lanes from a map."""
     rows = _read_rows(path, CENTRE, ("xCenter", "yCenter", "width", "length"))
-    users = _read_users(_beside(path, "_tracksMeta.csv"), "trackId", None)
+    users = _read_users(_beside(path, USERS), "trackId", None)
     meta_path = _beside(path, "_recordingMeta.csv")
     meta = _read_meta(meta_path)
     rate = _rate(meta_path, meta)
     rows["t"] = (rows["frame"] - rows["frame"].min()) / rate
-    ids, pieces = _pieces(path, rows["trackId"], rows["frame"], users)
+    ids, pieces = _pieces(path, rows["trackId"], rows["frame"], users, spec)
     tracks = [
-        _centred_track(name, part, rows, users[int(ids[part[0]])][0], spec)
+        _centred_track(name, part, rows, users[int(ids[part[0]])].kind, spec)
         for name, part in pieces
     ]
     limit = _limit(meta_path, meta)
     lanes, notes = _mapped_lanes(path, meta_path, meta, tracks, spec)
     notes += _absent(ids, users)
-    trailers = sum(users[int(i)][0] == "trailer" for i in np.unique(ids))
+    trailers = sum(users[int(i)].kind == "trailer" for i in np.unique(ids))
     if trailers:
-        notes.append(f"{trailers} trailers are tracks of their own")
+        notes.append(f"{trailers} trailers are obstacles of kind cyclist, no experts")
     return _recording(path, spec, rate, tracks, lanes, limit, notes)
 
 
@@ -228,22 +247,23 @@ def _centred_track(
     )
 
 
-def _read_users(
-    path: Path, key: str, direction: str | None
-) -> dict[int, tuple[str, float]]:
-    """Track number -> (class in lower case, driving direction or 0)."""
-    wanted = [key, "class", *([direction] if direction else [])]
-    table = read_table(path, wanted, (), ["class"])
+def _read_users(path: Path, key: str, direction: str | None) -> dict[int, _User]:
+    """Track number -> what tracksMeta says of it."""
+    rows, *ends = LIFE
+    wanted = [key, "class", *ends, *([direction] if direction else [])]
+    table = read_table(path, wanted, (rows,), ["class"])
+    first, last = (table[end] for end in ends)
+    lives = zip(table.get(rows, last - first + 1.0), first, last, strict=True)
     towards = table[direction] if direction else np.zeros(table[key].size)
     kinds = np.char.lower(table["class"])
     return {
-        int(name): (str(kind), float(way))
-        for name, kind, way in zip(table[key], kinds, towards, strict=True)
+        int(name): _User(kind=str(kind), direction=float(way), life=life)
+        for name, kind, way, life in zip(table[key], kinds, towards, lives, strict=True)
     }
 
 
 def _pieces(
-    path: Path, names: np.ndarray, frames: np.ndarray, users: dict
+    path: Path, names: np.ndarray, frames: np.ndarray, users: dict, spec: dict
 ) -> tuple[np.ndarray, list[tuple[str, np.ndarray]]]:
     """Track numbers per row, and the rows of each track without a gap."""
     wrong = np.flatnonzero((names != np.round(names)) | (np.abs(names) > MAX_ID))
@@ -255,10 +275,31 @@ def _pieces(
     unknown = sorted(set(np.unique(ids).tolist()) - set(users))
     if unknown:
         raise InputError(
-            f"{path}: track {unknown[0]}: no row in the tracksMeta file: "
+            f"{path}: track {unknown[0]}: no row in {_other(path, USERS).name}: "
             "expected one per track"
         )
-    return ids, split_tracks(path, ids, frames, MAX_GAP_FRAMES)
+    pieces = split_tracks(path, ids, frames, MAX_GAP_FRAMES)
+    if not spec.get("partial", False):
+        _check_whole(path, ids, frames, users)
+    return ids, pieces
+
+
+def _check_whole(
+    path: Path, ids: np.ndarray, frames: np.ndarray, users: dict[int, _User]
+) -> None:
+    """Every track has the rows that tracksMeta counts: nothing was cut off."""
+    order = np.lexsort((frames, ids))
+    known, starts, counts = np.unique(ids[order], return_index=True, return_counts=True)
+    ends = frames[order][starts], frames[order][starts + counts - 1]
+    found = dict(zip(known.tolist(), zip(counts, *ends, strict=True), strict=True))
+    for name, user in users.items():
+        life = found.get(name, (0, np.nan, np.nan))
+        for field, value, expected in zip(LIFE, life, user.life, strict=True):
+            if value != expected:
+                raise InputError(
+                    f"{path}: track {name}: {field}: {value:.12g}: expected "
+                    f"{expected:.12g} as in {_other(path, USERS).name}; truncated file?"
+                )
 
 
 def _absent(ids: np.ndarray, users: dict) -> list[str]:

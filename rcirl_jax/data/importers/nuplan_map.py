@@ -37,11 +37,13 @@ NONE = -1  # no feature's number
 BLOCK = 256  # points measured at once; memory grows with it and the bound
 FOLDERS_UP = 6  # folders above a log in which "maps" is looked for
 SAFE_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,99}")
-CENTRES = ("geom", "lane_fid", "lane_connector_fid")
+CENTRES = ("lane_fid", "lane_connector_fid")
 LANES = ("lane_fid", "lane_group_fid", "lane_index", "speed_limit_mps")
 CONNECTORS = ("fid", "exit_lane_fid", "entry_lane_fid", "speed_limit_mps")
 BOUNDS = ("left_boundary_fid", "right_boundary_fid")
-STOPS = ("fid", "geom", "stop_polygon_type_fid")
+STOPS = ("fid", "stop_polygon_type_fid")
+GEOMETRY = "geom"  # column of a layer's geometries where the file names none
+MAX_NAME = 100  # characters of a column's name
 CONNECTOR_BOUNDS = "gen_lane_connectors_scaled_width_polygons"
 
 
@@ -104,12 +106,14 @@ class NuplanMap:
         """Reads all tables; geometries of lanes' bounds stay blobs."""
         with Database(file) as database:
             self._layers = Layers(database, *_zone(database))
+            self._geometry = _geometry_columns(database)
             self._stops = self._read_stops(database)
             rows = {**self._connectors(database), **self._lanes_of(database)}
             self._rows, self._centres = self._read_centres(database, rows)
             self._bounds: dict[int, object] = {}
             if database.columns("boundaries"):
-                table = _table(database, "boundaries", ("fid", "geom"))
+                columns = ("fid", self._column("boundaries"))
+                table = _table(database, "boundaries", columns)
                 self._bounds = {_fid(fid): blob for fid, blob in table}
         self._made: dict[int, Lane] = {}
         self._boxes = np.array(
@@ -133,6 +137,14 @@ class NuplanMap:
                 dataclasses.replace(lane, centre=lane.centre - origin, stop_line=stop)
             )
         return tuple(found)
+
+    def _column(self, layer: str) -> str:
+        """Name of a layer's column of geometries."""
+        return self._geometry.get(layer, GEOMETRY)
+
+    def _lines(self, layer: str, blobs: Sequence[object]) -> list[np.ndarray]:
+        """[n, 2] m of each geometry of a layer."""
+        return self._layers.lines(layer, self._column(layer), blobs)
 
     def _make(self, index: int) -> Lane:
         row, centre = self._rows[index], self._centres[index]
@@ -162,7 +174,7 @@ class NuplanMap:
         default = np.full(len(centre), HALF_WIDTH_M)
         if fid not in self._bounds:
             return default
-        (line,) = self._layers.lines("boundaries", "geom", [self._bounds[fid]])
+        (line,) = self._lines("boundaries", [self._bounds[fid]])
         if not len(line):
             return default
         blocks = np.split(centre, np.arange(BLOCK, len(centre), BLOCK))
@@ -173,8 +185,9 @@ class NuplanMap:
         self, database: Database, rows: Mapping[str, _Row]
     ) -> tuple[list[_Row], list[np.ndarray]]:
         """Rows that have a centre line, and those lines [n >= 2, 2] m."""
-        table = _table(database, "baseline_paths", CENTRES)
-        lines = self._layers.lines("baseline_paths", "geom", [row[0] for row in table])
+        columns = (self._column("baseline_paths"), *CENTRES)
+        table = _table(database, "baseline_paths", columns)
+        lines = self._lines("baseline_paths", [row[0] for row in table])
         found: dict[str, np.ndarray] = {}
         for (_, lane, connector), line in zip(table, lines, strict=True):
             fid = _fid(lane)
@@ -255,27 +268,38 @@ class NuplanMap:
             name if name in columns else "NULL"
             for name in ("lane_fids", "lane_connector_fids")
         ]
-        table = _table(database, "stop_polygons", (*STOPS, *lists))
-        rings = self._layers.lines("stop_polygons", "geom", [row[1] for row in table])
+        wanted = (self._column("stop_polygons"), *STOPS, *lists)
+        table = _table(database, "stop_polygons", wanted)
+        rings = self._lines("stop_polygons", [row[0] for row in table])
         found = {}
-        for row, ring in zip(table, rings, strict=True):
+        for (_, fid, kind, *users), ring in zip(table, rings, strict=True):
             if len(ring):
                 middle = ring[:-1].mean(axis=0) if len(ring) > 1 else ring[0]
-                found[_fid(row[0])] = (
-                    _fid(row[2]),
-                    middle,
-                    _fids(row[3]),
-                    _fids(row[4]),
-                )
+                found[_fid(fid)] = (_fid(kind), middle, *map(_fids, users))
         return found
 
 
 def _table(database: Database, table: str, columns: Sequence[str]) -> list[tuple]:
     """All rows of a layer's columns; "NULL" stands for one that is missing."""
     database.need(table, [name for name in columns if name != "NULL"])
-    sql = f'SELECT {", ".join(columns)} FROM "{table}"'
+    chosen = [name if name == "NULL" else _quoted(name) for name in columns]
+    sql = f'SELECT {", ".join(chosen)} FROM "{table}"'
     chunks = database.chunks(sql, (table,), MAX_ROWS)
     return [row for rows in chunks for row in rows]
+
+
+def _quoted(name: str) -> str:
+    """A column's name in SQL; the file may have chosen it."""
+    return '"' + name.replace('"', '""') + '"'
+
+
+def _geometry_columns(database: Database) -> dict[str, str]:
+    """Layer -> its column of geometries; a short name, of one line for errors."""
+    table = "gpkg_geometry_columns"
+    if not database.columns(table):
+        return {}
+    rows = _table(database, table, ("table_name", "column_name"))
+    return {str(layer): " ".join(str(name).split())[:MAX_NAME] for layer, name in rows}
 
 
 def _zone(database: Database) -> tuple[int, bool]:

@@ -40,3 +40,17 @@ class Fixture:
     has_heading: bool = True  # False: computed from the positions
     # files whose truncation, garbling or removal has to be one clear line
     files: tuple[Path, ...] = ()
+    # text file -> pattern whose group is a number that is read, a position if there
+    # is one: anything else in its place has to be one clear line
+    numbers: dict[Path, str] = dataclasses.field(default_factory=dict)
+    # whether text cut between two lines is seen to be cut: rows are counted
+    # elsewhere, or the text has an end of its own
+    is_counted: bool = False
+    # whether a position may be missing here and there (NaN)
+    has_holes: bool = False
+
+
+def cell(column: int, separator: str = ",") -> str:
+    """Pattern of a table's cells in one column."""
+    other = f"[^{separator}\n]*"
+    return f"^(?:{other}{separator}){{{column}}}({other})"

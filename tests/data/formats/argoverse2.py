@@ -232,4 +232,6 @@ def write(folder):
         tracks=expected(),
         num_lanes=6,
         files=files,
+        numbers={files[1]: '"x": ([^,}]*)'},
+        is_counted=True,
     )

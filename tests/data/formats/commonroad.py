@@ -63,6 +63,8 @@ def write(folder):
         num_lanes=2,
         num_signals=1,
         files=(path,),
+        numbers={path: "<x>([^<]*)</x>"},
+        is_counted=True,
     )
 
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from rcirl_jax.types import Kind
 from tests.data import writers as w
-from tests.data.formats import Fixture
+from tests.data.formats import Fixture, cell
 from tests.data.formats.drives import arc, samples, straight
 
 COLUMNS = (
@@ -42,4 +42,5 @@ def write(folder):
         },
         num_lanes=2,
         files=(path,),
+        numbers={path: cell(COLUMNS.index("x"))},
     )

@@ -3,7 +3,7 @@
 import numpy as np
 
 from rcirl_jax.types import Kind
-from tests.data.formats import Fixture, osm
+from tests.data.formats import Fixture, cell, osm
 from tests.data.formats.drives import samples, straight
 from tests.data.formats.levelx import turning
 
@@ -89,10 +89,12 @@ def write(folder):
     osm.lanelet_map(maps / f"{SCENE}.osm_xy", osm.in_metres, SHIFT)
     osm.lanelet_map(maps / f"{SCENE}.osm", osm.in_degrees(31, ORIGIN), SHIFT)
     tracks = [scene / f"{kind}_tracks_000.csv" for kind in ("vehicle", "pedestrian")]
+    place_of_map, x = maps / f"{SCENE}.osm_xy", cell(VEHICLE_COLUMNS.index("x"))
     return Fixture(
         input=folder,
         rate_hz=10.0,
         tracks={n: samples(u, steps) for n, (_, u, steps) in road_users().items()},
         num_lanes=osm.NUM_LANES,
-        files=(*tracks, maps / f"{SCENE}.osm_xy"),
+        files=(*tracks, place_of_map),
+        numbers={**dict.fromkeys(tracks, x), place_of_map: " x='([^']*)'"},
     )

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tests.data.formats import Fixture, osm
+from tests.data.formats import Fixture, cell, osm
 from tests.data.formats.drives import samples
 from tests.data.formats.interaction import (
     SHIFT,
@@ -44,4 +44,8 @@ def write(folder):
         tracks=tracks,
         num_lanes=osm.NUM_LANES,
         files=(log, place),
+        numbers={
+            log: cell(1 + VEHICLE_COLUMNS.index("x")),
+            place: " x='([^']*)'",
+        },
     )

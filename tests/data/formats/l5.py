@@ -183,7 +183,7 @@ def write_array(folder, records, chunk):
     (folder / ".zarray").write_text(json.dumps(metadata, indent=4))
 
 
-def write_zarr(folder, *, scenes=2):
+def write_zarr(folder, *, scenes=2, start=START_NS, host="host-a013"):
     """Scenes of the same traffic, 30 s apart, at one host."""
     users = road_users()
     seen, intervals = agents(users)
@@ -193,7 +193,7 @@ def write_zarr(folder, *, scenes=2):
     for scene in range(scenes):
         part = frames[100 * scene : 100 * (scene + 1)]
         later = np.round((STAMPS + 40.0 * scene) * 1e9).astype(np.int64)
-        part["timestamp"] = START_NS + later
+        part["timestamp"] = start + later
         part["agent_index_interval"] = intervals + scene * len(seen)
         part["traffic_light_faces_index_interval"] = light_intervals + 200 * scene
         part["ego_translation"] = np.stack([ego.x, ego.y, np.full(100, 288.1)], axis=1)
@@ -201,7 +201,7 @@ def write_zarr(folder, *, scenes=2):
     table = np.zeros(scenes, SCENE_DTYPE)
     for scene in range(scenes):
         begin, end = frames["timestamp"][[100 * scene, 100 * scene + 99]]
-        table[scene] = ([100 * scene, 100 * (scene + 1)], "host-a013", begin, end)
+        table[scene] = ([100 * scene, 100 * (scene + 1)], host, begin, end)
     folder.mkdir(parents=True)
     (folder / ".zgroup").write_text('{"zarr_format": 2}')
     (folder / ".zattrs").write_text('{"format_version": 2, "labels": []}')
@@ -340,4 +340,10 @@ def write(folder):
             semantic_map,
             meta,
         ),
+        numbers={
+            dataset / "scenes" / ".zarray": r'"shape": \[\s*(\d+)',
+            dataset / "agents" / ".zarray": r'"shape": \[\s*(\d+)',
+            meta: r"(-?\d+\.\d+)",
+        },
+        is_counted=True,
     )

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from rcirl_jax.types import Kind
-from tests.data.formats import Fixture, osm
+from tests.data.formats import Fixture, cell, osm
 from tests.data.formats.drives import arc, samples, straight
 
 RATE = 25.0  # 1/s
@@ -116,10 +116,14 @@ def write(folder):
     )
     names = [f"07_{kind}.csv" for kind in ("tracks", "tracksMeta", "recordingMeta")]
     place_of_map = folder / "maps" / "lanelets" / "04_aseag" / "location4.osm"
+    columns = (ROW_COLUMNS.index("xCenter"), 2, [*META].index("xUtmOrigin"))
+    cells = zip([data / name for name in names], map(cell, columns), strict=True)
     return Fixture(
         input=folder,
         rate_hz=RATE,
         tracks={n: samples(u, frames) for n, (_, u, frames) in road_users().items()},
         num_lanes=osm.NUM_LANES,
         files=(*(data / name for name in names), place_of_map),
+        numbers={**dict(cells), place_of_map: "lat='([^']*)'"},
+        is_counted=True,
     )

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from tests.data.formats import Fixture
+from tests.data.formats import Fixture, cell
 from tests.data.formats.drives import samples, straight
 
 FORMAT = "levelx"
@@ -94,11 +94,16 @@ def write(folder):
     values = ",".join(str(value) for value in META.values())
     (folder / "01_recordingMeta.csv").write_text(",".join(META) + "\n" + values + "\n")
     names = ("01_tracks.csv", "01_tracksMeta.csv", "01_recordingMeta.csv")
+    files = tuple(folder / name for name in names)
+    frame = cell(META_COLUMNS.index("initialFrame"))
+    patterns = (cell(ROW_COLUMNS.index("x")), frame, r";([\d.]+);")
     return Fixture(
         input=folder,
         rate_hz=RATE,
         tracks={n: samples(u, f) for n, (*_, u, f) in road_users().items()},
         num_lanes=4,
         has_heading=False,
-        files=tuple(folder / name for name in names),
+        files=files,
+        numbers=dict(zip(files, patterns, strict=True)),
+        is_counted=True,
     )

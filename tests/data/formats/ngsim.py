@@ -3,7 +3,7 @@
 import numpy as np
 
 from tests.data import writers as w
-from tests.data.formats import Fixture
+from tests.data.formats import Fixture, cell
 from tests.data.formats.drives import straight
 
 
@@ -32,4 +32,5 @@ def write(folder):
         num_lanes=2,
         has_heading=False,
         files=(path,),
+        numbers={path: cell(w.NGSIM_COLUMNS.index("Local_Y"), " ")},
     )

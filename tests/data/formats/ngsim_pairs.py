@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from tests.data.formats import Fixture
+from tests.data.formats import Fixture, cell
 from tests.data.formats.drives import straight
 
 FOOT = 0.3048  # m
@@ -78,4 +78,5 @@ def write(folder):
         tracks={name: car(name, length) for name, length in lengths.items()},
         num_lanes=1,
         files=files,
+        numbers=dict.fromkeys(files, cell(COLUMNS.index("x_follower"))),
     )

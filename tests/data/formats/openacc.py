@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from tests.data.formats import Fixture
+from tests.data.formats import Fixture, cell
 from tests.data.formats.drives import samples
 
 T = np.round(np.arange(400) * 0.1, 1)
@@ -105,7 +105,8 @@ def road_users():
 
 def write(folder):
     """A platoon of three on a test track."""
-    log = write_drive(folder / "ASta_040719_platoon1.csv", table(cars()), tail=",")
+    columns = table(cars())
+    log = write_drive(folder / "ASta_040719_platoon1.csv", columns, tail=",")
     (folder / "Vehicles_specifications.csv").write_text("Vehicles,Max power (kW)\n")
     return Fixture(
         input=folder,
@@ -114,4 +115,6 @@ def write(folder):
         num_lanes=1,
         has_heading=False,
         files=(log,),
+        numbers={log: cell([*columns].index("E1"))},
+        has_holes=True,
     )
