@@ -3,7 +3,6 @@
 import json
 import shutil
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -72,7 +71,7 @@ def test_scenes_become_recordings(folder):
     assert "CC BY-NC-SA" in first.licence
     assert any("unknown class" in note for note in first.notes)
     # scenes of one host that follow each other show the same cars
-    assert first.group == second.group == "sample-from-000000"
+    assert first.group == second.group == "host-a013-from-1572643684"
 
 
 def test_groups_of_other_hosts_and_days():
@@ -80,9 +79,46 @@ def test_groups_of_other_hosts_and_days():
     scenes["host"] = ["a", "b", "a", "a"]
     scenes["start_time"] = np.array([0, 0, 30, 300]) * 10**9
     scenes["end_time"] = scenes["start_time"] + 25 * 10**9
-    assert l5._groups(Path("x.zarr"), scenes) == [
-        *("x-from-000000", "x-from-000001", "x-from-000000", "x-from-000003")
+    assert l5._groups(scenes, []) == [
+        *("a-from-0", "b-from-0", "a-from-0", "a-from-300")
     ]
+    # the third scene alone is still one of the drive that began with the first
+    assert l5._groups(scenes[2:], [scenes[:1]]) == ["a-from-0", "a-from-300"]
+
+
+def test_groups_over_datasets(folder):
+    """Scenes of one drive in several datasets, also if only one of them is read."""
+    scenes = folder / "scenes"
+    later = fixture.START_NS + 80 * 10**9
+    fixture.write_zarr(scenes / "train.zarr", start=later)
+    fixture.write_zarr(scenes / "validate.zarr", start=later, host="host-b")
+    groups = {one.name: one.group for one in read_recordings("l5", folder)}
+    drive = "host-a013-from-1572643684"
+    assert groups == {
+        **dict.fromkeys(("sample-000000", "sample-000001"), drive),
+        **dict.fromkeys(("train-000000", "train-000001"), drive),
+        **dict.fromkeys(
+            ("validate-000000", "validate-000001"), "host-b-from-1572643764"
+        ),
+    }
+    assert {one.group for one in read(scenes / "train.zarr")} == {drive}
+    (scenes / "sample.zarr" / "scenes" / "0").unlink()  # of no use: not looked into
+    assert {one.group for one in read(scenes / "train.zarr")} == {
+        "host-a013-from-1572643764"
+    }
+
+
+def test_scene_in_two_datasets(folder):
+    scenes = folder / "scenes"
+    fixture.write_zarr(scenes / "train.zarr", scenes=1)
+    with pytest.raises(
+        InputError,
+        match=r"train\.zarr: scene 0: host host-a013, start 1572643684801892606: met "
+        r"twice, also in sample\.zarr: expected once",
+    ):
+        read_recordings("l5", folder)
+    assert len(read(folder, pattern="sample.zarr")) == 2
+    assert len(read(scenes / "train.zarr")) == 1
 
 
 @pytest.mark.parametrize("inner", ["", "scenes", "scenes/sample.zarr"])
@@ -92,7 +128,7 @@ def test_dataset_is_found(folder, inner):
 
 
 def test_parts_are_datasets(folder):
-    shutil.copytree(folder / "scenes" / "sample.zarr", folder / "scenes" / "train.zarr")
+    fixture.write_zarr(folder / "scenes" / "train.zarr", start=fixture.START_NS + 1)
     found, _ = parts("l5", folder)
     assert [part.name for part in found] == ["sample.zarr", "train.zarr"]
     names = [recording.name for recording in read_recordings("l5", folder)]

@@ -1,5 +1,6 @@
 """nuPlan logs and maps: SQLite of others, geometry blobs, windows, lights."""
 
+import collections
 import hashlib
 import os
 import pickle
@@ -11,7 +12,10 @@ import time
 import numpy as np
 import pytest
 
+from rcirl_jax.data.config import CollectConfig
+from rcirl_jax.data.cut import cut
 from rcirl_jax.data.importers import (
+    csv_stream,
     geopackage,
     nuplan,
     nuplan_map,
@@ -23,6 +27,8 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.specs import load_toml, spec_root
 from rcirl_jax.types import Kind
 from tests.data.formats import nuplan as fixture
+
+DRIVE = "2021.06.14.21.57.33_veh-38"
 
 
 def read(path, **options):
@@ -73,7 +79,7 @@ def edit(path, *statements):
 def test_log_becomes_a_recording(folder):
     recording = only(folder)
     assert recording.name == fixture.NAME
-    assert (recording.rate_hz, recording.group) == (20.0, None)
+    assert (recording.rate_hz, recording.group) == (20.0, DRIVE)
     assert any("x = 664000 m, y = 3997000 m" in note for note in recording.notes)
     kinds = {track.id: track.kind for track in recording.tracks}
     assert kinds["ego"] == Kind.VEHICLE
@@ -100,20 +106,50 @@ def test_heading_from_the_quaternion(log):
     np.testing.assert_allclose(only(log).tracks[0].heading, 2.0 * half)
 
 
-def test_long_logs_are_read_in_windows(folder):
+@pytest.mark.parametrize(
+    ("name", "drive"),
+    [
+        (fixture.NAME, DRIVE),
+        ("2021.06.14.21.57.33_veh-38_01008_01518", DRIVE),
+        ("2021.06.14.21.57.33_veh-08_01008_01518", "2021.06.14.21.57.33_veh-08"),
+        ("my_log_00001_00002", "my_log_00001_00002"),
+        (f"{DRIVE}_00017", f"{DRIVE}_00017"),
+    ],
+)
+def test_logs_of_one_drive_are_one_group(name, drive):
+    assert nuplan.drive_of(name) == drive
+
+
+def test_windows_hold_the_scenes_of_the_log(folder, monkeypatch):
+    """Surroundings are shortened to those of a log of 8 s."""
+    monkeypatch.setattr(csv_stream, "BEFORE_S", 1.0)
+    monkeypatch.setattr(csv_stream, "AFTER_S", 2.5)
     found = read(folder, window_s=3.0)
     assert [r.name for r in found] == [f"{fixture.NAME}-{k:03d}" for k in range(3)]
-    assert {r.group for r in found} == {fixture.NAME}
-    sizes = [recording.tracks[0].t.size for recording in found]
-    assert sum(sizes) == 161
-    for recording in found:
-        assert recording.tracks[0].t[0] == 0.0
-        assert recording.tracks[0].t[-1] <= 3.0
-        assert all(signal.start[0] == 0.0 for signal in recording.signals)
-    whole = only(folder).tracks[0].x
+    assert {(r.group, r.piece_of) for r in found} == {(DRIVE, fixture.NAME)}
+    egos = [recording.tracks[0] for recording in found]
     np.testing.assert_allclose(
-        np.concatenate([recording.tracks[0].x for recording in found]), whole, atol=2e-3
+        [(ego.t[0], ego.t[-1]) for ego in egos],
+        [(0.0, 5.15), (1.7, 7.8), (4.35, 8.0)],
+        atol=0.051,
     )
+    assert {ego.first_seen_s for ego in egos} == {0.0}
+    for recording, ego in zip(found, egos, strict=True):
+        assert all(signal.start[0] == ego.t[0] for signal in recording.signals)
+    config = CollectConfig(
+        min_future_s=1.5, require_obstacles=False, require_speed_change=False
+    )
+    whole, apart = (
+        collections.Counter(
+            (name, int(frame))
+            for made in (cut(recording, config) for recording in recordings)
+            for name, frame in zip(made.vehicles, made.scenes.frame, strict=True)
+        )
+        for recordings in ([only(folder)], found)
+    )
+    assert max(apart.values()) == 1
+    assert whole.total() > 40
+    assert apart == whole
 
 
 def test_parts_are_logs(folder):
@@ -190,12 +226,14 @@ def test_lanes_of_the_map(folder):
 
 def test_stop_lines_and_signs(folder):
     lanes = lanes_of(only(folder))
-    line = lanes["connector-72"].stop_line
+    line, sign = lanes["connector-72"].stop_line, lanes["63"].stop_line
+    assert line is not None
+    assert sign is not None
     np.testing.assert_allclose(line, [[62.0, 1.75], [62.0, -1.75]], atol=0.02)
     assert lanes["connector-71"].signal_ids == ("71",)
     assert not lanes["connector-71"].stop_sign
     assert lanes["63"].stop_sign
-    assert lanes["63"].stop_line[0, 0] == pytest.approx(148.5, abs=0.02)
+    assert sign[0, 0] == pytest.approx(148.5, abs=0.02)
     assert lanes["61"].stop_line is None
 
 
@@ -310,6 +348,27 @@ def test_optional_layers_and_columns(folder):
     assert lanes["connector-72"].stop_line is None
 
 
+@pytest.mark.parametrize("column", ["geometry", 'the "shape", or 1'])
+def test_names_of_geometry_columns(folder, column):
+    """A GeoPackage says of each layer which column holds its geometries."""
+    whole = lanes_of(only(folder))
+    path = folder.parents[2] / "maps" / fixture.CITY / "9.15.1915" / "map.gpkg"
+    quoted = column.replace('"', '""')
+    for layer in ("baseline_paths", "boundaries", "stop_polygons"):
+        edit(
+            path,
+            f'ALTER TABLE {layer} RENAME COLUMN geom TO "{quoted}"',
+            f"UPDATE gpkg_geometry_columns SET column_name = '{column}' "
+            f"WHERE table_name = '{layer}'",
+        )
+    found = lanes_of(only(folder))
+    assert list(found) == list(whole)
+    for name, lane in whole.items():
+        np.testing.assert_array_equal(found[name].centre, lane.centre)
+        np.testing.assert_array_equal(found[name].left_width, lane.left_width)
+        np.testing.assert_equal(found[name].stop_line, lane.stop_line)
+
+
 def blob(kind, body, *, order="<", flags=1):
     mark = b"\x01" if order == "<" else b"\x00"
     head = b"GP" + bytes([0, flags]) + struct.pack("<i", 4326)
@@ -391,6 +450,18 @@ def test_empty_geometry():
         (
             "UPDATE gpkg_geometry_columns SET srs_id = 3857",
             "srs_id: 3857: expected 4326",
+        ),
+        (
+            "UPDATE gpkg_geometry_columns SET column_name = 'shape'",
+            "stop_polygons.shape: missing",
+        ),
+        (
+            "UPDATE gpkg_geometry_columns SET column_name = 'two' || char(10) || 'x'",
+            "stop_polygons.two x: missing",
+        ),
+        (
+            "ALTER TABLE gpkg_geometry_columns DROP COLUMN column_name",
+            "gpkg_geometry_columns.column_name: missing",
         ),
         (
             "UPDATE baseline_paths SET geom = x'00'",

@@ -73,7 +73,8 @@ def test_nuplan_splits(tmp_path):
     ]
     # a copy of a log is in the group of the log
     groups = {one.name: one.group for one in read_recordings("nuplan", tmp_path)}
-    assert groups == dict.fromkeys(groups, stem) | {"other": None}
+    drive = "2021.06.14.21.57.33_veh-38"
+    assert groups == dict.fromkeys(groups, drive) | {"other": "other"}
 
 
 def test_commonroad_folders(tmp_path):

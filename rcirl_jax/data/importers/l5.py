@@ -9,11 +9,13 @@ hundreds of GB.
 Traps: times are ns since 1970; `extent` is length, width, height; ids are unique
 inside a scene only; most agents have the class "unknown" (clutter, left out by
 default); scenes that follow each other show the same vehicles, so that they
-share a group. Colours of lights are in the semantic map alone.
+share a group, also over datasets: several hold scenes of one drive. Colours of
+lights are in the semantic map alone.
 """
 
+import contextlib
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -83,7 +85,7 @@ EGO = {"length": 4.87, "width": 1.85, "centre_ahead": 0.0}  # m
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Dataset:
     path: Path
-    scenes: StructuredArray
+    scenes: np.ndarray
     frames: StructuredArray
     agents: StructuredArray
     faces: StructuredArray | None
@@ -97,63 +99,121 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
         file = find_map(folder, spec)
         if file is not None and file not in maps:
             maps = {file: SemanticMap(file, spec)}
-        scenes = dataset.scenes.read(0, dataset.scenes.size)
-        groups = _groups(folder, scenes)
-        for index, scene in enumerate(scenes):
+        others = _tables(_beside(folder, spec))
+        groups = _groups(dataset.scenes, list(others.values()))
+        for index, scene in enumerate(dataset.scenes):
             name = f"{folder.stem}-{index:06d}"
             recording = _recording(
                 dataset, name, scene, maps[file] if file else None, spec
             )
             recording = dataclasses.replace(
-                recording, group=groups[index], progress=(index + 1) / len(scenes)
+                recording, group=groups[index], progress=(index + 1) / len(groups)
             )
             yield validate_recording(recording, f"{folder}: scene {index}")
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
     """The dataset itself, or those in a folder or its scenes/."""
-    pattern = str(spec.get("pattern", "*.zarr"))
     if (path / "scenes" / ".zarray").is_file():
         return [path]
-    found = sorted({*path.glob(pattern), *path.glob(f"scenes/{pattern}")})
+    found = _datasets(path, spec)
     if not found:
         raise InputError(
-            f"{path}: no scenes/.zarray and no folder {pattern}: expected L5 data"
+            f"{path}: no scenes/.zarray and no folder {_pattern(spec)}: "
+            "expected L5 data"
         )
+    _check_met_once(_tables(found))
     return found
+
+
+def _pattern(spec: dict) -> str:
+    return str(spec.get("pattern", "*.zarr"))
+
+
+def _datasets(path: Path, spec: dict) -> list[Path]:
+    """Datasets in a folder or its scenes/."""
+    pattern = _pattern(spec)
+    return sorted({*path.glob(pattern), *path.glob(f"scenes/{pattern}")})
+
+
+def _beside(folder: Path, spec: dict) -> list[Path]:
+    """The datasets that lie beside one."""
+    above = folder.absolute().parent
+    found = _datasets(above.parent if above.name == "scenes" else above, spec)
+    return [other for other in found if other != folder.absolute()]
+
+
+def _tables(folders: Sequence[Path]) -> dict[Path, np.ndarray]:
+    """The scenes of each dataset; those of no use are named when they are opened."""
+    tables = {}
+    for folder in folders:
+        with contextlib.suppress(InputError):
+            tables[folder] = _scenes(folder)
+    return tables
+
+
+def _check_met_once(tables: Mapping[Path, np.ndarray]) -> None:
+    """No scene is in two datasets."""
+    met: dict[tuple[str, ...], Path] = {}
+    for folder, table in tables.items():
+        for index, scene in enumerate(table):
+            key = tuple(str(scene[name]) for name in ("host", "start_time", "end_time"))
+            if met.setdefault(key, folder) != folder:
+                raise InputError(
+                    f"{folder}: scene {index}: host {key[0]}, start {key[1]}: met "
+                    f"twice, also in {met[key].name}: expected once; name one dataset"
+                )
 
 
 def _open(folder: Path) -> _Dataset:
     frames = StructuredArray(folder / "frames", FRAMES)
     lights = folder / "traffic_light_faces"  # missing in format version 1
     has_lights = lights.is_dir() and FACE_INTERVAL in (frames.dtype.names or ())
-    scenes = StructuredArray(folder / "scenes", SCENES)
-    if not 0 < scenes.size <= MAX_SCENES:
-        raise InputError(
-            f"{scenes.path}: shape: {scenes.size} scenes: expected 1 to {MAX_SCENES}"
-        )
     return _Dataset(
         path=folder,
-        scenes=scenes,
+        scenes=_scenes(folder),
         frames=frames,
         agents=StructuredArray(folder / "agents", AGENTS),
         faces=StructuredArray(lights, FACES) if has_lights else None,
     )
 
 
-def _groups(folder: Path, scenes: np.ndarray) -> list[str]:
-    """Vehicle-disjoint group of each scene: a host's drive without a long pause."""
-    start, end = scenes["start_time"] * 1e-9, scenes["end_time"] * 1e-9
-    _, host = np.unique(scenes["host"], return_inverse=True)
-    order = np.lexsort((start, host))
-    new = np.ones(order.size, bool)
-    new[1:] = (np.diff(host[order]) != 0) | (
-        start[order][1:] - end[order][:-1] > SAME_DRIVE_S
+def _scenes(folder: Path) -> np.ndarray:
+    """All scenes of a dataset."""
+    scenes = StructuredArray(folder / "scenes", SCENES)
+    if not 0 < scenes.size <= MAX_SCENES:
+        raise InputError(
+            f"{scenes.path}: shape: {scenes.size} scenes: expected 1 to {MAX_SCENES}"
+        )
+    return scenes.read(0, scenes.size)
+
+
+def _groups(scenes: np.ndarray, others: Sequence[np.ndarray]) -> list[str]:
+    """Vehicle-disjoint group of each scene: a host's drive without a long pause.
+
+    Named by the host and the drive's start, so that it is the same in every dataset.
+
+    Args:
+      scenes: of one dataset.
+      others: of those beside it, which may hold earlier scenes of its drives.
+    """
+    tables = [scenes, *others]
+    hosts = np.concatenate([table["host"] for table in tables])
+    start, end = (
+        np.concatenate([table[name].astype(np.int64) for table in tables])
+        for name in ("start_time", "end_time")
     )
-    first = order[np.flatnonzero(new)][np.cumsum(new) - 1]
-    names = np.empty(order.size, object)
-    names[order] = [f"{folder.stem}-from-{index:06d}" for index in first]
-    return names.tolist()
+    _, host = np.unique(hosts, return_inverse=True)
+    order = np.lexsort((start, host))
+    pause = start[order][1:] - end[order][:-1]  # ns
+    new = np.ones(order.size, bool)
+    new[1:] = (np.diff(host[order]) != 0) | (pause > SAME_DRIVE_S * 1e9)
+    first = np.empty(order.size, np.int64)
+    first[order] = order[np.flatnonzero(new)][np.cumsum(new) - 1]
+    return [
+        f"{hosts[drive]}-from-{start[drive] // 10**9}"
+        for drive in first[: len(scenes)].tolist()
+    ]
 
 
 def _interval(where: str, bounds: np.ndarray, size: int, most: int) -> tuple[int, int]:

@@ -3,7 +3,7 @@
 Layout: docs/nuplan_schema.md of motional/nuplan-devkit (v1.0, v1.1). Tokens are
 BLOBs, times microseconds, positions UTM metres, 20 Hz. Boxes come from the table
 lidar_box, the ego from the pose of each lidar_pc. Long logs are read in windows
-of time; each is a Recording.
+of time that overlap; each is a Recording. The logs of one drive are one group.
 
 Traps: ego_pose is the rear axle's centre; its time is not the lidar_pc's, even
 when linked; velocities of boxes are a network's guess; the columns translation,
@@ -12,6 +12,7 @@ traffic lights belong to lane connectors and are inferred from the traffic.
 """
 
 import dataclasses
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,7 +21,15 @@ import numpy as np
 from rcirl_jax.data.importers.files import files_below, log_name
 from rcirl_jax.data.importers.nuplan_map import NuplanMap, find_map
 from rcirl_jax.data.importers.paths import path_lanes
-from rcirl_jax.data.importers.perception import Boxes, positive, section, tracks_of
+from rcirl_jax.data.importers.perception import (
+    WINDOW_S,
+    Boxes,
+    Windows,
+    around,
+    positive,
+    section,
+    tracks_of,
+)
 from rcirl_jax.data.importers.shapes import (
     check_coordinates,
     local_origin,
@@ -65,6 +74,8 @@ BOX = ("track_token", "timestamp", "x", "y", "yaw", "vx", "vy", "length", "width
 LIGHT_SQL = """SELECT lp.timestamp, s.lane_connector_id, s.status
   FROM traffic_light_status AS s JOIN lidar_pc AS lp
   ON s.lidar_pc_token = lp.token WHERE lp.timestamp BETWEEN ? AND ?"""
+# of a release: DATE_veh-NN_START_END, the last two s of the drive
+DRIVE = re.compile(r"(?P<drive>.+_veh-\d+)_\d+_\d+")
 MAX_TOKEN_BYTES = 64
 MAX_FRAMES = 10_000_000  # lidar_pc rows
 MAX_DURATION_S = 86400.0  # s, of one log
@@ -74,7 +85,6 @@ RATE_HZ = 20.0  # 1/s
 MAX_GAP_S = 0.55  # s without a box inside one track
 HOLD_S = 1.0  # s, a light without status keeps its state this long
 MAX_STAMP_GAP_S = 0.2  # s, between a lidar_pc and the pose linked to it
-WINDOW_S = 300.0  # s
 LIMIT_MPS = 15.65  # m/s, 35 mph
 LANE_WIDTH_M = 3.5  # m
 # Chrysler Pacifica: 4.049 m before, 1.127 m behind the rear axle
@@ -87,7 +97,7 @@ class _Log:
 
     database: Database
     name: str
-    group: str  # logs of one name may be copies of each other
+    group: str  # the drive; logs of one name may be copies of each other
     poses: np.ndarray  # [n, 10] as POSE, in the order of time
     kinds: dict[bytes, int]  # token of a track -> Kind
     road: NuplanMap | None
@@ -104,6 +114,12 @@ def own_name(file: Path) -> str:
     return file.stem
 
 
+def drive_of(name: str) -> str:
+    """The drive that a log is a part of, by its name in the release."""
+    match = DRIVE.fullmatch(name)
+    return match["drive"] if match else name
+
+
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """One Recording per log, or per window of a long one."""
     roads: dict[Path, NuplanMap] = {}
@@ -117,7 +133,7 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
             log = _Log(
                 database=database,
                 name=log_name(file, spec, own_name(file)),
-                group=own_name(file),
+                group=drive_of(own_name(file)),
                 poses=_poses(database),
                 kinds=_kinds(database),
                 road=roads[map_file] if map_file is not None else None,
@@ -168,30 +184,29 @@ def _kinds(database: Database) -> dict[bytes, int]:
 
 
 def _windows(log: _Log) -> Iterator[Recording]:
-    """Recordings of equal length, none longer than the window."""
-    clock = log.poses[:, 0]
-    window = positive(log.spec, "window_s", WINDOW_S) * 1e6  # us
-    count = max(int(np.ceil((clock[-1] - clock[0]) / window)), 1)
-    pieces = np.searchsorted(clock, np.linspace(clock[0], clock[-1], count + 1)[1:-1])
-    filled = [piece for piece in np.split(log.poses, pieces) if len(piece)]
-    for index, poses in enumerate(filled):
-        recording = dataclasses.replace(
-            _recording(log, poses), progress=(index + 1) / len(filled)
-        )
-        if len(filled) > 1:
-            # neighbouring windows show the same vehicles
-            name = f"{log.name}-{index:03d}"
-            recording = dataclasses.replace(recording, name=name, group=log.group)
-        elif log.name != log.group:
-            recording = dataclasses.replace(recording, group=log.group)
-        yield recording
+    """The whole log, or windows of equal length, none longer than allowed."""
+    clock = (log.poses[:, 0] - log.poses[0, 0]) * 1e-6  # s
+    window = positive(log.spec, "window_s", WINDOW_S)
+    count = max(int(np.ceil(clock[-1] / window)), 1)
+    if count == 1:
+        yield dataclasses.replace(_recording(log, log.poses), progress=1.0)
+        return
+    edges = np.linspace(0.0, clock[-1], count + 1)
+    edges[-1] += 1.0  # the last pose is in the last window
+    windows = Windows(log.name, log.group, MAX_GAP_S)
+    filled = np.unique(np.searchsorted(edges, clock, side="right") - 1).tolist()
+    for index in filled:
+        within = (float(edges[index]), float(edges[index + 1]))
+        low, high = around(within)
+        made = _recording(log, log.poses[(clock >= low) & (clock < high)])
+        yield windows.recording(made, index, within, (index + 1) / count)
 
 
 def _recording(log: _Log, poses: np.ndarray) -> Recording:
-    spec, path = log.spec, log.database.path
-    first, last = poses[0, 0], poses[-1, 0]
-    tracks = _ego(path, poses, spec)
-    others, notes = _others(log, first, last)
+    """Everything at the times of some poses, in seconds of the log."""
+    spec, path, start = log.spec, log.database.path, log.poses[0, 0]
+    tracks = _ego(path, poses, start, spec)
+    others, notes = _others(log, poses[0, 0], poses[-1, 0])
     tracks += others
     x = np.concatenate([track.x for track in tracks])
     y = np.concatenate([track.y for track in tracks])
@@ -212,19 +227,20 @@ def _recording(log: _Log, poses: np.ndarray) -> Recording:
         notes.append(f"no map here; {len(lanes)} lanes fitted to the longest paths")
     return Recording(
         name=log.name,
+        group=log.group,
         source=str(spec.get("source", "nuPlan")),
         licence=str(spec.get("licence", "unknown")),
         rate_hz=positive(spec, "rate_hz", RATE_HZ),
         tracks=tuple(tracks),
         lanes=lanes,
-        signals=_signals(log.database, poses[:, 0]),
+        signals=_signals(log.database, poses[:, 0], start),
         default_speed_limit=positive(spec, "speed_limit", LIMIT_MPS),
         notes=(*notes, *origin_notes(origin)),
     )
 
 
-def _ego(path: Path, poses: np.ndarray, spec: dict) -> list[Track]:
-    """The ego's box at the times of the point clouds.
+def _ego(path: Path, poses: np.ndarray, start: float, spec: dict) -> list[Track]:
+    """The ego's box at the times of the point clouds, in s since `start` [us].
 
     Poses were taken a little earlier or later: x(t) = x_p + dx/dt (t - t_p).
     """
@@ -232,7 +248,7 @@ def _ego(path: Path, poses: np.ndarray, spec: dict) -> list[Track]:
         name: number(section(spec, "ego"), name, default)
         for name, default in EGO.items()
     }
-    t, stamp = (poses[:, :2] - poses[0, 0]).T * 1e-6
+    t, stamp = (poses[:, :2] - start).T * 1e-6
     x, y, qw, qx, qy, qz, vx, vy = poses[:, 2:].T
     heading = np.arctan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz))
     norm = np.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
@@ -294,7 +310,7 @@ def _others(log: _Log, first: float, last: float) -> tuple[list[Track], list[str
     boxes = Boxes(
         ids=ids,
         names=[key.hex() for key in keys],
-        t=(t - first) * 1e-6,
+        t=(t - log.poses[0, 0]) * 1e-6,
         x=x,
         y=y,
         heading=yaw,
@@ -319,8 +335,8 @@ def _tokens(database: Database, cells: tuple) -> np.ndarray:
     return np.frombuffer(joined, f"S{size}")
 
 
-def _signals(database: Database, clock: np.ndarray) -> tuple[Signal, ...]:
-    """Lights of the lane connectors at the times [us] of a window.
+def _signals(database: Database, clock: np.ndarray, start: float) -> tuple[Signal, ...]:
+    """Lights of the lane connectors at some times [us], in s since `start` [us].
 
     Off where there is no status for a second, and where it is "unknown".
     """
@@ -347,20 +363,23 @@ def _signals(database: Database, clock: np.ndarray) -> tuple[Signal, ...]:
     for connector in np.unique(table[:, 1][np.isfinite(table[:, 1])]):
         mine = np.flatnonzero(table[:, 1] == connector)
         mine = mine[np.argsort(table[mine, 0], kind="stable")]
-        found.append(_signal(int(connector), clock, table[mine, 0], state[mine]))
-    return tuple(found)
+        found.append(_signal(str(int(connector)), clock, table[mine, 0], state[mine]))
+    return tuple(
+        dataclasses.replace(signal, start=(signal.start - start) * 1e-6)
+        for signal in found
+    )
 
 
 def _signal(
-    connector: int, clock: np.ndarray, seen: np.ndarray, state: np.ndarray
+    connector: str, clock: np.ndarray, seen: np.ndarray, state: np.ndarray
 ) -> Signal:
-    """One light as intervals, from its states seen at some times [us]."""
+    """One light as intervals [us], from its states seen at some times [us]."""
     last = np.searchsorted(seen, clock, side="right") - 1
     fresh = (last >= 0) & (clock - seen[np.maximum(last, 0)] <= HOLD_S * 1e6)
     now = np.where(fresh, state[np.maximum(last, 0)], 0)
     change = np.flatnonzero(np.diff(now, prepend=-1) != 0)
     return Signal(
-        id=str(connector),
-        start=(clock[change] - clock[0]) * 1e-6,
+        id=connector,
+        start=clock[change],
         state=tuple(STATES[k] for k in now[change]),
     )

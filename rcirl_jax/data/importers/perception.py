@@ -1,8 +1,9 @@
-"""What logs of a car's own perception share: boxes, gaps, outliers.
+"""What logs of a car's own perception share: boxes, gaps, outliers, windows.
 
 L5, nuPlan and Apollo logs hold what one car saw while it drove: boxes with an
 id, a class that may be unknown, and gaps where the view was blocked. An importer
-gathers them as `Boxes`; this module makes tracks of them.
+gathers them as `Boxes`; this module makes tracks of them. Long drives are read in
+windows that overlap.
 """
 
 import dataclasses
@@ -11,15 +12,17 @@ from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.data.importers import csv_stream
 from rcirl_jax.data.importers.tables import number, split_tracks
 from rcirl_jax.data.recording import LENGTH_RANGE_M, MAX_SPEED_MPS, WIDTH_RANGE_M
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Kind, Track
+from rcirl_jax.types import Kind, Recording, Track
 
 UNKNOWN = -1  # kind of a box whose class the log does not know
 UNKNOWN_CHOICES = ("auto", "drop", "static", "vehicle")
 STANDING_M = 1.0  # m, an unknown object that moves less than this is static
 MAX_OUTLIERS = 0.1  # share of tracks dropped as outliers; more is an error
+WINDOW_S = 300.0  # s, longest window of a drive
 MAX_SIZE_M = 200.0  # m, of a box; beyond it the file is wrong, not the tracker
 FIELDS = ("t", "x", "y", "heading", "length", "width")
 
@@ -184,3 +187,53 @@ def section(spec: dict, key: str) -> dict:
     if not isinstance(found, dict):
         raise InputError(f"source TOML: {key}: {found}: expected a table [{key}]")
     return found
+
+
+def around(within: tuple[float, float]) -> tuple[float, float]:
+    """Times [s] that a window's scenes need: with their history and future."""
+    low, high = within
+    return low - csv_stream.BEFORE_S, high + csv_stream.AFTER_S
+
+
+class Windows:
+    """Windows of one long drive: each road user has one name in all of them.
+
+    Args:
+      drive: its name.
+      group: vehicle-disjoint group of all its windows.
+      max_gap_s: a road user unseen for longer is another track.
+    """
+
+    def __init__(self, drive: str, group: str, max_gap_s: float) -> None:
+        self.drive, self.group, self.max_gap_s = drive, group, max_gap_s
+        self._starts: dict[str, list[float]] = {}  # s, first seen, and after gaps
+        self._last: dict[str, float] = {}  # s
+
+    def recording(
+        self, made: Recording, number: int, within: tuple[float, float], progress: float
+    ) -> Recording:
+        """A window as a part of the drive; windows come in the order of time.
+
+        Args:
+          made: with `around(within)`, in seconds of the drive.
+          number: of the window.
+          within: s, when its scenes begin.
+          progress: share of the input read with it.
+        """
+        for track in made.tracks:
+            user, first = track.id.partition("#")[0], float(track.t[0])
+            last = self._last.get(user, -np.inf)
+            if first - last > self.max_gap_s:
+                self._starts.setdefault(user, []).append(first)
+            self._last[user] = max(last, float(track.t[-1]))
+        piece = csv_stream.Piece(
+            recording=None,
+            number=number,
+            values={},
+            within=within,
+            fragments=self._starts,
+            progress=progress,
+        )
+        name = f"{self.drive}-{number:03d}"
+        made = dataclasses.replace(made, name=name, group=self.group)
+        return csv_stream.piece_of(self.drive, made, piece)
