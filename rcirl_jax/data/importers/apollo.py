@@ -1,7 +1,8 @@
 """Baidu Apollo's cyber records: localization, chassis, obstacles, routing.
 
 Read: `*.record`, `*.record.00000`, `.00001`, ... of Apollo 3.5 and later; the
-parts of one drive make one Recording. Messages are decoded by the descriptors in
+parts of one drive make one Recording, or one per window of a long drive, made
+while they are read. Messages are decoded by the descriptors in
 the record (modules/common_msgs in the Apollo sources: localization.proto,
 chassis.proto, perception_obstacle.proto, prediction_obstacle.proto,
 routing.proto), so no Apollo or protobuf package is needed.
@@ -10,7 +11,8 @@ Traps: a pose is that of the rear axle's centre, not of the box; the quaternion'
 zero is north, the heading's is east; messages are irregular and on clocks of
 their own, so everything is put on one uniform clock; where perception recorded
 nothing, prediction repeats its obstacles; a drive may be the planner's own, not
-a human's (a note says how much of it).
+a human's (a note says how much of it); a drive may have several destinations,
+and the ego is another track from each new one on.
 """
 
 import dataclasses
@@ -20,13 +22,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.importers.apollo_messages import (
-    MANUAL,
-    TOPICS,
-    Drive,
-    read_drive,
-)
-from rcirl_jax.data.importers.apollo_obstacles import COLUMNS
+from rcirl_jax.data.importers.apollo_held import Held, Leg
+from rcirl_jax.data.importers.apollo_messages import LOCALIZATION, MANUAL, read_drive
 from rcirl_jax.data.importers.cyber_record import (
     drive_name,
     first_parts,
@@ -34,7 +31,10 @@ from rcirl_jax.data.importers.cyber_record import (
 )
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.perception import (
+    WINDOW_S,
     Boxes,
+    Windows,
+    around,
     positive,
     section,
     tracks_of,
@@ -51,8 +51,7 @@ from rcirl_jax.types import Kind, Recording, Track
 
 RATE_HZ = 10.0  # 1/s
 MAX_GAP_S = 0.55  # s without a message inside one track
-CLOCK_TOLERANCE_S = 1.0  # s, two topics' clocks differ by more: not one clock
-MAX_DURATION_S = 86400.0  # s, of one drive
+LATE_S = 2.0  # s, messages of one time are recorded within it
 LIMIT_MPS = 29.06  # m/s, 65 mph
 LANE_WIDTH_M = 3.5  # m
 # Lincoln MKZ in Apollo's mkz_example: 3.89 m before, 1.043 m behind the rear axle
@@ -68,39 +67,74 @@ def parts(path: Path, spec: dict) -> list[Path]:
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
-    """One Recording per drive: a record file and the parts that follow it."""
+    """One Recording per drive, or per window of a long one."""
     for first in parts(path, spec):
-        drive = read_drive(parts_from(first), spec)
-        yield validate_recording(_recording(first, drive, spec), first)
+        held, found = Held(first), False
+        for recording in _windows(held, spec):
+            found = True
+            yield validate_recording(recording, first)
+        if held.is_empty:
+            raise InputError(
+                f"{first}: {LOCALIZATION}: no messages, nor obstacles: "
+                "expected at least one of them"
+            )
+        if not found:
+            raise InputError(
+                f"{first}: tracks: none on a clock of {_rate(spec):g} Hz: "
+                "expected a longer record"
+            )
 
 
-def _recording(path: Path, drive: Drive, spec: dict) -> Recording:
-    rate = positive(spec, "rate_hz", RATE_HZ)
-    key = "perception" if any(map(len, drive.perception)) else "prediction"
-    rows = {
-        "localization": _table(drive.localization, 7),
-        "chassis": _table(drive.chassis, 3),
-        key: np.concatenate([np.zeros((0, COLUMNS)), *getattr(drive, key)]),
-    }
-    _check_present(path, drive, key, len(rows[key]))
-    clocks = _clocks(rows, drive.notes)
-    seen = [clocks[name] for name in ("localization", key) if clocks[name].size]
-    start = min(float(clock.min()) for clock in seen)
-    end = max(float(clock.max()) for clock in seen)
-    if not end - start <= MAX_DURATION_S:
-        raise InputError(
-            f"{path}: timestamp_sec: {end - start:g} s from first to last: "
-            f"expected at most {MAX_DURATION_S:g} s"
-        )
-    clocks = {name: clock - start for name, clock in clocks.items()}
-    tracks = _ego(path, rows, clocks, drive, spec, rate)
-    obstacles, notes = _obstacles(path, rows[key], clocks[key], spec, rate)
+def _rate(spec: dict) -> float:
+    return positive(spec, "rate_hz", RATE_HZ)
+
+
+def _windows(held: Held, spec: dict) -> Iterator[Recording]:
+    """Recordings of a drive, each made once the messages after it are read."""
+    drive, window = drive_name(held.path), positive(spec, "window_s", WINDOW_S)
+    windows, number = Windows(drive, drive, MAX_GAP_S), 0
+
+    def within() -> tuple[float, float]:
+        return number * window, (number + 1) * window
+
+    def take(low: float, high: float) -> Iterator[Recording]:
+        made = _recording(held.view(*around((low, high))), (low, high), spec)
+        if made is not None:
+            yield windows.recording(made, number, (low, high), held.progress)
+
+    for rows in read_drive(parts_from(held.path), spec):
+        held.add(rows)
+        while held.now > around(within())[1] + LATE_S:
+            yield from take(*within())
+            number += 1
+            held.forget(around(within())[0])
+    if number == 0 and held.end <= window:
+        whole = (-math.inf, math.inf)
+        made = _recording(held.view(*whole), whole, spec)
+        yield from [] if made is None else [made]
+        return
+    while (low := number * window) < held.end:
+        is_last = held.end <= low + window
+        yield from take(low, held.end + 1.0 if is_last else low + window)
+        number += 1
+
+
+def _recording(held: Held, within: tuple[float, float], spec: dict) -> Recording | None:
+    """The tracks of the rows held, with notes on the time within; None: nothing."""
+    path, rate, notes = held.path, _rate(spec), list(held.notes)
+    tracks = _ego(held, spec, rate)
+    obstacles, obstacle_notes = _obstacles(held, spec, rate)
     tracks += obstacles
-    if not tracks:
-        raise InputError(
-            f"{path}: tracks: none on a clock of {rate:g} Hz: expected a longer record"
-        )
-    tracks, origin_note = _localise(path, tracks)
+    if not any(t.t[0] < within[1] and t.t[-1] >= within[0] for t in tracks):
+        return None
+    notes += _what_is_missing(held, within)
+    x = np.concatenate([track.x for track in tracks])
+    y = np.concatenate([track.y for track in tracks])
+    origin = local_origin(x, y)
+    tracks = [
+        dataclasses.replace(track, x=track.x - origin[0], y=track.y - origin[1])
+        for track in tracks
+    ]
     lanes = path_lanes(
         tracks,
         positive(spec, "lane_width_m", LANE_WIDTH_M),
@@ -111,80 +145,52 @@ def _recording(path: Path, drive: Drive, spec: dict) -> Recording:
         source=str(spec.get("source", "Apollo cyber record")),
         licence=str(spec.get("licence", "unknown")),
         rate_hz=rate,
-        tracks=tuple(tracks),
+        tracks=tuple(_with_destinations(tracks, held.legs(), origin)),
         lanes=lanes,
         default_speed_limit=positive(spec, "speed_limit", LIMIT_MPS),
         notes=(
-            *drive.notes,
             *notes,
-            *origin_note,
+            *obstacle_notes,
+            *origin_notes(origin),
             f"records hold no map; {len(lanes)} lanes fitted to the longest paths",
         ),
     )
 
 
-def _table(rows: list[tuple], columns: int) -> np.ndarray:
-    """[n, columns] numbers."""
-    return np.array(rows, np.float64).reshape(-1, columns)
-
-
-def _check_present(path: Path, drive: Drive, key: str, obstacles: int) -> None:
-    """Say what is missing; without any position there is nothing to read."""
-    if not drive.localization and not obstacles:
-        raise InputError(
-            f"{path}: {TOPICS['localization']}: no messages, nor obstacles: "
-            "expected at least one of them"
-        )
-    if not drive.localization:
-        drive.notes.append("no localization recorded; no ego track")
-    if not obstacles:
-        drive.notes.append("no obstacles recorded; the ego is alone")
-    elif key == "prediction":
-        drive.notes.append("no perception recorded; obstacles are those of prediction")
-    automatic = 1.0 - float(np.mean(drive.modes)) if drive.modes else 0.0
+def _what_is_missing(held: Held, within: tuple[float, float]) -> list[str]:
+    """Notes on topics without messages, and on driving that is no human's."""
+    notes, (low, high) = [], within
+    if not len(held.tables["localization"]):
+        notes.append("no localization recorded; no ego track")
+    elif not any(start < high and place for start, place in held.legs()):
+        notes.append("no routing recorded; the ego's destination is unknown")
+    if not len(held.tables[held.key]):
+        notes.append("no obstacles recorded; the ego is alone")
+    elif held.key == "prediction":
+        notes.append("no perception recorded; obstacles are those of prediction")
+    clock = held.clock("chassis")
+    is_manual = held.tables["chassis"][(clock >= low) & (clock < high), 3]
+    automatic = 1.0 - float(np.mean(is_manual)) if is_manual.size else 0.0
     if automatic > 0.0:
-        drive.notes.append(
-            f"{automatic:.0%} of the drive not in {MANUAL}: the ego is no human there"
+        notes.append(
+            f"{automatic:.0%} of the time not in {MANUAL}: the ego is no human there"
         )
+    return notes
 
 
-def _clocks(rows: dict[str, np.ndarray], notes: list[str]) -> dict[str, np.ndarray]:
-    """Time [s] of each row: of measurement, or of recording where clocks differ."""
-    offsets = [
-        float(np.median(table[:, 0] - table[:, 1]))
-        for table in rows.values()
-        if len(table)
-    ]
-    if not max(offsets) - min(offsets) <= CLOCK_TOLERANCE_S:
-        notes.append("topics stamped on different clocks; times of recording used")
-        return {name: table[:, 1] for name, table in rows.items()}
-    clocks = {}
-    for name, table in rows.items():
-        own = table[:, 2] if name != "chassis" else table[:, 0]
-        near = np.abs(own - table[:, 0]) <= CLOCK_TOLERANCE_S
-        clocks[name] = np.where(near, own, table[:, 0])
-    return clocks
-
-
-def _ego(
-    path: Path,
-    rows: dict[str, np.ndarray],
-    clocks: dict[str, np.ndarray],
-    drive: Drive,
-    spec: dict,
-    rate: float,
-) -> list[Track]:
+def _ego(held: Held, spec: dict, rate: float) -> list[Track]:
     """The recording car's box, moved from its rear axle to its centre."""
     size = {
         name: number(section(spec, "ego"), name, default)
         for name, default in EGO.items()
     }
-    t, table = clocks["localization"], rows["localization"]
+    t, table = held.clock("localization"), held.tables["localization"]
     x, y, heading, speed = table[:, 3:].T
-    where = f"{path}: {TOPICS['localization']}"
+    where = f"{held.path}: {LOCALIZATION}"
     check_coordinates(where, "pose", ("x", "y", "heading"), table[:, 3:6])
     if t.size and not np.isfinite(speed).all():
-        speed = _chassis_speed(t, clocks["chassis"], rows["chassis"][:, 2])
+        wheels = held.tables["chassis"][:, 2]
+        speed = _chassis_speed(t, held.clock("chassis"), wheels)
     ahead = size["rear_axle_to_centre"]
     boxes = _uniform(
         ids=np.zeros(t.size, np.int64),
@@ -201,10 +207,7 @@ def _ego(
         kind=np.full(t.size, int(Kind.VEHICLE)),
         rate=rate,
     )
-    tracks, _ = tracks_of(path, boxes, MAX_GAP_S)
-    return [
-        dataclasses.replace(track, destination=drive.destination) for track in tracks
-    ]
+    return tracks_of(held.path, boxes, MAX_GAP_S)[0]
 
 
 def _chassis_speed(t: np.ndarray, clock: np.ndarray, speed: np.ndarray) -> np.ndarray:
@@ -216,9 +219,8 @@ def _chassis_speed(t: np.ndarray, clock: np.ndarray, speed: np.ndarray) -> np.nd
     return np.interp(t, clock[known][order], speed[known][order])
 
 
-def _obstacles(
-    path: Path, table: np.ndarray, clock: np.ndarray, spec: dict, rate: float
-) -> tuple[list[Track], list[str]]:
+def _obstacles(held: Held, spec: dict, rate: float) -> tuple[list[Track], list[str]]:
+    path, table, clock = held.path, held.tables[held.key], held.clock(held.key)
     # a state without a position, or of the ego (negative id), is none
     seen = ~np.isnan(table[:, 4:6]).any(axis=1) & (table[:, 3] >= 0)
     lost = int(np.count_nonzero(~seen))
@@ -288,24 +290,36 @@ def _uniform(
     )
 
 
-def _localise(path: Path, tracks: list[Track]) -> tuple[list[Track], list[str]]:
-    """Tracks and destinations less a local origin (records are in UTM)."""
-    origin = local_origin(
-        np.concatenate([track.x for track in tracks]),
-        np.concatenate([track.y for track in tracks]),
-    )
-    moved = [
-        dataclasses.replace(
-            track,
-            x=track.x - origin[0],
-            y=track.y - origin[1],
-            destination=None
-            if track.destination is None
-            else (
-                track.destination[0] - float(origin[0]),
-                track.destination[1] - float(origin[1]),
-            ),
-        )
-        for track in tracks
-    ]
-    return moved, origin_notes(origin)
+def _with_destinations(
+    tracks: list[Track], legs: list[Leg], origin: np.ndarray
+) -> list[Track]:
+    """The tracks, the ego's cut where a routing set another destination.
+
+    The destination is the one valid at the time: the driver knew no later one.
+    """
+    changes = np.array([start for start, _ in legs[1:]])
+    found: list[Track] = []
+    for track in tracks:
+        user, *again = track.id.split("#")
+        if user != "ego":
+            found.append(track)
+            continue
+        which = np.searchsorted(changes, track.t + 1e-6, side="right")
+        for leg in np.unique(which).tolist():
+            name = user if leg == 0 else f"{user}-leg{leg + 1}"
+            rows, place = which == leg, legs[leg][1]
+            series = {
+                field: getattr(track, field)[rows]
+                for field in ("t", "x", "y", "heading", "speed")
+            }
+            found.append(
+                dataclasses.replace(
+                    track,
+                    id="#".join((name, *again)),
+                    destination=None
+                    if place is None
+                    else (place[0] - float(origin[0]), place[1] - float(origin[1])),
+                    **series,
+                )
+            )
+    return found

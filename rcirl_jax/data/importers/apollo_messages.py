@@ -1,12 +1,13 @@
-"""Messages of an Apollo record as rows of numbers.
+"""Messages of an Apollo drive as rows of numbers, about a minute at a time.
 
 Fields are looked up by name in the record's own descriptors; those that a
 release of Apollo lacks are NaN or 0.
 """
 
+import collections
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +20,18 @@ from rcirl_jax.data.importers.reading import reading
 from rcirl_jax.data.importers.wire import ENUM_NAME, Plan, WireError, decode
 from rcirl_jax.errors import InputError
 
+LOCALIZATION = "/apollo/localization/pose"
+# topic -> its channels, of all releases
 TOPICS = {
-    "localization": "/apollo/localization/pose",
-    "chassis": "/apollo/canbus/chassis",
-    "perception": "/apollo/perception/obstacles",
-    "prediction": "/apollo/prediction",
-    "routing": "/apollo/routing_response",
-    "routing_history": "/apollo/routing_response_history",
+    "localization": (LOCALIZATION,),
+    "chassis": ("/apollo/canbus/chassis",),
+    "perception": ("/apollo/perception/obstacles",),
+    "prediction": ("/apollo/prediction",),
+    "routing": ("/apollo/routing_response", "/apollo/raw_routing_response"),
+    "routing_history": (
+        "/apollo/routing_response_history",
+        "/apollo/raw_rrouting_response_history",  # so spelt since Apollo 9
+    ),
 }
 POINT = {"x": None, "y": None}
 STAMP = {"timestamp_sec": None}
@@ -61,103 +67,136 @@ WANTED = {
     "routing_history": ROUTE,
 }
 MANUAL = "COMPLETE_MANUAL"  # driving mode of a human driver
-MAX_ROWS = 20_000_000  # obstacle states of one drive
+MAX_ROWS = 5_000_000  # obstacle states held at once
+PIECE_S = 60.0  # s of recording after which rows are handed on
 NAN = float("nan")
 
 
 @dataclasses.dataclass(kw_only=True)
-class Drive:
-    """Rows of each topic; the first columns are times [s].
+class Rows:
+    """Rows of each topic of a piece of a drive; the first columns are times [s].
 
     Times of the header and of the recording; of the localization and of obstacles
     also that of the measurement. Then: x, y [m], heading [rad], speed [m/s] of the
-    localization; speed of the chassis; `Obstacles.rows`.
+    localization; speed of the chassis and 1 where a human drives; `Obstacles.rows`.
+    A routing is its time of recording and x, y [m] of the destination.
     """
 
     localization: list[tuple] = dataclasses.field(default_factory=list)
     chassis: list[tuple] = dataclasses.field(default_factory=list)
-    # rows of the obstacles of each part, see `Obstacles.rows`
     perception: list[np.ndarray] = dataclasses.field(default_factory=list)
     prediction: list[np.ndarray] = dataclasses.field(default_factory=list)
-    destination: tuple[float, float] | None = None
-    modes: list[bool] = dataclasses.field(default_factory=list)  # is manual
-    counts: dict[str, int] = dataclasses.field(default_factory=dict)
+    routing: list[tuple[float, float, float]] = dataclasses.field(default_factory=list)
     notes: list[str] = dataclasses.field(default_factory=list)
+    progress: float = 0.0  # share of the drive's bytes that is read
 
 
-def read_drive(parts: list[Path], spec: dict) -> Drive:
-    """All wanted messages of the files of one drive."""
-    topics = {**TOPICS, **section(spec, "topics")}
-    unknown = sorted(set(topics) - set(TOPICS))
-    if unknown:
-        raise InputError(
-            f"source TOML: topics.{unknown[0]}: unknown: expected {', '.join(TOPICS)}"
-        )
-    names = {str(topic): key for key, topic in topics.items()}
-    drive = Drive()
+def read_drive(parts: list[Path], spec: dict) -> Iterator[Rows]:
+    """All wanted messages of the files of one drive, piece by piece."""
+    topics = _topics(spec)
+    numbers: collections.Counter[str] = collections.Counter()
+    done, total = 0, sum(part.stat().st_size for part in parts if part.is_file())
     with reading(parts[0], parts) as show:
+
+        def count(size: int) -> None:
+            nonlocal done
+            done += size
+            show(size)
+
         for part in parts:
             with Record(part) as record:
-                _read_part(record, names, drive, show)
-                if not record.is_complete:
-                    drive.notes.append(f"{part.name} was never closed; read to its end")
-    return drive
+                for rows in _read_part(record, topics, numbers, count):
+                    rows.progress = min(done / max(total, 1), 1.0)
+                    yield rows
+
+
+def _topics(spec: dict) -> dict[str, str]:
+    """Channel -> topic."""
+    found = {**TOPICS, **section(spec, "topics")}
+    channels: dict[str, str] = {}
+    for topic, names in found.items():
+        if topic not in TOPICS:
+            raise InputError(
+                f"source TOML: topics.{topic}: unknown: expected {', '.join(TOPICS)}"
+            )
+        every = [names] if isinstance(names, str) else names
+        if not isinstance(every, list | tuple) or {*map(type, every)} != {str}:
+            raise InputError(
+                f"source TOML: topics.{topic}: {names}: expected a channel or a list"
+            )
+        channels |= dict.fromkeys(every, topic)
+    return channels
 
 
 def _read_part(
-    record: Record, names: dict[str, str], drive: Drive, show: Callable[[int], object]
-) -> None:
+    record: Record,
+    topics: dict[str, str],
+    numbers: collections.Counter[str],
+    show: Callable[[int], object],
+) -> Iterator[Rows]:
     plans: dict[str, Plan] = {}
     obstacles: dict[str, Obstacles] = {}
-    for topic, time, content in record.messages(names.__contains__, show):
-        key = names[topic]
-        number = drive.counts[key] = drive.counts.get(key, -1) + 1
+    rows, began = Rows(), None
+    for channel, time, content in record.messages(topics.__contains__, show):
+        began = time if began is None else began
+        if abs(time - began) > PIECE_S * 1e9:
+            yield _finished(rows, obstacles, topics)
+            rows, began = Rows(), time
+        topic = topics[channel]
         try:
-            if topic not in plans:
-                plans[topic] = _plan(record, topic, key)
-                if key in ("perception", "prediction"):
-                    where = f"{record.path}: {topic}"
-                    obstacles[topic] = Obstacles(where, plans[topic])
-            if topic in obstacles:
-                obstacles[topic].add(time * 1e-9, content)
-                _check_count(record, topic, drive, obstacles)
+            if channel not in plans:
+                plans[channel] = _plan(record, channel, topic)
+                if topic in ("perception", "prediction"):
+                    where = f"{record.path}: {channel}"
+                    obstacles[channel] = Obstacles(where, plans[channel])
+            if channel in obstacles:
+                obstacles[channel].add(time * 1e-9, content)
+                held = sum(found.count for found in obstacles.values())
+                check_held(f"{record.path}: {channel}", held)
             else:
-                _add(drive, key, time * 1e-9, decode(plans[topic], content))
+                _add(rows, topic, time * 1e-9, decode(plans[channel], content))
         except WireError as error:
             raise InputError(
-                f"{record.path}: {topic}: message {number}: {error}: "
+                f"{record.path}: {channel}: message {numbers[topic]}: {error}: "
                 "expected an Apollo message"
             ) from error
-    for topic, found in obstacles.items():
-        getattr(drive, names[topic]).append(found.rows())
-        found.count = 0
-        _check_count(record, topic, drive, obstacles)
+        numbers[topic] += 1
+    if not record.is_complete:
+        rows.notes.append(f"{record.path.name} was never closed; read to its end")
+    yield _finished(rows, obstacles, topics)
 
 
-def _plan(record: Record, topic: str, key: str) -> Plan:
-    if topic not in record.channels:
+def _finished(
+    rows: Rows, obstacles: dict[str, Obstacles], topics: dict[str, str]
+) -> Rows:
+    """The rows with the obstacles decoded until now."""
+    for channel, found in obstacles.items():
+        getattr(rows, topics[channel]).append(found.rows())
+    return rows
+
+
+def _plan(record: Record, channel: str, topic: str) -> Plan:
+    if channel not in record.channels:
         raise WireError("no descriptor before its first message")
-    message, schema = record.channels[topic]
-    return schema.plan(message, WANTED[key])
+    message, schema = record.channels[channel]
+    return schema.plan(message, WANTED[topic])
 
 
-def _check_count(
-    record: Record, topic: str, drive: Drive, obstacles: dict[str, Obstacles]
-) -> None:
-    done = [len(rows) for rows in (*drive.perception, *drive.prediction)]
-    if sum(done) + sum(found.count for found in obstacles.values()) > MAX_ROWS:
+def check_held(where: str, count: int) -> None:
+    """No more obstacle states than MAX_ROWS are held."""
+    if count > MAX_ROWS:
         raise InputError(
-            f"{record.path}: {topic}: more than {MAX_ROWS} obstacle states: "
+            f"{where}: more than {MAX_ROWS} obstacle states in a few minutes: "
             "expected one drive"
         )
 
 
-def _add(drive: Drive, key: str, time: float, found: dict[str, Any]) -> None:
+def _add(rows: Rows, topic: str, time: float, found: dict[str, Any]) -> None:
     """Append a decoded message to its topic's rows."""
     stamp = found.get("header", {}).get("timestamp_sec", 0.0)
-    if key == "localization":
+    if topic == "localization":
         pose = found.get("pose", {})
-        drive.localization.append(
+        rows.localization.append(
             (
                 stamp,
                 time,
@@ -167,14 +206,14 @@ def _add(drive: Drive, key: str, time: float, found: dict[str, Any]) -> None:
                 math.hypot(*_point(pose, "linear_velocity")),
             )
         )
-    elif key == "chassis":
-        drive.chassis.append((stamp, time, found.get("speed_mps", NAN)))
-        drive.modes.append(found.get("driving_mode", MANUAL) == MANUAL)
+    elif topic == "chassis":
+        is_manual = found.get("driving_mode", MANUAL) == MANUAL
+        rows.chassis.append((stamp, time, found.get("speed_mps", NAN), is_manual))
     else:
         waypoints = found.get("routing_request", {}).get("waypoint", [])
         x, y = _point(waypoints[-1], "pose") if waypoints else (NAN, NAN)
         if np.isfinite(x) and np.isfinite(y):
-            drive.destination = (float(x), float(y))
+            rows.routing.append((time, float(x), float(y)))
 
 
 def _point(message: dict[str, Any], field: str) -> tuple[float, float]:

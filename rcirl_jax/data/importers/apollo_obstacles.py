@@ -60,7 +60,7 @@ class Obstacles:
         self._fields = {entry[0]: (number, entry) for number, entry in below.items()}
         for name in ("id", "position", "velocity"):
             _entry(below, name)
-        self.count = 0  # obstacles decoded since it was set to 0
+        self.count = 0  # obstacles decoded since the last `rows`
         self._waiting: list[tuple[float, bytes]] = []
         self._size = 0
         self._done: list[np.ndarray] = []
@@ -73,14 +73,15 @@ class Obstacles:
             self._decode()
 
     def rows(self) -> np.ndarray:
-        """All obstacles [n, 11].
+        """Obstacles since the last call, [n, 11].
 
         Times [s] of header, recording and measurement; id; x, y [m]; heading
         [rad]; speed [m/s]; length, width [m]; kind. NaN where a position or
         velocity was not recorded.
         """
         self._decode()
-        return np.concatenate([np.zeros((0, COLUMNS)), *self._done])
+        done, self._done, self.count = self._done, [], 0
+        return np.concatenate([np.zeros((0, COLUMNS)), *done])
 
     def _decode(self) -> None:
         waiting, self._waiting, self._size = self._waiting, [], 0
