@@ -90,7 +90,7 @@ def _rate(spec: dict) -> float:
 
 
 def _windows(held: Held, spec: dict) -> Iterator[Recording]:
-    """Recordings of a drive, each made once the messages after it are read."""
+    """Recordings of a drive, each made once what it needs is read."""
     drive, window = drive_name(held.path), positive(spec, "window_s", WINDOW_S)
     windows, number = Windows(drive, drive, MAX_GAP_S), 0
 
