@@ -35,13 +35,13 @@ from rcirl_jax.data.importers.perception import (
     Boxes,
     Windows,
     around,
+    placed,
     positive,
     section,
     tracks_of,
 )
 from rcirl_jax.data.importers.shapes import (
     check_coordinates,
-    local_origin,
     origin_notes,
 )
 from rcirl_jax.data.importers.tables import number
@@ -128,13 +128,7 @@ def _recording(held: Held, within: tuple[float, float], spec: dict) -> Recording
     if not any(t.t[0] < within[1] and t.t[-1] >= within[0] for t in tracks):
         return None
     notes += _what_is_missing(held, within)
-    x = np.concatenate([track.x for track in tracks])
-    y = np.concatenate([track.y for track in tracks])
-    origin = local_origin(x, y)
-    tracks = [
-        dataclasses.replace(track, x=track.x - origin[0], y=track.y - origin[1])
-        for track in tracks
-    ]
+    _, _, origin, tracks = placed(tracks)
     lanes = path_lanes(
         tracks,
         positive(spec, "lane_width_m", LANE_WIDTH_M),

@@ -25,13 +25,13 @@ from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.perception import (
     UNKNOWN,
     Boxes,
+    placed,
     positive,
     section,
     tracks_of,
 )
 from rcirl_jax.data.importers.shapes import (
     check_coordinates,
-    local_origin,
     origin_notes,
 )
 from rcirl_jax.data.importers.tables import number
@@ -256,13 +256,7 @@ def _recording(
     ego = _ego(Path(where), frames, t, spec)
     others, notes = _others(Path(where), dataset, frames, t, spec)
     tracks = [*ego, *others]
-    x = np.concatenate([track.x for track in tracks])
-    y = np.concatenate([track.y for track in tracks])
-    origin = local_origin(x, y)
-    tracks = [
-        dataclasses.replace(track, x=track.x - origin[0], y=track.y - origin[1])
-        for track in tracks
-    ]
+    x, y, origin, tracks = placed(tracks)
     lanes, signals, map_notes = (), (), []
     if semantic_map is not None:
         lanes = semantic_map.lanes(x, y, origin)

@@ -26,13 +26,13 @@ from rcirl_jax.data.importers.perception import (
     Boxes,
     Windows,
     around,
+    placed,
     positive,
     section,
     tracks_of,
 )
 from rcirl_jax.data.importers.shapes import (
     check_coordinates,
-    local_origin,
     origin_notes,
 )
 from rcirl_jax.data.importers.sqlite_ro import Database
@@ -208,13 +208,7 @@ def _recording(log: _Log, poses: np.ndarray) -> Recording:
     tracks = _ego(path, poses, start, spec)
     others, notes = _others(log, poses[0, 0], poses[-1, 0])
     tracks += others
-    x = np.concatenate([track.x for track in tracks])
-    y = np.concatenate([track.y for track in tracks])
-    origin = local_origin(x, y)
-    tracks = [
-        dataclasses.replace(track, x=track.x - origin[0], y=track.y - origin[1])
-        for track in tracks
-    ]
+    x, y, origin, tracks = placed(tracks)
     lanes: tuple[Lane, ...] = ()
     if log.road is not None:
         lanes = log.road.lanes(x, y, origin)

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.importers import csv_stream
+from rcirl_jax.data.importers.shapes import local_origin
 from rcirl_jax.data.importers.tables import number, split_tracks
 from rcirl_jax.data.recording import LENGTH_RANGE_M, MAX_SPEED_MPS, WIDTH_RANGE_M
 from rcirl_jax.errors import InputError
@@ -237,3 +238,17 @@ class Windows:
         name = f"{self.drive}-{number:03d}"
         made = dataclasses.replace(made, name=name, group=self.group)
         return csv_stream.piece_of(self.drive, made, piece)
+
+
+def placed(
+    tracks: Sequence[Track],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Track]]:
+    """(x, y [n] m of all samples, local origin [2] m, tracks around it)."""
+    x = np.concatenate([track.x for track in tracks])
+    y = np.concatenate([track.y for track in tracks])
+    origin = local_origin(x, y)
+    moved = [
+        dataclasses.replace(track, x=track.x - origin[0], y=track.y - origin[1])
+        for track in tracks
+    ]
+    return x, y, origin, moved
