@@ -17,8 +17,10 @@ from rcirl_jax.data.lanes import LaneFrame, LaneGraph, project
 from rcirl_jax.data.lines import line_obstacles, trusted_signals
 from rcirl_jax.data.motion import (
     GRID_M,
+    Driver,
     FrameTracks,
     Motion,
+    driver_of,
     given_path,
     human_motion,
 )
@@ -30,6 +32,7 @@ VIEW_BEHIND_M = 60.0  # m, obstacles farther behind are not collected
 MAX_GHOST_POINTS = 1000  # of the line that a missing road user is taken to drive
 VIEW_BESIDE_M = 12.0  # m, obstacles farther beside are not collected
 VIEW_NUMBERS = 7  # float64 of a sample in a frame: s, l, tilt and the table of four
+BOX = ("s_lower", "s_upper", "l_lower", "l_upper", "speed", "valid")
 VIEWS_BYTES = 256 * 2**20  # of tracks kept in the frames of chains
 
 
@@ -60,6 +63,7 @@ class Collector:
         self._heading = np.concatenate([t.heading for t in self.tracks] or [[]])
         self._offset = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(int)
         self._size = np.array([(t.track.length, t.track.width) for t in self.tracks])
+        self._kind = np.array([t.track.kind for t in self.tracks], np.int32)
 
     def own_frames(self, smooth: SmoothTrack) -> slice:
         """The samples of a track that are the recording's own, not surroundings.
@@ -105,12 +109,16 @@ class Collector:
             return
         lane_ids = self.graph.match(smooth.x, smooth.y, smooth.heading)
         visited = collections.Counter(lane_ids[lane_ids != ""].tolist())
+        driven: dict[str, tuple[LaneFrame, Driver]] = {}  # by the lane of the start
         for start in starts:
-            if lane_ids[start] == "":
+            lane = str(lane_ids[start])
+            if lane == "":
                 self.dropped["off_map"] += 1
                 continue
-            chain = self.graph.chain(str(lane_ids[start]), visited)
-            row = self._scene(number, int(start), self.graph.frame(chain))
+            if lane not in driven:
+                frame = self.graph.frame(self.graph.chain(lane, visited))
+                driven[lane] = frame, driver_of(self.view(frame), number, rate)
+            row = self._scene(number, int(start), *driven[lane])
             if isinstance(row, str):
                 self.dropped[row] += 1
             else:
@@ -141,18 +149,19 @@ class Collector:
             )
         return self._views[frame.chain]
 
-    def _scene(self, number: int, start: int, frame: LaneFrame) -> dict | str:
+    def _scene(
+        self, number: int, start: int, frame: LaneFrame, driver: Driver
+    ) -> dict | str:
         """One scene, or the reason why there is none."""
-        view = self.view(frame)
-        motion = human_motion(view, number, start, self.rate, frame.length)
+        motion = human_motion(driver, start, frame.length)
         if motion is None:
             return "off_map"
-        row = self._ego_and_path(number, start, frame, view, motion)
-        self._add_obstacles(row, number, start, frame, view, motion)
-        reason = filters.reject(
-            row, motion, self.config, self._ghosts(frame, start, number)
-        )
-        if reason is not None:
+        row = self._ego_and_path(number, start, frame, driver, motion)
+        if reason := filters.reject_motion(row, motion, self.config):
+            return reason
+        self._add_obstacles(row, number, start, frame, motion)
+        ghosts = self._ghosts(frame, start, number)
+        if reason := filters.reject(row, motion, self.config, ghosts):
             return reason
         labels.add_labels(row)
         return row
@@ -162,7 +171,7 @@ class Collector:
         number: int,
         start: int,
         frame: LaneFrame,
-        view: FrameTracks,
+        driver: Driver,
         motion: Motion,
     ) -> dict:
         smooth = self.tracks[number]
@@ -177,7 +186,7 @@ class Collector:
             "ego.length": smooth.track.length,
             "ego.width": smooth.track.width,
             "path.kappa": frame.on_grid("kappa", stations),
-            "path.l": given_path(view, number, start, motion.s0, frame.length),
+            "path.l": given_path(driver, start, motion.s0, frame.length),
             "time_valid": motion.future_s + 1e-6 >= TIMES_S,
             "human.s": motion.s,
             "human.l": motion.l,
@@ -192,13 +201,7 @@ class Collector:
         return row
 
     def _add_obstacles(
-        self,
-        row: dict,
-        number: int,
-        start: int,
-        frame: LaneFrame,
-        view: FrameTracks,
-        motion: Motion,
+        self, row: dict, number: int, start: int, frame: LaneFrame, motion: Motion
     ) -> None:
         """Boxes of everybody else, stop lines and the destination; nearest N."""
         smooth = self.tracks[number]
@@ -207,31 +210,42 @@ class Collector:
             self._last >= clock[0] * self.rate
         )
         seen[number] = False
-        found = self._boxes(view, np.flatnonzero(seen), clock, motion)
         lines = line_obstacles(frame, smooth.track, self.signals, clock, motion)
-        chosen = lines + found[: NUM_OBSTACLES - len(lines)]
-        shape = (NUM_OBSTACLES, TIMES_S.size)
-        for name in ("s_lower", "s_upper", "l_lower", "l_upper", "speed"):
-            table = np.zeros(shape)
-            for slot, box in enumerate(chosen):
-                table[slot] = box[name]
+        room = NUM_OBSTACLES - len(lines)
+        others = np.flatnonzero(seen)
+        near, boxes = self._boxes(self.view(frame), others, clock, motion, room)
+        end = len(lines) + min(len(near), room)
+        for name in BOX:
+            table = np.zeros((NUM_OBSTACLES, TIMES_S.size), boxes[name].dtype)
+            for slot, line in enumerate(lines):
+                table[slot] = line[name]
+            table[len(lines) : end] = boxes[name]
             row[f"obstacles.{name}"] = table
-        valid, kind = np.zeros(shape, bool), np.zeros(NUM_OBSTACLES, np.int32)
-        for slot, box in enumerate(chosen):
-            valid[slot], kind[slot] = box["valid"], box["kind"]
-        row["obstacles.valid"], row["obstacles.kind"] = valid, kind
+        kind = np.zeros(NUM_OBSTACLES, np.int32)
+        kind[: len(lines)] = [line["kind"] for line in lines]
+        kind[len(lines) : end] = self._kind[near[:room]]
+        row["obstacles.kind"] = kind
         row["obstacles.is_recorded"] = kind != Kind.NONE
         # for the labels only: what demands the stop is not stored
-        row["obstacles.is_light"] = np.array(
-            [box.get("is_light", False) for box in chosen]
-            + [False] * (NUM_OBSTACLES - len(chosen))
-        )
-        row["num_bodies"] = len(found)
+        is_light = np.zeros(NUM_OBSTACLES, bool)
+        is_light[: len(lines)] = [line["is_light"] for line in lines]
+        row["obstacles.is_light"] = is_light
+        row["num_bodies"] = len(near)
 
     def _boxes(
-        self, view: FrameTracks, others: np.ndarray, clock: np.ndarray, motion: Motion
-    ) -> list[dict]:
-        """Other road users in view as boxes at the T times, the most relevant first."""
+        self,
+        view: FrameTracks,
+        others: np.ndarray,
+        clock: np.ndarray,
+        motion: Motion,
+        room: int,
+    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Other road users in view as boxes at the T times.
+
+        Returns:
+          (near, boxes): numbers of all tracks in view, the most relevant first, and
+          `BOX` [k, T] of the first k <= room of them.
+        """
         frames = clock * self.rate - self._first[others, None]  # [n, T]
         last = (self._last - self._first)[others, None]
         valid = (frames >= -1e-6) & (frames <= last + 1e-6)
@@ -242,26 +256,24 @@ class Collector:
         s = s - motion.s0
         seen = valid & (s > -VIEW_BEHIND_M) & (s < GRID_M[-1])
         seen &= np.abs(l - motion.l[0]) < VIEW_BESIDE_M
-        along, across = np.abs(np.cos(tilt)), np.abs(np.sin(tilt))
-        length, width = self._size[others].T[..., None]
-        half_s = 0.5 * (length * along + width * across)
-        half_l = 0.5 * (length * across + width * along)
         apart = np.abs(s - motion.v0 * TIMES_S) + 4.0 * np.abs(l - motion.l[0])
         relevance = np.min(np.where(seen, apart, np.inf), axis=1)
         order = np.argsort(relevance, kind="stable")
-        return [
-            {
-                "s_lower": s[i] - half_s[i],
-                "s_upper": s[i] + half_s[i],
-                "l_lower": l[i] - half_l[i],
-                "l_upper": l[i] + half_l[i],
-                "speed": speed[i],
-                "valid": seen[i],
-                "kind": int(self.tracks[others[i]].track.kind),
-            }
-            for i in order
-            if np.isfinite(relevance[i])
-        ]
+        order = order[np.isfinite(relevance[order])]
+        most = order[:room]
+        s, l, tilt = s[most], l[most], tilt[most]
+        along, across = np.abs(np.cos(tilt)), np.abs(np.sin(tilt))
+        length, width = self._size[others[most]].T[..., None]
+        half_s = 0.5 * (length * along + width * across)
+        half_l = 0.5 * (length * across + width * along)
+        return others[order], {
+            "s_lower": s - half_s,
+            "s_upper": s + half_s,
+            "l_lower": l - half_l,
+            "l_upper": l + half_l,
+            "speed": speed[most],
+            "valid": seen[most],
+        }
 
     def _ghosts(self, frame: LaneFrame, start: int, number: int) -> np.ndarray:
         """[g, T, 2] station and offset of road users missing from the file."""

@@ -11,9 +11,9 @@ REASONS = {
     "future_too_short": "the track ends before the minimum future (per track)",
     "off_map": "the car is on no lane, or leaves the mapped stations",
     "far_from_road": "the human departs from the drivable area",
-    "no_obstacles": "nobody else is near (the paper's first filter)",
-    "no_speed_change": "the human keeps the speed (the paper's second filter)",
     "too_noisy": "accelerations no car can do remain after smoothing",
+    "no_speed_change": "the human keeps the speed (the paper's second filter)",
+    "no_obstacles": "nobody else is near (the paper's first filter)",
     "overlapping_boxes": "the human's box overlaps another's",
     "follows_missing_car": "the leader is missing from the file",
 }
@@ -26,30 +26,43 @@ OVERLAP_M = 0.3  # m of penetration taken as more than noise
 SAME_LANE_M = 2.0  # m of lateral difference within which one follows
 
 
-def reject(
-    row: dict, motion: Motion, config: CollectConfig, ghosts: np.ndarray
-) -> str | None:
-    """The first reason to drop the scene, or None.
+def reject_motion(row: dict, motion: Motion, config: CollectConfig) -> str | None:
+    """The first reason to drop a scene for how its human drives, or None.
+
+    Asked before anybody else is looked at: where traffic flows this drops most.
 
     Args:
-      row: the scene's flat arrays.
+      row: the scene's flat arrays, without obstacles.
       motion: the human's motion.
       config: which filters are on.
-      ghosts: [g, T, 2] station and offset of cars missing from the file.
     """
     valid = row["time_valid"]
     if _far_from_road(row, motion, valid):
         return "far_from_road"
-    if config.require_obstacles and row["num_bodies"] == 0:
-        return "no_obstacles"
     if _too_noisy(motion, valid):
         return "too_noisy"
-    if _overlaps(row, motion, valid):
+    if config.require_speed_change and _keeps_speed(motion, valid):
+        return "no_speed_change"
+    return None
+
+
+def reject(
+    row: dict, motion: Motion, config: CollectConfig, ghosts: np.ndarray
+) -> str | None:
+    """The first reason to drop a scene for who else is there, or None.
+
+    Args:
+      row: the scene's flat arrays.
+      motion: the human's motion, kept by `reject_motion`.
+      config: which filters are on.
+      ghosts: [g, T, 2] station and offset of cars missing from the file.
+    """
+    if config.require_obstacles and row["num_bodies"] == 0:
+        return "no_obstacles"
+    if _overlaps(row, motion, row["time_valid"]):
         return "overlapping_boxes"
     if follows_ghost(row, motion, ghosts):
         return "follows_missing_car"
-    if config.require_speed_change and _keeps_speed(motion, valid):
-        return "no_speed_change"
     return None
 
 

@@ -57,117 +57,112 @@ def add_labels(row: dict) -> None:
     """Add `decisions` [N] and `tags` [G] to a scene's row in place."""
     blocks = blocking(row) & row["time_valid"]
     speed = np.gradient(row["human.s"], TIMES_S)
-    decisions = np.full(row["obstacles.kind"].shape, Decision.IGNORE, np.int32)
-    for slot in np.flatnonzero(row["obstacles.kind"] != Kind.NONE).tolist():
-        decisions[slot] = _decide(row, slot, blocks[slot], speed)
-    row["decisions"] = decisions
+    row["decisions"] = decisions = _decide(row, blocks, speed)
     row["tags"] = _tags(row, decisions, blocks, speed)
 
 
-def _decide(row: dict, slot: int, blocks: np.ndarray, human: np.ndarray) -> Decision:
-    """One obstacle's label; `blocks` [T] of it, `human` [T] m/s, the driver's speed."""
-    kind = row["obstacles.kind"][slot]
-    if kind in (Kind.STOP, Kind.VIRTUAL):
-        return _decide_line(row, slot, human)
-    swerve = _swerve_past(row, slot, blocks)
-    if swerve > 0.0:
-        lane = row["path.lane_left"][0] - row["path.lane_right"][0]
-        beside = _decide_beside(row, slot, human)
-        if swerve > 0.5 * lane and row["obstacles.speed"][slot, 0] > STANDING_MPS:
-            return Decision.OVERTAKE
-        if beside != Decision.IGNORE:
-            return beside
+def _decide(row: dict, blocks: np.ndarray, human: np.ndarray) -> np.ndarray:
+    """Labels [N]; `blocks` [N, T], `human` [T] m/s, the driver's speed.
+
+    The first rule that holds decides: lines; the lead that is passed by a lane
+    change; who is passed by swerving in the lane; who never blocks; the rest blocks.
+    """
+    kind = row["obstacles.kind"]
+    is_line = (kind == Kind.STOP) | (kind == Kind.VIRTUAL)
+    swerve, beside = _swerve_past(row, blocks), _decide_beside(row, human)
+    lane = row["path.lane_left"][0] - row["path.lane_right"][0]
+    moving = row["obstacles.speed"][:, 0] > STANDING_MPS
     # who is abreast of the driver and yet not hit is beside, whatever the buffer
-    if not blocks.any() or (blocks & _abreast(row, slot)).any():
-        beside = _decide_beside(row, slot, human)
-        if beside != Decision.IGNORE or not blocks.any():
-            return beside
-    return _decide_ahead(row, slot, blocks)
+    never = ~blocks.any(axis=1)
+    clear = never | (blocks & _abreast(row)).any(axis=1)
+    is_beside = beside != Decision.IGNORE
+    rules = [
+        (kind == Kind.NONE, Decision.IGNORE),
+        (is_line, _decide_line(row, human)),
+        ((swerve > max(0.5 * lane, 0.0)) & moving, Decision.OVERTAKE),
+        ((swerve > 0.0) & is_beside, beside),
+        (clear & (is_beside | never), beside),
+    ]
+    holds, labels = zip(*rules, strict=True)
+    return np.select(holds, labels, _decide_ahead(row, blocks)).astype(np.int32)
 
 
-def _decide_ahead(row: dict, slot: int, blocks: np.ndarray) -> Decision:
-    """Apollo's rules for what blocks the path: which side of the profile."""
+def _decide_ahead(row: dict, blocks: np.ndarray) -> np.ndarray:
+    """[N] Apollo's rules for what blocks the path: which side of the profile."""
     human, half = row["human.s"], 0.5 * row["ego.length"]
-    lower, upper = row["obstacles.s_lower"][slot], row["obstacles.s_upper"][slot]
-    first = int(np.argmax(blocks))
-    if lower[first] < human[first]:
-        came_from_ahead = lower[0] > human[0] + half
-        enters_later = first > 0 and row["obstacles.valid"][slot, 0]
-        passed = came_from_ahead or enters_later
-        return Decision.OVERTAKE if passed else Decision.IGNORE
-    last = len(blocks) - 1 - int(np.argmax(blocks[::-1]))
-    if human[last] > upper[last]:
-        return Decision.OVERTAKE
-    lasts = np.count_nonzero(blocks) * (TIMES_S[1] - TIMES_S[0])
+    lower, upper = row["obstacles.s_lower"], row["obstacles.s_upper"]
+    slots = np.arange(len(blocks))
+    first = np.argmax(blocks, axis=1)
+    last = blocks.shape[1] - 1 - np.argmax(blocks[:, ::-1], axis=1)
+    behind = lower[slots, first] < human[first]
+    came_from_ahead = lower[:, 0] > human[0] + half
+    enters_later = (first > 0) & row["obstacles.valid"][:, 0]
+    passed = human[last] > upper[slots, last]
+    lasts = np.count_nonzero(blocks, axis=1) * (TIMES_S[1] - TIMES_S[0])
     back = STANDING_MPS * (TIMES_S[last] - TIMES_S[first])  # m, as of standing
-    same_way = lower[last] >= lower[first] - back
-    if TIMES_S[first] <= FOLLOW_ONSET_S and lasts >= FOLLOW_DURATION_S and same_way:
-        return Decision.FOLLOW
-    return Decision.YIELD
+    same_way = lower[slots, last] >= lower[slots, first] - back
+    lead = (TIMES_S[first] <= FOLLOW_ONSET_S) & (lasts >= FOLLOW_DURATION_S) & same_way
+    return np.select(
+        [behind & (came_from_ahead | enters_later), behind, passed, lead],
+        [Decision.OVERTAKE, Decision.IGNORE, Decision.OVERTAKE, Decision.FOLLOW],
+        Decision.YIELD,
+    )
 
 
-def _swerve_past(row: dict, slot: int, blocks: np.ndarray) -> float:
-    """Lateral move [m] by which the driver got past who was in the way; else 0.
+def _swerve_past(row: dict, blocks: np.ndarray) -> np.ndarray:
+    """[N] lateral move [m] by which the driver got past who was in the way; else 0.
 
     In the way: ahead at the frame, within the lateral buffer. A lead
     that turns off is passed too, but then it moved aside, not the driver.
     """
     human, half = row["human.s"], 0.5 * row["ego.length"]
-    l = _middle(row, "l")[slot]
+    l = _middle(row, "l")
     aside = np.maximum(
-        row["obstacles.l_lower"][slot, 0] - row["human.l"][0],
-        row["human.l"][0] - row["obstacles.l_upper"][slot, 0],
+        row["obstacles.l_lower"][:, 0] - row["human.l"][0],
+        row["human.l"][0] - row["obstacles.l_upper"][:, 0],
     )
-    valid = row["obstacles.valid"][slot] & row["time_valid"]
-    ahead = row["obstacles.s_lower"][slot, 0] > human[0] + half
+    valid = row["obstacles.valid"] & row["time_valid"]
+    ahead = row["obstacles.s_lower"][:, 0] > human[0] + half
     reach = 0.5 * row["ego.width"] + LATERAL_BUFFER_M
-    if not (valid[0] and ahead and (aside < reach or blocks[0])):
-        return 0.0
+    in_the_way = valid[:, 0] & ahead & ((aside < reach) | blocks[:, 0])
     driver = np.abs(row["human.l"] - row["human.l"][0])
-    passed = valid & (human - half > row["obstacles.s_upper"][slot])
-    passed &= driver > np.abs(l - l[0])
-    return float(driver[int(np.argmax(passed))]) if passed.any() else 0.0
+    passed = valid & (human - half > row["obstacles.s_upper"])
+    passed &= driver > np.abs(l - l[:, :1])
+    past = in_the_way & passed.any(axis=1)
+    return np.where(past, driver[np.argmax(passed, axis=1)], 0.0)
 
 
-def _abreast(row: dict, slot: int) -> np.ndarray:
-    """[T] bool: beside each other, bumper to bumper."""
+def _abreast(row: dict) -> np.ndarray:
+    """[N, T] bool: beside each other, bumper to bumper."""
     human, half = row["human.s"], 0.5 * row["ego.length"]
-    before = row["obstacles.s_lower"][slot] < human + half
-    abreast = before & (row["obstacles.s_upper"][slot] > human - half)
-    return abreast & row["obstacles.valid"][slot] & row["time_valid"]
+    before = row["obstacles.s_lower"] < human + half
+    abreast = before & (row["obstacles.s_upper"] > human - half)
+    return abreast & row["obstacles.valid"] & row["time_valid"]
 
 
-def _decide_line(row: dict, slot: int, human: np.ndarray) -> Decision:
-    """STOP if the human stands before the line (or at the destination)."""
-    valid = row["time_valid"]
+def _decide_line(row: dict, human: np.ndarray) -> np.ndarray:
+    """[N] STOP if the human stands before the line (or at the destination)."""
     front = row["human.s"] + 0.5 * row["ego.length"]
-    line = row["obstacles.s_lower"][slot]
-    gap = line - front
+    gap = row["obstacles.s_lower"] - front
     near = (gap > -2.0) & (gap < STOP_REACH_M)
-    stands = (human < STANDING_MPS) & near & valid
-    return Decision.STOP if stands.any() else Decision.IGNORE
+    stands = (human < STANDING_MPS) & near & row["time_valid"]
+    return np.where(stands.any(axis=1), Decision.STOP, Decision.IGNORE)
 
 
-def _decide_beside(row: dict, slot: int, human: np.ndarray) -> Decision:
-    """NUDGE if the human drives past a slower one within the nudge range.
+def _decide_beside(row: dict, human: np.ndarray) -> np.ndarray:
+    """[N] NUDGE if the human drives past a slower one within the nudge range.
 
     Oncoming traffic is slower as well; it is met, not nudged.
     """
-    speed = row["obstacles.speed"][slot]
-    gap = (
-        np.maximum(
-            row["obstacles.l_lower"][slot] - row["human.l"],
-            row["human.l"] - row["obstacles.l_upper"][slot],
-        )
-        - 0.5 * row["ego.width"]
-    )
+    speed, human_l = row["obstacles.speed"], row["human.l"]
+    lower, upper = row["obstacles.l_lower"], row["obstacles.l_upper"]
+    gap = np.maximum(lower - human_l, human_l - upper) - 0.5 * row["ego.width"]
     slower = (human - speed > NUDGE_SPEED_MPS) & (speed > -MOVING_MPS)
-    passes = _abreast(row, slot) & (gap < NUDGE_RANGE_M) & slower
-    if not passes.any():
-        return Decision.IGNORE
-    at = int(np.argmax(passes))
-    to_left = row["human.l"][at] > _middle(row, "l")[slot, at]
-    return Decision.NUDGE_LEFT if to_left else Decision.NUDGE_RIGHT
+    passes = _abreast(row) & (gap < NUDGE_RANGE_M) & slower
+    at = np.argmax(passes, axis=1)
+    to_left = human_l[at] > _middle(row, "l")[np.arange(len(at)), at]
+    side = np.where(to_left, Decision.NUDGE_LEFT, Decision.NUDGE_RIGHT)
+    return np.where(passes.any(axis=1), side, Decision.IGNORE)
 
 
 def _cuts_in(row: dict, blocks: np.ndarray) -> bool:

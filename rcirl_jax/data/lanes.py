@@ -81,6 +81,9 @@ class LaneGraph:
         self._heading = np.concatenate(headings) if headings else np.zeros(0)
         self._points = np.concatenate(points) if points else np.zeros((0, 2))
         self._tree = KDTree(self._points) if len(self._points) else None
+        self._lengths = {
+            lane.id: float(_arc(lane.centre)[-1]) for lane in recording.lanes
+        }
         self._frames: dict[tuple[str, ...], LaneFrame] = {}
 
     def match(self, x: np.ndarray, y: np.ndarray, heading: np.ndarray) -> np.ndarray:
@@ -131,7 +134,7 @@ class LaneGraph:
             if following is None or following in ahead:
                 break
             ahead.append(following)
-            travelled += self._length(following)
+            travelled += self._lengths[following]
         behind: list[str] = []
         travelled = 0.0
         while travelled < BEHIND_M:
@@ -140,11 +143,8 @@ class LaneGraph:
             if before is None or before in ahead or before in behind:
                 break
             behind.insert(0, before)
-            travelled += self._length(before)
+            travelled += self._lengths[before]
         return tuple(behind + ahead)
-
-    def _length(self, lane_id: str) -> float:
-        return float(_arc(self.lanes[lane_id].centre)[-1])
 
     def _pick(
         self, options: list[str], here: str, seen: Mapping[str, int], forward: bool

@@ -1,5 +1,8 @@
 """Stop lines, signals and destinations as obstacles of a scene."""
 
+import dataclasses
+from collections.abc import Sequence
+
 import numpy as np
 
 from rcirl_jax.data.lanes import LaneFrame, LaneGraph, project
@@ -37,16 +40,12 @@ def trusted_signals(
     """
     by_id = {signal.id: signal for signal in recording.signals}
     counts = {name: [0, 0] for name in by_id}
+    fronts = _fronts(recording.tracks) if by_id else None
     for lane in recording.lanes:
-        if lane.stop_line is None:
-            continue
         names = [name for name in lane.signal_ids if name in by_id]
-        if not names:
+        if lane.stop_line is None or fronts is None or not names:
             continue
-        for track in recording.tracks:
-            time = _crossing(track, lane.stop_line)
-            if time is None:
-                continue
+        for time in _crossings(fronts, lane.stop_line):
             states = [signal_state(by_id[n], np.array([time]))[0] for n in names]
             # another light of the line let the driver pass
             passable = any(state in PASSABLE for state in states)
@@ -67,18 +66,42 @@ def trusted_signals(
     return trusted, notes
 
 
-def _crossing(track: Track, line: np.ndarray) -> float | None:
-    """Time at which a track's front first crosses the segment `line` [2, 2]."""
-    front_x = track.x + 0.5 * track.length * np.cos(track.heading)
-    front_y = track.y + 0.5 * track.length * np.sin(track.heading)
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Fronts:
+    """The middle of every car's front bumper, all samples track after track."""
+
+    x: np.ndarray  # [n] m
+    y: np.ndarray  # [n] m
+    t: np.ndarray  # [n] s
+    owner: np.ndarray  # [n] number of the track
+
+
+def _fronts(tracks: Sequence[Track]) -> _Fronts:
+    def join(name: str) -> np.ndarray:
+        return np.concatenate([np.zeros(0)] + [getattr(one, name) for one in tracks])
+
+    sizes, heading = [track.t.size for track in tracks], join("heading")
+    half = np.repeat([0.5 * track.length for track in tracks], sizes)
+    return _Fronts(
+        x=join("x") + half * np.cos(heading),
+        y=join("y") + half * np.sin(heading),
+        t=join("t"),
+        owner=np.repeat(np.arange(len(tracks)), sizes),
+    )
+
+
+def _crossings(fronts: _Fronts, line: np.ndarray) -> np.ndarray:
+    """Time [s] at which each front that does first crosses the segment [2, 2]."""
     (x0, y0), (x1, y1) = line
     dx, dy = x1 - x0, y1 - y0
-    side = (front_x - x0) * dy - (front_y - y0) * dx
-    along = ((front_x - x0) * dx + (front_y - y0) * dy) / max(dx * dx + dy * dy, 1e-9)
+    side = (fronts.x - x0) * dy - (fronts.y - y0) * dx
+    along = ((fronts.x - x0) * dx + (fronts.y - y0) * dy) / max(dx * dx + dy * dy, 1e-9)
     flips = (np.sign(side[1:]) != np.sign(side[:-1])) & (side[:-1] != 0.0)
     flips &= (along[1:] > 0.0) & (along[1:] < 1.0)
+    flips &= fronts.owner[1:] == fronts.owner[:-1]
     where = np.flatnonzero(flips)
-    return float(track.t[where[0] + 1]) if where.size else None
+    _, first = np.unique(fronts.owner[where], return_index=True)
+    return fronts.t[where[first] + 1]
 
 
 def line_obstacles(

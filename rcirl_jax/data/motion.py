@@ -50,51 +50,69 @@ class Motion:
     s_at_5s: float  # m
 
 
-def human_motion(
-    view: FrameTracks, number: int, start: int, rate: float, length: float
-) -> Motion | None:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Driver:
+    """One track in a chain's frame, with the derivatives that all its scenes share."""
+
+    s: np.ndarray  # [n] m
+    l: np.ndarray  # [n] m
+    speed: np.ndarray  # [n] m/s, along the line
+    acceleration: np.ndarray  # [n] m/s^2
+    l_dot: np.ndarray  # [n] m/s
+    rate: float  # Hz
+
+
+def driver_of(view: FrameTracks, number: int, rate: float) -> Driver:
+    """Track `number` of a chain's frame as a driver; rate in Hz."""
+    s, l = view.s[number], view.l[number]
+    speed = np.gradient(s) * rate
+    return Driver(
+        s=s,
+        l=l,
+        speed=speed,
+        acceleration=savgol(np.gradient(speed) * rate, rate, ACCELERATION_WINDOW_S),
+        l_dot=np.gradient(l) * rate,
+        rate=rate,
+    )
+
+
+def human_motion(driver: Driver, start: int, length: float) -> Motion | None:
     """The human's positions at TIMES_S and the ego's state at the frame.
 
     v0 and a0 are the first and second derivative of the cubic fitted by the
     smoothing filter; all later derivatives are made by `sampling.kinematics`.
-    None if the driver leaves the chain's stations.
+    None if the driver leaves the chain's stations, 0 to `length` m.
     """
-    s, l = view.s[number], view.l[number]
-    future = s[start:]
-    within = future[: int(HORIZON_S * rate) + 2]
+    future = driver.s[start:]
+    within = future[: int(HORIZON_S * driver.rate) + 2]
     if within[0] <= 0.0 or within[-1] >= length:
         return None
-    seconds = np.arange(future.size) / rate
+    seconds = np.arange(future.size) / driver.rate
     future_s = float(min(seconds[-1], HORIZON_S))
-    speed = np.gradient(s) * rate
-    acceleration = savgol(np.gradient(speed) * rate, rate, ACCELERATION_WINDOW_S)
     monotone = np.maximum.accumulate(future) - future[0]
-    v_end = max(float(np.mean(speed[-3:])), 0.0)
+    v_end = max(float(np.mean(driver.speed[-3:])), 0.0)
     beyond = np.maximum(TIMES_S - seconds[-1], 0.0)
-    v0 = max(float(speed[start]), 0.0)
-    l_dot = float(np.gradient(l)[start] * rate)
+    v0 = max(float(driver.speed[start]), 0.0)
+    l_dot = float(driver.l_dot[start])
     return Motion(
         s0=float(future[0]),
         s=np.interp(TIMES_S, seconds, monotone) + v_end * beyond,
-        l=np.interp(TIMES_S, seconds, l[start:]),
+        l=np.interp(TIMES_S, seconds, driver.l[start:]),
         v0=v0,
-        a0=float(acceleration[start]),
+        a0=float(driver.acceleration[start]),
         dl0=float(np.clip(l_dot / v0, -0.3, 0.3)) if v0 > 1.0 else 0.0,
         future_s=future_s,
         s_at_5s=float(np.interp(5.0, seconds, monotone)),
     )
 
 
-def given_path(
-    view: FrameTracks, number: int, start: int, s0: float, length: float
-) -> np.ndarray:
+def given_path(driver: Driver, start: int, s0: float, length: float) -> np.ndarray:
     """Lateral offset [P] m of the human's own path on the station grid.
 
     The whole rest of the track on the chain shapes it, not only the scene's
     horizon; after its end the last offset is kept.
     """
-    s = np.maximum.accumulate(view.s[number][start:]) - s0
-    l = view.l[number][start:]
+    s = np.maximum.accumulate(driver.s[start:]) - s0
     keep = np.concatenate([[True], np.diff(s // MIN_PATH_ADVANCE_M) > 0])
     keep &= s + s0 < length
-    return np.interp(GRID_M, s[keep], l[keep])
+    return np.interp(GRID_M, s[keep], driver.l[start:][keep])

@@ -42,27 +42,24 @@ def reference_line_from_polyline(
     points = points[keep]
     arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
     dense = np.linspace(0.0, arc[-1], max(int(arc[-1]) + 1, 5))
-    xs = np.interp(dense, arc, points[:, 0])
-    ys = np.interp(dense, arc, points[:, 1])
-    curve_x = make_smoothing_spline(dense, xs, lam=SMOOTHING)
-    curve_y = make_smoothing_spline(dense, ys, lam=SMOOTHING)
+    thinned = np.stack([np.interp(dense, arc, points[:, i]) for i in (0, 1)], axis=1)
+    curve = make_smoothing_spline(dense, thinned, lam=SMOOTHING)
     fine = np.linspace(0.0, arc[-1], 8 * dense.size)
-    length = np.concatenate(
-        [[0.0], np.cumsum(np.hypot(np.diff(curve_x(fine)), np.diff(curve_y(fine))))]
-    )
+    steps = np.hypot(*np.diff(curve(fine), axis=0).T)
+    length = np.concatenate([[0.0], np.cumsum(steps)])
     grid = np.arange(size) * step
     inside = np.minimum(grid, length[-1])
     u = np.interp(inside, length, fine)
-    dx, dy = curve_x.derivative()(u), curve_y.derivative()(u)
-    ddx, ddy = curve_x.derivative(2)(u), curve_y.derivative(2)(u)
+    (x, y), (dx, dy) = curve(u).T, curve.derivative()(u).T
+    ddx, ddy = curve.derivative(2)(u).T
     heading = np.unwrap(np.arctan2(dy, dx))
     kappa = (dx * ddy - dy * ddx) / np.maximum(np.hypot(dx, dy), 1e-9) ** 3
     beyond = grid - inside
     kappa = np.where(beyond > 0.0, 0.0, kappa)
     as_array = lambda v: jnp.asarray(np.asarray(v, np.float32))  # noqa: E731
     return ReferenceLine(
-        x=as_array(curve_x(u) + beyond * np.cos(heading)),
-        y=as_array(curve_y(u) + beyond * np.sin(heading)),
+        x=as_array(x + beyond * np.cos(heading)),
+        y=as_array(y + beyond * np.sin(heading)),
         heading=as_array(heading),
         kappa=as_array(kappa),
         step=as_array(step),

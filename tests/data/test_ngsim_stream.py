@@ -1,10 +1,10 @@
-"""The portal's CSV in pieces: the scenes of the file read at once."""
+"""Long NGSIM files in pieces: the scenes of the file read at once."""
 
 import numpy as np
 import pytest
 
-from rcirl_jax.data.cut import Part, cut, is_long
-from rcirl_jax.data.importers import parts, read_part
+from rcirl_jax.data.cut import Part, cut, digest, is_long
+from rcirl_jax.data.importers import csv_stream, parts, read_part
 from rcirl_jax.data.importing import import_parts
 from rcirl_jax.data.store import open_dataset
 from rcirl_jax.errors import InputError
@@ -99,6 +99,43 @@ def test_pieces_hold_the_scenes_of_the_whole(tmp_path, shuffled):
                     atol=2e-2,
                 )
             np.testing.assert_array_equal(scenes.decisions[row], other.decisions[at])
+
+
+def native(path, stamp=BEGIN["i-80"][0]):
+    rows = [row for n in range(12) for row in vehicle(n, 60 * n, stamp)]
+    return w.ngsim_text(path, rows)
+
+
+def test_pieces_of_the_native_text_are_those_of_the_csv(tmp_path, monkeypatch):
+    monkeypatch.setattr(csv_stream, "READ_BYTES", 10_000)
+    path = native(tmp_path / "native.txt")
+    rows = [line.split() for line in path.read_text().splitlines()]
+    table = w.ngsim_csv(tmp_path / "native.csv", rows)
+    texts, tables = read(path, 1), read(table, 1)
+    assert [made.name for made in texts] == [f"native-0000{k}" for k in range(3)]
+    assert [digest(made) for made in texts] == [digest(made) for made in tables]
+
+
+@pytest.mark.parametrize(
+    ("cell", "message"),
+    [
+        ("far", r"line 2000: Local_Y: 'far': expected a finite number"),
+        ("nan", r"line 2000: Local_Y: 'nan': expected a finite number"),
+        ("1 2", r"line 2000: 19 cells: expected 18"),
+        ("1e30", r"row 2000: Local_Y: 1e\+30: expected within"),
+        ("\xff", r"line 2000: Local_Y: '.*': expected a finite number"),
+    ],
+)
+def test_bad_cells_of_a_long_text_are_one_line(tmp_path, monkeypatch, cell, message):
+    monkeypatch.setattr(csv_stream, "READ_BYTES", 10_000)
+    path = native(tmp_path / "native.txt")
+    lines = path.read_text().splitlines()
+    cells = lines[1999].split()
+    lines[1999] = " ".join([*cells[:5], cell, *cells[6:]])
+    path.write_text("\n".join(lines), encoding="latin-1")
+    with pytest.raises(InputError, match=message) as caught:
+        read(path, 1)
+    assert "\n" not in str(caught.value)
 
 
 def test_notes_name_what_is_left_out_and_repeated(tmp_path):

@@ -21,7 +21,7 @@ import fcntl
 import importlib
 import shutil
 import tempfile
-from collections.abc import Container, Iterator
+from collections.abc import Callable, Container, Iterator
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -77,14 +77,18 @@ def is_long(path: Path, spec: dict) -> bool:
 
 @contextlib.contextmanager
 def spilled(
-    path: Path, fields: list[Field], wanted: Container[str] | None = None
+    path: Path,
+    fields: list[Field],
+    wanted: Container[str] | None = None,
+    read: Callable[[Path, list[Field]], Iterator[dict]] | None = None,
 ) -> Iterator["Spill"]:
     """The rows of a file in scratch files, removed afterwards.
 
     Args:
-      path: CSV with a header.
+      path: CSV with a header, or what `read` reads.
       fields: at least t [s], id.
       wanted: values of the `recording` field whose rows are kept; None: all.
+      read: columns of READ_BYTES at a time; default `batches`.
 
     Raises:
       InputError: unreadable text, a cell that is no finite number, or more
@@ -93,7 +97,7 @@ def spilled(
     with scratch() as folder:
         spill = Spill(path, fields, folder, wanted)
         with reading(path, [path]) as show:
-            for batch in batches(path, fields):  # one per READ_BYTES of text
+            for batch in (read or batches)(path, fields):  # each of READ_BYTES
                 spill.add(batch)
                 show(READ_BYTES)
         if not any(spill.recordings()) and not spill.blocks:
@@ -192,8 +196,15 @@ def _column(path: Path, batch: Any, field: Field, start: int) -> Any:  # noqa: A
         names = [name.lower() if field.lower else name for name in names]
         return coded.indices.to_numpy(), names
     values = found.to_numpy(zero_copy_only=False)
-    if not np.isfinite(values).all():
-        return None
+    return in_si(path, values, field, start) if np.isfinite(values).all() else None
+
+
+def in_si(path: Path, values: np.ndarray, field: Field, start: int) -> np.ndarray:
+    """A field's numbers in SI units; `start`, the row of the first, is for errors.
+
+    Raises:
+      InputError: one is beyond the field's limit.
+    """
     far = np.flatnonzero(np.abs(values) > field.limit)
     if far.size:
         raise InputError(

@@ -7,11 +7,12 @@ without lateral positions (Local_X = 0) get them from the lane number.
 
 The portal's CSV holds several sites and periods; vehicle and frame numbers
 start anew in each. Sites become Recordings of their own; where the file has
-Global_Time, it is the clock and rows may come in any order, else Frame_ID. A CSV
+Global_Time, it is the clock and rows may come in any order, else Frame_ID. A file
 longer than `long_bytes` becomes a Recording per site and minute (`csv_stream`).
 """
 
-from collections.abc import Iterator, Sequence
+import functools
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NoReturn
 
@@ -73,8 +74,8 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     for file in parts(path, spec):
         factor = unit_factor(file, "unit", spec.get("unit", "ft"), ("ft", "m"))
         is_csv = _has_header(file)
-        if is_csv and csv_stream.is_long(file, spec):
-            found = _long_recordings(file, spec, factor)
+        if csv_stream.is_long(file, spec):
+            found = _long_recordings(file, spec, factor, is_csv)
         else:
             table = _read_csv(file) if is_csv else _read_text(file, spec)
             found = _whole_recordings(file, spec, factor, table)
@@ -106,17 +107,23 @@ def _whole_recordings(
         )
 
 
-def _long_recordings(path: Path, spec: dict, factor: float) -> Iterator[Recording]:
+def _long_recordings(
+    path: Path, spec: dict, factor: float, is_csv: bool
+) -> Iterator[Recording]:
     """One Recording per site and minute; lanes and notes are the site's."""
     frame_s = number(spec, "frame_s", FRAME_S)
-    names, header = _columns(path), read_header(path)
+    if is_csv:
+        header, read = read_header(path), csv_stream.batches
+    else:
+        header, read = _text_columns(spec), functools.partial(_text_batches, spec=spec)
+    names = _columns(header)
     for name in NEEDED:
         if names[name] not in header:
             raise InputError(
                 f"{path}: column {names[name]}: missing: expected it among {header}"
             )
     stamped = names["Global_Time"] in header and _has_stamps_long(
-        path, names["Global_Time"]
+        path, names["Global_Time"], read
     )
     clock, step = ("Global_Time", 1e-3) if stamped else ("Frame_ID", frame_s)
     fields = [
@@ -146,7 +153,7 @@ def _long_recordings(path: Path, spec: dict, factor: float) -> Iterator[Recordin
         return _complete({**values, "frame": np.round(values["t"] / frame_s)})
 
     gap_s = (MAX_FRAME_GAP + 0.5) * frame_s
-    with csv_stream.spilled(path, fields, spec.get("locations")) as spill:
+    with csv_stream.spilled(path, fields, spec.get("locations"), read) as spill:
         sites = spill.recordings()
         known, left_out = _known_sites(path, sites, spec)
         for site in known:
@@ -191,10 +198,14 @@ def _has_stamps(stamps: np.ndarray) -> bool:
     return bool(stamps.min() > 0.0 and stamps.max() > stamps.min())
 
 
-def _has_stamps_long(path: Path, column: str) -> bool:
+def _has_stamps_long(
+    path: Path,
+    column: str,
+    read: Callable[[Path, list[csv_stream.Field]], Iterator[dict]],
+) -> bool:
     """`_has_stamps` of a whole file, read a few MiB at a time."""
     field = csv_stream.Field(name="stamps", column=column)
-    found = (batch["stamps"] for batch in csv_stream.batches(path, [field]))
+    found = (batch["stamps"] for batch in read(path, [field]))
     ends = [(part.min(), part.max()) for part in found if part.size]
     return bool(ends) and _has_stamps(np.array(ends))
 
@@ -221,14 +232,14 @@ def _has_header(path: Path) -> bool:
     return "," in first
 
 
-def _columns(path: Path) -> dict[str, str]:
-    """Column -> its name in the CSV's header, without regard to case."""
-    actual = {name.lower(): name for name in read_header(path)}
+def _columns(header: Sequence[str]) -> dict[str, str]:
+    """Column -> its name in the header, without regard to case."""
+    actual = {name.lower(): name for name in header}
     return {n: actual.get(n.lower(), n) for n in (*NEEDED, *OPTIONAL, SITE)}
 
 
 def _read_csv(path: Path) -> Table:
-    names = _columns(path)
+    names = _columns(read_header(path))
     found = read_table(
         path,
         [names[n] for n in NEEDED],
@@ -247,19 +258,49 @@ def _complete(table: Table) -> Table:
     return {name: table.get(name, none) for name in (*NEEDED, *OPTIONAL)} | table
 
 
-def _read_text(path: Path, spec: dict) -> Table:
+def _text_columns(spec: dict) -> list[str]:
+    """Column order of the native text."""
     columns = spec.get("columns", [])
     for name in NEEDED:
         if name not in columns:
             raise InputError(f"source TOML: columns: {name}: missing: expected it")
+    return columns
+
+
+def _read_text(path: Path, spec: dict) -> Table:
+    columns = _text_columns(spec)
     wanted = [name for name in (*NEEDED, *OPTIONAL) if name in columns]
-    try:
-        values = load_rows(path, "f8", None)
-    except (ValueError, UnicodeError):
-        values = np.zeros((0, 0))
-    if values.shape[1:] != (len(columns),) or not np.isfinite(values).all():
-        _find_bad_line(path, columns)
+    values = np.concatenate(list(_text_rows(path, columns)))
     return _complete({name: values[:, columns.index(name)] for name in wanted})
+
+
+def _text_batches(
+    path: Path, fields: list[csv_stream.Field], spec: dict
+) -> Iterator[Table]:
+    """`csv_stream.batches` of the native text."""
+    columns, start = _text_columns(spec), 1
+    for values in _text_rows(path, columns):
+        found = {field.name: values[:, columns.index(field.column)] for field in fields}
+        yield {
+            field.name: csv_stream.in_si(path, found[field.name], field, start)
+            for field in fields
+        }
+        start += len(values)
+
+
+def _text_rows(path: Path, columns: list[str]) -> Iterator[np.ndarray]:
+    """Numbers [n, columns] of the native text, READ_BYTES at a time."""
+    try:
+        with path.open(encoding="utf-8-sig") as handle:
+            while lines := handle.readlines(csv_stream.READ_BYTES):
+                values = load_rows(lines, "f8", None)
+                if len(values) and values.shape[1] != len(columns):
+                    raise ValueError(values.shape)
+                if not np.isfinite(values).all():
+                    raise ValueError(values)
+                yield values.reshape(-1, len(columns))
+    except ValueError:  # also of bytes that are no text
+        _find_bad_line(path, columns)
 
 
 def _find_bad_line(path: Path, columns: list[str]) -> NoReturn:
