@@ -5,12 +5,15 @@ the left normal of the interpolated heading. Both directions use this one map,
 so the round trip is exact up to the Newton iteration's end.
 """
 
+import functools
+
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.interpolate import make_smoothing_spline
+from scipy.spatial import KDTree
 
 NEWTON_STEPS = 6  # iterations of to_frenet after the nearest grid point
 CHUNK = 1024  # points per device call of project_points
@@ -111,7 +114,12 @@ def to_frenet(
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """(s, l) m of a point: nearest grid point, then Newton on t(s).(p - r(s))."""
     nearest = jnp.argmin((line.x - x) ** 2 + (line.y - y) ** 2)
+    return _from_nearest(line, x, y, nearest)
 
+
+def _from_nearest(
+    line: ReferenceLine, x: jax.Array, y: jax.Array, nearest: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     def improve(s: jax.Array, _: None) -> tuple[jax.Array, None]:
         rx, ry, heading = _curve(line, s)
         along = (x - rx) * jnp.cos(heading) + (y - ry) * jnp.sin(heading)
@@ -124,20 +132,34 @@ def to_frenet(
     return s, (y - ry) * jnp.cos(heading) - (x - rx) * jnp.sin(heading)
 
 
-_project = jax.jit(jax.vmap(to_frenet, in_axes=(None, 0, 0)))
+@jax.jit
+@functools.partial(jax.vmap, in_axes=(None, 0, 0, 0))
+def _project(
+    line: ReferenceLine, x: jax.Array, y: jax.Array, near: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """`to_frenet` where the nearest grid point is `near` or a neighbour of it."""
+    some = jnp.clip(near + jnp.arange(-1, 2), 0, line.x.shape[0] - 1)
+    distance = (line.x[some] - x) ** 2 + (line.y[some] - y) ** 2
+    return _from_nearest(line, x, y, some[jnp.argmin(distance)])
 
 
 def project_points(
     line: ReferenceLine, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(s, l) of points [q, 2], numpy; padded so that few sizes compile."""
+    """`to_frenet` of points [q, 2], numpy; padded so that few sizes compile.
+
+    A tree finds the nearest grid points: trying all takes most of an import's time.
+    """
+    points = np.asarray(points, np.float32)
+    tree = KDTree(np.stack([line.x, line.y], axis=1))
+    near = np.asarray(tree.query(points)[1])
     parts = []
     for start in range(0, len(points), CHUNK):
         taken = points[start : start + CHUNK]
         size = SMALL_CHUNK if len(taken) <= SMALL_CHUNK else CHUNK
-        block = np.zeros((size, 2), np.float32)
-        block[: len(taken)] = taken
-        s, l = _project(line, block[:, 0], block[:, 1])
+        block, index = np.zeros((size, 2), np.float32), np.zeros(size, np.int32)
+        block[: len(taken)], index[: len(taken)] = taken, near[start : start + CHUNK]
+        s, l = _project(line, block[:, 0], block[:, 1], index)
         parts.append(np.stack([s, l])[:, : len(taken)])
     both = np.concatenate(parts, axis=1) if parts else np.zeros((2, 0), np.float32)
     return both[0], both[1]

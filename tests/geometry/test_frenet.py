@@ -49,6 +49,29 @@ def test_round_trip_within_a_centimetre(kind, noise):
     np.testing.assert_allclose(l_back, l, atol=0.01)
 
 
+@pytest.mark.parametrize("legs_apart", [8.0, 30.0])
+def test_many_points_are_projected_as_one_by_one_also_between_legs(legs_apart):
+    """A hairpin: the nearest grid point may be on either leg."""
+    turn = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 40)[1:-1]
+    out = np.arange(0.0, 100.0, 2.0)
+    bend = 100.0 + 0.5 * legs_apart * np.cos(turn)
+    x = np.concatenate([out, bend, out[::-1]])
+    y = (
+        0.5
+        * legs_apart
+        * np.concatenate([np.full(out.shape, -1.0), np.sin(turn), np.ones(out.shape)])
+    )
+    line = line_of(np.stack([x, y], axis=1), size=512)
+    rng = np.random.default_rng(0)
+    points = rng.uniform((-20.0, -40.0), (130.0, 40.0), (3000, 2)).astype(np.float32)
+    points = np.concatenate([points, np.stack([line.x, line.y], axis=1)])
+    alone = jax.jit(jax.vmap(to_frenet, in_axes=(None, 0, 0)))
+    for one, other in zip(
+        project_points(line, points), alone(line, *points.T), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
+
+
 @given(seed=st.integers(0, 1000))
 def test_round_trip_from_cartesian(seed):
     line = line_of(curve("s_curve"))
