@@ -201,6 +201,12 @@ class Track:
     destination: tuple[float, float] | None = None
     # s, when the log first saw it, where that is before t[0] (a log read in pieces)
     seen_since: float | None = None
+    # s, (begin, end) of times at which no human drove, or nobody knows who did
+    automated: tuple[tuple[float, float], ...] = ()
+
+    def is_human(self, begin: float, end: float) -> bool:
+        """Whether a human drove all the time from begin to end [s]."""
+        return not any(low < end and begin < high for low, high in self.automated)
 
     @property
     def first_seen_s(self) -> float:

@@ -26,7 +26,7 @@ from rcirl_jax.data.motion import (
 )
 from rcirl_jax.data.smoothing import SmoothTrack, smooth_track
 from rcirl_jax.types import Ghost, Kind, Recording
-from rcirl_jax.units import NUM_OBSTACLES, TIMES_S
+from rcirl_jax.units import HORIZON_S, NUM_OBSTACLES, TIMES_S
 
 VIEW_BEHIND_M = 60.0  # m, obstacles farther behind are not collected
 MAX_GHOST_POINTS = 1000  # of the line that a missing road user is taken to drive
@@ -114,6 +114,10 @@ class Collector:
             lane = str(lane_ids[start])
             if lane == "":
                 self.dropped["off_map"] += 1
+                continue
+            now = (smooth.first_frame + start) / rate
+            if not smooth.track.is_human(now - config.min_history_s, now + HORIZON_S):
+                self.dropped["not_human"] += 1
                 continue
             if lane not in driven:
                 frame = self.graph.frame(self.graph.chain(lane, visited))

@@ -10,6 +10,7 @@ from rcirl_jax.units import DT_S
 REASONS = {
     "future_too_short": "the track ends before the minimum future (per track)",
     "off_map": "the car is on no lane, or leaves the mapped stations",
+    "not_human": "an automation drives, or nobody knows who does",
     "far_from_road": "the human departs from the drivable area",
     "too_noisy": "accelerations no car can do remain after smoothing",
     "no_speed_change": "the human keeps the speed (the paper's second filter)",

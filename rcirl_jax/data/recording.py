@@ -103,6 +103,9 @@ def _check_track(name: str, track: Track) -> None:
         raise InputError(
             f"{where}: t: {after:g} s after {before:g} s: expected increasing times"
         )
+    for low, high in track.automated:
+        if not low <= high:
+            raise InputError(f"{where}: automated: {low} to {high} s: expected a span")
     static = track.kind == Kind.STATIC
     for field, moving in (("length", LENGTH_RANGE_M), ("width", WIDTH_RANGE_M)):
         low, high = STATIC_RANGE_M if static else moving

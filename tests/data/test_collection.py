@@ -104,6 +104,26 @@ def decision_of(row, at_s):
     return Decision(row["decisions"][slot])
 
 
+def test_only_what_a_human_drove_is_a_demonstration():
+    """One second of automation takes the scenes whose history or future it is in."""
+    tracks = [
+        car("ego", speeding_up(0.0), seconds=30.0, automated=((15.0, 16.0),)),
+        car("other", speeding_up(40.0), seconds=30.0),
+    ]
+    collector = Collector(recording(*tracks, lanes=road(length=900.0)), NO_FILTER)
+    rows = list(collector.scenes())
+    starts = {n: {r["frame"] for r in rows if r["track"] == n} for n in (0, 1)}
+    gone = starts[1] - starts[0]
+    history = NO_FILTER.min_history_s
+    assert starts[0] < starts[1]
+    assert gone == {k for k in starts[1] if 7.0 < 0.1 * k < 16.0 + history}
+    assert collector.dropped["not_human"] == len(gone)
+    with pytest.raises(InputError, match=r"automated: 3\.0 to 2\.0 s: expected a span"):
+        validate_recording(
+            recording(car("ego", speeding_up(0.0), automated=((3.0, 2.0),)))
+        )
+
+
 def test_smoothing_keeps_cubics_and_cuts_noise():
     t = np.arange(0.0, 10.0, 0.1)
     cubic = 3.0 + 2.0 * t - 0.4 * t**2 + 0.03 * t**3
@@ -322,6 +342,9 @@ def hard(name):
     table = {
         "future_too_short": recording(car("ego", speeding_up(20.0), seconds=3.0)),
         "off_map": recording(car("ego", speeding_up(20.0), y=40.0), lead),
+        "not_human": recording(
+            car("ego", speeding_up(20.0), automated=((5.0, 12.0),)), lead
+        ),
         "far_from_road": recording(
             car("ego", speeding_up(20.0), y=lambda t: 9.0 * smooth_step(t, 1, 5)), lead
         ),

@@ -146,9 +146,13 @@ def test_speed_of_the_chassis(tmp_path):
 
 def test_drive_of_the_planner_is_noted(tmp_path):
     messages = ego_only()
-    messages += [(CHASSIS, 0.1, fixture.chassis(0.1, manual=k > 2)) for k in range(4)]
-    notes = only(tmp_path, messages).notes
-    assert any("75% of the time not in COMPLETE_MANUAL" in note for note in notes)
+    messages += [
+        (CHASSIS, 0.5 * k, fixture.chassis(0.5 * k, manual=k == 2)) for k in range(4)
+    ]
+    made = only(tmp_path, messages)
+    assert any("75% of the time not in COMPLETE_MANUAL" in note for note in made.notes)
+    (ego,) = made.tracks
+    np.testing.assert_allclose(ego.automated, [(0.0, 1.0), (1.5, np.inf)])
 
 
 def test_obstacles_without_localization(tmp_path):

@@ -121,6 +121,15 @@ def test_every_type_has_a_kind_and_a_size():
     assert set(source["kinds"]) | {"AV"} == set(source["sizes"])
 
 
+@pytest.mark.parametrize(("driver", "found"), [("automated", {"AV"}), ("human", set())])
+def test_the_recording_car_is_no_human_unless_said(tmp_path, driver, found):
+    source = spec(
+        tmp_path, 'recording_car = "automated"', f'recording_car = "{driver}"'
+    )
+    recording = only(w.write(tmp_path).input, source)
+    assert {t.id for t in recording.tracks if t.automated} == found
+
+
 @pytest.mark.parametrize("nested", ["", "scenario", "split"])
 def test_input_is_a_file_a_folder_or_a_split(tmp_path, nested):
     parquet_file, _ = w.write_scenario(tmp_path / "train")

@@ -105,6 +105,19 @@ def test_far_coordinates_get_a_local_origin(tmp_path):
     assert any("local origin" in note for note in recording.notes)
 
 
+def test_rows_of_an_automation_are_no_demonstration(tmp_path):
+    """A column of the log says who drives; also in a log read in pieces."""
+    rows = [[*row, 1 if 10 <= k % 40 < 25 else 0] for k, row in enumerate(w.csv_rows())]
+    path = log(tmp_path, rows, (*w.CSV_COLUMNS, "auto"))
+    columns = {**{name: name for name in w.CSV_COLUMNS}, "automated": "auto"}
+    source = w.csv_spec(tmp_path / "s.toml", columns=columns)
+    whole = only(path, source)
+    source.write_text("long_bytes = 1\n" + source.read_text())
+    for made in (whole, only(path, source)):
+        for track in made.tracks:
+            np.testing.assert_allclose(track.automated, [(1.0, 2.5)])
+
+
 @pytest.mark.parametrize(("point", "shift"), [("front", -2.25), ("rear", 2.25)])
 def test_reference_point(tmp_path, point, shift):
     source = w.csv_spec(tmp_path / "s.toml")

@@ -285,7 +285,15 @@ def test_options(folder):
     assert (ego.length, ego.width) == (5.0, 2.0)
     assert ego.x[0] == pytest.approx(fixture.CENTRE[0] + 1.2)
     assert recording.default_speed_limit == 9.0
-    for bad in ({"ego": 3}, {"unknown": "x"}, {"rate_hz": 0}, {"min_probability": "x"}):
+    assert not ego.is_human(0.0, 1.0)
+    assert track(read(folder, recording_car="human")[0], "ego").is_human(0.0, 1.0)
+    for bad in (
+        {"recording_car": "x"},
+        {"ego": 3},
+        {"unknown": "x"},
+        {"rate_hz": 0},
+        {"min_probability": "x"},
+    ):
         with pytest.raises(InputError, match="source TOML"):
             read(folder, **bad)
 

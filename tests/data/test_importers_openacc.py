@@ -101,29 +101,27 @@ def test_car_without_positions_is_noted(tmp_path):
     assert "car 2 has no positions; left out" in recording.notes
 
 
-def test_only_human_drivers(tmp_path):
-    """Car 2 is driven by its ACC; car 3 by a human, but behind car 2."""
-    source = spec(tmp_path, 'drivers = "human"\n')
-    recording = only(drive(tmp_path), source)
-    assert [track.id for track in recording.tracks] == ["1-Audi(A8)"]
-    columns = fixture.table(fixture.cars(), ("Human", "Human", "ACC"))
-    recording = only(drive(tmp_path, columns), source)
-    assert [track.id for track in recording.tracks] == ["1-Audi(A8)", "2-Audi(A6)"]
+def test_only_human_drives_are_demonstrations(tmp_path):
+    """Car 2 is driven by its ACC: surroundings of cars 1 and 3."""
+    recording = only(drive(tmp_path))
+    assert [track.id for track in recording.tracks][:3] == [
+        "1-Audi(A8)",
+        "2-Audi(A6)",
+        "3-BMW(X5)",
+    ]
+    spans = [track.automated for track in recording.tracks[:3]]
+    assert spans == [(), ((0.0, np.inf),), ()]
+    all_of_them = only(drive(tmp_path), spec(tmp_path, 'drivers = "all"\n'))
+    assert not any(track.automated for track in all_of_them.tracks)
 
 
-@pytest.mark.parametrize(("flag", "cars"), [("0", 4), ("1", 0), ("2", 0), ("", 0)])
-def test_without_a_driver_column_the_flag_decides(tmp_path, flag, cars):
+@pytest.mark.parametrize("flag", ["0", "1", "2", ""])
+def test_without_a_driver_column_the_flag_decides(tmp_path, flag):
     columns = fixture.table(fixture.cars(), ())
     meta = [line.replace("ACC,2", f"ACC,{flag}") for line in fixture.META]
-    path = drive(tmp_path, columns, meta=meta)
-    source = spec(tmp_path, 'drivers = "human"\n')
-    if cars:
-        assert len(only(path, source).tracks) == cars
-    else:
-        with pytest.raises(InputError, match=r"tracks: none .*drivers = human"):
-            read(path, source)
-    recording = only(path)
+    recording = only(drive(tmp_path, columns, meta=meta))
     assert len(recording.tracks) == 4
+    assert {track.is_human(0.0, 40.0) for track in recording.tracks} == {flag == "0"}
     share = "100 %" if flag == "0" else "unknown"
     assert any(f"driven by a human: car 1 {share}" in n for n in recording.notes)
 
@@ -131,10 +129,14 @@ def test_without_a_driver_column_the_flag_decides(tmp_path, flag, cars):
 def test_who_drives_may_change(tmp_path):
     columns = fixture.table(fixture.cars(), ("Human", "Human", "Human"))
     columns["Driver2"] = ["Human"] * 150 + ["ACC"] * 100 + [""] * 50 + ["human"] * 100
-    source = spec(tmp_path, 'drivers = "human"\n')
-    tracks = {t.id: t for t in only(drive(tmp_path, columns), source).tracks}
-    assert tracks["2-Audi(A6)"].t.size == 146
-    assert tracks["2-Audi(A6)#2"].t.size == 100
+    tracks = {t.id: t for t in only(drive(tmp_path, columns)).tracks}
+    assert tracks["2-Audi(A6)"].automated == ((15.0, 30.0),)
+    blocks = read(drive(tmp_path, columns), spec(tmp_path, "block_s = 10.0\n"))
+    inside = [
+        next(t.is_human(0.0, 9.0) for t in made.tracks if t.id.startswith("2"))
+        for made in blocks
+    ]
+    assert inside == [True, False, False, True]
 
 
 def test_long_drives_are_cut(tmp_path):

@@ -187,6 +187,8 @@ def test_stamps_may_start_anywhere_and_be_packed(tmp_path):
 def test_notes_on_the_recording_car_and_shared_vehicles(tmp_path):
     recording = only(w.write(tmp_path).input)
     assert "the recording car is track 2314" in recording.notes
+    automated = {track.id for track in recording.tracks if track.automated}
+    assert automated == {"2314"}
     assert any("training_20s" in note for note in recording.notes)
 
 

@@ -44,7 +44,7 @@ from rcirl_jax.data.importers.shapes import (
     check_coordinates,
     origin_notes,
 )
-from rcirl_jax.data.importers.tables import number
+from rcirl_jax.data.importers.tables import number, spans_of
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Recording, Track
@@ -201,7 +201,16 @@ def _ego(held: Held, spec: dict, rate: float) -> list[Track]:
         kind=np.full(t.size, int(Kind.VEHICLE)),
         rate=rate,
     )
-    return tracks_of(held.path, boxes, MAX_GAP_S)[0]
+    automated = _automated(held)
+    found, _ = tracks_of(held.path, boxes, MAX_GAP_S)
+    return [dataclasses.replace(track, automated=automated) for track in found]
+
+
+def _automated(held: Held) -> tuple[tuple[float, float], ...]:
+    """When the chassis was in another mode than a human driver's."""
+    clock, is_manual = held.clock("chassis"), held.tables["chassis"][:, 3]
+    order = np.argsort(clock, kind="stable")
+    return spans_of(clock[order], is_manual[order] == 0.0)
 
 
 def _chassis_speed(t: np.ndarray, clock: np.ndarray, speed: np.ndarray) -> np.ndarray:

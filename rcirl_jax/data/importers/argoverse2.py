@@ -19,7 +19,12 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.importers.argoverse2_map import read_lanes
-from rcirl_jax.data.importers.options import kind_of, patterns, section
+from rcirl_jax.data.importers.options import (
+    kind_of,
+    patterns,
+    recording_car,
+    section,
+)
 from rcirl_jax.data.importers.parquet import read_columns
 from rcirl_jax.data.importers.perception import (
     has_possible_speed,
@@ -54,6 +59,7 @@ STEP_S = 0.1  # s, the data set's sampling interval
 STEP_TOLERANCE = 0.01  # relative; the stamps are rounded to 64 ns
 MAX_STEPS = 10_000  # 1000 s; a scenario has 110
 MAX_CATEGORY = 3  # 0 fragment, 1 unscored, 2 scored, 3 focal track
+RECORDER = "AV"  # id of the recording car
 FRAGMENT = 0
 MAX_GAP_STEPS = 5.5  # missing steps bridged inside one track
 LIMIT_MPS = 15.65  # m/s, 35 mph
@@ -211,6 +217,7 @@ def _track(
         y=table["position_y"][rows],
         heading=table["heading"][rows],
         speed=np.hypot(table["velocity_x"][rows], table["velocity_y"][rows]),
+        automated=recording_car(spec) if name.partition("#")[0] == RECORDER else (),
     )
 
 

@@ -30,6 +30,7 @@ from rcirl_jax.data.importers.tables import (
     number,
     read_header,
     read_table,
+    spans_of,
     split_tracks,
     travel_heading,
     unit_factor,
@@ -39,7 +40,10 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Recording, Track
 
 NEEDED = ("t", "id", "x", "y")
-OPTIONAL = ("heading", "speed", "length", "width", "kind", "lane", "recording")
+OPTIONAL = (
+    *("heading", "speed", "length", "width"),
+    *("kind", "lane", "recording", "automated"),
+)
 TEXT = ("id", "kind", "lane", "recording")
 LENGTH_UNITS = ("m", "ft")
 ALLOWED_UNITS = {
@@ -270,6 +274,7 @@ def _track(name: str, table: LogTable, rows: np.ndarray, spec: dict) -> Track:
         y=y + ahead * np.sin(heading),
         heading=heading,
         speed=speed,
+        automated=spans_of(t, values.get("automated", np.zeros(t.size)) != 0.0),
     )
 
 

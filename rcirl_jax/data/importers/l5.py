@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.importers.l5_map import LightFaces, SemanticMap, find_map
+from rcirl_jax.data.importers.options import recording_car
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.perception import (
     UNKNOWN,
@@ -311,7 +312,9 @@ def _ego(path: Path, frames: np.ndarray, t: np.ndarray, spec: dict) -> list[Trac
         width=np.full(t.size, size["width"]),
         kind=np.full(t.size, int(Kind.VEHICLE)),
     )
-    return tracks_of(path, boxes, MAX_GAP_S)[0]
+    automated = recording_car(spec)
+    found, _ = tracks_of(path, boxes, MAX_GAP_S)
+    return [dataclasses.replace(track, automated=automated) for track in found]
 
 
 def _others(

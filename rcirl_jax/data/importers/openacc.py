@@ -34,6 +34,7 @@ from rcirl_jax.data.importers.sparse_tables import (
 )
 from rcirl_jax.data.importers.tables import (
     number,
+    spans_of,
     split_tracks,
     travel_heading,
 )
@@ -54,7 +55,7 @@ ORIGIN_STEP_M = 1000.0  # m, local origins are multiples of it
 LANE_WIDTH_M = 3.5  # m, of lanes fitted to paths
 LIMIT_MPS = 36.11  # m/s, 130 km/h, the motorways and tracks driven
 SIZE_M = (4.6, 1.85)  # m, a car whose model is not listed
-DRIVERS = ("all", "human")
+DRIVERS = ("human", "all")  # whose drives are demonstrations
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -182,7 +183,9 @@ def _blocks(drive: _Drive, spec: dict) -> Iterator[Recording]:
         )
     part = np.zeros(drive.t.size) if block_s == 0.0 else drive.t // block_s
     numbers = np.unique(part)
-    kept = _kept(drive, spec)
+    if (wanted := spec.get("drivers", DRIVERS[0])) not in DRIVERS:
+        raise InputError(f"source TOML: drivers: {wanted}: expected one of {DRIVERS}")
+    kept = _located_samples(drive)
     notes = [*drive.notes, *_driver_notes(drive), *_spacing_notes(drive, spec)]
     found = False
     for block in numbers:
@@ -196,29 +199,23 @@ def _blocks(drive: _Drive, spec: dict) -> Iterator[Recording]:
         yield _recording(name, drive, tracks, spec, rate, [*notes, *origin])
     if not found:
         raise InputError(
-            f"{drive.path}: tracks: none with Speed and E, N (drivers = "
-            f"{spec.get('drivers', 'all')}): expected at least one car"
+            f"{drive.path}: tracks: none with Speed and E, N: expected at least one car"
         )
 
 
-def _kept(drive: _Drive, spec: dict) -> dict[int, np.ndarray]:
-    """Car -> [n] bool, samples used.
+def _located_samples(drive: _Drive) -> dict[int, np.ndarray]:
+    """Car -> [n] bool, samples with a place and a speed."""
+    return {
+        car: np.all([np.isfinite(values[f]) for f in ("x", "y", "Speed")], axis=0)
+        for car, values in drive.cars.items()
+    }
 
-    With drivers = "human": those of cars steered and braked by a human, as long
-    as the car ahead is kept too (else the scene would lack it).
-    """
-    wanted = spec.get("drivers", DRIVERS[0])
-    if wanted not in DRIVERS:
-        raise InputError(f"source TOML: drivers: {wanted}: expected one of {DRIVERS}")
-    kept: dict[int, np.ndarray] = {}
-    for car, values in drive.cars.items():
-        known = np.all([np.isfinite(values[f]) for f in ("x", "y", "Speed")], axis=0)
-        if wanted == "human":
-            known &= _modes(drive, car) == "human"
-            ahead = kept.get(car - 1)
-            known &= True if ahead is None else ahead
-        kept[car] = known
-    return kept
+
+def _automated(drive: _Drive, car: int, t0: float, spec: dict) -> tuple:
+    """`Track.automated`, in s since t0 of the drive; `drivers = "all"`: none."""
+    if spec.get("drivers", DRIVERS[0]) == "all":
+        return ()
+    return spans_of(drive.t - t0, _modes(drive, car) != "human")
 
 
 def _modes(drive: _Drive, car: int) -> np.ndarray:
@@ -333,6 +330,7 @@ def _tracks(
                     y=y,
                     heading=travel_heading(t, x, y),
                     speed=drive.cars[car]["Speed"][inside],
+                    automated=_automated(drive, car, t0, spec),
                 )
             )
     note = f"local origin at E = {origin[0]:.0f} m, N = {origin[1]:.0f} m"

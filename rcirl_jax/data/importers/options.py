@@ -1,5 +1,6 @@
 """Options of a source TOML, checked where an importer takes them."""
 
+import math
 from collections.abc import Mapping, Sequence
 
 from rcirl_jax.errors import InputError
@@ -14,6 +15,17 @@ def section(spec: Mapping, key: str) -> dict:
     if not isinstance(value, dict):
         raise InputError(f"source TOML: {key}: {value}: expected a table [{key}]")
     return value
+
+
+def recording_car(spec: Mapping) -> tuple[tuple[float, float], ...]:
+    """`Track.automated` of the car that recorded, by the option `recording_car`."""
+    spans = {"human": (), "automated": ((-math.inf, math.inf),)}
+    driver = spec.get("recording_car", "automated")
+    if driver not in spans:
+        raise InputError(
+            f"source TOML: recording_car: {driver}: expected one of {', '.join(spans)}"
+        )
+    return spans[driver]
 
 
 def choices(

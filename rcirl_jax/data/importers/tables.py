@@ -244,6 +244,16 @@ def split_tracks(
     return tracks
 
 
+def spans_of(t: np.ndarray, holds: np.ndarray) -> tuple[tuple[float, float], ...]:
+    """(begin, end) of each run of samples [n] that hold, up to the next that does not.
+
+    The last run has no end. t [n] s increases.
+    """
+    flips = np.flatnonzero(np.diff(np.concatenate([[False], holds])))
+    ends = [*t[flips].tolist(), np.inf]
+    return tuple(zip(ends[:-1:2], ends[1::2], strict=False))
+
+
 def travel_heading(
     t: np.ndarray, x: np.ndarray, y: np.ndarray, standing: float = 0.0
 ) -> np.ndarray:

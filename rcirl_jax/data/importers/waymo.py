@@ -20,7 +20,12 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.importers.options import kind_of, patterns, section
+from rcirl_jax.data.importers.options import (
+    kind_of,
+    patterns,
+    recording_car,
+    section,
+)
 from rcirl_jax.data.importers.perception import without_outliers
 from rcirl_jax.data.importers.shapes import (
     check_coordinates,
@@ -118,7 +123,7 @@ def _read_scenario(where: str, default: str, data: bytes, spec: dict) -> Recordi
     )
     states.values[X] -= origin[0]
     states.values[Y] -= origin[1]
-    tracks, notes = _tracks(record, heads, states, spec)
+    tracks, notes = _tracks(record, heads, states, spec, _recorder(scenario, heads))
     lanes, signals, map_notes = read_map(
         record,
         scenario.spans(MAP_FEATURES),
@@ -193,19 +198,28 @@ def _usual_limit(lanes: tuple[Lane, ...], spec: dict) -> float:
     )
 
 
+def _recorder(scenario: Fields, heads: list[Fields]) -> int | None:
+    """Number of the recording car's track."""
+    row = scenario.whole(SDC_TRACK_INDEX, -1)
+    return row if 0 <= row < len(heads) else None
+
+
 def _scenario_notes(
     scenario: Fields, heads: list[Fields], t: np.ndarray
 ) -> Iterator[str]:
-    index = scenario.whole(SDC_TRACK_INDEX, -1)
-    if 0 <= index < len(heads):
-        yield f"the recording car is track {heads[index].whole(TRACK_ID)}"
+    if (row := _recorder(scenario, heads)) is not None:
+        yield f"the recording car is track {heads[row].whole(TRACK_ID)}"
     low, high = WINDOW_S
     if low < t[-1] < high:
         yield "9.1 s windows of one drive may share vehicles; training_20s has none"
 
 
 def _tracks(
-    record: Record, heads: list[Fields], states: _States, spec: dict
+    record: Record,
+    heads: list[Fields],
+    states: _States,
+    spec: dict,
+    recorder: int | None,
 ) -> tuple[tuple[Track, ...], list[str]]:
     tracks: list[Track] = []
     unset = unseen = 0
@@ -218,7 +232,9 @@ def _tracks(
             unset += 1
         else:
             name = str(head.whole(TRACK_ID))
-            tracks += _pieces(record, name, kind, states, row, seen, spec)
+            found = _pieces(record, name, kind, states, row, seen, spec)
+            automated = recording_car(spec) if row == recorder else ()
+            tracks += [dataclasses.replace(t, automated=automated) for t in found]
     tracks, notes = without_outliers(tracks)
     if unset:
         notes.append(f"{unset} tracks of unset type left out")
