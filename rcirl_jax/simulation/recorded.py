@@ -75,7 +75,8 @@ def drives(
     for number, track in enumerate(recording.tracks):
         if track.kind != Kind.VEHICLE:
             continue
-        drive = cutter.drive(number)
+        by_human = track.is_human(float(track.t[0]), float(track.t[-1]))
+        drive = cutter.drive(number) if by_human else "not_human"
         if not isinstance(drive, str):
             yield drive
         elif dropped is not None:

@@ -5,6 +5,7 @@ import dataclasses
 from rcirl_jax.errors import InputError
 
 REASONS = {
+    "not_human": "an automation drives for a time, or nobody knows who does",
     "too_short": "less than the minimum duration on the mapped lanes",
     "off_map": "the car is never on a lane",
     "standing": "the car gets less far than the minimum progress",

@@ -269,7 +269,9 @@ def test_what_is_not_suitable_is_counted():
     jumps = at_speed(10.0, 8.0, start=400.0)
     jumps[40:] += 3.0
     noisy = car("noisy", jumps, 3.5)
-    tracks = [short, stands, away, walker, first, inside, noisy]
+    machine = car("machine", at_speed(10.0, 8.0, start=600.0))
+    machine = dataclasses.replace(machine, automated=((7.0, 9.0),))
+    tracks = [short, stands, away, walker, first, inside, noisy, machine]
     dropped = collections.Counter()
     with pytest.raises(InputError, match="expected at least one"):
         recorded_cases([straight(tracks)], RAW, dropped)
@@ -279,6 +281,7 @@ def test_what_is_not_suitable_is_counted():
         "off_map": 1,
         "overlapping_boxes": 2,
         "too_noisy": 1,
+        "not_human": 1,
     }
     assert dropped.keys() <= REASONS.keys()
     kept = dataclasses.replace(RAW, drop_overlaps=False)
