@@ -115,8 +115,9 @@ class Collector:
             if lane == "":
                 self.dropped["off_map"] += 1
                 continue
-            now = (smooth.first_frame + start) / rate
-            if not smooth.track.is_human(now - config.min_history_s, now + HORIZON_S):
+            now, track = (smooth.first_frame + start) / rate, smooth.track
+            end = min(now + HORIZON_S, float(track.t[-1]))
+            if not track.is_human(now - config.min_history_s, end):
                 self.dropped["not_human"] += 1
                 continue
             if lane not in driven:

@@ -103,9 +103,7 @@ def _check_track(name: str, track: Track) -> None:
         raise InputError(
             f"{where}: t: {after:g} s after {before:g} s: expected increasing times"
         )
-    for low, high in track.automated:
-        if not low <= high:
-            raise InputError(f"{where}: automated: {low} to {high} s: expected a span")
+    _check_driver(where, track)
     static = track.kind == Kind.STATIC
     for field, moving in (("length", LENGTH_RANGE_M), ("width", WIDTH_RANGE_M)):
         low, high = STATIC_RANGE_M if static else moving
@@ -119,6 +117,15 @@ def _check_track(name: str, track: Track) -> None:
         raise InputError(
             f"{where}: speed: {fastest:g} m/s: expected below {MAX_SPEED_MPS:g} m/s"
         )
+
+
+def _check_driver(where: str, track: Track) -> None:
+    place = track.destination
+    if place is not None and not np.isfinite(place).all():
+        raise InputError(f"{where}: destination: {place}: expected finite numbers")
+    for low, high in track.automated:
+        if not low <= high:
+            raise InputError(f"{where}: automated: {low} to {high} s: expected a span")
 
 
 def check_span(where: str, field: str, values: np.ndarray) -> None:

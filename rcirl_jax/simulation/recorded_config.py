@@ -5,10 +5,10 @@ import dataclasses
 from rcirl_jax.errors import InputError
 
 REASONS = {
-    "not_human": "an automation drives for a time, or nobody knows who does",
     "too_short": "less than the minimum duration on the mapped lanes",
     "off_map": "the car is never on a lane",
     "standing": "the car gets less far than the minimum progress",
+    "not_human": "an automation drives for a time, or nobody knows who does",
     "too_noisy": "accelerations no car can do remain after smoothing",
     "overlapping_boxes": "the human's box overlaps another's in the log",
     "follows_missing_car": "the leader is missing from the file",

@@ -97,13 +97,16 @@ class Cutter:
         if s[count] - s[0] < config.min_progress_m:
             return "standing"
         at = first + np.arange(int(seconds / STEP_S + 1e-6) + 1) * STEP_S * self.rate
+        clock = at + smooth.first_frame
+        if not smooth.track.is_human(clock[0] / self.rate, clock[-1] / self.rate):
+            return "not_human"
         return _Way(
             number=number,
             lane_id=visited[0],
             frame=frame,
             view=view,
             at=at,
-            clock=at + smooth.first_frame,
+            clock=clock,
         )
 
     def _build(self, way: _Way) -> Drive | str:

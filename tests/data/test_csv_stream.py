@@ -201,7 +201,10 @@ import resource, sys
 from pathlib import Path
 from rcirl_jax.data.cut import Part
 from rcirl_jax.data.importers import parts
+from rcirl_jax.data.importers import csv_stream
 from rcirl_jax.data.importers.csv_stream import Field, pieces
+# what is held is reached in the shorter log already
+csv_stream.READ_BYTES, csv_stream.BUFFER_BYTES = 2**18, 2**20
 fields = [Field(name=n, column=n, text=n == "id") for n in ("t", "id", "x", "y")]
 found = pieces(Path(sys.argv[1]), fields, 0.55)
 rows = sum(len(piece.values["t"]) for piece in found)

@@ -152,7 +152,26 @@ def test_drive_of_the_planner_is_noted(tmp_path):
     made = only(tmp_path, messages)
     assert any("75% of the time not in COMPLETE_MANUAL" in note for note in made.notes)
     (ego,) = made.tracks
-    np.testing.assert_allclose(ego.automated, [(0.0, 1.0), (1.5, np.inf)])
+    np.testing.assert_allclose(ego.automated, [(-np.inf, 1.0), (1.5, np.inf)])
+
+
+def test_of_a_silent_chassis_nobody_knows_the_mode(tmp_path):
+    """Also in windows that hold none of its messages; before the first: the first."""
+    for manual, spans in ((True, [(1.2, np.inf)]), (False, [(-np.inf, np.inf)])):
+        folder = tmp_path / str(manual)
+        folder.mkdir()
+        messages = [*ego_only(), (CHASSIS, 0.2, fixture.chassis(0.2, manual=manual))]
+        (ego,) = only(folder, messages).tracks
+        np.testing.assert_allclose(ego.automated, spans)
+    (ego,) = only(tmp_path, ego_only()).tracks
+    assert ego.automated == ()
+    messages = [(CHASSIS, 0.0, fixture.chassis(0.0, manual=False)), *long_drive(60.0)]
+    folder = tmp_path / "long"
+    folder.mkdir()
+    found = read(write(folder / "a.record.00000", messages), window_s=20.0)
+    egos = [one for made in found for one in made.tracks if one.id.startswith("ego")]
+    assert len(found) == len(egos) == 3
+    assert not any(ego.is_human(ego.t[0], ego.t[-1]) for ego in egos)
 
 
 def test_obstacles_without_localization(tmp_path):

@@ -269,7 +269,7 @@ def test_what_is_not_suitable_is_counted():
     jumps = at_speed(10.0, 8.0, start=400.0)
     jumps[40:] += 3.0
     noisy = car("noisy", jumps, 3.5)
-    machine = car("machine", at_speed(10.0, 8.0, start=600.0))
+    machine = car("machine", at_speed(10.0, 8.0, start=100.0))
     machine = dataclasses.replace(machine, automated=((7.0, 9.0),))
     tracks = [short, stands, away, walker, first, inside, noisy, machine]
     dropped = collections.Counter()

@@ -55,6 +55,7 @@ LATE_S = 2.0  # s, messages of one time are recorded within it
 LIMIT_MPS = 29.06  # m/s, 65 mph
 LANE_WIDTH_M = 3.5  # m
 # Lincoln MKZ in Apollo's mkz_example: 3.89 m before, 1.043 m behind the rear axle
+MAX_SILENCE_S = 1.0  # s without a chassis message, after which nobody knows
 EGO = {"length": 4.933, "width": 2.11, "rear_axle_to_centre": 1.4235}  # m
 NAN = float("nan")
 
@@ -207,10 +208,20 @@ def _ego(held: Held, spec: dict, rate: float) -> list[Track]:
 
 
 def _automated(held: Held) -> tuple[tuple[float, float], ...]:
-    """When the chassis was in another mode than a human driver's."""
-    clock, is_manual = held.clock("chassis"), held.tables["chassis"][:, 3]
+    """When the chassis was in another mode than a human driver's, or silent.
+
+    The first mode was in force before; without a chassis channel a human drives.
+    """
+    clock, mode = held.clock("chassis"), held.tables["chassis"][:, 3]
+    if not clock.size:
+        return ()
     order = np.argsort(clock, kind="stable")
-    return spans_of(clock[order], is_manual[order] == 0.0)
+    clock, other = clock[order], mode[order] == 0.0
+    silent = np.diff(clock, append=np.inf) > MAX_SILENCE_S
+    return spans_of(
+        np.concatenate([[-np.inf], clock, clock[silent] + MAX_SILENCE_S]),
+        np.concatenate([other[:1], other, np.ones(np.count_nonzero(silent), bool)]),
+    )
 
 
 def _chassis_speed(t: np.ndarray, clock: np.ndarray, speed: np.ndarray) -> np.ndarray:

@@ -127,10 +127,7 @@ class Held:
     def view(self, low: float, high: float) -> "Held":
         """Rows from one time [s] to before another, and the notes since the last."""
         view = copy.copy(self)
-        view.tables = {}
-        for name, table in self.tables.items():
-            clock = self.clock(name)
-            view.tables[name] = table[(clock >= low) & (clock < high)]
+        view.tables = {name: self._rows(name, low, high) for name in self.tables}
         self.notes = []
         if self._since == -math.inf and not self._is_one_clock:
             note = "topics stamped on different clocks; times of recording used"
@@ -139,11 +136,17 @@ class Held:
 
     def forget(self, before: float) -> None:
         """Drop rows from before a time [s]; the clock is settled from then on."""
-        self.tables = {
-            name: table[self.clock(name) >= before]
-            for name, table in self.tables.items()
-        }
+        self.tables = {name: self._rows(name, before) for name in self.tables}
         self._since = before
+
+    def _rows(self, name: str, low: float, high: float = math.inf) -> np.ndarray:
+        """Rows between two times [s], the chassis' in force at the first included."""
+        clock = self.clock(name)
+        kept = (clock >= low) & (clock < high)
+        before = np.where(clock < low, clock, -np.inf)
+        if name == "chassis" and (clock < low).any():
+            kept[np.argmax(before)] = True
+        return self.tables[name][kept]
 
     def legs(self) -> list[Leg]:
         """Destinations in the order of time, the first valid from the beginning.

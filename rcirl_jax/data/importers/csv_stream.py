@@ -1,4 +1,4 @@
-"""Long CSV logs: imported in pieces of a minute, in bounded memory.
+"""Long logs of rows: imported in pieces of a minute, in bounded memory.
 
 The file is read once, a few MiB at a time, and its rows are written to scratch
 files by recording and minute. Each minute is then a Recording of its own, with
@@ -12,7 +12,7 @@ order is found inside a minute only. Rows may come in any
 order of road users; scratch space of about the file's size is needed. An importer
 that needs something of the whole recording finds it in `Spill.minutes`.
 
-pyarrow reads the text (extra `[logs]`).
+pyarrow reads a CSV (extra `[logs]`); an importer may bring a reader of its own.
 """
 
 import contextlib
@@ -101,7 +101,7 @@ def spilled(
                 spill.add(batch)
                 show(READ_BYTES)
         if not any(spill.recordings()) and not spill.blocks:
-            raise InputError(f"{path}: rows: none: expected rows below the header")
+            raise InputError(f"{path}: rows: none: expected one at least")
         spill.flush()
         yield spill
 

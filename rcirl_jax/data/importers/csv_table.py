@@ -44,6 +44,7 @@ OPTIONAL = (
     *("heading", "speed", "length", "width"),
     *("kind", "lane", "recording", "automated"),
 )
+EXPECTED = (*NEEDED, "automated")  # errors where they are named and not there
 TEXT = ("id", "kind", "lane", "recording")
 LENGTH_UNITS = ("m", "ft")
 ALLOWED_UNITS = {
@@ -110,7 +111,7 @@ def _long_recordings(path: Path, spec: dict) -> Iterator[Recording]:
                     limit=LIMITS.get(field, np.inf),
                 )
             )
-        elif field in NEEDED:
+        elif field in EXPECTED:
             raise InputError(
                 f"{path}: column {column}: missing: expected it among {header}"
             )
@@ -156,7 +157,7 @@ def _read_tables(path: Path, spec: dict) -> Iterator[tuple[str, LogTable]]:
     columns = _columns(path, spec)
     raw = read_table(
         path,
-        [columns[field][0] for field in NEEDED],
+        [columns[field][0] for field in EXPECTED if field in columns],
         [columns[field][0] for field in OPTIONAL if field in columns],
         [columns[field][0] for field in TEXT if field in columns],
     )

@@ -142,7 +142,7 @@ def _long_recordings(
             if names[n] in header
         ),
     ]
-    if names[SITE] in header:
+    if is_csv and names[SITE] in header:
         fields.append(
             csv_stream.Field(
                 name="recording", column=names[SITE], text=True, lower=True
@@ -261,6 +261,8 @@ def _complete(table: Table) -> Table:
 def _text_columns(spec: dict) -> list[str]:
     """Column order of the native text."""
     columns = spec.get("columns", [])
+    if not isinstance(columns, list) or not all(isinstance(n, str) for n in columns):
+        raise InputError(f"source TOML: columns: {columns}: expected a list of names")
     for name in NEEDED:
         if name not in columns:
             raise InputError(f"source TOML: columns: {name}: missing: expected it")

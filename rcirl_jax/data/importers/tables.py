@@ -247,10 +247,11 @@ def split_tracks(
 def spans_of(t: np.ndarray, holds: np.ndarray) -> tuple[tuple[float, float], ...]:
     """(begin, end) of each run of samples [n] that hold, up to the next that does not.
 
-    The last run has no end. t [n] s increases.
+    The last run has no end. t [n] s in any order.
     """
-    flips = np.flatnonzero(np.diff(np.concatenate([[False], holds])))
-    ends = [*t[flips].tolist(), np.inf]
+    order = np.argsort(t, kind="stable")
+    flips = np.flatnonzero(np.diff(np.concatenate([[False], holds[order]])))
+    ends = [*t[order][flips].tolist(), np.inf]
     return tuple(zip(ends[:-1:2], ends[1::2], strict=False))
 
 
