@@ -15,6 +15,7 @@ import dataclasses
 
 import jax
 import numpy as np
+import tqdm
 from absl import flags
 
 from experiments.common import run, whole_numbers
@@ -64,6 +65,9 @@ def main() -> None:
     runs = seeds(least=2)
     same = {name: np.zeros((len(runs), len(counts))) for name in ROWS}
     regret = {name: np.zeros((len(runs), len(counts))) for name in ROWS}
+    bar = tqdm.tqdm(
+        total=len(runs) * len(counts) * len(ROWS), desc="train", unit="learner"
+    )
     for i, seed in enumerate(runs):
         hidden = hidden_reward(1000 + seed, normaliser_of(train, config))
         shown = experts(train, hidden, _TEMPERATURE.value, seed)
@@ -76,6 +80,8 @@ def main() -> None:
                 (learned,) = train_learner(part, own, [seed])
                 found = agreement(test, hidden, learned)
                 same[name][i, j], regret[name][i, j] = found
+                bar.update()
+    bar.close()
     made, axes = figure(1, 2, 11.0, 4.2)
     curves_panel(axes[0, 0], counts, same)
     label(axes[0, 0], "same choice as the hidden reward", "scenes", "share, 2 s.e.")
