@@ -202,7 +202,9 @@ class Track:
     # s, when the log first saw it, where that is before t[0] (a log read in pieces)
     seen_since: float | None = None
     # s, (begin, end) of times at which no human drove, or nobody knows who did
-    automated: tuple[tuple[float, float], ...] = ()
+    automated: tuple[tuple[float, float], ...] = dataclasses.field(
+        default=(), metadata={"in_digest": "unless default"}
+    )
 
     def is_human(self, begin: float, end: float) -> bool:
         """Whether a human drove all the time from begin to end [s]."""

@@ -184,3 +184,7 @@ def test_what_is_read_after_a_recording_is_no_part_of_it():
     assert digest(recording()) == DIGEST
     assert digest(recording(progress=0.3)) == DIGEST
     assert digest(dataclasses.replace(recording(), rate_hz=5.0)) != DIGEST
+    first, *others = recording().tracks
+    by_machine = dataclasses.replace(first, automated=((0.0, 1.0),))
+    changed = dataclasses.replace(recording(), tracks=(by_machine, *others))
+    assert digest(changed) != DIGEST
