@@ -29,6 +29,7 @@ from rcirl_jax.data.importers.cyber_record import (
     first_parts,
     parts_from,
 )
+from rcirl_jax.data.importers.options import positive, section
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.perception import (
     WINDOW_S,
@@ -36,8 +37,6 @@ from rcirl_jax.data.importers.perception import (
     Windows,
     around,
     placed,
-    positive,
-    section,
     tracks_of,
 )
 from rcirl_jax.data.importers.shapes import (
@@ -54,8 +53,8 @@ MAX_GAP_S = 0.55  # s without a message inside one track
 LATE_S = 2.0  # s, messages of one time are recorded within it
 LIMIT_MPS = 29.06  # m/s, 65 mph
 LANE_WIDTH_M = 3.5  # m
-# Lincoln MKZ in Apollo's mkz_example: 3.89 m before, 1.043 m behind the rear axle
 MAX_SILENCE_S = 1.0  # s without a chassis message, after which nobody knows
+# Lincoln MKZ in Apollo's mkz_example: 3.89 m before, 1.043 m behind the rear axle
 EGO = {"length": 4.933, "width": 2.11, "rear_axle_to_centre": 1.4235}  # m
 NAN = float("nan")
 

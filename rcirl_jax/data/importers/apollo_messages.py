@@ -15,7 +15,7 @@ import numpy as np
 
 from rcirl_jax.data.importers.apollo_obstacles import Obstacles
 from rcirl_jax.data.importers.cyber_record import Record
-from rcirl_jax.data.importers.perception import section
+from rcirl_jax.data.importers.options import section
 from rcirl_jax.data.importers.reading import reading
 from rcirl_jax.data.importers.wire import ENUM_NAME, Plan, WireError, decode
 from rcirl_jax.errors import InputError

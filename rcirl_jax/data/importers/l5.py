@@ -21,14 +21,12 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.importers.l5_map import LightFaces, SemanticMap, find_map
-from rcirl_jax.data.importers.options import recording_car
+from rcirl_jax.data.importers.options import positive, recording_car, section
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.perception import (
     UNKNOWN,
     Boxes,
     placed,
-    positive,
-    section,
     tracks_of,
 )
 from rcirl_jax.data.importers.shapes import (

@@ -20,6 +20,7 @@ import numpy as np
 
 from rcirl_jax.data.importers.files import files_below, log_name
 from rcirl_jax.data.importers.nuplan_map import NuplanMap, find_map
+from rcirl_jax.data.importers.options import positive, section
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.perception import (
     WINDOW_S,
@@ -27,8 +28,6 @@ from rcirl_jax.data.importers.perception import (
     Windows,
     around,
     placed,
-    positive,
-    section,
     tracks_of,
 )
 from rcirl_jax.data.importers.shapes import (

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 
+from rcirl_jax.data.importers.tables import number
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind
 
@@ -14,6 +15,14 @@ def section(spec: Mapping, key: str) -> dict:
     value = spec.get(key, {})
     if not isinstance(value, dict):
         raise InputError(f"source TOML: {key}: {value}: expected a table [{key}]")
+    return value
+
+
+def positive(spec: Mapping, key: str, default: float) -> float:
+    """A number > 0 from a source TOML."""
+    value = number(spec, key, default)
+    if value <= 0.0:
+        raise InputError(f"source TOML: {key}: {value:g}: expected > 0")
     return value
 
 

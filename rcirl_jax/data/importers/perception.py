@@ -14,7 +14,7 @@ import numpy as np
 
 from rcirl_jax.data.importers import csv_stream
 from rcirl_jax.data.importers.shapes import local_origin
-from rcirl_jax.data.importers.tables import number, split_tracks
+from rcirl_jax.data.importers.tables import split_tracks
 from rcirl_jax.data.recording import LENGTH_RANGE_M, MAX_SPEED_MPS, WIDTH_RANGE_M
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Recording, Track
@@ -172,22 +172,6 @@ def _is_possible(track: Track) -> bool:
         return True
     sizes = ((track.length, LENGTH_RANGE_M), (track.width, WIDTH_RANGE_M))
     return all(low <= size <= high for size, (low, high) in sizes)
-
-
-def positive(spec: dict, key: str, default: float) -> float:
-    """A number > 0 from a source TOML."""
-    value = number(spec, key, default)
-    if value <= 0.0:
-        raise InputError(f"source TOML: {key}: {value:g}: expected > 0")
-    return value
-
-
-def section(spec: dict, key: str) -> dict:
-    """A table of a source TOML; empty where there is none."""
-    found = spec.get(key, {})
-    if not isinstance(found, dict):
-        raise InputError(f"source TOML: {key}: {found}: expected a table [{key}]")
-    return found
 
 
 def around(within: tuple[float, float]) -> tuple[float, float]:
