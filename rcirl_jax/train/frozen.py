@@ -5,9 +5,9 @@ sampling and features once. Members of one call share network shape, loss and
 batches; they differ in seed, step size and leaky rate, which are arrays, so the
 whole grid is one compiled program.
 
-A batch is worked off in pieces of scenes whose gradient sums add up. A piece is
-gathered and normalised once for all members and stays in a CPU's cache while they
-use it; memory does not grow with batch size times members.
+A batch is worked off in pieces of scenes (`pieces`). A piece is gathered once for
+all members and stays in a CPU's cache while they use it; memory does not grow with
+batch size times members.
 """
 
 import contextlib
@@ -23,7 +23,7 @@ import optax
 
 from rcirl_jax.reward import Normaliser, RewardParams
 from rcirl_jax.train.loop import in_chunks
-from rcirl_jax.train.pieces import added, divisor_at_most
+from rcirl_jax.train.pieces import added, piece_size
 from rcirl_jax.train.state import OPTIMIZERS, FeatureBatch, TrainConfig
 from rcirl_jax.train.step import (
     as_tree,
@@ -34,13 +34,9 @@ from rcirl_jax.types import Demonstration
 
 ORDER_STREAM = 3  # fold_in number of the batch order's key
 
-# hidden values of all members in one piece of a batch: 2 MB on a CPU, of the order
-# of its second-level cache; elsewhere 1 GB, for large kernels in little memory
-PIECE_VALUES = {"cpu": 1 << 19}
-PIECE_VALUES_ELSEWHERE = 1 << 28
-# trajectory values of all members in one piece on a CPU: with more, jaxlib 0.10.2
-# sums wrongly in some fusions (jax-ml/jax issue 39103)
-PIECE_SUMS = 1 << 15
+# hidden values of all members in one piece of a batch, not on a CPU: 1 GB, for
+# large kernels in little memory
+PIECE_VALUES = 1 << 28
 COMPILED = "/jax/core/compile/backend_compile_duration"
 
 
@@ -120,24 +116,6 @@ def compiles() -> Iterator[list[float]]:
         jax.monitoring.unregister_event_duration_listener(listen)
 
 
-def piece_size(size: int, members: int, candidates: int, times: int, units: int) -> int:
-    """Scenes of a batch that are worked off together: a divisor of the batch size.
-
-    Args:
-      size: B, scenes in a batch.
-      members: M.
-      candidates: K of a scene.
-      times: T that are compared.
-      units: of the widest hidden layer; 1 for a linear reward.
-    """
-    device = jax.default_backend()
-    values = PIECE_VALUES.get(device, PIECE_VALUES_ELSEWHERE)
-    most = min(size, values // (members * candidates * times * units))
-    if device == "cpu":
-        most = min(most, PIECE_SUMS // (members * (candidates + 1)))
-    return divisor_at_most(size, most)
-
-
 def _taken(frozen: FeatureBatch, part: tuple, times: int) -> FeatureBatch:
     """Some scenes of the set, (rows, weights), without times valid in none of it."""
     batch = jax.tree.map(lambda x: x[part[0]], frozen)
@@ -162,11 +140,14 @@ def _fit(
     count, candidates = frozen.feasible.shape
     size = min(config.batch_size, count)
     batches = -(-count // size)
-    units = max(config.reward.hidden, default=1)
-    piece = piece_size(size, members.seed.size, candidates, times, units)
+    points = members.seed.size * candidates * times
+    widest = max(config.reward.hidden, default=1)
+    piece = piece_size(size, PIECE_VALUES // (points * widest))
     # the direction of a step of size 1; members scale it
-    decay = optax.add_decayed_weights(config.weight_decay)
-    optimizer = optax.chain(decay, OPTIMIZERS[config.optimizer](1.0))
+    optimizer = optax.chain(
+        optax.add_decayed_weights(config.weight_decay),
+        OPTIMIZERS[config.optimizer](1.0),
+    )
     init = lambda seed: init_params(  # noqa: E731
         jax.random.split(jax.random.key(seed))[0], frozen.human.shape[-1], config
     )
