@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rcirl_jax.geometry.frenet import path_curvature
+from rcirl_jax.geometry.frenet import entry, path_curvature
 from rcirl_jax.types import Scene, Trajectory
 from rcirl_jax.units import STATION_STEP_M
 
@@ -59,7 +59,7 @@ def path_view(scene: Scene, s: Float[Array, " t"]) -> PathView:
     rise = jnp.concatenate([table[1:] - table[:-1], jnp.zeros_like(table[:1])])
     position = jnp.clip(s / STATION_STEP_M, 0.0, table.shape[0] - 1.0)
     low = jnp.minimum(position.astype(jnp.int32), table.shape[0] - 2)
-    rows = jnp.concatenate([table, rise], axis=1)[low]
+    rows = entry(jnp.concatenate([table, rise], axis=1), low)
     share = (position - low)[:, None]
     l, dl_at, ddl, kappa, dkappa, limit = jnp.moveaxis(
         rows[:, :6] + share * rows[:, 6:], 1, 0

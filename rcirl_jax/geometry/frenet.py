@@ -70,6 +70,14 @@ def reference_line_from_polyline(
     )
 
 
+def entry(table: jax.Array, index: jax.Array) -> jax.Array:
+    """`table[index]` where every index is known to lie in the table.
+
+    Plain indexing masks what lies outside, which takes as long as the gather.
+    """
+    return jnp.asarray(table).at[index].get(mode="promise_in_bounds")
+
+
 def lookup(
     table: Float[Array, " p"],
     s: Float[Array, ""] | float,
@@ -79,7 +87,8 @@ def lookup(
     position = jnp.clip(s / step, 0.0, table.shape[0] - 1.0)
     low = jnp.minimum(position.astype(jnp.int32), table.shape[0] - 2)
     share = position - low
-    return table[low] + share * (table[low + 1] - table[low])
+    start = entry(table, low)
+    return start + share * (entry(table, low + 1) - start)
 
 
 def _curve(line: ReferenceLine, s: jax.Array) -> tuple:
@@ -90,11 +99,11 @@ def _curve(line: ReferenceLine, s: jax.Array) -> tuple:
     u = jnp.clip(position - low, 0.0, 1.0)
     h00, h10 = (1 + 2 * u) * (1 - u) ** 2, u * (1 - u) ** 2
     h01, h11 = u**2 * (3 - 2 * u), u**2 * (u - 1)
-    a, b = line.heading[low], line.heading[low + 1]
+    a, b = entry(line.heading, low), entry(line.heading, low + 1)
     beyond = (position - low - u) * line.step
     heading = a + u * (b - a)
-    x = h00 * line.x[low] + h01 * line.x[low + 1]
-    y = h00 * line.y[low] + h01 * line.y[low + 1]
+    x = h00 * entry(line.x, low) + h01 * entry(line.x, low + 1)
+    y = h00 * entry(line.y, low) + h01 * entry(line.y, low + 1)
     x = x + line.step * (h10 * jnp.cos(a) + h11 * jnp.cos(b))
     y = y + line.step * (h10 * jnp.sin(a) + h11 * jnp.sin(b))
     return x + beyond * jnp.cos(heading), y + beyond * jnp.sin(heading), heading

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rcirl_jax.features.columns import driven_curvature
+from rcirl_jax.geometry.running import running_max
 from rcirl_jax.sampling import lateral, speed
 from rcirl_jax.sampling.config import SamplerConfig
 from rcirl_jax.sampling.kinematics import trajectory_from_positions, trajectory_on_path
@@ -97,8 +98,11 @@ def sample(key: jax.Array, scene: Scene, config: SamplerConfig) -> Candidates:
 def speed_profiles(
     key: jax.Array, scene: Scene, config: SamplerConfig
 ) -> Float[Array, "m t"]:
-    """Stations of all speed profiles, in the order of `_speed_families`."""
-    return jnp.concatenate(
+    """Stations of all speed profiles, in the order of `_speed_families`.
+
+    Reversing is replaced by standing still.
+    """
+    stations = jnp.concatenate(
         [
             speed.constant_speed(scene),
             speed.cruise(scene, config),
@@ -110,6 +114,7 @@ def speed_profiles(
             speed.random_two_phase(key, scene, config),
         ]
     )
+    return running_max(stations)
 
 
 def _with_lateral(
@@ -154,7 +159,7 @@ def hard_negatives(
     power = jax.random.uniform(power_key, (count,), minval=1.0, maxval=3.0)
     share = jnp.asarray(TIMES_S) / HORIZON_S
     departure = (size * sign)[:, None] * share[None] ** power[:, None]
-    stations = jax.lax.cummax(human.s[None] + departure, axis=1)
+    stations = running_max(human.s[None] + departure)
     if config.mode == "speed":
         trajectory = jax.vmap(trajectory_on_path, in_axes=(None, 0))(scene, stations)
     else:

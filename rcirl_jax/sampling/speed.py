@@ -2,7 +2,7 @@
 
 Only positions are made here; derivatives come from `kinematics`. All profiles
 start in the ego's state (s, v, a). After its own duration a profile goes on at
-its end speed. Reversing is replaced by standing still.
+its end speed. One that reverses is mended by `sampler.speed_profiles`.
 """
 
 import jax
@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from rcirl_jax.features.path import SLOPE_POINTS, table_slope
 from rcirl_jax.geometry.frenet import lookup
 from rcirl_jax.geometry.polynomial import evaluate, quartic, quintic
+from rcirl_jax.geometry.running import remaining_min
 from rcirl_jax.sampling.config import SamplerConfig
 from rcirl_jax.types import Kind, Scene
 from rcirl_jax.units import DT_S, HORIZON_S, STATION_STEP_M, TIMES_S
@@ -40,12 +41,11 @@ def family_index(name: str) -> int:
 def _roll(
     coefficients: Float[Array, " c"], duration: Float[Array, ""]
 ) -> Float[Array, " t"]:
-    """Polynomial until `duration`, then its end speed; never backwards."""
+    """Polynomial until `duration`, then its end speed."""
     times = jnp.asarray(TIMES_S)
     inside = jnp.minimum(times, duration)
     value, speed, _, _ = jax.vmap(evaluate, in_axes=(None, 0))(coefficients, inside)
-    stations = value + jnp.maximum(speed, 0.0) * (times - inside)
-    return jax.lax.cummax(stations, axis=0)
+    return value + jnp.maximum(speed, 0.0) * (times - inside)
 
 
 def constant_speed(scene: Scene) -> Float[Array, "1 t"]:
@@ -228,7 +228,7 @@ def speed_envelope(
     cap = jnp.minimum(path.speed_limit**2, lateral[:, None] / kappa)
     stations = jnp.arange(path.l.shape[0]) * STATION_STEP_M
     ramp = 2.0 * braking[:, None] * stations
-    lowest = jax.lax.cummin(cap + ramp, axis=1, reverse=True)
+    lowest = remaining_min(cap + ramp)
     return jnp.sqrt(jnp.maximum(lowest - ramp, 0.0))
 
 
@@ -306,5 +306,4 @@ def _two_phase(
     early = jax.vmap(evaluate, in_axes=(None, 0))(one, jnp.minimum(times, first))[0]
     late = jax.vmap(evaluate, in_axes=(None, 0))(two, later)[0]
     rest = end * jnp.maximum(times - first - second, 0.0)
-    stations = jnp.where(times <= first, early, late + rest)
-    return jax.lax.cummax(stations, axis=0)
+    return jnp.where(times <= first, early, late + rest)
