@@ -82,6 +82,9 @@ LEARNERS: dict[str, dict] = {
     },
 }
 
+# one program for all runs of a shape: their weights are arguments
+_value = jax.jit(value, static_argnums=4)
+
 # learners whose features are scaled by the scene; the columns come from the preset
 BY_CONTEXT = ("logistic by context", "non-negative by context")
 
@@ -104,16 +107,14 @@ class Learned:
         In calls of `CHUNK` scenes: jaxlib 0.10.2 sums wrongly on CPUs in some
         fusions with more than 32,768 results (jax-ml/jax issue 39103).
         """
-        apply = jax.jit(
-            lambda x, valid: value(
-                self.params, self.normaliser, x, valid, self.config.reward
-            )
-        )
 
         def scorer(x: np.ndarray, valid: np.ndarray) -> np.ndarray:
+            of = (self.params, self.normaliser)
+            shape = self.config.reward
             starts = range(0, len(x), CHUNK)
-            parts = [apply(x[i : i + CHUNK], valid[i : i + CHUNK]) for i in starts]
-            return np.concatenate([np.asarray(part) for part in parts])
+            parts = [(x[i : i + CHUNK], valid[i : i + CHUNK]) for i in starts]
+            values = [_value(*of, *part, shape) for part in parts]
+            return np.concatenate([np.asarray(made) for made in values])
 
         return scorer
 

@@ -83,6 +83,16 @@ class ClusterBootstrap:
         self._index = index.reshape(-1)
         self._seed = seed
         self._weights = self._draw(found.size, 0)
+        self._of_runs: dict[tuple[int, int], np.ndarray] = {}
+
+    def _run_weights(self, count: int, stream: int) -> np.ndarray:
+        """[n, count] weights of runs, drawn once for all statistics."""
+        key = (count, stream)
+        if key not in self._of_runs:
+            draws = self._draw(count, stream).astype(np.float64)
+            stretch = math.sqrt(count / (count - 1))
+            self._of_runs[key] = 1.0 + (draws - 1.0) * stretch
+        return self._of_runs[key]
 
     def _draw(self, count: int, stream: int) -> np.ndarray:
         """[n, count] multinomial weights, `count` draws each."""
@@ -132,9 +142,7 @@ class ClusterBootstrap:
         count = runs.shape[0]
         if count == 1:
             return ratios[:, 0]
-        draws = self._draw(count, stream).astype(np.float64)
-        stretched = 1.0 + (draws - 1.0) * math.sqrt(count / (count - 1))
-        return np.mean(stretched * ratios, axis=1)
+        return np.mean(self._run_weights(count, stream) * ratios, axis=1)
 
     def mean(self, values: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
         """[R] mean of each run over the scenes."""
@@ -267,12 +275,17 @@ def paired_difference(
     bootstrap = _bootstrap(cluster)
     mean = bootstrap.mean(a, weight).mean() - bootstrap.mean(b, weight).mean()
     replicates = bootstrap.means(a, weight, 1) - bootstrap.means(b, weight, 2)
+    return difference_of(float(mean), replicates, confidence)
+
+
+def difference_of(mean: float, replicates: np.ndarray, confidence: float) -> Difference:
+    """A difference from its bootstrap replicates [n]; see `paired_difference`."""
     low, high, se = _interval(replicates, confidence)
     total = replicates.size + 1
     below = (1 + np.count_nonzero(replicates <= 0.0)) / total
     above = (1 + np.count_nonzero(replicates >= 0.0)) / total
     return Difference(
-        mean=float(mean),
+        mean=mean,
         low=low,
         high=high,
         se=se,

@@ -22,7 +22,7 @@ from rcirl_jax.evaluation.statistics import (
     Estimate,
     bootstrap_median,
     combine_seeds,
-    paired_difference,
+    difference_of,
 )
 from rcirl_jax.reward import TUNED_ROW
 
@@ -112,6 +112,7 @@ def build_report(
     if num_resamples is None:
         num_resamples = _enough_resamples(scorers, references)
     bootstrap = ClusterBootstrap(outcomes.cluster, num_resamples)
+    resampled = _Resampled(stacked, bootstrap)
     floor = oracle_fde(outcomes)
     counts = {"scenes": scenes, "vehicles": bootstrap.num_clusters}
     if group is not None:
@@ -135,7 +136,7 @@ def build_report(
             comparison
             for name in references
             for family in _families(scorers, name)
-            for comparison in _compare(stacked, family, name, bootstrap, confidence)
+            for comparison in _compare(resampled, family, name, confidence)
         ),
         human_rank_median={
             name: bootstrap_median(
@@ -219,23 +220,43 @@ def _enough_resamples(names: Iterable[str], references: Sequence[str]) -> int:
     return max(NUM_RESAMPLES, math.ceil(2 * largest / SMALLEST_P) - 1)
 
 
+class _Resampled:
+    """Means of rows over the resamples, made once for all references."""
+
+    def __init__(
+        self,
+        stacked: Mapping[str, Mapping[str, np.ndarray]],
+        bootstrap: ClusterBootstrap,
+    ) -> None:
+        self.stacked, self.bootstrap = stacked, bootstrap
+        self._means: dict[tuple[str, str, int], tuple[float, np.ndarray]] = {}
+
+    def means(self, row: str, metric: str, stream: int) -> tuple[float, np.ndarray]:
+        """Mean of a row, and its replicates [n] with runs drawn from `stream`."""
+        key = (row, metric, stream)
+        if key not in self._means:
+            values = self.stacked[row]
+            inputs = (values[metric], _weight(values, metric))
+            mean = self.bootstrap.mean(*inputs).mean()
+            self._means[key] = (mean, self.bootstrap.means(*inputs, stream))
+        return self._means[key]
+
+    def difference(
+        self, row: str, reference: str, metric: str, confidence: float
+    ) -> Difference:
+        """`paired_difference` of two rows."""
+        mean, replicates = self.means(row, metric, 1)
+        other, others = self.means(reference, metric, 2)
+        return difference_of(float(mean - other), replicates - others, confidence)
+
+
 def _compare(
-    stacked: Mapping[str, Mapping[str, np.ndarray]],
-    rows: Sequence[str],
-    reference: str,
-    bootstrap: ClusterBootstrap,
-    confidence: float,
+    resampled: _Resampled, rows: Sequence[str], reference: str, confidence: float
 ) -> list[Comparison]:
     """One family of rows against one reference, in row then metric order."""
     pairs = [(row, m) for row in rows for m, how in METRICS.items() if how.compared]
     found = [
-        paired_difference(
-            stacked[row][metric],
-            stacked[reference][metric],
-            bootstrap,
-            weight=_weight(stacked[row], metric),
-            confidence=confidence,
-        )
+        resampled.difference(row, reference, metric, confidence)
         for row, metric in pairs
     ]
     adjusted = holm(np.array([difference.p for difference in found]))

@@ -20,6 +20,7 @@ from rcirl_jax.evaluation import (
 )
 from rcirl_jax.evaluation.format import markdown_table
 from rcirl_jax.evaluation.ranking import METRICS
+from rcirl_jax.evaluation.statistics import ClusterBootstrap, paired_difference
 from rcirl_jax.evaluation.table import RIVALS, verdict
 
 SCENES, CANDIDATES, VEHICLES = 240, 12, 40
@@ -116,6 +117,20 @@ def test_differences_are_row_minus_reference(report, scorers):
     assert found["rc-irl", "random", "percentile_rank"] == "better"
     assert found["twin", "hand-set", "top1_fde"] == "no difference"
     assert found["random", "hand-set", "mrr"] == "worse"
+
+
+def test_comparisons_are_paired_differences_on_the_same_resamples(
+    report, scorers, outcomes
+):
+    shared = ClusterBootstrap(outcomes.cluster, 2000)
+    for c in report.comparisons:
+        a, b = (
+            np.stack([run[c.metric] for run in scorers[row]])
+            for row in (c.row, c.reference)
+        )
+        how = METRICS[c.metric].weight
+        weight = scorers[c.row][0][how] if how else None
+        assert c.difference == paired_difference(a, b, shared, weight=weight)
 
 
 def test_many_rows_can_still_differ_after_holms_correction(outcomes):
