@@ -109,11 +109,9 @@ class Learned:
         """
 
         def scorer(x: np.ndarray, valid: np.ndarray) -> np.ndarray:
-            of = (self.params, self.normaliser)
-            shape = self.config.reward
-            starts = range(0, len(x), CHUNK)
-            parts = [(x[i : i + CHUNK], valid[i : i + CHUNK]) for i in starts]
-            values = [_value(*of, *part, shape) for part in parts]
+            of, shape = (self.params, self.normaliser), self.config.reward
+            parts = [slice(i, i + CHUNK) for i in range(0, len(x), CHUNK)]
+            values = [_value(*of, x[part], valid[part], shape) for part in parts]
             return np.concatenate([np.asarray(made) for made in values])
 
         return scorer

@@ -226,8 +226,15 @@ def combine_seeds(
       Estimate; `seed_sd` is the standard deviation of the runs' means.
     """
     bootstrap = _bootstrap(cluster)
-    means = bootstrap.mean(values, weight)
-    low, high, se = _interval(bootstrap.means(values, weight), confidence)
+    replicates = bootstrap.means(values, weight)
+    return estimate_of(bootstrap.mean(values, weight), replicates, confidence)
+
+
+def estimate_of(
+    means: np.ndarray, replicates: np.ndarray, confidence: float
+) -> Estimate:
+    """From the means of runs [R] and bootstrap replicates [n]; see `combine_seeds`."""
+    low, high, se = _interval(replicates, confidence)
     value, count = float(means.mean()), means.size
     if count == 1:
         return Estimate(value=value, low=low, high=high, se=se)

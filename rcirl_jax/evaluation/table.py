@@ -23,6 +23,7 @@ from rcirl_jax.evaluation.statistics import (
     bootstrap_median,
     combine_seeds,
     difference_of,
+    estimate_of,
 )
 from rcirl_jax.reward import TUNED_ROW
 
@@ -127,10 +128,10 @@ def build_report(
         runs={name: len(runs) for name, runs in scorers.items()},
         rows={
             name: {
-                metric: _estimate(values, metric, bootstrap, confidence)
+                metric: _estimate(resampled, name, metric, confidence)
                 for metric in METRICS
             }
-            for name, values in stacked.items()
+            for name in stacked
         },
         comparisons=tuple(
             comparison
@@ -177,21 +178,47 @@ def _weight(values: Mapping[str, np.ndarray], metric: str) -> np.ndarray | None:
     return None if weight is None else values[weight][0]
 
 
+class _Resampled:
+    """Means of rows over the resamples, made once for rows and differences."""
+
+    def __init__(
+        self,
+        stacked: Mapping[str, Mapping[str, np.ndarray]],
+        bootstrap: ClusterBootstrap,
+    ) -> None:
+        self.stacked, self.bootstrap = stacked, bootstrap
+        self._means: dict[tuple[str, str, int], tuple[np.ndarray, np.ndarray]] = {}
+
+    def means(
+        self, row: str, metric: str, stream: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Means of the runs [R], and replicates [n] with runs drawn from `stream`."""
+        key = (row, metric, stream)
+        if key not in self._means:
+            values = self.stacked[row]
+            inputs = (values[metric], _weight(values, metric))
+            means = self.bootstrap.mean(*inputs)
+            self._means[key] = (means, self.bootstrap.means(*inputs, stream))
+        return self._means[key]
+
+    def difference(
+        self, row: str, reference: str, metric: str, confidence: float
+    ) -> Difference:
+        """`paired_difference` of two rows."""
+        means, replicates = self.means(row, metric, 1)
+        other, others = self.means(reference, metric, 2)
+        mean = float(means.mean() - other.mean())
+        return difference_of(mean, replicates - others, confidence)
+
+
 def _estimate(
-    values: Mapping[str, np.ndarray],
-    metric: str,
-    bootstrap: ClusterBootstrap,
-    confidence: float,
+    resampled: _Resampled, row: str, metric: str, confidence: float
 ) -> Estimate:
-    found = combine_seeds(
-        values[metric],
-        bootstrap,
-        weight=_weight(values, metric),
-        confidence=confidence,
-    )
+    found = estimate_of(*resampled.means(row, metric, 1), confidence)
     if METRICS[metric].unit != "%":
         return found
-    vehicles = bootstrap.num_clusters
+    values = resampled.stacked[row]
+    vehicles = resampled.bootstrap.num_clusters
     # the other end is certain, so all of the error probability goes to this one
     two_sided = 2.0 * confidence - 1.0
     if np.all(values[metric] == 0.0):
@@ -218,36 +245,6 @@ def _enough_resamples(names: Iterable[str], references: Sequence[str]) -> int:
     families = [part for name in references for part in _families(names, name)]
     largest = per_row * max(map(len, families), default=0)
     return max(NUM_RESAMPLES, math.ceil(2 * largest / SMALLEST_P) - 1)
-
-
-class _Resampled:
-    """Means of rows over the resamples, made once for all references."""
-
-    def __init__(
-        self,
-        stacked: Mapping[str, Mapping[str, np.ndarray]],
-        bootstrap: ClusterBootstrap,
-    ) -> None:
-        self.stacked, self.bootstrap = stacked, bootstrap
-        self._means: dict[tuple[str, str, int], tuple[float, np.ndarray]] = {}
-
-    def means(self, row: str, metric: str, stream: int) -> tuple[float, np.ndarray]:
-        """Mean of a row, and its replicates [n] with runs drawn from `stream`."""
-        key = (row, metric, stream)
-        if key not in self._means:
-            values = self.stacked[row]
-            inputs = (values[metric], _weight(values, metric))
-            mean = self.bootstrap.mean(*inputs).mean()
-            self._means[key] = (mean, self.bootstrap.means(*inputs, stream))
-        return self._means[key]
-
-    def difference(
-        self, row: str, reference: str, metric: str, confidence: float
-    ) -> Difference:
-        """`paired_difference` of two rows."""
-        mean, replicates = self.means(row, metric, 1)
-        other, others = self.means(reference, metric, 2)
-        return difference_of(float(mean - other), replicates - others, confidence)
 
 
 def _compare(

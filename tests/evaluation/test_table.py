@@ -20,7 +20,11 @@ from rcirl_jax.evaluation import (
 )
 from rcirl_jax.evaluation.format import markdown_table
 from rcirl_jax.evaluation.ranking import METRICS
-from rcirl_jax.evaluation.statistics import ClusterBootstrap, paired_difference
+from rcirl_jax.evaluation.statistics import (
+    ClusterBootstrap,
+    combine_seeds,
+    paired_difference,
+)
 from rcirl_jax.evaluation.table import RIVALS, verdict
 
 SCENES, CANDIDATES, VEHICLES = 240, 12, 40
@@ -119,10 +123,11 @@ def test_differences_are_row_minus_reference(report, scorers):
     assert found["random", "hand-set", "mrr"] == "worse"
 
 
-def test_comparisons_are_paired_differences_on_the_same_resamples(
-    report, scorers, outcomes
-):
+def test_rows_and_comparisons_are_of_the_same_resamples(report, scorers, outcomes):
     shared = ClusterBootstrap(outcomes.cluster, 2000)
+    for row, found in report.rows.items():
+        values = np.stack([run["top1_fde"] for run in scorers[row]])
+        assert found["top1_fde"] == combine_seeds(values, shared)
     for c in report.comparisons:
         a, b = (
             np.stack([run[c.metric] for run in scorers[row]])
