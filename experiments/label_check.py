@@ -1,10 +1,14 @@
 """Are the automatic labels right? Precision and recall against known truth.
 
     python -m experiments.label_check --cases=100 --noise=ngsim,none --output=DIR
+    python -m experiments.label_check --traffic=4 --noise=ngsim --output=DIR
     python -m experiments.label_check --format=commonroad --input=DIR --output=DIR
 
 Without --input: drives planned by `evaluation.label_cases`, whose decisions and
 tags are known, are labelled and compared; position noise as in NGSIM, or none.
+With --traffic=N instead: N simulated recordings of every entry of
+data_specs/sources/synthetic.toml, whose drivers' own state is the truth; the rules
+were never corrected on it.
 With --input (any recorded format): the written cycle of every signal is tested
 against crossings and stands, and the stop labels against observed stands, with
 the signals that an import trusts and with all of them. With --data the labels
@@ -24,13 +28,17 @@ from experiments.common import provenance, run
 from experiments.executor import executor
 from rcirl_jax.data.importers import IMPORTERS, read_recordings
 from rcirl_jax.data.store import open_dataset
+from rcirl_jax.evaluation.label_scores import LabelReport, format_labels, format_scores
 from rcirl_jax.evaluation.label_signals import check_phases, format_phases
 from rcirl_jax.evaluation.label_stops import check_stops, compare_stored, format_stops
-from rcirl_jax.evaluation.label_truth import format_labels, format_scores, measure
+from rcirl_jax.evaluation.label_traffic import measure_traffic
+from rcirl_jax.evaluation.label_truth import measure
+from rcirl_jax.executor import Executor
 from rcirl_jax.report.label_picture import label_chart
 from rcirl_jax.whole import write_json
 
 _CASES = flags.DEFINE_integer("cases", 100, "planned drives of each family")
+_TRAFFIC = flags.DEFINE_integer("traffic", None, "recordings of each road simulated")
 _NOISE = flags.DEFINE_list("noise", ["ngsim", "none"], "none, white, ngsim, rough")
 _SEED = flags.DEFINE_integer("seed", 0, "of the planned drives")
 _OUTPUT = flags.DEFINE_string("output", "out/label_check", "folder to write")
@@ -38,7 +46,7 @@ _DATA = flags.DEFINE_string("data", None, "dataset whose stored labels are compa
 _FORMAT = flags.DEFINE_enum("format", "commonroad", sorted(IMPORTERS), "of --input")
 _INPUT = flags.DEFINE_string("input", None, "recorded file or folder")
 _SOURCE = flags.DEFINE_string("source", None, "TOML of columns and units of --input")
-_QUICK = flags.DEFINE_bool("quick", False, "4 cases of each family, one noise")
+_QUICK = flags.DEFINE_bool("quick", False, "4 cases of each family, 1 of --traffic")
 
 
 def main() -> None:
@@ -63,8 +71,7 @@ def main() -> None:
         noises = _NOISE.value[:1] if _QUICK.value else _NOISE.value
         places = executor()
         for noise in noises:
-            cases = 4 if _QUICK.value else _CASES.value
-            report = measure(cases, noise, _SEED.value, executor=places)
+            report = _measured(noise, places)
             print(f"{format_labels(report)}\n")
             body[noise] = report.as_dict()
             tables[f"noise {noise}, decisions"] = report.decisions
@@ -75,6 +82,15 @@ def main() -> None:
     body["made_by"] = provenance()
     write_json(folder / "labels.json", body)
     print(f"written: {folder}/labels.json, {picture.name}")
+
+
+def _measured(noise: str, places: Executor | None) -> LabelReport:
+    seed, is_quick = _SEED.value, _QUICK.value
+    if _TRAFFIC.value is None:
+        return measure(4 if is_quick else _CASES.value, noise, seed, executor=places)
+    return measure_traffic(
+        1 if is_quick else _TRAFFIC.value, noise, seed, executor=places
+    )
 
 
 if __name__ == "__main__":

@@ -235,6 +235,9 @@ class Collector:
         is_light = np.zeros(NUM_OBSTACLES, bool)
         is_light[: len(lines)] = [line["is_light"] for line in lines]
         row["obstacles.is_light"] = is_light
+        # for the check of the labels only: whose box it is, -1: nobody's
+        row["obstacles.track"] = np.full(NUM_OBSTACLES, -1)
+        row["obstacles.track"][len(lines) : end] = near[:room]
         row["num_bodies"] = len(near)
 
     def _boxes(

@@ -41,7 +41,7 @@ class Manifest:
     groups: list[str]
     vehicles: list[str]
     splits: dict[str, list[str]]  # group names per split
-    shards: list[dict]  # {"count", "sha256"} by shard number
+    shards: list[dict]  # `shard_entry` by shard number
     quality: dict  # data-quality report
     import_flags: dict
     hash: str  # sha256 over the canonical manifest without this field
@@ -90,6 +90,16 @@ def unseal(raw: bytes, field: str, name: str) -> dict:
     if sha != stated:
         raise InputError(f"{name}: {field}: contents {sha}: expected {stated}; damaged")
     return payload
+
+
+def shard_entry(info: ShardInfo) -> dict:
+    """What the manifest says of a shard: its digest, and what it was made of.
+
+    "recordings" maps their names to the sha256 of what was cut into scenes and of
+    how (`cut.Cut.sha256`); null where nothing was recorded, as of planned drives.
+    """
+    made_of = {entry["name"]: entry.get("sha256") for entry in info.lineage}
+    return {"count": info.count, "sha256": info.sha256, "recordings": made_of}
 
 
 def array_table() -> dict[str, dict]:

@@ -33,6 +33,7 @@ from rcirl_jax.data.manifest import (
     array_table,
     parse_manifest,
     seal,
+    shard_entry,
 )
 from rcirl_jax.data.rows import checked_leaves, leaf_specs, row_spec
 from rcirl_jax.data.shards import (
@@ -119,7 +120,8 @@ class DatasetWriter:
         Args:
           index: number of the shard, the number of shards before it.
           demonstrations: numpy rows [n, ...], n >= 1.
-          lineage: one JSON-ready dict per recording in the shard.
+          lineage: one JSON-ready dict per recording in the shard, with its "name"
+            and, if known, the "sha256" of what it was made of.
 
         Raises:
           InputError: the place cannot be written at all.
@@ -178,9 +180,7 @@ class DatasetWriter:
             "count": sum(info.count for info in self._committed),
             "arrays": array_table(),
             "time_grid_s": TIMES_S.tolist(),
-            "shards": [
-                {"count": info.count, "sha256": info.sha256} for info in self._committed
-            ],
+            "shards": [shard_entry(info) for info in self._committed],
         }
         raw = seal(payload, "hash")
         dataset = Dataset(self._files, parse_manifest(raw, self._files))

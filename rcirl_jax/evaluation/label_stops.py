@@ -16,13 +16,13 @@ from rcirl_jax.data.collect import Collector
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.labels import add_labels
 from rcirl_jax.evaluation.label_cases import clear
+from rcirl_jax.evaluation.label_scores import ClassScore, format_scores
 from rcirl_jax.evaluation.label_signals import (
     STANDING_MPS,
     crossing_time,
     first_stands,
     stands_in_reach,
 )
-from rcirl_jax.evaluation.label_truth import ClassScore, format_scores
 from rcirl_jax.types import Decision, Demonstration, Kind, Recording, Tag, Track
 from rcirl_jax.units import HORIZON_S
 

@@ -1,17 +1,12 @@
-"""Automatic labels against the truth of constructed drives: precision, recall.
+"""Automatic labels against the truth of constructed drives.
 
-    precision = right / predicted,   recall = right / true
-
-per decision over all scored road users and lines, per tag over all scored
-scenes. Both are rates of independent cases, with exact binomial intervals.
-Precision depends on how often each class and each near miss occurs: here every
-family counts alike, which is harder than traffic.
+Every family of drives counts alike, which is harder than traffic: precision
+depends on how often each class and each near miss occurs.
 """
 
 import collections
-import dataclasses
 import functools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import tqdm
@@ -20,7 +15,6 @@ from rcirl_jax.data.collect import Collector
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.smoothing import harsh_share
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.exact import clopper_pearson
 from rcirl_jax.evaluation.label_cases import (
     FAMILIES,
     HISTORY_S,
@@ -32,8 +26,9 @@ from rcirl_jax.evaluation.label_cases import (
     draw,
     to_recording,
 )
+from rcirl_jax.evaluation.label_scores import LabelReport, Verdict, report
 from rcirl_jax.executor import Executor, Here
-from rcirl_jax.types import Decision, Kind, Tag
+from rcirl_jax.types import Decision, Kind
 from rcirl_jax.units import TIMES_S
 
 SAME_M = 4.0  # m, mean distance within which a slot is the road user
@@ -43,72 +38,6 @@ COLLECT = CollectConfig(
     require_obstacles=False,
     require_speed_change=False,
 )
-
-# (what, family, truth, label) of one scored thing; truth and label are names
-Verdict = tuple[str, str, str, str]
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ClassScore:
-    """How well one decision or tag is found."""
-
-    name: str
-    right: int  # labelled and true
-    wrong: int  # labelled, not true
-    missed: int  # true, not labelled
-
-    @property
-    def true(self) -> int:
-        """Cases in which it is true."""
-        return self.right + self.missed
-
-    def precision(self) -> tuple[float, float, float] | None:
-        """(rate, low, high), or None without a label."""
-        return _rate(self.right, self.right + self.wrong)
-
-    def recall(self) -> tuple[float, float, float] | None:
-        """(rate, low, high), or None without a true case."""
-        return _rate(self.right, self.true)
-
-    def as_dict(self) -> dict:
-        """JSON-ready."""
-        return {
-            "name": self.name,
-            "true": self.true,
-            "right": self.right,
-            "wrong": self.wrong,
-            "missed": self.missed,
-            "precision": self.precision(),
-            "recall": self.recall(),
-        }
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class LabelReport:
-    """Labels against truth over all families."""
-
-    noise: str
-    cases: int
-    dropped: dict[str, int]  # drop reason -> cases
-    decisions: tuple[ClassScore, ...]
-    tags: tuple[ClassScore, ...]
-    # (what, family, truth, label, count), most frequent first
-    errors: tuple[tuple[str, str, str, str, int], ...]
-
-    def as_dict(self) -> dict:
-        """JSON-ready."""
-        return {
-            "noise": self.noise,
-            "cases": self.cases,
-            "dropped": self.dropped,
-            "decisions": [score.as_dict() for score in self.decisions],
-            "tags": [score.as_dict() for score in self.tags],
-            "errors": [list(error) for error in self.errors],
-        }
-
-
-def _rate(k: int, n: int) -> tuple[float, float, float] | None:
-    return (k / n, *clopper_pearson(k, n)) if n else None
 
 
 def measure(
@@ -148,7 +77,7 @@ def measure(
             dropped[found] += 1
         else:
             verdicts += found
-    return _report(noise, total, dict(dropped), verdicts)
+    return report(noise, total, dict(dropped), verdicts)
 
 
 def _judged(
@@ -203,68 +132,6 @@ def _decision_about_line(row: dict) -> Decision:
         return Decision.IGNORE
     station = np.where(lines, row["obstacles.s_lower"][:, 0], np.inf)
     return Decision(row["decisions"][int(np.argmin(station))])
-
-
-def _report(
-    noise: str, cases: int, dropped: dict[str, int], verdicts: list[Verdict]
-) -> LabelReport:
-    decisions = [v for v in verdicts if v[0] == "decision"]
-    tags = [v for v in verdicts if v[0] == "tag"]
-    wrong = collections.Counter(v for v in verdicts if v[2] != v[3])
-    return LabelReport(
-        noise=noise,
-        cases=cases,
-        dropped=dropped,
-        decisions=tuple(_score(d.name, decisions) for d in Decision),
-        tags=tuple(_score(t.name, tags) for t in Tag),
-        errors=tuple((*key, count) for key, count in wrong.most_common()),
-    )
-
-
-def _score(name: str, verdicts: Iterable[Verdict]) -> ClassScore:
-    pairs = [(truth == name, label == name) for _, _, truth, label in verdicts]
-    return ClassScore(
-        name=name.lower(),
-        right=sum(truth and label for truth, label in pairs),
-        wrong=sum(label and not truth for truth, label in pairs),
-        missed=sum(truth and not label for truth, label in pairs),
-    )
-
-
-def format_labels(report: LabelReport, errors: int = 20) -> str:
-    """The report as a terminal table."""
-    lines = [
-        f"{report.cases} cases, position noise {report.noise!r}, dropped:"
-        f" {sum(report.dropped.values())} {report.dropped or ''}",
-        "",
-        *format_scores("decision", report.decisions),
-        "",
-        *format_scores("tag", report.tags),
-    ]
-    if report.errors:
-        lines += ["", f"{'family':<24}{'truth':<14}{'label':<14}{'cases':>6}"]
-    for what, family, truth, label, count in report.errors[:errors]:
-        rest = "-" if what == "tag" else ""
-        lines.append(f"{family:<24}{truth or rest:<14}{label or rest:<14}{count:>6}")
-    return "\n".join(lines)
-
-
-def format_scores(title: str, scores: Iterable[ClassScore]) -> list[str]:
-    """Lines of a table, one per class."""
-    head = f"{title:<14}{'true':>6}{'precision, %':>24}{'recall, %':>24}"
-    return [head, *(_line(score) for score in scores)]
-
-
-def _line(score: ClassScore) -> str:
-    cells = [_cell(score.precision()), _cell(score.recall())]
-    return f"{score.name:<14}{score.true:>6}{cells[0]:>24}{cells[1]:>24}"
-
-
-def _cell(rate: tuple[float, float, float] | None) -> str:
-    if rate is None:
-        return "-"
-    value, low, high = (100.0 * number for number in rate)
-    return f"{value:.1f} [{low:.1f}, {high:.1f}]"
 
 
 def noise_shares(noise: str, cases: int = 40, seed: int = 0) -> tuple[float, float]:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from rcirl_jax.evaluation.label_truth import ClassScore
+from rcirl_jax.evaluation.label_scores import ClassScore
 from rcirl_jax.report.intervals import Interval, interval_panel
 from rcirl_jax.report.style import figure, label, save
 

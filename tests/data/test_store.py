@@ -159,6 +159,8 @@ def test_manifest_says_what_the_dataset_is(made):
         mark = json.loads((folder / "shard.json").read_text())
         assert mark["lineage"] == lineage(number)
         assert mark["sha256"] == manifest.shards[number]["sha256"]
+        made_of = {f"recording {number}": "0" * 64}
+        assert manifest.shards[number]["recordings"] == made_of
         files = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
         assert files == {*mark["files"], "shard.json"}
         for name, stated in mark["files"].items():

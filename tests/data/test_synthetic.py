@@ -257,7 +257,7 @@ def closed_form_gap(v: float, v0: float) -> float:
 
 
 def test_platoon_settles_at_the_equilibrium_gap():
-    config = synthetic._driver_config(DEFAULT, load_toml(DEFAULT)["drivers"])
+    config = synthetic.driver_config(DEFAULT, load_toml(DEFAULT)["drivers"])
     config = dataclasses.replace(config, noise_mps2=0.0)
     run = RunConfig(
         road="highway_straight",

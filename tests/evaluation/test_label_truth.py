@@ -15,6 +15,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.label_cases import FAMILIES, Case, draw, to_recording
 from rcirl_jax.evaluation.label_cases.plans import ego_of
 from rcirl_jax.evaluation.label_cases.scenes import CLOCK, drive, speed
+from rcirl_jax.evaluation.label_scores import format_labels
 from rcirl_jax.evaluation.label_signals import (
     check_phases,
     first_stands,
@@ -22,7 +23,7 @@ from rcirl_jax.evaluation.label_signals import (
     period,
 )
 from rcirl_jax.evaluation.label_stops import check_stops, format_stops
-from rcirl_jax.evaluation.label_truth import format_labels, measure
+from rcirl_jax.evaluation.label_truth import measure
 from rcirl_jax.executor import Processes
 from rcirl_jax.types import Decision, Signal, Tag
 

@@ -72,7 +72,7 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     settings = {**spec, **own}
     settings["drivers"] = {**_table(spec, "drivers"), **_table(own, "drivers")}
     _check_keys(path, "", settings, TOP_KEYS)
-    drivers = _driver_config(path, settings["drivers"])
+    drivers = driver_config(path, settings["drivers"])
     jobs = _jobs(path, settings)
     return (
         dataclasses.replace(validate_recording(made), progress=number / len(jobs))
@@ -117,7 +117,8 @@ def _is_number(value: Any, kinds: tuple[type, ...] = (int, float)) -> bool:  # n
     return known and math.isfinite(value)
 
 
-def _driver_config(path: Path, found: dict) -> DriverConfig:
+def driver_config(path: Path, found: dict) -> DriverConfig:
+    """The drivers that a TOML's `drivers` table describes; InputError names a key."""
     fields = {field.name: field.type for field in dataclasses.fields(DriverConfig)}
     values = {}
     for key in found:

@@ -66,6 +66,7 @@ class Log:
     l: np.ndarray  # [K, n] m
     slope: np.ndarray  # [K, n] dl/ds
     v: np.ndarray  # [K, n] m/s
+    lanes: np.ndarray  # [K, n] bit mask of the lanes it is in; two in a change
     drivers: np.ndarray  # [vehicles] of DRIVER, by vehicle number
     signal_offset: np.ndarray  # [stops] s into the cycle at the first sample
 
@@ -350,13 +351,13 @@ def simulate(runs: Sequence[RunConfig], config: DriverConfig) -> list[Log]:
     for _ in range(int(round(runs[0].duration_s * runs[0].rate_hz))):
         state = traffic.state
         offset, slope = state.lateral(traffic.table)
-        rows.append(
-            (state.vehicle.copy(), state.s.copy(), offset, slope, state.v.copy())
-        )
+        now = (state.vehicle.copy(), state.s.copy(), state.v.copy(), state.occupied())
+        rows.append((*now, offset, slope))
         for _ in range(traffic.substeps):
             traffic.step()
     traffic.destinations()
-    vehicle, s, l, slope, v = (np.stack(column) for column in zip(*rows, strict=True))
+    columns = [np.stack(column) for column in zip(*rows, strict=True)]
+    vehicle, s, v, lanes, l, slope = columns
     logs = []
     for r, source in enumerate(traffic.sources):
         n = source.capacity
@@ -368,6 +369,7 @@ def simulate(runs: Sequence[RunConfig], config: DriverConfig) -> list[Log]:
                 l=l[:, r, :n],
                 slope=slope[:, r, :n],
                 v=v[:, r, :n],
+                lanes=lanes[:, r, :n],
                 drivers=source.pool[: source.used],
                 signal_offset=source.signal_offset,
             )

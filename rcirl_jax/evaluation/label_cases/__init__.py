@@ -10,6 +10,7 @@ from rcirl_jax.evaluation.label_cases.scenes import (
     Mover,
     at,
     clear,
+    position_errors,
     to_recording,
 )
 
@@ -25,6 +26,7 @@ __all__ = [
     "clear",
     "draw",
     "lines",
+    "position_errors",
     "to_recording",
     "traffic",
 ]

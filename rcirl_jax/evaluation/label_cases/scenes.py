@@ -252,7 +252,7 @@ def _track(
     vx, vy = np.gradient(x) * RATE_HZ, np.gradient(y) * RATE_HZ
     moving = np.hypot(vx, vy) > 0.3
     heading = np.where(moving, np.arctan2(vy, vx), road + mover.rest)
-    dx, dy = _errors(np.cumsum(moving) / RATE_HZ, noise, rng)
+    dx, dy = position_errors(np.cumsum(moving) / RATE_HZ, noise, rng)
     return Track(
         id=mover.id,
         kind=mover.kind,
@@ -266,7 +266,7 @@ def _track(
     )
 
 
-def _errors(
+def position_errors(
     driven: np.ndarray, noise: tuple[float, float], rng: np.random.Generator
 ) -> np.ndarray:
     """[2, n] m, errors of the positions in x and y.
