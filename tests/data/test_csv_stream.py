@@ -92,6 +92,31 @@ def test_pieces_hold_the_scenes_of_the_whole(tmp_path, by_car):
         )
 
 
+def test_a_crowded_minute_is_several_pieces(tmp_path, monkeypatch):
+    """Nothing is held that grows with the traffic; the scenes are the same."""
+    path = tmp_path / "log.csv"
+    spec = {**write(path, rows_of()), "long_bytes": 1}
+    minutes = cuts(path, spec)
+    monkeypatch.setattr(csv_stream, "MAX_ROWS", 2000)
+    windows = cuts(path, spec)
+    names = [made.name for made in windows]
+    assert "log-00001.00" in names
+    assert "log-00001.02" in names
+    assert len(names) == len(set(names)) > 2 * len(minutes)
+    whole, apart = scenes_by_name(minutes), scenes_by_name(windows)
+    assert set(apart) == set(whole)
+    for key, (scenes, row) in whole.items():
+        other, place = apart[key]
+        for name in ("s", "l", "v"):
+            np.testing.assert_allclose(
+                getattr(other.human, name)[place], getattr(scenes.human, name)[row],
+                atol=0.05,
+            )  # fmt: skip
+    most = max(made.scenes.vehicle.size for made in windows if made.scenes is not None)
+    assert most < 0.6 * max(made.scenes.vehicle.size for made in minutes)
+    assert [made.progress for made in windows] == sorted(m.progress for m in windows)
+
+
 def test_a_vehicle_is_in_one_group_whatever_the_piece(tmp_path):
     path = tmp_path / "log.csv"
     spec = {**write(path, rows_of()), "long_bytes": 1}

@@ -1,4 +1,4 @@
-"""Long logs of rows: imported in pieces of a minute, in bounded memory.
+"""Long logs of rows: imported in pieces of a minute or less, in bounded memory.
 
 The file is read once, a few MiB at a time, and its rows are written to scratch
 files by recording and minute. Each minute is then a Recording of its own, with
@@ -41,6 +41,9 @@ AFTER_S = 28.0  # s after it: the future of 8 s, smoothing, and the path beyond
 MAX_BLOCKS = 200_000  # pieces of one file; more mean a wrong unit of time
 SCRATCH = "rcirl-scratch-"  # how folders of scratch files begin
 LOCK = "lock"  # in such a folder, held while it is in use
+# own rows of a piece; of a minute with more, windows of it are pieces (10 kB a scene)
+MAX_ROWS = 150_000
+MAX_WINDOWS = 60  # of a minute
 BUFFER_BYTES = 64 * 2**20  # bytes of rows held before they go to scratch files
 
 
@@ -58,15 +61,25 @@ class Field:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Piece:
-    """Rows of one minute of one recording, and of its surroundings."""
+    """Rows of one minute of one recording, and of its surroundings.
+
+    Of a minute too crowded for memory it is a window, counted by `window`.
+    """
 
     recording: str | None  # value of the `recording` field
     number: int  # of the minute, from the recording's first
     values: dict[str, np.ndarray]  # field -> [n], t since the recording's start
-    within: tuple[float, float]  # s, the minute itself
+    within: tuple[float, float]  # s, the minute or the window itself
     # id -> s, when the whole log first saw it, and when again after each gap
     fragments: dict[str, list[float]]
     progress: float  # share of the file's pieces up to this one
+    window: int | None = None  # of the minute; None: the minute is one piece
+
+    @property
+    def label(self) -> str:
+        """The number as names of recordings have it."""
+        rest = "" if self.window is None else f".{self.window:02d}"
+        return f"{self.number:05d}{rest}"
 
 
 def is_long(path: Path, spec: dict) -> bool:
@@ -237,7 +250,7 @@ class Spill:
         self.blocks: dict[int, set[int]] = {}  # number of a recording -> minutes
         self.buffers: dict[tuple[int, int], list[np.ndarray]] = {}
         self.held = 0  # bytes in the buffers
-        self.given = 0  # pieces
+        self.given = 0.0  # minutes given as pieces
         self._tables: dict[str, np.ndarray] = {}
 
     def add(self, batch: dict) -> None:
@@ -305,6 +318,21 @@ class Spill:
         raw = np.fromfile(self.folder / f"{code}_{minute}", np.float64)
         return raw.reshape(-1, len(self.names))
 
+    def _count(self, code: int, minute: int) -> int:
+        """Rows of a minute, without reading them."""
+        size = (self.folder / f"{code}_{minute}").stat().st_size
+        return size // (8 * len(self.names))
+
+    def _between(
+        self, code: int, minute: int, begin: float, end: float
+    ) -> Iterator[np.ndarray]:
+        """Rows of t in [begin, end) s of a minute and the two beside it."""
+        t = self.names.index("t")
+        for near in (minute - 1, minute, minute + 1):
+            if near * BLOCK_S < end and (near + 1) * BLOCK_S > begin:
+                rows = self._rows(code, near)
+                yield rows[(rows[:, t] >= begin) & (rows[:, t] < end)]
+
     def minutes(self, recording: str | None) -> Iterator[dict[str, np.ndarray]]:
         """Field -> [n] of each minute alone, t as in the file."""
         code, minutes = self._minutes(recording)
@@ -356,25 +384,29 @@ class Spill:
         """
         code, minutes = self._minutes(recording)
         users: list[str] = list(self.texts.get("id", {}))
-        t, user = self.names.index("t"), self.names.index("id")
+        user = self.names.index("id")
         fragments = self._fragments(code, minutes, max_gap_s)
         start = min(seen for seen, *_ in fragments.values()) if fragments else 0.0
         total = sum(map(len, self.blocks.values()))
         for minute in minutes:
-            self.given += 1
-            low, high = minute * BLOCK_S, (minute + 1) * BLOCK_S
-            rows = np.concatenate([self._rows(code, minute + k) for k in (-1, 0, 1)])
-            rows = rows[(rows[:, t] >= low - BEFORE_S) & (rows[:, t] < high + AFTER_S)]
-            values = self._values(rows)
-            values["t"] = values["t"] - start
-            yield Piece(
-                recording=recording,
-                number=minute - int(np.floor(start / BLOCK_S)),
-                values=values,
-                within=(low - start, high - start),
-                fragments={
-                    users[u] if users else str(u): [s - start for s in fragments[u]]
-                    for u in np.unique(rows[:, user]).astype(int).tolist()
-                },
-                progress=self.given / total,
-            )
+            count = min(-(-self._count(code, minute) // MAX_ROWS), MAX_WINDOWS)
+            for window in range(count):
+                self.given += 1 / count
+                low = minute * BLOCK_S + window * BLOCK_S / count
+                high = minute * BLOCK_S + (window + 1) * BLOCK_S / count
+                surroundings = low - BEFORE_S, high + AFTER_S
+                rows = np.concatenate(list(self._between(code, minute, *surroundings)))
+                values = self._values(rows)
+                values["t"] = values["t"] - start
+                yield Piece(
+                    recording=recording,
+                    number=minute - int(np.floor(start / BLOCK_S)),
+                    values=values,
+                    within=(low - start, high - start),
+                    fragments={
+                        users[u] if users else str(u): [s - start for s in fragments[u]]
+                        for u in np.unique(rows[:, user]).astype(int).tolist()
+                    },
+                    progress=self.given / total,
+                    window=window if count > 1 else None,
+                )

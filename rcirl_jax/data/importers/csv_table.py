@@ -120,7 +120,7 @@ def _long_recordings(path: Path, spec: dict) -> Iterator[Recording]:
     for piece in csv_stream.pieces(path, fields, MAX_GAP_STEPS / rate):
         log = path.stem if piece.recording is None else f"{path.stem}-{piece.recording}"
         table = _localise(path, piece.values, rate, notes, start=0.0)
-        made = _recording(f"{log}-{piece.number:05d}", table, spec)
+        made = _recording(f"{log}-{piece.label}", table, spec)
         yield validate_recording(csv_stream.piece_of(log, made, piece), path)
 
 

@@ -162,7 +162,7 @@ def _long_recordings(
                 survey.add(table_of(values))
             notes = [*left_out, *survey.notes()]  # once, with the first minute
             for piece in spill.pieces(site, gap_s):
-                table, name = table_of(piece.values), f"{log}-{piece.number:05d}"
+                table, name = table_of(piece.values), f"{log}-{piece.label}"
                 drop_repeated(table)
                 made = site_recording(
                     path, name, table, spec, survey, stamped=stamped, notes=notes
