@@ -21,12 +21,11 @@ from pathlib import Path
 from absl import flags
 
 from experiments.common import provenance, run
+from experiments.paper.weights import drives_config, trained_weights
 from rcirl_jax.data.importers import IMPORTERS, read_recordings
-from rcirl_jax.data.joined import open_datasets
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop import SuiteConfig, run_suite, write_suite
 from rcirl_jax.export.closed_loop import table_rows
-from rcirl_jax.export.from_run import export_run
 from rcirl_jax.report.intervals import suite_chart
 from rcirl_jax.reward import RewardConfig
 from rcirl_jax.simulation.cases import STEP_S
@@ -40,8 +39,6 @@ from rcirl_jax.simulation.suite import (
     recorded_set,
     suite_refs,
 )
-from rcirl_jax.train.loop import train
-from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.whole import write_json
 
 _OUTPUT = flags.DEFINE_string("output", "out/table2", "folder for everything")
@@ -92,20 +89,9 @@ def _drives(folder: Path, seed: int, learner: Path | None) -> Path:
 
 def _weights(folder: Path, name: str, data: Sequence[Path]) -> Path:
     """One shape trained on drives and exported, made once."""
-    file = folder / f"{name}.msgpack"
-    if not file.exists():
-        dataset = open_datasets([str(path) for path in data])
-        config = TrainConfig(
-            positive="nearest",
-            learning_rate=4e-3,
-            halve_every=900,
-            epochs=1 if _QUICK.value else 4,
-            seed=_SEED.value,
-            **LEARNED[name.split("-")[0]],
-        )
-        train(dataset, folder / name, config, provenance=provenance())
-        export_run(folder / name, dataset, file)
-    return file
+    changes = LEARNED[name.split("-")[0]]
+    config = drives_config(quick=_QUICK.value, seed=_SEED.value, **changes)
+    return trained_weights(folder, name, data, config)
 
 
 def _trained(folder: Path) -> list[str]:

@@ -109,6 +109,23 @@ def test_writes_numbers_and_a_picture(name, dataset, tmp_path):
     assert (tmp_path / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
 
 
+def test_closed_loop_over_seeds(dataset, tmp_path):
+    flags = ("--quick", f"--data={dataset}", f"--output={tmp_path}")
+    done = command("closed_loop_seeds", *flags)
+    assert done.returncode == 0, done.stderr[-2000:]
+    body = json.loads((tmp_path / "closed_loop_seeds.json").read_text())
+    assert all(math.isfinite(x) for x in numbers(body))
+    assert [len(body["runs"][row]["progress"]) for row in body["rows"]] == [2, 2, 1, 1]
+    apart = body["tests"]["RC-IRL minus GAN"]["progress"]
+    rows = {row: body["runs"][row]["progress"] for row in ("RC-IRL", "GAN")}
+    means = {row: sum(x) / len(x) for row, x in rows.items()}
+    assert apart["mean"] == pytest.approx(means["RC-IRL"] - means["GAN"], abs=1e-3)
+    assert apart["low"] <= apart["mean"] <= apart["high"]
+    assert apart["p_holm"] >= apart["p"]
+    assert (tmp_path / "closed_loop_seeds.png").read_bytes()[:4] == b"\x89PNG"
+    assert "RC-IRL minus GAN: progress: " in done.stdout
+
+
 def test_the_example_frame_says_why(dataset, tmp_path):
     weights = random_weights(tmp_path / "random.msgpack")
     flags = ("--quick", f"--data={dataset}", f"--weights={weights}", "--row=0")

@@ -1,0 +1,143 @@
+"""RC-IRL against the GAN in the closed loop, over training seeds.
+
+    python -m experiments.paper.closed_loop_seeds --data=DRIVES[,DRIVES] --output=DIR
+
+Both are trained on the same drives (`experiments.drive_logs`, or the folders drives
+and takeovers of `experiments.paper.table2`) with every seed, as table II trains them,
+and drive the same catalogue cases beside hand-set and IDM. Differences are paired by
+case; their intervals resample families and seeds together, as `human_likeness`
+resamples vehicles and seeds. Weights that are there are kept and reused.
+Expected with three seeds of each loss and 230 cases of 120 s: an hour on one core
+with the drives of table II; no measure but way and comfort tells the two apart.
+`--quick`: two minutes, numbers without meaning.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from absl import flags
+
+from experiments.common import run
+from experiments.paper.common import DATA, OUTPUT, QUICK, dataset, picture, write
+from experiments.paper.weights import drives_config, trained_weights
+from rcirl_jax.data.joined import open_datasets
+from rcirl_jax.evaluation.closed_loop import SuiteConfig, SuiteResult, run_suite
+from rcirl_jax.evaluation.exact import holm
+from rcirl_jax.evaluation.statistics import (
+    Difference,
+    combine_seeds,
+    family_clusters,
+    paired_difference,
+)
+from rcirl_jax.export.closed_loop import table_rows
+from rcirl_jax.report.intervals import interval_chart
+from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics, nuplan_score
+from rcirl_jax.simulation.suite import FULL_S, catalogue_set, suite_refs
+
+_RUNS = flags.DEFINE_integer("runs", 3, "training seeds of each loss", lower_bound=2)
+_CASES = flags.DEFINE_integer("cases", 10, "of each family", lower_bound=1)
+_SEED = flags.DEFINE_integer("catalogue_seed", 0, "of the cases", lower_bound=0)
+
+LOSSES = {"RC-IRL": "rank", "GAN": "gan"}
+RIVALS = ("hand-set", "IDM")
+UNITS = {**{name: "share of drives" for name in COLUMNS}, "progress": "m"}
+UNITS |= {"no fault": "share of drives", "nuPlan": "score"}
+DRAWN = ("a_station", "j_station", "progress", "nuPlan")
+
+
+def _measures(metrics: CaseMetrics, way: np.ndarray) -> dict[str, np.ndarray]:
+    """[C] of every measure of one row."""
+    holds = np.asarray(metrics.holds, np.float64)
+    found = {name: holds[:, i] for i, name in enumerate(COLUMNS)}
+    found["no fault"] = np.asarray(metrics.at_fault) == 0
+    found["progress"] = np.asarray(metrics.progress)
+    found["nuPlan"] = np.asarray(nuplan_score(metrics, jnp.asarray(way))[0])
+    return {name: np.asarray(x, np.float64) for name, x in found.items()}
+
+
+def _by_row(result: SuiteResult) -> dict[str, dict[str, np.ndarray]]:
+    """Row -> measure -> [runs, C]; runs of one loss are one row."""
+    each = {name: _measures(m, result.way) for name, m in result.runs.items()}
+    rows = {}
+    for row in (*LOSSES, *RIVALS):
+        runs = [x for name, x in each.items() if name.split(" (seed")[0] == row]
+        rows[row] = {key: np.stack([x[key] for x in runs]) for key in UNITS}
+    return rows
+
+
+def differences(
+    rows: Mapping[str, Mapping[str, np.ndarray]], a: str, b: str, cluster: np.ndarray
+) -> dict[str, tuple[Difference, float]]:
+    """Measure -> (a minus b, p after Holm over the measures)."""
+    found = {key: paired_difference(rows[a][key], rows[b][key], cluster)
+             for key in UNITS}  # fmt: skip
+    adjusted = holm(np.array([d.p for d in found.values()]))
+    return {k: (d, float(p)) for (k, d), p in zip(found.items(), adjusted, strict=True)}
+
+
+def main() -> None:
+    """Train, drive, compare, draw."""
+    quick, folder = QUICK.value, Path(OUTPUT.value)
+    data = DATA.value.split(",") if DATA.value else None
+    if data is None:
+        dataset()
+        data = sorted(str(path) for path in folder.glob("synthetic_*"))
+    files, names = [], []
+    for row, loss in LOSSES.items():
+        for seed in range(2 if quick else _RUNS.value):
+            config = drives_config(quick=quick, seed=seed, loss=loss)
+            file = trained_weights(folder, f"{loss}_{seed}", data, config)
+            files.append(str(file))
+            names.append(f"{row} (seed {seed})")
+    which, duration = ("free_cruise,stopped_lead", 10.0) if quick else ("full", FULL_S)
+    refs = suite_refs(which, 1 if quick else _CASES.value, _SEED.value)
+    drivers = table_rows(files, RIVALS, names=names)
+    result = run_suite(drivers, catalogue_set(refs, duration), SuiteConfig())
+    rows, cluster = _by_row(result), family_clusters(result.cases.groups)
+    table = {
+        row: {key: combine_seeds(x, cluster) for key, x in found.items()}
+        for row, found in rows.items()
+    }
+    tests = {
+        f"{a} minus {b}": differences(rows, a, b, cluster)
+        for a, b in (("RC-IRL", "GAN"), ("RC-IRL", "hand-set"), ("GAN", "hand-set"))
+    }
+    for words, found in tests.items():
+        for key, (d, p) in found.items():
+            apart = f"{d.mean:+.3f} [{d.low:+.3f}, {d.high:+.3f}]"
+            print(f"{words}: {key}: {apart} {UNITS[key]}, Holm p {p:.3f}")
+    interval_chart(
+        picture("closed_loop_seeds"),
+        {key: (key, UNITS[key]) for key in DRAWN},
+        {
+            row: {key: (e.value, e.low, e.high) for key, e in found.items()}
+            for row, found in table.items()
+        },
+        3.2,
+    )
+    body = {
+        "cases": len(result.cases.ids),
+        "duration_s": duration,
+        "rows": {
+            row: {k: dataclasses.asdict(e) for k, e in found.items()}
+            for row, found in table.items()
+        },
+        "runs": {
+            row: {key: x.mean(axis=1).tolist() for key, x in found.items()}
+            for row, found in rows.items()
+        },
+        "tests": {
+            words: {
+                k: {**dataclasses.asdict(d), "p_holm": p} for k, (d, p) in x.items()
+            }
+            for words, x in tests.items()
+        },
+    }
+    write("closed_loop_seeds", body, open_datasets(data))
+
+
+if __name__ == "__main__":
+    run(main)
