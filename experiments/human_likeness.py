@@ -81,11 +81,14 @@ def main() -> None:
     write_whole(folder / "table.txt", format_table(report, 118))
     write_whole(folder / "table.md", markdown_table(report))
     made_by = {**provenance(), "data_hash": dataset.hash}
-    body = {**to_json(report), "split": words, "made_by": made_by}
+    failed = [name for name, runs in learned.items() if not all(x.finite for x in runs)]
+    body = {**to_json(report), "split": words, "not_finite": failed, "made_by": made_by}
     write_json(folder / "ranking.json", body)
     picture = ranking_chart(folder / "ranking.png", report)
     print(f"{format_table(report, 118, differences=False)}\nsplit: {words}")
     print(f"written: {folder}/ranking.json, table.md, {picture.name}")
+    if failed:
+        print(f"steps were refused for a NaN or infinity: {', '.join(failed)}")
     print(f"with paired differences: {folder}/table.txt")
 
 

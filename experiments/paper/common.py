@@ -18,7 +18,7 @@ from rcirl_jax.evaluation.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.evaluation.learners import Learned, scorers
 from rcirl_jax.evaluation.table import RankingReport
 from rcirl_jax.report.intervals import Interval
-from rcirl_jax.train.state import TrainConfig
+from rcirl_jax.train.state import POSITIVES, TrainConfig
 from rcirl_jax.whole import write_json
 
 DATA = flags.DEFINE_string("data", None, "dataset (default: synthetic traffic)")
@@ -29,6 +29,9 @@ EPOCHS = flags.DEFINE_integer(
 )
 HORIZON = flags.DEFINE_float(
     "horizon", 5.0, "s at which distances are taken", lower_bound=0.4, upper_bound=8.0
+)
+POSITIVE = flags.DEFINE_enum(
+    "positive", "nearest", POSITIVES, "trained on, where the experiment leaves it open"
 )
 QUICK = flags.DEFINE_bool("quick", False, "few scenes, two seeds, two epochs")
 
@@ -79,7 +82,7 @@ def base(**changes: object) -> TrainConfig:
     """The shared training configuration with some changes."""
     shared: dict = {
         "loss": "logistic",
-        "positive": "nearest",
+        "positive": POSITIVE.value,
         "epochs": 2 if QUICK.value else EPOCHS.value,
         "train_horizon": HORIZON.value,
     }

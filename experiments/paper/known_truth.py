@@ -42,12 +42,21 @@ from rcirl_jax.evaluation.learners import (
 )
 from rcirl_jax.report.intervals import curves_panel
 from rcirl_jax.report.style import figure, label, save
+from rcirl_jax.reward import RewardConfig
+from rcirl_jax.reward.network import PINS
 
 _COUNTS = flags.DEFINE_list(
     "counts", ["30", "100", "300", "1000", "3000"], "training scenes"
 )
 _TEMPERATURE = flags.DEFINE_float("temperature", 0.0, "of the experts, in values", 0.0)
-ROWS = ("RC-IRL rank", "RC-IRL logistic", "MaxEnt", "GAN")
+_LEARNERS = flags.DEFINE_list(
+    "learners",
+    ["RC-IRL rank", "RC-IRL logistic", "MaxEnt", "GAN"],
+    "rows, two at least",
+)
+_PIN = flags.DEFINE_enum(
+    "pin", "unit", PINS, "scale of the learners' values; the hidden one's is unit"
+)
 
 
 def main() -> None:
@@ -62,11 +71,14 @@ def main() -> None:
         raise InputError(
             f"--counts: {_COUNTS.value}: expected two that differ, up to {most}"
         )
+    rows, pin = _LEARNERS.value, RewardConfig(pin=_PIN.value)
+    if len(rows) < 2:
+        raise InputError(f"--learners: {','.join(rows)}: expected two at least")
     runs = seeds(least=2)
-    same = {name: np.zeros((len(runs), len(counts))) for name in ROWS}
-    regret = {name: np.zeros((len(runs), len(counts))) for name in ROWS}
+    same = {name: np.zeros((len(runs), len(counts))) for name in rows}
+    regret = {name: np.zeros((len(runs), len(counts))) for name in rows}
     bar = tqdm.tqdm(
-        total=len(runs) * len(counts) * len(ROWS), desc="train", unit="learner"
+        total=len(runs) * len(counts) * len(rows), desc="train", unit="learner"
     )
     for i, seed in enumerate(runs):
         hidden = hidden_reward(1000 + seed, normaliser_of(train, config))
@@ -74,14 +86,31 @@ def main() -> None:
         order = np.random.default_rng(seed).permutation(most)
         for j, count in enumerate(counts):
             part = jax.tree.map(lambda x, at=order[:count]: x[at], shown)
-            for name in ROWS:
+            for name in rows:
                 epochs = max(round(base().epochs * most / count), 1)
-                own = learner_config(name, base(epochs=epochs, positive="human"))
+                shared = base(epochs=epochs, positive="human", reward=pin)
+                own = learner_config(name, shared)
                 (learned,) = train_learner(part, own, [seed])
                 found = agreement(test, hidden, learned)
                 same[name][i, j], regret[name][i, j] = found
                 bar.update()
     bar.close()
+    _draw(counts, same, regret)
+    for name in rows:
+        print(f"{name:16s} same choice " + "  ".join(
+            f"{n}: {x:.2f}" for n, x in zip(counts, same[name].mean(0), strict=True)
+        ))  # fmt: skip
+    tested = differences(same, against="GAN" if "GAN" in rows else rows[-1])
+    for words, (d, p) in tested.items():
+        print(f"{words}: {d.mean:+.3f} [{d.low:+.3f}, {d.high:+.3f}], Holm p {p:.3f}")
+    body = {n: {"same": same[n].tolist(), "regret": regret[n].tolist()} for n in rows}
+    tests = {w: {**dataclasses.asdict(d), "p_holm": p} for w, (d, p) in tested.items()}
+    write("known_truth", {"counts": counts, "rows": body, "tests": tests}, data)
+
+
+def _draw(
+    counts: list[int], same: dict[str, np.ndarray], regret: dict[str, np.ndarray]
+) -> None:
     made, axes = figure(1, 2, 11.0, 4.2)
     curves_panel(axes[0, 0], counts, same)
     label(axes[0, 0], "same choice as the hidden reward", "scenes", "share, 2 s.e.")
@@ -90,16 +119,6 @@ def main() -> None:
     for axis in axes[0]:
         axis.set_xscale("log")
     save(made, picture("known_truth"))
-    for name in ROWS:
-        print(f"{name:16s} same choice " + "  ".join(
-            f"{n}: {x:.2f}" for n, x in zip(counts, same[name].mean(0), strict=True)
-        ))  # fmt: skip
-    tested = differences(same, against="GAN")
-    for words, (d, p) in tested.items():
-        print(f"{words}: {d.mean:+.3f} [{d.low:+.3f}, {d.high:+.3f}], Holm p {p:.3f}")
-    body = {n: {"same": same[n].tolist(), "regret": regret[n].tolist()} for n in ROWS}
-    tests = {w: {**dataclasses.asdict(d), "p_holm": p} for w, (d, p) in tested.items()}
-    write("known_truth", {"counts": counts, "rows": body, "tests": tests}, data)
 
 
 if __name__ == "__main__":

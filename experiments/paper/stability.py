@@ -4,10 +4,10 @@
 
 Every learner of `LEARNERS` with every optimiser at the defaults of
 `experiments.train` (20 epochs, step size 0.003, the human's curve as the
-positive) on one dataset. A step whose loss or gradient is not finite is refused
-by the trainer and counts as a failure here. Expected: no failure; exit code 1
-otherwise. How many pairs each wins is drawn, not judged. 20 minutes on two cores
-with US-101; `--quick`: two minutes.
+positive unless --positive=nearest) on one dataset. A step whose loss or gradient is
+not finite is refused by the trainer and counts as a failure here. Expected: no
+failure; exit code 1 otherwise. How many pairs each wins is drawn, not judged. 20
+minutes on two cores with US-101; `--quick`: two minutes.
 """
 
 import sys
@@ -17,7 +17,7 @@ import tqdm
 from absl import flags
 
 from experiments.common import run
-from experiments.paper.common import QUICK, dataset, picture, write
+from experiments.paper.common import POSITIVE, QUICK, dataset, picture, write
 from rcirl_jax.evaluation.learners import (
     LEARNERS,
     FrozenSets,
@@ -38,11 +38,14 @@ def main() -> None:
     data = dataset()
     sets, rows = FrozenSets(data), {}
     epochs = 2 if QUICK.value else TrainConfig().epochs
+    # the flag's default here is that of the trainer
+    positive = POSITIVE.value if POSITIVE.present else TrainConfig().positive
     grid = [
         (name, how, config)
         for how in sorted(OPTIMIZERS)
         for name, config in learner_configs(
-            _LEARNERS.value, TrainConfig(optimizer=how, epochs=epochs)
+            _LEARNERS.value,
+            TrainConfig(optimizer=how, epochs=epochs, positive=positive),
         ).items()
     ]
     grid = grid[::5] if QUICK.value else grid

@@ -72,6 +72,10 @@ def weights_supported(
 ) -> IdentifiabilityReport:
     """Which weights of a trained linear reward the data support.
 
+    Of a non-negative one these are two for each feature, of its part above the
+    training median and of its part below, and any sign is allowed here: that the
+    data ask for a cost shows in an interval below 0.
+
     Args:
       run: trained with `hidden = ()`; its gamma is taken as known, with a mean of
         1 over the times: only the product with the weights is in the reward.
@@ -81,13 +85,15 @@ def weights_supported(
     gauge = float(np.mean(pinned(run.params, run.config.reward).gamma))
     human, candidates = (phi / gauge for phi in sums_over_time(run, frozen))
     specs = feature_map(run.config.features).specs
+    sided = run.config.reward.constraint == "nonnegative"
+    sides = (" above", " below") if sided else ("",)
     return identify(
         candidates - human[:, None],
         np.asarray(frozen.feasible),
         np.asarray(vehicle),
-        np.asarray(run.normaliser.scale),
-        [spec.name for spec in specs],
-        [spec.unit for spec in specs],
+        np.tile(np.asarray(run.normaliser.scale), len(sides)),
+        [f"{spec.name}{side}" for side in sides for spec in specs],
+        [spec.unit for spec in specs] * len(sides),
     )
 
 

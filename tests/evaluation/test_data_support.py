@@ -31,6 +31,9 @@ FREE = dataclasses.replace(
     reward=RewardConfig(pin="none"),
 )
 LINEAR = dataclasses.replace(FREE, reward=RewardConfig(hidden=(), pin="none"))
+STRICT = dataclasses.replace(
+    FREE, reward=RewardConfig(hidden=(), pin="none", constraint="nonnegative")
+)
 NAMES = feature_map("paper21").names
 VEHICLE = np.arange(16) // 2
 
@@ -50,7 +53,9 @@ def values(run: Learned):
     return run.scorer(np.asarray(made.points), np.asarray(made.points_valid))
 
 
-@pytest.mark.parametrize("config", [FREE, LINEAR], ids=["network", "linear"])
+@pytest.mark.parametrize(
+    "config", [FREE, LINEAR, STRICT], ids=["network", "linear", "strict"]
+)
 def test_sums_over_time_times_the_output_weights_are_the_values(config):
     (run, _) = trained(config)
     w = np.asarray(pinned(run.params, config.reward).kernels[-1])[:, 0]
@@ -129,6 +134,20 @@ def test_supported_weights_name_the_presets_features():
     assert [row.name for row in report.features] == list(NAMES)
     assert report.pairs == int(np.asarray(frozen().feasible).sum())
     assert report.clusters == 8
+
+
+def test_costs_of_departures_are_two_for_each_feature():
+    """One for each side of the median; what the data ask for may have any sign."""
+    (run, _) = trained(STRICT)
+    report = weights_supported(run, frozen(), VEHICLE)
+    names = [row.name for row in report.features]
+    assert names == [f"{n} {s}" for s in ("above", "below") for n in NAMES]
+    units = [row.unit for row in report.features]
+    assert units[: len(NAMES)] == units[len(NAMES) :]
+    assert any(row.varies for row in report.features)
+    scale = np.asarray(run.normaliser.scale)
+    for row, of in zip(report.features, np.tile(scale, 2), strict=True):
+        assert row.normalised == pytest.approx(row.weight * of, rel=1e-5)
 
 
 def test_supported_weights_do_not_depend_on_the_size_and_sign_of_gamma():
