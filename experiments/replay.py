@@ -17,10 +17,14 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.export.closed_loop import table_rows
 from rcirl_jax.report.case_page import write_case_page
 from rcirl_jax.report.case_picture import animate_case, draw_case
-from rcirl_jax.simulation.metrics import MetricsConfig, case_metrics
-from rcirl_jax.simulation.rollout import drive_cases
 from rcirl_jax.simulation.rows import BASELINES, Row
-from rcirl_jax.simulation.suite import FULL_S, build, case_ref, rollout_config
+from rcirl_jax.simulation.suite import (
+    FULL_S,
+    build,
+    case_ref,
+    drive_with_logs,
+    rollout_config,
+)
 
 _WEIGHTS = flags.DEFINE_string("weights", None, "weights file", required=True)
 _CASE = flags.DEFINE_string("case", None, "id, for example cut_in/017@0", required=True)
@@ -43,11 +47,10 @@ def main() -> None:
         raise InputError(f"--duration: {_DURATION.value}: expected 1 to {FULL_S:g} s")
     ref, row, folder = case_ref(_CASE.value), _row(), Path(_OUTPUT.value)
     cases = build([ref], _DURATION.value)
-    config = rollout_config(row, _DURATION.value, _EVERY.value, snapshots=True)
-    logs = drive_cases(row.policy, row.params, cases, config)
+    config = rollout_config(row, _DURATION.value, _EVERY.value)
+    logs = drive_with_logs(row, cases, config)
     one = lambda x: np.asarray(x)[0]  # noqa: E731
-    case, record, shot = (jax.tree.map(one, x) for x in (cases, logs[0], logs[1]))
-    found = jax.tree.map(np.asarray, case_metrics(record, MetricsConfig()))
+    case, found, record, shot = (jax.tree.map(one, x) for x in (cases, *logs))
     title = f"{ref.id} driven by {row.name}"
     folder.mkdir(parents=True, exist_ok=True)
     picture = draw_case(case, record, shot, folder / "case.png", title)

@@ -24,9 +24,8 @@ from rcirl_jax.simulation.cases import (
     Snapshot,
 )
 from rcirl_jax.simulation.metrics import COLUMNS, MetricsConfig, case_metrics
-from rcirl_jax.simulation.rollout import LANES, drive_cases
 from rcirl_jax.simulation.rows import RECORDED_HUMAN, Row, human_row
-from rcirl_jax.simulation.suite import CaseSet, rollout_config
+from rcirl_jax.simulation.suite import CaseSet, drive_with_logs, rollout_config
 from rcirl_jax.types import Kind
 from rcirl_jax.units import TIMES_S
 
@@ -86,9 +85,9 @@ def make_replays(
 ) -> list[Replay]:
     """Drive the named cases with every row, and with the recorded human if any.
 
-    The drives are those of the suite but for the last digit: another program is
-    compiled to keep the agents, and traffic is chaotic. The numbers of a replay
-    are its own.
+    On a CPU the drives are those of the suite (`drive_with_logs`); elsewhere they
+    differ in the last digit, and traffic is chaotic: then a replay's numbers are its
+    own.
 
     Args:
       rows: who drives; names differ.
@@ -107,19 +106,18 @@ def make_replays(
         return []
     places = [cases.ids.index(name) for name in ids]
     built = [cases.build(place, place + 1) for place in places]
-    taken = np.minimum(np.arange(LANES), len(ids) - 1)
-    every = jax.tree.map(lambda *x: np.concatenate(x)[taken], *built)
+    every = jax.tree.map(lambda *x: np.concatenate(x), *built)
     if every.replay is None:
         rows = [row for row in rows if not row.follow_log]
     elif not any(row.follow_log for row in rows):
         rows = [*rows, human_row()]
     drives: list[list[Drive]] = [[] for _ in ids]
     for row in rows:
-        config = rollout_config(row, cases.duration_s, plan_every, snapshots=True)
-        logs = drive_cases(row.policy, row.params, every, config)
+        config = rollout_config(row, cases.duration_s, plan_every)
+        _, *logs = drive_with_logs(row, every, config)
         for number in range(len(ids)):
             case, record, shot = jax.tree.map(
-                lambda x, at=number: np.asarray(x[at]), (every, *logs[:2])
+                lambda x, at=number: np.asarray(x[at]), (every, *logs)
             )
             drives[number].append(thin(row.name, case, record, shot))
     return [

@@ -122,9 +122,9 @@ def _suite(report: TuningReport) -> str:
 
 def _played(report: TuningReport) -> str:
     lead = paragraph(
-        "Driven again for this page, every row in the same case. A drive's numbers are "
-        "its own: keeping the pictures rounds the last digit differently than the "
-        "suite, and traffic can make more of that."
+        "Driven again for this page, every row in the same case. On a CPU these are "
+        "the suite's own drives; elsewhere another program rounds the last digit "
+        "differently, and traffic can make more of that."
     )
     return lead + player(report.replays)
 

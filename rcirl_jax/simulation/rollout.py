@@ -148,10 +148,13 @@ def _compiled(
     reduce: Callable[[Record], Logs] | None,
     config: RolloutConfig,
     relief: Policy | None,
+    keep: bool,
 ) -> Callable:
     def run(params: Params, case: Case) -> Logs:
         logs = drive_case(policy, params, case, config, relief)
-        return logs if reduce is None else reduce(logs[0])
+        if reduce is None:
+            return logs
+        return (reduce(logs[0]), logs) if keep else reduce(logs[0])
 
     return jax.jit(jax.vmap(run, in_axes=(None, 0)))
 
@@ -169,21 +172,39 @@ def drive_cases(
     config: RolloutConfig,
     reduce: Callable[[Record], Logs] | None = None,
     relief: Policy | None = None,
+    *,
+    keep: bool = False,
 ) -> Logs:
     """All cases [B]: (records, snapshots, scenes), or what `reduce` makes of them.
 
-    With `reduce` the records never leave the device. On a CPU a batch that is a
-    multiple of `LANES` runs in groups of that many, else all cases at once.
+    On a CPU a batch that is a multiple of `LANES` runs in groups of that many, else
+    all cases at once. With `reduce` the records never leave the device; on a CPU,
+    where they need not move, they are made and dropped: so one program serves the
+    suite and the pictures of its cases, and draws the very drives.
+
+    Args:
+      policy: who drives.
+      params: its weights.
+      cases: leaves [B, ...].
+      config: of the rollouts.
+      reduce: record [S] -> what is wanted of it.
+      relief: drives in turn with the policy.
+      keep: with `reduce` (what it makes, logs with snapshots) instead.
     """
-    drive = _compiled(policy, reduce, config, relief)
     total = cases.steps.shape[0]
-    if total % LANES or jax.default_backend() != "cpu":
+    in_groups = total % LANES == 0 and jax.default_backend() == "cpu"
+    keeps = reduce is not None and (keep or in_groups)
+    if keeps:
+        config = dataclasses.replace(config, snapshots=True)
+    drive = _compiled(policy, reduce, config, relief, keeps)
+    if not in_groups:
         return drive(params, cases)
 
     def group(first: int) -> Logs:
         lanes = slice(first, first + LANES)
         part = jax.tree.map(lambda leaf: leaf[lanes], cases)
-        return jax.block_until_ready(drive(params, part))
+        made = jax.block_until_ready(drive(params, part))
+        return made[0] if keeps and not keep else made
 
     # a group keeps one core busy: its operations are too small to be shared
     with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:

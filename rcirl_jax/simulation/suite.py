@@ -18,7 +18,7 @@ import numpy as np
 
 from rcirl_jax.data.recording import Recording
 from rcirl_jax.errors import InputError
-from rcirl_jax.simulation.cases import STEP_S, Case
+from rcirl_jax.simulation.cases import STEP_S, Case, Record, Snapshot
 from rcirl_jax.simulation.catalogue import (
     build_cases,
     case_id,
@@ -185,6 +185,27 @@ class _Reduce:
         if config not in cls.made:
             cls.made[config] = lambda record: case_metrics(record, config)
         return cls.made[config]
+
+
+def drive_with_logs(
+    row: Row, cases: Case, config: RolloutConfig, metrics: MetricsConfig | None = None
+) -> tuple[CaseMetrics, Record, Snapshot]:
+    """Drive a few cases [n] as `drive_row` does, and keep what pictures need.
+
+    On a CPU these are the suite's own drives, to the bit; elsewhere another batch is
+    another program, which rounds the last digit differently, and traffic is chaotic.
+
+    Returns:
+      numpy leaves: metrics [n], record and snapshots [n, S].
+    """
+    count = cases.steps.shape[0]
+    fill = np.minimum(np.arange(-(-count // LANES) * LANES), count - 1)
+    full = jax.tree.map(lambda leaf: np.asarray(leaf)[fill], cases)
+    reduce = _Reduce.of(metrics or MetricsConfig())
+    made, (record, shots, _) = drive_cases(
+        row.policy, row.params, full, config, reduce, keep=True
+    )
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[:count], (made, record, shots))
 
 
 def drive_row(

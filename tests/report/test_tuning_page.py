@@ -23,12 +23,15 @@ from rcirl_jax.report.replays import AHEAD_M, BEHIND_M, FRAME_STEPS, make_replay
 from rcirl_jax.report.tuning_page import write_tuning_page
 from rcirl_jax.report.verdict_sections import outcome_of
 from rcirl_jax.sampling import SamplerConfig
+from rcirl_jax.simulation import rollout
 from rcirl_jax.simulation.cases import STEP_S
 from rcirl_jax.simulation.metrics import COLUMNS
 from rcirl_jax.simulation.recorded_config import RecordedConfig
 from rcirl_jax.simulation.rollout import LANES, drive_cases
 from rcirl_jax.simulation.suite import (
     catalogue_set,
+    drive_row,
+    drive_with_logs,
     recorded_set,
     rollout_config,
     suite_refs,
@@ -425,6 +428,23 @@ def test_frames_are_the_drives_own(replays):
                     assert station == pytest.approx(s[slot], abs=0.051)
             assert {int(a) for f in drive.agents for a in f[::4]} <= set(one.bodies)
             assert len(every.steps) == LANES
+
+
+def test_the_drives_are_those_of_the_suite():
+    """To the bit, and without another program: what the table says is what plays."""
+    cases, row = small_cases(), cheap_rows()[0]
+    config = rollout_config(row, cases.duration_s, 1)
+    suite = drive_row(row, cases.build, len(cases.ids), config, chunk=60)
+    before = rollout._compiled.cache_info().misses
+    at = cases.ids.index(PLAYED[0])
+    found, record, shot = drive_with_logs(row, cases.build(at, at + 1), config)
+    assert rollout._compiled.cache_info().misses == before
+    for mine, theirs in zip(
+        jax.tree.leaves(found), jax.tree.leaves(suite), strict=True
+    ):
+        np.testing.assert_array_equal(mine[0], theirs[at])
+    assert record.s.shape == (1, config.steps)
+    assert shot.plan_s.shape[:2] == (1, config.steps)
 
 
 def test_a_crash_ends_the_drive_and_shows_who_was_hit(replays):
