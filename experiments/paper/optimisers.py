@@ -5,7 +5,8 @@
 The paper's 21-15-1 network and rank loss with each optimiser at its own step
 size (momentum SGD needs a larger one), same candidates, same seeds: learning
 curves and held-out ranking. Expected: 5 minutes on two cores; Adam and RMSProp
-within each other's intervals, SGD behind. `--quick`: about a minute, its numbers
+within each other's intervals, SGD behind, clearly so with --positive=human, the
+paper's setting. `--quick`: about a minute, its numbers
 mean nothing.
 """
 
