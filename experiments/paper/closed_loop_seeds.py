@@ -8,7 +8,7 @@ and drive the same catalogue cases beside hand-set and IDM. Differences are pair
 case; their intervals resample families and seeds together, as `human_likeness`
 resamples vehicles and seeds. Weights that are there are kept and reused.
 Expected with three seeds of each loss and 230 cases of 120 s: an hour on one core
-with the drives of table II; no measure but way and comfort tells the two apart.
+with the drives of table II; no measure tells the two apart, their seeds differ more.
 `--quick`: two minutes, numbers without meaning.
 """
 
@@ -45,7 +45,13 @@ LOSSES = {"RC-IRL": "rank", "GAN": "gan"}
 RIVALS = ("hand-set", "IDM")
 UNITS = {**{name: "share of drives" for name in COLUMNS}, "progress": "m"}
 UNITS |= {"no fault": "share of drives", "nuPlan": "score"}
-DRAWN = ("a_station", "j_station", "progress", "nuPlan")
+# drawn: (unit, how many of the measure's)
+DRAWN = {
+    "a_station": ("share of drives", 1.0),
+    "j_station": ("share of drives", 1.0),
+    "progress": ("km", 1000.0),
+    "nuPlan": ("score", 1.0),
+}
 
 
 def _measures(metrics: CaseMetrics, way: np.ndarray) -> dict[str, np.ndarray]:
@@ -111,9 +117,12 @@ def main() -> None:
             print(f"{words}: {key}: {apart} {UNITS[key]}, Holm p {p:.3f}")
     interval_chart(
         picture("closed_loop_seeds"),
-        {key: (key, UNITS[key]) for key in DRAWN},
+        {key: (key, unit) for key, (unit, _) in DRAWN.items()},
         {
-            row: {key: (e.value, e.low, e.high) for key, e in found.items()}
+            row: {
+                key: (found[key].value / of, found[key].low / of, found[key].high / of)
+                for key, (_, of) in DRAWN.items()
+            }
             for row, found in table.items()
         },
         3.2,
