@@ -7,8 +7,7 @@
 Without --input: drives planned by `evaluation.label_cases`, whose decisions and
 tags are known, are labelled and compared; position noise as in NGSIM, or none.
 With --traffic=N instead: N simulated recordings of every entry of
-data_specs/sources/synthetic.toml, whose drivers' own state is the truth; the rules
-were never corrected on it.
+data_specs/sources/synthetic.toml, whose drivers' own state is the truth.
 With --input (any recorded format): the written cycle of every signal is tested
 against crossings and stands, and the stop labels against observed stands, with
 the signals that an import trusts and with all of them. With --data the labels

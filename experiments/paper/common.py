@@ -31,7 +31,10 @@ HORIZON = flags.DEFINE_float(
     "horizon", 5.0, "s at which distances are taken", lower_bound=0.4, upper_bound=8.0
 )
 POSITIVE = flags.DEFINE_enum(
-    "positive", "nearest", POSITIVES, "trained on, where the experiment leaves it open"
+    "positive",
+    None,
+    POSITIVES,
+    "trained on, where an experiment leaves it open",
 )
 QUICK = flags.DEFINE_bool("quick", False, "few scenes, two seeds, two epochs")
 
@@ -82,7 +85,7 @@ def base(**changes: object) -> TrainConfig:
     """The shared training configuration with some changes."""
     shared: dict = {
         "loss": "logistic",
-        "positive": POSITIVE.value,
+        "positive": POSITIVE.value or "nearest",
         "epochs": 2 if QUICK.value else EPOCHS.value,
         "train_horizon": HORIZON.value,
     }

@@ -39,7 +39,7 @@ def main() -> None:
     sets, rows = FrozenSets(data), {}
     epochs = 2 if QUICK.value else TrainConfig().epochs
     # the flag's default here is that of the trainer
-    positive = POSITIVE.value if POSITIVE.present else TrainConfig().positive
+    positive = POSITIVE.value or TrainConfig().positive
     grid = [
         (name, how, config)
         for how in sorted(OPTIMIZERS)
@@ -67,7 +67,7 @@ def main() -> None:
     label(axis, "training: first epoch to last", "share of pairs won", "")
     save(made, picture("stability"))
     print(f"{len(rows)} runs, not finite: {len(failed)} {failed or ''}")
-    write("stability", {"rows": rows, "failed": failed}, data)
+    write("stability", {"rows": rows, "failed": failed, "positive": positive}, data)
     if failed:
         sys.exit(1)
 

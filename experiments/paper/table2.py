@@ -14,6 +14,7 @@ families ahead of IDM and not to be told from hand-set. `--quick` makes the same
 files from a few cases in about three minutes; its numbers mean nothing.
 """
 
+import functools
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,6 +24,7 @@ from absl import flags
 from experiments.common import provenance, run
 from experiments.paper.weights import drives_config, trained_weights
 from rcirl_jax.data.importers import IMPORTERS, read_recordings
+from rcirl_jax.data.joined import open_datasets
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop import SuiteConfig, run_suite, write_suite
 from rcirl_jax.export.closed_loop import table_rows
@@ -91,7 +93,8 @@ def _weights(folder: Path, name: str, data: Sequence[Path]) -> Path:
     """One shape trained on drives and exported, made once."""
     changes = LEARNED[name.split("-")[0]]
     config = drives_config(quick=_QUICK.value, seed=_SEED.value, **changes)
-    return trained_weights(folder, name, data, config)
+    opened = functools.partial(open_datasets, [str(path) for path in data])
+    return trained_weights(folder, name, opened, config)
 
 
 def _trained(folder: Path) -> list[str]:

@@ -1,10 +1,10 @@
 """Weights files that the closed-loop experiments train from drives."""
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 from experiments.common import provenance
-from rcirl_jax.data.joined import open_datasets
+from rcirl_jax.data.joined import Demonstrations
 from rcirl_jax.export.from_run import export_run
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.state import TrainConfig
@@ -22,12 +22,15 @@ def drives_config(*, quick: bool, **changes: object) -> TrainConfig:
 
 
 def trained_weights(
-    folder: Path, name: str, data: Sequence[str | Path], config: TrainConfig
+    folder: Path, name: str, data: Callable[[], Demonstrations], config: TrainConfig
 ) -> Path:
-    """FOLDER/NAME.msgpack, trained on the datasets and exported; made once."""
+    """FOLDER/NAME.msgpack, trained on what `data` opens and exported; made once.
+
+    What a name stands for, its data and configuration, is the caller's to keep.
+    """
     file = folder / f"{name}.msgpack"
     if not file.exists():
-        dataset = open_datasets([str(path) for path in data])
+        dataset = data()
         train(dataset, folder / name, config, provenance=provenance())
         export_run(folder / name, dataset, file)
     return file

@@ -101,9 +101,10 @@ def _decide_ahead(row: dict, blocks: np.ndarray) -> np.ndarray:
     lasts = np.count_nonzero(blocks, axis=1) * (TIMES_S[1] - TIMES_S[0])
     back = STANDING_MPS * (TIMES_S[last] - TIMES_S[first])  # m, as of standing
     same_way = lower[slots, last] >= lower[slots, first] - back
-    # who leaves the view or the recording in the way does not end to be followed
+    # who drives out of view or of the recording does not end to be followed
     seen = row["obstacles.valid"] & row["time_valid"]
     to_the_end = last == blocks.shape[1] - 1 - np.argmax(seen[:, ::-1], axis=1)
+    to_the_end &= row["obstacles.speed"][slots, last] > MOVING_MPS
     lasts = np.where(to_the_end, TIMES_S[-1], lasts)
     lead = (TIMES_S[first] <= FOLLOW_ONSET_S) & (lasts >= FOLLOW_DURATION_S) & same_way
     return np.select(

@@ -2,7 +2,8 @@
 
 The drivers of `data.synthetic` follow, change lanes and stop by their own models. What
 they did is read from their lanes, stations and speeds without noise; nothing
-here reads `data/labels.py`, and its rules were never corrected on this traffic.
+here reads `data/labels.py`, whose rules were made before; one error in them was found
+and corrected by it (a lead that drives out of view).
 With E and O the lanes of the labelled driver and of another car over the window,
 and "ahead" of box before box:
 

@@ -93,7 +93,7 @@ def test_pieces_hold_the_scenes_of_the_whole(tmp_path, by_car):
 
 
 def test_a_crowded_minute_is_several_pieces(tmp_path, monkeypatch):
-    """Nothing is held that grows with the traffic; the scenes are the same."""
+    """The scenes held do not grow with the traffic; they are the same."""
     path = tmp_path / "log.csv"
     spec = {**write(path, rows_of()), "long_bytes": 1}
     minutes = cuts(path, spec)
@@ -115,6 +115,19 @@ def test_a_crowded_minute_is_several_pieces(tmp_path, monkeypatch):
     most = max(made.scenes.vehicle.size for made in windows if made.scenes is not None)
     assert most < 0.6 * max(made.scenes.vehicle.size for made in minutes)
     assert [made.progress for made in windows] == sorted(m.progress for m in windows)
+
+
+def test_windows_without_rows_are_no_pieces(tmp_path, monkeypatch):
+    """A last minute that ends early, cut into windows of which some are empty."""
+    path = tmp_path / "log.csv"
+    spec = {**write(path, rows_of(seconds=135.0)), "long_bytes": 1}
+    whole = scenes_by_name(cuts(path, spec))
+    monkeypatch.setattr(csv_stream, "MAX_ROWS", 200)
+    windows = cuts(path, spec)
+    assert set(scenes_by_name(windows)) == set(whole)
+    last = max(float(made.name.rpartition("-")[2]) for made in windows)
+    assert int(last) == 2
+    assert len({made.name for made in windows}) == len(windows)
 
 
 def test_a_vehicle_is_in_one_group_whatever_the_piece(tmp_path):

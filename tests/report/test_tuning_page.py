@@ -24,8 +24,9 @@ from rcirl_jax.report.tuning_page import write_tuning_page
 from rcirl_jax.report.verdict_sections import outcome_of
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.simulation import rollout
+from rcirl_jax.simulation import suite as suite_module
 from rcirl_jax.simulation.cases import STEP_S
-from rcirl_jax.simulation.metrics import COLUMNS
+from rcirl_jax.simulation.metrics import COLUMNS, MetricsConfig
 from rcirl_jax.simulation.recorded_config import RecordedConfig
 from rcirl_jax.simulation.rollout import LANES, drive_cases
 from rcirl_jax.simulation.suite import (
@@ -435,10 +436,13 @@ def test_the_drives_are_those_of_the_suite():
     cases, row = small_cases(), cheap_rows()[0]
     config = rollout_config(row, cases.duration_s, 1)
     suite = drive_row(row, cases.build, len(cases.ids), config, chunk=60)
-    before = rollout._compiled.cache_info().misses
+    reduce = suite_module._Reduce.of(MetricsConfig())
+    kept = dataclasses.replace(config, snapshots=True)
+    program = rollout._compiled(row.policy, reduce, kept, None, True)
+    assert program._cache_size() == 1
     at = cases.ids.index(PLAYED[0])
     found, record, shot = drive_with_logs(row, cases.build(at, at + 1), config)
-    assert rollout._compiled.cache_info().misses == before
+    assert program._cache_size() == 1
     for mine, theirs in zip(
         jax.tree.leaves(found), jax.tree.leaves(suite), strict=True
     ):

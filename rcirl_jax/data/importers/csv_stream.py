@@ -41,7 +41,8 @@ AFTER_S = 28.0  # s after it: the future of 8 s, smoothing, and the path beyond
 MAX_BLOCKS = 200_000  # pieces of one file; more mean a wrong unit of time
 SCRATCH = "rcirl-scratch-"  # how folders of scratch files begin
 LOCK = "lock"  # in such a folder, held while it is in use
-# own rows of a piece; of a minute with more, windows of it are pieces (10 kB a scene)
+# own rows of a piece, about; of a minute with more, windows of it are pieces, so that
+# the scenes held (10 kB each) are bounded; the minute's rows are read for each
 MAX_ROWS = 150_000
 MAX_WINDOWS = 60  # of a minute
 BUFFER_BYTES = 64 * 2**20  # bytes of rows held before they go to scratch files
@@ -384,7 +385,7 @@ class Spill:
         """
         code, minutes = self._minutes(recording)
         users: list[str] = list(self.texts.get("id", {}))
-        user = self.names.index("id")
+        t, user = self.names.index("t"), self.names.index("id")
         fragments = self._fragments(code, minutes, max_gap_s)
         start = min(seen for seen, *_ in fragments.values()) if fragments else 0.0
         total = sum(map(len, self.blocks.values()))
@@ -396,6 +397,8 @@ class Spill:
                 high = minute * BLOCK_S + (window + 1) * BLOCK_S / count
                 surroundings = low - BEFORE_S, high + AFTER_S
                 rows = np.concatenate(list(self._between(code, minute, *surroundings)))
+                if not np.any((rows[:, t] >= low) & (rows[:, t] < high)):
+                    continue
                 values = self._values(rows)
                 values["t"] = values["t"] - start
                 yield Piece(
