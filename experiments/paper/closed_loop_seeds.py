@@ -15,7 +15,7 @@ and no other measure tells the two apart.
 
 import dataclasses
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -66,12 +66,13 @@ def _measures(metrics: CaseMetrics, way: np.ndarray) -> dict[str, np.ndarray]:
     return {name: np.asarray(x, np.float64) for name, x in found.items()}
 
 
-def _by_row(result: SuiteResult) -> dict[str, dict[str, np.ndarray]]:
-    """Row -> measure -> [runs, C]; runs of one loss are one row."""
-    each = {name: _measures(m, result.way) for name, m in result.runs.items()}
+def _by_row(
+    result: SuiteResult, names: Mapping[str, Sequence[str]]
+) -> dict[str, dict[str, np.ndarray]]:
+    """Row -> measure -> [runs, C], from the names of each row's runs."""
     rows = {}
-    for row in (*LOSSES, *RIVALS):
-        runs = [x for name, x in each.items() if name.split(" (seed")[0] == row]
+    for row, own in names.items():
+        runs = [_measures(result.runs[name], result.way) for name in own]
         rows[row] = {key: np.stack([x[key] for x in runs]) for key in UNITS}
     return rows
 
@@ -94,7 +95,8 @@ def main() -> None:
     """Train, drive, compare, draw."""
     quick, folder = QUICK.value, Path(OUTPUT.value)
     data = open_datasets(DATA.value.split(",")) if DATA.value else dataset()
-    files, names = [], []
+    files: list[str] = []
+    names: dict[str, list[str]] = {row: [] for row in LOSSES}
     for row, loss in LOSSES.items():
         for seed in range(2 if quick else _RUNS.value):
             config = drives_config(quick=quick, seed=seed, loss=loss)
@@ -103,12 +105,15 @@ def main() -> None:
             name = f"{loss}_{seed}_{key}"
             file = trained_weights(folder, name, lambda: data, config)
             files.append(str(file))
-            names.append(f"{row} (seed {seed})")
+            names[row].append(f"{row} (seed {seed})")
     which, duration = ("free_cruise,stopped_lead", 10.0) if quick else ("full", FULL_S)
     refs = suite_refs(which, 1 if quick else _CASES.value, _SEED.value)
-    drivers = table_rows(files, RIVALS, names=names)
+    drivers = table_rows(
+        files, RIVALS, names=[x for own in names.values() for x in own]
+    )
     result = run_suite(drivers, catalogue_set(refs, duration), SuiteConfig())
-    rows, cluster = _by_row(result), family_clusters(result.cases.groups)
+    names |= {row: [row] for row in RIVALS}
+    rows, cluster = _by_row(result, names), family_clusters(result.cases.groups)
     table = {
         row: {key: combine_seeds(x, cluster) for key, x in found.items()}
         for row, found in rows.items()

@@ -10,6 +10,8 @@ import collections
 import dataclasses
 from collections.abc import Iterable
 
+import tqdm
+
 from rcirl_jax.evaluation.exact import clopper_pearson
 from rcirl_jax.types import Decision, Tag
 
@@ -80,17 +82,36 @@ def _rate(k: int, n: int) -> tuple[float, float, float] | None:
     return (k / n, *clopper_pearson(k, n)) if n else None
 
 
-def report(
-    noise: str, cases: int, dropped: dict[str, int], verdicts: list[Verdict]
+def count_verdicts(
+    judged: Iterable[list[Verdict] | str],
+    noise: str,
+    words: str,
+    total: int | None = None,
 ) -> LabelReport:
-    """Count the verdicts, class by class."""
+    """Count the verdicts of scenes as they come, class by class.
+
+    Args:
+      judged: verdicts of each scene, or why it was dropped.
+      noise: of the positions, for the report.
+      words: of the progress bar.
+      total: scenes that are expected, if known.
+    """
+    verdicts: list[Verdict] = []
+    dropped: collections.Counter[str] = collections.Counter()
+    cases = 0
+    for found in tqdm.tqdm(judged, desc=f"{words} {noise}", total=total, unit="scene"):
+        cases += 1
+        if isinstance(found, str):
+            dropped[found] += 1
+        else:
+            verdicts += found
     decisions = [v for v in verdicts if v[0] == "decision"]
     tags = [v for v in verdicts if v[0] == "tag"]
     wrong = collections.Counter(v for v in verdicts if v[2] != v[3])
     return LabelReport(
         noise=noise,
         cases=cases,
-        dropped=dropped,
+        dropped=dict(dropped),
         decisions=tuple(_score(d.name, decisions) for d in Decision),
         tags=tuple(_score(t.name, tags) for t in Tag),
         errors=tuple((*key, count) for key, count in wrong.most_common()),

@@ -4,12 +4,10 @@ Every family of drives counts alike, which is harder than traffic: precision
 depends on how often each class and each near miss occurs.
 """
 
-import collections
 import functools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-import tqdm
 
 from rcirl_jax.data.collect import Collector
 from rcirl_jax.data.config import CollectConfig
@@ -18,15 +16,15 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.label_cases import (
     FAMILIES,
     HISTORY_S,
-    NOISES,
     RATE_HZ,
     Case,
     Mover,
     at,
+    check_noise,
     draw,
     to_recording,
 )
-from rcirl_jax.evaluation.label_scores import LabelReport, Verdict, report
+from rcirl_jax.evaluation.label_scores import LabelReport, Verdict, count_verdicts
 from rcirl_jax.executor import Executor, Here
 from rcirl_jax.types import Decision, Kind
 from rcirl_jax.units import TIMES_S
@@ -61,23 +59,14 @@ def measure(
     """
     if cases < 1:
         raise InputError(f"--cases: {cases}: expected at least 1")
-    if noise not in NOISES:
-        raise InputError(f"--noise: {noise}: expected one of {', '.join(NOISES)}")
+    check_noise(noise)
     names = list(families) or list(FAMILIES)
     unknown = [name for name in names if name not in FAMILIES]
     if unknown:
         raise InputError(f"families: {unknown[0]}: expected of {', '.join(FAMILIES)}")
-    verdicts: list[Verdict] = []
-    dropped: collections.Counter[str] = collections.Counter()
     work = functools.partial(_judged, cases=cases, noise=noise, seed=seed)
     judged = (executor or Here()).stream(work, names)
-    total = cases * len(names)
-    for found in tqdm.tqdm(judged, desc=f"label {noise}", total=total, unit="case"):
-        if isinstance(found, str):
-            dropped[found] += 1
-        else:
-            verdicts += found
-    return report(noise, total, dict(dropped), verdicts)
+    return count_verdicts(judged, noise, "label", cases * len(names))
 
 
 def _judged(

@@ -159,9 +159,7 @@ def recorded_set(recordings: Iterable[Recording], config: RecordedConfig) -> Cas
     )
 
 
-def rollout_config(
-    row: Row, duration_s: float, plan_every: int, snapshots: bool = False
-) -> RolloutConfig:
+def rollout_config(row: Row, duration_s: float, plan_every: int) -> RolloutConfig:
     """How a row drives cases of a duration."""
     every = row.plan_every or plan_every
     steps = round(duration_s / STEP_S)
@@ -171,7 +169,6 @@ def rollout_config(
         follow_log=row.follow_log,
         command_delay=row.command_delay,
         braking_jerk=row.braking_jerk,
-        snapshots=snapshots,
     )
 
 

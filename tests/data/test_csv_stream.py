@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rcirl_jax.data.cut import Part, cut
-from rcirl_jax.data.importers import csv_stream, parts, read_part
+from rcirl_jax.data.importers import csv_stream, parts, read_part, scratch
 from rcirl_jax.data.importing import import_parts
 from rcirl_jax.data.store import open_dataset
 from rcirl_jax.errors import InputError
@@ -251,15 +251,15 @@ print(rows, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 
 
 def test_scratch_files_of_killed_imports_are_removed(tmp_path, monkeypatch):
-    monkeypatch.setattr(csv_stream.tempfile, "tempdir", str(tmp_path))
-    left, used = (tmp_path / f"{csv_stream.SCRATCH}{name}" for name in "ab")
+    monkeypatch.setattr(scratch.tempfile, "tempdir", str(tmp_path))
+    left, used = (tmp_path / f"{scratch.SCRATCH}{name}" for name in "ab")
     for folder in (left, used):
         folder.mkdir()
-        (folder / csv_stream.LOCK).touch()
+        (folder / scratch.LOCK).touch()
         (folder / "0_0").write_bytes(b"rows")
-    with (used / csv_stream.LOCK).open() as file:
+    with (used / scratch.LOCK).open() as file:
         fcntl.flock(file, fcntl.LOCK_EX)  # by an import that still runs
-        with csv_stream.scratch() as own:
+        with scratch.scratch() as own:
             assert own.parent == tmp_path
             assert not left.exists()
             assert (used / "0_0").exists()

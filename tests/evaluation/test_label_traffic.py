@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation import label_traffic
 from rcirl_jax.evaluation.label_cases import Case, Mover
 from rcirl_jax.evaluation.label_cases.scenes import START_M, drive
 from rcirl_jax.evaluation.label_scores import format_labels
-from rcirl_jax.evaluation.label_traffic import cuts_in, decision, measure_traffic
+from rcirl_jax.evaluation.label_traffic import measure_traffic
 from rcirl_jax.evaluation.label_truth import judge
+from rcirl_jax.evaluation.traffic_truth import Drive, cuts_in, decision
 from rcirl_jax.types import Decision
 
 ROADS = ("arterial_signals", "highway_s_curve")
@@ -58,7 +58,7 @@ def car(s, lanes, v=20.0, width=1.8):
     """A car that drives v from s, in these lanes (a mask, or one per sample)."""
     masks = np.broadcast_to(np.asarray(lanes), COUNT)
     middle = np.log2(np.maximum(masks & -masks, 1))
-    return label_traffic._Drive(
+    return Drive(
         s=s + v * CLOCK, l=-3.6 * middle, v=np.full(COUNT, v), lanes=masks,
         length=4.6, width=width,
     )  # fmt: skip

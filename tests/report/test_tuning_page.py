@@ -395,7 +395,8 @@ def driven(row, cases, count):
     """Record and snapshots of the first cases, as the replays drive them."""
     at = np.minimum(np.arange(LANES), count - 1)
     full = jax.tree.map(lambda x: np.asarray(x)[at], cases.build(0, count))
-    config = rollout_config(row, cases.duration_s, 1, snapshots=True)
+    config = rollout_config(row, cases.duration_s, 1)
+    config = dataclasses.replace(config, snapshots=True)
     logs = drive_cases(row.policy, row.params, full, config)
     return full, jax.tree.map(np.asarray, logs[0]), jax.tree.map(np.asarray, logs[1])
 

@@ -17,10 +17,8 @@ pyarrow reads a CSV (extra `[logs]`); an importer may bring a reader of its own.
 
 import contextlib
 import dataclasses
-import fcntl
 import importlib
-import shutil
-import tempfile
+import itertools
 from collections.abc import Callable, Container, Iterator
 from pathlib import Path
 from typing import Any, NoReturn
@@ -28,6 +26,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from rcirl_jax.data.importers.reading import reading
+from rcirl_jax.data.importers.scratch import scratch
 from rcirl_jax.data.importers.tables import check_cells, number, read_header
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Recording, Track
@@ -39,10 +38,8 @@ BLOCK_S = 60.0  # s of a piece
 BEFORE_S = 5.0  # s of rows before it: history and the smoothing window
 AFTER_S = 28.0  # s after it: the future of 8 s, smoothing, and the path beyond
 MAX_BLOCKS = 200_000  # pieces of one file; more mean a wrong unit of time
-SCRATCH = "rcirl-scratch-"  # how folders of scratch files begin
-LOCK = "lock"  # in such a folder, held while it is in use
 # own rows of a piece, about; of a minute with more, windows of it are pieces, so that
-# the scenes held (10 kB each) are bounded; the minute's rows are read for each
+# the scenes held (10 kB each) are bounded
 MAX_ROWS = 150_000
 MAX_WINDOWS = 60  # of a minute
 BUFFER_BYTES = 64 * 2**20  # bytes of rows held before they go to scratch files
@@ -118,20 +115,6 @@ def spilled(
             raise InputError(f"{path}: rows: none: expected one at least")
         spill.flush()
         yield spill
-
-
-@contextlib.contextmanager
-def scratch() -> Iterator[Path]:
-    """A locked folder for scratch files; removes those that killed imports left."""
-    for left in Path(tempfile.gettempdir()).glob(f"{SCRATCH}*/{LOCK}"):
-        with contextlib.suppress(OSError), left.open() as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # not while in use
-            shutil.rmtree(left.parent, ignore_errors=True)
-    with tempfile.TemporaryDirectory(prefix=SCRATCH) as name:
-        folder = Path(name)
-        with (folder / LOCK).open("w") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
-            yield folder
 
 
 def pieces(path: Path, fields: list[Field], max_gap_s: float) -> Iterator[Piece]:
@@ -235,6 +218,11 @@ def _refuse(path: Path, names: list[str], numeric: list[str], why: str) -> NoRet
     raise InputError(f"{path}: {reason}: expected rows as the header says")
 
 
+def _within(rows: np.ndarray, t: int, begin: float, end: float) -> np.ndarray:
+    """Rows whose column t lies in [begin, end) s."""
+    return rows[(rows[:, t] >= begin) & (rows[:, t] < end)]
+
+
 class Spill:
     """Rows by recording and minute in scratch files of float64."""
 
@@ -319,21 +307,6 @@ class Spill:
         raw = np.fromfile(self.folder / f"{code}_{minute}", np.float64)
         return raw.reshape(-1, len(self.names))
 
-    def _count(self, code: int, minute: int) -> int:
-        """Rows of a minute, without reading them."""
-        size = (self.folder / f"{code}_{minute}").stat().st_size
-        return size // (8 * len(self.names))
-
-    def _between(
-        self, code: int, minute: int, begin: float, end: float
-    ) -> Iterator[np.ndarray]:
-        """Rows of t in [begin, end) s of a minute and the two beside it."""
-        t = self.names.index("t")
-        for near in (minute - 1, minute, minute + 1):
-            if near * BLOCK_S < end and (near + 1) * BLOCK_S > begin:
-                rows = self._rows(code, near)
-                yield rows[(rows[:, t] >= begin) & (rows[:, t] < end)]
-
     def minutes(self, recording: str | None) -> Iterator[dict[str, np.ndarray]]:
         """Field -> [n] of each minute alone, t as in the file."""
         code, minutes = self._minutes(recording)
@@ -390,15 +363,17 @@ class Spill:
         start = min(seen for seen, *_ in fragments.values()) if fragments else 0.0
         total = sum(map(len, self.blocks.values()))
         for minute in minutes:
-            count = min(-(-self._count(code, minute) // MAX_ROWS), MAX_WINDOWS)
-            for window in range(count):
+            begin, end = minute * BLOCK_S, (minute + 1) * BLOCK_S
+            near = np.concatenate([self._rows(code, minute + k) for k in (-1, 0, 1)])
+            near = _within(near, t, begin - BEFORE_S, end + AFTER_S)
+            own = _within(near, t, begin, end)[:, t]
+            count = min(-(-own.size // MAX_ROWS), MAX_WINDOWS)
+            edges = np.linspace(begin, end, count + 1).tolist()
+            for window, (low, high) in enumerate(itertools.pairwise(edges)):
                 self.given += 1 / count
-                low = minute * BLOCK_S + window * BLOCK_S / count
-                high = minute * BLOCK_S + (window + 1) * BLOCK_S / count
-                surroundings = low - BEFORE_S, high + AFTER_S
-                rows = np.concatenate(list(self._between(code, minute, *surroundings)))
-                if not np.any((rows[:, t] >= low) & (rows[:, t] < high)):
+                if not np.any((own >= low) & (own < high)):
                     continue
+                rows = _within(near, t, low - BEFORE_S, high + AFTER_S)
                 values = self._values(rows)
                 values["t"] = values["t"] - start
                 yield Piece(

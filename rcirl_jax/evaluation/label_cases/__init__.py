@@ -1,16 +1,21 @@
 """Planned drives with known decisions: `draw(name, rng)` for a name of `FAMILIES`."""
 
 from rcirl_jax.evaluation.label_cases import beside, lines, traffic
+from rcirl_jax.evaluation.label_cases.noise import (
+    NOISES,
+    check_noise,
+    position_errors,
+)
 from rcirl_jax.evaluation.label_cases.plans import FAMILIES, draw
 from rcirl_jax.evaluation.label_cases.scenes import (
     HISTORY_S,
-    NOISES,
     RATE_HZ,
     Case,
     Mover,
     at,
     clear,
-    position_errors,
+    speed_tags,
+    tags_of_decisions,
     to_recording,
 )
 
@@ -23,10 +28,13 @@ __all__ = [
     "Mover",
     "at",
     "beside",
+    "check_noise",
     "clear",
     "draw",
     "lines",
     "position_errors",
+    "speed_tags",
+    "tags_of_decisions",
     "to_recording",
     "traffic",
 ]

@@ -10,10 +10,11 @@ l is 0 there and positive to the left.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 
 import numpy as np
 
+from rcirl_jax.evaluation.label_cases.noise import NOISES, position_errors
 from rcirl_jax.types import Decision, Kind, Lane, Recording, Signal, Tag, Track
 
 RATE_HZ = 10.0  # 1/s, of the recordings
@@ -24,17 +25,6 @@ FINE_S = 0.02  # s, step of the integration of accelerations
 START_M = 130.0  # m, station of the ego on the road at the planning frame
 ROAD_M = 560  # m, length of the road
 LENGTH_M, WIDTH_M = 4.6, 1.8  # m, of cars unless said
-
-# sd of the slow and the white error of positions, m. With "ngsim" 17 % of the raw
-# |a| exceed 3 m/s^2 (US-101: 17.9 %) and 0.1 % of the smoothed (US-101: 3.0 %, in
-# part real braking); "rough" doubles the slow error
-NOISES = {
-    "none": (0.0, 0.0),
-    "white": (0.0, 0.008),
-    "ngsim": (0.2, 0.008),
-    "rough": (0.4, 0.008),
-}
-SLOW_ERROR_S = (2.0, 6.0)  # s, range of the slow error's periods
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -130,23 +120,32 @@ def at(values: np.ndarray, time: float) -> float:
 # --------------------------------------------------------------------- truth
 
 
-def motion_tags(case: Case) -> dict[Tag, bool | None]:
-    """Tags that are the ego's motion alone, from exact speeds; None: too close.
+def speed_tags(v: np.ndarray, turned: float) -> dict[Tag, bool | None]:
+    """Tags of exact speeds and of the road's turn; None: too close to say.
 
     Moving is above 2 m/s, standing below 0.5 m/s, cruising a change below
     1.5 m/s above 5 m/s; a third of each threshold is left as doubt.
+
+    Args:
+      v: [n] m/s, of the driver over the scene.
+      turned: rad, by which the road turns under it.
     """
-    seen = (CLOCK >= 0.0) & (CLOCK <= 8.0)
-    v = speed(case.ego.s)[seen]
     first, last, top, low = v[0], v[-1], v.max(), v.min()
-    side = float(np.max(np.abs(case.ego.l[seen] - case.ego.l[seen][0])))
-    turn = np.rad2deg(abs(_heading_change(case)))
     return {
         Tag.STOPPING: clear(first - 2.0, 0.6, 0.5 - last, 0.2),
         Tag.STARTING: clear(0.5 - first, 0.2, last - 2.0, 0.6),
         Tag.CRUISING: clear(1.5 - (top - low), 0.5, low - 5.0, 0.5),
         Tag.STANDING: clear(0.5 - top, 0.2),
-        Tag.TURNING: clear(turn - 30.0, 6.0),
+        Tag.TURNING: clear(abs(np.rad2deg(turned)) - 30.0, 6.0),
+    }
+
+
+def motion_tags(case: Case) -> dict[Tag, bool | None]:
+    """Tags that are the ego's motion alone; None: too close to say."""
+    seen = (CLOCK >= 0.0) & (CLOCK <= 8.0)
+    side = float(np.max(np.abs(case.ego.l[seen] - case.ego.l[seen][0])))
+    return {
+        **speed_tags(speed(case.ego.s)[seen], _heading_change(case)),
         Tag.LANE_CHANGE: clear(side - 0.5 * case.lane_m, 0.15 * case.lane_m),
     }
 
@@ -171,10 +170,10 @@ def _heading_change(case: Case) -> float:
     return float(ends[1] - ends[0])
 
 
-def decision_tags(case: Case) -> dict[Tag, bool | None]:
-    """Tags that say that some decision was made."""
-    known = set(case.truth.values())
-    complete = all(other.id in case.truth for other in case.others)
+def tags_of_decisions(
+    known: Set[Decision | None], *, complete: bool
+) -> dict[Tag, bool | None]:
+    """Tags that some decision makes true; false only where all are known."""
     nudges = {Decision.NUDGE_LEFT, Decision.NUDGE_RIGHT}
     groups = {
         Tag.FOLLOWING: {Decision.FOLLOW},
@@ -183,9 +182,13 @@ def decision_tags(case: Case) -> dict[Tag, bool | None]:
         Tag.NUDGING: nudges,
     }
     rest = False if complete else None
-    found: dict[Tag, bool | None] = {
-        tag: True if known & members else rest for tag, members in groups.items()
-    }
+    return {tag: True if known & members else rest for tag, members in groups.items()}
+
+
+def decision_tags(case: Case) -> dict[Tag, bool | None]:
+    """Tags that say that some decision was made."""
+    complete = all(other.id in case.truth for other in case.others)
+    found = tags_of_decisions(set(case.truth.values()), complete=complete)
     return {**found, Tag.CUT_IN: False, Tag.RED_LIGHT: False}
 
 
@@ -264,26 +267,6 @@ def _track(
         heading=heading,
         speed=np.hypot(vx, vy),
     )
-
-
-def position_errors(
-    driven: np.ndarray, noise: tuple[float, float], rng: np.random.Generator
-) -> np.ndarray:
-    """[2, n] m, errors of the positions in x and y.
-
-    A slow one, sum_i A sin(2 pi u / P_i + p_i) with variance 3 A^2 / 2, and a
-    white one.
-
-    Args:
-      driven: [n] s in motion so far: u; a standing object's error hardly moves.
-      noise: sd of both, m.
-      rng: consumed.
-    """
-    periods = rng.uniform(*SLOW_ERROR_S, (2, 3, 1))
-    phases = rng.uniform(0.0, 2.0 * np.pi, (2, 3, 1))
-    waves = np.sin(2.0 * np.pi * driven / periods + phases)
-    slow = noise[0] * np.sqrt(2.0 / 3.0) * waves.sum(axis=1)
-    return slow + noise[1] * rng.standard_normal(slow.shape)
 
 
 def _lanes(world: _World, case: Case) -> tuple[Lane, ...]:
