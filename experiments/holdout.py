@@ -3,16 +3,32 @@
 from absl import flags
 
 from rcirl_jax.data.joined import Demonstrations
-from rcirl_jax.data.resplit import HOLDOUTS, held_out
+from rcirl_jax.data.resplit import HOLDOUTS, folds_by_recording, held_out
 from rcirl_jax.errors import InputError
 
 _HOLDOUT = flags.DEFINE_enum("holdout", "groups", HOLDOUTS, "what is held out")
+_FOLDS = flags.DEFINE_integer(
+    "folds", 0, "instead: recordings in so many parts, each held out once", 0
+)
 _SPLIT = flags.DEFINE_integer("split_seed", 0, "draws the vehicles held out", 0)
 _RECORDING = flags.DEFINE_list("recording", ["0"], "numbers of those held out")
 
 
+def splits(dataset: Demonstrations) -> tuple[list[Demonstrations], str]:
+    """The dataset split as the flags say, once or by --folds, and that in words."""
+    if not _FOLDS.value:
+        one, words = split(dataset)
+        return [one], words
+    if flags.FLAGS["holdout"].present:
+        raise InputError("--folds, --holdout: expected one of them")
+    words = f"{_FOLDS.value} parts of the recordings, each held out once"
+    return list(folds_by_recording(dataset, _FOLDS.value)), words
+
+
 def split(dataset: Demonstrations) -> tuple[Demonstrations, str]:
-    """The dataset split as the flags say, and that in words."""
+    """The dataset split as --holdout says, and that in words."""
+    if _FOLDS.value:
+        raise InputError(f"--folds: {_FOLDS.value}: expected 0, one split, here")
     try:
         named = [int(number) for number in _RECORDING.value]
     except ValueError as error:

@@ -98,6 +98,35 @@ def by_recording(dataset: Demonstrations, recordings: Sequence[int]) -> Resplit:
     return Resplit(dataset, {"train": rows[clear], "test": rows[held]})
 
 
+def folds_by_recording(dataset: Demonstrations, count: int) -> list[Resplit]:
+    """Every scene held out once: recordings dealt into parts, one held out at a time.
+
+    The largest recording first, each to the part with fewest scenes. As in
+    `by_recording`, whoever drives in a held-out recording leaves the training scenes.
+
+    Args:
+      dataset: any dataset; its own split does not matter.
+      count: of parts, at least 2.
+
+    Raises:
+      InputError: fewer recordings than parts, or a part whose vehicles drive in all
+        other scenes.
+    """
+    where = np.asarray(dataset.load(None).recording)
+    names, sizes = np.unique(where, return_counts=True)
+    if not 2 <= count <= names.size:
+        raise InputError(
+            f"--folds: {count}: expected 2 to {names.size}, recordings with scenes"
+        )
+    parts: list[list[int]] = [[] for _ in range(count)]
+    held = np.zeros(count, np.int64)
+    for at in np.argsort(-sizes, kind="stable"):
+        least = int(np.argmin(held))
+        parts[least].append(int(names[at]))
+        held[least] += sizes[at]
+    return [by_recording(dataset, sorted(part)) for part in parts]
+
+
 def fewer(dataset: Demonstrations, count: int, seed: int) -> Resplit:
     """The same test split, and `count` training scenes drawn by vehicle.
 

@@ -123,13 +123,22 @@ def _score(
     )
 
 
-def evaluate_ranking(
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Ranked:
+    """All rows on the same S held-out scenes; what a report is made of."""
+
+    # row -> one `scene_metrics` per run, metric -> [S]
+    table: Mapping[str, Sequence[Mapping[str, np.ndarray]]]
+    outcomes: Outcomes
+    group: np.ndarray  # [S] int, vehicle-disjoint group
+
+
+def rank_scenes(
     dataset: Demonstrations,
     learned: Mapping[str, Sequence[Scorer]],
     setup: RankingSetup,
     executor: Executor | None = None,
-    references: Sequence[str] | None = None,
-) -> RankingReport:
+) -> Ranked:
     """Rank the held-out scenes with learned rewards beside all baselines.
 
     Rows: every learned reward (its runs are seeds), random, constant speed, IDM,
@@ -141,7 +150,6 @@ def evaluate_ranking(
       learned: row name -> one scorer per training run.
       setup: features, sampler, horizon, split.
       executor: where scenes are scored; default: this process.
-      references: rows that the others are compared with; default: the usual rivals.
 
     Raises:
       InputError: no scene of the split covers the horizon.
@@ -171,8 +179,58 @@ def evaluate_ranking(
     table |= {name: [metrics(name)] for name in BASELINES} | runs(setup.hand_set)
     best = oracle_scorer(outcomes)
     table["oracle"] = [scene_metrics(*best, outcomes, temperatures["oracle"])]
-    groups = np.asarray(rows.group)
-    return build_report(table, outcomes, group=groups, references=references)
+    return Ranked(table=table, outcomes=outcomes, group=np.asarray(rows.group))
+
+
+def pooled(parts: Sequence[Ranked]) -> Ranked:
+    """The scenes of several splits of one dataset in one table.
+
+    Run r of a row is run r of every part. Rewards and temperatures are each part's
+    own, so every scene is judged by what has not seen it.
+
+    Args:
+      parts: of `rank_scenes`, with the same rows, runs, candidates and horizon.
+    """
+    join = lambda *x: np.concatenate(x)  # noqa: E731
+    first = parts[0].outcomes
+    arrays = ("fde", "ade", "crash", "feasible", "cluster", "human_crash")
+    several = {
+        name: join(*(getattr(part.outcomes, name) for part in parts)) for name in arrays
+    }
+    return Ranked(
+        table=jax.tree.map(join, *(dict(part.table) for part in parts)),
+        outcomes=dataclasses.replace(first, **several),
+        group=join(*(part.group for part in parts)),
+    )
+
+
+def report_of(ranked: Ranked, references: Sequence[str] | None = None) -> RankingReport:
+    """Estimates and paired differences; see `build_report`."""
+    return build_report(
+        ranked.table, ranked.outcomes, group=ranked.group, references=references
+    )
+
+
+def evaluate_ranking(
+    dataset: Demonstrations,
+    learned: Mapping[str, Sequence[Scorer]],
+    setup: RankingSetup,
+    executor: Executor | None = None,
+    references: Sequence[str] | None = None,
+) -> RankingReport:
+    """The report of `rank_scenes`.
+
+    Args:
+      dataset: as there.
+      learned: as there.
+      setup: as there.
+      executor: as there.
+      references: rows that the others are compared with; default: the usual rivals.
+
+    Raises:
+      InputError: no scene of the split covers the horizon.
+    """
+    return report_of(rank_scenes(dataset, learned, setup, executor), references)
 
 
 def oracle_floor(dataset: Demonstrations, setup: RankingSetup, max_scenes: int) -> dict:

@@ -7,7 +7,7 @@ that budgets can be compared with a learner's. Vectors are those of
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import jax
@@ -39,6 +39,8 @@ from rcirl_jax.train.step import human_of
 from rcirl_jax.types import Demonstration
 from rcirl_jax.units import HORIZON_S
 
+TUNING_SCENES = 256  # training scenes of a search at most
+SIGMA = 1.0  # first spread of the log-weights
 POPULATION_CHUNK = 8  # vectors per device call; padded, so that it compiles once
 
 
@@ -256,6 +258,32 @@ def learner_budget(
         epochs=epochs,
         queries_per_evaluation=problem.queries,
     )
+
+
+def tuned_costs(
+    dataset: Demonstrations,
+    setup: RankingSetup,
+    epochs: int,
+    seeds: Iterable[int],
+    max_scenes: int = TUNING_SCENES,
+) -> list[LatticeCost]:
+    """Costs tuned on the ranking of the training scenes, one search per seed.
+
+    Args:
+      dataset: the learners'; only its training split is read.
+      setup: sampler and horizon of the comparison.
+      epochs: the learners'; each search has the queries of one of them.
+      seeds: of the searches and their drawn scenes.
+      max_scenes: training scenes of a search at most.
+    """
+    found, own = [], dataclasses.replace(setup, split="train")
+    for seed in seeds:
+        problem = ranking_problem(dataset, own, max_scenes, seed)
+        budget = learner_budget(dataset, setup.sampler, epochs, problem)
+        start = np.zeros(len(TUNABLE))
+        best = tune(problem.objective, start, SIGMA, budget, seed).vector
+        found.append(tuned(jnp.asarray(best, jnp.float32)))
+    return found
 
 
 def tune_hand_set(

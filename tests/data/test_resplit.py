@@ -9,6 +9,7 @@ from rcirl_jax.data.resplit import (
     by_recording,
     by_vehicle,
     fewer,
+    folds_by_recording,
     halves,
     held_out,
 )
@@ -97,3 +98,21 @@ def test_overlap_and_nothing_are_refused():
         Resplit(Rows(), {"train": np.array([1, 2]), "test": np.array([2])})
     with pytest.raises(InputError, match="test: no rows"):
         Resplit(Rows(), {"train": np.array([1, 2]), "test": np.array([], int)})
+
+
+def test_folds_hold_out_every_scene_once():
+    data = Rows()
+    folds = folds_by_recording(data, 3)  # of four recordings with 50 scenes each
+    held = np.concatenate([fold.indices("test") for fold in folds])
+    np.testing.assert_array_equal(np.sort(held), data.indices(None))
+    assert sorted(fold.indices("test").size for fold in folds) == [50, 50, 100]
+    for fold in folds:
+        train, test = fold.load("train"), fold.load("test")
+        assert not set(train.vehicle) & set(test.vehicle)
+        assert not set(train.recording) & set(test.recording)
+
+
+@pytest.mark.parametrize("count", [1, 5])
+def test_folds_need_recordings(count):
+    with pytest.raises(InputError, match=f"--folds: {count}: expected 2 to 4"):
+        folds_by_recording(Rows(), count)

@@ -8,6 +8,7 @@ import pytest
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
+from rcirl_jax.data.store import open_dataset
 from rcirl_jax.simulation.suite import family_names
 from tests import commands
 from tests.weights_files import random_weights
@@ -199,6 +200,22 @@ def test_human_likeness_beside_a_tuned_hand_set_cost(dataset, tmp_path):
     assert (tmp_path / "ranking.png").read_bytes()[:4] == b"\x89PNG"
 
 
+def test_human_likeness_over_folds(dataset, tmp_path):
+    flags = ("--learners=RC-IRL rank,GAN", "--seeds=2", "--epochs=1", "--tuned=1")
+    done = commands.command(
+        "experiments.human_likeness",
+        *(f"--data={dataset}", "--folds=2", *flags, f"--output={tmp_path}"),
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    body = json.loads((tmp_path / "ranking.json").read_text())
+    scenes = open_dataset(dataset).indices(None).size
+    assert sum(part["test"] for part in body["parts"]) == scenes
+    assert body["counts"]["scenes"] > 0.9 * scenes  # those recorded for 5 s
+    assert body["runs"]["GAN"] == 2
+    assert body["runs"]["hand-set, tuned"] == 1
+    assert "2 parts of the recordings, each held out once" in done.stdout
+
+
 @pytest.mark.parametrize(
     ("module", "flag", "line"),
     [
@@ -217,6 +234,7 @@ def test_human_likeness_beside_a_tuned_hand_set_cost(dataset, tmp_path):
         ("experiments.human_likeness", "--hand_weights=x", "x: No such file"),
         ("experiments.tune_hand_set", "--output=x/t", "--budget, --epochs: expected"),
         ("experiments.human_likeness", "--recording=99", "--recording: [99]: expected"),
+        ("experiments.human_likeness", "--folds=2", "--folds, --holdout: expected"),
         ("experiments.human_likeness", "--recording=a", "--recording: ['a']: inv"),
     ],
 )

@@ -11,9 +11,17 @@ import pytest
 
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
+from rcirl_jax.data.resplit import Resplit
 from rcirl_jax.data.store import open_dataset
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.evaluate import RankingSetup, evaluate_ranking, oracle_floor
+from rcirl_jax.evaluation.evaluate import (
+    RankingSetup,
+    evaluate_ranking,
+    oracle_floor,
+    pooled,
+    rank_scenes,
+    report_of,
+)
 from rcirl_jax.evaluation.format import format_table
 from rcirl_jax.export.from_run import export_run, read_config
 from rcirl_jax.export.loading import load_runs, open_reward
@@ -194,6 +202,28 @@ def test_a_horizon_nobody_covers_is_one_line(dataset):
     setup = RankingSetup(sampler=SMALL, horizon_s=8.0, split="nowhere")
     with pytest.raises(InputError):
         evaluate_ranking(dataset, {}, setup)
+
+
+def test_pooled_parts_are_the_whole(dataset, run, tmp_path):
+    """Held-out scenes judged in two parts: the report of all of them at once."""
+    reward = export_run(run[0], dataset, tmp_path / "weights.msgpack")
+    learned, preset, _ = load_runs([reward.file])
+    setup = RankingSetup(preset=preset, sampler=SMALL)
+    train_rows, rows = dataset.indices("train"), dataset.indices("test")
+    cuts = [rows[: rows.size // 3], rows[rows.size // 3 :]]
+    parts = [Resplit(dataset, {"train": train_rows, "test": cut}) for cut in cuts]
+    ranked = [rank_scenes(part, learned, setup) for part in parts]
+    assert [part.group.size for part in ranked] == [len(cut) for cut in cuts]
+    whole, joined = evaluate_ranking(dataset, learned, setup), pooled(ranked)
+    # the random order is drawn for each part anew
+    assert joined.table["random"][0]["mrr"].size == rows.size
+    found = report_of(joined)
+    for name in set(whole.rows) - {"random"}:
+        for metric, value in whole.rows[name].items():
+            other = found.rows[name][metric]
+            assert (other.value, other.low, other.high) == pytest.approx(
+                (value.value, value.low, value.high), rel=1e-6
+            ), (name, metric)
 
 
 @pytest.mark.multiprocess
