@@ -8,7 +8,7 @@ WORKERS ?= 2
 # folder of recordings for `make bench`; what is not there is left out
 RECORDINGS ?= ../shared/data
 
-.PHONY: demo test test-dataset lint bench docs onboard setup clean
+.PHONY: demo test test-slow test-dataset lint bench docs onboard setup clean
 
 setup: $(VENV)/.installed
 
@@ -28,6 +28,10 @@ test: setup
 
 test-dataset: setup
 	$(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal -m "dataset"
+
+# Killed processes, lost Ray nodes, memory, the tutorial as written; one at a time
+test-slow: setup
+	$(BIN)/python -m pytest -q -m "slow and not dataset"
 
 lint: setup
 	$(BIN)/ruff check .
