@@ -17,6 +17,7 @@ from rcirl_jax.data.cut import Part
 from rcirl_jax.data.importers import IMPORTERS, parts
 from rcirl_jax.data.importing import ImportConfig, import_parts
 from rcirl_jax.data.quality import format_quality
+from rcirl_jax.data.signal_checks import read_signal_checks
 from rcirl_jax.data.store import open_dataset
 from rcirl_jax.evaluation.evaluate import RankingSetup, oracle_floor
 from rcirl_jax.sampling import SamplerConfig
@@ -49,6 +50,9 @@ _KEEP_ALONE = flags.DEFINE_bool(
 _TRUST = flags.DEFINE_bool(
     "trust_signals", False, "use cycles a converter wrote, unless crossings contradict"
 )
+_SIGNALS = flags.DEFINE_string(
+    "signals", None, "labels.json of label_check --input: verdicts over all files"
+)
 _TEST_FRACTION = flags.DEFINE_float(
     "test_fraction", 0.25, "share of scenes held out, by vehicle-disjoint group"
 )
@@ -68,6 +72,9 @@ def main() -> None:
             require_obstacles=not _KEEP_ALONE.value,
             require_speed_change=not _KEEP_STEADY.value,
             trust_signals=_TRUST.value,
+            signal_checks=(
+                read_signal_checks(_SIGNALS.value) if _SIGNALS.value else None
+            ),
         ),
         test_fraction=_TEST_FRACTION.value,
         split_seed=_SPLIT_SEED.value,

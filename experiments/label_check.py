@@ -10,7 +10,8 @@ With --traffic=N instead: N simulated recordings of every entry of
 data_specs/sources/synthetic.toml, whose drivers' own state is the truth.
 With --input (any recorded format): the written cycle of every signal is tested
 against crossings and stands, and the stop labels against observed stands, with
-the signals that an import trusts and with all of them. With --data the labels
+the signals that an import trusts of itself, those it uses when told these phases
+(`import_logs --signals=DIR/labels.json`), and all of them. With --data the labels
 stored in a dataset are compared with today's rules. --workers and --executor
 spread the planned drives.
 
@@ -26,6 +27,7 @@ from absl import flags
 from experiments.common import provenance, run
 from experiments.executor import executor
 from rcirl_jax.data.importers import IMPORTERS, read_recordings
+from rcirl_jax.data.signal_checks import signal_checks
 from rcirl_jax.data.store import open_dataset
 from rcirl_jax.evaluation.label_scores import LabelReport, format_labels, format_scores
 from rcirl_jax.evaluation.label_signals import check_phases, format_phases
@@ -57,8 +59,13 @@ def main() -> None:
         phases = check_phases(found)
         print(format_phases(phases))
         body["phases"] = [check.as_dict() for check in phases]
-        for name, everything in (("trusted signals", False), ("all signals", True)):
-            stops = check_stops(found, trust_all=everything)
+        by_phase = signal_checks({check.name: check.verdict for check in phases})
+        for name, how in {
+            "trusted signals": {},
+            "signals by their phases": {"checks": by_phase},
+            "all signals": {"trust_all": True},
+        }.items():
+            stops = check_stops(found, **how)
             print(f"\n{name}: {format_stops(stops)}")
             body[name], tables[f"recorded, {name}"] = stops.as_dict(), stops.scores
     if _DATA.value:

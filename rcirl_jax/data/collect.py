@@ -49,7 +49,7 @@ class Collector:
         ]
         self.graph = LaneGraph(recording)
         self.signals, self.signal_notes = trusted_signals(
-            recording, self.graph, config.trust_signals
+            recording, config.trust_signals, config.signal_checks
         )
         self.dropped: collections.Counter[str] = collections.Counter()
         self._views: dict[tuple[str, ...], FrameTracks] = {}

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+from rcirl_jax.data.signal_checks import SignalChecks
 from rcirl_jax.units import HORIZON_S
 
 
@@ -22,6 +23,8 @@ class CollectConfig:
     require_speed_change: bool = True
     # use cycles that a converter wrote, unless the file's own crossings contradict
     trust_signals: bool = False
+    # lines whose lights many files bear out, or refute; before all other rules
+    signal_checks: SignalChecks | None = None
 
     def __post_init__(self) -> None:
         """Reject what cannot be meant."""

@@ -5,8 +5,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rcirl_jax.data.lanes import LaneFrame, LaneGraph, project
+from rcirl_jax.data.lanes import LaneFrame, project
 from rcirl_jax.data.motion import Motion
+from rcirl_jax.data.signal_checks import SignalChecks
 from rcirl_jax.types import Kind, Recording, Signal, Track
 from rcirl_jax.units import EGO_LENGTH_M, TIMES_S
 
@@ -28,7 +29,9 @@ def signal_state(signal: Signal, times: np.ndarray) -> np.ndarray:
 
 
 def trusted_signals(
-    recording: Recording, graph: LaneGraph, trust_written: bool = False
+    recording: Recording,
+    trust_written: bool = False,
+    checks: SignalChecks | None = None,
 ) -> tuple[dict[str, Signal], list[str]]:
     """Signals whose phases agree with what the drivers did, and notes on others.
 
@@ -36,10 +39,12 @@ def trusted_signals(
     of a governed stop line is looked up in the cycle; if more than a tenth of
     at least three crossings happen on red, the signal is not used. Cycles with
     fewer crossings are used only if `trust_written`: a short file alone cannot
-    confirm them, many together can (`experiments.label_check`).
+    confirm them, many together can: where `checks` knows a signal's line its word
+    decides, and of two lines with one light the one that bears it out.
     """
     by_id = {signal.id: signal for signal in recording.signals}
     counts = {name: [0, 0] for name in by_id}
+    verdicts = checks.of_signals(recording) if checks else {}
     fronts = _fronts(recording.tracks) if by_id else None
     for lane in recording.lanes:
         names = [name for name in lane.signal_ids if name in by_id]
@@ -52,8 +57,15 @@ def trusted_signals(
             for name, state in zip(names, states, strict=True):
                 counts[name][0] += 1
                 counts[name][1] += state == "red" and not passable
-    trusted, notes = {}, []
+    trusted = {name: by_id[name] for name, good in verdicts.items() if good}
+    notes = [
+        f"signal {name}: many files speak against it; unused"
+        for name, good in verdicts.items()
+        if not good
+    ]
     for name, signal in by_id.items():
+        if name in verdicts:
+            continue
         crossings, reds = counts[name]
         wrong = crossings >= MIN_CROSSINGS and reds > MAX_RED_RUNNING * crossings
         judged = signal.is_recorded or trust_written

@@ -25,6 +25,7 @@ from rcirl_jax.data.lines import (
     STANDING_MPS,
     signal_state,
 )
+from rcirl_jax.data.signal_checks import CONFIRMED, OPEN, REJECTED, TOGETHER, line_name
 from rcirl_jax.types import Lane, Recording, Signal, Track
 
 ORDER = ("green", "yellow", "red", "off")
@@ -124,19 +125,15 @@ def before_line(track: Track, lane: Lane) -> tuple[np.ndarray, np.ndarray]:
     return distance, (share > 0.0) & (share < 1.0) & (same_way > 0.5)
 
 
-def observe(recording: Recording) -> dict[str, list[Event]]:
-    """Crossings and stands by the name of the line's signals.
-
-    The name joins the ids of the signals that govern one line.
-    """
+def observe(recording: Recording) -> dict[tuple[str, ...], list[Event]]:
+    """Crossings and stands by the ids of the signals that govern one line."""
     by_id = {signal.id: signal for signal in recording.signals}
-    found: dict[str, list[Event]] = collections.defaultdict(list)
+    found: dict[tuple[str, ...], list[Event]] = collections.defaultdict(list)
     for lane in recording.lanes:
         signals = tuple(by_id[i] for i in lane.signal_ids if i in by_id)
         if lane.stop_line is None or not signals:
             continue
-        name = "+".join(sorted(signal.id for signal in signals))
-        found[name] += [
+        found[tuple(sorted(signal.id for signal in signals))] += [
             Event(time=time, crossing=crossing, right=right, signals=signals)
             for time, crossing, right in _events(recording, lane)
         ]
@@ -205,18 +202,12 @@ def check_phases(recordings: Iterable[Recording]) -> list[PhaseCheck]:
     """
     events: dict[str, list[tuple[str, Event]]] = collections.defaultdict(list)
     for recording in recordings:
-        place = _place(recording.name)
-        for name, found in observe(recording).items():
-            events[f"{place}/{name}"] += [(recording.name, e) for e in found]
+        for ids, found in observe(recording).items():
+            name = line_name(recording.name, ids)
+            events[name] += [(recording.name, e) for e in found]
     checks = [_check(name, found) for name, found in sorted(events.items())]
     together = [pair for found in events.values() for pair in found]
-    return [*checks, _check("all together", together)]
-
-
-def _place(name: str) -> str:
-    """USA_Lanker-2_26_T-1 -> USA_Lanker-2; other names as they are."""
-    parts = name.split("_")
-    return "_".join(parts[:2]) if len(parts) >= 4 else name
+    return [*checks, _check(TOGETHER, together)]
 
 
 def _check(name: str, found: Sequence[tuple[str, Event]]) -> PhaseCheck:
@@ -274,10 +265,10 @@ def _share(values: np.ndarray, among: np.ndarray) -> float:
 
 def _verdict(crossings: int, red: float, p: float) -> str:
     if crossings < MIN_CROSSINGS:
-        return "too few crossings"
+        return OPEN[1]
     if red > MAX_RED_RUNNING:
-        return "rejected"
-    return "confirmed" if p <= MAX_P else "not contradicted"
+        return REJECTED
+    return CONFIRMED if p <= MAX_P else OPEN[0]
 
 
 def format_phases(checks: Sequence[PhaseCheck]) -> str:

@@ -15,6 +15,7 @@ import numpy as np
 from rcirl_jax.data.collect import Collector
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.labels import add_labels
+from rcirl_jax.data.signal_checks import SignalChecks
 from rcirl_jax.evaluation.label_cases import clear
 from rcirl_jax.evaluation.label_scores import ClassScore, format_scores
 from rcirl_jax.evaluation.label_signals import (
@@ -53,7 +54,10 @@ class StopReport:
 
 
 def check_stops(
-    recordings: Iterable[Recording], *, trust_all: bool = False
+    recordings: Iterable[Recording],
+    *,
+    trust_all: bool = False,
+    checks: SignalChecks | None = None,
 ) -> StopReport:
     """Compare every collected scene's labels with what was observed.
 
@@ -61,12 +65,14 @@ def check_stops(
       recordings: any.
       trust_all: use every written signal, also those that the importer's own
         check turns down; shows what the labels would be if they were right.
+      checks: what many files say of the signals, as in an import with --signals.
     """
     counts: collections.Counter[tuple[str, bool, bool]] = collections.Counter()
     scenes = signals = trusted = 0
     vehicles = set()
     for recording in recordings:
-        collector = Collector(recording, CollectConfig(require_speed_change=False))
+        config = CollectConfig(require_speed_change=False, signal_checks=checks)
+        collector = Collector(recording, config)
         if trust_all:
             collector.signals = {s.id: s for s in recording.signals}
         signals += len(recording.signals)

@@ -10,7 +10,11 @@ import sys
 import numpy as np
 import pytest
 
+from rcirl_jax.data.collect import Collector
+from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.lines import trusted_signals
+from rcirl_jax.data.signal_checks import SignalChecks, read_signal_checks
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.label_cases import FAMILIES, Case, draw, to_recording
 from rcirl_jax.evaluation.label_cases.plans import ego_of
@@ -197,6 +201,58 @@ def test_stops_of_recorded_drives_agree():
     refused = check_stops(made)
     assert (refused.trusted, refused.signals) == (0, 4)
     assert "0 of 4 written signals" in format_stops(refused)
+
+
+def write_checks(path, checks):
+    path.write_text(json.dumps({"phases": [check.as_dict() for check in checks]}))
+    return path
+
+
+@pytest.mark.parametrize(("turned", "used"), [(0.0, 4), (25.0, 0)])
+def test_an_import_takes_the_word_of_many_files(turned, used, tmp_path):
+    """Two or three crossings a file prove nothing; twelve files do."""
+    made = [drives_of(number, turned) for number in range(12)]
+    file = write_checks(tmp_path / "labels.json", check_phases(made))
+    config = CollectConfig(signal_checks=read_signal_checks(file))
+    alone = [Collector(one, CollectConfig()) for one in made[:4]]
+    told = [Collector(one, config) for one in made[:4]]
+    assert sum(len(one.signals) for one in alone) == 0
+    assert sum(len(one.signals) for one in told) == used
+    said = [note for one in told for note in one.signal_notes]
+    assert sum("many files speak against it" in note for note in said) == 4 - used
+
+
+def test_a_verdict_on_a_line_comes_before_all_rules(tmp_path):
+    one = drives_of(0, 0.0)
+    phases = [
+        {"name": "AAA_Place-1/light", "verdict": "rejected"},
+        {"name": "AAA_Place-1/other", "verdict": "too few crossings"},
+        {"name": "all together", "verdict": "not contradicted"},
+    ]
+    file = tmp_path / "labels.json"
+    file.write_text(json.dumps({"phases": phases}))
+    checks = read_signal_checks(file)
+    assert (checks.used, checks.unused) == ((), ("AAA_Place-1/light",))
+    assert not trusted_signals(one, True, checks)[0]
+    both = SignalChecks(used=("AAA_Place-1/light",), unused=())
+    assert list(trusted_signals(one, False, both)[0]) == ["light"]
+    phases[-1]["verdict"] = "confirmed"
+    file.write_text(json.dumps({"phases": phases}))
+    assert read_signal_checks(file).used == ("AAA_Place-1/other",)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", '{"phases": 3}', '{"phases": [{"name": "a"}]}',
+             '{"phases": [{"name": "a", "verdict": "fine"}]}',
+             '{"phases": [{"name": [], "verdict": "rejected"}]}']
+)  # fmt: skip
+def test_other_files_are_refused_in_one_line(text, tmp_path):
+    file = tmp_path / "labels.json"
+    file.write_text(text)
+    with pytest.raises(InputError, match=r"labels.json: phases: .*expected"):
+        read_signal_checks(file)
+    with pytest.raises(InputError, match="nowhere: No such file"):
+        read_signal_checks(tmp_path / "nowhere")
 
 
 def test_command(tmp_path):
