@@ -28,15 +28,19 @@ from rcirl_jax.train.loop import CHUNK, NORMALISER_SCENES, rows_that_count
 from rcirl_jax.train.state import FeatureBatch, TrainConfig
 
 LINEAR = RewardConfig(hidden=(), pin="none")
+FREE = RewardConfig(pin="none")
 
 # What a learner changes of the shared configuration. The linear rewards are not
 # pinned: with unit norm their values cannot grow to the spread that a logistic or
-# listwise loss asks for.
+# listwise loss asks for. "Free" says the same of the paper's network. The rank loss
+# alone has no free row: it is homogeneous in the scale and needs the pin.
 LEARNERS: dict[str, dict] = {
     "RC-IRL rank": {"loss": "rank"},
     "RC-IRL logistic": {"loss": "logistic"},
+    "logistic free": {"loss": "logistic", "reward": FREE},
     "hinge": {"loss": "hinge"},
     "MaxEnt": {"loss": "listwise"},
+    "MaxEnt free": {"loss": "listwise", "reward": FREE},
     "MaxEnt linear": {"loss": "listwise", "reward": LINEAR},
     "MaxEnt 64": {"loss": "listwise", "reward": RewardConfig(hidden=(64,))},
     "MaxEnt monotone": {
@@ -55,10 +59,17 @@ LEARNERS: dict[str, dict] = {
     "soft labels": {"loss": "soft"},
     "soft labels linear": {"loss": "soft", "reward": LINEAR},
     "GAN": {"loss": "gan"},
+    "GAN free": {"loss": "gan", "reward": FREE},
     # as in the paper: the recorded curve itself is the positive
     "RC-IRL rank on curves": {"loss": "rank", "positive": "human"},
     "RC-IRL logistic on curves": {"loss": "logistic", "positive": "human"},
+    "logistic free on curves": {
+        "loss": "logistic",
+        "positive": "human",
+        "reward": FREE,
+    },
     "GAN on curves": {"loss": "gan", "positive": "human"},
+    "GAN free on curves": {"loss": "gan", "positive": "human", "reward": FREE},
     "logistic linear": {"loss": "logistic", "reward": LINEAR},
     "logistic non-negative": {
         "loss": "logistic",
