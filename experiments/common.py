@@ -57,6 +57,14 @@ def _parse(argv: list[str]) -> list[str]:
         sys.exit(EXIT_BAD_INPUT)
 
 
+def alone(flag: str, *others: str) -> None:
+    """Refuse flags that were given beside one that leaves them unread."""
+    for other in others:
+        found = flags.FLAGS[other]
+        if found.present:
+            raise InputError(f"--{other}: {found.value}: expected none beside --{flag}")
+
+
 def floats(values: list[str], flag: str) -> tuple[float, ...]:
     """A comma list of numbers, with the flag's name on error."""
     try:

@@ -44,7 +44,7 @@ def main() -> None:
         horizon_s=_HORIZON.value,
         split=_SPLIT.value,
         drop_collisions=_FILTER.value,
-        hand_set=tuned_rows(_HAND.value),
+        tuned=tuned_rows(_HAND.value),
     )
     report = evaluate_ranking(open_dataset(_DATA.value), learned, setup, executor())
     print(format_table(report, _WIDTH.value))

@@ -2,6 +2,7 @@
 
 from absl import flags
 
+from experiments.common import alone
 from rcirl_jax.data.joined import Demonstrations
 from rcirl_jax.data.resplit import HOLDOUTS, folds_by_recording, held_out
 from rcirl_jax.errors import InputError
@@ -19,8 +20,7 @@ def splits(dataset: Demonstrations) -> tuple[list[Demonstrations], str]:
     if not _FOLDS.value:
         one, words = split(dataset)
         return [one], words
-    if flags.FLAGS["holdout"].present:
-        raise InputError("--folds, --holdout: expected one of them")
+    alone("folds", "holdout", "recording", "split_seed")
     words = f"{_FOLDS.value} parts of the recordings, each held out once"
     return list(folds_by_recording(dataset, _FOLDS.value)), words
 
@@ -29,8 +29,14 @@ def split(dataset: Demonstrations) -> tuple[Demonstrations, str]:
     """The dataset split as --holdout says, and that in words."""
     if _FOLDS.value:
         raise InputError(f"--folds: {_FOLDS.value}: expected 0, one split, here")
+    how = _HOLDOUT.value
+    if how != "recording" and flags.FLAGS["recording"].present:
+        raise InputError(
+            f"--recording: {_RECORDING.value}: expected with --holdout=recording, "
+            f"not {how}"
+        )
     try:
         named = [int(number) for number in _RECORDING.value]
     except ValueError as error:
         raise InputError(f"--recording: {_RECORDING.value}: {error}") from error
-    return held_out(dataset, _HOLDOUT.value, seed=_SPLIT.value, recordings=named)
+    return held_out(dataset, how, seed=_SPLIT.value, recordings=named)

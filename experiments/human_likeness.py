@@ -8,16 +8,16 @@ random, constant speed, IDM, hand-set and oracle rows. Of the scenes recorded as
 long as the horizon none is dropped; a crash of the chosen candidate is charged.
 `--holdout`:
 
-    groups      the dataset's split by vehicle-disjoint groups
-    vehicles    a quarter of the vehicles (drawn by --split_seed), which drove
-                beside those of the training scenes
-    recording   recordings (numbers --recording) and their vehicles
+    groups      the dataset's split by groups of vehicles
+    vehicles    a quarter of the vehicles (drawn by --split_seed)
+    recording   recordings (numbers --recording)
     validation  a quarter of the training scenes, by group or vehicle; the
                 dataset's held-out scenes stay unseen: to choose a learner by
 
---folds=6 instead: the recordings in six parts, each with its vehicles held out
-once, all learners trained six times --seeds; every scene of the dataset is judged,
-by rewards that saw neither its recording nor its vehicle.
+--folds=6 instead: the recordings in six parts, each held out once, all learners
+trained six times --seeds; every scene of the dataset is judged. Either way the
+vehicles that are the ego of a held-out scene are the ego of no training scene; they
+may still be obstacles in one, with their recorded future, and the reverse.
 
 Writes ranking.json, table.txt, table.md and ranking.png. US-101 on two cores:
 about 15 minutes with 5 learners, an hour with all; expected at 5 s: networks with
@@ -47,11 +47,11 @@ from rcirl_jax.evaluation.learners import (
     scorers,
     train_learners,
 )
-from rcirl_jax.evaluation.objectives import tuned_costs
+from rcirl_jax.evaluation.score import Rival
 from rcirl_jax.evaluation.table import to_json
+from rcirl_jax.evaluation.tuned_rivals import as_numbers, tuned_rivals
 from rcirl_jax.export.hand_weights import tuned_rows
 from rcirl_jax.report.intervals import ranking_chart
-from rcirl_jax.reward import TUNED_ROW, LatticeCost
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.whole import write_json, write_whole
@@ -74,16 +74,22 @@ _HAND = flags.DEFINE_list(
     "hand_weights", [], "of tune_hand_set with the same split: runs of a further row"
 )
 _TUNED = flags.DEFINE_integer(
-    "tuned", 0, "instead: so many searches here, on each split's training scenes", 0
+    "tuned", 0, "instead: hand-set and IDM tuned here on each split, so many times", 0
+)
+_LONG = flags.DEFINE_integer(
+    "tuned_long", 3000, "evaluations of the hand-set cost's long search, or 0", 0
 )
 
 
-def _tuned(part: Demonstrations, setup: RankingSetup) -> dict[str, list[LatticeCost]]:
-    """The row of the tuned hand-set cost, if any."""
+def _tuned(part: Demonstrations, setup: RankingSetup) -> dict[str, list[Rival]]:
+    """The rows of the tuned rivals, if any."""
     if not _TUNED.value:
-        return tuned_rows(_HAND.value, part.hash)
+        costs = tuned_rows(_HAND.value, part.hash)
+        return {row: [*runs] for row, runs in costs.items()}
     seeds = range(_TUNED.value)
-    return {TUNED_ROW: tuned_costs(part, setup, _EPOCHS.value, seeds)}
+    return tuned_rivals(
+        part, setup, epochs=_EPOCHS.value, seeds=seeds, long=_LONG.value
+    )
 
 
 def main() -> None:
@@ -102,7 +108,7 @@ def main() -> None:
     )
     configs = learner_configs(_LEARNERS.value, base)
     setup = RankingSetup(sampler=sampler, horizon_s=_HORIZON.value)
-    setups = [dataclasses.replace(setup, hand_set=_tuned(x, setup)) for x in parts]
+    setups = [dataclasses.replace(setup, tuned=_tuned(x, setup)) for x in parts]
     folder, ranked, failed = Path(_OUTPUT.value), [], set()
     for part, own in zip(parts, setups, strict=True):
         learned = train_learners(part, configs, range(_SEEDS.value))
@@ -120,6 +126,9 @@ def main() -> None:
         "parts": [
             {name: int(x.indices(name).size) for name in ("train", "test")}
             for x in parts
+        ],
+        "tuned": [
+            {row: as_numbers(runs) for row, runs in x.tuned.items()} for x in setups
         ],
         "not_finite": bad,
         "made_by": made_by,

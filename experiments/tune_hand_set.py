@@ -19,6 +19,7 @@ from rcirl_jax.data.joined import Demonstrations, open_datasets
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation import objectives
 from rcirl_jax.evaluation.evaluate import RankingSetup
+from rcirl_jax.evaluation.tuned_rivals import SIGMA, TUNING_SCENES
 from rcirl_jax.export.hand_weights import write_hand_weights
 from rcirl_jax.sampling import SamplerConfig
 
@@ -30,9 +31,7 @@ _BUDGET = flags.DEFINE_integer(
     "budget", 0, "evaluations of one weight vector at most", 0
 )
 _EPOCHS = flags.DEFINE_integer("epochs", 0, "instead: a learner's, same queries", 0)
-_SCENES = flags.DEFINE_integer(
-    "scenes", objectives.TUNING_SCENES, "training scenes at most", 1
-)
+_SCENES = flags.DEFINE_integer("scenes", TUNING_SCENES, "training scenes at most", 1)
 _HORIZON = flags.DEFINE_float("horizon", 5.0, "s at which distances are taken")
 _SUITE = flags.DEFINE_string("suite", "smoke", "smoke, or families with commas")
 _CASES = flags.DEFINE_integer("cases", 1, "cases per family")
@@ -40,9 +39,7 @@ _DURATION = flags.DEFINE_float("duration", 20.0, "s per case")
 _CATALOGUE = flags.DEFINE_integer(
     "catalogue_seed", 0, "of the cases; held-out: next", 0
 )
-_SIGMA = flags.DEFINE_float(
-    "sigma", objectives.SIGMA, "first spread of the log-weights"
-)
+_SIGMA = flags.DEFINE_float("sigma", SIGMA, "first spread of the log-weights")
 _SEED = flags.DEFINE_integer("seed", 0, "of the search and the drawn scenes", 0)
 _OUTPUT = flags.DEFINE_string("output", None, "JSON to write", required=True)
 

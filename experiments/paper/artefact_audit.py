@@ -15,7 +15,15 @@ in 63 %: the recording leaves a trace. `--quick`: under a minute.
 import numpy as np
 
 from experiments.common import run
-from experiments.paper.common import base, dataset, picture, seeds, write
+from experiments.paper.common import (
+    base,
+    dataset,
+    fixed,
+    picture,
+    seeds,
+    unread,
+    write,
+)
 from rcirl_jax.evaluation.learners import FrozenSets, pair_wins, train_learner
 from rcirl_jax.evaluation.statistics import ClusterBootstrap, combine_seeds
 from rcirl_jax.features import feature_map
@@ -24,6 +32,8 @@ from rcirl_jax.report.style import figure, label, save
 
 KEPT = {"a and j": ("acceleration", "jerk"), "all features": None}
 NEAR = 24  # candidates per scene
+fixed(horizon=8.0)
+unread("positive")  # each in turn
 
 
 def main() -> None:
@@ -32,7 +42,7 @@ def main() -> None:
     vehicle = np.asarray(data.load("test").vehicle)
     bootstrap, rows = ClusterBootstrap(vehicle), {}
     for positive in ("human", "nearest"):
-        config = base(positive=positive, train_horizon=8.0)
+        config = base(positive=positive)
         frozen = FrozenSets(data, nearest=NEAR).of(config)
         held = FrozenSets(data, "test", nearest=NEAR).of(config)
         for name, kept in KEPT.items():

@@ -23,7 +23,15 @@ import numpy as np
 from absl import flags
 
 from experiments.common import run
-from experiments.paper.common import DATA, OUTPUT, QUICK, dataset, picture, write
+from experiments.paper.common import (
+    DATA,
+    OUTPUT,
+    QUICK,
+    dataset,
+    picture,
+    unread,
+    write,
+)
 from experiments.paper.weights import drives_config, trained_weights
 from rcirl_jax.data.joined import open_datasets
 from rcirl_jax.evaluation.closed_loop import SuiteConfig, SuiteResult, run_suite
@@ -42,6 +50,7 @@ from rcirl_jax.simulation.suite import FULL_S, catalogue_set, suite_refs
 _RUNS = flags.DEFINE_integer("runs", 3, "training seeds of each loss", lower_bound=2)
 _CASES = flags.DEFINE_integer("cases", 10, "of each family", lower_bound=1)
 _SEED = flags.DEFINE_integer("catalogue_seed", 0, "of the cases", lower_bound=0)
+unread("seeds", "epochs", "horizon", "positive")  # `drives_config` says how
 
 LOSSES = {"RC-IRL": "rank", "GAN": "gan"}
 RIVALS = ("hand-set", "IDM")
@@ -94,11 +103,12 @@ def differences(
 def main() -> None:
     """Train, drive, compare, draw."""
     quick, folder = QUICK.value, Path(OUTPUT.value)
+    runs, cases = (2, 1) if quick else (_RUNS.value, _CASES.value)
     data = open_datasets(DATA.value.split(",")) if DATA.value else dataset()
     files: list[str] = []
     names: dict[str, list[str]] = {row: [] for row in LOSSES}
     for row, loss in LOSSES.items():
-        for seed in range(2 if quick else _RUNS.value):
+        for seed in range(runs):
             config = drives_config(quick=quick, seed=seed, loss=loss)
             # other data or settings are other files
             key = hashlib.sha256(f"{data.hash} {config}".encode()).hexdigest()[:8]
@@ -107,7 +117,7 @@ def main() -> None:
             files.append(str(file))
             names[row].append(f"{row} (seed {seed})")
     which, duration = ("free_cruise,stopped_lead", 10.0) if quick else ("full", FULL_S)
-    refs = suite_refs(which, 1 if quick else _CASES.value, _SEED.value)
+    refs = suite_refs(which, cases, _SEED.value)
     drivers = table_rows(
         files, RIVALS, names=[x for own in names.values() for x in own]
     )
@@ -138,7 +148,9 @@ def main() -> None:
         },
         3.2,
     )
+    trained = drives_config(quick=quick)
     body = {
+        "trained": {"epochs": trained.epochs, "positive": trained.positive},
         "cases": len(result.cases.ids),
         "duration_s": duration,
         "rows": {
@@ -156,7 +168,7 @@ def main() -> None:
             for words, x in tests.items()
         },
     }
-    write("closed_loop_seeds", body, data)
+    write("closed_loop_seeds", body, data, runs=runs, cases=cases)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from absl import flags
 
-from experiments.common import provenance
+from experiments.common import alone, provenance
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
@@ -30,16 +30,33 @@ EPOCHS = flags.DEFINE_integer(
 HORIZON = flags.DEFINE_float(
     "horizon", 5.0, "s at which distances are taken", lower_bound=0.4, upper_bound=8.0
 )
-POSITIVE = flags.DEFINE_enum(
-    "positive",
-    None,
-    POSITIVES,
-    "trained on, where an experiment leaves it open",
-)
+POSITIVE = flags.DEFINE_enum("positive", "nearest", POSITIVES, "trained on")
 QUICK = flags.DEFINE_bool("quick", False, "few scenes, two seeds, two epochs")
 
 QUICK_STRIDE_S = 60.0  # s between planning frames of the small synthetic dataset
 QUICK_SCENES = 128  # of each split
+QUICK_COUNTS = {"seeds": 2, "epochs": 2}  # whatever the flags say
+
+
+def unread(*names: str) -> None:
+    """Shared flags that an experiment does not read: unknown to it, not recorded."""
+    for name in names:
+        delattr(flags.FLAGS, name)
+
+
+def instead(flag: str, *names: str) -> None:
+    """As `unread`, by an experiment that was given --flag."""
+    alone(flag, *names)
+    unread(*names)
+
+
+def fixed(**values: object) -> None:
+    """Shared flags with one value in an experiment: recorded, any other refused."""
+    for name, value in values.items():
+        flags.FLAGS.set_default(name, value)
+        flags.register_validator(
+            name, lambda given, value=value: given == value, f"expected {value} here"
+        )
 
 
 def dataset() -> Demonstrations:
@@ -78,17 +95,23 @@ def seeds(least: int = 1) -> range:
     """Seeds of the training runs; a spread between them needs at least two."""
     if SEEDS.value < least:
         raise InputError(f"--seeds: {SEEDS.value}: expected at least {least}")
-    return range(2 if QUICK.value else SEEDS.value)
+    return range(QUICK_COUNTS["seeds"] if QUICK.value else SEEDS.value)
+
+
+def epochs() -> int:
+    """Passes over the training scenes."""
+    return QUICK_COUNTS["epochs"] if QUICK.value else EPOCHS.value
 
 
 def base(**changes: object) -> TrainConfig:
     """The shared training configuration with some changes."""
     shared: dict = {
         "loss": "logistic",
-        "positive": POSITIVE.value or "nearest",
-        "epochs": 2 if QUICK.value else EPOCHS.value,
+        "epochs": epochs(),
         "train_horizon": HORIZON.value,
     }
+    if "positive" not in changes:
+        shared["positive"] = POSITIVE.value
     return TrainConfig(**{**shared, **changes})
 
 
@@ -124,12 +147,30 @@ def intervals(report: RankingReport, metric: str) -> dict[str, Interval]:
     return {name: (e.value, e.low, e.high) for name, e in found.items()}
 
 
+def as_used(**used: object) -> dict:
+    """Provenance with the flags as they were used, under --quick too."""
+    found = provenance()
+    counts = QUICK_COUNTS if QUICK.value else {}
+    own = {name: count for name, count in counts.items() if name in found["flags"]}
+    return {**found, "flags": {**found["flags"], **own, **used}}
+
+
 def write(
-    name: str, body: Mapping[str, object], data: Demonstrations | None = None
+    name: str,
+    body: Mapping[str, object],
+    data: Demonstrations | None = None,
+    **used: object,
 ) -> None:
-    """OUTPUT/name.json with provenance, also of the scenes; says where."""
+    """OUTPUT/name.json with provenance, also of the scenes; says where.
+
+    Args:
+      name: of the experiment.
+      body: its numbers.
+      data: its scenes, if they are of one dataset.
+      used: flags of its own that --quick changes, as used.
+    """
     folder = Path(OUTPUT.value)
-    made_by = provenance()
+    made_by = as_used(**used)
     if data is not None:
         made_by["data_hash"] = data.hash
     made = {**body, "quick": QUICK.value, "made_by": made_by}

@@ -17,6 +17,7 @@ from experiments.paper.common import (
     base,
     dataset,
     few,
+    instead,
     intervals,
     picture,
     print_differences,
@@ -41,6 +42,7 @@ def sites() -> dict[str, Demonstrations]:
     if not _SITES.value:
         first, second = halves(dataset())
         return {"half A": first, "half B": second}
+    instead("sites", "data")
     pairs = [item.partition("=") for item in _SITES.value]
     named = {name: path for name, _, path in pairs}
     if len(pairs) < 2 or len(named) < len(pairs) or not all(named.values()):

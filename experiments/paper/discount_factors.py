@@ -18,7 +18,7 @@ import numpy as np
 from scipy.stats import ttest_ind
 
 from experiments.common import run
-from experiments.paper.common import base, dataset, picture, seeds, write
+from experiments.paper.common import base, dataset, fixed, picture, seeds, write
 from rcirl_jax.evaluation.exact import holm
 from rcirl_jax.evaluation.learners import Learned, learner_config, train_learners
 from rcirl_jax.report.intervals import curves_panel
@@ -28,6 +28,7 @@ from rcirl_jax.units import TIMES_S
 
 ROWS = ("RC-IRL rank", "RC-IRL logistic", "GAN")
 NEAR_S = 4.0  # s, where "near" ends
+fixed(horizon=8.0)
 
 
 def time_weights(runs: list[Learned]) -> np.ndarray:
@@ -66,7 +67,7 @@ def differences(shares: dict[str, np.ndarray]) -> list[dict]:
 
 def main() -> None:
     """Train, read gamma, draw."""
-    configs = {name: learner_config(name, base(train_horizon=8.0)) for name in ROWS}
+    configs = {name: learner_config(name, base()) for name in ROWS}
     data = dataset()
     learned = train_learners(data, configs, seeds(least=2))
     gamma = {name: time_weights(runs) for name, runs in learned.items()}

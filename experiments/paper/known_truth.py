@@ -24,6 +24,7 @@ from experiments.paper.common import (
     QUICK,
     base,
     dataset,
+    fixed,
     picture,
     seeds,
     write,
@@ -58,11 +59,12 @@ _LEARNERS = flags.DEFINE_list(
 _PIN = flags.DEFINE_enum(
     "pin", None, PINS, "scale of the learners' values; the hidden one's is unit"
 )
+fixed(positive="human")  # the curve that the expert's choice replaces
 
 
 def main() -> None:
     """Replace the humans, train on ever more of them, compare choices, draw."""
-    data, config = dataset(), learner_config("MaxEnt", base(positive="human"))
+    data, config = dataset(), learner_config("MaxEnt", base())
     train, test = (FrozenSets(data, name).of(config) for name in ("train", "test"))
     most = train.weight.shape[0]
     asked = whole_numbers(_COUNTS.value, "counts")
@@ -89,7 +91,7 @@ def main() -> None:
             part = jax.tree.map(lambda x, at=order[:count]: x[at], shown)
             for name in rows:
                 epochs = max(round(base().epochs * most / count), 1)
-                own = learner_config(name, base(epochs=epochs, positive="human"))
+                own = learner_config(name, base(epochs=epochs))
                 own = _pinned(own)
                 (learned,) = train_learner(part, own, [seed])
                 found = agreement(test, hidden, learned)

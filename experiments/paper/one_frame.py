@@ -16,8 +16,18 @@ from pathlib import Path
 import numpy as np
 from absl import flags
 
-from experiments.common import provenance, run
-from experiments.paper.common import OUTPUT, base, dataset, picture, write
+from experiments.common import run
+from experiments.paper.common import (
+    OUTPUT,
+    as_used,
+    base,
+    dataset,
+    fixed,
+    instead,
+    picture,
+    unread,
+    write,
+)
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.from_run import export_run
 from rcirl_jax.export.loading import open_reward
@@ -28,10 +38,14 @@ from rcirl_jax.train.loop import train
 _WEIGHTS = flags.DEFINE_string("weights", None, "weights file instead of training")
 _ROW = flags.DEFINE_integer("row", None, "dataset row of the scene")
 REASONS = 6  # features named on the terminal
+fixed(horizon=8.0)
+unread("seeds")
 
 
 def main() -> None:
     """One scene under one reward."""
+    if _WEIGHTS.value:
+        instead("weights", "epochs", "horizon", "positive")
     data, folder, row = dataset(), Path(OUTPUT.value), _ROW.value
     if row is None:
         row = int(pick_frames(data, 1)[0])
@@ -44,7 +58,7 @@ def main() -> None:
     file = _WEIGHTS.value
     if not file:
         workdir, file = folder / "one_frame_run", str(folder / "one_frame.msgpack")
-        train(data, workdir, base(train_horizon=8.0), provenance=provenance())
+        train(data, workdir, base(), provenance=as_used())
         export_run(workdir, data, Path(file))
     reward = open_reward(file)
     mode = str(reward.provenance.get("mode", "speed"))

@@ -17,7 +17,16 @@ import tqdm
 from absl import flags
 
 from experiments.common import run
-from experiments.paper.common import POSITIVE, QUICK, dataset, picture, write
+from experiments.paper.common import (
+    POSITIVE,
+    QUICK,
+    dataset,
+    epochs,
+    fixed,
+    picture,
+    unread,
+    write,
+)
 from rcirl_jax.evaluation.learners import (
     LEARNERS,
     FrozenSets,
@@ -31,21 +40,22 @@ from rcirl_jax.train.state import OPTIMIZERS, TrainConfig
 _LEARNERS = flags.DEFINE_list(
     "learners", [x for x in LEARNERS if not x.endswith("on curves")], "rows to train"
 )
+flags.set_default(POSITIVE, TrainConfig().positive)
+fixed(epochs=TrainConfig().epochs, horizon=TrainConfig().train_horizon)
+unread("seeds")
 
 
 def main() -> None:
     """Train all, say which stayed finite, draw."""
     data = dataset()
     sets, rows = FrozenSets(data), {}
-    epochs = 2 if QUICK.value else TrainConfig().epochs
-    # the flag's default here is that of the trainer
-    positive = POSITIVE.value or TrainConfig().positive
+    positive = POSITIVE.value
     grid = [
         (name, how, config)
         for how in sorted(OPTIMIZERS)
         for name, config in learner_configs(
             _LEARNERS.value,
-            TrainConfig(optimizer=how, epochs=epochs, positive=positive),
+            TrainConfig(optimizer=how, epochs=epochs(), positive=positive),
         ).items()
     ]
     grid = grid[::5] if QUICK.value else grid

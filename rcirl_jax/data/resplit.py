@@ -1,6 +1,9 @@
 """Another split of the same scenes: by vehicle, by recording, or smaller.
 
-Rows keep their numbers, and so their candidates.
+A vehicle is held out as the ego: the scenes of which it is the ego leave the training
+scenes. It may still be an obstacle in a training scene, with its recorded future, and
+a training ego one in a held-out scene. Rows keep their numbers, and so their
+candidates.
 """
 
 import hashlib
@@ -67,10 +70,9 @@ class Resplit:
 
 
 def by_vehicle(dataset: Demonstrations, share: float, seed: int) -> Resplit:
-    """Hold out about `share` of the vehicles, drawn by the seed.
+    """Hold out about `share` of the egos, drawn by the seed.
 
-    Held-out vehicles may still drive beside the training ones; where that
-    matters, use the dataset's own split by vehicle-disjoint groups.
+    They may still be obstacles in training scenes, with their recorded future.
     """
     vehicle = np.asarray(dataset.load(None).vehicle)
     known = np.unique(vehicle)
@@ -81,7 +83,10 @@ def by_vehicle(dataset: Demonstrations, share: float, seed: int) -> Resplit:
 
 
 def by_recording(dataset: Demonstrations, recordings: Sequence[int]) -> Resplit:
-    """Hold out recordings; their vehicles leave the training scenes too.
+    """Hold out recordings; scenes of their egos elsewhere leave training too.
+
+    Such an ego may still be an obstacle in a training scene, with its recorded
+    future, and a training ego one in a held-out scene.
 
     Raises:
       InputError: none is named, or one has no scene.
@@ -102,14 +107,15 @@ def folds_by_recording(dataset: Demonstrations, count: int) -> list[Resplit]:
     """Every scene held out once: recordings dealt into parts, one held out at a time.
 
     The largest recording first, each to the part with fewest scenes. As in
-    `by_recording`, whoever drives in a held-out recording leaves the training scenes.
+    `by_recording`, the ego of a held-out scene is that of no training scene, but may
+    be an obstacle there, with its recorded future; and the reverse.
 
     Args:
       dataset: any dataset; its own split does not matter.
       count: of parts, at least 2.
 
     Raises:
-      InputError: fewer recordings than parts, or a part whose vehicles drive in all
+      InputError: fewer recordings than parts, or a part whose egos are those of all
         other scenes.
     """
     where = np.asarray(dataset.load(None).recording)
@@ -149,7 +155,7 @@ def with_validation(
 
     By vehicle-disjoint group, if that holds out between half and twice the share
     and at least two vehicles; else, as where one group holds nearly all scenes, by
-    vehicle: those held out may then have driven beside those of the fit. Equal
+    vehicle. Either way those held out may be obstacles in scenes of the fit. Equal
     numbers in joined datasets are taken for one vehicle or group, which never puts
     one on both sides.
 
@@ -196,7 +202,7 @@ def held_out(
 ) -> tuple[Demonstrations, str]:
     """The dataset split anew, as one of `HOLDOUTS` says.
 
-    groups leaves the dataset's split; vehicles holds out `HELD_OUT` of them;
+    groups leaves the dataset's split; vehicles holds out `HELD_OUT` of the egos;
     recording holds out some; validation holds out `HELD_OUT` of the training scenes
     and leaves the dataset's test scenes unseen, so that a learner can be chosen.
 
@@ -216,7 +222,7 @@ def held_out(
 
 
 def halves(dataset: Demonstrations) -> tuple[Resplit, Resplit]:
-    """Two disjoint datasets with every other vehicle of each split."""
+    """Two datasets, each with the scenes of every other ego of each split."""
     found = []
     for half in (0, 1):
         splits = {}

@@ -16,10 +16,16 @@ from rcirl_jax.evaluation.ranking import (
     random_scorer,
     scene_metrics,
 )
-from rcirl_jax.evaluation.score import BASELINES, Scored, Scorer, covers, score_scenes
+from rcirl_jax.evaluation.score import (
+    BASELINES,
+    Rival,
+    Scored,
+    Scorer,
+    covers,
+    score_scenes,
+)
 from rcirl_jax.evaluation.table import RankingReport, build_report
 from rcirl_jax.executor import Executor
-from rcirl_jax.reward import LatticeCost
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.types import Demonstration
 
@@ -39,10 +45,8 @@ class RankingSetup:
     split: str = "test"
     # rank only among candidates that meet nothing: the same safety filter for all
     drop_collisions: bool = False
-    # further hand-set costs that are ranked: row -> runs
-    hand_set: Mapping[str, Sequence[LatticeCost]] = dataclasses.field(
-        default_factory=dict
-    )
+    # further hand-set costs and drivers that are ranked: row -> runs
+    tuned: Mapping[str, Sequence[Rival]] = dataclasses.field(default_factory=dict)
 
 
 def covered_rows(
@@ -118,7 +122,7 @@ def _score(
         sampler=setup.sampler,
         horizon_s=setup.horizon_s,
         scorers=scorers,
-        hand_set=_numbered(setup.hand_set),
+        tuned=_numbered(setup.tuned),
         executor=executor,
     )
 
@@ -176,7 +180,7 @@ def rank_scenes(
         scene_metrics(*random_scorer(seed, shape), outcomes, temperatures["random"])
         for seed in range(RANDOM_RUNS)
     ]
-    table |= {name: [metrics(name)] for name in BASELINES} | runs(setup.hand_set)
+    table |= {name: [metrics(name)] for name in BASELINES} | runs(setup.tuned)
     best = oracle_scorer(outcomes)
     table["oracle"] = [scene_metrics(*best, outcomes, temperatures["oracle"])]
     return Ranked(table=table, outcomes=outcomes, group=np.asarray(rows.group))
@@ -197,8 +201,13 @@ def pooled(parts: Sequence[Ranked]) -> Ranked:
     several = {
         name: join(*(getattr(part.outcomes, name) for part in parts)) for name in arrays
     }
+    # by name, for a tree map would sort the rows
+    table = {
+        row: jax.tree.map(join, *(list(part.table[row]) for part in parts))
+        for row in parts[0].table
+    }
     return Ranked(
-        table=jax.tree.map(join, *(dict(part.table) for part in parts)),
+        table=table,
         outcomes=dataclasses.replace(first, **several),
         group=join(*(part.group for part in parts)),
     )

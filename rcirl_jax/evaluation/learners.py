@@ -32,13 +32,14 @@ FREE = RewardConfig(pin="none")
 
 # What a learner changes of the shared configuration. The linear rewards are not
 # pinned: with unit norm their values cannot grow to the spread that a logistic or
-# listwise loss asks for. "Free" says the same of the paper's network. The rank loss
-# alone has no free row: it is homogeneous in the scale and needs the pin.
+# listwise loss asks for. "Free" says the same of the paper's network, whatever
+# the loss; the rank loss has no such row, for it is homogeneous in the scale.
 LEARNERS: dict[str, dict] = {
     "RC-IRL rank": {"loss": "rank"},
     "RC-IRL logistic": {"loss": "logistic"},
     "logistic free": {"loss": "logistic", "reward": FREE},
     "hinge": {"loss": "hinge"},
+    "hinge free": {"loss": "hinge", "reward": FREE},
     "MaxEnt": {"loss": "listwise"},
     "MaxEnt free": {"loss": "listwise", "reward": FREE},
     "MaxEnt linear": {"loss": "listwise", "reward": LINEAR},
@@ -57,6 +58,7 @@ LEARNERS: dict[str, dict] = {
         "reward": RewardConfig(hidden=(32, 16), constraint="monotone"),
     },
     "soft labels": {"loss": "soft"},
+    "soft labels free": {"loss": "soft", "reward": FREE},
     "soft labels linear": {"loss": "soft", "reward": LINEAR},
     "GAN": {"loss": "gan"},
     "GAN free": {"loss": "gan", "reward": FREE},

@@ -7,7 +7,7 @@ that budgets can be compared with a learner's. Vectors are those of
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -39,8 +39,6 @@ from rcirl_jax.train.step import human_of
 from rcirl_jax.types import Demonstration
 from rcirl_jax.units import HORIZON_S
 
-TUNING_SCENES = 256  # training scenes of a search at most
-SIGMA = 1.0  # first spread of the log-weights
 POPULATION_CHUNK = 8  # vectors per device call; padded, so that it compiles once
 
 
@@ -88,16 +86,23 @@ def ranking_problem(
         raise InputError(
             f"--horizon: {setup.horizon_s}: expected above 0, at most {HORIZON_S:g} s"
         )
-    rows, index = covered_rows(dataset, setup.split, setup.horizon_s)
-    chosen = np.random.default_rng(seed).permutation(index.size)[:max_scenes]
-    chosen = np.sort(chosen)
-    rows = jax.tree.map(lambda x: x[chosen], rows)
-    scenes = ranked_scenes(rows, index[chosen], setup.sampler, setup.horizon_s)
+    rows, index = drawn_rows(dataset, setup, max_scenes, seed)
+    scenes = ranked_scenes(rows, index, setup.sampler, setup.horizon_s)
     return Problem(
         objective=lambda vectors: mean_fde(scenes, vectors),
         queries=int(scenes.fde.size),
         title=f"mean FDE at {setup.horizon_s:g} s, m",
     )
+
+
+def drawn_rows(
+    dataset: Demonstrations, setup: RankingSetup, max_scenes: int | None, seed: int
+) -> tuple[Demonstration, np.ndarray]:
+    """Scenes that cover the horizon and their dataset rows, some drawn by the seed."""
+    rows, index = covered_rows(dataset, setup.split, setup.horizon_s)
+    chosen = np.random.default_rng(seed).permutation(index.size)[:max_scenes]
+    chosen = np.sort(chosen)
+    return jax.tree.map(lambda x: x[chosen], rows), index[chosen]
 
 
 def ranked_scenes(
@@ -143,12 +148,19 @@ def _make_scenes(
 
 def mean_fde(scenes: RankedScenes, vectors: np.ndarray) -> np.ndarray:
     """[n] m, mean FDE of the cheapest feasible candidate under each vector [n, 8]."""
+    return in_chunks(functools.partial(_mean_fde, scenes), vectors)
+
+
+def in_chunks(
+    objective: Callable[[jax.Array], jax.Array], vectors: np.ndarray
+) -> np.ndarray:
+    """[n] float64, an objective of several vectors [n, d], compiled for a few."""
     vectors = np.asarray(vectors, np.float32)
     found = []
     for start in range(0, len(vectors), POPULATION_CHUNK):
         picked = np.arange(start, start + POPULATION_CHUNK)
         some = jnp.asarray(vectors[np.minimum(picked, len(vectors) - 1)])
-        found.append(np.asarray(_mean_fde(scenes, some), np.float64))
+        found.append(np.asarray(objective(some), np.float64))
     return np.concatenate(found)[: len(vectors)]
 
 
@@ -258,32 +270,6 @@ def learner_budget(
         epochs=epochs,
         queries_per_evaluation=problem.queries,
     )
-
-
-def tuned_costs(
-    dataset: Demonstrations,
-    setup: RankingSetup,
-    epochs: int,
-    seeds: Iterable[int],
-    max_scenes: int = TUNING_SCENES,
-) -> list[LatticeCost]:
-    """Costs tuned on the ranking of the training scenes, one search per seed.
-
-    Args:
-      dataset: the learners'; only its training split is read.
-      setup: sampler and horizon of the comparison.
-      epochs: the learners'; each search has the queries of one of them.
-      seeds: of the searches and their drawn scenes.
-      max_scenes: training scenes of a search at most.
-    """
-    found, own = [], dataclasses.replace(setup, split="train")
-    for seed in seeds:
-        problem = ranking_problem(dataset, own, max_scenes, seed)
-        budget = learner_budget(dataset, setup.sampler, epochs, problem)
-        start = np.zeros(len(TUNABLE))
-        best = tune(problem.objective, start, SIGMA, budget, seed).vector
-        found.append(tuned(jnp.asarray(best, jnp.float32)))
-    return found
 
 
 def tune_hand_set(

@@ -48,8 +48,8 @@ class Scored:
 
 # (features [..., T, F], time_valid [..., T]) -> value [...]
 Scorer = Callable[[np.ndarray, np.ndarray], np.ndarray]
-# row -> `LatticeCost.fields()`
-HandSet = Mapping[str, Mapping[str, jax.Array]]
+# a rival with parameters; `fields()` is what may be traced of it
+Rival = LatticeCost | Idm
 
 
 def horizon_mask(scene: Scene, horizon_s: float) -> jax.Array:
@@ -96,7 +96,7 @@ def _crashes(scene: Scene, trajectory: Trajectory, mask: jax.Array) -> jax.Array
 def _score_one(
     key: jax.Array,
     demonstration: Demonstration,
-    hand_set: HandSet,
+    tuned: Mapping[str, Rival],
     features: FeatureMap,
     sampler: SamplerConfig,
     horizon_s: float,
@@ -114,13 +114,14 @@ def _score_one(
         "constant speed": lambda x: closeness(
             x, constant_speed_trajectory(scene, on_path), mask
         ),
-        "IDM": lambda x: closeness(x, idm_trajectory(scene, on_path, Idm()), mask),
     }
     cut = scene.replace(time_valid=mask)
-    costs = {"hand-set": LatticeCost()}
-    costs |= {name: LatticeCost(**fields) for name, fields in hand_set.items()}
-    for name, cost in costs.items():
-        rivals[name] = lambda x, cost=cost: -lattice_cost(cut, x, cost)
+    for name, rival in {"IDM": Idm(), "hand-set": LatticeCost(), **tuned}.items():
+        if isinstance(rival, Idm):
+            way = idm_trajectory(scene, on_path, rival)
+            rivals[name] = lambda x, way=way: closeness(x, way, mask)
+        else:
+            rivals[name] = lambda x, cost=rival: -lattice_cost(cut, x, cost)
     return {
         "features_human": features(scene, human),
         "features": features.of_candidates(scene, candidates),
@@ -141,12 +142,20 @@ def candidates_key(index: jax.Array) -> jax.Array:
 
 
 @functools.cache
-def _score_batch(preset: str, sampler: SamplerConfig, horizon_s: float) -> Callable:
+def _score_batch(
+    preset: str,
+    sampler: SamplerConfig,
+    horizon_s: float,
+    kinds: tuple[tuple[str, type[Rival]], ...],
+) -> Callable:
     features = feature_map(preset)
 
-    def one(hand_set: HandSet, index: jax.Array, demonstration: Demonstration) -> dict:
+    def one(
+        fields: Mapping[str, Mapping], index: jax.Array, demonstration: Demonstration
+    ) -> dict:
         key = candidates_key(index)
-        return _score_one(key, demonstration, hand_set, features, sampler, horizon_s)
+        tuned = {name: kind(**fields[name]) for name, kind in kinds}
+        return _score_one(key, demonstration, tuned, features, sampler, horizon_s)
 
     return jax.jit(jax.vmap(one, in_axes=(None, 0, 0)))
 
@@ -159,7 +168,7 @@ def score_scenes(
     sampler: SamplerConfig,
     horizon_s: float,
     scorers: Mapping[str, Scorer],
-    hand_set: Mapping[str, LatticeCost] | None = None,
+    tuned: Mapping[str, Rival] | None = None,
     executor: Executor | None = None,
 ) -> Scored:
     """Sample, featurise, measure and value S scenes, in chunks of bounded memory.
@@ -173,7 +182,7 @@ def score_scenes(
       horizon_s: 5 or 8 s (any in (0, 8]).
       scorers: rewards to apply to the features; the baselines are added. An executor
         with other processes sends them: `reader.Reward.value` can be sent.
-      hand_set: further hand-set costs by name, beside Apollo's.
+      tuned: further hand-set costs and drivers by name, beside the usual ones.
       executor: where chunks are scored; the result does not depend on it.
 
     Returns:
@@ -191,7 +200,7 @@ def score_scenes(
         _score_chunk,
         shared=(preset, sampler, float(horizon_s)),
         scorers=scorers,
-        costs={name: cost.fields() for name, cost in (hand_set or {}).items()},
+        tuned=tuned or {},
     )
     parts = (executor or Here()).stream(piece, chunks())
     return Scored(**jax.tree.map(lambda *x: np.concatenate(x), *parts))
@@ -201,11 +210,13 @@ def _score_chunk(
     item: tuple[Demonstration, np.ndarray, int],
     shared: tuple[str, SamplerConfig, float],
     scorers: Mapping[str, Scorer],
-    costs: HandSet,
+    tuned: Mapping[str, Rival],
 ) -> Iterator[dict]:
     """The arrays of one padded chunk; (rows, index, how many are real)."""
     rows, index, keep = item
-    made = _score_batch(*shared)(costs, index, rows)
+    kinds = tuple((name, type(rival)) for name, rival in tuned.items())
+    fields = {name: rival.fields() for name, rival in tuned.items()}
+    made = _score_batch(*shared, kinds)(fields, index, rows)
     made = jax.tree.map(lambda x: np.asarray(x[:keep]), made)
     yield _with_values(made, scorers)
 

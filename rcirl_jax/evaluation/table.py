@@ -25,17 +25,22 @@ from rcirl_jax.evaluation.statistics import (
     difference_of,
     estimate_of,
 )
-from rcirl_jax.reward import TUNED_ROW
+from rcirl_jax.planner.baselines import TUNED_IDM_ROW
+from rcirl_jax.reward import LONG_ROW, TUNED_ROW
 
 SCHEMA = "rcirl-jax/ranking-report"
 SCHEMA_VERSION = 1
 
 # Rows that are not learned, in the order printed below the learned ones.
-RIVALS = ("random", "constant speed", "IDM", "hand-set", TUNED_ROW, "oracle")
+RIVALS = (
+    *("random", "constant speed", "IDM", TUNED_IDM_ROW),
+    *("hand-set", TUNED_ROW, LONG_ROW, "oracle"),
+)
 # rows that the others are compared with
 REFERENCES = (
-    *("hand-set", TUNED_ROW, "IDM", "GAN", "GAN on curves", "random"),
-    *("RC-IRL logistic", "MaxEnt monotone 32-16"),
+    *("hand-set", TUNED_ROW, LONG_ROW, "IDM", TUNED_IDM_ROW, "random"),
+    *("GAN", "GAN on curves", "GAN free", "GAN free on curves"),
+    *("RC-IRL logistic", "logistic free", "MaxEnt monotone 32-16"),
 )
 
 SIGNIFICANT = 0.05  # Holm-adjusted p below which a difference has a name

@@ -15,19 +15,30 @@ from rcirl_jax.types import Kind, Scene, Trajectory
 from rcirl_jax.units import DT_S, NUM_TIMES, STATION_STEP_M, TIMES_S
 
 SUBSTEPS = 5  # integration steps of the IDM between two times (0.094 s)
+TUNED_IDM_ROW = "IDM, tuned"  # name of its row in all tables
 IN_WAY_M = 0.2  # m, lateral buffer within which an obstacle is a leader
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Idm:
-    """Intelligent Driver Model (Treiber, Hennecke, Helbing 2000), usual values."""
+    """Intelligent Driver Model (Treiber, Hennecke, Helbing 2000), usual values.
 
-    headway: float = 1.5  # s
-    standstill_gap: float = 2.0  # m
-    acceleration: float = 1.4  # m/s^2
-    braking: float = 2.0  # m/s^2, comfortable
-    exponent: float = 4.0
-    max_braking: float = 8.0  # m/s^2, physical cap
+    Any field may be traced.
+    """
+
+    headway: float | jax.Array = 1.5  # s
+    standstill_gap: float | jax.Array = 2.0  # m
+    acceleration: float | jax.Array = 1.4  # m/s^2
+    braking: float | jax.Array = 2.0  # m/s^2, comfortable
+    exponent: float | jax.Array = 4.0
+    max_braking: float | jax.Array = 8.0  # m/s^2, physical cap
+    # the speed wanted on a free road, as a share of the limit
+    speed_share: float | jax.Array = 1.0
+
+    def fields(self) -> dict[str, jax.Array]:
+        """Field -> float32 [], a pytree; `Idm(**fields)` is the inverse."""
+        pairs = dataclasses.asdict(self).items()
+        return {name: jnp.asarray(value, jnp.float32) for name, value in pairs}
 
 
 def idm_acceleration(
@@ -35,12 +46,12 @@ def idm_acceleration(
 ) -> jax.Array:
     """IDM acceleration, m/s^2.
 
-    a [1 - (v / v0)^4 - (s* / gap)^2],
+    a [1 - (v / (share v0))^4 - (s* / gap)^2],
     s* = s0 + max(v T + v dv / (2 sqrt(a b)), 0)
     """
     interaction = v * closing / (2.0 * (idm.acceleration * idm.braking) ** 0.5)
     wanted = idm.standstill_gap + jnp.maximum(v * idm.headway + interaction, 0.0)
-    free = (v / jnp.maximum(desired, 0.1)) ** idm.exponent
+    free = (v / jnp.maximum(idm.speed_share * desired, 0.1)) ** idm.exponent
     raw = idm.acceleration * (1.0 - free - (wanted / jnp.maximum(gap, 0.1)) ** 2)
     return jnp.clip(raw, -idm.max_braking, idm.acceleration)
 

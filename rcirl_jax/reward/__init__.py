@@ -1,6 +1,7 @@
 """The learned reward: network, normaliser, losses, and the hand-set rival."""
 
 from rcirl_jax.reward.hand import (
+    LONG_ROW,
     TUNABLE,
     TUNED_ROW,
     LatticeCost,
@@ -27,6 +28,7 @@ from rcirl_jax.reward.normaliser import fit_normaliser, normalise
 from rcirl_jax.types import Normaliser, RewardParams
 
 __all__ = [
+    "LONG_ROW",
     "LOSSES",
     "TUNABLE",
     "TUNED_ROW",

@@ -21,6 +21,7 @@ from rcirl_jax.types import Scene, Trajectory
 from rcirl_jax.units import TIMES_S
 
 TUNED_ROW = "hand-set, tuned"  # name of the tuned cost's row in all tables
+LONG_ROW = "hand-set, tuned long"  # of one tuned with many more queries
 
 # What a tuner may change, in the order of its vector; all but the last two
 # stand before a term of the sum.
@@ -35,8 +36,8 @@ TUNABLE = (
     "speed_share",
 )
 NUM_TERMS = 6  # 1, of TUNABLE, weights of terms
-LARGEST_LOG = 7.0  # a tuned weight is within a factor exp(7) = 1,097 of Apollo's
-SPEED_SHARES = (0.3, 1.2)  # 1, least and largest tuned speed_share
+LARGEST_LOG = 10.0  # a tuned weight is within a factor exp(10) = 22,026 of Apollo's
+SPEED_SHARES = (0.05, 2.0)  # 1, least and largest tuned speed_share
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -89,7 +90,7 @@ class LatticeTerms(NamedTuple):
 def tuned(vector: Float[Array, " d"]) -> LatticeCost:
     """The cost of a tuner's vector of log-weights; zeros are Apollo's, exactly.
 
-        weight_i = Apollo's_i exp(clip(x_i, -7, 7)),  speed_share in [0.3, 1.2]
+        weight_i = Apollo's_i exp(clip(x_i, -10, 10)),  speed_share in [0.05, 2]
 
     The charge of a collision grows with the largest weight of a term, so that
     colliding trajectories stay last.

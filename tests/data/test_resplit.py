@@ -14,6 +14,7 @@ from rcirl_jax.data.resplit import (
     held_out,
 )
 from rcirl_jax.errors import InputError
+from tests.docs.pages import DOCS, REPO
 
 
 class Rows:
@@ -26,6 +27,7 @@ class Rows:
         self.vehicle = np.repeat(np.arange(40), 5)
         self.recording = self.vehicle // 10
         self.group = self.vehicle // 2
+        self.beside = (self.vehicle + 1) % 40  # the obstacle of each scene
         self.test = np.flatnonzero(np.isin(self.vehicle, rng.permutation(40)[:8]))
 
     def indices(self, split):
@@ -35,7 +37,7 @@ class Rows:
         return self.test if split == "test" else np.setdiff1d(every, self.test)
 
     def read(self, rows):
-        names = ("vehicle", "recording", "group")
+        names = ("vehicle", "recording", "group", "beside")
         return type("Rows", (), {name: getattr(self, name)[rows] for name in names})
 
     def load(self, split):
@@ -46,11 +48,44 @@ class Rows:
     "split",
     [by_vehicle(Rows(), 0.25, 3), by_recording(Rows(), [0, 2]), *halves(Rows())],
 )
-def test_no_vehicle_is_on_both_sides(split):
+def test_no_vehicle_is_the_ego_on_both_sides(split):
     train, test = (set(split.load(name).vehicle) for name in ("train", "test"))
     assert train
     assert test
     assert not train & test
+
+
+@pytest.mark.parametrize("how", HOLDOUTS)
+def test_who_is_held_out_may_be_an_obstacle_of_the_others(how):
+    split, _ = held_out(Rows(), how, recordings=[1, 3])
+    train, test = split.load("train"), split.load("test")
+    assert set(train.beside) & set(test.vehicle)
+    assert set(test.beside) & set(train.vehicle)
+
+
+def words(path, start, end):
+    """The text from one phrase up to another, its lines joined."""
+    text = " ".join(path.read_text().split())
+    assert start in text, f"{path.name}: {start}"
+    return text.partition(start)[2].partition(end)[0]
+
+
+@pytest.mark.parametrize(
+    ("page", "start", "end"),
+    [
+        (REPO / "rcirl_jax/data/resplit.py", '"""Another split', '"""'),
+        (REPO / "rcirl_jax/data/resplit.py", "def by_vehicle", "vehicle = "),
+        (REPO / "rcirl_jax/data/resplit.py", "def by_recording", "every = "),
+        (REPO / "rcirl_jax/data/resplit.py", "def folds_by_recording", "where = "),
+        (REPO / "experiments/human_likeness.py", "--folds=6 instead", "Writes"),
+        (DOCS / "experiments.md", "--folds=6", "experiments.tune_hand_set"),
+    ],
+)
+def test_the_words_say_that_only_egos_are_held_out(page, start, end):
+    said = words(page, start, end)
+    assert "ego" in said
+    assert "obstacle" in said
+    assert "recorded future" in said
 
 
 @pytest.mark.parametrize("how", HOLDOUTS)

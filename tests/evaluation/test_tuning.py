@@ -175,11 +175,11 @@ def test_one_program_scores_any_weights():
 
 def test_tuned_weights_stay_in_their_ranges():
     far = tuned(jnp.full(D, 50.0))
-    assert float(far.speed_share) == pytest.approx(1.2)
-    assert float(far.jerk) == pytest.approx(np.exp(7.0), rel=1e-5)
-    assert float(far.collision_check) == pytest.approx(1e3 * np.exp(7.0), rel=1e-5)
+    assert float(far.speed_share) == pytest.approx(2.0)
+    assert float(far.jerk) == pytest.approx(np.exp(10.0), rel=1e-5)
+    assert float(far.collision_check) == pytest.approx(1e3 * np.exp(10.0), rel=1e-5)
     near = tuned(jnp.full(D, -50.0))
-    assert float(near.speed_share) == pytest.approx(0.3)
+    assert float(near.speed_share) == pytest.approx(0.05)
     assert float(near.collision_check) == 1e3
     with pytest.raises(ValueError, match="expected 8"):
         tuned(jnp.zeros(3))
@@ -269,7 +269,7 @@ def test_the_objective_is_what_the_ranking_report_measures():
         sampler=SMALL,
         horizon_s=8.0,
         scorers={},
-        hand_set={TUNED_ROW: cost, "again": LatticeCost()},
+        tuned={TUNED_ROW: cost, "again": LatticeCost()},
     )
     np.testing.assert_allclose(
         scored.values["again"], scored.values["hand-set"], rtol=1e-5, atol=1e-3

@@ -35,6 +35,21 @@ ASKED = {
     "linear_vs_network": ("21-15-1",),
     "optimisers": ("adam",),
 }
+# shared flags as used under --quick; those with a value of their own; those not read
+SHARED = {"seeds": 2, "epochs": 2, "horizon": 5.0, "positive": "nearest"}
+OWN = {
+    "artefact_audit": {"horizon": 8.0},
+    "discount_factors": {"horizon": 8.0},
+    "known_truth": {"positive": "human"},
+    "one_frame": {"horizon": 8.0},
+    "stability": {"horizon": 8.0, "positive": "human"},
+}
+UNREAD = {
+    "artefact_audit": {"positive"},
+    "closed_loop_seeds": set(SHARED),
+    "one_frame": {"seeds"},
+    "stability": {"seeds"},
+}
 
 
 @pytest.fixture(scope="session")
@@ -58,6 +73,12 @@ def numbers(item):
             yield from numbers(value)
     elif isinstance(item, float):
         yield item
+
+
+def shared_flags(body):
+    """The shared flags that the file records."""
+    recorded = body["made_by"]["flags"]
+    return {name: recorded[name] for name in SHARED if name in recorded}
 
 
 def references(report):
@@ -95,8 +116,12 @@ def test_writes_numbers_and_a_picture(name, dataset, tmp_path):
     assert all(math.isfinite(x) for x in found)
     assert body["quick"] is True
     assert body["made_by"]["versions"]
-    assert body["made_by"]["flags"]["seeds"]
+    used = {**SHARED, **OWN.get(name, {})}
+    for flag in UNREAD.get(name, ()):
+        del used[flag]
+    assert shared_flags(body) == used
     if name == "cross_site":
+        assert "data" not in body["made_by"]["flags"]
         assert set(body["data_hashes"]) == set(body["tested_on"]) == {"here", "there"}
         trained = {row for row in body["tested_on"]["here"]["rows"] if "on" in row}
         assert {"trained on here", "trained on there"} <= trained
@@ -117,6 +142,10 @@ def test_closed_loop_over_seeds(dataset, tmp_path):
     body = json.loads((tmp_path / "closed_loop_seeds.json").read_text())
     assert all(math.isfinite(x) for x in numbers(body))
     assert [len(body["runs"][row]["progress"]) for row in body["rows"]] == [2, 2, 1, 1]
+    assert shared_flags(body) == {}
+    assert body["trained"] == {"epochs": 1, "positive": "nearest"}
+    recorded = body["made_by"]["flags"]
+    assert (recorded["runs"], recorded["cases"]) == (2, 1)
     apart = body["tests"]["RC-IRL minus GAN"]["progress"]
     rows = {row: body["runs"][row]["progress"] for row in ("RC-IRL", "GAN")}
     means = {row: sum(x) / len(x) for row, x in rows.items()}
@@ -137,6 +166,7 @@ def test_the_example_frame_says_why(dataset, tmp_path):
     apart = body["chosen_value"] - body["human_value"]
     assert sum(body["reasons"].values()) == pytest.approx(apart, rel=0.02, abs=1e-4)
     assert body["row"] == 0
+    assert shared_flags(body) == {}  # nothing was trained
 
 
 def test_table2(tmp_path):
@@ -201,7 +231,13 @@ def test_human_likeness_beside_a_tuned_hand_set_cost(dataset, tmp_path):
 
 
 def test_human_likeness_over_folds(dataset, tmp_path):
-    flags = ("--learners=RC-IRL rank,GAN", "--seeds=2", "--epochs=1", "--tuned=1")
+    flags = (
+        "--learners=RC-IRL rank,GAN",
+        "--seeds=2",
+        "--epochs=1",
+        "--tuned=1",
+        "--tuned_long=5",
+    )
     done = commands.command(
         "experiments.human_likeness",
         *(f"--data={dataset}", "--folds=2", *flags, f"--output={tmp_path}"),
@@ -212,7 +248,9 @@ def test_human_likeness_over_folds(dataset, tmp_path):
     assert sum(part["test"] for part in body["parts"]) == scenes
     assert body["counts"]["scenes"] > 0.9 * scenes  # those recorded for 5 s
     assert body["runs"]["GAN"] == 2
-    assert body["runs"]["hand-set, tuned"] == 1
+    for row in ("hand-set, tuned", "hand-set, tuned long", "IDM, tuned"):
+        assert body["runs"][row] == 1
+        assert all(len(part[row]) == 1 for part in body["tuned"])
     assert "2 parts of the recordings, each held out once" in done.stdout
 
 
@@ -234,7 +272,6 @@ def test_human_likeness_over_folds(dataset, tmp_path):
         ("experiments.human_likeness", "--hand_weights=x", "x: No such file"),
         ("experiments.tune_hand_set", "--output=x/t", "--budget, --epochs: expected"),
         ("experiments.human_likeness", "--recording=99", "--recording: [99]: expected"),
-        ("experiments.human_likeness", "--folds=2", "--folds, --holdout: expected"),
         ("experiments.human_likeness", "--recording=a", "--recording: ['a']: inv"),
     ],
 )
@@ -245,6 +282,25 @@ def test_bad_flags_are_one_line(module, flag, line, dataset):
     assert done.returncode == 2
     (said,) = done.stderr.strip().splitlines()
     assert line in said
+
+
+@pytest.mark.parametrize(
+    ("given", "line"),
+    [
+        ("--folds=2 --holdout=groups", "--holdout: groups: expected none beside"),
+        ("--folds=2 --recording=1", "--recording: ['1']: expected none beside --folds"),
+        ("--folds=2 --split_seed=0", "--split_seed: 0: expected none beside --folds"),
+        ("--recording=1", "--recording: ['1']: expected with --holdout=recording"),
+        ("--recording=1 --holdout=vehicles", "=recording, not vehicles"),
+    ],
+)
+def test_flags_that_a_split_leaves_unread_are_refused(given, line, dataset, tmp_path):
+    flags = (f"--data={dataset}", f"--output={tmp_path / 'out'}", *given.split())
+    done = commands.command("experiments.human_likeness", *flags)
+    assert done.returncode == 2
+    (said,) = done.stderr.strip().splitlines()
+    assert line in said
+    assert not (tmp_path / "out").exists()
 
 
 def test_table2_never_reuses_the_parts_of_a_quick_run(tmp_path):
@@ -262,10 +318,21 @@ def test_table2_never_reuses_the_parts_of_a_quick_run(tmp_path):
         ("cross_site", "--sites=a=x,a=y", "named apart"),
         ("table2", "--input=missing", "missing"),
         ("background_shift", "--seed=-1", "--seed"),
+        # shared flags that an experiment does not read, or leaves no choice in
+        ("artefact_audit", "--positive=human", "Unknown command line flag 'positive'"),
+        ("closed_loop_seeds", "--seeds=3", "Unknown command line flag 'seeds'"),
+        ("closed_loop_seeds", "--epochs=3", "Unknown command line flag 'epochs'"),
+        ("one_frame", "--seeds=3", "Unknown command line flag 'seeds'"),
+        ("stability", "--seeds=3", "Unknown command line flag 'seeds'"),
+        ("stability", "--epochs=3", "flag --epochs=3: expected 20 here"),
+        ("known_truth", "--positive=nearest", "=nearest: expected human here"),
+        ("discount_factors", "--horizon=5", "flag --horizon=5.0: expected 8.0 here"),
+        ("one_frame", "--weights=x --epochs=3", "--epochs: 3: expected none beside"),
+        ("cross_site", "--sites=a=x,b=y --data=z", "--data: z: expected none beside"),
     ],
 )
 def test_bad_flags_without_data_are_one_line(name, flag, line, tmp_path):
-    done = command(name, flag, f"--output={tmp_path / 'out'}")
+    done = command(name, *flag.split(), f"--output={tmp_path / 'out'}")
     assert done.returncode == 2
     (said,) = done.stderr.strip().splitlines()
     assert said.startswith("error: ")

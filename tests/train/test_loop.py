@@ -207,7 +207,10 @@ def test_a_horizon_nobody_covers_is_one_line(dataset):
 def test_pooled_parts_are_the_whole(dataset, run, tmp_path):
     """Held-out scenes judged in two parts: the report of all of them at once."""
     reward = export_run(run[0], dataset, tmp_path / "weights.msgpack")
-    learned, preset, _ = load_runs([reward.file])
+    runs, preset, _ = load_runs([reward.file])
+    (scorer,) = next(iter(runs.values()))
+    # rows out of alphabetical order, runs that differ
+    learned = {"z": [scorer, lambda x, valid: -scorer(x, valid)], "a": [scorer]}
     setup = RankingSetup(preset=preset, sampler=SMALL)
     train_rows, rows = dataset.indices("train"), dataset.indices("test")
     cuts = [rows[: rows.size // 3], rows[rows.size // 3 :]]
@@ -217,6 +220,11 @@ def test_pooled_parts_are_the_whole(dataset, run, tmp_path):
     whole, joined = evaluate_ranking(dataset, learned, setup), pooled(ranked)
     # the random order is drawn for each part anew
     assert joined.table["random"][0]["mrr"].size == rows.size
+    assert list(joined.table) == list(ranked[0].table)
+    assert list(joined.table)[:2] == ["z", "a"]
+    runs_of_z = [run["top1_fde"].mean() for run in joined.table["z"]]
+    assert runs_of_z[0] != pytest.approx(runs_of_z[1])
+    assert joined.table["a"][0]["top1_fde"].mean() == pytest.approx(runs_of_z[0])
     found = report_of(joined)
     for name in set(whole.rows) - {"random"}:
         for metric, value in whole.rows[name].items():
