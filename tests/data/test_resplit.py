@@ -14,7 +14,6 @@ from rcirl_jax.data.resplit import (
     held_out,
 )
 from rcirl_jax.errors import InputError
-from tests.docs.pages import DOCS, REPO
 
 
 class Rows:
@@ -61,31 +60,6 @@ def test_who_is_held_out_may_be_an_obstacle_of_the_others(how):
     train, test = split.load("train"), split.load("test")
     assert set(train.beside) & set(test.vehicle)
     assert set(test.beside) & set(train.vehicle)
-
-
-def words(path, start, end):
-    """The text from one phrase up to another, its lines joined."""
-    text = " ".join(path.read_text().split())
-    assert start in text, f"{path.name}: {start}"
-    return text.partition(start)[2].partition(end)[0]
-
-
-@pytest.mark.parametrize(
-    ("page", "start", "end"),
-    [
-        (REPO / "rcirl_jax/data/resplit.py", '"""Another split', '"""'),
-        (REPO / "rcirl_jax/data/resplit.py", "def by_vehicle", "vehicle = "),
-        (REPO / "rcirl_jax/data/resplit.py", "def by_recording", "every = "),
-        (REPO / "rcirl_jax/data/resplit.py", "def folds_by_recording", "where = "),
-        (REPO / "experiments/human_likeness.py", "--folds=6 instead", "Writes"),
-        (DOCS / "experiments.md", "--folds=6", "experiments.tune_hand_set"),
-    ],
-)
-def test_the_words_say_that_only_egos_are_held_out(page, start, end):
-    said = words(page, start, end)
-    assert "ego" in said
-    assert "obstacle" in said
-    assert "recorded future" in said
 
 
 @pytest.mark.parametrize("how", HOLDOUTS)
