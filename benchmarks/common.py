@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.common import git_commit
+from experiments.common import git_commit, processor
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
@@ -29,17 +29,8 @@ STRIDE_S = 60.0  # s between planning frames of the synthetic dataset
 
 def machine() -> dict:
     """Hardware and versions, for the result file."""
-    model = platform.processor()
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        lines = cpuinfo.read_text().splitlines()
-        names = [
-            line.split(":", 1)[1].strip() for line in lines if "model name" in line
-        ]
-        model = names[0] if names else model
     return {
-        "cpu": model,
-        "cores": len(os.sched_getaffinity(0)),
+        **processor(),
         "load": round(os.getloadavg()[0], 2),
         "device": jax.devices()[0].device_kind,
         "devices": jax.device_count(),

@@ -3,7 +3,8 @@
     python -m experiments.import_logs --format=commonroad --input=DIR --output=DATASET
 
 Prints the data-quality report and writes it into DATASET/manifest.json. An
-interrupted import resumes; bad input leaves nothing behind.
+interrupted import resumes; bad input leaves nothing behind. Of large releases a few
+odd recordings may be left out (--leave_out), counted and named in the report.
 """
 
 from pathlib import Path
@@ -56,6 +57,9 @@ _SIGNALS = flags.DEFINE_string(
 _TEST_FRACTION = flags.DEFINE_float(
     "test_fraction", 0.25, "share of scenes held out, by vehicle-disjoint group"
 )
+_LEAVE_OUT = flags.DEFINE_integer(
+    "leave_out", 0, "recordings that may be refused and are left out, counted", 0
+)
 _FLOOR = flags.DEFINE_float("horizon", 5.0, "s at which the oracle floor is taken")
 _SPLIT_SEED = flags.DEFINE_integer("split_seed", 0, "order in which groups are dealt")
 
@@ -78,6 +82,7 @@ def main() -> None:
         ),
         test_fraction=_TEST_FRACTION.value,
         split_seed=_SPLIT_SEED.value,
+        leave_out=_LEAVE_OUT.value,
     )
     found, spec = parts(
         _FORMAT.value,

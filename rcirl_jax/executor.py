@@ -16,8 +16,10 @@ import itertools
 import multiprocessing
 import os
 import socket
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.synchronize import Barrier
 from typing import Any, Protocol, TypeVar
 
 from rcirl_jax.errors import InputError, LostWorkError
@@ -109,8 +111,15 @@ class Processes:
             # forking a process that runs JAX's threads can hang
             start = multiprocessing.get_context("spawn")
             self._pool = futures.ProcessPoolExecutor(
-                self.workers, mp_context=start, initializer=_on_cpu
+                self.workers,
+                mp_context=start,
+                initializer=_as_worker,
+                initargs=(start.Barrier(self.workers),),
             )
+            # all processes before any piece: a pool (of Python 3.11) that starts one
+            # while it finds another killed loses its own thread
+            for _ in range(self.workers):
+                self._pool.submit(os.getpid)
         pool = self._pool
         running: collections.deque[futures.Future] = collections.deque()
         try:
@@ -132,9 +141,25 @@ class Processes:
                 future.cancel()
 
 
-def _on_cpu() -> None:
-    """Numbers must not depend on an accelerator, nor processes fight over one."""
+def _as_worker(all_started: Barrier) -> None:
+    """On the CPU, and no longer than the process that started this one.
+
+    Numbers must not depend on an accelerator, nor processes fight over one. A parent
+    that is killed cannot tell its workers to end: each waits for that itself.
+
+    Args:
+      all_started: met by every worker of the pool before its first piece.
+    """
     os.environ["JAX_PLATFORMS"] = "cpu"
+    parent = multiprocessing.parent_process()
+
+    def outlive_nobody() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=outlive_nobody, daemon=True).start()
+    all_started.wait()
 
 
 def _listed_in(

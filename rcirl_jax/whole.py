@@ -37,6 +37,8 @@ def plain(node: Any) -> Any:  # noqa: ANN401
     return node
 
 
-def write_json(path: Path, body: Mapping[str, object] | Sequence[object]) -> None:
+def write_json(
+    path: Path, body: Mapping[str, object] | Sequence[object], indent: int = 2
+) -> None:
     """The body as JSON (see `plain`), whole."""
-    write_whole(path, json.dumps(plain(body), indent=2, allow_nan=False) + "\n")
+    write_whole(path, json.dumps(plain(body), indent=indent, allow_nan=False) + "\n")

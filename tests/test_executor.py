@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -35,6 +37,57 @@ def dies_once(folder):
 def dies(item):
     os.kill(os.getpid(), signal.SIGKILL)
     yield item
+
+
+def own_number(item):
+    time.sleep(0.3)  # for the other worker to take the other item
+    yield os.getpid()
+
+
+# a parent that says who works for it and then hangs
+HANGS = """
+import time
+from rcirl_jax.executor import Processes
+from tests.test_executor import own_number
+if __name__ == "__main__":
+    pool = Processes(2)
+    print(*pool.stream(own_number, range(4)), flush=True)
+    time.sleep(600)
+"""
+
+
+def lives(number):
+    """Whether a process runs; one that nobody has waited for does not."""
+    try:
+        return (
+            Path(f"/proc/{number}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+        )
+    except OSError:
+        return False
+
+
+@pytest.mark.multiprocess
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
+def test_workers_end_with_a_parent_that_is_killed(tmp_path):
+    file = tmp_path / "hangs.py"
+    file.write_text(HANGS)
+    root = str(Path(__file__).resolve().parents[1])
+    parent = subprocess.Popen(
+        [sys.executable, file], stdout=subprocess.PIPE, text=True,
+        env={**os.environ, "PYTHONPATH": root},
+    )  # fmt: skip
+    try:
+        workers = {int(number) for number in parent.stdout.readline().split()}
+        assert workers
+        assert all(lives(number) for number in workers)
+    finally:
+        parent.kill()
+        parent.wait()
+        parent.stdout.close()
+    deadline = time.monotonic() + 30.0
+    while any(lives(number) for number in workers):
+        assert time.monotonic() < deadline, "a worker outlives its parent"
+        time.sleep(0.1)
 
 
 @pytest.mark.parametrize("make", [Here, lambda: Processes(2)], ids=["here", "two"])

@@ -25,6 +25,7 @@ from rcirl_jax.data.importers import (
     read_part,
 )
 from rcirl_jax.data.quality import QualityReport
+from rcirl_jax.data.recording import LEAVE_OUT, refusal
 from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.types import Demonstration, Recording, Track
 
@@ -56,6 +57,7 @@ class Cut:
     groups: list[str]  # vehicle-disjoint group per scene
     quality: dict  # `QualityReport.state()`
     known: bool = False  # a committed shard holds it already
+    refused: str = ""  # why nothing of it was read, where it is left out
     part: str = ""  # the input it was read from
     progress: float | None = None  # share of the part read after it, if known
 
@@ -131,6 +133,11 @@ def cut(
                 "import: expected the same; use another --output"
             )
         return Cut(**about, **nothing, known=True)
+    if recording.refused:
+        report = QualityReport()
+        report.add_refusal(recording)
+        refused = {"quality": report.state(), "refused": recording.refused}
+        return Cut(**about, **{**nothing, **refused})
     with as_input_error(recording.name, "a sound recording"):
         collector = Collector(recording, config)
         parts, tracks = _assembled(recording, collector)
@@ -190,8 +197,17 @@ def cut_one(
 
 
 def recordings_of(part: Part) -> Iterator[Recording]:
-    """All recordings of a part, one at a time."""
-    return read_part(part.format, part.input, part.spec)
+    """All recordings of a part, one at a time.
+
+    Where recordings may be left out, a part that cannot be read any further ends
+    with one that says why.
+    """
+    try:
+        yield from read_part(part.format, part.input, part.spec)
+    except InputError as error:
+        if not part.spec.get(LEAVE_OUT):
+            raise
+        yield refusal(f"{part.input.parent.name}/{part.input.name}, the rest", error)
 
 
 def is_long(part: Part) -> bool:

@@ -30,6 +30,7 @@ from rcirl_jax.data.cut import (
     whole_of,
 )
 from rcirl_jax.data.quality import QualityReport
+from rcirl_jax.data.recording import LEAVE_OUT
 from rcirl_jax.data.splits import assign_groups
 from rcirl_jax.data.store import DatasetWriter, Manifest
 from rcirl_jax.errors import InputError, LostWorkError
@@ -48,6 +49,8 @@ class ImportConfig:
     # share of scenes held out, by vehicle-disjoint group
     test_fraction: float = 0.25
     split_seed: int = 0
+    # recordings that may be refused and are left out; the next one ends the import
+    leave_out: int = 0
 
 
 class _Numbers:
@@ -150,8 +153,9 @@ class _Import:
         """Take over one recording's scenes."""
         if made.name in self.recordings.table:
             raise InputError(f"{made.name}: name: met twice: expected once")
-        self.sources[made.source] = made.licence
-        self.rates.add(made.rate_hz)
+        if not made.refused:
+            self.sources[made.source] = made.licence
+            self.rates.add(made.rate_hz)
         number = self.recordings.of(made.name)
         if self.done:
             self._replay(self.done.pop(0), made)
@@ -172,6 +176,10 @@ class _Import:
                 )
             )
         self._count(entry)
+        if self.quality.refused > self.config.leave_out:
+            raise InputError(
+                f"{made.refused}; recordings left out before: {self.config.leave_out}"
+            )
         self.lineage.append(entry)
         if sum(block.vehicle.shape[0] for block in self.pending) >= SHARD_SCENES:
             self._close_shard()
@@ -231,9 +239,16 @@ class _Import:
                 "vehicles": self.vehicles.names(),
                 "splits": self._splits(),
                 "quality": self.quality.as_dict(),
-                "import": dataclasses.asdict(self.config),
+                "import": self._flags(),
             }
         )
+
+    def _flags(self) -> dict:
+        """What the manifest says of the settings; `leave_out` only where it is used."""
+        found = dataclasses.asdict(self.config)
+        if not found["leave_out"]:
+            del found["leave_out"]
+        return found
 
     def _splits(self) -> dict[str, list[str]]:
         """Groups per split: whole recordings, or minutes where there is only one."""
@@ -311,6 +326,10 @@ def import_parts(
       InputError: as `import_logs`.
     """
     places = executor or Here()
+    if config.leave_out:
+        parts = [
+            dataclasses.replace(x, spec={**x.spec, LEAVE_OUT: True}) for x in parts
+        ]
 
     def cuts(known: dict[str, str]) -> Iterable[Cut]:
         settings = {"config": config.collect, "done": known}

@@ -8,7 +8,7 @@ import numpy as np
 from rcirl_jax.data.collect import Collector
 from rcirl_jax.data.filters import REASONS
 from rcirl_jax.data.smoothing import HARSH_MPS2, harsh_share
-from rcirl_jax.types import Decision, Demonstration, Kind, Tag
+from rcirl_jax.types import Decision, Demonstration, Kind, Recording, Tag
 
 HEADWAY_STEP_S = 0.01  # s, to which headways are counted
 SPEED_STEP_MPS = 0.05  # m/s, likewise
@@ -43,6 +43,12 @@ class QualityReport:
         default_factory=collections.Counter
     )
     notes: list[str] = dataclasses.field(default_factory=list)
+    refused: int = 0  # recordings left out
+
+    def add_refusal(self, recording: Recording) -> None:
+        """Count a recording that is left out, and note why."""
+        self.refused += 1
+        self.notes.append(f"left out: {recording.refused}")
 
     def add_recording(self, collector: Collector) -> None:
         """Count a recording's tracks, noise, drop reasons and notes."""
@@ -117,6 +123,8 @@ class QualityReport:
             "tags": dict(self.tags),
             "decisions": dict(self.decisions),
             "dropped": {name: self.dropped.get(name, 0) for name in REASONS},
+            # said only where it happened: the manifests of before keep their hash
+            **({"refused": self.refused} if self.refused else {}),
             "notes": self.notes[:200],
             "num_notes": len(self.notes),
         }
@@ -189,6 +197,8 @@ def format_quality(report: dict) -> str:
         lines.append(left + right)
     decisions = ", ".join(f"{k} {v:,}" for k, v in report["decisions"].items())
     lines += ["", f"decisions per obstacle: {decisions}"]
+    if report.get("refused"):
+        lines.append(f"{report['refused']} recordings refused and left out")
     if report["num_notes"]:
         lines.append(f"{report['num_notes']} notes; first: {report['notes'][0]}")
     return "\n".join(lines)

@@ -6,22 +6,24 @@ file, the field, the value found and what was expected.
 """
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.errors import InputError
+from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.types import Ghost, Kind, Lane, Recording, Signal, Track
 from rcirl_jax.units import FOOT_M, MPH_MPS
 
+LEAVE_OUT = "leave_out"  # key of a spec: refused recordings are left out
 MAX_SPEED_MPS = 90.0  # m/s, faster than any road user
 LENGTH_RANGE_M = (0.2, 40.0)  # m
 WIDTH_RANGE_M = (0.2, 6.0)  # m
 MAX_SPAN_M = 1e6  # m between any two places of one recording
 MAX_LANES_M = 1e7  # m, all lanes of one recording together
 STATIC_RANGE_M = (0.01, 1000.0)  # m, standing objects: from posts to long walls
-# m, of the median vehicle: above it lengths are in feet, below it they were taken for
-# feet (a car is 4-5 m)
+# m, of the median vehicle: below it lengths were taken for feet; above it they are in
+# feet, if those of a quarter from the shortest are too (a car is 4-5 m, a bus 12)
 MEDIAN_CAR_M = (2.0, 9.0)
 MIN_CARS = 3  # vehicles needed to judge the median; two lorries are no error
 MOVING_MPS = 2.0  # m/s, speeds are compared only above this
@@ -39,6 +41,43 @@ RATIO_HINTS = {
 HINT_TOLERANCE = 0.08  # relative; 3.28 and 3.6 stay apart
 SERIES = ("t", "x", "y", "heading", "speed")
 STATES = ("red", "yellow", "green", "off")
+
+
+def accepted(
+    make: Callable[[], Recording], name: str, file: object, spec: dict
+) -> Recording:
+    """A validated recording of several in one file.
+
+    Args:
+      make: reads it.
+      name: of the recording, where it cannot be read.
+      file: named in errors.
+      spec: of the source; with `leave_out` what is refused becomes a recording
+        without tracks that says why, and the next one can be read.
+
+    Raises:
+      InputError: as `validate_recording`, without `leave_out`.
+    """
+    try:
+        with as_input_error(str(file), "a sound recording"):
+            return validate_recording(make(), str(file))
+    except InputError as error:
+        if not spec.get(LEAVE_OUT):
+            raise
+        return refusal(name, error)
+
+
+def refusal(name: str, error: InputError) -> Recording:
+    """What stands for a recording that is left out."""
+    return Recording(
+        name=name,
+        source="",
+        licence="",
+        rate_hz=0.0,
+        tracks=(),
+        lanes=(),
+        refused=str(error),
+    )
 
 
 def validate_recording(
@@ -179,7 +218,8 @@ def _check_lengths(name: str, tracks: tuple[Track, ...]) -> None:
         return
     median = float(np.median(lengths))
     low, high = MEDIAN_CAR_M
-    if not low <= median <= high:
+    short = float(np.quantile(lengths, 0.25))
+    if median < low or min(median, short) > high:
         wrong = "feet taken for metres" if median > high else "metres taken for feet"
         raise InputError(
             f"{name}: length: median {median:.1f} m: "

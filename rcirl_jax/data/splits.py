@@ -1,8 +1,9 @@
 """Splits by vehicle-disjoint group, never by row.
 
 Rows of one drive resemble each other: with rows of one vehicle on both sides a
-held-out score measures memory. A group holds every row of its vehicles, so
-splitting groups splits vehicles. The result depends on names, counts and seed
+held-out score measures memory. A group holds every row of the vehicles that are the
+ego of one, so splitting groups splits egos (an ego here may be an obstacle there,
+unless the groups given forbid it). The result depends on names, counts and seed
 only: ties and the "random" order come from sha256, which is the same on every
 machine, Python and numpy.
 """

@@ -269,6 +269,16 @@ def test_malformed_rows(tmp_path, rows, field):
     assert "\n" not in message
 
 
+def test_buses_are_no_feet(tmp_path):
+    """Two of three are 12 m long; three of three would be feet."""
+    rows = w.csv_rows()
+    for row in rows:
+        row[5] = 4.5 if row[1] == "car0" else 12.0
+    path = log(tmp_path, rows)
+    (recording,) = read(path, w.csv_spec(tmp_path / "s.toml"))
+    assert sorted(track.length for track in recording.tracks) == [4.5, 12.0, 12.0]
+
+
 @pytest.mark.parametrize("long_bytes", [1, 10**9])
 @pytest.mark.parametrize("cells", [1, 4, 7, 8])
 def test_a_file_cut_inside_its_last_line(tmp_path, cells, long_bytes):

@@ -145,6 +145,28 @@ def test_reads_only_the_scene_it_is_at(folder):
         next(found)
 
 
+@pytest.mark.parametrize(
+    ("controls", "governing"),
+    [
+        ((fixture.RED, fixture.GREEN), "gRN1|rED1"),
+        ((fixture.LIGHT,), "gRN1|rED1"),
+        # the light's other face is for another lane, say an arrow to the left
+        ((fixture.LIGHT, fixture.GREEN), "gRN1"),
+        ((fixture.RED, fixture.LIGHT), "rED1"),
+    ],
+)
+def test_a_lane_that_names_faces_has_only_those_of_its_light(
+    controls, governing, tmp_path
+):
+    made = fixture.write_map(tmp_path / "m.pb", controls)
+    lanes = l5_map.SemanticMap(made, packaged()).lanes(
+        *fixture.CENTRE[:, None], np.zeros(2)
+    )
+    by_name = {lane.id: lane.signal_ids for lane in lanes}
+    assert by_name["a1"] == (governing,)
+    assert by_name["a2"] == ()
+
+
 def test_lanes_of_the_semantic_map(folder):
     lanes = {lane.id: lane for lane in read(folder)[0].lanes}
     assert set(lanes) == {"a1", "a2", "b1", "c1"}  # not the stub
@@ -342,7 +364,7 @@ NAN, INF = float("nan"), float("inf")
         ("agents", set_field("extent", -1.0), r"length: -1 m: expected 0 to"),
         ("agents", set_field("extent", 1e6), r"length: 1e\+06 m: expected 0 to"),
         ("agents", set_field("yaw", NAN), r"heading: nan: expected a finite"),
-        ("agents", set_field("velocity", 1e4, row=0), r"speed: 14142"),
+        ("agents", set_field("velocity", 1e4, row=slice(0, 3)), r"speed: 14142"),
         ("agents", set_field("label_probabilities", NAN), r"label_probabilities"),
         ("agents", set_field("track_id", 15, row=0), r"met twice"),
         ("frames", set_field("ego_translation", NAN), r"ego_translation: x: nan"),

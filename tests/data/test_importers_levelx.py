@@ -215,6 +215,7 @@ def test_a_trailer_is_an_obstacle_but_no_expert(tmp_path):
         "data/location4.osm",
         "maps/lanelets/4_somewhere/town.osm",
         "maps/rounD_4.osm",
+        "maps/4_somewhere.osm",
     ],
 )
 def test_where_maps_lie(junction, place):
@@ -291,7 +292,8 @@ def test_truncated_at_the_border_of_lines(junction, kept, found):
     with pytest.raises(InputError) as error:
         read(junction)
     assert str(error.value) == (
-        f"{path}: {found} as in 07_tracksMeta.csv; truncated file?"
+        f"{path}: {found} as in 07_tracksMeta.csv; truncated file? "
+        "(of a sample, set partial = true in the TOML of --source)"
     )
 
 

@@ -161,6 +161,8 @@ def test_up_to_a_tenth_of_the_tracks_may_be_impossible(tmp_path, name):
     none = scenario(tmp_path / "none", f2=traffic(20, 0, change, rows))
     assert len(none.tracks) == 20
     assert not any("impossible" in note for note in none.notes)
+    one = scenario(tmp_path / "one", f2=traffic(5, 1, change, rows))
+    assert len(one.tracks) == 4  # one of few is no wrong file
     many = put(tmp_path / "many", w.scenario(f2=traffic(20, 3, change, rows)))
     assert f"record 0: track 100: {wrong}" in message(many)
 

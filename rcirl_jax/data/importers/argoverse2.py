@@ -185,7 +185,10 @@ def _read_tracks(
         else:
             tracks.append(_track(file, name, table, rows, clock, spec))
     # sizes are the source TOML's, so that a wrong one is no outlier
-    tracks, outliers = without_outliers(tracks, has_possible_speed)
+    # the recording car's own speed is measured: if that is wrong, so is the file
+    tracks, outliers = without_outliers(
+        tracks, lambda track: track.id == RECORDER or has_possible_speed(track)
+    )
     if low:
         notes.append(f"{low} tracks below category {least:g} left out")
     if wild:

@@ -14,6 +14,7 @@ may start at 0 or 1, challenge files hold what is asked for in SCENE_obs.csv.
 """
 
 import dataclasses
+import functools
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -39,7 +40,7 @@ from rcirl_jax.data.importers.tables import (
     split_tracks,
     travel_heading,
 )
-from rcirl_jax.data.recording import validate_recording
+from rcirl_jax.data.recording import accepted, validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Lane, Recording, Track
 
@@ -225,8 +226,8 @@ def _cases(table: dict[str, np.ndarray], scene: _Scene) -> Iterator[Recording]:
         part = {field: values[rows] for field, values in table.items()}
         log = log_name(scene.path, scene.spec, scene.path.stem)
         name = f"{log}-case{part['case_id'][0]:g}"
-        recording = _recording(name, part, scene, scene.path.stem)
-        yield validate_recording(recording, scene.path)
+        make = functools.partial(_recording, name, part, scene, scene.path.stem)
+        yield accepted(make, name, scene.path, scene.spec)
 
 
 def _recording(

@@ -15,6 +15,7 @@ lights are in the semantic map alone.
 
 import contextlib
 import dataclasses
+import functools
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -35,7 +36,7 @@ from rcirl_jax.data.importers.shapes import (
 )
 from rcirl_jax.data.importers.tables import number
 from rcirl_jax.data.importers.zarr2 import StructuredArray
-from rcirl_jax.data.recording import validate_recording
+from rcirl_jax.data.recording import accepted
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Lane, Recording, Signal, Track
 
@@ -102,13 +103,12 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
         groups = _groups(dataset.scenes, list(others.values()))
         for index, scene in enumerate(dataset.scenes):
             name = f"{folder.stem}-{index:06d}"
-            recording = _recording(
-                dataset, name, scene, maps[file] if file else None, spec
+            road = maps[file] if file else None
+            make = functools.partial(_recording, dataset, name, scene, road, spec)
+            made = accepted(make, name, f"{folder}: scene {index}", spec)
+            yield dataclasses.replace(
+                made, group=groups[index], progress=(index + 1) / len(groups)
             )
-            recording = dataclasses.replace(
-                recording, group=groups[index], progress=(index + 1) / len(groups)
-            )
-            yield validate_recording(recording, f"{folder}: scene {index}")
 
 
 def parts(path: Path, spec: dict) -> list[Path]:

@@ -237,6 +237,17 @@ class SemanticMap:
         check_coordinates(self.file, f"lane {name}", ("x", "y"), world)
         return world[moves(world)] if len(world) else world
 
+    def _faces_of(self, controls: tuple[str, ...]) -> list[str]:
+        """Faces that govern a lane: those it names; a light's, where it names none.
+
+        A light has faces for other lanes too, say an arrow to the left.
+        """
+        named, found = set(controls), []
+        for name in controls:
+            faces = self._lights.get(name, (name,))
+            found += faces if faces == (name,) or named.isdisjoint(faces) else ()
+        return found
+
     def _lane(self, raw: _RawLane) -> Lane | None:
         left, right = raw.left, raw.right
         centre, half = between_bounds(left, right)
@@ -249,9 +260,7 @@ class SemanticMap:
             centre, half = centre[::-1], half[::-1]
         forward, back = self._limits.get(raw.parent, (0.0, 0.0))
         limit = back if raw.backward and back > 0.0 else forward
-        faces = [
-            face for name in raw.controls for face in self._lights.get(name, (name,))
-        ]
+        faces = self._faces_of(raw.controls)
         governing = sorted({face for face in faces if face in self._faces})
         stop_sign = any(name in self._stop_signs for name in raw.controls)
         stops = bool(governing) or stop_sign

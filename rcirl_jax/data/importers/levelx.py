@@ -298,7 +298,8 @@ def _check_whole(
             if value != expected:
                 raise InputError(
                     f"{path}: track {name}: {field}: {value:.12g}: expected "
-                    f"{expected:.12g} as in {_other(path, USERS).name}; truncated file?"
+                    f"{expected:.12g} as in {_other(path, USERS).name}; truncated "
+                    "file? (of a sample, set partial = true in the TOML of --source)"
                 )
 
 

@@ -122,13 +122,14 @@ def find_map(path: Path, location: str, spec: dict) -> Path | None:
 
 
 def _of_location(files: list[Path], location: str) -> Path | None:
-    """locationN.osm; else the only map in a folder named N_...; else *_N.osm."""
+    """locationN.osm; else the only map in a folder named N_..., N_*.osm, *_N.osm."""
     digits = location.split(".")[0].lstrip("0") or "0"
     if not digits.isdigit():
         return None
     patterns = (
         (rf"location_?0*{digits}", "stem"),
         (rf"0*{digits}_.*", "parent"),
+        (rf"0*{digits}_.*", "stem"),
         (rf".*_0*{digits}", "stem"),
     )
     for pattern, part in patterns:

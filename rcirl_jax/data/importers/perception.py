@@ -23,6 +23,7 @@ UNKNOWN = -1  # kind of a box whose class the log does not know
 UNKNOWN_CHOICES = ("auto", "drop", "static", "vehicle")
 STANDING_M = 1.0  # m, an unknown object that moves less than this is static
 MAX_OUTLIERS = 0.1  # share of tracks dropped as outliers; more is an error
+ONE_OF = 5  # tracks of which one may always be an outlier
 WINDOW_S = 300.0  # s, longest window of a drive
 MAX_SIZE_M = 200.0  # m, of a box; beyond it the file is wrong, not the tracker
 FIELDS = ("t", "x", "y", "heading", "length", "width")
@@ -147,7 +148,8 @@ def without_outliers(
 ) -> tuple[list[Track], list[str]]:
     """Tracks without the impossible ones, and a note of their number.
 
-    All of them where more than MAX_OUTLIERS are: validation refuses them then.
+    All of them where more than MAX_OUTLIERS are, and more than one of ONE_OF or more:
+    validation refuses them then.
 
     Args:
       tracks: of one recording.
@@ -155,7 +157,8 @@ def without_outliers(
     """
     good = [track for track in tracks if (is_possible or _is_possible)(track)]
     lost = len(tracks) - len(good)
-    if lost == 0 or lost > MAX_OUTLIERS * len(tracks):
+    allowed = max(MAX_OUTLIERS * len(tracks), float(len(tracks) >= ONE_OF))
+    if lost == 0 or lost > allowed:
         return tracks, []
     return good, [f"{lost} tracks with an impossible size or speed left out"]
 

@@ -13,7 +13,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from rcirl_jax.data.recording import validate_recording
+from rcirl_jax.data.recording import LEAVE_OUT, validate_recording
 from rcirl_jax.data.synthetic import ROADS, DriverConfig, RunConfig, simulate
 from rcirl_jax.data.synthetic.roads import lanes, to_world
 from rcirl_jax.data.synthetic.stops import schedule
@@ -69,7 +69,9 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
       InputError: an unknown key or a bad value, before anything is simulated.
     """
     own = load_toml(path)
-    settings = {**spec, **own}
+    # the import's own switch says nothing here: none of these is refused
+    packaged = {key: value for key, value in spec.items() if key != LEAVE_OUT}
+    settings = {**packaged, **own}
     settings["drivers"] = {**_table(spec, "drivers"), **_table(own, "drivers")}
     _check_keys(path, "", settings, TOP_KEYS)
     drivers = driver_config(path, settings["drivers"])

@@ -15,6 +15,7 @@ cannot be told apart, so only `training_20s` is free of shared vehicles.
 """
 
 import dataclasses
+import functools
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -36,7 +37,7 @@ from rcirl_jax.data.importers.tables import number
 from rcirl_jax.data.importers.tfrecord import FRAME_BYTES, read_records
 from rcirl_jax.data.importers.waymo_map import read_map
 from rcirl_jax.data.importers.wire_columns import Fields, Record
-from rcirl_jax.data.recording import LENGTH_RANGE_M, WIDTH_RANGE_M, validate_recording
+from rcirl_jax.data.recording import LENGTH_RANGE_M, WIDTH_RANGE_M, accepted
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane, Recording, Track
 
@@ -100,7 +101,8 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
         for count, data in enumerate(read_records(file, limit)):
             where = f"{file}: record {count}"
             name = f"{file.name}-{count}"
-            made = validate_recording(_read_scenario(where, name, data, spec), where)
+            make = functools.partial(_read_scenario, where, name, data, spec)
+            made = accepted(make, name, where, spec)
             done += FRAME_BYTES + len(data)
             yield dataclasses.replace(made, progress=done / size)
 

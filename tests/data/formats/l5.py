@@ -50,6 +50,7 @@ TL_FACE_DTYPE = [
 UNKNOWN, CAR, CYCLIST, PEDESTRIAN = 1, 3, 12, 14  # labels
 LABEL = {Kind.VEHICLE: CAR, Kind.CYCLIST: CYCLIST, Kind.PEDESTRIAN: PEDESTRIAN}
 RED, GREEN = "rED1", "gRN1"  # faces of the light
+LIGHT = "lGT1"
 GREEN_FROM = 60  # frame in which the light turns green
 CENTRE = np.array([600.0, -900.0])  # m, in the world: where the scene is
 LATITUDE, LONGITUDE = 374310000, -1221585000  # 1e-7 degrees, of the map's frame
@@ -276,7 +277,8 @@ def element(name, kind, body):
     return message([(1, name_of(name)), (2, message([(kind, body)]))])
 
 
-def write_map(path):
+def write_map(path, controls=(RED, GREEN)):
+    """A road before a junction; `controls` govern its right lane."""
     x, y = CENTRE
     grid = np.linspace(-60.0, 60.0, 13)
 
@@ -290,18 +292,20 @@ def write_map(path):
         return centre + radius * np.stack([np.sin(angle), -np.cos(angle)], axis=1)
 
     last = np.array([[x + 60.0, y], [x + 160.0, y]])
+    faces = [(3, name_of(face)) for face in (RED, GREEN)]
     elements = [
         element("seg", 1, message([(9, Single(11.176))])),
         element("jun", 5, b""),
         element(RED, 4, message([(11, b"")])),
         element(GREEN, 4, message([(13, b"")])),
+        element(LIGHT, 4, message([(29, message(faces))])),
         lane(
             "a1",
             along(1.75),
             along(-1.75),
             ahead=("b1", "c1"),
             beside=((0, "a2"),),
-            controls=(RED, GREEN),
+            controls=controls,
         ),
         # drawn against the traffic: the left bound lies to the right of the points
         lane("a2", along(5.25)[::-1], along(1.75)[::-1], beside=((1, "a1"),)),
