@@ -105,7 +105,20 @@ def provenance() -> dict:
             **{name: metadata.version(name) for name in packages},
         },
         "machine": platform.machine(),
+        **processor(),
     }
+
+
+def processor() -> dict:
+    """Model of the CPU and the cores that this process may use."""
+    model, file = platform.processor(), Path("/proc/cpuinfo")
+    if file.exists():
+        lines = file.read_text().splitlines()
+        names = [x.split(":", 1)[1].strip() for x in lines if "model name" in x]
+        model = names[0] if names else model
+    told = hasattr(os, "sched_getaffinity")  # not on macOS
+    cores = len(os.sched_getaffinity(0)) if told else os.cpu_count()
+    return {"cpu": model, "cores": cores}
 
 
 def git_commit() -> str:

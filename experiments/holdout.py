@@ -14,6 +14,9 @@ _FOLDS = flags.DEFINE_integer(
 _SPLIT = flags.DEFINE_integer("split_seed", 0, "draws the vehicles held out", 0)
 _RECORDING = flags.DEFINE_list("recording", ["0"], "numbers of those held out")
 
+# what each of the other flags is read by
+_READ_BY = {"recording": ("recording",), "split_seed": ("vehicles", "validation")}
+
 
 def splits(dataset: Demonstrations) -> tuple[list[Demonstrations], str]:
     """The dataset split as the flags say, once or by --folds, and that in words."""
@@ -30,11 +33,12 @@ def split(dataset: Demonstrations) -> tuple[Demonstrations, str]:
     if _FOLDS.value:
         raise InputError(f"--folds: {_FOLDS.value}: expected 0, one split, here")
     how = _HOLDOUT.value
-    if how != "recording" and flags.FLAGS["recording"].present:
-        raise InputError(
-            f"--recording: {_RECORDING.value}: expected with --holdout=recording, "
-            f"not {how}"
-        )
+    for name, holdouts in _READ_BY.items():
+        if (flag := flags.FLAGS[name]).present and how not in holdouts:
+            raise InputError(
+                f"--{name}: {flag.value}: expected with --holdout="
+                f"{' or '.join(holdouts)}, not {how}"
+            )
     try:
         named = [int(number) for number in _RECORDING.value]
     except ValueError as error:

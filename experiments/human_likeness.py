@@ -4,15 +4,17 @@
 
 Every learner of `LEARNERS` is trained with every seed on the same candidates of
 the training scenes and ranks the same candidates of the held-out scenes, beside
-random, constant speed, IDM, hand-set and oracle rows. Of the scenes recorded as
-long as the horizon none is dropped; a crash of the chosen candidate is charged.
+random, untrained, constant speed, IDM, both hand-set and oracle rows. Of the
+scenes recorded as long as the horizon none is dropped; a crash of the chosen
+candidate is charged.
 `--holdout`:
 
     groups      the dataset's split by groups of vehicles
     vehicles    a quarter of the vehicles (drawn by --split_seed)
     recording   recordings (numbers --recording)
-    validation  a quarter of the training scenes, by group or vehicle; the
-                dataset's held-out scenes stay unseen: to choose a learner by
+    validation  a quarter of the training scenes, by group or vehicle (drawn by
+                --split_seed); the dataset's held-out scenes stay unseen: to
+                choose a learner by
 
 --folds=6 instead: the recordings in six parts, each held out once, all learners
 trained six times --seeds; every scene of the dataset is judged. Either way the
@@ -20,8 +22,9 @@ vehicles that are the ego of a held-out scene are the ego of no training scene; 
 may still be obstacles in one, with their recorded future, and the reverse.
 
 Writes ranking.json, table.txt, table.md and ranking.png. US-101 on two cores:
-about 15 minutes with 5 learners, an hour with all; expected at 5 s: networks with
-a top-1 FDE of 2.2 to 3.1 m, GAN among them, IDM 4.4, hand-set 8.8, oracle 0.2 m.
+about 10 minutes with 5 learners, half an hour with all (an hour if --tuned=3 and
+shared cores); expected at 5 s: networks with a top-1 FDE of 2.2 to 3.7 m, GAN among
+them, IDM 4.4, hand-set 8.8, oracle 0.2 m.
 """
 
 import dataclasses
@@ -46,9 +49,10 @@ from rcirl_jax.evaluation.learners import (
     learner_configs,
     scorers,
     train_learners,
+    untrained,
 )
 from rcirl_jax.evaluation.score import Rival
-from rcirl_jax.evaluation.table import to_json
+from rcirl_jax.evaluation.table import UNTRAINED_ROW, to_json
 from rcirl_jax.evaluation.tuned_rivals import as_numbers, tuned_rivals
 from rcirl_jax.export.hand_weights import tuned_rows
 from rcirl_jax.report.intervals import ranking_chart
@@ -112,7 +116,8 @@ def main() -> None:
     folder, ranked, failed = Path(_OUTPUT.value), [], set()
     for part, own in zip(parts, setups, strict=True):
         learned = train_learners(part, configs, range(_SEEDS.value))
-        ranked.append(rank_scenes(part, scorers(learned), own))
+        rows = {**learned, UNTRAINED_ROW: untrained(next(iter(learned.values())))}
+        ranked.append(rank_scenes(part, scorers(rows), own))
         failed |= {n for n, runs in learned.items() if not all(x.finite for x in runs)}
     report = report_of(pooled(ranked))
     write_whole(folder / "table.txt", format_table(report, 118))
@@ -133,7 +138,7 @@ def main() -> None:
         "not_finite": bad,
         "made_by": made_by,
     }
-    write_json(folder / "ranking.json", body)
+    write_json(folder / "ranking.json", body, indent=0)  # a third smaller
     picture = ranking_chart(folder / "ranking.png", report)
     print(f"{format_table(report, 118, differences=False)}\nsplit: {words}")
     print(f"written: {folder}/ranking.json, table.md, {picture.name}")

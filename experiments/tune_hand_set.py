@@ -6,6 +6,8 @@
 --epochs: as many queries as so many epochs of experiments.train on --data, split by
 --holdout as in experiments.human_likeness. The file is a row of experiments.evaluate,
 human_likeness and simulate (--hand_weights); files of several --seed are its runs.
+Measured on one core: 17 s for a search of 10 epochs on US-101 (the chosen ends 8.8 m
+from the human before, 4.5 to 5.1 after), 167 s for 97 evaluations of the smoke suite.
 """
 
 import functools

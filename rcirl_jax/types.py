@@ -283,3 +283,5 @@ class Recording:
     # share in (0, 1] of its input that is read after it, where the importer knows;
     # for the progress bar only, no part of what was recorded
     progress: float | None = dataclasses.field(default=None, compare=False)
+    # why nothing of it is read, where such recordings are left out; "" otherwise
+    refused: str = dataclasses.field(default="", metadata={"in_digest": True})

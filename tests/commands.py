@@ -9,7 +9,7 @@ def command(module, *flags):
     """The finished `python -m module *flags` on the CPU, with what it said."""
     return subprocess.run(
         [sys.executable, "-m", module, *flags],
-        capture_output=True, text=True, check=False, timeout=900,
+        capture_output=True, text=True, check=False, timeout=1800,
         env={**os.environ, "JAX_PLATFORMS": "cpu"},
     )  # fmt: skip
 

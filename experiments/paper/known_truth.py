@@ -8,7 +8,8 @@ held-out scenes. One hidden reward per seed. Expected with --counts=30,300,3000
 --epochs=40 --seeds=8: 40 minutes on one core; under the logistic and listwise losses
 agreement rises with the number of scenes and is above that of the GAN, which
 compares across scenes; under the leaky-ReLU loss neither shows. Recovery is partial,
-0.3 to 0.5 of the choices; with --pin=none logistic and MaxEnt find 0.6 to 0.7.
+0.3 to 0.5 of the choices; with --pin=none logistic and MaxEnt find 0.6 to 0.7, the
+GAN still 0.4.
 `--quick`: a minute.
 """
 

@@ -21,7 +21,7 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments.common import provenance, run
+from experiments.common import alone, provenance, run
 from experiments.paper.weights import drives_config, trained_weights
 from rcirl_jax.data.importers import IMPORTERS, read_recordings
 from rcirl_jax.data.joined import open_datasets
@@ -128,6 +128,8 @@ def _recorded() -> CaseSet | None:
 
 def main() -> None:
     """All tables, one folder each."""
+    if _WEIGHTS.value:
+        alone("weights", "seed")
     folder, recorded = Path(_OUTPUT.value), _recorded()
     _same_run(folder)
     weights = _WEIGHTS.value or _trained(folder)

@@ -146,8 +146,8 @@ def rank_scenes(
     """Rank the held-out scenes with learned rewards beside all baselines.
 
     Rows: every learned reward (its runs are seeds), random, constant speed, IDM,
-    hand-set (Apollo's lattice weights), further hand-set costs of the setup and the
-    oracle, on the same candidates.
+    hand-set (Apollo's lattice weights), hand-set DP (those of its speed DP), further
+    hand-set costs of the setup and the oracle, on the same candidates.
 
     Args:
       dataset: an open dataset.

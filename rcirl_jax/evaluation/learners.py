@@ -23,7 +23,7 @@ from rcirl_jax.reward import (
     fit_normaliser,
     value,
 )
-from rcirl_jax.train.frozen import Fitted, fit, freeze, members_of
+from rcirl_jax.train.frozen import Fitted, first_params, fit, freeze, members_of
 from rcirl_jax.train.loop import CHUNK, NORMALISER_SCENES, rows_that_count
 from rcirl_jax.train.state import FeatureBatch, TrainConfig
 
@@ -258,6 +258,21 @@ def _learned(one: Fitted, normaliser: Normaliser, config: TrainConfig) -> Learne
         wins=np.asarray(one.wins),
         finite=bool(one.finite),
     )
+
+
+def untrained(runs: Sequence[Learned]) -> list[Learned]:
+    """Networks 21-15-1 before their first step, with the runs' inputs and seeds."""
+    nothing, made = np.zeros(0), []
+    for run in runs:
+        config = dataclasses.replace(run.config, reward=RewardConfig(), loss="rank")
+        count = feature_map(config.features).num_features
+        params = first_params(config.seed, count, config)
+        made.append(
+            dataclasses.replace(
+                run, params=params, config=config, loss=nothing, wins=nothing
+            )
+        )
+    return made
 
 
 def pair_wins(

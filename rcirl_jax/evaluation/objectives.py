@@ -8,7 +8,7 @@ that budgets can be compared with a learner's. Vectors are those of
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -36,8 +36,10 @@ from rcirl_jax.simulation.suite import (
     suite_refs,
 )
 from rcirl_jax.train.step import human_of
-from rcirl_jax.types import Demonstration
+from rcirl_jax.types import Candidates, Demonstration
 from rcirl_jax.units import HORIZON_S
+
+Scenes = TypeVar("Scenes")  # a pytree of [S, ...] arrays
 
 POPULATION_CHUNK = 8  # vectors per device call; padded, so that it compiles once
 
@@ -88,11 +90,15 @@ def ranking_problem(
         )
     rows, index = drawn_rows(dataset, setup, max_scenes, seed)
     scenes = ranked_scenes(rows, index, setup.sampler, setup.horizon_s)
-    return Problem(
-        objective=lambda vectors: mean_fde(scenes, vectors),
-        queries=int(scenes.fde.size),
-        title=f"mean FDE at {setup.horizon_s:g} s, m",
-    )
+    return distance_problem(functools.partial(mean_fde, scenes), scenes.fde, setup)
+
+
+def distance_problem(
+    objective: Objective, fde: jax.Array, setup: RankingSetup
+) -> Problem:
+    """A mean FDE over the candidates whose FDE [S, K] is given, as a problem."""
+    title = f"mean FDE at {setup.horizon_s:g} s, m"
+    return Problem(objective=objective, queries=int(fde.size), title=title)
 
 
 def drawn_rows(
@@ -116,7 +122,16 @@ def ranked_scenes(
       sampler: sampler configuration.
       horizon_s: s in (0, 8].
     """
-    make, parts = _make_scenes(sampler, float(horizon_s)), []
+    return in_scene_chunks(_make_scenes(sampler, float(horizon_s)), rows, index)
+
+
+def in_scene_chunks(
+    make: Callable[[jax.Array, Demonstration], Scenes],
+    rows: Demonstration,
+    index: np.ndarray,
+) -> Scenes:
+    """What `make` makes of S scenes, a few at a time, compiled once."""
+    parts = []
     for start in range(0, index.size, CHUNK):
         picked = np.minimum(np.arange(start, start + CHUNK), index.size - 1)
         taken = jax.tree.map(lambda x, picked=picked: jnp.asarray(x[picked]), rows)
@@ -132,18 +147,28 @@ def _make_scenes(
 ) -> Callable[[jax.Array, Demonstration], RankedScenes]:
     def one(index: jax.Array, demonstration: Demonstration) -> RankedScenes:
         scene = demonstration.scene
-        human = human_of(demonstration, sampler)
-        candidates = sample(candidates_key(index), scene, sampler)
+        candidates, fde = measured(index, demonstration, sampler, horizon_s)
         cut = scene.replace(time_valid=horizon_mask(scene, horizon_s))
-        everyone = candidates.trajectory
-        far = jax.vmap(lambda x: distances(demonstration, human, x, horizon_s)[0])
         return RankedScenes(
-            terms=jax.vmap(lambda x: lattice_terms(cut, x))(everyone),
-            fde=far(everyone),
+            terms=jax.vmap(lambda x: lattice_terms(cut, x))(candidates.trajectory),
+            fde=fde,
             feasible=candidates.feasible,
         )
 
     return jax.jit(jax.vmap(one))
+
+
+def measured(
+    index: jax.Array,
+    demonstration: Demonstration,
+    sampler: SamplerConfig,
+    horizon_s: float,
+) -> tuple[Candidates, jax.Array]:
+    """The candidates of a dataset row as evaluations make them, and their FDE [K] m."""
+    human = human_of(demonstration, sampler)
+    candidates = sample(candidates_key(index), demonstration.scene, sampler)
+    far = jax.vmap(lambda x: distances(demonstration, human, x, horizon_s)[0])
+    return candidates, far(candidates.trajectory)
 
 
 def mean_fde(scenes: RankedScenes, vectors: np.ndarray) -> np.ndarray:

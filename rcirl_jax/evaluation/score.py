@@ -21,7 +21,13 @@ from rcirl_jax.planner.baselines import (
     constant_speed_trajectory,
     idm_trajectory,
 )
-from rcirl_jax.reward import LatticeCost, lattice_cost
+from rcirl_jax.reward import (
+    SPEED_DP_ROW,
+    LatticeCost,
+    SpeedDpCost,
+    lattice_cost,
+    speed_dp_cost,
+)
 from rcirl_jax.sampling import SamplerConfig, sample
 from rcirl_jax.train.step import human_of
 from rcirl_jax.types import Demonstration, Scene, Trajectory
@@ -30,7 +36,7 @@ from rcirl_jax.units import DT_S, NUM_TIMES, TIMES_S
 CHUNK = 128  # scenes per device call; padded, so that it compiles once
 EVALUATION_SEED = 20180814  # candidates of an evaluation are the same for all
 
-BASELINES = ("constant speed", "IDM", "hand-set")
+BASELINES = ("constant speed", "IDM", "hand-set", SPEED_DP_ROW)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -49,7 +55,11 @@ class Scored:
 # (features [..., T, F], time_valid [..., T]) -> value [...]
 Scorer = Callable[[np.ndarray, np.ndarray], np.ndarray]
 # a rival with parameters; `fields()` is what may be traced of it
-Rival = LatticeCost | Idm
+Rival = LatticeCost | SpeedDpCost | Idm
+COSTS: dict[type, Callable] = {
+    LatticeCost: lattice_cost,
+    SpeedDpCost: speed_dp_cost,
+}
 
 
 def horizon_mask(scene: Scene, horizon_s: float) -> jax.Array:
@@ -116,12 +126,14 @@ def _score_one(
         ),
     }
     cut = scene.replace(time_valid=mask)
-    for name, rival in {"IDM": Idm(), "hand-set": LatticeCost(), **tuned}.items():
+    usual = {"IDM": Idm(), "hand-set": LatticeCost(), SPEED_DP_ROW: SpeedDpCost()}
+    for name, rival in {**usual, **tuned}.items():
         if isinstance(rival, Idm):
             way = idm_trajectory(scene, on_path, rival)
             rivals[name] = lambda x, way=way: closeness(x, way, mask)
         else:
-            rivals[name] = lambda x, cost=rival: -lattice_cost(cut, x, cost)
+            cost_of = COSTS[type(rival)]
+            rivals[name] = lambda x, f=cost_of, rival=rival: -f(cut, x, rival)
     return {
         "features_human": features(scene, human),
         "features": features.of_candidates(scene, candidates),

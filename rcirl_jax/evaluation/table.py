@@ -26,15 +26,17 @@ from rcirl_jax.evaluation.statistics import (
     estimate_of,
 )
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW
-from rcirl_jax.reward import LONG_ROW, TUNED_ROW
+from rcirl_jax.reward import LONG_ROW, SPEED_DP_ROW, TUNED_ROW
 
 SCHEMA = "rcirl-jax/ranking-report"
 SCHEMA_VERSION = 1
 
+UNTRAINED_ROW = "random weights"  # networks as they are before the first step
+
 # Rows that are not learned, in the order printed below the learned ones.
 RIVALS = (
-    *("random", "constant speed", "IDM", TUNED_IDM_ROW),
-    *("hand-set", TUNED_ROW, LONG_ROW, "oracle"),
+    *("random", UNTRAINED_ROW, "constant speed", "IDM", TUNED_IDM_ROW),
+    *(SPEED_DP_ROW, "hand-set", TUNED_ROW, LONG_ROW, "oracle"),
 )
 # rows that the others are compared with
 REFERENCES = (

@@ -10,7 +10,7 @@ looks for those whose choices end nearest to the human. Rows:
 
 import dataclasses
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -22,16 +22,16 @@ from rcirl_jax.data.joined import Demonstrations
 from rcirl_jax.evaluation.evaluate import RankingSetup
 from rcirl_jax.evaluation.objectives import (
     Problem,
+    distance_problem,
     drawn_rows,
     in_chunks,
+    in_scene_chunks,
     learner_budget,
+    measured,
     ranking_problem,
 )
 from rcirl_jax.evaluation.score import (
-    CHUNK,
     Rival,
-    candidates_key,
-    distances,
     horizon_mask,
 )
 from rcirl_jax.evaluation.tuning import tune
@@ -42,8 +42,7 @@ from rcirl_jax.planner.baselines import (
     idm_trajectory,
 )
 from rcirl_jax.reward import LONG_ROW, TUNABLE, TUNED_ROW, tuned
-from rcirl_jax.sampling import SamplerConfig, sample
-from rcirl_jax.train.step import human_of
+from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.types import Demonstration, Scene, Trajectory
 
 TUNING_SCENES = 256  # training scenes of a search with a learner's queries, at most
@@ -105,11 +104,8 @@ def idm_problem(
     rows, index = drawn_rows(dataset, setup, max_scenes, seed)
     scenes = driven_scenes(rows, index, setup.sampler, setup.horizon_s)
     on_path = setup.sampler.mode == "speed"
-    return Problem(
-        objective=lambda vectors: mean_driven_fde(scenes, vectors, on_path),
-        queries=int(scenes.fde.size),
-        title=f"mean FDE at {setup.horizon_s:g} s, m",
-    )
+    objective = functools.partial(mean_driven_fde, scenes, on_path=on_path)
+    return distance_problem(objective, scenes.fde, setup)
 
 
 def driven_scenes(
@@ -123,27 +119,24 @@ def driven_scenes(
       sampler: sampler configuration.
       horizon_s: s in (0, 8].
     """
+    return in_scene_chunks(_make_scenes(sampler, float(horizon_s)), rows, index)
 
+
+@functools.lru_cache(maxsize=8)
+def _make_scenes(
+    sampler: SamplerConfig, horizon_s: float
+) -> Callable[[jax.Array, Demonstration], DrivenScenes]:
     def one(index: jax.Array, demonstration: Demonstration) -> DrivenScenes:
-        scene = demonstration.scene
-        human = human_of(demonstration, sampler)
-        candidates = sample(candidates_key(index), scene, sampler)
-        everyone = candidates.trajectory
-        far = jax.vmap(lambda x: distances(demonstration, human, x, horizon_s)[0])
+        candidates, fde = measured(index, demonstration, sampler, horizon_s)
         return DrivenScenes(
-            scene=scene,
-            everyone=everyone,
-            mask=horizon_mask(scene, horizon_s),
-            fde=far(everyone),
+            scene=demonstration.scene,
+            everyone=candidates.trajectory,
+            mask=horizon_mask(demonstration.scene, horizon_s),
+            fde=fde,
             feasible=candidates.feasible,
         )
 
-    make, parts = jax.jit(jax.vmap(one)), []
-    for start in range(0, index.size, CHUNK):
-        some = slice(start, start + CHUNK)
-        taken = jax.tree.map(lambda x, some=some: jnp.asarray(x[some]), rows)
-        parts.append(make(jnp.asarray(index[some], jnp.int32), taken))
-    return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+    return jax.jit(jax.vmap(one))
 
 
 def mean_driven_fde(

@@ -21,6 +21,7 @@ from rcirl_jax.planner.safety import SafetyConfig, check, choose
 from rcirl_jax.planner.yielding import held
 from rcirl_jax.reward.hand import LatticeCost, lattice_cost
 from rcirl_jax.reward.network import ACTIVATIONS, rows_value
+from rcirl_jax.reward.speed_dp import speed_dp_cost
 from rcirl_jax.sampling import SamplerConfig, sample
 from rcirl_jax.sampling.speed import family_index
 from rcirl_jax.types import (
@@ -96,6 +97,12 @@ def hand_score(
     weights = LatticeCost(**(params or {}))
     cost = jax.vmap(lambda x: lattice_cost(scene, x, weights))(candidates.trajectory)
     return -cost
+
+
+def speed_dp_score(params: None, scene: Scene, candidates: Candidates) -> jax.Array:
+    """Minus the cost of Apollo's speed DP, published weights; see `speed_dp_cost`."""
+    del params
+    return -jax.vmap(lambda x: speed_dp_cost(scene, x))(candidates.trajectory)
 
 
 def lead_time(period: float) -> float:

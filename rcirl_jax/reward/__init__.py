@@ -1,4 +1,4 @@
-"""The learned reward: network, normaliser, losses, and the hand-set rival."""
+"""The learned reward: network, normaliser, losses, and the hand-set rivals."""
 
 from rcirl_jax.reward.hand import (
     LONG_ROW,
@@ -25,11 +25,13 @@ from rcirl_jax.reward.network import (
     value,
 )
 from rcirl_jax.reward.normaliser import fit_normaliser, normalise
+from rcirl_jax.reward.speed_dp import SPEED_DP_ROW, SpeedDpCost, speed_dp_cost
 from rcirl_jax.types import Normaliser, RewardParams
 
 __all__ = [
     "LONG_ROW",
     "LOSSES",
+    "SPEED_DP_ROW",
     "TUNABLE",
     "TUNED_ROW",
     "Compared",
@@ -39,6 +41,7 @@ __all__ = [
     "Normaliser",
     "RewardConfig",
     "RewardParams",
+    "SpeedDpCost",
     "fit_normaliser",
     "init_reward",
     "lattice_cost",
@@ -47,6 +50,7 @@ __all__ = [
     "normalise",
     "pinned",
     "scenes_value",
+    "speed_dp_cost",
     "tuned",
     "value",
     "weighted_cost",

@@ -144,27 +144,35 @@ def within_limits(
     return jnp.all(ok | ~counts)
 
 
+DRIFT_SHARE = 0.25  # 1, of a hard negative's size: how far it drifts aside instead
+
+
 def hard_negatives(
     key: jax.Array, scene: Scene, human: Trajectory, config: SamplerConfig, count: int
 ) -> Candidates:
     """Offline only: `count` trajectories near the human that drive worse.
 
     Half brake late and lose the gap (stations ahead of the human's by up to
-    6 m at the end), half lag behind; the departure grows like (t / 8)^p with p
-    in [1, 3], so that near times stay human. The key is consumed.
+    6 m at the end), half lag behind; in `path_speed` a third of each drifts aside
+    instead, by up to 1.5 m, one half to each side. The departure grows like
+    (t / 8)^p with p in [1, 3], so that near times stay human. The key is consumed.
     """
     size_key, power_key = jax.random.split(key)
     size = jax.random.uniform(size_key, (count,), minval=1.0, maxval=6.0)
     sign = jnp.where(jnp.arange(count) % 2 == 0, 1.0, -1.0)
     power = jax.random.uniform(power_key, (count,), minval=1.0, maxval=3.0)
     share = jnp.asarray(TIMES_S) / HORIZON_S
-    departure = (size * sign)[:, None] * share[None] ** power[:, None]
-    stations = running_max(human.s[None] + departure)
+    grows = share[None] ** power[:, None]
+    drifts = (jnp.arange(count) % 6 >= 4) & (config.mode == "path_speed")
+    along = jnp.where(drifts, 0.0, size * sign)
+    stations = running_max(human.s[None] + along[:, None] * grows)
     if config.mode == "speed":
         trajectory = jax.vmap(trajectory_on_path, in_axes=(None, 0))(scene, stations)
     else:
-        trajectory = jax.vmap(trajectory_from_positions, in_axes=(None, 0, None))(
-            scene, stations, human.l
+        aside = jnp.where(drifts, DRIFT_SHARE * size * sign, 0.0)
+        offsets = human.l[None] + aside[:, None] * grows
+        trajectory = jax.vmap(trajectory_from_positions, in_axes=(None, 0, 0))(
+            scene, stations, offsets
         )
     return Candidates(
         trajectory=trajectory,

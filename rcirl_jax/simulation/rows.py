@@ -22,14 +22,19 @@ from rcirl_jax.planner.rank import (
     idm_policy,
     learned_score,
     rank_policy,
+    speed_dp_score,
 )
 from rcirl_jax.planner.yielding import Yielding, yielding_policy
 from rcirl_jax.reward.hand import TUNED_ROW, LatticeCost
 from rcirl_jax.reward.network import RewardConfig, init_reward, pinned
+from rcirl_jax.reward.speed_dp import SPEED_DP_ROW
 from rcirl_jax.types import Normaliser, RewardParams
 
 RECORDED_HUMAN = "recorded human"
-BASELINES = ("hand-set", "IDM", "IDM yielding", "constant speed", "random weights")
+BASELINES = (
+    *("hand-set", SPEED_DP_ROW, "IDM", "IDM yielding"),
+    *("constant speed", "random weights"),
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -102,6 +107,8 @@ def baseline_row(
     """
     if name == "hand-set":
         return Row(name=name, policy=rank_policy(hand_score, config))
+    if name == SPEED_DP_ROW:
+        return Row(name=name, policy=rank_policy(speed_dp_score, config))
     if name == "IDM":
         return Row(name=name, policy=idm_policy(Idm()))
     if name == "IDM yielding":

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from rcirl_jax.features.columns import Frame
-from rcirl_jax.train.state import Facts, TrainConfig
+from rcirl_jax.train.state import Facts
 from rcirl_jax.types import Candidates, Trajectory
 
 OVER_LIMIT_MPS = 0.5  # m/s above the limit that counts as breaking it
@@ -16,39 +16,49 @@ def facts_of(
     candidates: Candidates,
     frames: Frame,
     valid: jax.Array,
-    config: TrainConfig,
 ) -> Facts:
-    """Distances, collisions, broken rules and densities of one scene, leaves [K].
+    """Distances, collisions and broken rules of one scene, leaves [K].
 
     Over the times in `valid` [T]; the human's own are of the recorded curve.
     `frames` are those of the candidates, [T, K].
     """
     x = candidates.trajectory
     count = jnp.sum(valid)
-
-    def apart(a: Trajectory, b: Trajectory) -> jax.Array:
-        """Mean distance [m] over valid times."""
-        distance = jnp.sqrt((a.s - b.s) ** 2 + (a.l - b.l) ** 2 + 1e-9)
-        return jnp.sum(jnp.where(valid, distance, 0.0), axis=-1) / count
-
     seen = valid[:, None]
     fast = frames.point.v > frames.path.speed_limit + OVER_LIMIT_MPS
     unlawful = (fast | (frames.relations.line_overrun > 0.0)) & seen
-    human_density, density = jnp.zeros(()), jnp.zeros(x.s.shape[:1])
-    if config.loss == "listwise":
-        row = jax.vmap(lambda one: apart(x, one))
-        others = candidates.feasible & ~jnp.eye(density.size, dtype=bool)
-        density = log_density(row(x), others)
-        human_density = log_density(apart(x, driven), candidates.feasible)
     return Facts(
         human_distance=jnp.zeros(()),
         human_collides=jnp.zeros((), bool),
-        distance=apart(x, driven),
+        distance=mean_distance(x, driven, valid),
         collides=jnp.any((frames.relations.body < 0.0) & seen, axis=0),
         breaks_rule=jnp.sum(unlawful, axis=0) / count,
-        human_density=human_density,
-        density=density,
+        human_density=jnp.zeros(()),
+        density=jnp.zeros(x.s.shape[:1]),
     )
+
+
+def densities(
+    driven: Trajectory, x: Trajectory, counts: jax.Array, valid: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Log densities of the driven curve [] and of the candidates [K].
+
+    Args:
+      driven: the human's curve.
+      x: the candidates, [K, T].
+      counts: [K] bool, those that the partition function sums over, and the positive.
+      valid: [T] bool, times that count.
+    """
+    rows = jax.vmap(lambda one: mean_distance(x, one, valid))(x)
+    others = counts & ~jnp.eye(counts.size, dtype=bool)
+    human = log_density(mean_distance(x, driven, valid), counts)
+    return human, log_density(rows, others)
+
+
+def mean_distance(a: Trajectory, b: Trajectory, valid: jax.Array) -> jax.Array:
+    """Mean distance [m] over valid times [T]."""
+    distance = jnp.sqrt((a.s - b.s) ** 2 + (a.l - b.l) ** 2 + 1e-9)
+    return jnp.sum(jnp.where(valid, distance, 0.0), axis=-1) / jnp.sum(valid)
 
 
 def log_density(distance: jax.Array, others: jax.Array) -> jax.Array:

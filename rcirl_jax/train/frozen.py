@@ -24,7 +24,12 @@ import optax
 from rcirl_jax.reward import Normaliser, RewardParams
 from rcirl_jax.train.loop import in_chunks
 from rcirl_jax.train.pieces import added, piece_size
-from rcirl_jax.train.state import OPTIMIZERS, FeatureBatch, TrainConfig
+from rcirl_jax.train.state import (
+    OPTIMIZERS,
+    FeatureBatch,
+    TrainConfig,
+    weight_decay,
+)
 from rcirl_jax.train.step import (
     as_tree,
     gradient_sums,
@@ -65,6 +70,13 @@ def members_of(config: TrainConfig, seeds: Sequence[int]) -> Members:
         learning_rate=full(config.learning_rate),
         leaky_rate=full(config.leaky_rate),
     )
+
+
+def first_params(
+    seed: int | jax.Array, num_features: int, config: TrainConfig
+) -> RewardParams:
+    """A member's parameters before its first step, as a training run has them."""
+    return init_params(jax.random.split(jax.random.key(seed))[0], num_features, config)
 
 
 def freeze(rows: Demonstration, index: np.ndarray, config: TrainConfig) -> FeatureBatch:
@@ -145,13 +157,11 @@ def _fit(
     piece = piece_size(size, PIECE_VALUES // (points * widest))
     # the direction of a step of size 1; members scale it
     optimizer = optax.chain(
-        optax.add_decayed_weights(config.weight_decay),
+        weight_decay(config),
         OPTIMIZERS[config.optimizer](1.0),
     )
-    init = lambda seed: init_params(  # noqa: E731
-        jax.random.split(jax.random.key(seed))[0], frozen.human.shape[-1], config
-    )
-    params = jax.vmap(init)(members.seed)
+    features = frozen.human.shape[-1]
+    params = jax.vmap(lambda seed: first_params(seed, features, config))(members.seed)
     state = jax.vmap(lambda p: optimizer.init(as_tree(p)))(params)
 
     def one_step(batch: tuple, step: jax.Array, member: tuple) -> tuple:

@@ -108,6 +108,11 @@ class TrainConfig:
         for name, (low, high, text) in RANGES.items():
             if not low <= getattr(self, name) <= high:
                 raise InputError(f"--{name}: {getattr(self, name)}: expected {text}")
+        if self.loss == "listwise" and self.hard_negatives and self.hard_pool > 1:
+            raise InputError(
+                f"--hard_pool: {self.hard_pool}: expected 1 with --loss=listwise: its "
+                "proposal density is that of all candidates drawn"
+            )
 
     @property
     def hard_drawn(self) -> int:
@@ -190,9 +195,22 @@ class Batch(flax.struct.PyTreeNode, kw_only=True):
     preferences: FeatureBatch | None = None
 
 
+def weight_decay(config: TrainConfig) -> optax.GradientTransformation:
+    """The pull on kernels and biases; time weights, context and prior stay free."""
+    if config.weight_decay == 0.0:
+        return optax.identity()
+
+    def pulled(params: RewardParams) -> RewardParams:
+        free = jax.tree.map(lambda _: False, params)
+        yes = jax.tree.map(lambda _: True, (params.kernels, params.biases))
+        return free.replace(kernels=yes[0], biases=yes[1])
+
+    return optax.add_decayed_weights(config.weight_decay, mask=pulled)
+
+
 def make_optimizer(config: TrainConfig) -> optax.GradientTransformation:
     """The optimiser named in the configuration, its step size halved as asked."""
-    decay = optax.add_decayed_weights(config.weight_decay)
+    decay = weight_decay(config)
     rate: optax.ScalarOrSchedule = config.learning_rate
     if config.halve_every:
         rate = optax.exponential_decay(rate, config.halve_every, 0.5)

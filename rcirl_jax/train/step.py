@@ -34,10 +34,11 @@ from rcirl_jax.sampling import (
     trajectory_on_path,
 )
 from rcirl_jax.sampling.speed import family_index
-from rcirl_jax.train.facts import facts_of
+from rcirl_jax.train.facts import densities, facts_of
 from rcirl_jax.train.pieces import added, in_pieces
 from rcirl_jax.train.state import (
     Batch,
+    Facts,
     FeatureBatch,
     TrainConfig,
     TrainState,
@@ -124,15 +125,24 @@ def featurise(
         both = jnp.stack(features.of_frames(frames))
         human, rows = both[:, :, -1].T, both[:, :, :-1]
         frames = jax.tree.map(lambda x: x[:, :-1], frames)
-        facts = facts_of(driven, candidates, frames, valid, config)
+
+        def with_densities(facts: Facts, counts: jax.Array) -> Facts:
+            """Those of the candidates that count, where the loss asks for them."""
+            if config.loss != "listwise":
+                return facts
+            of_human, own = densities(driven, candidates.trajectory, counts, valid)
+            return facts.replace(human_density=of_human, density=own)
+
+        facts = facts_of(driven, candidates, frames, valid)
         feasible = candidates.feasible
         if config.positive == "human":
-            return human, rows, feasible, facts, valid
+            return human, rows, feasible, with_densities(facts, feasible), valid
         # a planner can choose what the sampler made, not a hard negative
         choice = feasible & (candidates.family != family_index("hard_negative"))
         near = jnp.argmin(jnp.where(choice, facts.distance, jnp.inf))
         # a hard negative that is nearer than the positive is no worse than it
         feasible = feasible & (choice | (facts.distance > facts.distance[near]))
+        facts = with_densities(facts, feasible)
         facts = facts.replace(
             human_distance=facts.distance[near],
             human_collides=facts.collides[near],

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.evaluation.score import candidates_key, score_scenes
+from rcirl_jax.evaluation.score import candidates_key
 from rcirl_jax.evaluation.tuned_rivals import (
     TUNABLE_IDM,
     as_numbers,
@@ -24,7 +24,7 @@ from rcirl_jax.planner.baselines import (
 )
 from rcirl_jax.reward import LatticeCost
 from rcirl_jax.sampling import SamplerConfig, sample
-from tests.scenes import T, demonstration
+from tests.evaluation.driven import long_rows, mean_chosen_fde, scored_rivals
 
 SMALL = SamplerConfig(num_random=16, cruise_times=(4.0,), edge_times=(4.0,))
 SCENES = 24
@@ -35,9 +35,7 @@ HIDDEN = np.array([0.5, 0.3, -0.8, -0.5, -0.4])
 @functools.cache
 def driven_by_a_hidden_driver():
     """Demonstrations of 8 s whose human is the candidate nearest to a hidden driver."""
-    rows = jax.tree.map(lambda *x: np.stack(x), *map(demonstration, range(SCENES)))
-    scene = rows.scene.replace(time_valid=np.ones((SCENES, T), bool))
-    rows = rows.replace(scene=scene, future_s=np.full(SCENES, 8.0, np.float32))
+    rows = long_rows(SCENES)
     scenes = driven_scenes(rows, INDEX, SMALL, 8.0)
     driver = idm_of(jnp.asarray(HIDDEN, jnp.float32))
 
@@ -63,25 +61,14 @@ def test_zeros_are_the_usual_driver_and_bounds_hold():
 def test_the_objective_is_what_the_ranking_report_measures():
     rows, hidden = driven_by_a_hidden_driver(), idm_of(jnp.asarray(HIDDEN, jnp.float32))
     tuned = {TUNED_IDM_ROW: hidden, "again": Idm(), "cost": LatticeCost()}
-    scored = score_scenes(
-        rows,
-        INDEX,
-        preset="paper21",
-        sampler=SMALL,
-        horizon_s=8.0,
-        scorers={},
-        tuned=tuned,
-    )
+    scored = scored_rivals(rows, SMALL, tuned)
     np.testing.assert_allclose(
         scored.values["again"], scored.values["IDM"], rtol=1e-5, atol=1e-4
     )
     np.testing.assert_allclose(
         scored.values["cost"], scored.values["hand-set"], rtol=1e-5, atol=1e-3
     )
-    found = []
-    for name in ("IDM", TUNED_IDM_ROW):
-        values = np.where(scored.feasible, scored.values[name], -np.inf)
-        found.append(scored.fde[INDEX, values.argmax(axis=1)].mean())
+    found = [mean_chosen_fde(scored, name) for name in ("IDM", TUNED_IDM_ROW)]
     scenes = driven_scenes(rows, INDEX, SMALL, 8.0)
     both = np.stack([np.zeros(len(TUNABLE_IDM)), HIDDEN])
     np.testing.assert_allclose(found, mean_driven_fde(scenes, both, True), atol=0.05)

@@ -18,7 +18,7 @@ from rcirl_jax.evaluation.objectives import (
     ranked_scenes,
     suite_problem,
 )
-from rcirl_jax.evaluation.score import candidates_key, score_scenes
+from rcirl_jax.evaluation.score import candidates_key
 from rcirl_jax.evaluation.tuning import equal_budget, tune
 from rcirl_jax.export.hand_weights import load_hand_weights, write_hand_weights
 from rcirl_jax.planner.rank import RankConfig
@@ -33,7 +33,8 @@ from rcirl_jax.reward import (
 from rcirl_jax.reward.hand import LatticeTerms
 from rcirl_jax.sampling import SamplerConfig, sample
 from rcirl_jax.simulation.rows import baseline_row, tuned_row
-from tests.scenes import T, demonstration
+from tests.evaluation.driven import long_rows, mean_chosen_fde, scored_rivals
+from tests.scenes import T
 
 D = len(TUNABLE)
 SMALL = SamplerConfig(num_random=16, cruise_times=(4.0,), edge_times=(4.0,))
@@ -130,12 +131,7 @@ def test_equal_budget_is_stated_in_queries():
 @functools.cache
 def some_rows():
     """Demonstrations in random scenes, all of 8 s, and their candidates [S, K]."""
-    made = [demonstration(seed) for seed in range(SCENES)]
-    rows = jax.tree.map(lambda *x: np.stack(x), *made)
-    rows = rows.replace(
-        scene=rows.scene.replace(time_valid=np.ones((SCENES, T), bool)),
-        future_s=np.full(SCENES, 8.0, np.float32),
-    )
+    rows = long_rows(SCENES)
     make = jax.jit(jax.vmap(lambda i, s: sample(candidates_key(i), s, SMALL)))
     return rows, make(INDEX, rows.scene)
 
@@ -262,22 +258,11 @@ def test_mean_fde_against_numpy_in_any_company():
 def test_the_objective_is_what_the_ranking_report_measures():
     rows = driven_by_the_hidden_cost()
     cost = tuned(jnp.asarray(HIDDEN, jnp.float32))
-    scored = score_scenes(
-        rows,
-        INDEX,
-        preset="paper21",
-        sampler=SMALL,
-        horizon_s=8.0,
-        scorers={},
-        tuned={TUNED_ROW: cost, "again": LatticeCost()},
-    )
+    scored = scored_rivals(rows, SMALL, {TUNED_ROW: cost, "again": LatticeCost()})
     np.testing.assert_allclose(
         scored.values["again"], scored.values["hand-set"], rtol=1e-5, atol=1e-3
     )
-    found = []
-    for name in ("hand-set", TUNED_ROW):
-        values = np.where(scored.feasible, scored.values[name], -np.inf)
-        found.append(scored.fde[INDEX, values.argmax(axis=1)].mean())
+    found = [mean_chosen_fde(scored, name) for name in ("hand-set", TUNED_ROW)]
     expected = mean_fde(ranked(rows), np.stack([np.zeros(D), HIDDEN]))
     np.testing.assert_allclose(found, expected, atol=0.05)
 

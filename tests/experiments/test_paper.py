@@ -9,6 +9,7 @@ from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.data.store import open_dataset
+from rcirl_jax.simulation.rows import BASELINES
 from rcirl_jax.simulation.suite import family_names
 from tests import commands
 from tests.weights_files import random_weights
@@ -175,8 +176,7 @@ def test_table2(tmp_path):
     assert done.returncode == 0, done.stderr[-2000:]
     body = json.loads((tmp_path / "suite" / "suite.json").read_text())["report"]
     learned = ("RC-IRL 21-15-1", "GAN 21-15-1", "RC-IRL linear")
-    rivals = ("hand-set", "IDM", "IDM yielding", "constant speed", "random weights")
-    assert set(body["rows"]) == {*learned, *rivals}
+    assert set(body["rows"]) == {*learned, *BASELINES}
     assert body["cases"] == len(body["families"]) == len(family_names())
     assert "the paper, GAN" in (tmp_path / "suite" / "table.txt").read_text()
     dp = json.loads((tmp_path / "dp" / "suite.json").read_text())["report"]
@@ -292,6 +292,8 @@ def test_bad_flags_are_one_line(module, flag, line, dataset):
         ("--folds=2 --split_seed=0", "--split_seed: 0: expected none beside --folds"),
         ("--recording=1", "--recording: ['1']: expected with --holdout=recording"),
         ("--recording=1 --holdout=vehicles", "=recording, not vehicles"),
+        ("--split_seed=1", "=vehicles or validation, not groups"),
+        ("--split_seed=1 --holdout=recording", "not recording"),
     ],
 )
 def test_flags_that_a_split_leaves_unread_are_refused(given, line, dataset, tmp_path):
@@ -317,6 +319,7 @@ def test_table2_never_reuses_the_parts_of_a_quick_run(tmp_path):
         ("cross_site", "--sites=a", "--sites: ['a']: expected two"),
         ("cross_site", "--sites=a=x,a=y", "named apart"),
         ("table2", "--input=missing", "missing"),
+        ("table2", "--weights=x --seed=1", "--seed: 1: expected none beside --weights"),
         ("background_shift", "--seed=-1", "--seed"),
         # shared flags that an experiment does not read, or leaves no choice in
         ("artefact_audit", "--positive=human", "Unknown command line flag 'positive'"),

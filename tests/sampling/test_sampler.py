@@ -161,6 +161,21 @@ def test_hard_negatives_depart_from_the_human_with_time():
     assert (signs > 0).sum() == 8
 
 
+def test_some_hard_negatives_drift_aside_where_paths_may_be_chosen():
+    made = scene(v=12.0)
+    human = trajectory_on_path(made, 12.0 * jnp.asarray(TIMES_S))
+    near = hard_negatives(jax.random.key(0), made, human, CONFIGS["path_speed"], 12)
+    aside = np.asarray(near.trajectory.l - human.l)
+    along = np.asarray(near.trajectory.s - human.s)
+    drifts = np.isin(np.arange(12), [4, 5, 10, 11])
+    assert (aside[~drifts] == 0.0).all()
+    assert (along[drifts] == 0.0).all()
+    assert (aside[:, 0] == 0.0).all()
+    last = np.abs(aside[drifts, -1])
+    assert ((last >= 0.24) & (last <= 1.51)).all()
+    assert sorted(np.sign(aside[drifts, -1])) == [-1, -1, 1, 1]
+
+
 def test_unknown_mode_is_one_line():
     with pytest.raises(InputError, match="--mode: sideways: expected one of"):
         SamplerConfig(mode="sideways")

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rcirl_jax.evaluation.learners import train_learner, untrained
 from rcirl_jax.train.frozen import Members, fit, freeze, members_of
 from rcirl_jax.train.state import TrainState
 from rcirl_jax.train.step import init_state, make_train_step
@@ -71,6 +72,21 @@ def test_the_last_batch_may_be_short_and_counts_every_scene_once():
     whole = dataclasses.replace(config, batch_size=16)
     once = fit(made, normaliser(), whole, members_of(whole, [0]))
     assert float(fitted.loss[0, 0]) == pytest.approx(float(once.loss[0, 0]), rel=1e-4)
+
+
+def test_untrained_rows_are_the_first_parameters():
+    frozen = freeze(rows(), np.arange(16), CONFIG)
+    still = dataclasses.replace(CONFIG, learning_rate=1e-9, epochs=1)
+    runs = train_learner(frozen, still, [3, 4])
+    for run, first in zip(runs, untrained(runs), strict=True):
+        assert first.normaliser is run.normaliser
+        assert first.loss.size == 0
+        jax.tree.map(
+            lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5),
+            run.params,
+            first.params,
+        )
+    assert not np.array_equal(*(x.params.kernels[0] for x in untrained(runs)))
 
 
 def test_mining_keeps_what_the_reward_values_most():

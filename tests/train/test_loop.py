@@ -111,14 +111,8 @@ def test_export_rank_report(dataset, run, tmp_path):
     learned, preset, _ = load_runs([reward.file])
     setup = RankingSetup(preset=preset, sampler=SMALL)
     report = evaluate_ranking(dataset, learned, setup)
-    assert set(report.rows) == {
-        "RC-IRL 21-15-1",
-        "random",
-        "constant speed",
-        "IDM",
-        "hand-set",
-        "oracle",
-    }
+    rivals = ("constant speed", "IDM", "hand-set", "hand-set DP")
+    assert set(report.rows) == {"RC-IRL 21-15-1", "random", *rivals, "oracle"}
     floor = report.rows["oracle"]["top1_fde"].value
     assert all(row["top1_fde"].value >= floor - 1e-6 for row in report.rows.values())
     # its scale is fitted as everybody's: random values must come to no preference

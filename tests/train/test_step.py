@@ -23,7 +23,7 @@ from rcirl_jax.train.parallel import (
     single,
 )
 from rcirl_jax.train.pieces import in_pieces
-from rcirl_jax.train.state import TrainConfig
+from rcirl_jax.train.state import TrainConfig, make_optimizer
 from rcirl_jax.train.step import (
     _featurised,
     featurised,
@@ -262,6 +262,45 @@ def test_a_hard_negative_is_never_the_positive_nor_better_than_it():
     assert (hard < near[:, None]).any()
     assert not np.asarray(made.feasible)[:, sampled:][hard <= near[:, None]].any()
     assert made.feasible[:, sampled:].any()
+
+
+def test_densities_are_of_the_candidates_that_count():
+    """Hard negatives nearer than the positive are no samples of the proposal."""
+    config = dataclasses.replace(
+        CONFIG, loss="listwise", positive="nearest", hard_negatives=12
+    )
+    key = init_state(config, normaliser()).key
+    made = featurised(key, batch(), config)
+    plain = featurised(key, batch(), dataclasses.replace(config, positive="human"))
+    left_out = np.asarray(plain.feasible & ~made.feasible)  # the positive among them
+    most = np.log(1.0 + np.asarray(made.feasible).sum(axis=1) + 1.0)
+    for b in range(made.human.shape[0]):
+        assert (np.asarray(made.facts.density)[b] <= most[b] + 1e-5).all()
+        fell = np.asarray(made.facts.density - plain.facts.density)[b]
+        assert (fell <= 1e-5).all()
+        if left_out[b].sum() > 1:
+            assert fell.min() < -1e-4
+    assert (left_out.sum(axis=1) > 1).any()
+
+
+def test_a_density_of_a_pool_that_is_mined_is_refused():
+    with pytest.raises(InputError, match="--hard_pool: 3: expected 1 with"):
+        dataclasses.replace(CONFIG, loss="listwise", hard_negatives=4, hard_pool=3)
+    dataclasses.replace(CONFIG, loss="listwise", hard_negatives=4)
+
+
+@pytest.mark.parametrize("how", ["sgd", "adam"])
+def test_decay_pulls_kernels_and_biases_only(how):
+    config = dataclasses.replace(
+        CONFIG, loss="gan", optimizer=how, weight_decay=0.1, learning_rate=0.5
+    )
+    params = jax.tree.map(lambda x: x + 1.0, init_state(config, normaliser()).params)
+    optimizer = make_optimizer(config)
+    still = jax.tree.map(jnp.zeros_like, params)
+    moved, _ = optimizer.update(still, optimizer.init(params), params)
+    assert all((np.asarray(x) != 0.0).all() for x in (*moved.kernels, *moved.biases))
+    assert (np.asarray(moved.gamma) == 0.0).all()
+    assert moved.offset == 0.0
 
 
 def test_twins_count_as_often_as_they_are_drawn():

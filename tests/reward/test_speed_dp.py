@@ -1,0 +1,78 @@
+"""The cost of Apollo's speed DP: its sum by loops, and what it prefers."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rcirl_jax.features.columns import COLUMNS, make_frame
+from rcirl_jax.reward import SpeedDpCost, speed_dp_cost
+from rcirl_jax.sampling import trajectory_from_positions
+from rcirl_jax.units import DT_S, TIMES_S
+from tests.scenes import random_scene, scene
+
+T = TIMES_S.size
+NAMES = ("speed_limit", "follow_distance", "overtake_distance", "collision")
+
+
+def sigmoid(x):
+    return 1.0 / (1.0 + math.exp(-x))
+
+
+def by_loops(made, way, w):
+    """The docstring's sum, a time at a time in float64."""
+    frame = make_frame(made, way)
+    column = {name: np.asarray(COLUMNS[name](frame), np.float64) for name in NAMES}
+    v, a, j, s = (np.asarray(getattr(way, x), np.float64) for x in "vajs")
+    total, hit = 0.0, False
+    for t in range(T):
+        if not made.time_valid[t]:
+            continue
+        hit |= column["collision"][t] > 0
+        if t == 0:
+            continue
+        limit = column["speed_limit"][t]
+        e = (v[t] - limit) / limit
+        at = w.exceed * max(e, 0) ** 2 + w.below * max(-e, 0)
+        at = w.speed * (at + w.cruise * abs(v[t] - limit))
+        at += a[t] ** 2 * (1 + sigmoid(a[t] - 2) + sigmoid(-a[t] - 4)) + j[t] ** 2
+        for name in ("follow_distance", "overtake_distance"):
+            at += w.obstacle * max(20 - column[name][t], 0) ** 2
+        total += DT_S * (at - w.way * s[t])
+    return total + hit * w.collision_check
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_equals_its_definition(seed):
+    made, rng = random_scene(seed), np.random.default_rng(seed)
+    speed = rng.uniform(2, 15) + rng.normal(0, 1.0, T).cumsum()
+    stations = np.concatenate([[0.0], np.maximum(speed[1:], 0.0).cumsum() * DT_S])
+    way = trajectory_from_positions(made, jnp.asarray(stations), jnp.zeros(T))
+    # without the charge of a crash, which hides the rest
+    for weights in (SpeedDpCost(collision_check=0.0), SpeedDpCost()):
+        cost = jax.jit(lambda x: speed_dp_cost(made, way, SpeedDpCost(**x)))
+        found = float(cost(weights.fields()))
+        assert found == pytest.approx(by_loops(made, way, weights), rel=2e-4)
+
+
+def test_prefers_what_it_should():
+    def cost(made, s):
+        way = trajectory_from_positions(made, s, jnp.zeros(T))
+        return float(speed_dp_cost(made, way))
+
+    t = jnp.asarray(TIMES_S)
+    free = scene(v=20.0, speed_limit=20.0)
+    crawling = jax.lax.cummax(20.0 * t - 1.2 * t**2)
+    assert cost(free, 20.0 * t) < cost(free, crawling)
+    assert cost(free, 20.0 * t) < cost(free, 22.0 * t)  # over the limit
+    wall = scene(v=10.0, speed_limit=10.0, boxes=[{"s": 60.0, "speed": 0.0}])
+    braking = 10.0 * jnp.minimum(t, 5.0) - jnp.minimum(t, 5.0) ** 2
+    assert cost(wall, braking) < cost(wall, 10.0 * t) - 0.9e9
+    # a body within 20 m of the bumper costs, and the more the nearer it is
+    near, far, gone = (
+        cost(scene(v=0.0, boxes=[{"s": at, "speed": 0.0}]), 0.0 * t)
+        for at in (12.0, 18.0, 40.0)
+    )
+    assert near > far > gone
