@@ -4,10 +4,11 @@
 
 Every learner of `LEARNERS` with every optimiser at the defaults of
 `experiments.train` (20 epochs, step size 0.003, the human's curve as the
-positive unless --positive=nearest) on one dataset. A step whose loss or gradient is
-not finite is refused by the trainer and counts as a failure here. Expected: no
-failure; exit code 1 otherwise. How many pairs each wins is drawn, not judged. 20
-minutes on two cores with US-101; `--quick`: two minutes.
+positive unless --positive=nearest) on one dataset; a learner's optimisers train side
+by side. A step whose loss or gradient is not finite is refused by the trainer and
+counts as a failure here. Expected: no failure; exit code 1 otherwise. How many pairs
+each wins is drawn, not judged. 20 minutes on one core with US-101; `--quick`: two
+minutes.
 """
 
 import sys
@@ -31,7 +32,7 @@ from rcirl_jax.evaluation.learners import (
     LEARNERS,
     FrozenSets,
     learner_configs,
-    train_learner,
+    train_with_each,
 )
 from rcirl_jax.report.style import figure, label, save
 from rcirl_jax.train.state import OPTIMIZERS, TrainConfig
@@ -50,22 +51,17 @@ def main() -> None:
     data = dataset()
     sets, rows = FrozenSets(data), {}
     positive = POSITIVE.value
-    grid = [
-        (name, how, config)
-        for how in sorted(OPTIMIZERS)
-        for name, config in learner_configs(
-            _LEARNERS.value,
-            TrainConfig(optimizer=how, epochs=epochs(), positive=positive),
-        ).items()
-    ]
-    grid = grid[::5] if QUICK.value else grid
-    for name, how, config in tqdm.tqdm(grid, desc="train", unit="run"):
-        (learned,) = train_learner(sets.of(config), config, [0])
-        rows[f"{name}, {how}"] = {
-            "finite": learned.finite and bool(np.isfinite(learned.loss).all()),
-            "loss": learned.loss.tolist(),
-            "wins": learned.wins.tolist(),
-        }
+    plain = TrainConfig(epochs=epochs(), positive=positive)
+    names = _LEARNERS.value[::5] if QUICK.value else _LEARNERS.value
+    configs, optimizers = learner_configs(names, plain), sorted(OPTIMIZERS)
+    for name, config in tqdm.tqdm(configs.items(), desc="train", unit="learner"):
+        runs = train_with_each(sets.of(config), config, optimizers)
+        for how, learned in runs.items():
+            rows[f"{name}, {how}"] = {
+                "finite": learned.finite and bool(np.isfinite(learned.loss).all()),
+                "loss": learned.loss.tolist(),
+                "wins": learned.wins.tolist(),
+            }
     failed = [name for name, row in rows.items() if not row["finite"]]
     made, axes = figure(1, 1, 7.0, 1.2 + 0.2 * len(rows))
     axis = axes[0, 0]

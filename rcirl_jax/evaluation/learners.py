@@ -23,7 +23,14 @@ from rcirl_jax.reward import (
     fit_normaliser,
     value,
 )
-from rcirl_jax.train.frozen import Fitted, first_params, fit, freeze, members_of
+from rcirl_jax.train.frozen import (
+    Fitted,
+    first_params,
+    fit,
+    freeze,
+    members_of,
+    place_of,
+)
 from rcirl_jax.train.loop import CHUNK, NORMALISER_SCENES, rows_that_count
 from rcirl_jax.train.state import FeatureBatch, TrainConfig
 
@@ -228,6 +235,28 @@ def train_grid(
     for number, own in enumerate(grid):
         one = jax.tree.map(lambda leaf, n=number: leaf[n], fitted)
         found[own.leaky_rate].append(_learned(one, normaliser, own))
+    return found
+
+
+def train_with_each(
+    frozen: FeatureBatch, config: TrainConfig, optimizers: Sequence[str]
+) -> dict[str, Learned]:
+    """One configuration with several optimisers, as members of one program.
+
+    Each takes the steps that `train_learner` would take: same first weights, same
+    batches, its own state.
+    """
+    normaliser = normaliser_of(frozen, config)
+    members = members_of(config, [config.seed] * len(optimizers))
+    members = members.replace(
+        optimizer=jnp.asarray([place_of(name) for name in optimizers], jnp.int32)
+    )
+    fitted = fit(frozen, normaliser, config, members)
+    found = {}
+    for number, name in enumerate(optimizers):
+        one = jax.tree.map(lambda leaf, n=number: leaf[n], fitted)
+        own = dataclasses.replace(config, optimizer=name)
+        found[name] = _learned(one, normaliser, own)
     return found
 
 

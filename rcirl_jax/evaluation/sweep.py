@@ -31,7 +31,7 @@ from rcirl_jax.evaluation.score import Scorer, score_scenes
 from rcirl_jax.evaluation.statistics import ClusterBootstrap, Estimate, combine_seeds
 from rcirl_jax.executor import Executor
 from rcirl_jax.reward import Normaliser, RewardParams
-from rcirl_jax.train.frozen import Members, compiles, fit, freeze
+from rcirl_jax.train.frozen import Members, compiles, fit, freeze, place_of
 from rcirl_jax.train.state import FeatureBatch, TrainConfig
 
 MEMBERS_AT_ONCE = 16  # per call: enough to share the scenes, few enough to see progress
@@ -208,6 +208,7 @@ def _arrays(members: Sequence[TrainConfig]) -> Members:
     column = lambda name, of: jnp.asarray([getattr(m, name) for m in members], of)  # noqa: E731
     return Members(
         seed=column("seed", jnp.uint32),
+        optimizer=jnp.asarray([place_of(m.optimizer) for m in members], jnp.int32),
         learning_rate=column("learning_rate", jnp.float32),
         leaky_rate=column("leaky_rate", jnp.float32),
     )

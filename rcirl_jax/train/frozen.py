@@ -2,8 +2,8 @@
 
 All learners of a comparison see the same candidates, and a sweep pays for
 sampling and features once. Members of one call share network shape, loss and
-batches; they differ in seed, step size and leaky rate, which are arrays, so the
-whole grid is one compiled program.
+batches; they differ in seed, optimiser, step size and leaky rate, which are arrays,
+so the whole grid is one compiled program.
 
 A batch is worked off in pieces of scenes (`pieces`). A piece is gathered once for
 all members and stays in a CPU's cache while they use it; memory does not grow with
@@ -14,6 +14,7 @@ import contextlib
 import dataclasses
 import functools
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import flax.struct
 import jax
@@ -49,6 +50,7 @@ class Members(flax.struct.PyTreeNode, kw_only=True):
     """What differs between the members of one training; all [M]."""
 
     seed: jax.Array  # of the initial weights
+    optimizer: jax.Array  # int32, place in OPTIMIZERS
     learning_rate: jax.Array
     leaky_rate: jax.Array
 
@@ -62,11 +64,17 @@ class Fitted(flax.struct.PyTreeNode, kw_only=True):
     finite: jax.Array  # [M] bool, no step was refused for a NaN or infinity
 
 
+def place_of(optimizer: str) -> int:
+    """A member's number for an optimiser."""
+    return list(OPTIMIZERS).index(optimizer)
+
+
 def members_of(config: TrainConfig, seeds: Sequence[int]) -> Members:
     """Members that differ in nothing but the seed."""
     full = lambda x: jnp.full((len(seeds),), x, jnp.float32)  # noqa: E731
     return Members(
         seed=jnp.asarray(seeds, jnp.uint32),
+        optimizer=jnp.full((len(seeds),), place_of(config.optimizer), jnp.int32),
         learning_rate=full(config.learning_rate),
         leaky_rate=full(config.leaky_rate),
     )
@@ -105,11 +113,16 @@ def fit(
       config: everything that the members share.
       members: what they do not.
     """
-    shared = dataclasses.replace(config, learning_rate=0.5, leaky_rate=0.5, seed=0)
+    shared = dataclasses.replace(
+        config, optimizer="sgd", learning_rate=0.5, leaky_rate=0.5, seed=0
+    )
+    used, which = np.unique(np.asarray(members.optimizer), return_inverse=True)
+    optimizers = tuple(list(OPTIMIZERS)[place] for place in used)
+    members = members.replace(optimizer=jnp.asarray(which, jnp.int32))
     order = jax.random.fold_in(jax.random.key(config.seed), ORDER_STREAM)
     seen = np.flatnonzero(np.any(np.asarray(frozen.time_valid), axis=0))
     times = int(np.max(seen, initial=0)) + 1
-    return _fit(frozen, normaliser, order, members, shared, times)
+    return _fit(frozen, normaliser, order, members, shared, times, optimizers)
 
 
 @contextlib.contextmanager
@@ -139,7 +152,14 @@ def _taken(frozen: FeatureBatch, part: tuple, times: int) -> FeatureBatch:
     )
 
 
-@functools.partial(jax.jit, static_argnames=("config", "times"))
+def _taken_of(asked: Sequence[tuple], chosen: jax.Array) -> tuple[Any, list]:
+    """The chosen one of several rules' updates, and the states of all."""
+    updates = [updates for updates, _ in asked]
+    taken = jax.tree.map(lambda *x: jnp.stack(x)[chosen], *updates)
+    return taken, [own for _, own in asked]
+
+
+@functools.partial(jax.jit, static_argnames=("config", "times", "optimizers"))
 def _fit(
     frozen: FeatureBatch,
     normaliser: Normaliser,
@@ -147,8 +167,13 @@ def _fit(
     members: Members,
     config: TrainConfig,
     times: int,
+    optimizers: tuple[str, ...],
 ) -> Fitted:
-    """`config.seed`, step size and leaky rate are not read: one compile for all."""
+    """What members differ in is not read from `config`: one compile for all.
+
+    A member's `optimizer` is its place in `optimizers`: all of them are asked for a
+    direction, which costs next to nothing beside the gradient, and one is taken.
+    """
     count, candidates = frozen.feasible.shape
     size = min(config.batch_size, count)
     batches = -(-count // size)
@@ -156,13 +181,13 @@ def _fit(
     widest = max(config.reward.hidden, default=1)
     piece = piece_size(size, PIECE_VALUES // (points * widest))
     # the direction of a step of size 1; members scale it
-    optimizer = optax.chain(
-        weight_decay(config),
-        OPTIMIZERS[config.optimizer](1.0),
+    rules = [
+        optax.chain(weight_decay(config), OPTIMIZERS[name](1.0)) for name in optimizers
+    ]
+    params = jax.vmap(lambda seed: first_params(seed, frozen.human.shape[-1], config))(
+        members.seed
     )
-    features = frozen.human.shape[-1]
-    params = jax.vmap(lambda seed: first_params(seed, features, config))(members.seed)
-    state = jax.vmap(lambda p: optimizer.init(as_tree(p)))(params)
+    state = jax.vmap(lambda p: [rule.init(as_tree(p)) for rule in rules])(params)
 
     def one_step(batch: tuple, step: jax.Array, member: tuple) -> tuple:
         who, params, state = member
@@ -172,15 +197,19 @@ def _fit(
         )
         grads, sums = added(sums_of, batch)
         grads = jax.tree.map(lambda g: g / jnp.maximum(sums.terms, 1.0), grads)
-        updates, after = optimizer.update(grads, state, as_tree(params))
+        asked = [
+            rule.update(grads, own, as_tree(params))
+            for rule, own in zip(rules, state, strict=True)
+        ]
+        updates, after = _taken_of(asked, who.optimizer)
         rate = who.learning_rate
         if config.halve_every:
             rate = rate * 0.5 ** (step / config.halve_every)
         moved = jax.tree.map(lambda p, u: p + rate * u, params, updates)
         fine = jnp.isfinite(sums.loss) & jnp.isfinite(optax.tree.norm(grads))
         keep = lambda new, old: jnp.where(fine, new, old)  # noqa: E731
-        params = jax.tree.map(keep, moved, params)
-        return params, jax.tree.map(keep, after, state), (sums, fine)
+        kept = jax.tree.map(keep, (moved, after), (params, state))
+        return *kept, (sums, fine)
 
     def step(carry: tuple, at: tuple) -> tuple:
         params, state = carry
