@@ -152,8 +152,8 @@ def _taken(frozen: FeatureBatch, part: tuple, times: int) -> FeatureBatch:
     )
 
 
-def _taken_of(asked: Sequence[tuple], chosen: jax.Array) -> tuple[Any, list]:
-    """The chosen one of several rules' updates, and the states of all."""
+def _own_updates(asked: Sequence[tuple], chosen: jax.Array) -> tuple[Any, list]:
+    """Updates of the rule that the member chose, and the states of all."""
     updates = [updates for updates, _ in asked]
     taken = jax.tree.map(lambda *x: jnp.stack(x)[chosen], *updates)
     return taken, [own for _, own in asked]
@@ -201,7 +201,7 @@ def _fit(
             rule.update(grads, own, as_tree(params))
             for rule, own in zip(rules, state, strict=True)
         ]
-        updates, after = _taken_of(asked, who.optimizer)
+        updates, after = _own_updates(asked, who.optimizer)
         rate = who.learning_rate
         if config.halve_every:
             rate = rate * 0.5 ** (step / config.halve_every)
