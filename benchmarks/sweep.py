@@ -10,11 +10,11 @@ to 64; compiling is reported apart. Medians over the rounds.
 """
 
 import dataclasses
+import itertools
 import time
 from collections.abc import Callable
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from absl import app, flags
 
@@ -49,9 +49,10 @@ def _seconds(call: Callable[[], object]) -> float:
 def _grid(config: TrainConfig) -> list[Members]:
     """The members in chunks as a sweep trains them."""
     seeds = range(_MEMBERS.value // len(LEAKY_RATES))
-    every = members_of(config, [seed for _ in LEAKY_RATES for seed in seeds])
-    rates = jnp.repeat(jnp.asarray(LEAKY_RATES, jnp.float32), len(seeds))
-    every = every.replace(leaky_rate=rates)
+    grid = itertools.product(LEAKY_RATES, seeds)
+    every = members_of(
+        [dataclasses.replace(config, leaky_rate=rate, seed=seed) for rate, seed in grid]
+    )
     starts = range(0, _MEMBERS.value, MEMBERS_AT_ONCE)
     size = MEMBERS_AT_ONCE
     return [jax.tree.map(lambda x, at=at: x[at : at + size], every) for at in starts]
@@ -83,7 +84,8 @@ def main(_: list[str]) -> None:
         return [fit(frozen, normaliser, config, members) for members in chunks]
 
     def alone() -> list:
-        runs = [members_of(single, [seed]) for seed in range(_SINGLE.value)]
+        seeds = range(_SINGLE.value)
+        runs = [members_of([dataclasses.replace(single, seed=seed)]) for seed in seeds]
         return [fit(frozen, normaliser, single, run) for run in runs]
 
     def steps() -> list:

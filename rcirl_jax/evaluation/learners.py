@@ -23,14 +23,7 @@ from rcirl_jax.reward import (
     fit_normaliser,
     value,
 )
-from rcirl_jax.train.frozen import (
-    Fitted,
-    first_params,
-    fit,
-    freeze,
-    members_of,
-    place_of,
-)
+from rcirl_jax.train.frozen import Fitted, first_params, fit, freeze, members_of
 from rcirl_jax.train.loop import CHUNK, NORMALISER_SCENES, rows_that_count
 from rcirl_jax.train.state import FeatureBatch, TrainConfig
 
@@ -227,15 +220,8 @@ def train_grid(
         for rate in leaky_rates
         for seed in seeds
     ]
-    normaliser = normaliser_of(frozen, config, keep)
-    members = members_of(config, [own.seed for own in grid])
-    members = members.replace(leaky_rate=jnp.asarray([x.leaky_rate for x in grid]))
-    fitted = fit(frozen, normaliser, config, members)
-    found: dict[float, list[Learned]] = {rate: [] for rate in leaky_rates}
-    for number, own in enumerate(grid):
-        one = jax.tree.map(lambda leaf, n=number: leaf[n], fitted)
-        found[own.leaky_rate].append(_learned(one, normaliser, own))
-    return found
+    runs = iter(_side_by_side(frozen, config, grid, keep))
+    return {rate: [next(runs) for _ in seeds] for rate in leaky_rates}
 
 
 def train_with_each(
@@ -246,18 +232,24 @@ def train_with_each(
     Each takes the steps that `train_learner` would take: same first weights, same
     batches, its own state.
     """
-    normaliser = normaliser_of(frozen, config)
-    members = members_of(config, [config.seed] * len(optimizers))
-    members = members.replace(
-        optimizer=jnp.asarray([place_of(name) for name in optimizers], jnp.int32)
-    )
-    fitted = fit(frozen, normaliser, config, members)
-    found = {}
-    for number, name in enumerate(optimizers):
-        one = jax.tree.map(lambda leaf, n=number: leaf[n], fitted)
-        own = dataclasses.replace(config, optimizer=name)
-        found[name] = _learned(one, normaliser, own)
-    return found
+    each = [dataclasses.replace(config, optimizer=name) for name in optimizers]
+    runs = _side_by_side(frozen, config, each, None)
+    return dict(zip(optimizers, runs, strict=True))
+
+
+def _side_by_side(
+    frozen: FeatureBatch,
+    config: TrainConfig,
+    members: Sequence[TrainConfig],
+    keep: Sequence[str] | None,
+) -> list[Learned]:
+    """Members of one program; candidates, batches, normaliser are of `config`."""
+    normaliser = normaliser_of(frozen, config, keep)
+    fitted = fit(frozen, normaliser, config, members_of(members))
+    return [
+        _learned(jax.tree.map(lambda leaf, n=n: leaf[n], fitted), normaliser, own)
+        for n, own in enumerate(members)
+    ]
 
 
 def train_learner(
@@ -272,7 +264,7 @@ def train_learner(
     found = []
     for seed in seeds:
         own = dataclasses.replace(config, seed=seed)
-        fitted = fit(frozen, normaliser, own, members_of(own, [seed]))
+        fitted = fit(frozen, normaliser, own, members_of([own]))
         one = jax.tree.map(lambda leaf: leaf[0], fitted)
         found.append(_learned(one, normaliser, own))
     return found

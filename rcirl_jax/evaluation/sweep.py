@@ -18,7 +18,6 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.data.joined import Demonstrations, open_datasets
@@ -31,7 +30,7 @@ from rcirl_jax.evaluation.score import Scorer, score_scenes
 from rcirl_jax.evaluation.statistics import ClusterBootstrap, Estimate, combine_seeds
 from rcirl_jax.executor import Executor
 from rcirl_jax.reward import Normaliser, RewardParams
-from rcirl_jax.train.frozen import Members, compiles, fit, freeze, place_of
+from rcirl_jax.train.frozen import compiles, fit, freeze, members_of
 from rcirl_jax.train.state import FeatureBatch, TrainConfig
 
 MEMBERS_AT_ONCE = 16  # per call: enough to share the scenes, few enough to see progress
@@ -188,7 +187,7 @@ def train_group(hidden: Hidden, config: SweepConfig) -> Iterator[Part]:
         filled = [*taken, *[taken[-1]] * (size - len(taken))]
         begin = time.perf_counter()
         with compiles() as compiled:
-            fitted = fit(frozen, normaliser, config.shared(hidden), _arrays(filled))
+            fitted = fit(frozen, normaliser, config.shared(hidden), members_of(filled))
             count = len(taken)
             fitted = jax.tree.map(lambda x, n=count: np.asarray(x)[:n], fitted)
         yield Part(
@@ -202,16 +201,6 @@ def train_group(hidden: Hidden, config: SweepConfig) -> Iterator[Part]:
             seconds=time.perf_counter() - begin,
             compile_s=tuple(compiled),
         )
-
-
-def _arrays(members: Sequence[TrainConfig]) -> Members:
-    column = lambda name, of: jnp.asarray([getattr(m, name) for m in members], of)  # noqa: E731
-    return Members(
-        seed=column("seed", jnp.uint32),
-        optimizer=jnp.asarray([place_of(m.optimizer) for m in members], jnp.int32),
-        learning_rate=column("learning_rate", jnp.float32),
-        leaky_rate=column("leaky_rate", jnp.float32),
-    )
 
 
 # row -> metric -> [R, S], runs are the seeds

@@ -64,19 +64,15 @@ class Fitted(flax.struct.PyTreeNode, kw_only=True):
     finite: jax.Array  # [M] bool, no step was refused for a NaN or infinity
 
 
-def place_of(optimizer: str) -> int:
-    """A member's number for an optimiser."""
-    return list(OPTIMIZERS).index(optimizer)
-
-
-def members_of(config: TrainConfig, seeds: Sequence[int]) -> Members:
-    """Members that differ in nothing but the seed."""
-    full = lambda x: jnp.full((len(seeds),), x, jnp.float32)  # noqa: E731
+def members_of(configs: Sequence[TrainConfig]) -> Members:
+    """What is a member's own, of configurations that share everything else."""
+    column = lambda name: [getattr(config, name) for config in configs]  # noqa: E731
+    places = [list(OPTIMIZERS).index(name) for name in column("optimizer")]
     return Members(
-        seed=jnp.asarray(seeds, jnp.uint32),
-        optimizer=jnp.full((len(seeds),), place_of(config.optimizer), jnp.int32),
-        learning_rate=full(config.learning_rate),
-        leaky_rate=full(config.leaky_rate),
+        seed=jnp.asarray(column("seed"), jnp.uint32),
+        optimizer=jnp.asarray(places, jnp.int32),
+        learning_rate=jnp.asarray(column("learning_rate"), jnp.float32),
+        leaky_rate=jnp.asarray(column("leaky_rate"), jnp.float32),
     )
 
 

@@ -33,7 +33,7 @@ def test_a_member_takes_the_steps_of_the_training_step(optimizer):
         SHORT, optimizer=optimizer, learning_rate=0.01, weight_decay=0.01
     )
     made = human_is_better()
-    fitted = fit(made, normaliser(), config, members_of(config, [config.seed]))
+    fitted = fit(made, normaliser(), config, members_of([config]))
     state: TrainState = init_state(config, normaliser())
     step = jax.jit(make_train_step(config))
     for epoch in range(3):
@@ -85,9 +85,9 @@ def test_each_optimiser_as_a_member_takes_its_own_steps():
 def test_the_last_batch_may_be_short_and_counts_every_scene_once():
     config = dataclasses.replace(SHORT, batch_size=5, epochs=1, learning_rate=1e-9)
     made = human_is_better()
-    fitted = fit(made, normaliser(), config, members_of(config, [0]))
+    fitted = fit(made, normaliser(), config, members_of([config]))
     whole = dataclasses.replace(config, batch_size=16)
-    once = fit(made, normaliser(), whole, members_of(whole, [0]))
+    once = fit(made, normaliser(), whole, members_of([whole]))
     assert float(fitted.loss[0, 0]) == pytest.approx(float(once.loss[0, 0]), rel=1e-4)
 
 

@@ -112,7 +112,7 @@ def member_base(member):
 
 
 def one(member):
-    return members_of(member, [member.seed])
+    return members_of([member])
 
 
 def test_a_group_is_one_compile_however_many_chunks(data, monkeypatch):
@@ -129,7 +129,7 @@ def test_many_members_fit():
     members, batch_size = 64, 64
     reward = RewardConfig(hidden=(64,))
     config = dataclasses.replace(BASE, batch_size=batch_size, reward=reward)
-    who = members_of(config, range(members))
+    who = members_of([config] * members)
     order = jax.random.key(0)
     given = (many(64), normaliser(), order, who, config, 18, (config.optimizer,))
     lowered = frozen._fit.lower(*given)
@@ -183,8 +183,8 @@ def test_times_that_no_scene_compares_change_nothing():
         human=jnp.where(early[:, None], made.human, -1e3),
     )
     config = dataclasses.replace(BASE, epochs=1)
-    a = fit(masked, normaliser(), config, members_of(config, [0]))
-    b = fit(loud, normaliser(), config, members_of(config, [0]))
+    a = fit(masked, normaliser(), config, members_of([config]))
+    b = fit(loud, normaliser(), config, members_of([config]))
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         np.testing.assert_array_equal(x, y)
     assert np.isfinite(np.asarray(a.loss)).all()
