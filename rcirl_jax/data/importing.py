@@ -139,7 +139,7 @@ class _Import:
         self.sources: dict[str, str] = {}
         self.rates: set[float] = set()
         self.next_shard = 0
-        self.done: list[dict] = []
+        self.done: collections.deque[dict] = collections.deque()
         for info in writer.committed():
             self.done += info.lineage
             self.next_shard += 1
@@ -158,7 +158,7 @@ class _Import:
             self.rates.add(made.rate_hz)
         number = self.recordings.of(made.name)
         if self.done:
-            self._replay(self.done.pop(0), made)
+            self._replay(self.done.popleft(), made)
             return
         entry = {
             "name": made.name,

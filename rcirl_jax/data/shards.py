@@ -73,11 +73,10 @@ def describe(data: bytes | None) -> dict:
     return {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
 
 
-def verify_shard(files: Files, index: int, sha256: str | None = None) -> ShardInfo:
-    """Read all of a shard against its checksums; InputError names what is wrong."""
-    key = shard_key(index)
-    name = files.path(key + MARK)
-    mark = files.read(key + MARK)
+def shard_info(files: Files, index: int, sha256: str | None = None) -> ShardInfo:
+    """What shard.json says; InputError if it is not there, or not as written."""
+    name = files.path(shard_key(index) + MARK)
+    mark = files.read(shard_key(index) + MARK)
     if mark is None:
         raise InputError(f"{name}: shard {index}: missing: expected sha256 {sha256}")
     info = ShardInfo(**unseal(mark, "sha256", name))
@@ -85,6 +84,13 @@ def verify_shard(files: Files, index: int, sha256: str | None = None) -> ShardIn
         raise InputError(
             f"{name}: shard {index}: sha256 {info.sha256}: expected {sha256}"
         )
+    return info
+
+
+def verify_shard(files: Files, index: int, sha256: str | None = None) -> ShardInfo:
+    """Read all of a shard against its checksums; InputError names what is wrong."""
+    key = shard_key(index)
+    info = shard_info(files, index, sha256)
     for path, data in files.read_many(key + file for file in info.files):
         found, expected = describe(data), info.files[path.removeprefix(key)]
         if found != expected:

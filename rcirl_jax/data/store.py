@@ -40,6 +40,7 @@ from rcirl_jax.data.shards import (
     BLOCK_ROWS,
     describe,
     encode,
+    shard_info,
     shard_key,
     verify_shard,
 )
@@ -96,21 +97,28 @@ class DatasetWriter:
                 f"{self._files.name}: holds a finished dataset: "
                 "expected a new folder, or --overwrite to replace it"
             )
-        self._committed = [] if overwrite or not shards else self._find_committed()
+        # one `shard_entry` a shard: lineages of a long log would fill the memory
+        self._shards = [] if overwrite or not shards else self._find_committed()
         self._first_written: int | None = None
         self._finished = False
 
-    def _find_committed(self) -> list[ShardInfo]:
+    def _find_committed(self) -> list[dict]:
         found = []
         while True:
             try:
-                found.append(verify_shard(self._files, len(found)))
+                found.append(shard_entry(verify_shard(self._files, len(found))))
             except InputError:
                 return found
 
     def committed(self) -> list[ShardInfo]:
-        """The shards already there and whole, from number 0 on without a gap."""
-        return list(self._committed)
+        """The shards already there and whole, from number 0 on without a gap.
+
+        Read from disk; the writer itself remembers digests only.
+        """
+        return [
+            shard_info(self._files, index, shard["sha256"])
+            for index, shard in enumerate(self._shards)
+        ]
 
     def write_shard(
         self, index: int, demonstrations: Demonstration, lineage: list[dict]
@@ -128,8 +136,8 @@ class DatasetWriter:
           OSError: it can no longer be written, e.g. the disk is full. Shards
             before this one stay, to resume from.
         """
-        if index != len(self._committed):
-            raise ValueError(f"shard {index}: expected {len(self._committed)} next")
+        if index != len(self._shards):
+            raise ValueError(f"shard {index}: expected {len(self._shards)} next")
         leaves = checked_leaves(demonstrations)
         values = encode(leaves)
         payload = {
@@ -150,8 +158,9 @@ class DatasetWriter:
             if index > 0:
                 raise
             raise InputError(f"{error}: expected a place to write to") from error
-        self._committed.append(ShardInfo(**json.loads(mark)))
-        return self._committed[-1]
+        info = ShardInfo(**json.loads(mark))
+        self._shards.append(shard_entry(info))
+        return info
 
     def _remove_from(self, index: int) -> None:
         # shards before the manifest: what an interrupt here leaves cannot pass for
@@ -172,20 +181,20 @@ class DatasetWriter:
         if set(manifest_fields) != set(IMPORT_FIELDS):
             different = sorted(set(manifest_fields) ^ set(IMPORT_FIELDS))
             raise ValueError(f"manifest: {different}: expected {IMPORT_FIELDS}")
-        if not self._committed:
+        if not self._shards:
             raise ValueError("dataset: 0 shards: expected at least one")
         payload = {
             **manifest_fields,
             "schema_version": SCHEMA_VERSION,
-            "count": sum(info.count for info in self._committed),
+            "count": sum(shard["count"] for shard in self._shards),
             "arrays": array_table(),
             "time_grid_s": TIMES_S.tolist(),
-            "shards": [shard_entry(info) for info in self._committed],
+            "shards": self._shards,
         }
         raw = seal(payload, "hash")
         dataset = Dataset(self._files, parse_manifest(raw, self._files))
         dataset.check_tables()
-        self._remove_from(len(self._committed))
+        self._remove_from(len(self._shards))
         self._files.write_many({MANIFEST: raw})
         self._finished = True
         return dataset.manifest

@@ -1,6 +1,7 @@
 import hashlib
 import json
 import shutil
+import tracemalloc
 
 import jax
 import numpy as np
@@ -408,6 +409,20 @@ def test_resuming_stops_at_the_first_damaged_shard(made, copy):
     assert [info.count for info in writer.committed()] == [SIZES[0]]
     write(copy, start=1, writer=writer)
     assert every_byte(copy) == every_byte(made)
+
+
+def test_lineages_of_written_shards_are_not_kept(tmp_path):
+    """A long log has one of 94 kB a minute; what is kept is a digest of each name."""
+    writer = DatasetWriter(tmp_path)
+    writer.write_shard(0, make_rows(1), lineage(0))  # once: caches fill
+    tracemalloc.start()
+    vehicles = [f"vehicle {i}" for i in range(100_000)]  # 6.5 MB
+    writer.write_shard(1, make_rows(1), [{**lineage(1)[0], "vehicles": vehicles}])
+    del vehicles
+    kept, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert kept < 1e6
+    assert len(writer.committed()[1].lineage[0]["vehicles"]) == 100_000
 
 
 def test_a_shorter_import_leaves_no_old_shards(made, tmp_path):
