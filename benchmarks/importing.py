@@ -18,8 +18,9 @@ from absl import flags
 from benchmarks.common import write
 from experiments.common import run
 from rcirl_jax.data.config import CollectConfig
-from rcirl_jax.data.cut import Part, cut_one
+from rcirl_jax.data.cut import cut_item
 from rcirl_jax.data.importers import parts, read_part
+from rcirl_jax.data.parts import Part
 from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.executor import Executor, Here, Processes
 from rcirl_jax.specs import spec_root
@@ -50,7 +51,7 @@ def rate(executor: Executor, items: list, config: CollectConfig) -> tuple[dict, 
     A first pass compiles in every process and is not timed. It repeats the first
     recording that has scenes: one without compiles nothing.
     """
-    piece = functools.partial(cut_one, config=config)
+    piece = functools.partial(cut_item, config=config)
     has_scenes = (item for item in items if any(x.vehicles for x in piece(item)))
     busy = list(itertools.islice(has_scenes, 1))
     for _ in executor.stream(piece, busy * 4 * executor.workers):

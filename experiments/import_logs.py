@@ -14,9 +14,9 @@ from absl import flags
 from experiments.common import run
 from experiments.executor import executor
 from rcirl_jax.data.config import CollectConfig
-from rcirl_jax.data.cut import Part
 from rcirl_jax.data.importers import IMPORTERS, parts
 from rcirl_jax.data.importing import ImportConfig, import_parts
+from rcirl_jax.data.parts import Part
 from rcirl_jax.data.quality import format_quality
 from rcirl_jax.data.signal_checks import read_signal_checks
 from rcirl_jax.data.store import open_dataset

@@ -19,10 +19,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from rcirl_jax.data.cut import Part
 from rcirl_jax.data.importers import parts
 from rcirl_jax.data.importers.files import listing
 from rcirl_jax.data.importing import ImportConfig, import_parts
+from rcirl_jax.data.parts import Part
 from rcirl_jax.data.preferences import read_preferences
 from rcirl_jax.data.store import Dataset, open_dataset
 from rcirl_jax.errors import InputError

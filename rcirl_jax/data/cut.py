@@ -9,7 +9,6 @@ import dataclasses
 import hashlib
 import itertools
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -17,29 +16,13 @@ import numpy as np
 from rcirl_jax.data.assemble import CHUNK, assemble
 from rcirl_jax.data.collect import Collector
 from rcirl_jax.data.config import CollectConfig
-from rcirl_jax.data.importers import (
-    CSV_PARTS,
-    SHARD_BYTES,
-    SMALL_PARTS,
-    csv_stream,
-    read_part,
-)
+from rcirl_jax.data.parts import Item, recordings_in
 from rcirl_jax.data.quality import QualityReport
-from rcirl_jax.data.recording import LEAVE_OUT, refusal
 from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.types import Demonstration, Recording, Track
 
 GROUP_BLOCK_S = 60.0  # s; vehicles first seen in one block share a group
 MINUTE = "/minute-"  # between a recording's name and the number of a block
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Part:
-    """One input that can be read without the others."""
-
-    format: str
-    input: Path
-    spec: dict
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -173,47 +156,9 @@ def _assembled(
 
 
 def cut_item(
-    item: Part | tuple[Part, Recording],
-    config: CollectConfig,
-    done: Mapping[str, str] | None = None,
+    item: Item, config: CollectConfig, done: Mapping[str, str] | None = None
 ) -> Iterator[Cut]:
     """A part, read here, or one recording of it; other arguments as `cut`."""
-    if not isinstance(item, Part):
-        yield from cut_one(item, config, done)
-        return
-    for recording in recordings_of(item):
-        yield from cut_one((item, recording), config, done)
-
-
-def cut_one(
-    item: tuple[Part, Recording],
-    config: CollectConfig,
-    done: Mapping[str, str] | None = None,
-) -> Iterator[Cut]:
-    """One recording of a part; arguments as `cut`."""
-    part, recording = item
-    made = cut(recording, config, done)
-    yield dataclasses.replace(made, part=str(part.input))
-
-
-def recordings_of(part: Part) -> Iterator[Recording]:
-    """All recordings of a part, one at a time.
-
-    Where recordings may be left out, a part that cannot be read any further ends
-    with one that says why.
-    """
-    try:
-        yield from read_part(part.format, part.input, part.spec)
-    except InputError as error:
-        if not part.spec.get(LEAVE_OUT):
-            raise
-        yield refusal(f"{part.input.parent.name}/{part.input.name}, the rest", error)
-
-
-def is_long(part: Part) -> bool:
-    """Whether a part's recordings may be too many to be held at once."""
-    if part.format in CSV_PARTS:
-        return csv_stream.is_long(part.input, part.spec)
-    if part.format in SHARD_BYTES and part.input.is_file():
-        return part.input.stat().st_size > SHARD_BYTES[part.format]
-    return part.format not in SMALL_PARTS
+    for part, recording in recordings_in(item):
+        made = cut(recording, config, done)
+        yield dataclasses.replace(made, part=str(part.input))

@@ -11,7 +11,7 @@ import collections
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +20,8 @@ import numpy as np
 import tqdm
 
 from rcirl_jax.data.config import CollectConfig
-from rcirl_jax.data.cut import (
-    Cut,
-    Part,
-    cut,
-    cut_item,
-    is_long,
-    recordings_of,
-    whole_of,
-)
+from rcirl_jax.data.cut import Cut, cut, cut_item, whole_of
+from rcirl_jax.data.parts import Part, items
 from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.data.recording import LEAVE_OUT
 from rcirl_jax.data.splits import assign_groups
@@ -333,22 +326,10 @@ def import_parts(
 
     def cuts(known: dict[str, str]) -> Iterable[Cut]:
         settings = {"config": config.collect, "done": known}
-        items = _items(parts, places.workers)
-        return places.stream(functools.partial(cut_item, **settings), items)
+        work = functools.partial(cut_item, **settings)
+        return places.stream(work, items(parts, places.workers))
 
     return _import(cuts, len(parts), output, config, overwrite)
-
-
-def _items(
-    parts: Sequence[Part], workers: int
-) -> Iterator[Part | tuple[Part, Recording]]:
-    """Parts, to be read where they are cut; of few or long ones, each recording."""
-    is_few = len(parts) < workers
-    for part in parts:
-        if is_few or is_long(part):
-            yield from ((part, recording) for recording in recordings_of(part))
-        else:
-            yield part
 
 
 def _import(

@@ -15,7 +15,9 @@ from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.types import Ghost, Kind, Lane, Recording, Signal, Track
 from rcirl_jax.units import FOOT_M, MPH_MPS
 
-LEAVE_OUT = "leave_out"  # key of a spec: refused recordings are left out
+# keys that an import adds to a spec
+LEAVE_OUT = "leave_out"  # refused recordings are left out
+PIECE = "piece"  # (first, last) scene of a part that is read in pieces
 MAX_SPEED_MPS = 90.0  # m/s, faster than any road user
 LENGTH_RANGE_M = (0.2, 40.0)  # m
 WIDTH_RANGE_M = (0.2, 6.0)  # m

@@ -110,7 +110,9 @@ def before_line(track: Track, lane: Lane) -> tuple[np.ndarray, np.ndarray]:
     line's ends and head the lane's way.
     """
     assert lane.stop_line is not None
-    ahead = lane.centre[-1] - lane.centre[-2]
+    apart = np.hypot(*(lane.centre - lane.stop_line.mean(axis=0)).T)
+    begin = max(int(apart.argmin()) - 1, 0)  # the line may be at either end
+    ahead = lane.centre[begin + 1] - lane.centre[begin]
     ahead = ahead / np.hypot(*ahead)
     front = np.stack([track.x, track.y], axis=1) + 0.5 * track.length * np.stack(
         [np.cos(track.heading), np.sin(track.heading)], axis=1

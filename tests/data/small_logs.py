@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.config import CollectConfig
-from rcirl_jax.data.cut import Part
 from rcirl_jax.data.importers import parts
 from rcirl_jax.data.importing import ImportConfig
+from rcirl_jax.data.parts import Part
 
 CONFIG = ImportConfig(
     format="csv",

@@ -16,7 +16,8 @@ import pytest
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.cut import digest
 from rcirl_jax.data.importers import IMPORTERS, parts, read_part, read_recordings
-from rcirl_jax.data.importing import ImportConfig, import_logs
+from rcirl_jax.data.importing import ImportConfig, import_parts
+from rcirl_jax.data.parts import Part
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.specs import load_toml, spec_root
@@ -182,17 +183,26 @@ def test_reads_one_recording_at_a_time(name, tmp_path):
     assert next(iter(found)).tracks
 
 
-def test_imports_end_to_end(name, tmp_path):
-    """Every fixture is long enough for a scene of 3 s."""
-    fixture = write(name, tmp_path / "log")
+def imported(name, fixture, output):
+    """The manifest of an import as by its command; 3 s of future are enough."""
     collect = CollectConfig(
         require_obstacles=False, require_speed_change=False, min_future_s=3.0
     )
     config = ImportConfig(format=format_of(name), collect=collect)
-    recordings = read_recordings(format_of(name), fixture.input)
-    manifest = import_logs(recordings, tmp_path / "dataset", config)
+    found, spec = parts(format_of(name), fixture.input)
+    apart = [Part(format=format_of(name), input=path, spec=spec) for path in found]
+    return import_parts(apart, output, config)
+
+
+def test_imports_end_to_end(name, tmp_path):
+    """Every fixture is long enough for a scene of 3 s."""
+    manifest = imported(name, write(name, tmp_path / "log"), tmp_path / "dataset")
     assert manifest.count > 0
     assert manifest.sources
+    spec = load_toml(spec_root() / "sources" / f"{format_of(name)}.toml")
+    known = [spec, *spec.get("provenance", [])]
+    licences = {entry.get("licence", spec["licence"]) for entry in known}
+    assert {entry["licence"] for entry in manifest.sources} <= licences
 
 
 # ---------------------------------------------------------------- damaged files
@@ -294,7 +304,10 @@ DAMAGES = {
 
 @pytest.mark.parametrize("damage", sorted(DAMAGES))
 def test_damaged_files(name, damage, tmp_path):
-    """One line that names the file, or (rows end cleanly, optional) a result."""
+    """One line that names the file, or (rows end cleanly, optional) a result.
+
+    An import says the same line and leaves nothing.
+    """
     apply, may_pass = DAMAGES[damage]
     target = tmp_path / "executed"
     count = len(write(name, tmp_path / "count").files)
@@ -312,6 +325,9 @@ def test_damaged_files(name, damage, tmp_path):
             assert len(message) < 1000
             where = path.name in message or damage == "removed"
             assert where, f"{path.name} is not named: {message}"
+            with pytest.raises(InputError, match=re.escape(message)):
+                imported(name, fixture, tmp_path / "dataset")
+            assert not (tmp_path / "dataset").exists()
         else:
             assert may_pass(fixture), f"{damage}: {path.name} was read as if sound"
             for recording in recordings:

@@ -6,9 +6,10 @@ import fcntl
 import numpy as np
 import pytest
 
-from rcirl_jax.data.cut import Part, cut
+from rcirl_jax.data.cut import cut
 from rcirl_jax.data.importers import csv_stream, parts, read_part, scratch
 from rcirl_jax.data.importing import import_parts
+from rcirl_jax.data.parts import Part
 from rcirl_jax.data.store import open_dataset
 from rcirl_jax.errors import InputError
 from tests.commands import count_and_peak
@@ -237,7 +238,7 @@ def test_settings_change_the_digest_of_a_piece(tmp_path):
 MEMORY = """
 import resource, sys
 from pathlib import Path
-from rcirl_jax.data.cut import Part
+from rcirl_jax.data.parts import Part
 from rcirl_jax.data.importers import parts
 from rcirl_jax.data.importers import csv_stream
 from rcirl_jax.data.importers.csv_stream import Field, pieces

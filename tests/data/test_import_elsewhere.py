@@ -9,14 +9,15 @@ import time
 import numpy as np
 import pytest
 
-from rcirl_jax.data import cut, importing
+from rcirl_jax.data import importing
+from rcirl_jax.data import parts as dealing
 from rcirl_jax.data.config import CollectConfig
-from rcirl_jax.data.cut import Part, recordings_of
 from rcirl_jax.data.importers import parts
 from rcirl_jax.data.importing import ImportConfig, import_parts
+from rcirl_jax.data.parts import Part, is_long, recordings_of
 from rcirl_jax.errors import InputError, LostWorkError
 from rcirl_jax.executor import Here, Processes, Ray
-from tests.data.formats import nuplan, waymo
+from tests.data.formats import apollo, l5, nuplan, waymo
 from tests.data.small_logs import CONFIG, files_of, write_logs
 
 ALL_SCENES = ImportConfig(
@@ -57,17 +58,21 @@ def reads_of_this_process(monkeypatch):
         read.append(part.input.name)
         return recordings_of(part)
 
-    monkeypatch.setattr(importing, "recordings_of", noted)
+    monkeypatch.setattr(dealing, "recordings_of", noted)
     return read
 
 
 @pytest.fixture(scope="module")
 def shards(tmp_path_factory):
-    """Four Waymo shards of two scenarios each, and a nuPlan log."""
+    """Four Waymo shards of two scenarios each; a nuPlan log, an Apollo drive, L5."""
     folder = tmp_path_factory.mktemp("shards")
     waymo.write_shards(folder / "waymo")
     made = []
-    places = ("waymo", folder / "waymo"), ("nuplan", nuplan.write(folder).input)
+    places = [("waymo", folder / "waymo")]
+    for other in (nuplan, apollo, l5):
+        name = other.__name__.rpartition(".")[2]
+        (folder / name).mkdir()
+        places.append((name, other.write(folder / name).input))
     for name, place in places:
         found, spec = parts(name, place)
         spec = {**spec, "recording_car": "human"}  # the only one seen for long
@@ -90,14 +95,15 @@ def test_shards_are_read_by_the_workers(shards, here, tmp_path, monkeypatch):
     assert read == []
     assert files_of(tmp_path / "data") == here
     waymos = [f"scenario-{shard}-{letter}" for shard in range(4) for letter in "ab"]
-    assert manifest.recordings[:-1] == waymos
+    assert manifest.recordings[: len(waymos)] == waymos
+    assert {"sample-000000", "sample-000001"} < set(manifest.recordings)
 
 
 @pytest.mark.multiprocess
 def test_long_shards_are_read_here_between_others(shards, here, tmp_path, monkeypatch):
     """One shard is longer than the limit: it alone is read in this process."""
     long = shards[1].input
-    monkeypatch.setattr(importing, "is_long", lambda part: part.input == long)
+    monkeypatch.setattr(dealing, "is_long", lambda part: part.input == long)
     read = reads_of_this_process(monkeypatch)
     import_parts(shards, tmp_path / "data", ALL_SCENES, executor=TWO)
     assert read == [long.name]
@@ -112,16 +118,20 @@ def test_fewer_shards_than_workers_are_read_here(shards, tmp_path, monkeypatch):
 
 
 def test_a_shard_is_long_beyond_its_formats_limit(shards, monkeypatch):
-    assert not any(map(cut.is_long, shards))
-    sizes = [part.input.stat().st_size for part in shards]
-    monkeypatch.setitem(cut.SHARD_BYTES, "waymo", sizes[0] - 1)
-    assert [cut.is_long(part) for part in shards] == [True] * 4 + [False]
-    monkeypatch.setitem(cut.SHARD_BYTES, "nuplan", sizes[-1])
-    assert not cut.is_long(shards[-1])
-    monkeypatch.setitem(cut.SHARD_BYTES, "nuplan", sizes[-1] - 1)
-    assert cut.is_long(shards[-1])
+    by_format = {part.format: part for part in shards}
+    assert not any(map(is_long, shards[:-1]))
+    assert is_long(by_format["l5"])  # a dataset: read in pieces
+    for name, files in ("waymo", 1), ("nuplan", 1), ("apollo", 2):
+        part = by_format[name]
+        found = dealing.files_of(name, part.input)
+        assert len(found) == files
+        size = sum(file.stat().st_size for file in found)
+        monkeypatch.setitem(dealing.SHARD_BYTES, name, size)
+        assert not is_long(part)
+        monkeypatch.setitem(dealing.SHARD_BYTES, name, size - 1)
+        assert is_long(part)
     folder = Part(format="waymo", input=shards[0].input.parent, spec={})
-    assert cut.is_long(folder)  # any number of shards
+    assert is_long(folder)  # any number of shards
 
 
 @pytest.mark.multiprocess

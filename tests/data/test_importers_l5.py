@@ -7,7 +7,15 @@ import struct
 import numpy as np
 import pytest
 
-from rcirl_jax.data.importers import l5, l5_map, parts, read_recordings, zarr2
+from rcirl_jax.data.cut import digest
+from rcirl_jax.data.importers import (
+    l5,
+    l5_map,
+    l5_scenes,
+    parts,
+    read_recordings,
+    zarr2,
+)
 from rcirl_jax.data.importers.wire import WireError, packed_sint32
 from rcirl_jax.errors import InputError
 from rcirl_jax.specs import load_toml, spec_root
@@ -22,6 +30,14 @@ def packaged():
 
 def read(path, **options):
     return list(l5.recordings(path, {**packaged(), **options}))
+
+
+def map_of(file):
+    return l5_map.SemanticMap(file, l5_map.world_to_ecef(file, packaged()))
+
+
+def lanes_around(semantic_map):
+    return semantic_map.lanes(*fixture.CENTRE[:, None], np.zeros(2))
 
 
 def track(recording, name):
@@ -79,11 +95,11 @@ def test_groups_of_other_hosts_and_days():
     scenes["host"] = ["a", "b", "a", "a"]
     scenes["start_time"] = np.array([0, 0, 30, 300]) * 10**9
     scenes["end_time"] = scenes["start_time"] + 25 * 10**9
-    assert l5._groups(scenes, []) == [
+    assert l5_scenes.groups_of(scenes, []) == [
         *("a-from-0", "b-from-0", "a-from-0", "a-from-300")
     ]
     # the third scene alone is still one of the drive that began with the first
-    assert l5._groups(scenes[2:], [scenes[:1]]) == ["a-from-0", "a-from-300"]
+    assert l5_scenes.groups_of(scenes[2:], [scenes[:1]]) == ["a-from-0", "a-from-300"]
 
 
 def test_groups_over_datasets(folder):
@@ -135,6 +151,29 @@ def test_parts_are_datasets(folder):
     assert names == ["sample-000000", "sample-000001", "train-000000", "train-000001"]
 
 
+@pytest.mark.parametrize("few", [1, 2, 5])
+def test_pieces_make_up_the_dataset(folder, few, monkeypatch):
+    monkeypatch.setattr(l5, "PIECE_SCENES", few)
+    whole, (dataset,) = read(folder), l5.parts(folder, packaged())
+    apart = [
+        r
+        for spec in l5.pieces(dataset, packaged())
+        for r in l5.recordings(dataset, spec)
+    ]
+    assert len(whole) == 2
+    assert [digest(r) for r in apart] == [digest(r) for r in whole]
+    assert [(r.group, r.progress) for r in apart] == [
+        (r.group, r.progress) for r in whole
+    ]
+
+
+def test_a_map_that_changed_is_read_again(folder):
+    before = {lane.id for lane in read(folder)[0].lanes if lane.signal_ids}
+    fixture.write_map(folder / "semantic_map" / "semantic_map.pb", controls=())
+    after = {lane.id for lane in read(folder)[0].lanes if lane.signal_ids}
+    assert (before, after) == ({"a1"}, set())
+
+
 def test_reads_only_the_scene_it_is_at(folder):
     """Chunks of later scenes are not touched: the full set has 100s of GB."""
     agents = folder / "scenes" / "sample.zarr" / "agents"
@@ -159,10 +198,7 @@ def test_a_lane_that_names_faces_has_only_those_of_its_light(
     controls, governing, tmp_path
 ):
     made = fixture.write_map(tmp_path / "m.pb", controls)
-    lanes = l5_map.SemanticMap(made, packaged()).lanes(
-        *fixture.CENTRE[:, None], np.zeros(2)
-    )
-    by_name = {lane.id: lane.signal_ids for lane in lanes}
+    by_name = {lane.id: lane.signal_ids for lane in lanes_around(map_of(made))}
     assert by_name["a1"] == (governing,)
     assert by_name["a2"] == ()
 
@@ -189,6 +225,18 @@ def test_lanes_of_the_semantic_map(folder):
     assert lanes["c1"].stop_line is None
 
 
+def test_the_line_of_a_lane_inside_a_junction_is_at_its_start(tmp_path):
+    """Whoever is on it was held at the junction's edge."""
+    made = fixture.write_map(tmp_path / "m.pb", controls=(), inside=(fixture.RED,))
+    lanes = {lane.id: lane for lane in lanes_around(map_of(made))}
+    x, y = fixture.CENTRE
+    np.testing.assert_allclose(
+        lanes["c1"].stop_line, [[x + 60, y + 1.75], [x + 60, y - 1.75]], atol=0.03
+    )
+    assert lanes["c1"].signal_ids == (fixture.RED,)
+    assert lanes["a1"].stop_line is None
+
+
 def test_light_of_a_lane(folder):
     recording = read(folder)[0]
     (signal,) = recording.signals
@@ -201,8 +249,8 @@ def test_light_of_a_lane(folder):
 
 
 def test_light_unseen_for_a_second_is_off(tmp_path):
-    semantic_map = l5_map.SemanticMap(fixture.write_map(tmp_path / "m.pb"), packaged())
-    lanes = semantic_map.lanes(*fixture.CENTRE[:, None], np.zeros(2))
+    semantic_map = map_of(fixture.write_map(tmp_path / "m.pb"))
+    lanes = lanes_around(semantic_map)
     t = 0.1 * np.arange(40)
     seen = l5_map.LightFaces(
         t=t,

@@ -5,9 +5,9 @@ import dataclasses
 import pytest
 
 from rcirl_jax.data.config import CollectConfig
-from rcirl_jax.data.cut import Part, recordings_of
 from rcirl_jax.data.importers import parts
 from rcirl_jax.data.importing import ImportConfig, import_parts
+from rcirl_jax.data.parts import Part, recordings_of
 from rcirl_jax.data.quality import format_quality
 from rcirl_jax.data.recording import LEAVE_OUT
 from rcirl_jax.errors import InputError

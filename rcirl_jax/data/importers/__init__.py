@@ -7,6 +7,7 @@ recordings through `validate_recording` with the file's name.
 
 import importlib
 import itertools
+import types
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -46,17 +47,35 @@ SMALL_PARTS = (
 )
 # formats of which one part is a file with many recordings, and the bytes of the
 # longest one whose scenes may be held at once (docs/formats, "Large inputs")
-SHARD_BYTES = {"nuplan": 2**28, "waymo": 2**30}
+SHARD_BYTES = {"apollo": 2**28, "nuplan": 2**28, "waymo": 2**30}
 # formats of which one part is a file that is read in pieces where it is long
 CSV_PARTS = ("csv", "ngsim")
 
 
 def read_part(name: str, path: Path, spec: dict) -> Iterator[Recording]:
     """All recordings of one part, each validated; arguments as of `parts`."""
-    module = importlib.import_module(f"{__name__}.{IMPORTERS[name]}")
-    importer: Importer = module.recordings
+    importer: Importer = _module(name).recordings
     with as_input_error(str(path), f"a sound log of format {name}"):
         yield from importer(path, spec)
+
+
+def pieces(name: str, path: Path, spec: dict) -> list[dict]:
+    """Specs that each read a share of one part, in order; arguments as of `parts`.
+
+    A format whose module has no `pieces(path, spec)` reads a part as a whole.
+    """
+    split = getattr(_module(name), "pieces", None)
+    return [spec] if split is None else split(path, spec)
+
+
+def files_of(name: str, path: Path) -> list[Path]:
+    """The files that one part is read from: itself, if its module says nothing."""
+    found = getattr(_module(name), "files_of", None)
+    return [path] if found is None else found(path)
+
+
+def _module(name: str) -> types.ModuleType:
+    return importlib.import_module(f"{__name__}.{IMPORTERS[name]}")
 
 
 def parts(
@@ -86,7 +105,7 @@ def parts(
         input_path = spec_path
     if not input_path.exists():
         raise InputError(f"{input_path}: input: missing: expected a file or folder")
-    module = importlib.import_module(f"{__name__}.{IMPORTERS[name]}")
+    module = _module(name)
     split = getattr(module, "parts", None)
     with as_input_error(
         str(input_path), f"logs of format {name}, and options as in its TOML"

@@ -66,6 +66,11 @@ def parts(path: Path, spec: dict) -> list[Path]:
     return first_parts(path, str(spec.get("pattern", "*.record*")))
 
 
+def files_of(first: Path) -> list[Path]:
+    """The files of a drive, by its first one."""
+    return parts_from(first)
+
+
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """One Recording per drive, or per window of a long one."""
     for first in parts(path, spec):

@@ -13,15 +13,26 @@ share a group, also over datasets: several hold scenes of one drive. Colours of
 lights are in the semantic map alone.
 """
 
-import contextlib
 import dataclasses
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.importers.l5_map import LightFaces, SemanticMap, find_map
+from rcirl_jax.data.importers.l5_map import (
+    LightFaces,
+    SemanticMap,
+    find_map,
+    world_to_ecef,
+)
+from rcirl_jax.data.importers.l5_scenes import (
+    beside,
+    groups_of,
+    parts,
+    scenes_of,
+    tables_of,
+)
 from rcirl_jax.data.importers.options import positive, recording_car, section
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.perception import (
@@ -36,7 +47,7 @@ from rcirl_jax.data.importers.shapes import (
 )
 from rcirl_jax.data.importers.tables import number
 from rcirl_jax.data.importers.zarr2 import StructuredArray
-from rcirl_jax.data.recording import accepted
+from rcirl_jax.data.recording import PIECE, accepted
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Lane, Recording, Signal, Track
 
@@ -49,8 +60,6 @@ KIND_OF_LABEL = np.array(
     + [Kind.PEDESTRIAN] * 2  # pedestrian, animal
     + [UNKNOWN]  # don't care
 )
-SCENES = {"frame_index_interval": ("iu", (2,)), "host": ("U", ())}
-SCENES |= dict.fromkeys(("start_time", "end_time"), ("iu", ()))
 FRAMES = {
     "timestamp": ("iu", ()),
     "agent_index_interval": ("iu", (2,)),
@@ -73,8 +82,7 @@ FACES = {
 FACE_INTERVAL = "traffic_light_faces_index_interval"  # of frames
 RATE_HZ = 10.0  # 1/s
 MAX_GAP_S = 0.55  # s without a box inside one track
-SAME_DRIVE_S = 60.0  # s, a host's scenes closer than this may show the same cars
-MAX_SCENES = 1_000_000
+PIECE_SCENES = 8  # scenes of a piece; their demonstrations are held at once
 MAX_FRAMES = 36_000  # frames of one scene: an hour
 MAX_AGENTS = 5_000_000  # agent records of one scene
 LIMIT_MPS = 15.65  # m/s, 35 mph: main roads of Palo Alto
@@ -92,76 +100,45 @@ class _Dataset:
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
-    """One Recording per scene of every dataset."""
-    maps: dict[Path, SemanticMap] = {}
+    """One Recording per scene of every dataset, or of the spec's piece of one."""
     for folder in parts(path, spec):
-        dataset = _open(folder)
-        file = find_map(folder, spec)
-        if file is not None and file not in maps:
-            maps = {file: SemanticMap(file, spec)}
-        others = _tables(_beside(folder, spec))
-        groups = _groups(dataset.scenes, list(others.values()))
-        for index, scene in enumerate(dataset.scenes):
+        dataset, road = _open(folder), _map_of(folder, spec)
+        others = tables_of(beside(folder, spec))
+        groups = groups_of(dataset.scenes, list(others.values()))
+        first, last = spec.get(PIECE, (0, len(groups)))
+        for index in range(first, last):
             name = f"{folder.stem}-{index:06d}"
-            road = maps[file] if file else None
-            make = functools.partial(_recording, dataset, name, scene, road, spec)
+            make = functools.partial(
+                _recording, dataset, name, dataset.scenes[index], road, spec
+            )
             made = accepted(make, name, f"{folder}: scene {index}", spec)
             yield dataclasses.replace(
                 made, group=groups[index], progress=(index + 1) / len(groups)
             )
 
 
-def parts(path: Path, spec: dict) -> list[Path]:
-    """The dataset itself, or those in a folder or its scenes/."""
-    if (path / "scenes" / ".zarray").is_file():
-        return [path]
-    found = _datasets(path, spec)
-    if not found:
-        raise InputError(
-            f"{path}: no scenes/.zarray and no folder {_pattern(spec)}: "
-            "expected L5 data"
-        )
-    _check_met_once(_tables(found))
-    return found
+def pieces(path: Path, spec: dict) -> list[dict]:
+    """Specs of a few scenes each: a dataset is the work of many processes."""
+    number = len(scenes_of(path))
+    return [
+        {**spec, PIECE: (first, min(first + PIECE_SCENES, number))}
+        for first in range(0, number, PIECE_SCENES)
+    ]
 
 
-def _pattern(spec: dict) -> str:
-    return str(spec.get("pattern", "*.zarr"))
+def _map_of(folder: Path, spec: dict) -> SemanticMap | None:
+    file = find_map(folder, spec)
+    if file is None:
+        return None
+    about, to_ecef = file.stat(), world_to_ecef(file, spec)
+    return _map(file, about.st_mtime_ns, about.st_size, tuple(to_ecef.flat))
 
 
-def _datasets(path: Path, spec: dict) -> list[Path]:
-    """Datasets in a folder or its scenes/."""
-    pattern = _pattern(spec)
-    return sorted({*path.glob(pattern), *path.glob(f"scenes/{pattern}")})
-
-
-def _beside(folder: Path, spec: dict) -> list[Path]:
-    """The datasets that lie beside one."""
-    above = folder.absolute().parent
-    found = _datasets(above.parent if above.name == "scenes" else above, spec)
-    return [other for other in found if other != folder.absolute()]
-
-
-def _tables(folders: Sequence[Path]) -> dict[Path, np.ndarray]:
-    """The scenes of each dataset; those of no use are named when they are opened."""
-    tables = {}
-    for folder in folders:
-        with contextlib.suppress(InputError):
-            tables[folder] = _scenes(folder)
-    return tables
-
-
-def _check_met_once(tables: Mapping[Path, np.ndarray]) -> None:
-    """No scene is in two datasets."""
-    met: dict[tuple[str, ...], Path] = {}
-    for folder, table in tables.items():
-        for index, scene in enumerate(table):
-            key = tuple(str(scene[name]) for name in ("host", "start_time", "end_time"))
-            if met.setdefault(key, folder) != folder:
-                raise InputError(
-                    f"{folder}: scene {index}: host {key[0]}, start {key[1]}: met "
-                    f"twice, also in {met[key].name}: expected once; name one dataset"
-                )
+@functools.lru_cache(maxsize=1)  # pieces of a dataset share it
+def _map(file: Path, changed_ns: int, size: int, to_ecef: tuple) -> SemanticMap:
+    """The map of a file as it was; all pieces of a dataset share it."""
+    del changed_ns, size  # they tell files of one name apart
+    return SemanticMap(file, np.array(to_ecef).reshape(4, 4))
 
 
 def _open(folder: Path) -> _Dataset:
@@ -170,49 +147,11 @@ def _open(folder: Path) -> _Dataset:
     has_lights = lights.is_dir() and FACE_INTERVAL in (frames.dtype.names or ())
     return _Dataset(
         path=folder,
-        scenes=_scenes(folder),
+        scenes=scenes_of(folder),
         frames=frames,
         agents=StructuredArray(folder / "agents", AGENTS),
         faces=StructuredArray(lights, FACES) if has_lights else None,
     )
-
-
-def _scenes(folder: Path) -> np.ndarray:
-    """All scenes of a dataset."""
-    scenes = StructuredArray(folder / "scenes", SCENES)
-    if not 0 < scenes.size <= MAX_SCENES:
-        raise InputError(
-            f"{scenes.path}: shape: {scenes.size} scenes: expected 1 to {MAX_SCENES}"
-        )
-    return scenes.read(0, scenes.size)
-
-
-def _groups(scenes: np.ndarray, others: Sequence[np.ndarray]) -> list[str]:
-    """Vehicle-disjoint group of each scene: a host's drive without a long pause.
-
-    Named by the host and the drive's start, so that it is the same in every dataset.
-
-    Args:
-      scenes: of one dataset.
-      others: of those beside it, which may hold earlier scenes of its drives.
-    """
-    tables = [scenes, *others]
-    hosts = np.concatenate([table["host"] for table in tables])
-    start, end = (
-        np.concatenate([table[name].astype(np.int64) for table in tables])
-        for name in ("start_time", "end_time")
-    )
-    _, host = np.unique(hosts, return_inverse=True)
-    order = np.lexsort((start, host))
-    pause = start[order][1:] - end[order][:-1]  # ns
-    new = np.ones(order.size, bool)
-    new[1:] = (np.diff(host[order]) != 0) | (pause > SAME_DRIVE_S * 1e9)
-    first = np.empty(order.size, np.int64)
-    first[order] = order[np.flatnonzero(new)][np.cumsum(new) - 1]
-    return [
-        f"{hosts[drive]}-from-{start[drive] // 10**9}"
-        for drive in first[: len(scenes)].tolist()
-    ]
 
 
 def _interval(where: str, bounds: np.ndarray, size: int, most: int) -> tuple[int, int]:

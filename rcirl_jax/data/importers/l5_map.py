@@ -88,14 +88,18 @@ def find_map(folder: Path, spec: dict) -> Path | None:
 class SemanticMap:
     """All lanes of a map in the dataset's world, and the lights' faces."""
 
-    def __init__(self, file: Path, spec: dict) -> None:
+    def __init__(self, file: Path, to_ecef: np.ndarray) -> None:
         """Reads the whole map once.
 
+        Args:
+          file: semantic_map.pb.
+          to_ecef: of `world_to_ecef`.
+
         Raises:
-          InputError: no protocol buffer, coordinates off the Earth, no transform.
+          InputError: no protocol buffer, coordinates off the Earth.
         """
         self.file = file
-        self._to_world = np.linalg.inv(_world_to_ecef(file, spec))
+        self._to_world = np.linalg.inv(to_ecef)
         self._limits: dict[str, tuple[float, float]] = {}  # forward, backward
         self._faces: dict[str, str] = {}  # id -> colour
         self._lights: dict[str, tuple[str, ...]] = {}  # id -> ids of its faces
@@ -264,6 +268,8 @@ class SemanticMap:
         governing = sorted({face for face in faces if face in self._faces})
         stop_sign = any(name in self._stop_signs for name in raw.controls)
         stops = bool(governing) or stop_sign
+        # who is inside a junction was held at its edge: a parent that is no segment
+        at = 0 if raw.parent and raw.parent not in self._limits else -1
         return Lane(
             id=raw.id,
             centre=centre,
@@ -273,7 +279,7 @@ class SemanticMap:
             successors=raw.ahead,
             left=raw.beside[0],
             right=raw.beside[1],
-            stop_line=np.stack([left[-1], right[-1]]) if stops else None,
+            stop_line=np.stack([left[at], right[at]]) if stops else None,
             signal_ids=("|".join(governing),) if governing else (),
             stop_sign=stop_sign,
         )
@@ -329,8 +335,16 @@ def _frame(buffer: memoryview) -> np.ndarray:
     return frame
 
 
-def _world_to_ecef(file: Path, spec: dict) -> np.ndarray:
-    """Rigid transform [4, 4] in m: of meta.json beside or above, or of the TOML."""
+def world_to_ecef(file: Path, spec: dict) -> np.ndarray:
+    """Rigid transform [4, 4] in m: of meta.json beside or above, or of the TOML.
+
+    Args:
+      file: semantic_map.pb.
+      spec: of the source; `world_to_ecef` counts where meta.json has none.
+
+    Raises:
+      InputError: no rigid transform.
+    """
     places = [folder / "meta.json" for folder in file.resolve().parents[:2]]
     meta = next((place for place in places if place.is_file()), None)
     where, found = "source TOML", spec.get("world_to_ecef")

@@ -277,8 +277,8 @@ def element(name, kind, body):
     return message([(1, name_of(name)), (2, message([(kind, body)]))])
 
 
-def write_map(path, controls=(RED, GREEN)):
-    """A road before a junction; `controls` govern its right lane."""
+def write_map(path, controls=(RED, GREEN), inside=()):
+    """A road before a junction; `controls` govern its right lane, `inside` the next."""
     x, y = CENTRE
     grid = np.linspace(-60.0, 60.0, 13)
 
@@ -310,7 +310,7 @@ def write_map(path, controls=(RED, GREEN)):
         # drawn against the traffic: the left bound lies to the right of the points
         lane("a2", along(5.25)[::-1], along(1.75)[::-1], beside=((1, "a1"),)),
         lane("b1", turn(23.25), turn(26.75), parent="jun"),
-        lane("c1", last + HALF, last - HALF, parent="jun"),
+        lane("c1", last + HALF, last - HALF, parent="jun", controls=inside),
         element("stub", 3, message([(1, name_of("seg"))])),
     ]
     path.parent.mkdir(parents=True, exist_ok=True)
