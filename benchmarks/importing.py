@@ -19,8 +19,7 @@ from benchmarks.common import write
 from experiments.common import run
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.cut import cut_item
-from rcirl_jax.data.importers import parts, read_part
-from rcirl_jax.data.parts import Part
+from rcirl_jax.data.parts import parts_of, recordings_of
 from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.executor import Executor, Here, Processes
 from rcirl_jax.specs import spec_root
@@ -76,12 +75,11 @@ def main() -> None:
             print(f"{name}: {path} is not there")
             continue
         toml = spec_root() / "sources" / f"{source}.toml"
-        inputs, spec = parts(format_, path, toml)
         begin = time.perf_counter()
         items = [
-            (Part(format=format_, input=one, spec=spec), made)
-            for one in inputs
-            for made in read_part(format_, one, spec)
+            (part, made)
+            for part in parts_of(format_, path, toml)
+            for made in recordings_of(part)
         ]
         parsing = time.perf_counter() - begin
         states = sum(t.t.size for _, made in items for t in made.tracks)

@@ -131,6 +131,7 @@ def main() -> None:
         found = {
             "gigabytes": log.stat().st_size / 2**30,
             "rows": rows,
+            "stride_s": _STRIDE.value,
             "scenes": scenes,
             "seconds": seconds,
             "scenes_per_s": scenes / seconds,

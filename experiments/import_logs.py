@@ -14,9 +14,9 @@ from absl import flags
 from experiments.common import run
 from experiments.executor import executor
 from rcirl_jax.data.config import CollectConfig
-from rcirl_jax.data.importers import IMPORTERS, parts
+from rcirl_jax.data.importers import IMPORTERS
 from rcirl_jax.data.importing import ImportConfig, import_parts
-from rcirl_jax.data.parts import Part
+from rcirl_jax.data.parts import parts_of
 from rcirl_jax.data.quality import format_quality
 from rcirl_jax.data.signal_checks import read_signal_checks
 from rcirl_jax.data.store import open_dataset
@@ -84,13 +84,12 @@ def main() -> None:
         split_seed=_SPLIT_SEED.value,
         leave_out=_LEAVE_OUT.value,
     )
-    found, spec = parts(
-        _FORMAT.value,
-        Path(_INPUT.value) if _INPUT.value else None,
-        Path(_SOURCE.value) if _SOURCE.value else None,
-    )
     manifest = import_parts(
-        [Part(format=_FORMAT.value, input=path, spec=spec) for path in found],
+        parts_of(
+            _FORMAT.value,
+            Path(_INPUT.value) if _INPUT.value else None,
+            Path(_SOURCE.value) if _SOURCE.value else None,
+        ),
         _OUTPUT.value,
         config,
         executor=executor(),

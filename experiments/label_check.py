@@ -13,7 +13,7 @@ against crossings and stands, and the stop labels against observed stands, with
 the signals that an import trusts of itself, those it uses when told these phases
 (`import_logs --signals=DIR/labels.json`), and all of them. With --data the labels
 stored in a dataset are compared with today's rules. --workers and --executor
-spread the planned drives.
+spread the drives and the logs.
 
 Writes labels.json and labels.png. On two cores 100 cases of each of the 38
 families take about 5 minutes per noise; the urban CommonRoad files 3 minutes.
@@ -26,12 +26,13 @@ from absl import flags
 
 from experiments.common import provenance, run
 from experiments.executor import executor
-from rcirl_jax.data.importers import IMPORTERS, read_recordings
-from rcirl_jax.data.signal_checks import signal_checks
+from rcirl_jax.data.importers import IMPORTERS
+from rcirl_jax.data.parts import parts_of
 from rcirl_jax.data.store import open_dataset
+from rcirl_jax.evaluation.label_logs import check_logs
 from rcirl_jax.evaluation.label_scores import LabelReport, format_labels, format_scores
-from rcirl_jax.evaluation.label_signals import check_phases, format_phases
-from rcirl_jax.evaluation.label_stops import check_stops, compare_stored, format_stops
+from rcirl_jax.evaluation.label_signals import format_phases
+from rcirl_jax.evaluation.label_stops import compare_stored, format_stops
 from rcirl_jax.evaluation.label_traffic import measure_traffic
 from rcirl_jax.evaluation.label_truth import measure
 from rcirl_jax.executor import Executor
@@ -55,17 +56,12 @@ def main() -> None:
     body, tables = {}, {}
     if _INPUT.value:
         source = Path(_SOURCE.value) if _SOURCE.value else None
-        found = list(read_recordings(_FORMAT.value, Path(_INPUT.value), source))
-        phases = check_phases(found)
-        print(format_phases(phases))
-        body["phases"] = [check.as_dict() for check in phases]
-        by_phase = signal_checks({check.name: check.verdict for check in phases})
-        for name, how in {
-            "trusted signals": {},
-            "signals by their phases": {"checks": by_phase},
-            "all signals": {"trust_all": True},
-        }.items():
-            stops = check_stops(found, **how)
+        logs = check_logs(
+            parts_of(_FORMAT.value, Path(_INPUT.value), source), executor=executor()
+        )
+        print(format_phases(logs.phases))
+        body["phases"] = [check.as_dict() for check in logs.phases]
+        for name, stops in logs.stops.items():
             print(f"\n{name}: {format_stops(stops)}")
             body[name], tables[f"recorded, {name}"] = stops.as_dict(), stops.scores
     if _DATA.value:

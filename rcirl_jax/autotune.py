@@ -19,10 +19,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from rcirl_jax.data.importers import parts
 from rcirl_jax.data.importers.files import listing
 from rcirl_jax.data.importing import ImportConfig, import_parts
-from rcirl_jax.data.parts import Part
+from rcirl_jax.data.parts import parts_of
 from rcirl_jax.data.preferences import read_preferences
 from rcirl_jax.data.store import Dataset, open_dataset
 from rcirl_jax.errors import InputError
@@ -156,10 +155,10 @@ class Loop:
         """Open the dataset, or import the logs."""
         if isinstance(given, str):
             return open_dataset(given)
-        found, spec = parts(given.format, given.input, given.source)
+        found = parts_of(given.format, given.input, given.source)
         inputs = {
             "config": dataclasses.asdict(given.config),
-            "spec": digest(spec),
+            "spec": digest(found[0].spec),
             "files": listing(given.input) if given.input else [],
         }
         key = digest({**inputs, **self._code()})[:8]
@@ -168,8 +167,7 @@ class Loop:
         def work() -> None:
             if (folder / "manifest.json").exists():
                 return  # finished, but not noted: killed in between
-            pieces = [Part(format=given.format, input=p, spec=spec) for p in found]
-            import_parts(pieces, folder, given.config, executor=self.executor)
+            import_parts(found, folder, given.config, executor=self.executor)
 
         self._run("import", inputs, [folder / "manifest.json"], work)
         return open_dataset(folder)

@@ -16,6 +16,7 @@ LINE_HALF_WIDTH_M = 20.0  # m, a line spans the whole road
 STOP_SIGN_WAIT_S = 1.0  # s, a stop sign is obeyed after standing this long
 MAX_RED_RUNNING = 0.1  # share of crossings on red above which a cycle is not true
 PASSABLE = ("green", "yellow")  # states that let a driver pass
+TOO_FEW = "has too few crossings"  # in a note on an unused signal
 MIN_CROSSINGS = 3  # crossings needed to judge a cycle
 OVER_M = 1.5  # m, a car that stands so far over a light's line still waits for it
 STANDING_MPS = 0.5  # m/s
@@ -71,7 +72,7 @@ def trusted_signals(
         judged = signal.is_recorded or trust_written
         unproved = not judged and crossings < MIN_CROSSINGS
         if wrong or unproved:
-            why = "disagrees with the crossings" if wrong else "has too few crossings"
+            why = "disagrees with the crossings" if wrong else TOO_FEW
             notes.append(f"signal {name}: {why} ({reds} on red of {crossings}); unused")
         else:
             trusted[name] = signal

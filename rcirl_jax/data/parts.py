@@ -13,6 +13,7 @@ from rcirl_jax.data.importers import (
     pieces,
     read_part,
 )
+from rcirl_jax.data.importers import parts as inputs_of
 from rcirl_jax.data.recording import LEAVE_OUT, PIECE, refusal
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Recording
@@ -35,6 +36,14 @@ class Part:
 
 
 Item = Part | tuple[Part, Recording]
+
+
+def parts_of(
+    name: str, input_path: Path | None, source: Path | None = None
+) -> list[Part]:
+    """All parts of an input, in order; arguments and errors as `importers.parts`."""
+    found, spec = inputs_of(name, input_path, source)
+    return [Part(format=name, input=path, spec=spec) for path in found]
 
 
 def items(parts: Sequence[Part], workers: int) -> Iterator[Item]:

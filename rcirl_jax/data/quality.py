@@ -7,6 +7,7 @@ import numpy as np
 
 from rcirl_jax.data.collect import Collector
 from rcirl_jax.data.filters import REASONS
+from rcirl_jax.data.lines import TOO_FEW
 from rcirl_jax.data.smoothing import HARSH_MPS2, harsh_share
 from rcirl_jax.types import Decision, Demonstration, Kind, Recording, Tag
 
@@ -14,6 +15,11 @@ HEADWAY_STEP_S = 0.01  # s, to which headways are counted
 SPEED_STEP_MPS = 0.05  # m/s, likewise
 FUTURE_STEP_S = 0.05  # s, likewise
 HEADWAY_EDGES_S = (0.5, 1.0, 1.5, 2.0, 3.0)  # s, bins of the headway histogram
+HOW_TO_POOL = (
+    "written lights that the crossings of one file cannot bear out give no stop "
+    "labels: `experiments.label_check --input=LOGS` asks all files together, and "
+    "`--signals` of an import takes its labels.json"
+)
 
 
 @dataclasses.dataclass
@@ -201,4 +207,6 @@ def format_quality(report: dict) -> str:
         lines.append(f"{report['refused']} recordings refused and left out")
     if report["num_notes"]:
         lines.append(f"{report['num_notes']} notes; first: {report['notes'][0]}")
+    if any(TOO_FEW in note for note in report["notes"]):
+        lines.append(HOW_TO_POOL)
     return "\n".join(lines)

@@ -202,11 +202,27 @@ def check_phases(recordings: Iterable[Recording]) -> list[PhaseCheck]:
     Signals are the same if their ids are and the recordings' names agree up to
     the last "-", as in CommonRoad's names of places.
     """
-    events: dict[str, list[tuple[str, Event]]] = collections.defaultdict(list)
-    for recording in recordings:
-        for ids, found in observe(recording).items():
-            name = line_name(recording.name, ids)
-            events[name] += [(recording.name, e) for e in found]
+    return check_events(map(line_events, recordings))
+
+
+# events by the name of their line, each with the name of its recording
+LineEvents = dict[str, list[tuple[str, Event]]]
+
+
+def line_events(recording: Recording) -> LineEvents:
+    """What a recording says of every line with signals, also if it is nothing."""
+    return {
+        line_name(recording.name, ids): [(recording.name, event) for event in found]
+        for ids, found in observe(recording).items()
+    }
+
+
+def check_events(recorded: Iterable[LineEvents]) -> list[PhaseCheck]:
+    """As `check_phases`, of what recordings say one after the other."""
+    events: LineEvents = collections.defaultdict(list)
+    for lines in recorded:
+        for name, found in lines.items():
+            events[name] += found
     checks = [_check(name, found) for name, found in sorted(events.items())]
     together = [pair for found in events.values() for pair in found]
     return [*checks, _check(TOGETHER, together)]

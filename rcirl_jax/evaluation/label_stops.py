@@ -67,29 +67,36 @@ def check_stops(
         check turns down; shows what the labels would be if they were right.
       checks: what many files say of the signals, as in an import with --signals.
     """
+    how = {"trust_all": trust_all, "checks": checks}
+    return joined(recording_stops(recording, **how) for recording in recordings)
+
+
+def recording_stops(
+    recording: Recording,
+    *,
+    trust_all: bool = False,
+    checks: SignalChecks | None = None,
+) -> StopReport:
+    """`check_stops` of one recording."""
     counts: collections.Counter[tuple[str, bool, bool]] = collections.Counter()
-    scenes = signals = trusted = 0
-    vehicles = set()
-    for recording in recordings:
-        config = CollectConfig(require_speed_change=False, signal_checks=checks)
-        collector = Collector(recording, config)
-        if trust_all:
-            collector.signals = {s.id: s for s in recording.signals}
-        signals += len(recording.signals)
-        trusted += len(collector.signals)
-        seen = _Observed(recording)
-        for row in collector.scenes():
-            scenes += 1
-            vehicles.add((recording.name, row["track"]))
-            for name, (truth, label) in _compare(row, seen).items():
-                if truth is not None:
-                    counts[name, truth, label] += 1
+    scenes, vehicles = 0, set()
+    config = CollectConfig(require_speed_change=False, signal_checks=checks)
+    collector = Collector(recording, config)
+    if trust_all:
+        collector.signals = {s.id: s for s in recording.signals}
+    seen = _Observed(recording)
+    for row in collector.scenes():
+        scenes += 1
+        vehicles.add(row["track"])
+        for name, (truth, label) in _compare(row, seen).items():
+            if truth is not None:
+                counts[name, truth, label] += 1
     names = dict.fromkeys(name for name, _, _ in counts)
     return StopReport(
         scenes=scenes,
         vehicles=len(vehicles),
-        signals=signals,
-        trusted=trusted,
+        signals=len(recording.signals),
+        trusted=len(collector.signals),
         scores=tuple(
             ClassScore(
                 name=name,
@@ -98,6 +105,34 @@ def check_stops(
                 missed=counts[name, True, False],
             )
             for name in names
+        ),
+    )
+
+
+def joined(reports: Iterable[StopReport]) -> StopReport:
+    """One report of several recordings."""
+    total: collections.Counter[str] = collections.Counter()
+    scores: dict[str, collections.Counter[str]] = {}
+    for report in reports:
+        for field in ("scenes", "vehicles", "signals", "trusted"):
+            total[field] += getattr(report, field)
+        for score in report.scores:
+            counts = scores.setdefault(score.name, collections.Counter())
+            for field in ("right", "wrong", "missed"):
+                counts[field] += getattr(score, field)
+    return StopReport(
+        scenes=total["scenes"],
+        vehicles=total["vehicles"],
+        signals=total["signals"],
+        trusted=total["trusted"],
+        scores=tuple(
+            ClassScore(
+                name=name,
+                right=counts["right"],
+                wrong=counts["wrong"],
+                missed=counts["missed"],
+            )
+            for name, counts in scores.items()
         ),
     )
 

@@ -5,9 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.config import CollectConfig
-from rcirl_jax.data.importers import parts
 from rcirl_jax.data.importing import ImportConfig
-from rcirl_jax.data.parts import Part
+from rcirl_jax.data.parts import Part, parts_of
 
 CONFIG = ImportConfig(
     format="csv",
@@ -31,8 +30,7 @@ def write_logs(folder: Path, files: int = 6, seconds: float = 16.0) -> list[Part
                 f"{a:.1f},{number}-{car},{b:.3f},0" for a, b in zip(t, x, strict=True)
             ]
         (folder / f"log{number:02d}.csv").write_text("\n".join(lines) + "\n")
-    found, spec = parts("csv", folder)
-    return [Part(format="csv", input=path, spec=spec) for path in found]
+    return parts_of("csv", folder)
 
 
 def files_of(folder: Path) -> dict[Path, bytes]:

@@ -15,7 +15,7 @@ from rcirl_jax.data.filters import REASONS
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.data.lanes import LaneGraph
-from rcirl_jax.data.lines import CREEP_M
+from rcirl_jax.data.lines import CREEP_M, TOO_FEW
 from rcirl_jax.data.quality import QualityReport, format_quality
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.data.smoothing import harsh_share, savgol
@@ -391,6 +391,15 @@ def test_quality_report_fits_a_terminal():
     text = format_quality(report.as_dict())
     assert set(report.as_dict()["dropped"]) == set(REASONS)
     assert max(len(line) for line in text.splitlines()[:-1]) <= 100
+    assert "--signals" not in text
+
+
+def test_quality_report_says_how_lights_are_borne_out():
+    report = QualityReport()
+    report.notes.append(f"a: signal 7: {TOO_FEW} (0 on red of 2); unused")
+    text = format_quality(report.as_dict())
+    assert "experiments.label_check --input" in text
+    assert "--signals" in text
 
 
 def three_recordings():

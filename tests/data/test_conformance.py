@@ -17,7 +17,7 @@ from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.cut import digest
 from rcirl_jax.data.importers import IMPORTERS, parts, read_part, read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_parts
-from rcirl_jax.data.parts import Part
+from rcirl_jax.data.parts import parts_of
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.specs import load_toml, spec_root
@@ -189,9 +189,7 @@ def imported(name, fixture, output):
         require_obstacles=False, require_speed_change=False, min_future_s=3.0
     )
     config = ImportConfig(format=format_of(name), collect=collect)
-    found, spec = parts(format_of(name), fixture.input)
-    apart = [Part(format=format_of(name), input=path, spec=spec) for path in found]
-    return import_parts(apart, output, config)
+    return import_parts(parts_of(format_of(name), fixture.input), output, config)
 
 
 def test_imports_end_to_end(name, tmp_path):

@@ -7,7 +7,7 @@ import pytest
 from rcirl_jax.data.cut import digest
 from rcirl_jax.data.importers import parts, read_part, read_recordings
 from rcirl_jax.data.importing import import_parts
-from rcirl_jax.data.parts import Part
+from rcirl_jax.data.parts import parts_of
 from rcirl_jax.data.store import open_dataset
 from rcirl_jax.errors import InputError
 from tests.data import writers as w
@@ -52,9 +52,7 @@ def test_openacc_drives_called_alike(tmp_path):
     drive(tmp_path / "Cherasco" / "part3.csv", 3)
     expected = ["Casale/part1", "Cherasco/part 2/part1", "part3"]
     assert names("openacc", tmp_path) == expected
-    found, spec = parts("openacc", tmp_path)
-    logs = [Part(format="openacc", input=part, spec=spec) for part in found]
-    import_parts(logs, tmp_path / "data", CONFIG)
+    import_parts(parts_of("openacc", tmp_path), tmp_path / "data", CONFIG)
     assert open_dataset(tmp_path / "data").manifest.recordings == expected
 
 

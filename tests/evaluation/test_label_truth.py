@@ -14,11 +14,13 @@ from rcirl_jax.data.collect import Collector
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.lines import trusted_signals
+from rcirl_jax.data.parts import parts_of, recordings_of
 from rcirl_jax.data.signal_checks import SignalChecks, read_signal_checks
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.label_cases import FAMILIES, Case, draw, to_recording
 from rcirl_jax.evaluation.label_cases.plans import ego_of
 from rcirl_jax.evaluation.label_cases.scenes import CLOCK, drive, speed
+from rcirl_jax.evaluation.label_logs import check_logs
 from rcirl_jax.evaluation.label_scores import format_labels
 from rcirl_jax.evaluation.label_signals import (
     check_phases,
@@ -30,6 +32,7 @@ from rcirl_jax.evaluation.label_stops import check_stops, format_stops
 from rcirl_jax.evaluation.label_truth import measure
 from rcirl_jax.executor import Processes
 from rcirl_jax.types import Decision, Signal, Tag
+from tests.data.formats import commonroad
 
 CASES = 2  # of every family
 FLOOR = 0.9  # precision and recall of a class with some 10 cases
@@ -203,6 +206,27 @@ def test_stops_of_recorded_drives_agree():
     assert "0 of 4 written signals" in format_stops(refused)
 
 
+@pytest.mark.multiprocess
+def test_logs_are_checked_alike_wherever_they_are_read(tmp_path):
+    """And as their recordings are when they are all held at once."""
+    for number in range(3):
+        (tmp_path / str(number)).mkdir()
+        commonroad.write(tmp_path / str(number))
+    logs = parts_of("commonroad", tmp_path)
+    made = [recording for part in logs for recording in recordings_of(part)]
+    assert len(made) == len(logs) == 3
+    here, there = check_logs(logs), check_logs(logs, executor=Processes(2))
+    assert here.stops == there.stops
+    alone = [check.as_dict() for check in check_phases(made)]
+    for one in here, there:
+        assert [check.as_dict() for check in one.phases] == alone
+    assert here.stops["trusted signals"] == check_stops(made)
+    every = here.stops["all signals"]
+    assert every == check_stops(made, trust_all=True)
+    assert (every.trusted, every.signals) == (3, 3)
+    assert every.scenes > 0
+
+
 def write_checks(path, checks):
     path.write_text(json.dumps({"phases": [check.as_dict() for check in checks]}))
     return path
@@ -272,8 +296,10 @@ def test_command(tmp_path):
 def test_urban_signals(data_dir):
     """The written cycles fit the drivers, over all files; one file proves little."""
     folder = data_dir / "ngsim_urban_commonroad" / "xml"
-    checks = check_phases(read_recordings("commonroad", folder))
-    together = checks[-1]
+    report = check_logs(parts_of("commonroad", folder), executor=Processes(2))
+    checks, together = report.phases, report.phases[-1]
+    used = report.stops["signals by their phases"]
+    assert report.stops["trusted signals"].trusted < used.trusted < used.signals
     assert together.crossings > 150
     assert together.red_written < 0.1
     assert together.best_offset_s == 0.0
