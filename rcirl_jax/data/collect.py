@@ -7,6 +7,7 @@ is counted by reason.
 """
 
 import collections
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
@@ -33,6 +34,7 @@ MAX_GHOST_POINTS = 1000  # of the line that a missing road user is taken to driv
 VIEW_BESIDE_M = 12.0  # m, obstacles farther beside are not collected
 VIEW_NUMBERS = 7  # float64 of a sample in a frame: s, l, tilt and the table of four
 BOX = ("s_lower", "s_upper", "l_lower", "l_upper", "speed", "valid")
+LABELLED_AT_ONCE = 64  # scenes
 VIEWS_BYTES = 256 * 2**20  # of tracks kept in the frames of chains
 
 
@@ -88,6 +90,13 @@ class Collector:
 
     def scenes(self) -> Iterator[dict]:
         """Rows of one scene each, as flat dicts of numpy arrays."""
+        rows = self._rows()
+        while some := list(itertools.islice(rows, LABELLED_AT_ONCE)):
+            labels.add_labels(some)
+            yield from some
+
+    def _rows(self) -> Iterator[dict]:
+        """Rows without their labels."""
         for number, smooth in enumerate(self.tracks):
             if smooth.track.kind == Kind.VEHICLE:
                 yield from self._scenes_of(number, smooth)
@@ -168,7 +177,6 @@ class Collector:
         ghosts = self._ghosts(frame, start, number)
         if reason := filters.reject(row, motion, self.config, ghosts):
             return reason
-        labels.add_labels(row)
         return row
 
     def _ego_and_path(

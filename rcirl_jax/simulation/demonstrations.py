@@ -101,7 +101,7 @@ def _rows(
         row["future_s"] = HORIZON_S
         row["s_at_5s"] = float(np.interp(now + 5.0, clock, s) - origin)
         row["frame"] = round(now / STEP_S)
-        add_labels(row)
+        add_labels([row])
         yield row
 
 

@@ -14,6 +14,7 @@ from rcirl_jax.data.cut import digest
 from rcirl_jax.data.filters import REASONS
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
+from rcirl_jax.data.labels import labels_of
 from rcirl_jax.data.lanes import LaneGraph
 from rcirl_jax.data.lines import CREEP_M, TOO_FEW
 from rcirl_jax.data.quality import QualityReport, format_quality
@@ -594,3 +595,17 @@ def test_a_red_light_is_not_disproved_by_those_whom_another_light_lets_pass():
     assert set(collector.signals) == {"arrow", "light"}
     rows = list(collector.scenes())
     assert any(row["tags"][Tag.RED_LIGHT] for row in rows)
+
+
+def test_labels_of_scenes_side_by_side_are_those_of_each_alone():
+    made = recording(
+        car("ego", speeding_up(20.0)),
+        car("lead", speeding_up(60.0)),
+        car("slow", lambda t: 90.0 + 2.0 * t, y=WIDTH),
+    )
+    rows = list(Collector(made, NO_FILTER).scenes())
+    assert len({row["decisions"].tobytes() for row in rows}) > 1
+    for row in rows:
+        decisions, tags = labels_of(row)  # no leading axis
+        np.testing.assert_array_equal(decisions, row["decisions"])
+        np.testing.assert_array_equal(tags, row["tags"])

@@ -41,9 +41,10 @@ def test_labels_say_what_the_drivers_did():
 
 
 def test_the_truth_does_not_come_from_the_labels(monkeypatch):
-    def nothing(row):
-        row["decisions"] = np.zeros(row["obstacles.kind"].shape, int)
-        row["tags"] = np.zeros(18, bool)
+    def nothing(rows):
+        for row in rows:
+            row["decisions"] = np.zeros(row["obstacles.kind"].shape, int)
+            row["tags"] = np.zeros(18, bool)
 
     monkeypatch.setattr("rcirl_jax.data.labels.add_labels", nothing)
     broken = measure_traffic(1, "ngsim", seed=7, roads=ROADS[:1])
