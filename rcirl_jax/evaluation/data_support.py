@@ -78,11 +78,13 @@ def weights_supported(
 
     Args:
       run: trained with `hidden = ()`; its gamma is taken as known, with a mean of
-        1 over the times: only the product with the weights is in the reward.
+        1 over the times that some scene has: only the product with the weights is
+        in the reward, and times beyond every horizon were never trained.
       frozen: scenes, positive against candidates.
       vehicle: [S], scenes of one vehicle are dependent.
     """
-    gauge = float(np.mean(pinned(run.params, run.config.reward).gamma))
+    seen = np.asarray(frozen.time_valid).any(axis=0)
+    gauge = float(np.mean(pinned(run.params, run.config.reward).gamma[seen]))
     human, candidates = (phi / gauge for phi in sums_over_time(run, frozen))
     specs = feature_map(run.config.features).specs
     sided = run.config.reward.constraint == "nonnegative"

@@ -36,6 +36,11 @@ FREE = RewardConfig(pin="none")
 # the loss; the rank loss has no such row, for it is homogeneous in the scale.
 LEARNERS: dict[str, dict] = {
     "RC-IRL rank": {"loss": "rank"},
+    "rank linear": {"loss": "rank", "reward": RewardConfig(hidden=())},
+    "rank non-negative": {
+        "loss": "rank",
+        "reward": RewardConfig(hidden=(), constraint="nonnegative"),
+    },
     "RC-IRL logistic": {"loss": "logistic"},
     "logistic free": {"loss": "logistic", "reward": FREE},
     "hinge": {"loss": "hinge"},

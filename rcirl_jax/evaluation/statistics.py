@@ -267,10 +267,11 @@ def paired_difference(
 ) -> Difference:
     """Mean of a - b on the same scenes; the vehicles are resampled together.
 
-    Runs of a and of b are resampled independently: run i of the one has
-    nothing in common with run i of the other. The p value counts replicates on
-    the other side of zero, 2 min(P(d <= 0), P(d >= 0)), each with one added to
-    count and total, so that it is never below 2 / (n + 1).
+    Runs of a and of b are resampled independently. Where run i of both has the
+    same seed, they share the order of the batches and the initial draw; that this
+    is not used makes the interval wider, if anything. The p value counts
+    replicates on the other side of zero, 2 min(P(d <= 0), P(d >= 0)), each with
+    one added to count and total, so that it is never below 2 / (n + 1).
 
     Args:
       a: [R, S] or [S]; the numbers of runs may differ.
@@ -314,8 +315,9 @@ def cluster_t(
         z_g = G / S * sum of (a - b) in cluster g,   t = mean z / (sd z / sqrt(G))
 
     with G - 1 degrees of freedom. A percentile bootstrap of two clusters takes
-    agreement by chance for certainty; this does not. No spread: the mean alone, with
-    p = 1 at zero.
+    agreement by chance for certainty; this does not. Clusters that all say the same
+    have no spread to reckon with: p is then that of their signs, 2^(1 - G), or 1 if
+    they all say 0, and the interval has no ends unless p < 1 - confidence.
 
     Args:
       a: [S].
@@ -331,7 +333,9 @@ def cluster_t(
     mean, se = float(z.mean()), float(z.std(ddof=1)) / math.sqrt(groups)
     df = groups - 1
     if se == 0.0:
-        return Difference(mean=mean, low=mean, high=mean, se=0.0, p=float(mean == 0.0))
+        p = 1.0 if mean == 0.0 else 2.0 ** (1 - groups)
+        reach = 0.0 if mean == 0.0 or p < 1.0 - confidence else math.inf
+        return Difference(mean=mean, low=mean - reach, high=mean + reach, se=0.0, p=p)
     reach = se * float(stdtrit(df, 0.5 * (1.0 + confidence)))
     p = 2.0 * float(stdtr(df, -abs(mean) / se))
     return Difference(mean=mean, low=mean - reach, high=mean + reach, se=se, p=p)

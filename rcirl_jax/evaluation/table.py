@@ -47,6 +47,7 @@ REFERENCES = (
 
 SIGNIFICANT = 0.05  # Holm-adjusted p below which a difference has a name
 MIN_WIDTH = 100  # characters; a line of the paired differences needs them
+DIGITS = 9  # significant, of a stored number: a report of 40 rows stays below 1 MB
 SMALLEST_P = 0.01  # that the resamples let a Holm-adjusted p value reach
 FEW_VEHICLES = 20  # below, percentile intervals are noticeably too short
 
@@ -287,7 +288,8 @@ def verdict(difference: Difference, p_holm: float, higher_is_better: bool) -> st
 def to_json(report: RankingReport) -> dict:
     """The report as plain JSON types: finite numbers, text, true/false and null.
 
-    `seed_sd` and `seed_se` are null for a single run. Shares are in [0, 1].
+    `seed_sd` and `seed_se` are null for a single run. Shares are in [0, 1]. Numbers
+    have `DIGITS` significant digits.
     """
     content = {
         "schema": SCHEMA,
@@ -347,4 +349,4 @@ def _plain(node: object, where: str) -> "dict | list | str | float | int | bool 
     number = float(node)  # type: ignore[arg-type]
     if not math.isfinite(number):
         raise InputError(f"report: {where}: {number}: expected a finite number")
-    return number
+    return float(f"{number:.{DIGITS}g}")

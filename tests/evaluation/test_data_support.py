@@ -163,6 +163,22 @@ def test_supported_weights_do_not_depend_on_the_size_and_sign_of_gamma():
         assert x.low == pytest.approx(y.low, rel=1e-3, abs=1e-9)
 
 
+def test_supported_weights_do_not_depend_on_gamma_where_no_scene_has_a_time():
+    """At a horizon of 5 s the last gammas stay where they were drawn."""
+    (run, _) = trained(LINEAR)
+    made = frozen()
+    early = np.arange(len(TIMES_S)) < 11
+    short = made.replace(time_valid=made.time_valid & early)
+    late = np.where(early, 1.0, 7.0)
+    other = run.params.replace(gamma=run.params.gamma * late)
+    a, b = (
+        weights_supported(one, short, VEHICLE).features
+        for one in (run, dataclasses.replace(run, params=other))
+    )
+    for x, y in zip(a, b, strict=True):
+        assert (x.weight, x.low) == pytest.approx((y.weight, y.low), rel=1e-5)
+
+
 def test_rank_correlation_of_known_cases():
     x, vehicle = np.arange(40.0), np.arange(40) // 2
     rho, low, high = rank_correlation(x, np.exp(0.1 * x), vehicle)

@@ -16,6 +16,7 @@ from rcirl_jax.evaluation.exact import (
 from rcirl_jax.evaluation.statistics import (
     ClusterBootstrap,
     bootstrap_median,
+    cluster_t,
     combine_seeds,
     paired_difference,
 )
@@ -241,6 +242,28 @@ def test_holm_equals_the_step_down_rule(p):
                 break
             rejected.add(i)
         assert {i for i in range(len(p)) if adjusted[i] <= alpha} == rejected
+
+
+def test_student_over_clusters_is_the_textbook_interval():
+    rng = np.random.default_rng(5)
+    difference, cluster = rng.normal(0.4, 1.0, 24), np.arange(24) // 4
+    found = cluster_t(difference, np.zeros(24), cluster)
+    means = difference.reshape(6, 4).mean(axis=1)
+    want = stats.ttest_1samp(means, 0.0)
+    assert found.p == pytest.approx(want.pvalue)
+    interval = want.confidence_interval(0.95)
+    assert (found.low, found.high) == pytest.approx((interval.low, interval.high))
+
+
+@pytest.mark.parametrize(("groups", "named"), [(2, False), (5, False), (6, True)])
+def test_clusters_that_all_say_the_same_are_no_certainty(groups, named):
+    """p is that of their signs; before enough of them, the interval has no ends."""
+    cluster = np.arange(groups)
+    found = cluster_t(np.ones(groups), np.zeros(groups), cluster)
+    assert (found.mean, found.p) == (1.0, 2.0 ** (1 - groups))
+    assert found.is_apart == named
+    same = cluster_t(np.ones(groups), np.ones(groups), cluster)
+    assert (same.mean, same.low, same.high, same.p) == (0.0, 0.0, 0.0, 1.0)
 
 
 def test_bad_input_is_refused():

@@ -254,7 +254,8 @@ def test_json_is_plain_versioned_and_complete(report):
     assert made["failure_m"] == 10.0
     assert set(made["rows"]["rc-irl"]) == set(METRICS) == set(made["metrics"])
     found = report.rows["rc-irl"]["top1_fde"]
-    assert made["rows"]["rc-irl"]["top1_fde"] == dataclasses.asdict(found)
+    stored = made["rows"]["rc-irl"]["top1_fde"]
+    assert stored == pytest.approx(dataclasses.asdict(found), rel=1e-8)
     assert made["rows"]["IDM"]["top1_fde"]["seed_sd"] is None
     assert len(made["comparisons"]) == len(report.comparisons)
 
