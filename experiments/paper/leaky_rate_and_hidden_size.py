@@ -6,8 +6,9 @@
 The paper's rank loss over a grid of leaky rates and hidden sizes. All leaky
 rates and seeds of one size train side by side as members of one vmapped program.
 Expected with US-101: 5 minutes on one core with 5 seeds; a = 0.5 fails at every
-size, 0.05 with 15 or 45 units is lowest, other differences are within their
-intervals. `--quick`: a minute, its numbers mean nothing.
+size, 0.05 with 15 or 45 units is lowest, a = 0.01 is behind with 5 units (+3.2 m)
+and with 15 (+1.3 m, not after correction). `--quick`: a minute, its numbers mean
+nothing.
 """
 
 import numpy as np

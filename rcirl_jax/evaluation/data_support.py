@@ -107,6 +107,9 @@ def choices_of(
 ) -> Choices:
     """What the mean of several runs chooses, and how unsure it is.
 
+    The two doubts are of two things: the seeds' is of the runs whose mean is
+    chosen by, the posterior's of the first run alone.
+
     Args:
       runs: of one configuration with a free scale (`pin="none"`), other seeds.
       train: what they were trained on; gives the Laplace posterior.

@@ -128,6 +128,19 @@ def test_more_drivers_leave_less_doubt_but_not_the_same_ones_again():
     assert same.mean() > 0.8 * once.mean()
 
 
+def test_a_feature_that_is_left_out_says_nothing():
+    (run,) = train_learner(frozen(), FREE, [0], keep=("velocity", "acceleration"))
+    made = frozen()
+    points = np.asarray(made.points)
+    valid = np.asarray(made.points_valid)
+    before = run.scorer(points, valid)
+    for name in NAMES:
+        other = points.copy()
+        other[..., NAMES.index(name)] += 3.0
+        same = np.array_equal(run.scorer(other, valid), before)
+        assert same == (name not in {"velocity", "acceleration"})
+
+
 def test_supported_weights_name_the_presets_features():
     (run, _) = trained(LINEAR)
     report = weights_supported(run, frozen(), VEHICLE)

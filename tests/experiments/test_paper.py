@@ -128,11 +128,27 @@ def test_writes_numbers_and_a_picture(name, dataset, tmp_path):
         assert {"trained on here", "trained on there"} <= trained
         for site, report in body["tested_on"].items():
             assert f"trained on {site}" in references(report)
+            rows = report["rows"]  # both sites are one dataset: the same reward twice
+            assert rows["trained on here"] == rows["trained on there"]
+            assert rows["trained on here"] != rows["IDM"]
     else:
         assert body["made_by"]["data_hash"]
     if name in ASKED:
         expected = {*ASKED[name], "IDM", "hand-set", "random"}
         assert references(body["ranking"]) == expected
+    if name == "data_scaling":
+        learners = ("RC-IRL logistic", "logistic non-negative", "logistic linear")
+        made = {f"{learner}, {n}" for learner in learners for n in body["counts"]}
+        assert body["counts"] == [30, 100]
+        assert made <= set(body["ranking"]["rows"])
+    if name == "feature_ablation":
+        kept = {row: set(names) for row, names in body["kept"].items()}
+        groups = [row.removesuffix(" alone") for row in kept if row.endswith(" alone")]
+        assert sum(len(kept[f"{group} alone"]) for group in groups) == 21
+        for group in groups:
+            assert kept[f"without {group}"] == kept["all 21"] - kept[f"{group} alone"]
+        tops = {row: body["ranking"]["rows"][row]["top1_fde"]["value"] for row in kept}
+        assert len(set(tops.values())) > 5  # what is left out matters
     assert (tmp_path / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
 
 
