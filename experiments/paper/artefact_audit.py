@@ -7,9 +7,9 @@ The positive is told from the sampled candidates nearest to the human only. If
 the recorded human's curve, the reward can learn how the curve was recorded
 (smoothing, noise) instead of how it was driven. The control: the nearest candidate
 as the positive against the next ones, all made by the sampler; what is told there
-is how people drive, not a trace of the recording. Expected with US-101: 15 minutes
-on one core; the human's curve is told in 88 % of the pairs, the nearest candidate
-in 63 %: the recording leaves a trace. `--quick`: under a minute.
+is how people drive, not a trace of the recording. Expected with US-101: five to
+fifteen minutes of a core; the human's curve is told in 88 % of the pairs, the nearest
+candidate in 63 %: the recording leaves a trace. `--quick`: under a minute.
 """
 
 import numpy as np

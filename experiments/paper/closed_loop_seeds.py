@@ -7,7 +7,7 @@ and takeovers of `experiments.paper.table2`) with every seed, as table II trains
 and drive the same catalogue cases beside hand-set and IDM. Differences are paired by
 case; their intervals resample families and seeds together, as `human_likeness`
 resamples vehicles and seeds. Weights that are there are kept and reused.
-Expected with three seeds of each loss and 230 cases of 120 s: an hour on one core
+Expected with three seeds of each loss and 230 cases of 120 s: 45 minutes of a core
 with the drives of table II; RC-IRL goes 5 % farther, which three seeds do not settle,
 and no other measure tells the two apart.
 `--quick`: two minutes, numbers without meaning.

@@ -21,7 +21,7 @@ import numpy as np
 from absl import flags
 
 from experiments.common import run
-from experiments.paper.common import base, dataset, picture, seeds, write
+from experiments.paper.common import base, dataset, fixed, picture, seeds, write
 from rcirl_jax.evaluation.data_support import (
     Choices,
     choices_of,
@@ -45,8 +45,12 @@ from rcirl_jax.reward import RewardConfig
 from rcirl_jax.units import TIMES_S
 
 _JUDGED = flags.DEFINE_enum(
-    "judged", "MaxEnt monotone 32-16", sorted(LEARNERS), "a further row's error in time"
+    "judged",
+    "MaxEnt monotone 32-16",
+    sorted(x for x in LEARNERS if not x.endswith("on curves")),
+    "a further row's error in time",
 )
+fixed(positive="nearest")  # what is chosen is compared with the nearest candidate
 
 
 def _error_over_time(made: Choices, time_valid: np.ndarray, of: str) -> list:

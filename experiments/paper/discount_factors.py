@@ -28,6 +28,7 @@ from rcirl_jax.units import TIMES_S
 
 ROWS = ("RC-IRL rank", "RC-IRL logistic", "GAN")
 NEAR_S = 4.0  # s, where "near" ends
+EQUAL = float(np.mean(TIMES_S[1:] <= NEAR_S))  # share of near times, 8 of 17
 fixed(horizon=8.0)
 
 
@@ -42,8 +43,12 @@ def time_weights(runs: list[Learned]) -> np.ndarray:
 
 
 def near_share(gamma: np.ndarray) -> np.ndarray:
-    """[R] share of |gamma| [R, T] up to NEAR_S."""
-    size = np.abs(gamma)
+    """[R] share of |gamma| [R, T] up to NEAR_S, without t = 0.
+
+    All candidates begin at one state, so gamma_0 is hardly trained and would add its
+    first value. Equal weights have the share EQUAL.
+    """
+    size = np.abs(gamma) * (TIMES_S > 0.0)
     return size[:, TIMES_S <= NEAR_S].sum(axis=1) / size.sum(axis=1)
 
 
@@ -83,7 +88,10 @@ def main() -> None:
     body, shares = {}, {name: near_share(runs) for name, runs in gamma.items()}
     for name, share in shares.items():
         error = share.std(ddof=1) / np.sqrt(share.size)
-        print(f"{name}: {share.mean():.2f} +- {error:.2f} of |gamma| up to {NEAR_S} s")
+        print(
+            f"{name}: {share.mean():.2f} +- {error:.2f} of |gamma| up to {NEAR_S} s, "
+            f"without t = 0 (equal weights: {EQUAL:.2f})"
+        )
         body[name] = {
             "gamma": gamma[name].round(5).tolist(),
             "near_share": [float(share.mean()), float(error)],
@@ -95,8 +103,13 @@ def main() -> None:
             f"{one['row']} minus {one['reference']}: {one['difference']:+.3f} "
             f"[{low:+.3f}, {high:+.3f}], Holm p {one['p_holm']:.3f}"
         )
-    made = {"times_s": TIMES_S.tolist(), "rows": body, "differences": apart}
-    write("discount_factors", made, data)
+    written = {
+        "times_s": TIMES_S.tolist(),
+        "equal_share": EQUAL,
+        "rows": body,
+        "differences": apart,
+    }
+    write("discount_factors", written, data)
 
 
 if __name__ == "__main__":

@@ -36,6 +36,7 @@ from rcirl_jax.evaluation.known_truth import (
     differences,
     experts,
     hidden_reward,
+    learns_from_choices,
 )
 from rcirl_jax.evaluation.learners import (
     FrozenSets,
@@ -75,9 +76,7 @@ def main() -> None:
         raise InputError(
             f"--counts: {_COUNTS.value}: expected two that differ, up to {most}"
         )
-    rows = _LEARNERS.value
-    if len(rows) < 2:
-        raise InputError(f"--learners: {','.join(rows)}: expected two at least")
+    rows = _rows()
     runs = seeds(least=2)
     same = {name: np.zeros((len(runs), len(counts))) for name in rows}
     regret = {name: np.zeros((len(runs), len(counts))) for name in rows}
@@ -110,6 +109,20 @@ def main() -> None:
     body = {n: {"same": same[n].tolist(), "regret": regret[n].tolist()} for n in rows}
     tests = {w: {**dataclasses.asdict(d), "p_holm": p} for w, (d, p) in tested.items()}
     write("known_truth", {"counts": counts, "rows": body, "tests": tests}, data)
+
+
+def _rows() -> list[str]:
+    """--learners, none of which may ask for more than the expert's choice."""
+    rows = _LEARNERS.value
+    if len(rows) < 2:
+        raise InputError(f"--learners: {','.join(rows)}: expected two at least")
+    for name in rows:
+        if not learns_from_choices(learner_config(name, base())):
+            raise InputError(
+                f"--learners: {name}: learns from distances to the recorded human, or "
+                "from candidates of its own: expected learners of the choice alone"
+            )
+    return rows
 
 
 def _pinned(config: TrainConfig) -> TrainConfig:

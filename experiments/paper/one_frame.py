@@ -8,7 +8,7 @@ stop-line and closest obstacles of one held-out scene (by default one with a
 leader and an interesting tag). Without --weights a reward is trained first.
 Writes one_frame.png (six panels), the large ST graph, and the drawn numbers as
 JSON, with what each feature says for the chosen trajectory against the human's.
-Expected: two minutes; human and chosen close together. `--quick`: less.
+Expected: three minutes; human and chosen close together. `--quick`: less.
 """
 
 from pathlib import Path

@@ -7,7 +7,7 @@ In each: how much value is left on the table against a finer lattice with local
 ascent, and what perception errors do to the plan and to its decisions. Rows:
 ranking, dynamic programming, Apollo's (t, s)-only recursion (gap only) and the
 hand-set cost (steadiness only: it has another value). Writes robustness.json,
-optimality.png and robustness.png. Expected: half an hour on one core; a tenth to a
+optimality.png and robustness.png. Expected: ten minutes on a quiet core; a tenth to a
 fifth of the value of not braking is left, by the lattice less than by ranking 64
 candidates. `--quick`: a few frames on coarse lattices, two minutes.
 """

@@ -19,9 +19,14 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.stats import rankdata
 
+from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.attribution import attribute
 from rcirl_jax.evaluation.identify import IdentifiabilityReport, identify
-from rcirl_jax.evaluation.laplace import laplace, last_layer_features
+from rcirl_jax.evaluation.laplace import (
+    laplace,
+    last_layer_features,
+    most_probable,
+)
 from rcirl_jax.evaluation.learners import Learned
 from rcirl_jax.evaluation.statistics import ClusterBootstrap
 from rcirl_jax.features import feature_map
@@ -115,21 +120,22 @@ def choices_of(
       train: what they were trained on; gives the Laplace posterior.
       test: scenes to choose in, with the positive `nearest`.
       vehicle: [S] of the training scenes; those of one are dependent.
+
+    Raises:
+      InputError: the positive of a test scene is none of its candidates.
     """
     facts = test.facts
     near = np.asarray(facts.distance == facts.human_distance[:, None])
+    if not near.any(axis=1).all():
+        raise InputError("choices_of: test: expected the positive `nearest`")
     feasible = np.asarray(test.feasible) | near
     phis = [sums_over_time(run, test)[1] for run in runs]
     weights = [_output_weights(run) for run in runs]
     values = [phi @ w for phi, w in zip(phis, weights, strict=True)]
-    precision = laplace(
-        *sums_over_time(runs[0], train),
-        np.asarray(train.feasible),
-        weights[0],
-        PRIOR_PRECISION,
-        vehicle,
-    )
-    drawn = _posterior_draws(weights[0], precision)
+    pairs = *sums_over_time(runs[0], train), np.asarray(train.feasible)
+    centre = most_probable(*pairs, PRIOR_PRECISION)
+    precision = laplace(*pairs, centre, PRIOR_PRECISION, vehicle)
+    drawn = _posterior_draws(centre, precision)
     place = feature_map(runs[0].config.features).names.index("station")
     # float64: equal ends have no spread at all
     stations = np.asarray(test.points[..., place], np.float64)

@@ -149,7 +149,7 @@ def identify(
         raise InputError(f"identify: ridge: {ridge}: expected > 0 and finite")
     if not 0.0 < confidence < 1.0:
         raise InputError(f"identify: confidence: {confidence}: expected in (0, 1)")
-    weights = _fit(pairs, ridge)
+    weights = pair_minimum(pairs, ridge)
     _, curvature = _slopes(pairs, weights)
     inverse = np.linalg.inv(curvature + ridge * np.eye(size))
     seen = np.flatnonzero(np.diag(curvature))
@@ -286,10 +286,17 @@ def _slopes(pairs: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndar
     return gradient, 0.5 * (curvature + curvature.T)
 
 
-def _fit(pairs: np.ndarray, ridge: float) -> np.ndarray:
+def pair_minimum(pairs: np.ndarray, ridge: float) -> np.ndarray:
     """Weights [F] at the minimum, by Newton's method with halved steps.
 
-    The loss is strictly convex, so there is one minimum.
+        mean over pairs d of log(1 + exp(d . w)) + ridge / 2 |w|^2   (convex)
+
+    Args:
+      pairs: [n, F] features of the candidate minus those of the positive.
+      ridge: > 0.
+
+    Raises:
+      InputError: the ridge is too small to find a minimum.
     """
     weights = np.zeros(pairs.shape[1])
     for _ in range(_MAX_STEPS):

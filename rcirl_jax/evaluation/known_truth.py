@@ -16,7 +16,7 @@ from rcirl_jax.evaluation.exact import holm
 from rcirl_jax.evaluation.learners import Learned
 from rcirl_jax.evaluation.statistics import Difference, cluster_t
 from rcirl_jax.reward import Normaliser, RewardConfig, RewardParams, init_reward, value
-from rcirl_jax.train.state import FeatureBatch
+from rcirl_jax.train.state import FeatureBatch, TrainConfig
 
 HIDDEN_SPREAD = 3.0  # std of the hidden kernels relative to Glorot's
 
@@ -87,6 +87,15 @@ def experts(
         feasible=frozen.feasible.at[rows, chosen].set(False),
         facts=facts,
     )
+
+
+def learns_from_choices(config: TrainConfig) -> bool:
+    """Whether all that a learner is told of a scene is which candidate was chosen.
+
+    Soft labels and the margin of the hinge are distances to the recorded human, whom
+    the experts replace; hard negatives are candidates that other learners lack.
+    """
+    return config.loss not in ("soft", "hinge") and not config.hard_negatives
 
 
 def agreement(

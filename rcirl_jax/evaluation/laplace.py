@@ -24,6 +24,7 @@ from scipy.special import expit
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.attribution import check_network_inputs
+from rcirl_jax.evaluation.identify import pair_minimum
 from rcirl_jax.reward import Normaliser, RewardParams, normalise
 from rcirl_jax.reward.network import ACTIVATIONS, conditioned
 
@@ -71,6 +72,24 @@ def last_layer_features(
     return jnp.sum(jnp.where(time_valid[..., None], weighted, 0.0), axis=-2)
 
 
+def most_probable(
+    phi_human: ArrayLike,
+    phi_candidates: ArrayLike,
+    feasible: ArrayLike,
+    prior_precision: float,
+) -> np.ndarray:
+    """Output weights [H] where the posterior is highest; arguments as in `laplace`.
+
+    A network that was trained for some epochs is near its minimum, not at it, and
+    had no prior: what `laplace` says holds around these weights, not around its own.
+
+    Raises:
+      InputError: as `laplace`, or no minimum was found.
+    """
+    pairs = _pairs(phi_human, phi_candidates, feasible, prior_precision)
+    return pair_minimum(pairs, prior_precision / pairs.shape[0])
+
+
 def laplace(
     phi_human: ArrayLike,
     phi_candidates: ArrayLike,
@@ -85,7 +104,7 @@ def laplace(
         d = Phi_candidate - Phi_human,   y = d . w,   s the logistic function
 
     This is the Hessian of sum log(1 + exp(y)) + prior / 2 |w|^2 at w, which
-    should be its minimum. With C clusters
+    should be its minimum (`most_probable`). With C clusters
 
         P (prior I + C / (C - 1) sum over clusters of (g_c - g)(g_c - g)^T)^-1 P
         g_c = sum over the cluster's pairs of s(y) d,   g their mean over clusters
@@ -108,18 +127,11 @@ def laplace(
       InputError: a shape that does not fit, a feasible feature that is not
         finite, or a prior precision that is not positive.
     """
-    human = np.asarray(phi_human, np.float64)
-    candidates = np.asarray(phi_candidates, np.float64)
-    mask, weights = np.asarray(feasible, bool), np.asarray(w, np.float64)
-    _check_pairs(human, candidates, mask, weights)
-    if not 0.0 < prior_precision < np.inf:
+    weights, mask = np.asarray(w, np.float64), np.asarray(feasible, bool)
+    pairs = _pairs(phi_human, phi_candidates, mask, prior_precision)
+    if weights.shape != pairs.shape[1:]:
         raise InputError(
-            f"laplace: prior_precision: {prior_precision}: expected > 0 and finite"
-        )
-    pairs = (candidates - human[:, None])[mask]
-    if not np.isfinite(pairs).all():
-        raise InputError(
-            "laplace: phi: NaN or infinite in a feasible pair: expected finite values"
+            f"laplace: w: shape {weights.shape}: expected {pairs.shape[1:]}"
         )
     chance = expit(pairs @ weights)
     curvature = pairs.T @ (pairs * (chance * (1.0 - chance))[:, None])
@@ -127,7 +139,7 @@ def laplace(
     precision = prior + 0.5 * (curvature + curvature.T)
     if cluster is None:
         return precision
-    scores = np.zeros((human.shape[0], weights.size))  # of scenes
+    scores = np.zeros((mask.shape[0], weights.size))  # of scenes
     np.add.at(scores, np.nonzero(mask)[0], pairs * chance[:, None])
     return _sandwich(precision, scores, np.asarray(cluster), prior)
 
@@ -148,21 +160,37 @@ def _sandwich(
     return 0.5 * (made + made.T)
 
 
-def _check_pairs(
-    human: np.ndarray, candidates: np.ndarray, feasible: np.ndarray, w: np.ndarray
-) -> None:
-    shapes = human.shape, candidates.shape, feasible.shape, w.shape
+def _pairs(
+    phi_human: ArrayLike,
+    phi_candidates: ArrayLike,
+    feasible: ArrayLike,
+    prior_precision: float,
+) -> np.ndarray:
+    """[n, H] Phi of the candidate minus Phi of the human, of the feasible pairs."""
+    human = np.asarray(phi_human, np.float64)
+    candidates = np.asarray(phi_candidates, np.float64)
+    mask = np.asarray(feasible, bool)
+    shapes = human.shape, candidates.shape, mask.shape
     fits = candidates.ndim == 3 and shapes == (
         (candidates.shape[0], candidates.shape[2]),
         candidates.shape,
         candidates.shape[:2],
-        candidates.shape[2:],
     )
     if not fits:
         raise InputError(
-            "laplace: phi_human, phi_candidates, feasible, w: shapes"
-            f" {', '.join(map(str, shapes))}: expected [S, H], [S, K, H], [S, K], [H]"
+            "laplace: phi_human, phi_candidates, feasible: shapes"
+            f" {', '.join(map(str, shapes))}: expected [S, H], [S, K, H], [S, K]"
         )
+    if not 0.0 < prior_precision < np.inf:
+        raise InputError(
+            f"laplace: prior_precision: {prior_precision}: expected > 0 and finite"
+        )
+    pairs = (candidates - human[:, None])[mask]
+    if not np.isfinite(pairs).all():
+        raise InputError(
+            "laplace: phi: NaN or infinite in a feasible pair: expected finite values"
+        )
+    return pairs
 
 
 def difference_std(

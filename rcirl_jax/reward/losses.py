@@ -45,7 +45,7 @@ class Compared(NamedTuple):
     human_collides: Bool[Array, " b"]
     distance: Float[Array, "b k"]
     collides: Bool[Array, "b k"]
-    breaks_rule: Float[Array, "b k"]  # share of times over the limit or the line
+    breaks_rule: Float[Array, "b k"]  # share of times over the limit; 1: ran a line
     # log of the proposal's density at each trajectory, up to a constant per scene
     human_density: Float[Array, " b"]
     density: Float[Array, "b k"]

@@ -26,13 +26,15 @@ def facts_of(
     count = jnp.sum(valid)
     seen = valid[:, None]
     fast = frames.point.v > frames.path.speed_limit + OVER_LIMIT_MPS
-    unlawful = (fast | (frames.relations.line_overrun > 0.0)) & seen
+    crossed = frames.relations.line_overrun > 0.0  # at the one time that it happens
     return Facts(
         human_distance=jnp.zeros(()),
         human_collides=jnp.zeros((), bool),
         distance=mean_distance(x, driven, valid),
         collides=jnp.any((frames.relations.body < 0.0) & seen, axis=0),
-        breaks_rule=jnp.sum(unlawful, axis=0) / count,
+        breaks_rule=jnp.where(
+            jnp.any(crossed & seen, axis=0), 1.0, jnp.sum(fast & seen, axis=0) / count
+        ),
         human_density=jnp.zeros(()),
         density=jnp.zeros(x.s.shape[:1]),
     )

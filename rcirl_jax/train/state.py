@@ -157,7 +157,7 @@ class Facts(flax.struct.PyTreeNode, kw_only=True):
     human_collides: jax.Array  # [B] bool, of the positive; a recorded curve's is False
     distance: jax.Array  # [B, K] m, the candidates'
     collides: jax.Array  # [B, K] bool, meets a body at a valid time
-    breaks_rule: jax.Array  # [B, K] share of times over the limit or a line
+    breaks_rule: jax.Array  # [B, K] share of times over the limit; 1: ran a line
     human_density: jax.Array  # [B] log of the proposal's density
     density: jax.Array  # [B, K]
 

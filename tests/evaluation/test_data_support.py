@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 
+from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation import data_support
 from rcirl_jax.evaluation.data_support import (
     choices_of,
@@ -91,7 +92,14 @@ def test_the_choice_is_the_best_feasible_one_and_its_error_its_distance():
         chosen, human = frozen().points[s, made.chosen[s]], frozen().human[s]
         gap = np.asarray(chosen, np.float64) - np.asarray(human, np.float64)
         np.testing.assert_array_equal(made.ahead[s], gap[:, NAMES.index("station")])
-    assert (made.spread_of_posterior >= 0.0).all()
+    assert (made.spread_of_posterior > 0.0).any()
+
+
+def test_a_positive_that_is_no_candidate_is_refused():
+    """Nothing is nearest then, and the first candidate is no answer."""
+    curves = freeze(rows(), np.arange(16), dataclasses.replace(FREE, positive="human"))
+    with pytest.raises(InputError, match="expected the positive `nearest`"):
+        choices_of(trained(FREE), frozen(), curves, VEHICLE)
 
 
 def test_growth_of_a_constant_error_of_acceleration():
@@ -112,7 +120,8 @@ def test_equal_runs_never_disagree():
 
 def test_a_sure_posterior_has_no_spread_at_all(monkeypatch):
     """Not the rounding of equal float32 ends, which would rank scenes by station."""
-    monkeypatch.setattr(data_support, "PRIOR_PRECISION", 1e14)
+    sure = lambda human, *_: 1e16 * np.eye(human.shape[1])  # noqa: E731
+    monkeypatch.setattr(data_support, "laplace", sure)
     made = choices_of(trained(FREE), frozen(), frozen(), VEHICLE)
     assert not made.spread_of_posterior.any()
 

@@ -12,8 +12,9 @@ from rcirl_jax.evaluation.known_truth import (
     differences,
     experts,
     hidden_reward,
+    learns_from_choices,
 )
-from rcirl_jax.evaluation.learners import normaliser_of, train_learner
+from rcirl_jax.evaluation.learners import learner_config, normaliser_of, train_learner
 from rcirl_jax.train.state import TrainConfig
 from tests.train.test_step import cached
 
@@ -40,6 +41,21 @@ def frozen(count, seed=0):
         weight=jnp.ones(count),
         facts=facts,
     )
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("RC-IRL rank", True),
+        ("MaxEnt", True),
+        ("GAN", True),
+        ("soft labels", False),
+        ("hinge", False),
+        ("logistic, hard negatives", False),
+    ],
+)
+def test_learners_of_the_recorded_humans_distances_are_told_apart(name, told):
+    assert learns_from_choices(learner_config(name, CONFIG)) == told
 
 
 def test_experts_choose_the_best_feasible():

@@ -12,6 +12,7 @@ from rcirl_jax.evaluation.laplace import (
     difference_std,
     laplace,
     last_layer_features,
+    most_probable,
 )
 from rcirl_jax.reward import (
     LossConfig,
@@ -173,6 +174,16 @@ def fitted(differences, prior):
     return minimize(loss, start, jac=slope, hess=hessian, method="trust-exact").x
 
 
+def test_the_most_probable_weights_are_the_minimum():
+    rng = np.random.default_rng(9)
+    human, candidates = rng.normal(size=(S, 3)), rng.normal(size=(S, K, 3))
+    feasible = rng.random((S, K)) < 0.7
+    want = fitted((candidates - human[:, None])[feasible], PRIOR)
+    got = most_probable(human, candidates, feasible, PRIOR)
+    np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-8)
+    assert np.abs(want).max() > 0.1
+
+
 def test_intervals_cover_the_true_differences():
     """95 % intervals of new differences, w* drawn from the prior."""
     rng = np.random.default_rng(6)
@@ -199,6 +210,8 @@ def test_input_that_does_not_fit_is_refused():
         laplace(human[:, :2], candidates, feasible, w, PRIOR)
     with pytest.raises(InputError, match=r"expected \[S, H\], \[S, K, H\]"):
         laplace(human, candidates[0], feasible, w, PRIOR)
+    with pytest.raises(InputError, match=r"w: shape \(2,\): expected \(3,\)"):
+        laplace(human, candidates, feasible, w[:2], PRIOR)
     with pytest.raises(InputError, match="prior_precision: 0"):
         laplace(human, candidates, feasible, w, 0.0)
     with pytest.raises(InputError, match="NaN or infinite"):

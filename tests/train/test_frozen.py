@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from rcirl_jax.evaluation.learners import train_learner, train_with_each, untrained
+from rcirl_jax.features import feature_map
 from rcirl_jax.train.frozen import Members, fit, freeze, members_of
 from rcirl_jax.train.state import TrainState
 from rcirl_jax.train.step import init_state, make_train_step
@@ -23,7 +24,14 @@ def test_freezing_equals_featurising():
     np.testing.assert_allclose(
         again.candidates, made.candidates[4:7], rtol=1e-5, atol=1e-4
     )
-    assert (np.asarray(made.facts.distance) >= 0.0).all()
+    names = feature_map(CONFIG.features).names
+    place = [names.index("station"), names.index("l")]
+    gap = np.asarray(made.points - made.human[:, None], np.float64)[..., place]
+    seen = np.asarray(made.time_valid, np.float64)
+    far = np.einsum("skt,st->sk", np.hypot(*np.moveaxis(gap, -1, 0)), seen)
+    want = far / seen.sum(axis=1)[:, None]
+    np.testing.assert_allclose(made.facts.distance, want, atol=2e-3)
+    assert want.max() > 1.0
 
 
 @pytest.mark.parametrize("optimizer", ["sgd", "adam", "rmsprop"])
