@@ -148,6 +148,15 @@ def test_maps_with_another_number(root, scene, maps, found):
     assert ("30001" in ids) == found
 
 
+def test_the_map_of_a_neighbouring_place_is_not_taken(root):
+    """EP0 and EP1 are two places: without its own map a log has none."""
+    for ending in (".osm_xy", ".osm"):
+        path = root / "maps" / f"{fixture.SCENE}{ending}"
+        path.rename(path.with_name(f"DR_USA_Intersection_EP1{ending}"))
+    recording = only(root)
+    assert "no map found; lanes fitted to the longest paths" in recording.notes
+
+
 def test_cases_are_recordings_of_one_group(cases):
     first, second = read(cases.parent)
     stem = f"{challenge.PLACE}_train"

@@ -345,6 +345,19 @@ def test_several_recordings_and_one_file(junction):
     assert only(junction / "data" / "08_tracks.csv").name == "08"
 
 
+def test_classes(junction):
+    """A class that nobody knows is a vehicle, and a note says so."""
+    meta = junction / "data" / "07_tracksMeta.csv"
+    edit(meta, ",truck_bus", ",Truck_Bus")
+    assert not any("classes" in note for note in only(junction).notes)
+    edit(meta, ",car", ",animal")
+    edit(meta, ",car", ",tram")
+    recording = only(junction)
+    kinds = [track.kind for track in recording.tracks[:2]]
+    assert kinds == [Kind.PEDESTRIAN, Kind.VEHICLE]
+    assert "classes taken for vehicles: tram" in recording.notes
+
+
 @pytest.mark.parametrize("kind", ["tracksMeta", "recordingMeta"])
 def test_missing_companion(motorway, kind):
     (motorway / f"01_{kind}.csv").unlink()

@@ -157,6 +157,53 @@ def periods():
     return rows
 
 
+def test_separators_between_thousands(tmp_path):
+    """A spreadsheet's export: "1,118,846,979,700" and "2,224"."""
+    rows = periods()
+    sites = ["us-101"] * len(rows)
+    plain = only(w.ngsim_csv(tmp_path / "a.csv", rows, sites=sites))
+    assert "800,003," in w.grouped(tmp_path / "a.csv").read_text()
+    assert digest(only(tmp_path / "a.csv")) == digest(plain)
+    text = (tmp_path / "a.csv").read_text()
+    (tmp_path / "a.csv").write_text(text.replace('"800,003,', '"800,03,', 1))
+    with pytest.raises(InputError, match=r"a\.csv: line 113: Global_Time: '800,03,"):
+        read(tmp_path / "a.csv")
+
+
+def test_release_with_every_log_twice(tmp_path):
+    """Text and CSV of one name are one log; other tables are none."""
+    for site, period in (("us-101", "0750am-0805am"), ("i-80", "0400-0415")):
+        folder = tmp_path / site / "vehicle-trajectory-data" / period
+        folder.mkdir(parents=True)
+        w.ngsim_text(folder / f"trajectories-{period}.txt", w.ngsim_rows())
+        w.ngsim_csv(folder / f"trajectories-{period}.csv", w.ngsim_rows())
+        detectors = tmp_path / site / "detector-data"
+        detectors.mkdir()
+        (detectors / "detectors.csv").write_text("station,flow\n1,2\n")
+        (detectors / "readme.txt").write_text("see the report\n")
+    found = [recording.name for recording in read(tmp_path)]
+    assert found == ["trajectories-0400-0415", "trajectories-0750am-0805am"]
+    again = tmp_path / "copy" / "trajectories-0400-0415.csv"
+    again.parent.mkdir()
+    w.ngsim_csv(again, w.ngsim_rows())
+    assert [recording.name for recording in read(tmp_path)][:2] == [
+        "copy/trajectories-0400-0415",
+        "i-80/vehicle-trajectory-data/0400-0415/trajectories-0400-0415",
+    ]
+
+
+@pytest.mark.parametrize("writer", [w.ngsim_text, w.ngsim_csv])
+def test_arterials_without_a_location(tmp_path, writer):
+    """Lankershim's and Peachtree's own files: 24 columns, no straight lanes."""
+    rows = [[*row[:14], *(102, 205, 2, 3, 2, 1), *row[14:]] for row in w.ngsim_rows()]
+    zones = ("O_Zone", "D_Zone", "Int_ID", "Section_ID", "Direction", "Movement")
+    columns = (*w.NGSIM_COLUMNS[:14], *zones, *w.NGSIM_COLUMNS[14:])
+    options = {"columns": columns} if writer is w.ngsim_csv else {}
+    path = writer(tmp_path / "trajectories.dat", rows, **options)
+    with pytest.raises(InputError, match="arterials have no straight lanes"):
+        read(path)
+
+
 @pytest.mark.parametrize("writer", [w.ngsim_text, w.ngsim_csv])
 def test_stamped_rows_may_come_in_any_order(tmp_path, writer):
     rows = periods()

@@ -84,6 +84,58 @@ def test_positions_from_latitude_and_longitude_in_radians(tmp_path):
     np.testing.assert_allclose(moved, track.speed[1:], rtol=0.03, atol=0.3)
 
 
+def test_positions_in_degrees(tmp_path):
+    """ZalaZone's Lat and Lon are degrees."""
+    columns = fixture.table(fixture.cars())
+    in_radians = only(drive(tmp_path, _without_plane(columns))).tracks[0]
+    for name in columns:
+        if name.startswith(("Lat", "Lon")):
+            cells = (f"{np.rad2deg(float(c)):.9f}" if c else "" for c in columns[name])
+            columns[name] = list(cells)
+    in_degrees = only(drive(tmp_path, _without_plane(columns))).tracks[0]
+    np.testing.assert_allclose(in_degrees.x, in_radians.x, atol=0.01)
+    np.testing.assert_allclose(in_degrees.y, in_radians.y, atol=0.01)
+
+
+def _without_plane(columns):
+    return {n: c for n, c in columns.items() if not n.startswith(("E", "N"))}
+
+
+def test_layouts_of_the_campaigns(tmp_path):
+    """Columns and metadata as Casale's and ZalaZone's files have them."""
+    columns = fixture.table(fixture.cars())
+    lost = ("Alt1", "U1", "Driver1")  # the leader was recorded otherwise
+    casale = {name: cells for name, cells in columns.items() if name not in lost}
+    meta = (
+        *("Date,27,10,2020", "Vehicle_order,Rexton,Hyundai,VW(GolfE)"),
+        *("Number_of_vehicles,3", "ACC,1", "Distance_setting,min"),
+    )
+    recording = only(drive(tmp_path, casale, meta=meta))
+    names = [track.id for track in recording.tracks]
+    assert names[:3] == ["1-Rexton", "2-Hyundai", "3-VW(GolfE)"]
+    # who drives the leader is not said
+    assert [track.is_human(0.0, 40.0) for track in recording.tracks[:3]] == [
+        False,
+        False,
+        True,
+    ]
+    assert [track.length for track in recording.tracks[:3]] == [4.85, 4.6, 4.27]
+    order = ("Time", "Speed", "E", "N", "Lon", "Lat", "Alt", "IVS")
+    zala = {
+        name: cells
+        for start in order
+        for name, cells in columns.items()
+        if name.startswith(start) and not name.endswith("1")
+    }
+    meta = (
+        *("Date,9,10,2019", "Vehicle_order,SKODA_TARGET,MAZDA_3,BMW_I3,"),
+        *("Number_of_vehicles,3", "ACC,1", "Distance_setting,SL"),
+    )
+    recording = only(drive(tmp_path, zala, meta=meta))
+    assert [track.id for track in recording.tracks][:2] == ["2-MAZDA_3", "3-BMW_I3"]
+    assert [track.length for track in recording.tracks[:2]] == [4.46, 4.01]
+
+
 def test_cars_with_fewer_columns(tmp_path):
     """The target car has no vehicle 2; the third has no altitude."""
     columns = fixture.table(fixture.cars())

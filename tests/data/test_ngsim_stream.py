@@ -181,6 +181,16 @@ def test_without_stamps_the_frames_are_the_clock(tmp_path):
     assert users == {track.id for track in whole.tracks}
 
 
+def test_separators_between_thousands(tmp_path):
+    plain = [digest(made) for made in read(write(tmp_path / "portal.csv"), 1)]
+    path = w.grouped(tmp_path / "portal.csv")
+    assert [digest(made) for made in read(path, 1)] == plain
+    text = path.read_text()
+    path.write_text(text.replace('"1,118,847,', '"1,118,8x7,', 1))
+    with pytest.raises(InputError, match=r"portal\.csv: line \d+: Global_Time: '1,118"):
+        read(path, 1)
+
+
 @pytest.mark.parametrize(
     ("column", "cell", "message"),
     [

@@ -15,6 +15,9 @@ from tests.data.formats import (
     commonroad,
     interaction,
     interaction_challenge,
+    levelx,
+    levelx_highd,
+    ngsim,
     nuplan,
     openacc,
 )
@@ -44,6 +47,36 @@ def test_openacc_campaigns(tmp_path):
         (tmp_path / name / "Vehicles_specifications.csv").write_text("Vehicles\n")
     (tmp_path / "readme.csv").write_text("Vehicles\n")
     assert names("openacc", tmp_path) == [f"{name}_platoon1" for name in CAMPAIGNS]
+
+
+def test_openacc_tables_that_are_no_drives(tmp_path):
+    """Lists of settings, and the campaign of one car without positions."""
+    drive(tmp_path / "ZalaZone" / "handling_part12.csv", 9)
+    settings = "Long setting vehs in mixed timegap experiment handling.csv"
+    (tmp_path / "ZalaZone" / settings).write_text(
+        "filename,Long timegap setting\nhandling_part12,BMW_I3/MERCEDES_GLE450\n"
+    )
+    alone = tmp_path / "One_vehicle_multiple_drivers_on_road_campaign"
+    alone.mkdir()
+    (alone / "D10_part1.csv").write_text(
+        "Time,Speed,Engine Speed,Gear\n0.0,0.0,0.0,0\n0.1,0.0,0.0,0\n"
+    )
+    assert names("openacc", tmp_path) == ["handling_part12"]
+    # asked for alone it is refused
+    with pytest.raises(
+        InputError, match=r"D10_part1\.csv: columns: .* expected Speed1"
+    ):
+        names("openacc", alone)
+
+
+@pytest.mark.parametrize(
+    "damaged", [b"", b"Date,09,10,2019\nVehicle_order,A\n", b"\xff\xfe\x00Time,Speed1"]
+)
+def test_damaged_openacc_drives_are_named(tmp_path, damaged):
+    drive(tmp_path / "part1.csv", 1)
+    (tmp_path / "part2.csv").write_bytes(damaged)
+    with pytest.raises(InputError, match=r"part2\.csv: (column Time|header)"):
+        names("openacc", tmp_path)
 
 
 def test_openacc_drives_called_alike(tmp_path):
@@ -94,11 +127,39 @@ def test_commonroad_folders(tmp_path):
     ]
 
 
-def test_rests_of_unpacking_are_passed_over(tmp_path):
-    commonroad.write(tmp_path)
-    (tmp_path / "__MACOSX").mkdir()
-    (tmp_path / "__MACOSX" / "._a.xml").write_bytes(b"\x00\x05\x16\x07")
-    assert names("commonroad", tmp_path) == ["USA_Test-1_1_T-1"]
+RESTS = [commonroad, interaction, interaction_challenge, levelx, ngsim, openacc]
+
+
+@pytest.mark.parametrize("module", RESTS)
+def test_rests_of_unpacking_are_passed_over(tmp_path, module):
+    """What a Mac's zip holds besides, in a folder of its own or beside the files."""
+    (tmp_path / "release").mkdir()
+    fixture = module.write(tmp_path / "release")
+    form = getattr(module, "FORMAT", module.__name__.rpartition(".")[2])
+    before = names(form, tmp_path / "release")
+    for file in fixture.files:
+        shadow = tmp_path / "release" / "__MACOSX" / file.relative_to(tmp_path)
+        shadow.parent.mkdir(parents=True, exist_ok=True)
+        for place in (shadow.parent, file.parent):
+            (place / f"._{file.name}").write_bytes(b"\x00\x05\x16\x07\x00\x02")
+    assert names(form, tmp_path / "release") == before
+
+
+def test_levelx_releases_side_by_side(tmp_path):
+    levelx.write(tmp_path / "inD-dataset-v1.1")
+    assert names("levelx", tmp_path) == ["07"]
+    highd = tmp_path / "highd-dataset-v1.0" / "data"
+    highd.mkdir(parents=True)
+    levelx_highd.write(highd)
+    assert names("levelx", tmp_path) == ["01", "07"]
+    for file in sorted(highd.iterdir()):
+        file.rename(file.with_name(file.name.replace("01_", "07_")))
+    assert names("levelx", tmp_path) == [
+        "highd-dataset-v1.0/data/07",
+        "inD-dataset-v1.1/data/07",
+    ]
+    (map_of_place,) = read_recordings("levelx", tmp_path / "inD-dataset-v1.1")
+    assert len(map_of_place.lanes) == 7
 
 
 @pytest.mark.parametrize("module", [openacc, nuplan, commonroad])

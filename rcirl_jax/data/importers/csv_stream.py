@@ -8,9 +8,9 @@ first, so that vehicles and their groups are those of a log read at once.
 
 What differs from a file that fits: lanes that are not given are fitted minute by
 minute, the given path is known for 28 s beyond the minute only, and a row out of
-order is found inside a minute only. Rows may come in any
-order of road users; scratch space of about the file's size is needed. An importer
-that needs something of the whole recording finds it in `Spill.minutes`.
+order is found inside a minute only. Rows may come in any order of road users; scratch
+space of about the file's size is needed. An importer that needs something of the
+whole recording finds it in `Spill.minutes`.
 
 pyarrow reads a CSV (extra `[logs]`); an importer may bring a reader of its own.
 """
@@ -150,15 +150,19 @@ def _of_log(track: Track, fragments: dict[str, list[float]]) -> Track:
     )
 
 
-def batches(path: Path, fields: list[Field]) -> Iterator[dict[str, np.ndarray]]:
-    """Columns of a few MiB of the file; text as (codes, names) pairs."""
+def batches(
+    path: Path, fields: list[Field], *, grouped: bool = False
+) -> Iterator[dict[str, np.ndarray]]:
+    """Columns of a few MiB; text as (codes, names) pairs; `grouped` as `is_grouped`."""
     try:
         arrow, csv = (importlib.import_module(n) for n in ("pyarrow", "pyarrow.csv"))
     except ImportError as error:
         raise InputError(
             f"{path}: pyarrow: not installed: expected the extra rcirl-jax[logs]"
         ) from error
-    kinds = {f.column: arrow.string() if f.text else arrow.float64() for f in fields}
+    texts = {f.column for f in fields if f.text or grouped}
+    columns = list(dict.fromkeys(f.column for f in fields))
+    kinds = {c: arrow.string() if c in texts else arrow.float64() for c in columns}
     names = read_header(path)
     numeric = [f.column for f in fields if not f.text]
     try:
@@ -169,19 +173,19 @@ def batches(path: Path, fields: list[Field]) -> Iterator[dict[str, np.ndarray]]:
             ),
             convert_options=csv.ConvertOptions(
                 column_types=kinds,
-                include_columns=list(dict.fromkeys(f.column for f in fields)),
+                include_columns=columns,
                 strings_can_be_null=False,
             ),
         )
         start = 1
         for batch in reader:
-            columns = {f.name: _column(path, batch, f, start) for f in fields}
+            found = {f.name: _column(path, batch, f, start) for f in fields}
             start += batch.num_rows
-            if any(column is None for column in columns.values()):
-                _refuse(path, names, numeric, "a cell that is no finite number")
-            yield columns
+            if any(column is None for column in found.values()):
+                _refuse(path, names, numeric, "a cell is no number", grouped)
+            yield found
     except arrow.ArrowException as error:
-        _refuse(path, names, numeric, str(error)[:200])
+        _refuse(path, names, numeric, str(error)[:200], grouped)
 
 
 def _column(path: Path, batch: Any, field: Field, start: int) -> Any:  # noqa: ANN401
@@ -192,6 +196,10 @@ def _column(path: Path, batch: Any, field: Field, start: int) -> Any:  # noqa: A
         names = [name.strip() for name in coded.dictionary.to_pylist()]
         names = [name.lower() if field.lower else name for name in names]
         return coded.indices.to_numpy(), names
+    if str(found.type) == "string":  # with separators between thousands
+        compute = importlib.import_module("pyarrow.compute")
+        found = compute.replace_substring_regex(found, r",(\d{3})", r"\1")
+        found = found.cast("float64")
     values = found.to_numpy(zero_copy_only=False)
     return in_si(path, values, field, start) if np.isfinite(values).all() else None
 
@@ -211,9 +219,11 @@ def in_si(path: Path, values: np.ndarray, field: Field, start: int) -> np.ndarra
     return values * field.factor
 
 
-def _refuse(path: Path, names: list[str], numeric: list[str], why: str) -> NoReturn:
+def _refuse(
+    path: Path, names: list[str], numeric: list[str], why: str, grouped: bool
+) -> NoReturn:
     """Read slowly and name the first line that is wrong."""
-    check_cells(path, names, numeric)
+    check_cells(path, names, numeric, grouped)
     reason = " ".join(why.split())
     raise InputError(f"{path}: {reason}: expected rows as the header says")
 

@@ -14,23 +14,28 @@ def input_files(path: Path, pattern: str) -> list[Path]:
     """The file itself, or a folder's matching files sorted by name."""
     if path.is_file():
         return [path]
-    found = sorted(file for file in path.glob(pattern) if file.is_file())
+    found = sorted(file for file in path.glob(pattern) if is_input(path, file))
     if not found:
         raise InputError(f"{path}: no file matches {pattern}: expected log files")
     return found
 
 
 def files_below(path: Path, pattern: str) -> list[Path]:
-    """The file itself, or matching files at any depth, sorted by relative path.
-
-    What unpacking leaves of another system (__MACOSX) is passed over.
-    """
+    """The file itself, or matching files at any depth, sorted by relative path."""
     if path.is_dir():
-        found = {file for file in path.rglob(pattern) if file.is_file()}
-        found = {f for f in found if "__MACOSX" not in f.relative_to(path).parts}
+        found = {file for file in path.rglob(pattern) if is_input(path, file)}
         if found:
             return sorted(found)
     return input_files(path, pattern)
+
+
+def is_input(folder: Path, file: Path) -> bool:
+    """Whether it is a file, and nothing that unpacking left of another system.
+
+    Such are folders __MACOSX and files that a Mac wrote beside others (._NAME).
+    """
+    rests = "__MACOSX" in file.relative_to(folder).parts or file.name.startswith("._")
+    return file.is_file() and not rests
 
 
 def with_log_names(

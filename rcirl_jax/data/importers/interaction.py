@@ -22,6 +22,7 @@ import numpy as np
 
 from rcirl_jax.data.importers.files import (
     input_files,
+    is_input,
     log_name,
 )
 from rcirl_jax.data.importers.lanelet2 import read_lanelet2
@@ -107,7 +108,8 @@ def parts(path: Path, spec: dict) -> list[Path]:
     """The log files below a folder, no other tables; pedestrians with vehicles."""
     if path.is_file():
         return [path]
-    found = [file for file in sorted(path.rglob("*.csv")) if _is_log(file)]
+    tables = sorted(file for file in path.rglob("*.csv") if is_input(path, file))
+    found = [file for file in tables if _is_log(file)]
     names = set(found)
     kept = [
         file
@@ -205,15 +207,22 @@ def _find_map(path: Path, spec: dict) -> Path | None:
             exact = folder / f"{name}{ending}"
             if exact.is_file():
                 return exact
-        # maps of ZS are called ZS0 and ZS2 in one release and ZS in another
+        # maps of ZS are called ZS0 and ZS2 in one release and ZS in another; EP0
+        # and EP1 are two places
         near = [
             file
             for file in sorted(folder.glob("*.osm*"))
-            if file.stem.rstrip("0123456789") == name.rstrip("0123456789")
+            if is_input(folder, file) and _is_numbered(file.stem, name)
         ]
         if len({file.stem for file in near}) == 1:
             return near[-1]
     return None
+
+
+def _is_numbered(one: str, other: str) -> bool:
+    """Whether one of two names is the other with a number behind it."""
+    short, long = sorted((one, other), key=len)
+    return long.removeprefix(short).isdigit() and not short[-1:].isdigit()
 
 
 def _cases(table: dict[str, np.ndarray], scene: _Scene) -> Iterator[Recording]:

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.importers.files import input_files
+from rcirl_jax.data.importers.files import files_below, log_name
 from rcirl_jax.data.importers.lanelet2 import read_lanelet2
 from rcirl_jax.data.importers.levelx_lanes import find_map, marked_lanes
 from rcirl_jax.data.importers.paths import path_lanes
@@ -51,12 +51,14 @@ CENTRE = (
 )
 KINDS = {
     "pedestrian": Kind.PEDESTRIAN,
+    "animal": Kind.PEDESTRIAN,
     "bicycle": Kind.CYCLIST,
     "bicyclist": Kind.CYCLIST,
     # in the way of others like any body that moves, but nobody drives it: only
     # vehicles are experts (Argoverse 2's "unknown" and Waymo's "other" likewise)
     "trailer": Kind.CYCLIST,
 }
+MOTORISED = ("car", "van", "truck", "bus", "truck_bus", "motorcycle")
 LIFE = ("numFrames", "initialFrame", "finalFrame")  # of a track, in tracksMeta
 MAX_GAP_FRAMES = 5.5  # frames missing inside one track
 MAX_ID = 2**53  # beyond it float64 does not count
@@ -76,11 +78,13 @@ class _User:
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
-    """The XX_tracks.csv of a folder, or of its folder data."""
-    folder = path
-    if path.is_dir() and not any(path.glob("*" + SUFFIX)) and (path / "data").is_dir():
-        folder = path / "data"
-    return input_files(folder, "*" + SUFFIX)
+    """The XX_tracks.csv at any depth of a folder: releases keep them in data/."""
+    return files_below(path, "*" + SUFFIX)
+
+
+def own_name(file: Path) -> str:
+    """Name of a log, as long as no other folder has one called alike."""
+    return file.name.removesuffix(SUFFIX)
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
@@ -195,7 +199,7 @@ def _read_corners(path: Path, spec: dict) -> Recording:
     check_span(str(path), "x", x)
     along = (float(x.min()), float(x.max()))
     lanes = marked_lanes(meta_path, meta, along, limit, (y, rows["xVelocity"]))
-    return _recording(path, spec, rate, tracks, lanes, limit, _absent(ids, users))
+    return _recording(path, spec, rate, tracks, lanes, limit, _user_notes(ids, users))
 
 
 def _read_centres(path: Path, spec: dict) -> Recording:
@@ -213,7 +217,7 @@ def _read_centres(path: Path, spec: dict) -> Recording:
     ]
     limit = _limit(meta_path, meta)
     lanes, notes = _mapped_lanes(path, meta_path, meta, tracks, spec)
-    notes += _absent(ids, users)
+    notes += _user_notes(ids, users)
     trailers = sum(users[int(i)].kind == "trailer" for i in np.unique(ids))
     if trailers:
         notes.append(f"{trailers} trailers are obstacles of kind cyclist, no experts")
@@ -303,9 +307,14 @@ def _check_whole(
                 )
 
 
-def _absent(ids: np.ndarray, users: dict) -> list[str]:
+def _user_notes(ids: np.ndarray, users: dict[int, _User]) -> list[str]:
+    """Tracks without rows, and classes that this module does not know."""
     missing = len(set(users) - set(np.unique(ids).tolist()))
-    return [f"{missing} tracks of tracksMeta have no rows"] if missing else []
+    notes = [f"{missing} tracks of tracksMeta have no rows"] if missing else []
+    unknown = {user.kind for user in users.values()} - {*KINDS, *MOTORISED}
+    if unknown:
+        notes.append(f"classes taken for vehicles: {', '.join(sorted(unknown))}")
+    return notes
 
 
 def _mapped_lanes(
@@ -346,7 +355,7 @@ def _recording(
 ) -> Recording:
     default = number(spec, "default_speed_limit", LIMIT_MPS)
     return Recording(
-        name=path.name.removesuffix(SUFFIX),
+        name=log_name(path, spec, own_name(path)),
         source=str(spec.get("source", "leveLXData")),
         licence=str(spec.get("licence", "leveLXData terms: non-commercial use")),
         rate_hz=rate,

@@ -9,6 +9,10 @@ The portal's CSV holds several sites and periods; vehicle and frame numbers
 start anew in each. Sites become Recordings of their own; where the file has
 Global_Time, it is the clock and rows may come in any order, else Frame_ID. A file
 longer than `long_bytes` becomes a Recording per site and minute (`csv_stream`).
+
+Traps: spreadsheets export numbers as "1,118,846,979,700"; the releases of the sites
+hold every log twice, as text and as CSV, in folders of their own; those of the
+arterials have no column Location to say what they are, but 24 columns.
 """
 
 import functools
@@ -19,7 +23,7 @@ from typing import NoReturn
 import numpy as np
 
 from rcirl_jax.data.importers import csv_stream
-from rcirl_jax.data.importers.files import input_files
+from rcirl_jax.data.importers.files import input_files, is_input, log_name
 from rcirl_jax.data.importers.ngsim_site import (
     FRAME_S,
     MAX_FRAME_GAP,
@@ -36,6 +40,7 @@ from rcirl_jax.data.importers.sparse_tables import (
 )
 from rcirl_jax.data.importers.tables import (
     check_row,
+    is_grouped,
     load_rows,
     number,
     read_header,
@@ -48,6 +53,9 @@ from rcirl_jax.types import Recording
 
 NEEDED = ("Vehicle_ID", "Frame_ID", "Local_Y", "v_Class", "v_Vel", "Lane_ID")
 OPTIONAL = ("Local_X", "v_Length", "v_Width", "Global_Time")
+JUNCTION = "Int_ID"  # a column of arterials, empty for freeways
+ARTERIAL_COLUMNS = 24  # of an arterial's native text
+LOGS = "trajectories"  # start of the logs' names in the releases
 LENGTHS = ("Local_X", "Local_Y", "v_Length", "v_Width", "v_Vel")
 MAX_NUMBER = 1e12  # of a vehicle or lane; larger ones are no numbers of anything
 # in the file's unit: what no log can mean
@@ -59,14 +67,26 @@ LIMITS = {
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
-    """The text and CSV files; each can be read alone."""
+    """The text and CSV files; each can be read alone.
+
+    In folders below only those called trajectories*. Of files in one folder with
+    one name that of the first pattern counts: it is the same log.
+    """
+    if path.is_file():
+        return [path]
     patterns = spec.get("pattern", ["*.txt", "*.csv"])
-    files = [path] if path.is_file() else []
-    for pattern in [] if files else patterns:
-        files += [f for f in path.glob(pattern) if "notice" not in f.name.lower()]
-    if not files:
-        files = input_files(path, " or ".join(patterns))
-    return sorted(files)
+    found: dict[tuple[Path, str], Path] = {}
+    for pattern in patterns:
+        for file in path.rglob(pattern):
+            own = file.parent == path or file.name.lower().startswith(LOGS)
+            if own and is_input(path, file) and "notice" not in file.name.lower():
+                found.setdefault((file.parent, file.stem), file)
+    return sorted(found.values()) or input_files(path, " or ".join(patterns))
+
+
+def own_name(file: Path) -> str:
+    """Name of a log, as long as no other folder has one called alike."""
+    return file.stem
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
@@ -101,7 +121,7 @@ def _whole_recordings(
         survey = Survey()
         survey.add(part)
         notes = [*left_out, *survey.notes()]
-        name = _name(path, site, sites)
+        name = _name(path, site, sites, spec)
         yield site_recording(
             path, name, part, spec, survey, stamped=stamped, notes=notes
         )
@@ -113,7 +133,8 @@ def _long_recordings(
     """One Recording per site and minute; lanes and notes are the site's."""
     frame_s = number(spec, "frame_s", FRAME_S)
     if is_csv:
-        header, read = read_header(path), csv_stream.batches
+        header = _read_header(path)
+        read = functools.partial(csv_stream.batches, grouped=is_grouped(path))
     else:
         header, read = _text_columns(spec), functools.partial(_text_batches, spec=spec)
     names = _columns(header)
@@ -157,7 +178,7 @@ def _long_recordings(
         sites = spill.recordings()
         known, left_out = _known_sites(path, sites, spec)
         for site in known:
-            survey, log = Survey(), _name(path, site, sites)
+            survey, log = Survey(), _name(path, site, sites, spec)
             for values in spill.minutes(site):
                 survey.add(table_of(values))
             notes = [*left_out, *survey.notes()]  # once, with the first minute
@@ -188,9 +209,10 @@ def _known_sites(
     return [*known], [f"left out, no freeway: {', '.join(left_out)}"][: len(left_out)]
 
 
-def _name(path: Path, site: str | None, sites: Sequence[str | None]) -> str:
+def _name(path: Path, site: str | None, sites: Sequence[str | None], spec: dict) -> str:
     """Of a site's recording: the file's alone where it has one site."""
-    return path.stem if len(sites) == 1 else f"{path.stem}-{site}"
+    log = log_name(path, spec, own_name(path))
+    return log if len(sites) == 1 else f"{log}-{site}"
 
 
 def _has_stamps(stamps: np.ndarray) -> bool:
@@ -238,13 +260,26 @@ def _columns(header: Sequence[str]) -> dict[str, str]:
     return {n: actual.get(n.lower(), n) for n in (*NEEDED, *OPTIONAL, SITE)}
 
 
+def _read_header(path: Path) -> list[str]:
+    """Column names; those of an arterial that does not say so are refused."""
+    header = read_header(path)
+    lower = [name.lower() for name in header]
+    if JUNCTION.lower() in lower and SITE.lower() not in lower:
+        raise InputError(
+            f"{path}: column {SITE}: missing: expected it beside {JUNCTION}; "
+            "arterials have no straight lanes"
+        )
+    return header
+
+
 def _read_csv(path: Path) -> Table:
-    names = _columns(read_header(path))
+    names = _columns(_read_header(path))
     found = read_table(
         path,
         [names[n] for n in NEEDED],
         [names[n] for n in (*OPTIONAL, SITE)],
         [names[SITE]],
+        grouped=is_grouped(path),
     )
     table = _complete({n: found[names[n]] for n in names if names[n] in found})
     if SITE in table:
@@ -310,5 +345,11 @@ def _find_bad_line(path: Path, columns: list[str]) -> NoReturn:
     with path.open(encoding="utf-8", errors="replace") as handle:
         for line, text in enumerate(handle, start=1):
             if text.strip():
-                check_row(path, line, text.split(), columns, columns)
+                cells = text.split()
+                if len(cells) == ARTERIAL_COLUMNS != len(columns):
+                    raise InputError(
+                        f"{path}: line {line}: {len(cells)} cells: expected "
+                        f"{len(columns)}; arterials have no straight lanes"
+                    )
+                check_row(path, line, cells, columns, columns)
     raise InputError(f"{path}: rows: unreadable: expected {len(columns)} numbers each")

@@ -8,9 +8,11 @@ the notes beside each campaign (JRCDBT0001, "JRC_tests_notes.txt") and Makridis
 et al. (2021), Transportation Research Part C 125, 103047.
 
 Traps: cells are empty where a receiver lost its fix, rows may end in surplus
-commas, cars may lack columns (numbers with holes), names hold spaces, most
+commas, cars may lack columns (numbers with holes, leaders without a Driver),
+names hold spaces, ZalaZone's Lat and Lon are degrees whatever its notes say, most
 followers are driven by their ACC and not by a human (option `drivers`), there
-is no box: the antenna is taken for its centre.
+is no box: the antenna is taken for its centre. Beside the drives lie tables that
+are none: specifications, lists of settings, a campaign of one car's speeds.
 
 Drives last up to hours: they are cut into Recordings of `block_s`.
 """
@@ -44,6 +46,8 @@ from rcirl_jax.types import Kind, Recording, Track
 
 COLUMN = re.compile(r"(Speed|Lat|Lon|E|N|IVS|Driver)(\d{1,3})")
 NOT_LOGS = re.compile(r"(?i).*(spec|note|readme|label).*")
+# first cells of the metadata lines
+METADATA = ("date", "vehicle_order", "number_of_vehicles", "acc", "distance_setting")
 MAX_HEADER_LINES = 30  # lines looked at for the row of column names
 MAX_LINE_CHARS = 65536
 DRIVER_CHARS = 16  # characters kept of a Driver cell
@@ -70,11 +74,24 @@ class _Drive:
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
-    """The drives; specifications and notes beside them are none."""
+    """The drives; specifications, notes and other tables beside them are none."""
     files = files_below(path, str(spec.get("pattern", "*.csv")))
     if path.is_dir():
         files = [file for file in files if not NOT_LOGS.fullmatch(file.name)] or files
+        files = [file for file in files if _is_drive(file)] or files
     return files
+
+
+def _is_drive(path: Path) -> bool:
+    """Whether a table is a drive, or so damaged that one cannot tell."""
+    try:
+        lines = _first_lines(path)
+    except InputError:
+        return True
+    if _ends_with_names(lines):
+        return any(COLUMN.fullmatch(name) for name in lines[-1])
+    firsts = {line[0].lower() for line in lines if line}
+    return not firsts or not firsts.isdisjoint(METADATA)
 
 
 def own_name(file: Path) -> str:
@@ -90,27 +107,39 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
             yield validate_recording(block, file)
 
 
-def _read_header(path: Path) -> tuple[dict[str, list[str]], list[str], int]:
-    """Metadata, column names, and the number of lines down to the names."""
-    about: dict[str, list[str]] = {}
+def _first_lines(path: Path) -> list[list[str]]:
+    """Cells of the lines down to the column names, or of the first ones."""
+    lines: list[list[str]] = []
     try:
         with path.open(encoding="utf-8-sig") as handle:
-            for line in range(1, MAX_HEADER_LINES + 1):
-                cells = handle.readline(MAX_LINE_CHARS).strip().split(",")
-                cells = [cell.strip().strip('"') for cell in cells]
+            while len(lines) < MAX_HEADER_LINES and not _ends_with_names(lines):
+                text = handle.readline(MAX_LINE_CHARS)
+                if not text:
+                    break
+                cells = [cell.strip().strip('"') for cell in text.strip().split(",")]
                 while cells and not cells[-1]:
                     cells.pop()
-                if cells and cells[0].lower() == "time":
-                    _check_names(path, cells)
-                    return about, cells, line
-                if cells:
-                    about[cells[0].lower()] = cells[1:]
+                lines.append(cells)
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: header: {error}: expected CSV text") from error
-    raise InputError(
-        f"{path}: column Time: missing: expected it in the first "
-        f"{MAX_HEADER_LINES} lines, below the metadata"
-    )
+    return lines
+
+
+def _ends_with_names(lines: list[list[str]]) -> bool:
+    return bool(lines and lines[-1]) and lines[-1][0].lower() == "time"
+
+
+def _read_header(path: Path) -> tuple[dict[str, list[str]], list[str], int]:
+    """Metadata, column names, and the number of lines down to the names."""
+    lines = _first_lines(path)
+    if not _ends_with_names(lines):
+        raise InputError(
+            f"{path}: column Time: missing: expected it in the first "
+            f"{MAX_HEADER_LINES} lines, below the metadata"
+        )
+    _check_names(path, lines[-1])
+    about = {cells[0].lower(): cells[1:] for cells in lines[:-1] if cells}
+    return about, lines[-1], len(lines)
 
 
 def _check_names(path: Path, names: list[str]) -> None:
@@ -160,11 +189,14 @@ def _read_drive(path: Path) -> _Drive:
 
 
 def _located(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """x, y [m] from E, N, or from latitude and longitude in radians."""
+    """x, y [m] from E, N, or from latitude and longitude in radians or degrees."""
     if "E" in values and "N" in values:
         return {**values, "x": values["E"], "y": values["N"]}
-    degrees = [np.rad2deg(values[field]) for field in ("Lat", "Lon")]
+    degrees = [values[field] for field in ("Lat", "Lon")]
     known = np.isfinite(degrees[0]) & np.isfinite(degrees[1])
+    # no latitude in radians is beyond pi / 2
+    if not known.any() or np.median(np.abs(degrees[0][known])) <= 0.5 * np.pi:
+        degrees = [np.rad2deg(angles) for angles in degrees]
     known &= (np.abs(degrees[0]) < 84.0) & (np.abs(degrees[1]) <= 180.0)
     place = np.full((known.size, 2), np.nan)
     if known.any():

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import re
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -27,6 +28,8 @@ UNITS = {
     "rad": 1.0,
     "deg": np.pi / 180.0,
 }
+# a quoted number with separators between thousands: "1,118,846,979,700"
+GROUPED = re.compile(r'"([-+]?\d{1,3}(?:,\d{3})+(?:\.\d*)?)"')
 HEADING_WINDOW_S = 1.0  # s, heading is the direction of travel over this window
 MIN_TRAVEL_M = 0.5  # m in that window; below it the heading is held
 LANE_STEP_M = 5.0  # m between points of a fitted lane
@@ -60,7 +63,12 @@ def read_header(path: Path) -> list[str]:
 
 
 def read_table(
-    path: Path, wanted: Sequence[str], optional: Sequence[str], text: Sequence[str]
+    path: Path,
+    wanted: Sequence[str],
+    optional: Sequence[str],
+    text: Sequence[str],
+    *,
+    grouped: bool = False,
 ) -> dict[str, np.ndarray]:
     """Columns of a comma-separated file with a header.
 
@@ -69,6 +77,7 @@ def read_table(
       wanted: columns that have to be there.
       optional: columns that may be.
       text: names among both that are not numbers.
+      grouped: numbers may have separators between thousands (`is_grouped`).
 
     Returns:
       Column name -> values; numbers as float64 (finite), text as str.
@@ -89,10 +98,17 @@ def read_table(
         if name in chosen and name in text:
             kinds[place] = f"U{TEXT_CHARS}"
     names = [f"c{place}" for place in range(len(header))]
+    numeric = [name for name in chosen if name not in text]
     try:
-        rows = load_rows(path, list(zip(names, kinds, strict=True)), ",", skip=1)
+        with path.open(encoding="utf-8-sig") as handle:
+            rows = load_rows(
+                (ungrouped(line) for line in handle) if grouped else path,
+                list(zip(names, kinds, strict=True)),
+                ",",
+                skip=1,
+            )
     except (ValueError, UnicodeError):
-        _find_bad_cell(path, header, [n for n in chosen if n not in text])
+        _find_bad_cell(path, header, numeric, grouped)
     if rows.size == 0:
         raise InputError(f"{path}: rows: none: expected rows below the header")
     table = {name: rows[f"c{header.index(name)}"] for name in chosen}
@@ -100,8 +116,23 @@ def read_table(
         if name in text:
             table[name] = np.char.strip(table[name])
         elif not np.isfinite(table[name]).all():
-            _find_bad_cell(path, header, [name])
+            _find_bad_cell(path, header, [name], grouped)
     return table
+
+
+def is_grouped(path: Path) -> bool:
+    """Whether a number of the first row has separators between thousands."""
+    try:
+        with path.open(encoding="utf-8-sig") as handle:
+            next(handle, "")
+            return GROUPED.search(next(handle, "")) is not None
+    except UnicodeDecodeError:
+        return False  # refused by whoever reads it
+
+
+def ungrouped(line: str) -> str:
+    """A line of a CSV without separators between thousands, and their quotes."""
+    return GROUPED.sub(lambda found: found[1].replace(",", ""), line)
 
 
 def load_rows(
@@ -125,17 +156,21 @@ def load_rows(
         )
 
 
-def _find_bad_cell(path: Path, header: list[str], numeric: list[str]) -> NoReturn:
+def _find_bad_cell(
+    path: Path, header: list[str], numeric: list[str], grouped: bool
+) -> NoReturn:
     """Read slowly and name the first line that is wrong."""
-    check_cells(path, header, numeric)
+    check_cells(path, header, numeric, grouped)
     raise InputError(f"{path}: rows: unreadable: expected comma-separated cells")
 
 
-def check_cells(path: Path, header: list[str], numeric: list[str]) -> None:
+def check_cells(
+    path: Path, header: list[str], numeric: list[str], grouped: bool = False
+) -> None:
     """Every row of a CSV is as `check_row` says; slow, to explain a failure."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as handle:
-            reader = csv.reader(handle)
+            reader = csv.reader(map(ungrouped, handle) if grouped else handle)
             next(reader)
             for row in reader:
                 if row:
