@@ -131,6 +131,20 @@ def test_speed_limits(tmp_path):
     assert any("speed limit" in note for note in recording.notes)
 
 
+@pytest.mark.parametrize("kind", ["R2-1", "274", "274.1", "r301"])
+def test_limit_signs_of_countries(tmp_path, kind):
+    lane = w.lanelet(extra='<trafficSignRef ref="50"/>')
+    path = w.commonroad(tmp_path / "a.xml", lane, w.sign("50", kind, 8.33), w.car())
+    assert only(path).lanes[0].speed_limit == 8.33
+
+
+@pytest.mark.parametrize("kind", ["R1-1", "206", "r2"])
+def test_stop_signs_of_countries(tmp_path, kind):
+    lane = w.lanelet(extra='<stopLine><trafficSignRef ref="50"/></stopLine>')
+    path = w.commonroad(tmp_path / "a.xml", lane, w.sign("50", kind), w.car())
+    assert only(path).lanes[0].stop_sign
+
+
 def test_speed_limit_of_2018b(tmp_path):
     body = w.lanelet(extra="<speedLimit>20</speedLimit>") + w.car(version="2018b")
     path = w.commonroad(tmp_path / "a.xml", body, version="2018b")

@@ -127,6 +127,19 @@ def test_commonroad_folders(tmp_path):
     ]
 
 
+def test_sumo_beside_commonroad(tmp_path):
+    """An interactive scenario's folder, with SUMO's header of generated files."""
+    w.commonroad(tmp_path / "DEU_A9-1_1_I-1.cr.xml")
+    made = "<?xml version='1.0'?>\n<!-- made by SUMO\n<commonRoad x='1'/>\n-->\n\n"
+    (tmp_path / "DEU_A9-1_1_I-1.net.xml").write_text(f"{made}<net version='1.6'/>")
+    (tmp_path / "DEU_A9-1_1_I-1.rou.xml").write_text(f"{made}<routes/>")
+    (tmp_path / "solution.xml").write_text('<CommonRoadSolution date="2024"/>')
+    assert names("commonroad", tmp_path) == ["DEU_A9-1_1_I-1.cr"]
+    (tmp_path / "broken.xml").write_text("<scenario/>")
+    with pytest.raises(InputError, match=r"broken\.xml: root: scenario"):
+        names("commonroad", tmp_path)
+
+
 RESTS = [commonroad, interaction, interaction_challenge, levelx, ngsim, openacc]
 
 

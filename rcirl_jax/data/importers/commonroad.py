@@ -8,6 +8,7 @@ removed that car from the traffic).
 
 import csv
 import dataclasses
+import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from xml.etree.ElementTree import Element, ParseError
@@ -32,6 +33,12 @@ MAX_FILE_BYTES = 512 * 1024**2  # bytes, larger files are refused
 MAX_STEP = 1e6  # of the clock: a day at 10 Hz
 DEFAULT_LIMIT_MPS = 29.06  # m/s, 65 mph, where the source TOML names none
 MIN_LIMIT_MPS = 5.0  # m/s, likewise; lower signs are converter artefacts
+# roots of what lies beside interactive scenarios: SUMO's files, solutions, other maps
+OTHER_ROOTS = (
+    *("net", "routes", "additional", "configuration", "sumoConfiguration"),
+    *("CommonRoadSolution", "osm", "OpenDRIVE", "OpenSCENARIO"),
+)
+HEAD_BYTES = 65536  # bytes in which a file's root is looked for
 # obstacle types; any other type that moves is a vehicle
 KINDS = {
     "bicycle": Kind.CYCLIST,
@@ -57,8 +64,19 @@ class _Box:
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
-    """The XML files; each can be read alone."""
-    return files_below(path, spec.get("pattern", "*.xml"))
+    """The XML files but those of other formats; each can be read alone."""
+    files = files_below(path, spec.get("pattern", "*.xml"))
+    if path.is_dir():
+        files = [file for file in files if _root_of(file) not in OTHER_ROOTS] or files
+    return files
+
+
+def _root_of(path: Path) -> str:
+    """Name of the root element, "" where the first bytes hold none."""
+    with path.open("rb") as handle:
+        head = re.sub(rb"<!--.*?(-->|$)", b"", handle.read(HEAD_BYTES), flags=re.DOTALL)
+    found = re.search(rb"<([A-Za-z][\w.-]*)", head)
+    return "" if found is None else found[1].decode()
 
 
 def own_name(file: Path) -> str:

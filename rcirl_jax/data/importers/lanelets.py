@@ -8,8 +8,9 @@ from rcirl_jax.data.importers.xml_fields import Fields
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane
 
-LIMIT_SIGNS = ("R2-1", "274")  # US and German speed-limit sign ids
-STOP_SIGNS = ("R1-1", "206")  # US and German stop sign ids
+# of the countries that the format knows; others use the German ids
+LIMIT_SIGNS = ("R2-1", "274", "274.1", "r301")  # US, German (also zones), Spanish
+STOP_SIGNS = ("R1-1", "206", "r2")  # US, German, Spanish
 MIN_HALF_WIDTH_M = 0.1  # m, lanelets taper to a point at forks
 
 
