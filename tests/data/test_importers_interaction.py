@@ -148,6 +148,21 @@ def test_maps_with_another_number(root, scene, maps, found):
     assert ("30001" in ids) == found
 
 
+def test_logs_split_by_the_scripts_of_the_data_set(root, scene):
+    """SCENE/train and SCENE/val are no places: names and map are the scene's."""
+    whole = only(root)
+    (scene / "train").mkdir()
+    for path in sorted(scene.glob("*.csv")):
+        path.rename(scene / "train" / path.name)
+    recording = only(root)
+    assert recording.name == whole.name == f"{fixture.SCENE}-000"
+    assert [lane.id for lane in recording.lanes] == [lane.id for lane in whole.lanes]
+    (scene / "train").rename(scene / "val")
+    (scene / "sorted").mkdir()
+    (scene / "val").rename(scene / "sorted" / "val")
+    assert only(root).name == whole.name
+
+
 def test_the_map_of_a_neighbouring_place_is_not_taken(root):
     """EP0 and EP1 are two places: without its own map a log has none."""
     for ending in (".osm_xy", ".osm"):

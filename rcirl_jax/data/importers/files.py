@@ -74,7 +74,7 @@ def listing(path: Path) -> list:
     files = set(path.rglob("*")) if path.is_dir() else {path}
     beside = path.absolute().parent.glob("*")
     files |= {file for file in beside if file.suffix in READ_BESIDE}
-    for above in path.absolute().parents[:4]:
+    for above in path.absolute().parents[:5]:
         files |= set((above / "maps").rglob("*"))
     stats = [(file, file.stat()) for file in sorted(files) if file.is_file()]
     return [[str(file), stat.st_size, stat.st_mtime_ns] for file, stat in stats]

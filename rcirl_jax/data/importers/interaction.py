@@ -53,6 +53,8 @@ PEDESTRIANS = "pedestrian_tracks_"
 # files of a release that are no logs: predictions to hand in, 1 s observations
 LEFT_OUT = ("_sub.csv", "_obs.csv")
 SETS = ("_train", "_val", "_test", "_obs")
+# folders below a scene's, made by the data set's own split_train_val_script.py
+SPLITS = ("train", "val", "sorted")
 KINDS = {
     "pedestrian": Kind.PEDESTRIAN,
     "person": Kind.PEDESTRIAN,
@@ -60,6 +62,7 @@ KINDS = {
     "cyclist": Kind.CYCLIST,
 }
 EITHER = "pedestrian/bicycle"
+MAPS_UP = 5  # folders above a log in which that of the maps is looked for
 RATE_HZ = 10.0  # 1/s
 MAX_GAP_MS = 550.0  # ms missing inside one track
 FAST_MPS = 3.5  # m/s; who of "pedestrian/bicycle" is faster rides
@@ -144,7 +147,8 @@ def own_name(file: Path) -> str:
 def _scene_name(path: Path) -> str:
     """Name of the place: the folder, or the challenge file without its set."""
     if path.name.startswith((VEHICLES, PEDESTRIANS)):
-        return path.resolve().parent.name
+        folders = [folder.name for folder in path.resolve().parents]
+        return next((name for name in folders if name not in SPLITS), folders[0])
     return next(
         (path.stem.removesuffix(s) for s in SETS if path.stem.endswith(s)), path.stem
     )
@@ -193,7 +197,7 @@ def _scene(path: Path, spec: dict) -> _Scene:
 
 def _find_map(path: Path, spec: dict) -> Path | None:
     """maps/SCENE.osm_xy or .osm in a folder above; the option `map` names one."""
-    folders = [folder / "maps" for folder in path.resolve().parents[:4]]
+    folders = [folder / "maps" for folder in path.resolve().parents[:MAPS_UP]]
     if spec.get("map"):
         given = Path(str(spec["map"]))
         if not given.exists():
