@@ -157,6 +157,14 @@ def periods():
     return rows
 
 
+def test_columns_chosen_in_the_portal(tmp_path):
+    """Downloads by its interface hold what was asked for; 0 is the class of nobody."""
+    columns = [w.NGSIM_COLUMNS[i] for i in (0, 1, 5, 11, 13)]
+    rows = [[row[i] for i in (0, 1, 5, 11, 13)] for row in w.ngsim_rows()]
+    (track,) = only(w.ngsim_csv(tmp_path / "a.csv", rows, columns=columns)).tracks
+    assert (track.length, track.width) == (4.5, 1.8)
+
+
 def test_separators_between_thousands(tmp_path):
     """A spreadsheet's export: "1,118,846,979,700" and "2,224"."""
     rows = periods()

@@ -51,8 +51,8 @@ from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Recording
 
-NEEDED = ("Vehicle_ID", "Frame_ID", "Local_Y", "v_Class", "v_Vel", "Lane_ID")
-OPTIONAL = ("Local_X", "v_Length", "v_Width", "Global_Time")
+NEEDED = ("Vehicle_ID", "Frame_ID", "Local_Y", "v_Vel", "Lane_ID")
+OPTIONAL = ("Local_X", "v_Length", "v_Width", "v_Class", "Global_Time")
 JUNCTION = "Int_ID"  # a column of arterials, empty for freeways
 ARTERIAL_COLUMNS = 24  # of an arterial's native text
 LOGS = "trajectories"  # start of the logs' names in the releases
