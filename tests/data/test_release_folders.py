@@ -127,6 +127,16 @@ def test_commonroad_folders(tmp_path):
     ]
 
 
+def test_the_invented_scenario_of_interactions_scripts(tmp_path):
+    """The data set unpacked into a clone of the repository of its tools."""
+    users = interaction.road_users()
+    for name in (".TestScenarioForScripts", "DR_A"):
+        interaction.write_scene(tmp_path / "recorded_trackfiles" / name, users)
+    assert names("interaction", tmp_path) == ["DR_A-000"]
+    alone = tmp_path / "recorded_trackfiles" / ".TestScenarioForScripts"
+    assert names("interaction", alone) == [".TestScenarioForScripts-000"]
+
+
 def test_sumo_beside_commonroad(tmp_path):
     """An interactive scenario's folder, with SUMO's header of generated files."""
     w.commonroad(tmp_path / "DEU_A9-1_1_I-1.cr.xml")

@@ -30,12 +30,13 @@ def files_below(path: Path, pattern: str) -> list[Path]:
 
 
 def is_input(folder: Path, file: Path) -> bool:
-    """Whether it is a file, and nothing that unpacking left of another system.
+    """Whether it is a file, not hidden in a folder, and no rest of unpacking.
 
-    Such are folders __MACOSX and files that a Mac wrote beside others (._NAME).
+    Hidden are what a Mac wrote beside others (._NAME), copies of editors and the
+    invented scenario of INTERACTION's scripts (.TestScenarioForScripts).
     """
-    rests = "__MACOSX" in file.relative_to(folder).parts or file.name.startswith("._")
-    return file.is_file() and not rests
+    below = file.relative_to(folder).parts
+    return file.is_file() and not any(p == "__MACOSX" or p[0] == "." for p in below)
 
 
 def with_log_names(
