@@ -51,7 +51,9 @@ def test_several_patterns_read_each_file_once(tmp_path):
     speed=st.sampled_from(
         [("m/s", 1.0), ("km/h", 1 / 3.6), ("mph", 0.44704), ("ft/s", 0.3048)]
     ),
-    clock=st.sampled_from([("s", 1.0), ("ms", 1e-3), ("frame", 0.1)]),
+    clock=st.sampled_from(
+        [("s", 1.0), ("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9), ("frame", 0.1)]
+    ),
     angle=st.sampled_from([("rad", 1.0), ("deg", np.pi / 180)]),
     origin=st.sampled_from([0.0, 1.6e9]),
 )

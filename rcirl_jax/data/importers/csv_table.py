@@ -48,7 +48,7 @@ EXPECTED = (*NEEDED, "automated")  # errors where they are named and not there
 TEXT = ("id", "kind", "lane", "recording")
 LENGTH_UNITS = ("m", "ft")
 ALLOWED_UNITS = {
-    "t": ("s", "ms", "frame"),
+    "t": ("s", "ms", "us", "ns", "frame"),
     "x": LENGTH_UNITS,
     "y": LENGTH_UNITS,
     "length": LENGTH_UNITS,
@@ -108,7 +108,7 @@ def _long_recordings(path: Path, spec: dict) -> Iterator[Recording]:
                     column=column,
                     factor=factor,
                     text=field in TEXT,
-                    limit=LIMITS.get(field, np.inf),
+                    limit=_limit(field, units),
                 )
             )
         elif field in EXPECTED:
@@ -170,7 +170,7 @@ def _read_tables(path: Path, spec: dict) -> Iterator[tuple[str, LogTable]]:
         elif field in TEXT:
             values[field] = raw[column]
         else:
-            check_range(path, raw, (column,), LIMITS.get(field, np.inf))
+            check_range(path, raw, (column,), _limit(field, units))
             values[field] = sign * units.get(field, 1.0) * raw[column]
     names = values.pop("recording", None)
     parts = np.unique(names) if names is not None else [None]
@@ -193,6 +193,12 @@ def _factors(path: Path, spec: dict, rate: float) -> dict[str, float]:
         else:
             factors[field] = unit_factor(path, field, unit, ALLOWED_UNITS[field])
     return factors
+
+
+def _limit(field: str, units: dict[str, float]) -> float:
+    """What a field's numbers stay within, in the file's unit."""
+    limit = LIMITS.get(field, np.inf)
+    return limit / min(units.get("t", 1.0), 1.0) if field == "t" else limit
 
 
 def _localise(

@@ -25,6 +25,8 @@ UNITS = {
     "mph": MPH_MPS,
     "s": 1.0,
     "ms": 1e-3,
+    "us": 1e-6,
+    "ns": 1e-9,
     "rad": 1.0,
     "deg": np.pi / 180.0,
 }
