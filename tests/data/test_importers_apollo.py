@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import struct
 from pathlib import Path
 
@@ -111,14 +112,41 @@ def test_parts_are_drives(tmp_path):
     fixture.write(tmp_path)
     write(tmp_path / "demo_3.5.record", ego_only())
     write(tmp_path / "x.record.00007", ego_only())
-    write(tmp_path / "x.record.00009", ego_only())  # a part is missing: another drive
+    write(tmp_path / "x.record.00009", ego_only())  # a part is missing before it
     (tmp_path / "notes.record.txt").write_text("not a record")
     found, _ = parts("apollo", tmp_path)
     assert [part.name for part in found] == [
-        *("20210723091215.record.00000", "demo_3.5.record", "x.record.00007")
+        *("20210723091215.record.00000", "demo_3.5.record"),
+        *("x.record.00007", "x.record.00009"),
     ]
-    names = [recording.name for recording in read_recordings("apollo", tmp_path)]
-    assert names == ["20210723091215", "demo_3.5", "x"]
+    recordings = list(read_recordings("apollo", tmp_path))
+    assert {made.name: made.group for made in recordings} == {
+        **{"20210723091215": None, "demo_3.5": None},
+        **{"x": "x", "x-00009": "x"},  # they may show the same cars
+    }
+
+
+def test_parts_named_by_when_they_began(tmp_path):
+    """As Apollo 10 and others name them; copies of a part are not read twice."""
+    first, second = fixture.write(tmp_path).files
+    first.rename(tmp_path / f"{first.name}.091215")
+    second.rename(tmp_path / f"{second.name}.20210723091219")
+    shutil.copy(tmp_path / f"{first.name}.091215", f"{first}.091215.split")
+    recording = only(tmp_path)
+    assert recording.name == "20210723091215"
+    np.testing.assert_allclose(track(recording, "ego").t, fixture.GRID, atol=1e-9)
+
+
+def test_copy_that_cyber_recorder_made(tmp_path):
+    write(tmp_path / "demo_3.5.record.split", ego_only())
+    assert only(tmp_path).name == "demo_3.5"
+
+
+def test_what_a_longer_file_left_behind(tmp_path):
+    """A record is written over without being emptied first; its index is its end."""
+    path = write(tmp_path / "a.record", ego_only())
+    path.write_bytes(path.read_bytes() + fixture.record(ego_only(8.0))[-3000:])
+    assert only(path).tracks[0].t.size == 21
 
 
 def test_prediction_where_perception_is_missing(tmp_path):
@@ -327,6 +355,18 @@ def test_routing_of_every_release(tmp_path, name):
     messages = [(name, 0.3, fixture.routing(*place(0))), *ego_only()]
     channels = {**fixture.CHANNELS, name: fixture.CHANNELS[ROUTING]}
     recording = only(tmp_path, messages, channels=channels)
+    assert destinations(recording) == {"ego": place(0)}
+    assert not any("no routing" in note for note in recording.notes)
+
+
+@pytest.mark.parametrize(
+    "name", ["/apollo/planning/command", "/apollo/planning_command_history"]
+)
+def test_routing_in_a_command_to_planning(tmp_path, name):
+    """Apollo 9 and later; a record from the middle of a drive has the history alone."""
+    commands = [(name, 0.3, fixture.command(*place(0))), (name, 3.0, fixture.parking())]
+    channels = {**fixture.CHANNELS, name: fixture.COMMANDS}
+    recording = only(tmp_path, [*commands, *ego_only(5.0)], channels=channels)
     assert destinations(recording) == {"ego": place(0)}
     assert not any("no routing" in note for note in recording.notes)
 

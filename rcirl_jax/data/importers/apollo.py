@@ -27,7 +27,9 @@ from rcirl_jax.data.importers.apollo_messages import LOCALIZATION, MANUAL, read_
 from rcirl_jax.data.importers.cyber_record import (
     drive_name,
     first_parts,
+    is_cut,
     parts_from,
+    run_name,
 )
 from rcirl_jax.data.importers.options import positive, section
 from rcirl_jax.data.importers.paths import path_lanes
@@ -60,19 +62,19 @@ NAN = float("nan")
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
-    """The first file of each drive: drives can be read without the others."""
+    """The first file of each run of parts: runs can be read without the others."""
     if path.is_file():
         return [path]
     return first_parts(path, str(spec.get("pattern", "*.record*")))
 
 
 def files_of(first: Path) -> list[Path]:
-    """The files of a drive, by its first one."""
+    """The files of a run, by its first one."""
     return parts_from(first)
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
-    """One Recording per drive, or per window of a long one."""
+    """One Recording per drive, or per window of a long one, or run of its parts."""
     for first in parts(path, spec):
         held, found = Held(first), False
         for recording in _windows(held, spec):
@@ -96,8 +98,8 @@ def _rate(spec: dict) -> float:
 
 def _windows(held: Held, spec: dict) -> Iterator[Recording]:
     """Recordings of a drive, each made once what it needs is read."""
-    drive, window = drive_name(held.path), positive(spec, "window_s", WINDOW_S)
-    windows, number = Windows(drive, drive, MAX_GAP_S), 0
+    name, window = run_name(held.path), positive(spec, "window_s", WINDOW_S)
+    windows, number = Windows(name, drive_name(held.path), MAX_GAP_S), 0
 
     def within() -> tuple[float, float]:
         return number * window, (number + 1) * window
@@ -140,7 +142,8 @@ def _recording(held: Held, within: tuple[float, float], spec: dict) -> Recording
         positive(spec, "speed_limit", LIMIT_MPS),
     )
     return Recording(
-        name=drive_name(path),
+        name=run_name(path),
+        group=drive_name(path) if is_cut(path) else None,
         source=str(spec.get("source", "Apollo cyber record")),
         licence=str(spec.get("licence", "unknown")),
         rate_hz=rate,

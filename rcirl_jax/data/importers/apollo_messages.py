@@ -32,6 +32,8 @@ TOPICS = {
         "/apollo/routing_response_history",
         "/apollo/raw_rrouting_response_history",  # so spelt since Apollo 9
     ),
+    # since Apollo 9; the command in force is sent again every second
+    "command": ("/apollo/planning/command", "/apollo/planning_command_history"),
 }
 POINT = {"x": None, "y": None}
 STAMP = {"timestamp_sec": None}
@@ -65,6 +67,7 @@ WANTED = {
     },
     "routing": ROUTE,
     "routing_history": ROUTE,
+    "command": {"lane_follow_command": ROUTE},
 }
 MANUAL = "COMPLETE_MANUAL"  # driving mode of a human driver
 MAX_ROWS = 5_000_000  # obstacle states held at once
@@ -210,6 +213,7 @@ def _add(rows: Rows, topic: str, time: float, found: dict[str, Any]) -> None:
         is_manual = found.get("driving_mode", MANUAL) == MANUAL
         rows.chassis.append((stamp, time, found.get("speed_mps", NAN), is_manual))
     else:
+        found = found.get("lane_follow_command", found)
         waypoints = found.get("routing_request", {}).get("waypoint", [])
         x, y = _point(waypoints[-1], "pose") if waypoints else (NAN, NAN)
         if np.isfinite(x) and np.isfinite(y):

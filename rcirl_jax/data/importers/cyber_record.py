@@ -12,7 +12,7 @@ import contextlib
 import mmap
 import re
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from rcirl_jax.data.importers.wire import (
@@ -30,7 +30,11 @@ HEADER_BYTES = 2048  # bytes that the header's section takes
 HEADER, CHUNK_HEADER, CHUNK_BODY, INDEX, CHANNEL = range(5)
 COMPRESSION = {1: "BZ2", 2: "LZ4"}
 MAX_DESCRIPTOR_BYTES = 64 * 1024**2  # bytes of one channel's descriptors
-NAME = re.compile(r"[^/]+?\.record(?:\.(?P<part>\d{1,9}))?")
+# NAME.record, or a part .record.00000; some releases add when it began, .112907, and
+# cyber_recorder what it did to a copy
+NAME = re.compile(
+    r"[^/]+?\.record(?:\.(?P<part>\d{1,9})(?:\.\d{1,20})?)?(?:\.(?:split|recover))?"
+)
 
 
 def drive_name(file: Path) -> str:
@@ -38,31 +42,55 @@ def drive_name(file: Path) -> str:
     return file.name.split(".record")[0]
 
 
+def run_name(first: Path) -> str:
+    """Name of a run of parts: its drive's, and its part behind a missing one."""
+    name, number = drive_name(first), _part(first)
+    is_first = number <= min(_parts_of(first), default=0)
+    return name if is_first else f"{name}-{number:05d}"
+
+
+def is_cut(first: Path) -> bool:
+    """Whether the drive of a run has other parts, which do not follow."""
+    return len(_parts_of(first)) > len(parts_from(first))
+
+
 def first_parts(folder: Path, pattern: str) -> list[Path]:
-    """The first file of each drive in a folder, sorted by name."""
-    files = [file for file in sorted(folder.glob(pattern)) if NAME.fullmatch(file.name)]
-    firsts: dict[str, Path] = {}
-    for file in sorted(files, key=_part):
-        firsts.setdefault(drive_name(file), file)
-    if not firsts:
+    """The first file of each run of parts in a folder, sorted by name."""
+    drives = _drives(folder.glob(pattern))
+    if not drives:
         raise InputError(f"{folder}: no file matches {pattern}: expected cyber records")
-    return sorted(firsts.values())
+    return sorted(
+        file
+        for parts in drives.values()
+        for number, file in parts.items()
+        if number - 1 not in parts
+    )
 
 
 def parts_from(file: Path) -> list[Path]:
     """A record and, if it is a part, those that follow: .00000, .00001, ..."""
-    match = NAME.fullmatch(file.name)
-    if match is None or match["part"] is None:
-        return [file]
-    found = {
-        _part(other): other
-        for other in file.parent.glob("*.record.*")
-        if NAME.fullmatch(other.name) and drive_name(other) == drive_name(file)
-    }
-    number, chain = _part(file), [file]
+    found, number, chain = _parts_of(file), _part(file), [file]
     while number + len(chain) in found:
         chain.append(found[number + len(chain)])
     return chain
+
+
+def _parts_of(file: Path) -> dict[int, Path]:
+    """Parts of a record's drive by their numbers; none if it is no part."""
+    match = NAME.fullmatch(file.name)
+    if match is None or match["part"] is None:
+        return {}
+    drives = _drives(file.parent.glob("*.record.*"))
+    return drives.get(drive_name(file), {})
+
+
+def _drives(files: Iterable[Path]) -> dict[str, dict[int, Path]]:
+    """Parts by drive and number; of a file and its copies the shortest name counts."""
+    drives: dict[str, dict[int, Path]] = {}
+    for file in sorted(files):
+        if NAME.fullmatch(file.name):
+            drives.setdefault(drive_name(file), {}).setdefault(_part(file), file)
+    return drives
 
 
 def _part(file: Path) -> int:
@@ -143,6 +171,8 @@ class Record:
                 raise self._truncated(at)
             yield kind, self._data[at : at + size]
             at += size
+            if kind == INDEX:  # the last; the rest is of a file written over
+                return
 
     def _truncated(self, at: int) -> InputError:
         return InputError(

@@ -260,6 +260,35 @@ ROUTING = file_of(
         ),
     ],
 )
+COMMAND = file_of(
+    "modules/common_msgs/planning_msgs/planning_command.proto",
+    "apollo.planning",
+    [
+        type_of("ParkingCommand", [field_of("parking_spot_id", 2, STRING)]),
+        type_of(
+            "PlanningCommand",
+            [
+                header_field(1),
+                field_of("command_id", 2, 3),
+                field_of(
+                    "lane_follow_command",
+                    3,
+                    MESSAGE,
+                    type_name=".apollo.routing.RoutingResponse",
+                ),
+                field_of(
+                    "parking_command",
+                    6,
+                    MESSAGE,
+                    type_name=".apollo.planning.ParkingCommand",
+                ),
+                field_of(
+                    "custom_command", 7, MESSAGE, type_name=".google.protobuf.Any"
+                ),
+            ],
+        ),
+    ],
+)
 
 
 def proto_desc(main, *needs):
@@ -268,6 +297,10 @@ def proto_desc(main, *needs):
 
 
 _HEADER, _GEOMETRY = proto_desc(HEADER), proto_desc(GEOMETRY)
+COMMANDS = (
+    "apollo.planning.PlanningCommand",
+    proto_desc(COMMAND, _HEADER, proto_desc(ROUTING, _HEADER, _GEOMETRY)),
+)
 CHANNELS = {
     "/apollo/localization/pose": (
         "apollo.localization.LocalizationEstimate",
@@ -364,6 +397,17 @@ def prediction(t):
 def routing(x, y):
     points = [(2, [(3, point(CENTRE[0], CENTRE[1]))]), (2, [(3, point(x, y))])]
     return message([(1, stamped(0.0)), (4, points)])
+
+
+def command(x, y):
+    """Since Apollo 9: the routing inside what planning is told to do."""
+    points = [(2, [(3, point(CENTRE[0], CENTRE[1]))]), (2, [(3, point(x, y))])]
+    follow = [(1, stamped(0.0)), (4, points)]
+    return message([(1, stamped(0.0)), (2, 7), (3, follow)])
+
+
+def parking():
+    return message([(1, stamped(0.0)), (2, 8), (6, [(2, "451089045")])])
 
 
 def perception_times():
