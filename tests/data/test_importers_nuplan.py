@@ -292,6 +292,14 @@ def test_map_names_cannot_leave_the_folder(folder, name):
     assert only(folder).lanes[0].id == "path-0"
 
 
+def test_maps_as_the_archive_unpacks_them(folder):
+    """nuplan-maps-v1.1.zip holds a folder nuplan-maps-v1.0."""
+    maps = folder.parents[2] / "maps"
+    (maps / "nuplan-maps-v1.0.json").write_text("{}")
+    maps.rename(maps.with_name("nuplan-maps-v1.0"))
+    assert "61" in lanes_of(only(folder))
+
+
 def test_latest_version_of_a_map(folder):
     city = folder.parents[2] / "maps" / fixture.CITY
     fixture.write_map(city / "9.17.0000" / "map.gpkg")

@@ -8,6 +8,8 @@ from rcirl_jax.errors import InputError
 
 # what importers read besides the input itself
 READ_BESIDE = (".csv", ".json", ".toml", ".xml", ".osm", ".gpkg")
+# folders of maps above an input; the second as nuPlan's archive unpacks
+MAP_FOLDERS = ("maps", "nuplan-maps-v1.0")
 
 
 def input_files(path: Path, pattern: str) -> list[Path]:
@@ -76,6 +78,7 @@ def listing(path: Path) -> list:
     beside = path.absolute().parent.glob("*")
     files |= {file for file in beside if file.suffix in READ_BESIDE}
     for above in path.absolute().parents[:5]:
-        files |= set((above / "maps").rglob("*"))
+        for name in MAP_FOLDERS:
+            files |= set((above / name).rglob("*"))
     stats = [(file, file.stat()) for file in sorted(files) if file.is_file()]
     return [[str(file), stat.st_size, stat.st_mtime_ns] for file, stat in stats]

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.data.importers.files import MAP_FOLDERS
 from rcirl_jax.data.importers.geopackage import Layers, zone_of
 from rcirl_jax.data.importers.shapes import (
     MIN_HALF_WIDTH_M,
@@ -35,7 +36,7 @@ MAX_LIMIT_MPS = 60.0  # m/s; faster "limits" are none
 STOP_SIGN = 1  # stop_polygon_type_fid
 NONE = -1  # no feature's number
 BLOCK = 256  # points measured at once; memory grows with it and the bound
-FOLDERS_UP = 6  # folders above a log in which "maps" is looked for
+FOLDERS_UP = 6  # folders above a log in which those of maps are looked for
 SAFE_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,99}")
 CENTRES = ("lane_fid", "lane_connector_fid")
 LANES = ("lane_fid", "lane_group_fid", "lane_index", "speed_limit_mps")
@@ -48,7 +49,7 @@ CONNECTOR_BOUNDS = "gen_lane_connectors_scaled_width_polygons"
 
 
 def find_map(file: Path, names: Sequence[str], spec: Mapping) -> Path | None:
-    """map.gpkg of a log: maps/NAME/VERSION/map.gpkg above it, or as in the TOML.
+    """map.gpkg of a log: MAP_FOLDERS/NAME/VERSION/ above it, or as in the TOML.
 
     Args:
       file: the log.
@@ -58,9 +59,9 @@ def find_map(file: Path, names: Sequence[str], spec: Mapping) -> Path | None:
     """
     given = str(spec.get("maps", ""))
     above = list(file.resolve().parents)[:FOLDERS_UP]
-    roots = [folder / (given or "maps") for folder in above]
-    roots = [root for root in (Path(given), *roots) if given or root != Path()]
-    for root in roots:
+    kept = [given] if given else MAP_FOLDERS
+    roots = [folder / name for folder in above for name in kept]
+    for root in [Path(given), *roots] if given else roots:
         for name in names:
             found = _versions(root, name)
             if found:
