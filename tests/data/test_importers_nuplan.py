@@ -100,6 +100,27 @@ def test_ego_is_the_box_at_the_clouds_time(folder):
     assert (turned.length, turned.width) == (4.0, 1.7)
 
 
+@pytest.mark.parametrize("indexed", [True, False])
+def test_rows_in_any_order(folder, log, indexed):
+    """A database has no order of rows: here that of the tokens, as of a key."""
+    for table in ("lidar_box", "lidar_pc", "ego_pose", "traffic_light_status"):
+        edit(
+            log,
+            f"CREATE TABLE kept AS SELECT * FROM {table}; DELETE FROM {table};"
+            f"INSERT INTO {table} SELECT * FROM kept ORDER BY substr(hex(token), 5);"
+            "DROP TABLE kept;",
+        )
+    if not indexed:
+        edit(log, "DROP INDEX ix_lidar_pc_timestamp")
+        edit(log, "DROP INDEX ix_lidar_box_lidar_pc_token")
+    found, expected = only(log), only(folder)
+    assert [track.id for track in found.tracks] == [t.id for t in expected.tracks]
+    for one, other in zip(found.tracks, expected.tracks, strict=True):
+        np.testing.assert_array_equal(one.t, other.t)
+        np.testing.assert_array_equal(one.x, other.x)
+    assert [s.state for s in found.signals] == [s.state for s in expected.signals]
+
+
 def test_heading_from_the_quaternion(log):
     half = 0.35
     edit(log, f"UPDATE ego_pose SET qw = {np.cos(half)}, qz = {np.sin(half)}")

@@ -290,9 +290,11 @@ def _others(log: _Log, first: float, last: float) -> tuple[list[Track], list[str
         )
     if not tokens:
         return [], ["no boxes recorded; the ego is alone"]
-    t, x, y, yaw, vx, vy, length, width = np.concatenate(values, axis=1)
+    table = np.concatenate(values, axis=1)
+    order = np.argsort(table[0], kind="stable")  # rows are stored in any order
+    t, x, y, yaw, vx, vy, length, width = table[:, order]
     check_coordinates(database.path, "lidar_box", ("x", "y"), np.stack([x, y], axis=1))
-    found, ids = np.unique(np.concatenate(tokens), return_inverse=True)
+    found, ids = np.unique(np.concatenate(tokens)[order], return_inverse=True)
     size = found.dtype.itemsize
     keys = [token.ljust(size, b"\0") for token in found.tolist()]
     unknown = next((key for key in keys if key not in log.kinds), None)
