@@ -137,6 +137,22 @@ def test_parts_named_by_when_they_began(tmp_path):
     np.testing.assert_allclose(track(recording, "ego").t, fixture.GRID, atol=1e-9)
 
 
+def test_a_folder_for_each_drive(tmp_path):
+    """As Apollo's own scripts record; parts follow each other inside a folder."""
+    for day in ("2021-07-23", "2021-07-24"):
+        (tmp_path / day).mkdir()
+        write(tmp_path / day / "demo.record.00000", ego_only())
+    write(tmp_path / "2021-07-24" / "x.record.00000", ego_only())
+    write(tmp_path / "2021-07-23" / "x.record.00001", ego_only())
+    names = [made.name for made in read_recordings("apollo", tmp_path)]
+    assert names == [
+        "2021-07-23/demo",
+        "2021-07-23/x",
+        "2021-07-24/demo",
+        "2021-07-24/x",
+    ]
+
+
 def test_copy_that_cyber_recorder_made(tmp_path):
     write(tmp_path / "demo_3.5.record.split", ego_only())
     assert only(tmp_path).name == "demo_3.5"

@@ -31,6 +31,7 @@ from rcirl_jax.data.importers.cyber_record import (
     parts_from,
     run_name,
 )
+from rcirl_jax.data.importers.files import log_name
 from rcirl_jax.data.importers.options import positive, section
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.perception import (
@@ -73,6 +74,11 @@ def files_of(first: Path) -> list[Path]:
     return parts_from(first)
 
 
+def own_name(first: Path) -> str:
+    """Name of a run, as long as no other folder has one called alike."""
+    return run_name(first)
+
+
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """One Recording per drive, or per window of a long one, or run of its parts."""
     for first in parts(path, spec):
@@ -98,7 +104,8 @@ def _rate(spec: dict) -> float:
 
 def _windows(held: Held, spec: dict) -> Iterator[Recording]:
     """Recordings of a drive, each made once what it needs is read."""
-    name, window = run_name(held.path), positive(spec, "window_s", WINDOW_S)
+    name = log_name(held.path, spec, run_name(held.path))
+    window = positive(spec, "window_s", WINDOW_S)
     windows, number = Windows(name, drive_name(held.path), MAX_GAP_S), 0
 
     def within() -> tuple[float, float]:
@@ -142,7 +149,7 @@ def _recording(held: Held, within: tuple[float, float], spec: dict) -> Recording
         positive(spec, "speed_limit", LIMIT_MPS),
     )
     return Recording(
-        name=run_name(path),
+        name=log_name(path, spec, run_name(path)),
         group=drive_name(path) if is_cut(path) else None,
         source=str(spec.get("source", "Apollo cyber record")),
         licence=str(spec.get("licence", "unknown")),

@@ -15,6 +15,7 @@ import struct
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
+from rcirl_jax.data.importers.files import files_below
 from rcirl_jax.data.importers.wire import (
     MAX_DEPTH,
     Schema,
@@ -55,8 +56,8 @@ def is_cut(first: Path) -> bool:
 
 
 def first_parts(folder: Path, pattern: str) -> list[Path]:
-    """The first file of each run of parts in a folder, sorted by name."""
-    drives = _drives(folder.glob(pattern))
+    """The first file of each run of parts at any depth of a folder, sorted."""
+    drives = _drives(files_below(folder, pattern))
     if not drives:
         raise InputError(f"{folder}: no file matches {pattern}: expected cyber records")
     return sorted(
@@ -81,15 +82,20 @@ def _parts_of(file: Path) -> dict[int, Path]:
     if match is None or match["part"] is None:
         return {}
     drives = _drives(file.parent.glob("*.record.*"))
-    return drives.get(drive_name(file), {})
+    return drives.get(_drive(file), {})
 
 
-def _drives(files: Iterable[Path]) -> dict[str, dict[int, Path]]:
+def _drive(file: Path) -> Path:
+    """The drive of a record, told from those of its name in other folders."""
+    return file.parent / drive_name(file)
+
+
+def _drives(files: Iterable[Path]) -> dict[Path, dict[int, Path]]:
     """Parts by drive and number; of a file and its copies the shortest name counts."""
-    drives: dict[str, dict[int, Path]] = {}
+    drives: dict[Path, dict[int, Path]] = {}
     for file in sorted(files):
         if NAME.fullmatch(file.name):
-            drives.setdefault(drive_name(file), {}).setdefault(_part(file), file)
+            drives.setdefault(_drive(file), {}).setdefault(_part(file), file)
     return drives
 
 
