@@ -32,7 +32,7 @@ TOPICS = {
         "/apollo/routing_response_history",
         "/apollo/raw_rrouting_response_history",  # so spelt since Apollo 9
     ),
-    # since Apollo 9; the command in force is sent again every second
+    # since Apollo 9; who listens late is given the last of the history
     "command": ("/apollo/planning/command", "/apollo/planning_command_history"),
 }
 POINT = {"x": None, "y": None}
