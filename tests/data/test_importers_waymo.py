@@ -646,11 +646,17 @@ def test_no_files(tmp_path):
 
 
 def test_other_messages_are_refused(tmp_path):
-    """tf_example files hold tf.train.Example: field 1 with a map of features."""
+    """tf_example files hold tf.train.Example: field 1 with a map of features.
+
+    lidar_and_camera files hold scenarios of an id, laser data and camera tokens.
+    """
     feature = [(1, [(1, "scenario/id"), (2, [(1, [(1, b"637f")])])])]
-    for data in (w.message([(1, feature)]), b"", w.message([(5, "id")])):
+    sensors = [(5, "id"), (12, [(1, [(1, 1), (2, bytes(900))])]), (13, [(1, 2)])]
+    for data in (w.message([(1, feature)]), b"", w.message(sensors)):
         path = put(tmp_path, data)
-        assert "tracks: none: expected Scenario messages" in message(path)
+        found = message(path)
+        assert "tracks: none: expected Scenario messages" in found
+        assert "not tf_example/ or lidar_and_camera/" in found
 
 
 def bad_track(**changes):

@@ -116,7 +116,8 @@ def _read_scenario(where: str, default: str, data: bytes, spec: dict) -> Recordi
     if not len(spans):
         raise record.error(
             "tracks: none",
-            "Scenario messages (the folder scenario/, not tf_example/)",
+            "Scenario messages (the folder scenario/, not tf_example/ or "
+            "lidar_and_camera/)",
         )
     heads = [record.walk(span, (TRACK_ID, OBJECT_TYPE, STATES)) for span in spans]
     states = _states(record, scenario, heads)
