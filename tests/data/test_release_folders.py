@@ -12,6 +12,7 @@ from rcirl_jax.data.store import open_dataset
 from rcirl_jax.errors import InputError
 from tests.data import writers as w
 from tests.data.formats import (
+    argoverse2,
     commonroad,
     interaction,
     interaction_challenge,
@@ -20,6 +21,7 @@ from tests.data.formats import (
     ngsim,
     nuplan,
     openacc,
+    waymo,
 )
 from tests.data.small_logs import CONFIG
 
@@ -150,7 +152,10 @@ def test_sumo_beside_commonroad(tmp_path):
         names("commonroad", tmp_path)
 
 
-RESTS = [commonroad, interaction, interaction_challenge, levelx, ngsim, openacc]
+RESTS = [
+    *(argoverse2, commonroad, interaction, interaction_challenge),
+    *(levelx, ngsim, openacc, waymo),
+]
 
 
 @pytest.mark.parametrize("module", RESTS)

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.importers.argoverse2_map import read_lanes
+from rcirl_jax.data.importers.files import files_matching
 from rcirl_jax.data.importers.options import (
     kind_of,
     patterns,
@@ -75,17 +76,8 @@ class _Clock:
 
 def parts(path: Path, spec: dict) -> list[Path]:
     """The scenario files; each can be read alone."""
-    if path.is_file():
-        return [path]
     wanted = patterns(spec, [f"{PREFIX}*{SUFFIX}"])
-    found = {
-        file for pattern in wanted for file in path.rglob(pattern) if file.is_file()
-    }
-    if not found:
-        raise InputError(
-            f"{path}: no file matches {', '.join(wanted)}: expected scenario files"
-        )
-    return sorted(found)
+    return files_matching(path, wanted, "scenario files")
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:

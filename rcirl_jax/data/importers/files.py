@@ -31,6 +31,19 @@ def files_below(path: Path, pattern: str) -> list[Path]:
     return input_files(path, pattern)
 
 
+def files_matching(path: Path, wanted: Sequence[str], what: str) -> list[Path]:
+    """The file itself, or those at any depth that match a pattern, sorted."""
+    if path.is_file():
+        return [path]
+    found = {file for pattern in wanted for file in path.rglob(pattern)}
+    files = sorted(file for file in found if is_input(path, file))
+    if not files:
+        raise InputError(
+            f"{path}: no file matches {', '.join(wanted)}: expected {what}"
+        )
+    return files
+
+
 def is_input(folder: Path, file: Path) -> bool:
     """Whether it is a file, not hidden in a folder, and no rest of unpacking.
 

@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.data.importers.files import files_matching
 from rcirl_jax.data.importers.options import (
     kind_of,
     patterns,
@@ -38,7 +39,6 @@ from rcirl_jax.data.importers.tfrecord import FRAME_BYTES, read_records
 from rcirl_jax.data.importers.waymo_map import read_map
 from rcirl_jax.data.importers.wire_columns import Fields, Record
 from rcirl_jax.data.recording import LENGTH_RANGE_M, WIDTH_RANGE_M, accepted
-from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane, Recording, Track
 
 # field numbers of scenario.proto
@@ -80,17 +80,7 @@ class _States:
 
 def parts(path: Path, spec: dict) -> list[Path]:
     """The TFRecord files; each can be read alone."""
-    if path.is_file():
-        return [path]
-    wanted = patterns(spec, PATTERNS)
-    found = {
-        file for pattern in wanted for file in path.rglob(pattern) if file.is_file()
-    }
-    if not found:
-        raise InputError(
-            f"{path}: no file matches {', '.join(wanted)}: expected TFRecord files"
-        )
-    return sorted(found)
+    return files_matching(path, patterns(spec, PATTERNS), "TFRecord files")
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
