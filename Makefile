@@ -7,20 +7,47 @@ OUT    ?= out/demo
 WORKERS ?= 2
 # folder of recordings for `make bench`; what is not there is left out
 RECORDINGS ?= ../shared/data
+# folder of the locked versions; `LOCK=` takes the newest that pyproject.toml allows
+LOCK ?= requirements
+PIP := -m pip --quiet --disable-pip-version-check
 
-.PHONY: demo test test-slow test-dataset lint bench docs onboard setup clean
+# $(call install,VENV,EXTRA): what EXTRA needs, each file by its hash, then the project
+install = $(if $(LOCK),\
+  $(1)/bin/python $(PIP) install --requirement $(LOCK)/$(2).lock --require-hashes && \
+  $(1)/bin/python $(PIP) install --no-deps --no-build-isolation --editable .,\
+  $(1)/bin/python $(PIP) install --editable '.[$(2)]')
+
+# Minutes; they touch every dependency: logs, store, two epochs, resume, export, readers, pages
+QUICK := $(addprefix tests/train/test_loop.py::test_,resume_is_bitwise run_writes_what_it_should \
+  export_rank_report exported_values_are_the_trainers) \
+  tests/data/test_conformance.py tests/data/test_store.py \
+  tests/data/test_import_elsewhere.py::test_no_cluster_is_one_line \
+  tests/evaluation/test_tuning.py::test_it_finds_the_minimum_of_a_shifted_sphere \
+  tests/export/test_forms.py tests/export/test_reader.py tests/export/test_weights.py \
+  tests/features tests/report/test_data_page.py
+QUICKLY = -m pytest -q -m "not slow and not dataset" $(QUICK)
+
+.PHONY: demo test test-slow test-dataset test-floor test-ceiling lint bench docs onboard setup
+.PHONY: lock audit wheel clean
 
 setup: $(VENV)/.installed
 
-$(VENV)/.installed: pyproject.toml
+$(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "error: $(PYTHON): Python >= 3.11 is needed (set PYTHON=...)"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
+
+# What users need, and what the tests need besides
+$(VENV)/.all: pyproject.toml $(if $(LOCK),$(LOCK)/all.lock) | $(BIN)/python
+	$(call install,$(VENV),all)
 	@touch $@
 
+$(VENV)/.installed: pyproject.toml $(if $(LOCK),$(LOCK)/test.lock) | $(BIN)/python
+	$(call install,$(VENV),test)
+	@touch $(VENV)/.all $@
+
 # The main job, end to end, on synthetic human traffic: import, train, rank, simulate, gate, report.
-demo: setup
+demo: $(VENV)/.all
 	$(BIN)/python -m experiments.autotune --workdir=$(OUT) --stride=6 --epochs=6 --cases=10 --duration=20
 
 test: setup
@@ -33,6 +60,40 @@ test-dataset: setup
 test-slow: setup
 	$(BIN)/python -m pytest -q -m "slow and not dataset"
 
+# The quick tests with the oldest versions allowed; they run among newer neighbours that
+# announce changes to come, so such announcements are no errors here
+test-floor: build/floor/.installed
+	build/floor/bin/python $(QUICKLY) -W default::DeprecationWarning
+
+build/floor/.installed: pyproject.toml requirements/floor.lock
+	rm -rf build/floor
+	$(PYTHON) -m venv build/floor
+	build/floor/bin/python $(PIP) install --require-hashes --requirement requirements/floor.lock
+	build/floor/bin/python $(PIP) install --no-deps --no-build-isolation --editable .
+	@touch $@
+
+# The quick tests with the newest versions allowed, whatever is locked
+test-ceiling:
+	rm -rf build/ceiling
+	$(PYTHON) -m venv build/ceiling
+	build/ceiling/bin/python $(PIP) install --editable '.[quick]'
+	build/ceiling/bin/python $(QUICKLY)
+
+# Source distribution, a wheel made of it, and the quick tests far from this folder with
+# what the wheel alone brings
+wheel: setup
+	rm -rf dist
+	$(BIN)/python -m hatchling build --target sdist
+	$(BIN)/python $(PIP) wheel --no-deps --no-build-isolation --wheel-dir dist dist/*.tar.gz
+	wheel=$$(realpath dist/*.whl) lock=$$(realpath $(LOCK)/test.lock) away=$$(mktemp -d); \
+	  trap 'rm -rf "$$away"' EXIT; set -e; \
+	  $(BIN)/python -m venv $$away/venv; cp -R tests pyproject.toml $$away; cd $$away; \
+	  venv/bin/python $(PIP) install --require-hashes --requirement $$lock; \
+	  venv/bin/python $(PIP) install --no-deps --no-index $$wheel; \
+	  venv/bin/python -c 'import experiments, rcirl_jax as r; print(r.__file__)'; \
+	  venv/bin/python $(QUICKLY); \
+	  venv/bin/python -m experiments.autotune --helpfull | grep -q workdir
+
 lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -40,7 +101,7 @@ lint: setup
 	$(BIN)/lint-imports
 
 $(VENV)/.bench: pyproject.toml | setup
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[bench]'
+	$(BIN)/python $(PIP) install --editable '.[bench]'
 	@touch $@
 
 # All benchmarks, three quarters of an hour; wants a quiet machine. Writes benchmarks/results and
@@ -72,6 +133,27 @@ onboard:
 	cmake -S onboard -B build/onboard -DRCIRL_WERROR=ON
 	cmake --build build/onboard --parallel $(WORKERS)
 	cd build/onboard && ctest --output-on-failure
+
+# Locked versions anew, for every Python and platform at once; `UPGRADE=` keeps what still fits
+UPGRADE ?= --upgrade
+lock: export UV_CUSTOM_COMPILE_COMMAND = make lock
+lock: COMPILE = build/tools/bin/uv pip compile --quiet $(UPGRADE) --universal --python-version 3.11 \
+  --generate-hashes --only-binary :all: --emit-build-options --no-emit-index-url --no-annotate
+lock: PROJECT = pyproject.toml requirements/build.in
+lock: build/tools/.installed
+	$(COMPILE) $(PROJECT) --extra test --output-file requirements/test.lock
+	$(COMPILE) $(PROJECT) --extra all --constraint requirements/test.lock --output-file requirements/all.lock
+	$(COMPILE) $(PROJECT) --extra quick --resolution lowest-direct --output-file requirements/floor.lock
+	$(COMPILE) requirements/tools.in --output-file requirements/tools.lock
+
+build/tools/.installed: $(if $(LOCK),$(LOCK)/tools.lock,requirements/tools.in)
+	$(PYTHON) -m venv build/tools
+	build/tools/bin/python $(PIP) install --requirement $<
+	@touch $@
+
+# Known vulnerabilities of the locked versions; `AUDIT=--vulnerability-service=osv` asks elsewhere
+audit: build/tools/.installed
+	build/tools/bin/python .ci/audit.py $(AUDIT) $(addprefix requirements/,all.lock test.lock tools.lock)
 
 clean:
 	rm -rf $(VENV) out build dist
