@@ -24,7 +24,7 @@ QUICK := $(addprefix tests/train/test_loop.py::test_,resume_is_bitwise run_write
   tests/data/test_import_elsewhere.py::test_no_cluster_is_one_line \
   tests/evaluation/test_tuning.py::test_it_finds_the_minimum_of_a_shifted_sphere \
   tests/export/test_forms.py tests/export/test_reader.py tests/export/test_weights.py \
-  tests/features tests/report/test_data_page.py
+  tests/features/test_features.py::test_equals_the_oracle tests/report/test_data_page.py
 QUICKLY = -m pytest -q -m "not slow and not dataset" $(QUICK)
 
 .PHONY: demo test test-slow test-dataset test-floor test-ceiling lint bench docs onboard setup

@@ -2,6 +2,7 @@
 
 import os
 import platform
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -10,9 +11,11 @@ from pathlib import Path
 
 from absl import app, flags, logging
 
+from rcirl_jax import __version__
 from rcirl_jax.errors import InputError
 
 EXIT_BAD_INPUT = 2
+HOOK_VARIABLES = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE")
 
 
 def run(main: Callable[[], None]) -> None:
@@ -102,6 +105,7 @@ def provenance() -> dict:
         "git_commit": git_commit(),
         "versions": {
             "python": platform.python_version(),
+            "rcirl-jax": __version__,
             **{name: metadata.version(name) for name in packages},
         },
         "machine": platform.machine(),
@@ -122,8 +126,16 @@ def processor() -> dict:
 
 
 def git_commit() -> str:
-    """The checkout's commit, with "+" when it has changes; "" outside git."""
+    """The checkout's commit, with "+" when it has changes; "" outside of one.
+
+    An installed package reports nothing, even below another repository's folder.
+    """
     root = Path(__file__).resolve().parents[1]
+    if shutil.which("git") is None:
+        return ""
+    # neither a folder above nor a hook's variables may name another repository
+    given = {k: v for k, v in os.environ.items() if k not in HOOK_VARIABLES}
+    env = {**given, "GIT_CEILING_DIRECTORIES": str(root.parent)}
 
     def git(*words: str) -> str:
         done = subprocess.run(
@@ -131,6 +143,7 @@ def git_commit() -> str:
             capture_output=True,
             text=True,
             check=False,
+            env=env,
         )
         return done.stdout.strip() if done.returncode == 0 else ""
 

@@ -7,10 +7,10 @@ from rcirl_jax.errors import InputError
 
 
 def spec_root() -> Path:
-    """The folder data_specs: of the checkout, else the copy in the wheel."""
+    """The folder data_specs: the copy in the wheel, else that of the checkout."""
     package = Path(__file__).resolve().parent
-    checkout = package.parent / "data_specs"
-    return checkout if checkout.is_dir() else package / "data_specs"
+    installed = package / "data_specs"
+    return installed if installed.is_dir() else package.parent / "data_specs"
 
 
 def load_toml(path: Path) -> dict:

@@ -1,0 +1,200 @@
+"""What is released: locked versions, the wheel's files, the commit it reports."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from zipfile import ZipFile
+
+import pytest
+from hatchling.builders.wheel import WheelBuilder
+from packaging.markers import default_environment
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+from experiments import common
+from tests.conftest import REPO
+
+LOCKS = sorted((REPO / "requirements").glob("*.lock"))
+VERSIONS = ("3.11.7", "3.12.1", "3.13.0", "3.14.0")
+PIN = re.compile(
+    r"^([\w.-]+)==(\S+)(?: ; ([^\\\n]+?))?((?: \\\n    --hash=\S+)+)$", re.M
+)
+
+
+def pins(name):
+    """(requirement, its hashes) of every line of a lock file."""
+    text = (REPO / "requirements" / f"{name}.lock").read_text()
+    found = [
+        (
+            Requirement(f"{n}=={v}" + (f" ; {m}" if m else "")),
+            hashes.split("--hash=")[1:],
+        )
+        for n, v, m, hashes in PIN.findall(text)
+    ]
+    assert len(found) == len(re.findall(r"^[\w.-]+==", text, re.M))
+    return found
+
+
+def asked(extra, environment):
+    """Requirements of the project with one extra, extras of its own unfolded."""
+    project = tomllib.loads((REPO / "pyproject.toml").read_text())["project"]
+    todo = [*project["dependencies"], f"rcirl-jax[{extra}]"]
+    while todo:
+        requirement = Requirement(todo.pop())
+        if requirement.name == "rcirl-jax":
+            for name in requirement.extras:
+                todo += project["optional-dependencies"][name]
+        elif not requirement.marker or requirement.marker.evaluate(environment):
+            yield requirement
+
+
+@pytest.mark.parametrize("file", LOCKS, ids=lambda file: file.stem)
+def test_locked_files_have_hashes_and_no_place(file):
+    text = file.read_text()
+    assert "://" not in text
+    assert "--only-binary :all:" in text
+    for requirement, hashes in pins(file.stem):
+        assert hashes, requirement
+        assert all(re.fullmatch(r"sha256:[0-9a-f]{64} ?\\?\n?\s*", h) for h in hashes)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+@pytest.mark.parametrize(
+    ("name", "extra"), [("all", "all"), ("test", "test"), ("floor", "quick")]
+)
+def test_what_the_project_asks_for_is_locked_once(name, extra, version):
+    short = ".".join(version.split(".")[:2])
+    environment = default_environment() | {
+        "python_version": short,
+        "python_full_version": version,
+    }
+    locked = {}
+    for pin, _ in pins(name):
+        if not pin.marker or pin.marker.evaluate(environment):
+            assert pin.name not in locked, pin
+            locked[pin.name] = next(iter(pin.specifier)).version
+    wanted = list(asked(extra, environment))
+    assert len(wanted) > 15
+    for requirement in wanted:
+        found = locked[canonicalize_name(requirement.name)]
+        assert requirement.specifier.contains(found), f"{requirement}: {found}"
+    assert {"hatchling", "editables"} <= locked.keys()
+
+
+def test_users_get_the_versions_that_are_tested():
+    tested = {(pin.name, str(pin.specifier)) for pin, _ in pins("test")}
+    assert {(pin.name, str(pin.specifier)) for pin, _ in pins("all")} <= tested
+
+
+# -------------------------------------------------------------------- advisories
+
+ANSWERS = {
+    "clean": [{"name": "numpy", "version": "2.0.0", "vulns": []}],
+    "flawed": [
+        {
+            "name": "numpy",
+            "version": "2.0.0",
+            "vulns": [{"id": "X-1", "fix_versions": ["2.0.1"]}],
+        }
+    ],
+    "silent": [{"name": "numpy", "version": "2.0.0", "skip_reason": "not there"}],
+    "broken": None,
+}
+
+
+@pytest.mark.parametrize(
+    ("answer", "status", "said"),
+    [
+        ("clean", 0, "audit: 1 locked versions, no known vulnerability"),
+        ("flawed", 1, "numpy 2.0.0: X-1, fixed in 2.0.1"),
+        ("silent", 2, "error: audit: 1 of 1 locked versions not audited"),
+        ("broken", 2, "pip-audit: no such host"),
+    ],
+)
+def test_an_audit_that_nobody_answers_is_not_passed(tmp_path, answer, status, said):
+    """With a pip-audit of our own making beside the Python."""
+    body = ANSWERS[answer]
+    told = "" if body is None else json.dumps({"dependencies": body})
+    tool = tmp_path / "pip-audit"
+    tool.write_text(f"#!/bin/sh\necho 'no such host' >&2\necho '{told}'\n")
+    tool.chmod(0o755)
+    (tmp_path / "python").symlink_to(sys.executable)
+    lock = tmp_path / "a.lock"
+    lock.write_text("numpy==2.0.0 ; python_version < '3.12' \\\n    --hash=sha256:0\n")
+    done = subprocess.run(
+        [tmp_path / "python", REPO / ".ci" / "audit.py", lock],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == status, done.stderr
+    lines = (done.stdout + done.stderr).splitlines()
+    assert len(lines) == 1
+    assert said in lines[0]
+
+
+# ------------------------------------------------------------------------- wheel
+
+
+def test_the_wheel_holds_what_the_package_reads(tmp_path):
+    builder = WheelBuilder(str(REPO))
+    (wheel,) = builder.build(directory=str(tmp_path), versions=["standard"])
+    packed = {name.split(".dist-info/")[-1] for name in ZipFile(wheel).namelist()}
+    rooms = {"rcirl_jax": "", "experiments": "", "data_specs": "rcirl_jax/"}
+    wanted = {
+        f"{above}{path.relative_to(REPO)}"
+        for room, above in rooms.items()
+        for path in (REPO / room).rglob("*.*")
+        if "__pycache__" not in path.parts
+    }
+    assert len(wanted) > 300
+    assert wanted <= packed
+    assert {"rcirl_jax/py.typed", "licenses/LICENSE", "licenses/NOTICE"} <= packed
+
+
+# ------------------------------------------------------------------------ commit
+
+
+def git(folder, *words):
+    done = subprocess.run(
+        ["git", "-C", folder, "-c", "user.name=a", "-c", "user.email=a@b", *words],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    return done.stdout.strip()
+
+
+@pytest.fixture
+def repository(tmp_path):
+    """A repository with one commit that is not ours."""
+    git(tmp_path, "init", "--quiet")
+    (tmp_path / "file").write_text("1")
+    git(tmp_path, "add", "file")
+    git(tmp_path, "commit", "--quiet", "--message=first")
+    return tmp_path
+
+
+def commit_of(root, monkeypatch):
+    """What the package says when it lies in `root`."""
+    monkeypatch.setattr(common, "__file__", str(root / "experiments" / "common.py"))
+    return common.git_commit()
+
+
+def test_the_commit_is_the_checkouts(repository, monkeypatch):
+    head = git(repository, "rev-parse", "HEAD")
+    assert commit_of(repository, monkeypatch) == head
+    (repository / "file").write_text("2")
+    assert commit_of(repository, monkeypatch) == head + "+"
+
+
+def test_an_installed_package_reports_no_other_repository(repository, monkeypatch):
+    inside = repository / "venv" / "site-packages"
+    inside.mkdir(parents=True)
+    assert commit_of(inside, monkeypatch) == ""
+    monkeypatch.setenv("GIT_DIR", str(repository / ".git"))
+    assert commit_of(inside, monkeypatch) == ""
+
+
+def test_no_git_is_no_commit(repository, monkeypatch):
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    assert commit_of(repository, monkeypatch) == ""
