@@ -17,7 +17,7 @@ import dataclasses
 import hashlib
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import zip_longest
 from typing import Any, NoReturn
 
@@ -335,9 +335,10 @@ def _unpack(field: str, data: bytes) -> object:
             _fail(field, "too many entries", f"at most {MAX_NODES}")
         return items
 
-    def on_map(pairs: list[tuple[Any, Any]]) -> dict[str, Any]:
-        result = dict(on_list(pairs))
-        if len(result) != len(pairs) or not all(isinstance(k, str) for k in result):
+    def on_map(pairs: Iterable[tuple[Any, Any]]) -> dict[str, Any]:
+        entries = on_list(list(pairs))  # older msgpack without its C part: an iterator
+        result = dict(entries)
+        if len(result) != len(entries) or not all(isinstance(k, str) for k in result):
             _fail(field, "a key used twice or not a text", "text keys, each once")
         return result
 
