@@ -50,6 +50,9 @@ def check_run(workdir: Path, config: TrainConfig, dataset: Demonstrations) -> No
     usual = _described(TrainConfig(), dataset)["config"]  # of settings added since
     if found.get("dataset_hash") != described["dataset_hash"]:
         raise InputError(f"{path}: dataset_hash: made from another dataset")
+    for name in found["config"]:
+        if name not in described["config"]:
+            raise InputError(f"{path}: {name}: unknown: expected a run of this version")
     for name, setting in described["config"].items():
         before = found["config"].get(name, usual[name])
         if before != setting and name != "epochs":

@@ -1,7 +1,9 @@
 import hashlib
 import json
 import shutil
+import tarfile
 import tracemalloc
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -16,6 +18,7 @@ from rcirl_jax.data.store import DatasetWriter, open_dataset
 from rcirl_jax.errors import InputError
 from tests import scenes
 
+GOLDEN = Path(__file__).parent / "golden"
 SIZES = (300, 40, 7)  # rows per shard: more than one block, less than one block
 NUM_GROUPS = 4
 SPECIAL = np.array([np.nan, -np.nan, np.inf, -np.inf, -0.0, 1e-42, 3.4e38], np.float32)
@@ -336,6 +339,33 @@ def test_manifests_that_are_none(copy, text):
     (copy / "manifest.json").write_text(text)
     with pytest.raises(InputError, match=r"manifest.json: "):
         open_dataset(copy)
+
+
+def test_a_dataset_of_an_old_version_reads_as_it_was(tmp_path):
+    """Written by 81c261a, the first commit with datasets; never made anew.
+
+    Leaf number i of row r is i/2 + r; flags and numbers by their remainders.
+    """
+    with tarfile.open(GOLDEN / "dataset_1.tar.xz") as archive:
+        archive.extractall(tmp_path, filter="data")
+    dataset = open_dataset(tmp_path)
+    assert dataset.manifest.schema_version == 1
+    assert dataset.hash == (
+        "1497094f14c7c9354adcb4194496e450a459f4f55bba1fb26c8b24b813831634"
+    )
+    rows = np.arange(3)
+    assert dataset.indices("train").tolist() == [0, 2]
+    read = dataset.load(None)
+    own = (read.group, read.vehicle, read.recording)
+    for number, leaf in enumerate(jax.tree.leaves(read)):
+        kind = {"f": 0.5 * number + rows, "b": (number + rows) % 2 == 1}
+        expected = kind.get(leaf.dtype.kind, (number + rows) % 3)
+        if any(leaf is other for other in own):
+            expected = rows % 2
+        flat = leaf.reshape(3, -1)
+        np.testing.assert_array_equal(
+            flat, np.broadcast_to(expected[:, None], flat.shape)
+        )
 
 
 def test_no_dataset_and_interrupted_import_are_told_apart(copy, tmp_path):

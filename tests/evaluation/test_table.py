@@ -25,7 +25,7 @@ from rcirl_jax.evaluation.statistics import (
     combine_seeds,
     paired_difference,
 )
-from rcirl_jax.evaluation.table import RIVALS, verdict
+from rcirl_jax.evaluation.table import RIVALS, from_json, verdict
 
 SCENES, CANDIDATES, VEHICLES = 240, 12, 40
 
@@ -258,6 +258,13 @@ def test_json_is_plain_versioned_and_complete(report):
     assert stored == pytest.approx(dataclasses.asdict(found), rel=1e-8)
     assert made["rows"]["IDM"]["top1_fde"]["seed_sd"] is None
     assert len(made["comparisons"]) == len(report.comparisons)
+
+
+def test_json_of_a_later_version_is_refused(report):
+    later = {**to_json(report), "schema_version": 2, "added": 1}
+    with pytest.raises(InputError, match=r"report: schema: .*, 2\): expected .*, 1\)"):
+        from_json(later)
+    assert from_json(to_json(report)).counts == report.counts
 
 
 def test_json_refuses_what_is_not_finite(report):

@@ -326,6 +326,11 @@ def test_a_wrong_field_is_named(path, value, message):
             sealed(body_of(), schema_version=3),
             "schema_version: 3: expected 1 or 2, all this reader supports",
         ),
+        # whatever a later version adds, its number is what is named
+        (
+            sealed(b"later", schema_version=4, magic="RCIRLW", signature="x"),
+            "schema_version: 4: expected 1 or 2, all this reader supports",
+        ),
         (
             sealed(body_of(), schema_version=2),
             "body.context: missing: expected the keys",

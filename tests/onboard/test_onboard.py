@@ -21,7 +21,7 @@ from rcirl_jax.export import (
     load_weights,
     save,
 )
-from tests.export import test_reader
+from tests.export import test_old_files, test_reader
 from tests.weights_files import packed, trained_network
 
 ONBOARD = Path(__file__).resolve().parents[2] / "onboard"
@@ -125,6 +125,17 @@ def test_ten_thousand_scores_equal_python_and_jax(
             assert np.all(np.abs(found - jax_values) <= close)
 
 
+@pytest.mark.parametrize("version", [1, 2])
+def test_an_old_file_scores_as_it_did(programs, tmp_path, version):
+    path, features, valid, expected = test_old_files.golden(version)
+    features.astype(np.float32).tofile(tmp_path / "features")
+    valid.astype(np.uint8).tofile(tmp_path / "valid")
+    command = (programs / "reader", "score", path)
+    bytes_out = run(*command, tmp_path / "features", tmp_path / "valid")
+    found = np.frombuffer(bytes_out, np.float32)
+    assert np.all(np.abs(found - expected) <= 1e-5 * np.maximum(1.0, np.abs(expected)))
+
+
 def test_choose_takes_the_best_candidate_that_has_a_value(programs, tmp_path):
     path = tmp_path / "weights.msgpack"
     path.write_bytes(VALID)
@@ -187,6 +198,8 @@ def test_wrong_fields_are_named_as_by_the_python_reader(programs, tmp_path):
     assert len(fields) > 50
     assert len(files) > 20
     lines = verdicts(programs, fields + files, tmp_path)
+    later = "schema_version: 4: expected 1 or 2, all this reader supports"
+    assert f"w: {later}" in lines
     for data, line in zip(fields + files, lines, strict=True):
         field = test_reader.refusal(data).split(": ")[0]
         # The Python reader counts times that do not increase from the second one.

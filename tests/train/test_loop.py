@@ -4,6 +4,7 @@ import dataclasses
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -34,6 +35,7 @@ from rcirl_jax.train.running import check_run
 from rcirl_jax.train.state import TrainConfig
 from tests.conftest import REPO
 
+GOLDEN = Path(__file__).parent / "golden"
 SMALL = SamplerConfig(num_random=4, cruise_times=(4.0,), edge_times=(4.0,))
 CONFIG = TrainConfig(batch_size=8, epochs=3, sampler=SMALL)
 
@@ -173,6 +175,26 @@ def test_a_broken_run_file_is_one_line(dataset, tmp_path, text):
     (tmp_path / "run.json").write_text(text)
     with pytest.raises(InputError, match=r"run\.json: .*: expected the file of a tr"):
         check_run(tmp_path, CONFIG, dataset)
+
+
+def test_the_run_file_of_an_old_version_reads_with_what_was_usual():
+    """Of 81c261a, with the settings that there were; what came since is as before."""
+    config, run = read_config(GOLDEN)
+    assert config == TrainConfig()
+    assert len(run["config"]) < len(dataclasses.asdict(config))
+    assert run["git_commit"] == "81c261a"
+
+
+def test_a_run_of_a_later_version_is_refused(dataset, run, tmp_path):
+    """A setting that this version does not know may have changed the result."""
+    body = json.loads((run[0] / "run.json").read_text())
+    body["config"]["momentum"] = 0.9
+    (tmp_path / "run.json").write_text(json.dumps(body))
+    with pytest.raises(InputError, match=r"run\.json: momentum: unknown: expected a r"):
+        train(dataset, tmp_path, CONFIG)
+    with pytest.raises(InputError, match=r"run\.json: .*momentum.*: expected a run of"):
+        export_run(tmp_path, dataset, tmp_path / "weights.msgpack")
+    assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
 
 
 @pytest.mark.parametrize("seed", [-1, 2**31])

@@ -83,6 +83,7 @@ SHORT = {"s": [0.0] * (NUM_TIMES - 1)}
     [
         ((), {}, "1 lines: expected a head and preferences"),
         ((line(),), {"schema": "other"}, "line 1: schema: other: expected rcirl"),
+        ((line(),), {"schema_version": 2}, "line 1: schema_version: 2: expected 1"),
         ((line(),), {"dataset_sha256": "x"}, "line 1: dataset_sha256: x: expected d"),
         (("{",), {}, "line 2: expected JSON"),
         (("[" * 100000,), {}, "line 2: expected JSON"),

@@ -1,0 +1,58 @@
+"""Files that earlier versions wrote are read as they were, later ones refused.
+
+The golden files were written, and their values computed, by the first commits that
+knew their version (1: 81c261a, 2: 41456a9). They are never made anew: a reader that
+fails here would strand the weights that planners have.
+"""
+
+import hashlib
+import json
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+
+from rcirl_jax.export import decode_weights, load_weights, to_json
+from rcirl_jax.specs import spec_root
+
+GOLDEN = Path(__file__).parent / "golden"
+SHA256 = {  # of the whole files
+    1: "5d14c2f70868cdbbef17d7d620b4ac9dc2a74f1305c4eec793739495a84dc6b4",
+    2: "f6e1824cbac37db0ac021427f6efa4cb4becb8c07936224bc9cfb8e323635161",
+}
+
+
+def golden(version):
+    """A file of this version, inputs, masks and the values they had then."""
+    told = json.loads((GOLDEN / f"weights_{version}.json").read_text())
+    arrays = [np.array(told[name]) for name in ("features", "time_valid", "value")]
+    return GOLDEN / f"weights_{version}.msgpack", *arrays
+
+
+@pytest.mark.parametrize("version", SHA256)
+def test_an_old_file_scores_as_it_did(version):
+    path, features, valid, expected = golden(version)
+    assert hashlib.sha256(path.read_bytes()).hexdigest() == SHA256[version]
+    reward = load_weights(path)
+    assert (reward.context is None) == (version == 1)
+    assert reward.names == ("feature0", "feature1", "feature2", "feature3")
+    assert reward.provenance["git_commit"] == "2fe49aa"
+    found = reward.value(features, valid)
+    assert np.ptp(expected) > 1.0
+    assert np.all(np.abs(found - expected) <= 1e-6 * np.maximum(1.0, np.abs(expected)))
+
+
+@pytest.mark.parametrize("version", SHA256)
+def test_the_schema_still_describes_an_old_file(version):
+    data = golden(version)[0].read_bytes()
+    schema = json.loads((spec_root() / "reward_weights.schema.json").read_text())
+    jsonschema.validate(to_json(data), schema)
+
+
+@pytest.mark.parametrize("version", SHA256)
+def test_one_flipped_bit_of_an_old_file_is_seen(version):
+    data = bytearray(golden(version)[0].read_bytes())
+    data[len(data) // 2] ^= 1
+    with pytest.raises(ValueError, match="the file is damaged"):
+        decode_weights(bytes(data))
