@@ -6,7 +6,8 @@ from pathlib import Path
 REPO = Path(__file__).resolve().parents[2]
 DOCS = REPO / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
-ALL = [*PAGES, REPO / "README.md", REPO / "BUILD.md", REPO / "onboard" / "README.md"]
+TOP = ("README.md", "BUILD.md", "CONTRIBUTING.md", "SECURITY.md", "onboard/README.md")
+ALL = [*PAGES, *(REPO / name for name in TOP)]
 
 FENCE = re.compile(r"^```(\w*)(?: title=\"([^\"]+)\")?\n(.*?)^```$", re.M | re.S)
 SPAN = re.compile(r"`([^`]+)`")
