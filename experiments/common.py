@@ -147,6 +147,8 @@ def git_commit() -> str:
         )
         return done.stdout.strip() if done.returncode == 0 else ""
 
+    if not git("ls-files", "experiments/common.py"):  # installed beside its files
+        return ""
     commit = git("rev-parse", "HEAD")
     dirty = git("status", "--porcelain", "--untracked-files=no")
     return commit + ("+" if commit and dirty else "")

@@ -166,10 +166,11 @@ def git(folder, *words):
 
 @pytest.fixture
 def repository(tmp_path):
-    """A repository with one commit that is not ours."""
+    """A repository with one commit of a file, ours if it is a checkout."""
     git(tmp_path, "init", "--quiet")
-    (tmp_path / "file").write_text("1")
-    git(tmp_path, "add", "file")
+    (tmp_path / "experiments").mkdir()
+    (tmp_path / "experiments" / "common.py").write_text("1")
+    git(tmp_path, "add", ".")
     git(tmp_path, "commit", "--quiet", "--message=first")
     return tmp_path
 
@@ -183,7 +184,7 @@ def commit_of(root, monkeypatch):
 def test_the_commit_is_the_checkouts(repository, monkeypatch):
     head = git(repository, "rev-parse", "HEAD")
     assert commit_of(repository, monkeypatch) == head
-    (repository / "file").write_text("2")
+    (repository / "experiments" / "common.py").write_text("2")
     assert commit_of(repository, monkeypatch) == head + "+"
 
 
@@ -193,6 +194,15 @@ def test_an_installed_package_reports_no_other_repository(repository, monkeypatc
     assert commit_of(inside, monkeypatch) == ""
     monkeypatch.setenv("GIT_DIR", str(repository / ".git"))
     assert commit_of(inside, monkeypatch) == ""
+
+
+def test_a_package_put_beside_the_files_of_another_repository(repository, monkeypatch):
+    """As `pip install --target=.` does: git does not know it."""
+    git(repository, "mv", "experiments", "theirs")
+    git(repository, "commit", "--quiet", "--message=second")
+    (repository / "experiments").mkdir()
+    (repository / "experiments" / "common.py").write_text("1")
+    assert commit_of(repository, monkeypatch) == ""
 
 
 def test_no_git_is_no_commit(repository, monkeypatch):
