@@ -9,9 +9,10 @@ from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
 
+import jax
 from absl import app, flags, logging
 
-from rcirl_jax import __version__
+from rcirl_jax import __version__, interrupts
 from rcirl_jax.errors import InputError
 
 EXIT_BAD_INPUT = 2
@@ -19,7 +20,11 @@ HOOK_VARIABLES = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE")
 
 
 def run(main: Callable[[], None]) -> None:
-    """Run a main; bad input becomes one line on stderr and exit status 2."""
+    """Run a main; bad input becomes one line on stderr and exit status 2.
+
+    So does a place that cannot be written. SIGTERM ends with 143, SIGINT with 130,
+    within ten seconds (`rcirl_jax.interrupts`).
+    """
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
     logging.set_verbosity(logging.WARNING)
@@ -34,10 +39,27 @@ def run(main: Callable[[], None]) -> None:
             print(f"error: {error}", file=sys.stderr)
             sys.exit(EXIT_BAD_INPUT)
         except OSError as error:
-            print(f"error: {error.filename or ''}: {error}", file=sys.stderr)
+            print(f"error: {_about(error)}", file=sys.stderr)
             sys.exit(EXIT_BAD_INPUT)
+        except interrupts.Interrupted as stop:
+            _leave(stop.number)
 
+    interrupts.install()
     app.run(guarded, flags_parser=_parse)
+
+
+def _about(error: OSError) -> str:
+    """One line: the file, if the system told it, and the reason."""
+    known = error.filename is not None and error.strerror is not None
+    text = f"{error.filename}: {error.strerror}" if known else str(error)
+    return " ".join(text.split())
+
+
+def _leave(number: int) -> None:
+    """End by a signal; one of several processes says goodbye to the others first."""
+    if jax.distributed.is_initialized():
+        sys.exit(128 + number)
+    interrupts.leave(number)
 
 
 def _own_the_shared_flags() -> None:

@@ -19,7 +19,7 @@ from rcirl_jax.data.importing import ImportConfig, import_parts
 from rcirl_jax.data.parts import parts_of
 from rcirl_jax.data.quality import format_quality
 from rcirl_jax.data.signal_checks import read_signal_checks
-from rcirl_jax.data.store import open_dataset
+from rcirl_jax.data.store import Dataset
 from rcirl_jax.evaluation.evaluate import RankingSetup, oracle_floor
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.sampling.config import MODES
@@ -84,6 +84,7 @@ def main() -> None:
         split_seed=_SPLIT_SEED.value,
         leave_out=_LEAVE_OUT.value,
     )
+    floors: list[dict] = []
     manifest = import_parts(
         parts_of(
             _FORMAT.value,
@@ -94,24 +95,30 @@ def main() -> None:
         config,
         executor=executor(),
         overwrite=_OVERWRITE.value,
+        before_commit=lambda dataset: floors.extend(_floors(dataset)),
     )
     print(format_quality(manifest.quality))
-    dataset = open_dataset(_OUTPUT.value)
-    floors = []
-    for mode in MODES:
-        setup = RankingSetup(sampler=SamplerConfig(mode=mode), horizon_s=_FLOOR.value)
-        floor = oracle_floor(dataset, setup, max_scenes=512)
-        floors.append(floor)
+    for mode, floor in zip(MODES, floors, strict=True):
         mean, median = floor["best_fde_mean_m"], floor["best_fde_median_m"]
         print(
             f"oracle floor, {mode}: best of {floor['candidates']} candidates ends "
             f"{mean:.2f} m (median {median:.2f}) from the human at "
             f"{floor['horizon_s']:g} s, {floor['scenes']} scenes"
         )
-    if "://" not in _OUTPUT.value:
-        beside = Path(_OUTPUT.value) / "oracle_floor.json"
-        write_json(beside, floors)
     print(f"dataset: {_OUTPUT.value}")
+
+
+def _floors(dataset: Dataset) -> list[dict]:
+    """The oracle floor of every mode of the sampler, also beside the dataset."""
+    dataset.verify()
+    setups = [
+        RankingSetup(sampler=SamplerConfig(mode=mode), horizon_s=_FLOOR.value)
+        for mode in MODES
+    ]
+    floors = [oracle_floor(dataset, setup, max_scenes=512) for setup in setups]
+    if "://" not in _OUTPUT.value:
+        write_json(Path(_OUTPUT.value) / "oracle_floor.json", floors)
+    return floors
 
 
 if __name__ == "__main__":

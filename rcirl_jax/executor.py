@@ -15,6 +15,7 @@ import importlib
 import itertools
 import multiprocessing
 import os
+import signal
 import socket
 import threading
 from collections.abc import Callable, Iterable, Iterator
@@ -151,6 +152,7 @@ def _as_worker(all_started: Barrier) -> None:
       all_started: met by every worker of the pool before its first piece.
     """
     os.environ["JAX_PLATFORMS"] = "cpu"
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a terminal: the parent decides
     parent = multiprocessing.parent_process()
 
     def outlive_nobody() -> None:

@@ -11,16 +11,18 @@ import fcntl
 import functools
 import hashlib
 import json
+import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.specs import spec_root
 from rcirl_jax.whole import write_json
 
 FILE = "stages.json"
+LOCK = ".lock"  # in a folder that one process at a time works in
 SCHEMA_VERSION = 1
 
 
@@ -126,18 +128,45 @@ class Stages:
 
 
 @contextlib.contextmanager
-def only_one(folder: Path) -> Iterator[None]:
-    """Hold a folder for this process.
+def only_one(folder: Path, *, leave_nothing: bool = False) -> Iterator[None]:
+    """Hold a folder for this process; it is made if missing.
+
+    The lock goes with the process, however that ends; its file means nothing.
+
+    Args:
+      folder: to hold.
+      leave_nothing: remove the lock's file at the end, and folders made for it that
+        are empty then.
 
     Raises:
       InputError: another process holds it.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / ".lock").open("w") as file:
+    path = folder / LOCK
+    made = [x for x in (folder, *folder.parents) if not os.path.lexists(x)]
+    with _locked(path):
+        try:
+            yield
+        finally:
+            if leave_nothing:
+                path.unlink(missing_ok=True)
+                with contextlib.suppress(OSError):
+                    for one in made:
+                        one.rmdir()
+
+
+def _locked(path: Path) -> IO[str]:
+    """The lock's file, open and locked."""
+    while True:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = path.open("a")
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
+        except BlockingIOError as error:
+            file.close()
             raise InputError(
-                f"{folder}: in use by another process: expected one run at a time"
+                f"{path.parent}: in use by another process: expected one run at a time"
             ) from error
-        yield
+        # who held it before may have removed the file after it was opened here
+        if path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat()):
+            return file
+        file.close()

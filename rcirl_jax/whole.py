@@ -1,5 +1,6 @@
 """Files that are there whole or not at all."""
 
+import contextlib
 import dataclasses
 import json
 import math
@@ -15,11 +16,24 @@ def write_whole(path: Path, content: str | bytes) -> None:
     """Write a file; who reads it sees the old one or the new one.
 
     Its folder is made. What a kill leaves behind ends in ".tmp".
+
+    Raises:
+      OSError: it cannot be written (the disk is full); names the file.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(path.name + ".tmp")
-    part.write_bytes(content.encode() if isinstance(content, str) else content)
-    os.replace(part, path)
+    try:
+        part.write_bytes(content.encode() if isinstance(content, str) else content)
+        os.replace(part, path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+        raise named(error, path) from error
+
+
+def named(error: OSError, path: Path) -> OSError:
+    """The same error with a file's name; writing to an open one has none."""
+    return OSError(error.errno, error.strerror or str(error), str(path))
 
 
 def plain(node: Any) -> Any:  # noqa: ANN401

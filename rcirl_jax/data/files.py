@@ -1,13 +1,16 @@
 """Keys and values through tensorstore: a folder or any kvstore URL."""
 
+import contextlib
 import functools
 import os
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 
 import tensorstore as ts
 
 from rcirl_jax.data.rows import _T
 from rcirl_jax.errors import InputError
+from rcirl_jax.stages import LOCK, only_one
 
 MANIFEST, MARK, SHARDS = "manifest.json", "shard.json", "shards/"
 
@@ -29,6 +32,16 @@ class Files:
                 f"{text}: {_reason(error)}: expected a folder or a gs://, s3:// URL"
             ) from error
 
+    def alone(self) -> contextlib.AbstractContextManager[None]:
+        """Held by this process; remote places cannot be.
+
+        Raises:
+          InputError: another process holds the folder.
+        """
+        if self.folder is None:
+            return contextlib.nullcontext()
+        return only_one(Path(self.folder), leave_nothing=True)
+
     def path(self, key: str) -> str:
         """How messages call a key."""
         return f"{self.name}/{key}"
@@ -44,8 +57,9 @@ class Files:
             ) from error
 
     def list_keys(self) -> list[str]:
-        """All keys below the dataset."""
-        return [key.decode() for key in self.wait(self.kv.list(), "")]
+        """All keys below the dataset, but for the lock of who writes it."""
+        found = [key.decode() for key in self.wait(self.kv.list(), "")]
+        return [key for key in found if key != LOCK]
 
     def read_many(self, keys: Iterable[str]) -> Iterable[tuple[str, bytes | None]]:
         """Each key with its value, None where it is missing; all read at once."""

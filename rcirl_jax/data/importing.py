@@ -21,11 +21,12 @@ import tqdm
 
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.cut import Cut, cut, cut_item, whole_of
+from rcirl_jax.data.files import Files
 from rcirl_jax.data.parts import Part, items
 from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.data.recording import LEAVE_OUT
 from rcirl_jax.data.splits import assign_groups
-from rcirl_jax.data.store import DatasetWriter, Manifest
+from rcirl_jax.data.store import Dataset, DatasetWriter, Manifest
 from rcirl_jax.errors import InputError, LostWorkError
 from rcirl_jax.executor import Executor, Here
 from rcirl_jax.types import Demonstration, Recording
@@ -206,7 +207,7 @@ class _Import:
         self.next_shard += 1
         self.pending, self.lineage = [], []
 
-    def finish(self) -> Manifest:
+    def finish(self, before_commit: Callable[[Dataset], object]) -> Manifest:
         """Close the last shard and commit the dataset."""
         if self.done:
             raise InputError(
@@ -233,7 +234,8 @@ class _Import:
                 "splits": self._splits(),
                 "quality": self.quality.as_dict(),
                 "import": self._flags(),
-            }
+            },
+            before_commit,
         )
 
     def _flags(self) -> dict:
@@ -302,6 +304,7 @@ def import_parts(
     *,
     executor: Executor | None = None,
     overwrite: bool = False,
+    before_commit: Callable[[Dataset], object] = lambda dataset: None,
 ) -> Manifest:
     """Import parts wherever the executor runs them; bytes do not depend on it.
 
@@ -311,6 +314,7 @@ def import_parts(
       config: collection and split settings.
       executor: default: this process.
       overwrite: replace a finished dataset.
+      before_commit: as `DatasetWriter.finish`.
 
     Returns:
       The manifest of the finished dataset.
@@ -329,7 +333,7 @@ def import_parts(
         work = functools.partial(cut_item, **settings)
         return places.stream(work, items(parts, places.workers))
 
-    return _import(cuts, len(parts), output, config, overwrite)
+    return _import(cuts, len(parts), output, config, overwrite, before_commit)
 
 
 def _import(
@@ -338,18 +342,20 @@ def _import(
     output: str | Path,
     config: ImportConfig,
     overwrite: bool,
+    before_commit: Callable[[Dataset], object] = lambda dataset: None,
 ) -> Manifest:
     """Write the cuts in their order; `total` recordings or parts are expected."""
-    writer = DatasetWriter(str(output), overwrite=overwrite)
-    try:
-        work = _Import(writer, config)
-        with Progress(total) as progress:
-            for made in cuts(work.known):
-                work.add(made)
-                progress.show(made, work.quality)
-        return work.finish()
-    except LostWorkError:
-        raise  # as after an interrupt, the next run goes on from the shards
-    except InputError:
-        writer.abort()
-        raise
+    with Files(str(output)).alone():
+        writer = DatasetWriter(str(output), overwrite=overwrite)
+        try:
+            work = _Import(writer, config)
+            with Progress(total) as progress:
+                for made in cuts(work.known):
+                    work.add(made)
+                    progress.show(made, work.quality)
+            return work.finish(before_commit)
+        except LostWorkError:
+            raise  # as after an interrupt, the next run goes on from the shards
+        except InputError:
+            writer.abort()
+            raise

@@ -18,7 +18,7 @@ import functools
 import json
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -169,11 +169,17 @@ class DatasetWriter:
         self._files.remove(start, SHARDS_END)
         self._files.remove(MANIFEST, MANIFEST + "\0")
 
-    def finish(self, manifest_fields: Mapping[str, Any]) -> Manifest:
+    def finish(
+        self,
+        manifest_fields: Mapping[str, Any],
+        before_commit: "Callable[[Dataset], object]" = lambda dataset: None,
+    ) -> Manifest:
         """Commit the dataset: check the tables, write manifest.json.
 
         Args:
           manifest_fields: exactly `IMPORT_FIELDS`, JSON-ready.
+          before_commit: what else belongs to a finished import; a run that is killed
+            in it is resumed, and its bad input is raised after the commit.
 
         Raises:
           InputError: a vehicle has rows in two splits.
@@ -195,8 +201,15 @@ class DatasetWriter:
         dataset = Dataset(self._files, parse_manifest(raw, self._files))
         dataset.check_tables()
         self._remove_from(len(self._shards))
+        failed = None
+        try:
+            before_commit(dataset)
+        except InputError as error:
+            failed = error
         self._files.write_many({MANIFEST: raw})
         self._finished = True
+        if failed is not None:
+            raise failed
         return dataset.manifest
 
     def abort(self) -> None:

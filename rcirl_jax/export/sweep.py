@@ -44,6 +44,7 @@ from rcirl_jax.evaluation.sweep import (
 from rcirl_jax.executor import Executor
 from rcirl_jax.export.from_run import verification_samples, write_weights
 from rcirl_jax.export.loading import compiled_scorer, open_reward
+from rcirl_jax.stages import only_one
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.whole import write_json, write_whole
 
@@ -68,10 +69,23 @@ def run_sweep(
       The contents of sweep.json.
 
     Raises:
-      InputError: the folder belongs to other settings or data; bad data; no
-        configuration that trains.
+      InputError: the folder belongs to other settings or data, or is in use; bad
+        data; no configuration that trains.
     """
-    dataset, split, by = open_split(config)
+    opened = open_split(config)
+    with only_one(folder):
+        return _sweep(config, folder, executor, provenance, opened)
+
+
+def _sweep(
+    config: SweepConfig,
+    folder: Path,
+    executor: Executor,
+    provenance: Mapping[str, object],
+    opened: tuple[Demonstrations, Demonstrations, str],
+) -> dict:
+    """`run_sweep` in a folder that is this sweep's alone."""
+    dataset, split, by = opened
     created = _claim(config, folder, dataset.hash)
     made_by = {**provenance, "dataset_sha256": dataset.hash, "created": created}
     for name in ("validation", "test"):  # what would fail only after the training

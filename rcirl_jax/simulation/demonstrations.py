@@ -24,6 +24,7 @@ import numpy as np
 import tqdm
 
 from rcirl_jax.data.assemble import assemble
+from rcirl_jax.data.files import Files
 from rcirl_jax.data.labels import add_labels
 from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.data.splits import assign_groups
@@ -149,7 +150,23 @@ def drive_catalogue(
     Raises:
       InputError: no scene is left, or the place cannot be written.
     """
-    writer = DatasetWriter(str(output), overwrite=overwrite)
+    with Files(str(output)).alone():
+        writer = DatasetWriter(str(output), overwrite=overwrite)
+        if writer.committed():  # of a killed run: drives are not taken up halfway
+            writer = DatasetWriter(str(output), overwrite=True)
+        try:
+            return _drive_all(refs, writer, config, learner)
+        except InputError:
+            writer.abort()
+            raise
+
+
+def _drive_all(
+    refs: Sequence[CaseRef],
+    writer: DatasetWriter,
+    config: DriveConfig,
+    learner: tuple[Policy, Params] | None,
+) -> Manifest:
     every = round(config.period_s / STEP_S)
     learner_s, driver_s = config.turns_s
     rollout = RolloutConfig(
@@ -162,35 +179,31 @@ def drive_catalogue(
     names: list[str] = []
     sizes: dict[str, int] = {}
     shard = 0
-    try:
-        with tqdm.tqdm(total=len(refs), desc="drive", unit="case") as bar:
-            for first in range(0, len(refs), CHUNK):
-                part = refs[first : first + CHUNK]
-                driver = DRIVERS[first // CHUNK % len(DRIVERS)]
-                for ref, rows in zip(
-                    part, _drives(part, driver, learner, rollout, config), strict=True
-                ):
-                    number = len(names)
-                    names.append(ref.id)
-                    quality.recordings += 1
-                    quality.tracks += 1
-                    if not rows:
-                        quality.notes.append(f"{ref.id}: no clean drive: dropped")
-                        continue
-                    same = [number] * len(rows)
-                    block = assemble(rows, vehicles=same, groups=same, recording=number)
-                    quality.add_scenes(block)
-                    sizes[ref.id] = len(rows)
-                    pending.append(block)
-                    lineage.append({"name": ref.id, "scenes": len(rows)})
-                bar.update(len(part))
-                if sum(b.vehicle.shape[0] for b in pending) >= SHARD_SCENES:
-                    shard = _close(writer, shard, pending, lineage)
-        _close(writer, shard, pending, lineage)
-        return _finish(writer, config, quality, names, sizes)
-    except InputError:
-        writer.abort()
-        raise
+    with tqdm.tqdm(total=len(refs), desc="drive", unit="case") as bar:
+        for first in range(0, len(refs), CHUNK):
+            part = refs[first : first + CHUNK]
+            driver = DRIVERS[first // CHUNK % len(DRIVERS)]
+            for ref, rows in zip(
+                part, _drives(part, driver, learner, rollout, config), strict=True
+            ):
+                number = len(names)
+                names.append(ref.id)
+                quality.recordings += 1
+                quality.tracks += 1
+                if not rows:
+                    quality.notes.append(f"{ref.id}: no clean drive: dropped")
+                    continue
+                same = [number] * len(rows)
+                block = assemble(rows, vehicles=same, groups=same, recording=number)
+                quality.add_scenes(block)
+                sizes[ref.id] = len(rows)
+                pending.append(block)
+                lineage.append({"name": ref.id, "scenes": len(rows)})
+            bar.update(len(part))
+            if sum(b.vehicle.shape[0] for b in pending) >= SHARD_SCENES:
+                shard = _close(writer, shard, pending, lineage)
+    _close(writer, shard, pending, lineage)
+    return _finish(writer, config, quality, names, sizes)
 
 
 def _drives(

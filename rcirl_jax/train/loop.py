@@ -1,13 +1,17 @@
 """Training from a dataset: sequence only, no mathematics.
 
-restore or init -> for each batch: step, guard, log -> checkpoint every epoch.
+restore or init -> for each batch: step, guard, log -> checkpoint every epoch, and
+when the process is told to end (`interrupts`).
 With several processes (`train.processes`) each reads and computes its part of every
 batch; process 0 alone writes run.json and metrics.
 """
 
+import contextlib
 import dataclasses
 import itertools
-from collections.abc import Iterator
+import signal
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import cast
 
@@ -21,12 +25,14 @@ from rcirl_jax.data.preferences import Preferences
 from rcirl_jax.data.stream import Prefetch
 from rcirl_jax.errors import InputError
 from rcirl_jax.features import FeatureMap, feature_map
+from rcirl_jax.interrupts import Interrupted, asked
 from rcirl_jax.reward import Normaliser, fit_normaliser
+from rcirl_jax.stages import only_one
 from rcirl_jax.train.checkpoint import Checkpoints
 from rcirl_jax.train.metrics import MetricsWriter, Progress
-from rcirl_jax.train.parallel import Step, parallelise
+from rcirl_jax.train.parallel import Parallel, Step, parallelise
 from rcirl_jax.train.preferences import featurise_preferences, pairs_of_step
-from rcirl_jax.train.processes import is_first
+from rcirl_jax.train.processes import all_stop_after, is_first
 from rcirl_jax.train.running import Running, check_run, describe_run
 from rcirl_jax.train.state import Batch, FeatureBatch, TrainConfig, TrainState
 from rcirl_jax.train.step import StepMetrics, featurised, init_state, make_train_step
@@ -136,8 +142,10 @@ def train(
         is their hash.
 
     Raises:
-      InputError: the workdir belongs to other settings or another dataset, or
-        a feature turns NaN or infinite (names scene and feature).
+      InputError: the workdir belongs to other settings or another dataset, is in
+        use, or has no whole checkpoint; a checkpoint cannot be written; or a feature
+        turns NaN or infinite (names scene and feature).
+      Interrupted: told to end; the last step is saved.
     """
     running = running or Running()
     if config.preferences != (preferences.sha256 if preferences else ""):
@@ -145,6 +153,22 @@ def train(
     train_step = make_train_step(config, whole=running.parallel == "jit_sharded")
     parallel = parallelise(train_step, running.parallel, config.batch_size)
     check_run(workdir, config, dataset)
+    with only_one(workdir) if is_first() else contextlib.nullcontext():
+        return _train(
+            dataset, workdir, config, parallel, running, provenance or {}, preferences
+        )
+
+
+def _train(
+    dataset: Demonstrations,
+    workdir: Path,
+    config: TrainConfig,
+    parallel: Parallel,
+    running: Running,
+    provenance: dict,
+    preferences: Preferences | None,
+) -> TrainResult:
+    """`train` in a folder that is this run's alone."""
     features = feature_map(config.features)
     batches = split_batches(
         dataset,
@@ -156,6 +180,8 @@ def train(
         num_shards=jax.process_count(),
     )
     checkpoints = Checkpoints(workdir / "checkpoints")
+    for line in checkpoints.passed_over if is_first() else ():
+        print(line, file=sys.stderr)
     if checkpoints.latest_step() is None:
         made = init_state(config, fit_normaliser_on(dataset, config, features))
         state = parallel.replicate(made)
@@ -163,7 +189,7 @@ def train(
         like = parallel.replicate(_like(config, features))
         state, position = checkpoints.restore(like)
         batches.restore(position)
-    describe_run(workdir, config, dataset, provenance or {})
+    describe_run(workdir, config, dataset, provenance)
     run = _Run(config, running, features, batches.batches_per_epoch, workdir, state)
     if preferences is not None:
         run.judged = featurise_preferences(preferences, dataset, config)
@@ -177,12 +203,14 @@ def train(
         made = host_batch(*next(batches), run.judged_at(next(steps)))
         return parallel.place(made), batches.state()
 
-    try:
-        with Prefetch(produce, running.prefetch) as ahead:
-            state = run.epochs_from(state, ahead, parallel.step, checkpoints)
-    finally:
-        checkpoints.close()
-        run.close()
+    # a signal waits for the end of the step, and for what is being saved
+    with (
+        asked() as run.told,
+        contextlib.closing(run),
+        contextlib.closing(checkpoints),
+        Prefetch(produce, running.prefetch) as ahead,
+    ):
+        state = run.epochs_from(state, ahead, parallel.step, checkpoints)
     return TrainResult(
         state=state,
         epochs=run.summaries,
@@ -196,10 +224,12 @@ def restore_run(workdir: Path, config: TrainConfig) -> TrainState:
     """The newest checkpoint of a run.
 
     Raises:
-      InputError: there is none, or it is of another structure.
+      InputError: there is none, it is damaged, or of another structure.
     """
-    checkpoints = Checkpoints(workdir / "checkpoints")
+    checkpoints = Checkpoints(workdir / "checkpoints", read_only=True)
     try:
+        for line in checkpoints.passed_over:
+            raise InputError(f"{line}: expected whole; run the training again")
         if checkpoints.latest_step() is None:
             raise InputError(f"{workdir}: checkpoints: none: expected a trained run")
         return checkpoints.restore(_like(config, feature_map(config.features)))[0]
@@ -233,6 +263,7 @@ class _Run:
         self.progress = Progress(total, first_step, "train", shown=is_first())
         self.summaries: list[dict] = []
         self.judged: FeatureBatch | None = None  # preferences, all of them
+        self.told: Callable[[], int | None] = lambda: None  # signal to end at
 
     def close(self) -> None:
         if self.writer is not None:
@@ -254,9 +285,12 @@ class _Run:
                 state, metrics = take_step(state, batch)
                 step += 1
                 sums += self._after_step(step, jax.device_get(metrics))
-                if self._is_due(step):
+                stop = self._told_to_stop(step)
+                if stop or self._is_due(step):
                     checkpoints.save(state, position)
                 self.running.on_step(step)
+                if stop:
+                    raise Interrupted(stop)
             self.summaries.append(_summary(epoch, sums))
         return state
 
@@ -272,6 +306,12 @@ class _Run:
             process=jax.process_index(),
             processes=jax.process_count(),
         )
+
+    def _told_to_stop(self, step: int) -> int | None:
+        """Number of a signal to end after this step, the same in all processes."""
+        if jax.process_count() > 1:
+            return signal.SIGTERM if all_stop_after(step) else None
+        return self.told()
 
     def _is_due(self, step: int) -> bool:
         every = self.running.checkpoint_every

@@ -1,23 +1,26 @@
 """Where training writes what it sees: JSON lines, TensorBoard, a progress bar."""
 
+import contextlib
 import json
 import math
+import os
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import tqdm
 
-from rcirl_jax.whole import write_whole
+from rcirl_jax.whole import named, write_whole
 
 
 class MetricsWriter:
     """Appends one JSON object a line to metrics.jsonl, and to TensorBoard.
 
     TensorBoard files are written when `tensorboardX` is installed (extra
-    `report`). On resume, lines at or after the resumed step are dropped first,
-    so that a killed run leaves no step twice.
+    `report`). On resume, lines after the resumed step are dropped first (the file
+    is replaced whole), so that a killed run leaves no step twice.
     """
 
     def __init__(self, folder: Path, resume_step: int = 0) -> None:
@@ -35,16 +38,23 @@ class MetricsWriter:
         self._board = _tensorboard(folder / "tensorboard", resume_step)
 
     def write(self, step: int, values: dict[str, float]) -> None:
-        """One line of finite scalars at a step (others are written as null)."""
+        """One line of finite scalars at a step (others are written as null).
+
+        Raises:
+          OSError: one of the files cannot be written; names it.
+        """
         clean = {k: (v if math.isfinite(v) else None) for k, v in values.items()}
-        self._file.write(json.dumps({"step": step, **clean}) + "\n")
+        try:
+            self._file.write(json.dumps({"step": step, **clean}) + "\n")
+        except OSError as error:
+            raise named(error, self._path) from error
         if self._board is not None:
-            for name, number in values.items():
-                self._board.add_scalar(name, number, step)
+            self._board.write(step, values)
 
     def close(self) -> None:
         """Flush and close both files."""
-        self._file.close()
+        with contextlib.suppress(OSError):  # said by `write`, if it was not
+            self._file.close()
         if self._board is not None:
             self._board.close()
 
@@ -56,12 +66,58 @@ def _step_of(line: str) -> int:
         return 1 << 62  # a line cut short by a crash is dropped
 
 
-def _tensorboard(folder: Path, purge_step: int) -> Any:  # noqa: ANN401
+def _tensorboard(folder: Path, purge_step: int) -> "_Board | None":
     try:
-        from tensorboardX import SummaryWriter
+        return _Board(folder, purge_step)
     except ImportError:
         return None
-    return SummaryWriter(str(folder), purge_step=purge_step or None)
+
+
+class _Board:
+    """A TensorBoard file, written by the caller's own thread.
+
+    tensorboardX' own writer hands events to a thread: on a full disk that thread
+    dies, and the training waits for it for ever.
+    """
+
+    FLUSH_S = 10.0  # s between two flushes
+
+    def __init__(self, folder: Path, purge_step: int) -> None:
+        from tensorboardX.event_file_writer import EventsWriter
+        from tensorboardX.proto import event_pb2
+        from tensorboardX.summary import scalar
+
+        self._made: Any = event_pb2  # its classes are made as it is loaded
+        self._folder, self._scalar = folder, scalar
+        folder.mkdir(parents=True, exist_ok=True)
+        # its name has seconds only: two runs in one of them must not share a file
+        own = f".{os.getpid()}.{len(list(folder.iterdir()))}"
+        self._file = EventsWriter(str(folder / "events"), own)
+        self._flushed = time.monotonic()
+        if purge_step:
+            start = self._made.SessionLog(status=self._made.SessionLog.START)
+            self._add(self._made.Event(step=purge_step, session_log=start))
+
+    def write(self, step: int, values: dict[str, float]) -> None:
+        for name, number in values.items():
+            made = {"step": step, "summary": self._scalar(name, number)}
+            self._add(self._made.Event(wall_time=time.time(), **made))
+        if time.monotonic() - self._flushed > self.FLUSH_S:
+            self._flushed = time.monotonic()
+            self._do(self._file.flush)
+
+    def _add(self, event: object) -> None:
+        self._do(lambda: self._file.write_event(event))
+
+    def _do(self, write: Callable[[], object]) -> None:
+        try:
+            write()
+        except OSError as error:
+            raise named(error, self._folder) from error
+
+    def close(self) -> None:
+        with contextlib.suppress(OSError):  # of pictures only
+            self._file.close()
 
 
 class Progress:

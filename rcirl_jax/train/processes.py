@@ -1,6 +1,7 @@
 """Several processes, perhaps on several machines, as one training."""
 
 import jax
+from jax.experimental import multihost_utils
 
 from rcirl_jax.errors import InputError
 
@@ -50,3 +51,13 @@ def join_processes(
 def is_first() -> bool:
     """Whether this process writes what a run writes once."""
     return jax.process_index() == 0
+
+
+def all_stop_after(step: int) -> bool:
+    """Whether a process was told to end (SIGTERM), and all of them stop at this step.
+
+    Every process calls it after every step.
+    """
+    return jax.process_count() > 1 and multihost_utils.reached_preemption_sync_point(
+        step
+    )
