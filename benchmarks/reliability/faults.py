@@ -1,0 +1,231 @@
+"""Kills at random moments: do the commands come to what they come to undisturbed?
+
+    python -m benchmarks.reliability.faults --kills=50 --output=benchmarks/results
+
+import, train, sweep and autotune run on small synthetic data. Each runs once
+undisturbed; then it is killed at moments drawn uniformly over that run's time, again
+and again, started by the same command each time, and when it has ended by itself its
+outputs are compared to the bit. `--signal=TERM` (to the process, as a cluster does)
+and `INT` (to its group, as a terminal does) also hold the seconds to the end and the
+exit status against what is promised. `--moments=work` draws them after the first
+thing is finished. `--broken_resume` has trainings forget where in the data they were:
+this file has to say so and end with 1.
+
+Writes faults_SIGNAL.json after every comparison, one row per command.
+"""
+
+import collections
+import dataclasses
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from absl import flags
+
+from benchmarks.common import write
+from benchmarks.reliability.jobs import Facts, Job, jobs, write_logs
+from benchmarks.reliability.small import BROKEN
+from experiments.common import run
+from rcirl_jax.errors import InputError
+
+SIGNALS = ("KILL", "TERM", "INT")
+SHARES = {"import": 15, "train": 15, "sweep": 10, "autotune": 10}  # of 50 kills
+_KILLS = flags.DEFINE_integer("kills", 50, "over all commands", 1)
+_JOBS = flags.DEFINE_list("commands", list(SHARES), "which of them")
+_SIGNAL = flags.DEFINE_enum("signal", "KILL", SIGNALS, "that ends them")
+_MOMENTS = flags.DEFINE_enum(
+    "moments",
+    "run",
+    ["run", "work"],
+    "over the whole run, or once it has made progress",
+)
+_SEED = flags.DEFINE_integer("seed", 0, "of the moments")
+_BROKEN = flags.DEFINE_bool("broken_resume", False, "break the resume of trainings")
+_OUTPUT = flags.DEFINE_string("output", "benchmarks/results", "folder of the JSON")
+
+WRAPPER = "benchmarks.reliability.small"
+ROOT = Path(__file__).resolve().parents[2]
+MOST_S = 1800.0  # s after which a command counts as hanging
+PROMISED_S = 10.0  # s from a signal to the end
+IN_A_ROW = 4  # kills before a command may end
+FINISHED = "holds a finished dataset"  # killed between its last file and its end
+
+
+@dataclasses.dataclass(kw_only=True)
+class Row:
+    """What came of one command."""
+
+    fault: str
+    injected: str
+    command: str
+    undisturbed_s: float
+    count: int = 0  # kills that met a running command
+    comparisons: int = 0
+    outcome: str = "not compared"
+    problems: list[str] = dataclasses.field(default_factory=list)
+    killed_at_s: list[float] = dataclasses.field(default_factory=list)
+    seconds_to_end: list[float] = dataclasses.field(default_factory=list)
+
+
+def start(job: Job, folder: Path, *, broken: bool = False) -> subprocess.Popen:
+    """The command in a process group of its own; what it says goes to said.txt."""
+    cache = os.environ.get("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".jax_cache"))
+    env = {
+        **os.environ,
+        "PYTHONPATH": str(ROOT),
+        "JAX_PLATFORMS": "cpu",
+        "JAX_COMPILATION_CACHE_DIR": cache,
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1",
+        **({BROKEN: "1"} if broken else {}),
+    }
+    with (folder / "said.txt").open("a") as said:
+        return subprocess.Popen(
+            [sys.executable, "-m", WRAPPER, job.module, *job.flags],
+            cwd=folder,
+            env=env,
+            stdout=said,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+
+
+def to_the_end(job: Job, folder: Path, *, broken: bool = False) -> float:
+    """Run it undisturbed; seconds.
+
+    Raises:
+      InputError: it failed or did not end.
+    """
+    begin = time.monotonic()
+    process = start(job, folder, broken=broken)
+    try:
+        status = process.wait(MOST_S)
+    except subprocess.TimeoutExpired as error:
+        os.killpg(process.pid, signal.SIGKILL)
+        raise InputError(f"{job.name}: no end after {MOST_S:.0f} s") from error
+    last = (folder / "said.txt").read_text().strip().splitlines()[-1:]
+    if status != 0 and not (last and FINISHED in last[0]):
+        raise InputError(f"{job.name}: exit status {status}: {last}")
+    return time.monotonic() - begin
+
+
+def killed(job: Job, folder: Path, wait_s: float, row: Row) -> bool:
+    """Start it and end it after so long; False if it ended by itself before."""
+    number = signal.Signals[f"SIG{_SIGNAL.value}"]
+    process = start(job, folder, broken=_BROKEN.value)
+    begin = time.monotonic()
+    if _MOMENTS.value == "work":
+        while process.poll() is None and not any(folder.glob(job.progress)):
+            time.sleep(0.02)
+    try:
+        process.wait(wait_s)
+        return False
+    except subprocess.TimeoutExpired:
+        pass
+    row.killed_at_s.append(round(time.monotonic() - begin, 2))
+    sent = time.monotonic()
+    if number == signal.SIGTERM:
+        process.send_signal(number)
+    else:
+        os.killpg(process.pid, number)
+    try:
+        status = process.wait(3.0 * PROMISED_S)
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        status = process.wait()
+        row.problems.append(f"alive {3.0 * PROMISED_S:.0f} s after the signal")
+    seconds = time.monotonic() - sent
+    row.seconds_to_end.append(round(seconds, 2))
+    if number != signal.SIGKILL:
+        # before Python hears signals they end it as they end any process
+        if status not in (128 + number, -number, 0):
+            row.problems.append(f"exit status {status} after SIG{_SIGNAL.value}")
+        if seconds > PROMISED_S:
+            row.problems.append(f"{seconds:.1f} s to the end")
+    return True
+
+
+def disturbed(job: Job, root: Path, count: int, row: Row, expected: Facts) -> None:
+    """Kill it `count` times in all, in as many folders as that takes."""
+    # a generator for each command, so that one can be run again alone
+    rng = np.random.default_rng([_SEED.value, list(SHARES).index(job.name)])
+    share = 1.0 if _MOMENTS.value == "run" else 0.3
+    while row.count < count:
+        folder = root / f"{job.name}-{row.comparisons}"
+        folder.mkdir()
+        for _ in range(min(IN_A_ROW, count - row.count)):
+            wait_s = float(rng.uniform(0.0, share * row.undisturbed_s))
+            if not killed(job, folder, wait_s, row):
+                break
+            row.count += 1
+        try:
+            to_the_end(job, folder, broken=_BROKEN.value)
+            found = job.outcome(folder)
+            names = sorted(found.keys() | expected.keys())
+            different = [x for x in names if found.get(x) != expected.get(x)]
+            if different:
+                row.problems.append(f"different: {', '.join(different[:5])}")
+        except InputError as error:
+            row.problems.append(str(error))
+        row.comparisons += 1
+        row.outcome = "as undisturbed" if not row.problems else row.problems[0]
+        print(f"{job.name}: {row.count} of {count} {row.fault}: {row.outcome}")
+        save(row)
+        if not row.problems:
+            shutil.rmtree(folder)
+
+
+_ROWS: dict[str, Row] = {}
+
+
+def save(row: Row) -> None:
+    """Write all rows so far."""
+    _ROWS[row.command] = row
+    result = {"seed": _SEED.value, "rows": list(_ROWS.values())}
+    write(f"faults_{_SIGNAL.value.lower()}", result, _OUTPUT.value)
+
+
+def main() -> None:
+    """Undisturbed runs, disturbed runs, rows."""
+    unknown = set(_JOBS.value) - set(SHARES)
+    if unknown:
+        raise InputError(f"--commands: {unknown}: expected some of {list(SHARES)}")
+    root = Path(tempfile.mkdtemp(prefix="rcirl-faults-"))
+    write_logs(root / "logs")
+    known = jobs(root)
+    # a dataset for the others to work on, and programs in the cache
+    to_the_end(known["import"], root)
+    total = sum(SHARES[name] for name in _JOBS.value)
+    for name in _JOBS.value:
+        job, folder = known[name], root / f"{name}-undisturbed"
+        folder.mkdir()
+        warm = root / f"{name}-warm"
+        warm.mkdir()
+        to_the_end(job, warm)
+        seconds = to_the_end(job, folder)
+        expected, again = job.outcome(folder), job.outcome(warm)
+        row = Row(
+            fault=f"SIG{_SIGNAL.value}",
+            injected=f"at moments uniform over the {_MOMENTS.value}, then run again",
+            command=f"{job.module} {' '.join(job.flags)}".replace(str(root), "ROOT"),
+            undisturbed_s=round(seconds, 2),
+        )
+        if again != expected:
+            odd = [x for x in expected if again.get(x) != expected[x]]
+            row.problems.append(f"two undisturbed runs differ: {odd[:5]}")
+        count = max(round(_KILLS.value * SHARES[name] / total), 1)
+        disturbed(job, root, count, row, expected)
+    problems = collections.Counter(x for row in _ROWS.values() for x in row.problems)
+    if problems:
+        print(f"{sum(problems.values())} problems; what was left: {root}")
+        sys.exit(1)
+    shutil.rmtree(root)
+
+
+if __name__ == "__main__":
+    run(main)

@@ -1,0 +1,158 @@
+"""The commands that are disturbed, on small data, and what has to come out of each.
+
+Every run has a folder of its own and names it by relative paths, so that everything
+written is equal to the byte, but for times: `created` in weights files, rates and
+seconds in metrics and sweeps. Those alone are left out.
+"""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from rcirl_jax.export.from_run import read_config
+from rcirl_jax.export.weights import to_json
+from rcirl_jax.stages import digest, file_sha256
+from rcirl_jax.train.loop import restore_run
+
+Facts = Mapping[str, str]  # what came out -> digest
+LOGS, CARS, SECONDS = 8, 4, 20.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Job:
+    """A command and what it makes in its folder."""
+
+    name: str
+    module: str
+    flags: tuple[str, ...]
+    outcome: Callable[[Path], Facts]
+    progress: str  # what is there once something is finished
+
+
+def write_logs(folder: Path) -> None:
+    """CSV logs of platoons on a straight road."""
+    folder.mkdir(parents=True)
+    t = np.arange(0.0, SECONDS, 0.1)
+    for number in range(LOGS):
+        rng = np.random.default_rng(number)
+        lines = ["t,id,x,y"]
+        for car in range(CARS):
+            speed = 12.0 + 2.0 * np.sin(0.4 * t + rng.uniform(0.0, 6.0))
+            x = 30.0 * (CARS - 1 - car) + np.cumsum(speed) * 0.1
+            rows = zip(t, x, strict=True)
+            lines += [f"{a:.1f},{number}-{car},{b:.3f},0" for a, b in rows]
+        (folder / f"log{number:02d}.csv").write_text("\n".join(lines) + "\n")
+
+
+def jobs(root: Path) -> dict[str, Job]:
+    """The four commands; `root` holds logs/ and data/, the dataset of them."""
+    logs = ("--format=csv", f"--input={root / 'logs'}")
+    data = f"--data={root / 'data'}"
+    steps = ("--batch_size=8", "--epochs=3")
+    made = [
+        Job(
+            name="import",
+            module="experiments.import_logs",
+            flags=(*logs, "--output=data", "--stride=1", "--workers=2"),
+            outcome=lambda folder: _files(folder / "data"),
+            progress="data/shards/*/shard.json",
+        ),
+        Job(
+            name="train",
+            module="experiments.train",
+            flags=(data, "--workdir=run", *steps, "--checkpoint_every=3"),
+            outcome=_of_training,
+            progress="run/checkpoints/*/sha256.json",
+        ),
+        Job(
+            name="sweep",
+            module="experiments.sweep",
+            flags=(
+                *(data, "--output=sweep", "--quick", "--batch_size=8"),
+                *("--hidden_sizes=6,0", "--leaky_rates=0.05,0.3"),
+            ),
+            outcome=_of_sweep,
+            progress="sweep/weights/*.msgpack",
+        ),
+        Job(
+            name="autotune",
+            module="experiments.autotune",
+            flags=(
+                *(*logs, "--workdir=run", "--stride=2", "--batch_size=8"),
+                *("--epochs=1", "--suite=free_cruise", "--cases=3", "--duration=2"),
+            ),
+            outcome=_of_tuning,
+            progress="run/stages.json",
+        ),
+    ]
+    return {job.name: job for job in made}
+
+
+def _files(folder: Path) -> Facts:
+    """Of every file, whatever it is called."""
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return {str(path.relative_to(folder)): file_sha256(path) for path in files}
+
+
+def _of_training(folder: Path) -> Facts:
+    """All of the last state (weights, optimiser, key, step), and the metrics."""
+    run = folder / "run"
+    state = restore_run(run, read_config(run)[0])
+    plain = state.replace(key=jax.random.key_data(state.key))
+    found = {
+        jax.tree_util.keystr(name): hashlib.sha256(np.asarray(leaf).tobytes())
+        for name, leaf in jax.tree_util.tree_leaves_with_path(plain)
+    }
+    return {
+        **{name: sha.hexdigest() for name, sha in found.items()},
+        "metrics.jsonl": digest(_untimed_metrics(run / "metrics.jsonl")),
+    }
+
+
+def _untimed_metrics(path: Path) -> list[dict]:
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    return [{k: v for k, v in x.items() if k != "queries_per_s"} for x in lines]
+
+
+def _of_weights(path: Path) -> str:
+    """The body of a weights file: tensors, samples, provenance but for times."""
+    body = to_json(path.read_bytes())
+    provenance = body["provenance"]
+    del provenance["created"]
+    provenance["metrics"].pop("queries_per_s", None)
+    return digest(body)
+
+
+def _weights_below(folder: Path) -> Facts:
+    files = sorted(folder.rglob("*.msgpack"))
+    return {str(x.relative_to(folder)): _of_weights(x) for x in files}
+
+
+def _of_sweep(folder: Path) -> Facts:
+    """Every member's weights, the choice and the table of sweep.json."""
+    report = json.loads((folder / "sweep" / "sweep.json").read_text())
+    for member in report["members"].values():
+        del member["sha256"]  # of a file that says when it was made
+    del report["groups"], report["peak_memory_gib"]  # seconds, compiles, memory
+    del report["made_by"]["created"]
+    return {"sweep.json": digest(report), **_weights_below(folder / "sweep")}
+
+
+def _of_tuning(folder: Path) -> Facts:
+    """Dataset, weights, ranking, drives, verdict."""
+    run = folder / "run"
+    (data,) = run.glob("dataset-*")
+    names = (
+        *("ranking.json", "ranking.txt", "verdict.json"),
+        *("suite/metrics.npz", "suite/cases.csv"),
+    )
+    return {
+        **{name: file_sha256(run / name) for name in names},
+        **{f"dataset/{name}": sha for name, sha in _files(data).items()},
+        **_weights_below(run),
+    }
