@@ -50,6 +50,8 @@ def install() -> None:
 
 
 def _hear(number: int, _: FrameType | None) -> None:
+    if _Heard.number is not None:
+        return  # it is ending already
     _Heard.number = number
     if not _Heard.waits:
         raise Interrupted(number)

@@ -9,6 +9,7 @@ orbax keeps no checksum of the arrays: the digests find what changed on disk.
 
 import contextlib
 import json
+import os
 import shutil
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -16,6 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jax.experimental import multihost_utils
 from orbax.checkpoint import v1 as ocp
 
@@ -28,6 +31,8 @@ from rcirl_jax.whole import write_json
 KEEP_LATEST = 3  # checkpoints kept
 DIGESTS = "sha256.json"
 DAMAGED = ".damaged"
+PROBE = ".room"
+OVERHEAD_BYTES = 2**17  # of a checkpoint's files besides the arrays
 
 
 class Checkpoints:
@@ -87,6 +92,8 @@ class Checkpoints:
         step = int(state.step)
         with self._writing():
             self._finish_pending()
+            if is_first():
+                _check_room(self._folder, state)
             response: Any = self._checkpointer.save_async(
                 step, state, force=True, custom_metadata={"position": position}
             )
@@ -149,6 +156,29 @@ class Checkpoints:
                 f"{self._folder}: cannot be written: {_first_line(error)}: expected "
                 "room for a checkpoint; the ones before are kept, run again to go on"
             ) from error
+
+
+def _check_room(folder: Path, state: TrainState) -> None:
+    """Write and remove as many bytes as a checkpoint may take.
+
+    Where it cannot write, orbax waits for minutes and fills the terminal.
+    """
+    held = sum(np.asarray(_numbers(leaf)).nbytes for leaf in jax.tree.leaves(state))
+    probe = folder / PROBE
+    try:
+        with probe.open("wb") as file:
+            file.write(bytes(2 * held + OVERHEAD_BYTES))
+            file.flush()
+            os.fsync(file.fileno())
+    finally:
+        with contextlib.suppress(OSError):
+            probe.unlink(missing_ok=True)
+
+
+def _numbers(leaf: jax.Array) -> jax.Array:
+    """Typed keys as what they are made of."""
+    is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    return jax.random.key_data(leaf) if is_key else leaf
 
 
 def _newest_whole(folder: Path) -> tuple[int | None, dict[int, str]]:

@@ -1,0 +1,200 @@
+"""Checkpoints harmed on disk: found, named, passed over; never half-believed."""
+
+import shutil
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.features import feature_map
+from rcirl_jax.train.checkpoint import DAMAGED, DIGESTS, KEEP_LATEST, Checkpoints
+from rcirl_jax.train.loop import _like
+from rcirl_jax.train.state import TrainConfig
+from tests.conftest import REPO
+from tests.data.small_logs import files_of
+
+CONFIG = TrainConfig()
+
+
+@pytest.fixture(scope="module")
+def state():
+    return _like(CONFIG, feature_map(CONFIG.features))
+
+
+def at(state, step):
+    """Another state at every step, to tell them apart."""
+    bias = state.params.biases[0] + step
+    params = state.params.replace(biases=(bias, *state.params.biases[1:]))
+    return state.replace(step=jnp.asarray(step, state.step.dtype), params=params)
+
+
+@pytest.fixture(scope="module")
+def saved(state, tmp_path_factory):
+    """Checkpoints 2, 3, 4."""
+    folder = tmp_path_factory.mktemp("saved") / "checkpoints"
+    checkpoints = Checkpoints(folder)
+    for step in (1, 2, 3, 4):
+        checkpoints.save(at(state, step), {"epoch": 0, "index": step})
+    checkpoints.close()
+    assert sorted(x.name for x in folder.iterdir()) == ["2", "3", "4"]
+    assert KEEP_LATEST == 3
+    return folder
+
+
+def restored(folder, state):
+    """(step, position, lines) of a run that goes on there."""
+    checkpoints = Checkpoints(folder)
+    found, position = checkpoints.restore(state)
+    checkpoints.close()
+    step = int(found.step)
+    for a, b in zip(leaves(found), leaves(at(state, step)), strict=True):
+        np.testing.assert_array_equal(a, b)
+    return step, position["index"], checkpoints.passed_over
+
+
+def leaves(state):
+    plain = state.replace(key=jax.random.key_data(state.key))
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(plain)]
+
+
+def flip(path, rng):
+    raw = bytearray(path.read_bytes())
+    bit = int(rng.integers(8 * len(raw)))
+    raw[bit // 8] ^= 1 << bit % 8
+    path.write_bytes(raw)
+
+
+def cut(path, rng):
+    raw = path.read_bytes()
+    path.write_bytes(raw[: int(rng.integers(len(raw)))])
+
+
+HARMS = {"flip": flip, "cut": cut, "delete": lambda path, rng: path.unlink()}
+
+
+@pytest.mark.parametrize("harm", HARMS)
+def test_harm_to_any_file_is_found_and_named(saved, state, tmp_path, harm):
+    assert restored(saved, state) == (4, 4, [])
+    rng = np.random.default_rng(0)
+    names = sorted(files_of(saved / "4"))
+    assert len(names) >= 8
+    for number, name in enumerate(names):
+        folder = tmp_path / str(number)
+        shutil.copytree(saved, folder)
+        HARMS[harm](folder / "4" / name, rng)
+        step, index, (line,) = restored(folder, state)
+        assert (step, index) == (3, 3), name
+        assert line.startswith(f"{folder}: checkpoint 4: {name}: "), line
+        assert line.endswith("the one before it that is whole: 3")
+        assert (folder / f"4{DAMAGED}").is_dir()  # kept to look at
+        assert not (folder / "4").exists()
+
+
+def test_a_file_too_many_is_damage(saved, state, tmp_path):
+    shutil.copytree(saved, tmp_path / "c")
+    (tmp_path / "c" / "4" / "state" / "more").write_text("x")
+    assert restored(tmp_path / "c", state)[0] == 3
+
+
+def test_steps_after_a_damaged_one_are_saved_again(saved, state, tmp_path):
+    """Twice: what was put aside before makes room."""
+    folder = tmp_path / "c"
+    shutil.copytree(saved, folder)
+    for _ in range(2):
+        (folder / "4" / DIGESTS).write_text("{}")
+        checkpoints = Checkpoints(folder)
+        assert checkpoints.latest_step() == 3
+        checkpoints.save(at(state, 4), {"epoch": 0, "index": 4})
+        checkpoints.close()
+        assert restored(folder, state) == (4, 4, [])
+
+
+def test_two_damaged_ones_are_two_lines(saved, state, tmp_path):
+    folder = tmp_path / "c"
+    shutil.copytree(saved, folder)
+    (folder / "4" / "_CHECKPOINT_METADATA").unlink()
+    (folder / "3" / DIGESTS).unlink()  # killed before it was noted
+    step, _, lines = restored(folder, state)
+    assert step == 2
+    first, second = (line.partition("checkpoint ")[2] for line in lines)
+    assert first.startswith("4: _CHECKPOINT_METADATA: missing; ")
+    assert second.startswith(f"3: {DIGESTS}: missing, it was not finished; ")
+
+
+def test_no_whole_one_is_one_line_and_nothing_is_touched(saved, tmp_path):
+    folder = tmp_path / "c"
+    shutil.copytree(saved, folder)
+    for step in ("2", "3", "4"):
+        (folder / step / "state" / "manifest.ocdbt").write_bytes(b"")
+    before = files_of(folder)
+    with pytest.raises(InputError, match=r"checkpoint 4: state/manifest\.ocdbt: damag"):
+        Checkpoints(folder)
+    assert files_of(folder) == before
+
+
+def test_who_only_reads_leaves_everything_as_it_is(saved, state, tmp_path):
+    """Also what a training beside it is just writing."""
+    folder = tmp_path / "c"
+    shutil.copytree(saved, folder)
+    half = folder / "5.orbax-checkpoint-tmp-7" / "state"
+    half.mkdir(parents=True)
+    (half / "d").write_text("half")
+    (folder / "4" / DIGESTS).unlink()
+    before = files_of(folder)
+    checkpoints = Checkpoints(folder, read_only=True)
+    assert int(checkpoints.restore(state)[0].step) == 3
+    checkpoints.close()
+    assert files_of(folder) == before
+    nothing = Checkpoints(tmp_path / "none", read_only=True)
+    assert nothing.latest_step() is None
+
+
+def test_checkpoints_of_versions_without_digests_are_taken(saved, state, tmp_path):
+    folder = tmp_path / "c"
+    shutil.copytree(saved, folder)
+    for step in ("2", "3", "4"):
+        (folder / step / DIGESTS).unlink()
+    assert restored(folder, state) == (4, 4, [])
+
+
+FULL = """
+import resource, signal, sys
+from pathlib import Path
+from rcirl_jax.errors import InputError
+from rcirl_jax.features import feature_map
+from rcirl_jax.train.checkpoint import Checkpoints
+from rcirl_jax.train.loop import _like
+from rcirl_jax.train.state import TrainConfig
+config = TrainConfig()
+checkpoints = Checkpoints(Path(sys.argv[1]))
+state = _like(config, feature_map(config.features))
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, resource.RLIM_INFINITY))
+for attempt in range(2):
+    try:
+        checkpoints.save(state.replace(step=state.step + 5), {})
+    except InputError as error:
+        print(error, file=sys.stderr)
+    resource.setrlimit(resource.RLIMIT_FSIZE, 2 * (resource.RLIM_INFINITY,))
+checkpoints.close()
+"""
+
+
+@pytest.mark.multiprocess
+def test_no_room_is_one_line_and_room_is_taken_when_there_is_some(saved, tmp_path):
+    """Of two attempts to save the first finds no room, the second does."""
+    folder = tmp_path / "c"
+    shutil.copytree(saved, folder)
+    done = subprocess.run(
+        [sys.executable, "-c", FULL, str(folder)],
+        capture_output=True, text=True, check=False, cwd=REPO, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    (line,) = done.stderr.strip().splitlines()
+    assert line.startswith(f"{folder}: cannot be written: [Errno 27] File too large")
+    assert sorted(x.name for x in folder.iterdir()) == ["3", "4", "5"]
+    assert Checkpoints(folder, read_only=True).latest_step() == 5
