@@ -32,7 +32,7 @@ from rcirl_jax.train.checkpoint import Checkpoints
 from rcirl_jax.train.metrics import MetricsWriter, Progress
 from rcirl_jax.train.parallel import Parallel, Step, parallelise
 from rcirl_jax.train.preferences import featurise_preferences, pairs_of_step
-from rcirl_jax.train.processes import all_stop_after, is_first
+from rcirl_jax.train.processes import all_stop_after, is_first, with_the_others
 from rcirl_jax.train.running import Running, check_run, describe_run
 from rcirl_jax.train.state import Batch, FeatureBatch, TrainConfig, TrainState
 from rcirl_jax.train.step import StepMetrics, featurised, init_state, make_train_step
@@ -282,9 +282,11 @@ class _Run:
             sums = np.zeros(4)
             for _ in range(self.per_epoch - step % self.per_epoch):
                 batch, position = next(batches)
-                state, metrics = take_step(state, batch)
                 step += 1
-                sums += self._after_step(step, jax.device_get(metrics))
+                with with_the_others(step):
+                    state, metrics = take_step(state, batch)
+                    metrics = jax.device_get(metrics)
+                sums += self._after_step(step, metrics)
                 stop = self._told_to_stop(step)
                 if stop or self._is_due(step):
                     checkpoints.save(state, position)

@@ -1,9 +1,16 @@
 """Several processes, perhaps on several machines, as one training."""
 
+import contextlib
+import os
+import sys
+from collections.abc import Iterator
+
 import jax
 from jax.experimental import multihost_utils
 
 from rcirl_jax.errors import InputError
+
+EXIT_LOST = 2  # status of a process that lost another, as of other lost work
 
 
 def join_processes(
@@ -61,3 +68,24 @@ def all_stop_after(step: int) -> bool:
     return jax.process_count() > 1 and multihost_utils.reached_preemption_sync_point(
         step
     )
+
+
+@contextlib.contextmanager
+def with_the_others(step: int) -> Iterator[None]:
+    """What all processes do together; if one of them is lost, this one ends at once.
+
+    Without the others nothing can be saved or closed: each would be waited for, for
+    minutes. All that is needed to go on is in the checkpoints.
+    """
+    try:
+        yield
+    except jax.errors.JaxRuntimeError as error:
+        if jax.process_count() == 1:
+            raise
+        reason = str(error).splitlines()[0][:200]
+        sys.stderr.write(
+            f"\nerror: step {step}: another process is lost ({reason}): start all of "
+            "them again to go on from the last checkpoint\n"
+        )
+        sys.stderr.flush()
+        os._exit(EXIT_LOST)

@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 
 import jax
 import numpy as np
@@ -14,7 +15,7 @@ import pytest
 from rcirl_jax.data.store import DatasetWriter
 from rcirl_jax.errors import InputError
 from rcirl_jax.train.loop import restore_run
-from rcirl_jax.train.processes import join_processes
+from rcirl_jax.train.processes import EXIT_LOST, join_processes
 from tests.conftest import REPO
 from tests.data.test_store import finish_fields, lineage
 from tests.scenes import batch, demonstration
@@ -44,7 +45,7 @@ def free_port():
         return taken.getsockname()[1]
 
 
-def start(data, workdir, parallel, processes, devices, kill_after=-1, in_memory_mb=0.0):
+def start(data, workdir, parallel, processes, devices, **changes):
     """The processes of one training; devices are those of each."""
     workdir.mkdir(parents=True, exist_ok=True)
     several = processes > 1
@@ -54,8 +55,11 @@ def start(data, workdir, parallel, processes, devices, kill_after=-1, in_memory_
         "parallel": parallel,
         "address": f"127.0.0.1:{free_port()}" if several else None,
         "num_processes": processes if several else None,
-        "kill_after": kill_after,
-        "in_memory_mb": in_memory_mb,
+        "kill_after": -1,
+        "victims": list(range(processes)),
+        "in_memory_mb": 0.0,
+        "pause_s": 0.0,
+        **changes,
     }
     env = {
         **os.environ,
@@ -170,6 +174,65 @@ def test_killed_processes_resume_to_the_bit(data, undisturbed, tmp_path):
     assert_same_bits(tmp_path, undisturbed["2x2"][0])
     lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
     assert [json.loads(line)["step"] for line in lines] == list(range(1, STEPS + 1))
+
+
+def lines_of(workdir, number):
+    """What a process said besides its progress bar."""
+    said = (workdir / f"stderr_{number}").read_text().replace("\r", "\n").splitlines()
+    return [line for line in said if line.strip() and "%|" not in line]
+
+
+@pytest.mark.slow
+def test_who_loses_another_process_ends_with_one_line(data, undisturbed, tmp_path):
+    """Number 1 is killed; number 0 does not wait for it; both start again."""
+    workers = start(
+        data, tmp_path, "jit_sharded", 2, 2, kill_after=2, victims=[1], pause_s=0.2
+    )
+    assert workers[1].wait(600) == -signal.SIGKILL
+    begin = time.monotonic()
+    assert workers[0].wait(120) == EXIT_LOST
+    assert time.monotonic() - begin < 30.0
+    errors = [line for line in lines_of(tmp_path, 0) if line.startswith("error: ")]
+    assert len(errors) == 1
+    assert "another process is lost" in errors[0]
+    assert "Traceback" not in (tmp_path / "stderr_0").read_text()
+    finished(start(data, tmp_path, "jit_sharded", 2, 2), tmp_path)
+    assert_same_bits(tmp_path, undisturbed["2x2"][0])
+
+
+@pytest.mark.slow
+def test_one_process_told_to_end_stops_all_at_the_same_step(
+    data, undisturbed, tmp_path
+):
+    workers = start(data, tmp_path, "jit_sharded", 2, 2, pause_s=1.5)
+    while not (tmp_path / "step_1").exists():
+        assert workers[1].poll() is None, lines_of(tmp_path, 1)[-20:]
+        time.sleep(0.05)
+    workers[1].send_signal(signal.SIGTERM)
+    assert [worker.wait(60) for worker in workers] == [143, 143]
+    steps = [(tmp_path / f"step_{number}").read_text() for number in (0, 1)]
+    assert steps[0] == steps[1]
+    assert 1 <= int(steps[0]) < STEPS
+    assert (tmp_path / "checkpoints" / steps[0]).is_dir()
+    finished(start(data, tmp_path, "jit_sharded", 2, 2), tmp_path)
+    assert_same_bits(tmp_path, undisturbed["2x2"][0])
+
+
+@pytest.mark.slow
+def test_processes_agree_on_the_checkpoint_before_a_damaged_one(
+    data, undisturbed, tmp_path
+):
+    workers = start(data, tmp_path, "jit_sharded", 2, 2, kill_after=4)
+    for worker in workers:
+        worker.wait(600)
+    noted = tmp_path / "checkpoints" / "4" / "_CHECKPOINT_METADATA"
+    noted.write_bytes(noted.read_bytes()[:-1])
+    seen = finished(start(data, tmp_path, "jit_sharded", 2, 2), tmp_path)
+    assert [process["steps"] for process in seen] == [STEPS - 2, STEPS - 2]
+    assert_same_bits(tmp_path, undisturbed["2x2"][0])
+    said = [lines_of(tmp_path, number) for number in (0, 1)]
+    assert sum("checkpoint 4: _CHECKPOINT_METADATA" in x for x in said[0]) == 1
+    assert not any("checkpoint 4" in x for x in said[1])
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ import jax
 
 from rcirl_jax.data import pipeline
 from rcirl_jax.data.store import open_dataset
+from rcirl_jax.interrupts import Interrupted
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.processes import join_processes
@@ -51,7 +52,9 @@ def main():
 
     def on_step(step):
         after_first.append(compilations.count)
-        if step == job["kill_after"] + 1:
+        time.sleep(job["pause_s"])
+        (workdir / f"step_{number}").write_text(str(step))
+        if step == job["kill_after"] + 1 and number in job["victims"]:
             while not saved.is_dir():  # it is being written while the steps go on
                 time.sleep(0.02)
             os.kill(os.getpid(), signal.SIGKILL)
@@ -63,7 +66,10 @@ def main():
         checkpoint_every=2,
         on_step=on_step,
     )
-    result = train(open_dataset(job["data"]), workdir, CONFIG, running=running)
+    try:
+        result = train(open_dataset(job["data"]), workdir, CONFIG, running=running)
+    except Interrupted as stop:
+        sys.exit(128 + stop.number)
     seen = {
         "compiled_later": after_first[-1] - after_first[0],
         "steps": len(after_first),

@@ -1,0 +1,238 @@
+"""A training disturbed in every way that one process can be: the same bits."""
+
+import json
+import os
+import shutil
+import signal
+import time
+
+import jax
+import numpy as np
+import pytest
+
+from rcirl_jax import interrupts
+from rcirl_jax.data.importing import import_parts
+from rcirl_jax.data.store import DatasetWriter, open_dataset
+from rcirl_jax.errors import InputError
+from rcirl_jax.stages import only_one
+from rcirl_jax.train.checkpoint import DIGESTS
+from rcirl_jax.train.loop import restore_run, train
+from rcirl_jax.train.running import Running
+from tests.data.small_logs import CONFIG as IMPORT
+from tests.data.small_logs import files_of, write_logs
+from tests.data.test_store import finish_fields, lineage
+from tests.scenes import batch, demonstration
+from tests.train.worker import CONFIG
+
+STEPS = 6  # 21 rows, batches of 8, two epochs
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("faults") / "d"
+    writer = DatasetWriter(folder)
+    for index in range(4):
+        rows = [demonstration(seed) for seed in range(7 * index, 7 * index + 7)]
+        writer.write_shard(index, jax.tree.map(np.asarray, batch(rows)), lineage(index))
+    writer.finish(finish_fields())
+    return open_dataset(folder)
+
+
+class StopError(Exception):
+    pass
+
+
+def trained(dataset, workdir, stop_after=None, each=lambda step: None):
+    """The run, saved after every step; cut short after a step if asked."""
+
+    def on_step(step):
+        each(step)
+        if step == stop_after:
+            raise StopError
+
+    running = Running(checkpoint_every=1, on_step=on_step)
+    if stop_after is None:
+        return train(dataset, workdir, CONFIG, running=running)
+    with pytest.raises(StopError):
+        train(dataset, workdir, CONFIG, running=running)
+    return None
+
+
+@pytest.fixture(scope="module")
+def undisturbed(dataset, tmp_path_factory):
+    return leaves(trained(dataset, tmp_path_factory.mktemp("undisturbed")).state)
+
+
+@pytest.fixture(scope="module")
+def cut_short(dataset, tmp_path_factory):
+    """A run folder with checkpoints 3, 4 and 5."""
+    folder = tmp_path_factory.mktemp("cut") / "run"
+    trained(dataset, folder, stop_after=5)
+    return folder
+
+
+@pytest.fixture
+def run(cut_short, tmp_path):
+    return shutil.copytree(cut_short, tmp_path / "run")
+
+
+def leaves(state):
+    plain = state.replace(key=jax.random.key_data(state.key))
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(plain)]
+
+
+def assert_same_bits(state, expected):
+    for a, b in zip(leaves(state), expected, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def steps_of(workdir):
+    lines = (workdir / "metrics.jsonl").read_text().splitlines()
+    return [json.loads(line)["step"] for line in lines]
+
+
+def test_a_run_goes_on_before_a_damaged_checkpoint(dataset, undisturbed, run, capsys):
+    victim = next((run / "checkpoints" / "5" / "state" / "d").iterdir())
+    raw = bytearray(victim.read_bytes())
+    raw[len(raw) // 2] ^= 8
+    victim.write_bytes(raw)
+    with pytest.raises(InputError, match=r"checkpoint 5: .* run the training again"):
+        restore_run(run, CONFIG)  # what is exported is never an older state
+    result = trained(dataset, run)
+    said = [x for x in capsys.readouterr().err.splitlines() if "checkpoint" in x]
+    assert len(said) == 1
+    assert "checkpoint 5: state/d/" in said[0]
+    assert said[0].endswith("damaged; the one before it that is whole: 4")
+    assert_same_bits(result.state, undisturbed)
+    assert steps_of(run) == list(range(1, STEPS + 1))
+    assert_same_bits(restore_run(run, CONFIG), undisturbed)
+
+
+def test_without_a_whole_checkpoint_nothing_is_touched(dataset, run):
+    for folder in (run / "checkpoints").iterdir():
+        (folder / "_CHECKPOINT_METADATA").unlink()
+    before = files_of(run)
+    with pytest.raises(InputError, match=r"expected one that is whole; use another -"):
+        trained(dataset, run)
+    assert files_of(run) == before
+
+
+def test_metrics_cut_in_a_line_go_on_with_the_next(dataset, undisturbed, run):
+    path = run / "metrics.jsonl"
+    path.write_bytes(path.read_bytes()[:-9])  # step 5, whose state is saved
+    (run / "metrics.jsonl.tmp").write_text("left by a kill")
+    result = trained(dataset, run)
+    assert_same_bits(result.state, undisturbed)
+    assert steps_of(run) == [1, 2, 3, 4, 6]
+
+
+def test_told_to_end_it_saves_the_step_it_is_in(
+    dataset, undisturbed, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(interrupts._Heard, "number", None)
+
+    def on_step(step):
+        if step == 2:  # in the middle of an epoch
+            interrupts._Heard.number = signal.SIGTERM
+
+    running = Running(on_step=on_step)
+    with pytest.raises(interrupts.Interrupted):
+        train(dataset, tmp_path, CONFIG, running=running)
+    assert [x.name for x in (tmp_path / "checkpoints").iterdir()] == ["3"]
+    interrupts._Heard.number = None
+    assert_same_bits(trained(dataset, tmp_path).state, undisturbed)
+    assert steps_of(tmp_path) == list(range(1, STEPS + 1))
+
+
+def test_a_folder_in_use_is_refused(dataset, undisturbed, run):
+    before = files_of(run)
+    with only_one(run), pytest.raises(InputError, match=f"{run}: in use by another"):
+        trained(dataset, run)
+    assert files_of(run) == before
+    assert_same_bits(trained(dataset, run).state, undisturbed)
+
+
+class Clock:
+    """The time of day, which jumps hours back and days forth when it is told to."""
+
+    JUMPS = (-7200.0, 3 * 86400.0, -400 * 86400.0, 5.0)
+
+    def __init__(self):
+        self.real, self.jumps, self.by_s = time.time, 0, 0.0
+
+    def __call__(self):
+        return self.real() + self.by_s
+
+    def jump(self):
+        self.by_s += self.JUMPS[self.jumps % len(self.JUMPS)]
+        self.jumps += 1
+
+
+def age(folder, by_s):
+    """Files as if written then; every second one the other way round."""
+    for number, path in enumerate(sorted(folder.rglob("*"))):
+        when = time.time() + (by_s if number % 2 else -by_s)
+        os.utime(path, (when, when))
+
+
+@pytest.mark.parametrize("by_s", [86400.0, -86400.0])
+def test_the_time_of_day_decides_nothing(
+    dataset, undisturbed, tmp_path, monkeypatch, by_s
+):
+    clock = Clock()
+    monkeypatch.setattr(time, "time", clock)
+
+    def jump_after(step):
+        """Once it is saved: orbax gives a save 300 s of the time of day."""
+        noted = tmp_path / "checkpoints" / str(step) / DIGESTS
+        while not noted.exists():
+            time.sleep(0.01)
+        clock.jump()
+
+    for stop_after in (2, 5):
+        trained(dataset, tmp_path, stop_after, jump_after)
+        age(tmp_path, by_s)
+    result = trained(dataset, tmp_path, each=jump_after)
+    assert clock.jumps == STEPS
+    assert_same_bits(result.state, undisturbed)
+    assert steps_of(tmp_path) == list(range(1, STEPS + 1))
+    kept = sorted(x.name for x in (tmp_path / "checkpoints").iterdir())
+    assert kept == ["4", "5", "6"]  # the newest by their steps
+    assert result.seconds >= 0.0
+
+
+def test_the_time_of_day_decides_nothing_in_an_import(tmp_path, monkeypatch):
+    logs = write_logs(tmp_path / "logs", files=3)
+    monkeypatch.setattr("rcirl_jax.data.importing.SHARD_SCENES", 30)
+    import_parts(logs, tmp_path / "expected", IMPORT)
+    clock = Clock()
+    monkeypatch.setattr(time, "time", clock)
+    write, left = DatasetWriter.write_shard, [1]
+
+    def dying(self, *rows):
+        clock.jump()
+        left[0] -= 1
+        if left[0] < 0:
+            raise StopError
+        return write(self, *rows)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(DatasetWriter, "write_shard", dying)
+        with pytest.raises(StopError):
+            import_parts(logs, tmp_path / "d", IMPORT)
+    assert len(list((tmp_path / "d").rglob("shard.json"))) == 1
+    age(tmp_path, 86400.0)
+    import_parts(logs, tmp_path / "d", IMPORT)
+    assert files_of(tmp_path / "d") == files_of(tmp_path / "expected")
+
+
+def test_a_dataset_being_written_is_refused_and_left_alone(tmp_path):
+    logs = write_logs(tmp_path / "logs", files=2)
+    data = tmp_path / "deep" / "d"
+    with only_one(data):
+        with pytest.raises(InputError, match=r"deep/d: in use by another process"):
+            import_parts(logs, data, IMPORT)
+        assert [x.name for x in data.iterdir()] == [".lock"]
+    # the file of a killed import holds nobody up, and does not stay
+    import_parts(logs, data, IMPORT)
+    assert sorted(x.name for x in data.iterdir()) == ["manifest.json", "shards"]
