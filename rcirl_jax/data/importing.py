@@ -25,6 +25,7 @@ from rcirl_jax.data.files import Files
 from rcirl_jax.data.parts import Part, items
 from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.data.recording import LEAVE_OUT
+from rcirl_jax.data.rows import check_finite
 from rcirl_jax.data.splits import assign_groups
 from rcirl_jax.data.store import Dataset, DatasetWriter, Manifest
 from rcirl_jax.errors import InputError, LostWorkError
@@ -162,13 +163,13 @@ class _Import:
             "quality": made.quality,
         }
         if made.scenes is not None:
-            self.pending.append(
-                made.scenes.replace(
-                    vehicle=self._numbers(self.vehicles, made.vehicles),
-                    group=self._numbers(self.groups, made.groups),
-                    recording=np.full_like(made.scenes.recording, number),
-                )
+            scenes = made.scenes.replace(
+                vehicle=self._numbers(self.vehicles, made.vehicles),
+                group=self._numbers(self.groups, made.groups),
+                recording=np.full_like(made.scenes.recording, number),
             )
+            check_finite(made.name, scenes, np.arange(len(made.vehicles)))
+            self.pending.append(scenes)
         self._count(entry)
         if self.quality.refused > self.config.leave_out:
             raise InputError(

@@ -2,11 +2,13 @@
 
 import dataclasses
 import functools
+from collections.abc import Mapping
 from typing import Any, TypeVar, cast
 
 import jax
 import numpy as np
 
+from rcirl_jax.errors import InputError
 from rcirl_jax.types import (
     NUM_TAGS,
     Demonstration,
@@ -91,3 +93,62 @@ def checked_leaves(rows: Demonstration) -> dict[str, np.ndarray]:
     if count == 0:
         raise ValueError("shard: 0 rows: expected at least one")
     return leaves
+
+
+def scene_name(rows: Demonstration, at: int, row: int) -> str:
+    """A scene in one line: its dataset row and the numbers that it carries.
+
+    Recording and vehicle number the manifest's tables, the frame those of the
+    recording.
+
+    Args:
+      rows: demonstrations (numpy).
+      at: place of the scene among them.
+      row: its row in the dataset.
+    """
+    number = lambda name: int(np.asarray(getattr(rows, name))[at])  # noqa: E731
+    names = ("recording", "vehicle", "frame")
+    return f"scene {row} ({', '.join(f'{name} {number(name)}' for name in names)})"
+
+
+def unusable_leaves(rows: Demonstration, at: int) -> list[str]:
+    """Names of a scene's stored leaves that hold a NaN or an infinity."""
+    return [
+        name
+        for name, leaf in named_leaves(rows).items()
+        if not np.isfinite(np.asarray(leaf[at])).all()
+    ]
+
+
+def refuse_scenes(
+    what: str, rows: Demonstration, index: np.ndarray, bad: Mapping[str, np.ndarray]
+) -> None:
+    """Refuse scenes of which something is no finite number.
+
+    Args:
+      what: first in the line, who read or made it.
+      rows: n demonstrations (numpy), or more than n.
+      index: [n] their rows in the dataset.
+      bad: name -> [n] bool, what is not finite of each scene.
+
+    Raises:
+      InputError: names the first such scene and all that is bad of it.
+    """
+    table = np.array(list(bad.values())).reshape(len(bad), -1)
+    if table.any():
+        at = int(np.argmax(table.any(axis=0)))
+        found = [name for name, is_bad in zip(bad, table[:, at], strict=True) if is_bad]
+        raise InputError(
+            f"{what}: {scene_name(rows, at, int(index[at]))}: {', '.join(found)}: not "
+            "finite: expected finite numbers"
+        )
+
+
+def check_finite(what: str, rows: Demonstration, index: np.ndarray) -> None:
+    """`refuse_scenes` for what n scenes (numpy) hold themselves."""
+    bad = {
+        name: ~np.isfinite(leaf).reshape(len(index), -1).all(axis=1)
+        for name, leaf in named_leaves(rows).items()
+        if leaf.dtype == np.float32
+    }
+    refuse_scenes(what, rows, index, bad)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import tqdm
 
+from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.suite_output import (
     format_families,
     format_suite,
@@ -69,6 +70,19 @@ def drive_here(row: Row, cases: CaseSet, config: SuiteConfig) -> CaseMetrics:
         )
 
 
+def _driven(row: Row, cases: CaseSet, config: SuiteConfig, drive: Drive) -> CaseMetrics:
+    """A row's drives; InputError names the first case with a NaN."""
+    metrics = drive(row, cases, config)
+    for field, values in vars(metrics).items():
+        bad = np.isnan(np.asarray(values)).reshape(len(cases.ids), -1).any(axis=1)
+        if bad.any():
+            case = cases.ids[int(np.argmax(bad))]
+            raise InputError(
+                f"simulate: {row.name}: case {case}: {field}: NaN: expected a number"
+            )
+    return metrics
+
+
 def run_suite(
     rows: Sequence[Row],
     cases: CaseSet,
@@ -81,7 +95,7 @@ def run_suite(
     preventable and how far one gets. Where the recorded human is a row, its
     distance is the reference instead of IDM's.
     """
-    classified = {row.name: drive(row, cases, config) for row in judges()}
+    classified = {row.name: _driven(row, cases, config, drive) for row in judges()}
     avoidable = preventable([classified["CC"], classified["FSM"]])
     calm = trivial([classified["IDM"], classified["constant speed"]])
     runs: dict[str, CaseMetrics] = {}
@@ -89,7 +103,7 @@ def run_suite(
     for row in rows:
         begin = time.perf_counter()
         known = classified.get(row.name)
-        runs[row.name] = drive(row, cases, config) if known is None else known
+        runs[row.name] = known or _driven(row, cases, config, drive)
         seconds = time.perf_counter() - begin
         hashes[row.name] = result_hash(runs[row.name])
         if known is None:

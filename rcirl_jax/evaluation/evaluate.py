@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from rcirl_jax.data.joined import Demonstrations
+from rcirl_jax.data.rows import check_finite
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking import (
     Outcomes,
@@ -55,9 +56,10 @@ def covered_rows(
     """Scenes of a split whose recording covers the horizon, and their rows.
 
     Raises:
-      InputError: there is none.
+      InputError: there is none, or a scene holds a NaN or an infinity.
     """
     rows, index = dataset.load(split), dataset.indices(split)
+    check_finite(f"split {split}", rows, index)
     keep = np.flatnonzero(covers(rows, horizon_s))
     if keep.size == 0:
         raise InputError(
@@ -159,8 +161,8 @@ def rank_scenes(
       InputError: no scene of the split covers the horizon.
     """
     flat = _numbered(learned)
-    temperatures = _temperatures(dataset, setup, flat, executor)
     rows, index = covered_rows(dataset, setup.split, setup.horizon_s)
+    temperatures = _temperatures(dataset, setup, flat, executor)
     scored = _score(rows, index, setup, flat, executor)
     outcomes = outcomes_of(scored, rows, setup)
 

@@ -6,12 +6,13 @@ recorded human in the scene's Frenet frame, at the chosen horizon.
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rcirl_jax.data.rows import refuse_scenes
 from rcirl_jax.executor import Executor, Here
 from rcirl_jax.features import FeatureMap, feature_map
 from rcirl_jax.features.columns import COLUMNS, make_frame
@@ -199,6 +200,9 @@ def score_scenes(
 
     Returns:
       Scored, numpy.
+
+    Raises:
+      InputError: a feature or a value is not a number (names the scene).
     """
     count = index.size
 
@@ -230,7 +234,26 @@ def _score_chunk(
     fields = {name: rival.fields() for name, rival in tuned.items()}
     made = _score_batch(*shared, kinds)(fields, index, rows)
     made = jax.tree.map(lambda x: np.asarray(x[:keep]), made)
-    yield _with_values(made, scorers)
+    both = (made["features"], made["features_human"])
+    if not all(np.isfinite(x).all() for x in both):  # by feature only then: slow
+        names = feature_map(shared[0]).names
+        columns = {
+            f"feature {n}": [x[..., i] for x in both] for i, n in enumerate(names)
+        }
+        refuse_scenes("rank", rows, index, _not_finite(columns, keep))
+    made = _with_values(made, scorers)
+    both = (made["values"], made["human_values"])
+    values = {f"value of {name}": [x[name] for x in both] for name in both[0]}
+    refuse_scenes("rank", rows, index, _not_finite(values, keep))
+    yield made
+
+
+def _not_finite(
+    found: Mapping[str, Sequence[np.ndarray]], count: int
+) -> dict[str, np.ndarray]:
+    """Name -> [count] bool: one of the scene's numbers, in any array, is not finite."""
+    fine = lambda x: np.isfinite(x).reshape(count, -1).all(axis=1)  # noqa: E731
+    return {n: ~np.logical_and.reduce([*map(fine, xs)]) for n, xs in found.items()}
 
 
 def _with_values(made: dict, scorers: Mapping[str, Scorer]) -> dict:

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 
 from rcirl_jax.features.columns import COLUMNS, LINE_CAP_M, make_frame
 from rcirl_jax.types import Scene, Trajectory
-from rcirl_jax.units import TIMES_S
+from rcirl_jax.units import DT_S, TIMES_S
 
 TUNED_ROW = "hand-set, tuned"  # name of the tuned cost's row in all tables
 LONG_ROW = "hand-set, tuned long"  # of one tuned with many more queries
@@ -150,7 +150,8 @@ def weighted_cost(terms: LatticeTerms, weights: LatticeCost) -> Float[Array, ""]
     """The cost of one trajectory's terms under some weights; see `lattice_cost`."""
     reference = jnp.minimum(terms.limit * weights.speed_share, terms.approach)
     off_speed = jnp.sum(terms.early * jnp.abs(reference - terms.speed))
-    off_speed = off_speed / jnp.sum(terms.early)
+    # nothing is early where t = 0 is the only valid time
+    off_speed = off_speed / jnp.maximum(jnp.sum(terms.early), DT_S**2)
     far = weights.objective_distance / (1.0 + terms.travelled)
     total = jnp.add(weights.objective_speed, weights.objective_distance)
     objective = (off_speed * weights.objective_speed + far) / total

@@ -22,6 +22,12 @@ import numpy as np
 from rcirl_jax.data.joined import Demonstrations
 from rcirl_jax.data.pipeline import split_batches
 from rcirl_jax.data.preferences import Preferences
+from rcirl_jax.data.rows import (
+    check_finite,
+    refuse_scenes,
+    scene_name,
+    unusable_leaves,
+)
 from rcirl_jax.data.stream import Prefetch
 from rcirl_jax.errors import InputError
 from rcirl_jax.features import FeatureMap, feature_map
@@ -76,12 +82,16 @@ def fit_normaliser_on(
     chosen = np.sort(chosen[:NORMALISER_SCENES])
     rows = dataset.read(index[chosen])
     key = jax.random.fold_in(jax.random.key(config.seed), NORMALISER_STREAM)
-    parts = map(rows_that_count, in_chunks(key, rows, chosen, config))
+    parts = map(rows_that_count, in_chunks(key, rows, chosen, config, index[chosen]))
     return fit_normaliser(np.concatenate(list(parts)), features)
 
 
 def in_chunks(
-    key: jax.Array, rows: Demonstration, index: np.ndarray, config: TrainConfig
+    key: jax.Array,
+    rows: Demonstration,
+    index: np.ndarray,
+    config: TrainConfig,
+    stored: np.ndarray | None = None,
 ) -> Iterator[FeatureBatch]:
     """Features (numpy) of S scenes, CHUNK at a time; each scene once.
 
@@ -90,7 +100,13 @@ def in_chunks(
       rows: S demonstrations (numpy).
       index: [S] number of each scene.
       config: sampler, positive, features.
+      stored: [S] dataset row of each scene, where that is not `index`.
+
+    Raises:
+      InputError: a stored number or a feature is NaN or infinite (names the scene).
     """
+    stored = index if stored is None else stored
+    check_finite("train", rows, stored)
     for start in range(0, index.size, CHUNK):
         # the last chunk is filled up: one shape to compile
         at = np.minimum(np.arange(start, start + CHUNK), index.size - 1)
@@ -99,7 +115,9 @@ def in_chunks(
             key, to_device_batch(taken, np.ones(CHUNK), index[at]), config
         )
         keep = min(CHUNK, index.size - start)
-        yield jax.tree.map(lambda x, n=keep: np.asarray(x[:n]), made)
+        made = jax.tree.map(lambda x, n=keep: np.asarray(x[:n]), made)
+        check_features(made, taken, stored[at], config.features)
+        yield made
 
 
 def rows_that_count(batch: FeatureBatch) -> np.ndarray:
@@ -190,7 +208,8 @@ def _train(
         state, position = checkpoints.restore(like)
         batches.restore(position)
     describe_run(workdir, config, dataset, provenance)
-    run = _Run(config, running, features, batches.batches_per_epoch, workdir, state)
+    per_epoch = batches.batches_per_epoch
+    run = _Run(config, running, features, per_epoch, workdir, state, dataset)
     if preferences is not None:
         run.judged = featurise_preferences(preferences, dataset, config)
 
@@ -255,8 +274,10 @@ class _Run:
         per_epoch: int,
         workdir: Path,
         state: TrainState,
+        dataset: Demonstrations,
     ) -> None:
         self.config, self.running, self.features = config, running, features
+        self.dataset = dataset
         self.per_epoch, first_step = per_epoch, int(state.step)
         total = self.per_epoch * config.epochs
         self.writer = MetricsWriter(workdir, first_step) if is_first() else None
@@ -320,7 +341,7 @@ class _Run:
         return step % self.per_epoch == 0 or (every > 0 and step % every == 0)
 
     def _after_step(self, step: int, metrics: StepMetrics) -> np.ndarray:
-        guard(metrics, self.features, step)
+        guard(metrics, self.features, step, self.dataset)
         pairs = max(float(metrics.pairs), 1.0)
         shown = {
             "loss": float(metrics.loss_sum) / max(float(metrics.terms), 1.0),
@@ -349,18 +370,53 @@ def _summary(epoch: int, sums: np.ndarray) -> dict:
     }
 
 
-def guard(metrics: StepMetrics, features: FeatureMap, step: int) -> None:
-    """Stop with the scene and the features named when a number is not finite."""
+def guard(
+    metrics: StepMetrics,
+    features: FeatureMap,
+    step: int,
+    dataset: Demonstrations | None = None,
+) -> None:
+    """Stop with the scene and the features named when a number is not finite.
+
+    The scene is looked up in the dataset, if given, once the step has failed.
+    """
     if bool(metrics.finite):
         return
-    bad = np.flatnonzero(np.asarray(metrics.nonfinite))
-    if bad.size:
+    row = int(metrics.first_bad)
+    if row >= 0:
+        bad = np.flatnonzero(np.asarray(metrics.nonfinite))
         names = ", ".join(features.names[i] for i in bad)
+        scene, cause = f"scene {row}", ""
+        if dataset is not None:
+            rows = dataset.read(np.array([row]))
+            scene, leaves = scene_name(rows, 0, row), unusable_leaves(rows, 0)
+            cause = f" (as is the stored {', '.join(leaves)})" if leaves else ""
         raise InputError(
-            f"train: step {step}: scene {int(metrics.first_bad)}: feature {names}: "
-            "not finite: expected finite features; the state before is kept"
+            f"train: step {step}: {scene}: feature {names}: not finite{cause}: "
+            "expected finite features; the state before is kept"
         )
     raise InputError(
         f"train: step {step}: loss or gradient: not finite: features are finite; "
         "lower --learning_rate; the state before is kept"
     )
+
+
+def check_features(
+    made: FeatureBatch, rows: Demonstration, stored: np.ndarray, preset: str
+) -> None:
+    """Refuse features (numpy) that are NaN or infinite.
+
+    Args:
+      made: features of the first n of the scenes; the others are not looked at.
+      rows: the scenes.
+      stored: their rows in the dataset.
+      preset: of the features.
+
+    Raises:
+      InputError: names the first such scene and its features.
+    """
+    bad = ~np.isfinite(made.candidates).all(axis=(2, 3))
+    bad |= ~np.isfinite(made.human).all(axis=1)
+    names = feature_map(preset).names
+    found = {f"feature {name}": bad[:, i] for i, name in enumerate(names)}
+    refuse_scenes("train", rows, stored, found)

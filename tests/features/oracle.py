@@ -113,3 +113,53 @@ def point(scene, trajectory, i):
         out[f"{column}_distance"], out[f"{column}_speed"] = best(name, cap)
     out["nudge_lateral"], out["nudge_speed"] = best("nudge", 10.0, by=2)
     return out
+
+
+def table_slope(table, points):
+    last = len(table) - 1
+    return np.array(
+        [
+            (table[min(i + points, last)] - table[max(i - points, 0)])
+            / (2.0 * points * STATION_STEP_M)
+            for i in range(len(table))
+        ]
+    )
+
+
+def motion(scene, s, l, mode):
+    """Leaves of the Trajectory through float64 stations (and offsets) [T], by loops.
+
+    `speed` takes the offsets of the scene's path, `path_speed` those given.
+    """
+    dt, ego = 8.0 / 17, scene.ego
+    last = int(np.asarray(scene.time_valid).sum()) - 1
+    v, a = [float(ego.v)], [float(ego.a)]
+    for i in range(1, T):
+        ends = i >= last
+        a.append(a[-1] if ends else (s[i + 1] - 2 * s[i] + s[i - 1]) / dt**2)
+        if ends:
+            v.append((s[i] - s[i - 1]) / dt + 0.5 * a[-1] * dt)
+        else:
+            v.append((s[i + 1] - s[i - 1]) / (2 * dt))
+    j = [(a[i] - a[i - 1]) / dt for i in range(1, T)]
+    out = {"s": s, "v": v, "a": a, "j": [j[0], *j]}
+    if mode == "speed":
+        offset = np.asarray(scene.path.l, np.float64)
+        slope = table_slope(offset, 3)
+        tables = {"l": offset, "dl": slope, "ddl": table_slope(slope, 3)}
+        out |= {n: [interpolate(x, at) for at in s] for n, x in tables.items()}
+    else:
+        dl = [float(ego.dl), *by_station(s, l)[1:]]
+        out |= {"l": l, "dl": dl, "ddl": by_station(s, dl)}
+    out["dl"][0], out["ddl"][0] = float(ego.dl), float(ego.ddl)
+    return {name: np.asarray(values, np.float64) for name, values in out.items()}
+
+
+def by_station(s, x):
+    """dx/ds over the neighbouring times; 0 where the car moves less than a metre."""
+    found = []
+    for i in range(T):
+        low, high = max(i - 1, 0), min(i + 1, T - 1)
+        advance = s[high] - s[low]
+        found.append((x[high] - x[low]) / advance if advance > 1.0 else 0.0)
+    return found

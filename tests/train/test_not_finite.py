@@ -1,0 +1,179 @@
+"""A NaN anywhere is one line that names the scene or the case."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from rcirl_jax.data import importing
+from rcirl_jax.data.cut import Cut
+from rcirl_jax.data.rows import check_finite
+from rcirl_jax.data.store import DatasetWriter, open_dataset
+from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation import score
+from rcirl_jax.evaluation.closed_loop import SuiteConfig, run_suite
+from rcirl_jax.evaluation.evaluate import RankingSetup, evaluate_ranking
+from rcirl_jax.evaluation.learners import learner_configs, train_learners
+from rcirl_jax.evaluation.sweep import train_group
+from rcirl_jax.simulation.metrics import CaseMetrics
+from rcirl_jax.simulation.rows import human_row
+from rcirl_jax.simulation.suite import catalogue_set, suite_refs
+from rcirl_jax.train import loop
+from rcirl_jax.train.loop import train
+from rcirl_jax.train.state import TrainConfig
+from rcirl_jax.units import HORIZON_S
+from tests.data.test_store import finish_fields, lineage
+from tests.scenes import batch, demonstration
+from tests.train.test_step import SMALL
+from tests.train.test_sweep import config_of
+
+COUNT = 16  # scenes, one vehicle each; every fourth from the second is a test scene
+CONFIG = TrainConfig(batch_size=4, epochs=1, sampler=SMALL, positive="nearest")
+SETUP = RankingSetup(sampler=SMALL)
+TRAINED, HELD_OUT = 6, 9
+
+
+def rows():
+    made = jax.tree.map(np.asarray, batch([demonstration(i) for i in range(COUNT)]))
+    return made.replace(future_s=np.full(COUNT, HORIZON_S, np.float32))
+
+
+def stored(folder, row=None, value=np.nan):
+    """A dataset of which one row, if any, holds a limit that is no number."""
+    made = rows()
+    if row is not None:
+        limit = made.scene.path.speed_limit.copy()
+        limit[row, 40] = value
+        path = made.scene.path.replace(speed_limit=limit)
+        made = made.replace(scene=made.scene.replace(path=path))
+    writer = DatasetWriter(folder)
+    writer.write_shard(0, made, lineage(0))
+    writer.finish(finish_fields())
+    return open_dataset(folder)
+
+
+def line(row):
+    return rf"scene {row} \(recording 0, vehicle {row}, frame {row}\): "
+
+
+LIMIT = r"scene\.path\.speed_limit: not finite: expected finite numbers"
+
+
+@pytest.mark.parametrize("value", [np.nan, -np.inf])
+def test_a_stored_scene_is_named_before_training(tmp_path, value):
+    data = stored(tmp_path / "d", TRAINED, value)
+    with pytest.raises(InputError, match=f"^train: {line(TRAINED)}{LIMIT}$"):
+        train(data, tmp_path / "run", CONFIG)
+    with pytest.raises(InputError, match=f"^train: {line(TRAINED)}{LIMIT}$"):
+        train_learners(data, learner_configs(["hinge"], CONFIG), [0])
+    assert not (tmp_path / "run" / "run.json").exists()
+
+
+def test_a_sweep_names_it(tmp_path):
+    stored(tmp_path / "d", TRAINED)
+    config = config_of(tmp_path / "d", base=dataclasses.replace(CONFIG, seed=3))
+    held = rf"(split validation|train): {line(TRAINED)}{LIMIT}"
+    with pytest.raises(InputError, match=held):
+        next(train_group((6,), config))
+
+
+def test_a_ranking_names_it(tmp_path):
+    data = stored(tmp_path / "d", HELD_OUT)
+    with pytest.raises(InputError, match=f"^split test: {line(HELD_OUT)}{LIMIT}$"):
+        evaluate_ranking(data, {}, SETUP)
+
+
+def test_the_guard_looks_up_a_scene_that_no_check_saw(tmp_path, monkeypatch):
+    """The normaliser is fitted on some training scenes only."""
+    monkeypatch.setattr(loop, "NORMALISER_SCENES", 8)
+    data = stored(tmp_path / "d")
+    index = data.indices("train")
+    drawn = np.random.default_rng([CONFIG.seed, loop.NORMALISER_STREAM])
+    unseen = index[drawn.permutation(index.size)[8:]]
+    bad = stored(tmp_path / "bad", int(unseen[0]))
+    expected = (
+        rf"^train: step \d+: {line(unseen[0])}feature .*speed_limit.*: not finite "
+        r"\(as is the stored scene\.path\.speed_limit\): expected finite features; "
+        "the state before is kept$"
+    )
+    with pytest.raises(InputError, match=expected):
+        train(bad, tmp_path / "run", dataclasses.replace(CONFIG, epochs=3))
+
+
+def test_one_candidate_of_one_scene_is_named(tmp_path, monkeypatch):
+    """Made by us from a scene without fault."""
+    data = stored(tmp_path / "d")
+    place = int(np.flatnonzero(data.indices("train") == TRAINED)[0])
+    whole = loop.featurised
+
+    def broken(key, given, config):
+        made = whole(key, given, config)
+        at = int(np.flatnonzero(np.asarray(given.index) == place)[0])
+        return made.replace(candidates=made.candidates.at[at, 9, 2, 0].set(np.inf))
+
+    monkeypatch.setattr(loop, "featurised", broken)
+    expected = f"^train: {line(TRAINED)}feature jerk: not finite: expected finite num"
+    with pytest.raises(InputError, match=expected):
+        train(data, tmp_path / "run", CONFIG)
+
+
+def test_a_ranked_candidate_and_its_value_are_named(tmp_path, monkeypatch):
+    data = stored(tmp_path / "d")
+
+    def scorer(x, valid):
+        values = np.zeros(x.shape[:-2])
+        values[(x.shape[0] - 1, *[0] * (x.ndim - 3))] = np.nan
+        return values
+
+    with pytest.raises(InputError, match=r"^rank: scene \d+ \(.*\): value of net#0: "):
+        evaluate_ranking(data, {"net": [scorer]}, SETUP)
+    whole = score._score_batch
+
+    def broken(*shared):
+        def run(*given):
+            made = dict(whole(*shared)(*given))
+            made["features"] = made["features"].at[0, 1, 2, 6].set(np.nan)
+            return made
+
+        return run
+
+    monkeypatch.setattr(score, "_score_batch", broken)
+    with pytest.raises(InputError, match=r"^rank: scene \d+ \(.*\): feature velocity"):
+        evaluate_ranking(data, {}, SETUP)
+
+
+def test_an_import_refuses_a_scene_that_is_not_finite(tmp_path):
+    made, v = rows(), rows().scene.ego.v.copy()
+    v[5] = np.nan
+    made = made.replace(scene=made.scene.replace(ego=made.scene.ego.replace(v=v)))
+    work = importing._Import(
+        DatasetWriter(tmp_path / "d"), importing.ImportConfig(format="synthetic")
+    )
+    known = {f.name: None for f in dataclasses.fields(Cut)}
+    cut = Cut(**{**known, "name": "log", "scenes": made, "quality": {}, "refused": "",
+                 "vehicles": ["v"] * COUNT, "groups": ["g"] * COUNT})  # fmt: skip
+    with pytest.raises(InputError, match=r"^log: scene 5 \(.*\): scene\.ego\.v: not"):
+        work.add(cut)
+
+
+def test_finite_scenes_pass():
+    check_finite("test", rows(), np.arange(COUNT))
+
+
+def test_a_suite_names_row_and_case():
+    cases = catalogue_set(suite_refs("smoke")[:3], 20.0)
+
+    def drive(row, cases, config):
+        shapes = {"inside": 6, "holds": 6, "inside_filtered": 2, "holds_filtered": 2}
+        fields = [f.name for f in dataclasses.fields(CaseMetrics)]
+        made = {n: np.zeros((3, shapes[n]) if n in shapes else 3) for n in fields}
+        made["min_ttc"][:] = np.inf  # nobody ahead: a number here
+        if row.name == human_row().name:
+            made["max_j"][1] = np.nan
+        return CaseMetrics(**made)
+
+    with pytest.raises(InputError) as caught:
+        run_suite([human_row()], cases, SuiteConfig(), drive)
+    expected = f"recorded human: case {cases.ids[1]}: max_j: NaN: expected a number"
+    assert str(caught.value) == f"simulate: {expected}"
