@@ -3,7 +3,8 @@
     python -m experiments.export_weights --workdir=RUN --data=DATASET --output=FILE
 
 The file carries verification samples from the dataset's training split; a
-reader recomputes them before it accepts the file.
+reader recomputes them before it accepts the file. The ranges are for the guard
+(docs/guard.md); a reader that knows schema versions 1 and 2 only takes --noranges.
 """
 
 import json
@@ -20,6 +21,9 @@ _WORKDIR = flags.DEFINE_string("workdir", None, "run folder", required=True)
 _DATA = flags.DEFINE_list(
     "data", None, "dataset (default: the run's own); several are joined"
 )
+_RANGES = flags.DEFINE_bool(
+    "ranges", True, "record what training saw of each feature (schema version 3)"
+)
 _OUTPUT = flags.DEFINE_string("output", None, "file (default: RUN/weights.msgpack)")
 
 
@@ -27,7 +31,8 @@ def main() -> None:
     """Flags -> one file."""
     workdir = Path(_WORKDIR.value)
     output = Path(_OUTPUT.value or workdir / "weights.msgpack")
-    reward = export_run(workdir, open_datasets(_DATA.value or _own(workdir)), output)
+    dataset = open_datasets(_DATA.value or _own(workdir))
+    reward = export_run(workdir, dataset, output, ranges=_RANGES.value)
     print(f"{output}: {len(reward.names)} features, sha256 {reward.sha256[:16]}...")
 
 

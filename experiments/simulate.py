@@ -47,6 +47,11 @@ _OUTPUT = flags.DEFINE_string("output", None, "folder to write", required=True)
 _BASELINES = flags.DEFINE_list("baselines", ",".join(BASELINES), "rival rows, or empty")
 _HAND = flags.DEFINE_string("hand_weights", None, "of tune_hand_set: a further row")
 _DP = flags.DEFINE_bool("dp", False, "also drive the first weights by DP")
+_GUARD = flags.DEFINE_string(
+    "guard",
+    None,
+    "hand-set or a weights file: drives where the first is out of its data",
+)
 _CASES = flags.DEFINE_integer("cases", None, "cases per family, or recorded in all")
 _DURATION = flags.DEFINE_float("duration", None, "s per case at most (smoke 20)")
 _EVERY = flags.DEFINE_integer("plan_every", 1, "steps of 0.1 s between two plans")
@@ -82,6 +87,7 @@ def _job() -> SuiteJob:
         plan_every=_EVERY.value,
         dp=_DP.value,
         hand_weights=_HAND.value,
+        guard=_GUARD.value,
     )
 
 

@@ -31,7 +31,13 @@ def provenance():
 
 
 def example_weights(
-    seed=0, features=3, times=4, hidden=(5,), activation="tanh", by_context=False
+    seed=0,
+    features=3,
+    times=4,
+    hidden=(5,),
+    activation="tanh",
+    by_context=False,
+    seen=False,
 ):
     rng = np.random.default_rng(seed)
     sizes = (features, *hidden, 1)
@@ -51,6 +57,7 @@ def example_weights(
         times=np.linspace(0.0, 8.0, times, dtype=np.float32),
         gamma=draw(times),
         context=draw(features, features) if by_context else None,
+        seen=np.sort(draw(2, features), axis=0) if seen else None,
         kernels=tuple(draw(*pair) for pair in pairwise(sizes)),
         biases=tuple(draw(size) for size in sizes[1:]),
         activation=activation,

@@ -1,6 +1,6 @@
 // libFuzzer target: any bytes are refused with one line, or score without harm.
 //
-// The first byte chooses what the rest is: 0 a whole file, 1 or 2 the body of a file of
+// The first byte chooses what the rest is: 0 a whole file, 1 to 3 the body of a file of
 // that schema version, wrapped with the right hash (which no mutation would hit).
 #include <cmath>
 #include <cstdint>
@@ -11,6 +11,7 @@
 #include <string_view>
 #include <vector>
 
+#include "rcirl/guard.hpp"
 #include "rcirl/reward.hpp"
 
 namespace {
@@ -47,6 +48,9 @@ void score(const rcirl::Reward& reward, std::string_view bits) {
                                {marks.data(), rcirl::Mask::kShared},
                                {marks.data(), rcirl::Mask::kEach}};
   for (const rcirl::Mask mask : masks) {
+    const rcirl::Verdict verdict = rcirl::Guard(reward).check(features.data(), kCount, mask);
+    require(verdict.feature < reward.features().size());
+    require(verdict.share >= 0.0 && verdict.share <= 1.0);
     float values[kCount];
     const std::size_t refused =
         reward.score(features.data(), kCount, mask, &workspace, values);
@@ -64,7 +68,7 @@ void score(const rcirl::Reward& reward, std::string_view bits) {
 extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size) {
   if (size < 1) return 0;
   const std::string_view rest(reinterpret_cast<const char*>(data) + 1, size - 1);
-  const int version = data[0] % 3;
+  const int version = data[0] % 4;
   const std::string file = version == 0 ? std::string(rest) : sealed(rest, version);
   rcirl::Reward reward;
   const rcirl::Status status = rcirl::decode(file, "fuzz", &reward);

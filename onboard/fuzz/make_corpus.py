@@ -2,11 +2,12 @@
 
     python -m onboard.fuzz.make_corpus --output=out/corpus
 
-One seed is a byte that says what follows (0: a file, 1 or 2: the body of a file of
+One seed is a byte that says what follows (0: a file, 1 to 3: the body of a file of
 that schema version) and a small file of every activation, depth and version. The
 dictionary, `weights.dict` beside the folder, holds the words of the format.
 """
 
+import itertools
 from pathlib import Path
 
 import msgpack
@@ -23,7 +24,7 @@ def main(_: list[str]) -> None:
     folder = Path(_OUTPUT.value)
     folder.mkdir(parents=True, exist_ok=True)
     for activation in reader.ACTIVATIONS:
-        for by_context in (False, True):
+        for by_context, seen in itertools.product((False, True), repeat=2):
             for hidden in ((), (2,), (3, 2)):
                 data = packed(
                     features=2,
@@ -31,14 +32,24 @@ def main(_: list[str]) -> None:
                     hidden=hidden,
                     activation=activation,
                     by_context=by_context,
+                    seen=seen,
                 )
                 outer = msgpack.unpackb(data)
                 version = outer["schema_version"]
-                name = f"{activation}_{len(hidden)}_v{version}"
+                name = f"{activation}_{len(hidden)}_v{version}_{by_context:d}"
                 (folder / f"file_{name}").write_bytes(b"\0" + data)
                 (folder / f"body_{name}").write_bytes(bytes([version]) + outer["body"])
     keys = {*reader.OUTER_KEYS, *reader.BODY_KEYS, *reader.RANGES, *reader.ACTIVATIONS}
-    keys |= {"context", "name", "unit", "none_value", "kernel", "bias", "leaky_rate"}
+    keys |= {
+        "context",
+        "seen",
+        "name",
+        "unit",
+        "none_value",
+        "kernel",
+        "bias",
+        "leaky_rate",
+    }
     keys |= {"shape", "dtype", "data", "<f4", "valid", "value"}
     lines = [f'"\\x{0xA0 + len(key):x}{key}"' for key in sorted(keys)]
     (folder.parent / "weights.dict").write_text("\n".join(lines) + "\n")

@@ -2,6 +2,8 @@
 //
 //   reader score WEIGHTS FEATURES [MASK]  -> float32 values of float32 [K, T, F] and, if
 //                                            given, of uint8 [K, T]
+//   reader guard WEIGHTS FEATURES [MASK]  -> of each plan of 4 candidates "0 or 1, the
+//                                            feature's place, its share"
 //   reader check BATCH                    -> for each file of BATCH, its bytes after
 //                                            their number as uint64, "ok" or its refusal
 #include <cstdint>
@@ -11,6 +13,7 @@
 #include <string_view>
 #include <vector>
 
+#include "rcirl/guard.hpp"
 #include "rcirl/reward.hpp"
 
 namespace {
@@ -26,26 +29,52 @@ std::vector<char> contents(const char* path) {
   return all;
 }
 
-int score(const char* weights, const char* input, const char* mask) {
+// A reward with candidates to judge.
+struct Given {
   rcirl::Reward reward;
-  const rcirl::Status status = rcirl::load(weights, &reward);
-  if (!status.ok()) {
-    std::fprintf(stderr, "%s\n", status.message().c_str());
-    return 2;
+  std::vector<float> features;
+  std::vector<char> marks;
+  std::size_t row = 0, count = 0;  // numbers of a candidate, candidates
+
+  bool read(const char* weights, const char* input, const char* mask) {
+    const rcirl::Status status = rcirl::load(weights, &reward);
+    if (!status.ok()) {
+      std::fprintf(stderr, "%s\n", status.message().c_str());
+      return false;
+    }
+    const std::vector<char> bytes = contents(input);
+    if (mask != nullptr) marks = contents(mask);
+    features.resize(bytes.size() / 4);
+    std::memcpy(features.data(), bytes.data(), 4 * features.size());
+    row = reward.times().size() * reward.features().size();
+    count = features.size() / row;
+    return true;
   }
-  const std::vector<char> bytes = contents(input);
-  const std::vector<char> marks = mask == nullptr ? std::vector<char>() : contents(mask);
-  std::vector<float> features(bytes.size() / 4);
-  std::memcpy(features.data(), bytes.data(), 4 * features.size());
-  const std::size_t row = reward.times().size() * reward.features().size();
-  std::vector<float> values(features.size() / row);
-  rcirl::Mask valid;
-  if (mask != nullptr) {
-    valid = {reinterpret_cast<const std::uint8_t*>(marks.data()), rcirl::Mask::kEach};
+
+  rcirl::Mask mask(std::size_t first) const {
+    if (marks.empty()) return {};
+    const char* from = marks.data() + first * reward.times().size();
+    return {reinterpret_cast<const std::uint8_t*>(from), rcirl::Mask::kEach};
   }
-  rcirl::Workspace workspace = reward.workspace();
-  reward.score(features.data(), values.size(), valid, &workspace, values.data());
+};
+
+int score(const Given& given) {
+  std::vector<float> values(given.count);
+  rcirl::Workspace workspace = given.reward.workspace();
+  given.reward.score(given.features.data(), given.count, given.mask(0), &workspace,
+                     values.data());
   return std::fwrite(values.data(), 4, values.size(), stdout) == values.size() ? 0 : 1;
+}
+
+int guard(const Given& given) {
+  constexpr std::size_t kPlan = 4;  // candidates
+  const rcirl::Guard guard(given.reward);
+  for (std::size_t first = 0; first + kPlan <= given.count; first += kPlan) {
+    const rcirl::Verdict found =
+        guard.check(&given.features[first * given.row], kPlan, given.mask(first));
+    std::printf("%d %zu %.17g\n", found.in_distribution, found.feature, found.share);
+  }
+  return 0;
 }
 
 int check(const char* batch) {
@@ -69,9 +98,11 @@ int check(const char* batch) {
 int main(int count, char** arguments) {
   const std::string mode = count > 1 ? arguments[1] : "";
   if (mode == "check" && count == 3) return check(arguments[2]);
-  if (mode == "score" && (count == 4 || count == 5)) {
-    return score(arguments[2], arguments[3], count == 5 ? arguments[4] : nullptr);
+  if ((mode == "score" || mode == "guard") && (count == 4 || count == 5)) {
+    Given given;
+    if (!given.read(arguments[2], arguments[3], count == 5 ? arguments[4] : nullptr)) return 2;
+    return mode == "score" ? score(given) : guard(given);
   }
-  std::fprintf(stderr, "reader: arguments: expected score WEIGHTS FEATURES [MASK] | check BATCH\n");
+  std::fprintf(stderr, "reader: arguments: expected score or guard WEIGHTS FEATURES [MASK] | check BATCH\n");
   return 2;
 }

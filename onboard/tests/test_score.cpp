@@ -11,6 +11,7 @@
 
 #include "check.hpp"
 #include "files.hpp"
+#include "rcirl/guard.hpp"
 #include "rcirl/reward.hpp"
 
 // Every allocation of this program is counted, whichever form of `new` asks for it.
@@ -221,11 +222,13 @@ void test_scoring_allocates_nothing() {
   rcirl::Workspace workspace = reward.workspace();
   const std::vector<float> features = example.inputs(100, 3);
   std::vector<float> values(100);
+  const rcirl::Guard guard(reward);
   const long before = allocations;
   reward.score(features.data(), 100, {}, &workspace, values.data());
+  const double share = guard.check(features.data(), 100, {}).share;
   const std::size_t best = rcirl::best(values.data(), 100);
   const long after = allocations;
-  CHECK(best < 100 && before > 0 && after == before);
+  CHECK(best < 100 && before > 0 && after == before && share >= 0.0);
 }
 
 void test_threads_share_a_reward() {

@@ -193,6 +193,14 @@ class FrozenSets:
         return self._made[key]
 
 
+def fitting_rows(frozen: FeatureBatch, config: TrainConfig) -> np.ndarray:
+    """[n, F] features of some scenes of a frozen set, to fit a normaliser on."""
+    count = frozen.weight.shape[0]
+    chosen = np.random.default_rng(config.seed).permutation(count)
+    some = jax.tree.map(lambda x: np.asarray(x)[chosen[:NORMALISER_SCENES]], frozen)
+    return rows_that_count(some)
+
+
 def normaliser_of(
     frozen: FeatureBatch, config: TrainConfig, keep: Sequence[str] | None = None
 ) -> Normaliser:
@@ -201,10 +209,7 @@ def normaliser_of(
     An infinite scale turns a feature into 0 for the network.
     """
     features = feature_map(config.features)
-    count = frozen.weight.shape[0]
-    chosen = np.random.default_rng(config.seed).permutation(count)
-    some = jax.tree.map(lambda x: np.asarray(x)[chosen[:NORMALISER_SCENES]], frozen)
-    made = fit_normaliser(rows_that_count(some), features)
+    made = fit_normaliser(fitting_rows(frozen, config), features)
     if keep is None:
         return made
     kept = jnp.asarray([name in keep for name in features.names])

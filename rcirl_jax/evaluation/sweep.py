@@ -24,12 +24,13 @@ from rcirl_jax.data.joined import Demonstrations, open_datasets
 from rcirl_jax.data.resplit import Resplit, fewer, with_validation
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.evaluate import RankingSetup, covered_rows, outcomes_of
-from rcirl_jax.evaluation.learners import normaliser_of
+from rcirl_jax.evaluation.learners import fitting_rows, normaliser_of
 from rcirl_jax.evaluation.ranking import METRICS, scene_metrics
 from rcirl_jax.evaluation.score import Scorer, score_scenes
 from rcirl_jax.evaluation.statistics import ClusterBootstrap, Estimate, combine_seeds
 from rcirl_jax.executor import Executor
-from rcirl_jax.reward import Normaliser, RewardParams
+from rcirl_jax.features import feature_map
+from rcirl_jax.reward import Normaliser, RewardParams, seen_range
 from rcirl_jax.train.frozen import compiles, fit, freeze, members_of
 from rcirl_jax.train.state import FeatureBatch, TrainConfig
 
@@ -141,6 +142,7 @@ class Part:
     members: tuple[TrainConfig, ...]  # [m]
     params: RewardParams  # leaves [m, ...]
     normaliser: Normaliser
+    seen: np.ndarray  # [2, F] of `seen_range`
     loss: np.ndarray  # [m] mean of the last epoch
     wins: np.ndarray  # [m] share of pairs the positive wins, last epoch
     finite: np.ndarray  # [m] no step was refused for a NaN or infinity
@@ -159,11 +161,13 @@ def open_split(
 
 
 @functools.lru_cache(maxsize=1)
-def _scenes(config: SweepConfig) -> tuple[FeatureBatch, Normaliser]:
-    """Candidates of the scenes to fit, made once per process."""
+def _scenes(config: SweepConfig) -> tuple[FeatureBatch, Normaliser, np.ndarray]:
+    """Candidates of the scenes to fit and their ranges, made once per process."""
     split = open_split(config, verify=False)[1]
     frozen = freeze(split.load("train"), split.indices("train"), config.base)
-    return frozen, normaliser_of(frozen, config.base)
+    rows = fitting_rows(frozen, config.base)
+    seen = seen_range(rows, feature_map(config.base.features))
+    return frozen, normaliser_of(frozen, config.base), seen
 
 
 def train_group(hidden: Hidden, config: SweepConfig) -> Iterator[Part]:
@@ -179,7 +183,7 @@ def train_group(hidden: Hidden, config: SweepConfig) -> Iterator[Part]:
     Yields:
       One part per chunk, in the order of `config.group(hidden)`.
     """
-    frozen, normaliser = _scenes(config)
+    frozen, normaliser, seen = _scenes(config)
     members = config.group(hidden)
     size = -(-len(members) // -(-len(members) // MEMBERS_AT_ONCE))
     for start in range(0, len(members), size):
@@ -195,6 +199,7 @@ def train_group(hidden: Hidden, config: SweepConfig) -> Iterator[Part]:
             members=tuple(taken),
             params=fitted.params,
             normaliser=jax.tree.map(np.asarray, normaliser),
+            seen=seen,
             loss=np.asarray(fitted.loss[:, -1]),
             wins=np.asarray(fitted.wins[:, -1]),
             finite=np.asarray(fitted.finite),

@@ -1,5 +1,6 @@
 """The exported reward: one file of weights, its writer and its reader."""
 
+from rcirl_jax.export.guard import Guard, Limits, Verdict
 from rcirl_jax.export.reader import Reward, WeightsError, decode_weights, load_weights
 from rcirl_jax.export.weights import (
     PROVENANCE_KEYS,
@@ -13,8 +14,11 @@ from rcirl_jax.export.weights import (
 __all__ = [
     "PROVENANCE_KEYS",
     "FeatureSpec",
+    "Guard",
+    "Limits",
     "Reward",
     "RewardWeights",
+    "Verdict",
     "WeightsError",
     "decode_weights",
     "load_weights",

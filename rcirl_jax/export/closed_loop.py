@@ -2,22 +2,51 @@
 
 from collections.abc import Sequence
 
+import jax.numpy as jnp
+
 from rcirl_jax.errors import InputError
+from rcirl_jax.export.guard import Limits, bounds
 from rcirl_jax.export.loading import open_reward, reward_params, row_name
+from rcirl_jax.export.reader import Reward
+from rcirl_jax.features import feature_map
 from rcirl_jax.planner.grid import DpConfig
-from rcirl_jax.planner.rank import RankConfig
+from rcirl_jax.planner.guard import Guarded
+from rcirl_jax.planner.rank import RankConfig, hand_score, learned_score
 from rcirl_jax.reward import LatticeCost
 from rcirl_jax.simulation.cases import STEP_S
 from rcirl_jax.simulation.rows import (
-    BASELINES,
     Row,
     baseline_row,
     dp_row,
+    guarded_row,
     learned_row,
     tuned_row,
 )
 
 DP_EVERY = 10  # steps between two plans of the DP row: it costs 1,000 rankings
+
+
+def _guarded(name: str, reward: Reward, incumbent: str, config: RankConfig) -> Row:
+    """A row behind the guard; the incumbent drives what is out of distribution."""
+    score, weights = hand_score, None
+    if incumbent != "hand-set":
+        other = open_reward(incumbent)
+        score = learned_score(feature_map(other.preset), other.activation)
+        weights = reward_params(other)
+    limits = Limits()
+    low, high = bounds(reward, limits)
+    effective, normaliser = reward_params(reward)
+    params = Guarded(
+        reward=effective,
+        normaliser=normaliser,
+        low=jnp.asarray(low),
+        high=jnp.asarray(high),
+        share=jnp.asarray(limits.share, jnp.float32),
+        incumbent=weights,
+    )
+    return guarded_row(
+        f"{name} guarded", params, reward.preset, reward.activation, config, score
+    )
 
 
 def table_rows(
@@ -28,11 +57,13 @@ def table_rows(
     dp: bool = False,
     hand_set: LatticeCost | None = None,
     names: Sequence[str] = (),
+    guard: str | None = None,
 ) -> list[Row]:
     """Learned rows first, in the order of the files, then the baselines.
 
     Files of one loss and shape are told apart by their seed, or rows bear `names`, one
-    per file. A tuned `hand_set` cost comes last.
+    per file. The first drives again by `dp`, and behind a `guard` that names its
+    incumbent ("hand-set" or a weights file). A tuned `hand_set` cost comes last.
 
     Raises:
       InputError: no file, an unreadable one, path_speed weights, or an unknown
@@ -72,12 +103,10 @@ def table_rows(
                 slow,
             ),
         )
+    if guard:
+        rows.insert(1, _guarded(rows[0].name, first, guard, config))
     normaliser = reward_params(first)[1]
     for name in baselines:
-        if name not in BASELINES:
-            raise InputError(
-                f"--baselines: {name}: expected some of {', '.join(BASELINES)}"
-            )
         rows.append(baseline_row(name, str(first.preset), normaliser, config))
     if hand_set is not None:
         rows.append(tuned_row(hand_set, config))

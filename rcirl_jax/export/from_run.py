@@ -19,11 +19,12 @@ from rcirl_jax.reward import (
     RewardConfig,
     RewardParams,
     pinned,
+    seen_range,
     value,
 )
 from rcirl_jax.reward.network import LEAKY_SLOPE
 from rcirl_jax.sampling import SamplerConfig
-from rcirl_jax.train.loop import restore_run, to_device_batch
+from rcirl_jax.train.loop import normaliser_rows, restore_run, to_device_batch
 from rcirl_jax.train.state import TrainConfig, TrainState
 from rcirl_jax.train.step import featurised
 from rcirl_jax.units import TIMES_S
@@ -58,7 +59,11 @@ def read_config(workdir: Path) -> tuple[TrainConfig, dict]:
 
 
 def reward_weights(
-    params: RewardParams, normaliser: Normaliser, config: TrainConfig, provenance: dict
+    params: RewardParams,
+    normaliser: Normaliser,
+    config: TrainConfig,
+    provenance: dict,
+    seen: np.ndarray | None = None,
 ) -> RewardWeights:
     """The effective weights of trained parameters, as the file holds them."""
     features = feature_map(config.features)
@@ -77,6 +82,7 @@ def reward_weights(
         gamma=np.asarray(effective.gamma),
         kernels=tuple(np.asarray(kernel) for kernel in effective.kernels),
         context=None if effective.context is None else np.asarray(effective.context),
+        seen=seen,
         biases=(*(np.asarray(bias) for bias in effective.biases), np.zeros(1)),
         activation=config.reward.hidden_activation,
         leaky_slope=LEAKY_SLOPE,
@@ -88,7 +94,9 @@ def reward_weights(
     )
 
 
-def export_run(workdir: Path, dataset: Demonstrations, output: Path) -> Reward:
+def export_run(
+    workdir: Path, dataset: Demonstrations, output: Path, *, ranges: bool = True
+) -> Reward:
     """Write weights.msgpack from a run's newest checkpoint.
 
     Verification samples are humans and candidates of the training split, with
@@ -98,6 +106,8 @@ def export_run(workdir: Path, dataset: Demonstrations, output: Path) -> Reward:
       workdir: run folder of experiments.train.
       dataset: the dataset of the run (its hash has to match).
       output: file to write, atomically.
+      ranges: record what the training saw of each feature (schema version 3), from
+        the scenes that fitted the normaliser.
 
     Raises:
       InputError: no run, no checkpoint, or another dataset.
@@ -108,7 +118,10 @@ def export_run(workdir: Path, dataset: Demonstrations, output: Path) -> Reward:
             f"{workdir / 'run.json'}: dataset_hash: {run.get('dataset_hash')}: "
             f"expected that of the given dataset, {dataset.hash}"
         )
-    state = restore_run(workdir, config)
+    state, seen = restore_run(workdir, config), None
+    if ranges:
+        rows = normaliser_rows(dataset, config)
+        seen = seen_range(rows, feature_map(config.features))
     return write_weights(
         output,
         state.params,
@@ -116,6 +129,7 @@ def export_run(workdir: Path, dataset: Demonstrations, output: Path) -> Reward:
         config,
         verification_samples(dataset, config),
         _provenance(workdir, state, config, run),
+        seen,
     )
 
 
@@ -126,6 +140,7 @@ def write_weights(
     config: TrainConfig,
     samples: tuple[np.ndarray, np.ndarray],
     provenance: dict,
+    seen: np.ndarray | None = None,
 ) -> Reward:
     """Write trained parameters as weights.msgpack, atomically.
 
@@ -137,10 +152,11 @@ def write_weights(
       samples: of `verification_samples`; their values are computed here as the
         trainer computes them.
       provenance: `weights.PROVENANCE_KEYS` and more.
+      seen: [2, F] of `seen_range`, if known.
     """
     x, valid = map(jnp.asarray, samples)
     values = value(params, normaliser, x, valid, config.reward)
-    weights = reward_weights(params, normaliser, config, provenance)
+    weights = reward_weights(params, normaliser, config, provenance, seen)
     output.parent.mkdir(parents=True, exist_ok=True)
     return save(output, weights, *samples, np.asarray(values))
 

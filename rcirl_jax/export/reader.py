@@ -4,7 +4,7 @@ This one file may be copied into a planner's repository. docs/weights_format.md
 gives the byte layout; the equation is
 
     x_t = (clip(f_t, lower, upper) - location) / scale       f [T, F]
-    x_t <- x_t * 2 / (1 + exp(-x_0 C))                       version 2 only
+    x_t <- x_t * 2 / (1 + exp(-x_0 C))                       with a context only
     r_t = act(... act(x_t W_1 + b_1) ...) W_L + b_L          last layer linear
     V   = sum_t gamma_t * time_valid_t * r_t                 higher is better
 
@@ -25,7 +25,7 @@ import msgpack
 import numpy as np
 
 MAGIC = "RCIRLW"  # first value of the outer map
-SCHEMA_VERSIONS = (1, 2)  # the layouts this reader knows
+SCHEMA_VERSIONS = (1, 2, 3)  # the layouts this reader knows
 TOLERANCE = 1e-5  # of max(1, |V|), on a verification sample, float32
 
 # Limits, far above any sensible reward (the paper's network is 21 -> 15 -> 1).
@@ -82,7 +82,8 @@ class Reward:
     biases: tuple[np.ndarray, ...]  # [H1], ..., [1]
     activation: str
     leaky_slope: float  # negative slope of "leaky_relu"
-    context: np.ndarray | None  # [F, F] C of version 2, gains by the scene
+    context: np.ndarray | None  # [F, F] C, gains by the scene
+    seen: np.ndarray | None  # [2, F] ends of the training's range, version 3
     loss: dict[str, Any]
     provenance: dict[str, Any]
 
@@ -97,7 +98,7 @@ class Reward:
     def point_rewards(self, features: np.ndarray) -> np.ndarray:
         """R(f) of single points, before gamma.
 
-        A conditioned reward (version 2) has no reward of a point without its
+        A conditioned reward (with a context) has no reward of a point without its
         scene: it raises.
 
         Args:
@@ -124,7 +125,7 @@ class Reward:
         Returns:
           float32 [...]. A value that is not finite raises: `argmax` would pick a
           NaN. Features at times that are not valid may be anything. The first time
-          has to be valid in a conditioned reward (version 2): it sets the gains.
+          has to be valid in a conditioned reward (`context`): it sets the gains.
         """
         numbers = self._numbers(features, (len(self.times), len(self.names)))
         valid = None if time_valid is None else self._mask(time_valid, numbers.shape)
@@ -180,7 +181,7 @@ class Reward:
 
 
 def load_weights(path: str | os.PathLike[str]) -> Reward:
-    """Read and verify one file, schema version 1 or 2.
+    """Read and verify one file, schema version 1, 2 or 3.
 
     Raises:
       WeightsError: the file is missing, damaged, of another version, out of
@@ -214,15 +215,17 @@ def _decode(data: bytes, file: str) -> Reward:
         _fail("magic", "missing or another", repr(MAGIC))
     version = outer.get("schema_version")
     if type(version) is not int or version not in SCHEMA_VERSIONS:
-        known = " or ".join(map(str, SCHEMA_VERSIONS))
-        _fail("schema_version", version, f"{known}, all this reader supports")
+        _fail("schema_version", version, "1, 2 or 3, all this reader supports")
     _map("file", outer, OUTER_KEYS)
     body = outer["body"]
     found = hashlib.sha256(body).hexdigest() if isinstance(body, bytes) else "no bytes"
     if outer["sha256"] != found or not isinstance(body, bytes):
         _fail("sha256", found, f"{_show(outer['sha256'])}; the file is damaged")
-    keys = BODY_KEYS if version == 1 else (*BODY_KEYS, "context")
-    fields = _map("body", _unpack("body", body), keys)
+    unpacked = _unpack("body", body)
+    keys = (*BODY_KEYS, *((), ("context",), ("seen",))[version - 1])
+    if version == 3 and isinstance(unpacked, dict) and "context" in unpacked:
+        keys += ("context",)
+    fields = _map("body", unpacked, keys)
     reward = Reward(file=file, sha256=found, **_fields(fields))
     _verify(reward, fields["samples"])
     return reward
@@ -246,6 +249,10 @@ def _fields(body: dict[str, Any]) -> dict[str, Any]:
     context = body.get("context")
     if "context" in body:
         context = _array("context", context, (size, size))
+    seen = body.get("seen")
+    if "seen" in body:
+        seen = _array("seen", seen, (2, size))
+        _every("seen", seen[:1], seen[:1] <= seen[1:], "at most the highest")
     loss = _map("loss", body["loss"], ("name", "leaky_rate"))
     _text("loss.name", loss["name"])
     if loss["leaky_rate"] is not None:
@@ -260,6 +267,7 @@ def _fields(body: dict[str, Any]) -> dict[str, Any]:
         "activation": activation,
         "leaky_slope": _number("leaky_slope", body["leaky_slope"]),
         "context": context,
+        "seen": seen,
         "loss": loss,
         "provenance": _plain("provenance", body["provenance"], MAX_DEPTH),
     }

@@ -41,6 +41,7 @@ class SuiteJob:
     dp: bool = False
     hand_weights: str | None = None
     names: tuple[str, ...] = ()  # of the learned rows; else after loss and shape
+    guard: str | None = None  # incumbent of the first weights' guarded row
 
     def rows(self) -> list[Row]:
         """Learned rows, then the baselines."""
@@ -53,6 +54,7 @@ class SuiteJob:
             if self.hand_weights
             else None,
             names=self.names,
+            guard=self.guard,
         )
 
     def cases(self) -> CaseSet:

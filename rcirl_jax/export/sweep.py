@@ -200,7 +200,7 @@ def _export(
     params = jax.tree.map(lambda x: jnp.asarray(x[number]), part.params)
     normaliser = jax.tree.map(jnp.asarray, part.normaliser)
     output = _weights(folder, member)
-    write_weights(output, params, normaliser, member, samples, provenance)
+    write_weights(output, params, normaliser, member, samples, provenance, part.seen)
 
 
 def _finish(folder: Path, parts: Sequence[Part], settings: dict) -> dict:

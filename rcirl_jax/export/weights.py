@@ -66,6 +66,7 @@ class RewardWeights:
     kernels: tuple[np.ndarray, ...]  # [F, H1], ..., [H, 1]
     biases: tuple[np.ndarray, ...]  # [H1], ..., [1]; one for every kernel
     context: np.ndarray | None = None  # [F, F], gains by scene; None: one reward
+    seen: np.ndarray | None = None  # [2, F], ends of the training's range, or unknown
     activation: str  # of the hidden layers: tanh, relu, leaky_relu, identity
     leaky_slope: float  # negative slope of the hidden leaky_relu
     loss: Mapping[str, Any]  # name; leaky_rate of the rank loss, or None
@@ -174,7 +175,7 @@ def _pack_checked(
         body = _dump(_body(weights, samples))
         outer = {
             "magic": reader.MAGIC,
-            "schema_version": 1 if weights.context is None else 2,
+            "schema_version": _version(weights),
             "body": body,
             "sha256": hashlib.sha256(body).hexdigest(),
         }
@@ -188,6 +189,13 @@ def _pack_checked(
         raise InputError(str(error)) from error
 
 
+def _version(weights: RewardWeights) -> int:
+    """The least that has all fields: who reads an older one goes on reading."""
+    if weights.seen is not None:
+        return 3
+    return 1 if weights.context is None else 2
+
+
 def _dump(value: dict[str, Any]) -> bytes:
     return cast("bytes", msgpack.packb(value, use_bin_type=True))
 
@@ -197,16 +205,18 @@ class _FieldError(Exception):
 
 
 def _body(weights: RewardWeights, samples: tuple[np.ndarray, ...]) -> dict[str, Any]:
-    """The body map, in the order of `reader.BODY_KEYS`; then the context, if any."""
+    """The body map, in the order of `reader.BODY_KEYS`; then what there is besides."""
     if len(weights.kernels) != len(weights.biases):
         found = f"{len(weights.biases)} biases"
         raise _FieldError(f"biases: {found}: expected one for each kernel")
     for key in PROVENANCE_KEYS:
         if key not in weights.provenance:
             raise _FieldError(f"provenance.{key}: missing: expected a value or None")
-    gated = {}
-    if weights.context is not None:
-        gated = {"context": _array("context", weights.context)}
+    more = {
+        name: _array(name, value)
+        for name, value in (("seen", weights.seen), ("context", weights.context))
+        if value is not None
+    }
     layers = zip(weights.kernels, weights.biases, strict=True)
     names = ("features", "valid", "value")
     return {
@@ -233,7 +243,7 @@ def _body(weights: RewardWeights, samples: tuple[np.ndarray, ...]) -> dict[str, 
             name: _array(f"samples.{name}", sample)
             for name, sample in zip(names, samples, strict=True)
         },
-        **gated,
+        **more,
     }
 
 

@@ -24,7 +24,7 @@ from rcirl_jax.reward.network import (
     scenes_value,
     value,
 )
-from rcirl_jax.reward.normaliser import fit_normaliser, normalise
+from rcirl_jax.reward.normaliser import fit_normaliser, normalise, seen_range
 from rcirl_jax.reward.speed_dp import SPEED_DP_ROW, SpeedDpCost, speed_dp_cost
 from rcirl_jax.types import Normaliser, RewardParams
 
@@ -50,6 +50,7 @@ __all__ = [
     "normalise",
     "pinned",
     "scenes_value",
+    "seen_range",
     "speed_dp_cost",
     "tuned",
     "value",

@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 from rcirl_jax.features import FeatureMap
 from rcirl_jax.types import Normaliser
 
+SEEN_QUANTILES = (0.001, 0.999)  # what counts as seen in training
 SCALE_FLOOR = 0.03  # share of a feature's declared range; the smallest scale
 
 
@@ -41,3 +42,14 @@ def fit_normaliser(features: np.ndarray, feature_map: FeatureMap) -> Normaliser:
         location=as_array(middle),
         scale=as_array(scale),
     )
+
+
+def seen_range(features: np.ndarray, feature_map: FeatureMap) -> np.ndarray:
+    """Lowest and highest value seen, [2, F] float32: `SEEN_QUANTILES` of rows [n, F].
+
+    Of clipped features, as the network sees them.
+    """
+    lower = np.array([spec.lower for spec in feature_map.specs])
+    upper = np.array([spec.upper for spec in feature_map.specs])
+    rows = np.clip(np.asarray(features, np.float64), lower, upper)
+    return np.quantile(rows, SEEN_QUANTILES, axis=0).astype(np.float32)

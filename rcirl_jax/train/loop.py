@@ -75,7 +75,12 @@ def host_batch(
 def fit_normaliser_on(
     dataset: Demonstrations, config: TrainConfig, features: FeatureMap
 ) -> Normaliser:
-    """The frozen normaliser from humans and feasible candidates of some scenes."""
+    """The frozen normaliser from `normaliser_rows`."""
+    return fit_normaliser(normaliser_rows(dataset, config), features)
+
+
+def normaliser_rows(dataset: Demonstrations, config: TrainConfig) -> np.ndarray:
+    """[n, F] features of humans and feasible candidates of some training scenes."""
     index = dataset.indices("train")
     count = index.size
     chosen = np.random.default_rng([config.seed, NORMALISER_STREAM]).permutation(count)
@@ -83,7 +88,7 @@ def fit_normaliser_on(
     rows = dataset.read(index[chosen])
     key = jax.random.fold_in(jax.random.key(config.seed), NORMALISER_STREAM)
     parts = map(rows_that_count, in_chunks(key, rows, chosen, config, index[chosen]))
-    return fit_normaliser(np.concatenate(list(parts)), features)
+    return np.concatenate(list(parts))
 
 
 def in_chunks(
@@ -415,8 +420,12 @@ def check_features(
     Raises:
       InputError: names the first such scene and its features.
     """
-    bad = ~np.isfinite(made.candidates).all(axis=(2, 3))
-    bad |= ~np.isfinite(made.human).all(axis=1)
-    names = feature_map(preset).names
-    found = {f"feature {name}": bad[:, i] for i, name in enumerate(names)}
+    candidates, human = np.asarray(made.candidates), np.asarray(made.human)
+    finite = [
+        np.isfinite(candidates[:, i]).all(axis=(1, 2))
+        & np.isfinite(human[:, :, i]).all(axis=1)
+        for i in range(candidates.shape[1])
+    ]
+    names = (f"feature {name}" for name in feature_map(preset).names)
+    found = {name: np.invert(fine) for name, fine in zip(names, finite, strict=True)}
     refuse_scenes("train", rows, stored, found)

@@ -44,6 +44,12 @@ def array(*shape, fill=1.0):
     return {"shape": list(shape), "dtype": "<f4", "data": data}
 
 
+def falling(*shape):
+    """An array n, n - 1, ..., 1."""
+    size = int(np.prod(shape))
+    return {**array(*shape), "data": np.arange(size, 0, -1, "<f4").tobytes()}
+
+
 def sealed(body, /, **outer):
     """A file with this body and the right hash."""
     body = body if isinstance(body, bytes) else dump(body)
@@ -323,8 +329,18 @@ def test_a_wrong_field_is_named(path, value, message):
         (b"\x82\xa1a\x01\xa1a\x02", "file: a key used twice"),
         (sealed(body_of(), magic="RCIRLX"), "magic: missing or another"),
         (
-            sealed(body_of(), schema_version=3),
-            "schema_version: 3: expected 1 or 2, all this reader supports",
+            sealed(body_of(), schema_version=4),
+            "schema_version: 4: expected 1, 2 or 3, all this reader supports",
+        ),
+        (sealed(body_of(), schema_version=3), "body.seen: missing: expected the keys"),
+        (sealed({**body_of(), "seen": array(2, 3)}), "body.seen: unknown: expected"),
+        (
+            sealed({**body_of(), "seen": array(1, 3)}, schema_version=3),
+            "seen.shape: [1, 3]: expected [2, 3]",
+        ),
+        (
+            sealed({**body_of(), "seen": falling(2, 3)}, schema_version=3),
+            "seen[0, 0]: 6: expected at most the highest",
         ),
         # whatever a later version adds, its number is what is named
         (
@@ -343,7 +359,7 @@ def test_a_wrong_field_is_named(path, value, message):
             sealed({**body_of(), "context": array(1, 2)}, schema_version=2),
             "context.shape: [1, 2]: expected",
         ),
-        (sealed(body_of(), schema_version=True), "schema_version: True: expected 1 or"),
+        (sealed(body_of(), schema_version=True), "schema_version: True: expected 1, 2"),
         (sealed(body_of(), extra=1), "file.extra: unknown"),
         (sealed(body_of(), sha256="0" * 64), "sha256: "),
         (sealed(body_of(), sha256=5), "expected 5; the file is damaged"),

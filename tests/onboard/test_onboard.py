@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from rcirl_jax.export import (
+    Guard,
     WeightsError,
     decode_weights,
     load_weights,
@@ -27,6 +28,8 @@ from tests.weights_files import packed, trained_network
 ONBOARD = Path(__file__).resolve().parents[2] / "onboard"
 VALID = packed(features=2, times=3, hidden=(4,))
 GATED = packed(features=2, times=3, hidden=(4,), by_context=True)
+RANGED = packed(features=2, times=3, hidden=(4,), seen=True)
+BOTH = packed(features=2, times=3, hidden=(4,), by_context=True, seen=True)
 
 
 def run(*command, **options):
@@ -136,6 +139,39 @@ def test_an_old_file_scores_as_it_did(programs, tmp_path, version):
     assert np.all(np.abs(found - expected) <= 1e-5 * np.maximum(1.0, np.abs(expected)))
 
 
+@pytest.mark.parametrize("data", [VALID, GATED, RANGED, BOTH])
+def test_a_thousand_plans_get_the_guard_of_python(programs, tmp_path, data):
+    """Plans of four candidates, some in distribution, some beyond, some with a NaN."""
+    path, rng = tmp_path / "weights.msgpack", np.random.default_rng(4)
+    path.write_bytes(data)
+    reward = load_weights(path)
+    guard = Guard(reward)
+    middle, half = 0.5 * (guard.low + guard.high), 0.5 * (guard.high - guard.low)
+    wide = rng.uniform(0.2, 3.0, (1000, 1, 1, 2))
+    features = middle + half * wide * rng.uniform(-1.0, 1.0, (1000, 4, 3, 2))
+    features[::9] = middle + half * rng.choice([-1.0, 1.0], (112, 4, 3, 2))  # the ends
+    features[::50, 1, 2, 0] = np.nan
+    features[7::50, 2, 1, 1] = np.inf
+    features = features.astype(np.float32)
+    valid = rng.random((1000, 4, 3)) < 0.7
+    features.tofile(tmp_path / "features")
+    valid.astype(np.uint8).tofile(tmp_path / "valid")
+    command = (programs / "reader", "guard", path, tmp_path / "features")
+    for mask in ((), (tmp_path / "valid",)):
+        lines = run(*command, *mask).decode().splitlines()
+        found = [line.split() for line in lines]
+        expected = [
+            guard.check(one, each if mask else None)
+            for one, each in zip(features, valid, strict=True)
+        ]
+        fine = [verdict.in_distribution for verdict in expected]
+        assert 100 < sum(fine) < 900
+        for row, verdict in zip(found, expected, strict=True):
+            assert bool(int(row[0])) == verdict.in_distribution
+            assert reward.names[int(row[1])] == verdict.feature
+            assert float(row[2]) == verdict.share
+
+
 def test_choose_takes_the_best_candidate_that_has_a_value(programs, tmp_path):
     path = tmp_path / "weights.msgpack"
     path.write_bytes(VALID)
@@ -185,7 +221,7 @@ def test_damaged_files_are_refused_with_one_line(programs, tmp_path):
         assert line.startswith("w: ")
         assert ": expected " in line
         assert line.isprintable()
-    assert verdicts(programs, [VALID, GATED], tmp_path) == ["ok", "ok"]
+    assert verdicts(programs, [VALID, GATED, RANGED, BOTH], tmp_path) == ["ok"] * 4
 
 
 def test_wrong_fields_are_named_as_by_the_python_reader(programs, tmp_path):
@@ -215,9 +251,9 @@ def test_bodies_changed_and_hashed_again_get_the_verdict_of_the_python_reader(
     programs, tmp_path
 ):
     rng, files = np.random.default_rng(2), []
-    for version, data in ((1, VALID), (2, GATED)):
+    for version, data in ((1, VALID), (2, GATED), (3, RANGED), (3, BOTH)):
         body = msgpack.unpackb(data)["body"]
-        for _ in range(1500):
+        for _ in range(800):
             changed = bytearray(body)
             for _ in range(rng.integers(1, 4)):
                 at = int(rng.integers(0, len(changed)))

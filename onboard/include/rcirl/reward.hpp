@@ -93,7 +93,7 @@ class Reward {
   //
   // Returns how many candidates were refused. Their value is -infinity: a NaN at a valid
   // time, a mask that is not 0 and 1, a sum beyond float32, or, with a reward by context
-  // (version 2), a first time that is not valid. Infinite features are clipped; at times
+  // (with a context), a first time that is not valid. Infinite features are clipped; at times
   // that are not valid, features may be anything. Without a reward, or with a workspace
   // of another one that is too small, all are refused.
   std::size_t score(const float* features, std::size_t count, Mask valid,
@@ -101,12 +101,13 @@ class Reward {
 
  private:
   friend Status decode(std::string_view data, const std::string& file, Reward* reward);
+  friend class Guard;
 
   std::string file_;
   detail::Weights weights_;
 };
 
-// Reads and verifies the bytes of a file, schema version 1 or 2; `file` is their name
+// Reads and verifies the bytes of a file, schema version 1, 2 or 3; `file` is their name
 // in messages. A failure leaves `reward` as it was.
 inline Status decode(std::string_view data, const std::string& file, Reward* reward) {
   Reward read;

@@ -7,7 +7,6 @@
 #include <cstdint>
 #include <cstdio>
 #include <cstring>
-#include <initializer_list>
 #include <string>
 #include <string_view>
 #include <vector>
@@ -84,7 +83,7 @@ struct Array {
   }
 };
 
-using Keys = std::initializer_list<std::string_view>;
+using Keys = std::vector<std::string_view>;
 
 // Every check returns whether all went well so far, so that `&&` chains them.
 class Checks {
@@ -117,7 +116,7 @@ class Checks {
   }
 
   // A map with exactly these keys; their values, in this order.
-  bool map(const std::string& field, const Node& node, Keys keys,
+  bool map(const std::string& field, const Node& node, const Keys& keys,
            std::vector<const Node*>* values) {
     if (node.kind != Kind::kMap) return fail(field, node, "a map");
     std::string listed = "the keys ";

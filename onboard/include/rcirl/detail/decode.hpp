@@ -34,6 +34,7 @@ struct Weights {
   std::string preset;
   std::vector<Feature> features;  // [F]
   std::vector<float> times;       // [T] s
+  std::vector<float> seen;        // [2, F] ends of the training's range, or empty
   Network network;
 };
 
@@ -192,19 +193,25 @@ inline bool verify(Checks& is, const Node& node, const Network& network) {
   return true;
 }
 
+inline bool decode_seen(Checks& is, const Node& node, std::size_t features, Array* seen) {
+  if (!is.array("seen", node, {2, features}, seen)) return false;
+  const std::vector<float>& ends = seen->values;
+  return is.every("seen", *seen, "at most the highest", [&](float value, std::size_t i) {
+    return i >= features || value <= ends[i + features];
+  });
+}
+
 inline bool decode_body(Checks& is, const Node& root, Weights* weights) {
   Network& network = weights->network;
+  const int version = weights->version;
+  std::vector<std::string_view> keys = {
+      "preset",     "features",    "normaliser", "times",      "gamma",  "layers",
+      "activation", "leaky_slope", "loss",       "provenance", "samples"};
+  if (version == 3) keys.push_back("seen");
+  const bool gated = version == 2 || (version == 3 && is.find(root, "context") != nullptr);
+  if (gated) keys.push_back("context");
   Values body;
-  const bool mapped =
-      weights->version == 1
-          ? is.map("body", root,
-                   {"preset", "features", "normaliser", "times", "gamma", "layers",
-                    "activation", "leaky_slope", "loss", "provenance", "samples"},
-                   &body)
-          : is.map("body", root,
-                   {"preset", "features", "normaliser", "times", "gamma", "layers",
-                    "activation", "leaky_slope", "loss", "provenance", "samples", "context"},
-                   &body);
+  const bool mapped = is.map("body", root, keys, &body);
   if (!(mapped && decode_features(is, *body[1], &weights->features))) return false;
   network.features = weights->features.size();
   if (!(decode_normaliser(is, *body[2], &network) &&
@@ -212,11 +219,12 @@ inline bool decode_body(Checks& is, const Node& root, Weights* weights) {
         decode_activation(is, *body[6], &network.activation))) {
     return false;
   }
-  Array context, gamma;
-  if (weights->version == 2 &&
-      !is.array("context", *body[11], {network.features, network.features}, &context)) {
+  Array context, seen, gamma;
+  if (gated &&
+      !is.array("context", *body.back(), {network.features, network.features}, &context)) {
     return false;
   }
+  if (version == 3 && !decode_seen(is, *body[11], network.features, &seen)) return false;
   double slope = 0.0;
   if (!(decode_loss(is, *body[8]) && is.text("preset", *body[0], &weights->preset) &&
         is.array("gamma", *body[4], {weights->times.size()}, &gamma) &&
@@ -225,6 +233,7 @@ inline bool decode_body(Checks& is, const Node& root, Weights* weights) {
         is.plain("provenance", *body[9], kMaxDepth))) {
     return false;
   }
+  weights->seen = std::move(seen.values);
   network.context = std::move(context.values);
   network.gamma = std::move(gamma.values);
   network.leaky_slope = narrow(slope);
@@ -239,9 +248,9 @@ inline bool decode_outer(Checks& is, const Node& root, Weights* weights,
   }
   const Node* version = is.find(root, "schema_version");
   if (version == nullptr || version->kind != Kind::kUint ||
-      (version->natural != 1 && version->natural != 2)) {
+      version->natural < 1 || version->natural > 3) {
     return is.fail("schema_version", version == nullptr ? Node{} : *version,
-                   "1 or 2, all this reader supports");
+                   "1, 2 or 3, all this reader supports");
   }
   Values outer;
   if (!is.map("file", root, {"magic", "schema_version", "body", "sha256"}, &outer)) {

@@ -1,0 +1,114 @@
+// The guard: what is flagged and what is not; test_score.cpp counts its allocations.
+#include <cmath>
+#include <cstdint>
+#include <limits>
+#include <string>
+#include <vector>
+
+#include "check.hpp"
+#include "files.hpp"
+#include "rcirl/guard.hpp"
+
+namespace {
+
+constexpr float kNan = std::numeric_limits<float>::quiet_NaN();
+constexpr std::size_t kCount = 8;
+
+// Features lie in [-1.5, 1.25], have location 0 and scale 1; seen in [-0.5, 0.5].
+Example plain() {
+  Example example(3, 4, {5}, "tanh", false);
+  example.location = {0.0f, 0.0f, 0.0f};
+  example.scale = {1.0f, 1.0f, 1.0f};
+  return example;
+}
+
+std::string with_seen(const Example& example) {
+  auto fields = example.body();
+  fields.push_back({"seen", pack::array({2, 3}, {-0.5f, -0.5f, -0.5f, 0.5f, 0.5f, 0.5f})});
+  return pack::sealed(pack::map(fields), 3);
+}
+
+rcirl::Reward loaded(const std::string& file) {
+  rcirl::Reward reward;
+  CHECK_TEXT(rcirl::decode(file, "w", &reward).message(), "");
+  return reward;
+}
+
+std::vector<float> filled(float value) { return std::vector<float>(kCount * 4 * 3, value); }
+
+void test_ranges_are_widened_by_the_margin() {
+  const rcirl::Reward reward = loaded(with_seen(plain()));
+  CHECK(reward.version() == 3);
+  const rcirl::Guard guard(reward);
+  for (const float inside : {0.0f, -0.75f, 0.75f}) {
+    const rcirl::Verdict found = guard.check(filled(inside).data(), kCount, {});
+    CHECK(found.in_distribution && found.share == 0.0 && found.feature == 0);
+  }
+  for (const float outside : {-0.76f, 0.76f, 9.0f}) {
+    const rcirl::Verdict found = guard.check(filled(outside).data(), kCount, {});
+    CHECK(!found.in_distribution && found.share == 1.0);
+  }
+  const rcirl::Guard wide(reward, {1.0, 3.0, 0.25});
+  CHECK(wide.check(filled(-1.5f).data(), kCount, {}).in_distribution);
+}
+
+void test_the_share_of_one_feature_decides() {
+  const rcirl::Guard guard(loaded(with_seen(plain())));
+  std::vector<float> features = filled(0.0f);
+  for (std::size_t i = 0; i < 8; ++i) features[3 * i + 1] = 1.0f;  // 8 of 32 entries
+  rcirl::Verdict found = guard.check(features.data(), kCount, {});
+  CHECK(found.in_distribution && found.feature == 1 && found.share == 0.25);
+  features[3 * 8 + 1] = 1.0f;
+  found = guard.check(features.data(), kCount, {});
+  CHECK(!found.in_distribution && found.feature == 1 && found.share == 9.0 / 32.0);
+}
+
+void test_without_ranges_the_normaliser_decides() {
+  Example example = plain();
+  example.scale = {0.25f, 0.25f, 0.25f};
+  const rcirl::Guard guard(loaded(example.file()));
+  CHECK(guard.check(filled(0.75f).data(), kCount, {}).in_distribution);
+  CHECK(!guard.check(filled(0.76f).data(), kCount, {}).in_distribution);
+}
+
+void test_a_nan_at_a_valid_time_is_out() {
+  const rcirl::Guard guard(loaded(with_seen(plain())));
+  std::vector<float> features = filled(0.0f);
+  features[(3 * 4 + 2) * 3 + 2] = kNan;  // candidate 3, time 2
+  rcirl::Verdict found = guard.check(features.data(), kCount, {});
+  CHECK(!found.in_distribution && found.feature == 2 && found.share == 1.0 / 32.0);
+  const std::vector<std::uint8_t> valid = {1, 1, 0, 1};
+  found = guard.check(features.data(), kCount, {valid.data(), rcirl::Mask::kShared});
+  CHECK(found.in_distribution && found.share == 0.0);
+}
+
+void test_nothing_known_is_out() {
+  const rcirl::Guard guard(loaded(with_seen(plain())));
+  const std::vector<std::uint8_t> none(4, 0);
+  CHECK(!guard.check(filled(0.0f).data(), kCount, {none.data(), rcirl::Mask::kShared})
+             .in_distribution);
+  CHECK(!guard.check(nullptr, 0, {}).in_distribution);
+  CHECK(!rcirl::Guard(rcirl::Reward()).check(nullptr, 0, {}).in_distribution);
+}
+
+void test_a_context_stands_beside_the_ranges() {
+  const Example example(3, 4, {5}, "tanh", true);
+  rcirl::Reward reward = loaded(with_seen(example));
+  rcirl::Workspace workspace = reward.workspace();
+  const std::vector<float> features = example.inputs(1, 5);
+  float value;
+  CHECK(reward.score(features.data(), 1, {}, &workspace, &value) == 0);
+  CHECK(std::abs(static_cast<double>(value) - example.value(features.data(), nullptr)) < 1e-5);
+}
+
+}  // namespace
+
+int main() {
+  test_ranges_are_widened_by_the_margin();
+  test_the_share_of_one_feature_decides();
+  test_without_ranges_the_normaliser_decides();
+  test_a_nan_at_a_valid_time_is_out();
+  test_nothing_known_is_out();
+  test_a_context_stands_beside_the_ranges();
+  return failures == 0 ? 0 : 1;
+}
