@@ -5,7 +5,7 @@ import platform
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib import metadata
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from absl import app, flags, logging
 
 from rcirl_jax import __version__, interrupts
 from rcirl_jax.errors import InputError
+from rcirl_jax.export.reader import load_weights
 
 EXIT_BAD_INPUT = 2
 HOOK_VARIABLES = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE")
@@ -118,20 +119,30 @@ def hidden_sizes(values: list[str], flag: str = "hidden_size") -> tuple[int, ...
     return sizes
 
 
-def provenance() -> dict:
-    """Flags of one experiment file, git commit, versions and machine."""
+def provenance(weights: Sequence[str] = ()) -> dict:
+    """Flags of one experiment file, git commit, versions and machine.
+
+    Starts JAX's devices: after `join_processes` where there are several processes.
+
+    Args:
+      weights: weights files that were read; their hashes name them.
+    """
     own = flags.FLAGS.get_key_flags_for_module(sys.argv[0])
-    packages = ("jax", "flax", "optax", "orbax-checkpoint", "numpy", "tensorstore")
+    packages = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
+    hashes = {str(path): load_weights(path).sha256 for path in weights}
     return {
         "flags": {flag.name: flag.value for flag in own},
         "git_commit": git_commit(),
         "versions": {
             "python": platform.python_version(),
             "rcirl-jax": __version__,
-            **{name: metadata.version(name) for name in packages},
+            **{name: metadata.version(name) for name in (*packages, "tensorstore")},
         },
         "machine": platform.machine(),
         **processor(),
+        "device": jax.devices()[0].device_kind,
+        "devices": jax.device_count(),
+        **({"weights_sha256": hashes} if hashes else {}),
     }
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments.common import run
+from experiments.common import provenance, run
 from experiments.executor import executor
 from rcirl_jax.data.store import open_dataset
 from rcirl_jax.errors import InputError
@@ -46,11 +46,13 @@ def main() -> None:
         drop_collisions=_FILTER.value,
         tuned=tuned_rows(_HAND.value),
     )
-    report = evaluate_ranking(open_dataset(_DATA.value), learned, setup, executor())
+    dataset = open_dataset(_DATA.value)
+    report = evaluate_ranking(dataset, learned, setup, executor())
     print(format_table(report, _WIDTH.value))
     if _OUTPUT.value:
         output = Path(_OUTPUT.value)
-        write_json(output, to_json(report))
+        made_by = {**provenance(_WEIGHTS.value), "data_hash": dataset.hash}
+        write_json(output, {**to_json(report), "made_by": made_by})
         print(f"report: {output}")
 
 

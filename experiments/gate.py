@@ -57,7 +57,7 @@ def main() -> None:
     result = drive_job(job, executor())
     verdict = judge(pair_of(runs_of(result), incumbent), config, left_out(job))
     files = {"candidate": _CANDIDATE.value, "incumbent": _INCUMBENT.value}
-    facts = {"files": files, **result.facts, "made_by": provenance()}
+    facts = {"files": files, **result.facts, "made_by": provenance(job.weights)}
     write_verdict(output, verdict, config, facts)
     print(format_verdict(verdict))
     print(f"written: {output}; exit status {verdict.exit_code}")

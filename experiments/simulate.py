@@ -108,7 +108,7 @@ def main() -> None:
             drive = spread(places, job)
     config = SuiteConfig(plan_every=_EVERY.value, chunk=_CHUNK.value)
     result = run_suite(rows, cases, config, drive)
-    print(write_suite(result, Path(_OUTPUT.value), provenance()))
+    print(write_suite(result, Path(_OUTPUT.value), provenance(_WEIGHTS.value)))
     for name, facts in result.timings.items():
         print(f"{name}: {facts['seconds']} s, {facts['plans_per_s']:,} plans/s")
     print(f"peak memory: {result.facts['peak_memory_gib']} GiB")

@@ -251,7 +251,8 @@ class Loop:
                 dataset, learned, setup, self.executor, references
             )
             write_whole(self.folder / "ranking.txt", format_table(report, 118) + "\n")
-            write_json(path, {**to_json(report), "made_by": dict(self.facts)})
+            made_by = {**self._made_by(), "data_hash": dataset.hash}
+            write_json(path, {**to_json(report), "made_by": made_by})
 
         self._run("rank", inputs, [path, self.folder / "ranking.txt"], work)
 
@@ -262,7 +263,7 @@ class Loop:
 
         def work() -> None:
             result = drive_job(job, self.executor)
-            write_suite(result, folder, self.facts)
+            write_suite(result, folder, self._made_by())
             write_runs(folder / "metrics.npz", runs_of(result))
 
         inputs = {"job": self._job_inputs()}
@@ -282,7 +283,7 @@ class Loop:
 
         def work() -> None:
             files = {"candidate": str(self.weights), "incumbent": self.config.incumbent}
-            facts = {"files": files, "made_by": dict(self.facts)}
+            facts = {"files": files, "made_by": self._made_by()}
             write_verdict(path, self._verdict, self.config.gate, facts)
 
         self._run("gate", inputs, [path], work)
@@ -301,6 +302,15 @@ class Loop:
         return path
 
     # -------------------------------------------------------------------- helpers
+
+    def _made_by(self) -> dict:
+        """Provenance of an output, with the hashes of the rewards."""
+        rewards = [
+            open_reward(str(file)) for file in [*self._seed_files(), self.weights]
+        ]
+        known = self._incumbent_reward()
+        rewards += [known] if known else []
+        return {**self.facts, "weights_sha256": {r.file: r.sha256 for r in rewards}}
 
     @functools.cached_property
     def _runs(self) -> SuiteRuns:

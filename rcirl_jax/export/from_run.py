@@ -2,6 +2,7 @@
 
 import datetime
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,21 @@ def _tuples(value: Any) -> Any:  # noqa: ANN401
     return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
+def config_of(settings: Mapping[str, Any]) -> TrainConfig:
+    """The configuration of its fields as JSON types.
+
+    Raises:
+      ValueError, KeyError, TypeError: they are not those of this version.
+    """
+    others = dict(settings)
+    reward, sampler = dict(others.pop("reward")), dict(others.pop("sampler"))
+    return TrainConfig(
+        reward=RewardConfig(**{k: _tuples(v) for k, v in reward.items()}),
+        sampler=SamplerConfig(**{k: _tuples(v) for k, v in sampler.items()}),
+        **others,
+    )
+
+
 def read_config(workdir: Path) -> tuple[TrainConfig, dict]:
     """The configuration a run was made with, and all of run.json."""
     path = workdir / "run.json"
@@ -44,15 +60,7 @@ def read_config(workdir: Path) -> tuple[TrainConfig, dict]:
         raise InputError(f"{path}: missing: expected a run made by experiments.train")
     try:
         run = json.loads(path.read_text())
-        settings = dict(run["config"])
-        reward = dict(settings.pop("reward"))
-        sampler = dict(settings.pop("sampler"))
-        lists = {k: _tuples(v) for k, v in sampler.items() if isinstance(v, list)}
-        config = TrainConfig(
-            reward=RewardConfig(**{k: _tuples(v) for k, v in reward.items()}),
-            sampler=SamplerConfig(**{**sampler, **lists}),
-            **settings,
-        )
+        config = config_of(run["config"])
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: {error}: expected a run of this version") from error
     return config, run
@@ -186,6 +194,8 @@ def _provenance(
         "flags": run.get("flags", {}),
         "metrics": last_metrics(workdir),
         "versions": run.get("versions", {}),
+        **{name: run.get(name) for name in ("machine", "cpu", "cores")},
+        **{name: run.get(name) for name in ("device", "devices")},
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "steps": int(state.step),
         "mode": config.sampler.mode,

@@ -1,0 +1,190 @@
+"""A weights file trained again from what it says of itself, and compared.
+
+Everything that decides a training run is in the file's provenance: the configuration
+(which the flags became), the seed, the hash of the data, versions and commit.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rcirl_jax.data.joined import Demonstrations
+from rcirl_jax.data.preferences import read_preferences
+from rcirl_jax.errors import InputError
+from rcirl_jax.export.from_run import config_of, export_run
+from rcirl_jax.export.reader import RANGES, Reward
+from rcirl_jax.train.loop import train
+from rcirl_jax.train.running import Running
+from rcirl_jax.train.state import TrainConfig
+
+NEEDED = ("config", "flags", "seed", "steps", "dataset_sha256")
+# where all of these are the same, so is every bit
+SETUP = ("versions", "git_commit", "machine", "cpu", "cores", "device", "devices")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Reproduction:
+    """How a file and its second training compare."""
+
+    # tensor -> largest difference, of its largest entry; inf: another shape
+    differences: Mapping[str, float]
+    # what differs of the setup, in words; empty: every bit has to be the same
+    warnings: tuple[str, ...]
+    tolerance: float  # allowed where the setups differ
+
+    @property
+    def allowed(self) -> float:
+        """The largest difference that still counts as reproduced."""
+        return self.tolerance if self.warnings else 0.0
+
+    @property
+    def worst(self) -> tuple[str, float]:
+        """The tensor that differs most; any where none does."""
+        name = max(self.differences, key=lambda name: self.differences[name])
+        return name, self.differences[name]
+
+    @property
+    def reproduced(self) -> bool:
+        """Whether it is the same reward."""
+        return self.worst[1] <= self.allowed
+
+    def text(self) -> str:
+        """One line of verdict."""
+        name, most = self.worst
+        found = "bit for bit" if most == 0.0 else f"{name} differs by {most:.3g}"
+        word = "reproduced" if self.reproduced else "not reproduced"
+        return f"{word}: {found} (of its largest entry; allowed: {self.allowed:g})"
+
+
+def settings_of(reward: Reward, dataset: Demonstrations) -> TrainConfig:
+    """The configuration that the file was trained with.
+
+    Raises:
+      InputError: the provenance lacks what a second training needs, is of other
+        data, or of a run that was exported before its end.
+    """
+    found, file = reward.provenance, reward.file
+    for name in NEEDED:
+        if found.get(name) in (None, "", {}):
+            raise InputError(
+                f"{file}: provenance.{name}: missing: expected a file exported from a "
+                "run of experiments.train or experiments.autotune of this version"
+            )
+    if found["dataset_sha256"] != dataset.hash:
+        raise InputError(
+            f"{file}: provenance.dataset_sha256: {found['dataset_sha256']}: expected "
+            f"that of the given data, {dataset.hash}"
+        )
+    try:
+        config = config_of(found["config"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{file}: provenance.config: {error}: expected settings of this version"
+        ) from error
+    per_epoch = -(-dataset.indices("train").size // config.batch_size)
+    if found["steps"] != per_epoch * config.epochs:
+        raise InputError(
+            f"{file}: provenance.steps: {found['steps']}: expected "
+            f"{per_epoch * config.epochs}, a run that was trained to its end"
+        )
+    return config
+
+
+def setup_warnings(
+    before: Mapping[str, Any], now: Mapping[str, Any]
+) -> tuple[str, ...]:
+    """What differs between two setups (provenances), in words."""
+    said = []
+    for name in SETUP:
+        was, is_now = before.get(name), now.get(name)
+        if isinstance(was, Mapping) and isinstance(is_now, Mapping):
+            for key in sorted({*was, *is_now}):
+                if was.get(key) != is_now.get(key):
+                    said.append(f"{name}.{key}: {was.get(key)}, now {is_now.get(key)}")
+        elif was != is_now:
+            said.append(f"{name}: {was}, now {is_now}")
+    if str(before.get("git_commit")).endswith("+"):
+        said.append("git_commit: of a checkout with changes, which are not recorded")
+    return tuple(said)
+
+
+def train_again(
+    reward: Reward,
+    dataset: Demonstrations,
+    folder: Path,
+    provenance: Mapping[str, Any],
+    preferences: Path | None = None,
+) -> Reward:
+    """Train FOLDER/run as the file was trained and write FOLDER/weights.msgpack.
+
+    Args:
+      reward: the file.
+      dataset: its data.
+      folder: a new folder.
+      provenance: of this run.
+      preferences: file of the judgements; default: the one that the flags name.
+
+    Raises:
+      InputError: as `settings_of`; the folder has a run; other preferences.
+    """
+    config, flags = settings_of(reward, dataset), reward.provenance["flags"]
+    workdir = folder / "run"
+    if workdir.exists():
+        raise InputError(f"{workdir}: exists: expected a folder without a run")
+    judged = None
+    if config.preferences:
+        path = preferences or Path(str(flags.get("preferences")))
+        judged = read_preferences(path, dataset)
+        if judged.sha256 != config.preferences:
+            raise InputError(
+                f"{path}: sha256: {judged.sha256}: expected {config.preferences}, the "
+                "judgements of the file"
+            )
+    train(
+        dataset,
+        workdir,
+        config,
+        running=Running(parallel=str(flags.get("parallel", "jit"))),
+        provenance=dict(provenance),
+        preferences=judged,
+    )
+    output = folder / "weights.msgpack"
+    return export_run(workdir, dataset, output, ranges=reward.seen is not None)
+
+
+def compare(before: Reward, after: Reward) -> dict[str, float]:
+    """Tensor -> largest difference, as a share of its largest entry.
+
+    Raises:
+      InputError: features, activation or loss are not the same.
+    """
+    for name in ("preset", "names", "units", "activation", "leaky_slope", "loss"):
+        was, found = getattr(before, name), getattr(after, name)
+        if was != found:
+            raise InputError(f"{after.file}: {name}: {found}: expected {was}")
+    ours, theirs = _tensors(before), _tensors(after)
+    found = {}
+    for name in {**ours, **theirs}:
+        a, b = ours.get(name), theirs.get(name)
+        if a is None or b is None or a.shape != b.shape:
+            found[name] = float("inf")
+        elif a.tobytes() == b.tobytes():
+            found[name] = 0.0
+        else:
+            apart = np.max(np.abs(a.astype(np.float64) - b))
+            largest = float(max(np.max(np.abs(a)), np.finfo(np.float32).tiny))
+            found[name] = max(float(apart), np.finfo(np.float64).tiny) / largest
+    return found
+
+
+def _tensors(reward: Reward) -> dict[str, np.ndarray]:
+    found = {name: getattr(reward, name) for name in (*RANGES, "times", "gamma")}
+    for number, (kernel, bias) in enumerate(
+        zip(reward.kernels, reward.biases, strict=True)
+    ):
+        found |= {f"layers[{number}].kernel": kernel, f"layers[{number}].bias": bias}
+    more = {"context": reward.context, "seen": reward.seen}
+    return found | {name: value for name, value in more.items() if value is not None}
