@@ -125,6 +125,10 @@ def test_layout_is_the_documented_one():
     gated = msgpack.unpackb(packed(by_context=True))
     assert gated["schema_version"] == 2
     assert tuple(msgpack.unpackb(gated["body"])) == (*reader.BODY_KEYS, "context")
+    for by_context, more in ((False, ("seen",)), (True, ("seen", "context"))):
+        ranged = msgpack.unpackb(packed(by_context=by_context, seen=True))
+        assert ranged["schema_version"] == 3
+        assert tuple(msgpack.unpackb(ranged["body"])) == (*reader.BODY_KEYS, *more)
     kernel = body["layers"][0]["kernel"]
     assert (kernel["shape"], kernel["dtype"]) == ([3, 5], "<f4")
     weights = example_weights()
@@ -179,10 +183,13 @@ def test_schema_describes_the_body_and_refuses_others():
     np.testing.assert_array_equal(gamma, example_weights(hidden=(4, 2)).gamma)
     keys = set(reader.BODY_KEYS)
     assert set(schema["required"]) == keys
-    assert set(schema["properties"]) == {*keys, "context"}
+    assert set(schema["properties"]) == {*keys, "context", "seen"}
     gated = to_json(packed(by_context=True))
     validator.validate(gated)
     assert not validator.is_valid({**gated, "context": 1})
+    ranged = to_json(packed(by_context=True, seen=True))
+    validator.validate(ranged)
+    assert not validator.is_valid({**ranged, "seen": ranged["gamma"]})
     assert schema["properties"]["activation"]["enum"] == sorted(ACTIVATIONS)
     for key in reader.BODY_KEYS:
         assert not validator.is_valid({k: v for k, v in body.items() if k != key})
