@@ -5,7 +5,8 @@
 
 import (if there is no --data; synthetic traffic if there is no --format) -> train ->
 export -> rank -> simulate -> gate -> report. Every stage is kept until what it is
-made from changes; a killed run goes on where it was. The candidate is in
+made from changes; a killed run goes on where it was, also one ended by SIGTERM (exit
+status 143) or SIGINT (130), which save the training's step. The candidate is in
 RUN/weights.msgpack; open RUN/report.html. The full suite takes half an hour on two
 cores; `--cases=3 --duration=30` is a look that can prove little. `experiments.gate`
 gives the verdict as its exit status.

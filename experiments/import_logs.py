@@ -3,8 +3,9 @@
     python -m experiments.import_logs --format=commonroad --input=DIR --output=DATASET
 
 Prints the data-quality report and writes it into DATASET/manifest.json. An
-interrupted import resumes; bad input leaves nothing behind. Of large releases a few
-odd recordings may be left out (--leave_out), counted and named in the report.
+interrupted import resumes (SIGTERM ends with exit status 143, SIGINT with 130, a full
+disk with 2: finished shards stay); bad input leaves nothing behind. Of large releases a
+few odd recordings may be left out (--leave_out), counted and named in the report.
 """
 
 from pathlib import Path

@@ -6,7 +6,8 @@
 Leaky rates, step sizes and seeds of one network shape train in one compiled program;
 shapes are spread by --executor. A part of the training scenes (other vehicles) is held
 out to choose by; the test split is scored once, for the chosen. Writes sweep.json,
-sweep.png, weights/*.msgpack and best.msgpack. Run again, it goes on where it stopped.
+sweep.png, weights/*.msgpack and best.msgpack. Run again, it goes on where it stopped
+(exit status 143 after SIGTERM, 130 after SIGINT): finished shapes are kept.
 The best was fitted without the validation scenes: train its settings again by
 experiments.train to use them all. `--quick`: 128 scenes, 2 epochs, 2 seeds.
 """

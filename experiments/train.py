@@ -2,7 +2,9 @@
 
     python -m experiments.train --data=DATASET --workdir=RUN
 
-Resumes from RUN/checkpoints when it is run again with the same settings.
+Resumes from RUN/checkpoints when it is run again with the same settings, to the same
+bits. SIGTERM and SIGINT (Ctrl-C) save the step it is in and end within ten seconds,
+with exit status 143 and 130. A damaged checkpoint is named and the one before it taken.
 Several processes (RUN and DATASET on a file system that all of them see), each with
 its own --process_id:
 

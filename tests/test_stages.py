@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.stages import FILE, Stages, only_one
+from rcirl_jax.stages import FILE, LOCK, Stages, only_one
 
 
 @pytest.fixture
@@ -86,3 +86,35 @@ def test_a_second_process_is_refused(tmp_path):
         assert "in use by another process" in done.stderr
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.stdout == "held\n"
+
+
+@pytest.mark.multiprocess
+def test_a_killed_process_holds_nothing(tmp_path):
+    code = (
+        "import sys, time; from pathlib import Path\n"
+        "from rcirl_jax.stages import only_one\n"
+        "with only_one(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "held\n"
+    with pytest.raises(InputError, match=f"{tmp_path}: in use"), only_one(tmp_path):
+        pass
+    process.kill()
+    process.wait()
+    process.stdout.close()
+    with only_one(tmp_path):
+        assert (tmp_path / LOCK).exists()
+
+
+def test_a_lock_that_leaves_nothing(tmp_path):
+    """Not even the folders made for it, unless something is in them."""
+    deep = tmp_path / "a" / "b"
+    with only_one(deep, leave_nothing=True):
+        assert (deep / LOCK).exists()
+        with pytest.raises(InputError, match="in use"), only_one(deep):
+            pass
+    assert list(tmp_path.iterdir()) == []
+    with only_one(deep, leave_nothing=True):
+        (deep / "kept").write_text("x")
+    assert [x.name for x in deep.iterdir()] == ["kept"]

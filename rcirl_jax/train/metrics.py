@@ -118,6 +118,8 @@ class _Board:
     def close(self) -> None:
         with contextlib.suppress(OSError):  # of pictures only
             self._file.close()
+        with contextlib.suppress(OSError):  # which the first leaves open if it fails
+            self._file._py_recordio_writer.close()
 
 
 class Progress:

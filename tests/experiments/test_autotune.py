@@ -5,6 +5,7 @@ import json
 import pytest
 
 from rcirl_jax.data.store import open_dataset
+from rcirl_jax.stages import only_one
 from tests.commands import command
 
 SMALL = (
@@ -79,3 +80,14 @@ def test_what_cannot_be_is_one_line_before_any_work(flags, message, tmp_path):
     (line,) = done.stderr.strip().splitlines()
     assert message in line
     assert not (tmp_path / "run" / "stages.json").exists()
+
+
+@pytest.mark.multiprocess
+def test_a_run_in_use_is_one_line(tmp_path):
+    run = tmp_path / "run"
+    with only_one(run):
+        done = command("experiments.autotune", f"--workdir={run}", *SMALL)
+    assert done.returncode == 2
+    (line,) = done.stderr.strip().splitlines()
+    assert line.startswith(f"error: {run}: in use by another process: ")
+    assert [x.name for x in run.iterdir()] == [".lock"]

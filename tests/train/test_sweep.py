@@ -28,6 +28,7 @@ from rcirl_jax.export.loading import compiled_scorer, open_reward
 from rcirl_jax.export.sweep import run_sweep, table
 from rcirl_jax.report.sweep_picture import sweep_picture
 from rcirl_jax.reward import RewardConfig
+from rcirl_jax.stages import only_one
 from rcirl_jax.train import frozen
 from rcirl_jax.train.frozen import fit, freeze, members_of
 from rcirl_jax.train.pieces import piece_size
@@ -258,6 +259,14 @@ def test_other_settings_or_data_in_the_folder_are_one_line(data, finished):
     longer = dataclasses.replace(BASE, epochs=9)
     with pytest.raises(InputError, match=r"settings\.json: epochs: 2: expected 9 to"):
         run_sweep(config_of(data, base=longer), folder, Here(), {})
+
+
+def test_a_sweep_in_use_is_refused(data, finished):
+    folder = finished[0]
+    before = (folder / "sweep.json").read_bytes()
+    with only_one(folder), pytest.raises(InputError, match="in use by another proc"):
+        run_sweep(config_of(data), folder, Here(), MADE_BY)
+    assert (folder / "sweep.json").read_bytes() == before
 
 
 RAY = """

@@ -1,0 +1,135 @@
+"""Commands killed, told to end, and without room on the disk: by their command."""
+
+import json
+import os
+import resource
+import subprocess
+import sys
+
+import pytest
+
+from benchmarks.reliability.jobs import jobs, write_logs
+from tests.commands import command
+from tests.conftest import REPO
+
+pytestmark = [pytest.mark.slow, pytest.mark.multiprocess]
+
+
+def harness(tmp_path, *flags):
+    """(exit status, rows) of the harness."""
+    done = command("benchmarks.reliability.faults", f"--output={tmp_path}", *flags)
+    (file,) = tmp_path.glob("faults_*.json")
+    return done, json.loads(file.read_text())["rows"]
+
+
+@pytest.mark.parametrize("signal", ["KILL", "TERM"])
+def test_disturbed_commands_come_to_the_same(tmp_path, signal):
+    done, rows = harness(
+        tmp_path, "--commands=import,train", "--kills=6", f"--signal={signal}"
+    )
+    assert done.returncode == 0, done.stdout
+    assert [row["count"] for row in rows] == [3, 3]
+    assert {row["outcome"] for row in rows} == {"as undisturbed"}
+    assert all(row["comparisons"] >= 1 for row in rows)
+    assert all(x < 10.0 for row in rows for x in row["seconds_to_end"])
+
+
+def test_a_broken_resume_is_found(tmp_path):
+    flags = ("--commands=train", "--kills=2", "--moments=work", "--broken_resume")
+    done, (row,) = harness(tmp_path, *flags)
+    assert done.returncode == 1
+    assert row["outcome"].startswith("different: ")
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    """logs/ and data/, a run on it in run/ and its weights."""
+    folder = tmp_path_factory.mktemp("reliability") / "root"
+    write_logs(folder / "logs")
+    for name in ("import", "train"):
+        job = jobs(folder)[name]
+        assert limited(folder, None, job.module, *job.flags).returncode == 0
+    export = ("--workdir=run", "--output=w.msgpack")
+    assert limited(folder, None, "experiments.export_weights", *export).returncode == 0
+    return folder
+
+
+def limited(folder, size, module, *flags):
+    """A command that can write no file longer than `size` bytes."""
+
+    def limit():
+        if size is not None:
+            hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
+            resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+
+    # JAX's own cache of programs warns when it cannot be written
+    own = {"PYTHONPATH": str(REPO), "JAX_ENABLE_COMPILATION_CACHE": "0"}
+    return subprocess.run(
+        [sys.executable, "-m", module, *flags], env={**os.environ, **own},
+        cwd=folder, preexec_fn=limit, text=True, capture_output=True, check=False,
+    )  # fmt: skip
+
+
+def errors_of(done):
+    """Lines besides progress bars."""
+    said = done.stderr.replace("\r", "\n").splitlines()
+    return [x for x in said if x.strip() and "%|" not in x and "import: " not in x]
+
+
+def flags_of(root, name):
+    """Module and flags of a command, by absolute inputs."""
+    known = jobs(root)
+    if name in known:
+        return known[name].module, known[name].flags
+    if name == "export":
+        data = f"--workdir={root / 'run'}", f"--data={root / 'data'}"
+        return "experiments.export_weights", (*data, "--output=w.msgpack")
+    data = f"--weights={root / 'w.msgpack'}", f"--data={root / 'data'}"
+    return "experiments.report", (*data, "--output=report.html")
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "file"),
+    [
+        ("import", 3_000, "data"),
+        ("train", 0, "run.json"),
+        ("train", 6_000, "run"),  # in metrics.jsonl, or before in TensorBoard's
+        ("train", 60_000, "checkpoints"),
+        ("export", 1_000, "w.msgpack"),
+        ("sweep", 3_000, "weights"),
+        ("report", 10_000, "report.html"),
+    ],
+)
+def test_a_full_disk_is_one_line_and_the_run_goes_on(root, tmp_path, name, size, file):
+    module, flags = flags_of(root, name)
+    done = limited(tmp_path, size, module, *flags)
+    assert done.returncode == 2, done.stderr[-2000:]
+    (line,) = errors_of(done)
+    assert line.startswith("error: ")
+    assert file in line
+    assert not list(tmp_path.rglob("*.tmp"))
+    for final in ("manifest.json", "w.msgpack", "report.html", "sweep.json"):
+        assert not list(tmp_path.rglob(final)), final
+    assert limited(tmp_path, None, module, *flags).returncode == 0
+    if name in ("import", "train", "sweep"):
+        job = jobs(root)[name]
+        if name != "sweep":
+            assert job.outcome(tmp_path) == job.outcome(root)
+
+
+@pytest.mark.parametrize("name", ["import", "train", "export", "sweep", "report"])
+def test_a_place_that_cannot_be_is_one_line(root, tmp_path, name):
+    """Below a file, where nobody can make a folder, whoever runs it."""
+    (tmp_path / "file").write_text("here")
+    module, flags = flags_of(root, name)
+    places = ("--output=", "--workdir=run")
+    below = [
+        x.replace("=", f"={tmp_path}/file/", 1) if x.startswith(places) else x
+        for x in flags
+    ]
+    done = limited(tmp_path, None, module, *below)
+    assert done.returncode == 2, done.stderr[-2000:]
+    (line,) = errors_of(done)
+    assert line.startswith("error: ")
+    assert f"{tmp_path}/file" in line
+    assert [x.name for x in tmp_path.iterdir()] == ["file"]
