@@ -84,7 +84,8 @@ def jobs(root: Path) -> dict[str, Job]:
             module="experiments.autotune",
             flags=(
                 *(*logs, "--workdir=run", "--stride=2", "--batch_size=8"),
-                *("--epochs=1", "--suite=free_cruise", "--cases=3", "--duration=2"),
+                *("--epochs=1", "--suite=free_cruise,stopped_lead"),
+                *("--cases=15", "--duration=2"),  # the gate judges no fewer
             ),
             outcome=_of_tuning,
             progress="run/stages.json",
