@@ -14,7 +14,8 @@ from rcirl_jax.features import feature_map
 from rcirl_jax.reward import LOSSES, Normaliser, RewardConfig, pinned
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train.facts import log_density
-from rcirl_jax.train.loop import guard, to_device_batch
+from rcirl_jax.train.finite import check_step
+from rcirl_jax.train.loop import to_device_batch
 from rcirl_jax.train.parallel import (
     jit_sharded,
     parallelise,
@@ -207,7 +208,7 @@ def test_not_finite_features_are_named_and_the_state_is_kept():
     after, metrics = jax.jit(make_train_step(CONFIG))(state, broken)
     np.testing.assert_array_equal(weights_of(after), weights_of(state))
     with pytest.raises(InputError, match=r"step 7: scene 103: feature jerk: not"):
-        guard(metrics, feature_map("paper21"), 7)
+        check_step(metrics, feature_map("paper21"), 7)
 
 
 def test_compiles_once():

@@ -1,0 +1,67 @@
+"""Numbers that are not finite, by the name of the scene that they come from."""
+
+import numpy as np
+
+from rcirl_jax.data.joined import Demonstrations
+from rcirl_jax.data.rows import refuse_scenes, scene_name, unusable_leaves
+from rcirl_jax.errors import InputError
+from rcirl_jax.features import FeatureMap, feature_map
+from rcirl_jax.train.state import FeatureBatch
+from rcirl_jax.train.step import StepMetrics
+from rcirl_jax.types import Demonstration
+
+
+def check_step(
+    metrics: StepMetrics,
+    features: FeatureMap,
+    step: int,
+    dataset: Demonstrations | None = None,
+) -> None:
+    """Stop with the scene and the features named when a number is not finite.
+
+    The scene is looked up in the dataset, if given, once the step has failed.
+    """
+    if bool(metrics.finite):
+        return
+    row = int(metrics.first_bad)
+    if row >= 0:
+        bad = np.flatnonzero(np.asarray(metrics.nonfinite))
+        names = ", ".join(features.names[i] for i in bad)
+        scene, cause = f"scene {row}", ""
+        if dataset is not None:
+            rows = dataset.read(np.array([row]))
+            scene, leaves = scene_name(rows, 0, row), unusable_leaves(rows, 0)
+            cause = f" (as is the stored {', '.join(leaves)})" if leaves else ""
+        raise InputError(
+            f"train: step {step}: {scene}: feature {names}: not finite{cause}: "
+            "expected finite features; the state before is kept"
+        )
+    raise InputError(
+        f"train: step {step}: loss or gradient: not finite: features are finite; "
+        "lower --learning_rate; the state before is kept"
+    )
+
+
+def check_features(
+    made: FeatureBatch, rows: Demonstration, stored: np.ndarray, preset: str
+) -> None:
+    """Refuse features (numpy) that are NaN or infinite.
+
+    Args:
+      made: features of the first n of the scenes; the others are not looked at.
+      rows: the scenes.
+      stored: their rows in the dataset.
+      preset: of the features.
+
+    Raises:
+      InputError: names the first such scene and its features.
+    """
+    candidates, human = np.asarray(made.candidates), np.asarray(made.human)
+    finite = [
+        np.isfinite(candidates[:, i]).all(axis=(1, 2))
+        & np.isfinite(human[:, :, i]).all(axis=1)
+        for i in range(candidates.shape[1])
+    ]
+    names = (f"feature {name}" for name in feature_map(preset).names)
+    found = {name: np.invert(fine) for name, fine in zip(names, finite, strict=True)}
+    refuse_scenes("train", rows, stored, found)
