@@ -5,10 +5,10 @@
 The paper's figure: gamma_t is a free vector, not an exponential; conditional
 learning is said to weigh the near future, the discriminator not. All eight seconds
 are compared. Expected with US-101: 6 minutes on one core with 10 seeds; no decay
-(0.42 to 0.47 of the weight in the first half, a peak at 5 s, where recordings begin
-to end) and no difference between the paper's loss and the GAN; with
---positive=human, the paper's setting, 0.41 against the GAN's 0.36. `--quick`: under
-a minute.
+(0.39 to 0.44 of the weight in the first half, equal weights have 0.47; a peak at 5 s,
+where recordings begin to end) and no difference between the paper's loss and the GAN;
+with --positive=human, the paper's setting, 0.37 against the GAN's 0.31. `--quick`:
+under a minute.
 """
 
 import itertools
