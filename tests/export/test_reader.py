@@ -345,7 +345,7 @@ def test_a_wrong_field_is_named(path, value, message):
         # whatever a later version adds, its number is what is named
         (
             sealed(b"later", schema_version=4, magic="RCIRLW", signature="x"),
-            "schema_version: 4: expected 1 or 2, all this reader supports",
+            "schema_version: 4: expected 1, 2 or 3, all this reader supports",
         ),
         (
             sealed(body_of(), schema_version=2),
