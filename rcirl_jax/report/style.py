@@ -1,5 +1,6 @@
 """One look for all pictures: colour-blind safe colours, names, sizes."""
 
+import io
 from pathlib import Path
 
 import matplotlib as mpl
@@ -9,6 +10,8 @@ mpl.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+
+from rcirl_jax.whole import write_whole
 
 # Okabe-Ito colours
 HUMAN = "#000000"
@@ -44,8 +47,9 @@ def label(axis: Axes, title: str, x: str, y: str) -> None:
 
 
 def save(made: Figure, path: Path) -> Path:
-    """Write the PNG (folder made if missing) and free the figure."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    made.savefig(path, dpi=130)
+    """Write the PNG, whole (folder made if missing), and free the figure."""
+    drawn = io.BytesIO()
+    made.savefig(drawn, dpi=130, format="png")
     plt.close(made)
+    write_whole(path, drawn.getvalue())
     return path
