@@ -19,10 +19,12 @@ from absl import flags
 from experiments import margins, training
 from experiments.common import provenance, run
 from experiments.executor import executor
+from experiments.signals import checked_signals
 from rcirl_jax.autotune import STAGES, Logs, Loop, TuneConfig
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import IMPORTERS
 from rcirl_jax.data.importing import ImportConfig
+from rcirl_jax.data.parts import parts_of
 from rcirl_jax.stages import file_sha256, only_one
 from rcirl_jax.train.running import Running
 
@@ -64,14 +66,6 @@ def main() -> None:
         catalogue_seed=_SEED.value,
         plan_every=_EVERY.value,
     )
-    logs = Logs(
-        format=_FORMAT.value,
-        input=Path(_INPUT.value) if _INPUT.value else None,
-        source=Path(_SOURCE.value) if _SOURCE.value else None,
-        config=ImportConfig(
-            format=_FORMAT.value, collect=CollectConfig(stride_s=_STRIDE.value)
-        ),
-    )
     loop = Loop(
         folder=Path(_WORKDIR.value),
         config=config,
@@ -80,7 +74,21 @@ def main() -> None:
         facts=provenance(),
     )
     with only_one(loop.folder):
-        loop.until(_UNTIL.value, _DATA.value or logs)
+        loop.until(_UNTIL.value, _DATA.value or _logs())
+
+
+def _logs() -> Logs:
+    """The recordings to import, and which of their written lights to use."""
+    found = Path(_INPUT.value) if _INPUT.value else None
+    source = Path(_SOURCE.value) if _SOURCE.value else None
+    checks = checked_signals(parts_of(_FORMAT.value, found, source), executor())
+    collect = CollectConfig(stride_s=_STRIDE.value, signal_checks=checks)
+    return Logs(
+        format=_FORMAT.value,
+        input=found,
+        source=source,
+        config=ImportConfig(format=_FORMAT.value, collect=collect),
+    )
 
 
 if __name__ == "__main__":

@@ -14,12 +14,12 @@ from absl import flags
 
 from experiments.common import run
 from experiments.executor import executor
+from experiments.signals import checked_signals
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import IMPORTERS
 from rcirl_jax.data.importing import ImportConfig, import_parts
 from rcirl_jax.data.parts import parts_of
 from rcirl_jax.data.quality import format_quality
-from rcirl_jax.data.signal_checks import read_signal_checks
 from rcirl_jax.data.store import Dataset
 from rcirl_jax.evaluation.evaluate import RankingSetup, oracle_floor
 from rcirl_jax.sampling import SamplerConfig
@@ -52,9 +52,6 @@ _KEEP_ALONE = flags.DEFINE_bool(
 _TRUST = flags.DEFINE_bool(
     "trust_signals", False, "use cycles a converter wrote, unless crossings contradict"
 )
-_SIGNALS = flags.DEFINE_string(
-    "signals", None, "labels.json of label_check --input: verdicts over all files"
-)
 _TEST_FRACTION = flags.DEFINE_float(
     "test_fraction", 0.25, "share of scenes held out, by vehicle-disjoint group"
 )
@@ -67,6 +64,12 @@ _SPLIT_SEED = flags.DEFINE_integer("split_seed", 0, "order in which groups are d
 
 def main() -> None:
     """Flags -> one import."""
+    places = executor()
+    parts = parts_of(
+        _FORMAT.value,
+        Path(_INPUT.value) if _INPUT.value else None,
+        Path(_SOURCE.value) if _SOURCE.value else None,
+    )
     config = ImportConfig(
         format=_FORMAT.value,
         collect=CollectConfig(
@@ -77,9 +80,7 @@ def main() -> None:
             require_obstacles=not _KEEP_ALONE.value,
             require_speed_change=not _KEEP_STEADY.value,
             trust_signals=_TRUST.value,
-            signal_checks=(
-                read_signal_checks(_SIGNALS.value) if _SIGNALS.value else None
-            ),
+            signal_checks=checked_signals(parts, places),
         ),
         test_fraction=_TEST_FRACTION.value,
         split_seed=_SPLIT_SEED.value,
@@ -87,14 +88,10 @@ def main() -> None:
     )
     floors: list[dict] = []
     manifest = import_parts(
-        parts_of(
-            _FORMAT.value,
-            Path(_INPUT.value) if _INPUT.value else None,
-            Path(_SOURCE.value) if _SOURCE.value else None,
-        ),
+        parts,
         _OUTPUT.value,
         config,
-        executor=executor(),
+        executor=places,
         overwrite=_OVERWRITE.value,
         before_commit=lambda dataset: floors.extend(_floors(dataset)),
     )

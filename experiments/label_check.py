@@ -11,7 +11,7 @@ data_specs/sources/synthetic.toml, whose drivers' own state is the truth.
 With --input (any recorded format): the written cycle of every signal is tested
 against crossings and stands, and the stop labels against observed stands, with
 the signals that an import trusts of itself, those it uses when told these phases
-(`import_logs --signals=DIR/labels.json`), and all of them. With --data the labels
+(`import_logs --signals=pooled`), and all of them. With --data the labels
 stored in a dataset are compared with today's rules. --workers and --executor
 spread the drives and the logs.
 

@@ -17,8 +17,7 @@ FUTURE_STEP_S = 0.05  # s, likewise
 HEADWAY_EDGES_S = (0.5, 1.0, 1.5, 2.0, 3.0)  # s, bins of the headway histogram
 HOW_TO_POOL = (
     "written lights that the crossings of one file cannot bear out give no stop "
-    "labels: `experiments.label_check --input=LOGS` asks all files together, and "
-    "`--signals` of an import takes its labels.json"
+    "labels: `--signals=pooled` of an import asks the drivers of all files together"
 )
 
 

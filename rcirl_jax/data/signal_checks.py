@@ -1,8 +1,8 @@
 """What drivers, over many files, say of written traffic lights.
 
-One short file cannot confirm a cycle; `experiments.label_check --input=LOGS` pools
-the crossings and stands of all files of a place. Its labels.json is read here, and
-an import then uses the lights of the lines that it bears out.
+One short file cannot confirm a cycle; `evaluation.label_logs.check_written` pools the
+crossings and stands of all files of a place, and an import then uses the lights of the
+lines that they bear out. The labels.json of `experiments.label_check` is read here.
 """
 
 import dataclasses

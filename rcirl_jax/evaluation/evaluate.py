@@ -23,6 +23,7 @@ from rcirl_jax.evaluation.score import (
     Scored,
     Scorer,
     covers,
+    measure_scenes,
     score_scenes,
 )
 from rcirl_jax.evaluation.table import RankingReport, build_report
@@ -266,15 +267,17 @@ def oracle_floor(dataset: Demonstrations, setup: RankingSetup, max_scenes: int) 
             f"--horizon: {setup.horizon_s}: no scene is recorded that long: "
             "expected a shorter one"
         )
-    scored = _score(dataset.read(keep), keep, setup, {})
-    fde = np.where(scored.feasible, scored.fde, np.inf).min(axis=1)
-    ade = np.where(scored.feasible, scored.ade, np.inf).min(axis=1)
+    near = measure_scenes(
+        dataset.read(keep), keep, sampler=setup.sampler, horizon_s=setup.horizon_s
+    )
+    fde = np.where(near.feasible, near.fde, np.inf).min(axis=1)
+    ade = np.where(near.feasible, near.ade, np.inf).min(axis=1)
     some = np.isfinite(fde)
     return {
         "mode": setup.sampler.mode,
         "horizon_s": setup.horizon_s,
         "scenes": int(keep.size),
-        "candidates": int(scored.fde.shape[1]),
+        "candidates": int(near.fde.shape[1]),
         "best_fde_mean_m": float(fde[some].mean()),
         "best_fde_median_m": float(np.median(fde[some])),
         "best_ade_mean_m": float(ade[some].mean()),

@@ -41,7 +41,7 @@ def check_logs(
       InputError: logs that cannot be read.
     """
     places = executor or Here()
-    phases = check_events(places.stream(_events, items(parts, places.workers)))
+    phases = check_written(parts, executor=places)
     checks = signal_checks({check.name: check.verdict for check in phases})
     work = functools.partial(_stops, checks=checks)
     found = list(places.stream(work, items(parts, places.workers)))
@@ -50,6 +50,17 @@ def check_logs(
         phases=phases,
         stops={name: joined(reports[name] for reports in found) for name in names},
     )
+
+
+def check_written(
+    parts: Sequence[Part], *, executor: Executor | None = None
+) -> list[PhaseCheck]:
+    """What all drivers of the logs say of the written signals, line by line.
+
+    Args and errors: of `check_logs`.
+    """
+    places = executor or Here()
+    return check_events(places.stream(_events, items(parts, places.workers)))
 
 
 def _events(item: Item) -> Iterator[LineEvents]:

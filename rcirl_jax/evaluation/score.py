@@ -204,22 +204,62 @@ def score_scenes(
     Raises:
       InputError: a feature or a value is not a number (names the scene).
     """
-    count = index.size
-
-    def chunks() -> Iterator[tuple[Demonstration, np.ndarray, int]]:
-        for start in range(0, count, CHUNK):
-            at = np.minimum(np.arange(start, start + CHUNK), count - 1)
-            taken = jax.tree.map(lambda x, at=at: np.asarray(x[at]), rows)
-            yield taken, index[at].astype(np.int32), min(CHUNK, count - start)
-
     piece = functools.partial(
         _score_chunk,
         shared=(preset, sampler, float(horizon_s)),
         scorers=scorers,
         tuned=tuned or {},
     )
-    parts = (executor or Here()).stream(piece, chunks())
+    parts = (executor or Here()).stream(piece, _chunks(rows, index))
     return Scored(**jax.tree.map(lambda *x: np.concatenate(x), *parts))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Measured:
+    """How far K candidates of S scenes end from the human (numpy)."""
+
+    feasible: np.ndarray  # [S, K]
+    fde: np.ndarray  # [S, K] m at the horizon
+    ade: np.ndarray  # [S, K] m, mean over times up to the horizon
+
+
+@functools.cache
+def _measure_batch(sampler: SamplerConfig, horizon_s: float) -> Callable:
+    def one(index: jax.Array, demonstration: Demonstration) -> dict:
+        human = human_of(demonstration, sampler)
+        made = sample(candidates_key(index), demonstration.scene, sampler)
+        fde, ade = jax.vmap(lambda x: distances(demonstration, human, x, horizon_s))(
+            made.trajectory
+        )
+        return {"feasible": made.feasible, "fde": fde, "ade": ade}
+
+    return jax.jit(jax.vmap(one))
+
+
+def measure_scenes(
+    rows: Demonstration, index: np.ndarray, *, sampler: SamplerConfig, horizon_s: float
+) -> Measured:
+    """The distances of `score_scenes` alone: no features, no values, little memory.
+
+    Args: as there.
+    """
+    measure = _measure_batch(sampler, float(horizon_s))
+    parts = [
+        jax.tree.map(lambda x, keep=keep: np.asarray(x)[:keep], measure(at, taken))
+        for taken, at, keep in _chunks(rows, index)
+    ]
+    return Measured(**jax.tree.map(lambda *x: np.concatenate(x), *parts))
+
+
+def _chunks(
+    rows: Demonstration, index: np.ndarray
+) -> Iterator[tuple[Demonstration, np.ndarray, int]]:
+    """Chunks of equal size, the last padded: (rows, index, how many are real)."""
+    count = index.size
+    for start in range(0, count, CHUNK):
+        at = np.minimum(np.arange(start, start + CHUNK), count - 1)
+        taken = jax.tree.map(lambda x, at=at: np.asarray(x[at]), rows)
+        yield taken, index[at].astype(np.int32), min(CHUNK, count - start)
 
 
 def _score_chunk(

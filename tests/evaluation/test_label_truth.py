@@ -9,7 +9,10 @@ import sys
 
 import numpy as np
 import pytest
+from absl import flags
+from absl.testing import flagsaver
 
+from experiments.signals import checked_signals
 from rcirl_jax.data.collect import Collector
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import read_recordings
@@ -17,10 +20,11 @@ from rcirl_jax.data.lines import trusted_signals
 from rcirl_jax.data.parts import parts_of, recordings_of
 from rcirl_jax.data.signal_checks import SignalChecks, read_signal_checks
 from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation import label_logs
 from rcirl_jax.evaluation.label_cases import FAMILIES, Case, draw, to_recording
 from rcirl_jax.evaluation.label_cases.plans import ego_of
 from rcirl_jax.evaluation.label_cases.scenes import CLOCK, drive, speed
-from rcirl_jax.evaluation.label_logs import check_logs
+from rcirl_jax.evaluation.label_logs import check_logs, check_written
 from rcirl_jax.evaluation.label_scores import format_labels
 from rcirl_jax.evaluation.label_signals import (
     check_phases,
@@ -30,7 +34,7 @@ from rcirl_jax.evaluation.label_signals import (
 )
 from rcirl_jax.evaluation.label_stops import check_stops, format_stops
 from rcirl_jax.evaluation.label_truth import measure
-from rcirl_jax.executor import Processes
+from rcirl_jax.executor import Here, Processes
 from rcirl_jax.types import Decision, Signal, Tag
 from tests.data.formats import commonroad
 
@@ -222,6 +226,7 @@ def test_logs_are_checked_alike_wherever_they_are_read(tmp_path):
     for one in here, there:
         assert [check.as_dict() for check in one.phases] == alone
     assert here.stops["trusted signals"] == check_stops(made)
+    assert [check.as_dict() for check in check_written(logs)] == alone
     every = here.stops["all signals"]
     assert every == check_stops(made, trust_all=True)
     assert (every.trusted, every.signals) == (3, 3)
@@ -245,6 +250,22 @@ def test_an_import_takes_the_word_of_many_files(turned, used, tmp_path):
     assert sum(len(one.signals) for one in told) == used
     said = [note for one in told for note in one.signal_notes]
     assert sum("many files speak against it" in note for note in said) == 4 - used
+
+
+def test_an_import_can_ask_all_files_itself(tmp_path, monkeypatch, capsys):
+    """`--signals=pooled` is what label_check and its labels.json would have said."""
+    made = [drives_of(number, 0.0) for number in range(12)]
+    monkeypatch.setattr(label_logs, "recordings_in", lambda one: [(None, one)])
+    monkeypatch.setattr(label_logs, "items", lambda parts, _: iter(parts))
+    file = write_checks(tmp_path / "labels.json", check_phases(made))
+    with flagsaver.as_parsed(signals="pooled"):
+        assert checked_signals(made, Here()) == read_signal_checks(file)
+    assert "confirmed" in capsys.readouterr().out
+    with flagsaver.as_parsed(signals=str(file)):
+        assert checked_signals(made, Here()) == read_signal_checks(file)
+    with flagsaver.flagsaver():
+        flags.FLAGS.mark_as_parsed()
+        assert checked_signals(made, Here()) is None
 
 
 def test_a_verdict_on_a_line_comes_before_all_rules(tmp_path):
