@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.evaluation.score import candidates_key
+from rcirl_jax.evaluation.score import candidates_key, measure_scenes
 from rcirl_jax.evaluation.tuned_rivals import (
     TUNABLE_IDM,
     as_numbers,
@@ -95,3 +95,13 @@ def test_numbers_of_a_rival():
     (numbers,) = as_numbers([Idm(headway=1.2)])
     assert numbers["headway"] == pytest.approx(1.2)
     assert set(numbers) == set(Idm().fields())
+
+
+def test_distances_alone_are_those_of_the_scores():
+    """What an import's oracle floor measures, over a padded chunk."""
+    rows = driven_by_a_hidden_driver()
+    scored = scored_rivals(rows, SMALL, {})
+    near = measure_scenes(rows, INDEX, sampler=SMALL, horizon_s=8.0)
+    for name in ("feasible", "fde", "ade"):
+        found, wanted = getattr(near, name), getattr(scored, name)
+        np.testing.assert_allclose(found, wanted, atol=1e-4)
