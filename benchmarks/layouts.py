@@ -91,7 +91,7 @@ def _forms(batch: FeatureBatch, normaliser: Normaliser) -> dict[str, Form]:
         return made._replace(human=whole(made.human), candidates=whole(made.candidates))
 
     stored = batch.replace(candidates=batch.candidates.astype(BF16))
-    own = SCENES // in_pieces(batch).weight.shape[0]
+    own = SCENES // in_pieces(batch)[0].size
     forms = {
         "points first": _points_first(batch, normaliser),
         "features first": Form(compare=plain, batch=batch),
@@ -159,7 +159,7 @@ def main(_: list[str]) -> None:
     for _ in range(_STEPS.value):
         trained, _ = step(trained, batch)
     forms = _forms(batch, state.normaliser)
-    own = f"features first, {SCENES // in_pieces(batch).weight.shape[0]}"
+    own = f"features first, {SCENES // in_pieces(batch)[0].size}"
     calls = {name: _gradient(form) for name, form in forms.items()}
     exact = forms["features first"].compare(trained.params, batch)
     result: dict = {"scenes": SCENES, "own": own, "rows": {}}

@@ -27,11 +27,22 @@ def piece_size(size: int, most: int) -> int:
     return next((n for n in range(min(size, most), 1, -1) if size % n == 0), 1)
 
 
-def in_pieces(batch: FeatureBatch) -> FeatureBatch:
-    """Leaves [n, B / n, ...]: scene by scene on a CPU, all at once elsewhere."""
+def in_pieces(
+    batch: FeatureBatch,
+) -> tuple[jax.Array, Callable[[jax.Array], FeatureBatch]]:
+    """Numbers of a batch's pieces, and how to take one of them.
+
+    Scene by scene on a CPU, all at once elsewhere. A piece is cut out where it is
+    used: leaves reshaped to [n, B / n, ...] would be copied whole before a loop.
+    """
     scenes = batch.weight.shape[0]
     size = piece_size(scenes, scenes)
-    return jax.tree.map(lambda x: x.reshape(-1, size, *x.shape[1:]), batch)
+
+    def piece(number: jax.Array) -> FeatureBatch:
+        cut = lambda x: jax.lax.dynamic_slice_in_dim(x, number * size, size)  # noqa: E731
+        return jax.tree.map(cut, batch)
+
+    return jnp.arange(scenes // size), piece
 
 
 def added(sums_of: Callable[[Any], Any], parts: Any) -> Any:  # noqa: ANN401

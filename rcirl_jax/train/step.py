@@ -26,6 +26,7 @@ from rcirl_jax.reward import (
     pinned,
     scenes_value,
 )
+from rcirl_jax.reward.network import product
 from rcirl_jax.sampling import (
     SamplerConfig,
     hard_negatives,
@@ -184,14 +185,14 @@ def compare(
     reward: RewardConfig,
 ) -> Compared:
     """Values of a batch under the Siamese network, with what losses need beside."""
-    valid, facts = batch.time_valid, batch.facts
-    both = jnp.concatenate([batch.human.swapaxes(1, 2)[..., None], batch.candidates], 3)
-    values = scenes_value(
-        pinned(params, reward), normaliser, both, valid, reward.hidden_activation
+    effective, facts = pinned(params, reward), batch.facts
+    both = (batch.human.swapaxes(1, 2)[..., None], batch.candidates)
+    human, candidates = scenes_value(
+        effective, normaliser, both, batch.time_valid, reward.hidden_activation
     )
     return Compared(
-        human=values[:, 0],
-        candidates=values[:, 1:],
+        human=human[:, 0],
+        candidates=candidates,
         counts=batch.feasible,
         weight=batch.weight,
         human_distance=facts.human_distance,
@@ -249,13 +250,21 @@ def gradient_sums(
 
 
 def _nonfinite(batch: FeatureBatch) -> tuple[jax.Array, jax.Array]:
-    """Bad values per feature, and the row of one bad scene (or -1)."""
-    bad = ~jnp.isfinite(batch.candidates)
-    bad_human = ~jnp.isfinite(batch.human)
-    per_scene = jnp.any(bad, axis=(2, 3)) | jnp.any(bad_human, axis=1)  # [B, F]
-    per_scene = per_scene & (batch.weight > 0.0)[:, None]
-    row = jnp.max(jnp.where(jnp.any(per_scene, axis=1), batch.index, -1))
-    return jnp.sum(per_scene, axis=0), row
+    """Scenes with bad values per feature, and the row of one such scene (or -1)."""
+    bad = _holds_bad(batch.candidates) | _holds_bad(batch.human.swapaxes(1, 2))
+    bad = bad & (batch.weight > 0.0)[:, None]  # [B, F]
+    row = jnp.max(jnp.where(jnp.any(bad, axis=1), batch.index, -1))
+    return jnp.sum(bad, axis=0), row
+
+
+def _holds_bad(features: jax.Array) -> jax.Array:
+    """[B, F] bool, of [B, F, ...]: one of the values is a NaN or an infinity.
+
+    Seen in a weighted sum, which a CPU takes at the speed of its memory; the weight
+    is so small that finite values do not overflow.
+    """
+    flat = features.reshape(*features.shape[:2], -1)
+    return ~jnp.isfinite(product(flat, jnp.full((flat.shape[2],), 1e-30)))
 
 
 def as_tree(params: RewardParams) -> Any:  # noqa: ANN401
@@ -290,7 +299,11 @@ def make_train_step(
         sums_of = lambda part: gradient_sums(  # noqa: E731
             state.params, state.normaliser, part, config
         )
-        grads, sums = sums_of(batch) if whole else added(sums_of, in_pieces(batch))
+        if whole:
+            grads, sums = sums_of(batch)
+        else:
+            numbers, piece = in_pieces(batch)
+            grads, sums = added(lambda number: sums_of(piece(number)), numbers)
         nonfinite, first_bad = _nonfinite(batch)
         if judged is not None:
             also, bad = _nonfinite(judged)
