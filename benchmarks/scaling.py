@@ -37,7 +37,7 @@ from rcirl_jax.units import NUM_OBSTACLES
 from tests.scenes import demonstration
 
 CANDIDATES = (80, 122, 256, 512, 1024)
-OBSTACLES = (1, 4, 8, NUM_OBSTACLES, 2 * NUM_OBSTACLES)
+OBSTACLES = (2, 4, 8, NUM_OBSTACLES, 2 * NUM_OBSTACLES)
 SCENES = (8, 16, 64, 256, 1024)
 DISTINCT = 64  # scenes that are made; larger batches repeat them
 
