@@ -220,7 +220,12 @@ def _ratios(rows: dict[str, dict]) -> dict[str, dict]:
 def _here(path: str, cores: int) -> dict:
     """Everything on so many cores, in this process."""
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:cores])
-    jax.config.update("jax_num_cpu_devices", cores)
+    jax.config.update("jax_num_cpu_devices", cores)  # before the first use of jax
+    if (backend := jax.default_backend()) != "cpu":
+        raise SystemExit(
+            f"error: jax: {backend}: PyTorch's rows run on the CPU: expected "
+            "JAX_PLATFORMS=cpu"
+        )
     torch.set_num_threads(cores)
     data = _data(path)
     rows = _timed(_ways(data, cores), len(data.raw))
@@ -323,11 +328,6 @@ def main(_: list[str]) -> None:
     """One core and all of them, or what --cores says."""
     if torch is None:
         raise SystemExit("error: torch: not installed: expected the extra [bench]")
-    if (backend := jax.default_backend()) != "cpu":
-        raise SystemExit(
-            f"error: jax: {backend}: PyTorch's rows run on the CPU: expected "
-            "JAX_PLATFORMS=cpu"
-        )
     size = CONFIG.batch_size
     if _SCENES.value < size or _SCENES.value % size:
         raise SystemExit(
