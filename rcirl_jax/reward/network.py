@@ -22,6 +22,7 @@ from rcirl_jax.units import NUM_TIMES
 # products in float32 on accelerators too (not TF32), as the onboard reader makes them
 EXACT = jax.lax.Precision.HIGHEST
 
+UNITS = 8  # hidden units are worked off in multiples of so many
 LEAKY_SLOPE = 0.01  # negative slope of the leaky-ReLU hidden activation
 
 PINS = ("unit", "none")
@@ -223,13 +224,18 @@ def _layers(
     """The network on points that stand side by side.
 
     An offset is added as a product with ones, so that its gradient is one too: a
-    sum along the points takes a CPU longer.
+    sum along the points takes a CPU longer. Units of weight 0 fill up its vectors.
     """
     ones = jnp.ones((1, points.shape[1]), points.dtype)
     for kernel, offset in zip(kernels[:-1], offsets[:-1], strict=True):
+        idle = -kernel.shape[1] % UNITS
+        kernel = jnp.pad(kernel, ((0, points.shape[0] - kernel.shape[0]), (0, idle)))
+        offset = jnp.pad(offset, (0, idle))
         moved = product(kernel.T, points) + product(offset[:, None], ones)
         points = ACTIVATIONS[activation](moved)
-    return product(kernels[-1].T, points) + offsets[-1][:, None]
+    out = kernels[-1]
+    out = jnp.pad(out, ((0, points.shape[0] - out.shape[0]), (0, 0)))
+    return product(out.T, points) + offsets[-1][:, None]
 
 
 def rows_value(

@@ -47,10 +47,16 @@ def in_pieces(
 
 def added(sums_of: Callable[[Any], Any], parts: Any) -> Any:  # noqa: ANN401
     """Sum of `sums_of(part)` over parts, leaves [n, ...], one after the other."""
-    like = jax.eval_shape(sums_of, jax.tree.map(lambda x: x[0], parts))
+    return added_and_kept(lambda part: (sums_of(part), None), parts)[0]
+
+
+def added_and_kept(work: Callable[[Any], tuple[Any, Any]], parts: Any) -> tuple:  # noqa: ANN401
+    """Of `work(part)`: the first summed over parts, the second kept for each."""
+    like, _ = jax.eval_shape(work, jax.tree.map(lambda x: x[0], parts))
     zero = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
-    add = lambda total, part: (  # noqa: E731
-        jax.tree.map(jnp.add, total, sums_of(part)),
-        None,
-    )
-    return jax.lax.scan(add, zero, parts)[0]
+
+    def one(total: Any, part: Any) -> tuple:  # noqa: ANN401
+        more, kept = work(part)
+        return jax.tree.map(jnp.add, total, more), kept
+
+    return jax.lax.scan(one, zero, parts)

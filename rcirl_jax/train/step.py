@@ -36,7 +36,7 @@ from rcirl_jax.sampling import (
 )
 from rcirl_jax.sampling.speed import family_index
 from rcirl_jax.train.facts import densities, facts_of
-from rcirl_jax.train.pieces import added, in_pieces
+from rcirl_jax.train.pieces import added_and_kept, in_pieces
 from rcirl_jax.train.state import (
     Batch,
     Facts,
@@ -249,12 +249,15 @@ def gradient_sums(
     return jax.grad(total, has_aux=True)(params)
 
 
-def _nonfinite(batch: FeatureBatch) -> tuple[jax.Array, jax.Array]:
-    """Scenes with bad values per feature, and the row of one such scene (or -1)."""
+def _bad_values(batch: FeatureBatch) -> jax.Array:
+    """[B, F] bool: scenes that count and hold a NaN or an infinity of a feature."""
     bad = _holds_bad(batch.candidates) | _holds_bad(batch.human.swapaxes(1, 2))
-    bad = bad & (batch.weight > 0.0)[:, None]  # [B, F]
-    row = jnp.max(jnp.where(jnp.any(bad, axis=1), batch.index, -1))
-    return jnp.sum(bad, axis=0), row
+    return bad & (batch.weight > 0.0)[:, None]
+
+
+def _nonfinite(bad: jax.Array, index: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Scenes with bad values per feature, and the row of one such scene (or -1)."""
+    return jnp.sum(bad, axis=0), jnp.max(jnp.where(jnp.any(bad, axis=1), index, -1))
 
 
 def _holds_bad(features: jax.Array) -> jax.Array:
@@ -265,6 +268,13 @@ def _holds_bad(features: jax.Array) -> jax.Array:
     """
     flat = features.reshape(*features.shape[:2], -1)
     return ~jnp.isfinite(product(flat, jnp.full((flat.shape[2],), 1e-30)))
+
+
+def _by_pieces(work: Callable[[FeatureBatch], tuple], batch: FeatureBatch) -> tuple:
+    """`work(batch)` piece by piece: (sums, rows of the batch)."""
+    numbers, piece = in_pieces(batch)
+    sums, rows = added_and_kept(lambda number: work(piece(number)), numbers)
+    return sums, rows.reshape(-1, rows.shape[-1])
 
 
 def as_tree(params: RewardParams) -> Any:  # noqa: ANN401
@@ -296,18 +306,16 @@ def make_train_step(
             key = jax.random.fold_in(state.key, state.step)
             batch = featurise(key, batch, config, features)
 
-        sums_of = lambda part: gradient_sums(  # noqa: E731
-            state.params, state.normaliser, part, config
-        )
-        if whole:
-            grads, sums = sums_of(batch)
-        else:
-            numbers, piece = in_pieces(batch)
-            grads, sums = added(lambda number: sums_of(piece(number)), numbers)
-        nonfinite, first_bad = _nonfinite(batch)
+        def work(part: FeatureBatch) -> tuple:
+            """Gradient and sums; the values are checked while they are at hand."""
+            found = gradient_sums(state.params, state.normaliser, part, config)
+            return found, _bad_values(part)
+
+        (grads, sums), bad = work(batch) if whole else _by_pieces(work, batch)
+        nonfinite, first_bad = _nonfinite(bad, batch.index)
         if judged is not None:
-            also, bad = _nonfinite(judged)
-            nonfinite, first_bad = nonfinite + also, jnp.maximum(first_bad, bad)
+            also, worst = _nonfinite(_bad_values(judged), judged.index)
+            nonfinite, first_bad = nonfinite + also, jnp.maximum(first_bad, worst)
         if axis_name is not None:
             sums, grads, nonfinite = jax.lax.psum((sums, grads, nonfinite), axis_name)
             first_bad = jax.lax.pmax(first_bad, axis_name)
