@@ -107,7 +107,8 @@ def _measured(points: list[Point]) -> list[dict]:
     for _ in range(_ROUNDS.value):
         for (step, _), count, seconds in zip(ways, counts, taken, strict=True):
             begin = time.perf_counter()
-            jax.block_until_ready([step() for _ in range(count)])
+            for _ in range(count):  # one at a time, as in the training loop
+                jax.block_until_ready(step())
             seconds.append((time.perf_counter() - begin) / count)
     found = []
     for point, (_, queries), seconds in zip(points, ways, taken, strict=True):

@@ -4,6 +4,9 @@ The same pure step becomes a function of (state, batch) with replicated state in
 and out; the batch is [B, ...] in all cases and B must be a multiple of the number
 of devices, which are those of all processes together. A process holds its
 contiguous part of the batch; `place` makes one global batch of the parts.
+
+On a CPU wait for every step before the next (the loop does): its devices share one
+pool of threads, and steps that run ahead may wait for each other's sums for ever.
 """
 
 import dataclasses
