@@ -26,17 +26,18 @@ from rcirl_jax.reward import (
     pinned,
     scenes_value,
 )
-from rcirl_jax.reward.network import product
 from rcirl_jax.sampling import (
     SamplerConfig,
     hard_negatives,
+    num_candidates,
     sample,
     trajectory_from_positions,
     trajectory_on_path,
 )
 from rcirl_jax.sampling.speed import family_index
+from rcirl_jax.train.bad_values import bad_values, count_bad
 from rcirl_jax.train.facts import densities, facts_of
-from rcirl_jax.train.pieces import added_and_kept, in_pieces
+from rcirl_jax.train.pieces import Scenes, added_and_kept, block_size, in_pieces
 from rcirl_jax.train.state import (
     Batch,
     Facts,
@@ -249,30 +250,11 @@ def gradient_sums(
     return jax.grad(total, has_aux=True)(params)
 
 
-def _bad_values(batch: FeatureBatch) -> jax.Array:
-    """[B, F] bool: scenes that count and hold a NaN or an infinity of a feature."""
-    bad = _holds_bad(batch.candidates) | _holds_bad(batch.human.swapaxes(1, 2))
-    return bad & (batch.weight > 0.0)[:, None]
-
-
-def _nonfinite(bad: jax.Array, index: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Scenes with bad values per feature, and the row of one such scene (or -1)."""
-    return jnp.sum(bad, axis=0), jnp.max(jnp.where(jnp.any(bad, axis=1), index, -1))
-
-
-def _holds_bad(features: jax.Array) -> jax.Array:
-    """[B, F] bool, of [B, F, ...]: one of the values is a NaN or an infinity.
-
-    Seen in a weighted sum, which a CPU takes at the speed of its memory; the weight
-    is so small that finite values do not overflow.
-    """
-    flat = features.reshape(*features.shape[:2], -1)
-    return ~jnp.isfinite(product(flat, jnp.full((flat.shape[2],), 1e-30)))
-
-
-def _by_pieces(work: Callable[[FeatureBatch], tuple], batch: FeatureBatch) -> tuple:
+def _by_pieces(
+    work: Callable[[Scenes], tuple], batch: Scenes, size: int | None = None
+) -> tuple:
     """`work(batch)` piece by piece: (sums, rows of the batch)."""
-    numbers, piece = in_pieces(batch)
+    numbers, piece = in_pieces(batch, size)
     sums, rows = added_and_kept(lambda number: work(piece(number)), numbers)
     return sums, rows.reshape(-1, rows.shape[-1])
 
@@ -280,6 +262,35 @@ def _by_pieces(work: Callable[[FeatureBatch], tuple], batch: FeatureBatch) -> tu
 def as_tree(params: RewardParams) -> Any:  # noqa: ANN401
     """The same object under optax's type for parameter trees."""
     return params
+
+
+def batch_sums(
+    state: TrainState, batch: Batch | FeatureBatch, config: TrainConfig, *, whole: bool
+) -> tuple[tuple[RewardParams, LossSums], jax.Array]:
+    """((gradient of the loss sum, sums), scenes with bad values [B, F]) of a batch.
+
+    Of a Batch, candidates and features are made block by block (`block_size`), and
+    the network reads them while they are in the cache; values are checked there too.
+    """
+    key = jax.random.fold_in(state.key, state.step)
+    features = feature_map(config.features)
+
+    def learn(part: FeatureBatch) -> tuple:
+        found = gradient_sums(state.params, state.normaliser, part, config)
+        return found, bad_values(part)
+
+    def learn_from(part: Batch) -> tuple:
+        made = featurise(key, part, config, features)
+        return learn(made) if whole else _by_pieces(learn, made)
+
+    if isinstance(batch, FeatureBatch):
+        return learn(batch) if whole else _by_pieces(learn, batch)
+    scenes = batch.replace(preferences=None)  # those have rows of their own
+    if whole:
+        return learn_from(scenes)
+    candidates = num_candidates(config.sampler) + config.hard_drawn
+    size = block_size(batch.weight.shape[0], candidates)
+    return _by_pieces(learn_from, scenes, size)
 
 
 def make_train_step(
@@ -294,7 +305,6 @@ def make_train_step(
     is not finite leaves the state as it was and says so in the metrics. Preferences
     of a Batch add their own mean loss, times `preference_weight`.
     """
-    features = feature_map(config.features)
     optimizer = make_optimizer(config)
     alone = dataclasses.replace(config, hard_negatives=0)  # preferences are as given
 
@@ -302,19 +312,10 @@ def make_train_step(
         state: TrainState, batch: Batch | FeatureBatch, *, axis_name: str | None = None
     ) -> tuple[TrainState, StepMetrics]:
         judged = batch.preferences if isinstance(batch, Batch) else None
-        if isinstance(batch, Batch):
-            key = jax.random.fold_in(state.key, state.step)
-            batch = featurise(key, batch, config, features)
-
-        def work(part: FeatureBatch) -> tuple:
-            """Gradient and sums; the values are checked while they are at hand."""
-            found = gradient_sums(state.params, state.normaliser, part, config)
-            return found, _bad_values(part)
-
-        (grads, sums), bad = work(batch) if whole else _by_pieces(work, batch)
-        nonfinite, first_bad = _nonfinite(bad, batch.index)
+        (grads, sums), bad = batch_sums(state, batch, config, whole=whole)
+        nonfinite, first_bad = count_bad(bad, batch.index)
         if judged is not None:
-            also, worst = _nonfinite(_bad_values(judged), judged.index)
+            also, worst = count_bad(bad_values(judged), judged.index)
             nonfinite, first_bad = nonfinite + also, jnp.maximum(first_bad, worst)
         if axis_name is not None:
             sums, grads, nonfinite = jax.lax.psum((sums, grads, nonfinite), axis_name)

@@ -12,7 +12,8 @@ import pytest
 from rcirl_jax.errors import InputError
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import LOSSES, Normaliser, RewardConfig, pinned
-from rcirl_jax.sampling import SamplerConfig
+from rcirl_jax.sampling import SamplerConfig, num_candidates
+from rcirl_jax.train import pieces
 from rcirl_jax.train.facts import log_density
 from rcirl_jax.train.finite import check_step
 from rcirl_jax.train.loop import to_device_batch
@@ -142,6 +143,36 @@ def test_scene_by_scene_is_the_step_of_the_whole_batch():
     )
     np.testing.assert_allclose(a.loss_sum, b.loss_sum, rtol=1e-5)
     assert (a.wins, a.pairs, a.terms) == (b.wins, b.pairs, b.terms)
+
+
+def test_block_by_block_is_the_step_of_the_whole_batch(monkeypatch):
+    """Features made for a few scenes at a time, from the scenes themselves."""
+    state, scenes = init_state(CONFIG, normaliser()), batch()
+    whole, a = jax.jit(make_train_step(CONFIG, whole=True))(state, scenes)
+    count = scenes.weight.shape[0]
+    most = num_candidates(CONFIG.sampler)
+    monkeypatch.setattr(pieces, "TRAJECTORIES", 2 * most)
+    assert pieces.block_size(count, most) == 2 < count
+    blocks, b = jax.jit(make_train_step(CONFIG))(state, scenes)
+    np.testing.assert_allclose(
+        weights_of(blocks), weights_of(whole), rtol=1e-4, atol=1e-5
+    )
+    np.testing.assert_allclose(a.loss_sum, b.loss_sum, rtol=1e-5)
+    assert (a.wins, a.pairs, a.terms) == (b.wins, b.pairs, b.terms)
+    broken = scenes.demonstrations.human.s.at[3, 2].set(jnp.nan)
+    human = scenes.demonstrations.human.replace(s=broken)
+    made = scenes.demonstrations.replace(human=human)
+    _, c = jax.jit(make_train_step(CONFIG))(state, scenes.replace(demonstrations=made))
+    assert (int(c.first_bad), bool(c.finite)) == (int(scenes.index[3]), False)
+
+
+@pytest.mark.parametrize(
+    ("scenes", "candidates", "size"),
+    [(64, 122, 16), (64, 1024, 2), (60, 122, 15), (7, 122, 7), (17, 122, 1),
+     (64, 5000, 1), (8, 4, 8)],
+)  # fmt: skip
+def test_blocks_divide_the_batch(scenes, candidates, size):
+    assert pieces.block_size(scenes, candidates) == size
 
 
 def test_candidates_of_a_scene_do_not_depend_on_the_batch():
