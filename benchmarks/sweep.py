@@ -7,18 +7,28 @@ once. Per round, in turn: all members in the chunks of a sweep; a few single run
 `fit` with one member, already compiled; and a few steps as experiments.train takes
 them, which make candidates and features anew in every step. Single runs are scaled
 to 64; compiling is reported apart. Medians over the rounds.
+
+Then as commands, as a user has them: `experiments.sweep`, which also chooses by
+held-out scenes and exports every member, and a few runs of `experiments.train`, each of
+which starts, compiles and trains. Run in turn, scaled to 64.
 """
 
 import dataclasses
 import itertools
+import shutil
+import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import jax
 import numpy as np
 from absl import app, flags
 
-from benchmarks.common import write
+from benchmarks.common import dataset_or_synthetic, write
+from rcirl_jax.data.store import open_dataset
 from rcirl_jax.evaluation.learners import normaliser_of
 from rcirl_jax.evaluation.sweep import MEMBERS_AT_ONCE
 from rcirl_jax.reward import RewardConfig
@@ -37,6 +47,8 @@ _HIDDEN = flags.DEFINE_list("hidden_size", ["15"], "units per layer")
 _SINGLE = flags.DEFINE_integer("single", 4, "single runs per round")
 _STEPS = flags.DEFINE_integer("steps", 2, "training steps per round")
 _ROUNDS = flags.DEFINE_integer("rounds", 5, "rounds")
+_COMMANDS = flags.DEFINE_integer("commands", 2, "rounds of the commands; 0: none")
+_DATA = flags.DEFINE_string("data", None, "dataset of the commands (default: made)")
 _OUTPUT = flags.DEFINE_string("output", "benchmarks/results", "folder of the JSON")
 
 
@@ -56,6 +68,49 @@ def _grid(config: TrainConfig) -> list[Members]:
     starts = range(0, _MEMBERS.value, MEMBERS_AT_ONCE)
     size = MEMBERS_AT_ONCE
     return [jax.tree.map(lambda x, at=at: x[at : at + size], every) for at in starts]
+
+
+def _command(module: str, data: str, folder: Path, *flags_: str) -> float:
+    """Seconds of one command."""
+    words = [sys.executable, "-m", module, f"--data={data}", *flags_]
+    words += ["--positive=nearest", f"--epochs={_EPOCHS.value}"]
+    begin = time.perf_counter()
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(f"error: {module}: {done.stderr[-300:]}")
+    shutil.rmtree(folder)
+    return time.perf_counter() - begin
+
+
+def _commands() -> dict:
+    """One command for all members, and one for each, in turn."""
+    taken: dict[str, list[float]] = {"sweep": [], "train": []}
+    rates = ",".join(map(str, LEAKY_RATES))
+    seeds = _MEMBERS.value // len(LEAKY_RATES)
+    with (
+        dataset_or_synthetic(_DATA.value) as data,
+        tempfile.TemporaryDirectory() as name,
+    ):
+        for number in range(_COMMANDS.value):
+            folder = Path(name) / "sweep"
+            grid = (f"--leaky_rates={rates}", f"--seeds={seeds}", f"--output={folder}")
+            taken["sweep"].append(_command("experiments.sweep", data, folder, *grid))
+            folder = Path(name) / "train"
+            one = (f"--seed={number}", "--train_horizon=5", f"--workdir={folder}")
+            taken["train"].append(_command("experiments.train", data, folder, *one))
+        scenes = int(open_dataset(data).indices("train").size)
+    sweep, alone = (float(np.median(taken[name])) for name in ("sweep", "train"))
+    return {
+        "scenes": scenes,
+        "seconds": {
+            name: [round(x, 2) for x in found] for name, found in taken.items()
+        },
+        "seconds_of_all_members": {
+            "sweep": round(sweep, 2),
+            "train": round(alone * _MEMBERS.value, 2),
+        },
+        "ratio": round(alone * _MEMBERS.value / sweep, 1),
+    }
 
 
 def main(_: list[str]) -> None:
@@ -121,6 +176,8 @@ def main(_: list[str]) -> None:
         "single_to_sweep": round(median["single"] / median["sweep"], 2),
         "train_to_sweep": round(median["train"] / median["sweep"], 2),
     }
+    if _COMMANDS.value:
+        result["commands"] = _commands()
     for name, found in result.items():
         print(f"{name}: {found}")
     print(f"written: {write('sweep', result, _OUTPUT.value)}")

@@ -17,7 +17,7 @@ SMALL = {
     "single_plan": ["--calls=5"],
     "streaming": ["--scenes=1000", "--steps=5"],
     "suite": ["--duration=1", "--rounds=1", "--single=1"],
-    "sweep": ["--members=8", "--scenes=64", "--single=1", "--rounds=1"],
+    "sweep": ["--members=8", "--scenes=64", "--single=1", "--rounds=1", "--commands=1"],
 }
 
 
