@@ -29,6 +29,7 @@ from rcirl_jax.train.state import TrainConfig, make_optimizer
 from rcirl_jax.train.step import (
     _featurised,
     featurised,
+    gradient_sums,
     init_state,
     make_train_step,
 )
@@ -164,6 +165,24 @@ def test_block_by_block_is_the_step_of_the_whole_batch(monkeypatch):
     made = scenes.demonstrations.replace(human=human)
     _, c = jax.jit(make_train_step(CONFIG))(state, scenes.replace(demonstrations=made))
     assert (int(c.first_bad), bool(c.finite)) == (int(scenes.index[3]), False)
+
+
+def test_a_feature_that_is_the_same_everywhere_gets_no_gradient():
+    """Not even from round-off: Adam would make a whole step of it."""
+    made = cached()
+    candidates = made.candidates.at[:, 3].set(17.3)
+    human = made.human.at[:, :, 3].set(17.3)
+    made = made.replace(candidates=candidates, human=human)
+    same = normaliser().replace(
+        lower=normaliser().lower.at[3].set(0.0),
+        upper=normaliser().upper.at[3].set(30.0),
+        location=normaliser().location.at[3].set(17.3),
+        scale=normaliser().scale.at[3].set(1e-3),
+    )
+    params = init_state(CONFIG, same).params
+    grads, _ = jax.jit(lambda p: gradient_sums(p, same, made, CONFIG))(params)
+    assert np.abs(grads.kernels[0][3]).max() == 0.0
+    assert np.abs(grads.kernels[0]).max() > 0.0
 
 
 @pytest.mark.parametrize(
