@@ -5,7 +5,7 @@
 The loss and its gradient from cached features (64 scenes, 122 candidates), in turn:
 
     points first            [B, K, T, F]: normalise, then the layers, as one writes it
-    features first          [B, F, T, K]: the normaliser folded into the first layer
+    features first          [B, F, T, K]: points along the long axis of every product
     features first, n       n scenes at a time, gradients added by a scan
     bf16 features, n        features kept in half the bytes, computed in float32
     bf16, n                 products and sums in bfloat16 as well

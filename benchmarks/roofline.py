@@ -50,6 +50,9 @@ def peaks() -> dict[str, float]:
 def network_flops(features: int, hidden: int) -> dict[str, int]:
     """Operations of one point through F-H-1, forward and backward; tanh apart.
 
+    The least that is needed: a normaliser may go into the first layer (ours takes
+    2 F for it), and units that fill up a vector are not counted.
+
     forward   clip 2 F, first layer 2 F H, bias H, output 2 H, time weight 2
     backward  output kernel 2 H, hidden H, tanh' 3 H, first kernel 2 F H, bias H
     """

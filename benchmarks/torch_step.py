@@ -4,8 +4,8 @@ Same network (F-H-1, tanh), normaliser, masks, pin, loss and Adam as
 `rcirl_jax.train.step` with its defaults, in two forms:
 
 * "plain": points before features, [B (1 + K) T, F]; normalise, then the layers;
-* "tuned": as ours: features before points, [F, B T (1 + K)], and the normaliser's
-  shift and scale go into the first layer.
+* "tuned": as ours, features before points, [F, B T (1 + K)]; the normaliser's shift
+  and scale go into the first layer, which saves it a pass.
 """
 
 from collections.abc import Callable

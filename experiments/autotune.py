@@ -19,12 +19,12 @@ from absl import flags
 from experiments import margins, training
 from experiments.common import provenance, run
 from experiments.executor import executor
-from experiments.signals import checked_signals
+from experiments.signals import checked_signals, signals_asked
 from rcirl_jax.autotune import STAGES, Logs, Loop, TuneConfig
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import IMPORTERS
 from rcirl_jax.data.importing import ImportConfig
-from rcirl_jax.data.parts import parts_of
+from rcirl_jax.errors import InputError
 from rcirl_jax.stages import file_sha256, only_one
 from rcirl_jax.train.running import Running
 
@@ -51,6 +51,8 @@ _UNTIL = flags.DEFINE_enum("until", "report", STAGES, "last stage")
 
 def main() -> None:
     """Flags -> one run of the loop."""
+    if _DATA.value and signals_asked():
+        raise InputError("--signals: expected with --input, whose lights they are")
     judged = training.PREFERENCES.value
     path = Path(judged) if judged else None
     config = TuneConfig(
@@ -78,16 +80,15 @@ def main() -> None:
 
 
 def _logs() -> Logs:
-    """The recordings to import, and which of their written lights to use."""
-    found = Path(_INPUT.value) if _INPUT.value else None
-    source = Path(_SOURCE.value) if _SOURCE.value else None
-    checks = checked_signals(parts_of(_FORMAT.value, found, source), executor())
-    collect = CollectConfig(stride_s=_STRIDE.value, signal_checks=checks)
+    """The recordings to import."""
+    collect = CollectConfig(stride_s=_STRIDE.value)
     return Logs(
         format=_FORMAT.value,
-        input=found,
-        source=source,
+        input=Path(_INPUT.value) if _INPUT.value else None,
+        source=Path(_SOURCE.value) if _SOURCE.value else None,
         config=ImportConfig(format=_FORMAT.value, collect=collect),
+        signals=signals_asked(),
+        checked=checked_signals,
     )
 
 

@@ -18,7 +18,7 @@ from experiments.signals import checked_signals
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import IMPORTERS
 from rcirl_jax.data.importing import ImportConfig, import_parts
-from rcirl_jax.data.parts import parts_of
+from rcirl_jax.data.parts import leaving_out, parts_of
 from rcirl_jax.data.quality import format_quality
 from rcirl_jax.data.store import Dataset
 from rcirl_jax.evaluation.evaluate import RankingSetup, oracle_floor
@@ -80,7 +80,9 @@ def main() -> None:
             require_obstacles=not _KEEP_ALONE.value,
             require_speed_change=not _KEEP_STEADY.value,
             trust_signals=_TRUST.value,
-            signal_checks=checked_signals(parts, places),
+            signal_checks=checked_signals(
+                leaving_out(parts) if _LEAVE_OUT.value else parts, places
+            ),
         ),
         test_fraction=_TEST_FRACTION.value,
         split_seed=_SPLIT_SEED.value,

@@ -1,14 +1,17 @@
 """The flag that says which written traffic lights an import uses."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 from absl import flags
 
 from rcirl_jax.data.parts import Part
 from rcirl_jax.data.signal_checks import SignalChecks, read_signal_checks, signal_checks
+from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.label_logs import check_written
 from rcirl_jax.evaluation.label_signals import format_phases
 from rcirl_jax.executor import Executor
+from rcirl_jax.stages import file_sha256
 
 POOLED = "pooled"
 _SIGNALS = flags.DEFINE_string(
@@ -17,6 +20,17 @@ _SIGNALS = flags.DEFINE_string(
     f"verdicts over all files on their written lights: {POOLED} (the drivers of "
     "--input are asked first), or the labels.json of label_check --input",
 )
+
+
+def signals_asked() -> str:
+    """What the flag asks for, to tell one import from another; "" for nothing."""
+    asked = _SIGNALS.value or ""
+    if asked in ("", POOLED):
+        return asked
+    try:
+        return file_sha256(Path(asked))
+    except OSError as error:
+        raise InputError(f"--signals: {asked}: {error.strerror}") from error
 
 
 def checked_signals(parts: Sequence[Part], executor: Executor) -> SignalChecks | None:

@@ -15,14 +15,15 @@ RUN/stages.json        what made what (`stages`)
 import dataclasses
 import functools
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from rcirl_jax.data.importers.files import listing
 from rcirl_jax.data.importing import ImportConfig, import_parts
-from rcirl_jax.data.parts import parts_of
+from rcirl_jax.data.parts import Part, parts_of
 from rcirl_jax.data.preferences import read_preferences
+from rcirl_jax.data.signal_checks import SignalChecks
 from rcirl_jax.data.store import Dataset, open_dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop import write_suite
@@ -89,6 +90,17 @@ class Logs:
     input: Path | None
     source: Path | None
     config: ImportConfig
+    # which written lights are used: what was asked for, and who finds it out
+    signals: str = ""
+    checked: Callable[[Sequence[Part], Executor], SignalChecks | None] | None = None
+
+    def import_config(self, parts: Sequence[Part], places: Executor) -> ImportConfig:
+        """The configuration with the verdicts on the lights, which reads all logs."""
+        if self.checked is None:
+            return self.config
+        checks = self.checked(parts, places)
+        collect = dataclasses.replace(self.config.collect, signal_checks=checks)
+        return dataclasses.replace(self.config, collect=collect)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -160,6 +172,7 @@ class Loop:
             "config": dataclasses.asdict(given.config),
             "spec": digest(found[0].spec),
             "files": listing(given.input) if given.input else [],
+            **({"signals": given.signals} if given.signals else {}),
         }
         key = digest({**inputs, **self._code()})[:8]
         folder = self.folder / f"dataset-{key}"
@@ -167,7 +180,8 @@ class Loop:
         def work() -> None:
             if (folder / "manifest.json").exists():
                 return  # finished, but not noted: killed in between
-            import_parts(found, folder, given.config, executor=self.executor)
+            config = given.import_config(found, self.executor)
+            import_parts(found, folder, config, executor=self.executor)
 
         self._run("import", inputs, [folder / "manifest.json"], work)
         return open_dataset(folder)

@@ -22,9 +22,8 @@ import tqdm
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.cut import Cut, cut, cut_item, whole_of
 from rcirl_jax.data.files import Files
-from rcirl_jax.data.parts import Part, items
+from rcirl_jax.data.parts import Part, items, leaving_out
 from rcirl_jax.data.quality import QualityReport
-from rcirl_jax.data.recording import LEAVE_OUT
 from rcirl_jax.data.rows import check_finite
 from rcirl_jax.data.splits import assign_groups
 from rcirl_jax.data.store import Dataset, DatasetWriter, Manifest
@@ -325,9 +324,7 @@ def import_parts(
     """
     places = executor or Here()
     if config.leave_out:
-        parts = [
-            dataclasses.replace(x, spec={**x.spec, LEAVE_OUT: True}) for x in parts
-        ]
+        parts = leaving_out(parts)
 
     def cuts(known: dict[str, str]) -> Iterable[Cut]:
         settings = {"config": config.collect, "done": known}

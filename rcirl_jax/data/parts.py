@@ -46,6 +46,13 @@ def parts_of(
     return [Part(format=name, input=path, spec=spec) for path in found]
 
 
+def leaving_out(parts: Sequence[Part]) -> list[Part]:
+    """The parts, to be read so that refused recordings are left out and counted."""
+    return [
+        dataclasses.replace(part, spec={**part.spec, LEAVE_OUT: True}) for part in parts
+    ]
+
+
 def items(parts: Sequence[Part], workers: int) -> Iterator[Item]:
     """Parts, to be read where they are used; of few or long ones, each recording."""
     dealt = [piece for part in parts for piece in _pieces(part)]

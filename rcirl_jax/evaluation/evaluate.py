@@ -248,7 +248,8 @@ def evaluate_ranking(
 def oracle_floor(dataset: Demonstrations, setup: RankingSetup, max_scenes: int) -> dict:
     """How close the best candidate comes to the human, over all splits.
 
-    Reads no more scenes at once than `max_scenes`, drawn at random.
+    Reads no more scenes at once than `max_scenes`, drawn at random. Makes no
+    features: those of a broken scene are named by training and ranking.
 
     Returns:
       mode, horizon, scenes, mean and median FDE and ADE [m] of the best

@@ -226,15 +226,14 @@ def _layers(
     An offset is added as a product with ones, so that its gradient is one too: a
     sum along the points takes a CPU longer. Units of weight 0 fill up its vectors.
     """
-    ones = jnp.ones((1, points.shape[1]), points.dtype)
+    ones, before = jnp.ones((1, points.shape[1]), points.dtype), 0
     for kernel, offset in zip(kernels[:-1], offsets[:-1], strict=True):
         idle = -kernel.shape[1] % UNITS
-        kernel = jnp.pad(kernel, ((0, points.shape[0] - kernel.shape[0]), (0, idle)))
+        kernel = jnp.pad(kernel, ((0, before), (0, idle)))
         offset = jnp.pad(offset, (0, idle))
         moved = product(kernel.T, points) + product(offset[:, None], ones)
-        points = ACTIVATIONS[activation](moved)
-    out = kernels[-1]
-    out = jnp.pad(out, ((0, points.shape[0] - out.shape[0]), (0, 0)))
+        points, before = ACTIVATIONS[activation](moved), idle
+    out = jnp.pad(kernels[-1], ((0, before), (0, 0)))
     return product(out.T, points) + offsets[-1][:, None]
 
 
@@ -270,11 +269,12 @@ def scenes_value(
 
     The same sum as `value`: the points run along the long axis of every matrix
     product. On a CPU it takes a third of the time of `value`; least with one scene
-    at a time, whose features stay in the cache and need no transposition. The parts
-    (the candidates and the human) follow one another along that axis: a human
-    between the candidates of every time would break each row of the copy. Points
-    are normalised in that copy; in the first layer's weights instead, a feature
-    that is the same everywhere would get a gradient from round-off.
+    at a time, whose features stay in the cache. The parts (the candidates and the
+    human) of one scene follow one another along that axis: a human between the
+    candidates of every time would break each row of the copy. Parts of several
+    scenes stand together at every time, so that devices which share the scenes
+    keep their own. Points are normalised in that copy; in the first layer's weights
+    instead, a feature that is the same everywhere would get a gradient from round-off.
 
     Args:
       effective: pinned parameters (`pinned`, or a weights file's).
@@ -286,17 +286,19 @@ def scenes_value(
     Returns:
       V of each part.
     """
+    scenes, times = time_valid.shape
+    counts = [part.shape[3] for part in parts]
+    if scenes > 1:
+        parts = [jnp.concatenate(parts, axis=3)]
     points = _side_by_side([jnp.moveaxis(part, 1, 0) for part in parts])
     points = jnp.clip(points, normaliser.lower[:, None], normaliser.upper[:, None])
     points = (points - normaliser.location[:, None]) * (1.0 / normaliser.scale)[:, None]
-    scenes, times = time_valid.shape
-    sizes = [scenes * times * part.shape[3] for part in parts]
-    ends = np.cumsum(sizes)
-    spans = list(zip(ends - sizes, ends, strict=True))
+    spans = _spans([scenes * times * part.shape[3] for part in parts])
     if effective.context is not None:
+        shapes = [(-1, scenes, times, part.shape[3]) for part in parts]
         apart = [
-            points[:, begin:end].reshape(-1, scenes, times, part.shape[3])
-            for (begin, end), part in zip(spans, parts, strict=True)
+            points[:, begin:end].reshape(shape)
+            for (begin, end), shape in zip(spans, shapes, strict=True)
         ]
         points = _side_by_side([_scaled(effective.context, x) for x in apart])
     offsets = (*effective.biases, jnp.zeros((1,)))
@@ -304,7 +306,16 @@ def scenes_value(
     weight = jnp.where(time_valid, effective.gamma[:times], 0.0)
     # slices, not a split: its gradient would be joined anew for every hidden unit
     apart = [rewards[begin:end].reshape(scenes, times, -1) for begin, end in spans]
-    return [jnp.einsum("bt,btk->bk", weight, r, precision=EXACT) for r in apart]
+    values = [jnp.einsum("bt,btk->bk", weight, r, precision=EXACT) for r in apart]
+    if scenes > 1:
+        return [values[0][:, begin:end] for begin, end in _spans(counts)]
+    return values
+
+
+def _spans(sizes: Sequence[int]) -> list[tuple[int, int]]:
+    """Where each of some lengths begins and ends, one after the other."""
+    ends = np.cumsum(sizes).tolist()
+    return [(end - size, end) for size, end in zip(sizes, ends, strict=True)]
 
 
 def _side_by_side(parts: Sequence[Float[Array, "f b t _"]]) -> Float[Array, "f n"]:

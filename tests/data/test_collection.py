@@ -399,8 +399,7 @@ def test_quality_report_says_how_lights_are_borne_out():
     report = QualityReport()
     report.notes.append(f"a: signal 7: {TOO_FEW} (0 on red of 2); unused")
     text = format_quality(report.as_dict())
-    assert "experiments.label_check --input" in text
-    assert "--signals" in text
+    assert "--signals=pooled" in text
 
 
 def three_recordings():

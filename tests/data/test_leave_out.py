@@ -110,6 +110,7 @@ def test_the_command(tmp_path):
     assert ends.returncode == 2
     assert ends.stderr.strip().splitlines()[-1].startswith("error: ")
     assert not (tmp_path / "data").exists()
-    done = commands.command("experiments.import_logs", *flags, "--leave_out=1")
+    flags = (*flags, "--leave_out=1", "--signals=pooled")  # which reads the logs too
+    done = commands.command("experiments.import_logs", *flags)
     assert done.returncode == 0, done.stderr[-2000:]
     assert "1 recordings refused and left out" in done.stdout

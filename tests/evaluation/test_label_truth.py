@@ -12,7 +12,7 @@ import pytest
 from absl import flags
 from absl.testing import flagsaver
 
-from experiments.signals import checked_signals
+from experiments.signals import checked_signals, signals_asked
 from rcirl_jax.data.collect import Collector
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import read_recordings
@@ -266,6 +266,23 @@ def test_an_import_can_ask_all_files_itself(tmp_path, monkeypatch, capsys):
     with flagsaver.flagsaver():
         flags.FLAGS.mark_as_parsed()
         assert checked_signals(made, Here()) is None
+
+
+def test_what_the_flag_asks_for_tells_imports_apart(tmp_path):
+    file = tmp_path / "labels.json"
+    file.write_text("{}")
+    asked = []
+    for word in ("pooled", str(file)):
+        with flagsaver.as_parsed(signals=word):
+            asked.append(signals_asked())
+    file.write_text("[]")
+    with flagsaver.as_parsed(signals=str(file)):
+        asked.append(signals_asked())
+    assert asked[0] == "pooled"
+    assert len(set(asked)) == 3
+    gone = flagsaver.as_parsed(signals=str(tmp_path / "gone"))
+    with gone, pytest.raises(InputError, match=r"--signals: .*gone: No such file"):
+        signals_asked()
 
 
 def test_a_verdict_on_a_line_comes_before_all_rules(tmp_path):

@@ -17,6 +17,7 @@ from rcirl_jax.reward import (
     loss_sums,
     normalise,
     pinned,
+    scenes_value,
     value,
 )
 from rcirl_jax.sampling import trajectory_from_positions
@@ -69,6 +70,18 @@ def test_value_against_float64_loops(hidden, activation, pin):
         config,
     )
     assert float(found) == pytest.approx(total, rel=1e-4, abs=1e-4)
+
+
+def test_parameters_of_another_shape_are_refused():
+    """Filling up hidden units hides no row that is missing."""
+    config = RewardConfig(hidden=(5,))
+    params = draw(config)
+    first, out = params.kernels
+    x = jnp.zeros((1, F, T, 2))
+    for kernels in (first[:-1], out), (first, out[:-1]):
+        wrong = pinned(params.replace(kernels=kernels), config)
+        with pytest.raises(TypeError, match=r"contracting|shape"):
+            scenes_value(wrong, unit_normaliser(), [x], jnp.ones((1, T), bool), "tanh")
 
 
 @pytest.mark.parametrize("activation", ["tanh", "relu"])

@@ -14,6 +14,7 @@ from rcirl_jax.features import feature_map
 from rcirl_jax.reward import LOSSES, Normaliser, RewardConfig, pinned
 from rcirl_jax.sampling import SamplerConfig, num_candidates
 from rcirl_jax.train import pieces
+from rcirl_jax.train.bad_values import bad_values
 from rcirl_jax.train.facts import log_density
 from rcirl_jax.train.finite import check_step
 from rcirl_jax.train.loop import to_device_batch
@@ -192,6 +193,31 @@ def test_a_feature_that_is_the_same_everywhere_gets_no_gradient():
 )  # fmt: skip
 def test_blocks_divide_the_batch(scenes, candidates, size):
     assert pieces.block_size(scenes, candidates) == size
+
+
+def test_devices_that_share_a_batch_keep_their_scenes():
+    """The compiler adds sums over devices and moves no features."""
+    made = cached()
+    step = jit_sharded(make_train_step(CONFIG, whole=True), 8)
+    text = step.lower(init_state(CONFIG, normaliser()), made).compile().as_text()
+    assert "all-reduce" in text
+    points = made.candidates.size // made.candidates.shape[1]
+    assert not [line for line in text.splitlines() if "all-gather" in line
+                and str(points) in line]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("value", "weight", "found"),
+    [(np.inf, 1.0, True), (-np.inf, 1.0, True), (np.nan, 1.0, True),
+     (3e38, 1.0, False), (np.nan, 0.0, False)],
+)  # fmt: skip
+def test_bad_values_are_those_that_are_not_finite(value, weight, found):
+    made = cached()
+    candidates = made.candidates.at[4, 2, 7, 1].set(value)
+    made = made.replace(candidates=candidates, weight=made.weight.at[4].set(weight))
+    expected = np.zeros((16, 21), bool)
+    expected[4, 2] = found
+    np.testing.assert_array_equal(bad_values(made), expected)
 
 
 def test_candidates_of_a_scene_do_not_depend_on_the_batch():
