@@ -75,7 +75,7 @@ def _curves(found: dict) -> Figure:
         axis.plot(at, [point[rate] / 1e6 for point in found[name]], "o-", color=CHOSEN)
         axis.set_xscale("log", base=2)
         axis.set_xticks(at, [f"{x:,}" for x in at], minor=False)
-        axis.set_ylim(bottom=0.0)
+        axis.set_ylim(0.0, 1.05 * axis.get_ylim()[1])
         label(axis, size, "", f"million {unit}")
     return made
 
