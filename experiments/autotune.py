@@ -20,10 +20,11 @@ from experiments import margins, training
 from experiments.common import provenance, run
 from experiments.executor import executor
 from experiments.signals import checked_signals, signals_asked
-from rcirl_jax.autotune import STAGES, Logs, Loop, TuneConfig
+from rcirl_jax.autotune import STAGES, Loop, TuneConfig
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import IMPORTERS
 from rcirl_jax.data.importing import ImportConfig
+from rcirl_jax.data.logs import Logs
 from rcirl_jax.errors import InputError
 from rcirl_jax.stages import file_sha256, only_one
 from rcirl_jax.train.running import Running

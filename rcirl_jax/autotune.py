@@ -15,15 +15,15 @@ RUN/stages.json        what made what (`stages`)
 import dataclasses
 import functools
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from rcirl_jax.data.importers.files import listing
-from rcirl_jax.data.importing import ImportConfig, import_parts
-from rcirl_jax.data.parts import Part, parts_of
+from rcirl_jax.data.importing import import_parts
+from rcirl_jax.data.logs import Logs
+from rcirl_jax.data.parts import parts_of
 from rcirl_jax.data.preferences import read_preferences
-from rcirl_jax.data.signal_checks import SignalChecks
 from rcirl_jax.data.store import Dataset, open_dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop import write_suite
@@ -80,27 +80,6 @@ class TuneConfig:
             raise InputError(
                 f"--mode: {self.train.sampler.mode}: the closed loop plans speed"
             )
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Logs:
-    """Recordings to import: as `experiments.import_logs` takes them."""
-
-    format: str
-    input: Path | None
-    source: Path | None
-    config: ImportConfig
-    # which written lights are used: what was asked for, and who finds it out
-    signals: str = ""
-    checked: Callable[[Sequence[Part], Executor], SignalChecks | None] | None = None
-
-    def import_config(self, parts: Sequence[Part], places: Executor) -> ImportConfig:
-        """The configuration with the verdicts on the lights, which reads all logs."""
-        if self.checked is None:
-            return self.config
-        checks = self.checked(parts, places)
-        collect = dataclasses.replace(self.config.collect, signal_checks=checks)
-        return dataclasses.replace(self.config, collect=collect)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
