@@ -87,12 +87,15 @@ def choose(
 ) -> tuple[jax.Array, jax.Array]:
     """Index of the best admissible candidate, and whether there was none.
 
+    A candidate whose score is not a number is not admissible.
+
     Without an admissible one, the latest contact with a body wins; among equals
     the larger margin to the leader, then the lower speed at the contact, then
     the shorter way: with nothing to gain, braking.
     """
-    best = jnp.argmax(jnp.where(verdict.admissible, scores, -jnp.inf))
-    nothing = ~jnp.any(verdict.admissible)
+    admissible = verdict.admissible & ~jnp.isnan(scores)
+    best = jnp.argmax(jnp.where(admissible, scores, -jnp.inf))
+    nothing = ~jnp.any(admissible)
     late = jnp.minimum(verdict.contact_s, TIMES_S[-1] + 1.0)
     # who drives through the leader has none ahead: its margin means nothing
     free = jnp.isinf(verdict.contact_s)

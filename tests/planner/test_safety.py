@@ -186,3 +186,7 @@ def test_the_later_contact_is_preferred_and_scores_decide_the_rest():
     index, nothing = choose(some, two, jnp.array([1.0, 9.0, 2.0]))
     assert int(index) == 2
     assert not bool(nothing)
+    # not a number: never the best, and nothing to choose from if all are
+    scores = jnp.array([1.0, 9.0, jnp.nan])
+    assert [int(x) for x in choose(some, two, scores)] == [0, 0]
+    assert [int(x) for x in choose(some, two, jnp.full(3, jnp.nan))] == [1, 1]
