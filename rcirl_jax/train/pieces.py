@@ -25,8 +25,11 @@ def piece_size(size: int, most: int) -> int:
       size: scenes in the batch; what is returned divides it.
       most: bound on an accelerator; a CPU takes one scene.
     """
-    if jax.default_backend() == "cpu":
-        return 1
+    return 1 if jax.default_backend() == "cpu" else _divisor(size, most)
+
+
+def _divisor(size: int, most: int) -> int:
+    """The largest divisor of `size` that is not above `most`, at least 1."""
     return next((n for n in range(min(size, most), 1, -1) if size % n == 0), 1)
 
 
@@ -39,7 +42,7 @@ def block_size(scenes: int, candidates: int) -> int:
     once, as elsewhere.
     """
     most = TRAJECTORIES // candidates if jax.default_backend() == "cpu" else scenes
-    return next(n for n in range(min(scenes, max(most, 1)), 0, -1) if scenes % n == 0)
+    return _divisor(scenes, most)
 
 
 def in_pieces(
