@@ -27,6 +27,13 @@ QUICK := $(addprefix tests/train/test_loop.py::test_,resume_is_bitwise run_write
   tests/features/test_features.py::test_equals_the_oracle tests/report/test_data_page.py
 QUICKLY = -m pytest -q -m "not slow and not dataset" $(QUICK)
 
+# Tests with the compiler as users have it: what rounds, and what is read in programs. For the
+# rest, whose programs are large, XLA compiles in half the time to slower ones; by hand,
+# pytest has the users' compiler for all
+EXACT := data export features geometry onboard reward sampling train
+QUICK_XLA := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false
+TEST = $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal -m "not slow and not dataset"
+
 .PHONY: demo test test-slow test-dataset test-floor test-ceiling lint bench docs onboard setup
 .PHONY: lock audit wheel clean
 
@@ -51,7 +58,8 @@ demo: $(VENV)/.all
 	$(BIN)/python -m experiments.autotune --workdir=$(OUT) --stride=6 --epochs=6 --cases=10 --duration=20
 
 test: setup
-	$(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal -m "not slow and not dataset"
+	$(TEST) $(addprefix tests/,$(EXACT))
+	XLA_FLAGS="$(QUICK_XLA) $(XLA_FLAGS)" $(TEST) $(addprefix --ignore=tests/,$(EXACT))
 
 test-dataset: setup
 	$(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal -m "dataset"

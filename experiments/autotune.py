@@ -47,6 +47,9 @@ _CASES = flags.DEFINE_integer("cases", None, "cases per family")
 _DURATION = flags.DEFINE_float("duration", None, "s per case at most")
 _SEED = flags.DEFINE_integer("catalogue_seed", 0, "seed of the cases")
 _EVERY = flags.DEFINE_integer("plan_every", 1, "steps of 0.1 s between two plans")
+_SWEEP = flags.DEFINE_string(
+    "sweep", None, "folder of experiments.sweep, to be shown in the report"
+)
 _UNTIL = flags.DEFINE_enum("until", "report", STAGES, "last stage")
 
 
@@ -68,6 +71,7 @@ def main() -> None:
         duration_s=_DURATION.value,
         catalogue_seed=_SEED.value,
         plan_every=_EVERY.value,
+        sweep=Path(_SWEEP.value) if _SWEEP.value else None,
     )
     loop = Loop(
         folder=Path(_WORKDIR.value),

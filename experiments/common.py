@@ -15,8 +15,14 @@ from absl import app, flags, logging
 from rcirl_jax import __version__, interrupts
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.reader import load_weights
+from rcirl_jax.stages import code_sha256
 
 EXIT_BAD_INPUT = 2
+# variables that decide how numbers are rounded
+COMPILER = (
+    *("XLA_FLAGS", "JAX_ENABLE_X64", "JAX_DISABLE_JIT"),
+    *("JAX_DEFAULT_MATMUL_PRECISION", "JAX_NUMPY_DTYPE_PROMOTION"),
+)
 HOOK_VARIABLES = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE")
 
 
@@ -133,6 +139,8 @@ def provenance(weights: Sequence[str] = ()) -> dict:
     return {
         "flags": {flag.name: flag.value for flag in own},
         "git_commit": git_commit(),
+        "code_sha256": code_sha256(),
+        "environment": {k: v for k, v in os.environ.items() if k in COMPILER and v},
         "versions": {
             "python": platform.python_version(),
             "rcirl-jax": __version__,

@@ -16,6 +16,7 @@ _MARGINS = {
         "min_ttc": "of cases above 0.95 s to collision",
         "speed_limit": "of cases within the limit",
         "on_road": "of cases on the road",
+        "family_clean": "of the clean drives in one family",
         "progress": "of the incumbent's way",
         "family_progress": "of its way in one family",
     }.items()

@@ -14,6 +14,7 @@ RUN/stages.json        what made what (`stages`)
 
 import dataclasses
 import functools
+import itertools
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -22,7 +23,7 @@ from typing import Any
 from rcirl_jax.data.importers.files import listing
 from rcirl_jax.data.importing import import_parts
 from rcirl_jax.data.logs import Logs
-from rcirl_jax.data.parts import parts_of
+from rcirl_jax.data.parts import items, parts_of, recordings_in
 from rcirl_jax.data.preferences import read_preferences
 from rcirl_jax.data.store import Dataset, open_dataset
 from rcirl_jax.errors import InputError
@@ -41,10 +42,13 @@ from rcirl_jax.export.gate_job import drive_job, gate_job, left_out
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.export.spread import SuiteJob
+from rcirl_jax.export.sweep import SWEEP, read_sweep
 from rcirl_jax.report.replays import make_replays
 from rcirl_jax.report.tuning_page import TuningReport, write_tuning_page
 from rcirl_jax.sampling import SamplerConfig
+from rcirl_jax.simulation.recorded_config import RecordedConfig
 from rcirl_jax.simulation.rows import BASELINES
+from rcirl_jax.simulation.suite import CaseSet, recorded_set
 from rcirl_jax.stages import Stages, code_sha256, digest, file_sha256
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.running import Running
@@ -52,8 +56,16 @@ from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.whole import write_json, write_whole
 
 STAGES = ("import", "train", "rank", "simulate", "gate", "report")
+# what reads as permission to use weights that are no longer there
+STALE = {
+    **dict.fromkeys(("import", "train"), ("export", "gate", "report")),
+    **dict.fromkeys(("export", "simulate"), ("gate", "report")),
+    **dict.fromkeys(("rank", "gate"), ("report",)),
+}
 RIVALS = ("hand-set", "IDM", "random weights")
 REPLAYS = 6  # cases to play in the report
+# recorded drives to play beside them, of the first so many inputs, at most so long
+RECORDED, INPUTS, RECORDED_S = 2, 4, 20.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -71,9 +83,12 @@ class TuneConfig:
     duration_s: float | None = None
     catalogue_seed: int = 0
     plan_every: int = 1
+    sweep: Path | None = None  # of `experiments.sweep`, shown in the report
 
     def __post_init__(self) -> None:
         """Reject what would fail only after the training."""
+        if self.sweep is not None:
+            read_sweep(self.sweep)
         if self.seeds < 1:
             raise InputError(f"--seeds: {self.seeds}: expected at least 1")
         if self.train.sampler.mode != "speed":
@@ -110,7 +125,9 @@ class Loop:
         outputs: list[Path],
         work: Callable[[], object],
     ) -> None:
-        done = self.stages.run(name, {**inputs, **self._code()}, outputs, work)
+        facts = {**inputs, **self._code()}
+        kind = name.partition(" ")[0]
+        done = self.stages.run(name, facts, outputs, work, stale=STALE.get(kind, ()))
         self.say(f"[{name}] {'done' if done else 'as before, kept'}")
 
     def _code(self) -> dict:
@@ -129,7 +146,7 @@ class Loop:
             "rank": lambda: self.rank(dataset),
             "simulate": self.simulate,
             "gate": self.gate,
-            "report": lambda: self.report(dataset),
+            "report": lambda: self.report(dataset, given),
         }
         for name in STAGES[: STAGES.index(last) + 1]:
             steps[name]()
@@ -276,12 +293,13 @@ class Loop:
 
         def work() -> None:
             files = {"candidate": str(self.weights), "incumbent": self.config.incumbent}
-            facts = {"files": files, "made_by": self._made_by()}
+            runs = {"training_runs": self.config.seeds}
+            facts = {"files": files, **runs, "made_by": self._made_by()}
             write_verdict(path, self._verdict, self.config.gate, facts)
 
         self._run("gate", inputs, [path], work)
 
-    def report(self, dataset: Dataset) -> Path:
+    def report(self, dataset: Dataset, given: str | Logs) -> Path:
         """report.html from everything above."""
         path = self.folder / "report.html"
         made_from = ("ranking.json", "suite/metrics.npz", "verdict.json")
@@ -290,8 +308,11 @@ class Loop:
             "weights": file_sha256(self.weights),
             "incumbent": self._incumbent_hash(),
             "dataset": dataset.hash,
+            "recorded": not isinstance(given, str),
         }
-        self._run("report", inputs, [path], lambda: self._draw(path, dataset))
+        if self.config.sweep:
+            inputs["sweep"] = file_sha256(self.config.sweep / SWEEP)
+        self._run("report", inputs, [path], lambda: self._draw(path, dataset, given))
         return path
 
     # -------------------------------------------------------------------- helpers
@@ -315,15 +336,23 @@ class Loop:
         job, incumbent = self._job()
         return judge(pair_of(self._runs, incumbent), self.config.gate, left_out(job))
 
-    def _draw(self, path: Path, dataset: Dataset) -> None:
+    def _draw(self, path: Path, dataset: Dataset, given: str | Logs) -> None:
         job, incumbent = self._job()
         verdict = self._verdict
-        made = {k: v for k, v in self.stages.read().items() if k != "report"}
+        names = [f"train {number}" for number in range(self.config.seeds)]
+        names = ["import", *names, "export", "rank", "simulate", "gate"]
+        known = self.stages.read()
+        made = {name: known[name] for name in names if name in known}
         rewards = {CANDIDATE: open_reward(str(self.weights))}
         if known := self._incumbent_reward():
             rewards[INCUMBENT] = known
         drivers = [row for row in job.rows() if row.name in (CANDIDATE, incumbent)]
         shown = verdict.look_at[:REPLAYS] or job.cases().ids[:2]
+        every = self.config.plan_every
+        replays = make_replays(drivers, job.cases(), shown, every)
+        if isinstance(given, Logs) and (cases := _recorded(given)):
+            replays += make_replays(drivers, cases, cases.ids, every)
+        sweep = self.config.sweep
         seed = int(rewards[CANDIDATE].provenance["seed"])
         write_tuning_page(
             path,
@@ -337,11 +366,10 @@ class Loop:
                 ),
                 rewards=rewards,
                 dataset=dataset,
-                replays=make_replays(
-                    drivers, job.cases(), shown, self.config.plan_every
-                ),
+                replays=replays,
                 workdir=self._workdir(dataset, seed),
-                sweep=None,
+                sweep=read_sweep(sweep) if sweep else None,
+                training_runs=self.config.seeds,
                 facts={**self.facts, "stages": made},
             ),
         )
@@ -385,3 +413,16 @@ class Loop:
             "refs": digest([ref.id for ref in job.refs]),
             "weights": [file_sha256(Path(file)) for file in job.weights],
         }
+
+
+def _recorded(logs: Logs) -> CaseSet | None:
+    """A few drives of the logs, for the human to be seen beside the others."""
+    parts = parts_of(logs.format, logs.input, logs.source)[:INPUTS]
+    config = RecordedConfig(max_cases=RECORDED, max_duration_s=RECORDED_S)
+    for item in itertools.islice(items(parts, 1), INPUTS):
+        try:
+            found = (recording for _, recording in recordings_in(item))
+            return recorded_set(found, config)
+        except InputError:
+            continue  # no drive of it can be driven again
+    return None

@@ -42,8 +42,11 @@ def digest(node: Any) -> str:  # noqa: ANN401
 def code_sha256() -> str:
     """Of this package's sources and of the specs that users edit."""
     package = Path(__file__).parent
-    files = [*package.rglob("*.py"), *spec_root().rglob("*.toml")]
-    return digest({str(file): file_sha256(file) for file in sorted(files)})
+    found = {}
+    for root, pattern in ((package, "*.py"), (spec_root(), "*.toml")):
+        for file in sorted(root.rglob(pattern)):
+            found[f"{pattern} {file.relative_to(root)}"] = file_sha256(file)
+    return digest(found)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -58,6 +61,7 @@ class Stages:
         inputs: Mapping[str, Any],
         outputs: Sequence[Path],
         work: Callable[[], object],
+        stale: Sequence[str] = (),
     ) -> bool:
         """Do the work unless it has been done from these inputs.
 
@@ -66,6 +70,8 @@ class Stages:
           inputs: settings and hashes that decide the outputs; JSON.
           outputs: files that the work writes, below the folder.
           work: writes them.
+          stale: stages whose outputs would mislead beside new ones; they are removed
+            before the work.
 
         Returns:
           Whether it was done now.
@@ -77,6 +83,7 @@ class Stages:
         if known.get("key") == digest(inputs) and self._intact(known, outputs):
             return False
         begin = time.monotonic()
+        self._forget(stale)
         work()
         made = {}
         for path in outputs:
@@ -91,6 +98,22 @@ class Stages:
         }
         self._write({**self.read(), name: record})
         return True
+
+    def _forget(self, names: Sequence[str]) -> None:
+        """Remove the outputs of stages, then their records."""
+        known, inside = self.read(), self.folder.resolve()
+        for name in names:
+            for file in known.get(name, {}).get("outputs", {}):
+                path = self.folder / file
+                if not path.resolve().is_relative_to(inside):
+                    raise InputError(
+                        f"{self.folder / FILE}: {name}: {file}: expected a file of"
+                        " the run's folder"
+                    )
+                path.unlink(missing_ok=True)
+        kept = {name: record for name, record in known.items() if name not in names}
+        if kept != known:
+            self._write(kept)
 
     def _intact(self, known: Mapping[str, Any], outputs: Sequence[Path]) -> bool:
         made = known.get("outputs", {})

@@ -59,6 +59,35 @@ def test_stages_do_not_disturb_each_other(stages):
     assert found["one"]["inputs"] == {"x": 1}
 
 
+def test_what_would_mislead_goes_before_the_work(stages):
+    """New weights beside the verdict on old ones, were the run killed here."""
+
+    def killed():
+        assert not (stages.folder / "verdict.txt").exists()
+        raise KeyboardInterrupt
+
+    step(stages, "w", {"x": 1}, "weights")
+    step(stages, "ship w", {}, "verdict")
+    outputs = [stages.folder / "weights.txt"]
+    kept = stages.run("weights", {"x": 1}, outputs, killed, stale=["verdict"])
+    assert not kept
+    assert (stages.folder / "verdict.txt").read_text() == "ship w"
+    with pytest.raises(KeyboardInterrupt):
+        stages.run("weights", {"x": 2}, outputs, killed, stale=["verdict", "report"])
+    assert list(stages.read()) == ["weights"]
+
+
+def test_nothing_outside_the_folder_is_removed(stages):
+    outside = stages.folder.parent / "outside.txt"
+    outside.write_text("precious")
+    step(stages, "a", {}, "one")
+    text = (stages.folder / FILE).read_text().replace("one.txt", "../outside.txt")
+    (stages.folder / FILE).write_text(text)
+    with pytest.raises(InputError, match="expected a file of the run's folder"):
+        stages.run("two", {}, [], lambda: None, stale=["one"])
+    assert outside.read_text() == "precious"
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

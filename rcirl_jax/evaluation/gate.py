@@ -8,8 +8,10 @@ Four kinds of check, none of them on a learned reward:
                 by more than a declared margin: the lower end of the paired 97.5 %
                 interval lies above it. Rates by Tango's score interval and by the
                 clusters (families), both; progress by the latter
-    families    in no family a loss of drives (exact McNemar) or of way (Student's t
-                over cases) is detected, Holm over families
+    families    in no family more clean drives or way are lost than a margin: by
+                Tango's interval, and by Student's t over cases. All families have to
+                show it, so none is adjusted; a loss is detected (exact McNemar, t) only
+                after Holm over families
     gain        better in one primary metric, at least: McNemar and clusters, or
                 clusters alone, Holm over the primary metrics
 
@@ -30,6 +32,7 @@ import numpy as np
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.gate_checks import (
     families,
+    family_of,
     gains,
     is_clean,
     no_loss,
@@ -72,7 +75,8 @@ def judge(pair: Pair, config: GateConfig, part: str = "") -> Verdict:
         checks=checks,
         cases=count,
         families=len(set(pair.families)),
-        look_at=_look_at(pair),
+        look_at=_look_at(pair, checks),
+        part=part,
     )
 
 
@@ -99,8 +103,11 @@ def _reason(check: Check) -> str:
     )
 
 
-def _look_at(pair: Pair) -> tuple[str, ...]:
-    """Cases that only one of them drives cleanly, or far apart; losses first."""
+def _look_at(pair: Pair, checks: Sequence[Check]) -> tuple[str, ...]:
+    """Cases that only one of them drives cleanly, or far apart; losses first.
+
+    Before them the worst of every family that failed.
+    """
     mine, theirs = passes_of(pair.candidate), passes_of(pair.incumbent)
     faults = 8.0 * (~mine["collision_free"] & theirs["collision_free"])
     lost = 4.0 * (~is_clean(pair.candidate) & is_clean(pair.incumbent))
@@ -108,5 +115,11 @@ def _look_at(pair: Pair) -> tuple[str, ...]:
     behind = np.clip(-way / np.maximum(pair.incumbent.progress, 1.0), 0.0, 1.0)
     comfort = 0.5 * (~mine["j_station"] & theirs["j_station"])
     key = faults + lost + behind + comfort
-    order = [i for i in np.argsort(-key, kind="stable")[:WORST].tolist() if key[i] > 0]
-    return tuple(pair.ids[int(i)] for i in order)
+    order = [int(i) for i in np.argsort(-key, kind="stable") if key[i] > 0]
+    failed = {family_of(c) for c in checks if c.outcome == "fail"}
+    firsts: dict[str, int] = {}
+    for i in order:
+        if pair.families[i] in failed:
+            firsts.setdefault(pair.families[i], i)
+    found = dict.fromkeys([*firsts.values(), *order])
+    return tuple(pair.ids[i] for i in list(found)[:WORST])

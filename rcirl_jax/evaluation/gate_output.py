@@ -8,6 +8,7 @@ from rcirl_jax.evaluation.gate_types import Check, GateConfig, Verdict
 from rcirl_jax.evaluation.suite_output import text_table
 from rcirl_jax.whole import plain, write_json
 
+RANKS = {"fail": 0, "open": 1, "pass": 2}  # the order in which they are shown
 OUTCOMES = {"pass": "ok", "fail": "FAIL", "open": "open"}
 WIDTH = 100  # columns of wrapped text
 
@@ -36,7 +37,7 @@ def _gain(check: Check) -> str:
 TITLES = {
     "safety": "Nothing new that is unsafe",
     "no loss": "No loss beyond the margin, over all cases",
-    "families": "No family that loses (Holm over families; worst ten)",
+    "families": "No loss beyond the margin in any family (p: Holm; the ten worst)",
     "gain": "Better somewhere (Holm over the primary metrics)",
 }
 WORST_FAMILIES = 10  # rows of the terminal table; the JSON has all
@@ -46,7 +47,7 @@ def _shown(kind: str, checks: list[Check]) -> list[Check]:
     """All, or of the families those that failed or lost most."""
     if kind != "families":
         return checks
-    ranked = sorted(checks, key=lambda c: (c.outcome != "fail", c.difference))
+    ranked = sorted(checks, key=lambda c: (RANKS[c.outcome], c.difference))
     return ranked[:WORST_FAMILIES]
 
 
@@ -61,6 +62,8 @@ def format_verdict(verdict: Verdict) -> str:
         )
     ]
     lines += ["", f"{verdict.cases:,} cases of {verdict.families} families; % of cases"]
+    if verdict.part:
+        lines += textwrap.wrap(f"a part of the suite: {verdict.part}", WIDTH)
     header = ["", "", "difference", "95 %", "margin", "cases", "p"]
     for kind, title in TITLES.items():
         checks = [check for check in verdict.checks if check.kind == kind]

@@ -31,6 +31,8 @@ class GateConfig:
     min_ttc: float = 0.003  # time to collision stays above 0.95 s
     speed_limit: float = 0.002
     on_road: float = 0.002
+    # clean drives, share of one family's cases; 180 cannot prove less than 0.021
+    family_clean: float = 0.05
     # share of the incumbent's way
     progress: float = 0.01
     family_progress: float = 0.05
@@ -82,6 +84,7 @@ class Verdict:
     cases: int
     families: int
     look_at: tuple[str, ...]  # ids of cases that differ, the worst first
+    part: str  # what of the suite was left out, in words; "" if nothing
 
     @property
     def exit_code(self) -> int:

@@ -14,6 +14,7 @@ from rcirl_jax.evaluation.closed_loop import (
 from rcirl_jax.evaluation.gate_runs import CANDIDATE, INCUMBENT, repeats
 from rcirl_jax.executor import Executor
 from rcirl_jax.export.spread import SuiteJob, spread
+from rcirl_jax.simulation.cases import STEP_S
 from rcirl_jax.simulation.rows import BASELINES
 from rcirl_jax.simulation.suite import FULL_S, SMOKE_S, CaseRef, suite_refs
 
@@ -82,11 +83,16 @@ def left_out(job: SuiteJob) -> str:
     """What of the full suite a job does not drive, in words; "" if nothing."""
     full = suite_refs("full")
     missing = len({ref.id for ref in full} - {_first(ref).id for ref in job.refs})
+    said = []
     if missing:
-        return f"{len(job.refs):,} cases, {missing:,} of the full suite's left out"
+        said.append(
+            f"{len(job.refs):,} cases, {missing:,} of the full suite's left out"
+        )
     if job.duration_s < FULL_S:
-        return f"cases of {job.duration_s:g} s instead of {FULL_S:g} s"
-    return ""
+        said.append(f"cases of {job.duration_s:g} s instead of {FULL_S:g} s")
+    if job.plan_every > 1:
+        said.append(f"a plan every {job.plan_every * STEP_S:g} s instead of {STEP_S:g}")
+    return "; ".join(said)
 
 
 def _first(ref: CaseRef) -> CaseRef:

@@ -91,8 +91,16 @@ class Guard:
           features: [..., T, F] raw features of all its candidates.
           time_valid: [..., T] of 0 and 1, broadcast to the leading axes; None: all
             valid. Without any valid time nothing is known: out of distribution.
+
+        Raises:
+          ValueError: another number of features than the reward's.
         """
         given = np.asarray(features, np.float32)
+        if given.ndim < 2 or given.shape[-1] != len(self.reward.names):
+            raise ValueError(
+                f"guard: features: shape {given.shape}: expected [..., T, "
+                f"{len(self.reward.names)}]"
+            )
         counts = np.ones(given.shape[:-1], bool)
         if time_valid is not None:
             counts = np.broadcast_to(np.asarray(time_valid) != 0, given.shape[:-1])
@@ -126,9 +134,21 @@ class Guard:
 
         Returns:
           Its index, and the verdict.
+
+        Raises:
+          ValueError: no candidate, values of other candidates, or none that is a
+            number where the incumbent has to choose.
         """
+        values = np.asarray(incumbent, np.float64)
+        count = np.shape(features)[0]
+        if count == 0 or values.shape != (count,):
+            raise ValueError(
+                f"guard: incumbent: shape {values.shape}: expected a value for each "
+                f"of {count} candidates, at least 1"
+            )
         verdict = self.check(features, time_valid)
         if verdict.in_distribution:
             return int(np.argmax(self.reward.value(features, time_valid))), verdict
-        values = np.asarray(incumbent, np.float64)
+        if np.isnan(values).all():
+            raise ValueError("guard: incumbent: all NaN: expected a value to choose by")
         return int(np.argmax(np.where(np.isnan(values), -np.inf, values))), verdict

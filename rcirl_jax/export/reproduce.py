@@ -23,6 +23,8 @@ from rcirl_jax.train.state import TrainConfig
 NEEDED = ("config", "flags", "seed", "steps", "dataset_sha256")
 # where all of these are the same, so is every bit
 SETUP = ("versions", "git_commit", "machine", "cpu", "cores", "device", "devices")
+# the same, in files that say it: older ones do not
+ALSO = ("code_sha256", "environment")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -98,7 +100,7 @@ def setup_warnings(
 ) -> tuple[str, ...]:
     """What differs between two setups (provenances), in words."""
     said = []
-    for name in SETUP:
+    for name in (*SETUP, *(name for name in ALSO if name in before)):
         was, is_now = before.get(name), now.get(name)
         if isinstance(was, Mapping) and isinstance(is_now, Mapping):
             for key in sorted({*was, *is_now}):

@@ -48,6 +48,8 @@ from rcirl_jax.stages import only_one
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.whole import write_json, write_whole
 
+SWEEP = "sweep.json"  # in the sweep's folder
+
 Rows = Mapping[str, Sequence[TrainConfig]]  # configuration -> its members
 
 
@@ -106,7 +108,7 @@ def _sweep(
     }
     chosen = folder / "weights" / f"{body['chosen']['member']}.msgpack"
     write_whole(folder / "best.msgpack", chosen.read_bytes())
-    write_json(folder / "sweep.json", body)
+    write_json(folder / SWEEP, body)
     return body
 
 
@@ -317,6 +319,23 @@ def _values_of(config: TrainConfig) -> dict:
 def _peak_memory_gib() -> float:
     """Of this process; that of workers is theirs."""
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2)
+
+
+def read_sweep(folder: Path) -> dict:
+    """The contents of a sweep's sweep.json.
+
+    Raises:
+      InputError: missing, or not of a finished sweep.
+    """
+    path = folder / SWEEP
+    try:
+        report = json.loads(path.read_text())
+        table(report)
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise InputError(
+            f"{path}: {type(error).__name__}: expected the result of experiments.sweep"
+        ) from error
+    return report
 
 
 def table(report: Mapping) -> str:

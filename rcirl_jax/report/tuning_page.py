@@ -43,6 +43,7 @@ from rcirl_jax.report.verdict_sections import (
     verdict_section,
 )
 from rcirl_jax.sampling import SamplerConfig
+from rcirl_jax.simulation.rows import RECORDED_HUMAN
 from rcirl_jax.whole import plain
 
 NUM_FRAMES = 2  # example frames
@@ -65,6 +66,7 @@ class TuningReport:
     replays: Sequence[Replay]
     workdir: Path | None  # run whose training curve is drawn
     sweep: Mapping | None  # contents of sweep.json
+    training_runs: int  # of which the candidate is the median one
     # provenance: flags, commit, versions, hashes by stage
     facts: Mapping[str, object]
 
@@ -113,7 +115,15 @@ def _compared(report: TuningReport) -> tuple[str, str]:
 
 def _verdict(report: TuningReport) -> str:
     played = [replay.case for replay in report.replays]
-    return verdict_section(report.verdict, report.gate, report.incumbent, played)
+    runs = report.training_runs
+    said = (
+        f"The candidate is the median of {runs} training runs."
+        if runs > 1
+        else "The candidate is one training run: with another seed it may drive "
+        "otherwise (--seeds)."
+    )
+    found = verdict_section(report.verdict, report.gate, report.incumbent, played)
+    return found + paragraph(said)
 
 
 def _suite(report: TuningReport) -> str:
@@ -126,7 +136,15 @@ def _played(report: TuningReport) -> str:
         "the suite's own drives; elsewhere another program rounds the last digit "
         "differently, and traffic can make more of that."
     )
-    return lead + player(report.replays)
+    human = any(d.row == RECORDED_HUMAN for one in report.replays for d in one.drives)
+    said = (
+        "The last are recorded drives, with the human beside the others; who meets "
+        "the planner may leave the log."
+        if human
+        else "No human drives in these: recorded drives are played where the run has "
+        "imported the logs itself."
+    )
+    return lead + paragraph(said) + player(report.replays)
 
 
 def _pictures(draw: Callable[[Path], list[tuple[Path, str]]]) -> str:
@@ -231,8 +249,10 @@ def _gamma(report: TuningReport) -> str:
         (f"{t:.2f}", *(number(float(row[i]), 3) for row in rows.values()))
         for i, t in enumerate(times)
     ]
+    alone = _alone(report) if len(report.rewards) == 1 else ""
     return (
-        paragraph(
+        alone
+        + paragraph(
             "How much each time of a plan counts: learned gamma_t over its largest "
             "(scale and sign are free)."
         )
@@ -249,7 +269,17 @@ def _features(report: TuningReport) -> str:
         f"{found.scenes} held-out scenes of {found.vehicles} vehicles; 95 % intervals "
         "over vehicles, not adjusted for the number of features."
     )
+    if len(report.rewards) == 1:
+        lead += _alone(report)
     return lead + legend(report.rewards) + _contributions(found, list(report.rewards))
+
+
+def _alone(report: TuningReport) -> str:
+    """Why nothing is compared."""
+    return paragraph(
+        f"The incumbent, {report.incumbent}, is no weights file: it has neither gamma "
+        "nor these features, so what changed shows in the drives only."
+    )
 
 
 def _contributions(found: Contributions, names: Sequence[str]) -> str:
@@ -302,7 +332,10 @@ def _data(dataset: Demonstrations) -> str:
 
 def _sweep(sweep: Mapping | None) -> str:
     if sweep is None:
-        return paragraph("No sweep: one configuration was trained.")
+        return paragraph(
+            "No sweep: one configuration was trained (--sweep=FOLDER shows one of "
+            "experiments.sweep)."
+        )
     caption = "validation over the swept settings, two standard errors over seeds"
     return _pictures(
         lambda folder: [(sweep_picture(folder / "sweep.png", sweep), caption)]

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from rcirl_jax.evaluation.exact import CONFIDENCE
-from rcirl_jax.evaluation.gate_output import OUTCOMES, TITLES
+from rcirl_jax.evaluation.gate_output import OUTCOMES, RANKS, TITLES
 from rcirl_jax.evaluation.gate_types import Check, GateConfig, Verdict
 from rcirl_jax.evaluation.suite_output import SHORT
 from rcirl_jax.evaluation.suite_summary import (
@@ -57,7 +57,9 @@ def verdict_section(
         f"<ul>{reasons}</ul></div>",
         f"<p>Candidate against {text(incumbent)} on the same {verdict.cases:,} cases "
         f"of {verdict.families} families; differences are candidate minus incumbent, "
-        f"in % of cases or of the incumbent's way, with {LEVEL} intervals.</p>",
+        f"in % of cases or of the incumbent's way, with {LEVEL} intervals."
+        + (f" A part of the suite: {text(verdict.part)}." if verdict.part else "")
+        + "</p>",
         _look_at(verdict, played),
     ]
     for name in KINDS:
@@ -152,17 +154,18 @@ def families_section(verdict: Verdict) -> str:
             for check in verdict.checks
             if check.kind == "families" and check.name.endswith(f", {kind}")
         ]
-        checks.sort(key=lambda c: (c.outcome != "fail", c.difference))
+        checks.sort(key=lambda c: (RANKS[c.outcome], c.difference))
         if checks:
             names = [check.name.removesuffix(f", {kind}") for check in checks]
             plots.append(forest(kind.capitalize(), checks, names))
     if not plots:
         return "<p>No family has two cases or more.</p>"
     lead = (
-        "<p>Candidate minus incumbent per family, the worst first. A family fails "
-        "(square) if drives that were clean are lost, or way beyond the dashed margin, "
-        "with p &lt; 0.05 after Holm over the families. Intervals are per family and "
-        "not adjusted. Cases: only the candidate clean, only the incumbent.</p>"
+        "<p>Candidate minus incumbent per family, the worst first. A family passes if "
+        "its interval lies above the dashed margin, and fails (square) if a loss is "
+        "detected with p &lt; 0.05 after Holm over the families; else it is open: too "
+        "few cases. Intervals are per family and not adjusted. Cases: only the "
+        "candidate clean, only the incumbent.</p>"
     )
     return "\n".join([lead, *plots])
 

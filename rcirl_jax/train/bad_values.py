@@ -13,6 +13,19 @@ def bad_values(batch: FeatureBatch) -> jax.Array:
     return bad & (batch.weight > 0.0)[:, None]
 
 
+def bad_facts(batch: FeatureBatch) -> jax.Array:
+    """[B, 1] bool: scenes that count whose facts, which losses read, are not finite.
+
+    Of candidates that count, and of the human.
+    """
+    facts = batch.facts
+    of_each = jnp.isfinite(facts.distance) & jnp.isfinite(facts.breaks_rule)
+    of_each &= jnp.isfinite(facts.density)
+    of_human = jnp.isfinite(facts.human_distance) & jnp.isfinite(facts.human_density)
+    bad = jnp.any(~of_each & batch.feasible, axis=-1) | ~of_human
+    return (bad & (batch.weight > 0.0))[:, None]
+
+
 def count_bad(bad: jax.Array, index: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Scenes with bad values per feature, and the row of one such scene (or -1)."""
     return jnp.sum(bad, axis=0), jnp.max(jnp.where(jnp.any(bad, axis=1), index, -1))

@@ -31,6 +31,7 @@ from rcirl_jax.whole import write_json
 KEEP_LATEST = 3  # checkpoints kept
 DIGESTS = "sha256.json"
 DAMAGED = ".damaged"
+SEALED = ".sealed"  # in folders whose finished checkpoints all have digests
 PROBE = ".room"
 OVERHEAD_BYTES = 2**17  # of a checkpoint's files besides the arrays
 
@@ -62,11 +63,13 @@ class Checkpoints:
         self._newest, bad = _newest_whole(self._folder)
         self.passed_over = [
             f"{self._folder}: checkpoint {step}: {why}; the one before it that is "
-            f"whole: {self._newest}"
+            f"whole: {'none' if self._newest is None else self._newest}"
             for step, why in bad.items()
         ]
         if not read_only:
             _put_aside(self._folder, list(bad))
+            if self._newest is None and is_first():
+                (self._folder / SEALED).touch()
         keep: Any = ocp.training.preservation_policies.LatestN(KEEP_LATEST)
         self._checkpointer = ocp.training.Checkpointer(
             str(self._folder),
@@ -190,6 +193,8 @@ def _newest_whole(folder: Path) -> tuple[int | None, dict[int, str]]:
     names = [path.name for path in folder.iterdir()] if folder.is_dir() else []
     steps = sorted((int(name) for name in names if name.isdecimal()), reverse=True)
     if not any((folder / str(step) / DIGESTS).exists() for step in steps):
+        if (folder / SEALED).exists():  # killed while it wrote the first ones
+            return None, {step: f"{DIGESTS}: missing, not finished" for step in steps}
         return (steps[0] if steps else None), {}  # of a version without digests
     bad: dict[int, str] = {}
     for step in steps:
@@ -208,12 +213,12 @@ def _damage(folder: Path) -> str | None:
     """What is wrong with a checkpoint, if anything."""
     try:
         noted = json.loads((folder / DIGESTS).read_text())
-        files = dict(noted["files"])
-        if noted["sha256"] != digest(files):
+        files = noted["files"]
+        if not isinstance(files, dict) or noted["sha256"] != digest(files):
             return f"{DIGESTS}: damaged"
     except FileNotFoundError:
         return f"{DIGESTS}: missing, it was not finished"
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, RecursionError):
         return f"{DIGESTS}: damaged"
     found = _digests(folder)
     for name in sorted(files.keys() | found.keys()):

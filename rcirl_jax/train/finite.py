@@ -10,6 +10,9 @@ from rcirl_jax.train.state import FeatureBatch
 from rcirl_jax.train.step import StepMetrics
 from rcirl_jax.types import Demonstration
 
+# what losses read besides features
+FACTS = "distance, density or broken rules of a candidate"
+
 
 def check_step(
     metrics: StepMetrics,
@@ -26,15 +29,16 @@ def check_step(
     row = int(metrics.first_bad)
     if row >= 0:
         bad = np.flatnonzero(np.asarray(metrics.nonfinite))
-        names = ", ".join(features.names[i] for i in bad)
+        known = [*(f"feature {name}" for name in features.names), FACTS]
+        names = ", ".join(known[i] for i in bad)
         scene, cause = f"scene {row}", ""
         if dataset is not None:
             rows = dataset.read(np.array([row]))
             scene, leaves = scene_name(rows, 0, row), unusable_leaves(rows, 0)
             cause = f" (as is the stored {', '.join(leaves)})" if leaves else ""
         raise InputError(
-            f"train: step {step}: {scene}: feature {names}: not finite{cause}: "
-            "expected finite features; the state before is kept"
+            f"train: step {step}: {scene}: {names}: not finite{cause}: "
+            "expected finite numbers; the state before is kept"
         )
     raise InputError(
         f"train: step {step}: loss or gradient: not finite: features are finite; "

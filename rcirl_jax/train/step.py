@@ -35,7 +35,7 @@ from rcirl_jax.sampling import (
     trajectory_on_path,
 )
 from rcirl_jax.sampling.speed import family_index
-from rcirl_jax.train.bad_values import bad_values, count_bad
+from rcirl_jax.train.bad_values import bad_facts, bad_values, count_bad
 from rcirl_jax.train.facts import densities, facts_of
 from rcirl_jax.train.pieces import Scenes, added_and_kept, block_size, in_pieces
 from rcirl_jax.train.state import (
@@ -68,7 +68,8 @@ class StepMetrics(flax.struct.PyTreeNode, kw_only=True):
     pairs: jax.Array  # [] feasible pairs (queries)
     preferred: jax.Array  # [2] preferences that the better one wins, and all
     grad_norm: jax.Array  # []
-    nonfinite: jax.Array  # [F] values that are NaN or infinite, per feature
+    # [F + 1] scenes with values that are NaN or infinite, per feature; last: facts
+    nonfinite: jax.Array
     first_bad: jax.Array  # [] dataset row of a scene with such a value, or -1
     finite: jax.Array  # [] bool: loss and gradient are finite
 
@@ -267,7 +268,9 @@ def as_tree(params: RewardParams) -> Any:  # noqa: ANN401
 def batch_sums(
     state: TrainState, batch: Batch | FeatureBatch, config: TrainConfig, *, whole: bool
 ) -> tuple[tuple[RewardParams, LossSums], jax.Array]:
-    """((gradient of the loss sum, sums), scenes with bad values [B, F]) of a batch.
+    """((gradient of the loss sum, sums), scenes with bad values [B, F + 1]) of a batch.
+
+    The last column is of the facts that losses read besides features.
 
     Of a Batch, candidates and features are made block by block (`block_size`), and
     the network reads them while they are in the cache; values are checked there too.
@@ -277,7 +280,7 @@ def batch_sums(
 
     def learn(part: FeatureBatch) -> tuple:
         found = gradient_sums(state.params, state.normaliser, part, config)
-        return found, bad_values(part)
+        return found, jnp.concatenate([bad_values(part), bad_facts(part)], axis=1)
 
     def learn_from(part: Batch) -> tuple:
         made = featurise(key, part, config, features)
@@ -316,7 +319,8 @@ def make_train_step(
         nonfinite, first_bad = count_bad(bad, batch.index)
         if judged is not None:
             also, worst = count_bad(bad_values(judged), judged.index)
-            nonfinite, first_bad = nonfinite + also, jnp.maximum(first_bad, worst)
+            nonfinite = nonfinite.at[:-1].add(also)
+            first_bad = jnp.maximum(first_bad, worst)
         if axis_name is not None:
             sums, grads, nonfinite = jax.lax.psum((sums, grads, nonfinite), axis_name)
             first_bad = jax.lax.pmax(first_bad, axis_name)

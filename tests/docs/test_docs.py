@@ -33,6 +33,7 @@ PRESETS = sorted((REPO / "data_specs" / "features").glob("*.toml"))
 MODULE = r"(?<![\w/.])((?:experiments|benchmarks)(?:\.[a-z_0-9]+)+)\b"
 COMMAND = re.compile(MODULE + r"([^\n|&]*)")
 FLAG = re.compile(r"(?<!\S)--([a-z_0-9]+)")
+VALUE = re.compile(r"(?<![\w-])--([a-z_0-9]+)=([^\s\\]+)")
 PATH = re.compile(r"[\w.-]+/[\w./*-]*")
 PLACEHOLDER = re.compile(r"[A-Z]{3}")  # NAME.toml, SCENE.csv
 BUILT_IN = {"help", "helpfull"}
@@ -97,7 +98,8 @@ LIST_FLAGS = """
 import importlib, json, sys
 from absl import flags
 OURS = ("experiments", "benchmarks")
-found = {}
+found, refused = {}, []
+given = json.load(sys.stdin)
 for name in sys.argv[1:]:
     for flag in list(flags.FLAGS):
         if flags.FLAGS.find_module_defining_flag(flag, "").startswith(OURS):
@@ -109,7 +111,13 @@ for name in sys.argv[1:]:
         flag for flag in flags.FLAGS
         if flags.FLAGS.find_module_defining_flag(flag, "").startswith(OURS)
     ]
-print(json.dumps(found))
+    for flag, value in given.get(name, []):
+        if flag in found[name]:
+            try:
+                flags.FLAGS[flag].parser.parse(value)
+            except ValueError as error:
+                refused.append(f"{name}: --{flag}={value}: {error}")
+print(json.dumps([found, refused]))
 """
 
 
@@ -128,12 +136,23 @@ def is_main(module):
     return path.is_file() and 'if __name__ == "__main__"' in path.read_text()
 
 
+def values():
+    """Module -> (flag, value) of its commands, but for NAMES and what is left open."""
+    found = {}
+    for _, module, rest in commands():
+        for flag, value in VALUE.findall(rest):
+            # N stands for a number; jsonl is the format that extending.md adds
+            if not PLACEHOLDER.search(value) and value.strip("`.,]") not in ("N", "jsonl"):
+                found.setdefault(module, []).append((flag, value.rstrip("`.,]")))
+    return found
+
+
 @functools.cache
 def known_flags():
-    """Module -> its flags; one process imports all that the pages name."""
+    """Module -> its flags, and values that are none; one process imports all."""
     named = sorted({module for _, module, _ in commands() if is_main(module)})
     done = subprocess.run(
-        [sys.executable, "-c", LIST_FLAGS, *named],
+        [sys.executable, "-c", LIST_FLAGS, *named], input=json.dumps(values()),
         capture_output=True, text=True, check=False, cwd=REPO, timeout=300,
         env={**os.environ, "JAX_PLATFORMS": "cpu"},
     )  # fmt: skip
@@ -148,13 +167,20 @@ def test_commands_name_modules_and_flags():
         if not path.with_suffix(".py").is_file() and not path.is_dir():
             wrong.append(f"{page}: {module}: no such module")
         elif is_main(module):
-            flags = set(known_flags()[module]) | BUILT_IN
+            flags = set(known_flags()[0][module]) | BUILT_IN
             names = {name.removeprefix("no") if name not in flags else name
                      for name in FLAG.findall(rest)}  # fmt: skip
             wrong += [f"{page}: {module}: --{name}" for name in sorted(names - flags)]
     assert not wrong, "\n".join(wrong)
     assert len(commands()) > 50
     assert len({module for _, module, _ in commands() if is_main(module)}) > 20
+
+
+def test_commands_have_values_that_their_flags_take():
+    """--suite=smok, --epochs=ten: a page would say what no longer runs."""
+    known, refused = known_flags()
+    assert not refused, "\n".join(refused)
+    assert sum(len(given) for name, given in values().items() if name in known) > 60
 
 
 # -------------------------------------------------------------------- numbers

@@ -35,6 +35,10 @@ def test_a_small_loop(tmp_path):
     assert verdict["files"]["incumbent"] == "hand-set"
     page = (run / "report.html").read_text()
     assert verdict["decision"] in page
+    assert verdict["training_runs"] == 1
+    left_out = "30 cases, 4,110 of the full suite's left out; cases of 2 s instead of"
+    assert verdict["part"].startswith(left_out)
+    assert "recorded human" in page  # drives beside the others
     assert list(json.loads((run / "stages.json").read_text())["stages"]) == stages
 
     again = command("experiments.autotune", *flags)
@@ -59,6 +63,9 @@ def test_a_small_loop(tmp_path):
     more = (f"--preferences={file}", "--until=train")
     told = command("experiments.autotune", *flags, *more)
     assert kept(told) == {"import": True, "train 0": False, "export": False}
+    # no verdict stays beside weights that it does not speak of
+    assert not (run / "verdict.json").exists()
+    assert not (run / "report.html").exists()
 
 
 @pytest.mark.multiprocess
@@ -72,6 +79,7 @@ def test_a_small_loop(tmp_path):
         (("--features=mine",), "mine"),
         (("--mode=path_speed",), "--mode: path_speed: the closed loop plans speed"),
         (("--preferences=nowhere.jsonl",), "nowhere.jsonl"),
+        (("--sweep=nowhere",), "nowhere/sweep.json: FileNotFoundError: expected"),
     ],
 )
 def test_what_cannot_be_is_one_line_before_any_work(flags, message, tmp_path):

@@ -13,7 +13,7 @@ SHORT = ("--suite=free_cruise,stopped_lead", "--cases=20", "--duration=2")
 @pytest.mark.multiprocess
 def test_a_reward_against_itself(tmp_path):
     file, out = random_weights(tmp_path / "w.msgpack"), tmp_path / "verdict.json"
-    names = ("collision_free", "min_ttc", "speed_limit", "on_road")
+    names = ("collision_free", "min_ttc", "speed_limit", "on_road", "family_clean")
     margins = [f"--{name}_margin=0.2" for name in names]  # 40 cases prove no less
     flags = (f"--candidate={file}", f"--incumbent={file}", f"--output={out}", *SHORT)
     done = command("experiments.gate", *flags, *margins)

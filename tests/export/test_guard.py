@@ -194,3 +194,25 @@ def test_a_table_may_have_a_guarded_row(tmp_path):
         drivers = table_rows([path], ["IDM"], guard=incumbent)
         assert [row.name for row in drivers][1] == f"{drivers[0].name} guarded"
         assert (drivers[1].params.incumbent is not None) == has_weights
+
+
+def test_no_value_at_all_is_no_choice():
+    far = plan() + 9.0
+    with pytest.raises(ValueError, match="incumbent: all NaN"):
+        Guard(made()).choose(far, np.full(len(far), np.nan))
+
+
+@pytest.mark.parametrize("count", [0, 3])
+def test_values_of_other_candidates_are_refused(count):
+    with pytest.raises(ValueError, match="incumbent: shape"):
+        Guard(made()).choose(plan(), np.zeros(count))
+
+
+def test_without_candidates_there_is_no_choice():
+    with pytest.raises(ValueError, match="of 0 candidates, at least 1"):
+        Guard(made()).choose(plan()[:0], np.zeros(0))
+
+
+def test_features_of_another_count_are_refused():
+    with pytest.raises(ValueError, match="features: shape"):
+        Guard(made()).check(plan()[..., :1])

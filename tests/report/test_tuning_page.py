@@ -227,7 +227,9 @@ def test_what_there_is_not_is_said(bare_file):
     assert "No case was driven again" in section(text, "worst")
     assert "Several datasets joined" in section(text, "data")
     assert 'id="training"' not in text
-    assert "incumbent" not in section(text, "features")
+    for name in ("features", "gamma"):
+        assert "The incumbent, hand-set, is no weights file" in section(text, name)
+    assert "No human drives in these" in section(text, "worst")
     assert section(text, "gamma").count("<polyline") == 1
 
 

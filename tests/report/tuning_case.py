@@ -152,6 +152,7 @@ def small_report(folder, replays):
         replays=replays,
         workdir=workdir,
         sweep=sweep(),
+        training_runs=3,
         facts={"flags": {"seed": 3}, "git_commit": "abc", "stages": {"train": "12ef"}},
     )
 

@@ -11,7 +11,13 @@ import pytest
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.features import feature_map
-from rcirl_jax.train.checkpoint import DAMAGED, DIGESTS, KEEP_LATEST, Checkpoints
+from rcirl_jax.train.checkpoint import (
+    DAMAGED,
+    DIGESTS,
+    KEEP_LATEST,
+    SEALED,
+    Checkpoints,
+)
 from rcirl_jax.train.loop import _like
 from rcirl_jax.train.state import TrainConfig
 from tests.conftest import REPO
@@ -158,7 +164,23 @@ def test_checkpoints_of_versions_without_digests_are_taken(saved, state, tmp_pat
     shutil.copytree(saved, folder)
     for step in ("2", "3", "4"):
         (folder / step / DIGESTS).unlink()
+    (folder / SEALED).unlink()
     assert restored(folder, state) == (4, 4, [])
+
+
+def test_a_first_checkpoint_that_was_not_finished_is_not_trusted(saved, tmp_path):
+    """Killed between its files and their digests: nobody knows what is in them."""
+    folder = tmp_path / "c"
+    shutil.copytree(saved, folder)
+    for step in ("2", "3"):
+        shutil.rmtree(folder / step)
+    (folder / "4" / DIGESTS).unlink()
+    checkpoints = Checkpoints(folder)
+    assert checkpoints.latest_step() is None
+    (line,) = checkpoints.passed_over
+    assert f"checkpoint 4: {DIGESTS}: missing, not finished" in line
+    assert line.endswith("whole: none")
+    checkpoints.close()
 
 
 FULL = """

@@ -94,7 +94,7 @@ def test_the_guard_looks_up_a_scene_that_no_check_saw(tmp_path, monkeypatch):
     bad = stored(tmp_path / "bad", int(unseen[0]))
     expected = (
         rf"^train: step \d+: {line(unseen[0])}feature .*speed_limit.*: not finite "
-        r"\(as is the stored scene\.path\.speed_limit\): expected finite features; "
+        r"\(as is the stored scene\.path\.speed_limit\): expected finite numbers; "
         "the state before is kept$"
     )
     with pytest.raises(InputError, match=expected):

@@ -159,3 +159,17 @@ def test_differences_of_the_setup_are_named():
         "git_commit: of a checkout with changes, which are not recorded",
     )
     assert setup_warnings(now, now) == ()
+
+
+def test_what_rounds_numbers_otherwise_is_part_of_the_setup(made):
+    """Flags of the compiler, and code that no commit names."""
+    found = load_weights(made[0]).provenance
+    assert "XLA_FLAGS" in found["environment"]  # as `command` sets them
+    assert len(found["code_sha256"]) == 64
+    others = {**found, "environment": {}, "code_sha256": "0"}
+    said = setup_warnings(found, others)
+    assert any(line.startswith("environment.XLA_FLAGS: --xla") for line in said)
+    assert any(line.startswith("code_sha256: ") for line in said)
+    # a file of a version that did not note them
+    old = {k: v for k, v in found.items() if k not in ("environment", "code_sha256")}
+    assert setup_warnings(old, found) == setup_warnings(found, found)

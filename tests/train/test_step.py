@@ -220,6 +220,33 @@ def test_bad_values_are_those_that_are_not_finite(value, weight, found):
     np.testing.assert_array_equal(bad_values(made), expected)
 
 
+@pytest.mark.parametrize(
+    ("loss", "field", "value"),
+    [("listwise", "density", np.nan), ("soft", "distance", np.nan),
+     ("hinge", "distance", np.inf)],
+)  # fmt: skip
+def test_what_only_the_loss_reads_names_its_scene(loss, field, value):
+    """Such a loss may well be finite, and the reward learned from it wrong."""
+    config = dataclasses.replace(CONFIG, loss=loss)
+    made = cached()
+    facts = made.facts.replace(
+        **{field: getattr(made.facts, field).at[3, 0].set(value)}
+    )
+    made = made.replace(
+        facts=facts,
+        index=100 + made.index,
+        feasible=made.feasible.at[3, 0].set(True),
+    )
+    state = init_state(config, normaliser())
+    _, metrics = jax.jit(make_train_step(config))(state, made)
+    known = feature_map(config.features)
+    with pytest.raises(InputError, match="scene 103: distance, density or broken"):
+        check_step(metrics, known, 7)
+    others = made.replace(feasible=made.feasible.at[3, 0].set(False))
+    _, metrics = jax.jit(make_train_step(config))(state, others)
+    check_step(metrics, known, 7)
+
+
 def test_candidates_of_a_scene_do_not_depend_on_the_batch():
     state = init_state(CONFIG, normaliser())
     some = jax.tree.map(lambda x: x[4:8], batch())

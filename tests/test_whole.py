@@ -1,0 +1,54 @@
+"""Files that are there whole or not at all, also with two writers."""
+
+import subprocess
+import sys
+
+import pytest
+
+from rcirl_jax.whole import write_whole
+from tests.conftest import REPO
+
+WRITER = """
+import sys
+from pathlib import Path
+from rcirl_jax.whole import write_whole
+text = sys.argv[2] * int(sys.argv[3])
+for _ in range(300):
+    write_whole(Path(sys.argv[1]), text)
+"""
+
+
+@pytest.mark.multiprocess
+def test_two_writers_of_one_file_leave_one_whole(tmp_path):
+    """Each would publish the other's half file if both wrote into one part."""
+    path, sizes = tmp_path / "a.json", {"a": 200_000, "b": 300_000}
+    writers = [
+        subprocess.Popen(
+            [sys.executable, "-c", WRITER, str(path), letter, str(size)], cwd=REPO
+        )
+        for letter, size in sizes.items()
+    ]
+    seen = set()
+    while any(writer.poll() is None for writer in writers):
+        text = path.read_text() if path.exists() else ""
+        if text:
+            assert set(text) == {text[0]}
+            assert len(text) == sizes[text[0]]
+            seen.add(text[0])
+    assert [writer.returncode for writer in writers] == [0, 0]
+    assert seen == {"a", "b"}
+    assert [x.name for x in tmp_path.iterdir()] == ["a.json"]
+
+
+def test_what_a_kill_left_is_written_over(tmp_path):
+    (tmp_path / "a.json.tmp").write_text("half of another, and longer")
+    write_whole(tmp_path / "a.json", "whole")
+    assert (tmp_path / "a.json").read_text() == "whole"
+    assert [x.name for x in tmp_path.iterdir()] == ["a.json"]
+
+
+def test_an_old_file_stays_if_the_new_one_cannot_be(tmp_path):
+    (tmp_path / "a.json").mkdir()
+    with pytest.raises(OSError, match=r"a\.json"):
+        write_whole(tmp_path / "a.json", "text")
+    assert [x.name for x in tmp_path.iterdir()] == ["a.json"]
