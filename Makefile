@@ -7,6 +7,8 @@ OUT    ?= out/demo
 WORKERS ?= 2
 # folder of recordings for `make bench`; what is not there is left out
 RECORDINGS ?= ../shared/data
+# where `make reliability` writes its JSON
+RESULTS ?= benchmarks/results
 # folder of the locked versions; `LOCK=` takes the newest that pyproject.toml allows
 LOCK ?= requirements
 PIP := -m pip --quiet --disable-pip-version-check
@@ -35,7 +37,7 @@ QUICK_XLA := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=fa
 TEST = $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal -m "not slow and not dataset"
 
 .PHONY: demo test test-slow test-dataset test-floor test-ceiling lint bench docs onboard setup
-.PHONY: lock audit wheel clean
+.PHONY: lock audit wheel clean reliability fuzz
 
 setup: $(VENV)/.installed
 
@@ -162,6 +164,20 @@ build/tools/.installed: $(if $(LOCK),$(LOCK)/tools.lock,requirements/tools.in)
 # Known vulnerabilities of the locked versions; `AUDIT=--vulnerability-service=osv` asks elsewhere
 audit: build/tools/.installed
 	build/tools/bin/python .ci/audit.py $(AUDIT) $(addprefix requirements/,all.lock test.lock tools.lock)
+
+# Every row of docs/reliability.md; `MINUTES=2` leaves out what takes longer
+reliability: setup
+	$(BIN)/python $(PIP) install --editable '.[fuzz]'
+	$(BIN)/python -m benchmarks.reliability.table $(if $(MINUTES),--minutes=$(MINUTES)) --output=$(RESULTS)
+
+# The C++ reader under libFuzzer; needs clang and its runtime
+FUZZ_SECONDS ?= 720
+fuzz: setup
+	$(BIN)/python -m onboard.fuzz.make_corpus --output=out/fuzz/corpus
+	cmake -S onboard -B build/fuzz -DCMAKE_CXX_COMPILER=clang++ -DRCIRL_BUILD_FUZZ=ON
+	cmake --build build/fuzz --target fuzz_load
+	build/fuzz/fuzz_load -dict=out/fuzz/weights.dict -max_len=16384 -timeout=10 \
+	  -max_total_time=$(FUZZ_SECONDS) -print_final_stats=1 out/fuzz/corpus
 
 clean:
 	rm -rf $(VENV) out build dist

@@ -5,20 +5,26 @@ experiment files turn it into that line on stderr and exit status 2.
 """
 
 import contextlib
+import struct
 import traceback
 from collections.abc import Iterator
 from pathlib import Path
+
+HEAD, TAIL = 1400, 400  # characters kept of the ends of a line too long
 
 
 class InputError(ValueError):
     """Something the user gave is wrong: file, field, value, expectation.
 
-    The message is a single line. It names the file first, then the field and
-    the value that was found, then what was expected instead.
+    The message is a single printable line. It names the file first, then the field
+    and the value that was found, then what was expected instead.
     """
 
     def __init__(self, message: str) -> None:
-        super().__init__(" ".join(str(message).split()))
+        line = " ".join(str(message).split())
+        if len(line) > HEAD + TAIL:
+            line = f"{line[:HEAD]} ... {line[-TAIL:]}"
+        super().__init__("".join(c if c.isprintable() else "?" for c in line))
 
 
 class LostWorkError(InputError):
@@ -29,10 +35,13 @@ class LostWorkError(InputError):
 UNFORESEEN = (
     ArithmeticError,
     AttributeError,
+    EOFError,
     LookupError,
     MemoryError,
+    RecursionError,
     TypeError,
     ValueError,
+    struct.error,
 )
 
 

@@ -135,7 +135,7 @@ class Stages:
         try:
             body = json.loads(path.read_text())
             version, stages = body["schema_version"], dict(body["stages"])
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise InputError(
                 f"{path}: damaged: expected the stages of a run"
             ) from error

@@ -2,8 +2,11 @@
 
 import json
 import os
+import shutil
+import signal
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -100,6 +103,7 @@ def flags_of(root, name):
         ("export", 1_000, "w.msgpack"),
         ("sweep", 3_000, "weights"),
         ("report", 10_000, "figures"),
+        ("autotune", 3_000, "dataset-"),
     ],
 )
 def test_a_full_disk_is_one_line_and_the_run_goes_on(root, tmp_path, name, size, file):
@@ -119,7 +123,110 @@ def test_a_full_disk_is_one_line_and_the_run_goes_on(root, tmp_path, name, size,
             assert job.outcome(tmp_path) == job.outcome(root)
 
 
-@pytest.mark.parametrize("name", ["import", "train", "export", "sweep", "report"])
+def in_namespace(*words):
+    """Words of a command that may mount, of nobody else's sight."""
+    unshare = shutil.which("unshare")
+    if (
+        unshare is None
+        or subprocess.run([unshare, "-rm", "true"], check=False).returncode
+    ):
+        pytest.skip("no user namespaces: unshare -rm: not permitted")
+    return [unshare, "-rm", "bash", "-c", *words]
+
+
+def mounted(folder, script, module, *flags):
+    """A script in a namespace of its own; its "$@" is the command."""
+    own = {"PYTHONPATH": str(REPO), "JAX_ENABLE_COMPILATION_CACHE": "0"}
+    return subprocess.run(
+        in_namespace(script, str(folder), sys.executable, "-m", module, *flags),
+        env={**os.environ, **own, "JAX_PLATFORMS": "cpu"},
+        text=True, capture_output=True, check=False,
+    )  # fmt: skip
+
+
+FULL = """mount -t tmpfs -o size=%s tmpfs "$0"; cd "$0"
+"$@" 2> >(grep -a "^error: " >&2); echo "first $?"
+mount -o remount,size=100m "$0"
+"$@" > /dev/null 2>&1; echo "second $?"
+cp -r "$0"/. "$0.kept" """
+
+
+@pytest.mark.parametrize(("name", "size"), [("import", "400k"), ("train", "96k")])
+def test_a_disk_without_room_is_one_line_and_the_run_goes_on(
+    root, tmp_path, name, size
+):
+    """ENOSPC from a real file system; with room again the same comes out."""
+    module, flags = flags_of(root, name)
+    place = tmp_path / "full"
+    place.mkdir()
+    (tmp_path / "full.kept").mkdir()
+    done = mounted(place, FULL % size, module, *flags)
+    assert "first 2" in done.stdout, done.stdout + done.stderr
+    assert "No space left on device" in done.stderr or "room" in done.stderr
+    assert "second 0" in done.stdout
+    job = jobs(root)[name]
+    assert job.outcome(tmp_path / "full.kept") == job.outcome(root)
+
+
+READ_ONLY = (
+    """mount --bind "$0" "$0" && mount -o remount,bind,ro "$0"; cd "$0"; "$@" """
+)
+
+
+@pytest.mark.parametrize("name", ["import", "train", "sweep", "autotune"])
+def test_a_read_only_folder_is_one_line(root, tmp_path, name):
+    module, flags = flags_of(root, name)
+    done = mounted(tmp_path, READ_ONLY, module, *flags)
+    assert done.returncode == 2, done.stderr[-2000:]
+    (line,) = errors_of(done)
+    assert line.startswith("error: ")
+    assert "Read-only file system" in line
+    assert not list(tmp_path.iterdir())
+
+
+def test_sigterm_saves_the_step_it_is_in(root, tmp_path):
+    module, flags = flags_of(root, "train")
+    flags = [x for x in flags if not x.startswith(("--epochs", "--checkpoint_every"))]
+    process = subprocess.Popen(
+        [sys.executable, "-m", module, *flags, "--epochs=5000"], cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(REPO), "JAX_PLATFORMS": "cpu"},
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    metrics = tmp_path / "run" / "metrics.jsonl"
+    while not (metrics.exists() and metrics.read_text().count("\n") >= 3):
+        assert process.poll() is None
+        time.sleep(0.05)
+    begin = time.monotonic()
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(30) == 143
+    assert time.monotonic() - begin < 10.0
+    last = json.loads(metrics.read_text().splitlines()[-1])["step"]
+    assert (tmp_path / "run" / "checkpoints" / str(last) / "sha256.json").exists()
+
+
+def test_a_guarded_row_drives(root, tmp_path):
+    flags = (f"--weights={root / 'w.msgpack'}", "--suite=free_cruise", "--cases=1")
+    short = ("--duration=2", "--baselines=", "--guard=hand-set", "--output=out")
+    done = limited(tmp_path, None, "experiments.simulate", *flags, *short)
+    assert done.returncode == 0, done.stderr[-2000:]
+    report = json.loads((tmp_path / "out" / "suite.json").read_text())["report"]
+    assert len([name for name in report["rows"] if name.endswith(" guarded")]) == 1
+
+
+def test_weights_of_the_tuning_loop_are_made_again(root, tmp_path):
+    job = jobs(root)["autotune"]
+    flags = [*job.flags, "--until=train"]
+    assert limited(tmp_path, None, job.module, *flags).returncode == 0
+    (data,) = tmp_path.glob("run/dataset-*")
+    again = ("--weights=run/weights.msgpack", f"--data={data}", "--output=again")
+    done = limited(tmp_path, None, "experiments.reproduce", *again)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "reproduced: bit for bit" in done.stdout
+
+
+@pytest.mark.parametrize(
+    "name", ["import", "train", "export", "sweep", "report", "autotune"]
+)
 def test_a_place_that_cannot_be_is_one_line(root, tmp_path, name):
     """Below a file, where nobody can make a folder, whoever runs it."""
     (tmp_path / "file").write_text("here")

@@ -93,6 +93,7 @@ def test_nothing_outside_the_folder_is_removed(stages):
     [
         ("{", "damaged"),
         ("[]", "damaged"),
+        ("[" * 100_000, "damaged"),
         (json.dumps({"schema_version": 9, "stages": {}}), "9: expected 1"),
     ],
 )

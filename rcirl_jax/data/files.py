@@ -90,8 +90,17 @@ class Files:
                 future.exception()
 
     def remove(self, start: str, end: str) -> None:
-        """Delete the keys from `start` up to `end`."""
-        self.kv.delete_range(ts.KvStore.KeyRange(start, end)).result()
+        """Delete the keys from `start` up to `end`.
+
+        Raises:
+          OSError: they cannot be deleted.
+        """
+        try:
+            self.kv.delete_range(ts.KvStore.KeyRange(start, end)).result()
+        except ValueError as error:
+            raise OSError(
+                f"{self.path(start)}: cannot be deleted: {_reason(error)}"
+            ) from error
 
 
 def _reason(error: ValueError) -> str:

@@ -3,7 +3,9 @@
 import dataclasses
 import hashlib
 import json
-from collections.abc import Mapping
+import math
+import types
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -13,6 +15,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.units import NUM_TIMES, TIMES_S
 
 SCHEMA_VERSION = 1  # of manifest.json and shard.json
+MAX_ROWS = 2**31  # rows of a dataset
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -47,12 +50,6 @@ class Manifest:
     hash: str  # sha256 over the canonical manifest without this field
 
 
-_MANIFEST_KEYS = tuple(
-    "import" if field.name == "import_flags" else field.name
-    for field in dataclasses.fields(Manifest)
-)
-
-
 def _canonical(payload: Mapping) -> str:
     return hashlib.sha256(
         json.dumps(
@@ -71,11 +68,20 @@ def _refuse_constant(text: str) -> None:
     raise ValueError(f"{text} is no JSON number")
 
 
+def _finite_float(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text} is no finite number")
+    return value
+
+
 def unseal(raw: bytes, field: str, name: str) -> dict:
     """Parse `seal`'s bytes; InputError when they are not as written."""
     try:
-        payload = json.loads(raw, parse_constant=_refuse_constant)
-    except ValueError as error:
+        payload = json.loads(
+            raw, parse_constant=_refuse_constant, parse_float=_finite_float
+        )
+    except (ValueError, RecursionError) as error:
         raise InputError(
             f"{name}: not JSON ({error}): expected the file as written; truncated?"
         ) from error
@@ -102,6 +108,94 @@ def shard_entry(info: ShardInfo) -> dict:
     return {"count": info.count, "sha256": info.sha256, "recordings": made_of}
 
 
+def parse_shard(raw: bytes, name: str) -> ShardInfo:
+    """What shard.json says, from its bytes, or InputError for what does not fit."""
+    payload = unseal(raw, "sha256", name)
+    _check_fields(name, payload, SHARD_FORMS)
+    for file, found in payload["files"].items():
+        parts = file.split("/")
+        if not all(parts) or {".", ".."} & set(parts):
+            raise InputError(f"{name}: files: {file}: expected a key below the shard")
+        if not isinstance(found, dict) or set(found) != {"bytes", "sha256"}:
+            raise InputError(
+                f"{name}: files: {file}: {found}: expected its bytes and sha256"
+            )
+    for entry in payload["lineage"]:
+        if not isinstance(entry.get("name"), str):
+            raise InputError(f"{name}: lineage: {entry}: expected names of recordings")
+    return ShardInfo(**payload)
+
+
+def _check_fields(name: str, payload: Mapping, forms: Mapping[str, str]) -> None:
+    """Exactly these fields, each of its form; InputError names one that is not."""
+    different = sorted(set(payload) ^ set(forms))
+    if different:
+        raise InputError(f"{name}: {different[0]}: expected {(*forms,)}")
+    for field, form in forms.items():
+        if not FORMS[form](payload[field]):
+            raise InputError(f"{name}: {field}: {payload[field]}: expected {form}")
+
+
+def _is_count(value: object) -> bool:
+    return type(value) is int and 0 <= value <= MAX_ROWS
+
+
+def _all(value: object, kind: type | types.UnionType) -> bool:
+    return isinstance(value, list) and all(isinstance(item, kind) for item in value)
+
+
+def _is_splits(value: object) -> bool:
+    return isinstance(value, dict) and all(_all(names, str) for names in value.values())
+
+
+def _is_shard_list(value: object) -> bool:
+    return isinstance(value, list) and all(
+        isinstance(shard, dict)
+        and _is_count(shard.get("count"))
+        and isinstance(shard.get("sha256"), str)
+        # datasets of the first version say nothing of recordings
+        and isinstance(shard.get("recordings", {}), dict)
+        for shard in value
+    )
+
+
+FORMS: dict[str, Callable[[object], bool]] = {
+    "a number of rows": _is_count,
+    "a whole number": _is_count,
+    "a list of names": lambda value: _all(value, str),
+    "a list of numbers": lambda value: _all(value, int | float),
+    "a list of objects": lambda value: _all(value, dict),
+    "a text": lambda value: isinstance(value, str),
+    "an object": lambda value: isinstance(value, dict),
+    "lists of names": _is_splits,
+    "shards with count and sha256": _is_shard_list,
+}
+SHARD_FORMS = {
+    "schema_version": "a whole number",
+    "index": "a whole number",
+    "count": "a number of rows",
+    "lineage": "a list of objects",
+    "files": "an object",
+    "sha256": "a text",
+}
+MANIFEST_FORMS = {
+    "schema_version": "a whole number",
+    "count": "a number of rows",
+    "arrays": "an object",
+    "time_grid_s": "a list of numbers",
+    "rate_hz": "a list of numbers",
+    "sources": "a list of objects",
+    "recordings": "a list of names",
+    "groups": "a list of names",
+    "vehicles": "a list of names",
+    "splits": "lists of names",
+    "shards": "shards with count and sha256",
+    "quality": "an object",
+    "import": "an object",
+    "hash": "a text",
+}
+
+
 def array_table() -> dict[str, dict]:
     """Shape and dtype of every array, as the manifest states them."""
     return {
@@ -114,9 +208,7 @@ def parse_manifest(raw: bytes, files: Files) -> Manifest:
     """The manifest from its bytes, or InputError for what does not fit."""
     name = files.path(MANIFEST)
     payload = unseal(raw, "hash", name)
-    if set(payload) != set(_MANIFEST_KEYS):
-        different = sorted(set(payload) ^ set(_MANIFEST_KEYS))
-        raise InputError(f"{name}: {different[0]}: expected {_MANIFEST_KEYS}")
+    _check_fields(name, payload, MANIFEST_FORMS)
     ours = array_table()
     for leaf in sorted(ours.keys() | payload["arrays"].keys()):
         found, expected = payload["arrays"].get(leaf), ours.get(leaf)
@@ -127,5 +219,19 @@ def parse_manifest(raw: bytes, files: Files) -> Manifest:
             f"{name}: time_grid_s: {payload['time_grid_s']}: expected {NUM_TIMES} "
             f"times from 0 to {TIMES_S[-1]} s"
         )
+    members = sorted(group for names in payload["splits"].values() for group in names)
+    if members != sorted(payload["groups"]):
+        raise InputError(
+            f"{name}: splits: {payload['splits']}: expected every group exactly once"
+        )
     payload["import_flags"] = payload.pop("import")
     return Manifest(**payload)
+
+
+def check_count(manifest: Manifest, name: str) -> None:
+    """The rows of a dataset are those of its shards; InputError if not."""
+    total = sum(shard["count"] for shard in manifest.shards)
+    if manifest.count != total:
+        raise InputError(
+            f"{name}: count: {manifest.count}: expected {total}, the sum of its shards"
+        )

@@ -7,7 +7,7 @@ import numpy as np
 import tensorstore as ts
 
 from rcirl_jax.data.files import MARK, SHARDS, Files
-from rcirl_jax.data.manifest import ShardInfo, unseal
+from rcirl_jax.data.manifest import ShardInfo, parse_shard
 from rcirl_jax.errors import InputError
 
 BLOCK_ROWS = 256  # rows of a separately compressed block: ~2.5 MB of scenes, unpacked
@@ -79,7 +79,7 @@ def shard_info(files: Files, index: int, sha256: str | None = None) -> ShardInfo
     mark = files.read(shard_key(index) + MARK)
     if mark is None:
         raise InputError(f"{name}: shard {index}: missing: expected sha256 {sha256}")
-    info = ShardInfo(**unseal(mark, "sha256", name))
+    info = parse_shard(mark, name)
     if sha256 is not None and info.sha256 != sha256:
         raise InputError(
             f"{name}: shard {index}: sha256 {info.sha256}: expected {sha256}"

@@ -68,7 +68,7 @@ def read_signal_checks(path: str | os.PathLike[str]) -> SignalChecks:
         found = {check["name"]: check["verdict"] for check in body["phases"]}
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}") from error
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(
             f"{path}: phases: {type(error).__name__}: expected labels.json of "
             "experiments.label_check --input"

@@ -31,6 +31,7 @@ from rcirl_jax.data.manifest import (
     Manifest,
     ShardInfo,
     array_table,
+    check_count,
     parse_manifest,
     seal,
     shard_entry,
@@ -302,10 +303,6 @@ class Dataset:
             low, high = columns[column].min(), columns[column].max()
             if low < 0 or high >= len(table):
                 raise ValueError(f"{column}: {low} to {high}: {len(table)} names")
-        splits = self.manifest.splits
-        members = sorted(name for names in splits.values() for name in names)
-        if members != sorted(self.manifest.groups):
-            raise ValueError(f"splits: {splits}: expected every group exactly once")
         split = self._split_groups()
         check_disjoint(columns["group"], columns["vehicle"], split)
 
@@ -395,4 +392,5 @@ def open_dataset(url: str | os.PathLike[str], verify: bool = True) -> Dataset:
     dataset = Dataset(files, parse_manifest(raw, files))
     if verify:
         dataset.verify()
+    check_count(dataset.manifest, files.path(MANIFEST))
     return dataset

@@ -6,6 +6,7 @@ ids and groups of the cases, and what the summary needs besides.
 
 import dataclasses
 import io
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -18,6 +19,8 @@ from rcirl_jax.evaluation.closed_loop import SuiteResult
 from rcirl_jax.evaluation.suite_summary import SuiteReport, summarise
 from rcirl_jax.simulation.metrics import CaseMetrics
 from rcirl_jax.whole import write_whole
+
+MAX_BYTES = 2**30  # bytes of a suite, unpacked
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -77,6 +80,20 @@ def write_runs(path: Path, runs: SuiteRuns) -> None:
     write_whole(path, packed.getvalue())
 
 
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of the archive; what it would unpack to is checked first."""
+    with zipfile.ZipFile(path) as archive:
+        size = sum(member.file_size for member in archive.infolist())
+        if size > MAX_BYTES:
+            raise ValueError(f"{size} bytes unpacked, more than {MAX_BYTES}")
+    with np.load(path, allow_pickle=False) as found:
+        arrays = {name: found[name] for name in found.files}
+    for name, value in arrays.items():
+        if not isinstance(value, np.ndarray):
+            raise ValueError(f"{name}: no array")
+    return arrays
+
+
 def read_runs(path: Path) -> SuiteRuns:
     """The suite of a file.
 
@@ -84,8 +101,7 @@ def read_runs(path: Path) -> SuiteRuns:
       InputError: missing, damaged, or not such a file.
     """
     try:
-        with np.load(path, allow_pickle=False) as found:
-            arrays = {name: found[name] for name in found.files}
+        arrays = _arrays(path)
         names = arrays["names"].tolist()
         rows = {
             name: CaseMetrics(
@@ -112,8 +128,9 @@ def read_runs(path: Path) -> SuiteRuns:
         )
     except (
         # of files and arrays; of zip: damaged, packed or locked in ways not known
-        *(OSError, LookupError, ValueError),
-        *(zipfile.BadZipFile, zlib.error, RuntimeError),
+        *(OSError, ArithmeticError, LookupError, ValueError, TypeError),
+        *(EOFError, MemoryError, RuntimeError),
+        *(zipfile.BadZipFile, zlib.error, tokenize.TokenError),
     ) as error:
         why = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path}: {why}: expected the metrics of a suite") from error

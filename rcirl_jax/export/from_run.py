@@ -61,7 +61,7 @@ def read_config(workdir: Path) -> tuple[TrainConfig, dict]:
     try:
         run = json.loads(path.read_text())
         config = config_of(run["config"])
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f"{path}: {error}: expected a run of this version") from error
     return config, run
 

@@ -77,7 +77,7 @@ def load_hand_weights(path: str | os.PathLike[str]) -> LatticeCost:
         body = json.loads(Path(path).read_text())
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}: expected hand weights") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: {error}: expected JSON") from error
     found = body if isinstance(body, dict) else {}
     for name, expected in {"schema": SCHEMA, "schema_version": SCHEMA_VERSION}.items():

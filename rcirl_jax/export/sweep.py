@@ -130,7 +130,7 @@ def _claim(config: SweepConfig, folder: Path, dataset_hash: str) -> str:
         try:
             found = json.loads(path.read_text())
             created = str(found["created"])
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise InputError(
                 f"{path}: {type(error).__name__}: {error}: expected the file of a sweep"
             ) from error
@@ -331,7 +331,7 @@ def read_sweep(folder: Path) -> dict:
     try:
         report = json.loads(path.read_text())
         table(report)
-    except (OSError, ValueError, LookupError, TypeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
         raise InputError(
             f"{path}: {type(error).__name__}: expected the result of experiments.sweep"
         ) from error

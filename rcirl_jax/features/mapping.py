@@ -98,12 +98,12 @@ def feature_map(preset: str) -> FeatureMap:
         known = sorted(item.stem for item in path.parent.glob("*.toml"))
         raise InputError(f"--features: {preset}: expected one of {', '.join(known)}")
     table = load_toml(path)
-    rows = table.get("feature", [])
+    rows, safety = table.get("feature", []), table.get("safety", {})
+    _check_tables(path, rows, safety)
     specs = tuple(_read_spec(path, row) for row in rows)
     names = [spec.name for spec in specs]
     if not names or len(set(names)) != len(names):
         raise InputError(f"{path}: feature: {names}: expected distinct names")
-    safety = table.get("safety", {})
     rises, falls = safety.get("rises", []), safety.get("falls", [])
     for name in (*rises, *falls):
         if name not in names or (name in rises and name in falls):
@@ -114,8 +114,22 @@ def feature_map(preset: str) -> FeatureMap:
     return FeatureMap(preset, specs, signs)
 
 
+def _check_tables(path: Path, rows: object, safety: object) -> None:
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise InputError(f"{path}: feature: {rows}: expected [[feature]] tables")
+    if not isinstance(safety, dict):
+        raise InputError(f"{path}: safety: {safety}: expected a table [safety]")
+    for key in ("rises", "falls"):
+        names = safety.get(key, [])
+        if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
+            raise InputError(f"{path}: safety.{key}: {names}: expected feature names")
+
+
 def _read_spec(path: Path, row: dict) -> FeatureSpec:
     name = row.get("name", "(no name)")
+    for key in ("name", "unit", "meaning"):
+        if not isinstance(row.get(key, ""), str):
+            raise InputError(f"{path}: feature: {key}: {row[key]}: expected a text")
     expected = {field.name for field in dataclasses.fields(FeatureSpec)}
     if set(row) != expected:
         raise InputError(

@@ -22,7 +22,7 @@ import numpy as np
 from scipy.special import ndtri
 from scipy.stats import qmc
 
-from rcirl_jax.errors import InputError
+from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.simulation.case_tables import (
     STATIONS,
     Parts,
@@ -64,6 +64,8 @@ __all__ = [
 ]
 
 MAX_EVENTS = 8  # events of a case
+MAX_COPIES = 1000  # of an agent, before `when` chooses
+MAX_LANES = 100  # beside the ego's
 SIZES = {  # m, length and width by kind
     "vehicle": (4.6, 1.9),
     "cyclist": (1.8, 0.6),
@@ -185,7 +187,12 @@ def _add_agents(
     rng: np.random.Generator,
 ) -> None:
     for spec in family.agents:
-        for copy in range(int(spec.fields["count"](variables))):
+        count = spec.fields["count"](variables)
+        if not count <= MAX_COPIES:
+            raise InputError(
+                f"{family.path}: agent.count: {count:g}: expected at most {MAX_COPIES}"
+            )
+        for copy in range(int(count)):
             own = {**variables, "i": float(copy)}
             if not _wanted(spec, own):
                 continue
@@ -240,7 +247,6 @@ def _check(family: Family, name: str, road: dict[str, float], parts: Parts) -> N
     found = {
         "agents": (len(parts.agents), NUM_AGENTS),
         "lines": (len(parts.lines), NUM_LINES),
-        "events": (int(road["events"]), MAX_EVENTS),
     }
     for what, (count, most) in found.items():
         if count > most:
@@ -262,6 +268,11 @@ def build_case(
       InputError: an expression fails, or there is more than fits (names file,
         case and count).
     """
+    with as_input_error(family.path, "a case that can be made"):
+        return _built(family, index, seed, duration_s)
+
+
+def _built(family: Family, index: int, seed: int, duration_s: float) -> Case:
     draws = _Draws(family, _uniforms(family, index, seed))
     rng = _stream(f"{family.name}/streams", seed, index)
     variables = dict(draws.case) | {"ego_length": EGO_LENGTH_M}
@@ -273,6 +284,16 @@ def build_case(
     for key, expression in family.road.items():
         if key not in road:
             road[key] = expression({**variables, **shared})
+    if not 0 <= road["events"] <= MAX_EVENTS:
+        raise InputError(
+            f"{family.path}: {case_id(family.name, index, seed)}: events: "
+            f"{road['events']:g}: expected at most {MAX_EVENTS}"
+        )
+    for key in ("lanes_left", "lanes_right", "oncoming"):
+        if not 0 <= road[key] <= MAX_LANES:
+            raise InputError(
+                f"{family.path}: road.{key}: {road[key]:g}: expected 0 to {MAX_LANES}"
+            )
     parts = _events(family, draws, shared, road, rng, index, seed)
     _check(family, case_id(family.name, index, seed), road, parts)
     stream = hashlib.sha256(case_id(family.name, index, seed).encode()).digest()

@@ -92,6 +92,13 @@ class _Bound(ast.NodeTransformer):
         return ast.Call(func=name, args=[node.left, node.right], keywords=[])
 
 
+def _number_text(number: float) -> str:
+    try:
+        return repr(float(number)) if math.isfinite(number) else "inf"
+    except OverflowError:
+        return "inf"
+
+
 class Expression:
     """One checked expression; calling it with variables gives a float."""
 
@@ -107,7 +114,7 @@ class Expression:
         """
         self.text, self.where = str(text), where
         if isinstance(text, bool | int | float):
-            self.text = repr(float(text)) if math.isfinite(text) else "inf"
+            self.text = _number_text(text)
         if len(self.text) > MAX_LENGTH:
             raise InputError(f"{where}: {len(self.text)} characters: too long")
         try:

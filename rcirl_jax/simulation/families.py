@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rcirl_jax.errors import InputError
+from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.simulation.cases import NUM_MOVES, NUM_PHASES
 from rcirl_jax.simulation.expressions import Expression
 from rcirl_jax.specs import load_toml, spec_root
@@ -19,6 +19,7 @@ DISTRIBUTIONS = {"uniform": 2, "normal": 2, "lognormal": 2, "choice": None}
 KINDS = ("vehicle", "cyclist", "pedestrian", "static")
 MODELS = ("lane", "oncoming", "crossing")
 LINE_KINDS = ("light", "stop_sign")
+LARGEST = 1e9  # of a parameter's numbers
 TOP = {
     "family",
     "title",
@@ -159,7 +160,9 @@ def load_family(name_or_path: str) -> Family:
         raise InputError(
             f"--suite: {name_or_path}: expected one of {', '.join(family_names())}"
         )
-    return _read(path, load_toml(path))
+    spec = load_toml(path)
+    with as_input_error(str(path), "a family of scenarios"):
+        return _read(path, spec)
 
 
 def _read(path: Path, spec: dict[str, Any]) -> Family:
@@ -232,6 +235,15 @@ def _known(path: Path, where: str, row: Mapping, allowed: set[str]) -> None:
             )
 
 
+def _is_numbers(value: object) -> bool:
+    return isinstance(value, list) and all(
+        isinstance(x, int | float)
+        and not isinstance(x, bool)
+        and -LARGEST <= x <= LARGEST
+        for x in value
+    )
+
+
 def _parameter(path: Path, name: str, row: Any) -> Parameter:  # noqa: ANN401
     where = f"{path}: parameters.{name}"
     if not isinstance(row, dict) or not name.isidentifier():
@@ -246,10 +258,8 @@ def _parameter(path: Path, name: str, row: Any) -> Parameter:  # noqa: ANN401
     if len(chosen) != 1:
         raise InputError(f"{where}: {chosen}: expected one of {list(DISTRIBUTIONS)}")
     arguments, count = row[chosen[0]], DISTRIBUTIONS[chosen[0]]
-    numbers = isinstance(arguments, list) and all(
-        isinstance(x, int | float) and not isinstance(x, bool) for x in arguments
-    )
-    if not numbers or not arguments or (count and len(arguments) != count):
+    numbers = _is_numbers(arguments) and arguments
+    if not numbers or (count and len(arguments) != count):
         raise InputError(f"{where}: {chosen[0]}: {arguments}: expected numbers")
     if row.get("per", "event") not in ("case", "event"):
         raise InputError(f"{where}: per: {row['per']}: expected case or event")
@@ -258,7 +268,7 @@ def _parameter(path: Path, name: str, row: Any) -> Parameter:  # noqa: ANN401
             raise InputError(f"{where}: {key}: missing: expected a text")
     clip = row.get("clip")
     if clip is not None and (
-        not isinstance(clip, list) or len(clip) != 2 or clip[0] > clip[1]
+        not _is_numbers(clip) or len(clip) != 2 or clip[0] > clip[1]
     ):
         raise InputError(f"{where}: clip: {clip}: expected [low, high]")
     return Parameter(

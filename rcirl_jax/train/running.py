@@ -87,6 +87,6 @@ def _read_run(path: Path) -> dict:
         if isinstance(found["config"], dict):
             return found
         reason = "config: not a table"
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         reason = f"{type(error).__name__}: {error}"
     raise InputError(f"{path}: {reason}: expected the file of a training run")

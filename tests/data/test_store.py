@@ -596,3 +596,17 @@ def test_wrong_calls(tmp_path):
     ):
         with pytest.raises(ValueError, match=words):
             writer.finish(finish_fields(**changes))
+
+
+def test_what_cannot_be_deleted_is_one_line(tmp_path, monkeypatch):
+    place = files.Files(str(tmp_path / "d"))
+
+    class Stuck:
+        def delete_range(self, _):
+            raise ValueError("PERMISSION_DENIED: no [source locations='here']")
+
+    monkeypatch.setattr(place, "kv", Stuck())
+    with pytest.raises(
+        OSError, match=r"d/shards: cannot be deleted: PERMISSION_DENIED: no$"
+    ):
+        place.remove("shards", "shardt")

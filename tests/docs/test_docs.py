@@ -142,7 +142,10 @@ def values():
     for _, module, rest in commands():
         for flag, value in VALUE.findall(rest):
             # N stands for a number; jsonl is the format that extending.md adds
-            if not PLACEHOLDER.search(value) and value.strip("`.,]") not in ("N", "jsonl"):
+            if not PLACEHOLDER.search(value) and value.strip("`.,]") not in (
+                "N",
+                "jsonl",
+            ):
                 found.setdefault(module, []).append((flag, value.rstrip("`.,]")))
     return found
 

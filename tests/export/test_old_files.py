@@ -1,8 +1,8 @@
 """Files that earlier versions wrote are read as they were, later ones refused.
 
 The golden files were written, and their values computed, by the first commits that
-knew their version (1: 81c261a, 2: 41456a9). They are never made anew: a reader that
-fails here would strand the weights that planners have.
+knew their version (1: 81c261a, 2: 41456a9), that of version 3 by 471ea86. They are
+never made anew: a reader that fails here would strand the weights that planners have.
 """
 
 import hashlib
@@ -20,6 +20,7 @@ GOLDEN = Path(__file__).parent / "golden"
 SHA256 = {  # of the whole files
     1: "5d14c2f70868cdbbef17d7d620b4ac9dc2a74f1305c4eec793739495a84dc6b4",
     2: "f6e1824cbac37db0ac021427f6efa4cb4becb8c07936224bc9cfb8e323635161",
+    3: "62818194b3d35babea2ec11c2f39f9e95885af1d22df35f88824370f85efcf20",
 }
 
 
@@ -36,6 +37,7 @@ def test_an_old_file_scores_as_it_did(version):
     assert hashlib.sha256(path.read_bytes()).hexdigest() == SHA256[version]
     reward = load_weights(path)
     assert (reward.context is None) == (version == 1)
+    assert (reward.seen is None) == (version < 3)
     assert reward.names == ("feature0", "feature1", "feature2", "feature3")
     assert reward.provenance["git_commit"] == "2fe49aa"
     found = reward.value(features, valid)

@@ -128,7 +128,7 @@ def test_ten_thousand_scores_equal_python_and_jax(
             assert np.all(np.abs(found - jax_values) <= close)
 
 
-@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("version", [1, 2, 3])
 def test_an_old_file_scores_as_it_did(programs, tmp_path, version):
     path, features, valid, expected = test_old_files.golden(version)
     features.astype(np.float32).tofile(tmp_path / "features")

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from rcirl_jax.data.importers.files import with_log_names
+from rcirl_jax.data.importers.options import check_types
 from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.specs import load_toml, spec_root
 from rcirl_jax.types import Recording
@@ -97,8 +98,11 @@ def parts(
     """
     if name not in IMPORTERS:
         raise InputError(f"--format: {name}: expected one of {sorted(IMPORTERS)}")
-    spec_path = source or spec_root() / "sources" / f"{name}.toml"
+    packaged = spec_root() / "sources" / f"{name}.toml"
+    spec_path = source or packaged
     spec = load_toml(spec_path)
+    if source is not None:
+        check_types(spec, load_toml(packaged))
     if input_path is None:
         if name != "synthetic":
             raise InputError("--input: not given: expected a file or folder")

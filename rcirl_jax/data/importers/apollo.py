@@ -32,7 +32,7 @@ from rcirl_jax.data.importers.cyber_record import (
     run_name,
 )
 from rcirl_jax.data.importers.files import log_name
-from rcirl_jax.data.importers.options import positive, section
+from rcirl_jax.data.importers.options import one_pattern, positive, section
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.perception import (
     WINDOW_S,
@@ -52,6 +52,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Recording, Track
 
 RATE_HZ = 10.0  # 1/s
+MAX_RATE_HZ = 1000.0  # 1/s, of the clock
 MAX_GAP_S = 0.55  # s without a message inside one track
 LATE_S = 2.0  # s, messages of one time are recorded within it
 LIMIT_MPS = 29.06  # m/s, 65 mph
@@ -66,7 +67,7 @@ def parts(path: Path, spec: dict) -> list[Path]:
     """The first file of each run of parts: runs can be read without the others."""
     if path.is_file():
         return [path]
-    return first_parts(path, str(spec.get("pattern", "*.record*")))
+    return first_parts(path, one_pattern(spec, "*.record*"))
 
 
 def files_of(first: Path) -> list[Path]:
@@ -99,7 +100,12 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
 
 
 def _rate(spec: dict) -> float:
-    return positive(spec, "rate_hz", RATE_HZ)
+    rate = positive(spec, "rate_hz", RATE_HZ)
+    if rate > MAX_RATE_HZ:
+        raise InputError(
+            f"source TOML: rate_hz: {rate:g}: expected at most {MAX_RATE_HZ:g}"
+        )
+    return rate
 
 
 def _windows(held: Held, spec: dict) -> Iterator[Recording]:

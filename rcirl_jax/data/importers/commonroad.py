@@ -22,6 +22,7 @@ from rcirl_jax.data.importers.commonroad_extras import (
 )
 from rcirl_jax.data.importers.files import files_below, log_name
 from rcirl_jax.data.importers.lanelets import read_lanes
+from rcirl_jax.data.importers.options import is_file_name, one_pattern
 from rcirl_jax.data.importers.xml_fields import Fields
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
@@ -65,7 +66,7 @@ class _Box:
 
 def parts(path: Path, spec: dict) -> list[Path]:
     """The XML files but those of other formats; each can be read alone."""
-    files = files_below(path, spec.get("pattern", "*.xml"))
+    files = files_below(path, one_pattern(spec, "*.xml"))
     if path.is_dir():
         files = [file for file in files if _root_of(file) not in OTHER_ROOTS] or files
     return files
@@ -93,6 +94,8 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
 
 def _read_groups(path: Path, name: str) -> dict[str, str]:
     """File name -> vehicle-disjoint group, from a CSV beside or above the files."""
+    if name and not is_file_name(name):
+        raise InputError(f"source TOML: groups: {name}: expected a file name")
     folder = (path if path.is_dir() else path.parent).resolve()
     for place in (folder, *folder.parents[:GROUPS_UP]):
         table = place / name

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.data.importers.options import path_option
 from rcirl_jax.data.importers.tables import (
     StraightLane,
     number,
@@ -37,7 +38,7 @@ class LogTable:
 def lane_file_of(spec: dict) -> str:
     """Name of the lanes' own CSV, "" without one."""
     lanes = spec.get("lanes", [])
-    return str(lanes.get("file", "")) if isinstance(lanes, dict) else ""
+    return path_option(lanes, "file") if isinstance(lanes, dict) else ""
 
 
 def lanes_of(

@@ -193,7 +193,7 @@ def _column(path: Path, batch: Any, field: Field, start: int) -> Any:  # noqa: A
     found = batch.column(field.column)
     if field.text:
         coded = found.dictionary_encode()
-        names = [name.strip() for name in coded.dictionary.to_pylist()]
+        names = [name.rstrip("\0 \t").strip() for name in coded.dictionary.to_pylist()]
         names = [name.lower() if field.lower else name for name in names]
         return coded.indices.to_numpy(), names
     if str(found.type) == "string":  # with separators between thousands

@@ -142,6 +142,13 @@ def _columns(path: Path, spec: dict) -> dict[str, tuple[str, float]]:
             raise InputError(f"{path}: columns.{field}: {column}: expected a name")
         turned = column.startswith("-") and field not in TEXT
         found[field] = (column[1:], -1.0) if turned else (column, 1.0)
+    texts = {found[field][0] for field in TEXT if field in found}
+    for field, (column, _) in found.items():
+        if field not in TEXT and column in texts:
+            raise InputError(
+                f"{path}: columns.{field}: {column}: expected a column of numbers, "
+                "not one that is read as text"
+            )
     return found
 
 

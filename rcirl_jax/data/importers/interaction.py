@@ -26,6 +26,7 @@ from rcirl_jax.data.importers.files import (
     log_name,
 )
 from rcirl_jax.data.importers.lanelet2 import read_lanelet2
+from rcirl_jax.data.importers.options import path_option
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.projection import utm, utm_zone
 from rcirl_jax.data.importers.sparse_tables import (
@@ -199,7 +200,7 @@ def _find_map(path: Path, spec: dict) -> Path | None:
     """maps/SCENE.osm_xy or .osm in a folder above; the option `map` names one."""
     folders = [folder / "maps" for folder in path.resolve().parents[:MAPS_UP]]
     if spec.get("map"):
-        given = Path(str(spec["map"]))
+        given = Path(path_option(spec, "map"))
         if not given.exists():
             raise InputError(f"{given}: map: missing: expected a file or folder")
         if given.is_file():

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.data.importers.options import path_option
 from rcirl_jax.data.importers.projection import FLATTENING, SEMI_MAJOR_M
 from rcirl_jax.data.importers.shapes import between_bounds, check_coordinates, moves
 from rcirl_jax.data.importers.wire import (
@@ -69,7 +70,7 @@ class _RawLane:
 
 def find_map(folder: Path, spec: dict) -> Path | None:
     """semantic_map.pb as named in the TOML, or beside or above a dataset."""
-    name = str(spec.get("map", ""))
+    name = path_option(spec, "map")
     above = folder.resolve().parents
     if name:
         places = [place / name for place in (Path(), folder, *above[:3])]

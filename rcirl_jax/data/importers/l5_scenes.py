@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.data.importers.options import one_pattern
 from rcirl_jax.data.importers.zarr2 import StructuredArray
 from rcirl_jax.errors import InputError
 
@@ -30,7 +31,7 @@ def parts(path: Path, spec: dict) -> list[Path]:
 
 
 def _pattern(spec: dict) -> str:
-    return str(spec.get("pattern", "*.zarr"))
+    return one_pattern(spec, "*.zarr")
 
 
 def _datasets(path: Path, spec: dict) -> list[Path]:

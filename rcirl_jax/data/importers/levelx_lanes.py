@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.data.importers.options import path_option
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane
 
@@ -105,7 +106,7 @@ def find_map(path: Path, location: str, spec: dict) -> Path | None:
     file, or a folder to look into.
     """
     if spec.get("map"):
-        given = Path(str(spec["map"]))
+        given = Path(path_option(spec, "map"))
         if not given.exists():
             raise InputError(f"{given}: map: missing: expected a file or folder")
         if given.is_file():

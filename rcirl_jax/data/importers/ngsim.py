@@ -33,6 +33,7 @@ from rcirl_jax.data.importers.ngsim_site import (
     drop_repeated,
     site_recording,
 )
+from rcirl_jax.data.importers.options import patterns, positive
 from rcirl_jax.data.importers.sparse_tables import (
     MAX_PLACE_M,
     MAX_TIME,
@@ -42,7 +43,6 @@ from rcirl_jax.data.importers.tables import (
     check_row,
     is_grouped,
     load_rows,
-    number,
     read_header,
     read_table,
     unit_factor,
@@ -74,14 +74,14 @@ def parts(path: Path, spec: dict) -> list[Path]:
     """
     if path.is_file():
         return [path]
-    patterns = spec.get("pattern", ["*.txt", "*.csv"])
+    wanted = patterns(spec, ["*.txt", "*.csv"])
     found: dict[tuple[Path, str], Path] = {}
-    for pattern in patterns:
+    for pattern in wanted:
         for file in path.rglob(pattern):
             own = file.parent == path or file.name.lower().startswith(LOGS)
             if own and is_input(path, file) and "notice" not in file.name.lower():
                 found.setdefault((file.parent, file.stem), file)
-    return sorted(found.values()) or input_files(path, " or ".join(patterns))
+    return sorted(found.values()) or input_files(path, " or ".join(wanted))
 
 
 def own_name(file: Path) -> str:
@@ -112,7 +112,7 @@ def _whole_recordings(
         table[name] = table[name] * factor
     sites = np.unique(table[SITE]).tolist() if SITE in table else [None]
     known, left_out = _known_sites(path, sites, spec)
-    frame_s = number(spec, "frame_s", FRAME_S)
+    frame_s = positive(spec, "frame_s", FRAME_S)
     for site in known:
         rows = slice(None) if site is None else table[SITE] == site
         part = {name: values[rows] for name, values in table.items() if name != SITE}
@@ -131,7 +131,7 @@ def _long_recordings(
     path: Path, spec: dict, factor: float, is_csv: bool
 ) -> Iterator[Recording]:
     """One Recording per site and minute; lanes and notes are the site's."""
-    frame_s = number(spec, "frame_s", FRAME_S)
+    frame_s = positive(spec, "frame_s", FRAME_S)
     if is_csv:
         header = _read_header(path)
         read = functools.partial(csv_stream.batches, grouped=is_grouped(path))

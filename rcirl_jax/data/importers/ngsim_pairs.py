@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.importers.files import input_files
+from rcirl_jax.data.importers.options import one_pattern
 from rcirl_jax.data.importers.sparse_tables import (
     MAX_PLACE_M,
     MAX_TIME,
@@ -52,7 +53,7 @@ SPACING_FT = 0.5  # tolerance of spacing against the positions
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """One Recording of two cars per file."""
-    files = input_files(path, str(spec.get("pattern", "**/*_f*_l*.csv")))
+    files = input_files(path, one_pattern(spec, "**/*_f*_l*.csv"))
     groups = _groups(files)
     lengths = _leader_lengths(files)
     for file in files:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.data.importers.options import positive
 from rcirl_jax.data.importers.tables import (
     StraightLane,
     number,
@@ -144,7 +145,7 @@ def site_recording(
       stamped: the clock is Global_Time; rows may come in any order.
       notes: of this Recording.
     """
-    frame_s = number(spec, "frame_s", FRAME_S)
+    frame_s = positive(spec, "frame_s", FRAME_S)
     # with stamps no step back has a meaning
     reuse = 0.0 if stamped else REUSE_S / frame_s
     vehicles = table["Vehicle_ID"].astype(np.int64)
@@ -166,7 +167,7 @@ def site_recording(
 def _track(
     name: str, table: Table, rows: np.ndarray, spec: dict, lateral: bool
 ) -> Track:
-    frame_s = number(spec, "frame_s", FRAME_S)
+    frame_s = positive(spec, "frame_s", FRAME_S)
     sizes = spec.get("sizes", {})
     kind = str(int(table["v_Class"][rows[0]]))
     default = sizes.get(kind, sizes.get("0", SIZE_M))
@@ -200,7 +201,7 @@ def _lateral_from_lanes(lane: np.ndarray, spec: dict) -> np.ndarray:
     new one.
     """
     width = number(spec, "lane_width_m", LANE_WIDTH_M)
-    span = number(spec, "lane_switch_s", SWITCH_S) / number(spec, "frame_s", FRAME_S)
+    span = number(spec, "lane_switch_s", SWITCH_S) / positive(spec, "frame_s", FRAME_S)
     y = np.full(lane.shape, -width * (lane[0] - 0.5))
     samples = np.arange(lane.size)
     for at in np.flatnonzero(np.diff(lane) != 0.0):

@@ -20,7 +20,7 @@ import numpy as np
 
 from rcirl_jax.data.importers.files import files_below, log_name
 from rcirl_jax.data.importers.nuplan_map import NuplanMap, find_map
-from rcirl_jax.data.importers.options import positive, section
+from rcirl_jax.data.importers.options import one_pattern, positive, section
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.perception import (
     WINDOW_S,
@@ -105,7 +105,7 @@ class _Log:
 
 def parts(path: Path, spec: dict) -> list[Path]:
     """The databases: each can be read without the others."""
-    return files_below(path, str(spec.get("pattern", "*.db")))
+    return files_below(path, one_pattern(spec, "*.db"))
 
 
 def own_name(file: Path) -> str:

@@ -18,6 +18,7 @@ import numpy as np
 
 from rcirl_jax.data.importers.files import MAP_FOLDERS
 from rcirl_jax.data.importers.geopackage import Layers, zone_of
+from rcirl_jax.data.importers.options import path_option
 from rcirl_jax.data.importers.shapes import (
     MIN_HALF_WIDTH_M,
     distance_to_line,
@@ -57,7 +58,7 @@ def find_map(file: Path, names: Sequence[str], spec: Mapping) -> Path | None:
         location "las_vegas".
       spec: `maps` names the folder of the maps; relative to a folder above the log.
     """
-    given = str(spec.get("maps", ""))
+    given = path_option(spec, "maps")
     above = list(file.resolve().parents)[:FOLDERS_UP]
     kept = [given] if given else MAP_FOLDERS
     roots = [folder / name for folder in above for name in kept]

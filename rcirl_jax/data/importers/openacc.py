@@ -25,6 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.importers.files import files_below, log_name
+from rcirl_jax.data.importers.options import one_pattern
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.projection import utm, utm_zone
 from rcirl_jax.data.importers.sparse_tables import (
@@ -75,7 +76,7 @@ class _Drive:
 
 def parts(path: Path, spec: dict) -> list[Path]:
     """The drives; specifications, notes and other tables beside them are none."""
-    files = files_below(path, str(spec.get("pattern", "*.csv")))
+    files = files_below(path, one_pattern(spec, "*.csv"))
     if path.is_dir():
         files = [file for file in files if not NOT_LOGS.fullmatch(file.name)] or files
         files = [file for file in files if _is_drive(file)] or files

@@ -2,11 +2,14 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import PurePosixPath
 
 from rcirl_jax.data.importers.tables import number
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind
 
+LARGEST = 10**18  # of an integer
+MAX_NAME = 255  # bytes of a file's name
 KINDS = ("vehicle", "cyclist", "pedestrian", "static")
 
 
@@ -54,13 +57,101 @@ def patterns(spec: Mapping, default: Sequence[str]) -> tuple[str, ...]:
     """The option `pattern`: one file name pattern or a list of them."""
     value = spec.get("pattern", list(default))
     found = [value] if isinstance(value, str) else value
-    if not isinstance(found, list) or not all(
-        isinstance(item, str) and item and not item.startswith("/") for item in found
-    ):
+    if not isinstance(found, list) or not found or not all(map(_is_pattern, found)):
         raise InputError(
             f"source TOML: pattern: {value}: expected file names such as {default[0]}"
         )
     return tuple(found)
+
+
+def one_pattern(spec: Mapping, default: str) -> str:
+    """The option `pattern` of a format that has one only."""
+    found = patterns(spec, [default])
+    if len(found) != 1:
+        raise InputError(
+            f"source TOML: pattern: {list(found)}: expected one such as {default}"
+        )
+    return found[0]
+
+
+def is_file_name(text: str) -> bool:
+    """Whether it names one file in a folder, and could."""
+    return text not in ("", ".", "..") and "/" not in text and _is_name(text)
+
+
+def _is_name(text: str) -> bool:
+    return "\0" not in text and len(text.encode(errors="replace")) <= MAX_NAME
+
+
+def _is_pattern(item: object) -> bool:
+    """Whether pathlib takes it, and it stays inside the input."""
+    if not isinstance(item, str) or item.startswith("/"):
+        return False
+    names = PurePosixPath(item).parts
+    return bool(names) and all(
+        is_file_name(name) and ("**" not in name or name == "**") for name in names
+    )
+
+
+def path_option(spec: Mapping, key: str) -> str:
+    """An option that names a file or folder; "" without one."""
+    value = spec.get(key, "")
+    names = value.split("/") if isinstance(value, str) else []
+    if not names or any(name and not _is_name(name) for name in names):
+        raise InputError(f"source TOML: {key}: {value}: expected a path")
+    return value
+
+
+def check_types(spec: Mapping, packaged: Mapping) -> None:
+    """Options have the types of those that the packaged TOML has.
+
+    In a table whose values are all of one type any name is allowed, and of that type.
+
+    Raises:
+      InputError: the first one that has another.
+    """
+    for key, value in spec.items():
+        if key in packaged and key != "pattern":
+            _check_type(f"source TOML: {key}", value, packaged[key])
+
+
+def _check_type(where: str, value: object, like: object) -> None:
+    if _type(value) != _type(like):
+        raise InputError(f"{where}: {value}: expected {_type(like)}")
+    if isinstance(value, int) and abs(value) > LARGEST:
+        raise InputError(f"{where}: {value}: expected at most {LARGEST:g}")
+    if isinstance(value, list) and isinstance(like, list):
+        for item in value if _is_uniform(like) else ():
+            _check_type(where, item, like[0])
+    if isinstance(value, dict) and isinstance(like, dict):
+        free = next(iter(like.values())) if _is_uniform([*like.values()]) else None
+        for name, item in value.items():
+            pattern = like.get(name, free)
+            if pattern is None:
+                continue
+            _check_type(f"{where}.{name}", item, pattern)
+            if isinstance(pattern, list) and free and len(item) != len(pattern):
+                raise InputError(
+                    f"{where}.{name}: {item}: expected {len(pattern)} values"
+                )
+
+
+def _type(value: object) -> str:
+    kinds = {
+        bool: "true or false",
+        str: "a text",
+        list: "a list",
+        dict: "a table",
+        int: "a number",
+        float: "a number",
+    }
+    return kinds.get(type(value), "another type")
+
+
+def _is_uniform(values: Sequence) -> bool:
+    """Whether all are of one type and, if lists, as long."""
+    forms = {(_type(v), len(v) if isinstance(v, list) else 0) for v in values}
+    return len(forms) == 1
 
 
 def kind_of(where: str, field: str, found: str, kinds: Mapping[str, str]) -> Kind:

@@ -164,7 +164,7 @@ class Database:
         while True:
             try:
                 rows = cursor.fetchmany(CHUNK_ROWS)
-            except (sqlite3.Error, OverflowError) as error:
+            except (sqlite3.Error, OverflowError, UnicodeDecodeError) as error:
                 raise self._failed(error) from error
             if not rows:
                 return
@@ -173,7 +173,10 @@ class Database:
     def _execute(self, sql: str, values: tuple) -> sqlite3.Cursor:
         try:
             return self._connection.execute(sql, values)
-        except (sqlite3.Error, sqlite3.Warning, OverflowError) as error:
+        # sqlite3's own messages may hold bytes of the file that are no text
+        except (
+            *(sqlite3.Error, sqlite3.Warning, OverflowError, UnicodeDecodeError),
+        ) as error:
             raise self._failed(error) from error
 
     def _failed(self, error: Exception) -> InputError:

@@ -115,8 +115,12 @@ def _check_keys(path: Path, where: str, found: dict, allowed: dict) -> None:
 
 
 def _is_number(value: Any, kinds: tuple[type, ...] = (int, float)) -> bool:  # noqa: ANN401
-    known = isinstance(value, kinds) and not isinstance(value, bool)
-    return known and math.isfinite(value)
+    if not isinstance(value, kinds) or isinstance(value, bool):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an integer beyond any float
+        return False
 
 
 def driver_config(path: Path, found: dict) -> DriverConfig:

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import math
 import re
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
@@ -220,9 +221,13 @@ def number(spec: Mapping, key: str, default: float) -> float:
     value = spec.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"source TOML: {key}: {value}: expected a number")
-    if not np.isfinite(value):
+    try:
+        found = float(value)
+    except OverflowError:
+        found = math.inf
+    if not math.isfinite(found):
         raise InputError(f"source TOML: {key}: {value}: expected a finite number")
-    return float(value)
+    return found
 
 
 def split_tracks(

@@ -171,7 +171,8 @@ def _dtype(file: Path, fields: object) -> np.dtype:
         )
     parts = []
     for field in fields:
-        name, kind, *shape = field if isinstance(field, list) else ("", "")
+        whole = isinstance(field, list) and len(field) >= 2
+        name, kind, *shape = field if whole else ("", "")
         match = TYPE.fullmatch(kind) if isinstance(kind, str) else None
         shape = shape[0] if len(shape) == 1 else shape
         sizes = isinstance(shape, list) and all(

@@ -1,0 +1,200 @@
+"""Damaged and hostile files for every reader, very many of them.
+
+    python -m benchmarks.reliability.fuzz --inputs=1000000 --output=benchmarks/results
+
+Each reader runs in a process of its own, in which an input may take 10 s and 2 GiB,
+and may open, write and start nothing outside its folder. It has to return, or to raise
+`InputError` of one line that names the file. With the extra [fuzz] (atheris) coverage
+of our code guides the inputs, else they are drawn at random. Most are made inside of
+their form: checksums, lengths and compression are right, what they hold is not.
+
+Writes fuzz.json, a row per reader, and under OUTPUT/crashes the inputs that broke a
+promise; one of these makes the exit status 1. `unforeseen` counts the lines by which
+the last net of the importers refused an input, and the place in the code that each
+names.
+"""
+
+import contextlib
+import dataclasses
+import json
+import multiprocessing
+import os
+import re
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from absl import flags
+
+from benchmarks.reliability.fuzz import child
+
+with child.instrumented():
+    from benchmarks.common import write
+    from benchmarks.reliability.fuzz.readers import READERS, shares
+    from experiments.common import run
+    from rcirl_jax.errors import InputError
+    from rcirl_jax.whole import write_json
+
+_INPUTS = flags.DEFINE_integer("inputs", 1_000_000, "over all readers", 1)
+_READERS = flags.DEFINE_list("readers", ["all"], "which of them")
+_SECONDS = flags.DEFINE_integer("seconds", 3600, "at most so long a reader", 1)
+_SEED = flags.DEFINE_integer("seed", 0, "of the inputs")
+_OUTPUT = flags.DEFINE_string("output", "benchmarks/results", "folder of the JSON")
+MOST_DEATHS = 20  # of a reader's processes
+SLACK_S = 60.0  # s for seeds, on top of what a reader is given
+# "#1500 DONE cov: 699 ft: 1863 corp: 141/156Kb ..."
+PROGRESS = re.compile(r"#\d+\s+\w+\s+cov: (\d+) ft: (\d+) corp: (\d+)/")
+PEAK = re.compile(r"stat::peak_rss_mb:\s+(\d+)")
+
+
+@dataclasses.dataclass(kw_only=True)
+class Row:
+    """What came of one reader."""
+
+    reader: str
+    inputs: int = 0
+    mutator: str = ""
+    corpus: int = 0  # inputs that reached something new
+    covered: int = 0  # edges of our code, libFuzzer's cov
+    features: int = 0  # and how often each was taken, its ft
+    crashes: list[str] = dataclasses.field(default_factory=list)
+    unforeseen: dict[str, int] = dataclasses.field(default_factory=dict)
+    seconds: float = 0.0
+    slowest_s: float = 0.0
+    peak_mib: int = 0
+    command: str = ""
+
+
+def chosen() -> list[str]:
+    """The readers asked for."""
+    names = list(READERS) if _READERS.value == ["all"] else list(_READERS.value)
+    for name in names:
+        if name not in READERS:
+            raise InputError(f"--readers: {name}: expected all or {', '.join(READERS)}")
+    return names
+
+
+def start(row: Row, folder: Path, inputs: int, seconds: int) -> tuple[int, str]:
+    """One process; (exit status, what it said)."""
+    said = folder / "said.txt"
+    # a fork, so that imports and their instrumentation are paid for once
+    process = multiprocessing.get_context("fork").Process(
+        target=_child, args=(row.reader, folder, inputs, seconds)
+    )
+    process.start()
+    process.join(seconds + SLACK_S)
+    if process.is_alive():
+        process.kill()
+        process.join()
+    return process.exitcode or 0, said.read_text(errors="replace")
+
+
+def _child(name: str, folder: Path, inputs: int, seconds: int) -> None:
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    with (folder / "said.txt").open("w") as file:
+        for stream in (1, 2):
+            os.dup2(file.fileno(), stream)
+    child.fuzz(name, folder, inputs, seconds, _SEED.value)
+
+
+def fuzzed(name: str, inputs: int, seconds: int, output: Path) -> Row:
+    """All inputs of a reader; a process that dies is followed by another."""
+    row = Row(
+        reader=name,
+        mutator="atheris, by form" if child.has_atheris() else "at random, by form",
+        command=f"python -m {child.PACKAGE} --readers={name} --inputs={inputs} "
+        f"--seed={_SEED.value}",
+    )
+    begin = time.monotonic()
+    place = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
+    with tempfile.TemporaryDirectory(prefix="fuzz-", dir=place) as made:
+        folder = Path(made) / name
+        for part in ("corpus", "crashes"):
+            (folder / part).mkdir(parents=True)
+        for _ in range(MOST_DEATHS):
+            left = seconds - round(time.monotonic() - begin)
+            if row.inputs >= inputs or left <= 0:
+                break
+            status, said = start(row, folder, inputs - row.inputs, left)
+            if not account(row, folder, status, said):
+                break
+        keep(row, folder, output)
+    row.seconds = round(time.monotonic() - begin, 1)
+    return row
+
+
+def account(row: Row, folder: Path, status: int, said: str) -> bool:
+    """Add what a process did to the row; whether another should follow."""
+    found = {"inputs": 0, "slowest_s": 0.0, "unforeseen": {}}
+    with contextlib.suppress(OSError, ValueError):
+        found = json.loads((folder / "status.json").read_text())
+        (folder / "status.json").unlink()
+    ended = re.search(r"stat::number_of_executed_units:\s*(\d+)", said)
+    row.inputs += max(found["inputs"], int(ended[1]) if ended else 0)
+    row.slowest_s = max(row.slowest_s, found["slowest_s"])
+    for where, count in found["unforeseen"].items():
+        row.unforeseen[where] = row.unforeseen.get(where, 0) + count
+    for line in PROGRESS.findall(said)[-1:]:
+        row.covered, row.features, row.corpus = map(int, line)
+    for peak in PEAK.findall(said):
+        row.peak_mib = max(row.peak_mib, int(peak))
+    if status != 0:
+        last = (said.strip().splitlines() or [""])[-1][:200]
+        reason = re.search(r"SUMMARY: (.*)", said)
+        row.crashes.append(f"process: {status}: {reason[1] if reason else last}")
+    return status != 0 and found["inputs"] > 0
+
+
+def keep(row: Row, folder: Path, output: Path) -> None:
+    """Save the inputs that broke a promise, and one for each unforeseen place."""
+    path = folder / "breaches.jsonl"
+    lines = path.read_text().splitlines() if path.exists() else []
+    for entry in map(json.loads, lines):
+        if entry["what"] == "breach":
+            row.crashes.append(f"{entry['file']}: {entry['kind']}: {entry['text']}")
+    files = sorted((folder / "crashes").iterdir())
+    if files:
+        kept = output / "crashes" / row.reader
+        kept.mkdir(parents=True, exist_ok=True)
+        for file in files:
+            shutil.copy(file, kept / file.name)
+
+
+def main() -> None:
+    """Fuzz the readers; exit status 1 if any broke a promise."""
+    names, output = chosen(), Path(_OUTPUT.value)
+    output.mkdir(parents=True, exist_ok=True)
+    rows = []
+    for name, inputs in shares(names, _INPUTS.value).items():
+        row = fuzzed(name, inputs, _SECONDS.value, output)
+        rows.append(dataclasses.asdict(row))
+        print(
+            f"{name}: {row.inputs:,} inputs, {row.seconds:.0f} s, corpus {row.corpus}, "
+            f"features {row.features}, crashes {len(row.crashes)}, "
+            f"unforeseen {sum(row.unforeseen.values())}",
+            flush=True,
+        )
+        for line in row.crashes:
+            print(f"  {line}", flush=True)
+        write_json(output / "fuzz.json", {"rows": rows})
+    limits = {"seconds": child.MAX_S, "bytes": child.MAX_BYTES}
+    write("fuzz", {"rows": rows, "limits": limits}, str(output))
+    total, broken = (sum(map(count, rows)) for count in (_inputs, _crashes))
+    print(f"{total:,} inputs, {broken} crashes")
+    if broken:
+        sys.exit(1)
+
+
+def _inputs(row: dict) -> int:
+    return row["inputs"]
+
+
+def _crashes(row: dict) -> int:
+    return len(row["crashes"])
+
+
+if __name__ == "__main__":
+    run(main)

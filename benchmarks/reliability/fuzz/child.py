@@ -1,0 +1,200 @@
+"""One reader under the fuzzer, in a process that may die.
+
+Its folder has corpus/ and crashes/ of the reader; what was broken is appended to
+breaches.jsonl, and status.json says how far it is. With atheris installed, coverage
+of our code guides what is tried next; else inputs are drawn at random.
+"""
+
+import contextlib
+import gc
+import hashlib
+import importlib
+import importlib.util
+import io
+import json
+import os
+import random
+import resource
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+MAX_S = 10  # s that one input may take
+MAX_BYTES = 2 * 2**30  # bytes of memory on top of what the imports take
+PACKAGE = "benchmarks.reliability.fuzz"
+INSTRUMENTED = {"rcirl_jax", "tomllib", "defusedxml"}
+EVERY_S = 1.0  # s between two writings of the status
+
+
+def has_atheris() -> bool:
+    """Whether coverage can guide."""
+    return importlib.util.find_spec("atheris") is not None
+
+
+class Session:
+    """Runs inputs and keeps account."""
+
+    def __init__(self, name: str, folder: Path, seed: int) -> None:
+        """Make the reader's target and remember what earlier processes found."""
+        readers = importlib.import_module(f"{PACKAGE}.readers")
+        self._codecs = importlib.import_module(f"{PACKAGE}.codecs")
+        self._contract = importlib.import_module(f"{PACKAGE}.contract")
+        work = folder / "work" / str(os.getpid())
+        self.reader = readers.READERS[name]
+        self.target = self.reader.make(work)
+        self._folder, self._rng = folder, random.Random(seed)
+        self.inputs, self._slowest, self._last = 0, 0.0, 0.0
+        self._unforeseen: dict[str, int] = {}
+        self._known = _known(folder)
+        self._watch = self._contract.Watch(folder)
+        tempfile.tempdir = str(work)
+
+    def run(self, data: bytes) -> None:
+        """Read one input; note what it broke."""
+        self.inputs += 1
+        self.target.put(data)
+        begin = time.perf_counter()
+        with self._watch:
+            breach, line = self._contract.verdict(self.target.read, self.target.names)
+        spent = time.perf_counter() - begin
+        breach = self._watch.seen or breach
+        if breach and breach.kind == "read outside" and self.target.names_paths(data):
+            breach = None
+        self._slowest = max(self._slowest, spent)
+        if line is not None:
+            for place in self._contract.UNFORESEEN.findall(line):
+                if place not in self._unforeseen:
+                    self._keep(data, "unforeseen", place, line)
+                self._unforeseen[place] = self._unforeseen.get(place, 0) + 1
+        if breach is not None and breach.kind not in self._known:
+            self._known.add(breach.kind)
+            self._keep(data, "breach", breach.kind, breach.text)
+        if begin - self._last > EVERY_S:
+            self._last = begin
+            self.write_status()
+
+    def mutate(self, data: bytes, most: int, seed: int, plain: Any = None) -> bytes:  # noqa: ANN401
+        """Another input, made from one."""
+        rng = random.Random(seed)
+        index = self.target.index(data)
+        if rng.random() < 0.05 or not data:
+            index = rng.randrange(len(self.target.seeds))
+            data = bytes([index]) + self.target.seeds[index]
+        if plain is not None and rng.random() < 0.3:
+            made = plain(data[1:], most - 1)
+        else:
+            made = self._codecs.mutate(data[1:], self.target.forms[index], rng)
+        return bytes([index]) + made[: most - 1]
+
+    def draw(self) -> bytes:
+        """A mutated seed, without anything that guides."""
+        index = self._rng.randrange(len(self.target.seeds))
+        data = bytes([index]) + self.target.seeds[index]
+        for _ in range(self._rng.choice((1, 1, 2, 3))):
+            data = self.mutate(data, 2**22, self._rng.getrandbits(32))
+        return data
+
+    def write_status(self) -> None:
+        """How far it is."""
+        found = {
+            "inputs": self.inputs,
+            "slowest_s": round(self._slowest, 3),
+            "unforeseen": self._unforeseen,
+        }
+        path = self._folder / "status.json"
+        path.with_suffix(".new").write_text(json.dumps(found))
+        path.with_suffix(".new").rename(path)
+
+    def _keep(self, data: bytes, what: str, kind: str, text: str) -> None:
+        name = f"{what}-{hashlib.sha256(data).hexdigest()[:12]}"
+        (self._folder / "crashes" / name).write_bytes(data)
+        line = {"what": what, "kind": kind, "text": text, "file": name}
+        with (self._folder / "breaches.jsonl").open("a") as file:
+            file.write(json.dumps(line) + "\n")
+
+
+def _known(folder: Path) -> set[str]:
+    path = folder / "breaches.jsonl"
+    lines = path.read_text().splitlines() if path.exists() else []
+    return {json.loads(line)["kind"] for line in lines}
+
+
+def limit_memory() -> None:
+    """What the process maps now, and so much more."""
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    most = pages * resource.getpagesize() + MAX_BYTES
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+
+
+def guided(session: Session, folder: Path, arguments: list[str]) -> None:
+    """libFuzzer, guided by coverage; does not return."""
+    import atheris
+
+    longest = max(map(len, session.target.seeds))
+    for index, seed in enumerate(session.target.seeds):
+        (folder / "corpus" / f"seed-{index:02d}").write_bytes(bytes([index]) + seed)
+    words = "".join(f'"{_escaped(word)}"\n' for word in session.reader.words)
+    (folder / "words").write_text(words or '"0"\n')
+    rss = int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+    flags = [
+        f"-timeout={MAX_S}",
+        f"-rss_limit_mb={(rss + MAX_BYTES) // 2**20}",
+        f"-max_len={longest + 2048}",
+        f"-artifact_prefix={folder}/crashes/",
+        f"-dict={folder}/words",
+        *("-print_final_stats=1", "-len_control=0", "-use_value_profile=0"),
+    ]
+
+    def mutator(data: bytes, most: int, seed: int) -> bytes:
+        return session.mutate(data, most, seed, atheris.Mutate)
+
+    given = ["fuzz", *flags, *arguments, str(folder / "corpus")]
+    atheris.Setup(given, session.run, custom_mutator=mutator)
+    atheris.Fuzz()
+
+
+def _escaped(word: str) -> str:
+    return "".join(f"\\x{byte:02x}" for byte in word.encode())
+
+
+def drawn(session: Session, inputs: int, seconds: float) -> None:
+    """Seeds mutated at random."""
+    end = time.monotonic() + seconds
+    while session.inputs < inputs and time.monotonic() < end:
+        session.run(session.draw())
+    session.write_status()
+
+
+@contextlib.contextmanager
+def instrumented() -> Iterator[None]:
+    """What is imported of our code meanwhile counts its edges, with atheris."""
+    if not has_atheris():
+        yield
+        return
+    from atheris.import_hook import HookManager
+
+    # comparisons are not traced: that takes twice the time, and files are changed
+    # inside of their form anyway
+    hook = HookManager(INSTRUMENTED, set(), True, trace_dataflow=False)
+    with contextlib.redirect_stderr(io.StringIO()), hook:
+        yield
+        importers = importlib.import_module("rcirl_jax.data.importers")
+        for module in set(importers.IMPORTERS.values()):
+            importlib.import_module(f"{importers.__name__}.{module}")
+
+
+def fuzz(name: str, folder: Path, inputs: int, seconds: int, seed: int) -> None:
+    """Fuzz one reader in this process; it may not return."""
+    session = Session(name, folder, seed)
+    for index, content in enumerate(session.target.seeds):
+        session.run(bytes([index]) + content)
+    gc.collect()
+    gc.freeze()  # what the imports made is never looked through again
+    limit_memory()
+    if has_atheris():
+        limits = [f"-runs={inputs}", f"-max_total_time={seconds}", f"-seed={seed}"]
+        guided(session, folder, limits)
+    else:
+        drawn(session, inputs, seconds)

@@ -1,0 +1,130 @@
+"""What every reader promises of any bytes, and how a breach of it is seen.
+
+It returns, or it raises `InputError` (`WeightsError` for weights) of one printable
+line that names the file. It opens nothing outside its folder for writing and nothing
+but code and system files for reading, and it starts no program and unpickles nothing.
+Seconds and memory are limited by whoever runs it.
+"""
+
+import contextlib
+import dataclasses
+import os
+import re
+import sys
+import traceback
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import Any
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.export.reader import WeightsError
+
+# where a last net caught what no check foresaw
+UNFORESEEN = re.compile(r"\((\w+\.py:\d+)\): expected ")
+MAX_LINE = 2000  # characters
+FORBIDDEN = (
+    *("os.system", "os.exec", "os.posix_spawn", "os.spawn", "os.fork"),
+    *("subprocess.Popen", "pickle.find_class", "socket.connect", "urllib.Request"),
+)
+CHANGES = (
+    *("os.remove", "os.rename", "os.mkdir", "os.rmdir", "os.link", "os.symlink"),
+    *("os.truncate", "os.chmod", "shutil.rmtree"),
+)
+WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
+SYSTEM = ("/proc/", "/dev/", "/sys/", "/usr/", "/lib", "/etc/localtime")
+
+
+@dataclasses.dataclass(frozen=True)
+class Breach:
+    """A promise that was not kept."""
+
+    kind: str  # what was broken; the same for all inputs of one defect
+    text: str
+
+
+class Watch:
+    """Sees what is opened, changed and started while a reader runs."""
+
+    def __init__(self, folder: Path) -> None:
+        """Start watching this process, for good; `folder` is the reader's own."""
+        self._folder = str(folder.resolve())
+        code = {sys.prefix, sys.base_prefix, str(Path(__file__).parents[3])}
+        self._readable = (*SYSTEM, self._folder, *code)
+        self._on, self.seen = False, None
+        sys.addaudithook(self._hook)
+
+    def __enter__(self) -> "Watch":
+        self._on, self.seen = True, None
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._on = False
+
+    def _hook(self, event: str, args: tuple) -> None:
+        if not self._on or self.seen is not None:
+            return
+        if event == "open":
+            self._opened(args[0], args[2])
+        elif event == "sqlite3.connect":
+            self._opened(str(args[0]).removeprefix("file://").split("?")[0], 0)
+        elif event in FORBIDDEN or (
+            event in CHANGES and not self._is_inside(_placed(args))
+        ):
+            self.seen = Breach(event, str(args)[:200])
+
+    def _opened(self, path: object, flags: object) -> None:
+        if not isinstance(path, str | bytes | os.PathLike):
+            return
+        writes = isinstance(flags, int) and bool(flags & WRITING)
+        name = os.path.abspath(os.fsdecode(path))
+        if writes and not self._is_inside(path):
+            self.seen = Breach("written outside", name[:200])
+        elif not name.startswith(self._readable):
+            self.seen = Breach("read outside", name[:200])
+
+    def _is_inside(self, path: Any) -> bool:  # noqa: ANN401 - whatever was opened
+        if not isinstance(path, str | bytes | os.PathLike):
+            return True
+        return os.path.abspath(os.fsdecode(path)).startswith((self._folder, "/dev/"))
+
+
+def _placed(args: tuple) -> Any:  # noqa: ANN401 - whatever was changed
+    """The path of an event; one that is relative to an open folder made whole."""
+    name, rest = args[0], args[1:]
+    folders = [number for number in rest if type(number) is int and number > 2]
+    if isinstance(name, str) and not os.path.isabs(name) and folders:
+        with contextlib.suppress(OSError):
+            return os.path.join(os.readlink(f"/proc/self/fd/{folders[-1]}"), name)
+    return name
+
+
+def refusal_breach(line: str, names: Collection[str]) -> Breach | None:
+    """What is wrong with the text of a refusal."""
+    if len(line.splitlines()) != 1 or not line.isprintable():
+        return Breach("not one printable line", repr(line)[:300])
+    if len(line) > MAX_LINE:
+        return Breach("a line too long", f"{len(line)} characters: {line[:200]}")
+    if not line.startswith("/") and not any(name in line for name in names):
+        return Breach("no file named", line[:300])
+    return None
+
+
+def place_of(error: BaseException) -> str:
+    """File and line of ours where it came from, and its type."""
+    frames = traceback.extract_tb(error.__traceback__)
+    ours = [frame for frame in frames if "/rcirl_jax/" in frame.filename]
+    last = (ours or frames)[-1]
+    return f"{type(error).__name__} at {Path(last.filename).name}:{last.lineno}"
+
+
+def verdict(
+    read: Callable[[], object], names: Collection[str]
+) -> tuple[Breach | None, str | None]:
+    """Read once; (what was broken, the line of a refusal)."""
+    try:
+        read()
+    except (InputError, WeightsError) as error:
+        return refusal_breach(str(error), names), str(error)
+    except Exception as error:
+        return Breach(place_of(error), str(error)[:300]), None
+    return None, None

@@ -1,0 +1,247 @@
+"""Every reader by its name, with its share of the inputs."""
+
+import dataclasses
+import hashlib
+import json
+import types
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.reliability.fuzz import pieces
+from benchmarks.reliability.fuzz.codecs import resealed, toml_text
+from benchmarks.reliability.fuzz.logs import LOGS
+from benchmarks.reliability.fuzz.targets import Bytes, OneFile, Reader, Target
+from rcirl_jax.data import signal_checks, store
+from rcirl_jax.data.files import MANIFEST, MARK, Files
+from rcirl_jax.data.importers import synthetic
+from rcirl_jax.data.preferences import SCHEMA, read_preferences
+from rcirl_jax.evaluation.suite_files import SuiteRuns, read_runs, write_runs
+from rcirl_jax.export.reader import decode_weights
+from rcirl_jax.features import mapping
+from rcirl_jax.simulation import families
+from rcirl_jax.simulation.catalogue import build_case
+from rcirl_jax.simulation.metrics import CaseMetrics
+from rcirl_jax.specs import load_toml, spec_root
+from rcirl_jax.train import checkpoint
+from rcirl_jax.units import NUM_TIMES
+from tests.data import test_store
+from tests.weights_files import packed
+
+ROWS = 2  # of a dataset
+CASES = 2  # of a suite
+
+
+def weights(folder: Path) -> Target:
+    """Weights files of all three versions."""
+    kinds = ({}, {"by_context": True}, {"by_context": True, "seen": True})
+    seeds = [packed(hidden=(2,), features=2, times=2, **kind) for kind in kinds]
+    name = "weights.msgpack"
+    read = lambda data: decode_weights(data, name)  # noqa: E731
+    return Bytes(read, [("weights", seed) for seed in seeds], [name])
+
+
+def _dataset(folder: Path) -> Path:
+    place = folder / "dataset"
+    test_store.write(place, (ROWS,))
+    return place
+
+
+def sealed(folder: Path) -> Target:
+    """manifest.json and shard.json of a dataset, each with its own digest."""
+    place = _dataset(folder)
+    files = Files(place)
+    mark = place / "shards" / "00000" / MARK
+
+    def read() -> None:
+        store.parse_manifest((place / MANIFEST).read_bytes(), files)
+        store.shard_entry(store.shard_info(files, 0))
+
+    return Target(read, [place / MANIFEST, mark])
+
+
+def dataset(folder: Path) -> Target:
+    """A dataset with all checksums made right, and rows read from it.
+
+    Files after the manifest and shard.json are the chunks and the metadata of a few
+    arrays. The manifest names the digest of shard.json, and that those of the arrays.
+    """
+    place = _dataset(folder)
+    shard = place / "shards" / "00000"
+    arrays = [shard / name for name in ("human.s", "group", "scene.tags")]
+    files = [place / MANIFEST, shard / MARK]
+    files += sorted(
+        file for array in arrays for file in array.rglob("*") if file.is_file()
+    )
+
+    def read() -> None:
+        found = store.open_dataset(place)
+        for split in (None, *found.manifest.splits):
+            found.indices(split)
+        for name in ("human.s", "scene.tags"):
+            found.column(name)
+
+    return Target(read, files, after=lambda index: _chain(place, shard, files, index))
+
+
+def _chain(place: Path, shard: Path, files: list[Path], index: int) -> None:
+    """Digests above a file that was changed."""
+    if index == 0:
+        return
+    try:
+        mark = json.loads((shard / MARK).read_text())
+        if index > 1:
+            key = files[index].relative_to(shard).as_posix()
+            mark["files"][key] = store.describe(files[index].read_bytes())
+            mark.pop("sha256")
+            (shard / MARK).write_bytes(resealed(mark, "sha256"))
+            mark = json.loads((shard / MARK).read_text())
+        head = json.loads((place / MANIFEST).read_text())
+        head["shards"][0]["sha256"] = mark["sha256"]
+        head.pop("hash")
+        (place / MANIFEST).write_bytes(resealed(head, "hash"))
+    except (ValueError, LookupError, TypeError, RecursionError):
+        return
+
+
+def _tomls(folder: Path, kind: str, read: Callable[[Path], object]) -> Target:
+    """The packaged TOML files of one folder, each read alone."""
+    folder.mkdir(parents=True)
+    files = []
+    for packaged in sorted((spec_root() / kind).glob("*.toml")):
+        files.append(folder / packaged.name)
+        files[-1].write_text(toml_text(load_toml(packaged)))
+    return OneFile(read, files)
+
+
+def toml(folder: Path) -> Target:
+    """Any TOML file, as people write them."""
+    folder.mkdir(parents=True)
+    file = folder / "csv.toml"
+    text = (spec_root() / "sources" / "csv.toml").read_text().splitlines()
+    file.write_text("\n".join(line.split(" #")[0] for line in text[3:]))
+    return OneFile(load_toml, [file])
+
+
+def features(folder: Path) -> Target:
+    """Presets of features."""
+    mapping.spec_root = lambda: folder  # the folder of presets is fixed
+    fresh = mapping.feature_map.__wrapped__
+    return _tomls(folder / "features", "features", lambda file: fresh(file.stem))
+
+
+def scenarios(folder: Path) -> Target:
+    """Families of scenarios, and the first case that each makes."""
+
+    def read(file: Path) -> None:
+        family = families.load_family.__wrapped__(str(file))
+        if not family.compound:
+            build_case(family, 0)
+
+    return _tomls(folder, "scenarios", read)
+
+
+def traffic(folder: Path) -> Target:
+    """Synthetic traffic: its TOML; nothing is simulated."""
+    spec = load_toml(spec_root() / "sources" / "synthetic.toml")
+    made = folder / "traffic"
+    made.mkdir(parents=True)
+    file = made / "synthetic.toml"
+    file.write_text(toml_text(spec))
+    return OneFile(lambda path: synthetic.recordings(path, spec), [file])
+
+
+def suite(folder: Path) -> Target:
+    """The metrics of a suite."""
+    folder.mkdir(parents=True)
+    file = folder / "suite.npz"
+    names = [field.name for field in dataclasses.fields(CaseMetrics)]
+    values: dict[str, Any] = {name: np.ones(CASES, np.float32) for name in names}
+    metrics = CaseMetrics(**values)
+    runs = SuiteRuns(
+        rows={"ours": metrics},
+        ids=("a", "b"),
+        groups=("g", "g"),
+        preventable=np.ones(CASES, bool),
+        trivial=np.zeros(CASES, bool),
+        reference="ours",
+        way=np.ones(CASES),
+    )
+    write_runs(file, runs)
+    return OneFile(read_runs, [file])
+
+
+def preferences(folder: Path) -> Target:
+    """Preferences of a dataset of twelve rows."""
+    folder.mkdir(parents=True)
+    rows = np.arange(12)
+    human = types.SimpleNamespace(
+        s=np.zeros((12, NUM_TIMES)), l=np.zeros((12, NUM_TIMES))
+    )
+
+    def chosen(wanted: np.ndarray) -> types.SimpleNamespace:
+        some = types.SimpleNamespace(s=human.s[wanted], l=human.l[wanted])
+        return types.SimpleNamespace(human=some)
+
+    scenes = types.SimpleNamespace(
+        hash="d" * 64, indices=lambda split: rows, read=chosen
+    )
+    head = {"schema": SCHEMA, "schema_version": 1, "dataset_sha256": "d" * 64}
+    slow = {"s": [0.5 * k for k in range(NUM_TIMES)]}
+    lines = [
+        {"scene": k, "better": slow, "worse": "human", "weight": 1.0} for k in (1, 2)
+    ]
+    file = folder / "preferences.jsonl"
+    file.write_text("\n".join(map(json.dumps, [head, *lines])) + "\n")
+    return OneFile(lambda path: read_preferences(path, scenes), [file])  # type: ignore[arg-type]
+
+
+def checkpoints(folder: Path) -> Target:
+    """The digests of a checkpoint's files; nothing is restored."""
+    step = folder / "3"
+    step.mkdir(parents=True)
+    (step / "state").write_bytes(b"numbers")
+    found = {"state": hashlib.sha256(b"numbers").hexdigest()}
+    noted = step / checkpoint.DIGESTS
+    noted.write_text(json.dumps({"files": found, "sha256": checkpoint.digest(found)}))
+    names = (str(folder),)
+    return Target(lambda: checkpoint._newest_whole(folder), [noted], names)
+
+
+def checks(folder: Path) -> Target:
+    """Verdicts on traffic lights."""
+    folder.mkdir(parents=True)
+    file = folder / "labels.json"
+    phases = [
+        {"name": "USA_Lanker-1: 1", "verdict": word} for word in signal_checks.VERDICTS
+    ]
+    file.write_text(json.dumps({"phases": phases}))
+    return OneFile(signal_checks.read_signal_checks, [file])
+
+
+READERS: dict[str, Reader] = {
+    "weights": Reader(make=weights, share=8, words=("sha256", "<f4", "tanh")),
+    "wire": Reader(make=pieces.wire_target, share=5),
+    "geometry": Reader(make=pieces.geometry_target, share=5),
+    "tfrecord": Reader(make=pieces.tfrecord_target, share=3),
+    "sealed": Reader(make=sealed, words=("schema_version", "shards")),
+    "dataset": Reader(make=dataset),
+    "toml": Reader(make=toml, share=2, words=("[[", "]]", '"""', "1979-05-27")),
+    "features": Reader(make=features),
+    "scenarios": Reader(make=scenarios),
+    "traffic": Reader(make=traffic),
+    "suite": Reader(make=suite),
+    "preferences": Reader(make=preferences, share=3),
+    "checkpoints": Reader(make=checkpoints, share=2),
+    "signal_checks": Reader(make=checks, share=3),
+    "lanelet2": Reader(make=pieces.lanelet2_target),
+    **{name: Reader(make=make) for name, make in LOGS.items()},
+}
+
+
+def shares(names: list[str], inputs: int) -> dict[str, int]:
+    """Inputs by reader."""
+    total = sum(READERS[name].share for name in names)
+    return {name: -(-inputs * READERS[name].share // total) for name in names}

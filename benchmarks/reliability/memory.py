@@ -1,0 +1,204 @@
+"""Memory over time: who looks at it, and when it counts as growth.
+
+Growth is told by the slope of Theil (1950) and Sen (1968), the median of the slopes
+between all pairs of points: a spike, or noise around a level, does not move it. Its
+interval (Sen's) takes the points as independent; those of a process are not quite.
+"""
+
+import dataclasses
+import os
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy import stats
+
+WARM_UP = 0.25  # share of a series before it is watched: programs, pools, buffers
+LEAST = 4  # points that a slope is taken from
+MOST = 500  # points that a slope is taken from: all pairs of them are compared
+SHARE, MB = 0.05, 50.0  # growth allowed to a series of rounds: the larger of the two
+PHASE_SHARE, PHASE_MB = 0.10, 200.0  # and to a phase, from its second tenth to its last
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Growth:
+    """How a series rises after its warm-up."""
+
+    per_round: float
+    # 95 % interval of it
+    low: float
+    high: float
+    rounds: int  # that were watched
+    # over the watched rounds, and what is allowed
+    by: float
+    allowed: float
+    # by more than allowed, and shown to rise at all
+    grows: bool
+
+
+def growth(values: Sequence[float], allowed: float) -> Growth:
+    """Whether a series of one value a round grows.
+
+    Args:
+      values: one a round, from the first on; the warm-up is dropped here.
+      allowed: rise over the watched rounds that does not count.
+
+    Raises:
+      ValueError: too few rounds to tell.
+    """
+    watched = np.asarray(values[int(WARM_UP * len(values)) :], np.float64)
+    if watched.size < LEAST:
+        raise ValueError(f"{watched.size} rounds: expected {LEAST} after the warm-up")
+    slope, low, high = _slope(np.arange(watched.size), watched)
+    by = slope * (watched.size - 1)
+    return Growth(
+        per_round=slope,
+        low=low,
+        high=high,
+        rounds=watched.size,
+        by=by,
+        allowed=allowed,
+        grows=bool(by > allowed and low > 0.0),
+    )
+
+
+def memory_growth(values: Sequence[float]) -> Growth:
+    """Of a series of MiB: more than `SHARE` of it and more than `MB` is growth."""
+    level = float(np.median(values[int(WARM_UP * len(values)) :]))
+    return growth(values, max(SHARE * level, MB))
+
+
+def count_growth(values: Sequence[float]) -> Growth:
+    """Of a series of numbers of things: one more over the watched rounds is growth.
+
+    Half a thing is allowed, so that a number which now and then is one higher is none.
+    """
+    return growth(values, 0.5)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Sample:
+    """One look at a process."""
+
+    seconds: float
+    mb: float  # resident, MiB
+    all_mb: float  # with all processes below it; shared pages count in each
+    done: float  # of the work, in its own unit
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Level:
+    """Memory of a phase of work, MiB."""
+
+    after_a_tenth: float  # median while the second tenth is done
+    at_the_end: float  # median while the last tenth is done
+    at_most: float
+    grown: float
+    allowed: float
+    # over the phase after its first tenth, per unit of work
+    mb_per_unit: tuple[float, float, float]  # and its interval
+    outcome: str  # bounded, or what it is instead
+
+
+def level(samples: Sequence[Sample], total: float) -> Level:
+    """What memory does in a phase of `total` units of work.
+
+    Raises:
+      ValueError: it was not looked at often enough.
+    """
+    done = np.array([sample.done for sample in samples]) / total
+    mb = np.array([sample.all_mb for sample in samples])
+    early, late = mb[(done >= 0.1) & (done <= 0.2)], mb[done >= 0.9]
+    watched = done >= 0.1
+    if not early.size or not late.size or watched.sum() < LEAST:
+        raise ValueError(f"{len(samples)} looks at memory: expected more in each tenth")
+    before, after = float(np.median(early)), float(np.median(late))
+    allowed = max(PHASE_SHARE * before, PHASE_MB)
+    grown = after - before
+    is_bounded = grown <= allowed
+    return Level(
+        after_a_tenth=before,
+        at_the_end=after,
+        at_most=float(mb.max()),
+        grown=grown,
+        allowed=allowed,
+        mb_per_unit=_slope(done[watched] * total, mb[watched]),
+        outcome="bounded" if is_bounded else f"grew by {grown:.0f} MiB",
+    )
+
+
+def _slope(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
+    """Slope and its interval; of some of the points where there are many."""
+    at = np.unique(np.linspace(0, x.size - 1, MOST).astype(int))
+    if np.ptp(x[at]) == 0.0:
+        return 0.0, 0.0, 0.0
+    found = np.asarray(stats.theilslopes(y[at], x[at]), np.float64)
+    slope, _, low, high = found.tolist()
+    return slope, low, high
+
+
+class Watch(threading.Thread):
+    """Looks at a process and all below it until told to stop or it is gone."""
+
+    def __init__(
+        self, pid: int, done: Callable[[], float], every_s: float = 1.0
+    ) -> None:
+        """Ready to `start`.
+
+        Args:
+          pid: of the process.
+          done: how much of the work is done.
+          every_s: between two looks.
+        """
+        super().__init__(daemon=True)
+        self.samples: list[Sample] = []
+        self._pid, self._done, self._every_s = pid, done, every_s
+        self._begin, self._stop_now = time.monotonic(), threading.Event()
+
+    def look(self) -> None:
+        """Look once, now."""
+        own = resident_of(self._pid)
+        below = sum(map(resident_of, below_of(self._pid)))
+        seconds = time.monotonic() - self._begin
+        self.samples.append(
+            Sample(seconds=seconds, mb=own, all_mb=own + below, done=self._done())
+        )
+
+    def run(self) -> None:
+        """Look again and again; a process that has ended has no memory."""
+        while not self._stop_now.wait(self._every_s) and resident_of(self._pid):
+            self.look()
+
+    def stop(self) -> None:
+        """No look after this."""
+        self._stop_now.set()
+        self.join()
+
+
+def thinned(samples: Sequence[Sample], most: int = 200) -> list[Sample]:
+    """At most so many, evenly over time, for a file."""
+    at = np.unique(np.linspace(0, len(samples) - 1, most).astype(int))
+    return [samples[place] for place in at] if samples else []
+
+
+def resident_of(pid: int) -> float:
+    """Resident memory of a process, MiB; 0 if there is none."""
+    try:
+        pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    except (OSError, IndexError):
+        return 0.0
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def below_of(pid: int) -> list[int]:
+    """Its children, and theirs."""
+    found = []
+    for task in Path(f"/proc/{pid}/task").glob("*/children"):
+        try:
+            direct = [int(word) for word in task.read_text().split()]
+        except OSError:
+            continue
+        found += direct + [inner for child in direct for inner in below_of(child)]
+    return found

@@ -1,0 +1,308 @@
+"""A long night in one process: does anything grow, or come out differently?
+
+    python -m benchmarks.reliability.soak --seconds=1200 --output=benchmarks/results
+
+Every round works in a new folder: a few small logs are written and imported, a reward
+is trained for an epoch, stopped after a checkpoint and resumed, exported, read again,
+ranked, driven over two cases of every family, judged by the gate and reported, with
+the pages of the ranking and of the data. After each round: resident memory, open
+files, threads, live arrays, programs compiled, seconds. The first quarter of the
+rounds is warm-up; after it memory may not rise by more than 5 % or 50 MiB, whichever
+is more (`memory.growth`), nothing else may rise at all, and every round's outputs have
+to be the first round's to the bit. Ends with 1 otherwise.
+
+`--leak=MB` keeps so much of every round: this file has to say so and end with 1.
+Writes soak.json after every tenth round and at the end.
+"""
+
+import contextlib
+import dataclasses
+import gc
+import json
+import os
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import jax
+from absl import flags
+
+from benchmarks.common import resident_mb, write
+from benchmarks.reliability.jobs import Facts, jobs, write_logs
+from benchmarks.reliability.memory import (
+    WARM_UP,
+    Growth,
+    count_growth,
+    memory_growth,
+)
+from benchmarks.reliability.small import SHARD_SCENES
+from experiments.common import provenance, run
+from rcirl_jax.autotune import Loop, TuneConfig
+from rcirl_jax.data import importing
+from rcirl_jax.data.config import CollectConfig
+from rcirl_jax.data.importing import ImportConfig
+from rcirl_jax.data.logs import Logs
+from rcirl_jax.data.store import open_dataset
+from rcirl_jax.evaluation.gate_types import GateConfig
+from rcirl_jax.evaluation.table import from_json
+from rcirl_jax.executor import Here
+from rcirl_jax.export.loading import open_reward
+from rcirl_jax.report.data_page import choose_rows, write_data_page
+from rcirl_jax.report.ranking_page import write_ranking_page
+from rcirl_jax.stages import digest, file_sha256
+from rcirl_jax.train.running import Running
+from rcirl_jax.train.state import TrainConfig
+
+_SECONDS = flags.DEFINE_float("seconds", 1200.0, "of the whole soak")
+_ROUNDS = flags.DEFINE_integer("rounds", 0, "most rounds; 0: as many as there is time")
+_LEAK = flags.DEFINE_float("leak", 0.0, "MiB kept of every round, to be found")
+_OUTPUT = flags.DEFINE_string("output", "benchmarks/results", "folder of the JSON")
+
+STRIDE_S = 2.0  # s between planning frames
+BATCH, CHECKPOINT_EVERY, STOP_AT = 8, 3, 5  # the resume repeats two steps
+CASES, DURATION_S = 2, 2.0  # of every family, and s of each; the gate wants 30
+DRAWN = 1  # scenes of the page of the data
+NIGHT_S = 8 * 3600.0
+COMPILED = "/jax/core/compile/backend_compile_duration"
+LEAST_ROUNDS = 6  # so that enough of them are left after the warm-up
+
+
+class _Stopped(Exception):
+    """The training was told to stop here."""
+
+
+@dataclasses.dataclass(kw_only=True)
+class Series:
+    """One value a round."""
+
+    rss_mb: list[float] = dataclasses.field(default_factory=list)
+    open_files: list[int] = dataclasses.field(default_factory=list)
+    threads: list[int] = dataclasses.field(default_factory=list)  # of the system
+    python_threads: list[int] = dataclasses.field(default_factory=list)
+    live_arrays: list[int] = dataclasses.field(default_factory=list)
+    objects: list[int] = dataclasses.field(default_factory=list)  # of Python
+    compiled: list[int] = dataclasses.field(default_factory=list)  # in the round
+    seconds: list[float] = dataclasses.field(default_factory=list)
+
+    def add(self, compiled: int, seconds: float) -> None:
+        """Look at this process at the end of a round."""
+        self.rss_mb.append(round(resident_mb(), 1))
+        self.open_files.append(len(os.listdir("/proc/self/fd")))
+        self.threads.append(len(os.listdir("/proc/self/task")))
+        self.python_threads.append(threading.active_count())
+        self.live_arrays.append(len(jax.live_arrays()))
+        self.objects.append(len(gc.get_objects()))
+        self.compiled.append(compiled)
+        self.seconds.append(round(seconds, 2))
+
+
+@contextlib.contextmanager
+def compiles() -> Iterator[list[str]]:
+    """Names of the programs compiled inside the `with` block."""
+    found: list[str] = []
+
+    def listen(event: str, duration_secs: float, **kwargs: str | int) -> None:
+        del duration_secs
+        if event == COMPILED:
+            found.append(str(kwargs.get("fun_name", "")))
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        yield found
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+
+
+def _stop(step: int) -> None:
+    if step == STOP_AT:
+        raise _Stopped
+
+
+def _loop(facts: Mapping[str, object], running: Running) -> Loop:
+    """The tuning loop in the present folder."""
+    train = TrainConfig(batch_size=BATCH, epochs=1, positive="nearest")
+    return Loop(
+        folder=Path("run"),
+        config=TuneConfig(
+            train=train,
+            gate=GateConfig(),
+            suite="smoke",
+            cases=CASES,
+            duration_s=DURATION_S,
+        ),
+        executor=Here(),
+        running=running,
+        facts=facts,
+        say=lambda line: None,
+    )
+
+
+def _logs() -> Logs:
+    collect = CollectConfig(stride_s=STRIDE_S)
+    config = ImportConfig(format="csv", collect=collect)
+    return Logs(format="csv", input=Path("logs"), source=None, config=config)
+
+
+def _pages() -> None:
+    """The pages that draw with matplotlib."""
+    (data,) = Path("run").glob("dataset-*")
+    dataset = open_dataset(data)
+    rows = choose_rows(dataset.column("scene.tags"), DRAWN)
+    write_data_page(Path("data/index.html"), dataset, rows, "a night's data")
+    write_ranking_page(
+        Path("ranking.html"),
+        dataset=dataset,
+        rewards=[open_reward("run/weights.msgpack")],
+        report=from_json(_plain("ranking.json")),
+        workdir=None,  # whose curve is of rates, too
+    )
+
+
+def _plain(name: str) -> dict:
+    """A JSON of the run without what made it: names of files that hold times."""
+    body = json.loads((Path("run") / name).read_text())
+    del body["made_by"]
+    return body
+
+
+def _outputs() -> Facts:
+    """Digests of what has to be the same in every round."""
+    sha256 = open_reward("run/weights.msgpack").sha256  # of a body with its date
+    page = Path("ranking.html").read_text().replace(sha256, "")
+    return {
+        **jobs(Path())["autotune"].outcome(Path()),
+        **{name: digest(_plain(name)) for name in ("ranking.json", "verdict.json")},
+        "ranking.html": digest(page),
+        "data/index.html": file_sha256(Path("data/index.html")),
+    }
+
+
+def _work(facts: Mapping[str, object]) -> Facts:
+    """One round in the present folder: the digests of what came out."""
+    write_logs(Path("logs"))
+    # told to stop after a checkpoint, then again by the same command
+    with contextlib.suppress(_Stopped):
+        stopping = Running(checkpoint_every=CHECKPOINT_EVERY, on_step=_stop)
+        _loop(facts, stopping).until("train", _logs())
+    if not list(Path("run").glob("train-*/seed-0/checkpoints/*/sha256.json")):
+        raise ValueError("the training was to stop after a checkpoint")
+    _loop(facts, Running()).until("report", _logs())
+    _pages()
+    return _outputs()
+
+
+def one_round(facts: Mapping[str, object]) -> Facts:
+    """One round in a new folder, which is removed."""
+    new = tempfile.TemporaryDirectory(prefix="rcirl-soak-")
+    with new as folder, contextlib.chdir(folder):
+        return _work(facts)
+
+
+@dataclasses.dataclass(kw_only=True)
+class Soak:
+    """What came of it so far."""
+
+    series: Series = dataclasses.field(default_factory=Series)
+    first: Facts = dataclasses.field(default_factory=dict)
+    # round -> outputs that were not the first round's
+    different: dict[int, list[str]] = dataclasses.field(default_factory=dict)
+    late_programs: list[str] = dataclasses.field(default_factory=list)
+    kept: list[bytearray] = dataclasses.field(default_factory=list)  # of --leak
+
+    @property
+    def rounds(self) -> int:
+        """That are finished."""
+        return len(self.series.seconds)
+
+    def round(self, facts: Mapping[str, object]) -> None:
+        """One more."""
+        begin = time.monotonic()
+        with compiles() as programs:
+            made = one_round(facts)
+        if _LEAK.value:
+            self.kept.append(bytearray(os.urandom(int(_LEAK.value * 2**20))))
+        self.first = self.first or made
+        names = sorted(made.keys() | self.first.keys())
+        odd = [name for name in names if made.get(name) != self.first.get(name)]
+        if odd:
+            self.different[self.rounds + 1] = odd
+            print(f"different from the first round: {', '.join(odd)}", flush=True)
+        self.late_programs = programs
+        self.series.add(len(programs), time.monotonic() - begin)
+
+    def growths(self) -> dict[str, Growth]:
+        """Of every series that may not grow."""
+        series = self.series
+        counted = ("open_files", "threads", "python_threads", "live_arrays", "compiled")
+        return {
+            "rss_mb": memory_growth(series.rss_mb),
+            **{name: count_growth(getattr(series, name)) for name in counted},
+        }
+
+    def problems(self) -> list[str]:
+        """What a night must not do; nothing is good."""
+        found = [
+            f"{name} grew by {x.by:.1f} over {x.rounds} rounds"
+            for name, x in self.growths().items()
+            if x.grows
+        ]
+        return found + [
+            f"round {number}: different: {', '.join(names[:3])}"
+            for number, names in self.different.items()
+        ]
+
+
+def save(soak: Soak) -> list[str]:
+    """Write soak.json; the problems."""
+    growths, problems = soak.growths(), soak.problems()
+    seconds = soak.series.seconds
+    usual = sum(seconds[1:]) / max(len(seconds) - 1, 1)
+    rss, night = growths["rss_mb"], NIGHT_S / usual
+    result = {
+        "rounds": soak.rounds,
+        "seconds": round(sum(seconds), 1),
+        "warm_up_share": WARM_UP,
+        "outputs_compared": len(soak.first),
+        "outcome": "no growth" if not problems else problems[0],
+        "problems": problems,
+        "growth": growths,
+        # the slope carried on; not measured
+        "extrapolated_mb_in_8_hours": [
+            round(x * night, 1) for x in (rss.per_round, rss.low, rss.high)
+        ],
+        "programs_of_the_last_round": soak.late_programs,
+        "series": soak.series,
+    }
+    write("soak", result, _OUTPUT.value)
+    return problems
+
+
+def main() -> None:
+    """Rounds until the time is over."""
+    importing.SHARD_SCENES = SHARD_SCENES  # several shards a dataset
+    facts, soak = provenance(), Soak()
+    end, most = time.monotonic() + _SECONDS.value, _ROUNDS.value or 10**9
+    while soak.rounds < LEAST_ROUNDS or time.monotonic() < end:
+        if soak.rounds >= most:
+            break
+        soak.round(facts)
+        s = soak.series
+        print(
+            f"round {soak.rounds}: {s.seconds[-1]} s, {s.rss_mb[-1]} MiB, "
+            f"{s.open_files[-1]} files, {s.threads[-1]} threads, "
+            f"{s.live_arrays[-1]} arrays, {s.compiled[-1]} programs",
+            flush=True,
+        )
+        if soak.rounds % 10 == 0:
+            save(soak)
+    problems = save(soak)
+    print("\n".join(problems) or "no growth", flush=True)
+    if problems:
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    run(main)

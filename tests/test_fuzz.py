@@ -1,0 +1,142 @@
+"""Damaged files for every reader, a few; benchmarks.reliability.fuzz has more."""
+
+import json
+import random
+
+import pytest
+
+from benchmarks.reliability.fuzz import codecs, contract
+from benchmarks.reliability.fuzz.readers import READERS, shares
+from benchmarks.reliability.fuzz.trees import MAX_DEEP, deep, mutate_tree
+from rcirl_jax.data import preferences
+from rcirl_jax.errors import InputError
+from tests.commands import command
+
+FEW = ("apollo", "nuplan", "argoverse2", "l5", "interaction", "suite", "scenarios")
+
+
+def drawn(target, count, seed):
+    """Inputs of a target: mutated seeds."""
+    rng = random.Random(seed)
+    for _ in range(count):
+        index = rng.randrange(len(target.seeds))
+        content = codecs.mutate(target.seeds[index], target.forms[index], rng)
+        yield bytes([index]) + content
+
+
+def breaches(target, inputs):
+    """What the inputs break, each kind once."""
+    found = {}
+    for data in inputs:
+        target.put(data)
+        breach, _ = contract.verdict(target.read, target.names)
+        if breach is not None:
+            found.setdefault(breach.kind, breach.text)
+    return found
+
+
+@pytest.mark.parametrize("name", sorted(READERS))
+def test_a_reader_returns_or_says_one_line(name, tmp_path):
+    target = READERS[name].make(tmp_path / "made")
+    for index, content in enumerate(target.seeds):
+        target.put(bytes([index]) + content)
+        assert contract.verdict(target.read, target.names) == (None, None), index
+    count = 15 if name in FEW else 60
+    assert breaches(target, drawn(target, count, name)) == {}
+
+
+def test_another_exception_is_a_breach(tmp_path, monkeypatch):
+    """A planted defect: the trajectory's check lets a KeyError out."""
+
+    def planted(where, found):
+        return found["s"], found["l"]
+
+    monkeypatch.setattr(preferences, "_trajectory", planted)
+    target = READERS["preferences"].make(tmp_path / "made")
+    found = breaches(target, drawn(target, 60, 1))
+    assert any(kind.startswith(("KeyError", "TypeError")) for kind in found), found
+
+
+@pytest.mark.parametrize(
+    ("line", "kind"),
+    [
+        ("two\nlines of a.csv", "not one printable line"),
+        ("a.csv: \x1b[31m", "not one printable line"),
+        ("a.csv: " + "x" * 5000, "a line too long"),
+        ("field: 3: expected 4", "no file named"),
+        ("a.csv: field: 3: expected 4", None),
+    ],
+)
+def test_what_a_refusal_may_say(line, kind):
+    found = contract.refusal_breach(line, ["a.csv"])
+    assert (found and found.kind) == kind
+
+
+def test_errors_are_one_short_printable_line():
+    line = str(
+        InputError("a.csv: x: \x1b[0m\ud800\u2028\0 " + "9" * 9000 + ": expected")
+    )
+    assert contract.refusal_breach(line, ["a.csv"]) is None
+    assert line.startswith("a.csv: x: ?[0m?")
+    assert line.endswith(": expected")
+
+
+def test_places_outside_are_seen(tmp_path):
+    watch = contract.Watch(tmp_path / "own")
+    (tmp_path / "own").mkdir()
+    secret = tmp_path / "secret"
+    secret.write_text("x")
+    with watch:
+        (tmp_path / "own" / "fine").write_text("x")
+    assert watch.seen is None
+    for action, kind in (
+        (lambda: secret.read_text(), "read outside"),
+        (lambda: secret.write_text("y"), "written outside"),
+        (lambda: secret.unlink(), "os.remove"),
+    ):
+        with watch:
+            action()
+        assert watch.seen.kind == kind
+
+
+@pytest.mark.parametrize("form", sorted(codecs.CODECS))
+def test_codecs_take_any_bytes(form):
+    rng = random.Random(form)
+    for data in (b"", b"\0" * 40, b"{}", rng.randbytes(300)):
+        assert isinstance(codecs.mutate(data, form, rng), bytes)
+
+
+def test_trees_stay_trees():
+    rng = random.Random(3)
+    for _ in range(300):
+        json.dumps(mutate_tree({"a": [1, {"b": "c"}], "d": None}, rng))
+    depths = {_depth(deep(0, rng)) for _ in range(40)}
+    assert max(depths) == MAX_DEEP
+
+
+def _depth(value):
+    count = 0
+    while isinstance(value, list | dict):
+        value = value[0] if isinstance(value, list) else value["a"]
+        count += 1
+    return count
+
+
+def test_every_reader_has_its_share():
+    dealt = shares(list(READERS), 1_000_000)
+    assert sum(dealt.values()) >= 1_000_000
+    assert min(dealt.values()) >= 20_000
+
+
+@pytest.mark.slow
+@pytest.mark.multiprocess
+def test_the_command_writes_a_row_per_reader(tmp_path):
+    done = command(
+        "benchmarks.reliability.fuzz",
+        *("--readers=preferences,tfrecord", "--inputs=400", f"--output={tmp_path}"),
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    rows = json.loads((tmp_path / "fuzz.json").read_text())["rows"]
+    assert [row["reader"] for row in rows] == ["preferences", "tfrecord"]
+    assert sum(row["inputs"] for row in rows) >= 400
+    assert all(row["crashes"] == [] and row["mutator"] for row in rows)
