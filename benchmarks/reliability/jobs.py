@@ -21,6 +21,7 @@ from rcirl_jax.train.loop import restore_run
 
 Facts = Mapping[str, str]  # what came out -> digest
 LOGS, CARS, SECONDS = 8, 4, 20.0
+SAID = ("ranking.json", "verdict.json")  # what a tuning run says
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -148,12 +149,13 @@ def _of_tuning(folder: Path) -> Facts:
     """Dataset, weights, ranking, drives, verdict."""
     run = folder / "run"
     (data,) = run.glob("dataset-*")
-    names = (
-        *("ranking.json", "ranking.txt", "verdict.json"),
-        *("suite/metrics.npz", "suite/cases.csv"),
-    )
+    names = ("ranking.txt", "suite/metrics.npz", "suite/cases.csv")
+    said = {name: json.loads((run / name).read_text()) for name in SAID}
+    for body in said.values():
+        del body["made_by"]["weights_sha256"]  # of files that say when they were made
     return {
         **{name: file_sha256(run / name) for name in names},
+        **{name: digest(body) for name, body in said.items()},
         **{f"dataset/{name}": sha for name, sha in _files(data).items()},
         **_weights_below(run),
     }

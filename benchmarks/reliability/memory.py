@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import stats
 
 WARM_UP = 0.25  # share of a series before it is watched: programs, pools, buffers
@@ -38,7 +39,7 @@ class Growth:
     grows: bool
 
 
-def growth(values: Sequence[float], allowed: float) -> Growth:
+def growth(values: ArrayLike, allowed: float) -> Growth:
     """Whether a series of one value a round grows.
 
     Args:
@@ -48,7 +49,7 @@ def growth(values: Sequence[float], allowed: float) -> Growth:
     Raises:
       ValueError: too few rounds to tell.
     """
-    watched = np.asarray(values[int(WARM_UP * len(values)) :], np.float64)
+    watched = _watched(values)
     if watched.size < LEAST:
         raise ValueError(f"{watched.size} rounds: expected {LEAST} after the warm-up")
     slope, low, high = _slope(np.arange(watched.size), watched)
@@ -64,18 +65,24 @@ def growth(values: Sequence[float], allowed: float) -> Growth:
     )
 
 
-def memory_growth(values: Sequence[float]) -> Growth:
+def memory_growth(values: ArrayLike) -> Growth:
     """Of a series of MiB: more than `SHARE` of it and more than `MB` is growth."""
-    level = float(np.median(values[int(WARM_UP * len(values)) :]))
-    return growth(values, max(SHARE * level, MB))
+    usual = float(np.median(_watched(values)))
+    return growth(values, max(SHARE * usual, MB))
 
 
-def count_growth(values: Sequence[float]) -> Growth:
+def count_growth(values: ArrayLike) -> Growth:
     """Of a series of numbers of things: one more over the watched rounds is growth.
 
     Half a thing is allowed, so that a number which now and then is one higher is none.
     """
     return growth(values, 0.5)
+
+
+def _watched(values: ArrayLike) -> np.ndarray:
+    """Without the warm-up."""
+    every = np.asarray(values, np.float64)
+    return every[int(WARM_UP * every.size) :]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -97,8 +104,8 @@ class Level:
     at_most: float
     grown: float
     allowed: float
-    # over the phase after its first tenth, per unit of work
-    mb_per_unit: tuple[float, float, float]  # and its interval
+    # per unit of work in the second half, when buffers and pools are full; interval
+    mb_per_unit: tuple[float, float, float]
     outcome: str  # bounded, or what it is instead
 
 
@@ -111,8 +118,8 @@ def level(samples: Sequence[Sample], total: float) -> Level:
     done = np.array([sample.done for sample in samples]) / total
     mb = np.array([sample.all_mb for sample in samples])
     early, late = mb[(done >= 0.1) & (done <= 0.2)], mb[done >= 0.9]
-    watched = done >= 0.1
-    if not early.size or not late.size or watched.sum() < LEAST:
+    half = done >= 0.5
+    if not early.size or not late.size or half.sum() < LEAST:
         raise ValueError(f"{len(samples)} looks at memory: expected more in each tenth")
     before, after = float(np.median(early)), float(np.median(late))
     allowed = max(PHASE_SHARE * before, PHASE_MB)
@@ -124,7 +131,7 @@ def level(samples: Sequence[Sample], total: float) -> Level:
         at_most=float(mb.max()),
         grown=grown,
         allowed=allowed,
-        mb_per_unit=_slope(done[watched] * total, mb[watched]),
+        mb_per_unit=_slope(done[half] * total, mb[half]),
         outcome="bounded" if is_bounded else f"grew by {grown:.0f} MiB",
     )
 

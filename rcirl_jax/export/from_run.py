@@ -196,6 +196,7 @@ def _provenance(
         "versions": run.get("versions", {}),
         **{name: run.get(name) for name in ("machine", "cpu", "cores")},
         **{name: run.get(name) for name in ("device", "devices")},
+        **{k: run[k] for k in ("code_sha256", "environment") if k in run},
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "steps": int(state.step),
         "mode": config.sampler.mode,

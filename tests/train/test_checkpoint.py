@@ -46,7 +46,7 @@ def saved(state, tmp_path_factory):
     for step in (1, 2, 3, 4):
         checkpoints.save(at(state, step), {"epoch": 0, "index": step})
     checkpoints.close()
-    assert sorted(x.name for x in folder.iterdir()) == ["2", "3", "4"]
+    assert sorted(x.name for x in folder.iterdir()) == [SEALED, "2", "3", "4"]
     assert KEEP_LATEST == 3
     return folder
 
@@ -218,5 +218,5 @@ def test_no_room_is_one_line_and_room_is_taken_when_there_is_some(saved, tmp_pat
     assert done.returncode == 0, done.stderr
     (line,) = done.stderr.strip().splitlines()
     assert line.startswith(f"{folder}: cannot be written: [Errno 27] File too large")
-    assert sorted(x.name for x in folder.iterdir()) == ["3", "4", "5"]
+    assert sorted(x.name for x in folder.iterdir()) == [SEALED, "3", "4", "5"]
     assert Checkpoints(folder, read_only=True).latest_step() == 5
