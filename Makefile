@@ -167,7 +167,7 @@ audit: build/tools/.installed
 
 # Every row of docs/reliability.md; `MINUTES=2` leaves out what takes longer
 reliability: setup
-	$(BIN)/python $(PIP) install --editable '.[fuzz]'
+	$(BIN)/python $(PIP) install --no-deps 'atheris>=3.0'
 	$(BIN)/python -m benchmarks.reliability.table $(if $(MINUTES),--minutes=$(MINUTES)) --output=$(RESULTS)
 
 # The C++ reader under libFuzzer; needs clang and its runtime

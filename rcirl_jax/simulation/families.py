@@ -6,6 +6,7 @@ a misspelt one does not silently keep its default.
 
 import dataclasses
 import functools
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -235,11 +236,11 @@ def _known(path: Path, where: str, row: Mapping, allowed: set[str]) -> None:
             )
 
 
-def _is_numbers(value: object) -> bool:
+def _is_numbers(value: object, largest: float = LARGEST) -> bool:
     return isinstance(value, list) and all(
         isinstance(x, int | float)
         and not isinstance(x, bool)
-        and -LARGEST <= x <= LARGEST
+        and -largest <= x <= largest
         for x in value
     )
 
@@ -268,7 +269,7 @@ def _parameter(path: Path, name: str, row: Any) -> Parameter:  # noqa: ANN401
             raise InputError(f"{where}: {key}: missing: expected a text")
     clip = row.get("clip")
     if clip is not None and (
-        not _is_numbers(clip) or len(clip) != 2 or clip[0] > clip[1]
+        not _is_numbers(clip, math.inf) or len(clip) != 2 or clip[0] > clip[1]
     ):
         raise InputError(f"{where}: clip: {clip}: expected [low, high]")
     return Parameter(

@@ -6,6 +6,7 @@ from rcirl_jax.data.joined import Demonstrations
 from rcirl_jax.data.rows import refuse_scenes, scene_name, unusable_leaves
 from rcirl_jax.errors import InputError
 from rcirl_jax.features import FeatureMap, feature_map
+from rcirl_jax.train.bad_values import bad_facts
 from rcirl_jax.train.state import FeatureBatch
 from rcirl_jax.train.step import StepMetrics
 from rcirl_jax.types import Demonstration
@@ -68,4 +69,5 @@ def check_features(
     ]
     names = (f"feature {name}" for name in feature_map(preset).names)
     found = {name: np.invert(fine) for name, fine in zip(names, finite, strict=True)}
+    found[FACTS] = np.asarray(bad_facts(made))[:, 0]
     refuse_scenes("train", rows, stored, found)

@@ -561,6 +561,9 @@ def test_options(tmp_path):
     assert (ego.t.size, ego.length, ego.width) == (11, 4.0, 1.7)
     assert ego.x[0] == pytest.approx(-fixture.AHEAD)
     assert found.default_speed_limit == 8.0
+    # a channel or a list of them, whichever the packaged file has
+    for topics in ({"localization": ["/apollo/localization/pose"]}, {"routing": "/x"}):
+        assert only(tmp_path, ego_only(), topics=topics).tracks
     for bad in (
         *({"rate_hz": 0}, {"ego": 1}, {"unknown": "x"}, {"topics": 3}),
         {"window_s": 0},

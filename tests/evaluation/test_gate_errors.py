@@ -15,6 +15,7 @@ from rcirl_jax.evaluation.gate_errors import (
     as_driven,
     clustered_rate,
     equal_pairs,
+    every_pair,
     format_errors,
     redrawn,
     swapped,
@@ -112,6 +113,18 @@ def test_one_fault_of_either_refuses_half_of_the_swaps():
     assert swaps.rate("refused") == swaps.rate("safety")
 
 
+def test_every_row_against_every_other():
+    rows = {"good": drives(0), "slow": slow_and_jerky(1), "again": drives(0)}
+    found = every_pair(pair(drives(0), drives(0)), rows, GateConfig())
+    said = {(one["candidate"], one["incumbent"]): one for one in found}
+    assert len(said) == 6
+    assert said["good", "slow"]["decision"] == "ship"
+    assert said["slow", "good"]["decision"] == "do not ship"
+    assert said["good", "again"]["decision"] == "no difference"
+    assert said["slow", "good"]["way"] == pytest.approx(0.5, abs=0.02)
+    assert said["good", "slow"]["cases_with_own_fault"] == [0, 0]
+
+
 def test_draws_of_one_suite_count_for_less_if_they_agree():
     """Ten suites that each say one thing ten times are ten draws, not a hundred."""
     agree = np.repeat(np.arange(10) < 3, 10).reshape(10, 10)
@@ -121,7 +134,10 @@ def test_draws_of_one_suite_count_for_less_if_they_agree():
     assert (low, high) == pytest.approx(exact, abs=0.03)
     apart = np.tile(np.arange(10) < 3, (10, 1))
     assert clustered_rate(apart)[1:] == pytest.approx(clopper_pearson(30, 100))
-    assert clustered_rate(np.zeros((2, 2), bool))[:2] == (0.0, 0.0)
+    none = clustered_rate(np.zeros((12, 25), bool))
+    assert none == pytest.approx((0.0, *clopper_pearson(0, 12)))
+    one = clustered_rate(np.zeros((1, 25), bool))
+    assert one == pytest.approx((0.0, *clopper_pearson(0, 25)))
 
 
 def test_bad_input_is_one_line():

@@ -102,6 +102,10 @@ def path_option(spec: Mapping, key: str) -> str:
     return value
 
 
+# options of several types, which their readers check
+CHECKED = ("pattern", "topics")
+
+
 def check_types(spec: Mapping, packaged: Mapping) -> None:
     """Options have the types of those that the packaged TOML has.
 
@@ -111,7 +115,7 @@ def check_types(spec: Mapping, packaged: Mapping) -> None:
       InputError: the first one that has another.
     """
     for key, value in spec.items():
-        if key in packaged and key != "pattern":
+        if key in packaged and key not in CHECKED:
             _check_type(f"source TOML: {key}", value, packaged[key])
 
 
