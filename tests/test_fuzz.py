@@ -10,9 +10,16 @@ from benchmarks.reliability.fuzz.readers import READERS, shares
 from benchmarks.reliability.fuzz.trees import MAX_DEEP, deep, mutate_tree
 from rcirl_jax.data import preferences
 from rcirl_jax.errors import InputError
+from rcirl_jax.features import mapping
 from tests.commands import command
 
 FEW = ("apollo", "nuplan", "argoverse2", "l5", "interaction", "suite", "scenarios")
+
+
+@pytest.fixture(autouse=True)
+def own_presets(monkeypatch):
+    """A target points the reader of presets to its folder: not beyond a test."""
+    monkeypatch.setattr(mapping, "spec_root", mapping.spec_root)
 
 
 def drawn(target, count, seed):

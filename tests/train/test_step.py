@@ -125,7 +125,8 @@ def test_cached_features_give_the_same_step():
 
 
 def test_runs_that_differ_in_other_settings_share_the_program_of_features():
-    key, made = jax.random.key(0), cached()
+    key = jax.random.key(0)
+    made = featurised(init_state(CONFIG, normaliser()).key, batch(), CONFIG)
     size = _featurised._cache_size()
     other = dataclasses.replace(CONFIG, seed=7, learning_rate=0.1, loss="logistic")
     same = featurised(init_state(CONFIG, normaliser()).key, batch(), other)

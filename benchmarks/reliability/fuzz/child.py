@@ -39,6 +39,7 @@ class Session:
     def __init__(self, name: str, folder: Path, seed: int) -> None:
         """Make the reader's target and remember what earlier processes found."""
         readers = importlib.import_module(f"{PACKAGE}.readers")
+        importlib.import_module(f"{PACKAGE}.logs").parse_once()
         self._codecs = importlib.import_module(f"{PACKAGE}.codecs")
         self._contract = importlib.import_module(f"{PACKAGE}.contract")
         work = folder / "work" / str(os.getpid())

@@ -43,8 +43,12 @@ def _parsed(path: Path, content: bytes) -> dict:
     return load_toml(path)
 
 
-# parsing the same sound TOML again and again would take most of the time
-importers.load_toml = lambda path: _parsed(path, path.read_bytes())
+def parse_once() -> None:
+    """In a process that does nothing else, parse the same sound TOML once.
+
+    Again and again, it would take most of the time.
+    """
+    importers.load_toml = lambda path: _parsed(path, path.read_bytes())
 
 
 def log_target(
