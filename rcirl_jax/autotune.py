@@ -14,7 +14,6 @@ RUN/stages.json        what made what (`stages`)
 
 import dataclasses
 import functools
-import itertools
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -23,7 +22,7 @@ from typing import Any
 from rcirl_jax.data.importers.files import listing
 from rcirl_jax.data.importing import import_parts
 from rcirl_jax.data.logs import Logs
-from rcirl_jax.data.parts import items, parts_of, recordings_in
+from rcirl_jax.data.parts import parts_of
 from rcirl_jax.data.preferences import read_preferences
 from rcirl_jax.data.store import Dataset, open_dataset
 from rcirl_jax.errors import InputError
@@ -43,12 +42,11 @@ from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.export.spread import SuiteJob
 from rcirl_jax.export.sweep import SWEEP, read_sweep
+from rcirl_jax.report.recorded_replays import recorded_replays
 from rcirl_jax.report.replays import make_replays
 from rcirl_jax.report.tuning_page import TuningReport, write_tuning_page
 from rcirl_jax.sampling import SamplerConfig
-from rcirl_jax.simulation.recorded_config import RecordedConfig
 from rcirl_jax.simulation.rows import BASELINES
-from rcirl_jax.simulation.suite import CaseSet, recorded_set
 from rcirl_jax.stages import Stages, code_sha256, digest, file_sha256
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.running import Running
@@ -64,8 +62,6 @@ STALE = {
 }
 RIVALS = ("hand-set", "IDM", "random weights")
 REPLAYS = 6  # cases to play in the report
-# recorded drives to play beside them, of the first so many inputs, at most so long
-RECORDED, INPUTS, RECORDED_S = 2, 4, 20.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -350,8 +346,9 @@ class Loop:
         shown = verdict.look_at[:REPLAYS] or job.cases().ids[:2]
         every = self.config.plan_every
         replays = make_replays(drivers, job.cases(), shown, every)
-        if isinstance(given, Logs) and (cases := _recorded(given)):
-            replays += make_replays(drivers, cases, cases.ids, every)
+        if isinstance(given, Logs):
+            parts = parts_of(given.format, given.input, given.source)
+            replays += recorded_replays(drivers, parts, every)
         sweep = self.config.sweep
         seed = int(rewards[CANDIDATE].provenance["seed"])
         write_tuning_page(
@@ -413,16 +410,3 @@ class Loop:
             "refs": digest([ref.id for ref in job.refs]),
             "weights": [file_sha256(Path(file)) for file in job.weights],
         }
-
-
-def _recorded(logs: Logs) -> CaseSet | None:
-    """A few drives of the logs, for the human to be seen beside the others."""
-    parts = parts_of(logs.format, logs.input, logs.source)[:INPUTS]
-    config = RecordedConfig(max_cases=RECORDED, max_duration_s=RECORDED_S)
-    for item in itertools.islice(items(parts, 1), INPUTS):
-        try:
-            found = (recording for _, recording in recordings_in(item))
-            return recorded_set(found, config)
-        except InputError:
-            continue  # no drive of it can be driven again
-    return None

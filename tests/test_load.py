@@ -180,12 +180,12 @@ def test_a_slice_of_an_import_says_what_the_whole_would_take(tmp_path):
 
 @pytest.mark.slow
 def test_a_soak_repeats_to_the_bit_and_finds_a_leak(tmp_path):
-    flags = ("--seconds=1", "--rounds=8", "--leak=60", f"--output={tmp_path}")
+    flags = ("--seconds=1", "--leak=60", f"--output={tmp_path}")  # the least rounds
     done = command("benchmarks.reliability.soak", *flags)
     assert done.returncode == 1, done.stderr[-2000:]
     made = json.loads((tmp_path / "soak.json").read_text())
     assert made["outcome"].startswith("rss_mb grew by ")
-    assert made["rounds"] == 8
-    assert all(len(values) == 8 for values in made["series"].values())
+    assert made["rounds"] == 6
+    assert all(len(values) == 6 for values in made["series"].values())
     assert made["outputs_compared"] > 10
     assert not [x for x in made["problems"] if "different" in x]

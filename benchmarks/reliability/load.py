@@ -100,9 +100,6 @@ def whole(found: Level) -> dict:
     return {k: round(v, 1) if isinstance(v, float) else v for k, v in shown.items()}
 
 
-# ------------------------------------------------------------------------- the suite
-
-
 def refs_of(count: int) -> list[CaseRef]:
     """The first cases of the whole catalogue of seed 0, 1, ... in turn."""
     refs: list[CaseRef] = []
@@ -194,9 +191,6 @@ def suite() -> list[str]:
     write("load_suite", result, _OUTPUT.value)
     odd = {k: x["outcome"] for k, x in watched.rows.items() if x["outcome"] != BOUNDED}
     return [f"suite: {name}: {outcome}" for name, outcome in odd.items()]
-
-
-# ------------------------------------------------------------------------ the import
 
 
 def write_log(path: Path, rows: int) -> int:
