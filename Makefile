@@ -32,7 +32,7 @@ QUICKLY = -m pytest -q -m "not slow and not dataset" $(QUICK)
 # Tests with the compiler as users have it: what rounds, and what is read in programs. For the
 # rest, whose programs are large, XLA compiles in half the time to slower ones; by hand,
 # pytest has the users' compiler for all
-EXACT := data export features geometry onboard reward sampling train
+EXACT := data evaluation export features geometry onboard reward sampling train
 QUICK_XLA := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false
 TEST = $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal -m "not slow and not dataset"
 
