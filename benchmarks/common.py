@@ -127,3 +127,19 @@ def stored_scenes(
     rest: dict = {"rate_hz": [10.0], "sources": [], "quality": {}, "import": {}}
     writer.finish({**names, **rest, "splits": {"train": ["made"]}})
     return open_dataset(folder, verify=False)
+
+
+# source TOML of generated CSV logs: one straight lane
+LANE_TOML = """
+source = "generated"
+licence = "none needed"
+[columns]
+t = "t"
+id = "id"
+x = "x"
+y = "y"
+[[lanes]]
+id = "a"
+points = [[-50.0, 0.0], [6000.0, 0.0]]
+width = 4.0
+"""

@@ -19,7 +19,8 @@ from pathlib import Path
 import numpy as np
 from absl import flags
 
-from benchmarks.common import write
+from benchmarks.common import LANE_TOML, write
+from benchmarks.reliability.memory import below_of, resident_of
 from experiments.common import run
 
 _SIZE = flags.DEFINE_float("gigabytes", 2.0, "size of the generated log")
@@ -30,19 +31,6 @@ _OUTPUT = flags.DEFINE_string("output", "benchmarks/results", "folder of the JSO
 
 CARS = 100  # at any time
 STAY_S = 60.0  # s that a car is seen
-TOML = """
-source = "generated"
-licence = "none needed"
-[columns]
-t = "t"
-id = "id"
-x = "x"
-y = "y"
-[[lanes]]
-id = "a"
-points = [[-50.0, 0.0], [6000.0, 0.0]]
-width = 4.0
-"""
 
 
 def write_log(path: Path, size: float) -> int:
@@ -71,38 +59,19 @@ def write_log(path: Path, size: float) -> int:
 
 
 class Watch(threading.Thread):
-    """Largest resident memory of a process and of it with all its children."""
+    """Largest resident memory of a process and of it with all its children, MiB."""
 
     def __init__(self, pid: int) -> None:
         super().__init__(daemon=True)
-        self.pid, self.one, self.all = pid, 0, 0
+        self.pid, self.one, self.all = pid, 0.0, 0.0
 
     def run(self) -> None:
         """Look ten times a second until the process is gone."""
         while Path(f"/proc/{self.pid}").exists():
-            own = _resident(self.pid)
+            own = resident_of(self.pid)
             self.one = max(self.one, own)
-            self.all = max(self.all, own + sum(map(_resident, _children(self.pid))))
+            self.all = max(self.all, own + sum(map(resident_of, below_of(self.pid))))
             time.sleep(0.1)
-
-
-def _children(pid: int) -> list[int]:
-    found = []
-    for task in Path(f"/proc/{pid}/task").glob("*/children"):
-        try:
-            direct = [int(word) for word in task.read_text().split()]
-        except OSError:
-            continue
-        found += direct + [inner for child in direct for inner in _children(child)]
-    return found
-
-
-def _resident(pid: int) -> int:
-    try:
-        pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-    except (OSError, IndexError):
-        return 0
-    return pages * os.sysconf("SC_PAGE_SIZE")
 
 
 def main() -> None:
@@ -110,7 +79,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(dir=_FOLDER.value) as place:
         folder = Path(place)
         log, toml = folder / "log.csv", folder / "log.toml"
-        toml.write_text(TOML)
+        toml.write_text(LANE_TOML)
         rows = write_log(log, _SIZE.value * 2**30)
         print(f"{log.stat().st_size / 2**30:.2f} GiB, {rows:,} rows", flush=True)
         begin = time.monotonic()
@@ -136,8 +105,8 @@ def main() -> None:
             "seconds": seconds,
             "scenes_per_s": scenes / seconds,
             "rows_per_s": rows / seconds,
-            "peak_gib_main": watch.one / 2**30,
-            "peak_gib_with_workers": watch.all / 2**30,
+            "peak_gib_main": watch.one / 2**10,
+            "peak_gib_with_workers": watch.all / 2**10,
             "workers": _WORKERS.value,
         }
     print(json.dumps(found, indent=2))

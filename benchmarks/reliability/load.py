@@ -33,7 +33,7 @@ from pathlib import Path
 import numpy as np
 from absl import flags
 
-from benchmarks.common import resident_mb, untrained, write
+from benchmarks.common import LANE_TOML, resident_mb, untrained, write
 from benchmarks.reliability.memory import Level, Sample, Watch, level, thinned
 from experiments.common import provenance, run
 from rcirl_jax.data.files import MARK
@@ -78,20 +78,7 @@ LEAST_SHARDS = 3  # seen one after the other, so that there is a rate
 SLICE_SHARDS = 15  # at least, so that every tenth of a slice is seen
 BOUNDED = "bounded"
 # read in pieces from the first byte on, so that a slice is read as the whole is
-TOML = """
-source = "generated"
-licence = "none needed"
-long_bytes = 1
-[columns]
-t = "t"
-id = "id"
-x = "x"
-y = "y"
-[[lanes]]
-id = "a"
-points = [[-50.0, 0.0], [6000.0, 0.0]]
-width = 4.0
-"""
+TOML = "long_bytes = 1\n" + LANE_TOML
 
 
 def whole(found: Level) -> dict:
