@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import json
+import shutil
 import subprocess
 import sys
 
@@ -233,7 +234,8 @@ def test_the_compiled_scorer_is_the_readers(finished):
 
 
 def test_a_finished_group_is_not_trained_again(data, finished, tmp_path, monkeypatch):
-    folder, report = finished
+    first, report = finished
+    folder = shutil.copytree(first, tmp_path / "again")
     trained = []
     real = folders.train_group
 
