@@ -1,13 +1,18 @@
 """Every row of docs/reliability.md by its command.
 
-    python -m benchmarks.reliability.table [--minutes=5] [--rows=guard,SIGTERM]
+    python -m benchmarks.reliability.table [--minutes=5] [--rows=guard,SIGTERM] [--anew]
 
 Runs the commands of the page's tables in their order, one at a time, and writes
-reliability.json: exit status, seconds and the last line said. Exit status 1 if one
-failed. `--minutes` leaves out rows that say that they take longer, and names them.
+reliability.json: exit status, seconds and the last line said, by row. Exit status 1 if
+one failed. `--minutes` leaves out rows that say that they take longer, and names them.
+A row that came out as stated with this very code is not run again, so that four hours
+may be several evenings; `--anew` runs all.
 """
 
 import dataclasses
+import datetime
+import json
+import os
 import re
 import shlex
 import subprocess
@@ -18,15 +23,20 @@ from pathlib import Path
 from absl import flags
 
 from benchmarks.common import write
-from experiments.common import run
+from experiments.common import git_commit, run
 from rcirl_jax.errors import InputError
+from rcirl_jax.stages import digest, file_sha256
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "reliability.md"
 NOT_RUN = 77  # status of a row whose tests were skipped, in part or all
+# what a row's outcome depends on, below the root
+SOURCES = ("rcirl_jax", "experiments", "benchmarks", "tests", "data_specs", "onboard")
+SUFFIXES = (".py", ".toml", ".hpp", ".cpp", ".lock")
 CELLS = ("fault", "injected", "count", "outcome", "minutes", "command")
 _MINUTES = flags.DEFINE_float("minutes", None, "longest row that is run")
 _ROWS = flags.DEFINE_list("rows", None, "words of the first column; only such rows")
+_ANEW = flags.DEFINE_bool("anew", False, "run what came out as stated before, too")
 _OUTPUT = flags.DEFINE_string("output", "benchmarks/results", "folder of the JSON")
 
 
@@ -78,9 +88,17 @@ def words(command: str) -> list[str]:
     return [*own.get(first, [first]), *rest]
 
 
+def code_sha256() -> str:
+    """Of all sources, tests, pins and the Makefile; not of the documentation."""
+    files = [ROOT / "Makefile", ROOT / "pyproject.toml"]
+    for folder in (*SOURCES, "requirements"):
+        files += [x for x in (ROOT / folder).rglob("*") if x.suffix in SUFFIXES]
+    return digest({str(x.relative_to(ROOT)): file_sha256(x) for x in files})
+
+
 def ran(row: Row) -> dict:
     """What came of one row."""
-    begin = time.monotonic()
+    begin, load = time.monotonic(), os.getloadavg()[0]
     done = subprocess.run(
         words(row.command), cwd=ROOT, text=True, capture_output=True, check=False
     )
@@ -94,12 +112,30 @@ def ran(row: Row) -> dict:
         "status": status,
         "seconds": round(time.monotonic() - begin, 1),
         "said": last,
+        "load_before": round(load, 2),
+        "date": datetime.date.today().isoformat(),
+    }
+
+
+def as_stated_before(path: Path, code: str) -> dict[tuple[str, str], dict]:
+    """The rows of a result file that came out as stated with this code."""
+    try:
+        rows = json.loads(path.read_text())["rows"]
+    except FileNotFoundError:
+        return {}
+    except (ValueError, KeyError, TypeError) as error:
+        expected = "expected a result of this command"
+        raise InputError(f"{path}: {expected}: {error}") from error
+    return {
+        (row["fault"], row["command"]): row
+        for row in rows
+        if row["status"] == 0 and row.get("code_sha256") == code
     }
 
 
 def main() -> None:
     """The page's rows, one after the other."""
-    found, results = rows_of(PAGE.read_text()), []
+    found, code, commit = rows_of(PAGE.read_text()), code_sha256(), git_commit()
     wanted = [
         row
         for row in found
@@ -108,17 +144,29 @@ def main() -> None:
     if not wanted:
         raise InputError(f"--rows: {_ROWS.value}: no row of {PAGE.name} has the words")
     most = float("inf") if _MINUTES.value is None else _MINUTES.value
+    path = Path(_OUTPUT.value) / "reliability.json"
+    keys = [(row.fault, row.command) for row in found]
+    done = as_stated_before(path, code)
     for row in wanted:
+        key = (row.fault, row.command)
         if row.minutes > most:
             print(f"left out, {row.minutes:g} minutes: {row.fault}")
             continue
+        if key in done and not _ANEW.value:
+            print(f"as stated before, with this code: {row.fault}")
+            continue
         print(f"{row.fault}: {row.command}", flush=True)
-        results.append(ran(row))
-        good = "as stated" if results[-1]["status"] == 0 else "NOT as stated"
-        print(f"    {good}, {results[-1]['seconds']} s: {results[-1]['said']}")
-        write("reliability", {"rows": results}, _OUTPUT.value)
-    failed = [one["fault"] for one in results if one["status"] != 0]
-    print(f"{len(results)} rows, {len(failed)} not as stated: {', '.join(failed)}")
+        done[key] = ran(row) | {"code_sha256": code, "git_commit": commit}
+        good = "as stated" if done[key]["status"] == 0 else "NOT as stated"
+        print(f"    {good}, {done[key]['seconds']} s: {done[key]['said']}", flush=True)
+        rows = [done[one] for one in keys if one in done]
+        not_run = [one[0] for one in keys if one not in done]
+        write("reliability", {"rows": rows, "not_run": not_run}, _OUTPUT.value)
+    failed = [fault for (fault, _), row in done.items() if row["status"] != 0]
+    print(
+        f"{len(done)} of {len(found)} rows, {len(failed)} not as stated: "
+        f"{', '.join(failed)}"
+    )
     sys.exit(1 if failed else 0)
 
 

@@ -1,9 +1,12 @@
 """docs/reliability.md: every row has a command, and what it names is there."""
 
+import json
 import re
 import sys
 
 import pytest
+from absl import flags
+from absl.testing import flagsaver
 
 from benchmarks.reliability import table
 from benchmarks.reliability.table import Row, rows_of, words
@@ -62,3 +65,59 @@ def test_what_came_of_a_row(monkeypatch, tmp_path):
     bad = table.ran(Row(fault="b", minutes=1, command='python -c "assert 0"'))
     assert bad["status"] == 1
     assert bad["said"].startswith("AssertionError")
+
+
+def page(*commands):
+    """A page of one row a command."""
+    return "\n".join(f"| {x} | by hand | 1 | 0 | 1 | `{x}` |" for x in commands)
+
+
+@pytest.fixture
+def rows(monkeypatch, tmp_path):
+    """(a function of pages and flags that runs the rows; the rows run by it)."""
+    seen, real = [], table.ran
+    monkeypatch.setattr(table, "PAGE", tmp_path / "page.md")
+    monkeypatch.setattr(table, "ran", lambda row: seen.append(row.fault) or real(row))
+    flags.FLAGS(["table"])
+
+    def go(text, **given):
+        table.PAGE.write_text(text)
+        seen.clear()
+        saved = flagsaver.flagsaver(output=str(tmp_path), **given)
+        with saved, pytest.raises(SystemExit) as ended:
+            table.main()
+        result = json.loads((tmp_path / "reliability.json").read_text())
+        return ended.value.code, [*seen], result
+
+    return go
+
+
+@pytest.mark.multiprocess
+def test_what_came_out_as_stated_is_not_run_again(rows, monkeypatch):
+    status, seen, result = rows(page("true", "false"))
+    assert (status, seen) == (1, ["true", "false"])
+    assert [row["status"] for row in result["rows"]] == [0, 1]
+    status, seen, result = rows(page("true", "false", "make --version"), rows=["a"])
+    assert (status, seen) == (1, ["false", "make --version"])
+    assert [row["fault"] for row in result["rows"]] == [
+        "true",
+        "false",
+        "make --version",
+    ]
+    status, seen, result = rows(page("true", "make --version"), anew=True, minutes=0.5)
+    assert (status, seen) == (0, [])
+    status, seen, result = rows(
+        page("true", "make --version"), anew=True, rows=["true"]
+    )
+    assert (status, seen) == (0, ["true"])
+    assert len(result["rows"]) == 2
+    monkeypatch.setattr(table, "code_sha256", lambda: "other")
+    status, seen, result = rows(page("true", "make --version"), rows=["true"])
+    assert seen == ["true"]
+    assert result["not_run"] == ["make --version"]
+
+
+def test_a_result_of_something_else_is_one_line(tmp_path):
+    (tmp_path / "reliability.json").write_text("[]")
+    with pytest.raises(InputError, match=r"reliability\.json: expected a result of"):
+        table.as_stated_before(tmp_path / "reliability.json", "")
