@@ -5,21 +5,23 @@
     python -m experiments.convert_weights --hand_weights=TUNED --yaml=FILE
 
 --onnx and --jax_export need the extra [export]. Each form scores as the file does;
-only weights.msgpack carries samples that a reader checks itself against.
+only weights.msgpack carries samples that a reader checks itself against. FILE.json
+beside each says which weights it is of, what trained them and what wrote it.
 """
 
 from pathlib import Path
 
 from absl import flags
 
-from experiments.common import run
+from experiments.common import provenance, run
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.hand_weights import load_hand_weights
 from rcirl_jax.export.linear_yaml import lattice_yaml, reward_yaml
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.onnx_model import write_onnx
 from rcirl_jax.export.stablehlo import write_stablehlo
-from rcirl_jax.whole import write_whole
+from rcirl_jax.stages import file_sha256
+from rcirl_jax.whole import write_json, write_whole
 
 _WEIGHTS = flags.DEFINE_string("weights", None, "weights file")
 _HAND = flags.DEFINE_string("hand_weights", None, "of tune_hand_set, for --yaml")
@@ -41,19 +43,30 @@ def main() -> None:
         if files:
             raise InputError(f"--{next(iter(files))}: expected --weights with it")
         text = lattice_yaml(load_hand_weights(_HAND.value), Path(_HAND.value).name)
+        facts = {"hand_weights_sha256": file_sha256(Path(_HAND.value))}
     else:
         reward = open_reward(str(_WEIGHTS.value))
         text = reward_yaml(reward) if _YAML.value else ""
+        facts = {
+            "weights_sha256": reward.sha256,
+            "features": reward.names,
+            "units": reward.units,
+            "times_s": [float(time) for time in reward.times],
+            "provenance": reward.provenance,
+        }
         for name, path in files.items():
             if name == "onnx":
                 write_onnx(path, reward)
             else:
                 form = "jax" if name == "jax_export" else "stablehlo"
                 write_stablehlo(path, reward, form)
-            print(f"written: {path}")
     if _YAML.value:
-        write_whole(Path(_YAML.value), text)
-        print(f"written: {_YAML.value}")
+        files["yaml"] = Path(_YAML.value)
+        write_whole(files["yaml"], text)
+    for name, path in files.items():
+        beside = path.with_name(f"{path.name}.json")
+        write_json(beside, {"form": name, **facts, "made_by": provenance()})
+        print(f"written: {path}, {beside}")
 
 
 if __name__ == "__main__":

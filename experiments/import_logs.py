@@ -2,17 +2,18 @@
 
     python -m experiments.import_logs --format=commonroad --input=DIR --output=DATASET
 
-Prints the data-quality report and writes it into DATASET/manifest.json. An
-interrupted import resumes (SIGTERM ends with exit status 143, SIGINT with 130, a full
-disk with 2: finished shards stay); bad input leaves nothing behind. Of large releases a
-few odd recordings may be left out (--leave_out), counted and named in the report.
+Prints the data-quality report and writes it into DATASET/manifest.json; commit,
+versions, flags and the oracle floor stand in DATASET/made_by.json. An interrupted
+import resumes (SIGTERM ends with exit status 143, SIGINT with 130, a full disk with 2:
+finished shards stay); bad input leaves nothing behind. Of large releases a few odd
+recordings may be left out (--leave_out), counted and named in the report.
 """
 
 from pathlib import Path
 
 from absl import flags
 
-from experiments.common import run
+from experiments.common import provenance, run
 from experiments.executor import executor
 from experiments.signals import checked_signals
 from rcirl_jax.data.config import CollectConfig
@@ -24,7 +25,6 @@ from rcirl_jax.data.store import Dataset
 from rcirl_jax.evaluation.evaluate import RankingSetup, oracle_floor
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.sampling.config import MODES
-from rcirl_jax.whole import write_json
 
 _FORMAT = flags.DEFINE_enum(
     "format", "synthetic", sorted(IMPORTERS), "log format to read"
@@ -109,15 +109,15 @@ def main() -> None:
 
 
 def _floors(dataset: Dataset) -> list[dict]:
-    """The oracle floor of every mode of the sampler, also beside the dataset."""
+    """The oracle floor of every mode of the sampler, also in the dataset's facts."""
     dataset.verify()
     setups = [
         RankingSetup(sampler=SamplerConfig(mode=mode), horizon_s=_FLOOR.value)
         for mode in MODES
     ]
     floors = [oracle_floor(dataset, setup, max_scenes=512) for setup in setups]
-    if "://" not in _OUTPUT.value:
-        write_json(Path(_OUTPUT.value) / "oracle_floor.json", floors)
+    facts = {"data_hash": dataset.hash, "oracle_floor": floors}
+    dataset.write_facts({**facts, "made_by": provenance()})
     return floors
 
 

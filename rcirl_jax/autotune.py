@@ -173,7 +173,15 @@ class Loop:
             if (folder / "manifest.json").exists():
                 return  # finished, but not noted: killed in between
             config = given.import_config(found, self.executor)
-            import_parts(found, folder, config, executor=self.executor)
+            import_parts(
+                found,
+                folder,
+                config,
+                executor=self.executor,
+                before_commit=lambda dataset: dataset.write_facts(
+                    {"data_hash": dataset.hash, "made_by": self.facts}
+                ),
+            )
 
         self._run("import", inputs, [folder / "manifest.json"], work)
         return open_dataset(folder)

@@ -13,6 +13,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.stages import LOCK, only_one
 
 MANIFEST, MARK, SHARDS = "manifest.json", "shard.json", "shards/"
+FACTS = "made_by.json"  # beside the manifest, whose bytes depend on the logs alone
 
 
 class Files:

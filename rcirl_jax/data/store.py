@@ -25,7 +25,7 @@ import jax
 import numpy as np
 import tensorstore as ts
 
-from rcirl_jax.data.files import MANIFEST, MARK, SHARDS, Files, context
+from rcirl_jax.data.files import FACTS, MANIFEST, MARK, SHARDS, Files, context
 from rcirl_jax.data.manifest import (
     SCHEMA_VERSION,
     Manifest,
@@ -51,6 +51,7 @@ from rcirl_jax.types import (
     Demonstration,
 )
 from rcirl_jax.units import TIMES_S
+from rcirl_jax.whole import plain
 
 SHARDS_END = "shards0"  # first key after all that begin with "shards/"
 OPEN_SHARDS = 256  # shards whose arrays are kept open, 60 kB each
@@ -252,6 +253,32 @@ class Dataset:
     def count(self) -> int:
         """Number of rows."""
         return self.manifest.count
+
+    def write_facts(self, body: Mapping[str, object]) -> None:
+        """Say beside the manifest what made the dataset: commit, versions, flags.
+
+        Raises:
+          OSError: the place cannot be written.
+        """
+        text = json.dumps(plain(body), indent=2, allow_nan=False) + "\n"
+        self._files.write_many({FACTS: text.encode()})
+
+    def facts(self) -> dict[str, Any]:
+        """What `write_facts` wrote; empty where nobody did.
+
+        Raises:
+          InputError: not a JSON object.
+        """
+        raw = self._files.read(FACTS)
+        try:
+            found = {} if raw is None else json.loads(raw)
+        except (ValueError, RecursionError) as error:
+            raise InputError(
+                f"{self._files.path(FACTS)}: {error}: expected JSON"
+            ) from error
+        if not isinstance(found, dict):
+            raise InputError(f"{self._files.path(FACTS)}: expected an object")
+        return found
 
     def _arrays(self, shard: int) -> dict[str, ts.TensorStore]:
         """The shard's arrays, opened once, of the shapes and dtypes promised."""

@@ -294,5 +294,11 @@ def _provenance(dataset: Dataset) -> str:
     flags = dataset.manifest.import_flags
     lines = [f"dataset sha256: {dataset.hash}"]
     lines += [f"{name}: {value}" for name, value in sorted(flags.items())]
+    made_by = dataset.facts().get("made_by")
+    made_by = made_by if isinstance(made_by, dict) else {}
+    lines += [
+        f"{name}: {made_by.get(name) or 'not said'}"
+        for name in ("git_commit", "code_sha256", "versions")
+    ]
     words = html.escape("\n".join(lines))
     return f"<h2>Made by</h2>\n<pre>{words}</pre>"

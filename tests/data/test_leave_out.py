@@ -4,12 +4,14 @@ import dataclasses
 
 import pytest
 
+from experiments.common import git_commit
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import parts
 from rcirl_jax.data.importing import ImportConfig, import_parts
 from rcirl_jax.data.parts import Part, recordings_of
 from rcirl_jax.data.quality import format_quality
 from rcirl_jax.data.recording import LEAVE_OUT
+from rcirl_jax.data.store import open_dataset
 from rcirl_jax.errors import InputError
 from tests import commands
 from tests.data.formats import waymo
@@ -114,3 +116,9 @@ def test_the_command(tmp_path):
     done = commands.command("experiments.import_logs", *flags)
     assert done.returncode == 0, done.stderr[-2000:]
     assert "1 recordings refused and left out" in done.stdout
+    dataset = open_dataset(tmp_path / "data")
+    facts = dataset.facts()
+    assert facts["data_hash"] == dataset.hash
+    assert facts["made_by"]["flags"]["leave_out"] == 1
+    assert facts["made_by"]["git_commit"] == git_commit()
+    assert [floor["candidates"] > 100 for floor in facts["oracle_floor"]] == [True] * 2

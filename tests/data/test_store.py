@@ -99,6 +99,20 @@ def copy(made, tmp_path):
     return shutil.copytree(made, tmp_path / "copy")
 
 
+def test_facts_stand_beside_the_manifest(copy):
+    dataset = open_dataset(copy)
+    assert dataset.facts() == {}
+    dataset.write_facts({"made_by": {"git_commit": "abc"}, "share": np.float32(0.5)})
+    again = open_dataset(copy)
+    assert again.facts() == {"made_by": {"git_commit": "abc"}, "share": 0.5}
+    assert again.hash == dataset.hash
+    again.verify()
+    for text, word in (("[" * 10**5, "expected JSON"), ("[1]", "expected an object")):
+        (copy / files.FACTS).write_text(text)
+        with pytest.raises(InputError, match=rf"made_by\.json: .*{word}"):
+            again.facts()
+
+
 def test_round_trip_is_bit_identical(made):
     dataset = open_dataset(made)
     assert dataset.count == sum(SIZES)

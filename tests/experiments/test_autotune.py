@@ -51,6 +51,8 @@ def test_a_small_loop(tmp_path):
 
     # what people said of two ways through a scene trains with the rest
     dataset = open_dataset(*run.glob("dataset-*"))
+    assert dataset.facts()["data_hash"] == dataset.hash
+    assert "flags" in dataset.facts()["made_by"]
     head = {
         "schema": "rcirl-jax/preferences",
         "schema_version": 1,

@@ -1,6 +1,7 @@
 """Other forms of a weights file score as it does."""
 
 import dataclasses
+import json
 
 import jax
 import numpy as np
@@ -12,6 +13,7 @@ from onnx.reference import ReferenceEvaluator
 from rcirl_jax.errors import InputError
 from rcirl_jax.export import save
 from rcirl_jax.export.linear_yaml import APOLLO, lattice_yaml, reward_yaml
+from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.onnx_model import write_onnx
 from rcirl_jax.export.reader import load_weights
 from rcirl_jax.export.stablehlo import exported, write_stablehlo
@@ -181,6 +183,13 @@ def test_the_command(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert all((tmp_path / name).stat().st_size > 1000 for name in names)
+    weights = open_reward(str(file))
+    for name in names:
+        beside = json.loads((tmp_path / f"{name}.json").read_text())
+        assert (beside["form"], beside["weights_sha256"]) == (name, weights.sha256)
+        assert beside["features"] == list(weights.names)
+        assert beside["made_by"]["flags"]["weights"] == str(file)
+        assert len(beside["made_by"]["code_sha256"]) == 64
     for flags, message in (
         ((f"--weights={file}", f"--yaml={tmp_path}/y"), "expected a linear reward"),
         ((f"--weights={file}",), "--onnx, --stablehlo"),
