@@ -2,7 +2,8 @@
 
 Every run has a folder of its own and names it by relative paths, so that everything
 written is equal to the byte, but for times: `created` in weights files, rates and
-seconds in metrics and sweeps. Those alone are left out.
+seconds in metrics and sweeps. Those are left out, and a dataset's `made_by.json`, which
+holds flags and machine.
 """
 
 import dataclasses
@@ -14,6 +15,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from rcirl_jax.data.files import FACTS
 from rcirl_jax.export.from_run import read_config
 from rcirl_jax.export.weights import to_json
 from rcirl_jax.stages import digest, file_sha256
@@ -96,8 +98,8 @@ def jobs(root: Path) -> dict[str, Job]:
 
 
 def _files(folder: Path) -> Facts:
-    """Of every file, whatever it is called."""
-    files = [path for path in folder.rglob("*") if path.is_file()]
+    """Of every file, whatever it is called, but who made it with which flags."""
+    files = [x for x in folder.rglob("*") if x.is_file() and x.name != FACTS]
     return {str(path.relative_to(folder)): file_sha256(path) for path in files}
 
 
