@@ -10,7 +10,10 @@ from benchmarks.reliability.fuzz.readers import READERS, shares
 from benchmarks.reliability.fuzz.trees import MAX_DEEP, deep, mutate_tree
 from rcirl_jax.data import preferences
 from rcirl_jax.errors import InputError
+from rcirl_jax.export.from_run import read_config
+from rcirl_jax.export.sweep import read_sweep
 from rcirl_jax.features import mapping
+from rcirl_jax.report.sweep_picture import sweep_picture
 from tests.commands import command
 
 FEW = ("apollo", "nuplan", "argoverse2", "l5", "interaction", "suite", "scenarios")
@@ -50,6 +53,44 @@ def test_a_reader_returns_or_says_one_line(name, tmp_path):
         assert contract.verdict(target.read, target.names) == (None, None), index
     count = 15 if name in FEW else 60
     assert breaches(target, drawn(target, count, name)) == {}
+
+
+def test_a_sweep_that_is_read_can_be_drawn(tmp_path):
+    target = READERS["sweeps"].make(tmp_path / "made")
+    drawings = 0
+    for data in drawn(target, 400, 3):
+        target.put(data)
+        try:
+            report = read_sweep(tmp_path / "made")
+        except InputError:
+            continue
+        if drawings < 20:
+            sweep_picture(tmp_path / "sweep.png", report)
+            drawings += 1
+    assert drawings == 20
+
+
+@pytest.mark.parametrize(
+    ("where", "name", "value"),
+    [
+        ("sampler", "max_jerk", "high"),
+        ("sampler", "num_random", 10**60),
+        ("sampler", "num_random", True),
+        ("sampler", "cruise_times", [2.0, [3.0]]),
+        ("sampler", "envelopes", [[1.0, 2.0]]),
+        ("reward", "hidden", 15),
+        ("reward", "hidden", [1.5]),
+        ("reward", "odd", 1),
+    ],
+)
+def test_settings_of_other_types(tmp_path, where, name, value):
+    READERS["runs"].make(tmp_path / "made")
+    file = tmp_path / "made" / "run.json"
+    found = json.loads(file.read_text())
+    found["config"][where][name] = value
+    file.write_text(json.dumps(found))
+    with pytest.raises(InputError, match=rf"run\.json: {where}\.{name}.*: expected"):
+        read_config(tmp_path / "made")
 
 
 def test_another_exception_is_a_breach(tmp_path, monkeypatch):

@@ -1,7 +1,9 @@
 """A training run -> weights.msgpack with verification samples."""
 
+import dataclasses
 import datetime
 import json
+import typing
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,20 +13,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.data.joined import Demonstrations
-from rcirl_jax.errors import InputError
+from rcirl_jax.errors import UNFORESEEN, InputError
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.export.weights import FeatureSpec, RewardWeights, save
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import (
     Normaliser,
-    RewardConfig,
     RewardParams,
     pinned,
     seen_range,
     value,
 )
 from rcirl_jax.reward.network import LEAKY_SLOPE
-from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train.loop import normaliser_rows, restore_run, to_device_batch
 from rcirl_jax.train.state import TrainConfig, TrainState
 from rcirl_jax.train.step import featurised
@@ -33,9 +33,36 @@ from rcirl_jax.units import TIMES_S
 NUM_SAMPLES = 32  # verification samples in the file
 
 
-def _tuples(value: Any) -> Any:  # noqa: ANN401
-    """Lists as tuples, at every depth."""
-    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+def _typed(kind: type, value: Any, where: str) -> Any:  # noqa: ANN401
+    """A JSON value as the type of a configuration's field: lists as tuples.
+
+    Raises:
+      ValueError: of another type, not finite, or beyond 32 bits (names the field).
+    """
+    parts = typing.get_args(kind)
+    if parts and isinstance(value, list):
+        kinds = parts[:1] * len(value) if parts[-1] is ... else parts
+        if len(kinds) == len(value):
+            return tuple(
+                _typed(k, v, f"{where}[{i}]")
+                for i, (k, v) in enumerate(zip(kinds, value, strict=True))
+            )
+    elif dataclasses.is_dataclass(kind) and isinstance(value, dict):
+        return _settings(kind, value, f"{where}.")
+    elif type(value) is kind is str:
+        return value
+    elif type(value) in {int, kind} and kind in {int, float} and abs(value) < 2**31:
+        return value  # NaN is not below either
+    name = "list" if parts else getattr(kind, "__name__", str(kind))
+    raise ValueError(f"{where}: {value}: expected {name}")
+
+
+def _settings(kind: type, found: Mapping[str, Any], where: str = "") -> Any:  # noqa: ANN401
+    hints = typing.get_type_hints(kind)
+    if unknown := sorted(set(found) - set(hints)):
+        raise ValueError(f"{where}{unknown[0]}: expected a setting of this version")
+    typed = {n: _typed(hints[n], v, f"{where}{n}") for n, v in found.items()}
+    return kind(**typed)
 
 
 def config_of(settings: Mapping[str, Any]) -> TrainConfig:
@@ -44,13 +71,9 @@ def config_of(settings: Mapping[str, Any]) -> TrainConfig:
     Raises:
       ValueError, KeyError, TypeError: they are not those of this version.
     """
-    others = dict(settings)
-    reward, sampler = dict(others.pop("reward")), dict(others.pop("sampler"))
-    return TrainConfig(
-        reward=RewardConfig(**{k: _tuples(v) for k, v in reward.items()}),
-        sampler=SamplerConfig(**{k: _tuples(v) for k, v in sampler.items()}),
-        **others,
-    )
+    for name in ("reward", "sampler"):
+        settings[name]  # these are no flags with a default
+    return _settings(TrainConfig, settings)
 
 
 def read_config(workdir: Path) -> tuple[TrainConfig, dict]:
@@ -61,7 +84,7 @@ def read_config(workdir: Path) -> tuple[TrainConfig, dict]:
     try:
         run = json.loads(path.read_text())
         config = config_of(run["config"])
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (OSError, *UNFORESEEN) as error:
         raise InputError(f"{path}: {error}: expected a run of this version") from error
     return config, run
 

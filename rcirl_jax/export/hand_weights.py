@@ -6,6 +6,7 @@
 What else is in the file (history of a search, provenance) is for people.
 """
 
+import contextlib
 import dataclasses
 import json
 import math
@@ -93,10 +94,10 @@ def load_hand_weights(path: str | os.PathLike[str]) -> LatticeCost:
 
 
 def _number(path: str | os.PathLike[str], name: str, value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        number = math.nan
-    else:
-        number = float(value)
+    number = math.nan
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        with contextlib.suppress(OverflowError):
+            number = float(value)
     if not math.isfinite(number) or number < 0.0:
         raise InputError(
             f"{path}: weights: {name}: {value}: expected a finite number, 0 or more"

@@ -13,7 +13,7 @@ import numpy as np
 
 from rcirl_jax.data.joined import Demonstrations
 from rcirl_jax.data.preferences import read_preferences
-from rcirl_jax.errors import InputError
+from rcirl_jax.errors import UNFORESEEN, InputError
 from rcirl_jax.export.from_run import config_of, export_run
 from rcirl_jax.export.reader import RANGES, Reward
 from rcirl_jax.train.loop import train
@@ -82,7 +82,7 @@ def settings_of(reward: Reward, dataset: Demonstrations) -> TrainConfig:
         )
     try:
         config = config_of(found["config"])
-    except (ValueError, KeyError, TypeError) as error:
+    except UNFORESEEN as error:
         raise InputError(
             f"{file}: provenance.config: {error}: expected settings of this version"
         ) from error

@@ -12,6 +12,7 @@ import dataclasses
 import datetime
 import functools
 import json
+import math
 import resource
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -22,7 +23,7 @@ import numpy as np
 import tqdm
 
 from rcirl_jax.data.joined import Demonstrations
-from rcirl_jax.errors import InputError
+from rcirl_jax.errors import UNFORESEEN, InputError
 from rcirl_jax.evaluation.evaluate import covered_rows
 from rcirl_jax.evaluation.ranking import METRICS
 from rcirl_jax.evaluation.statistics import ClusterBootstrap
@@ -242,7 +243,7 @@ def _finished(
             reward = open_reward(str(_weights(folder, member)))
             if reward.sha256 != group["members"][member_name(member)]["sha256"]:
                 return None
-    except (OSError, ValueError, KeyError, TypeError, InputError):
+    except (OSError, *UNFORESEEN, InputError):
         return None
     return group
 
@@ -331,11 +332,33 @@ def read_sweep(folder: Path) -> dict:
     try:
         report = json.loads(path.read_text())
         table(report)
-    except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
+        _check_grid(report)
+    except (OSError, *UNFORESEEN) as error:
         raise InputError(
             f"{path}: {type(error).__name__}: expected the result of experiments.sweep"
         ) from error
     return report
+
+
+def _check_grid(report: Mapping) -> None:
+    """Check what the picture takes for granted: a full grid, as many seeds in each.
+
+    Raises:
+      One of `UNFORESEEN`.
+    """
+    metric, members = report["choose_by"]["metric"], report["members"]
+    report["configurations"][report["chosen"]["configuration"]]
+    seen, seeds = set(), set()
+    for row in report["configurations"].values():
+        values = [members[name]["validation"][metric] for name in row["members"]]
+        rates = row["leaky_rate"], row["learning_rate"]
+        if not all(0.0 < x < 1.0 for x in rates) or not max(map(abs, values)) < 1e9:
+            raise ValueError("expected finite numbers, rates between 0 and 1")
+        seen.add((row["hidden"], row["leaky_rate"], row["learning_rate"]))
+        seeds.add(len(values))
+    axes = [len(set(axis)) for axis in zip(*seen, strict=True)]
+    if not seen or len(seen) != math.prod(axes) or len(seeds) != 1 or 0 in seeds:
+        raise ValueError("expected every configuration with the same seeds")
 
 
 def table(report: Mapping) -> str:

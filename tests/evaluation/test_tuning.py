@@ -338,6 +338,7 @@ def test_file_round_trip(tmp_path):
         (lambda b: b.update(schema="other"), "schema: other: expected rcirl-jax/hand"),
         (lambda b: b.update(schema_version=2), "schema_version: 2: expected 1"),
         (lambda b: b.pop("weights"), "weights: .*expected the cost's fields"),
+        (lambda b: b["weights"].update(jerk=10**400), "jerk: 1.*expected a finite"),
         (lambda b: b["weights"].pop("jerk"), "weights: jerk: expected the cost's"),
         (lambda b: b["weights"].update(jrk=1.0), "weights: jrk: expected the cost's"),
         (lambda b: b["weights"].update(jerk="1"), "jerk: 1: expected a finite number"),

@@ -19,14 +19,21 @@ from rcirl_jax.data.files import MANIFEST, MARK, Files
 from rcirl_jax.data.importers import synthetic
 from rcirl_jax.data.preferences import SCHEMA, read_preferences
 from rcirl_jax.evaluation.suite_files import SuiteRuns, read_runs, write_runs
+from rcirl_jax.export.from_run import read_config
+from rcirl_jax.export.hand_weights import tuned_rows, write_hand_weights
 from rcirl_jax.export.reader import decode_weights
+from rcirl_jax.export.sweep import SWEEP, read_sweep
 from rcirl_jax.features import mapping
+from rcirl_jax.reward import LatticeCost
 from rcirl_jax.simulation import families
 from rcirl_jax.simulation.catalogue import build_case
 from rcirl_jax.simulation.metrics import CaseMetrics
 from rcirl_jax.specs import load_toml, spec_root
 from rcirl_jax.train import checkpoint
+from rcirl_jax.train.running import check_run, describe_run
+from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.units import NUM_TIMES
+from rcirl_jax.whole import write_json
 from tests.data import test_store
 from tests.weights_files import packed
 
@@ -221,9 +228,37 @@ def checks(folder: Path) -> Target:
     return OneFile(signal_checks.read_signal_checks, [file])
 
 
+def runs(folder: Path) -> Target:
+    """run.json, as it is resumed and exported from."""
+    folder.mkdir(parents=True)
+    data: Any = types.SimpleNamespace(hash="d" * 64)
+    describe_run(folder, TrainConfig(), data, {"git_commit": "2fe49aa"})
+
+    def read() -> None:
+        check_run(folder, TrainConfig(), data)
+        read_config(folder)
+
+    return Target(read, [folder / "run.json"])
+
+
+def hand(folder: Path) -> Target:
+    """Weights of a hand-set cost."""
+    folder.mkdir(parents=True)
+    file = folder / "tuned.json"
+    write_hand_weights(file, LatticeCost(), {"data_hash": "d" * 64})
+    return OneFile(lambda path: tuned_rows([str(path)], "d" * 64), [file])
+
+
+def sweeps(folder: Path) -> Target:
+    """The result of a sweep: its table and the grid of its picture."""
+    folder.mkdir(parents=True)
+    write_json(folder / SWEEP, pieces.sweep_result())
+    return Target(lambda: read_sweep(folder), [folder / SWEEP])
+
+
 READERS: dict[str, Reader] = {
-    "weights": Reader(make=weights, share=8, words=("sha256", "<f4", "tanh")),
-    "wire": Reader(make=pieces.wire_target, share=5),
+    "weights": Reader(make=weights, share=6, words=("sha256", "<f4", "tanh")),
+    "wire": Reader(make=pieces.wire_target, share=4),
     "geometry": Reader(make=pieces.geometry_target, share=5),
     "tfrecord": Reader(make=pieces.tfrecord_target, share=3),
     "sealed": Reader(make=sealed, words=("schema_version", "shards")),
@@ -236,6 +271,9 @@ READERS: dict[str, Reader] = {
     "preferences": Reader(make=preferences, share=3),
     "checkpoints": Reader(make=checkpoints, share=2),
     "signal_checks": Reader(make=checks, share=3),
+    "runs": Reader(make=runs),
+    "hand_weights": Reader(make=hand),
+    "sweeps": Reader(make=sweeps),
     "lanelet2": Reader(make=pieces.lanelet2_target),
     **{name: Reader(make=make) for name, make in LOGS.items()},
 }
