@@ -30,9 +30,11 @@ QUICK := $(addprefix tests/train/test_loop.py::test_,resume_is_bitwise run_write
 QUICKLY = -m pytest -q -m "not slow and not dataset" $(QUICK)
 
 # Tests with the compiler as users have it: what rounds, and what is read in programs. For the
-# rest, whose programs are large, XLA compiles in half the time to slower ones; by hand,
-# pytest has the users' compiler for all
-EXACT := data evaluation export features geometry onboard reward sampling train
+# rest XLA compiles in half the time to slower ones; by hand, pytest has the users' compiler
+# for all, and so has every row of `make reliability`
+EXACT := features geometry reward export/test_spread.py \
+  $(addprefix evaluation/test_,closed_loop.py tuned_rivals.py) \
+  $(addprefix train/test_,loop.py processes.py reproduce.py step.py)
 QUICK_XLA := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false
 TEST = $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal -m "not slow and not dataset"
 

@@ -45,8 +45,8 @@ ROWS = ("RC-IRL logistic", "logistic non-negative", "logistic linear")
 
 def main() -> None:
     """Train on ever more scenes, rank the same ones, draw."""
-    data, most = dataset(), dataset().indices("train").size
-    asked = whole_numbers(_COUNTS.value, "counts")
+    asked, data = whole_numbers(_COUNTS.value, "counts"), dataset()
+    most = data.indices("train").size
     counts = sorted({min(count, most) for count in asked})
     counts = counts[:2] if QUICK.value else counts
     sets, learned = FrozenSets(data), {}

@@ -65,6 +65,7 @@ def _error_over_time(made: Choices, time_valid: np.ndarray, of: str) -> list:
 
 def main() -> None:
     """Train a linear reward and an ensemble, ask the three questions, draw."""
+    runs = seeds(least=2)
     data, config = dataset(), base(reward=RewardConfig(pin="none"))
     sets = {name: FrozenSets(data, name) for name in ("train", "test")}
     train, test = (sets[name].of(config) for name in ("train", "test"))
@@ -75,15 +76,15 @@ def main() -> None:
     strict = learner_config("logistic non-negative", base())
     (reward,) = train_learner(train, strict, [0])
     costs = weights_supported(reward, train, vehicle["train"])
-    (runs,) = train_grid(train, config, [config.leaky_rate], seeds(least=2)).values()
-    made = choices_of(runs, train, test, vehicle["train"])
+    (found,) = train_grid(train, config, [config.leaky_rate], runs).values()
+    made = choices_of(found, train, test, vehicle["train"])
     spreads = {"seeds": made.spread_of_seeds, "posterior": made.spread_of_posterior}
     warns = {
         name: rank_correlation(spread, made.error, vehicle["test"])
         for name, spread in spreads.items()
     }
     # the gap in the mean value is the mean of the runs' gaps
-    each = [reasons(run, test, made.chosen, made.nearest) for run in runs]
+    each = [reasons(run, test, made.chosen, made.nearest) for run in found]
     shares = np.mean(each, axis=0)
     names = feature_map(config.features).names
     print(format_report(weights))
@@ -98,7 +99,7 @@ def main() -> None:
     over_time = _error_over_time(made, valid, "logistic 21-15-1")
     judged = learner_config(_JUDGED.value, base())
     train, test = (sets[name].of(judged) for name in ("train", "test"))
-    others = train_learner(train, judged, seeds(least=2))
+    others = train_learner(train, judged, runs)
     chosen = choices_of(others, train, test, vehicle["train"])
     over_time_judged = _error_over_time(chosen, valid, _JUDGED.value)
     support_picture(

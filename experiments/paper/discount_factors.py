@@ -76,9 +76,9 @@ def differences(shares: dict[str, np.ndarray]) -> list[dict]:
 
 def main() -> None:
     """Train, read gamma, draw."""
+    asked, data = seeds(least=2), dataset()
     configs = {name: learner_config(name, base()) for name in ROWS}
-    data = dataset()
-    learned = train_learners(data, configs, seeds(least=2))
+    learned = train_learners(data, configs, asked)
     gamma = {name: time_weights(runs) for name, runs in learned.items()}
     made, axes = figure(1, 1, 6.8, 4.4)
     curves_panel(axes[0, 0], TIMES_S, gamma)

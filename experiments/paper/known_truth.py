@@ -66,18 +66,16 @@ fixed(positive="human")  # the curve that the expert's choice replaces
 
 def main() -> None:
     """Replace the humans, train on ever more of them, compare choices, draw."""
+    asked, rows, runs = whole_numbers(_COUNTS.value, "counts"), _rows(), seeds(least=2)
     data, config = dataset(), learner_config("MaxEnt", base())
     train, test = (FrozenSets(data, name).of(config) for name in ("train", "test"))
     most = train.weight.shape[0]
-    asked = whole_numbers(_COUNTS.value, "counts")
     counts = sorted({min(count, most) for count in asked})
     counts = counts[:2] if QUICK.value else counts
     if len(counts) < 2:
         raise InputError(
             f"--counts: {_COUNTS.value}: expected two that differ, up to {most}"
         )
-    rows = _rows()
-    runs = seeds(least=2)
     same = {name: np.zeros((len(runs), len(counts))) for name in rows}
     regret = {name: np.zeros((len(runs), len(counts))) for name in rows}
     bar = tqdm.tqdm(
