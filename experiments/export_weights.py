@@ -7,7 +7,6 @@ reader recomputes them before it accepts the file. The ranges are for the guard
 (docs/guard.md); a reader that knows schema versions 1 and 2 only takes --noranges.
 """
 
-import json
 from pathlib import Path
 
 from absl import flags
@@ -15,7 +14,8 @@ from absl import flags
 from experiments.common import run
 from rcirl_jax.data.joined import open_datasets
 from rcirl_jax.errors import InputError
-from rcirl_jax.export.from_run import export_run
+from rcirl_jax.export.from_run import export_run, read_config
+from rcirl_jax.export.provenance import dataset_names
 
 _WORKDIR = flags.DEFINE_string("workdir", None, "run folder", required=True)
 _DATA = flags.DEFINE_list(
@@ -41,10 +41,10 @@ def _own(workdir: Path) -> list[str]:
     path = workdir / "run.json"
     if not path.is_file():
         raise InputError(f"{path}: missing: expected a run made by experiments.train")
-    found = json.loads(path.read_text()).get("flags", {}).get("data")
+    found = read_config(workdir)[1].get("flags", {}).get("data")
     if not found:
         raise InputError("--data: not given and not in run.json: expected a dataset")
-    return found if isinstance(found, list) else [found]
+    return dataset_names(found, f"{path}: flags.data")
 
 
 if __name__ == "__main__":

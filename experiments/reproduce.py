@@ -19,6 +19,7 @@ from experiments.common import provenance, run
 from rcirl_jax.data.joined import open_datasets
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.loading import open_reward
+from rcirl_jax.export.provenance import dataset_names
 from rcirl_jax.export.reproduce import (
     Reproduction,
     compare,
@@ -44,10 +45,10 @@ _TOLERANCE = flags.DEFINE_float(
 def main() -> None:
     """Flags -> one verdict."""
     reward, folder = open_reward(_WEIGHTS.value), Path(_OUTPUT.value)
-    named = _DATA.value or reward.provenance.get("flags", {}).get("data")
+    named = _DATA.value or (reward.provenance.get("flags") or {}).get("data")
     if not named:
         raise InputError("--data: not given and not in the file: expected datasets")
-    dataset = open_datasets(named if isinstance(named, list) else [named])
+    dataset = open_datasets(dataset_names(named, f"{reward.file}: flags.data"))
     settings_of(reward, dataset)  # what fails, fails before a warning
     facts = provenance()
     warnings = setup_warnings(reward.provenance, facts)

@@ -14,7 +14,6 @@ RUN/stages.json        what made what (`stages`)
 
 import dataclasses
 import functools
-import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -49,9 +48,10 @@ from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.simulation.rows import BASELINES
 from rcirl_jax.stages import Stages, code_sha256, digest, file_sha256
 from rcirl_jax.train.loop import train
+from rcirl_jax.train.metrics import pairs_won
 from rcirl_jax.train.running import Running
 from rcirl_jax.train.state import TrainConfig
-from rcirl_jax.whole import write_json, write_whole
+from rcirl_jax.whole import read_json, write_json, write_whole
 
 STAGES = ("import", "train", "rank", "simulate", "gate", "report")
 # what reads as permission to use weights that are no longer there
@@ -229,11 +229,8 @@ class Loop:
         steps = -(-dataset.indices("train").size // config.batch_size)
 
         def won(number: int) -> float:
-            """Over the last epoch."""
-            path = self._workdir(dataset, number) / "metrics.jsonl"
-            lines = [json.loads(x) for x in path.read_text().splitlines()[-steps:]]
-            pairs = sum(line["pairs"] for line in lines)
-            return sum(x["pair_accuracy"] * x["pairs"] for x in lines) / max(pairs, 1.0)
+            workdir = self._workdir(dataset, number)
+            return pairs_won(workdir / "metrics.jsonl", steps)
 
         ranked = sorted(range(self.config.seeds), key=won)
         median = self._seed_files()[ranked[(len(ranked) - 1) // 2]]
@@ -366,9 +363,7 @@ class Loop:
                 gate=self.config.gate,
                 suite=self._runs.report(),
                 incumbent=incumbent,
-                ranking=from_json(
-                    json.loads((self.folder / "ranking.json").read_text())
-                ),
+                ranking=from_json(read_json(self.folder / "ranking.json", "a ranking")),
                 rewards=rewards,
                 dataset=dataset,
                 replays=replays,

@@ -19,7 +19,7 @@ from typing import IO, Any
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.specs import spec_root
-from rcirl_jax.whole import write_json
+from rcirl_jax.whole import read_json, write_json
 
 FILE = "stages.json"
 LOCK = ".lock"  # in a folder that one process at a time works in
@@ -133,22 +133,37 @@ class Stages:
         path = self.folder / FILE
         if not path.exists():
             return {}
-        try:
-            body = json.loads(path.read_text())
-            version, stages = body["schema_version"], dict(body["stages"])
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
-            raise InputError(
-                f"{path}: damaged: expected the stages of a run"
-            ) from error
+        body = read_json(path, "the stages of a run")
+        found = body if isinstance(body, dict) else {}
+        version, stages = found.get("schema_version"), found.get("stages")
         if version != SCHEMA_VERSION:
             raise InputError(
                 f"{path}: schema_version: {version}: expected {SCHEMA_VERSION}"
             )
+        if not isinstance(stages, dict):
+            raise InputError(f"{path}: stages: damaged: expected a table")
+        for name, record in stages.items():
+            if not _is_record(record):
+                raise InputError(f"{path}: {name}: damaged: expected a stage's record")
         return stages
 
     def _write(self, stages: Mapping[str, Any]) -> None:
         body = {"schema_version": SCHEMA_VERSION, "stages": dict(stages)}
         write_json(self.folder / FILE, body)
+
+
+def _is_record(record: object) -> bool:
+    """Whether it is what `Stages.run` writes of a stage."""
+    made = record.get("outputs") if isinstance(record, dict) else None
+    if not isinstance(record, dict) or not isinstance(made, dict):
+        return False
+    texts = [record.get("key"), *made.values()]
+    return (
+        all(isinstance(text, str) for text in texts)
+        and all("\0" not in file for file in made)
+        and isinstance(record.get("inputs", {}), dict)
+        and isinstance(record.get("seconds", 0.0), int | float)
+    )
 
 
 @contextlib.contextmanager

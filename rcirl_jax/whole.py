@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all."""
+"""Files that are there whole or not at all, and JSON of a bounded size."""
 
 import contextlib
 import dataclasses
@@ -12,6 +12,11 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+
+from rcirl_jax.errors import InputError
+
+MAX_JSON_BYTES = 16 * 1024**2  # of a JSON file that is read
+MAX_DEPTH = 100  # levels of it
 
 # of file systems without locks, where two writers are not kept apart
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP)
@@ -88,3 +93,45 @@ def write_json(
 ) -> None:
     """The body as JSON (see `plain`), whole."""
     write_whole(path, json.dumps(plain(body), indent=indent, allow_nan=False) + "\n")
+
+
+def _levels(body: object) -> int:
+    """Levels of a JSON body, as far as MAX_DEPTH + 1."""
+    level, depth = [body], 0
+    while level and depth <= MAX_DEPTH:
+        inner = [list(x.values()) if isinstance(x, dict) else x for x in level]
+        level = [one for x in inner if isinstance(x, list) for one in x]
+        depth += 1
+    return depth
+
+
+def read_json(path: Path, expected: str, most: int = MAX_JSON_BYTES) -> Any:  # noqa: ANN401
+    """The body of a JSON file.
+
+    Args:
+      path: of the file.
+      expected: what it should be, the end of every refusal.
+      most: bytes of a file that is read.
+
+    Raises:
+      InputError: unreadable, too large, no JSON, or nested too deep.
+    """
+    try:
+        with Path(path).open("rb") as file:
+            content = file.read(most + 1)
+        if len(content) > most:
+            raise InputError(
+                f"{path}: size: above {most >> 20} MiB: expected {expected}"
+            )
+        body = json.loads(content.decode("utf-8"))
+        if _levels(body) > MAX_DEPTH:
+            raise RecursionError
+        return body
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}: expected {expected}") from error
+    except RecursionError as error:
+        raise InputError(f"{path}: nested too deep: expected {expected}") from error
+    except InputError:
+        raise
+    except ValueError as error:  # also bytes that are no text
+        raise InputError(f"{path}: {error}: expected {expected}") from error

@@ -91,10 +91,23 @@ def test_nothing_outside_the_folder_is_removed(stages):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{", "damaged"),
-        ("[]", "damaged"),
-        ("[" * 100_000, "damaged"),
+        ("{", "expected the stages of a run"),
+        ("[]", "schema_version: None: expected 1"),
+        ("[" * 100_000, "nested too deep: expected the stages of a run"),
         (json.dumps({"schema_version": 9, "stages": {}}), "9: expected 1"),
+        *(
+            (json.dumps({"schema_version": 1, "stages": stages}), message)
+            for stages, message in (
+                ([], "stages: damaged"),
+                ({"a": 5}, "a: damaged: expected a stage's record"),
+                ({"a": []}, "a: damaged"),
+                ({"a": {"key": "k", "outputs": 5}}, "a: damaged"),
+                ({"a": {"key": "k", "outputs": [[1]]}}, "a: damaged"),
+                ({"a": {"key": "k", "outputs": {"f": 1}}}, "a: damaged"),
+                ({"b": {"key": "k", "outputs": {"f\0": "x"}}}, "b: damaged"),
+                ({"b": {"outputs": {}}}, "b: damaged"),
+            )
+        ),
     ],
 )
 def test_a_damaged_file_is_one_line(stages, text, message):

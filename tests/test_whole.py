@@ -5,7 +5,8 @@ import sys
 
 import pytest
 
-from rcirl_jax.whole import write_whole
+from rcirl_jax.errors import InputError
+from rcirl_jax.whole import MAX_DEPTH, MAX_JSON_BYTES, read_json, write_whole
 from tests.conftest import REPO
 
 WRITER = """
@@ -62,3 +63,37 @@ def test_an_old_file_stays_if_the_new_one_cannot_be(tmp_path):
     with pytest.raises(OSError, match=r"a\.json"):
         write_whole(tmp_path / "a.json", "text")
     assert [x.name for x in tmp_path.iterdir()] == ["a.json"]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"{", "a.json: Expecting .*: expected colours"),
+        (b"\xff\xfe", "a.json: .*utf-8.*: expected colours"),
+        (b"[" * 100_000, "a.json: nested too deep: expected colours"),
+        (b"[" * (MAX_DEPTH + 1) + b"]" * (MAX_DEPTH + 1), "nested too deep"),
+        (b"1" * 5000, "a.json: .*digits.*: expected colours"),
+    ],
+)
+def test_json_that_is_none_is_one_line(tmp_path, content, message):
+    (tmp_path / "a.json").write_bytes(content)
+    with pytest.raises(InputError, match=message):
+        read_json(tmp_path / "a.json", "colours")
+
+
+def test_json_of_any_size_takes_little_memory(tmp_path):
+    path = tmp_path / "a.json"
+    with path.open("wb") as file:
+        file.truncate(2**40)  # a terabyte of nothing
+    with pytest.raises(InputError, match="size: above 16 MiB: expected colours"):
+        read_json(path, "colours")
+    path.write_bytes(b" " * (MAX_JSON_BYTES - 2) + b"{}")
+    assert read_json(path, "colours") == {}
+    path.write_text("[" * MAX_DEPTH + "]" * MAX_DEPTH)
+    assert isinstance(read_json(path, "colours"), list)
+
+
+def test_json_that_is_not_there_is_one_line(tmp_path):
+    for path in (tmp_path / "none.json", tmp_path):
+        with pytest.raises(InputError, match=f"{path.name}: .*: expected colours"):
+            read_json(path, "colours")

@@ -6,13 +6,13 @@ lines that they bear out. The labels.json of `experiments.label_check` is read h
 """
 
 import dataclasses
-import json
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Recording
+from rcirl_jax.whole import read_json
 
 TOGETHER = "all together"  # the check of all signals as one
 CONFIRMED, REJECTED = "confirmed", "rejected"
@@ -63,12 +63,10 @@ def read_signal_checks(path: str | os.PathLike[str]) -> SignalChecks:
     Raises:
       InputError: no such file, or not of that command.
     """
+    body = read_json(Path(path), "labels.json of experiments.label_check --input")
     try:
-        body = json.loads(Path(path).read_text(encoding="utf-8"))
         found = {check["name"]: check["verdict"] for check in body["phases"]}
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}") from error
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise InputError(
             f"{path}: phases: {type(error).__name__}: expected labels.json of "
             "experiments.label_check --input"

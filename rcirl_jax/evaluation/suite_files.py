@@ -22,6 +22,10 @@ from rcirl_jax.simulation.metrics import CaseMetrics
 from rcirl_jax.whole import write_whole
 
 MAX_BYTES = 2**30  # bytes of a suite, unpacked
+COLUMNS = {  # metrics of several numbers a case
+    **dict.fromkeys(("inside", "holds"), (6,)),
+    **dict.fromkeys(("inside_filtered", "holds_filtered"), (2,)),
+}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -95,6 +99,32 @@ def _arrays(path: Path) -> dict[str, Any]:
     return arrays
 
 
+def _check_arrays(arrays: Mapping[str, np.ndarray], rows: int) -> None:
+    """Check shapes and kinds: numbers [C, ...] as `CaseMetrics` says, texts [C].
+
+    Raises:
+      ValueError, KeyError: another one (names the array).
+    """
+    numbers, texts, flags = "biuf", "U", "b"
+    wanted = {
+        "names": (texts, (rows,)),
+        "reference": (texts, ()),
+        **dict.fromkeys(("ids", "groups"), (texts, (len(arrays["ids"]),))),
+        **dict.fromkeys(("preventable", "trivial"), (flags, (len(arrays["ids"]),))),
+        "way": (numbers, (len(arrays["ids"]),)),
+    }
+    for number in range(rows):
+        for field in dataclasses.fields(CaseMetrics):
+            shape = (len(arrays["ids"]), *COLUMNS.get(field.name, ()))
+            wanted[f"row{number}.{field.name}"] = numbers, shape
+    for name, (kinds, shape) in wanted.items():
+        found = arrays[name]
+        if found.dtype.kind not in kinds or found.shape != shape:
+            raise ValueError(f"{name}: {found.dtype} {found.shape}, not {shape}")
+    if len(set(arrays["names"].tolist())) != rows:
+        raise ValueError("names: one twice")
+
+
 def read_runs(path: Path) -> SuiteRuns:
     """The suite of a file.
 
@@ -113,11 +143,7 @@ def read_runs(path: Path) -> SuiteRuns:
             )
             for number, name in enumerate(names)
         }
-        count = len(arrays["ids"])
-        whole = {name: value for name, value in arrays.items() if value.ndim}
-        short = [n for n, v in whole.items() if n != "names" and len(v) != count]
-        if short:
-            raise ValueError(f"{short[0]}: not {count} cases")
+        _check_arrays(arrays, len(names))
         return SuiteRuns(
             rows=rows,
             ids=tuple(arrays["ids"].tolist()),

@@ -78,7 +78,7 @@ def table_rows(
         mode = str(reward.provenance.get("mode", "speed"))
         if mode != "speed":
             raise InputError(f"{path}: mode: {mode}: the closed loop plans speed")
-        seed = int(reward.provenance.get("seed", 0))
+        seed = int(reward.provenance.get("seed") or 0)
         name = names[number] if names else row_name(reward)
         taken = {row.name for row in rows}
         if name in taken:

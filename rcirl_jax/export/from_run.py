@@ -2,7 +2,6 @@
 
 import dataclasses
 import datetime
-import json
 import typing
 from collections.abc import Mapping
 from pathlib import Path
@@ -26,9 +25,11 @@ from rcirl_jax.reward import (
 )
 from rcirl_jax.reward.network import LEAKY_SLOPE
 from rcirl_jax.train.loop import normaliser_rows, restore_run, to_device_batch
+from rcirl_jax.train.metrics import read_metrics
 from rcirl_jax.train.state import TrainConfig, TrainState
 from rcirl_jax.train.step import featurised
 from rcirl_jax.units import TIMES_S
+from rcirl_jax.whole import read_json
 
 NUM_SAMPLES = 32  # verification samples in the file
 
@@ -81,10 +82,12 @@ def read_config(workdir: Path) -> tuple[TrainConfig, dict]:
     path = workdir / "run.json"
     if not path.is_file():
         raise InputError(f"{path}: missing: expected a run made by experiments.train")
+    run = read_json(path, "a run of this version")
     try:
-        run = json.loads(path.read_text())
         config = config_of(run["config"])
-    except (OSError, *UNFORESEEN) as error:
+        if not isinstance(run.get("flags", {}), dict):
+            raise ValueError("flags: not a table")
+    except UNFORESEEN as error:
         raise InputError(f"{path}: {error}: expected a run of this version") from error
     return config, run
 
@@ -228,11 +231,6 @@ def _provenance(
 
 
 def last_metrics(workdir: Path) -> dict:
-    """The last line of metrics.jsonl, or nothing."""
-    path = workdir / "metrics.jsonl"
-    lines = path.read_text().splitlines() if path.is_file() else []
-    try:
-        found = json.loads(lines[-1]) if lines else {}
-    except ValueError:
-        found = {}
-    return {k: v for k, v in found.items() if isinstance(v, int | float)}
+    """The last whole line of metrics.jsonl, or nothing."""
+    rows = read_metrics(workdir / "metrics.jsonl")
+    return {k: v for k, v in rows[-1].items() if v is not None} if rows else {}

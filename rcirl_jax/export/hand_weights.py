@@ -8,7 +8,6 @@ What else is in the file (history of a search, provenance) is for people.
 
 import contextlib
 import dataclasses
-import json
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -16,7 +15,7 @@ from pathlib import Path
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.reward import TUNED_ROW, LatticeCost
-from rcirl_jax.whole import write_json
+from rcirl_jax.whole import read_json, write_json
 
 SCHEMA = "rcirl-jax/hand-weights"
 SCHEMA_VERSION = 1
@@ -58,7 +57,7 @@ def tuned_rows(
     """
     costs = [load_hand_weights(path) for path in paths]
     for path in paths:
-        found = json.loads(Path(path).read_text()).get("data_hash")
+        found = read_json(Path(path), "hand weights").get("data_hash")
         if data_hash and found and found != data_hash:
             raise InputError(
                 f"{path}: data_hash: {str(found)[:12]}: expected {data_hash[:12]}, "
@@ -74,12 +73,7 @@ def load_hand_weights(path: str | os.PathLike[str]) -> LatticeCost:
       InputError: unreadable, of another schema, or a weight that is missing,
         unknown, not a number, not finite, or negative; one line naming it.
     """
-    try:
-        body = json.loads(Path(path).read_text())
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}: expected hand weights") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: {error}: expected JSON") from error
+    body = read_json(Path(path), "JSON, hand weights")
     found = body if isinstance(body, dict) else {}
     for name, expected in {"schema": SCHEMA, "schema_version": SCHEMA_VERSION}.items():
         if found.get(name) != expected:

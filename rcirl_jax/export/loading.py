@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.errors import InputError
+from rcirl_jax.export.provenance import check_provenance
 from rcirl_jax.export.reader import Reward, WeightsError, load_weights
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward.network import LEAKY_SLOPE, conditioned, point_rewards
@@ -22,7 +23,8 @@ def open_reward(path: str) -> Reward:
     """A weights file whose features are those this package computes.
 
     Raises:
-      InputError: unreadable or damaged file, or other features or units.
+      InputError: unreadable or damaged file, other features or units, or a
+        provenance of other types.
     """
     try:
         reward = load_weights(path)
@@ -30,6 +32,7 @@ def open_reward(path: str) -> Reward:
         reward.check_features(features.names, [s.unit for s in features.specs])
     except WeightsError as error:
         raise InputError(str(error)) from error
+    check_provenance(reward.provenance, reward.file)
     return reward
 
 

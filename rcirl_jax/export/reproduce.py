@@ -184,6 +184,7 @@ def compare(before: Reward, after: Reward) -> dict[str, float]:
 
 def _tensors(reward: Reward) -> dict[str, np.ndarray]:
     found = {name: getattr(reward, name) for name in (*RANGES, "times", "gamma")}
+    found["none_values"] = np.asarray(reward.none_values)
     for number, (kernel, bias) in enumerate(
         zip(reward.kernels, reward.biases, strict=True)
     ):

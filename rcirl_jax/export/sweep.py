@@ -47,9 +47,10 @@ from rcirl_jax.export.from_run import verification_samples, write_weights
 from rcirl_jax.export.loading import compiled_scorer, open_reward
 from rcirl_jax.stages import only_one
 from rcirl_jax.train.state import TrainConfig
-from rcirl_jax.whole import write_json, write_whole
+from rcirl_jax.whole import read_json, write_json, write_whole
 
 SWEEP = "sweep.json"  # in the sweep's folder
+FACTS = ("members", "seconds", "compiles", "compile_seconds")  # of a group, numbers
 
 Rows = Mapping[str, Sequence[TrainConfig]]  # configuration -> its members
 
@@ -128,10 +129,10 @@ def _claim(config: SweepConfig, folder: Path, dataset_hash: str) -> str:
     path = folder / "settings.json"
     own = {**_settings(config), "dataset_sha256": dataset_hash}
     if path.exists():
+        found = read_json(path, "the file of a sweep")
         try:
-            found = json.loads(path.read_text())
             created = str(found["created"])
-        except (ValueError, KeyError, TypeError, RecursionError) as error:
+        except (KeyError, TypeError) as error:
             raise InputError(
                 f"{path}: {type(error).__name__}: {error}: expected the file of a sweep"
             ) from error
@@ -236,7 +237,11 @@ def _finished(
     """A group's file, if it and all its members' files are whole."""
     path = folder / "groups" / f"{shape_name(hidden)}.json"
     try:
-        group = json.loads(path.read_text())
+        group = read_json(path, "the group of a sweep")
+        facts, kept = group["facts"], group["members"]
+        numbers = all(type(facts[name]) in {int, float} for name in FACTS)
+        if not numbers or any(type(one["finite"]) is not bool for one in kept.values()):
+            return None
         if group["settings"] != {**_settings(config), **_data(made_by)}:
             return None
         for member in config.group(hidden):
@@ -330,7 +335,7 @@ def read_sweep(folder: Path) -> dict:
     """
     path = folder / SWEEP
     try:
-        report = json.loads(path.read_text())
+        report = read_json(path, "the result of experiments.sweep")
         table(report)
         _check_grid(report)
     except (OSError, *UNFORESEEN) as error:

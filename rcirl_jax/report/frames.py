@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from rcirl_jax.export.reader import Reward
 from rcirl_jax.features import feature_map
 from rcirl_jax.report import plots
 from rcirl_jax.sampling import SamplerConfig, sample
+from rcirl_jax.train.metrics import read_metrics
 from rcirl_jax.train.step import human_of
 from rcirl_jax.types import Decision, Demonstration, Tag
 
@@ -160,11 +160,10 @@ def draw_frames(
 
 def draw_training(workdir: Path, folder: Path) -> list[tuple[Path, str]]:
     """Loss and pair accuracy over the steps of a run, from metrics.jsonl."""
-    lines = (workdir / "metrics.jsonl").read_text().splitlines()
-    rows = [json.loads(line) for line in lines]
+    rows = read_metrics(workdir / "metrics.jsonl")
     steps = np.array([row["step"] for row in rows])
     series = {
-        name: np.array([row[name] or np.nan for row in rows], float)
+        name: np.array([row.get(name) or np.nan for row in rows], float)
         for name in ("loss", "pair_accuracy", "queries_per_s")
     }
     path = folder / "training.png"

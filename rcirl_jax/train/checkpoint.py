@@ -8,7 +8,6 @@ orbax keeps no checksum of the arrays: the digests find what changed on disk.
 """
 
 import contextlib
-import json
 import os
 import shutil
 from collections.abc import Iterator
@@ -26,7 +25,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.stages import digest, file_sha256
 from rcirl_jax.train.processes import is_first
 from rcirl_jax.train.state import TrainState
-from rcirl_jax.whole import write_json
+from rcirl_jax.whole import read_json, write_json
 
 KEEP_LATEST = 3  # checkpoints kept
 DIGESTS = "sha256.json"
@@ -212,13 +211,13 @@ def _newest_whole(folder: Path) -> tuple[int | None, dict[int, str]]:
 def _damage(folder: Path) -> str | None:
     """What is wrong with a checkpoint, if anything."""
     try:
-        noted = json.loads((folder / DIGESTS).read_text())
+        if not (folder / DIGESTS).exists():
+            return f"{DIGESTS}: missing, it was not finished"
+        noted = read_json(folder / DIGESTS, "digests")
         files = noted["files"]
         if not isinstance(files, dict) or noted["sha256"] != digest(files):
             return f"{DIGESTS}: damaged"
-    except FileNotFoundError:
-        return f"{DIGESTS}: missing, it was not finished"
-    except (ValueError, KeyError, TypeError, RecursionError):
+    except (ValueError, KeyError, TypeError):
         return f"{DIGESTS}: damaged"
     found = _digests(folder)
     for name in sorted(files.keys() | found.keys()):

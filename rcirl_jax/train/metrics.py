@@ -12,6 +12,7 @@ from typing import Any
 
 import tqdm
 
+from rcirl_jax.errors import InputError
 from rcirl_jax.whole import named, write_whole
 
 
@@ -28,11 +29,8 @@ class MetricsWriter:
         self._path = folder / "metrics.jsonl"
         kept = []
         if self._path.exists() and resume_step > 0:
-            kept = [
-                line
-                for line in self._path.read_text().splitlines()
-                if _step_of(line) <= resume_step
-            ]
+            rows = read_metrics(self._path)
+            kept = [json.dumps(row) for row in rows if row["step"] <= resume_step]
         write_whole(self._path, "".join(line + "\n" for line in kept))
         self._file = self._path.open("a", buffering=1)
         self._board = _tensorboard(folder / "tensorboard", resume_step)
@@ -59,11 +57,41 @@ class MetricsWriter:
             self._board.close()
 
 
-def _step_of(line: str) -> int:
-    try:
-        return int(json.loads(line)["step"])
-    except (ValueError, KeyError, TypeError):
-        return 1 << 62  # a line cut short by a crash is dropped
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """The whole lines of a metrics.jsonl, none where there is no file.
+
+    A line that a crash or a full disk cut short is left out, and so is one without a
+    step; values that are neither numbers nor null are left out of theirs.
+    """
+    rows = []
+    text = path.read_text(errors="replace") if path.is_file() else ""
+    for line in text.splitlines():
+        with contextlib.suppress(ValueError, RecursionError):
+            found = json.loads(line)
+            if isinstance(found, dict) and type(found.get("step")) is int:
+                rows.append({k: v for k, v in found.items() if _is_number(v)})
+    return rows
+
+
+def pairs_won(path: Path, steps: int) -> float:
+    """Share of the pairs that the positive won over the last `steps` steps, 0 to 1.
+
+    Raises:
+      InputError: fewer whole lines with both numbers.
+    """
+    rows = [(row.get("pair_accuracy"), row.get("pairs")) for row in read_metrics(path)]
+    whole = [(a, n) for a, n in rows[-steps:] if a is not None and n is not None]
+    if len(whole) != steps:
+        raise InputError(
+            f"{path}: {len(whole)} whole lines at its end: expected {steps}, the last "
+            "epoch; remove the folder to train again"
+        )
+    won = sum(share * pairs for share, pairs in whole)
+    return won / max(sum(pairs for _, pairs in whole), 1.0)
+
+
+def _is_number(value: Any) -> bool:  # noqa: ANN401
+    return value is None or (type(value) in {int, float} and abs(value) < 1e300)
 
 
 def _tensorboard(folder: Path, purge_step: int) -> "_Board | None":

@@ -9,7 +9,7 @@ from rcirl_jax.data.joined import Demonstrations
 from rcirl_jax.errors import InputError
 from rcirl_jax.train.processes import is_first
 from rcirl_jax.train.state import TrainConfig
-from rcirl_jax.whole import write_whole
+from rcirl_jax.whole import read_json, write_whole
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -82,11 +82,11 @@ def _described(config: TrainConfig, dataset: Demonstrations) -> dict:
 
 def _read_run(path: Path) -> dict:
     """The contents of run.json; one line if it is not the file of a run."""
+    found = read_json(path, "the file of a training run")
     try:
-        found = json.loads(path.read_text())
         if isinstance(found["config"], dict):
             return found
         reason = "config: not a table"
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (KeyError, TypeError) as error:
         reason = f"{type(error).__name__}: {error}"
     raise InputError(f"{path}: {reason}: expected the file of a training run")

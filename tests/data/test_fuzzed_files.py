@@ -105,6 +105,25 @@ def test_members_that_name_places_outside_are_not_unpacked(members, tmp_path):
     assert not list(tmp_path.rglob("odd.npy"))
 
 
+@pytest.mark.parametrize(
+    ("name", "array"),
+    [
+        ("way", np.array(["far", "near"])),
+        ("row0.progress", np.array(["a", "b"])),
+        ("row0.progress", np.ones((2, 7, 7))),
+        ("row0.inside", np.ones((2, 5))),
+        ("trivial", np.ones(2)),
+        ("names", np.array(["ours", "ours"])),
+        ("groups", np.array([1, 2])),
+        ("reference", np.array([1.0])),
+    ],
+)
+def test_arrays_of_other_types_in_a_suite(members, name, array):
+    file, content = members
+    file.write_bytes(archive_of({**content, f"{name}.npy": npy(array)}))
+    assert "expected the metrics of a suite" in line_of(lambda: read_runs(file))
+
+
 def test_a_suite_that_unpacks_to_gigabytes_is_refused(members, monkeypatch):
     file, content = members
     monkeypatch.setattr("rcirl_jax.evaluation.suite_files.MAX_BYTES", 2**20)

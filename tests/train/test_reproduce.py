@@ -109,6 +109,14 @@ def test_a_moved_tensor_is_named(made, tmp_path):
     assert not dataclasses.replace(other, tolerance=1e-4).reproduced
 
 
+def test_another_value_for_nothing_there_is_named(made):
+    before = load_weights(made[0])
+    moved = tuple(none + 1.0 for none in before.none_values)
+    after = dataclasses.replace(before, none_values=moved)
+    differences = compare(before, after)
+    assert {name for name, most in differences.items() if most} == {"none_values"}
+
+
 def test_another_shape_or_loss_is_no_reproduction(made, tmp_path):
     before = load_weights(made[0])
     wide = dataclasses.replace(before, gamma=np.ones(3, np.float32))

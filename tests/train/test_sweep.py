@@ -252,6 +252,13 @@ def test_a_finished_group_is_not_trained_again(data, finished, tmp_path, monkeyp
     again = run_sweep(config_of(data), folder, Here(), MADE_BY)
     assert trained == [(6,)]
     assert untimed(again) == untimed(report)
+    file = folder / "groups" / "6.json"
+    group = json.loads(file.read_text())
+    del group["facts"]
+    file.write_text(json.dumps(group))
+    again = run_sweep(config_of(data), folder, Here(), MADE_BY)
+    assert trained == [(6,), (6,)]
+    assert untimed(again) == untimed(report)
 
 
 def test_other_settings_or_data_in_the_folder_are_one_line(data, finished):

@@ -18,9 +18,10 @@ from rcirl_jax.data import signal_checks, store
 from rcirl_jax.data.files import MANIFEST, MARK, Files
 from rcirl_jax.data.importers import synthetic
 from rcirl_jax.data.preferences import SCHEMA, read_preferences
-from rcirl_jax.evaluation.suite_files import SuiteRuns, read_runs, write_runs
-from rcirl_jax.export.from_run import read_config
+from rcirl_jax.evaluation.suite_files import COLUMNS, SuiteRuns, read_runs, write_runs
+from rcirl_jax.export.from_run import last_metrics, read_config
 from rcirl_jax.export.hand_weights import tuned_rows, write_hand_weights
+from rcirl_jax.export.provenance import check_provenance
 from rcirl_jax.export.reader import decode_weights
 from rcirl_jax.export.sweep import SWEEP, read_sweep
 from rcirl_jax.features import mapping
@@ -29,7 +30,9 @@ from rcirl_jax.simulation import families
 from rcirl_jax.simulation.catalogue import build_case
 from rcirl_jax.simulation.metrics import CaseMetrics
 from rcirl_jax.specs import load_toml, spec_root
+from rcirl_jax.stages import Stages
 from rcirl_jax.train import checkpoint
+from rcirl_jax.train.metrics import pairs_won
 from rcirl_jax.train.running import check_run, describe_run
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.units import NUM_TIMES
@@ -46,7 +49,10 @@ def weights(folder: Path) -> Target:
     kinds = ({}, {"by_context": True}, {"by_context": True, "seen": True})
     seeds = [packed(hidden=(2,), features=2, times=2, **kind) for kind in kinds]
     name = "weights.msgpack"
-    read = lambda data: decode_weights(data, name)  # noqa: E731
+
+    def read(data: bytes) -> None:
+        check_provenance(decode_weights(data, name).provenance, name)
+
     return Bytes(read, [("weights", seed) for seed in seeds], [name])
 
 
@@ -165,7 +171,9 @@ def suite(folder: Path) -> Target:
     folder.mkdir(parents=True)
     file = folder / "suite.npz"
     names = [field.name for field in dataclasses.fields(CaseMetrics)]
-    values: dict[str, Any] = {name: np.ones(CASES, np.float32) for name in names}
+    values: dict[str, Any] = {
+        name: np.ones((CASES, *COLUMNS.get(name, ())), np.float32) for name in names
+    }
     metrics = CaseMetrics(**values)
     runs = SuiteRuns(
         rows={"ours": metrics},
@@ -241,6 +249,38 @@ def runs(folder: Path) -> Target:
     return Target(read, [folder / "run.json"])
 
 
+def stages(folder: Path) -> Target:
+    """stages.json: compared with what is there, a stage done, another forgotten."""
+    folder.mkdir(parents=True)
+    (folder / "weights.msgpack").write_bytes(b"weights")
+    (folder / "verdict.json").write_text("{}")
+    made = Stages(folder=folder)
+    for name, file in (("train", "weights.msgpack"), ("gate", "verdict.json")):
+        made.run(name, {"seed": 0}, [folder / file], lambda: None)
+
+    def read() -> None:
+        work = lambda: (folder / "weights.msgpack").write_bytes(b"weights")  # noqa: E731
+        outputs = [folder / "weights.msgpack"]
+        made.run("train", {"seed": 0}, outputs, work, stale=("gate",))
+
+    return Target(read, [folder / "stages.json"])
+
+
+def metrics(folder: Path) -> Target:
+    """metrics.jsonl as a resume, an export and the choice between seeds read it."""
+    folder.mkdir(parents=True)
+    file = folder / "metrics.jsonl"
+    line = {"loss": 0.5, "pair_accuracy": 0.75, "pairs": 64.0, "queries_per_s": None}
+    rows = [{"step": step, **line} for step in (1, 2, 3)]
+    file.write_text("".join(json.dumps(row) + "\n" for row in rows))
+
+    def read() -> None:
+        last_metrics(folder)
+        pairs_won(file, 2)
+
+    return Target(read, [file])
+
+
 def hand(folder: Path) -> Target:
     """Weights of a hand-set cost."""
     folder.mkdir(parents=True)
@@ -257,9 +297,9 @@ def sweeps(folder: Path) -> Target:
 
 
 READERS: dict[str, Reader] = {
-    "weights": Reader(make=weights, share=6, words=("sha256", "<f4", "tanh")),
+    "weights": Reader(make=weights, share=5, words=("sha256", "<f4", "tanh")),
     "wire": Reader(make=pieces.wire_target, share=4),
-    "geometry": Reader(make=pieces.geometry_target, share=5),
+    "geometry": Reader(make=pieces.geometry_target, share=4),
     "tfrecord": Reader(make=pieces.tfrecord_target, share=3),
     "sealed": Reader(make=sealed, words=("schema_version", "shards")),
     "dataset": Reader(make=dataset),
@@ -272,6 +312,8 @@ READERS: dict[str, Reader] = {
     "checkpoints": Reader(make=checkpoints, share=2),
     "signal_checks": Reader(make=checks, share=3),
     "runs": Reader(make=runs),
+    "stages": Reader(make=stages),
+    "metrics": Reader(make=metrics),
     "hand_weights": Reader(make=hand),
     "sweeps": Reader(make=sweeps),
     "lanelet2": Reader(make=pieces.lanelet2_target),

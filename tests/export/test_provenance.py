@@ -1,0 +1,74 @@
+"""What a file says of its making may be anything: it is checked before it is used."""
+
+import pytest
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.export.loading import open_reward
+from rcirl_jax.export.provenance import dataset_names
+from tests import weights_files
+from tests.commands import command
+
+
+def with_provenance(tmp_path, monkeypatch, **entries):
+    """A file that every main accepts, but for these entries of its provenance."""
+    made = {**weights_files.provenance(), **entries}
+    monkeypatch.setattr(weights_files, "provenance", lambda: made)
+    return weights_files.random_weights(tmp_path / "w.msgpack")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("seed", "x"), ("seed", [1]), ("seed", True), ("seed", 1.5), ("flags", "x"),
+        ("mode", 3), ("config", [1]), ("versions", "jax"), ("dataset_sha256", {}),
+        ("steps", "5"), ("git_commit", 3),
+    ],
+)  # fmt: skip
+def test_entries_of_other_types_are_one_line(tmp_path, monkeypatch, name, value):
+    path = with_provenance(tmp_path, monkeypatch, **{name: value})
+    with pytest.raises(
+        InputError, match=rf"w\.msgpack: provenance\.{name}: .*expected"
+    ):
+        open_reward(str(path))
+
+
+def test_what_is_not_said_is_no_mistake(tmp_path, monkeypatch):
+    nothing = dict.fromkeys(("seed", "flags", "git_commit", "versions"))
+    path = with_provenance(tmp_path, monkeypatch, **nothing)
+    assert open_reward(str(path)).provenance["seed"] is None
+
+
+@pytest.mark.parametrize("found", [5, [], [3], "", "a\0b", ["a", None], {"a": 1}])
+def test_names_that_no_dataset_can_have(found):
+    with pytest.raises(
+        InputError, match=r"run\.json: flags\.data: .*expected a dataset"
+    ):
+        dataset_names(found, "run.json: flags.data")
+
+
+def test_one_dataset_or_several():
+    assert dataset_names("a", "f") == ["a"]
+    assert dataset_names(["a", "b"], "f") == ["a", "b"]
+
+
+@pytest.mark.parametrize(
+    "text", ["[1]", "nul", '{"flags": [1]}', '{"flags": {"data": 5}}']
+)
+def test_a_run_that_is_none_is_one_line(tmp_path, text):
+    (tmp_path / "run.json").write_text(text)
+    done = command("experiments.export_weights", f"--workdir={tmp_path}")
+    assert done.returncode == 2
+    (said,) = done.stderr.strip().splitlines()
+    assert "run.json: " in said
+
+
+def test_no_data_in_the_provenance_is_one_line(tmp_path, monkeypatch):
+    for flags in ({"data": 5}, {}, None):
+        path = with_provenance(tmp_path, monkeypatch, flags=flags)
+        done = command(
+            "experiments.reproduce", f"--weights={path}", f"--output={tmp_path / 'out'}"
+        )
+        assert done.returncode == 2
+        (said,) = done.stderr.strip().splitlines()
+        assert "data" in said
+    assert not (tmp_path / "out").exists()

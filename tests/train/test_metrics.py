@@ -1,0 +1,62 @@
+"""metrics.jsonl as it is read again: damaged lines, missing numbers."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.export.from_run import last_metrics
+from rcirl_jax.report.frames import draw_training
+from rcirl_jax.train.metrics import MetricsWriter, pairs_won, read_metrics
+
+WHOLE = {"loss": 0.5, "pair_accuracy": 0.75, "pairs": 4.0, "queries_per_s": 1.0}
+DAMAGED = (
+    '{"step": 2, "loss": 0.', "[1]", "3", '{"loss": 1.0}', '{"step": "2"}',
+    '{"step": Infinity}', '{"step": true}', "[" * 100_000, "\ufffd", "",
+)  # fmt: skip
+
+
+def write(folder: Path, lines: list[str]) -> Path:
+    path = folder / "metrics.jsonl"
+    path.write_text("".join(line + "\n" for line in lines))
+    return path
+
+
+def line(step: int, **values: object) -> str:
+    return json.dumps({"step": step, **WHOLE, **values})
+
+
+@pytest.mark.parametrize("damaged", DAMAGED)
+def test_a_damaged_line_is_left_out(tmp_path, damaged):
+    path = write(tmp_path, [line(1), damaged, line(3, loss=0.25)])
+    assert [row["step"] for row in read_metrics(path)] == [1, 3]
+    assert last_metrics(tmp_path)["loss"] == 0.25
+    (tmp_path / "pictures").mkdir()
+    (picture, _), *_ = draw_training(tmp_path, tmp_path / "pictures")
+    assert picture.read_bytes()[:4] == b"\x89PNG"
+    MetricsWriter(tmp_path, resume_step=2).close()
+    assert path.read_text() == line(1) + "\n"
+
+
+def test_values_that_are_no_numbers_are_left_out(tmp_path):
+    path = write(tmp_path, [line(1, loss="low", pairs=[1], pair_accuracy=None)])
+    assert read_metrics(path) == [
+        {"step": 1, "pair_accuracy": None, "queries_per_s": 1.0}
+    ]
+    assert last_metrics(tmp_path) == {"step": 1, "queries_per_s": 1.0}
+
+
+def test_pairs_won_are_those_of_the_last_steps(tmp_path):
+    path = write(
+        tmp_path,
+        [line(1), line(2, pairs=10.0, pair_accuracy=0.5), line(3, pairs=30.0)],
+    )
+    assert pairs_won(path, 2) == pytest.approx((10 * 0.5 + 30 * 0.75) / 40)
+    with pytest.raises(InputError, match=r"metrics\.jsonl: 3 whole lines.*expected 4"):
+        pairs_won(path, 4)
+    write(tmp_path, [line(1), line(2, pairs=None)])
+    with pytest.raises(InputError, match="1 whole lines at its end: expected 2"):
+        pairs_won(path, 2)
+    with pytest.raises(InputError, match=r"nowhere\.jsonl: 0 whole lines"):
+        pairs_won(tmp_path / "nowhere.jsonl", 1)
