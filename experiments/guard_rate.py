@@ -4,14 +4,15 @@
 
 On held-out scenes of the site that the reward was trained on these are false alarms;
 on another site, in part, what the guard is for. docs/guard.md has the rule. Prints
-the share of the scenes whose plan is out of distribution, and by which feature.
+the share of the scenes whose plan is out of distribution, by which feature, and the
+features to which the guard is blind.
 """
 
 from absl import flags
 
 from experiments.common import run
 from rcirl_jax.data.joined import open_datasets
-from rcirl_jax.export.guard import Limits
+from rcirl_jax.export.guard import Guard, Limits
 from rcirl_jax.export.guard_rate import guard_rate
 from rcirl_jax.export.loading import open_reward
 
@@ -42,6 +43,8 @@ def main() -> None:
     )
     for name, count in rate.by_feature.items():
         print(f"  {name}: {count}")
+    blind = ", ".join(Guard(reward, limits).blind) or "none"
+    print(f"blind to (both sides of the range open): {blind}")
     if flagged:
         print(f"dataset rows, the worst first: {', '.join(map(str, flagged[:10]))}")
 

@@ -12,6 +12,7 @@
 namespace {
 
 constexpr float kNan = std::numeric_limits<float>::quiet_NaN();
+constexpr float kInfinity = std::numeric_limits<float>::infinity();
 constexpr std::size_t kCount = 8;
 
 // Features lie in [-1.5, 1.25], have location 0 and scale 1; seen in [-0.5, 0.5].
@@ -22,9 +23,10 @@ Example plain() {
   return example;
 }
 
-std::string with_seen(const Example& example) {
+std::string with_seen(const Example& example,
+                      const std::vector<float>& seen = {-0.5f, -0.5f, -0.5f, 0.5f, 0.5f, 0.5f}) {
   auto fields = example.body();
-  fields.push_back({"seen", pack::array({2, 3}, {-0.5f, -0.5f, -0.5f, 0.5f, 0.5f, 0.5f})});
+  fields.push_back({"seen", pack::array({2, 3}, seen)});
   return pack::sealed(pack::map(fields), 3);
 }
 
@@ -71,15 +73,51 @@ void test_without_ranges_the_normaliser_decides() {
   CHECK(!guard.check(filled(0.76f).data(), kCount, {}).in_distribution);
 }
 
-void test_a_nan_at_a_valid_time_is_out() {
-  const rcirl::Guard guard(loaded(with_seen(plain())));
+// Whether a plan with one number in one column is in distribution.
+bool fine(const rcirl::Guard& guard, std::size_t feature, float value) {
   std::vector<float> features = filled(0.0f);
-  features[(3 * 4 + 2) * 3 + 2] = kNan;  // candidate 3, time 2
-  rcirl::Verdict found = guard.check(features.data(), kCount, {});
-  CHECK(!found.in_distribution && found.feature == 2 && found.share == 1.0 / 32.0);
-  const std::vector<std::uint8_t> valid = {1, 1, 0, 1};
-  found = guard.check(features.data(), kCount, {valid.data(), rcirl::Mask::kShared});
-  CHECK(found.in_distribution && found.share == 0.0);
+  for (std::size_t i = feature; i < features.size(); i += 3) features[i] = value;
+  return guard.check(features.data(), kCount, {}).in_distribution;
+}
+
+void test_a_side_is_open_where_training_reached_the_limit() {
+  const rcirl::Guard guard(loaded(with_seen(plain(), {-1.5f, -0.5f, -1.6f, 0.5f, 1.25f, 1.3f})));
+  CHECK(fine(guard, 0, -1e9f) && !fine(guard, 0, 1e9f));
+  CHECK(!fine(guard, 1, -1e9f) && fine(guard, 1, 1e9f));
+  CHECK(fine(guard, 2, -1e9f) && fine(guard, 2, 1e9f));
+}
+
+// Range and margin cover [-1.5, 1.25], all that the network is given.
+void test_beyond_a_range_that_training_did_not_fill_is_outside() {
+  const rcirl::Guard guard(loaded(with_seen(plain(), {-1.4f, -1.4f, -1.4f, 1.2f, 1.2f, 1.2f})));
+  for (const float inside : {-1.6f, 0.0f, 1.4f}) CHECK(fine(guard, 1, inside));
+  for (const float outside : {-1e9f, -1.7f, 1.5f, 1e9f}) CHECK(!fine(guard, 1, outside));
+}
+
+void test_without_ranges_a_reach_to_the_limit_opens_its_side() {
+  Example example = plain();
+  example.scale = {0.42f, 0.25f, 0.5f};  // reach 1.26, 0.75, 1.5
+  const rcirl::Guard guard(loaded(example.file()));
+  CHECK(!fine(guard, 0, -1.3f) && fine(guard, 0, 1e9f));
+  CHECK(!fine(guard, 1, -1e9f) && !fine(guard, 1, 1e9f));
+  CHECK(fine(guard, 2, -1e9f) && fine(guard, 2, 1e9f));
+}
+
+void test_not_finite_at_a_valid_time_is_out() {
+  const rcirl::Reward narrow = loaded(with_seen(plain()));
+  const rcirl::Reward open = loaded(with_seen(plain(), {-2.f, -2.f, -2.f, 2.f, 2.f, 2.f}));
+  for (const rcirl::Reward* reward : {&narrow, &open}) {
+    const rcirl::Guard guard(*reward);
+    for (const float value : {kNan, kInfinity, -kInfinity}) {
+      std::vector<float> features = filled(0.0f);
+      features[(3 * 4 + 2) * 3 + 2] = value;  // candidate 3, time 2
+      rcirl::Verdict found = guard.check(features.data(), kCount, {});
+      CHECK(!found.in_distribution && found.feature == 2 && found.share == 1.0 / 32.0);
+      const std::vector<std::uint8_t> valid = {1, 1, 0, 1};
+      found = guard.check(features.data(), kCount, {valid.data(), rcirl::Mask::kShared});
+      CHECK(found.in_distribution && found.share == 0.0);
+    }
+  }
 }
 
 void test_nothing_known_is_out() {
@@ -107,7 +145,10 @@ int main() {
   test_ranges_are_widened_by_the_margin();
   test_the_share_of_one_feature_decides();
   test_without_ranges_the_normaliser_decides();
-  test_a_nan_at_a_valid_time_is_out();
+  test_a_side_is_open_where_training_reached_the_limit();
+  test_beyond_a_range_that_training_did_not_fill_is_outside();
+  test_without_ranges_a_reach_to_the_limit_opens_its_side();
+  test_not_finite_at_a_valid_time_is_out();
   test_nothing_known_is_out();
   test_a_context_stands_beside_the_ranges();
   return failures == 0 ? 0 : 1;

@@ -3,13 +3,17 @@
 May be copied into a planner's repository beside `reader.py`. docs/guard.md says what
 it can tell; the rule is
 
-    x_t   = clip(f_t, lower, upper)                        what the network sees
-    range = [low - margin scale, high + margin scale]      with the file's `seen`
-          = [location - reach scale, location + reach scale]      without
-    share_i = share of the entries x_ti of feature i, over all candidates and
-              valid times, that lie outside
+    [first, last] = [seen_0, seen_1]                       with the file's `seen`
+                  = [location - reach scale, location + reach scale]      without
+    low  = -inf if first <= lower, else first - margin scale   margin 0 without `seen`
+    high = +inf if last >= upper, else last + margin scale
+    share_i = share of the raw entries f_ti of feature i, over all candidates and
+              valid times, that lie outside [low_i, high_i] or are not finite
 
-A plan is in distribution if no share is above the limit and nothing is NaN.
+The network clips to [lower, upper]: what lies beyond a limit that the training
+reached looks to it like what it saw.
+
+A plan is in distribution if no share is above the limit and every entry is finite.
 
     guard = Guard(load_weights("weights.msgpack"))
     best, verdict = guard.choose(features, incumbent_values)  # [K, T, F], [K]
@@ -58,20 +62,28 @@ class Verdict:
     """What the guard says of one plan."""
 
     in_distribution: bool
-    feature: str  # the one with a NaN, else with the largest share; the first of equals
+    # one with an entry that is not finite, if any; of those the one with the largest
+    # share; the first of equals
+    feature: str
     share: float  # of its entries, outside
 
 
 @np.errstate(over="ignore")
 def bounds(reward: Ranged, limits: Limits) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest value of each feature, float32 [F], in its unit."""
+    """Lowest and highest value in distribution, float32 [F], in the feature's unit.
+
+    An infinite one is an open side.
+    """
     scale = np.asarray(reward.scale, np.float64)
     if reward.seen is None:
-        location = np.asarray(reward.location, np.float64)
-        low, high = location - limits.reach * scale, location + limits.reach * scale
+        location, reach = np.asarray(reward.location, np.float64), limits.reach * scale
+        ends, margin = np.stack([location - reach, location + reach]), 0.0
     else:
-        ends = np.asarray(reward.seen, np.float64)
-        low, high = ends[0] - limits.margin * scale, ends[1] + limits.margin * scale
+        ends, margin = np.asarray(reward.seen, np.float64), limits.margin * scale
+    first, last = ends.astype(np.float32)
+    lower, upper = (np.asarray(x, np.float32) for x in (reward.lower, reward.upper))
+    low = np.where(first <= lower, -np.inf, ends[0] - margin)
+    high = np.where(last >= upper, np.inf, ends[1] + margin)
     return low.astype(np.float32), high.astype(np.float32)
 
 
@@ -81,6 +93,13 @@ class Guard:
     def __init__(self, reward: Ranged, limits: Limits = Limits()) -> None:
         self.reward, self.limits = reward, limits
         self.low, self.high = bounds(reward, limits)
+
+    @property
+    def blind(self) -> tuple[str, ...]:
+        """Features with both sides open: only what is not finite is noticed."""
+        both = np.isneginf(self.low) & np.isposinf(self.high)
+        names = zip(self.reward.names, both, strict=True)
+        return tuple(name for name, is_open in names if is_open)
 
     def check(
         self, features: np.ndarray, time_valid: np.ndarray | None = None
@@ -105,9 +124,10 @@ class Guard:
         if time_valid is not None:
             counts = np.broadcast_to(np.asarray(time_valid) != 0, given.shape[:-1])
         rows = given[counts]  # [n, F]
-        unknown = np.isnan(rows).any(axis=0)
-        x = np.clip(rows, self.reward.lower, self.reward.upper)
-        outside = np.sum(~((x >= self.low) & (x <= self.high)), axis=0)
+        finite = np.isfinite(rows)
+        unknown = ~finite.all(axis=0)
+        inside = finite & (rows >= self.low) & (rows <= self.high)
+        outside = np.sum(~inside, axis=0)
         count = len(rows)
         shares = outside / count if count else np.ones(given.shape[-1])
         worst = int(np.argmax(np.where(unknown, shares + 2.0, shares)))

@@ -21,8 +21,8 @@ class Guarded(flax.struct.PyTreeNode, kw_only=True):
 
     reward: RewardParams  # effective
     normaliser: Normaliser
-    low: jax.Array  # [F] lowest value in distribution, in the feature's unit
-    high: jax.Array  # [F]
+    low: jax.Array  # [F] of `export.guard.bounds`, in the feature's unit; may be -inf
+    high: jax.Array  # [F]; may be +inf
     share: jax.Array  # [] largest share of a feature's entries outside
     incumbent: Params  # the other score's weights
 
@@ -30,21 +30,23 @@ class Guarded(flax.struct.PyTreeNode, kw_only=True):
 def in_distribution(params: Guarded, rows: jax.Array, counts: jax.Array) -> jax.Array:
     """Whether a plan is like what the reward was trained on.
 
+        share_i = share of the raw entries of feature i outside [low_i, high_i]
+
+    in distribution: no share above the limit, every entry finite.
+
     Args:
       params: ranges and limit.
       rows: [F, T, K] raw features of its candidates.
       counts: [T, K] bool, valid times of feasible candidates.
 
     Returns:
-      [] bool; False where nothing counts, or something that does is NaN.
+      [] bool; False where nothing counts, or something that does is not finite.
     """
-    columns = lambda v: v[:, None, None]  # noqa: E731
-    normaliser = params.normaliser
-    x = jnp.clip(rows, columns(normaliser.lower), columns(normaliser.upper))
-    inside = (x >= columns(params.low)) & (x <= columns(params.high))
+    low, high = (side[:, None, None] for side in (params.low, params.high))
+    inside = (rows >= low) & (rows <= high)
     outside = jnp.sum(~inside & counts, axis=(1, 2))
     shares = outside / jnp.maximum(jnp.sum(counts), 1)
-    known = jnp.any(counts) & ~jnp.any(jnp.isnan(x) & counts)
+    known = jnp.any(counts) & ~jnp.any(~jnp.isfinite(rows) & counts)
     return known & jnp.all(shares <= params.share)
 
 

@@ -12,15 +12,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rcirl_jax.data.store import DatasetWriter, open_dataset
 from rcirl_jax.export import Guard, Limits, decode_weights, guard, pack
 from rcirl_jax.export.closed_loop import table_rows
+from rcirl_jax.export.from_run import export_run
 from rcirl_jax.export.loading import open_reward, reward_params
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.guard import Guarded, guarded_score, in_distribution
 from rcirl_jax.planner.rank import hand_score, learned_score
 from rcirl_jax.reward import seen_range
+from rcirl_jax.train.loop import train
+from rcirl_jax.units import HORIZON_S
+from tests.data.test_store import finish_fields, lineage
 from tests.export.test_reader import ALLOWED
-from tests.scenes import random_scene, sampled
+from tests.scenes import batch, demonstration, random_scene, sampled
 from tests.train.test_step import CONFIG
 from tests.weights_files import example_samples, example_weights, random_weights
 
@@ -100,24 +105,62 @@ def test_the_limits_are_limits():
     assert not Guard(made(False), Limits(reach=2.9)).check(far).in_distribution
 
 
-def test_what_is_clipped_is_judged_as_the_network_sees_it():
-    """Nobody ahead, infinitely far away: the cap, which the training saw."""
-    reward = made(seen=True)
-    capped = decode_weights(
-        pack(w := dataclasses.replace(
-            example_weights(), lower=np.full(F, -1.0), upper=np.full(F, 1.0),
-            scale=np.ones(F), seen=np.array([[-1.0] * F, [1.0] * F]),
-        ), *example_samples(w))
-    )  # fmt: skip
+def reaching(low, high, seen=True):
+    """A reward clipped to [-1, 1] whose training, or reach, got to [low, high]."""
+    middle, half = 0.5 * (np.array(low) + high), 0.5 * (np.array(high) - low)
+    weights = dataclasses.replace(
+        example_weights(),
+        lower=np.full(F, -1.0),
+        upper=np.full(F, 1.0),
+        location=np.zeros(F) if seen else middle,
+        scale=np.ones(F) if seen else half / 3.0,
+        seen=np.array([low, high]) if seen else None,
+    )
+    return decode_weights(pack(weights, *example_samples(weights)))
+
+
+@pytest.mark.parametrize("value", [1e9, -1e9, 1.3])
+def test_beyond_a_range_that_training_did_not_fill_is_outside(value):
+    """Though range and margin together cover all that the network is given."""
+    features = plan(spread=0.9)
+    features[..., 1] = value
+    verdict = Guard(reaching([-0.9] * F, [0.9] * F)).check(features)
+    assert (verdict.in_distribution, verdict.feature) == (False, "feature1")
+    assert verdict.share == 1.0
+
+
+@pytest.mark.parametrize("seen", [True, False])
+def test_a_side_is_open_where_training_reached_the_limit(seen):
+    judge = Guard(reaching([-1.0, -0.5, -1.5], [0.5, 1.0, 1.5], seen))
+    np.testing.assert_array_equal(np.isneginf(judge.low), [True, False, True])
+    np.testing.assert_array_equal(np.isposinf(judge.high), [False, True, True])
+    assert judge.blind == ("feature2",)
+    assert (judge.low.dtype, judge.high.dtype) == (np.float32, np.float32)
+    for feature, value, fine in (
+        (0, -1e9, True), (0, 1e9, False), (1, -1e9, False), (1, 1e9, True),
+        (2, -1e9, True), (2, 1e9, True),
+    ):  # fmt: skip
+        features = np.zeros((K, T, F), np.float32)
+        features[..., feature] = value
+        assert judge.check(features).in_distribution == fine
+
+
+def test_the_margin_opens_no_side():
+    judge = Guard(reaching([-0.999] * F, [0.999] * F), Limits(margin=1e3))
+    assert judge.blind == ()
+    np.testing.assert_allclose(judge.high, 1000.999)
+
+
+def test_guards_of_files_that_cover_little_are_blind_to_nothing():
+    assert Guard(made()).blind == Guard(made(False)).blind == ()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("filled", [False, True])
+def test_not_finite_is_unknown_unless_its_time_does_not_count(value, filled):
+    reward = reaching([-1.0] * F, [1.0] * F) if filled else made()
     features = plan()
-    features[..., 0] = np.inf
-    assert Guard(capped).check(features).in_distribution
-    assert not Guard(reward).check(features).in_distribution
-
-
-def test_nan_is_out_of_distribution_unless_its_time_does_not_count():
-    reward, features = made(), plan()
-    features[4, 2, 1] = np.nan
+    features[4, 2, 1] = value
     index, verdict = Guard(reward).choose(features, -np.arange(K))
     assert (index, verdict.in_distribution, verdict.feature) == (0, False, "feature1")
     assert verdict.share == 1 / (K * T)
@@ -144,6 +187,32 @@ def test_the_range_seen_is_of_quantiles_of_clipped_rows():
     assert high[column] < 5.0
 
 
+def test_a_file_as_training_exports_it_notices_what_it_never_saw(tmp_path):
+    """Each feature in turn, far beyond what the network is given."""
+    rows = jax.tree.map(np.asarray, batch([demonstration(i) for i in range(8)]))
+    writer = DatasetWriter(tmp_path / "d")
+    future = np.full(8, HORIZON_S, np.float32)
+    writer.write_shard(0, rows.replace(future_s=future), lineage(0))
+    writer.finish(finish_fields())
+    dataset = open_dataset(tmp_path / "d")
+    config = dataclasses.replace(CONFIG, batch_size=4, epochs=1)
+    train(dataset, tmp_path / "run", config)
+    reward = export_run(tmp_path / "run", dataset, tmp_path / "w.msgpack")
+    judge, usual = Guard(reward), reward.location[None, None]
+    assert judge.check(usual).in_distribution
+    assert reward.seen is not None
+    below, above = reward.seen[0] <= reward.lower, reward.seen[1] >= reward.upper
+    assert 0 < below.sum() < below.size
+    assert 0 < above.sum() < above.size
+    for i, name in enumerate(reward.names):
+        for value, reached in ((-1e9, below[i]), (1e9, above[i])):
+            far = usual.copy()
+            far[..., i] = value
+            verdict = judge.check(far)
+            assert verdict.in_distribution == reached, (name, value)
+            assert verdict.in_distribution or verdict.feature == name
+
+
 # --------------------------------------------------------------- the closed loop
 
 
@@ -159,10 +228,13 @@ def guarded(reward, limits=None):
 
 @given(seed=st.integers(0, 10_000), spread=st.sampled_from([0.9, 1.2, 1.6, 3.0]))
 def test_the_compiled_rule_is_the_readers(seed, spread):
-    rng, reward = np.random.default_rng(seed), made(bool(seed % 2))
+    rng, recorded = np.random.default_rng(seed), bool(seed % 2)
+    open_sides = reaching([-1.0, -0.5, -1.5], [0.5, 1.0, 1.5], recorded)
+    reward = open_sides if seed % 3 == 0 else made(recorded)
     features = plan(seed, spread) * rng.uniform(0.3, 1.0, F).astype(np.float32)
     if seed % 5 == 0:
-        features[0, rng.integers(T), 0] = np.nan
+        value = rng.choice([np.nan, np.inf, -np.inf])
+        features[0, rng.integers(T), rng.integers(F)] = value
     valid = np.arange(T) < rng.integers(0, T + 1)
     counts = np.broadcast_to(valid[:, None], (T, K))
     found = RULE(guarded(reward), features.transpose(2, 1, 0), counts)

@@ -11,6 +11,8 @@ import struct
 import subprocess
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import msgpack
 import numpy as np
 import pytest
@@ -22,7 +24,8 @@ from rcirl_jax.export import (
     load_weights,
     save,
 )
-from tests.export import test_old_files, test_reader
+from rcirl_jax.planner.guard import in_distribution
+from tests.export import test_guard, test_old_files, test_reader
 from tests.weights_files import packed, trained_network
 
 ONBOARD = Path(__file__).resolve().parents[2] / "onboard"
@@ -141,17 +144,20 @@ def test_an_old_file_scores_as_it_did(programs, tmp_path, version):
 
 @pytest.mark.parametrize("data", [VALID, GATED, RANGED, BOTH])
 def test_a_thousand_plans_get_the_guard_of_python(programs, tmp_path, data):
-    """Plans of four candidates, some in distribution, some beyond, some with a NaN."""
+    """And of JAX: four candidates, some beyond, at an open side, or not finite."""
     path, rng = tmp_path / "weights.msgpack", np.random.default_rng(4)
     path.write_bytes(data)
     reward = load_weights(path)
     guard = Guard(reward)
-    middle, half = 0.5 * (guard.low + guard.high), 0.5 * (guard.high - guard.low)
+    low, high = np.clip(guard.low, -6.0, None), np.clip(guard.high, None, 6.0)
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
     wide = rng.uniform(0.2, 3.0, (1000, 1, 1, 2))
     features = middle + half * wide * rng.uniform(-1.0, 1.0, (1000, 4, 3, 2))
-    features[::9] = middle + half * rng.choice([-1.0, 1.0], (112, 4, 3, 2))  # the ends
+    features[::9] = np.where(rng.random((112, 4, 3, 2)) < 0.5, low, high)  # the ends
+    features[3::50, :, :, 1] = 1e9
     features[::50, 1, 2, 0] = np.nan
     features[7::50, 2, 1, 1] = np.inf
+    features[8::50, 3, 0, 0] = -np.inf
     features = features.astype(np.float32)
     valid = rng.random((1000, 4, 3)) < 0.7
     features.tofile(tmp_path / "features")
@@ -166,6 +172,13 @@ def test_a_thousand_plans_get_the_guard_of_python(programs, tmp_path, data):
         ]
         fine = [verdict.in_distribution for verdict in expected]
         assert 100 < sum(fine) < 900
+        counts = valid if mask else np.ones_like(valid)
+        compiled = jax.vmap(in_distribution, in_axes=(None, 0, 0))(
+            test_guard.guarded(reward),
+            jnp.asarray(features.transpose(0, 3, 2, 1)),
+            jnp.asarray(counts.transpose(0, 2, 1)),
+        )
+        np.testing.assert_array_equal(compiled, fine)
         for row, verdict in zip(found, expected, strict=True):
             assert bool(int(row[0])) == verdict.in_distribution
             assert reward.names[int(row[1])] == verdict.feature

@@ -12,6 +12,7 @@
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
+#include <limits>
 
 #include "rcirl/reward.hpp"
 
@@ -26,8 +27,10 @@ struct GuardLimits {
 
 struct Verdict {
   bool in_distribution = false;
-  std::size_t feature = 0;  // with a NaN, else with the largest share; the first of equals
-  double share = 1.0;       // of its entries, outside
+  // One with an entry that is not finite, if any; of those the one with the largest share;
+  // the first of equals.
+  std::size_t feature = 0;
+  double share = 1.0;  // of its entries, outside
 };
 
 class Guard {
@@ -41,15 +44,17 @@ class Guard {
     for (std::size_t f = 0; f < features_; ++f) {
       const double scale = static_cast<double>(network.scale[f]);
       const double location = static_cast<double>(network.location[f]);
-      double low = location - limits.reach * scale, high = location + limits.reach * scale;
+      double first = location - limits.reach * scale, last = location + limits.reach * scale;
+      double margin = 0.0;
       if (!seen.empty()) {
-        low = static_cast<double>(seen[f]) - limits.margin * scale;
-        high = static_cast<double>(seen[f + features_]) + limits.margin * scale;
+        first = static_cast<double>(seen[f]);
+        last = static_cast<double>(seen[f + features_]);
+        margin = limits.margin * scale;
       }
-      lower_[f] = network.lower[f];
-      upper_[f] = network.upper[f];
-      low_[f] = detail::narrow(low);
-      high_[f] = detail::narrow(high);
+      const bool open_below = detail::narrow(first) <= network.lower[f];
+      const bool open_above = detail::narrow(last) >= network.upper[f];
+      low_[f] = open_below ? -kInfinity : detail::narrow(first - margin);
+      high_[f] = open_above ? kInfinity : detail::narrow(last + margin);
     }
   }
 
@@ -69,10 +74,9 @@ class Guard {
         ++entries;
         const float* row = features + (k * times_ + t) * features_;
         for (std::size_t f = 0; f < features_; ++f) {
-          float x = row[f] < lower_[f] ? lower_[f] : row[f];
-          x = x > upper_[f] ? upper_[f] : x;
-          unknown[f] |= std::isnan(x);
-          outside[f] += !(x >= low_[f] && x <= high_[f]);
+          const bool finite = std::isfinite(row[f]);
+          unknown[f] |= !finite;
+          outside[f] += !(finite && row[f] >= low_[f] && row[f] <= high_[f]);
         }
       }
     }
@@ -95,9 +99,10 @@ class Guard {
   }
 
  private:
+  static constexpr float kInfinity = std::numeric_limits<float>::infinity();
+
   std::size_t features_, times_;
   double limit_;
-  float lower_[detail::kMaxFeatures] = {}, upper_[detail::kMaxFeatures] = {};
   float low_[detail::kMaxFeatures] = {}, high_[detail::kMaxFeatures] = {};
 };
 
