@@ -24,16 +24,24 @@ def harness(tmp_path, *flags):
     return done, json.loads(file.read_text())["rows"]
 
 
-@pytest.mark.parametrize("signal", ["KILL", "TERM"])
-def test_disturbed_commands_come_to_the_same(tmp_path, signal):
-    done, rows = harness(
-        tmp_path, "--commands=import,train", "--kills=6", f"--signal={signal}"
-    )
+@pytest.mark.parametrize(
+    ("signal", "kills"),
+    [
+        ("KILL", {"import": 3, "train": 3}),
+        ("TERM", {"import": 3, "train": 3, "sweep": 2, "autotune": 2}),
+    ],
+    ids=["KILL", "TERM"],
+)
+def test_disturbed_commands_come_to_the_same(tmp_path, signal, kills):
+    flags = (f"--commands={','.join(kills)}", f"--kills={sum(kills.values())}")
+    done, rows = harness(tmp_path, *flags, f"--signal={signal}")
     assert done.returncode == 0, done.stdout
-    assert [row["count"] for row in rows] == [3, 3]
+    assert [row["count"] for row in rows] == [*kills.values()]
     assert {row["outcome"] for row in rows} == {"as undisturbed"}
     assert all(row["comparisons"] >= 1 for row in rows)
     assert all(x < 10.0 for row in rows for x in row["seconds_to_end"])
+    assert all(len(row["progress_at_kill"]) == row["count"] for row in rows)
+    assert all(any(row["progress_at_kill"]) for row in rows)
 
 
 def test_a_broken_resume_is_found(tmp_path):

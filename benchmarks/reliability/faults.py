@@ -3,13 +3,14 @@
     python -m benchmarks.reliability.faults --kills=50 --output=benchmarks/results
 
 import, train, sweep and autotune run on small synthetic data. Each runs once
-undisturbed; then it is killed at moments drawn uniformly over that run's time, again
-and again, started by the same command each time, and when it has ended by itself its
-outputs are compared to the bit. `--signal=TERM` (to the process, as a cluster does)
-and `INT` (to its group, as a terminal does) also hold the seconds to the end and the
-exit status against what is promised. `--moments=work` draws them after the first
-thing is finished. `--broken_resume` has trainings forget where in the data they were:
-this file has to say so and end with 1.
+undisturbed; then it is killed at random moments, again and again, started by the same
+command each time, and when it has ended by itself its outputs are compared to the bit.
+Half of the moments are uniform over the whole run (`--moments=run`: all), half wait
+until something is finished (a shard, a checkpoint, a shape of a sweep, a stage;
+`--moments=work`: all) and are uniform over the rest. `--signal=TERM` (to the process,
+as a cluster does) and `INT` (to its group, as a terminal does) also hold the seconds to
+the end and the exit status against what is promised. `--broken_resume` has trainings
+forget where in the data they were: this file has to say so and end with 1.
 
 Writes faults_SIGNAL.json after every comparison, one row per command.
 """
@@ -41,9 +42,9 @@ _JOBS = flags.DEFINE_list("commands", list(SHARES), "which of them")
 _SIGNAL = flags.DEFINE_enum("signal", "KILL", SIGNALS, "that ends them")
 _MOMENTS = flags.DEFINE_enum(
     "moments",
-    "run",
-    ["run", "work"],
-    "over the whole run, or once it has made progress",
+    "both",
+    ["run", "work", "both"],
+    "over the whole run, once something is finished, or half and half",
 )
 _SEED = flags.DEFINE_integer("seed", 0, "of the moments")
 _BROKEN = flags.DEFINE_bool("broken_resume", False, "break the resume of trainings")
@@ -54,6 +55,12 @@ ROOT = Path(__file__).resolve().parents[2]
 MOST_S = 1800.0  # s after which a command counts as hanging
 PROMISED_S = 10.0  # s from a signal to the end
 IN_A_ROW = 4  # kills before a command may end
+LOOK_S = 0.02  # s between two looks at what is finished
+MOMENTS = {
+    "run": "uniform over the run",
+    "work": "uniform over the time after the first finished thing",
+    "both": "half uniform over the run, half after the first finished thing",
+}
 FINISHED = "holds a finished dataset"  # killed between its last file and its end
 
 
@@ -65,11 +72,14 @@ class Row:
     injected: str
     command: str
     undisturbed_s: float
+    first_finished_s: float  # when the undisturbed run had finished something
     count: int = 0  # kills that met a running command
     comparisons: int = 0
     outcome: str = "not compared"
     problems: list[str] = dataclasses.field(default_factory=list)
     killed_at_s: list[float] = dataclasses.field(default_factory=list)
+    # things that were finished at each kill: shards, checkpoints, shapes, stages
+    progress_at_kill: list[int] = dataclasses.field(default_factory=list)
     seconds_to_end: list[float] = dataclasses.field(default_factory=list)
 
 
@@ -95,14 +105,25 @@ def start(job: Job, folder: Path, *, broken: bool = False) -> subprocess.Popen:
         )
 
 
-def to_the_end(job: Job, folder: Path, *, broken: bool = False) -> float:
-    """Run it undisturbed; seconds.
+def until_finished(job: Job, folder: Path, process: subprocess.Popen) -> float:
+    """Wait until something is finished, or the process has ended; seconds."""
+    begin = time.monotonic()
+    while process.poll() is None and not job.finished(folder):
+        if time.monotonic() - begin > MOST_S:
+            break
+        time.sleep(LOOK_S)
+    return time.monotonic() - begin
+
+
+def to_the_end(job: Job, folder: Path, *, broken: bool = False) -> tuple[float, float]:
+    """Run it undisturbed; seconds to the end, and until something was finished.
 
     Raises:
       InputError: it failed or did not end.
     """
     begin = time.monotonic()
     process = start(job, folder, broken=broken)
+    first_s = until_finished(job, folder, process)
     try:
         status = process.wait(MOST_S)
     except subprocess.TimeoutExpired as error:
@@ -111,23 +132,29 @@ def to_the_end(job: Job, folder: Path, *, broken: bool = False) -> float:
     last = (folder / "said.txt").read_text().strip().splitlines()[-1:]
     if status != 0 and not (last and FINISHED in last[0]):
         raise InputError(f"{job.name}: exit status {status}: {last}")
-    return time.monotonic() - begin
+    return time.monotonic() - begin, first_s
 
 
-def killed(job: Job, folder: Path, wait_s: float, row: Row) -> bool:
-    """Start it and end it after so long; False if it ended by itself before."""
+def killed(job: Job, folder: Path, share: float, row: Row, *, work: bool) -> bool:
+    """Start it and end it after a share of its time; False if it ended before.
+
+    With `work` it first waits until something is finished; the share is then of the
+    rest. In a folder where something is, it starts at once, and is of all.
+    """
     number = signal.Signals[f"SIG{_SIGNAL.value}"]
     process = start(job, folder, broken=_BROKEN.value)
     begin = time.monotonic()
-    if _MOMENTS.value == "work":
-        while process.poll() is None and not any(folder.glob(job.progress)):
-            time.sleep(0.02)
+    of_s = row.undisturbed_s
+    if work and not job.finished(folder):
+        until_finished(job, folder, process)
+        of_s -= row.first_finished_s
     try:
-        process.wait(wait_s)
+        process.wait(share * of_s)
         return False
     except subprocess.TimeoutExpired:
         pass
     row.killed_at_s.append(round(time.monotonic() - begin, 2))
+    row.progress_at_kill.append(job.finished(folder))
     sent = time.monotonic()
     if number == signal.SIGTERM:
         process.send_signal(number)
@@ -150,17 +177,23 @@ def killed(job: Job, folder: Path, wait_s: float, row: Row) -> bool:
     return True
 
 
+def _of_work(count: int) -> np.ndarray:
+    """Which of so many kills wait until something is finished; `both`: half, up."""
+    share = {"run": 0, "work": count, "both": (count + 1) // 2}[_MOMENTS.value]
+    return np.arange(count) < share
+
+
 def disturbed(job: Job, root: Path, count: int, row: Row, expected: Facts) -> None:
     """Kill it `count` times in all, in as many folders as that takes."""
     # a generator for each command, so that one can be run again alone
     rng = np.random.default_rng([_SEED.value, list(SHARES).index(job.name)])
-    share = 1.0 if _MOMENTS.value == "run" else 0.3
+    work = rng.permutation(_of_work(count))
     while row.count < count:
         folder = root / f"{job.name}-{row.comparisons}"
         folder.mkdir()
         for _ in range(min(IN_A_ROW, count - row.count)):
-            wait_s = float(rng.uniform(0.0, share * row.undisturbed_s))
-            if not killed(job, folder, wait_s, row):
+            share = float(rng.uniform())
+            if not killed(job, folder, share, row, work=bool(work[row.count])):
                 break
             row.count += 1
         try:
@@ -173,6 +206,8 @@ def disturbed(job: Job, root: Path, count: int, row: Row, expected: Facts) -> No
         except InputError as error:
             row.problems.append(str(error))
         row.comparisons += 1
+        if row.count >= count and any(work) and not any(row.progress_at_kill):
+            row.problems.append("no kill after something was finished")
         row.outcome = "as undisturbed" if not row.problems else row.problems[0]
         print(f"{job.name}: {row.count} of {count} {row.fault}: {row.outcome}")
         save(row)
@@ -207,13 +242,14 @@ def main() -> None:
         warm = root / f"{name}-warm"
         warm.mkdir()
         to_the_end(job, warm)
-        seconds = to_the_end(job, folder)
+        seconds, first_s = to_the_end(job, folder)
         expected, again = job.outcome(folder), job.outcome(warm)
         row = Row(
             fault=f"SIG{_SIGNAL.value}",
-            injected=f"at moments uniform over the {_MOMENTS.value}, then run again",
+            injected=f"at moments {MOMENTS[_MOMENTS.value]}, then run again",
             command=f"{job.module} {' '.join(job.flags)}".replace(str(root), "ROOT"),
             undisturbed_s=round(seconds, 2),
+            first_finished_s=round(first_s, 2),
         )
         if again != expected:
             odd = [x for x in expected if again.get(x) != expected[x]]

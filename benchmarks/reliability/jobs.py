@@ -18,7 +18,7 @@ import numpy as np
 from rcirl_jax.data.files import FACTS
 from rcirl_jax.export.from_run import read_config
 from rcirl_jax.export.weights import to_json
-from rcirl_jax.stages import digest, file_sha256
+from rcirl_jax.stages import FILE, digest, file_sha256
 from rcirl_jax.train.loop import restore_run
 
 Facts = Mapping[str, str]  # what came out -> digest
@@ -34,7 +34,7 @@ class Job:
     module: str
     flags: tuple[str, ...]
     outcome: Callable[[Path], Facts]
-    progress: str  # what is there once something is finished
+    finished: Callable[[Path], int]  # things in its folder that are finished
 
 
 def write_logs(folder: Path) -> None:
@@ -63,14 +63,14 @@ def jobs(root: Path) -> dict[str, Job]:
             module="experiments.import_logs",
             flags=(*logs, "--output=data", "--stride=1", "--workers=2"),
             outcome=lambda folder: _files(folder / "data"),
-            progress="data/shards/*/shard.json",
+            finished=_files_like("data/shards/*/shard.json"),
         ),
         Job(
             name="train",
             module="experiments.train",
             flags=(data, "--workdir=run", *steps, "--checkpoint_every=3"),
             outcome=_of_training,
-            progress="run/checkpoints/*/sha256.json",
+            finished=_files_like("run/checkpoints/*/sha256.json"),  # 3 are kept
         ),
         Job(
             name="sweep",
@@ -80,7 +80,7 @@ def jobs(root: Path) -> dict[str, Job]:
                 *("--hidden_sizes=6,0", "--leaky_rates=0.05,0.3"),
             ),
             outcome=_of_sweep,
-            progress="sweep/weights/*.msgpack",
+            finished=_files_like("sweep/groups/*.json"),
         ),
         Job(
             name="autotune",
@@ -91,10 +91,20 @@ def jobs(root: Path) -> dict[str, Job]:
                 *("--cases=15", "--duration=2"),  # the gate judges no fewer
             ),
             outcome=_of_tuning,
-            progress="run/stages.json",
+            finished=lambda folder: _stages(folder / "run" / FILE),
         ),
     ]
     return {job.name: job for job in made}
+
+
+def _files_like(pattern: str) -> Callable[[Path], int]:
+    """Of a folder, the number of its files that match."""
+    return lambda folder: sum(1 for _ in folder.glob(pattern))
+
+
+def _stages(path: Path) -> int:
+    """The finished stages that a stages.json names."""
+    return len(json.loads(path.read_text())["stages"]) if path.exists() else 0
 
 
 def _files(folder: Path) -> Facts:

@@ -3,10 +3,11 @@
     python -m benchmarks.reliability.table [--minutes=5] [--rows=guard,SIGTERM] [--anew]
 
 Runs the commands of the page's tables in their order, one at a time, and writes
-reliability.json: exit status, seconds and the last line said, by row. Exit status 1 if
-one failed. `--minutes` leaves out rows that say that they take longer, and names them.
-A row that came out as stated with this very code is not run again, so that four hours
-may be several evenings; `--anew` runs all.
+reliability.json: exit status, seconds and the line that sums it up, by row. Exit
+status 1 if one failed. `--minutes` leaves out rows that say that they take longer, and
+names them. A row that came out as stated with this very code is not run again, so that
+four hours may be several evenings; `--anew` runs all. Rows that depend on what others
+publish (`WORLD`) are run each time.
 """
 
 import dataclasses
@@ -23,16 +24,20 @@ from pathlib import Path
 from absl import flags
 
 from benchmarks.common import write
-from experiments.common import git_commit, run
+from experiments.common import HOOK_VARIABLES, git_commit, run
 from rcirl_jax.errors import InputError
 from rcirl_jax.stages import digest, file_sha256
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "reliability.md"
 NOT_RUN = 77  # status of a row whose tests were skipped, in part or all
-# what a row's outcome depends on, below the root
-SOURCES = ("rcirl_jax", "experiments", "benchmarks", "tests", "data_specs", "onboard")
-SUFFIXES = (".py", ".toml", ".hpp", ".cpp", ".lock")
+# what no row's outcome depends on, by its path from the root
+NO_CODE = re.compile(r"docs/|benchmarks/results/|.*\.md$")
+WORLD = ("make audit", "make test-ceiling")  # depend on what others publish
+# "3 passed, 1 skipped, 2 deselected in 0.12s", by pytest
+_OF = r"\d+ (?:passed|failed|skipped|deselected|xfailed|xpassed|warnings?|errors?)"
+SUMMARY = re.compile(rf"^=* ?((?:no tests ran|{_OF}(?:, {_OF})*) in [\d.]+s.*)$", re.M)
+NOISE = re.compile(r"make(\[\d+\])?: (Entering|Leaving|\*\*\* \[)|WARNING: ")
 CELLS = ("fault", "injected", "count", "outcome", "minutes", "command")
 _MINUTES = flags.DEFINE_float("minutes", None, "longest row that is run")
 _ROWS = flags.DEFINE_list("rows", None, "words of the first column; only such rows")
@@ -45,6 +50,7 @@ class Row:
     """One row of the page."""
 
     fault: str
+    count: str
     minutes: float
     command: str
 
@@ -69,7 +75,8 @@ def rows_of(text: str) -> list[Row]:
                 "expected a number"
             ) from error
         command = cell["command"].strip("`")
-        found.append(Row(fault=cell["fault"], minutes=minutes, command=command))
+        fault, count = cell["fault"], cell["count"]
+        found.append(Row(fault=fault, count=count, minutes=minutes, command=command))
     return found
 
 
@@ -89,36 +96,63 @@ def words(command: str) -> list[str]:
 
 
 def code_sha256() -> str:
-    """Of all sources, tests, pins and the Makefile; not of the documentation."""
-    files = [ROOT / "Makefile", ROOT / "pyproject.toml"]
-    for folder in (*SOURCES, "requirements"):
-        files += [x for x in (ROOT / folder).rglob("*") if x.suffix in SUFFIXES]
-    return digest({str(x.relative_to(ROOT)): file_sha256(x) for x in files})
+    """Of every file that git knows, but documentation and results.
+
+    Raises:
+      InputError: git is not there, or knows nothing of this folder.
+    """
+    env = {k: v for k, v in os.environ.items() if k not in HOOK_VARIABLES}
+    words = ["git", "-C", str(ROOT), "ls-files", "-z"]
+    try:
+        done = subprocess.run(
+            words, env=env, text=True, capture_output=True, check=False
+        )
+    except OSError as error:
+        raise InputError(f"git: {error.strerror}: expected, to list files") from error
+    if done.returncode != 0 or not done.stdout:
+        reason = (done.stderr.strip().splitlines() or ["no files"])[0]
+        raise InputError(f"{ROOT}: git ls-files: {reason}: expected a checkout")
+    names = [x for x in done.stdout.split("\0") if x and not NO_CODE.match(x)]
+    files = {name: ROOT / name for name in names}
+    return digest({n: file_sha256(path) for n, path in files.items() if path.is_file()})
+
+
+def summed_up(stdout: str, stderr: str, status: int) -> tuple[str, bool]:
+    """(the line that says what came of a command, whether it skipped tests)."""
+    tests = SUMMARY.findall(stdout)
+    bad = [x for x in tests if re.search(r"\b(failed|errors?|skipped)\b", x)]
+    out, err = (
+        [x for x in text.splitlines() if x.strip() and not NOISE.match(x)]
+        for text in (stdout, stderr)
+    )
+    said = bad or (tests or out or err if status == 0 else err or out)
+    return said[-1] if said else "", any(" skipped" in x for x in tests)
 
 
 def ran(row: Row) -> dict:
     """What came of one row."""
     begin, load = time.monotonic(), os.getloadavg()[0]
     done = subprocess.run(
-        words(row.command), cwd=ROOT, text=True, capture_output=True, check=False
-    )
-    said = (done.stdout + done.stderr).strip().splitlines()
-    last = said[-1] if said else ""
-    status = done.returncode
-    if row.command.startswith("pytest") and "skipped" in last:
-        status = status or NOT_RUN
+        words(row.command), cwd=ROOT, text=True, capture_output=True, check=False,
+        env={**os.environ, "PY_COLORS": "0"},
+    )  # fmt: skip
+    said, skipped = summed_up(done.stdout, done.stderr, done.returncode)
+    status = done.returncode or (NOT_RUN if skipped else 0)
     return {
         **dataclasses.asdict(row),
         "status": status,
         "seconds": round(time.monotonic() - begin, 1),
-        "said": last,
+        "said": said,
         "load_before": round(load, 2),
         "date": datetime.date.today().isoformat(),
     }
 
 
 def as_stated_before(path: Path, code: str) -> dict[tuple[str, str], dict]:
-    """The rows of a result file that came out as stated with this code."""
+    """The rows of a result file that came out as stated with this code.
+
+    None of `WORLD`: what others publish is not in the code.
+    """
     try:
         rows = json.loads(path.read_text())["rows"]
     except FileNotFoundError:
@@ -129,7 +163,9 @@ def as_stated_before(path: Path, code: str) -> dict[tuple[str, str], dict]:
     return {
         (row["fault"], row["command"]): row
         for row in rows
-        if row["status"] == 0 and row.get("code_sha256") == code
+        if row["status"] == 0
+        and row.get("code_sha256") == code
+        and row["command"] not in WORLD
     }
 
 

@@ -138,7 +138,8 @@ def test_lanes_lie_under_the_vehicles(name, tmp_path):
     """Tracks and lanes share one frame: most vehicles have a lane below them."""
     fixture = write(name, tmp_path)
     if fixture.num_lanes == 0:
-        pytest.skip("the format has no lanes")
+        assert not any(recording.lanes for recording in read(name, fixture))
+        return
     shares = []
     for recording in read(name, fixture):
         centres = [lane.centre for lane in recording.lanes]
