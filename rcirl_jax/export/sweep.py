@@ -334,11 +334,11 @@ def read_sweep(folder: Path) -> dict:
       InputError: missing, or not of a finished sweep.
     """
     path = folder / SWEEP
+    report = read_json(path, "the result of experiments.sweep")
     try:
-        report = read_json(path, "the result of experiments.sweep")
         table(report)
         _check_grid(report)
-    except (OSError, *UNFORESEEN) as error:
+    except UNFORESEEN as error:
         raise InputError(
             f"{path}: {type(error).__name__}: expected the result of experiments.sweep"
         ) from error

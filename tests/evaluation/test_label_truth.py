@@ -305,7 +305,7 @@ def test_a_verdict_on_a_line_comes_before_all_rules(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "text", ["", "[]", "{}", '{"phases": 3}', '{"phases": [{"name": "a"}]}',
+    "text", ["[]", "{}", '{"phases": 3}', '{"phases": [{"name": "a"}]}',
              '{"phases": [{"name": "a", "verdict": "fine"}]}',
              '{"phases": [{"name": [], "verdict": "rejected"}]}']
 )  # fmt: skip
@@ -313,6 +313,9 @@ def test_other_files_are_refused_in_one_line(text, tmp_path):
     file = tmp_path / "labels.json"
     file.write_text(text)
     with pytest.raises(InputError, match=r"labels.json: phases: .*expected"):
+        read_signal_checks(file)
+    file.write_text("")
+    with pytest.raises(InputError, match=r"labels.json: Expecting value: .*expected"):
         read_signal_checks(file)
     with pytest.raises(InputError, match="nowhere: No such file"):
         read_signal_checks(tmp_path / "nowhere")
