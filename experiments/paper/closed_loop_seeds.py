@@ -116,7 +116,7 @@ def main() -> None:
             file = trained_weights(folder, name, lambda: data, config)
             files.append(str(file))
             names[row].append(f"{row} (seed {seed})")
-    which, duration = ("free_cruise,stopped_lead", 10.0) if quick else ("full", FULL_S)
+    which, duration = ("free_cruise,stopped_lead", 3.0) if quick else ("full", FULL_S)
     refs = suite_refs(which, cases, _SEED.value)
     drivers = table_rows(
         files, RIVALS, names=[x for own in names.values() for x in own]

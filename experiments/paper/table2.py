@@ -133,7 +133,7 @@ def main() -> None:
     folder, recorded = Path(_OUTPUT.value), _recorded()
     _same_run(folder)
     weights = _WEIGHTS.value or _trained(folder)
-    duration = 10.0 if _QUICK.value else FULL_S
+    duration = 3.0 if _QUICK.value else FULL_S
     full = suite_refs("full", 1 if _QUICK.value else None)
     _table("suite", catalogue_set(full, duration), weights, dp=False, human=False)
     which = "free_cruise,stopped_lead" if _QUICK.value else "full"

@@ -70,7 +70,7 @@ def test_differences_over_families_are_those_of_family_means(result):
     first = result.runs["careful"]
     for item in result.report.comparisons:
         other = result.runs[item.b]
-        apart = first.progress - other.progress
+        apart = np.subtract(first.progress, other.progress, dtype=float)
         means = [apart[groups == name].mean() for name in np.unique(groups)]
         found = scipy.stats.ttest_1samp(means, 0.0)
         low, high = found.confidence_interval(0.95)
