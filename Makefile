@@ -29,9 +29,9 @@ QUICK := $(addprefix tests/train/test_loop.py::test_,resume_is_bitwise run_write
   tests/features/test_features.py::test_equals_the_oracle tests/report/test_data_page.py
 QUICKLY = -m pytest -q -m "not slow and not dataset" $(QUICK)
 
-# Tests of what rounds and of equal bits, with the compiler as users have it. For the rest XLA
-# compiles in half the time to slower programs; by hand, pytest has the users' compiler for
-# all, and so has every row of `make reliability`
+# Features, gradients, resume, reproduction, and what rounds otherwise when compiled quickly, with
+# the compiler as users have it. For the rest XLA compiles in half the time to slower programs;
+# by hand, pytest has the users' compiler for all, and so has every row of `make reliability`
 EXACT := $(addprefix tests/,features/test_features.py reward/test_gradients.py \
   evaluation/test_tuned_rivals.py::test_distances_alone_are_those_of_the_scores \
   $(addprefix train/test_,loop.py::test_every_scene_counts_once_for_the_normaliser \

@@ -81,7 +81,10 @@ def test_a_small_loop(tmp_path):
         (("--features=mine",), "mine"),
         (("--mode=path_speed",), "--mode: path_speed: the closed loop plans speed"),
         (("--preferences=nowhere.jsonl",), "nowhere.jsonl"),
-        (("--sweep=nowhere",), "nowhere/sweep.json: No such file or directory"),
+        (
+            ("--sweep=nowhere",),
+            "nowhere/sweep.json: No such file or directory: expected the result of",
+        ),
     ],
 )
 def test_what_cannot_be_is_one_line_before_any_work(flags, message, tmp_path):
