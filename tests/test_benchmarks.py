@@ -7,7 +7,7 @@ import json
 
 import pytest
 
-from tests.commands import command
+from tests.commands import fresh as command
 
 SMALL = {
     "layouts": ["--rounds=1", "--calls=1", "--steps=1"],

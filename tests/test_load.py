@@ -17,7 +17,7 @@ from benchmarks.reliability.memory import (
     memory_growth,
     thinned,
 )
-from tests.commands import command
+from tests.commands import fresh as command
 
 ROUNDS = 80
 

@@ -11,7 +11,7 @@ import time
 import pytest
 
 from benchmarks.reliability.jobs import jobs, write_logs
-from tests.commands import command
+from tests.commands import fresh as command
 from tests.conftest import REPO
 
 pytestmark = [pytest.mark.slow, pytest.mark.multiprocess]

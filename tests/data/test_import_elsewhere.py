@@ -181,6 +181,7 @@ cluster.shutdown()
 
 
 @pytest.mark.ray
+@pytest.mark.slow
 def test_a_ray_cluster_that_loses_a_node_writes_the_bytes_of_one_process(
     local, tmp_path
 ):

@@ -19,14 +19,14 @@ FOLDERS = {
     "i80": ("ngsim_i80_native", "ngsim", None, 20.0),
     "pairs": ("ngsim_i80_pairs", "ngsim_pairs", 60, 1.0),
 }
-LONG = ("i80", "pairs")  # in `make test-slow`, with the recordings
+LONG = ("i80", "pairs", "urban")  # in `make test-slow`, with the recordings
 LEARNERS = ("RC-IRL rank", "logistic free", "MaxEnt free")
 
 
 @pytest.mark.dataset
 @pytest.mark.parametrize(
     "name",
-    ["us101", "urban", *(pytest.param(x, marks=pytest.mark.slow) for x in LONG)],
+    ["us101", *(pytest.param(x, marks=pytest.mark.slow) for x in LONG)],
 )
 def test_no_learner_ends_in_nan_with_any_optimiser(name, data_dir, tmp_path):
     """Default flags but for the epochs; the whole: experiments.paper.stability."""

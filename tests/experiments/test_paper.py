@@ -267,6 +267,7 @@ def test_human_likeness_beside_a_tuned_hand_set_cost(dataset, tmp_path):
     assert (tmp_path / "ranking.png").read_bytes()[:4] == b"\x89PNG"
 
 
+@pytest.mark.slow
 def test_human_likeness_over_folds(dataset, tmp_path):
     flags = (
         "--learners=RC-IRL rank,GAN",

@@ -18,7 +18,7 @@ from rcirl_jax.export.reproduce import (
     train_again,
 )
 from rcirl_jax.units import HORIZON_S
-from tests.commands import command
+from tests.commands import fresh as command
 from tests.data.test_store import finish_fields, lineage
 from tests.scenes import batch, demonstration
 
