@@ -8,6 +8,7 @@ batch; process 0 alone writes run.json and metrics.
 
 import contextlib
 import dataclasses
+import functools
 import itertools
 import signal
 import sys
@@ -169,13 +170,23 @@ def train(
     running = running or Running()
     if config.preferences != (preferences.sha256 if preferences else ""):
         raise ValueError("config.preferences: expected the hash of the preferences")
-    train_step = make_train_step(config, whole=running.parallel == "jit_sharded")
-    parallel = parallelise(train_step, running.parallel, config.batch_size)
+    parallel = step_of(config.for_step, running.parallel)
     check_run(workdir, config, dataset)
     with only_one(workdir) if is_first() else contextlib.nullcontext():
         return _train(
             dataset, workdir, config, parallel, running, provenance or {}, preferences
         )
+
+
+@functools.lru_cache(maxsize=2)
+def step_of(config: TrainConfig, parallel: str) -> Parallel:
+    """The step of a configuration on all devices; `train` of another seed reuses it.
+
+    Raises:
+      InputError: as `parallelise`.
+    """
+    train_step = make_train_step(config, whole=parallel == "jit_sharded")
+    return parallelise(train_step, parallel, config.batch_size)
 
 
 def _train(

@@ -134,6 +134,11 @@ class TrainConfig:
         )
 
     @property
+    def for_step(self) -> "TrainConfig":
+        """What decides the program of a step: a state and batches bring the rest."""
+        return dataclasses.replace(self, seed=0, epochs=1, preferences="")
+
+    @property
     def loss_config(self) -> LossConfig:
         """Constants of the losses."""
         names = [field.name for field in dataclasses.fields(LossConfig)]

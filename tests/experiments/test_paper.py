@@ -59,7 +59,7 @@ UNREAD = {
 @pytest.fixture(scope="session")
 def dataset(tmp_path_factory):
     folder = tmp_path_factory.mktemp("paper") / "synthetic"
-    config = ImportConfig(format="synthetic", collect=CollectConfig(stride_s=60.0))
+    config = ImportConfig(format="synthetic", collect=CollectConfig(stride_s=120.0))
     import_logs(read_recordings("synthetic", None), folder, config)
     return folder
 

@@ -82,6 +82,7 @@ def test_resume_is_bitwise(dataset, run, tmp_path):
     workdir = tmp_path / "resumed"
     one = TrainConfig(batch_size=8, epochs=1, sampler=SMALL)
     train(dataset, workdir, one)
+    loop.step_of.cache_clear()
     resumed = train(dataset, workdir, CONFIG)
     for a, b in zip(leaves(resumed.state), leaves(run[1].state), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -91,6 +92,21 @@ def test_resume_is_bitwise(dataset, run, tmp_path):
     ]
     steps = [line["step"] for line in lines]
     assert steps == list(range(1, len(steps) + 1))
+
+
+def test_another_seed_compiles_no_step(dataset, run, tmp_path):
+    loop.step_of.cache_clear()
+    seeds = [dataclasses.replace(CONFIG, epochs=1, seed=seed) for seed in (0, 1)]
+    done = [train(dataset, tmp_path / str(x.seed), x) for x in seeds]
+    step = loop.step_of(CONFIG.for_step, "jit").step
+    assert step._cache_size() == 1
+    weights = [jax.tree.leaves(x.state.params) for x in done]
+    assert any((a != b).any() for a, b in zip(*weights, strict=True))
+    # and a first run of a process does not differ from a later one
+    loop.step_of.cache_clear()
+    alone = train(dataset, tmp_path / "alone", seeds[1])
+    for a, b in zip(leaves(alone.state), leaves(done[1].state), strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 def test_other_settings_may_not_resume(dataset, run):
