@@ -71,7 +71,8 @@ test: setup
 test-dataset: setup
 	$(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal -m "dataset and not slow"
 
-# Killed processes, lost Ray nodes, memory, the tutorial as written; one at a time
+# Killed processes, lost Ray nodes, memory, folds, the tutorial as written; one at a time.
+# Those with the marker `dataset` want the recordings as well
 test-slow: setup
 	$(BIN)/python -m pytest -q -m slow
 

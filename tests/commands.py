@@ -1,7 +1,5 @@
 """Experiments by their command: flags of different ones clash in one process."""
 
-import atexit
-import contextlib
 import functools
 import json
 import os
@@ -19,9 +17,10 @@ LONGEST_S = 1800.0
 
 # Has imported what commands import, but none of their flags and no backend. Becomes a
 # command at the word, which saves the two seconds that importing takes; frozen, since
-# a fork that collects garbage at its end copies every page that it touches.
+# a fork that collects garbage at its end copies every page that it touches. A command
+# is over when nobody holds its stderr any more: what it left behind is waited for.
 FORKING = """
-import gc, json, os, runpy, sys
+import gc, json, os, runpy, shutil, sys
 import matplotlib.pyplot
 import rcirl_jax.evaluation.evaluate, rcirl_jax.evaluation.learners
 import rcirl_jax.report.intervals, rcirl_jax.simulation.suite
@@ -29,14 +28,21 @@ import rcirl_jax.report.intervals, rcirl_jax.simulation.suite
 gc.freeze()
 for line in sys.stdin:
     word = json.loads(line)
+    said, stderr = os.pipe()
     child = os.fork()
     if not child:
         break
+    os.close(stderr)
+    print(child, flush=True)
+    with os.fdopen(said, "rb") as source, open(word["err"], "wb") as file:
+        shutil.copyfileobj(source, file)
     print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 else:
     raise SystemExit
-for number, path in enumerate((os.devnull, word["out"], word["err"])):
-    os.dup2(os.open(path, os.O_RDWR), number)
+os.dup2(os.open(os.devnull, os.O_RDWR), 0)
+os.dup2(os.open(word["out"], os.O_WRONLY | os.O_CREAT), 1)
+os.dup2(stderr, 2)
+os.closerange(said, stderr + 1)
 os.chdir(word["folder"])
 sys.argv[1:] = word["flags"]
 runpy.run_module(word["module"], run_name="__main__", alter_sys=True)
@@ -46,15 +52,20 @@ runpy.run_module(word["module"], run_name="__main__", alter_sys=True)
 def command(module, *flags):
     """The finished `python -m module *flags` on the CPU, with what it said.
 
-    It runs in a fork of a process that has imported JAX; `fresh` starts Python anew.
+    It runs in a fork of a process that has imported JAX: what differs from one
+    interpreter to the next, as the seed of hashes, is the same for all commands of a
+    worker, and a main that sets JAX's environment before the import is too late.
+    `fresh` starts Python anew.
     """
     with tempfile.TemporaryDirectory() as folder:
         out, err = Path(folder) / "out", Path(folder) / "err"
-        out.touch()
-        err.touch()
         word = {"module": module, "flags": flags, "folder": os.getcwd()}
         word |= {"out": str(out), "err": str(err)}
-        status = _forking(tuple(sorted(_environment().items())))(word)
+        try:
+            status = _ask(_forking(tuple(sorted(_environment().items()))), word)
+        except BaseException:
+            _forking.cache_clear()  # it may still be busy with this one
+            raise
         if status is None:
             raise subprocess.TimeoutExpired((module, *flags), LONGEST_S)
         said = out.read_text(), err.read_text()
@@ -77,29 +88,32 @@ def _environment():
 
 @functools.cache
 def _forking(env):
-    """A function from the word to the exit status, or None when it took too long."""
-    process = subprocess.Popen(
+    return subprocess.Popen(
         [sys.executable, "-c", FORKING], env=dict(env), text=True,
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True,
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE,
     )  # fmt: skip
 
+
+def _ask(forking, word):
+    """Exit status of a command; None when it took too long."""
+    forking.stdin.write(json.dumps(word) + "\n")
+    forking.stdin.flush()
+    child, late = int(forking.stdout.readline()), threading.Event()
+
     def end():
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
+        late.set()
+        os.kill(child, signal.SIGKILL)
 
-    def ask(word):
-        late = threading.Timer(LONGEST_S, end)
-        late.start()
-        try:
-            process.stdin.write(json.dumps(word) + "\n")
-            process.stdin.flush()
-            status = process.stdout.readline()
-        finally:
-            late.cancel()
-        return int(status) if status else None
-
-    atexit.register(end)
-    return ask
+    timer = threading.Timer(LONGEST_S, end)
+    timer.start()
+    try:
+        status = int(forking.stdout.readline())
+    except BaseException:
+        os.kill(child, signal.SIGKILL)
+        raise
+    finally:
+        timer.cancel()
+    return None if late.is_set() else status
 
 
 def count_and_peak(script, path):

@@ -182,6 +182,8 @@ def train(
 def step_of(config: TrainConfig, parallel: str) -> Parallel:
     """The step of a configuration on all devices; `train` of another seed reuses it.
 
+    The programs of the last two stay in memory; they hold no data.
+
     Raises:
       InputError: as `parallelise`.
     """

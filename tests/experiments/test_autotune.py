@@ -6,7 +6,7 @@ import pytest
 
 from rcirl_jax.data.store import open_dataset
 from rcirl_jax.stages import only_one
-from tests.commands import command
+from tests.commands import command, fresh
 
 SMALL = (
     "--stride=60", "--epochs=1", "--suite=free_cruise,stopped_lead", "--cases=15",
@@ -45,7 +45,7 @@ def test_a_small_loop(tmp_path):
     assert all(kept(again).values()), again.stdout
 
     (run / "report.html").write_text("damaged")
-    mended = command("experiments.autotune", *flags)
+    mended = fresh("experiments.autotune", *flags)
     assert [name for name, was in kept(mended).items() if not was] == ["report"]
     assert (run / "report.html").read_text() == page
 

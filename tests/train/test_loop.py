@@ -98,8 +98,11 @@ def test_another_seed_compiles_no_step(dataset, run, tmp_path):
     loop.step_of.cache_clear()
     seeds = [dataclasses.replace(CONFIG, epochs=1, seed=seed) for seed in (0, 1)]
     done = [train(dataset, tmp_path / str(x.seed), x) for x in seeds]
-    step = loop.step_of(CONFIG.for_step, "jit").step
-    assert step._cache_size() == 1
+    judged = dataclasses.replace(CONFIG, preferences="the hash of a file")
+    assert loop.step_of(judged.for_step, "jit").step._cache_size() == 1
+    assert loop.step_of.cache_info().misses == 1
+    slower = dataclasses.replace(CONFIG, learning_rate=1e-4)
+    assert loop.step_of(slower.for_step, "jit").step._cache_size() == 0
     weights = [jax.tree.leaves(x.state.params) for x in done]
     assert any((a != b).any() for a, b in zip(*weights, strict=True))
     # and a first run of a process does not differ from a later one
