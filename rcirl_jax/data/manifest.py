@@ -113,6 +113,8 @@ def parse_shard(raw: bytes, name: str) -> ShardInfo:
     payload = unseal(raw, "sha256", name)
     _check_fields(name, payload, SHARD_FORMS)
     for file, found in payload["files"].items():
+        if not file.isprintable():  # a lone surrogate is no key either
+            raise InputError(f"{name}: files: {file!a}: expected a printable key")
         parts = file.split("/")
         if not all(parts) or {".", ".."} & set(parts):
             raise InputError(f"{name}: files: {file}: expected a key below the shard")

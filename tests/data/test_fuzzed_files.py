@@ -169,6 +169,13 @@ def test_keys_that_lead_out_of_a_shard(dataset, key):
     assert "expected a key below the shard" in line
 
 
+@pytest.mark.parametrize("key", ["human.s/c/\ud800", "human.s/\0", "a\nb"])
+def test_keys_that_no_text_has(dataset, key):
+    reseal(dataset, lambda shard: shard["files"].update({key: describe(b"x")}))
+    line = line_of(lambda: open_dataset(dataset))
+    assert f"shard.json: files: {key!a}: expected a printable key" in line
+
+
 def test_a_link_out_of_a_dataset_is_read_as_what_it_shows(dataset, tmp_path):
     file = next(f for f in (dataset / "shards/00000/human.s").rglob("*") if f.is_file())
     (tmp_path / "secret").write_text("x")
