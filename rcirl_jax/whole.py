@@ -114,7 +114,7 @@ def read_json(path: Path, expected: str, most: int = MAX_JSON_BYTES) -> Any:  # 
       most: bytes of a file that is read.
 
     Raises:
-      InputError: unreadable, too large, no JSON, or nested too deep.
+      InputError: unreadable, too large, no JSON, no text, or nested too deep.
     """
     try:
         with Path(path).open("rb") as file:
@@ -126,6 +126,8 @@ def read_json(path: Path, expected: str, most: int = MAX_JSON_BYTES) -> Any:  # 
         body = json.loads(content.decode("utf-8"))
         if _levels(body) > MAX_DEPTH:
             raise RecursionError
+        if b"\\ud" in content or b"\\uD" in content:  # half a pair is no text
+            json.dumps(body, ensure_ascii=False).encode()
         return body
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}: expected {expected}") from error

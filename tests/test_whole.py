@@ -73,12 +73,19 @@ def test_an_old_file_stays_if_the_new_one_cannot_be(tmp_path):
         (b"[" * 100_000, "a.json: nested too deep: expected colours"),
         (b"[" * (MAX_DEPTH + 1) + b"]" * (MAX_DEPTH + 1), "nested too deep"),
         (b"1" * 5000, "a.json: .*digits.*: expected colours"),
+        (b'{"\\ud800": 1}', "a.json: .*surrogates.*: expected colours"),
+        (b'["a\\uDC00"]', "a.json: .*surrogates.*: expected colours"),
     ],
 )
 def test_json_that_is_none_is_one_line(tmp_path, content, message):
     (tmp_path / "a.json").write_bytes(content)
     with pytest.raises(InputError, match=message):
         read_json(tmp_path / "a.json", "colours")
+
+
+def test_json_with_whole_pairs_is_text(tmp_path):
+    (tmp_path / "a.json").write_bytes(b'"\\ud83d\\ude97"')
+    assert read_json(tmp_path / "a.json", "a car") == "\U0001f697"
 
 
 def test_json_of_any_size_takes_little_memory(tmp_path):
