@@ -156,7 +156,7 @@ def read_runs(path: Path) -> SuiteRuns:
     except (
         # of files and arrays; of zip: damaged, packed or locked in ways not known
         *(OSError, ArithmeticError, LookupError, ValueError, TypeError),
-        *(EOFError, MemoryError, RuntimeError),
+        *(EOFError, MemoryError, RuntimeError, SyntaxError),  # of a kind "(,)f8"
         *(zipfile.BadZipFile, zlib.error, tokenize.TokenError),
     ) as error:
         why = str(error).splitlines()[0] if str(error) else type(error).__name__

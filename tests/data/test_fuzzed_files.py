@@ -97,6 +97,13 @@ def test_claimed_sizes_in_a_suite(members, shape):
     assert "expected the metrics of a suite" in line_of(lambda: read_runs(file))
 
 
+@pytest.mark.parametrize("kind", ["(,)f8", "f8,(", "f9", ""])
+def test_kinds_in_a_suite_that_are_none(members, kind):
+    file, content = members
+    file.write_bytes(archive_of({**content, "way.npy": head((2,), kind) + bytes(16)}))
+    assert "expected the metrics of a suite" in line_of(lambda: read_runs(file))
+
+
 def test_members_that_name_places_outside_are_not_unpacked(members, tmp_path):
     file, content = members
     for name in ("../odd.npy", f"{tmp_path}/odd.npy"):
