@@ -7,6 +7,7 @@ import fcntl
 import json
 import math
 import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
@@ -17,6 +18,7 @@ from rcirl_jax.errors import InputError
 
 MAX_JSON_BYTES = 16 * 1024**2  # of a JSON file that is read
 MAX_DEPTH = 100  # levels of it
+HALF_PAIR = re.compile("[\ud800-\udfff]|\\\\u[dD][89a-fA-F]")  # or a whole one
 
 # of file systems without locks, where two writers are not kept apart
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP)
@@ -105,6 +107,45 @@ def _levels(body: object) -> int:
     return depth
 
 
+def parse_json(text: bytes | str, *, finite: bool = False) -> Any:  # noqa: ANN401
+    """The body of JSON from outside; what it holds can be written again.
+
+    Args:
+      text: UTF-8 where it is bytes.
+      finite: infinities and NaN, which Python takes and JSON does not know, are none.
+
+    Raises:
+      ValueError: no JSON, no UTF-8, nested deeper than MAX_DEPTH, half of a surrogate
+        pair (no text: it cannot be printed or stored).
+    """
+    if isinstance(text, bytes):
+        text = text.decode("utf-8")
+    try:
+        body = json.loads(
+            text,
+            parse_constant=_no_number if finite else None,
+            parse_float=_finite if finite else None,
+        )
+    except RecursionError as error:
+        raise ValueError("nested too deep") from error
+    if _levels(body) > MAX_DEPTH:
+        raise ValueError("nested too deep")
+    if HALF_PAIR.search(text):
+        json.dumps(body, ensure_ascii=False).encode()  # raises where one has no half
+    return body
+
+
+def _no_number(text: str) -> float:
+    raise ValueError(f"{text} is no JSON number")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text} is no finite number")
+    return value
+
+
 def read_json(path: Path, expected: str, most: int = MAX_JSON_BYTES) -> Any:  # noqa: ANN401
     """The body of a JSON file.
 
@@ -123,17 +164,10 @@ def read_json(path: Path, expected: str, most: int = MAX_JSON_BYTES) -> Any:  # 
             raise InputError(
                 f"{path}: size: above {most >> 20} MiB: expected {expected}"
             )
-        body = json.loads(content.decode("utf-8"))
-        if _levels(body) > MAX_DEPTH:
-            raise RecursionError
-        if b"\\ud" in content or b"\\uD" in content:  # half a pair is no text
-            json.dumps(body, ensure_ascii=False).encode()
-        return body
+        return parse_json(content)
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}: expected {expected}") from error
-    except RecursionError as error:
-        raise InputError(f"{path}: nested too deep: expected {expected}") from error
     except InputError:
         raise
-    except ValueError as error:  # also bytes that are no text
+    except ValueError as error:
         raise InputError(f"{path}: {error}: expected {expected}") from error

@@ -6,7 +6,13 @@ import sys
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.whole import MAX_DEPTH, MAX_JSON_BYTES, read_json, write_whole
+from rcirl_jax.whole import (
+    MAX_DEPTH,
+    MAX_JSON_BYTES,
+    parse_json,
+    read_json,
+    write_whole,
+)
 from tests.conftest import REPO
 
 WRITER = """
@@ -81,6 +87,32 @@ def test_json_that_is_none_is_one_line(tmp_path, content, message):
     (tmp_path / "a.json").write_bytes(content)
     with pytest.raises(InputError, match=message):
         read_json(tmp_path / "a.json", "colours")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *(
+            "\ud800",
+            '"\udfff"',
+            b'"\xed\xa0\x80"',
+            '{"\\uDEAD": 1}',
+            '["\\ud83d \\ude97"]',
+        ),
+        *("{", b"\xff", "[" * 10**5, "1" * 5000),
+    ],
+)
+def test_json_from_outside_is_a_body_or_a_value_error(text):
+    with pytest.raises(ValueError, match=r"."):
+        parse_json(text)
+
+
+def test_finite_json_has_no_other_numbers():
+    assert parse_json("[1e9, -2, 0.5]", finite=True) == [1e9, -2, 0.5]
+    for text in ("[NaN]", "-Infinity", '{"a": 1e999}'):
+        assert parse_json(text) is not None
+        with pytest.raises(ValueError, match="number"):
+            parse_json(text, finite=True)
 
 
 def test_json_with_whole_pairs_is_text(tmp_path):

@@ -15,7 +15,6 @@ files from a few cases in about two minutes; its numbers mean nothing.
 """
 
 import functools
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -41,7 +40,7 @@ from rcirl_jax.simulation.suite import (
     recorded_set,
     suite_refs,
 )
-from rcirl_jax.whole import write_json
+from rcirl_jax.whole import read_json, write_json
 
 _OUTPUT = flags.DEFINE_string("output", "out/table2", "folder for everything")
 _WEIGHTS = flags.DEFINE_list("weights", None, "weights files instead of training")
@@ -63,10 +62,7 @@ LEARNED: dict[str, dict] = {
 def _same_run(folder: Path) -> None:
     """Parts are reused, but not those of a quick run or of another seed."""
     made, file = {"quick": _QUICK.value, "seed": _SEED.value}, folder / "run.json"
-    try:
-        found = json.loads(file.read_text()) if file.exists() else made
-    except ValueError as error:
-        raise InputError(f"{file}: {error}: expected JSON") from error
+    found = read_json(file, "the flags of a run") if file.exists() else made
     if found != made:
         raise InputError(
             f"{folder}: made with {found}: expected {made}, or a new folder"

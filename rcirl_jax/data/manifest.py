@@ -3,7 +3,6 @@
 import dataclasses
 import hashlib
 import json
-import math
 import types
 from collections.abc import Callable, Mapping
 
@@ -13,6 +12,7 @@ from rcirl_jax.data.files import MANIFEST, Files
 from rcirl_jax.data.rows import leaf_specs
 from rcirl_jax.errors import InputError
 from rcirl_jax.units import NUM_TIMES, TIMES_S
+from rcirl_jax.whole import parse_json
 
 SCHEMA_VERSION = 1  # of manifest.json and shard.json
 MAX_ROWS = 2**31  # rows of a dataset
@@ -64,24 +64,11 @@ def seal(payload: Mapping, field: str) -> bytes:
     return (json.dumps(whole, sort_keys=True, indent=1) + "\n").encode()
 
 
-def _refuse_constant(text: str) -> None:
-    raise ValueError(f"{text} is no JSON number")
-
-
-def _finite_float(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
-        raise ValueError(f"{text} is no finite number")
-    return value
-
-
 def unseal(raw: bytes, field: str, name: str) -> dict:
     """Parse `seal`'s bytes; InputError when they are not as written."""
     try:
-        payload = json.loads(
-            raw, parse_constant=_refuse_constant, parse_float=_finite_float
-        )
-    except (ValueError, RecursionError) as error:
+        payload = parse_json(raw, finite=True)
+    except ValueError as error:
         raise InputError(
             f"{name}: not JSON ({error}): expected the file as written; truncated?"
         ) from error
@@ -113,7 +100,7 @@ def parse_shard(raw: bytes, name: str) -> ShardInfo:
     payload = unseal(raw, "sha256", name)
     _check_fields(name, payload, SHARD_FORMS)
     for file, found in payload["files"].items():
-        if not file.isprintable():  # a lone surrogate is no key either
+        if not file.isprintable():
             raise InputError(f"{name}: files: {file!a}: expected a printable key")
         parts = file.split("/")
         if not all(parts) or {".", ".."} & set(parts):

@@ -13,7 +13,6 @@ at `units.TIMES_S`. `weight` (1 if not given) scales a preference's loss.
 
 import dataclasses
 import hashlib
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ import numpy as np
 from rcirl_jax.data.joined import Demonstrations
 from rcirl_jax.errors import InputError
 from rcirl_jax.units import NUM_TIMES
+from rcirl_jax.whole import parse_json
 
 SCHEMA = "rcirl-jax/preferences"
 SCHEMA_VERSION = 1
@@ -85,8 +85,8 @@ def read_preferences(path: Path, dataset: Demonstrations) -> Preferences:
 
 def _object(path: Path, number: int, line: str) -> dict[str, Any]:
     try:
-        found = json.loads(line)
-    except (ValueError, RecursionError) as error:
+        found = parse_json(line)
+    except ValueError as error:
         raise InputError(f"{path}: line {number}: expected JSON") from error
     if not isinstance(found, dict):
         raise InputError(f"{path}: line {number}: expected an object")

@@ -51,7 +51,7 @@ from rcirl_jax.types import (
     Demonstration,
 )
 from rcirl_jax.units import TIMES_S
-from rcirl_jax.whole import plain
+from rcirl_jax.whole import parse_json, plain
 
 SHARDS_END = "shards0"  # first key after all that begin with "shards/"
 OPEN_SHARDS = 256  # shards whose arrays are kept open, 60 kB each
@@ -271,8 +271,8 @@ class Dataset:
         """
         raw = self._files.read(FACTS)
         try:
-            found = {} if raw is None else json.loads(raw)
-        except (ValueError, RecursionError) as error:
+            found = {} if raw is None else parse_json(raw)
+        except ValueError as error:
             raise InputError(
                 f"{self._files.path(FACTS)}: {error}: expected JSON"
             ) from error

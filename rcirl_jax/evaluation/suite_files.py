@@ -22,6 +22,7 @@ from rcirl_jax.simulation.metrics import CaseMetrics
 from rcirl_jax.whole import write_whole
 
 MAX_BYTES = 2**30  # bytes of a suite, unpacked
+PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 COLUMNS = {  # metrics of several numbers a case
     **dict.fromkeys(("inside", "holds"), (6,)),
     **dict.fromkeys(("inside_filtered", "holds_filtered"), (2,)),
@@ -88,7 +89,10 @@ def write_runs(path: Path, runs: SuiteRuns) -> None:
 def _arrays(path: Path) -> dict[str, Any]:
     """The arrays of the archive; what it would unpack to is checked first."""
     with zipfile.ZipFile(path) as archive:
-        size = sum(member.file_size for member in archive.infolist())
+        members = archive.infolist()
+        if any(member.compress_type not in PACKINGS for member in members):
+            raise ValueError("packed in a way that numpy does not write")
+        size = sum(member.file_size for member in members)
         if size > MAX_BYTES:
             raise ValueError(f"{size} bytes unpacked, more than {MAX_BYTES}")
     with np.load(path, allow_pickle=False) as found:

@@ -13,7 +13,7 @@ from typing import Any
 import tqdm
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.whole import named, write_whole
+from rcirl_jax.whole import named, parse_json, write_whole
 
 
 class MetricsWriter:
@@ -66,8 +66,8 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
     rows = []
     text = path.read_text(errors="replace") if path.is_file() else ""
     for line in text.splitlines():
-        with contextlib.suppress(ValueError, RecursionError):
-            found = json.loads(line)
+        with contextlib.suppress(ValueError):
+            found = parse_json(line)
             if isinstance(found, dict) and type(found.get("step")) is int:
                 rows.append({k: v for k, v in found.items() if _is_number(v)})
     return rows

@@ -17,6 +17,7 @@ from benchmarks.reliability.fuzz.containers import archive_of
 from benchmarks.reliability.fuzz.readers import suite
 from rcirl_jax.data import manifest
 from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.importers.argoverse2_map import read_lanes
 from rcirl_jax.data.importers.parquet import read_columns
 from rcirl_jax.data.importers.sqlite_ro import Database
 from rcirl_jax.data.importers.zarr2 import StructuredArray
@@ -104,6 +105,17 @@ def test_kinds_in_a_suite_that_are_none(members, kind):
     assert "expected the metrics of a suite" in line_of(lambda: read_runs(file))
 
 
+@pytest.mark.parametrize("packing", [12, 14, 93, 97])
+def test_a_suite_packed_in_ways_that_are_not_ours(members, packing):
+    """bzip2, lzma (whose own error is no ValueError), zstd, and one that nobody has."""
+    file, content = members
+    whole = bytearray(archive_of(content))
+    first = whole.index(b"PK\1\2")  # of the directory at the end, which is believed
+    whole[first + 10 : first + 12] = packing.to_bytes(2, "little")
+    file.write_bytes(whole)
+    assert "packed in a way that numpy" in line_of(lambda: read_runs(file))
+
+
 def test_members_that_name_places_outside_are_not_unpacked(members, tmp_path):
     file, content = members
     for name in ("../odd.npy", f"{tmp_path}/odd.npy"):
@@ -176,11 +188,24 @@ def test_keys_that_lead_out_of_a_shard(dataset, key):
     assert "expected a key below the shard" in line
 
 
-@pytest.mark.parametrize("key", ["human.s/c/\ud800", "human.s/\0", "a\nb"])
+@pytest.mark.parametrize("key", ["human.s/\0", "a\nb"])
 def test_keys_that_no_text_has(dataset, key):
     reseal(dataset, lambda shard: shard["files"].update({key: describe(b"x")}))
     line = line_of(lambda: open_dataset(dataset))
     assert f"shard.json: files: {key!a}: expected a printable key" in line
+
+
+def test_half_a_surrogate_pair_anywhere_in_a_dataset(dataset, tmp_path):
+    file = dataset / "manifest.json"
+    good = file.read_bytes()
+    reseal(dataset, change=lambda whole: whole["sources"].append({"\udfff": 1}))
+    assert "manifest.json: not JSON" in line_of(lambda: open_dataset(dataset))
+    raw = "\ud800".encode(errors="surrogatepass")  # which json.loads takes from bytes
+    file.write_bytes(good.replace(b'"groups"', b'"groups%b"' % raw))
+    assert "manifest.json: not JSON" in line_of(lambda: open_dataset(dataset))
+    file.write_bytes(good)
+    reseal(dataset, lambda shard: shard["files"].update({"\ud800": describe(b"x")}))
+    assert "shard.json: not JSON" in line_of(lambda: open_dataset(dataset))
 
 
 def test_a_link_out_of_a_dataset_is_read_as_what_it_shows(dataset, tmp_path):
@@ -363,6 +388,15 @@ def test_a_field_without_a_type_in_an_array(tmp_path):
     )
     line = line_of(lambda: StructuredArray(tmp_path, {}))
     assert "dtype: []: expected [name, " in line
+
+
+def test_half_a_surrogate_pair_in_logs(tmp_path):
+    (tmp_path / ".zarray").write_text('{"dtype": [["\\ud800", "<f8"]]}')
+    line = line_of(lambda: StructuredArray(tmp_path, {}))
+    assert ".zarray: json: " in line
+    (tmp_path / "map.json").write_text('{"lane_segments": {"\\ud800": 3}}')
+    line = line_of(lambda: read_lanes(tmp_path / "map.json", np.zeros(2), {}))
+    assert "map.json: json: " in line
 
 
 def test_a_database_whose_errors_are_no_text(tmp_path):

@@ -107,9 +107,11 @@ def test_facts_stand_beside_the_manifest(copy):
     assert again.facts() == {"made_by": {"git_commit": "abc"}, "share": 0.5}
     assert again.hash == dataset.hash
     again.verify()
-    for text, word in (("[" * 10**5, "expected JSON"), ("[1]", "expected an object")):
+    half = '{"made_by": "\\ud800"}'
+    bad = (("[" * 10**5, "JSON"), (half, "JSON"), ("[1]", "an object"))
+    for text, word in bad:
         (copy / files.FACTS).write_text(text)
-        with pytest.raises(InputError, match=rf"made_by\.json: .*{word}"):
+        with pytest.raises(InputError, match=rf"made_by\.json: .*expected {word}"):
             again.facts()
 
 

@@ -87,6 +87,7 @@ SHORT = {"s": [0.0] * (NUM_TIMES - 1)}
         ((line(),), {"dataset_sha256": "x"}, "line 1: dataset_sha256: x: expected d"),
         (("{",), {}, "line 2: expected JSON"),
         (("[" * 100000,), {}, "line 2: expected JSON"),
+        ((line(better="\ud800"),), {}, "line 2: expected JSON"),
         ((line(), "3"), {}, "line 3: expected an object"),
         ((line(scene="3"),), {}, "line 2: scene: 3: expected a row number"),
         ((line(scene=12),), {}, "scene: 12: expected a row of the train split"),

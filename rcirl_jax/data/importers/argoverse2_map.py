@@ -7,7 +7,6 @@ not; it is not read. There are no speed limits, signals or stop lines.
 """
 
 import dataclasses
-import json
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ from rcirl_jax.data.importers.options import choices
 from rcirl_jax.data.importers.shapes import between_bounds, check_coordinates
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane
+from rcirl_jax.whole import parse_json
 
 MAX_FILE_BYTES = 64 * 1024**2  # bytes of a map; published ones have 0.1 to 1 MB
 LANE_TYPES = ("VEHICLE", "BUS", "BIKE")
@@ -70,9 +70,8 @@ def _segments(path: Path) -> dict:
             f"expected at most {MAX_FILE_BYTES}"
         )
     try:
-        with path.open(encoding="utf-8") as handle:
-            content = json.load(handle)
-    except (OSError, ValueError, RecursionError) as error:
+        content = parse_json(path.read_bytes())
+    except (OSError, ValueError) as error:
         raise InputError(f"{path}: json: {error}: expected JSON") from error
     segments = content.get("lane_segments") if isinstance(content, dict) else None
     if not isinstance(segments, dict):

@@ -6,7 +6,6 @@ blosc, bounded chunks. tensorstore decompresses; it knows no text fields ("<U16"
 so it is told that a record is plain bytes, and numpy gives them their meaning.
 """
 
-import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from rcirl_jax.errors import InputError
+from rcirl_jax.whole import parse_json
 
 MAX_METADATA_BYTES = 1024**2  # bytes of a .zarray
 MAX_RECORD_BYTES = 64 * 1024  # bytes of one record
@@ -135,8 +135,8 @@ def read_json(file: Path, max_bytes: int) -> dict:
     if size > max_bytes:
         raise InputError(f"{file}: size: {size} bytes: expected at most {max_bytes}")
     try:
-        found = json.loads(content)
-    except (ValueError, RecursionError) as error:
+        found = parse_json(content)
+    except ValueError as error:
         raise InputError(f"{file}: json: {_brief(error)}: expected JSON") from error
     if not isinstance(found, dict):
         raise InputError(f"{file}: json: {type(found).__name__}: expected an object")
