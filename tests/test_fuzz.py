@@ -58,7 +58,8 @@ def test_a_reader_returns_or_says_one_line(name, tmp_path):
 def test_a_sweep_that_is_read_can_be_drawn(tmp_path):
     target = READERS["sweeps"].make(tmp_path / "made")
     drawings = 0
-    for data in drawn(target, 400, 3):
+    results = (data for data in drawn(target, 1200, 3) if target.index(data) == 0)
+    for data in results:
         target.put(data)
         try:
             report = read_sweep(tmp_path / "made")

@@ -566,7 +566,7 @@ def test_options(tmp_path):
         assert only(tmp_path, ego_only(), topics=topics).tracks
     for bad in (
         *({"rate_hz": 0}, {"ego": 1}, {"unknown": "x"}, {"topics": 3}),
-        {"window_s": 0},
+        *({"window_s": 0}, {"window_s": 1e-320}, {"window_s": 0.99}),
     ):
         with pytest.raises(InputError, match="source TOML"):
             only(tmp_path, perceived({10: 0}), **bad)

@@ -710,7 +710,9 @@ def test_flipped_bytes_are_one_line(log, seed):
             assert "\n" not in line
 
 
-@pytest.mark.parametrize("options", [{"window_s": 0}, {"ego": 1}, {"rate_hz": "x"}])
+@pytest.mark.parametrize(
+    "options", [{"window_s": 0}, {"window_s": 1e-9}, {"ego": 1}, {"rate_hz": "x"}]
+)
 def test_options_are_checked(log, options):
     with pytest.raises(InputError, match="source TOML"):
         read(log, **options)

@@ -327,7 +327,14 @@ def test_header_sizes_have_to_be_numbers(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "text", ['drivers = "robots"', "block_s = -1.0", "rate_hz = 0.0", 'rate_hz = "x"']
+    "text",
+    [
+        "block_s = 1e-320",
+        'drivers = "robots"',
+        "block_s = -1.0",
+        "rate_hz = 0.0",
+        'rate_hz = "x"',
+    ],
 )
 def test_bad_options(tmp_path, text):
     with pytest.raises(InputError, match=r"source TOML: "):

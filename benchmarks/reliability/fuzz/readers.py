@@ -19,11 +19,13 @@ from rcirl_jax.data.files import MANIFEST, MARK, Files
 from rcirl_jax.data.importers import synthetic
 from rcirl_jax.data.preferences import SCHEMA, read_preferences
 from rcirl_jax.evaluation.suite_files import COLUMNS, SuiteRuns, read_runs, write_runs
+from rcirl_jax.evaluation.sweep import SweepConfig, member_name, shape_name
+from rcirl_jax.export import sweep
 from rcirl_jax.export.from_run import last_metrics, read_config
 from rcirl_jax.export.hand_weights import tuned_rows, write_hand_weights
+from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.provenance import check_provenance
 from rcirl_jax.export.reader import decode_weights
-from rcirl_jax.export.sweep import SWEEP, read_sweep
 from rcirl_jax.features import mapping
 from rcirl_jax.reward import LatticeCost
 from rcirl_jax.simulation import families
@@ -38,7 +40,7 @@ from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.units import NUM_TIMES
 from rcirl_jax.whole import write_json
 from tests.data import test_store
-from tests.weights_files import packed
+from tests.weights_files import packed, random_weights
 
 ROWS = 2  # of a dataset
 CASES = 2  # of a suite
@@ -290,10 +292,39 @@ def hand(folder: Path) -> Target:
 
 
 def sweeps(folder: Path) -> Target:
-    """The result of a sweep: its table and the grid of its picture."""
+    """A sweep's folder: its result, and what a resumed sweep takes from it."""
     folder.mkdir(parents=True)
-    write_json(folder / SWEEP, pieces.sweep_result())
-    return Target(lambda: read_sweep(folder), [folder / SWEEP])
+    data_hash, made_by, hidden = "d" * 64, {"git_commit": "2fe49aa"}, (15,)
+    config = SweepConfig(
+        data=("d",),
+        base=TrainConfig(),
+        hidden_sizes=(hidden,),
+        leaky_rates=(0.01,),
+        learning_rates=(1e-3,),
+        seeds=1,
+    )
+    write_json(folder / sweep.SWEEP, pieces.sweep_result())
+    sweep._claim(config, folder, data_hash)
+    (member,) = config.members()
+    weights = sweep._weights(folder, member)
+    weights.parent.mkdir()
+    random_weights(weights)
+    group = folder / "groups" / f"{shape_name(hidden)}.json"
+    one = {"sha256": open_reward(str(weights)).sha256, "finite": True}
+    settings = {**sweep._settings(config), **sweep._data(made_by)}
+    facts = dict.fromkeys(sweep.FACTS, 1.0)
+    members = {member_name(member): one}
+    write_json(group, {"facts": facts, "members": members, "settings": settings})
+    if sweep._finished(config, folder, hidden, made_by) is None:
+        raise AssertionError(f"{group}: not as a sweep takes it")
+
+    def read() -> None:
+        sweep.read_sweep(folder)
+        sweep._claim(config, folder, data_hash)
+        sweep._finished(config, folder, hidden, made_by)
+
+    names = (str(folder),)
+    return Target(read, [folder / sweep.SWEEP, folder / "settings.json", group], names)
 
 
 READERS: dict[str, Reader] = {

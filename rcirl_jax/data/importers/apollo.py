@@ -35,10 +35,10 @@ from rcirl_jax.data.importers.files import log_name
 from rcirl_jax.data.importers.options import one_pattern, positive, section
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.perception import (
-    WINDOW_S,
     Boxes,
     Windows,
     around,
+    longest_window,
     placed,
     tracks_of,
 )
@@ -111,7 +111,7 @@ def _rate(spec: dict) -> float:
 def _windows(held: Held, spec: dict) -> Iterator[Recording]:
     """Recordings of a drive, each made once what it needs is read."""
     name = log_name(held.path, spec, run_name(held.path))
-    window = positive(spec, "window_s", WINDOW_S)
+    window = longest_window(spec)
     windows, number = Windows(name, drive_name(held.path), MAX_GAP_S), 0
 
     def within() -> tuple[float, float]:

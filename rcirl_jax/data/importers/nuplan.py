@@ -23,10 +23,10 @@ from rcirl_jax.data.importers.nuplan_map import NuplanMap, find_map
 from rcirl_jax.data.importers.options import one_pattern, positive, section
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.perception import (
-    WINDOW_S,
     Boxes,
     Windows,
     around,
+    longest_window,
     placed,
     tracks_of,
 )
@@ -185,7 +185,7 @@ def _kinds(database: Database) -> dict[bytes, int]:
 def _windows(log: _Log) -> Iterator[Recording]:
     """The whole log, or windows of equal length, none longer than allowed."""
     clock = (log.poses[:, 0] - log.poses[0, 0]) * 1e-6  # s
-    window = positive(log.spec, "window_s", WINDOW_S)
+    window = longest_window(log.spec)
     count = max(int(np.ceil(clock[-1] / window)), 1)
     if count == 1:
         yield dataclasses.replace(_recording(log, log.poses), progress=1.0)

@@ -54,6 +54,7 @@ MAX_LINE_CHARS = 65536
 DRIVER_CHARS = 16  # characters kept of a Driver cell
 RATE_HZ = 10.0  # 1/s
 BLOCK_S = 120.0  # s of a drive in one Recording
+MIN_BLOCK_S = 1.0  # s that they may be
 MAX_GAP_STEPS = 5.5  # missing rows bridged inside one track
 FAR_M = 1e4  # m; coordinates beyond it are moved to a local origin
 ORIGIN_STEP_M = 1000.0  # m, local origins are multiples of it
@@ -210,9 +211,10 @@ def _blocks(drive: _Drive, spec: dict) -> Iterator[Recording]:
     """Parts of a drive; those without a car in motion or at rest are left out."""
     block_s = number(spec, "block_s", BLOCK_S)
     rate = number(spec, "rate_hz", RATE_HZ)
-    if rate <= 0.0 or block_s < 0.0:
+    if rate <= 0.0 or not (block_s == 0.0 or block_s >= MIN_BLOCK_S):
         raise InputError(
-            f"source TOML: rate_hz, block_s: {rate:g}, {block_s:g}: expected > 0, >= 0"
+            f"source TOML: rate_hz, block_s: {rate:g}, {block_s:g}: expected above 0, "
+            f"and at least {MIN_BLOCK_S:g} s or 0 (whole drives)"
         )
     part = np.zeros(drive.t.size) if block_s == 0.0 else drive.t // block_s
     numbers = np.unique(part)

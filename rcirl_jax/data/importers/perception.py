@@ -7,14 +7,14 @@ windows that overlap.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from rcirl_jax.data.importers import csv_stream
 from rcirl_jax.data.importers.shapes import local_origin
-from rcirl_jax.data.importers.tables import split_tracks
+from rcirl_jax.data.importers.tables import number, split_tracks
 from rcirl_jax.data.recording import LENGTH_RANGE_M, MAX_SPEED_MPS, WIDTH_RANGE_M
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Recording, Track
@@ -25,6 +25,7 @@ STANDING_M = 1.0  # m, an unknown object that moves less than this is static
 MAX_OUTLIERS = 0.1  # share of tracks dropped as outliers; more is an error
 ONE_OF = 5  # tracks of which one may always be an outlier
 WINDOW_S = 300.0  # s, longest window of a drive
+MIN_WINDOW_S = 1.0  # s that it may be; each window costs as much as its surroundings
 MAX_SIZE_M = 200.0  # m, of a box; beyond it the file is wrong, not the tracker
 FIELDS = ("t", "x", "y", "heading", "length", "width")
 
@@ -175,6 +176,16 @@ def _is_possible(track: Track) -> bool:
         return True
     sizes = ((track.length, LENGTH_RANGE_M), (track.width, WIDTH_RANGE_M))
     return all(low <= size <= high for size, (low, high) in sizes)
+
+
+def longest_window(spec: Mapping) -> float:
+    """The option `window_s` of a source TOML, s."""
+    window = number(spec, "window_s", WINDOW_S)
+    if window < MIN_WINDOW_S:
+        raise InputError(
+            f"source TOML: window_s: {window:g}: expected at least {MIN_WINDOW_S:g} s"
+        )
+    return window
 
 
 def around(within: tuple[float, float]) -> tuple[float, float]:
