@@ -16,6 +16,7 @@ from rcirl_jax import __version__, interrupts
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.reader import load_weights
 from rcirl_jax.stages import code_sha256
+from rcirl_jax.whole import is_text
 
 EXIT_BAD_INPUT = 2
 # variables that decide how numbers are rounded
@@ -81,7 +82,14 @@ def _own_the_shared_flags() -> None:
 
 
 def _parse(argv: list[str]) -> list[str]:
-    """Absl's parser, with its complaints as one line."""
+    """Absl's parser, with its complaints as one line.
+
+    Names of files that are no UTF-8 could not be written into what is made of them.
+    """
+    odd = [text for text in argv if not is_text(text)]
+    if odd:
+        print(f"error: {odd[0]!a}: expected UTF-8", file=sys.stderr)
+        sys.exit(EXIT_BAD_INPUT)
     try:
         return flags.FLAGS(argv)
     except flags.Error as error:

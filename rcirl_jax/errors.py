@@ -39,6 +39,7 @@ UNFORESEEN = (
     LookupError,
     MemoryError,
     RecursionError,
+    SystemError,
     TypeError,
     ValueError,
     struct.error,

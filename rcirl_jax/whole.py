@@ -8,6 +8,7 @@ import json
 import math
 import os
 import re
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
@@ -18,7 +19,8 @@ from rcirl_jax.errors import InputError
 
 MAX_JSON_BYTES = 16 * 1024**2  # of a JSON file that is read
 MAX_DEPTH = 100  # levels of it
-HALF_PAIR = re.compile("[\ud800-\udfff]|\\\\u[dD][89a-fA-F]")  # or a whole one
+HALVES = re.compile("[\ud800-\udfff]")  # of surrogate pairs
+ESCAPED = re.compile(r"\\u[dD][89a-fA-F]")  # in JSON: halves, or a whole pair
 
 # of file systems without locks, where two writers are not kept apart
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP)
@@ -130,7 +132,7 @@ def parse_json(text: bytes | str, *, finite: bool = False) -> Any:  # noqa: ANN4
         raise ValueError("nested too deep") from error
     if _levels(body) > MAX_DEPTH:
         raise ValueError("nested too deep")
-    if HALF_PAIR.search(text):
+    if not is_text(text) or ESCAPED.search(text):
         json.dumps(body, ensure_ascii=False).encode()  # raises where one has no half
     return body
 
@@ -144,6 +146,19 @@ def _finite(text: str) -> float:
     if not math.isfinite(value):
         raise ValueError(f"{text} is no finite number")
     return value
+
+
+def is_text(texts: str | np.ndarray) -> bool:
+    """Whether it can be printed and stored: half a surrogate pair is no character.
+
+    Python makes them of bytes that are no UTF-8, as in names of files; numpy holds
+    any 32 bits as a character.
+    """
+    if isinstance(texts, str):
+        return HALVES.search(texts) is None
+    points = np.frombuffer(texts.tobytes(), texts.dtype.byteorder + "u4")
+    half = (points >= 0xD800) & (points <= 0xDFFF)
+    return not np.any(half | (points > sys.maxunicode))
 
 
 def read_json(path: Path, expected: str, most: int = MAX_JSON_BYTES) -> Any:  # noqa: ANN401

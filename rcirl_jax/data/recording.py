@@ -14,6 +14,7 @@ import numpy as np
 from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.types import Ghost, Kind, Lane, Recording, Signal, Track
 from rcirl_jax.units import FOOT_M, MPH_MPS
+from rcirl_jax.whole import is_text
 
 # keys that an import adds to a spec
 LEAVE_OUT = "leave_out"  # refused recordings are left out
@@ -99,6 +100,7 @@ def validate_recording(
         raise InputError(f"{name}: rate_hz: {recording.rate_hz}: expected > 0")
     if not recording.tracks:
         raise InputError(f"{name}: tracks: none: expected at least one road user")
+    _check_texts(name, recording)
     _check_unique(name, "track id", [track.id for track in recording.tracks])
     _check_unique(name, "lane id", [lane.id for lane in recording.lanes])
     _check_unique(name, "signal id", [signal.id for signal in recording.signals])
@@ -117,6 +119,21 @@ def validate_recording(
     checked = [_check_lane(name, lane, lanes, signals) for lane in recording.lanes]
     _check_places(name, recording)
     return dataclasses.replace(recording, lanes=tuple(checked))
+
+
+def _check_texts(name: str, recording: Recording) -> None:
+    parts = (*recording.tracks, *recording.lanes, *recording.signals)
+    texts = {
+        "name": recording.name,
+        "group": recording.group or "",
+        "source": recording.source,
+        "licence": recording.licence,
+        "id": "".join(part.id for part in parts),
+        "notes": "".join(recording.notes),
+    }
+    for field, text in texts.items():
+        if not is_text(text):
+            raise InputError(f"{name}: {field}: {text!a:.80}: expected UTF-8 text")
 
 
 def _check_unique(name: str, field: str, ids: list[str]) -> None:

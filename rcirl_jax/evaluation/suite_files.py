@@ -19,7 +19,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop import SuiteResult
 from rcirl_jax.evaluation.suite_summary import SuiteReport, summarise
 from rcirl_jax.simulation.metrics import CaseMetrics
-from rcirl_jax.whole import write_whole
+from rcirl_jax.whole import is_text, write_whole
 
 MAX_BYTES = 2**30  # bytes of a suite, unpacked
 PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
@@ -100,6 +100,8 @@ def _arrays(path: Path) -> dict[str, Any]:
     for name, value in arrays.items():
         if not isinstance(value, np.ndarray):
             raise ValueError(f"{name}: no array")
+        if value.dtype.kind == "U" and not is_text(value):
+            raise ValueError(f"{name}: characters that are none")
     return arrays
 
 

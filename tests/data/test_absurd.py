@@ -1,5 +1,7 @@
 """Numbers in range for a parser and absurd for a road; faults no check foresaw."""
 
+import dataclasses
+import os
 import re
 import sqlite3
 
@@ -10,7 +12,9 @@ from rcirl_jax.data import importers
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.cut import cut
 from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError, as_input_error
+from tests.commands import command
 from tests.data.formats import (
     commonroad,
     csv,
@@ -152,3 +156,26 @@ def test_faults_of_other_kinds_pass():
         as_input_error("file", "anything"),
     ):
         raise InputError("own line")
+
+
+def test_names_that_are_no_text(tmp_path):
+    """A file's name may be any bytes; what an import writes has to be text."""
+    odd = tmp_path / os.fsdecode(b"a\xff.csv")
+    odd.write_text("t,id,x,y\n")
+    with pytest.raises(InputError, match=r"name: 'a\\udcff\.csv': expected UTF-8"):
+        next(read_recordings("csv", odd))
+    recording = next(read_recordings("synthetic", None))
+    track = dataclasses.replace(recording.tracks[0], id="\ud800")
+    for field, value in (
+        *(("name", "\udcff"), ("group", "\udcff"), ("licence", "\udcff")),
+        *(("notes", ("\udcff",)), ("tracks", (track, *recording.tracks[1:]))),
+    ):
+        bad = dataclasses.replace(recording, **{field: value})
+        with pytest.raises(InputError, match=r"expected UTF-8 text"):
+            validate_recording(bad, "a.csv")
+
+
+def test_flags_that_are_no_text(tmp_path):
+    ended = command("experiments.import_logs", "--format=csv", "--input=a\udcff")
+    assert ended.returncode == 2
+    assert ended.stderr == "error: '--input=a\\udcff': expected UTF-8\n"

@@ -105,6 +105,15 @@ def test_kinds_in_a_suite_that_are_none(members, kind):
     assert "expected the metrics of a suite" in line_of(lambda: read_runs(file))
 
 
+@pytest.mark.parametrize("order", "<>")
+@pytest.mark.parametrize("point", [0x110000, 2**32 - 1, 0xD800])
+def test_texts_in_a_suite_of_characters_that_are_none(members, order, point):
+    file, content = members
+    text = np.array([point, 65], f"{order}u4").view(f"{order}U1")
+    file.write_bytes(archive_of({**content, "ids.npy": npy(text)}))
+    assert "ids: characters that are none" in line_of(lambda: read_runs(file))
+
+
 @pytest.mark.parametrize("packing", [12, 14, 93, 97])
 def test_a_suite_packed_in_ways_that_are_not_ours(members, packing):
     """bzip2, lzma (whose own error is no ValueError), zstd, and one that nobody has."""

@@ -403,6 +403,18 @@ def set_field(name, value, row=5):
 NAN, INF = float("nan"), float("inf")
 
 
+def set_character(name, point):
+    """The first character of a text of the first record."""
+
+    def edit(records):
+        start = records.dtype.fields[name][1]
+        records.view(np.uint8)[start : start + 4] = np.frombuffer(
+            np.uint32(point).tobytes(), np.uint8
+        )
+
+    return edit
+
+
 @pytest.mark.parametrize(
     ("array", "edit", "expected"),
     [
@@ -422,6 +434,8 @@ NAN, INF = float("nan"), float("inf")
         ("frames", set_field("agent_index_interval", [-1, 9]), r"interval within 0"),
         ("frames", set_field("agent_index_interval", [9, 1]), r"interval within 0"),
         ("frames", set_field("agent_index_interval", [0, 10**15]), r"interval within"),
+        ("scenes", set_character("host", 2**31), r"host: characters that are none"),
+        ("scenes", set_character("host", 0xDCFF), r"host: characters that are none"),
         ("scenes", set_field("frame_index_interval", [0, 0], 0), r"expected frames"),
         ("scenes", set_field("frame_index_interval", [0, 999], 0), r"interval within"),
         ("scenes", set_field("frame_index_interval", [-(2**63), 2**63 - 1], 0), r"int"),

@@ -16,6 +16,7 @@ from rcirl_jax.data.importers.options import check_types
 from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.specs import load_toml, spec_root
 from rcirl_jax.types import Recording
+from rcirl_jax.whole import is_text
 
 Importer = Callable[[Path, dict], Iterator[Recording]]
 
@@ -118,6 +119,9 @@ def parts(
         name_of = getattr(module, "own_name", None)
         if name_of is not None:
             spec = with_log_names(input_path, found, spec, name_of)
+    for path in found:
+        if not is_text(str(path)):
+            raise InputError(f"{path}: name: {path.name!a}: expected UTF-8; rename it")
     return found, spec
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.whole import parse_json
+from rcirl_jax.whole import is_text, parse_json
 
 MAX_METADATA_BYTES = 1024**2  # bytes of a .zarray
 MAX_RECORD_BYTES = 64 * 1024  # bytes of one record
@@ -43,6 +43,7 @@ class StructuredArray:
         self.chunk = _extent(file, meta, "chunks", MAX_RECORDS)
         self.dtype = _dtype(file, meta.get("dtype"))
         _check_fields(file, self.dtype, fields)
+        self._texts = [name for name in fields if self.dtype[name].base.kind == "U"]
         if self.chunk < 1 or self.chunk * self.dtype.itemsize > MAX_CHUNK_BYTES:
             raise InputError(
                 f"{file}: chunks: {self.chunk} records: expected 1 to "
@@ -72,7 +73,14 @@ class StructuredArray:
                 f"{self.path}: records {start} to {stop}: {_brief(error)}: "
                 "expected whole chunks"
             ) from error
-        return np.ascontiguousarray(raw).reshape(-1).view(self.dtype)
+        records = np.ascontiguousarray(raw).reshape(-1).view(self.dtype)
+        for name in self._texts:
+            if not is_text(records[name]):
+                raise InputError(
+                    f"{self.path}: records {start} to {stop}: {name}: characters that "
+                    "are none: expected text"
+                )
+        return records
 
     def _open(self) -> Any:  # noqa: ANN401 - tensorstore is imported when needed
         if self._store is None:
