@@ -531,6 +531,27 @@ def test_short_drive_is_one_recording(tmp_path):
     assert len(read(tmp_path, window_s=19.9)) == 2
 
 
+@pytest.mark.parametrize("silence", [300.0, 86300.0])
+@pytest.mark.parametrize("piece", [5.0, 1e9])
+def test_a_long_silence_is_stepped_over(tmp_path, monkeypatch, silence, piece):
+    """What is held is not looked at once for every second of it."""
+    monkeypatch.setattr(apollo_messages, "PIECE_S", piece)
+    looked_at, recording = [], apollo._recording
+    monkeypatch.setattr(
+        apollo,
+        "_recording",
+        lambda held, *rest: looked_at.append(rest) or recording(held, *rest),
+    )
+    times = [start + 0.1 * k for start in (0.0, silence) for k in range(9)]
+    path = write(
+        tmp_path / "a.record",
+        [(LOCALIZATION, t, fixture.localization(t)) for t in times],
+    )
+    found = read(path, window_s=1.0)
+    assert [made.name for made in found] == ["a-000", f"a-{silence:.0f}"]
+    assert len(looked_at) < 10
+
+
 def test_rows_held_are_limited(tmp_path, monkeypatch):
     """Also where no single piece has too many."""
     monkeypatch.setattr(apollo_messages, "PIECE_S", 1.0)

@@ -24,6 +24,7 @@ import numpy as np
 
 from rcirl_jax.data.importers.apollo_held import Held, Leg
 from rcirl_jax.data.importers.apollo_messages import LOCALIZATION, MANUAL, read_drive
+from rcirl_jax.data.importers.csv_stream import AFTER_S
 from rcirl_jax.data.importers.cyber_record import (
     drive_name,
     first_parts,
@@ -122,11 +123,16 @@ def _windows(held: Held, spec: dict) -> Iterator[Recording]:
         if made is not None:
             yield windows.recording(made, number, (low, high), held.progress)
 
+    def following(last: float) -> int:
+        """The next window near a position, or else the one at a time [s]."""
+        near = held.next_position((number + 1) * window - MAX_GAP_S) - MAX_GAP_S
+        return max(number + 1, math.floor(min(near, last) / window))
+
     for rows in read_drive(parts_from(held.path), spec):
         held.add(rows)
         while held.now > around(within())[1] + LATE_S:
             yield from take(*within())
-            number += 1
+            number = following(held.now - LATE_S - AFTER_S)
             held.forget(around(within())[0])
     if number == 0 and held.end <= window:
         whole = (-math.inf, math.inf)
@@ -136,7 +142,7 @@ def _windows(held: Held, spec: dict) -> Iterator[Recording]:
     while (low := number * window) < held.end:
         is_last = held.end <= low + window
         yield from take(low, held.end + 1.0 if is_last else low + window)
-        number += 1
+        number = following(held.end)
 
 
 def _recording(held: Held, within: tuple[float, float], spec: dict) -> Recording | None:

@@ -57,6 +57,12 @@ class Held:
         recorded = [table[-1, 1] for table in tables if len(table)]
         return max(recorded, default=-math.inf) + self._offset - self._start
 
+    def next_position(self, since: float) -> float:
+        """Time [s] of the first position held from a time on; inf without one."""
+        clocks = [self.clock(name) for name in WIDTHS if name != "chassis"]
+        clock = np.concatenate(clocks)
+        return float(np.min(clock, where=clock >= since, initial=math.inf))
+
     def add(self, rows: Rows) -> None:
         """Rows that follow.
 
