@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.importers import openacc, read_recordings
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.errors import InputError
 from tests.data.formats import openacc as fixture
@@ -202,6 +202,25 @@ def test_long_drives_are_cut(tmp_path):
     assert sum(t.t.size for r in found for t in r.tracks) == 400 + 396 + 370
     whole = only(drive(tmp_path), spec(tmp_path, "block_s = 0.0\n"))
     assert whole.name == "part1"
+
+
+def test_blocks_hold_what_lies_in_them(tmp_path, monkeypatch):
+    """Who drives is looked up once per car, and kept where it matters."""
+    count = 400
+    columns = {"Time": [f"{0.1 * k:.1f}" for k in range(count)]}
+    columns |= {"Speed1": ["10"] * count, "N1": ["0"] * count}
+    columns["E1"] = [f"{k}" for k in range(count)]
+    columns["Driver1"] = ["Human", "ACC"] * (count // 2)
+    looked_up, modes = [], openacc._modes
+    monkeypatch.setattr(
+        openacc, "_modes", lambda *args: looked_up.append(args) or modes(*args)
+    )
+    found = read(drive(tmp_path, columns), spec(tmp_path, "block_s = 2.0\n"))
+    assert len(found) == 20
+    assert len(looked_up) == 2
+    for track in (one for made in found for one in made.tracks):
+        assert 9 <= len(track.automated) <= 20
+        assert not track.is_human(float(track.t[2]), float(track.t[4]))
 
 
 def test_far_places_are_moved(tmp_path):

@@ -217,15 +217,15 @@ def _blocks(drive: _Drive, spec: dict) -> Iterator[Recording]:
             f"and at least {MIN_BLOCK_S:g} s or 0 (whole drives)"
         )
     part = np.zeros(drive.t.size) if block_s == 0.0 else drive.t // block_s
-    numbers = np.unique(part)
+    order = np.argsort(part, kind="stable")
+    numbers, firsts = np.unique(part[order], return_index=True)
     if (wanted := spec.get("drivers", DRIVERS[0])) not in DRIVERS:
         raise InputError(f"source TOML: drivers: {wanted}: expected one of {DRIVERS}")
-    kept = _located_samples(drive)
+    kept, automated = _located_samples(drive), _automated(drive, spec)
     notes = [*drive.notes, *_driver_notes(drive), *_spacing_notes(drive, spec)]
     found = False
-    for block in numbers:
-        rows = np.flatnonzero(part == block)
-        tracks, origin = _tracks(drive, rows, kept, spec, rate)
+    for block, rows in zip(numbers, np.split(order, firsts[1:]), strict=True):
+        tracks, origin = _tracks(drive, rows, kept, automated, spec, rate)
         if not tracks:
             continue
         found = True
@@ -246,11 +246,20 @@ def _located_samples(drive: _Drive) -> dict[int, np.ndarray]:
     }
 
 
-def _automated(drive: _Drive, car: int, t0: float, spec: dict) -> tuple:
-    """`Track.automated`, in s since t0 of the drive; `drivers = "all"`: none."""
+def _automated(drive: _Drive, spec: dict) -> dict[int, np.ndarray]:
+    """Car -> [k, 2] s of the drive without a human; `drivers = "all"`: none."""
     if spec.get("drivers", DRIVERS[0]) == "all":
-        return ()
-    return spans_of(drive.t - t0, _modes(drive, car) != "human")
+        return {car: np.zeros((0, 2)) for car in drive.cars}
+    spans = {
+        car: spans_of(drive.t, _modes(drive, car) != "human") for car in drive.cars
+    }
+    return {car: np.array(found).reshape(-1, 2) for car, found in spans.items()}
+
+
+def _near(spans: np.ndarray, low: float, high: float) -> np.ndarray:
+    """Those of the spans [k, 2] in order of time that reach into low to high."""
+    first = np.searchsorted(spans[:, 1], low)
+    return spans[first : np.searchsorted(spans[:, 0], high, side="right")]
 
 
 def _modes(drive: _Drive, car: int) -> np.ndarray:
@@ -328,6 +337,7 @@ def _tracks(
     drive: _Drive,
     rows: np.ndarray,
     kept: dict[int, np.ndarray],
+    automated: dict[int, np.ndarray],
     spec: dict,
     rate: float,
 ) -> tuple[tuple[Track, ...], list[str]]:
@@ -349,7 +359,9 @@ def _tracks(
         length, width = _size(drive, car, spec)
         ids = np.full(part.size, car)
         gap = MAX_GAP_STEPS / rate
-        for label, piece in split_tracks(drive.path, ids, drive.t[part], gap):
+        times = drive.t[part]
+        spans = _near(automated[car], times.min() - gap, times.max() + gap) - t0
+        for label, piece in split_tracks(drive.path, ids, times, gap):
             inside = part[piece]
             t = drive.t[inside] - t0
             x = drive.cars[car]["x"][inside] - origin[0]
@@ -365,7 +377,7 @@ def _tracks(
                     y=y,
                     heading=travel_heading(t, x, y),
                     speed=drive.cars[car]["Speed"][inside],
-                    automated=_automated(drive, car, t0, spec),
+                    automated=tuple((begin, end) for begin, end in spans.tolist()),
                 )
             )
     note = f"local origin at E = {origin[0]:.0f} m, N = {origin[1]:.0f} m"
