@@ -15,8 +15,14 @@ import pytest
 
 from benchmarks.reliability.fuzz.containers import archive_of
 from benchmarks.reliability.fuzz.readers import suite
-from rcirl_jax.data import manifest
-from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data import importers, manifest
+from rcirl_jax.data.importers import (
+    interaction,
+    l5_map,
+    levelx_lanes,
+    nuplan_map,
+    read_recordings,
+)
 from rcirl_jax.data.importers.argoverse2_map import read_lanes
 from rcirl_jax.data.importers.parquet import read_columns
 from rcirl_jax.data.importers.sqlite_ro import Database
@@ -389,6 +395,7 @@ def test_row_groups_that_claim_too_much(tmp_path, monkeypatch):
             "columns.x: id: expected a column of numbers",
         ),
         ('lanes = {file = "a\\u0000b"}', "file: a?b: expected a path"),
+        (f'lanes = {{file = "{"a/" * 3000}x"}}', "a path of 6001 bytes: expected"),
     ],
 )
 def test_options_that_lead_out_or_are_of_another_type(text, words, tmp_path):
@@ -397,6 +404,30 @@ def test_options_that_lead_out_or_are_of_another_type(text, words, tmp_path):
     columns = "\n".join(f'columns.{name} = "{name}"' for name in ("t", "id", "x", "y"))
     source.write_text(f"{text}\n" + ("" if "columns" in text else columns))
     assert words in line_of(lambda: list(read_recordings("csv", tmp_path, source)))
+
+
+@pytest.mark.parametrize(
+    "find",
+    [
+        lambda log, path: l5_map.find_map(log, {"map": path}),
+        lambda log, path: interaction._find_map(log, {"map": path}),
+        lambda log, path: levelx_lanes.find_map(log, "1", {"map": path}),
+        lambda log, path: nuplan_map.find_map(log, ["x"], {"maps": path}),
+    ],
+)
+def test_a_map_whose_path_is_too_long(find, tmp_path):
+    line = line_of(lambda: find(tmp_path / "log", "a/" * 3000 + "x"))
+    assert re.search("map.*: a/a/.*: a path of 6001 bytes: expected at most", line)
+    assert "a path of" not in line_of(lambda: find(tmp_path / "log", "a/" * 1023 + "x"))
+
+
+def test_options_that_no_check_foresaw(tmp_path, monkeypatch):
+    source = tmp_path / "source.toml"
+    source.write_text("rate_hz = 1")
+    monkeypatch.setattr(importers, "check_types", lambda *_: {}["x"])
+    line = line_of(lambda: importers.parts("csv", tmp_path, source))
+    assert line.startswith(f"{source}: ")
+    assert line.endswith("expected options as in the TOML of format csv")
 
 
 def test_a_name_that_ends_in_a_nul(tmp_path):

@@ -102,8 +102,10 @@ def parts(
     packaged = spec_root() / "sources" / f"{name}.toml"
     spec_path = source or packaged
     spec = load_toml(spec_path)
+    options = f"options as in the TOML of format {name}"
     if source is not None:
-        check_types(spec, load_toml(packaged))
+        with as_input_error(str(source), options):
+            check_types(spec, load_toml(packaged))
     if input_path is None:
         if name != "synthetic":
             raise InputError("--input: not given: expected a file or folder")
@@ -112,9 +114,7 @@ def parts(
         raise InputError(f"{input_path}: input: missing: expected a file or folder")
     module = _module(name)
     split = getattr(module, "parts", None)
-    with as_input_error(
-        str(input_path), f"logs of format {name}, and options as in its TOML"
-    ):
+    with as_input_error(str(input_path), f"logs of format {name}, and {options}"):
         found = [input_path] if split is None else split(input_path, spec)
         name_of = getattr(module, "own_name", None)
         if name_of is not None:

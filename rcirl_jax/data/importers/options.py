@@ -10,6 +10,7 @@ from rcirl_jax.types import Kind
 
 LARGEST = 10**18  # of an integer
 MAX_NAME = 255  # bytes of a file's name
+MAX_PATH = 2048  # bytes of a path; systems take 4096, with the folder before it
 KINDS = ("vehicle", "cyclist", "pedestrian", "static")
 
 
@@ -99,6 +100,11 @@ def path_option(spec: Mapping, key: str) -> str:
     names = value.split("/") if isinstance(value, str) else []
     if not names or any(name and not _is_name(name) for name in names):
         raise InputError(f"source TOML: {key}: {value}: expected a path")
+    if (size := len(value.encode(errors="replace"))) > MAX_PATH:
+        raise InputError(
+            f"source TOML: {key}: {value[:40]}...: a path of {size} bytes: "
+            f"expected at most {MAX_PATH}"
+        )
     return value
 
 
