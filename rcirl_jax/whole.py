@@ -113,7 +113,7 @@ def parse_json(text: bytes | str, *, finite: bool = False) -> Any:  # noqa: ANN4
     """The body of JSON from outside; what it holds can be written again.
 
     Args:
-      text: UTF-8 where it is bytes.
+      text: where it is bytes, UTF-8, with or without a byte order mark.
       finite: infinities and NaN, which Python takes and JSON does not know, are none.
 
     Raises:
@@ -121,7 +121,7 @@ def parse_json(text: bytes | str, *, finite: bool = False) -> Any:  # noqa: ANN4
         pair (no text: it cannot be printed or stored).
     """
     if isinstance(text, bytes):
-        text = text.decode("utf-8")
+        text = text.decode("utf-8-sig")
     try:
         body = json.loads(
             text,
@@ -130,7 +130,8 @@ def parse_json(text: bytes | str, *, finite: bool = False) -> Any:  # noqa: ANN4
         )
     except RecursionError as error:
         raise ValueError("nested too deep") from error
-    if _levels(body) > MAX_DEPTH:
+    opened = text.count("[") + text.count("{")
+    if opened > MAX_DEPTH and _levels(body) > MAX_DEPTH:
         raise ValueError("nested too deep")
     if not is_text(text) or ESCAPED.search(text):
         json.dumps(body, ensure_ascii=False).encode()  # raises where one has no half

@@ -93,7 +93,7 @@ def test_json_that_is_none_is_one_line(tmp_path, content, message):
     "text",
     [
         *(
-            "\ud800",
+            '"\ud800"',
             '"\udfff"',
             b'"\xed\xa0\x80"',
             '{"\\uDEAD": 1}',
@@ -118,6 +118,8 @@ def test_finite_json_has_no_other_numbers():
 def test_json_with_whole_pairs_is_text(tmp_path):
     (tmp_path / "a.json").write_bytes(b'"\\ud83d\\ude97"')
     assert read_json(tmp_path / "a.json", "a car") == "\U0001f697"
+    (tmp_path / "a.json").write_bytes(b'\xef\xbb\xbf["as some editors write it"]')
+    assert read_json(tmp_path / "a.json", "a text") == ["as some editors write it"]
 
 
 def test_json_of_any_size_takes_little_memory(tmp_path):

@@ -100,6 +100,8 @@ def _arrays(path: Path) -> dict[str, Any]:
     for name, value in arrays.items():
         if not isinstance(value, np.ndarray):
             raise ValueError(f"{name}: no array")
+        if value.size > max(value.nbytes, 1):  # texts of no length, any number of them
+            raise ValueError(f"{name}: {value.size} values in {value.nbytes} bytes")
         if value.dtype.kind == "U" and not is_text(value):
             raise ValueError(f"{name}: characters that are none")
     return arrays

@@ -104,6 +104,14 @@ def test_claimed_sizes_in_a_suite(members, shape):
     assert "expected the metrics of a suite" in line_of(lambda: read_runs(file))
 
 
+def test_texts_of_no_length_in_a_suite(members):
+    """They take no room in the file, and as Python's some gigabytes."""
+    file, content = members
+    names = head((10**6,), "<U0")
+    file.write_bytes(archive_of({**content, "names.npy": names}))
+    assert "names: 1000000 values in 0 bytes" in line_of(lambda: read_runs(file))
+
+
 @pytest.mark.parametrize("kind", ["(,)f8", "f8,(", "f9", ""])
 def test_kinds_in_a_suite_that_are_none(members, kind):
     file, content = members
