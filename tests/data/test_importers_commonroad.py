@@ -8,7 +8,7 @@ from defusedxml import ElementTree
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rcirl_jax.data.importers import commonroad, read_recordings
+from rcirl_jax.data.importers import commonroad, commonroad_extras, read_recordings
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind
 from tests.data import writers as w
@@ -195,6 +195,27 @@ def test_signal_cycle_against_modular_arithmetic(tmp_path_factory, durations, of
         assert signal.state[index] == shown.get(expected, expected)
 
 
+@pytest.mark.parametrize("offset", [1.149e34, -1e300, -1e-30, 1e9 + 5])
+def test_offset_of_any_size_begins_one_turn_early(tmp_path, offset):
+    body = (
+        w.lanelet() + w.car() + w.light("7", [("red", 7), ("green", 5)], offset=offset)
+    )
+    (signal,) = only(w.commonroad(tmp_path / "a.xml", body)).signals
+    assert -1.21 < signal.start[0] <= 0.0
+    assert signal.start[-1] >= 3.1
+    np.testing.assert_allclose(np.diff(signal.start)[::2], 0.7)
+
+
+def test_intervals_of_all_lights_are_limited(tmp_path, monkeypatch):
+    lights = [w.light(name, [("red", 1), ("green", 1)]) for name in "78"]
+    path = w.commonroad(tmp_path / "a.xml", w.lanelet(), w.car(), *lights)
+    sizes = [signal.start.size for signal in only(path).signals]
+    assert sizes == [42, 42]  # steps 0 to 39 and a turn before
+    monkeypatch.setattr(commonroad_extras, "MAX_INTERVALS", sum(sizes) - 1)
+    with pytest.raises(InputError, match="trafficLight 8: cycle: 21 turns"):
+        read(path)
+
+
 def test_inactive_light_is_off(tmp_path):
     body = w.lanelet() + w.car() + w.light("7", [("red", 9)], active="false")
     (signal,) = only(w.commonroad(tmp_path / "a.xml", body)).signals
@@ -287,6 +308,8 @@ GOOD = [w.state(1, 1.5, 0)]
         ([w.lanelet(), w.lanelet(), w.car()], {}, "lane id: 1"),
         ([w.lanelet(), w.car(), w.light("7", [("pink", 9)])], {}, "pink"),
         ([w.lanelet(), w.car(), w.light("7", [("red", -1)])], {}, "duration"),
+        ([w.lanelet(), w.car(), w.light("7", [("red", 1e-9)])], {}, "red for 1e-09"),
+        ([w.lanelet(), w.car(), w.light("7", [("red", 1e300)])], {}, "red for 1e+300"),
         ([w.lanelet(), w.car(version="2018b").replace("dynamic<", "odd<")], {}, "role"),
     ],
 )

@@ -16,6 +16,8 @@ COLOURS = {
     "green": "green",
     "inactive": "off",
 }
+MAX_DURATION = 1e9  # steps of one phase; sums of phases stay exact
+MAX_INTERVALS = 5_000_000  # of all lights; 100 lights over a day take a tenth of it
 
 
 def position(state: Element, fields: Fields, where: str) -> tuple[float, float]:
@@ -28,6 +30,7 @@ def read_signals(
     root: Element, fields: Fields, dt: float, last: float
 ) -> Iterator[Signal]:
     """Every traffic light's written cycle, unrolled from 0 to after `last` s."""
+    left = MAX_INTERVALS
     for light in root.iterfind("trafficLight"):
         name = light.get("id", "(no id)")
         where = f"trafficLight {name}"
@@ -35,36 +38,39 @@ def read_signals(
         for element in light.iterfind("cycle/cycleElement"):
             colour = (element.findtext("color") or "none").strip()
             duration = fields.number(fields.child(element, "duration", where), where)
-            if colour.lower() not in COLOURS or duration <= 0.0:
+            if colour.lower() not in COLOURS or not 1.0 <= duration <= MAX_DURATION:
                 raise InputError(
                     f"{fields.path}: {where}: cycleElement: {colour} for {duration:g}: "
-                    f"expected a colour of {sorted(COLOURS)} and a duration > 0"
+                    f"expected a colour of {sorted(COLOURS)} and a duration of 1 to "
+                    f"{MAX_DURATION:g} steps"
                 )
-            phases.append((COLOURS[colour.lower()], duration * dt))
+            phases.append((COLOURS[colour.lower()], duration))
         if not phases or (light.findtext("active") or "true").strip() == "false":
-            phases = [("off", max(last, 1.0))]
+            phases = [("off", max(last, 1.0) / dt)]
         offset = light.find("cycle/timeOffset")
-        start = fields.number(offset, where) * dt if offset is not None else 0.0
-        yield _unroll(name, phases, start, last)
+        start = fields.number(offset, where) if offset is not None else 0.0
+        period = sum(duration for _, duration in phases)
+        begin = start % period - period  # steps; at or before 0
+        turns = max(int((last / dt - begin) // period) + 1, 1)
+        left -= turns * len(phases)
+        if left < 0:
+            raise InputError(
+                f"{fields.path}: {where}: cycle: {turns} turns of {len(phases)}: "
+                f"expected up to {MAX_INTERVALS} intervals of all lights"
+            )
+        yield _unroll(name, phases, begin, turns, dt)
 
 
 def _unroll(
-    name: str, phases: list[tuple[str, float]], offset: float, last: float
+    name: str, phases: list[tuple[str, float]], begin: float, turns: int, dt: float
 ) -> Signal:
-    """A repeating cycle as intervals from before 0 to after `last`.
-
-    The phase at time t is that at (t - offset) modulo the period.
-    """
-    period = sum(duration for _, duration in phases)
-    t = offset - period * (np.floor(offset / period) + 1.0)
-    starts, states = [], []
-    while t <= last:
-        for state, duration in phases:
-            starts.append(t)
-            states.append(state)
-            t += duration
+    """A cycle that begins at step `begin` and is repeated, as intervals."""
+    states, durations = zip(*phases, strict=True)
+    ends = np.cumsum(durations)
+    within = np.concatenate([[0.0], ends[:-1]])
+    steps = begin + np.arange(turns)[:, None] * ends[-1] + within
     return Signal(
-        id=name, start=np.array(starts), state=tuple(states), is_recorded=False
+        id=name, start=steps.ravel() * dt, state=states * turns, is_recorded=False
     )
 
 
