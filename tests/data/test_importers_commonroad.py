@@ -63,6 +63,16 @@ def test_standing_things_last_the_whole_recording(tmp_path, version):
         assert not track.speed.any()
 
 
+def test_samples_of_standing_things_are_limited(tmp_path, monkeypatch):
+    body = w.lanelet() + w.car() + w.standing()  # 40 steps
+    path = w.commonroad(tmp_path / "a.xml", body)
+    monkeypatch.setattr(commonroad, "MAX_STANDING", 40)
+    assert len(only(path).tracks) == 2
+    monkeypatch.setattr(commonroad, "MAX_STANDING", 39)
+    with pytest.raises(InputError, match="obstacles: 1 static ones over 40 steps"):
+        read(path)
+
+
 def test_shapes_and_their_offsets(tmp_path):
     circle = "<circle><radius>0.4</radius></circle>"
     corners = [(0, 0), (4, 0), (4, 2), (0, 2)]
@@ -239,6 +249,21 @@ def test_ghost_reaches_the_goal(tmp_path, goal, end):
     (ghost,) = only(w.commonroad(tmp_path / "a.xml", body)).ghosts
     assert (ghost.t0, ghost.t1, ghost.start) == (0.0, pytest.approx(3.0), (0.0, 0.0))
     np.testing.assert_allclose(ghost.end, end, atol=0.6)
+
+
+def test_lanelets_of_a_goal_are_limited(tmp_path):
+    ends = {"left": [(0, 2), (200000, 2)], "right": [(0, -2), (200000, -2)]}
+    goal = '<position><lanelet ref="1"/></position>'
+    path = w.commonroad(tmp_path / "a.xml", w.lanelet(**ends), w.car(), w.problem(goal))
+    with pytest.raises(InputError, match="goalState: lanelets of 200000 m"):
+        read(path)
+
+
+def test_lanelet_of_a_goal_counts_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(commonroad_extras, "MAX_GOAL_M", 201)  # m, the lanelet has 200
+    goal = "<position>" + '<lanelet ref="1"/>' * 3 + "</position>"
+    path = w.commonroad(tmp_path / "a.xml", w.lanelet(), w.car(), w.problem(goal))
+    np.testing.assert_allclose(only(path).ghosts[0].end, (30.0, 0.0), atol=0.6)
 
 
 def test_obstacle_without_trajectory_is_noted(tmp_path):

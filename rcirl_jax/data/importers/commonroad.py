@@ -32,6 +32,7 @@ VERSIONS = ("2018b", "2020a")
 GROUPS_UP = 4  # folders above a file in which the table of groups is looked for
 MAX_FILE_BYTES = 512 * 1024**2  # bytes, larger files are refused
 MAX_STEP = 1e6  # of the clock: a day at 10 Hz
+MAX_STANDING = 20_000_000  # samples of standing things: 500 over an hour at 10 Hz
 DEFAULT_LIMIT_MPS = 29.06  # m/s, 65 mph, where the source TOML names none
 MIN_LIMIT_MPS = 5.0  # m/s, likewise; lower signs are converter artefacts
 # roots of what lies beside interactive scenarios: SUMO's files, solutions, other maps
@@ -232,6 +233,11 @@ def _read_tracks(
     first = min((float(track.t[0]) for track in tracks), default=0.0)
     last = max((float(track.t[-1]) for track in tracks), default=0.0)
     clock = np.arange(round(first / dt), round(last / dt) + 1) * dt
+    if len(standing) * clock.size > MAX_STANDING:
+        raise InputError(
+            f"{fields.path}: obstacles: {len(standing)} static ones over {clock.size} "
+            f"steps: expected up to {MAX_STANDING} samples"
+        )
     tracks += [_read_standing(element, fields, clock) for element in standing]
     notes = []
     if unrecorded:

@@ -17,6 +17,7 @@ COLOURS = {
     "inactive": "off",
 }
 MAX_DURATION = 1e9  # steps of one phase; sums of phases stay exact
+MAX_GOAL_M = 1e5  # m, all lanelets of one goal together
 MAX_INTERVALS = 5_000_000  # of all lights; 100 lights over a day take a tenth of it
 
 
@@ -118,10 +119,16 @@ def _goal_point(
     if corners:
         return np.mean(corners, axis=0)
     names = [ref.get("ref", "") for ref in goal.iterfind("position/lanelet")]
-    points = [_densify(lanes[name]) for name in names if name in lanes]
-    if not points:
+    lines = [lanes[name] for name in dict.fromkeys(names) if name in lanes]
+    if not lines:
         return coasted
-    near = np.concatenate(points)
+    total = sum(float(np.hypot(*np.diff(line, axis=0).T).sum()) for line in lines)
+    if not total <= MAX_GOAL_M:
+        raise InputError(
+            f"{fields.path}: {where}: goalState: lanelets of {total:.0f} m: "
+            f"expected up to {MAX_GOAL_M:.0f} m"
+        )
+    near = np.concatenate([_densify(line) for line in lines])
     return near[np.argmin(np.hypot(*(near - coasted).T))]
 
 
