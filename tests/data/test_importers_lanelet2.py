@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rcirl_jax.data.importers import safe_xml
+from rcirl_jax.data.importers import lanelet2_rules, safe_xml
 from rcirl_jax.data.importers.lanelet2 import read_lanelet2
+from rcirl_jax.data.importers.lanelet2_rules import members
 from rcirl_jax.data.importers.projection import utm, utm_zone
 from rcirl_jax.errors import InputError
 from tests.data.formats import osm
@@ -134,6 +135,10 @@ def test_participants(tmp_path, tags, kept):
         ("fast", None),
         ("0", None),
         ("900 km/h", None),
+        (f"50{400 * ' '}km/h", 50 / 3.6),
+        (f"{300_000 * '5'}", None),
+        # minutes, if the time were the square of the spaces
+        (f"50{300_000 * ' '}!", None),
     ],
 )
 def test_speed_limits(tmp_path, monkeypatch, text, expected):
@@ -180,6 +185,30 @@ def test_rules_about_stopping(tmp_path, monkeypatch, rule, line, sign):
         assert lane.stop_line is None
     else:
         np.testing.assert_allclose(lane.stop_line, [[96.75, -80.0], [93.25, -80.0]])
+
+
+def test_rules_are_read_once(tmp_path, monkeypatch):
+    """However many lanelets name a rule, and however often."""
+    roles = []
+
+    def counted(element, role, kind):
+        roles.append(role)
+        return members(element, role, kind)
+
+    monkeypatch.setattr(lanelet2_rules, "members", counted)
+    lanelet = (["middle_3"], ["border_3"], osm.ROAD, ["50000", "50001"] * 20)
+    lanes, _ = read(metres(tmp_path, lanelets={"1": lanelet, "2": lanelet}))
+    assert lanes["2"].speed_limit == pytest.approx(50 / 3.6)
+    assert roles.count("yield") == len(osm.RULES)
+    assert roles.count("refers") == len(osm.RULES)
+
+
+def test_limit_of_the_last_rule_counts(tmp_path, monkeypatch):
+    slow = ({"subtype": "speed_limit", "sign_type": "de274-30"}, [])
+    monkeypatch.setitem(osm.RULES, "50002", slow)
+    both = {"1": (["middle_3"], ["border_3"], osm.ROAD, ["50000", "50002"])}
+    lanes, _ = read(metres(tmp_path, lanelets=both))
+    assert lanes["1"].speed_limit == pytest.approx(30 / 3.6)
 
 
 def test_positions_in_degrees_and_in_local_tags(tmp_path, lanes):

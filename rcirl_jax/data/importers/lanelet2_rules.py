@@ -1,8 +1,8 @@
 """Elements of Lanelet2 maps: tags, members, lines, speed limits, stop lines."""
 
 import dataclasses
+import functools
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -22,6 +22,17 @@ SPEED_UNITS = {
 }
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Rule:
+    """What a regulatory element says, read once for all its lanelets."""
+
+    subtype: str
+    yields: frozenset[str]  # lanelets that have to give way
+    stops: bool  # everybody has to stop
+    lines: np.ndarray  # [n, 2, 2] m, end points of its own stop lines
+    limit: float | None  # m/s
+
+
 @dataclasses.dataclass(frozen=True)
 class OsmMap:
     """What a file holds; elements by id."""
@@ -30,6 +41,11 @@ class OsmMap:
     points: dict[str, np.ndarray]  # node -> [2] m
     ways: dict[str, Element]
     relations: dict[str, Element]
+
+    @functools.cached_property
+    def rules(self) -> dict[str, Rule]:
+        """Regulatory elements by id."""
+        return _read_rules(self)
 
 
 def tag_of(element: Element, key: str) -> str:
@@ -85,34 +101,66 @@ def line_of(world: OsmMap, nodes: tuple[str, ...]) -> np.ndarray:
     return np.array([world.points[node] for node in nodes])
 
 
-def _rules(world: OsmMap, relation: Element) -> Iterator[Element]:
-    """Regulatory elements that a lanelet refers to."""
-    for member in relation.iterfind("member"):
-        rule = world.relations.get(member.get("ref", ""))
-        if (
-            member.get("type") == "relation"
-            and rule is not None
-            and tag_of(rule, "type") == "regulatory_element"
-        ):
-            yield rule
+def _read_rules(world: OsmMap) -> dict[str, Rule]:
+    """All regulatory elements; a way that many of them name is looked at once."""
+
+    @functools.cache
+    def sign(name: str) -> str:
+        return tag_of(world.ways[name], "subtype") if name in world.ways else ""
+
+    @functools.cache
+    def ends(name: str) -> tuple[str, ...]:
+        nodes = bound(world, [name])
+        return nodes and (nodes[0], nodes[-1])
+
+    rules = {}
+    for key, element in world.relations.items():
+        if tag_of(element, "type") != "regulatory_element":
+            continue
+        subtype, text = tag_of(element, "subtype"), tag_of(element, "sign_type")
+        kinds = [sign(name) for name in members(element, "refers", "way")]
+        texts = []
+        if subtype == "speed_limit":
+            # German sign 274 carries its number: de274-60
+            numbers = [kind.rpartition("-")[2] for kind in kinds if "274-" in kind]
+            texts = [text.rpartition("274-")[2], *numbers]
+        own = [ends(name) for name in members(element, "ref_line", "way")]
+        lines = [line_of(world, nodes) for nodes in own if nodes]
+        rules[key] = Rule(
+            subtype=subtype,
+            yields=frozenset(members(element, "yield", "relation")),
+            stops=subtype == "all_way_stop"
+            or any(kind.lower() in STOP_SIGNS for kind in (text, *kinds)),
+            lines=np.array(lines).reshape(-1, 2, 2),
+            limit=_first_speed(texts),
+        )
+    return rules
+
+
+def _rules(world: OsmMap, relation: Element) -> list[Rule]:
+    """Regulatory elements that a lanelet refers to, each once."""
+    names = dict.fromkeys(
+        member.get("ref", "")
+        for member in relation.iterfind("member")
+        if member.get("type") == "relation"
+    )
+    return [world.rules[name] for name in names if name in world.rules]
 
 
 def speed_limit(world: OsmMap, relation: Element) -> float | None:
-    """m/s, of a speed_limit rule, or of the lanelet's own tag."""
-    texts = [tag_of(relation, "speed_limit")]
-    for rule in _rules(world, relation):
-        if tag_of(rule, "subtype") == "speed_limit":
-            signs = [world.ways.get(n) for n in members(rule, "refers", "way")]
-            kinds = [tag_of(sign, "subtype") for sign in signs if sign is not None]
-            # German sign 274 carries its number: de274-60
-            numbers = [kind.rpartition("-")[2] for kind in kinds if "274-" in kind]
-            texts = [tag_of(rule, "sign_type").rpartition("274-")[2], *numbers, *texts]
+    """m/s, of the last speed_limit rule, or of the lanelet's own tag."""
+    limits = [rule.limit for rule in _rules(world, relation) if rule.limit is not None]
+    return limits[-1] if limits else _first_speed([tag_of(relation, "speed_limit")])
+
+
+def _first_speed(texts: list[str]) -> float | None:
     found = (_speed(text) for text in texts)
     return next((speed for speed in found if speed is not None), None)
 
 
 def _speed(text: str) -> float | None:
-    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([a-zA-Z/]*)\s*", text)
+    # one place for spaces: several take a time that is the square of their number
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([a-zA-Z/]*)", text.strip())
     if match is None or match[2].lower() not in SPEED_UNITS:
         return None
     speed = float(match[1]) * SPEED_UNITS[match[2].lower()]
@@ -126,32 +174,22 @@ def stop_of(
 
     A rule without a line of its own stops traffic at the lanelet's end.
     """
-    lines, sign = [], False
+    found, sign = [], False
     for rule in _rules(world, relation):
-        subtype = tag_of(rule, "subtype")
-        if subtype not in ("traffic_light", "all_way_stop", "traffic_sign"):
-            if subtype != "right_of_way":
-                continue
-            if name not in members(rule, "yield", "relation"):
-                continue
-        stops = subtype == "all_way_stop" or _has_stop_sign(world, rule)
-        if subtype == "traffic_sign" and not stops:
+        concerned = {
+            "traffic_light": True,
+            "all_way_stop": True,
+            "traffic_sign": rule.stops,
+            "right_of_way": name in rule.yields,
+        }
+        if not concerned.get(rule.subtype, False):
             continue
-        sign = sign or stops
-        own = [bound(world, [n]) for n in members(rule, "ref_line", "way")]
-        lines += [line_of(world, nodes)[[0, -1]] for nodes in own if nodes]
-        if subtype == "traffic_light" or stops:
-            lines += [] if any(own) else [ends]
-    if not lines:
+        sign = sign or rule.stops
+        found.append(rule.lines)
+        if not len(rule.lines) and (rule.subtype == "traffic_light" or rule.stops):
+            found.append(ends[None])
+    lines = np.concatenate([*found, np.zeros((0, 2, 2))])
+    if not len(lines):
         return None, False
-    middle = ends.mean(axis=0)
-    apart = [float(np.hypot(*(line.mean(axis=0) - middle))) for line in lines]
-    return lines[int(np.argmin(apart))], sign
-
-
-def _has_stop_sign(world: OsmMap, rule: Element) -> bool:
-    names = [tag_of(rule, "sign_type").lower()]
-    for name in members(rule, "refers", "way"):
-        if name in world.ways:
-            names.append(tag_of(world.ways[name], "subtype").lower())
-    return any(name in STOP_SIGNS for name in names)
+    apart = np.hypot(*(lines.mean(axis=1) - ends.mean(axis=0)).T)
+    return lines[np.argmin(apart)], sign
