@@ -8,7 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rcirl_jax.data.importers import parts, read_recordings, waymo_widths, wire_columns
+from rcirl_jax.data.importers import (
+    parts,
+    read_recordings,
+    waymo_map,
+    waymo_widths,
+    wire_columns,
+)
 from rcirl_jax.data.importers.shapes import distance_to_line
 from rcirl_jax.data.importers.tfrecord import read_records
 from rcirl_jax.data.importers.wire_columns import Record
@@ -756,6 +762,15 @@ def test_many_boundaries_of_one_lane_are_refused(tmp_path, monkeypatch):
     sides = [w.boundary(13, -(2**62), 2**62, 901)] * 50
     path = put(tmp_path, w.scenario(f8=[w.lane(1, rows, sides=sides)]))
     assert "left_boundaries: " in message(path)
+
+
+def test_lanes_with_signals_by_steps_are_limited(tmp_path, monkeypatch):
+    rows = [[(1, [(1, lane), (2, 4)]) for lane in (103, 106)]] * 91
+    path = put(tmp_path, w.scenario(f7=rows))
+    monkeypatch.setattr(waymo_map, "MAX_COLOURS", 182)
+    assert len(only(path).signals) == 2
+    monkeypatch.setattr(waymo_map, "MAX_COLOURS", 181)
+    assert "dynamic_map_states: 2 lanes over 91 steps" in message(path)
 
 
 def test_any_garbled_message_is_read_or_refused(tmp_path):

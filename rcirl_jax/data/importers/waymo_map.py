@@ -48,8 +48,9 @@ WIDTH_M = 3.5  # m, of lanes without boundaries
 # LANE_STATE_*: unknown, arrow stop/caution/go, stop/caution/go, flashing stop/caution
 OFF, RED, YELLOW, GREEN = range(4)
 NAMES = ("off", "red", "yellow", "green")
-COLOURS = np.array([OFF, RED, YELLOW, GREEN, RED, YELLOW, GREEN, OFF, OFF])
+COLOURS = np.array([OFF, RED, YELLOW, GREEN, RED, YELLOW, GREEN, OFF, OFF], np.int8)
 FLASHING_STOP = 7  # a stop sign, in effect
+MAX_COLOURS = 50_000_000  # lanes by steps; 1000 lanes over an hour take 36 million
 GAP_S = 2.0  # s, a signal unseen for so long kept its colour if it has it again
 
 
@@ -299,7 +300,12 @@ def _signals(
             f"0 to {len(COLOURS) - 1}",
         )
     ids, rows = np.unique(lane, return_inverse=True)
-    colours = np.full((ids.size, t.size), OFF)
+    if ids.size * t.size > MAX_COLOURS:
+        raise record.error(
+            f"dynamic_map_states: {ids.size} lanes over {t.size} steps",
+            f"at most {MAX_COLOURS} states",
+        )
+    colours = np.full((ids.size, t.size), OFF, np.int8)
     step = np.repeat(np.arange(len(steps)), counts)
     # of two heads for one lane the first that is known counts: it is written last
     known = np.flatnonzero(COLOURS[state] != OFF)[::-1]
