@@ -322,6 +322,17 @@ def test_sizes_are_limited_before_reading(tmp_path, monkeypatch):
     assert "columns: 18" in message(path)
 
 
+def test_bytes_of_texts_are_limited(tmp_path, monkeypatch):
+    path, _ = w.write_scenario(tmp_path)
+    rows, longest = pq.read_table(path).num_rows, len(w.columns()["scenario_id"][0])
+    monkeypatch.setattr(parquet, "MAX_TEXT_BYTES", 4 * rows * longest)
+    only(path)
+    monkeypatch.setattr(parquet, "MAX_TEXT_BYTES", 4 * rows * longest - 1)
+    assert f"scenario_id: {rows} rows of texts up to {longest} characters" in message(
+        path
+    )
+
+
 def test_a_small_file_of_many_rows(tmp_path):
     """Six million equal cells take 20 kB on disk."""
     path, _ = w.write_scenario(tmp_path)

@@ -23,6 +23,7 @@ MAX_GROUP_BYTES = 512 * 1024**2  # bytes of a row group, decompressed
 MAX_ROWS = 5_000_000
 MAX_COLUMNS = 1000
 MAX_TEXT = 200  # characters of a text value
+MAX_TEXT_BYTES = 128 * 1024**2  # bytes of a column of text; a scenario has 1e7
 MAX_FOOTER_BYTES = 16 * 1024**2  # bytes of a text in the footer (pandas metadata)
 
 
@@ -189,5 +190,12 @@ def _words(path: Path, name: str, chunk: "pyarrow.DictionaryArray") -> np.ndarra
         raise InputError(
             f"{path}: {name}: '{longest[:40]}...' of {len(longest)} characters: "
             f"expected at most {MAX_TEXT}"
+        )
+    # numpy gives every cell the room of the longest text
+    size = 4 * len(longest) * max(len(words), len(chunk))
+    if size > MAX_TEXT_BYTES:
+        raise InputError(
+            f"{path}: {name}: {len(chunk)} rows of texts up to {len(longest)} "
+            f"characters: {size} bytes: expected at most {MAX_TEXT_BYTES}"
         )
     return np.array(words)[chunk.indices.to_numpy(zero_copy_only=False)]
