@@ -401,6 +401,17 @@ def test_bad_toml_is_one_clear_line(tmp_path, old, new, field):
     assert "\n" not in str(error.value)
 
 
+def test_recordings_of_all_entries_are_limited(tmp_path, monkeypatch):
+    path = tmp_path / "many.toml"
+    text = SMALL.format(noise=0.0, road="stop_sign", count=3, duration=10.0, seed=3)
+    path.write_text(text + text[text.index("[[") :])
+    monkeypatch.setattr(synthetic, "MAX_RECORDINGS", 6)
+    synthetic.recordings(path, load_toml(DEFAULT))
+    monkeypatch.setattr(synthetic, "MAX_RECORDINGS", 5)
+    with pytest.raises(InputError, match=r"recordings\[2\]\.count: 3 after 3"):
+        synthetic.recordings(path, load_toml(DEFAULT))
+
+
 def test_broken_toml_names_the_file(tmp_path):
     path = tmp_path / "broken.toml"
     path.write_text("rate_hz = = 1")

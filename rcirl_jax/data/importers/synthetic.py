@@ -50,6 +50,7 @@ MAY_BE_ZERO = (
     "destination_share",
 )
 WHOLE = ("count", "seed")  # keys that take integers
+MAX_RECORDINGS = 100_000  # of all entries
 BATCH = 32  # recordings simulated together, at most
 SEEN_FROM_M = 30.0  # m, tracks begin this far from the road's start
 SEEN_UNTIL_M = 60.0  # m, and end this far before its end
@@ -175,6 +176,11 @@ def _jobs(path: Path, settings: dict) -> list[tuple[str, RunConfig]]:
             raise InputError(
                 f"{path}: {where}road: {entry['road']}: "
                 f"expected one of {', '.join(ROADS)}"
+            )
+        if len(jobs) + entry["count"] > MAX_RECORDINGS:
+            raise InputError(
+                f"{path}: {where}count: {entry['count']} after {len(jobs)}: "
+                f"expected up to {MAX_RECORDINGS} of all entries"
             )
         for index in range(entry["count"]):
             run = RunConfig(
