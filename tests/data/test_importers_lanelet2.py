@@ -203,6 +203,14 @@ def test_rules_are_read_once(tmp_path, monkeypatch):
     assert roles.count("refers") == len(osm.RULES)
 
 
+def test_a_stop_line_keeps_no_others(tmp_path, monkeypatch):
+    rule = ({"subtype": "traffic_light"}, [("way", "line", "ref_line")] * 9)
+    monkeypatch.setitem(osm.RULES, "50001", rule)
+    lane = read(metres(tmp_path))[0]["30004"]
+    np.testing.assert_allclose(lane.stop_line, [[93.25, -78.0], [96.75, -78.0]])
+    assert lane.stop_line.base is None
+
+
 def test_limit_of_the_last_rule_counts(tmp_path, monkeypatch):
     slow = ({"subtype": "speed_limit", "sign_type": "de274-30"}, [])
     monkeypatch.setitem(osm.RULES, "50002", slow)

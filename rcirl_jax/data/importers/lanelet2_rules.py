@@ -124,7 +124,7 @@ def _read_rules(world: OsmMap) -> dict[str, Rule]:
             # German sign 274 carries its number: de274-60
             numbers = [kind.rpartition("-")[2] for kind in kinds if "274-" in kind]
             texts = [text.rpartition("274-")[2], *numbers]
-        own = [ends(name) for name in members(element, "ref_line", "way")]
+        own = dict.fromkeys(map(ends, members(element, "ref_line", "way")))
         lines = [line_of(world, nodes) for nodes in own if nodes]
         rules[key] = Rule(
             subtype=subtype,
@@ -192,4 +192,4 @@ def stop_of(
     if not len(lines):
         return None, False
     apart = np.hypot(*(lines.mean(axis=1) - ends.mean(axis=0)).T)
-    return lines[np.argmin(apart)], sign
+    return lines[np.argmin(apart)].copy(), sign  # a view would keep all of them
