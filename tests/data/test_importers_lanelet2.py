@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rcirl_jax.data.importers import lanelet2_rules, safe_xml
+from rcirl_jax.data.importers import lanelet2, lanelet2_rules, safe_xml
 from rcirl_jax.data.importers.lanelet2 import read_lanelet2
 from rcirl_jax.data.importers.lanelet2_rules import members
 from rcirl_jax.data.importers.projection import utm, utm_zone
@@ -292,3 +292,18 @@ def test_too_large_a_file(tmp_path, monkeypatch):
     monkeypatch.setattr(safe_xml, "MAX_FILE_BYTES", 100)
     with pytest.raises(InputError, match="size"):
         read(metres(tmp_path))
+
+
+def test_nodes_and_ways_of_bounds_are_limited(tmp_path, monkeypatch):
+    """Few bytes make many lanelets of one way, or one bound of many ways."""
+    bounds = (["path_north"] * 3, ["path_south"], osm.ROAD, [])
+    path = metres(tmp_path, lanelets={"1": bounds, "2": bounds})
+    points = len(osm.WAYS["path_north"]) + len(osm.WAYS["path_south"])
+    monkeypatch.setattr(lanelet2, "MAX_NODES", 2 * points)
+    assert set(read(path)[0]) == {"1", "2"}
+    monkeypatch.setattr(lanelet2, "MAX_NODES", 2 * points - 1)
+    with pytest.raises(InputError, match=f"lanelet 2: {2 * points} nodes"):
+        read(path)
+    monkeypatch.setattr(lanelet2_rules, "MAX_WAYS", 2)
+    with pytest.raises(InputError, match="3 ways: expected up to 2"):
+        read(path)

@@ -43,6 +43,7 @@ MIN_STEP_M = 0.25  # m between points of a lane
 SAME_PLACE_M = 1e-3  # m, end points that near are one
 MAX_LATITUDE = 84.0  # degrees, UTM ends there
 MAX_COORDINATE_M = 1e8  # m, farther is no place on earth
+MAX_NODES = 5_000_000  # of all bounds; 2500 km of lanes, a point a metre
 BACKWARDS = "-back"  # appended to the id of a two-way lanelet's other direction
 
 
@@ -80,12 +81,18 @@ def read_lanelet2(path: Path, project: Projection) -> tuple[tuple[Lane, ...], li
     }
     points = _positions(path, found["node"], project)
     world = OsmMap(path, points, found["way"], found["relation"])
-    lanelets, broken = [], 0
+    lanelets, broken, nodes = [], 0, 0
     for name, relation in world.relations.items():
         if tag_of(relation, "type") == "lanelet" and _for_vehicles(relation):
             directions = list(_lanelets(world, name, relation))
             lanelets += directions
             broken += not directions
+            nodes += sum(len(one.left) + len(one.right) for one in directions)
+            if nodes > MAX_NODES:
+                raise InputError(
+                    f"{path}: lanelet {name[:40]}: {nodes} nodes up to it: "
+                    f"expected up to {MAX_NODES}"
+                )
     if not lanelets:
         raise InputError(f"{path}: lanelet: none for vehicles: expected a road map")
     notes = [f"{broken} lanelets without two bounds left out"] if broken else []

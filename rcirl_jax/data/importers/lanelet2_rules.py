@@ -8,9 +8,11 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from rcirl_jax.errors import InputError
 from rcirl_jax.units import MPH_MPS
 
 STOP_SIGNS = ("us_r1_1", "usr1-1", "r1-1", "de206", "206", "stop")
+MAX_WAYS = 1000  # of one bound; maps have a few
 SPEED_UNITS = {
     "": 1.0 / 3.6,  # Lanelet2: no unit means km/h
     "km/h": 1.0 / 3.6,
@@ -67,8 +69,13 @@ def members(element: Element, role: str, kind: str) -> list[str]:
 
 def bound(world: OsmMap, names: list[str]) -> tuple[str, ...]:
     """Nodes of a bound; its ways joined where they share an end. () if broken."""
+    if len(names) > MAX_WAYS:
+        raise InputError(
+            f"{world.path}: bound with way {names[0][:40]}: {len(names)} ways: "
+            f"expected up to {MAX_WAYS}"
+        )
     parts = []
-    for name in names:
+    for name in dict.fromkeys(names):
         way = world.ways.get(name)
         nodes = [] if way is None else [n.get("ref", "") for n in way.iterfind("nd")]
         if len(nodes) < 2 or not all(node in world.points for node in nodes):
