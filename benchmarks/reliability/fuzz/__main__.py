@@ -7,6 +7,7 @@ and may open, write and start nothing outside its folder. It has to return, or t
 `InputError` of one line that names the file. With the extra [fuzz] (atheris) coverage
 of our code guides the inputs, else they are drawn at random. Most are made inside of
 their form: checksums, lengths and compression are right, what they hold is not.
+`--copies=3000` puts one piece (row, element, field, item) so often into a file.
 
 Writes fuzz.json, a row per reader, and under OUTPUT/crashes the inputs that broke a
 promise; one of these makes the exit status 1. `unforeseen` counts the lines by which
@@ -42,6 +43,7 @@ _INPUTS = flags.DEFINE_integer("inputs", 1_000_000, "over all readers", 1)
 _READERS = flags.DEFINE_list("readers", ["all"], "which of them")
 _SECONDS = flags.DEFINE_integer("seconds", 3600, "at most so long a reader", 1)
 _SEED = flags.DEFINE_integer("seed", 0, "of the inputs")
+_COPIES = flags.DEFINE_integer("copies", 0, "most of one piece; 0: a few, guided", 0)
 _OUTPUT = flags.DEFINE_string("output", "benchmarks/results", "folder of the JSON")
 MOST_DEATHS = 20  # of a reader's processes
 SLACK_S = 60.0  # s for seeds, on top of what a reader is given
@@ -97,16 +99,17 @@ def _child(name: str, folder: Path, inputs: int, seconds: int) -> None:
     with (folder / "said.txt").open("w") as file:
         for stream in (1, 2):
             os.dup2(file.fileno(), stream)
-    child.fuzz(name, folder, inputs, seconds, _SEED.value)
+    child.fuzz(name, folder, inputs, seconds, _SEED.value, _COPIES.value)
 
 
 def fuzzed(name: str, inputs: int, seconds: int, output: Path) -> Row:
     """All inputs of a reader; a process that dies is followed by another."""
+    guided = child.has_atheris() and not _COPIES.value
     row = Row(
         reader=name,
-        mutator="atheris, by form" if child.has_atheris() else "at random, by form",
+        mutator=f"{'atheris' if guided else 'at random'}, by form",
         command=f"python -m {child.PACKAGE} --readers={name} --inputs={inputs} "
-        f"--seed={_SEED.value}",
+        f"--seed={_SEED.value} --copies={_COPIES.value}",
     )
     begin = time.monotonic()
     place = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None

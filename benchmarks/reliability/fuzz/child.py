@@ -69,6 +69,8 @@ class Session:
                 if place not in self._unforeseen:
                     self._keep(data, "unforeseen", place, line)
                 self._unforeseen[place] = self._unforeseen.get(place, 0) + 1
+        if breach is None and spent > MAX_S:
+            breach = self._contract.Breach("too long", f"{spent:.0f} s")
         if breach is not None and breach.kind not in self._known:
             self._known.add(breach.kind)
             self._keep(data, "breach", breach.kind, breach.text)
@@ -186,15 +188,22 @@ def instrumented() -> Iterator[None]:
             importlib.import_module(f"{importers.__name__}.{module}")
 
 
-def fuzz(name: str, folder: Path, inputs: int, seconds: int, seed: int) -> None:
-    """Fuzz one reader in this process; it may not return."""
+def fuzz(
+    name: str, folder: Path, inputs: int, seconds: int, seed: int, copies: int
+) -> None:
+    """Fuzz one reader in this process; it may not return.
+
+    With more copies of a piece than usual, files get too long for a guided search.
+    """
+    trees = importlib.import_module(f"{PACKAGE}.trees")
+    usual, trees.COPIES = trees.COPIES, copies or trees.COPIES
     session = Session(name, folder, seed)
     for index, content in enumerate(session.target.seeds):
         session.run(bytes([index]) + content)
     gc.collect()
     gc.freeze()  # what the imports made is never looked through again
     limit_memory()
-    if has_atheris():
+    if has_atheris() and usual >= trees.COPIES:
         limits = [f"-runs={inputs}", f"-max_total_time={seconds}", f"-seed={seed}"]
         guided(session, folder, limits)
     else:

@@ -24,6 +24,7 @@ from defusedxml import ElementTree
 from benchmarks.reliability.fuzz import containers
 from benchmarks.reliability.fuzz.trees import (
     TEXTS,
+    copies,
     mutate_bytes,
     mutate_text,
     mutate_tree,
@@ -34,6 +35,7 @@ from rcirl_jax.data.importers.tfrecord import FOOTER, FRAME_BYTES, HEADER, mask
 from rcirl_jax.data.importers.wire import FIXED32, FIXED64, LENGTH, VARINT, fields
 
 Codec = Callable[[bytes, random.Random], bytes]
+HUGE = "0x" + "f" * 4000  # Python reads it, and writes no decimal of so many digits
 MAX_NESTED = 12  # levels of messages that are gone into
 CELLS = (
     *("", " ", "0", "-1", "1e300", "-1e300", "1e12", "NaN", "inf", "-inf", "1e-320"),
@@ -52,7 +54,7 @@ def json_lines(data: bytes, rng: random.Random) -> bytes:
     lines = data.split(b"\n")
     at = rng.randrange(len(lines))
     if rng.random() < 0.1:
-        lines.insert(at, rng.choice(lines))
+        lines[at:at] = [rng.choice(lines)] * copies(rng)
     else:
         lines[at] = json_file(lines[at], rng)
     return b"\n".join(lines)
@@ -80,7 +82,10 @@ def resealed(payload: dict, field: str) -> bytes:
 
 def toml_file(data: bytes, rng: random.Random) -> bytes:
     """TOML: the tree of values."""
-    return toml_text(mutate_tree(json.loads(_toml_as_json(data)), rng)).encode()
+    text = toml_text(mutate_tree(json.loads(_toml_as_json(data)), rng))
+    if rng.random() < 0.02:
+        text = re.sub(r"(?<== )[0-9.]+", HUGE, text, count=1)
+    return text.encode()
 
 
 @functools.lru_cache(maxsize=512)
@@ -95,7 +100,7 @@ def toml_text(tree: dict) -> str:
 
 def _key(key: object) -> str:
     text = str(key)
-    return text if re.fullmatch(r"[A-Za-z0-9_-]+", text) else json.dumps(text)
+    return text if re.fullmatch(r"[A-Za-z0-9_.-]+", text) else json.dumps(text)
 
 
 def _toml(value: Any) -> str:  # noqa: ANN401
@@ -132,7 +137,7 @@ def _change_element(node: Element, nodes: list[Element], rng: random.Random) -> 
     elif kind == 3 and len(node):
         node.remove(rng.choice(list(node)))
     elif kind == 4 and len(node):
-        node.extend([rng.choice(list(node))] * rng.choice((1, 2, 10)))
+        node.extend([rng.choice(list(node))] * copies(rng))
     elif kind == 5:
         other = rng.choice(nodes)
         node.tag, node.text, node.attrib = other.tag, other.text, dict(other.attrib)
@@ -165,7 +170,7 @@ def _change_rows(rows: list[str], separator: str, rng: random.Random) -> list[st
     if kind == 4:
         return rows[:at] + rows[at + rng.choice((1, 5, 50)) :]
     if kind == 5:
-        return [*rows[:at], *[rows[at]] * rng.choice((1, 2, 20)), *rows[at:]]
+        return [*rows[:at], *[rows[at]] * copies(rng), *rows[at:]]
     if kind == 6:
         head, rest = rows[:1], rows[1:]
         rng.shuffle(rest)
@@ -233,7 +238,7 @@ def message(data: bytes, rng: random.Random, depth: int = 0) -> bytes:
     if kind == 0:
         del parts[at]
     elif kind == 1:
-        parts[at:at] = [parts[at]] * rng.choice((1, 2, 40))
+        parts[at:at] = [parts[at]] * copies(rng)
     elif kind == 2:
         parts[at] = (rng.choice((number + 1, 1, 2, 3, 2**20)), wire, value)
     elif kind == 3:
@@ -277,7 +282,8 @@ def tfrecord(data: bytes, rng: random.Random) -> bytes:
         at += FRAME_BYTES + size
     which = rng.randrange(len(records))
     if rng.random() < 0.1:
-        records[which:which] = rng.choice((records, [b""], [b"\0" * 9]))
+        odd = rng.choice((records, [b""], [b"\0" * 9], [records[which]] * copies(rng)))
+        records[which:which] = odd
     else:
         records[which] = message(records[which], rng)
     return b"".join(map(_framed, records))
@@ -299,7 +305,7 @@ def cyber(data: bytes, rng: random.Random) -> bytes:
     which = rng.randrange(len(sections))
     kind, body = sections[which]
     if rng.random() < 0.1:
-        sections[which] = rng.choice(sections)
+        sections[which:which] = [rng.choice(sections)] * copies(rng)
     else:
         sections[which] = (rng.choice((kind,) * 9 + (1, 2, 4)), message(body, rng))
     return head + b"".join(struct.pack("<i4xq", k, len(b)) + b for k, b in sections)

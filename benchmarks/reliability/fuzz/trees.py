@@ -14,6 +14,7 @@ TEXTS = (
     *("", " ", "a", "0", "-1", "1e999", "nan", "inf", "true", "null", "NULL"),
     *("../../../etc/passwd", "/etc/passwd", "..", ".", "a/b", "C:\\x", "~", "file:///"),
     *("a\0b", "\x1b[31mred", "two\nlines", "\u2028", "\ud800", "\u00e9\u4e2d", "'\"`;"),
+    *("a/" * 3000, "a." * 3000 + "a"),
     *("$(touch x)", "%s%n", "{0.__class__}", "__class__", "x" * 5000, "9" * 5000),
 )
 BYTES = (
@@ -22,6 +23,7 @@ BYTES = (
     *(b"{", b"\0\0\0\0\0\0\xf8\x7f", b"\0\0\0\0\0\0\xf0\x7f", b"\0\0\xc0\x7f"),
     *(b"\xff" * 9 + b"\x01", b"\x80" * 10, b"GP", b"SQLite format 3\0"),
 )
+COPIES = 20  # most of one piece, in its place
 MAX_DEEP = 900  # levels put around a value; writers of more recurse too deeply
 
 
@@ -33,6 +35,11 @@ def odd_scalar(rng: random.Random) -> Any:  # noqa: ANN401 - that is the point
     if kind < 6:
         return rng.choice(TEXTS)
     return rng.choice((None, True, False, [], {}, [[]], {"": {}}, [None]))
+
+
+def copies(rng: random.Random) -> int:
+    """How often a piece is put in once more."""
+    return rng.choice((1, 1, 2, COPIES))
 
 
 def near(value: Any, rng: random.Random) -> Any:  # noqa: ANN401
@@ -119,7 +126,7 @@ def _remove(rng: random.Random, node: Any, key: Any) -> None:  # noqa: ANN401
 
 def _double(rng: random.Random, node: Any, key: Any) -> None:  # noqa: ANN401
     if isinstance(node, list):
-        node[key:key] = [node[key]] * rng.choice((1, 1, 2, 20))
+        node[key:key] = [node[key]] * copies(rng)
     else:
         node[rng.choice(TEXTS)] = node[key]
 
