@@ -351,6 +351,14 @@ def test_header_met_twice_and_garbage(tmp_path):
             read(tmp_path / "log.csv", source)
 
 
+def test_more_columns_than_logs_have(tmp_path):
+    names = ",".join(f"c{number}" for number in range(10_001))
+    (tmp_path / "log.csv").write_text(f"{names}\n1\n")
+    source = w.csv_spec(tmp_path / "s.toml")
+    with pytest.raises(InputError, match=r"header: 10001 columns: expected up to"):
+        read(tmp_path, source)
+
+
 @pytest.mark.parametrize("name", ["commonroad", "csv", "ngsim"])
 def test_empty_folder_and_missing_path(tmp_path, name):
     for path in (tmp_path, tmp_path / "nowhere"):

@@ -1,5 +1,6 @@
 """Tables of text: read, check, convert; shared by the NGSIM and CSV importers."""
 
+import collections
 import csv
 import dataclasses
 import math
@@ -17,6 +18,7 @@ from rcirl_jax.types import Lane
 from rcirl_jax.units import FOOT_M, MPH_MPS
 
 TEXT_CHARS = 64  # characters kept of a text cell
+MAX_COLUMNS = 10_000  # of a table; logs have some dozens
 UNITS = {
     "m": 1.0,
     "ft": FOOT_M,
@@ -51,7 +53,7 @@ class StraightLane:
 
 
 def read_header(path: Path) -> list[str]:
-    """Column names of a comma-separated file: not empty, each met once."""
+    """Column names of a comma-separated file: not empty or too many, each once."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as handle:
             header = [name.strip() for name in next(csv.reader(handle), [])]
@@ -59,8 +61,12 @@ def read_header(path: Path) -> list[str]:
         raise InputError(f"{path}: header: {error}: expected CSV text") from error
     if not any(header):
         raise InputError(f"{path}: header: empty: expected column names and rows")
-    for name in header:
-        if header.count(name) > 1:
+    if len(header) > MAX_COLUMNS:
+        raise InputError(
+            f"{path}: header: {len(header)} columns: expected up to {MAX_COLUMNS}"
+        )
+    for name, count in collections.Counter(header).items():
+        if count > 1:
             raise InputError(f"{path}: column {name}: met twice: expected once")
     return header
 
