@@ -220,6 +220,14 @@ def test_names_with_a_hash_and_padded_headers_are_read(tmp_path):
     assert {track.id for track in made.tracks} == {"c#0", "c#1", "c#2"}
 
 
+def test_a_text_that_is_too_long_is_one_line(tmp_path):
+    path = tmp_path / "log.csv"
+    rows = rows_of(seconds=10.0, cars=2)
+    spec = {**write(path, rows, f"10.0,{'c' * 65},0,0\n"), "long_bytes": 1}
+    with pytest.raises(InputError, match=r"id: 'c{40}\.\.\.': 65 characters: expected"):
+        cuts(path, spec)
+
+
 def test_a_wrong_limit_is_one_line(tmp_path):
     path = tmp_path / "log.csv"
     spec = {**write(path, rows_of(seconds=30.0, cars=3)), "long_bytes": "256MB"}

@@ -27,7 +27,12 @@ import numpy as np
 
 from rcirl_jax.data.importers.reading import reading
 from rcirl_jax.data.importers.scratch import scratch
-from rcirl_jax.data.importers.tables import check_cells, number, read_header
+from rcirl_jax.data.importers.tables import (
+    TEXT_CHARS,
+    check_cells,
+    number,
+    read_header,
+)
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Recording, Track
 
@@ -194,6 +199,12 @@ def _column(path: Path, batch: Any, field: Field, start: int) -> Any:  # noqa: A
     if field.text:
         coded = found.dictionary_encode()
         names = [name.rstrip("\0 \t").strip() for name in coded.dictionary.to_pylist()]
+        for name in names:  # a piece holds each text as wide as its longest
+            if len(name) > TEXT_CHARS:
+                raise InputError(
+                    f"{path}: column {field.column}: '{name[:40]}...': "
+                    f"{len(name)} characters: expected up to {TEXT_CHARS}"
+                )
         names = [name.lower() if field.lower else name for name in names]
         return coded.indices.to_numpy(), names
     if str(found.type) == "string":  # with separators between thousands
