@@ -1,11 +1,13 @@
 """The generic CSV importer: mapping, units, lanes, malformed tables."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.importers import csv_lanes, read_recordings
 from rcirl_jax.errors import InputError
 from rcirl_jax.specs import spec_root
 from rcirl_jax.types import Kind
@@ -172,6 +174,19 @@ def test_lanes_along_paths_where_none_are_known(tmp_path):
     recording = only(log(tmp_path, rows, header), source)
     assert sorted(lane.centre[0, 1] for lane in recording.lanes) == [-7.0, -3.5, 0.0]
     assert any("fitted" in note for note in recording.notes)
+
+
+def test_long_paths_are_compared_in_little_memory():
+    """A path beside another one, a lane's width away or nearly so."""
+    x = 5.0 * np.arange(2000)
+    line, beside = (np.stack([x, np.full(x.shape, y)], axis=1) for y in (0.0, 3.5))
+    tracemalloc.start()
+    found = [csv_lanes._near(beside, line, width) for width in (3.5, 3.6)]
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert found == [False, True]
+    assert not csv_lanes._near(beside[::-1], line, 3.6)
+    assert peak < 50 * line.nbytes
 
 
 LANES = """

@@ -4,6 +4,7 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from rcirl_jax.data.importers.options import path_option
 from rcirl_jax.data.importers.tables import (
@@ -170,6 +171,8 @@ def _paths(tracks: tuple[Track, ...], width: float, limit: float) -> tuple[Lane,
 
 def _near(points: np.ndarray, line: np.ndarray, width: float) -> bool:
     """Whether most of a path runs within a lane width of a line, the same way."""
-    apart = np.hypot(*(points[:, None] - line[None]).transpose(2, 0, 1))
     along = (points[-1] - points[0]) @ (line[-1] - line[0])
-    return bool(along > 0.0 and np.median(apart.min(axis=1)) < width)
+    # of places too far for float64 there is no nearest, and no number in range
+    nearest = line.take(KDTree(line).query(points)[1], axis=0, mode="clip")
+    apart = np.hypot(*(points - nearest).T)
+    return bool(along > 0.0 and np.median(apart) < width)
