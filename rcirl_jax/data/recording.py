@@ -19,6 +19,7 @@ from rcirl_jax.whole import is_text
 # keys that an import adds to a spec
 LEAVE_OUT = "leave_out"  # refused recordings are left out
 PIECE = "piece"  # (first, last) scene of a part that is read in pieces
+MAX_RATE_HZ = 1000.0  # 1/s, of the clock
 MAX_SPEED_MPS = 90.0  # m/s, faster than any road user
 LENGTH_RANGE_M = (0.2, 40.0)  # m
 WIDTH_RANGE_M = (0.2, 6.0)  # m
@@ -98,6 +99,10 @@ def validate_recording(
     name = str(file or recording.name)
     if not (np.isfinite(recording.rate_hz) and recording.rate_hz > 0.0):
         raise InputError(f"{name}: rate_hz: {recording.rate_hz}: expected > 0")
+    if recording.rate_hz > MAX_RATE_HZ:
+        raise InputError(
+            f"{name}: rate_hz: {recording.rate_hz:g}: expected up to {MAX_RATE_HZ:g}"
+        )
     if not recording.tracks:
         raise InputError(f"{name}: tracks: none: expected at least one road user")
     _check_texts(name, recording)

@@ -468,6 +468,12 @@ def test_a_clock_that_would_fill_the_memory(tmp_path):
     source.write_text("rate_hz = 1e9")
     line = line_of(lambda: list(read_recordings("apollo", place, source)))
     assert "rate_hz: 1e+09: expected at most 1000" in line
+    rows = "".join(f"{k * 1e-5:.5f},a,{k * 1e-4:.4f},0\n" for k in range(200))
+    (tmp_path / "log.csv").write_text(f"t,id,x,y\n{rows}")
+    columns = "\n".join(f'{name} = "{name}"' for name in ("t", "id", "x", "y"))
+    source.write_text(f"rate_hz = 1e5\n[columns]\n{columns}\n")
+    line = line_of(lambda: list(read_recordings("csv", tmp_path, source)))
+    assert "rate_hz: 100000: expected up to 1000" in line
 
 
 def test_an_integer_beyond_any_float(tmp_path):

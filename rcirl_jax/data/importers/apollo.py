@@ -48,12 +48,11 @@ from rcirl_jax.data.importers.shapes import (
     origin_notes,
 )
 from rcirl_jax.data.importers.tables import number, spans_of
-from rcirl_jax.data.recording import validate_recording
+from rcirl_jax.data.recording import MAX_RATE_HZ, validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Recording, Track
 
 RATE_HZ = 10.0  # 1/s
-MAX_RATE_HZ = 1000.0  # 1/s, of the clock
 MAX_GAP_S = 0.55  # s without a message inside one track
 LATE_S = 2.0  # s, messages of one time are recorded within it
 LIMIT_MPS = 29.06  # m/s, 65 mph
