@@ -207,6 +207,14 @@ def check_span(where: str, field: str, values: np.ndarray) -> None:
     )
 
 
+def check_lanes_length(where: str, total: float) -> None:
+    """Lanes of `total` m together are no longer than roads are."""
+    if total > MAX_LANES_M:
+        raise InputError(
+            f"{where}: lanes: {total:g} m long in all: expected up to {MAX_LANES_M:g} m"
+        )
+
+
 def _check_places(name: str, recording: Recording) -> None:
     """Tracks and lanes lie near each other, and lanes are no longer than roads are."""
     for place, axis in enumerate(("x", "y")):
@@ -218,10 +226,7 @@ def _check_places(name: str, recording: Recording) -> None:
         float(np.hypot(*np.diff(lane.centre, axis=0).T).sum())
         for lane in recording.lanes
     )
-    if total > MAX_LANES_M:
-        raise InputError(
-            f"{name}: lanes: {total:g} m long in all: expected up to {MAX_LANES_M:g} m"
-        )
+    check_lanes_length(name, total)
 
 
 def _check_rate(name: str, recording: Recording) -> None:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rcirl_jax.data.importers import csv_lanes, read_recordings
+from rcirl_jax.data.importers import csv_lanes, read_recordings, tables
 from rcirl_jax.errors import InputError
 from rcirl_jax.specs import spec_root
 from rcirl_jax.types import Kind
@@ -165,6 +165,17 @@ def test_oncoming_lanes_run_the_other_way(tmp_path):
     assert (first.left, first.right, second.left) == (None, None, None)
     # bounds of lanes that are not neighbours lie half a lane out
     assert first.left_width[0] == pytest.approx(1.75)
+
+
+def test_straight_lanes_longer_than_roads_are_not_made(tmp_path):
+    found = [
+        tables.StraightLane(id=f"{k}", y=4.0 * k, lower=0.0, upper=9.9e5)
+        for k in range(11)
+    ]
+    lanes = tables.straight_lanes(tmp_path, found[:1], 4.0, None)
+    assert len(lanes[0].centre) > 1e5
+    with pytest.raises(InputError, match=r"lanes: 1\.089e\+07 m long in all: expected"):
+        tables.straight_lanes(tmp_path, found, 4.0, None)
 
 
 def test_lanes_along_paths_where_none_are_known(tmp_path):

@@ -8,6 +8,7 @@ import pytest
 from rcirl_jax.data.collect import Collector
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.importers.levelx_lanes import marked_lanes
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind
 from tests.data.formats import levelx as ind
@@ -128,6 +129,15 @@ def test_many_markings_are_read_in_full(motorway):
     marks = ";".join(f"{8.51 + 0.7 * k:.9f}" for k in range(11))
     edit(motorway / "01_recordingMeta.csv", "8.51;12.59;16.43", marks)
     assert len(only(motorway).lanes) == 12
+
+
+def test_marked_lanes_longer_than_roads_are_not_made(tmp_path):
+    marks = [";".join(f"{4 * k}" for k in range(a, a + 7)) for a in (0, 7)]
+    meta = {"upperLaneMarkings": marks[0], "lowerLaneMarkings": marks[1]}
+    rows = (np.zeros(1), np.ones(1))
+    assert len(marked_lanes(tmp_path, meta, (0.0, 400.0), None, rows)) == 12
+    with pytest.raises(InputError, match=r"lanes: 1\.18812e\+07 m long in all"):
+        marked_lanes(tmp_path, meta, (0.0, 9.9e5), None, rows)
 
 
 # -------------------------------------------------------------- inD and sisters

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.importers.options import path_option
+from rcirl_jax.data.recording import check_lanes_length
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane
 
@@ -32,6 +33,8 @@ def marked_lanes(
         driven the way its rows are.
     """
     sides = [_markings(path, meta, f"{side}LaneMarkings") for side in SIDES]
+    count = sum(marks.size - 1 for marks in sides)
+    check_lanes_length(str(path), count * (along[1] - along[0] + 2.0 * MARGIN_M))
     lanes: list[Lane] = []
     number = 1  # lane 1 lies above the first marking
     for side, marks in zip(SIDES, sides, strict=True):

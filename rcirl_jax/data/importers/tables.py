@@ -12,7 +12,7 @@ from typing import NoReturn
 
 import numpy as np
 
-from rcirl_jax.data.recording import check_span
+from rcirl_jax.data.recording import check_lanes_length, check_span
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane
 from rcirl_jax.units import FOOT_M, MPH_MPS
@@ -330,10 +330,12 @@ def straight_lanes(
     Lanes are neighbours if they are driven the same way and no more than
     `NEIGHBOUR_WIDTHS` lane widths apart; outer bounds lie half a width out.
     """
-    lanes = []
     for lane in found:
         ends = np.array([lane.lower, lane.upper])
         check_span(f"{path}: lane {lane.id}", "position along the road", ends)
+    check_lanes_length(str(path), sum(lane.upper - lane.lower for lane in found))
+    lanes = []
+    for lane in found:
         above = _beside(lane, found, width, +1.0)
         below = _beside(lane, found, width, -1.0)
         up = 0.5 * width if above is None else 0.5 * (above.y - lane.y)
