@@ -111,7 +111,13 @@ class Stages:
                         f"{self.folder / FILE}: {name}: {file}: expected a file of"
                         " the run's folder"
                     )
-                path.unlink(missing_ok=True)
+                try:
+                    path.unlink(missing_ok=True)
+                except OSError as error:
+                    raise InputError(
+                        f"{self.folder / FILE}: {name}: {file}: {error.strerror}:"
+                        " expected a file of the run's folder"
+                    ) from error
         kept = {name: record for name, record in known.items() if name not in names}
         if kept != known:
             self._write(kept)

@@ -88,6 +88,16 @@ def test_nothing_outside_the_folder_is_removed(stages):
     assert outside.read_text() == "precious"
 
 
+@pytest.mark.parametrize("name", ["one.txt/x", "a" * 300, "folder"])
+def test_outputs_that_no_stage_makes_are_one_line(stages, name):
+    step(stages, "a", {}, "one")
+    (stages.folder / "folder").mkdir()
+    text = (stages.folder / FILE).read_text().replace("one.txt", name)
+    (stages.folder / FILE).write_text(text)
+    with pytest.raises(InputError, match=rf"{FILE}: one: {name}: .*: expected a file"):
+        stages.run("two", {}, [], lambda: None, stale=["one"])
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
