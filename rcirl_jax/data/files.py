@@ -58,8 +58,18 @@ class Files:
             ) from error
 
     def list_keys(self) -> list[str]:
-        """All keys below the dataset, but for the lock of who writes it."""
-        found = [key.decode() for key in self.wait(self.kv.list(), "")]
+        """All keys below the dataset, but for the lock of who writes it.
+
+        Raises:
+          InputError: one is no text.
+        """
+        keys = self.wait(self.kv.list(), "")
+        try:
+            found = [key.decode() for key in keys]
+        except UnicodeDecodeError as error:
+            raise InputError(
+                f"{self.name}: holds {error.object!r}: expected names in UTF-8"
+            ) from error
         return [key for key in found if key != LOCK]
 
     def read_many(self, keys: Iterable[str]) -> Iterable[tuple[str, bytes | None]]:

@@ -1,5 +1,6 @@
 import hashlib
 import json
+import os
 import shutil
 import tarfile
 import tracemalloc
@@ -551,6 +552,13 @@ def test_folders_with_other_files_are_refused(tmp_path, overwrite, name):
     with pytest.raises(InputError, match=f"holds {name}, not a dataset"):
         DatasetWriter(tmp_path, overwrite=overwrite)
     assert path.read_text() == "precious"
+
+
+@pytest.mark.parametrize("use", [open_dataset, DatasetWriter])
+def test_a_name_that_is_no_text_is_one_line(tmp_path, use):
+    (tmp_path / os.fsdecode(b"caf\xe9.txt")).touch()
+    with pytest.raises(InputError, match=rf"^{tmp_path}: holds b'caf.*expected names"):
+        use(tmp_path)
 
 
 def test_a_file_is_no_place_for_a_dataset(tmp_path):
