@@ -15,6 +15,8 @@ import tqdm
 from rcirl_jax.errors import InputError
 from rcirl_jax.whole import named, parse_json, write_whole
 
+MAX_STEP = 2**63 - 1  # what 64 bits hold
+
 
 class MetricsWriter:
     """Appends one JSON object a line to metrics.jsonl, and to TensorBoard.
@@ -68,7 +70,8 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
     for line in text.splitlines():
         with contextlib.suppress(ValueError):
             found = parse_json(line)
-            if isinstance(found, dict) and type(found.get("step")) is int:
+            step = found.get("step") if isinstance(found, dict) else None
+            if type(step) is int and abs(step) <= MAX_STEP:
                 rows.append({k: v for k, v in found.items() if _is_number(v)})
     return rows
 

@@ -14,6 +14,7 @@ WHOLE = {"loss": 0.5, "pair_accuracy": 0.75, "pairs": 4.0, "queries_per_s": 1.0}
 DAMAGED = (
     '{"step": 2, "loss": 0.', "[1]", "3", '{"loss": 1.0}', '{"step": "2"}',
     '{"step": Infinity}', '{"step": true}', "[" * 100_000, "\ufffd", "",
+    '{"step": 1' + "0" * 400 + "}",
     '{"step": 2, "\\ud800": 1.0}',
 )  # fmt: skip
 
