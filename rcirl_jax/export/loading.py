@@ -10,7 +10,7 @@ import numpy as np
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.provenance import check_provenance
 from rcirl_jax.export.reader import Reward, WeightsError, load_weights
-from rcirl_jax.features import feature_map
+from rcirl_jax.features.mapping import feature_map, known_presets
 from rcirl_jax.reward.network import LEAKY_SLOPE, conditioned, point_rewards
 from rcirl_jax.reward.normaliser import normalise
 from rcirl_jax.sampling import SamplerConfig
@@ -28,7 +28,13 @@ def open_reward(path: str) -> Reward:
     """
     try:
         reward = load_weights(path)
-        features = feature_map(str(reward.preset))
+        known = known_presets()
+        if reward.preset not in known:
+            raise InputError(
+                f"{reward.file}: preset: {reward.preset}: "
+                f"expected one of {', '.join(known)}"
+            )
+        features = feature_map(reward.preset)
         reward.check_features(features.names, [s.unit for s in features.specs])
     except WeightsError as error:
         raise InputError(str(error)) from error

@@ -86,6 +86,11 @@ class FeatureMap:
         return tuple(COLUMNS[spec.name](frames) for spec in self.specs)
 
 
+def known_presets() -> list[str]:
+    """Names of the feature maps declared in data_specs/features."""
+    return sorted(item.stem for item in (spec_root() / "features").glob("*.toml"))
+
+
 @functools.cache
 def feature_map(preset: str) -> FeatureMap:
     """The feature map declared in data_specs/features/<preset>.toml.
@@ -93,10 +98,10 @@ def feature_map(preset: str) -> FeatureMap:
     Raises:
       InputError: no such preset, an unknown column, or a value out of order.
     """
-    path = spec_root() / "features" / f"{preset}.toml"
-    if not path.is_file():
-        known = sorted(item.stem for item in path.parent.glob("*.toml"))
+    known = known_presets()
+    if preset not in known:
         raise InputError(f"--features: {preset}: expected one of {', '.join(known)}")
+    path = spec_root() / "features" / f"{preset}.toml"
     table = load_toml(path)
     rows, safety = table.get("feature", []), table.get("safety", {})
     _check_tables(path, rows, safety)

@@ -1,8 +1,11 @@
 """What a file says of its making may be anything: it is checked before it is used."""
 
+import dataclasses
+
 import pytest
 
 from rcirl_jax.errors import InputError
+from rcirl_jax.export import pack
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.provenance import dataset_names
 from tests import weights_files
@@ -28,6 +31,17 @@ def test_entries_of_other_types_are_one_line(tmp_path, monkeypatch, name, value)
     path = with_provenance(tmp_path, monkeypatch, **{name: value})
     with pytest.raises(
         InputError, match=rf"w\.msgpack: provenance\.{name}: .*expected"
+    ):
+        open_reward(str(path))
+
+
+@pytest.mark.parametrize("preset", ["nope", "../../sources/csv", "/etc/hosts"])
+def test_features_that_no_package_has(tmp_path, preset):
+    made = dataclasses.replace(weights_files.example_weights(), preset=preset)
+    path = tmp_path / "w.msgpack"
+    path.write_bytes(pack(made, *weights_files.example_samples(made)))
+    with pytest.raises(
+        InputError, match=rf"w\.msgpack: preset: {preset}: expected one of apollo21, "
     ):
         open_reward(str(path))
 
