@@ -19,13 +19,19 @@ def shard_key(index: int) -> str:
     return f"{SHARDS}{index:05d}/"
 
 
+def layout(shape: tuple[int, ...]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Shapes of an array's blocks of rows, and of the storage chunk they fill."""
+    rows = min(max(shape[0], 1), BLOCK_ROWS)
+    return (rows, *shape[1:]), (-(-shape[0] // rows) * rows, *shape[1:])
+
+
 def _metadata(shape: tuple[int, ...], dtype: np.dtype) -> dict:
     """zarr3 metadata: one storage chunk per array, cut into blocks of rows."""
-    rows, rest = min(shape[0], BLOCK_ROWS), list(shape[1:])
+    block, chunk = map(list, layout(shape))
     plain = {"name": "bytes", "configuration": {"endian": "little"}}
     zstd = {"level": ZSTD_LEVEL, "checksum": False}  # crc32c checks already
     sharding = {
-        "chunk_shape": [rows, *rest],
+        "chunk_shape": block,
         "codecs": [
             plain if dtype.itemsize > 1 else {"name": "bytes"},
             {"name": "zstd", "configuration": zstd},
@@ -33,7 +39,6 @@ def _metadata(shape: tuple[int, ...], dtype: np.dtype) -> dict:
         ],
         "index_codecs": [plain, {"name": "crc32c"}],
     }
-    chunk = [-(-shape[0] // rows) * rows, *rest]
     return {
         "shape": list(shape),
         "data_type": dtype.name,

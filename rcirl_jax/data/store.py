@@ -41,6 +41,7 @@ from rcirl_jax.data.shards import (
     BLOCK_ROWS,
     describe,
     encode,
+    layout,
     shard_info,
     shard_key,
     verify_shard,
@@ -305,6 +306,13 @@ class Dataset:
                 raise InputError(
                     f"{self._files.path(key + name)}: shard {shard}: {found[0]} "
                     f"{found[1]}: expected {expected[0]} {expected[1]}"
+                )
+            grid = array.chunk_layout
+            chunks = (grid.read_chunk.shape, grid.write_chunk.shape)
+            if chunks != layout(array.shape):
+                raise InputError(
+                    f"{self._files.path(key + name)}: shard {shard}: chunks {chunks}: "
+                    f"expected {layout(array.shape)}"
                 )
             arrays[name] = array
         if len(self._open) >= OPEN_SHARDS:

@@ -321,6 +321,20 @@ def test_an_array_of_another_shape_is_named(copy):
         open_dataset(copy, verify=False).load(None)
 
 
+@pytest.mark.parametrize("rows", [(40_000_000, 256), (40_000_000, 40_000_000)])
+def test_an_array_in_other_chunks_is_named(copy, rows):
+    """The blocks of a store are unpacked whole: a huge one would fill the memory."""
+    path = copy / "shards/00001/human.s/zarr.json"
+    meta = json.loads(path.read_text())
+    chunk, block = ([count, *meta["shape"][1:]] for count in rows)
+    chunk[0] -= chunk[0] % block[0]
+    meta["chunk_grid"]["configuration"]["chunk_shape"] = chunk
+    meta["codecs"][0]["configuration"]["chunk_shape"] = block
+    path.write_text(json.dumps(meta))
+    with pytest.raises(InputError, match=r"human.s: shard 1: chunks .*expected \(\(40"):
+        open_dataset(copy, verify=False).indices("train")
+
+
 def reseal(folder, change):
     """Change the manifest and give it the hash that belongs to it."""
     path = folder / "manifest.json"
@@ -328,6 +342,18 @@ def reseal(folder, change):
     del payload["hash"]
     change(payload)
     path.write_bytes(manifest.seal(payload, "hash"))
+
+
+def test_a_shard_without_rows_is_one_line(copy):
+    for path in (copy / "shards/00001").glob("*/zarr.json"):
+        meta = json.loads(path.read_text())
+        meta["shape"][0] = 0
+        path.write_text(json.dumps(meta))
+    reseal(copy, lambda m: m["shards"][1].update(count=0))
+    reseal(copy, lambda m: m.update(count=sum(SIZES) - SIZES[1]))
+    dataset = open_dataset(copy, verify=False)
+    with pytest.raises(InputError, match=r"shard 1: chunks .*expected"):
+        dataset._arrays(1)
 
 
 @pytest.mark.parametrize(
