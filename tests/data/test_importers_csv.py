@@ -367,6 +367,19 @@ def test_unreadable_mapping(tmp_path, text):
         read(log(tmp_path), source)
 
 
+def test_texts_are_whole_or_refused(tmp_path):
+    """Two ids that begin alike are two cars, as in files of any length."""
+    source = w.csv_spec(tmp_path / "s.toml")
+    at = w.CSV_COLUMNS.index("id")
+    for size, ending in ((64, ""), (65, r"id: .*expected up to 64 characters")):
+        rows = [[*x[:at], f"{x[at]:x>{size}}", *x[at + 1 :]] for x in w.csv_rows()]
+        if ending:
+            with pytest.raises(InputError, match=ending):
+                read(log(tmp_path, rows), source)
+        else:
+            assert len(only(log(tmp_path, rows), source).tracks) == 3
+
+
 def test_header_met_twice_and_garbage(tmp_path):
     source = w.csv_spec(tmp_path / "s.toml")
     with pytest.raises(InputError, match="column t: met twice"):

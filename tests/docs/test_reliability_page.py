@@ -62,7 +62,8 @@ def count_of(command):
 @pytest.mark.parametrize(
     ("command", "file", "count"),
     [
-        ("fuzz", "fuzz", lambda x: sum(row["inputs"] for row in x["rows"])),
+        ("fuzz --inputs", "fuzz", lambda x: sum(row["inputs"] for row in x["rows"])),
+        ("fuzz --copies", "fuzz_copies", lambda x: sum(r["inputs"] for r in x["rows"])),
         ("faults", "faults_kill", lambda x: sum(row["count"] for row in x["rows"])),
         ("load --what=suite", "load_suite", lambda x: x["cases"]),
         ("load --what=import", "load_import", lambda x: x["scenes"]),

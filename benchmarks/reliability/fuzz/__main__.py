@@ -9,10 +9,10 @@ of our code guides the inputs, else they are drawn at random. Most are made insi
 their form: checksums, lengths and compression are right, what they hold is not.
 `--copies=3000` puts one piece (row, element, field, item) so often into a file.
 
-Writes fuzz.json, a row per reader, and under OUTPUT/crashes the inputs that broke a
-promise; one of these makes the exit status 1. `unforeseen` counts the lines by which
-the last net of the importers refused an input, and the place in the code that each
-names.
+Writes fuzz.json (fuzz_copies.json with --copies), a row per reader, and under
+OUTPUT/crashes the inputs that broke a promise; one of these makes the exit status 1.
+`unforeseen` counts the lines by which the last net of the importers refused an input,
+and the place in the code that each names.
 """
 
 import contextlib
@@ -169,6 +169,7 @@ def keep(row: Row, folder: Path, output: Path) -> None:
 def main() -> None:
     """Fuzz the readers; exit status 1 if any broke a promise."""
     names, output = chosen(), Path(_OUTPUT.value)
+    result = "fuzz_copies" if _COPIES.value else "fuzz"
     output.mkdir(parents=True, exist_ok=True)
     rows = []
     for name, inputs in shares(names, _INPUTS.value).items():
@@ -182,9 +183,9 @@ def main() -> None:
         )
         for line in row.crashes:
             print(f"  {line}", flush=True)
-        write_json(output / "fuzz.json", {"rows": rows})
+        write_json(output / f"{result}.json", {"rows": rows})
     limits = {"seconds": child.MAX_S, "bytes": child.MAX_BYTES}
-    write("fuzz", {"rows": rows, "limits": limits}, str(output))
+    write(result, {"rows": rows, "limits": limits}, str(output))
     total, broken = (sum(map(count, rows)) for count in (_inputs, _crashes))
     print(f"{total:,} inputs, {broken} crashes")
     if broken:

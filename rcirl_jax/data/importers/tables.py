@@ -17,7 +17,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane
 from rcirl_jax.units import FOOT_M, MPH_MPS
 
-TEXT_CHARS = 64  # characters kept of a text cell
+TEXT_CHARS = 64  # characters of a text cell
 MAX_COLUMNS = 10_000  # of a table; logs have some dozens
 UNITS = {
     "m": 1.0,
@@ -105,7 +105,7 @@ def read_table(
     kinds = ["f8" if name in chosen and name not in text else "U1" for name in header]
     for place, name in enumerate(header):
         if name in chosen and name in text:
-            kinds[place] = f"U{TEXT_CHARS}"
+            kinds[place] = f"U{TEXT_CHARS + 1}"
     names = [f"c{place}" for place in range(len(header))]
     numeric = [name for name in chosen if name not in text]
     try:
@@ -124,9 +124,20 @@ def read_table(
     for name in chosen:
         if name in text:
             table[name] = np.char.strip(table[name])
+            _check_lengths(path, name, table[name])
         elif not np.isfinite(table[name]).all():
             _find_bad_cell(path, header, [name], grouped)
     return table
+
+
+def _check_lengths(path: Path, name: str, texts: np.ndarray) -> None:
+    """Longer ones are not whole: two could be cut to the same."""
+    bad = np.flatnonzero(np.char.str_len(texts) > TEXT_CHARS)
+    if bad.size:
+        raise InputError(
+            f"{path}: row {bad[0] + 1}: column {name}: '{texts[bad[0]][:40]}...': "
+            f"expected up to {TEXT_CHARS} characters"
+        )
 
 
 def is_grouped(path: Path) -> bool:
