@@ -286,16 +286,14 @@ class Dataset:
         if shard in self._open:
             return self._open[shard]
         key, count = shard_key(shard), self.manifest.shards[shard]["count"]
-        specs = {
-            name: {
-                "driver": "zarr3",
-                "kvstore": (self._files.kv / f"{key}{name}/").spec().to_json(),
-            }
-            for name in leaf_specs()
-        }
         futures = {
-            name: ts.open(spec, open=True, context=context())
-            for name, spec in specs.items()
+            name: ts.open(
+                {"driver": "zarr3"},
+                kvstore=self._files.kv / f"{key}{name}/",
+                open=True,
+                context=context(),
+            )
+            for name in leaf_specs()
         }
         arrays = {}
         for name, leaf in leaf_specs().items():

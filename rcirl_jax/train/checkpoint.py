@@ -1,7 +1,8 @@
 """Checkpoints: orbax behind three functions. Nobody else imports orbax.
 
     checkpoints/STEP/              as orbax writes it, under another name until whole
-    checkpoints/STEP/sha256.json   digests of its files; written last, by this module
+    checkpoints/STEP/position.json data position; written by this module, then
+    checkpoints/STEP/sha256.json   digests of all its files
     checkpoints/STEP.damaged/      put aside by a run that went on from an older one
 
 orbax keeps no checksum of the arrays: the digests find what changed on disk.
@@ -29,6 +30,7 @@ from rcirl_jax.whole import read_json, write_json
 
 KEEP_LATEST = 3  # checkpoints kept
 DIGESTS = "sha256.json"
+POSITION = "position.json"
 DAMAGED = ".damaged"
 SEALED = ".sealed"  # in folders whose finished checkpoints all have digests
 PROBE = ".room"
@@ -38,8 +40,8 @@ OVERHEAD_BYTES = 2**17  # of a checkpoint's files besides the arrays
 class Checkpoints:
     """Saves and restores (TrainState, data position) under one folder.
 
-    Saving is asynchronous; the data position travels as the checkpoint's own
-    metadata, so that a resumed run sees the same batches in the same order.
+    Saving is asynchronous; the data position lies beside the state, so that a
+    resumed run sees the same batches in the same order.
 
     `passed_over` has one line for each checkpoint that is newer than the newest
     whole one, which is the one to go on from.
@@ -96,16 +98,15 @@ class Checkpoints:
             self._finish_pending()
             if is_first():
                 _check_room(self._folder, state)
-            response: Any = self._checkpointer.save_async(
-                step, state, force=True, custom_metadata={"position": position}
-            )
-            self._pending = self._thread.submit(self._seal, step, response)
+            response: Any = self._checkpointer.save_async(step, state, force=True)
+            self._pending = self._thread.submit(self._seal, step, response, position)
 
-    def _seal(self, step: int, response: Any) -> None:  # noqa: ANN401
-        """Once the files are complete, note what they are."""
+    def _seal(self, step: int, response: Any, position: dict) -> None:  # noqa: ANN401
+        """Once the files are complete, note the position and what they are."""
         response.result()
         if is_first():
             folder = self._folder / str(step)
+            write_json(folder / POSITION, position)
             found = _digests(folder)
             write_json(folder / DIGESTS, {"files": found, "sha256": digest(found)})
 
@@ -121,7 +122,8 @@ class Checkpoints:
           like: a state of the same structure; only shapes are read.
 
         Raises:
-          InputError: the checkpoint was written with another structure.
+          InputError: the checkpoint was written with another structure, or its
+            position is none.
         """
         step = self._newest
         abstract = jax.tree.map(_abstract, like)
@@ -132,8 +134,16 @@ class Checkpoints:
                 f"{self._folder}: checkpoint {step}: {_first_line(error)}: "
                 "expected the same features, hidden size and optimiser"
             ) from error
-        metadata: Any = self._checkpointer.metadata(step).custom_metadata or {}
-        return state, dict(metadata.get("position", {}))
+        path = self._folder / str(step) / POSITION
+        if not path.exists():  # of a version before; the call costs memory for good
+            metadata: Any = self._checkpointer.metadata(step).custom_metadata or {}
+            return state, dict(metadata.get("position", {}))
+        position = read_json(path, "a data position")
+        if not isinstance(position, dict) or not all(
+            isinstance(number, int) for number in position.values()
+        ):
+            raise InputError(f"{path}: {position}: expected numbers by name")
+        return state, position
 
     def close(self) -> None:
         """Wait for pending saves and release the folder.

@@ -1,7 +1,9 @@
+import gc
 import hashlib
 import json
 import os
 import shutil
+import sys
 import tarfile
 import tracemalloc
 from pathlib import Path
@@ -14,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rcirl_jax.data import files, manifest
-from rcirl_jax.data.rows import row_spec
+from rcirl_jax.data.rows import leaf_specs, row_spec
 from rcirl_jax.data.store import DatasetWriter, open_dataset
 from rcirl_jax.errors import InputError
 from tests import scenes
@@ -660,3 +662,17 @@ def test_what_cannot_be_deleted_is_one_line(tmp_path, monkeypatch):
         OSError, match=r"d/shards: cannot be deleted: PERMISSION_DENIED: no$"
     ):
         place.remove("shards", "shardt")
+
+
+def test_opening_again_and_again_keeps_nothing(tmp_path):
+    """A training over many shards opens their arrays thousands of times."""
+    write(tmp_path / "d")
+    open_dataset(tmp_path / "d")
+    gc.collect()
+    before = sys.getallocatedblocks()
+    for _ in range(10):
+        open_dataset(tmp_path / "d")
+    gc.collect()
+    assert (sys.getallocatedblocks() - before) / 10 < len(
+        leaf_specs()
+    )  # 12 an array before

@@ -1,5 +1,6 @@
 """Checkpoints harmed on disk: found, named, passed over; never half-believed."""
 
+import gc
 import shutil
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from rcirl_jax.train.checkpoint import (
     DAMAGED,
     DIGESTS,
     KEEP_LATEST,
+    POSITION,
     SEALED,
     Checkpoints,
 )
@@ -166,6 +168,42 @@ def test_checkpoints_of_versions_without_digests_are_taken(saved, state, tmp_pat
         (folder / step / DIGESTS).unlink()
     (folder / SEALED).unlink()
     assert restored(folder, state) == (4, 4, [])
+
+
+def test_the_position_of_a_version_before_is_in_what_orbax_notes(state, tmp_path):
+    checkpoints = Checkpoints(tmp_path)
+    noted = {"position": {"epoch": 0, "index": 7}}
+    checkpoints._checkpointer.save(7, at(state, 7), custom_metadata=noted)
+    checkpoints.close()
+    (tmp_path / SEALED).unlink()
+    assert restored(tmp_path, state) == (7, 7, [])
+
+
+@pytest.mark.parametrize("text", ['["epoch"]', '{"epoch": "0"}', "3"])
+def test_a_position_of_no_numbers_is_named(saved, state, tmp_path, text):
+    folder = tmp_path / "c"
+    shutil.copytree(saved, folder)
+    for step in ("2", "3", "4"):
+        (folder / step / DIGESTS).unlink()
+        (folder / step / POSITION).write_text(text)
+    (folder / SEALED).unlink()
+    checkpoints = Checkpoints(folder)
+    with pytest.raises(InputError, match=r"4/position\.json: .*expected numbers"):
+        checkpoints.restore(state)
+    checkpoints.close()
+
+
+def test_restoring_again_and_again_keeps_little(saved, state):
+    """What orbax itself keeps of a restore is a few hundred blocks."""
+    checkpoints = Checkpoints(saved, read_only=True)
+    checkpoints.restore(state)
+    gc.collect()
+    before = sys.getallocatedblocks()
+    for _ in range(10):
+        checkpoints.restore(state)
+    gc.collect()
+    assert (sys.getallocatedblocks() - before) / 10 < 1000  # 3,000 with its metadata
+    checkpoints.close()
 
 
 def test_a_first_checkpoint_that_was_not_finished_is_not_trusted(saved, tmp_path):
