@@ -1,7 +1,7 @@
 """Checkpoints: orbax behind three functions. Nobody else imports orbax.
 
     checkpoints/STEP/              as orbax writes it, under another name until whole
-    checkpoints/STEP/position.json data position; written by this module, then
+    checkpoints/STEP/position.json copy of the data position; by this module, then
     checkpoints/STEP/sha256.json   digests of all its files
     checkpoints/STEP.damaged/      put aside by a run that went on from an older one
 
@@ -40,8 +40,9 @@ OVERHEAD_BYTES = 2**17  # of a checkpoint's files besides the arrays
 class Checkpoints:
     """Saves and restores (TrainState, data position) under one folder.
 
-    Saving is asynchronous; the data position lies beside the state, so that a
-    resumed run sees the same batches in the same order.
+    Saving is asynchronous; the data position travels as the checkpoint's own
+    metadata, so that a resumed run sees the same batches in the same order. A copy
+    lies beside the state: reading orbax's metadata costs memory for good.
 
     `passed_over` has one line for each checkpoint that is newer than the newest
     whole one, which is the one to go on from.
@@ -98,7 +99,9 @@ class Checkpoints:
             self._finish_pending()
             if is_first():
                 _check_room(self._folder, state)
-            response: Any = self._checkpointer.save_async(step, state, force=True)
+            response: Any = self._checkpointer.save_async(
+                step, state, force=True, custom_metadata={"position": position}
+            )
             self._pending = self._thread.submit(self._seal, step, response, position)
 
     def _seal(self, step: int, response: Any, position: dict) -> None:  # noqa: ANN401
@@ -135,7 +138,7 @@ class Checkpoints:
                 "expected the same features, hidden size and optimiser"
             ) from error
         path = self._folder / str(step) / POSITION
-        if not path.exists():  # of a version before; the call costs memory for good
+        if not path.exists():  # of a version before
             metadata: Any = self._checkpointer.metadata(step).custom_metadata or {}
             return state, dict(metadata.get("position", {}))
         position = read_json(path, "a data position")

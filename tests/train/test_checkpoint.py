@@ -161,22 +161,16 @@ def test_who_only_reads_leaves_everything_as_it_is(saved, state, tmp_path):
     assert nothing.latest_step() is None
 
 
-def test_checkpoints_of_versions_without_digests_are_taken(saved, state, tmp_path):
+@pytest.mark.parametrize("missing", [(DIGESTS,), (DIGESTS, POSITION)])
+def test_checkpoints_of_older_versions_are_taken(saved, state, tmp_path, missing):
+    """Also one that a run of today left there when it was killed."""
     folder = tmp_path / "c"
     shutil.copytree(saved, folder)
     for step in ("2", "3", "4"):
-        (folder / step / DIGESTS).unlink()
+        for name in missing:
+            (folder / step / name).unlink()
     (folder / SEALED).unlink()
     assert restored(folder, state) == (4, 4, [])
-
-
-def test_the_position_of_a_version_before_is_in_what_orbax_notes(state, tmp_path):
-    checkpoints = Checkpoints(tmp_path)
-    noted = {"position": {"epoch": 0, "index": 7}}
-    checkpoints._checkpointer.save(7, at(state, 7), custom_metadata=noted)
-    checkpoints.close()
-    (tmp_path / SEALED).unlink()
-    assert restored(tmp_path, state) == (7, 7, [])
 
 
 @pytest.mark.parametrize("text", ['["epoch"]', '{"epoch": "0"}', "3"])
