@@ -6,10 +6,12 @@ Exit status 0: reproduced. On the same machine with the same versions and commit
 bit has to be the same; else, with a warning that names what differs, no tensor may
 differ by more than --tolerance of its largest entry. 1: not reproduced; the tensor
 that differs most is named. 2: could not: other data, an older file, or one that no
-training run exported (members of a sweep). Takes as long as the training did; writes
-DIR/run, DIR/weights.msgpack and DIR/reproduction.json.
+training made. Takes as long as the training did, of a sweep's member as long as its
+group; writes DIR/run (not of a member), DIR/weights.msgpack and
+DIR/reproduction.json.
 """
 
+import functools
 import sys
 from pathlib import Path
 
@@ -23,8 +25,11 @@ from rcirl_jax.export.provenance import dataset_names
 from rcirl_jax.export.reproduce import (
     Reproduction,
     compare,
+    is_member,
+    member_again,
     settings_of,
     setup_warnings,
+    sweep_of,
     train_again,
 )
 from rcirl_jax.whole import write_json
@@ -48,14 +53,23 @@ def main() -> None:
     named = _DATA.value or (reward.provenance.get("flags") or {}).get("data")
     if not named:
         raise InputError("--data: not given and not in the file: expected datasets")
-    dataset = open_datasets(dataset_names(named, f"{reward.file}: flags.data"))
-    settings_of(reward, dataset)  # what fails, fails before a warning
+    names = dataset_names(named, f"{reward.file}: flags.data")
+    dataset = open_datasets(names)
+    # what fails, fails before a warning
+    if is_member(reward):
+        sweep = sweep_of(reward, dataset, names)
+        make = functools.partial(member_again, reward, sweep, folder)
+    else:
+        settings_of(reward, dataset)
+        judged = Path(_PREFERENCES.value) if _PREFERENCES.value else None
+        make = functools.partial(
+            train_again, reward, dataset, folder, preferences=judged
+        )
     facts = provenance()
     warnings = setup_warnings(reward.provenance, facts)
     for line in warnings:
         print(f"warning: {line}")
-    judged = Path(_PREFERENCES.value) if _PREFERENCES.value else None
-    again = train_again(reward, dataset, folder, facts, judged)
+    again = make(provenance=facts)
     found = Reproduction(
         differences=compare(reward, again),
         warnings=warnings,

@@ -232,6 +232,18 @@ def test_weights_of_the_tuning_loop_are_made_again(root, tmp_path):
     assert "reproduced: bit for bit" in done.stdout
 
 
+def test_weights_of_a_sweep_are_made_again(root, tmp_path):
+    job = jobs(root)["sweep"]
+    assert limited(tmp_path, None, job.module, *job.flags).returncode == 0
+    again = ("--weights=sweep/best.msgpack", "--output=again")
+    done = limited(tmp_path, None, "experiments.reproduce", *again)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "reproduced: bit for bit" in done.stdout
+    assert [x.name for x in (tmp_path / "again").glob("*.msgpack")] == [
+        "weights.msgpack"
+    ]
+
+
 @pytest.mark.parametrize(
     "name", ["import", "train", "export", "sweep", "report", "autotune"]
 )

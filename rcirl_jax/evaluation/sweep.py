@@ -14,6 +14,7 @@ so nothing can be chosen by it.
 import dataclasses
 import functools
 import itertools
+import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -34,6 +35,7 @@ from rcirl_jax.reward import Normaliser, RewardParams, seen_range
 from rcirl_jax.train.frozen import compiles, fit, freeze, members_of
 from rcirl_jax.train.state import FeatureBatch, TrainConfig
 
+MOST_MEMBERS = 100_000  # of a sweep
 MEMBERS_AT_ONCE = 16  # per call: enough to share the scenes, few enough to see progress
 CHOICES = tuple(name for name, how in METRICS.items() if how.compared)
 # a likelihood needs a temperature of its own, which no choice here depends on
@@ -98,6 +100,12 @@ class SweepConfig:
             found = getattr(self, name)
             if not found:
                 raise InputError(f"--{name}: none: expected at least one value")
+        grid = (self.hidden_sizes, self.leaky_rates, self.learning_rates)
+        if math.prod(map(len, grid)) * self.seeds > MOST_MEMBERS:
+            raise InputError(
+                f"--seeds: {self.seeds}: expected a sweep of at most {MOST_MEMBERS} "
+                "trainings"
+            )
         names = [member_name(one) for one in self.members()]
         if len(set(names)) < len(names):
             twice = next(name for name in names if names.count(name) > 1)

@@ -49,7 +49,7 @@ def _typed(kind: type, value: Any, where: str) -> Any:  # noqa: ANN401
                 for i, (k, v) in enumerate(zip(kinds, value, strict=True))
             )
     elif dataclasses.is_dataclass(kind) and isinstance(value, dict):
-        return _settings(kind, value, f"{where}.")
+        return typed_settings(kind, value, f"{where}.")
     elif type(value) is kind is str:
         return value
     elif type(value) in {int, kind} and kind in {int, float} and abs(value) < 2**31:
@@ -58,7 +58,12 @@ def _typed(kind: type, value: Any, where: str) -> Any:  # noqa: ANN401
     raise ValueError(f"{where}: {value}: expected {name}")
 
 
-def _settings(kind: type, found: Mapping[str, Any], where: str = "") -> Any:  # noqa: ANN401
+def typed_settings(kind: type, found: Mapping[str, Any], where: str = "") -> Any:  # noqa: ANN401
+    """A dataclass of its fields as JSON types; `where` goes before their names.
+
+    Raises:
+      ValueError, TypeError: they are not those of this version.
+    """
     hints = typing.get_type_hints(kind)
     if unknown := sorted(set(found) - set(hints)):
         raise ValueError(f"{where}{unknown[0]}: expected a setting of this version")
@@ -74,7 +79,7 @@ def config_of(settings: Mapping[str, Any]) -> TrainConfig:
     """
     for name in ("reward", "sampler"):
         settings[name]  # these are no flags with a default
-    return _settings(TrainConfig, settings)
+    return typed_settings(TrainConfig, settings)
 
 
 def read_config(workdir: Path) -> tuple[TrainConfig, dict]:

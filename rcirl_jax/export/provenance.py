@@ -9,7 +9,7 @@ from rcirl_jax.errors import InputError
 TYPES: dict[str, type] = {
     **dict.fromkeys(("seed", "steps"), int),
     **dict.fromkeys(("git_commit", "dataset_sha256", "created", "mode"), str),
-    **dict.fromkeys(("flags", "metrics", "versions", "config"), dict),
+    **dict.fromkeys(("flags", "metrics", "versions", "config", "sweep"), dict),
 }
 
 

@@ -1,11 +1,14 @@
 """A weights file trained again from what it says of itself, and compared.
 
 Everything that decides a training run is in the file's provenance: the configuration
-(which the flags became), the seed, the hash of the data, versions and commit.
+(which the flags became), the seed, the hash of the data, versions and commit. A member
+of a sweep has the whole grid there besides, and is trained with its group.
 """
 
+import contextlib
 import dataclasses
-from collections.abc import Mapping
+import datetime
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +17,25 @@ import numpy as np
 from rcirl_jax.data.joined import Demonstrations
 from rcirl_jax.data.preferences import read_preferences
 from rcirl_jax.errors import UNFORESEEN, InputError
-from rcirl_jax.export.from_run import config_of, export_run
+from rcirl_jax.evaluation.sweep import (
+    SweepConfig,
+    member_name,
+    open_split,
+    train_group,
+)
+from rcirl_jax.export.from_run import (
+    config_of,
+    export_run,
+    typed_settings,
+    verification_samples,
+)
 from rcirl_jax.export.reader import RANGES, Reward
+from rcirl_jax.export.sweep import write_member
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.running import Running
 from rcirl_jax.train.state import TrainConfig
 
-NEEDED = ("config", "flags", "seed", "steps", "dataset_sha256")
+NEEDED = ("config", "flags", "seed", "dataset_sha256")
 # where all of these are the same, so is every bit
 SETUP = ("versions", "git_commit", "machine", "cpu", "cores", "device", "devices")
 # the same, in files that say it: older ones do not
@@ -68,24 +83,10 @@ def settings_of(reward: Reward, dataset: Demonstrations) -> TrainConfig:
       InputError: the provenance lacks what a second training needs, is of other
         data, or of a run that was exported before its end.
     """
+    _check_source(reward, dataset, (*NEEDED, "steps"))
     found, file = reward.provenance, reward.file
-    for name in NEEDED:
-        if found.get(name) in (None, "", {}):
-            raise InputError(
-                f"{file}: provenance.{name}: missing: expected a file exported from a "
-                "run of experiments.train or experiments.autotune of this version"
-            )
-    if found["dataset_sha256"] != dataset.hash:
-        raise InputError(
-            f"{file}: provenance.dataset_sha256: {found['dataset_sha256']}: expected "
-            f"that of the given data, {dataset.hash}"
-        )
-    try:
+    with _of_this_version(f"{file}: provenance.config"):
         config = config_of(found["config"])
-    except UNFORESEEN as error:
-        raise InputError(
-            f"{file}: provenance.config: {error}: expected settings of this version"
-        ) from error
     per_epoch = -(-dataset.indices("train").size // config.batch_size)
     if found["steps"] != per_epoch * config.epochs:
         raise InputError(
@@ -93,6 +94,68 @@ def settings_of(reward: Reward, dataset: Demonstrations) -> TrainConfig:
             f"{per_epoch * config.epochs}, a run that was trained to its end"
         )
     return config
+
+
+def is_member(reward: Reward) -> bool:
+    """Whether the file is of a sweep that kept its grid."""
+    return reward.provenance.get("sweep") is not None
+
+
+def sweep_of(
+    reward: Reward, dataset: Demonstrations, names: Sequence[str]
+) -> SweepConfig:
+    """The sweep whose member the file is.
+
+    Args:
+      reward: the file.
+      dataset: its data.
+      names: where they lie.
+
+    Raises:
+      InputError: as `settings_of`, or the file is no member of its own grid.
+    """
+    _check_source(reward, dataset, (*NEEDED, "sweep"))
+    found, file = reward.provenance, reward.file
+    with _of_this_version(f"{file}: provenance.sweep"):
+        grid = {**found["sweep"], "data": list(names)}
+        sweep = typed_settings(SweepConfig, grid)
+    with _of_this_version(f"{file}: provenance.config"):
+        member = config_of(found["config"])
+    if member not in sweep.members():
+        raise InputError(
+            f"{file}: provenance.config: {member_name(member)}: expected a member of "
+            "provenance.sweep"
+        )
+    return sweep
+
+
+def _check_source(
+    reward: Reward, dataset: Demonstrations, needed: Sequence[str]
+) -> None:
+    """Check that a file says what a second training needs, and is of these data."""
+    found, file = reward.provenance, reward.file
+    for name in needed:
+        if found.get(name) in (None, "", {}):
+            raise InputError(
+                f"{file}: provenance.{name}: missing: expected a file that "
+                "experiments.train, autotune or sweep of this version made"
+            )
+    if found["dataset_sha256"] != dataset.hash:
+        raise InputError(
+            f"{file}: provenance.dataset_sha256: {found['dataset_sha256']}: expected "
+            f"that of the given data, {dataset.hash}"
+        )
+
+
+@contextlib.contextmanager
+def _of_this_version(where: str) -> Iterator[None]:
+    """What settings of another version end in, as one line."""
+    try:
+        yield
+    except UNFORESEEN as error:
+        raise InputError(
+            f"{where}: {error}: expected settings of this version"
+        ) from error
 
 
 def setup_warnings(
@@ -155,6 +218,36 @@ def train_again(
     )
     output = folder / "weights.msgpack"
     return export_run(workdir, dataset, output, ranges=reward.seen is not None)
+
+
+def member_again(
+    reward: Reward, sweep: SweepConfig, folder: Path, provenance: Mapping[str, Any]
+) -> Reward:
+    """Train the group of a sweep's member and write FOLDER/weights.msgpack.
+
+    The members that were trained in one call with it are trained again beside it: the
+    compiled program is theirs, and so is every bit.
+
+    Args:
+      reward: the file.
+      sweep: of `sweep_of`.
+      folder: a new folder.
+      provenance: of this run.
+
+    Raises:
+      InputError: the folder has weights; a feature turns NaN or infinite.
+    """
+    output, member = folder / "weights.msgpack", config_of(reward.provenance["config"])
+    if output.exists():
+        raise InputError(f"{output}: exists: expected a folder without weights")
+    dataset, split, _ = open_split(sweep, verify=False)
+    samples = verification_samples(split, sweep.base)
+    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    made_by = {**provenance, "dataset_sha256": dataset.hash, "created": now}
+    parts = train_group(member.reward.hidden, sweep)
+    part = next(part for part in parts if member in part.members)
+    number = part.members.index(member)
+    return write_member(output, part, number, samples, sweep, made_by)
 
 
 def compare(before: Reward, after: Reward) -> dict[str, float]:

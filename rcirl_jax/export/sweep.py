@@ -45,6 +45,7 @@ from rcirl_jax.evaluation.sweep import (
 from rcirl_jax.executor import Executor
 from rcirl_jax.export.from_run import verification_samples, write_weights
 from rcirl_jax.export.loading import compiled_scorer, open_reward
+from rcirl_jax.export.reader import Reward
 from rcirl_jax.stages import only_one
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.whole import read_json, write_json, write_whole
@@ -114,10 +115,16 @@ def _sweep(
     return body
 
 
-def _settings(config: SweepConfig) -> dict:
+def grid_of(config: SweepConfig) -> dict:
     """What decides the result, as JSON; where the data lie does not."""
     made = json.loads(json.dumps(dataclasses.asdict(config)))
-    return {n: v for n, v in made.items() if n not in ("base", "data")} | made["base"]
+    return {name: value for name, value in made.items() if name != "data"}
+
+
+def _settings(config: SweepConfig) -> dict:
+    """The same in one level, as the folder's files name it."""
+    made = grid_of(config)
+    return {n: v for n, v in made.items() if n != "base"} | made["base"]
 
 
 def _claim(config: SweepConfig, folder: Path, dataset_hash: str) -> str:
@@ -158,7 +165,7 @@ def _train(
     """The groups' files by shape, after training those that are missing."""
     groups = {h: _finished(config, folder, h, made_by) for h in config.hidden_sizes}
     todo = [hidden for hidden, group in groups.items() if group is None]
-    samples = verification_samples(split, config.base) if todo else ()
+    samples = functools.cache(lambda: verification_samples(split, config.base))
     total = len(config.members())
     done = total - sum(len(config.group(hidden)) for hidden in todo)
     parts: dict[Hidden, list[Part]] = collections.defaultdict(list)
@@ -166,7 +173,8 @@ def _train(
         piece = functools.partial(train_group, config=config)
         for part in executor.stream(piece, todo):
             for number, member in enumerate(part.members):
-                _export(folder, part, number, member, samples, made_by)
+                output = _weights(folder, member)
+                write_member(output, part, number, samples(), config, made_by)
             parts[part.hidden].append(part)
             bar.update(len(part.members))
             if sum(len(p.members) for p in parts[part.hidden]) == len(
@@ -181,15 +189,25 @@ def _weights(folder: Path, member: TrainConfig) -> Path:
     return folder / "weights" / f"{member_name(member)}.msgpack"
 
 
-def _export(
-    folder: Path,
+def write_member(
+    output: Path,
     part: Part,
     number: int,
-    member: TrainConfig,
-    samples: tuple,
+    samples: tuple[np.ndarray, np.ndarray],
+    config: SweepConfig,
     made_by: Mapping[str, object],
-) -> None:
-    """One member's weights file."""
+) -> Reward:
+    """Write the weights file of one trained member.
+
+    Args:
+      output: the file.
+      part: that it was trained in.
+      number: its place there.
+      samples: of `verification_samples`.
+      config: the sweep; the file keeps all of it but where the data lie.
+      made_by: provenance, with the hash of the data.
+    """
+    member = part.members[number]
     metrics = {"loss": part.loss[number], "pair_accuracy": part.wins[number]}
     provenance = {
         "git_commit": None,
@@ -200,11 +218,13 @@ def _export(
         "metrics": {name: float(x) for name, x in metrics.items()},
         "mode": member.sampler.mode,
         "config": json.loads(json.dumps(dataclasses.asdict(member))),
+        "sweep": grid_of(config),
     }
     params = jax.tree.map(lambda x: jnp.asarray(x[number]), part.params)
     normaliser = jax.tree.map(jnp.asarray, part.normaliser)
-    output = _weights(folder, member)
-    write_weights(output, params, normaliser, member, samples, provenance, part.seen)
+    return write_weights(
+        output, params, normaliser, member, samples, provenance, part.seen
+    )
 
 
 def _finish(folder: Path, parts: Sequence[Part], settings: dict) -> dict:

@@ -129,9 +129,9 @@ def test_another_shape_or_loss_is_no_reproduction(made, tmp_path):
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("flags", {}, "provenance.flags: missing: expected a file exported from"),
-        ("config", None, "provenance.config: missing: expected a file exported"),
-        ("steps", None, "provenance.steps: missing: expected a file exported"),
+        ("flags", {}, "provenance.flags: missing: expected a file that"),
+        ("config", None, "provenance.config: missing: expected a file that"),
+        ("steps", None, "provenance.steps: missing: expected a file that"),
         ("steps", 5, "provenance.steps: 5: expected 6, a run that was trained to its"),
         ("config", {"loss": "rank"}, "provenance.config: 'reward': expected settings"),
         ("dataset_sha256", "0" * 64, "provenance.dataset_sha256: 0000"),
