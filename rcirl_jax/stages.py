@@ -7,7 +7,6 @@ killed run goes on with the first stage that is not. One process at a time.
 
 import contextlib
 import dataclasses
-import fcntl
 import functools
 import hashlib
 import json
@@ -15,11 +14,11 @@ import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.specs import spec_root
-from rcirl_jax.whole import read_json, write_json
+from rcirl_jax.whole import locked, read_json, write_json
 
 FILE = "stages.json"
 LOCK = ".lock"  # in a folder that one process at a time works in
@@ -188,7 +187,13 @@ def only_one(folder: Path, *, leave_nothing: bool = False) -> Iterator[None]:
     """
     path = folder / LOCK
     made = [x for x in (folder, *folder.parents) if not os.path.lexists(x)]
-    with _locked(path):
+    with contextlib.ExitStack() as held:
+        try:
+            held.enter_context(locked(path, wait=False))
+        except BlockingIOError as error:
+            raise InputError(
+                f"{folder}: in use by another process: expected one run at a time"
+            ) from error
         try:
             yield
         finally:
@@ -197,21 +202,3 @@ def only_one(folder: Path, *, leave_nothing: bool = False) -> Iterator[None]:
                 with contextlib.suppress(OSError):
                     for one in made:
                         one.rmdir()
-
-
-def _locked(path: Path) -> IO[str]:
-    """The lock's file, open and locked."""
-    while True:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        file = path.open("a")
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            file.close()
-            raise InputError(
-                f"{path.parent}: in use by another process: expected one run at a time"
-            ) from error
-        # who held it before may have removed the file after it was opened here
-        if path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat()):
-            return file
-        file.close()

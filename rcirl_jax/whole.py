@@ -34,10 +34,10 @@ def write_whole(path: Path, content: str | bytes) -> None:
     Raises:
       OSError: it cannot be written (the disk is full); names the file.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(path.name + ".tmp")
     try:
-        with _alone(part) as file:
+        with locked(part) as file:
+            file.truncate(0)
             try:
                 file.write(content.encode() if isinstance(content, str) else content)
                 file.flush()
@@ -50,24 +50,34 @@ def write_whole(path: Path, content: str | bytes) -> None:
 
 
 @contextlib.contextmanager
-def _alone(part: Path) -> Iterator[IO[bytes]]:
-    """The empty file, open and locked: another process may want to write the same.
+def locked(path: Path, *, wait: bool = True) -> Iterator[IO[bytes]]:
+    """A file open for appending, held by this process alone; made if missing.
 
-    It waits for the lock; what it then holds may have been renamed in between.
+    Where the file system has no locks, nobody is kept out.
+
+    Args:
+      path: of the file.
+      wait: for whoever holds it.
+
+    Raises:
+      BlockingIOError: somebody holds it, and this does not wait.
+      OSError: it cannot be made or written.
     """
+    how = fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB
     while True:
-        with part.open("ab") as file:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("ab") as file:
             try:
-                fcntl.flock(file, fcntl.LOCK_EX)
+                fcntl.flock(file, how)
             except OSError as error:
                 if error.errno not in NO_LOCKS:
                     raise
+            # who held it before may have renamed or removed it after it was opened
             try:
-                there = part.stat()
+                there = path.stat()
             except FileNotFoundError:
                 continue
             if os.path.samestat(os.fstat(file.fileno()), there):
-                file.truncate(0)
                 yield file
                 return
 

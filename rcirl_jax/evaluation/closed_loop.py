@@ -24,6 +24,9 @@ from rcirl_jax.simulation.rows import RECORDED_HUMAN, Row
 from rcirl_jax.simulation.suite import CaseSet, drive_row, rollout_config
 from rcirl_jax.whole import write_json, write_whole
 
+# infinite where nobody was met; every other number of a drive is finite
+NOBODY_MET = ("min_ttc", "min_headway", "min_clearance")
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SuiteConfig:
@@ -71,14 +74,18 @@ def drive_here(row: Row, cases: CaseSet, config: SuiteConfig) -> CaseMetrics:
 
 
 def _driven(row: Row, cases: CaseSet, config: SuiteConfig, drive: Drive) -> CaseMetrics:
-    """A row's drives; InputError names the first case with a NaN."""
+    """A row's drives; InputError names the first case with no number."""
     metrics = drive(row, cases, config)
     for field, values in vars(metrics).items():
-        bad = np.isnan(np.asarray(values)).reshape(len(cases.ids), -1).any(axis=1)
+        values = np.asarray(values).reshape(len(cases.ids), -1)
+        none = field in NOBODY_MET
+        bad = np.isnan(values) if none else ~np.isfinite(values)
         if bad.any():
-            case = cases.ids[int(np.argmax(bad))]
+            first = int(np.argmax(bad.any(axis=1)))
+            found = values[first][bad[first]][0]
             raise InputError(
-                f"simulate: {row.name}: case {case}: {field}: NaN: expected a number"
+                f"simulate: {row.name}: case {cases.ids[first]}: {field}: {found}: "
+                "expected a number"
             )
     return metrics
 

@@ -33,8 +33,7 @@ from rcirl_jax.planner.grid import (
     rest_of_network,
 )
 from rcirl_jax.planner.plan import Plan
-from rcirl_jax.planner.rank import Policy, RankConfig, command, learned_score
-from rcirl_jax.planner.safety import check, choose
+from rcirl_jax.planner.rank import Policy, RankConfig, best_plan, learned_score
 from rcirl_jax.reward.network import product
 from rcirl_jax.sampling import sample
 from rcirl_jax.sampling.kinematics import trajectory_on_path
@@ -323,7 +322,6 @@ def dp_policy(
     driven if its value is the highest of all that pass.
     """
     score = learned_score(features, activation)
-    emergency = family_index("emergency")
 
     def policy(params: Weights, scene: Scene, key: jax.Array) -> Plan:
         sampled = sample(key, scene, rank.sampler)
@@ -334,16 +332,6 @@ def dp_policy(
             feasible=join(sampled.feasible, plan.feasible),
             family=join(sampled.family, jnp.asarray(family_index("cruise"))),
         )
-        verdict = check(scene, candidates, rank.safety)
-        scores = score(params, scene, candidates)
-        index, fallback = choose(verdict, candidates, scores)
-        chosen = jax.tree.map(lambda x: x[index], candidates.trajectory)
-        hard = fallback | (candidates.family[index] == emergency)
-        return Plan(
-            acceleration=command(chosen, hard, rank.period),
-            s=chosen.s,
-            fallback=fallback,
-            admissible=jnp.sum(verdict.admissible, dtype=jnp.int32),
-        )
+        return best_plan(scene, candidates, score(params, scene, candidates), rank)
 
     return policy

@@ -133,24 +133,42 @@ def command(chosen: Trajectory, braking_now: jax.Array, period: float) -> jax.Ar
     return jnp.where(rests, jnp.minimum(wanted, stopping), wanted)
 
 
+def best_plan(
+    scene: Scene, candidates: Candidates, scores: jax.Array, config: RankConfig
+) -> Plan:
+    """The candidate that `safety.choose` takes, as a plan.
+
+    A feasible candidate whose score is not finite is a fault that no choice may hide:
+    the command is NaN then, and so are the drive's numbers, by which a suite names
+    the case. (The guard of the onboard side answers it before; see `guard`.)
+
+    Args:
+      scene: of the candidates.
+      candidates: K of them.
+      scores: [K].
+      config: filter and period.
+    """
+    verdict = check(scene, candidates, config.safety)
+    index, fallback = choose(verdict, candidates, scores)
+    chosen = jax.tree.map(lambda x: x[index], candidates.trajectory)
+    hard = fallback | (candidates.family[index] == family_index("emergency"))
+    known = jnp.all(jnp.isfinite(scores) | ~candidates.feasible)
+    return Plan(
+        acceleration=jnp.where(known, command(chosen, hard, config.period), jnp.nan),
+        s=chosen.s,
+        fallback=fallback,
+        admissible=jnp.sum(verdict.admissible, dtype=jnp.int32),
+    )
+
+
 @functools.lru_cache(maxsize=64)
 def rank_policy(score: Score, config: RankConfig) -> Policy:
     """The planner that drives the admissible candidate of the highest score."""
-    emergency = family_index("emergency")
 
     def policy(params: Params, scene: Scene, key: jax.Array) -> Plan:
         candidates = sample(key, scene, config.sampler)
-        verdict = check(scene, candidates, config.safety)
         scores = score(params, scene, candidates)
-        index, fallback = choose(verdict, candidates, scores)
-        chosen = jax.tree.map(lambda x: x[index], candidates.trajectory)
-        hard = fallback | (candidates.family[index] == emergency)
-        return Plan(
-            acceleration=command(chosen, hard, config.period),
-            s=chosen.s,
-            fallback=fallback,
-            admissible=jnp.sum(verdict.admissible, dtype=jnp.int32),
-        )
+        return best_plan(scene, candidates, scores, config)
 
     return policy
 

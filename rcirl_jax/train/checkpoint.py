@@ -138,15 +138,11 @@ class Checkpoints:
                 "expected the same features, hidden size and optimiser"
             ) from error
         path = self._folder / str(step) / POSITION
-        if not path.exists():  # of a version before
-            metadata: Any = self._checkpointer.metadata(step).custom_metadata or {}
-            return state, dict(metadata.get("position", {}))
-        position = read_json(path, "a data position")
-        if not isinstance(position, dict) or not all(
-            isinstance(number, int) for number in position.values()
-        ):
-            raise InputError(f"{path}: {position}: expected numbers by name")
-        return state, position
+        if path.exists():
+            return state, read_position(path)
+        # of a version before, or killed before the copy was written
+        metadata: Any = self._checkpointer.metadata(step).custom_metadata or {}
+        return state, dict(metadata.get("position", {}))
 
     def close(self) -> None:
         """Wait for pending saves and release the folder.
@@ -166,11 +162,25 @@ class Checkpoints:
         """Failures of writing, which come late, as one line."""
         try:
             yield
-        except Exception as error:
+        except (OSError, RuntimeError, ValueError) as error:
             raise InputError(
                 f"{self._folder}: cannot be written: {_first_line(error)}: expected "
                 "room for a checkpoint; the ones before are kept, run again to go on"
             ) from error
+
+
+def read_position(path: Path) -> dict[str, int]:
+    """The data position beside a checkpoint's state.
+
+    Raises:
+      InputError: the file is none.
+    """
+    position = read_json(path, "a data position")
+    if not isinstance(position, dict) or not all(
+        type(number) is int for number in position.values()
+    ):
+        raise InputError(f"{path}: {position}: expected numbers by name")
+    return position
 
 
 def _check_room(folder: Path, state: TrainState) -> None:

@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -16,8 +17,11 @@ from rcirl_jax.evaluation.closed_loop import SuiteConfig, run_suite
 from rcirl_jax.evaluation.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.evaluation.learners import learner_configs, train_learners
 from rcirl_jax.evaluation.sweep import train_group
+from rcirl_jax.planner.rank import RankConfig, best_plan
+from rcirl_jax.sampling import sample
 from rcirl_jax.simulation.metrics import CaseMetrics
-from rcirl_jax.simulation.rows import human_row
+from rcirl_jax.simulation.rollout import SAMPLER_STREAM
+from rcirl_jax.simulation.rows import Row, human_row
 from rcirl_jax.simulation.suite import catalogue_set, suite_refs
 from rcirl_jax.train import loop
 from rcirl_jax.train.loop import train
@@ -175,5 +179,26 @@ def test_a_suite_names_row_and_case():
 
     with pytest.raises(InputError) as caught:
         run_suite([human_row()], cases, SuiteConfig(), drive)
-    expected = f"recorded human: case {cases.ids[1]}: max_j: NaN: expected a number"
+    expected = f"recorded human: case {cases.ids[1]}: max_j: nan: expected a number"
     assert str(caught.value) == f"simulate: {expected}"
+
+
+@pytest.mark.parametrize("unknown", [np.nan, np.inf, -np.inf])
+def test_a_score_that_is_no_number_is_named_by_row_and_case(unknown):
+    """The filter would take the other candidates, and nobody would know."""
+    cases = catalogue_set(suite_refs("smoke")[:3], 5.0)
+    key = jax.random.key(int(cases.build(1, 2).seed[0]))
+    marked = jax.random.fold_in(jax.random.fold_in(key, SAMPLER_STREAM), 0)
+
+    def policy(params, scene, key):
+        candidates = sample(key, scene, RankConfig().sampler)
+        here = jnp.all(jax.random.key_data(key) == jax.random.key_data(marked))
+        way = candidates.trajectory.s[:, -1]
+        scores = jnp.where(here & (jnp.arange(way.size) == 3), unknown, way)
+        return best_plan(scene, candidates, scores, RankConfig())
+
+    row = Row(name="learned", policy=policy)
+    with pytest.raises(InputError) as caught:
+        run_suite([row], cases, SuiteConfig())
+    assert str(caught.value).startswith(f"simulate: learned: case {cases.ids[1]}: ")
+    assert str(caught.value).endswith(": nan: expected a number")
