@@ -5,7 +5,7 @@ import platform
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 
@@ -13,9 +13,11 @@ import jax
 from absl import app, flags, logging
 
 from rcirl_jax import __version__, interrupts
+from rcirl_jax.data.parts import Part, logs_sha256
+from rcirl_jax.data.store import Dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.reader import load_weights
-from rcirl_jax.stages import code_sha256
+from rcirl_jax.stages import code_sha256, file_sha256
 from rcirl_jax.whole import is_text
 
 EXIT_BAD_INPUT = 2
@@ -133,17 +135,32 @@ def hidden_sizes(values: list[str], flag: str = "hidden_size") -> tuple[int, ...
     return sizes
 
 
-def provenance(weights: Sequence[str] = ()) -> dict:
+def provenance(
+    weights: Sequence[str] = (),
+    *,
+    hand_weights: Sequence[str] = (),
+    logs: Sequence[Part] = (),
+) -> dict:
     """Flags of one experiment file, git commit, versions and machine.
 
     Starts JAX's devices: after `join_processes` where there are several processes.
 
     Args:
       weights: weights files that were read; their hashes name them.
+      hand_weights: files of tune_hand_set that were read, likewise.
+      logs: recordings that were read without an import, likewise.
+
+    Raises:
+      InputError: a weights file is missing or damaged.
+      OSError: another file cannot be read.
     """
     own = flags.FLAGS.get_key_flags_for_module(sys.argv[0])
     packages = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
-    hashes = {str(path): load_weights(path).sha256 for path in weights}
+    read = {
+        "weights_sha256": {str(path): load_weights(path).sha256 for path in weights},
+        "hand_weights_sha256": {path: file_sha256(Path(path)) for path in hand_weights},
+        "logs_sha256": logs_sha256(logs),
+    }
     return {
         "flags": {flag.name: flag.value for flag in own},
         "git_commit": git_commit(),
@@ -158,8 +175,25 @@ def provenance(weights: Sequence[str] = ()) -> dict:
         **processor(),
         "device": jax.devices()[0].device_kind,
         "devices": jax.device_count(),
-        **({"weights_sha256": hashes} if hashes else {}),
+        **{name: hashes for name, hashes in read.items() if hashes},
     }
+
+
+def made_by_file(
+    weights: Sequence[str] = (), more: Mapping[str, object] | None = None
+) -> Callable[[Dataset], None]:
+    """What writes a new dataset's made_by.json: its hash, provenance and `more`.
+
+    Args:
+      weights: weights files that decided what the dataset holds.
+      more: further facts.
+    """
+
+    def write(dataset: Dataset) -> None:
+        facts = {"data_hash": dataset.hash, **(more or {})}
+        dataset.write_facts({**facts, "made_by": provenance(weights)})
+
+    return write
 
 
 def processor() -> dict:

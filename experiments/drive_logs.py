@@ -8,12 +8,13 @@ than those of experiments.simulate, so a reward is never tested where it learned
     python -m experiments.drive_logs --learner=weights.msgpack --output=DATASET
 
 The learner and the driver take turns; what the driver does after a takeover is
-kept. Train on both sets: experiments.train --data=FIRST,TAKEOVERS.
+kept. Train on both sets: experiments.train --data=FIRST,TAKEOVERS. Commit, versions,
+flags and the learner's hash stand in DATASET/made_by.json.
 """
 
 from absl import flags
 
-from experiments.common import run
+from experiments.common import made_by_file, run
 from rcirl_jax.data.quality import format_quality
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.closed_loop import table_rows
@@ -43,12 +44,17 @@ def main() -> None:
         raise InputError(f"--duration: {_DURATION.value}: expected 15 to 120 s")
     config = DriveConfig(stride_s=_STRIDE.value, duration_s=_DURATION.value)
     refs = suite_refs(_SUITE.value, _CASES.value, _SEED.value)
-    learner = None
-    if _LEARNER.value:
-        row = table_rows([_LEARNER.value], (), round(config.period_s / STEP_S))[0]
+    files, learner = [_LEARNER.value] if _LEARNER.value else [], None
+    if files:
+        row = table_rows(files, (), round(config.period_s / STEP_S))[0]
         learner = row.policy, row.params
     manifest = drive_catalogue(
-        refs, _OUTPUT.value, config, learner=learner, overwrite=_OVERWRITE.value
+        refs,
+        _OUTPUT.value,
+        config,
+        learner=learner,
+        overwrite=_OVERWRITE.value,
+        before_commit=made_by_file(files),
     )
     print(format_quality(manifest.quality))
     print(f"dataset: {_OUTPUT.value}")

@@ -51,7 +51,8 @@ def main() -> None:
     print(format_table(report, _WIDTH.value))
     if _OUTPUT.value:
         output = Path(_OUTPUT.value)
-        made_by = {**provenance(_WEIGHTS.value), "data_hash": dataset.hash}
+        found = provenance(_WEIGHTS.value, hand_weights=_HAND.value)
+        made_by = {**found, "data_hash": dataset.hash}
         write_json(output, {**to_json(report), "made_by": made_by})
         print(f"report: {output}")
 

@@ -32,6 +32,7 @@ from rcirl_jax.evaluation.gate_types import Pair
 from rcirl_jax.evaluation.suite_files import read_runs
 from rcirl_jax.export.gate_job import gate_job
 from rcirl_jax.export.spread import spread
+from rcirl_jax.stages import file_sha256
 from rcirl_jax.whole import write_json
 
 WORSE = "random weights"
@@ -71,6 +72,9 @@ def main() -> None:
     print(f"{len(mine)} suites of {len(mine[0].ids):,} cases; share of the verdicts")
     print(format_errors(tallies))
     files = {"candidate": _CANDIDATE.value, "incumbent": incumbent}
+    known = [x for x in files.values() if x and Path(x).is_file()]
+    hashes = {file: file_sha256(Path(file)) for file in _DRIVEN.value or ()}
+    driven = {"driven_sha256": hashes} if hashes else {}
     body = {
         "cases": len(mine[0].ids),
         "suites": len(mine),
@@ -88,7 +92,7 @@ def main() -> None:
         "every_pair": others,
         "config": config,
         "files": {**files, "driven": _DRIVEN.value},
-        "made_by": provenance([x for x in files.values() if x and Path(x).is_file()]),
+        "made_by": {**provenance(known), **driven},
     }
     write_json(Path(_OUTPUT.value), body)
     print(f"written: {_OUTPUT.value}")

@@ -123,7 +123,7 @@ def main() -> None:
     write_whole(folder / "table.txt", format_table(report, 118))
     write_whole(folder / "table.md", markdown_table(report))
     split_of = parts[0] if len(parts) == 1 else dataset
-    made_by = {**provenance(), "data_hash": split_of.hash}
+    made_by = {**provenance(hand_weights=_HAND.value), "data_hash": split_of.hash}
     bad = sorted(failed)
     body = {
         **to_json(report),

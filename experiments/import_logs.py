@@ -13,7 +13,7 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments.common import provenance, run
+from experiments.common import made_by_file, run
 from experiments.executor import executor
 from experiments.signals import checked_signals
 from rcirl_jax.data.config import CollectConfig
@@ -116,8 +116,7 @@ def _floors(dataset: Dataset) -> list[dict]:
         for mode in MODES
     ]
     floors = [oracle_floor(dataset, setup, max_scenes=512) for setup in setups]
-    facts = {"data_hash": dataset.hash, "oracle_floor": floors}
-    dataset.write_facts({**facts, "made_by": provenance()})
+    made_by_file(more={"oracle_floor": floors})(dataset)
     return floors
 
 

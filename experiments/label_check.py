@@ -53,19 +53,20 @@ _QUICK = flags.DEFINE_bool("quick", False, "4 cases of each family, 1 of --traff
 
 def main() -> None:
     """Flags -> tables, labels.json, labels.png."""
-    body, tables = {}, {}
+    body, tables, parts, data = {}, {}, [], {}
     if _INPUT.value:
         source = Path(_SOURCE.value) if _SOURCE.value else None
-        logs = check_logs(
-            parts_of(_FORMAT.value, Path(_INPUT.value), source), executor=executor()
-        )
+        parts = parts_of(_FORMAT.value, Path(_INPUT.value), source)
+        logs = check_logs(parts, executor=executor())
         print(format_phases(logs.phases))
         body["phases"] = [check.as_dict() for check in logs.phases]
         for name, stops in logs.stops.items():
             print(f"\n{name}: {format_stops(stops)}")
             body[name], tables[f"recorded, {name}"] = stops.as_dict(), stops.scores
     if _DATA.value:
-        scores = compare_stored(open_dataset(_DATA.value).load(None))
+        dataset = open_dataset(_DATA.value)
+        data = {"data_hash": dataset.hash}
+        scores = compare_stored(dataset.load(None))
         print("\n".join(format_scores("stored", scores)))
         body["stored"] = [score.as_dict() for score in scores]
         tables["stored against today's rules"] = scores
@@ -81,7 +82,7 @@ def main() -> None:
     folder = Path(_OUTPUT.value)
     folder.mkdir(parents=True, exist_ok=True)
     picture = label_chart(folder / "labels.png", tables)
-    body["made_by"] = provenance()
+    body["made_by"] = {**provenance(logs=parts), **data}
     write_json(folder / "labels.json", body)
     print(f"written: {folder}/labels.json, {picture.name}")
 

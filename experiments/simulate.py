@@ -10,13 +10,15 @@ rows; on recorded scenes the recorded human is one of them. Writes table.txt,
 suite.json and cases.csv. A case is drawn by experiments.replay from its id.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from absl import flags
 
 from experiments.common import provenance, run
 from experiments.executor import executor
-from rcirl_jax.data.importers import IMPORTERS, read_recordings
+from rcirl_jax.data.importers import IMPORTERS
+from rcirl_jax.data.parts import Part, parts_of, recordings_of_all
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop import (
     SuiteConfig,
@@ -59,16 +61,34 @@ _CHUNK = flags.DEFINE_integer("chunk", 180, "cases driven together; bounds memor
 _SEED = flags.DEFINE_integer("catalogue_seed", 0, "seed of the cases")
 
 
-def _recorded() -> CaseSet:
+def _logs() -> list[Part]:
+    """The recordings of --suite=recorded; none of another suite."""
+    if _SUITE.value != "recorded":
+        return []
+    if not _INPUT.value:
+        raise InputError("--input: not given: expected the recordings to replay")
+    return parts_of(_FORMAT.value, Path(_INPUT.value))
+
+
+def _recorded(logs: Sequence[Part]) -> CaseSet:
     """Drives cut out of recordings."""
     config = RecordedConfig(
         smoothing_s=_SMOOTHING.value,
         max_cases=_CASES.value,
         max_duration_s=_DURATION.value or FULL_S,
     )
-    if not _INPUT.value:
-        raise InputError("--input: not given: expected the recordings to replay")
-    return recorded_set(read_recordings(_FORMAT.value, Path(_INPUT.value)), config)
+    return recorded_set(recordings_of_all(logs), config)
+
+
+def _made_by(logs: Sequence[Part]) -> dict:
+    """Provenance, with the hashes of all that decides how the rows drive."""
+    guard = _GUARD.value
+    further = [guard] if guard and guard not in BASELINES else []
+    return provenance(
+        [*_WEIGHTS.value, *further],
+        hand_weights=[_HAND.value] if _HAND.value else [],
+        logs=logs,
+    )
 
 
 def _job() -> SuiteJob:
@@ -96,11 +116,11 @@ def main() -> None:
     if _CHUNK.value < 1:
         raise InputError(f"--chunk: {_CHUNK.value}: expected at least 1")
     job, places = _job(), executor()
-    rows, drive = job.rows(), drive_here
-    if _SUITE.value == "recorded":
+    rows, drive, logs = job.rows(), drive_here, _logs()
+    if logs:
         if places.workers > 1:
             raise InputError("--suite: recorded: expected --workers=1: drives run here")
-        cases = _recorded()
+        cases = _recorded(logs)
         rows.append(human_row())
     else:
         cases = job.cases()
@@ -108,7 +128,7 @@ def main() -> None:
             drive = spread(places, job)
     config = SuiteConfig(plan_every=_EVERY.value, chunk=_CHUNK.value)
     result = run_suite(rows, cases, config, drive)
-    print(write_suite(result, Path(_OUTPUT.value), provenance(_WEIGHTS.value)))
+    print(write_suite(result, Path(_OUTPUT.value), _made_by(logs)))
     for name, facts in result.timings.items():
         print(f"{name}: {facts['seconds']} s, {facts['plans_per_s']:,} plans/s")
     print(f"peak memory: {result.facts['peak_memory_gib']} GiB")

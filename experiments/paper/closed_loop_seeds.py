@@ -168,7 +168,7 @@ def main() -> None:
             for words, x in tests.items()
         },
     }
-    write("closed_loop_seeds", body, data, runs=runs, cases=cases)
+    write("closed_loop_seeds", body, data, files, runs=runs, cases=cases)
 
 
 if __name__ == "__main__":

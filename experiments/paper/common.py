@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from absl import flags
 
-from experiments.common import alone, provenance
+from experiments.common import alone, made_by_file, provenance
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
@@ -87,7 +87,8 @@ def _synthetic() -> Dataset:
         config = ImportConfig(
             format="synthetic", collect=CollectConfig(stride_s=stride)
         )
-        import_logs(read_recordings("synthetic", None), folder, config)
+        recordings = read_recordings("synthetic", None)
+        import_logs(recordings, folder, config, before_commit=made_by_file())
     return open_dataset(folder)
 
 
@@ -147,9 +148,9 @@ def intervals(report: RankingReport, metric: str) -> dict[str, Interval]:
     return {name: (e.value, e.low, e.high) for name, e in found.items()}
 
 
-def as_used(**used: object) -> dict:
+def as_used(weights: Sequence[str] = (), **used: object) -> dict:
     """Provenance with the flags as they were used, under --quick too."""
-    found = provenance()
+    found = provenance(weights)
     counts = QUICK_COUNTS if QUICK.value else {}
     own = {name: count for name, count in counts.items() if name in found["flags"]}
     return {**found, "flags": {**found["flags"], **own, **used}}
@@ -159,18 +160,20 @@ def write(
     name: str,
     body: Mapping[str, object],
     data: Demonstrations | None = None,
+    weights: Sequence[str] = (),
     **used: object,
 ) -> None:
-    """OUTPUT/name.json with provenance, also of the scenes; says where.
+    """OUTPUT/name.json with provenance, also of scenes and weights; says where.
 
     Args:
       name: of the experiment.
       body: its numbers.
       data: its scenes, if they are of one dataset.
+      weights: files whose rewards it is about.
       used: flags of its own that --quick changes, as used.
     """
     folder = Path(OUTPUT.value)
-    made_by = as_used(**used)
+    made_by = as_used(weights, **used)
     if data is not None:
         made_by["data_hash"] = data.hash
     made = {**body, "quick": QUICK.value, "made_by": made_by}

@@ -84,6 +84,7 @@ def main() -> None:
             "chosen_s": frame.chosen_s.tolist(),
         },
         data,
+        [file],
     )
 
 

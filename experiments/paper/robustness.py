@@ -117,7 +117,7 @@ def main() -> None:
     _shown(folder, "robustness", SPREADS, robustness)
     body = {"optimality": optimality, "robustness": robustness, "frames": case.size}
     body |= {"disturbance": dataclasses.asdict(noise), "quick": quick}
-    body["made_by"] = provenance()
+    body["made_by"] = provenance([_WEIGHTS.value])
     write_json(folder / "robustness.json", body)
     print(f"written: {folder}/robustness.json, optimality.png, robustness.png")
 

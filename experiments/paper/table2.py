@@ -20,10 +20,11 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments.common import alone, provenance, run
+from experiments.common import alone, made_by_file, provenance, run
 from experiments.paper.weights import drives_config, trained_weights
-from rcirl_jax.data.importers import IMPORTERS, read_recordings
+from rcirl_jax.data.importers import IMPORTERS
 from rcirl_jax.data.joined import open_datasets
+from rcirl_jax.data.parts import Part, parts_of, recordings_of_all
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop import SuiteConfig, run_suite, write_suite
 from rcirl_jax.export.closed_loop import table_rows
@@ -62,13 +63,14 @@ LEARNED: dict[str, dict] = {
 def _same_run(folder: Path) -> None:
     """Parts are reused, but not those of a quick run or of another seed."""
     made, file = {"quick": _QUICK.value, "seed": _SEED.value}, folder / "run.json"
-    found = read_json(file, "the flags of a run") if file.exists() else made
+    before = read_json(file, "the flags of a run") if file.exists() else made
+    found = {name: before.get(name) for name in made}
     if found != made:
         raise InputError(
             f"{folder}: made with {found}: expected {made}, or a new folder"
         )
     folder.mkdir(parents=True, exist_ok=True)
-    write_json(file, made)
+    write_json(file, {**made, "made_by": provenance(_WEIGHTS.value or ())})
 
 
 def _drives(folder: Path, seed: int, learner: Path | None) -> Path:
@@ -81,7 +83,8 @@ def _drives(folder: Path, seed: int, learner: Path | None) -> Path:
         if learner:
             row = table_rows([str(learner)], (), round(config.period_s / STEP_S))[0]
         by = (row.policy, row.params) if row else None
-        drive_catalogue(refs, folder, config, learner=by)
+        note = made_by_file([str(learner)] if learner else [])
+        drive_catalogue(refs, folder, config, learner=by, before_commit=note)
     return folder
 
 
@@ -101,44 +104,52 @@ def _trained(folder: Path) -> list[str]:
 
 
 def _table(
-    name: str, cases: CaseSet, weights: Sequence[str], *, dp: bool, human: bool
+    name: str,
+    cases: CaseSet,
+    weights: Sequence[str],
+    *,
+    dp: bool = False,
+    logs: Sequence[Part] = (),
 ) -> None:
+    """FOLDER/NAME; with `logs`, whose drives the cases are, also the human's row."""
     rivals = ("hand-set", "IDM") if dp else BASELINES
     rows = table_rows(weights, rivals, _EVERY.value, dp=dp)
-    rows += [human_row()] if human else []
+    rows += [human_row()] if logs else []
     result = run_suite(rows, cases, SuiteConfig(plan_every=_EVERY.value))
-    folder = Path(_OUTPUT.value) / name
-    print(f"--- {name}\n{write_suite(result, folder, provenance())}")
+    folder, made_by = Path(_OUTPUT.value) / name, provenance(weights, logs=logs)
+    print(f"--- {name}\n{write_suite(result, folder, made_by)}")
     suite_chart(folder / "table.png", result.report)
 
 
-def _recorded() -> CaseSet | None:
+def _logs() -> list[Part]:
+    """--input."""
+    return parts_of(_FORMAT.value, Path(_INPUT.value)) if _INPUT.value else []
+
+
+def _recorded(logs: Sequence[Part]) -> CaseSet | None:
     """Cases cut from --input; read first, for what is wrong with it to show at once."""
-    if not _INPUT.value:
-        return None
-    recordings = read_recordings(_FORMAT.value, Path(_INPUT.value))
-    return recorded_set(
-        recordings, RecordedConfig(max_cases=5 if _QUICK.value else None)
-    )
+    config = RecordedConfig(max_cases=5 if _QUICK.value else None)
+    return recorded_set(recordings_of_all(logs), config) if logs else None
 
 
 def main() -> None:
     """All tables, one folder each."""
     if _WEIGHTS.value:
         alone("weights", "seed")
-    folder, recorded = Path(_OUTPUT.value), _recorded()
+    folder, logs = Path(_OUTPUT.value), _logs()
+    recorded = _recorded(logs)
     _same_run(folder)
     weights = _WEIGHTS.value or _trained(folder)
     duration = 3.0 if _QUICK.value else FULL_S
     full = suite_refs("full", 1 if _QUICK.value else None)
-    _table("suite", catalogue_set(full, duration), weights, dp=False, human=False)
+    _table("suite", catalogue_set(full, duration), weights)
     which = "free_cruise,stopped_lead" if _QUICK.value else "full"
     few = suite_refs(which, 1 if _QUICK.value else _DP_CASES.value)
     # a plan by DP takes half a second
     duration = 2.0 if _QUICK.value else FULL_S
-    _table("dp", catalogue_set(few, duration), weights[:1], dp=True, human=False)
+    _table("dp", catalogue_set(few, duration), weights[:1], dp=True)
     if recorded:
-        _table("recorded", recorded, weights, dp=False, human=True)
+        _table("recorded", recorded, weights, logs=logs)
 
 
 if __name__ == "__main__":

@@ -273,6 +273,7 @@ def import_logs(
     config: ImportConfig,
     *,
     overwrite: bool = False,
+    before_commit: Callable[[Dataset], object] = lambda dataset: None,
 ) -> Manifest:
     """Import recordings into a dataset, one after the other; shows scenes/s.
 
@@ -281,6 +282,7 @@ def import_logs(
       output: dataset folder or tensorstore URL.
       config: collection and split settings.
       overwrite: replace a finished dataset.
+      before_commit: as `DatasetWriter.finish`.
 
     Returns:
       The manifest of the finished dataset.
@@ -294,7 +296,7 @@ def import_logs(
     def cuts(known: dict[str, str]) -> Iterable[Cut]:
         return (cut(recording, config.collect, known) for recording in recordings)
 
-    return _import(cuts, None, output, config, overwrite)
+    return _import(cuts, None, output, config, overwrite, before_commit)
 
 
 def import_parts(

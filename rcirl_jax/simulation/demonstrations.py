@@ -16,8 +16,9 @@ learner's own mistakes lead (Ross et al. 2011, "DAgger", on takeovers).
 """
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -28,7 +29,7 @@ from rcirl_jax.data.files import Files
 from rcirl_jax.data.labels import add_labels
 from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.data.splits import assign_groups
-from rcirl_jax.data.store import DatasetWriter, Manifest
+from rcirl_jax.data.store import Dataset, DatasetWriter, Manifest
 from rcirl_jax.errors import InputError
 from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.planner.yielding import Yielding, yielding_policy
@@ -133,6 +134,7 @@ def drive_catalogue(
     *,
     learner: tuple[Policy, Params] | None = None,
     overwrite: bool = False,
+    before_commit: Callable[[Dataset], object] = lambda dataset: None,
 ) -> Manifest:
     """Drive cases with the driver models and write the drives as a dataset.
 
@@ -146,6 +148,7 @@ def drive_catalogue(
       learner: a policy planning every `period_s`, and its weights, with which
         the drivers take turns.
       overwrite: replace a finished dataset.
+      before_commit: as `DatasetWriter.finish`.
 
     Raises:
       InputError: no scene is left, or the place cannot be written.
@@ -155,7 +158,7 @@ def drive_catalogue(
         if writer.committed():  # of a killed run: drives are not taken up halfway
             writer = DatasetWriter(str(output), overwrite=True)
         try:
-            return _drive_all(refs, writer, config, learner)
+            return _drive_all(refs, writer, config, learner, before_commit)
         except InputError:
             writer.abort()
             raise
@@ -166,6 +169,7 @@ def _drive_all(
     writer: DatasetWriter,
     config: DriveConfig,
     learner: tuple[Policy, Params] | None,
+    before_commit: Callable[[Dataset], object],
 ) -> Manifest:
     every = round(config.period_s / STEP_S)
     learner_s, driver_s = config.turns_s
@@ -203,7 +207,8 @@ def _drive_all(
             if sum(b.vehicle.shape[0] for b in pending) >= SHARD_SCENES:
                 shard = _close(writer, shard, pending, lineage)
     _close(writer, shard, pending, lineage)
-    return _finish(writer, config, quality, names, sizes)
+    fields = _fields(config, quality, names, sizes)
+    return writer.finish(fields, before_commit)
 
 
 def _drives(
@@ -238,13 +243,13 @@ def _close(writer: DatasetWriter, shard: int, pending: list, lineage: list) -> i
     return shard + 1
 
 
-def _finish(
-    writer: DatasetWriter,
+def _fields(
     config: DriveConfig,
     quality: QualityReport,
     names: list[str],
     sizes: dict[str, int],
-) -> Manifest:
+) -> dict[str, Any]:
+    """Of the manifest."""
     if not sizes:
         raise InputError("drive: 0 scenes: expected at least one clean drive")
     fraction = config.test_fraction if len(sizes) > 1 else 0.0
@@ -252,15 +257,13 @@ def _finish(
     # names without a scene belong to the training split: every group has a split
     empty = [name for name in names if name not in sizes]
     splits["train"] = sorted([*splits["train"], *empty])
-    return writer.finish(
-        {
-            "rate_hz": [1.0 / STEP_S],
-            "sources": [{"source": SOURCE, "licence": LICENCE}],
-            "recordings": names,
-            "groups": names,
-            "vehicles": names,
-            "splits": splits,
-            "quality": quality.as_dict(),
-            "import": dataclasses.asdict(config),
-        }
-    )
+    return {
+        "rate_hz": [1.0 / STEP_S],
+        "sources": [{"source": SOURCE, "licence": LICENCE}],
+        "recordings": names,
+        "groups": names,
+        "vehicles": names,
+        "splits": splits,
+        "quality": quality.as_dict(),
+        "import": dataclasses.asdict(config),
+    }
