@@ -6,7 +6,7 @@ import os
 import platform
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from importlib import metadata
 from pathlib import Path
 
@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.common import git_commit, processor
+from experiments.common import processor, provenance
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
@@ -61,10 +61,30 @@ def timed(call: Callable[[], object], count: int, warm_up: int = 20) -> list[flo
     return seconds
 
 
-def write(name: str, result: dict, folder: str) -> Path:
-    """The result with its machine as JSON under `folder`."""
+def write(
+    name: str,
+    result: dict,
+    folder: str,
+    *,
+    weights: Sequence[str] = (),
+    data: str | None = None,
+) -> Path:
+    """The result with its machine and provenance as JSON under `folder`.
+
+    Args:
+      name: of the benchmark.
+      result: its numbers.
+      folder: where the file is written.
+      weights: weights files that were read.
+      data: dataset that was read.
+
+    Raises:
+      InputError: a weights file or the dataset is missing or damaged.
+    """
     path = Path(folder) / f"{name}.json"
-    made = {"git_commit": git_commit(), "date": datetime.date.today().isoformat()}
+    made = {**provenance(weights), "date": datetime.date.today().isoformat()}
+    if data:
+        made["data_hash"] = open_dataset(data, verify=False).hash
     write_json(path, {**result, "made_by": made, "machine": machine()})
     return path
 

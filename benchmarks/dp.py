@@ -110,7 +110,9 @@ def main(_: list[str]) -> None:
         result[name]["scenes"] = int(both.sum())
     for name, found in result.items():
         print(f"{name}: {found}")
-    print(f"written: {write('dp', result, _OUTPUT.value)}")
+    known = [_WEIGHTS.value] if _WEIGHTS.value else []
+    path = write("dp", result, _OUTPUT.value, weights=known)
+    print(f"written: {path}")
 
 
 if __name__ == "__main__":

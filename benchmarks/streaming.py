@@ -132,7 +132,7 @@ def main(_: list[str]) -> None:
             part.get("scenes", count) / part["seconds"]
         )
         print(f"{name}: {part}")
-    print(f"written: {write('streaming', result, _OUTPUT.value)}")
+    print("written:", write("streaming", result, _OUTPUT.value, data=_DATA.value))
 
 
 if __name__ == "__main__":

@@ -180,7 +180,7 @@ def main(_: list[str]) -> None:
         result["commands"] = _commands()
     for name, found in result.items():
         print(f"{name}: {found}")
-    print(f"written: {write('sweep', result, _OUTPUT.value)}")
+    print("written:", write("sweep", result, _OUTPUT.value, data=_DATA.value))
 
 
 if __name__ == "__main__":

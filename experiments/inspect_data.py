@@ -11,7 +11,7 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments.common import run
+from experiments.common import provenance, run
 from rcirl_jax.data.store import open_dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.report.data_page import choose_rows, write_data_page
@@ -36,7 +36,11 @@ def main() -> None:
     rows = rows or choose_rows(tags, _SCENES.value, _TAGS.value)
     name = Path(_DATA.value).name or _DATA.value
     page = write_data_page(
-        Path(_OUTPUT.value) / "index.html", dataset, rows, f"Dataset {name}"
+        Path(_OUTPUT.value) / "index.html",
+        dataset,
+        rows,
+        f"Dataset {name}",
+        provenance(),
     )
     print(f"{len(rows)} of {dataset.count:,} scenes drawn")
     print(f"page: {page}")

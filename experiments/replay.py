@@ -3,7 +3,7 @@
     python -m experiments.replay --weights=FILE --case=cut_in/017@0 --output=DIR
 
 `--row` names who drives: learned (default), dp, or a baseline. Looks at the
-worst moment of the drive; open case.html.
+worst moment of the drive; open case.html. What made them is in it and in case.json.
 """
 
 from pathlib import Path
@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from absl import flags
 
-from experiments.common import run
+from experiments.common import provenance, run
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.closed_loop import table_rows
 from rcirl_jax.report.case_page import write_case_page
@@ -25,6 +25,7 @@ from rcirl_jax.simulation.suite import (
     drive_with_logs,
     rollout_config,
 )
+from rcirl_jax.whole import write_json
 
 _WEIGHTS = flags.DEFINE_string("weights", None, "weights file", required=True)
 _CASE = flags.DEFINE_string("case", None, "id, for example cut_in/017@0", required=True)
@@ -42,7 +43,7 @@ def _row() -> Row:
 
 
 def main() -> None:
-    """Flags -> case.png, case.gif, case.html."""
+    """Flags -> case.png, case.gif, case.html, case.json."""
     if not 1.0 <= _DURATION.value <= FULL_S:
         raise InputError(f"--duration: {_DURATION.value}: expected 1 to {FULL_S:g} s")
     ref, row, folder = case_ref(_CASE.value), _row(), Path(_OUTPUT.value)
@@ -55,7 +56,10 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     picture = draw_case(case, record, shot, folder / "case.png", title)
     animation = animate_case(case, record, shot, folder / "case.gif", title)
-    scalars = {k: v for k, v in vars(found).items() if np.ndim(v) == 0}
+    scalars = {k: float(v) for k, v in vars(found).items() if np.ndim(v) == 0}
+    facts = provenance([_WEIGHTS.value])
+    body = {"case": ref.id, "row": row.name, "metrics": scalars, "made_by": facts}
+    write_json(folder / "case.json", body)
     page = write_case_page(
         folder / "case.html",
         title,
@@ -63,7 +67,8 @@ def main() -> None:
         f"own fault, closest {float(found.min_clearance):.2f} m.",
         picture=picture,
         animation=animation,
-        metrics={name: float(value) for name, value in scalars.items()},
+        metrics=scalars,
+        facts=facts,
     )
     print(f"{title}: page to open: {page}")
 

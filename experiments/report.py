@@ -8,7 +8,7 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments.common import run
+from experiments.common import provenance, run
 from rcirl_jax.data.store import open_dataset
 from rcirl_jax.evaluation.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.export.loading import load_runs, open_reward
@@ -32,6 +32,7 @@ def main() -> None:
         rewards=[open_reward(path) for path in _WEIGHTS.value],
         report=evaluate_ranking(dataset, learned, setup),
         workdir=Path(_WORKDIR.value) if _WORKDIR.value else None,
+        facts=provenance(_WEIGHTS.value),
     )
     print(f"report: {page}")
 

@@ -60,6 +60,7 @@ STALE = {
     **dict.fromkeys(("export", "simulate"), ("gate", "report")),
     **dict.fromkeys(("rank", "gate"), ("report",)),
 }
+NOTED = ("git_commit", "code_sha256", "versions", "flags")  # of every stage
 RIVALS = ("hand-set", "IDM", "random weights")
 REPLAYS = 6  # cases to play in the report
 
@@ -123,7 +124,9 @@ class Loop:
     ) -> None:
         facts = {**inputs, **self._code()}
         kind = name.partition(" ")[0]
-        done = self.stages.run(name, facts, outputs, work, stale=STALE.get(kind, ()))
+        stale = STALE.get(kind, ())
+        made_by = {key: self.facts[key] for key in NOTED if key in self.facts}
+        done = self.stages.run(name, facts, outputs, work, stale, made_by)
         self.say(f"[{name}] {'done' if done else 'as before, kept'}")
 
     def _code(self) -> dict:
@@ -343,7 +346,11 @@ class Loop:
         names = [f"train {number}" for number in range(self.config.seeds)]
         names = ["import", *names, "export", "rank", "simulate", "gate"]
         known = self.stages.read()
-        made = {name: known[name] for name in names if name in known}
+        made = {  # but by what: the page says it once, stages.json of each
+            name: {key: x for key, x in known[name].items() if key != "made_by"}
+            for name in names
+            if name in known
+        }
         rewards = {CANDIDATE: open_reward(str(self.weights))}
         if known := self._incumbent_reward():
             rewards[INCUMBENT] = known

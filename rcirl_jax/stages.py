@@ -2,7 +2,8 @@
 
 RUN/stages.json names, for every finished stage, the settings and hashes it was made
 from and the sha256 of what it made. A stage is skipped if both are as they were; a
-killed run goes on with the first stage that is not. One process at a time.
+killed run goes on with the first stage that is not. It also says which commit, versions
+and flags did the work, which decides nothing. One process at a time.
 """
 
 import contextlib
@@ -61,6 +62,7 @@ class Stages:
         outputs: Sequence[Path],
         work: Callable[[], object],
         stale: Sequence[str] = (),
+        made_by: Mapping[str, Any] | None = None,
     ) -> bool:
         """Do the work unless it has been done from these inputs.
 
@@ -71,6 +73,8 @@ class Stages:
           work: writes them.
           stale: stages whose outputs would mislead beside new ones; they are removed
             before the work.
+          made_by: commit, versions and flags, noted of work done now; they decide
+            nothing.
 
         Returns:
           Whether it was done now.
@@ -94,6 +98,7 @@ class Stages:
             "inputs": dict(inputs),
             "outputs": made,
             "seconds": round(time.monotonic() - begin, 1),
+            **({"made_by": dict(made_by)} if made_by else {}),
         }
         self._write({**self.read(), name: record})
         return True

@@ -126,6 +126,24 @@ def test_a_damaged_file_is_one_line(stages, text, message):
         step(stages, "a", {})
 
 
+def test_what_made_a_stage_is_noted_and_decides_nothing(stages):
+    """Another commit with the same code and inputs keeps what is there."""
+    path = stages.folder / "a.txt"
+
+    def made(commit):
+        facts = {"git_commit": commit, "flags": {"seed": 1}, "versions": {}}
+        work = lambda: path.write_text("x")  # noqa: E731
+        return stages.run("a", {"x": 1}, [path], work, made_by=facts)
+
+    assert made("abc")
+    record = stages.read()["a"]
+    assert record["made_by"] == {
+        "git_commit": "abc", "flags": {"seed": 1}, "versions": {},
+    }  # fmt: skip
+    assert not made("def")
+    assert stages.read()["a"] == record  # of the commit that did the work
+
+
 @pytest.mark.multiprocess
 def test_a_second_process_is_refused(tmp_path):
     code = (

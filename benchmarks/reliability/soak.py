@@ -159,13 +159,14 @@ def _pages() -> None:
     (data,) = Path("run").glob("dataset-*")
     dataset = open_dataset(data)
     rows = choose_rows(dataset.column("scene.tags"), DRAWN)
-    write_data_page(Path("data/index.html"), dataset, rows, "a night's data")
+    write_data_page(Path("data/index.html"), dataset, rows, "a night's data", {})
     write_ranking_page(
         Path("ranking.html"),
         dataset=dataset,
         rewards=[open_reward("run/weights.msgpack")],
         report=from_json(_plain("ranking.json")),
         workdir=None,  # whose curve is of rates, too
+        facts={},
     )
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.report.html import table_section, write_page
+from rcirl_jax.report.html import facts_text, table_section, write_page
 
 
 def write_case_page(
@@ -20,6 +20,7 @@ def write_case_page(
     picture: Path,
     animation: Path | None,
     metrics: Mapping[str, Any],
+    facts: Mapping[str, object],
 ) -> Path:
     """One HTML file of a drive: GIF, PNG and metrics; it needs no other file.
 
@@ -30,6 +31,7 @@ def write_case_page(
       picture: PNG of `draw_case`.
       animation: GIF of `animate_case`, if there is one.
       metrics: name -> value (a number or text), in the order to be shown.
+      facts: what made the page: commit, versions, flags.
     """
     sections = []
     for heading, file in (("drive", animation), ("picture", picture)):
@@ -38,6 +40,7 @@ def write_case_page(
     wide = max((len(name) for name in metrics), default=0)
     rows = [f"{name:<{wide}}  {_value(value)}" for name, value in metrics.items()]
     sections.append(table_section("metrics", "\n".join(rows)))
+    sections.append(table_section("made by", facts_text(facts)))
     return write_page(path, title, lead, sections)
 
 

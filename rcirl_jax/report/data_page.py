@@ -16,7 +16,7 @@ import tqdm
 from rcirl_jax.data.filters import REASONS
 from rcirl_jax.data.store import Dataset
 from rcirl_jax.errors import InputError
-from rcirl_jax.report.html import write_page
+from rcirl_jax.report.html import facts_text, table_section, write_page
 from rcirl_jax.report.scene_picture import draw_scene
 from rcirl_jax.report.scene_view import describe_scene, spoken, tag_names
 from rcirl_jax.types import Tag
@@ -86,6 +86,7 @@ def write_data_page(
     dataset: Dataset,
     rows: Sequence[int],
     title: str,
+    facts: Mapping[str, object],
 ) -> Path:
     """Draw the scenes into `scenes` beside the page, and write the page.
 
@@ -94,6 +95,7 @@ def write_data_page(
       dataset: what is shown.
       rows: scenes that are drawn.
       title: heading, e.g. the dataset's name.
+      facts: what made the page: commit, versions, flags.
 
     Raises:
       InputError: a row the dataset does not have, or one that cannot be drawn.
@@ -130,6 +132,7 @@ def write_data_page(
         _gallery(figures),
         _notes(quality),
         _provenance(dataset),
+        table_section("Page made by", facts_text(facts)),
     ]  # fmt: skip
     return write_page(output, title, lead, sections)
 

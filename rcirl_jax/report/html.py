@@ -2,10 +2,11 @@
 
 import base64
 import html
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from rcirl_jax.whole import write_whole
+from rcirl_jax.whole import plain, write_whole
 
 PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8">
@@ -29,6 +30,11 @@ figure {{ margin: 1rem 0; }} figcaption {{ color: #444; font-size: .9rem; }}
 def table_section(heading: str, text: str) -> str:
     """A section with preformatted text."""
     return f"<h2>{html.escape(heading)}</h2>\n<pre>{html.escape(text)}</pre>"
+
+
+def facts_text(facts: Mapping[str, object]) -> str:
+    """What made a page, as JSON."""
+    return json.dumps(plain(facts), indent=2, default=str, ensure_ascii=False)
 
 
 def picture_section(heading: str, pictures: Sequence[tuple[Path, str]]) -> str:

@@ -1,6 +1,6 @@
 """The ranking report as a page: tables, example frames, gamma_t, data quality."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +25,7 @@ def write_ranking_page(
     rewards: Sequence[Reward],
     report: RankingReport,
     workdir: Path | None,
+    facts: Mapping[str, object],
 ) -> Path:
     """Draw everything into the page's folder and write report.html.
 
@@ -34,6 +35,7 @@ def write_ranking_page(
       rewards: the learned rewards (seeds); the first one chooses in the frames.
       report: of `evaluate_ranking`.
       workdir: training run whose curve is drawn, if any.
+      facts: what made the page: commit, versions, flags.
     """
     folder = output.parent / "figures"
     sampler = SamplerConfig(mode=str(rewards[0].provenance.get("mode", "speed")))
@@ -47,11 +49,12 @@ def write_ranking_page(
     learned = [(gamma_path, "learned time weights gamma_t (seeds as a band)")]
     if workdir is not None:
         learned += draw_training(workdir, folder)
-    facts = "\n".join(
+    trained = "\n".join(
         f"{reward.file}: sha256 {reward.sha256}, commit "
         f"{reward.provenance.get('git_commit')}, seed {reward.provenance.get('seed')}"
         for reward in rewards
     )
+    made_by = {**facts, "data_hash": dataset.hash}
     return html.write_page(
         output,
         "Learned reward: ranking of held-out human driving",
@@ -62,6 +65,7 @@ def write_ranking_page(
             html.picture_section("Example frames", frames),
             html.picture_section("What was learned", learned),
             html.table_section("Data", format_quality(dataset.manifest.quality)),
-            html.table_section("Provenance", facts),
+            html.table_section("Weights", trained),
+            html.table_section("Made by", html.facts_text(made_by)),
         ],
     )

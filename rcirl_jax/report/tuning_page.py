@@ -1,7 +1,6 @@
 """The report of a tuning run: one HTML file that needs no other, verdict first."""
 
 import dataclasses
-import json
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -23,6 +22,7 @@ from rcirl_jax.report import html
 from rcirl_jax.report.charts import bars_cell, curves, legend
 from rcirl_jax.report.contributions import Contributions, contributions
 from rcirl_jax.report.frames import draw_frames, draw_training
+from rcirl_jax.report.html import facts_text
 from rcirl_jax.report.markup import (
     contents,
     folded,
@@ -44,7 +44,6 @@ from rcirl_jax.report.verdict_sections import (
 )
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.simulation.rows import RECORDED_HUMAN
-from rcirl_jax.whole import plain
 
 NUM_FRAMES = 2  # example frames
 RANKED = ("percentile_rank", "top1_fde", "top3_fde", "mrr", "crash_rate", "miss")
@@ -355,5 +354,6 @@ def _provenance(report: TuningReport) -> str:
     ]
     heads = ("reward", "file", "seed", "commit", "sha256")
     facts = {"dataset_sha256": report.dataset.hash, **report.facts}
-    body = json.dumps(plain(facts), indent=2, default=str, ensure_ascii=False)
-    return table("Weights", heads, files) + preformatted(body, "provenance")
+    return table("Weights", heads, files) + preformatted(
+        facts_text(facts), "provenance"
+    )

@@ -39,7 +39,12 @@ def test_a_small_loop(tmp_path):
     left_out = "30 cases, 4,110 of the full suite's left out; cases of 2 s instead of"
     assert verdict["part"].startswith(left_out)
     assert "recorded human" in page  # drives beside the others
-    assert list(json.loads((run / "stages.json").read_text())["stages"]) == stages
+    noted = json.loads((run / "stages.json").read_text())["stages"]
+    assert list(noted) == stages
+    for record in noted.values():
+        assert set(record["made_by"]) == {
+            "git_commit", "code_sha256", "versions", "flags",
+        }  # fmt: skip
 
     again = command("experiments.autotune", *flags)
     assert all(kept(again).values()), again.stdout

@@ -262,6 +262,7 @@ def test_the_page_needs_no_other_file(tmp_path):
         picture=picture,
         animation=animation,
         metrics={"min TTC, s": np.float32(0.51234), "red lights": 2, "note": "<ok>"},
+        facts={"git_commit": "abc", "flags": {"row": "<dp>"}},
     )
     text = page.read_text()
     assert "data:image/gif;base64," in text
@@ -270,6 +271,8 @@ def test_the_page_needs_no_other_file(tmp_path):
     assert re.search(r"min TTC, s\s+0\.5123\n", text)
     assert re.search(r"red lights\s+2\n", text)
     assert "&lt;ok&gt;" in text
+    assert "&quot;git_commit&quot;: &quot;abc&quot;" in text
+    assert "&quot;row&quot;: &quot;&lt;dp&gt;&quot;" in text
     assert not re.search(r'(src|href)="(?!data:)', text)
 
 
@@ -289,4 +292,5 @@ def test_bad_input_is_one_line(tmp_path):
             picture=tmp_path / "missing.png",
             animation=None,
             metrics={},
+            facts={},
         )

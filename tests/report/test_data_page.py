@@ -19,6 +19,7 @@ from rcirl_jax.types import Tag
 from tests.data.small_logs import CONFIG, write_logs
 
 REPO = Path(__file__).resolve().parents[2]
+FACTS = {"git_commit": "abc", "versions": {"jax": "1"}, "flags": {"scenes": 3}}
 HOSTILE = '"><script>alert(1)</script><img src=x onerror=alert(2)>'
 
 
@@ -59,7 +60,7 @@ def dataset(tmp_path_factory):
 @pytest.fixture(scope="module")
 def page(dataset, tmp_path_factory):
     output = tmp_path_factory.mktemp("page") / "index.html"
-    return write_data_page(output, dataset, [0, 3, 5], "Dataset a").read_text()
+    return write_data_page(output, dataset, [0, 3, 5], "Dataset a", FACTS).read_text()
 
 
 def test_it_is_one_file_that_needs_no_other(page):
@@ -112,7 +113,9 @@ def test_names_from_the_logs_are_text(dataset, tmp_path):
     )
     other = open_dataset(dataset._files.folder)
     other.manifest = hostile
-    page = Page(write_data_page(tmp_path / "a.html", other, [0], HOSTILE).read_text())
+    page = Page(
+        write_data_page(tmp_path / "a.html", other, [0], HOSTILE, FACTS).read_text()
+    )
     assert not page.of("script")
     assert len(page.of("img")) == 1
     assert not any("onerror" in attrs for _, attrs in page.tags)
@@ -150,7 +153,7 @@ def test_a_tag_that_nobody_has_is_one_line(wanted, line):
 
 def test_rows_beyond_the_end_are_one_line(dataset, tmp_path):
     with pytest.raises(InputError, match=r"--rows: 100000: expected 0 to \d+"):
-        write_data_page(tmp_path / "a.html", dataset, [100000], "Dataset a")
+        write_data_page(tmp_path / "a.html", dataset, [100000], "Dataset a", FACTS)
     assert not list(tmp_path.iterdir())
 
 

@@ -1,0 +1,94 @@
+"""Artefacts say what made them: commit, versions, flags, hashes of what was read."""
+
+import html
+import json
+import re
+
+import pytest
+
+from rcirl_jax.data.importing import import_parts
+from rcirl_jax.data.store import open_dataset
+from rcirl_jax.export.reader import load_weights
+from rcirl_jax.stages import file_sha256
+from tests.commands import command
+from tests.data.small_logs import CONFIG, write_logs
+from tests.weights_files import random_weights
+
+COMMON = ("flags", "git_commit", "code_sha256", "versions")
+DATA, LOGS = "--data={root}/data", ("--format=csv", "--input={root}/logs")
+WEIGHTS = "--weights={root}/w.msgpack"
+# command: what it is given, what it writes, and which hashes stand there
+ARTEFACTS = {
+    "drive_logs": (
+        ("--learner={root}/w.msgpack", "--suite=free_cruise", "--cases=2",
+         "--duration=45", "--output={out}"),
+        ("made_by.json",), ("weights_sha256",),
+    ),
+    "evaluate": (
+        (WEIGHTS, DATA, "--output={out}/ranking.json"),
+        ("ranking.json",), ("weights_sha256", "data_hash"),
+    ),
+    "inspect_data": (
+        (DATA, "--scenes=1", "--output={out}"), ("index.html",), (),
+    ),
+    "label_check": (
+        (*LOGS, DATA, "--output={out}"),
+        ("labels.json",), ("logs_sha256", "data_hash"),
+    ),
+    "replay": (
+        (WEIGHTS, "--case=free_cruise/000@0", "--duration=2", "--output={out}"),
+        ("case.html", "case.json"), ("weights_sha256",),
+    ),
+    "report": (
+        (WEIGHTS, DATA, "--output={out}/report.html"),
+        ("report.html",), ("weights_sha256", "data_hash"),
+    ),
+    "simulate": (
+        (WEIGHTS, "--suite=recorded", *LOGS, "--baselines=", "--cases=1",
+         "--duration=2", "--output={out}"),
+        ("suite.json",), ("weights_sha256", "logs_sha256"),
+    ),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    """Logs, the dataset of them, and weights."""
+    folder = tmp_path_factory.mktemp("provenance")
+    import_parts(write_logs(folder / "logs", 2), folder / "data", CONFIG)
+    random_weights(folder / "w.msgpack")
+    return folder
+
+
+def said(path):
+    """What an artefact says of its making."""
+    text = path.read_text()
+    if path.suffix == ".json":
+        return json.loads(text)["made_by"]
+    (found,) = re.findall(r"(?is)<h2>(?:page )?made by</h2>\n<pre>(\{.*?)</pre>", text)
+    return json.loads(html.unescape(found))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ARTEFACTS)
+def test_it_says_what_made_it(name, root, tmp_path):
+    flags, files, hashes = ARTEFACTS[name]
+    out = tmp_path / "out"
+    given = [flag.format(root=root, out=out) for flag in flags]
+    done = command(f"experiments.{name}", *given)
+    assert done.returncode == 0, done.stderr[-2000:]
+    weights = root / "w.msgpack"
+    expected = {
+        "weights_sha256": {str(weights): load_weights(weights).sha256},
+        "data_hash": open_dataset(root / "data").hash,
+        "logs_sha256": {
+            str(file): file_sha256(file) for file in sorted(root.glob("logs/*.csv"))
+        },
+    }
+    for file in files:
+        made_by = said(out / file)
+        assert all(made_by[key] for key in COMMON)
+        for flag in given:
+            assert flag[2:].partition("=")[0] in made_by["flags"]
+        for key in hashes:
+            assert made_by[key] == expected[key]
