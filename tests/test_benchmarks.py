@@ -28,4 +28,6 @@ def test_benchmark_writes_its_result(name, tmp_path):
     assert done.returncode == 0, done.stderr
     made = json.loads((tmp_path / f"{name}.json").read_text())
     assert made["machine"]["cores"] >= 1
-    assert made["made_by"]["git_commit"]
+    for fact in ("git_commit", "code_sha256", "versions", "date"):
+        assert made["made_by"][fact]
+    assert made["made_by"]["flags"]["output"] == str(tmp_path)

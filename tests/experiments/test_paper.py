@@ -104,6 +104,7 @@ def test_background_shift(tmp_path):
         assert ours[-1] > 2.0 * gan[-1]
         assert ours[-1] > 0.9 * ours[0]
     assert gan[-1] < 0.6 * gan[0]
+    assert body["made_by"]["flags"]["quick"] is True
     assert (tmp_path / "background_shift.png").read_bytes()[:4] == b"\x89PNG"
 
 
@@ -192,6 +193,7 @@ def test_closed_loop_over_seeds(dataset, tmp_path):
     assert [x["p_holm"] for x in differ] == pytest.approx(adjusted.tolist())
     assert (tmp_path / "closed_loop_seeds.png").read_bytes()[:4] == b"\x89PNG"
     assert "RC-IRL minus GAN: progress: " in done.stdout
+    assert len(body["made_by"]["weights_sha256"]) == 4  # two losses, two seeds
 
 
 def test_the_example_frame_says_why(dataset, tmp_path):
@@ -205,6 +207,7 @@ def test_the_example_frame_says_why(dataset, tmp_path):
     assert sum(body["reasons"].values()) == pytest.approx(apart, rel=0.02, abs=1e-4)
     assert body["row"] == 0
     assert shared_flags(body) == {}  # nothing was trained
+    assert body["made_by"]["weights_sha256"] == {str(weights): body["weights_sha256"]}
 
 
 def test_table2(tmp_path):
@@ -218,6 +221,14 @@ def test_table2(tmp_path):
     assert "the paper, GAN" in (tmp_path / "suite" / "table.txt").read_text()
     dp = json.loads((tmp_path / "dp" / "suite.json").read_text())["report"]
     assert "RC-IRL 21-15-1 DP" in dp["rows"]
+    made_by = json.loads((tmp_path / "suite" / "suite.json").read_text())["made_by"]
+    assert set(made_by["weights_sha256"]) == {
+        str(tmp_path / f"{name}.msgpack") for name in ("rcirl", "gan", "linear")
+    }
+    for name, weights in (("drives", 0), ("takeovers", 1)):
+        facts = open_dataset(tmp_path / name).facts()
+        assert len(facts["made_by"].get("weights_sha256", {})) == weights
+    assert json.loads((tmp_path / "run.json").read_text())["made_by"]["git_commit"]
     for folder in ("suite", "dp"):
         assert (tmp_path / folder / "table.png").read_bytes()[:4] == b"\x89PNG"
 
@@ -232,6 +243,7 @@ def test_robustness(tmp_path):
     assert set(body["robustness"]) == {"rank", "DP", "hand-set"}
     frames = {row["gap"]["frames"] for row in body["optimality"].values()}
     assert len(frames) == 1  # all rows on the same frames
+    assert set(body["made_by"]["weights_sha256"]) == {str(weights)}
     for name in ("optimality", "robustness"):
         assert (tmp_path / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
 

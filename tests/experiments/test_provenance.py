@@ -45,7 +45,7 @@ ARTEFACTS = {
     ),
     "simulate": (
         (WEIGHTS, "--suite=recorded", *LOGS, "--baselines=", "--cases=1",
-         "--duration=2", "--output={out}"),
+         "--duration=7", "--output={out}"),
         ("suite.json",), ("weights_sha256", "logs_sha256"),
     ),
 }  # fmt: skip
