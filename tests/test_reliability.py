@@ -1,5 +1,7 @@
 """Commands killed, told to end, and without room on the disk: by their command."""
 
+import dataclasses
+import functools
 import json
 import os
 import shutil
@@ -13,6 +15,7 @@ import pytest
 from benchmarks.reliability.jobs import jobs, write_logs
 from tests.commands import fresh as command
 from tests.conftest import REPO
+from tests.data.small_logs import files_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.multiprocess]
 
@@ -64,6 +67,22 @@ def root(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="module")
+def undisturbed(root, tmp_path_factory):
+    """Of a job, what comes out when nothing disturbs it."""
+
+    @functools.cache
+    def outcome(name):
+        job = jobs(root)[name]
+        if name in ("import", "train"):
+            return job.outcome(root)
+        folder = tmp_path_factory.mktemp(name)
+        assert limited(folder, None, job.module, *job.flags).returncode == 0
+        return job.outcome(folder)
+
+    return outcome
+
+
 # A program of its own: a fork of this process would be one beside JAX's threads
 LIMIT = """import os, resource, sys
 size, hard = int(sys.argv[1]), resource.getrlimit(resource.RLIMIT_FSIZE)[1]
@@ -73,13 +92,32 @@ os.execv(sys.executable, [sys.executable, "-m", *sys.argv[2:]])"""
 
 def limited(folder, size, module, *flags):
     """A command that can write no file longer than `size` bytes."""
-    start = [] if size is None else ["-c", LIMIT, str(size)]
-    # JAX's own cache of programs warns when it cannot be written
-    own = {"PYTHONPATH": str(REPO), "JAX_ENABLE_COMPILATION_CACHE": "0"}
+    start = ["-m"] if size is None else ["-c", LIMIT, str(size)]
     return subprocess.run(
-        [sys.executable, *(start or ["-m"]), module, *flags], cwd=folder,
-        env={**os.environ, **own}, text=True, capture_output=True, check=False,
+        [sys.executable, *start, module, *flags], cwd=folder, env=environment(),
+        text=True, capture_output=True, check=False,
     )  # fmt: skip
+
+
+def environment():
+    """Of a command; JAX's own cache of programs warns when it cannot be written."""
+    own = {"PYTHONPATH": str(REPO), "JAX_ENABLE_COMPILATION_CACHE": "0"}
+    return {**os.environ, **own, "JAX_PLATFORMS": "cpu"}
+
+
+def begun(folder, job):
+    """A process of a job's command."""
+    return subprocess.Popen(
+        [sys.executable, "-m", job.module, *job.flags], cwd=folder, env=environment(),
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+
+
+def wait_for(happened, process):
+    """Look until something has happened, while a process runs."""
+    while not happened():
+        assert process.poll() is None
+        time.sleep(0.02)
 
 
 def errors_of(done):
@@ -114,7 +152,9 @@ def flags_of(root, name):
         ("autotune", 3_000, "dataset-"),
     ],
 )
-def test_a_full_disk_is_one_line_and_the_run_goes_on(root, tmp_path, name, size, file):
+def test_a_full_disk_is_one_line_and_the_run_goes_on(
+    root, undisturbed, tmp_path, name, size, file
+):
     module, flags = flags_of(root, name)
     done = limited(tmp_path, size, module, *flags)
     assert done.returncode == 2, done.stderr[-2000:]
@@ -125,10 +165,31 @@ def test_a_full_disk_is_one_line_and_the_run_goes_on(root, tmp_path, name, size,
     for final in ("manifest.json", "w.msgpack", "report.html", "sweep.json"):
         assert not list(tmp_path.rglob(final)), final
     assert limited(tmp_path, None, module, *flags).returncode == 0
-    if name in ("import", "train", "sweep"):
-        job = jobs(root)[name]
-        if name != "sweep":
-            assert job.outcome(tmp_path) == job.outcome(root)
+    if name in jobs(root):
+        assert jobs(root)[name].outcome(tmp_path) == undisturbed(name)
+
+
+@pytest.mark.parametrize("name", ["import", "train", "sweep", "autotune"])
+def test_a_second_command_is_refused_and_the_first_not_disturbed(
+    root, undisturbed, tmp_path, name
+):
+    """The first is halted while it has its folder, so that the second meets it."""
+    job = jobs(root)[name]
+    first = begun(tmp_path, job)
+    wait_for(lambda: list(tmp_path.glob("*/.lock")), first)
+    first.send_signal(signal.SIGSTOP)
+    before = files_of(tmp_path)
+    second = limited(tmp_path, None, job.module, *job.flags)
+    after = files_of(tmp_path)
+    assert first.poll() is None
+    first.send_signal(signal.SIGCONT)
+    assert second.returncode == 2, second.stderr[-2000:]
+    (line,) = errors_of(second)
+    assert line.startswith("error: ")
+    assert "in use by another process" in line
+    assert after == before
+    assert first.wait(600) == 0
+    assert job.outcome(tmp_path) == undisturbed(name)
 
 
 def in_namespace(*words):
@@ -144,11 +205,9 @@ def in_namespace(*words):
 
 def mounted(folder, script, module, *flags):
     """A script in a namespace of its own; its "$@" is the command."""
-    own = {"PYTHONPATH": str(REPO), "JAX_ENABLE_COMPILATION_CACHE": "0"}
     return subprocess.run(
         in_namespace(script, str(folder), sys.executable, "-m", module, *flags),
-        env={**os.environ, **own, "JAX_PLATFORMS": "cpu"},
-        text=True, capture_output=True, check=False,
+        env=environment(), text=True, capture_output=True, check=False,
     )  # fmt: skip
 
 
@@ -161,7 +220,7 @@ cp -r "$0"/. "$0.kept" """
 
 @pytest.mark.parametrize(("name", "size"), [("import", "400k"), ("train", "96k")])
 def test_a_disk_without_room_is_one_line_and_the_run_goes_on(
-    root, tmp_path, name, size
+    root, undisturbed, tmp_path, name, size
 ):
     """ENOSPC from a real file system; with room again the same comes out."""
     module, flags = flags_of(root, name)
@@ -172,8 +231,7 @@ def test_a_disk_without_room_is_one_line_and_the_run_goes_on(
     assert "first 2" in done.stdout, done.stdout + done.stderr
     assert "No space left on device" in done.stderr or "room" in done.stderr
     assert "second 0" in done.stdout
-    job = jobs(root)[name]
-    assert job.outcome(tmp_path / "full.kept") == job.outcome(root)
+    assert jobs(root)[name].outcome(tmp_path / "full.kept") == undisturbed(name)
 
 
 READ_ONLY = (
@@ -193,17 +251,12 @@ def test_a_read_only_folder_is_one_line(root, tmp_path, name):
 
 
 def test_sigterm_saves_the_step_it_is_in(root, tmp_path):
-    module, flags = flags_of(root, "train")
-    flags = [x for x in flags if not x.startswith(("--epochs", "--checkpoint_every"))]
-    process = subprocess.Popen(
-        [sys.executable, "-m", module, *flags, "--epochs=5000"], cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(REPO), "JAX_PLATFORMS": "cpu"},
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-    )  # fmt: skip
+    job, own = jobs(root)["train"], ("--epochs", "--checkpoint_every")
+    flags = [x for x in job.flags if not x.startswith(own)]
+    longer = dataclasses.replace(job, flags=(*flags, "--epochs=5000"))
+    process = begun(tmp_path, longer)
     metrics = tmp_path / "run" / "metrics.jsonl"
-    while not (metrics.exists() and metrics.read_text().count("\n") >= 3):
-        assert process.poll() is None
-        time.sleep(0.05)
+    wait_for(lambda: metrics.exists() and metrics.read_text().count("\n") >= 3, process)
     begin = time.monotonic()
     process.send_signal(signal.SIGTERM)
     assert process.wait(30) == 143

@@ -81,6 +81,7 @@ class Row:
     # things that were finished at each kill: shards, checkpoints, shapes, stages
     progress_at_kill: list[int] = dataclasses.field(default_factory=list)
     seconds_to_end: list[float] = dataclasses.field(default_factory=list)
+    exit_statuses: dict[str, int] = dataclasses.field(default_factory=dict)
 
 
 def start(job: Job, folder: Path, *, broken: bool = False) -> subprocess.Popen:
@@ -169,8 +170,11 @@ def killed(job: Job, folder: Path, share: float, row: Row, *, work: bool) -> boo
     seconds = time.monotonic() - sent
     row.seconds_to_end.append(round(seconds, 2))
     if number != signal.SIGKILL:
-        # before Python hears signals they end it as they end any process
-        if status not in (128 + number, -number, 0):
+        # before Python hears signals they end it as they end any process; an end of
+        # its own may come between the last look and the signal
+        row.exit_statuses[str(status)] = row.exit_statuses.get(str(status), 0) + 1
+        early = [-number] if row.progress_at_kill[-1] == 0 else []
+        if status not in (128 + number, 0, *early):
             row.problems.append(f"exit status {status} after SIG{_SIGNAL.value}")
         if seconds > PROMISED_S:
             row.problems.append(f"{seconds:.1f} s to the end")

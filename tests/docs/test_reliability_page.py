@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 import subprocess
 import sys
 
@@ -67,13 +68,28 @@ def count_of(command):
         ("faults", "faults_kill", lambda x: sum(row["count"] for row in x["rows"])),
         ("load --what=suite", "load_suite", lambda x: x["cases"]),
         ("load --what=import", "load_import", lambda x: x["scenes"]),
-        ("soak", "soak", lambda x: x["outputs_compared"]),
+        ("soak", "soak", lambda x: f"{x['rounds']} rounds"),
     ],
     ids=lambda x: x if isinstance(x, str) else "",
 )
 def test_a_count_is_the_results(command, file, count):
     found = count(json.loads((RESULTS / f"{file}.json").read_text()))
-    assert count_of(f"python -m benchmarks.reliability.{command}") == f"{found:,}"
+    said = found if isinstance(found, str) else f"{found:,}"
+    assert count_of(f"python -m benchmarks.reliability.{command}") == said
+
+
+@pytest.mark.slow
+@pytest.mark.multiprocess
+def test_a_count_is_the_tests():
+    tested = [row for row in ROWS if row.command.startswith("pytest ")]
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.collected"], cwd=REPO, text=True,
+        input=json.dumps([shlex.split(row.command)[1:] for row in tested]),
+        capture_output=True, check=True,
+    )  # fmt: skip
+    said = {row.fault: int(row.count.split(" in ")[-1]) for row in tested}
+    found = [row.fault for row in tested], json.loads(done.stdout)
+    assert said == dict(zip(*found, strict=True))
 
 
 def test_the_count_of_the_fuzzed_reader_is_what_was_said():

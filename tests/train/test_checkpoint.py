@@ -89,7 +89,7 @@ def test_harm_to_any_file_is_found_and_named(saved, state, tmp_path, harm):
     assert restored(saved, state) == (4, 4, [])
     rng = np.random.default_rng(0)
     names = sorted(files_of(saved / "4"))
-    assert len(names) >= 8
+    assert len(names) == 12
     for number, name in enumerate(names):
         folder = tmp_path / str(number)
         shutil.copytree(saved, folder)
