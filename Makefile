@@ -41,7 +41,7 @@ EXACT := $(addprefix tests/,features/test_features.py reward/test_gradients.py \
 QUICK_XLA := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false
 TEST = $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal -m "not slow and not dataset"
 
-.PHONY: demo test test-slow test-dataset test-floor test-ceiling lint bench docs onboard setup
+.PHONY: demo test test-slow test-long test-dataset test-floor test-ceiling lint bench docs onboard setup
 .PHONY: lock audit wheel clean reliability fuzz
 
 setup: $(VENV)/.installed
@@ -74,7 +74,12 @@ test-dataset: setup
 # Killed processes, lost Ray nodes, memory, folds, the tutorial as written; one at a time.
 # Those with the marker `dataset` want the recordings as well
 test-slow: setup
-	$(BIN)/python -m pytest -q -m slow
+	$(BIN)/python -m pytest -q -m "slow and not long"
+
+# The long rows of docs/reliability.md, each by its command; hours, and `make fuzz` wants clang
+test-long: setup
+	$(BIN)/python $(PIP) install --no-deps 'atheris>=3.0'
+	$(BIN)/python -m pytest -q -m long
 
 # The quick tests with the oldest versions allowed; they run among newer neighbours that
 # announce changes to come, so such announcements are no errors here
@@ -95,8 +100,9 @@ test-ceiling:
 	build/ceiling/bin/python $(PIP) install --editable '.[quick]'
 	build/ceiling/bin/python $(QUICKLY)
 
-# Source distribution, a wheel made of it, and the quick tests far from this folder with
-# what the wheel alone brings
+# Source distribution, a wheel made of it, and the quick tests far from this folder in an environment
+# of what the wheel itself asks for with its extra `quick`, in the locked versions: what it does not
+# name is not there. Versions without hashes: pip wants hashes of all or of none, and the wheel has none
 wheel: setup
 	rm -rf dist
 	$(BIN)/python -m hatchling build --target sdist
@@ -104,8 +110,9 @@ wheel: setup
 	wheel=$$(realpath dist/*.whl) lock=$$(realpath $(LOCK)/test.lock) away=$$(mktemp -d); \
 	  trap 'rm -rf "$$away"' EXIT; set -e; \
 	  $(BIN)/python -m venv $$away/venv; cp -R tests pyproject.toml $$away; cd $$away; \
-	  venv/bin/python $(PIP) install --require-hashes --requirement $$lock; \
-	  venv/bin/python $(PIP) install --no-deps --no-index $$wheel; \
+	  sed -n 's/^\([a-z0-9].*[^ ]\) *\\$$/\1/p' $$lock > locked.txt; \
+	  venv/bin/python $(PIP) install --constraint locked.txt "$$wheel[quick]"; \
+	  venv/bin/python -m pip check; \
 	  venv/bin/python -c 'import experiments, rcirl_jax as r; print(r.__file__)'; \
 	  venv/bin/python $(QUICKLY); \
 	  venv/bin/python -m experiments.autotune --helpfull | grep -q workdir
