@@ -266,6 +266,17 @@ class Soak:
         ]
 
 
+def within(growths: Mapping[str, Growth]) -> str:
+    """What a run without problems has shown: slopes within limits, not none."""
+    rss, blocks = growths["rss_mb"], growths["blocks"]
+    return (
+        f"within the limit: {rss.per_round:.2f} MB a round [{rss.low:.2f}, "
+        f"{rss.high:.2f}], {rss.by:.0f} in all (limit {rss.allowed:.0f}), "
+        f"{blocks.per_round:,.0f} blocks a round, {blocks.by:,.0f} in all (limit "
+        f"{blocks.allowed:,.0f})"
+    )
+
+
 def save(soak: Soak) -> list[str]:
     """Write soak.json; the problems."""
     growths, problems = soak.growths(), soak.problems()
@@ -277,7 +288,7 @@ def save(soak: Soak) -> list[str]:
         "seconds": round(sum(seconds), 1),
         "warm_up_share": WARM_UP,
         "outputs_compared": len(soak.first),
-        "outcome": "no growth" if not problems else problems[0],
+        "outcome": problems[0] if problems else within(growths),
         "problems": problems,
         "growth": growths,
         # the slope carried on; not measured
@@ -310,7 +321,7 @@ def main() -> None:
         if soak.rounds % 10 == 0:
             save(soak)
     problems = save(soak)
-    print("\n".join(problems) or "no growth", flush=True)
+    print("\n".join(problems) or within(soak.growths()), flush=True)
     if problems:
         sys.exit(1)
 
