@@ -15,7 +15,7 @@ from benchmarks.reliability.fuzz.codecs import resealed, toml_text
 from benchmarks.reliability.fuzz.logs import LOGS
 from benchmarks.reliability.fuzz.targets import Bytes, OneFile, Reader, Target
 from rcirl_jax.data import signal_checks, store
-from rcirl_jax.data.files import MANIFEST, MARK, Files
+from rcirl_jax.data.files import FACTS, MANIFEST, MARK, Files
 from rcirl_jax.data.importers import synthetic
 from rcirl_jax.data.preferences import SCHEMA, read_preferences
 from rcirl_jax.evaluation.suite_files import COLUMNS, SuiteRuns, read_runs, write_runs
@@ -99,6 +99,13 @@ def dataset(folder: Path) -> Target:
             found.column(name)
 
     return Target(read, files, after=lambda index: _chain(place, shard, files, index))
+
+
+def made_by(folder: Path) -> Target:
+    """What made a dataset, as it is read from beside the manifest."""
+    made = store.open_dataset(_dataset(folder))
+    made.write_facts({"git_commit": "2fe49aa", "flags": ["--stride=1"], "cores": 2})
+    return Target(made.facts, [folder / "dataset" / FACTS])
 
 
 def _chain(place: Path, shard: Path, files: list[Path], index: int) -> None:
@@ -334,6 +341,7 @@ READERS: dict[str, Reader] = {
     "tfrecord": Reader(make=pieces.tfrecord_target, share=3),
     "sealed": Reader(make=sealed, words=("schema_version", "shards")),
     "dataset": Reader(make=dataset),
+    "made_by": Reader(make=made_by),
     "toml": Reader(make=toml, share=2, words=("[[", "]]", '"""', "1979-05-27")),
     "features": Reader(make=features),
     "scenarios": Reader(make=scenarios),
