@@ -13,6 +13,7 @@ import time
 import pytest
 
 from benchmarks.reliability.jobs import jobs, write_logs
+from tests.commands import LONGEST_S
 from tests.commands import fresh as command
 from tests.conftest import REPO
 from tests.data.small_logs import files_of
@@ -176,19 +177,22 @@ def test_a_second_command_is_refused_and_the_first_not_disturbed(
     """The first is halted while it has its folder, so that the second meets it."""
     job = jobs(root)[name]
     first = begun(tmp_path, job)
-    wait_for(lambda: list(tmp_path.glob("*/.lock")), first)
-    first.send_signal(signal.SIGSTOP)
-    before = files_of(tmp_path)
-    second = limited(tmp_path, None, job.module, *job.flags)
-    after = files_of(tmp_path)
-    assert first.poll() is None
-    first.send_signal(signal.SIGCONT)
+    try:
+        wait_for(lambda: list(tmp_path.glob("*/.lock")), first)
+        first.send_signal(signal.SIGSTOP)
+        before = files_of(tmp_path)
+        second = limited(tmp_path, None, job.module, *job.flags)
+        after = files_of(tmp_path)
+        assert first.poll() is None
+        first.send_signal(signal.SIGCONT)
+        assert first.wait(LONGEST_S) == 0
+    finally:
+        first.kill()
     assert second.returncode == 2, second.stderr[-2000:]
     (line,) = errors_of(second)
     assert line.startswith("error: ")
     assert "in use by another process" in line
     assert after == before
-    assert first.wait(600) == 0
     assert job.outcome(tmp_path) == undisturbed(name)
 
 
