@@ -146,7 +146,8 @@ def killed(job: Job, folder: Path, share: float, row: Row, *, work: bool) -> boo
     process = start(job, folder, broken=_BROKEN.value)
     begin = time.monotonic()
     of_s = row.undisturbed_s
-    if work and not job.finished(folder):
+    waits = work and not job.finished(folder)  # then this process has finished one
+    if waits:
         until_finished(job, folder, process)
         of_s -= row.first_finished_s
     try:
@@ -173,7 +174,7 @@ def killed(job: Job, folder: Path, share: float, row: Row, *, work: bool) -> boo
         # before Python hears signals they end it as they end any process; an end of
         # its own may come between the last look and the signal
         row.exit_statuses[str(status)] = row.exit_statuses.get(str(status), 0) + 1
-        early = [-number] if row.progress_at_kill[-1] == 0 else []
+        early = [] if waits else [-number]
         if status not in (128 + number, 0, *early):
             row.problems.append(f"exit status {status} after SIG{_SIGNAL.value}")
         if seconds > PROMISED_S:
