@@ -4,6 +4,8 @@ import json
 import random
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from benchmarks.reliability.fuzz import codecs, contract
 from benchmarks.reliability.fuzz.readers import READERS, shares
@@ -55,6 +57,41 @@ def test_a_reader_returns_or_says_one_line(name, tmp_path):
     assert breaches(target, drawn(target, count, name)) == {}
 
 
+# where in the file, bytes that go, bytes that come
+EDITS = st.lists(
+    st.tuples(st.floats(0.0, 1.0), st.integers(0, 9), st.binary(max_size=9)),
+    min_size=1,
+    max_size=4,
+)
+
+
+def edited(content, edits):
+    """A file with pieces replaced."""
+    for where, gone, new in edits:
+        at = int(where * len(content))
+        content = content[:at] + new + content[at + gone :]
+    return content
+
+
+def holds_after_any_edit(target, examples):
+    """The property, over hypothesis' files."""
+
+    @settings(max_examples=examples, derandomize=True, deadline=None, database=None)
+    @given(index=st.integers(0, len(target.seeds) - 1), edits=EDITS)
+    def holds(index, edits):
+        target.put(bytes([index]) + edited(target.seeds[index], edits))
+        breach, _ = contract.verdict(target.read, target.names)
+        assert breach is None, breach
+
+    holds()
+
+
+@pytest.mark.parametrize("name", sorted(READERS))
+def test_a_file_with_any_edit_is_read_or_one_line(name, tmp_path):
+    target = READERS[name].make(tmp_path / "made")
+    holds_after_any_edit(target, 25 if name in FEW else 60)
+
+
 def test_a_sweep_that_is_read_can_be_drawn(tmp_path):
     target = READERS["sweeps"].make(tmp_path / "made")
     drawings = 0
@@ -104,6 +141,8 @@ def test_another_exception_is_a_breach(tmp_path, monkeypatch):
     target = READERS["preferences"].make(tmp_path / "made")
     found = breaches(target, drawn(target, 60, 1))
     assert any(kind.startswith(("KeyError", "TypeError")) for kind in found), found
+    with pytest.raises(AssertionError, match="KeyError"):
+        holds_after_any_edit(target, 500)
 
 
 @pytest.mark.parametrize(
@@ -174,7 +213,7 @@ def _depth(value):
 def test_every_reader_has_its_share():
     dealt = shares(list(READERS), 1_000_000)
     assert sum(dealt.values()) >= 1_000_000
-    assert min(dealt.values()) >= 20_000
+    assert min(dealt.values()) >= 19_000
 
 
 @pytest.mark.slow

@@ -275,7 +275,8 @@ def test_a_guarded_row_drives(root, tmp_path):
     done = limited(tmp_path, None, "experiments.simulate", *flags, *short)
     assert done.returncode == 0, done.stderr[-2000:]
     report = json.loads((tmp_path / "out" / "suite.json").read_text())["report"]
-    assert len([name for name in report["rows"] if name.endswith(" guarded")]) == 1
+    (guarded,) = [name for name in report["rows"] if name.endswith(" guarded")]
+    assert report["rows"][guarded]["progress_m"] > 1.0
 
 
 def test_weights_of_the_tuning_loop_are_made_again(root, tmp_path):

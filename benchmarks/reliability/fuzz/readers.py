@@ -223,15 +223,21 @@ def preferences(folder: Path) -> Target:
 
 
 def checkpoints(folder: Path) -> Target:
-    """The digests of a checkpoint's files; nothing is restored."""
+    """The digests of a checkpoint's files, and its position; no array is restored."""
     step = folder / "3"
     step.mkdir(parents=True)
     (step / "state").write_bytes(b"numbers")
     found = {"state": hashlib.sha256(b"numbers").hexdigest()}
     noted = step / checkpoint.DIGESTS
     noted.write_text(json.dumps({"files": found, "sha256": checkpoint.digest(found)}))
-    names = (str(folder),)
-    return Target(lambda: checkpoint._newest_whole(folder), [noted], names)
+    position = folder / checkpoint.POSITION  # outside of what has digests
+    position.write_text(json.dumps({"epoch": 1, "position": 12, "seed": 0}))
+
+    def read() -> None:
+        checkpoint._newest_whole(folder)
+        checkpoint.read_position(position)
+
+    return Target(read, [noted, position], (str(folder),))
 
 
 def checks(folder: Path) -> Target:
