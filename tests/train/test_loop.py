@@ -146,8 +146,11 @@ def test_export_rank_report(dataset, run, tmp_path):
         rewards=[open_reward(reward.file)],
         report=report,
         workdir=run[0],
+        facts={"git_commit": "2fe49aa"},
     )
     text = page.read_text()
+    assert "2fe49aa" in text
+    assert dataset.hash in text
     assert text.count("data:image/png;base64,") >= 5
     assert 'src="http' not in text
 
