@@ -89,7 +89,7 @@ def holds_after_any_edit(target, examples):
 @pytest.mark.parametrize("name", sorted(READERS))
 def test_a_file_with_any_edit_is_read_or_one_line(name, tmp_path):
     target = READERS[name].make(tmp_path / "made")
-    holds_after_any_edit(target, 25 if name in FEW else 60)
+    holds_after_any_edit(target, 10 if name in FEW else 30)
 
 
 def test_a_sweep_that_is_read_can_be_drawn(tmp_path):

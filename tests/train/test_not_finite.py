@@ -183,21 +183,24 @@ def test_a_suite_names_row_and_case():
     assert str(caught.value) == f"simulate: {expected}"
 
 
+def one_unknown(params, scene, key):
+    """A policy of which one candidate's score is no number where the key is marked."""
+    unknown, marked = params
+    candidates = sample(key, scene, RankConfig().sampler)
+    here = jnp.all(jax.random.key_data(key) == marked)
+    way = candidates.trajectory.s[:, -1]
+    scores = jnp.where(here & (jnp.arange(way.size) == 3), unknown, way)
+    return best_plan(scene, candidates, scores, RankConfig())
+
+
 @pytest.mark.parametrize("unknown", [np.nan, np.inf, -np.inf])
 def test_a_score_that_is_no_number_is_named_by_row_and_case(unknown):
     """The filter would take the other candidates, and nobody would know."""
     cases = catalogue_set(suite_refs("smoke")[:3], 5.0)
     key = jax.random.key(int(cases.build(1, 2).seed[0]))
     marked = jax.random.fold_in(jax.random.fold_in(key, SAMPLER_STREAM), 0)
-
-    def policy(params, scene, key):
-        candidates = sample(key, scene, RankConfig().sampler)
-        here = jnp.all(jax.random.key_data(key) == jax.random.key_data(marked))
-        way = candidates.trajectory.s[:, -1]
-        scores = jnp.where(here & (jnp.arange(way.size) == 3), unknown, way)
-        return best_plan(scene, candidates, scores, RankConfig())
-
-    row = Row(name="learned", policy=policy)
+    params = jnp.float32(unknown), jax.random.key_data(marked)
+    row = Row(name="learned", policy=one_unknown, params=params)
     with pytest.raises(InputError) as caught:
         run_suite([row], cases, SuiteConfig())
     assert str(caught.value).startswith(f"simulate: learned: case {cases.ids[1]}: ")
