@@ -25,6 +25,7 @@ MAX_S = 10  # s that one input may take
 MAX_BYTES = 2 * 2**30  # bytes of memory on top of what the imports take
 PACKAGE = "benchmarks.reliability.fuzz"
 INSTRUMENTED = {"rcirl_jax", "tomllib", "defusedxml"}
+GROWTH = 2**28  # bytes of memory that one input is kept for
 EVERY_S = 1.0  # s between two writings of the status
 
 
@@ -47,6 +48,7 @@ class Session:
         self.target = self.reader.make(work)
         self._folder, self._rng = folder, random.Random(seed)
         self.inputs, self._slowest, self._last = 0, 0.0, 0.0
+        self._peak = 0  # bytes resident, at most
         self._unforeseen: dict[str, int] = {}
         self._known = _known(folder)
         self._watch = self._contract.Watch(folder)
@@ -60,6 +62,7 @@ class Session:
         with self._watch:
             breach, line = self._contract.verdict(self.target.read, self.target.names)
         spent = time.perf_counter() - begin
+        self._note_growth(data, "reading")
         breach = self._watch.seen or breach
         if breach and breach.kind == "read outside" and self.target.names_paths(data):
             breach = None
@@ -89,7 +92,15 @@ class Session:
             made = plain(data[1:], most - 1)
         else:
             made = self._codecs.mutate(data[1:], self.target.forms[index], rng)
+        self._note_growth(data, "changing")
         return bytes([index]) + made[: most - 1]
+
+    def _note_growth(self, data: bytes, doing: str) -> None:
+        """Keep what took much memory: libFuzzer looks once a second, at another."""
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+        if self._peak and peak > self._peak + GROWTH:
+            self._keep(data, "memory", doing, f"{doing}: {peak >> 20} MiB")
+        self._peak = max(self._peak, peak)
 
     def draw(self) -> bytes:
         """A mutated seed, without anything that guides."""

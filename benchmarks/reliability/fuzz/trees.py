@@ -24,6 +24,7 @@ BYTES = (
     *(b"\xff" * 9 + b"\x01", b"\x80" * 10, b"GP", b"SQLite format 3\0"),
 )
 COPIES = 20  # most of one piece, in its place
+GROWN = 2000  # nodes more, after which a tree is changed no further
 MAX_DEEP = 900  # levels put around a value; writers of more recurse too deeply
 
 
@@ -152,11 +153,18 @@ CHANGES = (
 
 
 def mutate_tree(tree: Any, rng: random.Random) -> Any:  # noqa: ANN401
-    """The tree changed in place at one to four nodes; its root may be another."""
+    """The tree changed in place at one to four nodes; its root may be another.
+
+    Copies of copies of copies would be gigabytes: a tree that has grown is left.
+    """
+    most = None
     for _ in range(rng.choice((1, 1, 1, 2, 4))):
         places = _places(tree) if isinstance(tree, dict | list) else []
         if not places:
             return odd_scalar(rng)
+        most = most or 2 * len(places) + GROWN
+        if len(places) > most:
+            break
         node, key = rng.choice(places)
         if rng.random() < 0.02:
             node[key] = deep(node[key], rng)
