@@ -115,8 +115,8 @@ def _table(
     rivals = ("hand-set", "IDM") if dp else BASELINES
     rows = table_rows(weights, rivals, _EVERY.value, dp=dp)
     rows += [human_row()] if logs else []
-    result = run_suite(rows, cases, SuiteConfig(plan_every=_EVERY.value))
     folder, made_by = Path(_OUTPUT.value) / name, provenance(weights, logs=logs)
+    result = run_suite(rows, cases, SuiteConfig(plan_every=_EVERY.value))
     print(f"--- {name}\n{write_suite(result, folder, made_by)}")
     suite_chart(folder / "table.png", result.report)
 
