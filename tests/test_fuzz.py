@@ -2,6 +2,7 @@
 
 import json
 import random
+import struct
 
 import pytest
 from hypothesis import given, settings
@@ -192,6 +193,13 @@ def test_codecs_take_any_bytes(form):
     rng = random.Random(form)
     for data in (b"", b"\0" * 40, b"{}", rng.randbytes(300)):
         assert isinstance(codecs.mutate(data, form, rng), bytes)
+
+
+@pytest.mark.parametrize("size", [-1, -16, -(2**63)])
+def test_a_section_that_ends_before_it_begins_is_no_record(size):
+    body = bytes(16 + 2048) + struct.pack("<i4xq", 1, size) + bytes(64)
+    with pytest.raises(ValueError, match="a section of"):
+        codecs.cyber(body, random.Random(0))
 
 
 def test_trees_stay_trees():

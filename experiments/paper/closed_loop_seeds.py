@@ -32,7 +32,7 @@ from experiments.paper.common import (
     unread,
     write,
 )
-from experiments.paper.weights import drives_config, trained_weights
+from experiments.paper.weights import QUICK_S, drives_config, trained_weights
 from rcirl_jax.data.joined import open_datasets
 from rcirl_jax.evaluation.closed_loop import SuiteConfig, SuiteResult, run_suite
 from rcirl_jax.evaluation.exact import holm
@@ -116,7 +116,9 @@ def main() -> None:
             file = trained_weights(folder, name, lambda: data, config)
             files.append(str(file))
             names[row].append(f"{row} (seed {seed})")
-    which, duration = ("free_cruise,stopped_lead", 3.0) if quick else ("full", FULL_S)
+    which, duration = (
+        ("free_cruise,stopped_lead", QUICK_S) if quick else ("full", FULL_S)
+    )
     refs = suite_refs(which, cases, _SEED.value)
     drivers = table_rows(
         files, RIVALS, names=[x for own in names.values() for x in own]

@@ -21,7 +21,7 @@ from pathlib import Path
 from absl import flags
 
 from experiments.common import alone, made_by_file, provenance, run
-from experiments.paper.weights import drives_config, trained_weights
+from experiments.paper.weights import QUICK_S, drives_config, trained_weights
 from rcirl_jax.data.importers import IMPORTERS
 from rcirl_jax.data.joined import open_datasets
 from rcirl_jax.data.parts import Part, parts_of, recordings_of_all
@@ -140,13 +140,12 @@ def main() -> None:
     recorded = _recorded(logs)
     _same_run(folder)
     weights = _WEIGHTS.value or _trained(folder)
-    duration = 3.0 if _QUICK.value else FULL_S
+    duration = QUICK_S if _QUICK.value else FULL_S
     full = suite_refs("full", 1 if _QUICK.value else None)
     _table("suite", catalogue_set(full, duration), weights)
     which = "free_cruise,stopped_lead" if _QUICK.value else "full"
     few = suite_refs(which, 1 if _QUICK.value else _DP_CASES.value)
     # a plan by DP takes half a second
-    duration = 2.0 if _QUICK.value else FULL_S
     _table("dp", catalogue_set(few, duration), weights[:1], dp=True)
     if recorded:
         _table("recorded", recorded, weights, logs=logs)

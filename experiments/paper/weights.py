@@ -9,6 +9,8 @@ from rcirl_jax.export.from_run import export_run
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.state import TrainConfig
 
+QUICK_S = 2.0  # s of a case of `--quick`: with one length a program serves all tables
+
 
 def drives_config(*, quick: bool, **changes: object) -> TrainConfig:
     """How rewards are learned from a driver model's drives, with some changes."""

@@ -31,6 +31,7 @@ RANKED = (
     "optimisers",
     "stability",
 )
+LONGEST = {"data_scaling", "feature_ablation", "leaky_rate_and_hidden_size"}
 # what the paired differences have to be to, beside IDM, hand-set and random
 ASKED = {
     "data_scaling": ("RC-IRL logistic, 30", "RC-IRL logistic, 100"),
@@ -108,7 +109,10 @@ def test_background_shift(tmp_path):
     assert (tmp_path / "background_shift.png").read_bytes()[:4] == b"\x89PNG"
 
 
-@pytest.mark.parametrize("name", RANKED)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(x, marks=pytest.mark.slow) if x in LONGEST else x for x in RANKED],
+)
 def test_writes_numbers_and_a_picture(name, dataset, tmp_path):
     scenes = f"--data={dataset}"
     if name == "cross_site":
@@ -172,6 +176,7 @@ def test_writes_numbers_and_a_picture(name, dataset, tmp_path):
     assert (tmp_path / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
 
 
+@pytest.mark.slow
 def test_closed_loop_over_seeds(dataset, tmp_path):
     flags = ("--quick", f"--data={dataset}", f"--output={tmp_path}")
     done = command("closed_loop_seeds", *flags)
@@ -233,6 +238,7 @@ def test_table2(tmp_path):
         assert (tmp_path / folder / "table.png").read_bytes()[:4] == b"\x89PNG"
 
 
+@pytest.mark.slow
 def test_robustness(tmp_path):
     weights = random_weights(tmp_path / "random.msgpack")
     flags = ("--quick", f"--weights={weights}", f"--output={tmp_path}")

@@ -300,6 +300,8 @@ def cyber(data: bytes, rng: random.Random) -> bytes:
     head, at, sections = data[: 16 + 2048], 16 + 2048, []
     while at + 16 <= len(data):
         kind, size = struct.unpack_from("<i4xq", data, at)
+        if size < 0:  # would be read again and again
+            raise ValueError(f"a section of {size} bytes")
         sections.append((kind, data[at + 16 : at + 16 + size]))
         at += 16 + size
     which = rng.randrange(len(sections))
