@@ -5,11 +5,13 @@
 import, train, sweep and autotune run on small synthetic data. Each runs once
 undisturbed; then it is killed at random moments, again and again, started by the same
 command each time, and when it has ended by itself its outputs are compared to the bit.
-Half of the moments are uniform over the whole run (`--moments=run`: all), half wait
-until something is finished (a shard, a checkpoint, a shape of a sweep, a stage;
-`--moments=work`: all) and are uniform over the rest. `--signal=TERM` (to the process,
-as a cluster does) and `INT` (to its group, as a terminal does) also hold the seconds to
-the end and the exit status against what is promised. `--broken_resume` has trainings
+Half of the moments are uniform over the whole run (`--moments=run`: all). The others
+(`--moments=work`: all) are, in turn, as soon as some but not all of its things are
+finished (shards, checkpoints, shapes of a sweep, stages), and uniform over the time
+after the first. A command that no kill found so half done is a problem.
+`--signal=TERM` (to the process, as a cluster does) and `INT` (to its group, as a
+terminal does) also hold the seconds to the end and the exit status against what is
+promised. `--broken_resume` has trainings
 forget where in the data they were: this file has to say so and end with 1.
 
 Writes faults_SIGNAL.json after every comparison, one row per command.
@@ -17,6 +19,7 @@ Writes faults_SIGNAL.json after every comparison, one row per command.
 
 import collections
 import dataclasses
+import itertools
 import os
 import shutil
 import signal
@@ -55,11 +58,12 @@ ROOT = Path(__file__).resolve().parents[2]
 MOST_S = 1800.0  # s after which a command counts as hanging
 PROMISED_S = 10.0  # s from a signal to the end
 IN_A_ROW = 4  # kills before a command may end
-LOOK_S = 0.02  # s between two looks at what is finished
+LOOK_S = 0.005  # s between two looks at what is finished
 MOMENTS = {
     "run": "uniform over the run",
-    "work": "uniform over the time after the first finished thing",
-    "both": "half uniform over the run, half after the first finished thing",
+    "work": "half with some things finished, half uniform over the time after one",
+    "both": "half uniform over the run, a quarter with some things finished, a "
+    "quarter uniform over the time after one",
 }
 FINISHED = "holds a finished dataset"  # killed between its last file and its end
 
@@ -73,6 +77,7 @@ class Row:
     command: str
     undisturbed_s: float
     first_finished_s: float  # when the undisturbed run had finished something
+    things: int  # that the undisturbed run finished
     count: int = 0  # kills that met a running command
     comparisons: int = 0
     outcome: str = "not compared"
@@ -106,10 +111,12 @@ def start(job: Job, folder: Path, *, broken: bool = False) -> subprocess.Popen:
         )
 
 
-def until_finished(job: Job, folder: Path, process: subprocess.Popen) -> float:
-    """Wait until something is finished, or the process has ended; seconds."""
+def until_finished(
+    job: Job, folder: Path, process: subprocess.Popen, count: int = 1
+) -> float:
+    """Wait until so many things are finished, or the process has ended; seconds."""
     begin = time.monotonic()
-    while process.poll() is None and not job.finished(folder):
+    while process.poll() is None and job.finished(folder) < count:
         if time.monotonic() - begin > MOST_S:
             break
         time.sleep(LOOK_S)
@@ -136,22 +143,26 @@ def to_the_end(job: Job, folder: Path, *, broken: bool = False) -> tuple[float, 
     return time.monotonic() - begin, first_s
 
 
-def killed(job: Job, folder: Path, share: float, row: Row, *, work: bool) -> bool:
-    """Start it and end it after a share of its time; False if it ended before.
+def killed(job: Job, folder: Path, share: float, row: Row, moment: str) -> bool:
+    """Start it and end it at a moment; False if it ended before.
 
-    With `work` it first waits until something is finished; the share is then of the
-    rest. In a folder where something is, it starts at once, and is of all.
+    "run": after a share of its time. "after": once something is finished, after a
+    share of the rest. "between": once a share of the first half of its things is
+    finished. In a folder where they are, after a share of all its time.
     """
     number = signal.Signals[f"SIG{_SIGNAL.value}"]
     process = start(job, folder, broken=_BROKEN.value)
     begin = time.monotonic()
-    of_s = row.undisturbed_s
-    waits = work and not job.finished(folder)  # then this process has finished one
+    half = max(row.things // 2, 1)
+    count = {"run": 0, "after": 1, "between": 1 + int(share * half)}[moment]
+    wait_s = share * row.undisturbed_s
+    waits = job.finished(folder) < count  # then this process has finished one
     if waits:
-        until_finished(job, folder, process)
-        of_s -= row.first_finished_s
+        until_finished(job, folder, process, count)
+        rest_s = row.undisturbed_s - row.first_finished_s
+        wait_s = share * rest_s if moment == "after" else 0.0
     try:
-        process.wait(share * of_s)
+        process.wait(wait_s)
         return False
     except subprocess.TimeoutExpired:
         pass
@@ -182,23 +193,26 @@ def killed(job: Job, folder: Path, share: float, row: Row, *, work: bool) -> boo
     return True
 
 
-def _of_work(count: int) -> np.ndarray:
-    """Which of so many kills wait until something is finished; `both`: half, up."""
-    share = {"run": 0, "work": count, "both": (count + 1) // 2}[_MOMENTS.value]
-    return np.arange(count) < share
+def _moments(count: int) -> list[str]:
+    """Of so many kills; `both`: half, rounded up, wait for what is finished."""
+    work = {"run": 0, "work": count, "both": (count + 1) // 2}[_MOMENTS.value]
+    waiting = itertools.islice(itertools.cycle(("between", "after")), work)
+    return [*waiting, *["run"] * (count - work)]
 
 
 def disturbed(job: Job, root: Path, count: int, row: Row, expected: Facts) -> None:
     """Kill it `count` times in all, in as many folders as that takes."""
     # a generator for each command, so that one can be run again alone
     rng = np.random.default_rng([_SEED.value, list(SHARES).index(job.name)])
-    work = rng.permutation(_of_work(count))
+    moments = rng.permutation(_moments(count))
     while row.count < count:
         folder = root / f"{job.name}-{row.comparisons}"
         folder.mkdir()
-        for _ in range(min(IN_A_ROW, count - row.count)):
+        for number in range(min(IN_A_ROW, count - row.count)):
+            if number and moments[row.count] == "between":
+                break  # in a new folder, where nothing is finished
             share = float(rng.uniform())
-            if not killed(job, folder, share, row, work=bool(work[row.count])):
+            if not killed(job, folder, share, row, moments[row.count]):
                 break
             row.count += 1
         try:
@@ -211,8 +225,9 @@ def disturbed(job: Job, root: Path, count: int, row: Row, expected: Facts) -> No
         except InputError as error:
             row.problems.append(str(error))
         row.comparisons += 1
-        if row.count >= count and any(work) and not any(row.progress_at_kill):
-            row.problems.append("no kill after something was finished")
+        half_done = any(0 < x < row.things for x in row.progress_at_kill)
+        if row.count >= count and "between" in moments and not half_done:
+            row.problems.append(f"no kill with some of {row.things} finished")
         row.outcome = "as undisturbed" if not row.problems else row.problems[0]
         print(f"{job.name}: {row.count} of {count} {row.fault}: {row.outcome}")
         save(row)
@@ -255,6 +270,7 @@ def main() -> None:
             command=f"{job.module} {' '.join(job.flags)}".replace(str(root), "ROOT"),
             undisturbed_s=round(seconds, 2),
             first_finished_s=round(first_s, 2),
+            things=job.finished(folder),
         )
         if again != expected:
             odd = [x for x in expected if again.get(x) != expected[x]]

@@ -25,6 +25,7 @@ from rcirl_jax.data.importers import (
 )
 from rcirl_jax.data.importers.argoverse2_map import read_lanes
 from rcirl_jax.data.importers.parquet import read_columns
+from rcirl_jax.data.importers.safe_xml import read_xml
 from rcirl_jax.data.importers.sqlite_ro import Database
 from rcirl_jax.data.importers.zarr2 import StructuredArray
 from rcirl_jax.data.shards import describe
@@ -347,6 +348,22 @@ def test_deep_xml_is_read_or_one_line(tmp_path):
     inner = "<a>" * 3000 + "</a>" * 3000
     writers.commonroad(tmp_path / "deep.xml", writers.lanelet(), writers.car(), inner)
     assert len(list(read_recordings("commonroad", tmp_path))) == 1
+
+
+@pytest.mark.parametrize("name", ["commonroad", "osm"])
+@pytest.mark.parametrize(
+    "prolog",
+    [
+        '<!DOCTYPE b [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;">]>',
+        '<!DOCTYPE b [<!ENTITY x SYSTEM "file:///etc/hostname">]>',
+        '<!DOCTYPE b SYSTEM "file:///etc/hostname">',
+    ],
+)
+def test_xml_of_entities_or_references_is_refused(tmp_path, name, prolog):
+    file = tmp_path / "x.xml"
+    file.write_text(f"{prolog}<{name}/>")
+    line = line_of(lambda: read_xml(file, name, 10_000))
+    assert line.endswith("expected no DTD, entities or external references")
 
 
 # ------------------------------------------------------------------------- sizes

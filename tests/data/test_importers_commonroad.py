@@ -353,7 +353,7 @@ def test_malformed(tmp_path, parts, options, field):
     [
         (b"\x00\xff\xfe\x01garbage" * 100, "xml"),
         (b"", "xml"),
-        (b"<other/>", "root: other"),
+        (b"<other/>", "root: 'other'"),
         (b'<commonRoad commonRoadVersion="2020a" timeStepSize="x"/>', "timeStepSize"),
         (b'<?xml version="1.0" encoding="klingon"?><commonRoad/>', "xml"),
     ],

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rcirl_jax.data.importers import lanelet2, lanelet2_rules, safe_xml
+from rcirl_jax.data.importers import lanelet2, lanelet2_rules
 from rcirl_jax.data.importers.lanelet2 import read_lanelet2
 from rcirl_jax.data.importers.lanelet2_rules import members
 from rcirl_jax.data.importers.projection import utm, utm_zone
@@ -289,7 +289,7 @@ def test_malformed(tmp_path, text, field):
 
 
 def test_too_large_a_file(tmp_path, monkeypatch):
-    monkeypatch.setattr(safe_xml, "MAX_FILE_BYTES", 100)
+    monkeypatch.setattr(lanelet2, "MAX_FILE_BYTES", 100)
     with pytest.raises(InputError, match="size"):
         read(metres(tmp_path))
 

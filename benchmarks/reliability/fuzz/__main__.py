@@ -167,7 +167,7 @@ def keep(row: Row, folder: Path, output: Path) -> None:
 
 
 def main() -> None:
-    """Fuzz the readers; exit status 1 if any broke a promise."""
+    """Fuzz the readers; exit status 1 if any broke a promise or inputs are missing."""
     names, output = chosen(), Path(_OUTPUT.value)
     result = "fuzz_copies" if _COPIES.value else "fuzz"
     output.mkdir(parents=True, exist_ok=True)
@@ -188,7 +188,9 @@ def main() -> None:
     write(result, {"rows": rows, "limits": limits}, str(output))
     total, broken = (sum(map(count, rows)) for count in (_inputs, _crashes))
     print(f"{total:,} inputs, {broken} crashes")
-    if broken:
+    if total < _INPUTS.value:
+        print(f"expected {_INPUTS.value:,} inputs: give it more --seconds")
+    if broken or total < _INPUTS.value:
         sys.exit(1)
 
 

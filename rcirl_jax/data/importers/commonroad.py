@@ -11,7 +11,7 @@ import dataclasses
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from xml.etree.ElementTree import Element, ParseError
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from rcirl_jax.data.importers.commonroad_extras import (
 from rcirl_jax.data.importers.files import files_below, log_name
 from rcirl_jax.data.importers.lanelets import read_lanes
 from rcirl_jax.data.importers.options import is_file_name, one_pattern
+from rcirl_jax.data.importers.safe_xml import read_xml
 from rcirl_jax.data.importers.xml_fields import Fields
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
@@ -114,33 +115,8 @@ def _read_groups(path: Path, name: str) -> dict[str, str]:
     return {}
 
 
-def parse_xml(path: Path) -> Element:
-    """The root element, with entities and external references forbidden."""
-    from defusedxml import DefusedXmlException
-    from defusedxml import ElementTree as Safe
-
-    if path.stat().st_size > MAX_FILE_BYTES:
-        raise InputError(
-            f"{path}: size: {path.stat().st_size} bytes: "
-            f"expected at most {MAX_FILE_BYTES}"
-        )
-    try:
-        root = Safe.parse(path, forbid_dtd=True).getroot()
-    except DefusedXmlException as error:
-        kind = type(error).__name__
-        raise InputError(
-            f"{path}: xml: {kind}: expected no DTD, entities or external references"
-        ) from error
-    except (ParseError, ValueError, LookupError) as error:
-        raise InputError(f"{path}: xml: {error}: expected well-formed XML") from error
-    if root is None or root.tag != "commonRoad":
-        tag = "nothing" if root is None else root.tag
-        raise InputError(f"{path}: root: {tag}: expected commonRoad")
-    return root
-
-
 def _read_file(path: Path, spec: dict, groups: dict[str, str]) -> Recording:
-    root, fields = parse_xml(path), Fields(path)
+    root, fields = read_xml(path, "commonRoad", MAX_FILE_BYTES), Fields(path)
     version = root.get("commonRoadVersion", "none")
     if version not in VERSIONS:
         raise InputError(

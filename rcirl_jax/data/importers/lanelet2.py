@@ -38,6 +38,7 @@ NOT_FOR_VEHICLES = (
     *("walkway", "shared_walkway", "crosswalk", "stairs", "bicycle_lane"),
     *("sidewalk", "pedestrian", "emergency_lane"),
 )
+MAX_FILE_BYTES = 256 * 1024**2  # bytes, larger files are refused
 MIN_HALF_WIDTH_M = 0.1  # m, lanelets taper to a point at forks
 MIN_STEP_M = 0.25  # m between points of a lane
 SAME_PLACE_M = 1e-3  # m, end points that near are one
@@ -70,7 +71,7 @@ def read_lanelet2(path: Path, project: Projection) -> tuple[tuple[Lane, ...], li
     Raises:
       InputError: not well-formed, a point without a position, or no lane.
     """
-    root = read_xml(path, "osm")
+    root = read_xml(path, "osm", MAX_FILE_BYTES)
     found = {
         kind: {
             element.get("id", ""): element

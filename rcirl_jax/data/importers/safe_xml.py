@@ -5,11 +5,14 @@ from xml.etree.ElementTree import Element, ParseError
 
 from rcirl_jax.errors import InputError
 
-MAX_FILE_BYTES = 256 * 1024**2  # bytes, larger files are refused
 
-
-def read_xml(path: Path, tag: str) -> Element:
+def read_xml(path: Path, tag: str, max_bytes: int) -> Element:
     """The root element, which has to be called `tag`.
+
+    Args:
+      path: of the file.
+      tag: of its root.
+      max_bytes: larger files are refused.
 
     Raises:
       InputError: too large a file, a DTD, entities or external references, XML
@@ -19,10 +22,8 @@ def read_xml(path: Path, tag: str) -> Element:
     from defusedxml import ElementTree as Safe
 
     size = path.stat().st_size
-    if size > MAX_FILE_BYTES:
-        raise InputError(
-            f"{path}: size: {size} bytes: expected at most {MAX_FILE_BYTES}"
-        )
+    if size > max_bytes:
+        raise InputError(f"{path}: size: {size} bytes: expected at most {max_bytes}")
     try:
         root = Safe.parse(path, forbid_dtd=True).getroot()
     except DefusedXmlException as error:
