@@ -31,6 +31,7 @@ from rcirl_jax.stages import digest, file_sha256
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "reliability.md"
 NOT_RUN = 77  # status of a row whose tests were skipped, in part or all
+TOLD = 4000  # characters of what a row said that came out otherwise
 # what no row's outcome depends on, by its path from the root
 NO_CODE = re.compile(r"docs/|benchmarks/results/|.*\.md$")
 WORLD = ("make audit", "make test-ceiling")  # depend on what others publish
@@ -138,6 +139,8 @@ def ran(row: Row) -> dict:
     )  # fmt: skip
     said, skipped = summed_up(done.stdout, done.stderr, done.returncode)
     status = done.returncode or (NOT_RUN if skipped else 0)
+    if status:  # the file keeps one line of it
+        print((done.stdout + done.stderr)[-TOLD:], file=sys.stderr)
     return {
         **dataclasses.asdict(row),
         "status": status,

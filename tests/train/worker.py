@@ -13,6 +13,7 @@ from rcirl_jax.data import pipeline
 from rcirl_jax.data.store import open_dataset
 from rcirl_jax.interrupts import Interrupted
 from rcirl_jax.sampling import SamplerConfig
+from rcirl_jax.train.checkpoint import DIGESTS
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.processes import join_processes
 from rcirl_jax.train.running import Running
@@ -46,7 +47,7 @@ class Compilations:
 def main():
     job = json.loads(sys.argv[1])
     number, workdir = job["process_id"] or 0, Path(job["workdir"])
-    saved = workdir / "checkpoints" / str(job["kill_after"])
+    saved = workdir / "checkpoints" / str(job["kill_after"]) / DIGESTS
     join_processes(job["address"], job["num_processes"], job["process_id"])
     compilations, after_first = Compilations(), []
 
@@ -55,7 +56,7 @@ def main():
         time.sleep(job["pause_s"])
         (workdir / f"step_{number}").write_text(str(step))
         if step == job["kill_after"] + 1 and number in job["victims"]:
-            while not saved.is_dir():  # it is being written while the steps go on
+            while not saved.exists():  # it is being written while the steps go on
                 time.sleep(0.02)
             os.kill(os.getpid(), signal.SIGKILL)
 
