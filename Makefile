@@ -78,7 +78,7 @@ test-slow: setup
 
 # The long rows of docs/reliability.md, each by its command; hours, and `make fuzz` wants clang
 test-long: setup
-	$(BIN)/python $(PIP) install --no-deps 'atheris>=3.0'
+	$(BIN)/python $(PIP) install $(if $(LOCK),--require-hashes --requirement $(LOCK)/fuzz.lock,--requirement requirements/fuzz.in)
 	$(BIN)/python -m pytest -q -m long
 
 # The quick tests with the oldest versions allowed; they run among newer neighbours that
@@ -168,6 +168,7 @@ lock: build/tools/.installed
 	$(COMPILE) $(PROJECT) --extra all --constraint requirements/test.lock --output-file requirements/all.lock
 	$(COMPILE) $(PROJECT) --extra quick --resolution lowest-direct --output-file requirements/floor.lock
 	$(COMPILE) requirements/tools.in --output-file requirements/tools.lock
+	$(COMPILE) requirements/fuzz.in --output-file requirements/fuzz.lock
 
 build/tools/.installed: $(if $(LOCK),$(LOCK)/tools.lock,requirements/tools.in)
 	$(PYTHON) -m venv build/tools
@@ -176,22 +177,24 @@ build/tools/.installed: $(if $(LOCK),$(LOCK)/tools.lock,requirements/tools.in)
 
 # Known vulnerabilities of the locked versions; `AUDIT=--vulnerability-service=osv` asks elsewhere
 audit: build/tools/.installed
-	build/tools/bin/python .ci/audit.py $(AUDIT) $(addprefix requirements/,all.lock test.lock tools.lock)
+	build/tools/bin/python .ci/audit.py $(AUDIT) $(addprefix requirements/,all.lock test.lock tools.lock fuzz.lock)
 
 # Every row of docs/reliability.md that has not come out as stated with this code before;
 # `MINUTES=2` leaves out what takes longer, `ANEW=1` runs all. Rows that depend on what others
 # publish, audit and test-ceiling, are run each time
 reliability: setup
-	$(BIN)/python $(PIP) install --no-deps 'atheris>=3.0'
+	$(BIN)/python $(PIP) install $(if $(LOCK),--require-hashes --requirement $(LOCK)/fuzz.lock,--requirement requirements/fuzz.in)
 	$(BIN)/python -m benchmarks.reliability.table $(if $(MINUTES),--minutes=$(MINUTES)) $(if $(ANEW),--anew) --output=$(RESULTS)
 
 # The C++ reader under libFuzzer; needs clang and its runtime
 FUZZ_SECONDS ?= 720
+# fewer than these are a failure
+FUZZ_INPUTS ?= 1000000
 fuzz: setup
 	$(BIN)/python -m onboard.fuzz.make_corpus --output=out/fuzz/corpus
 	cmake -S onboard -B build/fuzz -DCMAKE_CXX_COMPILER=clang++ -DRCIRL_BUILD_FUZZ=ON
 	cmake --build build/fuzz --target fuzz_load
-	$(BIN)/python -m onboard.fuzz.counted build/fuzz/fuzz_load \
+	$(BIN)/python -m onboard.fuzz.counted $(FUZZ_INPUTS) build/fuzz/fuzz_load \
 	  -dict=out/fuzz/weights.dict -max_len=16384 -timeout=10 \
 	  -max_total_time=$(FUZZ_SECONDS) -print_final_stats=1 out/fuzz/corpus
 

@@ -1,9 +1,10 @@
 """A libFuzzer program, and one last line of how many inputs it ran.
 
-    python -m onboard.fuzz.counted build/fuzz/fuzz_load -max_total_time=600 CORPUS
+    python -m onboard.fuzz.counted LEAST build/fuzz/fuzz_load -max_total_time=600 CORPUS
 
 What the program says is passed on; the line is on stdout, the exit status its own. A
-program that says nowhere how many it ran is one line on stderr and exit status 1.
+program that ran fewer than LEAST inputs, or does not say how many, is one line on
+stderr and exit status 1.
 """
 
 import re
@@ -19,8 +20,8 @@ def runs(lines: Iterable[str]) -> int:
     return sum(int(x[1]) for line in lines if (x := DONE.match(line)))
 
 
-def main(words: list[str]) -> int:
-    """Run the program; its exit status."""
+def main(least: int, words: list[str]) -> int:
+    """Run the program; its exit status, 1 with fewer than `least` inputs."""
     said = []
     with subprocess.Popen(
         words, stderr=subprocess.PIPE, text=True, errors="replace"
@@ -30,12 +31,15 @@ def main(words: list[str]) -> int:
             said.append(line)
     if process.returncode != 0:
         return process.returncode
-    if not runs(said):
-        print(f"error: {words[0]}: no line of how many runs", file=sys.stderr)
+    done = runs(said)
+    if done < least:
+        print(
+            f"error: {words[0]}: {done:,} inputs: expected {least:,}", file=sys.stderr
+        )
         return 1
-    print(f"fuzz: {runs(said):,} inputs, no crash")
+    print(f"fuzz: {done:,} inputs, no crash")
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main(int(sys.argv[1]), sys.argv[2:]))

@@ -148,7 +148,7 @@ def test_sumo_beside_commonroad(tmp_path):
     (tmp_path / "solution.xml").write_text('<CommonRoadSolution date="2024"/>')
     assert names("commonroad", tmp_path) == ["DEU_A9-1_1_I-1.cr"]
     (tmp_path / "broken.xml").write_text("<scenario/>")
-    with pytest.raises(InputError, match=r"broken\.xml: root: 'scenario': expected commonRoad"):
+    with pytest.raises(InputError, match=r"broken\.xml: root: 'scenario': expected"):
         names("commonroad", tmp_path)
 
 

@@ -31,7 +31,13 @@ RANKED = (
     "optimisers",
     "stability",
 )
-LONGEST = {"data_scaling", "feature_ablation", "leaky_rate_and_hidden_size"}
+LONGEST = {
+    "data_scaling",
+    "feature_ablation",
+    "known_truth",
+    "leaky_rate_and_hidden_size",
+    "linear_vs_network",
+}
 # what the paired differences have to be to, beside IDM, hand-set and random
 ASKED = {
     "data_scaling": ("RC-IRL logistic, 30", "RC-IRL logistic, 100"),
@@ -215,6 +221,7 @@ def test_the_example_frame_says_why(dataset, tmp_path):
     assert body["made_by"]["weights_sha256"] == {str(weights): body["weights_sha256"]}
 
 
+@pytest.mark.slow
 def test_table2(tmp_path):
     """From drives to the table: every row over every family."""
     done = command("table2", "--quick", f"--output={tmp_path}")
@@ -254,6 +261,7 @@ def test_robustness(tmp_path):
         assert (tmp_path / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
 
 
+@pytest.mark.slow
 def test_human_likeness_beside_a_tuned_hand_set_cost(dataset, tmp_path):
     tuned, data = tmp_path / "tuned.json", f"--data={dataset}"
     small = ("--budget=8", "--scenes=16", f"--output={tuned}")

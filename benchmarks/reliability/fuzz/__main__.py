@@ -4,8 +4,9 @@
 
 Each reader runs in a process of its own, in which an input may take 10 s and 2 GiB,
 and may open, write and start nothing outside its folder. It has to return, or to raise
-`InputError` of one line that names the file. With the extra [fuzz] (atheris) coverage
-of our code guides the inputs, else they are drawn at random. Most are made inside of
+`InputError` of one line that names the file. Coverage
+of our code guides the inputs (atheris, the extra [fuzz]; without it `--unguided`
+draws them at random). Most are made inside of
 their form: checksums, lengths and compression are right, what they hold is not.
 `--copies=3000` puts one piece (row, element, field, item) so often into a file.
 
@@ -44,6 +45,7 @@ _READERS = flags.DEFINE_list("readers", ["all"], "which of them")
 _SECONDS = flags.DEFINE_integer("seconds", 3600, "at most so long a reader", 1)
 _SEED = flags.DEFINE_integer("seed", 0, "of the inputs")
 _COPIES = flags.DEFINE_integer("copies", 0, "most of one piece; 0: a few, guided", 0)
+_UNGUIDED = flags.DEFINE_bool("unguided", False, "at random, without atheris")
 _OUTPUT = flags.DEFINE_string("output", "benchmarks/results", "folder of the JSON")
 MOST_DEATHS = 20  # of a reader's processes
 SLACK_S = 60.0  # s for seeds, on top of what a reader is given
@@ -79,6 +81,11 @@ def chosen() -> list[str]:
     return names
 
 
+def is_guided() -> bool:
+    """Whether coverage guides the inputs; many copies get too long for that."""
+    return not (_COPIES.value or _UNGUIDED.value)
+
+
 def start(row: Row, folder: Path, inputs: int, seconds: int) -> tuple[int, str]:
     """One process; (exit status, what it said)."""
     said = folder / "said.txt"
@@ -99,15 +106,14 @@ def _child(name: str, folder: Path, inputs: int, seconds: int) -> None:
     with (folder / "said.txt").open("w") as file:
         for stream in (1, 2):
             os.dup2(file.fileno(), stream)
-    child.fuzz(name, folder, inputs, seconds, _SEED.value, _COPIES.value)
+    child.fuzz(name, folder, inputs, seconds, _SEED.value, _COPIES.value, is_guided())
 
 
 def fuzzed(name: str, inputs: int, seconds: int, output: Path) -> Row:
     """All inputs of a reader; a process that dies is followed by another."""
-    guided = child.has_atheris() and not _COPIES.value
     row = Row(
         reader=name,
-        mutator=f"{'atheris' if guided else 'at random'}, by form",
+        mutator=f"{'atheris' if is_guided() else 'at random'}, by form",
         command=f"python -m {child.PACKAGE} --readers={name} --inputs={inputs} "
         f"--seed={_SEED.value} --copies={_COPIES.value}",
     )
@@ -169,6 +175,8 @@ def keep(row: Row, folder: Path, output: Path) -> None:
 def main() -> None:
     """Fuzz the readers; exit status 1 if any broke a promise or inputs are missing."""
     names, output = chosen(), Path(_OUTPUT.value)
+    if is_guided() and not child.has_atheris():
+        raise InputError("atheris: not installed: expected, or --unguided")
     result = "fuzz_copies" if _COPIES.value else "fuzz"
     output.mkdir(parents=True, exist_ok=True)
     rows = []

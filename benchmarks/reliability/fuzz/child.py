@@ -200,21 +200,27 @@ def instrumented() -> Iterator[None]:
 
 
 def fuzz(
-    name: str, folder: Path, inputs: int, seconds: int, seed: int, copies: int
+    name: str,
+    folder: Path,
+    inputs: int,
+    seconds: int,
+    seed: int,
+    copies: int,
+    guide: bool,
 ) -> None:
     """Fuzz one reader in this process; it may not return.
 
-    With more copies of a piece than usual, files get too long for a guided search.
+    At most `copies` of a piece, if not 0; guided by coverage (atheris) or at random.
     """
     trees = importlib.import_module(f"{PACKAGE}.trees")
-    usual, trees.COPIES = trees.COPIES, copies or trees.COPIES
+    trees.COPIES = copies or trees.COPIES
     session = Session(name, folder, seed)
     for index, content in enumerate(session.target.seeds):
         session.run(bytes([index]) + content)
     gc.collect()
     gc.freeze()  # what the imports made is never looked through again
     limit_memory()
-    if has_atheris() and usual >= trees.COPIES:
+    if guide:
         limits = [f"-runs={inputs}", f"-max_total_time={seconds}", f"-seed={seed}"]
         guided(session, folder, limits)
     else:
