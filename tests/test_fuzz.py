@@ -1,9 +1,11 @@
 """Damaged files for every reader, a few; benchmarks.reliability.fuzz has more."""
 
+import importlib.util
 import json
 import random
 import struct
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -12,12 +14,12 @@ from benchmarks.reliability.fuzz import codecs, contract
 from benchmarks.reliability.fuzz.readers import READERS, shares
 from benchmarks.reliability.fuzz.trees import MAX_DEEP, deep, mutate_tree
 from rcirl_jax.data import preferences
-from rcirl_jax.errors import InputError
+from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.export.from_run import read_config
 from rcirl_jax.export.sweep import read_sweep
 from rcirl_jax.features import mapping
 from rcirl_jax.report.sweep_picture import sweep_picture
-from tests.commands import command
+from tests.commands import command, fresh
 
 FEW = ("apollo", "nuplan", "argoverse2", "l5", "interaction", "suite", "scenarios")
 
@@ -222,6 +224,30 @@ def test_every_reader_has_its_share():
     dealt = shares(list(READERS), 1_000_000)
     assert sum(dealt.values()) >= 1_000_000
     assert min(dealt.values()) >= 19_000
+
+
+def test_refused_memory_is_a_breach():
+    def read():
+        with as_input_error("a.csv", "rows"):
+            np.empty(2**62, np.uint8)
+
+    breach, line = contract.verdict(read, ["a.csv"])
+    assert breach.kind.startswith("MemoryError at ")
+    assert line.startswith("a.csv: MemoryError: Unable to allocate 4.00 EiB")
+
+
+@pytest.mark.slow
+@pytest.mark.multiprocess
+def test_the_command_is_guided_or_refuses(tmp_path):
+    """In an environment with atheris (`make reliability`) and without."""
+    flags = ("--readers=tfrecord", "--inputs=50", f"--output={tmp_path}")
+    done = fresh("benchmarks.reliability.fuzz", *flags)
+    if importlib.util.find_spec("atheris"):
+        (row,) = json.loads((tmp_path / "fuzz.json").read_text())["rows"]
+        assert (done.returncode, row["mutator"]) == (0, "atheris, by form")
+    else:
+        assert done.stderr == "error: atheris: not installed: expected, or --unguided\n"
+        assert (done.returncode, list(tmp_path.iterdir())) == (2, [])
 
 
 @pytest.mark.slow

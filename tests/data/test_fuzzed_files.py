@@ -102,7 +102,7 @@ def test_pickles_in_a_suite_are_not_loaded(members, tmp_path):
 def test_claimed_sizes_in_a_suite(members, shape):
     file, content = members
     file.write_bytes(archive_of({**content, "way.npy": head(shape) + bytes(64)}))
-    assert "expected the metrics of a suite" in line_of(lambda: read_runs(file))
+    assert "of float64 in 64 bytes: expected the" in line_of(lambda: read_runs(file))
 
 
 def test_texts_of_no_length_in_a_suite(members):

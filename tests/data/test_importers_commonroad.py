@@ -388,10 +388,14 @@ def test_wrong_units_are_named(tmp_path):
         read(path)
 
 
-def test_group_file_without_its_columns(tmp_path):
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [("name,number\na.xml,1\n", "columns: "), ("file,group\na.xml\n", "row 1: ")],
+)
+def test_group_file_without_its_columns(tmp_path, table, said):
     path = w.commonroad(tmp_path / "a.xml")
-    (tmp_path / "independent_groups.csv").write_text("name,number\na.xml,1\n")
-    with pytest.raises(InputError, match="file,group"):
+    (tmp_path / "independent_groups.csv").write_text(table)
+    with pytest.raises(InputError, match=rf"csv: {said}.*expected file,group"):
         read(path)
 
 

@@ -5,8 +5,8 @@
 Each reader runs in a process of its own, in which an input may take 10 s and 2 GiB,
 and may open, write and start nothing outside its folder. It has to return, or to raise
 `InputError` of one line that names the file. Coverage
-of our code guides the inputs (atheris, the extra [fuzz]; without it `--unguided`
-draws them at random). Most are made inside of
+of our code guides the inputs (atheris, of requirements/fuzz.lock; without it
+`--unguided` draws them at random). Most are made inside of
 their form: checksums, lengths and compression are right, what they hold is not.
 `--copies=3000` puts one piece (row, element, field, item) so often into a file.
 
@@ -44,7 +44,7 @@ _INPUTS = flags.DEFINE_integer("inputs", 1_000_000, "over all readers", 1)
 _READERS = flags.DEFINE_list("readers", ["all"], "which of them")
 _SECONDS = flags.DEFINE_integer("seconds", 3600, "at most so long a reader", 1)
 _SEED = flags.DEFINE_integer("seed", 0, "of the inputs")
-_COPIES = flags.DEFINE_integer("copies", 0, "most of one piece; 0: a few, guided", 0)
+_COPIES = flags.DEFINE_integer("copies", 0, "most of one piece, at random; 0: a few", 0)
 _UNGUIDED = flags.DEFINE_bool("unguided", False, "at random, without atheris")
 _OUTPUT = flags.DEFINE_string("output", "benchmarks/results", "folder of the JSON")
 MOST_DEATHS = 20  # of a reader's processes
@@ -115,7 +115,8 @@ def fuzzed(name: str, inputs: int, seconds: int, output: Path) -> Row:
         reader=name,
         mutator=f"{'atheris' if is_guided() else 'at random'}, by form",
         command=f"python -m {child.PACKAGE} --readers={name} --inputs={inputs} "
-        f"--seed={_SEED.value} --copies={_COPIES.value}",
+        f"--seed={_SEED.value} --copies={_COPIES.value}"
+        f"{' --unguided' if _UNGUIDED.value else ''}",
     )
     begin = time.monotonic()
     place = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None

@@ -1,8 +1,8 @@
 """One reader under the fuzzer, in a process that may die.
 
 Its folder has corpus/ and crashes/ of the reader; what was broken is appended to
-breaches.jsonl, and status.json says how far it is. With atheris installed, coverage
-of our code guides what is tried next; else inputs are drawn at random.
+breaches.jsonl, and status.json says how far it is. Coverage of our code guides what is
+tried next (atheris), or inputs are drawn at random.
 """
 
 import contextlib

@@ -1,9 +1,9 @@
 """What every reader promises of any bytes, and how a breach of it is seen.
 
 It returns, or it raises `InputError` (`WeightsError` for weights) of one printable
-line that names the file. It opens nothing outside its folder for writing and nothing
-but code and system files for reading, and it starts no program and unpickles nothing.
-Seconds and memory are limited by whoever runs it.
+line that names the file, and not because memory was refused. It opens nothing outside
+its folder for writing and nothing but code and system files for reading, and it starts
+no program and unpickles nothing. Seconds and memory are limited by whoever runs it.
 """
 
 import contextlib
@@ -109,6 +109,14 @@ def refusal_breach(line: str, names: Collection[str]) -> Breach | None:
     return None
 
 
+def _memory_breach(error: BaseException) -> Breach | None:
+    """Whether a refusal comes of memory that was asked for and not given."""
+    cause = error.__cause__ or error.__context__
+    while cause is not None and not isinstance(cause, MemoryError):
+        cause = cause.__cause__ or cause.__context__
+    return Breach(place_of(cause), str(cause)[:300]) if cause else None
+
+
 def place_of(error: BaseException) -> str:
     """File and line of ours where it came from, and its type."""
     frames = traceback.extract_tb(error.__traceback__)
@@ -124,7 +132,8 @@ def verdict(
     try:
         read()
     except (InputError, WeightsError) as error:
-        return refusal_breach(str(error), names), str(error)
+        breach = _memory_breach(error) or refusal_breach(str(error), names)
+        return breach, str(error)
     except Exception as error:
         return Breach(place_of(error), str(error)[:300]), None
     return None, None

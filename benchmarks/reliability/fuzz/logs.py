@@ -112,7 +112,9 @@ def make_commonroad(folder: Path) -> tuple[Path, list[Path]]:
     goal = f"<position>{writers.BOX}</position>"
     parts = (road, traffic, cars, writers.standing(), writers.problem(goal))
     file = writers.commonroad(folder / "USA_Test-1_1_T-1.xml", *parts)
-    return folder, [file]
+    groups = folder / "independent_groups.csv"
+    groups.write_text(f"file,group\n{file.name},3\nUSA_Test-2_1_T-1.xml,4\n")
+    return folder, [file, groups]
 
 
 def make_csv(folder: Path) -> tuple[Path, list[Path]]:

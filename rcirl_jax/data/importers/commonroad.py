@@ -111,6 +111,9 @@ def _read_groups(path: Path, name: str) -> dict[str, str]:
             raise InputError(f"{table}: {error}: expected a CSV") from error
         if not {"file", "group"} <= set(header):
             raise InputError(f"{table}: columns: {header}: expected file,group")
+        for number, row in enumerate(rows, 1):
+            if row["group"] is None:
+                raise InputError(f"{table}: row {number}: expected file,group")
         return {row["file"]: row["group"] for row in rows}
     return {}
 
