@@ -19,6 +19,10 @@ install = $(if $(LOCK),\
   $(1)/bin/python $(PIP) install --no-deps --no-build-isolation --editable .,\
   $(1)/bin/python $(PIP) install --editable '.[$(2)]')
 
+# What guides the fuzzing of readers
+ATHERIS = $(BIN)/python $(PIP) install $(if $(LOCK),--require-hashes \
+  --requirement $(LOCK)/fuzz.lock,--requirement requirements/fuzz.in)
+
 # Minutes; they touch every dependency: logs, store, two epochs, resume, export, readers, pages
 QUICK := $(addprefix tests/train/test_loop.py::test_,resume_is_bitwise run_writes_what_it_should \
   export_rank_report exported_values_are_the_trainers) \
@@ -78,7 +82,7 @@ test-slow: setup
 
 # The long rows of docs/reliability.md, each by its command; hours, and `make fuzz` wants clang
 test-long: setup
-	$(BIN)/python $(PIP) install $(if $(LOCK),--require-hashes --requirement $(LOCK)/fuzz.lock,--requirement requirements/fuzz.in)
+	$(ATHERIS)
 	$(BIN)/python -m pytest -q -m long
 
 # The quick tests with the oldest versions allowed; they run among newer neighbours that
@@ -183,7 +187,7 @@ audit: build/tools/.installed
 # `MINUTES=2` leaves out what takes longer, `ANEW=1` runs all. Rows that depend on what others
 # publish, audit and test-ceiling, are run each time
 reliability: setup
-	$(BIN)/python $(PIP) install $(if $(LOCK),--require-hashes --requirement $(LOCK)/fuzz.lock,--requirement requirements/fuzz.in)
+	$(ATHERIS)
 	$(BIN)/python -m benchmarks.reliability.table $(if $(MINUTES),--minutes=$(MINUTES)) $(if $(ANEW),--anew) --output=$(RESULTS)
 
 # The C++ reader under libFuzzer; needs clang and its runtime

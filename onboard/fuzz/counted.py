@@ -3,8 +3,8 @@
     python -m onboard.fuzz.counted LEAST build/fuzz/fuzz_load -max_total_time=600 CORPUS
 
 What the program says is passed on; the line is on stdout, the exit status its own. A
-program that ran fewer than LEAST inputs, or does not say how many, is one line on
-stderr and exit status 1.
+program that says nowhere that it ran LEAST inputs is one line on stderr and exit
+status 1.
 """
 
 import re

@@ -111,7 +111,7 @@ def refusal_breach(line: str, names: Collection[str]) -> Breach | None:
 
 def _memory_breach(error: BaseException) -> Breach | None:
     """Whether a refusal comes of memory that was asked for and not given."""
-    cause = error.__cause__ or error.__context__
+    cause: BaseException | None = error
     while cause is not None and not isinstance(cause, MemoryError):
         cause = cause.__cause__ or cause.__context__
     return Breach(place_of(cause), str(cause)[:300]) if cause else None
