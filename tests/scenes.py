@@ -1,5 +1,7 @@
 """Random and hand-made scenes for tests (numpy in, jax scenes out)."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +23,10 @@ N, P, T = NUM_OBSTACLES, NUM_STATIONS, NUM_TIMES
 
 # as one program: its hundreds of operations one by one take half a minute to compile
 sampled = jax.jit(sample, static_argnums=2)
+# to the bit what operations one by one give, as one program: none is fused with another
+unfused = functools.partial(
+    jax.jit, compiler_options={"xla_disable_hlo_passes": "fusion"}
+)
 
 
 def _f(value):
@@ -132,7 +138,7 @@ def random_positions(seed, made):
 
 def batch(scenes):
     """Stack scenes along a new leading axis."""
-    return jax.tree.map(lambda *x: jnp.stack(x), *scenes)
+    return jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *scenes)
 
 
 def demonstration(seed):

@@ -1,6 +1,7 @@
 """docs/preferences.md: its file is read, its script asks and writes one."""
 
 import json
+import os
 import subprocess
 import sys
 
@@ -44,9 +45,10 @@ def test_the_script_of_the_page_asks_and_writes(tmp_path):
     data = stored(tmp_path / "d")
     (tmp_path / "judge.py").write_text(FILES["judge.py"])
     rows = ",".join(map(str, data.indices("train")[:2]))
+    compiled = {k: v for k, v in os.environ.items() if k.startswith(("JAX_", "XLA_"))}
     done = subprocess.run(
         [sys.executable, "judge.py", "d", rows, "judged.jsonl"], input="a\nb\n",
-        cwd=tmp_path, env={"PYTHONPATH": str(REPO), "JAX_PLATFORMS": "cpu", "PATH": ""},
+        cwd=tmp_path, env={**compiled, "PYTHONPATH": str(REPO), "PATH": ""},
         text=True, capture_output=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-2000:]

@@ -29,7 +29,7 @@ ROWS = [
 
 
 def run(chunk, count=3):
-    cases = catalogue_set(suite_refs(FAMILIES, count), 30.0)
+    cases = catalogue_set(suite_refs(FAMILIES, count), 20.0)
     return run_suite(ROWS, cases, SuiteConfig(plan_every=2, chunk=chunk))
 
 

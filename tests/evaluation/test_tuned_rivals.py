@@ -23,8 +23,9 @@ from rcirl_jax.planner.baselines import (
     idm_trajectory,
 )
 from rcirl_jax.reward import LatticeCost
-from rcirl_jax.sampling import SamplerConfig, sample
+from rcirl_jax.sampling import SamplerConfig
 from tests.evaluation.driven import long_rows, mean_chosen_fde, scored_rivals
+from tests.scenes import sampled
 
 SMALL = SamplerConfig(num_random=16, cruise_times=(4.0,), edge_times=(4.0,))
 SCENES = 24
@@ -87,7 +88,7 @@ def test_candidates_are_those_of_the_evaluation():
     rows = driven_by_a_hidden_driver()
     scenes = driven_scenes(rows, INDEX, SMALL, 8.0)
     one = jax.tree.map(lambda x: jnp.asarray(x[3]), rows.scene)
-    expected = sample(candidates_key(jnp.asarray(3)), one, SMALL).trajectory
+    expected = sampled(candidates_key(jnp.asarray(3)), one, SMALL).trajectory
     np.testing.assert_allclose(scenes.everyone.s[3], expected.s, atol=1e-3)
 
 

@@ -33,10 +33,13 @@ RANKED = (
 )
 LONGEST = {
     "data_scaling",
+    "data_support",
     "feature_ablation",
     "known_truth",
     "leaky_rate_and_hidden_size",
     "linear_vs_network",
+    "optimisers",
+    "stability",
 }
 # what the paired differences have to be to, beside IDM, hand-set and random
 ASKED = {

@@ -1,5 +1,7 @@
 """Conformance of F: every feature of every preset."""
 
+import functools
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -20,15 +22,17 @@ from rcirl_jax.sampling import (
 from rcirl_jax.types import Kind
 from rcirl_jax.units import TIMES_S
 from tests.features.oracle import point
-from tests.scenes import batch, random_positions, random_scene, scene
+from tests.scenes import batch, random_positions, random_scene, scene, unfused
 
 PRESETS = ("paper21", "apollo21")
+JITTED = {preset: jax.jit(feature_map(preset)) for preset in PRESETS}
+FROM_POSITIONS = jax.jit(trajectory_from_positions)
 UNITS = {"m", "1", "1/m", "s", "m/s", "m/s^2", "m/s^3"}
 
 
 def drive(seed):
     made = random_scene(seed)
-    return made, trajectory_from_positions(made, *random_positions(seed, made))
+    return made, FROM_POSITIONS(made, *random_positions(seed, made))
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -70,8 +74,8 @@ def test_every_column_is_used_by_a_preset():
 @given(seed=st.integers(0, 10_000))
 def test_equals_the_oracle(preset, seed):
     features = feature_map(preset)
-    made, trajectory = drive(seed)
-    found = np.asarray(features(made, trajectory))
+    made, trajectory = jax.tree.map(np.asarray, drive(seed))
+    found = np.asarray(JITTED[preset](made, trajectory))
     assert np.isfinite(found).all()
     for i in range(TIMES_S.size):
         expected = point(made, trajectory, i)
@@ -86,9 +90,8 @@ def test_none_values_without_obstacles(preset):
     features = feature_map(preset)
     empty = scene()
     s = empty.ego.v * jnp.asarray(TIMES_S)
-    found = np.asarray(
-        features(empty, trajectory_from_positions(empty, s, jnp.zeros_like(s)))
-    )
+    straight = FROM_POSITIONS(empty, s, jnp.zeros_like(s))
+    found = np.asarray(JITTED[preset](empty, straight))
     for column, spec in enumerate(features.specs):
         if "distance" in spec.name or spec.name.startswith(
             ("follow", "overtake", "stop", "virtual", "nudge", "sidepass", "collision")
@@ -118,8 +121,10 @@ def test_human_equal_to_a_candidate_has_the_same_bits(preset, mode):
     """The human enters as positions, like a candidate, and nothing differs."""
     features, config = feature_map(preset), SamplerConfig(mode=mode)
     made = random_scene(3)
-    candidates = sample(jax.random.key(0), made, config)
-    all_features = features.of_candidates(made, candidates)
+    candidates = unfused(functools.partial(sample, config=config))(
+        jax.random.key(0), made
+    )
+    all_features = unfused(features.of_candidates)(made, candidates)
 
     def of_human(s, l):
         if mode == "speed":
@@ -127,7 +132,7 @@ def test_human_equal_to_a_candidate_has_the_same_bits(preset, mode):
         return features(made, trajectory_from_positions(made, s, l))
 
     picks = jnp.arange(0, candidates.family.size, 7)
-    human = jax.vmap(of_human)(
+    human = unfused(jax.vmap(of_human))(
         candidates.trajectory.s[picks], candidates.trajectory.l[picks]
     )
     np.testing.assert_array_equal(
@@ -152,7 +157,7 @@ def test_classes_by_hand():
 
     def at(name, **box):
         made = scene(v=0.0, boxes=[box])
-        found = features(made, trajectory_from_positions(made, still, still))
+        found = JITTED["paper21"](made, FROM_POSITIONS(made, still, still))
         return float(found[0, features.names.index(name)])
 
     assert at("follow_distance", s=20.0, length=4.0) == pytest.approx(15.55)
@@ -201,7 +206,7 @@ def test_gradients_are_finite_where_boxes_touch():
     def total(s):
         return jnp.sum(features(made, trajectory_from_positions(made, s, 0.0 * s)))
 
-    gradient = jax.grad(total)(jnp.zeros(TIMES_S.size))
+    gradient = jax.jit(jax.grad(total))(jnp.zeros(TIMES_S.size))
     assert np.isfinite(np.asarray(gradient)).all()
 
 

@@ -154,6 +154,7 @@ def test_equals_brute_force_on_a_small_lattice(seed):
     np.testing.assert_array_equal(np.asarray(plan.n)[:6], best[:6])
 
 
+@pytest.mark.slow
 def test_a_nested_lattice_is_never_worse():
     fine = DpConfig(step=1.0, max_speed=26.0, max_way=160.0)
     gains = []

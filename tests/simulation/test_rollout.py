@@ -51,7 +51,7 @@ def test_padding_steps_do_not_count():
     record, _ = drive([long, short])
     assert record.valid[0].all()
     assert record.valid[1].sum() == 50
-    found = jax.vmap(lambda r: case_metrics(r, MetricsConfig()))(record)
+    found = jax.jit(jax.vmap(lambda r: case_metrics(r, MetricsConfig())))(record)
     assert float(found.progress[1]) == pytest.approx(50.0, rel=1e-3)
     assert int(found.samples[1]) == 50
 

@@ -120,8 +120,9 @@ def test_mining_keeps_what_the_reward_values_most():
     state = init_state(config, normaliser())
     from rcirl_jax.train.step import compare, mined
 
-    kept = mined(state.params, normaliser(), made, config)
-    values = compare(state.params, normaliser(), made, config.reward).candidates
+    kept = jax.jit(mined, static_argnums=3)(state.params, normaliser(), made, config)
+    compared = jax.jit(compare, static_argnums=3)
+    values = compared(state.params, normaliser(), made, config.reward).candidates
     pool = np.asarray(made.feasible)[:, -6:]
     chosen = np.asarray(kept.feasible)[:, -6:]
     assert (chosen.sum(axis=1) == np.minimum(2, pool.sum(axis=1))).all()

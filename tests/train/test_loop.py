@@ -165,7 +165,8 @@ def test_exported_values_are_the_trainers(dataset, run, tmp_path):
     reward = export_run(run[0], dataset, tmp_path / "weights.msgpack")
     index = dataset.indices("test")[:8]
     batch = to_device_batch(dataset.read(index), np.ones(8), index)
-    made = featurised(jax.random.key(9), batch, CONFIG)
+    features = jax.jit(featurised, static_argnums=2)
+    made = features(jax.random.key(9), batch, CONFIG)
     state = run[1].state
     expected = value(
         state.params, state.normaliser, made.points, made.points_valid, CONFIG.reward
