@@ -48,11 +48,30 @@ def test_a_small_loop(tmp_path):
 
     again = command("experiments.autotune", *flags)
     assert all(kept(again).values()), again.stdout
-
-    # what people said of two ways through a scene trains with the rest
     dataset = open_dataset(*run.glob("dataset-*"))
     assert dataset.facts()["data_hash"] == dataset.hash
     assert "flags" in dataset.facts()["made_by"]
+
+
+@pytest.mark.slow
+@pytest.mark.multiprocess
+def test_a_damaged_report_is_drawn_again_to_the_byte(tmp_path):
+    flags = (f"--workdir={tmp_path}", *SMALL)
+    assert command("experiments.autotune", *flags).returncode == 0
+    page = (tmp_path / "report.html").read_bytes()
+    (tmp_path / "report.html").write_text("damaged")
+    mended = fresh("experiments.autotune", *flags)
+    assert [name for name, was in kept(mended).items() if not was] == ["report"]
+    assert (tmp_path / "report.html").read_bytes() == page
+
+
+@pytest.mark.slow
+@pytest.mark.multiprocess
+def test_what_people_said_trains_with_the_rest(tmp_path):
+    run = tmp_path / "run"
+    flags = (f"--workdir={run}", *SMALL)
+    assert command("experiments.autotune", *flags).returncode == 0
+    dataset = open_dataset(*run.glob("dataset-*"))
     head = {
         "schema": "rcirl-jax/preferences",
         "schema_version": 1,
@@ -68,18 +87,6 @@ def test_a_small_loop(tmp_path):
     # no verdict stays beside weights that it does not speak of
     assert not (run / "verdict.json").exists()
     assert not (run / "report.html").exists()
-
-
-@pytest.mark.slow
-@pytest.mark.multiprocess
-def test_a_damaged_report_is_drawn_again_to_the_byte(tmp_path):
-    flags = (f"--workdir={tmp_path}", *SMALL)
-    assert command("experiments.autotune", *flags).returncode == 0
-    page = (tmp_path / "report.html").read_bytes()
-    (tmp_path / "report.html").write_text("damaged")
-    mended = fresh("experiments.autotune", *flags)
-    assert [name for name, was in kept(mended).items() if not was] == ["report"]
-    assert (tmp_path / "report.html").read_bytes() == page
 
 
 @pytest.mark.multiprocess

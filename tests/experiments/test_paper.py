@@ -32,12 +32,14 @@ RANKED = (
     "stability",
 )
 LONGEST = {
+    "cross_site",
     "data_scaling",
     "data_support",
     "feature_ablation",
     "known_truth",
     "leaky_rate_and_hidden_size",
     "linear_vs_network",
+    "one_frame",
     "optimisers",
     "stability",
 }

@@ -25,9 +25,9 @@ from tests.features.oracle import point
 from tests.scenes import batch, random_positions, random_scene, scene, unfused
 
 PRESETS = ("paper21", "apollo21")
+UNITS = {"m", "1", "1/m", "s", "m/s", "m/s^2", "m/s^3"}
 JITTED = {preset: jax.jit(feature_map(preset)) for preset in PRESETS}
 FROM_POSITIONS = jax.jit(trajectory_from_positions)
-UNITS = {"m", "1", "1/m", "s", "m/s", "m/s^2", "m/s^3"}
 
 
 def drive(seed):
