@@ -37,6 +37,7 @@ MEASURE = jax.jit(
 FREE = scene(v=14.0)
 
 
+@pytest.mark.slow
 def test_the_best_known_plan_has_no_gap_and_others_have():
     """A plan of the gap's own lattice loses only what local ascent adds."""
     w = weights()

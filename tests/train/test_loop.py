@@ -243,6 +243,7 @@ def test_a_horizon_nobody_covers_is_one_line(dataset):
         evaluate_ranking(dataset, {}, setup)
 
 
+@pytest.mark.slow
 def test_pooled_parts_are_the_whole(dataset, run, tmp_path):
     """Held-out scenes judged in two parts: the report of all of them at once."""
     reward = export_run(run[0], dataset, tmp_path / "weights.msgpack")
