@@ -113,6 +113,16 @@ def test_texts_of_no_length_in_a_suite(members):
     assert "names: 1000000 values in 0 bytes" in line_of(lambda: read_runs(file))
 
 
+@pytest.mark.parametrize("name", ["names", "ids", "groups", "way"])
+@pytest.mark.parametrize("kind", ["<f8", "<U1"])
+def test_many_times_nothing_in_a_suite(members, name, kind):
+    """A list of them would take terabytes."""
+    file, content = members
+    nothing = head((2**40, 0, 0), kind)
+    file.write_bytes(archive_of({**content, f"{name}.npy": nothing}))
+    assert "(1099511627776, 0, 0), not" in line_of(lambda: read_runs(file))
+
+
 @pytest.mark.parametrize("kind", ["(,)f8", "f8,(", "f9", ""])
 def test_kinds_in_a_suite_that_are_none(members, kind):
     file, content = members
