@@ -5,6 +5,8 @@ BIN    := $(VENV)/bin
 OUT    ?= out/demo
 # parallel test workers
 WORKERS ?= 2
+# which of them `make test` runs
+MARKS ?= not slow and not dataset
 # folder of recordings for `make bench`; what is not there is left out
 RECORDINGS ?= ../shared/data
 # where `make reliability` writes its JSON
@@ -35,15 +37,14 @@ QUICKLY = -m pytest -q -m "not slow and not dataset" $(QUICK)
 
 # Features, gradients, resume, reproduction, and what rounds otherwise when compiled quickly, with
 # the compiler as users have it. For the rest XLA compiles in half the time to slower programs;
-# by hand, pytest has the users' compiler for all, and so has every row of `make reliability`
+# by hand, pytest has the users' compiler for all but the commands of `tests.commands`, and every
+# row of `make reliability` has it
 EXACT := $(addprefix tests/,features/test_features.py reward/test_gradients.py \
-  evaluation/test_tuned_rivals.py::test_distances_alone_are_those_of_the_scores \
-  $(addprefix train/test_,loop.py::test_every_scene_counts_once_for_the_normaliser \
-    loop.py::test_resume_is_bitwise reproduce.py \
+  $(addprefix train/test_,reproduce.py loop.py::test_resume_is_bitwise \
     step.py::test_candidates_of_a_scene_do_not_depend_on_the_batch \
     step.py::test_a_hard_negative_is_never_the_positive_nor_better_than_it))
 QUICK_XLA := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false
-TEST = $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal -m "not slow and not dataset"
+TEST = $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal -m "$(MARKS)"
 
 .PHONY: demo test test-slow test-long test-dataset test-floor test-ceiling lint bench docs onboard setup
 .PHONY: lock audit wheel clean reliability fuzz
@@ -72,8 +73,9 @@ test: setup
 	$(TEST) $(EXACT)
 	XLA_FLAGS="$(QUICK_XLA) $(XLA_FLAGS)" $(TEST) $(addprefix --deselect=,$(EXACT))
 
+test-dataset: MARKS = dataset and not slow
 test-dataset: setup
-	$(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal -m "dataset and not slow"
+	XLA_FLAGS="$(QUICK_XLA) $(XLA_FLAGS)" $(TEST)
 
 # Killed processes, lost Ray nodes, memory, folds, the tutorial as written; one at a time.
 # Those with the marker `dataset` want the recordings as well

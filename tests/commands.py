@@ -72,18 +72,18 @@ def command(module, *flags):
         return subprocess.CompletedProcess((module, *flags), status, *said)
 
 
-def fresh(module, *flags):
-    """The same in an interpreter of its own."""
+def fresh(module, *flags, compiler=QUICKLY):
+    """The same in an interpreter of its own, its compiler with these flags."""
     return subprocess.run(
-        [sys.executable, "-m", module, *flags], env=_environment(),
+        [sys.executable, "-m", module, *flags], env=_environment(compiler),
         capture_output=True, text=True, check=False, timeout=LONGEST_S,
     )  # fmt: skip
 
 
-def _environment():
+def _environment(compiler=QUICKLY):
     env = {**os.environ, "JAX_PLATFORMS": "cpu"}
     env.pop("PYTEST_CURRENT_TEST", None)
-    return env | {"XLA_FLAGS": f"{QUICKLY} {os.environ.get('XLA_FLAGS', '')}"}
+    return env | {"XLA_FLAGS": f"{compiler} {os.environ.get('XLA_FLAGS', '')}"}
 
 
 @functools.cache

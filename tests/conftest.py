@@ -21,6 +21,10 @@ from hypothesis import HealthCheck, settings
 
 jax.config.update("jax_num_cpu_devices", 8)
 
+# Tracing makes millions of small objects that live on: looking through them at every
+# seven hundredth is a twelfth of the time of the tests
+gc.set_threshold(200_000, 50, 100)
+
 settings.register_profile(
     "ci",
     max_examples=25,

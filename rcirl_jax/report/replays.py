@@ -23,7 +23,7 @@ from rcirl_jax.simulation.cases import (
     Record,
     Snapshot,
 )
-from rcirl_jax.simulation.metrics import COLUMNS, MetricsConfig, case_metrics
+from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics
 from rcirl_jax.simulation.rows import RECORDED_HUMAN, Row, human_row
 from rcirl_jax.simulation.suite import CaseSet, drive_with_logs, rollout_config
 from rcirl_jax.types import Kind
@@ -114,19 +114,19 @@ def make_replays(
     drives: list[list[Drive]] = [[] for _ in ids]
     for row in rows:
         config = rollout_config(row, cases.duration_s, plan_every)
-        _, *logs = drive_with_logs(row, every, config)
+        driven = (every, *drive_with_logs(row, every, config))
         for number in range(len(ids)):
-            case, record, shot = jax.tree.map(
-                lambda x, at=number: np.asarray(x[at]), (every, *logs)
-            )
-            drives[number].append(thin(row.name, case, record, shot))
+            one = jax.tree.map(lambda x, at=number: np.asarray(x[at]), driven)
+            drives[number].append(thin(row.name, *one))
     return [
-        _replay(name, cases, place, jax.tree.map(lambda x: x[0], one), tuple(driven))
-        for name, place, one, driven in zip(ids, places, built, drives, strict=True)
+        _replay(name, cases, place, jax.tree.map(lambda x: x[0], one), tuple(found))
+        for name, place, one, found in zip(ids, places, built, drives, strict=True)
     ]
 
 
-def thin(row: str, case: Case, record: Record, shot: Snapshot) -> Drive:
+def thin(
+    row: str, case: Case, metrics: CaseMetrics, record: Record, shot: Snapshot
+) -> Drive:
     """One drive's frames; unbatched numpy leaves, record and snapshots [S]."""
     last = int(np.flatnonzero(record.valid)[-1])
     steps = np.arange(FRAME_STEPS - 1, last + FRAME_STEPS, FRAME_STEPS)
@@ -137,7 +137,7 @@ def thin(row: str, case: Case, record: Record, shot: Snapshot) -> Drive:
     red = np.asarray(shot.line_red, bool) & (case.lines.kind != LineKind.NONE)
     return Drive(
         row=row,
-        summary=_summary(record),
+        summary=_summary(metrics),
         events=events,
         start=start,
         end="ended by a collision of its own fault" if short else "",
@@ -217,9 +217,8 @@ def _events(
     return sorted(found), start
 
 
-def _summary(record: Record) -> str:
+def _summary(found: CaseMetrics) -> str:
     """The drive's own numbers in one line."""
-    found = jax.tree.map(np.asarray, case_metrics(record, MetricsConfig()))
     failed = [
         name.replace("_", " ")
         for name, holds in zip(COLUMNS, found.holds, strict=True)

@@ -1,6 +1,7 @@
 """A weights file trained again from its own provenance."""
 
 import dataclasses
+import functools
 
 import jax
 import msgpack
@@ -18,14 +19,16 @@ from rcirl_jax.export.reproduce import (
     train_again,
 )
 from rcirl_jax.units import HORIZON_S
-from tests.commands import fresh as command
+from tests.commands import fresh
 from tests.data.test_store import finish_fields, lineage
 from tests.scenes import batch, demonstration
 
 COUNT = 12  # scenes, of which nine train
+# The compiler as users have it: flags are noted, so there is one, with its usual value
+command = functools.partial(fresh, compiler="--xla_cpu_enable_fast_math=false")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def made(tmp_path_factory):
     """(weights file, dataset) of a small run by its commands."""
     folder = tmp_path_factory.mktemp("reproduce")
