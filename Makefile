@@ -5,8 +5,8 @@ BIN    := $(VENV)/bin
 OUT    ?= out/demo
 # parallel test workers
 WORKERS ?= 2
-# which of them `make test` runs
-MARKS ?= not slow and not dataset
+# markers of those that `make test` runs
+MARKS = not slow and not dataset
 # folder of recordings for `make bench`; what is not there is left out
 RECORDINGS ?= ../shared/data
 # where `make reliability` writes its JSON
@@ -35,12 +35,13 @@ QUICK := $(addprefix tests/train/test_loop.py::test_,resume_is_bitwise run_write
   tests/features/test_features.py::test_equals_the_oracle tests/report/test_data_page.py
 QUICKLY = -m pytest -q -m "not slow and not dataset" $(QUICK)
 
-# Features, gradients, resume, reproduction, and what rounds otherwise when compiled quickly, with
+# Features, gradients, resume, reproduction, recordings, and what rounds otherwise when compiled quickly, with
 # the compiler as users have it. For the rest XLA compiles in half the time to slower programs;
-# by hand, pytest has the users' compiler for all but the commands of `tests.commands`, and every
-# row of `make reliability` has it
-EXACT := $(addprefix tests/,features/test_features.py reward/test_gradients.py \
-  $(addprefix train/test_,reproduce.py loop.py::test_resume_is_bitwise \
+# by hand and in `make reliability` all have the users' compiler, but for what `tests/commands.py`
+# and `tests/train/test_processes.py` start
+EXACT := $(addprefix tests/,train/test_reproduce.py evaluation/test_recorded_training.py \
+  features/test_features.py reward/test_gradients.py \
+  $(addprefix train/test_,loop.py::test_resume_is_bitwise \
     step.py::test_candidates_of_a_scene_do_not_depend_on_the_batch \
     step.py::test_a_hard_negative_is_never_the_positive_nor_better_than_it))
 QUICK_XLA := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false
@@ -75,7 +76,7 @@ test: setup
 
 test-dataset: MARKS = dataset and not slow
 test-dataset: setup
-	XLA_FLAGS="$(QUICK_XLA) $(XLA_FLAGS)" $(TEST)
+	$(TEST)
 
 # Killed processes, lost Ray nodes, memory, folds, the tutorial as written; one at a time.
 # Those with the marker `dataset` want the recordings as well

@@ -11,7 +11,7 @@ import threading
 from pathlib import Path
 
 # Compiled in half the time, to slower programs: commands are run on little data to
-# see that they do what they say. Tests in process have the compiler as users have it.
+# see that they do what they say.
 QUICKLY = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 LONGEST_S = 1800.0
 

@@ -4,6 +4,7 @@ Programs are compiled once for all workers and runs: most of the tests' time
 would otherwise go into compiling the same ones again.
 """
 
+import ctypes
 import gc
 import os
 from pathlib import Path
@@ -61,8 +62,15 @@ def _resident_bytes() -> int:
 
 @pytest.fixture(scope="module", autouse=True)
 def bounded_memory():
-    """Forget compiled programs when many have piled up; the cache on disk has them."""
+    """Forget compiled programs when many have piled up; the cache on disk has them.
+
+    glibc keeps what it is given back (3.4 GB stayed 3.4 GB, trimmed 0.9): untrimmed,
+    the caches would be cleared after each file from then on.
+    """
     yield
     if _resident_bytes() > MAX_RESIDENT_BYTES:
         jax.clear_caches()
         gc.collect()
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+        if trim is not None:
+            trim(0)

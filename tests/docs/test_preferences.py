@@ -46,9 +46,10 @@ def test_the_script_of_the_page_asks_and_writes(tmp_path):
     (tmp_path / "judge.py").write_text(FILES["judge.py"])
     rows = ",".join(map(str, data.indices("train")[:2]))
     compiled = {k: v for k, v in os.environ.items() if k.startswith(("JAX_", "XLA_"))}
+    env = {**compiled, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(REPO), "PATH": ""}
     done = subprocess.run(
         [sys.executable, "judge.py", "d", rows, "judged.jsonl"], input="a\nb\n",
-        cwd=tmp_path, env={**compiled, "PYTHONPATH": str(REPO), "PATH": ""},
+        cwd=tmp_path, env=env,
         text=True, capture_output=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-2000:]

@@ -156,8 +156,9 @@ def test_zeros_are_apollos_weights_exactly():
     rows, candidates = some_rows()
     pick = lambda tree, *at: jax.tree.map(lambda x: jnp.asarray(x)[at], tree)  # noqa: E731
     drive = pick(rows.scene, 1), pick(candidates.trajectory, 1, 20)
-    of_zeros = unfused(lambda *x: lattice_cost(*x, weights))
-    assert float(of_zeros(*drive)) == float(unfused(lattice_cost)(*drive))
+    cost = unfused(lambda fields, *x: lattice_cost(*x, LatticeCost(**fields)))
+    found, wanted = (cost(w.fields(), *drive) for w in (weights, LatticeCost()))
+    assert float(found) == float(wanted)
 
 
 def test_one_program_scores_any_weights():

@@ -1,4 +1,4 @@
-"""The loop by its command: once, again, changed, damaged."""
+"""The loop by its command: once, again; `slow`: changed, damaged."""
 
 import json
 
@@ -46,7 +46,7 @@ def test_a_small_loop(tmp_path):
             "git_commit", "code_sha256", "versions", "flags",
         }  # fmt: skip
 
-    again = command("experiments.autotune", *flags)
+    again = fresh("experiments.autotune", *flags)
     assert all(kept(again).values()), again.stdout
     dataset = open_dataset(*run.glob("dataset-*"))
     assert dataset.facts()["data_hash"] == dataset.hash

@@ -126,7 +126,7 @@ def test_human_equal_to_a_candidate_has_the_same_bits(mode):
     of_all = unfused(lambda *given: [m.of_candidates(*given) for m in maps])
     all_features = of_all(made, candidates)
 
-    def of_human(s, l):
+    def of_human(made, s, l):
         if mode == "speed":
             human = trajectory_on_path(made, s)
         else:
@@ -134,8 +134,8 @@ def test_human_equal_to_a_candidate_has_the_same_bits(mode):
         return [features(made, human) for features in maps]
 
     picks = jnp.arange(0, candidates.family.size, 7)
-    human = unfused(jax.vmap(of_human))(
-        candidates.trajectory.s[picks], candidates.trajectory.l[picks]
+    human = unfused(jax.vmap(of_human, (None, 0, 0)))(
+        made, candidates.trajectory.s[picks], candidates.trajectory.l[picks]
     )
     for preset, found, wanted in zip(PRESETS, all_features, human, strict=True):
         np.testing.assert_array_equal(found[picks], wanted, preset)

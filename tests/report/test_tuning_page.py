@@ -415,6 +415,10 @@ def test_frames_are_the_drives_own(replays):
             steps = np.arange(FRAME_STEPS - 1, last + FRAME_STEPS, FRAME_STEPS)
             steps = np.minimum(steps, last)
             assert len(drive.s) == steps.size
+            driven_m = record.s[number, : last + 1].max()
+            assert drive.summary.startswith(f"{driven_m:.0f} m driven, ")
+            hit = bool(record.at_fault[number, : last + 1].any())
+            assert ("fails collision free" in drive.summary) == hit
             for name, half in (("s", 0.051), ("l", 0.0051), ("v", 0.051)):
                 shown = getattr(drive, name)
                 wanted = getattr(record, name)[number, steps]
