@@ -18,6 +18,7 @@ from rcirl_jax.evaluation import (
     scene_metrics,
     to_json,
 )
+from rcirl_jax.evaluation.evaluate import Ranked, pooled
 from rcirl_jax.evaluation.format import markdown_table
 from rcirl_jax.evaluation.ranking import METRICS
 from rcirl_jax.evaluation.statistics import (
@@ -99,6 +100,26 @@ def test_counts_and_oracle_floor(report, outcomes):
     assert report.oracle_floor.value == pytest.approx(np.mean(best))
     assert report.oracle_floor_median.value == pytest.approx(np.median(best))
     assert report.rows["oracle"]["top1_fde"].value == report.oracle_floor.value
+
+
+def test_two_parts_pooled_are_the_whole(report, scorers, outcomes):
+    def part(rows):
+        of = lambda x: x[rows] if isinstance(x, np.ndarray) else x  # noqa: E731
+        return Ranked(
+            table={
+                name: [{metric: of(x) for metric, x in run.items()} for run in runs]
+                for name, runs in scorers.items()
+            },
+            outcomes=Outcomes(**{k: of(x) for k, x in vars(outcomes).items()}),
+            group=of(outcomes.cluster % 5),
+        )
+
+    joined = pooled([part(np.s_[:90]), part(np.s_[90:])])
+    again = build_report(
+        joined.table, joined.outcomes, group=joined.group, num_resamples=2000
+    )
+    assert to_json(again) == to_json(report)
+    assert list(again.rows) == list(report.rows)
 
 
 def test_differences_are_row_minus_reference(report, scorers):
