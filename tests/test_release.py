@@ -13,6 +13,7 @@ from hatchling.builders.wheel import WheelBuilder
 from packaging.markers import default_environment
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+from packaging.version import Version
 
 from experiments import common
 from tests.conftest import REPO
@@ -61,14 +62,10 @@ def test_locked_files_have_hashes_and_no_place(file):
         assert all(re.fullmatch(r"sha256:[0-9a-f]{64} ?\\?\n?\s*", h) for h in hashes)
 
 
-@pytest.mark.parametrize("version", VERSIONS)
-@pytest.mark.parametrize(
-    ("name", "extra"), [("all", "all"), ("test", "test"), ("floor", "quick")]
-)
-def test_what_the_project_asks_for_is_locked_once(name, extra, version):
-    short = ".".join(version.split(".")[:2])
+def locked_for(name, version):
+    """Name -> version locked for one Python, and that Python's environment."""
     environment = default_environment() | {
-        "python_version": short,
+        "python_version": ".".join(version.split(".")[:2]),
         "python_full_version": version,
     }
     locked = {}
@@ -76,12 +73,30 @@ def test_what_the_project_asks_for_is_locked_once(name, extra, version):
         if not pin.marker or pin.marker.evaluate(environment):
             assert pin.name not in locked, pin
             locked[pin.name] = next(iter(pin.specifier)).version
+    return locked, environment
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+@pytest.mark.parametrize(
+    ("name", "extra"), [("all", "all"), ("test", "test"), ("floor", "quick")]
+)
+def test_what_the_project_asks_for_is_locked_once(name, extra, version):
+    locked, environment = locked_for(name, version)
     wanted = list(asked(extra, environment))
     assert len(wanted) > 15
     for requirement in wanted:
         found = locked[canonicalize_name(requirement.name)]
         assert requirement.specifier.contains(found), f"{requirement}: {found}"
     assert {"hatchling", "editables"} <= locked.keys()
+
+
+def test_the_floor_is_the_lowest_that_is_allowed():
+    """On the oldest Python; newer ones have no wheels of some."""
+    locked, environment = locked_for("floor", VERSIONS[0])
+    for requirement in asked("quick", environment):
+        (bound,) = (s.version for s in requirement.specifier if s.operator == ">=")
+        found = locked[canonicalize_name(requirement.name)]
+        assert Version(found) == Version(bound), requirement
 
 
 def test_users_get_the_versions_that_are_tested():
