@@ -10,9 +10,17 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 
 from benchmarks.reliability.jobs import jobs, write_logs
+from rcirl_jax.export.closed_loop import table_rows
+from rcirl_jax.simulation.suite import (
+    catalogue_set,
+    drive_row,
+    rollout_config,
+    suite_refs,
+)
 from tests.commands import LONGEST_S
 from tests.commands import fresh as command
 from tests.conftest import REPO
@@ -280,6 +288,29 @@ def test_a_guarded_row_drives(root, tmp_path):
     report = json.loads((tmp_path / "out" / "suite.json").read_text())["report"]
     (guarded,) = [name for name in report["rows"] if name.endswith(" guarded")]
     assert report["rows"][guarded]["progress_m"] > 1.0
+
+
+def test_a_guarded_row_drives_as_the_reward_or_as_its_incumbent(root):
+    """With ranges that hold everything, and such that hold nothing."""
+    files = [str(root / "w.msgpack")]
+    learned, guarded, hand = table_rows(files, ["hand-set"], guard="hand-set")
+    cases = catalogue_set(suite_refs("stopped_lead", 4), 6.0)
+    config = rollout_config(learned, cases.duration_s, 1)
+
+    def driven(row, **ranges):
+        if ranges:
+            weights = {k: np.full_like(getattr(row.params, k), x)
+                       for k, x in ranges.items()}  # fmt: skip
+            row = dataclasses.replace(row, params=row.params.replace(**weights))
+        found = drive_row(row, cases.build, len(cases.ids), config, chunk=4)
+        return np.stack([found.progress, found.min_a, found.max_a])
+
+    ours, theirs = driven(learned), driven(hand)
+    assert np.all(np.abs(ours - theirs).max(axis=0) > 0.1)  # else nothing is shown
+    everything = driven(guarded, low=-np.inf, high=np.inf, share=1.0)
+    np.testing.assert_allclose(everything, ours, atol=1e-2)
+    nothing = driven(guarded, low=np.inf, high=-np.inf, share=0.0)
+    np.testing.assert_allclose(nothing, theirs, atol=1e-2)
 
 
 def test_weights_of_the_tuning_loop_are_made_again(root, tmp_path):
