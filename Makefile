@@ -41,7 +41,9 @@ QUICKLY = -m pytest -q -m "not slow and not dataset" $(QUICK)
 # and `tests/train/test_processes.py` start
 EXACT := $(addprefix tests/,train/test_reproduce.py evaluation/test_recorded_training.py \
   features/test_features.py reward/test_gradients.py \
-  $(addprefix train/test_,loop.py::test_resume_is_bitwise \
+  evaluation/test_tuned_rivals.py::test_distances_alone_are_those_of_the_scores \
+  $(addprefix train/test_,loop.py::test_every_scene_counts_once_for_the_normaliser \
+    loop.py::test_resume_is_bitwise \
     step.py::test_candidates_of_a_scene_do_not_depend_on_the_batch \
     step.py::test_a_hard_negative_is_never_the_positive_nor_better_than_it))
 QUICK_XLA := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false

@@ -105,4 +105,4 @@ def test_distances_alone_are_those_of_the_scores():
     near = measure_scenes(rows, INDEX, sampler=SMALL, horizon_s=8.0)
     for name in ("feasible", "fde", "ade"):
         found, wanted = getattr(near, name), getattr(scored, name)
-        np.testing.assert_allclose(found, wanted, atol=1e-3)  # m, of a hundred
+        np.testing.assert_allclose(found, wanted, atol=1e-4)
