@@ -21,7 +21,7 @@ from experiments.common import provenance, run
 from rcirl_jax.data.joined import open_datasets
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.loading import open_reward
-from rcirl_jax.export.provenance import dataset_names
+from rcirl_jax.export.provenance import check_local, dataset_names
 from rcirl_jax.export.reproduce import (
     Reproduction,
     compare,
@@ -53,7 +53,10 @@ def main() -> None:
     named = _DATA.value or (reward.provenance.get("flags") or {}).get("data")
     if not named:
         raise InputError("--data: not given and not in the file: expected datasets")
-    names = dataset_names(named, f"{reward.file}: flags.data")
+    where = f"{reward.file}: provenance.flags.data"
+    names = dataset_names(named, where)
+    if not _DATA.value:
+        check_local(names, where)
     dataset = open_datasets(names)
     # what fails, fails before a warning
     if is_member(reward):

@@ -13,6 +13,7 @@ from benchmarks.reliability.memory import (
     Watch,
     count_growth,
     growth,
+    in_use_mb,
     level,
     memory_growth,
     thinned,
@@ -50,6 +51,25 @@ def test_growth_below_the_noise_of_a_round_is_found(seed):
         assert found.grows
         assert found.low > 1.0
         assert found.by == pytest.approx(120.0, abs=30.0)
+
+
+def test_memory_in_use_falls_when_it_is_given_back():
+    before = in_use_mb()
+    kept = bytearray(64 * 2**20)
+    assert in_use_mb() - before == pytest.approx(64.0, abs=2.0)
+    del kept
+    assert in_use_mb() - before == pytest.approx(0.0, abs=2.0)
+
+
+def test_a_fall_hides_growth_of_what_is_resident_and_not_of_what_is_in_use():
+    """3 MiB a round, and 660 given back in the middle."""
+    rounds = np.arange(ROUNDS)
+    used = 1024.0 + 3.0 * rounds
+    resident = used + np.where(rounds < ROUNDS // 2, 1320.0, 660.0)
+    assert not memory_growth(resident).grows
+    found = growth(used, 0.5 * ROUNDS)
+    assert found.grows
+    assert found.low == pytest.approx(3.0)
 
 
 def test_the_interval_of_a_slope_covers_it_as_often_as_it_says():
@@ -185,6 +205,7 @@ def test_a_soak_repeats_to_the_bit_and_finds_a_leak(tmp_path):
     assert done.returncode == 1, done.stderr[-2000:]
     made = json.loads((tmp_path / "soak.json").read_text())
     assert made["outcome"].startswith("rss_mb grew by ")
+    assert any(x.startswith("in_use_mb grew by ") for x in made["problems"])
     assert made["rounds"] == 6
     assert all(len(values) == 6 for values in made["series"].values())
     assert made["outputs_compared"] > 10

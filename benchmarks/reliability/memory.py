@@ -5,6 +5,7 @@ between all pairs of points: a spike, or noise around a level, does not move it.
 interval (Sen's) takes the points as independent; those of a process are not quite.
 """
 
+import ctypes
 import dataclasses
 import os
 import threading
@@ -37,6 +38,30 @@ class Growth:
     allowed: float
     # by more than allowed, and shown to rise at all
     grows: bool
+
+
+class _Malloc(ctypes.Structure):
+    """glibc's mallinfo2 (2.33), bytes over all arenas."""
+
+    _fields_ = [
+        (name, ctypes.c_size_t)
+        for name in (
+            "arena", "ordblks", "smblks", "hblks", "hblkhd",
+            "usmblks", "fsmblks", "uordblks", "fordblks", "keepcost",
+        )
+    ]  # fmt: skip
+
+
+def in_use_mb() -> float:
+    """What malloc has given and not got back, MiB.
+
+    Resident memory has the room besides that it keeps or gives back as it likes, and
+    falls by hundreds of MiB at once.
+    """
+    ask = ctypes.CDLL(None).mallinfo2
+    ask.restype = _Malloc
+    found = ask()
+    return (found.uordblks + found.hblkhd) / 2**20
 
 
 def growth(values: ArrayLike, allowed: float) -> Growth:

@@ -5,13 +5,14 @@
 Every round works in a new folder: a few small logs are written and imported, a reward
 is trained for an epoch, stopped after a checkpoint and resumed, exported, read again,
 ranked, driven over two cases of every family, judged by the gate and reported, with
-the pages of the ranking and of the data. After each round: resident memory, open
-files, threads, live arrays, blocks of Python's allocator, programs compiled, seconds.
-The first quarter of the rounds is warm-up; after it memory may not rise by more than
-5 % or 50 MiB, whichever is more (`memory.growth`), blocks by `BLOCKS` a round, nothing
-else may rise at all (gc's objects, which are some of the blocks, and seconds are noted
-only), and every round's outputs have to be the first round's to the bit. Ends with 1
-otherwise.
+the pages of the ranking and of the data. After each round: resident memory, what
+malloc has in use of it, open files, threads, live arrays, blocks of Python's allocator,
+programs compiled, seconds. The first quarter of the rounds is warm-up; after it memory
+may not rise by more than 5 % or 50 MiB, whichever is more (`memory.growth`), what is in
+use by `IN_USE_MB` a round, blocks by `BLOCKS` a round, nothing else may rise at all
+(gc's objects, which are some of the blocks, and seconds are noted only), and every
+round's outputs have to be the first round's to the bit. Ends
+with 1 otherwise.
 
 `--leak=MB` keeps so much of every round: this file has to say so and end with 1.
 Writes soak.json after every tenth round and at the end.
@@ -39,6 +40,7 @@ from benchmarks.reliability.memory import (
     Growth,
     count_growth,
     growth,
+    in_use_mb,
     memory_growth,
 )
 from benchmarks.reliability.small import SHARD_SCENES
@@ -72,6 +74,8 @@ NIGHT_S = 8 * 3600.0
 COMPILED = "/jax/core/compile/backend_compile_duration"
 # a round; most of 1,490 that are kept are tensorstore's JSON that orbax asks for
 BLOCKS = 3_000
+# MiB a round. A fall of resident memory hides a leak, and this one does not fall
+IN_USE_MB = 0.5
 LEAST_ROUNDS = 6  # so that enough of them are left after the warm-up
 
 
@@ -84,6 +88,7 @@ class Series:
     """One value a round."""
 
     rss_mb: list[float] = dataclasses.field(default_factory=list)
+    in_use_mb: list[float] = dataclasses.field(default_factory=list)  # of malloc
     open_files: list[int] = dataclasses.field(default_factory=list)
     threads: list[int] = dataclasses.field(default_factory=list)  # of the system
     python_threads: list[int] = dataclasses.field(default_factory=list)
@@ -97,6 +102,7 @@ class Series:
         """Look at this process at the end of a round."""
         gc.collect()
         self.rss_mb.append(round(resident_mb(), 1))
+        self.in_use_mb.append(round(in_use_mb(), 2))
         self.open_files.append(len(os.listdir("/proc/self/fd")))
         self.threads.append(len(os.listdir("/proc/self/task")))
         self.python_threads.append(threading.active_count())
@@ -249,6 +255,7 @@ class Soak:
         counted = ("open_files", "threads", "python_threads", "live_arrays", "compiled")
         return {
             "rss_mb": memory_growth(series.rss_mb),
+            "in_use_mb": growth(series.in_use_mb, IN_USE_MB * rises),
             "blocks": growth(series.blocks, BLOCKS * rises),
             **{name: count_growth(getattr(series, name)) for name in counted},
         }
@@ -268,12 +275,13 @@ class Soak:
 
 def within(growths: Mapping[str, Growth]) -> str:
     """What a run without problems has shown: slopes within limits, not none."""
-    rss, blocks = growths["rss_mb"], growths["blocks"]
+    rss, used, blocks = (growths[x] for x in ("rss_mb", "in_use_mb", "blocks"))
     return (
         f"within the limit: {rss.per_round:.2f} MB a round [{rss.low:.2f}, "
-        f"{rss.high:.2f}], {rss.by:.0f} in all (limit {rss.allowed:.0f}), "
-        f"{blocks.per_round:,.0f} blocks a round, {blocks.by:,.0f} in all (limit "
-        f"{blocks.allowed:,.0f})"
+        f"{rss.high:.2f}], {rss.by:.0f} in all (limit {rss.allowed:.0f}), in use "
+        f"{used.per_round:.2f} [{used.low:.2f}, {used.high:.2f}], {used.by:.1f} in all "
+        f"(limit {used.allowed:.1f}), {blocks.per_round:,.0f} blocks a round, "
+        f"{blocks.by:,.0f} in all (limit {blocks.allowed:,.0f})"
     )
 
 
@@ -314,6 +322,7 @@ def main() -> None:
         s = soak.series
         print(
             f"round {soak.rounds}: {s.seconds[-1]} s, {s.rss_mb[-1]} MiB, "
+            f"{s.in_use_mb[-1]} in use, "
             f"{s.open_files[-1]} files, {s.threads[-1]} threads, "
             f"{s.live_arrays[-1]} arrays, {s.compiled[-1]} programs",
             flush=True,

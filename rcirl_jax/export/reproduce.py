@@ -85,8 +85,7 @@ def settings_of(reward: Reward, dataset: Demonstrations) -> TrainConfig:
     """
     _check_source(reward, dataset, (*NEEDED, "steps"))
     found, file = reward.provenance, reward.file
-    with _of_this_version(f"{file}: provenance.config"):
-        config = config_of(found["config"])
+    config = _config_of(reward)
     per_epoch = -(-dataset.indices("train").size // config.batch_size)
     if found["steps"] != per_epoch * config.epochs:
         raise InputError(
@@ -119,14 +118,27 @@ def sweep_of(
     with _of_this_version(f"{file}: provenance.sweep"):
         grid = {**found["sweep"], "data": list(names)}
         sweep = typed_settings(SweepConfig, grid)
-    with _of_this_version(f"{file}: provenance.config"):
-        member = config_of(found["config"])
+    member = _config_of(reward)
     if member not in sweep.members():
         raise InputError(
             f"{file}: provenance.config: {member_name(member)}: expected a member of "
             "provenance.sweep"
         )
     return sweep
+
+
+def _config_of(reward: Reward) -> TrainConfig:
+    """The configuration that the file names; its network is the one in the file."""
+    where = f"{reward.file}: provenance.config"
+    with _of_this_version(where):
+        config = config_of(reward.provenance["config"])
+    hidden = tuple(len(bias) for bias in reward.biases[:-1])
+    if config.reward.hidden != hidden:
+        raise InputError(
+            f"{where}.reward.hidden: {list(config.reward.hidden)}: expected "
+            f"{list(hidden)}, the layers of the file"
+        )
+    return config
 
 
 def _check_source(

@@ -7,7 +7,7 @@ import pytest
 from rcirl_jax.errors import InputError
 from rcirl_jax.export import pack
 from rcirl_jax.export.loading import open_reward
-from rcirl_jax.export.provenance import dataset_names
+from rcirl_jax.export.provenance import check_local, dataset_names
 from tests import weights_files
 from tests.commands import command
 
@@ -63,6 +63,12 @@ def test_names_that_no_dataset_can_have(found):
 def test_one_dataset_or_several():
     assert dataset_names("a", "f") == ["a"]
     assert dataset_names(["a", "b"], "f") == ["a", "b"]
+
+
+def test_a_file_names_folders_only():
+    check_local(["a", "/b/c"], "f")
+    with pytest.raises(InputError, match="f: gs://b/d: expected a folder; --data may"):
+        check_local(["a", "gs://b/d"], "f")
 
 
 @pytest.mark.parametrize(

@@ -138,6 +138,11 @@ def test_another_shape_or_loss_is_no_reproduction(made, tmp_path):
         ("steps", 5, "provenance.steps: 5: expected 6, a run that was trained to its"),
         ("config", {"loss": "rank"}, "provenance.config: 'reward': expected settings"),
         ("dataset_sha256", "0" * 64, "provenance.dataset_sha256: 0000"),
+        (
+            "config",
+            {"reward": {"hidden": [2**30]}, "sampler": {}},
+            "provenance.config.reward.hidden: [1073741824]: expected [4], the layers",
+        ),
     ],
 )
 def test_what_cannot_be_trained_again_is_one_line(made, tmp_path, name, value, message):
@@ -147,6 +152,15 @@ def test_what_cannot_be_trained_again_is_one_line(made, tmp_path, name, value, m
         train_again(reward, made[1], tmp_path / "out", {})
     assert str(caught.value).startswith(f"{path}: {message}")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_place_elsewhere_is_not_opened(made, tmp_path):
+    path, folder = tmp_path / "w.msgpack", tmp_path / "again"
+    changed(made[0], path, flags={"data": "gs://bucket/d"})
+    done = command("experiments.reproduce", f"--weights={path}", f"--output={folder}")
+    assert done.returncode == 2
+    assert f"{path}: provenance.flags.data: gs://bucket/d: expected a fo" in done.stderr
+    assert not folder.exists()
 
 
 def test_a_file_says_how_it_was_made(made):
