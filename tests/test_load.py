@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from benchmarks.reliability.memory import (
+    FINISHING_MB,
     Sample,
     Watch,
     count_growth,
+    finishing_problems,
     growth,
     in_use_mb,
     level,
@@ -98,6 +100,25 @@ def test_one_more_open_file_a_few_rounds_is_growth():
     assert not count_growth(np.full(60, 30)).grows
     assert count_growth(steady + np.arange(60) // 5).grows
     assert count_growth(30 + np.arange(60) // 20).grows
+
+
+@pytest.mark.parametrize("at", [18, 20, 40, 57])
+def test_one_thing_kept_once_is_growth(at):
+    """After the first rounds that are watched; a slope alone does not see it."""
+    kept = (np.arange(60) >= at).astype(int)
+    assert not growth(30 + kept, 0.5).grows
+    assert count_growth(30 + kept).grows
+    assert not count_growth(30 + kept, allowed=1).grows
+    found = count_growth(30 + 2 * kept, allowed=1)
+    assert found.grows
+    assert found.by >= 2.0
+
+
+def test_writing_the_index_is_judged_as_well():
+    cutting = level(phase(1000.0), 1000.0)
+    assert finishing_problems(cutting, 1000.0 + FINISHING_MB - 1.0) == []
+    (line,) = finishing_problems(cutting, 1000.0 + FINISHING_MB + 1.0)
+    assert line == "finishing held 1601 MiB, expected 1600 at most"
 
 
 def test_a_fall_is_no_growth_and_few_rounds_are_refused():

@@ -34,7 +34,14 @@ import numpy as np
 from absl import flags
 
 from benchmarks.common import LANE_TOML, resident_mb, untrained, write
-from benchmarks.reliability.memory import Level, Sample, Watch, level, thinned
+from benchmarks.reliability.memory import (
+    Level,
+    Sample,
+    Watch,
+    finishing_problems,
+    level,
+    thinned,
+)
 from experiments.common import provenance, run
 from rcirl_jax.data.files import MARK
 from rcirl_jax.data.shards import shard_key
@@ -349,7 +356,8 @@ def imports() -> list[str]:
     }
     write("load_import", result, _OUTPUT.value)
     print({k: v for k, v in result.items() if k != "series"}, flush=True)
-    return [] if found.outcome == BOUNDED else [f"import: {found.outcome}"]
+    grown = [] if found.outcome == BOUNDED else [found.outcome]
+    return [f"import: {x}" for x in (*grown, *finishing_problems(found, at_the_end))]
 
 
 def _extrapolated(made: Imported, found: Level) -> dict:

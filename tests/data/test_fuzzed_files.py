@@ -416,6 +416,8 @@ def test_row_groups_that_claim_too_much(tmp_path, monkeypatch):
         ('pattern = ""', "pattern: : expected file names"),
         ('pattern = "a**"', "pattern: a**: expected file names"),
         (f'pattern = "{"x" * 300}"', "expected file names"),
+        (f'pattern = "{"x/" * 600}x"', "/x: expected file names"),
+        ('pattern = "**/**/x.csv"', "pattern: **/**/x.csv: expected file names"),
         ("rate_hz = [1]", "rate_hz: [1]: expected a number"),
         ("rate_hz = 5" + "0" * 18, "expected at most 1e+18"),
         (

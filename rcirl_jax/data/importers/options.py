@@ -11,6 +11,7 @@ from rcirl_jax.types import Kind
 LARGEST = 10**18  # of an integer
 MAX_NAME = 255  # bytes of a file's name
 MAX_PATH = 2048  # bytes of a path; systems take 4096, with the folder before it
+MAX_PARTS = 32  # of a pattern, which pathlib matches by recursion
 KINDS = ("vehicle", "cyclist", "pedestrian", "static")
 
 
@@ -85,12 +86,19 @@ def _is_name(text: str) -> bool:
 
 
 def _is_pattern(item: object) -> bool:
-    """Whether pathlib takes it, and it stays inside the input."""
+    """Whether pathlib takes it, and it stays inside the input.
+
+    Each `**` walks all folders below those of the one before it, so it stands once.
+    """
     if not isinstance(item, str) or item.startswith("/"):
         return False
     names = PurePosixPath(item).parts
-    return bool(names) and all(
-        is_file_name(name) and ("**" not in name or name == "**") for name in names
+    return (
+        0 < len(names) <= MAX_PARTS
+        and names.count("**") <= 1
+        and all(
+            is_file_name(name) and ("**" not in name or name == "**") for name in names
+        )
     )
 
 
