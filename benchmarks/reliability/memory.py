@@ -108,7 +108,7 @@ def count_growth(values: ArrayLike, allowed: int = 0) -> Growth:
     pairs; a number that now and then is one higher is no growth.
     """
     watched = _watched(values)
-    slope = growth(values, allowed + 0.5)
+    slope = growth(values, 0.5)
     kept = float(watched[-LOOKS:].min() - watched[:LOOKS].max())
     if kept <= allowed:
         return slope
