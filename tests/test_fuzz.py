@@ -163,6 +163,16 @@ def test_what_a_refusal_may_say(line, kind):
     assert (found and found.kind) == kind
 
 
+def test_reading_what_an_input_names_hides_nothing():
+    read, other = (contract.Breach(kind, "") for kind in ("read outside", "KeyError"))
+    written = contract.Breach("written outside", "")
+    assert contract.broken_by(other, [read, written], True) == [other, written]
+    assert contract.broken_by(None, [read], True) == []
+    assert contract.broken_by(other, [read], False) == [other, read]
+    assert contract.refusal_breach("/b.csv: x: 3: expected 4", ["a.csv"], True) is None
+    assert contract.refusal_breach("/b.csv: x: 3: expected 4", ["a.csv"]) is not None
+
+
 def test_errors_are_one_short_printable_line():
     line = str(
         InputError("a.csv: x: \x1b[0m\ud800\u2028\0 " + "9" * 9000 + ": expected")
@@ -179,7 +189,7 @@ def test_places_outside_are_seen(tmp_path):
     secret.write_text("x")
     with watch:
         (tmp_path / "own" / "fine").write_text("x")
-    assert watch.seen is None
+    assert watch.seen == []
     for action, kind in (
         (lambda: secret.read_text(), "read outside"),
         (lambda: secret.write_text("y"), "written outside"),
@@ -187,7 +197,12 @@ def test_places_outside_are_seen(tmp_path):
     ):
         with watch:
             action()
-        assert watch.seen.kind == kind
+        assert [breach.kind for breach in watch.seen] == [kind]
+    with watch:  # one hides none that comes after it
+        for _ in range(2):
+            (tmp_path / "other").write_text("x")
+            (tmp_path / "other").read_text()
+    assert [x.kind for x in watch.seen] == ["written outside", "read outside"]
 
 
 @pytest.mark.parametrize("form", sorted(codecs.CODECS))

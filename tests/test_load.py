@@ -18,6 +18,7 @@ from benchmarks.reliability.memory import (
     in_use_mb,
     level,
     memory_growth,
+    peak_problems,
     thinned,
 )
 from tests.commands import fresh as command
@@ -151,12 +152,25 @@ def test_a_phase_is_judged_from_its_second_tenth_on():
     assert level(phase(8000.0, grown=1200.0), 1000.0).outcome != "bounded"
 
 
-def test_a_spike_in_a_phase_is_its_most_and_no_growth():
+@pytest.mark.parametrize(
+    ("mb", "outcome"),
+    [
+        (2000.0, "bounded"),
+        (2001.0, "held 2001 MiB, expected 2000 at most"),
+        (5000.0, "held 5000 MiB, expected 2000 at most"),
+    ],
+)
+def test_a_spike_in_a_phase_is_its_most_and_no_growth(mb, outcome):
     samples = phase(1000.0)
     spike = samples[390]
-    samples[390] = Sample(seconds=390.0, mb=1.0, all_mb=5000.0, done=spike.done)
+    samples[390] = Sample(seconds=390.0, mb=1.0, all_mb=mb, done=spike.done)
     found = level(samples, 1000.0)
-    assert (found.outcome, found.at_most) == ("bounded", 5000.0)
+    assert (found.outcome, found.at_most, found.grown) == (outcome, mb, 0.0)
+
+
+def test_rows_one_after_the_other_are_judged_together():
+    assert peak_problems(1000.0, 2000.0) == []
+    assert peak_problems(1000.0, 2001.0) == ["held 2001 MiB, expected 2000 at most"]
 
 
 def test_too_few_looks_are_refused():

@@ -23,6 +23,7 @@ LOOKS = 3  # rounds at either end that a count is compared in
 MOST = 500  # points that a slope is taken from: all pairs of them are compared
 SHARE, MB = 0.05, 50.0  # growth allowed to a series of rounds: the larger of the two
 PHASE_SHARE, PHASE_MB = 0.10, 200.0  # and to a phase, from its second tenth to its last
+PEAK_MB = 1_000.0  # that a moment may hold above the level
 # and to what ends an import: 160 to 420 were seen, the most of 10 million scenes, whose
 # index would take more in Python's objects
 FINISHING_MB = 600.0
@@ -160,16 +161,29 @@ def level(samples: Sequence[Sample], total: float) -> Level:
     before, after = float(np.median(early)), float(np.median(late))
     allowed = max(PHASE_SHARE * before, PHASE_MB)
     grown = after - before
-    is_bounded = grown <= allowed
+    at_most, limit = float(mb.max()), max(before, after) + PEAK_MB
+    outcome = "bounded"
+    if grown > allowed:
+        outcome = f"grew by {grown:.0f} MiB"
+    elif at_most > limit:
+        outcome = f"held {at_most:.0f} MiB, expected {limit:.0f} at most"
     return Level(
         after_a_tenth=before,
         at_the_end=after,
-        at_most=float(mb.max()),
+        at_most=at_most,
         grown=grown,
         allowed=allowed,
         mb_per_unit=_slope(done[half] * total, mb[half]),
-        outcome="bounded" if is_bounded else f"grew by {grown:.0f} MiB",
+        outcome=outcome,
     )
+
+
+def peak_problems(usual: float, at_most: float) -> list[str]:
+    """Phases of one process may hold `PEAK_MB` more than the first usually did."""
+    limit = usual + PEAK_MB
+    if at_most <= limit:
+        return []
+    return [f"held {at_most:.0f} MiB, expected {limit:.0f} at most"]
 
 
 def finishing_problems(cutting: Level, at_most: float) -> list[str]:

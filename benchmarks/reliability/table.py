@@ -96,7 +96,7 @@ def words(command: str) -> list[str]:
     return [*own.get(first, [first]), *rest]
 
 
-def code_sha256() -> str:
+def tree_sha256() -> str:
     """Of every file that git knows, but documentation and results.
 
     Raises:
@@ -167,14 +167,14 @@ def as_stated_before(path: Path, code: str) -> dict[tuple[str, str], dict]:
         (row["fault"], row["command"]): row
         for row in rows
         if row["status"] == 0
-        and row.get("code_sha256") == code
+        and row.get("tree_sha256") == code
         and row["command"] not in WORLD
     }
 
 
 def main() -> None:
     """The page's rows, one after the other."""
-    found, code, commit = rows_of(PAGE.read_text()), code_sha256(), git_commit()
+    found, code, commit = rows_of(PAGE.read_text()), tree_sha256(), git_commit()
     wanted = [
         row
         for row in found
@@ -195,7 +195,7 @@ def main() -> None:
             print(f"as stated before, with this code: {row.fault}")
             continue
         print(f"{row.fault}: {row.command}", flush=True)
-        done[key] = ran(row) | {"code_sha256": code, "git_commit": commit}
+        done[key] = ran(row) | {"tree_sha256": code, "git_commit": commit}
         good = "as stated" if done[key]["status"] == 0 else "NOT as stated"
         print(f"    {good}, {done[key]['seconds']} s: {done[key]['said']}", flush=True)
         rows = [done[one] for one in keys if one in done]

@@ -2,8 +2,10 @@
 
 import contextlib
 import functools
+import hashlib
 import os
-from collections.abc import Iterable, Mapping
+import stat
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import tensorstore as ts
@@ -14,6 +16,7 @@ from rcirl_jax.stages import LOCK, only_one
 
 MANIFEST, MARK, SHARDS = "manifest.json", "shard.json", "shards/"
 FACTS = "made_by.json"  # beside the manifest, whose bytes depend on the logs alone
+MAX_JSON_BYTES = 256 * 2**20  # of each of these; 10 million scenes take some 10 MiB
 
 
 class Files:
@@ -72,16 +75,79 @@ class Files:
             ) from error
         return [key for key in found if key != LOCK]
 
-    def read_many(self, keys: Iterable[str]) -> Iterable[tuple[str, bytes | None]]:
-        """Each key with its value, None where it is missing; all read at once."""
-        futures = {key: self.kv.read(key) for key in keys}
-        for key, future in futures.items():
-            found = self.wait(future, key)
-            yield key, found.value if found.state == "value" else None
+    def read_json(self, key: str) -> bytes | None:
+        """The bytes of one of the dataset's JSON files, or None.
 
-    def read(self, key: str) -> bytes | None:
-        """One value, or None."""
-        return dict(self.read_many([key]))[key]
+        Raises:
+          InputError: it cannot be read, or is larger than `MAX_JSON_BYTES`; in a folder
+            that is seen before it is read.
+        """
+        self._check_size(key, self._bytes_of(key))
+        found = self.wait(self.kv.read(key), key)
+        if found.state != "value":
+            return None
+        self._check_size(key, len(found.value))
+        return found.value
+
+    def digest(self, key: str, expected: int) -> tuple[int, str]:
+        """Bytes and sha256 of a value; a file is read piece by piece.
+
+        Args:
+          key: of the value.
+          expected: its bytes; of another number of bytes there is no sha256, and a file
+            of them is not read.
+
+        Returns:
+          (bytes, sha256); the latter "missing" or "not read" where there is none.
+
+        Raises:
+          InputError: it cannot be read.
+        """
+        if self.folder is None:
+            found = self.wait(self.kv.read(key), key)
+            value = found.value if found.state == "value" else None
+            if value is None:
+                return 0, "missing"
+            return len(value), hashlib.sha256(value).hexdigest()
+        size = self._bytes_of(key)
+        if size is None:
+            return 0, "missing"
+        if size != expected:
+            return size, "not read"
+        with self._refusing(key), open(os.path.join(self.folder, key), "rb") as file:
+            return size, hashlib.file_digest(file, "sha256").hexdigest()
+
+    def _bytes_of(self, key: str) -> int | None:
+        """Of a file in a folder; None where there is none, or no folder."""
+        if self.folder is None:
+            return None
+        try:
+            with self._refusing(key):
+                found = os.stat(os.path.join(self.folder, key))
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+        if not stat.S_ISREG(found.st_mode):
+            raise InputError(f"{self.path(key)}: expected a file")
+        return found.st_size
+
+    @contextlib.contextmanager
+    def _refusing(self, key: str) -> Iterator[None]:
+        """What the system says of a file that is there, as a refusal."""
+        try:
+            yield
+        except (FileNotFoundError, NotADirectoryError):
+            raise
+        except OSError as error:
+            raise InputError(
+                f"{self.path(key)}: cannot be read: {error.strerror}: "
+                "expected a dataset's file"
+            ) from error
+
+    def _check_size(self, key: str, size: int | None) -> None:
+        if size is not None and size > MAX_JSON_BYTES:
+            raise InputError(
+                f"{self.path(key)}: {size} bytes: expected {MAX_JSON_BYTES} at most"
+            )
 
     def write_many(self, values: Mapping[str, bytes]) -> None:
         """Each value atomically; returns when all are on disk."""

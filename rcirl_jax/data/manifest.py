@@ -8,14 +8,14 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from rcirl_jax.data.files import MANIFEST, Files
+from rcirl_jax.data.files import MANIFEST, MAX_JSON_BYTES, Files
 from rcirl_jax.data.rows import leaf_specs
 from rcirl_jax.errors import InputError
 from rcirl_jax.units import NUM_TIMES, TIMES_S
 from rcirl_jax.whole import parse_json
 
 SCHEMA_VERSION = 1  # of manifest.json and shard.json
-MAX_ROWS = 2**31  # rows of a dataset
+MAX_ROWS = 2**27  # rows of a dataset: their numbers alone are 1 GiB
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -59,9 +59,19 @@ def _canonical(payload: Mapping) -> str:
 
 
 def seal(payload: Mapping, field: str) -> bytes:
-    """JSON bytes of the payload with its own digest as one more field."""
+    """JSON bytes of the payload with its own digest as one more field.
+
+    Raises:
+      InputError: more of them than are read again.
+    """
     whole = {**payload, field: _canonical(payload)}
-    return (json.dumps(whole, sort_keys=True, indent=1) + "\n").encode()
+    raw = (json.dumps(whole, sort_keys=True, indent=1) + "\n").encode()
+    if len(raw) > MAX_JSON_BYTES:
+        raise InputError(
+            f"dataset: {len(raw)} bytes of names and recordings: expected "
+            f"{MAX_JSON_BYTES} at most; import into several datasets"
+        )
+    return raw
 
 
 def unseal(raw: bytes, field: str, name: str) -> dict:

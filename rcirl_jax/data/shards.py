@@ -8,6 +8,7 @@ import tensorstore as ts
 
 from rcirl_jax.data.files import MARK, SHARDS, Files
 from rcirl_jax.data.manifest import ShardInfo, parse_shard
+from rcirl_jax.data.rows import leaf_specs
 from rcirl_jax.errors import InputError
 
 BLOCK_ROWS = 256  # rows of a separately compressed block: ~2.5 MB of scenes, unpacked
@@ -71,17 +72,15 @@ def encode(leaves: Mapping[str, np.ndarray]) -> dict[str, bytes]:
     return {key.decode(): future.result().value for key, future in futures.items()}
 
 
-def describe(data: bytes | None) -> dict:
-    """Size and sha256 of a file, or that it is missing."""
-    if data is None:
-        return {"bytes": 0, "sha256": "missing"}
+def describe(data: bytes) -> dict:
+    """Size and sha256 of a file."""
     return {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
 
 
 def shard_info(files: Files, index: int, sha256: str | None = None) -> ShardInfo:
     """What shard.json says; InputError if it is not there, or not as written."""
     name = files.path(shard_key(index) + MARK)
-    mark = files.read(shard_key(index) + MARK)
+    mark = files.read_json(shard_key(index) + MARK)
     if mark is None:
         raise InputError(f"{name}: shard {index}: missing: expected sha256 {sha256}")
     info = parse_shard(mark, name)
@@ -96,12 +95,25 @@ def verify_shard(files: Files, index: int, sha256: str | None = None) -> ShardIn
     """Read all of a shard against its checksums; InputError names what is wrong."""
     key = shard_key(index)
     info = shard_info(files, index, sha256)
-    for path, data in files.read_many(key + file for file in info.files):
-        found, expected = describe(data), info.files[path.removeprefix(key)]
-        if found != expected:
+    _check_names(files.path(key + MARK), info)
+    for name, stated in info.files.items():
+        size, found = files.digest(key + name, stated["bytes"])
+        if {"bytes": size, "sha256": found} != stated:
             raise InputError(
-                f"{files.path(path)}: shard {index}: {found['bytes']} bytes, sha256 "
-                f"{found['sha256']}: expected {expected['bytes']} bytes, sha256 "
-                f"{expected['sha256']}; import the logs again"
+                f"{files.path(key + name)}: shard {index}: {size} bytes, sha256 "
+                f"{found}: expected {stated['bytes']} bytes, sha256 "
+                f"{stated['sha256']}; import the logs again"
             )
     return info
+
+
+def _check_names(name: str, info: ShardInfo) -> None:
+    """Every array has its two files: of rows without one zarr makes zeros."""
+    made = leaf_specs()
+    expected = {f"{leaf}/zarr.json" for leaf in made}
+    expected |= {
+        "/".join([leaf, "c", *"0" * (1 + len(made[leaf].shape))]) for leaf in made
+    }
+    different = sorted(expected ^ info.files.keys())
+    if different:
+        raise InputError(f"{name}: files: {different[0]}: expected two of every array")

@@ -270,7 +270,7 @@ class Dataset:
         Raises:
           InputError: not a JSON object.
         """
-        raw = self._files.read(FACTS)
+        raw = self._files.read_json(FACTS)
         try:
             found = {} if raw is None else parse_json(raw)
         except ValueError as error:
@@ -387,7 +387,12 @@ class Dataset:
         if rows.ndim != 1 or np.any((rows < 0) | (rows >= self.count)):
             raise IndexError(f"rows: expected a list of numbers below {self.count}")
         spec = {name: leaf_specs()[name] for name in names}
-        out = {k: np.empty((rows.size, *v.shape), v.dtype) for k, v in spec.items()}
+        try:
+            out = {k: np.empty((rows.size, *v.shape), v.dtype) for k, v in spec.items()}
+        except MemoryError as error:
+            raise InputError(
+                f"{self._files.name}: {rows.size} rows: {error}: expected that memory"
+            ) from error
         owner = np.searchsorted(self._starts, rows, side="right") - 1
         for shard in np.unique(owner).tolist():
             places = np.flatnonzero(owner == shard)
@@ -413,7 +418,7 @@ def open_dataset(url: str | os.PathLike[str], verify: bool = True) -> Dataset:
         damage; names the file.
     """
     files = Files(url)
-    raw = files.read(MANIFEST)
+    raw = files.read_json(MANIFEST)
     if raw is None:
         shards = any(key.startswith(SHARDS) for key in files.list_keys())
         reason = (

@@ -16,6 +16,8 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.whole import named, parse_json, write_whole
 
 MAX_STEP = 2**63 - 1  # what 64 bits hold
+MAX_BYTES = 2**30  # of a metrics.jsonl: some four million steps
+MAX_LINE = 2**16  # characters of one of its lines; the rest of a longer one is no JSON
 
 
 class MetricsWriter:
@@ -64,15 +66,22 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
 
     A line that a crash or a full disk cut short is left out, and so is one without a
     step; values that are neither numbers nor null are left out of theirs.
+
+    Raises:
+      InputError: a file of more than `MAX_BYTES`.
     """
     rows = []
-    text = path.read_text(errors="replace") if path.is_file() else ""
-    for line in text.splitlines():
-        with contextlib.suppress(ValueError):
-            found = parse_json(line)
-            step = found.get("step") if isinstance(found, dict) else None
-            if type(step) is int and abs(step) <= MAX_STEP:
-                rows.append({k: v for k, v in found.items() if _is_number(v)})
+    if not path.is_file():
+        return rows
+    if (size := path.stat().st_size) > MAX_BYTES:
+        raise InputError(f"{path}: {size} bytes: expected {MAX_BYTES} at most")
+    with path.open(errors="replace") as file:
+        while line := file.readline(MAX_LINE):
+            with contextlib.suppress(ValueError):
+                found = parse_json(line)
+                step = found.get("step") if isinstance(found, dict) else None
+                if type(step) is int and abs(step) <= MAX_STEP:
+                    rows.append({k: v for k, v in found.items() if _is_number(v)})
     return rows
 
 

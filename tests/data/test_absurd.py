@@ -1,6 +1,7 @@
 """Numbers in range for a parser and absurd for a road; faults no check foresaw."""
 
 import dataclasses
+import importlib
 import os
 import re
 import sqlite3
@@ -11,7 +12,7 @@ import pytest
 from rcirl_jax.data import importers
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.cut import cut
-from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.importers import read_recordings, tables
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError, as_input_error
 from tests.commands import command
@@ -95,6 +96,57 @@ def test_a_csv_cell_beyond_any_place_or_time(long_bytes, cell, column, tmp_path)
     line = only_line("csv", log, source)
     assert f"{column}: {float(cell):g}" in line or f"{column}: {float(cell)}" in line
     assert "expected" in line
+
+
+WHOLE = ["interaction", "levelx_highd", "ngsim_pairs", "openacc"]
+
+
+def first_file(name, folder):
+    """The first file of a sound log."""
+    module = importlib.import_module(f"tests.data.formats.{name}")
+    return module.write(made(folder)).files[0]
+
+
+def importer_of(name):
+    return "levelx" if name.startswith("levelx") else name
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_a_log_that_is_held_whole_has_a_size(name, tmp_path):
+    file = first_file(name, tmp_path / "in")
+    with file.open("r+b") as opened:
+        opened.truncate(2**40)  # its rows, and a terabyte of nothing
+    line = only_line(importer_of(name), tmp_path / "in")
+    assert f"{file.name}: size: {2**20} MiB: expected 1024 at most" in line
+
+
+@pytest.mark.parametrize("where", ["header", "rows"])
+@pytest.mark.parametrize("name", [*WHOLE, "csv", "ngsim"])
+def test_a_line_without_an_end_is_not_held(name, where, tmp_path, monkeypatch):
+    """All of it on one line, or a sound head and then one line of cells."""
+    monkeypatch.setattr(tables, "MAX_LINE", 2**14)
+    file = first_file(name, tmp_path / "in")
+    rows = file.read_text().splitlines(keepends=True)
+    end = rows[-1].rstrip("\n").replace(" ", ",")
+    kept = "" if where == "header" else "".join(rows)
+    file.write_text(kept + (end + ",") * (2**15 // len(end)))
+    line = only_line(importer_of(name), tmp_path / "in")
+    assert file.name in line
+    if name != "openacc" or where == "rows":  # which reads so much of its head only
+        assert "a line of more than 16384 characters: expected one a row" in line
+
+
+def test_a_long_log_with_a_line_without_an_end(tmp_path):
+    """Read in pieces, by another reader, which says where it stopped."""
+    log, source = tmp_path / "log.csv", tmp_path / "source.toml"
+    with log.open("w") as file:
+        file.write("t,id,x,y,lane\n0.0,a,0.0,0.0,1\n")
+        for _ in range(200):
+            file.write("0.1,a,0.0,0.0,1," * 2**12)
+    names = "\n".join(f'{name} = "{name}"' for name in ("t", "id", "x", "y", "lane"))
+    source.write_text(f"long_bytes = 1\n[columns]\n{names}\n")
+    line = only_line("csv", log, source)
+    assert "a line of more than 1048576 characters: expected one a row" in line
 
 
 @pytest.mark.parametrize(

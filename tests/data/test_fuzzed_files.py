@@ -253,12 +253,64 @@ def test_a_link_out_of_a_dataset_is_read_as_what_it_shows(dataset, tmp_path):
 
 
 @pytest.mark.parametrize(
+    "name", ["manifest.json", "made_by.json", "shards/00000/shard.json"]
+)
+def test_a_terabyte_in_a_dataset_is_not_read(dataset, name):
+    with (dataset / name).open("wb") as file:
+        file.truncate(2**40)
+    line = line_of(lambda: open_dataset(dataset).facts())
+    assert f"{name}: {2**40} bytes: expected {2**28} at most" in line
+
+
+def test_a_terabyte_of_rows_is_not_read(dataset):
+    file = next(f for f in (dataset / "shards/00000/human.s").rglob("*") if f.is_file())
+    with file.open("r+b") as opened:
+        opened.truncate(2**40)
+    line = line_of(lambda: open_dataset(dataset))
+    assert f"{file.name}: shard 0: {2**40} bytes, sha256 not read: expected" in line
+
+
+def test_what_is_no_file_in_a_dataset_is_not_read(dataset):
+    file = dataset / "shards/00000/human.s/zarr.json"
+    file.unlink()
+    os.mkfifo(file)  # which would be waited for
+    assert "zarr.json: expected a file" in line_of(lambda: open_dataset(dataset))
+
+
+def test_arrays_without_their_rows_are_no_shard(dataset):
+    """zarr reads zeros where nothing is."""
+    (dataset / "shards/00000/vehicle/c/0").unlink()
+    reseal(dataset, lambda shard: shard["files"].pop("vehicle/c/0"))
+    line = line_of(lambda: open_dataset(dataset))
+    assert "shard.json: files: vehicle/c/0: expected two of every array" in line
+
+
+def test_rows_that_memory_does_not_hold_are_one_line(dataset, monkeypatch):
+    opened = open_dataset(dataset)
+
+    def refused(*_):
+        raise MemoryError("Unable to allocate")
+
+    monkeypatch.setattr(np, "empty", refused)
+    line = line_of(lambda: opened.load(None))
+    assert line.endswith("2 rows: Unable to allocate: expected that memory")
+
+
+def test_a_dataset_that_could_not_be_read_again_is_not_written(tmp_path, monkeypatch):
+    monkeypatch.setattr(manifest, "MAX_JSON_BYTES", 1000)
+    line = line_of(lambda: store.write(tmp_path / "d", (2,)))
+    assert "expected 1000 at most; import into several datasets" in line
+    assert not (tmp_path / "d" / "manifest.json").exists()
+
+
+@pytest.mark.parametrize(
     ("change", "words"),
     [
         (lambda m: m.update(count=-1), "count: -1: expected a number of rows"),
         (lambda m: m.update(count=True), "count: True: expected a number of rows"),
         (lambda m: m.update(count=1), "count: 1: expected 2, the sum of its shards"),
         (lambda m: m.update(count=10**15), "count: 10{15}: expected a number of rows"),
+        (lambda m: m.update(count=2**27 + 1), "count: .*: expected a number of rows"),
         (lambda m: m.update(arrays=3), "arrays: 3: expected an object"),
         (lambda m: m.update(shards={}), "shards: .*: expected shards with count"),
         (lambda m: m["shards"].append(3), "shards: .*: expected shards with count"),

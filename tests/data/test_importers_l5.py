@@ -575,6 +575,7 @@ def test_folder_without_data(tmp_path):
         ({"world_to_ecef": [[1.0]]}, "world_to_ecef"),
         ({"world_to_ecef": [[0.0] * 4] * 4}, "world_to_ecef"),
         ({"world_to_ecef": [[1.0, {}]]}, "world_to_ecef"),
+        ({"world_to_ecef": [[10**400] * 4] * 4}, "world_to_ecef"),
     ],
 )
 def test_malformed_meta(folder, content, expected):

@@ -93,12 +93,11 @@ def test_a_count_is_the_tests():
 
 
 def test_the_count_of_the_fuzzed_reader_is_what_was_said():
-    """Of the last `make reliability` in the results, if it has the row."""
-    path = RESULTS / "reliability.json"
-    rows = json.loads(path.read_text())["rows"] if path.exists() else []
-    for row in rows:
-        if row["command"] == "make fuzz" and row["status"] == 0:
-            assert row["said"] == f"fuzz: {count_of('make fuzz')} inputs, no crash"
+    """Of the last `make reliability` in the results."""
+    rows = json.loads((RESULTS / "reliability.json").read_text())["rows"]
+    (row,) = (row for row in rows if row["command"] == "make fuzz")
+    assert row["status"] == 0
+    assert row["said"] == f"fuzz: {count_of('make fuzz')} inputs, no crash"
 
 
 def test_rows_of_the_world_are_rows():
@@ -172,29 +171,29 @@ def test_the_code_is_what_git_knows(monkeypatch, tmp_path):
 
     monkeypatch.setattr(table, "ROOT", tmp_path)
     with pytest.raises(InputError, match=r"git ls-files: .*: expected a checkout$"):
-        table.code_sha256()
+        table.tree_sha256()
     git("init", "-q")
     with pytest.raises(InputError, match="no files: expected a checkout"):
-        table.code_sha256()
+        table.tree_sha256()
     names = ("docs/a.js", "benchmarks/results/a.json", "README.md", "notes")
     code = (".ci/audit.py", "onboard/CMakeLists.txt", "a.msgpack", "tests/docs/a.py")
     for name in (*names, *code):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("before")
     git("add", *names[:3], *code)
-    before = table.code_sha256()
+    before = table.tree_sha256()
     for name in names:
         (tmp_path / name).write_text("after")
-        assert table.code_sha256() == before, name
+        assert table.tree_sha256() == before, name
     for name in code:
         (tmp_path / name).write_text("after")
-        assert table.code_sha256() != before, name
+        assert table.tree_sha256() != before, name
         (tmp_path / name).write_text("before")
     (tmp_path / code[0]).unlink()
-    assert table.code_sha256() != before
+    assert table.tree_sha256() != before
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(InputError, match=r"^git: No such file or directory"):
-        table.code_sha256()
+        table.tree_sha256()
 
 
 def page(*commands):
@@ -207,7 +206,7 @@ def rows(monkeypatch, tmp_path):
     """(a function of pages and flags that runs the rows; the rows run by it)."""
     seen, real = [], table.ran
     monkeypatch.setattr(table, "PAGE", tmp_path / "page.md")
-    monkeypatch.setattr(table, "code_sha256", lambda: "this")
+    monkeypatch.setattr(table, "tree_sha256", lambda: "this")
     monkeypatch.setattr(table, "ran", lambda row: seen.append(row.fault) or real(row))
     flags.FLAGS(["table"])
 
@@ -242,7 +241,7 @@ def test_what_came_out_as_stated_is_not_run_again(rows, monkeypatch):
     )
     assert (status, seen) == (0, ["true"])
     assert len(result["rows"]) == 2
-    monkeypatch.setattr(table, "code_sha256", lambda: "other")
+    monkeypatch.setattr(table, "tree_sha256", lambda: "other")
     status, seen, result = rows(page("true", "make --version"), rows=["true"])
     assert seen == ["true"]
     assert result["not_run"] == ["make --version"]

@@ -5,13 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.common import untrained
 from rcirl_jax.errors import InputError
 from rcirl_jax.planner.baselines import Idm
-from rcirl_jax.planner.rank import idm_policy
-from rcirl_jax.simulation.cases import NUM_AGENTS, Replay
+from rcirl_jax.planner.rank import RankConfig, idm_policy
+from rcirl_jax.simulation.cases import NUM_AGENTS, STEP_S, Replay
 from rcirl_jax.simulation.metrics import MetricsConfig, case_metrics
 from rcirl_jax.simulation.rollout import LANES, RolloutConfig, drive_cases
-from rcirl_jax.simulation.rows import Row
+from rcirl_jax.simulation.rows import Row, baseline_row
 from rcirl_jax.simulation.suite import build, drive_row, suite_refs
 from tests.simulation.drives import constant, drive, stack
 from tests.simulation.worlds import make_case
@@ -20,18 +21,30 @@ CONFIG = RolloutConfig(steps=100)
 IDM = Row(name="IDM", policy=idm_policy(Idm()))
 
 
-def metrics_of(chunk):
+def metrics_of(row, chunk, seconds=10.0):
     refs = suite_refs("cut_in,pedestrian", 20)
-    cases = lambda a, b: build(refs[a:b], 10.0)  # noqa: E731
-    return drive_row(IDM, cases, len(refs), CONFIG, chunk=chunk)
+    config = RolloutConfig(steps=round(seconds / STEP_S))
+    cases = lambda a, b: build(refs[a:b], seconds)  # noqa: E731
+    return drive_row(row, cases, len(refs), config, chunk=chunk)
+
+
+def is_same(first, again):
+    return all(jax.tree.leaves(jax.tree.map(np.array_equal, first, again)))
 
 
 def test_batch_size_and_repetition_change_no_bit():
-    first = metrics_of(2 * LANES)
+    first = metrics_of(IDM, 2 * LANES)
     for chunk in (2 * LANES, LANES, 7):
-        again = metrics_of(chunk)
-        same = jax.tree.map(np.array_equal, first, again)
-        assert all(jax.tree.leaves(same)), chunk
+        assert is_same(first, metrics_of(IDM, chunk)), chunk
+
+
+@pytest.mark.parametrize("name", ["hand-set", "random weights"])
+def test_batch_size_changes_no_bit_of_what_ranks_candidates(name):
+    row = baseline_row(name, "paper21", untrained()[1], RankConfig())
+    first = metrics_of(row, 2 * LANES, 2.0)
+    assert np.unique(first.progress).size > 2
+    for chunk in (LANES, 7):
+        assert is_same(first, metrics_of(row, chunk, 2.0)), chunk
 
 
 def test_chunks_report_every_case_once():

@@ -41,6 +41,19 @@ def test_a_damaged_line_is_left_out(tmp_path, damaged):
     assert path.read_text() == line(1) + "\n"
 
 
+def test_metrics_of_any_size_take_little_memory(tmp_path):
+    path = write(
+        tmp_path, [line(1), '{"step": 2, "a": "' + "x" * 70_000 + '"}', line(3)]
+    )
+    assert [row["step"] for row in read_metrics(path)] == [1, 3]
+    with path.open("r+b") as file:
+        file.truncate(2**40)  # a terabyte of nothing
+    with pytest.raises(
+        InputError, match=r"metrics\.jsonl: \d+ bytes: expected 1073741"
+    ):
+        read_metrics(path)
+
+
 def test_values_that_are_no_numbers_are_left_out(tmp_path):
     path = write(tmp_path, [line(1, loss="low", pairs=[1], pair_accuracy=None)])
     assert read_metrics(path) == [

@@ -322,12 +322,17 @@ def test_other_settings_or_data_in_the_folder_are_one_line(data, finished):
         run_sweep(config_of(data, base=longer), folder, Here(), {})
 
 
+def contents(folder):
+    return {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
 def test_a_sweep_in_use_is_refused(data, finished):
     folder = finished[0]
-    before = (folder / "sweep.json").read_bytes()
-    with only_one(folder), pytest.raises(InputError, match="in use by another proc"):
-        run_sweep(config_of(data), folder, Here(), MADE_BY)
-    assert (folder / "sweep.json").read_bytes() == before
+    with only_one(folder):
+        before = contents(folder)
+        with pytest.raises(InputError, match="in use by another proc"):
+            run_sweep(config_of(data), folder, Here(), MADE_BY)
+        assert contents(folder) == before
 
 
 RAY = """

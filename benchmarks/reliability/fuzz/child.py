@@ -58,25 +58,27 @@ class Session:
         """Read one input; note what it broke."""
         self.inputs += 1
         self.target.put(data)
+        elsewhere = self.target.names_paths(data)
         begin = time.perf_counter()
         with self._watch:
-            breach, line = self._contract.verdict(self.target.read, self.target.names)
+            breach, line = self._contract.verdict(
+                self.target.read, self.target.names, elsewhere
+            )
         spent = time.perf_counter() - begin
         self._note_growth(data, "reading")
-        breach = self._watch.seen or breach
-        if breach and breach.kind == "read outside" and self.target.names_paths(data):
-            breach = None
+        broken = self._contract.broken_by(breach, self._watch.seen, elsewhere)
+        if spent > MAX_S:
+            broken.append(self._contract.Breach("too long", f"{spent:.0f} s"))
         self._slowest = max(self._slowest, spent)
         if line is not None:
             for place in self._contract.UNFORESEEN.findall(line):
                 if place not in self._unforeseen:
                     self._keep(data, "unforeseen", place, line)
                 self._unforeseen[place] = self._unforeseen.get(place, 0) + 1
-        if breach is None and spent > MAX_S:
-            breach = self._contract.Breach("too long", f"{spent:.0f} s")
-        if breach is not None and breach.kind not in self._known:
-            self._known.add(breach.kind)
-            self._keep(data, "breach", breach.kind, breach.text)
+        for breach in broken:
+            if breach.kind not in self._known:
+                self._known.add(breach.kind)
+                self._keep(data, "breach", breach.kind, breach.text)
         if begin - self._last > EVERY_S:
             self._last = begin
             self.write_status()

@@ -12,7 +12,7 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -50,18 +50,26 @@ class Watch:
         self._folder = str(folder.resolve())
         code = {sys.prefix, sys.base_prefix, str(Path(__file__).parents[3])}
         self._readable = (*SYSTEM, self._folder, *code)
-        self._on, self.seen = False, None
+        self._on, self._seen = False, {}
         sys.addaudithook(self._hook)
 
     def __enter__(self) -> "Watch":
-        self._on, self.seen = True, None
+        self._on, self._seen = True, {}
         return self
 
     def __exit__(self, *_: object) -> None:
         self._on = False
 
+    @property
+    def seen(self) -> list[Breach]:
+        """What was broken since it was entered, the first of each kind."""
+        return list(self._seen.values())
+
+    def _see(self, kind: str, text: str) -> None:
+        self._seen.setdefault(kind, Breach(kind, text[:200]))
+
     def _hook(self, event: str, args: tuple) -> None:
-        if not self._on or self.seen is not None:
+        if not self._on:
             return
         if event == "open":
             self._opened(args[0], args[2])
@@ -70,7 +78,7 @@ class Watch:
         elif event in FORBIDDEN or (
             event in CHANGES and not self._is_inside(_placed(args))
         ):
-            self.seen = Breach(event, str(args)[:200])
+            self._see(event, str(args))
 
     def _opened(self, path: object, flags: object) -> None:
         if not isinstance(path, str | bytes | os.PathLike):
@@ -78,9 +86,9 @@ class Watch:
         writes = isinstance(flags, int) and bool(flags & WRITING)
         name = os.path.abspath(os.fsdecode(path))
         if writes and not self._is_inside(path):
-            self.seen = Breach("written outside", name[:200])
+            self._see("written outside", name)
         elif not name.startswith(self._readable):
-            self.seen = Breach("read outside", name[:200])
+            self._see("read outside", name)
 
     def _is_inside(self, path: Any) -> bool:  # noqa: ANN401 - whatever was opened
         if not isinstance(path, str | bytes | os.PathLike):
@@ -98,13 +106,22 @@ def _placed(args: tuple) -> Any:  # noqa: ANN401 - whatever was changed
     return name
 
 
-def refusal_breach(line: str, names: Collection[str]) -> Breach | None:
-    """What is wrong with the text of a refusal."""
+def refusal_breach(
+    line: str, names: Collection[str], elsewhere: bool = False
+) -> Breach | None:
+    """What is wrong with the text of a refusal.
+
+    Args:
+      line: the text.
+      names: one of them is in it.
+      elsewhere: or it begins with a path, which the input named.
+    """
     if len(line.splitlines()) != 1 or not line.isprintable():
         return Breach("not one printable line", repr(line)[:300])
     if len(line) > MAX_LINE:
         return Breach("a line too long", f"{len(line)} characters: {line[:200]}")
-    if not line.startswith("/") and not any(name in line for name in names):
+    named = any(name in line for name in names)
+    if not named and not (elsewhere and line.startswith("/")):
         return Breach("no file named", line[:300])
     return None
 
@@ -126,14 +143,25 @@ def place_of(error: BaseException) -> str:
 
 
 def verdict(
-    read: Callable[[], object], names: Collection[str]
+    read: Callable[[], object], names: Collection[str], elsewhere: bool = False
 ) -> tuple[Breach | None, str | None]:
-    """Read once; (what was broken, the line of a refusal)."""
+    """Read once; (what was broken, the line of a refusal). Args of `refusal_breach`."""
     try:
         read()
     except (InputError, WeightsError) as error:
-        breach = _memory_breach(error) or refusal_breach(str(error), names)
+        breach = _memory_breach(error) or refusal_breach(str(error), names, elsewhere)
         return breach, str(error)
     except Exception as error:
         return Breach(place_of(error), str(error)[:300]), None
     return None, None
+
+
+def broken_by(
+    breach: Breach | None, seen: Sequence[Breach], elsewhere: bool
+) -> list[Breach]:
+    """All that one input broke: its end, and what was seen meanwhile.
+
+    Where it may name files elsewhere, reading them is none, and hides nothing.
+    """
+    found = [*seen] if breach is None else [breach, *seen]
+    return [x for x in found if not (elsewhere and x.kind == "read outside")]

@@ -356,7 +356,7 @@ def world_to_ecef(file: Path, spec: dict) -> np.ndarray:
             where, found = str(meta), known
     try:
         matrix = np.array(found, np.float64)
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         matrix = np.zeros(0)
     rigid = (
         matrix.shape == (4, 4)

@@ -15,6 +15,7 @@ degrees, moved by the recording's UTM origin, a trailer is a track of its own.
 
 import csv
 import dataclasses
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -32,6 +33,7 @@ from rcirl_jax.data.importers.sparse_tables import (
     check_range,
 )
 from rcirl_jax.data.importers.tables import (
+    lines_of,
     number,
     read_header,
     read_table,
@@ -114,7 +116,8 @@ def _read_meta(path: Path) -> dict[str, str]:
     names = read_header(path)
     try:
         with path.open(newline="", encoding="utf-8-sig") as handle:
-            rows = [row for row in csv.reader(handle) if row][1:]
+            rows = filter(None, csv.reader(lines_of(handle)))
+            rows = list(itertools.islice(rows, 1, 4))  # one more is one too many
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: text: {error}: expected CSV text") from error
     if len(rows) != 1 or len(rows[0]) != len(names):

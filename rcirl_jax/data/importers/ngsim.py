@@ -18,7 +18,7 @@ arterials have no column Location to say what they are, but 24 columns.
 import functools
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import NoReturn, TextIO
 
 import numpy as np
 
@@ -42,6 +42,7 @@ from rcirl_jax.data.importers.sparse_tables import (
 from rcirl_jax.data.importers.tables import (
     check_row,
     is_grouped,
+    lines_of,
     load_rows,
     read_header,
     read_table,
@@ -246,7 +247,7 @@ def _has_header(path: Path) -> bool:
     """Whether the file is the portal's CSV rather than the native text."""
     try:
         with path.open(encoding="utf-8-sig") as handle:
-            first = handle.readline()
+            first = next(lines_of(handle), "")
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: text: {error}: expected NGSIM rows") from error
     if not first.strip():
@@ -329,7 +330,7 @@ def _text_rows(path: Path, columns: list[str]) -> Iterator[np.ndarray]:
     """Numbers [n, columns] of the native text, READ_BYTES at a time."""
     try:
         with path.open(encoding="utf-8-sig") as handle:
-            while lines := handle.readlines(csv_stream.READ_BYTES):
+            for lines in _pieces(handle):
                 values = load_rows(lines, "f8", None)
                 if len(values) and values.shape[1] != len(columns):
                     raise ValueError(values.shape)
@@ -340,10 +341,23 @@ def _text_rows(path: Path, columns: list[str]) -> Iterator[np.ndarray]:
         _find_bad_line(path, columns)
 
 
+def _pieces(handle: TextIO) -> Iterator[list[str]]:
+    """Lines of READ_BYTES or a little more."""
+    lines, held = [], 0
+    for line in lines_of(handle):
+        lines.append(line)
+        held += len(line)
+        if held >= csv_stream.READ_BYTES:
+            yield lines
+            lines, held = [], 0
+    if lines:
+        yield lines
+
+
 def _find_bad_line(path: Path, columns: list[str]) -> NoReturn:
     """Name the first line that is not a row of numbers."""
     with path.open(encoding="utf-8", errors="replace") as handle:
-        for line, text in enumerate(handle, start=1):
+        for line, text in enumerate(lines_of(handle), start=1):
             if text.strip():
                 cells = text.split()
                 if len(cells) == ARTERIAL_COLUMNS != len(columns):

@@ -29,6 +29,7 @@ from rcirl_jax.data.importers.sparse_tables import (
 )
 from rcirl_jax.data.importers.tables import (
     StraightLane,
+    lines_of,
     number,
     read_table,
     split_tracks,
@@ -97,8 +98,9 @@ def _leader_lengths(files: Sequence[Path]) -> dict[tuple[str, str], float]:
         run, _, leader = _ids(file)
         try:
             with file.open(encoding="utf-8-sig") as handle:
-                names = handle.readline().strip().split(",")
-                cells = handle.readline().strip().split(",")
+                lines = lines_of(handle)
+                names = next(lines, "").strip().split(",")
+                cells = next(lines, "").strip().split(",")
             length = float(cells[names.index("leader_length")])
         except (UnicodeDecodeError, ValueError, IndexError):
             continue  # reported when the file itself is read

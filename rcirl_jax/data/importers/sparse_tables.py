@@ -1,13 +1,14 @@
 """Tables of text with empty cells, and bounds on what their numbers may be."""
 
 import csv
+import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
 
-from rcirl_jax.data.importers.tables import check_row, load_rows
+from rcirl_jax.data.importers.tables import check_row, check_size, lines_of, load_rows
 from rcirl_jax.errors import InputError
 
 MAX_PLACE_M = 1e8  # m, farther is no place on earth
@@ -44,11 +45,11 @@ def read_sparse_table(
     ]
     names = [f"c{place}" for place in range(len(header))]
     dtype = list(zip(names, kinds, strict=True))
+    check_size(path)
     try:
         with path.open(encoding="utf-8-sig") as handle:
-            for _ in range(skip):
-                next(handle, "")
-            rows = load_rows(_filled(handle, len(header)), dtype, ",")
+            lines = itertools.islice(lines_of(handle), skip, None)
+            rows = load_rows(_filled(lines, len(header)), dtype, ",")
     except (ValueError, UnicodeError):
         _find_bad_sparse_cell(path, header, [n for n in chosen if n not in text], skip)
     if rows.size == 0:
@@ -67,8 +68,9 @@ def _filled(lines: Iterable[str], count: int) -> Iterator[str]:
     """Lines with empty cells written as nan and surplus commas dropped."""
     for line in lines:
         row = line.rstrip("\r\n")
-        while row.endswith(",") and row.count(",") >= count:
-            row = row[:-1]
+        at_the_end = len(row) - len(row.rstrip(","))
+        surplus = max(row.count(",") - count + 1, 0)
+        row = row[: len(row) - min(at_the_end, surplus)]
         if ",," in row:
             row = row.replace(",,", ",nan,").replace(",,", ",nan,")
         if row.endswith(","):
@@ -82,7 +84,7 @@ def _find_bad_sparse_cell(
     """Read slowly and name the first line that is wrong."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as handle:
-            for line, cells in enumerate(csv.reader(handle), start=1):
+            for line, cells in enumerate(csv.reader(lines_of(handle)), start=1):
                 if line > skip and cells:
                     while len(cells) > len(header) and not cells[-1].strip():
                         cells.pop()

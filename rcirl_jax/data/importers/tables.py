@@ -6,9 +6,9 @@ import dataclasses
 import math
 import re
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import NoReturn, TextIO
 
 import numpy as np
 
@@ -19,6 +19,8 @@ from rcirl_jax.units import FOOT_M, MPH_MPS
 
 TEXT_CHARS = 64  # characters of a text cell
 MAX_COLUMNS = 10_000  # of a table; logs have some dozens
+MAX_LINE = 2**20  # characters of a line
+MAX_BYTES = 2**30  # of a file that is held whole: a few times the longest known
 UNITS = {
     "m": 1.0,
     "ft": FOOT_M,
@@ -52,11 +54,37 @@ class StraightLane:
     forward: bool = True  # driven towards +x
 
 
+def check_size(path: Path) -> None:
+    """A file that is held whole is no larger than `MAX_BYTES`."""
+    size = path.stat().st_size
+    if size > MAX_BYTES:
+        raise InputError(
+            f"{path}: size: {size >> 20} MiB: expected {MAX_BYTES >> 20} at most; "
+            "cut it into recordings"
+        )
+
+
+def lines_of(handle: TextIO) -> Iterator[str]:
+    """Lines of a text of which no more than one is held, of a bounded length.
+
+    Raises:
+      InputError: a line of more than `MAX_LINE` characters.
+    """
+    while line := handle.readline(MAX_LINE + 1):
+        if len(line) > MAX_LINE:
+            raise InputError(
+                f"{handle.name}: a line of more than {MAX_LINE} characters: "
+                "expected one a row"
+            )
+        yield line
+
+
 def read_header(path: Path) -> list[str]:
     """Column names of a comma-separated file: not empty or too many, each once."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as handle:
-            header = [name.strip() for name in next(csv.reader(handle), [])]
+            rows = csv.reader(lines_of(handle))
+            header = [name.strip() for name in next(rows, [])]
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: header: {error}: expected CSV text") from error
     if not any(header):
@@ -96,6 +124,7 @@ def read_table(
         length, a cell that is no finite number (with its line).
     """
     header = read_header(path)
+    check_size(path)
     for name in wanted:
         if name not in header:
             raise InputError(
@@ -144,8 +173,9 @@ def is_grouped(path: Path) -> bool:
     """Whether a number of the first row has separators between thousands."""
     try:
         with path.open(encoding="utf-8-sig") as handle:
-            next(handle, "")
-            return GROUPED.search(next(handle, "")) is not None
+            lines = lines_of(handle)
+            next(lines, "")
+            return GROUPED.search(next(lines, "")) is not None
     except UnicodeDecodeError:
         return False  # refused by whoever reads it
 
@@ -190,7 +220,8 @@ def check_cells(
     """Every row of a CSV is as `check_row` says; slow, to explain a failure."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as handle:
-            reader = csv.reader(map(ungrouped, handle) if grouped else handle)
+            lines = lines_of(handle)
+            reader = csv.reader(map(ungrouped, lines) if grouped else lines)
             next(reader)
             for row in reader:
                 if row:
