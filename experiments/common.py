@@ -32,8 +32,8 @@ HOOK_VARIABLES = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE")
 def run(main: Callable[[], None]) -> None:
     """Run a main; bad input becomes one line on stderr and exit status 2.
 
-    So does a place that cannot be written. SIGTERM ends with 143, SIGINT with 130,
-    within ten seconds (`rcirl_jax.interrupts`).
+    So do a place that cannot be written and memory that is not given. SIGTERM ends
+    with 143, SIGINT with 130, within ten seconds (`rcirl_jax.interrupts`).
     """
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
@@ -50,6 +50,10 @@ def run(main: Callable[[], None]) -> None:
             sys.exit(EXIT_BAD_INPUT)
         except OSError as error:
             print(f"error: {_about(error)}", file=sys.stderr)
+            sys.exit(EXIT_BAD_INPUT)
+        except MemoryError as error:
+            why = " ".join(str(error).split()) or "no more of it is given"
+            print(f"error: memory: {why}: expected more for this work", file=sys.stderr)
             sys.exit(EXIT_BAD_INPUT)
         except interrupts.Interrupted as stop:
             _leave(stop.number)

@@ -28,7 +28,7 @@ class InputError(ValueError):
 
 
 class LostWorkError(InputError):
-    """Where work was done is gone (memory, nodes); what is finished stays valid."""
+    """Work cannot go on (lost memory, nodes; too many names); what is done stays."""
 
 
 # what reading an unforeseen file may end in; anything else is a fault of ours

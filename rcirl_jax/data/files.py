@@ -16,7 +16,8 @@ from rcirl_jax.stages import LOCK, only_one
 
 MANIFEST, MARK, SHARDS = "manifest.json", "shard.json", "shards/"
 FACTS = "made_by.json"  # beside the manifest, whose bytes depend on the logs alone
-MAX_JSON_BYTES = 256 * 2**20  # of each of these; 10 million scenes take some 10 MiB
+# of each; the manifest of 10 million scenes takes some 10 MiB
+JSON_BYTES = {MANIFEST: 2**30, MARK: 2**28, FACTS: 2**28}
 
 
 class Files:
@@ -79,51 +80,54 @@ class Files:
         """The bytes of one of the dataset's JSON files, or None.
 
         Raises:
-          InputError: it cannot be read, or is larger than `MAX_JSON_BYTES`; in a folder
+          InputError: it cannot be read, or is too large (`JSON_BYTES`); in a folder
             that is seen before it is read.
         """
-        self._check_size(key, self._bytes_of(key))
-        found = self.wait(self.kv.read(key), key)
-        if found.state != "value":
-            return None
-        self._check_size(key, len(found.value))
-        return found.value
+        self._check_size(key, self._size(key))
+        value = self._value(self.kv.read(key), key)
+        self._check_size(key, None if value is None else len(value))
+        return value
 
-    def digest(self, key: str, expected: int) -> tuple[int, str]:
-        """Bytes and sha256 of a value; a file is read piece by piece.
+    def digests(
+        self, expected: Mapping[str, int]
+    ) -> Iterator[tuple[str, int, str | None]]:
+        """(key, bytes, sha256) of each value; (key, 0, None) where it is missing.
+
+        Files of a folder are read piece by piece, remote ones all at once.
 
         Args:
-          key: of the value.
-          expected: its bytes; of another number of bytes there is no sha256, and a file
-            of them is not read.
-
-        Returns:
-          (bytes, sha256); the latter "missing" or "not read" where there is none.
+          expected: key -> its bytes; a file of another number of bytes is not read, and
+            its sha256 is None.
 
         Raises:
-          InputError: it cannot be read.
+          InputError: one cannot be read.
         """
-        if self.folder is None:
-            found = self.wait(self.kv.read(key), key)
-            value = found.value if found.state == "value" else None
-            if value is None:
-                return 0, "missing"
-            return len(value), hashlib.sha256(value).hexdigest()
-        size = self._bytes_of(key)
-        if size is None:
-            return 0, "missing"
-        if size != expected:
-            return size, "not read"
-        with self._refusing(key), open(os.path.join(self.folder, key), "rb") as file:
-            return size, hashlib.file_digest(file, "sha256").hexdigest()
+        futures = {} if self.folder else {key: self.kv.read(key) for key in expected}
+        for key, future in futures.items():
+            value = self._value(future, key)
+            sha256 = None if value is None else hashlib.sha256(value).hexdigest()
+            yield key, len(value or b""), sha256
+        for key, wanted in expected.items() if self.folder else ():
+            size, sha256 = self._size(key), None
+            if size == wanted:
+                with self._refusing(key), open(self._place(key), "rb") as file:
+                    sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+            yield key, size or 0, sha256
 
-    def _bytes_of(self, key: str) -> int | None:
-        """Of a file in a folder; None where there is none, or no folder."""
+    def _value(self, future: "ts.Future", key: str) -> bytes | None:
+        found = self.wait(future, key)
+        return found.value if found.state == "value" else None
+
+    def _place(self, key: str) -> str:
+        return os.path.join(self.folder or "", key)
+
+    def _size(self, key: str) -> int | None:
+        """Bytes of a file in a folder; None where there is none, or no folder."""
         if self.folder is None:
             return None
         try:
             with self._refusing(key):
-                found = os.stat(os.path.join(self.folder, key))
+                found = os.stat(self._place(key))
         except (FileNotFoundError, NotADirectoryError):
             return None
         if not stat.S_ISREG(found.st_mode):
@@ -144,10 +148,9 @@ class Files:
             ) from error
 
     def _check_size(self, key: str, size: int | None) -> None:
-        if size is not None and size > MAX_JSON_BYTES:
-            raise InputError(
-                f"{self.path(key)}: {size} bytes: expected {MAX_JSON_BYTES} at most"
-            )
+        most = JSON_BYTES[key.rpartition("/")[2]]
+        if size is not None and size > most:
+            raise InputError(f"{self.path(key)}: {size} bytes: expected {most} at most")
 
     def write_many(self, values: Mapping[str, bytes]) -> None:
         """Each value atomically; returns when all are on disk."""

@@ -3,19 +3,21 @@
 import dataclasses
 import hashlib
 import json
+import re
 import types
 from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from rcirl_jax.data.files import MANIFEST, MAX_JSON_BYTES, Files
+from rcirl_jax.data.files import MANIFEST, Files
 from rcirl_jax.data.rows import leaf_specs
 from rcirl_jax.errors import InputError
 from rcirl_jax.units import NUM_TIMES, TIMES_S
 from rcirl_jax.whole import parse_json
 
 SCHEMA_VERSION = 1  # of manifest.json and shard.json
-MAX_ROWS = 2**27  # rows of a dataset: their numbers alone are 1 GiB
+SHA256 = re.compile("[0-9a-f]{64}")
+MAX_ROWS = 2**31  # rows of a dataset
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -59,19 +61,9 @@ def _canonical(payload: Mapping) -> str:
 
 
 def seal(payload: Mapping, field: str) -> bytes:
-    """JSON bytes of the payload with its own digest as one more field.
-
-    Raises:
-      InputError: more of them than are read again.
-    """
+    """JSON bytes of the payload with its own digest as one more field."""
     whole = {**payload, field: _canonical(payload)}
-    raw = (json.dumps(whole, sort_keys=True, indent=1) + "\n").encode()
-    if len(raw) > MAX_JSON_BYTES:
-        raise InputError(
-            f"dataset: {len(raw)} bytes of names and recordings: expected "
-            f"{MAX_JSON_BYTES} at most; import into several datasets"
-        )
-    return raw
+    return (json.dumps(whole, sort_keys=True, indent=1) + "\n").encode()
 
 
 def unseal(raw: bytes, field: str, name: str) -> dict:
@@ -115,7 +107,7 @@ def parse_shard(raw: bytes, name: str) -> ShardInfo:
         parts = file.split("/")
         if not all(parts) or {".", ".."} & set(parts):
             raise InputError(f"{name}: files: {file}: expected a key below the shard")
-        if not isinstance(found, dict) or set(found) != {"bytes", "sha256"}:
+        if not _is_described(found):
             raise InputError(
                 f"{name}: files: {file}: {found}: expected its bytes and sha256"
             )
@@ -137,6 +129,15 @@ def _check_fields(name: str, payload: Mapping, forms: Mapping[str, str]) -> None
 
 def _is_count(value: object) -> bool:
     return type(value) is int and 0 <= value <= MAX_ROWS
+
+
+def _is_described(value: object) -> bool:
+    """Whether it says size and sha256 of a file."""
+    if not isinstance(value, dict) or set(value) != {"bytes", "sha256"}:
+        return False
+    size, sha256 = value["bytes"], value["sha256"]
+    is_sha256 = isinstance(sha256, str) and SHA256.fullmatch(sha256) is not None
+    return type(size) is int and size >= 0 and is_sha256
 
 
 def _all(value: object, kind: type | types.UnionType) -> bool:

@@ -95,25 +95,38 @@ def verify_shard(files: Files, index: int, sha256: str | None = None) -> ShardIn
     """Read all of a shard against its checksums; InputError names what is wrong."""
     key = shard_key(index)
     info = shard_info(files, index, sha256)
-    _check_names(files.path(key + MARK), info)
-    for name, stated in info.files.items():
-        size, found = files.digest(key + name, stated["bytes"])
-        if {"bytes": size, "sha256": found} != stated:
+    _check_files(files.path(key + MARK), info)
+    stated = {key + name: found for name, found in info.files.items()}
+    sizes = {name: found["bytes"] for name, found in stated.items()}
+    for name, size, found in files.digests(sizes):
+        expected = stated[name]
+        if {"bytes": size, "sha256": found} != expected:
+            sha256 = found or ("not taken" if size else "missing")
             raise InputError(
-                f"{files.path(key + name)}: shard {index}: {size} bytes, sha256 "
-                f"{found}: expected {stated['bytes']} bytes, sha256 "
-                f"{stated['sha256']}; import the logs again"
+                f"{files.path(name)}: shard {index}: {size} bytes, sha256 "
+                f"{sha256}: expected {expected['bytes']} bytes, sha256 "
+                f"{expected['sha256']}; import the logs again"
             )
     return info
 
 
-def _check_names(name: str, info: ShardInfo) -> None:
-    """Every array has its two files: of rows without one zarr makes zeros."""
-    made = leaf_specs()
-    expected = {f"{leaf}/zarr.json" for leaf in made}
-    expected |= {
-        "/".join([leaf, "c", *"0" * (1 + len(made[leaf].shape))]) for leaf in made
-    }
-    different = sorted(expected ^ info.files.keys())
+def _check_files(name: str, info: ShardInfo) -> None:
+    """Every array has its two files, one large enough to say where its blocks are.
+
+    Of rows without a file zarr makes zeros; so a few bytes cannot claim many rows.
+    """
+    least = {}
+    index_bytes = 16 * -(-info.count // BLOCK_ROWS) + 4  # two offsets a block, crc32c
+    for leaf, spec in leaf_specs().items():
+        least[f"{leaf}/zarr.json"] = 1
+        least["/".join([leaf, "c", *"0" * (1 + len(spec.shape))])] = index_bytes
+    different = sorted(least.keys() ^ info.files.keys())
     if different:
         raise InputError(f"{name}: files: {different[0]}: expected two of every array")
+    for file, size in least.items():
+        found = info.files[file]["bytes"]
+        if found < size:
+            raise InputError(
+                f"{name}: files: {file}: {found} bytes: expected {size} at least "
+                f"for {info.count} rows"
+            )

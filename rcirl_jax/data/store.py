@@ -25,7 +25,15 @@ import jax
 import numpy as np
 import tensorstore as ts
 
-from rcirl_jax.data.files import FACTS, MANIFEST, MARK, SHARDS, Files, context
+from rcirl_jax.data.files import (
+    FACTS,
+    JSON_BYTES,
+    MANIFEST,
+    MARK,
+    SHARDS,
+    Files,
+    context,
+)
 from rcirl_jax.data.manifest import (
     SCHEMA_VERSION,
     Manifest,
@@ -47,7 +55,7 @@ from rcirl_jax.data.shards import (
     verify_shard,
 )
 from rcirl_jax.data.splits import check_disjoint
-from rcirl_jax.errors import InputError
+from rcirl_jax.errors import InputError, LostWorkError
 from rcirl_jax.types import (
     Demonstration,
 )
@@ -150,7 +158,8 @@ class DatasetWriter:
             "lineage": lineage,
             "files": {key: describe(value) for key, value in values.items()},
         }
-        mark, key = seal(payload, "sha256"), shard_key(index)
+        key = shard_key(index)
+        mark = self._readable(seal(payload, "sha256"), key + MARK)
         if self._first_written is None:
             self._first_written = index
         self._remove_from(index)
@@ -164,6 +173,16 @@ class DatasetWriter:
         info = ShardInfo(**json.loads(mark))
         self._shards.append(shard_entry(info))
         return info
+
+    def _readable(self, raw: bytes, key: str) -> bytes:
+        """Refuse to write what would not be read again; what is finished stays."""
+        most = JSON_BYTES[key.rpartition("/")[2]]
+        if len(raw) > most:
+            raise LostWorkError(
+                f"{self._files.path(key)}: {len(raw)} bytes of names: expected {most} "
+                "at most; import into several datasets"
+            )
+        return raw
 
     def _remove_from(self, index: int) -> None:
         # shards before the manifest: what an interrupt here leaves cannot pass for
@@ -186,6 +205,7 @@ class DatasetWriter:
 
         Raises:
           InputError: a vehicle has rows in two splits.
+          LostWorkError: more names than a manifest holds; the shards stay.
         """
         if set(manifest_fields) != set(IMPORT_FIELDS):
             different = sorted(set(manifest_fields) ^ set(IMPORT_FIELDS))
@@ -200,7 +220,7 @@ class DatasetWriter:
             "time_grid_s": TIMES_S.tolist(),
             "shards": self._shards,
         }
-        raw = seal(payload, "hash")
+        raw = self._readable(seal(payload, "hash"), MANIFEST)
         dataset = Dataset(self._files, parse_manifest(raw, self._files))
         dataset.check_tables()
         self._remove_from(len(self._shards))
@@ -387,12 +407,7 @@ class Dataset:
         if rows.ndim != 1 or np.any((rows < 0) | (rows >= self.count)):
             raise IndexError(f"rows: expected a list of numbers below {self.count}")
         spec = {name: leaf_specs()[name] for name in names}
-        try:
-            out = {k: np.empty((rows.size, *v.shape), v.dtype) for k, v in spec.items()}
-        except MemoryError as error:
-            raise InputError(
-                f"{self._files.name}: {rows.size} rows: {error}: expected that memory"
-            ) from error
+        out = {k: np.empty((rows.size, *v.shape), v.dtype) for k, v in spec.items()}
         owner = np.searchsorted(self._starts, rows, side="right") - 1
         for shard in np.unique(owner).tolist():
             places = np.flatnonzero(owner == shard)

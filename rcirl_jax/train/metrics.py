@@ -5,10 +5,10 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, TextIO
 
 import tqdm
 
@@ -17,7 +17,7 @@ from rcirl_jax.whole import named, parse_json, write_whole
 
 MAX_STEP = 2**63 - 1  # what 64 bits hold
 MAX_BYTES = 2**30  # of a metrics.jsonl: some four million steps
-MAX_LINE = 2**16  # characters of one of its lines; the rest of a longer one is no JSON
+MAX_LINE = 2**16  # characters of one of its lines
 
 
 class MetricsWriter:
@@ -76,13 +76,23 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
     if (size := path.stat().st_size) > MAX_BYTES:
         raise InputError(f"{path}: {size} bytes: expected {MAX_BYTES} at most")
     with path.open(errors="replace") as file:
-        while line := file.readline(MAX_LINE):
+        for line in _lines(file):
             with contextlib.suppress(ValueError):
                 found = parse_json(line)
                 step = found.get("step") if isinstance(found, dict) else None
                 if type(step) is int and abs(step) <= MAX_STEP:
                     rows.append({k: v for k, v in found.items() if _is_number(v)})
     return rows
+
+
+def _lines(file: TextIO) -> Iterator[str]:
+    """Lines of a text, without those of more than `MAX_LINE` characters."""
+    is_start = True
+    while piece := file.readline(MAX_LINE):
+        is_end = piece.endswith("\n")
+        if is_start and (is_end or len(piece) < MAX_LINE):
+            yield piece
+        is_start = is_end
 
 
 def pairs_won(path: Path, steps: int) -> float:

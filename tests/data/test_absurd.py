@@ -5,6 +5,8 @@ import importlib
 import os
 import re
 import sqlite3
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -120,19 +122,22 @@ def test_a_log_that_is_held_whole_has_a_size(name, tmp_path):
     assert f"{file.name}: size: {2**20} MiB: expected 1024 at most" in line
 
 
-@pytest.mark.parametrize("where", ["header", "rows"])
+@pytest.mark.parametrize("where", ["header", "rows", "cell"])
 @pytest.mark.parametrize("name", [*WHOLE, "csv", "ngsim"])
 def test_a_line_without_an_end_is_not_held(name, where, tmp_path, monkeypatch):
-    """All of it on one line, or a sound head and then one line of cells."""
+    """All of it on one line; a sound head, then a line of cells, or of a wide one."""
     monkeypatch.setattr(tables, "MAX_LINE", 2**14)
     file = first_file(name, tmp_path / "in")
     rows = file.read_text().splitlines(keepends=True)
     end = rows[-1].rstrip("\n").replace(" ", ",")
-    kept = "" if where == "header" else "".join(rows)
-    file.write_text(kept + (end + ",") * (2**15 // len(end)))
+    text = "" if where == "header" else "".join(rows)
+    text += (end + ",") * (2**15 // len(end))
+    if where == "cell":  # a row that numpy takes
+        text = "".join(rows[:-1]) + 2**15 * " " + rows[-1]
+    file.write_text(text)
     line = only_line(importer_of(name), tmp_path / "in")
     assert file.name in line
-    if name != "openacc" or where == "rows":  # which reads so much of its head only
+    if name != "openacc" or where != "header":  # which reads so much of its head only
         assert "a line of more than 16384 characters: expected one a row" in line
 
 
@@ -208,6 +213,18 @@ def test_faults_of_other_kinds_pass():
         as_input_error("file", "anything"),
     ):
         raise InputError("own line")
+
+
+@pytest.mark.multiprocess
+def test_memory_that_is_not_given_is_one_line():
+    work = "import numpy; numpy.empty(2**62, numpy.uint8)"
+    script = f"from experiments.common import run; run(lambda: exec({work!r}))"
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: memory: Unable to allocate 4.00 EiB for an array")
 
 
 def test_names_that_are_no_text(tmp_path):

@@ -42,9 +42,8 @@ def test_a_damaged_line_is_left_out(tmp_path, damaged):
 
 
 def test_metrics_of_any_size_take_little_memory(tmp_path):
-    path = write(
-        tmp_path, [line(1), '{"step": 2, "a": "' + "x" * 70_000 + '"}', line(3)]
-    )
+    long = ['{"step": 2, "a": "' + 70_000 * "x" + '"}', 2**16 * "x" + line(4)]
+    path = write(tmp_path, [line(1), *long, line(3)])
     assert [row["step"] for row in read_metrics(path)] == [1, 3]
     with path.open("r+b") as file:
         file.truncate(2**40)  # a terabyte of nothing

@@ -117,7 +117,7 @@ def _read_meta(path: Path) -> dict[str, str]:
     try:
         with path.open(newline="", encoding="utf-8-sig") as handle:
             rows = filter(None, csv.reader(lines_of(handle)))
-            rows = list(itertools.islice(rows, 1, 4))  # one more is one too many
+            rows = list(itertools.islice(rows, 1, 3))
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: text: {error}: expected CSV text") from error
     if len(rows) != 1 or len(rows[0]) != len(names):

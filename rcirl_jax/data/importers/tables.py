@@ -3,6 +3,7 @@
 import collections
 import csv
 import dataclasses
+import itertools
 import math
 import re
 import warnings
@@ -60,7 +61,7 @@ def check_size(path: Path) -> None:
     if size > MAX_BYTES:
         raise InputError(
             f"{path}: size: {size >> 20} MiB: expected {MAX_BYTES >> 20} at most; "
-            "cut it into recordings"
+            "cut it into recordings (a csv or NGSIM log: lower long_bytes)"
         )
 
 
@@ -83,8 +84,8 @@ def read_header(path: Path) -> list[str]:
     """Column names of a comma-separated file: not empty or too many, each once."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as handle:
-            rows = csv.reader(lines_of(handle))
-            header = [name.strip() for name in next(rows, [])]
+            first = itertools.islice(lines_of(handle), 1)
+            header = [name.strip() for name in next(csv.reader(first), [])]
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: header: {error}: expected CSV text") from error
     if not any(header):
@@ -139,8 +140,9 @@ def read_table(
     numeric = [name for name in chosen if name not in text]
     try:
         with path.open(encoding="utf-8-sig") as handle:
+            lines = lines_of(handle)
             rows = load_rows(
-                (ungrouped(line) for line in handle) if grouped else path,
+                map(ungrouped, lines) if grouped else lines,
                 list(zip(names, kinds, strict=True)),
                 ",",
                 skip=1,
@@ -220,12 +222,11 @@ def check_cells(
     """Every row of a CSV is as `check_row` says; slow, to explain a failure."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as handle:
-            lines = lines_of(handle)
-            reader = csv.reader(map(ungrouped, lines) if grouped else lines)
-            next(reader)
-            for row in reader:
-                if row:
-                    check_row(path, reader.line_num, row, header, numeric)
+            lines = itertools.islice(lines_of(handle), 1, None)
+            for number_, line in enumerate(lines, start=2):
+                cells = csv.reader([ungrouped(line) if grouped else line])
+                if row := next(cells, []):
+                    check_row(path, number_, row, header, numeric)
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: text: {error}: expected CSV text") from error
 
