@@ -29,6 +29,9 @@ COMPILER = (
 HOOK_VARIABLES = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE")
 
 
+NO_MEMORY = "RESOURCE_EXHAUSTED"  # how JAX's errors begin that come of its want
+
+
 def run(main: Callable[[], None]) -> None:
     """Run a main; bad input becomes one line on stderr and exit status 2.
 
@@ -51,9 +54,14 @@ def run(main: Callable[[], None]) -> None:
         except OSError as error:
             print(f"error: {_about(error)}", file=sys.stderr)
             sys.exit(EXIT_BAD_INPUT)
-        except MemoryError as error:
-            why = " ".join(str(error).split()) or "no more of it is given"
-            print(f"error: memory: {why}: expected more for this work", file=sys.stderr)
+        except (MemoryError, jax.errors.JaxRuntimeError) as error:
+            why = " ".join(str(error).split())[:200]
+            if not isinstance(error, MemoryError) and not why.startswith(NO_MEMORY):
+                raise
+            print(
+                f"error: memory: {why or 'refused'}: expected more for this work",
+                file=sys.stderr,
+            )
             sys.exit(EXIT_BAD_INPUT)
         except interrupts.Interrupted as stop:
             _leave(stop.number)

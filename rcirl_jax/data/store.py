@@ -205,7 +205,7 @@ class DatasetWriter:
 
         Raises:
           InputError: a vehicle has rows in two splits.
-          LostWorkError: more names than a manifest holds; the shards stay.
+          LostWorkError: more names than a manifest holds; the shards are sound.
         """
         if set(manifest_fields) != set(IMPORT_FIELDS):
             different = sorted(set(manifest_fields) ^ set(IMPORT_FIELDS))

@@ -16,7 +16,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.whole import named, parse_json, write_whole
 
 MAX_STEP = 2**63 - 1  # what 64 bits hold
-MAX_BYTES = 2**30  # of a metrics.jsonl: some four million steps
+MAX_BYTES = 2**32  # of a metrics.jsonl: some 27 million steps
 MAX_LINE = 2**16  # characters of one of its lines
 
 

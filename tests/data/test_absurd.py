@@ -141,6 +141,21 @@ def test_a_line_without_an_end_is_not_held(name, where, tmp_path, monkeypatch):
         assert "a line of more than 16384 characters: expected one a row" in line
 
 
+def test_a_row_without_an_end_is_not_held(tmp_path, monkeypatch):
+    """Of short lines, each of which ends inside of quotes."""
+    monkeypatch.setattr(tables, "MAX_LINE", 2**14)
+    log = tmp_path / "log.csv"
+    log.write_text('t,id,x,y\n0.0,a,0.0,0.0\n"a' + 4000 * '\n","b')
+    with pytest.raises(InputError, match="a row of more than 16384 characters"):
+        tables.check_cells(log, ["t", "id", "x", "y"], ["t", "x", "y"])
+    log.write_text('"a' + 4000 * '\n","b')
+    with pytest.raises(InputError, match="a row of more than 16384 characters"):
+        tables.read_header(log)
+    log.write_text('t,id,note,x\n0,a,"two\nlines",1\n1,a,b,oops\n')
+    with pytest.raises(InputError, match="line 4: x: 'oops'"):
+        tables.check_cells(log, ["t", "id", "note", "x"], ["t", "x"])
+
+
 def test_a_long_log_with_a_line_without_an_end(tmp_path):
     """Read in pieces, by another reader, which says where it stopped."""
     log, source = tmp_path / "log.csv", tmp_path / "source.toml"
@@ -216,15 +231,22 @@ def test_faults_of_other_kinds_pass():
 
 
 @pytest.mark.multiprocess
-def test_memory_that_is_not_given_is_one_line():
-    work = "import numpy; numpy.empty(2**62, numpy.uint8)"
+@pytest.mark.parametrize(
+    ("work", "said"),
+    [
+        ("import numpy; numpy.empty(2**62, numpy.uint8)", "Unable to allocate 4.00 Ei"),
+        ("import jax; jax.numpy.zeros(2**45)", "RESOURCE_EXHAUSTED: Out of memory"),
+    ],
+)
+def test_memory_that_is_not_given_is_one_line(work, said):
     script = f"from experiments.common import run; run(lambda: exec({work!r}))"
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stdout) == (2, "")
     (line,) = done.stderr.splitlines()
-    assert line.startswith("error: memory: Unable to allocate 4.00 EiB for an array")
+    assert line.startswith(f"error: memory: {said}")
+    assert line.endswith(": expected more for this work")
 
 
 def test_names_that_are_no_text(tmp_path):

@@ -1,12 +1,13 @@
 """Recordings made by hand -> scenes: labels, tags, drop reasons, import."""
 
 import dataclasses
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
-from rcirl_jax.data import importing
+from rcirl_jax.data import files, importing
 from rcirl_jax.data.assemble import assemble
 from rcirl_jax.data.collect import Collector
 from rcirl_jax.data.config import CollectConfig
@@ -414,8 +415,8 @@ CONFIG = ImportConfig(format="test", collect=NO_FILTER, test_fraction=0.4)
 
 
 def files_of(folder):
-    files = [path for path in folder.rglob("*") if path.is_file()]
-    return {path.relative_to(folder): path.read_bytes() for path in files}
+    found = [path for path in folder.rglob("*") if path.is_file()]
+    return {path.relative_to(folder): path.read_bytes() for path in found}
 
 
 def test_interrupted_import_resumes_to_the_same_bytes(tmp_path, monkeypatch):
@@ -460,6 +461,31 @@ def test_bad_input_in_the_middle_leaves_nothing(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="r2: x: nan"):
         import_logs(broken(), tmp_path / "out", CONFIG)
     assert not (tmp_path / "out").exists() or not files_of(tmp_path / "out")
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "shards/00002/shard.json"])
+def test_too_many_names_leave_what_is_finished(tmp_path, monkeypatch, name):
+    """A dataset that could not be read again is not written."""
+    monkeypatch.setattr(importing, "SHARD_SCENES", 1)
+
+    def named():
+        *first, last = three_recordings()
+        yield from first
+        yield dataclasses.replace(last, name=1000 * "x")
+
+    import_logs(named(), tmp_path / "whole", CONFIG)
+    whole, out = files_of(tmp_path / "whole"), tmp_path / "out"
+    most = len(whole[Path(name)]) - 1
+    with monkeypatch.context() as patched:
+        patched.setitem(files.JSON_BYTES, name.rpartition("/")[2], most)
+        with pytest.raises(InputError, match=f"{name}: .*: expected {most} at most"):
+            import_logs(named(), out, CONFIG)
+    kept = {path: path.stat().st_mtime_ns for path in out.rglob("shard.json")}
+    assert len(kept) == (3 if name == "manifest.json" else 2)
+    assert not (out / "manifest.json").exists()
+    import_logs(named(), out, CONFIG)
+    assert all(path.stat().st_mtime_ns == when for path, when in kept.items())
+    assert files_of(out) == whole
 
 
 def test_nothing_kept_says_why(tmp_path):

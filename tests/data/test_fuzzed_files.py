@@ -15,7 +15,7 @@ import pytest
 
 from benchmarks.reliability.fuzz.containers import archive_of
 from benchmarks.reliability.fuzz.readers import suite
-from rcirl_jax.data import files, importers, manifest
+from rcirl_jax.data import importers, manifest
 from rcirl_jax.data.importers import (
     interaction,
     l5_map,
@@ -313,21 +313,6 @@ def test_rows_that_are_claimed_need_the_bytes_of_their_places(dataset):
     reseal(dataset, lambda shard: shard.update(count=10**9))
     line = line_of(lambda: open_dataset(dataset))
     assert re.search(r"files: .*: \d+ bytes: expected 62500004 at least for 10", line)
-
-
-@pytest.mark.parametrize(
-    ("name", "kept"), [("manifest.json", True), ("shard.json", False)]
-)
-def test_a_dataset_that_could_not_be_read_again_is_not_written(
-    tmp_path, monkeypatch, name, kept
-):
-    """And what had been written before is kept."""
-    monkeypatch.setitem(files.JSON_BYTES, name, 1000)
-    line = line_of(lambda: store.write(tmp_path / "d", (2,)))
-    assert f"{name}: " in line
-    assert "expected 1000 at most; import into several datasets" in line
-    assert not (tmp_path / "d" / "manifest.json").exists()
-    assert (tmp_path / "d/shards/00000/shard.json").exists() == kept
 
 
 @pytest.mark.parametrize(

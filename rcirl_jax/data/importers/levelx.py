@@ -33,10 +33,10 @@ from rcirl_jax.data.importers.sparse_tables import (
     check_range,
 )
 from rcirl_jax.data.importers.tables import (
-    lines_of,
     number,
     read_header,
     read_table,
+    rows_of,
     split_tracks,
     travel_heading,
 )
@@ -116,7 +116,7 @@ def _read_meta(path: Path) -> dict[str, str]:
     names = read_header(path)
     try:
         with path.open(newline="", encoding="utf-8-sig") as handle:
-            rows = filter(None, csv.reader(lines_of(handle)))
+            rows = (row for _, row in rows_of(handle) if row)
             rows = list(itertools.islice(rows, 1, 3))
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: text: {error}: expected CSV text") from error

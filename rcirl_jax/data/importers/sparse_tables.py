@@ -8,7 +8,13 @@ from typing import NoReturn
 
 import numpy as np
 
-from rcirl_jax.data.importers.tables import check_row, check_size, lines_of, load_rows
+from rcirl_jax.data.importers.tables import (
+    check_row,
+    check_size,
+    lines_of,
+    load_rows,
+    rows_of,
+)
 from rcirl_jax.errors import InputError
 
 MAX_PLACE_M = 1e8  # m, farther is no place on earth
@@ -84,7 +90,7 @@ def _find_bad_sparse_cell(
     """Read slowly and name the first line that is wrong."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as handle:
-            for line, cells in enumerate(csv.reader(lines_of(handle)), start=1):
+            for line, (_, cells) in enumerate(rows_of(handle), start=1):
                 if line > skip and cells:
                     while len(cells) > len(header) and not cells[-1].strip():
                         cells.pop()

@@ -3,11 +3,10 @@
 import collections
 import csv
 import dataclasses
-import itertools
 import math
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NoReturn, TextIO
 
@@ -80,12 +79,44 @@ def lines_of(handle: TextIO) -> Iterator[str]:
         yield line
 
 
+def rows_of(
+    handle: TextIO, change: Callable[[str], str] = str
+) -> Iterator[tuple[int, list[str]]]:
+    """(number of its last line, cells) of each row of a CSV.
+
+    Args:
+      handle: of the text, opened with `newline=""`.
+      change: what is made of each line first.
+
+    Raises:
+      InputError: a line, or a row over several, of more than `MAX_LINE` characters.
+      csv.Error: a cell too long, or what is no CSV.
+    """
+    held = 0
+
+    def lines() -> Iterator[str]:
+        nonlocal held
+        for line in lines_of(handle):
+            held += len(line)
+            if held > MAX_LINE:
+                raise InputError(
+                    f"{handle.name}: a row of more than {MAX_LINE} characters: "
+                    "expected one a line"
+                )
+            yield change(line)
+
+    reader = csv.reader(lines())
+    for row in reader:
+        held = 0
+        yield reader.line_num, row
+
+
 def read_header(path: Path) -> list[str]:
     """Column names of a comma-separated file: not empty or too many, each once."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as handle:
-            first = itertools.islice(lines_of(handle), 1)
-            header = [name.strip() for name in next(csv.reader(first), [])]
+            _, names = next(rows_of(handle), (0, []))
+            header = [name.strip() for name in names]
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: header: {error}: expected CSV text") from error
     if not any(header):
@@ -222,11 +253,11 @@ def check_cells(
     """Every row of a CSV is as `check_row` says; slow, to explain a failure."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as handle:
-            lines = itertools.islice(lines_of(handle), 1, None)
-            for number_, line in enumerate(lines, start=2):
-                cells = csv.reader([ungrouped(line) if grouped else line])
-                if row := next(cells, []):
-                    check_row(path, number_, row, header, numeric)
+            rows = rows_of(handle, ungrouped if grouped else str)
+            next(rows)
+            for line, row in rows:
+                if row:
+                    check_row(path, line, row, header, numeric)
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: text: {error}: expected CSV text") from error
 
