@@ -334,6 +334,7 @@ def test_command(tmp_path):
     assert (tmp_path / "labels.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 @pytest.mark.dataset
 def test_urban_signals(data_dir):
     """The written cycles fit the drivers, over all files; one file proves little."""

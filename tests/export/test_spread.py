@@ -77,6 +77,7 @@ def test_a_piece_is_its_part_of_the_whole(weights):
         np.testing.assert_array_equal(a, b[1:3])
 
 
+@pytest.mark.slow
 @pytest.mark.multiprocess
 def test_a_ranking_does_not_depend_on_where_it_is_scored(weights):
     here, there = scored(weights, Here()), scored(weights, Processes(2))

@@ -115,7 +115,9 @@ def test_vmap_equals_loop_and_jit_equals_eager(preset):
         )
 
 
-@pytest.mark.parametrize("mode", ["speed", "path_speed"])
+@pytest.mark.parametrize(
+    "mode", ["speed", pytest.param("path_speed", marks=pytest.mark.slow)]
+)
 def test_human_equal_to_a_candidate_has_the_same_bits(mode):
     """The human enters as positions, like a candidate, and nothing differs."""
     maps, config = [feature_map(preset) for preset in PRESETS], SamplerConfig(mode=mode)
