@@ -109,7 +109,9 @@ class Obstacles(flax.struct.PyTreeNode, kw_only=True):
     speed: jax.Array  # [N, T] m/s, along the reference line, signed
     valid: jax.Array  # [N, T] bool, known at that time (STOP: demands a stop)
     kind: jax.Array  # [N] int32, `Kind`
-    is_recorded: jax.Array  # [N] bool, motion recorded (True) or predicted
+    # what is measured at t = 0 and cannot be read from the boxes there
+    a: jax.Array  # [N] m/s^2, acceleration along the reference line
+    l_dot: jax.Array  # [N] m/s, lateral speed
 
 
 class Scene(flax.struct.PyTreeNode, kw_only=True):

@@ -238,7 +238,9 @@ class Collector:
         kind[: len(lines)] = [line["kind"] for line in lines]
         kind[len(lines) : end] = self._kind[near[:room]]
         row["obstacles.kind"] = kind
-        row["obstacles.is_recorded"] = kind != Kind.NONE
+        for name in ("a", "l_dot"):
+            row[f"obstacles.{name}"] = np.zeros(NUM_OBSTACLES)
+            row[f"obstacles.{name}"][len(lines) : end] = boxes[name]
         # for the labels only: what demands the stop is not stored
         is_light = np.zeros(NUM_OBSTACLES, bool)
         is_light[: len(lines)] = [line["is_light"] for line in lines]
@@ -289,7 +291,20 @@ class Collector:
             "l_upper": l + half_l,
             "speed": speed[most],
             "valid": seen[most],
+            **self._rates(view, others[most], clock[0]),
         }
+
+    def _rates(
+        self, view: FrameTracks, tracks: np.ndarray, now: float
+    ) -> dict[str, np.ndarray]:
+        """Acceleration and lateral speed [k] of tracks at a time, over +-1 sample."""
+        last = self._last[tracks] - self._first[tracks]
+        frame = np.rint(now * self.rate).astype(int) - self._first[tracks]
+        before, after = (np.clip(frame + step, 0, last) for step in (-1, 1))
+        span = np.maximum(after - before, 1) / self.rate
+        low, high = (view.table[self._offset[tracks] + at] for at in (before, after))
+        change = (high - low) / span[:, None]
+        return {"a": change[:, 3], "l_dot": change[:, 1]}
 
     def _ghosts(self, frame: LaneFrame, start: int, number: int) -> np.ndarray:
         """[g, T, 2] station and offset of road users missing from the file."""

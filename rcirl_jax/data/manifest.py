@@ -15,7 +15,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.units import NUM_TIMES, TIMES_S
 from rcirl_jax.whole import parse_json
 
-SCHEMA_VERSION = 1  # of manifest.json and shard.json
+SCHEMA_VERSION = 2  # of manifest.json and shard.json
 SHA256 = re.compile("[0-9a-f]{64}")
 MAX_ROWS = 2**31  # rows of a dataset
 

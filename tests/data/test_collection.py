@@ -154,6 +154,30 @@ def test_follow():
     )
 
 
+def slot_of(row, at_s):
+    """The obstacle whose rear end is nearest to station `at_s` at the frame."""
+    return int(np.argmin(np.abs(row["obstacles.s_lower"][:, 0] - at_s)))
+
+
+@pytest.mark.parametrize(("a", "l_dot"), [(-0.8, 0.0), (0.5, 0.25), (0.0, -0.25)])
+def test_rates_at_the_frame(a, l_dot):
+    """A quadratic in s and a line in l pass the smoothing unchanged."""
+    made = recording(
+        car("ego", speeding_up(0.0)),
+        car("lead", speeding_up(40.0, v=14.0, a=a), y=lambda t: l_dot * (t - 2.0)),
+        car("far", speeding_up(90.0)),
+    )
+    row = first_scene(made)
+    assert row["frame"] == 5
+    lead = slot_of(row, 40.0 + 0.5 * 2.0 - 2.25)
+    assert row["obstacles.a"][lead] == pytest.approx(a, abs=0.01)
+    assert row["obstacles.l_dot"][lead] == pytest.approx(l_dot, abs=0.01)
+    empty = row["obstacles.kind"] == Kind.NONE
+    assert empty.any()
+    assert not row["obstacles.a"][empty].any()
+    assert not row["obstacles.l_dot"][empty].any()
+
+
 def smooth_step(t, start, duration):
     u = np.clip((t - start) / duration, 0.0, 1.0)
     return u**3 * (10 - 15 * u + 6 * u**2)

@@ -361,8 +361,8 @@ def test_a_shard_without_rows_is_one_line(copy):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda m: m.update(schema_version=2), "schema_version: 2: expected 1"),
-        (lambda m: m.pop("schema_version"), "schema_version: None: expected 1"),
+        (lambda m: m.update(schema_version=1), "schema_version: 1: expected 2"),
+        (lambda m: m.pop("schema_version"), "schema_version: None: expected 2"),
         (lambda m: m.pop("quality"), "quality: expected"),
         (lambda m: m["arrays"].pop("human.s"), "arrays: human.s: None: expected"),
         (
@@ -386,31 +386,14 @@ def test_manifests_that_are_none(copy, text):
         open_dataset(copy)
 
 
-def test_a_dataset_of_an_old_version_reads_as_it_was(tmp_path):
-    """Written by 81c261a, the first commit with datasets; never made anew.
-
-    Leaf number i of row r is i/2 + r; flags and numbers by their remainders.
-    """
+def test_a_dataset_of_an_old_version_says_to_import_again(tmp_path):
+    """Written by the first code with datasets, never made anew: without rates."""
     with tarfile.open(GOLDEN / "dataset_1.tar.xz") as archive:
         archive.extractall(tmp_path, filter="data")
-    dataset = open_dataset(tmp_path)
-    assert dataset.manifest.schema_version == 1
-    assert dataset.hash == (
-        "1497094f14c7c9354adcb4194496e450a459f4f55bba1fb26c8b24b813831634"
-    )
-    rows = np.arange(3)
-    assert dataset.indices("train").tolist() == [0, 2]
-    read = dataset.load(None)
-    own = (read.group, read.vehicle, read.recording)
-    for number, leaf in enumerate(jax.tree.leaves(read)):
-        kind = {"f": 0.5 * number + rows, "b": (number + rows) % 2 == 1}
-        expected = kind.get(leaf.dtype.kind, (number + rows) % 3)
-        if any(leaf is other for other in own):
-            expected = rows % 2
-        flat = leaf.reshape(3, -1)
-        np.testing.assert_array_equal(
-            flat, np.broadcast_to(expected[:, None], flat.shape)
-        )
+    with pytest.raises(InputError) as caught:
+        open_dataset(tmp_path)
+    words = "schema_version: 1: expected 2; import the logs again with this version"
+    assert str(caught.value) == f"{tmp_path}/manifest.json: {words}"
 
 
 def test_no_dataset_and_interrupted_import_are_told_apart(copy, tmp_path):
