@@ -92,7 +92,9 @@ class Path(flax.struct.PyTreeNode, kw_only=True):
 
     kappa: jax.Array  # [P] 1/m, curvature of the reference line, left positive
     l: jax.Array  # [P] m, lateral offset of the given path
-    speed_limit: jax.Array  # [P] m/s
+    # [P] m/s, what the planner may drive: posted, curve and the way to brake for what
+    # comes (`geometry.limits.planning_limit`)
+    speed_limit: jax.Array
     lane_left: jax.Array  # [P] m, lateral offset of the ego lane's left bound
     lane_right: jax.Array  # [P] m, of its right bound (negative)
     road_left: jax.Array  # [P] m, of the drivable area's left edge
@@ -205,6 +207,12 @@ class Track:
     seen_since: float | None = None
     # s, (begin, end) of times at which no human drove, or nobody knows who did
     automated: tuple[tuple[float, float], ...] = dataclasses.field(
+        default=(), metadata={"in_digest": "unless default"}
+    )
+
+    # s, (begin, end) of times at which the log names a leader of this driver that it
+    # does not hold
+    leader_missing: tuple[tuple[float, float], ...] = dataclasses.field(
         default=(), metadata={"in_digest": "unless default"}
     )
 

@@ -26,13 +26,23 @@ from rcirl_jax.data.motion import (
     human_motion,
 )
 from rcirl_jax.data.smoothing import SmoothTrack, smooth_track
+from rcirl_jax.data.surroundings import surroundings_end
+from rcirl_jax.geometry.limits import LOOK_AHEAD_M, planning_limit
 from rcirl_jax.types import Ghost, Kind, Recording
-from rcirl_jax.units import HORIZON_S, NUM_OBSTACLES, TIMES_S
+from rcirl_jax.units import (
+    HORIZON_S,
+    NUM_OBSTACLES,
+    NUM_STATIONS,
+    STATION_STEP_M,
+    TIMES_S,
+)
 
 VIEW_BEHIND_M = 60.0  # m, obstacles farther behind are not collected
 MAX_GHOST_POINTS = 1000  # of the line that a missing road user is taken to drive
 VIEW_BESIDE_M = 12.0  # m, obstacles farther beside are not collected
 VIEW_NUMBERS = 7  # float64 of a sample in a frame: s, l, tilt and the table of four
+# m, the scene's station grid and as far beyond it as its speed limits look
+LONG_GRID_M = np.arange(0.0, GRID_M[-1] + LOOK_AHEAD_M + 1e-6, STATION_STEP_M)
 BOX = ("s_lower", "s_upper", "l_lower", "l_upper", "speed", "valid")
 LABELLED_AT_ONCE = 64  # scenes
 VIEWS_BYTES = 256 * 2**20  # of tracks kept in the frames of chains
@@ -54,6 +64,8 @@ class Collector:
             recording, config.trust_signals, config.signal_checks
         )
         self.dropped: collections.Counter[str] = collections.Counter()
+        # of the scenes: how many end with their surroundings, times recorded, times cut
+        self.ended: collections.Counter[str] = collections.Counter()
         self._views: dict[tuple[str, ...], FrameTracks] = {}
         self._ghost_views: dict[tuple[str, ...], list[tuple[np.ndarray, ...]]] = {}
         counts = [track.num_frames for track in self.tracks]
@@ -136,7 +148,14 @@ class Collector:
             if isinstance(row, str):
                 self.dropped[row] += 1
             else:
+                self._count_end(row)
                 yield row
+
+    def _count_end(self, row: dict) -> None:
+        """Count the times of a scene's recorded future, and those without mask."""
+        times = int(np.sum(row["future_s"] + 1e-6 >= TIMES_S))
+        cut = times - int(np.sum(row["time_valid"]))
+        self.ended.update(shortened=int(cut > 0), times=times, times_cut=cut)
 
     def view(self, frame: LaneFrame) -> FrameTracks:
         """All tracks in the chain's frame (cached for the chains last asked for)."""
@@ -174,10 +193,31 @@ class Collector:
         if reason := filters.reject_motion(row, motion, self.config):
             return reason
         self._add_obstacles(row, number, start, frame, motion)
+        if reason := self._end(row, number, motion):
+            return reason
         ghosts = self._ghosts(frame, start, number)
         if reason := filters.reject(row, motion, self.config, ghosts):
             return reason
         return row
+
+    def _end(self, row: dict, number: int, motion: Motion) -> str | None:
+        """End the mask where the surroundings end; or the reason to drop the scene."""
+        now = row["frame"] / self.rate
+        track, end = self.tracks[number].track, np.inf
+        for begin, until in track.leader_missing:
+            if begin <= now + 1e-6 < until:
+                return "follows_missing_car"
+            if begin > now:
+                end = min(end, begin - now - 1.0 / self.rate)
+        of = row["obstacles.track"]
+        ends = np.where(of < 0, np.inf, self._last[of] / self.rate - now)
+        end = min(end, surroundings_end(row, ends))
+        if end >= row["future_s"]:
+            return None
+        if end < self.config.min_surroundings_s:
+            return "surroundings_end"
+        row["time_valid"] = row["time_valid"] & (end + 1e-6 >= TIMES_S)
+        return filters.reject_motion(row, motion, self.config)
 
     def _ego_and_path(
         self,
@@ -208,9 +248,16 @@ class Collector:
             "track": number,
             "frame": smooth.first_frame + start,
         }
-        for name in ("speed_limit", "lane_left", "lane_right", "road_left"):
+        for name in ("lane_left", "lane_right", "road_left", "road_right"):
             row[f"path.{name}"] = frame.table(name, stations)
-        row["path.road_right"] = frame.table("road_right", stations)
+        far = motion.s0 + LONG_GRID_M
+        limit = planning_limit(
+            frame.on_grid("kappa", far),
+            np.interp(LONG_GRID_M, GRID_M, row["path.l"]),
+            frame.table("speed_limit", far),
+            STATION_STEP_M,
+        )
+        row["path.speed_limit"] = limit[:NUM_STATIONS]
         return row
 
     def _add_obstacles(

@@ -5,6 +5,8 @@ import dataclasses
 from rcirl_jax.data.signal_checks import SignalChecks
 from rcirl_jax.units import HORIZON_S
 
+SHORTEST_S = 1.0  # s of mask; derivatives need three points of the time axis
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CollectConfig:
@@ -18,6 +20,9 @@ class CollectConfig:
     min_history_s: float = 0.5
     # s of recording after it (5 s and one more point of the time axis)
     min_future_s: float = 5.2
+    # s, at least, until someone whom the human reacts to leaves the record: a scene
+    # that is shorter then is dropped, others end there
+    min_surroundings_s: float = 3.0
     # the paper's two filters
     require_obstacles: bool = True
     require_speed_change: bool = True
@@ -30,5 +35,9 @@ class CollectConfig:
         """Reject what cannot be meant."""
         if not 0.0 < self.min_future_s <= HORIZON_S:
             raise ValueError(f"min_future_s: {self.min_future_s}: expected (0, 8]")
+        if not SHORTEST_S <= self.min_surroundings_s <= HORIZON_S:
+            raise ValueError(
+                f"min_surroundings_s: {self.min_surroundings_s}: expected [1, 8]"
+            )
         if self.stride_s <= 0.0:
             raise ValueError(f"stride_s: {self.stride_s}: expected > 0")

@@ -17,6 +17,7 @@ REASONS = {
     "no_obstacles": "nobody else is near (the paper's first filter)",
     "overlapping_boxes": "the human's box overlaps another's",
     "follows_missing_car": "the leader is missing from the file",
+    "surroundings_end": "someone the human reacts to leaves the record too early",
 }
 
 MIN_SPEED_CHANGE_MPS = 0.5  # m/s over the scene

@@ -32,6 +32,9 @@ class QualityReport:
     harsh_raw: int = 0
     harsh_smooth: int = 0
     accelerations: int = 0
+    shortened: int = 0  # scenes that end with their surroundings
+    times: int = 0  # points of the time axis inside the scenes' recorded futures
+    times_cut: int = 0  # of them after the surroundings' end
     dropped: collections.Counter = dataclasses.field(
         default_factory=collections.Counter
     )
@@ -71,6 +74,9 @@ class QualityReport:
             self.harsh_smooth += smoothed[0]
             self.accelerations += count
         self.dropped.update(collector.dropped)
+        self.shortened += collector.ended["shortened"]
+        self.times += collector.ended["times"]
+        self.times_cut += collector.ended["times_cut"]
         notes = [*recording.notes, *collector.signal_notes]
         self.notes += [f"{recording.name}: {note}" for note in notes]
 
@@ -125,6 +131,8 @@ class QualityReport:
             "headway_histogram": _histogram(self.headways, HEADWAY_STEP_S),
             "speed_mps": _quantiles(self.speeds, SPEED_STEP_MPS),
             "future_s": _quantiles(self.futures, FUTURE_STEP_S),
+            "shortened": self.shortened,
+            "shortened_share": self.times_cut / max(self.times, 1),
             "tags": dict(self.tags),
             "decisions": dict(self.decisions),
             "dropped": {name: self.dropped.get(name, 0) for name in REASONS},
@@ -192,6 +200,9 @@ def format_quality(report: dict) -> str:
         if report[name] is not None:
             values = " / ".join(f"{value:.1f}" for value in report[name].values())
             lines.append(f"{label:<28}{values:>20}")
+    if report["shortened"]:
+        share = f"{report['shortened']:,} ({report['shortened_share']:.1%} of times)"
+        lines.append(f"{'end with surroundings':<28}{share:>20}")
     lines.append("")
     lines.append("tags                         scenes   dropped because")
     tags = sorted(report["tags"].items(), key=lambda item: -item[1])

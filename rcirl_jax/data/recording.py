@@ -186,9 +186,12 @@ def _check_driver(where: str, track: Track) -> None:
     place = track.destination
     if place is not None and not np.isfinite(place).all():
         raise InputError(f"{where}: destination: {place}: expected finite numbers")
-    for low, high in track.automated:
-        if not low <= high:
-            raise InputError(f"{where}: automated: {low} to {high} s: expected a span")
+    for field in ("automated", "leader_missing"):
+        for low, high in getattr(track, field):
+            if not low <= high:
+                raise InputError(
+                    f"{where}: {field}: {low} to {high} s: expected a span"
+                )
 
 
 def check_span(where: str, field: str, values: np.ndarray) -> None:

@@ -178,6 +178,37 @@ def test_rates_at_the_frame(a, l_dot):
     assert not row["obstacles.l_dot"][empty].any()
 
 
+def test_the_speed_limit_is_what_a_planner_may_drive():
+    """From 300 m on 5 m/s, beyond the scene's 254 m: braked for with 1 m/s^2."""
+    half = np.full(61, WIDTH / 2)
+    parts = {"a": (0.0, 25.0, ("b",)), "b": (300.0, 5.0, ())}
+    lanes = tuple(
+        Lane(
+            id=name,
+            centre=np.stack([start + np.arange(0.0, 301.0, 5.0), 0.0 * half], 1),
+            left_width=half,
+            right_width=half,
+            speed_limit=limit,
+            successors=after,
+        )
+        for name, (start, limit, after) in parts.items()
+    )
+    made = recording(
+        car("ego", speeding_up(20.0)), car("lead", speeding_up(60.0)), lanes=lanes
+    )
+    row = first_scene(made)
+    here = 20.0 + 12.0 * 0.5 + 0.5 * 0.3 * 0.5**2
+    to_go = 300.0 - here - 2.0 * np.arange(128)
+    expected = np.minimum(25.0, np.sqrt(5.0**2 + 2.0 * to_go))
+    # the lower limit counts from up to one grid point of 2 m earlier
+    np.testing.assert_array_less(row["path.speed_limit"], expected + 1e-3)
+    earlier = np.sqrt(5.0**2 + 2.0 * (to_go - 4.0))
+    np.testing.assert_array_less(
+        np.minimum(25.0, earlier) - 1e-3, row["path.speed_limit"]
+    )
+    assert row["path.speed_limit"][-1] < 10.0
+
+
 def smooth_step(t, start, duration):
     u = np.clip((t - start) / duration, 0.0, 1.0)
     return u**3 * (10 - 15 * u + 6 * u**2)
@@ -379,6 +410,7 @@ def hard(name):
         "too_noisy": recording(jerky, lead),
         "overlapping_boxes": recording(ego, car("twin", speeding_up(22.0))),
         "follows_missing_car": recording(ego, lead, ghosts=(ghost,)),
+        "surroundings_end": recording(ego, car("lead", speeding_up(60.0), seconds=2.0)),
     }
     return table[name]
 

@@ -53,7 +53,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.types import Recording
 
 NEEDED = ("Vehicle_ID", "Frame_ID", "Local_Y", "v_Vel", "Lane_ID")
-OPTIONAL = ("Local_X", "v_Length", "v_Width", "v_Class", "Global_Time")
+OPTIONAL = ("Local_X", "v_Length", "v_Width", "v_Class", "Global_Time", "Preceding")
 JUNCTION = "Int_ID"  # a column of arterials, empty for freeways
 ARTERIAL_COLUMNS = 24  # of an arterial's native text
 LOGS = "trajectories"  # start of the logs' names in the releases
@@ -61,7 +61,7 @@ LENGTHS = ("Local_X", "Local_Y", "v_Length", "v_Width", "v_Vel")
 MAX_NUMBER = 1e12  # of a vehicle or lane; larger ones are no numbers of anything
 # in the file's unit: what no log can mean
 LIMITS = {
-    **dict.fromkeys(("Vehicle_ID", "Lane_ID", "v_Class"), MAX_NUMBER),
+    **dict.fromkeys(("Vehicle_ID", "Lane_ID", "v_Class", "Preceding"), MAX_NUMBER),
     **dict.fromkeys(("Frame_ID", "Global_Time"), MAX_TIME),
     **dict.fromkeys(LENGTHS, MAX_PLACE_M),
 }

@@ -13,6 +13,7 @@ from rcirl_jax.data.importers.options import positive
 from rcirl_jax.data.importers.tables import (
     StraightLane,
     number,
+    spans_of,
     split_tracks,
     straight_lanes,
     travel_heading,
@@ -111,7 +112,7 @@ def _median(values: np.ndarray, counts: np.ndarray) -> float:
 
 def drop_repeated(table: Table) -> int:
     """Remove rows that repeat another in every value; returns how many."""
-    values = [column for name, column in table.items() if name != SITE]
+    values = [v for name, v in table.items() if name not in (SITE, "Preceding")]
     order = np.lexsort((np.arange(values[0].size), table["frame"], table["Vehicle_ID"]))
     stacked = np.stack(values, axis=1)[order]
     repeated = np.all(stacked[1:] == stacked[:-1], axis=1)
@@ -151,6 +152,7 @@ def site_recording(
     vehicles = table["Vehicle_ID"].astype(np.int64)
     pieces = split_tracks(path, vehicles, table["frame"], MAX_FRAME_GAP, reuse)
     lateral = survey.lateral
+    table = {**table, "leader_missing": _leader_missing(table)}
     tracks = [_track(name, table, rows, spec, lateral) for name, rows in pieces]
     return Recording(
         name=name,
@@ -162,6 +164,16 @@ def site_recording(
         default_speed_limit=number(spec, "speed_limit", LIMIT_MPS),
         notes=tuple(notes),
     )
+
+
+def _leader_missing(table: Table) -> np.ndarray:
+    """[n] bool: the row names a vehicle ahead that has no row at that time."""
+    named = table["Preceding"] > 0.0
+    users = np.concatenate([table["Vehicle_ID"], table["Preceding"]])
+    number = np.unique(users, return_inverse=True)[1].reshape(2, -1)
+    frames = np.unique(table["frame"], return_inverse=True)[1].reshape(-1)
+    own, ahead = number * (frames.max() + 1) + frames
+    return named & ~np.isin(ahead, own)
 
 
 def _track(
@@ -189,6 +201,7 @@ def _track(
         y=y,
         heading=travel_heading(t, x, y),
         speed=table["v_Vel"][rows],
+        leader_missing=spans_of(t, table["leader_missing"][rows]),
     )
 
 
