@@ -86,7 +86,7 @@ def main() -> None:
         words = [sys.executable, "-m", "experiments.import_logs", "--format=csv"]
         words += [f"--input={log}", f"--source={toml}", f"--output={folder / 'data'}"]
         words += [f"--stride={_STRIDE.value}", f"--workers={_WORKERS.value}"]
-        words += ["--keep_steady", "--keep_alone"]
+        words += ["--keep_steady", "--keep_free_road"]
         process = subprocess.Popen(
             words, env={**os.environ, "TMPDIR": place, "JAX_PLATFORMS": "cpu"}
         )

@@ -20,7 +20,7 @@ from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import IMPORTERS
 from rcirl_jax.data.importing import ImportConfig, import_parts
 from rcirl_jax.data.parts import leaving_out, parts_of
-from rcirl_jax.data.quality import format_quality
+from rcirl_jax.data.quality import format_quality, format_splits
 from rcirl_jax.data.store import Dataset
 from rcirl_jax.evaluation.evaluate import RankingSetup, oracle_floor
 from rcirl_jax.sampling import SamplerConfig
@@ -42,12 +42,17 @@ _MIN_FUTURE = flags.DEFINE_float("min_future", 5.2, "s of recording a scene need
 _MIN_HISTORY = flags.DEFINE_float(
     "min_history", 0.5, "s of recording before a planning frame"
 )
+_MIN_SURROUNDINGS = flags.DEFINE_float(
+    "min_surroundings",
+    3.0,
+    "s until someone whom the human reacts to leaves the record, at least",
+)
 _SMOOTHING = flags.DEFINE_float("smoothing", 4.1, "s, window of the position filter")
 _KEEP_STEADY = flags.DEFINE_bool(
     "keep_steady", False, "keep scenes without speed change (the paper drops them)"
 )
-_KEEP_ALONE = flags.DEFINE_bool(
-    "keep_alone", False, "keep scenes without obstacles (the paper drops them)"
+_KEEP_FREE_ROAD = flags.DEFINE_bool(
+    "keep_free_road", False, "keep scenes without obstacles (the paper drops them)"
 )
 _TRUST = flags.DEFINE_bool(
     "trust_signals", False, "use cycles a converter wrote, unless crossings contradict"
@@ -77,7 +82,8 @@ def main() -> None:
             stride_s=_STRIDE.value,
             min_future_s=_MIN_FUTURE.value,
             min_history_s=_MIN_HISTORY.value,
-            require_obstacles=not _KEEP_ALONE.value,
+            min_surroundings_s=_MIN_SURROUNDINGS.value,
+            require_obstacles=not _KEEP_FREE_ROAD.value,
             require_speed_change=not _KEEP_STEADY.value,
             trust_signals=_TRUST.value,
             signal_checks=checked_signals(
@@ -89,15 +95,22 @@ def main() -> None:
         leave_out=_LEAVE_OUT.value,
     )
     floors: list[dict] = []
+    splits: list[str] = []
+
+    def judged(dataset: Dataset) -> None:
+        floors.extend(_floors(dataset))
+        splits.append(format_splits(dataset))
+
     manifest = import_parts(
         parts,
         _OUTPUT.value,
         config,
         executor=places,
         overwrite=_OVERWRITE.value,
-        before_commit=lambda dataset: floors.extend(_floors(dataset)),
+        before_commit=judged,
     )
     print(format_quality(manifest.quality))
+    print(*splits, sep="\n")
     for mode, floor in zip(MODES, floors, strict=True):
         mean, median = floor["best_fde_mean_m"], floor["best_fde_median_m"]
         print(

@@ -39,6 +39,9 @@ class Cut:
     vehicles: list[str]  # name per scene
     groups: list[str]  # vehicle-disjoint group per scene
     quality: dict  # `QualityReport.state()`
+    # s, per scene, when the log first saw its vehicle
+    first_seen: list[float] = dataclasses.field(default_factory=list)
+    log: str = ""  # of which the recording is a piece, or its own name
     known: bool = False  # a committed shard holds it already
     refused: str = ""  # why nothing of it was read, where it is left out
     part: str = ""  # the input it was read from
@@ -107,8 +110,10 @@ def cut(
         "rate_hz": recording.rate_hz,
         "sha256": sha256,
         "progress": recording.progress,
+        "log": recording.piece_of or recording.name,
     }
-    nothing = {"scenes": None, "vehicles": [], "groups": [], "quality": {}}
+    lists = {"vehicles": [], "groups": [], "first_seen": []}
+    nothing = {"scenes": None, "quality": {}, **lists}
     if recording.name in (done or {}):
         if done and done[recording.name] != sha256:
             raise InputError(
@@ -136,6 +141,7 @@ def cut(
         scenes=scenes,
         vehicles=[f"{g}:{t.id}" for g, t in zip(groups, tracks, strict=True)],
         groups=groups,
+        first_seen=[track.first_seen_s for track in tracks],
         quality=report.state(),
     )
 

@@ -25,7 +25,7 @@ from rcirl_jax.data.files import Files
 from rcirl_jax.data.parts import Part, items, leaving_out
 from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.data.rows import check_finite
-from rcirl_jax.data.splits import assign_groups
+from rcirl_jax.data.splits import split_wholes, time_blocks
 from rcirl_jax.data.store import Dataset, DatasetWriter, Manifest
 from rcirl_jax.errors import InputError, LostWorkError
 from rcirl_jax.executor import Executor, Here
@@ -128,7 +128,11 @@ class _Import:
         self.vehicles = _Numbers()
         self.quality = QualityReport()
         self.sizes: dict[str, int] = {}
+        # of the scenes in `pending`: name and first sight of each one's vehicle
         self.pending: list[Demonstration] = []
+        self.drivers: list[tuple[str, float]] = []
+        self.logs: set[str] = set()  # that scenes come from
+        self.split_by = ""  # in words, what is kept on one side
         self.lineage: list[dict] = []
         self.sources: dict[str, str] = {}
         self.rates: set[float] = set()
@@ -169,6 +173,8 @@ class _Import:
             )
             check_finite(made.name, scenes, np.arange(len(made.vehicles)))
             self.pending.append(scenes)
+            self.drivers += zip(made.vehicles, made.first_seen, strict=True)
+            self.logs.add(made.log)
         self._count(entry)
         if self.quality.refused > self.config.leave_out:
             raise InputError(
@@ -205,7 +211,40 @@ class _Import:
         joined = jax.tree.map(lambda *x: np.concatenate(x), *self.pending)
         self.writer.write_shard(self.next_shard, joined, self.lineage)
         self.next_shard += 1
-        self.pending, self.lineage = [], []
+        self.pending, self.drivers, self.lineage = [], [], []
+
+    def _split_one_group(self) -> None:
+        """Make groups of one that would leave the test split empty.
+
+        Raises:
+          LostWorkError: it cannot be cut; finished shards stay for another share.
+        """
+        if len(self.sizes) != 1 or not self.config.test_fraction:
+            return
+        (group,) = self.sizes
+        vehicles = [name for name, _ in self.drivers]
+        first_seen = np.array([time for _, time in self.drivers])
+        whole = len(vehicles) == self.quality.scenes and len(self.logs) == 1
+        if not whole or len(set(vehicles)) == 1:
+            self._close_shard()
+            raise LostWorkError(
+                f"splits: groups: 1 ({group}): expected at least two vehicle-disjoint "
+                f"groups for --test_fraction={self.config.test_fraction:g}; give more "
+                "recordings, or import with --test_fraction=0 for training scenes only"
+            )
+        blocks, self.split_by = time_blocks(
+            first_seen, vehicles, self.config.test_fraction
+        )
+        names = [f"{group}/{block}" for block in blocks]
+        self.groups, start = _Numbers(), 0
+        numbers = self._numbers(self.groups, names)
+        joined = jax.tree.map(lambda *x: np.concatenate(x), *self.pending)
+        self.pending = [joined.replace(group=numbers)]
+        self.sizes = dict(collections.Counter(names))
+        for entry in self.lineage:
+            end = start + sum(entry["groups"].values())
+            entry["groups"] = dict(collections.Counter(names[start:end]))
+            start = end
 
     def finish(self, before_commit: Callable[[Dataset], object]) -> Manifest:
         """Close the last shard and commit the dataset."""
@@ -214,13 +253,22 @@ class _Import:
                 f"{self.done[0]['name']}: missing: expected all recordings of the "
                 "interrupted import; use another --output"
             )
-        self._close_shard()
         if self.quality.scenes == 0:
             drops = {k: v for k, v in self.quality.dropped.items() if v}
             raise InputError(
                 f"import: 0 scenes kept of {self.quality.tracks} tracks: "
                 f"dropped because {drops}: expected at least one scene"
             )
+        self._split_one_group()
+        self._close_shard()
+        wholes = {group: whole_of(group) for group in self.sizes}
+        splits, kept = split_wholes(
+            self.sizes,
+            wholes,
+            test_fraction=self.config.test_fraction,
+            seed=self.config.split_seed,
+        )
+        self.split_by = self.split_by or kept
         return self.writer.finish(
             {
                 "rate_hz": sorted(self.rates),
@@ -231,7 +279,7 @@ class _Import:
                 "recordings": self.recordings.names(),
                 "groups": self.groups.names(),
                 "vehicles": self.vehicles.names(),
-                "splits": self._splits(),
+                "splits": splits,
                 "quality": self.quality.as_dict(),
                 "import": self._flags(),
             },
@@ -243,28 +291,7 @@ class _Import:
         found = dataclasses.asdict(self.config)
         if not found["leave_out"]:
             del found["leave_out"]
-        return found
-
-    def _splits(self) -> dict[str, list[str]]:
-        """Groups per split: whole recordings, or minutes where there is only one."""
-        wholes: collections.Counter[str] = collections.Counter()
-        for group, scenes in self.sizes.items():
-            wholes[whole_of(group)] += scenes
-        is_one = len(wholes) == 1
-        counts = self.sizes if is_one else wholes
-        chosen = assign_groups(
-            counts,
-            test_fraction=self.config.test_fraction if len(counts) > 1 else 0.0,
-            seed=self.config.split_seed,
-        )
-        return {
-            split: sorted(
-                group
-                for group in self.sizes
-                if (group if is_one else whole_of(group)) in names
-            )
-            for split, names in chosen.items()
-        }
+        return found | {"split_by": self.split_by}
 
 
 def import_logs(

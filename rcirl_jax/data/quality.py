@@ -9,6 +9,7 @@ from rcirl_jax.data.collect import Collector
 from rcirl_jax.data.filters import REASONS
 from rcirl_jax.data.lines import TOO_FEW
 from rcirl_jax.data.smoothing import HARSH_MPS2, harsh_share
+from rcirl_jax.data.store import Dataset
 from rcirl_jax.types import Decision, Demonstration, Kind, Recording, Tag
 
 HEADWAY_STEP_S = 0.01  # s, to which headways are counted
@@ -219,4 +220,20 @@ def format_quality(report: dict) -> str:
         lines.append(f"{report['num_notes']} notes; first: {report['notes'][0]}")
     if any(TOO_FEW in note for note in report["notes"]):
         lines.append(HOW_TO_POOL)
+    return "\n".join(lines)
+
+
+def format_splits(dataset: Dataset) -> str:
+    """Scenes and groups of each split, and by what it was split, in one line each."""
+    flags, lines = dataset.manifest.import_flags, []
+    for split, groups in dataset.manifest.splits.items():
+        scenes = dataset.indices(split).size
+        share = scenes / max(dataset.count, 1)
+        lines.append(
+            f"{'split ' + split:<28}{scenes:>10,} scenes ({share:.1%}) in "
+            f"{len(groups):,} groups that share no vehicle"
+        )
+    if "split_by" in flags:
+        asked = f"asked for {flags['test_fraction']:.1%} to test"
+        lines.append(f"{'split by':<28}{flags['split_by']}; {asked}")
     return "\n".join(lines)

@@ -17,6 +17,8 @@ from rcirl_jax.errors import InputError
 
 TRAIN = "train"
 TEST = "test"
+LONGEST_BLOCK_S = 30.0  # s, half of the minute that a group usually is
+SHORTEST_BLOCK_S = 0.1  # s, about a frame
 
 
 def _by_size(counts: Mapping[str, int], seed: int) -> list[str]:
@@ -74,6 +76,72 @@ def assign_groups(
         if not chosen[empty]:
             chosen[empty].append(chosen[other].pop())  # the smallest comes last
     return {split: sorted(names) for split, names in chosen.items()}
+
+
+def split_wholes(
+    sizes: Mapping[str, int],
+    wholes: Mapping[str, str],
+    *,
+    test_fraction: float,
+    seed: int,
+) -> tuple[dict[str, list[str]], str]:
+    """`assign_groups` of whole recordings, or of their groups where there is only one.
+
+    Args:
+      sizes: rows per group.
+      wholes: of each group the recording that it is a part of, or the group itself.
+      test_fraction: share of rows wanted in the test split.
+      seed: as there.
+
+    Returns:
+      (group names per split; in words what is kept on one side).
+    """
+    counts: dict[str, int] = {}
+    for group, rows in sizes.items():
+        counts[wholes[group]] = counts.get(wholes[group], 0) + rows
+    is_one = len(counts) == 1
+    chosen = assign_groups(
+        sizes if is_one else counts, test_fraction=test_fraction, seed=seed
+    )
+    splits = {
+        split: sorted(g for g in sizes if (g if is_one else wholes[g]) in names)
+        for split, names in chosen.items()
+    }
+    words = "minutes in which vehicles are first seen"
+    return splits, words if is_one else "recordings, or groups that a log declares"
+
+
+def time_blocks(
+    first_seen: np.ndarray, vehicles: Sequence[str], test_fraction: float
+) -> tuple[list[str], str]:
+    """Cut the vehicles of one group into groups by when they were first seen.
+
+    Blocks of 30 s, halved until none holds more scenes than the training split is
+    to have; if there is no such length, the longest whose largest block is smallest.
+    Where all vehicles are first seen at once each is a block of its own.
+
+    Args:
+      first_seen: [n] s, of each scene's vehicle; one value per vehicle.
+      vehicles: [n] names.
+      test_fraction: share of scenes wanted in the test split.
+
+    Returns:
+      (block of each scene, e.g. "block-0003"; in words what a block is).
+    """
+    since = np.asarray(first_seen, np.float64) - np.min(first_seen)
+    least, length, number = np.inf, 0.0, np.zeros(since.size, int)
+    shorter = LONGEST_BLOCK_S
+    while shorter > SHORTEST_BLOCK_S and least > 1.0 - test_fraction:
+        found = np.floor(since / shorter + 1e-6).astype(int)
+        most = np.bincount(found).max() / since.size
+        if most < least:
+            least, length, number = most, shorter, found
+        shorter *= 0.5
+    words = f"blocks of {length:g} s in which vehicles are first seen"
+    if np.unique(number).size == 1:
+        number = np.unique(vehicles, return_inverse=True)[1].reshape(-1)
+        words = "vehicle, for all are first seen at once"
+    return [f"block-{block:04d}" for block in number.tolist()], words
 
 
 def check_disjoint(

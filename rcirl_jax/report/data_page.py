@@ -191,10 +191,18 @@ def _facts(dataset: Dataset) -> str:
         if found is not None:
             words = f"{found['p50']:.1f} {unit} ({found['p05']:.1f} to "
             rows.append([_text(name), _text(f"{words}{found['p95']:.1f} in 90 %)")])
+    if quality.get("shortened"):
+        words = (
+            f"{quality['shortened']:,} scenes, {quality['shortened_share']:.1%} of the "
+            "recorded futures: someone whom the driver reacts to leaves the record"
+        )
+        rows.append([_text("end before the driver's record"), _text(words)])
     for split, groups in manifest.splits.items():
         count = dataset.indices(split).size
         words = f"{count:,} scenes in {len(groups):,} groups that share no vehicle"
         rows.append([_text(f"split {split}"), _text(words)])
+    if "split_by" in manifest.import_flags:
+        rows.append([_text("split by"), _text(manifest.import_flags["split_by"])])
     for source in manifest.sources:
         words = f"{source.get('source', '')}; licence: {source.get('licence', '')}"
         rows.append([_text("source"), _text(words)])

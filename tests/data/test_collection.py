@@ -1,6 +1,7 @@
 """Recordings made by hand -> scenes: labels, tags, drop reasons, import."""
 
 import dataclasses
+import re
 from pathlib import Path
 
 import jax
@@ -18,8 +19,9 @@ from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.data.labels import labels_of
 from rcirl_jax.data.lanes import LaneGraph
 from rcirl_jax.data.lines import CREEP_M, TOO_FEW
-from rcirl_jax.data.quality import QualityReport, format_quality
+from rcirl_jax.data.quality import QualityReport, format_quality, format_splits
 from rcirl_jax.data.recording import validate_recording
+from rcirl_jax.data.rows import check_finite
 from rcirl_jax.data.smoothing import harsh_share, savgol
 from rcirl_jax.data.store import open_dataset
 from rcirl_jax.errors import InputError
@@ -557,6 +559,54 @@ def test_no_vehicle_in_both_splits(tmp_path):
     train, test = dataset.load("train"), dataset.load("test")
     assert not set(train.vehicle.tolist()) & set(test.vehicle.tolist())
     assert not set(train.group.tolist()) & set(test.group.tolist())
+
+
+def late(track, since):
+    """The track's samples from `since` s on."""
+    series = ("t", "x", "y", "heading", "speed")
+    keep = track.t >= since - 1e-6
+    return dataclasses.replace(track, **{k: getattr(track, k)[keep] for k in series})
+
+
+@pytest.mark.parametrize("group", [None, "declared"])
+def test_one_recording_is_split_by_when_vehicles_are_first_seen(tmp_path, group):
+    one = late(car("one", speeding_up(0.0, 10.0), seconds=20.0), 0.0)
+    two = late(car("two", speeding_up(60.0, 10.0), seconds=20.0), 0.0)
+    three = late(car("three", speeding_up(30.0, 10.0), seconds=20.0), 4.0)
+    made = dataclasses.replace(recording(one, two, three), group=group)
+    import_logs([validate_recording(made)], tmp_path / "data", CONFIG)
+    dataset = open_dataset(tmp_path / "data")
+    dataset.check_tables()
+    names = dataset.manifest.vehicles
+    driven = {
+        split: {names[n].rpartition(":")[2] for n in dataset.load(split).vehicle}
+        for split in ("train", "test")
+    }
+    assert driven == {"train": {"one", "two"}, "test": {"three"}}
+    told = format_splits(dataset)
+    assert "split by                    blocks of 3.75 s in which" in told
+    scenes = dataset.indices("test").size
+    assert re.search(rf"split test +{scenes} scenes \(.*%\) in 1 groups", told)
+    assert "asked for 40.0% to test" in told
+
+
+def test_an_empty_split_is_refused_and_what_is_finished_stays(tmp_path):
+    alone = recording(car("only", speeding_up(0.0)), car("bike", speeding_up(30.0),
+                      kind=Kind.CYCLIST))  # fmt: skip
+    with pytest.raises(InputError) as caught:
+        import_logs([alone], tmp_path / "data", CONFIG)
+    assert str(caught.value) == (
+        "splits: groups: 1 (hand/minute-0000): expected at least two vehicle-disjoint "
+        "groups for --test_fraction=0.4; give more recordings, or import with "
+        "--test_fraction=0 for training scenes only"
+    )
+    import_logs(
+        [alone], tmp_path / "data", dataclasses.replace(CONFIG, test_fraction=0.0)
+    )
+    dataset = open_dataset(tmp_path / "data")
+    assert dataset.indices("test").size == 0
+    with pytest.raises(InputError, match=r"^test: 0 scenes: expected at least one; "):
+        check_finite("test", dataset.load("test"), dataset.indices("test"))
 
 
 @pytest.mark.dataset

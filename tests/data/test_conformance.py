@@ -189,7 +189,7 @@ def imported(name, fixture, output):
     collect = CollectConfig(
         require_obstacles=False, require_speed_change=False, min_future_s=3.0
     )
-    config = ImportConfig(format=format_of(name), collect=collect)
+    config = ImportConfig(format=format_of(name), collect=collect, test_fraction=0.0)
     return import_parts(parts_of(format_of(name), fixture.input), output, config)
 
 

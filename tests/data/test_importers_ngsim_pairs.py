@@ -118,7 +118,9 @@ def test_only_the_follower_is_an_expert(tmp_path):
     """Whom the leader follows is not in the file: its scenes are dropped."""
     path = fixture.write_pair(tmp_path, "1032", "1025", "00046")
     (recording,) = read(path)
-    config = ImportConfig(format="ngsim_pairs", collect=CollectConfig())
+    config = ImportConfig(
+        format="ngsim_pairs", collect=CollectConfig(), test_fraction=0.0
+    )
     manifest = import_logs([recording], tmp_path / "out", config)
     assert [name.rpartition(":")[2] for name in manifest.vehicles] == ["1032"]
     assert manifest.quality["dropped"]["follows_missing_car"] > 0

@@ -7,7 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rcirl_jax.data.splits import assign_groups, check_disjoint, folds
+from rcirl_jax.data.splits import (
+    assign_groups,
+    check_disjoint,
+    folds,
+    split_wholes,
+    time_blocks,
+)
 from rcirl_jax.errors import InputError
 
 COUNTS = st.dictionaries(
@@ -148,3 +154,43 @@ def test_check_disjoint_against_sets(seed):
             check_disjoint(groups, vehicles, split)
     else:
         check_disjoint(groups, vehicles, split)
+
+
+def test_blocks_are_halved_until_none_holds_too_much():
+    """Ten scenes each of cars seen at 0, 4, 8 and 50 s: 30 s hold 3/4, 7.5 s 1/2."""
+    seen = np.repeat([100.0, 104.0, 108.0, 150.0], 10)
+    cars = np.repeat(["a", "b", "c", "d"], 10).tolist()
+    blocks, words = time_blocks(seen, cars, 0.25)
+    assert blocks == ["block-0000"] * 30 + ["block-0001"] * 10
+    assert words == "blocks of 30 s in which vehicles are first seen"
+    blocks, words = time_blocks(seen, cars, 0.4)
+    assert blocks == [f"block-{n:04d}" for n in (0, 0, 1, 6) for _ in range(10)]
+    assert words == "blocks of 7.5 s in which vehicles are first seen"
+
+
+def test_vehicles_that_are_all_seen_at_once_are_blocks():
+    blocks, words = time_blocks(np.zeros(5), ["b", "a", "b", "c", "a"], 0.25)
+    assert blocks == [f"block-{n:04d}" for n in (1, 0, 1, 2, 0)]
+    assert words == "vehicle, for all are first seen at once"
+
+
+@given(seed=st.integers(0, 10_000))
+def test_a_vehicle_is_in_one_block_only(seed):
+    rng = np.random.default_rng(seed)
+    since = rng.uniform(0.0, 60.0, 8).round(1)
+    car = rng.integers(0, 8, 50)
+    blocks, _ = time_blocks(since[car], [f"v{n}" for n in car], 0.25)
+    assert all(len({blocks[i] for i in np.flatnonzero(car == n)}) <= 1 for n in car)
+    assert (len(set(blocks)) > 1) == (len(set(car)) > 1)
+
+
+def test_recordings_are_split_whole_and_one_by_its_groups():
+    sizes = {"r1/minute-0000": 30, "r1/minute-0001": 10, "r2/minute-0000": 15}
+    wholes = {name: name[:2] for name in sizes}
+    split, words = split_wholes(sizes, wholes, test_fraction=0.25, seed=0)
+    assert split["test"] == ["r2/minute-0000"]
+    assert words == "recordings, or groups that a log declares"
+    del sizes["r2/minute-0000"]
+    split, words = split_wholes(sizes, wholes, test_fraction=0.25, seed=0)
+    assert split == {"train": ["r1/minute-0000"], "test": ["r1/minute-0001"]}
+    assert words == "minutes in which vehicles are first seen"
