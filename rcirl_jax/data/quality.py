@@ -205,11 +205,14 @@ def format_quality(report: dict) -> str:
         share = f"{report['shortened']:,} ({report['shortened_share']:.1%} of times)"
         lines.append(f"{'end with surroundings':<28}{share:>20}")
     lines.append("")
-    lines.append("tags                         scenes   dropped because")
+    lines.append("tags                  scenes  share   dropped because")
     tags = sorted(report["tags"].items(), key=lambda item: -item[1])
     drops = sorted(report["dropped"].items(), key=lambda item: -item[1])
     for row in range(max(len(tags), len(drops))):
-        left = f"{tags[row][0]:<26}{tags[row][1]:>9,}" if row < len(tags) else " " * 35
+        left = " " * 35
+        if row < len(tags):
+            name, count = tags[row]
+            left = f"{name:<19}{count:>9,}{count / max(report['scenes'], 1):>7.1%}"
         right = f"   {drops[row][0]:<24}{drops[row][1]:>9,}" if row < len(drops) else ""
         lines.append(left + right)
     decisions = ", ".join(f"{k} {v:,}" for k, v in report["decisions"].items())
@@ -226,12 +229,13 @@ def format_quality(report: dict) -> str:
 def format_splits(dataset: Dataset) -> str:
     """Scenes and groups of each split, and by what it was split, in one line each."""
     flags, lines = dataset.manifest.import_flags, []
-    for split, groups in dataset.manifest.splits.items():
+    for split in ("train", "test"):
         scenes = dataset.indices(split).size
-        share = scenes / max(dataset.count, 1)
+        count = len(dataset.manifest.splits[split])
         lines.append(
-            f"{'split ' + split:<28}{scenes:>10,} scenes ({share:.1%}) in "
-            f"{len(groups):,} groups that share no vehicle"
+            f"{'split ' + split:<28}{scenes:>10,} scenes "
+            f"({scenes / max(dataset.count, 1):.1%}), groups that share no vehicle: "
+            f"{count:,}"
         )
     if "split_by" in flags:
         asked = f"asked for {flags['test_fraction']:.1%} to test"

@@ -585,8 +585,9 @@ def test_one_recording_is_split_by_when_vehicles_are_first_seen(tmp_path, group)
     assert driven == {"train": {"one", "two"}, "test": {"three"}}
     told = format_splits(dataset)
     assert "split by                    blocks of 3.75 s in which" in told
+    assert told.index("split train") < told.index("split test")
     scenes = dataset.indices("test").size
-    assert re.search(rf"split test +{scenes} scenes \(.*%\) in 1 groups", told)
+    assert re.search(rf"split test +{scenes} scenes \(.*%\), .*: 1$", told, re.M)
     assert "asked for 40.0% to test" in told
 
 
