@@ -229,6 +229,7 @@ class Collector:
     ) -> dict:
         smooth = self.tracks[number]
         stations = motion.s0 + GRID_M
+        path_l = given_path(driver, start, motion.s0, frame.length, LONG_GRID_M)
         row = {
             "ego.s": 0.0,
             "ego.l": motion.l[0],
@@ -239,7 +240,7 @@ class Collector:
             "ego.length": smooth.track.length,
             "ego.width": smooth.track.width,
             "path.kappa": frame.on_grid("kappa", stations),
-            "path.l": given_path(driver, start, motion.s0, frame.length),
+            "path.l": path_l[:NUM_STATIONS],
             "time_valid": motion.future_s + 1e-6 >= TIMES_S,
             "human.s": motion.s,
             "human.l": motion.l,
@@ -253,7 +254,7 @@ class Collector:
         far = motion.s0 + LONG_GRID_M
         limit = planning_limit(
             frame.on_grid("kappa", far),
-            np.interp(LONG_GRID_M, GRID_M, row["path.l"]),
+            path_l,
             frame.table("speed_limit", far),
             STATION_STEP_M,
         )

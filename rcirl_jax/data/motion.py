@@ -9,6 +9,8 @@ from rcirl_jax.units import HORIZON_S, NUM_STATIONS, STATION_STEP_M, TIMES_S
 
 GRID_M = np.arange(NUM_STATIONS) * STATION_STEP_M  # [P] m, the station grid
 MIN_PATH_ADVANCE_M = 0.5  # m between recorded points that shape the path
+SLOPE_M = 6.0  # m at a track's end over which its slope is taken: three grid points
+TURN_ALONG_M = 10.0  # m, within which a path turns along the line after its record
 ACCELERATION_WINDOW_S = 0.7  # s, smoothing of the ego's acceleration
 
 
@@ -106,13 +108,24 @@ def human_motion(driver: Driver, start: int, length: float) -> Motion | None:
     )
 
 
-def given_path(driver: Driver, start: int, s0: float, length: float) -> np.ndarray:
-    """Lateral offset [P] m of the human's own path on the station grid.
+def given_path(
+    driver: Driver, start: int, s0: float, length: float, grid: np.ndarray = GRID_M
+) -> np.ndarray:
+    """Lateral offset [g] m of the human's own path at stations `grid` [g] m.
 
     The whole rest of the track on the chain shapes it, not only the scene's
-    horizon; after its end the last offset is kept.
+    horizon. After its end at s_e the path turns along the line, without a kink that
+    would tell where the record ends:
+
+        l(s) = l_e + m L (1 - exp(-(s - s_e) / L)),  m the slope over the last
+        `SLOPE_M` metres, L = `TURN_ALONG_M`
     """
     s = np.maximum.accumulate(driver.s[start:]) - s0
     keep = np.concatenate([[True], np.diff(s // MIN_PATH_ADVANCE_M) > 0])
     keep &= s + s0 < length
-    return np.interp(GRID_M, s[keep], driver.l[start:][keep])
+    s, l = s[keep], driver.l[start:][keep]
+    before = max(s[-1] - SLOPE_M, s[0])
+    advance = s[-1] - before
+    slope = (l[-1] - np.interp(before, s, l)) / advance if advance > 0.0 else 0.0
+    beyond = np.maximum(grid - s[-1], 0.0) / TURN_ALONG_M
+    return np.interp(grid, s, l) + slope * TURN_ALONG_M * (1.0 - np.exp(-beyond))

@@ -19,6 +19,7 @@ from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.data.labels import labels_of
 from rcirl_jax.data.lanes import LaneGraph
 from rcirl_jax.data.lines import CREEP_M, TOO_FEW
+from rcirl_jax.data.motion import FrameTracks, driver_of, given_path
 from rcirl_jax.data.quality import QualityReport, format_quality, format_splits
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.data.rows import check_finite
@@ -209,6 +210,25 @@ def test_the_speed_limit_is_what_a_planner_may_drive():
         np.minimum(25.0, earlier) - 1e-3, row["path.speed_limit"]
     )
     assert row["path.speed_limit"][-1] < 10.0
+
+
+def test_the_path_turns_along_the_lane_after_the_record():
+    """It ends 80 m ahead with a slope of 0.05: 0.05 * 10 m more, and no sharp bend."""
+    t = np.arange(0.0, 8.05, 0.1)
+    s = 10.0 * t
+    view = FrameTracks(s=[s], l=[0.05 * s], tilt=[0.0 * s], table=np.zeros((1, 4)))
+    driver = driver_of(view, 0, 10.0)
+    grid = 2.0 * np.arange(128)
+    path = given_path(driver, 0, 0.0, 1e3)
+    beyond = np.maximum(grid - 80.0, 0.0)
+    expected = 0.05 * np.minimum(grid, 80.0) + 0.5 - 0.5 * np.exp(-beyond / 10.0)
+    np.testing.assert_allclose(path, expected, atol=1e-9)
+    bend = np.gradient(np.gradient(path, 2.0), 2.0)
+    assert np.abs(bend).max() < 0.05 / 10.0  # held at its offset: 0.05 / 4
+    stands = FrameTracks(s=[0 * s], l=[0 * s + 1.0], tilt=[0 * s], table=view.table)
+    np.testing.assert_array_equal(
+        given_path(driver_of(stands, 0, 10.0), 0, 0.0, 1e3), 1.0
+    )
 
 
 def smooth_step(t, start, duration):
