@@ -90,14 +90,14 @@ def main() -> None:
     """Frames, gaps, steadiness; table on the terminal, numbers as JSON, pictures."""
     quick, folder = _QUICK.value, Path(_OUTPUT.value)
     reward = open_reward(_WEIGHTS.value)
-    params, config = reward_params(reward), RankConfig(period=0.2)
+    params, config = reward_params(reward), RankConfig()
     features, activation = feature_map(str(reward.preset)), reward.activation
     rank = rank_policy(learned_score(features, activation), config)
     coarse = DpConfig(step=4.0 if quick else 2.0)
     few, duration = ("free_cruise,stopped_lead", 20.0) if quick else ("full", 60.0)
     cases = build(suite_refs(few, 1, CATALOGUE_SEED), duration)
     count = 6 if quick else _FRAMES.value
-    times = {"period_s": config.period, "every_s": EVERY_S}
+    times = {"every_s": EVERY_S}
     met, case = spread_over(count, *frames(rank, params, cases, duration, **times))
     dp = dp_policy(features, activation, config, coarse)
     states = time_station_policy(features, activation, coarse)

@@ -26,7 +26,7 @@ from rcirl_jax.evaluation.statistics import combine_seeds
 from rcirl_jax.features import FeatureMap
 from rcirl_jax.planner.grid import Weights
 from rcirl_jax.planner.optimality import GapConfig, optimality_gap
-from rcirl_jax.planner.plan import Plan
+from rcirl_jax.planner.plan import Plan, command
 from rcirl_jax.planner.rank import Policy
 from rcirl_jax.sampling.kinematics import trajectory_on_path
 from rcirl_jax.simulation.cases import STEP_S, Case
@@ -105,7 +105,7 @@ def _steadiness(policy: Policy, config: Disturbance) -> Callable:
         # judged in the true scene: a body that was seen elsewhere is no decision
         taken = jax.vmap(lambda s: decision(scene, s))(plans.s)
         return {
-            "acceleration_std": jnp.std(plans.acceleration[1:]),
+            "acceleration_std": jnp.std(jax.vmap(command)(plans, scenes.ego.v)[1:]),
             "end_station_std": jnp.std(plans.s[1:, -1]),
             "flip_rate": 1.0 - jnp.mean(jnp.all(taken[1:] == taken[0], axis=1)),
             "fallback_rate": jnp.mean(plans.fallback[1:]),

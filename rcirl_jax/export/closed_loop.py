@@ -13,7 +13,6 @@ from rcirl_jax.planner.grid import DpConfig
 from rcirl_jax.planner.guard import Guarded
 from rcirl_jax.planner.rank import RankConfig, hand_score, learned_score
 from rcirl_jax.reward import LatticeCost
-from rcirl_jax.simulation.cases import STEP_S
 from rcirl_jax.simulation.rows import (
     Row,
     baseline_row,
@@ -72,7 +71,7 @@ def table_rows(
     if not weights:
         raise InputError("--weights: none: expected at least one file")
     rewards = [open_reward(path) for path in weights]
-    config = RankConfig(period=plan_every * STEP_S)
+    config = RankConfig()
     rows: list[Row] = []
     for number, (reward, path) in enumerate(zip(rewards, weights, strict=True)):
         mode = str(reward.provenance.get("mode", "speed"))
@@ -98,7 +97,7 @@ def table_rows(
                 reward_params(first),
                 str(first.preset),
                 first.activation,
-                RankConfig(period=slow * STEP_S),
+                config,
                 DpConfig(),
                 slow,
             ),

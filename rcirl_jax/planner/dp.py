@@ -33,7 +33,13 @@ from rcirl_jax.planner.grid import (
     rest_of_network,
 )
 from rcirl_jax.planner.plan import Plan
-from rcirl_jax.planner.rank import Policy, RankConfig, best_plan, learned_score
+from rcirl_jax.planner.rank import (
+    Policy,
+    RankConfig,
+    best_plan,
+    learned_score,
+    with_plan_in_force,
+)
 from rcirl_jax.reward.network import product
 from rcirl_jax.sampling import sample
 from rcirl_jax.sampling.kinematics import trajectory_on_path
@@ -323,7 +329,9 @@ def dp_policy(
     """
     score = learned_score(features, activation)
 
-    def policy(params: Weights, scene: Scene, key: jax.Array) -> Plan:
+    def policy(
+        params: Weights, scene: Scene, key: jax.Array, before: Plan | None = None
+    ) -> Plan:
         sampled = sample(key, scene, rank.sampler)
         plan = plan_dp(scene, params, features, activation, config)
         join = lambda many, one: jnp.concatenate([many, one[None]])  # noqa: E731
@@ -332,6 +340,9 @@ def dp_policy(
             feasible=join(sampled.feasible, plan.feasible),
             family=join(sampled.family, jnp.asarray(family_index("cruise"))),
         )
-        return best_plan(scene, candidates, score(params, scene, candidates), rank)
+        if before is not None:
+            candidates = with_plan_in_force(scene, candidates, before, rank.sampler)
+        scores = score(params, scene, candidates)
+        return best_plan(scene, candidates, scores, rank, before)
 
     return policy

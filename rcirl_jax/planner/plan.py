@@ -1,13 +1,130 @@
-"""What a planner answers to a scene."""
+"""What a planner answers to a scene, and how it is followed until the next plan.
+
+A plan is a curve s(t), v(t), a(t) on the time axis. Between two plans the ego follows
+that curve (`command`), and the next planning step sees it among its candidates, moved
+on in time (`stations_from_now`): what was valued is what is driven.
+"""
+
+import math
 
 import flax.struct
 import jax
+import jax.numpy as jnp
+
+from rcirl_jax.types import Trajectory
+from rcirl_jax.units import DT_S, NUM_TIMES, TIMES_S
+
+COMMAND_STEP_S = 0.1  # s that one command stays in force
+ACTUATOR_LAG_S = 0.2  # s, of the drive train; the command leads the plan by it
+EASED_MPS2 = 0.3  # m/s^2, braking left at standstill in an ordinary stop
+EASING_S = 0.5  # s, time constant of the last part of an ordinary stop
+MIN_WAY_M = 0.01  # m, keeps v^2 / 2s finite at rest
+# A command held for h moves the acceleration by 1 - exp(-h / lag) of the way, so a
+# plan with jerk j is met after h when the command leads by j h / (1 - exp(-h / lag)).
+LEAD_S = COMMAND_STEP_S / (1.0 - math.exp(-COMMAND_STEP_S / ACTUATOR_LAG_S))
 
 
 class Plan(flax.struct.PyTreeNode, kw_only=True):
-    """One plan: the command in force until the next one, and its evidence."""
+    """One plan in the frame of the scene that it was made for, and its evidence."""
 
-    acceleration: jax.Array  # [] m/s^2, command
-    s: jax.Array  # [T] m, planned stations in the scene's frame
+    s: jax.Array  # [T] m, planned stations
+    v: jax.Array  # [T] m/s
+    a: jax.Array  # [T] m/s^2
+    since: jax.Array  # [] s since it was made
+    lasts: jax.Array  # [] bool: may be gone on with at the next planning step
+    urgent: jax.Array  # [] bool: brakes at once, without leading up to it
     fallback: jax.Array  # [] bool: no candidate was admissible
     admissible: jax.Array  # [] int32, candidates that passed the safety filter
+
+
+def plan_of(
+    chosen: Trajectory,
+    *,
+    lasts: jax.Array | bool = False,
+    urgent: jax.Array | bool = False,
+    fallback: jax.Array | bool = False,
+    admissible: jax.Array | int = 0,
+) -> Plan:
+    """A fresh plan along a trajectory [T]."""
+    return Plan(
+        s=chosen.s,
+        v=chosen.v,
+        a=chosen.a,
+        since=jnp.zeros(()),
+        lasts=jnp.asarray(lasts),
+        urgent=jnp.asarray(urgent),
+        fallback=jnp.asarray(fallback),
+        admissible=jnp.asarray(admissible, jnp.int32),
+    )
+
+
+def no_plan() -> Plan:
+    """What is in force before the first plan: nothing to go on with."""
+    zero = jnp.zeros((NUM_TIMES,))
+    nothing = Trajectory(**dict.fromkeys(Trajectory.__dataclass_fields__, zero))
+    return plan_of(nothing)
+
+
+def held(v: jax.Array, a: jax.Array) -> Plan:
+    """A plan that holds an acceleration [] m/s^2 from a speed [] m/s until standing."""
+    times = jnp.asarray(TIMES_S)
+    until = jnp.where(a < 0.0, jnp.minimum(times, v / -jnp.minimum(a, -1e-6)), times)
+    return Plan(
+        s=v * until + 0.5 * a * until**2,
+        v=v + a * until,
+        a=jnp.full_like(times, a),
+        since=jnp.zeros(()),
+        lasts=jnp.zeros((), bool),
+        urgent=jnp.zeros((), bool),
+        fallback=jnp.zeros((), bool),
+        admissible=jnp.zeros((), jnp.int32),
+    )
+
+
+def command(plan: Plan, v: jax.Array) -> jax.Array:
+    """Acceleration command [] m/s^2 that follows a plan now, `plan.since` on.
+
+    The planned acceleration, linear between the times, led by the actuator's lag; an
+    urgent plan asks for its braking at once. A plan that comes to rest within an
+    interval shows only a part of its braking in second differences: there the braking
+    is the one that stops on the planned way, v^2 / 2s, eased off towards standstill
+    unless it is urgent.
+
+    Args:
+      plan: the plan in force.
+      v: [] m/s, the ego's speed now.
+    """
+    at = jnp.clip(plan.since / DT_S, 0.0, NUM_TIMES - 2.0)
+    here = at.astype(jnp.int32)
+    led = jnp.clip((plan.since + LEAD_S) / DT_S, 0.0, NUM_TIMES - 1.0)
+    wanted = jnp.interp(led, jnp.arange(NUM_TIMES), plan.a)
+    wanted = jnp.where(plan.urgent, plan.a[here + 1], wanted)
+    begin, way = plan.v[here], plan.s[here + 1] - plan.s[here]
+    rests = way < 0.5 * begin * DT_S
+    stopping = -(begin**2) / (2.0 * jnp.maximum(way, MIN_WAY_M))
+    eased = jnp.maximum(stopping, -(EASED_MPS2 + v / EASING_S))
+    stopping = jnp.where(plan.urgent, stopping, eased)
+    return jnp.where(rests, jnp.minimum(wanted, stopping), wanted)
+
+
+def stations_from_now(plan: Plan) -> jax.Array:
+    """Stations [T] m of the rest of a plan, from 0 now, on the time axis.
+
+    Cubic Hermite interpolation between the planned times; after the plan's end its
+    last speed is kept.
+    """
+
+    def at(t: jax.Array) -> jax.Array:
+        place = jnp.clip(t / DT_S, 0.0, NUM_TIMES - 1.0)
+        low = jnp.minimum(place.astype(jnp.int32), NUM_TIMES - 2)
+        x = place - low
+        s0, s1, v0, v1 = plan.s[low], plan.s[low + 1], plan.v[low], plan.v[low + 1]
+        inside = (
+            (1.0 + 2.0 * x) * (1.0 - x) ** 2 * s0
+            + x * (1.0 - x) ** 2 * DT_S * v0
+            + x**2 * (3.0 - 2.0 * x) * s1
+            - x**2 * (1.0 - x) * DT_S * v1
+        )
+        return inside + jnp.maximum(t - TIMES_S[-1], 0.0) * plan.v[-1]
+
+    return at(plan.since + jnp.asarray(TIMES_S)) - at(plan.since)

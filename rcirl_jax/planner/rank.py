@@ -1,13 +1,12 @@
 """The ranking planner: sample, filter, value all candidates at once, take the best.
 
-Every policy here is a pure function `(params, scene, key) -> Plan`; a policy
+Every policy here is a pure function `(params, scene, key, before) -> Plan`; a policy
 differs from another by its score only, so the safety filter, the candidates
 and the tracking are the same for a learned, a hand-set and a random reward.
 """
 
 import dataclasses
 import functools
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -15,14 +14,15 @@ import jax
 import jax.numpy as jnp
 
 from rcirl_jax.features import FeatureMap
+from rcirl_jax.geometry.running import running_max
 from rcirl_jax.planner.baselines import Idm, idm_acceleration
-from rcirl_jax.planner.plan import Plan
+from rcirl_jax.planner.plan import Plan, held, plan_of, stations_from_now
 from rcirl_jax.planner.safety import SafetyConfig, check, choose
-from rcirl_jax.planner.yielding import held
 from rcirl_jax.reward.hand import LatticeCost, lattice_cost
 from rcirl_jax.reward.network import ACTIVATIONS, rows_value
 from rcirl_jax.reward.speed_dp import speed_dp_cost
-from rcirl_jax.sampling import SamplerConfig, sample
+from rcirl_jax.sampling import SamplerConfig, sample, trajectory_on_path
+from rcirl_jax.sampling.sampler import within_limits
 from rcirl_jax.sampling.speed import family_index
 from rcirl_jax.types import (
     Candidates,
@@ -30,19 +30,13 @@ from rcirl_jax.types import (
     Normaliser,
     RewardParams,
     Scene,
-    Trajectory,
 )
-from rcirl_jax.units import DT_S
 
 Params = Any  # a score's weights: any pytree
 Score = Callable[[Params, Scene, Candidates], jax.Array]  # -> [K], higher is better
-Policy = Callable[[Params, Scene, jax.Array], Plan]
+Policy = Callable[..., Plan]  # (params, scene, key, plan in force) -> Plan
 
-EASED_MPS2 = 0.3  # m/s^2, braking left at standstill in an ordinary stop
-EASING_S = 0.5  # s, time constant of the last part of an ordinary stop
-MIN_WAY_M = 0.01  # m, keeps v^2 / 2s finite at rest
-ACTUATOR_LAG_S = 0.2  # s, of the drive train; the command leads the plan by it
-
+LONGEST_S = 4.0  # s after which a plan in force is no longer kept for its own sake
 
 # The closed loop's grid: 64 candidates, all families of the offline sampler.
 ONLINE = SamplerConfig(
@@ -64,8 +58,10 @@ class RankConfig:
 
     sampler: SamplerConfig = ONLINE
     safety: SafetyConfig = dataclasses.field(default_factory=SafetyConfig)
-    # s a command stays in force
-    period: float = 0.1
+    # s for which a plan is kept as long as it is admissible
+    commitment: float = 1.0
+    # 1, lead of a new plan, in standard deviations of the scores, that replaces it
+    hysteresis: float = 0.0
 
 
 @functools.lru_cache(maxsize=16)
@@ -105,70 +101,86 @@ def speed_dp_score(params: None, scene: Scene, candidates: Candidates) -> jax.Ar
     return -jax.vmap(lambda x: speed_dp_cost(scene, x))(candidates.trajectory)
 
 
-def lead_time(period: float) -> float:
-    """How far ahead [s] of now the plan's acceleration is commanded.
-
-    Under a lag tau a command held for h moves the acceleration by
-    (1 - exp(-h / tau)) of the way, so a plan with jerk j is met after h when
-    the command leads by j h / (1 - exp(-h / tau)).
-    """
-    return period / (1.0 - math.exp(-period / ACTUATOR_LAG_S))
-
-
-def command(chosen: Trajectory, braking_now: jax.Array, period: float) -> jax.Array:
-    """Acceleration command m/s^2 that starts a planned trajectory.
-
-    The lag is led as in `lead_time`; an emergency asks for its braking at once.
-    A plan that comes to rest within the first interval shows only a part of its
-    braking in second differences: there the braking is the one that stops on
-    the planned way, v^2 / 2s, eased off towards standstill unless it is urgent.
-    """
-    a, v, way = chosen.a, chosen.v[0], chosen.s[1] - chosen.s[0]
-    share = min(lead_time(period) / DT_S, 1.0)
-    wanted = jnp.where(braking_now, a[1], a[0] + share * (a[1] - a[0]))
-    rests = way < 0.5 * v * DT_S
-    stopping = -(v**2) / (2.0 * jnp.maximum(way, MIN_WAY_M))
-    eased = jnp.maximum(stopping, -(EASED_MPS2 + v / EASING_S))
-    stopping = jnp.where(braking_now, stopping, eased)
-    return jnp.where(rests, jnp.minimum(wanted, stopping), wanted)
+def with_plan_in_force(
+    scene: Scene, candidates: Candidates, before: Plan, config: SamplerConfig
+) -> Candidates:
+    """The candidates and, last, the rest of the plan in force (infeasible if none)."""
+    stations = running_max(scene.ego.s + stations_from_now(before))
+    rest = trajectory_on_path(scene, stations)
+    join = lambda many, one: jnp.concatenate([many, one[None]])  # noqa: E731
+    return Candidates(
+        trajectory=jax.tree.map(join, candidates.trajectory, rest),
+        feasible=join(
+            candidates.feasible, before.lasts & within_limits(scene, rest, config)
+        ),
+        family=join(candidates.family, jnp.asarray(family_index("in_force"))),
+    )
 
 
 def best_plan(
-    scene: Scene, candidates: Candidates, scores: jax.Array, config: RankConfig
+    scene: Scene,
+    candidates: Candidates,
+    scores: jax.Array,
+    config: RankConfig,
+    before: Plan | None = None,
 ) -> Plan:
     """The candidate that `safety.choose` takes, as a plan.
 
+    With `before`, the last candidate is the rest of the plan in force. It is kept while
+    it is admissible and either younger than `commitment` or hardly worse than the best:
+
+        V_best - V_in_force <= hysteresis * std of the admissible scores
+
     A feasible candidate whose score is not finite is a fault that no choice may hide:
-    the command is NaN then, and so are the drive's numbers, by which a suite names
+    the plan is NaN then, and so are the drive's numbers, by which a suite names
     the case. (The guard of the onboard side answers it before; see `guard`.)
 
     Args:
       scene: of the candidates.
       candidates: K of them.
       scores: [K].
-      config: filter and period.
+      config: filter and commitment.
+      before: the plan in force.
     """
     verdict = check(scene, candidates, config.safety)
     index, fallback = choose(verdict, candidates, scores)
     chosen = jax.tree.map(lambda x: x[index], candidates.trajectory)
-    hard = fallback | (candidates.family[index] == family_index("emergency"))
+    urgent = fallback | (candidates.family[index] == family_index("emergency"))
     known = jnp.all(jnp.isfinite(scores) | ~candidates.feasible)
-    return Plan(
-        acceleration=jnp.where(known, command(chosen, hard, config.period), jnp.nan),
-        s=chosen.s,
+    count = jnp.sum(verdict.admissible, dtype=jnp.int32)
+    fresh = plan_of(
+        jax.tree.map(lambda x: jnp.where(known, x, jnp.nan), chosen),
+        lasts=~urgent,
+        urgent=urgent,
         fallback=fallback,
-        admissible=jnp.sum(verdict.admissible, dtype=jnp.int32),
+        admissible=count,
     )
+    if before is None:
+        return fresh
+    allowed = verdict.admissible
+    share = allowed / jnp.maximum(count, 1)
+    finite = jnp.where(allowed, scores, 0.0)
+    mean = jnp.sum(share * finite)
+    spread = jnp.sqrt(jnp.sum(share * (finite - mean) ** 2))
+    near = scores[index] - scores[-1] <= config.hysteresis * spread
+    young = before.since < config.commitment
+    keeps = known & allowed[-1] & (near | young) & (before.since < LONGEST_S)
+    kept = before.replace(admissible=count)
+    return jax.tree.map(lambda old, new: jnp.where(keeps, old, new), kept, fresh)
 
 
 @functools.lru_cache(maxsize=64)
 def rank_policy(score: Score, config: RankConfig) -> Policy:
     """The planner that drives the admissible candidate of the highest score."""
 
-    def policy(params: Params, scene: Scene, key: jax.Array) -> Plan:
+    def policy(
+        params: Params, scene: Scene, key: jax.Array, before: Plan | None = None
+    ) -> Plan:
         candidates = sample(key, scene, config.sampler)
+        if before is not None:
+            candidates = with_plan_in_force(scene, candidates, before, config.sampler)
         scores = score(params, scene, candidates)
-        return best_plan(scene, candidates, scores, config)
+        return best_plan(scene, candidates, scores, config, before)
 
     return policy
 
@@ -177,8 +189,10 @@ def rank_policy(score: Score, config: RankConfig) -> Policy:
 def idm_policy(idm: Idm) -> Policy:
     """IDM behind the nearest body or line in the ego's corridor now."""
 
-    def policy(params: Params, scene: Scene, key: jax.Array) -> Plan:
-        del params, key
+    def policy(
+        params: Params, scene: Scene, key: jax.Array, before: Plan | None = None
+    ) -> Plan:
+        del params, key, before
         obstacles, ego = scene.obstacles, scene.ego
         front = ego.s + 0.5 * ego.length
         aside = jnp.maximum(
@@ -197,12 +211,14 @@ def idm_policy(idm: Idm) -> Policy:
             scene.path.speed_limit[0],
             idm,
         )
-        return held(scene, a)
+        return held(ego.v, a)
 
     return policy
 
 
-def constant_speed_policy(params: Params, scene: Scene, key: jax.Array) -> Plan:
+def constant_speed_policy(
+    params: Params, scene: Scene, key: jax.Array, before: Plan | None = None
+) -> Plan:
     """Nobody drives: the acceleration stays 0."""
-    del params, key
-    return held(scene, jnp.zeros(()))
+    del params, key, before
+    return held(scene.ego.v, jnp.zeros(()))

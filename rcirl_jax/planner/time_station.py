@@ -26,7 +26,7 @@ from rcirl_jax.planner.grid import (
     motion_activation,
     rest_of_network,
 )
-from rcirl_jax.planner.plan import Plan
+from rcirl_jax.planner.plan import Plan, plan_of
 from rcirl_jax.planner.rank import Policy
 from rcirl_jax.reward.network import product
 from rcirl_jax.sampling.kinematics import trajectory_on_path
@@ -167,12 +167,13 @@ def time_station_policy(
 ) -> Policy:
     """The recursion as a planner without a filter: to be measured, not driven."""
 
-    def policy(params: Weights, scene: Scene, key: jax.Array) -> Plan:
-        del key
+    def policy(
+        params: Weights, scene: Scene, key: jax.Array, before: Plan | None = None
+    ) -> Plan:
+        del key, before
         plan = plan_time_station(scene, params, features, activation, config)
-        return Plan(
-            acceleration=plan.trajectory.a[0],
-            s=plan.trajectory.s,
+        return plan_of(
+            plan.trajectory,
             fallback=~plan.feasible,
             admissible=plan.feasible.astype(jnp.int32),
         )

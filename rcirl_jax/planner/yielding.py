@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from rcirl_jax.geometry.frenet import lookup
 from rcirl_jax.planner.baselines import Idm, idm_acceleration
-from rcirl_jax.planner.plan import Plan
+from rcirl_jax.planner.plan import Plan, held
 from rcirl_jax.types import Kind, Obstacles, Scene
 from rcirl_jax.units import DT_S, STATION_STEP_M, TIMES_S
 
@@ -138,21 +138,10 @@ def _drives_along(o: Obstacles) -> jax.Array:
 def yielding_policy(driver: Yielding) -> Callable[..., Plan]:
     """The driver as a policy of the simulator."""
 
-    def policy(params: None, scene: Scene, key: jax.Array) -> Plan:
-        del params, key
-        return held(scene, acceleration(scene, driver))
+    def policy(
+        params: None, scene: Scene, key: jax.Array, before: Plan | None = None
+    ) -> Plan:
+        del params, key, before
+        return held(scene.ego.v, acceleration(scene, driver))
 
     return policy
-
-
-def held(scene: Scene, a: jax.Array) -> Plan:
-    """A plan that holds an acceleration until standing."""
-    times = jnp.asarray(TIMES_S)
-    braking = jnp.minimum(a, -1e-6)
-    until = jnp.where(a < 0.0, jnp.minimum(times, scene.ego.v / -braking), times)
-    return Plan(
-        acceleration=a,
-        s=scene.ego.s + scene.ego.v * until + 0.5 * a * until**2,
-        fallback=jnp.zeros((), bool),
-        admissible=jnp.zeros((), jnp.int32),
-    )

@@ -28,6 +28,7 @@ FAMILIES = (
     "emergency",
     "random",
     "hard_negative",
+    "in_force",  # what is left of the plan that is being driven
 )
 
 MIN_PHASE_S = 0.5  # s, shortest phase of a two-phase profile

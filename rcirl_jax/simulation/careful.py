@@ -20,9 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.planner.baselines import Idm
-from rcirl_jax.planner.plan import Plan
+from rcirl_jax.planner.plan import Plan, held
 from rcirl_jax.planner.rank import constant_speed_policy, idm_policy
-from rcirl_jax.planner.yielding import Yielding, acceleration, bodies_in_path, held
+from rcirl_jax.planner.yielding import Yielding, acceleration, bodies_in_path
 from rcirl_jax.simulation.metrics import CaseMetrics
 from rcirl_jax.simulation.rows import Row
 from rcirl_jax.types import Scene
@@ -100,14 +100,16 @@ def fsm_braking(
 def cc_policy(config: Careful) -> Callable[..., Plan]:
     """The CC driver; its reaction time is the rollout's `command_delay`."""
 
-    def policy(params: None, scene: Scene, key: jax.Array) -> Plan:
-        del params, key
+    def policy(
+        params: None, scene: Scene, key: jax.Array, before: Plan | None = None
+    ) -> Plan:
+        del params, key, before
         gap, lead = bodies_in_path(scene, config.driver)
         brake = jnp.max(
             jax.vmap(cc_braking, (0, None, 0, None))(gap, scene.ego.v, lead, config)
         )
         a = acceleration(scene, config.driver)
-        return held(scene, jnp.minimum(a, jnp.where(brake > 0.0, -brake, a)))
+        return held(scene.ego.v, jnp.minimum(a, jnp.where(brake > 0.0, -brake, a)))
 
     return policy
 
@@ -116,8 +118,10 @@ def cc_policy(config: Careful) -> Callable[..., Plan]:
 def fsm_policy(config: Careful) -> Callable[..., Plan]:
     """The FSM driver; its reaction time is inside its distances."""
 
-    def policy(params: None, scene: Scene, key: jax.Array) -> Plan:
-        del params, key
+    def policy(
+        params: None, scene: Scene, key: jax.Array, before: Plan | None = None
+    ) -> Plan:
+        del params, key, before
         gap, lead = bodies_in_path(scene, config.driver)
         brake = jnp.max(
             jax.vmap(fsm_braking, (0, None, None, 0, None))(
@@ -125,7 +129,7 @@ def fsm_policy(config: Careful) -> Callable[..., Plan]:
             )
         )
         a = acceleration(scene, config.driver)
-        return held(scene, jnp.minimum(a, jnp.where(brake > 0.0, -brake, a)))
+        return held(scene.ego.v, jnp.minimum(a, jnp.where(brake > 0.0, -brake, a)))
 
     return policy
 

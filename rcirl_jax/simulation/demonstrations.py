@@ -33,7 +33,7 @@ from rcirl_jax.data.store import Dataset, DatasetWriter, Manifest
 from rcirl_jax.errors import InputError
 from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.planner.yielding import Yielding, yielding_policy
-from rcirl_jax.simulation.cases import STEP_S, Record
+from rcirl_jax.simulation.cases import STEP_S, Case, Record
 from rcirl_jax.simulation.rollout import (
     Params,
     Policy,
@@ -72,6 +72,10 @@ class DriveConfig:
     split_seed: int = 0
     # s that the learner, then the driver drive in turn (with a learner only)
     turns_s: tuple[float, float] = (25.0, 13.0)
+    # of every so many cases one ends at a destination on the way (0: none)
+    destination_every: int = 4
+    # m, where: drawn evenly between the two
+    destination_m: tuple[float, float] = (150.0, 900.0)
 
 
 def _rows(
@@ -132,11 +136,12 @@ def drive_catalogue(
     output: str | Path,
     config: DriveConfig,
     *,
+    teacher: tuple[Policy, Params] | None = None,
     learner: tuple[Policy, Params] | None = None,
     overwrite: bool = False,
     before_commit: Callable[[Dataset], object] = lambda dataset: None,
 ) -> Manifest:
-    """Drive cases with the driver models and write the drives as a dataset.
+    """Drive cases with a teacher and write the drives as a dataset.
 
     A case is a recording, a vehicle and a group of its own, so splits are by
     case. Drives with any collision are dropped and counted in the notes.
@@ -145,8 +150,10 @@ def drive_catalogue(
       refs: the cases, each driven by one driver in turn.
       output: dataset folder or tensorstore URL.
       config: duration, stride, split.
+      teacher: who shows how to drive, with its weights; None: the driver models of
+        `DRIVERS` in turn.
       learner: a policy planning every `period_s`, and its weights, with which
-        the drivers take turns.
+        the teacher takes turns.
       overwrite: replace a finished dataset.
       before_commit: as `DatasetWriter.finish`.
 
@@ -158,7 +165,7 @@ def drive_catalogue(
         if writer.committed():  # of a killed run: drives are not taken up halfway
             writer = DatasetWriter(str(output), overwrite=True)
         try:
-            return _drive_all(refs, writer, config, learner, before_commit)
+            return _drive_all(refs, writer, config, (teacher, learner), before_commit)
         except InputError:
             writer.abort()
             raise
@@ -168,7 +175,7 @@ def _drive_all(
     refs: Sequence[CaseRef],
     writer: DatasetWriter,
     config: DriveConfig,
-    learner: tuple[Policy, Params] | None,
+    who: tuple[tuple[Policy, Params] | None, tuple[Policy, Params] | None],
     before_commit: Callable[[Dataset], object],
 ) -> Manifest:
     every = round(config.period_s / STEP_S)
@@ -186,10 +193,9 @@ def _drive_all(
     with tqdm.tqdm(total=len(refs), desc="drive", unit="case") as bar:
         for first in range(0, len(refs), CHUNK):
             part = refs[first : first + CHUNK]
-            driver = DRIVERS[first // CHUNK % len(DRIVERS)]
-            for ref, rows in zip(
-                part, _drives(part, driver, learner, rollout, config), strict=True
-            ):
+            model = yielding_policy(DRIVERS[first // CHUNK % len(DRIVERS)]), None
+            driven = _drives(part, first, who[0] or model, who[1], rollout, config)
+            for ref, rows in zip(part, driven, strict=True):
                 number = len(names)
                 names.append(ref.id)
                 quality.recordings += 1
@@ -213,17 +219,19 @@ def _drive_all(
 
 def _drives(
     refs: Sequence[CaseRef],
-    driver: Yielding,
+    first: int,
+    teacher: tuple[Policy, Params],
     learner: tuple[Policy, Params] | None,
     rollout: RolloutConfig,
     config: DriveConfig,
 ) -> Iterator[list[dict]]:
-    """The rows of every case of a chunk, in order."""
-    cases = build(refs, config.duration_s)
+    """The rows of every case of a chunk, in order; `first` numbers its first case."""
+    cases = with_destinations(build(refs, config.duration_s), first, config)
     fill = np.minimum(np.arange(CHUNK), len(refs) - 1)
     full = jax.tree.map(lambda leaf: leaf[fill], cases)
-    policy, params = learner or (yielding_policy(driver), None)
-    relief = yielding_policy(driver) if learner else None
+    (policy, params), relief = teacher, None
+    if learner:
+        policy, params, relief = learner[0], (learner[1], params), policy
     record, _, scenes = jax.tree.map(
         np.asarray, drive_cases(policy, params, full, rollout, relief=relief)
     )
@@ -231,6 +239,22 @@ def _drives(
         one = lambda x, i=i: x[i]  # noqa: E731
         logs = jax.tree.map(one, record), jax.tree.map(one, scenes)
         yield list(_rows(*logs, config, learner is not None))
+
+
+def with_destinations(cases: Case, first: int, config: DriveConfig) -> Case:
+    """Cases [B] of which every `destination_every`-th ends at a place on the way.
+
+    So the teacher shows how to stop at a destination, which the suite's own cases
+    have beyond their end.
+    """
+    if not config.destination_every:
+        return cases
+    places = np.asarray(cases.road.destination).copy()
+    for i in range(places.size):
+        if (first + i) % config.destination_every == 0:
+            draw = np.random.default_rng([config.split_seed, first + i, 11])
+            places[i] = min(places[i], draw.uniform(*config.destination_m))
+    return cases.replace(road=cases.road.replace(destination=places))
 
 
 def _close(writer: DatasetWriter, shard: int, pending: list, lineage: list) -> int:

@@ -1,8 +1,9 @@
 """Closed loop: scan over time, vmap over cases, chunks to bound memory.
 
-The only file of the simulator that names `jit`, `vmap` or `scan` over cases
-and time. A policy is a pure function `(params, scene, key) -> Plan`; weights
-are arguments, so the compiled program serves every weights file of one shape.
+The only file of the simulator that names `jit`, `vmap` or `scan` over cases and time.
+A policy is a pure function `(params, scene, key, before) -> Plan`, `before` being the
+plan in force; between two plans the ego follows the plan. Weights are arguments, so the
+compiled program serves every weights file of one shape.
 """
 
 import concurrent.futures
@@ -17,16 +18,16 @@ import jax
 import jax.numpy as jnp
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.planner.plan import Plan
+from rcirl_jax.planner.plan import Plan, command, no_plan, stations_from_now
 from rcirl_jax.simulation import lines as signals
 from rcirl_jax.simulation.cases import STEP_S, Case, Record, Snapshot, World
-from rcirl_jax.simulation.observe import observe, planning_limit
+from rcirl_jax.simulation.observe import observe, road_limit
 from rcirl_jax.simulation.vehicle import Vehicle
 from rcirl_jax.simulation.world import start, step
 from rcirl_jax.types import Scene
 
 Params = Any  # a policy's weights: any pytree
-Policy = Callable[[Params, Scene, jax.Array], Plan]
+Policy = Callable[..., Plan]  # (params, scene, key, plan in force) -> Plan
 Logs = Any  # what a rollout returns: records, or what `reduce` made of them
 
 SAMPLER_STREAM = 7  # fold_in number of the sampler's key
@@ -76,49 +77,53 @@ def drive_case(
 ) -> tuple[Record, Snapshot | None, Scene | None]:
     """One case from start to end.
 
-    With a `relief`, which takes no weights, the two drive in turn: the policy
-    for `turns[0]` steps, then the relief for `turns[1]`.
+    With a `relief` the two drive in turn, the policy for `turns[0]` steps, then the
+    relief for `turns[1]`; `params` is then the pair of their weights.
 
     Returns:
       The record [S], and where the configuration asks for them the snapshots
       [S] and the planning frames [S / plan_every].
     """
-    limit = planning_limit(case.road)
+    limit = road_limit(case.road)
     key = jax.random.fold_in(jax.random.key(case.seed), SAMPLER_STREAM)
 
     def plan_and_drive(carry: tuple, _: None) -> tuple[tuple, tuple]:
-        world, queue = carry
+        world, queue, before = carry
         scene = observe(case, world, limit)
         with jax.named_scope("policy"):
             draw = jax.random.fold_in(key, world.step)
-            plan = policy(params, scene, draw)
+            own = params if relief is None else params[0]
+            plan = policy(own, scene, draw, before)
             if relief is not None:
                 relieved = world.step % sum(config.turns) >= config.turns[0]
-                other = relief(None, scene, draw)
+                other = relief(params[1], scene, draw, before)
                 plan = jax.tree.map(
                     lambda yes, no: jnp.where(relieved, yes, no), other, plan
                 )
 
         def tick(carry: tuple, _: None) -> tuple[tuple, tuple]:
-            now, waiting = carry
-            waiting = jnp.concatenate([plan.acceleration[None], waiting])
-            command, waiting = waiting[-1], waiting[:-1]
+            now, waiting, ahead = carry
+            asked = command(ahead, now.ego.v)
+            waiting = jnp.concatenate([asked[None], waiting])
+            late, waiting = waiting[-1], waiting[:-1]
             after, record = step(
                 case,
                 now,
-                _build_up(command, now.ego.a, config),
-                plan.fallback,
+                _build_up(late, now.ego.a, config),
+                ahead.fallback,
                 config.vehicle,
                 config.follow_log,
             )
-            shot = _snapshot(case, world, after, plan) if config.snapshots else None
-            return (after, waiting), (record, shot)
+            shot = _snapshot(case, now, after, ahead) if config.snapshots else None
+            ahead = ahead.replace(since=ahead.since + STEP_S)
+            return (after, waiting, ahead), (record, shot)
 
-        carry, logs = jax.lax.scan(tick, (world, queue), None, length=config.plan_every)
+        begin = (world, queue, plan)
+        carry, logs = jax.lax.scan(tick, begin, None, length=config.plan_every)
         return carry, (logs, scene if config.scenes else None)
 
     plans = config.steps // config.plan_every
-    begin = (start(case), jnp.zeros((config.command_delay,)))
+    begin = (start(case), jnp.zeros((config.command_delay,)), no_plan())
     _, (logs, scenes) = jax.lax.scan(plan_and_drive, begin, None, length=plans)
     flat = lambda x: x.reshape(config.steps, *x.shape[2:])  # noqa: E731
     return *jax.tree.map(flat, logs), scenes
@@ -133,12 +138,14 @@ def _build_up(command: jax.Array, a: jax.Array, config: RolloutConfig) -> jax.Ar
     return jnp.maximum(command, a - config.braking_jerk * reach)
 
 
-def _snapshot(case: Case, planned: World, after: World, plan: Plan) -> Snapshot:
+def _snapshot(case: Case, now: World, after: World, plan: Plan) -> Snapshot:
     time = after.step * STEP_S
     _, red = signals.colours(case.lines, time)
     sign = ~after.served & (case.lines.kind == 2)
     return Snapshot(
-        agents=after.agents, plan_s=plan.s + planned.ego.s, line_red=red | sign
+        agents=after.agents,
+        plan_s=now.ego.s + stations_from_now(plan),
+        line_red=red | sign,
     )
 
 
@@ -184,7 +191,7 @@ def drive_cases(
 
     Args:
       policy: who drives.
-      params: its weights.
+      params: its weights; with a relief the pair of both.
       cases: leaves [B, ...].
       config: of the rollouts.
       reduce: record [S] -> what is wanted of it.

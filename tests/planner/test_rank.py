@@ -10,14 +10,19 @@ import pytest
 
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.baselines import Idm, idm_acceleration
-from rcirl_jax.planner.rank import (
+from rcirl_jax.planner.plan import (
     ACTUATOR_LAG_S,
+    COMMAND_STEP_S,
+    command,
+    no_plan,
+    plan_of,
+    stations_from_now,
+)
+from rcirl_jax.planner.rank import (
     ONLINE,
     RankConfig,
-    command,
     hand_score,
     idm_policy,
-    lead_time,
     learned_score,
     rank_policy,
 )
@@ -40,7 +45,6 @@ def scene_of(seed):
 
 def test_the_online_sampler_offers_64_candidates():
     assert num_candidates(ONLINE) == 64
-    assert math.isclose(lead_time(1e-6), ACTUATOR_LAG_S, rel_tol=1e-3)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -86,10 +90,47 @@ def test_command_leads_the_lag_so_that_the_plan_is_met():
     candidates = sampled(jax.random.key(0), made, ONLINE)
     x = jax.tree.map(lambda a: a[4], candidates.trajectory)
     x = x.replace(a=x.a.at[0].set(0.5).at[1].set(1.5), s=x.s.at[1].set(8.0))
-    for period in (0.1, 0.3):
-        asked = float(command(x, jnp.asarray(False), period))
-        reached = 0.5 + (asked - 0.5) * (1 - math.exp(-period / ACTUATOR_LAG_S))
-        assert reached == pytest.approx(0.5 + period / (8 / 17), rel=1e-3)
+    asked = float(command(plan_of(x), x.v[0]))
+    moved = 1 - math.exp(-COMMAND_STEP_S / ACTUATOR_LAG_S)
+    reached = 0.5 + (asked - 0.5) * moved
+    assert reached == pytest.approx(0.5 + COMMAND_STEP_S / (8 / 17), rel=1e-3)
+    # half an interval later the planned acceleration is half way on
+    later = plan_of(x).replace(since=jnp.asarray(0.5 * 8 / 17))
+    rise = float(x.a[2]) - 1.5
+    lead = COMMAND_STEP_S / moved - 0.5 * 8 / 17
+    wanted = 1.5 + rise * lead * 17 / 8
+    assert float(command(later, x.v[0])) == pytest.approx(wanted, rel=1e-3)
+
+
+def test_a_plan_goes_on_where_it_was():
+    made = with_obstacle(Kind.NONE, 0.0, 0.0, v=8.0)
+    plans = sampled(jax.random.key(0), made, ONLINE).trajectory
+    x = jax.tree.map(lambda a: a[7], plans)
+    plan = plan_of(x)
+    np.testing.assert_allclose(stations_from_now(plan), x.s, atol=1e-4)
+    step = 3 * 8 / 17
+    later = stations_from_now(plan.replace(since=jnp.asarray(step)))
+    np.testing.assert_allclose(later[:-3], x.s[3:] - x.s[3], atol=1e-3)
+    beyond = x.s[-1] - x.s[3] + step * x.v[-1]
+    assert float(later[-1]) == pytest.approx(float(beyond), rel=1e-4)
+
+
+def test_the_plan_in_force_is_kept_while_it_is_admissible_and_young():
+    made, key = with_obstacle(Kind.NONE, 0.0, 0.0, v=8.0), jax.random.key(0)
+    slow = lambda _, scene, x: -x.trajectory.v[:, -1]  # noqa: E731
+    fast = lambda _, scene, x: x.trajectory.v[:, -1]  # noqa: E731
+    config = RankConfig(commitment=1.0, hysteresis=0.0)
+    first = jax.jit(rank_policy(fast, config))(None, made, key, no_plan())
+    assert float(first.since) == 0.0
+    assert bool(first.lasts)
+    policy = jax.jit(rank_policy(slow, config))
+    for since, kept in ((0.5, True), (1.5, False)):
+        aged = first.replace(since=jnp.asarray(since))
+        found = policy(None, made, key, aged)
+        assert (float(found.since) == since) is kept
+    wall = with_obstacle(Kind.VEHICLE, 12.0, 0.0, v=8.0, speed=0.0)
+    aged = first.replace(since=jnp.asarray(0.5))
+    assert float(policy(None, wall, key, aged).since) == 0.0
 
 
 def test_a_plan_that_rests_within_the_first_interval_is_braked_to_rest():
@@ -97,9 +138,9 @@ def test_a_plan_that_rests_within_the_first_interval_is_braked_to_rest():
     plans = sampled(jax.random.key(0), made, ONLINE).trajectory
     x = jax.tree.map(lambda a: a[0], plans)
     still = x.replace(s=jnp.full_like(x.s, 0.03).at[0].set(0.0), a=x.a * 0.0)
-    urgent = float(command(still, jnp.asarray(True), 0.1))
+    urgent = float(command(plan_of(still, urgent=True), still.v[0]))
     assert urgent == pytest.approx(-0.25 / 0.06, rel=0.05)
-    assert urgent < float(command(still, jnp.asarray(False), 0.1)) < -0.3
+    assert urgent < float(command(plan_of(still), still.v[0])) < -0.3
 
 
 def test_idm_policy_is_the_formula():
@@ -108,10 +149,10 @@ def test_idm_policy_is_the_formula():
     gap = 28.0 - 0.5 * float(made.ego.length)
     f = jnp.float32
     expected = idm_acceleration(f(12.0), f(gap), f(4.0), f(30.0), Idm())
-    assert float(plan.acceleration) == pytest.approx(float(expected), rel=1e-4)
+    assert float(command(plan, f(12.0))) == pytest.approx(float(expected), rel=1e-4)
 
 
 def test_the_hand_set_row_uses_the_same_machine():
     policy = jax.jit(rank_policy(hand_score, dataclasses.replace(RankConfig())))
     plan = policy(None, scene_of(1), jax.random.key(1))
-    assert np.isfinite(float(plan.acceleration))
+    assert np.isfinite(np.asarray(plan.a)).all()

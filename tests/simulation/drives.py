@@ -4,18 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rcirl_jax.planner.plan import Plan
+from rcirl_jax.planner.plan import held
 from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases
 
 
-def constant(params, scene, key):
+def constant(params, scene, key, before=None):
     """The ego's acceleration is the parameter."""
-    return Plan(
-        acceleration=params + 0.0 * scene.ego.v,
-        s=jnp.zeros(18),
-        fallback=jnp.zeros((), bool),
-        admissible=jnp.zeros((), jnp.int32),
-    )
+    return held(scene.ego.v, params + 0.0 * scene.ego.v)
 
 
 def stack(cases):

@@ -13,7 +13,7 @@ from scipy.interpolate import CubicHermiteSpline
 
 from rcirl_jax.data.importers import read_recordings, synthetic
 from rcirl_jax.errors import InputError
-from rcirl_jax.planner.plan import Plan
+from rcirl_jax.planner.plan import held
 from rcirl_jax.simulation.cases import NUM_AGENTS, NUM_ROAD, STEP_S, LineKind
 from rcirl_jax.simulation.recorded import drives, recorded_cases
 from rcirl_jax.simulation.recorded_config import REASONS, RecordedConfig
@@ -394,13 +394,8 @@ def test_stacking_pads_with_absence(turning):
     np.testing.assert_array_equal(cut.steps, 40)
 
 
-def _coast(params, scene, key):
-    return Plan(
-        acceleration=jnp.zeros(()),
-        s=scene.ego.v * jnp.linspace(0.0, 8.0, 18),
-        fallback=jnp.zeros((), bool),
-        admissible=jnp.ones((), jnp.int32),
-    )
+def _coast(params, scene, key, before):
+    return held(scene.ego.v, jnp.zeros(()))
 
 
 def test_the_simulator_replays_the_human(turning):

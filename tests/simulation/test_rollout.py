@@ -14,6 +14,7 @@ from rcirl_jax.simulation.metrics import MetricsConfig, case_metrics
 from rcirl_jax.simulation.rollout import LANES, RolloutConfig, drive_cases
 from rcirl_jax.simulation.rows import Row, baseline_row
 from rcirl_jax.simulation.suite import build, drive_row, suite_refs
+from rcirl_jax.units import TIMES_S
 from tests.simulation.drives import constant, drive, stack
 from tests.simulation.worlds import make_case
 
@@ -75,10 +76,9 @@ def test_padding_steps_do_not_count():
 def test_a_plan_stays_in_force_until_the_next():
     calls = []
 
-    def policy(params, scene, key):
+    def policy(params, scene, key, before):
         calls.append(1)  # counts traces, not plans
-        plan = constant(jnp.float32(0.0), scene, key)
-        return plan.replace(acceleration=scene.ego.v - 10.0 + 1.0)
+        return constant(scene.ego.v - 10.0 + 1.0, scene, key)
 
     record, _ = drive([make_case(speed=10.0)], steps=20, policy=policy, plan_every=5)
     commands = record.command[0]
@@ -88,10 +88,21 @@ def test_a_plan_stays_in_force_until_the_next():
     assert len(calls) == 1
 
 
+def test_between_two_plans_the_plan_is_followed():
+    """A plan whose acceleration rises by 1 m/s^3: so does the car's, after its lag."""
+
+    def policy(params, scene, key, before):
+        plan = constant(jnp.float32(0.0), scene, key)
+        return plan.replace(a=jnp.asarray(TIMES_S), s=100.0 * jnp.asarray(TIMES_S))
+
+    record, _ = drive([make_case(speed=10.0)], steps=20, policy=policy, plan_every=20)
+    np.testing.assert_allclose(record.a[0], 0.1 * np.arange(1, 21), atol=2e-3)
+
+
 def test_new_weights_do_not_compile_again():
     traces = []
 
-    def policy(params, scene, key):
+    def policy(params, scene, key, before):
         traces.append(1)
         return constant(params, scene, key)
 
@@ -189,15 +200,12 @@ def test_policy_and_relief_take_turns():
     """The policy brakes for 3 s, the relief accelerates for 2 s, and again."""
     config = RolloutConfig(steps=100, turns=(30, 20))
 
-    def faster(params, scene, key):
-        return constant(jnp.float32(1.0), scene, key)
-
     record, *_ = drive_cases(
         constant,
-        jnp.float32(-1.0),
+        (jnp.float32(-1.0), jnp.float32(1.0)),
         stack([make_case(speed=20.0)]),
         config,
-        relief=faster,
+        relief=constant,
     )
     command = np.asarray(record.command)[0]
     expected = np.where(np.arange(100) % 50 < 30, -1.0, 1.0)

@@ -183,7 +183,7 @@ def test_a_suite_names_row_and_case():
     assert str(caught.value) == f"simulate: {expected}"
 
 
-def one_unknown(params, scene, key):
+def one_unknown(params, scene, key, before):
     """A policy of which one candidate's score is no number where the key is marked."""
     unknown, marked = params
     candidates = sample(key, scene, RankConfig().sampler)
