@@ -45,6 +45,9 @@ class RankingSetup:
     sampler: SamplerConfig = dataclasses.field(default_factory=SamplerConfig)
     horizon_s: float = 5.0  # s
     split: str = "test"
+    # what scorers see of the others' future (`train.state.FUTURES`); crashes are
+    # always judged by the record
+    futures: str = "predicted"
     # rank only among candidates that meet nothing: the same safety filter for all
     drop_collisions: bool = False
     # further hand-set costs and drivers that are ranked: row -> runs
@@ -125,6 +128,7 @@ def _score(
         sampler=setup.sampler,
         horizon_s=setup.horizon_s,
         scorers=scorers,
+        futures=setup.futures,
         tuned=_numbered(setup.tuned),
         executor=executor,
     )
@@ -269,7 +273,11 @@ def oracle_floor(dataset: Demonstrations, setup: RankingSetup, max_scenes: int) 
             "expected a shorter one"
         )
     near = measure_scenes(
-        dataset.read(keep), keep, sampler=setup.sampler, horizon_s=setup.horizon_s
+        dataset.read(keep),
+        keep,
+        sampler=setup.sampler,
+        horizon_s=setup.horizon_s,
+        futures=setup.futures,
     )
     fde = np.where(near.feasible, near.fde, np.inf).min(axis=1)
     ade = np.where(near.feasible, near.ade, np.inf).min(axis=1)

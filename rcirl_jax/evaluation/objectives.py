@@ -19,13 +19,13 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.evaluate import RankingSetup, covered_rows
 from rcirl_jax.evaluation.score import CHUNK, candidates_key, distances, horizon_mask
 from rcirl_jax.evaluation.tuning import Objective, equal_budget, tune
+from rcirl_jax.planner.prediction import as_seen
 from rcirl_jax.planner.rank import RankConfig
 from rcirl_jax.reward import TUNABLE, LatticeCost, lattice_terms, tuned, weighted_cost
 from rcirl_jax.reward.hand import LatticeTerms
 from rcirl_jax.sampling import SamplerConfig, sample
 from rcirl_jax.sampling.sampler import num_candidates
 from rcirl_jax.simulation.careful import judges
-from rcirl_jax.simulation.cases import STEP_S
 from rcirl_jax.simulation.metrics import CaseMetrics, nuplan_score
 from rcirl_jax.simulation.rows import Row, tuned_row
 from rcirl_jax.simulation.suite import (
@@ -104,11 +104,21 @@ def distance_problem(
 def drawn_rows(
     dataset: Demonstrations, setup: RankingSetup, max_scenes: int | None, seed: int
 ) -> tuple[Demonstration, np.ndarray]:
-    """Scenes that cover the horizon and their dataset rows, some drawn by the seed."""
+    """Scenes that cover the horizon and their dataset rows, some drawn by the seed.
+
+    With `setup.futures` of "predicted" they hold what the planner sees.
+    """
     rows, index = covered_rows(dataset, setup.split, setup.horizon_s)
     chosen = np.random.default_rng(seed).permutation(index.size)[:max_scenes]
     chosen = np.sort(chosen)
-    return jax.tree.map(lambda x: x[chosen], rows), index[chosen]
+    rows = jax.tree.map(lambda x: x[chosen], rows)
+    if setup.futures == "predicted":
+        seen = jax.tree.map(np.asarray, _seen(rows.scene))
+        rows = rows.replace(scene=seen)
+    return rows, index[chosen]
+
+
+_seen = jax.jit(jax.vmap(as_seen))
 
 
 def ranked_scenes(
@@ -237,7 +247,7 @@ def suite_problem(
     cases = catalogue_set(suite_refs(suite, per_family, catalogue_seed), duration_s)
     total = len(cases.ids)
     built = cases.build(0, total)
-    config = RankConfig(period=plan_every * STEP_S)
+    config = RankConfig()
     idm = next(row for row in judges() if row.name == "IDM")
     rollout = rollout_config(idm, duration_s, plan_every)
 

@@ -22,6 +22,7 @@ from rcirl_jax.planner.baselines import (
     constant_speed_trajectory,
     idm_trajectory,
 )
+from rcirl_jax.planner.prediction import as_seen
 from rcirl_jax.reward import (
     SPEED_DP_ROW,
     LatticeCost,
@@ -111,8 +112,10 @@ def _score_one(
     features: FeatureMap,
     sampler: SamplerConfig,
     horizon_s: float,
+    futures: str,
 ) -> dict:
-    scene = demonstration.scene
+    recorded = demonstration.scene
+    scene = as_seen(recorded) if futures == "predicted" else recorded
     mask = horizon_mask(scene, horizon_s)
     human = human_of(demonstration, sampler)
     candidates = sample(key, scene, sampler)
@@ -141,8 +144,8 @@ def _score_one(
         "feasible": candidates.feasible,
         "fde": fde,
         "ade": ade,
-        "crash": jax.vmap(lambda x: _crashes(scene, x, mask))(everyone),
-        "human_crash": _crashes(scene, human, mask),
+        "crash": jax.vmap(lambda x: _crashes(recorded, x, mask))(everyone),
+        "human_crash": _crashes(recorded, human, mask),
         "time_valid": mask,
         "values": {name: jax.vmap(f)(everyone) for name, f in rivals.items()},
         "human_values": {name: f(human) for name, f in rivals.items()},
@@ -159,6 +162,7 @@ def _score_batch(
     preset: str,
     sampler: SamplerConfig,
     horizon_s: float,
+    futures: str,
     kinds: tuple[tuple[str, type[Rival]], ...],
 ) -> Callable:
     features = feature_map(preset)
@@ -168,7 +172,9 @@ def _score_batch(
     ) -> dict:
         key = candidates_key(index)
         tuned = {name: kind(**fields[name]) for name, kind in kinds}
-        return _score_one(key, demonstration, tuned, features, sampler, horizon_s)
+        return _score_one(
+            key, demonstration, tuned, features, sampler, horizon_s, futures
+        )
 
     return jax.jit(jax.vmap(one, in_axes=(None, 0, 0)))
 
@@ -181,6 +187,7 @@ def score_scenes(
     sampler: SamplerConfig,
     horizon_s: float,
     scorers: Mapping[str, Scorer],
+    futures: str = "predicted",
     tuned: Mapping[str, Rival] | None = None,
     executor: Executor | None = None,
 ) -> Scored:
@@ -195,6 +202,8 @@ def score_scenes(
       horizon_s: 5 or 8 s (any in (0, 8]).
       scorers: rewards to apply to the features; the baselines are added. An executor
         with other processes sends them: `reader.Reward.value` can be sent.
+      futures: "predicted", as the planner sees the others, or "recorded"; crashes are
+        judged by the record either way.
       tuned: further hand-set costs and drivers by name, beside the usual ones.
       executor: where chunks are scored; the result does not depend on it.
 
@@ -206,7 +215,7 @@ def score_scenes(
     """
     piece = functools.partial(
         _score_chunk,
-        shared=(preset, sampler, float(horizon_s)),
+        shared=(preset, sampler, float(horizon_s), futures),
         scorers=scorers,
         tuned=tuned or {},
     )
@@ -224,10 +233,12 @@ class Measured:
 
 
 @functools.cache
-def _measure_batch(sampler: SamplerConfig, horizon_s: float) -> Callable:
+def _measure_batch(sampler: SamplerConfig, horizon_s: float, futures: str) -> Callable:
     def one(index: jax.Array, demonstration: Demonstration) -> dict:
         human = human_of(demonstration, sampler)
-        made = sample(candidates_key(index), demonstration.scene, sampler)
+        scene = demonstration.scene
+        scene = as_seen(scene) if futures == "predicted" else scene
+        made = sample(candidates_key(index), scene, sampler)
         fde, ade = jax.vmap(lambda x: distances(demonstration, human, x, horizon_s))(
             made.trajectory
         )
@@ -237,13 +248,18 @@ def _measure_batch(sampler: SamplerConfig, horizon_s: float) -> Callable:
 
 
 def measure_scenes(
-    rows: Demonstration, index: np.ndarray, *, sampler: SamplerConfig, horizon_s: float
+    rows: Demonstration,
+    index: np.ndarray,
+    *,
+    sampler: SamplerConfig,
+    horizon_s: float,
+    futures: str = "predicted",
 ) -> Measured:
     """The distances of `score_scenes` alone: no features, no values, little memory.
 
     Args: as there.
     """
-    measure = _measure_batch(sampler, float(horizon_s))
+    measure = _measure_batch(sampler, float(horizon_s), futures)
     parts = [
         jax.tree.map(lambda x, keep=keep: np.asarray(x)[:keep], measure(at, taken))
         for taken, at, keep in _chunks(rows, index)
@@ -264,7 +280,7 @@ def _chunks(
 
 def _score_chunk(
     item: tuple[Demonstration, np.ndarray, int],
-    shared: tuple[str, SamplerConfig, float],
+    shared: tuple[str, SamplerConfig, float, str],
     scorers: Mapping[str, Scorer],
     tuned: Mapping[str, Rival],
 ) -> Iterator[dict]:

@@ -240,6 +240,7 @@ def held_out_scores(
         preset=setup.preset,
         sampler=setup.sampler,
         horizon_s=setup.horizon_s,
+        futures=setup.futures,
         scorers={f"{n}#{i}": f for n, fs in runs.items() for i, f in enumerate(fs)},
         executor=executor,
     )

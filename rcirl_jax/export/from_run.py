@@ -79,6 +79,8 @@ def config_of(settings: Mapping[str, Any]) -> TrainConfig:
     """
     for name in ("reward", "sampler"):
         settings[name]  # these are no flags with a default
+    # runs of before the planner's prediction learned from the record
+    settings = {"futures": "recorded", **settings}
     return typed_settings(TrainConfig, settings)
 
 

@@ -82,8 +82,10 @@ def bounds(reward: Ranged, limits: Limits) -> tuple[np.ndarray, np.ndarray]:
         ends, margin = np.asarray(reward.seen, np.float64), limits.margin * scale
     first, last = ends.astype(np.float32)
     lower, upper = (np.asarray(x, np.float32) for x in (reward.lower, reward.upper))
-    low = np.where(first <= lower, -np.inf, ends[0] - margin)
-    high = np.where(last >= upper, np.inf, ends[1] + margin)
+    # a value at its cap may lie anywhere beyond; what never varied has no cap
+    capped = lower < upper
+    low = np.where(capped & (first <= lower), -np.inf, ends[0] - margin)
+    high = np.where(capped & (last >= upper), np.inf, ends[1] + margin)
     return low.astype(np.float32), high.astype(np.float32)
 
 

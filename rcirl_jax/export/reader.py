@@ -87,6 +87,12 @@ class Reward:
     loss: dict[str, Any]
     provenance: dict[str, Any]
 
+    @property
+    def unsupported(self) -> tuple[str, ...]:
+        """Features without effect: the training never saw them vary."""
+        empty = zip(self.names, self.lower >= self.upper, strict=True)
+        return tuple(name for name, none in empty if none)
+
     def check_features(self, names: Sequence[str], units: Sequence[str]) -> None:
         """Refuse columns that are not the file's, in the file's order and units."""
         own = zip(self.names, self.units, strict=True)

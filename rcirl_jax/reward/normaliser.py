@@ -1,13 +1,17 @@
 """The frozen robust normaliser of features, stored with the weights."""
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from rcirl_jax.features import FeatureMap
 from rcirl_jax.types import Normaliser
 
 SEEN_QUANTILES = (0.001, 0.999)  # what counts as seen in training
+VARYING_SHARE = 0.002  # of rows that have to differ from the median: one in 500
 SCALE_FLOOR = 0.03  # share of a feature's declared range; the smallest scale
 
 
@@ -28,6 +32,9 @@ def fit_normaliser(features: np.ndarray, feature_map: FeatureMap) -> Normaliser:
     between the quantiles; its standard deviation is used, and at least
     SCALE_FLOOR of the declared range: a feature that is seldom active must not
     arrive at the network as 20 or 1,000 of its own standard deviations.
+
+    A feature that does not vary (`varies`) has no effect by construction: its range
+    is its median, so its normalised value is 0 everywhere and nothing untrained drives.
     """
     lower = np.array([spec.lower for spec in feature_map.specs])
     upper = np.array([spec.upper for spec in feature_map.specs])
@@ -35,6 +42,8 @@ def fit_normaliser(features: np.ndarray, feature_map: FeatureMap) -> Normaliser:
     low, middle, high = np.quantile(rows, [0.05, 0.5, 0.95], axis=0)
     spread = np.maximum(0.5 * (high - low), rows.std(axis=0))
     scale = np.maximum(spread, SCALE_FLOOR * (upper - lower))
+    seen = varies(rows, middle)
+    lower, upper = np.where(seen, lower, middle), np.where(seen, upper, middle)
     as_array = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
     return Normaliser(
         lower=as_array(lower),
@@ -42,6 +51,25 @@ def fit_normaliser(features: np.ndarray, feature_map: FeatureMap) -> Normaliser:
         location=as_array(middle),
         scale=as_array(scale),
     )
+
+
+def varies(rows: np.ndarray, middle: np.ndarray) -> np.ndarray:
+    """Which features [F] differ from their median in `VARYING_SHARE` of rows [n, F]."""
+    # float32 is what the features are made in
+    differs = rows.astype(np.float32) != middle.astype(np.float32)
+    return differs.mean(axis=0) >= VARYING_SHARE
+
+
+def unsupported(lower: ArrayLike, upper: ArrayLike, names: Sequence[str]) -> list[str]:
+    """Names of the features without effect: those whose normaliser has no range.
+
+    Args:
+      lower: [F], of the normaliser.
+      upper: [F].
+      names: F names.
+    """
+    empty = np.asarray(lower) >= np.asarray(upper)
+    return [name for name, none in zip(names, empty, strict=True) if none]
 
 
 def seen_range(features: np.ndarray, feature_map: FeatureMap) -> np.ndarray:

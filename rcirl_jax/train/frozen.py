@@ -141,7 +141,7 @@ def _taken(frozen: FeatureBatch, part: tuple, times: int) -> FeatureBatch:
     """Some scenes of the set, (rows, weights), without times valid in none of it."""
     batch = jax.tree.map(lambda x: x[part[0]], frozen)
     return batch.replace(
-        weight=part[1],
+        weight=part[1] * batch.weight,
         human=batch.human[:, :times],
         candidates=batch.candidates[:, :, :times],
         time_valid=batch.time_valid[:, :times],

@@ -42,7 +42,7 @@ from rcirl_jax.train.step import StepMetrics, featurised, init_state, make_train
 from rcirl_jax.types import Demonstration
 
 CHUNK = 128  # scenes featurised per call where no batch sets their number
-NORMALISER_SCENES = 512  # training scenes whose features fit the normaliser
+NORMALISER_SCENES = 2048  # training scenes whose features fit the normaliser
 NORMALISER_STREAM = 7  # fold_in number of the key that samples for the normaliser
 
 

@@ -30,6 +30,8 @@ OPTIMIZERS: dict[
 
 
 POSITIVES = ("human", "nearest")
+# what the learner sees of the others' future: the planner's prediction, or the record
+FUTURES = ("predicted", "recorded")
 
 
 # least, most, in words
@@ -83,6 +85,8 @@ class TrainConfig:
     # what is ranked above the candidates: the "human" curve itself, or the
     # "nearest" feasible candidate to it (what a planner could have driven)
     positive: str = "human"
+    # the others' future: "predicted" as in closed loop, or "recorded" as in the paper
+    futures: str = "predicted"
     # s, times after it are not compared, nor their weights learned
     train_horizon: float = 8.0
     # offline negatives near the human per scene (0: none)
@@ -100,6 +104,7 @@ class TrainConfig:
     def __post_init__(self) -> None:
         """Reject values out of range with the flag's name."""
         known = {"loss": LOSSES, "optimizer": OPTIMIZERS, "positive": POSITIVES}
+        known["futures"] = FUTURES
         for name, values in known.items():
             if getattr(self, name) not in values:
                 raise InputError(
@@ -127,6 +132,7 @@ class TrainConfig:
             # the only loss that asks for densities
             loss="listwise" if self.loss == "listwise" else "rank",
             positive=self.positive,
+            futures=self.futures,
             train_horizon=self.train_horizon,
             hard_negatives=self.hard_negatives,
             hard_pool=self.hard_pool,

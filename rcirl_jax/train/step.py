@@ -16,6 +16,7 @@ import optax
 
 from rcirl_jax.features import FeatureMap, feature_map
 from rcirl_jax.features.columns import candidate_frames
+from rcirl_jax.planner.prediction import as_seen
 from rcirl_jax.reward import (
     Compared,
     LossConfig,
@@ -117,6 +118,8 @@ def featurise(
     seen = jnp.asarray(TIMES_S) <= config.train_horizon + 1e-6
 
     def one(index: jax.Array, demonstration: Demonstration) -> tuple:
+        if config.futures == "predicted":
+            demonstration = demonstration.replace(scene=as_seen(demonstration.scene))
         own_key = jax.random.fold_in(key, index)
         valid = demonstration.scene.time_valid & seen
         candidates = candidates_of(own_key, demonstration, config)

@@ -51,8 +51,10 @@ class Guard {
         last = static_cast<double>(seen[f + features_]);
         margin = limits.margin * scale;
       }
-      const bool open_below = detail::narrow(first) <= network.lower[f];
-      const bool open_above = detail::narrow(last) >= network.upper[f];
+      // a value at its cap may lie anywhere beyond; what never varied has no cap
+      const bool capped = network.lower[f] < network.upper[f];
+      const bool open_below = capped && detail::narrow(first) <= network.lower[f];
+      const bool open_above = capped && detail::narrow(last) >= network.upper[f];
       low_[f] = open_below ? -kInfinity : detail::narrow(first - margin);
       high_[f] = open_above ? kInfinity : detail::narrow(last + margin);
     }
