@@ -4,10 +4,10 @@
     python -m experiments.gate --candidate=FILE --incumbent=hand-set --output=FILE
 
 Both drive the same closed-loop cases; never is a learned reward the judge. Refused (3)
-if the candidate has more faults, or runs more red lights or stop signs, in any case
-than the incumbent; if rates or way are worse than the margins allow; if a family
-loses; or if nothing is better. 2: could not judge: bad input, too few cases, or a part
-of the suite. With no fault anywhere, a margin of 0.1 % takes 3,838 cases.
+if the candidate has more cases with a fault than the incumbent, if rates or progress
+are worse than the margins allow, if a family loses, if it is behind rewards that know
+nothing or farther from the human, or if nothing is better. 2: could not judge: bad
+input, too few cases, something not measured, or a part of the suite. docs/gate.md.
 """
 
 import sys
@@ -53,9 +53,11 @@ def main() -> None:
         duration_s=_DURATION.value,
         catalogue_seed=_SEED.value,
         plan_every=_EVERY.value,
+        rivals=("IDM", *(name for name in config.nulls if name in BASELINES)),
     )
     result = drive_job(job, executor())
-    verdict = judge(pair_of(runs_of(result), incumbent), config, left_out(job))
+    pair = pair_of(runs_of(result), incumbent, config.nulls)
+    verdict = judge(pair, config, left_out(job))
     files = {"candidate": _CANDIDATE.value, "incumbent": _INCUMBENT.value}
     facts = {"files": files, **result.facts, "made_by": provenance(job.weights)}
     write_verdict(output, verdict, config, facts)

@@ -1,45 +1,46 @@
 """May a candidate replace the incumbent? Tests on the same closed-loop cases.
 
-Four kinds of check, none of them on a learned reward:
+Six kinds of check, none of them on a learned reward:
 
-    safety      no case in which the candidate has more faults, hits more people, runs
-                more red lights or stop signs than the incumbent: zero, not few
+    safety      not more cases with a preventable collision of its own fault, a
+                collision with a pedestrian or cyclist, a red light or a stop sign run
+                than the incumbent, up to a declared margin (`gate_safety`)
     no loss     rates and progress over all cases are not worse than the incumbent's
-                by more than a declared margin: the lower end of the paired 97.5 %
-                interval lies above it. Rates by Tango's score interval and by the
-                clusters (families), both; progress by the latter
-    families    in no family more clean drives or way are lost than a margin: by
-                Tango's interval, and by Student's t over cases. All families have to
-                show it, so none is adjusted; a loss is detected (exact McNemar, t) only
-                after Holm over families
-    gain        better in one primary metric, at least: McNemar and clusters, or
-                clusters alone, Holm over the primary metrics
+                by more than a margin: the lower end of the paired 95 % interval over
+                cases lies above it
+    families    in no family more clean drives or progress are lost than a margin. All
+                families have to show it, so none is adjusted; a loss is detected
+                (exact McNemar, t) only after Holm over families
+    nulls       nearer to the human than rewards that know nothing, and as safe
+    likeness    not farther from the human than the incumbent (`gate_likeness`)
+    gain        better in one primary metric or in human-likeness, at least: McNemar
+                and families as clusters, Holm over them; and in no primary metric
+                worse by the same tests and more than a margin
 
-Over clusters means the paired bootstrap and Student's t with families - 1 degrees of
-freedom, of both the wider interval and the larger p: with few families the bootstrap
-alone takes chance for certainty.
-
-A check passes, fails, or is open: too few cases to prove it either way. Ship needs
-every check passed, a gain and the full suite; one failed check refuses; else, open
-checks, or a part of the suite only, make the gate unable to judge. Host numpy,
+A check passes, fails, or is open: what was measured does not show it either way. Ship
+needs every check passed, a gain and the full suite; one failed check refuses; else,
+open checks, or a part of the suite only, make the gate unable to judge. A case with a
+new fault that a person accepts no longer counts in the tests of safety. Host numpy,
 float64. `C` cases.
 """
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 
 from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation import gate_likeness
 from rcirl_jax.evaluation.gate_checks import (
     families,
-    family_of,
     gains,
     is_clean,
     no_loss,
     passes_of,
-    safety,
 )
+from rcirl_jax.evaluation.gate_safety import new_faults, nulls_safety, safety
 from rcirl_jax.evaluation.gate_types import Check, Decision, GateConfig, Pair, Verdict
+from rcirl_jax.evaluation.gate_words import family_of, sentence
 
 WORST = 20  # cases named for a person to look at
 MIN_CASES = 30  # below, no interval means anything
@@ -54,35 +55,43 @@ def judge(pair: Pair, config: GateConfig, part: str = "") -> Verdict:
       part: what was left out of the suite, in words; then nothing ships.
 
     Raises:
-      InputError: fewer than `MIN_CASES` cases.
+      InputError: fewer than `MIN_CASES` cases, an accepted id that is no new fault,
+        or no distances of a row that human-likeness is compared with.
     """
     count = len(pair.ids)
     if count < MIN_CASES:
         raise InputError(f"gate: {count} cases: expected at least {MIN_CASES}")
+    faults = new_faults(pair, config.accept)
     checks = (
-        *safety(pair),
+        *safety(pair, config),
         *no_loss(pair, config),
         *families(pair, config),
+        *gate_likeness.against_nulls(pair, config),
+        *nulls_safety(pair, config),
+        *gate_likeness.against_incumbent(pair),
         *gains(pair, config),
     )
     decision, reasons = _decide(checks)
     if part and decision == "ship":
         decision = "could not judge"
         reasons = (f"{part}: nothing ships on a part of the suite", *reasons)
-    return Verdict(
+    verdict = Verdict(
         decision=decision,
+        sentence="",
         reasons=reasons,
         checks=checks,
         cases=count,
         families=len(set(pair.families)),
-        look_at=_look_at(pair, checks),
+        new_faults=faults,
+        look_at=_look_at(pair, checks, [f.case for f in faults if not f.accepted]),
         part=part,
     )
+    return dataclasses.replace(verdict, sentence=sentence(pair, verdict))
 
 
 def _decide(checks: Sequence[Check]) -> tuple[Decision, tuple[str, ...]]:
+    failed = [check for check in checks if check.outcome == "fail"]
     needed = [check for check in checks if check.kind != "gain"]
-    failed = [check for check in needed if check.outcome == "fail"]
     unclear = [check for check in needed if check.outcome == "open"]
     gained = [c for c in checks if c.kind == "gain" and c.outcome == "pass"]
     if failed:
@@ -95,21 +104,26 @@ def _decide(checks: Sequence[Check]) -> tuple[Decision, tuple[str, ...]]:
 
 
 def _reason(check: Check) -> str:
+    if not check.measured:
+        return f"{check.kind}: {check.title}: {check.note}"
     pairs = "" if check.lost is None else f", +{check.gained} -{check.lost} cases"
     return (
-        f"{check.kind}: {check.name}: {100 * check.difference:+.2f} "
+        f"{check.kind}: {check.title}: {100 * check.difference:+.2f} "
         f"[{100 * check.low:+.2f}, {100 * check.high:+.2f}] %{pairs}"
         + (f"; {check.note}" if check.note else "")
     )
 
 
-def _look_at(pair: Pair, checks: Sequence[Check]) -> tuple[str, ...]:
+def _look_at(
+    pair: Pair, checks: Sequence[Check], new: Sequence[str]
+) -> tuple[str, ...]:
     """Cases that only one of them drives cleanly, or far apart; losses first.
 
-    Before them the worst of every family that failed.
+    Before them new faults that nobody has accepted, if safety is not shown, and the
+    worst of every family that failed.
     """
     mine, theirs = passes_of(pair.candidate), passes_of(pair.incumbent)
-    faults = 8.0 * (~mine["collision_free"] & theirs["collision_free"])
+    faults = 8.0 * np.isin(pair.ids, new)
     lost = 4.0 * (~is_clean(pair.candidate) & is_clean(pair.incumbent))
     way = np.asarray(pair.candidate.progress) - np.asarray(pair.incumbent.progress)
     behind = np.clip(-way / np.maximum(pair.incumbent.progress, 1.0), 0.0, 1.0)
@@ -121,5 +135,7 @@ def _look_at(pair: Pair, checks: Sequence[Check]) -> tuple[str, ...]:
     for i in order:
         if pair.families[i] in failed:
             firsts.setdefault(pair.families[i], i)
-    found = dict.fromkeys([*firsts.values(), *order])
+    unsafe = any(c.kind == "safety" and c.outcome != "pass" for c in checks)
+    first = [i for i in order if unsafe and pair.ids[i] in new]
+    found = dict.fromkeys([*first, *firsts.values(), *order])
     return tuple(pair.ids[i] for i in list(found)[:WORST])

@@ -5,12 +5,13 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from rcirl_jax.evaluation.gate_types import Check, GateConfig, Verdict
+from rcirl_jax.evaluation.gate_words import WIDTH, fault_words
 from rcirl_jax.evaluation.suite_output import text_table
 from rcirl_jax.whole import plain, write_json
 
 RANKS = {"fail": 0, "open": 1, "pass": 2}  # the order in which they are shown
 OUTCOMES = {"pass": "ok", "fail": "FAIL", "open": "open"}
-WIDTH = 100  # columns of wrapped text
+FIRST = ("sentence", "decision")  # of the JSON
 
 
 def _percent(share: float) -> str:
@@ -19,9 +20,12 @@ def _percent(share: float) -> str:
 
 def _cells(check: Check) -> list[str]:
     pairs = "" if check.lost is None else f"+{check.gained} -{check.lost}"
+    outcome = OUTCOMES[check.outcome] if check.kind != "gain" else _gain(check)
+    if not check.measured:
+        return [check.title, outcome, *["", "not measured"], *["", "", ""]]
     return [
-        check.name,
-        OUTCOMES[check.outcome] if check.kind != "gain" else _gain(check),
+        check.title,
+        outcome,
         _percent(check.difference),
         f"[{_percent(check.low)}, {_percent(check.high)}]",
         "" if check.margin is None else f"-{100.0 * check.margin:g}",
@@ -31,14 +35,16 @@ def _cells(check: Check) -> list[str]:
 
 
 def _gain(check: Check) -> str:
-    return "better" if check.outcome == "pass" else "-"
+    return {"pass": "better", "fail": "FAIL", "open": "-"}[check.outcome]
 
 
 TITLES = {
-    "safety": "Nothing new that is unsafe",
+    "safety": "Not more cases with a fault (p: of as many more as the margin)",
     "no loss": "No loss beyond the margin, over all cases",
     "families": "No loss beyond the margin in any family (p: Holm; the ten worst)",
-    "gain": "Better somewhere (Holm over the primary metrics)",
+    "nulls": "Ahead of rewards that know nothing",
+    "likeness": "Not farther from the human",
+    "gain": "Better somewhere, worse nowhere (Holm over the primary metrics)",
 }
 WORST_FAMILIES = 10  # rows of the terminal table; the JSON has all
 
@@ -52,15 +58,10 @@ def _shown(kind: str, checks: list[Check]) -> list[Check]:
 
 
 def format_verdict(verdict: Verdict) -> str:
-    """Decision first, then every kind of check as a table."""
-    lines = [f"verdict: {verdict.decision.upper()}"]
-    lines += [
-        line
-        for reason in verdict.reasons
-        for line in textwrap.wrap(
-            reason, WIDTH, initial_indent="  - ", subsequent_indent="    "
-        )
-    ]
+    """The sentence and decision first, then every kind of check as a table."""
+    lines = textwrap.wrap(verdict.sentence, WIDTH)
+    lines += ["", f"verdict: {verdict.decision.upper()}"]
+    lines += [line for reason in verdict.reasons for line in _item(reason)]
     lines += ["", f"{verdict.cases:,} cases of {verdict.families} families; % of cases"]
     if verdict.part:
         lines += textwrap.wrap(f"a part of the suite: {verdict.part}", WIDTH)
@@ -70,10 +71,18 @@ def format_verdict(verdict: Verdict) -> str:
         rows = [_cells(check) for check in _shown(kind, checks)]
         if rows:
             lines += ["", title, *text_table(header, rows)]
+    if verdict.new_faults:
+        lines += ["", "Cases with a new fault; --accept=ID,... of those that may stay"]
+        for fault in verdict.new_faults:
+            lines += _item(fault_words(fault))
     if verdict.look_at:
         named = ", ".join(verdict.look_at)
         lines += ["", *textwrap.wrap(f"look first at: {named}", WIDTH)]
     return "\n".join(lines) + "\n"
+
+
+def _item(said: str) -> list[str]:
+    return textwrap.wrap(said, WIDTH, initial_indent="  - ", subsequent_indent="    ")
 
 
 def write_verdict(
@@ -81,9 +90,10 @@ def write_verdict(
 ) -> None:
     """Verdict, margins and `facts` (files, hashes, provenance) as JSON."""
     body = {
+        "sentence": verdict.sentence,
         "decision": verdict.decision,
         "exit_code": verdict.exit_code,
-        **{k: v for k, v in plain(verdict).items() if k != "decision"},
+        **{k: v for k, v in plain(verdict).items() if k not in FIRST},
         "config": plain(config),
         **facts,
     }

@@ -1,22 +1,40 @@
 """From a driven suite to what the gate compares."""
 
+from collections.abc import Sequence
+
 import jax
 import numpy as np
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop import SuiteConfig, SuiteResult
-from rcirl_jax.evaluation.gate_types import Pair
+from rcirl_jax.evaluation.gate_types import (
+    CANDIDATE,
+    INCUMBENT,
+    NULLS,
+    Likeness,
+    Pair,
+)
 from rcirl_jax.evaluation.suite_files import SuiteRuns
 from rcirl_jax.evaluation.suite_output import result_hash
 from rcirl_jax.simulation.rollout import LANES
 from rcirl_jax.simulation.rows import Row
 from rcirl_jax.simulation.suite import drive_row, rollout_config
 
-CANDIDATE, INCUMBENT = "candidate", "incumbent"
 
+def pair_of(
+    runs: SuiteRuns,
+    incumbent: str = INCUMBENT,
+    nulls: Sequence[str] = NULLS,
+    likeness: Likeness | None = None,
+) -> Pair:
+    """Candidate, incumbent and nulls of a driven suite.
 
-def pair_of(runs: SuiteRuns, incumbent: str = INCUMBENT) -> Pair:
-    """Candidate and incumbent of a driven suite.
+    Args:
+      runs: the drives.
+      incumbent: name of its row.
+      nulls: names of rows that the candidate has to be ahead of; those that the suite
+        does not have are left out.
+      likeness: distances to the human, where they were measured.
 
     Raises:
       InputError: the suite has no such rows.
@@ -30,6 +48,10 @@ def pair_of(runs: SuiteRuns, incumbent: str = INCUMBENT) -> Pair:
         families=runs.groups,
         ids=runs.ids,
         reference=np.asarray(runs.way, np.float64),
+        preventable=np.asarray(runs.preventable, bool),
+        name=incumbent,
+        nulls={name: runs.rows[name] for name in nulls if name in runs.rows},
+        likeness=likeness,
     )
 
 

@@ -1,7 +1,10 @@
-"""What a gate is given and what it says: margins, drives, checks, a verdict."""
+"""What a gate is given and what it says: margins, drives, checks, a verdict.
+
+Axes: `C` cases of the suite, `D` held-out recorded drives.
+"""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -9,7 +12,7 @@ import numpy as np
 from rcirl_jax.errors import InputError
 from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics
 
-Kind = Literal["safety", "no loss", "families", "gain"]
+Kind = Literal["safety", "no loss", "families", "nulls", "likeness", "gain"]
 Outcome = Literal["pass", "fail", "open"]
 Decision = Literal["ship", "do not ship", "no difference", "could not judge"]
 
@@ -22,30 +25,52 @@ EXIT_CODES: dict[Decision, int] = {
 }
 
 
+CANDIDATE, INCUMBENT = "candidate", "incumbent"  # names of rows
+NULLS = ("constant V", "+velocity")  # rewards that know nothing
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class GateConfig:
-    """Margins and primary metrics; what a team declares before it looks."""
+    """Margins and primary metrics; what a team declares before it looks.
 
+    docs/gate.md says how each margin was chosen and what it can detect.
+    """
+
+    # more cases with a fault than the incumbent that count as none: shares of all
+    # cases. 0.0025 of 4,140 are ten
+    collision: float = 0.0025  # of its own fault, preventable
+    vulnerable: float = 0.002  # of its own fault, with a pedestrian or cyclist
+    red_light: float = 0.0025
+    stop_sign: float = 0.0025
     # largest loss that counts as none: shares of all cases
-    collision_free: float = 0.001
-    min_ttc: float = 0.003  # time to collision stays above 0.95 s
-    speed_limit: float = 0.002
-    on_road: float = 0.002
+    collision_free: float = 0.005  # of its own fault, preventable or not
+    min_ttc: float = 0.01  # time to collision stays above 0.95 s
+    speed_limit: float = 0.005
+    on_road: float = 0.0025
     # clean drives, share of one family's cases; 180 cannot prove less than 0.021
-    family_clean: float = 0.05
-    # share of the incumbent's way
+    family_clean: float = 0.10
+    # share of the incumbent's progress
     progress: float = 0.01
-    family_progress: float = 0.05
+    family_progress: float = 0.10
+    # loss in one primary metric that a gain in another may cost; share of cases, or
+    # of the score
+    gain: float = 0.02
     primary: tuple[str, ...] = ("a_station", "j_station", "progress", "nuplan")
+    # rows that the candidate has to be ahead of
+    nulls: tuple[str, ...] = NULLS
+    # cases with a new fault that a person has looked at and accepts
+    accept: tuple[str, ...] = ()
+
+    @property
+    def margins(self) -> dict[str, float]:
+        """The margins by name."""
+        return {k: v for k, v in vars(self).items() if isinstance(v, int | float)}
 
     def __post_init__(self) -> None:
-        """Margins within (0, 1) and known primary metrics."""
-        for field in dataclasses.fields(self):
-            margin = getattr(self, field.name)
-            if field.name != "primary" and not 0.0 < margin < 1.0:
-                raise InputError(
-                    f"--{field.name}_margin: {margin}: expected within (0, 1)"
-                )
+        """Margins within (0, 1), known primary metrics, no name twice."""
+        for name, margin in self.margins.items():
+            if not 0.0 < margin < 1.0:
+                raise InputError(f"--{name}_margin: {margin}: expected within (0, 1)")
         known = (*COLUMNS, "progress", "nuplan")
         for name in self.primary:
             if name not in known:
@@ -54,6 +79,36 @@ class GateConfig:
                 )
         if not self.primary:
             raise InputError("--primary: none: expected at least one metric")
+        for flag in ("primary", "nulls", "accept"):
+            names = getattr(self, flag)
+            if len(set(names)) != len(names):
+                twice = next(name for name in names if names.count(name) > 1)
+                raise InputError(f"--{flag}: {twice}: met twice: expected it once")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Likeness:
+    """How near every row drives to the human, on D held-out recorded drives."""
+
+    # row name -> [D] >= 0, distance to the human; lower is nearer
+    distance: Mapping[str, np.ndarray]
+    clusters: np.ndarray  # [D] int, recording (or vehicle group) of each drive
+
+    def __post_init__(self) -> None:
+        """As many finite distances >= 0 for every row as there are clusters."""
+        count = len(self.clusters)
+        for name, values in self.distance.items():
+            values = np.asarray(values, np.float64)
+            if values.shape != (count,):
+                raise InputError(
+                    f"likeness: {name}: shape {values.shape}: expected ({count},)"
+                )
+            bad = ~(np.isfinite(values) & (values >= 0.0))
+            if bad.any():
+                raise InputError(
+                    f"likeness: {name}: drive {int(np.argmax(bad))}:"
+                    f" {values[bad][0]}: expected a distance >= 0"
+                )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -62,16 +117,31 @@ class Check:
 
     kind: Kind
     name: str
+    title: str  # in words
     outcome: Outcome
-    # candidate minus incumbent; rates as shares, progress as share of its way
+    # candidate minus the other, positive is better; rates as shares, progress and
+    # likeness as shares of the other's mean
     difference: float
     low: float
     high: float
     margin: float | None  # below which a loss is one; None: any
-    gained: int | None  # cases only the candidate passes
-    lost: int | None  # cases only the incumbent passes
-    p: float | None  # two-sided, Holm-adjusted within its kind
+    gained: int | None  # cases that only the candidate passes
+    lost: int | None  # cases that only the other passes
+    # safety and nulls: one-sided, of a loss as large as the margin; families and
+    # gain: two-sided, of no difference, Holm-adjusted within the kind
+    p: float | None
     note: str = ""
+    measured: bool = True  # else the numbers say nothing: from -1 to 1
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class NewFault:
+    """A case in which the candidate commits more of an offence than the incumbent."""
+
+    case: str
+    faults: tuple[str, ...]  # names of the safety checks
+    preventable: bool  # a careful driver has no collision there
+    accepted: bool  # a person has looked at it
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -79,10 +149,12 @@ class Verdict:
     """What the gate says, and why."""
 
     decision: Decision
+    sentence: str  # the decision in plain words
     reasons: tuple[str, ...]
     checks: tuple[Check, ...]
     cases: int
     families: int
+    new_faults: tuple[NewFault, ...]
     look_at: tuple[str, ...]  # ids of cases that differ, the worst first
     part: str  # what of the suite was left out, in words; "" if nothing
 
@@ -101,12 +173,16 @@ class Pair:
     families: Sequence[str]
     ids: Sequence[str]
     reference: np.ndarray  # [C] m, way of the driver that nuPlan's score compares to
+    preventable: np.ndarray  # [C] bool, `simulation.careful.preventable`
+    name: str = INCUMBENT  # of the incumbent
+    nulls: Mapping[str, CaseMetrics] = dataclasses.field(default_factory=dict)
+    likeness: Likeness | None = None  # rows `CANDIDATE`, `name` and the nulls
 
     def __post_init__(self) -> None:
         """Same cases, all finite where a drive has a number."""
         count = len(self.ids)
-        for name in ("candidate", "incumbent"):
-            metrics = getattr(self, name)
+        rows = {CANDIDATE: self.candidate, self.name: self.incumbent, **self.nulls}
+        for name, metrics in rows.items():
             for field in ("progress", "at_fault", "holds", "max_j", "rms_a"):
                 values = np.asarray(getattr(metrics, field), np.float64)
                 if len(values) != count:
@@ -121,5 +197,6 @@ class Pair:
         if len(set(self.ids)) != count:
             twice = next(name for name in self.ids if self.ids.count(name) > 1)
             raise InputError(f"gate: {twice}: met twice: expected distinct cases")
-        if len(self.families) != count or len(self.reference) != count:
-            raise InputError(f"gate: families, reference: expected {count} each")
+        for name in ("families", "reference", "preventable"):
+            if len(getattr(self, name)) != count:
+                raise InputError(f"gate: {name}: expected {count} values")

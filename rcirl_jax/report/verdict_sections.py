@@ -36,7 +36,8 @@ DECISIONS = {  # class, what it means
         "incumbent, or drive more cases.",
     ),
 }
-KINDS = ("safety", "no loss", "gain")  # families have a section of their own
+# families have a section of their own
+KINDS = ("safety", "no loss", "nulls", "likeness", "gain")
 
 
 def verdict_section(
@@ -127,7 +128,7 @@ def forest(title: str, checks: Sequence[Check], names: Sequence[str]) -> str:
 
 def outcome_of(check: Check) -> tuple[str, str]:
     """Word and class; a gain that is missing is no failure of the gate."""
-    if check.kind != "gain":
+    if check.kind != "gain" or check.outcome == "fail":
         return OUTCOMES[check.outcome], check.outcome
     if check.outcome == "pass":
         return "better", "pass"

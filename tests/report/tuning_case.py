@@ -74,6 +74,8 @@ def suite_and_verdict():
         families=names,
         ids=ids,
         reference=way,
+        preventable=~none,
+        name="hand-set",
     )
     verdict = judge(pair, GateConfig())
     return suite, dataclasses.replace(verdict, look_at=(*PLAYED, *verdict.look_at[:4]))

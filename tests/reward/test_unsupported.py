@@ -1,0 +1,100 @@
+"""Nothing untrained drives: a feature that never varied in training has no effect."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rcirl_jax.features import feature_map
+from rcirl_jax.planner.rank import RankConfig
+from rcirl_jax.reward import RewardConfig, fit_normaliser, init_reward, value
+from rcirl_jax.reward.normaliser import VARYING_SHARE, unsupported
+from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases
+from rcirl_jax.simulation.rows import learned_row
+from rcirl_jax.simulation.suite import build, suite_refs
+
+FEATURES = feature_map("paper21")
+NEVER = ("stop_distance", "stop_speed", "virtual_distance", "virtual_speed")
+BY_CONTEXT = RewardConfig(hidden=(32, 16), pin="none", context=FEATURES.context)
+
+
+def rows(count=4000):
+    """Training features: all vary but those of lines and destinations."""
+    rng = np.random.default_rng(0)
+    lower = np.array([s.lower for s in FEATURES.specs])
+    upper = np.array([s.upper for s in FEATURES.specs])
+    made = rng.uniform(lower, upper, (count, FEATURES.num_features))
+    for name in NEVER:
+        made[:, FEATURES.names.index(name)] = FEATURES.specs[
+            FEATURES.names.index(name)
+        ].none
+    return made
+
+
+def redrawn(params, seed):
+    """The same reward but for the weights that read the unsupported columns."""
+    at = jnp.asarray([FEATURES.names.index(name) for name in NEVER])
+    draw = lambda x: 5.0 * jax.random.normal(jax.random.key(seed), x.shape)  # noqa: E731
+    first = params.kernels[0]
+    first = first.at[at].set(draw(first[at]))
+    context = params.context
+    context = context.at[at].set(draw(context[at]))
+    context = context.at[:, at].set(draw(context[:, at]))
+    return params.replace(kernels=(first, *params.kernels[1:]), context=context)
+
+
+def weights():
+    key = jax.random.key(1)
+    params = init_reward(key, FEATURES.num_features, BY_CONTEXT)
+    shape = params.context.shape
+    params = params.replace(context=0.1 * jax.random.normal(key, shape))
+    return params, fit_normaliser(rows(), FEATURES)
+
+
+def test_they_are_found_and_named():
+    _, norm = weights()
+    assert unsupported(norm.lower, norm.upper, FEATURES.names) == list(NEVER)
+    # one in 500 rows is enough, fewer are not
+    made = rows(10_000)
+    at = FEATURES.names.index("stop_distance")
+    made[: round(VARYING_SHARE * 10_000), at] = 12.0
+    found = fit_normaliser(made, FEATURES)
+    assert "stop_distance" not in unsupported(found.lower, found.upper, FEATURES.names)
+    made[0, at] = made[-1, at]
+    found = fit_normaliser(made, FEATURES)
+    assert "stop_distance" in unsupported(found.lower, found.upper, FEATURES.names)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_their_weights_change_no_value_and_get_no_gradient(seed):
+    params, norm = weights()
+    x = np.random.default_rng(seed).uniform(-50.0, 120.0, (7, 18, 21))
+    x, valid = jnp.asarray(x, jnp.float32), jnp.ones((7, 18), bool)
+    of = lambda p: value(p, norm, x, valid, BY_CONTEXT)  # noqa: E731
+    np.testing.assert_array_equal(of(params), of(redrawn(params, seed)))
+    grad = jax.grad(lambda p: jnp.sum(of(p) ** 2))(params)
+    at = [FEATURES.names.index(name) for name in NEVER]
+    assert not np.any(np.asarray(grad.kernels[0])[at])
+    assert np.all(
+        np.any(np.asarray(grad.kernels[0]), axis=1)[: FEATURES.num_features - 8]
+    )
+
+
+def test_redrawn_weights_drive_the_same():
+    """Bit for bit, where lines demand stops: the case that the columns are about."""
+    params, norm = weights()
+    cases = build(suite_refs("stop_sign,red_light", 2), 8.0)
+    config = RolloutConfig(steps=80)
+
+    def driven(made):
+        row = learned_row("learned", (made, norm), "paper21", "tanh", RankConfig())
+        record, *_ = drive_cases(row.policy, row.params, cases, config)
+        return jax.tree.map(np.asarray, record)
+
+    first = driven(params)
+    assert np.ptp(first.s[:, -1]) > 0.5
+    for seed in range(2):
+        again = driven(redrawn(params, seed))
+        assert all(jax.tree.leaves(jax.tree.map(np.array_equal, first, again)))
+    other = params.replace(kernels=(-params.kernels[0], *params.kernels[1:]))
+    assert not np.array_equal(first.s, driven(other).s)
