@@ -28,6 +28,7 @@ from rcirl_jax.evaluation.closed_loop import (
     write_suite,
 )
 from rcirl_jax.export.spread import SuiteJob, spread
+from rcirl_jax.planner.safety import TRACKS
 from rcirl_jax.simulation.recorded_config import RecordedConfig
 from rcirl_jax.simulation.rows import BASELINES, human_row
 from rcirl_jax.simulation.suite import (
@@ -53,6 +54,9 @@ _GUARD = flags.DEFINE_string(
     "guard",
     None,
     "hand-set or a weights file: drives where the first is out of its data",
+)
+_FILTER = flags.DEFINE_enum(
+    "filter", "full", TRACKS, "full, or collision: the reward decides the rest"
 )
 _CASES = flags.DEFINE_integer("cases", None, "cases per family, or recorded in all")
 _DURATION = flags.DEFINE_float("duration", None, "s per case at most (smoke 20)")
@@ -108,6 +112,7 @@ def _job() -> SuiteJob:
         dp=_DP.value,
         hand_weights=_HAND.value,
         guard=_GUARD.value,
+        track=_FILTER.value,
     )
 
 

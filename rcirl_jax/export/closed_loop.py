@@ -12,6 +12,7 @@ from rcirl_jax.features import feature_map
 from rcirl_jax.planner.grid import DpConfig
 from rcirl_jax.planner.guard import Guarded
 from rcirl_jax.planner.rank import RankConfig, hand_score, learned_score
+from rcirl_jax.planner.safety import SafetyConfig
 from rcirl_jax.reward import LatticeCost
 from rcirl_jax.simulation.rows import (
     Row,
@@ -57,12 +58,14 @@ def table_rows(
     hand_set: LatticeCost | None = None,
     names: Sequence[str] = (),
     guard: str | None = None,
+    track: str = "full",
 ) -> list[Row]:
     """Learned rows first, in the order of the files, then the baselines.
 
-    Files of one loss and shape are told apart by their seed, or rows bear `names`, one
-    per file. The first drives again by `dp`, and behind a `guard` that names its
-    incumbent ("hand-set" or a weights file). A tuned `hand_set` cost comes last.
+    Files of one loss and shape are told apart by their seed, then by their path, or
+    rows bear `names`, one per file. The first drives again by `dp`, and behind a
+    `guard` that names its incumbent ("hand-set" or a weights file). A tuned `hand_set`
+    cost comes last. `track` is the safety filter's (`SafetyConfig`).
 
     Raises:
       InputError: no file, an unreadable one, path_speed weights, or an unknown
@@ -71,7 +74,7 @@ def table_rows(
     if not weights:
         raise InputError("--weights: none: expected at least one file")
     rewards = [open_reward(path) for path in weights]
-    config = RankConfig()
+    config = RankConfig(safety=SafetyConfig(track=track))
     rows: list[Row] = []
     for number, (reward, path) in enumerate(zip(rewards, weights, strict=True)):
         mode = str(reward.provenance.get("mode", "speed"))
@@ -83,7 +86,9 @@ def table_rows(
         if name in taken:
             name = f"{name} (seed {seed})"
         if name in taken:
-            raise InputError(f"{path}: {name}: met twice: expected distinct runs")
+            name = f"{row_name(reward)} ({path})"
+        if name in taken:
+            raise InputError(f"--weights: {path}: met twice: expected distinct files")
         params = reward_params(reward)
         preset = str(reward.preset)
         rows.append(learned_row(name, params, preset, reward.activation, config, seed))

@@ -41,6 +41,7 @@ class SuiteJob:
     dp: bool = False
     hand_weights: str | None = None
     names: tuple[str, ...] = ()  # of the learned rows; else after loss and shape
+    track: str = "full"  # of the safety filter
     guard: str | None = None  # incumbent of the first weights' guarded row
 
     def rows(self) -> list[Row]:
@@ -55,6 +56,7 @@ class SuiteJob:
             else None,
             names=self.names,
             guard=self.guard,
+            track=self.track,
         )
 
     def cases(self) -> CaseSet:

@@ -95,6 +95,24 @@ def hand_score(
     return -cost
 
 
+def constant_score(params: None, scene: Scene, candidates: Candidates) -> jax.Array:
+    """V = 0, a null: the first admissible candidate is driven.
+
+    That is constant speed where it is admissible: what the filter, the sampler's order
+    and the given path do by themselves.
+    """
+    del params, scene
+    return jnp.zeros(candidates.feasible.shape)
+
+
+def velocity_score(params: None, scene: Scene, candidates: Candidates) -> jax.Array:
+    """V = mean of v over valid times, a null: as fast as the filter allows."""
+    del params
+    valid = scene.time_valid
+    v = jnp.where(valid, candidates.trajectory.v, 0.0)
+    return jnp.sum(v, axis=1) / jnp.sum(valid)
+
+
 def speed_dp_score(params: None, scene: Scene, candidates: Candidates) -> jax.Array:
     """Minus the cost of Apollo's speed DP, published weights; see `speed_dp_cost`."""
     del params

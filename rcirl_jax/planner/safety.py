@@ -20,6 +20,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
+from rcirl_jax.errors import InputError
 from rcirl_jax.features.path import path_view
 from rcirl_jax.geometry.boxes import frenet_extent
 from rcirl_jax.geometry.frenet import lookup
@@ -30,10 +31,16 @@ MOVING_MPS = 1.0  # m/s, above which a body's prediction is uncertain
 CROSSING_MPS = 1.0  # m/s, sideways speed above which a body crosses and leads nobody
 
 
+TRACKS = ("full", "collision")
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SafetyConfig:
     """Margins and limits of the filter; hashable."""
 
+    # "full": all five rules; "collision": only bodies and lines (1 and 2), so that
+    # everything else is the reward's to decide
+    track: str = "full"
     # m added along the road on each side of an obstacle
     margin_along: float = 0.6
     # m/s by which that margin grows with time for bodies that move: their
@@ -61,6 +68,11 @@ class SafetyConfig:
     rss_index: int = 2
     # m by which a violated distance must have grown by then
     rss_recovery: float = 0.3
+
+    def __post_init__(self) -> None:
+        """Reject an unknown track."""
+        if self.track not in TRACKS:
+            raise InputError(f"--filter: {self.track}: expected one of {TRACKS}")
 
 
 class Verdict(flax.struct.PyTreeNode, kw_only=True):
@@ -120,6 +132,8 @@ def _check_one(
     speed = jnp.where(jnp.isfinite(body), x.v[moment], 0.0)
     clear = jnp.isinf(body) & jnp.isinf(line)
     keeps = (margin >= 0.0) | gains
+    if config.track == "collision":
+        inside, keeps = jnp.ones((), bool), jnp.ones((), bool)
     return Verdict(
         admissible=feasible & clear & inside & keeps,
         contact_s=body,

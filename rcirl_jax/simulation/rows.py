@@ -19,12 +19,14 @@ from rcirl_jax.planner.rank import (
     Policy,
     RankConfig,
     Score,
+    constant_score,
     constant_speed_policy,
     hand_score,
     idm_policy,
     learned_score,
     rank_policy,
     speed_dp_score,
+    velocity_score,
 )
 from rcirl_jax.planner.yielding import Yielding, yielding_policy
 from rcirl_jax.reward.hand import TUNED_ROW, LatticeCost
@@ -33,9 +35,10 @@ from rcirl_jax.reward.speed_dp import SPEED_DP_ROW
 from rcirl_jax.types import Normaliser, RewardParams
 
 RECORDED_HUMAN = "recorded human"
+NULLS = ("constant V", "+velocity")  # rewards that know nothing
 BASELINES = (
     *("hand-set", SPEED_DP_ROW, "IDM", "IDM yielding"),
-    *("constant speed", "random weights"),
+    *("constant speed", "random weights", *NULLS),
 )
 
 
@@ -133,6 +136,9 @@ def baseline_row(
         return Row(name=name, policy=rank_policy(hand_score, config))
     if name == SPEED_DP_ROW:
         return Row(name=name, policy=rank_policy(speed_dp_score, config))
+    if name in NULLS:
+        null = constant_score if name == "constant V" else velocity_score
+        return Row(name=name, policy=rank_policy(null, config))
     if name == "IDM":
         return Row(name=name, policy=idm_policy(Idm()))
     if name == "IDM yielding":

@@ -85,6 +85,8 @@ class TrainConfig:
     # what is ranked above the candidates: the "human" curve itself, or the
     # "nearest" feasible candidate to it (what a planner could have driven)
     positive: str = "human"
+    # compare only candidates that the planner's safety filter lets it choose
+    admissible_only: bool = False
     # the others' future: "predicted" as in closed loop, or "recorded" as in the paper
     futures: str = "predicted"
     # s, times after it are not compared, nor their weights learned
@@ -133,6 +135,7 @@ class TrainConfig:
             loss="listwise" if self.loss == "listwise" else "rank",
             positive=self.positive,
             futures=self.futures,
+            admissible_only=self.admissible_only,
             train_horizon=self.train_horizon,
             hard_negatives=self.hard_negatives,
             hard_pool=self.hard_pool,

@@ -17,6 +17,7 @@ import optax
 from rcirl_jax.features import FeatureMap, feature_map
 from rcirl_jax.features.columns import candidate_frames
 from rcirl_jax.planner.prediction import as_seen
+from rcirl_jax.planner.safety import check
 from rcirl_jax.reward import (
     Compared,
     LossConfig,
@@ -123,6 +124,9 @@ def featurise(
         own_key = jax.random.fold_in(key, index)
         valid = demonstration.scene.time_valid & seen
         candidates = candidates_of(own_key, demonstration, config)
+        if config.admissible_only:
+            verdict = check(demonstration.scene, candidates)
+            candidates = candidates.replace(feasible=verdict.admissible)
         driven = human_of(demonstration, config.sampler)
         # the human stands last among the candidates: one pass for all
         join = lambda many, one: jnp.concatenate([many, one[None]])  # noqa: E731
