@@ -168,6 +168,7 @@ class Case(flax.struct.PyTreeNode, kw_only=True):
     agents: Agents
     perception: Perception
     replay: Replay | None = None
+    ego_a: jax.Array | None = None  # [] m/s^2 at t = 0; None: 0
 
 
 class EgoState(flax.struct.PyTreeNode, kw_only=True):

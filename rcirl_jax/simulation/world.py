@@ -42,7 +42,7 @@ def start(case: Case) -> World:
         l=l,
         heading=jnp.arctan(slope / jnp.maximum(1.0 - kappa * l, 0.1)),
         v=case.ego_v,
-        a=jnp.zeros(()),
+        a=jnp.zeros(()) if case.ego_a is None else case.ego_a,
         curvature=curvature,
     )
     state = AgentState(
