@@ -1,17 +1,19 @@
 """The whole tuning loop by one command, from logs to a verdict and its report.
 
-    python -m experiments.autotune --data=DATASET --workdir=RUN [--incumbent=FILE]
+    python -m experiments.autotune --data=DATASET[,DATASET] --workdir=RUN
     python -m experiments.autotune --format=ngsim --input=LOGS --workdir=RUN
+    python -m experiments.autotune --synthetic --recipe=quick --workdir=RUN
 
-import (if there is no --data; synthetic traffic if there is no --format) -> train ->
-export -> rank -> simulate -> gate -> report. Every stage is kept until what it is
-made from changes; a killed run goes on where it was, also one ended by SIGTERM (exit
-status 143) or SIGINT (130), which save the training's step. The candidate is in
-RUN/weights.msgpack; open RUN/report.html. The full suite takes half an hour on two
-cores; `--cases=3 --duration=30` is a look that can prove little. `experiments.gate`
-gives the verdict as its exit status.
+import (unless there is --data) -> rehearse -> train -> export -> rank -> simulate ->
+gate -> report, as the --recipe says; a flag given beside it wins. Every stage is kept
+until what it is made from changes; a killed run goes on where it was, also one ended by
+SIGTERM (exit status 143) or SIGINT (130), which save the training's step. The candidate
+is in RUN/weights.msgpack; open RUN/report.html. `--cases=3 --duration=30` is a look
+that can prove little. `experiments.gate` gives the verdict as its exit status.
 """
 
+import dataclasses
+import difflib
 from pathlib import Path
 
 from absl import flags
@@ -21,25 +23,43 @@ from experiments.common import provenance, run
 from experiments.executor import executor
 from experiments.signals import checked_signals, signals_asked
 from rcirl_jax.autotune import STAGES, Loop, TuneConfig
-from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import IMPORTERS
 from rcirl_jax.data.importing import ImportConfig
 from rcirl_jax.data.logs import Logs
 from rcirl_jax.errors import InputError
+from rcirl_jax.rehearsal import TEACHERS
 from rcirl_jax.stages import file_sha256, only_one
 from rcirl_jax.train.running import Running
 
-flags.set_default(training.POSITIVE, "nearest")  # what a planner can choose
 _WORKDIR = flags.DEFINE_string("workdir", None, "folder of the run", required=True)
-_DATA = flags.DEFINE_string("data", None, "dataset, instead of an import")
-_FORMAT = flags.DEFINE_enum("format", "synthetic", sorted(IMPORTERS), "of --input")
-_INPUT = flags.DEFINE_string("input", None, "recordings to import")
-_SOURCE = flags.DEFINE_string("source", None, "TOML of columns and units of --input")
-_STRIDE = flags.DEFINE_float("stride", 0.5, "s between planning frames of a driver")
+_DATA = flags.DEFINE_list("data", None, "datasets, instead of imports")
+_SYNTHETIC = flags.DEFINE_bool(
+    "synthetic", False, "embedded synthetic traffic instead of data"
+)
+_FORMAT = flags.DEFINE_list("format", None, "of each --input")
+_INPUT = flags.DEFINE_list("input", None, "recordings to import, one or several logs")
+_SOURCE = flags.DEFINE_list("source", None, "TOML of columns and units of each --input")
+_STRIDE = flags.DEFINE_float(
+    "stride", None, "s between planning frames of a driver" + training.AS_SAID
+)
+_KEEP_STEADY = flags.DEFINE_bool(
+    "keep_steady", None, "keep scenes without speed change" + training.AS_SAID
+)
+_KEEP_FREE_ROAD = flags.DEFINE_bool(
+    "keep_free_road", None, "keep scenes without obstacles" + training.AS_SAID
+)
 _INCUMBENT = flags.DEFINE_string(
     "incumbent", "hand-set", "weights file that drives today, or a baseline"
 )
-_SEEDS = flags.DEFINE_integer("seeds", 1, "training runs; the median one drives")
+_SEEDS = flags.DEFINE_integer(
+    "seeds", None, "training runs; the median one drives" + training.AS_SAID
+)
+_TEACHER = flags.DEFINE_enum(
+    "teacher", None, TEACHERS, "who rehearses the catalogue" + training.AS_SAID
+)
+_DRIVES = flags.DEFINE_integer(
+    "drives", 240, "held-out recorded drives, for human-likeness"
+)
 _PARALLEL = flags.DEFINE_string("parallel", "jit", "how the devices share a batch")
 _HORIZON = flags.DEFINE_float("horizon", 5.0, "s at which distances are taken")
 _SUITE = flags.DEFINE_string("suite", "full", "full, smoke, or families with commas")
@@ -55,16 +75,22 @@ _UNTIL = flags.DEFINE_enum("until", "report", STAGES, "last stage")
 
 def main() -> None:
     """Flags -> one run of the loop."""
-    if _DATA.value and signals_asked():
-        raise InputError("--signals: expected with --input, whose lights they are")
+    given, recipe = _given(), training.recipe()
     judged = training.PREFERENCES.value
     path = Path(judged) if judged else None
+    rehearsal = recipe.rehearsal
+    if _TEACHER.value is not None:
+        rehearsal = dataclasses.replace(rehearsal, teacher=_TEACHER.value)
     config = TuneConfig(
         train=training.training_config(preferences=file_sha256(path) if path else ""),
         preferences=path,
         gate=margins.gate_config(),
         incumbent=_INCUMBENT.value,
-        seeds=_SEEDS.value,
+        rehearsal=rehearsal,
+        data_weights=training.DATA_WEIGHTS.value,
+        recipe=recipe.name,
+        seeds=recipe.seeds if _SEEDS.value is None else _SEEDS.value,
+        drives=_DRIVES.value,
         horizon_s=_HORIZON.value,
         suite=_SUITE.value,
         cases=_CASES.value,
@@ -81,17 +107,60 @@ def main() -> None:
         facts=provenance(),
     )
     with only_one(loop.folder):
-        loop.until(_UNTIL.value, _DATA.value or _logs())
+        loop.until(_UNTIL.value, given)
 
 
-def _logs() -> Logs:
-    """The recordings to import."""
-    collect = CollectConfig(stride_s=_STRIDE.value)
+def _given() -> list[str | Logs]:
+    """The sources: datasets, logs, or synthetic traffic."""
+    ways = [bool(_DATA.value), bool(_INPUT.value), _SYNTHETIC.value]
+    if sum(ways) != 1:
+        raise InputError(
+            "--data, --input, --synthetic: expected one of them: datasets of "
+            "import_logs, logs with their --format, or the embedded synthetic traffic"
+        )
+    if _DATA.value:
+        if signals_asked():
+            raise InputError("--signals: expected with --input, whose lights they are")
+        return list(_DATA.value)
+    if _SYNTHETIC.value:
+        return [_logs("synthetic", None, None)]
+    inputs, formats = _INPUT.value or [], _FORMAT.value or []
+    count, sources = len(inputs), _SOURCE.value or []
+    if len(formats) != count or len(sources) not in (0, count):
+        raise InputError(
+            f"--format, --source: {len(formats)} and {len(sources)}: expected one for "
+            f"each of the {count} --input"
+        )
+    for name in formats:
+        if name not in IMPORTERS:
+            near = difflib.get_close_matches(name, IMPORTERS, 1)
+            hint = f"; did you mean {near[0]}?" if near else ""
+            known = ", ".join(sorted(IMPORTERS))
+            raise InputError(f"--format: {name}: expected one of {known}{hint}")
+    return [
+        _logs(name, Path(path), Path(source) if source else None)
+        for name, path, source in zip(
+            formats, inputs, sources or [""] * count, strict=True
+        )
+    ]
+
+
+def _logs(name: str, path: Path | None, source: Path | None) -> Logs:
+    """One log to import, cut as the recipe and the flags say."""
+    collect = training.recipe().collect
+    if _STRIDE.value is not None:
+        collect = dataclasses.replace(collect, stride_s=_STRIDE.value)
+    if _KEEP_STEADY.value is not None:
+        keep = _KEEP_STEADY.value
+        collect = dataclasses.replace(collect, require_speed_change=not keep)
+    if _KEEP_FREE_ROAD.value is not None:
+        keep = _KEEP_FREE_ROAD.value
+        collect = dataclasses.replace(collect, require_obstacles=not keep)
     return Logs(
-        format=_FORMAT.value,
-        input=Path(_INPUT.value) if _INPUT.value else None,
-        source=Path(_SOURCE.value) if _SOURCE.value else None,
-        config=ImportConfig(format=_FORMAT.value, collect=collect),
+        format=name,
+        input=path,
+        source=source,
+        config=ImportConfig(format=name, collect=collect),
         signals=signals_asked(),
         checked=checked_signals,
     )

@@ -51,7 +51,7 @@ _PROCESS = flags.DEFINE_integer("process_id", None, "number of this one")
 def main() -> None:
     """Flags -> one training run."""
     join_processes(_COORDINATOR.value, _PROCESSES.value, _PROCESS.value)
-    dataset = open_datasets(_DATA.value, verify=_VERIFY.value)
+    dataset = open_datasets(_DATA.value, _VERIFY.value, training.DATA_WEIGHTS.value)
     judged = None
     if training.PREFERENCES.value:
         judged = read_preferences(Path(training.PREFERENCES.value), dataset)

@@ -1,102 +1,145 @@
-"""The flags that decide the result of one training run."""
+"""The recipe of a training run, and the flags that may depart from it.
+
+A recipe holds everything that decides a run; no command has a default of its own.
+"""
+
+import dataclasses
+from collections.abc import Sequence
 
 from absl import flags
 
 from experiments.common import floats, hidden_sizes
+from rcirl_jax.data.joined import EQUAL
 from rcirl_jax.errors import InputError
-from rcirl_jax.features import feature_map
+from rcirl_jax.recipes import DEFAULT, Recipe, load_recipe, reward_config
 from rcirl_jax.reward import LOSSES, RewardConfig
-from rcirl_jax.reward.network import CONSTRAINTS
-from rcirl_jax.sampling import SamplerConfig
-from rcirl_jax.train.state import POSITIVES, TrainConfig
+from rcirl_jax.reward.network import CONSTRAINTS, PINS
+from rcirl_jax.sampling.config import MODES
+from rcirl_jax.train.state import (
+    ADMISSIBLE_IN,
+    FUTURES,
+    OPTIMIZERS,
+    POSITIVES,
+    TrainConfig,
+)
 
-_FEATURES = flags.DEFINE_string("features", "paper21", "preset in data_specs/features")
-_MODE = flags.DEFINE_enum(
-    "mode", "speed", ["speed", "path_speed"], "what the sampler varies"
+RECIPE = flags.DEFINE_string(
+    "recipe", DEFAULT, "name in data_specs/recipes, or a TOML file"
 )
-_LOSS = flags.DEFINE_enum("loss", "rank", sorted(LOSSES), "loss on value differences")
+AS_SAID = "; default: as the recipe says"
+
+
+def _text(name: str, text: str) -> flags.FlagHolder:
+    return flags.DEFINE_string(name, None, text + AS_SAID)
+
+
+def _number(name: str, text: str) -> flags.FlagHolder:
+    return flags.DEFINE_float(name, None, text + AS_SAID)
+
+
+def _count(name: str, text: str) -> flags.FlagHolder:
+    return flags.DEFINE_integer(name, None, text + AS_SAID)
+
+
+def _one_of(name: str, values: Sequence[str], text: str) -> flags.FlagHolder:
+    return flags.DEFINE_enum(name, None, list(values), text + AS_SAID)
+
+
+# fields of TrainConfig by the flag of the same name
+_TRAIN = {
+    "features": _text("features", "preset in data_specs/features"),
+    "loss": _one_of("loss", sorted(LOSSES), "loss on value differences"),
+    "soft_distance": _number("soft_distance", "m, temperature of soft labels"),
+    "leaky_rate": _number("leaky_rate", "a of the rank loss"),
+    "optimizer": _one_of("optimizer", sorted(OPTIMIZERS), "gradient method"),
+    "learning_rate": _number("learning_rate", "step size"),
+    "halve_every": _count("halve_every", "steps per halving; 0: never"),
+    "weight_decay": _number("weight_decay", "L2 pull on the weights"),
+    "batch_size": _count("batch_size", "scenes per step, all devices"),
+    "epochs": _count("epochs", "passes over the training scenes"),
+    "positive": _one_of(
+        "positive", POSITIVES, "ranked first: the human curve or its nearest candidate"
+    ),
+    "futures": _one_of("futures", FUTURES, "of the others, as a learner sees them"),
+    "admissible_in": _one_of(
+        "admissible_in",
+        ADMISSIBLE_IN,
+        "scenes that compare only admissible plans",
+    ),
+    "train_horizon": _number("train_horizon", "s that are compared"),
+    "hard_negatives": _count("hard_negatives", "near negatives per scene"),
+    "hard_pool": _count(
+        "hard_pool", "near negatives drawn for each that the present reward keeps"
+    ),
+    "preference_weight": _number(
+        "preference_weight", "of their mean loss beside that of the demonstrations"
+    ),
+}
+_REWARD = {
+    "activation": _one_of(
+        "activation", ("tanh", "relu", "leaky_relu"), "of the hidden layers"
+    ),
+    "constraint": _one_of(
+        "constraint", CONSTRAINTS, "nonnegative costs (linear), monotone in safety"
+    ),
+    "pin": _one_of("pin", PINS, "scale pinning"),
+}
+_MODE = _one_of("mode", MODES, "what the sampler varies")
 _MARGINS = flags.DEFINE_list(
-    "margins", ["0.2", "4", "2"], "hinge: per metre from the human, collision, rule"
+    "margins", None, "hinge: per metre from the human, collision, rule" + AS_SAID
 )
-_SOFT = flags.DEFINE_float("soft_distance", 1.0, "m, temperature of soft labels")
-_LEAKY = flags.DEFINE_float("leaky_rate", 0.05, "a of the rank loss")
-_HIDDEN = flags.DEFINE_list("hidden_size", ["15"], "units per layer; 0 is linear")
-_ACTIVATION = flags.DEFINE_enum(
-    "activation", "tanh", ["tanh", "relu", "leaky_relu"], "of the hidden layers"
-)
-_CONSTRAINT = flags.DEFINE_enum(
-    "constraint", "none", CONSTRAINTS, "nonnegative costs (linear), monotone in safety"
+_HIDDEN = flags.DEFINE_list(
+    "hidden_size", None, "units per layer; 0 is linear" + AS_SAID
 )
 _BY_CONTEXT = flags.DEFINE_bool(
-    "by_context", False, "scale the features by what the scene is like at t = 0"
-)
-_PIN = flags.DEFINE_enum("pin", "unit", ["unit", "none"], "scale pinning")
-_OPTIMIZER = flags.DEFINE_enum(
-    "optimizer", "adam", ["sgd", "adam", "rmsprop"], "gradient method"
-)
-_RATE = flags.DEFINE_float("learning_rate", 3e-3, "step size")
-_HALVE = flags.DEFINE_integer("halve_every", 0, "steps per halving; 0: never")
-_DECAY = flags.DEFINE_float("weight_decay", 0.0, "L2 pull on the weights")
-_BATCH = flags.DEFINE_integer("batch_size", 64, "scenes per step, all devices")
-_EPOCHS = flags.DEFINE_integer("epochs", 20, "passes over the training scenes")
-POSITIVE = flags.DEFINE_enum(
-    "positive",
-    "human",
-    POSITIVES,
-    "ranked first: the human curve or its nearest candidate",
-)
-_HORIZON = flags.DEFINE_float("train_horizon", 8.0, "s that are compared")
-_NEGATIVES = flags.DEFINE_integer("hard_negatives", 0, "near negatives per scene")
-_POOL = flags.DEFINE_integer(
-    "hard_pool", 1, "near negatives drawn for each that the present reward keeps"
+    "by_context", None, "scale features by what the scene is like at t = 0" + AS_SAID
 )
 PREFERENCES = flags.DEFINE_string(
     "preferences", None, "JSON Lines: in a scene, A is better than B"
 )
-_PREFERENCE_WEIGHT = flags.DEFINE_float(
-    "preference_weight", 1.0, "of their mean loss beside that of the demonstrations"
+DATA_WEIGHTS = flags.DEFINE_string(
+    "data_weights", EQUAL, "of several sources: equal, scenes, or a number for each"
 )
 
 
+def recipe() -> Recipe:
+    """The recipe that the flags name, as its file has it."""
+    return load_recipe(RECIPE.value)
+
+
 def training_config(*, preferences: str = "", seed: int = 0) -> TrainConfig:
-    """The run that the flags describe.
+    """The recipe's training, and what flags say besides.
 
     Args:
       preferences: hash of the file of --preferences; empty without one.
       seed: of initial weights, batches, candidates.
     """
-    if len(_MARGINS.value) != 3:
-        raise InputError(f"--margins: {_MARGINS.value}: expected three numbers")
-    margins = floats(_MARGINS.value, "margins")
-    features = feature_map(_FEATURES.value)
-    return TrainConfig(
-        features=_FEATURES.value,
-        loss=_LOSS.value,
-        leaky_rate=_LEAKY.value,
-        margin_distance=margins[0],
-        margin_collision=margins[1],
-        margin_rule=margins[2],
-        soft_distance=_SOFT.value,
-        optimizer=_OPTIMIZER.value,
-        learning_rate=_RATE.value,
-        halve_every=_HALVE.value,
-        weight_decay=_DECAY.value,
-        batch_size=_BATCH.value,
-        epochs=_EPOCHS.value,
-        positive=POSITIVE.value,
-        train_horizon=_HORIZON.value,
-        hard_negatives=_NEGATIVES.value,
-        hard_pool=_POOL.value,
+    base = recipe().train
+    given = {n: flag.value for n, flag in _TRAIN.items() if flag.value is not None}
+    if _MARGINS.value is not None:
+        if len(_MARGINS.value) != 3:
+            raise InputError(f"--margins: {_MARGINS.value}: expected three numbers")
+        names = ("margin_distance", "margin_collision", "margin_rule")
+        given |= dict(zip(names, floats(_MARGINS.value, "margins"), strict=True))
+    sampler = base.sampler
+    if _MODE.value is not None:
+        sampler = dataclasses.replace(sampler, mode=_MODE.value)
+    return dataclasses.replace(
+        base,
+        **given,
         preferences=preferences,
-        preference_weight=_PREFERENCE_WEIGHT.value,
         seed=seed,
-        reward=RewardConfig(
-            hidden=hidden_sizes(_HIDDEN.value),
-            activation=_ACTIVATION.value,
-            pin=_PIN.value,
-            constraint=_CONSTRAINT.value,
-            context=features.context if _BY_CONTEXT.value else (),
-            signs=features.signs if _CONSTRAINT.value == "monotone" else (),
-        ),
-        sampler=SamplerConfig(mode=_MODE.value),
+        reward=_reward(base.reward, given.get("features", base.features)),
+        sampler=sampler,
+    )
+
+
+def _reward(base: RewardConfig, features: str) -> RewardConfig:
+    settings = {n: getattr(base, n) for n in ("hidden", *_REWARD)}
+    settings |= {n: f.value for n, f in _REWARD.items() if f.value is not None}
+    if _HIDDEN.value is not None:
+        settings["hidden"] = hidden_sizes(_HIDDEN.value)
+    by_context = _BY_CONTEXT.value
+    return reward_config(
+        features, settings, bool(base.context) if by_context is None else by_context
     )

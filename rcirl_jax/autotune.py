@@ -1,11 +1,16 @@
 """The tuning loop: data -> rewards -> ranking -> simulation -> verdict -> report.
 
-RUN/dataset-KEY/       the import, unless a dataset is given
+RUN/dataset-KEY/       the import of each log, unless datasets are given
+RUN/rehearsal-KEY/N/   the rehearsed catalogue: the teacher's drives, then each round's
+RUN/rounds/N.msgpack   the reward that the teacher of round N takes over from
 RUN/train-KEY/seed-N/  training runs; KEY changes with what they are made from
 RUN/seeds/N.msgpack    every seed's reward
 RUN/weights.msgpack    the candidate: of the seeds the one with the median share of
                        training pairs won
-RUN/ranking.json       held-out scenes, all seeds beside rivals and incumbent
+RUN/tuned_idm.json     the driver model tuned on the training scenes, a rival
+RUN/ranking.json       held-out scenes as the planner sees them, all seeds beside rivals
+RUN/ranking_recorded.json   the same with recorded futures
+RUN/likeness.json      held-out drives: how near to the human (and likeness.npz, .txt)
 RUN/suite/             metrics.npz, suite.json, cases.csv, table.txt
 RUN/verdict.json       of the gate
 RUN/report.html        all of it to look at
@@ -14,12 +19,13 @@ RUN/stages.json        what made what (`stages`)
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from rcirl_jax.data.importers.files import listing
 from rcirl_jax.data.importing import import_parts
+from rcirl_jax.data.joined import EQUAL, Demonstrations, JoinedDatasets, shares_of
 from rcirl_jax.data.logs import Logs
 from rcirl_jax.data.parts import parts_of
 from rcirl_jax.data.preferences import read_preferences
@@ -32,8 +38,14 @@ from rcirl_jax.evaluation.gate import judge
 from rcirl_jax.evaluation.gate_output import format_verdict, write_verdict
 from rcirl_jax.evaluation.gate_runs import CANDIDATE, INCUMBENT, pair_of
 from rcirl_jax.evaluation.gate_types import GateConfig, Verdict
+from rcirl_jax.evaluation.likeness import (
+    held_out_likeness,
+    read_arrays,
+    write_arrays,
+)
 from rcirl_jax.evaluation.suite_files import SuiteRuns, read_runs, runs_of, write_runs
 from rcirl_jax.evaluation.table import from_json, to_json
+from rcirl_jax.evaluation.tuned_rivals import tune_idm
 from rcirl_jax.executor import Executor
 from rcirl_jax.export.from_run import export_run
 from rcirl_jax.export.gate_job import drive_job, gate_job, left_out
@@ -41,27 +53,31 @@ from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.export.spread import SuiteJob
 from rcirl_jax.export.sweep import SWEEP, read_sweep
+from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm
+from rcirl_jax.rehearsal import Rehearsal, rehearse
 from rcirl_jax.report.recorded_replays import recorded_replays
 from rcirl_jax.report.replays import make_replays
 from rcirl_jax.report.tuning_page import TuningReport, write_tuning_page
 from rcirl_jax.sampling import SamplerConfig
-from rcirl_jax.simulation.rows import BASELINES
+from rcirl_jax.simulation.recorded_scenes import held_out
+from rcirl_jax.simulation.rows import BASELINES, NULLS
 from rcirl_jax.stages import Stages, code_sha256, digest, file_sha256
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.metrics import pairs_won
 from rcirl_jax.train.running import Running
-from rcirl_jax.train.state import TrainConfig
+from rcirl_jax.train.state import FUTURES, TrainConfig
 from rcirl_jax.whole import read_json, write_json, write_whole
 
-STAGES = ("import", "train", "rank", "simulate", "gate", "report")
+STAGES = ("import", "rehearse", "train", "rank", "simulate", "gate", "report")
 # what reads as permission to use weights that are no longer there
 STALE = {
-    **dict.fromkeys(("import", "train"), ("export", "gate", "report")),
-    **dict.fromkeys(("export", "simulate"), ("gate", "report")),
+    **dict.fromkeys(("import", "rehearse", "train"), ("export", "gate", "report")),
+    **dict.fromkeys(("export", "simulate", "likeness"), ("gate", "report")),
     **dict.fromkeys(("rank", "gate"), ("report",)),
 }
 NOTED = ("git_commit", "code_sha256", "versions", "flags")  # of every stage
-RIVALS = ("hand-set", "IDM", "random weights")
+RIVALS = ("hand-set", "IDM", "random weights", *NULLS)
+IDM_EVALUATIONS = 300  # of the search for the tuned IDM
 REPLAYS = 6  # cases to play in the report
 
 
@@ -73,7 +89,11 @@ class TuneConfig:
     gate: GateConfig
     preferences: Path | None = None  # whose hash `train.preferences` is
     incumbent: str = "hand-set"  # weights file or baseline
+    rehearsal: Rehearsal = dataclasses.field(default_factory=Rehearsal)
+    data_weights: str = EQUAL  # of several sources, as `data.joined.shares_of`
+    recipe: str = ""  # its name
     seeds: int = 1
+    drives: int = 240  # held-out, for human-likeness
     horizon_s: float = 5.0
     suite: str = "full"
     cases: int | None = None  # per family
@@ -86,6 +106,8 @@ class TuneConfig:
         """Reject what would fail only after the training."""
         if self.sweep is not None:
             read_sweep(self.sweep)
+        if self.drives < 1:
+            raise InputError(f"--drives: {self.drives}: expected at least 1")
         if self.seeds < 1:
             raise InputError(f"--seeds: {self.seeds}: expected at least 1")
         if self.train.sampler.mode != "speed":
@@ -133,33 +155,45 @@ class Loop:
         """What made a stage besides its inputs."""
         return {"code": code_sha256(), "versions": self.facts["versions"]}
 
-    def until(self, last: str, given: str | Logs) -> None:
+    def until(self, last: str, given: Sequence[str | Logs]) -> None:
         """Run the stages in order, up to and with `last`; says what comes of it."""
         # what would fail only after hours of work
-        self._job()
+        shares = shares_of(self.config.data_weights, len(given))
         self._check_incumbent()
-        dataset = self.data(given)
+        sources = [self.data(one, number) for number, one in enumerate(given)]
+        dataset = sources[0] if len(sources) == 1 else JoinedDatasets(sources, shares)
+        everything: list[Demonstrations] = [dataset]
         steps: dict[str, Callable[[], object]] = {
             "import": lambda: None,
-            "train": lambda: self.train(dataset),
+            "rehearse": lambda: everything.append(self.rehearse(sources, shares)),
+            "train": lambda: self.train(everything[-1]),
             "rank": lambda: self.rank(dataset),
-            "simulate": self.simulate,
+            "simulate": lambda: (self.simulate(), self.likeness(sources)),
             "gate": self.gate,
             "report": lambda: self.report(dataset, given),
         }
         for name in STAGES[: STAGES.index(last) + 1]:
             steps[name]()
         if last in ("gate", "report"):
+            self.say((self.folder / "likeness.txt").read_text())
             self.say(format_verdict(self._verdict))
-        if last != "import":
+        if last not in ("import", "rehearse"):
             self.say(f"weights: {self.weights}")
+            self.say(self._without_effect())
         if last == "report":
             self.say(f"report to open: {self.folder / 'report.html'}")
 
     # ---------------------------------------------------------------- the stages
 
-    def data(self, given: str | Logs) -> Dataset:
-        """Open the dataset, or import the logs."""
+    def _without_effect(self) -> str:
+        """Features that the training never saw vary, in words."""
+        names = open_reward(str(self.weights)).unsupported
+        return "features without effect, for they never vary in the training data: " + (
+            ", ".join(names) or "none"
+        )
+
+    def data(self, given: str | Logs, number: int) -> Dataset:
+        """Open a source's dataset, or import its logs."""
         if isinstance(given, str):
             return open_dataset(given)
         found = parts_of(given.format, given.input, given.source)
@@ -186,39 +220,98 @@ class Loop:
                 ),
             )
 
-        self._run("import", inputs, [folder / "manifest.json"], work)
+        self._run(f"import {number}", inputs, [folder / "manifest.json"], work)
         return open_dataset(folder)
 
-    def train(self, dataset: Dataset) -> None:
+    def rehearse(
+        self, sources: Sequence[Dataset], shares: Sequence[float] | None
+    ) -> Demonstrations:
+        """The sources and the rehearsed catalogue as one; each round trains first."""
+        plan, made = self.config.rehearsal, [*sources]
+        given = list(shares or [float(s.indices("train").size) for s in sources])
+        # a recorded source has the weight 1, whatever the shares add up to
+        scale = len(sources) / sum(given)
+        given = [share * scale for share in given]
+        joined: Demonstrations = _as_one(made, given)
+        for number in range(plan.datasets):
+            learner = None
+            if number:
+                learner = self.folder / "rounds" / f"{number}.msgpack"
+                self._train_round(joined, number, learner)
+            made.append(self._rehearsed(number, learner))
+            given.append(plan.weights[number])
+            joined = _as_one(made, given)
+        return joined
+
+    def _rehearsed(self, number: int, learner: Path | None) -> Dataset:
+        plan, config = self.config.rehearsal, self.config
+        inputs = {
+            "rehearsal": dataclasses.asdict(plan),
+            "number": number,
+            "teacher": self._incumbent_hash() if plan.teacher == "incumbent" else "",
+            "learner": file_sha256(learner) if learner else "",
+        }
+        key = digest({**inputs, **self._code()})[:8]
+        folder = self.folder / f"rehearsal-{key}" / str(number)
+
+        def work() -> None:
+            if (folder / "manifest.json").exists():
+                return  # finished, but not noted: killed in between
+            rehearse(
+                number,
+                plan,
+                folder,
+                incumbent=config.incumbent,
+                learner=learner,
+                before_commit=lambda dataset: dataset.write_facts(
+                    {"data_hash": dataset.hash, "made_by": self.facts}
+                ),
+            )
+
+        self._run(f"rehearse {number}", inputs, [folder / "manifest.json"], work)
+        return open_dataset(folder)
+
+    def _train_round(self, dataset: Demonstrations, number: int, file: Path) -> None:
+        inputs = {**self._train_inputs(dataset), "seed": 0}
+        work = lambda: self._train_one(dataset, 0, file, judged=None)  # noqa: E731
+        self._run(f"rehearse learner {number}", inputs, [file], work)
+
+    def _train_one(
+        self, dataset: Demonstrations, seed: int, file: Path, judged: Path | None
+    ) -> None:
+        """One training run, exported."""
+        config = dataclasses.replace(self.config.train, seed=seed)
+        if judged is None:
+            config = dataclasses.replace(config, preferences="")
+        workdir = self._workdir(dataset, seed)
+        train(
+            dataset,
+            workdir,
+            config,
+            running=self.running,
+            provenance=dict(self.facts),
+            preferences=read_preferences(judged, dataset) if judged else None,
+        )
+        file.parent.mkdir(parents=True, exist_ok=True)
+        export_run(workdir, dataset, file)
+
+    def train(self, dataset: Demonstrations) -> None:
         """Train every seed, export it, choose the median one."""
         inputs, files = self._train_inputs(dataset), self._seed_files()
-
-        def one(number: int) -> None:
-            config = dataclasses.replace(self.config.train, seed=number)
-            workdir = self._workdir(dataset, number)
-            judged = self.config.preferences
-            train(
-                dataset,
-                workdir,
-                config,
-                running=self.running,
-                provenance=dict(self.facts),
-                preferences=read_preferences(judged, dataset) if judged else None,
-            )
-            export_run(workdir, dataset, files[number])
-
+        judged = self.config.preferences
         for number, file in enumerate(files):
             named = {**inputs, "seed": number}
-            self._run(f"train {number}", named, [file], lambda n=number: one(n))
+            one = lambda n=number, f=file: self._train_one(dataset, n, f, judged)  # noqa: E731
+            self._run(f"train {number}", named, [file], one)
         hashes = [file_sha256(file) for file in files]
         choose = lambda: self._choose(dataset)  # noqa: E731
         self._run("export", {"seeds": hashes}, [self.weights], choose)
 
-    def _train_inputs(self, dataset: Dataset) -> dict:
+    def _train_inputs(self, dataset: Demonstrations) -> dict:
         settings = dataclasses.asdict(self.config.train)
         return {"config": settings, "dataset": dataset.hash, **self._code()}
 
-    def _workdir(self, dataset: Dataset, seed: int) -> Path:
+    def _workdir(self, dataset: Demonstrations, seed: int) -> Path:
         key = digest(self._train_inputs(dataset))[:8]
         return self.folder / f"train-{key}" / f"seed-{seed}"
 
@@ -226,7 +319,7 @@ class Loop:
         numbers = range(self.config.seeds)
         return [self.folder / "seeds" / f"{number}.msgpack" for number in numbers]
 
-    def _choose(self, dataset: Dataset) -> None:
+    def _choose(self, dataset: Demonstrations) -> None:
         """The seed with the median share of training pairs won becomes candidate."""
         config = self.config.train
         steps = -(-dataset.indices("train").size // config.batch_size)
@@ -239,14 +332,40 @@ class Loop:
         median = self._seed_files()[ranked[(len(ranked) - 1) // 2]]
         write_whole(self.weights, median.read_bytes())
 
-    def rank(self, dataset: Dataset) -> None:
-        """Held-out scenes, all seeds beside incumbent and rivals."""
-        config, path = self.config, self.folder / "ranking.json"
+    def rank(self, dataset: Demonstrations) -> None:
+        """Held-out scenes in both forms, all seeds beside incumbent and rivals."""
+        self._tune_idm(dataset)
+        for futures in FUTURES:
+            self._rank(dataset, futures)
+
+    def _tune_idm(self, dataset: Demonstrations) -> None:
+        """The rival that a sceptic names: IDM tuned on the same training scenes."""
+        path = self.folder / "tuned_idm.json"
+        setup = RankingSetup(horizon_s=self.config.horizon_s)
+        inputs = {"dataset": dataset.hash, "evaluations": IDM_EVALUATIONS}
+
+        def work() -> None:
+            found = tune_idm(dataset, setup, IDM_EVALUATIONS)
+            write_json(path, dataclasses.asdict(found))
+
+        self._run("tune", inputs, [path], work)
+
+    @property
+    def _tuned_idm(self) -> Idm:
+        found = read_json(self.folder / "tuned_idm.json", "a tuned IDM")
+        return Idm(**{name: float(value) for name, value in found.items()})
+
+    def _rank(self, dataset: Demonstrations, futures: str) -> None:
+        config, tuned = self.config, self._tuned_idm
+        stem = "ranking" if futures == "predicted" else f"ranking_{futures}"
+        path, text = self.folder / f"{stem}.json", self.folder / f"{stem}.txt"
         inputs = {
             "dataset": dataset.hash,
             "seeds": [file_sha256(file) for file in self._seed_files()],
             "incumbent": self._incumbent_hash(),
             "horizon_s": config.horizon_s,
+            "futures": futures,
+            "tuned_idm": dataclasses.asdict(tuned),
         }
 
         def work() -> None:
@@ -259,16 +378,19 @@ class Loop:
                 preset=str(rewards[0].preset),
                 sampler=SamplerConfig(mode=config.train.sampler.mode),
                 horizon_s=config.horizon_s,
+                futures=futures,
+                tuned={TUNED_IDM_ROW: [tuned]},
             )
-            references = [*([INCUMBENT] if known else []), "hand-set", "random"]
+            own = [INCUMBENT] if known else []
+            references = [*own, "hand-set", TUNED_IDM_ROW, "random"]
             report = evaluate_ranking(
                 dataset, learned, setup, self.executor, references
             )
-            write_whole(self.folder / "ranking.txt", format_table(report, 118) + "\n")
+            write_whole(text, format_table(report, 118) + "\n")
             made_by = {**self._made_by(), "data_hash": dataset.hash}
             write_json(path, {**to_json(report), "made_by": made_by})
 
-        self._run("rank", inputs, [path, self.folder / "ranking.txt"], work)
+        self._run(f"rank {futures}", inputs, [path, text], work)
 
     def simulate(self) -> None:
         """Candidate, incumbent and rivals on the same closed-loop cases."""
@@ -284,12 +406,33 @@ class Loop:
         names = ("metrics.npz", "suite.json", "cases.csv", "table.txt")
         self._run("simulate", inputs, [folder / name for name in names], work)
 
+    def likeness(self, sources: Sequence[Dataset]) -> None:
+        """Every row over held-out drives of all sources: how near to the human."""
+        job, _ = self._job()
+        paths = [self.folder / f"likeness.{kind}" for kind in ("npz", "json", "txt")]
+
+        def work() -> None:
+            drives = held_out(sources, self.config.drives)
+            found = held_out_likeness(drives, job.rows())
+            write_arrays(paths[0], found.likeness)
+            body = {**found.as_dict(), "made_by": self._made_by()}
+            write_json(paths[1], body)
+            write_whole(paths[2], found.text())
+
+        inputs = {
+            "datasets": [source.hash for source in sources],
+            "drives": self.config.drives,
+            "job": self._job_inputs(),
+        }
+        self._run("likeness", inputs, paths, work)
+
     def gate(self) -> None:
         """The verdict."""
         path = self.folder / "verdict.json"
         metrics = self.folder / "suite" / "metrics.npz"
         inputs = {
             "metrics": file_sha256(metrics),
+            "likeness": file_sha256(self.folder / "likeness.npz"),
             "gate": dataclasses.asdict(self.config.gate),
             "incumbent": self._job()[1],
             "left_out": left_out(self._job()[0]),
@@ -303,7 +446,7 @@ class Loop:
 
         self._run("gate", inputs, [path], work)
 
-    def report(self, dataset: Dataset, given: str | Logs) -> Path:
+    def report(self, dataset: Demonstrations, given: Sequence[str | Logs]) -> Path:
         """report.html from everything above."""
         path = self.folder / "report.html"
         made_from = ("ranking.json", "suite/metrics.npz", "verdict.json")
@@ -312,7 +455,7 @@ class Loop:
             "weights": file_sha256(self.weights),
             "incumbent": self._incumbent_hash(),
             "dataset": dataset.hash,
-            "recorded": not isinstance(given, str),
+            "recorded": [not isinstance(one, str) for one in given],
         }
         if self.config.sweep:
             inputs["sweep"] = file_sha256(self.config.sweep / SWEEP)
@@ -338,13 +481,20 @@ class Loop:
     @functools.cached_property
     def _verdict(self) -> Verdict:
         job, incumbent = self._job()
-        return judge(pair_of(self._runs, incumbent), self.config.gate, left_out(job))
+        known = read_arrays(self.folder / "likeness.npz")
+        pair = pair_of(self._runs, incumbent, self.config.gate.nulls, known)
+        return judge(pair, self.config.gate, left_out(job))
 
-    def _draw(self, path: Path, dataset: Dataset, given: str | Logs) -> None:
+    def _draw(
+        self, path: Path, dataset: Demonstrations, given: Sequence[str | Logs]
+    ) -> None:
         job, incumbent = self._job()
         verdict = self._verdict
         names = [f"train {number}" for number in range(self.config.seeds)]
-        names = ["import", *names, "export", "rank", "simulate", "gate"]
+        imports = [f"import {number}" for number in range(len(given))]
+        ranks = [f"rank {futures}" for futures in FUTURES]
+        after = ["export", *ranks, "simulate", "likeness", "gate"]
+        names = [*imports, *names, *after]
         known = self.stages.read()
         made = {  # but by what: the page says it once, stages.json of each
             name: {key: x for key, x in known[name].items() if key != "made_by"}
@@ -358,9 +508,10 @@ class Loop:
         shown = verdict.look_at[:REPLAYS] or job.cases().ids[:2]
         every = self.config.plan_every
         replays = make_replays(drivers, job.cases(), shown, every)
-        if isinstance(given, Logs):
-            parts = parts_of(given.format, given.input, given.source)
-            replays += recorded_replays(drivers, parts, every)
+        for one in given:
+            if isinstance(one, Logs):
+                parts = parts_of(one.format, one.input, one.source)
+                replays += recorded_replays(drivers, parts, every)
         sweep = self.config.sweep
         seed = int(rewards[CANDIDATE].provenance["seed"])
         write_tuning_page(
@@ -411,6 +562,7 @@ class Loop:
             catalogue_seed=config.catalogue_seed,
             plan_every=config.plan_every,
             rivals=RIVALS,
+            tuned_idm=tuple(dataclasses.asdict(self._tuned_idm).items()),
         )
 
     def _job_inputs(self) -> dict:
@@ -420,3 +572,8 @@ class Loop:
             "refs": digest([ref.id for ref in job.refs]),
             "weights": [file_sha256(Path(file)) for file in job.weights],
         }
+
+
+def _as_one(parts: Sequence[Dataset], shares: Sequence[float]) -> Demonstrations:
+    """Datasets joined under their shares; one alone as it is."""
+    return parts[0] if len(parts) == 1 else JoinedDatasets(parts, shares)

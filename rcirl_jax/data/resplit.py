@@ -60,6 +60,10 @@ class Resplit:
         """[m] number of the block of rows, unpacked together, that each lies in."""
         return self._dataset.blocks(indices)
 
+    def weights(self, indices: np.ndarray) -> np.ndarray:
+        """[m] float32 weight of each scene in a training loss."""
+        return self._dataset.weights(indices)
+
     def load(self, split: str | None) -> Demonstration:
         """All rows of a split in memory."""
         return self._dataset.read(self.indices(split))

@@ -380,6 +380,10 @@ class Dataset:
     def _groups(self) -> np.ndarray:
         return self._read(np.arange(self.count), ("group",))["group"]
 
+    def weights(self, indices: np.ndarray) -> np.ndarray:
+        """[m] float32 weight of each scene in a training loss: 1 in a single source."""
+        return np.ones(np.size(indices), np.float32)
+
     def blocks(self, indices: np.ndarray) -> np.ndarray:
         """[m] number of the block of rows, unpacked together, that each lies in."""
         shard = np.searchsorted(self._starts, indices, side="right") - 1

@@ -177,6 +177,7 @@ class FrozenSets:
         self, dataset: Demonstrations, split: str = "train", *, nearest: int = 0
     ) -> None:
         self.rows, self.index = dataset.load(split), dataset.indices(split)
+        self.weights = dataset.weights(self.index)
         self.nearest = nearest
         self._made: dict[TrainConfig, FeatureBatch] = {}
 
@@ -185,6 +186,7 @@ class FrozenSets:
         key = config.for_features
         if key not in self._made:
             made = freeze(self.rows, self.index, key)
+            made = made.replace(weight=jnp.asarray(self.weights))
             if self.nearest:
                 apart = jnp.where(made.feasible, made.facts.distance, jnp.inf)
                 place = jnp.argsort(jnp.argsort(apart, axis=1), axis=1)

@@ -14,7 +14,9 @@ numpy, float64.
 """
 
 import dataclasses
+import io
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -31,6 +33,7 @@ from rcirl_jax.simulation.cases import STEP_S, Record
 from rcirl_jax.simulation.recorded_scenes import STEPS, HeldOut
 from rcirl_jax.simulation.rollout import LANES, RolloutConfig, drive_cases
 from rcirl_jax.simulation.rows import RECORDED_HUMAN, Row, human_row
+from rcirl_jax.whole import write_whole
 
 TIMES_SHOWN_S = (1.0, 3.0, 5.0, 8.0)  # s at which distances are printed
 # what is compared as a distribution: lowest, highest, bins
@@ -155,6 +158,31 @@ class LikenessReport:
             "human's; a to TTC: how unlike the human's distribution, 0 to 1"
         )
         return "\n".join([title, *table, note]) + "\n"
+
+
+def write_arrays(path: Path, known: Likeness) -> None:
+    """The distances as an npz file, whole or not at all."""
+    names = list(known.distance)
+    table = np.array([known.distance[name] for name in names], np.float64)
+    content = io.BytesIO()
+    np.savez(content, names=np.array(names), distance=table, clusters=known.clusters)
+    write_whole(path, content.getvalue())
+
+
+def read_arrays(path: Path) -> Likeness:
+    """Distances written by `write_arrays`.
+
+    Raises:
+      InputError: no such file, or not as written.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            names, table = file["names"].tolist(), file["distance"]
+            clusters = file["clusters"]
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(f"{path}: {error}: expected distances as written") from error
+    distance = dict(zip(names, table, strict=True))
+    return Likeness(distance=distance, clusters=clusters)
 
 
 def jensen_shannon(a: np.ndarray, b: np.ndarray, name: str) -> float:

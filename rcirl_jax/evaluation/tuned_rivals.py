@@ -200,6 +200,25 @@ def tuned_rivals(
     return found
 
 
+def tune_idm(
+    dataset: Demonstrations, setup: RankingSetup, evaluations: int = 300, seed: int = 0
+) -> Idm:
+    """The driver model that ends nearest to the humans of the training split.
+
+    Args:
+      dataset: only its training split is read.
+      setup: sampler, horizon and what is seen of the others.
+      evaluations: of the search.
+      seed: of the search and its `LONG_SCENES` drawn scenes.
+    """
+    own = dataclasses.replace(setup, split="train")
+    problem = idm_problem(dataset, own, LONG_SCENES, seed)
+    start = np.zeros(len(TUNABLE_IDM))
+    best = tune(problem.objective, start, SIGMA, evaluations, seed).vector
+    found = idm_of(jnp.asarray(best, jnp.float32)).fields()
+    return Idm(**{name: float(value) for name, value in found.items()})
+
+
 def as_numbers(rivals: Iterable[Rival]) -> list[dict[str, float]]:
     """The parameters of each, for a JSON file."""
     return [{n: float(x) for n, x in rival.fields().items()} for rival in rivals]

@@ -9,9 +9,15 @@ from rcirl_jax.export.guard import Limits, bounds
 from rcirl_jax.export.loading import open_reward, reward_params, row_name
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.features import feature_map
+from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm
 from rcirl_jax.planner.grid import DpConfig
 from rcirl_jax.planner.guard import Guarded
-from rcirl_jax.planner.rank import RankConfig, hand_score, learned_score
+from rcirl_jax.planner.rank import (
+    RankConfig,
+    hand_score,
+    idm_policy,
+    learned_score,
+)
 from rcirl_jax.planner.safety import SafetyConfig
 from rcirl_jax.reward import LatticeCost
 from rcirl_jax.simulation.rows import (
@@ -56,6 +62,7 @@ def table_rows(
     *,
     dp: bool = False,
     hand_set: LatticeCost | None = None,
+    tuned_idm: Idm | None = None,
     names: Sequence[str] = (),
     guard: str | None = None,
     track: str = "full",
@@ -64,8 +71,8 @@ def table_rows(
 
     Files of one loss and shape are told apart by their seed, then by their path, or
     rows bear `names`, one per file. The first drives again by `dp`, and behind a
-    `guard` that names its incumbent ("hand-set" or a weights file). A tuned `hand_set`
-    cost comes last. `track` is the safety filter's (`SafetyConfig`).
+    `guard` that names its incumbent ("hand-set" or a weights file). Tuned rivals come
+    last. `track` is the safety filter's (`SafetyConfig`).
 
     Raises:
       InputError: no file, an unreadable one, path_speed weights, or an unknown
@@ -73,45 +80,47 @@ def table_rows(
     """
     if not weights:
         raise InputError("--weights: none: expected at least one file")
-    rewards = [open_reward(path) for path in weights]
     config = RankConfig(safety=SafetyConfig(track=track))
+    rewards = [open_reward(path) for path in weights]
+    rows = _learned_rows(rewards, names, config)
+    first = rewards[0]
+    preset, params = str(first.preset), reward_params(first)
+    if dp:
+        slow = max(plan_every, DP_EVERY)
+        of = (params, preset, first.activation, config, DpConfig(), slow)
+        rows.insert(1, dp_row(f"{rows[0].name} DP", *of))
+    if guard:
+        rows.insert(1, _guarded(rows[0].name, first, guard, config))
+    rows += [baseline_row(name, preset, params[1], config) for name in baselines]
+    if hand_set is not None:
+        rows.append(tuned_row(hand_set, config))
+    if tuned_idm is not None:
+        rows.append(Row(name=TUNED_IDM_ROW, policy=idm_policy(tuned_idm)))
+    return rows
+
+
+def _learned_rows(
+    rewards: Sequence[Reward], names: Sequence[str], config: RankConfig
+) -> list[Row]:
+    """One row a file, under distinct names."""
     rows: list[Row] = []
-    for number, (reward, path) in enumerate(zip(rewards, weights, strict=True)):
+    for number, reward in enumerate(rewards):
         mode = str(reward.provenance.get("mode", "speed"))
         if mode != "speed":
-            raise InputError(f"{path}: mode: {mode}: the closed loop plans speed")
+            raise InputError(
+                f"{reward.file}: mode: {mode}: the closed loop plans speed"
+            )
         seed = int(reward.provenance.get("seed") or 0)
         name = names[number] if names else row_name(reward)
         taken = {row.name for row in rows}
         if name in taken:
             name = f"{name} (seed {seed})"
         if name in taken:
-            name = f"{row_name(reward)} ({path})"
+            name = f"{row_name(reward)} ({reward.file})"
         if name in taken:
-            raise InputError(f"--weights: {path}: met twice: expected distinct files")
-        params = reward_params(reward)
-        preset = str(reward.preset)
-        rows.append(learned_row(name, params, preset, reward.activation, config, seed))
-    first = rewards[0]
-    if dp:
-        slow = max(plan_every, DP_EVERY)
-        rows.insert(
-            1,
-            dp_row(
-                f"{rows[0].name} DP",
-                reward_params(first),
-                str(first.preset),
-                first.activation,
-                config,
-                DpConfig(),
-                slow,
-            ),
-        )
-    if guard:
-        rows.insert(1, _guarded(rows[0].name, first, guard, config))
-    normaliser = reward_params(first)[1]
-    for name in baselines:
-        rows.append(baseline_row(name, str(first.preset), normaliser, config))
-    if hand_set is not None:
-        rows.append(tuned_row(hand_set, config))
+            raise InputError(
+                f"--weights: {reward.file}: met twice: expected distinct files"
+            )
+        made = reward_params(reward), str(reward.preset), reward.activation
+        rows.append(learned_row(name, *made, config, seed))
     return rows

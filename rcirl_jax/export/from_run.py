@@ -80,7 +80,7 @@ def config_of(settings: Mapping[str, Any]) -> TrainConfig:
     for name in ("reward", "sampler"):
         settings[name]  # these are no flags with a default
     # runs of before the planner's prediction learned from the record
-    settings = {"futures": "recorded", **settings}
+    settings = {"futures": "recorded", "admissible_in": "none", **settings}
     return typed_settings(TrainConfig, settings)
 
 

@@ -29,6 +29,7 @@ def gate_job(
     catalogue_seed: int,
     plan_every: int,
     rivals: Sequence[str] = ("IDM",),
+    tuned_idm: tuple[tuple[str, float], ...] = (),
 ) -> tuple[SuiteJob, str]:
     """The suite that both drive, and the name of the incumbent's row.
 
@@ -41,6 +42,7 @@ def gate_job(
       catalogue_seed: of the cases.
       plan_every: steps of 0.1 s between two plans.
       rivals: further baselines.
+      tuned_idm: fields of a further IDM row; empty without one.
 
     Raises:
       InputError: a duration, suite or count that cannot be.
@@ -62,6 +64,7 @@ def gate_job(
         refs=suite_refs(suite, cases, catalogue_seed),
         duration_s=duration,
         plan_every=plan_every,
+        tuned_idm=tuned_idm,
     )
     return job, INCUMBENT if learned else incumbent
 

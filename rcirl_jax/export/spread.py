@@ -16,6 +16,7 @@ from rcirl_jax.evaluation.closed_loop import Drive, SuiteConfig
 from rcirl_jax.executor import Executor
 from rcirl_jax.export.closed_loop import table_rows
 from rcirl_jax.export.hand_weights import load_hand_weights
+from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.simulation.careful import judges
 from rcirl_jax.simulation.metrics import CaseMetrics
 from rcirl_jax.simulation.rollout import LANES
@@ -41,6 +42,7 @@ class SuiteJob:
     dp: bool = False
     hand_weights: str | None = None
     names: tuple[str, ...] = ()  # of the learned rows; else after loss and shape
+    tuned_idm: tuple[tuple[str, float], ...] = ()  # fields of a further IDM row
     track: str = "full"  # of the safety filter
     guard: str | None = None  # incumbent of the first weights' guarded row
 
@@ -57,6 +59,7 @@ class SuiteJob:
             names=self.names,
             guard=self.guard,
             track=self.track,
+            tuned_idm=Idm(**dict(self.tuned_idm)) if self.tuned_idm else None,
         )
 
     def cases(self) -> CaseSet:

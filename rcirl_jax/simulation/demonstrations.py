@@ -41,7 +41,7 @@ from rcirl_jax.simulation.rollout import (
     drive_cases,
 )
 from rcirl_jax.simulation.suite import CaseRef, build
-from rcirl_jax.types import Ego, Kind, Obstacles, Scene
+from rcirl_jax.types import Ego, Kind, Obstacles, Scene, Tag
 from rcirl_jax.types import Path as ScenePath
 from rcirl_jax.units import HORIZON_S, NUM_OBSTACLES, TIMES_S
 
@@ -108,6 +108,8 @@ def _rows(
         row["s_at_5s"] = float(np.interp(now + 5.0, clock, s) - origin)
         row["frame"] = round(now / STEP_S)
         add_labels([row])
+        row["tags"] = row["tags"].copy()
+        row["tags"][Tag.REHEARSED] = True
         yield row
 
 

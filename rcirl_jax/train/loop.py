@@ -233,7 +233,9 @@ def _train(
         """The next batch, on its devices before its step, and where it stands."""
         if batches.state()["epoch"] >= config.epochs:
             raise StopIteration
-        made = host_batch(*next(batches), run.judged_at(next(steps)))
+        rows, weight, index = next(batches)
+        weight = weight * dataset.weights(index)
+        made = host_batch(rows, weight, index, run.judged_at(next(steps)))
         return parallel.place(made), batches.state()
 
     # a signal waits for the end of the step, and for what is being saved

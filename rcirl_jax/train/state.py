@@ -32,6 +32,7 @@ OPTIMIZERS: dict[
 POSITIVES = ("human", "nearest")
 # what the learner sees of the others' future: the planner's prediction, or the record
 FUTURES = ("predicted", "recorded")
+ADMISSIBLE_IN = ("none", "rehearsed", "all")
 
 
 # least, most, in words
@@ -85,8 +86,9 @@ class TrainConfig:
     # what is ranked above the candidates: the "human" curve itself, or the
     # "nearest" feasible candidate to it (what a planner could have driven)
     positive: str = "human"
-    # compare only candidates that the planner's safety filter lets it choose
-    admissible_only: bool = False
+    # scenes in which only candidates that the planner's safety filter admits are
+    # compared: "none", "rehearsed" ones (a planner drove there), or "all"
+    admissible_in: str = "rehearsed"
     # the others' future: "predicted" as in closed loop, or "recorded" as in the paper
     futures: str = "predicted"
     # s, times after it are not compared, nor their weights learned
@@ -106,7 +108,7 @@ class TrainConfig:
     def __post_init__(self) -> None:
         """Reject values out of range with the flag's name."""
         known = {"loss": LOSSES, "optimizer": OPTIMIZERS, "positive": POSITIVES}
-        known["futures"] = FUTURES
+        known |= {"futures": FUTURES, "admissible_in": ADMISSIBLE_IN}
         for name, values in known.items():
             if getattr(self, name) not in values:
                 raise InputError(
@@ -135,7 +137,7 @@ class TrainConfig:
             loss="listwise" if self.loss == "listwise" else "rank",
             positive=self.positive,
             futures=self.futures,
-            admissible_only=self.admissible_only,
+            admissible_in=self.admissible_in,
             train_horizon=self.train_horizon,
             hard_negatives=self.hard_negatives,
             hard_pool=self.hard_pool,

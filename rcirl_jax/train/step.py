@@ -53,6 +53,7 @@ from rcirl_jax.types import (
     Demonstration,
     Normaliser,
     RewardParams,
+    Tag,
     Trajectory,
 )
 from rcirl_jax.units import TIMES_S
@@ -124,9 +125,11 @@ def featurise(
         own_key = jax.random.fold_in(key, index)
         valid = demonstration.scene.time_valid & seen
         candidates = candidates_of(own_key, demonstration, config)
-        if config.admissible_only:
-            verdict = check(demonstration.scene, candidates)
-            candidates = candidates.replace(feasible=verdict.admissible)
+        if config.admissible_in != "none":
+            admitted = check(demonstration.scene, candidates).admissible
+            if config.admissible_in == "rehearsed":
+                admitted = admitted | ~demonstration.scene.tags[Tag.REHEARSED]
+            candidates = candidates.replace(feasible=candidates.feasible & admitted)
         driven = human_of(demonstration, config.sampler)
         # the human stands last among the candidates: one pass for all
         join = lambda many, one: jnp.concatenate([many, one[None]])  # noqa: E731
