@@ -11,6 +11,8 @@ import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
+import jax.numpy as jnp
+
 from rcirl_jax.data.store import Dataset, open_dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.closed_loop import table_rows
@@ -24,10 +26,14 @@ from rcirl_jax.planner.rank import (
     learned_score,
     rank_policy,
 )
+from rcirl_jax.reward import LatticeCost
 from rcirl_jax.simulation.demonstrations import DriveConfig, drive_catalogue
 from rcirl_jax.simulation.suite import suite_refs
 
-TEACHERS = ("none", "driver model", "hand-set", "incumbent")
+TEACHERS = ("none", "driver model", "hand-set", "calm hand-set", "incumbent")
+# what the calm teacher multiplies the hand-set cost's jerk weight by: on validation
+# cases as much way and a tenth more drives within the jerk bound
+CALM_JERK = 6.0
 SUITE_SEED = 0  # of the catalogue that rewards are judged on
 
 
@@ -100,6 +106,10 @@ def teacher_of(rehearsal: Rehearsal, incumbent: str) -> tuple[Policy, Params] | 
     """
     if rehearsal.teacher == "driver model":
         return None
+    if rehearsal.teacher == "calm hand-set":
+        usual = LatticeCost()
+        calm = dataclasses.replace(usual, jerk=CALM_JERK * jnp.asarray(usual.jerk))
+        return rank_policy(hand_score, RankConfig()), calm.fields()
     name = "hand-set" if rehearsal.teacher == "hand-set" else incumbent
     if name == "hand-set":
         return rank_policy(hand_score, RankConfig()), None

@@ -1,0 +1,174 @@
+"""Stored scenes driven in closed loop: the human comes back, and draws are even."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rcirl_jax.data.assemble import assemble
+from rcirl_jax.data.collect import Collector
+from rcirl_jax.data.config import CollectConfig
+from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.gate_types import Likeness
+from rcirl_jax.evaluation.likeness import (
+    held_out_likeness,
+    jensen_shannon,
+    read_arrays,
+    write_arrays,
+)
+from rcirl_jax.planner.baselines import Idm
+from rcirl_jax.planner.plan import held
+from rcirl_jax.planner.prediction import as_seen
+from rcirl_jax.planner.rank import idm_policy
+from rcirl_jax.simulation.recorded_scenes import (
+    CLOCK_S,
+    STEPS,
+    case_of,
+    drawn_evenly,
+    held_out,
+)
+from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases
+from rcirl_jax.simulation.rows import RECORDED_HUMAN, Row
+from rcirl_jax.types import Kind
+from tests.planner.test_prediction import tracks
+from tests.simulation.test_recorded import straight
+
+
+def stored(count=6):
+    """Demonstrations [n] of a hand-made log: a leader that brakes, others beside."""
+    config = CollectConfig(
+        smoothing_s=0.0, require_speed_change=False, require_obstacles=False
+    )
+    rows = [r for r in Collector(straight(tracks()), config).scenes()]
+    rows = [row for row in rows if row["track"] in (0, 3)][:count]
+    numbers = [row["track"] for row in rows]
+    return assemble(rows, vehicles=numbers, groups=numbers, recording=0)
+
+
+class Rows:
+    """As much of a dataset as held-out drives ask for."""
+
+    def __init__(self, rows):
+        self.rows = rows
+
+    def indices(self, split):
+        return np.arange(self.rows.vehicle.size if split == "test" else 0)
+
+    def read(self, index):
+        return jax.tree.map(lambda x: np.asarray(x)[index], self.rows)
+
+
+def coast(params, scene, key, before):
+    return held(scene.ego.v, 0.0 * scene.ego.v)
+
+
+def test_the_human_drives_its_own_log_and_the_planner_sees_the_stored_scene():
+    drives = held_out([Rows(stored())], 6)
+    config = RolloutConfig(steps=STEPS, follow_log=True, scenes=True)
+    record, _, scenes = drive_cases(coast, None, drives.cases, config)
+    assert not np.any(np.asarray(record.collision))
+    for i, steps in enumerate(np.asarray(drives.cases.steps)):
+        human = jax.tree.map(lambda x, i=i: np.asarray(x)[i], drives.rows.human)
+        expected = np.interp(CLOCK_S[1 : steps + 1], np.linspace(0, 8, 18), human.s)
+        # linear between the stored times: they lie closer than the curve bends
+        np.testing.assert_allclose(record.s[i, :steps], expected, atol=0.05)
+    seen = jax.tree.map(lambda x: np.asarray(x)[:, 0], scenes)
+    wanted = jax.vmap(as_seen)(jax.tree.map(jnp.asarray, drives.rows.scene))
+    for name in ("l", "v", "a", "length", "width"):
+        np.testing.assert_allclose(
+            getattr(seen.ego, name), getattr(wanted.ego, name), atol=2e-3, err_msg=name
+        )
+    known = np.asarray(wanted.obstacles.valid)[..., 0]
+    np.testing.assert_array_equal(seen.obstacles.valid[..., 0], known)
+    for name in ("s_lower", "s_upper", "l_lower", "l_upper", "speed"):
+        one = getattr(seen.obstacles, name)[..., 0][known]
+        two = np.asarray(getattr(wanted.obstacles, name))[..., 0][known]
+        np.testing.assert_allclose(one, two, atol=2e-2, err_msg=name)
+    np.testing.assert_allclose(
+        seen.path.speed_limit, wanted.path.speed_limit, atol=1e-2
+    )
+
+
+def test_a_case_ends_where_the_mask_ends():
+    one = jax.tree.map(lambda x: np.asarray(x)[0], stored(1))
+    cut = np.arange(18) < 8  # to 3.29 s
+    short = case_of(one.replace(scene=one.scene.replace(time_valid=cut)))
+    assert int(short.steps) == 32
+    assert not short.replay.present[:, 33:].any()
+
+
+def test_a_line_that_demands_a_stop_for_a_time_is_a_red_light():
+    one = jax.tree.map(lambda x: np.asarray(x)[0], stored(1))
+    o = one.scene.obstacles
+    slot = 15
+    valid = o.valid.copy()
+    valid[slot] = np.arange(18) < 10
+    kind = o.kind.copy()
+    kind[slot] = Kind.STOP
+    lower = o.s_lower.copy()
+    lower[slot] = 40.0
+    lined = o.replace(valid=valid, kind=kind, s_lower=lower)
+    case = case_of(one.replace(scene=one.scene.replace(obstacles=lined)))
+    assert float(case.lines.s[0]) == 40.0
+    assert float(case.lines.red[0]) == pytest.approx(10 * 8 / 17, rel=1e-5)
+    assert float(case.lines.offset[0]) == float(case.lines.green[0])
+
+
+def test_draws_are_even_over_recordings_and_vehicles():
+    rows = stored()
+    many = jax.tree.map(lambda x: np.repeat(np.asarray(x)[:1], 130, 0), rows)
+    recording = np.repeat([0, 1, 2], [100, 20, 10]).astype(np.int32)
+    vehicle = np.concatenate([np.arange(100) // 50, np.arange(20), np.arange(10)])
+    many = many.replace(recording=recording, vehicle=vehicle.astype(np.int32))
+    at = drawn_evenly(many, 30, seed=0)
+    assert np.bincount(recording[at]).tolist() == [10, 10, 10]
+    first = vehicle[at][recording[at] == 0]
+    assert np.bincount(first).tolist() == [5, 5]
+    assert not np.array_equal(at, drawn_evenly(many, 30, seed=1))
+    assert np.array_equal(at, drawn_evenly(many, 30, seed=0))
+
+
+def test_distances_are_those_of_the_drives(tmp_path):
+    """Coasting against a human who brakes at 0.2 m/s^2.
+
+    The ego starts with the human's braking, which fades with the drive train's lag of
+    0.2 s: 0.1 t^2 - 0.04 t apart.
+    """
+    drives = held_out([Rows(stored(3))], 3)
+    rows = [
+        Row(name="coast", policy=coast),
+        Row(name="IDM", policy=idm_policy(Idm())),
+    ]
+    report = held_out_likeness(drives, rows)
+    coasted = report.rows["coast"]
+    apart = lambda t: 0.1 * t**2 - 0.04 * t  # noqa: E731
+    shown = np.array([1.0, 3.0, 5.0, 8.0])
+    np.testing.assert_allclose(coasted.at[0], apart(shown), atol=0.02)
+    mean = float(np.mean(apart(CLOCK_S[1:])))
+    assert coasted.distance[0] == pytest.approx(mean, abs=0.02)
+    assert report.rows[RECORDED_HUMAN].distance.max() < 0.02
+    assert report.unlikeness(RECORDED_HUMAN)["acceleration"] == 0.0
+    assert report.unlikeness("coast")["acceleration"] == pytest.approx(1.0)
+    assert "coast" in report.text()
+    assert set(report.distance) == {"coast", "IDM"}
+    write_arrays(tmp_path / "x.npz", report.likeness)
+    back = read_arrays(tmp_path / "x.npz")
+    assert isinstance(back, Likeness)
+    np.testing.assert_array_equal(back.distance["coast"], coasted.distance)
+    with pytest.raises(InputError, match=r"none\.npz"):
+        read_arrays(tmp_path / "none.npz")
+
+
+def test_jensen_shannon_of_known_samples():
+    a, b = np.zeros(10), np.full(10, 3.0)
+    assert jensen_shannon(a, a, "jerk") == 0.0
+    assert jensen_shannon(a, b, "jerk") == pytest.approx(1.0)
+    # half of one in the other's bin: sqrt(H(3/4, 1/4) - H(1/2, 1/2) / 2)
+    mixed = np.concatenate([a[:5], b[:5]])
+    expected = -(0.75 * np.log2(0.75) + 0.25 * np.log2(0.25)) - 0.5
+    assert jensen_shannon(a, mixed, "jerk") == pytest.approx(np.sqrt(expected))
+
+
+def test_a_split_without_scenes_is_one_line():
+    with pytest.raises(InputError, match="0 scenes"):
+        held_out([Rows(stored(2))], 5, split="train")
