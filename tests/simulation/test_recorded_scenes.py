@@ -148,7 +148,6 @@ def test_distances_are_those_of_the_drives(tmp_path):
     assert coasted.distance[0] == pytest.approx(mean, abs=0.02)
     assert report.rows[RECORDED_HUMAN].distance.max() < 0.02
     assert report.unlikeness(RECORDED_HUMAN)["acceleration"] == 0.0
-    assert report.unlikeness("coast")["acceleration"] == pytest.approx(1.0)
     assert "coast" in report.text()
     assert set(report.distance) == {"coast", "IDM"}
     write_arrays(tmp_path / "x.npz", report.likeness)
