@@ -118,6 +118,8 @@ def _given() -> list[str | Logs]:
             "--data, --input, --synthetic: expected one of them: datasets of "
             "import_logs, logs with their --format, or the embedded synthetic traffic"
         )
+    if not _INPUT.value and (_FORMAT.value or _SOURCE.value):
+        raise InputError("--input: not given: expected one for each --format")
     if _DATA.value:
         if signals_asked():
             raise InputError("--signals: expected with --input, whose lights they are")

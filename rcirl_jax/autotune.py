@@ -158,6 +158,7 @@ class Loop:
     def until(self, last: str, given: Sequence[str | Logs]) -> None:
         """Run the stages in order, up to and with `last`; says what comes of it."""
         # what would fail only after hours of work
+        self._job(tuned=False)
         shares = shares_of(self.config.data_weights, len(given))
         self._check_incumbent()
         sources = [self.data(one, number) for number, one in enumerate(given)]
@@ -284,13 +285,15 @@ class Loop:
         if judged is None:
             config = dataclasses.replace(config, preferences="")
         workdir = self._workdir(dataset, seed)
+        # people judged scenes of the first source, whose rows come first
+        whose = dataset.parts[0] if isinstance(dataset, JoinedDatasets) else dataset
         train(
             dataset,
             workdir,
             config,
             running=self.running,
             provenance=dict(self.facts),
-            preferences=read_preferences(judged, dataset) if judged else None,
+            preferences=read_preferences(judged, whose) if judged else None,
         )
         file.parent.mkdir(parents=True, exist_ok=True)
         export_run(workdir, dataset, file)
@@ -551,8 +554,10 @@ class Loop:
         name = self.config.incumbent
         return name if name in BASELINES else file_sha256(Path(name))
 
-    def _job(self) -> tuple[SuiteJob, str]:
+    def _job(self, *, tuned: bool = True) -> tuple[SuiteJob, str]:
+        """What the suite drives; without the tuned IDM before there is one."""
         config = self.config
+        idm = dataclasses.asdict(self._tuned_idm) if tuned else {}
         return gate_job(
             str(self.weights),
             config.incumbent,
@@ -562,7 +567,7 @@ class Loop:
             catalogue_seed=config.catalogue_seed,
             plan_every=config.plan_every,
             rivals=RIVALS,
-            tuned_idm=tuple(dataclasses.asdict(self._tuned_idm).items()),
+            tuned_idm=tuple(idm.items()),
         )
 
     def _job_inputs(self) -> dict:

@@ -9,9 +9,23 @@ from rcirl_jax.stages import only_one
 from tests.commands import command, fresh
 
 SMALL = (
-    "--stride=60", "--epochs=1", "--suite=free_cruise,stopped_lead", "--cases=15",
-    "--duration=2",
+    "--synthetic", "--recipe=quick", "--stride=60", "--epochs=1", "--drives=6",
+    "--suite=free_cruise,stopped_lead", "--cases=15", "--duration=2",
 )  # fmt: skip
+REHEARSED = """
+[train]
+epochs = 1
+loss = "listwise"
+positive = "nearest"
+[rehearsal]
+teacher = "hand-set"
+cases = 1
+takeover_cases = 1
+rounds = 1
+duration_s = 45.0
+stride_s = 8.0
+takeover_stride_s = 4.0
+"""
 
 
 def kept(done):
@@ -22,13 +36,18 @@ def kept(done):
 
 @pytest.mark.multiprocess
 def test_a_small_loop(tmp_path):
-    run = tmp_path / "run"
-    flags = (f"--workdir={run}", *SMALL)
+    run, own = tmp_path / "run", tmp_path / "own.toml"
+    own.write_text(REHEARSED)
+    flags = (f"--workdir={run}", *SMALL, f"--recipe={own}")
     done = command("experiments.autotune", *flags)
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.rstrip().endswith(f"report to open: {run}/report.html")
     assert "verdict: " in done.stdout
-    stages = ["import", "train 0", "export", "rank", "simulate", "gate", "report"]
+    stages = [
+        "import 0", "rehearse 0", "rehearse learner 1", "rehearse 1", "train 0",
+        "export", "tune", "rank predicted", "rank recorded", "simulate", "likeness",
+        "gate", "report",
+    ]  # fmt: skip
     assert kept(done) == dict.fromkeys(stages, False)
     verdict = json.loads((run / "verdict.json").read_text())
     assert verdict["cases"] == 30
@@ -39,6 +58,14 @@ def test_a_small_loop(tmp_path):
     left_out = "30 cases, 4,110 of the full suite's left out; cases of 2 s instead of"
     assert verdict["part"].startswith(left_out)
     assert "recorded human" in page  # drives beside the others
+    assert "features without effect" in done.stdout
+    likeness = json.loads((run / "likeness.json").read_text())
+    rows = {"candidate", "hand-set", "IDM", "IDM, tuned", "constant V", "+velocity"}
+    assert rows | {"random weights", "recorded human"} == set(likeness["rows"])
+    table = (run / "suite" / "table.txt").read_text()
+    assert all(name in table for name in rows)
+    kinds = {check["kind"] for check in verdict["checks"]}
+    assert {"safety", "nulls", "likeness", "gain"} <= kinds
     noted = json.loads((run / "stages.json").read_text())["stages"]
     assert list(noted) == stages
     for record in noted.values():
@@ -83,7 +110,8 @@ def test_what_people_said_trains_with_the_rest(tmp_path):
     file.write_text(f"{json.dumps(head)}\n{json.dumps(judged)}\n")
     more = (f"--preferences={file}", "--until=train")
     told = command("experiments.autotune", *flags, *more)
-    assert kept(told) == {"import": True, "train 0": False, "export": False}
+    told = {name: was for name, was in kept(told).items() if name[:8] != "rehearse"}
+    assert told == {"import 0": True, "train 0": False, "export": False}
     # no verdict stays beside weights that it does not speak of
     assert not (run / "verdict.json").exists()
     assert not (run / "report.html").exists()
