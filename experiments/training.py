@@ -64,7 +64,7 @@ _TRAIN = {
     "admissible_in": _one_of(
         "admissible_in",
         ADMISSIBLE_IN,
-        "scenes that compare only admissible plans",
+        "scenes whose nearest candidate is admissible",
     ),
     "train_horizon": _number("train_horizon", "s that are compared"),
     "hard_negatives": _count("hard_negatives", "near negatives per scene"),

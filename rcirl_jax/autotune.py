@@ -530,6 +530,7 @@ class Loop:
                 replays=replays,
                 workdir=self._workdir(dataset, seed),
                 sweep=read_sweep(sweep) if sweep else None,
+                likeness=(self.folder / "likeness.txt").read_text(),
                 training_runs=self.config.seeds,
                 facts={**self.facts, "stages": made},
             ),

@@ -229,6 +229,8 @@ def _row(
             "brake_taps": float(np.mean(m.brake_taps)),
             "fallback_share": float(np.mean(m.fallback_share)),
             "standing_share": float(np.mean(m.standing_share)),
+            "creeping_share": float(np.mean(m.creeping_share)),
+            "sign_changes_per_s": float(np.mean(m.sign_changes)),
         },
         families=_by_family(m, scores, names, preventable, way),
     )

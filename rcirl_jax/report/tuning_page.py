@@ -65,6 +65,7 @@ class TuningReport:
     replays: Sequence[Replay]
     workdir: Path | None  # run whose training curve is drawn
     sweep: Mapping | None  # contents of sweep.json
+    likeness: str  # table of held-out drives; "" without
     training_runs: int  # of which the candidate is the median one
     # provenance: flags, commit, versions, hashes by stage
     facts: Mapping[str, object]
@@ -87,6 +88,7 @@ def write_tuning_page(path: Path, report: TuningReport) -> Path:
         ("worst", "Worst cases, to be played", lambda: _played(report)),
         ("frames", "Example frames", lambda: _frames(report)),
         ("ranking", "Ranking of held-out human driving", lambda: _ranking(report)),
+        ("likeness", "Near to the human, in closed loop", lambda: _likeness(report)),
         ("gamma", "Time weights", lambda: _gamma(report)),
         ("features", "What each feature contributes", lambda: _features(report)),
         ("data", "Data", lambda: _data(report.dataset)),
@@ -95,7 +97,7 @@ def write_tuning_page(path: Path, report: TuningReport) -> Path:
     ]
     workdir = report.workdir
     if workdir is not None:
-        parts.insert(7, ("training", "Training", lambda: _training(workdir)))
+        parts.insert(8, ("training", "Training", lambda: _training(workdir)))
     entries = [(anchor, heading) for anchor, heading, _ in parts]
     sections = [section(anchor, heading, body()) for anchor, heading, body in parts]
     return html.write_page(
@@ -234,6 +236,17 @@ def _ranking_differences(ranking: RankingReport, learned: Sequence[str]) -> str:
     return table(title, heads, rows)
 
 
+def _likeness(report: TuningReport) -> str:
+    """Held-out recordings, driven: what a reward is for."""
+    if not report.likeness:
+        return paragraph("Not measured.")
+    lead = paragraph(
+        "Every row drives held-out recordings from the human's own state; how far from "
+        "the human it is along the road, nearest row first."
+    )
+    return lead + preformatted(report.likeness, "held-out drives")
+
+
 def _gamma(report: TuningReport) -> str:
     """Curves of gamma_t, each over its largest: its scale and sign are free."""
     times = next(iter(report.rewards.values())).times
@@ -268,6 +281,12 @@ def _features(report: TuningReport) -> str:
         f"{found.scenes} held-out scenes of {found.vehicles} vehicles; 95 % intervals "
         "over vehicles, not adjusted for the number of features."
     )
+    for name, reward in report.rewards.items():
+        if reward.unsupported:
+            lead += paragraph(
+                f"Without effect in the {name}, for they never vary in its training "
+                f"data: {', '.join(reward.unsupported)}."
+            )
     if len(report.rewards) == 1:
         lead += _alone(report)
     return lead + legend(report.rewards) + _contributions(found, list(report.rewards))

@@ -55,7 +55,7 @@ def verdict_section(
     reasons = "".join(f"<li>{text(reason)}</li>" for reason in verdict.reasons)
     parts = [
         f'<div class="decision {kind}"><strong>{text(words)}</strong>'
-        f"<ul>{reasons}</ul></div>",
+        f"<p>{text(verdict.sentence)}</p><ul>{reasons}</ul></div>",
         f"<p>Candidate against {text(incumbent)} on the same {verdict.cases:,} cases "
         f"of {verdict.families} families; differences are candidate minus incumbent, "
         f"in % of cases or of the incumbent's way, with {LEVEL} intervals."

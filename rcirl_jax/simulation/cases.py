@@ -237,6 +237,7 @@ class Record(flax.struct.PyTreeNode, kw_only=True):
     ttc: jax.Array  # [] s, constant speeds and headings; inf if never
     ttc_counts: jax.Array  # [] bool: nuPlan's TTC looks at that agent
     headway: jax.Array  # [] s to the agent ahead in the own corridor; inf
+    free_way: jax.Array  # [] m to that agent, or to a line that demands a stop; inf
     collision: jax.Array  # [] int32, number of agents hit in this step
     at_fault: jax.Array  # [] int32, of them by the ego's fault
     at_fault_vru: jax.Array  # [] int32, of them pedestrians or cyclists

@@ -128,6 +128,12 @@ def off_road(case: Case, ego: EgoState) -> jax.Array:
 
 def headway(case: Case, ego: EgoState, state: AgentState) -> jax.Array:
     """Time [s] to the rear of the nearest agent ahead in the own corridor."""
+    nearest = gap_ahead(case, ego, state)
+    return jnp.where(ego.v > 0.5, nearest / jnp.maximum(ego.v, 0.5), jnp.inf)
+
+
+def gap_ahead(case: Case, ego: EgoState, state: AgentState) -> jax.Array:
+    """Distance [m] to the rear of the nearest agent ahead in the own corridor; inf."""
     half_s = 0.5 * (
         case.agents.length * jnp.abs(jnp.cos(state.heading))
         + case.agents.width * jnp.abs(jnp.sin(state.heading))
@@ -139,8 +145,7 @@ def headway(case: Case, ego: EgoState, state: AgentState) -> jax.Array:
     gap = state.s - half_s - ego.s - 0.5 * case.ego_length
     aside = jnp.abs(state.l - ego.l) - half_l - 0.5 * case.ego_width
     in_way = state.present & (gap > 0.0) & (aside < CORRIDOR_MARGIN_M)
-    nearest = jnp.min(jnp.where(in_way, gap, jnp.inf))
-    return jnp.where(ego.v > 0.5, nearest / jnp.maximum(ego.v, 0.5), jnp.inf)
+    return jnp.min(jnp.where(in_way, gap, jnp.inf))
 
 
 def is_vru(case: Case) -> jax.Array:

@@ -38,6 +38,9 @@ class MetricsConfig:
     tap_change: float = 1.0  # m/s^2, change of acceleration of a brake tap
     tap_window_s: float = 2.0  # s within which the sign turns back
     standing: float = 0.2  # m/s (Apollo)
+    creeping_limit: float = 0.2  # 1, share of the posted limit below which one creeps
+    creeping_way: float = 40.0  # m, free ahead, where to creep is nobody's doing
+    turning_band: float = 0.1  # m/s^2, |a| below which a sign of it does not count
     # --- nuPlan (reference: its devkit) ---
     nuplan_ttc: float = 0.95  # s
     nuplan_overspeed: float = 2.23  # m/s
@@ -72,6 +75,8 @@ class CaseMetrics(flax.struct.PyTreeNode, kw_only=True):
     progress: jax.Array  # m
     mean_speed: jax.Array  # m/s
     standing_share: jax.Array  # 1
+    creeping_share: jax.Array  # 1, slow or standing with a free road ahead
+    sign_changes: jax.Array  # 1/s, turns of the acceleration from push to brake or back
     min_ttc: jax.Array  # s, inf if none
     tet: jax.Array  # s, time with TTC below the threshold
     tit: jax.Array  # s^2, integral of (threshold - TTC)
@@ -163,6 +168,12 @@ def case_metrics(record: Record, config: MetricsConfig) -> CaseMetrics:
         progress=jnp.maximum(highest(record.s), 0.0),
         mean_speed=total(record.v) / count,
         standing_share=total(record.v < config.standing) / count,
+        creeping_share=total(
+            (record.v < config.creeping_limit * record.speed_limit)
+            & (record.free_way > config.creeping_way)
+        )
+        / count,
+        sign_changes=_sign_changes(record, config) / (count * STEP_S),
         min_ttc=lowest(ttc),
         tet=total(below > 0.0) * STEP_S,
         tit=total(below) * STEP_S,
@@ -180,6 +191,19 @@ def case_metrics(record: Record, config: MetricsConfig) -> CaseMetrics:
         max_j_lateral=highest(jnp.abs(j_lateral)),
         **_nuplan(record, a_lateral, ttc, config),
     )
+
+
+def _sign_changes(record: Record, config: MetricsConfig) -> jax.Array:
+    """How often a, where beyond the band, has another sign than when last beyond it."""
+    sign = jnp.sign(record.a) * (jnp.abs(record.a) > config.turning_band)
+    sign = jnp.where(record.valid, sign, 0.0)
+
+    def last(before: jax.Array, now: jax.Array) -> tuple[jax.Array, jax.Array]:
+        turned = (now * before) < 0.0
+        return jnp.where(now != 0.0, now, before), turned
+
+    _, turned = jax.lax.scan(last, jnp.zeros_like(sign[0]), sign)
+    return jnp.sum(turned)
 
 
 def _brake_taps(record: Record, config: MetricsConfig) -> jax.Array:

@@ -86,8 +86,8 @@ class TrainConfig:
     # what is ranked above the candidates: the "human" curve itself, or the
     # "nearest" feasible candidate to it (what a planner could have driven)
     positive: str = "human"
-    # scenes in which only candidates that the planner's safety filter admits are
-    # compared: "none", "rehearsed" ones (a planner drove there), or "all"
+    # scenes in which the nearest candidate has to be one that the planner's safety
+    # filter admits: "none", "rehearsed" ones (a planner drove there), or "all"
     admissible_in: str = "rehearsed"
     # the others' future: "predicted" as in closed loop, or "recorded" as in the paper
     futures: str = "predicted"

@@ -53,6 +53,7 @@ from rcirl_jax.types import (
     Demonstration,
     Normaliser,
     RewardParams,
+    Scene,
     Tag,
     Trajectory,
 )
@@ -125,11 +126,6 @@ def featurise(
         own_key = jax.random.fold_in(key, index)
         valid = demonstration.scene.time_valid & seen
         candidates = candidates_of(own_key, demonstration, config)
-        if config.admissible_in != "none":
-            admitted = check(demonstration.scene, candidates).admissible
-            if config.admissible_in == "rehearsed":
-                admitted = admitted | ~demonstration.scene.tags[Tag.REHEARSED]
-            candidates = candidates.replace(feasible=candidates.feasible & admitted)
         driven = human_of(demonstration, config.sampler)
         # the human stands last among the candidates: one pass for all
         join = lambda many, one: jnp.concatenate([many, one[None]])  # noqa: E731
@@ -152,9 +148,11 @@ def featurise(
             return human, rows, feasible, with_densities(facts, feasible), valid
         # a planner can choose what the sampler made, not a hard negative
         choice = feasible & (candidates.family != family_index("hard_negative"))
+        choice = choice & _admitted(demonstration.scene, candidates, config)
         near = jnp.argmin(jnp.where(choice, facts.distance, jnp.inf))
-        # a hard negative that is nearer than the positive is no worse than it
+        # what is nearer than the positive without being a choice is no worse than it
         feasible = feasible & (choice | (facts.distance > facts.distance[near]))
+        feasible = feasible & jnp.any(choice)
         facts = with_densities(facts, feasible)
         facts = facts.replace(
             human_distance=facts.distance[near],
@@ -175,6 +173,20 @@ def featurise(
         weight=batch.weight,
         index=batch.index,
     )
+
+
+def _admitted(scene: Scene, candidates: Candidates, config: TrainConfig) -> jax.Array:
+    """[K] bool: what the safety filter lets a planner choose, where that is asked for.
+
+    A teacher in the simulator stops at a line and then drives over it; the planner's
+    view at the start of the scene forbids that for all its times.
+    """
+    if config.admissible_in == "none":
+        return jnp.ones(candidates.feasible.shape, bool)
+    admitted = check(scene, candidates).admissible
+    if config.admissible_in == "rehearsed":
+        admitted = admitted | ~scene.tags[Tag.REHEARSED]
+    return admitted
 
 
 def featurised(key: jax.Array, batch: Batch, config: TrainConfig) -> FeatureBatch:

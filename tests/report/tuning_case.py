@@ -144,6 +144,7 @@ def small_report(folder, replays):
     (workdir / "metrics.jsonl").write_text("\n".join(map(json.dumps, lines)))
     suite, verdict = suite_and_verdict()
     return TuningReport(
+        likeness="row  distance m\ncandidate  1.75\n",
         verdict=verdict,
         gate=GateConfig(),
         suite=suite,

@@ -18,7 +18,7 @@ from rcirl_jax.simulation.metrics import (
 )
 
 S = 100
-NEVER = ("ttc", "headway", "clearance")
+NEVER = ("ttc", "headway", "clearance", "free_way")
 FLAGS = ("ttc_counts", "red_light", "stop_sign", "fallback")
 COUNTS = ("collision", "at_fault", "at_fault_vru", "at_fault_object")
 MEASURE = jax.jit(lambda record: case_metrics(record, MetricsConfig()))
@@ -132,6 +132,29 @@ def test_ttc_counts_only_where_nuplan_looks():
     assert found.ttc_bound == 0.0
     assert found.tet == pytest.approx(0.1)
     assert found.tit == pytest.approx(0.1)
+
+
+def test_creeping_is_slow_where_the_road_is_free():
+    """The limit is 15 m/s: below 3 m/s one creeps, unless something is near ahead."""
+    slow = np.full(S, 10.0, np.float32)
+    slow[:30] = 2.9
+    assert measured(v=slow).creeping_share == pytest.approx(0.3)
+    assert measured(v=slow + 0.2).creeping_share == 0.0
+    near = np.full(S, np.inf, np.float32)
+    near[:20] = 39.0
+    assert measured(v=slow, free_way=near).creeping_share == pytest.approx(0.1)
+
+
+def test_sign_changes_of_the_acceleration_a_second():
+    """10 s: push, coast, brake, push within the band, push: two turns."""
+    a = np.zeros(S, np.float32)
+    a[:20], a[40:60], a[60:70], a[70:] = 0.5, -0.5, 0.05, 0.5
+    assert measured(a=a).sign_changes == pytest.approx(0.2)
+    assert measured(a=-a).sign_changes == pytest.approx(0.2)
+    assert measured(a=np.abs(a)).sign_changes == 0.0
+    flicker = np.where(np.arange(S) % 2 == 0, 0.3, -0.3).astype(np.float32)
+    assert measured(a=flicker).sign_changes == pytest.approx(9.9)
+    assert measured(a=0.3 * flicker).sign_changes == 0.0
 
 
 def test_brake_taps_are_turns_of_the_acceleration():
