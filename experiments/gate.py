@@ -18,12 +18,15 @@ from absl import flags
 from experiments import margins
 from experiments.common import provenance, run
 from experiments.executor import executor
+from rcirl_jax.data.store import open_dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.gate import judge
 from rcirl_jax.evaluation.gate_output import format_verdict, write_verdict
 from rcirl_jax.evaluation.gate_runs import pair_of
+from rcirl_jax.evaluation.likeness import held_out_likeness
 from rcirl_jax.evaluation.suite_files import runs_of
 from rcirl_jax.export.gate_job import drive_job, gate_job, left_out
+from rcirl_jax.simulation.recorded_scenes import held_out
 from rcirl_jax.simulation.rows import BASELINES
 
 _CANDIDATE = flags.DEFINE_string("candidate", None, "weights file", required=True)
@@ -35,6 +38,10 @@ _SUITE = flags.DEFINE_string("suite", "full", "full, smoke, or families with com
 _CASES = flags.DEFINE_integer("cases", None, "cases per family")
 _DURATION = flags.DEFINE_float("duration", None, "s per case at most (smoke 20)")
 _SEED = flags.DEFINE_integer("catalogue_seed", 0, "seed of the cases")
+_DATA = flags.DEFINE_list(
+    "data", [], "datasets whose held-out drives measure human-likeness"
+)
+_DRIVES = flags.DEFINE_integer("drives", 240, "of them, held-out drives in all")
 _EVERY = flags.DEFINE_integer("plan_every", 1, "steps of 0.1 s between two plans")
 
 
@@ -55,8 +62,14 @@ def main() -> None:
         plan_every=_EVERY.value,
         rivals=("IDM", *(name for name in config.nulls if name in BASELINES)),
     )
+    sources = [open_dataset(url) for url in _DATA.value]
     result = drive_job(job, executor())
-    pair = pair_of(runs_of(result), incumbent, config.nulls)
+    known = None
+    if sources:
+        report = held_out_likeness(held_out(sources, _DRIVES.value), job.rows())
+        known = report.likeness
+        print(report.text())
+    pair = pair_of(runs_of(result), incumbent, config.nulls, known)
     verdict = judge(pair, config, left_out(job))
     files = {"candidate": _CANDIDATE.value, "incumbent": _INCUMBENT.value}
     facts = {"files": files, **result.facts, "made_by": provenance(job.weights)}

@@ -113,7 +113,7 @@ def count_verdicts(
         cases=cases,
         dropped=dict(dropped),
         decisions=tuple(_score(d.name, decisions) for d in Decision),
-        tags=tuple(_score(t.name, tags) for t in Tag),
+        tags=tuple(_score(t.name, tags) for t in Tag if t != Tag.REHEARSED),
         errors=tuple((*key, count) for key, count in wrong.most_common()),
     )
 

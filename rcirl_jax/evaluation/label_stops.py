@@ -233,7 +233,9 @@ def compare_stored(stored: Demonstration) -> tuple[ClassScore, ...]:
     known = kind != Kind.NONE
     pairs = [(d.name, decisions[known] == d, before[known] == d) for d in Decision]
     old = np.asarray(stored.scene.tags)
-    pairs += [(f"tag {t.name}", tags[:, t], old[:, t]) for t in Tag]
+    pairs += [
+        (f"tag {t.name}", tags[:, t], old[:, t]) for t in Tag if t != Tag.REHEARSED
+    ]
     return tuple(
         ClassScore(
             name=name.lower(),

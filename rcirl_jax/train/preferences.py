@@ -18,6 +18,7 @@ from rcirl_jax.data.preferences import Preferences
 from rcirl_jax.errors import InputError
 from rcirl_jax.features import FeatureMap, feature_map
 from rcirl_jax.features.columns import candidate_frames
+from rcirl_jax.planner.prediction import as_seen
 from rcirl_jax.sampling import trajectory_from_positions, trajectory_on_path
 from rcirl_jax.train.state import Facts, FeatureBatch, TrainConfig
 from rcirl_jax.types import Scene
@@ -80,6 +81,8 @@ def _make(
     seen = jnp.asarray(TIMES_S) <= config.train_horizon + 1e-6
 
     def one(scene: Scene, s: jax.Array, l: jax.Array) -> tuple:
+        if config.futures == "predicted":
+            scene = as_seen(scene)
         along = jax.vmap(trajectory_on_path, in_axes=(None, 0))
         across = jax.vmap(trajectory_from_positions, in_axes=(None, 0, 0))
         speed = config.sampler.mode == "speed"

@@ -23,6 +23,7 @@ def scored_rivals(rows, sampler, tuned):
         sampler=sampler,
         horizon_s=8.0,
         scorers={},
+        futures="recorded",
         tuned=tuned,
     )
 

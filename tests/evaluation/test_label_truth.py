@@ -69,7 +69,8 @@ def test_labels_do_not_depend_on_where_they_are_made():
 
 def test_the_table_names_every_class():
     text = format_labels(report())
-    for name in [*Decision.__members__, *Tag.__members__]:
+    named = set(Tag.__members__) - {"REHEARSED"}  # says who drove, not how
+    for name in [*Decision.__members__, *named]:
         assert f"\n{name.lower():<14}" in text
     json.dumps(report().as_dict(), allow_nan=False)
 

@@ -102,7 +102,7 @@ def test_distances_alone_are_those_of_the_scores():
     """What an import's oracle floor measures, over a padded chunk."""
     rows = driven_by_a_hidden_driver()
     scored = scored_rivals(rows, SMALL, {})
-    near = measure_scenes(rows, INDEX, sampler=SMALL, horizon_s=8.0)
+    near = measure_scenes(rows, INDEX, sampler=SMALL, horizon_s=8.0, futures="recorded")
     for name in ("feasible", "fde", "ade"):
         found, wanted = getattr(near, name), getattr(scored, name)
         np.testing.assert_allclose(found, wanted, atol=1e-4)

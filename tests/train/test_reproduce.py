@@ -125,7 +125,7 @@ def test_another_shape_or_loss_is_no_reproduction(made, tmp_path):
     wide = dataclasses.replace(before, gamma=np.ones(3, np.float32))
     assert compare(before, wide)["gamma"] == np.inf
     loss = dataclasses.replace(before, loss={"name": "gan", "leaky_rate": None})
-    with pytest.raises(InputError, match=r"loss: .*gan.*: expected .*rank"):
+    with pytest.raises(InputError, match=r"loss: .*gan.*: expected .*listwise"):
         compare(before, loss)
 
 
