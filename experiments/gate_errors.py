@@ -19,7 +19,7 @@ from experiments import margins
 from experiments.common import provenance, run
 from experiments.executor import executor
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.closed_loop import SuiteConfig, drive_here
+from rcirl_jax.evaluation.closed_loop import SuiteConfig, drive_here, run_suite
 from rcirl_jax.evaluation.gate_errors import (
     SAID,
     as_driven,
@@ -29,7 +29,7 @@ from rcirl_jax.evaluation.gate_errors import (
 )
 from rcirl_jax.evaluation.gate_runs import CANDIDATE
 from rcirl_jax.evaluation.gate_types import Pair
-from rcirl_jax.evaluation.suite_files import read_runs
+from rcirl_jax.evaluation.suite_files import SuiteRuns, read_runs, runs_of
 from rcirl_jax.export.gate_job import gate_job
 from rcirl_jax.export.spread import spread
 from rcirl_jax.stages import file_sha256
@@ -98,7 +98,8 @@ def main() -> None:
     print(f"written: {_OUTPUT.value}")
 
 
-def _three(runs: dict, families: tuple, ids: tuple, way: np.ndarray) -> Three:
+def _three(found: SuiteRuns) -> Three:
+    runs = dict(found.rows)
     for name in (CANDIDATE, _INCUMBENT.value, WORSE):
         if name not in runs:
             raise InputError(f"{name}: expected a row of {', '.join(runs)}")
@@ -107,9 +108,10 @@ def _three(runs: dict, families: tuple, ids: tuple, way: np.ndarray) -> Three:
         return Pair(
             candidate=runs[candidate],
             incumbent=runs[other],
-            families=families,
-            ids=ids,
-            reference=np.asarray(way, np.float64),
+            families=found.groups,
+            ids=found.ids,
+            reference=np.asarray(found.way, np.float64),
+            preventable=np.asarray(found.preventable, bool),
         )
 
     incumbent = _INCUMBENT.value
@@ -118,8 +120,7 @@ def _three(runs: dict, families: tuple, ids: tuple, way: np.ndarray) -> Three:
 
 def _read(file: str) -> Three:
     """A suite that was driven before."""
-    found = read_runs(Path(file))
-    return _three(dict(found.rows), found.groups, found.ids, found.way)
+    return _three(read_runs(Path(file)))
 
 
 def _all_driven() -> list[Three]:
@@ -140,8 +141,7 @@ def _driven(seed: int) -> Three:
     )
     pool, cases, how = executor(), job.cases(), SuiteConfig()
     drive = spread(pool, job) if pool.workers > 1 else drive_here
-    runs = {row.name: drive(row, cases, how) for row in job.rows()}
-    return _three(runs, cases.groups, cases.ids, np.asarray(runs["IDM"].progress))
+    return _three(runs_of(run_suite(job.rows(), cases, how, drive)))
 
 
 if __name__ == "__main__":
