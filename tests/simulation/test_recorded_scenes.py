@@ -134,7 +134,8 @@ def test_distances_are_those_of_the_drives(tmp_path):
     The ego starts with the human's braking, which fades with the drive train's lag of
     0.2 s: 0.1 t^2 - 0.04 t apart.
     """
-    drives = held_out([Rows(stored(3))], 3)
+    two = stored(3).replace(vehicle=np.array([0, 1, 1], np.int32))
+    drives = held_out([Rows(two)], 3)
     rows = [
         Row(name="coast", policy=coast),
         Row(name="IDM", policy=idm_policy(Idm())),
