@@ -29,12 +29,16 @@ from rcirl_jax.evaluation.statistics import (
     combine_seeds,
     paired_difference,
 )
+from rcirl_jax.evaluation.suite_output import text_table
 from rcirl_jax.simulation.cases import STEP_S, Record
 from rcirl_jax.simulation.recorded_scenes import STEPS, HeldOut
-from rcirl_jax.simulation.rollout import LANES, RolloutConfig, drive_cases
+from rcirl_jax.simulation.rollout import LANES, drive_cases
 from rcirl_jax.simulation.rows import RECORDED_HUMAN, Row, human_row
+from rcirl_jax.simulation.suite import rollout_config
+from rcirl_jax.units import HORIZON_S
 from rcirl_jax.whole import write_whole
 
+DRIVES = 240  # held-out drives of a report, if not told otherwise
 TIMES_SHOWN_S = (1.0, 3.0, 5.0, 8.0)  # s at which distances are printed
 # what is compared as a distribution: lowest, highest, bins
 HISTOGRAMS: dict[str, tuple[float, float, int]] = {
@@ -144,11 +148,7 @@ class LikenessReport:
                     str(row["crashed"]),
                 ]
             )
-        widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
-        table = [
-            "  ".join(x.ljust(w) for x, w in zip(line, widths, strict=True)).rstrip()
-            for line in lines
-        ]
+        table = text_table(lines[0], lines[1:])
         title = (
             f"Distance to the human, held out: {facts['drives']} drives of "
             f"{facts['vehicles']} vehicles in {facts['recordings']} recordings"
@@ -157,7 +157,22 @@ class LikenessReport:
             "distance: mean of |s - s_human|, and at 1 to 8 s; speed: share of the "
             "human's; a to TTC: how unlike the human's distribution, 0 to 1"
         )
-        return "\n".join([title, *table, note]) + "\n"
+        lines = [title, *table, note, "", *self._differences_text()]
+        return "\n".join(lines) + "\n"
+
+    def _differences_text(self) -> list[str]:
+        """Every row minus each reference; nothing where there is none."""
+        known = [name for name in REFERENCES if name in self.rows]
+        rows = []
+        for name in self.distance:
+            found = self.differences(name)
+            cells = [
+                f"{d.mean:+.2f} [{d.low:+.2f}, {d.high:+.2f}]" if d else "-"
+                for d in map(found.get, known)
+            ]
+            rows.append([name, *cells])
+        title = "distance minus that of, m [95 % over vehicles]; below 0 is nearer"
+        return [title, *text_table(["row minus", *known], rows)] if known else []
 
 
 def write_arrays(path: Path, known: Likeness) -> None:
@@ -209,21 +224,27 @@ def jensen_shannon(a: np.ndarray, b: np.ndarray, name: str) -> float:
     return float(np.sqrt(max(apart, 0.0)))
 
 
-def held_out_likeness(drives: HeldOut, rows: Sequence[Row]) -> LikenessReport:
+def held_out_likeness(
+    drives: HeldOut, rows: Sequence[Row], plan_every: int = 1
+) -> LikenessReport:
     """Drive every row, and the recorded human, over the held-out drives.
 
     Args:
       drives: of `simulation.recorded_scenes.held_out`.
       rows: learned rows, rivals, nulls; names are distinct.
+      plan_every: steps of 0.1 s between two plans, of rows that need no other.
 
     Raises:
-      InputError: a name twice, or a drive with no number.
+      InputError: a name twice, drives of one vehicle, or a drive with no number.
     """
+    ClusterBootstrap(drives.vehicle)  # refuses one vehicle before hours of driving
     names = [row.name for row in rows]
     if len(set(names)) < len(names):
         raise InputError(f"held-out drives: rows {names}: expected distinct names")
     others = [row for row in rows if row.name != RECORDED_HUMAN]
-    found = {row.name: _driven(row, drives) for row in (human_row(), *others)}
+    found = {
+        row.name: _driven(row, drives, plan_every) for row in (human_row(), *others)
+    }
     return LikenessReport(
         rows=found,
         ids=drives.ids,
@@ -232,19 +253,15 @@ def held_out_likeness(drives: HeldOut, rows: Sequence[Row]) -> LikenessReport:
     )
 
 
-def _driven(row: Row, drives: HeldOut) -> Driven:
+def _driven(row: Row, drives: HeldOut, plan_every: int = 1) -> Driven:
     """One row's drives, measured against the humans of the cases."""
     count = len(drives.ids)
     fill = np.minimum(np.arange(-(-count // LANES) * LANES), count - 1)
     cases = jax.tree.map(lambda x: np.asarray(x)[fill], drives.cases)
-    config = RolloutConfig(
-        steps=STEPS,
-        follow_log=row.follow_log,
-        command_delay=row.command_delay,
-        braking_jerk=row.braking_jerk,
-    )
+    config = rollout_config(row, HORIZON_S, plan_every)
     logs = drive_cases(row.policy, row.params, cases, config)
-    record: Record = jax.tree.map(lambda x: np.asarray(x)[:count], logs[0])
+    # where plans are rarer, the last may end after the horizon
+    record: Record = jax.tree.map(lambda x: np.asarray(x)[:count, :STEPS], logs[0])
     assert drives.cases.replay is not None
     human = np.asarray(drives.cases.replay.ego_s, np.float64)[:, 1:]
     steps = np.asarray(drives.cases.steps)

@@ -18,7 +18,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from scipy.interpolate import CubicHermiteSpline
 
-from rcirl_jax.data.joined import Demonstrations
+from rcirl_jax.data.store import Dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.simulation.cases import (
     NUM_AGENTS,
@@ -42,6 +42,7 @@ from rcirl_jax.units import DT_S, HORIZON_S, NUM_STATIONS, STATION_STEP_M, TIMES
 STEPS = round(HORIZON_S / STEP_S)  # of a case; one with a shorter record is padded
 CLOCK_S = np.arange(STEPS + 1) * STEP_S  # [STEPS + 1] s
 LONG_S = 1000.0  # s, a light that does not change within the case
+MOVING_MPS = 0.5  # m/s, above which the direction of motion is the heading
 EDGE_MARGIN_M = 0.3  # m between the human's box and the drivable area's edge
 
 
@@ -57,7 +58,7 @@ class HeldOut:
 
 
 def held_out(
-    datasets: Sequence[Demonstrations], count: int, seed: int = 0, split: str = "test"
+    datasets: Sequence[Dataset], count: int, seed: int = 0, split: str = "test"
 ) -> HeldOut:
     """About `count` drives of a split, drawn evenly over datasets, recordings, egos.
 
@@ -76,14 +77,15 @@ def held_out(
         index = dataset.indices(split)
         if index.size == 0:
             continue
-        rows = dataset.read(index)
-        at = drawn_evenly(rows, share, seed)
-        parts.append(jax.tree.map(lambda x, at=at: np.asarray(x)[at], rows))
-        ids += [f"{number}:{row}" for row in index[at].tolist()]
-        vehicles.append(number * 2**40 + np.asarray(rows.vehicle)[at].astype(np.int64))
-        recordings.append(
-            number * 2**40 + np.asarray(rows.recording)[at].astype(np.int64)
+        recording, vehicle = (
+            dataset.column(name)[index].astype(np.int64)
+            for name in ("recording", "vehicle")
         )
+        at = drawn_evenly(recording, vehicle, share, seed)
+        parts.append(dataset.read(index[at]))
+        ids += [f"{number}:{row}" for row in index[at].tolist()]
+        vehicles.append(number * 2**40 + vehicle[at])
+        recordings.append(number * 2**40 + recording[at])
     if not parts:
         raise InputError(
             f"held-out drives: split {split}: 0 scenes: expected a dataset with some"
@@ -99,13 +101,20 @@ def held_out(
     )
 
 
-def drawn_evenly(rows: Demonstration, count: int, seed: int) -> np.ndarray:
+def drawn_evenly(
+    recording: np.ndarray, vehicle: np.ndarray, count: int, seed: int
+) -> np.ndarray:
     """Places [<= count] of scenes: turn by turn over recordings, then over vehicles.
 
     Every recording gives one scene before any gives two, and within a recording every
     vehicle; which of a vehicle's scenes comes first is drawn.
+
+    Args:
+      recording: [n] int, of each scene.
+      vehicle: [n] int, its ego.
+      count: of scenes, at most.
+      seed: of the draw.
     """
-    recording, vehicle = np.asarray(rows.recording), np.asarray(rows.vehicle)
     order = np.random.default_rng([seed, 23]).permutation(recording.size)
     turn_of_vehicle = _turn(list(zip(recording[order], vehicle[order], strict=True)))
     second = order[np.argsort(turn_of_vehicle, kind="stable")]
@@ -207,21 +216,42 @@ def _others(one: Demonstration) -> dict[str, np.ndarray]:
         s_dot, l_dot = curve(time, 1), np.gradient(l, STEP_S)
         speed = np.hypot(s_dot, l_dot)
         # who stands keeps the direction that it had
-        angle = np.where(speed > 0.5, np.arctan2(l_dot, s_dot), np.nan)
-        angle = _filled(angle, 0.0 if np.asarray(o.speed)[slot, first] >= 0 else np.pi)
+        angle = np.where(speed > MOVING_MPS, np.arctan2(l_dot, s_dot), np.nan)
+        towards = np.asarray(o.speed)[slot, known].min() < -MOVING_MPS
+        angle = _filled(angle, np.pi if towards else 0.0)
         tables["s"][agent], tables["l"][agent] = s, l
         tables["v"][agent], tables["heading"][agent] = speed, angle
         tables["present"][agent] = np.isclose(CLOCK_S, time, atol=1e-6)
-        extent = [
-            float((np.asarray(high) - np.asarray(low))[slot, first])
-            for low, high in ((o.s_lower, o.s_upper), (o.l_lower, o.l_upper))
-        ]
-        # across the road the long side lies along l
-        crosses = np.abs(np.sin(angle[np.argmax(tables["present"][agent])])) > 0.7
-        length, width = extent[::-1] if crosses else extent
         sizes["kind"][agent] = kind[slot]
-        sizes["length"][agent], sizes["width"][agent] = length, width
+        sizes["length"][agent], sizes["width"][agent] = _size(one, slot, time, angle)
     return tables | sizes
+
+
+def _size(
+    one: Demonstration, slot: int, time: np.ndarray, angle: np.ndarray
+) -> tuple[float, float]:
+    """Length and width, m, of the body in a slot.
+
+    Stored extents along the axes contain a tilted box. They are its sides where the
+    body is aligned with an axis, and there their product is smallest.
+
+    Args:
+      one: the Demonstration.
+      slot: of the obstacles.
+      time: [S] s, moments of the angle.
+      angle: [S] rad, of the body's motion to the road.
+    """
+    o = one.scene.obstacles
+    extents = [
+        np.asarray(high)[slot] - np.asarray(low)[slot]
+        for low, high in ((o.s_lower, o.s_upper), (o.l_lower, o.l_upper))
+    ]
+    area = np.where(np.asarray(o.valid)[slot], extents[0] * extents[1], np.inf)
+    best = int(np.argmin(area))
+    # across the road the long side lies along l
+    crosses = abs(np.sin(angle[np.argmin(np.abs(time - TIMES_S[best]))])) > 0.7
+    length, width = (float(x[best]) for x in (extents[::-1] if crosses else extents))
+    return length, width
 
 
 def _filled(values: np.ndarray, default: float) -> np.ndarray:

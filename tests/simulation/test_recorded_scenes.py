@@ -54,6 +54,9 @@ class Rows:
     def indices(self, split):
         return np.arange(self.rows.vehicle.size if split == "test" else 0)
 
+    def column(self, name):
+        return np.asarray(getattr(self.rows, name))
+
     def read(self, index):
         return jax.tree.map(lambda x: np.asarray(x)[index], self.rows)
 
@@ -115,17 +118,38 @@ def test_a_line_that_demands_a_stop_for_a_time_is_a_red_light():
 
 
 def test_draws_are_even_over_recordings_and_vehicles():
-    rows = stored()
-    many = jax.tree.map(lambda x: np.repeat(np.asarray(x)[:1], 130, 0), rows)
-    recording = np.repeat([0, 1, 2], [100, 20, 10]).astype(np.int32)
+    recording = np.repeat([0, 1, 2], [100, 20, 10])
     vehicle = np.concatenate([np.arange(100) // 50, np.arange(20), np.arange(10)])
-    many = many.replace(recording=recording, vehicle=vehicle.astype(np.int32))
-    at = drawn_evenly(many, 30, seed=0)
+    at = drawn_evenly(recording, vehicle, 30, seed=0)
     assert np.bincount(recording[at]).tolist() == [10, 10, 10]
     first = vehicle[at][recording[at] == 0]
     assert np.bincount(first).tolist() == [5, 5]
-    assert not np.array_equal(at, drawn_evenly(many, 30, seed=1))
-    assert np.array_equal(at, drawn_evenly(many, 30, seed=0))
+    assert not np.array_equal(at, drawn_evenly(recording, vehicle, 30, seed=1))
+    assert np.array_equal(at, drawn_evenly(recording, vehicle, 30, seed=0))
+
+
+def test_a_turning_body_has_the_size_that_it_has_along_an_axis():
+    """A bus of 10 m x 2.5 m turns from across the road (90 degrees) to along it (0)."""
+    one = jax.tree.map(lambda x: np.asarray(x)[0], stored(1))
+    heading = np.linspace(0.5 * np.pi, 0.0, 18)
+    s, l = np.cumsum(4.0 * np.cos(heading)), np.cumsum(4.0 * np.sin(heading))
+    cos, sin = np.abs(np.cos(heading)), np.abs(np.sin(heading))
+    half_s, half_l = 0.5 * (10.0 * cos + 2.5 * sin), 0.5 * (10.0 * sin + 2.5 * cos)
+    low_high = {"s_lower": 20 + s - half_s, "s_upper": 20 + s + half_s}
+    low_high |= {"l_lower": l - half_l, "l_upper": l + half_l}
+    low_high |= {"speed": 4.0 * np.cos(heading) * 17 / 8}
+    for seen in (slice(0, 18), slice(0, 12), slice(6, 18)):
+        valid = np.zeros((16, 18), bool)
+        valid[0, seen] = True
+        kind = np.where(np.arange(16) == 0, Kind.VEHICLE, Kind.NONE)
+        changed = {}
+        for name, values in low_high.items():
+            changed[name] = getattr(one.scene.obstacles, name).copy()
+            changed[name][0] = values
+        o = one.scene.obstacles.replace(kind=kind, valid=valid, **changed)
+        case = case_of(one.replace(scene=one.scene.replace(obstacles=o)))
+        assert float(case.agents.length[0]) == pytest.approx(10.0, abs=0.1)
+        assert float(case.agents.width[0]) == pytest.approx(2.5, abs=0.1)
 
 
 def test_distances_are_those_of_the_drives(tmp_path):
@@ -134,6 +158,8 @@ def test_distances_are_those_of_the_drives(tmp_path):
     The ego starts with the human's braking, which fades with the drive train's lag of
     0.2 s: 0.1 t^2 - 0.04 t apart.
     """
+    with pytest.raises(InputError, match="1 vehicles: expected at least 2"):
+        held_out_likeness(held_out([Rows(stored(3))], 3), [])
     two = stored(3).replace(vehicle=np.array([0, 1, 1], np.int32))
     drives = held_out([Rows(two)], 3)
     rows = [
@@ -150,6 +176,10 @@ def test_distances_are_those_of_the_drives(tmp_path):
     assert report.rows[RECORDED_HUMAN].distance.max() < 0.02
     assert report.unlikeness(RECORDED_HUMAN)["acceleration"] == 0.0
     assert "coast" in report.text()
+    minus = report.differences("coast")["IDM"].mean
+    apart_of = report.distance["coast"] - report.distance["IDM"]
+    assert minus == pytest.approx(float(apart_of.mean()))
+    assert f"{minus:+.2f} [" in report.text()
     assert set(report.distance) == {"coast", "IDM"}
     write_arrays(tmp_path / "x.npz", report.likeness)
     back = read_arrays(tmp_path / "x.npz")
