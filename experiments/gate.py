@@ -23,9 +23,11 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.gate import judge
 from rcirl_jax.evaluation.gate_output import format_verdict, write_verdict
 from rcirl_jax.evaluation.gate_runs import pair_of
-from rcirl_jax.evaluation.likeness import held_out_likeness
+from rcirl_jax.evaluation.likeness import DRIVES, held_out_likeness
 from rcirl_jax.evaluation.suite_files import runs_of
 from rcirl_jax.export.gate_job import drive_job, gate_job, left_out
+from rcirl_jax.export.tuned_idm import idm_fields
+from rcirl_jax.planner.safety import TRACKS
 from rcirl_jax.simulation.recorded_scenes import held_out
 from rcirl_jax.simulation.rows import BASELINES
 
@@ -41,7 +43,11 @@ _SEED = flags.DEFINE_integer("catalogue_seed", 0, "seed of the cases")
 _DATA = flags.DEFINE_list(
     "data", [], "datasets whose held-out drives measure human-likeness"
 )
-_DRIVES = flags.DEFINE_integer("drives", 240, "of them, held-out drives in all")
+_DRIVES = flags.DEFINE_integer("drives", DRIVES, "of them, held-out drives in all")
+_IDM = flags.DEFINE_string("tuned_idm", None, "JSON of autotune: a further row")
+_FILTER = flags.DEFINE_enum(
+    "filter", "full", TRACKS, "full; collision: no verdict ships, the reward decides"
+)
 _EVERY = flags.DEFINE_integer("plan_every", 1, "steps of 0.1 s between two plans")
 
 
@@ -61,12 +67,16 @@ def main() -> None:
         catalogue_seed=_SEED.value,
         plan_every=_EVERY.value,
         rivals=("IDM", *(name for name in config.nulls if name in BASELINES)),
+        tuned_idm=idm_fields(_IDM.value),
+        track=_FILTER.value,
     )
     sources = [open_dataset(url) for url in _DATA.value]
     result = drive_job(job, executor())
     known = None
     if sources:
-        report = held_out_likeness(held_out(sources, _DRIVES.value), job.rows())
+        report = held_out_likeness(
+            held_out(sources, _DRIVES.value), job.rows(), job.plan_every
+        )
         known = report.likeness
         print(report.text())
     pair = pair_of(runs_of(result), incumbent, config.nulls, known)

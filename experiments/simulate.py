@@ -4,10 +4,13 @@
         --output=DIR
     python -m experiments.simulate --weights=FILE --suite=recorded --format=FORMAT \
         --input=LOGS --output=DIR
+    python -m experiments.simulate --weights=FILE --suite=heldout --data=DATASET \
+        --output=DIR
 
 Every case is driven at 10 Hz; safety filter and candidates are the same for all
 rows; on recorded scenes the recorded human is one of them. Writes table.txt,
-suite.json and cases.csv. A case is drawn by experiments.replay from its id.
+suite.json and cases.csv. A case is drawn by experiments.replay from its id. Held-out
+drives of datasets say how near to the human each row is: table.txt and likeness.json.
 """
 
 from collections.abc import Sequence
@@ -18,6 +21,7 @@ from absl import flags
 from experiments.common import provenance, run
 from experiments.executor import executor
 from rcirl_jax.data.importers import IMPORTERS
+from rcirl_jax.data.joined import JoinedDatasets, open_datasets
 from rcirl_jax.data.parts import Part, parts_of, recordings_of_all
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop import (
@@ -27,9 +31,13 @@ from rcirl_jax.evaluation.closed_loop import (
     worst_cases,
     write_suite,
 )
+from rcirl_jax.evaluation.likeness import DRIVES, held_out_likeness
 from rcirl_jax.export.spread import SuiteJob, spread
+from rcirl_jax.export.tuned_idm import idm_fields
+from rcirl_jax.planner.baselines import TUNED_IDM_ROW
 from rcirl_jax.planner.safety import TRACKS
 from rcirl_jax.simulation.recorded_config import RecordedConfig
+from rcirl_jax.simulation.recorded_scenes import held_out
 from rcirl_jax.simulation.rows import BASELINES, human_row
 from rcirl_jax.simulation.suite import (
     FULL_S,
@@ -38,17 +46,20 @@ from rcirl_jax.simulation.suite import (
     recorded_set,
     suite_refs,
 )
+from rcirl_jax.whole import write_json, write_whole
 
 _WEIGHTS = flags.DEFINE_list("weights", None, "weights files", required=True)
 _SUITE = flags.DEFINE_string(
-    "suite", "smoke", "full, smoke, recorded, or families with commas"
+    "suite", "smoke", "full, smoke, recorded, heldout, or families with commas"
 )
+_DATA = flags.DEFINE_list("data", [], "datasets of --suite=heldout")
 _FORMAT = flags.DEFINE_enum("format", "commonroad", sorted(IMPORTERS), "of --input")
 _INPUT = flags.DEFINE_string("input", None, "recordings of --suite=recorded")
 _SMOOTHING = flags.DEFINE_float("smoothing", 4.1, "s, window on recorded positions")
 _OUTPUT = flags.DEFINE_string("output", None, "folder to write", required=True)
 _BASELINES = flags.DEFINE_list("baselines", ",".join(BASELINES), "rival rows, or empty")
 _HAND = flags.DEFINE_string("hand_weights", None, "of tune_hand_set: a further row")
+_IDM = flags.DEFINE_string("tuned_idm", None, "JSON of autotune: a further row")
 _DP = flags.DEFINE_bool("dp", False, "also drive the first weights by DP")
 _GUARD = flags.DEFINE_string(
     "guard",
@@ -58,7 +69,7 @@ _GUARD = flags.DEFINE_string(
 _FILTER = flags.DEFINE_enum(
     "filter", "full", TRACKS, "full, or collision: the reward decides the rest"
 )
-_CASES = flags.DEFINE_integer("cases", None, "cases per family, or recorded in all")
+_CASES = flags.DEFINE_integer("cases", None, "per family, else in all")
 _DURATION = flags.DEFINE_float("duration", None, "s per case at most (smoke 20)")
 _EVERY = flags.DEFINE_integer("plan_every", 1, "steps of 0.1 s between two plans")
 _CHUNK = flags.DEFINE_integer("chunk", 180, "cases driven together; bounds memory")
@@ -97,23 +108,40 @@ def _made_by(logs: Sequence[Part]) -> dict:
 
 def _job() -> SuiteJob:
     """Rows and catalogue cases that the flags name."""
-    recorded = _SUITE.value == "recorded"
+    elsewhere = _SUITE.value in ("recorded", "heldout")
     duration = _DURATION.value or (SMOKE_S if _SUITE.value == "smoke" else FULL_S)
     if not 1.0 <= duration <= FULL_S:
         raise InputError(f"--duration: {duration}: expected 1 to {FULL_S:g} s")
-    if recorded and _CASES.value is not None and _CASES.value < 1:
+    if elsewhere and _CASES.value is not None and _CASES.value < 1:
         raise InputError(f"--cases: {_CASES.value}: expected at least 1")
     return SuiteJob(
         weights=tuple(_WEIGHTS.value),
         baselines=tuple(_BASELINES.value),
-        refs=() if recorded else suite_refs(_SUITE.value, _CASES.value, _SEED.value),
+        refs=() if elsewhere else suite_refs(_SUITE.value, _CASES.value, _SEED.value),
         duration_s=duration,
         plan_every=_EVERY.value,
         dp=_DP.value,
         hand_weights=_HAND.value,
         guard=_GUARD.value,
+        tuned_idm=idm_fields(_IDM.value),
         track=_FILTER.value,
     )
+
+
+def _held_out(job: SuiteJob) -> None:
+    """Every row, and the recorded human, over held-out drives."""
+    if _DURATION.value:
+        raise InputError("--duration: of --suite=heldout: drives last as their records")
+    data = open_datasets(_DATA.value)
+    sources = data.parts if isinstance(data, JoinedDatasets) else [data]
+    made_by = {**_made_by([]), "data_hash": data.hash}
+    drives = held_out(sources, _CASES.value or DRIVES, _SEED.value)
+    report = held_out_likeness(drives, job.rows(), _EVERY.value)
+    folder = Path(_OUTPUT.value)
+    write_whole(folder / "table.txt", report.text())
+    write_json(folder / "likeness.json", {**report.as_dict(), "made_by": made_by})
+    print(report.text())
+    print(f"written: {_OUTPUT.value}/table.txt, likeness.json")
 
 
 def main() -> None:
@@ -121,10 +149,19 @@ def main() -> None:
     if _CHUNK.value < 1:
         raise InputError(f"--chunk: {_CHUNK.value}: expected at least 1")
     job, places = _job(), executor()
+    if not _IDM.value:
+        print(f"left out: {TUNED_IDM_ROW}: --tuned_idm is not given")
+    if not job.refs and places.workers > 1:
+        raise InputError(
+            f"--suite: {_SUITE.value}: expected --workers=1: drives run here"
+        )
+    if _SUITE.value == "heldout":
+        _held_out(job)
+        return
+    if _DATA.value:
+        raise InputError(f"--data: with --suite={_SUITE.value}: expected heldout")
     rows, drive, logs = job.rows(), drive_here, _logs()
     if logs:
-        if places.workers > 1:
-            raise InputError("--suite: recorded: expected --workers=1: drives run here")
         cases = _recorded(logs)
         rows.append(human_row())
     else:

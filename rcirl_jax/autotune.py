@@ -53,6 +53,7 @@ from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.export.spread import SuiteJob
 from rcirl_jax.export.sweep import SWEEP, read_sweep
+from rcirl_jax.export.tuned_idm import read_tuned_idm, write_tuned_idm
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm
 from rcirl_jax.rehearsal import Rehearsal, rehearse
 from rcirl_jax.report.recorded_replays import recorded_replays
@@ -348,15 +349,13 @@ class Loop:
         inputs = {"dataset": dataset.hash, "evaluations": IDM_EVALUATIONS}
 
         def work() -> None:
-            found = tune_idm(dataset, setup, IDM_EVALUATIONS)
-            write_json(path, dataclasses.asdict(found))
+            write_tuned_idm(path, tune_idm(dataset, setup, IDM_EVALUATIONS))
 
         self._run("tune", inputs, [path], work)
 
     @property
     def _tuned_idm(self) -> Idm:
-        found = read_json(self.folder / "tuned_idm.json", "a tuned IDM")
-        return Idm(**{name: float(value) for name, value in found.items()})
+        return read_tuned_idm(self.folder / "tuned_idm.json")
 
     def _rank(self, dataset: Demonstrations, futures: str) -> None:
         config, tuned = self.config, self._tuned_idm
@@ -416,7 +415,7 @@ class Loop:
 
         def work() -> None:
             drives = held_out(sources, self.config.drives)
-            found = held_out_likeness(drives, job.rows())
+            found = held_out_likeness(drives, job.rows(), job.plan_every)
             write_arrays(paths[0], found.likeness)
             body = {**found.as_dict(), "made_by": self._made_by()}
             write_json(paths[1], body)

@@ -30,6 +30,7 @@ def gate_job(
     plan_every: int,
     rivals: Sequence[str] = ("IDM",),
     tuned_idm: tuple[tuple[str, float], ...] = (),
+    track: str = "full",
 ) -> tuple[SuiteJob, str]:
     """The suite that both drive, and the name of the incumbent's row.
 
@@ -43,6 +44,7 @@ def gate_job(
       plan_every: steps of 0.1 s between two plans.
       rivals: further baselines.
       tuned_idm: fields of a further IDM row; empty without one.
+      track: of the safety filter, `SafetyConfig.track`.
 
     Raises:
       InputError: a duration, suite or count that cannot be.
@@ -65,6 +67,7 @@ def gate_job(
         duration_s=duration,
         plan_every=plan_every,
         tuned_idm=tuned_idm,
+        track=track,
     )
     return job, INCUMBENT if learned else incumbent
 
@@ -83,7 +86,7 @@ def drive_job(job: SuiteJob, executor: Executor) -> SuiteResult:
 
 
 def left_out(job: SuiteJob) -> str:
-    """What of the full suite a job does not drive, in words; "" if nothing."""
+    """What of the full suite a job leaves out, in words; "" if nothing."""
     full = suite_refs("full")
     missing = len({ref.id for ref in full} - {_first(ref).id for ref in job.refs})
     said = []
@@ -95,6 +98,8 @@ def left_out(job: SuiteJob) -> str:
         said.append(f"cases of {job.duration_s:g} s instead of {FULL_S:g} s")
     if job.plan_every > 1:
         said.append(f"a plan every {job.plan_every * STEP_S:g} s instead of {STEP_S:g}")
+    if job.track != "full":
+        said.append("a safety filter that only forbids collisions")
     return "; ".join(said)
 
 

@@ -21,10 +21,12 @@ from rcirl_jax.planner.plan import (
 from rcirl_jax.planner.rank import (
     ONLINE,
     RankConfig,
+    constant_score,
     hand_score,
     idm_policy,
     learned_score,
     rank_policy,
+    velocity_score,
 )
 from rcirl_jax.reward import RewardConfig, value
 from rcirl_jax.reward.network import pinned
@@ -156,3 +158,18 @@ def test_the_hand_set_row_uses_the_same_machine():
     policy = jax.jit(rank_policy(hand_score, dataclasses.replace(RankConfig())))
     plan = policy(None, scene_of(1), jax.random.key(1))
     assert np.isfinite(np.asarray(plan.a)).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_nulls_drive_the_first_and_the_fastest_admissible_candidate(seed):
+    made, key = scene_of(seed), jax.random.key(seed)
+    candidates = sampled(key, made, ONLINE)
+    ok = np.asarray(judge(made, candidates).admissible)
+    assert ok.any()
+    valid = np.asarray(made.time_valid)
+    mean = np.asarray(candidates.trajectory.v)[:, valid].mean(axis=1)
+    first, fastest = int(np.argmax(ok)), int(np.argmax(np.where(ok, mean, -1.0)))
+    for score, expected in ((constant_score, first), (velocity_score, fastest)):
+        plan = jax.jit(rank_policy(score, RankConfig()))(None, made, key)
+        driven = np.asarray(candidates.trajectory.s)[expected]
+        np.testing.assert_allclose(plan.s, driven, atol=1e-3)

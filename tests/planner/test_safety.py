@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from rcirl_jax.errors import InputError
 from rcirl_jax.planner.rank import ONLINE
 from rcirl_jax.planner.safety import SafetyConfig, Verdict, check, choose, first_contact
 from rcirl_jax.sampling.kinematics import trajectory_on_path
@@ -190,3 +191,35 @@ def test_the_later_contact_is_preferred_and_scores_decide_the_rest():
     scores = jnp.array([1.0, 9.0, jnp.nan])
     assert [int(x) for x in choose(some, two, scores)] == [0, 0]
     assert [int(x) for x in choose(some, two, jnp.full(3, jnp.nan))] == [1, 1]
+
+
+def test_the_collision_track_forbids_contacts_and_lines_only():
+    only = jax.jit(lambda s, c: check(s, c, SafetyConfig(track="collision")))
+    for seed in range(6):
+        made, candidates = scene_and_candidates(seed)
+        bounded, free = judge(made, candidates), only(made, candidates)
+        mine = np.asarray(free.admissible)
+        assert np.all(mine | ~np.asarray(bounded.admissible))
+        clear = np.isinf(np.asarray(free.contact_s)) & np.asarray(candidates.feasible)
+        o = made.obstacles
+        if not np.any(np.asarray(o.kind) == Kind.STOP):
+            np.testing.assert_array_equal(mine, clear)
+    # 25 m/s where 20 are allowed; 7.6 m behind a leader at 20 m/s, where the RSS
+    # distance is 20 0.4 + 20^2/14 - 20^2/16 + 1 = 12.6 m
+    fast = with_obstacle(Kind.NONE, 0.0, 0.0, v=25.0)
+    fast = fast.replace(
+        path=fast.path.replace(speed_limit=jnp.full_like(fast.path.speed_limit, 20.0))
+    )
+    near = with_obstacle(Kind.VEHICLE, 12.0, 0.0, v=20.0, speed=20.0)
+    for made, v in ((fast, 25.0), (near, 20.0)):
+        plan = straight(made, v)
+        assert not bool(judge(made, plan).admissible[0])
+        assert bool(only(made, plan).admissible[0])
+    for kind in (Kind.VEHICLE, Kind.STOP):
+        wall = with_obstacle(kind, 30.0, 0.0, v=20.0, speed=0.0)
+        assert not bool(only(wall, straight(wall, 20.0)).admissible[0])
+
+
+def test_an_unknown_track_is_one_line():
+    with pytest.raises(InputError, match="--filter: rss: expected one of"):
+        SafetyConfig(track="rss")

@@ -1,0 +1,59 @@
+"""Rows of a closed-loop table from files: the tuned IDM, several weights."""
+
+import dataclasses
+import json
+import shutil
+
+import pytest
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.export.closed_loop import table_rows
+from rcirl_jax.export.tuned_idm import idm_fields, read_tuned_idm, write_tuned_idm
+from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm
+from tests.weights_files import random_weights
+
+TUNED = Idm(headway=1.1, standstill_gap=2.5)
+
+
+def test_a_tuned_idm_comes_back_and_is_a_row(tmp_path):
+    file = tmp_path / "idm.json"
+    write_tuned_idm(file, TUNED)
+    assert read_tuned_idm(file) == TUNED
+    assert dict(idm_fields(str(file))) == dataclasses.asdict(TUNED)
+    assert idm_fields(None) == ()
+    weights = str(random_weights(tmp_path / "w.msgpack"))
+    names = [row.name for row in table_rows([weights], ["IDM"], tuned_idm=TUNED)]
+    assert names[1:] == ["IDM", TUNED_IDM_ROW]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"headway": -1.0}, "headway: -1.0: expected a number above 0"),
+        ({"headway": "1"}, "headway: 1: expected a number"),
+        ({"headway": True}, "headway: True: expected a number"),
+        ({"gap": 1.0}, "gap: expected the fields"),
+        (None, "expected JSON, a tuned IDM"),
+    ],
+)
+def test_a_wrong_file_is_one_line(change, message, tmp_path):
+    file = tmp_path / "idm.json"
+    body = {**dataclasses.asdict(TUNED), **(change or {})}
+    file.write_text(json.dumps(body) if change else "{")
+    with pytest.raises(InputError) as caught:
+        read_tuned_idm(file)
+    (line,) = str(caught.value).splitlines()
+    assert line.startswith(str(file))
+    assert message in line
+
+
+def test_weights_of_one_shape_and_seed_are_told_apart_by_their_file(tmp_path):
+    one = random_weights(tmp_path / "one.msgpack")
+    files = [str(one)]
+    for name in ("two", "three"):
+        files.append(str(shutil.copy(one, tmp_path / f"{name}.msgpack")))
+    rows = [row.name for row in table_rows(files, [])]
+    assert len(set(rows)) == 3
+    assert files[2] in rows[2]
+    with pytest.raises(InputError, match="met twice"):
+        table_rows([files[0]] * 4, [])
