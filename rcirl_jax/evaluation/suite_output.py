@@ -68,7 +68,7 @@ def format_suite(report: SuiteReport) -> str:
     ]
     lines += text_table(
         ["", "|j| case", "|j| sample", "faults", "prevent.", "VRU", "hits", "red",
-         "stop", "off road", "progress", "nuPlan [95 %]"],
+         "stop", "off road", "creep", "turns/s", "progress", "nuPlan [95 %]"],
         [_safety(name, row) for name, row in report.rows.items()],
     )  # fmt: skip
     lines += ["", *_differences(report)]
@@ -87,6 +87,8 @@ def _safety(name: str, row: RowSummary) -> list[str]:
         str(row.red_lights),
         str(row.stop_signs),
         str(row.off_road),
+        f"{100 * row.physical['creeping_share']:.1f} %",
+        f"{row.physical['sign_changes_per_s']:.2f}",
         f"{100 * row.progress_ratio:.1f} %",
         f"{100 * row.nuplan:.1f} [{100 * row.nuplan_low:.1f},"
         f"{100 * row.nuplan_high:.1f}]",
