@@ -8,6 +8,7 @@ import pytest
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.closed_loop import table_rows
+from rcirl_jax.export.gate_job import gate_job, left_out
 from rcirl_jax.export.tuned_idm import idm_fields, read_tuned_idm, write_tuned_idm
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm
 from tests.weights_files import random_weights
@@ -57,3 +58,19 @@ def test_weights_of_one_shape_and_seed_are_told_apart_by_their_file(tmp_path):
     assert files[2] in rows[2]
     with pytest.raises(InputError, match="met twice"):
         table_rows([files[0]] * 4, [])
+
+
+@pytest.mark.parametrize("track", ["full", "collision"])
+def test_a_gate_under_another_filter_has_left_something_out(track, tmp_path):
+    job, _ = gate_job(
+        str(random_weights(tmp_path / "w.msgpack")),
+        "hand-set",
+        suite="full",
+        cases=None,
+        duration_s=None,
+        catalogue_seed=0,
+        plan_every=1,
+        track=track,
+    )
+    assert job.track == track
+    assert ("only forbids collisions" in left_out(job)) is (track == "collision")
