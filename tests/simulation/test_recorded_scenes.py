@@ -197,6 +197,15 @@ def test_jensen_shannon_of_known_samples():
     mixed = np.concatenate([a[:5], b[:5]])
     expected = -(0.75 * np.log2(0.75) + 0.25 * np.log2(0.25)) - 0.5
     assert jensen_shannon(a, mixed, "jerk") == pytest.approx(np.sqrt(expected))
+    assert jensen_shannon(a[:0], b[:0], "jerk") == 0.0
+
+
+def test_jensen_shannon_of_nearly_equal_samples_is_a_number():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        a = rng.uniform(-8.0, 8.0, 10_000)
+        b = np.append(a[1:], 0.0)
+        assert 0.0 <= jensen_shannon(a, b, "jerk") < 0.01
 
 
 def test_a_split_without_scenes_is_one_line():
