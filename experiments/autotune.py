@@ -13,7 +13,6 @@ that can prove little. `experiments.gate` gives the verdict as its exit status.
 """
 
 import dataclasses
-import difflib
 from pathlib import Path
 
 from absl import flags
@@ -26,7 +25,7 @@ from rcirl_jax.autotune import STAGES, Loop, TuneConfig
 from rcirl_jax.data.importers import IMPORTERS
 from rcirl_jax.data.importing import ImportConfig
 from rcirl_jax.data.logs import Logs
-from rcirl_jax.errors import InputError
+from rcirl_jax.errors import InputError, did_you_mean
 from rcirl_jax.rehearsal import TEACHERS
 from rcirl_jax.stages import file_sha256, only_one
 from rcirl_jax.train.running import Running
@@ -135,9 +134,8 @@ def _given() -> list[str | Logs]:
         )
     for name in formats:
         if name not in IMPORTERS:
-            near = difflib.get_close_matches(name, IMPORTERS, 1)
-            hint = f"; did you mean {near[0]}?" if near else ""
             known = ", ".join(sorted(IMPORTERS))
+            hint = did_you_mean(name, IMPORTERS)
             raise InputError(f"--format: {name}: expected one of {known}{hint}")
     return [
         _logs(name, Path(path), Path(source) if source else None)

@@ -5,9 +5,10 @@ experiment files turn it into that line on stderr and exit status 2.
 """
 
 import contextlib
+import difflib
 import struct
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 HEAD, TAIL = 1400, 400  # characters kept of the ends of a line too long
@@ -44,6 +45,17 @@ UNFORESEEN = (
     ValueError,
     struct.error,
 )
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """The end of a line on an unknown name: the nearest known one, "" if none is near.
+
+    Args:
+      name: what was given.
+      known: what there is.
+    """
+    near = difflib.get_close_matches(name, list(known), 1)
+    return f"; did you mean {near[0]}?" if near else ""
 
 
 @contextlib.contextmanager

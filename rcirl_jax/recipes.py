@@ -12,7 +12,6 @@ given beside it win.
 """
 
 import dataclasses
-import difflib
 import types
 import typing
 from collections.abc import Mapping
@@ -20,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from rcirl_jax.data.config import CollectConfig
-from rcirl_jax.errors import InputError
+from rcirl_jax.errors import InputError, did_you_mean
 from rcirl_jax.features import feature_map
 from rcirl_jax.rehearsal import Rehearsal
 from rcirl_jax.reward import RewardConfig
@@ -66,7 +65,7 @@ def load_recipe(name: str) -> Recipe:
     else:
         raise InputError(
             f"--recipe: {name}: expected one of {', '.join(known)}, or a .toml file"
-            + _nearest(name, known)
+            + did_you_mean(name, known)
         )
     body = load_toml(path)
     _check_keys(f"{path}", body, TABLES)
@@ -172,10 +171,5 @@ def _check_keys(where: str, found: Mapping[str, Any], known: typing.Sequence) ->
         if key not in known:
             raise InputError(
                 f"{where}: {key}: unknown: expected some of {', '.join(known)}"
-                + _nearest(key, known)
+                + did_you_mean(key, known)
             )
-
-
-def _nearest(name: str, known: typing.Sequence[str]) -> str:
-    close = difflib.get_close_matches(name, known, 1)
-    return f"; did you mean {close[0]}?" if close else ""
