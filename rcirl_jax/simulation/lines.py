@@ -3,7 +3,14 @@
 import jax
 import jax.numpy as jnp
 
-from rcirl_jax.simulation.cases import LineKind, Lines
+from rcirl_jax.simulation.cases import (
+    STEP_S,
+    Case,
+    EgoState,
+    LineKind,
+    Lines,
+    World,
+)
 
 # m/s^2: at yellow one stops if this braking suffices (dilemma-zone practice)
 YELLOW_BRAKING_MPS2 = 3.0
@@ -45,3 +52,18 @@ def serve(
     """Stop signs at which the ego has stood: within 5 m before it, below 0.1 m/s."""
     stands = (v < STOP_SPEED_MPS) & (distance >= 0.0) & (distance <= STOP_WINDOW_M)
     return served | (stands & (lines.kind == LineKind.STOP_SIGN))
+
+
+def stop_line(case: Case, world: World, ego: EgoState) -> jax.Array:
+    """Station [] m of the nearest line that demands a stop of the ego now; inf.
+
+    Args:
+      case: the drive, with its lines.
+      world: its clock and the stop signs at which the ego has stood.
+      ego: whose front is at or before the line.
+    """
+    lines = case.lines
+    distance = lines.s - (ego.s + 0.5 * case.ego_length)
+    light = demands(lines, world.step * STEP_S, distance, ego.v[None])
+    sign = (lines.kind == LineKind.STOP_SIGN) & ~world.served
+    return jnp.min(jnp.where((light | sign) & (distance >= 0.0), lines.s, jnp.inf))

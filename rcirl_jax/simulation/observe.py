@@ -11,7 +11,6 @@ from rcirl_jax.geometry.boxes import frenet_extent
 from rcirl_jax.geometry.frenet import lookup
 from rcirl_jax.geometry.limits import planning_limit
 from rcirl_jax.planner.prediction import Bodies, obstacles_of
-from rcirl_jax.simulation import lines as signals
 from rcirl_jax.simulation.cases import (
     NUM_AGENTS,
     NUM_HISTORY,
@@ -19,11 +18,11 @@ from rcirl_jax.simulation.cases import (
     STEP_S,
     AgentState,
     Case,
-    LineKind,
     Road,
     Seen,
     World,
 )
+from rcirl_jax.simulation.lines import stop_line
 from rcirl_jax.types import NUM_TAGS, Ego, Path, Scene
 from rcirl_jax.units import NUM_STATIONS, NUM_TIMES
 
@@ -83,16 +82,6 @@ def _bodies(case: Case, world: World, seen: Seen) -> Bodies:
     )
 
 
-def _stop_line(case: Case, world: World) -> jax.Array:
-    """Station of the nearest line that demands a stop now, m; inf without one."""
-    lines = case.lines
-    distance = lines.s - (world.ego.s + 0.5 * case.ego_length)
-    light = signals.demands(lines, world.step * STEP_S, distance, world.ego.v[None])
-    sign = (lines.kind == LineKind.STOP_SIGN) & ~world.served
-    demands = (light | sign) & (distance >= 0.0)
-    return jnp.min(jnp.where(demands, lines.s, jnp.inf))
-
-
 def _window(table: jax.Array, s: jax.Array) -> jax.Array:
     """The road grid from the ego on, at the planner's stations [P]."""
     position = jnp.clip(s / ROAD_STEP_M, 0.0, table.shape[0] - NUM_STATIONS - 1.0)
@@ -138,7 +127,7 @@ def observe(case: Case, world: World, limit: jax.Array) -> Scene:
         path=path,
         obstacles=obstacles_of(
             _bodies(case, world, perceive(case, world)),
-            _stop_line(case, world) - ego.s,
+            stop_line(case, world, ego) - ego.s,
             road.destination - ego.s,
             seen_ego,
             path,

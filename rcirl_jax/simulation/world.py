@@ -233,21 +233,13 @@ def _lines(
     return ran_red, ran_sign, signals.serve(lines, world.served, after, moved.v)
 
 
-def _line_ahead(case: Case, world: World, ego: EgoState) -> jax.Array:
-    """Distance [m] from the front to the nearest line that demands a stop; inf."""
-    lines = case.lines
-    distance = lines.s - (ego.s + 0.5 * case.ego_length)
-    light = signals.demands(lines, world.step * STEP_S, distance, ego.v[None])
-    sign = (lines.kind == LineKind.STOP_SIGN) & ~world.served
-    return jnp.min(jnp.where((light | sign) & (distance >= 0.0), distance, jnp.inf))
-
-
 def _record(
     case: Case, world: World, ego: EgoState, state: AgentState, found: judge.Contacts
 ) -> Record:
     road = case.road
     count = lambda mask: jnp.sum(mask, dtype=jnp.int32)  # noqa: E731
     nearest = jnp.argmin(found.ttc)
+    front = ego.s + 0.5 * case.ego_length
     fault = found.at_fault
     return Record(
         valid=(world.step < case.steps) & ~world.stopped,
@@ -264,7 +256,8 @@ def _record(
         ttc_counts=found.ahead[nearest] & jnp.isfinite(found.ttc[nearest]),
         headway=judge.headway(case, ego, state),
         free_way=jnp.minimum(
-            judge.gap_ahead(case, ego, state), _line_ahead(case, world, ego)
+            judge.gap_ahead(case, ego, state),
+            signals.stop_line(case, world, ego) - front,
         ),
         collision=count(found.hit),
         at_fault=count(fault),
