@@ -12,8 +12,6 @@ given beside it win.
 """
 
 import dataclasses
-import types
-import typing
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -24,6 +22,7 @@ from rcirl_jax.features import feature_map
 from rcirl_jax.rehearsal import Rehearsal
 from rcirl_jax.reward import RewardConfig
 from rcirl_jax.sampling import SamplerConfig
+from rcirl_jax.settings import check_names, typed_fields
 from rcirl_jax.specs import load_toml, spec_root
 from rcirl_jax.train.state import TrainConfig
 
@@ -68,12 +67,12 @@ def load_recipe(name: str) -> Recipe:
             + did_you_mean(name, known)
         )
     body = load_toml(path)
-    _check_keys(f"{path}", body, TABLES)
+    check_names(f"{path}: ", body, TABLES)
     train = _table(path, "train", body.get("train", {}))
     reward = _table(path, "train.reward", train.pop("reward", {}))
     sampler = _table(path, "train.sampler", train.pop("sampler", {}))
     tuning = _table(path, "autotune", body.get("autotune", {}))
-    _check_keys(f"{path}: [autotune]", tuning, ("seeds",))
+    check_names(f"{path}: [autotune] ", tuning, ("seeds",))
     seeds = tuning.get("seeds", 1)
     if type(seeds) is not int or seeds < 1:
         raise InputError(f"{path}: [autotune] seeds: {seeds}: expected at least 1")
@@ -143,33 +142,5 @@ def _table(path: Path, where: str, found: object) -> dict:
 def _typed(
     path: Path, where: str, kind: type, found: dict, without: tuple[str, ...]
 ) -> dict[str, Any]:
-    """Values of the fields of a dataclass, of their types; lists as tuples."""
-    hints = typing.get_type_hints(kind)
-    known = [f.name for f in dataclasses.fields(kind) if f.name not in without]
-    _check_keys(f"{path}: [{where}]", found, known)
-    return {n: _value(f"{path}: [{where}] {n}", hints[n], v) for n, v in found.items()}
-
-
-def _value(where: str, kind: Any, value: Any) -> Any:  # noqa: ANN401
-    if isinstance(kind, types.UnionType):
-        kind = next(k for k in typing.get_args(kind) if k is not type(None))
-    parts = typing.get_args(kind)
-    if parts and isinstance(value, list):
-        kinds = parts[:1] * len(value) if parts[-1] is ... else parts
-        if len(kinds) == len(value):
-            return tuple(_value(where, k, v) for k, v in zip(kinds, value, strict=True))
-    elif type(value) is kind:
-        return value
-    elif kind is float and type(value) is int:
-        return float(value)
-    name = "a list" if parts else {"str": "a text"}.get(kind.__name__, kind.__name__)
-    raise InputError(f"{where}: {value!r}: expected {name}")
-
-
-def _check_keys(where: str, found: Mapping[str, Any], known: typing.Sequence) -> None:
-    for key in found:
-        if key not in known:
-            raise InputError(
-                f"{where}: {key}: unknown: expected some of {', '.join(known)}"
-                + did_you_mean(key, known)
-            )
+    """The values of a table [where] of the recipe, of the types of their fields."""
+    return typed_fields(kind, found, f"{path}: [{where}] ", without)

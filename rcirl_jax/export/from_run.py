@@ -1,8 +1,6 @@
 """A training run -> weights.msgpack with verification samples."""
 
-import dataclasses
 import datetime
-import typing
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -24,6 +22,7 @@ from rcirl_jax.reward import (
     value,
 )
 from rcirl_jax.reward.network import LEAKY_SLOPE
+from rcirl_jax.settings import typed_settings
 from rcirl_jax.train.loop import normaliser_rows, restore_run, to_device_batch
 from rcirl_jax.train.metrics import read_metrics
 from rcirl_jax.train.state import TrainConfig, TrainState
@@ -32,43 +31,6 @@ from rcirl_jax.units import TIMES_S
 from rcirl_jax.whole import read_json
 
 NUM_SAMPLES = 32  # verification samples in the file
-
-
-def _typed(kind: type, value: Any, where: str) -> Any:  # noqa: ANN401
-    """A JSON value as the type of a configuration's field: lists as tuples.
-
-    Raises:
-      ValueError: of another type, not finite, or beyond 32 bits (names the field).
-    """
-    parts = typing.get_args(kind)
-    if parts and isinstance(value, list):
-        kinds = parts[:1] * len(value) if parts[-1] is ... else parts
-        if len(kinds) == len(value):
-            return tuple(
-                _typed(k, v, f"{where}[{i}]")
-                for i, (k, v) in enumerate(zip(kinds, value, strict=True))
-            )
-    elif dataclasses.is_dataclass(kind) and isinstance(value, dict):
-        return typed_settings(kind, value, f"{where}.")
-    elif type(value) is kind is str:
-        return value
-    elif type(value) in {int, kind} and kind in {int, float} and abs(value) < 2**31:
-        return value  # NaN is not below either
-    name = "list" if parts else getattr(kind, "__name__", str(kind))
-    raise ValueError(f"{where}: {value}: expected {name}")
-
-
-def typed_settings(kind: type, found: Mapping[str, Any], where: str = "") -> Any:  # noqa: ANN401
-    """A dataclass of its fields as JSON types; `where` goes before their names.
-
-    Raises:
-      ValueError, TypeError: they are not those of this version.
-    """
-    hints = typing.get_type_hints(kind)
-    if unknown := sorted(set(found) - set(hints)):
-        raise ValueError(f"{where}{unknown[0]}: expected a setting of this version")
-    typed = {n: _typed(hints[n], v, f"{where}{n}") for n, v in found.items()}
-    return kind(**typed)
 
 
 def config_of(settings: Mapping[str, Any]) -> TrainConfig:

@@ -26,11 +26,11 @@ from rcirl_jax.evaluation.sweep import (
 from rcirl_jax.export.from_run import (
     config_of,
     export_run,
-    typed_settings,
     verification_samples,
 )
 from rcirl_jax.export.reader import RANGES, Reward
 from rcirl_jax.export.sweep import write_member
+from rcirl_jax.settings import typed_settings
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.running import Running
 from rcirl_jax.train.state import TrainConfig

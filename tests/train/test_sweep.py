@@ -121,8 +121,8 @@ def test_a_member_is_made_again_from_its_file(data, finished, tmp_path):
         ({"dataset_sha256": "0" * 64}, "provenance.dataset_sha256: 0000"),
         ({"seeds": 1}, "provenance.config: h6_a0.3_r0.03_s1: expected a member of"),
         ({"seeds": 10**9}, "provenance.sweep: --seeds: 1000000000: expected a sweep"),
-        ({"seeds": "two"}, "provenance.sweep: seeds: two: expected int: expected"),
-        ({"more": 1}, "provenance.sweep: more: expected a setting of this version"),
+        ({"seeds": "two"}, "provenance.sweep: seeds: 'two': expected int: expected"),
+        ({"more": 1}, "provenance.sweep: more: unknown: expected some of data, base,"),
     ],
 )
 def test_a_member_that_cannot_be_made_again_is_one_line(
