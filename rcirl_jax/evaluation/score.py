@@ -16,6 +16,7 @@ from rcirl_jax.data.rows import refuse_scenes
 from rcirl_jax.executor import Executor, Here
 from rcirl_jax.features import FeatureMap, feature_map
 from rcirl_jax.features.columns import COLUMNS, make_frame
+from rcirl_jax.geometry.polynomial import hermite
 from rcirl_jax.planner.baselines import (
     Idm,
     closeness,
@@ -73,14 +74,8 @@ def position_at(trajectory: Trajectory, horizon_s: float) -> tuple:
     """(s, l) [m] at the horizon: cubic Hermite in s, linear in l between times."""
     low = min(int(horizon_s / DT_S + 1e-6), NUM_TIMES - 2)
     u = horizon_s / DT_S - low
-    s0, s1 = trajectory.s[low], trajectory.s[low + 1]
-    v0, v1 = trajectory.v[low] * DT_S, trajectory.v[low + 1] * DT_S
-    s = (
-        (1 + 2 * u) * (1 - u) ** 2 * s0
-        + u * (1 - u) ** 2 * v0
-        + u**2 * (3 - 2 * u) * s1
-        + u**2 * (u - 1) * v1
-    )
+    slopes = trajectory.v[low] * DT_S, trajectory.v[low + 1] * DT_S
+    s = hermite(u, trajectory.s[low], trajectory.s[low + 1], slopes)
     return s, trajectory.l[low] + u * (trajectory.l[low + 1] - trajectory.l[low])
 
 

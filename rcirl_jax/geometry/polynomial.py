@@ -1,4 +1,4 @@
-"""Quartic and quintic polynomials between states, in closed form.
+"""Cubic, quartic and quintic polynomials between states, in closed form.
 
 Source: Werling et al. 2010, "Optimal trajectory generation for dynamic street
 scenarios in a Frenet frame". Time is normalised by the duration inside, so
@@ -71,3 +71,27 @@ def evaluate(
         values.append(total)
         row = row[1:] * jnp.arange(1, row.shape[0], dtype=jnp.float32)
     return values[0], values[1], values[2], values[3]
+
+
+def hermite(
+    x: Float[Array, "..."] | float,
+    begin: Float[Array, "..."],
+    end: Float[Array, "..."],
+    slopes: tuple[Float[Array, "..."], Float[Array, "..."]],
+    duration: float = 1.0,
+) -> Float[Array, "..."]:
+    """Value of the cubic that has given values and slopes at both ends.
+
+    Args:
+      x: share of the way between the ends, 0 to 1.
+      begin: value at x = 0; its unit is that of the result.
+      end: value at x = 1.
+      slopes: at both ends, per unit of time (or of whatever the cubic runs over).
+      duration: between the ends, in that unit; 1: the slopes are per whole way.
+    """
+    return (
+        (1.0 + 2.0 * x) * (1.0 - x) ** 2 * begin
+        + x * (1.0 - x) ** 2 * duration * slopes[0]
+        + x**2 * (3.0 - 2.0 * x) * end
+        - x**2 * (1.0 - x) * duration * slopes[1]
+    )

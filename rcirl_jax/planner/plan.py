@@ -11,6 +11,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
+from rcirl_jax.geometry.polynomial import hermite
 from rcirl_jax.types import Trajectory
 from rcirl_jax.units import DT_S, NUM_TIMES, TIMES_S
 
@@ -117,13 +118,12 @@ def stations_from_now(plan: Plan) -> jax.Array:
     def at(t: jax.Array) -> jax.Array:
         place = jnp.clip(t / DT_S, 0.0, NUM_TIMES - 1.0)
         low = jnp.minimum(place.astype(jnp.int32), NUM_TIMES - 2)
-        x = place - low
-        s0, s1, v0, v1 = plan.s[low], plan.s[low + 1], plan.v[low], plan.v[low + 1]
-        inside = (
-            (1.0 + 2.0 * x) * (1.0 - x) ** 2 * s0
-            + x * (1.0 - x) ** 2 * DT_S * v0
-            + x**2 * (3.0 - 2.0 * x) * s1
-            - x**2 * (1.0 - x) * DT_S * v1
+        inside = hermite(
+            place - low,
+            plan.s[low],
+            plan.s[low + 1],
+            (plan.v[low], plan.v[low + 1]),
+            DT_S,
         )
         return inside + jnp.maximum(t - TIMES_S[-1], 0.0) * plan.v[-1]
 

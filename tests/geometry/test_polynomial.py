@@ -1,4 +1,4 @@
-"""Polynomials against a float64 linear solve and automatic derivatives."""
+"""Polynomials against a float64 linear solve, automatic derivatives and scipy."""
 
 import jax
 import jax.numpy as jnp
@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.interpolate import CubicHermiteSpline
 
-from rcirl_jax.geometry.polynomial import evaluate, quartic, quintic
+from rcirl_jax.geometry.polynomial import evaluate, hermite, quartic, quintic
 
 speeds = st.floats(-5, 40, width=32)
 accelerations = st.floats(-8, 4, width=32)
@@ -65,3 +66,19 @@ def test_tiny_durations_stay_finite(duration):
     assert np.isfinite(
         np.asarray(quintic(0.0, 1.0, 0.0, 1.0, 2.0, 0.0, duration))
     ).all()
+
+
+@given(v0=speeds, v1=speeds, s1=st.floats(0, 200, width=32), d=durations)
+def test_hermite_is_that_of_scipy(v0, v1, s1, d):
+    x = jnp.linspace(0.0, 1.0, 9)
+    ends, slopes = (
+        (jnp.float32(3.0), jnp.float32(s1)),
+        (jnp.float32(v0), jnp.float32(v1)),
+    )
+    expected = CubicHermiteSpline([0.0, d], [3.0, s1], [v0, v1])(np.linspace(0, d, 9))
+    found = hermite(x, *ends, slopes, d)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-3)
+    # slopes per whole way, and a share that is no array
+    again = hermite(0.25, *ends, (slopes[0] * d, slopes[1] * d))
+    assert float(again) == pytest.approx(expected[2], rel=1e-5, abs=1e-3)
+    assert (float(found[0]), float(found[-1])) == pytest.approx((3.0, s1))
