@@ -72,7 +72,7 @@ def _value(kind: Any, value: Any, where: str) -> Any:  # noqa: ANN401
         kinds = typing.get_args(kind)
         if value is None and type(None) in kinds:
             return None
-        kind = next(k for k in kinds if k is not type(None))
+        return _value(next(k for k in kinds if k is not type(None)), value, where)
     parts = typing.get_args(kind)
     if parts and isinstance(value, list):
         kinds = parts[:1] * len(value) if parts[-1] is ... else parts
