@@ -8,10 +8,11 @@ from rcirl_jax.evaluation.exact import CONFIDENCE, holm, mcnemar_exact, tango
 from rcirl_jax.evaluation.gate_stats import (
     MIN_CLUSTERS,
     clipped,
+    counted,
     over_clusters,
     within_strata,
 )
-from rcirl_jax.evaluation.gate_types import Check, GateConfig, Kind, Outcome, Pair
+from rcirl_jax.evaluation.gate_types import Check, GateConfig, Outcome, Pair, check_of
 from rcirl_jax.evaluation.gate_words import title_of
 from rcirl_jax.evaluation.statistics import (
     ClusterBootstrap,
@@ -65,41 +66,6 @@ def _proved(low: float, high: float, margin: float) -> Outcome:
     return "fail" if high < 0.0 else "open"
 
 
-def _check(
-    kind: Kind,
-    name: str,
-    title: str,
-    outcome: Outcome,
-    found: Difference,
-    margin: float | None,
-    pairs: tuple[int, int] | None = None,
-    p: float | None = None,
-    note: str = "",
-) -> Check:
-    return Check(
-        kind=kind,
-        name=name,
-        title=title,
-        outcome=outcome,
-        difference=found.mean,
-        low=found.low,
-        high=found.high,
-        margin=margin,
-        gained=None if pairs is None else pairs[0],
-        lost=None if pairs is None else pairs[1],
-        p=p,
-        note=note,
-    )
-
-
-def _counted(pairs: tuple[int, int], total: int) -> Difference:
-    """(gained, lost) of `total` cases with Tango's interval; McNemar's p."""
-    low, high = tango(*pairs, total, CONFIDENCE)
-    mean = (pairs[0] - pairs[1]) / total
-    p = mcnemar_exact(*pairs)
-    return Difference(mean=mean, low=low, high=high, se=np.nan, p=p)
-
-
 def no_loss(pair: Pair, config: GateConfig) -> list[Check]:
     """Rates and progress of all cases, within their margins.
 
@@ -111,23 +77,22 @@ def no_loss(pair: Pair, config: GateConfig) -> list[Check]:
     for name in RATES:
         margin = config.margins[name]
         pairs = _discordant(mine[name], theirs[name])
-        rate = _counted(pairs, count)
+        rate = counted(pairs, count)
         note = ""
         if tango(0, 0, count, CONFIDENCE)[0] <= -margin:
             note = f"{count} cases can never prove a loss below {100 * margin:g} %"
         outcome = _proved(rate.low, rate.high, margin)
         title = title_of(name)
-        found.append(
-            _check("no loss", name, title, outcome, rate, margin, pairs, note=note)
+        check = check_of(
+            "no loss", name, title, outcome, rate, margin, pairs, note=note
         )
+        found.append(check)
     _, strata = np.unique(pair.families, return_inverse=True)
     # nobody drives less than no way at all
     way = clipped(within_strata(*_ways(pair), strata), high=np.inf)
-    outcome = _proved(way.low, way.high, config.progress)
-    margin = config.progress
-    found.append(
-        _check("no loss", "progress", title_of("progress"), outcome, way, margin)
-    )
+    margin, title = config.progress, title_of("progress")
+    outcome = _proved(way.low, way.high, margin)
+    found.append(check_of("no loss", "progress", title, outcome, way, margin))
     return found
 
 
@@ -152,7 +117,7 @@ def families(pair: Pair, config: GateConfig) -> list[Check]:
     mine, theirs = is_clean(pair.candidate), is_clean(pair.incumbent)
     pairs = [_discordant(mine[names == n], theirs[names == n]) for n in order]
     totals = [int(np.sum(names == n)) for n in order]
-    rates = [_counted(*each) for each in zip(pairs, totals, strict=True)]
+    rates = [counted(*each) for each in zip(pairs, totals, strict=True)]
     ways = []
     for name in order:
         at = names == name
@@ -167,19 +132,19 @@ def families(pair: Pair, config: GateConfig) -> list[Check]:
         shown = rates[i].low > -config.family_clean
         clean: Outcome = "fail" if detected else "pass" if shown else "open"
         title, p = f"{name}, clean drives", float(rate_p[i])
+        margin = config.family_clean
         found.append(
-            _check("families", title, title, clean, rates[i], config.family_clean,
-                   pairs[i], p)
-        )  # fmt: skip
+            check_of("families", title, title, clean, rates[i], margin, pairs[i], p)
+        )
         small = -MATERIAL * config.family_progress
         detected = ways[i].mean < small and way_p[i] < LEVEL and not few
         shown = ways[i].low > -config.family_progress and not few
         way: Outcome = "fail" if detected else "pass" if shown else "open"
         title, p = f"{name}, progress", float(way_p[i])
+        margin = config.family_progress
         found.append(
-            _check("families", title, title, way, ways[i], config.family_progress,
-                   p=p, note=note)
-        )  # fmt: skip
+            check_of("families", title, title, way, ways[i], margin, p=p, note=note)
+        )
     return found
 
 
@@ -242,7 +207,8 @@ def _gain(
     if judged and found.mean < -config.gain and p < LEVEL:
         outcome = "fail"
     note = few if name != "likeness" else ""
-    return _check("gain", name, title_of(name), outcome, found, None, pairs, p, note)
+    title = title_of(name)
+    return check_of("gain", name, title, outcome, found, pairs=pairs, p=p, note=note)
 
 
 def _scores(pair: Pair) -> tuple[np.ndarray, np.ndarray]:

@@ -1,6 +1,6 @@
 """Human-likeness in the gate: nearer to held-out recorded drives than nulls.
 
-Distances are paired by drive and clustered by recording. Differences are shares of the
+Distances are paired by drive and clustered by vehicle. Differences are shares of the
 other row's mean distance, positive where the candidate is nearer. Host numpy. `D`
 recorded drives.
 """
@@ -8,7 +8,6 @@ recorded drives.
 import numpy as np
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.gate_safety import unmeasured
 from rcirl_jax.evaluation.gate_stats import MIN_CLUSTERS, over_clusters
 from rcirl_jax.evaluation.gate_types import (
     CANDIDATE,
@@ -18,6 +17,8 @@ from rcirl_jax.evaluation.gate_types import (
     Likeness,
     Outcome,
     Pair,
+    check_of,
+    unmeasured,
 )
 from rcirl_jax.evaluation.gate_words import name_of
 from rcirl_jax.evaluation.statistics import ClusterBootstrap, Difference
@@ -61,19 +62,7 @@ def _check(pair: Pair, kind: Kind, name: str, title: str, other: str) -> Check:
         outcome = "fail"
     elif found.low > 0.0:
         outcome = "pass"
-    return Check(
-        kind=kind,
-        name=name,
-        title=title,
-        outcome=outcome,
-        difference=found.mean,
-        low=found.low,
-        high=found.high,
-        margin=None,
-        gained=None,
-        lost=None,
-        p=found.p,
-    )
+    return check_of(kind, name, title, outcome, found, p=found.p)
 
 
 def _few(known: Likeness) -> str:
@@ -82,7 +71,7 @@ def _few(known: Likeness) -> str:
     if clusters >= MIN_CLUSTERS:
         return ""
     return (
-        f"{clusters} recordings are too few for an interval over them:"
+        f"{clusters} vehicles are too few for an interval over them:"
         f" measure at least {MIN_CLUSTERS}"
     )
 

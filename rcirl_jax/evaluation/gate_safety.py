@@ -17,8 +17,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.exact import CONFIDENCE, mcnemar_exact, tango
 from rcirl_jax.evaluation.gate_exact import ALPHA, no_more_faults
+from rcirl_jax.evaluation.gate_stats import counted
 from rcirl_jax.evaluation.gate_types import (
     Check,
     GateConfig,
@@ -26,6 +26,8 @@ from rcirl_jax.evaluation.gate_types import (
     NewFault,
     Outcome,
     Pair,
+    check_of,
+    unmeasured,
 )
 from rcirl_jax.evaluation.gate_words import title_of
 from rcirl_jax.simulation.metrics import CaseMetrics
@@ -99,25 +101,6 @@ def nulls_safety(pair: Pair, config: GateConfig) -> list[Check]:
     return found
 
 
-def unmeasured(kind: Kind, name: str, title: str, note: str) -> Check:
-    """A check that nothing was measured for; `note` says what to do."""
-    return Check(
-        kind=kind,
-        name=name,
-        title=title,
-        outcome="open",
-        difference=0.0,
-        low=-1.0,
-        high=1.0,
-        margin=None,
-        gained=None,
-        lost=None,
-        p=None,
-        note=note,
-        measured=False,
-    )
-
-
 def _against(
     kind: Kind, pair: Pair, other: CaseMetrics, config: GateConfig, null: str
 ) -> list[Check]:
@@ -149,26 +132,15 @@ def _check(
     null: str,
 ) -> Check:
     """One offence with (gained, lost) of `count` cases."""
-    (gained, lost), margin = pairs, margins[name]
-    p = no_more_faults(gained, lost, count, margin)
+    margin, found = margins[name], counted(pairs, count)
+    p = no_more_faults(*pairs, count, margin)
     outcome: Outcome = "pass" if p <= ALPHA else "open"
-    if lost > gained and mcnemar_exact(gained, lost) < 2.0 * ALPHA:
+    if found.mean < 0.0 and found.p < 2.0 * ALPHA:
         outcome = "fail"
-    low, high = tango(gained, lost, count, CONFIDENCE)
     note = ""
     if outcome == "open" and no_more_faults(0, 0, count, margin) > ALPHA:
         note = f"{count} cases can never prove a margin of {100 * margin:g} %"
-    return Check(
-        kind=kind,
-        name=f"{name}, {null}" if null else name,
-        title=f"as safe as {null}: {title_of(name)}" if null else title_of(name),
-        outcome=outcome,
-        difference=(gained - lost) / count,
-        low=low,
-        high=high,
-        margin=margin,
-        gained=gained,
-        lost=lost,
-        p=p,
-        note=note,
-    )
+    title = title_of(name)
+    if null:
+        name, title = f"{name}, {null}", f"as safe as {null}: {title}"
+    return check_of(kind, name, title, outcome, found, margin, pairs, p, note)

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from scipy.special import stdtr, stdtrit
 
-from rcirl_jax.evaluation.exact import CONFIDENCE
+from rcirl_jax.evaluation.exact import CONFIDENCE, mcnemar_exact, tango
 from rcirl_jax.evaluation.statistics import (
     ClusterBootstrap,
     Difference,
@@ -20,7 +20,19 @@ from rcirl_jax.evaluation.statistics import (
     paired_difference,
 )
 
-MIN_CLUSTERS = 5  # families or recordings below which no interval over them is made
+MIN_CLUSTERS = 5  # families or vehicles below which no interval over them is made
+
+
+def counted(pairs: tuple[int, int], total: int) -> Difference:
+    """Share of cases gained minus lost, with Tango's interval and McNemar's p.
+
+    Args:
+      pairs: (gained, lost) cases.
+      total: all cases.
+    """
+    low, high = tango(*pairs, total, CONFIDENCE)
+    mean = (pairs[0] - pairs[1]) / total
+    return Difference(mean=mean, low=low, high=high, se=np.nan, p=mcnemar_exact(*pairs))
 
 
 def over_clusters(

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.statistics import Difference
 from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics
 
 Kind = Literal["safety", "no loss", "families", "nulls", "likeness", "gain"]
@@ -92,7 +93,7 @@ class Likeness:
 
     # row name -> [D] >= 0, distance to the human; lower is nearer
     distance: Mapping[str, np.ndarray]
-    clusters: np.ndarray  # [D] int, recording (or vehicle group) of each drive
+    clusters: np.ndarray  # [D] int, the ego's vehicle in each drive
 
     def __post_init__(self) -> None:
         """As many finite distances >= 0 for every row as there are clusters."""
@@ -132,6 +133,54 @@ class Check:
     p: float | None
     note: str = ""
     measured: bool = True  # else the numbers say nothing: from -1 to 1
+
+
+def check_of(
+    kind: Kind,
+    name: str,
+    title: str,
+    outcome: Outcome,
+    found: Difference,
+    margin: float | None = None,
+    pairs: tuple[int, int] | None = None,
+    p: float | None = None,
+    note: str = "",
+) -> Check:
+    """A check with the mean and the interval of a difference.
+
+    Args:
+      kind: as in `Check`, like all others here.
+      name: likewise.
+      title: likewise.
+      outcome: likewise.
+      found: candidate minus the other; its own p is not the check's.
+      margin: likewise.
+      pairs: (gained, lost) cases, where cases are counted.
+      p: likewise.
+      note: likewise.
+    """
+    gained, lost = pairs or (None, None)
+    return Check(
+        kind=kind,
+        name=name,
+        title=title,
+        outcome=outcome,
+        difference=found.mean,
+        low=found.low,
+        high=found.high,
+        margin=margin,
+        gained=gained,
+        lost=lost,
+        p=p,
+        note=note,
+    )
+
+
+def unmeasured(kind: Kind, name: str, title: str, note: str) -> Check:
+    """A check that nothing was measured for; `note` says what to do."""
+    anything = Difference(mean=0.0, low=-1.0, high=1.0, se=np.nan, p=1.0)
+    check = check_of(kind, name, title, "open", anything, note=note)
+    return dataclasses.replace(check, measured=False)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -263,7 +263,7 @@ def test_the_interval_of_likeness_is_over_recordings():
     alone = Likeness(distance=distance, clusters=known.clusters % 3)
     few = judge(pair(drives(), drives(), likeness=alone), GateConfig())
     assert few.decision == "could not judge"
-    assert any("3 recordings are too few" in reason for reason in few.reasons)
+    assert any("3 vehicles are too few" in reason for reason in few.reasons)
 
 
 def test_bad_likeness_is_one_line():
