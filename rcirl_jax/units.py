@@ -17,6 +17,9 @@ NUM_OBSTACLES = 16  # N, obstacle slots of a scene
 NUM_STATIONS = 128  # P, points of the station grid along the reference line
 STATION_STEP_M = 2.0  # m between points of the station grid
 
+# --- scenes ---
+LINE_HALF_WIDTH_M = 20.0  # m aside of the reference line; a stop line spans the road
+
 # --- conversions at the borders ---
 FOOT_M = 0.3048  # m, international foot
 MPH_MPS = 0.44704  # m/s per mile per hour

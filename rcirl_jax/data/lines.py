@@ -9,10 +9,9 @@ from rcirl_jax.data.lanes import LaneFrame, project
 from rcirl_jax.data.motion import Motion
 from rcirl_jax.data.signal_checks import SignalChecks
 from rcirl_jax.types import Kind, Recording, Signal, Track
-from rcirl_jax.units import EGO_LENGTH_M, TIMES_S
+from rcirl_jax.units import EGO_LENGTH_M, LINE_HALF_WIDTH_M, TIMES_S
 
 LOOK_AHEAD_M = 120.0  # m, lines farther ahead are not collected
-LINE_HALF_WIDTH_M = 20.0  # m, a line spans the whole road
 STOP_SIGN_WAIT_S = 1.0  # s, a stop sign is obeyed after standing this long
 MAX_RED_RUNNING = 0.1  # share of crossings on red above which a cycle is not true
 PASSABLE = ("green", "yellow")  # states that let a driver pass

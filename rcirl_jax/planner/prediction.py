@@ -20,7 +20,14 @@ import jax.numpy as jnp
 
 from rcirl_jax.planner.baselines import Idm, idm_acceleration
 from rcirl_jax.types import Ego, Kind, Obstacles, Path, Scene
-from rcirl_jax.units import DT_S, NUM_STATIONS, NUM_TIMES, STATION_STEP_M, TIMES_S
+from rcirl_jax.units import (
+    DT_S,
+    LINE_HALF_WIDTH_M,
+    NUM_STATIONS,
+    NUM_TIMES,
+    STATION_STEP_M,
+    TIMES_S,
+)
 
 NUM_BODIES = 8  # bodies handed to the planner, the most relevant first
 BEHIND_WEIGHT = 2.0  # 1, how much farther a body behind counts
@@ -28,7 +35,6 @@ ASIDE_WEIGHT = 0.5  # 1, how much a metre aside counts
 LANE_CHANGE_MPS = 0.3  # m/s, lateral speed taken as a lane change
 CROSSING_SLOPE = 0.5  # 1, |l_dot| beyond this share of the speed crosses the road
 LINE_DEPTH_M = 0.1  # m, thickness of a stop wall (Apollo's virtual obstacle)
-LINE_HALF_WIDTH_M = 20.0  # m, a line spans the whole road
 STANDING_MPS = 0.2  # m/s (Apollo)
 STARTING_MPS = 0.5  # m/s of a leader for which who stands behind it starts too
 VIEW_M = (NUM_STATIONS - 1) * STATION_STEP_M  # m, farthest station of a scene
