@@ -21,10 +21,10 @@ from rcirl_jax.simulation.cases import (
     Case,
     LineKind,
     Lines,
-    Perception,
     Replay,
     Road,
     node,
+    perfect_perception,
 )
 from rcirl_jax.simulation.recorded_agents import agents_of, touches
 from rcirl_jax.simulation.recorded_config import RecordedConfig
@@ -140,13 +140,7 @@ class Cutter:
             road=self._road(way, own),
             lines=lines,
             agents=agents_of(tables, limit, config),
-            perception=node(
-                Perception,
-                sigma_position=single(0),
-                sigma_speed=single(0),
-                latency=single(0),
-                dropout=single(0),
-            ),
+            perception=perfect_perception(),
             replay=node(
                 Replay,
                 **{key: tables[key].astype(single) for key in BODY[:4]},

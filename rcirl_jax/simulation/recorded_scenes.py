@@ -29,10 +29,10 @@ from rcirl_jax.simulation.cases import (
     Case,
     LineKind,
     Lines,
-    Perception,
     Replay,
     Road,
     node,
+    perfect_perception,
 )
 from rcirl_jax.simulation.recorded_agents import agents_of
 from rcirl_jax.simulation.recorded_config import RecordedConfig
@@ -147,7 +147,6 @@ def case_of(one: Demonstration) -> Case:
     limit = np.interp(
         np.maximum(tables["s"], 0.0), _stations(), np.asarray(scene.path.speed_limit)
     )
-    still = single(0.0)
     return node(
         Case,
         seed=np.uint32(int(one.frame) * 7919 + int(one.vehicle)),
@@ -159,13 +158,7 @@ def case_of(one: Demonstration) -> Case:
         road=_road(one),
         lines=lines,
         agents=agents_of(tables, limit * config.limit_share, config),
-        perception=node(
-            Perception,
-            sigma_position=still,
-            sigma_speed=still,
-            latency=still,
-            dropout=still,
-        ),
+        perception=perfect_perception(),
         replay=node(
             Replay,
             **{k: tables[k].astype(single) for k in ("s", "l", "heading", "v")},
