@@ -14,7 +14,6 @@ numpy, float64.
 """
 
 import dataclasses
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -24,6 +23,12 @@ from scipy.spatial.distance import jensenshannon
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.gate_types import Likeness
+from rcirl_jax.evaluation.npz_files import (
+    check_array,
+    names_of_rows,
+    read_npz,
+    write_npz,
+)
 from rcirl_jax.evaluation.statistics import (
     ClusterBootstrap,
     Difference,
@@ -37,7 +42,6 @@ from rcirl_jax.simulation.rollout import LANES, drive_cases
 from rcirl_jax.simulation.rows import RECORDED_HUMAN, Row, human_row
 from rcirl_jax.simulation.suite import rollout_config
 from rcirl_jax.units import HORIZON_S
-from rcirl_jax.whole import write_whole
 
 DRIVES = 240  # held-out drives of a report, if not told otherwise
 TIMES_SHOWN_S = (1.0, 3.0, 5.0, 8.0)  # s at which distances are printed
@@ -178,27 +182,25 @@ class LikenessReport:
 
 def write_arrays(path: Path, known: Likeness) -> None:
     """The distances as an npz file, whole or not at all."""
-    names = list(known.distance)
-    table = np.array([known.distance[name] for name in names], np.float64)
-    content = io.BytesIO()
-    np.savez(content, names=np.array(names), distance=table, clusters=known.clusters)
-    write_whole(path, content.getvalue())
+    table = np.array(list(known.distance.values()), np.float64)
+    names = np.array(list(known.distance))
+    arrays = {"names": names, "distance": table, "clusters": known.clusters}
+    write_npz(path, arrays)
 
 
 def read_arrays(path: Path) -> Likeness:
     """Distances written by `write_arrays`.
 
     Raises:
-      InputError: no such file, or not as written.
+      InputError: no such file, damaged, or not as written.
     """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            names, table = file["names"].tolist(), file["distance"]
-            clusters = file["clusters"]
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(f"{path}: {error}: expected distances as written") from error
-    distance = dict(zip(names, table, strict=True))
-    return Likeness(distance=distance, clusters=clusters)
+    with read_npz(path, "distances as written") as arrays:
+        names = names_of_rows(arrays["names"])
+        count = arrays["clusters"].size
+        check_array(arrays, "clusters", "iu", (count,))
+        check_array(arrays, "distance", "f", (len(names), count))
+        distance = dict(zip(names, arrays["distance"], strict=True))
+        return Likeness(distance=distance, clusters=arrays["clusters"])
 
 
 def jensen_shannon(a: np.ndarray, b: np.ndarray, name: str) -> float:

@@ -5,25 +5,21 @@ ids and groups of the cases, and what the summary needs besides.
 """
 
 import dataclasses
-import io
-import math
-import tokenize
-import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop import SuiteResult
+from rcirl_jax.evaluation.npz_files import (
+    check_array,
+    names_of_rows,
+    read_npz,
+    write_npz,
+)
 from rcirl_jax.evaluation.suite_summary import SuiteReport, summarise
 from rcirl_jax.simulation.metrics import CaseMetrics
-from rcirl_jax.whole import is_text, write_whole
 
-MAX_BYTES = 2**30  # bytes of a suite, unpacked
-PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 COLUMNS = {  # metrics of several numbers a case
     **dict.fromkeys(("inside", "holds"), (6,)),
     **dict.fromkeys(("inside_filtered", "holds_filtered"), (2,)),
@@ -82,60 +78,7 @@ def write_runs(path: Path, runs: SuiteRuns) -> None:
         for field in dataclasses.fields(CaseMetrics):
             value = np.asarray(getattr(metrics, field.name))
             arrays[f"row{number}.{field.name}"] = value
-    packed = io.BytesIO()
-    np.savez_compressed(packed, allow_pickle=False, **arrays)
-    write_whole(path, packed.getvalue())
-
-
-def _arrays(path: Path) -> dict[str, Any]:
-    """The arrays of the archive; what it would unpack to is checked first."""
-    with zipfile.ZipFile(path) as archive:
-        members = archive.infolist()
-        if any(member.compress_type not in PACKINGS for member in members):
-            raise ValueError("packed in a way that numpy does not write")
-        size = sum(member.file_size for member in members)
-        if size > MAX_BYTES:
-            raise ValueError(f"{size} bytes unpacked, more than {MAX_BYTES}")
-        for member in members:
-            _check_claim(archive, member)
-    with np.load(path, allow_pickle=False) as found:
-        arrays = {name: found[name] for name in found.files}
-    for name, value in arrays.items():
-        if value.size > max(value.nbytes, 1):  # texts of no length, any number of them
-            raise ValueError(f"{name}: {value.size} values in {value.nbytes} bytes")
-        if value.dtype.kind == "U" and not is_text(value):
-            raise ValueError(f"{name}: characters that are none")
-    return arrays
-
-
-def _check_claim(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> None:
-    """Check that an array's head claims the bytes that are there, before any is made.
-
-    Raises:
-      ValueError: it does not, or the member is no array.
-    """
-    with archive.open(member) as file:
-        version = np.lib.format.read_magic(file)
-        if version != (1, 0):
-            raise ValueError(f"{member.filename}: version {version} of its head")
-        shape, _, dtype = np.lib.format.read_array_header_1_0(file)
-        held = member.file_size - file.tell()
-    if math.prod(shape) * dtype.itemsize != held:
-        raise ValueError(f"{member.filename}: {shape} of {dtype} in {held} bytes")
-
-
-def _names_of_rows(found: np.ndarray) -> list[str]:
-    """Texts [rows], checked before they are listed: 2**40 times nothing is no byte.
-
-    Raises:
-      ValueError: another array, or a name that is there twice.
-    """
-    if found.dtype.kind != "U" or found.ndim != 1:
-        raise ValueError(f"names: {found.dtype} {found.shape}, not texts (rows,)")
-    names = found.tolist()
-    if len(set(names)) != len(names):
-        raise ValueError("names: one twice")
-    return names
+    write_npz(path, arrays)
 
 
 def _check_arrays(arrays: Mapping[str, np.ndarray], rows: int) -> None:
@@ -156,9 +99,7 @@ def _check_arrays(arrays: Mapping[str, np.ndarray], rows: int) -> None:
             shape = (len(arrays["ids"]), *COLUMNS.get(field.name, ()))
             wanted[f"row{number}.{field.name}"] = numbers, shape
     for name, (kinds, shape) in wanted.items():
-        found = arrays[name]
-        if found.dtype.kind not in kinds or found.shape != shape:
-            raise ValueError(f"{name}: {found.dtype} {found.shape}, not {shape}")
+        check_array(arrays, name, kinds, shape)
 
 
 def read_runs(path: Path) -> SuiteRuns:
@@ -167,9 +108,8 @@ def read_runs(path: Path) -> SuiteRuns:
     Raises:
       InputError: missing, damaged, or not such a file.
     """
-    try:
-        arrays = _arrays(path)
-        names = _names_of_rows(arrays["names"])
+    with read_npz(path, "the metrics of a suite") as arrays:
+        names = names_of_rows(arrays["names"])
         rows = {
             name: CaseMetrics(
                 **{
@@ -189,11 +129,3 @@ def read_runs(path: Path) -> SuiteRuns:
             reference=str(arrays["reference"]),
             way=arrays["way"],
         )
-    except (
-        # of files and arrays; of zip: damaged, packed or locked in ways not known
-        *(OSError, ArithmeticError, LookupError, ValueError, TypeError),
-        *(EOFError, MemoryError, RuntimeError, SyntaxError),  # of a kind "(,)f8"
-        *(zipfile.BadZipFile, zlib.error, tokenize.TokenError),
-    ) as error:
-        why = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{path}: {why}: expected the metrics of a suite") from error

@@ -179,7 +179,7 @@ def test_arrays_of_other_types_in_a_suite(members, name, array):
 
 def test_a_suite_that_unpacks_to_gigabytes_is_refused(members, monkeypatch):
     file, content = members
-    monkeypatch.setattr("rcirl_jax.evaluation.suite_files.MAX_BYTES", 2**20)
+    monkeypatch.setattr("rcirl_jax.evaluation.npz_files.MAX_BYTES", 2**20)
     zeros = npy(np.zeros(2**18))
     file.write_bytes(archive_of({**content, "way.npy": zeros}, zipfile.ZIP_DEFLATED))
     assert file.stat().st_size < 2**20

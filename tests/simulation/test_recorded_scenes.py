@@ -189,6 +189,35 @@ def test_distances_are_those_of_the_drives(tmp_path):
         read_arrays(tmp_path / "none.npz")
 
 
+@pytest.mark.parametrize(
+    ("name", "array", "says"),
+    [
+        ("names", np.array(["a", "a"]), "names: one twice"),
+        ("names", np.array([1, 2]), "names: int64 (2,), not texts"),
+        ("distance", np.ones((2, 2)), "distance: float64 (2, 2), not (2, 3)"),
+        ("clusters", np.ones(3), "clusters: float64 (3,), not (3,)"),
+        ("distance", -np.ones((2, 3)), "likeness: a: drive 0: -1.0"),
+        ("distance", None, "expected distances as written"),
+    ],
+)
+def test_damaged_distances_are_one_line(tmp_path, name, array, says):
+    arrays = {
+        "names": np.array(["a", "b"]),
+        "distance": np.ones((2, 3)),
+        "clusters": np.arange(3),
+    }
+    arrays = {n: x for n, x in {**arrays, name: array}.items() if x is not None}
+    path = tmp_path / "x.npz"
+    np.savez(path, **arrays)
+    with pytest.raises(InputError) as caught:
+        read_arrays(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert says in str(caught.value)
+    path.write_bytes(path.read_bytes()[:-30])
+    with pytest.raises(InputError, match="expected distances as written"):
+        read_arrays(path)
+
+
 def test_jensen_shannon_of_known_samples():
     a, b = np.zeros(10), np.full(10, 3.0)
     assert jensen_shannon(a, a, "jerk") == 0.0
