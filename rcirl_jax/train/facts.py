@@ -4,8 +4,9 @@ import jax
 import jax.numpy as jnp
 
 from rcirl_jax.features.columns import Frame
-from rcirl_jax.train.state import Facts
-from rcirl_jax.types import Candidates, Trajectory
+from rcirl_jax.planner.safety import check
+from rcirl_jax.train.state import Facts, TrainConfig
+from rcirl_jax.types import Candidates, Scene, Tag, Trajectory
 
 OVER_LIMIT_MPS = 0.5  # m/s above the limit that counts as breaking it
 KERNEL_M = 2.0  # m, bandwidth of the proposal's density
@@ -38,6 +39,26 @@ def facts_of(
         human_density=jnp.zeros(()),
         density=jnp.zeros(x.s.shape[:1]),
     )
+
+
+def admitted(scene: Scene, candidates: Candidates, config: TrainConfig) -> jax.Array:
+    """[K] bool: candidates that the safety filter lets a planner choose.
+
+    A teacher in the simulator stops at a line and then drives over it; the planner's
+    view at the start of the scene forbids that for all its times.
+
+    Args:
+      scene: as the planner sees it.
+      candidates: of it, K.
+      config: `admissible_in` says in which scenes the filter is asked: in none, in
+        those that a teacher drove, or in all; elsewhere every candidate is admitted.
+    """
+    if config.admissible_in == "none":
+        return jnp.ones(candidates.feasible.shape, bool)
+    passed = check(scene, candidates).admissible
+    if config.admissible_in == "rehearsed":
+        passed = passed | ~scene.tags[Tag.REHEARSED]
+    return passed
 
 
 def densities(

@@ -17,7 +17,6 @@ import optax
 from rcirl_jax.features import FeatureMap, feature_map
 from rcirl_jax.features.columns import candidate_frames
 from rcirl_jax.planner.prediction import as_seen
-from rcirl_jax.planner.safety import check
 from rcirl_jax.reward import (
     Compared,
     LossConfig,
@@ -38,7 +37,7 @@ from rcirl_jax.sampling import (
 )
 from rcirl_jax.sampling.speed import family_index
 from rcirl_jax.train.bad_values import bad_facts, bad_values, count_bad
-from rcirl_jax.train.facts import densities, facts_of
+from rcirl_jax.train.facts import admitted, densities, facts_of
 from rcirl_jax.train.pieces import Scenes, added_and_kept, block_size, in_pieces
 from rcirl_jax.train.state import (
     Batch,
@@ -53,8 +52,6 @@ from rcirl_jax.types import (
     Demonstration,
     Normaliser,
     RewardParams,
-    Scene,
-    Tag,
     Trajectory,
 )
 from rcirl_jax.units import TIMES_S
@@ -148,7 +145,7 @@ def featurise(
             return human, rows, feasible, with_densities(facts, feasible), valid
         # a planner can choose what the sampler made, not a hard negative
         choice = feasible & (candidates.family != family_index("hard_negative"))
-        choice = choice & _admitted(demonstration.scene, candidates, config)
+        choice = choice & admitted(demonstration.scene, candidates, config)
         near = jnp.argmin(jnp.where(choice, facts.distance, jnp.inf))
         # what is nearer than the positive without being a choice is no worse than it
         feasible = feasible & (choice | (facts.distance > facts.distance[near]))
@@ -173,20 +170,6 @@ def featurise(
         weight=batch.weight,
         index=batch.index,
     )
-
-
-def _admitted(scene: Scene, candidates: Candidates, config: TrainConfig) -> jax.Array:
-    """[K] bool: what the safety filter lets a planner choose, where that is asked for.
-
-    A teacher in the simulator stops at a line and then drives over it; the planner's
-    view at the start of the scene forbids that for all its times.
-    """
-    if config.admissible_in == "none":
-        return jnp.ones(candidates.feasible.shape, bool)
-    admitted = check(scene, candidates).admissible
-    if config.admissible_in == "rehearsed":
-        admitted = admitted | ~scene.tags[Tag.REHEARSED]
-    return admitted
 
 
 def featurised(key: jax.Array, batch: Batch, config: TrainConfig) -> FeatureBatch:
