@@ -18,7 +18,7 @@ from pathlib import Path
 from absl import flags
 
 from experiments import margins, training
-from experiments.common import provenance, run
+from experiments.common import cutting, provenance, run
 from experiments.executor import executor
 from experiments.signals import checked_signals, signals_asked
 from rcirl_jax.autotune import STAGES, Loop, TuneConfig
@@ -38,15 +38,7 @@ _SYNTHETIC = flags.DEFINE_bool(
 _FORMAT = flags.DEFINE_list("format", None, "of each --input")
 _INPUT = flags.DEFINE_list("input", None, "recordings to import, one or several logs")
 _SOURCE = flags.DEFINE_list("source", None, "TOML of columns and units of each --input")
-_STRIDE = flags.DEFINE_float(
-    "stride", None, "s between planning frames of a driver" + training.AS_SAID
-)
-_KEEP_STEADY = flags.DEFINE_bool(
-    "keep_steady", None, "keep scenes without speed change" + training.AS_SAID
-)
-_KEEP_FREE_ROAD = flags.DEFINE_bool(
-    "keep_free_road", None, "keep scenes without obstacles" + training.AS_SAID
-)
+_CUT = cutting(said=training.AS_SAID)
 _INCUMBENT = flags.DEFINE_string(
     "incumbent", "hand-set", "weights file that drives today, or a baseline"
 )
@@ -147,20 +139,11 @@ def _given() -> list[str | Logs]:
 
 def _logs(name: str, path: Path | None, source: Path | None) -> Logs:
     """One log to import, cut as the recipe and the flags say."""
-    collect = training.recipe().collect
-    if _STRIDE.value is not None:
-        collect = dataclasses.replace(collect, stride_s=_STRIDE.value)
-    if _KEEP_STEADY.value is not None:
-        keep = _KEEP_STEADY.value
-        collect = dataclasses.replace(collect, require_speed_change=not keep)
-    if _KEEP_FREE_ROAD.value is not None:
-        keep = _KEEP_FREE_ROAD.value
-        collect = dataclasses.replace(collect, require_obstacles=not keep)
     return Logs(
         format=name,
         input=path,
         source=source,
-        config=ImportConfig(format=name, collect=collect),
+        config=ImportConfig(format=name, collect=_CUT(training.recipe().collect)),
         signals=signals_asked(),
         checked=checked_signals,
     )

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments.common import made_by_file, run
+from experiments.common import cutting, made_by_file, run
 from experiments.executor import executor
 from experiments.signals import checked_signals
 from rcirl_jax.data.config import CollectConfig
@@ -37,7 +37,7 @@ _SOURCE = flags.DEFINE_string(
 )
 _OUTPUT = flags.DEFINE_string("output", None, "dataset to write", required=True)
 _OVERWRITE = flags.DEFINE_bool("overwrite", False, "replace a finished dataset")
-_STRIDE = flags.DEFINE_float("stride", 0.5, "s between planning frames of a driver")
+_CUT = cutting(CollectConfig())
 _MIN_FUTURE = flags.DEFINE_float("min_future", 5.2, "s of recording a scene needs")
 _MIN_HISTORY = flags.DEFINE_float(
     "min_history", 0.5, "s of recording before a planning frame"
@@ -48,12 +48,6 @@ _MIN_SURROUNDINGS = flags.DEFINE_float(
     "s until someone whom the human reacts to leaves the record, at least",
 )
 _SMOOTHING = flags.DEFINE_float("smoothing", 4.1, "s, window of the position filter")
-_KEEP_STEADY = flags.DEFINE_bool(
-    "keep_steady", False, "keep scenes without speed change (the paper drops them)"
-)
-_KEEP_FREE_ROAD = flags.DEFINE_bool(
-    "keep_free_road", False, "keep scenes without obstacles (the paper drops them)"
-)
 _TRUST = flags.DEFINE_bool(
     "trust_signals", False, "use cycles a converter wrote, unless crossings contradict"
 )
@@ -77,18 +71,17 @@ def main() -> None:
     )
     config = ImportConfig(
         format=_FORMAT.value,
-        collect=CollectConfig(
-            smoothing_s=_SMOOTHING.value,
-            stride_s=_STRIDE.value,
-            min_future_s=_MIN_FUTURE.value,
-            min_history_s=_MIN_HISTORY.value,
-            min_surroundings_s=_MIN_SURROUNDINGS.value,
-            require_obstacles=not _KEEP_FREE_ROAD.value,
-            require_speed_change=not _KEEP_STEADY.value,
-            trust_signals=_TRUST.value,
-            signal_checks=checked_signals(
-                leaving_out(parts) if _LEAVE_OUT.value else parts, places
-            ),
+        collect=_CUT(
+            CollectConfig(
+                smoothing_s=_SMOOTHING.value,
+                min_future_s=_MIN_FUTURE.value,
+                min_history_s=_MIN_HISTORY.value,
+                min_surroundings_s=_MIN_SURROUNDINGS.value,
+                trust_signals=_TRUST.value,
+                signal_checks=checked_signals(
+                    leaving_out(parts) if _LEAVE_OUT.value else parts, places
+                ),
+            )
         ),
         test_fraction=_TEST_FRACTION.value,
         split_seed=_SPLIT_SEED.value,
