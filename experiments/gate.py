@@ -26,7 +26,7 @@ from rcirl_jax.evaluation.gate_runs import pair_of
 from rcirl_jax.evaluation.likeness import DRIVES, held_out_likeness
 from rcirl_jax.evaluation.suite_files import runs_of
 from rcirl_jax.export.gate_job import drive_job, gate_job, left_out
-from rcirl_jax.export.tuned_idm import idm_fields
+from rcirl_jax.export.tuned_idm import idm_fields, idm_left_out
 from rcirl_jax.planner.safety import TRACKS
 from rcirl_jax.simulation.recorded_scenes import held_out
 from rcirl_jax.simulation.rows import BASELINES
@@ -70,6 +70,8 @@ def main() -> None:
         tuned_idm=idm_fields(_IDM.value),
         track=_FILTER.value,
     )
+    if said := idm_left_out(_IDM.value):
+        print(said)
     sources = [open_dataset(url) for url in _DATA.value]
     result = drive_job(job, executor())
     known = None

@@ -10,7 +10,7 @@ import math
 from pathlib import Path
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.planner.baselines import Idm
+from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm
 from rcirl_jax.whole import read_json, write_json
 
 FIELDS = tuple(field.name for field in dataclasses.fields(Idm))
@@ -45,3 +45,8 @@ def idm_fields(path: str | None) -> tuple[tuple[str, float], ...]:
     if path is None:
         return ()
     return tuple(dataclasses.asdict(read_tuned_idm(Path(path))).items())
+
+
+def idm_left_out(path: str | None) -> str:
+    """What a command says where --tuned_idm names no file; "" where it names one."""
+    return "" if path else f"left out: {TUNED_IDM_ROW}: --tuned_idm is not given"

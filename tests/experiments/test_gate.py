@@ -19,6 +19,7 @@ def test_a_reward_against_itself(tmp_path):
     done = command("experiments.gate", *flags, *margins)
     assert done.returncode == 2, done.stderr[-2000:]
     assert "verdict: COULD NOT JUDGE" in done.stdout
+    assert "left out: IDM, tuned: --tuned_idm is not given" in done.stdout
     body = json.loads(out.read_text())
     assert body["decision"] == "could not judge"
     assert not [check for check in body["checks"] if check["outcome"] == "fail"]
