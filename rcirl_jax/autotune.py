@@ -2,6 +2,7 @@
 
 RUN/dataset-KEY/       the import of each log, unless datasets are given
 RUN/rehearsal-KEY/N/   the rehearsed catalogue: the teacher's drives, then each round's
+RUN/rounds/human.msgpack   the reward of the recordings alone, for an anchored teacher
 RUN/rounds/N.msgpack   the reward that the teacher of round N takes over from
 RUN/train-KEY/seed-N/  training runs; KEY changes with what they are made from
 RUN/seeds/N.msgpack    every seed's reward
@@ -235,22 +236,31 @@ class Loop:
         scale = len(sources) / sum(given)
         given = [share * scale for share in given]
         joined: Demonstrations = _as_one(made, given)
+        human = None
+        if plan.teacher == "anchored":
+            human = self.folder / "rounds" / "human.msgpack"
+            self._train_round(joined, "human", human)
         for number in range(plan.datasets):
             learner = None
             if number:
                 learner = self.folder / "rounds" / f"{number}.msgpack"
-                self._train_round(joined, number, learner)
-            made.append(self._rehearsed(number, learner))
+                self._train_round(joined, str(number), learner)
+            made.append(self._rehearsed(number, human, learner))
             given.append(plan.weights[number])
             joined = _as_one(made, given)
         return joined
 
-    def _rehearsed(self, number: int, learner: Path | None) -> Dataset:
+    def _rehearsed(
+        self, number: int, human: Path | None, learner: Path | None
+    ) -> Dataset:
         plan, config = self.config.rehearsal, self.config
         inputs = {
             "rehearsal": dataclasses.asdict(plan),
             "number": number,
-            "teacher": self._incumbent_hash() if plan.teacher == "incumbent" else "",
+            "teacher": self._incumbent_hash()
+            if plan.teacher in ("incumbent", "anchored")
+            else "",
+            "human": file_sha256(human) if human else "",
             "learner": file_sha256(learner) if learner else "",
         }
         key = digest({**inputs, **self._code()})[:8]
@@ -264,6 +274,7 @@ class Loop:
                 plan,
                 folder,
                 incumbent=config.incumbent,
+                human=human,
                 learner=learner,
                 before_commit=lambda dataset: dataset.write_facts(
                     {"data_hash": dataset.hash, "made_by": self.facts}
@@ -273,10 +284,10 @@ class Loop:
         self._run(f"rehearse {number}", inputs, [folder / "manifest.json"], work)
         return open_dataset(folder)
 
-    def _train_round(self, dataset: Demonstrations, number: int, file: Path) -> None:
+    def _train_round(self, dataset: Demonstrations, name: str, file: Path) -> None:
         inputs = {**self._train_inputs(dataset), "seed": 0}
         work = lambda: self._train_one(dataset, 0, file, judged=None)  # noqa: E731
-        self._run(f"rehearse learner {number}", inputs, [file], work)
+        self._run(f"rehearse learner {name}", inputs, [file], work)
 
     def _train_one(
         self, dataset: Demonstrations, seed: int, file: Path, judged: Path | None

@@ -5,35 +5,25 @@ than the suite's) is driven by a teacher, and in each further round by the rewar
 learned so far, which the teacher takes over from in turn: its way out of where the
 learner's own mistakes lead becomes a demonstration too (Ross et al. 2011, "DAgger",
 with takeovers). What is driven is a dataset like any other, with a weight of its own.
+
+The teacher "anchored" drives by V_incumbent + gain support V_human (`planner.anchor`),
+V_human being learned from the recordings alone: what people do where they were
+recorded, and the incumbent elsewhere.
 """
 
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
-import jax.numpy as jnp
-
 from rcirl_jax.data.store import Dataset, open_dataset
 from rcirl_jax.errors import InputError
-from rcirl_jax.export.closed_loop import table_rows
-from rcirl_jax.export.loading import open_reward, reward_params
-from rcirl_jax.features import feature_map
-from rcirl_jax.planner.rank import (
-    Params,
-    Policy,
-    RankConfig,
-    hand_score,
-    learned_score,
-    rank_policy,
-)
-from rcirl_jax.reward import LatticeCost
+from rcirl_jax.export.closed_loop import anchored_row, incumbent_score, table_rows
+from rcirl_jax.export.loading import open_reward
+from rcirl_jax.planner.rank import Params, Policy, RankConfig, rank_policy
 from rcirl_jax.simulation.demonstrations import DriveConfig, drive_catalogue
 from rcirl_jax.simulation.suite import suite_refs
 
-TEACHERS = ("none", "driver model", "hand-set", "calm hand-set", "incumbent")
-# what the calm teacher multiplies the hand-set cost's jerk weight by: on validation
-# cases as much way and a tenth more drives within the jerk bound
-CALM_JERK = 6.0
+TEACHERS = ("none", "driver model", "hand-set", "incumbent", "anchored")
 SUITE_SEED = 0  # of the catalogue that rewards are judged on
 
 
@@ -48,6 +38,8 @@ class Rehearsal:
     takeover_cases: int = 16
     # rounds in which it takes over from the reward learned so far
     rounds: int = 1
+    # of V_human, for the teacher "anchored"
+    anchor_gain: float = 0.3
     # seed of the cases; round r has this one plus r
     catalogue_seed: int = 1000
     # s of a drive, and between two scenes of the teacher's drives and of takeovers
@@ -77,7 +69,7 @@ class Rehearsal:
                 f"rehearsal: catalogue_seed: {self.catalogue_seed}: expected above "
                 f"{SUITE_SEED}, the suite's own"
             )
-        for name in ("weight", "takeover_weight"):
+        for name in ("weight", "takeover_weight", "anchor_gain"):
             if getattr(self, name) <= 0.0:
                 raise InputError(
                     f"rehearsal: {name}: {getattr(self, name)}: expected > 0"
@@ -94,28 +86,30 @@ class Rehearsal:
         return (self.weight, *[self.takeover_weight] * self.rounds)[: self.datasets]
 
 
-def teacher_of(rehearsal: Rehearsal, incumbent: str) -> tuple[Policy, Params] | None:
+def teacher_of(
+    rehearsal: Rehearsal, incumbent: str, human: Path | None
+) -> tuple[Policy, Params] | None:
     """The teacher as a policy and its weights; None: the driver models.
 
     Args:
       rehearsal: names the teacher.
-      incumbent: weights file or "hand-set", of the teacher "incumbent".
+      incumbent: weights file or "hand-set", of "incumbent" and "anchored".
+      human: weights file of the reward learned from the recordings alone, of
+        "anchored".
 
     Raises:
-      InputError: the incumbent is neither.
+      InputError: a file cannot be read.
     """
     if rehearsal.teacher == "driver model":
         return None
-    if rehearsal.teacher == "calm hand-set":
-        usual = LatticeCost()
-        calm = dataclasses.replace(usual, jerk=CALM_JERK * jnp.asarray(usual.jerk))
-        return rank_policy(hand_score, RankConfig()), calm.fields()
+    if rehearsal.teacher == "anchored":
+        assert human is not None
+        reward = open_reward(str(human))
+        row = anchored_row("teacher", reward, incumbent, rehearsal.anchor_gain)
+        return row.policy, row.params
     name = "hand-set" if rehearsal.teacher == "hand-set" else incumbent
-    if name == "hand-set":
-        return rank_policy(hand_score, RankConfig()), None
-    reward = open_reward(name)
-    score = learned_score(feature_map(str(reward.preset)), reward.activation)
-    return rank_policy(score, RankConfig()), reward_params(reward)
+    score, weights = incumbent_score(name)
+    return rank_policy(score, RankConfig()), weights
 
 
 def rehearse(
@@ -124,6 +118,7 @@ def rehearse(
     output: Path,
     *,
     incumbent: str,
+    human: Path | None,
     learner: Path | None,
     before_commit: Callable[[Dataset], object],
 ) -> Dataset:
@@ -134,6 +129,7 @@ def rehearse(
       rehearsal: how.
       output: dataset folder.
       incumbent: as `teacher_of`.
+      human: as `teacher_of`.
       learner: weights file of the reward learned so far; None in round 0.
       before_commit: as `DatasetWriter.finish`.
     """
@@ -153,7 +149,7 @@ def rehearse(
         refs,
         output,
         config,
-        teacher=teacher_of(rehearsal, incumbent),
+        teacher=teacher_of(rehearsal, incumbent, human),
         learner=driven,
         overwrite=True,
         before_commit=before_commit,

@@ -16,38 +16,42 @@ from rcirl_jax.reward.network import rows_value
 from rcirl_jax.types import Candidates, Normaliser, RewardParams, Scene
 
 
+class Ranges(flax.struct.PyTreeNode, kw_only=True):
+    """What the training saw of every feature: `export.guard.bounds`."""
+
+    low: jax.Array  # [F] in the feature's unit; may be -inf
+    high: jax.Array  # [F]; may be +inf
+
+
 class Guarded(flax.struct.PyTreeNode, kw_only=True):
     """Weights of a guarded score."""
 
     reward: RewardParams  # effective
     normaliser: Normaliser
-    low: jax.Array  # [F] of `export.guard.bounds`, in the feature's unit; may be -inf
-    high: jax.Array  # [F]; may be +inf
+    ranges: Ranges
     share: jax.Array  # [] largest share of a feature's entries outside
     incumbent: Params  # the other score's weights
 
 
-def in_distribution(params: Guarded, rows: jax.Array, counts: jax.Array) -> jax.Array:
-    """Whether a plan is like what the reward was trained on.
+def worst_share(ranges: Ranges, rows: jax.Array, counts: jax.Array) -> jax.Array:
+    """Largest share of a feature's entries outside the training's: max_i share_i.
 
         share_i = share of the raw entries of feature i outside [low_i, high_i]
 
-    in distribution: no share above the limit, every entry finite.
-
     Args:
-      params: ranges and limit.
-      rows: [F, T, K] raw features of its candidates.
+      ranges: of every feature.
+      rows: [F, T, K] raw features of the plan's candidates.
       counts: [T, K] bool, valid times of feasible candidates.
 
     Returns:
-      [] bool; False where nothing counts, or something that does is not finite.
+      [] in [0, 1]; inf where nothing counts, or something that does is not finite.
     """
-    low, high = (side[:, None, None] for side in (params.low, params.high))
+    low, high = (side[:, None, None] for side in (ranges.low, ranges.high))
     inside = (rows >= low) & (rows <= high)
     outside = jnp.sum(~inside & counts, axis=(1, 2))
-    shares = outside / jnp.maximum(jnp.sum(counts), 1)
+    share = jnp.max(outside / jnp.maximum(jnp.sum(counts), 1))
     known = jnp.any(counts) & ~jnp.any(~jnp.isfinite(rows) & counts)
-    return known & jnp.all(shares <= params.share)
+    return jnp.where(known, share, jnp.inf)
 
 
 @functools.lru_cache(maxsize=16)
@@ -58,7 +62,7 @@ def guarded_score(features: FeatureMap, activation: str, incumbent: Score) -> Sc
         rows, valid = features.rows(scene, candidates), scene.time_valid
         values = rows_value(params.reward, params.normaliser, rows, valid, activation)
         counts = valid[:, None] & candidates.feasible
-        fine = in_distribution(params, jnp.stack(rows), counts)
+        fine = worst_share(params.ranges, jnp.stack(rows), counts) <= params.share
         other = incumbent(params.incumbent, scene, candidates)
         return jnp.where(fine, values, other)
 

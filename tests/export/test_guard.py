@@ -18,7 +18,7 @@ from rcirl_jax.export.closed_loop import table_rows
 from rcirl_jax.export.from_run import export_run
 from rcirl_jax.export.loading import open_reward, reward_params
 from rcirl_jax.features import feature_map
-from rcirl_jax.planner.guard import Guarded, guarded_score, in_distribution
+from rcirl_jax.planner.guard import Guarded, Ranges, guarded_score, worst_share
 from rcirl_jax.planner.rank import hand_score, learned_score
 from rcirl_jax.reward import seen_range
 from rcirl_jax.train.loop import train
@@ -220,8 +220,9 @@ def guarded(reward, limits=None):
     low, high = guard.bounds(reward, limits or Limits())
     effective, normaliser = reward_params(reward)
     return Guarded(
-        reward=effective, normaliser=normaliser, low=jnp.asarray(low),
-        high=jnp.asarray(high), share=jnp.asarray((limits or Limits()).share),
+        reward=effective, normaliser=normaliser,
+        ranges=Ranges(low=jnp.asarray(low), high=jnp.asarray(high)),
+        share=jnp.asarray((limits or Limits()).share),
         incumbent=None,
     )  # fmt: skip
 
@@ -237,11 +238,14 @@ def test_the_compiled_rule_is_the_readers(seed, spread):
         features[0, rng.integers(T), rng.integers(F)] = value
     valid = np.arange(T) < rng.integers(0, T + 1)
     counts = np.broadcast_to(valid[:, None], (T, K))
-    found = RULE(guarded(reward), features.transpose(2, 1, 0), counts)
-    assert bool(found) == Guard(reward).check(features, valid).in_distribution
+    own = guarded(reward)
+    found = RULE(own.ranges, features.transpose(2, 1, 0), counts)
+    assert (
+        bool(found <= own.share) == Guard(reward).check(features, valid).in_distribution
+    )
 
 
-RULE = jax.jit(in_distribution)
+RULE = jax.jit(worst_share)
 
 
 def test_the_guarded_score_is_one_or_the_other(tmp_path):
