@@ -33,8 +33,7 @@ from rcirl_jax.evaluation.closed_loop import (
 )
 from rcirl_jax.evaluation.likeness import DRIVES, held_out_likeness
 from rcirl_jax.export.spread import SuiteJob, spread
-from rcirl_jax.export.tuned_idm import idm_fields
-from rcirl_jax.planner.baselines import TUNED_IDM_ROW
+from rcirl_jax.export.tuned_idm import idm_fields, idm_left_out
 from rcirl_jax.planner.safety import TRACKS
 from rcirl_jax.simulation.recorded_config import RecordedConfig
 from rcirl_jax.simulation.recorded_scenes import held_out
@@ -159,8 +158,8 @@ def main() -> None:
     if _CHUNK.value < 1:
         raise InputError(f"--chunk: {_CHUNK.value}: expected at least 1")
     job, places = _job(), executor()
-    if not _IDM.value:
-        print(f"left out: {TUNED_IDM_ROW}: --tuned_idm is not given")
+    if said := idm_left_out(_IDM.value):
+        print(said)
     if not job.refs and places.workers > 1:
         raise InputError(
             f"--suite: {_SUITE.value}: expected --workers=1: drives run here"

@@ -44,6 +44,7 @@ def test_held_out_drives_are_measured_against_the_human(root):
     assert body["made_by"]["data_hash"] == open_dataset(root / "data").hash
     assert body["made_by"]["weights_sha256"]
     assert (root / "out" / "table.txt").read_text() in done.stdout
+    assert "left out: IDM, tuned" not in done.stdout
 
 
 @pytest.mark.multiprocess

@@ -60,7 +60,9 @@ def test_a_table_may_have_an_anchored_row(tmp_path):
 def test_the_anchored_teacher_drives_by_both(tmp_path):
     file = random_weights(tmp_path / "w.msgpack")
     rehearsal = Rehearsal(teacher="anchored", anchor_gain=0.5)
-    policy, params = teacher_of(rehearsal, "hand-set", file)
+    teacher = teacher_of(rehearsal, "hand-set", file)
+    assert teacher is not None
+    policy, params = teacher
     row = anchored_row("teacher", open_reward(str(file)), "hand-set", 0.5)
     assert policy is row.policy
     assert float(params.gain) == 0.5
