@@ -1,7 +1,13 @@
 """The exported reward: one file of weights, its writer and its reader."""
 
 from rcirl_jax.export.guard import Guard, Limits, Verdict
-from rcirl_jax.export.reader import Reward, WeightsError, decode_weights, load_weights
+from rcirl_jax.export.reader import (
+    Anchor,
+    Reward,
+    WeightsError,
+    decode_weights,
+    load_weights,
+)
 from rcirl_jax.export.weights import (
     PROVENANCE_KEYS,
     FeatureSpec,
@@ -13,6 +19,7 @@ from rcirl_jax.export.weights import (
 
 __all__ = [
     "PROVENANCE_KEYS",
+    "Anchor",
     "FeatureSpec",
     "Guard",
     "Limits",

@@ -8,6 +8,12 @@ gives the byte layout; the equation is
     r_t = act(... act(x_t W_1 + b_1) ...) W_L + b_L          last layer linear
     V   = sum_t gamma_t * time_valid_t * r_t                 higher is better
 
+An anchored reward (schema version 4) is driven on top of the planner's own cost:
+
+    V_total = V_incumbent + gain V
+    gain    = low + (high - low) sigmoid(out . tanh(z W + b) + c)
+    z_i     = clip((f_0i - location_i) / scale_i, -5, 5)      f_0 raw, location of it
+
     reward = load_weights("weights.msgpack")
     reward.check_features(names, units)  # the planner's columns, in its order
     best = int(np.argmax(reward.value(features)))  # features [K, T, F]
@@ -25,8 +31,9 @@ import msgpack
 import numpy as np
 
 MAGIC = "RCIRLW"  # first value of the outer map
-SCHEMA_VERSIONS = (1, 2, 3)  # the layouts this reader knows
-TOLERANCE = 1e-5  # of max(1, |V|), on a verification sample, float32
+SCHEMA_VERSIONS = (1, 2, 3, 4)  # the layouts this reader knows
+TOLERANCE = 1e-5  # of max(1, |V|), on a verification sample, float32; of gains too
+REACH = 5.0  # scales from the location beyond which an anchor's inputs are clipped
 
 # Limits, far above any sensible reward (the paper's network is 21 -> 15 -> 1).
 MAX_FILE_BYTES = 64 * 2**20  # bytes
@@ -45,6 +52,9 @@ OUTER_KEYS = ("magic", "schema_version", "body", "sha256")
 RANGES = ("lower", "upper", "location", "scale")
 GRID_KEYS = ("preset", "features", "normaliser", "times", "gamma")
 NETWORK_KEYS = ("layers", "activation", "leaky_slope")
+ANCHOR_NUMBERS = ("low", "high")
+ANCHOR_ARRAYS = ("location", "scale", "kernel", "bias", "out", "offset")
+ANCHOR_KEYS = ("incumbent", *ANCHOR_NUMBERS, *ANCHOR_ARRAYS, "gain")
 BODY_KEYS = (*GRID_KEYS, *NETWORK_KEYS, "loss", "provenance", "samples")
 ACTIVATIONS: dict[str, Callable[[np.ndarray, np.float32], np.ndarray]] = {
     "tanh": lambda x, slope: np.tanh(x),
@@ -60,6 +70,37 @@ class WeightsError(ValueError):
     def __init__(self, message: str) -> None:
         line = " ".join(str(message).split())
         super().__init__("".join(c if c.isprintable() else "?" for c in line))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Anchor:
+    """How much of V is added to the incumbent's value; the equation stands above."""
+
+    incumbent: str  # whose value V is added to, at most 64 characters
+    low: float  # gain where the training data do not reach, >= 0
+    high: float  # where they do, >= low
+    location: np.ndarray  # [F] in the feature's unit
+    scale: np.ndarray  # [F] > 0
+    kernel: np.ndarray  # [F, H] W; a feature whose row is 0 does not matter
+    bias: np.ndarray  # [H] b
+    out: np.ndarray  # [H]
+    offset: np.ndarray  # [1] c
+
+    @np.errstate(all="ignore")
+    def gain(self, first: np.ndarray) -> np.ndarray:
+        """Gains of V, summed in float64.
+
+        Args:
+          first: [..., F] raw features at the first time.
+
+        Returns:
+          float32 [...]; a NaN among the features that matter gives NaN.
+        """
+        z = np.clip((first - self.location.astype(float)) / self.scale, -REACH, REACH)
+        z = np.where(self.kernel.any(axis=1), z, 0.0)
+        hidden = np.tanh(z @ self.kernel + self.bias)
+        share = 1.0 / (1.0 + np.exp(-(hidden @ self.out + self.offset[0])))
+        return np.asarray(self.low + (self.high - self.low) * share).astype(np.float32)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -83,7 +124,8 @@ class Reward:
     activation: str
     leaky_slope: float  # negative slope of "leaky_relu"
     context: np.ndarray | None  # [F, F] C, gains by the scene
-    seen: np.ndarray | None  # [2, F] ends of the training's range, version 3
+    seen: np.ndarray | None  # [2, F] ends of the training's range, from version 3
+    anchor: Anchor | None  # version 4: drives on top of an incumbent, by `total`
     loss: dict[str, Any]
     provenance: dict[str, Any]
 
@@ -135,13 +177,69 @@ class Reward:
         """
         numbers = self._numbers(features, (len(self.times), len(self.names)))
         valid = None if time_valid is None else self._mask(time_valid, numbers.shape)
-        if self.context is not None and valid is not None and not valid[..., 0].all():
-            _fail(f"{self.file}: time_valid", "0 at the first time", "1: gains need it")
-        values = self._values(numbers, valid)
+        if self.context is not None and valid is not None:
+            self._needs_first(valid)
+        return self._finite("value", self._values(numbers, valid), "finite features")
+
+    def gain(self, features: np.ndarray) -> np.ndarray:
+        """How much of V an anchored reward adds to the incumbent's value.
+
+        Args:
+          features: [..., T, F] raw features at `times`; the first time counts.
+
+        Returns:
+          float32 [...] in [low, high]. A reward without an anchor raises, and a NaN
+          among the features that matter (whose row of the kernel is not 0).
+        """
+        if self.anchor is None:
+            _fail(f"{self.file}: anchor", "missing", "an anchored reward")
+        numbers = self._numbers(features, (len(self.times), len(self.names)))
+        gains = self.anchor.gain(numbers[..., 0, :])
+        return self._finite("gain", gains, "finite features at the first time")
+
+    def total(
+        self,
+        features: np.ndarray,
+        incumbent: np.ndarray,
+        time_valid: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """V_incumbent + gain V of trajectories; higher is better.
+
+        Args:
+          features: as `value`.
+          incumbent: [...] the incumbent's values (its cost, negated), broadcast to
+            the leading axes of the features.
+          time_valid: as `value`; the first time has to be valid.
+
+        Returns:
+          float32 [...]. Raises as `value` and `gain`, and for a sum or an
+          incumbent's value that is not finite.
+        """
+        gains = self.gain(features)
+        if time_valid is not None:
+            shape = (*gains.shape, len(self.times), len(self.names))
+            self._needs_first(self._mask(time_valid, shape))
+        values = self.value(features, time_valid)
+        try:
+            others = np.broadcast_to(np.asarray(incumbent), gains.shape)
+        except (TypeError, ValueError) as error:
+            _fail(f"{self.file}: incumbent", error, f"numbers of shape {gains.shape}")
+        if others.dtype.kind not in "fiu":
+            _fail(f"{self.file}: incumbent", others.dtype, "numbers")
+        with np.errstate(all="ignore"):
+            total = others.astype(np.float32) + gains.astype(float) * values
+            total = np.asarray(total).astype(np.float32)
+        return self._finite("total", total, "finite values of the incumbent")
+
+    def _finite(self, name: str, values: np.ndarray, expected: str) -> np.ndarray:
         bad = np.argwhere(~np.isfinite(values)).tolist()
         if bad:
-            _fail(f"{self.file}: value{bad[0]}", "not finite", "finite features")
+            _fail(f"{self.file}: {name}{bad[0]}", "not finite", expected)
         return values
+
+    def _needs_first(self, valid: np.ndarray) -> None:
+        if not valid[..., 0].all():
+            _fail(f"{self.file}: time_valid", "0 at the first time", "1: gains need it")
 
     @np.errstate(all="ignore")
     def _values(self, features: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
@@ -187,7 +285,7 @@ class Reward:
 
 
 def load_weights(path: str | os.PathLike[str]) -> Reward:
-    """Read and verify one file, schema version 1, 2 or 3.
+    """Read and verify one file, schema version 1, 2, 3 or 4.
 
     Raises:
       WeightsError: the file is missing, damaged, of another version, out of
@@ -221,19 +319,20 @@ def _decode(data: bytes, file: str) -> Reward:
         _fail("magic", "missing or another", repr(MAGIC))
     version = outer.get("schema_version")
     if type(version) is not int or version not in SCHEMA_VERSIONS:
-        _fail("schema_version", version, "1, 2 or 3, all this reader supports")
+        _fail("schema_version", version, "1, 2, 3 or 4, all this reader supports")
     _map("file", outer, OUTER_KEYS)
     body = outer["body"]
     found = hashlib.sha256(body).hexdigest() if isinstance(body, bytes) else "no bytes"
     if outer["sha256"] != found or not isinstance(body, bytes):
         _fail("sha256", found, f"{_show(outer['sha256'])}; the file is damaged")
     unpacked = _unpack("body", body)
-    keys = (*BODY_KEYS, *((), ("context",), ("seen",))[version - 1])
-    if version == 3 and isinstance(unpacked, dict) and "context" in unpacked:
+    more = ((), ("context",), ("seen",), ("seen", "anchor"))[version - 1]
+    keys = (*BODY_KEYS, *more)
+    if version >= 3 and isinstance(unpacked, dict) and "context" in unpacked:
         keys += ("context",)
     fields = _map("body", unpacked, keys)
     reward = Reward(file=file, sha256=found, **_fields(fields))
-    _verify(reward, fields["samples"])
+    _verify(reward, fields["samples"], fields.get("anchor"))
     return reward
 
 
@@ -259,6 +358,7 @@ def _fields(body: dict[str, Any]) -> dict[str, Any]:
     if "seen" in body:
         seen = _array("seen", seen, (2, size))
         _every("seen", seen[:1], seen[:1] <= seen[1:], "at most the highest")
+    anchor = read_anchor(body["anchor"], size) if "anchor" in body else None
     loss = _map("loss", body["loss"], ("name", "leaky_rate"))
     _text("loss.name", loss["name"])
     if loss["leaky_rate"] is not None:
@@ -274,6 +374,7 @@ def _fields(body: dict[str, Any]) -> dict[str, Any]:
         "leaky_slope": _number("leaky_slope", body["leaky_slope"]),
         "context": context,
         "seen": seen,
+        "anchor": anchor,
         "loss": loss,
         "provenance": _plain("provenance", body["provenance"], MAX_DEPTH),
     }
@@ -307,6 +408,37 @@ def _layers(value: object, width: int) -> dict[str, tuple[np.ndarray, ...]]:
     return {"kernels": tuple(kernels), "biases": tuple(biases)}
 
 
+def read_anchor(value: object, features: int) -> Anchor:
+    """The body's `anchor`, checked but for the gains of the samples.
+
+    Raises:
+      WeightsError: a field is wrong.
+    """
+    box = _map("anchor", value, ANCHOR_KEYS)
+    text = _text("anchor.incumbent", box["incumbent"])
+    low, high = (_number(f"anchor.{key}", box[key]) for key in ANCHOR_NUMBERS)
+    if low < 0.0:
+        _fail("anchor.low", low, "at least 0")
+    if high < low:
+        _fail("anchor.high", high, f"at least low, {_show(low)}")
+    read = lambda key, *shape: _array(f"anchor.{key}", box[key], shape)  # noqa: E731
+    location, scale = read("location", features), read("scale", features)
+    _every("anchor.scale", scale, scale > 0.0, "over 0")
+    kernel = read("kernel", features, range(1, MAX_UNITS + 1))
+    units = kernel.shape[1]
+    return Anchor(
+        incumbent=text,
+        low=low,
+        high=high,
+        location=location,
+        scale=scale,
+        kernel=kernel,
+        bias=read("bias", units),
+        out=read("out", units),
+        offset=read("offset", 1),
+    )
+
+
 def _plain(field: str, value: Any, depth: int) -> Any:  # noqa: ANN401
     """A map of what JSON can say: texts, finite numbers, lists, maps."""
     if depth == MAX_DEPTH and not isinstance(value, dict):
@@ -319,15 +451,15 @@ def _plain(field: str, value: Any, depth: int) -> Any:  # noqa: ANN401
     return value
 
 
-def _verify(reward: Reward, samples: object) -> None:
-    """The file's own samples must score as the file says."""
+def _verify(reward: Reward, samples: object, anchor: Any) -> None:  # noqa: ANN401
+    """The file's own samples must score, and have gains, as the file says."""
     found = _map("samples", samples, ("features", "valid", "value"))
     wanted = _array("samples.value", found["value"], (range(1, MAX_SAMPLES + 1),))
     shape = (len(wanted), len(reward.times), len(reward.names))
     features = _array("samples.features", found["features"], shape)
     valid = _array("samples.valid", found["valid"], shape[:2])
     _every("samples.valid", valid, (valid == 0.0) | (valid == 1.0), "0 or 1")
-    if reward.context is not None:
+    if reward.context is not None or reward.anchor is not None:
         first = valid[:, :1]
         _every("samples.valid", first, first == 1.0, "1 at the first time")
     # One sample at a time: little memory, however wide the layers are.
@@ -336,6 +468,12 @@ def _verify(reward: Reward, samples: object) -> None:
         if not abs(scored - want) <= TOLERANCE * max(1.0, abs(want)):
             need = f"{want:.9g} within {TOLERANCE:g} of max(1, |V|)"
             _fail(f"samples[{index}]", f"scored {scored:.9g}", need)
+    if reward.anchor is not None:
+        gains = _array("anchor.gain", anchor["gain"], (len(wanted),))
+        with np.errstate(all="ignore"):
+            error = np.abs(reward.anchor.gain(features[:, 0]).astype(float) - gains)
+        good = error <= TOLERANCE * np.maximum(1.0, np.abs(gains))
+        _every("anchor.gain", gains, good, "the gain of the sample")
 
 
 def _unpack(field: str, data: bytes) -> object:

@@ -67,6 +67,7 @@ class RewardWeights:
     biases: tuple[np.ndarray, ...]  # [H1], ..., [1]; one for every kernel
     context: np.ndarray | None = None  # [F, F], gains by scene; None: one reward
     seen: np.ndarray | None = None  # [2, F], ends of the training's range, or unknown
+    anchor: reader.Anchor | None = None  # of a reward driven on top of an incumbent
     activation: str  # of the hidden layers: tanh, relu, leaky_relu, identity
     leaky_slope: float  # negative slope of the hidden leaky_relu
     loss: Mapping[str, Any]  # name; leaky_rate of the rank loss, or None
@@ -191,6 +192,8 @@ def _pack_checked(
 
 def _version(weights: RewardWeights) -> int:
     """The least that has all fields: who reads an older one goes on reading."""
+    if weights.anchor is not None:
+        return 4
     if weights.seen is not None:
         return 3
     return 1 if weights.context is None else 2
@@ -217,6 +220,10 @@ def _body(weights: RewardWeights, samples: tuple[np.ndarray, ...]) -> dict[str, 
         for name, value in (("seen", weights.seen), ("context", weights.context))
         if value is not None
     }
+    if weights.anchor is not None:
+        if weights.seen is None:
+            raise _FieldError("seen: missing: expected ranges in an anchored reward")
+        more["anchor"] = _anchor(weights.anchor, len(weights.features), samples[0])
     layers = zip(weights.kernels, weights.biases, strict=True)
     names = ("features", "valid", "value")
     return {
@@ -245,6 +252,28 @@ def _body(weights: RewardWeights, samples: tuple[np.ndarray, ...]) -> dict[str, 
         },
         **more,
     }
+
+
+def _anchor(
+    anchor: reader.Anchor, features: int, samples_x: np.ndarray
+) -> dict[str, Any]:
+    """The map `anchor`, with the gains of the samples as its reader has them."""
+    numbers = {key: getattr(anchor, key) for key in reader.ANCHOR_NUMBERS}
+    arrays = {key: getattr(anchor, key) for key in reader.ANCHOR_ARRAYS}
+    box = {
+        "incumbent": anchor.incumbent,
+        **{key: _plain(f"anchor.{key}", item, 0) for key, item in numbers.items()},
+        **{key: _array(f"anchor.{key}", item) for key, item in arrays.items()},
+        "gain": None,
+    }
+    read = reader.read_anchor(box, features)
+    x = np.asarray(samples_x)
+    # of another shape: the reader names the samples
+    fits = x.dtype.kind in "fiub" and x.ndim == 3 and x.shape[-1] == features
+    with np.errstate(over="ignore"):
+        first = x[:, 0].astype(np.float32) if fits and x.shape[1] else None
+    gains = np.zeros(1) if first is None else read.gain(first)
+    return {**box, "gain": _array("anchor.gain", gains)}
 
 
 def _array(field: str, value: np.ndarray) -> dict[str, Any]:

@@ -329,8 +329,8 @@ def test_a_wrong_field_is_named(path, value, message):
         (b"\x82\xa1a\x01\xa1a\x02", "file: a key used twice"),
         (sealed(body_of(), magic="RCIRLX"), "magic: missing or another"),
         (
-            sealed(body_of(), schema_version=4),
-            "schema_version: 4: expected 1, 2 or 3, all this reader supports",
+            sealed(body_of(), schema_version=5),
+            "schema_version: 5: expected 1, 2, 3 or 4, all this reader supports",
         ),
         (sealed(body_of(), schema_version=3), "body.seen: missing: expected the keys"),
         (sealed({**body_of(), "seen": array(2, 3)}), "body.seen: unknown: expected"),
@@ -344,8 +344,8 @@ def test_a_wrong_field_is_named(path, value, message):
         ),
         # whatever a later version adds, its number is what is named
         (
-            sealed(b"later", schema_version=4, magic="RCIRLW", signature="x"),
-            "schema_version: 4: expected 1, 2 or 3, all this reader supports",
+            sealed(b"later", schema_version=5, magic="RCIRLW", signature="x"),
+            "schema_version: 5: expected 1, 2, 3 or 4, all this reader supports",
         ),
         (
             sealed(body_of(), schema_version=2),
