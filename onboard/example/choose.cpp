@@ -18,6 +18,11 @@ int main(int count, char** arguments) {
     std::fprintf(stderr, "%s\n", status.message().c_str());
     return 2;
   }
+  if (reward.anchored()) {
+    std::fprintf(stderr, "%s: anchor: %s: expected a reward that is not added to another\n",
+                 arguments[1], reward.incumbent().c_str());
+    return 2;
+  }
   std::vector<float> features, chunk(1 << 16);
   for (std::size_t read; (read = std::fread(chunk.data(), 4, chunk.size(), stdin)) > 0;) {
     features.insert(features.end(), chunk.begin(), chunk.begin() + static_cast<long>(read));

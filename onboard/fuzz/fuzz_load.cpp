@@ -1,6 +1,6 @@
 // libFuzzer target: any bytes are refused with one line, or score without harm.
 //
-// The first byte chooses what the rest is: 0 a whole file, 1 to 3 the body of a file of
+// The first byte chooses what the rest is: 0 a whole file, 1 to 4 the body of a file of
 // that schema version, wrapped with the right hash (which no mutation would hit).
 #include <cmath>
 #include <cstdint>
@@ -60,6 +60,14 @@ void score(const rcirl::Reward& reward, std::string_view bits) {
       none += std::isinf(value);
     }
     require(none == refused);
+    const std::size_t more =
+        reward.total(features.data(), kCount, mask, features.data(), &workspace, values);
+    none = 0;
+    for (const float value : values) {
+      require(!std::isnan(value) && value != std::numeric_limits<float>::infinity());
+      none += std::isinf(value);
+    }
+    require(none == more && (reward.anchored() ? more >= refused : more == kCount));
   }
 }
 
@@ -68,7 +76,7 @@ void score(const rcirl::Reward& reward, std::string_view bits) {
 extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size) {
   if (size < 1) return 0;
   const std::string_view rest(reinterpret_cast<const char*>(data) + 1, size - 1);
-  const int version = data[0] % 4;
+  const int version = data[0] % 5;
   const std::string file = version == 0 ? std::string(rest) : sealed(rest, version);
   rcirl::Reward reward;
   const rcirl::Status status = rcirl::decode(file, "fuzz", &reward);

@@ -2,6 +2,7 @@
 //
 //   reader score WEIGHTS FEATURES [MASK]  -> float32 values of float32 [K, T, F] and, if
 //                                            given, of uint8 [K, T]
+//   reader total WEIGHTS FEATURES OWN [MASK]  -> as score, on top of float32 values OWN [K]
 //   reader guard WEIGHTS FEATURES [MASK]  -> of each plan of 4 candidates "0 or 1, the
 //                                            feature's place, its share"
 //   reader check BATCH                    -> for each file of BATCH, its bytes after
@@ -66,6 +67,17 @@ int score(const Given& given) {
   return std::fwrite(values.data(), 4, values.size(), stdout) == values.size() ? 0 : 1;
 }
 
+int total(const Given& given, const char* own) {
+  const std::vector<char> bytes = contents(own);
+  std::vector<float> values(given.count);
+  if (bytes.size() != 4 * values.size()) return 2;
+  if (!values.empty()) std::memcpy(values.data(), bytes.data(), bytes.size());
+  rcirl::Workspace workspace = given.reward.workspace();
+  given.reward.total(given.features.data(), given.count, given.mask(0), values.data(), &workspace,
+                     values.data());
+  return std::fwrite(values.data(), 4, values.size(), stdout) == values.size() ? 0 : 1;
+}
+
 int guard(const Given& given) {
   constexpr std::size_t kPlan = 4;  // candidates
   const rcirl::Guard guard(given.reward);
@@ -103,6 +115,11 @@ int main(int count, char** arguments) {
     if (!given.read(arguments[2], arguments[3], count == 5 ? arguments[4] : nullptr)) return 2;
     return mode == "score" ? score(given) : guard(given);
   }
-  std::fprintf(stderr, "reader: arguments: expected score or guard WEIGHTS FEATURES [MASK] | check BATCH\n");
+  if (mode == "total" && (count == 5 || count == 6)) {
+    Given given;
+    if (!given.read(arguments[2], arguments[3], count == 6 ? arguments[5] : nullptr)) return 2;
+    return total(given, arguments[4]);
+  }
+  std::fprintf(stderr, "reader: arguments: expected score or guard WEIGHTS FEATURES [MASK] | total WEIGHTS FEATURES OWN [MASK] | check BATCH\n");
   return 2;
 }

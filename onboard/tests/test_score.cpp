@@ -9,8 +9,8 @@
 #include <thread>
 #include <vector>
 
+#include "anchored.hpp"
 #include "check.hpp"
-#include "files.hpp"
 #include "rcirl/guard.hpp"
 #include "rcirl/reward.hpp"
 
@@ -217,14 +217,16 @@ void test_check_features() {
 }
 
 void test_scoring_allocates_nothing() {
-  const Example example(21, 18, {32, 16}, "tanh", true);
-  const rcirl::Reward reward = loaded(example);
+  const Anchored anchored(Example(21, 18, {32, 16}, "tanh", true));
+  rcirl::Reward reward;
+  CHECK_TEXT(rcirl::decode(anchored.file(), "w", &reward).message(), "");
   rcirl::Workspace workspace = reward.workspace();
-  const std::vector<float> features = example.inputs(100, 3);
+  const std::vector<float> features = anchored.example.inputs(100, 3);
   std::vector<float> values(100);
   const rcirl::Guard guard(reward);
   const long before = allocations;
   reward.score(features.data(), 100, {}, &workspace, values.data());
+  reward.total(features.data(), 100, {}, values.data(), &workspace, values.data());
   const double share = guard.check(features.data(), 100, {}).share;
   const std::size_t best = rcirl::best(values.data(), 100);
   const long after = allocations;

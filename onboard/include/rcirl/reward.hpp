@@ -8,6 +8,9 @@
 //   reward.score(features, count, {}, &workspace, values);     // [K, T, F] -> [K]
 //   std::size_t best = rcirl::best(values, count);             // count: none is usable
 //
+// An anchored reward (schema version 4) goes on top of the planner's own values: where
+// `reward.anchored()`, call `reward.total(..., own, &workspace, values)` instead of `score`.
+//
 // Headers only, on top of msgpack-c's C headers; compiles with -fno-exceptions and
 // -fno-rtti. Loading allocates. Scoring allocates nothing, throws nothing, takes no lock,
 // and one reward may be scored by many threads, each with its own workspace.
@@ -19,6 +22,7 @@
 
 #include <algorithm>
 #include <cerrno>
+#include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <cstdio>
@@ -54,7 +58,7 @@ struct Mask {
   Shape shape = kShared;
 };
 
-// Scratch memory of `Reward::score`; belongs to one thread at a time.
+// Scratch memory of `Reward::score` and `total`; belongs to one thread at a time.
 class Workspace {
  public:
   Workspace() = default;
@@ -99,6 +103,22 @@ class Reward {
   std::size_t score(const float* features, std::size_t count, Mask valid,
                     Workspace* workspace, float* values) const noexcept;
 
+  // Whether V is made to be added to the value of an incumbent, and of which one.
+  bool anchored() const { return !incumbent().empty(); }
+  const std::string& incumbent() const { return weights_.anchor.incumbent; }
+
+  // V_incumbent + gain V of trajectories, of an anchored reward; higher is better.
+  //
+  //   incumbent  [K] its values (a cost, negated); may be the same memory as `values`
+  //
+  // The rest as `score`, which refuses the same candidates. Refused are also those with
+  // a first time that is not valid, without a finite gain (a NaN at the first time among
+  // the features that matter to it) or a finite value of the incumbent, and all
+  // candidates of a reward without an anchor.
+  std::size_t total(const float* features, std::size_t count, Mask valid,
+                    const float* incumbent, Workspace* workspace,
+                    float* values) const noexcept;
+
  private:
   friend Status decode(std::string_view data, const std::string& file, Reward* reward);
   friend class Guard;
@@ -107,8 +127,8 @@ class Reward {
   detail::Weights weights_;
 };
 
-// Reads and verifies the bytes of a file, schema version 1, 2 or 3; `file` is their name
-// in messages. A failure leaves `reward` as it was.
+// Reads and verifies the bytes of a file, schema version 1, 2, 3 or 4; `file` is their
+// name in messages. A failure leaves `reward` as it was.
 inline Status decode(std::string_view data, const std::string& file, Reward* reward) {
   Reward read;
   const std::string error = detail::decode(data, &read.weights_);
@@ -182,6 +202,43 @@ inline std::size_t Reward::score(const float* features, std::size_t count, Mask 
   detail::score(network, features, count, {valid.data, stride}, workspace->lanes_.data(),
                 values);
   return static_cast<std::size_t>(std::count(values, values + count, kNone));
+}
+
+inline std::size_t Reward::total(const float* features, std::size_t count, Mask valid,
+                                 const float* incumbent, Workspace* workspace,
+                                 float* values) const noexcept {
+  constexpr float kNone = -std::numeric_limits<float>::infinity();
+  if (!anchored()) {
+    std::fill(values, values + count, kNone);
+    return count;
+  }
+  const detail::Network& network = weights_.network;
+  const std::size_t row = network.times() * network.features;
+  const std::size_t stride = valid.shape == Mask::kEach ? network.times() : 0;
+  std::size_t refused = 0;
+  for (std::size_t first = 0; first < count; first += detail::kLanes) {
+    const std::size_t lanes = std::min(detail::kLanes, count - first);
+    const float* block = features + first * row;
+    float own[detail::kLanes], gain = 0.0f;
+    std::copy(incumbent + first, incumbent + first + lanes, own);
+    Mask marks = valid;
+    if (valid.data != nullptr) marks.data += first * stride;
+    score(block, lanes, marks, workspace, values + first);
+    for (std::size_t k = 0; k < lanes; ++k) {
+      const float* x = block + k * row;
+      // candidates of one scene begin alike
+      const bool same = k > 0 && std::memcmp(x, x - row, network.features * sizeof *x) == 0;
+      if (!same) gain = detail::gain(weights_.anchor, x);
+      float& value = values[first + k];
+      const double sum = static_cast<double>(own[k]) +
+                         static_cast<double>(gain) * static_cast<double>(value);
+      const bool starts = marks.data == nullptr || marks.data[k * stride] == 1;
+      const bool finite = std::abs(sum) <= std::numeric_limits<float>::max();
+      value = starts && finite ? static_cast<float>(sum) : kNone;
+      refused += value == kNone;
+    }
+  }
+  return refused;
 }
 
 }  // namespace rcirl

@@ -7,6 +7,7 @@
 #include <cstdint>
 #include <cstdio>
 #include <cstring>
+#include <limits>
 #include <string>
 #include <string_view>
 #include <vector>
@@ -15,6 +16,14 @@
 #include "rcirl/detail/tree.hpp"
 
 namespace rcirl::detail {
+
+// A double as float32; what lies beyond becomes infinite, as numpy makes it.
+inline float narrow(double value) {
+  constexpr float kMost = std::numeric_limits<float>::max();
+  constexpr float kInfinity = std::numeric_limits<float>::infinity();
+  if (std::abs(value) <= static_cast<double>(kMost)) return static_cast<float>(value);
+  return value > 0.0 ? kInfinity : -kInfinity;
+}
 
 inline std::string number_text(double value) {
   char text[32];

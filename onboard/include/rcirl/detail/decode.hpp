@@ -5,12 +5,12 @@
 #include <algorithm>
 #include <cmath>
 #include <cstddef>
-#include <limits>
 #include <string>
 #include <string_view>
 #include <utility>
 #include <vector>
 
+#include "rcirl/detail/anchor.hpp"
 #include "rcirl/detail/checks.hpp"
 #include "rcirl/detail/limits.hpp"
 #include "rcirl/detail/network.hpp"
@@ -35,6 +35,7 @@ struct Weights {
   std::vector<Feature> features;  // [F]
   std::vector<float> times;       // [T] s
   std::vector<float> seen;        // [2, F] ends of the training's range, or empty
+  Anchor anchor;                  // version 4, or empty
   Network network;
 };
 
@@ -140,14 +141,6 @@ inline bool decode_layers(Checks& is, const Node& node, Network* network) {
                                std::to_string(width), "1 output, the reward");
 }
 
-// A double as float32; what lies beyond becomes infinite, as numpy makes it.
-inline float narrow(double value) {
-  constexpr float kMost = std::numeric_limits<float>::max();
-  constexpr float kInfinity = std::numeric_limits<float>::infinity();
-  if (std::abs(value) <= static_cast<double>(kMost)) return static_cast<float>(value);
-  return value > 0.0 ? kInfinity : -kInfinity;
-}
-
 inline bool decode_loss(Checks& is, const Node& node) {
   Values loss;
   std::string name;
@@ -157,8 +150,22 @@ inline bool decode_loss(Checks& is, const Node& node) {
          (loss[1]->kind == Kind::kNil || is.number("loss.leaky_rate", *loss[1], &rate));
 }
 
-// The file's own samples must score as the file says.
-inline bool verify(Checks& is, const Node& node, const Network& network) {
+// The samples' gains must be as the file says. `features` [m, T, F].
+inline bool verify_gains(Checks& is, const Node& node, const Anchor& anchor,
+                         const Array& features) {
+  const std::size_t count = features.shape[0], row = features.shape[1] * features.shape[2];
+  Array gains;
+  return is.array("anchor.gain", node, {count}, &gains) &&
+         is.every("anchor.gain", gains, "the gain of the sample", [&](float v, std::size_t i) {
+           const double want = static_cast<double>(v);
+           const double got = static_cast<double>(gain(anchor, &features.values[i * row]));
+           return std::abs(got - want) <= kTolerance * std::max(1.0, std::abs(want));
+         });
+}
+
+// The file's own samples must score as the file says; `gains` of an anchor, or null.
+inline bool verify(Checks& is, const Node& node, const Weights& weights, const Node* gains) {
+  const Network& network = weights.network;
   Values found;
   Array value, features, valid;
   if (!(is.map("samples", node, {"features", "valid", "value"}, &found) &&
@@ -172,7 +179,7 @@ inline bool verify(Checks& is, const Node& node, const Network& network) {
                  [](float v, std::size_t) { return v == 0.0f || v == 1.0f; }))) {
     return false;
   }
-  if (!network.context.empty() &&
+  if ((gains != nullptr || !network.context.empty()) &&
       !is.every("samples.valid", valid, "1 at the first time",
                 [&](float v, std::size_t i) { return i % times != 0 || v == 1.0f; })) {
     return false;
@@ -190,7 +197,7 @@ inline bool verify(Checks& is, const Node& node, const Network& network) {
                      number_text(want) + " within 1e-05 of max(1, |V|)");
     }
   }
-  return true;
+  return gains == nullptr || verify_gains(is, *gains, weights.anchor, features);
 }
 
 inline bool decode_seen(Checks& is, const Node& node, std::size_t features, Array* seen) {
@@ -207,8 +214,9 @@ inline bool decode_body(Checks& is, const Node& root, Weights* weights) {
   std::vector<std::string_view> keys = {
       "preset",     "features",    "normaliser", "times",      "gamma",  "layers",
       "activation", "leaky_slope", "loss",       "provenance", "samples"};
-  if (version == 3) keys.push_back("seen");
-  const bool gated = version == 2 || (version == 3 && is.find(root, "context") != nullptr);
+  if (version >= 3) keys.push_back("seen");
+  if (version == 4) keys.push_back("anchor");
+  const bool gated = version == 2 || (version >= 3 && is.find(root, "context") != nullptr);
   if (gated) keys.push_back("context");
   Values body;
   const bool mapped = is.map("body", root, keys, &body);
@@ -224,7 +232,12 @@ inline bool decode_body(Checks& is, const Node& root, Weights* weights) {
       !is.array("context", *body.back(), {network.features, network.features}, &context)) {
     return false;
   }
-  if (version == 3 && !decode_seen(is, *body[11], network.features, &seen)) return false;
+  if (version >= 3 && !decode_seen(is, *body[11], network.features, &seen)) return false;
+  const Node* gains = nullptr;
+  if (version == 4 &&
+      !decode_anchor(is, *body[12], network.features, &weights->anchor, &gains)) {
+    return false;
+  }
   double slope = 0.0;
   if (!(decode_loss(is, *body[8]) && is.text("preset", *body[0], &weights->preset) &&
         is.array("gamma", *body[4], {weights->times.size()}, &gamma) &&
@@ -237,7 +250,7 @@ inline bool decode_body(Checks& is, const Node& root, Weights* weights) {
   network.context = std::move(context.values);
   network.gamma = std::move(gamma.values);
   network.leaky_slope = narrow(slope);
-  return verify(is, *body[10], network);
+  return verify(is, *body[10], *weights, gains);
 }
 
 inline bool decode_outer(Checks& is, const Node& root, Weights* weights,
@@ -248,9 +261,9 @@ inline bool decode_outer(Checks& is, const Node& root, Weights* weights,
   }
   const Node* version = is.find(root, "schema_version");
   if (version == nullptr || version->kind != Kind::kUint ||
-      version->natural < 1 || version->natural > 3) {
+      version->natural < 1 || version->natural > 4) {
     return is.fail("schema_version", version == nullptr ? Node{} : *version,
-                   "1, 2 or 3, all this reader supports");
+                   "1, 2, 3 or 4, all this reader supports");
   }
   Values outer;
   if (!is.map("file", root, {"magic", "schema_version", "body", "sha256"}, &outer)) {

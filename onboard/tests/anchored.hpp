@@ -1,0 +1,99 @@
+// An example on top of an incumbent, and its gain in plain double loops.
+#ifndef RCIRL_TESTS_ANCHORED_HPP_
+#define RCIRL_TESTS_ANCHORED_HPP_
+
+#include <algorithm>
+#include <cmath>
+#include <cstddef>
+#include <random>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "files.hpp"
+
+using Fields = std::vector<std::pair<std::string, std::string>>;
+
+struct Anchored {
+  Example example;
+  std::size_t units = 4;
+  double low = 0.1, high = 1.5;
+  std::vector<float> location, scale, kernel, bias, out, offset;
+
+  explicit Anchored(Example e) : example(std::move(e)) {
+    std::mt19937 random(11);
+    std::normal_distribution<double> draw(0.0, 1.0);
+    const auto normal = [&](std::size_t size) {
+      std::vector<float> values(size);
+      for (float& value : values) value = static_cast<float>(draw(random));
+      return values;
+    };
+    location = normal(example.features);
+    scale = std::vector<float>(example.features, 0.5f);
+    kernel = normal(example.features * units);
+    for (std::size_t h = 0; h < units; ++h) kernel[h] = 0.0f;  // the first does not matter
+    bias = normal(units);
+    out = normal(units);
+    offset = normal(1);
+  }
+
+  // Of the first time [F].
+  double gain(const float* first) const {
+    double sum = double{offset[0]};
+    for (std::size_t h = 0; h < units; ++h) {
+      double x = double{bias[h]};
+      for (std::size_t f = 1; f < example.features; ++f) {
+        const double z = (double{first[f]} - double{location[f]}) / double{scale[f]};
+        x += std::min(std::max(z, -5.0), 5.0) * double{kernel[f * units + h]};
+      }
+      sum += double{out[h]} * std::tanh(x);
+    }
+    return low + (high - low) / (1.0 + std::exp(-sum));
+  }
+
+  Fields anchor() const {
+    const std::size_t size = example.features, row = example.times * size;
+    const std::vector<float> raw = example.inputs(example.samples, example.seed + 1);
+    std::vector<float> gains(example.samples);
+    for (std::size_t i = 0; i < gains.size(); ++i) {
+      gains[i] = static_cast<float>(gain(&raw[i * row]));
+    }
+    return {{"incumbent", pack::text("hand-set")},
+            {"low", pack::real(low)},
+            {"high", pack::real(high)},
+            {"location", pack::array({size}, location)},
+            {"scale", pack::array({size}, scale)},
+            {"kernel", pack::array({size, units}, kernel)},
+            {"bias", pack::array({units}, bias)},
+            {"out", pack::array({units}, out)},
+            {"offset", pack::array({1}, offset)},
+            {"gain", pack::array({gains.size()}, gains)}};
+  }
+
+  // A file with this anchor.
+  std::string with(const Fields& anchor) const {
+    Fields body = example.body();
+    std::vector<float> seen(2 * example.features, 1.0f);
+    std::fill_n(seen.begin(), example.features, -1.0f);
+    body.push_back({"seen", pack::array({2, example.features}, seen)});
+    body.push_back({"anchor", pack::map(anchor)});
+    return pack::sealed(pack::map(body), 4);
+  }
+
+  std::string file() const { return with(anchor()); }
+
+  // The file with one field of the anchor replaced (added if it is new).
+  std::string tampered(const std::string& key, const std::string& bytes) const {
+    Fields fields = anchor();
+    for (auto& field : fields) {
+      if (field.first == key) {
+        field.second = bytes;
+        return with(fields);
+      }
+    }
+    fields.push_back({key, bytes});
+    return with(fields);
+  }
+};
+
+#endif  // RCIRL_TESTS_ANCHORED_HPP_
