@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rcirl_jax.export import FeatureSpec, RewardWeights, pack, reader, save
+from rcirl_jax.export import Anchor, FeatureSpec, RewardWeights, pack, reader, save
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward.network import LEAKY_SLOPE, RewardConfig, init_reward, pinned
 from rcirl_jax.reward.network import value as trained_value
@@ -38,6 +38,7 @@ def example_weights(
     activation="tanh",
     by_context=False,
     seen=False,
+    anchored=False,
 ):
     rng = np.random.default_rng(seed)
     sizes = (features, *hidden, 1)
@@ -57,7 +58,8 @@ def example_weights(
         times=np.linspace(0.0, 8.0, times, dtype=np.float32),
         gamma=draw(times),
         context=draw(features, features) if by_context else None,
-        seen=np.sort(draw(2, features), axis=0) if seen else None,
+        seen=np.sort(draw(2, features), axis=0) if seen or anchored else None,
+        anchor=example_anchor(seed, features) if anchored else None,
         kernels=tuple(draw(*pair) for pair in pairwise(sizes)),
         biases=tuple(draw(size) for size in sizes[1:]),
         activation=activation,
@@ -67,13 +69,32 @@ def example_weights(
     )
 
 
+def example_anchor(seed=0, features=3, units=4):
+    """Its first feature does not matter, if there is another."""
+    rng = np.random.default_rng(seed)
+    draw = lambda *shape: rng.normal(size=shape).astype(np.float32)  # noqa: E731
+    kernel = draw(features, units)
+    kernel[: features - 1 and 1] = 0.0
+    return Anchor(
+        incumbent="hand-set",
+        low=0.25,
+        high=1.5,
+        location=draw(features),
+        scale=0.2 + rng.random(features, np.float32),
+        kernel=kernel,
+        bias=draw(units),
+        out=draw(units),
+        offset=draw(1),
+    )
+
+
 def example_samples(weights, count=4, seed=1):
     """Features that often leave [lower, upper], masks, float64 values."""
     rng = np.random.default_rng(seed)
     size = (count, len(weights.times), len(weights.features))
     features = rng.normal(scale=2.0, size=size).astype(np.float32)
     valid = rng.random(size[:2]) < 0.7
-    valid[:, 0] |= weights.context is not None
+    valid[:, 0] |= weights.context is not None or weights.anchor is not None
     values = [loop_value(weights, *one) for one in zip(features, valid, strict=True)]
     return features, valid, np.array(values)
 
@@ -122,6 +143,18 @@ def loop_value(weights, features, valid):
             x = y if last else [act(item) for item in y]
         total += float(weights.gamma[t]) * x[0] if valid[t] else 0.0
     return total
+
+
+def loop_gain(anchor, first):
+    """The gain of V by plain float64 loops; `first` is [F]."""
+    total = float(anchor.offset[0])
+    for unit in range(len(anchor.bias)):
+        x = float(anchor.bias[unit])
+        for f in range(len(first)):
+            z = (float(first[f]) - float(anchor.location[f])) / float(anchor.scale[f])
+            x += max(-5.0, min(5.0, z)) * float(anchor.kernel[f, unit])
+        total += float(anchor.out[unit]) * math.tanh(x)
+    return anchor.low + (anchor.high - anchor.low) / (1.0 + math.exp(-total))
 
 
 def random_weights(path, seed=2):

@@ -2,7 +2,7 @@
 
     python -m onboard.fuzz.make_corpus --output=out/corpus
 
-One seed is a byte that says what follows (0: a file, 1 to 3: the body of a file of
+One seed is a byte that says what follows (0: a file, 1 to 4: the body of a file of
 that schema version) and a small file of every activation, depth and version. The
 dictionary, `weights.dict` beside the folder, holds the words of the format.
 """
@@ -17,6 +17,7 @@ from rcirl_jax.export import reader
 from tests.export.test_weights import packed
 
 _OUTPUT = flags.DEFINE_string("output", "out/corpus", "folder of the seeds")
+VERSIONS = ((), ("seen",), ("anchored",))  # what makes a file one of 1 or 2, 3, 4
 
 
 def main(_: list[str]) -> None:
@@ -24,7 +25,7 @@ def main(_: list[str]) -> None:
     folder = Path(_OUTPUT.value)
     folder.mkdir(parents=True, exist_ok=True)
     for activation in reader.ACTIVATIONS:
-        for by_context, seen in itertools.product((False, True), repeat=2):
+        for by_context, more in itertools.product((False, True), VERSIONS):
             for hidden in ((), (2,), (3, 2)):
                 data = packed(
                     features=2,
@@ -32,7 +33,7 @@ def main(_: list[str]) -> None:
                     hidden=hidden,
                     activation=activation,
                     by_context=by_context,
-                    seen=seen,
+                    **{key: True for key in more},
                 )
                 outer = msgpack.unpackb(data)
                 version = outer["schema_version"]
@@ -40,6 +41,7 @@ def main(_: list[str]) -> None:
                 (folder / f"file_{name}").write_bytes(b"\0" + data)
                 (folder / f"body_{name}").write_bytes(bytes([version]) + outer["body"])
     keys = {*reader.OUTER_KEYS, *reader.BODY_KEYS, *reader.RANGES, *reader.ACTIVATIONS}
+    keys |= {"anchor", *reader.ANCHOR_KEYS, "hand-set"}
     keys |= {
         "context",
         "seen",

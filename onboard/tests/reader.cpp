@@ -120,6 +120,8 @@ int main(int count, char** arguments) {
     if (!given.read(arguments[2], arguments[3], count == 6 ? arguments[5] : nullptr)) return 2;
     return total(given, arguments[4]);
   }
-  std::fprintf(stderr, "reader: arguments: expected score or guard WEIGHTS FEATURES [MASK] | total WEIGHTS FEATURES OWN [MASK] | check BATCH\n");
+  std::fprintf(stderr, 
+               "reader: arguments: expected score or guard WEIGHTS FEATURES [MASK] | "
+               "total WEIGHTS FEATURES OWN [MASK] | check BATCH\n");
   return 2;
 }

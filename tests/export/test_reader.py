@@ -27,10 +27,12 @@ from tests.weights_files import (
     ACTIVATIONS,
     example_samples,
     example_weights,
+    loop_gain,
     packed,
 )
 
 VALID = packed()
+ANCHORED = packed(anchored=True)
 CASES = max(300, settings().max_examples)  # the nightly profile asks for more
 ALLOWED = {"numpy", "msgpack"}
 
@@ -62,15 +64,15 @@ def body_of(data=VALID):
     return msgpack.unpackb(msgpack.unpackb(data)["body"])
 
 
-def tampered(path, value):
+def tampered(path, value, data=VALID):
     """The valid file with one field of its body replaced, and hashed again."""
-    body = body_of()
+    body = body_of(data)
     *way, last = path
     place = body
     for step in way:
         place = place[step]
     place[last] = value
-    return sealed(body)
+    return sealed(body, schema_version=msgpack.unpackb(data)["schema_version"])
 
 
 def refusal(data):
@@ -217,6 +219,68 @@ def test_wrong_arguments_are_one_line(features, time_valid, message):
         decode_weights(VALID).point_rewards(np.zeros((4, 2)))
 
 
+def test_the_total_is_the_incumbents_value_and_the_gained_one():
+    weights = example_weights(anchored=True)
+    features, valid, values = example_samples(weights, count=6, seed=4)
+    reward = decode_weights(ANCHORED)
+    gains = reward.gain(features)
+    assert gains.dtype == np.float32
+    expected = [loop_gain(weights.anchor, one[0]) for one in features]
+    np.testing.assert_allclose(gains, expected, rtol=1e-6)
+    assert np.ptp(gains) > 0.1
+    own = np.linspace(-3.0, 50.0, 6)
+    total = reward.total(features, own, valid)
+    assert total.dtype == np.float32
+    np.testing.assert_allclose(total, own + np.multiply(expected, values), atol=2e-5)
+    folded = reward.total(features.reshape(2, 3, 4, 3), own.reshape(2, 3))
+    np.testing.assert_array_equal(folded.ravel(), reward.total(features, own))
+    np.testing.assert_array_equal(reward.value(features, valid[0]).shape, (6,))
+    plain = decode_weights(packed(seen=True))
+    np.testing.assert_array_equal(reward.value(features), plain.value(features))
+    assert reward.total(features[0], np.ones(())).shape == ()
+
+
+def test_a_gain_needs_the_features_that_matter_to_it():
+    reward = decode_weights(ANCHORED)
+    features, valid, _ = example_samples(example_weights(anchored=True), count=3)
+    expected = reward.gain(features)
+    features[:, 0, 0] = np.nan  # its row of the kernel is 0
+    features[:, 1:] = np.nan
+    np.testing.assert_array_equal(reward.gain(features), expected)
+    features[1, 0, 2] = np.inf  # clipped
+    assert reward.gain(features)[1] != expected[1]
+    features[1, 0, 2] = np.nan
+    with pytest.raises(
+        WeightsError, match=r"weights: gain\[1\]: not finite: expected f"
+    ):
+        reward.gain(features)
+    with pytest.raises(WeightsError, match=r"features: float32 \(3, 3, 3\): expected"):
+        reward.gain(features[:, 1:])
+    with pytest.raises(WeightsError, match="anchor: missing: expected an anchored"):
+        decode_weights(VALID).gain(features)
+    clean, valid, _ = example_samples(example_weights(anchored=True), count=3)
+    for own, mask, message in (
+        (
+            np.zeros(()),
+            np.arange(4) > 0,
+            "time_valid: 0 at the first time: expected 1: gains",
+        ),
+        (np.zeros(2), valid, r"incumbent: .*: expected numbers of shape \(3,\)"),
+        (np.array(["a"] * 3), valid, "incumbent: <U1: expected numbers"),
+        (
+            np.array([0.0, np.nan, 0.0]),
+            valid,
+            r"total\[1\]: not finite: expected finite values",
+        ),
+        (np.array(3.5e38), valid, r"total\[0\]: not finite"),
+    ):
+        with pytest.raises(WeightsError, match=message):
+            reward.total(clean, own, mask)
+    clean[2, 0, 1] = np.nan
+    with pytest.raises(WeightsError, match=r"gain\[2\]: not finite"):
+        reward.total(clean, np.zeros(3))
+
+
 def test_check_features_names_the_first_mismatch():
     reward = decode_weights(VALID)
     names, units = list(reward.names), list(reward.units)
@@ -313,6 +377,51 @@ def test_a_wrong_field_is_named(path, value, message):
 
 
 @pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        ([], None, "anchor: None: expected a map"),
+        ([], {}, "anchor.incumbent: missing: expected the keys incumbent, low, high"),
+        (["extra"], 1, "anchor.extra: unknown: expected the keys incumbent, low, high"),
+        (["incumbent"], 5, "anchor.incumbent: 5: expected a text"),
+        (["incumbent"], "", "anchor.incumbent: : expected a text of 1 to 64"),
+        (["incumbent"], "x" * 65, "anchor.incumbent: xxx"),
+        (["low"], -0.5, "anchor.low: -0.5: expected at least 0"),
+        (["low"], True, "anchor.low: True: expected a finite number"),
+        (["low"], 2, "anchor.high: 1.5: expected at least low, 2"),
+        (["low"], 0.2, "anchor.gain[0]: "),
+        (["high"], float("inf"), "anchor.high: inf: expected a finite number"),
+        (["high"], float("nan"), "anchor.high: nan: expected a finite number"),
+        (["high"], 1e300, "anchor.gain[0]: "),
+        (["high"], None, "anchor.high: None: expected a finite number"),
+        (["location"], array(2), "anchor.location.shape: [2]: expected [3]"),
+        (["location"], array(3, fill=np.inf), "anchor.location[0]: inf: expected fin"),
+        (["location", "data"], b"\0" * 11, "anchor.location.data: bytes of 11"),
+        (["scale"], array(3, fill=0.0), "anchor.scale[0]: 0: expected over 0"),
+        (["scale"], array(3, fill=-1.0), "anchor.scale[0]: -1: expected over 0"),
+        (["scale"], array(3, 1), "anchor.scale.shape: list of 2: expected [3]"),
+        (["kernel"], array(4, 3), "anchor.kernel.shape: [4, 3]: expected [3, "),
+        (["kernel"], array(3, 0), "anchor.kernel.shape: [3, 0]: expected [3, "),
+        (["kernel"], array(3, 4097), "anchor.kernel.shape: [3, 4097]: expected [3, "),
+        (["kernel"], array(3, 4), "anchor.gain[0]: "),
+        (["kernel"], array(3, 5), "anchor.bias.shape: [4]: expected [5]"),
+        (["kernel", "dtype"], "<f8", "anchor.kernel.dtype: <f8: expected <f4"),
+        (["bias"], array(5), "anchor.bias.shape: [5]: expected [4]"),
+        (["bias"], array(4, fill=np.nan), "anchor.bias[0]: nan: expected finite"),
+        (["out"], array(1), "anchor.out.shape: [1]: expected [4]"),
+        (["out"], array(4, fill=3e38), "anchor.gain["),
+        (["offset"], array(2), "anchor.offset.shape: [2]: expected [1]"),
+        (["offset"], 0.5, "anchor.offset: 0.5: expected a map"),
+        (["gain"], array(3), "anchor.gain.shape: [3]: expected [4]"),
+        (["gain"], None, "anchor.gain: None: expected a map"),
+        (["gain"], array(4, fill=np.nan), "anchor.gain[0]: nan: expected finite"),
+        (["gain"], array(4, fill=9.0), "anchor.gain[0]: 9: expected the gain of the"),
+    ],
+)
+def test_a_wrong_anchor_is_named(path, value, message):
+    assert message in refusal(tampered(["anchor", *path], value, ANCHORED))
+
+
+@pytest.mark.parametrize(
     ("data", "message"),
     [
         (b"", "size: 0 bytes or more: expected 1 to 67108864 bytes"),
@@ -341,6 +450,19 @@ def test_a_wrong_field_is_named(path, value, message):
         (
             sealed({**body_of(), "seen": falling(2, 3)}, schema_version=3),
             "seen[0, 0]: 6: expected at most the highest",
+        ),
+        (
+            sealed({**body_of(), "seen": array(2, 3)}, schema_version=4),
+            "body.anchor: missing: expected the keys",
+        ),
+        (sealed(body_of(), schema_version=4), "body.seen: missing: expected the keys"),
+        (
+            sealed({**body_of(), "seen": array(2, 3), "anchor": {}}, schema_version=3),
+            "body.anchor: unknown: expected the keys",
+        ),
+        (
+            tampered(["samples", "valid"], array(4, 4, fill=0.0), ANCHORED),
+            "samples.valid[0, 0]: 0: expected 1 at the first time",
         ),
         # whatever a later version adds, its number is what is named
         (
@@ -382,6 +504,19 @@ def test_a_verified_file_must_score_to_one_part_in_a_hundred_thousand():
         data = tampered(["samples", "value", "data"], moved.astype("<f4").tobytes())
         if refused:
             assert "samples[0]: scored" in refusal(data)
+        else:
+            decode_weights(data)
+
+
+def test_a_gain_must_be_met_to_one_part_in_a_hundred_thousand():
+    box = body_of(ANCHORED)["anchor"]["gain"]
+    gains = np.frombuffer(box["data"], "<f4").astype(float)
+    for shift, refused in ((3e-6, False), (3e-5, True)):
+        moved = gains + shift * np.maximum(1.0, gains)
+        path = ["anchor", "gain", "data"]
+        data = tampered(path, moved.astype("<f4").tobytes(), ANCHORED)
+        if refused:
+            assert "anchor.gain[0]: " in refusal(data)
         else:
             decode_weights(data)
 
@@ -447,7 +582,10 @@ def only_weights_errors(data):
     try:
         reward = decode_weights(data)
         # Harmless for the samples, such as another name: it scores, or says why not.
-        value = reward.value(np.zeros((len(reward.times), len(reward.names))))
+        zeros = np.zeros((len(reward.times), len(reward.names)))
+        value = reward.value(zeros)
+        if reward.anchor is not None:
+            value = reward.total(zeros, value)
     except WeightsError:
         return
     assert np.isfinite(value)
@@ -487,6 +625,12 @@ def places(value, way=()):
 @given(st.sampled_from(list(places(body_of()))), OBJECTS)
 def test_any_object_in_any_place_is_refused_or_works(path, value):
     only_weights_errors(tampered(path, value))
+
+
+@settings(max_examples=CASES)
+@given(st.sampled_from(list(places(body_of(ANCHORED)["anchor"]))), OBJECTS)
+def test_any_object_in_any_place_of_an_anchor_is_refused_or_works(path, value):
+    only_weights_errors(tampered(["anchor", *path], value, ANCHORED))
 
 
 def test_the_pure_python_msgpack_refuses_the_same(monkeypatch):

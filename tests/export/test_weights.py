@@ -30,6 +30,7 @@ from rcirl_jax.export import (
 from rcirl_jax.specs import spec_root
 from tests.weights_files import (
     ACTIVATIONS,
+    example_anchor,
     example_samples,
     example_weights,
     loop_value,
@@ -94,6 +95,25 @@ def test_everything_comes_back_as_it_was_given():
     assert type(reward.provenance["metrics"]["steps"]) is int
 
 
+def test_an_anchor_comes_back_as_it_was_given():
+    weights = example_weights(anchored=True)
+    reward = decode_weights(pack(weights, *example_samples(weights)))
+    made, found = weights.anchor, reward.anchor
+    assert made is not None
+    assert found is not None
+    for name in ("incumbent", "low", "high"):
+        assert getattr(found, name) == getattr(made, name)
+    for name in reader.ANCHOR_ARRAYS:
+        np.testing.assert_array_equal(getattr(found, name), getattr(made, name))
+        assert not getattr(found, name).flags.writeable
+    as_doubles = {n: np.float64(getattr(made, n)) for n in reader.ANCHOR_ARRAYS}
+    numbers = {"low": np.float32(made.low), "high": np.float32(made.high)}
+    other = dataclasses.replace(made, **as_doubles, **numbers)
+    same = dataclasses.replace(weights, anchor=other)
+    assert pack(same, *example_samples(weights)) == packed(anchored=True)
+    assert decode_weights(packed(seen=True)).anchor is None
+
+
 def test_same_input_same_bytes_whatever_the_order_of_keys(tmp_path):
     weights = example_weights()
     samples = example_samples(weights)
@@ -129,6 +149,12 @@ def test_layout_is_the_documented_one():
         ranged = msgpack.unpackb(packed(by_context=by_context, seen=True))
         assert ranged["schema_version"] == 3
         assert tuple(msgpack.unpackb(ranged["body"])) == (*reader.BODY_KEYS, *more)
+    for by_context, more in ((False, ()), (True, ("context",))):
+        added = msgpack.unpackb(packed(by_context=by_context, anchored=True))
+        assert added["schema_version"] == 4
+        found = msgpack.unpackb(added["body"])
+        assert tuple(found) == (*reader.BODY_KEYS, "seen", *more, "anchor")
+        assert tuple(found["anchor"]) == reader.ANCHOR_KEYS
     kernel = body["layers"][0]["kernel"]
     assert (kernel["shape"], kernel["dtype"]) == ([3, 5], "<f4")
     weights = example_weights()
@@ -183,13 +209,24 @@ def test_schema_describes_the_body_and_refuses_others():
     np.testing.assert_array_equal(gamma, example_weights(hidden=(4, 2)).gamma)
     keys = set(reader.BODY_KEYS)
     assert set(schema["required"]) == keys
-    assert set(schema["properties"]) == {*keys, "context", "seen"}
+    assert set(schema["properties"]) == {*keys, "context", "seen", "anchor"}
     gated = to_json(packed(by_context=True))
     validator.validate(gated)
     assert not validator.is_valid({**gated, "context": 1})
     ranged = to_json(packed(by_context=True, seen=True))
     validator.validate(ranged)
     assert not validator.is_valid({**ranged, "seen": ranged["gamma"]})
+    anchored = to_json(packed(anchored=True))
+    validator.validate(anchored)
+    anchor = anchored["anchor"]
+    assert set(schema["properties"]["anchor"]["required"]) == set(reader.ANCHOR_KEYS)
+    assert set(schema["properties"]["anchor"]["properties"]) == set(reader.ANCHOR_KEYS)
+    for key in reader.ANCHOR_KEYS:
+        less = {k: v for k, v in anchor.items() if k != key}
+        for wrong in (less, {**anchor, key: True}, {**anchor, "extra": 1}):
+            assert not validator.is_valid({**anchored, "anchor": wrong})
+    less = {k: v for k, v in anchored.items() if k != "seen"}
+    assert not validator.is_valid(less)
     assert schema["properties"]["activation"]["enum"] == sorted(ACTIVATIONS)
     for key in reader.BODY_KEYS:
         assert not validator.is_valid({k: v for k, v in body.items() if k != key})
@@ -243,6 +280,41 @@ def test_what_a_reader_would_refuse_is_never_written(changes, message, tmp_path)
     assert str(caught.value).startswith(f"{path}: ")
     assert message in str(caught.value)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"incumbent": ""}, "anchor.incumbent: : expected a text"),
+        ({"low": -1.0}, "anchor.low: -1: expected at least 0"),
+        ({"high": 0.1}, "anchor.high: 0.1: expected at least low, 0.25"),
+        ({"high": [1.0]}, "anchor.high: list: expected texts, numbers"),
+        ({"scale": np.zeros(3)}, "anchor.scale[0]: 0: expected over 0"),
+        ({"kernel": np.ones((2, 4))}, "anchor.kernel.shape: [2, 4]: expected [3, "),
+        ({"bias": "many"}, "anchor.bias: <U4: expected an array of numbers"),
+        ({"out": np.ones(3)}, "anchor.out.shape: [3]: expected [4]"),
+        ({"offset": np.float32(0.0)}, "anchor.offset.shape: list of 0: expected [1]"),
+        ({"high": 1e300}, "anchor.gain[0]: inf: expected finite numbers"),
+    ],
+)
+def test_an_anchor_that_a_reader_would_refuse_is_never_written(changes, message):
+    weights = example_weights(anchored=True)
+    anchor = dataclasses.replace(example_anchor(), **changes)
+    with pytest.raises(InputError) as caught:
+        pack(dataclasses.replace(weights, anchor=anchor), *example_samples(weights))
+    assert f"weights: {message}" in str(caught.value)
+
+
+def test_an_anchor_needs_ranges_and_samples_that_fit():
+    weights = example_weights(anchored=True)
+    features, valid, values = example_samples(weights)
+    with pytest.raises(InputError, match=r"seen: missing: expected ranges in an anch"):
+        pack(dataclasses.replace(weights, seen=None), features, valid, values)
+    for wrong in (features[:, :, :2], features[:0], features[:, :0], features[0]):
+        with pytest.raises(InputError, match=r"samples\.features\.shape: .*: expected"):
+            pack(weights, wrong, valid, values)
+    with pytest.raises(InputError, match=r"samples\.features\[0, 0, 0\]: nan"):
+        pack(weights, features * np.nan, valid, values)
 
 
 def test_samples_of_other_weights_are_refused():

@@ -4,6 +4,7 @@ Built with the sanitizers, so a read past the end of any file here is a failure;
 allocation over 256 MB too. Needs cmake, a C++17 compiler and msgpack-c's C headers.
 """
 
+import dataclasses
 import os
 import re
 import shutil
@@ -24,15 +25,21 @@ from rcirl_jax.export import (
     load_weights,
     save,
 )
-from rcirl_jax.planner.guard import in_distribution
+from rcirl_jax.planner.guard import worst_share
 from tests.export import test_guard, test_old_files, test_reader
-from tests.weights_files import packed, trained_network
+from tests.weights_files import (
+    example_samples,
+    example_weights,
+    packed,
+    trained_network,
+)
 
 ONBOARD = Path(__file__).resolve().parents[2] / "onboard"
 VALID = packed(features=2, times=3, hidden=(4,))
 GATED = packed(features=2, times=3, hidden=(4,), by_context=True)
 RANGED = packed(features=2, times=3, hidden=(4,), seen=True)
 BOTH = packed(features=2, times=3, hidden=(4,), by_context=True, seen=True)
+ANCHORED = packed(features=2, times=3, hidden=(4,), by_context=True, anchored=True)
 
 
 def run(*command, **options):
@@ -131,6 +138,51 @@ def test_ten_thousand_scores_equal_python_and_jax(
             assert np.all(np.abs(found - jax_values) <= close)
 
 
+def test_ten_thousand_totals_equal_python(programs, tmp_path):
+    path, rng = tmp_path / "weights.msgpack", np.random.default_rng(6)
+    weights = example_weights(features=21, times=4, hidden=(15,), anchored=True)
+    reward = save(path, weights, *example_samples(weights))
+    features = rng.normal(scale=2.0, size=(10_000, 4, 21)).astype(np.float32)
+    features[:9999].reshape(-1, 3, 4, 21)[:, 1, 0] = features[:9999:3, 0]  # alike
+    valid = np.arange(4) < rng.integers(1, 5, (10_000, 1))
+    own = rng.normal(scale=5.0, size=10_000).astype(np.float32)
+    for name, data in (("x", features), ("own", own), ("valid", np.uint8(valid))):
+        data.tofile(tmp_path / name)
+    command = (programs / "reader", "total", path, tmp_path / "x", tmp_path / "own")
+    for mask in ((), (tmp_path / "valid",)):
+        found = np.frombuffer(run(*command, *mask), np.float32)
+        expected = reward.total(features, own, valid if mask else None)
+        assert np.ptp(expected) > 1.0
+        close = 1e-5 * np.maximum(1.0, np.abs(expected))
+        assert np.all(np.abs(found - expected) <= close)
+
+
+def test_ten_thousand_gains_equal_python(programs, tmp_path):
+    """Of a reward that is 1 everywhere, on top of 0: the total is the gain."""
+    path, rng = tmp_path / "weights.msgpack", np.random.default_rng(7)
+    weights = dataclasses.replace(
+        example_weights(features=21, times=2, hidden=(), anchored=True),
+        kernels=(np.zeros((21, 1)),),
+        biases=(np.ones(1),),
+        gamma=np.array([1.0, 0.0]),
+    )
+    x, valid, _ = example_samples(weights)
+    reward = save(path, weights, x, valid, np.ones(len(x)))
+    features = rng.normal(scale=3.0, size=(10_000, 2, 21)).astype(np.float32)
+    features[::50, 0, 3] = rng.choice([-np.inf, np.inf, 3e38], 200)
+    features[::70, 0, 0] = np.nan  # does not matter to the gain, but to V
+    features[::40, 0, 5] = np.nan
+    features.tofile(tmp_path / "x")
+    np.zeros(10_000, np.float32).tofile(tmp_path / "own")
+    command = (programs / "reader", "total", path, tmp_path / "x", tmp_path / "own")
+    found = np.frombuffer(run(*command), np.float32)
+    none = np.isnan(features[:, 0]).any(axis=1)
+    np.testing.assert_array_equal(np.isneginf(found), none)
+    expected = reward.gain(features[~none])
+    assert np.ptp(expected) > 0.5
+    assert np.max(np.abs(found[~none] - expected)) <= 1e-6
+
+
 @pytest.mark.parametrize("version", [1, 2, 3])
 def test_an_old_file_scores_as_it_did(programs, tmp_path, version):
     path, features, valid, expected = test_old_files.golden(version)
@@ -142,7 +194,7 @@ def test_an_old_file_scores_as_it_did(programs, tmp_path, version):
     assert np.all(np.abs(found - expected) <= 1e-5 * np.maximum(1.0, np.abs(expected)))
 
 
-@pytest.mark.parametrize("data", [VALID, GATED, RANGED, BOTH])
+@pytest.mark.parametrize("data", [VALID, GATED, RANGED, BOTH, ANCHORED])
 def test_a_thousand_plans_get_the_guard_of_python(programs, tmp_path, data):
     """And of JAX: four candidates, some beyond, at an open side, or not finite."""
     path, rng = tmp_path / "weights.msgpack", np.random.default_rng(4)
@@ -173,12 +225,13 @@ def test_a_thousand_plans_get_the_guard_of_python(programs, tmp_path, data):
         fine = [verdict.in_distribution for verdict in expected]
         assert 100 < sum(fine) < 900
         counts = valid if mask else np.ones_like(valid)
-        compiled = jax.vmap(in_distribution, in_axes=(None, 0, 0))(
-            test_guard.guarded(reward),
+        rule = test_guard.guarded(reward)
+        compiled = jax.vmap(worst_share, in_axes=(None, 0, 0))(
+            rule.ranges,
             jnp.asarray(features.transpose(0, 3, 2, 1)),
             jnp.asarray(counts.transpose(0, 2, 1)),
         )
-        np.testing.assert_array_equal(compiled, fine)
+        np.testing.assert_array_equal(compiled <= rule.share, fine)
         for row, verdict in zip(found, expected, strict=True):
             assert bool(int(row[0])) == verdict.in_distribution
             assert reward.names[int(row[1])] == verdict.feature
@@ -209,6 +262,14 @@ def test_choose_takes_the_best_candidate_that_has_a_value(programs, tmp_path):
         assert done.stderr.decode().startswith(message)
 
 
+def test_choose_refuses_a_reward_that_is_added_to_another(programs, tmp_path):
+    path = tmp_path / "weights.msgpack"
+    path.write_bytes(ANCHORED)
+    done = subprocess.run([programs / "choose", path], capture_output=True, check=False)
+    wanted = f"{path}: anchor: hand-set: expected a reward that is not added to another"
+    assert (done.returncode, done.stderr.decode()) == (2, f"{wanted}\n")
+
+
 def test_a_missing_file_has_the_line_of_the_python_reader(programs, tmp_path):
     missing = tmp_path / "missing"
     done = subprocess.run(
@@ -234,7 +295,8 @@ def test_damaged_files_are_refused_with_one_line(programs, tmp_path):
         assert line.startswith("w: ")
         assert ": expected " in line
         assert line.isprintable()
-    assert verdicts(programs, [VALID, GATED, RANGED, BOTH], tmp_path) == ["ok"] * 4
+    good = [VALID, GATED, RANGED, BOTH, ANCHORED]
+    assert verdicts(programs, good, tmp_path) == ["ok"] * len(good)
 
 
 def test_wrong_fields_are_named_as_by_the_python_reader(programs, tmp_path):
@@ -243,8 +305,12 @@ def test_wrong_fields_are_named_as_by_the_python_reader(programs, tmp_path):
         test_reader.tampered(path, value)
         for path, value, _ in _cases(test_reader.test_a_wrong_field_is_named)
     ]
+    fields += [
+        test_reader.tampered(["anchor", *path], value, test_reader.ANCHORED)
+        for path, value, _ in _cases(test_reader.test_a_wrong_anchor_is_named)
+    ]
     files = [data for data, _ in _cases(test_reader.test_a_wrong_file_is_refused)]
-    assert len(fields) > 50
+    assert len(fields) > 80
     assert len(files) > 20
     lines = verdicts(programs, fields + files, tmp_path)
     later = "schema_version: 5: expected 1, 2, 3 or 4, all this reader supports"
@@ -264,7 +330,8 @@ def test_bodies_changed_and_hashed_again_get_the_verdict_of_the_python_reader(
     programs, tmp_path
 ):
     rng, files = np.random.default_rng(2), []
-    for version, data in ((1, VALID), (2, GATED), (3, RANGED), (3, BOTH)):
+    versions = ((1, VALID), (2, GATED), (3, RANGED), (3, BOTH), (4, ANCHORED))
+    for version, data in versions:
         body = msgpack.unpackb(data)["body"]
         for _ in range(800):
             changed = bytearray(body)
