@@ -78,6 +78,7 @@ def main() -> None:
         gate=margins.gate_config(),
         incumbent=_INCUMBENT.value,
         rehearsal=rehearsal,
+        anchor=recipe.anchor,
         data_weights=training.DATA_WEIGHTS.value,
         recipe=recipe.name,
         seeds=recipe.seeds if _SEEDS.value is None else _SEEDS.value,

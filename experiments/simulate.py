@@ -65,15 +65,6 @@ _GUARD = flags.DEFINE_string(
     None,
     "hand-set or a weights file: drives where the first is out of its data",
 )
-_ANCHOR = flags.DEFINE_string(
-    "anchor",
-    None,
-    "hand-set or a weights file: also drive by its value plus --anchor_gain times the "
-    "first weights', as far as their data reach",
-)
-_ANCHOR_GAIN = flags.DEFINE_float(
-    "anchor_gain", 0.3, "of the first weights' value in --anchor", lower_bound=0.0
-)
 _FILTER = flags.DEFINE_enum(
     "filter", "full", TRACKS, "full, or collision: the reward decides the rest"
 )
@@ -105,8 +96,8 @@ def _recorded(logs: Sequence[Part]) -> CaseSet:
 
 def _made_by(logs: Sequence[Part]) -> dict:
     """Provenance, with the hashes of all that decides how the rows drive."""
-    named = (_GUARD.value, _ANCHOR.value)
-    further = [name for name in named if name and name not in BASELINES]
+    guard = _GUARD.value
+    further = [guard] if guard and guard not in BASELINES else []
     return provenance(
         [*_WEIGHTS.value, *further],
         hand_weights=[_HAND.value] if _HAND.value else [],
@@ -131,7 +122,6 @@ def _job() -> SuiteJob:
         dp=_DP.value,
         hand_weights=_HAND.value,
         guard=_GUARD.value,
-        anchor=(_ANCHOR.value, _ANCHOR_GAIN.value) if _ANCHOR.value else None,
         tuned_idm=idm_fields(_IDM.value),
         track=_FILTER.value,
     )

@@ -2,8 +2,8 @@
 
 RUN/dataset-KEY/       the import of each log, unless datasets are given
 RUN/rehearsal-KEY/N/   the rehearsed catalogue: the teacher's drives, then each round's
-RUN/rounds/human.msgpack   the reward of the recordings alone, for an anchored teacher
 RUN/rounds/N.msgpack   the reward that the teacher of round N takes over from
+RUN/anchor.json        how far the recordings reach, of an anchored reward
 RUN/train-KEY/seed-N/  training runs; KEY changes with what they are made from
 RUN/seeds/N.msgpack    every seed's reward
 RUN/weights.msgpack    the candidate: of the seeds the one with the median share of
@@ -24,6 +24,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from rcirl_jax.anchoring import Anchoring, fitted_anchor, read_anchor, write_anchor
 from rcirl_jax.data.importers.files import listing
 from rcirl_jax.data.importing import import_parts
 from rcirl_jax.data.joined import EQUAL, Demonstrations, JoinedDatasets, shares_of
@@ -50,11 +51,12 @@ from rcirl_jax.evaluation.tuned_rivals import tune_idm
 from rcirl_jax.executor import Executor
 from rcirl_jax.export.from_run import export_run
 from rcirl_jax.export.gate_job import drive_job, gate_job, left_out
-from rcirl_jax.export.loading import open_reward
-from rcirl_jax.export.reader import Reward
+from rcirl_jax.export.loading import open_reward, scorer_of
+from rcirl_jax.export.reader import Anchor, Reward
 from rcirl_jax.export.spread import SuiteJob
 from rcirl_jax.export.sweep import SWEEP, read_sweep
 from rcirl_jax.export.tuned_idm import read_tuned_idm, write_tuned_idm
+from rcirl_jax.features import feature_map
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm
 from rcirl_jax.rehearsal import Rehearsal, rehearse
 from rcirl_jax.report.recorded_replays import recorded_replays
@@ -92,6 +94,7 @@ class TuneConfig:
     preferences: Path | None = None  # whose hash `train.preferences` is
     incumbent: str = "hand-set"  # weights file or baseline
     rehearsal: Rehearsal = dataclasses.field(default_factory=Rehearsal)
+    anchor: Anchoring = dataclasses.field(default_factory=Anchoring)
     data_weights: str = EQUAL  # of several sources, as `data.joined.shares_of`
     recipe: str = ""  # its name, for the report
     seeds: int = 1
@@ -236,31 +239,47 @@ class Loop:
         scale = len(sources) / sum(given)
         given = [share * scale for share in given]
         joined: Demonstrations = _as_one(made, given)
-        human = None
-        if plan.teacher == "anchored":
-            human = self.folder / "rounds" / "human.msgpack"
-            self._train_round(joined, "human", human)
+        drives: list[Dataset] = []
         for number in range(plan.datasets):
             learner = None
             if number:
                 learner = self.folder / "rounds" / f"{number}.msgpack"
-                self._train_round(joined, str(number), learner)
-            made.append(self._rehearsed(number, human, learner))
-            given.append(plan.weights[number])
-            joined = _as_one(made, given)
+                self._train_round(joined, number, learner)
+            drives.append(self._rehearsed(number, learner))
+            if plan.weights[number] > 0.0:
+                made.append(drives[-1])
+                given.append(plan.weights[number])
+                joined = _as_one(made, given)
+        if self.config.anchor.wanted:
+            self._anchor(sources, given[: len(sources)], drives)
         return joined
 
-    def _rehearsed(
-        self, number: int, human: Path | None, learner: Path | None
-    ) -> Dataset:
+    def _anchor(
+        self, sources: Sequence[Dataset], shares: Sequence[float], drives: list[Dataset]
+    ) -> None:
+        """How far the recordings reach, against the rehearsed drives."""
+        config, path = self.config, self.folder / "anchor.json"
+        inputs = {
+            "anchor": dataclasses.asdict(config.anchor),
+            "recorded": [one.hash for one in sources],
+            "shares": list(shares),
+            "drives": [one.hash for one in drives],
+            "features": config.train.features,
+        }
+
+        def work() -> None:
+            features = feature_map(config.train.features)
+            made = fitted_anchor(config.anchor, sources, shares, drives, features)
+            write_anchor(path, made)
+
+        self._run("anchor", inputs, [path], work)
+
+    def _rehearsed(self, number: int, learner: Path | None) -> Dataset:
         plan, config = self.config.rehearsal, self.config
         inputs = {
             "rehearsal": dataclasses.asdict(plan),
             "number": number,
-            "teacher": self._incumbent_hash()
-            if plan.teacher in ("incumbent", "anchored")
-            else "",
-            "human": file_sha256(human) if human else "",
+            "teacher": self._incumbent_hash() if plan.teacher == "incumbent" else "",
             "learner": file_sha256(learner) if learner else "",
         }
         key = digest({**inputs, **self._code()})[:8]
@@ -274,7 +293,6 @@ class Loop:
                 plan,
                 folder,
                 incumbent=config.incumbent,
-                human=human,
                 learner=learner,
                 before_commit=lambda dataset: dataset.write_facts(
                     {"data_hash": dataset.hash, "made_by": self.facts}
@@ -284,13 +302,18 @@ class Loop:
         self._run(f"rehearse {number}", inputs, [folder / "manifest.json"], work)
         return open_dataset(folder)
 
-    def _train_round(self, dataset: Demonstrations, name: str, file: Path) -> None:
+    def _train_round(self, dataset: Demonstrations, number: int, file: Path) -> None:
         inputs = {**self._train_inputs(dataset), "seed": 0}
-        work = lambda: self._train_one(dataset, 0, file, judged=None)  # noqa: E731
-        self._run(f"rehearse learner {name}", inputs, [file], work)
+        work = lambda: self._train_one(dataset, 0, file, None, None)  # noqa: E731
+        self._run(f"rehearse learner {number}", inputs, [file], work)
 
     def _train_one(
-        self, dataset: Demonstrations, seed: int, file: Path, judged: Path | None
+        self,
+        dataset: Demonstrations,
+        seed: int,
+        file: Path,
+        judged: Path | None,
+        anchor: Anchor | None,
     ) -> None:
         """One training run, exported."""
         config = dataclasses.replace(self.config.train, seed=seed)
@@ -308,15 +331,20 @@ class Loop:
             preferences=read_preferences(judged, whose) if judged else None,
         )
         file.parent.mkdir(parents=True, exist_ok=True)
-        export_run(workdir, dataset, file)
+        export_run(workdir, dataset, file, anchor=anchor)
 
     def train(self, dataset: Demonstrations) -> None:
         """Train every seed, export it, choose the median one."""
         inputs, files = self._train_inputs(dataset), self._seed_files()
-        judged = self.config.preferences
+        judged, anchor = self.config.preferences, None
+        if self.config.anchor.wanted:
+            path = self.folder / "anchor.json"
+            anchor, inputs = read_anchor(path), {**inputs, "anchor": file_sha256(path)}
         for number, file in enumerate(files):
             named = {**inputs, "seed": number}
-            one = lambda n=number, f=file: self._train_one(dataset, n, f, judged)  # noqa: E731
+            one = lambda n=number, f=file: self._train_one(  # noqa: E731
+                dataset, n, f, judged, anchor
+            )
             self._run(f"train {number}", named, [file], one)
         hashes = [file_sha256(file) for file in files]
         choose = lambda: self._choose(dataset)  # noqa: E731
@@ -383,10 +411,10 @@ class Loop:
 
         def work() -> None:
             rewards = [open_reward(str(file)) for file in self._seed_files()]
-            learned = {CANDIDATE: [reward.value for reward in rewards]}
+            learned = {CANDIDATE: [scorer_of(reward) for reward in rewards]}
             known = self._incumbent_reward()
             if known is not None:
-                learned[INCUMBENT] = [known.value]
+                learned[INCUMBENT] = [scorer_of(known)]
             setup = RankingSetup(
                 preset=str(rewards[0].preset),
                 sampler=SamplerConfig(mode=config.train.sampler.mode),

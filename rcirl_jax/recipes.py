@@ -6,7 +6,8 @@
 
 [train] are fields of `TrainConfig`, [train.reward] of `RewardConfig` (`by_context`
 stands for the preset's context columns), [train.sampler] of `SamplerConfig`, [collect]
-of `CollectConfig`, [rehearsal] of `Rehearsal`. What a file leaves out is the field's
+of `CollectConfig`, [rehearsal] of `Rehearsal`, [anchor] of `Anchoring`. What a file
+leaves out is the field's
 own default. Nothing else has a default of its own: commands take a recipe, and flags
 given beside it win.
 """
@@ -16,6 +17,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from rcirl_jax.anchoring import Anchoring
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.errors import InputError, did_you_mean
 from rcirl_jax.features import feature_map
@@ -27,7 +29,7 @@ from rcirl_jax.specs import load_toml, spec_root
 from rcirl_jax.train.state import TrainConfig
 
 DEFAULT = "tuned"
-TABLES = ("about", "train", "collect", "rehearsal", "autotune")
+TABLES = ("about", "train", "collect", "rehearsal", "anchor", "autotune")
 # of a run, not of a recipe
 NOT_OF_A_RECIPE = ("seed", "preferences", "reward", "sampler")
 
@@ -41,6 +43,7 @@ class Recipe:
     train: TrainConfig
     collect: CollectConfig
     rehearsal: Rehearsal
+    anchor: Anchoring
     seeds: int  # training runs of which the median one drives
 
 
@@ -83,12 +86,21 @@ def load_recipe(name: str) -> Recipe:
     }
     collect = _table(path, "collect", body.get("collect", {}))
     rehearsal = _table(path, "rehearsal", body.get("rehearsal", {}))
+    rehearsed = _made(path, "rehearsal", Rehearsal, rehearsal)
+    anchor = _table(path, "anchor", body.get("anchor", {}))
+    anchored = _made(path, "anchor", Anchoring, anchor)
+    if anchored.wanted and not rehearsed.datasets:
+        raise InputError(
+            f"{path}: [rehearsal] teacher: none: expected one with an [anchor]: its "
+            "drives show what was not recorded"
+        )
     return Recipe(
         name=path.stem if name in known else name,
         about=str(body.get("about", "")),
         train=_built(path, "train", TrainConfig, {**settings, **made}),
         collect=_made(path, "collect", CollectConfig, collect, ("signal_checks",)),
-        rehearsal=_made(path, "rehearsal", Rehearsal, rehearsal),
+        rehearsal=rehearsed,
+        anchor=anchored,
         seeds=seeds,
     )
 

@@ -6,9 +6,8 @@ learned so far, which the teacher takes over from in turn: its way out of where 
 learner's own mistakes lead becomes a demonstration too (Ross et al. 2011, "DAgger",
 with takeovers). What is driven is a dataset like any other, with a weight of its own.
 
-The teacher "anchored" drives by V_incumbent + gain support V_human (`planner.anchor`),
-V_human being learned from the recordings alone: what people do where they were
-recorded, and the incumbent elsewhere.
+Drives of weight 0 are not learned from. They show what an anchored reward
+(`rcirl_jax.anchoring`) has to leave to the planner's own cost.
 """
 
 import dataclasses
@@ -17,13 +16,12 @@ from pathlib import Path
 
 from rcirl_jax.data.store import Dataset, open_dataset
 from rcirl_jax.errors import InputError
-from rcirl_jax.export.closed_loop import anchored_row, incumbent_score, table_rows
-from rcirl_jax.export.loading import open_reward
+from rcirl_jax.export.closed_loop import incumbent_score, table_rows
 from rcirl_jax.planner.rank import Params, Policy, RankConfig, rank_policy
 from rcirl_jax.simulation.demonstrations import DriveConfig, drive_catalogue
 from rcirl_jax.simulation.suite import suite_refs
 
-TEACHERS = ("none", "driver model", "hand-set", "incumbent", "anchored")
+TEACHERS = ("none", "driver model", "hand-set", "incumbent")
 SUITE_SEED = 0  # of the catalogue that rewards are judged on
 
 
@@ -38,15 +36,14 @@ class Rehearsal:
     takeover_cases: int = 16
     # rounds in which it takes over from the reward learned so far
     rounds: int = 1
-    # of V_human, for the teacher "anchored"
-    anchor_gain: float = 0.3
     # seed of the cases; round r has this one plus r
     catalogue_seed: int = 1000
     # s of a drive, and between two scenes of the teacher's drives and of takeovers
     duration_s: float = 120.0
     stride_s: float = 3.0
     takeover_stride_s: float = 1.5
-    # weight of the teacher's drives, and of each round, where a recorded source has 1
+    # weight of the teacher's drives, and of each round, where a recorded source has 1;
+    # 0: not learned from
     weight: float = 1.2
     takeover_weight: float = 0.8
 
@@ -69,11 +66,17 @@ class Rehearsal:
                 f"rehearsal: catalogue_seed: {self.catalogue_seed}: expected above "
                 f"{SUITE_SEED}, the suite's own"
             )
-        for name in ("weight", "takeover_weight", "anchor_gain"):
-            if getattr(self, name) <= 0.0:
-                raise InputError(
-                    f"rehearsal: {name}: {getattr(self, name)}: expected > 0"
-                )
+        if self.weight < 0.0:
+            raise InputError(f"rehearsal: weight: {self.weight}: expected >= 0")
+        if self.takeover_weight <= 0.0:
+            raise InputError(
+                f"rehearsal: takeover_weight: {self.takeover_weight}: expected > 0"
+            )
+        if self.weight == 0.0 and self.rounds and self.teacher != "none":
+            raise InputError(
+                f"rehearsal: rounds: {self.rounds}: with weight 0 nothing is learned "
+                "from the drives: expected 0"
+            )
 
     @property
     def datasets(self) -> int:
@@ -86,27 +89,18 @@ class Rehearsal:
         return (self.weight, *[self.takeover_weight] * self.rounds)[: self.datasets]
 
 
-def teacher_of(
-    rehearsal: Rehearsal, incumbent: str, human: Path | None
-) -> tuple[Policy, Params] | None:
+def teacher_of(rehearsal: Rehearsal, incumbent: str) -> tuple[Policy, Params] | None:
     """The teacher as a policy and its weights; None: the driver models.
 
     Args:
       rehearsal: names the teacher.
-      incumbent: weights file or "hand-set", of "incumbent" and "anchored".
-      human: weights file of the reward learned from the recordings alone, of
-        "anchored".
+      incumbent: weights file or "hand-set", of the teacher "incumbent".
 
     Raises:
       InputError: a file cannot be read.
     """
     if rehearsal.teacher == "driver model":
         return None
-    if rehearsal.teacher == "anchored":
-        assert human is not None
-        reward = open_reward(str(human))
-        row = anchored_row("teacher", reward, incumbent, rehearsal.anchor_gain)
-        return row.policy, row.params
     name = "hand-set" if rehearsal.teacher == "hand-set" else incumbent
     score, weights = incumbent_score(name)
     return rank_policy(score, RankConfig()), weights
@@ -118,7 +112,6 @@ def rehearse(
     output: Path,
     *,
     incumbent: str,
-    human: Path | None,
     learner: Path | None,
     before_commit: Callable[[Dataset], object],
 ) -> Dataset:
@@ -129,7 +122,6 @@ def rehearse(
       rehearsal: how.
       output: dataset folder.
       incumbent: as `teacher_of`.
-      human: as `teacher_of`.
       learner: weights file of the reward learned so far; None in round 0.
       before_commit: as `DatasetWriter.finish`.
     """
@@ -149,7 +141,7 @@ def rehearse(
         refs,
         output,
         config,
-        teacher=teacher_of(rehearsal, incumbent, human),
+        teacher=teacher_of(rehearsal, incumbent),
         learner=driven,
         overwrite=True,
         before_commit=before_commit,

@@ -19,6 +19,7 @@ from rcirl_jax.evaluation.ranking import (
 )
 from rcirl_jax.evaluation.score import (
     BASELINES,
+    OnTop,
     Rival,
     Scored,
     Scorer,
@@ -92,7 +93,7 @@ def outcomes_of(scored: Scored, rows: Demonstration, setup: RankingSetup) -> Out
 def _temperatures(
     dataset: Demonstrations,
     setup: RankingSetup,
-    scorers: Mapping[str, Scorer],
+    scorers: Mapping[str, Scorer | OnTop],
     executor: Executor | None,
 ) -> dict[str, float]:
     """Scale of each row's values, fitted on TRAINING scenes."""
@@ -118,7 +119,7 @@ def _score(
     rows: Demonstration,
     index: np.ndarray,
     setup: RankingSetup,
-    scorers: Mapping[str, Scorer],
+    scorers: Mapping[str, Scorer | OnTop],
     executor: Executor | None = None,
 ) -> Scored:
     return score_scenes(
@@ -146,7 +147,7 @@ class Ranked:
 
 def rank_scenes(
     dataset: Demonstrations,
-    learned: Mapping[str, Sequence[Scorer]],
+    learned: Mapping[str, Sequence[Scorer | OnTop]],
     setup: RankingSetup,
     executor: Executor | None = None,
 ) -> Ranked:
@@ -229,7 +230,7 @@ def report_of(ranked: Ranked, references: Sequence[str] | None = None) -> Rankin
 
 def evaluate_ranking(
     dataset: Demonstrations,
-    learned: Mapping[str, Sequence[Scorer]],
+    learned: Mapping[str, Sequence[Scorer | OnTop]],
     setup: RankingSetup,
     executor: Executor | None = None,
     references: Sequence[str] | None = None,

@@ -57,6 +57,16 @@ class Scored:
 
 # (features [..., T, F], time_valid [..., T]) -> value [...]
 Scorer = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class OnTop:
+    """A value that is added to a baseline's."""
+
+    incumbent: str  # of BASELINES
+    value: Scorer
+
+
 # a rival with parameters; `fields()` is what may be traced of it
 Rival = LatticeCost | SpeedDpCost | Idm
 COSTS: dict[type, Callable] = {
@@ -181,7 +191,7 @@ def score_scenes(
     preset: str,
     sampler: SamplerConfig,
     horizon_s: float,
-    scorers: Mapping[str, Scorer],
+    scorers: Mapping[str, Scorer | OnTop],
     futures: str = "predicted",
     tuned: Mapping[str, Rival] | None = None,
     executor: Executor | None = None,
@@ -276,7 +286,7 @@ def _chunks(
 def _score_chunk(
     item: tuple[Demonstration, np.ndarray, int],
     shared: tuple[str, SamplerConfig, float, str],
-    scorers: Mapping[str, Scorer],
+    scorers: Mapping[str, Scorer | OnTop],
     tuned: Mapping[str, Rival],
 ) -> Iterator[dict]:
     """The arrays of one padded chunk; (rows, index, how many are real)."""
@@ -307,14 +317,22 @@ def _not_finite(
     return {n: ~np.logical_and.reduce([*map(fine, xs)]) for n, xs in found.items()}
 
 
-def _with_values(made: dict, scorers: Mapping[str, Scorer]) -> dict:
+def _with_values(made: dict, scorers: Mapping[str, Scorer | OnTop]) -> dict:
     """Replace the features of a chunk by the scorers' values."""
     valid = made.pop("time_valid")
     of_candidates, of_human = made.pop("features"), made.pop("features_human")
     spread = np.broadcast_to(valid[:, None], of_candidates.shape[:3])
+    tables = (
+        (made["values"], of_candidates, spread),
+        (made["human_values"], of_human, valid),
+    )
     for name, scorer in scorers.items():
-        made["values"][name] = scorer(of_candidates, spread)
-        made["human_values"][name] = scorer(of_human, valid)
+        for values, features, counts in tables:
+            if isinstance(scorer, OnTop):
+                own = values[scorer.incumbent]
+                values[name] = own + scorer.value(features, counts)
+            else:
+                values[name] = scorer(features, counts)
     return made
 
 

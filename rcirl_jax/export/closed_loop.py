@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.guard import Limits, bounds
-from rcirl_jax.export.loading import open_reward, reward_params, row_name
+from rcirl_jax.export.loading import open_reward, reward_params, row_name, support_of
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.anchor import Anchored, anchored_score
@@ -29,11 +29,34 @@ from rcirl_jax.simulation.rows import (
     baseline_row,
     dp_row,
     guarded_row,
-    learned_row,
     tuned_row,
 )
 
 DP_EVERY = 10  # steps between two plans of the DP row: it costs 1,000 rankings
+
+
+def score_of(reward: Reward) -> tuple[Score, Params]:
+    """What a weights file drives by: V, or the own cost and V where it is anchored."""
+    features, params = feature_map(str(reward.preset)), reward_params(reward)
+    anchor = reward.anchor
+    if anchor is None:
+        return learned_score(features, reward.activation), params
+    known = {"hand-set": hand_score}
+    if anchor.incumbent not in known:
+        raise InputError(
+            f"{reward.file}: anchor.incumbent: {anchor.incumbent}: expected one of "
+            f"{', '.join(known)}, whose cost is known here"
+        )
+    score = anchored_score(features, reward.activation, known[anchor.incumbent])
+    effective, normaliser = params
+    return score, Anchored(
+        reward=effective,
+        normaliser=normaliser,
+        support=support_of(anchor),
+        low=jnp.asarray(anchor.low, jnp.float32),
+        high=jnp.asarray(anchor.high, jnp.float32),
+        own=None,
+    )
 
 
 def incumbent_score(name: str) -> tuple[Score, Params]:
@@ -42,62 +65,29 @@ def incumbent_score(name: str) -> tuple[Score, Params]:
     Raises:
       InputError: neither.
     """
-    if name == "hand-set":
-        return hand_score, None
-    other = open_reward(name)
-    score = learned_score(feature_map(str(other.preset)), other.activation)
-    return score, reward_params(other)
-
-
-def _ranges(reward: Reward) -> Ranges:
-    low, high = bounds(reward, Limits())
-    return Ranges(low=jnp.asarray(low), high=jnp.asarray(high))
+    return (hand_score, None) if name == "hand-set" else score_of(open_reward(name))
 
 
 def _guarded(name: str, reward: Reward, incumbent: str, config: RankConfig) -> Row:
     """A row behind the guard; the incumbent drives what is out of distribution."""
+    if reward.anchor is not None:
+        raise InputError(
+            f"--guard: {reward.file}: expected a reward without an anchor: this one "
+            "leaves the choice to the own cost by itself"
+        )
+    limits = Limits()
+    low, high = bounds(reward, limits)
     score, weights = incumbent_score(incumbent)
     effective, normaliser = reward_params(reward)
     params = Guarded(
         reward=effective,
         normaliser=normaliser,
-        ranges=_ranges(reward),
-        share=jnp.asarray(Limits().share, jnp.float32),
+        ranges=Ranges(low=jnp.asarray(low), high=jnp.asarray(high)),
+        share=jnp.asarray(limits.share, jnp.float32),
         incumbent=weights,
     )
     return guarded_row(
         f"{name} guarded", params, str(reward.preset), reward.activation, config, score
-    )
-
-
-def anchored_row(
-    name: str,
-    reward: Reward,
-    incumbent: str,
-    gain: float,
-    config: RankConfig | None = None,
-) -> Row:
-    """A row that drives by V_incumbent + gain support V (`planner.anchor`).
-
-    Args:
-      name: of the row.
-      reward: V.
-      incumbent: "hand-set" or a weights file.
-      gain: of V.
-      config: of the ranking planner; None: its defaults.
-    """
-    score, weights = incumbent_score(incumbent)
-    effective, normaliser = reward_params(reward)
-    params = Anchored(
-        reward=effective,
-        normaliser=normaliser,
-        ranges=_ranges(reward),
-        gain=jnp.asarray(gain, jnp.float32),
-        incumbent=weights,
-    )
-    both = anchored_score(feature_map(str(reward.preset)), reward.activation, score)
-    return Row(
-        name=name, policy=rank_policy(both, config or RankConfig()), params=params
     )
 
 
@@ -111,15 +101,13 @@ def table_rows(
     tuned_idm: Idm | None = None,
     names: Sequence[str] = (),
     guard: str | None = None,
-    anchor: tuple[str, float] | None = None,
     track: str = "full",
 ) -> list[Row]:
     """Learned rows first, in the order of the files, then the baselines.
 
     Files of one loss and shape are told apart by their seed, then by their path, or
-    rows bear `names`, one per file. The first drives again by `dp`, behind a `guard`
-    that names its incumbent ("hand-set" or a weights file), and on top of an `anchor`
-    (incumbent, gain). Tuned rivals come
+    rows bear `names`, one per file. The first drives again by `dp`, and behind a
+    `guard` that names its incumbent ("hand-set" or a weights file). Tuned rivals come
     last. `track` is the safety filter's (`SafetyConfig`).
 
     Raises:
@@ -133,14 +121,17 @@ def table_rows(
     rows = _learned_rows(rewards, names, config)
     first = rewards[0]
     preset, params = str(first.preset), reward_params(first)
+    if dp and first.anchor is not None:
+        raise InputError(
+            f"--dp: {first.file}: expected a reward without an anchor: the own cost is "
+            "no sum over points"
+        )
     if dp:
         slow = max(plan_every, DP_EVERY)
         of = (params, preset, first.activation, config, DpConfig(), slow)
         rows.insert(1, dp_row(f"{rows[0].name} DP", *of))
     if guard:
         rows.insert(1, _guarded(rows[0].name, first, guard, config))
-    if anchor:
-        rows.insert(1, anchored_row(f"{rows[0].name} anchored", first, *anchor, config))
     rows += [baseline_row(name, preset, params[1], config) for name in baselines]
     if hand_set is not None:
         rows.append(tuned_row(hand_set, config))
@@ -171,6 +162,7 @@ def _learned_rows(
             raise InputError(
                 f"--weights: {reward.file}: met twice: expected distinct files"
             )
-        made = reward_params(reward), str(reward.preset), reward.activation
-        rows.append(learned_row(name, *made, config, seed))
+        score, params = score_of(reward)
+        policy = rank_policy(score, config)
+        rows.append(Row(name=name, policy=policy, params=params, seed=seed))
     return rows

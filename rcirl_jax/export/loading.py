@@ -8,11 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.score import OnTop
 from rcirl_jax.export.provenance import check_provenance
-from rcirl_jax.export.reader import Reward, WeightsError, load_weights
+from rcirl_jax.export.reader import Anchor, Reward, WeightsError, load_weights
 from rcirl_jax.features.mapping import feature_map, known_presets
 from rcirl_jax.reward.network import LEAKY_SLOPE, conditioned, point_rewards
 from rcirl_jax.reward.normaliser import normalise
+from rcirl_jax.reward.support import Support
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.types import Normaliser, RewardParams
 
@@ -74,6 +76,27 @@ def reward_params(reward: Reward) -> tuple[RewardParams, Normaliser]:
     )
 
 
+def support_of(anchor: Anchor) -> Support:
+    """A weights file's anchor as the pytree that JAX code takes."""
+    names = ("location", "scale", "kernel", "bias", "out")
+    arrays = {n: jnp.asarray(getattr(anchor, n), jnp.float32) for n in names}
+    offset = jnp.asarray(np.ravel(anchor.offset)[0], jnp.float32)
+    return Support(**arrays, offset=offset)
+
+
+def scorer_of(reward: Reward) -> Scorer | OnTop:
+    """The reward as a row of ranking tables: V, on top of its anchor if it has one."""
+    if reward.anchor is None:
+        return reward.value
+    return OnTop(
+        incumbent=reward.anchor.incumbent, value=functools.partial(_gained, reward)
+    )
+
+
+def _gained(reward: Reward, features: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    return reward.gain(features) * reward.value(features, valid)
+
+
 def compiled_scorer(reward: Reward) -> Scorer:
     """`reward.value` as a compiled program, one for all rewards of a shape.
 
@@ -122,12 +145,13 @@ def row_name(reward: Reward) -> str:
     }
     loss = str(reward.loss.get("name"))
     by_scene = "" if reward.context is None else ", by context"
-    return f"{name.get(loss, loss)} {shape if hidden else 'linear'}{by_scene}"
+    on = "" if reward.anchor is None else f", on {reward.anchor.incumbent}"
+    return f"{name.get(loss, loss)} {shape if hidden else 'linear'}{by_scene}{on}"
 
 
 def load_runs(
     paths: Sequence[str],
-) -> tuple[dict[str, list[Scorer]], str, SamplerConfig]:
+) -> tuple[dict[str, list[Scorer | OnTop]], str, SamplerConfig]:
     """Scorers by row (files of one loss and shape are its seeds).
 
     Raises:
@@ -142,7 +166,7 @@ def load_runs(
             f"--weights: {sorted(settings)}: expected files of one preset and mode"
         )
     preset, mode = settings.pop()
-    runs: dict[str, list[Scorer]] = {}
+    runs: dict[str, list[Scorer | OnTop]] = {}
     for reward in rewards:
-        runs.setdefault(row_name(reward), []).append(reward.value)
+        runs.setdefault(row_name(reward), []).append(scorer_of(reward))
     return runs, preset, SamplerConfig(mode=mode)

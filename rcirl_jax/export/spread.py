@@ -45,7 +45,6 @@ class SuiteJob:
     tuned_idm: tuple[tuple[str, float], ...] = ()  # fields of a further IDM row
     track: str = "full"  # of the safety filter
     guard: str | None = None  # incumbent of the first weights' guarded row
-    anchor: tuple[str, float] | None = None  # (incumbent, gain) of an anchored row
 
     def rows(self) -> list[Row]:
         """Learned rows, then the baselines."""
@@ -59,7 +58,6 @@ class SuiteJob:
             else None,
             names=self.names,
             guard=self.guard,
-            anchor=self.anchor,
             track=self.track,
             tuned_idm=Idm(**dict(self.tuned_idm)) if self.tuned_idm else None,
         )

@@ -1,23 +1,25 @@
-"""A learned score on top of the incumbent's, as far as the training data reach.
+"""A learned score on top of the planner's own cost, as far as the recordings reach.
 
-    V = V_incumbent + gain support V_learned
-    support = 1 - max_i share_i                  share_i as in docs/guard.md
+    V = V_own + gain V_learned
+    gain = low + (high - low) support              support as in `reward.support`
 
-A reward that people taught on some roads knows nothing of the others. There the
-incumbent's score decides, and where the plan's features are like the training's the
-learned one has its say. The gain is in units of the incumbent's cost per unit of V.
+A reward that people taught on some roads knows little of the others. There the
+planner's own cost decides and the learned value only tips the scales (`low`); in
+traffic as people were recorded in it, it has the last word (`high`). Gains are in units
+of the own cost per unit of V.
 """
 
 import functools
+from collections.abc import Sequence
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 
 from rcirl_jax.features import FeatureMap
-from rcirl_jax.planner.guard import Ranges, worst_share
 from rcirl_jax.planner.rank import Params, Score
 from rcirl_jax.reward.network import rows_value
+from rcirl_jax.reward.support import Support, support
 from rcirl_jax.types import Candidates, Normaliser, RewardParams, Scene
 
 
@@ -26,23 +28,25 @@ class Anchored(flax.struct.PyTreeNode, kw_only=True):
 
     reward: RewardParams  # effective
     normaliser: Normaliser
-    ranges: Ranges  # of the training's features
-    gain: jax.Array  # []
-    incumbent: Params  # the incumbent's weights
+    support: Support
+    low: jax.Array  # [] gain where nothing is known
+    high: jax.Array  # [] gain where all is
+    own: Params  # weights of the own cost
+
+
+def gain(params: Anchored, rows: Sequence[jax.Array]) -> jax.Array:
+    """The gain [] of a scene from its candidates' raw features, F of [T, K]."""
+    x0 = jnp.stack([row[0, 0] for row in rows])
+    return params.low + (params.high - params.low) * support(params.support, x0)
 
 
 @functools.lru_cache(maxsize=16)
-def anchored_score(features: FeatureMap, activation: str, incumbent: Score) -> Score:
+def anchored_score(features: FeatureMap, activation: str, own: Score) -> Score:
     """Score of `Anchored`; the equation stands above."""
 
     def score(params: Anchored, scene: Scene, candidates: Candidates) -> jax.Array:
         rows, valid = features.rows(scene, candidates), scene.time_valid
         values = rows_value(params.reward, params.normaliser, rows, valid, activation)
-        counts = valid[:, None] & candidates.feasible
-        outside = worst_share(params.ranges, jnp.stack(rows), counts)
-        weight = params.gain * jnp.maximum(1.0 - outside, 0.0)
-        other = incumbent(params.incumbent, scene, candidates)
-        # without support the learned value may be anything, NaN too
-        return other + jnp.where(weight > 0.0, weight * values, 0.0)
+        return own(params.own, scene, candidates) + gain(params, rows) * values
 
     return score

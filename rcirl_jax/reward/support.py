@@ -1,0 +1,54 @@
+"""How far the recordings reach: a number in (0, 1) for every scene.
+
+    support = sigmoid(out . tanh(z W + b) + c)
+    z = clip((f_0 - location) / scale, -5, 5)
+
+f_0 are the raw features at t = 0, which all candidates of a scene share. Fitted to tell
+recorded scenes from those of a catalogue (`train.support`), it is near 1 in traffic as
+people were recorded in it and near 0 elsewhere.
+"""
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from rcirl_jax.features import FeatureMap
+
+REACH = 5.0  # 1, |z| beyond which a feature counts as that far
+# functions of the trajectory's own time, equal in all scenes at t = 0
+OF_THE_TRAJECTORY = ("station", "time")
+
+
+class Support(flax.struct.PyTreeNode, kw_only=True):
+    """Weights of the support; H hidden units."""
+
+    location: jax.Array  # [F] in the feature's unit
+    scale: jax.Array  # [F] > 0
+    kernel: jax.Array  # [F, H] W
+    bias: jax.Array  # [H] b
+    out: jax.Array  # [H]
+    offset: jax.Array  # [] c
+
+
+def support_logit(params: Support, x0: Float[Array, "*n f"]) -> Float[Array, "*n"]:
+    """The support before its sigmoid.
+
+    Args:
+      params: of `train.support.fit_support`.
+      x0: [..., F] raw features at t = 0.
+    """
+    z = jnp.clip((x0 - params.location) / params.scale, -REACH, REACH)
+    hidden = jnp.tanh(z @ params.kernel + params.bias)
+    return hidden @ params.out + params.offset
+
+
+def support(params: Support, x0: Float[Array, "*n f"]) -> Float[Array, "*n"]:
+    """The equation above, [...] in (0, 1)."""
+    return jax.nn.sigmoid(support_logit(params, x0))
+
+
+def of_the_scene(features: FeatureMap) -> tuple[bool, ...]:
+    """[F] which features say at t = 0 what a scene is like."""
+    pairs = zip(features.names, features.context, strict=True)
+    return tuple(bool(c) and name not in OF_THE_TRAJECTORY for name, c in pairs)
