@@ -183,7 +183,7 @@ def test_ten_thousand_gains_equal_python(programs, tmp_path):
     assert np.max(np.abs(found[~none] - expected)) <= 1e-6
 
 
-@pytest.mark.parametrize("version", [1, 2, 3])
+@pytest.mark.parametrize("version", [1, 2, 3, 4])
 def test_an_old_file_scores_as_it_did(programs, tmp_path, version):
     path, features, valid, expected = test_old_files.golden(version)
     features.astype(np.float32).tofile(tmp_path / "features")

@@ -47,8 +47,9 @@ CASES = 2  # of a suite
 
 
 def weights(folder: Path) -> Target:
-    """Weights files of all three versions."""
-    kinds = ({}, {"by_context": True}, {"by_context": True, "seen": True})
+    """Weights files of all four versions."""
+    both = {"by_context": True, "seen": True}
+    kinds = ({}, {"by_context": True}, both, {"by_context": True, "anchored": True})
     seeds = [packed(hidden=(2,), features=2, times=2, **kind) for kind in kinds]
     name = "weights.msgpack"
 
