@@ -1,7 +1,8 @@
 """Fitting the support: recorded scenes against scenes of the catalogue.
 
-Minimises the weighted binary cross entropy of `reward.support`, both sides weighing the
-same, every recorded source as its share says:
+Minimises the weighted binary cross entropy of `reward.support`; the catalogue weighs
+ELSEWHERE times as much as all recordings together, so that doubt leaves the choice to
+the own cost, and every recorded source weighs as its share says:
 
     loss = mean_i w_i BCE(support(x_i), y_i) + DECAY |weights|^2,   y = 1 recorded
 
@@ -27,6 +28,7 @@ UNITS = 16  # H
 STEPS = 1500
 STEP_SIZE = 1e-2
 DECAY = 1e-3
+ELSEWHERE = 3.0  # weight of the catalogue, where the recordings have 1
 STILL = 1e-3  # scale below which a feature does not vary
 LANES = 64  # scenes whose features are made together
 
@@ -66,10 +68,10 @@ def fit_support(
     location, spread = both.mean(axis=0), both.std(axis=0)
     varies = counts & (spread > STILL)
     scale = np.where(varies, spread, 1.0)
-    share = np.concatenate(
+    shares = np.concatenate(
         [
-            0.5 * weights / weights.sum(),
-            np.full(len(elsewhere), 0.5 / len(elsewhere)),
+            weights / weights.sum(),
+            np.full(len(elsewhere), ELSEWHERE / len(elsewhere)),
         ]
     )
     mask = jnp.asarray(varies, jnp.float32)[:, None]
@@ -89,7 +91,7 @@ def fit_support(
         mask,
         jnp.asarray(both, jnp.float32),
         jnp.asarray(labels, jnp.float32),
-        jnp.asarray(share, jnp.float32),
+        jnp.asarray(shares / (1.0 + ELSEWHERE), jnp.float32),
     )
 
 
