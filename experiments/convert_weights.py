@@ -46,6 +46,11 @@ def main() -> None:
         facts = {"hand_weights_sha256": file_sha256(Path(_HAND.value))}
     else:
         reward = open_reward(str(_WEIGHTS.value))
+        if reward.anchor is not None:
+            raise InputError(
+                f"--weights: {reward.file}: expected a reward without an anchor: these "
+                "forms hold V alone, and the gain on top of the own cost would be lost"
+            )
         text = reward_yaml(reward) if _YAML.value else ""
         facts = {
             "weights_sha256": reward.sha256,

@@ -19,6 +19,7 @@ from typing import Any
 from absl import flags
 
 from experiments.common import provenance, run
+from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.robustness import (
     Disturbance,
     Table,
@@ -90,6 +91,11 @@ def main() -> None:
     """Frames, gaps, steadiness; table on the terminal, numbers as JSON, pictures."""
     quick, folder = _QUICK.value, Path(_OUTPUT.value)
     reward = open_reward(_WEIGHTS.value)
+    if reward.anchor is not None:
+        raise InputError(
+            f"--weights: {reward.file}: expected a reward without an anchor: the "
+            "lattice of the DP has no own cost"
+        )
     params, config = reward_params(reward), RankConfig()
     features, activation = feature_map(str(reward.preset)), reward.activation
     rank = rank_policy(learned_score(features, activation), config)

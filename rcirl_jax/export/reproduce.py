@@ -229,7 +229,9 @@ def train_again(
         preferences=judged,
     )
     output = folder / "weights.msgpack"
-    return export_run(workdir, dataset, output, ranges=reward.seen is not None)
+    ranges = reward.seen is not None
+    # an anchor is no outcome of the training: it is handed on
+    return export_run(workdir, dataset, output, ranges=ranges, anchor=reward.anchor)
 
 
 def member_again(

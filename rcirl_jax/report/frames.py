@@ -15,11 +15,19 @@ from rcirl_jax.evaluation.score import candidates_key
 from rcirl_jax.export.loading import reward_params
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.features import feature_map
+from rcirl_jax.planner.rank import hand_score
 from rcirl_jax.report import plots
 from rcirl_jax.sampling import SamplerConfig, sample
 from rcirl_jax.train.metrics import read_metrics
 from rcirl_jax.train.step import human_of
-from rcirl_jax.types import Decision, Demonstration, Tag
+from rcirl_jax.types import (
+    Candidates,
+    Decision,
+    Demonstration,
+    Scene,
+    Tag,
+    Trajectory,
+)
 
 WANTED = (
     Tag.STOPPING,
@@ -78,6 +86,28 @@ def _sampled(preset: str, sampler: SamplerConfig) -> Callable:
     return jax.jit(made)
 
 
+def _only(trajectory: Trajectory) -> Candidates:
+    """A trajectory as the only candidate."""
+    return Candidates(
+        trajectory=jax.tree.map(lambda x: x[None], trajectory),
+        feasible=jnp.ones(1, bool),
+        family=jnp.zeros(1, jnp.int32),
+    )
+
+
+def _driven_by(
+    reward: Reward,
+    scene: Scene,
+    candidates: Candidates,
+    x: np.ndarray,
+    mask: np.ndarray,
+) -> np.ndarray:
+    """[K] what the candidates are ranked by: V, on top of the own cost if anchored."""
+    if reward.anchor is None:
+        return reward.value(x, mask)
+    return reward.total(x, np.asarray(hand_score(None, scene, candidates)), mask)
+
+
 def draw_frame(
     dataset: Demonstrations,
     reward: Reward,
@@ -94,7 +124,8 @@ def draw_frame(
     candidates, human = made[:2]
     x, x_human = map(np.asarray, made[2:])
     valid = np.asarray(one.scene.time_valid)
-    values = reward.value(x, np.broadcast_to(valid, x.shape[:2]))
+    mask = np.broadcast_to(valid, x.shape[:2])
+    values = _driven_by(reward, one.scene, candidates, x, mask)
     feasible = np.asarray(candidates.feasible)
     chosen = int(np.argmax(np.where(feasible, values, -np.inf)))
     drawn = one.replace(human=human)
@@ -122,7 +153,9 @@ def draw_frame(
         chosen=chosen,
         values=values,
         feasible=feasible,
-        human_value=float(reward.value(x_human[None], valid[None])[0]),
+        human_value=float(
+            _driven_by(reward, one.scene, _only(human), x_human[None], valid[None])[0]
+        ),
         human_s=np.asarray(human.s),
         chosen_s=np.asarray(candidates.trajectory.s[chosen]),
         reasons=dict(zip(reward.names, reasons, strict=True)),

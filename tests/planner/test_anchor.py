@@ -1,68 +1,98 @@
-"""A learned score on top of the incumbent's."""
+"""A learned score on top of the planner's own cost."""
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.export.closed_loop import anchored_row, table_rows
-from rcirl_jax.export.loading import open_reward, reward_params
+from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.score import OnTop
+from rcirl_jax.export.closed_loop import score_of, table_rows
+from rcirl_jax.export.loading import open_reward, reward_params, scorer_of
+from rcirl_jax.export.reader import Anchor
 from rcirl_jax.features import feature_map
-from rcirl_jax.planner.anchor import anchored_score
-from rcirl_jax.planner.guard import Ranges, worst_share
 from rcirl_jax.planner.rank import ONLINE, hand_score, learned_score
-from rcirl_jax.rehearsal import Rehearsal, teacher_of
+from rcirl_jax.reward.support import Support, support
 from tests.scenes import random_scene, sampled
 from tests.weights_files import random_weights
 
 FEATURES = feature_map("paper21")
 
 
-def everywhere(low, high):
-    count = FEATURES.num_features
-    return Ranges(low=jnp.full(count, low), high=jnp.full(count, high))
+def anchored(reward, offset, low=0.3, high=2.0):
+    """A reward whose support is sigmoid(offset) in every scene."""
+    size = FEATURES.num_features
+    return dataclasses.replace(
+        reward,
+        anchor=Anchor(
+            incumbent="hand-set", low=low, high=high, location=np.zeros(size),
+            scale=np.ones(size), kernel=np.zeros((size, 2)), bias=np.zeros(2),
+            out=np.zeros(2), offset=np.array([offset]),
+        ),
+    )  # fmt: skip
 
 
-@pytest.mark.parametrize(("low", "high", "support"), [(-1e9, 1e9, 1.0), (9e9, 9e9, 0)])
-def test_the_learned_value_counts_as_far_as_the_data_reach(
-    tmp_path, low, high, support
-):
-    reward = open_reward(str(random_weights(tmp_path / "w.msgpack")))
-    params = anchored_row("a", reward, "hand-set", 0.3).params
-    params = params.replace(ranges=everywhere(low, high))
+@pytest.mark.parametrize(("offset", "gain"), [(-30.0, 0.3), (30.0, 2.0), (0.0, 1.15)])
+def test_the_gain_goes_from_low_to_high_with_the_support(tmp_path, offset, gain):
+    reward = anchored(open_reward(str(random_weights(tmp_path / "w.msgpack"))), offset)
     scene = random_scene(3)
     candidates = sampled(jax.random.key(0), scene, ONLINE)
-    score = anchored_score(FEATURES, reward.activation, hand_score)
+    score, params = score_of(reward)
     ours = learned_score(FEATURES, reward.activation)(
         reward_params(reward), scene, candidates
     )
     theirs = hand_score(None, scene, candidates)
     found = jax.jit(score)(params, scene, candidates)
-    np.testing.assert_allclose(found, theirs + 0.3 * support * ours, rtol=1e-4)
+    np.testing.assert_allclose(found, theirs + gain * ours, rtol=1e-4, atol=1e-4)
+    # the planner's side computes the same from features and its own cost
+    features = np.asarray(FEATURES.of_candidates(scene, candidates))
+    valid = np.broadcast_to(np.asarray(scene.time_valid), features.shape[:2])
+    total = reward.total(features, np.asarray(theirs), valid)
+    np.testing.assert_allclose(total, found, rtol=1e-4, atol=1e-3)
+    scorer = scorer_of(reward)
+    assert isinstance(scorer, OnTop)
+    assert scorer.incumbent == "hand-set"
+    np.testing.assert_allclose(
+        scorer.value(features, valid), gain * ours, rtol=1e-4, atol=1e-4
+    )
 
 
-def test_half_a_feature_out_of_the_data_halves_the_gain():
-    rows = jnp.zeros((2, 18, 4)).at[1, :, :2].set(5.0)
-    counts = jnp.ones((18, 4), bool)
-    ranges = Ranges(low=-jnp.ones(2), high=jnp.ones(2))
-    assert float(worst_share(ranges, rows, counts)) == 0.5
-    assert np.isinf(worst_share(ranges, rows.at[0, 0, 0].set(jnp.nan), counts))
+def test_the_support_is_the_equation():
+    rng = np.random.default_rng(0)
+    size, units = 3, 4
+    params = Support(
+        location=jnp.asarray(rng.normal(size=size), jnp.float32),
+        scale=jnp.asarray(rng.uniform(0.5, 2.0, size), jnp.float32),
+        kernel=jnp.asarray(rng.normal(size=(size, units)), jnp.float32),
+        bias=jnp.asarray(rng.normal(size=units), jnp.float32),
+        out=jnp.asarray(rng.normal(size=units), jnp.float32),
+        offset=jnp.asarray(0.2),
+    )
+    x = rng.normal(size=(5, size)) * 20.0
+    z = np.clip((x - params.location) / params.scale, -5.0, 5.0)
+    logit = np.tanh(z @ params.kernel + params.bias) @ params.out + 0.2
+    wanted = 1.0 / (1.0 + np.exp(-logit))
+    np.testing.assert_allclose(support(params, jnp.asarray(x)), wanted, rtol=1e-4)
 
 
-def test_a_table_may_have_an_anchored_row(tmp_path):
-    path, other = (str(random_weights(tmp_path / f"{i}.msgpack", i)) for i in (1, 2))
-    for incumbent, has_weights in (("hand-set", False), (other, True)):
-        drivers = table_rows([path], ["IDM"], anchor=(incumbent, 0.3))
-        assert [row.name for row in drivers][1] == f"{drivers[0].name} anchored"
-        assert (drivers[1].params.incumbent is not None) == has_weights
+def test_an_anchored_file_drives_anchored(tmp_path, monkeypatch):
+    path = str(random_weights(tmp_path / "w.msgpack"))
+    reward = anchored(open_reward(path), 0.0)
+    monkeypatch.setattr("rcirl_jax.export.closed_loop.open_reward", lambda _: reward)
+    rows = table_rows([path], ["IDM"])
+    assert rows[0].name.endswith("on hand-set")
+    assert float(rows[0].params.high) == 2.0
+    with pytest.raises(InputError, match="without an anchor"):
+        table_rows([path], [], dp=True)
+    with pytest.raises(InputError, match="without an anchor"):
+        table_rows([path], [], guard="hand-set")
 
 
-def test_the_anchored_teacher_drives_by_both(tmp_path):
-    file = random_weights(tmp_path / "w.msgpack")
-    rehearsal = Rehearsal(teacher="anchored", anchor_gain=0.5)
-    teacher = teacher_of(rehearsal, "hand-set", file)
-    assert teacher is not None
-    policy, params = teacher
-    row = anchored_row("teacher", open_reward(str(file)), "hand-set", 0.5)
-    assert policy is row.policy
-    assert float(params.gain) == 0.5
+def test_another_own_cost_is_not_known_here(tmp_path):
+    reward = anchored(open_reward(str(random_weights(tmp_path / "w.msgpack"))), 0.0)
+    assert reward.anchor is not None
+    other = dataclasses.replace(reward.anchor, incumbent="mine")
+    with pytest.raises(InputError, match=r"anchor\.incumbent: mine"):
+        score_of(dataclasses.replace(reward, anchor=other))
