@@ -65,10 +65,12 @@ def format_suite(report: SuiteReport) -> str:
     lines += [
         "",
         f"Jerk filtered as in nuPlan; safety; progress against {report.reference}",
+        "start: from standstill to 80 % of the limit on a free road: median s "
+        "(n starts)",
     ]
     lines += text_table(
         ["", "|j| case", "|j| sample", "faults", "prevent.", "VRU", "hits", "red",
-         "stop", "off road", "creep", "turns/s", "progress", "nuPlan [95 %]"],
+         "stop", "off road", "creep", "start", "turns/s", "progress", "nuPlan [95 %]"],
         [_safety(name, row) for name, row in report.rows.items()],
     )  # fmt: skip
     lines += ["", *_differences(report)]
@@ -88,11 +90,18 @@ def _safety(name: str, row: RowSummary) -> list[str]:
         str(row.stop_signs),
         str(row.off_road),
         f"{100 * row.physical['creeping_share']:.1f} %",
+        _start(row),
         f"{row.physical['sign_changes_per_s']:.2f}",
         f"{100 * row.progress_ratio:.1f} %",
         f"{100 * row.nuplan:.1f} [{100 * row.nuplan_low:.1f},"
         f"{100 * row.nuplan_high:.1f}]",
     ]
+
+
+def _start(row: RowSummary) -> str:
+    """5.4 (120), or - (0) where no case has a start on a free road."""
+    count, median = (row.physical[key] for key in ("starts", "start_s_median"))
+    return f"{median:.1f} ({count:.0f})" if count else "- (0)"
 
 
 def _differences(report: SuiteReport) -> list[str]:

@@ -183,6 +183,13 @@ def _finite_low(x: np.ndarray, quantile: float) -> float:
     return float(np.quantile(np.minimum(x, 1e3), quantile))
 
 
+def _starts(seconds: np.ndarray) -> dict[str, float]:
+    """Cases with a start on a free road, and the median of theirs, s; -1 if none."""
+    found = seconds[seconds >= 0.0]
+    median = float(np.median(found)) if found.size else -1.0
+    return {"starts": float(found.size), "start_s_median": median}
+
+
 def _row(
     m: CaseMetrics,
     scores: np.ndarray,
@@ -231,6 +238,7 @@ def _row(
             "standing_share": float(np.mean(m.standing_share)),
             "creeping_share": float(np.mean(m.creeping_share)),
             "sign_changes_per_s": float(np.mean(m.sign_changes)),
+            **_starts(np.asarray(m.start_time)),
         },
         families=_by_family(m, scores, names, preventable, way),
     )

@@ -41,6 +41,8 @@ class MetricsConfig:
     creeping_limit: float = 0.2  # 1, share of the posted limit below which one creeps
     creeping_way: float = 40.0  # m, free ahead, where to creep is nobody's doing
     turning_band: float = 0.1  # m/s^2, |a| below which a sign of it does not count
+    starting: float = 1.0  # m/s below which a drive begins with a start
+    started: float = 0.8  # 1, share of the posted limit at which a start is over
     # --- nuPlan (reference: its devkit) ---
     nuplan_ttc: float = 0.95  # s
     nuplan_overspeed: float = 2.23  # m/s
@@ -76,6 +78,7 @@ class CaseMetrics(flax.struct.PyTreeNode, kw_only=True):
     mean_speed: jax.Array  # m/s
     standing_share: jax.Array  # 1
     creeping_share: jax.Array  # 1, slow or standing with a free road ahead
+    start_time: jax.Array  # s, longest start on a free road; -1 if none
     sign_changes: jax.Array  # 1/s, turns of the acceleration from push to brake or back
     min_ttc: jax.Array  # s, inf if none
     tet: jax.Array  # s, time with TTC below the threshold
@@ -173,6 +176,7 @@ def case_metrics(record: Record, config: MetricsConfig) -> CaseMetrics:
             & (record.free_way > config.creeping_way)
         )
         / count,
+        start_time=_start_time(record, config),
         sign_changes=_sign_changes(record, config) / (count * STEP_S),
         min_ttc=lowest(ttc),
         tet=total(below > 0.0) * STEP_S,
@@ -191,6 +195,37 @@ def case_metrics(record: Record, config: MetricsConfig) -> CaseMetrics:
         max_j_lateral=highest(jnp.abs(j_lateral)),
         **_nuplan(record, a_lateral, ttc, config),
     )
+
+
+def _start_time(record: Record, config: MetricsConfig) -> jax.Array:
+    """Longest time [s] from standstill to 80 % of the posted limit, the road free.
+
+    A start begins at the first sample at which the ego stands, or that the drive
+    begins with below 1 m/s, and from which on the road is free as for
+    `creeping_share`; it ends where the speed is reached, or else with the record. One
+    in which the road is free no longer does not count. -1: no start that counts.
+    """
+    is_free = record.free_way > config.creeping_way
+    reached = record.v >= config.started * record.speed_limit
+    first = jnp.arange(record.v.size) == 0
+    begins = (record.v < config.standing) | (first & (record.v < config.starting))
+
+    def follow(
+        carry: tuple[jax.Array, jax.Array], now: tuple[jax.Array, ...]
+    ) -> tuple[tuple[jax.Array, jax.Array], None]:
+        since, longest = carry  # samples since the start began; -1: in none
+        valid, free, there, stands = now
+        lasts = jnp.where(since >= 0, since + 1, jnp.where(stands, 0, -1))
+        is_over = valid & there & (since >= 0)
+        longest = jnp.where(is_over, jnp.maximum(longest, lasts), longest)
+        lasts = jnp.where(free & ~there, lasts, -1)
+        return (jnp.where(valid, lasts, since), longest), None
+
+    none = jnp.full_like(record.collision[0], -1)
+    samples = (record.valid, is_free, reached, begins)
+    (since, longest), _ = jax.lax.scan(follow, (none, none), samples)
+    found = jnp.maximum(since, longest)  # a start may last to the record's end
+    return jnp.where(found < 0, -1.0, found * STEP_S)
 
 
 def _sign_changes(record: Record, config: MetricsConfig) -> jax.Array:

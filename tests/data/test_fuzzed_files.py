@@ -98,6 +98,15 @@ def test_pickles_in_a_suite_are_not_loaded(members, tmp_path):
     assert not target.exists()
 
 
+def test_a_suite_of_other_columns(members):
+    file, content = members
+    less = {n: x for n, x in content.items() if n != "row0.start_time.npy"}
+    file.write_bytes(archive_of(less))
+    line = line_of(lambda: read_runs(file))
+    assert "row0.start_time" in line
+    assert line.endswith("expected the metrics of a suite")
+
+
 @pytest.mark.parametrize("shape", [(2**62,), (2**40, 2), (10**30,), (-1,)])
 def test_claimed_sizes_in_a_suite(members, shape):
     file, content = members

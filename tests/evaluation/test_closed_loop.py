@@ -13,12 +13,15 @@ from rcirl_jax.evaluation.closed_loop import (
     worst_cases,
     write_suite,
 )
+from rcirl_jax.evaluation.suite_output import format_suite
+from rcirl_jax.evaluation.suite_summary import summarise
 from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.planner.rank import constant_speed_policy, idm_policy
 from rcirl_jax.simulation.metrics import COLUMNS
 from rcirl_jax.simulation.rollout import LANES
 from rcirl_jax.simulation.rows import Row
 from rcirl_jax.simulation.suite import catalogue_set, suite_refs
+from tests.report.tuning_case import metrics
 
 FAMILIES = "free_cruise,stopped_lead"
 ROWS = [
@@ -52,6 +55,28 @@ def test_rates_are_those_of_the_metrics(result):
         assert row.at_fault == (metrics.at_fault > 0).sum()
     assert report.rows["IDM"].progress_ratio == pytest.approx(1.0)
     assert report.rows["constant speed"].at_fault == 3  # the standing leaders
+
+
+def test_starts_are_the_cases_with_one():
+    """Median and number of the cases with a start on a free road."""
+    some, none = metrics(0), metrics(1)
+    cases = some.samples.size
+    seconds = np.full(cases, -1.0)
+    seconds[:3] = 4.0, 5.5, 30.0
+    runs = {
+        "some": some.replace(start_time=seconds),
+        "none": none.replace(start_time=np.full(cases, -1.0)),
+    }
+    flags = np.zeros(cases, bool)
+    names = [f"family {i % 2}" for i in range(cases)]
+    report = summarise(runs, names, flags, flags, "IDM", np.full(cases, 1000.0))
+    found = {name: row.physical for name, row in report.rows.items()}
+    assert [x["starts"] for x in found.values()] == [3, 0]
+    assert [x["start_s_median"] for x in found.values()] == [5.5, -1.0]
+    text = format_suite(report)
+    assert "on a free road: median s (n starts)" in text
+    assert "  5.5 (3)  " in text
+    assert "  - (0)  " in text
 
 
 def test_differences_are_paired(result):

@@ -145,6 +145,54 @@ def test_creeping_is_slow_where_the_road_is_free():
     assert measured(v=slow, free_way=near).creeping_share == pytest.approx(0.1)
 
 
+def speeding_up(begin=0.0, first=0):
+    """m/s under 2 m/s^2 from a sample on, to 10 m/s."""
+    steps = np.maximum(np.arange(S) - first, 0)
+    return np.minimum(begin + 0.2 * steps, 10.0).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("v", "seconds"),
+    [
+        (speeding_up(), 4.0),  # to 8 m/s
+        (speeding_up(first=30), 7.0),  # standing for 3 s first
+        (speeding_up(0.8), 3.6),
+        (speeding_up(1.0), -1.0),  # it did not stand
+        (np.minimum(speeding_up(), 7.9), 9.9),  # never: to the record's end
+        (np.full(S, 10.0), -1.0),
+        (np.r_[speeding_up()[:50], speeding_up(first=10)[:50]], 4.9),  # twice
+    ],
+)
+def test_time_of_the_longest_start(v, seconds):
+    limit = np.full(S, 10.0, np.float32)
+    found = measured(v=v.astype(np.float32), speed_limit=limit)
+    assert found.start_time == pytest.approx(seconds)
+
+
+@pytest.mark.parametrize(
+    ("blocked", "seconds"),
+    [
+        (slice(40, 45), -1.0),  # on the way
+        (slice(20, 25), 4.5),  # while it stands
+        (slice(0, 10), 6.0),  # a red light, and 2 s more of standing
+        (slice(70, None), 7.0),  # when 80 % are reached already
+        (slice(0, None), -1.0),
+    ],
+)
+def test_a_start_counts_on_a_free_road_only(blocked, seconds):
+    """It stands for 3 s and is at 8 m/s after 7 s."""
+    way = at(blocked, 39.0, np.inf)
+    limit = np.full(S, 10.0, np.float32)
+    found = measured(v=speeding_up(first=30), speed_limit=limit, free_way=way)
+    assert found.start_time == pytest.approx(seconds)
+
+
+def test_a_start_ends_with_the_drive():
+    limit, valid = np.full(S, 10.0, np.float32), np.arange(S) < 31
+    found = measured(v=speeding_up(), speed_limit=limit, valid=valid)
+    assert found.start_time == pytest.approx(3.0)
+
+
 def test_sign_changes_of_the_acceleration_a_second():
     """10 s: push, coast, brake, push within the band, push: two turns."""
     a = np.zeros(S, np.float32)
