@@ -61,7 +61,7 @@ from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm
 from rcirl_jax.rehearsal import Rehearsal, rehearse
 from rcirl_jax.report.recorded_replays import recorded_replays
 from rcirl_jax.report.replays import make_replays
-from rcirl_jax.report.tuning_page import TuningReport, write_tuning_page
+from rcirl_jax.report.tuning_page import TuningReport, anchor_words, write_tuning_page
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.simulation.recorded_scenes import held_out
 from rcirl_jax.simulation.rows import BASELINES, NULLS
@@ -185,18 +185,19 @@ class Loop:
             self.say(format_verdict(self._verdict))
         if last not in ("import", "rehearse"):
             self.say(f"weights: {self.weights}")
-            self.say(self._without_effect())
+            self.say(self._said_of_weights())
         if last == "report":
             self.say(f"report to open: {self.folder / 'report.html'}")
 
     # ---------------------------------------------------------------- the stages
 
-    def _without_effect(self) -> str:
-        """Features that the training never saw vary, in words."""
-        names = open_reward(str(self.weights)).unsupported
-        return "features without effect, for they never vary in the training data: " + (
-            ", ".join(names) or "none"
-        )
+    def _said_of_weights(self) -> str:
+        """Features that the training never saw vary; gains, if anchored; one a line."""
+        reward = open_reward(str(self.weights))
+        silent = "features without effect, for they never vary in the training data: "
+        silent += ", ".join(reward.unsupported) or "none"
+        anchored = anchor_words(CANDIDATE, reward)
+        return "\n".join(filter(None, (silent, anchored)))
 
     def data(self, given: str | Logs, number: int) -> Dataset:
         """Open a source's dataset, or import its logs."""

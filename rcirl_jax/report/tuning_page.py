@@ -287,9 +287,23 @@ def _features(report: TuningReport) -> str:
                 f"Without effect in the {name}, for they never vary in its training "
                 f"data: {', '.join(reward.unsupported)}."
             )
+        if said := anchor_words(name, reward):
+            lead += paragraph(said)
     if len(report.rewards) == 1:
         lead += _alone(report)
     return lead + legend(report.rewards) + _contributions(found, list(report.rewards))
+
+
+def anchor_words(name: str, reward: Reward) -> str:
+    """One sentence on what an anchored reward drives by; "" of another one."""
+    anchor = reward.anchor
+    if anchor is None:
+        return ""
+    return (
+        f"The {name} is anchored: it drives by V_total = own cost ({anchor.incumbent}, "
+        f"negated) + gain V, with a gain from {anchor.low:g}, where nothing like the "
+        f"scene was recorded, to {anchor.high:g}, where all of it was."
+    )
 
 
 def _alone(report: TuningReport) -> str:

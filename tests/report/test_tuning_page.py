@@ -42,6 +42,7 @@ from tests.report.test_data_page import HOSTILE, Page
 from tests.report.tuning_case import PLAYED, SECONDS, cheap_rows, small_cases
 from tests.report.tuning_case import small_report as build
 from tests.simulation.test_recorded import traffic
+from tests.weights_files import example_anchor
 
 MAX_BYTES = 3e6
 
@@ -388,6 +389,29 @@ def test_a_linear_rewards_shares_are_its_terms(report):
         assert row.share["linear"].value == pytest.approx(
             wanted[row.feature], abs=2e-4
         ), row.feature
+
+
+def test_features_without_effect_and_gains_are_said(report):
+    reward = report.rewards["candidate"]
+    silent = dataclasses.replace(reward, lower=reward.lower.copy())
+    silent.lower[1] = silent.upper[1]
+    anchor = dataclasses.replace(
+        example_anchor(features=len(reward.names)), low=0.25, high=1.5
+    )
+    anchored = dataclasses.replace(silent, anchor=anchor)
+    text = tuning_page._features(
+        dataclasses.replace(report, rewards={**report.rewards, "candidate": anchored})
+    )
+    assert "Without effect in the candidate" in text
+    assert f"in its training data: {reward.names[1]}." in text
+    (said,) = re.findall(r"<p>([^<]*is anchored[^<]*)</p>", text)
+    assert said.startswith("The candidate is anchored: it drives by V_total = own cost")
+    assert "from 0.25, where nothing" in said
+    assert "to 1.5, where all of it was." in said
+
+
+def test_the_table_of_held_out_drives_is_there(page, report):
+    assert report.likeness in section(page, "likeness")
 
 
 # ------------------------------------------------------------------------- drives
