@@ -121,6 +121,12 @@ def alone(flag: str, *others: str) -> None:
             raise InputError(f"--{other}: {found.value}: expected none beside --{flag}")
 
 
+def unread(*names: str) -> None:
+    """Flags of other files that a command does not read: unknown to it, unrecorded."""
+    for name in names:
+        delattr(flags.FLAGS, name)
+
+
 def cutting(
     defaults: CollectConfig | None = None, said: str = ""
 ) -> Callable[[CollectConfig], CollectConfig]:

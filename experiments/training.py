@@ -4,14 +4,16 @@ A recipe holds everything that decides a run; no command has a default of its ow
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from absl import flags
 
 from experiments.common import floats, hidden_sizes
+from experiments.recipe import AS_SAID, recipe
 from rcirl_jax.data.joined import EQUAL
 from rcirl_jax.errors import InputError
-from rcirl_jax.recipes import DEFAULT, Recipe, load_recipe, reward_config
+from rcirl_jax.recipes import reward_config
 from rcirl_jax.reward import LOSSES, RewardConfig
 from rcirl_jax.reward.network import CONSTRAINTS, PINS
 from rcirl_jax.sampling.config import MODES
@@ -22,11 +24,6 @@ from rcirl_jax.train.state import (
     POSITIVES,
     TrainConfig,
 )
-
-RECIPE = flags.DEFINE_string(
-    "recipe", DEFAULT, "name in data_specs/recipes, or a TOML file"
-)
-AS_SAID = "; default: as the recipe says"
 
 
 def _text(name: str, text: str) -> flags.FlagHolder:
@@ -102,44 +99,56 @@ DATA_WEIGHTS = flags.DEFINE_string(
 )
 
 
-def recipe() -> Recipe:
-    """The recipe that the flags name, as its file has it."""
-    return load_recipe(RECIPE.value)
-
-
-def training_config(*, preferences: str = "", seed: int = 0) -> TrainConfig:
+def training_config(
+    *, preferences: str = "", seed: int = 0, hidden: tuple[int, ...] | None = None
+) -> TrainConfig:
     """The recipe's training, and what flags say besides.
 
     Args:
       preferences: hash of the file of --preferences; empty without one.
       seed: of initial weights, batches, candidates.
+      hidden: units per layer, whatever recipe and flags say.
     """
     base = recipe().train
-    given = {n: flag.value for n, flag in _TRAIN.items() if flag.value is not None}
-    if _MARGINS.value is not None:
-        if len(_MARGINS.value) != 3:
-            raise InputError(f"--margins: {_MARGINS.value}: expected three numbers")
+    given = _given(_TRAIN)
+    if (margins := _value(_MARGINS)) is not None:
+        if len(margins) != 3:
+            raise InputError(f"--margins: {margins}: expected three numbers")
         names = ("margin_distance", "margin_collision", "margin_rule")
-        given |= dict(zip(names, floats(_MARGINS.value, "margins"), strict=True))
+        given |= dict(zip(names, floats(margins, "margins"), strict=True))
     sampler = base.sampler
-    if _MODE.value is not None:
-        sampler = dataclasses.replace(sampler, mode=_MODE.value)
+    if (mode := _value(_MODE)) is not None:
+        sampler = dataclasses.replace(sampler, mode=mode)
     return dataclasses.replace(
         base,
         **given,
         preferences=preferences,
         seed=seed,
-        reward=_reward(base.reward, given.get("features", base.features)),
+        reward=_network(base.reward, given.get("features", base.features), hidden),
         sampler=sampler,
     )
 
 
-def _reward(base: RewardConfig, features: str) -> RewardConfig:
-    settings = {n: getattr(base, n) for n in ("hidden", *_REWARD)}
-    settings |= {n: f.value for n, f in _REWARD.items() if f.value is not None}
-    if _HIDDEN.value is not None:
-        settings["hidden"] = hidden_sizes(_HIDDEN.value)
-    by_context = _BY_CONTEXT.value
+def _network(
+    base: RewardConfig, features: str, hidden: tuple[int, ...] | None
+) -> RewardConfig:
+    settings = {n: getattr(base, n) for n in ("hidden", *_REWARD)} | _given(_REWARD)
+    if (units := _value(_HIDDEN)) is not None:
+        settings["hidden"] = hidden_sizes(units)
+    if hidden is not None:
+        settings["hidden"] = hidden
+    by_context = _value(_BY_CONTEXT)
     return reward_config(
         features, settings, bool(base.context) if by_context is None else by_context
     )
+
+
+def _given(named: Mapping[str, flags.FlagHolder]) -> dict[str, Any]:
+    """The values of those flags that were given."""
+    values = {name: _value(flag) for name, flag in named.items()}
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _value(flag: flags.FlagHolder) -> Any:  # noqa: ANN401
+    """What was given; None also where the command does not read the flag."""
+    return flag.value if flag.name in flags.FLAGS else None

@@ -50,7 +50,8 @@ from rcirl_jax.simulation.suite import FULL_S, catalogue_set, suite_refs
 _RUNS = flags.DEFINE_integer("runs", 3, "training seeds of each loss", lower_bound=2)
 _CASES = flags.DEFINE_integer("cases", 10, "of each family", lower_bound=1)
 _SEED = flags.DEFINE_integer("catalogue_seed", 0, "of the cases", lower_bound=0)
-unread("seeds", "epochs", "horizon", "positive")  # `drives_config` says how
+# `drives_config` says how
+unread("recipe", "seeds", "epochs", "horizon", "positive")
 
 LOSSES = {"RC-IRL": "rank", "GAN": "gan"}
 RIVALS = ("hand-set", "IDM")

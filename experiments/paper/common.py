@@ -1,12 +1,14 @@
 """What the paper's experiments share: flags, data, training, files."""
 
+import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from absl import flags
 
-from experiments.common import alone, made_by_file, provenance
+from experiments.common import alone, made_by_file, provenance, unread
+from experiments.recipe import AS_SAID, recipe
 from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
@@ -18,6 +20,7 @@ from rcirl_jax.evaluation.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.evaluation.learners import Learned, scorers
 from rcirl_jax.evaluation.table import RankingReport
 from rcirl_jax.report.intervals import Interval
+from rcirl_jax.reward import RewardConfig
 from rcirl_jax.train.state import POSITIVES, TrainConfig
 from rcirl_jax.whole import write_json
 
@@ -25,23 +28,17 @@ DATA = flags.DEFINE_string("data", None, "dataset (default: synthetic traffic)")
 OUTPUT = flags.DEFINE_string("output", "out/paper", "folder to write")
 SEEDS = flags.DEFINE_integer("seeds", 10, "training runs of each row", lower_bound=1)
 EPOCHS = flags.DEFINE_integer(
-    "epochs", 10, "passes over the training scenes", lower_bound=1
+    "epochs", None, "passes over the training scenes" + AS_SAID, lower_bound=1
 )
 HORIZON = flags.DEFINE_float(
-    "horizon", 5.0, "s at which distances are taken", lower_bound=0.4, upper_bound=8.0
+    "horizon", 5.0, "s compared and ranked", lower_bound=0.4, upper_bound=8.0
 )
-POSITIVE = flags.DEFINE_enum("positive", "nearest", POSITIVES, "trained on")
+POSITIVE = flags.DEFINE_enum("positive", None, POSITIVES, "trained on" + AS_SAID)
 QUICK = flags.DEFINE_bool("quick", False, "few scenes, two seeds, two epochs")
 
 QUICK_STRIDE_S = 60.0  # s between planning frames of the small synthetic dataset
 QUICK_SCENES = 128  # of each split
 QUICK_COUNTS = {"seeds": 2, "epochs": 2}  # whatever the flags say
-
-
-def unread(*names: str) -> None:
-    """Shared flags that an experiment does not read: unknown to it, not recorded."""
-    for name in names:
-        delattr(flags.FLAGS, name)
 
 
 def instead(flag: str, *names: str) -> None:
@@ -101,19 +98,27 @@ def seeds(least: int = 1) -> range:
 
 def epochs() -> int:
     """Passes over the training scenes."""
-    return QUICK_COUNTS["epochs"] if QUICK.value else EPOCHS.value
+    if QUICK.value:
+        return QUICK_COUNTS["epochs"]
+    return EPOCHS.value or recipe().train.epochs
+
+
+def positive() -> str:
+    """What is ranked first."""
+    return POSITIVE.value or recipe().train.positive
 
 
 def base(**changes: object) -> TrainConfig:
-    """The shared training configuration with some changes."""
+    """The recipe's training of the paper's network on pairs, with some changes."""
     shared: dict = {
         "loss": "logistic",
         "epochs": epochs(),
         "train_horizon": HORIZON.value,
+        "reward": RewardConfig(),
     }
     if "positive" not in changes:
-        shared["positive"] = POSITIVE.value
-    return TrainConfig(**{**shared, **changes})
+        shared["positive"] = positive()
+    return dataclasses.replace(recipe().train, **{**shared, **changes})
 
 
 def ranked(
@@ -127,7 +132,10 @@ def ranked(
     and to IDM, hand-set and random.
     """
     references = (*against, "IDM", "hand-set", "random")
-    setup = RankingSetup(horizon_s=HORIZON.value)
+    told = recipe().train
+    setup = RankingSetup(
+        preset=told.features, sampler=told.sampler, horizon_s=HORIZON.value
+    )
     return evaluate_ranking(data, scorers(learned), setup, references=references)
 
 
@@ -149,11 +157,13 @@ def intervals(report: RankingReport, metric: str) -> dict[str, Interval]:
 
 
 def as_used(weights: Sequence[str] = (), **used: object) -> dict:
-    """Provenance with the flags as they were used, under --quick too."""
+    """Provenance with the flags as they were used, whatever --quick and recipe say."""
     found = provenance(weights)
-    counts = QUICK_COUNTS if QUICK.value else {}
-    own = {name: count for name, count in counts.items() if name in found["flags"]}
-    return {**found, "flags": {**found["flags"], **own, **used}}
+    given = found["flags"]
+    own = {"seeds": len(seeds())} if "seeds" in given else {}
+    own |= {"epochs": epochs()} if "epochs" in given else {}
+    own |= {"positive": positive()} if "positive" in given else {}
+    return {**found, "flags": {**given, **own, **used}}
 
 
 def write(
@@ -176,6 +186,8 @@ def write(
     made_by = as_used(weights, **used)
     if data is not None:
         made_by["data_hash"] = data.hash
+    if "recipe" in made_by["flags"]:
+        made_by["recipe"] = dataclasses.asdict(recipe().train)
     made = {**body, "quick": QUICK.value, "made_by": made_by}
     write_json(folder / f"{name}.json", made)
     print(f"written: {folder}/{name}.json, {name}.png")

@@ -45,7 +45,7 @@ unread("seeds")
 def main() -> None:
     """One scene under one reward."""
     if _WEIGHTS.value:
-        instead("weights", "epochs", "horizon", "positive")
+        instead("weights", "recipe", "epochs", "horizon", "positive")
     data, folder, row = dataset(), Path(OUTPUT.value), _ROW.value
     if row is None:
         row = int(pick_frames(data, 1)[0])

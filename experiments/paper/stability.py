@@ -1,14 +1,12 @@
-"""Does any learner train to NaN, with any optimiser, at the default flags?
+"""Does any learner train to NaN, with any optimiser, as a recipe trains?
 
     python -m experiments.paper.stability --data=DATASET --output=DIR [--quick]
 
-Every learner of `LEARNERS` with every optimiser at the defaults of
-`experiments.train` (20 epochs, step size 0.003, the human's curve as the
-positive unless --positive=nearest) on one dataset; a learner's optimisers train side
-by side. A step whose loss or gradient is not finite is refused by the trainer and
-counts as a failure here. Expected: no failure; exit code 1 otherwise. How many pairs
-each wins is drawn, not judged. 20 minutes on one core with US-101; `--quick`: two
-minutes.
+Every learner of `LEARNERS` with every optimiser, epochs, step size and positive as
+the --recipe says, on one dataset; a learner's optimisers train side by side. A step
+whose loss or gradient is not finite is refused by the trainer and counts as a failure
+here. Expected: no failure; exit code 1 otherwise. How many pairs each wins is drawn,
+not judged. 20 minutes on one core with US-101 and --epochs=20; `--quick`: two minutes.
 """
 
 import sys
@@ -19,12 +17,12 @@ from absl import flags
 
 from experiments.common import run
 from experiments.paper.common import (
-    POSITIVE,
     QUICK,
+    base,
     dataset,
-    epochs,
     fixed,
     picture,
+    positive,
     unread,
     write,
 )
@@ -35,14 +33,13 @@ from rcirl_jax.evaluation.learners import (
     train_with_each,
 )
 from rcirl_jax.report.style import figure, label, save
-from rcirl_jax.train.state import OPTIMIZERS, TrainConfig
+from rcirl_jax.train.state import OPTIMIZERS
 
-# "on curves" names the default positive: those are the same runs
+# "on curves" are the runs of --positive=human
 _LEARNERS = flags.DEFINE_list(
     "learners", [x for x in LEARNERS if not x.endswith("on curves")], "rows to train"
 )
-flags.set_default(POSITIVE, TrainConfig().positive)
-fixed(epochs=TrainConfig().epochs, horizon=TrainConfig().train_horizon)
+fixed(horizon=8.0)
 unread("seeds")
 
 
@@ -50,10 +47,8 @@ def main() -> None:
     """Train all, say which stayed finite, draw."""
     data = dataset()
     sets, rows = FrozenSets(data), {}
-    positive = POSITIVE.value
-    plain = TrainConfig(epochs=epochs(), positive=positive)
     names = _LEARNERS.value[::5] if QUICK.value else _LEARNERS.value
-    configs, optimizers = learner_configs(names, plain), sorted(OPTIMIZERS)
+    configs, optimizers = learner_configs(names, base()), sorted(OPTIMIZERS)
     for name, config in tqdm.tqdm(configs.items(), desc="train", unit="learner"):
         runs = train_with_each(sets.of(config), config, optimizers)
         for how, learned in runs.items():
@@ -73,7 +68,7 @@ def main() -> None:
     label(axis, "training: first epoch to last", "share of pairs won", "")
     save(made, picture("stability"))
     print(f"{len(rows)} runs, not finite: {len(failed)} {failed or ''}")
-    write("stability", {"rows": rows, "failed": failed, "positive": positive}, data)
+    write("stability", {"rows": rows, "failed": failed, "positive": positive()}, data)
     if failed:
         sys.exit(1)
 

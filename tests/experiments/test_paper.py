@@ -42,6 +42,7 @@ ASKED = {
 }
 # shared flags as used under --quick; those with a value of their own; those not read
 SHARED = {"seeds": 2, "epochs": 2, "horizon": 5.0, "positive": "nearest"}
+SHARED["recipe"] = "tuned"
 OWN = {
     "artefact_audit": {"horizon": 8.0},
     "discount_factors": {"horizon": 8.0},
@@ -117,7 +118,8 @@ def test_writes_numbers_and_a_picture(name, dataset, tmp_path):
     scenes = f"--data={dataset}"
     if name == "cross_site":
         scenes = f"--sites=here={dataset},there={dataset}"
-    done = command(name, "--quick", scenes, f"--output={tmp_path}")
+    curves = ("--positive=human",) if name == "stability" else ()
+    done = command(name, "--quick", scenes, f"--output={tmp_path}", *curves)
     assert done.returncode == 0, done.stderr[-2000:]
     body = json.loads((tmp_path / f"{name}.json").read_text())
     found = list(numbers(body))
@@ -125,6 +127,7 @@ def test_writes_numbers_and_a_picture(name, dataset, tmp_path):
     assert all(math.isfinite(x) for x in found)
     assert body["quick"] is True
     assert body["made_by"]["versions"]
+    assert body["made_by"]["recipe"]["batch_size"] == 64
     used = {**SHARED, **OWN.get(name, {})}
     for flag in UNREAD.get(name, ()):
         del used[flag]
