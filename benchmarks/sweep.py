@@ -73,7 +73,8 @@ def _grid(config: TrainConfig) -> list[Members]:
 def _command(module: str, data: str, folder: Path, *flags_: str) -> float:
     """Seconds of one command."""
     words = [sys.executable, "-m", module, f"--data={data}", *flags_]
-    words += ["--positive=nearest", f"--epochs={_EPOCHS.value}"]
+    words += ["--recipe=paper", "--positive=nearest", "--train_horizon=5"]
+    words += ["--futures=predicted", f"--epochs={_EPOCHS.value}"]
     begin = time.perf_counter()
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     if done.returncode:
@@ -96,7 +97,7 @@ def _commands() -> dict:
             grid = (f"--leaky_rates={rates}", f"--seeds={seeds}", f"--output={folder}")
             taken["sweep"].append(_command("experiments.sweep", data, folder, *grid))
             folder = Path(name) / "train"
-            one = (f"--seed={number}", "--train_horizon=5", f"--workdir={folder}")
+            one = (f"--seed={number}", f"--workdir={folder}")
             taken["train"].append(_command("experiments.train", data, folder, *one))
         scenes = int(open_dataset(data).indices("train").size)
     sweep, alone = (float(np.median(taken[name])) for name in ("sweep", "train"))

@@ -6,7 +6,8 @@ Every learner of `LEARNERS` is trained with every seed on the same candidates of
 the training scenes and ranks the same candidates of the held-out scenes, beside
 random, untrained, constant speed, IDM, both hand-set and oracle rows. Of the
 scenes recorded as long as the horizon none is dropped; a crash of the chosen
-candidate is charged.
+candidate is charged. Its name says a learner's loss and network; all else is as the
+--recipe says, and a flag given beside it wins.
 `--holdout`:
 
     groups      the dataset's split by groups of vehicles
@@ -32,7 +33,8 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments.common import provenance, run
+from experiments import training
+from experiments.common import provenance, run, unread
 from experiments.holdout import splits
 from rcirl_jax.data.joined import Demonstrations
 from rcirl_jax.data.store import open_dataset
@@ -56,23 +58,18 @@ from rcirl_jax.evaluation.table import UNTRAINED_ROW, to_json
 from rcirl_jax.evaluation.tuned_rivals import as_numbers, tuned_rivals
 from rcirl_jax.export.hand_weights import tuned_rows
 from rcirl_jax.report.intervals import ranking_chart
-from rcirl_jax.sampling import SamplerConfig
-from rcirl_jax.train.state import TrainConfig
+from rcirl_jax.reward import RewardConfig
 from rcirl_jax.whole import write_json, write_whole
 
+# the learners say
+unread("loss", "hidden_size", "activation", "constraint", "pin", "by_context")
+unread("preferences", "preference_weight", "data_weights")
 _DATA = flags.DEFINE_string("data", None, "dataset of import_logs", required=True)
 _OUTPUT = flags.DEFINE_string("output", "out/likeness", "folder to write")
 _LEARNERS = flags.DEFINE_list("learners", list(LEARNERS), "rows to train")
 _SEEDS = flags.DEFINE_integer("seeds", 10, "training runs per learner", lower_bound=1)
-_EPOCHS = flags.DEFINE_integer(
-    "epochs", 10, "passes over the training scenes", lower_bound=1
-)
-_HALVE = flags.DEFINE_integer("halve_every", 0, "steps per halving of the step size")
 _HORIZON = flags.DEFINE_float(
     "horizon", 5.0, "s at which distances are taken", lower_bound=0.4, upper_bound=8.0
-)
-_MODE = flags.DEFINE_enum(
-    "mode", "speed", ["speed", "path_speed"], "what the sampler varies"
 )
 _HAND = flags.DEFINE_list(
     "hand_weights", [], "of tune_hand_set with the same split: runs of a further row"
@@ -85,15 +82,15 @@ _LONG = flags.DEFINE_integer(
 )
 
 
-def _tuned(part: Demonstrations, setup: RankingSetup) -> dict[str, list[Rival]]:
-    """The rows of the tuned rivals, if any."""
+def _tuned(
+    part: Demonstrations, setup: RankingSetup, epochs: int
+) -> dict[str, list[Rival]]:
+    """The rows of the tuned rivals, if any; with the queries of a learner's epochs."""
     if not _TUNED.value:
         costs = tuned_rows(_HAND.value, part.hash)
         return {row: [*runs] for row, runs in costs.items()}
     seeds = range(_TUNED.value)
-    return tuned_rivals(
-        part, setup, epochs=_EPOCHS.value, seeds=seeds, long=_LONG.value
-    )
+    return tuned_rivals(part, setup, epochs=epochs, seeds=seeds, long=_LONG.value)
 
 
 def main() -> None:
@@ -102,17 +99,14 @@ def main() -> None:
         raise InputError("--tuned, --hand_weights: expected one of them")
     dataset = open_dataset(_DATA.value)
     parts, words = splits(dataset)
-    sampler = SamplerConfig(mode=_MODE.value)
-    base = TrainConfig(
-        positive="nearest",
-        epochs=_EPOCHS.value,
-        halve_every=_HALVE.value,
-        train_horizon=_HORIZON.value,
-        sampler=sampler,
-    )
+    base = dataclasses.replace(training.training_config(), reward=RewardConfig())
     configs = learner_configs(_LEARNERS.value, base)
-    setup = RankingSetup(sampler=sampler, horizon_s=_HORIZON.value)
-    setups = [dataclasses.replace(setup, tuned=_tuned(x, setup)) for x in parts]
+    setup = RankingSetup(
+        preset=base.features, sampler=base.sampler, horizon_s=_HORIZON.value
+    )
+    setups = [
+        dataclasses.replace(setup, tuned=_tuned(x, setup, base.epochs)) for x in parts
+    ]
     folder, ranked, failed = Path(_OUTPUT.value), [], set()
     for part, own in zip(parts, setups, strict=True):
         learned = train_learners(part, configs, range(_SEEDS.value))
@@ -136,6 +130,7 @@ def main() -> None:
             {row: as_numbers(runs) for row, runs in x.tuned.items()} for x in setups
         ],
         "not_finite": bad,
+        "settings": dataclasses.asdict(base),  # which learners depart from
         "made_by": made_by,
     }
     write_json(folder / "ranking.json", body, indent=0)  # a third smaller

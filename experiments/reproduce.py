@@ -6,9 +6,10 @@ Exit status 0: reproduced. On the same machine with the same versions and commit
 bit has to be the same; else, with a warning that names what differs, no tensor may
 differ by more than --tolerance of its largest entry. 1: not reproduced; the tensor
 that differs most is named. 2: could not: other data, an older file, or one that no
-training made. Takes as long as the training did, of a sweep's member as long as its
-group; writes DIR/run (not of a member), DIR/weights.msgpack and
-DIR/reproduction.json.
+training made. There is no --recipe: the file holds every setting of its training, and
+what a recipe says may have changed since. Takes as long as the training did, of a
+sweep's member as long as its group; writes DIR/run (not of a member),
+DIR/weights.msgpack and DIR/reproduction.json.
 """
 
 import functools

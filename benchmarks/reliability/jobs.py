@@ -77,7 +77,7 @@ def jobs(root: Path) -> dict[str, Job]:
             module="experiments.sweep",
             flags=(
                 *(data, "--output=sweep", "--quick", "--batch_size=8"),
-                *("--hidden_sizes=6,0", "--leaky_rates=0.05,0.3"),
+                *("--recipe=paper", "--hidden_sizes=6,0", "--leaky_rates=0.05,0.3"),
             ),
             outcome=_of_sweep,
             finished=_files_like("sweep/groups/*.json"),

@@ -77,20 +77,30 @@ class SweepConfig:
     validation: float = 0.2
     # training scenes used at most, drawn by vehicle (0: all)
     scenes: int = 0
-    # metric of the choice, at s of the base's training horizon
+    # metric of the choice
     choose_by: str = "top1_fde"
+    # s at which distances are taken
+    horizon_s: float = 5.0
 
     def __post_init__(self) -> None:
-        """Reject values out of range, empty lists and equal members."""
+        """Reject values out of range and what is no grid."""
         if self.choose_by not in CHOICES:
             raise InputError(
                 f"--choose_by: {self.choose_by}: expected one of {CHOICES}"
             )
         if not 0.0 < self.validation <= 0.5:
             raise InputError(f"--validation: {self.validation}: expected 0 to 0.5")
+        if not 0.0 < self.horizon_s <= 8.0:
+            raise InputError(
+                f"--horizon: {self.horizon_s}: expected above 0, at most 8 s"
+            )
         for name, low in (("seeds", 1), ("scenes", 0)):
             if getattr(self, name) < low:
                 raise InputError(f"--{name}: {getattr(self, name)}: expected >= {low}")
+        self._check_grid()
+
+    def _check_grid(self) -> None:
+        """Reject empty lists, equal members and too many."""
         if self.base.loss != "rank" and len(self.leaky_rates) > 1:
             raise InputError(
                 f"--leaky_rates: {list(self.leaky_rates)}: expected one value: only "
@@ -138,7 +148,7 @@ class SweepConfig:
         return RankingSetup(
             preset=self.base.features,
             sampler=self.base.sampler,
-            horizon_s=self.base.train_horizon,
+            horizon_s=self.horizon_s,
         )
 
 

@@ -18,7 +18,7 @@ def test_a_small_sweep(tmp_path):
     import_logs(read_recordings("synthetic", None), tmp_path / "d", config)
     flags = (
         "--quick", f"--data={tmp_path}/d", f"--output={tmp_path}/out",
-        "--leaky_rates=0.05,0.3", "--hidden_sizes=0,6x3",
+        "--recipe=paper", "--leaky_rates=0.05,0.3", "--hidden_sizes=0,6x3",
     )  # fmt: skip
     done = command("experiments.sweep", *flags, "--workers=2")
     assert done.returncode == 0, done.stderr[-2000:]
