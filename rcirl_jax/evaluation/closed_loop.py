@@ -1,5 +1,6 @@
 """A suite from weights to report: classify the cases, drive every row, summarise."""
 
+import concurrent.futures
 import dataclasses
 import resource
 import time
@@ -23,6 +24,10 @@ from rcirl_jax.simulation.metrics import CaseMetrics
 from rcirl_jax.simulation.rows import RECORDED_HUMAN, Row
 from rcirl_jax.simulation.suite import CaseSet, drive_row, rollout_config
 from rcirl_jax.whole import write_json, write_whole
+
+# s of driving in all cases below which compiling takes longer than driving: then rows
+# drive two at a time, so that one compiles while the other drives
+SHORT_S = 2e4
 
 # infinite where nobody was met; every other number of a drive is finite
 NOBODY_MET = ("min_ttc", "min_headway", "min_clearance")
@@ -90,6 +95,21 @@ def _driven(row: Row, cases: CaseSet, config: SuiteConfig, drive: Drive) -> Case
     return metrics
 
 
+def _all_driven(
+    rows: Sequence[Row], cases: CaseSet, config: SuiteConfig, drive: Drive
+) -> dict[str, tuple[CaseMetrics, float]]:
+    """Every row's drives and seconds, by name."""
+
+    def one(row: Row) -> tuple[CaseMetrics, float]:
+        begin = time.perf_counter()
+        found = _driven(row, cases, config, drive)
+        return found, time.perf_counter() - begin
+
+    short = len(cases.ids) * cases.duration_s <= SHORT_S
+    with concurrent.futures.ThreadPoolExecutor(2 if short else 1) as pool:
+        return dict(zip([row.name for row in rows], pool.map(one, rows), strict=True))
+
+
 def run_suite(
     rows: Sequence[Row],
     cases: CaseSet,
@@ -98,31 +118,28 @@ def run_suite(
 ) -> SuiteResult:
     """Drive every row over the cases and judge them; `drive` says where.
 
-    The careful drivers and IDM drive first: they say which cases are
+    The careful drivers and IDM drive too: they say which cases are
     preventable and how far one gets. Where the recorded human is a row, its
     distance is the reference instead of IDM's.
     """
-    classified = {row.name: _driven(row, cases, config, drive) for row in judges()}
-    avoidable = preventable([classified["CC"], classified["FSM"]])
-    calm = trivial([classified["IDM"], classified["constant speed"]])
-    runs: dict[str, CaseMetrics] = {}
-    timings, hashes = {}, {}
+    every = {row.name: row for row in [*rows, *judges()]}
+    timed = _all_driven([*every.values()], cases, config, drive)
+    driven = {name: found for name, (found, _) in timed.items()}
+    avoidable = preventable([driven["CC"], driven["FSM"]])
+    calm = trivial([driven["IDM"], driven["constant speed"]])
+    runs = {row.name: driven[row.name] for row in rows}
+    hashes = {name: result_hash(found) for name, found in runs.items()}
+    timings = {}
     for row in rows:
-        begin = time.perf_counter()
-        known = classified.get(row.name)
-        runs[row.name] = known or _driven(row, cases, config, drive)
-        seconds = time.perf_counter() - begin
-        hashes[row.name] = result_hash(runs[row.name])
-        if known is None:
-            every = row.plan_every or config.plan_every
-            plans = len(cases.ids) * round(cases.duration_s / STEP_S) / every
-            timings[row.name] = {
-                "seconds": round(seconds, 2),
-                "plans_per_s": round(plans / seconds, 1),
-                "plan_every_steps": every,
-            }
+        seconds, steps = timed[row.name][1], row.plan_every or config.plan_every
+        plans = len(cases.ids) * round(cases.duration_s / STEP_S) / steps
+        timings[row.name] = {
+            "seconds": round(seconds, 2),
+            "plans_per_s": round(plans / seconds, 1),
+            "plan_every_steps": steps,
+        }
     reference = RECORDED_HUMAN if RECORDED_HUMAN in runs else "IDM"
-    way = np.asarray({**classified, **runs}[reference].progress)
+    way = np.asarray(driven[reference].progress)
     report = summarise(runs, cases.groups, avoidable, calm, reference, way)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     return SuiteResult(

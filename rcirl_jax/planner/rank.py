@@ -18,7 +18,7 @@ from rcirl_jax.geometry.running import running_max
 from rcirl_jax.planner.baselines import Idm, idm_acceleration
 from rcirl_jax.planner.plan import Plan, held, plan_of, stations_from_now
 from rcirl_jax.planner.safety import SafetyConfig, check, choose
-from rcirl_jax.reward.hand import LatticeCost, lattice_cost
+from rcirl_jax.reward.hand import LatticeCost, lattice_costs
 from rcirl_jax.reward.network import ACTIVATIONS, rows_value
 from rcirl_jax.reward.speed_dp import speed_dp_cost
 from rcirl_jax.sampling import SamplerConfig, sample, trajectory_on_path
@@ -91,8 +91,7 @@ def hand_score(
       candidates: K of them.
     """
     weights = LatticeCost(**(params or {}))
-    cost = jax.vmap(lambda x: lattice_cost(scene, x, weights))(candidates.trajectory)
-    return -cost
+    return -lattice_costs(scene, candidates.trajectory, weights)
 
 
 def constant_score(params: None, scene: Scene, candidates: Candidates) -> jax.Array:

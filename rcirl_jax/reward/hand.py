@@ -16,7 +16,13 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from rcirl_jax.features.columns import COLUMNS, LINE_CAP_M, make_frame
+from rcirl_jax.features.columns import (
+    COLUMNS,
+    LINE_CAP_M,
+    Frame,
+    candidate_frames,
+    make_frame,
+)
 from rcirl_jax.types import Scene, Trajectory
 from rcirl_jax.units import DT_S, TIMES_S
 
@@ -72,19 +78,19 @@ class LatticeCost:
 
 
 class LatticeTerms(NamedTuple):
-    """What the cost of one trajectory is made of, before any tunable weight."""
+    """What the cost of one trajectory (or of K, last axis) is made of, unweighted."""
 
-    limit: Float[Array, " t"]  # m/s, speed limit where the ego is
-    approach: Float[Array, " t"]  # m/s, from which it can stop in time; or inf
-    speed: Float[Array, " t"]  # m/s
-    early: Float[Array, " t"]  # s^2, t^2 at valid times, else 0
-    travelled: Float[Array, ""]  # m
-    jerk: Float[Array, ""]  # 1, and so are the next three
-    collision: Float[Array, ""]
-    centripetal: Float[Array, ""]  # m/s^2
-    lateral_offset: Float[Array, ""]
-    lateral_comfort: Float[Array, ""]  # m/s^2
-    collides: Bool[Array, ""]
+    limit: Float[Array, "t ..."]  # m/s, speed limit where the ego is
+    approach: Float[Array, "t ..."]  # m/s, from which it can stop in time; or inf
+    speed: Float[Array, "t ..."]  # m/s
+    early: Float[Array, "t ..."]  # s^2, t^2 at valid times, else 0
+    travelled: Float[Array, "..."]  # m
+    jerk: Float[Array, "..."]  # 1, and so are the next three
+    collision: Float[Array, "..."]
+    centripetal: Float[Array, "..."]  # m/s^2
+    lateral_offset: Float[Array, "..."]
+    lateral_comfort: Float[Array, "..."]  # m/s^2
+    collides: Bool[Array, "..."]
 
 
 def tuned(vector: Float[Array, " d"]) -> LatticeCost:
@@ -109,9 +115,9 @@ def tuned(vector: Float[Array, " d"]) -> LatticeCost:
 
 
 def _ratio(x: jax.Array, valid: jax.Array) -> jax.Array:
-    """Sum x^2 / sum |x| over valid times, 0 for x = 0."""
-    square = jnp.sum(jnp.where(valid, x**2, 0.0))
-    size = jnp.sum(jnp.where(valid, jnp.abs(x), 0.0))
+    """Sum x^2 / sum |x| over valid times (first axis), 0 for x = 0."""
+    square = jnp.sum(jnp.where(valid, x**2, 0.0), axis=0)
+    size = jnp.sum(jnp.where(valid, jnp.abs(x), 0.0), axis=0)
     return square / (size + 1e-6)
 
 
@@ -119,9 +125,14 @@ def lattice_terms(
     scene: Scene, trajectory: Trajectory, weights: LatticeCost = LatticeCost()
 ) -> LatticeTerms:
     """The terms of one trajectory; reads only fields that `TUNABLE` does not name."""
-    frame, valid = make_frame(scene, trajectory), scene.time_valid
+    return _terms(make_frame(scene, trajectory), scene.time_valid, weights)
+
+
+def _terms(frame: Frame, valid: jax.Array, weights: LatticeCost) -> LatticeTerms:
+    """From frames [T] of one trajectory, or [T, K] of K with `valid` [T, 1]."""
+    x = frame.point
     column = {name: COLUMNS[name](frame) for name in _READ}
-    times = jnp.asarray(TIMES_S)
+    times = jnp.asarray(TIMES_S).reshape(valid.shape)
     to_stop = jnp.minimum(column["stop_distance"], column["virtual_distance"])
     braking = jnp.sqrt(jnp.multiply(2.0, weights.comfort_braking) * to_stop)
     distance = jnp.minimum(
@@ -130,26 +141,26 @@ def lattice_terms(
     )
     distance = jnp.where(column["collision"] > 0.0, 0.0, distance)
     near = jnp.exp(-0.5 * (distance / weights.collision_sigma) ** 2)
-    comfort = jnp.abs(trajectory.ddl * trajectory.v**2 + trajectory.dl * trajectory.a)
+    comfort = jnp.abs(x.ddl * x.v**2 + x.dl * x.a)
     return LatticeTerms(
         limit=column["speed_limit"],
         approach=jnp.where(to_stop >= LINE_CAP_M, jnp.inf, braking),
-        speed=trajectory.v,
+        speed=x.v,
         early=jnp.where(valid, times**2, 0.0),
-        travelled=jnp.max(jnp.where(valid, trajectory.s, 0.0)),
-        jerk=_ratio(trajectory.j / weights.jerk_bound, valid),
+        travelled=jnp.max(jnp.where(valid, x.s, 0.0), axis=0),
+        jerk=_ratio(x.j / weights.jerk_bound, valid),
         collision=_ratio(near, valid),
         centripetal=_ratio(column["lateral_acceleration"], valid),
-        lateral_offset=_ratio(trajectory.l / weights.offset_scale, valid),
-        lateral_comfort=jnp.max(jnp.where(valid, comfort, 0.0)),
-        collides=jnp.any((column["collision"] > 0.0) & valid),
+        lateral_offset=_ratio(x.l / weights.offset_scale, valid),
+        lateral_comfort=jnp.max(jnp.where(valid, comfort, 0.0), axis=0),
+        collides=jnp.any((column["collision"] > 0.0) & valid, axis=0),
     )
 
 
-def weighted_cost(terms: LatticeTerms, weights: LatticeCost) -> Float[Array, ""]:
+def weighted_cost(terms: LatticeTerms, weights: LatticeCost) -> Float[Array, "..."]:
     """The cost of one trajectory's terms under some weights; see `lattice_cost`."""
     reference = jnp.minimum(terms.limit * weights.speed_share, terms.approach)
-    off_speed = jnp.sum(terms.early * jnp.abs(reference - terms.speed))
+    off_speed = jnp.sum(terms.early * jnp.abs(reference - terms.speed), axis=0)
     # nothing is early where t = 0 is the only valid time
     off_speed = off_speed / jnp.maximum(jnp.sum(terms.early), DT_S**2)
     far = weights.objective_distance / (1.0 + terms.travelled)
@@ -178,6 +189,14 @@ def lattice_cost(
     trajectory that collides costs 1000 more, so that it comes last as in Apollo.
     """
     return weighted_cost(lattice_terms(scene, trajectory, weights), weights)
+
+
+def lattice_costs(
+    scene: Scene, trajectories: Trajectory, weights: LatticeCost = LatticeCost()
+) -> Float[Array, " k"]:
+    """`lattice_cost` of K trajectories [K, T] in long loops, over features' frames."""
+    frames = candidate_frames(scene, trajectories)
+    return weighted_cost(_terms(frames, scene.time_valid[:, None], weights), weights)
 
 
 _READ = (

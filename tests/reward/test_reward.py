@@ -14,16 +14,17 @@ from rcirl_jax.reward import (
     fit_normaliser,
     init_reward,
     lattice_cost,
+    lattice_costs,
     loss_sums,
     normalise,
     pinned,
     scenes_value,
     value,
 )
-from rcirl_jax.sampling import trajectory_from_positions
+from rcirl_jax.sampling import SamplerConfig, trajectory_from_positions
 from rcirl_jax.units import TIMES_S
 from tests.reward.compared import compared
-from tests.scenes import scene
+from tests.scenes import random_scene, sampled, scene
 
 F, T = 21, TIMES_S.size
 SHAPES = {"linear": (), "paper": (15,), "deep": (8, 4)}
@@ -211,3 +212,11 @@ def test_nonnegative_reward_is_a_sum_of_costs():
     assert (np.asarray(found) <= 0.0).all()
     with pytest.raises(InputError, match="--hidden_size"):
         RewardConfig(hidden=(15,), constraint="nonnegative")
+
+
+def test_costs_of_all_candidates_are_those_of_each():
+    scene = random_scene(5)
+    candidates = sampled(jax.random.key(1), scene, SamplerConfig())
+    each = jax.vmap(lambda x: lattice_cost(scene, x))(candidates.trajectory)
+    together = lattice_costs(scene, candidates.trajectory)
+    np.testing.assert_allclose(together, each, rtol=1e-5, atol=1e-5)
