@@ -393,7 +393,6 @@ def test_table2_never_reuses_the_parts_of_a_quick_run(tmp_path):
         ("closed_loop_seeds", "--epochs=3", "Unknown command line flag 'epochs'"),
         ("one_frame", "--seeds=3", "Unknown command line flag 'seeds'"),
         ("stability", "--seeds=3", "Unknown command line flag 'seeds'"),
-        ("stability", "--epochs=3", "flag --epochs=3: expected 20 here"),
         ("known_truth", "--positive=nearest", "=nearest: expected human here"),
         ("data_support", "--positive=human", "=human: expected nearest here"),
         ("discount_factors", "--horizon=5", "flag --horizon=5.0: expected 8.0 here"),
