@@ -71,7 +71,7 @@ $(VENV)/.installed: pyproject.toml $(if $(LOCK),$(LOCK)/test.lock) | $(BIN)/pyth
 # The main job, end to end, on synthetic human traffic: import, train, rank, simulate, gate, report.
 demo: $(VENV)/.all
 	$(BIN)/python -m experiments.autotune --synthetic --recipe=quick \
-	  --workdir=$(OUT) --cases=10 --duration=20 --drives=60
+	  --workdir=$(OUT) --cases=4 --duration=20 --drives=40
 
 test: setup
 	$(TEST) $(EXACT)

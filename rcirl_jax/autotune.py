@@ -245,21 +245,30 @@ class Loop:
             learner = None
             if number:
                 learner = self.folder / "rounds" / f"{number}.msgpack"
-                self._train_round(joined, number, learner)
+                anchor = None
+                if self.config.anchor.wanted:
+                    anchor = self.folder / "rounds" / f"{number}.anchor.json"
+                    self._anchor(sources, given[: len(sources)], drives, anchor)
+                self._train_round(joined, number, learner, anchor)
             drives.append(self._rehearsed(number, learner))
             if plan.weights[number] > 0.0:
                 made.append(drives[-1])
                 given.append(plan.weights[number])
                 joined = _as_one(made, given)
         if self.config.anchor.wanted:
-            self._anchor(sources, given[: len(sources)], drives)
+            path = self.folder / "anchor.json"
+            self._anchor(sources, given[: len(sources)], drives, path)
         return joined
 
     def _anchor(
-        self, sources: Sequence[Dataset], shares: Sequence[float], drives: list[Dataset]
+        self,
+        sources: Sequence[Dataset],
+        shares: Sequence[float],
+        drives: list[Dataset],
+        path: Path,
     ) -> None:
         """How far the recordings reach, against the rehearsed drives."""
-        config, path = self.config, self.folder / "anchor.json"
+        config = self.config
         inputs = {
             "anchor": dataclasses.asdict(config.anchor),
             "recorded": [one.hash for one in sources],
@@ -273,7 +282,8 @@ class Loop:
             made = fitted_anchor(config.anchor, sources, shares, drives, features)
             write_anchor(path, made)
 
-        self._run("anchor", inputs, [path], work)
+        name = "anchor" if path.stem == "anchor" else f"anchor of round {len(drives)}"
+        self._run(name, inputs, [path], work)
 
     def _rehearsed(self, number: int, learner: Path | None) -> Dataset:
         plan, config = self.config.rehearsal, self.config
@@ -303,9 +313,15 @@ class Loop:
         self._run(f"rehearse {number}", inputs, [folder / "manifest.json"], work)
         return open_dataset(folder)
 
-    def _train_round(self, dataset: Demonstrations, number: int, file: Path) -> None:
+    def _train_round(
+        self, dataset: Demonstrations, number: int, file: Path, path: Path | None
+    ) -> None:
+        """The learner of a round; `path` is of its anchor."""
         inputs = {**self._train_inputs(dataset), "seed": 0}
-        work = lambda: self._train_one(dataset, 0, file, None, None)  # noqa: E731
+        anchor = None
+        if path:
+            anchor, inputs = read_anchor(path), {**inputs, "anchor": file_sha256(path)}
+        work = lambda: self._train_one(dataset, 0, file, None, anchor)  # noqa: E731
         self._run(f"rehearse learner {number}", inputs, [file], work)
 
     def _train_one(

@@ -7,7 +7,8 @@ learner's own mistakes lead becomes a demonstration too (Ross et al. 2011, "DAgg
 with takeovers). What is driven is a dataset like any other, with a weight of its own.
 
 Drives of weight 0 are not learned from. They show what an anchored reward
-(`rcirl_jax.anchoring`) has to leave to the planner's own cost.
+(`rcirl_jax.anchoring`) has to leave to the planner's own cost; in further rounds the
+anchored reward drives alone, and shows where it gets to by itself.
 """
 
 import dataclasses
@@ -72,11 +73,6 @@ class Rehearsal:
             raise InputError(
                 f"rehearsal: takeover_weight: {self.takeover_weight}: expected > 0"
             )
-        if self.weight == 0.0 and self.rounds and self.teacher != "none":
-            raise InputError(
-                f"rehearsal: rounds: {self.rounds}: with weight 0 nothing is learned "
-                "from the drives: expected 0"
-            )
 
     @property
     def datasets(self) -> int:
@@ -86,7 +82,8 @@ class Rehearsal:
     @property
     def weights(self) -> tuple[float, ...]:
         """Weight of each dataset, in their order."""
-        return (self.weight, *[self.takeover_weight] * self.rounds)[: self.datasets]
+        again = self.takeover_weight if self.weight else 0.0
+        return (self.weight, *[again] * self.rounds)[: self.datasets]
 
 
 def teacher_of(rehearsal: Rehearsal, incumbent: str) -> tuple[Policy, Params] | None:
@@ -126,22 +123,24 @@ def rehearse(
       before_commit: as `DatasetWriter.finish`.
     """
     first = number == 0
+    teacher, driven = teacher_of(rehearsal, incumbent), None
+    if learner is not None:
+        row = table_rows([str(learner)], ())[0]
+        driven = row.policy, row.params
+    if driven and not rehearsal.weight:
+        teacher, driven = driven, None
     config = DriveConfig(
         duration_s=rehearsal.duration_s,
-        stride_s=rehearsal.stride_s if first else rehearsal.takeover_stride_s,
+        stride_s=rehearsal.takeover_stride_s if driven else rehearsal.stride_s,
         test_fraction=0.0,
     )
     cases = rehearsal.cases if first else rehearsal.takeover_cases
     refs = suite_refs("full", cases, rehearsal.catalogue_seed + number)
-    driven = None
-    if learner is not None:
-        row = table_rows([str(learner)], ())[0]
-        driven = row.policy, row.params
     drive_catalogue(
         refs,
         output,
         config,
-        teacher=teacher_of(rehearsal, incumbent),
+        teacher=teacher,
         learner=driven,
         overwrite=True,
         before_commit=before_commit,
