@@ -3,7 +3,7 @@
 RUN/dataset-KEY/       the import of each log, unless datasets are given
 RUN/rehearsal-KEY/N/   the rehearsed catalogue: the teacher's drives, then each round's
 RUN/rounds/N.msgpack   the reward that the teacher of round N takes over from
-RUN/anchor.json        how far the recordings reach, of an anchored reward
+RUN/anchors/N.json     how far the recordings reach, against N sets of drives
 RUN/train-KEY/seed-N/  training runs; KEY changes with what they are made from
 RUN/seeds/N.msgpack    every seed's reward
 RUN/weights.msgpack    the candidate: of the seeds the one with the median share of
@@ -245,19 +245,14 @@ class Loop:
             learner = None
             if number:
                 learner = self.folder / "rounds" / f"{number}.msgpack"
-                anchor = None
-                if self.config.anchor.wanted:
-                    anchor = self.folder / "rounds" / f"{number}.anchor.json"
-                    self._anchor(sources, given[: len(sources)], drives, anchor)
+                anchor = self._anchor(sources, given[: len(sources)], drives)
                 self._train_round(joined, number, learner, anchor)
             drives.append(self._rehearsed(number, learner))
             if plan.weights[number] > 0.0:
                 made.append(drives[-1])
                 given.append(plan.weights[number])
                 joined = _as_one(made, given)
-        if self.config.anchor.wanted:
-            path = self.folder / "anchor.json"
-            self._anchor(sources, given[: len(sources)], drives, path)
+        self._anchor(sources, given[: len(sources)], drives)
         return joined
 
     def _anchor(
@@ -265,10 +260,11 @@ class Loop:
         sources: Sequence[Dataset],
         shares: Sequence[float],
         drives: list[Dataset],
-        path: Path,
-    ) -> None:
-        """How far the recordings reach, against the rehearsed drives."""
-        config = self.config
+    ) -> Path | None:
+        """How far the recordings reach beside the rehearsed drives; None: no anchor."""
+        config, path = self.config, self._anchor_file(len(drives))
+        if path is None:
+            return None
         inputs = {
             "anchor": dataclasses.asdict(config.anchor),
             "recorded": [one.hash for one in sources],
@@ -282,8 +278,13 @@ class Loop:
             made = fitted_anchor(config.anchor, sources, shares, drives, features)
             write_anchor(path, made)
 
-        name = "anchor" if path.stem == "anchor" else f"anchor of round {len(drives)}"
-        self._run(name, inputs, [path], work)
+        self._run(f"anchor {len(drives)}", inputs, [path], work)
+        return path
+
+    def _anchor_file(self, drives: int) -> Path | None:
+        """Where the anchor against so many sets of drives lies; None: there is none."""
+        wanted = self.config.anchor.wanted
+        return self.folder / "anchors" / f"{drives}.json" if wanted else None
 
     def _rehearsed(self, number: int, learner: Path | None) -> Dataset:
         plan, config = self.config.rehearsal, self.config
@@ -354,8 +355,7 @@ class Loop:
         """Train every seed, export it, choose the median one."""
         inputs, files = self._train_inputs(dataset), self._seed_files()
         judged, anchor = self.config.preferences, None
-        if self.config.anchor.wanted:
-            path = self.folder / "anchor.json"
+        if path := self._anchor_file(self.config.rehearsal.datasets):
             anchor, inputs = read_anchor(path), {**inputs, "anchor": file_sha256(path)}
         for number, file in enumerate(files):
             named = {**inputs, "seed": number}

@@ -247,6 +247,17 @@ class Ray:
             ) from error
 
 
+def two_at_a_time(
+    work: Callable[[Item], Result], items: Iterable[Item]
+) -> list[Result]:
+    """`work` of every item in their order, in two threads of this process.
+
+    For work that compiles longer than it computes: one compiles, another computes.
+    """
+    with futures.ThreadPoolExecutor(2) as pool:
+        return list(pool.map(work, items))
+
+
 def make_executor(
     name: str, *, workers: int = 1, ray_address: str = "auto"
 ) -> Executor:

@@ -32,10 +32,11 @@ class Rehearsal:
 
     # one of TEACHERS
     teacher: str = "none"
-    # cases of each family that the teacher drives, and those of a round of takeovers
+    # cases of each family that the teacher drives, and those of a further round
     cases: int = 12
     takeover_cases: int = 16
-    # rounds in which it takes over from the reward learned so far
+    # further rounds: the teacher takes over from the reward learned so far, or (weight
+    # 0) that reward drives alone
     rounds: int = 1
     # seed of the cases; round r has this one plus r
     catalogue_seed: int = 1000

@@ -146,18 +146,10 @@ def check_of(
     p: float | None = None,
     note: str = "",
 ) -> Check:
-    """A check with the mean and the interval of a difference.
+    """A check with the mean and interval of a difference, candidate minus the other.
 
-    Args:
-      kind: as in `Check`, like all others here.
-      name: likewise.
-      title: likewise.
-      outcome: likewise.
-      found: candidate minus the other; its own p is not the check's.
-      margin: likewise.
-      pairs: (gained, lost) cases, where cases are counted.
-      p: likewise.
-      note: likewise.
+    The arguments are fields of `Check`; `pairs` are (gained, lost) cases where those
+    are counted, and the difference's own p is not the check's.
     """
     gained, lost = pairs or (None, None)
     return Check(

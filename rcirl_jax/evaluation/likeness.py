@@ -13,7 +13,6 @@ collision are: the Jensen-Shannon distance of histograms over all drives, 0 to 1
 numpy, float64.
 """
 
-import concurrent.futures
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -37,6 +36,7 @@ from rcirl_jax.evaluation.statistics import (
     paired_difference,
 )
 from rcirl_jax.evaluation.suite_output import text_table
+from rcirl_jax.executor import two_at_a_time
 from rcirl_jax.simulation.cases import STEP_S, Record
 from rcirl_jax.simulation.recorded_scenes import STEPS, HeldOut
 from rcirl_jax.simulation.rollout import LANES, drive_cases
@@ -245,10 +245,8 @@ def held_out_likeness(
         raise InputError(f"held-out drives: rows {names}: expected distinct names")
     others = [row for row in rows if row.name != RECORDED_HUMAN]
     every = [human_row(), *others]
-    # the drives are short: one row compiles while another drives
-    with concurrent.futures.ThreadPoolExecutor(2) as pool:
-        made = pool.map(lambda row: _driven(row, drives, plan_every), every)
-        found = {row.name: one for row, one in zip(every, made, strict=True)}
+    made = two_at_a_time(lambda row: _driven(row, drives, plan_every), every)
+    found = {row.name: one for row, one in zip(every, made, strict=True)}
     return LikenessReport(
         rows=found,
         ids=drives.ids,

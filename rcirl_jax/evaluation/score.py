@@ -61,10 +61,11 @@ Scorer = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class OnTop:
-    """A value that is added to a baseline's."""
+    """A reward on top of a baseline's values."""
 
     incumbent: str  # of BASELINES
-    value: Scorer
+    # (features [..., T, F], the incumbent's values [...], time_valid [..., T]) -> [...]
+    total: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 # a rival with parameters; `fields()` is what may be traced of it
@@ -329,8 +330,7 @@ def _with_values(made: dict, scorers: Mapping[str, Scorer | OnTop]) -> dict:
     for name, scorer in scorers.items():
         for values, features, counts in tables:
             if isinstance(scorer, OnTop):
-                own = values[scorer.incumbent]
-                values[name] = own + scorer.value(features, counts)
+                values[name] = scorer.total(features, values[scorer.incumbent], counts)
             else:
                 values[name] = scorer(features, counts)
     return made

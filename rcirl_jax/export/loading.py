@@ -88,13 +88,7 @@ def scorer_of(reward: Reward) -> Scorer | OnTop:
     """The reward as a row of ranking tables: V, on top of its anchor if it has one."""
     if reward.anchor is None:
         return reward.value
-    return OnTop(
-        incumbent=reward.anchor.incumbent, value=functools.partial(_gained, reward)
-    )
-
-
-def _gained(reward: Reward, features: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    return reward.gain(features) * reward.value(features, valid)
+    return OnTop(incumbent=reward.anchor.incumbent, total=reward.total)
 
 
 def compiled_scorer(reward: Reward) -> Scorer:

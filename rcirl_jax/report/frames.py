@@ -12,10 +12,10 @@ import numpy as np
 from rcirl_jax.data.joined import Demonstrations
 from rcirl_jax.evaluation.attribution import attribute
 from rcirl_jax.evaluation.score import candidates_key
+from rcirl_jax.export.closed_loop import incumbent_score
 from rcirl_jax.export.loading import reward_params
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.features import feature_map
-from rcirl_jax.planner.rank import hand_score
 from rcirl_jax.report import plots
 from rcirl_jax.sampling import SamplerConfig, sample
 from rcirl_jax.train.metrics import read_metrics
@@ -105,7 +105,8 @@ def _driven_by(
     """[K] what the candidates are ranked by: V, on top of the own cost if anchored."""
     if reward.anchor is None:
         return reward.value(x, mask)
-    return reward.total(x, np.asarray(hand_score(None, scene, candidates)), mask)
+    own, weights = incumbent_score(reward.anchor.incumbent)
+    return reward.total(x, np.asarray(own(weights, scene, candidates)), mask)
 
 
 def draw_frame(

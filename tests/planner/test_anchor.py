@@ -54,9 +54,8 @@ def test_the_gain_goes_from_low_to_high_with_the_support(tmp_path, offset, gain)
     scorer = scorer_of(reward)
     assert isinstance(scorer, OnTop)
     assert scorer.incumbent == "hand-set"
-    np.testing.assert_allclose(
-        scorer.value(features, valid), gain * ours, rtol=1e-4, atol=1e-4
-    )
+    ranked = scorer.total(features, np.asarray(theirs), valid)
+    np.testing.assert_array_equal(ranked, total)
 
 
 def test_the_support_is_the_equation():
