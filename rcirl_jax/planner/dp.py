@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 
 from rcirl_jax.features import FeatureMap
+from rcirl_jax.planner.commitment import InForce, committed
 from rcirl_jax.planner.grid import (
     FEASIBLE,
     FORBIDDEN,
@@ -329,8 +330,8 @@ def dp_policy(
     """
     score = learned_score(features, activation)
 
-    def policy(
-        params: Weights, scene: Scene, key: jax.Array, before: Plan | None = None
+    def anew(
+        params: Weights, scene: Scene, key: jax.Array, in_force: InForce | None
     ) -> Plan:
         sampled = sample(key, scene, rank.sampler)
         plan = plan_dp(scene, params, features, activation, config)
@@ -340,9 +341,11 @@ def dp_policy(
             feasible=join(sampled.feasible, plan.feasible),
             family=join(sampled.family, jnp.asarray(family_index("cruise"))),
         )
-        if before is not None:
-            candidates = with_plan_in_force(scene, candidates, before, rank.sampler)
+        before = None
+        if in_force is not None:
+            before, rest = in_force
+            candidates = with_plan_in_force(candidates, rest)
         scores = score(params, scene, candidates)
         return best_plan(scene, candidates, scores, rank, before)
 
-    return policy
+    return committed(anew, rank.sampler, rank.safety, rank.commitment)

@@ -32,6 +32,7 @@ class Plan(flax.struct.PyTreeNode, kw_only=True):
     v: jax.Array  # [T] m/s
     a: jax.Array  # [T] m/s^2
     since: jax.Array  # [] s since it was made
+    since_choice: jax.Array  # [] s since it was last chosen, made or confirmed
     lasts: jax.Array  # [] bool: may be gone on with at the next planning step
     urgent: jax.Array  # [] bool: brakes at once, without leading up to it
     fallback: jax.Array  # [] bool: no candidate was admissible
@@ -52,6 +53,7 @@ def plan_of(
         v=chosen.v,
         a=chosen.a,
         since=jnp.zeros(()),
+        since_choice=jnp.zeros(()),
         lasts=jnp.asarray(lasts),
         urgent=jnp.asarray(urgent),
         fallback=jnp.asarray(fallback),
@@ -75,6 +77,7 @@ def held(v: jax.Array, a: jax.Array) -> Plan:
         v=v + a * until,
         a=jnp.full_like(times, a),
         since=jnp.zeros(()),
+        since_choice=jnp.zeros(()),
         lasts=jnp.zeros((), bool),
         urgent=jnp.zeros((), bool),
         fallback=jnp.zeros((), bool),
@@ -106,6 +109,13 @@ def command(plan: Plan, v: jax.Array) -> jax.Array:
     eased = jnp.maximum(stopping, -(EASED_MPS2 + v / EASING_S))
     stopping = jnp.where(plan.urgent, stopping, eased)
     return jnp.where(rests, jnp.minimum(wanted, stopping), wanted)
+
+
+def later(plan: Plan, seconds: float) -> Plan:
+    """The same plan, some time on."""
+    return plan.replace(
+        since=plan.since + seconds, since_choice=plan.since_choice + seconds
+    )
 
 
 def stations_from_now(plan: Plan) -> jax.Array:

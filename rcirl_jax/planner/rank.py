@@ -14,15 +14,14 @@ import jax
 import jax.numpy as jnp
 
 from rcirl_jax.features import FeatureMap
-from rcirl_jax.geometry.running import running_max
 from rcirl_jax.planner.baselines import Idm, idm_acceleration
-from rcirl_jax.planner.plan import Plan, held, plan_of, stations_from_now
+from rcirl_jax.planner.commitment import InForce, committed
+from rcirl_jax.planner.plan import Plan, held, plan_of
 from rcirl_jax.planner.safety import SafetyConfig, check, choose
 from rcirl_jax.reward.hand import LatticeCost, lattice_costs
 from rcirl_jax.reward.network import ACTIVATIONS, rows_value
 from rcirl_jax.reward.speed_dp import speed_dp_cost
-from rcirl_jax.sampling import SamplerConfig, sample, trajectory_on_path
-from rcirl_jax.sampling.sampler import within_limits
+from rcirl_jax.sampling import SamplerConfig, sample
 from rcirl_jax.sampling.speed import family_index
 from rcirl_jax.types import (
     Candidates,
@@ -36,7 +35,7 @@ Params = Any  # a score's weights: any pytree
 Score = Callable[[Params, Scene, Candidates], jax.Array]  # -> [K], higher is better
 Policy = Callable[..., Plan]  # (params, scene, key, plan in force) -> Plan
 
-LONGEST_S = 4.0  # s after which a plan in force is no longer kept for its own sake
+LONGEST_S = 4.0  # s after which a plan in force gives way to one that is made anew
 
 # The closed loop's grid: 64 candidates, all families of the offline sampler.
 ONLINE = SamplerConfig(
@@ -58,10 +57,8 @@ class RankConfig:
 
     sampler: SamplerConfig = ONLINE
     safety: SafetyConfig = dataclasses.field(default_factory=SafetyConfig)
-    # s for which a plan is kept as long as it is admissible
+    # s for which a plan is kept, once chosen, as long as it is admissible
     commitment: float = 1.0
-    # 1, lead of a new plan, in standard deviations of the scores, that replaces it
-    hysteresis: float = 0.0
 
 
 @functools.lru_cache(maxsize=16)
@@ -118,20 +115,9 @@ def speed_dp_score(params: None, scene: Scene, candidates: Candidates) -> jax.Ar
     return -jax.vmap(lambda x: speed_dp_cost(scene, x))(candidates.trajectory)
 
 
-def with_plan_in_force(
-    scene: Scene, candidates: Candidates, before: Plan, config: SamplerConfig
-) -> Candidates:
-    """The candidates and, last, the rest of the plan in force (infeasible if none)."""
-    stations = running_max(scene.ego.s + stations_from_now(before))
-    rest = trajectory_on_path(scene, stations)
-    join = lambda many, one: jnp.concatenate([many, one[None]])  # noqa: E731
-    return Candidates(
-        trajectory=jax.tree.map(join, candidates.trajectory, rest),
-        feasible=join(
-            candidates.feasible, before.lasts & within_limits(scene, rest, config)
-        ),
-        family=join(candidates.family, jnp.asarray(family_index("in_force"))),
-    )
+def with_plan_in_force(candidates: Candidates, rest: Candidates) -> Candidates:
+    """The candidates and, last, the rest of the plan in force [1]."""
+    return jax.tree.map(lambda *x: jnp.concatenate(x), candidates, rest)
 
 
 def best_plan(
@@ -143,10 +129,8 @@ def best_plan(
 ) -> Plan:
     """The candidate that `safety.choose` takes, as a plan.
 
-    With `before`, the last candidate is the rest of the plan in force. It is kept while
-    it is admissible and either younger than `commitment` or hardly worse than the best:
-
-        V_best - V_in_force <= hysteresis * std of the admissible scores
+    With `before`, the last candidate is the rest of the plan in force. Where that is
+    the best, it is confirmed: followed as it was made, not drawn again from its rest.
 
     A feasible candidate whose score is not finite is a fault that no choice may hide:
     the plan is NaN then, and so are the drive's numbers, by which a suite names
@@ -156,7 +140,7 @@ def best_plan(
       scene: of the candidates.
       candidates: K of them.
       scores: [K].
-      config: filter and commitment.
+      config: the filter's.
       before: the plan in force.
     """
     verdict = check(scene, candidates, config.safety)
@@ -174,15 +158,9 @@ def best_plan(
     )
     if before is None:
         return fresh
-    allowed = verdict.admissible
-    share = allowed / jnp.maximum(count, 1)
-    finite = jnp.where(allowed, scores, 0.0)
-    mean = jnp.sum(share * finite)
-    spread = jnp.sqrt(jnp.sum(share * (finite - mean) ** 2))
-    near = scores[index] - scores[-1] <= config.hysteresis * spread
-    young = before.since < config.commitment
-    keeps = known & allowed[-1] & (near | young) & (before.since < LONGEST_S)
-    kept = before.replace(admissible=count)
+    keeps = known & verdict.admissible[-1] & (scores[-1] >= scores[index])
+    keeps = keeps & (before.since < LONGEST_S)
+    kept = before.replace(since_choice=jnp.zeros(()), admissible=count)
     return jax.tree.map(lambda old, new: jnp.where(keeps, old, new), kept, fresh)
 
 
@@ -190,16 +168,18 @@ def best_plan(
 def rank_policy(score: Score, config: RankConfig) -> Policy:
     """The planner that drives the admissible candidate of the highest score."""
 
-    def policy(
-        params: Params, scene: Scene, key: jax.Array, before: Plan | None = None
+    def anew(
+        params: Params, scene: Scene, key: jax.Array, in_force: InForce | None
     ) -> Plan:
         candidates = sample(key, scene, config.sampler)
-        if before is not None:
-            candidates = with_plan_in_force(scene, candidates, before, config.sampler)
+        before = None
+        if in_force is not None:
+            before, rest = in_force
+            candidates = with_plan_in_force(candidates, rest)
         scores = score(params, scene, candidates)
         return best_plan(scene, candidates, scores, config, before)
 
-    return policy
+    return committed(anew, config.sampler, config.safety, config.commitment)
 
 
 @functools.lru_cache(maxsize=8)

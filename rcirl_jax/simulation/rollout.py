@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.planner.plan import Plan, command, no_plan, stations_from_now
+from rcirl_jax.planner.plan import Plan, command, later, no_plan, stations_from_now
 from rcirl_jax.simulation import lines as signals
 from rcirl_jax.simulation.cases import STEP_S, Case, Record, Snapshot, World
 from rcirl_jax.simulation.observe import observe, road_limit
@@ -115,7 +115,7 @@ def drive_case(
                 config.follow_log,
             )
             shot = _snapshot(case, now, after, ahead) if config.snapshots else None
-            ahead = ahead.replace(since=ahead.since + STEP_S)
+            ahead = later(ahead, STEP_S)
             return (after, waiting, ahead), (record, shot)
 
         begin = (world, queue, plan)

@@ -14,6 +14,7 @@ from rcirl_jax.planner.plan import (
     ACTUATOR_LAG_S,
     COMMAND_STEP_S,
     command,
+    later,
     no_plan,
     plan_of,
     stations_from_now,
@@ -97,11 +98,11 @@ def test_command_leads_the_lag_so_that_the_plan_is_met():
     reached = 0.5 + (asked - 0.5) * moved
     assert reached == pytest.approx(0.5 + COMMAND_STEP_S / (8 / 17), rel=1e-3)
     # half an interval later the planned acceleration is half way on
-    later = plan_of(x).replace(since=jnp.asarray(0.5 * 8 / 17))
+    rest = plan_of(x).replace(since=jnp.asarray(0.5 * 8 / 17))
     rise = float(x.a[2]) - 1.5
     lead = COMMAND_STEP_S / moved - 0.5 * 8 / 17
     wanted = 1.5 + rise * lead * 17 / 8
-    assert float(command(later, x.v[0])) == pytest.approx(wanted, rel=1e-3)
+    assert float(command(rest, x.v[0])) == pytest.approx(wanted, rel=1e-3)
 
 
 def test_a_plan_goes_on_where_it_was():
@@ -111,28 +112,36 @@ def test_a_plan_goes_on_where_it_was():
     plan = plan_of(x)
     np.testing.assert_allclose(stations_from_now(plan), x.s, atol=1e-4)
     step = 3 * 8 / 17
-    later = stations_from_now(plan.replace(since=jnp.asarray(step)))
-    np.testing.assert_allclose(later[:-3], x.s[3:] - x.s[3], atol=1e-3)
+    rest = stations_from_now(later(plan, step))
+    np.testing.assert_allclose(rest[:-3], x.s[3:] - x.s[3], atol=1e-3)
     beyond = x.s[-1] - x.s[3] + step * x.v[-1]
-    assert float(later[-1]) == pytest.approx(float(beyond), rel=1e-4)
+    assert float(rest[-1]) == pytest.approx(float(beyond), rel=1e-4)
 
 
 def test_the_plan_in_force_is_kept_while_it_is_admissible_and_young():
     made, key = with_obstacle(Kind.NONE, 0.0, 0.0, v=8.0), jax.random.key(0)
     slow = lambda _, scene, x: -x.trajectory.v[:, -1]  # noqa: E731
     fast = lambda _, scene, x: x.trajectory.v[:, -1]  # noqa: E731
-    config = RankConfig(commitment=1.0, hysteresis=0.0)
+    config = RankConfig(commitment=1.0)
     first = jax.jit(rank_policy(fast, config))(None, made, key, no_plan())
     assert float(first.since) == 0.0
     assert bool(first.lasts)
     policy = jax.jit(rank_policy(slow, config))
     for since, kept in ((0.5, True), (1.5, False)):
-        aged = first.replace(since=jnp.asarray(since))
-        found = policy(None, made, key, aged)
+        found = policy(None, made, key, later(first, since))
         assert (float(found.since) == since) is kept
     wall = with_obstacle(Kind.VEHICLE, 12.0, 0.0, v=8.0, speed=0.0)
-    aged = first.replace(since=jnp.asarray(0.5))
-    assert float(policy(None, wall, key, aged).since) == 0.0
+    assert float(policy(None, wall, key, later(first, 0.5)).since) == 0.0
+
+
+def test_a_plan_in_force_that_is_still_the_best_is_confirmed():
+    made, key = with_obstacle(Kind.NONE, 0.0, 0.0, v=8.0), jax.random.key(0)
+    last = lambda _, scene, x: jnp.arange(x.feasible.size, dtype=jnp.float32)  # noqa: E731
+    policy = jax.jit(rank_policy(last, RankConfig(commitment=1.0)))
+    first = policy(None, made, key, no_plan())
+    found = policy(None, made, key, later(first, 1.5))
+    assert float(found.since) == 1.5
+    assert float(found.since_choice) == 0.0
 
 
 def test_a_plan_that_rests_within_the_first_interval_is_braked_to_rest():
