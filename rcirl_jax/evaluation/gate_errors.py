@@ -7,15 +7,27 @@
     redrawn     one driver against itself, on the cases of two seeds of the catalogue:
                 equal, and the drives have nothing to do with each other
     as driven   a pair that is better or worse, or that nobody knows the truth of
+    constructed hand-set against itself with other random candidates (equal), with a
+                lower wanted speed (worse), with some drives of IDM, which has more
+                faults (worse), and the slower one as incumbent (better)
 
 What a gate detects in an equal pair is a false alarm. Rates depend on the number of
-cases: at ten cases a family hardly anything can be detected. Host numpy.
+cases: at ten cases a family hardly anything can be detected, and margins of a quarter
+of a percent cannot be shown, so nothing ships.
+
+Nobody is compared with recordings here. Pairs of `pair_between` count as equally near
+to the human, so that the check of likeness passes and gains nothing; a config without
+nulls leaves out that the candidate is ahead of rewards that know nothing. Every other
+check is the gate's. To ship then takes every check of safety, of no loss and of
+families passed, and a gain in a metric. The rule that nothing ships on a part of the
+suite is left out too. Host numpy, but for the drivers.
 """
 
 import dataclasses
+import functools
 import itertools
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from typing import get_args
 
 import jax
 import numpy as np
@@ -24,13 +36,87 @@ from scipy.special import betaincinv
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.exact import CONFIDENCE
 from rcirl_jax.evaluation.gate import judge
-from rcirl_jax.evaluation.gate_types import Decision, GateConfig, Pair, Verdict
+from rcirl_jax.evaluation.gate_stats import MIN_CLUSTERS
+from rcirl_jax.evaluation.gate_types import (
+    CANDIDATE,
+    INCUMBENT,
+    Decision,
+    GateConfig,
+    Likeness,
+    Pair,
+    Verdict,
+)
+from rcirl_jax.evaluation.suite_files import SuiteRuns
 from rcirl_jax.evaluation.suite_output import text_table
+from rcirl_jax.planner.baselines import Idm
+from rcirl_jax.planner.plan import Plan
+from rcirl_jax.planner.rank import (
+    Params,
+    Policy,
+    RankConfig,
+    hand_score,
+    idm_policy,
+    rank_policy,
+)
+from rcirl_jax.reward.hand import LatticeCost
 from rcirl_jax.simulation.metrics import CaseMetrics
+from rcirl_jax.simulation.rows import Row, tuned_row
+from rcirl_jax.types import Scene
 
 # what a verdict may say: a failed check of a kind, any of them, a gain
 SAID = ("safety", "no loss", "families", "refused", "gain")
+DECISIONS: tuple[Decision, ...] = get_args(Decision)
 COINS = 7919  # of the coins' random stream, which nothing else may share
+MIXES = 7927  # of the mixes' random stream
+OTHER_STREAM = 1  # fold_in number of the other candidates' keys
+
+# rows that constructed pairs are made of
+HAND_SET, IDM = "hand-set", "IDM"
+OTHER, SLOWER, SLOWEST = (
+    f"{HAND_SET}, {what}" for what in ("other candidates", "5 % slower", "20 % slower")
+)
+SPEED_SHARES = {SLOWER: 0.95, SLOWEST: 0.8}  # 1, wanted speed as a share of the limit
+
+# recordings that tell nobody from anybody
+ALIKE = Likeness(
+    distance=dict.fromkeys((CANDIDATE, INCUMBENT), np.ones(MIN_CLUSTERS)),
+    clusters=np.arange(MIN_CLUSTERS),
+)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Constructed:
+    """A pair of drivers, one of which is made from the other."""
+
+    name: str
+    truth: str  # "equal", "better" or "worse", of the candidate
+    candidate: str = HAND_SET  # a row
+    incumbent: str = HAND_SET
+    # a row that drives a share of the candidate's cases, or of those with its own fault
+    mixed_in: str = ""
+    share: float = 0.0
+    faulty: bool = False
+
+
+CONSTRUCTED = (
+    Constructed(name=OTHER, truth="equal", candidate=OTHER),
+    Constructed(name=SLOWER, truth="worse", candidate=SLOWER),
+    Constructed(name=SLOWEST, truth="worse", candidate=SLOWEST),
+    Constructed(
+        name=f"{HAND_SET}, {IDM} in 5 % of the cases",
+        truth="worse",
+        mixed_in=IDM,
+        share=0.05,
+    ),
+    Constructed(
+        name=f"{HAND_SET}, {IDM} where it is at fault",
+        truth="worse",
+        mixed_in=IDM,
+        share=1.0,
+        faulty=True,
+    ),
+    Constructed(name=f"{HAND_SET} for 5 % slower", truth="better", incumbent=SLOWER),
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -39,12 +125,22 @@ class Tally:
 
     name: str
     truth: str  # "equal", "better", "worse" or "unknown", of the candidate
-    said: np.ndarray  # [S, D, len(SAID)] bool
-    decisions: Mapping[Decision, int]
+    said: np.ndarray  # [S, D, len(SAID + DECISIONS)] bool
+    cases: int  # of a suite
+    drives: Mapping[str, object] = dataclasses.field(default_factory=dict)  # `compared`
+
+    def of(self, what: str) -> np.ndarray:
+        """[S, D] bool: which verdicts say `what`, one of `SAID` or `DECISIONS`."""
+        return self.said[:, :, (*SAID, *DECISIONS).index(what)]
 
     def rate(self, what: str) -> tuple[float, float, float]:
         """Share of the verdicts that say `what`, with its 95 % interval."""
-        return clustered_rate(self.said[:, :, SAID.index(what)])
+        return clustered_rate(self.of(what))
+
+    @property
+    def decisions(self) -> dict[Decision, int]:
+        """Number of verdicts by decision, without those that were never taken."""
+        return {w: int(self.of(w).sum()) for w in DECISIONS if self.of(w).any()}
 
 
 def clustered_rate(events: np.ndarray) -> tuple[float, float, float]:
@@ -78,18 +174,48 @@ def swapped(pair: Pair, rng: np.random.Generator, *, by_family: bool = False) ->
     else:
         coin = rng.random(len(pair.ids)) < 0.5
 
-    def chosen(heads: CaseMetrics, tails: CaseMetrics) -> CaseMetrics:
-        def pick(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-            a, b = np.asarray(a), np.asarray(b)
-            return np.where(coin.reshape(-1, *[1] * (a.ndim - 1)), a, b)
-
-        return jax.tree.map(pick, heads, tails)
-
     return dataclasses.replace(
         pair,
-        candidate=chosen(pair.incumbent, pair.candidate),
-        incumbent=chosen(pair.candidate, pair.incumbent),
+        candidate=_chosen(coin, pair.incumbent, pair.candidate),
+        incumbent=_chosen(coin, pair.candidate, pair.incumbent),
     )
+
+
+def _chosen(
+    where: np.ndarray, there: CaseMetrics, elsewhere: CaseMetrics
+) -> CaseMetrics:
+    """The drives of `there` in the cases `where` [C], of `elsewhere` in the others."""
+
+    def pick(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        a, b = np.asarray(a), np.asarray(b)
+        return np.where(where.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+
+    return jax.tree.map(pick, there, elsewhere)
+
+
+def mixed(
+    drives: CaseMetrics,
+    others: CaseMetrics,
+    among: np.ndarray,
+    share: float,
+    rng: np.random.Generator,
+) -> CaseMetrics:
+    """Some drives exchanged for another driver's of the same cases.
+
+    Args:
+      drives: leaves [C, ...].
+      others: likewise.
+      among: [C] bool, the n cases of which some are drawn.
+      share: of them that are drawn, within (0, 1].
+      rng: draws which.
+
+    Returns:
+      Leaves [C, ...]: those of `others` in round(share n) cases, else of `drives`.
+    """
+    places = np.flatnonzero(among)
+    where = np.zeros(len(among), bool)
+    where[rng.choice(places, round(share * places.size), replace=False)] = True
+    return _chosen(where, others, drives)
 
 
 def redrawn(first: Pair, second: Pair) -> Pair:
@@ -103,10 +229,117 @@ def redrawn(first: Pair, second: Pair) -> Pair:
     return dataclasses.replace(second, candidate=first.incumbent)
 
 
+def pair_between(runs: SuiteRuns, candidate: str, incumbent: str) -> Pair:
+    """Two rows of a driven suite, equally near to the human; without nulls.
+
+    Raises:
+      InputError: the suite has no such rows.
+    """
+    for name in (candidate, incumbent):
+        if name not in runs.rows:
+            raise InputError(f"{name}: expected a row of {', '.join(runs.rows)}")
+    return Pair(
+        candidate=runs.rows[candidate],
+        incumbent=runs.rows[incumbent],
+        families=runs.groups,
+        ids=runs.ids,
+        reference=np.asarray(runs.way, np.float64),
+        preventable=np.asarray(runs.preventable, bool),
+        likeness=ALIKE,
+    )
+
+
+def joined(pairs: Sequence[Pair]) -> Pair:
+    """The cases of several suites, all different, as one suite."""
+    return dataclasses.replace(
+        pairs[0],
+        candidate=_stacked([pair.candidate for pair in pairs]),
+        incumbent=_stacked([pair.incumbent for pair in pairs]),
+        families=[name for pair in pairs for name in pair.families],
+        ids=[name for pair in pairs for name in pair.ids],
+        reference=np.concatenate([pair.reference for pair in pairs]),
+        preventable=np.concatenate([pair.preventable for pair in pairs]),
+    )
+
+
+def _stacked(drives: Sequence[CaseMetrics]) -> CaseMetrics:
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *drives)
+
+
+@functools.lru_cache(maxsize=4)
+def other_candidates(policy: Policy, stream: int) -> Policy:
+    """The same planner with other random candidates: `stream` folded into its key."""
+
+    def other(
+        params: Params, scene: Scene, key: jax.Array, before: Plan | None = None
+    ) -> Plan:
+        return policy(params, scene, jax.random.fold_in(key, stream), before)
+
+    return other
+
+
+def constructed_rows() -> list[Row]:
+    """The rows that `CONSTRUCTED` names: three of hand-set's making, it, and IDM."""
+    config = RankConfig()
+    policy = rank_policy(hand_score, config)
+    slower = [
+        dataclasses.replace(tuned_row(LatticeCost(speed_share=x), config), name=name)
+        for name, x in SPEED_SHARES.items()
+    ]
+    return [
+        Row(name=HAND_SET, policy=policy),
+        Row(name=OTHER, policy=other_candidates(policy, OTHER_STREAM)),
+        *slower,
+        Row(name=IDM, policy=idm_policy(Idm())),
+    ]
+
+
+def constructed(
+    suites: Sequence[SuiteRuns], config: GateConfig, together: int = 1, seed: int = 0
+) -> list[Tally]:
+    """The gate on the pairs of `CONSTRUCTED`.
+
+    Args:
+      suites: drives of `constructed_rows`, one suite per seed of the catalogue.
+      config: margins, without nulls.
+      together: seeds that are judged as one suite besides; 1: none.
+      seed: of the mixes.
+
+    Returns:
+      A tally for each pair with one verdict per seed; then, with `together` above 1,
+      a tally for each with one verdict for every so many seeds.
+
+    Raises:
+      InputError: a suite lacks a row, there are nulls, or fewer suites than `together`.
+    """
+    if together > len(suites):
+        raise InputError(f"--together: {together}: expected at most {len(suites)}")
+    rng = np.random.default_rng([seed, MIXES])
+    alone, more = [], []
+    for made in CONSTRUCTED:
+        pairs = [_pair_of(made, runs, rng) for runs in suites]
+        alone.append(as_driven(made.name, made.truth, pairs, config))
+        if together > 1:
+            firsts = range(0, len(pairs) - together + 1, together)
+            large = [joined(pairs[first : first + together]) for first in firsts]
+            more.append(as_driven(made.name, made.truth, large, config))
+    return alone + more
+
+
+def _pair_of(made: Constructed, runs: SuiteRuns, rng: np.random.Generator) -> Pair:
+    pair = pair_between(runs, made.candidate, made.incumbent)
+    if not made.mixed_in:
+        return pair
+    others = pair_between(runs, made.mixed_in, made.incumbent).candidate
+    faults = np.asarray(others.at_fault) > 0
+    among = faults if made.faulty else np.ones_like(faults)
+    drives = mixed(pair.candidate, others, among, made.share, rng)
+    return dataclasses.replace(pair, candidate=drives)
+
+
 def tally(name: str, truth: str, suites: Iterable[Iterable[Verdict]]) -> Tally:
     """Count what was said; `suites` hold equally many verdicts each."""
-    decisions: Counter[Decision] = Counter()
-    said = []
+    said, cases = [], 0
     for verdicts in suites:
         rows = []
         for verdict in verdicts:
@@ -115,14 +348,15 @@ def tally(name: str, truth: str, suites: Iterable[Iterable[Verdict]]) -> Tally:
                 c.kind == "gain" and c.outcome == "pass" for c in verdict.checks
             )
             kinds = [kind in failed for kind in SAID[:3]]
-            rows.append([*kinds, bool(failed), gained])
-            decisions[verdict.decision] += 1
+            decided = [verdict.decision == what for what in DECISIONS]
+            rows.append([*kinds, bool(failed), gained, *decided])
+            cases = verdict.cases
         said.append(rows)
     return Tally(
         name=name,
         truth=truth,
-        said=np.array(said, bool).reshape(len(said), -1, len(SAID)),
-        decisions=dict(decisions),
+        said=np.array(said, bool).reshape(len(said), -1, len(SAID + DECISIONS)),
+        cases=cases,
     )
 
 
@@ -163,8 +397,32 @@ def equal_pairs(
 def as_driven(
     name: str, truth: str, pairs: Sequence[Pair], config: GateConfig
 ) -> Tally:
-    """The gate on pairs as they are."""
-    return tally(name, truth, ([judge(pair, config)] for pair in pairs))
+    """The gate on pairs as they are, and how their drives compare."""
+    found = tally(name, truth, ([judge(pair, config)] for pair in pairs))
+    mine = _stacked([pair.candidate for pair in pairs])
+    theirs = _stacked([pair.incumbent for pair in pairs])
+    return dataclasses.replace(found, drives=compared(mine, theirs))
+
+
+def compared(mine: CaseMetrics, theirs: CaseMetrics) -> dict[str, object]:
+    """How the drives of two rows on the same cases differ, by name.
+
+    Args:
+      mine: leaves [C, ...].
+      theirs: likewise.
+
+    Returns:
+      "way": mean progress, as a share of theirs; "cases_that_differ": cases of another
+      progress; "cases_with_own_fault" and "cases_with_red_light": [mine, theirs].
+    """
+    way, other = (np.asarray(x.progress, np.float64) for x in (mine, theirs))
+    count = lambda m, field: int(np.sum(np.asarray(getattr(m, field)) > 0))  # noqa: E731
+    return {
+        "way": float(way.mean() / other.mean()),
+        "cases_that_differ": int(np.sum(way != other)),
+        "cases_with_own_fault": [count(m, "at_fault") for m in (mine, theirs)],
+        "cases_with_red_light": [count(m, "red_lights") for m in (mine, theirs)],
+    }
 
 
 def every_pair(
@@ -182,34 +440,39 @@ def every_pair(
         a, b = rows[mine], rows[theirs]
         verdict = judge(dataclasses.replace(pair, candidate=a, incumbent=b), config)
         failed = [c.name for c in verdict.checks if c.outcome == "fail"]
-        count = lambda m, field: int(np.sum(np.asarray(getattr(m, field)) > 0))  # noqa: E731
         found.append(
             {
                 "candidate": mine,
                 "incumbent": theirs,
                 "decision": verdict.decision,
                 "failed": failed,
-                "way": float(np.mean(a.progress) / np.mean(b.progress)),
-                "cases_with_own_fault": [count(m, "at_fault") for m in (a, b)],
-                "cases_with_red_light": [count(m, "red_lights") for m in (a, b)],
+                **compared(a, b),
             }
         )
     return found
 
 
 def format_errors(tallies: Sequence[Tally]) -> str:
-    """One line per kind of pair, shares of verdicts with 95 % intervals."""
-    header = ["", "candidate is", "verdicts", *SAID]
-    rows = [
-        [
-            found.name,
-            found.truth,
-            f"{found.said[:, :, 0].size:,}",
-            *(_share(found.rate(what)) for what in SAID),
+    """Shares of verdicts with 95 % intervals: what was decided, then what was said.
+
+    Returns:
+      Two tables, each with one line per kind of pair.
+    """
+    lines = []
+    for columns in (DECISIONS, SAID):
+        header = ["", "candidate is", "cases", "verdicts", *columns]
+        rows = [
+            [
+                found.name,
+                found.truth,
+                f"{found.cases:,}",
+                f"{found.of(columns[0]).size:,}",
+                *(_share(found.rate(what)) for what in columns),
+            ]
+            for found in tallies
         ]
-        for found in tallies
-    ]
-    return "\n".join(text_table(header, rows)) + "\n"
+        lines += [*text_table(header, rows), ""]
+    return "\n".join(lines)
 
 
 def _share(rate: tuple[float, float, float]) -> str:

@@ -11,16 +11,30 @@ from rcirl_jax.evaluation.closed_loop import (
     drive_here,
     run_suite,
 )
+from rcirl_jax.evaluation.gate_errors import constructed_rows
 from rcirl_jax.evaluation.gate_runs import CANDIDATE, INCUMBENT, repeats
 from rcirl_jax.executor import Executor
 from rcirl_jax.export.spread import SuiteJob, spread
 from rcirl_jax.simulation.cases import STEP_S
-from rcirl_jax.simulation.rows import BASELINES
+from rcirl_jax.simulation.rows import BASELINES, Row
 from rcirl_jax.simulation.suite import FULL_S, SMOKE_S, CaseRef, suite_refs
 
 
+class ErrorsJob(SuiteJob):
+    """A suite that drivers of known truth drive too, or alone where it has no weights.
+
+    Made of a job by `ErrorsJob(**vars(job))`.
+    """
+
+    def rows(self) -> list[Row]:
+        """The rows of a job with weights, then those made from hand-set."""
+        others = super().rows() if self.weights else []
+        known = {row.name: row for row in (*others, *constructed_rows())}
+        return [*known.values()]
+
+
 def gate_job(
-    candidate: str,
+    candidate: str | None,
     incumbent: str,
     *,
     suite: str,
@@ -35,7 +49,7 @@ def gate_job(
     """The suite that both drive, and the name of the incumbent's row.
 
     Args:
-      candidate: weights file.
+      candidate: weights file; None: for an `ErrorsJob` without one.
       incumbent: weights file, or the name of a baseline.
       suite: full, smoke, or families with commas.
       cases: per family; None: as declared.
@@ -59,9 +73,11 @@ def gate_job(
             + ", ".join(BASELINES)
         )
     names = [*rivals] if learned else [incumbent, *rivals]
+    files = {CANDIDATE: candidate, INCUMBENT: incumbent if learned else None}
+    files = {name: file for name, file in files.items() if file is not None}
     job = SuiteJob(
-        weights=(candidate, incumbent) if learned else (candidate,),
-        names=(CANDIDATE, INCUMBENT) if learned else (CANDIDATE,),
+        weights=tuple(files.values()),
+        names=tuple(files),
         baselines=tuple(dict.fromkeys(names)),
         refs=suite_refs(suite, cases, catalogue_seed),
         duration_s=duration,

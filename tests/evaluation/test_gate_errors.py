@@ -3,6 +3,7 @@
 import dataclasses
 import json
 
+import jax
 import numpy as np
 import pytest
 
@@ -12,15 +13,26 @@ from rcirl_jax.evaluation.exact import clopper_pearson
 from rcirl_jax.evaluation.gate_checks import gains
 from rcirl_jax.evaluation.gate_errors import (
     COINS,
+    CONSTRUCTED,
+    DECISIONS,
+    IDM,
     as_driven,
     clustered_rate,
+    constructed,
+    constructed_rows,
     equal_pairs,
     every_pair,
     format_errors,
+    joined,
+    mixed,
+    other_candidates,
+    pair_between,
     redrawn,
     swapped,
 )
 from rcirl_jax.evaluation.gate_types import GateConfig
+from rcirl_jax.evaluation.suite_files import SuiteRuns, write_runs
+from rcirl_jax.export.gate_job import ErrorsJob, gate_job
 from rcirl_jax.simulation.metrics import CaseMetrics
 from tests.commands import command
 from tests.evaluation.test_gate import CASES, EACH, FAMILIES, broken, drives, pair
@@ -128,6 +140,127 @@ def test_every_row_against_every_other():
     assert said["good", "slow"]["cases_with_own_fault"] == [0, 0]
 
 
+@pytest.mark.parametrize(("share", "count"), [(0.05, 10), (1.0, 200)])
+def test_some_drives_of_another_driver(share, count):
+    """So many, of the cases named, in every field; all others as they were."""
+    mine, others = drives(0), slow_and_jerky(1)
+    among = np.arange(CASES) < 200
+    made = mixed(mine, others, among, share, np.random.default_rng(0))
+    exchanged = np.asarray(made.progress) == others.progress
+    assert exchanged.sum() == count
+    assert not exchanged[200:].any()
+    for field in dataclasses.fields(CaseMetrics):
+        found, here, there = (
+            getattr(x, field.name) for x in (made, mine, others)
+        )  # fmt: skip
+        np.testing.assert_array_equal(found[exchanged], there[exchanged])
+        np.testing.assert_array_equal(found[~exchanged], here[~exchanged])
+    none = mixed(mine, others, among & ~among, share, np.random.default_rng(0))
+    np.testing.assert_array_equal(none.progress, mine.progress)
+
+
+NAMES = [made.name for made in CONSTRUCTED]
+EQUAL, SLOWER, SLOWEST, FIVE, FAULTY, BETTER = NAMES
+
+
+def suite_of(seed):
+    """Drives as the rows of constructed drivers leave them; IDM is at fault in 40."""
+    hand = drives(10 * seed)
+    shorter = lambda share: hand.replace(progress=share * hand.progress)  # noqa: E731
+    at_fault = broken(drives(10 * seed + 1), np.arange(40) * 100, at_fault=1)
+    ids = tuple(f"{x}/{seed}" for x in pair(hand, hand).ids)
+    rows = ("hand-set", EQUAL, SLOWER, SLOWEST, IDM)
+    found = (hand, drives(10 * seed + 2), shorter(0.95), shorter(0.8), at_fault)
+    return SuiteRuns(
+        rows=dict(zip(rows, found, strict=True)),
+        ids=ids,
+        groups=tuple(pair(hand, hand).families),
+        preventable=np.ones(CASES, bool),
+        trivial=np.zeros(CASES, bool),
+        reference=IDM,
+        way=np.full(CASES, 1000.0),
+    )
+
+
+def test_constructed_drivers_are_judged_by_what_they_are():
+    suites, config = [suite_of(i) for i in range(3)], GateConfig(nulls=())
+    tallies = constructed(suites, config, together=2)
+    assert [x.name for x in tallies] == NAMES * 2
+    found = dict(zip(NAMES, tallies, strict=False))
+    assert {x.said.shape[:2] for x in tallies[: len(NAMES)]} == {(3, 1)}
+    assert {x.cases for x in tallies[: len(NAMES)]} == {CASES}
+    assert found[EQUAL].decisions == {"no difference": 3}
+    assert found[SLOWER].decisions == found[SLOWEST].decisions == {"do not ship": 3}
+    assert found[BETTER].decisions == {"ship": 3}
+    assert found[BETTER].rate("ship")[0] == found[BETTER].rate("gain")[0] == 1.0
+    # 2 faults of 4,000 are within the margin, 40 are not
+    assert found[FIVE].rate("refused")[0] == 0.0
+    assert found[FAULTY].decisions == {"do not ship": 3}
+    assert found[FAULTY].rate("safety")[0] == 1.0
+    for tally in found.values():
+        assert sum(tally.rate(what)[0] for what in DECISIONS) == pytest.approx(1.0)
+    # what was driven
+    assert found[SLOWER].drives["way"] == pytest.approx(0.95)
+    assert found[BETTER].drives["way"] == pytest.approx(1.0 / 0.95)
+    assert found[EQUAL].drives["cases_that_differ"] == 3 * CASES
+    assert found[FIVE].drives["cases_that_differ"] == 3 * CASES // 20
+    assert found[FAULTY].drives["cases_with_own_fault"] == [3 * 40, 0]
+    # two of the three seeds as one suite
+    large = dict(zip(NAMES, tallies[len(NAMES) :], strict=True))
+    assert {x.said.shape[:2] for x in large.values()} == {(1, 1)}
+    assert {x.cases for x in large.values()} == {2 * CASES}
+    assert large[BETTER].decisions == {"ship": 1}
+    text = format_errors(tallies)
+    assert text.count(BETTER) == 4
+    assert "could not judge" in text
+    with pytest.raises(InputError, match="--together: 4: expected at most 3"):
+        constructed(suites, config, together=4)
+
+
+def test_nulls_are_refused_where_nobody_drives_them():
+    with pytest.raises(InputError, match="likeness: constant V: expected a row"):
+        constructed([suite_of(0)], GateConfig())
+
+
+def test_suites_joined_are_all_their_cases():
+    pairs = [pair_between(suite_of(i), SLOWER, "hand-set") for i in range(2)]
+    both = joined(pairs)
+    assert both.ids == [*pairs[0].ids, *pairs[1].ids]
+    np.testing.assert_array_equal(
+        both.candidate.holds,
+        np.concatenate([one.candidate.holds for one in pairs]),
+    )
+    with pytest.raises(InputError, match="nobody: expected a row of hand-set, "):
+        pair_between(suite_of(0), "nobody", "hand-set")
+
+
+def test_other_candidates_come_of_another_key_only():
+    policy = other_candidates(lambda *seen: seen, 3)
+    key = jax.random.key(5)
+    params, scene, other, before = policy("params", "scene", key, "before")
+    assert (params, scene, before) == ("params", "scene", "before")
+    assert other == jax.random.fold_in(key, 3)
+    # one object per stream, or the rollout compiles anew for every seed
+    once, again = constructed_rows(), constructed_rows()
+    assert [row.policy for row in once] == [row.policy for row in again]
+    assert len({row.name for row in once}) == len(once) == 5
+    shares = [float(row.params["speed_share"]) for row in once if row.params]
+    assert shares == pytest.approx([0.95, 0.8])
+
+
+def test_a_job_without_weights_has_the_constructed_rows():
+    asked, _ = gate_job(
+        None, "hand-set", suite="free_cruise", cases=2, duration_s=2.0,
+        catalogue_seed=3, plan_every=1,
+    )  # fmt: skip
+    job = ErrorsJob(**vars(asked))
+    assert [row.name for row in job.rows()] == [row.name for row in constructed_rows()]
+    assert job.cases().ids == ("free_cruise/000@3", "free_cruise/001@3")
+    assert hash(job) == hash(ErrorsJob(**vars(asked)))
+    with pytest.raises(InputError, match="--weights: none"):
+        asked.rows()
+
+
 def test_draws_of_one_suite_count_for_less_if_they_agree():
     """Ten suites that each say one thing ten times are ten draws, not a hundred."""
     agree = np.repeat(np.arange(10) < 3, 10).reshape(10, 10)
@@ -162,8 +295,71 @@ def test_by_its_command(tmp_path):
     assert done.returncode == 0, done.stderr[-2000:]
     body = json.loads(out.read_text())
     found = {one["name"]: one for one in body["tallies"]}
-    assert [one["verdicts"] for one in found.values()] == [4, 4, 1, 2, 2, 2]
+    assert [one["verdicts"] for one in found.values()] == [2] * 6 + [4, 4, 1, 2, 2, 2]
     assert found["random weights, hand-set"]["rates"]["refused"][0] == 1.0
     assert found["hand-set, random weights"]["rates"]["refused"][0] == 0.0
     assert body["cases"] == 30
     assert body["made_by"]["flags"]["swaps"] == 2
+
+
+@pytest.mark.multiprocess
+def test_driven_suites_by_its_command(tmp_path):
+    """A better candidate ships; the incumbent of a file is the row of that name."""
+    out, file = tmp_path / "errors.json", random_weights(tmp_path / "w.msgpack")
+    made, zeros = suite_of(0), lambda n: np.zeros((CASES, n))
+    unread = {"inside": zeros(6), "inside_filtered": zeros(2)}
+    unread["holds_filtered"] = zeros(2)
+    names = {"candidate": "hand-set", "incumbent": SLOWER, "random weights": SLOWEST}
+    rows = {name: made.rows[row].replace(**unread) for name, row in names.items()}
+    write_runs(tmp_path / "metrics.npz", dataclasses.replace(made, rows=rows))
+    flags = (f"--driven={tmp_path}/metrics.npz", f"--output={out}", "--swaps=2")
+    done = command("experiments.gate_errors", *flags, f"--incumbent={file}")
+    assert done.returncode == 0, done.stderr[-2000:]
+    body = json.loads(out.read_text())
+    found = {one["name"]: one for one in body["tallies"]}
+    assert found["candidate, incumbent"]["decisions"] == {"ship": 1}
+    assert found["incumbent, random weights"]["rates"]["ship"][0] == 1.0
+    assert found["random weights, incumbent"]["rates"]["do not ship"][0] == 1.0
+    assert not set(found) & set(NAMES)
+    assert "of 6 pairs of its rows 3 ship" in done.stdout
+
+
+@pytest.mark.multiprocess
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (("--incumbent=IDM",), "--incumbent: IDM: expected --candidate or --driven"),
+        (("--seeds=2", "--together=3"), "--together: 3: expected at most 2 seeds"),
+        (("--driven=x", "--together=2"), "--together: 2: expected none beside"),
+    ],
+)
+def test_flags_that_do_not_fit(tmp_path, flags, said):
+    done = command("experiments.gate_errors", f"--output={tmp_path}/x.json", *flags)
+    assert done.returncode == 2
+    assert said in done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.multiprocess
+def test_constructed_drivers_by_its_command(tmp_path):
+    """Driven: other candidates drive otherwise and as far, slower ones less far."""
+    out = tmp_path / "errors.json"
+    short = ("--suite=free_cruise,curve_speed", "--cases=15", "--duration=10")
+    flags = (f"--output={out}", "--seeds=2", "--together=2")
+    done = command("experiments.gate_errors", *flags, *short)
+    assert done.returncode == 0, done.stderr[-2000:]
+    body = json.loads(out.read_text())
+    assert [one["name"] for one in body["tallies"]] == NAMES * 2
+    assert [one["verdicts"] for one in body["tallies"]] == [2] * 6 + [1] * 6
+    assert [one["cases"] for one in body["tallies"]] == [30] * 6 + [60] * 6
+    found = {one["name"]: one for one in body["tallies"][:6]}
+    drove = {name: one["drives"] for name, one in found.items()}
+    assert drove[EQUAL]["cases_that_differ"] > 10
+    assert drove[EQUAL]["way"] == pytest.approx(1.0, abs=0.01)
+    assert drove[SLOWEST]["way"] < drove[SLOWER]["way"] < 0.99
+    assert drove[BETTER]["way"] == pytest.approx(1.0 / drove[SLOWER]["way"])
+    # round(0.05 * 30) of each seed
+    assert drove[FIVE]["cases_that_differ"] <= 2 * 2
+    assert found[SLOWEST]["decisions"] == {"do not ship": 2}
+    for name in (SLOWER, SLOWEST, EQUAL):
+        assert found[name]["rates"]["ship"][0] == 0.0
