@@ -3,6 +3,7 @@
 import dataclasses
 
 from rcirl_jax.data.signal_checks import SignalChecks
+from rcirl_jax.errors import InputError
 from rcirl_jax.units import HORIZON_S
 
 SHORTEST_S = 1.0  # s of mask; derivatives need three points of the time axis
@@ -34,10 +35,10 @@ class CollectConfig:
     def __post_init__(self) -> None:
         """Reject what cannot be meant."""
         if not 0.0 < self.min_future_s <= HORIZON_S:
-            raise ValueError(f"min_future_s: {self.min_future_s}: expected (0, 8]")
+            raise InputError(f"min_future_s: {self.min_future_s}: expected (0, 8]")
         if not SHORTEST_S <= self.min_surroundings_s <= HORIZON_S:
-            raise ValueError(
+            raise InputError(
                 f"min_surroundings_s: {self.min_surroundings_s}: expected [1, 8]"
             )
         if self.stride_s <= 0.0:
-            raise ValueError(f"stride_s: {self.stride_s}: expected > 0")
+            raise InputError(f"stride_s: {self.stride_s}: expected > 0")

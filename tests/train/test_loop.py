@@ -279,6 +279,7 @@ def test_pooled_parts_are_the_whole(dataset, run, tmp_path):
     ("command", "message"),
     [
         (["import_logs", "--format=commonroad", "--input=nowhere", "--output=o"], "no"),
+        (["import_logs", "--format=synthetic", "--stride=0", "--output=o"], "stride"),
         (["train", "--data=nowhere", "--workdir=w"], "nowhere"),
         (["evaluate", "--weights=nowhere", "--data=nowhere"], "nowhere"),
         (["export_weights", "--workdir=nowhere"], "run.json: missing"),

@@ -18,6 +18,8 @@ from rcirl_jax.data import signal_checks, store
 from rcirl_jax.data.files import FACTS, MANIFEST, MARK, Files
 from rcirl_jax.data.importers import synthetic
 from rcirl_jax.data.preferences import SCHEMA, read_preferences
+from rcirl_jax.evaluation.gate_types import Likeness
+from rcirl_jax.evaluation.likeness import read_arrays, write_arrays
 from rcirl_jax.evaluation.suite_files import COLUMNS, SuiteRuns, read_runs, write_runs
 from rcirl_jax.evaluation.sweep import SweepConfig, member_name, shape_name
 from rcirl_jax.export import sweep
@@ -198,6 +200,15 @@ def suite(folder: Path) -> Target:
     return OneFile(read_runs, [file])
 
 
+def distances(folder: Path) -> Target:
+    """The held-out drives' distances to the human."""
+    folder.mkdir(parents=True)
+    file = folder / "likeness.npz"
+    known = Likeness(distance={"ours": np.ones(CASES)}, clusters=np.arange(CASES))
+    write_arrays(file, known)
+    return OneFile(read_arrays, [file])
+
+
 def preferences(folder: Path) -> Target:
     """Preferences of a dataset of twelve rows."""
     folder.mkdir(parents=True)
@@ -354,6 +365,7 @@ READERS: dict[str, Reader] = {
     "scenarios": Reader(make=scenarios),
     "traffic": Reader(make=traffic),
     "suite": Reader(make=suite),
+    "distances": Reader(make=distances, share=3),
     "preferences": Reader(make=preferences, share=3),
     "checkpoints": Reader(make=checkpoints, share=2),
     "signal_checks": Reader(make=checks, share=3),
