@@ -29,6 +29,7 @@ RANKED = (
     "linear_vs_network",
     "one_frame",
     "optimisers",
+    "rank_against_gan",
     "stability",
 )
 QUICKEST = ("artefact_audit", "discount_factors")  # the others are `slow`
