@@ -224,6 +224,7 @@ class World(flax.struct.PyTreeNode, kw_only=True):
     agents: AgentState
     seen: Seen
     served: jax.Array  # [L] bool: the ego has stood at this stop sign
+    halts: jax.Array  # [L] bool: this light's yellow or red has demanded a stop
     stopped: jax.Array  # [] bool: an at-fault collision has ended the drive
     reactive: jax.Array  # [] bool: replayed agents have left their logs
 

@@ -46,6 +46,18 @@ def demands(
     return red | (yellow & can_stop)
 
 
+def halting(
+    lines: Lines, halts: jax.Array, time: jax.Array, distance: jax.Array, v: jax.Array
+) -> jax.Array:
+    """Lights [L] that have demanded a stop of the ego and are not green again.
+
+    Who could stop when the light turned yellow has to: without this a driver who
+    brakes late by a little is let go on, and meets red at the line.
+    """
+    yellow, red = colours(lines, time)
+    return (yellow | red) & (halts | demands(lines, time, distance, v))
+
+
 def serve(
     lines: Lines, served: jax.Array, distance: jax.Array, v: jax.Array
 ) -> jax.Array:
@@ -59,11 +71,13 @@ def stop_line(case: Case, world: World, ego: EgoState) -> jax.Array:
 
     Args:
       case: the drive, with its lines.
-      world: its clock and the stop signs at which the ego has stood.
+      world: its clock, the stop signs at which the ego has stood, the lights that it
+        stops for.
       ego: whose front is at or before the line.
     """
     lines = case.lines
     distance = lines.s - (ego.s + 0.5 * case.ego_length)
-    light = demands(lines, world.step * STEP_S, distance, ego.v[None])
+    time = world.step * STEP_S
+    light = halting(lines, world.halts, time, distance, ego.v[None])
     sign = (lines.kind == LineKind.STOP_SIGN) & ~world.served
     return jnp.min(jnp.where((light | sign) & (distance >= 0.0), lines.s, jnp.inf))

@@ -76,6 +76,7 @@ def start(case: Case) -> World:
         agents=state,
         seen=jax.tree.map(lambda x: jnp.stack([x] * NUM_HISTORY), fresh),
         served=jnp.zeros((NUM_LINES,), bool),
+        halts=jnp.zeros((NUM_LINES,), bool),
         stopped=jnp.zeros((), bool),
         reactive=jnp.zeros((), bool),
     )
@@ -175,7 +176,7 @@ def step(
     over = world.stopped
     moved_ego = jax.tree.map(lambda a, b: jnp.where(over, a, b), ego, moved_ego)
     found = judge.contacts(case, moved_ego, state)
-    crossed_red, crossed_sign, served = _lines(case, world, moved_ego)
+    crossed_red, crossed_sign, served, halts = _lines(case, world, moved_ego)
     crash = jnp.any(found.at_fault)
     record = _record(case, world, moved_ego, state, found).replace(
         red_light=crossed_red,
@@ -200,6 +201,7 @@ def step(
         agents=state,
         seen=remember(world.seen, state),
         served=served,
+        halts=halts,
         stopped=over | crash,
         reactive=reactive,
     ), record
@@ -220,17 +222,20 @@ def _human(replay: Replay, ego: EgoState, step: jax.Array) -> EgoState:
 
 def _lines(
     case: Case, world: World, moved: EgoState
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """(red light run, stop sign run, served signs) of this step."""
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """(red light run, stop sign run, served signs, halts) of this step."""
     lines, half = case.lines, 0.5 * case.ego_length
     before = lines.s - (world.ego.s + half)
     after = lines.s - (moved.s + half)
     crosses = (before >= 0.0) & (after < 0.0)
-    _, red = signals.colours(lines, world.step * STEP_S)
+    time = world.step * STEP_S
+    _, red = signals.colours(lines, time)
     is_sign = lines.kind == LineKind.STOP_SIGN
     ran_red = jnp.any(crosses & red)
     ran_sign = jnp.any(crosses & is_sign & ~world.served)
-    return ran_red, ran_sign, signals.serve(lines, world.served, after, moved.v)
+    served = signals.serve(lines, world.served, after, moved.v)
+    halts = signals.halting(lines, world.halts, time, before, world.ego.v[None])
+    return ran_red, ran_sign, served, halts
 
 
 def _record(

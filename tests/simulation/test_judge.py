@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from rcirl_jax.geometry.boxes import Box, contact_interval
 from rcirl_jax.simulation import judge
 from rcirl_jax.simulation.agents import come_and_go
+from rcirl_jax.simulation.lines import halting
 from rcirl_jax.simulation.world import start
 from rcirl_jax.types import Kind
 from tests.simulation.drives import drive
@@ -137,6 +138,26 @@ def test_red_lights_and_stop_signs_are_seen_at_the_crossing():
     assert np.flatnonzero(record.red_light[0]).tolist() == [crossing]
     assert not record.red_light[1].any()
     assert np.flatnonzero(record.stop_sign[2]).tolist() == [crossing]
+
+
+def test_a_light_that_has_demanded_a_stop_does_so_until_it_is_green():
+    lines = make_case(
+        lines=[{"kind": 1, "s": 70.0, "green": 20.0, "yellow": 4.0, "red": 16.0}]
+    ).lines
+    v = jnp.asarray([18.0])  # stops within 54 m at 3 m/s^2
+
+    def halts(before, time, distance):
+        asked = jnp.asarray([before] + [False] * (lines.s.size - 1))
+        return bool(
+            halting(lines, asked, jnp.asarray(time), distance - 0 * lines.s, v)[0]
+        )
+
+    assert not halts(False, 10.0, 60.0)  # green
+    assert halts(False, 20.5, 60.0)
+    assert not halts(False, 20.5, 50.0)  # too near to stop: it may go on
+    assert halts(True, 20.7, 50.0)  # was asked when it could
+    assert halts(False, 25.0, 50.0)  # red
+    assert not halts(True, 41.0, 50.0)  # green again
 
 
 def test_a_served_stop_sign_is_not_run():
