@@ -5,12 +5,13 @@
     python -m experiments.gate_errors --driven=RUN/suite/metrics.npz --output=FILE
 
 Every seed is a suite of its own cases. On each, drivers whose truth is known by
-construction are compared with hand-set (`CONSTRUCTED` in `gate_errors`). Hand-set with
+construction are compared with hand-set (`CONSTRUCTED` in `gate_pairs`). Hand-set with
 other random candidates is equal. With a wanted speed lower by 5 or 20 % it is worse.
 So it is with IDM's drives in a random 5 % of the cases, or wherever IDM is at fault.
-Against the 5 % slower one hand-set is better. The table says how often the gate ships,
-refuses and cannot judge. 230 cases are too few to show that nothing got worse: with
-`--together=20` the gate also judges the cases of 20 seeds as one suite.
+Hand-set is better than the 5 % slower one, and than itself with IDM at fault. The table
+says how often the gate ships, refuses and cannot judge. 230 cases are too few to show
+that nothing got worse: with `--together=20` the gate also judges the cases of 20 seeds
+as one suite.
 
 With a candidate: it and the incumbent with their drives swapped by coins, and the
 incumbent against itself on the cases of two seeds, are equal: what the gate detects
@@ -42,8 +43,8 @@ from rcirl_jax.evaluation.gate_errors import (
     equal_pairs,
     every_pair,
     format_errors,
-    pair_between,
 )
+from rcirl_jax.evaluation.gate_pairs import pair_between
 from rcirl_jax.evaluation.gate_runs import CANDIDATE, INCUMBENT
 from rcirl_jax.evaluation.gate_types import GateConfig
 from rcirl_jax.evaluation.suite_files import SuiteRuns, read_runs, runs_of

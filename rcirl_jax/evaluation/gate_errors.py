@@ -24,99 +24,40 @@ suite is left out too. Host numpy, but for the drivers.
 """
 
 import dataclasses
-import functools
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from typing import get_args
 
-import jax
 import numpy as np
 from scipy.special import betaincinv
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.exact import CONFIDENCE
 from rcirl_jax.evaluation.gate import judge
-from rcirl_jax.evaluation.gate_stats import MIN_CLUSTERS
+from rcirl_jax.evaluation.gate_pairs import (
+    COINS,
+    CONSTRUCTED,
+    MIXES,
+    joined,
+    pair_of,
+    redrawn,
+    stacked,
+    swapped,
+)
 from rcirl_jax.evaluation.gate_types import (
-    CANDIDATE,
-    INCUMBENT,
     Decision,
     GateConfig,
-    Likeness,
     Pair,
     Verdict,
 )
 from rcirl_jax.evaluation.suite_files import SuiteRuns
 from rcirl_jax.evaluation.suite_output import text_table
-from rcirl_jax.planner.baselines import Idm
-from rcirl_jax.planner.plan import Plan
-from rcirl_jax.planner.rank import (
-    Params,
-    Policy,
-    RankConfig,
-    hand_score,
-    idm_policy,
-    rank_policy,
-)
-from rcirl_jax.reward.hand import LatticeCost
 from rcirl_jax.simulation.metrics import CaseMetrics
-from rcirl_jax.simulation.rows import Row, tuned_row
-from rcirl_jax.types import Scene
 
 # what a verdict may say: a failed check of a kind, any of them, a gain
 SAID = ("safety", "no loss", "families", "refused", "gain")
+
 DECISIONS: tuple[Decision, ...] = get_args(Decision)
-COINS = 7919  # of the coins' random stream, which nothing else may share
-MIXES = 7927  # of the mixes' random stream
-OTHER_STREAM = 1  # fold_in number of the other candidates' keys
-
-# rows that constructed pairs are made of
-HAND_SET, IDM = "hand-set", "IDM"
-OTHER, SLOWER, SLOWEST = (
-    f"{HAND_SET}, {what}" for what in ("other candidates", "5 % slower", "20 % slower")
-)
-SPEED_SHARES = {SLOWER: 0.95, SLOWEST: 0.8}  # 1, wanted speed as a share of the limit
-
-# recordings that tell nobody from anybody
-ALIKE = Likeness(
-    distance=dict.fromkeys((CANDIDATE, INCUMBENT), np.ones(MIN_CLUSTERS)),
-    clusters=np.arange(MIN_CLUSTERS),
-)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Constructed:
-    """A pair of drivers, one of which is made from the other."""
-
-    name: str
-    truth: str  # "equal", "better" or "worse", of the candidate
-    candidate: str = HAND_SET  # a row
-    incumbent: str = HAND_SET
-    # a row that drives a share of the candidate's cases, or of those with its own fault
-    mixed_in: str = ""
-    share: float = 0.0
-    faulty: bool = False
-
-
-CONSTRUCTED = (
-    Constructed(name=OTHER, truth="equal", candidate=OTHER),
-    Constructed(name=SLOWER, truth="worse", candidate=SLOWER),
-    Constructed(name=SLOWEST, truth="worse", candidate=SLOWEST),
-    Constructed(
-        name=f"{HAND_SET}, {IDM} in 5 % of the cases",
-        truth="worse",
-        mixed_in=IDM,
-        share=0.05,
-    ),
-    Constructed(
-        name=f"{HAND_SET}, {IDM} where it is at fault",
-        truth="worse",
-        mixed_in=IDM,
-        share=1.0,
-        faulty=True,
-    ),
-    Constructed(name=f"{HAND_SET} for 5 % slower", truth="better", incumbent=SLOWER),
-)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -166,134 +107,6 @@ def clustered_rate(events: np.ndarray) -> tuple[float, float, float]:
     return share, low, high
 
 
-def swapped(pair: Pair, rng: np.random.Generator, *, by_family: bool = False) -> Pair:
-    """The pair with candidate and incumbent exchanged in about half of the cases."""
-    if by_family:
-        _, family = np.unique(pair.families, return_inverse=True)
-        coin = (rng.random(family.max() + 1) < 0.5)[family]
-    else:
-        coin = rng.random(len(pair.ids)) < 0.5
-
-    return dataclasses.replace(
-        pair,
-        candidate=_chosen(coin, pair.incumbent, pair.candidate),
-        incumbent=_chosen(coin, pair.candidate, pair.incumbent),
-    )
-
-
-def _chosen(
-    where: np.ndarray, there: CaseMetrics, elsewhere: CaseMetrics
-) -> CaseMetrics:
-    """The drives of `there` in the cases `where` [C], of `elsewhere` in the others."""
-
-    def pick(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        a, b = np.asarray(a), np.asarray(b)
-        return np.where(where.reshape(-1, *[1] * (a.ndim - 1)), a, b)
-
-    return jax.tree.map(pick, there, elsewhere)
-
-
-def mixed(
-    drives: CaseMetrics,
-    others: CaseMetrics,
-    among: np.ndarray,
-    share: float,
-    rng: np.random.Generator,
-) -> CaseMetrics:
-    """Some drives exchanged for another driver's of the same cases.
-
-    Args:
-      drives: leaves [C, ...].
-      others: likewise.
-      among: [C] bool, the n cases of which some are drawn.
-      share: of them that are drawn, within (0, 1].
-      rng: draws which.
-
-    Returns:
-      Leaves [C, ...]: those of `others` in round(share n) cases, else of `drives`.
-    """
-    places = np.flatnonzero(among)
-    where = np.zeros(len(among), bool)
-    where[rng.choice(places, round(share * places.size), replace=False)] = True
-    return _chosen(where, others, drives)
-
-
-def redrawn(first: Pair, second: Pair) -> Pair:
-    """The incumbent's drives in `first` against its drives in `second`.
-
-    Raises:
-      InputError: the two do not have as many cases of the same families.
-    """
-    if list(first.families) != list(second.families):
-        raise InputError("gate_errors: expected two suites of the same families")
-    return dataclasses.replace(second, candidate=first.incumbent)
-
-
-def pair_between(runs: SuiteRuns, candidate: str, incumbent: str) -> Pair:
-    """Two rows of a driven suite, equally near to the human; without nulls.
-
-    Raises:
-      InputError: the suite has no such rows.
-    """
-    for name in (candidate, incumbent):
-        if name not in runs.rows:
-            raise InputError(f"{name}: expected a row of {', '.join(runs.rows)}")
-    return Pair(
-        candidate=runs.rows[candidate],
-        incumbent=runs.rows[incumbent],
-        families=runs.groups,
-        ids=runs.ids,
-        reference=np.asarray(runs.way, np.float64),
-        preventable=np.asarray(runs.preventable, bool),
-        likeness=ALIKE,
-    )
-
-
-def joined(pairs: Sequence[Pair]) -> Pair:
-    """The cases of several suites, all different, as one suite."""
-    return dataclasses.replace(
-        pairs[0],
-        candidate=_stacked([pair.candidate for pair in pairs]),
-        incumbent=_stacked([pair.incumbent for pair in pairs]),
-        families=[name for pair in pairs for name in pair.families],
-        ids=[name for pair in pairs for name in pair.ids],
-        reference=np.concatenate([pair.reference for pair in pairs]),
-        preventable=np.concatenate([pair.preventable for pair in pairs]),
-    )
-
-
-def _stacked(drives: Sequence[CaseMetrics]) -> CaseMetrics:
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *drives)
-
-
-@functools.lru_cache(maxsize=4)
-def other_candidates(policy: Policy, stream: int) -> Policy:
-    """The same planner with other random candidates: `stream` folded into its key."""
-
-    def other(
-        params: Params, scene: Scene, key: jax.Array, before: Plan | None = None
-    ) -> Plan:
-        return policy(params, scene, jax.random.fold_in(key, stream), before)
-
-    return other
-
-
-def constructed_rows() -> list[Row]:
-    """The rows that `CONSTRUCTED` names: three of hand-set's making, it, and IDM."""
-    config = RankConfig()
-    policy = rank_policy(hand_score, config)
-    slower = [
-        dataclasses.replace(tuned_row(LatticeCost(speed_share=x), config), name=name)
-        for name, x in SPEED_SHARES.items()
-    ]
-    return [
-        Row(name=HAND_SET, policy=policy),
-        Row(name=OTHER, policy=other_candidates(policy, OTHER_STREAM)),
-        *slower,
-        Row(name=IDM, policy=idm_policy(Idm())),
-    ]
-
-
 def constructed(
     suites: Sequence[SuiteRuns], config: GateConfig, together: int = 1, seed: int = 0
 ) -> list[Tally]:
@@ -317,24 +130,13 @@ def constructed(
     rng = np.random.default_rng([seed, MIXES])
     alone, more = [], []
     for made in CONSTRUCTED:
-        pairs = [_pair_of(made, runs, rng) for runs in suites]
+        pairs = [pair_of(made, runs, rng) for runs in suites]
         alone.append(as_driven(made.name, made.truth, pairs, config))
         if together > 1:
             firsts = range(0, len(pairs) - together + 1, together)
             large = [joined(pairs[first : first + together]) for first in firsts]
             more.append(as_driven(made.name, made.truth, large, config))
     return alone + more
-
-
-def _pair_of(made: Constructed, runs: SuiteRuns, rng: np.random.Generator) -> Pair:
-    pair = pair_between(runs, made.candidate, made.incumbent)
-    if not made.mixed_in:
-        return pair
-    others = pair_between(runs, made.mixed_in, made.incumbent).candidate
-    faults = np.asarray(others.at_fault) > 0
-    among = faults if made.faulty else np.ones_like(faults)
-    drives = mixed(pair.candidate, others, among, made.share, rng)
-    return dataclasses.replace(pair, candidate=drives)
 
 
 def tally(name: str, truth: str, suites: Iterable[Iterable[Verdict]]) -> Tally:
@@ -399,8 +201,8 @@ def as_driven(
 ) -> Tally:
     """The gate on pairs as they are, and how their drives compare."""
     found = tally(name, truth, ([judge(pair, config)] for pair in pairs))
-    mine = _stacked([pair.candidate for pair in pairs])
-    theirs = _stacked([pair.incumbent for pair in pairs])
+    mine = stacked([pair.candidate for pair in pairs])
+    theirs = stacked([pair.incumbent for pair in pairs])
     return dataclasses.replace(found, drives=compared(mine, theirs))
 
 

@@ -11,7 +11,7 @@ from rcirl_jax.evaluation.closed_loop import (
     drive_here,
     run_suite,
 )
-from rcirl_jax.evaluation.gate_errors import constructed_rows
+from rcirl_jax.evaluation.gate_pairs import constructed_rows
 from rcirl_jax.evaluation.gate_runs import CANDIDATE, INCUMBENT, repeats
 from rcirl_jax.executor import Executor
 from rcirl_jax.export.spread import SuiteJob, spread

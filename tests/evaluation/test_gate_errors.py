@@ -12,17 +12,19 @@ from rcirl_jax.evaluation import gate_checks
 from rcirl_jax.evaluation.exact import clopper_pearson
 from rcirl_jax.evaluation.gate_checks import gains
 from rcirl_jax.evaluation.gate_errors import (
-    COINS,
-    CONSTRUCTED,
     DECISIONS,
-    IDM,
     as_driven,
     clustered_rate,
     constructed,
-    constructed_rows,
     equal_pairs,
     every_pair,
     format_errors,
+)
+from rcirl_jax.evaluation.gate_pairs import (
+    COINS,
+    CONSTRUCTED,
+    IDM,
+    constructed_rows,
     joined,
     mixed,
     other_candidates,
@@ -160,7 +162,7 @@ def test_some_drives_of_another_driver(share, count):
 
 
 NAMES = [made.name for made in CONSTRUCTED]
-EQUAL, SLOWER, SLOWEST, FIVE, FAULTY, BETTER = NAMES
+EQUAL, SLOWER, SLOWEST, FIVE, FAULTY, BETTER, SOUND = NAMES
 
 
 def suite_of(seed):
@@ -197,6 +199,8 @@ def test_constructed_drivers_are_judged_by_what_they_are():
     assert found[FIVE].rate("refused")[0] == 0.0
     assert found[FAULTY].decisions == {"do not ship": 3}
     assert found[FAULTY].rate("safety")[0] == 1.0
+    assert found[SOUND].rate("refused")[0] == 0.0
+    assert found[SOUND].drives["cases_with_own_fault"] == [0, 3 * 40]
     for tally in found.values():
         assert sum(tally.rate(what)[0] for what in DECISIONS) == pytest.approx(1.0)
     # what was driven
@@ -295,7 +299,7 @@ def test_by_its_command(tmp_path):
     assert done.returncode == 0, done.stderr[-2000:]
     body = json.loads(out.read_text())
     found = {one["name"]: one for one in body["tallies"]}
-    assert [one["verdicts"] for one in found.values()] == [2] * 6 + [4, 4, 1, 2, 2, 2]
+    assert [one["verdicts"] for one in found.values()] == [2] * 7 + [4, 4, 1, 2, 2, 2]
     assert found["random weights, hand-set"]["rates"]["refused"][0] == 1.0
     assert found["hand-set, random weights"]["rates"]["refused"][0] == 0.0
     assert body["cases"] == 30
