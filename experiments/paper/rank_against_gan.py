@@ -348,8 +348,12 @@ def main() -> None:
         for name in drawn:
             print(f"rank {form} minus gan {form}: {name}: {_apart(found[name])}")
         better = "the rank loss" if found["nuPlan"].mean > 0.0 else "the GAN"
-        sure = "outside" if found["nuPlan"].is_apart else "inside"
-        print(f"{form}, {better} drives better; 0 is {sure} the interval")
+        said = (
+            f"{better} drives better"
+            if found["nuPlan"].is_apart
+            else ("neither is shown to drive better")
+        )
+        print(f"{form}: {said}")
     panels = {name: (name.removesuffix(", m"), "m") for name in errors}
     interval_chart(
         picture("rank_against_gan"),
