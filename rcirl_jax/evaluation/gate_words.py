@@ -68,6 +68,7 @@ def sentence(pair: Pair, verdict: Verdict) -> str:
     checks = verdict.checks
     worse = sorted((c for c in checks if c.outcome == "fail"), key=_rank)
     better = [c for c in checks if c.kind == "gain" and c.outcome == "pass"]
+    better.sort(key=lambda c: c.name != "likeness")  # what it is for comes first
     unclear = [c for c in checks if c.kind != "gain" and c.outcome == "open"]
     gains = [_better(c) for c in better]
     titles = [c.title for c in unclear]
