@@ -43,6 +43,7 @@ def only_where(
 
     @custom_vmap
     def chosen(needed: jax.Array, otherwise: Tree, args: tuple) -> Tree:
+        args = jax.tree.map(jnp.asarray, args)  # constants come as numpy's
         return jax.lax.cond(needed, lambda: make(*args), lambda: otherwise)
 
     @chosen.def_vmap
@@ -71,7 +72,9 @@ def only_where(
         def body(n: jax.Array, plans: Tree) -> Tree:
             lane = order[n]
             own = jax.tree.map(
-                lambda x, is_batched: x[lane] if is_batched else x, args, batched[2]
+                lambda x, is_batched: x[lane] if is_batched else jnp.asarray(x),
+                args,
+                batched[2],
             )
             return jax.tree.map(
                 lambda all_, one: all_.at[lane].set(one), plans, make(*own)
