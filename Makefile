@@ -69,7 +69,7 @@ $(VENV)/.installed: pyproject.toml $(if $(LOCK),$(LOCK)/test.lock) | $(BIN)/pyth
 	@touch $(VENV)/.all $@
 
 # The main job, end to end, on synthetic human traffic: import, train, rank, simulate, gate, report.
-# Most of its time is compiling, which takes half as long without XLA's fusion emitters.
+# Most of its time is compiling, which is a third shorter without XLA's fusion emitters.
 demo: $(VENV)/.all
 	XLA_FLAGS="--xla_cpu_use_fusion_emitters=false $(XLA_FLAGS)" $(BIN)/python -m experiments.autotune --synthetic --recipe=quick \
 	  --workdir=$(OUT) --cases=4 --duration=20 --drives=40

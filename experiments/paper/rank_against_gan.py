@@ -348,12 +348,10 @@ def main() -> None:
         for name in drawn:
             print(f"rank {form} minus gan {form}: {name}: {_apart(found[name])}")
         better = "the rank loss" if found["nuPlan"].mean > 0.0 else "the GAN"
-        said = (
-            f"{better} drives better"
-            if found["nuPlan"].is_apart
-            else ("neither is shown to drive better")
+        sure = (
+            f"{better} drives better" if found["nuPlan"].is_apart else "not told apart"
         )
-        print(f"{form}: {said}")
+        print(f"{form}, in driving: {sure}")
     panels = {name: (name.removesuffix(", m"), "m") for name in errors}
     interval_chart(
         picture("rank_against_gan"),

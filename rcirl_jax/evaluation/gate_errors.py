@@ -38,8 +38,8 @@ from rcirl_jax.evaluation.gate_pairs import (
     COINS,
     CONSTRUCTED,
     MIXES,
+    constructed_pair,
     joined,
-    pair_of,
     redrawn,
     stacked,
     swapped,
@@ -130,7 +130,7 @@ def constructed(
     rng = np.random.default_rng([seed, MIXES])
     alone, more = [], []
     for made in CONSTRUCTED:
-        pairs = [pair_of(made, runs, rng) for runs in suites]
+        pairs = [constructed_pair(made, runs, rng) for runs in suites]
         alone.append(as_driven(made.name, made.truth, pairs, config))
         if together > 1:
             firsts = range(0, len(pairs) - together + 1, together)

@@ -13,13 +13,9 @@ import jax
 import numpy as np
 
 from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.gate_runs import pair_of
 from rcirl_jax.evaluation.gate_stats import MIN_CLUSTERS
-from rcirl_jax.evaluation.gate_types import (
-    CANDIDATE,
-    INCUMBENT,
-    Likeness,
-    Pair,
-)
+from rcirl_jax.evaluation.gate_types import CANDIDATE, Likeness, Pair
 from rcirl_jax.evaluation.suite_files import SuiteRuns
 from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.planner.plan import Plan
@@ -51,21 +47,14 @@ OTHER, SLOWER, SLOWEST = (
 
 SPEED_SHARES = {SLOWER: 0.95, SLOWEST: 0.8}  # 1, wanted speed as a share of the limit
 
-# recordings that tell nobody from anybody
-ALIKE = Likeness(
-    distance=dict.fromkeys((CANDIDATE, INCUMBENT), np.ones(MIN_CLUSTERS)),
-    clusters=np.arange(MIN_CLUSTERS),
-)
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Constructed:
-    """A pair of drivers, one of which is made from the other."""
+    """A driver against hand-set, of which it is made."""
 
     name: str
     truth: str  # "equal", "better" or "worse", of the candidate
     candidate: str = HAND_SET  # a row
-    incumbent: str = HAND_SET
     # a row that drives a share of the candidate's cases, or of those with its own fault
     mixed_in: str = ""
     share: float = 0.0
@@ -177,18 +166,11 @@ def pair_between(runs: SuiteRuns, candidate: str, incumbent: str) -> Pair:
     Raises:
       InputError: the suite has no such rows.
     """
-    for name in (candidate, incumbent):
-        if name not in runs.rows:
-            raise InputError(f"{name}: expected a row of {', '.join(runs.rows)}")
-    return Pair(
-        candidate=runs.rows[candidate],
-        incumbent=runs.rows[incumbent],
-        families=runs.groups,
-        ids=runs.ids,
-        reference=np.asarray(runs.way, np.float64),
-        preventable=np.asarray(runs.preventable, bool),
-        likeness=ALIKE,
+    alike = Likeness(
+        distance=dict.fromkeys((CANDIDATE, incumbent), np.ones(MIN_CLUSTERS)),
+        clusters=np.arange(MIN_CLUSTERS),
     )
+    return pair_of(runs, incumbent, (), alike, candidate=candidate)
 
 
 def joined(pairs: Sequence[Pair]) -> Pair:
@@ -237,11 +219,13 @@ def constructed_rows() -> list[Row]:
     ]
 
 
-def pair_of(made: Constructed, runs: SuiteRuns, rng: np.random.Generator) -> Pair:
+def constructed_pair(
+    made: Constructed, runs: SuiteRuns, rng: np.random.Generator
+) -> Pair:
     """The pair of one of `CONSTRUCTED` on a suite; `rng` draws the mixed cases."""
-    pair = pair_between(runs, made.candidate, made.incumbent)
+    pair = pair_between(runs, made.candidate, HAND_SET)
     if made.mixed_in:
-        others = pair_between(runs, made.mixed_in, made.incumbent).candidate
+        others = runs.rows[made.mixed_in]
         faults = np.asarray(others.at_fault) > 0
         among = faults if made.faulty else np.ones_like(faults)
         drives = mixed(pair.candidate, others, among, made.share, rng)

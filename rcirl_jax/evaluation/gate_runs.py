@@ -26,6 +26,8 @@ def pair_of(
     incumbent: str = INCUMBENT,
     nulls: Sequence[str] = NULLS,
     likeness: Likeness | None = None,
+    *,
+    candidate: str = CANDIDATE,
 ) -> Pair:
     """Candidate, incumbent and nulls of a driven suite.
 
@@ -35,15 +37,16 @@ def pair_of(
       nulls: names of rows that the candidate has to be ahead of; those that the suite
         does not have are left out.
       likeness: distances to the human, where they were measured.
+      candidate: name of its row.
 
     Raises:
       InputError: the suite has no such rows.
     """
-    for name in (CANDIDATE, incumbent):
+    for name in (candidate, incumbent):
         if name not in runs.rows:
             raise InputError(f"gate: {name}: expected a row of {', '.join(runs.rows)}")
     return Pair(
-        candidate=runs.rows[CANDIDATE],
+        candidate=runs.rows[candidate],
         incumbent=runs.rows[incumbent],
         families=runs.groups,
         ids=runs.ids,

@@ -4,7 +4,7 @@
 
 Then the best of all candidates is chosen, the plan in force among them. Keeping costs
 the check of one trajectory, choosing the values of 65; `only_where` spares the lanes of
-a batch that keep their plan the work, which makes a closed loop some times faster.
+a batch that keep their plan the work, which makes a closed loop several times faster.
 """
 
 from collections.abc import Callable
@@ -32,7 +32,7 @@ def only_where(
     """`make(*args)` where `needed` [], else `otherwise`, like `lax.cond`.
 
     Under `vmap` a `lax.cond` computes both for every lane. Here a CPU makes the lanes
-    that need it one by one; other devices, which are idle anyway, make all at once.
+    that need it one by one; other devices make all of them at once.
 
     Args:
       needed: [] bool.
@@ -57,28 +57,18 @@ def only_where(
         otherwise = jax.tree.map(spread, otherwise, batched[1])
         every = jax.tree.map(lambda _: True, otherwise)
         if jax.default_backend() != "cpu":
-            axes = jax.tree.map(
-                lambda is_batched: 0 if is_batched else None, batched[2]
-            )
-            made = jax.vmap(make, in_axes=axes)(*args)
-            return jax.vmap(
-                lambda yes, new, old: jax.tree.map(
-                    lambda a, b: jnp.where(yes, a, b), new, old
-                )
-            )(needed, made, otherwise), every
+            axes = jax.tree.map(lambda x: 0 if x else None, batched[2])
+            made = jax.vmap(make, axes, axis_size=size)(*args)
+            return jax.vmap(_either)(needed, made, otherwise), every
 
         order = jnp.argsort(~needed)
 
         def body(n: jax.Array, plans: Tree) -> Tree:
             lane = order[n]
-            own = jax.tree.map(
-                lambda x, is_batched: x[lane] if is_batched else jnp.asarray(x),
-                args,
-                batched[2],
-            )
-            return jax.tree.map(
-                lambda all_, one: all_.at[lane].set(one), plans, make(*own)
-            )
+            # constants come as numpy's
+            here = lambda x, is_batched: x[lane] if is_batched else jnp.asarray(x)  # noqa: E731
+            new = make(*jax.tree.map(here, args, batched[2]))
+            return jax.tree.map(lambda old, one: old.at[lane].set(one), plans, new)
 
         return jax.lax.fori_loop(0, jnp.sum(needed), body, otherwise), every
 

@@ -341,11 +341,8 @@ def dp_policy(
             feasible=join(sampled.feasible, plan.feasible),
             family=join(sampled.family, jnp.asarray(family_index("cruise"))),
         )
-        before = None
-        if in_force is not None:
-            before, rest = in_force
-            candidates = with_plan_in_force(candidates, rest)
+        candidates = with_plan_in_force(candidates, in_force)
         scores = score(params, scene, candidates)
-        return best_plan(scene, candidates, scores, rank, before)
+        return best_plan(scene, candidates, scores, rank, in_force)
 
     return committed(anew, rank.sampler, rank.safety, rank.commitment)

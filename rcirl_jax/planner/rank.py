@@ -115,9 +115,11 @@ def speed_dp_score(params: None, scene: Scene, candidates: Candidates) -> jax.Ar
     return -jax.vmap(lambda x: speed_dp_cost(scene, x))(candidates.trajectory)
 
 
-def with_plan_in_force(candidates: Candidates, rest: Candidates) -> Candidates:
-    """The candidates and, last, the rest of the plan in force [1]."""
-    return jax.tree.map(lambda *x: jnp.concatenate(x), candidates, rest)
+def with_plan_in_force(candidates: Candidates, in_force: InForce | None) -> Candidates:
+    """The candidates and, last, the rest of the plan in force, if there is one."""
+    if in_force is None:
+        return candidates
+    return jax.tree.map(lambda *x: jnp.concatenate(x), candidates, in_force[1])
 
 
 def best_plan(
@@ -125,11 +127,11 @@ def best_plan(
     candidates: Candidates,
     scores: jax.Array,
     config: RankConfig,
-    before: Plan | None = None,
+    in_force: InForce | None = None,
 ) -> Plan:
     """The candidate that `safety.choose` takes, as a plan.
 
-    With `before`, the last candidate is the rest of the plan in force. Where that is
+    With a plan in force, the last candidate is its rest. Where that is
     the best, it is confirmed: followed as it was made, not drawn again from its rest.
 
     A feasible candidate whose score is not finite is a fault that no choice may hide:
@@ -141,7 +143,7 @@ def best_plan(
       candidates: K of them.
       scores: [K].
       config: the filter's.
-      before: the plan in force.
+      in_force: the plan in force.
     """
     verdict = check(scene, candidates, config.safety)
     index, fallback = choose(verdict, candidates, scores)
@@ -156,8 +158,9 @@ def best_plan(
         fallback=fallback,
         admissible=count,
     )
-    if before is None:
+    if in_force is None:
         return fresh
+    before, _ = in_force
     keeps = known & verdict.admissible[-1] & (scores[-1] >= scores[index])
     keeps = keeps & (before.since < LONGEST_S)
     kept = before.replace(since_choice=jnp.zeros(()), admissible=count)
@@ -171,13 +174,10 @@ def rank_policy(score: Score, config: RankConfig) -> Policy:
     def anew(
         params: Params, scene: Scene, key: jax.Array, in_force: InForce | None
     ) -> Plan:
-        candidates = sample(key, scene, config.sampler)
-        before = None
-        if in_force is not None:
-            before, rest = in_force
-            candidates = with_plan_in_force(candidates, rest)
+        sampled = sample(key, scene, config.sampler)
+        candidates = with_plan_in_force(sampled, in_force)
         scores = score(params, scene, candidates)
-        return best_plan(scene, candidates, scores, config, before)
+        return best_plan(scene, candidates, scores, config, in_force)
 
     return committed(anew, config.sampler, config.safety, config.commitment)
 

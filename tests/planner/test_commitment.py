@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from rcirl_jax.planner.commitment import only_where
 from rcirl_jax.planner.plan import later, no_plan
@@ -10,7 +11,10 @@ from rcirl_jax.planner.rank import RankConfig, hand_score, rank_policy
 from tests.scenes import random_scene
 
 
-def test_only_lanes_that_need_it_are_made_anew():
+@pytest.mark.parametrize("backend", ["cpu", "gpu"])
+def test_only_lanes_that_need_it_are_made_anew(backend, monkeypatch):
+    """One by one on a CPU, all at once elsewhere."""
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
     needed = jnp.asarray([True, False, True, False, False])
     old = {"a": jnp.arange(5.0), "b": jnp.zeros((5, 2))}
     offset = jnp.asarray(10.0)
