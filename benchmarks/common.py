@@ -15,14 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.common import processor, provenance
-from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
-from rcirl_jax.data.store import Dataset, DatasetWriter, open_dataset
+from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.data.store.dataset import Dataset, DatasetWriter, open_dataset
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import RewardConfig, init_reward, pinned
+from rcirl_jax.runtime.atomic_files import write_json
 from rcirl_jax.types import Demonstration, Normaliser, RewardParams
-from rcirl_jax.whole import write_json
 
 STRIDE_S = 60.0  # s between planning frames of the synthetic dataset
 

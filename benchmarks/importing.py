@@ -17,12 +17,12 @@ from absl import flags
 
 from benchmarks.common import write
 from experiments.common import run
-from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.cut import cut_item
 from rcirl_jax.data.parts import parts_of, recordings_of
-from rcirl_jax.data.quality import QualityReport
-from rcirl_jax.executor import Executor, Here, Processes
-from rcirl_jax.specs import spec_root
+from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.data.scenes.quality import QualityReport
+from rcirl_jax.runtime.executors import Executor, Here, Processes
+from rcirl_jax.runtime.specs import spec_root
 
 _DATA = flags.DEFINE_string("data", "../shared/data", "folder of the recordings")
 _PROCESSES = flags.DEFINE_integer("processes", 2, "processes side by side")

@@ -28,7 +28,7 @@ import numpy as np
 from absl import app, flags
 
 from benchmarks.common import write
-from rcirl_jax.evaluation.learners import normaliser_of
+from rcirl_jax.evaluation.ranking.learners import normaliser_of
 from rcirl_jax.reward import Compared, loss_sums, value
 from rcirl_jax.train.frozen import freeze
 from rcirl_jax.train.pieces import added, in_pieces

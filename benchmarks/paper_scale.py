@@ -27,7 +27,7 @@ from absl import flags
 
 from benchmarks.common import dataset_or_synthetic, write
 from experiments.common import run
-from rcirl_jax.data.store import open_dataset
+from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.features import feature_map
 from rcirl_jax.sampling import SamplerConfig, num_candidates

@@ -25,7 +25,7 @@ import numpy as np
 from absl import app, flags
 
 from benchmarks.common import write
-from rcirl_jax.evaluation.learners import normaliser_of
+from rcirl_jax.evaluation.ranking.learners import normaliser_of
 from rcirl_jax.sampling import SamplerConfig, num_candidates
 from rcirl_jax.train.frozen import freeze
 from rcirl_jax.train.loop import host_batch

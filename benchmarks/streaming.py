@@ -17,11 +17,11 @@ import numpy as np
 from absl import app, flags
 
 from benchmarks.common import resident_mb, stored_scenes, write
-from rcirl_jax.data.pipeline import ROW_BYTES, BatchIterator, split_batches
-from rcirl_jax.data.rows import checked_leaves
-from rcirl_jax.data.shards import encode
-from rcirl_jax.data.store import open_dataset
-from rcirl_jax.data.stream import Prefetch
+from rcirl_jax.data.store.dataset import open_dataset
+from rcirl_jax.data.store.order import ROW_BYTES, BatchIterator, split_batches
+from rcirl_jax.data.store.rows import checked_leaves
+from rcirl_jax.data.store.shards import encode
+from rcirl_jax.data.store.stream import Prefetch
 from rcirl_jax.features import feature_map
 from rcirl_jax.train.loop import fit_normaliser_on, host_batch
 from rcirl_jax.train.state import TrainConfig

@@ -28,9 +28,9 @@ import numpy as np
 from absl import app, flags
 
 from benchmarks.common import dataset_or_synthetic, write
-from rcirl_jax.data.store import open_dataset
-from rcirl_jax.evaluation.learners import normaliser_of
-from rcirl_jax.evaluation.sweep import MEMBERS_AT_ONCE
+from rcirl_jax.data.store.dataset import open_dataset
+from rcirl_jax.evaluation.ranking.learners import normaliser_of
+from rcirl_jax.evaluation.ranking.sweep import MEMBERS_AT_ONCE
 from rcirl_jax.reward import RewardConfig
 from rcirl_jax.train.frozen import Members, compiles, fit, freeze, members_of
 from rcirl_jax.train.loop import to_device_batch

@@ -29,8 +29,8 @@ from absl import app, flags
 
 from benchmarks import roofline
 from benchmarks.common import dataset_or_synthetic, write
-from rcirl_jax.data.store import open_dataset
-from rcirl_jax.evaluation.learners import normaliser_of
+from rcirl_jax.data.store.dataset import open_dataset
+from rcirl_jax.evaluation.ranking.learners import normaliser_of
 from rcirl_jax.features import feature_map
 from rcirl_jax.train.frozen import freeze
 from rcirl_jax.train.loop import host_batch

@@ -21,13 +21,13 @@ from experiments import margins, training
 from experiments.common import cutting, provenance, run
 from experiments.executor import executor
 from experiments.signals import checked_signals, signals_asked
-from rcirl_jax.autotune import STAGES, Loop, TuneConfig
+from rcirl_jax.autotune.loop import STAGES, Loop, TuneConfig
+from rcirl_jax.autotune.rehearsal import TEACHERS
 from rcirl_jax.data.importers import IMPORTERS
 from rcirl_jax.data.importing import ImportConfig
 from rcirl_jax.data.logs import Logs
 from rcirl_jax.errors import InputError, did_you_mean
-from rcirl_jax.rehearsal import TEACHERS
-from rcirl_jax.stages import file_sha256, only_one
+from rcirl_jax.runtime.pipeline import file_sha256, only_one
 from rcirl_jax.train.running import Running
 
 _WORKDIR = flags.DEFINE_string("workdir", None, "folder of the run", required=True)

@@ -13,14 +13,15 @@ from pathlib import Path
 import jax
 from absl import app, flags, logging
 
-from rcirl_jax import __version__, interrupts
-from rcirl_jax.data.config import CollectConfig
+from rcirl_jax import __version__
 from rcirl_jax.data.parts import Part, logs_sha256
-from rcirl_jax.data.store import Dataset
+from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.reader import load_weights
-from rcirl_jax.stages import code_sha256, file_sha256
-from rcirl_jax.whole import is_text
+from rcirl_jax.runtime import signals as interrupts
+from rcirl_jax.runtime.atomic_files import is_text
+from rcirl_jax.runtime.pipeline import code_sha256, file_sha256
 
 EXIT_BAD_INPUT = 2
 # variables that decide how numbers are rounded
@@ -38,7 +39,7 @@ def run(main: Callable[[], None]) -> None:
     """Run a main; bad input becomes one line on stderr and exit status 2.
 
     So do a place that cannot be written and memory that is not given. SIGTERM ends
-    with 143, SIGINT with 130, within ten seconds (`rcirl_jax.interrupts`).
+    with 143, SIGINT with 130, within ten seconds (`rcirl_jax.runtime.signals`).
     """
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 

@@ -20,8 +20,8 @@ from rcirl_jax.export.linear_yaml import lattice_yaml, reward_yaml
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.onnx_model import write_onnx
 from rcirl_jax.export.stablehlo import write_stablehlo
-from rcirl_jax.stages import file_sha256
-from rcirl_jax.whole import write_json, write_whole
+from rcirl_jax.runtime.atomic_files import write_json, write_whole
+from rcirl_jax.runtime.pipeline import file_sha256
 
 _WEIGHTS = flags.DEFINE_string("weights", None, "weights file")
 _HAND = flags.DEFINE_string("hand_weights", None, "of tune_hand_set, for --yaml")

@@ -15,7 +15,7 @@ flags and the learner's hash stand in DATASET/made_by.json.
 from absl import flags
 
 from experiments.common import made_by_file, run
-from rcirl_jax.data.quality import format_quality
+from rcirl_jax.data.scenes.quality import format_quality
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.closed_loop import table_rows
 from rcirl_jax.simulation.cases import STEP_S

@@ -12,14 +12,14 @@ from absl import flags
 
 from experiments.common import provenance, run
 from experiments.executor import executor
-from rcirl_jax.data.store import open_dataset
+from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.evaluate import RankingSetup, evaluate_ranking
-from rcirl_jax.evaluation.format import format_table
-from rcirl_jax.evaluation.table import to_json
+from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
+from rcirl_jax.evaluation.ranking.format import format_table
+from rcirl_jax.evaluation.ranking.table import to_json
 from rcirl_jax.export.hand_weights import tuned_rows
 from rcirl_jax.export.loading import load_runs
-from rcirl_jax.whole import write_json
+from rcirl_jax.runtime.atomic_files import write_json
 
 _WEIGHTS = flags.DEFINE_list("weights", None, "weights files", required=True)
 _DATA = flags.DEFINE_string("data", None, "dataset", required=True)

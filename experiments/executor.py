@@ -2,7 +2,7 @@
 
 from absl import flags
 
-from rcirl_jax.executor import EXECUTORS, Executor, make_executor
+from rcirl_jax.runtime.executors import EXECUTORS, Executor, make_executor
 
 _EXECUTOR = flags.DEFINE_enum(
     "executor", "local", EXECUTORS, "where independent pieces of work run"

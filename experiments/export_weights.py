@@ -12,7 +12,7 @@ from pathlib import Path
 from absl import flags
 
 from experiments.common import run
-from rcirl_jax.data.joined import open_datasets
+from rcirl_jax.data.store.joined import open_datasets
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.from_run import export_run, read_config
 from rcirl_jax.export.provenance import dataset_names

@@ -18,17 +18,17 @@ from absl import flags
 from experiments import margins
 from experiments.common import provenance, run
 from experiments.executor import executor
-from rcirl_jax.data.store import open_dataset
+from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.gate import judge
-from rcirl_jax.evaluation.gate_output import format_verdict, write_verdict
-from rcirl_jax.evaluation.gate_runs import pair_of
-from rcirl_jax.evaluation.likeness import DRIVES, held_out_likeness
-from rcirl_jax.evaluation.suite_files import runs_of
+from rcirl_jax.evaluation.closed_loop.files import runs_of
+from rcirl_jax.evaluation.closed_loop.likeness import DRIVES, held_out_likeness
+from rcirl_jax.evaluation.gate.decision import judge
+from rcirl_jax.evaluation.gate.output import format_verdict, write_verdict
+from rcirl_jax.evaluation.gate.runs import pair_of
 from rcirl_jax.export.gate_job import drive_job, gate_job, left_out
 from rcirl_jax.export.tuned_idm import idm_fields, idm_left_out
 from rcirl_jax.planner.safety import TRACKS
-from rcirl_jax.simulation.recorded_scenes import held_out
+from rcirl_jax.simulation.recorded.scenes import held_out
 from rcirl_jax.simulation.rows import BASELINES
 
 _CANDIDATE = flags.DEFINE_string("candidate", None, "weights file", required=True)

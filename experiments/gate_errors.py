@@ -33,8 +33,9 @@ from experiments import margins
 from experiments.common import alone, provenance, run
 from experiments.executor import executor
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.closed_loop import SuiteConfig, drive_here, run_suite
-from rcirl_jax.evaluation.gate_errors import (
+from rcirl_jax.evaluation.closed_loop.files import SuiteRuns, read_runs, runs_of
+from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, drive_here, run_suite
+from rcirl_jax.evaluation.gate.errors import (
     DECISIONS,
     SAID,
     Tally,
@@ -44,14 +45,13 @@ from rcirl_jax.evaluation.gate_errors import (
     every_pair,
     format_errors,
 )
-from rcirl_jax.evaluation.gate_pairs import pair_between
-from rcirl_jax.evaluation.gate_runs import CANDIDATE, INCUMBENT
-from rcirl_jax.evaluation.gate_types import GateConfig
-from rcirl_jax.evaluation.suite_files import SuiteRuns, read_runs, runs_of
+from rcirl_jax.evaluation.gate.pairs import pair_between
+from rcirl_jax.evaluation.gate.runs import CANDIDATE, INCUMBENT
+from rcirl_jax.evaluation.gate.types import GateConfig
 from rcirl_jax.export.gate_job import ErrorsJob, gate_job
 from rcirl_jax.export.spread import spread
-from rcirl_jax.stages import file_sha256
-from rcirl_jax.whole import write_json
+from rcirl_jax.runtime.atomic_files import write_json
+from rcirl_jax.runtime.pipeline import file_sha256
 
 WORSE = "random weights"
 CHUNK = 240  # cases in memory: ten of each family at once

@@ -11,7 +11,7 @@ features to which the guard is blind.
 from absl import flags
 
 from experiments.common import run
-from rcirl_jax.data.joined import open_datasets
+from rcirl_jax.data.store.joined import open_datasets
 from rcirl_jax.export.guard import Guard, Limits
 from rcirl_jax.export.guard_rate import guard_rate
 from rcirl_jax.export.loading import open_reward

@@ -3,8 +3,8 @@
 from absl import flags
 
 from experiments.common import alone
-from rcirl_jax.data.joined import Demonstrations
-from rcirl_jax.data.resplit import HOLDOUTS, folds_by_recording, held_out
+from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.data.store.resplit import HOLDOUTS, folds_by_recording, held_out
 from rcirl_jax.errors import InputError
 
 _HOLDOUT = flags.DEFINE_enum("holdout", "groups", HOLDOUTS, "what is held out")

@@ -36,30 +36,30 @@ from absl import flags
 from experiments import training
 from experiments.common import provenance, run, unread
 from experiments.holdout import splits
-from rcirl_jax.data.joined import Demonstrations
-from rcirl_jax.data.store import open_dataset
+from rcirl_jax.data.store.dataset import open_dataset
+from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.evaluate import (
+from rcirl_jax.evaluation.ranking.evaluate import (
     RankingSetup,
     pooled,
     rank_scenes,
     report_of,
 )
-from rcirl_jax.evaluation.format import format_table, markdown_table
-from rcirl_jax.evaluation.learners import (
+from rcirl_jax.evaluation.ranking.format import format_table, markdown_table
+from rcirl_jax.evaluation.ranking.learners import (
     LEARNERS,
     learner_configs,
     scorers,
     train_learners,
     untrained,
 )
-from rcirl_jax.evaluation.score import Rival
-from rcirl_jax.evaluation.table import UNTRAINED_ROW, to_json
-from rcirl_jax.evaluation.tuned_rivals import as_numbers, tuned_rivals
+from rcirl_jax.evaluation.ranking.score import Rival
+from rcirl_jax.evaluation.ranking.table import UNTRAINED_ROW, to_json
+from rcirl_jax.evaluation.rivals.tuned import as_numbers, tuned_rivals
 from rcirl_jax.export.hand_weights import tuned_rows
-from rcirl_jax.report.intervals import ranking_chart
+from rcirl_jax.report.ranking.intervals import ranking_chart
 from rcirl_jax.reward import RewardConfig
-from rcirl_jax.whole import write_json, write_whole
+from rcirl_jax.runtime.atomic_files import write_json, write_whole
 
 # the learners say
 unread("loss", "hidden_size", "activation", "constraint", "pin", "by_context")

@@ -16,13 +16,13 @@ from absl import flags
 from experiments.common import cutting, made_by_file, run
 from experiments.executor import executor
 from experiments.signals import checked_signals
-from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import IMPORTERS
 from rcirl_jax.data.importing import ImportConfig, import_parts
 from rcirl_jax.data.parts import leaving_out, parts_of
-from rcirl_jax.data.quality import format_quality, format_splits
-from rcirl_jax.data.store import Dataset
-from rcirl_jax.evaluation.evaluate import RankingSetup, oracle_floor
+from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.data.scenes.quality import format_quality, format_splits
+from rcirl_jax.data.store.dataset import Dataset
+from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, oracle_floor
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.sampling.config import MODES
 

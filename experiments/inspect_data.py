@@ -12,9 +12,9 @@ from pathlib import Path
 from absl import flags
 
 from experiments.common import provenance, run
-from rcirl_jax.data.store import open_dataset
+from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
-from rcirl_jax.report.data_page import choose_rows, write_data_page
+from rcirl_jax.report.data.page import choose_rows, write_data_page
 
 _DATA = flags.DEFINE_string("data", None, "dataset", required=True)
 _OUTPUT = flags.DEFINE_string("output", None, "folder to write", required=True)

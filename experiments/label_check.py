@@ -4,7 +4,7 @@
     python -m experiments.label_check --traffic=4 --noise=ngsim --output=DIR
     python -m experiments.label_check --format=commonroad --input=DIR --output=DIR
 
-Without --input: drives planned by `evaluation.label_cases`, whose decisions and
+Without --input: drives planned by `evaluation.labels.cases`, whose decisions and
 tags are known, are labelled and compared; position noise as in NGSIM, or none.
 With --traffic=N instead: N simulated recordings of every entry of
 data_specs/sources/synthetic.toml, whose drivers' own state is the truth.
@@ -28,16 +28,16 @@ from experiments.common import provenance, run
 from experiments.executor import executor
 from rcirl_jax.data.importers import IMPORTERS
 from rcirl_jax.data.parts import parts_of
-from rcirl_jax.data.store import open_dataset
-from rcirl_jax.evaluation.label_logs import check_logs
-from rcirl_jax.evaluation.label_scores import LabelReport, format_labels, format_scores
-from rcirl_jax.evaluation.label_signals import format_phases
-from rcirl_jax.evaluation.label_stops import compare_stored, format_stops
-from rcirl_jax.evaluation.label_traffic import measure_traffic
-from rcirl_jax.evaluation.label_truth import measure
-from rcirl_jax.executor import Executor
-from rcirl_jax.report.label_picture import label_chart
-from rcirl_jax.whole import write_json
+from rcirl_jax.data.store.dataset import open_dataset
+from rcirl_jax.evaluation.labels.logs import check_logs
+from rcirl_jax.evaluation.labels.scores import LabelReport, format_labels, format_scores
+from rcirl_jax.evaluation.labels.signals import format_phases
+from rcirl_jax.evaluation.labels.stops import compare_stored, format_stops
+from rcirl_jax.evaluation.labels.traffic import measure_traffic
+from rcirl_jax.evaluation.labels.truth import measure
+from rcirl_jax.report.data.label_picture import label_chart
+from rcirl_jax.runtime.atomic_files import write_json
+from rcirl_jax.runtime.executors import Executor
 
 _CASES = flags.DEFINE_integer("cases", 100, "planned drives of each family")
 _TRAFFIC = flags.DEFINE_integer("traffic", None, "recordings of each road simulated")

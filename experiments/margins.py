@@ -4,7 +4,7 @@ import dataclasses
 
 from absl import flags
 
-from rcirl_jax.evaluation.gate_types import GateConfig
+from rcirl_jax.evaluation.gate.types import GateConfig
 
 _PRIMARY = flags.DEFINE_list(
     "primary", list(GateConfig().primary), "metrics that may gain"

@@ -2,7 +2,7 @@
 
 from absl import flags
 
-from rcirl_jax.recipes import DEFAULT, Recipe, load_recipe
+from rcirl_jax.autotune.recipes import DEFAULT, Recipe, load_recipe
 
 RECIPE = flags.DEFINE_string(
     "recipe", DEFAULT, "name in data_specs/recipes, or a TOML file"

@@ -15,8 +15,9 @@ from absl import flags
 from experiments.common import provenance, run
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.closed_loop import table_rows
-from rcirl_jax.report.case_page import write_case_page
-from rcirl_jax.report.case_picture import animate_case, draw_case
+from rcirl_jax.report.case.page import write_case_page
+from rcirl_jax.report.case.picture import animate_case, draw_case
+from rcirl_jax.runtime.atomic_files import write_json
 from rcirl_jax.simulation.rows import BASELINES, Row
 from rcirl_jax.simulation.suite import (
     FULL_S,
@@ -25,7 +26,6 @@ from rcirl_jax.simulation.suite import (
     drive_with_logs,
     rollout_config,
 )
-from rcirl_jax.whole import write_json
 
 _WEIGHTS = flags.DEFINE_string("weights", None, "weights file", required=True)
 _CASE = flags.DEFINE_string("case", None, "id, for example cut_in/017@0", required=True)

@@ -9,10 +9,10 @@ from pathlib import Path
 from absl import flags
 
 from experiments.common import provenance, run
-from rcirl_jax.data.store import open_dataset
-from rcirl_jax.evaluation.evaluate import RankingSetup, evaluate_ranking
+from rcirl_jax.data.store.dataset import open_dataset
+from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.export.loading import load_runs, open_reward
-from rcirl_jax.report.ranking_page import write_ranking_page
+from rcirl_jax.report.ranking.page import write_ranking_page
 
 _WEIGHTS = flags.DEFINE_list("weights", None, "weights files", required=True)
 _DATA = flags.DEFINE_string("data", None, "dataset", required=True)

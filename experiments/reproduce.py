@@ -19,7 +19,7 @@ from pathlib import Path
 from absl import flags
 
 from experiments.common import provenance, run
-from rcirl_jax.data.joined import open_datasets
+from rcirl_jax.data.store.joined import open_datasets
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.provenance import check_local, dataset_names
@@ -33,7 +33,7 @@ from rcirl_jax.export.reproduce import (
     sweep_of,
     train_again,
 )
-from rcirl_jax.whole import write_json
+from rcirl_jax.runtime.atomic_files import write_json
 
 _WEIGHTS = flags.DEFINE_string("weights", None, "weights file", required=True)
 _DATA = flags.DEFINE_list(

@@ -6,12 +6,16 @@ from pathlib import Path
 from absl import flags
 
 from rcirl_jax.data.parts import Part
-from rcirl_jax.data.signal_checks import SignalChecks, read_signal_checks, signal_checks
+from rcirl_jax.data.scenes.signal_checks import (
+    SignalChecks,
+    read_signal_checks,
+    signal_checks,
+)
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.label_logs import check_written
-from rcirl_jax.evaluation.label_signals import format_phases
-from rcirl_jax.executor import Executor
-from rcirl_jax.stages import file_sha256
+from rcirl_jax.evaluation.labels.logs import check_written
+from rcirl_jax.evaluation.labels.signals import format_phases
+from rcirl_jax.runtime.executors import Executor
+from rcirl_jax.runtime.pipeline import file_sha256
 
 POOLED = "pooled"
 _SIGNALS = flags.DEFINE_string(

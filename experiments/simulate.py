@@ -21,22 +21,23 @@ from absl import flags
 from experiments.common import provenance, run
 from experiments.executor import executor
 from rcirl_jax.data.importers import IMPORTERS
-from rcirl_jax.data.joined import JoinedDatasets, open_datasets
 from rcirl_jax.data.parts import Part, parts_of, recordings_of_all
+from rcirl_jax.data.store.joined import JoinedDatasets, open_datasets
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.closed_loop import (
+from rcirl_jax.evaluation.closed_loop.likeness import DRIVES, held_out_likeness
+from rcirl_jax.evaluation.closed_loop.suite import (
     SuiteConfig,
     drive_here,
     run_suite,
     worst_cases,
     write_suite,
 )
-from rcirl_jax.evaluation.likeness import DRIVES, held_out_likeness
 from rcirl_jax.export.spread import SuiteJob, spread
 from rcirl_jax.export.tuned_idm import idm_fields, idm_left_out
 from rcirl_jax.planner.safety import TRACKS
-from rcirl_jax.simulation.recorded_config import RecordedConfig
-from rcirl_jax.simulation.recorded_scenes import held_out
+from rcirl_jax.runtime.atomic_files import write_json, write_whole
+from rcirl_jax.simulation.recorded.config import RecordedConfig
+from rcirl_jax.simulation.recorded.scenes import held_out
 from rcirl_jax.simulation.rows import BASELINES, human_row
 from rcirl_jax.simulation.suite import (
     FULL_S,
@@ -45,7 +46,6 @@ from rcirl_jax.simulation.suite import (
     recorded_set,
     suite_refs,
 )
-from rcirl_jax.whole import write_json, write_whole
 
 _WEIGHTS = flags.DEFINE_list("weights", None, "weights files", required=True)
 _SUITE = flags.DEFINE_string(

@@ -22,9 +22,9 @@ from experiments import training
 from experiments.common import floats, hidden_sizes, provenance, run, unread
 from experiments.executor import executor
 from experiments.recipe import AS_SAID
-from rcirl_jax.evaluation.sweep import CHOICES, SweepConfig
+from rcirl_jax.evaluation.ranking.sweep import CHOICES, SweepConfig
 from rcirl_jax.export.sweep import run_sweep, table
-from rcirl_jax.report.sweep_picture import sweep_picture
+from rcirl_jax.report.ranking.sweep_picture import sweep_picture
 from rcirl_jax.train.state import TrainConfig
 
 unread("leaky_rate", "learning_rate", "hidden_size")  # the grid

@@ -18,8 +18,8 @@ from absl import flags
 
 from experiments import training
 from experiments.common import provenance, run
-from rcirl_jax.data.joined import open_datasets
-from rcirl_jax.data.preferences import read_preferences
+from rcirl_jax.data.store.joined import open_datasets
+from rcirl_jax.data.store.preferences import read_preferences
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.parallel import PARALLEL
 from rcirl_jax.train.processes import is_first, join_processes

@@ -11,9 +11,9 @@ from absl import flags
 
 from experiments.common import floats, hidden_sizes
 from experiments.recipe import AS_SAID, recipe
-from rcirl_jax.data.joined import EQUAL
+from rcirl_jax.autotune.recipes import reward_config
+from rcirl_jax.data.store.joined import EQUAL
 from rcirl_jax.errors import InputError
-from rcirl_jax.recipes import reward_config
 from rcirl_jax.reward import LOSSES, RewardConfig
 from rcirl_jax.reward.network import CONSTRAINTS, PINS
 from rcirl_jax.sampling.config import MODES

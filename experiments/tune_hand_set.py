@@ -17,11 +17,11 @@ from absl import flags
 
 from experiments.common import provenance, run
 from experiments.holdout import split
-from rcirl_jax.data.joined import Demonstrations, open_datasets
+from rcirl_jax.data.store.joined import Demonstrations, open_datasets
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation import objectives
-from rcirl_jax.evaluation.evaluate import RankingSetup
-from rcirl_jax.evaluation.tuned_rivals import SIGMA, TUNING_SCENES
+from rcirl_jax.evaluation.ranking.evaluate import RankingSetup
+from rcirl_jax.evaluation.rivals import objectives
+from rcirl_jax.evaluation.rivals.tuned import SIGMA, TUNING_SCENES
 from rcirl_jax.export.hand_weights import write_hand_weights
 from rcirl_jax.sampling import SamplerConfig
 

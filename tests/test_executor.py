@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.executor import Here, Processes, make_executor
+from rcirl_jax.runtime.executors import Here, Processes, make_executor
 
 
 def twice(item):
@@ -47,7 +47,7 @@ def own_number(item):
 # a parent that says who works for it and then hangs
 HANGS = """
 import time
-from rcirl_jax.executor import Processes
+from rcirl_jax.runtime.executors import Processes
 from tests.test_executor import own_number
 if __name__ == "__main__":
     pool = Processes(2)

@@ -14,7 +14,7 @@ pytestmark = pytest.mark.multiprocess
 
 HEAD = """
 import hashlib, sys, time
-from rcirl_jax import interrupts
+from rcirl_jax.runtime import signals as interrupts
 
 def command(work):
     try:

@@ -6,10 +6,10 @@ import sys
 
 import pytest
 
+from rcirl_jax.autotune.recipes import load_recipe, recipe_names
 from rcirl_jax.errors import InputError
-from rcirl_jax.recipes import load_recipe, recipe_names
 from rcirl_jax.reward import RewardConfig
-from rcirl_jax.specs import load_toml, spec_root
+from rcirl_jax.runtime.specs import load_toml, spec_root
 from tests.commands import command
 
 PAPER = spec_root() / "recipes" / "paper.toml"

@@ -2,9 +2,9 @@
 
 import pytest
 
-from rcirl_jax import rehearsal
+from rcirl_jax.autotune import rehearsal
+from rcirl_jax.autotune.rehearsal import Rehearsal
 from rcirl_jax.errors import InputError
-from rcirl_jax.rehearsal import Rehearsal
 from tests.weights_files import random_weights
 
 

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.settings import typed_fields, typed_settings
+from rcirl_jax.runtime.settings import typed_fields, typed_settings
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.stages import FILE, LOCK, Stages, only_one
+from rcirl_jax.runtime.pipeline import FILE, LOCK, Stages, only_one
 
 
 @pytest.fixture
@@ -147,7 +147,8 @@ def test_what_made_a_stage_is_noted_and_decides_nothing(stages):
 @pytest.mark.multiprocess
 def test_a_second_process_is_refused(tmp_path):
     code = (
-        "import sys; from pathlib import Path; from rcirl_jax.stages import only_one\n"
+        "import sys; from pathlib import Path\n"
+        "from rcirl_jax.runtime.pipeline import only_one\n"
         "with only_one(Path(sys.argv[1])): print('held')"
     )
     command = [sys.executable, "-c", code, str(tmp_path)]
@@ -163,7 +164,7 @@ def test_a_second_process_is_refused(tmp_path):
 def test_a_killed_process_holds_nothing(tmp_path):
     code = (
         "import sys, time; from pathlib import Path\n"
-        "from rcirl_jax.stages import only_one\n"
+        "from rcirl_jax.runtime.pipeline import only_one\n"
         "with only_one(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
     )
     command = [sys.executable, "-c", code, str(tmp_path)]

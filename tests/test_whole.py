@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.whole import (
+from rcirl_jax.runtime.atomic_files import (
     MAX_DEPTH,
     MAX_JSON_BYTES,
     parse_json,
@@ -18,7 +18,7 @@ from tests.conftest import REPO
 WRITER = """
 import sys
 from pathlib import Path
-from rcirl_jax.whole import write_whole
+from rcirl_jax.runtime.atomic_files import write_whole
 text = sys.argv[2] * int(sys.argv[3])
 print("ready", flush=True)
 sys.stdin.readline()  # both at once

@@ -15,10 +15,10 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from rcirl_jax.data.files import FACTS
+from rcirl_jax.data.store.files import FACTS
 from rcirl_jax.export.from_run import read_config
 from rcirl_jax.export.weights import to_json
-from rcirl_jax.stages import FILE, digest, file_sha256
+from rcirl_jax.runtime.pipeline import FILE, digest, file_sha256
 from rcirl_jax.train.loop import restore_run
 
 Facts = Mapping[str, str]  # what came out -> digest

@@ -3,9 +3,10 @@
     python -m benchmarks.reliability.load --what=suite,import --output=DIR
 
 suite: `--cases` closed-loop cases, the whole catalogue of as many seeds as that takes,
-driven by `evaluation.closed_loop.run_suite` as `experiments.simulate` does: the four
-judges, IDM among them, then the hand-set cost, which plans 64 candidates a step.
-`--duration` below 120 s makes it another suite than the paper's, and the JSON says so.
+driven by `evaluation.closed_loop.suite.run_suite` as `experiments.simulate` does:
+the four judges, IDM among them, then the hand-set cost, which plans 64 candidates a
+step. `--duration` below 120 s makes it another suite than the paper's, and the JSON
+says so.
 
 import: `--scenes` scenes of one generated log (platoons in waves, 2 GB for 10 million)
 by `experiments.import_logs` as a user would call it, with its usual filters and
@@ -46,10 +47,10 @@ from benchmarks.reliability.memory import (
     thinned,
 )
 from experiments.common import provenance, run
-from rcirl_jax.data.files import MARK
-from rcirl_jax.data.shards import shard_key
+from rcirl_jax.data.store.files import MARK
+from rcirl_jax.data.store.shards import shard_key
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.closed_loop import (
+from rcirl_jax.evaluation.closed_loop.suite import (
     SuiteConfig,
     drive_here,
     run_suite,

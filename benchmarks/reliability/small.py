@@ -11,7 +11,8 @@ import os
 import runpy
 import sys
 
-from rcirl_jax.data import importing, pipeline
+from rcirl_jax.data import importing
+from rcirl_jax.data.store import order as pipeline
 
 SHARD_SCENES = 60
 BROKEN = "RCIRL_BROKEN_RESUME"

@@ -46,19 +46,19 @@ from benchmarks.reliability.memory import (
 )
 from benchmarks.reliability.small import SHARD_SCENES
 from experiments.common import provenance, run
-from rcirl_jax.autotune import Loop, TuneConfig
+from rcirl_jax.autotune.loop import Loop, TuneConfig
 from rcirl_jax.data import importing
-from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importing import ImportConfig
 from rcirl_jax.data.logs import Logs
-from rcirl_jax.data.store import open_dataset
-from rcirl_jax.evaluation.gate_types import GateConfig
-from rcirl_jax.evaluation.table import from_json
-from rcirl_jax.executor import Here
+from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.data.store.dataset import open_dataset
+from rcirl_jax.evaluation.gate.types import GateConfig
+from rcirl_jax.evaluation.ranking.table import from_json
 from rcirl_jax.export.loading import open_reward
-from rcirl_jax.report.data_page import choose_rows, write_data_page
-from rcirl_jax.report.ranking_page import write_ranking_page
-from rcirl_jax.stages import digest, file_sha256
+from rcirl_jax.report.data.page import choose_rows, write_data_page
+from rcirl_jax.report.ranking.page import write_ranking_page
+from rcirl_jax.runtime.executors import Here
+from rcirl_jax.runtime.pipeline import digest, file_sha256
 from rcirl_jax.train.running import Running
 from rcirl_jax.train.state import TrainConfig
 

@@ -26,7 +26,7 @@ from absl import flags
 from benchmarks.common import write
 from experiments.common import HOOK_VARIABLES, git_commit, run
 from rcirl_jax.errors import InputError
-from rcirl_jax.stages import digest, file_sha256
+from rcirl_jax.runtime.pipeline import digest, file_sha256
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "reliability.md"

@@ -24,15 +24,15 @@ import numpy as np
 from absl import flags
 
 from experiments.common import provenance, run
-from rcirl_jax.evaluation.background import (
+from rcirl_jax.evaluation.insight.background import (
     Learning,
     TwoFrames,
     draw_examples,
     example_numbers,
 )
-from rcirl_jax.evaluation.background_world import World, summary, sweep
-from rcirl_jax.report.background_picture import background_figure
-from rcirl_jax.whole import write_json
+from rcirl_jax.evaluation.insight.background_world import World, summary, sweep
+from rcirl_jax.report.tuning.background_picture import background_figure
+from rcirl_jax.runtime.atomic_files import write_json
 
 _OUTPUT = flags.DEFINE_string("output", "out/background_shift", "folder to write")
 _SEED = flags.DEFINE_integer("seed", 0, "seed of the draws, and the first seed", 0)

@@ -33,8 +33,8 @@ from experiments.paper.common import (
     write,
 )
 from experiments.paper.weights import QUICK_S, drives_config, trained_weights
-from rcirl_jax.data.joined import open_datasets
-from rcirl_jax.evaluation.closed_loop import SuiteConfig, SuiteResult, run_suite
+from rcirl_jax.data.store.joined import open_datasets
+from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, SuiteResult, run_suite
 from rcirl_jax.evaluation.exact import holm
 from rcirl_jax.evaluation.statistics import (
     Difference,
@@ -43,7 +43,7 @@ from rcirl_jax.evaluation.statistics import (
     paired_difference,
 )
 from rcirl_jax.export.closed_loop import table_rows
-from rcirl_jax.report.intervals import interval_chart
+from rcirl_jax.report.ranking.intervals import interval_chart
 from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics, nuplan_score
 from rcirl_jax.simulation.suite import FULL_S, catalogue_set, suite_refs
 

@@ -9,20 +9,20 @@ from absl import flags
 
 from experiments.common import alone, made_by_file, provenance, unread
 from experiments.recipe import AS_SAID, recipe
-from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
-from rcirl_jax.data.joined import Demonstrations
-from rcirl_jax.data.resplit import Resplit
-from rcirl_jax.data.store import Dataset, open_dataset
+from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.data.store.dataset import Dataset, open_dataset
+from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.data.store.resplit import Resplit
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.evaluate import RankingSetup, evaluate_ranking
-from rcirl_jax.evaluation.learners import Learned, scorers
-from rcirl_jax.evaluation.table import RankingReport
-from rcirl_jax.report.intervals import Interval
+from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
+from rcirl_jax.evaluation.ranking.learners import Learned, scorers
+from rcirl_jax.evaluation.ranking.table import RankingReport
+from rcirl_jax.report.ranking.intervals import Interval
 from rcirl_jax.reward import RewardConfig
+from rcirl_jax.runtime.atomic_files import write_json
 from rcirl_jax.train.state import POSITIVES, TrainConfig
-from rcirl_jax.whole import write_json
 
 DATA = flags.DEFINE_string("data", None, "dataset (default: synthetic traffic)")
 OUTPUT = flags.DEFINE_string("output", "out/paper", "folder to write")

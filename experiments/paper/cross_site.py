@@ -25,13 +25,13 @@ from experiments.paper.common import (
     seeds,
     write,
 )
-from rcirl_jax.data.joined import Demonstrations
-from rcirl_jax.data.resplit import halves
-from rcirl_jax.data.store import open_dataset
+from rcirl_jax.data.store.dataset import open_dataset
+from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.data.store.resplit import halves
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.learners import FrozenSets, train_learner
-from rcirl_jax.evaluation.table import to_json
-from rcirl_jax.report.intervals import interval_panel
+from rcirl_jax.evaluation.ranking.learners import FrozenSets, train_learner
+from rcirl_jax.evaluation.ranking.table import to_json
+from rcirl_jax.report.ranking.intervals import interval_panel
 from rcirl_jax.report.style import figure, label, save
 
 _SITES = flags.DEFINE_list("sites", [], "NAME=DATASET, at least two")

@@ -27,14 +27,14 @@ from experiments.paper.common import (
     seeds,
     write,
 )
-from rcirl_jax.data.resplit import fewer
-from rcirl_jax.evaluation.learners import (
+from rcirl_jax.data.store.resplit import fewer
+from rcirl_jax.evaluation.ranking.learners import (
     FrozenSets,
     learner_config,
     train_learner,
 )
-from rcirl_jax.evaluation.table import to_json
-from rcirl_jax.report.intervals import interval_curves
+from rcirl_jax.evaluation.ranking.table import to_json
+from rcirl_jax.report.ranking.intervals import interval_curves
 from rcirl_jax.report.style import figure, label, save
 
 _COUNTS = flags.DEFINE_list(

@@ -22,7 +22,7 @@ from absl import flags
 
 from experiments.common import run
 from experiments.paper.common import base, dataset, fixed, picture, seeds, write
-from rcirl_jax.evaluation.data_support import (
+from rcirl_jax.evaluation.insight.data_support import (
     Choices,
     choices_of,
     growth,
@@ -30,9 +30,9 @@ from rcirl_jax.evaluation.data_support import (
     reasons,
     weights_supported,
 )
-from rcirl_jax.evaluation.identify import to_json
-from rcirl_jax.evaluation.identify_text import format_report
-from rcirl_jax.evaluation.learners import (
+from rcirl_jax.evaluation.insight.identify import to_json
+from rcirl_jax.evaluation.insight.identify_text import format_report
+from rcirl_jax.evaluation.ranking.learners import (
     LEARNERS,
     FrozenSets,
     learner_config,
@@ -40,7 +40,7 @@ from rcirl_jax.evaluation.learners import (
     train_learner,
 )
 from rcirl_jax.features import feature_map
-from rcirl_jax.report.support_picture import support_picture
+from rcirl_jax.report.tuning.support_picture import support_picture
 from rcirl_jax.reward import RewardConfig
 from rcirl_jax.units import TIMES_S
 

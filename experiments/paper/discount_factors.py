@@ -20,8 +20,12 @@ from scipy.stats import ttest_ind
 from experiments.common import run
 from experiments.paper.common import base, dataset, fixed, picture, seeds, write
 from rcirl_jax.evaluation.exact import holm
-from rcirl_jax.evaluation.learners import Learned, learner_config, train_learners
-from rcirl_jax.report.intervals import curves_panel
+from rcirl_jax.evaluation.ranking.learners import (
+    Learned,
+    learner_config,
+    train_learners,
+)
+from rcirl_jax.report.ranking.intervals import curves_panel
 from rcirl_jax.report.style import figure, label, save
 from rcirl_jax.reward import pinned
 from rcirl_jax.units import TIMES_S

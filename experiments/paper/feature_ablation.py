@@ -12,11 +12,11 @@ speed, limit) the choice is no worse.
 
 from experiments.common import run
 from experiments.paper.common import base, dataset, picture, ranked, seeds, write
-from rcirl_jax.evaluation.format import format_table
-from rcirl_jax.evaluation.learners import FrozenSets, train_learner
-from rcirl_jax.evaluation.table import to_json
+from rcirl_jax.evaluation.ranking.format import format_table
+from rcirl_jax.evaluation.ranking.learners import FrozenSets, train_learner
+from rcirl_jax.evaluation.ranking.table import to_json
 from rcirl_jax.features import feature_map
-from rcirl_jax.report.intervals import ranking_chart
+from rcirl_jax.report.ranking.intervals import ranking_chart
 
 GROUPS = {
     "lateral": ("l", "dl", "ddl", "curvature", "lateral_acceleration"),

@@ -31,20 +31,20 @@ from experiments.paper.common import (
     write,
 )
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.known_truth import (
+from rcirl_jax.evaluation.insight.known_truth import (
     agreement,
     differences,
     experts,
     hidden_reward,
     learns_from_choices,
 )
-from rcirl_jax.evaluation.learners import (
+from rcirl_jax.evaluation.ranking.learners import (
     FrozenSets,
     learner_config,
     normaliser_of,
     train_learner,
 )
-from rcirl_jax.report.intervals import curves_panel
+from rcirl_jax.report.ranking.intervals import curves_panel
 from rcirl_jax.report.style import figure, label, save
 from rcirl_jax.reward.network import PINS
 from rcirl_jax.train.state import TrainConfig

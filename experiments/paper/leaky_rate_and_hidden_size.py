@@ -25,9 +25,9 @@ from experiments.paper.common import (
     seeds,
     write,
 )
-from rcirl_jax.evaluation.learners import FrozenSets, train_grid
-from rcirl_jax.evaluation.table import to_json
-from rcirl_jax.report.intervals import interval_curves
+from rcirl_jax.evaluation.ranking.learners import FrozenSets, train_grid
+from rcirl_jax.evaluation.ranking.table import to_json
+from rcirl_jax.report.ranking.intervals import interval_curves
 from rcirl_jax.report.style import figure, label, save
 from rcirl_jax.reward import RewardConfig
 

@@ -10,14 +10,14 @@ linear in departures from the usual, is close to the network. `--quick`: a minut
 
 from experiments.common import run
 from experiments.paper.common import base, dataset, picture, ranked, seeds, write
-from rcirl_jax.evaluation.format import format_table
-from rcirl_jax.evaluation.learners import (
+from rcirl_jax.evaluation.ranking.format import format_table
+from rcirl_jax.evaluation.ranking.learners import (
     LINEAR,
     learner_config,
     train_learners,
 )
-from rcirl_jax.evaluation.table import to_json
-from rcirl_jax.report.intervals import ranking_chart
+from rcirl_jax.evaluation.ranking.table import to_json
+from rcirl_jax.report.ranking.intervals import ranking_chart
 from rcirl_jax.reward import RewardConfig
 
 

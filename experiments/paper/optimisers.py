@@ -22,10 +22,10 @@ from experiments.paper.common import (
     seeds,
     write,
 )
-from rcirl_jax.evaluation.format import format_table
-from rcirl_jax.evaluation.learners import train_learners
-from rcirl_jax.evaluation.table import to_json
-from rcirl_jax.report.intervals import curves_panel, interval_panel
+from rcirl_jax.evaluation.ranking.format import format_table
+from rcirl_jax.evaluation.ranking.learners import train_learners
+from rcirl_jax.evaluation.ranking.table import to_json
+from rcirl_jax.report.ranking.intervals import curves_panel, interval_panel
 from rcirl_jax.report.style import figure, label, save
 
 RATES = {"adam": 3e-3, "rmsprop": 3e-3, "sgd": 3e-2}

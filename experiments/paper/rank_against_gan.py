@@ -55,19 +55,21 @@ from experiments.paper.common import (
     write,
 )
 from experiments.paper.weights import QUICK_S
-from rcirl_jax.anchoring import OWN_COST, Anchoring, fitted_anchor
-from rcirl_jax.data.joined import Demonstrations, JoinedDatasets, open_datasets
-from rcirl_jax.data.store import Dataset
+from rcirl_jax.autotune.anchoring import OWN_COST, Anchoring, fitted_anchor
+from rcirl_jax.autotune.recipes import DEFAULT, load_recipe
+from rcirl_jax.autotune.rehearsal import rehearse
+from rcirl_jax.data.store.dataset import Dataset
+from rcirl_jax.data.store.joined import Demonstrations, JoinedDatasets, open_datasets
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.closed_loop import SuiteConfig, run_suite
-from rcirl_jax.evaluation.evaluate import RankingSetup, rank_scenes
-from rcirl_jax.evaluation.learners import (
+from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, run_suite
+from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, rank_scenes
+from rcirl_jax.evaluation.ranking.learners import (
     FrozenSets,
     Learned,
     fitting_rows,
     train_grid,
 )
-from rcirl_jax.evaluation.score import candidates_key
+from rcirl_jax.evaluation.ranking.score import candidates_key
 from rcirl_jax.evaluation.statistics import (
     Difference,
     combine_seeds,
@@ -81,9 +83,7 @@ from rcirl_jax.export.reader import Anchor
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.prediction import as_seen
 from rcirl_jax.planner.rank import ONLINE, Params, Score, hand_score
-from rcirl_jax.recipes import DEFAULT, load_recipe
-from rcirl_jax.rehearsal import rehearse
-from rcirl_jax.report.intervals import Interval, interval_chart
+from rcirl_jax.report.ranking.intervals import Interval, interval_chart
 from rcirl_jax.reward import LOSSES, seen_range
 from rcirl_jax.sampling import sample
 from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics, nuplan_score

@@ -20,7 +20,7 @@ from absl import flags
 
 from experiments.common import provenance, run
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.robustness import (
+from rcirl_jax.evaluation.closed_loop.robustness import (
     Disturbance,
     Table,
     frames,
@@ -43,9 +43,9 @@ from rcirl_jax.planner.rank import (
 )
 from rcirl_jax.planner.refine import RefineConfig
 from rcirl_jax.planner.time_station import time_station_policy
-from rcirl_jax.report.intervals import interval_chart
+from rcirl_jax.report.ranking.intervals import interval_chart
+from rcirl_jax.runtime.atomic_files import write_json
 from rcirl_jax.simulation.suite import build, suite_refs
-from rcirl_jax.whole import write_json
 
 _WEIGHTS = flags.DEFINE_string("weights", None, "weights file", required=True)
 _OUTPUT = flags.DEFINE_string("output", "out/robustness", "folder to write")

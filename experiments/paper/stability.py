@@ -26,7 +26,7 @@ from experiments.paper.common import (
     unread,
     write,
 )
-from rcirl_jax.evaluation.learners import (
+from rcirl_jax.evaluation.ranking.learners import (
     LEARNERS,
     FrozenSets,
     learner_configs,

@@ -23,16 +23,17 @@ from absl import flags
 from experiments.common import alone, made_by_file, provenance, run
 from experiments.paper.weights import QUICK_S, drives_config, trained_weights
 from rcirl_jax.data.importers import IMPORTERS
-from rcirl_jax.data.joined import open_datasets
 from rcirl_jax.data.parts import Part, parts_of, recordings_of_all
+from rcirl_jax.data.store.joined import open_datasets
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.closed_loop import SuiteConfig, run_suite, write_suite
+from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, run_suite, write_suite
 from rcirl_jax.export.closed_loop import table_rows
-from rcirl_jax.report.intervals import suite_chart
+from rcirl_jax.report.ranking.intervals import suite_chart
 from rcirl_jax.reward import RewardConfig
+from rcirl_jax.runtime.atomic_files import read_json, write_json
 from rcirl_jax.simulation.cases import STEP_S
 from rcirl_jax.simulation.demonstrations import DriveConfig, drive_catalogue
-from rcirl_jax.simulation.recorded_config import RecordedConfig
+from rcirl_jax.simulation.recorded.config import RecordedConfig
 from rcirl_jax.simulation.rows import BASELINES, human_row
 from rcirl_jax.simulation.suite import (
     FULL_S,
@@ -41,7 +42,6 @@ from rcirl_jax.simulation.suite import (
     recorded_set,
     suite_refs,
 )
-from rcirl_jax.whole import read_json, write_json
 
 _OUTPUT = flags.DEFINE_string("output", "out/table2", "folder for everything")
 _WEIGHTS = flags.DEFINE_list("weights", None, "weights files instead of training")

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from experiments.common import provenance
-from rcirl_jax.data.joined import Demonstrations
+from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.export.from_run import export_run
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.state import TrainConfig

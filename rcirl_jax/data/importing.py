@@ -19,16 +19,16 @@ import jax
 import numpy as np
 import tqdm
 
-from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.cut import Cut, cut, cut_item, whole_of
-from rcirl_jax.data.files import Files
 from rcirl_jax.data.parts import Part, items, leaving_out
-from rcirl_jax.data.quality import QualityReport
-from rcirl_jax.data.rows import check_finite
-from rcirl_jax.data.splits import split_wholes, time_blocks
-from rcirl_jax.data.store import Dataset, DatasetWriter, Manifest
+from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.data.scenes.quality import QualityReport
+from rcirl_jax.data.store.dataset import Dataset, DatasetWriter, Manifest
+from rcirl_jax.data.store.files import Files
+from rcirl_jax.data.store.rows import check_finite
+from rcirl_jax.data.store.splits import split_wholes, time_blocks
 from rcirl_jax.errors import InputError, LostWorkError
-from rcirl_jax.executor import Executor, Here
+from rcirl_jax.runtime.executors import Executor, Here
 from rcirl_jax.types import Demonstration, Recording
 
 SHARD_SCENES = 4096  # scenes after which a shard is closed

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from rcirl_jax.data.importing import ImportConfig
 from rcirl_jax.data.parts import Part
-from rcirl_jax.data.signal_checks import SignalChecks
-from rcirl_jax.executor import Executor
+from rcirl_jax.data.scenes.signal_checks import SignalChecks
+from rcirl_jax.runtime.executors import Executor
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -9,15 +9,15 @@ from rcirl_jax.data.importers import (
     CSV_PARTS,
     SHARD_BYTES,
     SMALL_PARTS,
-    csv_stream,
     files_of,
     pieces,
     read_part,
 )
 from rcirl_jax.data.importers import parts as inputs_of
+from rcirl_jax.data.readers import csv_stream
 from rcirl_jax.data.recording import LEAVE_OUT, PIECE, refusal
 from rcirl_jax.errors import InputError
-from rcirl_jax.stages import file_sha256
+from rcirl_jax.runtime.pipeline import file_sha256
 from rcirl_jax.types import Recording
 
 

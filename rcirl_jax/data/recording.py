@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.errors import InputError, as_input_error
+from rcirl_jax.runtime.atomic_files import is_text
 from rcirl_jax.types import Ghost, Kind, Lane, Recording, Signal, Track
 from rcirl_jax.units import FOOT_M, MPH_MPS
-from rcirl_jax.whole import is_text
 
 # keys that an import adds to a spec
 LEAVE_OUT = "leave_out"  # refused recordings are left out

@@ -6,8 +6,8 @@ from rcirl_jax.evaluation.exact import (
     mcnemar_exact,
     rule_of_three,
 )
-from rcirl_jax.evaluation.format import format_table
-from rcirl_jax.evaluation.ranking import (
+from rcirl_jax.evaluation.ranking.format import format_table
+from rcirl_jax.evaluation.ranking.metrics import (
     Outcomes,
     fit_temperature,
     miss_threshold,
@@ -16,6 +16,7 @@ from rcirl_jax.evaluation.ranking import (
     random_scorer,
     scene_metrics,
 )
+from rcirl_jax.evaluation.ranking.table import RankingReport, build_report, to_json
 from rcirl_jax.evaluation.statistics import (
     ClusterBootstrap,
     Difference,
@@ -24,7 +25,6 @@ from rcirl_jax.evaluation.statistics import (
     combine_seeds,
     paired_difference,
 )
-from rcirl_jax.evaluation.table import RankingReport, build_report, to_json
 
 __all__ = [
     "ClusterBootstrap",

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rcirl_jax.data.joined import Demonstrations
+from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.errors import UNFORESEEN, InputError
 from rcirl_jax.export.reader import Anchor, Reward
 from rcirl_jax.export.weights import FeatureSpec, RewardWeights, save
@@ -22,13 +22,13 @@ from rcirl_jax.reward import (
     value,
 )
 from rcirl_jax.reward.network import LEAKY_SLOPE
-from rcirl_jax.settings import typed_settings
+from rcirl_jax.runtime.atomic_files import read_json
+from rcirl_jax.runtime.settings import typed_settings
 from rcirl_jax.train.loop import normaliser_rows, restore_run, to_device_batch
 from rcirl_jax.train.metrics import read_metrics
 from rcirl_jax.train.state import TrainConfig, TrainState
 from rcirl_jax.train.step import featurised
 from rcirl_jax.units import TIMES_S
-from rcirl_jax.whole import read_json
 
 NUM_SAMPLES = 32  # verification samples in the file
 

@@ -5,16 +5,16 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.closed_loop import (
+from rcirl_jax.evaluation.closed_loop.suite import (
     SuiteConfig,
     SuiteResult,
     drive_here,
     run_suite,
 )
-from rcirl_jax.evaluation.gate_pairs import constructed_rows
-from rcirl_jax.evaluation.gate_runs import CANDIDATE, INCUMBENT, repeats
-from rcirl_jax.executor import Executor
+from rcirl_jax.evaluation.gate.pairs import constructed_rows
+from rcirl_jax.evaluation.gate.runs import CANDIDATE, INCUMBENT, repeats
 from rcirl_jax.export.spread import SuiteJob, spread
+from rcirl_jax.runtime.executors import Executor
 from rcirl_jax.simulation.cases import STEP_S
 from rcirl_jax.simulation.rows import BASELINES, Row
 from rcirl_jax.simulation.suite import FULL_S, SMOKE_S, CaseRef, suite_refs

@@ -5,8 +5,8 @@ import dataclasses
 import jax
 import numpy as np
 
-from rcirl_jax.data.joined import Demonstrations
-from rcirl_jax.evaluation.score import EVALUATION_SEED
+from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.evaluation.ranking.score import EVALUATION_SEED
 from rcirl_jax.export.guard import Guard, Limits, Verdict
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.sampling import SamplerConfig

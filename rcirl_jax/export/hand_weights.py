@@ -15,7 +15,7 @@ from pathlib import Path
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.reward import TUNED_ROW, LatticeCost
-from rcirl_jax.whole import read_json, write_json
+from rcirl_jax.runtime.atomic_files import read_json, write_json
 
 SCHEMA = "rcirl-jax/hand-weights"
 SCHEMA_VERSION = 1

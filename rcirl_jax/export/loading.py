@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.score import OnTop
+from rcirl_jax.evaluation.ranking.score import OnTop
 from rcirl_jax.export.provenance import check_provenance
 from rcirl_jax.export.reader import Anchor, Reward, WeightsError, load_weights
 from rcirl_jax.features.mapping import feature_map, known_presets

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from rcirl_jax.data.joined import Demonstrations
-from rcirl_jax.data.preferences import read_preferences
+from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.data.store.preferences import read_preferences
 from rcirl_jax.errors import UNFORESEEN, InputError
-from rcirl_jax.evaluation.sweep import (
+from rcirl_jax.evaluation.ranking.sweep import (
     SweepConfig,
     member_name,
     open_split,
@@ -30,7 +30,7 @@ from rcirl_jax.export.from_run import (
 )
 from rcirl_jax.export.reader import RANGES, Reward
 from rcirl_jax.export.sweep import write_member
-from rcirl_jax.settings import typed_settings
+from rcirl_jax.runtime.settings import typed_settings
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.running import Running
 from rcirl_jax.train.state import TrainConfig

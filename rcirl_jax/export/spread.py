@@ -12,12 +12,11 @@ import jax
 import numpy as np
 import tqdm
 
-from rcirl_jax.evaluation.closed_loop import Drive, SuiteConfig
-from rcirl_jax.executor import Executor
+from rcirl_jax.evaluation.closed_loop.suite import Drive, SuiteConfig
 from rcirl_jax.export.closed_loop import table_rows
 from rcirl_jax.export.hand_weights import load_hand_weights
 from rcirl_jax.planner.baselines import Idm
-from rcirl_jax.simulation.careful import judges
+from rcirl_jax.runtime.executors import Executor
 from rcirl_jax.simulation.metrics import CaseMetrics
 from rcirl_jax.simulation.rollout import LANES
 from rcirl_jax.simulation.rows import Row
@@ -28,6 +27,7 @@ from rcirl_jax.simulation.suite import (
     drive_row,
     rollout_config,
 )
+from rcirl_jax.simulation.world.careful import judges
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -18,7 +18,7 @@ import numpy as np
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.loading import reward_params, scored
 from rcirl_jax.export.reader import Reward
-from rcirl_jax.whole import write_whole
+from rcirl_jax.runtime.atomic_files import write_whole
 
 Form = Literal["jax", "stablehlo"]
 

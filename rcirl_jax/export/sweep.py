@@ -22,12 +22,11 @@ import jax.numpy as jnp
 import numpy as np
 import tqdm
 
-from rcirl_jax.data.joined import Demonstrations
+from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.errors import UNFORESEEN, InputError
-from rcirl_jax.evaluation.evaluate import covered_rows
-from rcirl_jax.evaluation.ranking import METRICS
-from rcirl_jax.evaluation.statistics import ClusterBootstrap
-from rcirl_jax.evaluation.sweep import (
+from rcirl_jax.evaluation.ranking.evaluate import covered_rows
+from rcirl_jax.evaluation.ranking.metrics import METRICS
+from rcirl_jax.evaluation.ranking.sweep import (
     Hidden,
     Part,
     Scores,
@@ -42,13 +41,14 @@ from rcirl_jax.evaluation.sweep import (
     shape_name,
     train_group,
 )
-from rcirl_jax.executor import Executor
+from rcirl_jax.evaluation.statistics import ClusterBootstrap
 from rcirl_jax.export.from_run import verification_samples, write_weights
 from rcirl_jax.export.loading import compiled_scorer, open_reward
 from rcirl_jax.export.reader import Reward
-from rcirl_jax.stages import only_one
+from rcirl_jax.runtime.atomic_files import read_json, write_json, write_whole
+from rcirl_jax.runtime.executors import Executor
+from rcirl_jax.runtime.pipeline import only_one
 from rcirl_jax.train.state import TrainConfig
-from rcirl_jax.whole import read_json, write_json, write_whole
 
 SWEEP = "sweep.json"  # in the sweep's folder
 FACTS = ("members", "seconds", "compiles", "compile_seconds")  # of a group, numbers

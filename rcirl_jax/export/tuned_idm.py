@@ -11,7 +11,7 @@ from pathlib import Path
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm
-from rcirl_jax.whole import read_json, write_json
+from rcirl_jax.runtime.atomic_files import read_json, write_json
 
 FIELDS = tuple(field.name for field in dataclasses.fields(Idm))
 

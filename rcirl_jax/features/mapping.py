@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.features.columns import COLUMNS, Frame, candidate_frames, make_frame
-from rcirl_jax.specs import load_toml, spec_root
+from rcirl_jax.runtime.specs import load_toml, spec_root
 from rcirl_jax.types import Candidates, Scene, Trajectory
 
 

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from rcirl_jax.whole import plain, write_whole
+from rcirl_jax.runtime.atomic_files import plain, write_whole
 
 PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8">

@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rcirl_jax.whole import write_whole
+from rcirl_jax.runtime.atomic_files import write_whole
 
 # Okabe-Ito colours
 HUMAN = "#000000"

@@ -24,12 +24,12 @@ import jax
 import numpy as np
 import tqdm
 
-from rcirl_jax.data.assemble import assemble
-from rcirl_jax.data.files import Files
-from rcirl_jax.data.labels import add_labels
-from rcirl_jax.data.quality import QualityReport
-from rcirl_jax.data.splits import assign_groups
-from rcirl_jax.data.store import Dataset, DatasetWriter, Manifest
+from rcirl_jax.data.scenes.assemble import assemble
+from rcirl_jax.data.scenes.labels import add_labels
+from rcirl_jax.data.scenes.quality import QualityReport
+from rcirl_jax.data.store.dataset import Dataset, DatasetWriter, Manifest
+from rcirl_jax.data.store.files import Files
+from rcirl_jax.data.store.splits import assign_groups
 from rcirl_jax.errors import InputError
 from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.planner.yielding import Yielding, yielding_policy

@@ -19,11 +19,11 @@ import jax.numpy as jnp
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.planner.plan import Plan, command, later, no_plan, stations_from_now
-from rcirl_jax.simulation import lines as signals
 from rcirl_jax.simulation.cases import STEP_S, Case, Record, Snapshot, World
-from rcirl_jax.simulation.observe import observe, road_limit
-from rcirl_jax.simulation.vehicle import Vehicle
-from rcirl_jax.simulation.world import start, step
+from rcirl_jax.simulation.world import lines as signals
+from rcirl_jax.simulation.world.observe import observe, road_limit
+from rcirl_jax.simulation.world.step import start, step
+from rcirl_jax.simulation.world.vehicle import Vehicle
 from rcirl_jax.types import Scene
 
 Params = Any  # a policy's weights: any pytree

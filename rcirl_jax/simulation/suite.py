@@ -19,7 +19,7 @@ import numpy as np
 from rcirl_jax.data.recording import Recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.simulation.cases import STEP_S, Case, Record, Snapshot
-from rcirl_jax.simulation.catalogue import (
+from rcirl_jax.simulation.catalogue.build import (
     build_cases,
     case_id,
     family_names,
@@ -28,8 +28,8 @@ from rcirl_jax.simulation.catalogue import (
     parse_case_id,
 )
 from rcirl_jax.simulation.metrics import CaseMetrics, MetricsConfig, case_metrics
-from rcirl_jax.simulation.recorded import recorded_cases
-from rcirl_jax.simulation.recorded_config import RecordedConfig
+from rcirl_jax.simulation.recorded.cases import recorded_cases
+from rcirl_jax.simulation.recorded.config import RecordedConfig
 from rcirl_jax.simulation.rollout import LANES, RolloutConfig, drive_cases
 from rcirl_jax.simulation.rows import Row
 

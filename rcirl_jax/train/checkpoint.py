@@ -23,10 +23,10 @@ from jax.experimental import multihost_utils
 from orbax.checkpoint import v1 as ocp
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.stages import digest, file_sha256
+from rcirl_jax.runtime.atomic_files import read_json, write_json
+from rcirl_jax.runtime.pipeline import digest, file_sha256
 from rcirl_jax.train.processes import is_first
 from rcirl_jax.train.state import TrainState
-from rcirl_jax.whole import read_json, write_json
 
 KEEP_LATEST = 3  # checkpoints kept
 DIGESTS = "sha256.json"

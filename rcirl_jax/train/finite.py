@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from rcirl_jax.data.joined import Demonstrations
-from rcirl_jax.data.rows import refuse_scenes, scene_name, unusable_leaves
+from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.data.store.rows import refuse_scenes, scene_name, unusable_leaves
 from rcirl_jax.errors import InputError
 from rcirl_jax.features import FeatureMap, feature_map
 from rcirl_jax.train.bad_values import bad_facts

@@ -20,16 +20,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rcirl_jax.data.joined import Demonstrations
-from rcirl_jax.data.pipeline import split_batches
-from rcirl_jax.data.preferences import Preferences
-from rcirl_jax.data.rows import check_finite
-from rcirl_jax.data.stream import Prefetch
+from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.data.store.order import split_batches
+from rcirl_jax.data.store.preferences import Preferences
+from rcirl_jax.data.store.rows import check_finite
+from rcirl_jax.data.store.stream import Prefetch
 from rcirl_jax.errors import InputError
 from rcirl_jax.features import FeatureMap, feature_map
-from rcirl_jax.interrupts import Interrupted, asked
 from rcirl_jax.reward import Normaliser, fit_normaliser
-from rcirl_jax.stages import only_one
+from rcirl_jax.runtime.pipeline import only_one
+from rcirl_jax.runtime.signals import Interrupted, asked
 from rcirl_jax.train.checkpoint import Checkpoints
 from rcirl_jax.train.finite import check_features, check_step
 from rcirl_jax.train.metrics import MetricsWriter, Progress

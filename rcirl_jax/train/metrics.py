@@ -13,7 +13,7 @@ from typing import Any, TextIO
 import tqdm
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.whole import named, parse_json, write_whole
+from rcirl_jax.runtime.atomic_files import named, parse_json, write_whole
 
 MAX_STEP = 2**63 - 1  # what 64 bits hold
 MAX_BYTES = 2**32  # of a metrics.jsonl: some 27 million steps

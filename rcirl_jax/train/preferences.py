@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rcirl_jax.data.joined import Demonstrations
-from rcirl_jax.data.preferences import Preferences
+from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.data.store.preferences import Preferences
 from rcirl_jax.errors import InputError
 from rcirl_jax.features import FeatureMap, feature_map
 from rcirl_jax.features.columns import candidate_frames

@@ -5,11 +5,11 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-from rcirl_jax.data.joined import Demonstrations
+from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.errors import InputError
+from rcirl_jax.runtime.atomic_files import read_json, write_whole
 from rcirl_jax.train.processes import is_first
 from rcirl_jax.train.state import TrainConfig
-from rcirl_jax.whole import read_json, write_whole
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importing import ImportConfig
 from rcirl_jax.data.parts import Part, parts_of
+from rcirl_jax.data.scenes.config import CollectConfig
 
 CONFIG = ImportConfig(
     format="csv",

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from rcirl_jax.data import importers
-from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.cut import cut
-from rcirl_jax.data.importers import read_recordings, tables
+from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.readers import tables
 from rcirl_jax.data.recording import validate_recording
+from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.errors import InputError, as_input_error
 from tests.commands import command
 from tests.data.formats import (
@@ -206,7 +207,7 @@ def test_what_no_check_foresaw_is_one_line_that_names_the_place(tmp_path, monkey
         yield from ()
         raise KeyError("stations")
 
-    module = importers.importlib.import_module("rcirl_jax.data.importers.csv_table")
+    module = importers.importlib.import_module("rcirl_jax.data.importers.csv.reader")
     monkeypatch.setattr(module, "recordings", broken)
     line = only_line("csv", fixture.input)
     assert "KeyError: 'stations' (test_absurd.py:" in line
@@ -215,7 +216,9 @@ def test_what_no_check_foresaw_is_one_line_that_names_the_place(tmp_path, monkey
 
 def test_a_recording_that_cannot_be_cut_is_one_line(monkeypatch):
     recording = next(read_recordings("synthetic", None))
-    monkeypatch.setattr("rcirl_jax.data.lanes._densify", lambda *_: np.zeros(2**62))
+    monkeypatch.setattr(
+        "rcirl_jax.data.scenes.lanes._densify", lambda *_: np.zeros(2**62)
+    )
     with pytest.raises(InputError, match=r"expected a sound recording"):
         cut(recording, CollectConfig())
 

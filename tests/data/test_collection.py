@@ -8,23 +8,24 @@ import jax
 import numpy as np
 import pytest
 
-from rcirl_jax.data import files, importing
-from rcirl_jax.data.assemble import assemble
-from rcirl_jax.data.collect import Collector
-from rcirl_jax.data.config import CollectConfig
+from rcirl_jax.data import importing
 from rcirl_jax.data.cut import digest
-from rcirl_jax.data.filters import REASONS
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
-from rcirl_jax.data.labels import labels_of
-from rcirl_jax.data.lanes import LaneGraph
-from rcirl_jax.data.lines import CREEP_M, TOO_FEW
-from rcirl_jax.data.motion import FrameTracks, driver_of, given_path
-from rcirl_jax.data.quality import QualityReport, format_quality, format_splits
 from rcirl_jax.data.recording import validate_recording
-from rcirl_jax.data.rows import check_finite
-from rcirl_jax.data.smoothing import harsh_share, savgol
-from rcirl_jax.data.store import open_dataset
+from rcirl_jax.data.scenes.assemble import assemble
+from rcirl_jax.data.scenes.collect import Collector
+from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.data.scenes.filters import REASONS
+from rcirl_jax.data.scenes.labels import labels_of
+from rcirl_jax.data.scenes.lanes import LaneGraph
+from rcirl_jax.data.scenes.lines import CREEP_M, TOO_FEW
+from rcirl_jax.data.scenes.motion import FrameTracks, driver_of, given_path
+from rcirl_jax.data.scenes.quality import QualityReport, format_quality, format_splits
+from rcirl_jax.data.scenes.smoothing import harsh_share, savgol
+from rcirl_jax.data.store import files
+from rcirl_jax.data.store.dataset import open_dataset
+from rcirl_jax.data.store.rows import check_finite
 from rcirl_jax.errors import InputError
 from rcirl_jax.sampling import trajectory_from_positions
 from rcirl_jax.types import Decision, Ghost, Kind, Lane, Recording, Signal, Tag, Track

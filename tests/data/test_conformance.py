@@ -13,14 +13,14 @@ import re
 import numpy as np
 import pytest
 
-from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.cut import digest
 from rcirl_jax.data.importers import IMPORTERS, parts, read_part, read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_parts
 from rcirl_jax.data.parts import parts_of
 from rcirl_jax.data.recording import validate_recording
+from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.errors import InputError
-from rcirl_jax.specs import load_toml, spec_root
+from rcirl_jax.runtime.specs import load_toml, spec_root
 from rcirl_jax.types import Kind
 from tests.data import formats
 

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from rcirl_jax.data.cut import cut
-from rcirl_jax.data.importers import csv_stream, parts, read_part, scratch
+from rcirl_jax.data.importers import parts, read_part
 from rcirl_jax.data.importing import import_parts
 from rcirl_jax.data.parts import Part
-from rcirl_jax.data.store import open_dataset
+from rcirl_jax.data.readers import csv_stream, scratch
+from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
 from tests.commands import count_and_peak
 from tests.data.small_logs import CONFIG
@@ -248,8 +249,8 @@ import resource, sys
 from pathlib import Path
 from rcirl_jax.data.parts import Part
 from rcirl_jax.data.importers import parts
-from rcirl_jax.data.importers import csv_stream
-from rcirl_jax.data.importers.csv_stream import Field, pieces
+from rcirl_jax.data.readers import csv_stream
+from rcirl_jax.data.readers.csv_stream import Field, pieces
 # what is held is reached in the shorter log already
 csv_stream.READ_BYTES, csv_stream.BUFFER_BYTES = 2**18, 2**20
 fields = [Field(name=n, column=n, text=n == "id") for n in ("t", "id", "x", "y")]

@@ -15,25 +15,24 @@ import pytest
 
 from benchmarks.reliability.fuzz.containers import archive_of
 from benchmarks.reliability.fuzz.readers import suite
-from rcirl_jax.data import importers, manifest
-from rcirl_jax.data.importers import (
-    interaction,
-    l5_map,
-    levelx_lanes,
-    nuplan_map,
-    read_recordings,
-)
-from rcirl_jax.data.importers.argoverse2_map import read_lanes
-from rcirl_jax.data.importers.parquet import read_columns
-from rcirl_jax.data.importers.safe_xml import read_xml
-from rcirl_jax.data.importers.sqlite_ro import Database
-from rcirl_jax.data.importers.zarr2 import StructuredArray
-from rcirl_jax.data.shards import describe
-from rcirl_jax.data.signal_checks import read_signal_checks
-from rcirl_jax.data.store import open_dataset
+from rcirl_jax.data import importers
+from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.importers.argoverse2.map import read_lanes
+from rcirl_jax.data.importers.interaction import reader as interaction
+from rcirl_jax.data.importers.l5 import map as l5_map
+from rcirl_jax.data.importers.levelx import map as levelx_lanes
+from rcirl_jax.data.importers.nuplan import map as nuplan_map
+from rcirl_jax.data.readers.parquet import read_columns
+from rcirl_jax.data.readers.safe_xml import read_xml
+from rcirl_jax.data.readers.sqlite import Database
+from rcirl_jax.data.readers.zarr2 import StructuredArray
+from rcirl_jax.data.scenes.signal_checks import read_signal_checks
+from rcirl_jax.data.store import manifest
+from rcirl_jax.data.store.dataset import open_dataset
+from rcirl_jax.data.store.shards import describe
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.suite_files import read_runs
-from rcirl_jax.specs import load_toml, spec_root
+from rcirl_jax.evaluation.closed_loop.files import read_runs
+from rcirl_jax.runtime.specs import load_toml, spec_root
 from rcirl_jax.train import checkpoint
 from tests.conftest import REPO
 from tests.data import test_store as store
@@ -188,7 +187,7 @@ def test_arrays_of_other_types_in_a_suite(members, name, array):
 
 def test_a_suite_that_unpacks_to_gigabytes_is_refused(members, monkeypatch):
     file, content = members
-    monkeypatch.setattr("rcirl_jax.evaluation.npz_files.MAX_BYTES", 2**20)
+    monkeypatch.setattr("rcirl_jax.evaluation.closed_loop.npz_files.MAX_BYTES", 2**20)
     zeros = npy(np.zeros(2**18))
     file.write_bytes(archive_of({**content, "way.npy": zeros}, zipfile.ZIP_DEFLATED))
     assert file.stat().st_size < 2**20
@@ -464,17 +463,17 @@ def test_long_numbers_and_files_in_a_toml(tmp_path, monkeypatch):
         )
     file.write_text("a = [-9223372036854775808, 0x7fffffffffffffff]")
     assert load_toml(file)["a"] == [-(2**63), 2**63 - 1]
-    monkeypatch.setattr("rcirl_jax.specs.MAX_BYTES", 10)
+    monkeypatch.setattr("rcirl_jax.runtime.specs.MAX_BYTES", 10)
     assert "size: expected at most" in line_of(lambda: load_toml(file))
 
 
 def test_row_groups_that_claim_too_much(tmp_path, monkeypatch):
     file = tmp_path / "x.parquet"
     pq.write_table(pa.table({"a": list(range(100))}), file)
-    monkeypatch.setattr("rcirl_jax.data.importers.parquet.MAX_GROUP_BYTES", 10)
+    monkeypatch.setattr("rcirl_jax.data.readers.parquet.MAX_GROUP_BYTES", 10)
     line = line_of(lambda: read_columns(file, ["a"], [], []))
     assert "x.parquet: row group: " in line
-    monkeypatch.setattr("rcirl_jax.data.importers.parquet.MAX_ROWS", 10)
+    monkeypatch.setattr("rcirl_jax.data.readers.parquet.MAX_ROWS", 10)
     assert "x.parquet: rows: 100" in line_of(lambda: read_columns(file, ["a"], [], []))
 
 
@@ -645,7 +644,7 @@ FORBIDDEN = re.compile(
     r"|(?<![\w.])eval\(|(?<![\w.])exec\(|yaml\.(?:unsafe_)?load\b|allow_pickle\s*=\s*True"
 )
 # arithmetic of scenario families, its syntax tree checked node by node before
-CHECKED = {"rcirl_jax/simulation/expressions.py": "eval("}
+CHECKED = {"rcirl_jax/simulation/catalogue/expressions.py": "eval("}
 
 
 def test_no_module_runs_what_a_file_says():

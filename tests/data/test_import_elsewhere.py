@@ -11,12 +11,12 @@ import pytest
 
 from rcirl_jax.data import importing
 from rcirl_jax.data import parts as dealing
-from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import parts
 from rcirl_jax.data.importing import ImportConfig, import_parts
 from rcirl_jax.data.parts import Part, is_long, recordings_of
+from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.errors import InputError, LostWorkError
-from rcirl_jax.executor import Here, Processes, Ray
+from rcirl_jax.runtime.executors import Here, Processes, Ray
 from tests.data.formats import apollo, l5, nuplan, waymo
 from tests.data.small_logs import CONFIG, files_of, write_logs
 
@@ -150,7 +150,7 @@ from pathlib import Path
 import ray
 from ray.cluster_utils import Cluster
 from rcirl_jax.data import importing
-from rcirl_jax.executor import Ray
+from rcirl_jax.runtime.executors import Ray
 from tests.data.small_logs import CONFIG, write_logs
 
 importing.SHARD_SCENES = 30
@@ -286,7 +286,8 @@ def duration(logs, data):
 DYING = """
 import os, signal, sys
 from pathlib import Path
-from rcirl_jax.data import files, importing
+from rcirl_jax.data.store import files
+from rcirl_jax.data import importing
 from tests.data.small_logs import CONFIG, write_logs
 importing.SHARD_SCENES = 30
 write, left = files.Files.write_many, int(sys.argv[3])

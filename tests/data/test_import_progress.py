@@ -9,10 +9,11 @@ import pytest
 
 from rcirl_jax.data import importing
 from rcirl_jax.data.cut import Cut, digest
-from rcirl_jax.data.importers import csv_stream, parts, read_part, reading
+from rcirl_jax.data.importers import parts, read_part
 from rcirl_jax.data.importing import Progress, import_parts
 from rcirl_jax.data.parts import Part
-from rcirl_jax.data.quality import QualityReport
+from rcirl_jax.data.readers import csv_stream, reading
+from rcirl_jax.data.scenes.quality import QualityReport
 from rcirl_jax.types import Kind, Recording, Track
 from tests.data import small_logs
 from tests.data import test_csv_stream as long_csv

@@ -9,25 +9,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.cut import cut
-from rcirl_jax.data.importers import (
-    apollo,
-    apollo_messages,
-    apollo_obstacles,
-    cyber_record,
-    parts,
-    read_recordings,
-)
-from rcirl_jax.data.importers.wire import (
+from rcirl_jax.data.importers import parts, read_recordings
+from rcirl_jax.data.importers.apollo import messages as apollo_messages
+from rcirl_jax.data.importers.apollo import obstacles as apollo_obstacles
+from rcirl_jax.data.importers.apollo import reader as apollo
+from rcirl_jax.data.importers.apollo import records as cyber_record
+from rcirl_jax.data.readers.wire import (
     ENUM_NAME,
     Schema,
     WireError,
     decode,
     fields,
 )
+from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.errors import InputError
-from rcirl_jax.specs import load_toml, spec_root
+from rcirl_jax.runtime.specs import load_toml, spec_root
 from rcirl_jax.types import Kind
 from tests.data.formats import apollo as fixture
 from tests.data.formats.waymo import Packed, Single, message, varint

@@ -9,9 +9,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from rcirl_jax.data.importers import parquet, read_recordings
+from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.readers import parquet
 from rcirl_jax.errors import InputError
-from rcirl_jax.specs import load_toml, spec_root
+from rcirl_jax.runtime.specs import load_toml, spec_root
 from rcirl_jax.types import Kind
 from tests.data.formats import argoverse2 as w
 

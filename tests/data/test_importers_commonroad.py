@@ -8,7 +8,9 @@ from defusedxml import ElementTree
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rcirl_jax.data.importers import commonroad, commonroad_extras, read_recordings
+from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.importers.commonroad import extras as commonroad_extras
+from rcirl_jax.data.importers.commonroad import reader as commonroad
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind
 from tests.data import writers as w

@@ -7,9 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rcirl_jax.data.importers import csv_lanes, read_recordings, tables
+from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.importers.csv import map as csv_lanes
+from rcirl_jax.data.readers import tables
 from rcirl_jax.errors import InputError
-from rcirl_jax.specs import spec_root
+from rcirl_jax.runtime.specs import spec_root
 from rcirl_jax.types import Kind
 from tests.data import writers as w
 

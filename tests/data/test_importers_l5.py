@@ -8,17 +8,14 @@ import numpy as np
 import pytest
 
 from rcirl_jax.data.cut import digest
-from rcirl_jax.data.importers import (
-    l5,
-    l5_map,
-    l5_scenes,
-    parts,
-    read_recordings,
-    zarr2,
-)
-from rcirl_jax.data.importers.wire import WireError, packed_sint32
+from rcirl_jax.data.importers import parts, read_recordings
+from rcirl_jax.data.importers.l5 import map as l5_map
+from rcirl_jax.data.importers.l5 import reader as l5
+from rcirl_jax.data.importers.l5 import scenes as l5_scenes
+from rcirl_jax.data.readers import zarr2
+from rcirl_jax.data.readers.wire import WireError, packed_sint32
 from rcirl_jax.errors import InputError
-from rcirl_jax.specs import load_toml, spec_root
+from rcirl_jax.runtime.specs import load_toml, spec_root
 from rcirl_jax.types import Kind
 from tests.data.formats import l5 as fixture
 from tests.data.formats.waymo import message, varint

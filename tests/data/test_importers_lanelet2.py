@@ -5,10 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rcirl_jax.data.importers import lanelet2, lanelet2_rules
-from rcirl_jax.data.importers.lanelet2 import read_lanelet2
-from rcirl_jax.data.importers.lanelet2_rules import members
-from rcirl_jax.data.importers.projection import utm, utm_zone
+from rcirl_jax.data.importers.lanelet2 import map as lanelet2
+from rcirl_jax.data.importers.lanelet2 import rules as lanelet2_rules
+from rcirl_jax.data.importers.lanelet2.map import read_lanelet2
+from rcirl_jax.data.importers.lanelet2.rules import members
+from rcirl_jax.data.readers.projection import utm, utm_zone
 from rcirl_jax.errors import InputError
 from tests.data.formats import osm
 

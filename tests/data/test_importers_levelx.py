@@ -5,10 +5,10 @@ import time
 import numpy as np
 import pytest
 
-from rcirl_jax.data.collect import Collector
-from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import read_recordings
-from rcirl_jax.data.importers.levelx_lanes import marked_lanes
+from rcirl_jax.data.importers.levelx.map import marked_lanes
+from rcirl_jax.data.scenes.collect import Collector
+from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind
 from tests.data.formats import levelx as ind

@@ -8,7 +8,7 @@ import pytest
 from rcirl_jax.data.cut import digest
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.errors import InputError
-from rcirl_jax.specs import spec_root
+from rcirl_jax.runtime.specs import spec_root
 from tests.data import writers as w
 
 LANE_M = 3.6576  # m, 12 ft

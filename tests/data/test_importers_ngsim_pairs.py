@@ -5,9 +5,9 @@ import time
 import numpy as np
 import pytest
 
-from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
+from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.errors import InputError
 from tests.data.formats import ngsim_pairs as fixture
 

@@ -12,19 +12,15 @@ import time
 import numpy as np
 import pytest
 
-from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.cut import cut
-from rcirl_jax.data.importers import (
-    csv_stream,
-    geopackage,
-    nuplan,
-    nuplan_map,
-    parts,
-    read_recordings,
-    sqlite_ro,
-)
+from rcirl_jax.data.importers import parts, read_recordings
+from rcirl_jax.data.importers.nuplan import map as nuplan_map
+from rcirl_jax.data.importers.nuplan import reader as nuplan
+from rcirl_jax.data.readers import csv_stream, geopackage
+from rcirl_jax.data.readers import sqlite as sqlite_ro
+from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.errors import InputError
-from rcirl_jax.specs import load_toml, spec_root
+from rcirl_jax.runtime.specs import load_toml, spec_root
 from rcirl_jax.types import Kind
 from tests.data.formats import nuplan as fixture
 

@@ -6,7 +6,8 @@ import time
 import numpy as np
 import pytest
 
-from rcirl_jax.data.importers import openacc, read_recordings
+from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.importers.openacc import reader as openacc
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.errors import InputError
 from tests.data.formats import openacc as fixture

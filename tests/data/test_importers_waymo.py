@@ -8,18 +8,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rcirl_jax.data.importers import (
-    parts,
-    read_recordings,
-    waymo_map,
-    waymo_widths,
-    wire_columns,
-)
-from rcirl_jax.data.importers.shapes import distance_to_line
-from rcirl_jax.data.importers.tfrecord import read_records
-from rcirl_jax.data.importers.wire_columns import Record
+from rcirl_jax.data.importers import parts, read_recordings
+from rcirl_jax.data.importers.waymo import map as waymo_map
+from rcirl_jax.data.importers.waymo import widths as waymo_widths
+from rcirl_jax.data.readers import wire_columns
+from rcirl_jax.data.readers.shapes import distance_to_line
+from rcirl_jax.data.readers.tfrecord import read_records
+from rcirl_jax.data.readers.wire_columns import Record
 from rcirl_jax.errors import InputError
-from rcirl_jax.specs import spec_root
+from rcirl_jax.runtime.specs import spec_root
 from rcirl_jax.types import Kind
 from tests.data.formats import waymo as w
 from tests.data.formats.drives import straight
@@ -757,7 +754,7 @@ def test_work_is_limited(tmp_path, monkeypatch):
 
 
 def test_many_boundaries_of_one_lane_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("rcirl_jax.data.importers.waymo_map.MAX_POINTS", 1000)
+    monkeypatch.setattr("rcirl_jax.data.importers.waymo.map.MAX_POINTS", 1000)
     rows = w.eastward(0.0, 0.0, 50.0)
     sides = [w.boundary(13, -(2**62), 2**62, 901)] * 50
     path = put(tmp_path, w.scenario(f8=[w.lane(1, rows, sides=sides)]))

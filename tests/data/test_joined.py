@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.data import joined
+from rcirl_jax.data.store import joined
 from rcirl_jax.errors import InputError
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train.loop import to_device_batch

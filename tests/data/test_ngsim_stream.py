@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from rcirl_jax.data.cut import cut, digest
-from rcirl_jax.data.importers import csv_stream, parts, read_part
+from rcirl_jax.data.importers import parts, read_part
 from rcirl_jax.data.importing import import_parts
 from rcirl_jax.data.parts import Part, is_long
-from rcirl_jax.data.store import open_dataset
+from rcirl_jax.data.readers import csv_stream
+from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
 from tests.commands import count_and_peak
 from tests.data import writers as w

@@ -8,7 +8,7 @@ from rcirl_jax.data.cut import digest
 from rcirl_jax.data.importers import parts, read_part, read_recordings
 from rcirl_jax.data.importing import import_parts
 from rcirl_jax.data.parts import parts_of
-from rcirl_jax.data.store import open_dataset
+from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
 from tests.data import writers as w
 from tests.data.formats import (

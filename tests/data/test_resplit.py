@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rcirl_jax.data.resplit import (
+from rcirl_jax.data.store.resplit import (
     HOLDOUTS,
     Resplit,
     by_recording,

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rcirl_jax.data.splits import (
+from rcirl_jax.data.store.splits import (
     assign_groups,
     check_disjoint,
     folds,
@@ -85,7 +85,7 @@ def test_seed_decides_among_equals_by_sha256():
 
 def test_same_in_a_process_with_another_hash_seed():
     code = (
-        "from rcirl_jax.data.splits import assign_groups, folds\n"
+        "from rcirl_jax.data.store.splits import assign_groups, folds\n"
         "counts = {f'g{i}': 5 + i % 3 for i in range(40)}\n"
         "print(assign_groups(counts, test_fraction=0.3, seed=9), folds(counts, 3, 9))"
     )

@@ -15,9 +15,9 @@ import tensorstore as ts
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rcirl_jax.data import files, manifest
-from rcirl_jax.data.rows import leaf_specs, row_spec
-from rcirl_jax.data.store import DatasetWriter, open_dataset
+from rcirl_jax.data.store import files, manifest
+from rcirl_jax.data.store.dataset import DatasetWriter, open_dataset
+from rcirl_jax.data.store.rows import leaf_specs, row_spec
 from rcirl_jax.errors import InputError
 from tests import scenes
 

@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rcirl_jax.data import pipeline
-from rcirl_jax.data.joined import JoinedDatasets
-from rcirl_jax.data.pipeline import BatchIterator, epoch_order, split_batches
-from rcirl_jax.data.shards import BLOCK_ROWS
-from rcirl_jax.data.store import open_dataset
-from rcirl_jax.data.stream import Prefetch, RowStream
+from rcirl_jax.data.store import order as pipeline
+from rcirl_jax.data.store.dataset import open_dataset
+from rcirl_jax.data.store.joined import JoinedDatasets
+from rcirl_jax.data.store.order import BatchIterator, epoch_order, split_batches
+from rcirl_jax.data.store.shards import BLOCK_ROWS
+from rcirl_jax.data.store.stream import Prefetch, RowStream
 from tests.data.test_pipeline import equal, take
 from tests.data.test_store import write
 

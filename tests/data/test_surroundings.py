@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rcirl_jax.data.assemble import assemble
-from rcirl_jax.data.collect import Collector
-from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import read_recordings
-from rcirl_jax.data.quality import QualityReport, format_quality
 from rcirl_jax.data.recording import validate_recording
+from rcirl_jax.data.scenes.assemble import assemble
+from rcirl_jax.data.scenes.collect import Collector
+from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.data.scenes.quality import QualityReport, format_quality
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Decision
 from rcirl_jax.units import TIMES_S

@@ -9,7 +9,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rcirl_jax.data.importers import synthetic
+from rcirl_jax.data.importers.synthetic import reader as synthetic
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.data.synthetic import ROADS, RunConfig
 from rcirl_jax.data.synthetic.drivers import DRIVER, idm_acceleration
@@ -18,7 +18,7 @@ from rcirl_jax.data.synthetic.state import Neighbours, State
 from rcirl_jax.data.synthetic.stops import schedule
 from rcirl_jax.data.synthetic.traffic import Traffic
 from rcirl_jax.errors import InputError
-from rcirl_jax.specs import load_toml, spec_root
+from rcirl_jax.runtime.specs import load_toml, spec_root
 from rcirl_jax.types import Recording, Track
 
 DEFAULT = spec_root() / "sources" / "synthetic.toml"

@@ -12,9 +12,9 @@ import tomllib
 import pytest
 
 from rcirl_jax.evaluation.exact import tango
-from rcirl_jax.evaluation.format import markdown_table
-from rcirl_jax.evaluation.gate_types import EXIT_CODES, GateConfig
-from rcirl_jax.evaluation.table import from_json
+from rcirl_jax.evaluation.gate.types import EXIT_CODES, GateConfig
+from rcirl_jax.evaluation.ranking.format import markdown_table
+from rcirl_jax.evaluation.ranking.table import from_json
 from tests.docs.pages import (
     ALL,
     DOCS,

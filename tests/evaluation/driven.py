@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 
-from rcirl_jax.evaluation.score import score_scenes
+from rcirl_jax.evaluation.ranking.score import score_scenes
 from tests.scenes import T, demonstration
 
 

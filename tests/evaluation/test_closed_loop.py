@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from rcirl_jax.evaluation.closed_loop import (
+from rcirl_jax.evaluation.closed_loop.output import format_suite
+from rcirl_jax.evaluation.closed_loop.suite import (
     SuiteConfig,
     run_suite,
     worst_cases,
     write_suite,
 )
-from rcirl_jax.evaluation.suite_output import format_suite
-from rcirl_jax.evaluation.suite_summary import summarise
+from rcirl_jax.evaluation.closed_loop.summary import summarise
 from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.planner.rank import constant_speed_policy, idm_policy
 from rcirl_jax.simulation.metrics import COLUMNS

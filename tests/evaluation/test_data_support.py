@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation import data_support
-from rcirl_jax.evaluation.data_support import (
+from rcirl_jax.evaluation.insight import data_support
+from rcirl_jax.evaluation.insight.data_support import (
     choices_of,
     growth,
     rank_correlation,
@@ -17,7 +17,7 @@ from rcirl_jax.evaluation.data_support import (
     sums_over_time,
     weights_supported,
 )
-from rcirl_jax.evaluation.learners import Learned, train_learner
+from rcirl_jax.evaluation.ranking.learners import Learned, train_learner
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import RewardConfig, pinned
 from rcirl_jax.train.frozen import freeze

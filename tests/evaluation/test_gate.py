@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.gate import judge
-from rcirl_jax.evaluation.gate_output import format_verdict, write_verdict
-from rcirl_jax.evaluation.gate_types import (
+from rcirl_jax.evaluation.gate.decision import judge
+from rcirl_jax.evaluation.gate.output import format_verdict, write_verdict
+from rcirl_jax.evaluation.gate.types import (
     EXIT_CODES,
     NULLS,
     GateConfig,

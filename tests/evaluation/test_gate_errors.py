@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation import gate_checks
+from rcirl_jax.evaluation.closed_loop.files import SuiteRuns, write_runs
 from rcirl_jax.evaluation.exact import clopper_pearson
-from rcirl_jax.evaluation.gate_checks import gains
-from rcirl_jax.evaluation.gate_errors import (
+from rcirl_jax.evaluation.gate import checks as gate_checks
+from rcirl_jax.evaluation.gate.checks import gains
+from rcirl_jax.evaluation.gate.errors import (
     DECISIONS,
     as_driven,
     clustered_rate,
@@ -20,7 +21,7 @@ from rcirl_jax.evaluation.gate_errors import (
     every_pair,
     format_errors,
 )
-from rcirl_jax.evaluation.gate_pairs import (
+from rcirl_jax.evaluation.gate.pairs import (
     COINS,
     CONSTRUCTED,
     IDM,
@@ -32,8 +33,7 @@ from rcirl_jax.evaluation.gate_pairs import (
     redrawn,
     swapped,
 )
-from rcirl_jax.evaluation.gate_types import GateConfig
-from rcirl_jax.evaluation.suite_files import SuiteRuns, write_runs
+from rcirl_jax.evaluation.gate.types import GateConfig
 from rcirl_jax.export.gate_job import ErrorsJob, gate_job
 from rcirl_jax.simulation.metrics import CaseMetrics
 from tests.commands import command

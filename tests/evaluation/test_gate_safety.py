@@ -9,16 +9,16 @@ import pytest
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.exact import clopper_pearson
-from rcirl_jax.evaluation.gate import judge
-from rcirl_jax.evaluation.gate_exact import (
+from rcirl_jax.evaluation.gate.decision import judge
+from rcirl_jax.evaluation.gate.exact import (
     ALPHA,
     NUISANCE_ALPHA,
     NUISANCE_STEPS,
     no_more_faults,
     scores,
 )
-from rcirl_jax.evaluation.gate_output import format_verdict
-from rcirl_jax.evaluation.gate_types import NULLS, GateConfig, Likeness
+from rcirl_jax.evaluation.gate.output import format_verdict
+from rcirl_jax.evaluation.gate.types import NULLS, GateConfig, Likeness
 from tests.evaluation.test_gate import (
     CASES,
     broken,

@@ -9,8 +9,8 @@ from scipy.special import expit, ndtr
 from scipy.stats import t as student
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.identify import identify, to_json
-from rcirl_jax.evaluation.identify_text import format_report
+from rcirl_jax.evaluation.insight.identify import identify, to_json
+from rcirl_jax.evaluation.insight.identify_text import format_report
 
 NAMES = ("speed", "gap", "jerk", "offset")
 UNITS = ("m/s", "m", "m/s^3", "m")

@@ -7,14 +7,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.evaluation.known_truth import (
+from rcirl_jax.evaluation.insight.known_truth import (
     agreement,
     differences,
     experts,
     hidden_reward,
     learns_from_choices,
 )
-from rcirl_jax.evaluation.learners import learner_config, normaliser_of, train_learner
+from rcirl_jax.evaluation.ranking.learners import (
+    learner_config,
+    normaliser_of,
+    train_learner,
+)
 from rcirl_jax.train.state import TrainConfig
 from tests.train.test_step import cached
 

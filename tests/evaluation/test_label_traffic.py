@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.label_cases import Case, Mover
-from rcirl_jax.evaluation.label_cases.scenes import START_M, drive
-from rcirl_jax.evaluation.label_scores import format_labels
-from rcirl_jax.evaluation.label_traffic import measure_traffic
-from rcirl_jax.evaluation.label_truth import judge
-from rcirl_jax.evaluation.traffic_truth import Drive, cuts_in, decision
+from rcirl_jax.evaluation.labels.cases import Case, Mover
+from rcirl_jax.evaluation.labels.cases.scenes import START_M, drive
+from rcirl_jax.evaluation.labels.made_traffic import Drive, cuts_in, decision
+from rcirl_jax.evaluation.labels.scores import format_labels
+from rcirl_jax.evaluation.labels.traffic import measure_traffic
+from rcirl_jax.evaluation.labels.truth import judge
 from rcirl_jax.types import Decision
 
 ROADS = ("arterial_signals", "highway_s_curve")
@@ -46,7 +46,7 @@ def test_the_truth_does_not_come_from_the_labels(monkeypatch):
             row["decisions"] = np.zeros(row["obstacles.kind"].shape, int)
             row["tags"] = np.zeros(18, bool)
 
-    monkeypatch.setattr("rcirl_jax.data.labels.add_labels", nothing)
+    monkeypatch.setattr("rcirl_jax.data.scenes.labels.add_labels", nothing)
     broken = measure_traffic(1, "ngsim", seed=7, roads=ROADS[:1])
     whole = {score.name: score for score in report().decisions}
     for score in broken.decisions:

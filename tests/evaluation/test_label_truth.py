@@ -13,28 +13,28 @@ from absl import flags
 from absl.testing import flagsaver
 
 from experiments.signals import checked_signals, signals_asked
-from rcirl_jax.data.collect import Collector
-from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import read_recordings
-from rcirl_jax.data.lines import trusted_signals
 from rcirl_jax.data.parts import parts_of, recordings_of
-from rcirl_jax.data.signal_checks import SignalChecks, read_signal_checks
+from rcirl_jax.data.scenes.collect import Collector
+from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.data.scenes.lines import trusted_signals
+from rcirl_jax.data.scenes.signal_checks import SignalChecks, read_signal_checks
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation import label_logs
-from rcirl_jax.evaluation.label_cases import FAMILIES, Case, draw, to_recording
-from rcirl_jax.evaluation.label_cases.plans import ego_of
-from rcirl_jax.evaluation.label_cases.scenes import CLOCK, drive, speed
-from rcirl_jax.evaluation.label_logs import check_logs, check_written
-from rcirl_jax.evaluation.label_scores import format_labels
-from rcirl_jax.evaluation.label_signals import (
+from rcirl_jax.evaluation.labels import logs as label_logs
+from rcirl_jax.evaluation.labels.cases import FAMILIES, Case, draw, to_recording
+from rcirl_jax.evaluation.labels.cases.plans import ego_of
+from rcirl_jax.evaluation.labels.cases.scenes import CLOCK, drive, speed
+from rcirl_jax.evaluation.labels.logs import check_logs, check_written
+from rcirl_jax.evaluation.labels.scores import format_labels
+from rcirl_jax.evaluation.labels.signals import (
     check_phases,
     first_stands,
     format_phases,
     period,
 )
-from rcirl_jax.evaluation.label_stops import check_stops, format_stops
-from rcirl_jax.evaluation.label_truth import measure
-from rcirl_jax.executor import Here, Processes
+from rcirl_jax.evaluation.labels.stops import check_stops, format_stops
+from rcirl_jax.evaluation.labels.truth import measure
+from rcirl_jax.runtime.executors import Here, Processes
 from rcirl_jax.types import Decision, Signal, Tag
 from tests.data.formats import commonroad
 
@@ -83,7 +83,7 @@ def test_broken_labels_are_noticed(monkeypatch):
             row["decisions"] = np.zeros(row["obstacles.kind"].shape, int)
             row["tags"] = np.zeros(len(Tag), bool)
 
-    monkeypatch.setattr("rcirl_jax.data.labels.add_labels", nothing)
+    monkeypatch.setattr("rcirl_jax.data.scenes.labels.add_labels", nothing)
     found = measure(1, "none", families=["follow", "cut_in", "red_light"])
     scores = {score.name: score for score in found.decisions + found.tags}
     for name in ("follow", "yield", "stop", "cut_in", "following"):

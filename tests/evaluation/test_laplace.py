@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 from scipy.special import expit
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.laplace import (
+from rcirl_jax.evaluation.insight.laplace import (
     difference_std,
     laplace,
     last_layer_features,

@@ -11,7 +11,7 @@ from scipy.optimize import minimize_scalar
 from scipy.special import log_softmax
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.ranking import (
+from rcirl_jax.evaluation.ranking.metrics import (
     METRICS,
     Outcomes,
     fit_temperature,

@@ -5,11 +5,15 @@ import shutil
 import numpy as np
 import pytest
 
-from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
-from rcirl_jax.data.store import open_dataset
-from rcirl_jax.evaluation.learners import FrozenSets, learner_configs, train_learner
+from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.data.store.dataset import open_dataset
+from rcirl_jax.evaluation.ranking.learners import (
+    FrozenSets,
+    learner_configs,
+    train_learner,
+)
 from rcirl_jax.train.state import OPTIMIZERS, TrainConfig
 
 # folder, format, files to take (all that can be told apart by name), stride s

@@ -18,15 +18,15 @@ from rcirl_jax.evaluation import (
     scene_metrics,
     to_json,
 )
-from rcirl_jax.evaluation.evaluate import Ranked, pooled
-from rcirl_jax.evaluation.format import markdown_table
-from rcirl_jax.evaluation.ranking import METRICS
+from rcirl_jax.evaluation.ranking.evaluate import Ranked, pooled
+from rcirl_jax.evaluation.ranking.format import markdown_table
+from rcirl_jax.evaluation.ranking.metrics import METRICS
+from rcirl_jax.evaluation.ranking.table import RIVALS, from_json, verdict
 from rcirl_jax.evaluation.statistics import (
     ClusterBootstrap,
     combine_seeds,
     paired_difference,
 )
-from rcirl_jax.evaluation.table import RIVALS, from_json, verdict
 
 SCENES, CANDIDATES, VEHICLES = 240, 12, 40
 

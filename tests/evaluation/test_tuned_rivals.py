@@ -7,15 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.evaluation.score import candidates_key, measure_scenes
-from rcirl_jax.evaluation.tuned_rivals import (
+from rcirl_jax.evaluation.ranking.score import candidates_key, measure_scenes
+from rcirl_jax.evaluation.rivals.cma_es import tune
+from rcirl_jax.evaluation.rivals.tuned import (
     TUNABLE_IDM,
     as_numbers,
     driven_scenes,
     idm_of,
     mean_driven_fde,
 )
-from rcirl_jax.evaluation.tuning import tune
 from rcirl_jax.planner.baselines import (
     TUNED_IDM_ROW,
     Idm,

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.objectives import (
+from rcirl_jax.evaluation.ranking.score import candidates_key
+from rcirl_jax.evaluation.rivals.cma_es import equal_budget, tune
+from rcirl_jax.evaluation.rivals.objectives import (
     RankedScenes,
     drive_value,
     mean_fde,
     ranked_scenes,
     suite_problem,
 )
-from rcirl_jax.evaluation.score import candidates_key
-from rcirl_jax.evaluation.tuning import equal_budget, tune
 from rcirl_jax.export.hand_weights import load_hand_weights, write_hand_weights
 from rcirl_jax.planner.rank import RankConfig
 from rcirl_jax.reward import (

@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from rcirl_jax.data.store import open_dataset
-from rcirl_jax.stages import only_one
+from rcirl_jax.data.store.dataset import open_dataset
+from rcirl_jax.runtime.pipeline import only_one
 from tests.commands import command, fresh
 
 SMALL = (

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from rcirl_jax.data.importing import import_parts
-from rcirl_jax.data.store import open_dataset
+from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.export.tuned_idm import write_tuned_idm
 from rcirl_jax.planner.baselines import Idm
 from tests.commands import command

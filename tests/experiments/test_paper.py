@@ -6,10 +6,10 @@ import math
 import numpy as np
 import pytest
 
-from rcirl_jax.data.config import CollectConfig
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
-from rcirl_jax.data.store import open_dataset
+from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.evaluation.exact import holm
 from rcirl_jax.simulation.rows import BASELINES
 from rcirl_jax.simulation.suite import family_names

@@ -7,9 +7,9 @@ import re
 import pytest
 
 from rcirl_jax.data.importing import import_parts
-from rcirl_jax.data.store import open_dataset
+from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.export.reader import load_weights
-from rcirl_jax.stages import file_sha256
+from rcirl_jax.runtime.pipeline import file_sha256
 from tests.commands import command
 from tests.data.small_logs import CONFIG, write_logs
 from tests.weights_files import random_weights

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from rcirl_jax.export import decode_weights, load_weights, to_json
-from rcirl_jax.specs import spec_root
+from rcirl_jax.runtime.specs import spec_root
 
 GOLDEN = Path(__file__).parent / "golden"
 SHA256 = {  # of the whole files

@@ -8,11 +8,11 @@ import jax
 import numpy as np
 import pytest
 
-from rcirl_jax.evaluation.closed_loop import SuiteConfig, drive_here, run_suite
-from rcirl_jax.evaluation.score import score_scenes
-from rcirl_jax.executor import Here, Processes
+from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, drive_here, run_suite
+from rcirl_jax.evaluation.ranking.score import score_scenes
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.spread import SuiteJob, drive_piece, spread
+from rcirl_jax.runtime.executors import Here, Processes
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.simulation.suite import suite_refs
 from tests.train.test_step import rows
@@ -89,7 +89,7 @@ RAY = """
 import sys
 import numpy as np
 import ray
-from rcirl_jax.executor import Here, Ray
+from rcirl_jax.runtime.executors import Here, Ray
 from tests.export.test_spread import driven, scored
 ray.init(num_cpus=2, log_to_driver=False, logging_level="ERROR")
 weights, cluster = sys.argv[1], Ray("auto")

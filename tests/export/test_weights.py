@@ -27,7 +27,7 @@ from rcirl_jax.export import (
     save,
     to_json,
 )
-from rcirl_jax.specs import spec_root
+from rcirl_jax.runtime.specs import spec_root
 from tests.weights_files import (
     ACTIVATIONS,
     example_anchor,

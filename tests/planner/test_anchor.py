@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.score import OnTop
+from rcirl_jax.evaluation.ranking.score import OnTop
 from rcirl_jax.export.closed_loop import score_of, table_rows
 from rcirl_jax.export.loading import open_reward, reward_params, scorer_of
 from rcirl_jax.export.reader import Anchor

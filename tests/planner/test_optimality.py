@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.evaluation.robustness import (
+from rcirl_jax.evaluation.closed_loop.robustness import (
     Disturbance,
     decision,
     disturbed,

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.data.assemble import assemble
-from rcirl_jax.data.collect import Collector
-from rcirl_jax.data.config import CollectConfig
+from rcirl_jax.data.scenes.assemble import assemble
+from rcirl_jax.data.scenes.collect import Collector
+from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.planner.plan import held
 from rcirl_jax.planner.prediction import (
     NUM_BODIES,
@@ -17,8 +17,8 @@ from rcirl_jax.planner.prediction import (
     predict,
     relevant,
 )
-from rcirl_jax.simulation.recorded import recorded_cases
-from rcirl_jax.simulation.recorded_config import RecordedConfig
+from rcirl_jax.simulation.recorded.cases import recorded_cases
+from rcirl_jax.simulation.recorded.config import RecordedConfig
 from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases
 from rcirl_jax.types import Kind, Track
 from rcirl_jax.units import DT_S, TIMES_S

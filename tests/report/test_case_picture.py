@@ -11,8 +11,8 @@ from PIL import Image
 from scipy.integrate import solve_ivp
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.report import case_picture
-from rcirl_jax.report.case_drive import (
+from rcirl_jax.report.case import picture as case_picture
+from rcirl_jax.report.case.drive import (
     on_host,
     plan_start,
     present_at,
@@ -20,8 +20,8 @@ from rcirl_jax.report.case_drive import (
     window,
     worst_step,
 )
-from rcirl_jax.report.case_page import write_case_page
-from rcirl_jax.report.case_picture import animate_case, draw_case
+from rcirl_jax.report.case.page import write_case_page
+from rcirl_jax.report.case.picture import animate_case, draw_case
 from rcirl_jax.simulation.cases import (
     NUM_AGENTS,
     NUM_LINES,

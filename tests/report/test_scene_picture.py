@@ -8,11 +8,11 @@ import pytest
 from matplotlib import pyplot
 from matplotlib.colors import to_hex
 
-from rcirl_jax.data.rows import row_spec
+from rcirl_jax.data.store.rows import row_spec
 from rcirl_jax.errors import InputError
-from rcirl_jax.report import scene_picture
-from rcirl_jax.report.scene_picture import DECISION_COLOURS, draw_scene
-from rcirl_jax.report.scene_view import describe_scene
+from rcirl_jax.report.data import scene_picture
+from rcirl_jax.report.data.scene_picture import DECISION_COLOURS, draw_scene
+from rcirl_jax.report.data.scene_view import describe_scene
 from rcirl_jax.types import Decision, Kind, Tag
 from rcirl_jax.units import TIMES_S
 

@@ -11,23 +11,23 @@ import jax
 import numpy as np
 import pytest
 
-from rcirl_jax.data.joined import JoinedDatasets
+from rcirl_jax.data.store.joined import JoinedDatasets
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.score import candidates_key
-from rcirl_jax.evaluation.suite_summary import PAPER
-from rcirl_jax.report import tuning_page
-from rcirl_jax.report.contributions import NUM_CANDIDATES, contributions
-from rcirl_jax.report.frames import _sampled
+from rcirl_jax.evaluation.closed_loop.summary import PAPER
+from rcirl_jax.evaluation.ranking.score import candidates_key
 from rcirl_jax.report.markup import interval
-from rcirl_jax.report.replays import AHEAD_M, BEHIND_M, FRAME_STEPS, make_replays
-from rcirl_jax.report.tuning_page import write_tuning_page
-from rcirl_jax.report.verdict_sections import outcome_of
+from rcirl_jax.report.player.replays import AHEAD_M, BEHIND_M, FRAME_STEPS, make_replays
+from rcirl_jax.report.ranking.frames import _sampled
+from rcirl_jax.report.tuning import page as tuning_page
+from rcirl_jax.report.tuning.contributions import NUM_CANDIDATES, contributions
+from rcirl_jax.report.tuning.page import write_tuning_page
+from rcirl_jax.report.tuning.verdict_sections import outcome_of
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.simulation import rollout
 from rcirl_jax.simulation import suite as suite_module
 from rcirl_jax.simulation.cases import STEP_S
 from rcirl_jax.simulation.metrics import COLUMNS, MetricsConfig
-from rcirl_jax.simulation.recorded_config import RecordedConfig
+from rcirl_jax.simulation.recorded.config import RecordedConfig
 from rcirl_jax.simulation.rollout import LANES, drive_cases
 from rcirl_jax.simulation.suite import (
     catalogue_set,

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.data.store import open_dataset
+from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.simulation.demonstrations import DriveConfig, drive_catalogue
 from rcirl_jax.simulation.suite import CaseRef
 from rcirl_jax.units import TIMES_S

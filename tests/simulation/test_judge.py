@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rcirl_jax.geometry.boxes import Box, contact_interval
-from rcirl_jax.simulation import judge
-from rcirl_jax.simulation.agents import come_and_go
-from rcirl_jax.simulation.lines import halting
-from rcirl_jax.simulation.world import start
+from rcirl_jax.simulation.world import judge
+from rcirl_jax.simulation.world.agents import come_and_go
+from rcirl_jax.simulation.world.lines import halting
+from rcirl_jax.simulation.world.step import start
 from rcirl_jax.types import Kind
 from tests.simulation.drives import drive
 from tests.simulation.worlds import make_case

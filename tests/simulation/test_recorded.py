@@ -11,15 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 
-from rcirl_jax.data.importers import read_recordings, synthetic
+from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.importers.synthetic import reader as synthetic
 from rcirl_jax.errors import InputError
 from rcirl_jax.planner.plan import held
+from rcirl_jax.runtime.specs import load_toml, spec_root
 from rcirl_jax.simulation.cases import NUM_AGENTS, NUM_ROAD, STEP_S, LineKind
-from rcirl_jax.simulation.recorded import drives, recorded_cases
-from rcirl_jax.simulation.recorded_config import REASONS, RecordedConfig
-from rcirl_jax.simulation.recorded_drive import light_cycle
+from rcirl_jax.simulation.recorded.cases import drives, recorded_cases
+from rcirl_jax.simulation.recorded.config import REASONS, RecordedConfig
+from rcirl_jax.simulation.recorded.drive import light_cycle
 from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases
-from rcirl_jax.specs import load_toml, spec_root
 from rcirl_jax.types import Kind, Lane, Recording, Signal, Track
 
 DEFAULT = spec_root() / "sources" / "synthetic.toml"

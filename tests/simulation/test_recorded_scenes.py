@@ -5,22 +5,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.data.assemble import assemble
-from rcirl_jax.data.collect import Collector
-from rcirl_jax.data.config import CollectConfig
+from rcirl_jax.data.scenes.assemble import assemble
+from rcirl_jax.data.scenes.collect import Collector
+from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.gate_types import Likeness
-from rcirl_jax.evaluation.likeness import (
+from rcirl_jax.evaluation.closed_loop.likeness import (
     held_out_likeness,
     jensen_shannon,
     read_arrays,
     write_arrays,
 )
+from rcirl_jax.evaluation.gate.types import Likeness
 from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.planner.plan import held
 from rcirl_jax.planner.prediction import as_seen
 from rcirl_jax.planner.rank import idm_policy
-from rcirl_jax.simulation.recorded_scenes import (
+from rcirl_jax.simulation.recorded.scenes import (
     CLOCK_S,
     STEPS,
     case_of,

@@ -10,11 +10,11 @@ import jax
 import numpy as np
 import pytest
 
-from rcirl_jax import interrupts
 from rcirl_jax.data.importing import import_parts
-from rcirl_jax.data.store import DatasetWriter, open_dataset
+from rcirl_jax.data.store.dataset import DatasetWriter, open_dataset
 from rcirl_jax.errors import InputError
-from rcirl_jax.stages import only_one
+from rcirl_jax.runtime import signals as interrupts
+from rcirl_jax.runtime.pipeline import only_one
 from rcirl_jax.train.checkpoint import DIGESTS
 from rcirl_jax.train.loop import restore_run, train
 from rcirl_jax.train.running import Running

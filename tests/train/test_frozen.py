@@ -7,7 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.evaluation.learners import train_learner, train_with_each, untrained
+from rcirl_jax.evaluation.ranking.learners import (
+    train_learner,
+    train_with_each,
+    untrained,
+)
 from rcirl_jax.features import feature_map
 from rcirl_jax.train.frozen import Members, fit, freeze, members_of
 from rcirl_jax.train.state import TrainState

@@ -12,10 +12,10 @@ import pytest
 
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
-from rcirl_jax.data.resplit import Resplit
-from rcirl_jax.data.store import open_dataset
+from rcirl_jax.data.store.dataset import open_dataset
+from rcirl_jax.data.store.resplit import Resplit
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.evaluate import (
+from rcirl_jax.evaluation.ranking.evaluate import (
     RankingSetup,
     evaluate_ranking,
     oracle_floor,
@@ -23,11 +23,11 @@ from rcirl_jax.evaluation.evaluate import (
     rank_scenes,
     report_of,
 )
-from rcirl_jax.evaluation.format import format_table
+from rcirl_jax.evaluation.ranking.format import format_table
 from rcirl_jax.export.from_run import export_run, read_config
 from rcirl_jax.export.loading import load_runs, open_reward
 from rcirl_jax.features import feature_map
-from rcirl_jax.report.ranking_page import write_ranking_page
+from rcirl_jax.report.ranking.page import write_ranking_page
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train import loop
 from rcirl_jax.train.loop import fit_normaliser_on, train

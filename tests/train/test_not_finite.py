@@ -9,14 +9,14 @@ import pytest
 
 from rcirl_jax.data import importing
 from rcirl_jax.data.cut import Cut
-from rcirl_jax.data.rows import check_finite
-from rcirl_jax.data.store import DatasetWriter, open_dataset
+from rcirl_jax.data.store.dataset import DatasetWriter, open_dataset
+from rcirl_jax.data.store.rows import check_finite
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation import score
-from rcirl_jax.evaluation.closed_loop import SuiteConfig, run_suite
-from rcirl_jax.evaluation.evaluate import RankingSetup, evaluate_ranking
-from rcirl_jax.evaluation.learners import learner_configs, train_learners
-from rcirl_jax.evaluation.sweep import train_group
+from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, run_suite
+from rcirl_jax.evaluation.ranking import score
+from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
+from rcirl_jax.evaluation.ranking.learners import learner_configs, train_learners
+from rcirl_jax.evaluation.ranking.sweep import train_group
 from rcirl_jax.planner.rank import RankConfig, best_plan
 from rcirl_jax.sampling import sample
 from rcirl_jax.simulation.metrics import CaseMetrics

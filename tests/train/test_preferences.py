@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.data.preferences import SCHEMA, read_preferences
+from rcirl_jax.data.store.preferences import SCHEMA, read_preferences
 from rcirl_jax.errors import InputError
 from rcirl_jax.train.loop import host_batch, train
 from rcirl_jax.train.parallel import pmapped, sharded, single

@@ -8,7 +8,7 @@ import msgpack
 import numpy as np
 import pytest
 
-from rcirl_jax.data.store import DatasetWriter, open_dataset
+from rcirl_jax.data.store.dataset import DatasetWriter, open_dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.export import FeatureSpec, RewardWeights, load_weights, save
 from rcirl_jax.export.reproduce import (

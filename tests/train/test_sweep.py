@@ -12,25 +12,25 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.data.resplit import Resplit, with_validation
-from rcirl_jax.data.store import DatasetWriter, open_dataset
+from rcirl_jax.data.store.dataset import DatasetWriter, open_dataset
+from rcirl_jax.data.store.resplit import Resplit, with_validation
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation import sweep
-from rcirl_jax.evaluation.sweep import (
+from rcirl_jax.evaluation.ranking import sweep
+from rcirl_jax.evaluation.ranking.sweep import (
     SweepConfig,
     best,
     member_name,
     open_split,
     train_group,
 )
-from rcirl_jax.executor import Here, Processes
 from rcirl_jax.export import sweep as folders
 from rcirl_jax.export.loading import compiled_scorer, open_reward
 from rcirl_jax.export.reproduce import compare, is_member, member_again, sweep_of
 from rcirl_jax.export.sweep import run_sweep, table
-from rcirl_jax.report.sweep_picture import sweep_picture
+from rcirl_jax.report.ranking.sweep_picture import sweep_picture
 from rcirl_jax.reward import RewardConfig
-from rcirl_jax.stages import only_one
+from rcirl_jax.runtime.executors import Here, Processes
+from rcirl_jax.runtime.pipeline import only_one
 from rcirl_jax.train import frozen
 from rcirl_jax.train.frozen import fit, freeze, members_of
 from rcirl_jax.train.pieces import piece_size
@@ -339,7 +339,7 @@ RAY = """
 import sys
 from pathlib import Path
 import ray
-from rcirl_jax.executor import Ray
+from rcirl_jax.runtime.executors import Ray
 from rcirl_jax.export.sweep import run_sweep
 from tests.train.test_sweep import MADE_BY, config_of
 ray.init(num_cpus=2, log_to_driver=False, logging_level="ERROR")

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import jax
 
-from rcirl_jax.data import pipeline
-from rcirl_jax.data.store import open_dataset
-from rcirl_jax.interrupts import Interrupted
+from rcirl_jax.data.store import order as pipeline
+from rcirl_jax.data.store.dataset import open_dataset
+from rcirl_jax.runtime.signals import Interrupted
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train.checkpoint import DIGESTS
 from rcirl_jax.train.loop import train

@@ -38,7 +38,7 @@ with child.instrumented():
     from benchmarks.reliability.fuzz.readers import READERS, shares
     from experiments.common import run
     from rcirl_jax.errors import InputError
-    from rcirl_jax.whole import write_json
+    from rcirl_jax.runtime.atomic_files import write_json
 
 _INPUTS = flags.DEFINE_integer("inputs", 1_000_000, "over all readers", 1)
 _READERS = flags.DEFINE_list("readers", ["all"], "which of them")

@@ -197,8 +197,8 @@ def instrumented() -> Iterator[None]:
     with contextlib.redirect_stderr(io.StringIO()), hook:
         yield
         importers = importlib.import_module("rcirl_jax.data.importers")
-        for module in set(importers.IMPORTERS.values()):
-            importlib.import_module(f"{importers.__name__}.{module}")
+        for name in importers.IMPORTERS:
+            importlib.import_module(f"{importers.__name__}.{name}.reader")
 
 
 def fuzz(

@@ -31,8 +31,8 @@ from benchmarks.reliability.fuzz.trees import (
     near,
     odd_scalar,
 )
-from rcirl_jax.data.importers.tfrecord import FOOTER, FRAME_BYTES, HEADER, mask
-from rcirl_jax.data.importers.wire import FIXED32, FIXED64, LENGTH, VARINT, fields
+from rcirl_jax.data.readers.tfrecord import FOOTER, FRAME_BYTES, HEADER, mask
+from rcirl_jax.data.readers.wire import FIXED32, FIXED64, LENGTH, VARINT, fields
 
 Codec = Callable[[bytes, random.Random], bytes]
 HUGE = "0x" + "f" * 4000  # Python reads it, and writes no decimal of so many digits

@@ -14,8 +14,8 @@ from benchmarks.reliability.fuzz.codecs import toml_text
 from benchmarks.reliability.fuzz.targets import Several, Target
 from rcirl_jax.data import importers
 from rcirl_jax.data.importers import read_recordings
-from rcirl_jax.data.importers.zarr2 import StructuredArray
-from rcirl_jax.specs import load_toml, spec_root
+from rcirl_jax.data.readers.zarr2 import StructuredArray
+from rcirl_jax.runtime.specs import load_toml, spec_root
 from tests.data import writers
 from tests.data.formats import (
     Fixture,

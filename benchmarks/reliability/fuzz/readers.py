@@ -14,14 +14,20 @@ from benchmarks.reliability.fuzz import pieces
 from benchmarks.reliability.fuzz.codecs import resealed, toml_text
 from benchmarks.reliability.fuzz.logs import LOGS
 from benchmarks.reliability.fuzz.targets import Bytes, OneFile, Reader, Target
-from rcirl_jax.data import signal_checks, store
-from rcirl_jax.data.files import FACTS, MANIFEST, MARK, Files
-from rcirl_jax.data.importers import synthetic
-from rcirl_jax.data.preferences import SCHEMA, read_preferences
-from rcirl_jax.evaluation.gate_types import Likeness
-from rcirl_jax.evaluation.likeness import read_arrays, write_arrays
-from rcirl_jax.evaluation.suite_files import COLUMNS, SuiteRuns, read_runs, write_runs
-from rcirl_jax.evaluation.sweep import SweepConfig, member_name, shape_name
+from rcirl_jax.data.importers.synthetic import reader as synthetic
+from rcirl_jax.data.scenes import signal_checks
+from rcirl_jax.data.store import dataset as store
+from rcirl_jax.data.store.files import FACTS, MANIFEST, MARK, Files
+from rcirl_jax.data.store.preferences import SCHEMA, read_preferences
+from rcirl_jax.evaluation.closed_loop.files import (
+    COLUMNS,
+    SuiteRuns,
+    read_runs,
+    write_runs,
+)
+from rcirl_jax.evaluation.closed_loop.likeness import read_arrays, write_arrays
+from rcirl_jax.evaluation.gate.types import Likeness
+from rcirl_jax.evaluation.ranking.sweep import SweepConfig, member_name, shape_name
 from rcirl_jax.export import sweep
 from rcirl_jax.export.from_run import last_metrics, read_config
 from rcirl_jax.export.hand_weights import tuned_rows, write_hand_weights
@@ -30,17 +36,17 @@ from rcirl_jax.export.provenance import check_provenance
 from rcirl_jax.export.reader import decode_weights
 from rcirl_jax.features import mapping
 from rcirl_jax.reward import LatticeCost
-from rcirl_jax.simulation import families
-from rcirl_jax.simulation.catalogue import build_case
+from rcirl_jax.runtime.atomic_files import write_json
+from rcirl_jax.runtime.pipeline import Stages
+from rcirl_jax.runtime.specs import load_toml, spec_root
+from rcirl_jax.simulation.catalogue import families
+from rcirl_jax.simulation.catalogue.build import build_case
 from rcirl_jax.simulation.metrics import CaseMetrics
-from rcirl_jax.specs import load_toml, spec_root
-from rcirl_jax.stages import Stages
 from rcirl_jax.train import checkpoint
 from rcirl_jax.train.metrics import pairs_won
 from rcirl_jax.train.running import check_run, describe_run
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.units import NUM_TIMES
-from rcirl_jax.whole import write_json
 from tests.data import test_store
 from tests.weights_files import packed, random_weights
 

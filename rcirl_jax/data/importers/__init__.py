@@ -1,8 +1,8 @@
-"""Importers: one module per log format, each yielding valid Recordings.
+"""Importers: one folder per log format, each yielding valid Recordings.
 
-An importer is a function (input path, source spec) -> iterator of Recording.
-The spec is the TOML of data_specs/sources (or the user's own). Each passes its
-recordings through `validate_recording` with the file's name.
+Each has `reader.recordings`: (input path, source spec) -> iterator of Recording. The
+spec is the TOML of data_specs/sources (or the user's own). Each passes its recordings
+through `validate_recording` with the file's name.
 """
 
 import importlib
@@ -14,29 +14,17 @@ from pathlib import Path
 from rcirl_jax.data.importers.files import with_log_names
 from rcirl_jax.data.importers.options import check_types
 from rcirl_jax.errors import InputError, as_input_error
-from rcirl_jax.specs import load_toml, spec_root
+from rcirl_jax.runtime.atomic_files import is_text
+from rcirl_jax.runtime.specs import load_toml, spec_root
 from rcirl_jax.types import Recording
-from rcirl_jax.whole import is_text
 
 Importer = Callable[[Path, dict], Iterator[Recording]]
 
-# format -> module; loaded only when the format is asked for
-IMPORTERS: dict[str, str] = {
-    "apollo": "apollo",
-    "argoverse2": "argoverse2",
-    "commonroad": "commonroad",
-    "csv": "csv_table",
-    "interaction": "interaction",
-    "l5": "l5",
-    "levelx": "levelx",
-    "ngsim": "ngsim",
-    "ngsim_pairs": "ngsim_pairs",
-    "nuplan": "nuplan",
-    "openacc": "openacc",
-    "synthetic": "synthetic",
-    "waymo": "waymo",
-}
-
+# a folder each, whose `reader` is loaded only when the format is asked for
+IMPORTERS = (
+    *("apollo", "argoverse2", "commonroad", "csv", "interaction", "l5", "levelx"),
+    *("ngsim", "ngsim_pairs", "nuplan", "openacc", "synthetic", "waymo"),
+)
 
 # formats of which one part (see `parts`) is a file with a few recordings
 SMALL_PARTS = (
@@ -77,7 +65,7 @@ def files_of(name: str, path: Path) -> list[Path]:
 
 
 def _module(name: str) -> types.ModuleType:
-    return importlib.import_module(f"{__name__}.{IMPORTERS[name]}")
+    return importlib.import_module(f"{__name__}.{name}.reader")
 
 
 def parts(

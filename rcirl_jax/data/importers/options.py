@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import PurePosixPath
 
-from rcirl_jax.data.importers.tables import number
+from rcirl_jax.data.readers.tables import number
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind
 

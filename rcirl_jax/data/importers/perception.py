@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.importers import csv_stream
-from rcirl_jax.data.importers.shapes import local_origin
-from rcirl_jax.data.importers.tables import number, split_tracks
+from rcirl_jax.data.readers import csv_stream
+from rcirl_jax.data.readers.shapes import local_origin
+from rcirl_jax.data.readers.tables import number, split_tracks
 from rcirl_jax.data.recording import LENGTH_RANGE_M, MAX_SPEED_MPS, WIDTH_RANGE_M
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Recording, Track

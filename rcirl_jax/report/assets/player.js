@@ -1,6 +1,6 @@
 // Plays the drives of a case side by side: bird's eye and station-time graph.
-// Data: the JSON of `report.player`: replays, each drive with its `look`, and colours.
-// `report.player` puts drawing.js and this file into one strict function.
+// Data: the JSON of `report.player.player`: replays, each drive with its `look`, and colours.
+// `report.player.player` puts drawing.js and this file into one strict function.
 const at = (id) => document.getElementById(id);
 const root = at("player");
 if (!root) return;

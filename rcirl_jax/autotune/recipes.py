@@ -1,0 +1,158 @@
+"""Recipes: TOML files that hold everything that decides a run.
+
+    data_specs/recipes/tuned.toml   the default
+    data_specs/recipes/paper.toml   the paper's own setting
+    data_specs/recipes/quick.toml   for the demo
+
+[train] are fields of `TrainConfig`, [train.reward] of `RewardConfig` (`by_context`
+stands for the preset's context columns), [train.sampler] of `SamplerConfig`, [collect]
+of `CollectConfig`, [rehearsal] of `Rehearsal`, [anchor] of `Anchoring`. What a file
+leaves out is the field's
+own default. Nothing else has a default of its own: commands take a recipe, and flags
+given beside it win.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rcirl_jax.autotune.anchoring import Anchoring
+from rcirl_jax.autotune.rehearsal import Rehearsal
+from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.errors import InputError, did_you_mean
+from rcirl_jax.features import feature_map
+from rcirl_jax.reward import RewardConfig
+from rcirl_jax.runtime.settings import check_names, typed_fields
+from rcirl_jax.runtime.specs import load_toml, spec_root
+from rcirl_jax.sampling import SamplerConfig
+from rcirl_jax.train.state import TrainConfig
+
+DEFAULT = "tuned"
+TABLES = ("about", "train", "collect", "rehearsal", "anchor", "autotune")
+# of a run, not of a recipe
+NOT_OF_A_RECIPE = ("seed", "preferences", "reward", "sampler")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """Everything that decides a run but the data and the seed."""
+
+    name: str
+    about: str
+    train: TrainConfig
+    collect: CollectConfig
+    rehearsal: Rehearsal
+    anchor: Anchoring
+    seeds: int  # training runs of which the median one drives
+
+
+def recipe_names() -> list[str]:
+    """Those in data_specs/recipes."""
+    return sorted(path.stem for path in (spec_root() / "recipes").glob("*.toml"))
+
+
+def load_recipe(name: str) -> Recipe:
+    """A recipe by its name or by its file.
+
+    Raises:
+      InputError: no such recipe; an unknown table or key (with the nearest known one);
+        a value of another type or out of range.
+    """
+    known = recipe_names()
+    if name in known:
+        path = spec_root() / "recipes" / f"{name}.toml"
+    elif name.endswith(".toml"):
+        path = Path(name)
+    else:
+        raise InputError(
+            f"--recipe: {name}: expected one of {', '.join(known)}, or a .toml file"
+            + did_you_mean(name, known)
+        )
+    body = load_toml(path)
+    check_names(f"{path}: ", body, TABLES)
+    train = _table(path, "train", body.get("train", {}))
+    reward = _table(path, "train.reward", train.pop("reward", {}))
+    sampler = _table(path, "train.sampler", train.pop("sampler", {}))
+    tuning = _table(path, "autotune", body.get("autotune", {}))
+    check_names(f"{path}: [autotune] ", tuning, ("seeds",))
+    seeds = tuning.get("seeds", 1)
+    if type(seeds) is not int or seeds < 1:
+        raise InputError(f"{path}: [autotune] seeds: {seeds}: expected at least 1")
+    settings = _typed(path, "train", TrainConfig, train, NOT_OF_A_RECIPE)
+    made = {
+        "reward": _reward(path, reward, settings.get("features", "paper21")),
+        "sampler": _made(path, "train.sampler", SamplerConfig, sampler),
+    }
+    collect = _table(path, "collect", body.get("collect", {}))
+    rehearsal = _table(path, "rehearsal", body.get("rehearsal", {}))
+    rehearsed = _made(path, "rehearsal", Rehearsal, rehearsal)
+    anchor = _table(path, "anchor", body.get("anchor", {}))
+    anchored = _made(path, "anchor", Anchoring, anchor)
+    if anchored.wanted and not rehearsed.datasets:
+        raise InputError(
+            f"{path}: [rehearsal] teacher: none: expected one with an [anchor]: its "
+            "drives show what was not recorded"
+        )
+    return Recipe(
+        name=path.stem if name in known else name,
+        about=str(body.get("about", "")),
+        train=_built(path, "train", TrainConfig, {**settings, **made}),
+        collect=_made(path, "collect", CollectConfig, collect, ("signal_checks",)),
+        rehearsal=rehearsed,
+        anchor=anchored,
+        seeds=seeds,
+    )
+
+
+def reward_config(
+    features: str, settings: Mapping[str, Any], by_context: bool
+) -> RewardConfig:
+    """The network with the preset's context and signs where they are asked for."""
+    preset = feature_map(features)
+    monotone = settings.get("constraint") == "monotone"
+    return RewardConfig(
+        **settings,
+        context=preset.context if by_context else (),
+        signs=preset.signs if monotone else (),
+    )
+
+
+def _reward(path: Path, found: dict, features: str) -> RewardConfig:
+    where = "train.reward"
+    by_context = found.pop("by_context", False)
+    if not isinstance(by_context, bool):
+        raise InputError(
+            f"{path}: [{where}] by_context: {by_context}: expected true or false"
+        )
+    typed = _typed(path, where, RewardConfig, found, ("context", "signs"))
+    try:
+        return reward_config(features, typed, by_context)
+    except (InputError, ValueError) as error:
+        raise InputError(f"{path}: [{where}] {error}") from error
+
+
+def _made(
+    path: Path, where: str, kind: type, found: dict, without: tuple[str, ...] = ()
+) -> Any:  # noqa: ANN401
+    return _built(path, where, kind, _typed(path, where, kind, found, without))
+
+
+def _built(path: Path, where: str, kind: type, values: dict) -> Any:  # noqa: ANN401
+    try:
+        return kind(**values)
+    except (InputError, ValueError) as error:
+        raise InputError(f"{path}: [{where}] {error}") from error
+
+
+def _table(path: Path, where: str, found: object) -> dict:
+    if not isinstance(found, dict):
+        raise InputError(f"{path}: {where}: {found}: expected a table [{where}]")
+    return dict(found)
+
+
+def _typed(
+    path: Path, where: str, kind: type, found: dict, without: tuple[str, ...]
+) -> dict[str, Any]:
+    """The values of a table [where] of the recipe, of the types of their fields."""
+    return typed_fields(kind, found, f"{path}: [{where}] ", without)

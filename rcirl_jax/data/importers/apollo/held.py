@@ -1,0 +1,168 @@
+"""Rows of an Apollo drive while its parts are read: what windows still need of them.
+
+All times here are of one clock: of measurement, or of recording where topics are
+stamped on different clocks; s since the drive's first position.
+"""
+
+import copy
+import math
+from pathlib import Path
+
+import numpy as np
+
+from rcirl_jax.data.importers.apollo.messages import Rows, check_held
+from rcirl_jax.data.importers.apollo.obstacles import COLUMNS
+from rcirl_jax.errors import InputError
+
+MAX_DURATION_S = 86400.0  # s, of one drive
+CLOCK_TOLERANCE_S = 1.0  # s, two topics' clocks differ by more: not one clock
+REPEAT_S = 1.5  # s; Apollo sends the routing in force again every second
+# columns of each topic's rows, see `Rows`
+WIDTHS = {
+    "localization": 7,
+    "chassis": 4,
+    "perception": COLUMNS,
+    "prediction": COLUMNS,
+}
+
+Leg = tuple[float, tuple[float, float] | None]  # s, from when on; destination, m
+
+
+class Held:
+    """Rows of a drive, put onto one clock."""
+
+    def __init__(self, path: Path) -> None:
+        """Holds nothing; `path` is named in errors."""
+        self.path = path
+        self.tables = {name: np.zeros((0, width)) for name, width in WIDTHS.items()}
+        self.notes: list[str] = []
+        self.progress = 0.0  # share of the drive's bytes that is read
+        self.is_empty = True  # no position until now
+        self.end = -math.inf  # s, last position
+        self._routing: list[tuple[float, float, float]] = []
+        self._since = -math.inf  # s, rows from before it were forgotten
+        self._start = 0.0  # s, what the clock shows at the first position
+        self._offset = 0.0  # s, what it shows less the time of recording
+        self._is_one_clock = True
+
+    @property
+    def key(self) -> str:
+        """The topic of the obstacles."""
+        return "perception" if len(self.tables["perception"]) else "prediction"
+
+    @property
+    def now(self) -> float:
+        """Time [s] at which the last position was recorded; -inf without any held."""
+        tables = [self.tables[name] for name in ("localization", self.key)]
+        recorded = [table[-1, 1] for table in tables if len(table)]
+        return max(recorded, default=-math.inf) + self._offset - self._start
+
+    def next_position(self, since: float) -> float:
+        """Time [s] of the first position held from a time on; inf without one."""
+        clocks = [self.clock(name) for name in WIDTHS if name != "chassis"]
+        clock = np.concatenate(clocks)
+        return float(np.min(clock, where=clock >= since, initial=math.inf))
+
+    def add(self, rows: Rows) -> None:
+        """Rows that follow.
+
+        Raises:
+          InputError: too many, too long a drive, or rows of windows long taken.
+        """
+        for name, width in WIDTHS.items():
+            new = getattr(rows, name)
+            if name not in ("perception", "prediction"):
+                new = [np.array(new, np.float64).reshape(-1, width)]
+            self.tables[name] = np.concatenate([self.tables[name], *new])
+        held = len(self.tables["perception"]) + len(self.tables["prediction"])
+        check_held(str(self.path), held)
+        for routing in rows.routing:
+            if not self._routing or routing[1:] != self._routing[-1][1:]:
+                self._routing.append(routing)
+        self.notes += rows.notes
+        self.progress = rows.progress
+        if self._since == -math.inf:
+            self._settle()
+        clock = np.concatenate([self.clock(n) for n in ("localization", self.key)])
+        if clock.size:
+            self._check_span(float(clock.min()), float(clock.max()))
+
+    def _settle(self) -> None:
+        """Choose the clock, and where it starts."""
+        self.end = -math.inf  # all rows are held still
+        names = ("localization", self.key)
+        tables = [self.tables[name] for name in (*names, "chassis")]
+        offsets = [float(np.median(t[:, 0] - t[:, 1])) for t in tables if len(t)]
+        if offsets:
+            apart = max(offsets) - min(offsets)
+            self._is_one_clock = apart <= CLOCK_TOLERANCE_S
+        clock = np.concatenate([self._shown(name) for name in names])
+        recorded = np.concatenate([self.tables[name][:, 1] for name in names])
+        if clock.size:
+            self.is_empty = False
+            self._start = float(clock.min())
+            self._offset = float(np.median(clock - recorded))
+
+    def _shown(self, name: str) -> np.ndarray:
+        """What the clock shows [s] at each row of a topic."""
+        table = self.tables[name]
+        if not self._is_one_clock:
+            return table[:, 1]
+        own = table[:, 0 if name == "chassis" else 2]
+        near = np.abs(own - table[:, 0]) <= CLOCK_TOLERANCE_S
+        return np.where(near, own, table[:, 0])
+
+    def clock(self, name: str) -> np.ndarray:
+        """Time [s] of each row of a topic."""
+        return self._shown(name) - self._start
+
+    def _check_span(self, first: float, last: float) -> None:
+        self.end = max(self.end, last)
+        span = max(last, self.now) - min(first, 0.0)
+        if not span <= MAX_DURATION_S:
+            raise InputError(
+                f"{self.path}: timestamp_sec: {span:g} s from first to last: "
+                f"expected at most {MAX_DURATION_S:g} s"
+            )
+        if first < self._since:
+            raise InputError(
+                f"{self.path}: timestamp_sec: {first:g} s from the start after "
+                f"{self.now:g} s: goes backwards; expected parts in order"
+            )
+
+    def view(self, low: float, high: float) -> "Held":
+        """Rows from one time [s] to before another, and the notes since the last."""
+        view = copy.copy(self)
+        view.tables = {name: self._rows(name, low, high) for name in self.tables}
+        self.notes = []
+        if self._since == -math.inf and not self._is_one_clock:
+            note = "topics stamped on different clocks; times of recording used"
+            view.notes = [*view.notes, note]
+        return view
+
+    def forget(self, before: float) -> None:
+        """Drop rows from before a time [s]; the clock is settled from then on."""
+        self.tables = {name: self._rows(name, before) for name in self.tables}
+        self._since = before
+
+    def _rows(self, name: str, low: float, high: float = math.inf) -> np.ndarray:
+        """Rows between two times [s], the chassis' in force at the first included."""
+        clock = self.clock(name)
+        kept = (clock >= low) & (clock < high)
+        before = np.where(clock < low, clock, -np.inf)
+        if name == "chassis" and (clock < low).any():
+            kept[np.argmax(before)] = True
+        return self.tables[name][kept]
+
+    def legs(self) -> list[Leg]:
+        """Destinations in the order of time, the first valid from the beginning.
+
+        A routing that came within REPEAT_S of the start was in force before.
+        """
+        legs: list[Leg] = [(-math.inf, None)]
+        for time, x, y in sorted(self._routing):
+            if (x, y) != legs[-1][1]:
+                legs.append((time + self._offset - self._start, (x, y)))
+        while len(legs) > 1 and legs[1][0] <= (REPEAT_S if legs[0][1] is None else 0.0):
+            legs[:2] = [(-math.inf, legs[1][1])]
+        return legs

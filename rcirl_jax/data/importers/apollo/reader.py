@@ -1,0 +1,364 @@
+"""Baidu Apollo's cyber records: localization, chassis, obstacles, routing.
+
+Read: `*.record`, `*.record.00000`, `.00001`, ... of Apollo 3.5 and later; the
+parts of one drive make one Recording, or one per window of a long drive, made
+while they are read. Messages are decoded by the descriptors in
+the record (modules/common_msgs in the Apollo sources: localization.proto,
+chassis.proto, perception_obstacle.proto, prediction_obstacle.proto,
+routing.proto), so no Apollo or protobuf package is needed.
+
+Traps: a pose is that of the rear axle's centre, not of the box; the quaternion's
+zero is north, the heading's is east; messages are irregular and on clocks of
+their own, so everything is put on one uniform clock; where perception recorded
+nothing, prediction repeats its obstacles; a drive may be the planner's own, not
+a human's (a note says how much of it); a drive may have several destinations,
+and the ego is another track from each new one on.
+"""
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from rcirl_jax.data.importers.apollo.held import Held, Leg
+from rcirl_jax.data.importers.apollo.messages import LOCALIZATION, MANUAL, read_drive
+from rcirl_jax.data.importers.apollo.records import (
+    drive_name,
+    first_parts,
+    is_cut,
+    parts_from,
+    run_name,
+)
+from rcirl_jax.data.importers.files import log_name
+from rcirl_jax.data.importers.options import one_pattern, positive, section
+from rcirl_jax.data.importers.paths import path_lanes
+from rcirl_jax.data.importers.perception import (
+    Boxes,
+    Windows,
+    around,
+    longest_window,
+    placed,
+    tracks_of,
+)
+from rcirl_jax.data.readers.csv_stream import AFTER_S
+from rcirl_jax.data.readers.shapes import (
+    check_coordinates,
+    origin_notes,
+)
+from rcirl_jax.data.readers.tables import number, spans_of
+from rcirl_jax.data.recording import MAX_RATE_HZ, validate_recording
+from rcirl_jax.errors import InputError
+from rcirl_jax.types import Kind, Recording, Track
+
+RATE_HZ = 10.0  # 1/s
+MAX_GAP_S = 0.55  # s without a message inside one track
+LATE_S = 2.0  # s, messages of one time are recorded within it
+LIMIT_MPS = 29.06  # m/s, 65 mph
+LANE_WIDTH_M = 3.5  # m
+MAX_SILENCE_S = 1.0  # s without a chassis message, after which nobody knows
+# Lincoln MKZ in Apollo's mkz_example: 3.89 m before, 1.043 m behind the rear axle
+EGO = {"length": 4.933, "width": 2.11, "rear_axle_to_centre": 1.4235}  # m
+NAN = float("nan")
+
+
+def parts(path: Path, spec: dict) -> list[Path]:
+    """The first file of each run of parts: runs can be read without the others."""
+    if path.is_file():
+        return [path]
+    return first_parts(path, one_pattern(spec, "*.record*"))
+
+
+def files_of(first: Path) -> list[Path]:
+    """The files of a run, by its first one."""
+    return parts_from(first)
+
+
+def own_name(first: Path) -> str:
+    """Name of a run, as long as no other folder has one called alike."""
+    return run_name(first)
+
+
+def recordings(path: Path, spec: dict) -> Iterator[Recording]:
+    """One Recording per drive, or per window of a long one, or run of its parts."""
+    for first in parts(path, spec):
+        held, found = Held(first), False
+        for recording in _windows(held, spec):
+            found = True
+            yield validate_recording(recording, first)
+        if held.is_empty:
+            raise InputError(
+                f"{first}: {LOCALIZATION}: no messages, nor obstacles: "
+                "expected at least one of them"
+            )
+        if not found:
+            raise InputError(
+                f"{first}: tracks: none on a clock of {_rate(spec):g} Hz: "
+                "expected a longer record"
+            )
+
+
+def _rate(spec: dict) -> float:
+    rate = positive(spec, "rate_hz", RATE_HZ)
+    if rate > MAX_RATE_HZ:
+        raise InputError(
+            f"source TOML: rate_hz: {rate:g}: expected at most {MAX_RATE_HZ:g}"
+        )
+    return rate
+
+
+def _windows(held: Held, spec: dict) -> Iterator[Recording]:
+    """Recordings of a drive, each made once what it needs is read."""
+    name = log_name(held.path, spec, run_name(held.path))
+    window = longest_window(spec)
+    windows, number = Windows(name, drive_name(held.path), MAX_GAP_S), 0
+
+    def within() -> tuple[float, float]:
+        return number * window, (number + 1) * window
+
+    def take(low: float, high: float) -> Iterator[Recording]:
+        made = _recording(held.view(*around((low, high))), (low, high), spec)
+        if made is not None:
+            yield windows.recording(made, number, (low, high), held.progress)
+
+    def following(last: float) -> int:
+        """The next window near a position, or else the one at a time [s]."""
+        near = held.next_position((number + 1) * window - MAX_GAP_S) - MAX_GAP_S
+        return max(number + 1, math.floor(min(near, last) / window))
+
+    for rows in read_drive(parts_from(held.path), spec):
+        held.add(rows)
+        while held.now > around(within())[1] + LATE_S:
+            yield from take(*within())
+            number = following(held.now - LATE_S - AFTER_S)
+            held.forget(around(within())[0])
+    if number == 0 and held.end <= window:
+        whole = (-math.inf, math.inf)
+        made = _recording(held.view(*whole), whole, spec)
+        yield from [] if made is None else [made]
+        return
+    while (low := number * window) < held.end:
+        is_last = held.end <= low + window
+        yield from take(low, held.end + 1.0 if is_last else low + window)
+        number = following(held.end)
+
+
+def _recording(held: Held, within: tuple[float, float], spec: dict) -> Recording | None:
+    """The tracks of the rows held, with notes on the time within; None: nothing."""
+    path, rate, notes = held.path, _rate(spec), list(held.notes)
+    tracks = _ego(held, spec, rate)
+    obstacles, obstacle_notes = _obstacles(held, spec, rate)
+    tracks += obstacles
+    if not any(t.t[0] < within[1] and t.t[-1] >= within[0] for t in tracks):
+        return None
+    notes += _what_is_missing(held, within)
+    _, _, origin, tracks = placed(tracks)
+    lanes = path_lanes(
+        tracks,
+        positive(spec, "lane_width_m", LANE_WIDTH_M),
+        positive(spec, "speed_limit", LIMIT_MPS),
+    )
+    return Recording(
+        name=log_name(path, spec, run_name(path)),
+        group=drive_name(path) if is_cut(path) else None,
+        source=str(spec.get("source", "Apollo cyber record")),
+        licence=str(spec.get("licence", "unknown")),
+        rate_hz=rate,
+        tracks=tuple(_with_destinations(tracks, held.legs(), origin)),
+        lanes=lanes,
+        default_speed_limit=positive(spec, "speed_limit", LIMIT_MPS),
+        notes=(
+            *notes,
+            *obstacle_notes,
+            *origin_notes(origin),
+            f"records hold no map; {len(lanes)} lanes fitted to the longest paths",
+        ),
+    )
+
+
+def _what_is_missing(held: Held, within: tuple[float, float]) -> list[str]:
+    """Notes on topics without messages, and on driving that is no human's."""
+    notes, (low, high) = [], within
+    if not len(held.tables["localization"]):
+        notes.append("no localization recorded; no ego track")
+    elif not any(start < high and place for start, place in held.legs()):
+        notes.append("no routing recorded; the ego's destination is unknown")
+    if not len(held.tables[held.key]):
+        notes.append("no obstacles recorded; the ego is alone")
+    elif held.key == "prediction":
+        notes.append("no perception recorded; obstacles are those of prediction")
+    clock = held.clock("chassis")
+    is_manual = held.tables["chassis"][(clock >= low) & (clock < high), 3]
+    automatic = 1.0 - float(np.mean(is_manual)) if is_manual.size else 0.0
+    if automatic > 0.0:
+        notes.append(
+            f"{automatic:.0%} of the time not in {MANUAL}: the ego is no human there"
+        )
+    return notes
+
+
+def _ego(held: Held, spec: dict, rate: float) -> list[Track]:
+    """The recording car's box, moved from its rear axle to its centre."""
+    size = {
+        name: number(section(spec, "ego"), name, default)
+        for name, default in EGO.items()
+    }
+    t, table = held.clock("localization"), held.tables["localization"]
+    x, y, heading, speed = table[:, 3:].T
+    where = f"{held.path}: {LOCALIZATION}"
+    check_coordinates(where, "pose", ("x", "y", "heading"), table[:, 3:6])
+    if t.size and not np.isfinite(speed).all():
+        wheels = held.tables["chassis"][:, 2]
+        speed = _chassis_speed(t, held.clock("chassis"), wheels)
+    ahead = size["rear_axle_to_centre"]
+    boxes = _uniform(
+        ids=np.zeros(t.size, np.int64),
+        names=("ego",),
+        t=t,
+        columns=(
+            x + ahead * np.cos(heading),
+            y + ahead * np.sin(heading),
+            heading,
+            speed,
+            np.full(t.size, size["length"]),
+            np.full(t.size, size["width"]),
+        ),
+        kind=np.full(t.size, int(Kind.VEHICLE)),
+        rate=rate,
+    )
+    automated = _automated(held)
+    found, _ = tracks_of(held.path, boxes, MAX_GAP_S)
+    return [dataclasses.replace(track, automated=automated) for track in found]
+
+
+def _automated(held: Held) -> tuple[tuple[float, float], ...]:
+    """When the chassis was in another mode than a human driver's, or silent.
+
+    The first mode was in force before; without a chassis channel a human drives.
+    """
+    clock, mode = held.clock("chassis"), held.tables["chassis"][:, 3]
+    if not clock.size:
+        return ()
+    order = np.argsort(clock, kind="stable")
+    clock, other = clock[order], mode[order] == 0.0
+    silent = np.diff(clock, append=np.inf) > MAX_SILENCE_S
+    return spans_of(
+        np.concatenate([[-np.inf], clock, clock[silent] + MAX_SILENCE_S]),
+        np.concatenate([other[:1], other, np.ones(np.count_nonzero(silent), bool)]),
+    )
+
+
+def _chassis_speed(t: np.ndarray, clock: np.ndarray, speed: np.ndarray) -> np.ndarray:
+    """Speed [m/s] of the wheels at times t; NaN where there is none."""
+    known = np.isfinite(speed)
+    if np.count_nonzero(known) < 2:
+        return np.full(t.shape, NAN)
+    order = np.argsort(clock[known], kind="stable")
+    return np.interp(t, clock[known][order], speed[known][order])
+
+
+def _obstacles(held: Held, spec: dict, rate: float) -> tuple[list[Track], list[str]]:
+    path, table, clock = held.path, held.tables[held.key], held.clock(held.key)
+    # a state without a position, or of the ego (negative id), is none
+    seen = ~np.isnan(table[:, 4:6]).any(axis=1) & (table[:, 3] >= 0)
+    lost = int(np.count_nonzero(~seen))
+    table, clock = table[seen], clock[seen]
+    where = f"{path}: obstacles"
+    check_coordinates(where, "perception_obstacle", ("x", "y", "theta"), table[:, 4:7])
+    number_of, ids = np.unique(table[:, 3].astype(np.int64), return_inverse=True)
+    boxes = _uniform(
+        ids=ids,
+        names=tuple(str(found) for found in number_of.tolist()),
+        t=clock,
+        columns=tuple(table[:, 4:10].T),
+        kind=table[:, 10].astype(np.int64),
+        rate=rate,
+    )
+    unknown = str(spec.get("unknown", "auto"))
+    tracks, notes = tracks_of(path, boxes, MAX_GAP_S, unknown)
+    if lost:
+        notes.append(f"{lost} obstacle states without position or id left out")
+    return tracks, notes
+
+
+def _uniform(
+    *,
+    ids: np.ndarray,
+    names: tuple[str, ...],
+    t: np.ndarray,
+    columns: tuple[np.ndarray, ...],
+    kind: np.ndarray,
+    rate: float,
+) -> Boxes:
+    """Boxes on the clock k / rate, between the messages of each gapless piece.
+
+    Linear interpolation; headings (column 2) are unwrapped first. A piece
+    between two ticks of the clock gives nothing. Of several messages of one
+    time the first counts.
+    """
+    order = np.lexsort((t, ids))
+    step, same = np.diff(t[order]), np.diff(ids[order]) == 0
+    order = order[np.concatenate([[True], ~same | (step > 0.0)])[: order.size]]
+    step, same = np.diff(t[order]), np.diff(ids[order]) == 0
+    breaks = np.flatnonzero(~same | (step > MAX_GAP_S)) + 1
+    parts: list[tuple[np.ndarray, ...]] = []
+    for rows in np.split(order, breaks) if order.size else []:
+        first = math.ceil(float(t[rows[0]]) * rate - 1e-6)
+        last = math.floor(float(t[rows[-1]]) * rate + 1e-6)
+        clock = np.arange(first, last + 1) / rate
+        values = [column[rows] for column in columns]
+        values[2] = np.unwrap(values[2])
+        at = np.minimum(np.searchsorted(t[rows], clock), rows.size - 1)
+        parts.append(
+            (
+                np.full(clock.size, ids[rows[0]]),
+                clock,
+                *(np.interp(clock, t[rows], value) for value in values),
+                kind[rows][at],
+            )
+        )
+    empty = (np.zeros(0, np.int64), *[np.zeros(0)] * 7, np.zeros(0, np.int64))
+    merged = [np.concatenate(group) for group in zip(empty, *parts, strict=True)]
+    fields = ("t", "x", "y", "heading", "speed", "length", "width")
+    return Boxes(
+        ids=merged[0],
+        names=names,
+        kind=merged[8],
+        **dict(zip(fields, merged[1:8], strict=True)),
+    )
+
+
+def _with_destinations(
+    tracks: list[Track], legs: list[Leg], origin: np.ndarray
+) -> list[Track]:
+    """The tracks, the ego's cut where a routing set another destination.
+
+    The destination is the one valid at the time: the driver knew no later one.
+    """
+    changes = np.array([start for start, _ in legs[1:]])
+    found: list[Track] = []
+    for track in tracks:
+        user, *again = track.id.split("#")
+        if user != "ego":
+            found.append(track)
+            continue
+        which = np.searchsorted(changes, track.t + 1e-6, side="right")
+        for leg in np.unique(which).tolist():
+            name = user if leg == 0 else f"{user}-leg{leg + 1}"
+            rows, place = which == leg, legs[leg][1]
+            series = {
+                field: getattr(track, field)[rows]
+                for field in ("t", "x", "y", "heading", "speed")
+            }
+            found.append(
+                dataclasses.replace(
+                    track,
+                    id="#".join((name, *again)),
+                    destination=None
+                    if place is None
+                    else (place[0] - float(origin[0]), place[1] - float(origin[1])),
+                    **series,
+                )
+            )
+    return found

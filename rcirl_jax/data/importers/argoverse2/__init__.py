@@ -1,0 +1,1 @@
+"""Argoverse 2 motion forecasting: `reader` for scenarios, `map` for their lanes."""

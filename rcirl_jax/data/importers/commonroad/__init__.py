@@ -1,0 +1,1 @@
+"""CommonRoad XML scenarios: `reader`, `map` for lanelets, `extras` for signals."""

@@ -1,0 +1,123 @@
+"""CommonRoad lanelets -> Lanes: centre lines, widths, limits, stop lines."""
+
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from rcirl_jax.data.readers.xml_fields import Fields
+from rcirl_jax.errors import InputError
+from rcirl_jax.types import Lane
+
+# of the countries that the format knows; others use the German ids
+LIMIT_SIGNS = ("R2-1", "274", "274.1", "r301")  # US, German (also zones), Spanish
+STOP_SIGNS = ("R1-1", "206", "r2")  # US, German, Spanish
+MIN_HALF_WIDTH_M = 0.1  # m, lanelets taper to a point at forks
+
+
+def read_lanes(
+    root: Element, fields: Fields, spec: dict
+) -> tuple[tuple[Lane, ...], list[str]]:
+    """All lanelets of a file as lanes, and notes about what was ignored."""
+    limits, stops, notes = _read_signs(root, fields, float(spec["min_speed_limit"]))
+    lanes = tuple(
+        _read_lanelet(element, fields, limits, stops)
+        for element in root.iterfind("lanelet")
+    )
+    if not lanes:
+        raise InputError(f"{fields.path}: lanelet: none: expected a road network")
+    return lanes, notes
+
+
+def _read_signs(
+    root: Element, fields: Fields, lowest: float
+) -> tuple[dict[str, float], set[str], list[str]]:
+    limits: dict[str, float] = {}
+    stops: set[str] = set()
+    ignored = 0
+    for sign in root.iterfind("trafficSign"):
+        name = sign.get("id", "")
+        for element in sign.iterfind("trafficSignElement"):
+            kind = (element.findtext("trafficSignID") or "").strip()
+            value = element.find("additionalValue")
+            if kind in STOP_SIGNS:
+                stops.add(name)
+            elif kind in LIMIT_SIGNS and value is not None:
+                limit = fields.number(value, f"trafficSign {name}")
+                if limit >= lowest:
+                    limits[name] = limit
+                else:
+                    ignored += 1
+    notes = [f"{ignored} speed limits below {lowest:g} m/s ignored"] if ignored else []
+    return limits, stops, notes
+
+
+def _bound(element: Element, tag: str, fields: Fields, where: str) -> np.ndarray:
+    bound = fields.child(element, tag, where)
+    points = [fields.point(point, where) for point in bound.iterfind("point")]
+    if len(points) < 2:
+        raise InputError(f"{fields.path}: {where}: {tag}: expected >= 2 points")
+    return np.array(points)
+
+
+def _fractions(points: np.ndarray) -> np.ndarray:
+    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    return arc / max(arc[-1], 1e-9)
+
+
+def _resample(points: np.ndarray, at: np.ndarray) -> np.ndarray:
+    share = _fractions(points)
+    return np.stack([np.interp(at, share, points[:, i]) for i in (0, 1)], axis=1)
+
+
+def _read_lanelet(
+    element: Element, fields: Fields, limits: dict[str, float], stops: set[str]
+) -> Lane:
+    name = element.get("id", "(no id)")
+    where = f"lanelet {name}"
+    left = _bound(element, "leftBound", fields, where)
+    right = _bound(element, "rightBound", fields, where)
+    if len(left) != len(right):
+        at = np.unique(np.concatenate([_fractions(left), _fractions(right)]))
+        left, right = _resample(left, at), _resample(right, at)
+    half = np.maximum(0.5 * np.hypot(*(left - right).T), MIN_HALF_WIDTH_M)
+    signs = [ref.get("ref", "") for ref in element.iter("trafficSignRef")]
+    limit = element.find("speedLimit")
+    if limit is not None:
+        speed_limit: float | None = fields.number(limit, where)
+    else:
+        speed_limit = next((limits[sign] for sign in signs if sign in limits), None)
+    stop = element.find("stopLine")
+    return Lane(
+        id=name,
+        centre=0.5 * (left + right),
+        left_width=half,
+        right_width=half,
+        speed_limit=speed_limit,
+        successors=tuple(s.get("ref", "") for s in element.iterfind("successor")),
+        left=_neighbour(element, "adjacentLeft"),
+        right=_neighbour(element, "adjacentRight"),
+        stop_line=_stop_line(stop, fields, where, left, right),
+        signal_ids=tuple(r.get("ref", "") for r in element.iterfind("trafficLightRef")),
+        stop_sign=stop is not None and any(sign in stops for sign in signs),
+    )
+
+
+def _neighbour(element: Element, tag: str) -> str | None:
+    found = element.find(tag)
+    if found is None or found.get("drivingDir") != "same":
+        return None
+    return found.get("ref")
+
+
+def _stop_line(
+    stop: Element | None,
+    fields: Fields,
+    where: str,
+    left: np.ndarray,
+    right: np.ndarray,
+) -> np.ndarray | None:
+    """End points [2, 2]; a stop line without points lies at the lanelet's end."""
+    if stop is None:
+        return None
+    points = [fields.point(point, where) for point in stop.iterfind("point")]
+    return np.array(points) if len(points) == 2 else np.stack([left[-1], right[-1]])

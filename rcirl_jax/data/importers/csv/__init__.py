@@ -1,0 +1,1 @@
+"""Tables as people have them: `reader` for tracks, `map` for lane files beside them."""

@@ -1,0 +1,304 @@
+"""INTERACTION dataset: drone tracks of every kind of junction, with maps.
+
+Two layouts, told apart by the column case_id: the recordings of 2019
+(recorded_trackfiles/SCENE/vehicle_tracks_NNN.csv with pedestrian_tracks_NNN.csv
+beside it) and the prediction challenge of 2021 (train/SCENE_train.csv: cases of
+4 s, each a Recording here). Maps are Lanelet2 files, maps/SCENE.osm_xy in
+metres or maps/SCENE.osm in degrees about (0, 0). Specification: README.md of
+interaction-dataset/interaction-dataset and of
+INTERPRET_challenge_multi-agent.
+
+Traps: pedestrians have no heading and no size (columns missing or cells
+empty), their numbers are text ("P4"), "pedestrian/bicycle" is one class, frames
+may start at 0 or 1, challenge files hold what is asked for in SCENE_obs.csv.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from rcirl_jax.data.importers.files import (
+    input_files,
+    is_input,
+    log_name,
+)
+from rcirl_jax.data.importers.lanelet2.map import read_lanelet2
+from rcirl_jax.data.importers.options import path_option
+from rcirl_jax.data.importers.paths import path_lanes
+from rcirl_jax.data.readers.projection import utm, utm_zone
+from rcirl_jax.data.readers.sparse_tables import (
+    MAX_PLACE_M,
+    MAX_TIME,
+    MAX_VELOCITY_MPS,
+    check_range,
+    read_sparse_table,
+)
+from rcirl_jax.data.readers.tables import (
+    number,
+    read_header,
+    split_tracks,
+    travel_heading,
+)
+from rcirl_jax.data.recording import accepted, validate_recording
+from rcirl_jax.errors import InputError
+from rcirl_jax.types import Kind, Lane, Recording, Track
+
+NEEDED = ("track_id", "timestamp_ms", "agent_type", "x", "y", "vx", "vy")
+OPTIONAL = ("case_id", "psi_rad", "length", "width")
+TEXT = {"track_id": 16, "agent_type": 24}  # characters kept
+VEHICLES = "vehicle_tracks_"
+PEDESTRIANS = "pedestrian_tracks_"
+# files of a release that are no logs: predictions to hand in, 1 s observations
+LEFT_OUT = ("_sub.csv", "_obs.csv")
+SETS = ("_train", "_val", "_test", "_obs")
+# folders below a scene's, made by the data set's own split_train_val_script.py
+SPLITS = ("train", "val", "sorted")
+KINDS = {
+    "pedestrian": Kind.PEDESTRIAN,
+    "person": Kind.PEDESTRIAN,
+    "bicycle": Kind.CYCLIST,
+    "cyclist": Kind.CYCLIST,
+}
+EITHER = "pedestrian/bicycle"
+MAPS_UP = 5  # folders above a log in which that of the maps is looked for
+RATE_HZ = 10.0  # 1/s
+MAX_GAP_MS = 550.0  # ms missing inside one track
+FAST_MPS = 3.5  # m/s; who of "pedestrian/bicycle" is faster rides
+LANE_WIDTH_M = 3.5  # m, of lanes fitted to paths
+LIMIT_MPS = 13.41  # m/s, 30 mph, where the map says nothing
+SIZES_M = {
+    Kind.PEDESTRIAN: (0.5, 0.5),
+    Kind.CYCLIST: (1.8, 0.6),
+    Kind.VEHICLE: (4.5, 1.8),
+}  # m, length and width where the file has none
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Scene:
+    """What recordings of one file share."""
+
+    path: Path
+    spec: dict
+    lanes: tuple[Lane, ...] | None  # None: fitted to the paths of each
+    limit: float  # m/s, of lanes without one
+    notes: tuple[str, ...]
+
+
+def recordings(path: Path, spec: dict) -> Iterator[Recording]:
+    """One Recording per vehicle file, or per case of a challenge file."""
+    for file in parts(path, spec):
+        header = read_header(file)
+        table = _read(file, header)
+        scene = _scene(file, spec)
+        if "case_id" in header:
+            yield from _cases(table, scene)
+            continue
+        partner = file.with_name(file.name.replace(VEHICLES, PEDESTRIANS, 1))
+        if partner != file and partner.is_file():
+            extra = _read(partner, read_header(partner))
+            table = {k: np.concatenate([table[k], extra[k]]) for k in table}
+        number_ = file.stem.removeprefix(VEHICLES).removeprefix(PEDESTRIANS)
+        own = f"{_scene_name(file)}-{number_}"
+        name = log_name(file, spec, own)
+        # logs of one name may be copies of each other
+        group = None if name == own else own
+        yield validate_recording(_recording(name, table, scene, group), file)
+
+
+def parts(path: Path, spec: dict) -> list[Path]:
+    """The log files below a folder, no other tables; pedestrians with vehicles."""
+    if path.is_file():
+        return [path]
+    tables = sorted(file for file in path.rglob("*.csv") if is_input(path, file))
+    found = [file for file in tables if _is_log(file)]
+    names = set(found)
+    kept = [
+        file
+        for file in found
+        if not file.name.startswith(PEDESTRIANS)
+        or file.with_name(file.name.replace(PEDESTRIANS, VEHICLES, 1)) not in names
+    ]
+    return kept or input_files(path, "**/*.csv")
+
+
+def _is_log(path: Path) -> bool:
+    """Whether a file has a log's name, or its columns under another name."""
+    if path.name.endswith(LEFT_OUT):
+        return False
+    if path.name.startswith((VEHICLES, PEDESTRIANS)) or path.stem.endswith(SETS):
+        return True
+    try:
+        header = read_header(path)
+    except InputError:
+        return False
+    return {"track_id", "timestamp_ms"} <= set(header)
+
+
+def own_name(file: Path) -> str:
+    """Name of a log, as long as no other folder has one called alike."""
+    if not file.name.startswith((VEHICLES, PEDESTRIANS)):
+        return file.stem
+    number_ = file.stem.removeprefix(VEHICLES).removeprefix(PEDESTRIANS)
+    return f"{_scene_name(file)}-{number_}"
+
+
+def _scene_name(path: Path) -> str:
+    """Name of the place: the folder, or the challenge file without its set."""
+    if path.name.startswith((VEHICLES, PEDESTRIANS)):
+        folders = [folder.name for folder in path.resolve().parents]
+        return next((name for name in folders if name not in SPLITS), folders[0])
+    return next(
+        (path.stem.removesuffix(s) for s in SETS if path.stem.endswith(s)), path.stem
+    )
+
+
+def _read(path: Path, header: list[str]) -> dict[str, np.ndarray]:
+    """All columns this module uses; NaN where a file or a cell has none."""
+    for name in NEEDED:
+        if name not in header:
+            raise InputError(
+                f"{path}: column {name}: missing: expected it among {header}"
+            )
+    chosen = [*NEEDED, *(name for name in OPTIONAL if name in header)]
+    table = read_sparse_table(path, header, chosen, TEXT)
+    for name in NEEDED:
+        values = table[name]
+        empty = values == "" if name in TEXT else ~np.isfinite(values)
+        if empty.any():
+            row = int(np.flatnonzero(empty)[0]) + 2
+            raise InputError(f"{path}: line {row}: {name}: '': expected a value")
+    check_range(path, table, ("x", "y"), MAX_PLACE_M)
+    check_range(path, table, ("vx", "vy"), MAX_VELOCITY_MPS)
+    check_range(path, table, ("timestamp_ms",), MAX_TIME)
+    count = table["x"].size
+    return {n: table.get(n, np.full(count, np.nan)) for n in (*NEEDED, *OPTIONAL)}
+
+
+def _scene(path: Path, spec: dict) -> _Scene:
+    place = _find_map(path, spec)
+    limit = number(spec, "default_speed_limit", LIMIT_MPS)
+    if place is None:
+        note = "no map found; lanes fitted to the longest paths"
+        return _Scene(path=path, spec=spec, lanes=None, limit=limit, notes=(note,))
+    zone = utm_zone(0.0)
+    origin = utm(np.zeros(1), np.zeros(1), zone)
+    lanes, notes = read_lanelet2(place, lambda a, b: utm(a, b, zone) - origin)
+    limits = [lane.speed_limit for lane in lanes if lane.speed_limit is not None]
+    return _Scene(
+        path=path,
+        spec=spec,
+        lanes=lanes,
+        limit=float(np.median(limits)) if limits else limit,
+        notes=tuple(notes),
+    )
+
+
+def _find_map(path: Path, spec: dict) -> Path | None:
+    """maps/SCENE.osm_xy or .osm in a folder above; the option `map` names one."""
+    folders = [folder / "maps" for folder in path.resolve().parents[:MAPS_UP]]
+    if spec.get("map"):
+        given = Path(path_option(spec, "map"))
+        if not given.exists():
+            raise InputError(f"{given}: map: missing: expected a file or folder")
+        if given.is_file():
+            return given
+        folders = [given]
+    name = _scene_name(path)
+    for folder in folders:
+        for ending in (".osm_xy", ".osm"):
+            exact = folder / f"{name}{ending}"
+            if exact.is_file():
+                return exact
+        # maps of ZS are called ZS0 and ZS2 in one release and ZS in another; EP0
+        # and EP1 are two places
+        near = [
+            file
+            for file in sorted(folder.glob("*.osm*"))
+            if is_input(folder, file) and _is_numbered(file.stem, name)
+        ]
+        if len({file.stem for file in near}) == 1:
+            return near[-1]
+    return None
+
+
+def _is_numbered(one: str, other: str) -> bool:
+    """Whether one of two names is the other with a number behind it."""
+    short, long = sorted((one, other), key=len)
+    return long.removeprefix(short).isdigit() and not short[-1:].isdigit()
+
+
+def _cases(table: dict[str, np.ndarray], scene: _Scene) -> Iterator[Recording]:
+    """One Recording per case; all of a file are one group, they share vehicles."""
+    order = np.argsort(table["case_id"], kind="stable")
+    case = table["case_id"][order]
+    if not np.isfinite(case).all():
+        raise InputError(f"{scene.path}: case_id: '': expected a number in every row")
+    for rows in np.split(order, np.flatnonzero(np.diff(case)) + 1):
+        part = {field: values[rows] for field, values in table.items()}
+        log = log_name(scene.path, scene.spec, scene.path.stem)
+        name = f"{log}-case{part['case_id'][0]:g}"
+        make = functools.partial(_recording, name, part, scene, scene.path.stem)
+        yield accepted(make, name, scene.path, scene.spec)
+
+
+def _recording(
+    name: str, table: dict[str, np.ndarray], scene: _Scene, group: str | None
+) -> Recording:
+    stamps = table["timestamp_ms"]
+    table["t"] = (stamps - stamps.min()) / 1000.0
+    pieces = split_tracks(scene.path, table["track_id"], stamps, MAX_GAP_MS)
+    notes = list(scene.notes)
+    tracks = tuple(_track(label, rows, table, scene) for label, rows in pieces)
+    unknown = set(np.unique(table["agent_type"])) - {EITHER, *KINDS, *MOTORISED}
+    if unknown:
+        notes.append(f"agent types taken for vehicles: {', '.join(sorted(unknown))}")
+    lanes = scene.lanes
+    if lanes is None:
+        width = number(scene.spec, "lane_width_m", LANE_WIDTH_M)
+        lanes = path_lanes(tracks, width, None)
+    return Recording(
+        name=name,
+        source=str(scene.spec.get("source", "INTERACTION dataset")),
+        licence=str(scene.spec.get("licence", "INTERACTION: research use only")),
+        rate_hz=number(scene.spec, "rate_hz", RATE_HZ),
+        tracks=tracks,
+        lanes=lanes,
+        group=group,
+        default_speed_limit=scene.limit,
+        notes=tuple(notes),
+    )
+
+
+MOTORISED = ("car", "truck", "bus", "van", "motorcycle", "vehicle")
+
+
+def _track(
+    name: str, rows: np.ndarray, table: dict[str, np.ndarray], scene: _Scene
+) -> Track:
+    t, x, y, psi = (table[field][rows] for field in ("t", "x", "y", "psi_rad"))
+    speed = np.hypot(table["vx"][rows], table["vy"][rows])
+    agent = str(table["agent_type"][rows[0]]).lower()
+    kind = KINDS.get(agent, Kind.VEHICLE)
+    if agent == EITHER:
+        fast = number(scene.spec, "cyclist_speed_mps", FAST_MPS)
+        rides = float(np.percentile(speed, 90.0)) > fast
+        kind = Kind.CYCLIST if rides else Kind.PEDESTRIAN
+    sizes = []
+    for field, default in zip(("length", "width"), SIZES_M[kind], strict=True):
+        known = table[field][rows]
+        known = known[np.isfinite(known) & (known > 0.0)]
+        sizes.append(float(np.median(known)) if known.size else default)
+    return Track(
+        id=name,
+        kind=kind,
+        length=sizes[0],
+        width=sizes[1],
+        t=t,
+        x=x,
+        y=y,
+        heading=psi if np.isfinite(psi).all() else travel_heading(t, x, y),
+        speed=speed,
+    )

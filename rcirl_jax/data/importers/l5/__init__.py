@@ -1,0 +1,1 @@
+"""Lyft Level 5 (zarr): `reader`, `map` for lanes, `scenes` for the tables."""

@@ -1,0 +1,1 @@
+"""levelXData (highD, inD, rounD, exiD, uniD): `reader` for tracks, `map` for lanes."""

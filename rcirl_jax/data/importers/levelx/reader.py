@@ -1,0 +1,369 @@
+"""leveLXData drone recordings: highD, inD, rounD, exiD and uniD.
+
+Each recording is three CSV files, XX_tracks, XX_tracksMeta, XX_recordingMeta;
+the header of the first tells the two layouts apart. Specification: the format
+pages of www.highd-dataset.com and levelxdata.com, and the tools
+RobertKrajewski/highD-dataset and ika-rwth-aachen/drone-dataset-tools.
+
+Traps, highD: x, y is the bounding box's upper-left corner, `width` is the
+length along x, `height` the width of the car, y points down (ours up), frames
+start at 1, speedLimit -1 means none. inD and its sisters: x, y is the centre,
+heading is in degrees, width and length of pedestrians and cyclists are 0, lists
+are separated by semicolons, the map is a Lanelet2 file of the location in
+degrees, moved by the recording's UTM origin, a trailer is a track of its own.
+"""
+
+import csv
+import dataclasses
+import itertools
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from rcirl_jax.data.importers.files import files_below, log_name
+from rcirl_jax.data.importers.lanelet2.map import read_lanelet2
+from rcirl_jax.data.importers.levelx.map import find_map, marked_lanes
+from rcirl_jax.data.importers.paths import path_lanes
+from rcirl_jax.data.readers.projection import utm, utm_zone
+from rcirl_jax.data.readers.sparse_tables import (
+    MAX_PLACE_M,
+    MAX_TIME,
+    MAX_VELOCITY_MPS,
+    check_range,
+)
+from rcirl_jax.data.readers.tables import (
+    number,
+    read_header,
+    read_table,
+    rows_of,
+    split_tracks,
+    travel_heading,
+)
+from rcirl_jax.data.recording import check_span, validate_recording
+from rcirl_jax.errors import InputError
+from rcirl_jax.types import Kind, Lane, Recording, Track
+
+SUFFIX = "_tracks.csv"
+USERS = "_tracksMeta.csv"
+CORNER = ("frame", "id", "x", "y", "width", "height", "xVelocity", "yVelocity")
+CENTRE = (
+    *("frame", "trackId", "xCenter", "yCenter", "heading", "width", "length"),
+    *("xVelocity", "yVelocity"),
+)
+KINDS = {
+    "pedestrian": Kind.PEDESTRIAN,
+    "animal": Kind.PEDESTRIAN,
+    "bicycle": Kind.CYCLIST,
+    "bicyclist": Kind.CYCLIST,
+    # in the way of others like any body that moves, but nobody drives it: only
+    # vehicles are experts (Argoverse 2's "unknown" and Waymo's "other" likewise)
+    "trailer": Kind.CYCLIST,
+}
+MOTORISED = ("car", "van", "truck", "bus", "truck_bus", "motorcycle")
+LIFE = ("numFrames", "initialFrame", "finalFrame")  # of a track, in tracksMeta
+MAX_GAP_FRAMES = 5.5  # frames missing inside one track
+MAX_ID = 2**53  # beyond it float64 does not count
+FAR_M = 200.0  # m; a map that far from all tracks is not theirs
+LANE_WIDTH_M = 3.5  # m, of lanes fitted to paths
+LIMIT_MPS = 36.11  # m/s, 130 km/h, advised where German motorways have no limit
+SIZE_M = (0.5, 0.5)  # m, length and width of a road user without a box
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _User:
+    """One row of a tracksMeta.csv."""
+
+    kind: str  # class in lower case
+    direction: float  # highD's drivingDirection, 1 towards -x; else 0
+    life: tuple[float, float, float]  # its LIFE
+
+
+def parts(path: Path, spec: dict) -> list[Path]:
+    """The XX_tracks.csv at any depth of a folder: releases keep them in data/."""
+    return files_below(path, "*" + SUFFIX)
+
+
+def own_name(file: Path) -> str:
+    """Name of a log, as long as no other folder has one called alike."""
+    return file.name.removesuffix(SUFFIX)
+
+
+def recordings(path: Path, spec: dict) -> Iterator[Recording]:
+    """One Recording per XX_tracks.csv."""
+    for file in parts(path, spec):
+        if not file.name.endswith(SUFFIX):
+            raise InputError(f"{file}: name: {file.name}: expected XX{SUFFIX}")
+        header = read_header(file)
+        read = _read_centres if "xCenter" in header else _read_corners
+        yield validate_recording(read(file, spec), file)
+
+
+def _other(path: Path, suffix: str) -> Path:
+    return path.with_name(path.name.removesuffix(SUFFIX) + suffix)
+
+
+def _beside(path: Path, suffix: str) -> Path:
+    """The file of the same recording with another ending."""
+    other = _other(path, suffix)
+    if not other.is_file():
+        raise InputError(f"{other}: input: missing: expected it beside {path.name}")
+    return other
+
+
+def _read_meta(path: Path) -> dict[str, str]:
+    """The one row of a recordingMeta.csv, as text."""
+    names = read_header(path)
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as handle:
+            rows = (row for _, row in rows_of(handle) if row)
+            rows = list(itertools.islice(rows, 1, 3))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: text: {error}: expected CSV text") from error
+    if len(rows) != 1 or len(rows[0]) != len(names):
+        sizes = [len(row) for row in rows][:3]
+        raise InputError(
+            f"{path}: rows: {len(rows)} of {sizes} cells: expected one of {len(names)}"
+        )
+    return dict(zip(names, (cell.strip() for cell in rows[0]), strict=True))
+
+
+def _meta_number(
+    path: Path, meta: dict[str, str], field: str, limit: float = np.inf
+) -> float:
+    """A number of a recordingMeta.csv, finite and within a limit."""
+    try:
+        value = float(meta[field])
+    except (KeyError, ValueError):
+        value = float("nan")
+    if not (np.isfinite(value) and abs(value) <= limit):
+        found = meta.get(field, "missing")[:40]
+        kind = "finite number" if limit == np.inf else f"number within {limit:g}"
+        raise InputError(f"{path}: {field}: '{found}': expected a {kind}")
+    return value
+
+
+def _rate(path: Path, meta: dict[str, str]) -> float:
+    rate = _meta_number(path, meta, "frameRate")
+    if not 1.0 <= rate <= 1000.0:
+        raise InputError(f"{path}: frameRate: {rate:g}: expected 1 to 1000 1/s")
+    return rate
+
+
+def _limit(path: Path, meta: dict[str, str]) -> float | None:
+    """The recording's speed limit [m/s]; -1 stands for none."""
+    if meta.get("speedLimit", "").lower() in ("", "nan"):
+        return None
+    limit = _meta_number(path, meta, "speedLimit")
+    return limit if limit > 0.0 else None
+
+
+def _read_rows(
+    path: Path, columns: tuple[str, ...], metres: tuple[str, ...]
+) -> dict[str, np.ndarray]:
+    rows = read_table(path, columns, (), ())
+    check_range(path, rows, metres, MAX_PLACE_M)
+    check_range(path, rows, ("xVelocity", "yVelocity"), MAX_VELOCITY_MPS)
+    check_range(path, rows, ("frame",), MAX_TIME)
+    return rows
+
+
+def _read_corners(path: Path, spec: dict) -> Recording:
+    """highD: corners of boxes, lanes by the y of their markings."""
+    rows = _read_rows(path, CORNER, ("x", "y", "width", "height"))
+    users = _read_users(_beside(path, USERS), "id", "drivingDirection")
+    meta_path = _beside(path, "_recordingMeta.csv")
+    meta = _read_meta(meta_path)
+    rate = _rate(meta_path, meta)
+    t = (rows["frame"] - rows["frame"].min()) / rate
+    x = rows["x"] + 0.5 * rows["width"]
+    y = -(rows["y"] + 0.5 * rows["height"])
+    speed = np.hypot(rows["xVelocity"], rows["yVelocity"])
+    ids, pieces = _pieces(path, rows["id"], rows["frame"], users, spec)
+    tracks = []
+    for name, part in pieces:
+        user = users[int(ids[part[0]])]
+        standing = np.pi if user.direction == 1.0 else 0.0
+        heading = travel_heading(t[part], x[part], y[part], standing)
+        tracks.append(
+            Track(
+                id=name,
+                kind=KINDS.get(user.kind, Kind.VEHICLE),
+                length=float(np.median(rows["width"][part])),
+                width=float(np.median(rows["height"][part])),
+                t=t[part],
+                x=x[part],
+                y=y[part],
+                heading=heading,
+                speed=speed[part],
+            )
+        )
+    limit = _limit(meta_path, meta)
+    check_span(str(path), "x", x)
+    along = (float(x.min()), float(x.max()))
+    lanes = marked_lanes(meta_path, meta, along, limit, (y, rows["xVelocity"]))
+    return _recording(path, spec, rate, tracks, lanes, limit, _user_notes(ids, users))
+
+
+def _read_centres(path: Path, spec: dict) -> Recording:
+    """inD, rounD, exiD, uniD: centres of boxes, lanes from a map."""
+    rows = _read_rows(path, CENTRE, ("xCenter", "yCenter", "width", "length"))
+    users = _read_users(_beside(path, USERS), "trackId", None)
+    meta_path = _beside(path, "_recordingMeta.csv")
+    meta = _read_meta(meta_path)
+    rate = _rate(meta_path, meta)
+    rows["t"] = (rows["frame"] - rows["frame"].min()) / rate
+    ids, pieces = _pieces(path, rows["trackId"], rows["frame"], users, spec)
+    tracks = [
+        _centred_track(name, part, rows, users[int(ids[part[0]])].kind, spec)
+        for name, part in pieces
+    ]
+    limit = _limit(meta_path, meta)
+    lanes, notes = _mapped_lanes(path, meta_path, meta, tracks, spec)
+    notes += _user_notes(ids, users)
+    trailers = sum(users[int(i)].kind == "trailer" for i in np.unique(ids))
+    if trailers:
+        notes.append(f"{trailers} trailers are obstacles of kind cyclist, no experts")
+    return _recording(path, spec, rate, tracks, lanes, limit, notes)
+
+
+def _centred_track(
+    name: str, part: np.ndarray, rows: dict[str, np.ndarray], kind: str, spec: dict
+) -> Track:
+    t, x, y = (rows[field][part] for field in ("t", "xCenter", "yCenter"))
+    heading = np.deg2rad(rows["heading"][part])
+    size = [float(np.median(rows[field][part])) for field in ("length", "width")]
+    if min(size) <= 0.0:
+        default = spec.get("sizes", {}).get(kind, SIZE_M)
+        size = [
+            found or float(given) for found, given in zip(size, default, strict=True)
+        ]
+        if np.ptp(heading) == 0.0:
+            # a road user without a box has no heading either
+            heading = travel_heading(t, x, y, float(heading[0]))
+    return Track(
+        id=name,
+        kind=KINDS.get(kind, Kind.VEHICLE),
+        length=size[0],
+        width=size[1],
+        t=t,
+        x=x,
+        y=y,
+        heading=heading,
+        speed=np.hypot(rows["xVelocity"][part], rows["yVelocity"][part]),
+    )
+
+
+def _read_users(path: Path, key: str, direction: str | None) -> dict[int, _User]:
+    """Track number -> what tracksMeta says of it."""
+    rows, *ends = LIFE
+    wanted = [key, "class", *ends, *([direction] if direction else [])]
+    table = read_table(path, wanted, (rows,), ["class"])
+    first, last = (table[end] for end in ends)
+    lives = zip(table.get(rows, last - first + 1.0), first, last, strict=True)
+    towards = table[direction] if direction else np.zeros(table[key].size)
+    kinds = np.char.lower(table["class"])
+    return {
+        int(name): _User(kind=str(kind), direction=float(way), life=life)
+        for name, kind, way, life in zip(table[key], kinds, towards, lives, strict=True)
+    }
+
+
+def _pieces(
+    path: Path, names: np.ndarray, frames: np.ndarray, users: dict, spec: dict
+) -> tuple[np.ndarray, list[tuple[str, np.ndarray]]]:
+    """Track numbers per row, and the rows of each track without a gap."""
+    wrong = np.flatnonzero((names != np.round(names)) | (np.abs(names) > MAX_ID))
+    if wrong.size:
+        raise InputError(
+            f"{path}: track number: {names[wrong[0]]:g}: expected a whole number"
+        )
+    ids = names.astype(np.int64)
+    unknown = sorted(set(np.unique(ids).tolist()) - set(users))
+    if unknown:
+        raise InputError(
+            f"{path}: track {unknown[0]}: no row in {_other(path, USERS).name}: "
+            "expected one per track"
+        )
+    pieces = split_tracks(path, ids, frames, MAX_GAP_FRAMES)
+    if not spec.get("partial", False):
+        _check_whole(path, ids, frames, users)
+    return ids, pieces
+
+
+def _check_whole(
+    path: Path, ids: np.ndarray, frames: np.ndarray, users: dict[int, _User]
+) -> None:
+    """Every track has the rows that tracksMeta counts: nothing was cut off."""
+    order = np.lexsort((frames, ids))
+    known, starts, counts = np.unique(ids[order], return_index=True, return_counts=True)
+    ends = frames[order][starts], frames[order][starts + counts - 1]
+    found = dict(zip(known.tolist(), zip(counts, *ends, strict=True), strict=True))
+    for name, user in users.items():
+        life = found.get(name, (0, np.nan, np.nan))
+        for field, value, expected in zip(LIFE, life, user.life, strict=True):
+            if value != expected:
+                raise InputError(
+                    f"{path}: track {name}: {field}: {value:.12g}: expected "
+                    f"{expected:.12g} as in {_other(path, USERS).name}; truncated "
+                    "file? (of a sample, set partial = true in the TOML of --source)"
+                )
+
+
+def _user_notes(ids: np.ndarray, users: dict[int, _User]) -> list[str]:
+    """Tracks without rows, and classes that this module does not know."""
+    missing = len(set(users) - set(np.unique(ids).tolist()))
+    notes = [f"{missing} tracks of tracksMeta have no rows"] if missing else []
+    unknown = {user.kind for user in users.values()} - {*KINDS, *MOTORISED}
+    if unknown:
+        notes.append(f"classes taken for vehicles: {', '.join(sorted(unknown))}")
+    return notes
+
+
+def _mapped_lanes(
+    path: Path, meta_path: Path, meta: dict[str, str], tracks: list[Track], spec: dict
+) -> tuple[tuple[Lane, ...], list[str]]:
+    """Lanes of the location's Lanelet2 map; else fitted to the paths driven."""
+    place = find_map(path, meta.get("locationId", ""), spec)
+    why = "no map found"
+    if place is not None:
+        longitude = _meta_number(meta_path, meta, "lonLocation", 180.0)
+        fields = ("xUtmOrigin", "yUtmOrigin")
+        found = [_meta_number(meta_path, meta, f, MAX_PLACE_M) for f in fields]
+        origin = np.array(found)
+        zone = utm_zone(longitude)
+        lanes, notes = read_lanelet2(place, lambda a, b: utm(a, b, zone) - origin)
+        if _apart(lanes, tracks) < FAR_M:
+            return lanes, notes
+        why = f"{place.name} lies elsewhere"
+    width = number(spec, "lane_width_m", LANE_WIDTH_M)
+    lanes = path_lanes(tracks, width, None)
+    return lanes, [f"{why}; {len(lanes)} lanes fitted to the longest paths"]
+
+
+def _apart(lanes: tuple[Lane, ...], tracks: list[Track]) -> float:
+    """m, from the middle of all tracks to the nearest lane point."""
+    middle = [np.median([np.median(getattr(t, c)) for t in tracks]) for c in "xy"]
+    return min(float(np.min(np.hypot(*(ln.centre - middle).T))) for ln in lanes)
+
+
+def _recording(
+    path: Path,
+    spec: dict,
+    rate: float,
+    tracks: list[Track],
+    lanes: tuple[Lane, ...],
+    limit: float | None,
+    notes: list[str],
+) -> Recording:
+    default = number(spec, "default_speed_limit", LIMIT_MPS)
+    return Recording(
+        name=log_name(path, spec, own_name(path)),
+        source=str(spec.get("source", "leveLXData")),
+        licence=str(spec.get("licence", "leveLXData terms: non-commercial use")),
+        rate_hz=rate,
+        tracks=tuple(tracks),
+        lanes=lanes,
+        default_speed_limit=limit if limit is not None else default,
+        notes=tuple(notes),
+    )

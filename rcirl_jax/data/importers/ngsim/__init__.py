@@ -1,0 +1,1 @@
+"""NGSIM trajectory tables: `reader`, and `map` for the lanes of each site."""

@@ -1,0 +1,1 @@
+"""Car-following pairs cut from NGSIM: `reader`."""

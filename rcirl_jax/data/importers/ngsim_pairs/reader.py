@@ -1,0 +1,191 @@
+"""NGSIM I-80 leader-follower pairs: one CSV per pair, in FEET.
+
+Columns t, x_follower, v_follower, a_follower, x_leader, v_leader, a_leader,
+leader_length, spacing, dv; t in s, x of the front bumper along the road, spacing
+between the follower's front and the leader's rear. Taken from the re-extracted
+NGSIM set of T. Zhang, P. Jin et al. (arXiv 2201.04755), folder cf_ngsim_I80 of
+TeRyZh/Segment-based-Calibration-of-Car-Following-Dynamics.
+
+Traps: files share vehicles and some hold the same pair twice (run, follower and
+leader stand in the file name ..._fF_lL_NNNNN.csv), so pairs that share a vehicle
+are one group; the follower's own length is known only where it leads in another
+file; there is no lateral position and no lane; whom the leader follows is not in
+the file (a Ghost ahead says so, and its scenes are dropped).
+"""
+
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from rcirl_jax.data.importers.files import input_files
+from rcirl_jax.data.importers.options import one_pattern
+from rcirl_jax.data.readers.sparse_tables import (
+    MAX_PLACE_M,
+    MAX_TIME,
+    MAX_VELOCITY_MPS,
+    check_range,
+)
+from rcirl_jax.data.readers.tables import (
+    StraightLane,
+    lines_of,
+    number,
+    read_table,
+    split_tracks,
+    straight_lanes,
+    unit_factor,
+)
+from rcirl_jax.data.recording import validate_recording
+from rcirl_jax.errors import InputError
+from rcirl_jax.types import Ghost, Kind, Recording, Track
+
+COLUMNS = ("t", "x_follower", "v_follower", "x_leader", "v_leader", "leader_length")
+NAME = re.compile(r"(?P<run>.*?)_?f(?P<follower>\d+)_l(?P<leader>\d+)(_\d+)?")
+RATE_HZ = 10.0  # 1/s
+LIMIT_MPS = 29.06  # m/s, 65 mph
+LANE_WIDTH_M = 3.6576  # m, 12 ft
+LENGTH_M = 4.5  # m, of a follower that leads in no file
+WIDTH_M = 1.8  # m
+MAX_GAP_FRAMES = 5.5  # frames missing inside one track
+MARGIN_M = 50.0  # m of lane beyond the first and last position
+SPACING_FT = 0.5  # tolerance of spacing against the positions
+
+
+def recordings(path: Path, spec: dict) -> Iterator[Recording]:
+    """One Recording of two cars per file."""
+    files = input_files(path, one_pattern(spec, "**/*_f*_l*.csv"))
+    groups = _groups(files)
+    lengths = _leader_lengths(files)
+    for file in files:
+        recording = _read_pair(file, spec, groups[file], lengths)
+        yield validate_recording(recording, file)
+
+
+def _ids(path: Path) -> tuple[str, str, str]:
+    """(run, follower, leader) by the file's name."""
+    match = NAME.fullmatch(path.stem)
+    if match is None:
+        return path.stem, "follower", "leader"
+    return match["run"], match["follower"], match["leader"]
+
+
+def _groups(files: Sequence[Path]) -> dict[Path, str]:
+    """Vehicle-disjoint group of each file: files that share a car are joined."""
+    parent: dict[tuple[str, str], tuple[str, str]] = {}
+
+    def root(car: tuple[str, str]) -> tuple[str, str]:
+        parent.setdefault(car, car)
+        while parent[car] != car:
+            parent[car] = parent[parent[car]]
+            car = parent[car]
+        return car
+
+    for file in files:
+        run, follower, leader = _ids(file)
+        parent[root((run, follower))] = root((run, leader))
+    first: dict[tuple[str, str], str] = {}
+    for file in files:
+        run, follower, _ = _ids(file)
+        first.setdefault(root((run, follower)), file.stem)
+    return {file: first[root(_ids(file)[:2])] for file in files}
+
+
+def _leader_lengths(files: Sequence[Path]) -> dict[tuple[str, str], float]:
+    """(run, car) -> length in the files' unit, of every car that leads somewhere."""
+    lengths = {}
+    for file in files:
+        run, _, leader = _ids(file)
+        try:
+            with file.open(encoding="utf-8-sig") as handle:
+                lines = lines_of(handle)
+                names = next(lines, "").strip().split(",")
+                cells = next(lines, "").strip().split(",")
+            length = float(cells[names.index("leader_length")])
+        except (UnicodeDecodeError, ValueError, IndexError):
+            continue  # reported when the file itself is read
+        if np.isfinite(length):
+            lengths[run, leader] = length
+    return lengths
+
+
+def _read_pair(
+    path: Path, spec: dict, group: str, lengths: dict[tuple[str, str], float]
+) -> Recording:
+    table = read_table(path, COLUMNS, ("spacing",), ())
+    check_range(path, table, ("x_follower", "x_leader"), MAX_PLACE_M)
+    check_range(path, table, ("v_follower", "v_leader"), MAX_VELOCITY_MPS)
+    check_range(path, table, ("t",), MAX_TIME)
+    factor = unit_factor(path, "unit", str(spec.get("unit", "ft")), ("ft", "m"))
+    run, follower, leader = _ids(path)
+    length = float(np.median(table["leader_length"]))
+    _check_spacing(path, table, length)
+    own = lengths.get((run, follower))
+    notes = ["no lateral positions; both cars on one straight lane"]
+    if own is None:
+        own = number(spec, "follower_length_m", LENGTH_M) / factor
+        notes.append(f"length of follower {follower} unknown; default")
+    rate = number(spec, "rate_hz", RATE_HZ)
+    if rate <= 0.0:
+        raise InputError(f"source TOML: rate_hz: {rate:g}: expected > 0")
+    # t is rounded to the clock: it is written with the noise of floating point
+    frames = np.round((table["t"] - table["t"].min()) * rate)
+    pieces = split_tracks(path, np.zeros(frames.size, int), frames, MAX_GAP_FRAMES)
+    tracks = tuple(
+        Track(
+            id=name + part.removeprefix("0"),
+            kind=Kind.VEHICLE,
+            length=size * factor,
+            width=number(spec, "width_m", WIDTH_M),
+            t=frames[rows] / rate,
+            x=(table[f"x_{role}"][rows] - 0.5 * size) * factor,
+            y=np.zeros(rows.shape),
+            heading=np.zeros(rows.shape),
+            speed=table[f"v_{role}"][rows] * factor,
+        )
+        for role, name, size in (
+            ("follower", follower, own),
+            ("leader", leader, length),
+        )
+        for part, rows in pieces
+    )
+    limit = number(spec, "speed_limit", LIMIT_MPS)
+    lane = StraightLane(
+        id="1",
+        y=0.0,
+        lower=min(float(track.x.min()) for track in tracks) - MARGIN_M,
+        upper=max(float(track.x.max()) for track in tracks) + MARGIN_M,
+    )
+    width = number(spec, "lane_width_m", LANE_WIDTH_M)
+    return Recording(
+        name=path.stem,
+        source=str(spec.get("source", "NGSIM I-80 leader-follower pairs")),
+        licence=str(spec.get("licence", "NGSIM: U.S. DOT FHWA, doi 10.21949/1504477")),
+        rate_hz=rate,
+        tracks=tracks,
+        lanes=straight_lanes(path, [lane], width, limit),
+        group=group,
+        ghosts=(_ghost(tracks, lane.upper),),
+        default_speed_limit=limit,
+        notes=tuple(notes),
+    )
+
+
+def _ghost(tracks: Sequence[Track], end: float) -> Ghost:
+    """Somebody ahead of both cars all the time, at the end of the lane."""
+    last = max(float(track.t[-1]) for track in tracks)
+    return Ghost(t0=0.0, t1=last, start=(end, 0.0), end=(end, 0.0))
+
+
+def _check_spacing(path: Path, table: dict[str, np.ndarray], length: float) -> None:
+    """The file's own spacing says that positions are those of front bumpers."""
+    if "spacing" not in table:
+        return
+    gap = table["x_leader"] - table["x_follower"] - length
+    wrong = np.abs(gap - table["spacing"]) > SPACING_FT
+    if wrong.any():
+        row = int(np.flatnonzero(wrong)[0])
+        raise InputError(
+            f"{path}: line {row + 2}: spacing: {table['spacing'][row]:g}: expected "
+            f"{gap[row]:g}, x_leader - x_follower - leader_length"
+        )

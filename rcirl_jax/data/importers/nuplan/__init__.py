@@ -1,0 +1,1 @@
+"""nuPlan logs (SQLite): `reader`, and `map` for its GeoPackage maps."""

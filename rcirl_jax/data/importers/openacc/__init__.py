@@ -1,0 +1,1 @@
+"""OpenACC platoon recordings (CSV): `reader`."""

@@ -1,0 +1,1 @@
+"""Simulated traffic as a log of its own: `reader`."""

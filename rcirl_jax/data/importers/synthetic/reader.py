@@ -1,0 +1,298 @@
+"""Synthetic human traffic as an importer: TOML of recordings -> Recordings.
+
+See data_specs/sources/synthetic.toml for every key. Each recording has its own
+random streams, made of its entry's seed and its number in the entry; it is a
+vehicle-disjoint group of its own.
+"""
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+
+from rcirl_jax.data.recording import LEAVE_OUT, validate_recording
+from rcirl_jax.data.synthetic import ROADS, DriverConfig, RunConfig, simulate
+from rcirl_jax.data.synthetic.roads import lanes, to_world
+from rcirl_jax.data.synthetic.stops import schedule
+from rcirl_jax.data.synthetic.traffic import Log
+from rcirl_jax.errors import InputError
+from rcirl_jax.runtime.specs import load_toml
+from rcirl_jax.types import Kind, Recording, Signal, Track
+
+TOP_KEYS = {
+    "source": str,
+    "licence": str,
+    "rate_hz": (2.0, 50.0),
+    "warmup_s": (0.0, 600.0),
+    "position_noise_m": (0.0, 1.0),
+    "drivers": dict,
+    "recordings": list,
+}
+ENTRY_KEYS = {
+    "road": str,
+    "count": (1, 10000),
+    "duration_s": (1.0, 3600.0),
+    "density_veh_per_km": (1.0, 60.0),
+    "seed": (0, 2**63 - 1),
+}
+# driver settings that may be zero; all others are above it
+MAY_BE_ZERO = (
+    "delay_s",
+    "noise_mps2",
+    "politeness",
+    "threshold_mps2",
+    "change_pause_s",
+    "drift_m",
+    "sign_wait_s",
+    "destination_share",
+)
+WHOLE = ("count", "seed")  # keys that take integers
+MAX_RECORDINGS = 100_000  # of all entries
+BATCH = 32  # recordings simulated together, at most
+SEEN_FROM_M = 30.0  # m, tracks begin this far from the road's start
+SEEN_UNTIL_M = 60.0  # m, and end this far before its end
+MIN_TRACK_S = 1.0  # s, shorter tracks are dropped
+POSITION_STREAM = 1  # last part of a seed: the stream of the position noise
+TRAFFIC_STREAM = 0  # last part of a seed: the stream of the simulation
+
+
+def recordings(path: Path, spec: dict) -> Iterator[Recording]:
+    """All recordings that a TOML file declares.
+
+    Args:
+      path: the file, like data_specs/sources/synthetic.toml.
+      spec: the packaged settings; what `path` does not set is taken from there.
+
+    Raises:
+      InputError: an unknown key or a bad value, before anything is simulated.
+    """
+    own = load_toml(path)
+    # the import's own switch says nothing here: none of these is refused
+    packaged = {key: value for key, value in spec.items() if key != LEAVE_OUT}
+    settings = {**packaged, **own}
+    settings["drivers"] = {**_table(spec, "drivers"), **_table(own, "drivers")}
+    _check_keys(path, "", settings, TOP_KEYS)
+    drivers = driver_config(path, settings["drivers"])
+    jobs = _jobs(path, settings)
+    return (
+        dataclasses.replace(validate_recording(made), progress=number / len(jobs))
+        for number, made in enumerate(_simulated(jobs, drivers, settings), start=1)
+    )
+
+
+def _table(spec: dict, key: str) -> dict:
+    value = spec.get(key, {})
+    return value if isinstance(value, dict) else {key: value}
+
+
+def _check_keys(path: Path, where: str, found: dict, allowed: dict) -> None:
+    """Every key known, present, of its type and in its range."""
+    for key in found:
+        if key not in allowed:
+            raise InputError(
+                f"{path}: {where}{key}: unknown: expected {', '.join(allowed)}"
+            )
+    for key, rule in allowed.items():
+        if key not in found:
+            raise InputError(f"{path}: {where}{key}: missing")
+        value = found[key]
+        if isinstance(rule, type):
+            if not isinstance(value, rule) or not value:
+                raise InputError(
+                    f"{path}: {where}{key}: {value!r}: expected {rule.__name__}"
+                )
+            continue
+        low, high = rule
+        kinds = (int,) if key in WHOLE else (int, float)
+        if not _is_number(value, kinds) or not low <= value <= high:
+            kind = "an integer" if key in WHOLE else "a number"
+            raise InputError(
+                f"{path}: {where}{key}: {value!r}: expected {kind} "
+                f"from {low:g} to {high:g}"
+            )
+
+
+def _is_number(value: Any, kinds: tuple[type, ...] = (int, float)) -> bool:  # noqa: ANN401
+    if not isinstance(value, kinds) or isinstance(value, bool):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an integer beyond any float
+        return False
+
+
+def driver_config(path: Path, found: dict) -> DriverConfig:
+    """The drivers that a TOML's `drivers` table describes; InputError names a key."""
+    fields = {field.name: field.type for field in dataclasses.fields(DriverConfig)}
+    values = {}
+    for key in found:
+        if key not in fields:
+            raise InputError(
+                f"{path}: drivers.{key}: unknown: expected {', '.join(fields)}"
+            )
+    for key, kind in fields.items():
+        if key not in found:
+            raise InputError(f"{path}: drivers.{key}: missing")
+        values[key] = _driver_value(path, key, found[key], kind)
+    return DriverConfig(**values)
+
+
+def _driver_value(
+    path: Path,
+    key: str,
+    value: Any,  # noqa: ANN401
+    kind: Any,  # noqa: ANN401
+) -> float | tuple[float, ...]:
+    """One distribution: a number, [low, high] or [mean, sd, low, high]; all >= 0."""
+    size: int = 1 if kind is float else len(get_args(kind))
+    form = {1: "a number", 2: "[low, high]", 4: "[mean, sd, low, high]"}[size]
+    sign = ">= 0" if key in MAY_BE_ZERO else "> 0"
+    numbers: list[Any] = value if isinstance(value, list) and size > 1 else [value]
+    good = len(numbers) == size and all(_is_number(x) and x >= 0.0 for x in numbers)
+    # the sd of a spread may be zero; its mean and bounds follow the key's rule
+    bounds = numbers[-2:] if size > 1 else numbers
+    good = good and (sign == ">= 0" or bounds[0] > 0.0)
+    if not good or bounds[0] > bounds[-1]:
+        raise InputError(
+            f"{path}: drivers.{key}: {value!r}: expected {form}, {sign}, low <= high"
+        )
+    if key == "destination_share" and numbers[0] > 1.0:
+        raise InputError(f"{path}: drivers.{key}: {value!r}: expected 0 to 1")
+    return float(numbers[0]) if size == 1 else tuple(float(x) for x in numbers)
+
+
+def _jobs(path: Path, settings: dict) -> list[tuple[str, RunConfig]]:
+    """(name, run) of every recording."""
+    jobs = []
+    for number, entry in enumerate(settings["recordings"], start=1):
+        where = f"recordings[{number}]."
+        if not isinstance(entry, dict):
+            raise InputError(f"{path}: recordings: {entry!r}: expected tables")
+        _check_keys(path, where, entry, ENTRY_KEYS)
+        if entry["road"] not in ROADS:
+            raise InputError(
+                f"{path}: {where}road: {entry['road']}: "
+                f"expected one of {', '.join(ROADS)}"
+            )
+        if len(jobs) + entry["count"] > MAX_RECORDINGS:
+            raise InputError(
+                f"{path}: {where}count: {entry['count']} after {len(jobs)}: "
+                f"expected up to {MAX_RECORDINGS} of all entries"
+            )
+        for index in range(entry["count"]):
+            run = RunConfig(
+                road=entry["road"],
+                duration_s=float(entry["duration_s"]),
+                density_veh_per_km=float(entry["density_veh_per_km"]),
+                seed=(entry["seed"], index, TRAFFIC_STREAM),
+                rate_hz=float(settings["rate_hz"]),
+                warmup_s=float(settings["warmup_s"]),
+            )
+            jobs.append((f"{entry['road']}-{number:02d}-{index:03d}", run))
+    return jobs
+
+
+def _simulated(
+    jobs: list[tuple[str, RunConfig]], drivers: DriverConfig, settings: dict
+) -> Iterator[Recording]:
+    """Simulate neighbours of equal duration together, in the declared order."""
+    start = 0
+    while start < len(jobs):
+        duration = jobs[start][1].duration_s
+        end = start
+        while (
+            end < min(len(jobs), start + BATCH) and jobs[end][1].duration_s == duration
+        ):
+            end += 1
+        batch = jobs[start:end]
+        logs = simulate([run for _, run in batch], drivers)
+        for (name, run), log in zip(batch, logs, strict=True):
+            yield to_recording(name, run, log, settings)
+        start = end
+
+
+def to_recording(name: str, run: RunConfig, log: Log, settings: dict) -> Recording:
+    """A simulated log as a Recording.
+
+    Args:
+      name: of the recording; also its group.
+      run: what was simulated.
+      log: the samples.
+      settings: `source`, `licence` and `position_noise_m` are used.
+    """
+    rng = np.random.default_rng((*run.seed[:-1], POSITION_STREAM))
+    seen = log.vehicle >= 0
+    seen &= (log.s > SEEN_FROM_M) & (log.s < log.road.length - SEEN_UNTIL_M)
+    numbers = np.unique(log.vehicle[seen])
+    noise = float(settings["position_noise_m"])
+    tracks = []
+    for number in numbers:
+        times, slots = np.nonzero(seen & (log.vehicle == number))
+        if times.size >= MIN_TRACK_S * run.rate_hz:
+            tracks.append(_track(int(number), times, slots, log, run, rng, noise))
+    return Recording(
+        name=name,
+        source=settings["source"],
+        licence=settings["licence"],
+        rate_hz=run.rate_hz,
+        tracks=tuple(tracks),
+        lanes=lanes(log.road),
+        signals=_signals(log, run),
+        group=name,
+        default_speed_limit=float(log.road.limit[0]),
+        notes=(f"simulated: {run.road}, seed {run.seed}",),
+    )
+
+
+def _track(
+    number: int,
+    times: np.ndarray,
+    slots: np.ndarray,
+    log: Log,
+    run: RunConfig,
+    rng: np.random.Generator,
+    noise: float,
+) -> Track:
+    driver = log.drivers[number]
+    s, l, slope, v = (
+        values[times, slots] for values in (log.s, log.l, log.slope, log.v)
+    )
+    x, y, heading = to_world(log.road, s, l, slope)
+    shift = noise * rng.standard_normal((2, times.size))
+    return Track(
+        id=f"v{number:04d}",
+        kind=Kind.VEHICLE,
+        length=float(driver["length"]),
+        width=float(driver["width"]),
+        t=times / run.rate_hz,
+        x=x + shift[0],
+        y=y + shift[1],
+        heading=heading,
+        speed=v,
+        destination=_destination(driver, log),
+    )
+
+
+def _destination(driver: np.void, log: Log) -> tuple[float, float] | None:
+    """Where the car stands, or wants to stand, on the strip."""
+    station = float(driver["destination"])
+    if not math.isfinite(station):
+        return None
+    road = log.road
+    offset = road.offset(road.num_lanes)
+    x, y, _ = to_world(road, np.array(station), offset, np.array(0.0))
+    return float(x), float(y)
+
+
+def _signals(log: Log, run: RunConfig) -> tuple[Signal, ...]:
+    signals = []
+    for index, stop in enumerate(log.road.stops):
+        if not stop.is_sign:
+            start, state = schedule(
+                log.road.cycle, float(log.signal_offset[index]), run.duration_s
+            )
+            signals.append(Signal(id=f"signal-{index}", start=start, state=state))
+    return tuple(signals)

@@ -1,0 +1,1 @@
+"""Waymo Open Motion (TFRecord): `reader`, `map` for lanes, `widths` of lanes."""

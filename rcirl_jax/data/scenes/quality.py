@@ -1,0 +1,243 @@
+"""The data-quality report of an import: counts, noise, headways, labels, drops."""
+
+import collections
+import dataclasses
+
+import numpy as np
+
+from rcirl_jax.data.scenes.collect import Collector
+from rcirl_jax.data.scenes.filters import REASONS
+from rcirl_jax.data.scenes.lines import TOO_FEW
+from rcirl_jax.data.scenes.smoothing import HARSH_MPS2, harsh_share
+from rcirl_jax.data.store.dataset import Dataset
+from rcirl_jax.types import Decision, Demonstration, Kind, Recording, Tag
+
+HEADWAY_STEP_S = 0.01  # s, to which headways are counted
+SPEED_STEP_MPS = 0.05  # m/s, likewise
+FUTURE_STEP_S = 0.05  # s, likewise
+HEADWAY_EDGES_S = (0.5, 1.0, 1.5, 2.0, 3.0)  # s, bins of the headway histogram
+HOW_TO_POOL = (
+    "written lights that the crossings of one file cannot bear out give no stop "
+    "labels: `--signals=pooled` of an import asks the drivers of all files together"
+)
+
+
+@dataclasses.dataclass
+class QualityReport:
+    """Accumulates over recordings; `as_dict` is what the manifest stores."""
+
+    recordings: int = 0
+    tracks: int = 0
+    states: int = 0
+    scenes: int = 0
+    harsh_raw: int = 0
+    harsh_smooth: int = 0
+    accelerations: int = 0
+    shortened: int = 0  # scenes that end with their surroundings
+    times: int = 0  # points of the time axis inside the scenes' recorded futures
+    times_cut: int = 0  # of them after the surroundings' end
+    dropped: collections.Counter = dataclasses.field(
+        default_factory=collections.Counter
+    )
+    tags: collections.Counter = dataclasses.field(default_factory=collections.Counter)
+    decisions: collections.Counter = dataclasses.field(
+        default_factory=collections.Counter
+    )
+    # how often each multiple of a step was met; the key is the multiple as text
+    headways: collections.Counter = dataclasses.field(
+        default_factory=collections.Counter
+    )
+    speeds: collections.Counter = dataclasses.field(default_factory=collections.Counter)
+    futures: collections.Counter = dataclasses.field(
+        default_factory=collections.Counter
+    )
+    notes: list[str] = dataclasses.field(default_factory=list)
+    refused: int = 0  # recordings left out
+
+    def add_refusal(self, recording: Recording) -> None:
+        """Count a recording that is left out, and note why."""
+        self.refused += 1
+        self.notes.append(f"left out: {recording.refused}")
+
+    def add_recording(self, collector: Collector) -> None:
+        """Count a recording's tracks, noise, drop reasons and notes."""
+        recording = collector.recording
+        self.recordings += 1
+        for smooth in collector.tracks:
+            own = collector.own_frames(smooth)
+            self.tracks += collector.begins_here(smooth)
+            self.states += own.stop - own.start
+            raw, count = harsh_share(
+                smooth.raw_x[own], smooth.raw_y[own], collector.rate
+            )
+            self.harsh_raw += raw
+            smoothed = harsh_share(smooth.x[own], smooth.y[own], collector.rate)
+            self.harsh_smooth += smoothed[0]
+            self.accelerations += count
+        self.dropped.update(collector.dropped)
+        self.shortened += collector.ended["shortened"]
+        self.times += collector.ended["times"]
+        self.times_cut += collector.ended["times_cut"]
+        notes = [*recording.notes, *collector.signal_notes]
+        self.notes += [f"{recording.name}: {note}" for note in notes]
+
+    def add_scenes(self, demonstrations: Demonstration) -> None:
+        """Count scenes, tags, decisions, headways, speeds and futures."""
+        scene = demonstrations.scene
+        count = int(np.shape(demonstrations.vehicle)[0])
+        self.scenes += count
+        for tag in Tag:
+            self.tags[tag.name.lower()] += int(np.sum(scene.tags[:, tag]))
+        known = np.asarray(scene.obstacles.kind) != Kind.NONE
+        for decision in Decision:
+            chosen = (np.asarray(demonstrations.decisions) == decision) & known
+            self.decisions[decision.name.lower()] += int(np.sum(chosen))
+        for counts, values, step in (
+            (self.headways, _headways(demonstrations), HEADWAY_STEP_S),
+            (self.speeds, np.asarray(scene.ego.v), SPEED_STEP_MPS),
+            (self.futures, np.asarray(demonstrations.future_s), FUTURE_STEP_S),
+        ):
+            counts.update(map(str, np.round(values / step).astype(int).tolist()))
+
+    def state(self) -> dict:
+        """All sums and lists, JSON-ready; `merge` takes it back."""
+        return {
+            name: dict(found) if isinstance(found, collections.Counter) else found
+            for name, found in vars(self).items()
+        }
+
+    def merge(self, state: dict) -> None:
+        """Add another report's `state()`."""
+        for name, found in state.items():
+            mine = getattr(self, name)
+            if isinstance(mine, collections.Counter):
+                mine.update(found)
+            elif isinstance(mine, list):
+                mine.extend(found)
+            else:
+                setattr(self, name, mine + found)
+
+    def as_dict(self) -> dict:
+        """JSON-ready summary."""
+        total = max(self.accelerations, 1)
+        return {
+            "recordings": self.recordings,
+            "tracks": self.tracks,
+            "states": self.states,
+            "scenes": self.scenes,
+            "harsh_threshold_mps2": HARSH_MPS2,
+            "harsh_share_raw": self.harsh_raw / total,
+            "harsh_share_smoothed": self.harsh_smooth / total,
+            "headway_s": _quantiles(self.headways, HEADWAY_STEP_S),
+            "headway_histogram": _histogram(self.headways, HEADWAY_STEP_S),
+            "speed_mps": _quantiles(self.speeds, SPEED_STEP_MPS),
+            "future_s": _quantiles(self.futures, FUTURE_STEP_S),
+            "shortened": self.shortened,
+            "shortened_share": self.times_cut / max(self.times, 1),
+            "tags": dict(self.tags),
+            "decisions": dict(self.decisions),
+            "dropped": {name: self.dropped.get(name, 0) for name in REASONS},
+            # said only where it happened: the manifests of before keep their hash
+            **({"refused": self.refused} if self.refused else {}),
+            "notes": self.notes[:200],
+            "num_notes": len(self.notes),
+        }
+
+
+def _headways(demonstrations: Demonstration) -> np.ndarray:
+    """Time headway [s] to the followed car at the planning frame, if any."""
+    scene = demonstrations.scene
+    follows = np.asarray(demonstrations.decisions) == Decision.FOLLOW
+    front = 0.5 * np.asarray(scene.ego.length)[:, None]
+    gap = np.asarray(scene.obstacles.s_lower)[:, :, 0] - front
+    speed = np.maximum(np.asarray(scene.ego.v), 1e-3)[:, None]
+    usable = follows & (gap > 0.0) & (speed > 2.0)
+    headway = np.min(np.where(usable, gap / speed, np.inf), axis=1)
+    return headway[np.isfinite(headway)]
+
+
+def _sorted(counts: collections.Counter, step: float) -> tuple[np.ndarray, np.ndarray]:
+    """Values in ascending order, and how often each was met."""
+    pairs = sorted((int(key), count) for key, count in counts.items())
+    keys, times = np.array(pairs, float).reshape(-1, 2).T
+    return keys * step, times
+
+
+def _quantiles(counts: collections.Counter, step: float) -> dict | None:
+    """5, 50 and 95 % points, to half a step; None of nothing."""
+    if not counts:
+        return None
+    values, times = _sorted(counts, step)
+    at = np.searchsorted(np.cumsum(times), np.array([0.05, 0.5, 0.95]) * times.sum())
+    found = values[np.minimum(at, values.size - 1)]
+    return dict(zip(("p05", "p50", "p95"), found.tolist(), strict=True))
+
+
+def _histogram(counts: collections.Counter, step: float) -> dict[str, int]:
+    edges = (0.0, *HEADWAY_EDGES_S, np.inf)
+    values, times = _sorted(counts, step)
+    found = np.histogram(values, edges, weights=times)[0]
+    return {
+        f"{low:g}-{high:g} s": int(n)
+        for low, high, n in zip(edges[:-1], edges[1:], found, strict=True)
+    }
+
+
+def format_quality(report: dict) -> str:
+    """The report as a terminal table."""
+    lines = [
+        f"{'recordings':<28}{report['recordings']:>10,}",
+        f"{'tracks':<28}{report['tracks']:>10,}",
+        f"{'states':<28}{report['states']:>10,}",
+        f"{'scenes kept':<28}{report['scenes']:>10,}",
+        f"{'|a| > 3 m/s^2, raw':<28}{report['harsh_share_raw']:>10.1%}",
+        f"{'|a| > 3 m/s^2, smoothed':<28}{report['harsh_share_smoothed']:>10.1%}",
+    ]
+    for name, label in (
+        ("speed_mps", "speed, m/s (5/50/95 %)"),
+        ("headway_s", "headway, s (5/50/95 %)"),
+        ("future_s", "future, s (5/50/95 %)"),
+    ):
+        if report[name] is not None:
+            values = " / ".join(f"{value:.1f}" for value in report[name].values())
+            lines.append(f"{label:<28}{values:>20}")
+    if report["shortened"]:
+        share = f"{report['shortened']:,} ({report['shortened_share']:.1%} of times)"
+        lines.append(f"{'end with surroundings':<28}{share:>20}")
+    lines.append("")
+    lines.append("tags                  scenes  share   dropped because")
+    tags = sorted(report["tags"].items(), key=lambda item: -item[1])
+    drops = sorted(report["dropped"].items(), key=lambda item: -item[1])
+    for row in range(max(len(tags), len(drops))):
+        left = " " * 35
+        if row < len(tags):
+            name, count = tags[row]
+            left = f"{name:<19}{count:>9,}{count / max(report['scenes'], 1):>7.1%}"
+        right = f"   {drops[row][0]:<24}{drops[row][1]:>9,}" if row < len(drops) else ""
+        lines.append(left + right)
+    decisions = ", ".join(f"{k} {v:,}" for k, v in report["decisions"].items())
+    lines += ["", f"decisions per obstacle: {decisions}"]
+    if report.get("refused"):
+        lines.append(f"{report['refused']} recordings refused and left out")
+    if report["num_notes"]:
+        lines.append(f"{report['num_notes']} notes; first: {report['notes'][0]}")
+    if any(TOO_FEW in note for note in report["notes"]):
+        lines.append(HOW_TO_POOL)
+    return "\n".join(lines)
+
+
+def format_splits(dataset: Dataset) -> str:
+    """Scenes and groups of each split, and by what it was split, in one line each."""
+    flags, lines = dataset.manifest.import_flags, []
+    for split in ("train", "test"):
+        scenes = dataset.indices(split).size
+        count = len(dataset.manifest.splits[split])
+        lines.append(
+            f"{'split ' + split:<28}{scenes:>10,} scenes "
+            f"({scenes / max(dataset.count, 1):.1%}), groups that share no vehicle: "
+            f"{count:,}"
+        )
+    if "split_by" in flags:
+        asked = f"asked for {flags['test_fraction']:.1%} to test"
+        lines.append(f"{'split by':<28}{flags['split_by']}; {asked}")
+    return "\n".join(lines)

@@ -1,0 +1,453 @@
+"""The dataset on disk: shards of zarr3 arrays, each commit marked by a file.
+
+    DATASET/manifest.json                  the dataset is complete; written last
+    DATASET/shards/00000/shard.json        the shard is complete; written last
+    DATASET/shards/00000/scene.ego.v/...   one zarr3 array [n, ...] per leaf
+
+DATASET is a folder or any tensorstore URL (`gs://`, `s3://`, `memory://`).
+Arrays: codec `sharding_indexed` around zstd and crc32c (zarr v3 specification),
+so one file per leaf and shard, of which single blocks of rows can be read.
+
+Checksums form a chain: manifest `hash` -> `sha256` of each shard.json -> sha256
+of each file. Both JSON files carry the sha256 of their own canonical form (sorted
+keys, no spaces, without that field). Nothing written depends on the time or the
+machine: equal scenes give equal bytes.
+"""
+
+import functools
+import json
+import os
+import re
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import numpy as np
+import tensorstore as ts
+
+from rcirl_jax.data.store.files import (
+    FACTS,
+    JSON_BYTES,
+    MANIFEST,
+    MARK,
+    SHARDS,
+    Files,
+    context,
+)
+from rcirl_jax.data.store.manifest import (
+    SCHEMA_VERSION,
+    Manifest,
+    ShardInfo,
+    array_table,
+    check_count,
+    parse_manifest,
+    seal,
+    shard_entry,
+)
+from rcirl_jax.data.store.rows import checked_leaves, leaf_specs, row_spec
+from rcirl_jax.data.store.shards import (
+    BLOCK_ROWS,
+    describe,
+    encode,
+    layout,
+    shard_info,
+    shard_key,
+    verify_shard,
+)
+from rcirl_jax.data.store.splits import check_disjoint
+from rcirl_jax.errors import InputError, LostWorkError
+from rcirl_jax.runtime.atomic_files import parse_json, plain
+from rcirl_jax.types import (
+    Demonstration,
+)
+from rcirl_jax.units import TIMES_S
+
+SHARDS_END = "shards0"  # first key after all that begin with "shards/"
+OPEN_SHARDS = 256  # shards whose arrays are kept open, 60 kB each
+# what the import hands to `DatasetWriter.finish`; the writer knows the rest
+IMPORT_FIELDS = (
+    "rate_hz",
+    "sources",
+    "recordings",
+    "groups",
+    "vehicles",
+    "splits",
+    "quality",
+    "import",
+)
+
+
+class DatasetWriter:
+    """Writes a dataset shard by shard; can be interrupted anywhere.
+
+    Nothing is touched before the first shard is written: with `overwrite`, bad
+    input found before that leaves the old dataset as it was.
+    """
+
+    def __init__(self, url: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+        """Look at what is there.
+
+        Args:
+          url: dataset folder, need not exist, or tensorstore URL.
+          overwrite: start over, replacing whatever import is there.
+
+        Raises:
+          InputError: a finished dataset without `overwrite`; other files.
+        """
+        self._files = Files(url)
+        self._missing_folders = _missing_folders(self._files.folder)
+        keys = self._files.list_keys()
+        shards = any(re.match(SHARDS + r"\d{5}/", key) for key in keys)
+        if keys and not shards and MANIFEST not in keys:
+            raise InputError(
+                f"{self._files.name}: holds {keys[0]}, not a dataset: "
+                "expected an empty or new folder"
+            )
+        if MANIFEST in keys and not overwrite:
+            raise InputError(
+                f"{self._files.name}: holds a finished dataset: "
+                "expected a new folder, or --overwrite to replace it"
+            )
+        # one `shard_entry` a shard: lineages of a long log would fill the memory
+        self._shards = [] if overwrite or not shards else self._find_committed()
+        self._first_written: int | None = None
+        self._finished = False
+
+    def _find_committed(self) -> list[dict]:
+        found = []
+        while True:
+            try:
+                found.append(shard_entry(verify_shard(self._files, len(found))))
+            except InputError:
+                return found
+
+    def committed(self) -> list[ShardInfo]:
+        """The shards already there and whole, from number 0 on without a gap.
+
+        Read from disk; the writer itself remembers digests only.
+        """
+        return [
+            shard_info(self._files, index, shard["sha256"])
+            for index, shard in enumerate(self._shards)
+        ]
+
+    def write_shard(
+        self, index: int, demonstrations: Demonstration, lineage: list[dict]
+    ) -> ShardInfo:
+        """Write and commit the next shard; removes remains of an earlier attempt.
+
+        Args:
+          index: number of the shard, the number of shards before it.
+          demonstrations: numpy rows [n, ...], n >= 1.
+          lineage: one JSON-ready dict per recording in the shard, with its "name"
+            and, if known, the "sha256" of what it was made of.
+
+        Raises:
+          InputError: the place cannot be written at all.
+          OSError: it can no longer be written, e.g. the disk is full. Shards
+            before this one stay, to resume from.
+        """
+        if index != len(self._shards):
+            raise ValueError(f"shard {index}: expected {len(self._shards)} next")
+        leaves = checked_leaves(demonstrations)
+        values = encode(leaves)
+        payload = {
+            "schema_version": SCHEMA_VERSION,
+            "index": index,
+            "count": int(leaves["vehicle"].size),
+            "lineage": lineage,
+            "files": {key: describe(value) for key, value in values.items()},
+        }
+        key = shard_key(index)
+        mark = self._readable(seal(payload, "sha256"), key + MARK)
+        if self._first_written is None:
+            self._first_written = index
+        self._remove_from(index)
+        try:
+            self._files.write_many({key + file: v for file, v in values.items()})
+            self._files.write_many({key + MARK: mark})
+        except OSError as error:
+            if index > 0:
+                raise
+            raise InputError(f"{error}: expected a place to write to") from error
+        info = ShardInfo(**json.loads(mark))
+        self._shards.append(shard_entry(info))
+        return info
+
+    def _readable(self, raw: bytes, key: str) -> bytes:
+        """Refuse to write what would not be read again; what is finished stays."""
+        most = JSON_BYTES[key.rpartition("/")[2]]
+        if len(raw) > most:
+            raise LostWorkError(
+                f"{self._files.path(key)}: {len(raw)} bytes of names: expected {most} "
+                "at most; import into several datasets"
+            )
+        return raw
+
+    def _remove_from(self, index: int) -> None:
+        # shards before the manifest: what an interrupt here leaves cannot pass for
+        # an import to resume
+        start = SHARDS if index == 0 else shard_key(index).rstrip("/")
+        self._files.remove(start, SHARDS_END)
+        self._files.remove(MANIFEST, MANIFEST + "\0")
+
+    def finish(
+        self,
+        manifest_fields: Mapping[str, Any],
+        before_commit: "Callable[[Dataset], object]" = lambda dataset: None,
+    ) -> Manifest:
+        """Commit the dataset: check the tables, write manifest.json.
+
+        Args:
+          manifest_fields: exactly `IMPORT_FIELDS`, JSON-ready.
+          before_commit: what else belongs to a finished import; a run that is killed
+            in it is resumed, and its bad input is raised after the commit.
+
+        Raises:
+          InputError: a vehicle has rows in two splits.
+          LostWorkError: more names than a manifest holds; the shards are sound.
+        """
+        if set(manifest_fields) != set(IMPORT_FIELDS):
+            different = sorted(set(manifest_fields) ^ set(IMPORT_FIELDS))
+            raise ValueError(f"manifest: {different}: expected {IMPORT_FIELDS}")
+        if not self._shards:
+            raise ValueError("dataset: 0 shards: expected at least one")
+        payload = {
+            **manifest_fields,
+            "schema_version": SCHEMA_VERSION,
+            "count": sum(shard["count"] for shard in self._shards),
+            "arrays": array_table(),
+            "time_grid_s": TIMES_S.tolist(),
+            "shards": self._shards,
+        }
+        raw = self._readable(seal(payload, "hash"), MANIFEST)
+        dataset = Dataset(self._files, parse_manifest(raw, self._files))
+        dataset.check_tables()
+        self._remove_from(len(self._shards))
+        failed = None
+        try:
+            before_commit(dataset)
+        except InputError as error:
+            failed = error
+        self._files.write_many({MANIFEST: raw})
+        self._finished = True
+        if failed is not None:
+            raise failed
+        return dataset.manifest
+
+    def abort(self) -> None:
+        """Remove what this writer wrote; shards resumed from stay as they were."""
+        if self._finished or self._first_written is None:
+            return
+        self._remove_from(self._first_written)
+        inner = [os.path.join(self._files.folder, SHARDS)] if self._files.folder else []
+        for folder in inner + self._missing_folders:
+            if os.path.isdir(folder) and not os.listdir(folder):
+                os.rmdir(folder)
+
+
+def _missing_folders(folder: str | None) -> list[str]:
+    """Folders that writing into `folder` will create, innermost first."""
+    missing = []
+    while folder is not None and not os.path.lexists(folder):
+        missing.append(folder)
+        folder = os.path.dirname(folder)
+    return missing
+
+
+class Dataset:
+    """A finished dataset, opened with `open_dataset`; rows are numbered 0 .. n-1."""
+
+    def __init__(self, files: Files, manifest: Manifest) -> None:
+        self.manifest = manifest
+        self._files = files
+        counts = [shard["count"] for shard in manifest.shards]
+        self._starts = np.cumsum([0, *counts])
+        self._open: dict[int, dict[str, ts.TensorStore]] = {}
+
+    @property
+    def hash(self) -> str:
+        """Identity of the whole contents: the manifest's hash."""
+        return self.manifest.hash
+
+    @property
+    def count(self) -> int:
+        """Number of rows."""
+        return self.manifest.count
+
+    def write_facts(self, body: Mapping[str, object]) -> None:
+        """Say beside the manifest what made the dataset: commit, versions, flags.
+
+        Raises:
+          OSError: the place cannot be written.
+        """
+        text = json.dumps(plain(body), indent=2, allow_nan=False) + "\n"
+        self._files.write_many({FACTS: text.encode()})
+
+    def facts(self) -> dict[str, Any]:
+        """What `write_facts` wrote; empty where nobody did.
+
+        Raises:
+          InputError: not a JSON object.
+        """
+        raw = self._files.read_json(FACTS)
+        try:
+            found = {} if raw is None else parse_json(raw)
+        except ValueError as error:
+            raise InputError(
+                f"{self._files.path(FACTS)}: {error}: expected JSON"
+            ) from error
+        if not isinstance(found, dict):
+            raise InputError(f"{self._files.path(FACTS)}: expected an object")
+        return found
+
+    def _arrays(self, shard: int) -> dict[str, ts.TensorStore]:
+        """The shard's arrays, opened once, of the shapes and dtypes promised."""
+        if shard in self._open:
+            return self._open[shard]
+        key, count = shard_key(shard), self.manifest.shards[shard]["count"]
+        futures = {
+            name: ts.open(
+                {"driver": "zarr3"},
+                kvstore=self._files.kv / f"{key}{name}/",
+                open=True,
+                context=context(),
+            )
+            for name in leaf_specs()
+        }
+        arrays = {}
+        for name, leaf in leaf_specs().items():
+            array = self._files.wait(futures[name], key + name)
+            found = (array.dtype.numpy_dtype, array.shape)
+            expected = (leaf.dtype, (count, *leaf.shape))
+            if found != expected:
+                raise InputError(
+                    f"{self._files.path(key + name)}: shard {shard}: {found[0]} "
+                    f"{found[1]}: expected {expected[0]} {expected[1]}"
+                )
+            grid = array.chunk_layout
+            chunks = (grid.read_chunk.shape, grid.write_chunk.shape)
+            if chunks != layout(array.shape):
+                raise InputError(
+                    f"{self._files.path(key + name)}: shard {shard}: chunks {chunks}: "
+                    f"expected {layout(array.shape)}"
+                )
+            arrays[name] = array
+        if len(self._open) >= OPEN_SHARDS:
+            self._open.pop(next(iter(self._open)))
+        self._open[shard] = arrays
+        return arrays
+
+    def verify(self) -> None:
+        """Check every byte; InputError names the shard and the file at fault."""
+        for number, shard in enumerate(self.manifest.shards):
+            verify_shard(self._files, number, shard["sha256"])
+            self._arrays(number)
+
+    def check_tables(self) -> None:
+        """Check numbers against name tables, and that splits share no vehicle."""
+        names = {
+            "group": self.manifest.groups,
+            "vehicle": self.manifest.vehicles,
+            "recording": self.manifest.recordings,
+        }
+        columns = self._read(np.arange(self.count), tuple(names))
+        for column, table in names.items():
+            low, high = columns[column].min(), columns[column].max()
+            if low < 0 or high >= len(table):
+                raise ValueError(f"{column}: {low} to {high}: {len(table)} names")
+        split = self._split_groups()
+        check_disjoint(columns["group"], columns["vehicle"], split)
+
+    def _split_groups(self) -> dict[str, list[int]]:
+        number = {name: i for i, name in enumerate(self.manifest.groups)}
+        splits = self.manifest.splits.items()
+        return {split: [number[name] for name in names] for split, names in splits}
+
+    def indices(self, split: str | None) -> np.ndarray:
+        """[m] int64 row numbers of a split in ascending order; of all for None."""
+        rows = np.arange(self.count)
+        if split is None:
+            return rows
+        if split not in self.manifest.splits:
+            known = ", ".join(self.manifest.splits)
+            raise InputError(
+                f"{self._files.path(MANIFEST)}: splits: {split}: expected {known}"
+            )
+        return rows[np.isin(self._groups, self._split_groups()[split])]
+
+    @functools.cached_property
+    def _groups(self) -> np.ndarray:
+        return self._read(np.arange(self.count), ("group",))["group"]
+
+    def weights(self, indices: np.ndarray) -> np.ndarray:
+        """[m] float32 weight of each scene in a training loss: 1 in a single source."""
+        return np.ones(np.size(indices), np.float32)
+
+    def blocks(self, indices: np.ndarray) -> np.ndarray:
+        """[m] number of the block of rows, unpacked together, that each lies in."""
+        shard = np.searchsorted(self._starts, indices, side="right") - 1
+        counts = -(-np.diff(self._starts) // BLOCK_ROWS)
+        before = np.cumsum([0, *counts])[shard]
+        return before + (indices - self._starts[shard]) // BLOCK_ROWS
+
+    def load(self, split: str | None) -> Demonstration:
+        """All rows of a split (None: of all splits) in memory."""
+        return self.read(self.indices(split))
+
+    def read(self, indices: np.ndarray) -> Demonstration:
+        """Rows by number, numpy leaves [m, ...], in the order asked for."""
+        leaves = self._read(indices, tuple(leaf_specs()))
+        return jax.tree.unflatten(jax.tree.structure(row_spec()), leaves.values())
+
+    def column(self, name: str) -> np.ndarray:
+        """One leaf of all rows, e.g. "scene.tags", numpy [n, ...]."""
+        return self._read(np.arange(self.count), (name,))[name]
+
+    def _read(
+        self, indices: np.ndarray, names: tuple[str, ...]
+    ) -> dict[str, np.ndarray]:
+        rows = np.asarray(indices, np.int64)
+        if rows.ndim != 1 or np.any((rows < 0) | (rows >= self.count)):
+            raise IndexError(f"rows: expected a list of numbers below {self.count}")
+        spec = {name: leaf_specs()[name] for name in names}
+        out = {k: np.empty((rows.size, *v.shape), v.dtype) for k, v in spec.items()}
+        owner = np.searchsorted(self._starts, rows, side="right") - 1
+        for shard in np.unique(owner).tolist():
+            places = np.flatnonzero(owner == shard)
+            local = rows[places] - self._starts[shard]
+            arrays = self._arrays(shard)
+            reads = {name: arrays[name][local].read() for name in names}
+            for name, future in reads.items():
+                key = f"{shard_key(shard)}{name}"
+                out[name][places] = self._files.wait(future, key)
+        return out
+
+
+def open_dataset(url: str | os.PathLike[str], verify: bool = True) -> Dataset:
+    """Open a finished dataset.
+
+    Args:
+      url: dataset folder or tensorstore URL.
+      verify: read every byte against its checksum first. Without it damage is
+        found by crc32c when the damaged rows are read.
+
+    Raises:
+      InputError: no dataset, an interrupted import, another schema version, or
+        damage; names the file.
+    """
+    files = Files(url)
+    raw = files.read_json(MANIFEST)
+    if raw is None:
+        shards = any(key.startswith(SHARDS) for key in files.list_keys())
+        reason = (
+            "the import was interrupted: run import again to resume"
+            if shards
+            else "no dataset here: expected a folder made by import_logs"
+        )
+        raise InputError(f"{files.path(MANIFEST)}: missing: {reason}")
+    dataset = Dataset(files, parse_manifest(raw, files))
+    if verify:
+        dataset.verify()
+    check_count(dataset.manifest, files.path(MANIFEST))
+    return dataset

@@ -1,0 +1,296 @@
+"""How near a driver stays to the human, in closed loop on held-out recordings.
+
+Every row drives the same D short cases (`simulation.recorded.scenes`) from the human's
+own state along the human's own path. The number that the gate reads is
+
+    distance = mean over the recorded 10 Hz times of |s_row(t) - s_human(t)|    [m]
+
+per drive: it has the unit of the ranking tables, needs no choice of features, and a
+drive that crashes stays where it crashed, so no drive is dropped. Beside it, in the
+spirit of the Waymo sim-agents challenge (Montali et al. 2023, arXiv 2305.12032), how
+unlike the human's the distributions of acceleration, jerk, headway and time to
+collision are: the Jensen-Shannon distance of histograms over all drives, 0 to 1. Host
+numpy, float64.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import jax
+import numpy as np
+from scipy.spatial.distance import jensenshannon
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.closed_loop.npz_files import (
+    check_array,
+    names_of_rows,
+    read_npz,
+    write_npz,
+)
+from rcirl_jax.evaluation.closed_loop.output import text_table
+from rcirl_jax.evaluation.gate.types import Likeness
+from rcirl_jax.evaluation.statistics import (
+    ClusterBootstrap,
+    Difference,
+    combine_seeds,
+    paired_difference,
+)
+from rcirl_jax.runtime.executors import two_at_a_time
+from rcirl_jax.simulation.cases import STEP_S, Record
+from rcirl_jax.simulation.recorded.scenes import STEPS, HeldOut
+from rcirl_jax.simulation.rollout import LANES, drive_cases
+from rcirl_jax.simulation.rows import RECORDED_HUMAN, Row, human_row
+from rcirl_jax.simulation.suite import rollout_config
+from rcirl_jax.units import HORIZON_S
+
+DRIVES = 240  # held-out drives of a report, if not told otherwise
+TIMES_SHOWN_S = (1.0, 3.0, 5.0, 8.0)  # s at which distances are printed
+# what is compared as a distribution: lowest, highest, bins
+HISTOGRAMS: dict[str, tuple[float, float, int]] = {
+    "acceleration": (-6.0, 4.0, 40),  # m/s^2
+    "jerk": (-8.0, 8.0, 40),  # m/s^3
+    "headway": (0.0, 8.0, 32),  # s; nobody ahead counts in the last bin
+    "time_to_collision": (0.0, 20.0, 40),  # s; likewise
+}
+REFERENCES = ("hand-set", "IDM", "IDM, tuned", "+velocity", "constant V")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Driven:
+    """What one row did in the D drives."""
+
+    distance: np.ndarray  # [D] m, see above
+    at: np.ndarray  # [D, len(TIMES_SHOWN_S)] m; NaN where the record is shorter
+    mean_speed: np.ndarray  # [D] m/s, over the same time as the human's
+    induced_braking: np.ndarray  # [D] m/s^2, hardest that the ego caused
+    crashed: np.ndarray  # [D] bool, of its own fault
+    samples: Mapping[str, np.ndarray]  # of HISTOGRAMS, all drives' in one
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LikenessReport:
+    """All rows on the same held-out drives."""
+
+    rows: Mapping[str, Driven]  # the recorded human first
+    ids: tuple[str, ...]
+    clusters: np.ndarray  # [D] int, the ego's vehicle
+    recordings: int
+
+    @property
+    def distance(self) -> dict[str, np.ndarray]:
+        """[D] m of every row but the human's."""
+        named = self.rows.items()
+        return {n: row.distance for n, row in named if n != RECORDED_HUMAN}
+
+    @property
+    def likeness(self) -> Likeness:
+        """What the gate reads."""
+        return Likeness(distance=self.distance, clusters=self.clusters)
+
+    def unlikeness(self, name: str) -> dict[str, float]:
+        """Jensen-Shannon distance to the human's distribution, by HISTOGRAMS."""
+        mine, human = self.rows[name].samples, self.rows[RECORDED_HUMAN].samples
+        return {key: jensen_shannon(mine[key], human[key], key) for key in HISTOGRAMS}
+
+    def differences(self, name: str) -> dict[str, Difference]:
+        """Row minus each reference, m, clustered by vehicle; below 0 is nearer."""
+        bootstrap, found = ClusterBootstrap(self.clusters), self.distance
+        others = [n for n in REFERENCES if n in found and n != name]
+        return {n: paired_difference(found[name], found[n], bootstrap) for n in others}
+
+    def as_dict(self) -> dict:
+        """For a JSON file."""
+        bootstrap = ClusterBootstrap(self.clusters)
+        human = self.rows[RECORDED_HUMAN]
+        body = {}
+        for name, row in self.rows.items():
+            mean = combine_seeds(row.distance[None], bootstrap)
+            speed = float(np.mean(row.mean_speed) / np.mean(human.mean_speed))
+            body[name] = {
+                "distance_m": {"mean": mean.value, "low": mean.low, "high": mean.high},
+                "at_m": {
+                    f"{t:g}": float(np.nanmean(row.at[:, i]))
+                    for i, t in enumerate(TIMES_SHOWN_S)
+                    if not np.isnan(row.at[:, i]).all()
+                },
+                "unlikeness": self.unlikeness(name),
+                "speed_share": speed,
+                "induced_braking_mps2": float(np.mean(row.induced_braking)),
+                "crashed": int(np.sum(row.crashed)),
+                "minus": {
+                    other: dataclasses.asdict(found)
+                    for other, found in self.differences(name).items()
+                }
+                if name != RECORDED_HUMAN
+                else {},
+            }
+        return {
+            "drives": len(self.ids),
+            "vehicles": int(np.unique(self.clusters).size),
+            "recordings": self.recordings,
+            "rows": body,
+            "ids": list(self.ids),
+        }
+
+    def text(self) -> str:
+        """The table, nearest row first."""
+        facts = self.as_dict()
+        shown = [f"{t:g} s" for t in TIMES_SHOWN_S]
+        head = ["row", "distance m", *shown, "speed", "a", "jerk", "headway", "TTC"]
+        lines = [[*head, "induced", "crashes"]]
+        ranked = sorted(facts["rows"].items(), key=lambda x: x[1]["distance_m"]["mean"])
+        for name, row in ranked:
+            mean = row["distance_m"]
+            apart = [row["at_m"].get(f"{t:g}") for t in TIMES_SHOWN_S]
+            lines.append(
+                [
+                    name,
+                    f"{mean['mean']:.2f} [{mean['low']:.2f}, {mean['high']:.2f}]",
+                    *["" if x is None else f"{x:.2f}" for x in apart],
+                    f"{100 * row['speed_share']:.0f} %",
+                    *[f"{x:.2f}" for x in row["unlikeness"].values()],
+                    f"{row['induced_braking_mps2']:.2f}",
+                    str(row["crashed"]),
+                ]
+            )
+        table = text_table(lines[0], lines[1:])
+        title = (
+            f"Distance to the human, held out: {facts['drives']} drives of "
+            f"{facts['vehicles']} vehicles in {facts['recordings']} recordings"
+        )
+        note = (
+            "distance: mean of |s - s_human|, and at 1 to 8 s; speed: share of the "
+            "human's; a to TTC: how unlike the human's distribution, 0 to 1"
+        )
+        lines = [title, *table, note, "", *self._differences_text()]
+        return "\n".join(lines) + "\n"
+
+    def _differences_text(self) -> list[str]:
+        """Every row minus each reference; nothing where there is none."""
+        known = [name for name in REFERENCES if name in self.rows]
+        rows = []
+        for name in self.distance:
+            found = self.differences(name)
+            cells = [
+                f"{d.mean:+.2f} [{d.low:+.2f}, {d.high:+.2f}]" if d else "-"
+                for d in map(found.get, known)
+            ]
+            rows.append([name, *cells])
+        title = "distance minus that of, m [95 % over vehicles]; below 0 is nearer"
+        return [title, *text_table(["row minus", *known], rows)] if known else []
+
+
+def write_arrays(path: Path, known: Likeness) -> None:
+    """The distances as an npz file, whole or not at all."""
+    table = np.array(list(known.distance.values()), np.float64)
+    names = np.array(list(known.distance))
+    arrays = {"names": names, "distance": table, "clusters": known.clusters}
+    write_npz(path, arrays)
+
+
+def read_arrays(path: Path) -> Likeness:
+    """Distances written by `write_arrays`.
+
+    Raises:
+      InputError: no such file, damaged, or not as written.
+    """
+    with read_npz(path, "distances as written") as arrays:
+        names = names_of_rows(arrays["names"])
+        count = arrays["clusters"].size
+        check_array(arrays, "clusters", "iu", (count,))
+        check_array(arrays, "distance", "f", (len(names), count))
+        distance = dict(zip(names, arrays["distance"], strict=True))
+        return Likeness(distance=distance, clusters=arrays["clusters"])
+
+
+def jensen_shannon(a: np.ndarray, b: np.ndarray, name: str) -> float:
+    """Jensen-Shannon distance of two samples' histograms, 0 (equal) to 1.
+
+    Logarithms are of base 2. Two samples without a value are equal.
+
+    Args:
+      a: [n].
+      b: [m].
+      name: of HISTOGRAMS; values beyond its ends count in the first and last bin.
+    """
+    low, high, bins = HISTOGRAMS[name]
+    p, q = (
+        np.histogram(np.clip(values, low, high), bins, (low, high))[0]
+        for values in (a, b)
+    )
+    if not p.any() or not q.any():  # no shares of nothing
+        return float(p.any() != q.any())
+    # rounding may put the square of a distance of nearly equal ones below 0
+    with np.errstate(invalid="ignore"):
+        return float(np.nan_to_num(jensenshannon(p, q, base=2)))
+
+
+def held_out_likeness(
+    drives: HeldOut, rows: Sequence[Row], plan_every: int = 1
+) -> LikenessReport:
+    """Drive every row, and the recorded human, over the held-out drives.
+
+    Args:
+      drives: of `simulation.recorded.scenes.held_out`.
+      rows: learned rows, rivals, nulls; names are distinct.
+      plan_every: steps of 0.1 s between two plans, of rows that need no other.
+
+    Raises:
+      InputError: a name twice, drives of one vehicle, or a drive with no number.
+    """
+    ClusterBootstrap(drives.vehicle)  # refuses one vehicle before hours of driving
+    names = [row.name for row in rows]
+    if len(set(names)) < len(names):
+        raise InputError(f"held-out drives: rows {names}: expected distinct names")
+    others = [row for row in rows if row.name != RECORDED_HUMAN]
+    every = [human_row(), *others]
+    made = two_at_a_time(lambda row: _driven(row, drives, plan_every), every)
+    found = {row.name: one for row, one in zip(every, made, strict=True)}
+    return LikenessReport(
+        rows=found,
+        ids=drives.ids,
+        clusters=np.unique(drives.vehicle, return_inverse=True)[1],
+        recordings=int(np.unique(drives.recording).size),
+    )
+
+
+def _driven(row: Row, drives: HeldOut, plan_every: int = 1) -> Driven:
+    """One row's drives, measured against the humans of the cases."""
+    count = len(drives.ids)
+    fill = np.minimum(np.arange(-(-count // LANES) * LANES), count - 1)
+    cases = jax.tree.map(lambda x: np.asarray(x)[fill], drives.cases)
+    config = rollout_config(row, HORIZON_S, plan_every)
+    logs = drive_cases(row.policy, row.params, cases, config)
+    # where plans are rarer, the last may end after the horizon
+    record: Record = jax.tree.map(lambda x: np.asarray(x)[:count, :STEPS], logs[0])
+    assert drives.cases.replay is not None
+    human = np.asarray(drives.cases.replay.ego_s, np.float64)[:, 1:]
+    steps = np.asarray(drives.cases.steps)
+    lasts = np.arange(STEPS)[None] < steps[:, None]  # [D, S], crash or not
+    apart = np.abs(np.asarray(record.s, np.float64) - human)
+    if not np.isfinite(apart[lasts]).all():
+        bad = drives.ids[int(np.argmax(~np.isfinite(apart).all(axis=1)))]
+        raise InputError(
+            f"held-out drives: {row.name}: {bad}: station: expected a finite number"
+        )
+    at = [
+        np.where(steps >= round(t / STEP_S), apart[:, round(t / STEP_S) - 1], np.nan)
+        for t in TIMES_SHOWN_S
+    ]
+    mean = lambda x: np.sum(np.where(lasts, x, 0.0), axis=1) / lasts.sum(axis=1)  # noqa: E731
+    a = np.asarray(record.a, np.float64)
+    moves = lasts[:, 1:]
+    return Driven(
+        distance=mean(apart),
+        at=np.stack(at, axis=1),
+        mean_speed=mean(np.asarray(record.v, np.float64)),
+        induced_braking=np.where(lasts, record.induced_braking, 0.0).max(axis=1),
+        crashed=np.any(np.asarray(record.at_fault) > 0, axis=1),
+        samples={
+            "acceleration": a[lasts],
+            "jerk": (np.diff(a, axis=1) / STEP_S)[moves],
+            "headway": np.asarray(record.headway)[lasts],
+            "time_to_collision": np.asarray(record.ttc)[lasts],
+        },
+    )

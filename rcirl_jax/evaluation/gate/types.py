@@ -1,0 +1,243 @@
+"""What a gate is given and what it says: margins, drives, checks, a verdict.
+
+Axes: `C` cases of the suite, `D` held-out recorded drives.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import numpy as np
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.statistics import Difference
+from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics
+
+Kind = Literal["safety", "no loss", "families", "nulls", "likeness", "gain"]
+Outcome = Literal["pass", "fail", "open"]
+Decision = Literal["ship", "do not ship", "no difference", "could not judge"]
+
+# exit status of the command line
+EXIT_CODES: dict[Decision, int] = {
+    "ship": 0,
+    "do not ship": 3,
+    "no difference": 3,
+    "could not judge": 2,
+}
+
+
+CANDIDATE, INCUMBENT = "candidate", "incumbent"  # names of rows
+NULLS = ("constant V", "+velocity")  # rewards that know nothing
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GateConfig:
+    """Margins and primary metrics; what a team declares before it looks.
+
+    docs/gate.md says how each margin was chosen and what it can detect.
+    """
+
+    # more cases with a fault than the incumbent that count as none: shares of all
+    # cases. 0.0025 of 4,140 are ten
+    collision: float = 0.0025  # of its own fault, preventable
+    vulnerable: float = 0.002  # of its own fault, with a pedestrian or cyclist
+    red_light: float = 0.0025
+    stop_sign: float = 0.0025
+    # largest loss that counts as none: shares of all cases
+    collision_free: float = 0.005  # of its own fault, preventable or not
+    min_ttc: float = 0.01  # time to collision stays above 0.95 s
+    speed_limit: float = 0.005
+    on_road: float = 0.0025
+    # clean drives, share of one family's cases; 180 cannot prove less than 0.021
+    family_clean: float = 0.10
+    # share of the incumbent's progress
+    progress: float = 0.01
+    family_progress: float = 0.10
+    # loss in one primary metric that a gain in another may cost; share of cases, or
+    # of the score
+    gain: float = 0.02
+    primary: tuple[str, ...] = ("a_station", "j_station", "progress", "nuplan")
+    # rows that the candidate has to be ahead of
+    nulls: tuple[str, ...] = NULLS
+    # cases with a new fault that a person has looked at and accepts
+    accept: tuple[str, ...] = ()
+
+    @property
+    def margins(self) -> dict[str, float]:
+        """The margins by name."""
+        return {k: v for k, v in vars(self).items() if isinstance(v, int | float)}
+
+    def __post_init__(self) -> None:
+        """Margins within (0, 1), known primary metrics, no name twice."""
+        for name, margin in self.margins.items():
+            if not 0.0 < margin < 1.0:
+                raise InputError(f"--{name}_margin: {margin}: expected within (0, 1)")
+        known = (*COLUMNS, "progress", "nuplan")
+        for name in self.primary:
+            if name not in known:
+                raise InputError(
+                    f"--primary: {name}: expected some of {', '.join(known)}"
+                )
+        if not self.primary:
+            raise InputError("--primary: none: expected at least one metric")
+        for flag in ("primary", "nulls", "accept"):
+            names = getattr(self, flag)
+            if len(set(names)) != len(names):
+                twice = next(name for name in names if names.count(name) > 1)
+                raise InputError(f"--{flag}: {twice}: met twice: expected it once")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Likeness:
+    """How near every row drives to the human, on D held-out recorded drives."""
+
+    # row name -> [D] >= 0, distance to the human; lower is nearer
+    distance: Mapping[str, np.ndarray]
+    clusters: np.ndarray  # [D] int, the ego's vehicle in each drive
+
+    def __post_init__(self) -> None:
+        """As many finite distances >= 0 for every row as there are clusters."""
+        count = len(self.clusters)
+        for name, values in self.distance.items():
+            values = np.asarray(values, np.float64)
+            if values.shape != (count,):
+                raise InputError(
+                    f"likeness: {name}: shape {values.shape}: expected ({count},)"
+                )
+            bad = ~(np.isfinite(values) & (values >= 0.0))
+            if bad.any():
+                raise InputError(
+                    f"likeness: {name}: drive {int(np.argmax(bad))}:"
+                    f" {values[bad][0]}: expected a distance >= 0"
+                )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Check:
+    """One test with its numbers."""
+
+    kind: Kind
+    name: str
+    title: str  # in words
+    outcome: Outcome
+    # candidate minus the other, positive is better; rates as shares, progress and
+    # likeness as shares of the other's mean
+    difference: float
+    low: float
+    high: float
+    margin: float | None  # below which a loss is one; None: any
+    gained: int | None  # cases that only the candidate passes
+    lost: int | None  # cases that only the other passes
+    # safety and nulls: one-sided, of a loss as large as the margin; families and
+    # gain: two-sided, of no difference, Holm-adjusted within the kind
+    p: float | None
+    note: str = ""
+    measured: bool = True  # else the numbers say nothing: from -1 to 1
+
+
+def check_of(
+    kind: Kind,
+    name: str,
+    title: str,
+    outcome: Outcome,
+    found: Difference,
+    margin: float | None = None,
+    pairs: tuple[int, int] | None = None,
+    p: float | None = None,
+    note: str = "",
+) -> Check:
+    """A check with the mean and interval of a difference, candidate minus the other.
+
+    The arguments are fields of `Check`; `pairs` are (gained, lost) cases where those
+    are counted, and the difference's own p is not the check's.
+    """
+    gained, lost = pairs or (None, None)
+    return Check(
+        kind=kind,
+        name=name,
+        title=title,
+        outcome=outcome,
+        difference=found.mean,
+        low=found.low,
+        high=found.high,
+        margin=margin,
+        gained=gained,
+        lost=lost,
+        p=p,
+        note=note,
+    )
+
+
+def unmeasured(kind: Kind, name: str, title: str, note: str) -> Check:
+    """A check that nothing was measured for; `note` says what to do."""
+    anything = Difference(mean=0.0, low=-1.0, high=1.0, se=np.nan, p=1.0)
+    check = check_of(kind, name, title, "open", anything, note=note)
+    return dataclasses.replace(check, measured=False)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class NewFault:
+    """A case in which the candidate commits more of an offence than the incumbent."""
+
+    case: str
+    faults: tuple[str, ...]  # names of the safety checks
+    preventable: bool  # a careful driver has no collision there
+    accepted: bool  # a person has looked at it
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """What the gate says, and why."""
+
+    decision: Decision
+    sentence: str  # the decision in plain words
+    reasons: tuple[str, ...]
+    checks: tuple[Check, ...]
+    cases: int
+    families: int
+    new_faults: tuple[NewFault, ...]
+    look_at: tuple[str, ...]  # ids of cases that differ, the worst first
+    part: str  # what of the suite was left out, in words; "" if nothing
+
+    @property
+    def exit_code(self) -> int:
+        """0 only to ship."""
+        return EXIT_CODES[self.decision]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Pair:
+    """Candidate and incumbent on the same C cases; numpy leaves [C]."""
+
+    candidate: CaseMetrics
+    incumbent: CaseMetrics
+    families: Sequence[str]
+    ids: Sequence[str]
+    reference: np.ndarray  # [C] m, way of the driver that nuPlan's score compares to
+    preventable: np.ndarray  # [C] bool, `simulation.world.careful.preventable`
+    name: str = INCUMBENT  # of the incumbent
+    nulls: Mapping[str, CaseMetrics] = dataclasses.field(default_factory=dict)
+    likeness: Likeness | None = None  # rows `CANDIDATE`, `name` and the nulls
+
+    def __post_init__(self) -> None:
+        """Same cases, all finite where a drive has a number."""
+        count = len(self.ids)
+        rows = {CANDIDATE: self.candidate, self.name: self.incumbent, **self.nulls}
+        for name, metrics in rows.items():
+            for field in ("progress", "at_fault", "holds", "max_j", "rms_a"):
+                values = np.asarray(getattr(metrics, field), np.float64)
+                if len(values) != count:
+                    raise InputError(
+                        f"gate: {name}: {len(values)} cases: expected {count}"
+                    )
+                if not np.isfinite(values).all():
+                    bad = self.ids[int(np.argwhere(~np.isfinite(values))[0, 0])]
+                    raise InputError(
+                        f"gate: {name}: {bad}: {field}: not a finite number"
+                    )
+        if len(set(self.ids)) != count:
+            twice = next(name for name in self.ids if self.ids.count(name) > 1)
+            raise InputError(f"gate: {twice}: met twice: expected distinct cases")
+        for name in ("families", "reference", "preventable"):
+            if len(getattr(self, name)) != count:
+                raise InputError(f"gate: {name}: expected {count} values")

@@ -1,0 +1,340 @@
+"""Learners by name, trained on one frozen set of candidates.
+
+Every learner is a value of the training configuration; nothing else differs.
+`train_learners` gives each the same scenes, candidates, features and steps.
+"""
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tqdm
+
+from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.ranking.score import Scorer
+from rcirl_jax.features import feature_map
+from rcirl_jax.reward import (
+    Normaliser,
+    RewardConfig,
+    RewardParams,
+    fit_normaliser,
+    value,
+)
+from rcirl_jax.train.frozen import Fitted, first_params, fit, freeze, members_of
+from rcirl_jax.train.loop import CHUNK, NORMALISER_SCENES, rows_that_count
+from rcirl_jax.train.state import FeatureBatch, TrainConfig
+
+LINEAR = RewardConfig(hidden=(), pin="none")
+FREE = RewardConfig(pin="none")
+
+# What a learner changes of the shared configuration. The linear rewards are not
+# pinned: with unit norm their values cannot grow to the spread that a logistic or
+# listwise loss asks for. "Free" says the same of the paper's network, whatever
+# the loss; the rank loss has no such row, for it is homogeneous in the scale.
+LEARNERS: dict[str, dict] = {
+    "RC-IRL rank": {"loss": "rank"},
+    "rank linear": {"loss": "rank", "reward": RewardConfig(hidden=())},
+    "rank non-negative": {
+        "loss": "rank",
+        "reward": RewardConfig(hidden=(), constraint="nonnegative"),
+    },
+    "RC-IRL logistic": {"loss": "logistic"},
+    "logistic free": {"loss": "logistic", "reward": FREE},
+    "hinge": {"loss": "hinge"},
+    "hinge free": {"loss": "hinge", "reward": FREE},
+    "MaxEnt": {"loss": "listwise"},
+    "MaxEnt free": {"loss": "listwise", "reward": FREE},
+    "MaxEnt linear": {"loss": "listwise", "reward": LINEAR},
+    "MaxEnt 64": {"loss": "listwise", "reward": RewardConfig(hidden=(64,))},
+    "MaxEnt monotone": {
+        "loss": "listwise",
+        "reward": RewardConfig(constraint="monotone"),
+    },
+    "MaxEnt monotone 64": {
+        "loss": "listwise",
+        "reward": RewardConfig(hidden=(64,), constraint="monotone"),
+    },
+    "MaxEnt 32-16": {"loss": "listwise", "reward": RewardConfig(hidden=(32, 16))},
+    "MaxEnt monotone 32-16": {
+        "loss": "listwise",
+        "reward": RewardConfig(hidden=(32, 16), constraint="monotone"),
+    },
+    "soft labels": {"loss": "soft"},
+    "soft labels free": {"loss": "soft", "reward": FREE},
+    "soft labels linear": {"loss": "soft", "reward": LINEAR},
+    "GAN": {"loss": "gan"},
+    "GAN free": {"loss": "gan", "reward": FREE},
+    # as in the paper: the recorded curve itself is the positive
+    "RC-IRL rank on curves": {"loss": "rank", "positive": "human"},
+    "RC-IRL logistic on curves": {"loss": "logistic", "positive": "human"},
+    "logistic free on curves": {
+        "loss": "logistic",
+        "positive": "human",
+        "reward": FREE,
+    },
+    "GAN on curves": {"loss": "gan", "positive": "human"},
+    "GAN free on curves": {"loss": "gan", "positive": "human", "reward": FREE},
+    "logistic linear": {"loss": "logistic", "reward": LINEAR},
+    "logistic non-negative": {
+        "loss": "logistic",
+        "reward": RewardConfig(hidden=(), pin="none", constraint="nonnegative"),
+    },
+    "logistic 64": {"loss": "logistic", "reward": RewardConfig(hidden=(64,))},
+    "logistic 32-16": {"loss": "logistic", "reward": RewardConfig(hidden=(32, 16))},
+    "logistic monotone": {
+        "loss": "logistic",
+        "reward": RewardConfig(constraint="monotone"),
+    },
+    "logistic by context": {"loss": "logistic"},
+    "non-negative by context": {
+        "loss": "logistic",
+        "reward": RewardConfig(hidden=(), pin="none", constraint="nonnegative"),
+    },
+    "logistic, hard negatives": {
+        "loss": "logistic",
+        "hard_negatives": 12,
+        "hard_pool": 3,
+    },
+}
+
+# one program for all runs of a shape: their weights are arguments
+_value = jax.jit(value, static_argnums=4)
+
+# learners whose features are scaled by the scene; the columns come from the preset
+BY_CONTEXT = ("logistic by context", "non-negative by context")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Learned:
+    """One trained reward."""
+
+    params: RewardParams
+    normaliser: Normaliser
+    config: TrainConfig
+    loss: np.ndarray  # [epochs]
+    wins: np.ndarray  # [epochs]
+    finite: bool  # no step was refused for a NaN or infinity
+
+    @property
+    def scorer(self) -> Scorer:
+        """(features [S, ..., T, F], time_valid [S, ..., T]) -> value [S, ...].
+
+        In calls of `CHUNK` scenes: jaxlib 0.10.2 sums wrongly on CPUs in some
+        fusions with more than 32,768 results (jax-ml/jax issue 39103).
+        """
+
+        def scorer(x: np.ndarray, valid: np.ndarray) -> np.ndarray:
+            of, shape = (self.params, self.normaliser), self.config.reward
+            parts = [slice(i, i + CHUNK) for i in range(0, len(x), CHUNK)]
+            values = [_value(*of, x[part], valid[part], shape) for part in parts]
+            return np.concatenate([np.asarray(made) for made in values])
+
+        return scorer
+
+
+def learner_config(name: str, base: TrainConfig) -> TrainConfig:
+    """The configuration of a named learner.
+
+    Raises:
+      InputError: no learner of that name.
+    """
+    if name not in LEARNERS:
+        raise InputError(f"--learners: {name}: expected some of {sorted(LEARNERS)}")
+    config = dataclasses.replace(base, **LEARNERS[name])
+    features = feature_map(config.features)
+    reward = config.reward
+    if reward.constraint == "monotone":
+        reward = dataclasses.replace(reward, signs=features.signs)
+    if name in BY_CONTEXT:
+        reward = dataclasses.replace(reward, context=features.context)
+    return dataclasses.replace(config, reward=reward)
+
+
+def learner_configs(names: Sequence[str], base: TrainConfig) -> dict[str, TrainConfig]:
+    """The configurations of some learners, by name.
+
+    Raises:
+      InputError: no name, or one that is not known.
+    """
+    if not names:
+        raise InputError(f"--learners: none: expected some of {sorted(LEARNERS)}")
+    return {name: learner_config(name, base) for name in names}
+
+
+class FrozenSets:
+    """Frozen scenes of one split, made once for all configurations that share them.
+
+    Args:
+      dataset: any dataset.
+      split: which scenes.
+      nearest: leave only so many candidates, those nearest to the human; 0: all.
+    """
+
+    def __init__(
+        self, dataset: Demonstrations, split: str = "train", *, nearest: int = 0
+    ) -> None:
+        self.rows, self.index = dataset.load(split), dataset.indices(split)
+        self.weights = dataset.weights(self.index)
+        self.nearest = nearest
+        self._made: dict[TrainConfig, FeatureBatch] = {}
+
+    def of(self, config: TrainConfig) -> FeatureBatch:
+        """Features for a configuration."""
+        key = config.for_features
+        if key not in self._made:
+            made = freeze(self.rows, self.index, key)
+            made = made.replace(weight=jnp.asarray(self.weights))
+            if self.nearest:
+                apart = jnp.where(made.feasible, made.facts.distance, jnp.inf)
+                place = jnp.argsort(jnp.argsort(apart, axis=1), axis=1)
+                made = made.replace(feasible=made.feasible & (place < self.nearest))
+            self._made[key] = made
+        return self._made[key]
+
+
+def fitting_rows(frozen: FeatureBatch, config: TrainConfig) -> np.ndarray:
+    """[n, F] features of some scenes of a frozen set, to fit a normaliser on."""
+    count = frozen.weight.shape[0]
+    chosen = np.random.default_rng(config.seed).permutation(count)
+    some = jax.tree.map(lambda x: np.asarray(x)[chosen[:NORMALISER_SCENES]], frozen)
+    return rows_that_count(some)
+
+
+def normaliser_of(
+    frozen: FeatureBatch, config: TrainConfig, keep: Sequence[str] | None = None
+) -> Normaliser:
+    """Fitted on a frozen set; features that are not kept lose all spread.
+
+    An infinite scale turns a feature into 0 for the network.
+    """
+    features = feature_map(config.features)
+    made = fit_normaliser(fitting_rows(frozen, config), features)
+    if keep is None:
+        return made
+    kept = jnp.asarray([name in keep for name in features.names])
+    return made.replace(scale=jnp.where(kept, made.scale, jnp.inf))
+
+
+def train_grid(
+    frozen: FeatureBatch,
+    config: TrainConfig,
+    leaky_rates: Sequence[float],
+    seeds: Sequence[int],
+    *,
+    keep: Sequence[str] | None = None,
+) -> dict[float, list[Learned]]:
+    """Leaky rates x seeds as members of one program; they share the batch order."""
+    grid = [
+        dataclasses.replace(config, seed=seed, leaky_rate=rate)
+        for rate in leaky_rates
+        for seed in seeds
+    ]
+    runs = iter(_side_by_side(frozen, config, grid, keep))
+    return {rate: [next(runs) for _ in seeds] for rate in leaky_rates}
+
+
+def train_with_each(
+    frozen: FeatureBatch, config: TrainConfig, optimizers: Sequence[str]
+) -> dict[str, Learned]:
+    """One configuration with several optimisers, as members of one program.
+
+    Each takes the steps that `train_learner` would take: same first weights, same
+    batches, its own state.
+    """
+    each = [dataclasses.replace(config, optimizer=name) for name in optimizers]
+    runs = _side_by_side(frozen, config, each, None)
+    return dict(zip(optimizers, runs, strict=True))
+
+
+def _side_by_side(
+    frozen: FeatureBatch,
+    config: TrainConfig,
+    members: Sequence[TrainConfig],
+    keep: Sequence[str] | None,
+) -> list[Learned]:
+    """Members of one program; candidates, batches, normaliser are of `config`."""
+    normaliser = normaliser_of(frozen, config, keep)
+    fitted = fit(frozen, normaliser, config, members_of(members))
+    return [
+        _learned(jax.tree.map(lambda leaf, n=n: leaf[n], fitted), normaliser, own)
+        for n, own in enumerate(members)
+    ]
+
+
+def train_learner(
+    frozen: FeatureBatch,
+    config: TrainConfig,
+    seeds: Iterable[int],
+    *,
+    keep: Sequence[str] | None = None,
+) -> list[Learned]:
+    """One configuration trained with several seeds (weights and batch order)."""
+    normaliser = normaliser_of(frozen, config, keep)
+    found = []
+    for seed in seeds:
+        own = dataclasses.replace(config, seed=seed)
+        fitted = fit(frozen, normaliser, own, members_of([own]))
+        one = jax.tree.map(lambda leaf: leaf[0], fitted)
+        found.append(_learned(one, normaliser, own))
+    return found
+
+
+def _learned(one: Fitted, normaliser: Normaliser, config: TrainConfig) -> Learned:
+    return Learned(
+        params=one.params,
+        normaliser=normaliser,
+        config=config,
+        loss=np.asarray(one.loss),
+        wins=np.asarray(one.wins),
+        finite=bool(one.finite),
+    )
+
+
+def untrained(runs: Sequence[Learned]) -> list[Learned]:
+    """Networks 21-15-1 before their first step, with the runs' inputs and seeds."""
+    nothing, made = np.zeros(0), []
+    for run in runs:
+        config = dataclasses.replace(run.config, reward=RewardConfig(), loss="rank")
+        count = feature_map(config.features).num_features
+        params = first_params(config.seed, count, config)
+        made.append(
+            dataclasses.replace(
+                run, params=params, config=config, loss=nothing, wins=nothing
+            )
+        )
+    return made
+
+
+def pair_wins(
+    frozen: FeatureBatch, runs: Sequence[Learned]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs that the positive wins (ties half), [R, S], and pairs [S]."""
+    won, feasible = [], np.asarray(frozen.feasible)
+    points, spread = np.asarray(frozen.points), np.asarray(frozen.points_valid)
+    for run in runs:
+        human = run.scorer(np.asarray(frozen.human), np.asarray(frozen.time_valid))
+        y = run.scorer(points, spread) - human[:, None]
+        won.append(np.sum(((y < 0.0) + 0.5 * (y == 0.0)) * feasible, axis=1))
+    return np.array(won), feasible.sum(axis=1)
+
+
+def train_learners(
+    dataset: Demonstrations,
+    configs: Mapping[str, TrainConfig],
+    seeds: Sequence[int],
+) -> dict[str, list[Learned]]:
+    """All learners of a comparison on the dataset's training split."""
+    sets, found = FrozenSets(dataset), {}
+    with tqdm.tqdm(configs.items(), desc="train", unit="learner") as bar:
+        for name, config in bar:
+            bar.set_postfix_str(name)
+            found[name] = train_learner(sets.of(config), config, seeds)
+    return found
+
+
+def scorers(learned: Mapping[str, Sequence[Learned]]) -> dict[str, list[Scorer]]:
+    """Row -> one scorer per seed, as `evaluate_ranking` takes them."""
+    return {name: [one.scorer for one in runs] for name, runs in learned.items()}

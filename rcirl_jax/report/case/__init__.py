@@ -1,0 +1,1 @@
+"""One drive as a page: what happened, when and why it failed."""

@@ -1,0 +1,1 @@
+"""Pictures and the page of an import: scenes as they were cut."""

@@ -1,0 +1,1 @@
+"""Cases driven again for the report, and the player that shows them."""

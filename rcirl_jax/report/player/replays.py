@@ -1,0 +1,272 @@
+"""Named cases driven again by several rows, thinned for a player in a web page.
+
+A frame holds the ego, the agents near it, its plan and the stop lines that demand
+a stop. Frame i is the moment (i + 1) * FRAME_STEPS * 0.1 s; the last one is the end of
+the drive. Numbers are rounded to what a screen can show: a drive of 120 s takes about
+100 kB of JSON.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.report.case.drive import plan_start, road_in_plane, worst_step
+from rcirl_jax.simulation.cases import (
+    ROAD_STEP_M,
+    STEP_S,
+    Case,
+    LineKind,
+    Record,
+    Snapshot,
+)
+from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics
+from rcirl_jax.simulation.rows import RECORDED_HUMAN, Row, human_row
+from rcirl_jax.simulation.suite import CaseSet, drive_with_logs, rollout_config
+from rcirl_jax.types import Kind
+from rcirl_jax.units import TIMES_S
+
+MAX_CASES = 6  # cases of a page
+FRAME_STEPS = 2  # simulator steps between two frames: 5 Hz
+BEHIND_M, AHEAD_M = 45.0, 110.0  # m of road around the ego in which agents are kept
+PLAN_AHEAD_S = np.arange(1.0, 6.0)  # s ahead of the frame at which the plan is kept
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Drive:
+    """One row's drive of a case, [I] frames; JSON-ready."""
+
+    row: str
+    summary: str
+    # (s, what happened), in order of time; the moment to look at first is one
+    events: list[tuple[float, str]]
+    start: float  # s, the moment to look at first
+    end: str  # what ended the drive before its time, or ""
+    s: list[float]  # [I] m, station
+    l: list[float]  # [I] m
+    heading: list[float]  # [I] rad, against the reference line
+    v: list[float]  # [I] m/s
+    a: list[float]  # [I] m/s^2
+    clearance: list[float | None]  # [I] m; None: nobody near
+    # [I] stations of the plan in force, m beyond s, at PLAN_AHEAD_S
+    plan: list[list[float]]
+    red: list[list[int]]  # [I] numbers of the lines that demand a stop
+    # [I] flat quadruples: slot, s, l, heading
+    agents: list[list[float]]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Replay:
+    """One case driven by every row; JSON-ready by `dataclasses.asdict`."""
+
+    case: str
+    group: str
+    parameters: dict[str, float]
+    frame_s: float  # s between frames
+    road_step: float  # m between the points of the road
+    x: list[float]  # [R] m, reference line
+    y: list[float]  # [R] m
+    turn: list[float]  # [R] rad, its heading
+    path_l: list[float]  # [R] m, offset of the path given to the ego
+    edges: tuple[float, float]  # m, offsets of the road's edges, left and right
+    marks: list[float]  # m, offsets of the lane marks
+    lines: list[float]  # m, stations of the stop lines
+    ego: tuple[float, float]  # m, length and width
+    # slot -> (kind, length, width) of whoever is met
+    bodies: dict[int, tuple[str, float, float]]
+    drives: tuple[Drive, ...]
+
+
+def make_replays(
+    rows: Sequence[Row], cases: CaseSet, ids: Sequence[str], plan_every: int
+) -> list[Replay]:
+    """Drive the named cases with every row, and with the recorded human if any.
+
+    On a CPU the drives are those of the suite (`drive_with_logs`); elsewhere they
+    differ in the last digit, and traffic is chaotic: then a replay's numbers are its
+    own.
+
+    Args:
+      rows: who drives; names differ.
+      cases: the suite.
+      ids: cases of it; the first `MAX_CASES` are driven.
+      plan_every: steps of 0.1 s between two plans.
+
+    Raises:
+      InputError: a case that the suite does not have.
+    """
+    ids = list(dict.fromkeys(ids))[:MAX_CASES]
+    for name in ids:
+        if name not in cases.ids:
+            raise InputError(f"replays: case: {name}: expected a case of the suite")
+    if not ids:
+        return []
+    places = [cases.ids.index(name) for name in ids]
+    built = [cases.build(place, place + 1) for place in places]
+    every = jax.tree.map(lambda *x: np.concatenate(x), *built)
+    if every.replay is None:
+        rows = [row for row in rows if not row.follow_log]
+    elif not any(row.follow_log for row in rows):
+        rows = [*rows, human_row()]
+    drives: list[list[Drive]] = [[] for _ in ids]
+    for row in rows:
+        config = rollout_config(row, cases.duration_s, plan_every)
+        driven = (every, *drive_with_logs(row, every, config))
+        for number in range(len(ids)):
+            one = jax.tree.map(lambda x, at=number: np.asarray(x[at]), driven)
+            drives[number].append(thin(row.name, *one))
+    return [
+        _replay(name, cases, place, jax.tree.map(lambda x: x[0], one), tuple(found))
+        for name, place, one, found in zip(ids, places, built, drives, strict=True)
+    ]
+
+
+def thin(
+    row: str, case: Case, metrics: CaseMetrics, record: Record, shot: Snapshot
+) -> Drive:
+    """One drive's frames; unbatched numpy leaves, record and snapshots [S]."""
+    last = int(np.flatnonzero(record.valid)[-1])
+    steps = np.arange(FRAME_STEPS - 1, last + FRAME_STEPS, FRAME_STEPS)
+    steps = np.minimum(steps, last)  # the end is a frame
+    events, start = _events(case, record, last)
+    follows = row == RECORDED_HUMAN
+    short = (last + 1) * STEP_S < float(case.steps) * STEP_S - 1e-6
+    red = np.asarray(shot.line_red, bool) & (case.lines.kind != LineKind.NONE)
+    return Drive(
+        row=row,
+        summary=_summary(metrics),
+        events=events,
+        start=start,
+        end="ended by a collision of its own fault" if short else "",
+        s=_rounded(record.s[steps], 1),
+        l=_rounded(record.l[steps], 2),
+        heading=_rounded(record.heading[steps], 3),
+        v=_rounded(record.v[steps], 1),
+        a=_rounded(record.a[steps], 1),
+        clearance=[
+            round(float(x), 1) if np.isfinite(x) else None
+            for x in record.clearance[steps]
+        ],
+        plan=[[] if follows else _plan(record, shot, int(step)) for step in steps],
+        red=[np.flatnonzero(red[step]).tolist() for step in steps],
+        agents=[_agents(case, record, shot, int(step)) for step in steps],
+    )
+
+
+def _rounded(values: ArrayLike, digits: int) -> list[float]:
+    return np.round(np.asarray(values, np.float64), digits).tolist()
+
+
+def _plan(record: Record, shot: Snapshot, step: int) -> list[float]:
+    """Stations of the plan in force, beyond the ego's, while the plan lasts."""
+    now = (step + 1) * STEP_S
+    ahead = now + PLAN_AHEAD_S - plan_start(record, shot, step)
+    ahead = ahead[ahead <= TIMES_S[-1]]
+    stations = np.interp(ahead, TIMES_S, shot.plan_s[step])
+    return _rounded(stations - record.s[step], 1)
+
+
+def _agents(case: Case, record: Record, shot: Snapshot, step: int) -> list[float]:
+    """Who is there; whom the ego has hit since the last frame is shown once more."""
+    agents = shot.agents
+    before = max(step - FRAME_STEPS, 0)
+    present = np.asarray(agents.present[step], bool)
+    if np.any(record.collision[before + 1 : step + 1] > 0):
+        hit = np.asarray(agents.gone[step], bool) & agents.present[before]
+        present = present | hit
+    ahead = np.asarray(agents.s[step]) - float(record.s[step])
+    near = (ahead > -BEHIND_M) & (ahead < AHEAD_M)
+    found: list[float] = []
+    for slot in np.flatnonzero(present & near & (case.agents.kind != Kind.NONE)):
+        found += [
+            int(slot),
+            round(float(agents.s[step, slot]), 1),
+            round(float(agents.l[step, slot]), 2),
+            round(float(agents.heading[step, slot]), 2),
+        ]
+    return found
+
+
+def _events(
+    case: Case, record: Record, last: int
+) -> tuple[list[tuple[float, str]], float]:
+    """What happened and when, and the moment to look at first."""
+    time = lambda step: round((int(step) + 1) * STEP_S, 1)  # noqa: E731
+    found = []
+    for name, happens in (
+        ("collision of its own fault", record.at_fault > 0),
+        ("collision", (record.collision > 0) & (record.at_fault == 0)),
+        ("red light run", record.red_light),
+        ("stop sign run", record.stop_sign),
+    ):
+        steps = np.flatnonzero(np.asarray(happens, bool)[: last + 1])
+        found += [(time(step), name) for step in steps]
+    worst = min(worst_step(record), last)
+    if found:
+        start = min(found)[0]
+    else:
+        gap = float(record.clearance[worst])
+        what = (
+            f"closest, {max(gap, 0.0):.1f} m" if np.isfinite(gap) else "hardest braking"
+        )
+        start = time(worst)
+        found.append((start, what))
+    return sorted(found), start
+
+
+def _summary(found: CaseMetrics) -> str:
+    """The drive's own numbers in one line."""
+    failed = [
+        name.replace("_", " ")
+        for name, holds in zip(COLUMNS, found.holds, strict=True)
+        if not holds
+    ]
+    for name in ("red_lights", "stop_signs"):
+        if getattr(found, name) > 0:
+            failed.append(name.replace("_", " "))
+    gap = float(found.min_clearance)
+    near = f"closest {max(gap, 0.0):.1f} m" if np.isfinite(gap) else "nobody near"
+    broken = f"fails {', '.join(failed)}" if failed else "all bounds hold, no line run"
+    return f"{float(found.progress):.0f} m driven, {near}, {broken}"
+
+
+def _replay(
+    name: str, cases: CaseSet, place: int, case: Case, drives: tuple[Drive, ...]
+) -> Replay:
+    """The case's road up to where the drives have looked."""
+    road = case.road
+    reach = max(max(drive.s) for drive in drives) + AHEAD_M
+    count = min(int(reach / ROAD_STEP_M) + 2, len(road.kappa))
+    x, y, turn = road_in_plane(np.asarray(road.kappa))
+    edges = float(road.edge_left), float(road.edge_right)
+    lanes = range(-int(road.lanes_right), int(road.lanes_left) + 2)
+    marks = [(lane - 0.5) * float(road.lane_width) for lane in lanes]
+    met = {int(a) for drive in drives for frame in drive.agents for a in frame[::4]}
+    who, lines = case.agents, case.lines
+    return Replay(
+        case=name,
+        group=cases.groups[place],
+        parameters={k: round(float(v), 3) for k, v in cases.parameters[place].items()},
+        frame_s=FRAME_STEPS * STEP_S,
+        road_step=ROAD_STEP_M,
+        x=_rounded(x[:count], 2),
+        y=_rounded(y[:count], 2),
+        turn=_rounded(turn[:count], 4),
+        path_l=_rounded(road.path_l[:count], 2),
+        edges=(round(edges[0], 2), round(edges[1], 2)),
+        marks=[round(l, 2) for l in marks if edges[1] + 0.2 < l < edges[0] - 0.2],
+        lines=_rounded(np.where(lines.kind != LineKind.NONE, lines.s, -1e4), 1),
+        ego=(round(float(case.ego_length), 2), round(float(case.ego_width), 2)),
+        bodies={
+            slot: (
+                Kind(int(who.kind[slot])).name.lower(),
+                round(float(who.length[slot]), 2),
+                round(float(who.width[slot]), 2),
+            )
+            for slot in sorted(met)
+        },
+        drives=drives,
+    )

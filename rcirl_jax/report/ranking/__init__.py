@@ -1,0 +1,1 @@
+"""Pictures of ranking results: intervals, frames, sweeps."""

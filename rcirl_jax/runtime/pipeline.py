@@ -1,0 +1,209 @@
+"""Stages of a run: each is done once for its inputs, and again when they change.
+
+RUN/stages.json names, for every finished stage, the settings and hashes it was made
+from and the sha256 of what it made. A stage is skipped if both are as they were; a
+killed run goes on with the first stage that is not. It also says which commit, versions
+and flags did the work, which decides nothing. One process at a time.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import hashlib
+import json
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.runtime.atomic_files import locked, read_json, write_json
+from rcirl_jax.runtime.specs import spec_root
+
+FILE = "stages.json"
+LOCK = ".lock"  # in a folder that one process at a time works in
+SCHEMA_VERSION = 1
+
+
+def file_sha256(path: Path) -> str:
+    """Of a file's bytes."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def digest(node: Any) -> str:  # noqa: ANN401
+    """Sha256 of anything that JSON can say."""
+    text = json.dumps(node, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+@functools.cache
+def code_sha256() -> str:
+    """Of this package's sources and of the specs that users edit."""
+    package = Path(__file__).resolve().parents[1]
+    found = {}
+    for root, pattern in ((package, "*.py"), (spec_root(), "*.toml")):
+        for file in sorted(root.rglob(pattern)):
+            found[f"{pattern} {file.relative_to(root)}"] = file_sha256(file)
+    return digest(found)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Stages:
+    """The stages of one run folder."""
+
+    folder: Path
+
+    def run(
+        self,
+        name: str,
+        inputs: Mapping[str, Any],
+        outputs: Sequence[Path],
+        work: Callable[[], object],
+        stale: Sequence[str] = (),
+        made_by: Mapping[str, Any] | None = None,
+    ) -> bool:
+        """Do the work unless it has been done from these inputs.
+
+        Args:
+          name: of the stage.
+          inputs: settings and hashes that decide the outputs; JSON.
+          outputs: files that the work writes, below the folder.
+          work: writes them.
+          stale: stages whose outputs would mislead beside new ones; they are removed
+            before the work.
+          made_by: commit, versions and flags, noted of work done now; they decide
+            nothing.
+
+        Returns:
+          Whether it was done now.
+
+        Raises:
+          InputError: the work left an output unwritten.
+        """
+        known = self.read().get(name, {})
+        if known.get("key") == digest(inputs) and self._intact(known, outputs):
+            return False
+        begin = time.monotonic()
+        self._forget(stale)
+        work()
+        made = {}
+        for path in outputs:
+            if not path.is_file():
+                raise InputError(f"{path}: missing after stage {name}")
+            made[str(path.relative_to(self.folder))] = file_sha256(path)
+        record = {
+            "key": digest(inputs),
+            "inputs": dict(inputs),
+            "outputs": made,
+            "seconds": round(time.monotonic() - begin, 1),
+            **({"made_by": dict(made_by)} if made_by else {}),
+        }
+        self._write({**self.read(), name: record})
+        return True
+
+    def _forget(self, names: Sequence[str]) -> None:
+        """Remove the outputs of stages, then their records."""
+        known, inside = self.read(), self.folder.resolve()
+        for name in names:
+            for file in known.get(name, {}).get("outputs", {}):
+                path = self.folder / file
+                where = path.parent.resolve()  # the file itself may be a link
+                if path.name == ".." or not where.is_relative_to(inside):
+                    raise InputError(
+                        f"{self.folder / FILE}: {name}: {file}: expected a file of"
+                        " the run's folder"
+                    )
+                try:
+                    path.unlink(missing_ok=True)
+                except OSError as error:
+                    raise InputError(
+                        f"{self.folder / FILE}: {name}: {file}: {error.strerror}:"
+                        " expected a file of the run's folder"
+                    ) from error
+        kept = {name: record for name, record in known.items() if name not in names}
+        if kept != known:
+            self._write(kept)
+
+    def _intact(self, known: Mapping[str, Any], outputs: Sequence[Path]) -> bool:
+        made = known.get("outputs", {})
+        names = [str(path.relative_to(self.folder)) for path in outputs]
+        return sorted(made) == sorted(names) and all(
+            path.is_file() and file_sha256(path) == made[name]
+            for path, name in zip(outputs, names, strict=True)
+        )
+
+    def read(self) -> dict[str, Any]:
+        """Finished stages by name.
+
+        Raises:
+          InputError: the file is not one of this version.
+        """
+        path = self.folder / FILE
+        if not path.exists():
+            return {}
+        body = read_json(path, "the stages of a run")
+        found = body if isinstance(body, dict) else {}
+        version, stages = found.get("schema_version"), found.get("stages")
+        if version != SCHEMA_VERSION:
+            raise InputError(
+                f"{path}: schema_version: {version}: expected {SCHEMA_VERSION}"
+            )
+        if not isinstance(stages, dict):
+            raise InputError(f"{path}: stages: damaged: expected a table")
+        for name, record in stages.items():
+            if not _is_record(record):
+                raise InputError(f"{path}: {name}: damaged: expected a stage's record")
+        return stages
+
+    def _write(self, stages: Mapping[str, Any]) -> None:
+        body = {"schema_version": SCHEMA_VERSION, "stages": dict(stages)}
+        write_json(self.folder / FILE, body)
+
+
+def _is_record(record: object) -> bool:
+    """Whether it is what `Stages.run` writes of a stage."""
+    made = record.get("outputs") if isinstance(record, dict) else None
+    if not isinstance(record, dict) or not isinstance(made, dict):
+        return False
+    texts = [record.get("key"), *made.values()]
+    return (
+        all(isinstance(text, str) for text in texts)
+        and all("\0" not in file for file in made)
+        and isinstance(record.get("inputs", {}), dict)
+        and isinstance(record.get("seconds", 0.0), int | float)
+    )
+
+
+@contextlib.contextmanager
+def only_one(folder: Path, *, leave_nothing: bool = False) -> Iterator[None]:
+    """Hold a folder for this process; it is made if missing.
+
+    The lock goes with the process, however that ends; its file means nothing.
+
+    Args:
+      folder: to hold.
+      leave_nothing: remove the lock's file at the end, and folders made for it that
+        are empty then.
+
+    Raises:
+      InputError: another process holds it.
+    """
+    path = folder / LOCK
+    made = [x for x in (folder, *folder.parents) if not os.path.lexists(x)]
+    with contextlib.ExitStack() as held:
+        try:
+            held.enter_context(locked(path, wait=False))
+        except BlockingIOError as error:
+            raise InputError(
+                f"{folder}: in use by another process: expected one run at a time"
+            ) from error
+        try:
+            yield
+        finally:
+            if leave_nothing:
+                path.unlink(missing_ok=True)
+                with contextlib.suppress(OSError):
+                    for one in made:
+                        one.rmdir()
