@@ -19,7 +19,7 @@ from rcirl_jax.reward.network import CONSTRAINTS, PINS
 from rcirl_jax.sampling.config import MODES
 from rcirl_jax.train.state import (
     ADMISSIBLE_IN,
-    FUTURES,
+    LEARNED_FUTURES,
     OPTIMIZERS,
     POSITIVES,
     TrainConfig,
@@ -57,7 +57,9 @@ _TRAIN = {
     "positive": _one_of(
         "positive", POSITIVES, "ranked first: the human curve or its nearest candidate"
     ),
-    "futures": _one_of("futures", FUTURES, "of the others, as a learner sees them"),
+    "futures": _one_of(
+        "futures", LEARNED_FUTURES, "of the others, as a learner sees them"
+    ),
     "admissible_in": _one_of(
         "admissible_in",
         ADMISSIBLE_IN,

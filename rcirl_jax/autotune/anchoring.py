@@ -29,12 +29,21 @@ class Anchoring:
 
     low: float = 0.0  # where nothing like the scene was recorded
     high: float = 0.0  # where all of it was; 0: no anchor, V drives alone
+    # shares of the ego's speed at which the rehearsed scenes are shown once more: who
+    # is slow on an empty road is not in recorded traffic for being slow
+    slowed: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        """0 <= low <= high."""
+        """0 <= low <= high, and 0 <= slowed < 1."""
         if not 0.0 <= self.low <= self.high:
             raise InputError(
                 f"anchor: low, high: {self.low}, {self.high}: expected 0 <= low <= high"
+            )
+
+        if not all(0.0 <= share < 1.0 for share in self.slowed):
+            raise InputError(
+                f"anchor: slowed: {list(self.slowed)}: expected shares of the speed, "
+                "each at least 0 and below 1"
             )
 
     @property
@@ -62,7 +71,13 @@ def fitted_anchor(
     mine = [_training_scenes(one, features) for one in recorded]
     pairs = zip(mine, shares, strict=True)
     weights = np.concatenate([np.full(len(x), share / len(x)) for x, share in pairs])
-    others = np.concatenate([_training_scenes(one, features) for one in elsewhere])
+    others = np.concatenate(
+        [
+            scenes
+            for one in elsewhere
+            for scenes in _also_slowed(one, features, config.slowed)
+        ]
+    )
     made = fit_support(
         np.concatenate(mine), weights, others, np.asarray(of_the_scene(features))
     )
@@ -95,3 +110,13 @@ def read_anchor(path: Path) -> Anchor:
 
 def _training_scenes(dataset: Dataset, features: FeatureMap) -> np.ndarray:
     return scene_features(dataset.load("train").scene, features)
+
+
+def _also_slowed(
+    dataset: Dataset, features: FeatureMap, shares: Sequence[float]
+) -> list[np.ndarray]:
+    """Features of the training scenes, and of the same with a slower, steady ego."""
+    scene = dataset.load("train").scene
+    egos = [scene.ego.replace(v=x * scene.ego.v, a=0.0 * scene.ego.a) for x in shares]
+    scenes = [scene, *[scene.replace(ego=ego) for ego in egos]]
+    return [scene_features(one, features) for one in scenes]

@@ -236,3 +236,20 @@ def as_seen(scene: Scene) -> Scene:
         bodies_now(o), nearest(Kind.STOP), nearest(Kind.VIRTUAL), scene.ego, scene.path
     )
     return scene.replace(obstacles=seen)
+
+
+def either(scene: Scene, predicted: jax.Array) -> Scene:
+    """A scene from a log as the planner sees it, or as recorded.
+
+    Args:
+      scene: of a log; the slots of both forms are as many as the log's.
+      predicted: [] bool, which of the two.
+    """
+    more = scene.obstacles.valid.shape[0] - (NUM_BODIES + 2)
+
+    def one(seen: jax.Array, recorded: jax.Array) -> jax.Array:
+        empty = [(0, more), *[(0, 0)] * (seen.ndim - 1)]
+        return jnp.where(predicted, jnp.pad(seen, empty), recorded)
+
+    obstacles = jax.tree.map(one, as_seen(scene).obstacles, scene.obstacles)
+    return scene.replace(obstacles=obstacles)

@@ -81,7 +81,7 @@ def _make(
     seen = jnp.asarray(TIMES_S) <= config.train_horizon + 1e-6
 
     def one(scene: Scene, s: jax.Array, l: jax.Array) -> tuple:
-        if config.futures == "predicted":
+        if config.futures != "recorded":
             scene = as_seen(scene)
         along = jax.vmap(trajectory_on_path, in_axes=(None, 0))
         across = jax.vmap(trajectory_from_positions, in_axes=(None, 0, 0))

@@ -32,6 +32,7 @@ OPTIMIZERS: dict[
 POSITIVES = ("human", "nearest")
 # what the learner sees of the others' future: the planner's prediction, or the record
 FUTURES = ("predicted", "recorded")
+LEARNED_FUTURES = (*FUTURES, "both")
 ADMISSIBLE_IN = ("none", "rehearsed", "all")
 
 
@@ -89,7 +90,8 @@ class TrainConfig:
     # scenes in which the nearest candidate has to be one that the planner's safety
     # filter admits: "none", "rehearsed" ones (a planner drove there), or "all"
     admissible_in: str = "rehearsed"
-    # the others' future: "predicted" as in closed loop, or "recorded" as in the paper
+    # the others' future: "predicted" as in closed loop, "recorded" as in the paper, or
+    # "both": drawn anew for each scene and step, so that V can be asked about either
     futures: str = "predicted"
     # s, times after it are not compared, nor their weights learned
     train_horizon: float = 8.0
@@ -108,7 +110,7 @@ class TrainConfig:
     def __post_init__(self) -> None:
         """Reject values out of range with the flag's name."""
         known = {"loss": LOSSES, "optimizer": OPTIMIZERS, "positive": POSITIVES}
-        known |= {"futures": FUTURES, "admissible_in": ADMISSIBLE_IN}
+        known |= {"futures": LEARNED_FUTURES, "admissible_in": ADMISSIBLE_IN}
         for name, values in known.items():
             if getattr(self, name) not in values:
                 raise InputError(

@@ -16,7 +16,7 @@ import optax
 
 from rcirl_jax.features import FeatureMap, feature_map
 from rcirl_jax.features.columns import candidate_frames
-from rcirl_jax.planner.prediction import as_seen
+from rcirl_jax.planner.prediction import as_seen, either
 from rcirl_jax.reward import (
     Compared,
     LossConfig,
@@ -52,12 +52,14 @@ from rcirl_jax.types import (
     Demonstration,
     Normaliser,
     RewardParams,
+    Scene,
     Trajectory,
 )
 from rcirl_jax.units import TIMES_S
 
 SAMPLER_STREAM = 0  # fold_in number of the sampler's key
 NEGATIVE_STREAM = 1  # fold_in number of the hard negatives' key
+FUTURES_STREAM = 2  # fold_in number of the draw between futures
 
 
 class StepMetrics(flax.struct.PyTreeNode, kw_only=True):
@@ -106,6 +108,15 @@ def candidates_of(
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), sampled, near)
 
 
+def _under_futures(key: jax.Array, scene: Scene, futures: str) -> Scene:
+    """The others' future as `TrainConfig.futures` says. Key not consumed."""
+    if futures == "recorded":
+        return scene
+    if futures == "predicted":
+        return as_seen(scene)
+    return either(scene, jax.random.bernoulli(jax.random.fold_in(key, FUTURES_STREAM)))
+
+
 def featurise(
     key: jax.Array, batch: Batch, config: TrainConfig, features: FeatureMap
 ) -> FeatureBatch:
@@ -118,9 +129,9 @@ def featurise(
     seen = jnp.asarray(TIMES_S) <= config.train_horizon + 1e-6
 
     def one(index: jax.Array, demonstration: Demonstration) -> tuple:
-        if config.futures == "predicted":
-            demonstration = demonstration.replace(scene=as_seen(demonstration.scene))
         own_key = jax.random.fold_in(key, index)
+        scene = _under_futures(own_key, demonstration.scene, config.futures)
+        demonstration = demonstration.replace(scene=scene)
         valid = demonstration.scene.time_valid & seen
         candidates = candidates_of(own_key, demonstration, config)
         driven = human_of(demonstration, config.sampler)

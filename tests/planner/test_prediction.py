@@ -14,6 +14,7 @@ from rcirl_jax.planner.prediction import (
     Bodies,
     as_seen,
     bodies_now,
+    either,
     predict,
     relevant,
 )
@@ -135,6 +136,18 @@ def test_to_look_twice_shows_the_same(seed):
         a, b = (np.asarray(getattr(x.obstacles, name)) for x in (once, twice))
         np.testing.assert_allclose(a[known], b[known], atol=1e-3)
     np.testing.assert_array_equal(known, twice.obstacles.valid)
+
+
+@pytest.mark.parametrize("predicted", [True, False])
+def test_either_future_of_a_scene(predicted):
+    made = jax.tree.map(jnp.asarray, random_scene(2))
+    found = jax.jit(either)(made, jnp.asarray(predicted)).obstacles
+    wanted = (AS_SEEN(made) if predicted else made).obstacles
+    slots = wanted.valid.shape[0]
+    same = jax.tree.map(lambda x, y: np.array_equal(x[:slots], y), found, wanted)
+    assert all(jax.tree.leaves(same))
+    assert not np.asarray(found.valid)[slots:].any()
+    assert found.valid.shape == made.obstacles.valid.shape
 
 
 def test_all_leaves_of_bodies_come_back():

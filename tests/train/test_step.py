@@ -248,6 +248,22 @@ def test_what_only_the_loss_reads_names_its_scene(loss, field, value):
     check_step(metrics, known, 7)
 
 
+def test_either_future_is_learned_from():
+    """With "both" a scene is seen as predicted or as recorded, another time anew."""
+
+    def made(futures, key=0):
+        config = dataclasses.replace(CONFIG, futures=futures)
+        return np.asarray(featurised(jax.random.key(key), batch(), config).candidates)
+
+    same = lambda x, y: np.isclose(x, y, atol=1e-4).all(axis=(1, 2, 3))  # noqa: E731
+    as_predicted = same(made("both"), made("predicted"))
+    as_recorded = same(made("both"), made("recorded"))
+    assert (as_predicted | as_recorded).all()
+    assert 0 < np.sum(as_predicted & ~as_recorded) < 16
+    again = same(made("both", key=1), made("predicted", key=1))
+    assert (again != as_predicted).any()
+
+
 def test_candidates_of_a_scene_do_not_depend_on_the_batch():
     state = init_state(CONFIG, normaliser())
     some = jax.tree.map(lambda x: x[4:8], batch())
