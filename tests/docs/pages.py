@@ -6,7 +6,14 @@ from pathlib import Path
 REPO = Path(__file__).resolve().parents[2]
 DOCS = REPO / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
-TOP = ("README.md", "BUILD.md", "CONTRIBUTING.md", "SECURITY.md", "onboard/README.md")
+TOP = (
+    "README.md",
+    "BUILD.md",
+    "ROADMAP.md",
+    "CONTRIBUTING.md",
+    "SECURITY.md",
+    "onboard/README.md",
+)
 ALL = [*PAGES, *(REPO / name for name in TOP)]
 
 FENCE = re.compile(r"^```(\w*)(?: title=\"([^\"]+)\")?\n(.*?)^```$", re.M | re.S)
