@@ -8,7 +8,7 @@ from rcirl_jax.autotune.rehearsal import Rehearsal
 from rcirl_jax.data.store.joined import EQUAL
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.gate.types import GateConfig
-from rcirl_jax.export.sweep import read_sweep
+from rcirl_jax.export.sweep.result import read_sweep
 from rcirl_jax.train.state import TrainConfig
 
 

@@ -13,7 +13,8 @@ from rcirl_jax.evaluation.gate.runs import CANDIDATE, INCUMBENT
 from rcirl_jax.evaluation.gate.types import Verdict
 from rcirl_jax.evaluation.ranking.table import from_json
 from rcirl_jax.export.loading import open_reward
-from rcirl_jax.export.sweep import SWEEP, read_sweep
+from rcirl_jax.export.sweep.folder import SWEEP
+from rcirl_jax.export.sweep.result import read_sweep
 from rcirl_jax.report.player.recorded_replays import recorded_replays
 from rcirl_jax.report.player.replays import Replay, make_replays
 from rcirl_jax.report.tuning.page import TuningReport, write_tuning_page
