@@ -16,9 +16,11 @@ from benchmarks.reliability.fuzz.logs import LOGS
 from benchmarks.reliability.fuzz.targets import Bytes, OneFile, Reader, Target
 from rcirl_jax.data.importers.synthetic import reader as synthetic
 from rcirl_jax.data.scenes import signal_checks
-from rcirl_jax.data.store import dataset as store
+from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.files import FACTS, MANIFEST, MARK, Files
+from rcirl_jax.data.store.manifest import parse_manifest, shard_entry
 from rcirl_jax.data.store.preferences import SCHEMA, read_preferences
+from rcirl_jax.data.store.shards import describe, shard_info
 from rcirl_jax.evaluation.closed_loop.files import (
     COLUMNS,
     SuiteRuns,
@@ -89,8 +91,8 @@ def sealed(folder: Path) -> Target:
     mark = place / "shards" / "00000" / MARK
 
     def read() -> None:
-        store.parse_manifest((place / MANIFEST).read_bytes(), files)
-        store.shard_entry(store.shard_info(files, 0))
+        parse_manifest((place / MANIFEST).read_bytes(), files)
+        shard_entry(shard_info(files, 0))
 
     return Target(read, [place / MANIFEST, mark])
 
@@ -110,7 +112,7 @@ def dataset(folder: Path) -> Target:
     )
 
     def read() -> None:
-        found = store.open_dataset(place)
+        found = open_dataset(place)
         for split in (None, *found.manifest.splits):
             found.indices(split)
         for name in ("human.s", "scene.tags"):
@@ -121,7 +123,7 @@ def dataset(folder: Path) -> Target:
 
 def made_by(folder: Path) -> Target:
     """What made a dataset, as it is read from beside the manifest."""
-    made = store.open_dataset(_dataset(folder))
+    made = open_dataset(_dataset(folder))
     made.write_facts({"git_commit": "2fe49aa", "flags": ["--stride=1"], "cores": 2})
     return Target(made.facts, [folder / "dataset" / FACTS])
 
@@ -134,7 +136,7 @@ def _chain(place: Path, shard: Path, files: list[Path], index: int) -> None:
         mark = json.loads((shard / MARK).read_text())
         if index > 1:
             key = files[index].relative_to(shard).as_posix()
-            mark["files"][key] = store.describe(files[index].read_bytes())
+            mark["files"][key] = describe(files[index].read_bytes())
             mark.pop("sha256")
             (shard / MARK).write_bytes(resealed(mark, "sha256"))
             mark = json.loads((shard / MARK).read_text())
