@@ -18,7 +18,8 @@ from experiments.common import processor, provenance
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.data.scenes.config import CollectConfig
-from rcirl_jax.data.store.dataset import Dataset, DatasetWriter, open_dataset
+from rcirl_jax.data.store.dataset import Dataset, open_dataset
+from rcirl_jax.data.store.writer import DatasetWriter
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import RewardConfig, init_reward, pinned
 from rcirl_jax.runtime.atomic_files import write_json

@@ -21,8 +21,10 @@ from experiments import margins, training
 from experiments.common import cutting, provenance, run
 from experiments.executor import executor
 from experiments.signals import checked_signals, signals_asked
-from rcirl_jax.autotune.loop import STAGES, Loop, TuneConfig
+from rcirl_jax.autotune.config import TuneConfig
+from rcirl_jax.autotune.loop import STAGES, tune
 from rcirl_jax.autotune.rehearsal import TEACHERS
+from rcirl_jax.autotune.run import Run
 from rcirl_jax.data.importers import IMPORTERS
 from rcirl_jax.data.importing import ImportConfig
 from rcirl_jax.data.logs import Logs
@@ -91,15 +93,15 @@ def main() -> None:
         plan_every=_EVERY.value,
         sweep=Path(_SWEEP.value) if _SWEEP.value else None,
     )
-    loop = Loop(
+    one = Run(
         folder=Path(_WORKDIR.value),
         config=config,
         executor=executor(),
         running=Running(parallel=_PARALLEL.value),
         facts=provenance(),
     )
-    with only_one(loop.folder):
-        loop.until(_UNTIL.value, given)
+    with only_one(one.folder):
+        tune(one, given, _UNTIL.value)
 
 
 def _given() -> list[str | Logs]:

@@ -15,11 +15,11 @@ from absl import flags
 
 from experiments.common import provenance, run
 from rcirl_jax.errors import InputError
+from rcirl_jax.export.forms.linear_yaml import lattice_yaml, reward_yaml
+from rcirl_jax.export.forms.onnx_model import write_onnx
+from rcirl_jax.export.forms.stablehlo import write_stablehlo
 from rcirl_jax.export.hand_weights import load_hand_weights
-from rcirl_jax.export.linear_yaml import lattice_yaml, reward_yaml
 from rcirl_jax.export.loading import open_reward
-from rcirl_jax.export.onnx_model import write_onnx
-from rcirl_jax.export.stablehlo import write_stablehlo
 from rcirl_jax.runtime.atomic_files import write_json, write_whole
 from rcirl_jax.runtime.pipeline import file_sha256
 

@@ -23,7 +23,8 @@ from experiments.common import floats, hidden_sizes, provenance, run, unread
 from experiments.executor import executor
 from experiments.recipe import AS_SAID
 from rcirl_jax.evaluation.ranking.sweep import CHOICES, SweepConfig
-from rcirl_jax.export.sweep import run_sweep, table
+from rcirl_jax.export.sweep.result import table
+from rcirl_jax.export.sweep.run import run_sweep
 from rcirl_jax.report.ranking.sweep_picture import sweep_picture
 from rcirl_jax.train.state import TrainConfig
 

@@ -6,10 +6,12 @@ experiment files turn it into that line on stderr and exit status 2.
 
 import contextlib
 import difflib
+import importlib
 import struct
 import traceback
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from types import ModuleType
 
 HEAD, TAIL = 1400, 400  # characters kept of the ends of a line too long
 
@@ -80,4 +82,14 @@ def as_input_error(what: str, expected: str) -> Iterator[None]:
         raise InputError(
             f"{what}: {type(error).__name__}: {str(error)[:200]} "
             f"({Path(place.filename).name}:{place.lineno}): expected {expected}"
+        ) from error
+
+
+def extra_module(name: str) -> ModuleType:
+    """A module of the extra [logs]; one clear line where it is not installed."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise InputError(
+            f"{name}: not installed ({error}): expected pip install 'rcirl-jax[logs]'"
         ) from error

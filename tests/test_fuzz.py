@@ -16,7 +16,7 @@ from benchmarks.reliability.fuzz.trees import MAX_DEEP, deep, mutate_tree
 from rcirl_jax.data.store import preferences
 from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.export.from_run import read_config
-from rcirl_jax.export.sweep import read_sweep
+from rcirl_jax.export.sweep.result import read_sweep
 from rcirl_jax.features import mapping
 from rcirl_jax.report.ranking.sweep_picture import sweep_picture
 from tests.commands import command, fresh

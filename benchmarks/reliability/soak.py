@@ -46,7 +46,9 @@ from benchmarks.reliability.memory import (
 )
 from benchmarks.reliability.small import SHARD_SCENES
 from experiments.common import provenance, run
-from rcirl_jax.autotune.loop import Loop, TuneConfig
+from rcirl_jax.autotune.config import TuneConfig
+from rcirl_jax.autotune.loop import tune
+from rcirl_jax.autotune.run import Run
 from rcirl_jax.data import importing
 from rcirl_jax.data.importing import ImportConfig
 from rcirl_jax.data.logs import Logs
@@ -139,10 +141,10 @@ def _stop(step: int) -> None:
         raise _Stopped
 
 
-def _loop(facts: Mapping[str, object], running: Running) -> Loop:
-    """The tuning loop in the present folder."""
+def _run(facts: Mapping[str, object], running: Running) -> Run:
+    """A run of the tuning loop in the present folder."""
     train = TrainConfig(batch_size=BATCH, epochs=1, positive="nearest")
-    return Loop(
+    return Run(
         folder=Path("run"),
         config=TuneConfig(
             train=train,
@@ -205,10 +207,10 @@ def _work(facts: Mapping[str, object]) -> Facts:
     # told to stop after a checkpoint, then again by the same command
     with contextlib.suppress(_Stopped):
         stopping = Running(checkpoint_every=CHECKPOINT_EVERY, on_step=_stop)
-        _loop(facts, stopping).until("train", _logs())
+        tune(_run(facts, stopping), [_logs()], "train")
     if not list(Path("run").glob("train-*/seed-0/checkpoints/*/sha256.json")):
         raise ValueError("the training was to stop after a checkpoint")
-    _loop(facts, Running()).until("report", _logs())
+    tune(_run(facts, Running()), [_logs()])
     _pages()
     return _outputs()
 

@@ -23,10 +23,12 @@ from rcirl_jax.data.cut import Cut, cut, cut_item, whole_of
 from rcirl_jax.data.parts import Part, items, leaving_out
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.data.scenes.quality import QualityReport
-from rcirl_jax.data.store.dataset import Dataset, DatasetWriter, Manifest
+from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.data.store.files import Files
+from rcirl_jax.data.store.manifest import Manifest
 from rcirl_jax.data.store.rows import check_finite
 from rcirl_jax.data.store.splits import split_wholes, time_blocks
+from rcirl_jax.data.store.writer import DatasetWriter
 from rcirl_jax.errors import InputError, LostWorkError
 from rcirl_jax.runtime.executors import Executor, Here
 from rcirl_jax.types import Demonstration, Recording

@@ -14,7 +14,7 @@ from rcirl_jax.data.importers import (
     read_part,
 )
 from rcirl_jax.data.importers import parts as inputs_of
-from rcirl_jax.data.readers import csv_stream
+from rcirl_jax.data.importers.files import is_long_file
 from rcirl_jax.data.recording import LEAVE_OUT, PIECE, refusal
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.pipeline import file_sha256
@@ -111,7 +111,7 @@ def is_long(part: Part) -> bool:
     if PIECE in part.spec:
         return False
     if part.format in CSV_PARTS:
-        return csv_stream.is_long(part.input, part.spec)
+        return is_long_file(part.input, part.spec)
     if part.format in SHARD_BYTES and part.input.is_file():
         files = files_of(part.format, part.input)
         return sum(file.stat().st_size for file in files) > SHARD_BYTES[part.format]

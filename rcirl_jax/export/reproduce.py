@@ -29,7 +29,7 @@ from rcirl_jax.export.from_run import (
     verification_samples,
 )
 from rcirl_jax.export.reader import RANGES, Reward
-from rcirl_jax.export.sweep import write_member
+from rcirl_jax.export.sweep.run import write_member
 from rcirl_jax.runtime.settings import typed_settings
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.running import Running

@@ -27,9 +27,11 @@ import tqdm
 from rcirl_jax.data.scenes.assemble import assemble
 from rcirl_jax.data.scenes.labels import add_labels
 from rcirl_jax.data.scenes.quality import QualityReport
-from rcirl_jax.data.store.dataset import Dataset, DatasetWriter, Manifest
+from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.data.store.files import Files
+from rcirl_jax.data.store.manifest import Manifest
 from rcirl_jax.data.store.splits import assign_groups
+from rcirl_jax.data.store.writer import DatasetWriter
 from rcirl_jax.errors import InputError
 from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.planner.yielding import Yielding, yielding_policy

@@ -36,8 +36,8 @@ from rcirl_jax.sampling import (
     trajectory_on_path,
 )
 from rcirl_jax.sampling.speed import family_index
-from rcirl_jax.train.bad_values import bad_facts, bad_values, count_bad
 from rcirl_jax.train.facts import admitted, densities, facts_of
+from rcirl_jax.train.finite import bad_facts, bad_values, count_bad
 from rcirl_jax.train.pieces import Scenes, added_and_kept, block_size, in_pieces
 from rcirl_jax.train.state import (
     Batch,

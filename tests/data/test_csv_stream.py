@@ -10,7 +10,7 @@ from rcirl_jax.data.cut import cut
 from rcirl_jax.data.importers import parts, read_part
 from rcirl_jax.data.importing import import_parts
 from rcirl_jax.data.parts import Part
-from rcirl_jax.data.readers import csv_stream, scratch
+from rcirl_jax.data.readers import long_logs
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
 from tests.commands import count_and_peak
@@ -99,7 +99,7 @@ def test_a_crowded_minute_is_several_pieces(tmp_path, monkeypatch):
     path = tmp_path / "log.csv"
     spec = {**write(path, rows_of()), "long_bytes": 1}
     minutes = cuts(path, spec)
-    monkeypatch.setattr(csv_stream, "MAX_ROWS", 2000)
+    monkeypatch.setattr(long_logs, "MAX_ROWS", 2000)
     windows = cuts(path, spec)
     names = [made.name for made in windows]
     assert "log-00001.00" in names
@@ -124,7 +124,7 @@ def test_windows_without_rows_are_no_pieces(tmp_path, monkeypatch):
     path = tmp_path / "log.csv"
     spec = {**write(path, rows_of(seconds=135.0)), "long_bytes": 1}
     whole = scenes_by_name(cuts(path, spec))
-    monkeypatch.setattr(csv_stream, "MAX_ROWS", 200)
+    monkeypatch.setattr(long_logs, "MAX_ROWS", 200)
     windows = cuts(path, spec)
     assert set(scenes_by_name(windows)) == set(whole)
     last = max(float(made.name.rpartition("-")[2]) for made in windows)
@@ -206,7 +206,7 @@ def test_bad_cells_are_one_line_and_leave_nothing(tmp_path, bad, message):
 
 def test_a_wrong_unit_of_time_is_found(tmp_path, monkeypatch):
     path = tmp_path / "log.csv"
-    monkeypatch.setattr(csv_stream, "MAX_BLOCKS", 3)
+    monkeypatch.setattr(long_logs, "MAX_BLOCKS", 3)
     spec = {**write(path, rows_of()), "long_bytes": 1}
     with pytest.raises(InputError, match=r"t: more than 3 minutes: expected seconds"):
         cuts(path, spec)
@@ -249,27 +249,27 @@ import resource, sys
 from pathlib import Path
 from rcirl_jax.data.parts import Part
 from rcirl_jax.data.importers import parts
-from rcirl_jax.data.readers import csv_stream
-from rcirl_jax.data.readers.csv_stream import Field, pieces
+from rcirl_jax.data.readers import csv_stream, long_logs
+from rcirl_jax.data.readers.csv_stream import Field
 # what is held is reached in the shorter log already
-csv_stream.READ_BYTES, csv_stream.BUFFER_BYTES = 2**18, 2**20
+csv_stream.READ_BYTES, long_logs.BUFFER_BYTES = 2**18, 2**20
 fields = [Field(name=n, column=n, text=n == "id") for n in ("t", "id", "x", "y")]
-found = pieces(Path(sys.argv[1]), fields, 0.55)
+found = long_logs.pieces(Path(sys.argv[1]), fields, 0.55)
 rows = sum(len(piece.values["t"]) for piece in found)
 print(rows, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """
 
 
 def test_scratch_files_of_killed_imports_are_removed(tmp_path, monkeypatch):
-    monkeypatch.setattr(scratch.tempfile, "tempdir", str(tmp_path))
-    left, used = (tmp_path / f"{scratch.SCRATCH}{name}" for name in "ab")
+    monkeypatch.setattr(long_logs.tempfile, "tempdir", str(tmp_path))
+    left, used = (tmp_path / f"{long_logs.SCRATCH}{name}" for name in "ab")
     for folder in (left, used):
         folder.mkdir()
-        (folder / scratch.LOCK).touch()
+        (folder / long_logs.LOCK).touch()
         (folder / "0_0").write_bytes(b"rows")
-    with (used / scratch.LOCK).open() as file:
+    with (used / long_logs.LOCK).open() as file:
         fcntl.flock(file, fcntl.LOCK_EX)  # by an import that still runs
-        with scratch.scratch() as own:
+        with long_logs.scratch() as own:
             assert own.parent == tmp_path
             assert not left.exists()
             assert (used / "0_0").exists()

@@ -23,8 +23,8 @@ from rcirl_jax.data.importers.l5 import map as l5_map
 from rcirl_jax.data.importers.levelx import map as levelx_lanes
 from rcirl_jax.data.importers.nuplan import map as nuplan_map
 from rcirl_jax.data.readers.parquet import read_columns
-from rcirl_jax.data.readers.safe_xml import read_xml
 from rcirl_jax.data.readers.sqlite import Database
+from rcirl_jax.data.readers.xml import read_xml
 from rcirl_jax.data.readers.zarr2 import StructuredArray
 from rcirl_jax.data.scenes.signal_checks import read_signal_checks
 from rcirl_jax.data.store import manifest

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importers.csv import map as csv_lanes
-from rcirl_jax.data.readers import tables
+from rcirl_jax.data.importers.lanes import StraightLane, straight_lanes
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import spec_root
 from rcirl_jax.types import Kind
@@ -171,13 +171,12 @@ def test_oncoming_lanes_run_the_other_way(tmp_path):
 
 def test_straight_lanes_longer_than_roads_are_not_made(tmp_path):
     found = [
-        tables.StraightLane(id=f"{k}", y=4.0 * k, lower=0.0, upper=9.9e5)
-        for k in range(11)
+        StraightLane(id=f"{k}", y=4.0 * k, lower=0.0, upper=9.9e5) for k in range(11)
     ]
-    lanes = tables.straight_lanes(tmp_path, found[:1], 4.0, None)
+    lanes = straight_lanes(tmp_path, found[:1], 4.0, None)
     assert len(lanes[0].centre) > 1e5
     with pytest.raises(InputError, match=r"lanes: 1\.089e\+07 m long in all: expected"):
-        tables.straight_lanes(tmp_path, found, 4.0, None)
+        straight_lanes(tmp_path, found, 4.0, None)
 
 
 def test_lanes_along_paths_where_none_are_known(tmp_path):

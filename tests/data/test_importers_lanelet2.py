@@ -9,7 +9,7 @@ from rcirl_jax.data.importers.lanelet2 import map as lanelet2
 from rcirl_jax.data.importers.lanelet2 import rules as lanelet2_rules
 from rcirl_jax.data.importers.lanelet2.map import read_lanelet2
 from rcirl_jax.data.importers.lanelet2.rules import members
-from rcirl_jax.data.readers.projection import utm, utm_zone
+from rcirl_jax.data.importers.projection import utm, utm_zone
 from rcirl_jax.errors import InputError
 from tests.data.formats import osm
 

@@ -14,9 +14,10 @@ import pytest
 
 from rcirl_jax.data.cut import cut
 from rcirl_jax.data.importers import parts, read_recordings
+from rcirl_jax.data.importers.nuplan import geopackage
 from rcirl_jax.data.importers.nuplan import map as nuplan_map
 from rcirl_jax.data.importers.nuplan import reader as nuplan
-from rcirl_jax.data.readers import csv_stream, geopackage
+from rcirl_jax.data.readers import long_logs
 from rcirl_jax.data.readers import sqlite as sqlite_ro
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.errors import InputError
@@ -139,8 +140,8 @@ def test_logs_of_one_drive_are_one_group(name, drive):
 
 def test_windows_hold_the_scenes_of_the_log(folder, monkeypatch):
     """Surroundings are shortened to those of a log of 8 s."""
-    monkeypatch.setattr(csv_stream, "BEFORE_S", 1.0)
-    monkeypatch.setattr(csv_stream, "AFTER_S", 2.5)
+    monkeypatch.setattr(long_logs, "BEFORE_S", 1.0)
+    monkeypatch.setattr(long_logs, "AFTER_S", 2.5)
     found = read(folder, window_s=3.0)
     assert [r.name for r in found] == [f"{fixture.NAME}-{k:03d}" for k in range(3)]
     assert {(r.group, r.piece_of) for r in found} == {(DRIVE, fixture.NAME)}

@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rcirl_jax.data.importers import parts, read_recordings
+from rcirl_jax.data.importers.shapes import distance_to_line
 from rcirl_jax.data.importers.waymo import map as waymo_map
 from rcirl_jax.data.importers.waymo import widths as waymo_widths
 from rcirl_jax.data.readers import wire_columns
-from rcirl_jax.data.readers.shapes import distance_to_line
 from rcirl_jax.data.readers.tfrecord import read_records
 from rcirl_jax.data.readers.wire_columns import Record
 from rcirl_jax.errors import InputError

@@ -6,8 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rcirl_jax.data.store.dataset import DatasetWriter, open_dataset
+from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.order import BatchIterator
+from rcirl_jax.data.store.writer import DatasetWriter
 from rcirl_jax.errors import InputError
 from tests.data.test_store import finish_fields, make_rows
 

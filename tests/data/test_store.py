@@ -16,8 +16,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rcirl_jax.data.store import files, manifest
-from rcirl_jax.data.store.dataset import DatasetWriter, open_dataset
+from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.rows import leaf_specs, row_spec
+from rcirl_jax.data.store.writer import DatasetWriter
 from rcirl_jax.errors import InputError
 from tests import scenes
 

@@ -8,8 +8,9 @@ import sys
 import jax
 import numpy as np
 
-from rcirl_jax.data.store.dataset import DatasetWriter, open_dataset
+from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.preferences import read_preferences
+from rcirl_jax.data.store.writer import DatasetWriter
 from rcirl_jax.units import HORIZON_S
 from tests.data.test_store import finish_fields, lineage
 from tests.docs.pages import DOCS, REPO, fences

@@ -12,11 +12,11 @@ from onnx.reference import ReferenceEvaluator
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.export import save
-from rcirl_jax.export.linear_yaml import APOLLO, lattice_yaml, reward_yaml
+from rcirl_jax.export.forms.linear_yaml import APOLLO, lattice_yaml, reward_yaml
+from rcirl_jax.export.forms.onnx_model import write_onnx
+from rcirl_jax.export.forms.stablehlo import exported, write_stablehlo
 from rcirl_jax.export.loading import open_reward
-from rcirl_jax.export.onnx_model import write_onnx
 from rcirl_jax.export.reader import load_weights
-from rcirl_jax.export.stablehlo import exported, write_stablehlo
 from rcirl_jax.reward import LatticeCost
 from tests.commands import command
 from tests.weights_files import example_weights, loop_value, random_weights

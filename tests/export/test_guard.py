@@ -12,7 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rcirl_jax.data.store.dataset import DatasetWriter, open_dataset
+from rcirl_jax.data.store.dataset import open_dataset
+from rcirl_jax.data.store.writer import DatasetWriter
 from rcirl_jax.export import Guard, Limits, decode_weights, guard, pack
 from rcirl_jax.export.closed_loop import table_rows
 from rcirl_jax.export.from_run import export_run

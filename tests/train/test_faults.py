@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from rcirl_jax.data.importing import import_parts
-from rcirl_jax.data.store.dataset import DatasetWriter, open_dataset
+from rcirl_jax.data.store.dataset import open_dataset
+from rcirl_jax.data.store.writer import DatasetWriter
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime import signals as interrupts
 from rcirl_jax.runtime.pipeline import only_one

@@ -9,8 +9,9 @@ import pytest
 
 from rcirl_jax.data import importing
 from rcirl_jax.data.cut import Cut
-from rcirl_jax.data.store.dataset import DatasetWriter, open_dataset
+from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.rows import check_finite
+from rcirl_jax.data.store.writer import DatasetWriter
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, run_suite
 from rcirl_jax.evaluation.ranking import score

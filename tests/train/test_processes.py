@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import pytest
 
-from rcirl_jax.data.store.dataset import DatasetWriter
+from rcirl_jax.data.store.writer import DatasetWriter
 from rcirl_jax.errors import InputError
 from rcirl_jax.train.loop import restore_run
 from rcirl_jax.train.processes import EXIT_LOST, join_processes

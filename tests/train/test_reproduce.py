@@ -8,7 +8,8 @@ import msgpack
 import numpy as np
 import pytest
 
-from rcirl_jax.data.store.dataset import DatasetWriter, open_dataset
+from rcirl_jax.data.store.dataset import open_dataset
+from rcirl_jax.data.store.writer import DatasetWriter
 from rcirl_jax.errors import InputError
 from rcirl_jax.export import FeatureSpec, RewardWeights, load_weights, save
 from rcirl_jax.export.reproduce import (

@@ -14,9 +14,8 @@ from rcirl_jax.features import feature_map
 from rcirl_jax.reward import LOSSES, Normaliser, RewardConfig, pinned
 from rcirl_jax.sampling import SamplerConfig, num_candidates
 from rcirl_jax.train import pieces
-from rcirl_jax.train.bad_values import bad_values
 from rcirl_jax.train.facts import log_density
-from rcirl_jax.train.finite import check_step
+from rcirl_jax.train.finite import bad_values, check_step
 from rcirl_jax.train.loop import to_device_batch
 from rcirl_jax.train.parallel import (
     jit_sharded,

@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.data.store.dataset import DatasetWriter, open_dataset
+from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.resplit import Resplit, with_validation
+from rcirl_jax.data.store.writer import DatasetWriter
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking import sweep
 from rcirl_jax.evaluation.ranking.sweep import (
@@ -23,10 +24,11 @@ from rcirl_jax.evaluation.ranking.sweep import (
     open_split,
     train_group,
 )
-from rcirl_jax.export import sweep as folders
 from rcirl_jax.export.loading import compiled_scorer, open_reward
 from rcirl_jax.export.reproduce import compare, is_member, member_again, sweep_of
-from rcirl_jax.export.sweep import run_sweep, table
+from rcirl_jax.export.sweep import run as folders
+from rcirl_jax.export.sweep.result import table
+from rcirl_jax.export.sweep.run import run_sweep
 from rcirl_jax.report.ranking.sweep_picture import sweep_picture
 from rcirl_jax.reward import RewardConfig
 from rcirl_jax.runtime.executors import Here, Processes
@@ -340,7 +342,7 @@ import sys
 from pathlib import Path
 import ray
 from rcirl_jax.runtime.executors import Ray
-from rcirl_jax.export.sweep import run_sweep
+from rcirl_jax.export.sweep.run import run_sweep
 from tests.train.test_sweep import MADE_BY, config_of
 ray.init(num_cpus=2, log_to_driver=False, logging_level="ERROR")
 run_sweep(config_of(sys.argv[1]), Path(sys.argv[2]), Ray("auto"), MADE_BY)

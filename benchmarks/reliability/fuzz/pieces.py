@@ -8,7 +8,8 @@ import numpy as np
 
 from benchmarks.reliability.fuzz.targets import Bytes, OneFile, Target
 from rcirl_jax.data.importers.lanelet2 import map as lanelet2
-from rcirl_jax.data.readers import geopackage, tfrecord
+from rcirl_jax.data.importers.nuplan import geopackage
+from rcirl_jax.data.readers import tfrecord
 from rcirl_jax.data.readers.wire import Schema, WireError, fields, packed_sint32
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.metrics import METRICS

@@ -16,9 +16,11 @@ from benchmarks.reliability.fuzz.logs import LOGS
 from benchmarks.reliability.fuzz.targets import Bytes, OneFile, Reader, Target
 from rcirl_jax.data.importers.synthetic import reader as synthetic
 from rcirl_jax.data.scenes import signal_checks
-from rcirl_jax.data.store import dataset as store
+from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.files import FACTS, MANIFEST, MARK, Files
+from rcirl_jax.data.store.manifest import parse_manifest, shard_entry
 from rcirl_jax.data.store.preferences import SCHEMA, read_preferences
+from rcirl_jax.data.store.shards import describe, shard_info
 from rcirl_jax.evaluation.closed_loop.files import (
     COLUMNS,
     SuiteRuns,
@@ -28,12 +30,21 @@ from rcirl_jax.evaluation.closed_loop.files import (
 from rcirl_jax.evaluation.closed_loop.likeness import read_arrays, write_arrays
 from rcirl_jax.evaluation.gate.types import Likeness
 from rcirl_jax.evaluation.ranking.sweep import SweepConfig, member_name, shape_name
-from rcirl_jax.export import sweep
 from rcirl_jax.export.from_run import last_metrics, read_config
 from rcirl_jax.export.hand_weights import tuned_rows, write_hand_weights
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.provenance import check_provenance
 from rcirl_jax.export.reader import decode_weights
+from rcirl_jax.export.sweep.folder import (
+    GROUP_FACTS,
+    SWEEP,
+    claim,
+    data_of,
+    finished_group,
+    settings_of,
+    weights_file,
+)
+from rcirl_jax.export.sweep.result import read_sweep
 from rcirl_jax.features import mapping
 from rcirl_jax.reward import LatticeCost
 from rcirl_jax.runtime.atomic_files import write_json
@@ -80,8 +91,8 @@ def sealed(folder: Path) -> Target:
     mark = place / "shards" / "00000" / MARK
 
     def read() -> None:
-        store.parse_manifest((place / MANIFEST).read_bytes(), files)
-        store.shard_entry(store.shard_info(files, 0))
+        parse_manifest((place / MANIFEST).read_bytes(), files)
+        shard_entry(shard_info(files, 0))
 
     return Target(read, [place / MANIFEST, mark])
 
@@ -101,7 +112,7 @@ def dataset(folder: Path) -> Target:
     )
 
     def read() -> None:
-        found = store.open_dataset(place)
+        found = open_dataset(place)
         for split in (None, *found.manifest.splits):
             found.indices(split)
         for name in ("human.s", "scene.tags"):
@@ -112,7 +123,7 @@ def dataset(folder: Path) -> Target:
 
 def made_by(folder: Path) -> Target:
     """What made a dataset, as it is read from beside the manifest."""
-    made = store.open_dataset(_dataset(folder))
+    made = open_dataset(_dataset(folder))
     made.write_facts({"git_commit": "2fe49aa", "flags": ["--stride=1"], "cores": 2})
     return Target(made.facts, [folder / "dataset" / FACTS])
 
@@ -125,7 +136,7 @@ def _chain(place: Path, shard: Path, files: list[Path], index: int) -> None:
         mark = json.loads((shard / MARK).read_text())
         if index > 1:
             key = files[index].relative_to(shard).as_posix()
-            mark["files"][key] = store.describe(files[index].read_bytes())
+            mark["files"][key] = describe(files[index].read_bytes())
             mark.pop("sha256")
             (shard / MARK).write_bytes(resealed(mark, "sha256"))
             mark = json.loads((shard / MARK).read_text())
@@ -334,28 +345,28 @@ def sweeps(folder: Path) -> Target:
         learning_rates=(1e-3,),
         seeds=1,
     )
-    write_json(folder / sweep.SWEEP, pieces.sweep_result())
-    sweep._claim(config, folder, data_hash)
+    write_json(folder / SWEEP, pieces.sweep_result())
+    claim(config, folder, data_hash)
     (member,) = config.members()
-    weights = sweep._weights(folder, member)
+    weights = weights_file(folder, member)
     weights.parent.mkdir()
     random_weights(weights)
     group = folder / "groups" / f"{shape_name(hidden)}.json"
     one = {"sha256": open_reward(str(weights)).sha256, "finite": True}
-    settings = {**sweep._settings(config), **sweep._data(made_by)}
-    facts = dict.fromkeys(sweep.FACTS, 1.0)
+    settings = {**settings_of(config), **data_of(made_by)}
+    facts = dict.fromkeys(GROUP_FACTS, 1.0)
     members = {member_name(member): one}
     write_json(group, {"facts": facts, "members": members, "settings": settings})
-    if sweep._finished(config, folder, hidden, made_by) is None:
+    if finished_group(config, folder, hidden, made_by) is None:
         raise AssertionError(f"{group}: not as a sweep takes it")
 
     def read() -> None:
-        sweep.read_sweep(folder)
-        sweep._claim(config, folder, data_hash)
-        sweep._finished(config, folder, hidden, made_by)
+        read_sweep(folder)
+        claim(config, folder, data_hash)
+        finished_group(config, folder, hidden, made_by)
 
     names = (str(folder),)
-    return Target(read, [folder / sweep.SWEEP, folder / "settings.json", group], names)
+    return Target(read, [folder / SWEEP, folder / "settings.json", group], names)
 
 
 READERS: dict[str, Reader] = {

@@ -4,12 +4,16 @@ import collections
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from rcirl_jax.data.importers.options import number
 from rcirl_jax.errors import InputError
 
 # what importers read besides the input itself
 READ_BESIDE = (".csv", ".json", ".toml", ".xml", ".osm", ".gpkg")
 # folders of maps above an input; the second as nuPlan's archive unpacks
 MAP_FOLDERS = ("maps", "nuplan-maps-v1.0")
+
+# bytes; a longer file is read in pieces (at once it takes ten times as much)
+LONG_BYTES = 64 * 2**20
 
 
 def input_files(path: Path, pattern: str) -> list[Path]:
@@ -95,3 +99,9 @@ def listing(path: Path) -> list:
             files |= set((above / name).rglob("*"))
     stats = [(file, file.stat()) for file in sorted(files) if file.is_file()]
     return [[str(file), stat.st_size, stat.st_mtime_ns] for file, stat in stats]
+
+
+def is_long_file(path: Path, spec: dict) -> bool:
+    """Whether a file is read in pieces; `long_bytes` of the TOML sets from where."""
+    limit = number(spec, "long_bytes", LONG_BYTES)
+    return path.is_file() and path.stat().st_size > limit

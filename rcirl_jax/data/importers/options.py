@@ -2,17 +2,54 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 
-from rcirl_jax.data.readers.tables import number
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind
+from rcirl_jax.units import FOOT_M, MPH_MPS
 
 LARGEST = 10**18  # of an integer
 MAX_NAME = 255  # bytes of a file's name
 MAX_PATH = 2048  # bytes of a path; systems take 4096, with the folder before it
 MAX_PARTS = 32  # of a pattern, which pathlib matches by recursion
+UNITS = {
+    "m": 1.0,
+    "ft": FOOT_M,
+    "m/s": 1.0,
+    "ft/s": FOOT_M,
+    "km/h": 1.0 / 3.6,
+    "mph": MPH_MPS,
+    "s": 1.0,
+    "ms": 1e-3,
+    "us": 1e-6,
+    "ns": 1e-9,
+    "rad": 1.0,
+    "deg": math.pi / 180.0,
+}
 KINDS = ("vehicle", "cyclist", "pedestrian", "static")
+
+
+def number(spec: Mapping, key: str, default: float) -> float:
+    """A finite number from a source TOML."""
+    value = spec.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(f"source TOML: {key}: {value}: expected a number")
+    try:
+        found = float(value)
+    except OverflowError:
+        found = math.inf
+    if not math.isfinite(found):
+        raise InputError(f"source TOML: {key}: {value}: expected a finite number")
+    return found
+
+
+def unit_factor(path: Path, field: str, unit: str, allowed: Sequence[str]) -> float:
+    """Factor from a declared unit to SI."""
+    if unit not in allowed:
+        raise InputError(
+            f"{path}: units.{field}: {unit}: expected one of {', '.join(allowed)}"
+        )
+    return UNITS[unit]
 
 
 def section(spec: Mapping, key: str) -> dict:

@@ -12,9 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.readers import csv_stream
-from rcirl_jax.data.readers.shapes import local_origin
-from rcirl_jax.data.readers.tables import number, split_tracks
+from rcirl_jax.data.importers.options import number
+from rcirl_jax.data.importers.shapes import local_origin
+from rcirl_jax.data.importers.tracks import split_tracks
+from rcirl_jax.data.readers import long_logs
 from rcirl_jax.data.recording import LENGTH_RANGE_M, MAX_SPEED_MPS, WIDTH_RANGE_M
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Recording, Track
@@ -191,7 +192,7 @@ def longest_window(spec: Mapping) -> float:
 def around(within: tuple[float, float]) -> tuple[float, float]:
     """Times [s] that a window's scenes need: with their history and future."""
     low, high = within
-    return low - csv_stream.BEFORE_S, high + csv_stream.AFTER_S
+    return low - long_logs.BEFORE_S, high + long_logs.AFTER_S
 
 
 class Windows:
@@ -225,7 +226,7 @@ class Windows:
             if first - last > self.max_gap_s:
                 self._starts.setdefault(user, []).append(first)
             self._last[user] = max(last, float(track.t[-1]))
-        piece = csv_stream.Piece(
+        piece = long_logs.Piece(
             recording=None,
             number=number,
             values={},
@@ -235,7 +236,7 @@ class Windows:
         )
         name = f"{self.drive}-{number:03d}"
         made = dataclasses.replace(made, name=name, group=self.group)
-        return csv_stream.piece_of(self.drive, made, piece)
+        return long_logs.piece_of(self.drive, made, piece)
 
 
 def placed(

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rcirl_jax.data.readers.extras import extra_module
-from rcirl_jax.errors import InputError
+from rcirl_jax.errors import InputError, extra_module
 
 if TYPE_CHECKING:  # an optional package
     import pyarrow

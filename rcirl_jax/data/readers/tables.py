@@ -1,57 +1,23 @@
-"""Tables of text: read, check, convert; shared by the NGSIM and CSV importers."""
+"""Tables of comma-separated text with a header, read and checked row by row."""
 
 import collections
 import csv
-import dataclasses
-import math
 import re
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NoReturn, TextIO
 
 import numpy as np
 
-from rcirl_jax.data.recording import check_lanes_length, check_span
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Lane
-from rcirl_jax.units import FOOT_M, MPH_MPS
 
 TEXT_CHARS = 64  # characters of a text cell
 MAX_COLUMNS = 10_000  # of a table; logs have some dozens
 MAX_LINE = 2**20  # characters of a line
 MAX_BYTES = 2**30  # of a file that is held whole: a few times the longest known
-UNITS = {
-    "m": 1.0,
-    "ft": FOOT_M,
-    "m/s": 1.0,
-    "ft/s": FOOT_M,
-    "km/h": 1.0 / 3.6,
-    "mph": MPH_MPS,
-    "s": 1.0,
-    "ms": 1e-3,
-    "us": 1e-6,
-    "ns": 1e-9,
-    "rad": 1.0,
-    "deg": np.pi / 180.0,
-}
 # a quoted number with separators between thousands: "1,118,846,979,700"
 GROUPED = re.compile(r'"([-+]?\d{1,3}(?:,\d{3})+(?:\.\d*)?)"')
-HEADING_WINDOW_S = 1.0  # s, heading is the direction of travel over this window
-MIN_TRAVEL_M = 0.5  # m in that window; below it the heading is held
-LANE_STEP_M = 5.0  # m between points of a fitted lane
-NEIGHBOUR_WIDTHS = 1.6  # lane widths between centres up to which lanes adjoin
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class StraightLane:
-    """A lane parallel to the x axis, as observed."""
-
-    id: str
-    y: float  # m, of the centre line
-    lower: float  # m, first x
-    upper: float  # m, last x
-    forward: bool = True  # driven towards +x
 
 
 def check_size(path: Path) -> None:
@@ -285,170 +251,3 @@ def check_row(
             raise InputError(
                 f"{path}: line {line}: {name}: '{cell[:40]}': expected a finite number"
             )
-
-
-def unit_factor(path: Path, field: str, unit: str, allowed: Sequence[str]) -> float:
-    """Factor from a declared unit to SI."""
-    if unit not in allowed:
-        raise InputError(
-            f"{path}: units.{field}: {unit}: expected one of {', '.join(allowed)}"
-        )
-    return UNITS[unit]
-
-
-def number(spec: Mapping, key: str, default: float) -> float:
-    """A finite number from a source TOML."""
-    value = spec.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"source TOML: {key}: {value}: expected a number")
-    try:
-        found = float(value)
-    except OverflowError:
-        found = math.inf
-    if not math.isfinite(found):
-        raise InputError(f"source TOML: {key}: {value}: expected a finite number")
-    return found
-
-
-def split_tracks(
-    path: Path, ids: np.ndarray, t: np.ndarray, max_gap: float, reuse: float = np.inf
-) -> list[tuple[str, np.ndarray]]:
-    """Rows of each track: one road user without a gap.
-
-    A gap longer than `max_gap` starts another track of the same id, named
-    "id#2", "id#3", ... A step back by more than `reuse` is a number given to
-    somebody else at another time; by less it is an error.
-
-    Args:
-      path: named in errors.
-      ids: [n] of each row, text or numbers.
-      t: [n] in any unit.
-      max_gap: in the unit of t.
-      reuse: in the unit of t.
-
-    Returns:
-      (name, row numbers in the order of time) per track.
-
-    Raises:
-      InputError: time goes backwards, or is met twice, inside an id, or most
-        steps are gaps.
-    """
-    _, codes = np.unique(ids, return_inverse=True)
-    order = np.argsort(codes, kind="stable")
-    step, same = np.diff(t[order]), np.diff(codes[order]) == 0
-    wrong = np.flatnonzero(same & (step < 0.0) & (step >= -reuse))
-    if wrong.size:
-        row = order[wrong[0] + 1]
-        raise InputError(
-            f"{path}: id {ids[row]}: t: {t[row]:.12g} after {t[order[wrong[0]]]:.12g}: "
-            "goes backwards; expected increasing times"
-        )
-    order = np.lexsort((t, codes))
-    step, same = np.diff(t[order]), np.diff(codes[order]) == 0
-    twice = np.flatnonzero(same & (step == 0.0))
-    if twice.size:
-        row = order[twice[0]]
-        raise InputError(
-            f"{path}: id {ids[row]}: t: {t[row]:.12g}: met twice: expected once"
-        )
-    if same.any() and np.median(step[same]) > max_gap:
-        raise InputError(
-            f"{path}: t: median step {np.median(step[same]):g}: "
-            f"expected at most {max_gap:g}; wrong unit of time or rate?"
-        )
-    pieces = np.split(order, np.flatnonzero(~same | (step > max_gap)) + 1)
-    parts: dict[str, int] = {}
-    tracks = []
-    for rows in pieces:
-        name = str(ids[rows[0]])
-        parts[name] = parts.get(name, 0) + 1
-        tracks.append((name if parts[name] == 1 else f"{name}#{parts[name]}", rows))
-    return tracks
-
-
-def spans_of(t: np.ndarray, holds: np.ndarray) -> tuple[tuple[float, float], ...]:
-    """(begin, end) of each run of samples [n] that hold, up to the next that does not.
-
-    The last run has no end. t [n] s in any order.
-    """
-    order = np.argsort(t, kind="stable")
-    flips = np.flatnonzero(np.diff(np.concatenate([[False], holds[order]])))
-    ends = [*t[order][flips].tolist(), np.inf]
-    return tuple(zip(ends[:-1:2], ends[1::2], strict=False))
-
-
-def travel_heading(
-    t: np.ndarray, x: np.ndarray, y: np.ndarray, standing: float = 0.0
-) -> np.ndarray:
-    """Direction of travel [n] rad, over a second around each sample.
-
-        heading(t) = atan2(y(t + h) - y(t - h), x(t + h) - x(t - h)),  h = 0.5 s
-
-    Held from the last moving sample (before the first: from it) where the car
-    covers less than half a metre; `standing` [rad] for one that never moves.
-    """
-    half = 0.5 * HEADING_WINDOW_S
-    dx, dy = (np.interp(t + half, t, v) - np.interp(t - half, t, v) for v in (x, y))
-    moving = np.flatnonzero(np.hypot(dx, dy) > MIN_TRAVEL_M)
-    if moving.size == 0:
-        return np.full(t.shape, standing)
-    held = np.searchsorted(moving, np.arange(t.size), side="right") - 1
-    return np.arctan2(dy, dx)[moving[np.maximum(held, 0)]]
-
-
-def straight_lanes(
-    path: Path, found: Sequence[StraightLane], width: float, limit: float | None
-) -> tuple[Lane, ...]:
-    """Lanes parallel to the x axis, with bounds midway between neighbours.
-
-    Lanes are neighbours if they are driven the same way and no more than
-    `NEIGHBOUR_WIDTHS` lane widths apart; outer bounds lie half a width out.
-    """
-    for lane in found:
-        ends = np.array([lane.lower, lane.upper])
-        check_span(f"{path}: lane {lane.id}", "position along the road", ends)
-    check_lanes_length(str(path), sum(lane.upper - lane.lower for lane in found))
-    lanes = []
-    for lane in found:
-        above = _beside(lane, found, width, +1.0)
-        below = _beside(lane, found, width, -1.0)
-        up = 0.5 * width if above is None else 0.5 * (above.y - lane.y)
-        down = 0.5 * width if below is None else 0.5 * (lane.y - below.y)
-        x = np.linspace(
-            lane.lower, lane.upper, int((lane.upper - lane.lower) / LANE_STEP_M) + 2
-        )
-        left, right = (above, below) if lane.forward else (below, above)
-        sides = (up, down) if lane.forward else (down, up)
-        x = x if lane.forward else x[::-1]
-        lanes.append(
-            Lane(
-                id=lane.id,
-                centre=np.stack([x, np.full(x.shape, lane.y)], axis=1),
-                left_width=np.full(x.shape, sides[0]),
-                right_width=np.full(x.shape, sides[1]),
-                speed_limit=limit,
-                left=None if left is None else left.id,
-                right=None if right is None else right.id,
-            )
-        )
-    return tuple(lanes)
-
-
-def _beside(
-    lane: StraightLane, found: Sequence[StraightLane], width: float, side: float
-) -> StraightLane | None:
-    """The nearest lane on the side of +y (side = 1) or -y (side = -1), if adjoining.
-
-    Lanes nearer than 0.4 widths are one lane under two names (on- and off-ramp).
-    """
-    apart = {
-        other.id: side * (other.y - lane.y)
-        for other in found
-        if other.forward == lane.forward
-    }
-    near = [
-        other
-        for other in found
-        if 0.4 * width < apart.get(other.id, 0.0) < NEIGHBOUR_WIDTHS * width
-    ]
-    return min(near, key=lambda other: apart[other.id], default=None)

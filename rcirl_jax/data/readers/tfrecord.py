@@ -11,8 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from rcirl_jax.data.readers.extras import extra_module
-from rcirl_jax.errors import InputError
+from rcirl_jax.errors import InputError, extra_module
 
 MAX_RECORD_BYTES = 256 * 1024**2  # bytes of a record
 MASK_DELTA = 0xA282EAD8

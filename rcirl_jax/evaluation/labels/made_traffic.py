@@ -2,8 +2,8 @@
 
 The drivers of `data.synthetic` follow, change lanes and stop by their own models. What
 they did is read from their lanes, stations and speeds without noise, never from
-`data/labels.py`. With E and O the lanes of the labelled driver and of another car
-over the window, and "ahead" of box before box:
+`data/scenes/labels.py`. With E and O the lanes of the labelled driver and of another
+car over the window, and "ahead" of box before box:
 
     E steady, O the same lane all the time, ahead            follow; behind: ignore
     E steady, O leaves that lane after FOLLOWED_S, ahead     follow; behind: ignore

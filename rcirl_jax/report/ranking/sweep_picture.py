@@ -21,7 +21,7 @@ def sweep_picture(path: Path, report: Mapping) -> Path:
 
     Args:
       path: file to write.
-      report: of `export.sweep.run_sweep`.
+      report: of `export.sweep.run.run_sweep`.
     """
     rows = list(report["configurations"].values())
     of = {name: sorted({row[name] for row in rows}) for name in AXES}

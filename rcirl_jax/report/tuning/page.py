@@ -17,7 +17,7 @@ from rcirl_jax.evaluation.ranking.metrics import METRICS
 from rcirl_jax.evaluation.ranking.table import RIVALS, SIGNIFICANT, RankingReport
 from rcirl_jax.evaluation.statistics import Difference
 from rcirl_jax.export.reader import Reward
-from rcirl_jax.export.sweep import table as sweep_table
+from rcirl_jax.export.sweep.result import table as sweep_table
 from rcirl_jax.report import html
 from rcirl_jax.report.charts import bars_cell, curves, legend
 from rcirl_jax.report.html import facts_text

@@ -7,7 +7,7 @@ turns right and leads south. A footpath and a two-way access road lie beside it.
 
 import numpy as np
 
-from rcirl_jax.data.readers.projection import utm
+from rcirl_jax.data.importers.projection import utm
 
 WIDTH = 3.5  # m, of every lane
 TURN_X, RADIUS = 80.0, 15.0  # m, where the right turn begins; of its centre line

@@ -32,7 +32,7 @@ from rcirl_jax.data.importers.apollo.records import (
     run_name,
 )
 from rcirl_jax.data.importers.files import log_name
-from rcirl_jax.data.importers.options import one_pattern, positive, section
+from rcirl_jax.data.importers.options import number, one_pattern, positive, section
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.perception import (
     Boxes,
@@ -42,12 +42,12 @@ from rcirl_jax.data.importers.perception import (
     placed,
     tracks_of,
 )
-from rcirl_jax.data.readers.csv_stream import AFTER_S
-from rcirl_jax.data.readers.shapes import (
+from rcirl_jax.data.importers.shapes import (
     check_coordinates,
     origin_notes,
 )
-from rcirl_jax.data.readers.tables import number, spans_of
+from rcirl_jax.data.importers.tracks import spans_of
+from rcirl_jax.data.readers.long_logs import AFTER_S
 from rcirl_jax.data.recording import MAX_RATE_HZ, validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Recording, Track

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.importers.options import choices
-from rcirl_jax.data.readers.shapes import between_bounds, check_coordinates
+from rcirl_jax.data.importers.shapes import between_bounds, check_coordinates
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.atomic_files import parse_json
 from rcirl_jax.types import Lane

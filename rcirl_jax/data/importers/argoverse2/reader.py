@@ -22,6 +22,7 @@ from rcirl_jax.data.importers.argoverse2.map import read_lanes
 from rcirl_jax.data.importers.files import files_matching
 from rcirl_jax.data.importers.options import (
     kind_of,
+    number,
     patterns,
     recording_car,
     section,
@@ -30,13 +31,13 @@ from rcirl_jax.data.importers.perception import (
     has_possible_speed,
     without_outliers,
 )
-from rcirl_jax.data.readers.parquet import read_columns
-from rcirl_jax.data.readers.shapes import (
+from rcirl_jax.data.importers.shapes import (
     check_coordinates,
     local_origin,
     origin_notes,
 )
-from rcirl_jax.data.readers.tables import number, split_tracks
+from rcirl_jax.data.importers.tracks import split_tracks
+from rcirl_jax.data.readers.parquet import read_columns
 from rcirl_jax.data.recording import MAX_SPEED_MPS, validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Recording, Track

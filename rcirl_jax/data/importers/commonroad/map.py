@@ -4,7 +4,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from rcirl_jax.data.readers.xml_fields import Fields
+from rcirl_jax.data.readers.xml import Fields
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane
 

@@ -23,8 +23,7 @@ from rcirl_jax.data.importers.commonroad.extras import (
 from rcirl_jax.data.importers.commonroad.map import read_lanes
 from rcirl_jax.data.importers.files import files_below, log_name
 from rcirl_jax.data.importers.options import is_file_name, one_pattern
-from rcirl_jax.data.readers.safe_xml import read_xml
-from rcirl_jax.data.readers.xml_fields import Fields
+from rcirl_jax.data.readers.xml import Fields, read_xml
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Lane, Recording, Track

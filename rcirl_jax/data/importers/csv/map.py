@@ -6,13 +6,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import KDTree
 
-from rcirl_jax.data.importers.options import path_option
-from rcirl_jax.data.readers.tables import (
-    StraightLane,
-    number,
-    read_table,
-    straight_lanes,
-)
+from rcirl_jax.data.importers.lanes import StraightLane, straight_lanes
+from rcirl_jax.data.importers.options import number, path_option
+from rcirl_jax.data.readers.tables import read_table
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane, Track
 

@@ -17,24 +17,17 @@ from rcirl_jax.data.importers.csv.map import (
     lane_file_of,
     lanes_of,
 )
-from rcirl_jax.data.importers.files import input_files
-from rcirl_jax.data.importers.options import patterns, section
-from rcirl_jax.data.readers import csv_stream
+from rcirl_jax.data.importers.files import input_files, is_long_file
+from rcirl_jax.data.importers.options import number, patterns, section, unit_factor
+from rcirl_jax.data.importers.tracks import spans_of, split_tracks, travel_heading
+from rcirl_jax.data.readers import csv_stream, long_logs
 from rcirl_jax.data.readers.sparse_tables import (
     MAX_PLACE_M,
     MAX_TIME,
     MAX_VELOCITY_MPS,
     check_range,
 )
-from rcirl_jax.data.readers.tables import (
-    number,
-    read_header,
-    read_table,
-    spans_of,
-    split_tracks,
-    travel_heading,
-    unit_factor,
-)
+from rcirl_jax.data.readers.tables import read_header, read_table
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Recording, Track
@@ -88,7 +81,7 @@ def parts(path: Path, spec: dict) -> list[Path]:
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """One Recording per file, or per value of the `recording` column."""
     for file in parts(path, spec):
-        if csv_stream.is_long(file, spec):
+        if is_long_file(file, spec):
             yield from _long_recordings(file, spec)
             continue
         for name, table in _read_tables(file, spec):
@@ -117,11 +110,11 @@ def _long_recordings(path: Path, spec: dict) -> Iterator[Recording]:
             )
         else:
             notes.append(f"no column '{column}': {field} computed or by default")
-    for piece in csv_stream.pieces(path, fields, MAX_GAP_STEPS / rate):
+    for piece in long_logs.pieces(path, fields, MAX_GAP_STEPS / rate):
         log = path.stem if piece.recording is None else f"{path.stem}-{piece.recording}"
         table = _localise(path, piece.values, rate, notes, start=0.0)
         made = _recording(f"{log}-{piece.label}", table, spec)
-        yield validate_recording(csv_stream.piece_of(log, made, piece), path)
+        yield validate_recording(long_logs.piece_of(log, made, piece), path)
 
 
 def _columns(path: Path, spec: dict) -> dict[str, tuple[str, float]]:

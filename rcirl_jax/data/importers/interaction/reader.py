@@ -26,9 +26,10 @@ from rcirl_jax.data.importers.files import (
     log_name,
 )
 from rcirl_jax.data.importers.lanelet2.map import read_lanelet2
-from rcirl_jax.data.importers.options import path_option
+from rcirl_jax.data.importers.options import number, path_option
 from rcirl_jax.data.importers.paths import path_lanes
-from rcirl_jax.data.readers.projection import utm, utm_zone
+from rcirl_jax.data.importers.projection import utm, utm_zone
+from rcirl_jax.data.importers.tracks import split_tracks, travel_heading
 from rcirl_jax.data.readers.sparse_tables import (
     MAX_PLACE_M,
     MAX_TIME,
@@ -36,12 +37,7 @@ from rcirl_jax.data.readers.sparse_tables import (
     check_range,
     read_sparse_table,
 )
-from rcirl_jax.data.readers.tables import (
-    number,
-    read_header,
-    split_tracks,
-    travel_heading,
-)
+from rcirl_jax.data.readers.tables import read_header
 from rcirl_jax.data.recording import accepted, validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Lane, Recording, Track

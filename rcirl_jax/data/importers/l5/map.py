@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.importers.options import path_option
-from rcirl_jax.data.readers.projection import FLATTENING, SEMI_MAJOR_M
-from rcirl_jax.data.readers.shapes import between_bounds, check_coordinates, moves
+from rcirl_jax.data.importers.projection import FLATTENING, SEMI_MAJOR_M
+from rcirl_jax.data.importers.shapes import between_bounds, check_coordinates, moves
 from rcirl_jax.data.readers.wire import (
     Value,
     WireError,

@@ -33,7 +33,7 @@ from rcirl_jax.data.importers.l5.scenes import (
     scenes_of,
     tables_of,
 )
-from rcirl_jax.data.importers.options import positive, recording_car, section
+from rcirl_jax.data.importers.options import number, positive, recording_car, section
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.perception import (
     UNKNOWN,
@@ -41,11 +41,10 @@ from rcirl_jax.data.importers.perception import (
     placed,
     tracks_of,
 )
-from rcirl_jax.data.readers.shapes import (
+from rcirl_jax.data.importers.shapes import (
     check_coordinates,
     origin_notes,
 )
-from rcirl_jax.data.readers.tables import number
 from rcirl_jax.data.readers.zarr2 import StructuredArray
 from rcirl_jax.data.recording import PIECE, accepted
 from rcirl_jax.errors import InputError

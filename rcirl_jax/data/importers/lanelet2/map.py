@@ -26,7 +26,7 @@ from rcirl_jax.data.importers.lanelet2.rules import (
     stop_of,
     tag_of,
 )
-from rcirl_jax.data.readers.safe_xml import read_xml
+from rcirl_jax.data.readers.xml import read_xml
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane
 

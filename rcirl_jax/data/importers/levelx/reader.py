@@ -24,22 +24,17 @@ import numpy as np
 from rcirl_jax.data.importers.files import files_below, log_name
 from rcirl_jax.data.importers.lanelet2.map import read_lanelet2
 from rcirl_jax.data.importers.levelx.map import find_map, marked_lanes
+from rcirl_jax.data.importers.options import number
 from rcirl_jax.data.importers.paths import path_lanes
-from rcirl_jax.data.readers.projection import utm, utm_zone
+from rcirl_jax.data.importers.projection import utm, utm_zone
+from rcirl_jax.data.importers.tracks import split_tracks, travel_heading
 from rcirl_jax.data.readers.sparse_tables import (
     MAX_PLACE_M,
     MAX_TIME,
     MAX_VELOCITY_MPS,
     check_range,
 )
-from rcirl_jax.data.readers.tables import (
-    number,
-    read_header,
-    read_table,
-    rows_of,
-    split_tracks,
-    travel_heading,
-)
+from rcirl_jax.data.readers.tables import read_header, read_table, rows_of
 from rcirl_jax.data.recording import check_span, validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Lane, Recording, Track

@@ -9,15 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.importers.options import positive
-from rcirl_jax.data.readers.tables import (
-    StraightLane,
-    number,
-    spans_of,
-    split_tracks,
-    straight_lanes,
-    travel_heading,
-)
+from rcirl_jax.data.importers.lanes import StraightLane, straight_lanes
+from rcirl_jax.data.importers.options import number, positive
+from rcirl_jax.data.importers.tracks import spans_of, split_tracks, travel_heading
 from rcirl_jax.types import Kind, Lane, Recording, Track
 
 FRAME_S = 0.1  # s

@@ -8,7 +8,7 @@ without lateral positions (Local_X = 0) get them from the lane number.
 The portal's CSV holds several sites and periods; vehicle and frame numbers
 start anew in each. Sites become Recordings of their own; where the file has
 Global_Time, it is the clock and rows may come in any order, else Frame_ID. A file
-longer than `long_bytes` becomes a Recording per site and minute (`csv_stream`).
+longer than `long_bytes` becomes a Recording per site and minute (`long_logs`).
 
 Traps: spreadsheets export numbers as "1,118,846,979,700"; the releases of the sites
 hold every log twice, as text and as CSV, in folders of their own; those of the
@@ -22,7 +22,7 @@ from typing import NoReturn, TextIO
 
 import numpy as np
 
-from rcirl_jax.data.importers.files import input_files, is_input, log_name
+from rcirl_jax.data.importers.files import input_files, is_input, is_long_file, log_name
 from rcirl_jax.data.importers.ngsim.map import (
     FRAME_S,
     MAX_FRAME_GAP,
@@ -32,8 +32,8 @@ from rcirl_jax.data.importers.ngsim.map import (
     drop_repeated,
     site_recording,
 )
-from rcirl_jax.data.importers.options import patterns, positive
-from rcirl_jax.data.readers import csv_stream
+from rcirl_jax.data.importers.options import patterns, positive, unit_factor
+from rcirl_jax.data.readers import csv_stream, long_logs
 from rcirl_jax.data.readers.sparse_tables import (
     MAX_PLACE_M,
     MAX_TIME,
@@ -46,7 +46,6 @@ from rcirl_jax.data.readers.tables import (
     load_rows,
     read_header,
     read_table,
-    unit_factor,
 )
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
@@ -95,7 +94,7 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     for file in parts(path, spec):
         factor = unit_factor(file, "unit", spec.get("unit", "ft"), ("ft", "m"))
         is_csv = _has_header(file)
-        if csv_stream.is_long(file, spec):
+        if is_long_file(file, spec):
             found = _long_recordings(file, spec, factor, is_csv)
         else:
             table = _read_csv(file) if is_csv else _read_text(file, spec)
@@ -175,7 +174,7 @@ def _long_recordings(
         return _complete({**values, "frame": np.round(values["t"] / frame_s)})
 
     gap_s = (MAX_FRAME_GAP + 0.5) * frame_s
-    with csv_stream.spilled(path, fields, spec.get("locations"), read) as spill:
+    with long_logs.spilled(path, fields, spec.get("locations"), read) as spill:
         sites = spill.recordings()
         known, left_out = _known_sites(path, sites, spec)
         for site in known:
@@ -189,7 +188,7 @@ def _long_recordings(
                 made = site_recording(
                     path, name, table, spec, survey, stamped=stamped, notes=notes
                 )
-                yield csv_stream.piece_of(log, made, piece)
+                yield long_logs.piece_of(log, made, piece)
                 notes = []
 
 

@@ -20,22 +20,16 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.importers.files import input_files
-from rcirl_jax.data.importers.options import one_pattern
+from rcirl_jax.data.importers.lanes import StraightLane, straight_lanes
+from rcirl_jax.data.importers.options import number, one_pattern, unit_factor
+from rcirl_jax.data.importers.tracks import split_tracks
 from rcirl_jax.data.readers.sparse_tables import (
     MAX_PLACE_M,
     MAX_TIME,
     MAX_VELOCITY_MPS,
     check_range,
 )
-from rcirl_jax.data.readers.tables import (
-    StraightLane,
-    lines_of,
-    number,
-    read_table,
-    split_tracks,
-    straight_lanes,
-    unit_factor,
-)
+from rcirl_jax.data.readers.tables import lines_of, read_table
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Ghost, Kind, Recording, Track

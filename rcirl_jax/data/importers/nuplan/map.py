@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.importers.files import MAP_FOLDERS
+from rcirl_jax.data.importers.nuplan.geopackage import Layers, zone_of
 from rcirl_jax.data.importers.options import path_option
-from rcirl_jax.data.readers.geopackage import Layers, zone_of
-from rcirl_jax.data.readers.shapes import (
+from rcirl_jax.data.importers.shapes import (
     MIN_HALF_WIDTH_M,
     distance_to_line,
     line_across,

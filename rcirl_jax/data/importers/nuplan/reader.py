@@ -20,7 +20,7 @@ import numpy as np
 
 from rcirl_jax.data.importers.files import files_below, log_name
 from rcirl_jax.data.importers.nuplan.map import NuplanMap, find_map
-from rcirl_jax.data.importers.options import one_pattern, positive, section
+from rcirl_jax.data.importers.options import number, one_pattern, positive, section
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.perception import (
     Boxes,
@@ -30,12 +30,11 @@ from rcirl_jax.data.importers.perception import (
     placed,
     tracks_of,
 )
-from rcirl_jax.data.readers.shapes import (
+from rcirl_jax.data.importers.shapes import (
     check_coordinates,
     origin_notes,
 )
 from rcirl_jax.data.readers.sqlite import Database
-from rcirl_jax.data.readers.tables import number
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Lane, Recording, Signal, Track

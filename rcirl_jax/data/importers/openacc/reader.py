@@ -17,7 +17,6 @@ are none: specifications, lists of settings, a campaign of one car's speeds.
 Drives last up to hours: they are cut into Recordings of `block_s`.
 """
 
-import dataclasses
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,54 +24,24 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.importers.files import files_below, log_name
-from rcirl_jax.data.importers.options import one_pattern
+from rcirl_jax.data.importers.openacc.drive import Drive, is_drive, read_drive
+from rcirl_jax.data.importers.options import number, one_pattern
 from rcirl_jax.data.importers.paths import path_lanes
-from rcirl_jax.data.readers.projection import utm, utm_zone
-from rcirl_jax.data.readers.sparse_tables import (
-    MAX_PLACE_M,
-    MAX_TIME,
-    MAX_VELOCITY_MPS,
-    check_range,
-    read_sparse_table,
-)
-from rcirl_jax.data.readers.tables import (
-    number,
-    spans_of,
-    split_tracks,
-    travel_heading,
-)
+from rcirl_jax.data.importers.shapes import local_origin
+from rcirl_jax.data.importers.tracks import spans_of, split_tracks, travel_heading
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Recording, Track
 
-COLUMN = re.compile(r"(Speed|Lat|Lon|E|N|IVS|Driver)(\d{1,3})")
 NOT_LOGS = re.compile(r"(?i).*(spec|note|readme|label).*")
-# first cells of the metadata lines
-METADATA = ("date", "vehicle_order", "number_of_vehicles", "acc", "distance_setting")
-MAX_HEADER_LINES = 30  # lines looked at for the row of column names
-MAX_LINE_CHARS = 65536
-DRIVER_CHARS = 16  # characters kept of a Driver cell
 RATE_HZ = 10.0  # 1/s
 BLOCK_S = 120.0  # s of a drive in one Recording
 MIN_BLOCK_S = 1.0  # s that they may be
 MAX_GAP_STEPS = 5.5  # missing rows bridged inside one track
-FAR_M = 1e4  # m; coordinates beyond it are moved to a local origin
-ORIGIN_STEP_M = 1000.0  # m, local origins are multiples of it
 LANE_WIDTH_M = 3.5  # m, of lanes fitted to paths
 LIMIT_MPS = 36.11  # m/s, 130 km/h, the motorways and tracks driven
 SIZE_M = (4.6, 1.85)  # m, a car whose model is not listed
 DRIVERS = ("human", "all")  # whose drives are demonstrations
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _Drive:
-    """One file: its header, and per car the samples."""
-
-    path: Path
-    about: dict[str, list[str]]  # metadata, key in lower case -> cells
-    t: np.ndarray  # [n] s, from 0
-    cars: dict[int, dict[str, np.ndarray]]  # number -> x, y, speed [n], maybe more
-    notes: tuple[str, ...]
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
@@ -80,20 +49,8 @@ def parts(path: Path, spec: dict) -> list[Path]:
     files = files_below(path, one_pattern(spec, "*.csv"))
     if path.is_dir():
         files = [file for file in files if not NOT_LOGS.fullmatch(file.name)] or files
-        files = [file for file in files if _is_drive(file)] or files
+        files = [file for file in files if is_drive(file)] or files
     return files
-
-
-def _is_drive(path: Path) -> bool:
-    """Whether a table is a drive, or so damaged that one cannot tell."""
-    try:
-        lines = _first_lines(path)
-    except InputError:
-        return True
-    if _ends_with_names(lines):
-        return any(COLUMN.fullmatch(name) for name in lines[-1])
-    firsts = {line[0].lower() for line in lines if line}
-    return not firsts or not firsts.isdisjoint(METADATA)
 
 
 def own_name(file: Path) -> str:
@@ -104,110 +61,12 @@ def own_name(file: Path) -> str:
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """Recordings of `block_s` seconds, file by file."""
     for file in parts(path, spec):
-        drive = _read_drive(file)
+        drive = read_drive(file)
         for block in _blocks(drive, spec):
             yield validate_recording(block, file)
 
 
-def _first_lines(path: Path) -> list[list[str]]:
-    """Cells of the lines down to the column names, or of the first ones."""
-    lines: list[list[str]] = []
-    try:
-        with path.open(encoding="utf-8-sig") as handle:
-            while len(lines) < MAX_HEADER_LINES and not _ends_with_names(lines):
-                text = handle.readline(MAX_LINE_CHARS)
-                if not text:
-                    break
-                cells = [cell.strip().strip('"') for cell in text.strip().split(",")]
-                while cells and not cells[-1]:
-                    cells.pop()
-                lines.append(cells)
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: header: {error}: expected CSV text") from error
-    return lines
-
-
-def _ends_with_names(lines: list[list[str]]) -> bool:
-    return bool(lines and lines[-1]) and lines[-1][0].lower() == "time"
-
-
-def _read_header(path: Path) -> tuple[dict[str, list[str]], list[str], int]:
-    """Metadata, column names, and the number of lines down to the names."""
-    lines = _first_lines(path)
-    if not _ends_with_names(lines):
-        raise InputError(
-            f"{path}: column Time: missing: expected it in the first "
-            f"{MAX_HEADER_LINES} lines, below the metadata"
-        )
-    _check_names(path, lines[-1])
-    about = {cells[0].lower(): cells[1:] for cells in lines[:-1] if cells}
-    return about, lines[-1], len(lines)
-
-
-def _check_names(path: Path, names: list[str]) -> None:
-    twice = [n for n in names if COLUMN.fullmatch(n) and names.count(n) > 1]
-    if twice:
-        raise InputError(f"{path}: column {twice[0]!r}: met twice: expected once")
-
-
-def _read_drive(path: Path) -> _Drive:
-    about, header, skip = _read_header(path)
-    columns: dict[int, dict[str, str]] = {}
-    for name in header[1:]:
-        match = COLUMN.fullmatch(name)
-        if match is not None:
-            columns.setdefault(int(match[2]), {})[match[1]] = name
-    chosen = [
-        header[0],
-        *(name for found in columns.values() for name in found.values()),
-    ]
-    text = {name: DRIVER_CHARS for name in chosen if name.startswith("Driver")}
-    table = read_sparse_table(path, header, chosen, text, skip)
-    time = table[header[0]]
-    if not np.isfinite(time).all():
-        row = int(np.flatnonzero(~np.isfinite(time))[0])
-        raise InputError(f"{path}: line {skip + 1 + row}: Time: '': expected a number")
-    check_range(path, {"Time": time}, ("Time",), MAX_TIME)
-    cars, without = {}, []
-    for car, found in sorted(columns.items()):
-        if "Speed" not in found:
-            continue
-        values = {field: table[name] for field, name in found.items()}
-        check_range(path, table, (found["Speed"],), MAX_VELOCITY_MPS)
-        if not ({"E", "N"} <= set(found) or {"Lat", "Lon"} <= set(found)):
-            without.append(car)
-            continue
-        places = [name for field, name in found.items() if field in ("E", "N")]
-        check_range(path, table, places, MAX_PLACE_M)
-        cars[car] = _located(values)
-    if not cars:
-        raise InputError(
-            f"{path}: columns: {header[:8]}: expected Speed1, E1, N1 of one car or more"
-        )
-    notes = [f"car {car} has no positions; left out" for car in without]
-    return _Drive(
-        path=path, about=about, t=time - time.min(), cars=cars, notes=tuple(notes)
-    )
-
-
-def _located(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """x, y [m] from E, N, or from latitude and longitude in radians or degrees."""
-    if "E" in values and "N" in values:
-        return {**values, "x": values["E"], "y": values["N"]}
-    degrees = [values[field] for field in ("Lat", "Lon")]
-    known = np.isfinite(degrees[0]) & np.isfinite(degrees[1])
-    # no latitude in radians is beyond pi / 2
-    if not known.any() or np.median(np.abs(degrees[0][known])) <= 0.5 * np.pi:
-        degrees = [np.rad2deg(angles) for angles in degrees]
-    known &= (np.abs(degrees[0]) < 84.0) & (np.abs(degrees[1]) <= 180.0)
-    place = np.full((known.size, 2), np.nan)
-    if known.any():
-        zone = utm_zone(float(np.median(degrees[1][known])))
-        place[known] = utm(degrees[0][known], degrees[1][known], zone)
-    return {**values, "x": place[:, 0], "y": place[:, 1]}
-
-
-def _blocks(drive: _Drive, spec: dict) -> Iterator[Recording]:
+def _blocks(drive: Drive, spec: dict) -> Iterator[Recording]:
     """Parts of a drive; those without a car in motion or at rest are left out."""
     block_s = number(spec, "block_s", BLOCK_S)
     rate = number(spec, "rate_hz", RATE_HZ)
@@ -238,7 +97,7 @@ def _blocks(drive: _Drive, spec: dict) -> Iterator[Recording]:
         )
 
 
-def _located_samples(drive: _Drive) -> dict[int, np.ndarray]:
+def _located_samples(drive: Drive) -> dict[int, np.ndarray]:
     """Car -> [n] bool, samples with a place and a speed."""
     return {
         car: np.all([np.isfinite(values[f]) for f in ("x", "y", "Speed")], axis=0)
@@ -246,7 +105,7 @@ def _located_samples(drive: _Drive) -> dict[int, np.ndarray]:
     }
 
 
-def _automated(drive: _Drive, spec: dict) -> dict[int, np.ndarray]:
+def _automated(drive: Drive, spec: dict) -> dict[int, np.ndarray]:
     """Car -> [k, 2] s of the drive without a human; `drivers = "all"`: none."""
     if spec.get("drivers", DRIVERS[0]) == "all":
         return {car: np.zeros((0, 2)) for car in drive.cars}
@@ -262,7 +121,7 @@ def _near(spans: np.ndarray, low: float, high: float) -> np.ndarray:
     return spans[first : np.searchsorted(spans[:, 0], high, side="right")]
 
 
-def _modes(drive: _Drive, car: int) -> np.ndarray:
+def _modes(drive: Drive, car: int) -> np.ndarray:
     """[n] "human", "acc" or "unknown"; without a column by the file's ACC flag."""
     values = drive.cars[car]
     if "Driver" in values:
@@ -272,7 +131,7 @@ def _modes(drive: _Drive, car: int) -> np.ndarray:
     return np.full(drive.t.shape, "human" if flag == "0" else "unknown")
 
 
-def _driver_notes(drive: _Drive) -> list[str]:
+def _driver_notes(drive: Drive) -> list[str]:
     shares = []
     for car in drive.cars:
         modes = _modes(drive, car)
@@ -282,7 +141,7 @@ def _driver_notes(drive: _Drive) -> list[str]:
     return [f"driven by a human: {', '.join(shares)}"]
 
 
-def _spacing_notes(drive: _Drive, spec: dict) -> list[str]:
+def _spacing_notes(drive: Drive, spec: dict) -> list[str]:
     """How far positions and sizes are from the recorded spacing.
 
     |p_i - p_{i+1}| - (L_i + L_{i+1}) / 2 - IVS_i, the median over all samples
@@ -301,13 +160,13 @@ def _spacing_notes(drive: _Drive, spec: dict) -> list[str]:
     return [f"spacing of the boxes minus IVS: {np.median(known):.1f} m in the median"]
 
 
-def _name(drive: _Drive, car: int) -> str:
+def _name(drive: Drive, car: int) -> str:
     names = drive.about.get("vehicle_order", [])
     model = re.sub(r"\s+", "", names[car - 1]) if 0 < car <= len(names) else ""
     return f"{car}-{model[:40]}" if model else str(car)
 
 
-def _size(drive: _Drive, car: int, spec: dict) -> tuple[float, float]:
+def _size(drive: Drive, car: int, spec: dict) -> tuple[float, float]:
     """Length and width [m]: of the header, of the model, or a car's."""
     size = list(_model_size(_name(drive, car), spec))
     for place, field in enumerate(("length", "width")):
@@ -334,7 +193,7 @@ def _model_size(name: str, spec: dict) -> tuple[float, float]:
 
 
 def _tracks(
-    drive: _Drive,
+    drive: Drive,
     rows: np.ndarray,
     kept: dict[int, np.ndarray],
     automated: dict[int, np.ndarray],
@@ -347,13 +206,11 @@ def _tracks(
     if not used:
         return (), []
     t0 = min(float(drive.t[part].min()) for part in used.values())
-    middle = [
-        np.median(np.concatenate([drive.cars[c][axis][p] for c, p in used.items()]))
+    x, y = (
+        np.concatenate([drive.cars[c][axis][p] for c, p in used.items()])
         for axis in ("x", "y")
-    ]
-    origin = np.zeros(2)
-    if np.max(np.abs(middle)) > FAR_M:
-        origin = np.round(np.array(middle) / ORIGIN_STEP_M) * ORIGIN_STEP_M
+    )
+    origin = local_origin(x, y)
     tracks = []
     for car, part in used.items():
         length, width = _size(drive, car, spec)
@@ -386,7 +243,7 @@ def _tracks(
 
 def _recording(
     name: str,
-    drive: _Drive,
+    drive: Drive,
     tracks: tuple[Track, ...],
     spec: dict,
     rate: float,

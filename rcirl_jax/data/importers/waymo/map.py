@@ -11,19 +11,18 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rcirl_jax.data.importers.options import choices
+from rcirl_jax.data.importers.options import choices, number
+from rcirl_jax.data.importers.shapes import (
+    check_coordinates,
+    line_across,
+    moves,
+)
 from rcirl_jax.data.importers.waymo.widths import (
     MAX_POINTS,
     Bounds,
     Segments,
     half_widths,
 )
-from rcirl_jax.data.readers.shapes import (
-    check_coordinates,
-    line_across,
-    moves,
-)
-from rcirl_jax.data.readers.tables import number
 from rcirl_jax.data.readers.wire_columns import Fields, Record
 from rcirl_jax.data.recording import MAX_SPEED_MPS
 from rcirl_jax.types import Lane, Signal

@@ -24,18 +24,18 @@ import numpy as np
 from rcirl_jax.data.importers.files import files_matching
 from rcirl_jax.data.importers.options import (
     kind_of,
+    number,
     patterns,
     recording_car,
     section,
 )
 from rcirl_jax.data.importers.perception import without_outliers
-from rcirl_jax.data.importers.waymo.map import read_map
-from rcirl_jax.data.readers.shapes import (
+from rcirl_jax.data.importers.shapes import (
     check_coordinates,
     local_origin,
     origin_notes,
 )
-from rcirl_jax.data.readers.tables import number
+from rcirl_jax.data.importers.waymo.map import read_map
 from rcirl_jax.data.readers.tfrecord import FRAME_BYTES, read_records
 from rcirl_jax.data.readers.wire_columns import Fields, Record
 from rcirl_jax.data.recording import LENGTH_RANGE_M, WIDTH_RANGE_M, accepted

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.spatial import KDTree
 
-from rcirl_jax.data.readers.shapes import MIN_HALF_WIDTH_M
+from rcirl_jax.data.importers.shapes import MIN_HALF_WIDTH_M
 
 MAX_HALF_WIDTH_M = 5.0  # m; a farther line does not bound the lane
 MEASURE_STEP = 4  # points (2 m) between those at which widths are measured

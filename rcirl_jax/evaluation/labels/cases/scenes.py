@@ -2,7 +2,7 @@
 
 A `Case` is a planned drive in the frame of a road, with the decision towards
 every other road user written down by whoever planned it. Nothing here reads
-`data/labels.py`: tags follow from the exact, noise-free motion, and what lies
+`data/scenes/labels.py`: tags follow from the exact, noise-free motion, and what lies
 near a definition's edge is left unscored.
 
 Time 0 is the planning frame. Stations are along the ego lane's centre line,

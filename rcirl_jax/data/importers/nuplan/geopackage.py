@@ -11,8 +11,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rcirl_jax.data.readers.projection import utm
-from rcirl_jax.data.readers.shapes import MAX_COORDINATE_M
+from rcirl_jax.data.importers.projection import utm
+from rcirl_jax.data.importers.shapes import MAX_COORDINATE_M
 from rcirl_jax.data.readers.sqlite import Database
 
 ENVELOPE_BYTES = (0, 32, 48, 48, 64)  # by the flags' envelope code

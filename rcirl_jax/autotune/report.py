@@ -1,0 +1,109 @@
+"""The page of a run: the stage report."""
+
+import functools
+from collections.abc import Callable, Sequence
+
+from rcirl_jax.autotune.evidence import suite_job, suite_runs
+from rcirl_jax.autotune.rewards import workdir_of
+from rcirl_jax.autotune.run import Run
+from rcirl_jax.data.logs import Logs
+from rcirl_jax.data.parts import parts_of
+from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.evaluation.gate.runs import CANDIDATE, INCUMBENT
+from rcirl_jax.evaluation.gate.types import Verdict
+from rcirl_jax.evaluation.ranking.table import from_json
+from rcirl_jax.export.loading import open_reward
+from rcirl_jax.export.sweep.folder import SWEEP
+from rcirl_jax.export.sweep.result import read_sweep
+from rcirl_jax.report.player.recorded_replays import recorded_replays
+from rcirl_jax.report.player.replays import Replay, make_replays
+from rcirl_jax.report.tuning.page import TuningReport, write_tuning_page
+from rcirl_jax.runtime.atomic_files import read_json
+from rcirl_jax.runtime.pipeline import file_sha256
+from rcirl_jax.train.state import FUTURES
+
+REPLAYS = 6  # cases to play in the report
+
+
+def report(
+    run: Run,
+    verdict: Callable[[], Verdict],
+    dataset: Demonstrations,
+    given: Sequence[str | Logs],
+) -> None:
+    """report.html from everything before it."""
+    made_from = ("ranking.json", "suite/metrics.npz", "verdict.json")
+    inputs = {
+        "files": [file_sha256(run.folder / name) for name in made_from],
+        "weights": file_sha256(run.weights),
+        "incumbent": run.incumbent_hash(),
+        "dataset": dataset.hash,
+        "recorded": [not isinstance(one, str) for one in given],
+        "recipe": run.config.recipe,
+    }
+    if run.config.sweep:
+        inputs["sweep"] = file_sha256(run.config.sweep / SWEEP)
+    draw = functools.partial(_draw, run, verdict, dataset, given)
+    run.stage("report", inputs, [run.page], draw)
+
+
+def _draw(
+    run: Run,
+    verdict: Callable[[], Verdict],
+    dataset: Demonstrations,
+    given: Sequence[str | Logs],
+) -> None:
+    _, incumbent = suite_job(run)
+    judged = verdict()
+    rewards = {CANDIDATE: open_reward(str(run.weights))}
+    if known := run.incumbent_reward():
+        rewards[INCUMBENT] = known
+    sweep = run.config.sweep
+    seed = int(rewards[CANDIDATE].provenance["seed"])
+    facts = {"recipe": run.config.recipe, **run.facts}
+    write_tuning_page(
+        run.page,
+        TuningReport(
+            verdict=judged,
+            gate=run.config.gate,
+            suite=suite_runs(run).report(),
+            incumbent=incumbent,
+            ranking=from_json(read_json(run.folder / "ranking.json", "a ranking")),
+            rewards=rewards,
+            dataset=dataset,
+            replays=_replays(run, judged, given),
+            workdir=workdir_of(run, dataset, seed),
+            sweep=read_sweep(sweep) if sweep else None,
+            likeness=(run.folder / "likeness.txt").read_text(),
+            training_runs=run.config.seeds,
+            facts={**facts, "stages": _stages(run, len(given))},
+        ),
+    )
+
+
+def _stages(run: Run, sources: int) -> dict:
+    """The stages' records, but by what: the page says it once, stages.json of each."""
+    imports = [f"import {number}" for number in range(sources)]
+    trained = [f"train {number}" for number in range(run.config.seeds)]
+    ranks = [f"rank {futures}" for futures in FUTURES]
+    after = ["export", *ranks, "simulate", "likeness", "gate"]
+    known = run.stages.read()
+    return {
+        name: {key: x for key, x in known[name].items() if key != "made_by"}
+        for name in [*imports, *trained, *after]
+        if name in known
+    }
+
+
+def _replays(run: Run, verdict: Verdict, given: Sequence[str | Logs]) -> list[Replay]:
+    """Cases worth a look, then drives of the recordings given."""
+    job, incumbent = suite_job(run)
+    drivers = [row for row in job.rows() if row.name in (CANDIDATE, incumbent)]
+    shown = verdict.look_at[:REPLAYS] or job.cases().ids[:2]
+    every = run.config.plan_every
+    replays = make_replays(drivers, job.cases(), shown, every)
+    for one in given:
+        if isinstance(one, Logs):
+            parts = parts_of(one.format, one.input, one.source)
+            replays += recorded_replays(drivers, parts, every)
+    return replays

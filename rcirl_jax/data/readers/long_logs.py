@@ -1,0 +1,320 @@
+"""Long logs of rows: imported in pieces of a minute or less, in bounded memory.
+
+The file is read once, a few MiB at a time, and its rows are written to scratch
+files by recording and minute. Each minute is then a Recording of its own, with
+rows before and after it, so that scenes and filters do not end at the border.
+When each road user was first seen, also after gaps, is found for the whole log
+first, so that vehicles and their groups are those of a log read at once.
+
+What differs from a file that fits: lanes that are not given are fitted minute by
+minute, the given path is known for 28 s beyond the minute only, and a row out of
+order is found inside a minute only. Rows may come in any order of road users; scratch
+space of about the file's size is needed. An importer that needs something of the
+whole recording finds it in `Spill.minutes`.
+
+`csv_stream` reads a CSV; an importer may bring a reader of its own.
+"""
+
+import contextlib
+import dataclasses
+import fcntl
+import itertools
+import shutil
+import tempfile
+from collections.abc import Callable, Container, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rcirl_jax.data.readers import csv_stream
+from rcirl_jax.data.readers.csv_stream import Field
+from rcirl_jax.data.readers.reading import reading
+from rcirl_jax.errors import InputError
+from rcirl_jax.types import Recording, Track
+
+BLOCK_S = 60.0  # s of a piece
+BEFORE_S = 5.0  # s of rows before it: history and the smoothing window
+AFTER_S = 28.0  # s after it: the future of 8 s, smoothing, and the path beyond
+MAX_BLOCKS = 200_000  # pieces of one file; more mean a wrong unit of time
+# own rows of a piece, about; of a minute with more, windows of it are pieces, so that
+# the scenes held (10 kB each) are bounded
+MAX_ROWS = 150_000
+MAX_WINDOWS = 60  # of a minute
+BUFFER_BYTES = 64 * 2**20  # bytes of rows held before they go to scratch files
+SCRATCH = "rcirl-scratch-"  # how folders of scratch files begin
+LOCK = "lock"  # in such a folder, held while it is in use
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Piece:
+    """Rows of one minute of one recording, and of its surroundings.
+
+    Of a minute too crowded for memory it is a window, counted by `window`.
+    """
+
+    recording: str | None  # value of the `recording` field
+    number: int  # of the minute, from the recording's first
+    values: dict[str, np.ndarray]  # field -> [n], t since the recording's start
+    within: tuple[float, float]  # s, the minute or the window itself
+    # id -> s, when the whole log first saw it, and when again after each gap
+    fragments: dict[str, list[float]]
+    progress: float  # share of the file's pieces up to this one
+    window: int | None = None  # of the minute; None: the minute is one piece
+
+    @property
+    def label(self) -> str:
+        """The number as names of recordings have it."""
+        rest = "" if self.window is None else f".{self.window:02d}"
+        return f"{self.number:05d}{rest}"
+
+
+@contextlib.contextmanager
+def spilled(
+    path: Path,
+    fields: list[Field],
+    wanted: Container[str] | None = None,
+    read: Callable[[Path, list[Field]], Iterator[dict]] | None = None,
+) -> Iterator["Spill"]:
+    """The rows of a file in scratch files, removed afterwards.
+
+    Args:
+      path: CSV with a header, or what `read` reads.
+      fields: at least t [s], id.
+      wanted: values of the `recording` field whose rows are kept; None: all.
+      read: columns of READ_BYTES at a time; default `csv_stream.batches`.
+
+    Raises:
+      InputError: unreadable text, a cell that is no finite number, or more
+        than MAX_BLOCKS minutes.
+    """
+    with scratch() as folder:
+        spill = Spill(path, fields, folder, wanted)
+        batches = (read or csv_stream.batches)(path, fields)  # each of READ_BYTES
+        with reading(path, [path]) as show:
+            for batch in batches:
+                spill.add(batch)
+                show(csv_stream.READ_BYTES)
+        if not any(spill.recordings()) and not spill.blocks:
+            raise InputError(f"{path}: rows: none: expected one at least")
+        spill.flush()
+        yield spill
+
+
+def pieces(path: Path, fields: list[Field], max_gap_s: float) -> Iterator[Piece]:
+    """All pieces of a file, recording by recording in the order of time.
+
+    Arguments and errors as of `spilled` and `Spill.pieces`.
+    """
+    with spilled(path, fields) as spill:
+        for recording in spill.recordings():
+            yield from spill.pieces(recording, max_gap_s)
+
+
+def piece_of(log: str, made: Recording, piece: Piece) -> Recording:
+    """A piece's Recording as a part of the log: its tracks named as in the whole."""
+    return dataclasses.replace(
+        made,
+        tracks=tuple(_of_log(track, piece.fragments) for track in made.tracks),
+        piece_of=log,
+        scenes_within=piece.within,
+        progress=piece.progress,
+    )
+
+
+def _of_log(track: Track, fragments: dict[str, list[float]]) -> Track:
+    """A track of a piece under the name that it has in the whole log."""
+    user = track.id if track.id in fragments else track.id.rpartition("#")[0]
+    starts = fragments[user]
+    number = int(np.searchsorted(starts, track.t[0] + 1e-6, side="right"))
+    return dataclasses.replace(
+        track,
+        id=user if number <= 1 else f"{user}#{number}",
+        seen_since=starts[max(number - 1, 0)],
+    )
+
+
+@contextlib.contextmanager
+def scratch() -> Iterator[Path]:
+    """A locked folder for scratch files; removes those that killed imports left."""
+    for left in Path(tempfile.gettempdir()).glob(f"{SCRATCH}*/{LOCK}"):
+        with contextlib.suppress(OSError), left.open() as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # not while in use
+            shutil.rmtree(left.parent, ignore_errors=True)
+    with tempfile.TemporaryDirectory(prefix=SCRATCH) as name:
+        folder = Path(name)
+        with (folder / LOCK).open("w") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            yield folder
+
+
+def _within(rows: np.ndarray, t: int, begin: float, end: float) -> np.ndarray:
+    """Rows whose column t lies in [begin, end) s."""
+    return rows[(rows[:, t] >= begin) & (rows[:, t] < end)]
+
+
+class Spill:
+    """Rows by recording and minute in scratch files of float64."""
+
+    def __init__(
+        self,
+        path: Path,
+        fields: list[Field],
+        folder: Path,
+        wanted: Container[str] | None = None,
+    ) -> None:
+        self.path, self.folder, self.wanted = path, folder, wanted
+        self.names = [field.name for field in fields]
+        self.texts = {field.name: {} for field in fields if field.text}
+        self.blocks: dict[int, set[int]] = {}  # number of a recording -> minutes
+        self.buffers: dict[tuple[int, int], list[np.ndarray]] = {}
+        self.held = 0  # bytes in the buffers
+        self.given = 0.0  # minutes given as pieces
+        self._tables: dict[str, np.ndarray] = {}
+
+    def add(self, batch: dict) -> None:
+        """Sort a batch's rows into their minutes."""
+        columns = [self._numbers(name, batch[name]) for name in self.names]
+        rows = np.stack(columns, axis=1)
+        recording = np.zeros(len(rows), np.int64)
+        if "recording" in self.names:
+            recording = rows[:, self.names.index("recording")].astype(np.int64)
+            rows, recording = self._of_wanted(rows, recording)
+        minute = np.floor(rows[:, self.names.index("t")] / BLOCK_S).astype(np.int64)
+        order = np.lexsort((minute, recording))  # stable: the file's order inside
+        keys = np.stack([recording, minute], axis=1)[order]
+        changes = np.flatnonzero(np.any(np.diff(keys, axis=0), axis=1)) + 1
+        for part in np.split(order, changes) if order.size else []:
+            key = (int(recording[part[0]]), int(minute[part[0]]))
+            self.blocks.setdefault(key[0], set()).add(key[1])
+            self.buffers.setdefault(key, []).append(rows[part])
+        if sum(map(len, self.blocks.values())) > MAX_BLOCKS:
+            raise InputError(
+                f"{self.path}: t: more than {MAX_BLOCKS} minutes: expected seconds; "
+                "wrong unit of time?"
+            )
+        self.held += rows.nbytes
+        if self.held > BUFFER_BYTES:
+            self.flush()
+
+    def _numbers(self, name: str, column: Any) -> np.ndarray:  # noqa: ANN401
+        """A column as float64; texts as their numbers in order of appearance."""
+        if name not in self.texts:
+            return column
+        codes, texts = column
+        known = self.texts[name]
+        mine = [known.setdefault(text, len(known)) for text in texts]
+        return np.array(mine, np.float64)[codes]
+
+    def _of_wanted(
+        self, rows: np.ndarray, recording: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        if self.wanted is None:
+            return rows, recording
+        kept = np.array([name in self.wanted for name in self.texts["recording"]])
+        return rows[kept[recording]], recording[kept[recording]]
+
+    def flush(self) -> None:
+        """Write what is held to the scratch files."""
+        for (recording, minute), rows in self.buffers.items():
+            with (self.folder / f"{recording}_{minute}").open("ab") as file:
+                for part in rows:
+                    file.write(np.ascontiguousarray(part).tobytes())
+        self.buffers, self.held = {}, 0
+
+    def recordings(self) -> list[str | None]:
+        """Values of `recording` met, left out ones too; [None] without the field."""
+        return list(self.texts.get("recording", [None]))
+
+    def _minutes(self, recording: str | None) -> tuple[int, list[int]]:
+        """A recording's number, and its minutes in the order of time."""
+        code = 0 if recording is None else self.texts["recording"][recording]
+        return code, sorted(self.blocks.get(code, ()))
+
+    def _rows(self, code: int, minute: int) -> np.ndarray:
+        if minute not in self.blocks[code]:
+            return np.zeros((0, len(self.names)))
+        raw = np.fromfile(self.folder / f"{code}_{minute}", np.float64)
+        return raw.reshape(-1, len(self.names))
+
+    def minutes(self, recording: str | None) -> Iterator[dict[str, np.ndarray]]:
+        """Field -> [n] of each minute alone, t as in the file."""
+        code, minutes = self._minutes(recording)
+        for minute in minutes:
+            yield self._values(self._rows(code, minute))
+
+    def _values(self, rows: np.ndarray) -> dict[str, np.ndarray]:
+        values = {name: rows[:, place] for place, name in enumerate(self.names)}
+        values.pop("recording", None)
+        for name in self.texts:
+            if name in values:
+                codes = values[name].astype(np.int64)
+                values[name] = self._table(name)[codes].astype(str)
+        return values
+
+    def _table(self, name: str) -> np.ndarray:
+        """Texts of a field by number; all of them are known once the file is read."""
+        if name not in self._tables:
+            self._tables[name] = np.array(list(self.texts[name]), object)
+        return self._tables[name]
+
+    def _fragments(
+        self, code: int, minutes: list[int], max_gap_s: float
+    ) -> dict[int, list[float]]:
+        """Number of id -> times [s] at which it is first seen, or again."""
+        found: dict[int, list[float]] = {}
+        last: dict[int, float] = {}
+        t, user = self.names.index("t"), self.names.index("id")
+        for minute in minutes:
+            rows = self._rows(code, minute)[:, [user, t]]
+            rows = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
+            same = np.diff(rows[:, 0]) == 0.0
+            later = same & (np.diff(rows[:, 1]) > max_gap_s)
+            starts = np.flatnonzero(np.concatenate([[True], ~same | later]))
+            ends = np.concatenate([starts[1:] - 1, [len(rows) - 1]])
+            for low, high in zip(starts.tolist(), ends.tolist(), strict=True):
+                key, begin = int(rows[low, 0]), float(rows[low, 1])
+                if begin - last.get(key, -np.inf) > max_gap_s:
+                    found.setdefault(key, []).append(begin)
+                last[key] = float(rows[high, 1])
+        return found
+
+    def pieces(self, recording: str | None, max_gap_s: float) -> Iterator[Piece]:
+        """Every minute of a recording with its surroundings, in the order of time.
+
+        Args:
+          recording: one of `recordings()`.
+          max_gap_s: a road user unseen for longer is another fragment.
+        """
+        code, minutes = self._minutes(recording)
+        users: list[str] = list(self.texts.get("id", {}))
+        t, user = self.names.index("t"), self.names.index("id")
+        fragments = self._fragments(code, minutes, max_gap_s)
+        start = min(seen for seen, *_ in fragments.values()) if fragments else 0.0
+        total = sum(map(len, self.blocks.values()))
+        for minute in minutes:
+            begin, end = minute * BLOCK_S, (minute + 1) * BLOCK_S
+            near = np.concatenate([self._rows(code, minute + k) for k in (-1, 0, 1)])
+            near = _within(near, t, begin - BEFORE_S, end + AFTER_S)
+            own = _within(near, t, begin, end)[:, t]
+            count = min(-(-own.size // MAX_ROWS), MAX_WINDOWS)
+            edges = np.linspace(begin, end, count + 1).tolist()
+            for window, (low, high) in enumerate(itertools.pairwise(edges)):
+                self.given += 1 / count
+                if not np.any((own >= low) & (own < high)):
+                    continue
+                rows = _within(near, t, low - BEFORE_S, high + AFTER_S)
+                values = self._values(rows)
+                values["t"] = values["t"] - start
+                yield Piece(
+                    recording=recording,
+                    number=minute - int(np.floor(start / BLOCK_S)),
+                    values=values,
+                    within=(low - start, high - start),
+                    fragments={
+                        users[u] if users else str(u): [s - start for s in fragments[u]]
+                        for u in np.unique(rows[:, user]).astype(int).tolist()
+                    },
+                    progress=self.given / total,
+                    window=window if count > 1 else None,
+                )

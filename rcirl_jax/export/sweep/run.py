@@ -1,0 +1,178 @@
+"""A sweep in its folder: trained once, resumed, chosen, written."""
+
+import collections
+import dataclasses
+import functools
+import json
+import resource
+from collections.abc import Mapping
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tqdm
+
+from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.evaluation.ranking.evaluate import covered_rows
+from rcirl_jax.evaluation.ranking.sweep import (
+    Hidden,
+    Part,
+    SweepConfig,
+    open_split,
+    row_name,
+    shape_name,
+    train_group,
+)
+from rcirl_jax.evaluation.statistics import ClusterBootstrap
+from rcirl_jax.export.from_run import verification_samples, write_weights
+from rcirl_jax.export.reader import Reward
+from rcirl_jax.export.sweep.choice import judged
+from rcirl_jax.export.sweep.folder import (
+    SWEEP,
+    claim,
+    data_of,
+    finish_group,
+    finished_group,
+    grid_of,
+    settings_of,
+    weights_file,
+)
+from rcirl_jax.runtime.atomic_files import write_json, write_whole
+from rcirl_jax.runtime.executors import Executor
+from rcirl_jax.runtime.pipeline import only_one
+from rcirl_jax.train.state import TrainConfig
+
+
+def run_sweep(
+    config: SweepConfig,
+    folder: Path,
+    executor: Executor,
+    provenance: Mapping[str, object],
+) -> dict:
+    """Train what is not there yet, choose, score the chosen, write everything.
+
+    Args:
+      config: the sweep.
+      folder: its folder; a finished group in it is not trained again.
+      executor: where groups train and scenes are scored.
+      provenance: of `experiments.common`; kept in every file.
+
+    Returns:
+      The contents of sweep.json.
+
+    Raises:
+      InputError: the folder belongs to other settings or data, or is in use; bad
+        data; no configuration that trains.
+    """
+    opened = open_split(config)
+    with only_one(folder):
+        return _sweep(config, folder, executor, provenance, opened)
+
+
+def _sweep(
+    config: SweepConfig,
+    folder: Path,
+    executor: Executor,
+    provenance: Mapping[str, object],
+    opened: tuple[Demonstrations, Demonstrations, str],
+) -> dict:
+    """`run_sweep` in a folder that is this sweep's alone."""
+    dataset, split, by = opened
+    created = claim(config, folder, dataset.hash)
+    made_by = {**provenance, "dataset_sha256": dataset.hash, "created": created}
+    for name in ("validation", "test"):  # what would fail only after the training
+        held_out, _ = covered_rows(split, name, config.setup.horizon_s)
+        ClusterBootstrap(np.asarray(held_out.vehicle))
+    groups = _train(config, folder, split, executor, made_by)
+    rows: dict[str, list[TrainConfig]] = collections.defaultdict(list)
+    for one in config.members():
+        rows[row_name(one)].append(one)
+    body = {
+        "settings": settings_of(config),
+        "validation_by": by,
+        "scenes": {n: split.indices(n).size for n in ("train", "validation", "test")},
+        "groups": {name: group["facts"] for name, group in groups.items()},
+        **judged(config, folder, split, rows, groups, executor),
+        "peak_memory_gib": _peak_memory_gib(),
+        "made_by": made_by,
+    }
+    chosen = folder / "weights" / f"{body['chosen']['member']}.msgpack"
+    write_whole(folder / "best.msgpack", chosen.read_bytes())
+    write_json(folder / SWEEP, body)
+    return body
+
+
+def _train(
+    config: SweepConfig,
+    folder: Path,
+    split: Demonstrations,
+    executor: Executor,
+    made_by: Mapping[str, object],
+) -> dict[str, dict]:
+    """The groups' files by shape, after training those that are missing."""
+    groups = {
+        h: finished_group(config, folder, h, made_by) for h in config.hidden_sizes
+    }
+    todo = [hidden for hidden, group in groups.items() if group is None]
+    samples = functools.cache(lambda: verification_samples(split, config.base))
+    total = len(config.members())
+    done = total - sum(len(config.group(hidden)) for hidden in todo)
+    parts: dict[Hidden, list[Part]] = collections.defaultdict(list)
+    with tqdm.tqdm(total=total, initial=done, desc="sweep", unit="member") as bar:
+        piece = functools.partial(train_group, config=config)
+        for part in executor.stream(piece, todo):
+            for number, member in enumerate(part.members):
+                output = weights_file(folder, member)
+                write_member(output, part, number, samples(), config, made_by)
+            parts[part.hidden].append(part)
+            bar.update(len(part.members))
+            if sum(len(p.members) for p in parts[part.hidden]) == len(
+                config.group(part.hidden)
+            ):
+                settings = {**settings_of(config), **data_of(made_by)}
+                groups[part.hidden] = finish_group(folder, parts[part.hidden], settings)
+    return {shape_name(hidden): group or {} for hidden, group in groups.items()}
+
+
+def write_member(
+    output: Path,
+    part: Part,
+    number: int,
+    samples: tuple[np.ndarray, np.ndarray],
+    config: SweepConfig,
+    made_by: Mapping[str, object],
+) -> Reward:
+    """Write the weights file of one trained member.
+
+    Args:
+      output: the file.
+      part: that it was trained in.
+      number: its place there.
+      samples: of `verification_samples`.
+      config: the sweep; the file keeps all of it but where the data lie.
+      made_by: provenance, with the hash of the data.
+    """
+    member = part.members[number]
+    metrics = {"loss": part.loss[number], "pair_accuracy": part.wins[number]}
+    provenance = {
+        "git_commit": None,
+        "flags": {},
+        "versions": {},
+        **made_by,
+        "seed": member.seed,
+        "metrics": {name: float(x) for name, x in metrics.items()},
+        "mode": member.sampler.mode,
+        "config": json.loads(json.dumps(dataclasses.asdict(member))),
+        "sweep": grid_of(config),
+    }
+    params = jax.tree.map(lambda x: jnp.asarray(x[number]), part.params)
+    normaliser = jax.tree.map(jnp.asarray, part.normaliser)
+    return write_weights(
+        output, params, normaliser, member, samples, provenance, part.seen
+    )
+
+
+def _peak_memory_gib() -> float:
+    """Of this process; that of workers is theirs."""
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2)
