@@ -129,6 +129,7 @@ class TuneConfig:
             raise InputError(
                 f"--mode: {self.train.sampler.mode}: the closed loop plans speed"
             )
+        self.train.reward.check_own()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from rcirl_jax.reward.network import product
+from rcirl_jax.reward.module import product
 from rcirl_jax.train.state import FeatureBatch
 
 
