@@ -89,7 +89,7 @@ def module_score(features: FeatureMap, network: ValueNetwork) -> Score:
         params: tuple[dict, Normaliser], scene: Scene, candidates: Candidates
     ) -> jax.Array:
         variables, normaliser = params
-        x = jnp.stack(features.rows(scene, candidates), axis=-1).swapaxes(0, 1)
+        x = features.of_candidates(scene, candidates)
         valid = jnp.broadcast_to(scene.time_valid, x.shape[:-1])
         return module_value(network, variables, normaliser, x, valid)
 

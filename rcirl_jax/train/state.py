@@ -25,17 +25,18 @@ from rcirl_jax.types import Demonstration
 Optimizer = Callable[[optax.ScalarOrSchedule], optax.GradientTransformation]
 
 
-def _of_optax() -> dict[str, Optimizer]:
-    """Optax's functions of a learning rate alone, by their names.
+# the first asks for the loss again, the second for a key, the third is deprecated
+OTHERWISE = ("lbfgs", "noisy_sgd", "optimistic_adam")
 
-    Without lbfgs, whose line search asks for the loss again.
-    """
+
+def _of_optax() -> dict[str, Optimizer]:
+    """Optax's functions of a learning rate alone, by their names."""
     found = {}
     for name, function in inspect.getmembers(optax, inspect.isfunction):
         arguments = inspect.signature(function).parameters.values()
         needed = {x.name for x in arguments if x.default is x.empty}
         first = next((x.name for x in arguments), "")
-        if first == "learning_rate" and needed <= {first} and name != "lbfgs":
+        if first == "learning_rate" and needed <= {first} and name not in OTHERWISE:
             found[name] = function
     return {n: f for n, f in found.items() if not n.startswith("scale_by")}
 
