@@ -25,8 +25,9 @@ from rcirl_jax.types import Demonstration
 Optimizer = Callable[[optax.ScalarOrSchedule], optax.GradientTransformation]
 
 
-# the first asks for the loss again, the second for a key, the third is deprecated
-OTHERWISE = ("lbfgs", "noisy_sgd", "optimistic_adam")
+# the first asks for the loss again, the second for a key, the third is deprecated, the
+# others take no schedule
+OTHERWISE = ("lbfgs", "noisy_sgd", "optimistic_adam", "rprop", "sm3")
 
 
 def _of_optax() -> dict[str, Optimizer]:

@@ -121,6 +121,16 @@ def test_other_settings_may_not_resume(dataset, run):
         train(dataset, run[0], TrainConfig(batch_size=8, leaky_rate=0.1, sampler=SMALL))
 
 
+def test_a_run_of_before_a_setting_may_resume(dataset, run, tmp_path):
+    body = json.loads((run[0] / "run.json").read_text())
+    del body["config"]["clip_norm"], body["config"]["reward"]["module"]
+    (tmp_path / "run.json").write_text(json.dumps(body))
+    check_run(tmp_path, CONFIG, dataset)
+    other = dataclasses.replace(CONFIG, reward=RewardConfig(module="a.b:C"))
+    with pytest.raises(InputError, match=r"reward: .*to resume"):
+        check_run(tmp_path, other, dataset)
+
+
 def test_run_writes_what_it_should(run):
     workdir, result = run
     assert (workdir / "run.json").is_file()

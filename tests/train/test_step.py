@@ -434,8 +434,8 @@ def test_decay_pulls_kernels_and_biases_only(how):
 
 @pytest.mark.parametrize("name", OPTIMIZERS)
 def test_any_optimiser_of_optax_takes_steps(name):
-    """With the step size as a number, and as an array that members differ in."""
-    config = TrainConfig(optimizer=name, learning_rate=0.01)
+    """With a scheduled step size, and with an array that members differ in."""
+    config = TrainConfig(optimizer=name, learning_rate=0.01, halve_every=10**9)
     first = {"gamma": jnp.array([1.0, -2.0]), "kernel": jnp.ones((2, 3))}
     slope = {"gamma": jnp.array([0.3, 0.1]), "kernel": jnp.full((2, 3), -0.2)}
 
