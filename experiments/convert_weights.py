@@ -17,7 +17,7 @@ from experiments.common import provenance, run
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.forms.linear_yaml import lattice_yaml, reward_yaml
 from rcirl_jax.export.forms.onnx_model import write_onnx
-from rcirl_jax.export.forms.stablehlo import write_stablehlo
+from rcirl_jax.export.forms.stablehlo import exported, write_stablehlo
 from rcirl_jax.export.hand_weights import load_hand_weights
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.runtime.atomic_files import write_json, write_whole
@@ -64,7 +64,7 @@ def main() -> None:
                 write_onnx(path, reward)
             else:
                 form = "jax" if name == "jax_export" else "stablehlo"
-                write_stablehlo(path, reward, form)
+                write_stablehlo(path, exported(reward), form)
     if _YAML.value:
         files["yaml"] = Path(_YAML.value)
         write_whole(files["yaml"], text)

@@ -15,12 +15,11 @@ from rcirl_jax.autotune.recipes import reward_config
 from rcirl_jax.data.store.joined import EQUAL
 from rcirl_jax.errors import InputError
 from rcirl_jax.reward import LOSSES, RewardConfig
-from rcirl_jax.reward.network import CONSTRAINTS, PINS
+from rcirl_jax.reward.config import CONSTRAINTS, PINS
 from rcirl_jax.sampling.config import MODES
 from rcirl_jax.train.state import (
     ADMISSIBLE_IN,
     LEARNED_FUTURES,
-    OPTIMIZERS,
     POSITIVES,
     TrainConfig,
 )
@@ -48,10 +47,11 @@ _TRAIN = {
     "loss": _one_of("loss", sorted(LOSSES), "loss on value differences"),
     "soft_distance": _number("soft_distance", "m, temperature of soft labels"),
     "leaky_rate": _number("leaky_rate", "a of the rank loss"),
-    "optimizer": _one_of("optimizer", sorted(OPTIMIZERS), "gradient method"),
+    "optimizer": _text("optimizer", "gradient method, by its name in optax"),
     "learning_rate": _number("learning_rate", "step size"),
     "halve_every": _count("halve_every", "steps per halving; 0: never"),
     "weight_decay": _number("weight_decay", "L2 pull on the weights"),
+    "clip_norm": _number("clip_norm", "norm the gradient is cut down to; 0: none"),
     "batch_size": _count("batch_size", "scenes per step, all devices"),
     "epochs": _count("epochs", "passes over the training scenes"),
     "positive": _one_of(
@@ -82,6 +82,7 @@ _REWARD = {
         "constraint", CONSTRAINTS, "nonnegative costs (linear), monotone in safety"
     ),
     "pin": _one_of("pin", PINS, "scale pinning"),
+    "module": _text("module", "PACKAGE.MODULE:CLASS, a linen module as R_theta"),
 }
 _MODE = _one_of("mode", MODES, "what the sampler varies")
 _MARGINS = flags.DEFINE_list(

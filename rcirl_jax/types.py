@@ -16,6 +16,7 @@ scene or ONE trajectory; batching adds leading axes by `vmap`. Host types
 
 import dataclasses
 import enum
+from typing import Any
 
 import flax.struct
 import jax
@@ -176,10 +177,15 @@ class RewardParams(flax.struct.PyTreeNode, kw_only=True):
     gamma: jax.Array  # [T] weight of each time
     kernels: tuple[jax.Array, ...]  # [F, H1], ..., [H, 1]
     biases: tuple[jax.Array, ...]  # [H1], ... one per hidden layer
-    # [F, F] gains of the features by the scene (`reward.conditioned`); None: none
+    # [F, F] gains of the features by the scene (`reward.module.gains`); None: none
     context: jax.Array | None = None
     # [] logit of the discriminator's prior, of the GAN loss only; ranks nothing
     offset: jax.Array | None = None
+
+
+# around an R_theta of somebody else's: Flax's tree {"gamma", "point": {...}, "context",
+# "offset"}, leaves as above (see `reward.module.ValueNetwork`)
+Parameters = RewardParams | dict[str, Any]
 
 
 # ----------------------------------------------------------------------- host

@@ -10,8 +10,9 @@ import numpy as np
 
 from rcirl_jax.export import Anchor, FeatureSpec, RewardWeights, pack, reader, save
 from rcirl_jax.features import feature_map
-from rcirl_jax.reward.network import LEAKY_SLOPE, RewardConfig, init_reward, pinned
-from rcirl_jax.reward.network import value as trained_value
+from rcirl_jax.reward import RewardConfig, init_reward, pinned
+from rcirl_jax.reward import value as trained_value
+from rcirl_jax.reward.module import LEAKY_SLOPE
 from rcirl_jax.reward.normaliser import Normaliser
 from rcirl_jax.units import TIMES_S
 

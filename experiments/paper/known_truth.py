@@ -46,7 +46,7 @@ from rcirl_jax.evaluation.ranking.learners import (
 )
 from rcirl_jax.report.ranking.intervals import curves_panel
 from rcirl_jax.report.style import figure, label, save
-from rcirl_jax.reward.network import PINS
+from rcirl_jax.reward.config import PINS
 from rcirl_jax.train.state import TrainConfig
 
 _COUNTS = flags.DEFINE_list(

@@ -33,7 +33,7 @@ from rcirl_jax.evaluation.ranking.learners import (
     train_with_each,
 )
 from rcirl_jax.report.style import figure, label, save
-from rcirl_jax.train.state import OPTIMIZERS
+from rcirl_jax.train.state import PAPER_OPTIMIZERS
 
 # "on curves" are the runs of --positive=human
 _LEARNERS = flags.DEFINE_list(
@@ -48,7 +48,7 @@ def main() -> None:
     data = dataset()
     sets, rows = FrozenSets(data), {}
     names = _LEARNERS.value[::5] if QUICK.value else _LEARNERS.value
-    configs, optimizers = learner_configs(names, base()), sorted(OPTIMIZERS)
+    configs, optimizers = learner_configs(names, base()), sorted(PAPER_OPTIMIZERS)
     for name, config in tqdm.tqdm(configs.items(), desc="train", unit="learner"):
         runs = train_with_each(sets.of(config), config, optimizers)
         for how, learned in runs.items():

@@ -46,3 +46,4 @@ class TuneConfig:
             raise InputError(
                 f"--mode: {self.train.sampler.mode}: the closed loop plans speed"
             )
+        self.train.reward.check_own()

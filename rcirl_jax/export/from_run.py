@@ -3,7 +3,7 @@
 import datetime
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ from rcirl_jax.reward import (
     seen_range,
     value,
 )
-from rcirl_jax.reward.network import LEAKY_SLOPE
+from rcirl_jax.reward.module import LEAKY_SLOPE
 from rcirl_jax.runtime.atomic_files import read_json
 from rcirl_jax.runtime.settings import typed_settings
 from rcirl_jax.train.loop import normaliser_rows, restore_run, to_device_batch
@@ -122,7 +122,8 @@ def export_run(
       anchor: of a reward driven on top of an incumbent (version 4; needs the ranges).
 
     Raises:
-      InputError: no run, no checkpoint, or another dataset.
+      InputError: no run, no checkpoint, another dataset, or another network than
+        the package's own.
     """
     config, run = read_config(workdir)
     if run.get("dataset_hash") != dataset.hash:
@@ -130,13 +131,14 @@ def export_run(
             f"{workdir / 'run.json'}: dataset_hash: {run.get('dataset_hash')}: "
             f"expected that of the given dataset, {dataset.hash}"
         )
+    config.reward.check_own()
     state, seen = restore_run(workdir, config), None
     if ranges:
         rows = normaliser_rows(dataset, config)
         seen = seen_range(rows, feature_map(config.features))
     return write_weights(
         output,
-        state.params,
+        cast("RewardParams", state.params),
         state.normaliser,
         config,
         verification_samples(dataset, config),

@@ -12,8 +12,7 @@ from rcirl_jax.evaluation.ranking.score import OnTop
 from rcirl_jax.export.provenance import check_provenance
 from rcirl_jax.export.reader import Anchor, Reward, WeightsError, load_weights
 from rcirl_jax.features.mapping import feature_map, known_presets
-from rcirl_jax.reward.network import LEAKY_SLOPE, conditioned, point_rewards
-from rcirl_jax.reward.normaliser import normalise
+from rcirl_jax.reward.module import LEAKY_SLOPE, module_value, network_of, variables_of
 from rcirl_jax.reward.support import Support
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.types import Normaliser, RewardParams
@@ -110,20 +109,16 @@ def _score(
     return np.asarray(_value(effective, normaliser, x, valid, activation))
 
 
-def scored(
+@functools.partial(jax.jit, static_argnames="activation")
+def _value(
     effective: RewardParams,
     normaliser: Normaliser,
     x: jax.Array,
     valid: jax.Array,
     activation: str,
 ) -> jax.Array:
-    """V [...] of raw features [..., T, F] under a mask [..., T]."""
-    x = conditioned(effective, normalise(normaliser, x))
-    rewards = point_rewards(effective, x, activation)
-    return jnp.sum(jnp.where(valid, effective.gamma * rewards, 0.0), axis=-1)
-
-
-_value = jax.jit(scored, static_argnames="activation")
+    network, variables = network_of(effective, activation), variables_of(effective)
+    return module_value(network, variables, normaliser, x, valid)
 
 
 def row_name(reward: Reward) -> str:

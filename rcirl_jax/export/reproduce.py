@@ -132,6 +132,7 @@ def _config_of(reward: Reward) -> TrainConfig:
     where = f"{reward.file}: provenance.config"
     with _of_this_version(where):
         config = config_of(reward.provenance["config"])
+    config.reward.check_own()  # no file may name code to import
     hidden = tuple(len(bias) for bias in reward.biases[:-1])
     if config.reward.hidden != hidden:
         raise InputError(

@@ -41,7 +41,7 @@ from rcirl_jax.planner.rank import (
     learned_score,
     with_plan_in_force,
 )
-from rcirl_jax.reward.network import product
+from rcirl_jax.reward.module import product
 from rcirl_jax.sampling import sample
 from rcirl_jax.sampling.kinematics import trajectory_on_path
 from rcirl_jax.sampling.speed import family_index

@@ -32,7 +32,7 @@ from rcirl_jax.features import FeatureMap
 from rcirl_jax.features.path import path_view
 from rcirl_jax.planner.safety import SafetyConfig
 from rcirl_jax.reward import normalise
-from rcirl_jax.reward.network import ACTIVATIONS, gains, product
+from rcirl_jax.reward.module import ACTIVATIONS, gains, product
 from rcirl_jax.sampling.kinematics import trajectory_on_path
 from rcirl_jax.types import (
     Candidates,

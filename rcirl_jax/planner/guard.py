@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from rcirl_jax.features import FeatureMap
 from rcirl_jax.planner.rank import Params, Score
-from rcirl_jax.reward.network import rows_value
+from rcirl_jax.reward.fast import rows_value
 from rcirl_jax.types import Candidates, Normaliser, RewardParams, Scene
 
 

@@ -18,8 +18,9 @@ from rcirl_jax.planner.baselines import Idm, idm_acceleration
 from rcirl_jax.planner.commitment import InForce, committed
 from rcirl_jax.planner.plan import Plan, held, plan_of
 from rcirl_jax.planner.safety import SafetyConfig, check, choose
+from rcirl_jax.reward.fast import rows_value
 from rcirl_jax.reward.hand import LatticeCost, lattice_costs
-from rcirl_jax.reward.network import ACTIVATIONS, rows_value
+from rcirl_jax.reward.module import ACTIVATIONS, ValueNetwork, module_value
 from rcirl_jax.reward.speed_dp import speed_dp_cost
 from rcirl_jax.sampling import SamplerConfig, sample
 from rcirl_jax.sampling.speed import family_index
@@ -73,6 +74,24 @@ def learned_score(features: FeatureMap, activation: str) -> Score:
         effective, normaliser = params
         rows = features.rows(scene, candidates)
         return rows_value(effective, normaliser, rows, scene.time_valid, activation)
+
+    return score
+
+
+@functools.lru_cache(maxsize=16)
+def module_score(features: FeatureMap, network: ValueNetwork) -> Score:
+    """Score of (variables, Normaliser): V of any module, by its own `apply`.
+
+    `reward.effective_network` gives the module and the variables of a training.
+    """
+
+    def score(
+        params: tuple[dict, Normaliser], scene: Scene, candidates: Candidates
+    ) -> jax.Array:
+        variables, normaliser = params
+        x = features.of_candidates(scene, candidates)
+        valid = jnp.broadcast_to(scene.time_valid, x.shape[:-1])
+        return module_value(network, variables, normaliser, x, valid)
 
     return score
 

@@ -28,7 +28,7 @@ from rcirl_jax.planner.grid import (
 )
 from rcirl_jax.planner.plan import Plan, plan_of
 from rcirl_jax.planner.rank import Policy
-from rcirl_jax.reward.network import product
+from rcirl_jax.reward.module import product
 from rcirl_jax.sampling.kinematics import trajectory_on_path
 from rcirl_jax.types import Scene
 from rcirl_jax.units import DT_S, NUM_TIMES

@@ -1,5 +1,8 @@
 """The learned reward: network, normaliser, losses, and the hand-set rivals."""
 
+from rcirl_jax.reward.config import RewardConfig
+from rcirl_jax.reward.constraints import pinned
+from rcirl_jax.reward.fast import scenes_value
 from rcirl_jax.reward.hand import (
     LONG_ROW,
     TUNABLE,
@@ -18,16 +21,16 @@ from rcirl_jax.reward.losses import (
     LossSums,
     loss_sums,
 )
+from rcirl_jax.reward.module import PointReward, ValueNetwork
 from rcirl_jax.reward.network import (
-    RewardConfig,
+    effective_network,
     init_reward,
-    pinned,
-    scenes_value,
+    init_tree,
     value,
 )
 from rcirl_jax.reward.normaliser import fit_normaliser, normalise, seen_range
 from rcirl_jax.reward.speed_dp import SPEED_DP_ROW, SpeedDpCost, speed_dp_cost
-from rcirl_jax.types import Normaliser, RewardParams
+from rcirl_jax.types import Normaliser, Parameters, RewardParams
 
 __all__ = [
     "LONG_ROW",
@@ -40,11 +43,16 @@ __all__ = [
     "LossConfig",
     "LossSums",
     "Normaliser",
+    "Parameters",
+    "PointReward",
     "RewardConfig",
     "RewardParams",
     "SpeedDpCost",
+    "ValueNetwork",
+    "effective_network",
     "fit_normaliser",
     "init_reward",
+    "init_tree",
     "lattice_cost",
     "lattice_costs",
     "lattice_terms",

@@ -65,7 +65,7 @@ def rank_loss(y: Float[Array, "*n"], leaky_rate: ArrayLike) -> Float[Array, "*n"
     """The paper's leaky-ReLU rank loss: L(y) = y if y >= 0 else a y, a = 0.05.
 
     A candidate valued above the human costs its lead; one below earns a small
-    reward for its distance. Needs a pinned scale (`reward.network.pinned`).
+    reward for its distance. Needs a pinned scale (`reward.pinned`).
     """
     return jnp.where(y >= 0.0, y, leaky_rate * y)
 

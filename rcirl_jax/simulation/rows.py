@@ -29,8 +29,8 @@ from rcirl_jax.planner.rank import (
     velocity_score,
 )
 from rcirl_jax.planner.yielding import Yielding, yielding_policy
+from rcirl_jax.reward import RewardConfig, init_reward, pinned
 from rcirl_jax.reward.hand import TUNED_ROW, LatticeCost
-from rcirl_jax.reward.network import RewardConfig, init_reward, pinned
 from rcirl_jax.reward.speed_dp import SPEED_DP_ROW
 from rcirl_jax.types import Normaliser, RewardParams
 

@@ -10,7 +10,7 @@ from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.data.store.rows import refuse_scenes, scene_name, unusable_leaves
 from rcirl_jax.errors import InputError
 from rcirl_jax.features import FeatureMap, feature_map
-from rcirl_jax.reward.network import product
+from rcirl_jax.reward.module import product
 from rcirl_jax.train.state import FeatureBatch
 from rcirl_jax.types import Demonstration
 

@@ -14,7 +14,7 @@ import contextlib
 import dataclasses
 import functools
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, cast
 
 import flax.struct
 import jax
@@ -29,7 +29,7 @@ from rcirl_jax.train.state import (
     OPTIMIZERS,
     FeatureBatch,
     TrainConfig,
-    weight_decay,
+    make_rule,
 )
 from rcirl_jax.train.step import (
     as_tree,
@@ -79,8 +79,14 @@ def members_of(configs: Sequence[TrainConfig]) -> Members:
 def first_params(
     seed: int | jax.Array, num_features: int, config: TrainConfig
 ) -> RewardParams:
-    """A member's parameters before its first step, as a training run has them."""
-    return init_params(jax.random.split(jax.random.key(seed))[0], num_features, config)
+    """A member's parameters before its first step, as a training run has them.
+
+    Raises:
+      InputError: not of the package's own network.
+    """
+    config.reward.check_own()
+    key = jax.random.split(jax.random.key(seed))[0]
+    return cast("RewardParams", init_params(key, num_features, config))
 
 
 def freeze(rows: Demonstration, index: np.ndarray, config: TrainConfig) -> FeatureBatch:
@@ -176,14 +182,13 @@ def _fit(
     points = members.seed.size * candidates * times
     widest = max(config.reward.hidden, default=1)
     piece = piece_size(size, PIECE_VALUES // (points * widest))
-    # the direction of a step of size 1; members scale it
-    rules = [
-        optax.chain(weight_decay(config), OPTIMIZERS[name](1.0)) for name in optimizers
-    ]
     params = jax.vmap(lambda seed: first_params(seed, frozen.human.shape[-1], config))(
         members.seed
     )
-    state = jax.vmap(lambda p: [rule.init(as_tree(p)) for rule in rules])(params)
+    rules = lambda rate: [make_rule(config, name, rate) for name in optimizers]  # noqa: E731
+    state = jax.vmap(
+        lambda params, rate: [rule.init(as_tree(params)) for rule in rules(rate)]
+    )(params, members.learning_rate)
 
     def one_step(batch: tuple, step: jax.Array, member: tuple) -> tuple:
         who, params, state = member
@@ -193,15 +198,15 @@ def _fit(
         )
         grads, sums = added(sums_of, batch)
         grads = jax.tree.map(lambda g: g / jnp.maximum(sums.terms, 1.0), grads)
-        asked = [
-            rule.update(grads, own, as_tree(params))
-            for rule, own in zip(rules, state, strict=True)
-        ]
-        updates, after = _own_updates(asked, who.optimizer)
         rate = who.learning_rate
         if config.halve_every:
             rate = rate * 0.5 ** (step / config.halve_every)
-        moved = jax.tree.map(lambda p, u: p + rate * u, params, updates)
+        asked = [
+            rule.update(grads, own, as_tree(params))
+            for rule, own in zip(rules(rate), state, strict=True)
+        ]
+        updates, after = _own_updates(asked, who.optimizer)
+        moved = optax.apply_updates(as_tree(params), updates)
         fine = jnp.isfinite(sums.loss) & jnp.isfinite(optax.tree.norm(grads))
         keep = lambda new, old: jnp.where(fine, new, old)  # noqa: E731
         kept = jax.tree.map(keep, (moved, after), (params, state))

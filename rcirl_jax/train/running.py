@@ -55,6 +55,8 @@ def check_run(workdir: Path, config: TrainConfig, dataset: Demonstrations) -> No
             raise InputError(f"{path}: {name}: unknown: expected a run of this version")
     for name, setting in described["config"].items():
         before = found["config"].get(name, usual[name])
+        if isinstance(before, dict) and isinstance(usual[name], dict):
+            before = {**usual[name], **before}
         if before != setting and name != "epochs":
             raise InputError(
                 f"{path}: {name}: {before}: expected {setting} to resume; "

@@ -1,6 +1,7 @@
 """What training carries: state, batch, configuration."""
 
 import dataclasses
+import inspect
 from collections.abc import Callable
 
 import flax.struct
@@ -9,25 +10,45 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from rcirl_jax.errors import InputError
+from rcirl_jax.errors import InputError, did_you_mean
 from rcirl_jax.reward import (
     LOSSES,
     LossConfig,
     Normaliser,
+    Parameters,
     RewardConfig,
     RewardParams,
 )
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.types import Demonstration
 
-OPTIMIZERS: dict[
-    str, Callable[[optax.ScalarOrSchedule], optax.GradientTransformation]
-] = {
+Optimizer = Callable[[optax.ScalarOrSchedule], optax.GradientTransformation]
+
+
+# the first asks for the loss again, the second for a key, the third is deprecated, the
+# others take no schedule
+OTHERWISE = ("lbfgs", "noisy_sgd", "optimistic_adam", "rprop", "sm3")
+
+
+def _of_optax() -> dict[str, Optimizer]:
+    """Optax's functions of a learning rate alone, by their names."""
+    found = {}
+    for name, function in inspect.getmembers(optax, inspect.isfunction):
+        arguments = inspect.signature(function).parameters.values()
+        needed = {x.name for x in arguments if x.default is x.empty}
+        first = next((x.name for x in arguments), "")
+        if first == "learning_rate" and needed <= {first} and name not in OTHERWISE:
+            found[name] = function
+    return {n: f for n, f in found.items() if not n.startswith("scale_by")}
+
+
+# those of the paper, then the others of optax
+PAPER_OPTIMIZERS: dict[str, Optimizer] = {
     "sgd": lambda rate: optax.sgd(rate, momentum=0.9),
     "adam": optax.adam,
     "rmsprop": optax.rmsprop,
 }
-
+OPTIMIZERS = PAPER_OPTIMIZERS | (_of_optax() | PAPER_OPTIMIZERS)
 
 POSITIVES = ("human", "nearest")
 # what the learner sees of the others' future: the planner's prediction, or the record
@@ -43,7 +64,7 @@ RANGES: dict[str, tuple[float, float, str]] = {
     ),
     **dict.fromkeys(
         (
-            *("halve_every", "hard_negatives", "weight_decay"),
+            *("halve_every", "hard_negatives", "weight_decay", "clip_norm"),
             *("margin_distance", "margin_collision", "margin_rule"),
         ),
         (0.0, np.inf, ">= 0"),
@@ -72,7 +93,7 @@ class TrainConfig:
     margin_rule: float = 2.0
     # soft: m, temperature of the labels
     soft_distance: float = 1.0
-    # optimiser; the paper found no substantial difference between these
+    # key of OPTIMIZERS; the paper saw no difference between PAPER_OPTIMIZERS
     optimizer: str = "adam"
     # 1/step
     learning_rate: float = 3e-3
@@ -80,6 +101,8 @@ class TrainConfig:
     halve_every: int = 0
     # L2 pull on kernels and biases, per step
     weight_decay: float = 0.0
+    # norm that the gradient is cut down to (0: as it is)
+    clip_norm: float = 0.0
     # scenes per step, over all devices
     batch_size: int = 64
     # passes over the training scenes
@@ -115,6 +138,7 @@ class TrainConfig:
             if getattr(self, name) not in values:
                 raise InputError(
                     f"--{name}: {getattr(self, name)}: expected one of {sorted(values)}"
+                    + did_you_mean(getattr(self, name), values)
                 )
         for name, (low, high, text) in RANGES.items():
             if not low <= getattr(self, name) <= high:
@@ -159,13 +183,17 @@ class TrainConfig:
 
 
 class TrainState(flax.struct.PyTreeNode, kw_only=True):
-    """Step counter, parameters, optimiser state, PRNG key, frozen normaliser."""
+    """All that a step changes or needs besides its batch; what a checkpoint holds.
 
-    step: jax.Array  # [] int32
-    params: RewardParams
-    opt_state: optax.OptState
-    key: jax.Array  # typed PRNG key; folded, never split away
-    normaliser: Normaliser
+    Flax's own TrainState would carry `apply` and the optimiser too: here the
+    configuration makes them (`make_train_step`).
+    """
+
+    step: jax.Array  # [] int32, steps taken, refused ones included
+    params: Parameters  # raw: pin and constraints are applied where they are used
+    opt_state: optax.OptState  # of `make_optimizer`
+    key: jax.Array  # typed PRNG key; folded with step and row, never split away
+    normaliser: Normaliser  # frozen
 
 
 class Facts(flax.struct.PyTreeNode, kw_only=True):
@@ -218,18 +246,29 @@ def weight_decay(config: TrainConfig) -> optax.GradientTransformation:
     if config.weight_decay == 0.0:
         return optax.identity()
 
-    def pulled(params: RewardParams) -> RewardParams:
+    def pulled(params: Parameters) -> Parameters:
         free = jax.tree.map(lambda _: False, params)
+        if not isinstance(params, RewardParams):
+            return {**free, "point": jax.tree.map(lambda _: True, params["point"])}
         yes = jax.tree.map(lambda _: True, (params.kernels, params.biases))
         return free.replace(kernels=yes[0], biases=yes[1])
 
     return optax.add_decayed_weights(config.weight_decay, mask=pulled)
 
 
+def make_rule(
+    config: TrainConfig, name: str, rate: optax.ScalarOrSchedule
+) -> optax.GradientTransformation:
+    """An optimiser by its name, after clipping and weight decay as configured."""
+    parts = [weight_decay(config), OPTIMIZERS[name](rate)]
+    if config.clip_norm:
+        parts.insert(0, optax.clip_by_global_norm(config.clip_norm))
+    return optax.chain(*parts)
+
+
 def make_optimizer(config: TrainConfig) -> optax.GradientTransformation:
     """The optimiser named in the configuration, its step size halved as asked."""
-    decay = weight_decay(config)
     rate: optax.ScalarOrSchedule = config.learning_rate
     if config.halve_every:
         rate = optax.exponential_decay(rate, config.halve_every, 0.5)
-    return optax.chain(decay, OPTIMIZERS[config.optimizer](rate))
+    return make_rule(config, config.optimizer, rate)

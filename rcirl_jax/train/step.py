@@ -23,9 +23,11 @@ from rcirl_jax.reward import (
     LossSums,
     RewardConfig,
     init_reward,
+    init_tree,
     loss_sums,
     pinned,
     scenes_value,
+    value,
 )
 from rcirl_jax.sampling import (
     SamplerConfig,
@@ -51,6 +53,7 @@ from rcirl_jax.types import (
     Candidates,
     Demonstration,
     Normaliser,
+    Parameters,
     RewardParams,
     Scene,
     Trajectory,
@@ -196,20 +199,40 @@ def _featurised(key: jax.Array, batch: Batch, config: TrainConfig) -> FeatureBat
     return featurise(key, batch, config, feature_map(config.features))
 
 
+def siamese_values(
+    params: Parameters,
+    normaliser: Normaliser,
+    batch: FeatureBatch,
+    reward: RewardConfig,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """(V of the positives [B], of the candidates [B, K], the prior's logit []).
+
+    In the fast layout for the package's own network, by `value` for any other.
+    """
+    if not isinstance(params, RewardParams):
+        human = value(params, normaliser, batch.human, batch.time_valid, reward)
+        others = value(params, normaliser, batch.points, batch.points_valid, reward)
+        return human, others, params.get("offset", jnp.zeros(()))
+    both = (batch.human.swapaxes(1, 2)[..., None], batch.candidates)
+    activation = reward.hidden_activation
+    human, candidates = scenes_value(
+        pinned(params, reward), normaliser, both, batch.time_valid, activation
+    )
+    offset = jnp.zeros(()) if params.offset is None else params.offset
+    return human[:, 0], candidates, offset
+
+
 def compare(
-    params: RewardParams,
+    params: Parameters,
     normaliser: Normaliser,
     batch: FeatureBatch,
     reward: RewardConfig,
 ) -> Compared:
     """Values of a batch under the Siamese network, with what losses need beside."""
-    effective, facts = pinned(params, reward), batch.facts
-    both = (batch.human.swapaxes(1, 2)[..., None], batch.candidates)
-    human, candidates = scenes_value(
-        effective, normaliser, both, batch.time_valid, reward.hidden_activation
-    )
+    facts = batch.facts
+    human, candidates, offset = siamese_values(params, normaliser, batch, reward)
     return Compared(
-        human=human[:, 0],
+        human=human,
         candidates=candidates,
         counts=batch.feasible,
         weight=batch.weight,
@@ -220,12 +243,12 @@ def compare(
         breaks_rule=facts.breaks_rule,
         human_density=facts.human_density,
         density=facts.density,
-        offset=jnp.zeros(()) if params.offset is None else params.offset,
+        offset=offset,
     )
 
 
 def mined(
-    params: RewardParams,
+    params: Parameters,
     normaliser: Normaliser,
     batch: FeatureBatch,
     config: TrainConfig,
@@ -246,12 +269,12 @@ def mined(
 
 
 def gradient_sums(
-    params: RewardParams,
+    params: Parameters,
     normaliser: Normaliser,
     batch: FeatureBatch,
     config: TrainConfig,
     constants: LossConfig | None = None,
-) -> tuple[RewardParams, LossSums]:
+) -> tuple[Parameters, LossSums]:
     """Gradient of the loss sum, and the sums; divide by `terms` afterwards.
 
     `constants` replaces those of the configuration and may hold tracers.
@@ -259,7 +282,7 @@ def gradient_sums(
     if config.hard_negatives and config.hard_pool > 1:
         batch = mined(params, normaliser, batch, config)
 
-    def total(params: RewardParams) -> tuple[jax.Array, LossSums]:
+    def total(params: Parameters) -> tuple[jax.Array, LossSums]:
         compared = compare(params, normaliser, batch, config.reward)
         sums = loss_sums(config.loss, compared, constants or config.loss_config)
         return sums.loss, sums
@@ -276,14 +299,14 @@ def _by_pieces(
     return sums, rows.reshape(-1, rows.shape[-1])
 
 
-def as_tree(params: RewardParams) -> Any:  # noqa: ANN401
+def as_tree(params: Parameters) -> Any:  # noqa: ANN401
     """The same object under optax's type for parameter trees."""
     return params
 
 
 def batch_sums(
     state: TrainState, batch: Batch | FeatureBatch, config: TrainConfig, *, whole: bool
-) -> tuple[tuple[RewardParams, LossSums], jax.Array]:
+) -> tuple[tuple[Parameters, LossSums], jax.Array]:
     """((gradient of the loss sum, sums), scenes with bad values [B, F + 1]) of a batch.
 
     The last column is of the facts that losses read besides features.
@@ -321,8 +344,9 @@ def make_train_step(
     With `axis_name` the step runs inside pmap or shard_map and sums over that
     axis. `whole` works the batch off at once, for a compiler that shares it over
     devices by itself and would gather it for a loop. A step whose loss or gradient
-    is not finite leaves the state as it was and says so in the metrics. Preferences
-    of a Batch add their own mean loss, times `preference_weight`.
+    is not finite leaves the state as it was and says so in the metrics; not by
+    `optax.apply_if_finite`, which sees updates only: it cannot name scene and feature.
+    Preferences of a Batch add their own mean loss, times `preference_weight`.
     """
     optimizer = make_optimizer(config)
     alone = dataclasses.replace(config, hard_negatives=0)  # preferences are as given
@@ -379,8 +403,11 @@ def make_train_step(
     return train_step
 
 
-def init_params(key: jax.Array, num_features: int, config: TrainConfig) -> RewardParams:
+def init_params(key: jax.Array, num_features: int, config: TrainConfig) -> Parameters:
     """Random parameters, with the discriminator's offset for the GAN loss."""
+    if config.reward.module:
+        tree = init_tree(key, num_features, config.reward)
+        return {**tree, "offset": jnp.zeros(())} if config.loss == "gan" else tree
     params = init_reward(key, num_features, config.reward)
     if config.loss == "gan":
         params = params.replace(offset=jnp.zeros(()))

@@ -14,7 +14,7 @@ from rcirl_jax.evaluation.ranking.learners import (
     learner_configs,
     train_learner,
 )
-from rcirl_jax.train.state import OPTIMIZERS, TrainConfig
+from rcirl_jax.train.state import PAPER_OPTIMIZERS, TrainConfig
 
 # folder, format, files to take (all that can be told apart by name), stride s
 FOLDERS = {
@@ -25,7 +25,7 @@ FOLDERS = {
 }
 DEFAULT = (TrainConfig().optimizer,)
 # in `make test-slow`, with the recordings
-LONG = tuple((name, tuple(sorted(OPTIMIZERS))) for name in FOLDERS)
+LONG = tuple((name, tuple(sorted(PAPER_OPTIMIZERS))) for name in FOLDERS)
 LEARNERS = ("RC-IRL rank", "logistic free", "MaxEnt free")
 
 

@@ -74,7 +74,7 @@ def test_onnx_scores_as_the_file(tmp_path, hidden, activation, by_context):
 @pytest.mark.parametrize(("hidden", "activation", "by_context"), SHAPES)
 def test_jax_export_scores_as_the_file(tmp_path, hidden, activation, by_context):
     made, (x, valid) = reward(tmp_path, hidden, activation, by_context), inputs()
-    write_stablehlo(tmp_path / "w.jax", made, "jax")
+    write_stablehlo(tmp_path / "w.jax", exported(made), "jax")
     again = jax.export.deserialize(bytearray((tmp_path / "w.jax").read_bytes()))
     want = made.value(x, np.broadcast_to(valid, x.shape[:2]))
     for count in (1, 200):  # any number of candidates
@@ -84,7 +84,7 @@ def test_jax_export_scores_as_the_file(tmp_path, hidden, activation, by_context)
 
 def test_stablehlo_is_portable_bytecode(tmp_path):
     made = reward(tmp_path)
-    write_stablehlo(tmp_path / "w.stablehlo", made, "stablehlo")
+    write_stablehlo(tmp_path / "w.stablehlo", exported(made), "stablehlo")
     assert (tmp_path / "w.stablehlo").read_bytes()[:4] == b"ML\xefR"  # MLIR bytecode
     assert "stablehlo.tanh" in exported(made).mlir_module()
 

@@ -29,8 +29,7 @@ from rcirl_jax.planner.rank import (
     rank_policy,
     velocity_score,
 )
-from rcirl_jax.reward import RewardConfig, value
-from rcirl_jax.reward.network import pinned
+from rcirl_jax.reward import RewardConfig, pinned, value
 from rcirl_jax.sampling import num_candidates
 from rcirl_jax.types import Kind
 from tests.planner.test_dp import weights

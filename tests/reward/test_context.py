@@ -8,7 +8,8 @@ import pytest
 from rcirl_jax.errors import InputError
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import Normaliser, RewardConfig, init_reward, pinned, value
-from rcirl_jax.reward.network import conditioned, rows_value
+from rcirl_jax.reward.fast import rows_value
+from rcirl_jax.reward.module import conditioned
 from rcirl_jax.units import TIMES_S
 
 F, T, K = 21, TIMES_S.size, 5
@@ -50,7 +51,7 @@ def test_an_untrained_context_changes_nothing():
 def test_gains_are_positive_and_those_of_the_first_time():
     params = pinned(draw(), CONFIG)
     x = features()
-    got = np.asarray(conditioned(params, x)) / np.asarray(x)
+    got = np.asarray(conditioned(params.context, x)) / np.asarray(x)
     x0, c = (np.asarray(a, np.float64) for a in (x[:, 0], params.context))
     want = np.broadcast_to((2.0 / (1.0 + np.exp(-x0 @ c)))[:, None], got.shape)
     np.testing.assert_allclose(got, want, rtol=2e-5)

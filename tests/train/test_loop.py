@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -24,10 +25,13 @@ from rcirl_jax.evaluation.ranking.evaluate import (
     report_of,
 )
 from rcirl_jax.evaluation.ranking.format import format_table
-from rcirl_jax.export.from_run import export_run, read_config
+from rcirl_jax.evaluation.ranking.learners import FrozenSets, train_learner
+from rcirl_jax.export.forms.stablehlo import exported_run
+from rcirl_jax.export.from_run import export_run, read_config, verification_samples
 from rcirl_jax.export.loading import load_runs, open_reward
 from rcirl_jax.features import feature_map
 from rcirl_jax.report.ranking.page import write_ranking_page
+from rcirl_jax.reward import RewardConfig, value
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train import loop
 from rcirl_jax.train.loop import fit_normaliser_on, train
@@ -117,6 +121,16 @@ def test_other_settings_may_not_resume(dataset, run):
         train(dataset, run[0], TrainConfig(batch_size=8, leaky_rate=0.1, sampler=SMALL))
 
 
+def test_a_run_of_before_a_setting_may_resume(dataset, run, tmp_path):
+    body = json.loads((run[0] / "run.json").read_text())
+    del body["config"]["clip_norm"], body["config"]["reward"]["module"]
+    (tmp_path / "run.json").write_text(json.dumps(body))
+    check_run(tmp_path, CONFIG, dataset)
+    other = dataclasses.replace(CONFIG, reward=RewardConfig(module="a.b:C"))
+    with pytest.raises(InputError, match=r"reward: .*to resume"):
+        check_run(tmp_path, other, dataset)
+
+
 def test_run_writes_what_it_should(run):
     workdir, result = run
     assert (workdir / "run.json").is_file()
@@ -155,10 +169,23 @@ def test_export_rank_report(dataset, run, tmp_path):
     assert 'src="http' not in text
 
 
+def test_a_run_of_another_module_is_exported_as_stablehlo(dataset, tmp_path):
+    other = RewardConfig(module="tests.reward.others:Residual")
+    config = dataclasses.replace(CONFIG, epochs=1, reward=other)
+    state = train(dataset, tmp_path, config).state
+    with pytest.raises(InputError, match=r"--module: .*export_weights --stablehlo"):
+        export_run(tmp_path, dataset, tmp_path / "weights.msgpack")
+    with pytest.raises(InputError, match=r"expected none: weights\.msgpack"):
+        train_learner(FrozenSets(dataset).of(config), config, [0])
+    x, valid = map(jnp.asarray, verification_samples(dataset, config))
+    found = exported_run(tmp_path).call(x, valid[0])
+    every = jnp.broadcast_to(valid[:1], valid.shape)
+    want = value(state.params, state.normaliser, x, every, other)
+    np.testing.assert_allclose(found, want, rtol=1e-5, atol=1e-5)
+
+
 def test_exported_values_are_the_trainers(dataset, run, tmp_path):
     """The numpy reader and the JAX network agree on fresh scenes to 1e-5."""
-
-    from rcirl_jax.reward import value
     from rcirl_jax.train.loop import to_device_batch
     from rcirl_jax.train.step import featurised
 
@@ -267,10 +294,10 @@ def test_pooled_parts_are_the_whole(dataset, run, tmp_path):
     assert joined.table["a"][0]["top1_fde"].mean() == pytest.approx(runs_of_z[0])
     found = report_of(joined)
     for name in set(whole.rows) - {"random"}:
-        for metric, value in whole.rows[name].items():
+        for metric, row in whole.rows[name].items():
             other = found.rows[name][metric]
             assert (other.value, other.low, other.high) == pytest.approx(
-                (value.value, value.low, value.high), rel=1e-6
+                (row.value, row.low, row.high), rel=1e-6
             ), (name, metric)
 
 

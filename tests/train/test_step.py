@@ -7,6 +7,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from rcirl_jax.errors import InputError
@@ -25,7 +26,12 @@ from rcirl_jax.train.parallel import (
     single,
 )
 from rcirl_jax.train.pieces import in_pieces
-from rcirl_jax.train.state import TrainConfig, make_optimizer
+from rcirl_jax.train.state import (
+    OPTIMIZERS,
+    TrainConfig,
+    make_optimizer,
+    make_rule,
+)
 from rcirl_jax.train.step import (
     _featurised,
     featurised,
@@ -351,6 +357,8 @@ def test_batches_that_do_not_divide_are_one_line():
         ({"loss": "hope"}, "--loss: hope: expected one of"),
         ({"leaky_rate": 2.0}, "--leaky_rate: 2.0: expected between 0 and 1"),
         ({"optimizer": "luck"}, "--optimizer: luck: expected one of"),
+        ({"optimizer": "radom"}, "; did you mean radam?"),
+        ({"clip_norm": -1.0}, "--clip_norm: -1.0: expected >= 0"),
         ({"epochs": 0}, "--epochs: 0: expected >= 1"),
     ],
 )
@@ -421,6 +429,37 @@ def test_decay_pulls_kernels_and_biases_only(how):
     assert all((np.asarray(x) != 0.0).all() for x in (*moved.kernels, *moved.biases))
     assert (np.asarray(moved.gamma) == 0.0).all()
     assert moved.offset == 0.0
+
+
+@pytest.mark.parametrize("name", OPTIMIZERS)
+def test_any_optimiser_of_optax_takes_steps(name):
+    """With a scheduled step size, and with an array that members differ in."""
+    config = TrainConfig(optimizer=name, learning_rate=0.01, halve_every=10**9)
+    first = {"gamma": jnp.array([1.0, -2.0]), "kernel": jnp.ones((2, 3))}
+    slope = {"gamma": jnp.array([0.3, 0.1]), "kernel": jnp.full((2, 3), -0.2)}
+
+    def steps(rule):
+        params, state = first, rule.init(first)
+        for _ in range(2):
+            updates, state = rule.update(slope, state, params)
+            params = optax.apply_updates(params, updates)
+        return params
+
+    by_array = jax.jit(lambda rate: steps(make_rule(config, name, rate)))(0.01)
+    fixed = jax.jit(lambda: steps(make_optimizer(config)))()
+    for a, b, old in zip(*map(jax.tree.leaves, (by_array, fixed, first)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-6)
+        assert np.isfinite(a).all()
+        assert (a != old).all()
+
+
+def test_the_gradient_is_cut_down_to_its_norm():
+    config = TrainConfig(optimizer="sgd", learning_rate=0.5, clip_norm=0.5)
+    for size, want in ((10.0, 0.25), (0.1, 0.05)):
+        slope = {"a": jnp.array([0.6 * size]), "b": jnp.array([0.8 * size])}
+        rule = make_optimizer(config)
+        updates, _ = rule.update(slope, rule.init(slope), slope)
+        assert float(optax.tree.norm(updates)) == pytest.approx(want, rel=1e-5)
 
 
 def test_twins_count_as_often_as_they_are_drawn():

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.reward import Normaliser, RewardParams, normalise
-from rcirl_jax.reward.network import ACTIVATIONS, conditioned, point_rewards
+from rcirl_jax.reward.module import ACTIVATIONS, network_of, variables_of
 
 STEPS = 64  # points on the line from b to a
 
@@ -117,12 +117,9 @@ def attribute(
     )
     # exactly 0 where the network sees no difference
     change = (clipped_a - clipped_b) / normaliser.scale
-    weight = jnp.where(time_valid, effective_params.gamma, 0.0)
-
-    def total(x: jax.Array) -> jax.Array:
-        x = conditioned(effective_params, x)
-        return jnp.sum(weight * point_rewards(effective_params, x, activation))
-
+    network = network_of(effective_params, activation)
+    variables = variables_of(effective_params)
+    total = lambda x: network.apply(variables, x, time_valid)  # noqa: E731
     shares = (jnp.arange(steps) + 0.5) / steps
     slopes = jax.vmap(lambda share: jax.grad(total)(start + share * change))(shares)
     contribution = change * jnp.mean(slopes, axis=0)

@@ -89,7 +89,7 @@ def learn(loss: str, frames: Frames, start: jax.Array, config: Learning) -> Lear
         minimise  loss(w, b) / terms + ridge |w|^2 / 2
 
     The rank loss has no scale of its own: there w is divided by its norm first,
-    as `reward.network.pinned` does, and the ridge is left out.
+    as `reward.pinned` does, and the ridge is left out.
 
     Args:
       loss: key of `reward.LOSSES` that reads values only; "gan" pools, "rank"

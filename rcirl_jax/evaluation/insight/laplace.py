@@ -26,7 +26,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.insight.attribution import check_network_inputs
 from rcirl_jax.evaluation.insight.identify import pair_minimum
 from rcirl_jax.reward import Normaliser, RewardParams, normalise
-from rcirl_jax.reward.network import ACTIVATIONS, conditioned
+from rcirl_jax.reward.module import ACTIVATIONS, conditioned
 
 
 def last_layer_features(
@@ -64,7 +64,7 @@ def last_layer_features(
         time_valid,
         activation,
     )
-    x = conditioned(effective_params, normalise(normaliser, features))
+    x = conditioned(effective_params.context, normalise(normaliser, features))
     hidden = zip(effective_params.kernels[:-1], effective_params.biases, strict=True)
     for kernel, bias in hidden:
         x = ACTIVATIONS[activation](x @ kernel + bias)

@@ -104,7 +104,8 @@ class SweepConfig:
         self._check_grid()
 
     def _check_grid(self) -> None:
-        """Reject empty lists, equal members and too many."""
+        """Reject empty lists, equal members, too many, and no weights file's."""
+        self.base.reward.check_own()
         if self.base.loss != "rank" and len(self.leaky_rates) > 1:
             raise InputError(
                 f"--leaky_rates: {list(self.leaky_rates)}: expected one value: only "

@@ -5,7 +5,8 @@
 
 The operations are those of docs/weights_format.md in that order, nothing fused, so
 that a runtime may; opset 17, IR 8. The file's sha256 and features stand in the
-metadata.
+metadata. Of the package's own network: no exporter of any JAX function to ONNX goes
+with this package's versions, and other modules have StableHLO (`stablehlo`).
 """
 
 import json

@@ -7,24 +7,27 @@ Two forms of the same program: `jax.export`'s own bytes, which
 compilers (IREE, XLA). K is symbolic; T, F and the weights are constants.
 """
 
-import functools
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.export.loading import reward_params, scored
+from rcirl_jax.export.from_run import read_config
+from rcirl_jax.export.loading import reward_params
 from rcirl_jax.export.reader import Reward
+from rcirl_jax.reward import Normaliser, ValueNetwork, effective_network
+from rcirl_jax.reward.module import module_value, network_of, variables_of
 from rcirl_jax.runtime.atomic_files import write_whole
+from rcirl_jax.train.loop import restore_run
 
 Form = Literal["jax", "stablehlo"]
 
 
 def exported(reward: Reward) -> jax.export.Exported:
-    """The scorer with K left open, for CPUs and NVIDIA GPUs.
+    """The scorer of a weights file.
 
     Raises:
       InputError: a file with an output bias, which this package never writes and
@@ -33,25 +36,46 @@ def exported(reward: Reward) -> jax.export.Exported:
     if np.any(reward.biases[-1]):
         raise InputError(f"{reward.file}: layers: output bias: expected 0")
     effective, normaliser = reward_params(reward)
-    program = functools.partial(
-        scored, effective, normaliser, activation=reward.activation
-    )
+    network = network_of(effective, str(reward.activation))
+    return exported_module(network, variables_of(effective), normaliser)
+
+
+def exported_run(workdir: Path) -> jax.export.Exported:
+    """The scorer of a run's newest checkpoint, whatever its R_theta is.
+
+    Raises:
+      InputError: no run, or no whole checkpoint.
+    """
+    config, _ = read_config(workdir)
+    state = restore_run(workdir, config)
+    network, variables = effective_network(state.params, config.reward)
+    return exported_module(network, variables, state.normaliser)
+
+
+def exported_module(
+    network: ValueNetwork, variables: dict[str, Any], normaliser: Normaliser
+) -> jax.export.Exported:
+    """V of a module with K left open, for CPUs and NVIDIA GPUs."""
+
+    def program(features: jax.Array, valid: jax.Array) -> jax.Array:
+        every = jnp.broadcast_to(valid, features.shape[:-1])
+        return module_value(network, variables, normaliser, features, every)
+
     (count,) = jax.export.symbolic_shape("k")
-    times, features = len(reward.times), len(reward.names)
+    shape = (count, network.times, normaliser.scale.shape[0])
     shapes = (
-        jax.ShapeDtypeStruct((count, times, features), jnp.float32),
-        jax.ShapeDtypeStruct((times,), jnp.bool_),
+        jax.ShapeDtypeStruct(shape, jnp.float32),
+        jax.ShapeDtypeStruct((network.times,), jnp.bool_),
     )
     return jax.export.export(jax.jit(program), platforms=("cpu", "cuda"))(*shapes)
 
 
-def write_stablehlo(path: Path, reward: Reward, form: Form) -> None:
-    """Write the scorer.
+def write_stablehlo(path: Path, made: jax.export.Exported, form: Form) -> None:
+    """Write a scorer.
 
     Raises:
       InputError: the package flatbuffers, which jax.export needs, is missing.
     """
-    made = exported(reward)
     if form == "stablehlo":
         content = bytes(made.mlir_module_serialized)
     else:
