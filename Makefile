@@ -45,6 +45,7 @@ EXACT := $(addprefix tests/,train/test_reproduce.py evaluation/test_recorded_tra
   $(addprefix train/test_,loop.py::test_every_scene_counts_once_for_the_normaliser \
     loop.py::test_resume_is_bitwise \
     step.py::test_candidates_of_a_scene_do_not_depend_on_the_batch \
+    step.py::test_either_future_is_learned_from \
     step.py::test_a_hard_negative_is_never_the_positive_nor_better_than_it))
 QUICK_XLA := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false
 TEST = $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal -m "$(MARKS)"
