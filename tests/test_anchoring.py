@@ -6,8 +6,8 @@ import jax
 import numpy as np
 
 from rcirl_jax.autotune.anchoring import Anchoring, fitted_anchor
+from rcirl_jax.autotune.support import scene_features
 from rcirl_jax.features import feature_map
-from rcirl_jax.train.support import scene_features
 from tests.scenes import scene
 
 FEATURES = feature_map("paper21")

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.autotune.support import fit_support, scene_features
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.reader import Anchor
 from rcirl_jax.features import FeatureMap
 from rcirl_jax.reward.support import of_the_scene
 from rcirl_jax.runtime.atomic_files import read_json, write_json
-from rcirl_jax.train.support import fit_support, scene_features
 
 OWN_COST = "hand-set"  # what stands for the planner's own cost here
 ARRAYS = ("location", "scale", "kernel", "bias", "out", "offset")
@@ -71,15 +71,12 @@ def fitted_anchor(
     mine = [_training_scenes(one, features) for one in recorded]
     pairs = zip(mine, shares, strict=True)
     weights = np.concatenate([np.full(len(x), share / len(x)) for x, share in pairs])
-    others = np.concatenate(
-        [
-            scenes
-            for one in elsewhere
-            for scenes in _also_slowed(one, features, config.slowed)
-        ]
-    )
+    others = [_training_scenes(one, features, config.slowed) for one in elsewhere]
     made = fit_support(
-        np.concatenate(mine), weights, others, np.asarray(of_the_scene(features))
+        np.concatenate(mine),
+        weights,
+        np.concatenate(others),
+        np.asarray(of_the_scene(features)),
     )
     arrays = {name: np.asarray(getattr(made, name)) for name in ARRAYS}
     arrays["offset"] = arrays["offset"].reshape(1)
@@ -108,15 +105,11 @@ def read_anchor(path: Path) -> Anchor:
     return Anchor(incumbent=own[0], low=own[1], high=own[2], **arrays)
 
 
-def _training_scenes(dataset: Dataset, features: FeatureMap) -> np.ndarray:
-    return scene_features(dataset.load("train").scene, features)
-
-
-def _also_slowed(
-    dataset: Dataset, features: FeatureMap, shares: Sequence[float]
-) -> list[np.ndarray]:
-    """Features of the training scenes, and of the same with a slower, steady ego."""
+def _training_scenes(
+    dataset: Dataset, features: FeatureMap, slowed: Sequence[float] = ()
+) -> np.ndarray:
+    """Features of the training scenes, then of the same with a slower, steady ego."""
     scene = dataset.load("train").scene
-    egos = [scene.ego.replace(v=x * scene.ego.v, a=0.0 * scene.ego.a) for x in shares]
+    egos = [scene.ego.replace(v=x * scene.ego.v, a=0.0 * scene.ego.a) for x in slowed]
     scenes = [scene, *[scene.replace(ego=ego) for ego in egos]]
-    return [scene_features(one, features) for one in scenes]
+    return np.concatenate([scene_features(one, features) for one in scenes])

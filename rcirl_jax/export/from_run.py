@@ -24,10 +24,10 @@ from rcirl_jax.reward import (
 from rcirl_jax.reward.module import LEAKY_SLOPE
 from rcirl_jax.runtime.atomic_files import read_json
 from rcirl_jax.runtime.settings import typed_settings
+from rcirl_jax.train.featurise import featurised
 from rcirl_jax.train.loop import normaliser_rows, restore_run, to_device_batch
 from rcirl_jax.train.metrics import read_metrics
 from rcirl_jax.train.state import TrainConfig, TrainState
-from rcirl_jax.train.step import featurised
 from rcirl_jax.units import TIMES_S
 
 NUM_SAMPLES = 32  # verification samples in the file

@@ -4,8 +4,8 @@
     z = clip((f_0 - location) / scale, -5, 5)
 
 f_0 are the raw features at t = 0, which all candidates of a scene share. Fitted to tell
-recorded scenes from those of a catalogue (`train.support`), it is near 1 in traffic as
-people were recorded in it and near 0 elsewhere.
+recorded scenes from those of a catalogue (`autotune.support`), it is near 1 in traffic
+as people were recorded in it and near 0 elsewhere.
 """
 
 import flax.struct
@@ -35,7 +35,7 @@ def support_logit(params: Support, x0: Float[Array, "*n f"]) -> Float[Array, "*n
     """The support before its sigmoid.
 
     Args:
-      params: of `train.support.fit_support`.
+      params: of `autotune.support.fit_support`.
       x0: [..., F] raw features at t = 0.
     """
     z = jnp.clip((x0 - params.location) / params.scale, -REACH, REACH)

@@ -31,11 +31,7 @@ from rcirl_jax.train.state import (
     TrainConfig,
     make_rule,
 )
-from rcirl_jax.train.step import (
-    as_tree,
-    gradient_sums,
-    init_params,
-)
+from rcirl_jax.train.step import as_tree, gradient_sums, init_params
 from rcirl_jax.types import Demonstration
 
 ORDER_STREAM = 3  # fold_in number of the batch order's key

@@ -31,6 +31,7 @@ from rcirl_jax.reward import Normaliser, fit_normaliser
 from rcirl_jax.runtime.pipeline import only_one
 from rcirl_jax.runtime.signals import Interrupted, asked
 from rcirl_jax.train.checkpoint import Checkpoints
+from rcirl_jax.train.featurise import featurised
 from rcirl_jax.train.finite import check_features, check_step
 from rcirl_jax.train.metrics import MetricsWriter, Progress
 from rcirl_jax.train.parallel import Parallel, Step, parallelise
@@ -38,7 +39,7 @@ from rcirl_jax.train.preferences import featurise_preferences, pairs_of_step
 from rcirl_jax.train.processes import all_stop_after, is_first, with_the_others
 from rcirl_jax.train.running import Running, check_run, describe_run
 from rcirl_jax.train.state import Batch, FeatureBatch, TrainConfig, TrainState
-from rcirl_jax.train.step import StepMetrics, featurised, init_state, make_train_step
+from rcirl_jax.train.step import StepMetrics, init_state, make_train_step
 from rcirl_jax.types import Demonstration
 
 CHUNK = 128  # scenes featurised per call where no batch sets their number

@@ -6,9 +6,10 @@ import pytest
 from rcirl_jax.data.store import joined
 from rcirl_jax.errors import InputError
 from rcirl_jax.sampling import SamplerConfig
+from rcirl_jax.train.featurise import featurised
 from rcirl_jax.train.loop import to_device_batch
 from rcirl_jax.train.state import TrainConfig
-from rcirl_jax.train.step import featurised, gradient_sums, init_params
+from rcirl_jax.train.step import gradient_sums, init_params
 from rcirl_jax.types import Normaliser
 from tests.scenes import batch, demonstration
 

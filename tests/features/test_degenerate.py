@@ -14,10 +14,11 @@ from rcirl_jax.planner.rank import hand_score, learned_score
 from rcirl_jax.planner.refine import RefineConfig, refine
 from rcirl_jax.reward import LOSSES, RewardConfig, init_reward, pinned
 from rcirl_jax.sampling import SamplerConfig, trajectory_on_path
-from rcirl_jax.train import step
+from rcirl_jax.train import featurise as making
+from rcirl_jax.train.featurise import featurise
 from rcirl_jax.train.loop import to_device_batch
 from rcirl_jax.train.state import TrainConfig
-from rcirl_jax.train.step import featurise, gradient_sums, init_state
+from rcirl_jax.train.step import gradient_sums, init_state
 from rcirl_jax.types import Candidates, Kind
 from rcirl_jax.units import NUM_OBSTACLES, NUM_TIMES, TIMES_S
 from tests.features.oracle import motion
@@ -146,16 +147,16 @@ def featurised(alike=False, **changes):
     config = TrainConfig(sampler=SMALL, **changes)
     count = len(SCENES)
     given = to_device_batch(demonstrations(), np.ones(count), np.arange(count))
-    whole = step.candidates_of
+    whole = making.candidates_of
 
     def copies(key, shown, config):
-        made, human = whole(key, shown, config), step.human_of(shown, config.sampler)
+        made, human = whole(key, shown, config), making.human_of(shown, config.sampler)
         same = lambda x, y: jnp.broadcast_to(y, x.shape)  # noqa: E731
         return made.replace(trajectory=jax.tree.map(same, made.trajectory, human))
 
     with pytest.MonkeyPatch.context() as patch:
         if alike:
-            patch.setattr(step, "candidates_of", copies)
+            patch.setattr(making, "candidates_of", copies)
         make = jax.jit(lambda key, rows: featurise(key, rows, config,
                                                    feature_map("paper21")))  # fmt: skip
         return make(jax.random.key(0), given)
@@ -226,7 +227,7 @@ def driven(mode):
     def run(made, s, l):
         human = like.human.replace(s=s, l=l)
         shown = like.replace(scene=made, human=human)
-        return step.human_of(shown, SamplerConfig(mode=mode))
+        return making.human_of(shown, SamplerConfig(mode=mode))
 
     return jax.jit(run)
 

@@ -186,8 +186,8 @@ def test_a_run_of_another_module_is_exported_as_stablehlo(dataset, tmp_path):
 
 def test_exported_values_are_the_trainers(dataset, run, tmp_path):
     """The numpy reader and the JAX network agree on fresh scenes to 1e-5."""
+    from rcirl_jax.train.featurise import featurised
     from rcirl_jax.train.loop import to_device_batch
-    from rcirl_jax.train.step import featurised
 
     reward = export_run(run[0], dataset, tmp_path / "weights.msgpack")
     index = dataset.indices("test")[:8]

@@ -16,6 +16,7 @@ from rcirl_jax.reward import LOSSES, Normaliser, RewardConfig, pinned
 from rcirl_jax.sampling import SamplerConfig, num_candidates
 from rcirl_jax.train import pieces
 from rcirl_jax.train.facts import log_density
+from rcirl_jax.train.featurise import _featurised, featurised
 from rcirl_jax.train.finite import bad_values, check_step
 from rcirl_jax.train.loop import to_device_batch
 from rcirl_jax.train.parallel import (
@@ -32,13 +33,7 @@ from rcirl_jax.train.state import (
     make_optimizer,
     make_rule,
 )
-from rcirl_jax.train.step import (
-    _featurised,
-    featurised,
-    gradient_sums,
-    init_state,
-    make_train_step,
-)
+from rcirl_jax.train.step import gradient_sums, init_state, make_train_step
 from tests.scenes import demonstration
 
 SMALL = SamplerConfig(num_random=4, cruise_times=(4.0,), edge_times=(4.0,))

@@ -32,7 +32,7 @@ from rcirl_jax.reward import (
 )
 from rcirl_jax.runtime.executors import Executor, Here
 from rcirl_jax.sampling import SamplerConfig, sample
-from rcirl_jax.train.step import human_of
+from rcirl_jax.train.featurise import human_of
 from rcirl_jax.types import Demonstration, Scene, Trajectory
 from rcirl_jax.units import DT_S, NUM_TIMES, TIMES_S
 

@@ -40,7 +40,7 @@ from rcirl_jax.simulation.suite import (
     suite_refs,
 )
 from rcirl_jax.simulation.world.careful import judges
-from rcirl_jax.train.step import human_of
+from rcirl_jax.train.featurise import human_of
 from rcirl_jax.types import Candidates, Demonstration
 from rcirl_jax.units import HORIZON_S
 

@@ -18,8 +18,8 @@ from rcirl_jax.export.reader import Reward
 from rcirl_jax.features import feature_map
 from rcirl_jax.report.ranking import plots
 from rcirl_jax.sampling import SamplerConfig, sample
+from rcirl_jax.train.featurise import human_of
 from rcirl_jax.train.metrics import read_metrics
-from rcirl_jax.train.step import human_of
 from rcirl_jax.types import (
     Candidates,
     Decision,

@@ -29,7 +29,7 @@ from rcirl_jax.export.loading import reward_params
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.features import feature_map
 from rcirl_jax.sampling import SamplerConfig, sample
-from rcirl_jax.train.step import human_of
+from rcirl_jax.train.featurise import human_of
 from rcirl_jax.types import Demonstration, Normaliser, RewardParams
 
 NUM_SCENES = 48  # held-out scenes, spread over the split

@@ -3,9 +3,9 @@
 import jax.numpy as jnp
 import numpy as np
 
+from rcirl_jax.autotune.support import fit_support, scene_features
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward.support import of_the_scene, support
-from rcirl_jax.train.support import fit_support, scene_features
 from tests.scenes import batch, random_scene
 
 COUNTS = np.array([True, True, False, True])
