@@ -26,7 +26,7 @@ from rcirl_jax.planner.safety import check
 from rcirl_jax.reward import RewardConfig, init_reward, pinned
 from rcirl_jax.sampling import num_candidates, sample
 from rcirl_jax.types import Normaliser, Scene
-from tests.scenes import random_scene
+from tests.helpers.scenes import random_scene
 
 _WEIGHTS = flags.DEFINE_string("weights", None, "weights file (default: random)")
 _SCENES = flags.DEFINE_integer("scenes", 24, "scenes")

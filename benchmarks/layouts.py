@@ -35,7 +35,7 @@ from rcirl_jax.train.pieces import added, in_pieces
 from rcirl_jax.train.state import FeatureBatch, TrainConfig
 from rcirl_jax.train.step import compare, init_state, make_train_step
 from rcirl_jax.types import Normaliser, RewardParams
-from tests.scenes import demonstration
+from tests.helpers.scenes import demonstration
 
 SCENES = 64
 PIECES = (1, 2, 4, 16)  # scenes at a time

@@ -18,7 +18,7 @@ from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.running import Running
 from rcirl_jax.train.state import TrainConfig
-from tests.scenes import demonstration
+from tests.helpers.scenes import demonstration
 
 _STEPS = flags.DEFINE_integer("steps", 10_000, "training steps, a multiple of 100")
 _OUTPUT = flags.DEFINE_string("output", "benchmarks/results", "folder of the JSON")

@@ -34,7 +34,7 @@ from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.train.step import init_state, make_train_step
 from rcirl_jax.types import Demonstration
 from rcirl_jax.units import NUM_OBSTACLES
-from tests.scenes import demonstration
+from tests.helpers.scenes import demonstration
 
 CANDIDATES = (80, 122, 256, 512, 1024)
 OBSTACLES = (2, 4, 8, NUM_OBSTACLES, 2 * NUM_OBSTACLES)

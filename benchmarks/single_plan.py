@@ -18,7 +18,7 @@ from rcirl_jax.features import feature_map
 from rcirl_jax.planner.rank import ONLINE, RankConfig, learned_score, rank_policy
 from rcirl_jax.reward import RewardConfig
 from rcirl_jax.sampling import num_candidates
-from tests.scenes import random_scene
+from tests.helpers.scenes import random_scene
 
 _CALLS = flags.DEFINE_integer("calls", 2000, "plans that are timed")
 _OUTPUT = flags.DEFINE_string("output", "benchmarks/results", "folder of the JSON")

@@ -27,7 +27,7 @@ from rcirl_jax.train.loop import fit_normaliser_on, host_batch
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.train.step import init_state, make_train_step
 from rcirl_jax.types import Demonstration
-from tests.scenes import demonstration
+from tests.helpers.scenes import demonstration
 
 _DATA = flags.DEFINE_string("data", None, "dataset to repeat (default: random scenes)")
 _SCENES = flags.DEFINE_integer("scenes", 100_000, "scenes to write and stream")

@@ -36,7 +36,7 @@ from rcirl_jax.train.frozen import Members, compiles, fit, freeze, members_of
 from rcirl_jax.train.loop import to_device_batch
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.train.step import init_state, make_train_step
-from tests.scenes import demonstration
+from tests.helpers.scenes import demonstration
 
 LEAKY_RATES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
 

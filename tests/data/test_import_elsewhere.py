@@ -17,7 +17,7 @@ from rcirl_jax.data.parts import Part, is_long, recordings_of
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.errors import InputError, LostWorkError
 from rcirl_jax.runtime.executors import Here, Processes, Ray
-from tests.data.formats import apollo, l5, nuplan, waymo
+from tests.data.importers.formats import apollo, l5, nuplan, waymo
 from tests.data.small_logs import CONFIG, files_of, write_logs
 
 ALL_SCENES = ImportConfig(

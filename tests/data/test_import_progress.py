@@ -16,8 +16,8 @@ from rcirl_jax.data.readers import csv_stream, reading
 from rcirl_jax.data.scenes.quality import QualityReport
 from rcirl_jax.types import Kind, Recording, Track
 from tests.data import small_logs
-from tests.data import test_csv_stream as long_csv
-from tests.data.formats import apollo, l5, nuplan, waymo
+from tests.data.importers import test_csv_stream as long_csv
+from tests.data.importers.formats import apollo, l5, nuplan, waymo
 
 # of `recording`, before a recording could say how much of its input is read
 DIGEST = "92db9b7575ab6d0465ca8587350f959848a3e729e65b78c27369f84490d3e1cc"

@@ -12,9 +12,9 @@ from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.preferences import read_preferences
 from rcirl_jax.data.store.writer import DatasetWriter
 from rcirl_jax.units import HORIZON_S
-from tests.data.test_store import finish_fields, lineage
+from tests.data.store.test_dataset import finish_fields, lineage
 from tests.docs.pages import DOCS, REPO, fences
-from tests.scenes import batch, demonstration
+from tests.helpers.scenes import batch, demonstration
 
 PAGE = (DOCS / "preferences.md").read_text()
 FILES = {title: content for _, title, content in fences(PAGE) if title}

@@ -83,7 +83,7 @@ def test_a_count_is_the_results(command, file, count):
 def test_a_count_is_the_tests():
     tested = [row for row in ROWS if row.command.startswith("pytest ")]
     done = subprocess.run(
-        [sys.executable, "-m", "tests.collected"], cwd=REPO, text=True,
+        [sys.executable, "-m", "tests.helpers.collected"], cwd=REPO, text=True,
         input=json.dumps([shlex.split(row.command)[1:] for row in tested]),
         capture_output=True, check=True,
     )  # fmt: skip

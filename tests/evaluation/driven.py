@@ -4,7 +4,7 @@ import jax
 import numpy as np
 
 from rcirl_jax.evaluation.ranking.score import score_scenes
-from tests.scenes import T, demonstration
+from tests.helpers.scenes import T, demonstration
 
 
 def long_rows(count):

@@ -6,7 +6,7 @@ import pytest
 
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.runtime.pipeline import only_one
-from tests.commands import command, fresh
+from tests.helpers.commands import command, fresh
 
 SMALL = (
     "--synthetic", "--recipe=quick", "--stride=60", "--epochs=1", "--drives=6",

@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from tests.commands import command
-from tests.weights_files import random_weights
+from tests.helpers.commands import command
+from tests.helpers.weights_files import random_weights
 
 SHORT = ("--suite=free_cruise,stopped_lead", "--cases=20", "--duration=2")
 

@@ -8,9 +8,9 @@ from rcirl_jax.data.importing import import_parts
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.export.tuned_idm import write_tuned_idm
 from rcirl_jax.planner.baselines import Idm
-from tests.commands import command
 from tests.data.small_logs import CONFIG, write_logs
-from tests.weights_files import random_weights
+from tests.helpers.commands import command
+from tests.helpers.weights_files import random_weights
 
 
 @pytest.fixture(scope="module")

@@ -14,8 +14,8 @@ from rcirl_jax.evaluation.exact import holm
 from rcirl_jax.simulation.rows import BASELINES
 from rcirl_jax.simulation.suite import family_names
 from rcirl_jax.train.state import PAPER_OPTIMIZERS
-from tests import commands
-from tests.weights_files import random_weights
+from tests.helpers import commands
+from tests.helpers.weights_files import random_weights
 
 RANKED = (
     "artefact_audit",

@@ -10,9 +10,9 @@ from rcirl_jax.data.importing import import_parts
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.export.reader import load_weights
 from rcirl_jax.runtime.pipeline import file_sha256
-from tests.commands import command
 from tests.data.small_logs import CONFIG, write_logs
-from tests.weights_files import random_weights
+from tests.helpers.commands import command
+from tests.helpers.weights_files import random_weights
 
 COMMON = ("flags", "git_commit", "code_sha256", "versions")
 DATA, LOGS = "--data={root}/data", ("--format=csv", "--input={root}/logs")

@@ -8,7 +8,7 @@ from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.export.loading import open_reward
-from tests.commands import command
+from tests.helpers.commands import command
 
 
 @pytest.mark.slow

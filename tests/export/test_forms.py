@@ -18,8 +18,8 @@ from rcirl_jax.export.forms.stablehlo import exported, write_stablehlo
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.reader import load_weights
 from rcirl_jax.reward import LatticeCost
-from tests.commands import command
-from tests.weights_files import example_weights, loop_value, random_weights
+from tests.helpers.commands import command
+from tests.helpers.weights_files import example_weights, loop_value, random_weights
 
 F, T = 5, 7
 

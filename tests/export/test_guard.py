@@ -24,11 +24,11 @@ from rcirl_jax.planner.rank import hand_score, learned_score
 from rcirl_jax.reward import seen_range
 from rcirl_jax.train.loop import train
 from rcirl_jax.units import HORIZON_S
-from tests.data.test_store import finish_fields, lineage
+from tests.data.store.test_dataset import finish_fields, lineage
 from tests.export.test_reader import ALLOWED
-from tests.scenes import batch, demonstration, random_scene, sampled
+from tests.helpers.scenes import batch, demonstration, random_scene, sampled
+from tests.helpers.weights_files import example_samples, example_weights, random_weights
 from tests.train.test_step import CONFIG
-from tests.weights_files import example_samples, example_weights, random_weights
 
 F, T, K = 3, 4, 10
 

@@ -8,8 +8,8 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.export import pack
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.provenance import check_local, dataset_names
-from tests import weights_files
-from tests.commands import command
+from tests.helpers import weights_files
+from tests.helpers.commands import command
 
 
 def with_provenance(tmp_path, monkeypatch, **entries):

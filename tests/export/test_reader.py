@@ -23,7 +23,7 @@ from rcirl_jax.export import (
     reader,
     save,
 )
-from tests.weights_files import (
+from tests.helpers.weights_files import (
     ACTIVATIONS,
     example_samples,
     example_weights,

@@ -15,8 +15,8 @@ from rcirl_jax.export.spread import SuiteJob, drive_piece, spread
 from rcirl_jax.runtime.executors import Here, Processes
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.simulation.suite import suite_refs
+from tests.helpers.weights_files import random_weights
 from tests.train.test_step import rows
-from tests.weights_files import random_weights
 
 REPO = Path(__file__).resolve().parents[2]
 

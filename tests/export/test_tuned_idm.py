@@ -11,7 +11,7 @@ from rcirl_jax.export.closed_loop import table_rows
 from rcirl_jax.export.gate_job import gate_job, left_out
 from rcirl_jax.export.tuned_idm import idm_fields, read_tuned_idm, write_tuned_idm
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm
-from tests.weights_files import random_weights
+from tests.helpers.weights_files import random_weights
 
 TUNED = Idm(headway=1.1, standstill_gap=2.5)
 

@@ -28,7 +28,7 @@ from rcirl_jax.export import (
     to_json,
 )
 from rcirl_jax.runtime.specs import spec_root
-from tests.weights_files import (
+from tests.helpers.weights_files import (
     ACTIVATIONS,
     example_anchor,
     example_samples,

@@ -22,7 +22,13 @@ from rcirl_jax.train.step import gradient_sums, init_state
 from rcirl_jax.types import Candidates, Kind
 from rcirl_jax.units import NUM_OBSTACLES, NUM_TIMES, TIMES_S
 from tests.features.oracle import motion
-from tests.scenes import batch, demonstration, random_positions, random_scene, scene
+from tests.helpers.scenes import (
+    batch,
+    demonstration,
+    random_positions,
+    random_scene,
+    scene,
+)
 from tests.train.test_step import SMALL, normaliser
 
 LEAD = {"s": 30.0, "speed": 5.0}

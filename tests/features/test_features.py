@@ -22,7 +22,7 @@ from rcirl_jax.sampling import (
 from rcirl_jax.types import Kind
 from rcirl_jax.units import TIMES_S
 from tests.features.oracle import point
-from tests.scenes import batch, random_positions, random_scene, scene, unfused
+from tests.helpers.scenes import batch, random_positions, random_scene, scene, unfused
 
 PRESETS = ("paper21", "apollo21")
 UNITS = {"m", "1", "1/m", "s", "m/s", "m/s^2", "m/s^3"}

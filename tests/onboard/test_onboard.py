@@ -27,7 +27,7 @@ from rcirl_jax.export import (
 )
 from rcirl_jax.planner.guard import worst_share
 from tests.export import test_guard, test_old_files, test_reader
-from tests.weights_files import (
+from tests.helpers.weights_files import (
     example_samples,
     example_weights,
     packed,

@@ -15,8 +15,8 @@ from rcirl_jax.export.reader import Anchor
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.rank import ONLINE, hand_score, learned_score
 from rcirl_jax.reward.support import Support, support
-from tests.scenes import random_scene, sampled
-from tests.weights_files import random_weights
+from tests.helpers.scenes import random_scene, sampled
+from tests.helpers.weights_files import random_weights
 
 FEATURES = feature_map("paper21")
 

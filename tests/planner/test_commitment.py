@@ -8,7 +8,7 @@ import pytest
 from rcirl_jax.planner.commitment import only_where
 from rcirl_jax.planner.plan import later, no_plan
 from rcirl_jax.planner.rank import RankConfig, hand_score, rank_policy
-from tests.scenes import random_scene
+from tests.helpers.scenes import random_scene
 
 
 @pytest.mark.parametrize("backend", ["cpu", "gpu"])

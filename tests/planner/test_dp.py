@@ -17,7 +17,7 @@ from rcirl_jax.planner.time_station import plan_time_station
 from rcirl_jax.reward import RewardConfig, init_reward, pinned
 from rcirl_jax.sampling.kinematics import trajectory_on_path
 from rcirl_jax.types import Candidates, Normaliser
-from tests.scenes import random_scene, sampled
+from tests.helpers.scenes import random_scene, sampled
 
 FEATURES = feature_map("paper21")
 SHAPE = RewardConfig()

@@ -24,9 +24,9 @@ from rcirl_jax.planner.rank import (
 )
 from rcirl_jax.planner.refine import RefineConfig
 from rcirl_jax.units import TIMES_S
+from tests.helpers.scenes import batch, random_scene, sampled, scene
 from tests.planner.test_dp import COARSE, FEATURES, SCORE, SHAPE, one, planner, weights
 from tests.planner.test_safety import judge
-from tests.scenes import batch, random_scene, sampled, scene
 
 GAP = GapConfig(
     lattice=dataclasses.replace(COARSE, step=4.0), refinement=RefineConfig(steps=6)

@@ -23,7 +23,7 @@ from rcirl_jax.simulation.recorded.config import RecordedConfig
 from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases
 from rcirl_jax.types import Kind, Track
 from rcirl_jax.units import DT_S, TIMES_S
-from tests.scenes import random_scene, scene
+from tests.helpers.scenes import random_scene, scene
 from tests.simulation.test_recorded import straight
 
 PREDICT = jax.jit(predict)

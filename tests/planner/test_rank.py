@@ -32,9 +32,9 @@ from rcirl_jax.planner.rank import (
 from rcirl_jax.reward import RewardConfig, pinned, value
 from rcirl_jax.sampling import num_candidates
 from rcirl_jax.types import Kind
+from tests.helpers.scenes import random_scene, sampled
 from tests.planner.test_dp import weights
 from tests.planner.test_safety import judge, with_obstacle
-from tests.scenes import random_scene, sampled
 
 FEATURES = feature_map("paper21")
 SCORE = jax.jit(learned_score(FEATURES, "tanh"))

@@ -13,7 +13,7 @@ from rcirl_jax.planner.safety import SafetyConfig, Verdict, check, choose, first
 from rcirl_jax.sampling.kinematics import trajectory_on_path
 from rcirl_jax.types import Candidates, Kind
 from rcirl_jax.units import DT_S, TIMES_S
-from tests.scenes import random_scene, sampled, scene
+from tests.helpers.scenes import random_scene, sampled, scene
 
 BARE = SafetyConfig(margin_along=0.0, margin_growth=0.0, margin_across=0.0)
 

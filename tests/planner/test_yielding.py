@@ -8,7 +8,7 @@ from rcirl_jax.planner.baselines import Idm, idm_acceleration
 from rcirl_jax.planner.yielding import Yielding, acceleration, bodies_in_path
 from rcirl_jax.types import Kind
 from rcirl_jax.units import TIMES_S
-from tests.scenes import scene
+from tests.helpers.scenes import scene
 
 DRIVER = Yielding()
 ACCELERATE = jax.jit(lambda made: acceleration(made, DRIVER))

@@ -38,11 +38,11 @@ from rcirl_jax.simulation.suite import (
     suite_refs,
 )
 from rcirl_jax.units import TIMES_S
+from tests.helpers.weights_files import example_anchor
 from tests.report.test_data_page import HOSTILE, Page
 from tests.report.tuning_case import PLAYED, SECONDS, cheap_rows, small_cases
 from tests.report.tuning_case import small_report as build
 from tests.simulation.test_recorded import traffic
-from tests.weights_files import example_anchor
 
 MAX_BYTES = 3e6
 

@@ -20,7 +20,7 @@ from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics
 from rcirl_jax.simulation.rows import Row
 from rcirl_jax.simulation.suite import catalogue_set, suite_refs
 from tests.data.small_logs import CONFIG, write_logs
-from tests.weights_files import random_weights
+from tests.helpers.weights_files import random_weights
 
 FAMILIES, EACH = ("stop_and_go", "cut_in", "red_light"), 40
 PLAYED = ("stop_and_go/001@0", "red_light/000@0")

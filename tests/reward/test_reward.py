@@ -23,8 +23,8 @@ from rcirl_jax.reward import (
 )
 from rcirl_jax.sampling import SamplerConfig, trajectory_from_positions
 from rcirl_jax.units import TIMES_S
+from tests.helpers.scenes import random_scene, sampled, scene
 from tests.reward.compared import compared
-from tests.scenes import random_scene, sampled, scene
 
 F, T = 21, TIMES_S.size
 SHAPES = {"linear": (), "paper": (15,), "deep": (8, 4)}

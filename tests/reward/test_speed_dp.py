@@ -11,7 +11,7 @@ from rcirl_jax.features.columns import COLUMNS, make_frame
 from rcirl_jax.reward import SpeedDpCost, speed_dp_cost
 from rcirl_jax.sampling import trajectory_from_positions
 from rcirl_jax.units import DT_S, TIMES_S
-from tests.scenes import random_scene, scene
+from tests.helpers.scenes import random_scene, scene
 
 T = TIMES_S.size
 NAMES = ("speed_limit", "follow_distance", "overtake_distance", "collision")

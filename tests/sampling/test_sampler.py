@@ -20,7 +20,7 @@ from rcirl_jax.sampling import (
 from rcirl_jax.sampling.speed import speed_envelope
 from rcirl_jax.types import Kind
 from rcirl_jax.units import STATION_STEP_M, TIMES_S
-from tests.scenes import batch, random_scene, scene
+from tests.helpers.scenes import batch, random_scene, scene
 
 CONFIGS = {mode: SamplerConfig(mode=mode) for mode in ("speed", "path_speed")}
 SAMPLE = {

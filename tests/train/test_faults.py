@@ -21,8 +21,8 @@ from rcirl_jax.train.loop import restore_run, train
 from rcirl_jax.train.running import Running
 from tests.data.small_logs import CONFIG as IMPORT
 from tests.data.small_logs import files_of, write_logs
-from tests.data.test_store import finish_fields, lineage
-from tests.scenes import batch, demonstration
+from tests.data.store.test_dataset import finish_fields, lineage
+from tests.helpers.scenes import batch, demonstration
 from tests.train.worker import CONFIG
 
 STEPS = 6  # 21 rows, batches of 8, two epochs

@@ -12,7 +12,7 @@ from rcirl_jax.features import feature_map
 from rcirl_jax.planner.rank import RankConfig, module_score, rank_policy
 from rcirl_jax.reward import RewardConfig, effective_network, value
 from rcirl_jax.train.step import init_state, make_train_step
-from tests.scenes import random_scene, sampled
+from tests.helpers.scenes import random_scene, sampled
 from tests.train.test_step import CONFIG, batch, human_is_better, normaliser
 
 FEATURES = feature_map("paper21")

@@ -28,8 +28,8 @@ from rcirl_jax.train import loop
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.units import HORIZON_S
-from tests.data.test_store import finish_fields, lineage
-from tests.scenes import batch, demonstration
+from tests.data.store.test_dataset import finish_fields, lineage
+from tests.helpers.scenes import batch, demonstration
 from tests.train.test_step import SMALL
 from tests.train.test_sweep import config_of
 

@@ -17,8 +17,8 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.train.loop import restore_run
 from rcirl_jax.train.processes import EXIT_LOST, join_processes
 from tests.conftest import REPO
-from tests.data.test_store import finish_fields, lineage
-from tests.scenes import batch, demonstration
+from tests.data.store.test_dataset import finish_fields, lineage
+from tests.helpers.scenes import batch, demonstration
 from tests.train.worker import CONFIG
 
 pytestmark = pytest.mark.multiprocess

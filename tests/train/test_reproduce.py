@@ -20,9 +20,9 @@ from rcirl_jax.export.reproduce import (
     train_again,
 )
 from rcirl_jax.units import HORIZON_S
-from tests.commands import fresh
-from tests.data.test_store import finish_fields, lineage
-from tests.scenes import batch, demonstration
+from tests.data.store.test_dataset import finish_fields, lineage
+from tests.helpers.commands import fresh
+from tests.helpers.scenes import batch, demonstration
 
 COUNT = 12  # scenes, of which nine train
 # The compiler as users have it: flags are noted, so there is one, with its usual value

@@ -34,7 +34,7 @@ from rcirl_jax.train.state import (
     make_rule,
 )
 from rcirl_jax.train.step import gradient_sums, init_state, make_train_step
-from tests.scenes import demonstration
+from tests.helpers.scenes import demonstration
 
 SMALL = SamplerConfig(num_random=4, cruise_times=(4.0,), edge_times=(4.0,))
 CONFIG = TrainConfig(batch_size=16, sampler=SMALL)

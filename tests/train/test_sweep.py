@@ -39,8 +39,8 @@ from rcirl_jax.train.pieces import piece_size
 from rcirl_jax.train.state import Facts, FeatureBatch, TrainConfig
 from rcirl_jax.units import HORIZON_S
 from tests.conftest import REPO
-from tests.data.test_store import finish_fields, lineage
-from tests.scenes import batch, demonstration
+from tests.data.store.test_dataset import finish_fields, lineage
+from tests.helpers.scenes import batch, demonstration
 from tests.train.test_step import SMALL, normaliser
 
 BASE = TrainConfig(

@@ -16,8 +16,8 @@ from rcirl_jax.data import importers
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.readers.zarr2 import StructuredArray
 from rcirl_jax.runtime.specs import load_toml, spec_root
-from tests.data import writers
-from tests.data.formats import (
+from tests.data.importers import writers
+from tests.data.importers.formats import (
     Fixture,
     apollo,
     argoverse2,

@@ -13,7 +13,7 @@ from rcirl_jax.data.readers import tfrecord
 from rcirl_jax.data.readers.wire import Schema, WireError, fields, packed_sint32
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.metrics import METRICS
-from tests.data.formats import apollo, interaction, nuplan, osm, waymo
+from tests.data.importers.formats import apollo, interaction, nuplan, osm, waymo
 
 
 def lanelet2_target(folder: Path) -> Target:

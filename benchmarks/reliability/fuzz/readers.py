@@ -58,8 +58,8 @@ from rcirl_jax.train.metrics import pairs_won
 from rcirl_jax.train.running import check_run, describe_run
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.units import NUM_TIMES
-from tests.data import test_store
-from tests.weights_files import packed, random_weights
+from tests.data.store import test_dataset as test_store
+from tests.helpers.weights_files import packed, random_weights
 
 ROWS = 2  # of a dataset
 CASES = 2  # of a suite

@@ -1,0 +1,356 @@
+"""Commands killed, told to end, and without room on the disk: by their command."""
+
+import dataclasses
+import functools
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from benchmarks.reliability.jobs import jobs, write_logs
+from rcirl_jax.export.closed_loop import table_rows
+from rcirl_jax.simulation.suite import (
+    catalogue_set,
+    drive_row,
+    rollout_config,
+    suite_refs,
+)
+from tests.conftest import REPO
+from tests.data.small_logs import files_of
+from tests.helpers.commands import LONGEST_S
+from tests.helpers.commands import fresh as command
+
+pytestmark = [pytest.mark.slow, pytest.mark.multiprocess]
+
+
+def harness(tmp_path, *flags):
+    """(exit status, rows) of the harness."""
+    done = command("benchmarks.reliability.faults", f"--output={tmp_path}", *flags)
+    (file,) = tmp_path.glob("faults_*.json")
+    return done, json.loads(file.read_text())["rows"]
+
+
+@pytest.mark.parametrize(
+    ("signal", "kills"),
+    [
+        ("KILL", {"import": 3, "train": 3}),
+        ("TERM", {"import": 3, "train": 3, "sweep": 2, "autotune": 2}),
+    ],
+    ids=["KILL", "TERM"],
+)
+def test_disturbed_commands_come_to_the_same(tmp_path, signal, kills):
+    flags = (f"--commands={','.join(kills)}", f"--kills={sum(kills.values())}")
+    done, rows = harness(tmp_path, *flags, f"--signal={signal}")
+    assert done.returncode == 0, done.stdout
+    assert [row["count"] for row in rows] == [*kills.values()]
+    assert {row["outcome"] for row in rows} == {"as undisturbed"}
+    assert all(row["comparisons"] >= 1 for row in rows)
+    assert all(x < 10.0 for row in rows for x in row["seconds_to_end"])
+    assert all(len(row["progress_at_kill"]) == row["count"] for row in rows)
+    for row in rows:
+        assert any(0 < x < row["things"] for x in row["progress_at_kill"]), row
+
+
+def test_a_broken_resume_is_found(tmp_path):
+    flags = ("--commands=train", "--kills=2", "--moments=work", "--broken_resume")
+    done, (row,) = harness(tmp_path, *flags)
+    assert done.returncode == 1
+    assert row["outcome"].startswith("different: ")
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    """logs/ and data/, a run on it in run/ and its weights."""
+    folder = tmp_path_factory.mktemp("reliability") / "root"
+    write_logs(folder / "logs")
+    for name in ("import", "train"):
+        job = jobs(folder)[name]
+        assert limited(folder, None, job.module, *job.flags).returncode == 0
+    export = ("--workdir=run", "--output=w.msgpack")
+    assert limited(folder, None, "experiments.export_weights", *export).returncode == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def undisturbed(root, tmp_path_factory):
+    """Of a job, what comes out when nothing disturbs it."""
+
+    @functools.cache
+    def outcome(name):
+        job = jobs(root)[name]
+        if name in ("import", "train"):
+            return job.outcome(root)
+        folder = tmp_path_factory.mktemp(name)
+        assert limited(folder, None, job.module, *job.flags).returncode == 0
+        return job.outcome(folder)
+
+    return outcome
+
+
+# A program of its own: a fork of this process would be one beside JAX's threads
+LIMIT = """import os, resource, sys
+size, hard = int(sys.argv[1]), resource.getrlimit(resource.RLIMIT_FSIZE)[1]
+resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+os.execv(sys.executable, [sys.executable, "-m", *sys.argv[2:]])"""
+
+
+def limited(folder, size, module, *flags):
+    """A command that can write no file longer than `size` bytes."""
+    start = ["-m"] if size is None else ["-c", LIMIT, str(size)]
+    return subprocess.run(
+        [sys.executable, *start, module, *flags], cwd=folder, env=environment(),
+        text=True, capture_output=True, check=False,
+    )  # fmt: skip
+
+
+def environment():
+    """Of a command; JAX's own cache of programs warns when it cannot be written."""
+    own = {"PYTHONPATH": str(REPO), "JAX_ENABLE_COMPILATION_CACHE": "0"}
+    return {**os.environ, **own, "JAX_PLATFORMS": "cpu"}
+
+
+def begun(folder, job):
+    """A process of a job's command."""
+    return subprocess.Popen(
+        [sys.executable, "-m", job.module, *job.flags], cwd=folder, env=environment(),
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+
+
+def wait_for(happened, process):
+    """Look until something has happened, while a process runs."""
+    while not happened():
+        assert process.poll() is None
+        time.sleep(0.02)
+
+
+def errors_of(done):
+    """Lines besides progress bars."""
+    said = done.stderr.replace("\r", "\n").splitlines()
+    return [x for x in said if x.strip() and "%|" not in x and "import: " not in x]
+
+
+def flags_of(root, name):
+    """Module and flags of a command, by absolute inputs."""
+    known = jobs(root)
+    if name in known:  # in one process: a limit also binds what workers share
+        flags = [x for x in known[name].flags if not x.startswith("--workers")]
+        return known[name].module, flags
+    if name == "export":
+        data = f"--workdir={root / 'run'}", f"--data={root / 'data'}"
+        return "experiments.export_weights", (*data, "--output=w.msgpack")
+    data = f"--weights={root / 'w.msgpack'}", f"--data={root / 'data'}"
+    return "experiments.report", (*data, "--output=report.html")
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "file"),
+    [
+        ("import", 3_000, "data"),
+        ("train", 0, "run.json"),
+        ("train", 6_000, "run"),  # in metrics.jsonl, or before in TensorBoard's
+        ("train", 60_000, "checkpoints"),
+        ("export", 1_000, "w.msgpack"),
+        ("sweep", 3_000, "weights"),
+        ("report", 10_000, "figures"),
+        ("autotune", 3_000, "dataset-"),
+    ],
+)
+def test_a_full_disk_is_one_line_and_the_run_goes_on(
+    root, undisturbed, tmp_path, name, size, file
+):
+    module, flags = flags_of(root, name)
+    done = limited(tmp_path, size, module, *flags)
+    assert done.returncode == 2, done.stderr[-2000:]
+    (line,) = errors_of(done)
+    assert line.startswith("error: ")
+    assert file in line
+    assert not list(tmp_path.rglob("*.tmp"))
+    for final in ("manifest.json", "w.msgpack", "report.html", "sweep.json"):
+        assert not list(tmp_path.rglob(final)), final
+    assert limited(tmp_path, None, module, *flags).returncode == 0
+    if name in jobs(root):
+        assert jobs(root)[name].outcome(tmp_path) == undisturbed(name)
+
+
+@pytest.mark.parametrize("name", ["import", "train", "sweep", "autotune"])
+def test_a_second_command_is_refused_and_the_first_not_disturbed(
+    root, undisturbed, tmp_path, name
+):
+    """The first is halted while it has its folder, so that the second meets it."""
+    job = jobs(root)[name]
+    first = begun(tmp_path, job)
+    try:
+        wait_for(lambda: list(tmp_path.glob("*/.lock")), first)
+        first.send_signal(signal.SIGSTOP)
+        before = files_of(tmp_path)
+        second = limited(tmp_path, None, job.module, *job.flags)
+        after = files_of(tmp_path)
+        assert first.poll() is None
+        first.send_signal(signal.SIGCONT)
+        assert first.wait(LONGEST_S) == 0
+    finally:
+        first.kill()
+    assert second.returncode == 2, second.stderr[-2000:]
+    (line,) = errors_of(second)
+    assert line.startswith("error: ")
+    assert "in use by another process" in line
+    assert after == before
+    assert job.outcome(tmp_path) == undisturbed(name)
+
+
+def in_namespace(*words):
+    """Words of a command that may mount, of nobody else's sight."""
+    unshare = shutil.which("unshare")
+    if (
+        unshare is None
+        or subprocess.run([unshare, "-rm", "true"], check=False).returncode
+    ):
+        pytest.skip("no user namespaces: unshare -rm: not permitted")
+    return [unshare, "-rm", "bash", "-c", *words]
+
+
+def mounted(folder, script, module, *flags):
+    """A script in a namespace of its own; its "$@" is the command."""
+    return subprocess.run(
+        in_namespace(script, str(folder), sys.executable, "-m", module, *flags),
+        env=environment(), text=True, capture_output=True, check=False,
+    )  # fmt: skip
+
+
+FULL = """mount -t tmpfs -o size=%s tmpfs "$0"; cd "$0"
+"$@"; echo "first $?"
+mount -o remount,size=100m "$0"
+"$@" > /dev/null 2>&1; echo "second $?"
+cp -r "$0"/. "$0.kept" """
+
+
+@pytest.mark.parametrize(("name", "size"), [("import", "400k"), ("train", "96k")])
+def test_a_disk_without_room_is_one_line_and_the_run_goes_on(
+    root, undisturbed, tmp_path, name, size
+):
+    """ENOSPC from a real file system; with room again the same comes out."""
+    module, flags = flags_of(root, name)
+    place = tmp_path / "full"
+    place.mkdir()
+    (tmp_path / "full.kept").mkdir()
+    done = mounted(place, FULL % size, module, *flags)
+    assert "first 2" in done.stdout, done.stdout + done.stderr
+    (line,) = errors_of(done)
+    assert line.startswith("error: ")
+    assert "No space left on device" in line
+    assert "second 0" in done.stdout
+    assert jobs(root)[name].outcome(tmp_path / "full.kept") == undisturbed(name)
+
+
+READ_ONLY = (
+    """mount --bind "$0" "$0" && mount -o remount,bind,ro "$0"; cd "$0"; "$@" """
+)
+
+
+@pytest.mark.parametrize("name", ["import", "train", "sweep", "autotune"])
+def test_a_read_only_folder_is_one_line(root, tmp_path, name):
+    module, flags = flags_of(root, name)
+    done = mounted(tmp_path, READ_ONLY, module, *flags)
+    assert done.returncode == 2, done.stderr[-2000:]
+    (line,) = errors_of(done)
+    assert line.startswith("error: ")
+    assert "Read-only file system" in line
+    assert not list(tmp_path.iterdir())
+
+
+def test_sigterm_saves_the_step_it_is_in(root, tmp_path):
+    job, own = jobs(root)["train"], ("--epochs", "--checkpoint_every")
+    flags = [x for x in job.flags if not x.startswith(own)]
+    longer = dataclasses.replace(job, flags=(*flags, "--epochs=5000"))
+    process = begun(tmp_path, longer)
+    metrics = tmp_path / "run" / "metrics.jsonl"
+    wait_for(lambda: metrics.exists() and metrics.read_text().count("\n") >= 3, process)
+    begin = time.monotonic()
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(30) == 143
+    assert time.monotonic() - begin < 10.0
+    last = json.loads(metrics.read_text().splitlines()[-1])["step"]
+    assert (tmp_path / "run" / "checkpoints" / str(last) / "sha256.json").exists()
+
+
+def test_a_guarded_row_drives(root, tmp_path):
+    flags = (f"--weights={root / 'w.msgpack'}", "--suite=free_cruise", "--cases=1")
+    short = ("--duration=2", "--baselines=", "--guard=hand-set", "--output=out")
+    done = limited(tmp_path, None, "experiments.simulate", *flags, *short)
+    assert done.returncode == 0, done.stderr[-2000:]
+    report = json.loads((tmp_path / "out" / "suite.json").read_text())["report"]
+    (guarded,) = [name for name in report["rows"] if name.endswith(" guarded")]
+    assert report["rows"][guarded]["progress_m"] > 1.0
+
+
+def test_a_guarded_row_drives_as_the_reward_or_as_its_incumbent(root):
+    """With ranges that hold everything, and such that hold nothing."""
+    files = [str(root / "w.msgpack")]
+    learned, guarded, hand = table_rows(files, ["hand-set"], guard="hand-set")
+    cases = catalogue_set(suite_refs("stopped_lead", 4), 6.0)
+    config = rollout_config(learned, cases.duration_s, 1)
+
+    def driven(row, **ranges):
+        if ranges:
+            weights = {k: np.full_like(getattr(row.params, k), x)
+                       for k, x in ranges.items()}  # fmt: skip
+            row = dataclasses.replace(row, params=row.params.replace(**weights))
+        found = drive_row(row, cases.build, len(cases.ids), config, chunk=4)
+        return np.stack([found.progress, found.min_a, found.max_a])
+
+    ours, theirs = driven(learned), driven(hand)
+    assert np.all(np.abs(ours - theirs).max(axis=0) > 0.1)  # else nothing is shown
+    everything = driven(guarded, low=-np.inf, high=np.inf, share=1.0)
+    np.testing.assert_allclose(everything, ours, atol=1e-2)
+    nothing = driven(guarded, low=np.inf, high=-np.inf, share=0.0)
+    np.testing.assert_allclose(nothing, theirs, atol=1e-2)
+
+
+def test_weights_of_the_tuning_loop_are_made_again(root, tmp_path):
+    job = jobs(root)["autotune"]
+    flags = [*job.flags, "--until=train"]
+    assert limited(tmp_path, None, job.module, *flags).returncode == 0
+    (data,) = tmp_path.glob("run/dataset-*")
+    again = ("--weights=run/weights.msgpack", f"--data={data}", "--output=again")
+    done = limited(tmp_path, None, "experiments.reproduce", *again)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "reproduced: bit for bit" in done.stdout
+
+
+def test_weights_of_a_sweep_are_made_again(root, tmp_path):
+    job = jobs(root)["sweep"]
+    assert limited(tmp_path, None, job.module, *job.flags).returncode == 0
+    again = ("--weights=sweep/best.msgpack", "--output=again")
+    done = limited(tmp_path, None, "experiments.reproduce", *again)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "reproduced: bit for bit" in done.stdout
+    assert [x.name for x in (tmp_path / "again").glob("*.msgpack")] == [
+        "weights.msgpack"
+    ]
+
+
+@pytest.mark.parametrize(
+    "name", ["import", "train", "export", "sweep", "report", "autotune"]
+)
+def test_a_place_that_cannot_be_is_one_line(root, tmp_path, name):
+    """Below a file, where nobody can make a folder, whoever runs it."""
+    (tmp_path / "file").write_text("here")
+    module, flags = flags_of(root, name)
+    places = ("--output=", "--workdir=run")
+    below = [
+        x.replace("=", f"={tmp_path}/file/", 1) if x.startswith(places) else x
+        for x in flags
+    ]
+    done = limited(tmp_path, None, module, *below)
+    assert done.returncode == 2, done.stderr[-2000:]
+    (line,) = errors_of(done)
+    assert line.startswith("error: ")
+    assert f"{tmp_path}/file" in line
+    assert [x.name for x in tmp_path.iterdir()] == ["file"]

@@ -1,0 +1,65 @@
+"""Motions that fixtures write: straight on or along an arc, at changing speed."""
+
+import dataclasses
+
+import numpy as np
+
+from rcirl_jax.types import Kind
+from tests.data.importers.formats import Written
+
+WAVE_RAD_S = 0.7  # rad/s, of a changing speed
+
+
+def motion(t, speed, wave):
+    """(station, speed) of v = speed + wave sin(0.7 t); all in m and s."""
+    station = speed * t + wave / WAVE_RAD_S * (1.0 - np.cos(WAVE_RAD_S * t))
+    return station, speed + wave * np.sin(WAVE_RAD_S * t)
+
+
+def straight(t, start, heading, speed, *, wave=0.0, kind=Kind.VEHICLE, size=(4.5, 1.9)):
+    """Along a heading [rad] from start [m] at t = 0, at a speed [m/s]."""
+    station, speeds = motion(t, speed, wave)
+    return Written(
+        kind=kind,
+        length=size[0],
+        width=size[1],
+        t=t,
+        x=start[0] + station * np.cos(heading),
+        y=start[1] + station * np.sin(heading),
+        heading=np.full(t.shape, float(heading)),
+        speed=speeds,
+    )
+
+
+def arc(
+    t,
+    start,
+    heading,
+    speed,
+    radius,
+    *,
+    wave=0.0,
+    kind=Kind.VEHICLE,
+    size=(4.5, 1.9),
+):
+    """Along a circle; radius [m] > 0 turns left, < 0 right."""
+    station, speeds = motion(t, speed, wave)
+    angle = heading + station / radius
+    return Written(
+        kind=kind,
+        length=size[0],
+        width=size[1],
+        t=t,
+        x=start[0] + radius * (np.sin(angle) - np.sin(heading)),
+        y=start[1] - radius * (np.cos(angle) - np.cos(heading)),
+        heading=(angle + np.pi) % (2.0 * np.pi) - np.pi,
+        speed=speeds,
+    )
+
+
+def samples(written, rows):
+    """The road user at some of its samples."""
+    series = ("t", "x", "y", "heading", "speed")
+    return dataclasses.replace(
+        written, **{name: getattr(written, name)[rows] for name in series}
+    )

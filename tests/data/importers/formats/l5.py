@@ -1,0 +1,353 @@
+"""Two scenes of an L5 prediction dataset in the public folder layout.
+
+scenes/sample.zarr (zarr 2, blosc-compressed structured arrays of L5Kit's dtypes),
+semantic_map/semantic_map.pb and meta.json. The world's origin lies in Palo Alto;
+the map's lanes have a local frame of their own, 200 m away.
+"""
+
+import dataclasses
+import json
+import struct
+
+import numpy as np
+import tensorstore
+
+from rcirl_jax.types import Kind
+from tests.data.importers.formats import Fixture
+from tests.data.importers.formats.drives import arc, samples, straight
+from tests.data.importers.formats.waymo import Packed, Single, message, varint
+
+T = 0.1 * np.arange(100)
+# frames come a few milliseconds early or late
+STAMPS = T + np.where(T > 0.0, 0.003 * np.sin(np.arange(100)), 0.0)
+START_NS = 1572643684801892606  # as in the public sample
+SCENE_DTYPE = [
+    ("frame_index_interval", np.int64, (2,)),
+    ("host", "<U16"),
+    ("start_time", np.int64),
+    ("end_time", np.int64),
+]
+FRAME_DTYPE = [
+    ("timestamp", np.int64),
+    ("agent_index_interval", np.int64, (2,)),
+    ("traffic_light_faces_index_interval", np.int64, (2,)),
+    ("ego_translation", np.float64, (3,)),
+    ("ego_rotation", np.float64, (3, 3)),
+]
+AGENT_DTYPE = [
+    ("centroid", np.float64, (2,)),
+    ("extent", np.float32, (3,)),
+    ("yaw", np.float32),
+    ("velocity", np.float32, (2,)),
+    ("track_id", np.uint64),
+    ("label_probabilities", np.float32, (17,)),
+]
+TL_FACE_DTYPE = [
+    ("face_id", "<U16"),
+    ("traffic_light_id", "<U16"),
+    ("traffic_light_face_status", np.float32, (3,)),
+]
+UNKNOWN, CAR, CYCLIST, PEDESTRIAN = 1, 3, 12, 14  # labels
+LABEL = {Kind.VEHICLE: CAR, Kind.CYCLIST: CYCLIST, Kind.PEDESTRIAN: PEDESTRIAN}
+RED, GREEN = "rED1", "gRN1"  # faces of the light
+LIGHT = "lGT1"
+GREEN_FROM = 60  # frame in which the light turns green
+CENTRE = np.array([600.0, -900.0])  # m, in the world: where the scene is
+LATITUDE, LONGITUDE = 374310000, -1221585000  # 1e-7 degrees, of the map's frame
+HALF = np.array([0.0, 1.75])  # m, half a lane to the left
+WORLD_TO_ECEF = np.array(
+    [
+        [8.46617444e-01, 3.23463078e-01, -4.22623402e-01, -2.69876744e06],
+        [-5.32201938e-01, 5.14559352e-01, -6.72301845e-01, -4.29315158e06],
+        [-3.05311332e-16, 7.94103464e-01, 6.07782600e-01, 3.85516476e06],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
+)
+
+
+def road_users():
+    """Id -> motion; 17 is seen for a part of the scene, 19 with a gap."""
+    x, y = CENTRE
+    users = {
+        "ego": straight(STAMPS, (x, y), 0.0, 8.0, size=(4.87, 1.85)),
+        "12": straight(STAMPS, (x + 25.0, y), 0.0, 8.0),
+        "15": arc(STAMPS, (x + 60.0, y), 0.0, 7.0, 25.0, size=(5.2, 2.0)),
+        "17": straight(STAMPS, (x - 30.0, y + 3.5), 0.0, 11.0),
+        "19": straight(STAMPS, (x - 10.0, y + 3.5), 0.0, 9.0, size=(11.0, 2.6)),
+        "23": straight(
+            STAMPS,
+            (x + 50.0, y - 6.0),
+            np.pi / 2,
+            1.3,
+            kind=Kind.PEDESTRIAN,
+            size=(0.6, 0.6),
+        ),
+        "27": straight(
+            STAMPS, (x, y - 2.0), 0.0, 5.0, kind=Kind.CYCLIST, size=(1.7, 0.6)
+        ),
+    }
+    users["17"] = samples(users["17"], slice(30, 80))
+    return users
+
+
+GAP = slice(40, 60)  # frames in which 19 is hidden
+
+
+def visible():
+    """Id of the file -> the frames it is seen in, and its motion."""
+    rows = {name: np.arange(100) for name in road_users() if name != "ego"}
+    rows["17"] = np.arange(30, 80)
+    rows["19"] = np.delete(np.arange(100), GAP)
+    return rows
+
+
+def agents(users):
+    """All agents, and the interval of each frame."""
+    records, frames = [], []
+    for name, frame in visible().items():
+        user = users[name]
+        at = np.searchsorted(user.t, STAMPS[frame])
+        part = np.zeros(frame.size, AGENT_DTYPE)
+        part["centroid"] = np.stack([user.x, user.y], axis=1)[at]
+        part["extent"] = user.length, user.width, 1.6
+        part["yaw"] = user.heading[at]
+        part["velocity"] = np.stack(
+            [user.speed * np.cos(user.heading), user.speed * np.sin(user.heading)], 1
+        )[at]
+        part["track_id"] = int(name)
+        part["label_probabilities"][:, LABEL[user.kind]] = 1.0
+        records.append(part)
+        frames.append(frame)
+    # a bush: class unknown, jitters
+    bush = np.zeros(100, AGENT_DTYPE)
+    bush["centroid"] = CENTRE + np.array([20.0, 9.0])
+    bush["extent"], bush["track_id"] = (0.9, 0.8, 1.0), 99
+    bush["label_probabilities"][:, UNKNOWN] = 1.0
+    records.append(bush)
+    frames.append(np.arange(100))
+    frame = np.concatenate(frames)
+    order = np.argsort(frame, kind="stable")
+    ends = np.cumsum(np.bincount(frame, minlength=100))
+    return np.concatenate(records)[order], np.stack(
+        [ends - np.bincount(frame), ends], 1
+    )
+
+
+def faces():
+    """Red until GREEN_FROM, both faces in every frame."""
+    found = np.zeros(200, TL_FACE_DTYPE)
+    found["face_id"] = [RED, GREEN] * 100
+    found["traffic_light_id"] = "l1gh"
+    green = np.repeat(np.arange(100) >= GREEN_FROM, 2)
+    lit = np.where(np.arange(200) % 2 == 1, green, ~green)
+    found["traffic_light_face_status"][:, 0] = lit
+    found["traffic_light_face_status"][:, 1] = ~lit
+    starts = 2 * np.arange(100)
+    return found, np.stack([starts, starts + 2], axis=1)
+
+
+def write_array(folder, records, chunk):
+    """A zarr array as zarr-python writes it: .zarray of named fields, blosc."""
+    fields = [
+        [name, records.dtype[name].base.str, *([list(shape)] if shape else [])]
+        for name in records.dtype.names
+        for shape in [records.dtype[name].shape]
+    ]
+    metadata = {
+        "zarr_format": 2,
+        "shape": [records.size],
+        "chunks": [chunk],
+        "dtype": [["record", "|u1", [records.dtype.itemsize]]],
+        "compressor": {
+            "id": "blosc",
+            "cname": "lz4",
+            "clevel": 5,
+            "shuffle": 1,
+            "blocksize": 0,
+        },
+        "filters": None,
+        "fill_value": None,
+        "order": "C",
+    }
+    store = tensorstore.open(
+        {
+            "driver": "zarr",
+            "kvstore": {"driver": "file", "path": str(folder)},
+            "metadata": metadata,
+        },
+        create=True,
+    ).result()
+    shape = (records.size, records.dtype.itemsize)
+    raw = np.ascontiguousarray(records).view(np.uint8).reshape(shape)
+    store.write(raw).result()
+    metadata["dtype"], metadata["fill_value"] = fields, "AAAA"
+    (folder / ".zarray").write_text(json.dumps(metadata, indent=4))
+
+
+def write_zarr(folder, *, scenes=2, start=START_NS, host="host-a013"):
+    """Scenes of the same traffic, 30 s apart, at one host."""
+    users = road_users()
+    seen, intervals = agents(users)
+    lights, light_intervals = faces()
+    frames = np.zeros(100 * scenes, FRAME_DTYPE)
+    ego = users["ego"]
+    for scene in range(scenes):
+        part = frames[100 * scene : 100 * (scene + 1)]
+        later = np.round((STAMPS + 40.0 * scene) * 1e9).astype(np.int64)
+        part["timestamp"] = start + later
+        part["agent_index_interval"] = intervals + scene * len(seen)
+        part["traffic_light_faces_index_interval"] = light_intervals + 200 * scene
+        part["ego_translation"] = np.stack([ego.x, ego.y, np.full(100, 288.1)], axis=1)
+        part["ego_rotation"] = np.eye(3)
+    table = np.zeros(scenes, SCENE_DTYPE)
+    for scene in range(scenes):
+        begin, end = frames["timestamp"][[100 * scene, 100 * scene + 99]]
+        table[scene] = ([100 * scene, 100 * (scene + 1)], host, begin, end)
+    folder.mkdir(parents=True)
+    (folder / ".zgroup").write_text('{"zarr_format": 2}')
+    (folder / ".zattrs").write_text('{"format_version": 2, "labels": []}')
+    write_array(folder / "scenes", table, 10)
+    write_array(folder / "frames", frames, 64)
+    write_array(folder / "agents", np.tile(seen, scenes), 500)
+    write_array(folder / "traffic_light_faces", np.tile(lights, scenes), 100)
+
+
+# --------------------------------------------------------------- semantic map
+
+
+def zigzag(value):
+    return (int(value) << 1) ^ (int(value) >> 63)
+
+
+def fixed32(number, value):
+    return varint(number << 3 | 5) + struct.pack("<i", value)
+
+
+def name_of(text):
+    """GlobalId."""
+    return message([(1, text.encode())])
+
+
+def to_local(world):
+    """Centimetres [n, 2] in the frame of the map's lanes."""
+    latitude, longitude = np.deg2rad(np.array([LATITUDE, LONGITUDE]) * 1e-7)
+    a, f = 6378137.0, 1.0 / 298.257223563
+    e2 = f * (2.0 - f)
+    n = a / np.sqrt(1.0 - e2 * np.sin(latitude) ** 2)
+    origin = np.array(
+        [
+            n * np.cos(latitude) * np.cos(longitude),
+            n * np.cos(latitude) * np.sin(longitude),
+            n * (1.0 - e2) * np.sin(latitude),
+        ]
+    )
+    sin_a, cos_a = np.sin(longitude), np.cos(longitude)
+    sin_b, cos_b = np.sin(latitude), np.cos(latitude)
+    enu = np.array(
+        [
+            [-sin_a, cos_a, 0.0],
+            [-sin_b * cos_a, -sin_b * sin_a, cos_b],
+            [cos_b * cos_a, cos_b * sin_a, sin_b],
+        ]
+    )
+    points = np.concatenate([world, np.zeros((len(world), 1))], axis=1)
+    ecef = points @ WORLD_TO_ECEF[:3, :3].T + WORLD_TO_ECEF[:3, 3]
+    return 100.0 * ((ecef - origin) @ enu.T)
+
+
+def bound(points):
+    local = np.round(to_local(np.asarray(points, np.float64)))
+    steps = np.diff(local, axis=0, prepend=np.zeros((1, 3)))
+    axes = [Packed(zigzag(v) for v in axis) for axis in steps.T]
+    return message([(1, axes[0]), (2, axes[1]), (3, axes[2])])
+
+
+def lane(name, left, right, *, parent="seg", ahead=(), beside=(), controls=()):
+    origin = fixed32(1, LATITUDE) + fixed32(2, LONGITUDE)
+    body = [(1, name_of(parent)), (2, message([(1, origin)]))]
+    body += [(3, bound(left)), (4, bound(right))]
+    body += [(5, name_of(other)) for other in ahead]
+    body += [(6 + k, name_of(other)) for k, other in beside]
+    body += [(8, name_of(control)) for control in controls]
+    return element(name, 3, message(body))
+
+
+def element(name, kind, body):
+    """MapElement with a segment (1), lane (3) or traffic control (4)."""
+    return message([(1, name_of(name)), (2, message([(kind, body)]))])
+
+
+def write_map(path, controls=(RED, GREEN), inside=()):
+    """A road before a junction; `controls` govern its right lane, `inside` the next."""
+    x, y = CENTRE
+    grid = np.linspace(-60.0, 60.0, 13)
+
+    def along(offset):
+        return np.stack([x + grid, np.full(13, y + offset)], axis=1)
+
+    angle = np.linspace(0.0, 2.2, 16)
+
+    def turn(radius):
+        centre = np.array([x + 60.0, y + 25.0])
+        return centre + radius * np.stack([np.sin(angle), -np.cos(angle)], axis=1)
+
+    last = np.array([[x + 60.0, y], [x + 160.0, y]])
+    faces = [(3, name_of(face)) for face in (RED, GREEN)]
+    elements = [
+        element("seg", 1, message([(9, Single(11.176))])),
+        element("jun", 5, b""),
+        element(RED, 4, message([(11, b"")])),
+        element(GREEN, 4, message([(13, b"")])),
+        element(LIGHT, 4, message([(29, message(faces))])),
+        lane(
+            "a1",
+            along(1.75),
+            along(-1.75),
+            ahead=("b1", "c1"),
+            beside=((0, "a2"),),
+            controls=controls,
+        ),
+        # drawn against the traffic: the left bound lies to the right of the points
+        lane("a2", along(5.25)[::-1], along(1.75)[::-1], beside=((1, "a1"),)),
+        lane("b1", turn(23.25), turn(26.75), parent="jun"),
+        lane("c1", last + HALF, last - HALF, parent="jun", controls=inside),
+        element("stub", 3, message([(1, name_of("seg"))])),
+    ]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(message([(1, "map"), *[(2, item) for item in elements]]))
+    return path
+
+
+def write(folder):
+    dataset = folder / "scenes" / "sample.zarr"
+    write_zarr(dataset)
+    semantic_map = write_map(folder / "semantic_map" / "semantic_map.pb")
+    meta = folder / "meta.json"
+    meta.write_text(json.dumps({"world_to_ecef": WORLD_TO_ECEF.tolist()}))
+    users = road_users()
+    gapped = users.pop("19")
+    users["19"] = samples(gapped, slice(0, GAP.start))
+    users["19#2"] = samples(gapped, slice(GAP.stop, None))
+    return Fixture(
+        input=folder,
+        rate_hz=10.0,
+        tracks={name: dataclasses.replace(user) for name, user in users.items()},
+        num_lanes=4,
+        num_signals=1,
+        files=(
+            dataset / "scenes" / ".zarray",
+            dataset / "scenes" / "0",
+            dataset / "frames" / "1",
+            dataset / "agents" / ".zarray",
+            dataset / "agents" / "0",
+            dataset / "traffic_light_faces" / "0",
+            semantic_map,
+            meta,
+        ),
+        numbers={
+            dataset / "scenes" / ".zarray": r'"shape": \[\s*(\d+)',
+            dataset / "agents" / ".zarray": r'"shape": \[\s*(\d+)',
+            meta: r"(-?\d+\.\d+)",
+        },
+        is_counted=True,
+    )

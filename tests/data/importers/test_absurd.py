@@ -1,0 +1,275 @@
+"""Numbers in range for a parser and absurd for a road; faults no check foresaw."""
+
+import dataclasses
+import importlib
+import os
+import re
+import sqlite3
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from rcirl_jax.data import importers
+from rcirl_jax.data.cut import cut
+from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.readers import tables
+from rcirl_jax.data.recording import validate_recording
+from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.errors import InputError, as_input_error
+from tests.data.importers.formats import (
+    commonroad,
+    csv,
+    levelx_highd,
+    ngsim,
+    nuplan,
+    openacc,
+)
+from tests.helpers.commands import command
+
+
+def only_line(name, path, source=None):
+    with pytest.raises(InputError) as caught:
+        list(read_recordings(name, path, source))
+    (line,) = str(caught.value).splitlines()
+    return line
+
+
+def made(folder):
+    folder.mkdir(parents=True)
+    return folder
+
+
+def replace_cell(file, row, column, value, separator=","):
+    """Overwrites one cell of a text table; the column by name or number."""
+    lines = file.read_text().splitlines()
+    place = column
+    if isinstance(column, str):
+        place = lines[0].split(separator).index(column)
+    cells = lines[row].split(separator)
+    cells[place] = value
+    lines[row] = separator.join(cells)
+    file.write_text("\n".join(lines) + "\n")
+
+
+def test_a_clock_of_a_century_beside_a_standing_obstacle(tmp_path):
+    fixture = commonroad.write(tmp_path)
+    (file,) = fixture.files
+    text = file.read_text()
+    latest = max(map(int, re.findall(r"<exact>(\d+)</exact>", text)))
+    before, _, after = text.rpartition(f"<exact>{latest}</exact>")
+    file.write_text(f"{before}<exact>20000000000</exact>{after}")
+    line = only_line("commonroad", fixture.input)
+    assert "time: 2e+10: expected steps up to 1e+06" in line
+
+
+def test_one_wrong_cell_does_not_make_a_lane_across_the_globe(tmp_path):
+    fixture = levelx_highd.write(made(tmp_path / "highd"))
+    (tracks,) = [f for f in fixture.files if f.name.endswith("_tracks.csv")]
+    replace_cell(tracks, 50, "x", "9e7")
+    line = only_line("levelx", fixture.input)
+    assert "x: 9e+07 m, the median is " in line
+    fixture = ngsim.write(made(tmp_path / "ngsim"))
+    replace_cell(fixture.files[0], 50, 5, "1e12", " ")
+    assert "row 51: Local_Y: 1e+12: expected" in only_line("ngsim", fixture.input)
+    fixture = openacc.write(made(tmp_path / "openacc"))
+    file = fixture.files[0]
+    rows = file.read_text().splitlines()
+    head = next(i for i, row in enumerate(rows) if row.startswith("Time"))
+    cells = rows[head + 60].split(",")
+    cells[rows[head].split(",").index("N1")] = "-9e7"
+    rows[head + 60] = ",".join(cells)
+    file.write_text("\n".join(rows) + "\n")
+    assert "y: -9e+07 m, the median is " in only_line("openacc", file)
+
+
+@pytest.mark.parametrize("long_bytes", [1, 10**9])
+@pytest.mark.parametrize(
+    ("cell", "column"), [("1e300", "t"), ("1e200", "x"), ("-9e9", "y")]
+)
+def test_a_csv_cell_beyond_any_place_or_time(long_bytes, cell, column, tmp_path):
+    rows = ["t,id,x,y,lane"]
+    rows += [f"{k / 10:.1f},a,{k}.0,0.0,1" for k in range(120)]
+    log, source = tmp_path / "log.csv", tmp_path / "source.toml"
+    log.write_text("\n".join(rows) + "\n")
+    replace_cell(log, 60, column, cell)
+    columns = "\n".join(f'{name} = "{name}"' for name in ("t", "id", "x", "y", "lane"))
+    source.write_text(f"long_bytes = {long_bytes}\n[columns]\n{columns}\n")
+    line = only_line("csv", log, source)
+    assert f"{column}: {float(cell):g}" in line or f"{column}: {float(cell)}" in line
+    assert "expected" in line
+
+
+WHOLE = ["interaction", "levelx_highd", "ngsim_pairs", "openacc"]
+
+
+def first_file(name, folder):
+    """The first file of a sound log."""
+    module = importlib.import_module(f"tests.data.importers.formats.{name}")
+    return module.write(made(folder)).files[0]
+
+
+def importer_of(name):
+    return "levelx" if name.startswith("levelx") else name
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_a_log_that_is_held_whole_has_a_size(name, tmp_path):
+    file = first_file(name, tmp_path / "in")
+    with file.open("r+b") as opened:
+        opened.truncate(2**40)  # its rows, and a terabyte of nothing
+    line = only_line(importer_of(name), tmp_path / "in")
+    assert f"{file.name}: size: {2**20} MiB: expected 1024 at most" in line
+
+
+@pytest.mark.parametrize("where", ["header", "rows", "cell"])
+@pytest.mark.parametrize("name", [*WHOLE, "csv", "ngsim"])
+def test_a_line_without_an_end_is_not_held(name, where, tmp_path, monkeypatch):
+    """All of it on one line; a sound head, then a line of cells, or of a wide one."""
+    monkeypatch.setattr(tables, "MAX_LINE", 2**14)
+    file = first_file(name, tmp_path / "in")
+    rows = file.read_text().splitlines(keepends=True)
+    end = rows[-1].rstrip("\n").replace(" ", ",")
+    text = "" if where == "header" else "".join(rows)
+    text += (end + ",") * (2**15 // len(end))
+    if where == "cell":  # a row that numpy takes
+        text = "".join(rows[:-1]) + 2**15 * " " + rows[-1]
+    file.write_text(text)
+    line = only_line(importer_of(name), tmp_path / "in")
+    assert file.name in line
+    if name != "openacc" or where != "header":  # which reads so much of its head only
+        assert "a line of more than 16384 characters: expected one a row" in line
+
+
+def test_a_row_without_an_end_is_not_held(tmp_path, monkeypatch):
+    """Of short lines, each of which ends inside of quotes."""
+    monkeypatch.setattr(tables, "MAX_LINE", 2**14)
+    log = tmp_path / "log.csv"
+    log.write_text('t,id,x,y\n0.0,a,0.0,0.0\n"a' + 4000 * '\n","b')
+    with pytest.raises(InputError, match="a row of more than 16384 characters"):
+        tables.check_cells(log, ["t", "id", "x", "y"], ["t", "x", "y"])
+    log.write_text('"a' + 4000 * '\n","b')
+    with pytest.raises(InputError, match="a row of more than 16384 characters"):
+        tables.read_header(log)
+    log.write_text('t,id,note,x\n0,a,"two\nlines",1\n1,a,b,oops\n')
+    with pytest.raises(InputError, match="line 4: x: 'oops'"):
+        tables.check_cells(log, ["t", "id", "note", "x"], ["t", "x"])
+
+
+def test_a_long_log_with_a_line_without_an_end(tmp_path):
+    """Read in pieces, by another reader, which says where it stopped."""
+    log, source = tmp_path / "log.csv", tmp_path / "source.toml"
+    with log.open("w") as file:
+        file.write("t,id,x,y,lane\n0.0,a,0.0,0.0,1\n")
+        for _ in range(200):
+            file.write("0.1,a,0.0,0.0,1," * 2**12)
+    names = "\n".join(f'{name} = "{name}"' for name in ("t", "id", "x", "y", "lane"))
+    source.write_text(f"long_bytes = 1\n[columns]\n{names}\n")
+    line = only_line("csv", log, source)
+    assert "a line of more than 1048576 characters: expected one a row" in line
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("columns = 3", "columns: 3: expected a table"),
+        ("pattern = 3", "pattern: 3: expected file names"),
+        ("units = 3", "units: 3: expected a table"),
+        ("lanes = [3]", "lanes: [3]: expected tables"),
+        ("defaults = 3", "defaults: 3: expected a table"),
+    ],
+)
+def test_options_of_another_type(text, line, tmp_path):
+    log, source = tmp_path / "log.csv", tmp_path / "source.toml"
+    rows = [f"{k / 10:.1f},a,{k}.0,0.0" for k in range(40)]
+    log.write_text("\n".join(["t,id,x,y", *rows]) + "\n")
+    columns = "\n".join(f'{name} = "{name}"' for name in ("t", "id", "x", "y"))
+    rest = "" if text.startswith("columns") else f"[columns]\n{columns}\n"
+    source.write_text(f"{text}\n{rest}")
+    assert line in only_line("csv", log, source)
+
+
+def test_a_map_without_stop_polygons(tmp_path):
+    fixture = nuplan.write(tmp_path)
+    whole = list(read_recordings("nuplan", fixture.input))
+    (layers,) = tmp_path.rglob("*.gpkg")
+    with sqlite3.connect(layers) as database:
+        database.execute("DELETE FROM stop_polygons")
+    found = list(read_recordings("nuplan", fixture.input))
+    assert [len(x.tracks) for x in found] == [len(x.tracks) for x in whole]
+
+
+def test_what_no_check_foresaw_is_one_line_that_names_the_place(tmp_path, monkeypatch):
+    fixture = csv.write(tmp_path)
+
+    def broken(path, spec):
+        yield from ()
+        raise KeyError("stations")
+
+    module = importers.importlib.import_module("rcirl_jax.data.importers.csv.reader")
+    monkeypatch.setattr(module, "recordings", broken)
+    line = only_line("csv", fixture.input)
+    assert "KeyError: 'stations' (test_absurd.py:" in line
+    assert line.endswith("expected a sound log of format csv")
+
+
+def test_a_recording_that_cannot_be_cut_is_one_line(monkeypatch):
+    recording = next(read_recordings("synthetic", None))
+    monkeypatch.setattr(
+        "rcirl_jax.data.scenes.lanes._densify", lambda *_: np.zeros(2**62)
+    )
+    with pytest.raises(InputError, match=r"expected a sound recording"):
+        cut(recording, CollectConfig())
+
+
+def test_faults_of_other_kinds_pass():
+    with pytest.raises(OSError, match="disk"), as_input_error("file", "anything"):
+        raise OSError("disk")
+    with (
+        pytest.raises(InputError, match=r"^own line$"),
+        as_input_error("file", "anything"),
+    ):
+        raise InputError("own line")
+
+
+@pytest.mark.multiprocess
+@pytest.mark.parametrize(
+    ("work", "said"),
+    [
+        ("import numpy; numpy.empty(2**62, numpy.uint8)", "Unable to allocate 4.00 Ei"),
+        ("import jax; jax.numpy.zeros(2**45)", "RESOURCE_EXHAUSTED: Out of memory"),
+    ],
+)
+def test_memory_that_is_not_given_is_one_line(work, said):
+    script = f"from experiments.common import run; run(lambda: exec({work!r}))"
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(f"error: memory: {said}")
+    assert line.endswith(": expected more for this work")
+
+
+def test_names_that_are_no_text(tmp_path):
+    """A file's name may be any bytes; what an import writes has to be text."""
+    odd = tmp_path / os.fsdecode(b"a\xff.csv")
+    odd.write_text("t,id,x,y\n")
+    with pytest.raises(InputError, match=r"name: 'a\\udcff\.csv': expected UTF-8"):
+        next(read_recordings("csv", odd))
+    recording = next(read_recordings("synthetic", None))
+    track = dataclasses.replace(recording.tracks[0], id="\ud800")
+    for field, value in (
+        *(("name", "\udcff"), ("group", "\udcff"), ("licence", "\udcff")),
+        *(("notes", ("\udcff",)), ("tracks", (track, *recording.tracks[1:]))),
+    ):
+        bad = dataclasses.replace(recording, **{field: value})
+        with pytest.raises(InputError, match=r"expected UTF-8 text"):
+            validate_recording(bad, "a.csv")
+
+
+def test_flags_that_are_no_text(tmp_path):
+    ended = command("experiments.import_logs", "--format=csv", "--input=a\udcff")
+    assert ended.returncode == 2
+    assert ended.stderr == "error: '--input=a\\udcff': expected UTF-8\n"

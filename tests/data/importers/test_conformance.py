@@ -1,0 +1,363 @@
+"""Every importer, one set of invariants: what is written is what is read.
+
+The formats are the modules of tests/data/importers/formats with a function `write`; a
+module named otherwise than its format says so by FORMAT.
+"""
+
+import importlib
+import os
+import pickle
+import pkgutil
+import re
+
+import numpy as np
+import pytest
+
+from rcirl_jax.data.cut import digest
+from rcirl_jax.data.importers import IMPORTERS, parts, read_part, read_recordings
+from rcirl_jax.data.importing import ImportConfig, import_parts
+from rcirl_jax.data.parts import parts_of
+from rcirl_jax.data.recording import validate_recording
+from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.errors import InputError
+from rcirl_jax.runtime.specs import load_toml, spec_root
+from rcirl_jax.types import Kind
+from tests.data.importers import formats
+
+SPEED_TOLERANCE_MPS = 0.3  # m/s
+SIZE_TOLERANCE_M = 0.02  # m
+HEADING_TOLERANCE = 0.02  # rad
+TIME_TOLERANCE_S = 0.006  # s, stamps rounded to 10 ms
+
+
+def discover():
+    """Module name -> module, of every fixture."""
+    names = [item.name for item in pkgutil.iter_modules(formats.__path__)]
+    modules = {n: importlib.import_module(f"{formats.__name__}.{n}") for n in names}
+    return {
+        name: module for name, module in modules.items() if hasattr(module, "write")
+    }
+
+
+MODULES = discover()
+
+
+def format_of(name):
+    return getattr(MODULES[name], "FORMAT", name)
+
+
+def write(name, folder):
+    folder.mkdir(parents=True, exist_ok=True)
+    return MODULES[name].write(folder)
+
+
+def read(name, fixture):
+    return list(read_recordings(format_of(name), fixture.input))
+
+
+@pytest.fixture(params=sorted(MODULES))
+def name(request):
+    return request.param
+
+
+def find(recordings, label, expected):
+    """The track of this id, in the recording where it has as many samples."""
+    found = [t for r in recordings for t in r.tracks if t.id == label]
+    known = sorted({t.id for r in recordings for t in r.tracks})
+    assert found, f"no track {label} among {known}"
+    fitting = [track for track in found if track.t.size == expected.t.size]
+    sizes = [track.t.size for track in found]
+    assert fitting, f"track {label}: {sizes} samples, written {expected.t.size}"
+    return fitting[0]
+
+
+def test_every_format_has_a_fixture():
+    """A new importer comes with a fixture; synthetic traffic is its own."""
+    assert {format_of(name) for name in MODULES} == set(IMPORTERS) - {"synthetic"}
+
+
+def test_registry_and_source(name):
+    assert format_of(name) in IMPORTERS
+    spec = load_toml(spec_root() / "sources" / f"{format_of(name)}.toml")
+    sources = [
+        spec.get("source"),
+        *(e.get("source") for e in spec.get("provenance", [])),
+    ]
+    assert any(sources)
+    assert spec["licence"].strip()
+
+
+def test_what_was_written_is_found(name, tmp_path):
+    fixture = write(name, tmp_path)
+    recordings = read(name, fixture)
+    for label, expected in fixture.tracks.items():
+        track = find(recordings, label, expected)
+        assert track.kind == expected.kind, label
+        for field in ("length", "width"):
+            found, meant = getattr(track, field), getattr(expected, field)
+            assert abs(found - meant) <= SIZE_TOLERANCE_M, (label, field, found, meant)
+        np.testing.assert_allclose(track.t, expected.t, atol=TIME_TOLERANCE_S)
+        apart = np.hypot(track.x - expected.x, track.y - expected.y)
+        assert apart.max() <= fixture.tolerance_m, (label, apart.max())
+        fast = np.abs(track.speed - expected.speed)
+        assert fast.max() <= SPEED_TOLERANCE_MPS, (label, fast.max())
+        if fixture.has_heading:
+            turn = np.angle(np.exp(1j * (track.heading - expected.heading)))
+            assert np.abs(turn).max() <= HEADING_TOLERANCE, (label, np.abs(turn).max())
+    assert max(len(r.lanes) for r in recordings) >= fixture.num_lanes
+    assert max(len(r.signals) for r in recordings) >= fixture.num_signals
+
+
+def test_every_recording_is_sound(name, tmp_path):
+    fixture = write(name, tmp_path)
+    recordings = read(name, fixture)
+    assert recordings
+    names = [recording.name for recording in recordings]
+    assert len(set(names)) == len(names)
+    for recording in recordings:
+        validate_recording(recording)
+        assert recording.rate_hz == pytest.approx(fixture.rate_hz, rel=1e-6)
+        for text in (recording.source, recording.licence):
+            assert text.strip()
+            assert not text.lower().startswith("unknown")
+        assert min(track.t[0] for track in recording.tracks) == pytest.approx(
+            0.0, abs=1e-6
+        )
+        for track in recording.tracks:
+            assert isinstance(track.kind, Kind)
+            for field in ("t", "x", "y", "heading", "speed"):
+                assert getattr(track, field).dtype == np.float64
+            assert np.all(np.diff(track.t) > 0.0)
+            # float32 on the device resolves a centimetre up to about 100 km
+            assert max(np.abs(track.x).max(), np.abs(track.y).max()) < 1e5
+        for lane in recording.lanes:
+            assert lane.centre.dtype == np.float64
+
+
+def test_lanes_lie_under_the_vehicles(name, tmp_path):
+    """Tracks and lanes share one frame: most vehicles have a lane below them."""
+    fixture = write(name, tmp_path)
+    if fixture.num_lanes == 0:
+        assert not any(recording.lanes for recording in read(name, fixture))
+        return
+    shares = []
+    for recording in read(name, fixture):
+        centres = [lane.centre for lane in recording.lanes]
+        dense = np.concatenate([_dense(centre) for centre in centres])
+        for track in recording.tracks:
+            if track.kind == Kind.VEHICLE:
+                gap = np.hypot(
+                    track.x[:, None] - dense[:, 0], track.y[:, None] - dense[:, 1]
+                )
+                shares.append(np.mean(gap.min(axis=1) < 4.0))
+    assert np.median(shares) > 0.9, shares
+
+
+def _dense(line):
+    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    at = np.linspace(0.0, arc[-1], int(arc[-1]) + 2)
+    return np.stack([np.interp(at, arc, line[:, i]) for i in (0, 1)], axis=1)
+
+
+def test_reading_twice_is_bit_identical(name, tmp_path):
+    fixture = write(name, tmp_path)
+    first, second = read(name, fixture), read(name, fixture)
+    assert [digest(r) for r in first] == [digest(r) for r in second]
+    assert [r.signals == () for r in first] == [r.signals == () for r in second]
+    assert [r.notes for r in first] == [r.notes for r in second]
+
+
+def test_parts_make_up_the_whole(name, tmp_path):
+    """Inputs read apart (on other machines) give what the whole input gives."""
+    fixture = write(name, tmp_path)
+    found, spec = parts(format_of(name), fixture.input)
+    apart = [r for part in found for r in read_part(format_of(name), part, spec)]
+    whole = list(read_part(format_of(name), fixture.input, spec))
+    assert [digest(r) for r in apart] == [digest(r) for r in whole]
+    assert [r.group for r in apart] == [r.group for r in whole]
+
+
+def test_reads_one_recording_at_a_time(name, tmp_path):
+    fixture = write(name, tmp_path)
+    found = read_recordings(format_of(name), fixture.input)
+    assert iter(found) is iter(found)
+    assert next(iter(found)).tracks
+
+
+def imported(name, fixture, output):
+    """The manifest of an import as by its command; 3 s of future are enough."""
+    collect = CollectConfig(
+        require_obstacles=False, require_speed_change=False, min_future_s=3.0
+    )
+    config = ImportConfig(format=format_of(name), collect=collect, test_fraction=0.0)
+    return import_parts(parts_of(format_of(name), fixture.input), output, config)
+
+
+def test_imports_end_to_end(name, tmp_path):
+    """Every fixture is long enough for a scene of 3 s."""
+    manifest = imported(name, write(name, tmp_path / "log"), tmp_path / "dataset")
+    assert manifest.count > 0
+    assert manifest.sources
+    spec = load_toml(spec_root() / "sources" / f"{format_of(name)}.toml")
+    known = [spec, *spec.get("provenance", [])]
+    licences = {entry.get("licence", spec["licence"]) for entry in known}
+    assert {entry["licence"] for entry in manifest.sources} <= licences
+
+
+# ---------------------------------------------------------------- damaged files
+
+
+class Bomb:
+    """Unpickling it creates a file."""
+
+    def __init__(self, target):
+        self.target = str(target)
+
+    def __reduce__(self):
+        return os.mkdir, (self.target,)
+
+
+def text_of(path):
+    """Content of a text file; None: it is none."""
+    try:
+        text = path.read_bytes().decode()
+    except UnicodeDecodeError:
+        return None
+    return None if "\0" in text else text
+
+
+def truncate(share):
+    """Cut at a share of the file: of text, in the middle of the line there."""
+
+    def apply(path, fixture, target):
+        content = path.read_bytes()
+        cut = int(share * len(content))
+        if text_of(path) is not None:
+            begin, end = content.rfind(b"\n", 0, cut) + 1, content.find(b"\n", cut)
+            cut = (begin + (end if end >= 0 else len(content))) // 2
+        path.write_bytes(content[:cut])
+        return True
+
+    return apply
+
+
+def drop_lines(path, fixture, target):
+    """Cut text between two lines, at nine tenths."""
+    text = text_of(path)
+    if text is None:
+        return False
+    path.write_text(text[: text.rfind("\n", 0, int(0.9 * len(text))) + 1])
+    return True
+
+
+def garble(path, fixture, target):
+    size = max(min(path.stat().st_size, 20000), 64)
+    path.write_bytes(np.random.default_rng(7).bytes(size))
+    return True
+
+
+def empty(path, fixture, target):
+    path.write_bytes(b"")
+    return True
+
+
+def remove(path, fixture, target):
+    path.unlink()
+    return True
+
+
+def plant_pickle(path, fixture, target):
+    path.write_bytes(pickle.dumps(Bomb(target)) * 3)
+    return True
+
+
+def write_number(value):
+    """Write something else for a number in the middle of a text file."""
+
+    def apply(path, fixture, target):
+        if path not in fixture.numbers:
+            return False
+        text = path.read_text()
+        found = list(re.finditer(fixture.numbers[path], text, re.MULTILINE))
+        start, end = found[len(found) // 2].span(1)
+        path.write_text(text[:start] + value + text[end:])
+        return True
+
+    return apply
+
+
+# damage -> (what is done, if it can be; whether a valid result is allowed too)
+DAMAGES = {
+    "truncated at 30 %": (truncate(0.3), lambda fixture: False),
+    "truncated at 90 %": (truncate(0.9), lambda fixture: False),
+    "truncated between lines": (drop_lines, lambda fixture: not fixture.is_counted),
+    "emptied": (empty, lambda fixture: False),
+    "random bytes": (garble, lambda fixture: False),
+    "a pickle": (plant_pickle, lambda fixture: False),
+    "removed": (remove, lambda fixture: True),
+    "a word for a number": (write_number('"west"'), lambda fixture: False),
+    "an absurd number": (write_number("1e30"), lambda fixture: False),
+    "no number": (write_number("NaN"), lambda fixture: fixture.has_holes),
+}
+
+
+@pytest.mark.parametrize("damage", sorted(DAMAGES))
+def test_damaged_files(name, damage, tmp_path):
+    """One line that names the file, or (rows end cleanly, optional) a result.
+
+    An import says the same line and leaves nothing.
+    """
+    apply, may_pass = DAMAGES[damage]
+    target = tmp_path / "executed"
+    count = len(write(name, tmp_path / "count").files)
+    assert count > 0
+    for place in range(count):
+        fixture = write(name, tmp_path / str(place))
+        path = fixture.files[place]
+        if not apply(path, fixture, target):
+            continue
+        try:
+            recordings = read(name, fixture)
+        except InputError as error:
+            message = str(error)
+            assert "\n" not in message
+            assert len(message) < 1000
+            where = path.name in message or damage == "removed"
+            assert where, f"{path.name} is not named: {message}"
+            with pytest.raises(InputError, match=re.escape(message)):
+                imported(name, fixture, tmp_path / "dataset")
+            assert not (tmp_path / "dataset").exists()
+        else:
+            assert may_pass(fixture), f"{damage}: {path.name} was read as if sound"
+            for recording in recordings:
+                validate_recording(recording)
+        assert not target.exists(), f"{path.name}: code was executed"
+
+
+def test_the_last_line_needs_no_newline(name, tmp_path):
+    fixture = write(name, tmp_path)
+    whole = [digest(recording) for recording in read(name, fixture)]
+    for path in fixture.numbers:
+        path.write_text(path.read_text().rstrip("\n"))
+    assert [digest(recording) for recording in read(name, fixture)] == whole
+
+
+def test_text_files_say_where_a_number_is(tmp_path):
+    """So that the last three damages are done to all of them."""
+    for name in sorted(MODULES):
+        fixture = write(name, tmp_path / name)
+        texts = {path for path in fixture.files if text_of(path) is not None}
+        assert texts == set(fixture.numbers), name
+
+
+def test_missing_input_is_one_line(name, tmp_path):
+    with pytest.raises(InputError) as error:
+        list(read_recordings(format_of(name), tmp_path / "nowhere"))
+    assert str(error.value).startswith(str(tmp_path / "nowhere"))
+
+
+def test_empty_folder_is_one_line(name, tmp_path):
+    with pytest.raises(InputError) as error:
+        list(read_recordings(format_of(name), tmp_path))
+    assert str(tmp_path) in str(error.value)
+    assert "\n" not in str(error.value)

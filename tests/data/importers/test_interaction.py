@@ -1,0 +1,276 @@
+"""INTERACTION: recordings with pedestrians, cases of the challenge, maps."""
+
+import numpy as np
+import pytest
+
+from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.errors import InputError
+from rcirl_jax.types import Kind
+from tests.data.importers.formats import interaction as fixture
+from tests.data.importers.formats import interaction_challenge as challenge
+
+
+def read(path, source=None):
+    return list(read_recordings("interaction", path, source))
+
+
+def only(path, source=None):
+    (recording,) = read(path, source)
+    return recording
+
+
+def edit(path, old, new, count=1):
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, count))
+
+
+@pytest.fixture
+def root(tmp_path):
+    fixture.write(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def scene(root):
+    return root / "recorded_trackfiles" / fixture.SCENE
+
+
+@pytest.fixture
+def cases(tmp_path):
+    challenge.write(tmp_path)
+    return tmp_path / "train" / f"{challenge.PLACE}_train.csv"
+
+
+def test_vehicles_and_pedestrians_are_one_recording(root):
+    recording = only(root)
+    assert recording.name == f"{fixture.SCENE}-000"
+    kinds = {track.id: track.kind for track in recording.tracks}
+    assert kinds["1"] == Kind.VEHICLE
+    assert kinds["P4"] == Kind.PEDESTRIAN
+    # the same class, but at 5 m/s
+    assert kinds["P13"] == Kind.CYCLIST
+    assert recording.group is None
+    assert recording.tracks[0].heading.dtype == np.float64
+
+
+def test_pedestrians_head_where_they_walk(root):
+    (walker,) = [track for track in only(root).tracks if track.id == "P4"]
+    assert (walker.length, walker.width) == (0.5, 0.5)
+    np.testing.assert_allclose(walker.heading, 0.0, atol=1e-3)
+    np.testing.assert_allclose(walker.speed, 1.3, atol=1e-3)
+
+
+def test_who_rides_is_decided_by_the_source(root, tmp_path):
+    source = tmp_path / "s.toml"
+    source.write_text("cyclist_speed_mps = 6.0\n")
+    kinds = {track.id: track.kind for track in only(root, source).tracks}
+    assert kinds["P13"] == Kind.PEDESTRIAN
+
+
+def test_inputs_from_the_release_down_to_a_file(root, scene):
+    whole = only(root)
+    for path in (root / "recorded_trackfiles", scene, scene / "vehicle_tracks_000.csv"):
+        recording = only(path)
+        assert (recording.name, len(recording.tracks)) == (whole.name, 5)
+        assert len(recording.lanes) == len(whole.lanes)
+
+
+def test_pedestrians_alone(scene):
+    (scene / "vehicle_tracks_000.csv").unlink()
+    assert [track.id for track in only(scene).tracks] == ["P13", "P4"]
+
+
+def test_recordings_of_several_scenes_have_names_of_their_own(root, scene):
+    other = root / "recorded_trackfiles" / "DR_DEU_Merging_MT"
+    fixture.write_scene(other, fixture.road_users())
+    names = [recording.name for recording in read(root)]
+    assert names == ["DR_DEU_Merging_MT-000", f"{fixture.SCENE}-000"]
+
+
+def test_frames_may_start_at_zero(root, scene):
+    whole = only(root)
+    for kind in ("vehicle", "pedestrian"):
+        path = scene / f"{kind}_tracks_000.csv"
+        header, *rows = path.read_text().splitlines()
+        cells = [row.split(",") for row in rows]
+        for row in cells:
+            row[1], row[2] = str(int(row[1]) - 1), str(int(row[2]) - 100)
+        path.write_text("\n".join([header, *(",".join(row) for row in cells)]) + "\n")
+    for one, other in zip(only(root).tracks, whole.tracks, strict=True):
+        np.testing.assert_allclose(one.t, other.t)
+
+
+@pytest.mark.parametrize("kept", [".osm_xy", ".osm"])
+def test_map_in_metres_and_in_degrees(root, kept):
+    both = {lane.id: lane for lane in only(root).lanes}
+    for ending in {".osm_xy", ".osm"} - {kept}:
+        (root / "maps" / f"{fixture.SCENE}{ending}").unlink()
+    lanes = only(root).lanes
+    assert len(lanes) == len(both)
+    for lane in lanes:
+        np.testing.assert_allclose(lane.centre, both[lane.id].centre, atol=0.01)
+    assert lanes[0].speed_limit == pytest.approx(50 / 3.6)
+
+
+def test_without_a_map_lanes_follow_the_paths(root):
+    for path in (root / "maps").iterdir():
+        path.unlink()
+    recording = only(root)
+    assert len(recording.lanes) >= 2
+    assert any("no map found" in note for note in recording.notes)
+    assert recording.default_speed_limit == pytest.approx(13.41)
+
+
+def test_map_of_the_source(root, tmp_path):
+    source = tmp_path / "s.toml"
+    place = root / "maps" / f"{fixture.SCENE}.osm"
+    source.write_text(f'map = "{place}"\n')
+    assert len(only(root, source).lanes) == 7
+    source.write_text(f'map = "{root / "maps"}"\n')
+    assert len(only(root, source).lanes) == 7
+    source.write_text('map = "/nowhere"\n')
+    with pytest.raises(InputError, match="/nowhere: map: missing"):
+        read(root, source)
+
+
+@pytest.mark.parametrize(
+    ("maps", "found"), [(["ZS"], True), (["ZS2"], True), (["ZS0", "ZS2"], False)]
+)
+def test_maps_with_another_number(root, scene, maps, found):
+    scene.rename(scene.with_name("DR_CHN_Merging_ZS"))
+    (root / "maps" / f"{fixture.SCENE}.osm").unlink()
+    content = (root / "maps" / f"{fixture.SCENE}.osm_xy").read_bytes()
+    (root / "maps" / f"{fixture.SCENE}.osm_xy").unlink()
+    for name in maps:
+        (root / "maps" / f"DR_CHN_Merging_{name}.osm_xy").write_bytes(content)
+    ids = {lane.id for lane in only(root).lanes}
+    assert ("30001" in ids) == found
+
+
+def test_logs_split_by_the_scripts_of_the_data_set(root, scene):
+    """SCENE/train and SCENE/val are no places: names and map are the scene's."""
+    whole = only(root)
+    (scene / "train").mkdir()
+    for path in sorted(scene.glob("*.csv")):
+        path.rename(scene / "train" / path.name)
+    recording = only(root)
+    assert recording.name == whole.name == f"{fixture.SCENE}-000"
+    assert [lane.id for lane in recording.lanes] == [lane.id for lane in whole.lanes]
+    (scene / "train").rename(scene / "val")
+    (scene / "sorted").mkdir()
+    (scene / "val").rename(scene / "sorted" / "val")
+    assert only(root).name == whole.name
+
+
+def test_the_map_of_a_neighbouring_place_is_not_taken(root):
+    """EP0 and EP1 are two places: without its own map a log has none."""
+    for ending in (".osm_xy", ".osm"):
+        path = root / "maps" / f"{fixture.SCENE}{ending}"
+        path.rename(path.with_name(f"DR_USA_Intersection_EP1{ending}"))
+    recording = only(root)
+    assert "no map found; lanes fitted to the longest paths" in recording.notes
+
+
+def test_cases_are_recordings_of_one_group(cases):
+    first, second = read(cases.parent)
+    stem = f"{challenge.PLACE}_train"
+    assert (first.name, second.name) == (f"{stem}-case1", f"{stem}-case2")
+    assert {first.group, second.group} == {stem}
+    assert [track.id for track in first.tracks] == ["1", "P4"]
+    assert first.tracks[0].t.size == 40
+    assert second.tracks[0].t[0] == 0.0
+    assert len(second.lanes) == 7
+
+
+def test_cases_in_any_order_of_rows(cases):
+    names = [recording.name for recording in read(cases)]
+    header, *rows = cases.read_text().splitlines()
+    order = np.random.default_rng(0).permutation(len(rows))
+    rows = sorted((rows[i] for i in order), key=lambda row: float(row.split(",")[3]))
+    cases.write_text("\n".join([header, *rows]) + "\n")
+    found = read(cases)
+    assert [recording.name for recording in found] == names
+    assert [track.id for track in found[0].tracks] == ["1", "P4"]
+
+
+def test_observations_and_submissions_are_left_out(cases):
+    for name in ("test_multi-agent/DR_CHN_Merging_ZS0_obs.csv", "DR_A_sub.csv"):
+        path = cases.parent.parent / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("not read")
+    assert len(read(cases.parent.parent)) == 2
+
+
+def test_columns_of_the_test_sets(cases):
+    header, *rows = cases.read_text().splitlines()
+    header += ",track_to_predict,interesting_agent"
+    cases.write_text("\n".join([header, *(row + ",0.0,1.0" for row in rows)]) + "\n")
+    assert len(read(cases)) == 2
+
+
+def test_unknown_agents_are_vehicles(scene, root):
+    path = scene / "vehicle_tracks_000.csv"
+    path.write_text(path.read_text().replace(",car,", ",tram,"))
+    recording = only(root)
+    assert recording.tracks[0].kind == Kind.VEHICLE
+    assert "agent types taken for vehicles: tram" in recording.notes
+
+
+def test_gap_splits_a_track(scene, root):
+    path = scene / "vehicle_tracks_000.csv"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(lines[:50] + lines[60:]) + "\n")
+    assert "1#2" in [track.id for track in only(root).tracks]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "found"),
+    [
+        ("psi_rad", "psi", None),
+        ("timestamp_ms", "time", "column timestamp_ms: missing"),
+        ("track_id,frame_id", "track_id,track_id", "column track_id: met twice"),
+        ("1,1,100,car,1005.000", "1,1,100,car,", "line 2: x: ''"),
+        ("1,1,100,car,1005.000", "1,1,,car,1005.000", "line 2: timestamp_ms: ''"),
+        ("1,1,100,car", ",1,100,car", "line 2: track_id: ''"),
+        ("1,1,100,car,1005.000", "1,1,100,car,west", "line 2: x: 'west'"),
+        ("1,1,100,car,1005.000", "1,1,100,car,inf", "line 2: x: 'inf'"),
+        ("1,1,100,car,1005.000", "1,1,100,car,1e300", "x: 1e+300"),
+        ("1,1,100,car,1005.000", "1,1,1e200,car,1005.000", "timestamp_ms: 1e+200"),
+        ("1,1,100,car,", "1,1,200,car,", "id 1: t: 200: met twice"),
+        ("1,1,100,car,1005.000,", "1,1,100,car,", "line 2: 10 cells: expected 11"),
+    ],
+)
+def test_malformed(scene, root, old, new, found):
+    path = scene / "vehicle_tracks_000.csv"
+    edit(path, old, new)
+    if found is None:
+        assert len(only(root).tracks) == 5
+        return
+    with pytest.raises(InputError) as error:
+        read(root)
+    message = str(error.value)
+    assert message.startswith(str(path))
+    assert found in message
+    assert "\n" not in message
+
+
+def test_bad_pedestrians_are_named(scene, root):
+    path = scene / "pedestrian_tracks_000.csv"
+    edit(path, "track_id", "id")
+    with pytest.raises(InputError, match="pedestrian_tracks_000"):
+        read(root)
+
+
+def test_case_without_a_number(cases):
+    edit(cases, "\n1.0,", "\n,")
+    with pytest.raises(InputError, match="case_id"):
+        read(cases)
+
+
+def test_bad_map_is_named(root):
+    path = root / "maps" / f"{fixture.SCENE}.osm_xy"
+    edit(path, "x='", "x='east")
+    with pytest.raises(InputError) as error:
+        read(root)
+    assert str(error.value).startswith(str(path))

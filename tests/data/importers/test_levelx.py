@@ -1,0 +1,457 @@
+"""leveLXData: highD's boxes and markings, inD's centres and maps, traps."""
+
+import time
+
+import numpy as np
+import pytest
+
+from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.importers.levelx.map import marked_lanes
+from rcirl_jax.data.scenes.collect import Collector
+from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.errors import InputError
+from rcirl_jax.types import Kind
+from tests.data.importers.formats import levelx as ind
+from tests.data.importers.formats import levelx_highd as highd
+from tests.data.importers.formats import osm
+from tests.data.importers.formats.drives import straight
+
+
+def read(path, source=None):
+    return list(read_recordings("levelx", path, source))
+
+
+def only(path, source=None):
+    (recording,) = read(path, source)
+    return recording
+
+
+def edit(path, old, new, count=1):
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, count))
+
+
+def dense(line):
+    """A point about every metre of a polyline."""
+    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    at = np.linspace(0.0, arc[-1], int(arc[-1]) + 2)
+    return np.stack([np.interp(at, arc, line[:, i]) for i in (0, 1)], axis=1)
+
+
+@pytest.fixture
+def motorway(tmp_path):
+    highd.write(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def junction(tmp_path):
+    ind.write(tmp_path)
+    return tmp_path
+
+
+# ------------------------------------------------------------------------ highD
+
+
+def test_corner_and_downward_axis(motorway):
+    recording = only(motorway)
+    car = recording.tracks[0]
+    assert (recording.name, recording.rate_hz) == ("01", 25.0)
+    # x, y of the file is the corner: 5 - 4.85 / 2, 22.98 - 2.12 / 2
+    np.testing.assert_allclose((car.x[0], car.y[0]), (5.0, -22.98), atol=0.01)
+    assert (car.length, car.width) == (4.85, 2.12)
+    assert car.t[0] == 0.0
+    assert np.diff(car.t) == pytest.approx(0.04)
+
+
+def test_carriageways_and_lane_numbers(motorway):
+    lanes = {lane.id: lane for lane in only(motorway).lanes}
+    assert sorted(lanes) == ["2", "3", "5", "6"]
+    np.testing.assert_allclose(lanes["2"].centre[:, 1], -0.5 * (8.51 + 12.59))
+    np.testing.assert_allclose(lanes["6"].left_width, 0.5 * (28.8 - 24.96))
+    # the upper carriageway is driven towards -x: its left lane is the lower one
+    assert lanes["2"].centre[0, 0] > lanes["2"].centre[-1, 0]
+    assert (lanes["2"].left, lanes["2"].right) == ("3", None)
+    assert (lanes["5"].left, lanes["5"].right) == (None, "6")
+    assert lanes["6"].left == "5"
+
+
+def test_vehicles_are_on_the_lane_of_the_file(motorway):
+    recording = only(motorway)
+    centres = {lane.id: lane.centre[0, 1] for lane in recording.lanes}
+    for name, (_, _, lane, *_) in highd.road_users().items():
+        (track,) = [t for t in recording.tracks if t.id == name]
+        nearest = min(centres, key=lambda n: abs(centres[n] - track.y[0]))
+        assert nearest == str(lane)
+
+
+def test_direction_decides_the_heading_of_who_stands(motorway):
+    lines = (motorway / "01_tracks.csv").read_text().splitlines()
+    stopped = [lines[0]]
+    for line in lines[1:]:
+        cells = line.split(",")
+        if cells[1] == "3":
+            cells[2], cells[3], cells[6], cells[7] = "200", "9.4", "0.00", "0.00"
+        stopped.append(",".join(cells))
+    (motorway / "01_tracks.csv").write_text("\n".join(stopped) + "\n")
+    (truck,) = [t for t in only(motorway).tracks if t.id == "3"]
+    np.testing.assert_allclose(truck.heading, np.pi)
+
+
+@pytest.mark.parametrize(
+    ("text", "lane", "default"),
+    [("-1.00", None, 36.11), ("33.33", 33.33, 33.33), ("", None, 36.11)],
+)
+def test_speed_limit(motorway, text, lane, default):
+    edit(motorway / "01_recordingMeta.csv", ",-1.00,", f",{text},")
+    recording = only(motorway)
+    assert recording.lanes[0].speed_limit == lane
+    assert recording.default_speed_limit == default
+
+
+def test_speed_limit_that_is_no_number(motorway):
+    edit(motorway / "01_recordingMeta.csv", ",-1.00,", ",fast,")
+    with pytest.raises(InputError, match=r"01_recordingMeta\.csv: speedLimit: 'fast'"):
+        read(motorway)
+
+
+@pytest.mark.parametrize(
+    "marks", ["8.51", "8.51;x", "12.59;8.51", "", "8.51;8.51", "nan;1"]
+)
+def test_markings(motorway, marks):
+    edit(motorway / "01_recordingMeta.csv", "8.51;12.59;16.43", marks)
+    with pytest.raises(InputError, match=r"01_recordingMeta.csv: upperLaneMarkings: '"):
+        read(motorway)
+
+
+def test_many_markings_are_read_in_full(motorway):
+    marks = ";".join(f"{8.51 + 0.7 * k:.9f}" for k in range(11))
+    edit(motorway / "01_recordingMeta.csv", "8.51;12.59;16.43", marks)
+    assert len(only(motorway).lanes) == 12
+
+
+def test_marked_lanes_longer_than_roads_are_not_made(tmp_path):
+    marks = [";".join(f"{4 * k}" for k in range(a, a + 7)) for a in (0, 7)]
+    meta = {"upperLaneMarkings": marks[0], "lowerLaneMarkings": marks[1]}
+    rows = (np.zeros(1), np.ones(1))
+    assert len(marked_lanes(tmp_path, meta, (0.0, 400.0), None, rows)) == 12
+    with pytest.raises(InputError, match=r"lanes: 1\.18812e\+07 m long in all"):
+        marked_lanes(tmp_path, meta, (0.0, 9.9e5), None, rows)
+
+
+# -------------------------------------------------------------- inD and sisters
+
+
+def test_headings_in_degrees_and_sizes_of_zero(junction):
+    tracks = {track.id: track for track in only(junction).tracks}
+    assert tracks["2"].heading[0] == pytest.approx(np.pi)
+    assert (tracks["3"].kind, tracks["3"].length) == (Kind.PEDESTRIAN, 0.5)
+    assert (tracks["4"].kind, tracks["4"].length) == (Kind.CYCLIST, 1.8)
+    assert tracks["2"].length == 11.5
+
+
+def test_sizes_of_the_source(junction, tmp_path):
+    source = tmp_path / "s.toml"
+    source.write_text("[sizes]\npedestrian = [0.6, 0.4]\n")
+    tracks = {track.id: track for track in only(junction, source).tracks}
+    assert (tracks["3"].length, tracks["3"].width) == (0.6, 0.4)
+
+
+def test_walkers_without_a_heading_get_that_of_their_path(tmp_path):
+    users = ind.road_users()
+    kind, walker, frames = users["3"]
+    turned = ind.straight(ind.T, (60.0, -40.0), np.pi / 2, 1.4, kind=walker.kind)
+    ind.write_tracks(tmp_path, "00", {"3": (kind, turned, frames)})
+    path = tmp_path / "00_tracks.csv"
+    path.write_text(path.read_text().replace(",90.00000,", ",0.00000,"))
+    ind.write_meta(tmp_path, "00")
+    (track,) = only(tmp_path).tracks
+    np.testing.assert_allclose(track.heading, np.pi / 2, atol=1e-3)
+
+
+EXID = {
+    **{"traveledDistance": "1.5", "latLaneCenterOffset": "0.1;-3.6"},
+    **{"laneWidth": "3.7;3.5", "laneletId": "1992;1996", "laneChange": 0},
+    **{"lonLaneletPos": "12.5;3.1", "laneletLength": "120.1;80.2"},
+    **{"leadDHW": "", "leadTHW": -1, "leadTTC": "nan", "leadId": -1, "rearId": 12},
+    **{"leftAlongsideId": "-1", "rightAlongsideId": "4;5", "odrRoadId": 0},
+}
+
+
+def test_exid_columns_with_lists_and_holes(tmp_path):
+    users = ind.road_users()
+    users["0"] = ("van", *users["0"][1:])
+    users["2"] = ("trailer", *users["2"][1:])
+    ind.write_tracks(tmp_path, "39", users, more=EXID)
+    ind.write_meta(tmp_path, "39", speedLimit=-1)
+    recording = only(tmp_path)
+    assert len(recording.tracks) == 6
+    assert recording.default_speed_limit == 36.11
+    assert "1 trailers are obstacles of kind cyclist, no experts" in recording.notes
+
+
+def test_a_trailer_is_an_obstacle_but_no_expert(tmp_path):
+    """It follows its tractor half a metre behind; a car follows the trailer."""
+    frames = np.arange(ind.FRAMES)
+    users = {
+        str(number): (kind, straight(ind.T, (x, -41.75), 0.0, 15.0, size=size), frames)
+        for number, (kind, x, size) in enumerate(
+            [
+                ("car", 60.0, (4.5, 1.9)),
+                ("trailer", 54.25, (6.0, 2.2)),
+                ("car", 20.0, (4.5, 1.9)),
+            ]
+        )
+    }
+    ind.write_tracks(tmp_path, "00", users)
+    ind.write_meta(tmp_path, "00")
+    recording = only(tmp_path)
+    collect = CollectConfig(require_speed_change=False)
+    scenes = list(Collector(recording, collect).scenes())
+    drivers = {recording.tracks[scene["track"]].id for scene in scenes}
+    assert drivers == {"0", "2"}
+    for scene in scenes:
+        if recording.tracks[scene["track"]].id == "2":
+            length = scene["obstacles.s_upper"] - scene["obstacles.s_lower"]
+            assert np.any(np.abs(length[:, 0] - 6.0) < 0.05)
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        "maps/lanelets/04_aseag/location4.osm",
+        "lanelets/location4.osm",
+        "data/location4.osm",
+        "maps/lanelets/4_somewhere/town.osm",
+        "maps/rounD_4.osm",
+        "maps/4_somewhere.osm",
+    ],
+)
+def test_where_maps_lie(junction, place):
+    found = junction / "maps" / "lanelets" / "04_aseag" / "location4.osm"
+    target = junction / place
+    target.parent.mkdir(parents=True, exist_ok=True)
+    found.rename(target)
+    # maps of other places and of building sites are not taken for it
+    other = target.parent / "location4_construction.osm"
+    other.write_text("not read")
+    (target.parent / "location14.osm").write_text("not read")
+    lanes = only(junction).lanes
+    assert {lane.id for lane in lanes} >= {"30001", "30003"}
+
+
+def test_map_of_the_source(junction, tmp_path):
+    found = junction / "maps" / "lanelets" / "04_aseag" / "location4.osm"
+    other = tmp_path / "elsewhere" / "any.osm"
+    other.parent.mkdir()
+    found.rename(other)
+    source = tmp_path / "s.toml"
+    source.write_text(f'map = "{other}"\n')
+    assert {lane.id for lane in only(junction, source).lanes} >= {"30001"}
+    source.write_text('map = "/nowhere/any.osm"\n')
+    with pytest.raises(InputError, match=r"/nowhere/any\.osm: map: missing"):
+        read(junction, source)
+
+
+def test_without_a_map_lanes_follow_the_paths(junction):
+    (junction / "maps" / "lanelets" / "04_aseag" / "location4.osm").unlink()
+    recording = only(junction)
+    assert any("no map found" in note for note in recording.notes)
+    assert len(recording.lanes) >= 2
+    centres = np.concatenate([dense(lane.centre) for lane in recording.lanes])
+    car = recording.tracks[0]
+    gap = np.hypot(car.x[:, None] - centres[:, 0], car.y[:, None] - centres[:, 1])
+    assert gap.min(axis=1).max() < 3.5
+
+
+def test_a_map_of_another_place_is_not_used(junction):
+    path = junction / "maps" / "lanelets" / "04_aseag" / "location4.osm"
+    osm.lanelet_map(path, osm.in_degrees(32, (0.0, 5.2e6)))
+    notes = only(junction).notes
+    assert any("location4.osm lies elsewhere" in note for note in notes)
+
+
+def test_meta_without_the_utm_origin(junction):
+    edit(junction / "data" / "07_recordingMeta.csv", "xUtmOrigin", "xOrigin")
+    with pytest.raises(
+        InputError, match=r"07_recordingMeta\.csv: xUtmOrigin: 'missing'"
+    ):
+        read(junction)
+
+
+def rows_of(path, kept):
+    """Keep the lines of a table for which `kept(line number, cells)`."""
+    lines = path.read_text().splitlines()
+    found = [x for k, x in enumerate(lines) if k == 0 or kept(k, x.split(","))]
+    path.write_text("\n".join(found) + "\n")
+
+
+@pytest.mark.parametrize(
+    ("kept", "found"),
+    [
+        (lambda k, _: k < 400, "track 1: numFrames: 99: expected 235"),
+        (lambda k, _: k < 301, "track 1: numFrames: 0: expected 235"),
+        (lambda k, _: k != 50, "track 0: numFrames: 299: expected 300"),
+        (lambda _, cells: cells[1] != "5", "track 5: numFrames: 0: expected 300"),
+    ],
+)
+def test_truncated_at_the_border_of_lines(junction, kept, found):
+    path = junction / "data" / "07_tracks.csv"
+    rows_of(path, kept)
+    with pytest.raises(InputError) as error:
+        read(junction)
+    assert str(error.value) == (
+        f"{path}: {found} as in 07_tracksMeta.csv; truncated file? "
+        "(of a sample, set partial = true in the TOML of --source)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("row", "other", "found"),
+    [
+        ("0,299,300", "1,300,300", "track 0: initialFrame: 0: expected 1"),
+        ("0,299,300", "0,300,300", "track 0: finalFrame: 299: expected 300"),
+        ("0,299,300", "0,299,299", "track 0: numFrames: 300: expected 299"),
+    ],
+)
+def test_lives_of_tracks(junction, row, other, found):
+    edit(junction / "data" / "07_tracksMeta.csv", row, other)
+    with pytest.raises(InputError, match=found):
+        read(junction)
+
+
+def test_without_a_number_of_frames_the_ends_count(junction):
+    edit(junction / "data" / "07_tracksMeta.csv", "numFrames", "lifetime")
+    assert len(only(junction).tracks) == 6
+    rows_of(junction / "data" / "07_tracks.csv", lambda k, _: k != 50)
+    with pytest.raises(InputError, match="track 0: numFrames: 299: expected 300"):
+        read(junction)
+
+
+def test_a_part_of_the_rows_on_request(junction, tmp_path):
+    """Published samples hold the first rows only, and all of the meta data."""
+    rows_of(junction / "data" / "07_tracks.csv", lambda k, _: k < 400)
+    source = tmp_path / "s.toml"
+    source.write_text("partial = true\n")
+    recording = only(junction, source)
+    assert len(recording.tracks) == 2
+    assert "4 tracks of tracksMeta have no rows" in recording.notes
+
+
+def test_gap_splits_a_track(junction):
+    rows_of(junction / "data" / "07_tracks.csv", lambda k, _: not 100 < k < 120)
+    edit(junction / "data" / "07_tracksMeta.csv", "0,299,300", "0,299,281")
+    assert [track.id for track in only(junction).tracks][:2] == ["0", "0#2"]
+
+
+# ------------------------------------------------------------------------- both
+
+
+def test_several_recordings_and_one_file(junction):
+    ind.write_tracks(junction / "data", "08", ind.road_users())
+    ind.write_meta(junction / "data", "08", recordingId=8)
+    assert [recording.name for recording in read(junction)] == ["07", "08"]
+    assert only(junction / "data" / "08_tracks.csv").name == "08"
+
+
+def test_classes(junction):
+    """A class that nobody knows is a vehicle, and a note says so."""
+    meta = junction / "data" / "07_tracksMeta.csv"
+    edit(meta, ",truck_bus", ",Truck_Bus")
+    assert not any("classes" in note for note in only(junction).notes)
+    edit(meta, ",car", ",animal")
+    edit(meta, ",car", ",tram")
+    recording = only(junction)
+    kinds = [track.kind for track in recording.tracks[:2]]
+    assert kinds == [Kind.PEDESTRIAN, Kind.VEHICLE]
+    assert "classes taken for vehicles: tram" in recording.notes
+
+
+@pytest.mark.parametrize("kind", ["tracksMeta", "recordingMeta"])
+def test_missing_companion(motorway, kind):
+    (motorway / f"01_{kind}.csv").unlink()
+    with pytest.raises(InputError) as error:
+        read(motorway)
+    assert str(error.value).startswith(f"{motorway}/01_{kind}.csv: input: missing")
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "found"),
+    [
+        ("tracks", "xVelocity", "vx", "column xVelocity: missing"),
+        ("tracks", "frame,id", "frame,frame", "column frame: met twice"),
+        ("tracks", "\n1,1,", "\n1,77,", "track 77: no row in 01_tracksMeta.csv"),
+        ("tracks", "\n1,1,", "\n1,1.5,", "track number: 1.5"),
+        ("tracks", "\n1,1,", "\nx,1,", "line 2: frame: 'x'"),
+        ("tracks", "\n1,1,", "\n1e300,1,", "frame: 1e+300"),
+        ("tracks", "\n1,1,", "\n2,1,", "id 1: t: 2: met twice"),
+        ("tracks", "\n1,1,2.58", "\n1,1,nan", "line 2: x: 'nan'"),
+        ("tracks", "\n1,1,2.58", "\n1,1,1e300", "x: 1e+300"),
+        ("tracks", "\n1,1,2.58", "\n1,1", "line 2: 24 cells: expected 25"),
+        ("tracksMeta", "class", "type", "column class: missing"),
+        ("tracksMeta", "\n1,4.85", "\none,4.85", "line 2: id: 'one'"),
+        ("recordingMeta", "frameRate", "rate", "frameRate: 'missing'"),
+        ("recordingMeta", "1,25,", "1,0,", "frameRate: 0"),
+        ("recordingMeta", "1,25,", "1,nan,", "frameRate: 'nan'"),
+        ("recordingMeta", "1,25,2", "1,25", "expected one of 15"),
+    ],
+)
+def test_malformed(motorway, file, old, new, found):
+    path = motorway / f"01_{file}.csv"
+    edit(path, old, new)
+    with pytest.raises(InputError) as error:
+        read(motorway)
+    message = str(error.value)
+    assert found in message
+    assert "01_" in message
+    assert "\n" not in message
+
+
+def test_absurd_sizes_and_speeds(motorway):
+    path = motorway / "01_tracks.csv"
+    path.write_text(path.read_text().replace(",4.85,", ",485.00,"))
+    with pytest.raises(InputError, match="length: 485 m"):
+        read(motorway)
+
+
+def test_kmh_are_named(motorway):
+    path = motorway / "01_tracks.csv"
+    lines = path.read_text().splitlines()
+    rows = [line.split(",") for line in lines[1:]]
+    for row in rows:
+        row[6] = f"{3.6 * float(row[6]) if abs(float(row[6])) < 25 else 0:.2f}"
+    path.write_text("\n".join([lines[0], *(",".join(row) for row in rows)]) + "\n")
+    with pytest.raises(InputError, match="speed"):
+        read(motorway)
+
+
+def test_other_header_names_both_layouts(motorway):
+    edit(motorway / "01_tracks.csv", "frame,id", "Vehicle_ID,Frame_ID")
+    with pytest.raises(InputError, match="column frame: missing"):
+        read(motorway)
+
+
+def test_name_of_the_file(motorway):
+    path = motorway / "01_tracks.csv"
+    path.rename(motorway / "log.csv")
+    with pytest.raises(InputError, match=r"expected XX_tracks\.csv"):
+        read(motorway / "log.csv")
+
+
+def test_speed_of_parsing(tmp_path):
+    """A recording's rows are read by numpy: over 100,000 states a second."""
+    users = {
+        str(k): (
+            "car",
+            ind.straight(ind.T, (5.0 * k, -41.75), 0.0, 10.0),
+            np.arange(300),
+        )
+        for k in range(150)
+    }
+    ind.write_tracks(tmp_path, "00", users)
+    ind.write_meta(tmp_path, "00")
+    begin = time.process_time()
+    recording = only(tmp_path)
+    seconds = time.process_time() - begin
+    assert sum(track.t.size for track in recording.tracks) / seconds > 5e4

@@ -1,0 +1,124 @@
+"""A few refused recordings of many: ended with one line, or left out and counted."""
+
+import dataclasses
+
+import pytest
+
+from experiments.common import git_commit
+from rcirl_jax.data.importers import parts
+from rcirl_jax.data.importing import ImportConfig, import_parts
+from rcirl_jax.data.parts import Part, recordings_of
+from rcirl_jax.data.recording import LEAVE_OUT
+from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.data.scenes.quality import format_quality
+from rcirl_jax.data.store.dataset import open_dataset
+from rcirl_jax.errors import InputError
+from tests.data.importers.formats import waymo
+from tests.data.small_logs import CONFIG, write_logs
+from tests.helpers import commands
+
+STRICT = ImportConfig(
+    format="waymo",
+    collect=CollectConfig(require_speed_change=False, require_obstacles=False),
+)
+LENIENT = dataclasses.replace(STRICT, leave_out=1)
+
+
+def shard(folder, *scenarios):
+    """One file; the recording car, the only one seen for long, counts as human."""
+    folder.mkdir(parents=True)
+    (folder / "a.tfrecord").write_bytes(waymo.tfrecord(scenarios))
+    found, spec = parts("waymo", folder)
+    spec = {**spec, "recording_car": "human"}
+    return [Part(format="waymo", input=path, spec=spec) for path in found]
+
+
+def good(name):
+    return waymo.scenario(f5=[f"scenario-{name}"])
+
+
+# times that go backwards
+BAD = waymo.scenario(f1=[float(x) for x in waymo.STAMPS[::-1]], f5=["scenario-bad"])
+
+
+def test_one_scenario_of_a_file_is_left_out(tmp_path):
+    mixed = shard(tmp_path / "mixed", good("a"), BAD, good("b"))
+    lenient = dataclasses.replace(mixed[0], spec={**mixed[0].spec, LEAVE_OUT: True})
+    assert [bool(x.refused) for x in recordings_of(lenient)] == [False, True, False]
+    made = import_parts(mixed, tmp_path / "data", LENIENT)
+    plain = import_parts(
+        shard(tmp_path / "plain", good("a"), good("b")), tmp_path / "other", STRICT
+    )
+    assert made.count == plain.count > 0
+    assert made.quality["refused"] == 1
+    assert "refused" not in plain.quality
+    assert any("left out: " in note and "record 1" in note
+               for note in made.quality["notes"])  # fmt: skip
+    assert "1 recordings refused and left out" in format_quality(made.quality)
+    assert made.sources == plain.sources
+    assert made.rate_hz == plain.rate_hz
+    assert made.import_flags["leave_out"] == 1
+    assert "leave_out" not in plain.import_flags
+
+
+def test_one_too_many_ends_the_import(tmp_path):
+    other = waymo.scenario(f1=[0.0] * waymo.NUM_STEPS, f5=["scenario-worse"])
+    logs = shard(tmp_path / "logs", good("a"), BAD, good("b"), other)
+    with pytest.raises(
+        InputError, match=r"record 3: .*; recordings left out before: 1"
+    ):
+        import_parts(logs, tmp_path / "data", LENIENT)
+    assert not (tmp_path / "data").exists()
+
+
+def test_without_it_the_first_one_ends_the_import(tmp_path):
+    (strict,) = shard(tmp_path / "logs", good("a"), BAD)
+    with pytest.raises(InputError, match="record 1: "):
+        import_parts([strict], tmp_path / "data", STRICT)
+    assert not (tmp_path / "data").exists()
+
+
+def test_a_file_that_breaks_off_gives_what_it_has(tmp_path):
+    """The rest of it is one refused recording; other files are read."""
+    logs = write_logs(tmp_path / "logs", files=3)
+    text = logs[1].input.read_text().splitlines()
+    logs[1].input.write_text("\n".join([*text[:40], "1.0,x,not a number,0"]))
+    config = dataclasses.replace(CONFIG, leave_out=2)
+    made = import_parts(logs, tmp_path / "data", config)
+    rest = import_parts([logs[0], logs[2]], tmp_path / "other", CONFIG)
+    assert made.count == rest.count > 0
+    assert made.quality["refused"] == 1
+    assert "logs/log01.csv, the rest" in made.recordings
+
+
+def test_it_may_be_asked_for_where_nothing_is_refused(tmp_path):
+    file = tmp_path / "one.toml"
+    file.write_text(
+        '[[recordings]]\nroad = "highway_straight"\ncount = 1\nduration_s = 40.0\n'
+        "density_veh_per_km = 9.0\nseed = 1\n"
+    )
+    found, spec = parts("synthetic", file)
+    logs = [Part(format="synthetic", input=path, spec=spec) for path in found]
+    config = dataclasses.replace(LENIENT, format="synthetic")
+    assert import_parts(logs, tmp_path / "data", config).quality.get("refused", 0) == 0
+
+
+def test_the_command(tmp_path):
+    write_logs(tmp_path / "logs", files=3)
+    (tmp_path / "logs" / "log01.csv").write_text("t,id,x,y\nnothing\n")
+    flags = (f"--input={tmp_path / 'logs'}", f"--output={tmp_path / 'data'}")
+    flags = ("--format=csv", "--stride=1", *flags)
+    ends = commands.command("experiments.import_logs", *flags)
+    assert ends.returncode == 2
+    assert ends.stderr.strip().splitlines()[-1].startswith("error: ")
+    assert not (tmp_path / "data").exists()
+    flags = (*flags, "--leave_out=1", "--signals=pooled")  # which reads the logs too
+    done = commands.command("experiments.import_logs", *flags)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert "1 recordings refused and left out" in done.stdout
+    dataset = open_dataset(tmp_path / "data")
+    facts = dataset.facts()
+    assert facts["data_hash"] == dataset.hash
+    assert facts["made_by"]["flags"]["leave_out"] == 1
+    assert facts["made_by"]["git_commit"] == git_commit()
+    assert [floor["candidates"] > 100 for floor in facts["oracle_floor"]] == [True] * 2

@@ -1,0 +1,213 @@
+"""Scenes end where someone whom the human reacts to leaves the record."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.recording import validate_recording
+from rcirl_jax.data.scenes.assemble import assemble
+from rcirl_jax.data.scenes.collect import Collector
+from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.data.scenes.quality import QualityReport, format_quality
+from rcirl_jax.errors import InputError
+from rcirl_jax.types import Decision
+from rcirl_jax.units import TIMES_S
+from tests.data.importers import writers as w
+from tests.data.scenes.test_collection import (
+    NO_FILTER,
+    WIDTH,
+    car,
+    first_scene,
+    recording,
+    smooth_step,
+)
+
+CASE = Path(__file__).parents[4] / "shared/cases/17_leader_leaves"
+START_S = 0.5  # s, the first planning frame of a track that begins at 0
+
+
+def steady(start, v=12.0):
+    return lambda t: start + v * t
+
+
+def mask_until(end_s):
+    """The mask of a scene whose surroundings end at `end_s` of the recording."""
+    return end_s - START_S + 1e-6 >= TIMES_S
+
+
+def test_the_mask_ends_with_the_leader():
+    made = recording(car("ego", steady(0.0)), car("lead", steady(30.0), seconds=5.0))
+    row = first_scene(made)
+    # 0 to 4.235 s; 4.706 s is after the leader's last sample at 4.5 s
+    assert row["time_valid"].tolist() == [True] * 10 + [False] * 8
+    assert row["future_s"] == 8.0
+    np.testing.assert_allclose(row["human.s"], 12.0 * TIMES_S, atol=0.01)
+    block = assemble([row], vehicles=[0], groups=[0], recording=0)
+    for leaf in vars(block.human).values():
+        assert np.isfinite(leaf).all()
+    assert block.s_at_5s[0] == pytest.approx(60.0, abs=0.01)
+    lead = int(np.flatnonzero(row["obstacles.kind"])[0])
+    assert row["decisions"][lead] == Decision.FOLLOW
+    assert not row["obstacles.valid"][lead, ~row["time_valid"]].any()
+
+
+UNCHANGED = {
+    "a leader of the leader": [car("lead", steady(20.0)), ("gone", steady(40.0), 0.0)],
+    "behind": [car("lead", steady(20.0)), ("gone", steady(-15.0), 0.0)],
+    "beside, as fast": [car("lead", steady(20.0)), ("gone", steady(10.0), WIDTH)],
+    "overtaken before": [("gone", steady(16.0, v=4.0), WIDTH)],
+    "two lanes away": [
+        car("mid", steady(20.0), y=WIDTH),
+        ("gone", steady(20.0, v=6.0), -2 * WIDTH),
+    ],
+    "with the human": [car("lead", steady(20.0))],
+}
+
+
+@pytest.mark.parametrize("name", UNCHANGED)
+def test_others_end_nothing(name):
+    found = [
+        car(one[0], one[1], y=one[2], seconds=5.0) if isinstance(one, tuple) else one
+        for one in UNCHANGED[name]
+    ]
+    ego = car("ego", steady(0.0), y=-WIDTH if name == "two lanes away" else 0.0)
+    row = first_scene(recording(ego, *found))
+    assert row["time_valid"].all()
+
+
+def test_a_leader_that_changes_lane_ends_nothing_when_it_leaves():
+    def moves(t):
+        return WIDTH * smooth_step(t, 1.0, 3.0)
+
+    made = recording(
+        car("ego", steady(0.0)), car("lead", steady(25.0), y=moves, seconds=6.0)
+    )
+    assert first_scene(made)["time_valid"].all()
+    # the same that stays in the lane, or leaves it after the record's end
+    stays = recording(car("ego", steady(0.0)), car("lead", steady(25.0), seconds=6.0))
+    assert first_scene(stays)["time_valid"].tolist() == mask_until(6.0).tolist()
+
+
+def test_a_slower_one_beside_that_would_be_passed_ends_the_scene():
+    """12 m/s past 4 m/s: 40 m are made good at 5 s, its track ends at 4 s."""
+    slow = car("slow", steady(40.0, v=4.0), y=WIDTH, seconds=4.0)
+    row = first_scene(recording(car("ego", steady(0.0)), slow))
+    assert row["time_valid"].tolist() == mask_until(4.0).tolist()
+    far = car("slow", steady(150.0, v=4.0), y=WIDTH, seconds=4.0)
+    assert first_scene(recording(car("ego", steady(0.0)), far))["time_valid"].all()
+
+
+def test_a_track_that_another_goes_on_for_ends_nothing():
+    """Perception gives the leader a new number: nothing is missing."""
+    first = car("lead#1", steady(30.0), seconds=5.0)
+    whole = car("lead#2", steady(30.0))
+    later = whole.t > 5.05
+    series = ("t", "x", "y", "heading", "speed")
+    second = dataclasses.replace(whole, **{k: getattr(whole, k)[later] for k in series})
+    row = first_scene(recording(car("ego", steady(0.0)), first, second))
+    assert row["time_valid"].all()
+
+
+@pytest.mark.parametrize(("seconds", "kept"), [(3.4, False), (3.6, True)])
+def test_scenes_that_end_too_early_are_dropped_and_counted(seconds, kept):
+    made = recording(
+        car("ego", steady(0.0), seconds=6.0),
+        car("lead", steady(30.0), seconds=seconds),
+    )
+    config = dataclasses.replace(NO_FILTER, stride_s=10.0)
+    collector = Collector(made, config)
+    assert len(list(collector.scenes())) == kept
+    assert collector.dropped["surroundings_end"] == (not kept)
+    short = dataclasses.replace(config, min_surroundings_s=2.5)
+    assert len(list(Collector(made, short).scenes())) == 1
+
+
+def test_filters_judge_what_is_left():
+    """The human brakes after the leader is gone: within the mask it keeps its speed."""
+
+    def brakes_late(t):
+        return 12.0 * t - np.where(t > 6.0, 0.75 * (t - 6.0) ** 2, 0.0)
+
+    alone = car("far", steady(60.0), y=2 * WIDTH)
+    ego, lead = car("ego", brakes_late), car("lead", steady(30.0), seconds=4.5)
+    config = CollectConfig(stride_s=100.0)
+    assert first_scene(recording(ego, alone), config=config)["time_valid"].all()
+    dropped = first_scene(recording(ego, lead), config=config)
+    assert dropped == {"no_speed_change": 1, "future_too_short": 1}
+
+
+def test_what_is_cut_is_counted():
+    made = recording(car("ego", steady(0.0)), car("lead", steady(30.0), seconds=5.0))
+    collector = Collector(made, dataclasses.replace(NO_FILTER, stride_s=100.0))
+    rows = list(collector.scenes())
+    assert len(rows) == 1
+    report = QualityReport()
+    report.add_recording(collector)
+    told = report.as_dict()
+    assert told["shortened"] == 1
+    assert told["shortened_share"] == pytest.approx(8 / 18)
+    assert "end with surroundings" in format_quality(told)
+    assert "1 (44.4% of times)" in format_quality(told)
+    again = QualityReport()
+    again.merge(report.state())
+    again.merge(report.state())
+    assert again.as_dict()["shortened"] == 2
+    assert again.as_dict()["shortened_share"] == pytest.approx(8 / 18)
+
+
+def test_a_leader_that_the_file_names_and_does_not_hold():
+    ego = car("ego", steady(0.0), leader_missing=((4.5, np.inf),))
+    row = first_scene(recording(ego, car("far", steady(90.0), y=2 * WIDTH)))
+    # its last time is one sample earlier: 4.4 s of the recording
+    assert row["time_valid"].tolist() == mask_until(4.4).tolist()
+    gone = dataclasses.replace(ego, leader_missing=((0.0, 0.6),))
+    dropped = Collector(recording(gone), NO_FILTER)
+    frames = [row["frame"] for row in dropped.scenes()]
+    assert frames[0] == 10
+    assert dropped.dropped["follows_missing_car"] == 1
+    bad = recording(dataclasses.replace(ego, leader_missing=((3.0, 2.0),)))
+    with pytest.raises(InputError, match=r"leader_missing: 3\.0 to 2\.0 s: expected"):
+        validate_recording(bad)
+
+
+def ngsim_pair(folder, *, leads=45, named=70):
+    """A follower of 70 rows that names its leader, which has fewer."""
+    rows = w.ngsim_rows(vehicle=1, first=100, count=leads, start_ft=120.0)
+    for k, row in enumerate(w.ngsim_rows(vehicle=2, first=100, count=70)):
+        row[w.NGSIM_COLUMNS.index("Preceding")] = 1 if k < named else 0
+        rows.append(row)
+    return w.ngsim_text(folder / "trajectories.txt", rows)
+
+
+def test_ngsim_names_its_leaders(tmp_path):
+    (made,) = read_recordings("ngsim", ngsim_pair(tmp_path))
+    spans = {track.id: track.leader_missing for track in made.tracks}
+    assert spans == {"1": (), "2": ((4.5, np.inf),)}
+    (made,) = read_recordings("ngsim", ngsim_pair(tmp_path, named=60))
+    assert made.tracks[1].leader_missing == ((4.5, 6.0),)
+    (made,) = read_recordings("ngsim", ngsim_pair(tmp_path, leads=70))
+    assert made.tracks[1].leader_missing == ()
+
+
+def ends_with_the_leader(folder):
+    """Each scene's mask ends with the leader's last sample, 4.4 s after the start."""
+    (made,) = read_recordings("ngsim", folder)
+    rows = list(Collector(made, NO_FILTER).scenes())
+    assert rows
+    for row in rows:
+        left = 4.4 - 0.1 * row["frame"]
+        assert row["time_valid"].tolist() == (left + 1e-6 >= TIMES_S).tolist()
+        assert row["future_s"] > left + 1.0
+
+
+def test_ngsim_pair_ends_with_its_leader(tmp_path):
+    ends_with_the_leader(ngsim_pair(tmp_path))
+
+
+def test_the_shared_case_ends_with_its_leader():
+    if not CASE.is_dir():
+        pytest.skip(f"{CASE} is not here")
+    ends_with_the_leader(CASE)

@@ -1,0 +1,107 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rcirl_jax.data.store import joined
+from rcirl_jax.errors import InputError
+from rcirl_jax.sampling import SamplerConfig
+from rcirl_jax.train.featurise import featurised
+from rcirl_jax.train.loop import to_device_batch
+from rcirl_jax.train.state import TrainConfig
+from rcirl_jax.train.step import gradient_sums, init_params
+from rcirl_jax.types import Normaliser
+from tests.helpers.scenes import batch, demonstration
+
+
+class Part:
+    def __init__(self, seeds, test):
+        self.rows = jax.tree.map(np.asarray, batch([demonstration(s) for s in seeds]))
+        self.count, self.hash, self.test = len(seeds), f"part {seeds}", set(test)
+
+    def indices(self, split):
+        everyone = range(self.count)
+        keep = {"test": self.test, None: set(everyone)}.get(
+            split, set(everyone) - self.test
+        )
+        return np.array([i for i in everyone if i in keep], np.int64)
+
+    def read(self, indices):
+        return jax.tree.map(lambda x: x[indices], self.rows)
+
+
+def test_rows_of_parts_follow_each_other_in_the_order_asked_for():
+    parts = [Part([0, 1, 2], [1]), Part([3, 4], [0])]
+    both = joined.JoinedDatasets(parts)
+    assert both.count == 5
+    np.testing.assert_array_equal(both.indices("train"), [0, 2, 4])
+    np.testing.assert_array_equal(both.indices("test"), [1, 3])
+    order = np.array([4, 0, 3, 2])
+    found = both.read(order)
+    whole = np.concatenate([part.rows.scene.ego.v for part in parts])
+    np.testing.assert_array_equal(found.scene.ego.v, whole[order])
+    np.testing.assert_array_equal(both.load("test").scene.ego.v, whole[[1, 3]])
+
+
+def test_identity_depends_on_parts_and_order():
+    one, two = Part([0], []), Part([1], [])
+    hashes = {joined.JoinedDatasets(p).hash for p in ([one, two], [two, one], [one])}
+    assert len(hashes) == 3
+
+
+def test_a_dataset_named_twice_is_refused():
+    with pytest.raises(InputError, match="distinct"):
+        joined.open_datasets(["a", "a"])
+
+
+def test_sources_count_by_their_shares_whatever_their_size():
+    """Two training scenes and one: shares 1 and 1 give 3/4, 3/4 and 3/2."""
+    parts = [Part([0, 1, 2], [1]), Part([3, 4], [0])]
+    equal = joined.JoinedDatasets(parts, (1.0, 1.0))
+    np.testing.assert_allclose(equal.weights(np.array([0, 2, 4])), [0.75, 0.75, 1.5])
+    threefold = joined.JoinedDatasets(parts, (1.0, 3.0))
+    np.testing.assert_allclose(
+        threefold.weights(np.array([4, 0])), [2.25, 0.375], rtol=1e-6
+    )
+    train = threefold.indices("train")
+    assert threefold.weights(train).mean() == pytest.approx(1.0)
+    plain = joined.JoinedDatasets(parts)
+    np.testing.assert_array_equal(plain.weights(train), 1.0)
+    assert len({x.hash for x in (plain, equal, threefold)}) == 3
+
+
+def test_shares_from_a_flag():
+    assert joined.shares_of("scenes", 3) is None
+    assert joined.shares_of("equal", 3) == (1.0, 1.0, 1.0)
+    assert joined.shares_of("1,0.5,2", 3) == (1.0, 0.5, 2.0)
+    assert joined.shares_of("equal", 1) is None
+    for bad in ("1,2", "1,2,0", "1,2,x", "1,2,nan", "1,2,inf", "half"):
+        with pytest.raises(InputError, match="--data_weights"):
+            joined.shares_of(bad, 3)
+
+
+def test_a_scene_of_weight_two_counts_as_often_as_two():
+    """The step's sums are those of the weights: checked against single scenes."""
+    config = TrainConfig(sampler=SamplerConfig(num_random=4, edge_times=(4.0,)))
+    rows = Part([0, 1], []).rows
+    index = np.arange(2, dtype=np.int32)
+    norm = Normaliser(
+        lower=jnp.full(21, -1e3),
+        upper=jnp.full(21, 1e3),
+        location=jnp.zeros(21),
+        scale=jnp.full(21, 10.0),
+    )
+    params = init_params(jax.random.key(0), 21, config)
+
+    def sums(weight):
+        made = featurised(
+            jax.random.key(0),
+            to_device_batch(rows, np.asarray(weight, np.float32), index),
+            config,
+        )
+        return gradient_sums(params, norm, made, config)[1]
+
+    first, second, both = sums([1, 0]), sums([0, 1]), sums([2, 0.5])
+    for name in ("loss", "terms", "pairs"):
+        one, two, found = (float(getattr(x, name)) for x in (first, second, both))
+        assert found == pytest.approx(2 * one + 0.5 * two, rel=1e-4), name

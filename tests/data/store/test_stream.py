@@ -1,0 +1,190 @@
+"""Streaming: the same batches as from memory, each block once, a bounded thread."""
+
+import threading
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rcirl_jax.data.store import order as pipeline
+from rcirl_jax.data.store.dataset import open_dataset
+from rcirl_jax.data.store.joined import JoinedDatasets
+from rcirl_jax.data.store.order import BatchIterator, epoch_order, split_batches
+from rcirl_jax.data.store.shards import BLOCK_ROWS
+from rcirl_jax.data.store.stream import Prefetch, RowStream
+from tests.data.store.test_dataset import write
+from tests.data.store.test_order import equal, take
+
+SIZES = (300, 40, 7, 25, 60, 18)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("stream") / "d"
+    write(folder, SIZES)
+    return open_dataset(folder)
+
+
+class Recorded:
+    """A dataset that remembers which rows were read."""
+
+    def __init__(self, dataset):
+        self._dataset, self.rows = dataset, []
+
+    def __getattr__(self, name):
+        return getattr(self._dataset, name)
+
+    def read(self, indices):
+        self.rows += indices.tolist()
+        return self._dataset.read(indices)
+
+
+@pytest.fixture
+def narrow(monkeypatch):
+    """A window of three blocks, so that small data slide through it."""
+    monkeypatch.setattr(pipeline, "WINDOW_BLOCKS", 3)
+
+
+def test_blocks_are_those_unpacked_together(dataset):
+    blocks = dataset.blocks(np.arange(sum(SIZES)))
+    sizes = [BLOCK_ROWS, 300 - BLOCK_ROWS, *SIZES[1:]]
+    assert np.bincount(blocks).tolist() == sizes
+    assert np.all(np.diff(blocks) >= 0)
+    joined = JoinedDatasets([dataset, dataset])
+    some = np.array([sum(SIZES), 0, sum(SIZES) - 1, 2 * sum(SIZES) - 1])
+    assert joined.blocks(some).tolist() == [7, 0, 6, 13]
+
+
+@given(
+    count=st.integers(1, 400),
+    per_block=st.integers(1, 20),
+    window=st.integers(1, 30),
+    epoch=st.integers(0, 5),
+)
+def test_order_visits_all_rows_and_few_blocks_at_a_time(
+    count, per_block, window, epoch
+):
+    blocks = np.arange(count) // per_block
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pipeline, "WINDOW_BLOCKS", window)
+        order = epoch_order(3, epoch, blocks)
+    assert sorted(order.tolist()) == list(range(count))
+    first = np.unique(blocks[order], return_index=True)[1]
+    last = count - 1 - np.unique(blocks[order][::-1], return_index=True)[1]
+    live = np.zeros(count + 1, int)
+    np.add.at(live, first, 1)
+    np.add.at(live, last + 1, -1)
+    assert np.cumsum(live).max() <= window + 1
+
+
+def test_the_window_mixes_as_far_as_it_says():
+    """Middle of a long epoch: a batch comes from the whole window, evenly."""
+    blocks = np.arange(400 * 256) // 256
+    order = epoch_order(0, 0, blocks)
+    middle = blocks[order][50_000:50_256]
+    assert np.unique(middle).size > 0.6 * pipeline.WINDOW_BLOCKS  # 1 - 1/e expected
+    # neighbours in the data are not neighbours in the order
+    assert np.mean(np.abs(np.diff(order)) < 256) < 0.02
+    assert not np.array_equal(order, epoch_order(0, 1, blocks))
+    assert not np.array_equal(order, epoch_order(1, 0, blocks))
+
+
+@pytest.mark.parametrize("processes", [1, 2, 4])
+def test_streamed_batches_are_those_of_memory(dataset, narrow, processes):
+    settings = {"batch_size": 16, "seed": 5}
+    memory = split_batches(dataset, "train", in_memory_mb=100.0, **settings)
+    parts = [
+        split_batches(
+            dataset, "train", in_memory_mb=0.0, **settings, shard_index=i,
+            num_shards=processes,
+        )
+        for i in range(processes)
+    ]  # fmt: skip
+    for _ in range(2 * memory.batches_per_epoch + 3):
+        batch, weight, index = next(memory)
+        joined = jax.tree.map(lambda *x: np.concatenate(x), *map(next, parts))
+        assert equal(joined, (batch, weight, index))
+        assert equal(batch, dataset.read(index))
+    assert all(part.state() == memory.state() for part in parts)
+
+
+@given(cut=st.integers(0, 60))
+def test_streams_restart_anywhere_to_the_bit(dataset, cut):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pipeline, "WINDOW_BLOCKS", 3)
+        batches = BatchIterator(dataset, batch_size=16, seed=4)
+        take(batches, cut)
+        resumed = BatchIterator(dataset, batch_size=16, seed=4)
+        resumed.restore(batches.state())
+        assert equal(take(resumed, 5), take(batches, 5))
+
+
+def test_the_next_epoch_is_planned_while_this_one_is_used(dataset, monkeypatch):
+    planned = []
+
+    def watched(seed, epoch, blocks):
+        planned.append((epoch, threading.current_thread() is threading.main_thread()))
+        return epoch_order(seed, epoch, blocks)
+
+    monkeypatch.setattr(pipeline, "epoch_order", watched)
+    batches = BatchIterator(dataset, batch_size=16, seed=4)
+    take(batches, 2 * batches.batches_per_epoch + 1)
+    assert planned == [(0, True), (1, False), (2, False)]
+
+
+def test_a_process_reads_its_own_rows_once_an_epoch(dataset, narrow):
+    read = []
+    for part in range(2):
+        watched = Recorded(dataset)
+        batches = BatchIterator(
+            watched, batch_size=16, seed=0, shard_index=part, num_shards=2
+        )
+        given = take(batches, batches.batches_per_epoch)
+        due = np.concatenate([index for _, _, index in given])
+        assert sorted(watched.rows) == sorted(due.tolist())
+        read += due[np.concatenate([weight for _, weight, _ in given]) > 0].tolist()
+    assert sorted(read) == list(range(sum(SIZES)))
+
+
+def test_memory_is_bounded_by_the_window(dataset, narrow):
+    """Not the 450 rows: at most three blocks and the one coming in."""
+    index = np.arange(sum(SIZES))
+    whole = RowStream(dataset, index, dataset.blocks(index), 1)
+    assert whole.capacity == BLOCK_ROWS
+    small = np.arange(300, sum(SIZES))
+    blocks = np.sort(dataset.blocks(small))
+    order = epoch_order(0, 0, blocks)
+    assert RowStream(dataset, small[order], blocks[order], 1).capacity < small.size
+
+
+def test_prefetch_is_bounded_and_ends_in_order():
+    made, full = [], threading.Event()
+
+    def produce():
+        if len(made) == 7:
+            raise StopIteration
+        made.append(len(made))
+        if len(made) == 4:
+            full.set()
+        return made[-1]
+
+    with Prefetch(produce, 3) as ahead:
+        assert full.wait(10.0)
+        assert made == [0, 1, 2, 3]  # three wait, the fourth is in hand
+        assert list(ahead) == list(range(7))
+        with pytest.raises(StopIteration):
+            next(ahead)
+
+
+def test_prefetch_hands_on_errors_and_stops_while_full():
+    def produce():
+        raise OSError("disk gone")
+
+    with Prefetch(produce, 2) as ahead, pytest.raises(OSError, match="disk gone"):
+        next(ahead)
+    before = threading.active_count()
+    with Prefetch(lambda: 1, 1) as ahead:
+        assert next(ahead) == 1
+    assert threading.active_count() == before

@@ -1,0 +1,282 @@
+"""Faults, accepted cases, nulls and human-likeness in the gate."""
+
+import dataclasses
+import math
+import statistics
+
+import numpy as np
+import pytest
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.exact import clopper_pearson
+from rcirl_jax.evaluation.gate.decision import judge
+from rcirl_jax.evaluation.gate.exact import (
+    ALPHA,
+    NUISANCE_ALPHA,
+    NUISANCE_STEPS,
+    no_more_faults,
+    scores,
+)
+from rcirl_jax.evaluation.gate.output import format_verdict
+from rcirl_jax.evaluation.gate.types import NULLS, GateConfig, Likeness
+from tests.evaluation.gate.test_gate import (
+    CASES,
+    broken,
+    check_of,
+    decide,
+    drives,
+    failed,
+    likeness,
+    pair,
+    smoother,
+)
+
+OFFENCES = [
+    ("at_fault", "collision"),
+    ("at_fault_vru", "vulnerable"),
+    ("red_lights", "red_light"),
+    ("stop_signs", "stop_sign"),
+]
+
+
+def spread(count, start=0):
+    """Cases far apart, so that no family has many of them."""
+    return start + 97 * np.arange(count)
+
+
+# ------------------------------------------------------------------- the exact test
+
+
+@pytest.mark.parametrize(
+    ("gained", "lost", "n", "margin"),
+    [(2, 1, 40, 0.1), (0, 0, 40, 0.1), (5, 5, 60, 0.2), (3, 0, 30, 0.05)],
+)
+def test_the_tail_is_the_sum_over_all_outcomes(gained, lost, n, margin):
+    """Every outcome of the trinomial listed, at the same nuisance values."""
+    seen = scores(np.array(gained), np.array(lost), n, margin)
+    low, high = clopper_pearson(gained, n, 1.0 - NUISANCE_ALPHA)
+    worst = 0.0
+    for q in np.linspace(low, min(high, 1.0 - margin), NUISANCE_STEPS):
+        if 2 * q + margin > 1.0:
+            continue
+        p, total = q + margin, 0.0
+        for g in range(n + 1):
+            for c in range(n + 1 - g):
+                if scores(np.array(g), np.array(c), n, margin) >= seen - 1e-9:
+                    ways = math.comb(n, g) * math.comb(n - g, c)
+                    total += ways * q**g * p**c * (1 - q - p) ** (n - g - c)
+        worst = max(worst, total)
+    found = no_more_faults(gained, lost, n, margin) - NUISANCE_ALPHA
+    assert found == pytest.approx(worst, rel=1e-6)
+
+
+@pytest.mark.parametrize("q", [0.0, 0.0005, 0.002, 0.01])
+def test_a_driver_as_bad_as_the_margin_hardly_ever_passes(q):
+    """Size: at a loss of exactly the margin 2.5 % pass at most, whatever q is."""
+    margin, n, rng = 0.0025, 4140, np.random.default_rng(1)
+    draws = rng.multinomial(n, [q, q + margin, 1 - 2 * q - margin], size=2000)
+    known = {}
+    for gained, lost, _ in draws.tolist():
+        key = gained, lost
+        if key not in known:
+            known[key] = no_more_faults(gained, lost, n, margin) <= ALPHA
+    passed = sum(known[g, c] for g, c, _ in draws.tolist())
+    # P(more than 72 of 2,000 at 2.5 %) = 0.1 %
+    assert passed <= 72
+
+
+def test_how_many_cases_without_any_fault_it_takes():
+    """At least those of (1 - m)^n <= 2.5 %, at most those of Tango's interval."""
+    least = math.ceil(math.log(0.025) / math.log(1 - 0.0025))
+    most = math.ceil(
+        statistics.NormalDist().inv_cdf(0.975) ** 2 * (1 - 0.0025) / 0.0025
+    )
+    assert (least, most) == (1474, 1533)
+    assert no_more_faults(0, 0, least - 1, 0.0025) > ALPHA
+    assert no_more_faults(0, 0, most, 0.0025) <= ALPHA
+
+
+def test_bad_counts_are_one_line():
+    with pytest.raises(InputError, match="no_more_faults: gained, lost, n, margin"):
+        no_more_faults(3, 3, 5, 0.1)
+
+
+# -------------------------------------------------------------------------- safety
+
+
+@pytest.mark.parametrize(("field", "name"), OFFENCES)
+def test_a_handful_of_faults_on_each_side_is_no_difference(field, name):
+    mine = broken(drives(), spread(3), **{field: 1})
+    theirs = broken(drives(), spread(3, start=5), **{field: 1})
+    verdict = decide(mine, theirs)
+    check = check_of(verdict, name)
+    assert (check.outcome, check.gained, check.lost) == ("pass", 3, 3)
+    assert verdict.decision == "no difference"
+    assert len(verdict.new_faults) == 3
+
+
+@pytest.mark.parametrize(("field", "name"), OFFENCES)
+def test_clearly_more_faults_are_refused_however_smooth(field, name):
+    mine = smoother(broken(drives(), spread(8), **{field: 1}))
+    theirs = broken(drives(), spread(1, start=5), **{field: 1})
+    verdict = decide(mine, theirs)
+    assert verdict.decision == "do not ship"
+    # McNemar, 8 against 1: p = 0.039; the nulls drive as the incumbent does here
+    assert failed(verdict) == {name, *(f"{name}, {null}" for null in NULLS)}
+    assert "has 8 new" in verdict.sentence
+    assert verdict.look_at[0] == "family00/000@0"
+
+
+def test_a_few_new_faults_are_open_and_named():
+    """Five lost and none gained: p = 0.06, but not less than ten for certain."""
+    verdict = decide(smoother(broken(drives(), spread(5), at_fault=1)), drives())
+    assert verdict.decision == "could not judge"
+    assert check_of(verdict, "collision").outcome == "open"
+    assert verdict.sentence.endswith(
+        "Next: look at the new faults; --accept those that may stay."
+    )
+    text = format_verdict(verdict)
+    for case in ("family00/000@0", "family00/097@0", "family01/188@1"):
+        assert f"{case}: preventable at-fault collision" in text
+
+
+def test_a_collision_that_nobody_prevents_is_listed_and_not_counted():
+    mine = broken(drives(), spread(8), at_fault=1)
+    preventable = np.ones(CASES, bool)
+    preventable[spread(8)] = False
+    verdict = judge(pair(mine, drives(), preventable=preventable), GateConfig())
+    assert check_of(verdict, "collision").lost == 0
+    assert check_of(verdict, "collision_free").lost == 8  # over all cases it is
+    assert [fault.preventable for fault in verdict.new_faults] == [False] * 8
+    assert "at-fault collision, not preventable" in format_verdict(verdict)
+    # people count wherever they are hit
+    hit = broken(mine, spread(8), at_fault_vru=1)
+    verdict = judge(pair(hit, drives(), preventable=preventable), GateConfig())
+    assert "vulnerable" in failed(verdict)
+
+
+def test_more_of_an_offence_that_both_commit_is_new():
+    """A cone touched by both is no excuse for a pedestrian hit by one."""
+    both = broken(drives(), [7], at_fault=1, red_lights=1)
+    worse = broken(both, [7], at_fault_vru=1)
+    assert [f.faults for f in decide(worse, both).new_faults] == [("vulnerable",)]
+    more = decide(broken(both, [7], red_lights=3), both)
+    assert [f.faults for f in more.new_faults] == [("red_light",)]
+    assert decide(both, both).new_faults == ()
+
+
+def test_an_accepted_case_does_not_count():
+    mine, theirs = smoother(broken(drives(), spread(5), at_fault=1)), drives()
+    ids = [fault.case for fault in decide(mine, theirs).new_faults]
+    verdict = decide(mine, theirs, accept=tuple(ids[:2]))
+    check = check_of(verdict, "collision")
+    assert (check.outcome, check.lost) == ("pass", 3)
+    assert verdict.decision == "ship"
+    assert [fault.accepted for fault in verdict.new_faults] == [True] * 2 + [False] * 3
+    assert f"{ids[0]}: preventable at-fault collision (accepted)" in (
+        format_verdict(verdict)
+    )
+
+
+def test_what_is_no_new_fault_cannot_be_accepted():
+    mine = broken(drives(), spread(2), at_fault=1)
+    with pytest.raises(InputError) as found:
+        decide(mine, drives(), accept=("family01/000@1",))
+    assert str(found.value) == (
+        "--accept: family01/000@1: no case with a new fault: expected some of"
+        " family00/000@0, family00/097@0"
+    )
+    with pytest.raises(InputError, match="expected none, for there is none"):
+        decide(drives(), drives(), accept=("family01/000@1",))
+
+
+# ----------------------------------------------------------------- nulls and likeness
+
+
+def test_what_was_not_measured_is_open_and_says_what_to_do():
+    mine = smoother(drives())
+    verdict = judge(pair(mine, drives(), likeness=None), GateConfig())
+    assert verdict.decision == "could not judge"
+    unmeasured = [c.name for c in verdict.checks if not c.measured]
+    assert unmeasured == [*(f"likeness, {name}" for name in NULLS), "likeness"]
+    assert "Next: measure human-likeness" in verdict.sentence
+    assert "not measured" in format_verdict(verdict)
+    verdict = judge(pair(mine, drives(), nulls={}), GateConfig())
+    assert verdict.decision == "could not judge"
+    assert "drive constant V on the same cases" in verdict.reasons[0]
+    # where something is worse, that is said, not what is missing
+    slow = mine.replace(progress=0.9 * np.array(mine.progress))
+    verdict = judge(pair(slow, drives(), likeness=None), GateConfig())
+    assert verdict.decision == "do not ship"
+
+
+def test_behind_a_null_in_safety_is_refused():
+    mine = smoother(broken(drives(), spread(12), red_lights=1))
+    null = {"constant V": mine, "+velocity": drives()}
+    verdict = judge(pair(mine, mine, nulls=null), GateConfig())
+    assert failed(verdict) == {"red_light, +velocity"}
+    assert "is not as safe as +velocity: red lights run" in verdict.sentence
+
+
+@pytest.mark.parametrize(
+    ("factors", "outcome"),
+    [({}, "pass"), ({"+velocity": 1.0}, "open"), ({"+velocity": 0.9}, "fail")],
+)
+def test_the_candidate_is_nearer_than_every_null(factors, outcome):
+    known = likeness(**factors)
+    verdict = judge(pair(smoother(drives()), drives(), likeness=known), GateConfig())
+    assert check_of(verdict, "likeness, +velocity").outcome == outcome
+    assert check_of(verdict, "likeness, constant V").outcome == "pass"
+    decisions = {"pass": "ship", "open": "could not judge", "fail": "do not ship"}
+    assert verdict.decision == decisions[outcome]
+
+
+def test_nearer_to_the_human_is_a_gain_and_farther_a_loss():
+    nearer = judge(
+        pair(drives(), drives(), likeness=likeness(candidate=0.9)), GateConfig()
+    )
+    assert nearer.decision == "ship"
+    assert "% nearer to the human" in nearer.sentence
+    farther = judge(
+        pair(smoother(drives()), drives(), likeness=likeness(candidate=1.1)),
+        GateConfig(),
+    )
+    assert failed(farther) == {"likeness"}
+    assert "% farther from the human" in farther.sentence
+
+
+def test_the_interval_of_likeness_is_over_recordings():
+    """Nearer in nearly every drive of one recording says little of others."""
+    known = likeness()
+    distance = dict(known.distance)
+    distance["candidate"] = np.where(known.clusters == 0, 0.5, 1.0) * np.asarray(
+        distance["incumbent"]
+    )
+    verdict = judge(
+        pair(drives(), drives(),
+             likeness=Likeness(distance=distance, clusters=known.clusters)),
+        GateConfig(),
+    )  # fmt: skip
+    gains = [c for c in verdict.checks if c.kind == "gain" and c.name == "likeness"]
+    assert gains[0].difference > 0.0
+    assert gains[0].outcome == "open"
+    alone = Likeness(distance=distance, clusters=known.clusters % 3)
+    few = judge(pair(drives(), drives(), likeness=alone), GateConfig())
+    assert few.decision == "could not judge"
+    assert any("3 vehicles are too few" in reason for reason in few.reasons)
+
+
+def test_bad_likeness_is_one_line():
+    known = likeness()
+    with pytest.raises(InputError, match=r"likeness: candidate: shape \(3,\): expec"):
+        dataclasses.replace(known, distance={"candidate": np.ones(3)})
+    bad = {"candidate": np.where(np.arange(240) == 7, -1.0, 1.0)}
+    with pytest.raises(InputError, match=r"likeness: candidate: drive 7: -1\.0: expec"):
+        dataclasses.replace(known, distance=bad)
+    without = {k: v for k, v in known.distance.items() if k != "+velocity"}
+    with pytest.raises(InputError, match=r"likeness: \+velocity: expected a row of"):
+        judge(
+            pair(drives(), drives(),
+                 likeness=dataclasses.replace(known, distance=without)),
+            GateConfig(),
+        )  # fmt: skip

@@ -1,0 +1,366 @@
+"""Labels against planned drives; written signals against drivers."""
+
+import dataclasses
+import functools
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from absl import flags
+from absl.testing import flagsaver
+
+from experiments.signals import checked_signals, signals_asked
+from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.parts import parts_of, recordings_of
+from rcirl_jax.data.scenes.collect import Collector
+from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.data.scenes.lines import trusted_signals
+from rcirl_jax.data.scenes.signal_checks import SignalChecks, read_signal_checks
+from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.labels import logs as label_logs
+from rcirl_jax.evaluation.labels.cases import FAMILIES, Case, draw, to_recording
+from rcirl_jax.evaluation.labels.cases.plans import ego_of
+from rcirl_jax.evaluation.labels.cases.scenes import CLOCK, drive, speed
+from rcirl_jax.evaluation.labels.logs import check_logs, check_written
+from rcirl_jax.evaluation.labels.scores import format_labels
+from rcirl_jax.evaluation.labels.signals import (
+    check_phases,
+    first_stands,
+    format_phases,
+    period,
+)
+from rcirl_jax.evaluation.labels.stops import check_stops, format_stops
+from rcirl_jax.evaluation.labels.truth import measure
+from rcirl_jax.runtime.executors import Here, Processes
+from rcirl_jax.types import Decision, Signal, Tag
+from tests.data.importers.formats import commonroad
+
+CASES = 2  # of every family
+FLOOR = 0.9  # precision and recall of a class with some 10 cases
+
+
+@functools.cache
+def report(noise="ngsim"):
+    return measure(CASES, noise, seed=7)
+
+
+@pytest.mark.parametrize("noise", ["ngsim", "none"])
+def test_every_class_is_found(noise):
+    found = report(noise)
+    assert found.cases == CASES * len(FAMILIES)
+    assert sum(found.dropped.values()) <= 2
+    for score in found.decisions + found.tags:
+        assert score.true >= CASES, score.name
+        for what in ("precision", "recall"):
+            value, low, high = getattr(score, what)()
+            assert value >= FLOOR, (score, what, format_labels(found))
+            assert low <= value <= high
+
+
+@pytest.mark.multiprocess
+def test_labels_do_not_depend_on_where_they_are_made():
+    some = ["follow", "cut_in", "red_light"]
+    here = measure(2, "ngsim", families=some)
+    assert measure(2, "ngsim", families=some, executor=Processes(2)) == here
+
+
+def test_the_table_names_every_class():
+    text = format_labels(report())
+    named = set(Tag.__members__) - {"REHEARSED"}  # says who drove, not how
+    for name in [*Decision.__members__, *named]:
+        assert f"\n{name.lower():<14}" in text
+    json.dumps(report().as_dict(), allow_nan=False)
+
+
+def test_broken_labels_are_noticed(monkeypatch):
+    """The truth does not come from the labels: without them nothing is right."""
+
+    def nothing(rows):
+        for row in rows:
+            row["decisions"] = np.zeros(row["obstacles.kind"].shape, int)
+            row["tags"] = np.zeros(len(Tag), bool)
+
+    monkeypatch.setattr("rcirl_jax.data.scenes.labels.add_labels", nothing)
+    found = measure(1, "none", families=["follow", "cut_in", "red_light"])
+    scores = {score.name: score for score in found.decisions + found.tags}
+    for name in ("follow", "yield", "stop", "cut_in", "following"):
+        assert scores[name].right == 0
+        assert scores[name].missed >= 1
+    assert ("decision", "follow", "FOLLOW", "IGNORE", 1) in found.errors
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_plans_are_drivable(name):
+    case = draw(name, np.random.default_rng(3))
+    assert case.family == name
+    assert speed(case.ego.s).min() >= 0.0
+    seen = (CLOCK >= 0.0) & (CLOCK <= 8.0)
+    for other in case.others:
+        along = np.abs(other.s - case.ego.s) - 0.5 * (other.length + case.ego.length)
+        across = np.abs(other.l - case.ego.l) - 0.5 * (other.width + case.ego.width)
+        if name not in ("crossing_yield", "crossing_passed", "left_turner"):
+            assert np.all(np.maximum(along, across)[seen] > -0.05), other.id
+
+
+def test_the_same_seed_gives_the_same_drive():
+    one, two = (draw("cut_in", np.random.default_rng(5)) for _ in range(2))
+    np.testing.assert_array_equal(one.ego.s, two.ego.s)
+    assert one.truth == two.truth
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((0, "none"), "--cases: 0"),
+        ((1, "loud"), "--noise: loud"),
+        ((1, "none", 0, ["flying"]), "families: flying"),
+    ],
+)
+def test_bad_input(arguments, message):
+    with pytest.raises(InputError, match=message):
+        measure(*arguments)
+
+
+# --------------------------------------------------------------------- signals
+
+
+def light(offset, until=200.0):
+    """30 s green, 3 s yellow, 27 s red, from `offset` on."""
+    starts, states, t = [], [], offset - 120.0
+    while t < until:
+        for state, seconds in (("green", 30.0), ("yellow", 3.0), ("red", 27.0)):
+            starts.append(t)
+            states.append(state)
+            t += seconds
+    return Signal(
+        id="light", start=np.array(starts), state=tuple(states), is_recorded=False
+    )
+
+
+def drives_of(number, written):
+    """A car that crosses 2 to 6 s after the start, and one that waits or not.
+
+    The file starts when its light has been green for 5 s (even numbers) or red
+    for 5 s (odd ones); its clock, and thus the cycle's offset, is its own.
+    """
+    rng = np.random.default_rng(number)
+    green = number % 2 == 0
+    v = rng.uniform(8.0, 12.0) if green else 0.0
+    ego = ego_of(rng, drive(130.0, v), np.zeros(CLOCK.size))
+    behind = dataclasses.replace(ego, id="behind", s=ego.s - rng.uniform(12.0, 20.0))
+    line = 130.0 + (30.0 if green else 0.5 * ego.length + 2.0)
+    since = -5.0 if green else -38.0
+    made = to_recording(
+        Case(
+            family=f"file{number}", ego=ego, others=(behind,), line_m=line,
+            light=light(since + written),
+        ),
+        "none",
+        rng,
+    )  # fmt: skip
+    return dataclasses.replace(made, name=f"AAA_Place-1_{number}_T-1")
+
+
+def test_a_true_phase_is_confirmed():
+    checks = check_phases(drives_of(number, 0.0) for number in range(12))
+    assert len(checks) == 2
+    assert checks[0].verdict == "confirmed"
+    assert checks[0].crossings == 12
+    assert checks[0].stands == 6
+    assert checks[0].red_written == 0.0
+    assert checks[0].stands_red_written == 1.0
+    assert checks[0].best_offset_s == 0.0
+    assert "confirmed" in format_phases(checks)
+
+
+def test_a_shifted_phase_is_rejected_and_its_shift_found():
+    check = check_phases(drives_of(number, 25.0) for number in range(12))[0]
+    assert check.verdict == "rejected"
+    assert check.red_written > 0.9
+    assert abs(check.best_offset_s - 35.0) <= 10.0
+    assert check.red_best == 0.0
+
+
+def test_a_phase_per_file_that_means_nothing_is_not_confirmed():
+    rng = np.random.default_rng(1)
+    made = [drives_of(number, rng.uniform(0.0, 60.0)) for number in range(12)]
+    assert check_phases(made)[0].verdict in ("rejected", "not contradicted")
+
+
+def test_period():
+    assert period(light(0.0)) == pytest.approx(60.0)
+    always = Signal(id="s", start=np.array([0.0]), state=("red",))
+    assert period(always) is None
+
+
+def test_only_the_first_of_a_queue_stands_at_the_line():
+    made = drives_of(1, 0.0)
+    stands = first_stands(made, made.lanes[1])
+    assert list(stands) == [0]
+
+
+def test_stops_of_recorded_drives_agree():
+    made = [drives_of(number, 0.0) for number in range(4)]
+    scores = {s.name: s for s in check_stops(made, trust_all=True).scores}
+    assert scores["stop (line)"].recall()[0] == 1.0
+    assert scores["stop (line)"].precision()[0] == 1.0
+    refused = check_stops(made)
+    assert (refused.trusted, refused.signals) == (0, 4)
+    assert "0 of 4 written signals" in format_stops(refused)
+
+
+@pytest.mark.multiprocess
+def test_logs_are_checked_alike_wherever_they_are_read(tmp_path):
+    """And as their recordings are when they are all held at once."""
+    for number in range(3):
+        (tmp_path / str(number)).mkdir()
+        commonroad.write(tmp_path / str(number))
+    logs = parts_of("commonroad", tmp_path)
+    made = [recording for part in logs for recording in recordings_of(part)]
+    assert len(made) == len(logs) == 3
+    here, there = check_logs(logs), check_logs(logs, executor=Processes(2))
+    assert here.stops == there.stops
+    alone = [check.as_dict() for check in check_phases(made)]
+    for one in here, there:
+        assert [check.as_dict() for check in one.phases] == alone
+    assert here.stops["trusted signals"] == check_stops(made)
+    assert [check.as_dict() for check in check_written(logs)] == alone
+    every = here.stops["all signals"]
+    assert every == check_stops(made, trust_all=True)
+    assert (every.trusted, every.signals) == (3, 3)
+    assert every.scenes > 0
+
+
+def write_checks(path, checks):
+    path.write_text(json.dumps({"phases": [check.as_dict() for check in checks]}))
+    return path
+
+
+@pytest.mark.parametrize(("turned", "used"), [(0.0, 4), (25.0, 0)])
+def test_an_import_takes_the_word_of_many_files(turned, used, tmp_path):
+    """Two or three crossings a file prove nothing; twelve files do."""
+    made = [drives_of(number, turned) for number in range(12)]
+    file = write_checks(tmp_path / "labels.json", check_phases(made))
+    config = CollectConfig(signal_checks=read_signal_checks(file))
+    alone = [Collector(one, CollectConfig()) for one in made[:4]]
+    told = [Collector(one, config) for one in made[:4]]
+    assert sum(len(one.signals) for one in alone) == 0
+    assert sum(len(one.signals) for one in told) == used
+    said = [note for one in told for note in one.signal_notes]
+    assert sum("many files speak against it" in note for note in said) == 4 - used
+
+
+def test_an_import_can_ask_all_files_itself(tmp_path, monkeypatch, capsys):
+    """`--signals=pooled` is what label_check and its labels.json would have said."""
+    made = [drives_of(number, 0.0) for number in range(12)]
+    monkeypatch.setattr(label_logs, "recordings_in", lambda one: [(None, one)])
+    monkeypatch.setattr(label_logs, "items", lambda parts, _: iter(parts))
+    file = write_checks(tmp_path / "labels.json", check_phases(made))
+    with flagsaver.as_parsed(signals="pooled"):
+        assert checked_signals(made, Here()) == read_signal_checks(file)
+    assert "confirmed" in capsys.readouterr().out
+    with flagsaver.as_parsed(signals=str(file)):
+        assert checked_signals(made, Here()) == read_signal_checks(file)
+    with flagsaver.flagsaver():
+        flags.FLAGS.mark_as_parsed()
+        assert checked_signals(made, Here()) is None
+
+
+def test_what_the_flag_asks_for_tells_imports_apart(tmp_path):
+    file = tmp_path / "labels.json"
+    file.write_text("{}")
+    asked = []
+    for word in ("pooled", str(file)):
+        with flagsaver.as_parsed(signals=word):
+            asked.append(signals_asked())
+    file.write_text("[]")
+    with flagsaver.as_parsed(signals=str(file)):
+        asked.append(signals_asked())
+    assert asked[0] == "pooled"
+    assert len(set(asked)) == 3
+    gone = flagsaver.as_parsed(signals=str(tmp_path / "gone"))
+    with gone, pytest.raises(InputError, match=r"--signals: .*gone: No such file"):
+        signals_asked()
+
+
+def test_a_verdict_on_a_line_comes_before_all_rules(tmp_path):
+    one = drives_of(0, 0.0)
+    phases = [
+        {"name": "AAA_Place-1/light", "verdict": "rejected"},
+        {"name": "AAA_Place-1/other", "verdict": "too few crossings"},
+        {"name": "all together", "verdict": "not contradicted"},
+    ]
+    file = tmp_path / "labels.json"
+    file.write_text(json.dumps({"phases": phases}))
+    checks = read_signal_checks(file)
+    assert (checks.used, checks.unused) == ((), ("AAA_Place-1/light",))
+    assert not trusted_signals(one, True, checks)[0]
+    both = SignalChecks(used=("AAA_Place-1/light",), unused=())
+    assert list(trusted_signals(one, False, both)[0]) == ["light"]
+    phases[-1]["verdict"] = "confirmed"
+    file.write_text(json.dumps({"phases": phases}))
+    assert read_signal_checks(file).used == ("AAA_Place-1/other",)
+
+
+@pytest.mark.parametrize(
+    "text", ["[]", "{}", '{"phases": 3}', '{"phases": [{"name": "a"}]}',
+             '{"phases": [{"name": "a", "verdict": "fine"}]}',
+             '{"phases": [{"name": [], "verdict": "rejected"}]}']
+)  # fmt: skip
+def test_other_files_are_refused_in_one_line(text, tmp_path):
+    file = tmp_path / "labels.json"
+    file.write_text(text)
+    with pytest.raises(InputError, match=r"labels.json: phases: .*expected"):
+        read_signal_checks(file)
+    file.write_text("")
+    with pytest.raises(InputError, match=r"labels.json: Expecting value: .*expected"):
+        read_signal_checks(file)
+    with pytest.raises(InputError, match="nowhere: No such file"):
+        read_signal_checks(tmp_path / "nowhere")
+
+
+def test_command(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "experiments.label_check", "--quick",
+         "--noise=none", f"--output={tmp_path}"],
+        capture_output=True, text=True, check=False, timeout=600,
+        env={**os.environ, "JAX_PLATFORMS": "cpu"},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    body = json.loads((tmp_path / "labels.json").read_text())
+    assert body["none"]["cases"] == 4 * len(FAMILIES)
+    assert (tmp_path / "labels.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+@pytest.mark.dataset
+def test_urban_signals(data_dir):
+    """The written cycles fit the drivers, over all files; one file proves little."""
+    folder = data_dir / "ngsim_urban_commonroad" / "xml"
+    report = check_logs(parts_of("commonroad", folder), executor=Processes(2))
+    checks, together = report.phases, report.phases[-1]
+    used = report.stops["signals by their phases"]
+    assert report.stops["trusted signals"].trusted < used.trusted < used.signals
+    assert together.crossings > 150
+    assert together.red_written < 0.1
+    assert together.best_offset_s == 0.0
+    assert together.verdict == "confirmed"
+    assert sum(check.verdict == "confirmed" for check in checks[:-1]) >= 3
+    assert sum(check.verdict == "rejected" for check in checks[:-1]) <= 4
+
+
+@pytest.mark.dataset
+def test_urban_stops(data_dir):
+    folder = data_dir / "ngsim_urban_commonroad" / "xml"
+    made = [
+        recording
+        for recording in read_recordings("commonroad", folder)
+        if recording.name.startswith("USA_Lanker-2_1")
+    ]
+    used = {s.name: s for s in check_stops(made, trust_all=True).scores}
+    assert used["stop (line)"].precision()[1] > 0.9
+    assert used["stop (line)"].recall()[0] > 0.8
+    assert used["red_light"].precision()[0] > 0.85

@@ -1,0 +1,108 @@
+"""The driver model tuned on the ranking; its search, its row."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from rcirl_jax.evaluation.ranking.score import candidates_key, measure_scenes
+from rcirl_jax.evaluation.rivals.cma_es import tune
+from rcirl_jax.evaluation.rivals.tuned import (
+    TUNABLE_IDM,
+    as_numbers,
+    driven_scenes,
+    idm_of,
+    mean_driven_fde,
+)
+from rcirl_jax.planner.baselines import (
+    TUNED_IDM_ROW,
+    Idm,
+    closeness,
+    idm_trajectory,
+)
+from rcirl_jax.reward import LatticeCost
+from rcirl_jax.sampling import SamplerConfig
+from tests.evaluation.driven import long_rows, mean_chosen_fde, scored_rivals
+from tests.helpers.scenes import sampled
+
+SMALL = SamplerConfig(num_random=16, cruise_times=(4.0,), edge_times=(4.0,))
+SCENES = 24
+INDEX = np.arange(SCENES)
+HIDDEN = np.array([0.5, 0.3, -0.8, -0.5, -0.4])
+
+
+@functools.cache
+def driven_by_a_hidden_driver():
+    """Demonstrations of 8 s whose human is the candidate nearest to a hidden driver."""
+    rows = long_rows(SCENES)
+    scenes = driven_scenes(rows, INDEX, SMALL, 8.0)
+    driver = idm_of(jnp.asarray(HIDDEN, jnp.float32))
+
+    def nearest(one):
+        way = idm_trajectory(one.scene, True, driver)
+        near = jax.vmap(lambda x: closeness(x, way, one.mask))(one.everyone)
+        best = jnp.argmax(jnp.where(one.feasible, near, -jnp.inf))
+        return jax.tree.map(lambda x: x[best], one.everyone)
+
+    human = jax.tree.map(np.asarray, jax.jit(jax.vmap(nearest))(scenes))
+    return rows.replace(human=human)
+
+
+def test_zeros_are_the_usual_driver_and_bounds_hold():
+    usual = idm_of(jnp.zeros(len(TUNABLE_IDM)))
+    for name, value in Idm().fields().items():
+        assert float(getattr(usual, name)) == float(value), name
+    wild = idm_of(jnp.full(len(TUNABLE_IDM), 50.0))
+    assert float(wild.headway) == pytest.approx(Idm().headway * np.exp(3.0))
+    assert float(wild.max_braking) == Idm().max_braking
+
+
+def test_the_objective_is_what_the_ranking_report_measures():
+    rows, hidden = driven_by_a_hidden_driver(), idm_of(jnp.asarray(HIDDEN, jnp.float32))
+    tuned = {TUNED_IDM_ROW: hidden, "again": Idm(), "cost": LatticeCost()}
+    scored = scored_rivals(rows, SMALL, tuned)
+    np.testing.assert_allclose(
+        scored.values["again"], scored.values["IDM"], rtol=1e-5, atol=1e-4
+    )
+    np.testing.assert_allclose(
+        scored.values["cost"], scored.values["hand-set"], rtol=1e-5, atol=1e-3
+    )
+    found = [mean_chosen_fde(scored, name) for name in ("IDM", TUNED_IDM_ROW)]
+    scenes = driven_scenes(rows, INDEX, SMALL, 8.0)
+    both = np.stack([np.zeros(len(TUNABLE_IDM)), HIDDEN])
+    np.testing.assert_allclose(found, mean_driven_fde(scenes, both, True), atol=0.05)
+
+
+def test_the_search_comes_close_to_a_hidden_driver():
+    scenes = driven_scenes(driven_by_a_hidden_driver(), INDEX, SMALL, 8.0)
+    start = np.zeros(len(TUNABLE_IDM))
+    usual, hidden = mean_driven_fde(scenes, np.stack([start, HIDDEN]), True)
+    assert hidden < 0.05
+    result = tune(lambda x: mean_driven_fde(scenes, x, True), start, 1.0, 200, 0, False)
+    assert result.value < 0.5 * usual
+
+
+def test_candidates_are_those_of_the_evaluation():
+    rows = driven_by_a_hidden_driver()
+    scenes = driven_scenes(rows, INDEX, SMALL, 8.0)
+    one = jax.tree.map(lambda x: jnp.asarray(x[3]), rows.scene)
+    expected = sampled(candidates_key(jnp.asarray(3)), one, SMALL).trajectory
+    np.testing.assert_allclose(scenes.everyone.s[3], expected.s, atol=1e-3)
+
+
+def test_numbers_of_a_rival():
+    (numbers,) = as_numbers([Idm(headway=1.2)])
+    assert numbers["headway"] == pytest.approx(1.2)
+    assert set(numbers) == set(Idm().fields())
+
+
+def test_distances_alone_are_those_of_the_scores():
+    """What an import's oracle floor measures, over a padded chunk."""
+    rows = driven_by_a_hidden_driver()
+    scored = scored_rivals(rows, SMALL, {})
+    near = measure_scenes(rows, INDEX, sampler=SMALL, horizon_s=8.0, futures="recorded")
+    for name in ("feasible", "fde", "ade"):
+        found, wanted = getattr(near, name), getattr(scored, name)
+        np.testing.assert_allclose(found, wanted, atol=1e-4)
