@@ -1,23 +1,21 @@
 """Are the automatic labels right? Precision and recall against known truth.
 
-    python -m experiments.label_check --cases=100 --noise=ngsim,none --output=DIR
-    python -m experiments.label_check --traffic=4 --noise=ngsim --output=DIR
+    python -m experiments.label_check --traffic=4 --noise=ngsim,none --output=DIR
     python -m experiments.label_check --format=commonroad --input=DIR --output=DIR
 
-Without --input: drives planned by `evaluation.labels.cases`, whose decisions and
-tags are known, are labelled and compared; position noise as in NGSIM, or none.
-With --traffic=N instead: N simulated recordings of every entry of
-data_specs/sources/synthetic.toml, whose drivers' own state is the truth.
+Without --input: --traffic simulated recordings of every entry of
+data_specs/sources/synthetic.toml, whose drivers' own state is the truth, are labelled
+and compared; position noise as in NGSIM, or none.
 With --input (any recorded format): the written cycle of every signal is tested
 against crossings and stands, and the stop labels against observed stands, with
 the signals that an import trusts of itself, those it uses when told these phases
 (`import_logs --signals=pooled`), and all of them. With --data the labels
 stored in a dataset are compared with today's rules. --workers and --executor
-spread the drives and the logs.
+spread the recordings and the logs.
 
-Writes labels.json and labels.png. On two cores 100 cases of each of the 38
-families take about 5 minutes per noise; the urban CommonRoad files 3 minutes.
-Expected: above 98 % everywhere.
+Writes labels.json and labels.png. Four recordings of each entry take some
+minutes per noise, the urban CommonRoad files three on two cores.
+Expected: above 95 % everywhere.
 """
 
 from pathlib import Path
@@ -30,25 +28,22 @@ from rcirl_jax.data.importers import IMPORTERS
 from rcirl_jax.data.parts import parts_of
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.evaluation.labels.logs import check_logs
-from rcirl_jax.evaluation.labels.scores import LabelReport, format_labels, format_scores
+from rcirl_jax.evaluation.labels.scores import format_labels, format_scores
 from rcirl_jax.evaluation.labels.signals import format_phases
 from rcirl_jax.evaluation.labels.stops import compare_stored, format_stops
 from rcirl_jax.evaluation.labels.traffic import measure_traffic
-from rcirl_jax.evaluation.labels.truth import measure
 from rcirl_jax.report.data.label_picture import label_chart
 from rcirl_jax.runtime.atomic_files import write_json
-from rcirl_jax.runtime.executors import Executor
 
-_CASES = flags.DEFINE_integer("cases", 100, "planned drives of each family")
-_TRAFFIC = flags.DEFINE_integer("traffic", None, "recordings of each road simulated")
+_TRAFFIC = flags.DEFINE_integer("traffic", 4, "recordings of each road simulated")
 _NOISE = flags.DEFINE_list("noise", ["ngsim", "none"], "none, white, ngsim, rough")
-_SEED = flags.DEFINE_integer("seed", 0, "of the planned drives")
+_SEED = flags.DEFINE_integer("seed", 0, "of the traffic and the noise")
 _OUTPUT = flags.DEFINE_string("output", "out/label_check", "folder to write")
 _DATA = flags.DEFINE_string("data", None, "dataset whose stored labels are compared")
 _FORMAT = flags.DEFINE_enum("format", "commonroad", sorted(IMPORTERS), "of --input")
 _INPUT = flags.DEFINE_string("input", None, "recorded file or folder")
 _SOURCE = flags.DEFINE_string("source", None, "TOML of columns and units of --input")
-_QUICK = flags.DEFINE_bool("quick", False, "4 cases of each family, 1 of --traffic")
+_QUICK = flags.DEFINE_bool("quick", False, "one recording of each road, one noise")
 
 
 def main() -> None:
@@ -72,9 +67,10 @@ def main() -> None:
         tables["stored against today's rules"] = scores
     if not body:
         noises = _NOISE.value[:1] if _QUICK.value else _NOISE.value
+        count = 1 if _QUICK.value else _TRAFFIC.value
         places = executor()
         for noise in noises:
-            report = _measured(noise, places)
+            report = measure_traffic(count, noise, _SEED.value, executor=places)
             print(f"{format_labels(report)}\n")
             body[noise] = report.as_dict()
             tables[f"noise {noise}, decisions"] = report.decisions
@@ -85,15 +81,6 @@ def main() -> None:
     body["made_by"] = {**provenance(logs=parts), **data}
     write_json(folder / "labels.json", body)
     print(f"written: {folder}/labels.json, {picture.name}")
-
-
-def _measured(noise: str, places: Executor | None) -> LabelReport:
-    seed, is_quick = _SEED.value, _QUICK.value
-    if _TRAFFIC.value is None:
-        return measure(4 if is_quick else _CASES.value, noise, seed, executor=places)
-    return measure_traffic(
-        1 if is_quick else _TRAFFIC.value, noise, seed, executor=places
-    )
 
 
 if __name__ == "__main__":

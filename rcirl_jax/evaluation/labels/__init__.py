@@ -1,4 +1,4 @@
 """Automatic labels held against truth: made traffic, signals, stops, logs.
 
-`cases` are scenes whose labels are known; a new label gets its case there.
+The truth is what simulated drivers did; a new label gets its truth in `made_traffic`.
 """

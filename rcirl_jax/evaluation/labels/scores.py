@@ -56,7 +56,7 @@ class ClassScore:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LabelReport:
-    """Labels against truth over all families."""
+    """Labels against truth over all roads."""
 
     noise: str
     cases: int
@@ -82,24 +82,17 @@ def _rate(k: int, n: int) -> tuple[float, float, float] | None:
     return (k / n, *clopper_pearson(k, n)) if n else None
 
 
-def count_verdicts(
-    judged: Iterable[list[Verdict] | str],
-    noise: str,
-    words: str,
-    total: int | None = None,
-) -> LabelReport:
+def count_verdicts(judged: Iterable[list[Verdict] | str], noise: str) -> LabelReport:
     """Count the verdicts of scenes as they come, class by class.
 
     Args:
       judged: verdicts of each scene, or why it was dropped.
       noise: of the positions, for the report.
-      words: of the progress bar.
-      total: scenes that are expected, if known.
     """
     verdicts: list[Verdict] = []
     dropped: collections.Counter[str] = collections.Counter()
     cases = 0
-    for found in tqdm.tqdm(judged, desc=f"{words} {noise}", total=total, unit="scene"):
+    for found in tqdm.tqdm(judged, desc=f"traffic {noise}", unit="scene"):
         cases += 1
         if isinstance(found, str):
             dropped[found] += 1

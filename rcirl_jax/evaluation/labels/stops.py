@@ -16,7 +16,7 @@ from rcirl_jax.data.scenes.collect import Collector
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.data.scenes.labels import labels_of
 from rcirl_jax.data.scenes.signal_checks import SignalChecks
-from rcirl_jax.evaluation.labels.cases import clear
+from rcirl_jax.evaluation.labels.made_traffic import clear
 from rcirl_jax.evaluation.labels.scores import ClassScore, format_scores
 from rcirl_jax.evaluation.labels.signals import (
     STANDING_MPS,
