@@ -15,7 +15,6 @@ from benchmarks.reliability.fuzz.codecs import resealed, toml_text
 from benchmarks.reliability.fuzz.logs import LOGS
 from benchmarks.reliability.fuzz.targets import Bytes, OneFile, Reader, Target
 from rcirl_jax.data.importers.synthetic import reader as synthetic
-from rcirl_jax.data.scenes import signal_checks
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.files import FACTS, MANIFEST, MARK, Files
 from rcirl_jax.data.store.manifest import parse_manifest, shard_entry
@@ -269,17 +268,6 @@ def checkpoints(folder: Path) -> Target:
     return Target(read, [noted, position], (str(folder),))
 
 
-def checks(folder: Path) -> Target:
-    """Verdicts on traffic lights."""
-    folder.mkdir(parents=True)
-    file = folder / "labels.json"
-    phases = [
-        {"name": "USA_Lanker-1: 1", "verdict": word} for word in signal_checks.VERDICTS
-    ]
-    file.write_text(json.dumps({"phases": phases}))
-    return OneFile(signal_checks.read_signal_checks, [file])
-
-
 def runs(folder: Path) -> Target:
     """run.json, as it is resumed and exported from."""
     folder.mkdir(parents=True)
@@ -385,7 +373,6 @@ READERS: dict[str, Reader] = {
     "distances": Reader(make=distances, share=3),
     "preferences": Reader(make=preferences, share=3),
     "checkpoints": Reader(make=checkpoints, share=2),
-    "signal_checks": Reader(make=checks, share=3),
     "runs": Reader(make=runs),
     "stages": Reader(make=stages),
     "metrics": Reader(make=metrics),

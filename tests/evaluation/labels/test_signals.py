@@ -1,6 +1,4 @@
-"""Written signals against drivers, and labels against what a log shows."""
-
-import json
+"""Written signals against drivers."""
 
 import numpy as np
 import pytest
@@ -8,22 +6,20 @@ from absl import flags
 from absl.testing import flagsaver
 
 from experiments.signals import checked_signals, signals_asked
-from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.parts import parts_of, recordings_of
 from rcirl_jax.data.scenes.collect import Collector
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.data.scenes.lines import trusted_signals
-from rcirl_jax.data.scenes.signal_checks import SignalChecks, read_signal_checks
-from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.labels import logs as label_logs
-from rcirl_jax.evaluation.labels.logs import check_logs, check_written
+from rcirl_jax.data.scenes.signal_checks import SignalChecks, signal_checks
+from rcirl_jax.evaluation.labels import signals
 from rcirl_jax.evaluation.labels.signals import (
-    check_phases,
+    check_events,
+    check_written,
     first_stands,
     format_phases,
+    line_events,
     period,
 )
-from rcirl_jax.evaluation.labels.stops import check_stops, format_stops
 from rcirl_jax.runtime.executors import Here, Processes
 from rcirl_jax.types import Kind, Lane, Recording, Signal, Track
 from tests.data.importers.formats import commonroad
@@ -88,8 +84,13 @@ def drives_of(number, written):
     )  # fmt: skip
 
 
+def checked(made):
+    """The checks of all lines of these recordings, and of all together."""
+    return check_events(map(line_events, made))
+
+
 def test_a_true_phase_is_confirmed():
-    checks = check_phases(drives_of(number, 0.0) for number in range(12))
+    checks = checked(drives_of(number, 0.0) for number in range(12))
     assert len(checks) == 2
     assert checks[0].verdict == "confirmed"
     assert checks[0].crossings == 12
@@ -101,7 +102,7 @@ def test_a_true_phase_is_confirmed():
 
 
 def test_a_shifted_phase_is_rejected_and_its_shift_found():
-    check = check_phases(drives_of(number, 25.0) for number in range(12))[0]
+    check = checked(drives_of(number, 25.0) for number in range(12))[0]
     assert check.verdict == "rejected"
     assert check.red_written > 0.9
     assert abs(check.best_offset_s - 35.0) <= 10.0
@@ -111,7 +112,7 @@ def test_a_shifted_phase_is_rejected_and_its_shift_found():
 def test_a_phase_per_file_that_means_nothing_is_not_confirmed():
     rng = np.random.default_rng(1)
     made = [drives_of(number, rng.uniform(0.0, 60.0)) for number in range(12)]
-    assert check_phases(made)[0].verdict in ("rejected", "not contradicted")
+    assert checked(made)[0].verdict in ("rejected", "not contradicted")
 
 
 def test_period():
@@ -126,16 +127,6 @@ def test_only_the_first_of_a_queue_stands_at_the_line():
     assert list(stands) == [0]
 
 
-def test_stops_of_recorded_drives_agree():
-    made = [drives_of(number, 0.0) for number in range(4)]
-    scores = {s.name: s for s in check_stops(made, trust_all=True).scores}
-    assert scores["stop (line)"].recall()[0] == 1.0
-    assert scores["stop (line)"].precision()[0] == 1.0
-    refused = check_stops(made)
-    assert (refused.trusted, refused.signals) == (0, 4)
-    assert "0 of 4 written signals" in format_stops(refused)
-
-
 @pytest.mark.multiprocess
 def test_logs_are_checked_alike_wherever_they_are_read(tmp_path):
     """And as their recordings are when they are all held at once."""
@@ -145,30 +136,21 @@ def test_logs_are_checked_alike_wherever_they_are_read(tmp_path):
     logs = parts_of("commonroad", tmp_path)
     made = [recording for part in logs for recording in recordings_of(part)]
     assert len(made) == len(logs) == 3
-    here, there = check_logs(logs), check_logs(logs, executor=Processes(2))
-    assert here.stops == there.stops
-    alone = [check.as_dict() for check in check_phases(made)]
-    for one in here, there:
-        assert [check.as_dict() for check in one.phases] == alone
-    assert here.stops["trusted signals"] == check_stops(made)
-    assert [check.as_dict() for check in check_written(logs)] == alone
-    every = here.stops["all signals"]
-    assert every == check_stops(made, trust_all=True)
-    assert (every.trusted, every.signals) == (3, 3)
-    assert every.scenes > 0
+    for places in Here(), Processes(2):
+        found = check_written(logs, executor=places)
+        assert repr(found) == repr(checked(made))  # a share of nothing is NaN
 
 
-def write_checks(path, checks):
-    path.write_text(json.dumps({"phases": [check.as_dict() for check in checks]}))
-    return path
+def verdicts(made):
+    """As an import takes them."""
+    return signal_checks({check.name: check.verdict for check in checked(made)})
 
 
 @pytest.mark.parametrize(("turned", "used"), [(0.0, 4), (25.0, 0)])
-def test_an_import_takes_the_word_of_many_files(turned, used, tmp_path):
+def test_an_import_takes_the_word_of_many_files(turned, used):
     """Two or three crossings a file prove nothing; twelve files do."""
     made = [drives_of(number, turned) for number in range(12)]
-    file = write_checks(tmp_path / "labels.json", check_phases(made))
-    config = CollectConfig(signal_checks=read_signal_checks(file))
+    config = CollectConfig(signal_checks=verdicts(made))
     alone = [Collector(one, CollectConfig()) for one in made[:4]]
     told = [Collector(one, config) for one in made[:4]]
     assert sum(len(one.signals) for one in alone) == 0
@@ -177,73 +159,35 @@ def test_an_import_takes_the_word_of_many_files(turned, used, tmp_path):
     assert sum("many files speak against it" in note for note in said) == 4 - used
 
 
-def test_an_import_can_ask_all_files_itself(tmp_path, monkeypatch, capsys):
-    """`--signals=pooled` is what label_check and its labels.json would have said."""
+def test_an_import_can_ask_all_files_itself(monkeypatch, capsys):
+    """`--signals=pooled`."""
     made = [drives_of(number, 0.0) for number in range(12)]
-    monkeypatch.setattr(label_logs, "recordings_in", lambda one: [(None, one)])
-    monkeypatch.setattr(label_logs, "items", lambda parts, _: iter(parts))
-    file = write_checks(tmp_path / "labels.json", check_phases(made))
+    monkeypatch.setattr(signals, "recordings_in", lambda one: [(None, one)])
+    monkeypatch.setattr(signals, "items", lambda parts, _: iter(parts))
     with flagsaver.as_parsed(signals="pooled"):
-        assert checked_signals(made, Here()) == read_signal_checks(file)
+        assert signals_asked() == "pooled"
+        assert checked_signals(made, Here()) == verdicts(made)
     assert "confirmed" in capsys.readouterr().out
-    with flagsaver.as_parsed(signals=str(file)):
-        assert checked_signals(made, Here()) == read_signal_checks(file)
     with flagsaver.flagsaver():
         flags.FLAGS.mark_as_parsed()
+        assert signals_asked() == ""
         assert checked_signals(made, Here()) is None
 
 
-def test_what_the_flag_asks_for_tells_imports_apart(tmp_path):
-    file = tmp_path / "labels.json"
-    file.write_text("{}")
-    asked = []
-    for word in ("pooled", str(file)):
-        with flagsaver.as_parsed(signals=word):
-            asked.append(signals_asked())
-    file.write_text("[]")
-    with flagsaver.as_parsed(signals=str(file)):
-        asked.append(signals_asked())
-    assert asked[0] == "pooled"
-    assert len(set(asked)) == 3
-    gone = flagsaver.as_parsed(signals=str(tmp_path / "gone"))
-    with gone, pytest.raises(InputError, match=r"--signals: .*gone: No such file"):
-        signals_asked()
-
-
-def test_a_verdict_on_a_line_comes_before_all_rules(tmp_path):
+def test_a_verdict_on_a_line_comes_before_all_rules():
     one = drives_of(0, 0.0)
-    phases = [
-        {"name": "AAA_Place-1/light", "verdict": "rejected"},
-        {"name": "AAA_Place-1/other", "verdict": "too few crossings"},
-        {"name": "all together", "verdict": "not contradicted"},
-    ]
-    file = tmp_path / "labels.json"
-    file.write_text(json.dumps({"phases": phases}))
-    checks = read_signal_checks(file)
-    assert (checks.used, checks.unused) == ((), ("AAA_Place-1/light",))
-    assert not trusted_signals(one, True, checks)[0]
+    words = {
+        "AAA_Place-1/light": "rejected",
+        "AAA_Place-1/other": "too few crossings",
+        "all together": "not contradicted",
+    }
+    found = signal_checks(words)
+    assert (found.used, found.unused) == ((), ("AAA_Place-1/light",))
+    assert not trusted_signals(one, found)[0]
     both = SignalChecks(used=("AAA_Place-1/light",), unused=())
-    assert list(trusted_signals(one, False, both)[0]) == ["light"]
-    phases[-1]["verdict"] = "confirmed"
-    file.write_text(json.dumps({"phases": phases}))
-    assert read_signal_checks(file).used == ("AAA_Place-1/other",)
-
-
-@pytest.mark.parametrize(
-    "text", ["[]", "{}", '{"phases": 3}', '{"phases": [{"name": "a"}]}',
-             '{"phases": [{"name": "a", "verdict": "fine"}]}',
-             '{"phases": [{"name": [], "verdict": "rejected"}]}']
-)  # fmt: skip
-def test_other_files_are_refused_in_one_line(text, tmp_path):
-    file = tmp_path / "labels.json"
-    file.write_text(text)
-    with pytest.raises(InputError, match=r"labels.json: phases: .*expected"):
-        read_signal_checks(file)
-    file.write_text("")
-    with pytest.raises(InputError, match=r"labels.json: Expecting value: .*expected"):
-        read_signal_checks(file)
-    with pytest.raises(InputError, match="nowhere: No such file"):
-        read_signal_checks(tmp_path / "nowhere")
+    assert list(trusted_signals(one, both)[0]) == ["light"]
+    words["all together"] = "confirmed"
+    assert signal_checks(words).used == ("AAA_Place-1/other",)
 
 
 @pytest.mark.slow
@@ -251,27 +195,11 @@ def test_other_files_are_refused_in_one_line(text, tmp_path):
 def test_urban_signals(data_dir):
     """The written cycles fit the drivers, over all files; one file proves little."""
     folder = data_dir / "ngsim_urban_commonroad" / "xml"
-    report = check_logs(parts_of("commonroad", folder), executor=Processes(2))
-    checks, together = report.phases, report.phases[-1]
-    used = report.stops["signals by their phases"]
-    assert report.stops["trusted signals"].trusted < used.trusted < used.signals
+    checks = check_written(parts_of("commonroad", folder), executor=Processes(2))
+    together = checks[-1]
     assert together.crossings > 150
     assert together.red_written < 0.1
     assert together.best_offset_s == 0.0
     assert together.verdict == "confirmed"
     assert sum(check.verdict == "confirmed" for check in checks[:-1]) >= 3
     assert sum(check.verdict == "rejected" for check in checks[:-1]) <= 4
-
-
-@pytest.mark.dataset
-def test_urban_stops(data_dir):
-    folder = data_dir / "ngsim_urban_commonroad" / "xml"
-    made = [
-        recording
-        for recording in read_recordings("commonroad", folder)
-        if recording.name.startswith("USA_Lanker-2_1")
-    ]
-    used = {s.name: s for s in check_stops(made, trust_all=True).scores}
-    assert used["stop (line)"].precision()[1] > 0.9
-    assert used["stop (line)"].recall()[0] > 0.8
-    assert used["red_light"].precision()[0] > 0.85
