@@ -96,14 +96,9 @@ def test_background_shift(tmp_path):
     assert all(math.isfinite(x) for x in numbers(body))
     angles = body["example"]["angle_to_truth_deg"]
     assert angles["conditional, logistic"]["mean"] < angles["pooled"]["mean"]
-    rows = body["by_size"]["rows"]
-    gan = [x["high"] for x in rows["GAN"]["agreement"]]
-    for conditional in ("RC-IRL logistic", "RC-IRL rank"):
-        ours = [x["low"] for x in rows[conditional]["agreement"]]
-        # conditional comparison keeps its agreement, average comparison loses it
-        assert ours[-1] > 2.0 * gan[-1]
-        assert ours[-1] > 0.9 * ours[0]
-    assert gan[-1] < 0.6 * gan[0]
+    still = body["example_without_shift"]["angle_to_truth_deg"]
+    assert angles["pooled"]["low"] > 30.0 > 10.0 > still["pooled"]["high"]
+    assert max(angles[x]["high"] for x in angles if "conditional" in x) < 10.0
     assert body["made_by"]["flags"]["quick"] is True
     assert (tmp_path / "background_shift.png").read_bytes()[:4] == b"\x89PNG"
 
