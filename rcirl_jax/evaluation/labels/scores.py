@@ -15,6 +15,8 @@ import tqdm
 from rcirl_jax.evaluation.exact import clopper_pearson
 from rcirl_jax.types import Decision, Tag
 
+SHOWN = 20  # kinds of errors in a table
+
 # (what, family, truth, label) of one scored thing; truth and label are names
 Verdict = tuple[str, str, str, str]
 
@@ -121,8 +123,8 @@ def _score(name: str, verdicts: Iterable[Verdict]) -> ClassScore:
     )
 
 
-def format_labels(report: LabelReport, errors: int = 20) -> str:
-    """The report as a terminal table."""
+def format_labels(report: LabelReport) -> str:
+    """The report as a terminal table, with the most frequent errors."""
     lines = [
         f"{report.cases} cases, position noise {report.noise!r}, dropped:"
         f" {sum(report.dropped.values())} {report.dropped or ''}",
@@ -133,7 +135,7 @@ def format_labels(report: LabelReport, errors: int = 20) -> str:
     ]
     if report.errors:
         lines += ["", f"{'family':<24}{'truth':<14}{'label':<14}{'cases':>6}"]
-    for what, family, truth, label, count in report.errors[:errors]:
+    for what, family, truth, label, count in report.errors[:SHOWN]:
         rest = "-" if what == "tag" else ""
         lines.append(f"{family:<24}{truth or rest:<14}{label or rest:<14}{count:>6}")
     return "\n".join(lines)
