@@ -29,7 +29,7 @@ from rcirl_jax.data.importers import IMPORTERS
 from rcirl_jax.data.importing import ImportConfig
 from rcirl_jax.data.logs import Logs
 from rcirl_jax.errors import InputError, did_you_mean
-from rcirl_jax.runtime.pipeline import file_sha256, only_one
+from rcirl_jax.runtime.pipeline import only_one
 from rcirl_jax.train.running import Running
 
 _WORKDIR = flags.DEFINE_string("workdir", None, "folder of the run", required=True)
@@ -69,14 +69,11 @@ _UNTIL = flags.DEFINE_enum("until", "report", STAGES, "last stage")
 def main() -> None:
     """Flags -> one run of the loop."""
     given, recipe = _given(), training.recipe()
-    judged = training.PREFERENCES.value
-    path = Path(judged) if judged else None
     rehearsal = recipe.rehearsal
     if _TEACHER.value is not None:
         rehearsal = dataclasses.replace(rehearsal, teacher=_TEACHER.value)
     config = TuneConfig(
-        train=training.training_config(preferences=file_sha256(path) if path else ""),
-        preferences=path,
+        train=training.training_config(),
         gate=margins.gate_config(),
         incumbent=_INCUMBENT.value,
         rehearsal=rehearsal,

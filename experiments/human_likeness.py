@@ -63,7 +63,7 @@ from rcirl_jax.runtime.atomic_files import write_json, write_whole
 
 # the learners say
 unread("loss", "hidden_size", "activation", "constraint", "pin", "by_context")
-unread("preferences", "preference_weight", "data_weights")
+unread("data_weights")
 _DATA = flags.DEFINE_string("data", None, "dataset of import_logs", required=True)
 _OUTPUT = flags.DEFINE_string("output", "out/likeness", "folder to write")
 _LEARNERS = flags.DEFINE_list("learners", list(LEARNERS), "rows to train")

@@ -48,9 +48,6 @@ _MIN_SURROUNDINGS = flags.DEFINE_float(
     "s until someone whom the human reacts to leaves the record, at least",
 )
 _SMOOTHING = flags.DEFINE_float("smoothing", 4.1, "s, window of the position filter")
-_TRUST = flags.DEFINE_bool(
-    "trust_signals", False, "use cycles a converter wrote, unless crossings contradict"
-)
 _TEST_FRACTION = flags.DEFINE_float(
     "test_fraction", 0.25, "share of scenes held out, by vehicle-disjoint group"
 )
@@ -77,7 +74,6 @@ def main() -> None:
                 min_future_s=_MIN_FUTURE.value,
                 min_history_s=_MIN_HISTORY.value,
                 min_surroundings_s=_MIN_SURROUNDINGS.value,
-                trust_signals=_TRUST.value,
                 signal_checks=checked_signals(
                     leaving_out(parts) if _LEAVE_OUT.value else parts, places
                 ),

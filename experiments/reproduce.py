@@ -39,9 +39,6 @@ _WEIGHTS = flags.DEFINE_string("weights", None, "weights file", required=True)
 _DATA = flags.DEFINE_list(
     "data", None, "its datasets (default: where its flags say they were)"
 )
-_PREFERENCES = flags.DEFINE_string(
-    "preferences", None, "its judgements (default: where its flags say)"
-)
 _OUTPUT = flags.DEFINE_string("output", None, "new folder to write", required=True)
 _TOLERANCE = flags.DEFINE_float(
     "tolerance", 0.01, "largest difference on another machine or version", 0.0
@@ -65,10 +62,7 @@ def main() -> None:
         make = functools.partial(member_again, reward, sweep, folder)
     else:
         settings_of(reward, dataset)
-        judged = Path(_PREFERENCES.value) if _PREFERENCES.value else None
-        make = functools.partial(
-            train_again, reward, dataset, folder, preferences=judged
-        )
+        make = functools.partial(train_again, reward, dataset, folder)
     facts = provenance()
     warnings = setup_warnings(reward.provenance, facts)
     for line in warnings:

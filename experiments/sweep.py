@@ -29,7 +29,7 @@ from rcirl_jax.report.ranking.sweep_picture import sweep_picture
 from rcirl_jax.train.state import TrainConfig
 
 unread("leaky_rate", "learning_rate", "hidden_size")  # the grid
-unread("preferences", "preference_weight", "data_weights")
+unread("data_weights")
 LEAKY_RATES = (0.01, 0.05, 0.2)
 _DATA = flags.DEFINE_list("data", None, "datasets of import_logs", required=True)
 _OUTPUT = flags.DEFINE_string("output", None, "folder to write", required=True)

@@ -19,7 +19,6 @@ from absl import flags
 from experiments import training
 from experiments.common import provenance, run
 from rcirl_jax.data.store.joined import open_datasets
-from rcirl_jax.data.store.preferences import read_preferences
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.parallel import PARALLEL
 from rcirl_jax.train.processes import is_first, join_processes
@@ -52,12 +51,7 @@ def main() -> None:
     """Flags -> one training run."""
     join_processes(_COORDINATOR.value, _PROCESSES.value, _PROCESS.value)
     dataset = open_datasets(_DATA.value, _VERIFY.value, training.DATA_WEIGHTS.value)
-    judged = None
-    if training.PREFERENCES.value:
-        judged = read_preferences(Path(training.PREFERENCES.value), dataset)
-    config = training.training_config(
-        preferences=judged.sha256 if judged else "", seed=_SEED.value
-    )
+    config = training.training_config(seed=_SEED.value)
     running = Running(
         parallel=_PARALLEL.value,
         in_memory_mb=_IN_MEMORY.value,
@@ -70,7 +64,6 @@ def main() -> None:
         config,
         running=running,
         provenance=provenance(),
-        preferences=judged,
     )
     if not is_first():
         return

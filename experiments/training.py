@@ -70,9 +70,6 @@ _TRAIN = {
     "hard_pool": _count(
         "hard_pool", "near negatives drawn for each that the present reward keeps"
     ),
-    "preference_weight": _number(
-        "preference_weight", "of their mean loss beside that of the demonstrations"
-    ),
 }
 _REWARD = {
     "activation": _one_of(
@@ -94,21 +91,17 @@ _HIDDEN = flags.DEFINE_list(
 _BY_CONTEXT = flags.DEFINE_bool(
     "by_context", None, "scale features by what the scene is like at t = 0" + AS_SAID
 )
-PREFERENCES = flags.DEFINE_string(
-    "preferences", None, "JSON Lines: in a scene, A is better than B"
-)
 DATA_WEIGHTS = flags.DEFINE_string(
     "data_weights", EQUAL, "of several sources: equal, scenes, or a number for each"
 )
 
 
 def training_config(
-    *, preferences: str = "", seed: int = 0, hidden: tuple[int, ...] | None = None
+    *, seed: int = 0, hidden: tuple[int, ...] | None = None
 ) -> TrainConfig:
     """The recipe's training, and what flags say besides.
 
     Args:
-      preferences: hash of the file of --preferences; empty without one.
       seed: of initial weights, batches, candidates.
       hidden: units per layer, whatever recipe and flags say.
     """
@@ -125,7 +118,6 @@ def training_config(
     return dataclasses.replace(
         base,
         **given,
-        preferences=preferences,
         seed=seed,
         reward=_network(base.reward, given.get("features", base.features), hidden),
         sampler=sampler,

@@ -25,7 +25,5 @@ FOOT_M = 0.3048  # m, international foot
 MPH_MPS = 0.44704  # m/s per mile per hour
 
 # --- physics and vehicles ---
-G_MPS2 = 9.80665  # m/s^2, standard gravity
 EGO_LENGTH_M = 4.933  # m, Lincoln MKZ (Apollo vehicle_param)
 EGO_WIDTH_M = 2.11  # m, Lincoln MKZ with mirrors (Apollo vehicle_param)
-STANDSTILL_MPS = 0.2  # m/s, Apollo max_abs_speed_when_stopped

@@ -18,7 +18,6 @@ class TuneConfig:
 
     train: TrainConfig
     gate: GateConfig
-    preferences: Path | None = None  # whose hash `train.preferences` is
     incumbent: str = "hand-set"  # weights file or baseline
     rehearsal: Rehearsal = dataclasses.field(default_factory=Rehearsal)
     anchor: Anchoring = dataclasses.field(default_factory=Anchoring)

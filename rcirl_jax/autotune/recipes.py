@@ -31,7 +31,7 @@ from rcirl_jax.train.state import TrainConfig
 DEFAULT = "tuned"
 TABLES = ("about", "train", "collect", "rehearsal", "anchor", "autotune")
 # of a run, not of a recipe
-NOT_OF_A_RECIPE = ("seed", "preferences", "reward", "sampler")
+NOT_OF_A_RECIPE = ("seed", "reward", "sampler")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -8,8 +8,7 @@ from pathlib import Path
 from rcirl_jax.autotune.anchoring import fitted_anchor, read_anchor, write_anchor
 from rcirl_jax.autotune.run import Run
 from rcirl_jax.data.store.dataset import Dataset
-from rcirl_jax.data.store.joined import Demonstrations, JoinedDatasets
-from rcirl_jax.data.store.preferences import read_preferences
+from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.export.from_run import export_run
 from rcirl_jax.export.reader import Anchor
 from rcirl_jax.features import feature_map
@@ -54,19 +53,19 @@ def train_round(
     anchor = None
     if path:
         anchor, inputs = read_anchor(path), {**inputs, "anchor": file_sha256(path)}
-    work = functools.partial(_train_one, run, dataset, 0, file, None, anchor)
+    work = functools.partial(_train_one, run, dataset, 0, file, anchor)
     run.stage(f"rehearse learner {number}", inputs, [file], work)
 
 
 def train_seeds(run: Run, dataset: Demonstrations) -> None:
     """Train every seed, export it, choose the median one."""
     inputs, files = _inputs(run, dataset), run.seed_files
-    judged, anchor = run.config.preferences, None
+    anchor = None
     if path := _anchor_file(run, run.config.rehearsal.datasets):
         anchor, inputs = read_anchor(path), {**inputs, "anchor": file_sha256(path)}
     for number, file in enumerate(files):
         named = {**inputs, "seed": number}
-        work = functools.partial(_train_one, run, dataset, number, file, judged, anchor)
+        work = functools.partial(_train_one, run, dataset, number, file, anchor)
         run.stage(f"train {number}", named, [file], work)
     hashes = [file_sha256(file) for file in files]
     choose = functools.partial(_choose, run, dataset)
@@ -86,33 +85,23 @@ def _anchor_file(run: Run, drives: int) -> Path | None:
 
 
 def _inputs(run: Run, dataset: Demonstrations) -> dict:
-    """What decides a training besides its seed, anchor and what people said."""
+    """What decides a training besides its seed and anchor."""
     settings = dataclasses.asdict(run.config.train)
     return {"config": settings, "dataset": dataset.hash, **run.code()}
 
 
 def _train_one(
-    run: Run,
-    dataset: Demonstrations,
-    seed: int,
-    file: Path,
-    judged: Path | None,
-    anchor: Anchor | None,
+    run: Run, dataset: Demonstrations, seed: int, file: Path, anchor: Anchor | None
 ) -> None:
     """One training run, exported."""
     config = dataclasses.replace(run.config.train, seed=seed)
-    if judged is None:
-        config = dataclasses.replace(config, preferences="")
     workdir = workdir_of(run, dataset, seed)
-    # people judged scenes of the first source, whose rows come first
-    whose = dataset.parts[0] if isinstance(dataset, JoinedDatasets) else dataset
     train(
         dataset,
         workdir,
         config,
         running=run.running,
         provenance=dict(run.facts),
-        preferences=read_preferences(judged, whose) if judged else None,
     )
     file.parent.mkdir(parents=True, exist_ok=True)
     export_run(workdir, dataset, file, anchor=anchor)

@@ -301,7 +301,6 @@ def import_logs(
     output: str | Path,
     config: ImportConfig,
     *,
-    overwrite: bool = False,
     before_commit: Callable[[Dataset], object] = lambda dataset: None,
 ) -> Manifest:
     """Import recordings into a dataset, one after the other; shows scenes/s.
@@ -310,7 +309,6 @@ def import_logs(
       recordings: from `importers.read_recordings`.
       output: dataset folder or tensorstore URL.
       config: collection and split settings.
-      overwrite: replace a finished dataset.
       before_commit: as `DatasetWriter.finish`.
 
     Returns:
@@ -325,7 +323,7 @@ def import_logs(
     def cuts(known: dict[str, str]) -> Iterable[Cut]:
         return (cut(recording, config.collect, known) for recording in recordings)
 
-    return _import(cuts, None, output, config, overwrite, before_commit)
+    return _import(cuts, None, output, config, False, before_commit)
 
 
 def import_parts(

@@ -197,9 +197,9 @@ def _bootstrap(cluster: np.ndarray | ClusterBootstrap) -> ClusterBootstrap:
     )
 
 
-def _interval(replicates: np.ndarray, confidence: float) -> tuple[float, float, float]:
+def _interval(replicates: np.ndarray) -> tuple[float, float, float]:
     """(low, high, standard error) of bootstrap replicates."""
-    tail = 0.5 * (1.0 - confidence)
+    tail = 0.5 * (1.0 - CONFIDENCE)
     low, high = np.quantile(replicates, [tail, 1.0 - tail])
     return float(low), float(high), float(np.std(replicates, ddof=1))
 
@@ -209,7 +209,6 @@ def combine_seeds(
     cluster: np.ndarray | ClusterBootstrap,
     *,
     weight: np.ndarray | None = None,
-    confidence: float = CONFIDENCE,
 ) -> Estimate:
     """Mean over runs and scenes, with an interval that covers both.
 
@@ -220,21 +219,18 @@ def combine_seeds(
       values: [R, S], or [S] for a single run.
       cluster: [S] int, or the bootstrap to share.
       weight: [S] weights of the scenes, for a ratio of sums.
-      confidence: of the percentile interval.
 
     Returns:
       Estimate; `seed_sd` is the standard deviation of the runs' means.
     """
     bootstrap = _bootstrap(cluster)
     replicates = bootstrap.means(values, weight)
-    return estimate_of(bootstrap.mean(values, weight), replicates, confidence)
+    return estimate_of(bootstrap.mean(values, weight), replicates)
 
 
-def estimate_of(
-    means: np.ndarray, replicates: np.ndarray, confidence: float
-) -> Estimate:
+def estimate_of(means: np.ndarray, replicates: np.ndarray) -> Estimate:
     """From the means of runs [R] and bootstrap replicates [n]; see `combine_seeds`."""
-    low, high, se = _interval(replicates, confidence)
+    low, high, se = _interval(replicates)
     value, count = float(means.mean()), means.size
     if count == 1:
         return Estimate(value=value, low=low, high=high, se=se)
@@ -248,12 +244,10 @@ def estimate_of(
 def bootstrap_median(
     values: np.ndarray,
     cluster: np.ndarray | ClusterBootstrap,
-    *,
-    confidence: float = CONFIDENCE,
 ) -> Estimate:
     """Median over scenes [S] of one run, with the interval of resampled vehicles."""
     bootstrap = _bootstrap(cluster)
-    low, high, se = _interval(bootstrap.medians(values), confidence)
+    low, high, se = _interval(bootstrap.medians(values))
     return Estimate(value=float(np.median(values)), low=low, high=high, se=se)
 
 
@@ -263,7 +257,6 @@ def paired_difference(
     cluster: np.ndarray | ClusterBootstrap,
     *,
     weight: np.ndarray | None = None,
-    confidence: float = CONFIDENCE,
 ) -> Difference:
     """Mean of a - b on the same scenes; the vehicles are resampled together.
 
@@ -278,17 +271,16 @@ def paired_difference(
       b: [R', S] or [S].
       cluster: [S] int, or the bootstrap to share.
       weight: [S] weights of the scenes, for a difference of ratios.
-      confidence: of the percentile interval.
     """
     bootstrap = _bootstrap(cluster)
     mean = bootstrap.mean(a, weight).mean() - bootstrap.mean(b, weight).mean()
     replicates = bootstrap.means(a, weight, 1) - bootstrap.means(b, weight, 2)
-    return difference_of(float(mean), replicates, confidence)
+    return difference_of(float(mean), replicates)
 
 
-def difference_of(mean: float, replicates: np.ndarray, confidence: float) -> Difference:
+def difference_of(mean: float, replicates: np.ndarray) -> Difference:
     """A difference from its bootstrap replicates [n]; see `paired_difference`."""
-    low, high, se = _interval(replicates, confidence)
+    low, high, se = _interval(replicates)
     total = replicates.size + 1
     below = (1 + np.count_nonzero(replicates <= 0.0)) / total
     above = (1 + np.count_nonzero(replicates >= 0.0)) / total
@@ -307,9 +299,7 @@ def family_clusters(families: Sequence[str] | np.ndarray) -> np.ndarray:
     return index if index.max() > 0 else np.arange(index.size)
 
 
-def cluster_t(
-    a: np.ndarray, b: np.ndarray, cluster: np.ndarray, confidence: float = CONFIDENCE
-) -> Difference:
+def cluster_t(a: np.ndarray, b: np.ndarray, cluster: np.ndarray) -> Difference:
     """Mean of a - b with Student's interval over clusters, for few of them.
 
         z_g = G / S * sum of (a - b) in cluster g,   t = mean z / (sd z / sqrt(G))
@@ -317,13 +307,12 @@ def cluster_t(
     with G - 1 degrees of freedom. A percentile bootstrap of two clusters takes
     agreement by chance for certainty; this does not. Clusters that all say the same
     have no spread to reckon with: p is then that of their signs, 2^(1 - G), or 1 if
-    they all say 0, and the interval has no ends unless p < 1 - confidence.
+    they all say 0, and the interval has no ends unless p < 1 - CONFIDENCE.
 
     Args:
       a: [S].
       b: [S].
       cluster: [S] int; at least 2 different ones.
-      confidence: of the interval.
     """
     found, index = np.unique(np.asarray(cluster), return_inverse=True)
     groups, difference = found.size, np.asarray(a, float) - np.asarray(b, float)
@@ -334,8 +323,8 @@ def cluster_t(
     df = groups - 1
     if se == 0.0:
         p = 1.0 if mean == 0.0 else 2.0 ** (1 - groups)
-        reach = 0.0 if mean == 0.0 or p < 1.0 - confidence else math.inf
+        reach = 0.0 if mean == 0.0 or p < 1.0 - CONFIDENCE else math.inf
         return Difference(mean=mean, low=mean - reach, high=mean + reach, se=0.0, p=p)
-    reach = se * float(stdtrit(df, 0.5 * (1.0 + confidence)))
+    reach = se * float(stdtrit(df, 0.5 * (1.0 + CONFIDENCE)))
     p = 2.0 * float(stdtr(df, -abs(mean) / se))
     return Difference(mean=mean, low=mean - reach, high=mean + reach, se=se, p=p)

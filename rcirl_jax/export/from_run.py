@@ -27,6 +27,7 @@ from rcirl_jax.runtime.settings import typed_settings
 from rcirl_jax.train.featurise import featurised
 from rcirl_jax.train.loop import normaliser_rows, restore_run, to_device_batch
 from rcirl_jax.train.metrics import read_metrics
+from rcirl_jax.train.running import of_today
 from rcirl_jax.train.state import TrainConfig, TrainState
 from rcirl_jax.units import TIMES_S
 
@@ -42,7 +43,7 @@ def config_of(settings: Mapping[str, Any]) -> TrainConfig:
     for name in ("reward", "sampler"):
         settings[name]  # these are no flags with a default
     # runs of before the planner's prediction learned from the record
-    settings = {"futures": "recorded", "admissible_in": "none", **settings}
+    settings = {"futures": "recorded", "admissible_in": "none", **of_today(settings)}
     return typed_settings(TrainConfig, settings)
 
 

@@ -11,30 +11,16 @@ from rcirl_jax.evaluation.closed_loop.suite import (
     drive_here,
     run_suite,
 )
-from rcirl_jax.evaluation.gate.pairs import constructed_rows
 from rcirl_jax.evaluation.gate.runs import CANDIDATE, INCUMBENT, repeats
 from rcirl_jax.export.spread import SuiteJob, spread
 from rcirl_jax.runtime.executors import Executor
 from rcirl_jax.simulation.cases import STEP_S
-from rcirl_jax.simulation.rows import BASELINES, Row
+from rcirl_jax.simulation.rows import BASELINES
 from rcirl_jax.simulation.suite import FULL_S, SMOKE_S, CaseRef, suite_refs
 
 
-class ErrorsJob(SuiteJob):
-    """A suite that drivers of known truth drive too, or alone where it has no weights.
-
-    Made of a job by `ErrorsJob(**vars(job))`.
-    """
-
-    def rows(self) -> list[Row]:
-        """The rows of a job with weights, then those made from hand-set."""
-        others = super().rows() if self.weights else []
-        known = {row.name: row for row in (*others, *constructed_rows())}
-        return [*known.values()]
-
-
 def gate_job(
-    candidate: str | None,
+    candidate: str,
     incumbent: str,
     *,
     suite: str,
@@ -49,7 +35,7 @@ def gate_job(
     """The suite that both drive, and the name of the incumbent's row.
 
     Args:
-      candidate: weights file; None: for an `ErrorsJob` without one.
+      candidate: weights file.
       incumbent: weights file, or the name of a baseline.
       suite: full, smoke, or families with commas.
       cases: per family; None: as declared.
@@ -73,8 +59,7 @@ def gate_job(
             + ", ".join(BASELINES)
         )
     names = [*rivals] if learned else [incumbent, *rivals]
-    files = {CANDIDATE: candidate, INCUMBENT: incumbent if learned else None}
-    files = {name: file for name, file in files.items() if file is not None}
+    files = {CANDIDATE: candidate, **({INCUMBENT: incumbent} if learned else {})}
     job = SuiteJob(
         weights=tuple(files.values()),
         names=tuple(files),

@@ -143,23 +143,6 @@ class Reward:
             if found != wanted:
                 _fail(f"{self.file}: features[{index}]", found, str(wanted))
 
-    def point_rewards(self, features: np.ndarray) -> np.ndarray:
-        """R(f) of single points, before gamma.
-
-        A conditioned reward (with a context) has no reward of a point without its
-        scene: it raises.
-
-        Args:
-          features: [..., F] raw features in the file's order and units.
-
-        Returns:
-          float32 [...]; a NaN among a point's features gives NaN.
-        """
-        if self.context is not None:
-            _fail(f"{self.file}: context", "conditioned", "whole trajectories: value()")
-        points = self._numbers(features, (len(self.names),))
-        return self._network(self._normalise(points))
-
     def value(
         self, features: np.ndarray, time_valid: np.ndarray | None = None
     ) -> np.ndarray:

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from rcirl_jax.data.store.joined import Demonstrations
-from rcirl_jax.data.store.preferences import read_preferences
 from rcirl_jax.errors import UNFORESEEN, InputError
 from rcirl_jax.evaluation.ranking.sweep import (
     SweepConfig,
@@ -32,7 +31,7 @@ from rcirl_jax.export.reader import RANGES, Reward
 from rcirl_jax.export.sweep.run import write_member
 from rcirl_jax.runtime.settings import typed_settings
 from rcirl_jax.train.loop import train
-from rcirl_jax.train.running import Running
+from rcirl_jax.train.running import Running, of_today
 from rcirl_jax.train.state import TrainConfig
 
 NEEDED = ("config", "flags", "seed", "dataset_sha256")
@@ -116,7 +115,8 @@ def sweep_of(
     _check_source(reward, dataset, (*NEEDED, "sweep"))
     found, file = reward.provenance, reward.file
     with _of_this_version(f"{file}: provenance.sweep"):
-        grid = {**found["sweep"], "data": list(names)}
+        grid = dict(found["sweep"])
+        grid |= {"base": of_today(grid["base"]), "data": list(names)}
         sweep = typed_settings(SweepConfig, grid)
     member = _config_of(reward)
     if member not in sweep.members():
@@ -194,7 +194,6 @@ def train_again(
     dataset: Demonstrations,
     folder: Path,
     provenance: Mapping[str, Any],
-    preferences: Path | None = None,
 ) -> Reward:
     """Train FOLDER/run as the file was trained and write FOLDER/weights.msgpack.
 
@@ -203,31 +202,20 @@ def train_again(
       dataset: its data.
       folder: a new folder.
       provenance: of this run.
-      preferences: file of the judgements; default: the one that the flags name.
 
     Raises:
-      InputError: as `settings_of`; the folder has a run; other preferences.
+      InputError: as `settings_of`; the folder has a run.
     """
     config, flags = settings_of(reward, dataset), reward.provenance["flags"]
     workdir = folder / "run"
     if workdir.exists():
         raise InputError(f"{workdir}: exists: expected a folder without a run")
-    judged = None
-    if config.preferences:
-        path = preferences or Path(str(flags.get("preferences")))
-        judged = read_preferences(path, dataset)
-        if judged.sha256 != config.preferences:
-            raise InputError(
-                f"{path}: sha256: {judged.sha256}: expected {config.preferences}, the "
-                "judgements of the file"
-            )
     train(
         dataset,
         workdir,
         config,
         running=Running(parallel=str(flags.get("parallel", "jit"))),
         provenance=dict(provenance),
-        preferences=judged,
     )
     output = folder / "weights.msgpack"
     ranges = reward.seen is not None

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from scipy.interpolate import make_smoothing_spline
 from scipy.spatial import KDTree
 
-NEWTON_STEPS = 6  # iterations of to_frenet after the nearest grid point
+NEWTON_STEPS = 6  # iterations after the nearest grid point
 CHUNK = 1024  # points per device call of project_points
 SMALL_CHUNK = 128  # likewise, where there are no more
 SMOOTHING = 30.0  # penalty of the smoothing spline on second derivatives
@@ -109,26 +109,11 @@ def _curve(line: ReferenceLine, s: jax.Array) -> tuple:
     return x + beyond * jnp.cos(heading), y + beyond * jnp.sin(heading), heading
 
 
-def to_cartesian(
-    line: ReferenceLine, s: Float[Array, ""], l: Float[Array, ""]
-) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """(x, y) m of a Frenet point, the line's heading rad and curvature 1/m."""
-    x, y, heading = _curve(line, s)
-    kappa = lookup(line.kappa, s, line.step)
-    return x - l * jnp.sin(heading), y + l * jnp.cos(heading), heading, kappa
-
-
-def to_frenet(
-    line: ReferenceLine, x: Float[Array, ""], y: Float[Array, ""]
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """(s, l) m of a point: nearest grid point, then Newton on t(s).(p - r(s))."""
-    nearest = jnp.argmin((line.x - x) ** 2 + (line.y - y) ** 2)
-    return _from_nearest(line, x, y, nearest)
-
-
 def _from_nearest(
     line: ReferenceLine, x: jax.Array, y: jax.Array, nearest: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
+    """(s, l) m of a point: from the nearest grid point, Newton on t(s).(p - r(s))."""
+
     def improve(s: jax.Array, _: None) -> tuple[jax.Array, None]:
         rx, ry, heading = _curve(line, s)
         along = (x - rx) * jnp.cos(heading) + (y - ry) * jnp.sin(heading)
@@ -146,7 +131,7 @@ def _from_nearest(
 def _project(
     line: ReferenceLine, x: jax.Array, y: jax.Array, near: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """`to_frenet` where the nearest grid point is `near` or a neighbour of it."""
+    """(s, l) m where the nearest grid point is `near` or a neighbour of it."""
     some = jnp.clip(near + jnp.arange(-1, 2), 0, line.x.shape[0] - 1)
     distance = (line.x[some] - x) ** 2 + (line.y[some] - y) ** 2
     return _from_nearest(line, x, y, some[jnp.argmin(distance)])
@@ -155,7 +140,7 @@ def _project(
 def project_points(
     line: ReferenceLine, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`to_frenet` of points [q, 2], numpy; padded so that few sizes compile.
+    """(s, l) m of points [q, 2], numpy; padded so that few sizes compile.
 
     A tree finds the nearest grid points: trying all takes most of an import's time.
     """

@@ -104,7 +104,7 @@ class Following:
 
 
 def predict(
-    bodies: Bodies, ego: Ego, path: Path, how: Following = Following()
+    bodies: Bodies, ego: Ego, path: Path
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Stations [M, T] m, offsets [M, T] m and speeds [M, T] m/s of the others.
 
@@ -117,6 +117,7 @@ def predict(
     start. Hard braking goes on until standing;
     what crosses or comes towards the ego keeps its speed. Speeds never change sign.
     """
+    how = Following()
     l, crosses = lateral_motion(bodies, path)
     count = bodies.s.shape[0]
     times = jnp.asarray(TIMES_S)

@@ -10,8 +10,6 @@ from rcirl_jax.sampling.config import SamplerConfig
 from rcirl_jax.types import Scene
 from rcirl_jax.units import STATION_STEP_M
 
-LATERAL_FAMILIES = ("hold", "centre", "left", "right", "nudge")
-
 
 def num_lateral(config: SamplerConfig) -> int:
     """Number of lateral profiles: hold, centre, two neighbours each time, nudges."""

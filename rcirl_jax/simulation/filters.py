@@ -11,33 +11,33 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rcirl_jax.simulation.cases import STEP_S
+
+ORDER = 2  # of the polynomials
+
 
 @functools.cache
-def coefficients(window: int, order: int, derivative: int) -> tuple[float, ...]:
-    """Weights of the least-squares polynomial's derivative at the middle.
+def coefficients(window: int, derivative: int) -> tuple[float, ...]:
+    """Weights of the least-squares parabola's derivative at the middle.
 
-    Per sample step; the caller divides by step**derivative.
+    Per sample step; the caller divides by STEP_S**derivative.
     """
     half = window // 2
     x = np.arange(-half, half + 1)
-    powers = np.vander(x, order + 1, increasing=True)
+    powers = np.vander(x, ORDER + 1, increasing=True)
     rows = np.linalg.pinv(powers)
     return tuple(float(w) for w in rows[derivative] * np.prod(range(1, derivative + 1)))
 
 
-def savitzky_golay(
-    x: jax.Array, window: int, derivative: int = 0, step: float = 0.1, order: int = 2
-) -> jax.Array:
+def savitzky_golay(x: jax.Array, window: int, derivative: int = 0) -> jax.Array:
     """Smoothed x [S], or its derivative by time; ends hold their values.
 
     Args:
-      x: [S], any unit.
+      x: [S], any unit, a sample every `STEP_S`.
       window: samples; an even one is enlarged by one.
       derivative: 0 or 1.
-      step: s between samples.
-      order: of the polynomial.
     """
     odd = window | 1
-    weights = jnp.asarray(coefficients(odd, order, derivative), x.dtype)
+    weights = jnp.asarray(coefficients(odd, derivative), x.dtype)
     padded = jnp.pad(x, odd // 2, mode="edge")
-    return jnp.convolve(padded, weights[::-1], mode="valid") / step**derivative
+    return jnp.convolve(padded, weights[::-1], mode="valid") / STEP_S**derivative

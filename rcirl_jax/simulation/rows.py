@@ -66,11 +66,10 @@ def learned_row(
     preset: str,
     activation: str,
     config: RankConfig,
-    seed: int = 0,
 ) -> Row:
     """A learned reward, ranking; weights are effective (pinned) parameters."""
     score = learned_score(feature_map(preset), activation)
-    return Row(name=name, policy=rank_policy(score, config), params=weights, seed=seed)
+    return Row(name=name, policy=rank_policy(score, config), params=weights)
 
 
 def guarded_row(
@@ -121,7 +120,7 @@ def human_row() -> Row:
 
 
 def baseline_row(
-    name: str, preset: str, normaliser: Normaliser, config: RankConfig, seed: int = 0
+    name: str, preset: str, normaliser: Normaliser, config: RankConfig
 ) -> Row:
     """A baseline by its name in `BASELINES`.
 
@@ -130,7 +129,6 @@ def baseline_row(
       preset: feature preset of the random weights.
       normaliser: of the learned reward; random weights see the same inputs.
       config: of the ranking planner.
-      seed: of the random weights.
     """
     if name == "hand-set":
         return Row(name=name, policy=rank_policy(hand_score, config))
@@ -148,7 +146,7 @@ def baseline_row(
     if name == "random weights":
         shape = RewardConfig()
         count = feature_map(preset).num_features
-        params = init_reward(jax.random.key(seed), count, shape)
+        params = init_reward(jax.random.key(0), count, shape)
         weights = (pinned(params, shape), normaliser)
-        return learned_row(name, weights, preset, shape.activation, config, seed)
+        return learned_row(name, weights, preset, shape.activation, config)
     raise InputError(f"--baselines: {name}: expected some of {', '.join(BASELINES)}")

@@ -172,20 +172,13 @@ def rollout_config(row: Row, duration_s: float, plan_every: int) -> RolloutConfi
     )
 
 
-class _Reduce:
-    """Record -> CaseMetrics; one object per thresholds, so programs are reused."""
-
-    made: dict[MetricsConfig, Callable] = {}  # noqa: RUF012
-
-    @classmethod
-    def of(cls, config: MetricsConfig) -> Callable:
-        if config not in cls.made:
-            cls.made[config] = lambda record: case_metrics(record, config)
-        return cls.made[config]
+def _reduced(record: Record) -> CaseMetrics:
+    """With the usual thresholds; one object, so that programs are reused."""
+    return case_metrics(record, MetricsConfig())
 
 
 def drive_with_logs(
-    row: Row, cases: Case, config: RolloutConfig, metrics: MetricsConfig | None = None
+    row: Row, cases: Case, config: RolloutConfig
 ) -> tuple[CaseMetrics, Record, Snapshot]:
     """Drive a few cases [n] as `drive_row` does, and keep what pictures need.
 
@@ -198,9 +191,8 @@ def drive_with_logs(
     count = cases.steps.shape[0]
     fill = np.minimum(np.arange(-(-count // LANES) * LANES), count - 1)
     full = jax.tree.map(lambda leaf: np.asarray(leaf)[fill], cases)
-    reduce = _Reduce.of(metrics or MetricsConfig())
     made, (record, shots, _) = drive_cases(
-        row.policy, row.params, full, config, reduce, keep=True
+        row.policy, row.params, full, config, _reduced, keep=True
     )
     return jax.tree.map(lambda leaf: np.asarray(leaf)[:count], (made, record, shots))
 
@@ -212,7 +204,6 @@ def drive_row(
     config: RolloutConfig,
     *,
     chunk: int,
-    metrics: MetricsConfig | None = None,
     progress: Progress | None = None,
 ) -> CaseMetrics:
     """Drive `total` cases with one row; metrics with numpy leaves [total].
@@ -224,10 +215,8 @@ def drive_row(
       config: of the rollouts.
       chunk: cases in memory at a time, rounded up to whole groups of `LANES`;
         the metrics do not depend on it.
-      metrics: thresholds.
       progress: told how many cases have been driven since the last call.
     """
-    reduce = _Reduce.of(metrics or MetricsConfig())
     size = -(-min(chunk, total) // LANES) * LANES
     parts = []
     for first in range(0, total, size):
@@ -235,7 +224,7 @@ def drive_row(
         cases = cases_of(first, first + count)
         fill = np.minimum(np.arange(size), count - 1)
         full = jax.tree.map(lambda leaf, f=fill: np.asarray(leaf)[f], cases)
-        found = drive_cases(row.policy, row.params, full, config, reduce)
+        found = drive_cases(row.policy, row.params, full, config, _reduced)
         parts.append(jax.tree.map(lambda leaf, n=count: np.asarray(leaf)[:n], found))
         if progress is not None:
             progress(count)

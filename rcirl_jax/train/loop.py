@@ -9,7 +9,6 @@ batch; process 0 alone writes run.json and metrics.
 import contextlib
 import dataclasses
 import functools
-import itertools
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -22,7 +21,6 @@ import numpy as np
 
 from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.data.store.order import split_batches
-from rcirl_jax.data.store.preferences import Preferences
 from rcirl_jax.data.store.rows import check_finite
 from rcirl_jax.data.store.stream import Prefetch
 from rcirl_jax.errors import InputError
@@ -35,7 +33,6 @@ from rcirl_jax.train.featurise import featurised
 from rcirl_jax.train.finite import check_features, check_step
 from rcirl_jax.train.metrics import MetricsWriter, Progress
 from rcirl_jax.train.parallel import Parallel, Step, parallelise
-from rcirl_jax.train.preferences import featurise_preferences, pairs_of_step
 from rcirl_jax.train.processes import all_stop_after, is_first, with_the_others
 from rcirl_jax.train.running import Running, check_run, describe_run
 from rcirl_jax.train.state import Batch, FeatureBatch, TrainConfig, TrainState
@@ -55,10 +52,7 @@ def to_device_batch(
 
 
 def host_batch(
-    demonstrations: Demonstration,
-    weight: np.ndarray,
-    index: np.ndarray,
-    preferences: FeatureBatch | None = None,
+    demonstrations: Demonstration, weight: np.ndarray, index: np.ndarray
 ) -> Batch:
     """Numpy rows -> a Batch of numpy arrays of the step's types."""
     weight, index = np.asarray(weight, np.float32), np.asarray(index, np.int32)
@@ -66,7 +60,6 @@ def host_batch(
         demonstrations=demonstrations,
         weight=cast(jax.Array, weight),
         index=cast(jax.Array, index),
-        preferences=preferences,
     )
 
 
@@ -149,7 +142,6 @@ def train(
     *,
     running: Running | None = None,
     provenance: dict | None = None,
-    preferences: Preferences | None = None,
 ) -> TrainResult:
     """Train on the dataset's training split; resumes from the last checkpoint.
 
@@ -159,8 +151,6 @@ def train(
       config: everything that decides the result.
       running: what does not: devices, memory, checkpoints.
       provenance: extra facts for run.json.
-      preferences: pairs that people judged, of this dataset; `config.preferences`
-        is their hash.
 
     Raises:
       InputError: the workdir belongs to other settings or another dataset, is in
@@ -169,14 +159,10 @@ def train(
       Interrupted: told to end; the last step is saved.
     """
     running = running or Running()
-    if config.preferences != (preferences.sha256 if preferences else ""):
-        raise ValueError("config.preferences: expected the hash of the preferences")
     parallel = step_of(config.for_step, running.parallel)
     check_run(workdir, config, dataset)
     with only_one(workdir) if is_first() else contextlib.nullcontext():
-        return _train(
-            dataset, workdir, config, parallel, running, provenance or {}, preferences
-        )
+        return _train(dataset, workdir, config, parallel, running, provenance or {})
 
 
 @functools.lru_cache(maxsize=2)
@@ -199,7 +185,6 @@ def _train(
     parallel: Parallel,
     running: Running,
     provenance: dict,
-    preferences: Preferences | None,
 ) -> TrainResult:
     """`train` in a folder that is this run's alone."""
     features = feature_map(config.features)
@@ -225,10 +210,6 @@ def _train(
     describe_run(workdir, config, dataset, provenance)
     per_epoch = batches.batches_per_epoch
     run = _Run(config, running, features, per_epoch, workdir, state, dataset)
-    if preferences is not None:
-        run.judged = featurise_preferences(preferences, dataset, config)
-
-    steps = itertools.count(int(state.step))
 
     def produce() -> tuple:
         """The next batch, on its devices before its step, and where it stands."""
@@ -236,8 +217,7 @@ def _train(
             raise StopIteration
         rows, weight, index = next(batches)
         weight = weight * dataset.weights(index)
-        made = host_batch(rows, weight, index, run.judged_at(next(steps)))
-        return parallel.place(made), batches.state()
+        return parallel.place(host_batch(rows, weight, index)), batches.state()
 
     # a signal waits for the end of the step, and for what is being saved
     with (
@@ -300,7 +280,6 @@ class _Run:
         self.writer = MetricsWriter(workdir, first_step) if is_first() else None
         self.progress = Progress(total, first_step, "train", shown=is_first())
         self.summaries: list[dict] = []
-        self.judged: FeatureBatch | None = None  # preferences, all of them
         self.told: Callable[[], int | None] = lambda: None  # signal to end at
 
     def close(self) -> None:
@@ -334,19 +313,6 @@ class _Run:
             self.summaries.append(_summary(epoch, sums))
         return state
 
-    def judged_at(self, step: int) -> FeatureBatch | None:
-        """This process's preferences of a step."""
-        if self.judged is None:
-            return None
-        return pairs_of_step(
-            self.judged,
-            step,
-            most=self.config.batch_size,
-            devices=jax.device_count(),
-            process=jax.process_index(),
-            processes=jax.process_count(),
-        )
-
     def _told_to_stop(self, step: int) -> int | None:
         """Number of a signal to end after this step, the same in all processes."""
         if jax.process_count() > 1:
@@ -369,9 +335,6 @@ class _Run:
             rate = self.progress.queries / self.progress.seconds
             norm = float(metrics.grad_norm)
             more = {"grad_norm": norm, "pairs": pairs, "queries_per_s": rate}
-            if self.judged is not None:
-                won, all_of = (float(x) for x in metrics.preferred)
-                more["preferences_won"] = won / max(all_of, 1.0)
             self.writer.write(step, {**shown, **more})
         counted = (metrics.loss_sum, metrics.terms, metrics.wins, metrics.pairs)
         return np.array([float(x) for x in counted])

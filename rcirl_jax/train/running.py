@@ -2,8 +2,9 @@
 
 import dataclasses
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.errors import InputError
@@ -46,15 +47,16 @@ def check_run(workdir: Path, config: TrainConfig, dataset: Demonstrations) -> No
     if not path.exists():
         return
     found = _read_run(path)
+    made = of_today(found["config"])
     described = _described(config, dataset)
     usual = _described(TrainConfig(), dataset)["config"]  # of settings added since
     if found.get("dataset_hash") != described["dataset_hash"]:
         raise InputError(f"{path}: dataset_hash: made from another dataset")
-    for name in found["config"]:
+    for name in made:
         if name not in described["config"]:
             raise InputError(f"{path}: {name}: unknown: expected a run of this version")
     for name, setting in described["config"].items():
-        before = found["config"].get(name, usual[name])
+        before = made.get(name, usual[name])
         if isinstance(before, dict) and isinstance(usual[name], dict):
             before = {**usual[name], **before}
         if before != setting and name != "epochs":
@@ -62,6 +64,17 @@ def check_run(workdir: Path, config: TrainConfig, dataset: Demonstrations) -> No
                 f"{path}: {name}: {before}: expected {setting} to resume; "
                 "use another --workdir for other settings"
             )
+
+
+def of_today(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of a run without those that are gone, where they decided nothing.
+
+    A run that people's judgements taught as well keeps `preferences`, which is unknown.
+    """
+    gone = ["preference_weight"]
+    if not settings.get("preferences"):
+        gone.append("preferences")
+    return {name: value for name, value in settings.items() if name not in gone}
 
 
 def describe_run(

@@ -72,7 +72,6 @@ RANGES: dict[str, tuple[float, float, str]] = {
     **dict.fromkeys(("batch_size", "epochs", "hard_pool"), (1, np.inf, ">= 1")),
     "seed": (0, 2**31 - 1, "0 to 2147483647"),
     "soft_distance": (1e-6, np.inf, "> 0 m"),
-    "preference_weight": (1e-9, np.inf, "> 0"),
     "train_horizon": (0.4, 8.0, "0.4 to 8 s"),
 }
 
@@ -123,9 +122,6 @@ class TrainConfig:
     # so many times more are drawn each time; those that the reward values most
     # just then are kept (1: all are)
     hard_pool: int = 1
-    # sha256 of the file of human preferences, "" without; their loss counts so much
-    preferences: str = ""
-    preference_weight: float = 1.0
     seed: int = 0
     reward: RewardConfig = dataclasses.field(default_factory=RewardConfig)
     sampler: SamplerConfig = dataclasses.field(default_factory=SamplerConfig)
@@ -173,7 +169,7 @@ class TrainConfig:
     @property
     def for_step(self) -> "TrainConfig":
         """What decides the program of a step: a state and batches bring the rest."""
-        return dataclasses.replace(self, seed=0, epochs=1, preferences="")
+        return dataclasses.replace(self, seed=0, epochs=1)
 
     @property
     def loss_config(self) -> LossConfig:
@@ -237,8 +233,6 @@ class Batch(flax.struct.PyTreeNode, kw_only=True):
     demonstrations: Demonstration  # [B, ...]
     weight: jax.Array  # [B] 1, or 0 for padding
     index: jax.Array  # [B] int32, row in the dataset; seeds the sampler
-    # pairs that people judged, K = 1, of any scenes
-    preferences: FeatureBatch | None = None
 
 
 def weight_decay(config: TrainConfig) -> optax.GradientTransformation:

@@ -4,7 +4,6 @@ Shards carry (sum, count) and divide once after `psum`: a mean of shard means
 is wrong when shards hold different numbers of pairs.
 """
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -47,7 +46,6 @@ class StepMetrics(flax.struct.PyTreeNode, kw_only=True):
     terms: jax.Array  # [] what the loss is divided by: pairs or scenes
     wins: jax.Array  # [] pairs the human wins, ties half
     pairs: jax.Array  # [] feasible pairs (queries)
-    preferred: jax.Array  # [2] preferences that the better one wins, and all
     grad_norm: jax.Array  # []
     # [F + 1] scenes with values that are NaN or infinite, per feature; last: facts
     nonfinite: jax.Array
@@ -183,12 +181,11 @@ def batch_sums(
 
     if isinstance(batch, FeatureBatch):
         return learn(batch) if whole else _by_pieces(learn, batch)
-    scenes = batch.replace(preferences=None)  # those have rows of their own
     if whole:
-        return learn_from(scenes)
+        return learn_from(batch)
     candidates = num_candidates(config.sampler) + config.hard_drawn
     size = block_size(batch.weight.shape[0], candidates)
-    return _by_pieces(learn_from, scenes, size)
+    return _by_pieces(learn_from, batch, size)
 
 
 def make_train_step(
@@ -202,34 +199,18 @@ def make_train_step(
     devices by itself and would gather it for a loop. A step whose loss or gradient
     is not finite leaves the state as it was and says so in the metrics; not by
     `optax.apply_if_finite`, which sees updates only: it cannot name scene and feature.
-    Preferences of a Batch add their own mean loss, times `preference_weight`.
     """
     optimizer = make_optimizer(config)
-    alone = dataclasses.replace(config, hard_negatives=0)  # preferences are as given
 
     def train_step(
         state: TrainState, batch: Batch | FeatureBatch, *, axis_name: str | None = None
     ) -> tuple[TrainState, StepMetrics]:
-        judged = batch.preferences if isinstance(batch, Batch) else None
         (grads, sums), bad = batch_sums(state, batch, config, whole=whole)
         nonfinite, first_bad = count_bad(bad, batch.index)
-        if judged is not None:
-            also, worst = count_bad(bad_values(judged), judged.index)
-            nonfinite = nonfinite.at[:-1].add(also)
-            first_bad = jnp.maximum(first_bad, worst)
         if axis_name is not None:
             sums, grads, nonfinite = jax.lax.psum((sums, grads, nonfinite), axis_name)
             first_bad = jax.lax.pmax(first_bad, axis_name)
         grads = jax.tree.map(lambda g: g / jnp.maximum(sums.terms, 1.0), grads)
-        preferred = jnp.zeros(2)
-        if judged is not None:
-            more, wanted = gradient_sums(state.params, state.normaliser, judged, alone)
-            if axis_name is not None:
-                more, wanted = jax.lax.psum((more, wanted), axis_name)
-            terms = jnp.where(wanted.terms > 0.0, wanted.terms, 1.0)
-            scale = config.preference_weight / terms
-            grads = jax.tree.map(lambda g, m: g + scale * m, grads, more)
-            preferred = jnp.stack([wanted.wins, wanted.pairs])
         norm = optax.tree.norm(grads)
         finite = jnp.isfinite(sums.loss) & jnp.isfinite(norm)
         before = as_tree(state.params)
@@ -248,7 +229,6 @@ def make_train_step(
             terms=sums.terms,
             wins=sums.wins,
             pairs=sums.pairs,
-            preferred=preferred,
             grad_norm=norm,
             nonfinite=nonfinite,
             first_bad=first_bad,

@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from benchmarks.reliability.fuzz import codecs, contract
 from benchmarks.reliability.fuzz.readers import READERS, shares
 from benchmarks.reliability.fuzz.trees import MAX_DEEP, deep, mutate_tree
-from rcirl_jax.data.store import preferences
 from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.export.from_run import read_config
 from rcirl_jax.export.sweep.result import read_sweep
 from rcirl_jax.features import mapping
 from rcirl_jax.report.ranking.sweep_picture import sweep_picture
+from rcirl_jax.runtime import pipeline
 from tests.helpers.commands import command, fresh
 
 FEW = ("apollo", "nuplan", "argoverse2", "l5", "interaction", "suite", "scenarios")
@@ -135,13 +135,9 @@ def test_settings_of_other_types(tmp_path, where, name, value):
 
 
 def test_another_exception_is_a_breach(tmp_path, monkeypatch):
-    """A planted defect: the trajectory's check lets a KeyError out."""
-
-    def planted(where, found):
-        return found["s"], found["l"]
-
-    monkeypatch.setattr(preferences, "_trajectory", planted)
-    target = READERS["preferences"].make(tmp_path / "made")
+    """A planted defect: a stage's record is not looked at."""
+    monkeypatch.setattr(pipeline, "_is_record", lambda record: True)
+    target = READERS["stages"].make(tmp_path / "made")
     found = breaches(target, drawn(target, 60, 1))
     assert any(kind.startswith(("KeyError", "TypeError")) for kind in found), found
     with pytest.raises(AssertionError, match="KeyError"):
@@ -270,12 +266,12 @@ def test_the_command_is_guided_or_refuses(tmp_path):
 def test_the_command_writes_a_row_per_reader(tmp_path):
     done = command(
         "benchmarks.reliability.fuzz",
-        *("--readers=preferences,tfrecord", "--inputs=400", f"--output={tmp_path}"),
+        *("--readers=stages,tfrecord", "--inputs=400", f"--output={tmp_path}"),
         "--unguided",
     )
     assert done.returncode == 0, done.stdout + done.stderr
     rows = json.loads((tmp_path / "fuzz.json").read_text())["rows"]
-    assert [row["reader"] for row in rows] == ["preferences", "tfrecord"]
+    assert [row["reader"] for row in rows] == ["stages", "tfrecord"]
     assert sum(row["inputs"] for row in rows) >= 400
     assert all(row["crashes"] == [] for row in rows)
     assert {row["mutator"] for row in rows} == {"at random, by form"}

@@ -31,10 +31,6 @@ ARTEFACTS = {
     "inspect_data": (
         (DATA, "--scenes=1", "--output={out}"), ("index.html",), (),
     ),
-    "label_check": (
-        (*LOGS, DATA, "--output={out}"),
-        ("labels.json",), ("logs_sha256", "data_hash"),
-    ),
     "replay": (
         (WEIGHTS, "--case=free_cruise/000@0", "--duration=2", "--output={out}"),
         ("case.html", "case.json"), ("weights_sha256",),

@@ -147,15 +147,15 @@ def test_imports_are_numpy_msgpack_and_the_standard_library():
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
-def test_value_is_the_weighted_sum_of_point_rewards(activation):
+def test_value_is_the_sum_over_valid_times(activation):
     weights = example_weights(activation=activation)
     features, valid, values = example_samples(weights, count=6, seed=4)
     reward = decode_weights(packed(activation=activation))
-    points = reward.point_rewards(features)
-    assert points.shape == (6, 4)
-    summed = np.sum(points.astype(np.float64) * weights.gamma * valid, axis=-1)
-    np.testing.assert_allclose(reward.value(features, valid), summed, atol=2e-6)
-    np.testing.assert_allclose(summed, values, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(
+        reward.value(features, valid), values, rtol=1e-5, atol=1e-5
+    )
+    alone = [reward.value(features, valid & (np.arange(4) == t)) for t in range(4)]
+    np.testing.assert_allclose(np.sum(alone, axis=0), values, rtol=1e-5, atol=1e-5)
 
 
 def test_leading_axes_and_the_shared_mask():
@@ -215,8 +215,6 @@ def test_infinite_features_are_clipped():
 def test_wrong_arguments_are_one_line(features, time_valid, message):
     with pytest.raises(WeightsError, match=message):
         decode_weights(VALID).value(features, time_valid)
-    with pytest.raises(WeightsError, match="features"):
-        decode_weights(VALID).point_rewards(np.zeros((4, 2)))
 
 
 def test_the_total_is_the_incumbents_value_and_the_gained_one():
@@ -661,7 +659,5 @@ def test_a_conditioned_reward_needs_the_first_time():
     late[1, 0] = False
     with pytest.raises(WeightsError, match=r"time_valid: 0 at the first time: exp"):
         reward.value(features, late)
-    with pytest.raises(WeightsError, match=r"context: conditioned: expected whole"):
-        reward.point_rewards(features)
     with pytest.raises(InputError, match=r"samples\.valid\[1, 0\]: 0: expected 1 at"):
         pack(weights, features, late, values)

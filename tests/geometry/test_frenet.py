@@ -9,12 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rcirl_jax.geometry.frenet import (
+    _curve,
+    _from_nearest,
     lookup,
     path_curvature,
     project_points,
     reference_line_from_polyline,
-    to_cartesian,
-    to_frenet,
 )
 
 
@@ -36,6 +36,22 @@ def line_of(points, size=256):
     return reference_line_from_polyline(points, size=size, step=1.0)
 
 
+@jax.jit
+def placed(line, s, l):
+    """[n, 2] m, of stations and offsets [n]."""
+    x, y, heading = jax.vmap(_curve, in_axes=(None, 0))(line, s)
+    return jnp.stack([x - l * jnp.sin(heading), y + l * jnp.cos(heading)], axis=1)
+
+
+@jax.jit
+def alone(line, points):
+    """(s, l) m of points [n, 2], each from the nearest of all grid points."""
+    x, y = points.T
+    apart = (line.x[:, None] - x) ** 2 + (line.y[:, None] - y) ** 2
+    near = jnp.argmin(apart, axis=0)
+    return jax.vmap(_from_nearest, in_axes=(None, 0, 0, 0))(line, x, y, near)
+
+
 @pytest.mark.parametrize("kind", ["straight", "circle", "clothoid", "s_curve"])
 @pytest.mark.parametrize("noise", [0.0, 0.03])
 def test_round_trip_within_a_centimetre(kind, noise):
@@ -43,8 +59,7 @@ def test_round_trip_within_a_centimetre(kind, noise):
     rng = np.random.default_rng(1)
     s = jnp.asarray(rng.uniform(2.0, 190.0, 300), jnp.float32)
     l = jnp.asarray(rng.uniform(-8.0, 8.0, 300), jnp.float32)
-    x, y, _, _ = jax.vmap(to_cartesian, in_axes=(None, 0, 0))(line, s, l)
-    s_back, l_back = jax.vmap(to_frenet, in_axes=(None, 0, 0))(line, x, y)
+    s_back, l_back = project_points(line, np.asarray(placed(line, s, l)))
     np.testing.assert_allclose(s_back, s, atol=0.01)
     np.testing.assert_allclose(l_back, l, atol=0.01)
 
@@ -65,10 +80,8 @@ def test_many_points_are_projected_as_one_by_one_also_between_legs(legs_apart):
     rng = np.random.default_rng(0)
     points = rng.uniform((-20.0, -40.0), (130.0, 40.0), (3000, 2)).astype(np.float32)
     points = np.concatenate([points, np.stack([line.x, line.y], axis=1)])
-    alone = jax.jit(jax.vmap(to_frenet, in_axes=(None, 0, 0)))
-    for one, other in zip(
-        project_points(line, points), alone(line, *points.T), strict=True
-    ):
+    found = zip(project_points(line, points), alone(line, points), strict=True)
+    for one, other in found:
         np.testing.assert_array_equal(one, other)
 
 
@@ -77,11 +90,9 @@ def test_round_trip_from_cartesian(seed):
     line = line_of(curve("s_curve"))
     rng = np.random.default_rng(seed)
     base = curve("s_curve")[rng.integers(5, 90)]
-    x, y = base + rng.uniform(-5.0, 5.0, 2)
-    s, l = to_frenet(line, jnp.float32(x), jnp.float32(y))
-    x_back, y_back, _, _ = to_cartesian(line, s, l)
-    assert float(x_back) == pytest.approx(x, abs=0.01)
-    assert float(y_back) == pytest.approx(y, abs=0.01)
+    point = base + rng.uniform(-5.0, 5.0, 2)
+    back = placed(line, *project_points(line, point[None]))
+    np.testing.assert_allclose(back[0], point, atol=0.01)
 
 
 @pytest.mark.parametrize("kind", ["straight", "circle", "s_curve"])
@@ -103,8 +114,8 @@ def test_shapely_projects_to_the_same_station(kind):
 
 def test_left_is_positive():
     line = line_of(curve("straight"))
-    _, l = to_frenet(line, jnp.float32(50.0), jnp.float32(2.0))
-    assert float(l) == pytest.approx(2.0, abs=1e-3)
+    _, l = project_points(line, np.array([[50.0, 2.0]]))
+    assert l[0] == pytest.approx(2.0, abs=1e-3)
 
 
 def test_curvature_of_a_circle_and_of_noise_on_a_straight():
@@ -117,7 +128,8 @@ def test_curvature_of_a_circle_and_of_noise_on_a_straight():
 
 def test_straight_beyond_the_end():
     line = line_of(curve("straight"), size=512)
-    x, y, heading, kappa = to_cartesian(line, jnp.float32(400.0), jnp.float32(0.0))
+    x, y, heading = _curve(line, jnp.float32(400.0))
+    kappa = lookup(line.kappa, 400.0, line.step)
     assert float(x) - float(line.x[0]) == pytest.approx(400.0, abs=0.1)
     assert float(y) == pytest.approx(0.0, abs=0.1)
     assert float(kappa) == 0.0

@@ -26,7 +26,7 @@ from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.simulation import rollout
 from rcirl_jax.simulation import suite as suite_module
 from rcirl_jax.simulation.cases import STEP_S
-from rcirl_jax.simulation.metrics import COLUMNS, MetricsConfig
+from rcirl_jax.simulation.metrics import COLUMNS
 from rcirl_jax.simulation.recorded.config import RecordedConfig
 from rcirl_jax.simulation.rollout import LANES, drive_cases
 from rcirl_jax.simulation.suite import (
@@ -467,9 +467,8 @@ def test_the_drives_are_those_of_the_suite():
     cases, row = small_cases(), cheap_rows()[0]
     config = rollout_config(row, cases.duration_s, 1)
     suite = drive_row(row, cases.build, len(cases.ids), config, chunk=60)
-    reduce = suite_module._Reduce.of(MetricsConfig())
     kept = dataclasses.replace(config, snapshots=True)
-    program = rollout._compiled(row.policy, reduce, kept, None, True)
+    program = rollout._compiled(row.policy, suite_module._reduced, kept, None, True)
     assert program._cache_size() == 1
     at = cases.ids.index(PLAYED[0])
     found, record, shot = drive_with_logs(row, cases.build(at, at + 1), config)

@@ -102,8 +102,7 @@ def test_another_seed_compiles_no_step(dataset, run, tmp_path):
     loop.step_of.cache_clear()
     seeds = [dataclasses.replace(CONFIG, epochs=1, seed=seed) for seed in (0, 1)]
     done = [train(dataset, tmp_path / str(x.seed), x) for x in seeds]
-    judged = dataclasses.replace(CONFIG, preferences="the hash of a file")
-    assert loop.step_of(judged.for_step, "jit").step._cache_size() == 1
+    assert loop.step_of(CONFIG.for_step, "jit").step._cache_size() == 1
     assert loop.step_of.cache_info().misses == 1
     slower = dataclasses.replace(CONFIG, learning_rate=1e-4)
     assert loop.step_of(slower.for_step, "jit").step._cache_size() == 0
@@ -126,9 +125,19 @@ def test_a_run_of_before_a_setting_may_resume(dataset, run, tmp_path):
     del body["config"]["clip_norm"], body["config"]["reward"]["module"]
     (tmp_path / "run.json").write_text(json.dumps(body))
     check_run(tmp_path, CONFIG, dataset)
+    body["config"] |= {"preferences": "", "preference_weight": 2.0}  # gone since
+    (tmp_path / "run.json").write_text(json.dumps(body))
+    check_run(tmp_path, CONFIG, dataset)
+    assert read_config(tmp_path)[0] == CONFIG
     other = dataclasses.replace(CONFIG, reward=RewardConfig(module="a.b:C"))
     with pytest.raises(InputError, match=r"reward: .*to resume"):
         check_run(tmp_path, other, dataset)
+    body["config"]["preferences"] = "the hash of a file"  # it taught this run
+    (tmp_path / "run.json").write_text(json.dumps(body))
+    with pytest.raises(InputError, match=r"run\.json: preferences: unknown: expected"):
+        check_run(tmp_path, CONFIG, dataset)
+    with pytest.raises(InputError, match=r"run\.json: preferences: unknown: expected"):
+        read_config(tmp_path)
 
 
 def test_run_writes_what_it_should(run):

@@ -15,11 +15,9 @@ from benchmarks.reliability.fuzz.codecs import resealed, toml_text
 from benchmarks.reliability.fuzz.logs import LOGS
 from benchmarks.reliability.fuzz.targets import Bytes, OneFile, Reader, Target
 from rcirl_jax.data.importers.synthetic import reader as synthetic
-from rcirl_jax.data.scenes import signal_checks
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.files import FACTS, MANIFEST, MARK, Files
 from rcirl_jax.data.store.manifest import parse_manifest, shard_entry
-from rcirl_jax.data.store.preferences import SCHEMA, read_preferences
 from rcirl_jax.data.store.shards import describe, shard_info
 from rcirl_jax.evaluation.closed_loop.files import (
     COLUMNS,
@@ -57,7 +55,6 @@ from rcirl_jax.train import checkpoint
 from rcirl_jax.train.metrics import pairs_won
 from rcirl_jax.train.running import check_run, describe_run
 from rcirl_jax.train.state import TrainConfig
-from rcirl_jax.units import NUM_TIMES
 from tests.data.store import test_dataset as test_store
 from tests.helpers.weights_files import packed, random_weights
 
@@ -226,31 +223,6 @@ def distances(folder: Path) -> Target:
     return OneFile(read_arrays, [file])
 
 
-def preferences(folder: Path) -> Target:
-    """Preferences of a dataset of twelve rows."""
-    folder.mkdir(parents=True)
-    rows = np.arange(12)
-    human = types.SimpleNamespace(
-        s=np.zeros((12, NUM_TIMES)), l=np.zeros((12, NUM_TIMES))
-    )
-
-    def chosen(wanted: np.ndarray) -> types.SimpleNamespace:
-        some = types.SimpleNamespace(s=human.s[wanted], l=human.l[wanted])
-        return types.SimpleNamespace(human=some)
-
-    scenes = types.SimpleNamespace(
-        hash="d" * 64, indices=lambda split: rows, read=chosen
-    )
-    head = {"schema": SCHEMA, "schema_version": 1, "dataset_sha256": "d" * 64}
-    slow = {"s": [0.5 * k for k in range(NUM_TIMES)]}
-    lines = [
-        {"scene": k, "better": slow, "worse": "human", "weight": 1.0} for k in (1, 2)
-    ]
-    file = folder / "preferences.jsonl"
-    file.write_text("\n".join(map(json.dumps, [head, *lines])) + "\n")
-    return OneFile(lambda path: read_preferences(path, scenes), [file])  # type: ignore[arg-type]
-
-
 def checkpoints(folder: Path) -> Target:
     """The digests of a checkpoint's files, and its position; no array is restored."""
     step = folder / "3"
@@ -267,17 +239,6 @@ def checkpoints(folder: Path) -> Target:
         checkpoint.read_position(position)
 
     return Target(read, [noted, position], (str(folder),))
-
-
-def checks(folder: Path) -> Target:
-    """Verdicts on traffic lights."""
-    folder.mkdir(parents=True)
-    file = folder / "labels.json"
-    phases = [
-        {"name": "USA_Lanker-1: 1", "verdict": word} for word in signal_checks.VERDICTS
-    ]
-    file.write_text(json.dumps({"phases": phases}))
-    return OneFile(signal_checks.read_signal_checks, [file])
 
 
 def runs(folder: Path) -> Target:
@@ -383,9 +344,7 @@ READERS: dict[str, Reader] = {
     "traffic": Reader(make=traffic),
     "suite": Reader(make=suite),
     "distances": Reader(make=distances, share=3),
-    "preferences": Reader(make=preferences, share=3),
     "checkpoints": Reader(make=checkpoints, share=2),
-    "signal_checks": Reader(make=checks, share=3),
     "runs": Reader(make=runs),
     "stages": Reader(make=stages),
     "metrics": Reader(make=metrics),

@@ -79,15 +79,16 @@ def recording_car(spec: Mapping) -> tuple[tuple[float, float], ...]:
     return spans[driver]
 
 
-def choices(
-    spec: Mapping, key: str, allowed: Sequence[str], default: Sequence[str]
+def lane_types(
+    spec: Mapping, allowed: Sequence[str], default: Sequence[str]
 ) -> tuple[str, ...]:
-    """A list of names, each one of those allowed."""
-    value = spec.get(key, default)
+    """The option `lane_types`: a list of names, each one of those allowed."""
+    value = spec.get("lane_types", default)
     for name in value if isinstance(value, list | tuple) else [value]:
         if name not in allowed:
             raise InputError(
-                f"source TOML: {key}: {name}: expected a list of {', '.join(allowed)}"
+                f"source TOML: lane_types: {name}: expected a list of "
+                + ", ".join(allowed)
             )
     return tuple(value)
 
@@ -209,13 +210,13 @@ def _is_uniform(values: Sequence) -> bool:
     return len(forms) == 1
 
 
-def kind_of(where: str, field: str, found: str, kinds: Mapping[str, str]) -> Kind:
+def kind_of(where: str, found: str, kinds: Mapping[str, str]) -> Kind:
     """Kind of a road user by its type in the file and [kinds] of the TOML."""
     kind = kinds.get(found)
     if found not in kinds:
         raise InputError(
-            f"{where}: {field}: {found}: expected one of {', '.join(kinds) or 'none'} "
-            "([kinds] of the source TOML)"
+            f"{where}: object_type: {found}: expected one of "
+            f"{', '.join(kinds) or 'none'} ([kinds] of the source TOML)"
         )
     if kind not in KINDS:
         raise InputError(

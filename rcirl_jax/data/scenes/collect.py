@@ -61,7 +61,7 @@ class Collector:
         ]
         self.graph = LaneGraph(recording)
         self.signals, self.signal_notes = trusted_signals(
-            recording, config.trust_signals, config.signal_checks
+            recording, config.signal_checks
         )
         self.dropped: collections.Counter[str] = collections.Counter()
         # of the scenes: how many end with their surroundings, times recorded, times cut

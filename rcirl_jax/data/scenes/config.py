@@ -27,8 +27,6 @@ class CollectConfig:
     # the paper's two filters
     require_obstacles: bool = True
     require_speed_change: bool = True
-    # use cycles that a converter wrote, unless the file's own crossings contradict
-    trust_signals: bool = False
     # lines whose lights many files bear out, or refute; before all other rules
     signal_checks: SignalChecks | None = None
 

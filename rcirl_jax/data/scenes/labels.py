@@ -9,7 +9,7 @@ A recorded drive shows what a plan does not. Recorded positions jitter, so a
 standing car is "not moving towards the ego" within a tolerance. And the path is
 the driver's own: a lead that is overtaken by a lane change blocks it at first,
 below the profile, and yet ends up above it.
-`evaluation.labels.truth` measures these rules on drives of known decisions.
+`evaluation.labels.traffic` measures these rules on drivers whose state is known.
 
 Shapes: [S] scenes side by side, [N] obstacles, [T] times, [P] stations of the path.
 All functions work on any leading axes, so on one scene without [S] as well.

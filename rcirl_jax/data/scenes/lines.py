@@ -29,17 +29,15 @@ def signal_state(signal: Signal, times: np.ndarray) -> np.ndarray:
 
 
 def trusted_signals(
-    recording: Recording,
-    trust_written: bool = False,
-    checks: SignalChecks | None = None,
+    recording: Recording, checks: SignalChecks | None = None
 ) -> tuple[dict[str, Signal], list[str]]:
     """Signals whose phases agree with what the drivers did, and notes on others.
 
     Cycles written by a converter need not match the recording. Every crossing
     of a governed stop line is looked up in the cycle; if more than a tenth of
-    at least three crossings happen on red, the signal is not used. Cycles with
-    fewer crossings are used only if `trust_written`: a short file alone cannot
-    confirm them, many together can: where `checks` knows a signal's line its word
+    at least three crossings happen on red, the signal is not used, nor is a cycle
+    with fewer crossings: a short file alone cannot
+    confirm it, many together can: where `checks` knows a signal's line its word
     decides, and of two lines with one light the one that bears it out.
     """
     by_id = {signal.id: signal for signal in recording.signals}
@@ -68,8 +66,7 @@ def trusted_signals(
             continue
         crossings, reds = counts[name]
         wrong = crossings >= MIN_CROSSINGS and reds > MAX_RED_RUNNING * crossings
-        judged = signal.is_recorded or trust_written
-        unproved = not judged and crossings < MIN_CROSSINGS
+        unproved = not signal.is_recorded and crossings < MIN_CROSSINGS
         if wrong or unproved:
             why = "disagrees with the crossings" if wrong else TOO_FEW
             notes.append(f"signal {name}: {why} ({reds} on red of {crossings}); unused")

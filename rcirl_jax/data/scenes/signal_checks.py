@@ -1,23 +1,18 @@
 """What drivers, over many files, say of written traffic lights.
 
-One short file cannot confirm a cycle; `evaluation.labels.logs.check_written` pools the
+One short file cannot confirm a cycle; `evaluation.labels.signals` pools the
 crossings and stands of all files of a place, and an import then uses the lights of the
-lines that they bear out. The labels.json of `experiments.label_check` is read here.
+lines that they bear out.
 """
 
 import dataclasses
-import os
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 
-from rcirl_jax.errors import InputError
-from rcirl_jax.runtime.atomic_files import read_json
 from rcirl_jax.types import Recording
 
 TOGETHER = "all together"  # the check of all signals as one
 CONFIRMED, REJECTED = "confirmed", "rejected"
 OPEN = ("not contradicted", "too few crossings")  # alone; the others may speak for it
-VERDICTS = (CONFIRMED, REJECTED, *OPEN)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -52,32 +47,6 @@ def place_of(recording: str) -> str:
 def line_name(recording: str, signal_ids: Iterable[str]) -> str:
     """One name of a stop line in all files of a place: PLACE/ID or PLACE/ID+ID."""
     return f"{place_of(recording)}/{'+'.join(sorted(signal_ids))}"
-
-
-def read_signal_checks(path: str | os.PathLike[str]) -> SignalChecks:
-    """The verdicts of `experiments.label_check --input`, as an import takes them.
-
-    Args:
-      path: its labels.json.
-
-    Raises:
-      InputError: no such file, or not of that command.
-    """
-    body = read_json(Path(path), "labels.json of experiments.label_check --input")
-    try:
-        found = {check["name"]: check["verdict"] for check in body["phases"]}
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"{path}: phases: {type(error).__name__}: expected labels.json of "
-            "experiments.label_check --input"
-        ) from error
-    for name, verdict in found.items():
-        if not isinstance(name, str) or verdict not in VERDICTS:
-            raise InputError(
-                f"{path}: phases: {str(name)[:40]}: verdict {str(verdict)[:40]}: "
-                f"expected {', '.join(VERDICTS)}"
-            )
-    return signal_checks(found)
 
 
 def signal_checks(verdicts: Mapping[str, str]) -> SignalChecks:

@@ -167,33 +167,3 @@ def check_disjoint(
                     "expected every vehicle in one split only"
                 )
             owner[vehicle] = name
-
-
-def folds(counts: Mapping[str, int], num_folds: int, seed: int) -> list[list[str]]:
-    """Cut groups into folds of nearly equal numbers of rows.
-
-    Largest group first, each to the fold with the fewest rows (first of equals).
-
-    Args:
-      counts: rows per group, each at least 1.
-      num_folds: number of folds, 2 .. number of groups.
-      seed: of the random order among groups of one size.
-
-    Returns:
-      Sorted group names per fold; no fold is empty, every group in exactly one.
-
-    Raises:
-      InputError: more folds than groups, or fewer than two folds.
-    """
-    if not 2 <= num_folds <= len(counts):
-        raise InputError(
-            f"folds: num_folds: {num_folds}: expected 2 to {len(counts)} "
-            "(the number of vehicle-disjoint groups)"
-        )
-    rows = [0] * num_folds
-    members: list[list[str]] = [[] for _ in range(num_folds)]
-    for name in _by_size(counts, seed):
-        smallest = rows.index(min(rows))
-        members[smallest].append(name)
-        rows[smallest] += counts[name]
-    return [sorted(names) for names in members]

@@ -178,9 +178,9 @@ def _interval(scores: np.ndarray, cluster: np.ndarray) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _finite_low(x: np.ndarray, quantile: float) -> float:
-    """A quantile in which "never" (inf) counts as large."""
-    return float(np.quantile(np.minimum(x, 1e3), quantile))
+def _finite_low(x: np.ndarray) -> float:
+    """The 5 % quantile, in which "never" (inf) counts as large."""
+    return float(np.quantile(np.minimum(x, 1e3), 0.05))
 
 
 def _starts(seconds: np.ndarray) -> dict[str, float]:
@@ -229,8 +229,8 @@ def _row(
             "rms_j": float(np.mean(m.rms_j)),
             "worst_a": float(np.min(m.min_a)),
             "worst_j": float(np.max(m.max_j)),
-            "min_ttc_p5": _finite_low(np.asarray(m.min_ttc), 0.05),
-            "min_headway_p5": _finite_low(np.asarray(m.min_headway), 0.05),
+            "min_ttc_p5": _finite_low(np.asarray(m.min_ttc)),
+            "min_headway_p5": _finite_low(np.asarray(m.min_headway)),
             "tet_s": float(np.mean(m.tet)),
             "induced_over_4": float(np.mean(np.asarray(m.induced_braking) > 4.0)),
             "brake_taps": float(np.mean(m.brake_taps)),

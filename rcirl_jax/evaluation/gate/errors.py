@@ -1,282 +1,106 @@
-"""How often is the gate wrong? Its verdicts where the truth is known by construction.
+"""Drivers of known truth, all made of hand-set, and what the gate says of them.
 
-    swapped     candidate and incumbent exchange their drives in cases drawn by a coin:
-                neither is better, whatever they are, and the drives stay paired
-    by family   the same with a coin for each family: equal over families, each of which
-                may well lose, so only what is judged over families can be wrong
-    redrawn     one driver against itself, on the cases of two seeds of the catalogue:
-                equal, and the drives have nothing to do with each other
-    as driven   a pair that is better or worse, or that nobody knows the truth of
-    constructed hand-set against itself with other random candidates (equal), with a
-                lower wanted speed (worse), with some drives of IDM, which has more
-                faults (worse), and the slower one as incumbent (better)
-
-What a gate detects in an equal pair is a false alarm. Rates depend on the number of
-cases: at ten cases a family hardly anything can be detected, and margins of a quarter
-of a percent cannot be shown, so nothing ships.
-
-Nobody is compared with recordings here. Pairs of `pair_between` count as equally near
-to the human, so that the check of likeness passes and gains nothing; a config without
-nulls leaves out that the candidate is ahead of rewards that know nothing. Every other
-check is the gate's. To ship then takes every check of safety, of no loss and of
-families passed, and a gain in a metric. The rule that nothing ships on a part of the
-suite is left out too. Host numpy, but for the drivers.
+What it refuses of the equal one is a false alarm, of the worse ones its power. Nobody
+is compared with recordings: likeness counts as equal, and there are no nulls.
 """
 
+import collections
 import dataclasses
-import itertools
-from collections.abc import Iterable, Mapping, Sequence
-from typing import get_args
+from collections.abc import Sequence
 
+import jax
 import numpy as np
-from scipy.special import betaincinv
 
-from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.files import SuiteRuns
 from rcirl_jax.evaluation.closed_loop.output import text_table
-from rcirl_jax.evaluation.exact import CONFIDENCE
+from rcirl_jax.evaluation.exact import clopper_pearson
+from rcirl_jax.evaluation.gate import types as gate
 from rcirl_jax.evaluation.gate.decision import judge
-from rcirl_jax.evaluation.gate.pairs import (
-    COINS,
-    CONSTRUCTED,
-    MIXES,
-    constructed_pair,
-    joined,
-    redrawn,
-    stacked,
-    swapped,
+from rcirl_jax.evaluation.gate.runs import pair_of
+from rcirl_jax.evaluation.gate.stats import MIN_CLUSTERS
+from rcirl_jax.planner import rank
+from rcirl_jax.planner.baselines import Idm
+from rcirl_jax.planner.plan import Plan
+from rcirl_jax.reward.hand import LatticeCost
+from rcirl_jax.simulation.rows import Row
+from rcirl_jax.types import Scene
+
+HAND_SET, IDM, OTHER = "hand-set", "IDM", "other candidates"
+SLOWER = {"5 % slower": 0.95, "20 % slower": 0.8}  # wanted speed over the limit
+FAULTY = "IDM's faults"  # in some 5 % of the cases
+# candidate, incumbent, what is true of the candidate
+KINDS = (
+    (OTHER, HAND_SET, "equal"),
+    *((name, HAND_SET, "worse") for name in SLOWER),
+    (FAULTY, HAND_SET, "worse"),
+    (HAND_SET, FAULTY, "better"),
 )
-from rcirl_jax.evaluation.gate.types import (
-    Decision,
-    GateConfig,
-    Pair,
-    Verdict,
-)
-from rcirl_jax.simulation.metrics import CaseMetrics
-
-# what a verdict may say: a failed check of a kind, any of them, a gain
-SAID = ("safety", "no loss", "families", "refused", "gain")
-
-DECISIONS: tuple[Decision, ...] = get_args(Decision)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Tally:
-    """What the gate said about pairs of one kind: S suites, D draws of each."""
+def made_rows() -> list[Row]:
+    """Hand-set, itself with other random candidates, two slower ones, and IDM."""
+    policy = rank.rank_policy(rank.hand_score, rank.RankConfig())
 
-    name: str
-    truth: str  # "equal", "better", "worse" or "unknown", of the candidate
-    said: np.ndarray  # [S, D, len(SAID + DECISIONS)] bool
-    cases: int  # of a suite
-    drives: Mapping[str, object] = dataclasses.field(default_factory=dict)  # `compared`
+    def other(p: rank.Params, s: Scene, key: jax.Array, *before: Plan | None) -> Plan:
+        return policy(p, s, jax.random.fold_in(key, 1), *before)
 
-    def of(self, what: str) -> np.ndarray:
-        """[S, D] bool: which verdicts say `what`, one of `SAID` or `DECISIONS`."""
-        return self.said[:, :, (*SAID, *DECISIONS).index(what)]
-
-    def rate(self, what: str) -> tuple[float, float, float]:
-        """Share of the verdicts that say `what`, with its 95 % interval."""
-        return clustered_rate(self.of(what))
-
-    @property
-    def decisions(self) -> dict[Decision, int]:
-        """Number of verdicts by decision, without those that were never taken."""
-        return {w: int(self.of(w).sum()) for w in DECISIONS if self.of(w).any()}
-
-
-def clustered_rate(events: np.ndarray) -> tuple[float, float, float]:
-    """Share of events [S, D] with an exact interval for draws that come in suites.
-
-    Clopper and Pearson's interval of n / max(1, d) draws, where the design effect d is
-    the variance of the suites' shares over that of independent draws. Where all say the
-    same nothing is known of d: n is the number of suites. Of one suite alone, the
-    interval is over its draws.
-    """
-    suites, draws = events.shape
-    total, share = events.size, float(events.mean())
-    design = 1.0
-    if suites > 1 and share in (0.0, 1.0):
-        design = draws
-    elif suites > 1:
-        found = float(events.mean(axis=1).var(ddof=1))
-        design = max(1.0, found / (share * (1.0 - share) / draws))
-    n, tail = total / design, 0.5 * (1.0 - CONFIDENCE)
-    k = share * n
-    low = 0.0 if k == 0.0 else float(betaincinv(k, n - k + 1.0, tail))
-    high = 1.0 if share == 1.0 else 1.0 - float(betaincinv(n - k, k + 1.0, tail))
-    return share, low, high
-
-
-def constructed(
-    suites: Sequence[SuiteRuns], config: GateConfig, together: int = 1, seed: int = 0
-) -> list[Tally]:
-    """The gate on the pairs of `CONSTRUCTED`.
-
-    Args:
-      suites: drives of `constructed_rows`, one suite per seed of the catalogue.
-      config: margins, without nulls.
-      together: seeds that are judged as one suite besides; 1: none.
-      seed: of the mixes.
-
-    Returns:
-      A tally for each pair with one verdict per seed; then, with `together` above 1,
-      a tally for each with one verdict for every so many seeds.
-
-    Raises:
-      InputError: a suite lacks a row, there are nulls, or fewer suites than `together`.
-    """
-    if together > len(suites):
-        raise InputError(f"--together: {together}: expected at most {len(suites)}")
-    rng = np.random.default_rng([seed, MIXES])
-    alone, more = [], []
-    for made in CONSTRUCTED:
-        pairs = [constructed_pair(made, runs, rng) for runs in suites]
-        alone.append(as_driven(made.name, made.truth, pairs, config))
-        if together > 1:
-            firsts = range(0, len(pairs) - together + 1, together)
-            large = [joined(pairs[first : first + together]) for first in firsts]
-            more.append(as_driven(made.name, made.truth, large, config))
-    return alone + more
-
-
-def tally(name: str, truth: str, suites: Iterable[Iterable[Verdict]]) -> Tally:
-    """Count what was said; `suites` hold equally many verdicts each."""
-    said, cases = [], 0
-    for verdicts in suites:
-        rows = []
-        for verdict in verdicts:
-            failed = {c.kind for c in verdict.checks if c.outcome == "fail"}
-            gained = any(
-                c.kind == "gain" and c.outcome == "pass" for c in verdict.checks
-            )
-            kinds = [kind in failed for kind in SAID[:3]]
-            decided = [verdict.decision == what for what in DECISIONS]
-            rows.append([*kinds, bool(failed), gained, *decided])
-            cases = verdict.cases
-        said.append(rows)
-    return Tally(
-        name=name,
-        truth=truth,
-        said=np.array(said, bool).reshape(len(said), -1, len(SAID + DECISIONS)),
-        cases=cases,
-    )
-
-
-def equal_pairs(
-    pairs: Sequence[Pair], config: GateConfig, swaps: int, seed: int = 0
-) -> list[Tally]:
-    """The gate on equal pairs made from candidate and incumbent.
-
-    Args:
-      pairs: one suite per seed of the catalogue.
-      config: margins. NuPlan's score is left out where cases are not paired: it is
-        relative to the way that is possible in a case.
-      swaps: draws of the coins for every suite.
-      seed: of the coins.
-    """
-    rng = np.random.default_rng([seed, COINS])
-
-    def coins(*, by_family: bool) -> Iterable[Iterable[Verdict]]:
-        for pair in pairs:
-            yield [
-                judge(swapped(pair, rng, by_family=by_family), config)
-                for _ in range(swaps)
-            ]
-
-    found = [
-        tally("swapped", "equal", coins(by_family=False)),
-        tally("swapped by family", "equal", coins(by_family=True)),
+    rows = {HAND_SET: policy, OTHER: other, IDM: rank.idm_policy(Idm())}
+    slower = {name: LatticeCost(speed_share=x).fields() for name, x in SLOWER.items()}
+    return [
+        *(Row(name=name, policy=made) for name, made in rows.items()),
+        *(Row(name=name, policy=policy, params=p) for name, p in slower.items()),
     ]
-    primary = tuple(name for name in config.primary if name != "nuplan")
-    unpaired = dataclasses.replace(config, primary=primary or ("progress",))
-    twice = list(zip(pairs[::2], pairs[1::2], strict=False))
-    if twice:
-        judged = ([judge(redrawn(a, b), unpaired)] for a, b in twice)
-        found.append(tally("redrawn", "equal", judged))
+
+
+def with_faults(runs: SuiteRuns) -> SuiteRuns:
+    """The suite with the row `FAULTY`: IDM drives wherever it is at fault."""
+    at_fault = np.asarray(runs.rows[IDM].at_fault) > 0
+
+    def pick(idm: np.ndarray, hand: np.ndarray) -> np.ndarray:
+        return np.where(at_fault.reshape(-1, *[1] * (np.ndim(idm) - 1)), idm, hand)
+
+    made = jax.tree.map(pick, runs.rows[IDM], runs.rows[HAND_SET])
+    return dataclasses.replace(runs, rows={**runs.rows, FAULTY: made})
+
+
+def tallied(runs: SuiteRuns, seeds: int, config: gate.GateConfig) -> list[dict]:
+    """What the gate says of `KINDS`: decisions on every seed, and that on all cases.
+
+    Args:
+      runs: drives of `made_rows`, `with_faults`; as many cases of each seed in turn.
+      seeds: of the catalogue.
+      config: margins, without nulls.
+    """
+    found, size = [], len(runs.ids) // seeds
+    for names in KINDS:
+        same = dict.fromkeys((gate.CANDIDATE, names[1]), np.ones(MIN_CLUSTERS))
+        alike = gate.Likeness(distance=same, clusters=np.arange(MIN_CLUSTERS))
+        pair = pair_of(runs, names[1], (), alike, candidate=names[0])
+        parts = [_part(pair, slice(i * size, (i + 1) * size)) for i in range(seeds)]
+        each = collections.Counter(judge(part, config).decision for part in parts)
+        way = [float(np.sum(x.progress)) for x in (pair.candidate, pair.incumbent)]
+        one = dict(zip(("candidate", "incumbent", "truth"), names, strict=True))
+        one |= {"each": dict(each), "together": judge(pair, config).decision}
+        found.append({**one, "way": way[0] / way[1]})
     return found
 
 
-def as_driven(
-    name: str, truth: str, pairs: Sequence[Pair], config: GateConfig
-) -> Tally:
-    """The gate on pairs as they are, and how their drives compare."""
-    found = tally(name, truth, ([judge(pair, config)] for pair in pairs))
-    mine = stacked([pair.candidate for pair in pairs])
-    theirs = stacked([pair.incumbent for pair in pairs])
-    return dataclasses.replace(found, drives=compared(mine, theirs))
+def _part(pair: gate.Pair, at: slice) -> gate.Pair:
+    """Some of the cases."""
+    names = ("families", "ids", "reference", "preventable")
+    rest = {name: getattr(pair, name)[at] for name in names}
+    for row in ("candidate", "incumbent"):
+        rest[row] = jax.tree.map(lambda x: np.asarray(x)[at], getattr(pair, row))
+    return dataclasses.replace(pair, **rest)
 
 
-def compared(mine: CaseMetrics, theirs: CaseMetrics) -> dict[str, object]:
-    """How the drives of two rows on the same cases differ, by name.
-
-    Args:
-      mine: leaves [C, ...].
-      theirs: likewise.
-
-    Returns:
-      "way": mean progress, as a share of theirs; "cases_that_differ": cases of another
-      progress; "cases_with_own_fault" and "cases_with_red_light": [mine, theirs].
-    """
-    way, other = (np.asarray(x.progress, np.float64) for x in (mine, theirs))
-    count = lambda m, field: int(np.sum(np.asarray(getattr(m, field)) > 0))  # noqa: E731
-    return {
-        "way": float(way.mean() / other.mean()),
-        "cases_that_differ": int(np.sum(way != other)),
-        "cases_with_own_fault": [count(m, "at_fault") for m in (mine, theirs)],
-        "cases_with_red_light": [count(m, "red_lights") for m in (mine, theirs)],
-    }
-
-
-def every_pair(
-    pair: Pair, rows: Mapping[str, CaseMetrics], config: GateConfig
-) -> list[dict]:
-    """What the gate says of every row against every other of one suite.
-
-    Args:
-      pair: of the suite; its drives are replaced.
-      rows: the drives by name.
-      config: margins.
-    """
-    found = []
-    for mine, theirs in itertools.permutations(rows, 2):
-        a, b = rows[mine], rows[theirs]
-        verdict = judge(dataclasses.replace(pair, candidate=a, incumbent=b), config)
-        failed = [c.name for c in verdict.checks if c.outcome == "fail"]
-        found.append(
-            {
-                "candidate": mine,
-                "incumbent": theirs,
-                "decision": verdict.decision,
-                "failed": failed,
-                **compared(a, b),
-            }
-        )
-    return found
-
-
-def format_errors(tallies: Sequence[Tally]) -> str:
-    """Shares of verdicts with 95 % intervals: what was decided, then what was said.
-
-    Returns:
-      Two tables, each with one line per kind of pair.
-    """
-    lines = []
-    for columns in (DECISIONS, SAID):
-        header = ["", "candidate is", "cases", "verdicts", *columns]
-        rows = [
-            [
-                found.name,
-                found.truth,
-                f"{found.cases:,}",
-                f"{found.of(columns[0]).size:,}",
-                *(_share(found.rate(what)) for what in columns),
-            ]
-            for found in tallies
-        ]
-        lines += [*text_table(header, rows), ""]
-    return "\n".join(lines)
-
-
-def _share(rate: tuple[float, float, float]) -> str:
-    share, low, high = (100.0 * x for x in rate)
-    return f"{share:.1f} % [{low:.1f}, {high:.1f}]"
+def table(found: Sequence[dict]) -> str:
+    """Share of the seeds by decision with 95 % intervals, and the verdict on all."""
+    head, lines = ["candidate", "incumbent", "truth"], []
+    for one in found:
+        total, cells = sum(one["each"].values()), []
+        for k in (one["each"].get(decision, 0) for decision in gate.EXIT_CODES):
+            low, high = (100.0 * x for x in clopper_pearson(k, total))
+            cells.append(f"{100.0 * k / total:.0f} % [{low:.0f}, {high:.0f}]")
+        lines.append([*(one[name] for name in head), *cells, one["together"]])
+    return "\n".join(text_table([*head, *gate.EXIT_CODES, "all cases"], lines))

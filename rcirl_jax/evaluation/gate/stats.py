@@ -63,7 +63,6 @@ def within_strata(
     a: np.ndarray,
     b: np.ndarray,
     stratum: np.ndarray,
-    confidence: float = CONFIDENCE,
 ) -> Difference:
     """Mean of a - b over S values drawn independently within fixed strata.
 
@@ -78,7 +77,6 @@ def within_strata(
       a: [S].
       b: [S].
       stratum: [S] int.
-      confidence: of the interval.
     """
     d = np.asarray(a, np.float64) - np.asarray(b, np.float64)
     _, index, counts = np.unique(stratum, return_inverse=True, return_counts=True)
@@ -93,21 +91,20 @@ def within_strata(
     if se == 0.0:
         p = 1.0 if mean == 0.0 else 0.0
         return Difference(mean=mean, low=mean, high=mean, se=0.0, p=p)
-    reach = se * float(stdtrit(df, 0.5 * (1.0 + confidence)))
+    reach = se * float(stdtrit(df, 0.5 * (1.0 + CONFIDENCE)))
     p = 2.0 * float(stdtr(df, -abs(mean) / se))
     return Difference(mean=mean, low=mean - reach, high=mean + reach, se=se, p=p)
 
 
-def clipped(found: Difference, low: float = -1.0, high: float = 1.0) -> Difference:
+def clipped(found: Difference, high: float = 1.0) -> Difference:
     """The same with an interval that stays where a difference can be.
 
     Args:
       found: with any ends.
-      low: lowest difference there can be.
-      high: highest.
+      high: largest difference there can be; the smallest is -1.
     """
     return dataclasses.replace(
         found,
-        low=min(max(found.low, low), high),
-        high=max(min(found.high, high), low),
+        low=min(max(found.low, -1.0), high),
+        high=max(min(found.high, high), -1.0),
     )

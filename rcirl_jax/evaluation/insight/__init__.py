@@ -1,5 +1,5 @@
-"""What a reward has learned and what the data support.
+"""What a reward has learned, and from what.
 
-Shares of features, Laplace intervals, identifiability, known truth, background; each
-file answers one question and nothing here decides anything.
+Shares of features, and the paper's background shift; each file answers one question
+and nothing here decides anything.
 """

@@ -20,46 +20,33 @@ from rcirl_jax.reward.module import ACTIVATIONS, network_of, variables_of
 STEPS = 64  # points on the line from b to a
 
 
-def check_network_inputs(
-    where: str,
+def _check(
     effective_params: RewardParams,
     normaliser: Normaliser,
     features: jax.Array,
     time_valid: jax.Array,
     activation: str,
 ) -> None:
-    """Refuse features that do not fit the network; shapes only, so it may be traced.
-
-    Args:
-      where: the caller's name, first in the message.
-      effective_params: gamma [T], first kernel [F, H1].
-      normaliser: [F].
-      features: [..., T, F].
-      time_valid: [..., T].
-      activation: key of ACTIVATIONS.
-
-    Raises:
-      InputError: an unknown activation, or a shape that does not fit.
-    """
+    """Refuse features [T, F] that do not fit the network; reads shapes only."""
     if activation not in ACTIVATIONS:
         raise InputError(
-            f"{where}: activation: {activation}: expected one of {sorted(ACTIVATIONS)}"
+            f"attribute: activation: {activation}: expected one of"
+            f" {sorted(ACTIVATIONS)}"
         )
     expected = (effective_params.gamma.shape[0], effective_params.kernels[0].shape[0])
-    if features.shape[-2:] != expected:
+    if features.shape != expected:
         raise InputError(
-            f"{where}: features: shape {features.shape}: expected [..., T, F] with"
-            f" T, F = {expected}"
+            f"attribute: features: shape {features.shape}: expected T, F = {expected}"
         )
     if normaliser.scale.shape != expected[1:]:
         raise InputError(
-            f"{where}: normaliser: shape {normaliser.scale.shape}: expected"
+            f"attribute: normaliser: shape {normaliser.scale.shape}: expected"
             f" [{expected[1]}]"
         )
-    if time_valid.shape != features.shape[:-1]:
+    if time_valid.shape != expected[:1]:
         raise InputError(
-            f"{where}: time_valid: shape {time_valid.shape}: expected"
-            f" {features.shape[:-1]}, one flag per time"
+            f"attribute: time_valid: shape {time_valid.shape}: expected"
+            f" {expected[:1]}, one flag per time"
         )
 
 
@@ -105,9 +92,7 @@ def attribute(
             f"attribute: features: shapes {features_a.shape}, {features_b.shape}:"
             " expected [T, F] for both"
         )
-    check_network_inputs(
-        "attribute", effective_params, normaliser, features_a, time_valid, activation
-    )
+    _check(effective_params, normaliser, features_a, time_valid, activation)
     if steps < 1:
         raise InputError(f"attribute: steps: {steps}: expected at least 1")
     start = normalise(normaliser, features_b)

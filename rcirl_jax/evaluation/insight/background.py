@@ -2,20 +2,15 @@
 
 The paper says why human and samples must be compared within a scene (section
 II, "Background shifting problem"): scenes differ in features that no candidate
-of the scene can change, and a learner that pools scenes learns those too. Two
-measurements of that, with the package's own losses and a linear reward V = w f:
-
-* here, the paper's figure: two frames that differ by a constant, one direction
-  that is right in both, and the directions that pooling and conditioning find;
-* in `background_world`, a choice problem with a hidden reward, where the
-  background is made large.
+of the scene can change, and a learner that pools scenes learns those too. This is
+the paper's figure, computed with the package's own losses and a linear reward
+V = w f: two frames that differ by a constant, one direction that is right in both,
+and the directions that pooling and conditioning find.
 
 For a linear reward the conditional losses see V(sample) - V(human) only, so the
-background drops out by algebra: that their curves are flat is no discovery. How
-much pooling loses, and what brings the background back in, are.
-
-Features are numbers without a unit: within a frame the candidates have a spread
-of about 1 per feature, and the background's size is told in that spread.
+background drops out by algebra: that they find the same is no discovery. How far
+pooling is led astray is. Features are numbers without a unit: within a frame the
+candidates have a spread of about 1 per feature.
 """
 
 import dataclasses
@@ -52,8 +47,6 @@ class Frames(NamedTuple):
 
     human: jax.Array  # [N, F]
     candidates: jax.Array  # [N, K, F]
-    counts: jax.Array  # [N, K] bool, False where the candidate is the human
-    weight: jax.Array  # [N] 1, or 0 for frames left out
 
 
 class Learned(NamedTuple):
@@ -66,12 +59,12 @@ class Learned(NamedTuple):
 
 def _compared(weights: jax.Array, offset: jax.Array, frames: Frames) -> Compared:
     """Values V = w f of all frames; the losses used here read nothing else."""
-    table = jnp.zeros(frames.counts.shape)
+    table = jnp.zeros(frames.candidates.shape[:2])
     return Compared(
         human=frames.human @ weights,
         candidates=frames.candidates @ weights,
-        counts=frames.counts,
-        weight=frames.weight,
+        counts=table == 0.0,
+        weight=table[:, 0] + 1.0,
         human_distance=table[:, 0],
         human_collides=table[:, 0] > 0.0,
         distance=table,
@@ -103,10 +96,8 @@ def learn(loss: str, frames: Frames, start: jax.Array, config: Learning) -> Lear
     """
     unit = loss == "rank"
     # a common shift changes nothing but the offset, and Adam's patience with it
-    centre, _ = pooled_moments(frames)
-    moved = frames._replace(
-        human=frames.human - centre, candidates=frames.candidates - centre
-    )
+    centre = jnp.mean(jnp.mean(frames.candidates, axis=1), axis=0)
+    moved = Frames(frames.human - centre, frames.candidates - centre)
     constants = LossConfig(leaky_rate=config.leaky_rate)
 
     def total(params: tuple[jax.Array, jax.Array]) -> jax.Array:
@@ -133,14 +124,6 @@ def learn(loss: str, frames: Frames, start: jax.Array, config: Learning) -> Lear
     scale = jnp.linalg.norm(weights)
     direction = weights / scale
     return Learned(direction, direction @ centre - offset / scale, norms[-1])
-
-
-def pooled_moments(frames: Frames) -> tuple[jax.Array, jax.Array]:
-    """Mean and spread of all candidates of all frames, each [F]."""
-    share = frames.weight / jnp.sum(frames.weight)
-    centre = share @ jnp.mean(frames.candidates, axis=1)
-    apart = (frames.candidates - centre) ** 2
-    return centre, jnp.sqrt(share @ jnp.mean(apart, axis=1))
 
 
 def angle_deg(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -196,8 +179,6 @@ def two_frames(key: jax.Array, config: TwoFrames) -> Frames:
     return Frames(
         human=config.lead * jnp.asarray(TRUTH) + moves,
         candidates=around + moves[:, None],
-        counts=jnp.ones((2, config.samples), bool),
-        weight=jnp.ones(2),
     )
 
 

@@ -1,4 +1,5 @@
-"""Automatic labels held against truth: made traffic, signals, stops, logs.
+"""Automatic labels held against truth, and written signals against drivers.
 
-`cases` are scenes whose labels are known; a new label gets its case there.
+The truth of labels is what simulated drivers did; a new label gets its truth in
+`made_traffic`.
 """

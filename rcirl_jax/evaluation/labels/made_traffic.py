@@ -17,13 +17,13 @@ All else is left unscored, as is what lies near the edge of a definition.
 """
 
 import dataclasses
+from collections.abc import Set
 
 import numpy as np
 
 from rcirl_jax.data.synthetic.roads import GRID_M
 from rcirl_jax.data.synthetic.stops import schedule
 from rcirl_jax.data.synthetic.traffic import Log
-from rcirl_jax.evaluation.labels.cases import speed_tags
 from rcirl_jax.types import Decision, Tag
 
 CLEAR_M = 1.0  # m between bumpers beyond doubt
@@ -169,6 +169,52 @@ def motion_tags(log: Log, ego: Drive) -> dict[Tag, bool | None]:
         **speed_tags(ego.v, float(turned)),
         Tag.LANE_CHANGE: False if ego.is_steady else change,
     }
+
+
+def speed_tags(v: np.ndarray, turned: float) -> dict[Tag, bool | None]:
+    """Tags of exact speeds and of the road's turn; None: too close to say.
+
+    Moving is above 2 m/s, standing below 0.5 m/s, cruising a change below
+    1.5 m/s above 5 m/s; a third of each threshold is left as doubt.
+
+    Args:
+      v: [n] m/s, of the driver over the scene.
+      turned: rad, by which the road turns under it.
+    """
+    first, last, top, low = v[0], v[-1], v.max(), v.min()
+    return {
+        Tag.STOPPING: clear(first - 2.0, 0.6, 0.5 - last, 0.2),
+        Tag.STARTING: clear(0.5 - first, 0.2, last - 2.0, 0.6),
+        Tag.CRUISING: clear(1.5 - (top - low), 0.5, low - 5.0, 0.5),
+        Tag.STANDING: clear(0.5 - top, 0.2),
+        Tag.TURNING: clear(abs(np.rad2deg(turned)) - 30.0, 6.0),
+    }
+
+
+def tags_of_decisions(
+    known: Set[Decision | None], *, complete: bool
+) -> dict[Tag, bool | None]:
+    """Tags that some decision makes true; false only where all are known."""
+    nudges = {Decision.NUDGE_LEFT, Decision.NUDGE_RIGHT}
+    groups = {
+        Tag.FOLLOWING: {Decision.FOLLOW},
+        Tag.YIELDING: {Decision.YIELD},
+        Tag.OVERTAKING: {Decision.OVERTAKE},
+        Tag.NUDGING: nudges,
+    }
+    rest = False if complete else None
+    return {tag: True if known & members else rest for tag, members in groups.items()}
+
+
+def clear(*margins: float) -> bool | None:
+    """True if every value of (value, tolerance, ...) is above its tolerance.
+
+    False if one is below minus its tolerance, None if it is too close to say.
+    """
+    pairs = list(zip(margins[::2], margins[1::2], strict=True))
+    if any(value < -doubt for value, doubt in pairs):
+        return False
+    return True if all(value > doubt for value, doubt in pairs) else None
 
 
 def cuts_in(ego: Drive, other: Drive | None, rate_hz: float) -> bool | None:

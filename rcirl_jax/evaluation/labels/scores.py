@@ -15,6 +15,8 @@ import tqdm
 from rcirl_jax.evaluation.exact import clopper_pearson
 from rcirl_jax.types import Decision, Tag
 
+SHOWN = 20  # kinds of errors in a table
+
 # (what, family, truth, label) of one scored thing; truth and label are names
 Verdict = tuple[str, str, str, str]
 
@@ -56,7 +58,7 @@ class ClassScore:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LabelReport:
-    """Labels against truth over all families."""
+    """Labels against truth over all roads."""
 
     noise: str
     cases: int
@@ -82,24 +84,17 @@ def _rate(k: int, n: int) -> tuple[float, float, float] | None:
     return (k / n, *clopper_pearson(k, n)) if n else None
 
 
-def count_verdicts(
-    judged: Iterable[list[Verdict] | str],
-    noise: str,
-    words: str,
-    total: int | None = None,
-) -> LabelReport:
+def count_verdicts(judged: Iterable[list[Verdict] | str], noise: str) -> LabelReport:
     """Count the verdicts of scenes as they come, class by class.
 
     Args:
       judged: verdicts of each scene, or why it was dropped.
       noise: of the positions, for the report.
-      words: of the progress bar.
-      total: scenes that are expected, if known.
     """
     verdicts: list[Verdict] = []
     dropped: collections.Counter[str] = collections.Counter()
     cases = 0
-    for found in tqdm.tqdm(judged, desc=f"{words} {noise}", total=total, unit="scene"):
+    for found in tqdm.tqdm(judged, desc=f"traffic {noise}", unit="scene"):
         cases += 1
         if isinstance(found, str):
             dropped[found] += 1
@@ -128,8 +123,8 @@ def _score(name: str, verdicts: Iterable[Verdict]) -> ClassScore:
     )
 
 
-def format_labels(report: LabelReport, errors: int = 20) -> str:
-    """The report as a terminal table."""
+def format_labels(report: LabelReport) -> str:
+    """The report as a terminal table, with the most frequent errors."""
     lines = [
         f"{report.cases} cases, position noise {report.noise!r}, dropped:"
         f" {sum(report.dropped.values())} {report.dropped or ''}",
@@ -140,7 +135,7 @@ def format_labels(report: LabelReport, errors: int = 20) -> str:
     ]
     if report.errors:
         lines += ["", f"{'family':<24}{'truth':<14}{'label':<14}{'cases':>6}"]
-    for what, family, truth, label, count in report.errors[:errors]:
+    for what, family, truth, label, count in report.errors[:SHOWN]:
         rest = "-" if what == "tag" else ""
         lines.append(f"{family:<24}{truth or rest:<14}{label or rest:<14}{count:>6}")
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""Written traffic lights against what drivers did, and stops against labels.
+"""Written traffic lights against what drivers did.
 
 A converter's cycle is a claim. It is tested by turning it: the written phase is
 moved by every offset d of the cycle, and the agreement
@@ -14,10 +14,11 @@ apart: where these data come from they may cross on red.
 
 import collections
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
+from rcirl_jax.data.parts import Item, Part, items, recordings_in
 from rcirl_jax.data.scenes.lines import (
     MAX_RED_RUNNING,
     MIN_CROSSINGS,
@@ -32,6 +33,7 @@ from rcirl_jax.data.scenes.signal_checks import (
     TOGETHER,
     line_name,
 )
+from rcirl_jax.runtime.executors import Executor, Here
 from rcirl_jax.types import Lane, Recording, Signal, Track
 
 ORDER = ("green", "yellow", "red", "off")
@@ -80,11 +82,6 @@ class PhaseCheck:
     red_best: float  # share of crossings on red there
     p: float  # share of random turns that agree at least as well as the written
     verdict: str
-
-    def as_dict(self) -> dict:
-        """JSON-ready; shares of nothing become null."""
-        found = dataclasses.asdict(self)
-        return {k: None if v != v else v for k, v in found.items()}
 
 
 def period(signal: Signal) -> float | None:
@@ -192,23 +189,7 @@ def first_stands(recording: Recording, lane: Lane) -> dict[int, np.ndarray]:
     return {number: np.array(times) for number, times in stands.items()}
 
 
-def stands_in_reach(track: Track, lane: Lane) -> np.ndarray:
-    """Times [s] at which a track stands within reach of a line, first or not."""
-    distance, reach = before_line(track, lane)
-    near = reach & (distance > -OVER_M) & (distance < REACH_M)
-    return track.t[near & (track.speed < STANDING_MPS)]
-
-
 # ---------------------------------------------------------------------- phases
-
-
-def check_phases(recordings: Iterable[Recording]) -> list[PhaseCheck]:
-    """One check per signal over all recordings, and one of all signals together.
-
-    Signals are the same if their ids are and the recordings' names agree up to
-    the last "-", as in CommonRoad's names of places.
-    """
-    return check_events(map(line_events, recordings))
 
 
 # events by the name of their line, each with the name of its recording
@@ -224,7 +205,14 @@ def line_events(recording: Recording) -> LineEvents:
 
 
 def check_events(recorded: Iterable[LineEvents]) -> list[PhaseCheck]:
-    """As `check_phases`, of what recordings say one after the other."""
+    """One check per line over all recordings, and one of all lines together.
+
+    Lines are the same if their signals' ids are and the recordings' names agree up to
+    the last "-", as in CommonRoad's names of places.
+
+    Args:
+      recorded: what the recordings say, one after the other.
+    """
     events: LineEvents = collections.defaultdict(list)
     for lines in recorded:
         for name, found in lines.items():
@@ -232,6 +220,27 @@ def check_events(recorded: Iterable[LineEvents]) -> list[PhaseCheck]:
     checks = [_check(name, found) for name, found in sorted(events.items())]
     together = [pair for found in events.values() for pair in found]
     return [*checks, _check(TOGETHER, together)]
+
+
+def check_written(
+    parts: Sequence[Part], *, executor: Executor | None = None
+) -> list[PhaseCheck]:
+    """What all drivers of the logs say of the written signals, line by line.
+
+    Args:
+      parts: of `importers.parts`.
+      executor: where they are read; default: this process. Changes no number.
+
+    Raises:
+      InputError: logs that cannot be read.
+    """
+    places = executor or Here()
+    return check_events(places.stream(_line_events, items(parts, places.workers)))
+
+
+def _line_events(item: Item) -> Iterator[LineEvents]:
+    for _, recording in recordings_in(item):
+        yield line_events(recording)
 
 
 def _check(name: str, found: Sequence[tuple[str, Event]]) -> PhaseCheck:

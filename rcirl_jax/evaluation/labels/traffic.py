@@ -23,12 +23,6 @@ from rcirl_jax.data.synthetic import RunConfig, simulate
 from rcirl_jax.data.synthetic.roads import GRID_M
 from rcirl_jax.data.synthetic.traffic import Log
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.labels.cases import (
-    NOISES,
-    check_noise,
-    position_errors,
-    tags_of_decisions,
-)
 from rcirl_jax.evaluation.labels.made_traffic import (
     Drive,
     cuts_in,
@@ -38,7 +32,9 @@ from rcirl_jax.evaluation.labels.made_traffic import (
     line_decision,
     motion_tags,
     red_light,
+    tags_of_decisions,
 )
+from rcirl_jax.evaluation.labels.noise import NOISES, check_noise, position_errors
 from rcirl_jax.evaluation.labels.scores import LabelReport, Verdict, count_verdicts
 from rcirl_jax.runtime.executors import Executor, Here
 from rcirl_jax.runtime.specs import load_toml, spec_root
@@ -193,7 +189,7 @@ def measure_traffic(
     items = [(entry, i) for entry in entries for i in range(recordings)]
     work = functools.partial(_judged, noise=noise, seed=seed)
     judged = (executor or Here()).stream(work, items)
-    return count_verdicts(judged, noise, "traffic")
+    return count_verdicts(judged, noise)
 
 
 def _spec_path() -> Path:

@@ -94,7 +94,6 @@ def build_report(
     *,
     group: np.ndarray | None = None,
     references: Sequence[str] | None = None,
-    confidence: float = CONFIDENCE,
     num_resamples: int | None = None,
 ) -> RankingReport:
     """Estimates with intervals, and paired differences, of several scorers.
@@ -108,7 +107,6 @@ def build_report(
       outcomes: the scenes' outcomes; its `cluster` is what is resampled.
       group: [S] int, vehicle-disjoint group of each scene, to be counted.
       references: rows to compare with; by default those of `REFERENCES` present.
-      confidence: of all intervals.
       num_resamples: bootstrap resamples; by default as many as it takes for the
         largest family of differences to reach an adjusted p of `SMALLEST_P`.
     """
@@ -140,29 +138,24 @@ def build_report(
         counts=counts,
         runs={name: len(runs) for name, runs in scorers.items()},
         rows={
-            name: {
-                metric: _estimate(resampled, name, metric, confidence)
-                for metric in METRICS
-            }
+            name: {metric: _estimate(resampled, name, metric) for metric in METRICS}
             for name in stacked
         },
         comparisons=tuple(
             comparison
             for name in references
             for family in _families(scorers, name)
-            for comparison in _compare(resampled, family, name, confidence)
+            for comparison in _compare(resampled, family, name)
         ),
         human_rank_median={
             name: bootstrap_median(
-                np.mean(values["percentile_rank"], axis=0),
-                bootstrap,
-                confidence=confidence,
+                np.mean(values["percentile_rank"], axis=0), bootstrap
             )
             for name, values in stacked.items()
         },
-        oracle_floor=combine_seeds(floor, bootstrap, confidence=confidence),
-        oracle_floor_median=bootstrap_median(floor, bootstrap, confidence=confidence),
-        confidence=confidence,
+        oracle_floor=combine_seeds(floor, bootstrap),
+        oracle_floor_median=bootstrap_median(floor, bootstrap),
+        confidence=CONFIDENCE,
         num_resamples=num_resamples,
     )
 
@@ -214,26 +207,22 @@ class _Resampled:
             self._means[key] = (means, self.bootstrap.means(*inputs, stream))
         return self._means[key]
 
-    def difference(
-        self, row: str, reference: str, metric: str, confidence: float
-    ) -> Difference:
+    def difference(self, row: str, reference: str, metric: str) -> Difference:
         """`paired_difference` of two rows."""
         means, replicates = self.means(row, metric, 1)
         other, others = self.means(reference, metric, 2)
         mean = float(means.mean() - other.mean())
-        return difference_of(mean, replicates - others, confidence)
+        return difference_of(mean, replicates - others)
 
 
-def _estimate(
-    resampled: _Resampled, row: str, metric: str, confidence: float
-) -> Estimate:
-    found = estimate_of(*resampled.means(row, metric, 1), confidence)
+def _estimate(resampled: _Resampled, row: str, metric: str) -> Estimate:
+    found = estimate_of(*resampled.means(row, metric, 1))
     if METRICS[metric].unit != "%":
         return found
     values = resampled.stacked[row]
     vehicles = resampled.bootstrap.num_clusters
     # the other end is certain, so all of the error probability goes to this one
-    two_sided = 2.0 * confidence - 1.0
+    two_sided = 2.0 * CONFIDENCE - 1.0
     if np.all(values[metric] == 0.0):
         high = clopper_pearson(0, vehicles, two_sided)[1]
         return dataclasses.replace(found, value=0.0, low=0.0, high=high, exact=True)
@@ -261,14 +250,11 @@ def _enough_resamples(names: Iterable[str], references: Sequence[str]) -> int:
 
 
 def _compare(
-    resampled: _Resampled, rows: Sequence[str], reference: str, confidence: float
+    resampled: _Resampled, rows: Sequence[str], reference: str
 ) -> list[Comparison]:
     """One family of rows against one reference, in row then metric order."""
     pairs = [(row, m) for row in rows for m, how in METRICS.items() if how.compared]
-    found = [
-        resampled.difference(row, reference, metric, confidence)
-        for row, metric in pairs
-    ]
+    found = [resampled.difference(row, reference, metric) for row, metric in pairs]
     adjusted = holm(np.array([difference.p for difference in found]))
     return [
         Comparison(

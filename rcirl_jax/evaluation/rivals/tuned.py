@@ -201,7 +201,7 @@ def tuned_rivals(
 
 
 def tune_idm(
-    dataset: Demonstrations, setup: RankingSetup, evaluations: int = 300, seed: int = 0
+    dataset: Demonstrations, setup: RankingSetup, evaluations: int = 300
 ) -> Idm:
     """The driver model that ends nearest to the humans of the training split.
 
@@ -209,12 +209,11 @@ def tune_idm(
       dataset: only its training split is read.
       setup: sampler, horizon and what is seen of the others.
       evaluations: of the search.
-      seed: of the search and its `LONG_SCENES` drawn scenes.
     """
     own = dataclasses.replace(setup, split="train")
-    problem = idm_problem(dataset, own, LONG_SCENES, seed)
+    problem = idm_problem(dataset, own, LONG_SCENES)
     start = np.zeros(len(TUNABLE_IDM))
-    best = tune(problem.objective, start, SIGMA, evaluations, seed).vector
+    best = tune(problem.objective, start, SIGMA, evaluations, 0).vector
     found = idm_of(jnp.asarray(best, jnp.float32)).fields()
     return Idm(**{name: float(value) for name, value in found.items()})
 

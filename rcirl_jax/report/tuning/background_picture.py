@@ -1,22 +1,26 @@
-"""The background-shifting figure: two frames above, the choice problem below.
+"""The background-shifting figure: one draw of the paper's example as it is computed.
 
-Above, one draw of the paper's example as it is computed: what each frame alone
-asks for, what pooling both finds, and what comparing within a frame finds. Below,
-how the hidden reward's choices are met as the background grows, and with data.
+What each frame alone asks for, what pooling both finds, and what comparing within a
+frame finds.
 """
 
-import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
 
 from rcirl_jax.evaluation.insight.background import TRUTH, Frames, Learned
-from rcirl_jax.report.style import CANDIDATE, CHOSEN, CLASS_COLOURS, HUMAN, label, save
-from rcirl_jax.report.style import plt as pyplot
+from rcirl_jax.report.style import (
+    CANDIDATE,
+    CHOSEN,
+    CLASS_COLOURS,
+    HUMAN,
+    figure,
+    label,
+    save,
+)
 
 FRAME_COLOURS = (CLASS_COLOURS["other"], CLASS_COLOURS["nudge"])
 FRAME_MARKS = ("o", "s")
@@ -26,16 +30,7 @@ DIRECTION_COLOURS = {
     "conditional, logistic": CLASS_COLOURS["follow"],
     "conditional, rank": CLASS_COLOURS["overtake"],
 }
-LINES = {  # row -> colour, dashes
-    "GAN": (CHOSEN, "-"),
-    "GAN, uncorrelated": (CHOSEN, "--"),
-    "GAN, all directions": (CHOSEN, ":"),
-    "RC-IRL logistic": (CLASS_COLOURS["follow"], "-"),
-    "RC-IRL rank": (CLASS_COLOURS["overtake"], "-"),
-    "RC-IRL rank, pooled scale": (CLASS_COLOURS["overtake"], "--"),
-}
 ARROW = 2.2  # length of the arrows in feature units
-LABEL_APART = 0.055  # smallest distance of two labels, share of the axis
 
 
 def _points(axis: Axes, frames: Frames) -> None:
@@ -126,76 +121,15 @@ def _difference_panel(axis: Axes, frames: Frames, found: Mapping[str, Learned]) 
     )
 
 
-def _spread(values: np.ndarray, apart: float) -> np.ndarray:
-    """The values in their order, moved up until they lie apart."""
-    placed = np.array(values, float)
-    order = np.argsort(placed, kind="stable")
-    for below, above in itertools.pairwise(order):
-        placed[above] = max(placed[above], placed[below] + apart)
-    return placed
-
-
-def _lines_panel(axis: Axes, at: np.ndarray, rows: Mapping[str, Any]) -> None:
-    """Mean agreement of each row with its band, named at the right end."""
-    last = []
-    for name, (colour, dashes) in LINES.items():
-        points = rows[name]["agreement"]
-        mean, low, high = (
-            np.array([point[key] for point in points])
-            for key in ("mean", "low", "high")
-        )
-        axis.plot(at, mean, dashes, marker="o", color=colour, lw=1.8, ms=3.5)
-        axis.fill_between(at, low, high, color=colour, alpha=0.18, lw=0)
-        last.append(mean[-1])
-    axis.set_ylim(0.0, 1.02)
-    human = rows["GAN"]["human_agreement"][0]["mean"]
-    axis.axhline(human, color=CANDIDATE, lw=1.0)
-    axis.annotate(
-        "the simulated person",
-        (float(at[0]), human),
-        (0, 2),
-        textcoords="offset points",
-        fontsize=8,
-        color="#666666",
-    )
-    places = _spread(np.array(last), LABEL_APART)
-    places -= max(0.0, float(places.max()) - 1.0)
-    for (name, (colour, _)), place in zip(LINES.items(), places, strict=True):
-        axis.annotate(
-            name,
-            (1.02, float(place)),
-            xycoords=("axes fraction", "data"),
-            fontsize=8,
-            color=colour,
-            va="center",
-            annotation_clip=False,
-        )
-
-
-def background_figure(
-    path: Path,
-    frames: Frames,
-    found: Mapping[str, Learned],
-    by_size: Mapping[str, Any],
-    by_frames: Mapping[str, Any],
-) -> Path:
-    """PNG of the example and the two charts.
+def background_figure(path: Path, frames: Frames, found: Mapping[str, Learned]) -> Path:
+    """PNG of the example.
 
     Args:
       path: PNG to write.
       frames: one draw of the two frames, human [2, 2], candidates [2, K, 2].
       found: its directions by name.
-      by_size: of `evaluation.insight.background_world.sweep`, over sigma_b.
-      by_frames: the same over the number of training frames.
     """
-    made = pyplot.figure(figsize=(13.5, 9.0), layout="constrained")
-    halves: Any = made.subfigures(2, 1, height_ratios=(1.15, 1.0))
-    above, below = halves
-    example = above.subplots(1, 3)
-    charts = below.subplots(1, 2)
-    for axis in (*example, *charts):
-        axis.grid(True, linewidth=0.4, alpha=0.5)
-        axis.spines[["top", "right"]].set_visible(False)
+    made, axes = figure(1, 3, 13.5, 4.8)
     truth = np.asarray(TRUTH)
     angles = {
         name: float(np.degrees(np.arccos(np.clip(x.direction @ truth, -1.0, 1.0))))
@@ -203,27 +137,11 @@ def background_figure(
     }
     panels = (_frames_panel, _pooled_panel, _difference_panel)
     names = (["one frame"], ["pooled"], ["conditional, logistic", "conditional, rank"])
-    for axis, draw, shown in zip(example, panels, names, strict=True):
+    for axis, draw, shown in zip(axes[0], panels, names, strict=True):
         draw(axis, frames, found)
         _legend(axis, shown, angles)
         axis.set_aspect("equal")
-    for axis in example[:2]:
+    for axis in axes[0, :2]:
         axis.set_xlim(-4.0, 6.5)
         axis.set_ylim(-3.5, 9.5)
-    sizes = np.array([size for _, size in by_size["points"]])
-    counts = np.array([count for count, _ in by_frames["points"]])
-    _lines_panel(charts[0], sizes, by_size["rows"])
-    charts[0].set_xscale("symlog", base=2, linthresh=0.5, linscale=1.0)
-    charts[0].set_xticks(sizes, [f"{size:g}" for size in sizes])
-    x = "size of the background, in spreads within a frame"
-    y = "share of fresh frames"
-    title = (
-        f"same best candidate as the hidden reward, {by_size['points'][0][0]} frames"
-    )
-    label(charts[0], title, x, y)
-    _lines_panel(charts[1], counts, by_frames["rows"])
-    charts[1].set_xscale("log", base=2)
-    charts[1].set_xticks(counts, [str(count) for count in counts])
-    title = f"the same with data, background {by_frames['points'][0][1]:g}"
-    label(charts[1], title, "training frames", y)
     return save(made, path)

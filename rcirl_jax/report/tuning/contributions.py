@@ -57,24 +57,23 @@ class Contributions:
 
 
 def contributions(
-    dataset: Demonstrations, rewards: Mapping[str, Reward], split: str = "test"
+    dataset: Demonstrations, rewards: Mapping[str, Reward]
 ) -> Contributions:
     """Shares of every reward's features on the same scenes and candidates.
 
     Args:
-      dataset: held-out scenes come from it.
+      dataset: its test split is read.
       rewards: by name; the first one's sampler mode makes the candidates.
-      split: of the dataset.
 
     Raises:
-      InputError: fewer than two vehicles in the split.
+      InputError: fewer than two vehicles in the test split.
     """
-    index = dataset.indices(split)
+    index = dataset.indices("test")
     picked = np.linspace(0, index.size - 1, min(NUM_SCENES, index.size))
     index = index[np.unique(picked.astype(int))]
     rows = dataset.read(index)
     if np.unique(np.asarray(rows.vehicle)).size < 2:
-        raise InputError(f"data: split {split}: 1 vehicle: expected at least 2")
+        raise InputError("data: split test: 1 vehicle: expected at least 2")
     bootstrap = ClusterBootstrap(np.asarray(rows.vehicle))
     first = next(iter(rewards.values()))
     sampler = SamplerConfig(mode=str(first.provenance.get("mode", "speed")))

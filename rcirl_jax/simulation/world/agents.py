@@ -254,11 +254,9 @@ def _ratio_behind(
     return (wanted / jnp.maximum(pairs.gap, MIN_GAP_M)) ** 2
 
 
-def move(
-    case: Case, state: AgentState, applied: jax.Array, time_step: float = STEP_S
-) -> AgentState:
+def move(case: Case, state: AgentState, applied: jax.Array) -> AgentState:
     """Everybody one step on, under the accelerations [A] that act now."""
-    agents, h = case.agents, time_step
+    agents, h = case.agents, STEP_S
     stands = agents.kind == Kind.STATIC
     runs = state.present & (state.clock >= 0.0) & ~stands
     v = jnp.maximum(state.v + applied * h, 0.0)

@@ -26,7 +26,6 @@ from rcirl_jax.data.readers.parquet import read_columns
 from rcirl_jax.data.readers.sqlite import Database
 from rcirl_jax.data.readers.xml import read_xml
 from rcirl_jax.data.readers.zarr2 import StructuredArray
-from rcirl_jax.data.scenes.signal_checks import read_signal_checks
 from rcirl_jax.data.store import manifest
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.shards import describe
@@ -378,9 +377,6 @@ def test_deep_nesting_is_one_line(dataset, tmp_path):
     for text in ("[" * 110 + "]" * 110, "{a=" * 110 + "1" + "}" * 110):
         deep.write_text("a = " + text)
         assert "nested too deeply" in line_of(lambda: load_toml(deep))
-    checks = tmp_path / "labels.json"
-    checks.write_text('{"phases": ' + "[" * DEEP)
-    assert "labels.json" in line_of(lambda: read_signal_checks(checks))
 
 
 @pytest.mark.parametrize(

@@ -242,6 +242,18 @@ def entering(t):
     return WIDTH * (1.0 - smooth_step(t, 2, 3))
 
 
+def test_a_lead_that_drives_out_of_view_is_followed():
+    """It is in the way until nobody sees it any more, here for less than 2 s."""
+    made = recording(
+        car("ego", lambda t: 20.0 + 14.0 * t),
+        car("lead", lambda t: 245.0 + 32.0 * t),
+        lanes=road(length=900.0),
+    )
+    row = first_scene(made)
+    assert 0 < row["obstacles.valid"][0].sum() < np.count_nonzero(TIMES_S <= 2.0)
+    assert Decision(row["decisions"][0]) == Decision.FOLLOW
+
+
 def test_cut_in_and_yield():
     """A car from the left lane enters ahead after three seconds."""
     made = recording(

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from rcirl_jax.data.store.splits import (
     assign_groups,
     check_disjoint,
-    folds,
     split_wholes,
     time_blocks,
 )
@@ -38,7 +37,6 @@ def test_the_order_of_the_table_does_not_matter(counts, fraction, seed):
     assert assign_groups(counts, test_fraction=fraction, seed=seed) == assign_groups(
         turned, test_fraction=fraction, seed=seed
     )
-    assert folds(counts, 2, seed) == folds(turned, 2, seed)
 
 
 @given(counts=COUNTS, fraction=FRACTIONS, seed=SEEDS)
@@ -85,12 +83,12 @@ def test_seed_decides_among_equals_by_sha256():
 
 def test_same_in_a_process_with_another_hash_seed():
     code = (
-        "from rcirl_jax.data.store.splits import assign_groups, folds\n"
+        "from rcirl_jax.data.store.splits import assign_groups\n"
         "counts = {f'g{i}': 5 + i % 3 for i in range(40)}\n"
-        "print(assign_groups(counts, test_fraction=0.3, seed=9), folds(counts, 3, 9))"
+        "print(assign_groups(counts, test_fraction=0.3, seed=9))"
     )
     counts = {f"g{i}": 5 + i % 3 for i in range(40)}
-    here = f"{assign_groups(counts, test_fraction=0.3, seed=9)} {folds(counts, 3, 9)}"
+    here = f"{assign_groups(counts, test_fraction=0.3, seed=9)}"
     done = subprocess.run(
         [sys.executable, "-c", code],
         env={"PYTHONHASHSEED": "12345", "PYTHONPATH": ":".join(sys.path)},
@@ -124,23 +122,6 @@ def test_one_group_without_a_test_split_is_fine():
 def test_empty_groups_are_refused():
     with pytest.raises(ValueError, match="group b: 0 rows"):
         assign_groups({"a": 3, "b": 0}, test_fraction=0.5, seed=0)
-
-
-@given(counts=COUNTS, seed=SEEDS, data=st.data())
-def test_folds_cover_and_are_balanced(counts, seed, data):
-    number = data.draw(st.integers(2, len(counts)))
-    made = folds(counts, number, seed)
-    assert len(made) == number
-    assert all(made)
-    assert sorted(name for fold in made for name in fold) == sorted(counts)
-    rows = [sum(counts[name] for name in fold) for fold in made]
-    assert max(rows) - min(rows) <= max(counts.values())
-
-
-@pytest.mark.parametrize("number", [0, 1, 4])
-def test_bad_numbers_of_folds(number):
-    with pytest.raises(InputError, match="num_folds"):
-        folds({"a": 1, "b": 2, "c": 3}, number, 0)
 
 
 @given(seed=st.integers(0, 10_000))

@@ -1,18 +1,18 @@
 """Labels against simulated drivers: what they did is in their lanes and speeds."""
 
 import functools
+import json
 
 import numpy as np
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.labels.cases import Case, Mover
-from rcirl_jax.evaluation.labels.cases.scenes import START_M, drive
 from rcirl_jax.evaluation.labels.made_traffic import Drive, cuts_in, decision
 from rcirl_jax.evaluation.labels.scores import format_labels
 from rcirl_jax.evaluation.labels.traffic import measure_traffic
-from rcirl_jax.evaluation.labels.truth import judge
-from rcirl_jax.types import Decision
+from rcirl_jax.runtime.executors import Processes
+from rcirl_jax.types import Decision, Tag
+from tests.helpers.commands import command
 
 ROADS = ("arterial_signals", "highway_s_curve")
 FLOOR = 0.9  # precision and recall of a class with ten cases or more
@@ -53,6 +53,31 @@ def test_the_truth_does_not_come_from_the_labels(monkeypatch):
         if score.name in ("follow", "stop"):
             assert score.right == 0
             assert 0 < score.missed <= whole[score.name].true
+
+
+@pytest.mark.multiprocess
+def test_labels_do_not_depend_on_where_they_are_made():
+    again = measure_traffic(1, "ngsim", seed=7, roads=ROADS, executor=Processes(2))
+    assert again == report()
+
+
+def test_the_table_names_every_class():
+    text = format_labels(report())
+    named = set(Tag.__members__) - {"REHEARSED"}  # says who drove, not how
+    for name in [*Decision.__members__, *named]:
+        assert f"\n{name.lower():<14}" in text
+    json.dumps(report().as_dict(), allow_nan=False)
+
+
+@pytest.mark.slow
+def test_command(tmp_path):
+    flags = ("--quick", "--noise=none", f"--output={tmp_path}")
+    done = command("experiments.label_check", *flags)
+    assert done.returncode == 0, done.stderr
+    body = json.loads((tmp_path / "labels.json").read_text())
+    assert body["none"]["cases"] > 500
+    assert all(score["wrong"] <= 2 for score in body["none"]["decisions"])
+    assert (tmp_path / "labels.png").stat().st_size > 10_000
 
 
 def car(s, lanes, v=20.0, width=1.8):
@@ -112,17 +137,6 @@ def test_who_cuts_in():
     assert cuts_in(EGO, car(30.0, changing(4, 2, 0.5)), RATE_HZ) is None
     assert cuts_in(OUT, enters, RATE_HZ) is None
     assert cuts_in(EGO, None, RATE_HZ) is None
-
-
-def test_a_lead_that_drives_out_of_view_is_followed():
-    """It is in the way until nobody sees it any more, here for less than 2 s."""
-    ego = Mover(id="ego", s=drive(START_M, 14.0), l=np.zeros(111))
-    lead = Mover(id="lead", s=drive(START_M + 225.0, 32.0), l=np.zeros(111))
-    case = Case(
-        family="out_of_view", ego=ego, others=(lead,), truth={"lead": Decision.FOLLOW}
-    )
-    verdicts = judge(case, "none", np.random.default_rng(0))
-    assert ("decision", "out_of_view", "FOLLOW", "FOLLOW") in verdicts
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.importers.options import choices
+from rcirl_jax.data.importers.options import lane_types
 from rcirl_jax.data.importers.shapes import between_bounds, check_coordinates
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.atomic_files import parse_json
@@ -32,7 +32,7 @@ def read_lanes(
       origin: [2] m, subtracted from all points.
       spec: source TOML; `lane_types` names the types that are read.
     """
-    wanted = choices(spec, "lane_types", LANE_TYPES, DRIVEN)
+    wanted = lane_types(spec, LANE_TYPES, DRIVEN)
     segments = _segments(path)
     lanes: dict[str, Lane] = {}
     others, empty = 0, 0

@@ -199,9 +199,7 @@ def _track(
     spec: dict,
 ) -> Track:
     found = str(table["object_type"][rows[0]])
-    kind = kind_of(
-        f"{file}: track {name}", "object_type", found, section(spec, "kinds")
-    )
+    kind = kind_of(f"{file}: track {name}", found, section(spec, "kinds"))
     length, width = _size(spec, name.partition("#")[0], found)
     return Track(
         id=name,

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rcirl_jax.data.importers.options import choices, number
+from rcirl_jax.data.importers.options import lane_types, number
 from rcirl_jax.data.importers.shapes import (
     check_coordinates,
     line_across,
@@ -139,7 +139,7 @@ def _lanes(
         key: record.walk(span, range(SPEED_LIMIT_MPH, BOUNDARIES["right"] + 1))
         for key, span in _messages(record, found, LANE).items()
     }
-    wanted = choices(spec, "lane_types", tuple(LANE_TYPES.values()), DRIVEN)
+    wanted = lane_types(spec, tuple(LANE_TYPES.values()), DRIVEN)
     driven = {
         key: head
         for key, head in every.items()

@@ -247,9 +247,7 @@ def _pieces(
 ) -> Iterator[Track]:
     """The parts of a track between long gaps: "id", "id#2", ..."""
     found = TYPES.get(kind, str(kind))
-    known = kind_of(
-        f"{record.where}: track {name}", "object_type", found, section(spec, "kinds")
-    )
+    known = kind_of(f"{record.where}: track {name}", found, section(spec, "kinds"))
     values = {field: column[row] for field, column in states.values.items()}
     length = _size(values[LENGTH][seen], LENGTH_RANGE_M)
     width = _size(values[WIDTH][seen], WIDTH_RANGE_M)

@@ -1,4 +1,4 @@
-"""Errors of recorded positions, as drives of known decisions get them."""
+"""Errors of recorded positions, as simulated drives get them."""
 
 import numpy as np
 

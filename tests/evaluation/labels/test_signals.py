@@ -1,0 +1,205 @@
+"""Written signals against drivers."""
+
+import numpy as np
+import pytest
+from absl import flags
+from absl.testing import flagsaver
+
+from experiments.signals import checked_signals, signals_asked
+from rcirl_jax.data.parts import parts_of, recordings_of
+from rcirl_jax.data.scenes.collect import Collector
+from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.data.scenes.lines import trusted_signals
+from rcirl_jax.data.scenes.signal_checks import SignalChecks, signal_checks
+from rcirl_jax.evaluation.labels import signals
+from rcirl_jax.evaluation.labels.signals import (
+    check_events,
+    check_written,
+    first_stands,
+    format_phases,
+    line_events,
+    period,
+)
+from rcirl_jax.runtime.executors import Here, Processes
+from rcirl_jax.types import Kind, Lane, Recording, Signal, Track
+from tests.data.importers.formats import commonroad
+
+T = np.arange(0.0, 11.05, 0.1)  # s
+LENGTH_M, WIDTH_M, LANE_M = 4.6, 1.8, 3.6
+
+
+def light(offset, until=200.0):
+    """30 s green, 3 s yellow, 27 s red, from `offset` on."""
+    starts, states, t = [], [], offset - 120.0
+    while t < until:
+        for state, seconds in (("green", 30.0), ("yellow", 3.0), ("red", 27.0)):
+            starts.append(t)
+            states.append(state)
+            t += seconds
+    return Signal(
+        id="light", start=np.array(starts), state=tuple(states), is_recorded=False
+    )
+
+
+def car(name, x):
+    still = np.zeros(T.size)
+    return Track(
+        id=name, kind=Kind.VEHICLE, length=LENGTH_M, width=WIDTH_M, t=T, x=x,
+        y=still, heading=still, speed=np.gradient(x, T),
+    )  # fmt: skip
+
+
+def lanes(line):
+    """Three along x whose line at x = `line` m the light governs."""
+    x = np.arange(0.0, 560.0, 4.0)
+    half = np.full(x.size, LANE_M / 2)
+    names = ("left", "mid", "right")
+    return tuple(
+        Lane(
+            id=name, centre=np.stack([x, np.full(x.size, (1 - i) * LANE_M)], 1),
+            left_width=half, right_width=half, speed_limit=25.0,
+            left=names[i - 1] if i else None, right=names[i + 1] if i < 2 else None,
+            stop_line=np.array([[line, (j - i) * LANE_M] for j in (1.5, 0.5)]),
+            signal_ids=("light",),
+        )
+        for i, name in enumerate(names)
+    )  # fmt: skip
+
+
+def drives_of(number, written):
+    """A car that crosses 2 to 6 s after the start, and one that waits or not.
+
+    The file starts when its light has been green for 5 s (even numbers) or red
+    for 5 s (odd ones); its clock, and thus the cycle's offset, is its own.
+    """
+    rng = np.random.default_rng(number)
+    green = number % 2 == 0
+    x = 130.0 + (rng.uniform(8.0, 12.0) if green else 0.0) * (T - 2.0)
+    line = 130.0 + (30.0 if green else 0.5 * LENGTH_M + 2.0)
+    since = -5.0 if green else -38.0
+    return Recording(
+        name=f"AAA_Place-1_{number}_T-1", source="test", licence="none", rate_hz=10.0,
+        tracks=(car("ego", x), car("behind", x - rng.uniform(12.0, 20.0))),
+        lanes=lanes(line), signals=(light(since + written),),
+    )  # fmt: skip
+
+
+def checked(made):
+    """The checks of all lines of these recordings, and of all together."""
+    return check_events(map(line_events, made))
+
+
+def test_a_true_phase_is_confirmed():
+    checks = checked(drives_of(number, 0.0) for number in range(12))
+    assert len(checks) == 2
+    assert checks[0].verdict == "confirmed"
+    assert checks[0].crossings == 12
+    assert checks[0].stands == 6
+    assert checks[0].red_written == 0.0
+    assert checks[0].stands_red_written == 1.0
+    assert checks[0].best_offset_s == 0.0
+    assert "confirmed" in format_phases(checks)
+
+
+def test_a_shifted_phase_is_rejected_and_its_shift_found():
+    check = checked(drives_of(number, 25.0) for number in range(12))[0]
+    assert check.verdict == "rejected"
+    assert check.red_written > 0.9
+    assert abs(check.best_offset_s - 35.0) <= 10.0
+    assert check.red_best == 0.0
+
+
+def test_a_phase_per_file_that_means_nothing_is_not_confirmed():
+    rng = np.random.default_rng(1)
+    made = [drives_of(number, rng.uniform(0.0, 60.0)) for number in range(12)]
+    assert checked(made)[0].verdict in ("rejected", "not contradicted")
+
+
+def test_period():
+    assert period(light(0.0)) == pytest.approx(60.0)
+    always = Signal(id="s", start=np.array([0.0]), state=("red",))
+    assert period(always) is None
+
+
+def test_only_the_first_of_a_queue_stands_at_the_line():
+    made = drives_of(1, 0.0)
+    stands = first_stands(made, made.lanes[1])
+    assert list(stands) == [0]
+
+
+@pytest.mark.multiprocess
+def test_logs_are_checked_alike_wherever_they_are_read(tmp_path):
+    """And as their recordings are when they are all held at once."""
+    for number in range(3):
+        (tmp_path / str(number)).mkdir()
+        commonroad.write(tmp_path / str(number))
+    logs = parts_of("commonroad", tmp_path)
+    made = [recording for part in logs for recording in recordings_of(part)]
+    assert len(made) == len(logs) == 3
+    for places in Here(), Processes(2):
+        found = check_written(logs, executor=places)
+        assert repr(found) == repr(checked(made))  # a share of nothing is NaN
+
+
+def verdicts(made):
+    """As an import takes them."""
+    return signal_checks({check.name: check.verdict for check in checked(made)})
+
+
+@pytest.mark.parametrize(("turned", "used"), [(0.0, 4), (25.0, 0)])
+def test_an_import_takes_the_word_of_many_files(turned, used):
+    """Two or three crossings a file prove nothing; twelve files do."""
+    made = [drives_of(number, turned) for number in range(12)]
+    config = CollectConfig(signal_checks=verdicts(made))
+    alone = [Collector(one, CollectConfig()) for one in made[:4]]
+    told = [Collector(one, config) for one in made[:4]]
+    assert sum(len(one.signals) for one in alone) == 0
+    assert sum(len(one.signals) for one in told) == used
+    said = [note for one in told for note in one.signal_notes]
+    assert sum("many files speak against it" in note for note in said) == 4 - used
+
+
+def test_an_import_can_ask_all_files_itself(monkeypatch, capsys):
+    """`--signals=pooled`."""
+    made = [drives_of(number, 0.0) for number in range(12)]
+    monkeypatch.setattr(signals, "recordings_in", lambda one: [(None, one)])
+    monkeypatch.setattr(signals, "items", lambda parts, _: iter(parts))
+    with flagsaver.as_parsed(signals="pooled"):
+        assert signals_asked() == "pooled"
+        assert checked_signals(made, Here()) == verdicts(made)
+    assert "confirmed" in capsys.readouterr().out
+    with flagsaver.flagsaver():
+        flags.FLAGS.mark_as_parsed()
+        assert signals_asked() == ""
+        assert checked_signals(made, Here()) is None
+
+
+def test_a_verdict_on_a_line_comes_before_all_rules():
+    one = drives_of(0, 0.0)
+    words = {
+        "AAA_Place-1/light": "rejected",
+        "AAA_Place-1/other": "too few crossings",
+        "all together": "not contradicted",
+    }
+    found = signal_checks(words)
+    assert (found.used, found.unused) == ((), ("AAA_Place-1/light",))
+    assert not trusted_signals(one, found)[0]
+    both = SignalChecks(used=("AAA_Place-1/light",), unused=())
+    assert list(trusted_signals(one, both)[0]) == ["light"]
+    words["all together"] = "confirmed"
+    assert signal_checks(words).used == ("AAA_Place-1/other",)
+
+
+@pytest.mark.slow
+@pytest.mark.dataset
+def test_urban_signals(data_dir):
+    """The written cycles fit the drivers, over all files; one file proves little."""
+    folder = data_dir / "ngsim_urban_commonroad" / "xml"
+    checks = check_written(parts_of("commonroad", folder), executor=Processes(2))
+    together = checks[-1]
+    assert together.crossings > 150
+    assert together.red_written < 0.1
+    assert together.best_offset_s == 0.0
+    assert together.verdict == "confirmed"
+    assert sum(check.verdict == "confirmed" for check in checks[:-1]) >= 3
+    assert sum(check.verdict == "rejected" for check in checks[:-1]) <= 4
