@@ -33,7 +33,7 @@ from rcirl_jax.units import TIMES_S
 NUM_SAMPLES = 32  # verification samples in the file
 
 
-def config_of(settings: Mapping[str, Any]) -> TrainConfig:
+def _config_of(settings: Mapping[str, Any]) -> TrainConfig:
     """The configuration of its fields as JSON types.
 
     Raises:
@@ -53,7 +53,7 @@ def read_config(workdir: Path) -> tuple[TrainConfig, dict]:
         raise InputError(f"{path}: missing: expected a run made by experiments.train")
     run = read_json(path, "a run of this version")
     try:
-        config = config_of(run["config"])
+        config = _config_of(run["config"])
         if not isinstance(run.get("flags", {}), dict):
             raise ValueError("flags: not a table")
     except UNFORESEEN as error:

@@ -1,6 +1,6 @@
 """What a file says of its making, checked before anything is done with it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from rcirl_jax.errors import InputError
@@ -38,16 +38,3 @@ def dataset_names(found: object, where: str) -> list[str]:
     if not names or len(texts) != len(names) or any("\0" in name for name in texts):
         raise InputError(f"{where}: {found}: expected a dataset, or a list of them")
     return texts
-
-
-def check_local(names: Sequence[str], where: str) -> None:
-    """Refuse what lies elsewhere: a file decides about no connection.
-
-    Raises:
-      InputError: a URL among the names.
-    """
-    for name in names:
-        if "://" in name:
-            raise InputError(
-                f"{where}: {name}: expected a folder; --data may name another place"
-            )

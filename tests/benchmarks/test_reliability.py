@@ -313,29 +313,6 @@ def test_a_guarded_row_drives_as_the_reward_or_as_its_incumbent(root):
     np.testing.assert_allclose(nothing, theirs, atol=1e-2)
 
 
-def test_weights_of_the_tuning_loop_are_made_again(root, tmp_path):
-    job = jobs(root)["autotune"]
-    flags = [*job.flags, "--until=train"]
-    assert limited(tmp_path, None, job.module, *flags).returncode == 0
-    (data,) = tmp_path.glob("run/dataset-*")
-    again = ("--weights=run/weights.msgpack", f"--data={data}", "--output=again")
-    done = limited(tmp_path, None, "experiments.reproduce", *again)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "reproduced: bit for bit" in done.stdout
-
-
-def test_weights_of_a_sweep_are_made_again(root, tmp_path):
-    job = jobs(root)["sweep"]
-    assert limited(tmp_path, None, job.module, *job.flags).returncode == 0
-    again = ("--weights=sweep/best.msgpack", "--output=again")
-    done = limited(tmp_path, None, "experiments.reproduce", *again)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "reproduced: bit for bit" in done.stdout
-    assert [x.name for x in (tmp_path / "again").glob("*.msgpack")] == [
-        "weights.msgpack"
-    ]
-
-
 @pytest.mark.parametrize(
     "name", ["import", "train", "export", "sweep", "report", "autotune"]
 )

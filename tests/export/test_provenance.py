@@ -7,7 +7,7 @@ import pytest
 from rcirl_jax.errors import InputError
 from rcirl_jax.export import pack
 from rcirl_jax.export.loading import open_reward
-from rcirl_jax.export.provenance import check_local, dataset_names
+from rcirl_jax.export.provenance import dataset_names
 from tests.helpers import weights_files
 from tests.helpers.commands import command
 
@@ -65,12 +65,6 @@ def test_one_dataset_or_several():
     assert dataset_names(["a", "b"], "f") == ["a", "b"]
 
 
-def test_a_file_names_folders_only():
-    check_local(["a", "/b/c"], "f")
-    with pytest.raises(InputError, match="f: gs://b/d: expected a folder; --data may"):
-        check_local(["a", "gs://b/d"], "f")
-
-
 @pytest.mark.parametrize(
     "text", ["[1]", "nul", '{"flags": [1]}', '{"flags": {"data": 5}}']
 )
@@ -80,15 +74,3 @@ def test_a_run_that_is_none_is_one_line(tmp_path, text):
     assert done.returncode == 2
     (said,) = done.stderr.strip().splitlines()
     assert "run.json: " in said
-
-
-def test_no_data_in_the_provenance_is_one_line(tmp_path, monkeypatch):
-    for flags in ({"data": 5}, {}, None):
-        path = with_provenance(tmp_path, monkeypatch, flags=flags)
-        done = command(
-            "experiments.reproduce", f"--weights={path}", f"--output={tmp_path / 'out'}"
-        )
-        assert done.returncode == 2
-        (said,) = done.stderr.strip().splitlines()
-        assert "data" in said
-    assert not (tmp_path / "out").exists()

@@ -143,6 +143,11 @@ def test_run_writes_what_it_should(run):
 
 def test_export_rank_report(dataset, run, tmp_path):
     reward = export_run(run[0], dataset, tmp_path / "weights.msgpack")
+    assert reward.provenance["config"] == json.loads(
+        json.dumps(dataclasses.asdict(CONFIG))
+    )
+    assert reward.provenance["dataset_sha256"] == dataset.hash
+    assert reward.provenance["steps"] == int(run[1].state.step)
     learned, preset, _ = load_runs([reward.file])
     setup = RankingSetup(preset=preset, sampler=SMALL)
     report = evaluate_ranking(dataset, learned, setup)
