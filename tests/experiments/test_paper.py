@@ -199,7 +199,7 @@ def test_robustness(tmp_path):
     done = command("robustness", *flags)
     assert done.returncode == 0, done.stderr[-2000:]
     body = json.loads((tmp_path / "robustness.json").read_text())
-    assert set(body["optimality"]) == {"rank", "DP", "(t, s) only"}
+    assert set(body["optimality"]) == {"rank", "DP"}
     assert set(body["robustness"]) == {"rank", "DP", "hand-set"}
     frames = {row["gap"]["frames"] for row in body["optimality"].values()}
     assert len(frames) == 1  # all rows on the same frames
