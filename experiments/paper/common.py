@@ -32,6 +32,7 @@ HORIZON = flags.DEFINE_float(
 POSITIVE = flags.DEFINE_enum("positive", None, POSITIVES, "trained on" + AS_SAID)
 QUICK = flags.DEFINE_bool("quick", False, "few scenes, two seeds, two epochs")
 
+QUICK_S = 2.0  # s of a case of `--quick`: with one length a program serves all tables
 QUICK_STRIDE_S = 60.0  # s between planning frames of the small synthetic dataset
 QUICK_SCENES = 128  # of each split
 QUICK_COUNTS = {"seeds": 2, "epochs": 2}  # whatever the flags say

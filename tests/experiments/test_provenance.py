@@ -19,11 +19,6 @@ DATA, LOGS = "--data={root}/data", ("--format=csv", "--input={root}/logs")
 WEIGHTS = "--weights={root}/w.msgpack"
 # command: what it is given, what it writes, and which hashes stand there
 ARTEFACTS = {
-    "drive_logs": (
-        ("--learner={root}/w.msgpack", "--suite=free_cruise", "--cases=2",
-         "--duration=45", "--output={out}"),
-        ("made_by.json",), ("weights_sha256",),
-    ),
     "evaluate": (
         (WEIGHTS, DATA, "--output={out}/ranking.json"),
         ("ranking.json",), ("weights_sha256", "data_hash"),
