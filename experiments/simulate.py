@@ -60,11 +60,6 @@ _BASELINES = flags.DEFINE_list("baselines", ",".join(BASELINES), "rival rows, or
 _HAND = flags.DEFINE_string("hand_weights", None, "of tune_hand_set: a further row")
 _IDM = flags.DEFINE_string("tuned_idm", None, "JSON of autotune: a further row")
 _DP = flags.DEFINE_bool("dp", False, "also drive the first weights by DP")
-_GUARD = flags.DEFINE_string(
-    "guard",
-    None,
-    "hand-set or a weights file: drives where the first is out of its data",
-)
 _FILTER = flags.DEFINE_enum(
     "filter", "full", TRACKS, "full, or collision: the reward decides the rest"
 )
@@ -96,10 +91,8 @@ def _recorded(logs: Sequence[Part]) -> CaseSet:
 
 def _made_by(logs: Sequence[Part]) -> dict:
     """Provenance, with the hashes of all that decides how the rows drive."""
-    guard = _GUARD.value
-    further = [guard] if guard and guard not in BASELINES else []
     return provenance(
-        [*_WEIGHTS.value, *further],
+        _WEIGHTS.value,
         hand_weights=[_HAND.value] if _HAND.value else [],
         logs=logs,
     )
@@ -121,7 +114,6 @@ def _job() -> SuiteJob:
         plan_every=_EVERY.value,
         dp=_DP.value,
         hand_weights=_HAND.value,
-        guard=_GUARD.value,
         tuned_idm=idm_fields(_IDM.value),
         track=_FILTER.value,
     )

@@ -44,7 +44,6 @@ class SuiteJob:
     names: tuple[str, ...] = ()  # of the learned rows; else after loss and shape
     tuned_idm: tuple[tuple[str, float], ...] = ()  # fields of a further IDM row
     track: str = "full"  # of the safety filter
-    guard: str | None = None  # incumbent of the first weights' guarded row
 
     def rows(self) -> list[Row]:
         """Learned rows, then the baselines."""
@@ -57,7 +56,6 @@ class SuiteJob:
             if self.hand_weights
             else None,
             names=self.names,
-            guard=self.guard,
             track=self.track,
             tuned_idm=Idm(**dict(self.tuned_idm)) if self.tuned_idm else None,
         )

@@ -10,17 +10,9 @@ import subprocess
 import sys
 import time
 
-import numpy as np
 import pytest
 
 from benchmarks.reliability.jobs import jobs, write_logs
-from rcirl_jax.export.closed_loop import table_rows
-from rcirl_jax.simulation.suite import (
-    catalogue_set,
-    drive_row,
-    rollout_config,
-    suite_refs,
-)
 from tests.conftest import REPO
 from tests.data.small_logs import files_of
 from tests.helpers.commands import LONGEST_S
@@ -278,39 +270,6 @@ def test_sigterm_saves_the_step_it_is_in(root, tmp_path):
     assert time.monotonic() - begin < 10.0
     last = json.loads(metrics.read_text().splitlines()[-1])["step"]
     assert (tmp_path / "run" / "checkpoints" / str(last) / "sha256.json").exists()
-
-
-def test_a_guarded_row_drives(root, tmp_path):
-    flags = (f"--weights={root / 'w.msgpack'}", "--suite=free_cruise", "--cases=1")
-    short = ("--duration=2", "--baselines=", "--guard=hand-set", "--output=out")
-    done = limited(tmp_path, None, "experiments.simulate", *flags, *short)
-    assert done.returncode == 0, done.stderr[-2000:]
-    report = json.loads((tmp_path / "out" / "suite.json").read_text())["report"]
-    (guarded,) = [name for name in report["rows"] if name.endswith(" guarded")]
-    assert report["rows"][guarded]["progress_m"] > 1.0
-
-
-def test_a_guarded_row_drives_as_the_reward_or_as_its_incumbent(root):
-    """With ranges that hold everything, and such that hold nothing."""
-    files = [str(root / "w.msgpack")]
-    learned, guarded, hand = table_rows(files, ["hand-set"], guard="hand-set")
-    cases = catalogue_set(suite_refs("stopped_lead", 4), 6.0)
-    config = rollout_config(learned, cases.duration_s, 1)
-
-    def driven(row, **ranges):
-        if ranges:
-            weights = {k: np.full_like(getattr(row.params, k), x)
-                       for k, x in ranges.items()}  # fmt: skip
-            row = dataclasses.replace(row, params=row.params.replace(**weights))
-        found = drive_row(row, cases.build, len(cases.ids), config, chunk=4)
-        return np.stack([found.progress, found.min_a, found.max_a])
-
-    ours, theirs = driven(learned), driven(hand)
-    assert np.all(np.abs(ours - theirs).max(axis=0) > 0.1)  # else nothing is shown
-    everything = driven(guarded, low=-np.inf, high=np.inf, share=1.0)
-    np.testing.assert_allclose(everything, ours, atol=1e-2)
-    nothing = driven(guarded, low=np.inf, high=-np.inf, share=0.0)
-    np.testing.assert_allclose(nothing, theirs, atol=1e-2)
 
 
 @pytest.mark.parametrize(
