@@ -2,7 +2,6 @@
 
     python -m experiments.convert_weights --weights=FILE --onnx=FILE --stablehlo=FILE
     python -m experiments.convert_weights --weights=LINEAR --yaml=FILE
-    python -m experiments.convert_weights --hand_weights=TUNED --yaml=FILE
 
 --onnx and --jax_export need the extra [export]. Each form scores as the file does;
 only weights.msgpack carries samples that a reader checks itself against. FILE.json
@@ -15,16 +14,13 @@ from absl import flags
 
 from experiments.common import provenance, run
 from rcirl_jax.errors import InputError
-from rcirl_jax.export.forms.linear_yaml import lattice_yaml, reward_yaml
+from rcirl_jax.export.forms.linear_yaml import reward_yaml
 from rcirl_jax.export.forms.onnx_model import write_onnx
 from rcirl_jax.export.forms.stablehlo import exported, write_stablehlo
-from rcirl_jax.export.hand_weights import load_hand_weights
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.runtime.atomic_files import write_json, write_whole
-from rcirl_jax.runtime.pipeline import file_sha256
 
-_WEIGHTS = flags.DEFINE_string("weights", None, "weights file")
-_HAND = flags.DEFINE_string("hand_weights", None, "of tune_hand_set, for --yaml")
+_WEIGHTS = flags.DEFINE_string("weights", None, "weights file", required=True)
 _ONNX = flags.DEFINE_string("onnx", None, "ONNX model to write")
 _STABLEHLO = flags.DEFINE_string("stablehlo", None, "StableHLO bytecode to write")
 _JAX = flags.DEFINE_string("jax_export", None, "bytes of jax.export to write")
@@ -35,39 +31,31 @@ def main() -> None:
     """Flags -> files."""
     wanted = {"onnx": _ONNX, "stablehlo": _STABLEHLO, "jax_export": _JAX}
     files = {name: Path(flag.value) for name, flag in wanted.items() if flag.value}
-    if bool(_WEIGHTS.value) == bool(_HAND.value):
-        raise InputError("--weights, --hand_weights: expected one of them")
     if not files and not _YAML.value:
         raise InputError("--onnx, --stablehlo, --jax_export, --yaml: expected one")
-    if _HAND.value:
-        if files:
-            raise InputError(f"--{next(iter(files))}: expected --weights with it")
-        text = lattice_yaml(load_hand_weights(_HAND.value), Path(_HAND.value).name)
-        facts = {"hand_weights_sha256": file_sha256(Path(_HAND.value))}
-    else:
-        reward = open_reward(str(_WEIGHTS.value))
-        if reward.anchor is not None:
-            raise InputError(
-                f"--weights: {reward.file}: expected a reward without an anchor: these "
-                "forms hold V alone, and the gain on top of the own cost would be lost"
-            )
-        text = reward_yaml(reward) if _YAML.value else ""
-        facts = {
-            "weights_sha256": reward.sha256,
-            "features": reward.names,
-            "units": reward.units,
-            "times_s": [float(time) for time in reward.times],
-            "provenance": reward.provenance,
-        }
-        for name, path in files.items():
-            if name == "onnx":
-                write_onnx(path, reward)
-            else:
-                form = "jax" if name == "jax_export" else "stablehlo"
-                write_stablehlo(path, exported(reward), form)
+    reward = open_reward(_WEIGHTS.value)
+    if reward.anchor is not None:
+        raise InputError(
+            f"--weights: {reward.file}: expected a reward without an anchor: these "
+            "forms hold V alone, and the gain on top of the own cost would be lost"
+        )
+    text = reward_yaml(reward) if _YAML.value else ""
+    for name, path in files.items():
+        if name == "onnx":
+            write_onnx(path, reward)
+        else:
+            form = "jax" if name == "jax_export" else "stablehlo"
+            write_stablehlo(path, exported(reward), form)
     if _YAML.value:
         files["yaml"] = Path(_YAML.value)
         write_whole(files["yaml"], text)
+    facts = {
+        "weights_sha256": reward.sha256,
+        "features": reward.names,
+        "units": reward.units,
+        "times_s": [float(time) for time in reward.times],
+        "provenance": reward.provenance,
+    }
     for name, path in files.items():
         beside = path.with_name(f"{path.name}.json")
         write_json(beside, {"form": name, **facts, "made_by": provenance()})

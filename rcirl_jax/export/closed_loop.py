@@ -21,12 +21,10 @@ from rcirl_jax.planner.rank import (
     rank_policy,
 )
 from rcirl_jax.planner.safety import SafetyConfig
-from rcirl_jax.reward import LatticeCost
 from rcirl_jax.simulation.rows import (
     Row,
     baseline_row,
     dp_row,
-    tuned_row,
 )
 
 DP_EVERY = 10  # steps between two plans of the DP row: it costs 1,000 rankings
@@ -71,7 +69,6 @@ def table_rows(
     plan_every: int = 1,
     *,
     dp: bool = False,
-    hand_set: LatticeCost | None = None,
     tuned_idm: Idm | None = None,
     names: Sequence[str] = (),
     track: str = "full",
@@ -79,7 +76,7 @@ def table_rows(
     """Learned rows first, in the order of the files, then the baselines.
 
     Files of one loss and shape are told apart by their seed, then by their path, or
-    rows bear `names`, one per file. The first drives again by `dp`. Tuned rivals come
+    rows bear `names`, one per file. The first drives again by `dp`. A tuned IDM comes
     last. `track` is the safety filter's (`SafetyConfig`).
 
     Raises:
@@ -103,8 +100,6 @@ def table_rows(
         of = (params, preset, first.activation, config, DpConfig(), slow)
         rows.insert(1, dp_row(f"{rows[0].name} DP", *of))
     rows += [baseline_row(name, preset, params[1], config) for name in baselines]
-    if hand_set is not None:
-        rows.append(tuned_row(hand_set, config))
     if tuned_idm is not None:
         rows.append(Row(name=TUNED_IDM_ROW, policy=idm_policy(tuned_idm)))
     return rows

@@ -86,7 +86,7 @@ def dp_row(
 
 
 def tuned_row(cost: LatticeCost, config: RankConfig) -> Row:
-    """The hand-set cost with tuned weights, ranking like the hand-set one."""
+    """The hand-set cost with other weights, ranking like the hand-set one."""
     policy = rank_policy(hand_score, config)
     return Row(name=TUNED_ROW, policy=policy, params=cost.fields())
 
