@@ -27,7 +27,7 @@ ATHERIS = $(BIN)/python $(PIP) install $(if $(LOCK),--require-hashes \
 
 # Minutes; they touch every dependency: logs, store, two epochs, resume, export, readers, pages
 QUICK := $(addprefix tests/train/test_loop.py::test_,resume_is_bitwise run_writes_what_it_should \
-  export_rank_report exported_values_are_the_trainers) \
+  export_and_rank exported_values_are_the_trainers) \
   tests/data/importers/test_conformance.py tests/data/store/test_dataset.py \
   tests/data/test_import_elsewhere.py::test_no_cluster_is_one_line \
   tests/evaluation/rivals/test_cma_es.py::test_it_finds_the_minimum_of_a_shifted_sphere \

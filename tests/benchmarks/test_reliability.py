@@ -137,8 +137,8 @@ def flags_of(root, name):
     if name == "export":
         data = f"--workdir={root / 'run'}", f"--data={root / 'data'}"
         return "experiments.export_weights", (*data, "--output=w.msgpack")
-    data = f"--weights={root / 'w.msgpack'}", f"--data={root / 'data'}"
-    return "experiments.report", (*data, "--output=report.html")
+    data = f"--data={root / 'data'}", "--scenes=4"
+    return "experiments.inspect_data", (*data, "--output=look")
 
 
 @pytest.mark.parametrize(
@@ -150,7 +150,7 @@ def flags_of(root, name):
         ("train", 60_000, "checkpoints"),
         ("export", 1_000, "w.msgpack"),
         ("sweep", 3_000, "weights"),
-        ("report", 10_000, "figures"),
+        ("look", 10_000, "look"),
         ("autotune", 3_000, "dataset-"),
     ],
 )
@@ -164,7 +164,7 @@ def test_a_full_disk_is_one_line_and_the_run_goes_on(
     assert line.startswith("error: ")
     assert file in line
     assert not list(tmp_path.rglob("*.tmp"))
-    for final in ("manifest.json", "w.msgpack", "report.html", "sweep.json"):
+    for final in ("manifest.json", "w.msgpack", "index.html", "sweep.json"):
         assert not list(tmp_path.rglob(final)), final
     assert limited(tmp_path, None, module, *flags).returncode == 0
     if name in jobs(root):
@@ -273,7 +273,7 @@ def test_sigterm_saves_the_step_it_is_in(root, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name", ["import", "train", "export", "sweep", "report", "autotune"]
+    "name", ["import", "train", "export", "sweep", "look", "autotune"]
 )
 def test_a_place_that_cannot_be_is_one_line(root, tmp_path, name):
     """Below a file, where nobody can make a folder, whoever runs it."""

@@ -32,11 +32,7 @@ ARTEFACTS = {
     ),
     "replay": (
         (WEIGHTS, "--case=free_cruise/000@0", "--duration=2", "--output={out}"),
-        ("case.html", "case.json"), ("weights_sha256",),
-    ),
-    "report": (
-        (WEIGHTS, DATA, "--output={out}/report.html"),
-        ("report.html",), ("weights_sha256", "data_hash"),
+        ("case.html",), ("weights_sha256",),
     ),
     "simulate": (
         (WEIGHTS, "--suite=recorded", *LOGS, "--baselines=", "--cases=1",
@@ -60,7 +56,8 @@ def said(path):
     text = path.read_text()
     if path.suffix == ".json":
         return json.loads(text)["made_by"]
-    (found,) = re.findall(r"(?is)<h2>(?:page )?made by</h2>\n<pre>(\{.*?)</pre>", text)
+    block = r"(?is)<h2[^>]*>(?:page )?made by</h2>\n<pre[^>]*>(\{.*?)</pre>"
+    (found,) = re.findall(block, text)
     return json.loads(html.unescape(found))
 
 
