@@ -61,6 +61,23 @@ def read_config(workdir: Path) -> tuple[TrainConfig, dict]:
     return config, run
 
 
+def datasets_of(workdir: Path) -> list[str]:
+    """The datasets that a run's flags name.
+
+    Raises:
+      InputError: no run, or flags that name none that a file can have.
+    """
+    found = read_config(workdir)[1].get("flags", {}).get("data")
+    names = found if isinstance(found, list) else [found]
+    for name in names or [None]:
+        if not isinstance(name, str) or not name.strip("\0") or "\0" in name:
+            raise InputError(
+                f"{workdir / 'run.json'}: flags.data: {found}: expected a dataset, or "
+                "a list of them; or give --data"
+            )
+    return names
+
+
 def reward_weights(
     params: RewardParams,
     normaliser: Normaliser,

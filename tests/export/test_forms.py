@@ -168,7 +168,7 @@ def test_the_command(tmp_path):
 
     names = ("onnx", "stablehlo", "jax_export")
     done = command(
-        "experiments.convert_weights",
+        "experiments.export_weights",
         f"--weights={file}",
         *(f"--{n}={tmp_path}/{n}" for n in names),
     )
@@ -184,9 +184,10 @@ def test_the_command(tmp_path):
     for flags, message in (
         ((f"--weights={file}", f"--yaml={tmp_path}/y"), "expected a linear reward"),
         ((f"--weights={file}",), "--onnx, --stablehlo"),
-        ((f"--onnx={tmp_path}/o",), "flag --weights=None: Flag --weights must"),
+        ((f"--onnx={tmp_path}/o",), "--workdir, --weights: expected one of them"),
+        ((f"--yaml={tmp_path}/y", f"--workdir={tmp_path}"), "expected --weights with"),
     ):
-        done = command("experiments.convert_weights", *flags)
+        done = command("experiments.export_weights", *flags)
         assert done.returncode == 2
         (line,) = done.stderr.strip().splitlines()
         assert message in line

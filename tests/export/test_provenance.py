@@ -6,8 +6,10 @@ import pytest
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.export import pack
+from rcirl_jax.export.from_run import datasets_of
 from rcirl_jax.export.loading import open_reward
-from rcirl_jax.export.provenance import dataset_names
+from rcirl_jax.runtime.atomic_files import write_json
+from rcirl_jax.train.state import TrainConfig
 from tests.helpers import weights_files
 from tests.helpers.commands import command
 
@@ -52,17 +54,25 @@ def test_what_is_not_said_is_no_mistake(tmp_path, monkeypatch):
     assert open_reward(str(path)).provenance["seed"] is None
 
 
+def run_on(folder, data):
+    """A run's folder whose flags name these data."""
+    config = dataclasses.asdict(TrainConfig())
+    body = {"config": config, "flags": {"data": data}}
+    write_json(folder / "run.json", body)
+    return folder
+
+
 @pytest.mark.parametrize("found", [5, [], [3], "", "a\0b", ["a", None], {"a": 1}])
-def test_names_that_no_dataset_can_have(found):
+def test_names_that_no_dataset_can_have(tmp_path, found):
     with pytest.raises(
         InputError, match=r"run\.json: flags\.data: .*expected a dataset"
     ):
-        dataset_names(found, "run.json: flags.data")
+        datasets_of(run_on(tmp_path, found))
 
 
-def test_one_dataset_or_several():
-    assert dataset_names("a", "f") == ["a"]
-    assert dataset_names(["a", "b"], "f") == ["a", "b"]
+def test_one_dataset_or_several(tmp_path):
+    assert datasets_of(run_on(tmp_path, "a")) == ["a"]
+    assert datasets_of(run_on(tmp_path, ["a", "b"])) == ["a", "b"]
 
 
 @pytest.mark.parametrize(

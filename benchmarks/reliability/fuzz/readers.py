@@ -31,8 +31,7 @@ from rcirl_jax.evaluation.closed_loop.likeness import read_arrays, write_arrays
 from rcirl_jax.evaluation.gate.types import Likeness
 from rcirl_jax.evaluation.ranking.sweep import SweepConfig, member_name, shape_name
 from rcirl_jax.export.from_run import last_metrics, read_config
-from rcirl_jax.export.loading import open_reward
-from rcirl_jax.export.provenance import check_provenance
+from rcirl_jax.export.loading import check_provenance, open_reward
 from rcirl_jax.export.reader import decode_weights
 from rcirl_jax.export.sweep.folder import (
     GROUP_FACTS,
