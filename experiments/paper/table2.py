@@ -7,8 +7,8 @@ Without --weights rewards are trained as by `experiments.paper.rank_against_gan`
 flags of training these are: every loss alone and on top of the own cost. Two seeds
 train, the first drives. OUTPUT/suite holds the table of every row, OUTPUT/dp that of
 the first file without an anchor by ranking and by dynamic programming on --dp_cases of
-each family. Expected: two minutes of training, then a quarter of an hour a row on two
-cores. `--quick`: three minutes, numbers without meaning.
+each family. Expected: four hours of two cores, nearly all of it the suite, a quarter of
+an hour a row. `--quick`: three minutes, numbers without meaning.
 """
 
 import dataclasses
