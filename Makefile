@@ -27,7 +27,7 @@ ATHERIS = $(BIN)/python $(PIP) install $(if $(LOCK),--require-hashes \
 
 # Minutes; they touch every dependency: logs, store, two epochs, resume, export, readers, pages
 QUICK := $(addprefix tests/train/test_loop.py::test_,resume_is_bitwise run_writes_what_it_should \
-  export_rank_report exported_values_are_the_trainers) \
+  export_and_rank exported_values_are_the_trainers) \
   tests/data/importers/test_conformance.py tests/data/store/test_dataset.py \
   tests/data/test_import_elsewhere.py::test_no_cluster_is_one_line \
   tests/evaluation/rivals/test_cma_es.py::test_it_finds_the_minimum_of_a_shifted_sphere \
@@ -35,11 +35,11 @@ QUICK := $(addprefix tests/train/test_loop.py::test_,resume_is_bitwise run_write
   tests/features/test_features.py::test_equals_the_oracle tests/report/test_data_page.py
 QUICKLY = -m pytest -q -m "not slow and not dataset" $(QUICK)
 
-# Features, gradients, resume, reproduction, recordings, and what rounds otherwise when compiled quickly, with
+# Features, gradients, resume, recordings, and what rounds otherwise when compiled quickly, with
 # the compiler as users have it. For the rest XLA compiles in half the time to slower programs;
 # by hand and in `make reliability` all have the users' compiler, but for what `tests/helpers/commands.py`
 # and `tests/train/test_processes.py` start
-EXACT := $(addprefix tests/,train/test_reproduce.py evaluation/test_recorded_training.py \
+EXACT := $(addprefix tests/,evaluation/test_recorded_training.py \
   features/test_features.py reward/test_gradients.py \
   evaluation/rivals/test_tuned.py::test_distances_alone_are_those_of_the_scores \
   $(addprefix train/test_,loop.py::test_every_scene_counts_once_for_the_normaliser \

@@ -68,7 +68,14 @@ _UNTIL = flags.DEFINE_enum("until", "report", STAGES, "last stage")
 
 def main() -> None:
     """Flags -> one run of the loop."""
-    given, recipe = _given(), training.recipe()
+    given, one = sources(), made_run()
+    with only_one(one.folder):
+        tune(one, given, _UNTIL.value)
+
+
+def made_run() -> Run:
+    """The run that the flags describe."""
+    recipe = training.recipe()
     rehearsal = recipe.rehearsal
     if _TEACHER.value is not None:
         rehearsal = dataclasses.replace(rehearsal, teacher=_TEACHER.value)
@@ -90,18 +97,16 @@ def main() -> None:
         plan_every=_EVERY.value,
         sweep=Path(_SWEEP.value) if _SWEEP.value else None,
     )
-    one = Run(
+    return Run(
         folder=Path(_WORKDIR.value),
         config=config,
         executor=executor(),
         running=Running(parallel=_PARALLEL.value),
         facts=provenance(),
     )
-    with only_one(one.folder):
-        tune(one, given, _UNTIL.value)
 
 
-def _given() -> list[str | Logs]:
+def sources() -> list[str | Logs]:
     """The sources: datasets, logs, or synthetic traffic."""
     ways = [bool(_DATA.value), bool(_INPUT.value), _SYNTHETIC.value]
     if sum(ways) != 1:

@@ -21,7 +21,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.export.reader import load_weights
 from rcirl_jax.runtime import signals as interrupts
 from rcirl_jax.runtime.atomic_files import is_text
-from rcirl_jax.runtime.pipeline import code_sha256, file_sha256
+from rcirl_jax.runtime.pipeline import code_sha256
 
 EXIT_BAD_INPUT = 2
 # variables that decide how numbers are rounded
@@ -192,30 +192,23 @@ def hidden_sizes(values: list[str], flag: str = "hidden_size") -> tuple[int, ...
     return sizes
 
 
-def provenance(
-    weights: Sequence[str] = (),
-    *,
-    hand_weights: Sequence[str] = (),
-    logs: Sequence[Part] = (),
-) -> dict:
+def provenance(weights: Sequence[str] = (), *, logs: Sequence[Part] = ()) -> dict:
     """Flags of one experiment file, git commit, versions and machine.
 
     Starts JAX's devices: after `join_processes` where there are several processes.
 
     Args:
       weights: weights files that were read; their hashes name them.
-      hand_weights: files of tune_hand_set that were read, likewise.
       logs: recordings that were read without an import, likewise.
 
     Raises:
       InputError: a weights file is missing or damaged.
-      OSError: another file cannot be read.
+      OSError: a recording cannot be read.
     """
     own = flags.FLAGS.get_key_flags_for_module(sys.argv[0])
     packages = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
     read = {
         "weights_sha256": {str(path): load_weights(path).sha256 for path in weights},
-        "hand_weights_sha256": {path: file_sha256(Path(path)) for path in hand_weights},
         "logs_sha256": logs_sha256(logs),
     }
     return {

@@ -17,7 +17,6 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.evaluation.ranking.format import format_table
 from rcirl_jax.evaluation.ranking.table import to_json
-from rcirl_jax.export.hand_weights import tuned_rows
 from rcirl_jax.export.loading import load_runs
 from rcirl_jax.runtime.atomic_files import write_json
 
@@ -29,7 +28,6 @@ _SPLIT = flags.DEFINE_string("split", "test", "split that is ranked")
 _FILTER = flags.DEFINE_bool(
     "drop_collisions", False, "rank only candidates that meet nothing, in every row"
 )
-_HAND = flags.DEFINE_list("hand_weights", [], "of tune_hand_set: runs of a further row")
 _WIDTH = flags.DEFINE_integer("width", 118, "columns of the printed table")
 
 
@@ -44,15 +42,13 @@ def main() -> None:
         horizon_s=_HORIZON.value,
         split=_SPLIT.value,
         drop_collisions=_FILTER.value,
-        tuned=tuned_rows(_HAND.value),
     )
     dataset = open_dataset(_DATA.value)
     report = evaluate_ranking(dataset, learned, setup, executor())
     print(format_table(report, _WIDTH.value))
     if _OUTPUT.value:
         output = Path(_OUTPUT.value)
-        found = provenance(_WEIGHTS.value, hand_weights=_HAND.value)
-        made_by = {**found, "data_hash": dataset.hash}
+        made_by = {**provenance(_WEIGHTS.value), "data_hash": dataset.hash}
         write_json(output, {**to_json(report), "made_by": made_by})
         print(f"report: {output}")
 

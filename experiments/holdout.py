@@ -20,18 +20,10 @@ _READ_BY = {"recording": ("recording",), "split_seed": ("vehicles", "validation"
 
 def splits(dataset: Demonstrations) -> tuple[list[Demonstrations], str]:
     """The dataset split as the flags say, once or by --folds, and that in words."""
-    if not _FOLDS.value:
-        one, words = split(dataset)
-        return [one], words
-    alone("folds", "holdout", "recording", "split_seed")
-    words = f"{_FOLDS.value} parts of the recordings, each held out once"
-    return list(folds_by_recording(dataset, _FOLDS.value)), words
-
-
-def split(dataset: Demonstrations) -> tuple[Demonstrations, str]:
-    """The dataset split as --holdout says, and that in words."""
     if _FOLDS.value:
-        raise InputError(f"--folds: {_FOLDS.value}: expected 0, one split, here")
+        alone("folds", "holdout", "recording", "split_seed")
+        words = f"{_FOLDS.value} parts of the recordings, each held out once"
+        return list(folds_by_recording(dataset, _FOLDS.value)), words
     how = _HOLDOUT.value
     for name, holdouts in _READ_BY.items():
         if (flag := flags.FLAGS[name]).present and how not in holdouts:
@@ -43,4 +35,5 @@ def split(dataset: Demonstrations) -> tuple[Demonstrations, str]:
         named = [int(number) for number in _RECORDING.value]
     except ValueError as error:
         raise InputError(f"--recording: {_RECORDING.value}: {error}") from error
-    return held_out(dataset, how, seed=_SPLIT.value, recordings=named)
+    one, words = held_out(dataset, how, seed=_SPLIT.value, recordings=named)
+    return [one], words

@@ -38,7 +38,6 @@ from experiments.common import provenance, run, unread
 from experiments.holdout import splits
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.joined import Demonstrations
-from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.evaluate import (
     RankingSetup,
     pooled,
@@ -56,7 +55,6 @@ from rcirl_jax.evaluation.ranking.learners import (
 from rcirl_jax.evaluation.ranking.score import Rival
 from rcirl_jax.evaluation.ranking.table import UNTRAINED_ROW, to_json
 from rcirl_jax.evaluation.rivals.tuned import as_numbers, tuned_rivals
-from rcirl_jax.export.hand_weights import tuned_rows
 from rcirl_jax.report.ranking.intervals import ranking_chart
 from rcirl_jax.reward import RewardConfig
 from rcirl_jax.runtime.atomic_files import write_json, write_whole
@@ -71,11 +69,8 @@ _SEEDS = flags.DEFINE_integer("seeds", 10, "training runs per learner", lower_bo
 _HORIZON = flags.DEFINE_float(
     "horizon", 5.0, "s at which distances are taken", lower_bound=0.4, upper_bound=8.0
 )
-_HAND = flags.DEFINE_list(
-    "hand_weights", [], "of tune_hand_set with the same split: runs of a further row"
-)
 _TUNED = flags.DEFINE_integer(
-    "tuned", 0, "instead: hand-set and IDM tuned here on each split, so many times", 0
+    "tuned", 0, "hand-set and IDM tuned on each split, so many times", 0
 )
 _LONG = flags.DEFINE_integer(
     "tuned_long", 3000, "evaluations of the hand-set cost's long search, or 0", 0
@@ -87,16 +82,13 @@ def _tuned(
 ) -> dict[str, list[Rival]]:
     """The rows of the tuned rivals, if any; with the queries of a learner's epochs."""
     if not _TUNED.value:
-        costs = tuned_rows(_HAND.value, part.hash)
-        return {row: [*runs] for row, runs in costs.items()}
+        return {}
     seeds = range(_TUNED.value)
     return tuned_rivals(part, setup, epochs=epochs, seeds=seeds, long=_LONG.value)
 
 
 def main() -> None:
     """Flags -> one comparison."""
-    if _TUNED.value and _HAND.value:
-        raise InputError("--tuned, --hand_weights: expected one of them")
     dataset = open_dataset(_DATA.value)
     parts, words = splits(dataset)
     base = dataclasses.replace(training.training_config(), reward=RewardConfig())
@@ -117,7 +109,7 @@ def main() -> None:
     write_whole(folder / "table.txt", format_table(report, 118))
     write_whole(folder / "table.md", markdown_table(report))
     split_of = parts[0] if len(parts) == 1 else dataset
-    made_by = {**provenance(hand_weights=_HAND.value), "data_hash": split_of.hash}
+    made_by = {**provenance(), "data_hash": split_of.hash}
     bad = sorted(failed)
     body = {
         **to_json(report),

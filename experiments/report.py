@@ -1,40 +1,57 @@
-"""Write the ranking report as one HTML page with its pictures.
+"""Draw the page of a tuning run again, as this version draws it.
 
-python -m experiments.report --weights=FILE[,FILE...] --data=DATASET \
-        --output=report.html [--workdir=RUN]
+    python -m experiments.report --workdir=RUN
+
+RUN is of `experiments.autotune`, finished up to its verdict. Its settings and sources
+are those that RUN/stages.json has noted; nothing but RUN/report.html is made.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from absl import flags
 
-from experiments.common import provenance, run
-from rcirl_jax.data.store.dataset import open_dataset
-from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
-from rcirl_jax.export.loading import load_runs, open_reward
-from rcirl_jax.report.ranking.page import write_ranking_page
+from experiments import autotune
+from experiments.common import run
+from rcirl_jax.autotune.loop import draw_again
+from rcirl_jax.errors import UNFORESEEN, InputError
+from rcirl_jax.runtime.pipeline import FILE, Stages, only_one
 
-_WEIGHTS = flags.DEFINE_list("weights", None, "weights files", required=True)
-_DATA = flags.DEFINE_string("data", None, "dataset", required=True)
-_OUTPUT = flags.DEFINE_string("output", None, "HTML to write", required=True)
-_WORKDIR = flags.DEFINE_string("workdir", None, "run whose training curve is drawn")
-_HORIZON = flags.DEFINE_float("horizon", 5.0, "s at which distances are taken")
+NOT_OF_A_RUN = ("workdir", "executor", "workers", "ray_address")
+
+
+def recall(folder: Path) -> None:
+    """Set the flags of `experiments.autotune` to those of a run's verdict.
+
+    Raises:
+      InputError: no such run, or a flag was given that the run's would replace.
+    """
+    where, known = folder / FILE, Stages(folder=folder).read()
+    if "gate" not in known:
+        raise InputError(f"{where}: gate: missing: expected a run with its verdict")
+    noted = known["gate"].get("made_by")
+    found = noted.get("flags") if isinstance(noted, Mapping) else None
+    if not isinstance(found, Mapping):
+        raise InputError(f"{where}: gate: made_by.flags: expected the run's flags")
+    for name, value in found.items():
+        if name in NOT_OF_A_RUN or name not in flags.FLAGS:
+            continue
+        flag = flags.FLAGS[name]
+        if flag.present:
+            raise InputError(f"--{name}: expected none: the run's own is taken")
+        try:
+            own = None if value is None else flag.parser.parse(value)
+            setattr(flags.FLAGS, name, own)
+        except (*UNFORESEEN, flags.Error) as error:
+            raise InputError(f"{where}: gate: --{name}: {error}") from error
 
 
 def main() -> None:
-    """Flags -> one page."""
-    learned, preset, sampler = load_runs(_WEIGHTS.value)
-    dataset = open_dataset(_DATA.value)
-    setup = RankingSetup(preset=preset, sampler=sampler, horizon_s=_HORIZON.value)
-    page = write_ranking_page(
-        Path(_OUTPUT.value),
-        dataset=dataset,
-        rewards=[open_reward(path) for path in _WEIGHTS.value],
-        report=evaluate_ranking(dataset, learned, setup),
-        workdir=Path(_WORKDIR.value) if _WORKDIR.value else None,
-        facts=provenance(_WEIGHTS.value),
-    )
-    print(f"report: {page}")
+    """The run's flags -> its page."""
+    folder = Path(flags.FLAGS["workdir"].value)
+    recall(folder)
+    with only_one(folder):
+        draw_again(autotune.made_run(), autotune.sources())
 
 
 if __name__ == "__main__":

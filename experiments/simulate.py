@@ -57,14 +57,8 @@ _INPUT = flags.DEFINE_string("input", None, "recordings of --suite=recorded")
 _SMOOTHING = flags.DEFINE_float("smoothing", 4.1, "s, window on recorded positions")
 _OUTPUT = flags.DEFINE_string("output", None, "folder to write", required=True)
 _BASELINES = flags.DEFINE_list("baselines", ",".join(BASELINES), "rival rows, or empty")
-_HAND = flags.DEFINE_string("hand_weights", None, "of tune_hand_set: a further row")
 _IDM = flags.DEFINE_string("tuned_idm", None, "JSON of autotune: a further row")
 _DP = flags.DEFINE_bool("dp", False, "also drive the first weights by DP")
-_GUARD = flags.DEFINE_string(
-    "guard",
-    None,
-    "hand-set or a weights file: drives where the first is out of its data",
-)
 _FILTER = flags.DEFINE_enum(
     "filter", "full", TRACKS, "full, or collision: the reward decides the rest"
 )
@@ -94,17 +88,6 @@ def _recorded(logs: Sequence[Part]) -> CaseSet:
     return recorded_set(recordings_of_all(logs), config)
 
 
-def _made_by(logs: Sequence[Part]) -> dict:
-    """Provenance, with the hashes of all that decides how the rows drive."""
-    guard = _GUARD.value
-    further = [guard] if guard and guard not in BASELINES else []
-    return provenance(
-        [*_WEIGHTS.value, *further],
-        hand_weights=[_HAND.value] if _HAND.value else [],
-        logs=logs,
-    )
-
-
 def _job() -> SuiteJob:
     """Rows and catalogue cases that the flags name."""
     elsewhere = _SUITE.value in ("recorded", "heldout")
@@ -120,8 +103,6 @@ def _job() -> SuiteJob:
         duration_s=duration,
         plan_every=_EVERY.value,
         dp=_DP.value,
-        hand_weights=_HAND.value,
-        guard=_GUARD.value,
         tuned_idm=idm_fields(_IDM.value),
         track=_FILTER.value,
     )
@@ -133,7 +114,7 @@ def _held_out(job: SuiteJob) -> None:
         raise InputError("--duration: of --suite=heldout: drives last as their records")
     data = open_datasets(_DATA.value)
     sources = data.parts if isinstance(data, JoinedDatasets) else [data]
-    made_by = {**_made_by([]), "data_hash": data.hash}
+    made_by = {**provenance(_WEIGHTS.value), "data_hash": data.hash}
     drives = held_out(sources, _CASES.value or DRIVES, _SEED.value)
     report = held_out_likeness(drives, job.rows(), _EVERY.value)
     folder = Path(_OUTPUT.value)
@@ -168,7 +149,8 @@ def main() -> None:
         if places.workers > 1:
             drive = spread(places, job)
     config = SuiteConfig(plan_every=_EVERY.value, chunk=_CHUNK.value)
-    made_by = _made_by(logs)  # of the files as they are read, not hours later
+    # of the files as they are read, not hours later
+    made_by = provenance(_WEIGHTS.value, logs=logs)
     result = run_suite(rows, cases, config, drive)
     print(write_suite(result, Path(_OUTPUT.value), made_by))
     for name, facts in result.timings.items():

@@ -5,7 +5,7 @@
 Every round works in a new folder: a few small logs are written and imported, a reward
 is trained for an epoch, stopped after a checkpoint and resumed, exported, read again,
 ranked, driven over two cases of every family, judged by the gate and reported, with
-the pages of the ranking and of the data. After each round: resident memory, what
+the page of the data. After each round: resident memory, what
 malloc has in use of it, open files, threads, live arrays, blocks of Python's allocator,
 programs compiled, seconds. The first quarter of the rounds is warm-up; after it memory
 may not rise by more than 5 % or 50 MiB, whichever is more (`memory.growth`), what is in
@@ -55,10 +55,7 @@ from rcirl_jax.data.logs import Logs
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.evaluation.gate.types import GateConfig
-from rcirl_jax.evaluation.ranking.table import from_json
-from rcirl_jax.export.loading import open_reward
 from rcirl_jax.report.data.page import choose_rows, write_data_page
-from rcirl_jax.report.ranking.page import write_ranking_page
 from rcirl_jax.runtime.executors import Here
 from rcirl_jax.runtime.pipeline import digest, file_sha256
 from rcirl_jax.train.running import Running
@@ -166,20 +163,12 @@ def _logs() -> Logs:
     return Logs(format="csv", input=Path("logs"), source=None, config=config)
 
 
-def _pages() -> None:
-    """The pages that draw with matplotlib."""
+def _page() -> None:
+    """The page of the data, beside that of the run."""
     (data,) = Path("run").glob("dataset-*")
     dataset = open_dataset(data)
     rows = choose_rows(dataset.column("scene.tags"), DRAWN)
     write_data_page(Path("data/index.html"), dataset, rows, "a night's data", {})
-    write_ranking_page(
-        Path("ranking.html"),
-        dataset=dataset,
-        rewards=[open_reward("run/weights.msgpack")],
-        report=from_json(_plain("ranking.json")),
-        workdir=None,  # whose curve is of rates, too
-        facts={},
-    )
 
 
 def _plain(name: str) -> dict:
@@ -191,12 +180,9 @@ def _plain(name: str) -> dict:
 
 def _outputs() -> Facts:
     """Digests of what has to be the same in every round."""
-    sha256 = open_reward("run/weights.msgpack").sha256  # of a body with its date
-    page = Path("ranking.html").read_text().replace(sha256, "")
     return {
         **jobs(Path())["autotune"].outcome(Path()),
         **{name: digest(_plain(name)) for name in ("ranking.json", "verdict.json")},
-        "ranking.html": digest(page),
         "data/index.html": file_sha256(Path("data/index.html")),
     }
 
@@ -211,7 +197,7 @@ def _work(facts: Mapping[str, object]) -> Facts:
     if not list(Path("run").glob("train-*/seed-0/checkpoints/*/sha256.json")):
         raise ValueError("the training was to stop after a checkpoint")
     tune(_run(facts, Running()), [_logs()])
-    _pages()
+    _page()
     return _outputs()
 
 

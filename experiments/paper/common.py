@@ -1,7 +1,7 @@
 """What the paper's experiments share: flags, data, training, files."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +16,6 @@ from rcirl_jax.data.store.dataset import Dataset, open_dataset
 from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.data.store.resplit import Resplit
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
-from rcirl_jax.evaluation.ranking.learners import Learned, scorers
-from rcirl_jax.evaluation.ranking.table import RankingReport
-from rcirl_jax.report.ranking.intervals import Interval
 from rcirl_jax.reward import RewardConfig
 from rcirl_jax.runtime.atomic_files import write_json
 from rcirl_jax.train.state import POSITIVES, TrainConfig
@@ -36,6 +32,7 @@ HORIZON = flags.DEFINE_float(
 POSITIVE = flags.DEFINE_enum("positive", None, POSITIVES, "trained on" + AS_SAID)
 QUICK = flags.DEFINE_bool("quick", False, "few scenes, two seeds, two epochs")
 
+QUICK_S = 2.0  # s of a case of `--quick`: with one length a program serves all tables
 QUICK_STRIDE_S = 60.0  # s between planning frames of the small synthetic dataset
 QUICK_SCENES = 128  # of each split
 QUICK_COUNTS = {"seeds": 2, "epochs": 2}  # whatever the flags say
@@ -119,41 +116,6 @@ def base(**changes: object) -> TrainConfig:
     if "positive" not in changes:
         shared["positive"] = positive()
     return dataclasses.replace(recipe().train, **{**shared, **changes})
-
-
-def ranked(
-    data: Demonstrations,
-    learned: Mapping[str, Sequence[Learned]],
-    against: Sequence[str],
-) -> RankingReport:
-    """Learned rows beside the baselines on held-out scenes.
-
-    Paired differences are to the rows of `against`, which the experiment asks about,
-    and to IDM, hand-set and random.
-    """
-    references = (*against, "IDM", "hand-set", "random")
-    told = recipe().train
-    setup = RankingSetup(
-        preset=told.features, sampler=told.sampler, horizon_s=HORIZON.value
-    )
-    return evaluate_ranking(data, scorers(learned), setup, references=references)
-
-
-def print_differences(report: RankingReport, pairs: Iterable[tuple[str, str]]) -> None:
-    """A line per (row, reference): the paired difference in top-1 FDE."""
-    found = {
-        (c.row, c.reference): c for c in report.comparisons if c.metric == "top1_fde"
-    }
-    for pair in pairs:
-        d, p = found[pair].difference, found[pair].p_holm
-        apart = f"{d.mean:+.2f} m [{d.low:+.2f}, {d.high:+.2f}], Holm p {p:.3f}"
-        print(f"{' minus '.join(pair)}: top-1 FDE {apart}")
-
-
-def intervals(report: RankingReport, metric: str) -> dict[str, Interval]:
-    """Row -> (value, low, high) of one metric."""
-    found = {name: row[metric] for name, row in report.rows.items()}
-    return {name: (e.value, e.low, e.high) for name, e in found.items()}
 
 
 def as_used(weights: Sequence[str] = (), **used: object) -> dict:

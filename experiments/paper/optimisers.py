@@ -13,22 +13,16 @@ mean nothing.
 import numpy as np
 
 from experiments.common import run
-from experiments.paper.common import (
-    base,
-    dataset,
-    intervals,
-    picture,
-    ranked,
-    seeds,
-    write,
-)
+from experiments.paper.common import HORIZON, base, dataset, picture, seeds, write
+from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.evaluation.ranking.format import format_table
-from rcirl_jax.evaluation.ranking.learners import train_learners
+from rcirl_jax.evaluation.ranking.learners import scorers, train_learners
 from rcirl_jax.evaluation.ranking.table import to_json
 from rcirl_jax.report.ranking.intervals import curves_panel, interval_panel
 from rcirl_jax.report.style import figure, label, save
 
 RATES = {"adam": 3e-3, "rmsprop": 3e-3, "sgd": 3e-2}
+REFERENCES = ("adam", "IDM", "hand-set", "random")  # of the paired differences
 
 
 def main() -> None:
@@ -39,14 +33,21 @@ def main() -> None:
         for name, rate in RATES.items()
     }
     learned = train_learners(data, configs, seeds())
-    report = ranked(data, learned, ["adam"])
+    told = base()
+    setup = RankingSetup(
+        preset=told.features, sampler=told.sampler, horizon_s=HORIZON.value
+    )
+    report = evaluate_ranking(data, scorers(learned), setup, references=REFERENCES)
     print(format_table(report, 118))
     made, axes = figure(1, 2, 11.0, 4.2)
     wins = {n: np.array([r.wins for r in runs]) for n, runs in learned.items()}
     epochs = np.arange(1, next(iter(wins.values())).shape[1] + 1)
     curves_panel(axes[0, 0], epochs, wins)
     label(axes[0, 0], "training, band: 2 s.e.", "epoch", "share of pairs won")
-    interval_panel(axes[0, 1], intervals(report, "top1_fde"))
+    found = {name: row["top1_fde"] for name, row in report.rows.items()}
+    interval_panel(
+        axes[0, 1], {name: (x.value, x.low, x.high) for name, x in found.items()}
+    )
     label(axes[0, 1], "held out: distance of the chosen", "m, lower is better", "")
     save(made, picture("optimisers"))
     write(

@@ -44,6 +44,7 @@ from experiments.paper.common import (
     HORIZON,
     OUTPUT,
     QUICK,
+    QUICK_S,
     dataset,
     epochs,
     few,
@@ -54,7 +55,6 @@ from experiments.paper.common import (
     seeds,
     write,
 )
-from experiments.paper.weights import QUICK_S
 from rcirl_jax.autotune.anchoring import OWN_COST, Anchoring, fitted_anchor
 from rcirl_jax.autotune.recipes import DEFAULT, load_recipe
 from rcirl_jax.autotune.rehearsal import rehearse

@@ -13,6 +13,7 @@ from rcirl_jax.data.logs import Logs
 from rcirl_jax.data.parts import parts_of
 from rcirl_jax.data.store.dataset import Dataset, open_dataset
 from rcirl_jax.data.store.joined import Demonstrations, JoinedDatasets
+from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.pipeline import digest, file_sha256
 
 
@@ -40,6 +41,20 @@ def source(run: Run, given: str | Logs, number: int) -> Dataset:
 
     run.stage(f"import {number}", inputs, [folder / "manifest.json"], work)
     return open_dataset(folder)
+
+
+def kept_source(run: Run, given: str | Logs, number: int) -> Dataset:
+    """A source's dataset, as the run has imported it.
+
+    Raises:
+      InputError: the run has not.
+    """
+    if isinstance(given, str):
+        return open_dataset(given)
+    made = run.stages.read().get(f"import {number}", {}).get("outputs", {})
+    for manifest in made:
+        return open_dataset((run.folder / manifest).parent)
+    raise InputError(f"{run.folder}: import {number}: missing: expected its dataset")
 
 
 def with_rehearsal(

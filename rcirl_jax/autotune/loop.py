@@ -7,7 +7,7 @@ The order of the stages and what is printed; each stage's work is in `demonstrat
 import functools
 from collections.abc import Callable, Sequence
 
-from rcirl_jax.autotune.demonstrations import source, with_rehearsal
+from rcirl_jax.autotune.demonstrations import kept_source, source, with_rehearsal
 from rcirl_jax.autotune.evidence import (
     gate,
     likeness,
@@ -65,6 +65,20 @@ def tune(run: Run, given: Sequence[str | Logs], last: str = STAGES[-1]) -> None:
         run.say(_said_of_weights(run))
     if last == "report":
         run.say(f"report to open: {run.page}")
+
+
+def draw_again(run: Run, given: Sequence[str | Logs]) -> None:
+    """The stage report alone, of a run that has its verdict.
+
+    Args:
+      run: folder and settings.
+      given: sources, as in `tune`; what was imported is in the folder.
+    """
+    shares = shares_of(run.config.data_weights, len(given))
+    sources = [kept_source(run, one, number) for number, one in enumerate(given)]
+    dataset = sources[0] if len(sources) == 1 else JoinedDatasets(sources, shares)
+    report(run, functools.cache(lambda: verdict_of(run)), dataset, given)
+    run.say(f"report to open: {run.page}")
 
 
 def _check_incumbent(run: Run) -> None:

@@ -4,7 +4,7 @@ import functools
 from collections.abc import Callable, Sequence
 
 from rcirl_jax.autotune.evidence import suite_job, suite_runs
-from rcirl_jax.autotune.rewards import workdir_of
+from rcirl_jax.autotune.rewards import kept_workdir
 from rcirl_jax.autotune.run import Run
 from rcirl_jax.data.logs import Logs
 from rcirl_jax.data.parts import parts_of
@@ -72,7 +72,7 @@ def _draw(
             rewards=rewards,
             dataset=dataset,
             replays=_replays(run, judged, given),
-            workdir=workdir_of(run, dataset, seed),
+            workdir=kept_workdir(run, seed),
             sweep=read_sweep(sweep) if sweep else None,
             likeness=(run.folder / "likeness.txt").read_text(),
             training_runs=run.config.seeds,

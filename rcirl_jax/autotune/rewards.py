@@ -78,6 +78,14 @@ def workdir_of(run: Run, dataset: Demonstrations, seed: int) -> Path:
     return run.folder / f"train-{key}" / f"seed-{seed}"
 
 
+def kept_workdir(run: Run, seed: int) -> Path:
+    """The folder of a finished training run, by what is noted of it."""
+    noted = run.stages.read().get(f"train {seed}", {}).get("inputs", {})
+    decided = ("config", "dataset", *run.code())
+    key = digest({name: noted.get(name) for name in decided})[:8]
+    return run.folder / f"train-{key}" / f"seed-{seed}"
+
+
 def _anchor_file(run: Run, drives: int) -> Path | None:
     """Where the anchor against so many sets of drives lies; None: there is none."""
     wanted = run.config.anchor.wanted

@@ -5,14 +5,12 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.export.guard import Limits, bounds
 from rcirl_jax.export.loading import open_reward, reward_params, row_name, support_of
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.anchor import Anchored, anchored_score
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm
 from rcirl_jax.planner.grid import DpConfig
-from rcirl_jax.planner.guard import Guarded, Ranges
 from rcirl_jax.planner.rank import (
     Params,
     RankConfig,
@@ -23,13 +21,10 @@ from rcirl_jax.planner.rank import (
     rank_policy,
 )
 from rcirl_jax.planner.safety import SafetyConfig
-from rcirl_jax.reward import LatticeCost
 from rcirl_jax.simulation.rows import (
     Row,
     baseline_row,
     dp_row,
-    guarded_row,
-    tuned_row,
 )
 
 DP_EVERY = 10  # steps between two plans of the DP row: it costs 1,000 rankings
@@ -68,46 +63,20 @@ def incumbent_score(name: str) -> tuple[Score, Params]:
     return (hand_score, None) if name == "hand-set" else score_of(open_reward(name))
 
 
-def _guarded(name: str, reward: Reward, incumbent: str, config: RankConfig) -> Row:
-    """A row behind the guard; the incumbent drives what is out of distribution."""
-    if reward.anchor is not None:
-        raise InputError(
-            f"--guard: {reward.file}: expected a reward without an anchor: this one "
-            "leaves the choice to the own cost by itself"
-        )
-    limits = Limits()
-    low, high = bounds(reward, limits)
-    score, weights = incumbent_score(incumbent)
-    effective, normaliser = reward_params(reward)
-    params = Guarded(
-        reward=effective,
-        normaliser=normaliser,
-        ranges=Ranges(low=jnp.asarray(low), high=jnp.asarray(high)),
-        share=jnp.asarray(limits.share, jnp.float32),
-        incumbent=weights,
-    )
-    return guarded_row(
-        f"{name} guarded", params, str(reward.preset), reward.activation, config, score
-    )
-
-
 def table_rows(
     weights: Sequence[str],
     baselines: Sequence[str],
     plan_every: int = 1,
     *,
     dp: bool = False,
-    hand_set: LatticeCost | None = None,
     tuned_idm: Idm | None = None,
     names: Sequence[str] = (),
-    guard: str | None = None,
     track: str = "full",
 ) -> list[Row]:
     """Learned rows first, in the order of the files, then the baselines.
 
     Files of one loss and shape are told apart by their seed, then by their path, or
-    rows bear `names`, one per file. The first drives again by `dp`, and behind a
-    `guard` that names its incumbent ("hand-set" or a weights file). Tuned rivals come
+    rows bear `names`, one per file. The first drives again by `dp`. A tuned IDM comes
     last. `track` is the safety filter's (`SafetyConfig`).
 
     Raises:
@@ -130,11 +99,7 @@ def table_rows(
         slow = max(plan_every, DP_EVERY)
         of = (params, preset, first.activation, config, DpConfig(), slow)
         rows.insert(1, dp_row(f"{rows[0].name} DP", *of))
-    if guard:
-        rows.insert(1, _guarded(rows[0].name, first, guard, config))
     rows += [baseline_row(name, preset, params[1], config) for name in baselines]
-    if hand_set is not None:
-        rows.append(tuned_row(hand_set, config))
     if tuned_idm is not None:
         rows.append(Row(name=TUNED_IDM_ROW, policy=idm_policy(tuned_idm)))
     return rows

@@ -34,7 +34,7 @@ from rcirl_jax.units import TIMES_S
 NUM_SAMPLES = 32  # verification samples in the file
 
 
-def config_of(settings: Mapping[str, Any]) -> TrainConfig:
+def _config_of(settings: Mapping[str, Any]) -> TrainConfig:
     """The configuration of its fields as JSON types.
 
     Raises:
@@ -54,12 +54,29 @@ def read_config(workdir: Path) -> tuple[TrainConfig, dict]:
         raise InputError(f"{path}: missing: expected a run made by experiments.train")
     run = read_json(path, "a run of this version")
     try:
-        config = config_of(run["config"])
+        config = _config_of(run["config"])
         if not isinstance(run.get("flags", {}), dict):
             raise ValueError("flags: not a table")
     except UNFORESEEN as error:
         raise InputError(f"{path}: {error}: expected a run of this version") from error
     return config, run
+
+
+def datasets_of(workdir: Path) -> list[str]:
+    """The datasets that a run's flags name.
+
+    Raises:
+      InputError: no run, or flags that name none that a file can have.
+    """
+    found = read_config(workdir)[1].get("flags", {}).get("data")
+    names = found if isinstance(found, list) else [found]
+    for name in names or [None]:
+        if not isinstance(name, str) or not name.strip("\0") or "\0" in name:
+            raise InputError(
+                f"{workdir / 'run.json'}: flags.data: {found}: expected a dataset, or "
+                "a list of them; or give --data"
+            )
+    return names
 
 
 def reward_weights(

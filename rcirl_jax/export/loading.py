@@ -1,7 +1,8 @@
 """Weights files -> scorers, with the features and sampler they were made for."""
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,6 @@ import numpy as np
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.score import OnTop
-from rcirl_jax.export.provenance import check_provenance
 from rcirl_jax.export.reader import Anchor, Reward, WeightsError, load_weights
 from rcirl_jax.features.mapping import feature_map, known_presets
 from rcirl_jax.reward.module import LEAKY_SLOPE, module_value, network_of, variables_of
@@ -18,6 +18,13 @@ from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.types import Normaliser, RewardParams
 
 Scorer = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+# types of the entries that are used; None stands for "not said"
+_SAID: dict[str, type] = {
+    **dict.fromkeys(("seed", "steps"), int),
+    **dict.fromkeys(("git_commit", "dataset_sha256", "created", "mode"), str),
+    **dict.fromkeys(("flags", "metrics", "versions", "config", "sweep"), dict),
+}
 
 
 def open_reward(path: str) -> Reward:
@@ -41,6 +48,20 @@ def open_reward(path: str) -> Reward:
         raise InputError(str(error)) from error
     check_provenance(reward.provenance, reward.file)
     return reward
+
+
+def check_provenance(found: Mapping[str, Any], file: str) -> None:
+    """Check the entries that this package uses; others may be anything.
+
+    Raises:
+      InputError: one is of another type (names file, entry and value).
+    """
+    for name, kind in _SAID.items():
+        value = found.get(name)
+        if value is not None and type(value) is not kind:
+            raise InputError(
+                f"{file}: provenance.{name}: {value}: expected {kind.__name__} or none"
+            )
 
 
 def reward_params(reward: Reward) -> tuple[RewardParams, Normaliser]:

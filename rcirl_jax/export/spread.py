@@ -14,7 +14,6 @@ import tqdm
 
 from rcirl_jax.evaluation.closed_loop.suite import Drive, SuiteConfig
 from rcirl_jax.export.closed_loop import table_rows
-from rcirl_jax.export.hand_weights import load_hand_weights
 from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.runtime.executors import Executor
 from rcirl_jax.simulation.metrics import CaseMetrics
@@ -40,11 +39,9 @@ class SuiteJob:
     duration_s: float
     plan_every: int = 1
     dp: bool = False
-    hand_weights: str | None = None
     names: tuple[str, ...] = ()  # of the learned rows; else after loss and shape
     tuned_idm: tuple[tuple[str, float], ...] = ()  # fields of a further IDM row
     track: str = "full"  # of the safety filter
-    guard: str | None = None  # incumbent of the first weights' guarded row
 
     def rows(self) -> list[Row]:
         """Learned rows, then the baselines."""
@@ -53,11 +50,7 @@ class SuiteJob:
             self.baselines,
             self.plan_every,
             dp=self.dp,
-            hand_set=load_hand_weights(self.hand_weights)
-            if self.hand_weights
-            else None,
             names=self.names,
-            guard=self.guard,
             track=self.track,
             tuned_idm=Idm(**dict(self.tuned_idm)) if self.tuned_idm else None,
         )

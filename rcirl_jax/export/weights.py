@@ -10,11 +10,9 @@ so a file that would be refused is never written.
 """
 
 import base64
-import contextlib
 import dataclasses
 import hashlib
 import os
-import secrets
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -24,6 +22,7 @@ import numpy as np
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.export import reader
+from rcirl_jax.runtime.atomic_files import write_whole
 
 PROVENANCE_KEYS = (
     "dataset_sha256",  # text, hash of the data manifest
@@ -107,9 +106,7 @@ def save(
     samples_valid: np.ndarray,
     samples_value: np.ndarray,
 ) -> reader.Reward:
-    """Write the file atomically; the folder must exist. Arguments as `pack`.
-
-    A reader sees the old file or the new one, also after a power cut.
+    """Write the file, whole (`write_whole`). Arguments as `pack`.
 
     Returns:
       The reward as a reader of the file sees it, with the hash that names it.
@@ -117,17 +114,11 @@ def save(
     target = Path(path)
     samples = (samples_x, samples_valid, samples_value)
     data, reward = _pack_checked(str(target), weights, samples)
-    # The folder is the target's own: os.replace is atomic on one file system only.
-    temporary = target.parent / f".{target.name}.{secrets.token_hex(8)}.tmp"
     try:
-        _write(temporary, target, data)
+        write_whole(target, data)
     except OSError as error:
-        reason = error.strerror or error
-        message = f"{target}: path: {reason}: expected a writable file"
+        message = f"{target}: path: {error.strerror}: expected a writable file"
         raise InputError(message) from error
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
     return reward
 
 
@@ -153,20 +144,6 @@ def _json(value: Any) -> Any:  # noqa: ANN401
     if isinstance(value, list):
         return [_json(item) for item in value]
     return base64.b64encode(value).decode() if isinstance(value, bytes) else value
-
-
-def _write(temporary: Path, target: Path, data: bytes) -> None:
-    with temporary.open("xb") as stream:
-        stream.write(data)
-        stream.flush()
-        os.fsync(stream.fileno())
-    os.replace(temporary, target)
-    # The new name lives in the folder; it is on disk once the folder is.
-    folder = os.open(target.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
 
 
 def _pack_checked(

@@ -5,7 +5,7 @@
 over accelerations k with m + k >= 0, |k - k-| within the jerk limit, free of
 bodies and walls at the next station and within the speed rule (`grid`). Apollo's
 speed DP keeps (t, s) only and reads v and a off its single best predecessor, so
-it is not optimal for its own cost (`time_station` measures by how much).
+it is not optimal for its own cost.
 
 One backward `lax.scan` over time makes an int8 policy, one forward scan reads
 the plan off it; the plan's Trajectory goes through the operator shared with all

@@ -1,6 +1,5 @@
 """One self-contained HTML page of an evaluation: tables, pictures, provenance."""
 
-import base64
 import html
 import json
 from collections.abc import Mapping, Sequence
@@ -35,19 +34,6 @@ def table_section(heading: str, text: str) -> str:
 def facts_text(facts: Mapping[str, object]) -> str:
     """What made a page, as JSON."""
     return json.dumps(plain(facts), indent=2, default=str, ensure_ascii=False)
-
-
-def picture_section(heading: str, pictures: Sequence[tuple[Path, str]]) -> str:
-    """A section of PNGs, embedded, each with its caption."""
-    figures = []
-    for path, caption in pictures:
-        data = base64.b64encode(path.read_bytes()).decode()
-        words = html.escape(caption)
-        figures.append(
-            f'<figure><img alt="{words}" src="data:image/png;base64,{data}">'
-            f"<figcaption>{words}</figcaption></figure>"
-        )
-    return f"<h2>{html.escape(heading)}</h2>\n" + "\n".join(figures)
 
 
 def write_page(

@@ -27,7 +27,7 @@ NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP)
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
-    """Write a file; who reads it sees the old one or the new one.
+    """Write a file; who reads it sees the old one or the new one, also after a crash.
 
     Its folder is made. What a kill leaves behind ends in ".tmp".
 
@@ -41,10 +41,17 @@ def write_whole(path: Path, content: str | bytes) -> None:
             try:
                 file.write(content.encode() if isinstance(content, str) else content)
                 file.flush()
+                os.fsync(file.fileno())
                 os.replace(part, path)
             except OSError:
                 part.unlink(missing_ok=True)
                 raise
+        # the new name lives in the folder; it is on disk once the folder is
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
     except OSError as error:
         raise named(error, path) from error
 

@@ -13,12 +13,10 @@ from rcirl_jax.features import feature_map
 from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.planner.dp import dp_policy
 from rcirl_jax.planner.grid import DpConfig
-from rcirl_jax.planner.guard import Guarded, guarded_score
 from rcirl_jax.planner.rank import (
     Params,
     Policy,
     RankConfig,
-    Score,
     constant_score,
     constant_speed_policy,
     hand_score,
@@ -72,28 +70,6 @@ def learned_row(
     return Row(name=name, policy=rank_policy(score, config), params=weights)
 
 
-def guarded_row(
-    name: str,
-    weights: Guarded,
-    preset: str,
-    activation: str,
-    config: RankConfig,
-    incumbent: Score,
-) -> Row:
-    """A learned reward that hands plans out of distribution to the incumbent's score.
-
-    Args:
-      name: of the row.
-      weights: of the reward, its ranges, and the incumbent's.
-      preset: of the features.
-      activation: of the reward.
-      config: of the ranking planner.
-      incumbent: the other score.
-    """
-    score = guarded_score(feature_map(preset), activation, incumbent)
-    return Row(name=name, policy=rank_policy(score, config), params=weights)
-
-
 def dp_row(
     name: str,
     weights: tuple[RewardParams, Normaliser],
@@ -109,7 +85,7 @@ def dp_row(
 
 
 def tuned_row(cost: LatticeCost, config: RankConfig) -> Row:
-    """The hand-set cost with tuned weights, ranking like the hand-set one."""
+    """The hand-set cost with other weights, ranking like the hand-set one."""
     policy = rank_policy(hand_score, config)
     return Row(name=TUNED_ROW, policy=policy, params=cost.fields())
 

@@ -2,8 +2,8 @@
 
 All learners of a comparison see the same candidates, and a sweep pays for
 sampling and features once. Members of one call share network shape, loss and
-batches; they differ in seed, optimiser, step size and leaky rate, which are arrays,
-so the whole grid is one compiled program.
+batches; they differ in seed, step size and leaky rate, which are arrays, so the whole
+grid is one compiled program.
 
 A batch is worked off in pieces of scenes (`pieces`). A piece is gathered once for
 all members and stays in a CPU's cache while they use it; memory does not grow with
@@ -14,7 +14,7 @@ import contextlib
 import dataclasses
 import functools
 from collections.abc import Iterator, Sequence
-from typing import Any, cast
+from typing import cast
 
 import flax.struct
 import jax
@@ -26,7 +26,6 @@ from rcirl_jax.reward import Normaliser, RewardParams
 from rcirl_jax.train.loop import in_chunks
 from rcirl_jax.train.pieces import added, piece_size
 from rcirl_jax.train.state import (
-    OPTIMIZERS,
     FeatureBatch,
     TrainConfig,
     make_rule,
@@ -46,7 +45,6 @@ class Members(flax.struct.PyTreeNode, kw_only=True):
     """What differs between the members of one training; all [M]."""
 
     seed: jax.Array  # of the initial weights
-    optimizer: jax.Array  # int32, place in OPTIMIZERS
     learning_rate: jax.Array
     leaky_rate: jax.Array
 
@@ -63,10 +61,8 @@ class Fitted(flax.struct.PyTreeNode, kw_only=True):
 def members_of(configs: Sequence[TrainConfig]) -> Members:
     """What is a member's own, of configurations that share everything else."""
     column = lambda name: [getattr(config, name) for config in configs]  # noqa: E731
-    places = [list(OPTIMIZERS).index(name) for name in column("optimizer")]
     return Members(
         seed=jnp.asarray(column("seed"), jnp.uint32),
-        optimizer=jnp.asarray(places, jnp.int32),
         learning_rate=jnp.asarray(column("learning_rate"), jnp.float32),
         leaky_rate=jnp.asarray(column("leaky_rate"), jnp.float32),
     )
@@ -111,16 +107,11 @@ def fit(
       config: everything that the members share.
       members: what they do not.
     """
-    shared = dataclasses.replace(
-        config, optimizer="sgd", learning_rate=0.5, leaky_rate=0.5, seed=0
-    )
-    used, which = np.unique(np.asarray(members.optimizer), return_inverse=True)
-    optimizers = tuple(list(OPTIMIZERS)[place] for place in used)
-    members = members.replace(optimizer=jnp.asarray(which, jnp.int32))
+    shared = dataclasses.replace(config, learning_rate=0.5, leaky_rate=0.5, seed=0)
     order = jax.random.fold_in(jax.random.key(config.seed), ORDER_STREAM)
     seen = np.flatnonzero(np.any(np.asarray(frozen.time_valid), axis=0))
     times = int(np.max(seen, initial=0)) + 1
-    return _fit(frozen, normaliser, order, members, shared, times, optimizers)
+    return _fit(frozen, normaliser, order, members, shared, times)
 
 
 @contextlib.contextmanager
@@ -150,14 +141,7 @@ def _taken(frozen: FeatureBatch, part: tuple, times: int) -> FeatureBatch:
     )
 
 
-def _own_updates(asked: Sequence[tuple], chosen: jax.Array) -> tuple[Any, list]:
-    """Updates of the rule that the member chose, and the states of all."""
-    updates = [updates for updates, _ in asked]
-    taken = jax.tree.map(lambda *x: jnp.stack(x)[chosen], *updates)
-    return taken, [own for _, own in asked]
-
-
-@functools.partial(jax.jit, static_argnames=("config", "times", "optimizers"))
+@functools.partial(jax.jit, static_argnames=("config", "times"))
 def _fit(
     frozen: FeatureBatch,
     normaliser: Normaliser,
@@ -165,13 +149,8 @@ def _fit(
     members: Members,
     config: TrainConfig,
     times: int,
-    optimizers: tuple[str, ...],
 ) -> Fitted:
-    """What members differ in is not read from `config`: one compile for all.
-
-    A member's `optimizer` is its place in `optimizers`: all of them are asked for a
-    direction, which costs next to nothing beside the gradient, and one is taken.
-    """
+    """What members differ in is not read from `config`: one compile for all."""
     count, candidates = frozen.feasible.shape
     size = min(config.batch_size, count)
     batches = -(-count // size)
@@ -181,10 +160,10 @@ def _fit(
     params = jax.vmap(lambda seed: first_params(seed, frozen.human.shape[-1], config))(
         members.seed
     )
-    rules = lambda rate: [make_rule(config, name, rate) for name in optimizers]  # noqa: E731
-    state = jax.vmap(
-        lambda params, rate: [rule.init(as_tree(params)) for rule in rules(rate)]
-    )(params, members.learning_rate)
+    rule = lambda rate: make_rule(config, rate)  # noqa: E731
+    state = jax.vmap(lambda params, rate: rule(rate).init(as_tree(params)))(
+        params, members.learning_rate
+    )
 
     def one_step(batch: tuple, step: jax.Array, member: tuple) -> tuple:
         who, params, state = member
@@ -197,11 +176,7 @@ def _fit(
         rate = who.learning_rate
         if config.halve_every:
             rate = rate * 0.5 ** (step / config.halve_every)
-        asked = [
-            rule.update(grads, own, as_tree(params))
-            for rule, own in zip(rules(rate), state, strict=True)
-        ]
-        updates, after = _own_updates(asked, who.optimizer)
+        updates, after = rule(rate).update(grads, state, as_tree(params))
         moved = optax.apply_updates(as_tree(params), updates)
         fine = jnp.isfinite(sums.loss) & jnp.isfinite(optax.tree.norm(grads))
         keep = lambda new, old: jnp.where(fine, new, old)  # noqa: E731

@@ -251,10 +251,10 @@ def weight_decay(config: TrainConfig) -> optax.GradientTransformation:
 
 
 def make_rule(
-    config: TrainConfig, name: str, rate: optax.ScalarOrSchedule
+    config: TrainConfig, rate: optax.ScalarOrSchedule
 ) -> optax.GradientTransformation:
-    """An optimiser by its name, after clipping and weight decay as configured."""
-    parts = [weight_decay(config), OPTIMIZERS[name](rate)]
+    """The optimiser with a step size, after clipping and weight decay as configured."""
+    parts = [weight_decay(config), OPTIMIZERS[config.optimizer](rate)]
     if config.clip_norm:
         parts.insert(0, optax.clip_by_global_norm(config.clip_norm))
     return optax.chain(*parts)
@@ -265,4 +265,4 @@ def make_optimizer(config: TrainConfig) -> optax.GradientTransformation:
     rate: optax.ScalarOrSchedule = config.learning_rate
     if config.halve_every:
         rate = optax.exponential_decay(rate, config.halve_every, 0.5)
-    return make_rule(config, config.optimizer, rate)
+    return make_rule(config, rate)

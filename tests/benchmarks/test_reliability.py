@@ -10,17 +10,9 @@ import subprocess
 import sys
 import time
 
-import numpy as np
 import pytest
 
 from benchmarks.reliability.jobs import jobs, write_logs
-from rcirl_jax.export.closed_loop import table_rows
-from rcirl_jax.simulation.suite import (
-    catalogue_set,
-    drive_row,
-    rollout_config,
-    suite_refs,
-)
 from tests.conftest import REPO
 from tests.data.small_logs import files_of
 from tests.helpers.commands import LONGEST_S
@@ -145,8 +137,8 @@ def flags_of(root, name):
     if name == "export":
         data = f"--workdir={root / 'run'}", f"--data={root / 'data'}"
         return "experiments.export_weights", (*data, "--output=w.msgpack")
-    data = f"--weights={root / 'w.msgpack'}", f"--data={root / 'data'}"
-    return "experiments.report", (*data, "--output=report.html")
+    data = f"--data={root / 'data'}", "--scenes=4"
+    return "experiments.inspect_data", (*data, "--output=look")
 
 
 @pytest.mark.parametrize(
@@ -158,7 +150,7 @@ def flags_of(root, name):
         ("train", 60_000, "checkpoints"),
         ("export", 1_000, "w.msgpack"),
         ("sweep", 3_000, "weights"),
-        ("report", 10_000, "figures"),
+        ("look", 10_000, "look"),
         ("autotune", 3_000, "dataset-"),
     ],
 )
@@ -172,7 +164,7 @@ def test_a_full_disk_is_one_line_and_the_run_goes_on(
     assert line.startswith("error: ")
     assert file in line
     assert not list(tmp_path.rglob("*.tmp"))
-    for final in ("manifest.json", "w.msgpack", "report.html", "sweep.json"):
+    for final in ("manifest.json", "w.msgpack", "index.html", "sweep.json"):
         assert not list(tmp_path.rglob(final)), final
     assert limited(tmp_path, None, module, *flags).returncode == 0
     if name in jobs(root):
@@ -280,64 +272,8 @@ def test_sigterm_saves_the_step_it_is_in(root, tmp_path):
     assert (tmp_path / "run" / "checkpoints" / str(last) / "sha256.json").exists()
 
 
-def test_a_guarded_row_drives(root, tmp_path):
-    flags = (f"--weights={root / 'w.msgpack'}", "--suite=free_cruise", "--cases=1")
-    short = ("--duration=2", "--baselines=", "--guard=hand-set", "--output=out")
-    done = limited(tmp_path, None, "experiments.simulate", *flags, *short)
-    assert done.returncode == 0, done.stderr[-2000:]
-    report = json.loads((tmp_path / "out" / "suite.json").read_text())["report"]
-    (guarded,) = [name for name in report["rows"] if name.endswith(" guarded")]
-    assert report["rows"][guarded]["progress_m"] > 1.0
-
-
-def test_a_guarded_row_drives_as_the_reward_or_as_its_incumbent(root):
-    """With ranges that hold everything, and such that hold nothing."""
-    files = [str(root / "w.msgpack")]
-    learned, guarded, hand = table_rows(files, ["hand-set"], guard="hand-set")
-    cases = catalogue_set(suite_refs("stopped_lead", 4), 6.0)
-    config = rollout_config(learned, cases.duration_s, 1)
-
-    def driven(row, **ranges):
-        if ranges:
-            weights = {k: np.full_like(getattr(row.params, k), x)
-                       for k, x in ranges.items()}  # fmt: skip
-            row = dataclasses.replace(row, params=row.params.replace(**weights))
-        found = drive_row(row, cases.build, len(cases.ids), config, chunk=4)
-        return np.stack([found.progress, found.min_a, found.max_a])
-
-    ours, theirs = driven(learned), driven(hand)
-    assert np.all(np.abs(ours - theirs).max(axis=0) > 0.1)  # else nothing is shown
-    everything = driven(guarded, low=-np.inf, high=np.inf, share=1.0)
-    np.testing.assert_allclose(everything, ours, atol=1e-2)
-    nothing = driven(guarded, low=np.inf, high=-np.inf, share=0.0)
-    np.testing.assert_allclose(nothing, theirs, atol=1e-2)
-
-
-def test_weights_of_the_tuning_loop_are_made_again(root, tmp_path):
-    job = jobs(root)["autotune"]
-    flags = [*job.flags, "--until=train"]
-    assert limited(tmp_path, None, job.module, *flags).returncode == 0
-    (data,) = tmp_path.glob("run/dataset-*")
-    again = ("--weights=run/weights.msgpack", f"--data={data}", "--output=again")
-    done = limited(tmp_path, None, "experiments.reproduce", *again)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "reproduced: bit for bit" in done.stdout
-
-
-def test_weights_of_a_sweep_are_made_again(root, tmp_path):
-    job = jobs(root)["sweep"]
-    assert limited(tmp_path, None, job.module, *job.flags).returncode == 0
-    again = ("--weights=sweep/best.msgpack", "--output=again")
-    done = limited(tmp_path, None, "experiments.reproduce", *again)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "reproduced: bit for bit" in done.stdout
-    assert [x.name for x in (tmp_path / "again").glob("*.msgpack")] == [
-        "weights.msgpack"
-    ]
-
-
 @pytest.mark.parametrize(
-    "name", ["import", "train", "export", "sweep", "report", "autotune"]
+    "name", ["import", "train", "export", "sweep", "look", "autotune"]
 )
 def test_a_place_that_cannot_be_is_one_line(root, tmp_path, name):
     """Below a file, where nobody can make a folder, whoever runs it."""

@@ -35,7 +35,7 @@ LEARNERS = ("RC-IRL rank", "logistic free", "MaxEnt free")
     [("us101", DEFAULT), *(pytest.param(*x, marks=pytest.mark.slow) for x in LONG)],
 )
 def test_no_learner_ends_in_nan(name, optimisers, data_dir, tmp_path):
-    """Default flags but for the epochs; the whole: experiments.paper.stability."""
+    """Default flags but for the epochs."""
     folder, kind, some, stride = FOLDERS[name]
     (tmp_path / "logs").mkdir()
     files = sorted(x for x in (data_dir / folder).iterdir() if x.is_file())

@@ -76,6 +76,12 @@ def test_a_small_loop(tmp_path):
 
     again = fresh("experiments.autotune", *flags)
     assert all(kept(again).values()), again.stdout
+    (run / "report.html").unlink()
+    drawn = command("experiments.report", f"--workdir={run}")
+    assert kept(drawn) == {"report": False}, drawn.stderr[-2000:]
+    assert verdict["decision"] in (run / "report.html").read_text()
+    assert 'id="training-heading"' in page
+    assert all(kept(fresh("experiments.autotune", *flags)).values())
     dataset = open_dataset(*run.glob("dataset-*"))
     assert dataset.facts()["data_hash"] == dataset.hash
     assert "flags" in dataset.facts()["made_by"]
@@ -131,6 +137,27 @@ def test_what_cannot_be_is_one_line_before_any_work(flags, message, tmp_path):
     (line,) = done.stderr.strip().splitlines()
     assert message in line
     assert not (tmp_path / "run" / "stages.json").exists()
+
+
+@pytest.mark.multiprocess
+def test_a_page_of_no_run_is_one_line(tmp_path):
+    done = command("experiments.report", f"--workdir={tmp_path}")
+    assert done.returncode == 2
+    (line,) = done.stderr.strip().splitlines()
+    assert line.endswith("stages.json: gate: missing: expected a run with its verdict")
+    gate = {
+        "key": "k",
+        "inputs": {},
+        "outputs": {},
+        "made_by": {"flags": {"seeds": []}},
+    }
+    stages = {"schema_version": 1, "stages": {"gate": gate}}
+    (tmp_path / "stages.json").write_text(json.dumps(stages))
+    for flag, message in (("--seeds=2", "--seeds: expected none"), ("", "--seeds: ")):
+        done = command("experiments.report", f"--workdir={tmp_path}", *flag.split())
+        assert done.returncode == 2
+        (line,) = done.stderr.strip().splitlines()
+        assert message in line
 
 
 @pytest.mark.multiprocess

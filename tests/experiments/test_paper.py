@@ -10,7 +10,6 @@ from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.data.store.dataset import open_dataset
-from rcirl_jax.evaluation.exact import holm
 from rcirl_jax.simulation.rows import BASELINES
 from rcirl_jax.simulation.suite import family_names
 from rcirl_jax.train.state import PAPER_OPTIMIZERS
@@ -19,26 +18,12 @@ from tests.helpers.weights_files import random_weights
 
 RANKED = (
     "artefact_audit",
-    "cross_site",
-    "data_scaling",
     "discount_factors",
-    "feature_ablation",
-    "leaky_rate_and_hidden_size",
-    "linear_vs_network",
     "one_frame",
     "optimisers",
     "rank_against_gan",
-    "stability",
 )
 QUICKEST = ("artefact_audit", "discount_factors")  # the others are `slow`
-# what the paired differences have to be to, beside IDM, hand-set and random
-ASKED = {
-    "data_scaling": ("RC-IRL logistic, 30", "RC-IRL logistic, 100"),
-    "feature_ablation": ("all 21",),
-    "leaky_rate_and_hidden_size": ("a 0.05, 15 hidden",),
-    "linear_vs_network": ("21-15-1",),
-    "optimisers": ("adam",),
-}
 # shared flags as used under --quick; those with a value of their own; those not read
 SHARED = {"seeds": 2, "epochs": 2, "horizon": 5.0, "positive": "nearest"}
 SHARED["recipe"] = "tuned"
@@ -46,13 +31,10 @@ OWN = {
     "artefact_audit": {"horizon": 8.0},
     "discount_factors": {"horizon": 8.0},
     "one_frame": {"horizon": 8.0},
-    "stability": {"horizon": 8.0, "positive": "human"},
 }
 UNREAD = {
     "artefact_audit": {"positive"},
-    "closed_loop_seeds": set(SHARED),
     "one_frame": {"seeds"},
-    "stability": {"seeds"},
 }
 
 
@@ -85,10 +67,6 @@ def shared_flags(body):
     return {name: recorded[name] for name in SHARED if name in recorded}
 
 
-def references(report):
-    return {comparison["reference"] for comparison in report["comparisons"]}
-
-
 def test_background_shift(tmp_path):
     done = command("background_shift", "--quick", f"--output={tmp_path}")
     assert done.returncode == 0, done.stderr[-2000:]
@@ -108,11 +86,7 @@ def test_background_shift(tmp_path):
     [x if x in QUICKEST else pytest.param(x, marks=pytest.mark.slow) for x in RANKED],
 )
 def test_writes_numbers_and_a_picture(name, dataset, tmp_path):
-    scenes = f"--data={dataset}"
-    if name == "cross_site":
-        scenes = f"--sites=here={dataset},there={dataset}"
-    curves = ("--positive=human",) if name == "stability" else ()
-    done = command(name, "--quick", scenes, f"--output={tmp_path}", *curves)
+    done = command(name, "--quick", f"--data={dataset}", f"--output={tmp_path}")
     assert done.returncode == 0, done.stderr[-2000:]
     body = json.loads((tmp_path / f"{name}.json").read_text())
     found = list(numbers(body))
@@ -125,74 +99,20 @@ def test_writes_numbers_and_a_picture(name, dataset, tmp_path):
     for flag in UNREAD.get(name, ()):
         del used[flag]
     assert shared_flags(body) == used
-    if name == "cross_site":
-        assert "data" not in body["made_by"]["flags"]
-        assert set(body["data_hashes"]) == set(body["tested_on"]) == {"here", "there"}
-        trained = {row for row in body["tested_on"]["here"]["rows"] if "on" in row}
-        assert {"trained on here", "trained on there"} <= trained
-        for site, report in body["tested_on"].items():
-            assert f"trained on {site}" in references(report)
-            rows = report["rows"]  # both sites are one dataset: the same reward twice
-            assert rows["trained on here"] == rows["trained on there"]
-            assert rows["trained on here"] != rows["IDM"]
-    else:
-        assert body["made_by"]["data_hash"]
-    if name in ASKED:
-        expected = {*ASKED[name], "IDM", "hand-set", "random"}
-        assert references(body["ranking"]) == expected
+    assert body["made_by"]["data_hash"]
     if name == "discount_factors":
         for row in body["rows"].values():
             size = np.abs(row["gamma"])[:, 1:]
             shares = size[:, np.array(body["times_s"])[1:] <= 4.0].sum(1) / size.sum(1)
             assert row["near_share"][0] == pytest.approx(shares.mean(), abs=1e-4)
     if name == "optimisers":
+        compared = {x["reference"] for x in body["ranking"]["comparisons"]}
+        assert compared == {"adam", "IDM", "hand-set", "random"}
         tops = [
             body["ranking"]["rows"][x]["top1_fde"]["value"] for x in PAPER_OPTIMIZERS
         ]
         assert len(set(tops)) == 3
-    if name == "stability":
-        assert body["failed"] == []
-        ways = {row.split(", ")[-1] for row in body["rows"]}
-        assert ways == set(PAPER_OPTIMIZERS)
-    if name == "data_scaling":
-        learners = ("RC-IRL logistic", "logistic non-negative", "logistic linear")
-        made = {f"{learner}, {n}" for learner in learners for n in body["counts"]}
-        assert body["counts"] == [30, 100]
-        assert made <= set(body["ranking"]["rows"])
-    if name == "feature_ablation":
-        kept = {row: set(names) for row, names in body["kept"].items()}
-        groups = [row.removesuffix(" alone") for row in kept if row.endswith(" alone")]
-        assert sum(len(kept[f"{group} alone"]) for group in groups) == 21
-        for group in groups:
-            assert kept[f"without {group}"] == kept["all 21"] - kept[f"{group} alone"]
-        tops = {row: body["ranking"]["rows"][row]["top1_fde"]["value"] for row in kept}
-        assert len(set(tops.values())) > 5  # what is left out matters
     assert (tmp_path / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
-
-
-@pytest.mark.slow
-def test_closed_loop_over_seeds(dataset, tmp_path):
-    flags = ("--quick", f"--data={dataset}", f"--output={tmp_path}")
-    done = command("closed_loop_seeds", *flags)
-    assert done.returncode == 0, done.stderr[-2000:]
-    body = json.loads((tmp_path / "closed_loop_seeds.json").read_text())
-    assert all(math.isfinite(x) for x in numbers(body))
-    assert [len(body["runs"][row]["progress"]) for row in body["rows"]] == [2, 2, 1, 1]
-    assert shared_flags(body) == {}
-    assert body["trained"] == {"epochs": 1, "positive": "nearest"}
-    recorded = body["made_by"]["flags"]
-    assert (recorded["runs"], recorded["cases"]) == (2, 1)
-    apart = body["tests"]["RC-IRL minus GAN"]["progress"]
-    rows = {row: body["runs"][row]["progress"] for row in ("RC-IRL", "GAN")}
-    means = {row: sum(x) / len(x) for row, x in rows.items()}
-    assert apart["mean"] == pytest.approx(means["RC-IRL"] - means["GAN"], abs=1e-3)
-    assert apart["low"] <= apart["mean"] <= apart["high"]
-    differ = [x for x in body["tests"]["RC-IRL minus GAN"].values() if x["se"] > 0.0]
-    adjusted = holm(np.array([x["p"] for x in differ]))
-    assert [x["p_holm"] for x in differ] == pytest.approx(adjusted.tolist())
-    assert (tmp_path / "closed_loop_seeds.png").read_bytes()[:4] == b"\x89PNG"
-    assert "RC-IRL minus GAN: progress: " in done.stdout
-    assert len(body["made_by"]["weights_sha256"]) == 4  # two losses, two seeds
 
 
 def test_the_example_frame_says_why(dataset, tmp_path):
@@ -210,27 +130,38 @@ def test_the_example_frame_says_why(dataset, tmp_path):
 
 
 @pytest.mark.slow
-def test_table2(tmp_path):
-    """From drives to the table: every row over every family."""
-    done = command("table2", "--quick", f"--output={tmp_path}")
+def test_table2(dataset, tmp_path):
+    """From people to the table: every row over every family."""
+    done = command("table2", "--quick", f"--data={dataset}", f"--output={tmp_path}")
     assert done.returncode == 0, done.stderr[-2000:]
-    body = json.loads((tmp_path / "suite" / "suite.json").read_text())["report"]
-    learned = ("RC-IRL 21-15-1", "GAN 21-15-1", "RC-IRL linear")
-    assert set(body["rows"]) == {*learned, *BASELINES}
-    assert body["cases"] == len(body["families"]) == len(family_names())
-    assert "the paper, GAN" in (tmp_path / "suite" / "table.txt").read_text()
-    dp = json.loads((tmp_path / "dp" / "suite.json").read_text())["report"]
-    assert "RC-IRL 21-15-1 DP" in dp["rows"]
-    made_by = json.loads((tmp_path / "suite" / "suite.json").read_text())["made_by"]
-    assert set(made_by["weights_sha256"]) == {
-        str(tmp_path / f"{name}.msgpack") for name in ("rcirl", "gan", "linear")
+    suite = json.loads((tmp_path / "suite" / "suite.json").read_text())
+    forms = ("alone", "anchored")
+    learned = {
+        f"{loss} {form}" for loss in ("rank", "gan", "listwise") for form in forms
     }
-    for name, weights in (("drives", 0), ("takeovers", 1)):
-        facts = open_dataset(tmp_path / name).facts()
-        assert len(facts["made_by"].get("weights_sha256", {})) == weights
-    assert json.loads((tmp_path / "run.json").read_text())["made_by"]["git_commit"]
+    assert set(suite["report"]["rows"]) == {*learned, *BASELINES}
+    assert suite["report"]["cases"] == len(suite["report"]["families"])
+    assert suite["report"]["cases"] == len(family_names())
+    assert "the paper, GAN" in (tmp_path / "suite" / "table.txt").read_text()
+    assert len(suite["made_by"]["weights_sha256"]) == len(learned)
+    assert shared_flags(suite) == {k: v for k, v in SHARED.items() if k != "horizon"}
     for folder in ("suite", "dp"):
         assert (tmp_path / folder / "table.png").read_bytes()[:4] == b"\x89PNG"
+
+
+@pytest.mark.slow
+def test_table2_of_given_files(tmp_path):
+    """Ranking and dynamic programming of the same file."""
+    weights = random_weights(tmp_path / "w.msgpack")
+    done = command("table2", "--quick", f"--weights={weights}", f"--output={tmp_path}")
+    assert done.returncode == 0, done.stderr[-2000:]
+    dp = json.loads((tmp_path / "dp" / "suite.json").read_text())
+    (own,) = {row for row in dp["report"]["rows"] if not row.endswith(" DP")} - {
+        *BASELINES
+    }
+    assert set(dp["report"]["rows"]) == {own, f"{own} DP", "hand-set", "IDM"}
+    assert dp["made_by"]["weights_sha256"].keys() == {str(weights)}
+    assert shared_flags(dp) == {}  # nothing was trained
 
 
 @pytest.mark.slow
@@ -240,45 +171,13 @@ def test_robustness(tmp_path):
     done = command("robustness", *flags)
     assert done.returncode == 0, done.stderr[-2000:]
     body = json.loads((tmp_path / "robustness.json").read_text())
-    assert set(body["optimality"]) == {"rank", "DP", "(t, s) only"}
+    assert set(body["optimality"]) == {"rank", "DP"}
     assert set(body["robustness"]) == {"rank", "DP", "hand-set"}
     frames = {row["gap"]["frames"] for row in body["optimality"].values()}
     assert len(frames) == 1  # all rows on the same frames
     assert set(body["made_by"]["weights_sha256"]) == {str(weights)}
     for name in ("optimality", "robustness"):
         assert (tmp_path / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
-
-
-@pytest.mark.slow
-def test_human_likeness_beside_a_tuned_hand_set_cost(dataset, tmp_path):
-    tuned, data = tmp_path / "tuned.json", f"--data={dataset}"
-    small = ("--budget=8", "--scenes=16", f"--output={tuned}")
-    done = commands.command("experiments.tune_hand_set", data, *small)
-    assert done.returncode == 0, done.stderr[-2000:]
-    few = ("--learners=RC-IRL rank", "--seeds=2", "--epochs=1")
-    again = tmp_path / "again.json"
-    again.write_text(tuned.read_text())
-    rest = (f"--hand_weights={tuned},{again}", f"--output={tmp_path}")
-    other = commands.command(
-        "experiments.human_likeness", data, *few, *rest, "--holdout=vehicles"
-    )
-    assert other.returncode == 2
-    assert "weights tuned with the same --data and --holdout" in other.stderr
-    assert not (tmp_path / "ranking.json").exists()
-    done = commands.command("experiments.human_likeness", data, *few, *rest)
-    assert done.returncode == 0, done.stderr[-2000:]
-    assert "Paired differences" not in done.stdout
-    assert "RC-IRL rank minus hand-set, tuned" in (tmp_path / "table.txt").read_text()
-    body = json.loads((tmp_path / "ranking.json").read_text())
-    assert body["runs"]["RC-IRL rank"] == body["runs"]["hand-set, tuned"] == 2
-    assert body["made_by"]["data_hash"] == json.loads(tuned.read_text())["data_hash"]
-    assert {"random", "IDM", "hand-set", "hand-set, tuned", "oracle"} <= set(
-        body["rows"]
-    )
-    rows = (tmp_path / "table.md").read_text().splitlines()
-    assert rows[2].startswith("| RC-IRL rank (2 runs) | ")
-    assert {line.count("|") for line in rows} == {10}
-    assert (tmp_path / "ranking.png").read_bytes()[:4] == b"\x89PNG"
 
 
 @pytest.mark.slow
@@ -304,6 +203,13 @@ def test_human_likeness_over_folds(dataset, tmp_path):
         assert body["runs"][row] == 1
         assert all(len(part[row]) == 1 for part in body["tuned"])
     assert "2 parts of the recordings, each held out once" in done.stdout
+    assert "Paired differences" not in done.stdout
+    assert "RC-IRL rank minus hand-set, tuned" in (tmp_path / "table.txt").read_text()
+    assert body["made_by"]["data_hash"] == open_dataset(dataset).hash
+    rows = (tmp_path / "table.md").read_text().splitlines()
+    assert rows[2].startswith("| RC-IRL rank (2 runs) | ")
+    assert {line.count("|") for line in rows} == {11}
+    assert (tmp_path / "ranking.png").read_bytes()[:4] == b"\x89PNG"
 
 
 @pytest.mark.parametrize(
@@ -311,12 +217,10 @@ def test_human_likeness_over_folds(dataset, tmp_path):
     [
         ("experiments.paper.data_scaling", "--counts=abc", "--counts: ['abc']"),
         ("experiments.paper.discount_factors", "--seeds=1", "--seeds: 1: expected at"),
-        ("experiments.paper.stability", "--learners=", "--learners: none: expected"),
+        ("experiments.human_likeness", "--learners=", "--learners: none: expected"),
         ("experiments.paper.one_frame", "--row=-5", "--row: -5: expected one of"),
         ("experiments.human_likeness", "--split_seed=-1", "--split_seed"),
         ("experiments.human_likeness", "--horizon=9", "--horizon"),
-        ("experiments.human_likeness", "--hand_weights=x", "x: No such file"),
-        ("experiments.tune_hand_set", "--output=x/t", "--budget, --epochs: expected"),
         ("experiments.human_likeness", "--recording=99", "--recording: [99]: expected"),
         ("experiments.human_likeness", "--recording=a", "--recording: ['a']: inv"),
     ],
@@ -351,31 +255,19 @@ def test_flags_that_a_split_leaves_unread_are_refused(given, line, dataset, tmp_
     assert not (tmp_path / "out").exists()
 
 
-def test_table2_never_reuses_the_parts_of_a_quick_run(tmp_path):
-    (tmp_path / "run.json").write_text('{"quick": true, "seed": 0}')
-    done = command("table2", f"--output={tmp_path}")
-    assert done.returncode == 2
-    (said,) = done.stderr.strip().splitlines()
-    assert "made with {'quick': True, 'seed': 0}" in said
-
-
 @pytest.mark.parametrize(
     ("name", "flag", "line"),
     [
-        ("cross_site", "--sites=a", "--sites: ['a']: expected two"),
-        ("cross_site", "--sites=a=x,a=y", "named apart"),
-        ("table2", "--input=missing", "missing"),
-        ("table2", "--weights=x --seed=1", "--seed: 1: expected none beside --weights"),
+        ("table2", "--cases=3", "Unknown command line flag 'cases'"),
+        ("table2", "--seeds=3", "flag --seeds=3: expected 2 here"),
+        ("table2", "--weights=x --losses=gan", "expected none beside --weights"),
+        ("table2", "--weights=missing", "missing: "),
         ("background_shift", "--seed=-1", "--seed"),
         # shared flags that an experiment does not read, or leaves no choice in
         ("artefact_audit", "--positive=human", "Unknown command line flag 'positive'"),
-        ("closed_loop_seeds", "--seeds=3", "Unknown command line flag 'seeds'"),
-        ("closed_loop_seeds", "--epochs=3", "Unknown command line flag 'epochs'"),
         ("one_frame", "--seeds=3", "Unknown command line flag 'seeds'"),
-        ("stability", "--seeds=3", "Unknown command line flag 'seeds'"),
         ("discount_factors", "--horizon=5", "flag --horizon=5.0: expected 8.0 here"),
         ("one_frame", "--weights=x --epochs=3", "--epochs: 3: expected none beside"),
-        ("cross_site", "--sites=a=x,b=y --data=z", "--data: z: expected none beside"),
     ],
 )
 def test_bad_flags_without_data_are_one_line(name, flag, line, tmp_path):

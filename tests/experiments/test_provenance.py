@@ -19,11 +19,6 @@ DATA, LOGS = "--data={root}/data", ("--format=csv", "--input={root}/logs")
 WEIGHTS = "--weights={root}/w.msgpack"
 # command: what it is given, what it writes, and which hashes stand there
 ARTEFACTS = {
-    "drive_logs": (
-        ("--learner={root}/w.msgpack", "--suite=free_cruise", "--cases=2",
-         "--duration=45", "--output={out}"),
-        ("made_by.json",), ("weights_sha256",),
-    ),
     "evaluate": (
         (WEIGHTS, DATA, "--output={out}/ranking.json"),
         ("ranking.json",), ("weights_sha256", "data_hash"),
@@ -33,11 +28,7 @@ ARTEFACTS = {
     ),
     "replay": (
         (WEIGHTS, "--case=free_cruise/000@0", "--duration=2", "--output={out}"),
-        ("case.html", "case.json"), ("weights_sha256",),
-    ),
-    "report": (
-        (WEIGHTS, DATA, "--output={out}/report.html"),
-        ("report.html",), ("weights_sha256", "data_hash"),
+        ("case.html",), ("weights_sha256",),
     ),
     "simulate": (
         (WEIGHTS, "--suite=recorded", *LOGS, "--baselines=", "--cases=1",
@@ -61,7 +52,8 @@ def said(path):
     text = path.read_text()
     if path.suffix == ".json":
         return json.loads(text)["made_by"]
-    (found,) = re.findall(r"(?is)<h2>(?:page )?made by</h2>\n<pre>(\{.*?)</pre>", text)
+    block = r"(?is)<h2[^>]*>(?:page )?made by</h2>\n<pre[^>]*>(\{.*?)</pre>"
+    (found,) = re.findall(block, text)
     return json.loads(html.unescape(found))
 
 

@@ -12,12 +12,11 @@ from onnx.reference import ReferenceEvaluator
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.export import save
-from rcirl_jax.export.forms.linear_yaml import APOLLO, lattice_yaml, reward_yaml
+from rcirl_jax.export.forms.linear_yaml import reward_yaml
 from rcirl_jax.export.forms.onnx_model import write_onnx
 from rcirl_jax.export.forms.stablehlo import exported, write_stablehlo
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.reader import load_weights
-from rcirl_jax.reward import LatticeCost
 from tests.helpers.commands import command
 from tests.helpers.weights_files import example_weights, loop_value, random_weights
 
@@ -163,21 +162,13 @@ def test_a_network_is_no_linear_cost(tmp_path):
         reward_yaml(reward(tmp_path))
 
 
-def test_yaml_of_a_hand_set_cost_has_apollos_names():
-    cost = LatticeCost(objective=12.5, jerk=1e-7)
-    document = yaml.safe_load(lattice_yaml(cost, "tuned.json"))["apollo_lattice"]
-    assert set(document) == set(APOLLO)
-    assert document["weight_lon_objective"] == 12.5
-    assert document["weight_lon_jerk"] == 1e-7
-
-
 @pytest.mark.multiprocess
 def test_the_command(tmp_path):
     file = random_weights(tmp_path / "w.msgpack")
 
     names = ("onnx", "stablehlo", "jax_export")
     done = command(
-        "experiments.convert_weights",
+        "experiments.export_weights",
         f"--weights={file}",
         *(f"--{n}={tmp_path}/{n}" for n in names),
     )
@@ -193,9 +184,10 @@ def test_the_command(tmp_path):
     for flags, message in (
         ((f"--weights={file}", f"--yaml={tmp_path}/y"), "expected a linear reward"),
         ((f"--weights={file}",), "--onnx, --stablehlo"),
-        ((f"--onnx={tmp_path}/o",), "--weights, --hand_weights: expected one"),
+        ((f"--onnx={tmp_path}/o",), "--workdir, --weights: expected one of them"),
+        ((f"--yaml={tmp_path}/y", f"--workdir={tmp_path}"), "expected --weights with"),
     ):
-        done = command("experiments.convert_weights", *flags)
+        done = command("experiments.export_weights", *flags)
         assert done.returncode == 2
         (line,) = done.stderr.strip().splitlines()
         assert message in line

@@ -1,4 +1,4 @@
-"""The guard: what is flagged, what drives instead, alone and in the closed loop."""
+"""The guard: what is flagged, and what drives instead."""
 
 import ast
 import dataclasses
@@ -6,28 +6,21 @@ import sys
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.writer import DatasetWriter
 from rcirl_jax.export import Guard, Limits, decode_weights, guard, pack
-from rcirl_jax.export.closed_loop import table_rows
 from rcirl_jax.export.from_run import export_run
-from rcirl_jax.export.loading import open_reward, reward_params
 from rcirl_jax.features import feature_map
-from rcirl_jax.planner.guard import Guarded, Ranges, guarded_score, worst_share
-from rcirl_jax.planner.rank import hand_score, learned_score
 from rcirl_jax.reward import seen_range
 from rcirl_jax.train.loop import train
 from rcirl_jax.units import HORIZON_S
 from tests.data.store.test_dataset import finish_fields, lineage
 from tests.export.test_reader import ALLOWED
-from tests.helpers.scenes import batch, demonstration, random_scene, sampled
-from tests.helpers.weights_files import example_samples, example_weights, random_weights
+from tests.helpers.scenes import batch, demonstration
+from tests.helpers.weights_files import example_samples, example_weights
 from tests.train.test_step import CONFIG
 
 F, T, K = 3, 4, 10
@@ -212,65 +205,6 @@ def test_a_file_as_training_exports_it_notices_what_it_never_saw(tmp_path):
             verdict = judge.check(far)
             assert verdict.in_distribution == reached, (name, value)
             assert verdict.in_distribution or verdict.feature == name
-
-
-# --------------------------------------------------------------- the closed loop
-
-
-def guarded(reward, limits=None):
-    low, high = guard.bounds(reward, limits or Limits())
-    effective, normaliser = reward_params(reward)
-    return Guarded(
-        reward=effective, normaliser=normaliser,
-        ranges=Ranges(low=jnp.asarray(low), high=jnp.asarray(high)),
-        share=jnp.asarray((limits or Limits()).share),
-        incumbent=None,
-    )  # fmt: skip
-
-
-@given(seed=st.integers(0, 10_000), spread=st.sampled_from([0.9, 1.2, 1.6, 3.0]))
-def test_the_compiled_rule_is_the_readers(seed, spread):
-    rng, recorded = np.random.default_rng(seed), bool(seed % 2)
-    open_sides = reaching([-1.0, -0.5, -1.5], [0.5, 1.0, 1.5], recorded)
-    reward = open_sides if seed % 3 == 0 else made(recorded)
-    features = plan(seed, spread) * rng.uniform(0.3, 1.0, F).astype(np.float32)
-    if seed % 5 == 0:
-        value = rng.choice([np.nan, np.inf, -np.inf])
-        features[0, rng.integers(T), rng.integers(F)] = value
-    valid = np.arange(T) < rng.integers(0, T + 1)
-    counts = np.broadcast_to(valid[:, None], (T, K))
-    own = guarded(reward)
-    found = RULE(own.ranges, features.transpose(2, 1, 0), counts)
-    assert (
-        bool(found <= own.share) == Guard(reward).check(features, valid).in_distribution
-    )
-
-
-RULE = jax.jit(worst_share)
-
-
-def test_the_guarded_score_is_one_or_the_other(tmp_path):
-    reward = open_reward(str(random_weights(tmp_path / "w.msgpack")))
-    preset, scene = feature_map("paper21"), random_scene(3)
-    candidates = sampled(jax.random.key(0), scene, CONFIG.sampler)
-    score = jax.jit(guarded_score(preset, reward.activation, hand_score))
-    ours = learned_score(preset, reward.activation)(
-        reward_params(reward), scene, candidates
-    )
-    theirs = hand_score(None, scene, candidates)
-    wide, none = Limits(reach=100.0), Limits(reach=0.0, share=0.0)
-    found = score(guarded(reward, wide), scene, candidates)
-    np.testing.assert_allclose(found, ours, rtol=1e-4, atol=1e-4)
-    found = score(guarded(reward, none), scene, candidates)
-    np.testing.assert_allclose(found, theirs, rtol=1e-4, atol=1e-3)
-
-
-def test_a_table_may_have_a_guarded_row(tmp_path):
-    path, other = (str(random_weights(tmp_path / f"{i}.msgpack", i)) for i in (1, 2))
-    for incumbent, has_weights in (("hand-set", False), (other, True)):
-        drivers = table_rows([path], ["IDM"], guard=incumbent)
-        assert [row.name for row in drivers][1] == f"{drivers[0].name} guarded"
-        assert (drivers[1].params.incumbent is not None) == has_weights
 
 
 def test_no_value_at_all_is_no_choice():

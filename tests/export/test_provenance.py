@@ -6,8 +6,10 @@ import pytest
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.export import pack
+from rcirl_jax.export.from_run import datasets_of
 from rcirl_jax.export.loading import open_reward
-from rcirl_jax.export.provenance import check_local, dataset_names
+from rcirl_jax.runtime.atomic_files import write_json
+from rcirl_jax.train.state import TrainConfig
 from tests.helpers import weights_files
 from tests.helpers.commands import command
 
@@ -52,23 +54,25 @@ def test_what_is_not_said_is_no_mistake(tmp_path, monkeypatch):
     assert open_reward(str(path)).provenance["seed"] is None
 
 
+def run_on(folder, data):
+    """A run's folder whose flags name these data."""
+    config = dataclasses.asdict(TrainConfig())
+    body = {"config": config, "flags": {"data": data}}
+    write_json(folder / "run.json", body)
+    return folder
+
+
 @pytest.mark.parametrize("found", [5, [], [3], "", "a\0b", ["a", None], {"a": 1}])
-def test_names_that_no_dataset_can_have(found):
+def test_names_that_no_dataset_can_have(tmp_path, found):
     with pytest.raises(
         InputError, match=r"run\.json: flags\.data: .*expected a dataset"
     ):
-        dataset_names(found, "run.json: flags.data")
+        datasets_of(run_on(tmp_path, found))
 
 
-def test_one_dataset_or_several():
-    assert dataset_names("a", "f") == ["a"]
-    assert dataset_names(["a", "b"], "f") == ["a", "b"]
-
-
-def test_a_file_names_folders_only():
-    check_local(["a", "/b/c"], "f")
-    with pytest.raises(InputError, match="f: gs://b/d: expected a folder; --data may"):
-        check_local(["a", "gs://b/d"], "f")
+def test_one_dataset_or_several(tmp_path):
+    assert datasets_of(run_on(tmp_path, "a")) == ["a"]
+    assert datasets_of(run_on(tmp_path, ["a", "b"])) == ["a", "b"]
 
 
 @pytest.mark.parametrize(
@@ -80,15 +84,3 @@ def test_a_run_that_is_none_is_one_line(tmp_path, text):
     assert done.returncode == 2
     (said,) = done.stderr.strip().splitlines()
     assert "run.json: " in said
-
-
-def test_no_data_in_the_provenance_is_one_line(tmp_path, monkeypatch):
-    for flags in ({"data": 5}, {}, None):
-        path = with_provenance(tmp_path, monkeypatch, flags=flags)
-        done = command(
-            "experiments.reproduce", f"--weights={path}", f"--output={tmp_path / 'out'}"
-        )
-        assert done.returncode == 2
-        (said,) = done.stderr.strip().splitlines()
-        assert "data" in said
-    assert not (tmp_path / "out").exists()

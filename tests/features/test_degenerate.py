@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.rank import hand_score, learned_score
-from rcirl_jax.planner.refine import RefineConfig, refine
 from rcirl_jax.reward import LOSSES, RewardConfig, init_reward, pinned
 from rcirl_jax.sampling import SamplerConfig, trajectory_on_path
 from rcirl_jax.train import featurise as making
@@ -73,7 +72,7 @@ LEARNED = learned_score(feature_map("paper21"), "tanh")
 
 @jax.jit
 def slope(made, s):
-    """V of stations [T] and its gradient, as the planner's refinement takes it."""
+    """V of stations [T] and its gradient."""
 
     def value(s):
         return LEARNED(weights(), made, one_of(trajectory_on_path(made, s)))[0]
@@ -120,19 +119,6 @@ def test_random_scenes_have_finite_slopes(seed, moves, num):
     made = random_scene(seed).replace(time_valid=jnp.arange(NUM_TIMES) < num)
     s = random_positions(seed, made)[0] * moves
     assert finite(slope(made, s))
-
-
-@jax.jit
-def climb(made, s):
-    start = trajectory_on_path(made, s)
-    return refine(made, start, LEARNED, weights(), RefineConfig(steps=3))
-
-
-@pytest.mark.parametrize("name", ["standstill", "corners touch", "one valid time"])
-def test_refinement_ends_with_finite_stations(name):
-    made = SCENES[name]
-    for s in drives(made):
-        assert finite(climb(made, s))
 
 
 # ------------------------------------------------------------------- the losses

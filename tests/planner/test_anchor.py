@@ -85,8 +85,6 @@ def test_an_anchored_file_drives_anchored(tmp_path, monkeypatch):
     assert float(rows[0].params.high) == 2.0
     with pytest.raises(InputError, match="without an anchor"):
         table_rows([path], [], dp=True)
-    with pytest.raises(InputError, match="without an anchor"):
-        table_rows([path], [], guard="hand-set")
 
 
 def test_another_own_cost_is_not_known_here(tmp_path):

@@ -11,13 +11,11 @@ import pytest
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.dp import plan_dp
 from rcirl_jax.planner.grid import DpConfig
-from rcirl_jax.planner.rank import ONLINE, learned_score
-from rcirl_jax.planner.refine import refine
-from rcirl_jax.planner.time_station import plan_time_station
+from rcirl_jax.planner.rank import learned_score
 from rcirl_jax.reward import RewardConfig, init_reward, pinned
 from rcirl_jax.sampling.kinematics import trajectory_on_path
 from rcirl_jax.types import Candidates, Normaliser
-from tests.helpers.scenes import random_scene, sampled
+from tests.helpers.scenes import random_scene
 
 FEATURES = feature_map("paper21")
 SHAPE = RewardConfig()
@@ -47,9 +45,8 @@ SCORE = jax.jit(learned_score(FEATURES, SHAPE.activation))
 
 
 @functools.cache
-@functools.cache
-def planner(config, kind=plan_dp):
-    return jax.jit(lambda s, w: kind(s, w, FEATURES, SHAPE.activation, config))
+def planner(config):
+    return jax.jit(lambda s, w: plan_dp(s, w, FEATURES, SHAPE.activation, config))
 
 
 def one(trajectory):
@@ -168,23 +165,6 @@ def test_a_nested_lattice_is_never_worse():
     assert sum(b for _, b in gains) < sum(a for a, _ in gains)
 
 
-def test_is_at_least_as_good_as_the_time_station_recursion():
-    gaps = []
-    for seed in range(8):
-        made, w = scene_of(seed), weights(seed)
-        full = planner(MIDDLE)(made, w)
-        small = planner(MIDDLE, plan_time_station)(made, w)
-        if not bool(small.feasible):
-            continue
-        again = float(network_value(made, small.trajectory, w))
-        assert float(small.value) == pytest.approx(again, rel=1e-3, abs=1e-3)
-        gaps.append(float(full.value) - float(small.value))
-        assert gaps[-1] > -1e-3
-    print(f"gap of the (t, s)-only recursion: {np.round(gaps, 3)}")
-    assert len(gaps) >= 4
-    assert max(gaps) > 1e-3
-
-
 def test_walls_and_bodies_are_not_entered():
     for seed in range(6):
         made = scene_of(seed)
@@ -198,20 +178,3 @@ def test_walls_and_bodies_are_not_entered():
         row = FEATURES(ahead, plan.trajectory)
         names = FEATURES.names
         assert float(row[1:, names.index("collision_distance")].min()) > 0.0
-
-
-def test_refinement_never_lowers_the_value_and_raises_some():
-    climb = jax.jit(lambda s, t, w: refine(s, t, SCORE, w))
-    gains = []
-    for seed in (1, 3, 4, 5):
-        made, w = scene_of(seed), weights(seed)
-        candidates = sampled(jax.random.key(0), made, ONLINE)
-        start = jax.tree.map(lambda x: x[3], candidates.trajectory)
-        before = float(network_value(made, start, w))
-        after, value = climb(made, start, w)
-        again = float(network_value(made, after, w))
-        assert float(value) == pytest.approx(again, rel=1e-3, abs=1e-3)
-        gains.append(again - before)
-        assert gains[-1] >= -1e-4
-        assert float(jnp.min(jnp.diff(after.s))) >= -1e-4
-    assert max(gains) > 0.01

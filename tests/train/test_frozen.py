@@ -9,7 +9,6 @@ import pytest
 
 from rcirl_jax.evaluation.ranking.learners import (
     train_learner,
-    train_with_each,
     untrained,
 )
 from rcirl_jax.features import feature_map
@@ -63,7 +62,6 @@ def test_a_member_takes_the_steps_of_the_training_step(optimizer):
 def test_members_do_not_know_of_each_other():
     grid = Members(
         seed=jnp.asarray([0, 1, 1], jnp.uint32),
-        optimizer=jnp.asarray([1, 2, 1], jnp.int32),
         learning_rate=jnp.asarray([0.003, 0.003, 0.03]),
         leaky_rate=jnp.asarray([0.05, 0.3, 0.05]),
     )
@@ -76,22 +74,6 @@ def test_members_do_not_know_of_each_other():
         ):
             np.testing.assert_allclose(a[0], b[m], rtol=1e-3, atol=1e-5)
     assert len({float(x) for x in together.loss[:, -1]}) == 3
-
-
-def test_each_optimiser_as_a_member_takes_its_own_steps():
-    made, names = human_is_better(), ["rmsprop", "sgd"]
-    together = train_with_each(made, SHORT, names)
-    assert list(together) == names
-    for name, learned in together.items():
-        config = dataclasses.replace(SHORT, optimizer=name)
-        (alone,) = train_learner(made, config, [SHORT.seed])
-        assert learned.config == config
-        for a, b in zip(
-            jax.tree.leaves(alone.params), jax.tree.leaves(learned.params), strict=True
-        ):
-            np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5)
-    a, b = (learned.params.kernels[0] for learned in together.values())
-    assert not np.allclose(a, b, atol=1e-4)
 
 
 def test_the_last_batch_may_be_short_and_counts_every_scene_once():

@@ -25,7 +25,6 @@ from rcirl_jax.evaluation.ranking.sweep import (
     train_group,
 )
 from rcirl_jax.export.loading import compiled_scorer, open_reward
-from rcirl_jax.export.reproduce import compare, is_member, member_again, sweep_of
 from rcirl_jax.export.sweep import run as folders
 from rcirl_jax.export.sweep.result import table
 from rcirl_jax.export.sweep.run import run_sweep
@@ -91,57 +90,6 @@ def untimed(report):
         del member["sha256"]  # of a file that says when it was made
     del kept["peak_memory_gib"], kept["made_by"]
     return kept
-
-
-def test_a_member_is_made_again_from_its_file(data, finished, tmp_path):
-    name = "h6_a0.3_r0.03_s1"
-    dataset = open_dataset(data)
-    reward = open_reward(str(finished[0] / "weights" / f"{name}.msgpack"))
-    file = dataclasses.replace(
-        reward, provenance={**reward.provenance, "flags": {1: 1}}
-    )
-    assert is_member(file)
-    sweep_again = sweep_of(file, dataset, [str(data)])
-    assert sweep_again == config_of(data)
-    again = member_again(file, sweep_again, tmp_path / "a", MADE_BY)
-    assert again.file == str(tmp_path / "a" / "weights.msgpack")
-    assert max(compare(reward, again).values()) == 0.0
-    assert again.provenance["config"] == reward.provenance["config"]
-    with pytest.raises(
-        InputError, match=r"weights\.msgpack: exists: expected a folder"
-    ):
-        member_again(file, sweep_again, tmp_path / "a", MADE_BY)
-    moved = dataclasses.replace(BASE, seed=1)
-    other = member_again(file, config_of(data, base=moved), tmp_path / "other", MADE_BY)
-    assert max(compare(reward, other).values()) > 0.0
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"sweep": None}, "provenance.sweep: missing: expected a file that"),
-        ({"dataset_sha256": "0" * 64}, "provenance.dataset_sha256: 0000"),
-        ({"seeds": 1}, "provenance.config: h6_a0.3_r0.03_s1: expected a member of"),
-        ({"seeds": 10**9}, "provenance.sweep: --seeds: 1000000000: expected a sweep"),
-        ({"seeds": "two"}, "provenance.sweep: seeds: 'two': expected int: expected"),
-        ({"more": 1}, "provenance.sweep: more: unknown: expected some of data, base,"),
-    ],
-)
-def test_a_member_that_cannot_be_made_again_is_one_line(
-    data, finished, changes, message
-):
-    file = finished[0] / "weights" / "h6_a0.3_r0.03_s1.msgpack"
-    reward = open_reward(str(file))
-    found = {**reward.provenance, "flags": {1: 1}}
-    for key, value in changes.items():
-        if key in found:
-            found[key] = value
-        else:
-            found["sweep"] = {**found["sweep"], key: value}
-    reward = dataclasses.replace(reward, provenance=found)
-    with pytest.raises(InputError) as caught:
-        sweep_of(reward, open_dataset(data), [str(data)])
-    assert str(caught.value).startswith(f"{file}: {message}")
 
 
 def test_members_equal_single_runs(data, monkeypatch):

@@ -29,9 +29,7 @@ from rcirl_jax.evaluation.closed_loop.likeness import read_arrays, write_arrays
 from rcirl_jax.evaluation.gate.types import Likeness
 from rcirl_jax.evaluation.ranking.sweep import SweepConfig, member_name, shape_name
 from rcirl_jax.export.from_run import last_metrics, read_config
-from rcirl_jax.export.hand_weights import tuned_rows, write_hand_weights
-from rcirl_jax.export.loading import open_reward
-from rcirl_jax.export.provenance import check_provenance
+from rcirl_jax.export.loading import check_provenance, open_reward
 from rcirl_jax.export.reader import decode_weights
 from rcirl_jax.export.sweep.folder import (
     GROUP_FACTS,
@@ -44,7 +42,6 @@ from rcirl_jax.export.sweep.folder import (
 )
 from rcirl_jax.export.sweep.result import read_sweep
 from rcirl_jax.features import mapping
-from rcirl_jax.reward import LatticeCost
 from rcirl_jax.runtime.atomic_files import write_json
 from rcirl_jax.runtime.pipeline import Stages
 from rcirl_jax.runtime.specs import load_toml, spec_root
@@ -286,14 +283,6 @@ def metrics(folder: Path) -> Target:
     return Target(read, [file])
 
 
-def hand(folder: Path) -> Target:
-    """Weights of a hand-set cost."""
-    folder.mkdir(parents=True)
-    file = folder / "tuned.json"
-    write_hand_weights(file, LatticeCost(), {"data_hash": "d" * 64})
-    return OneFile(lambda path: tuned_rows([str(path)], "d" * 64), [file])
-
-
 def sweeps(folder: Path) -> Target:
     """A sweep's folder: its result, and what a resumed sweep takes from it."""
     folder.mkdir(parents=True)
@@ -348,7 +337,6 @@ READERS: dict[str, Reader] = {
     "runs": Reader(make=runs),
     "stages": Reader(make=stages),
     "metrics": Reader(make=metrics),
-    "hand_weights": Reader(make=hand),
     "sweeps": Reader(make=sweeps),
     "lanelet2": Reader(make=pieces.lanelet2_target),
     **{name: Reader(make=make) for name, make in LOGS.items()},

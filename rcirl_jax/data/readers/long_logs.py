@@ -19,17 +19,18 @@ import contextlib
 import dataclasses
 import fcntl
 import itertools
+import multiprocessing
 import shutil
 import tempfile
-from collections.abc import Callable, Container, Iterator
+from collections.abc import Callable, Container, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tqdm
 
 from rcirl_jax.data.readers import csv_stream
 from rcirl_jax.data.readers.csv_stream import Field
-from rcirl_jax.data.readers.reading import reading
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Recording, Track
 
@@ -44,6 +45,7 @@ MAX_WINDOWS = 60  # of a minute
 BUFFER_BYTES = 64 * 2**20  # bytes of rows held before they go to scratch files
 SCRATCH = "rcirl-scratch-"  # how folders of scratch files begin
 LOCK = "lock"  # in such a folder, held while it is in use
+DELAY_S = 2.0  # s; what is read faster shows no bar
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -318,3 +320,29 @@ class Spill:
                     progress=self.given / total,
                     window=window if count > 1 else None,
                 )
+
+
+@contextlib.contextmanager
+def reading(path: Path, files: Sequence[Path]) -> Iterator[Callable[[int], object]]:
+    """A function to be called with the bytes just read of the files.
+
+    The bar stands below that of the import, shows bytes/s and the time left, and
+    goes when all is read. Processes that the import started show none.
+
+    Args:
+      path: named in the bar.
+      files: all that will be read.
+    """
+    with tqdm.tqdm(
+        total=sum(file.stat().st_size for file in files if file.is_file()),
+        desc=f"{path.name}: read",
+        unit="B",
+        unit_scale=True,
+        unit_divisor=1024,
+        leave=False,
+        delay=DELAY_S,
+        mininterval=0.5,
+        disable=multiprocessing.parent_process() is not None,
+    ) as bar:
+        # the last piece may be short
+        yield lambda size: bar.update(min(size, bar.total - bar.n))

@@ -223,16 +223,3 @@ def held_out(
         splits = {TRAIN: parts.indices(TRAIN), TEST: parts.indices("validation")}
         return Resplit(dataset, splits), f"validation by {by}, seed {seed}"
     return dataset, "as imported"
-
-
-def halves(dataset: Demonstrations) -> tuple[Resplit, Resplit]:
-    """Two datasets, each with the scenes of every other ego of each split."""
-    found = []
-    for half in (0, 1):
-        splits = {}
-        for name in ("train", "test"):
-            vehicle = np.asarray(dataset.load(name).vehicle)
-            odd = np.unique(vehicle, return_inverse=True)[1].reshape(-1) % 2
-            splits[name] = dataset.indices(name)[odd == half]
-        found.append(Resplit(dataset, splits))
-    return found[0], found[1]

@@ -17,7 +17,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.gate.exact import ALPHA, no_more_faults
+from rcirl_jax.evaluation.exact import ALPHA, no_more_faults
 from rcirl_jax.evaluation.gate.stats import counted
 from rcirl_jax.evaluation.gate.types import (
     Check,

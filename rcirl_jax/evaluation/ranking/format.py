@@ -1,15 +1,18 @@
 """The ranking report as aligned plain text for a terminal, or as Markdown."""
 
+import itertools
 import textwrap
 from collections.abc import Sequence
 
 from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.closed_loop.output import text_table
 from rcirl_jax.evaluation.ranking.metrics import METRICS
 from rcirl_jax.evaluation.ranking.table import (
     FEW_VEHICLES,
     MIN_WIDTH,
     RIVALS,
     SIGNIFICANT,
+    Comparison,
     RankingReport,
 )
 from rcirl_jax.evaluation.statistics import Estimate
@@ -45,22 +48,70 @@ def format_table(
     names = _order(report)
     learned = [name for name in names if name not in RIVALS]
     lines = [line for text in _heading(report) for line in textwrap.wrap(text, width)]
-    labels = [_label(report, name) for name in names]
-    first = max(len(label) for label in labels)
-    columns = {name: _column(report, name, names) for name in METRICS}
-    labels = ["", "", *(x for label in labels for x in (label, "  sd over runs"))]
-    first = max(first, len("  sd over runs"))
-    block: list[str] = []
-    for name in METRICS:
-        used = sum(len(columns[x][0]) + 2 for x in [*block, name])
-        if block and first + used > width:
-            lines += _block(labels, first, [columns[x] for x in block])
-            block = []
-        block.append(name)
-    lines += _block(labels, first, [columns[x] for x in block])
-    lines += _medians(report, names)
+    grid, block = _grid(report, names), [0]
+    for column in range(1, len(grid[0])):
+        wide = max(map(len, _columns(grid, [*block, column]))) > width
+        if wide and len(block) > 1:
+            lines += ["", *_columns(grid, block)]
+            block = [0]
+        block.append(column)
+    lines += ["", *_columns(grid, block)]
     lines += _differences(report, learned or names) if differences else []
     return "\n".join(lines) + "\n"
+
+
+def _columns(grid: Sequence[Sequence[str]], which: Sequence[int]) -> list[str]:
+    """Lines of some columns of a table."""
+    head, *rows = [[row[i] for i in which] for row in grid]
+    return text_table(head, rows)
+
+
+def _grid(report: RankingReport, names: Sequence[str]) -> list[list[str]]:
+    """Titles, units, then a row's cells and, of several runs, their spread."""
+    kinds = [*METRICS.values(), METRICS["percentile_rank"]]
+    titles = [how.title for how in kinds]
+    titles[-1] = f"{titles[-1]}, median"
+    ways = ["high" if how.higher_is_better else "low" for how in kinds]
+    units = [f"{how.unit}, {way}" for how, way in zip(kinds, ways, strict=True)]
+    grid = [["", *titles], ["", *units]]
+    for name in names:
+        found = [report.rows[name][x] for x in METRICS]
+        cells = [*found, report.human_rank_median[name]]
+        pairs = list(zip(cells, kinds, strict=True))
+        grid.append([_label(report, name), *(_cell(x, how.unit) for x, how in pairs)])
+        if report.runs[name] > 1:
+            spread = [(x.seed_sd, how.unit) for x, how in pairs]
+            sds = ["" if sd is None else _number(sd, unit) for sd, unit in spread]
+            grid.append(["  sd over runs", *sds])
+    return grid
+
+
+def _differences(report: RankingReport, names: Sequence[str]) -> list[str]:
+    shown = [c for c in report.comparisons if c.row in names]
+    if not shown:
+        return []
+    lines = [
+        "",
+        "Paired differences on the same scenes; named where Holm's p is below "
+        f"{SIGNIFICANT:g}",
+    ]
+    for pair, group in itertools.groupby(shown, lambda c: (c.row, c.reference)):
+        first, *others = [_difference(c) for c in group]
+        lines += [" minus ".join(pair), *text_table(first, others)]
+    return lines
+
+
+def _difference(found: Comparison) -> list[str]:
+    d, how = found.difference, METRICS[found.metric]
+    scale, unit = (100.0, "points") if how.unit == "%" else (1.0, how.unit)
+    mean, low, high, se = (scale * x for x in (d.mean, d.low, d.high, d.se))
+    return [
+        f"  {how.title}",
+        f"{mean:+.3f} [{low:+.3f}, {high:+.3f}] {unit:6}",
+        f"s.e. {se:.3f}",
+        f"p {d.p:.3f}, Holm {found.p_holm:.3f}",
+        found.verdict,
+    ]
 
 
 def markdown_table(report: RankingReport, against: str = "GAN") -> str:
@@ -119,30 +170,6 @@ def _label(report: RankingReport, name: str) -> str:
     return name if runs == 1 else f"{name} ({runs} runs)"
 
 
-def _column(report: RankingReport, metric: str, names: Sequence[str]) -> list[str]:
-    """Title, unit, then per row its cell and its spread; all of one width."""
-    how = METRICS[metric]
-    cells = [how.title, f"{how.unit}, {'high' if how.higher_is_better else 'low'}"]
-    for name in names:
-        found = report.rows[name][metric]
-        cells.append(_cell(found, how.unit))
-        spread = found.seed_sd
-        cells.append("" if spread is None else _number(spread, how.unit))
-    wide = max(len(cell) for cell in cells)
-    return [cell.rjust(wide) for cell in cells]
-
-
-def _block(labels: list[str], first: int, columns: list[list[str]]) -> list[str]:
-    """Lines of one block of columns; spread lines of single runs are left out."""
-    lines = [""]
-    for i, label in enumerate(labels):
-        cells = [column[i] for column in columns]
-        if any(cell.strip() for cell in cells):
-            lines.append("  ".join([label.ljust(first), *cells]).rstrip())
-    rule = "-" * (first + sum(len(column[0]) + 2 for column in columns))
-    return [*lines[:3], rule, *lines[3:]]
-
-
 def _cell(found: Estimate, unit: str) -> str:
     if found.exact:
         bound = found.high if found.value == 0.0 else found.low
@@ -150,18 +177,6 @@ def _cell(found: Estimate, unit: str) -> str:
         return f"{100.0 * found.value:.0f} ({sign} {_number(bound, unit)})"
     low, high = _number(found.low, unit), _number(found.high, unit)
     return f"{_number(found.value, unit)} [{low}, {high}]"
-
-
-def _medians(report: RankingReport, names: Sequence[str]) -> list[str]:
-    """One line per row: the median over scenes of the human's percentile rank."""
-    lines = ["", "Median over scenes of the human's percentile rank"]
-    wide = max(len(name) for name in names)
-    for name in names:
-        found = report.human_rank_median[name]
-        low, high = 100.0 * found.low, 100.0 * found.high
-        cell = f"{100.0 * found.value:5.1f} [{low:.1f}, {high:.1f}] %"
-        lines.append(f"  {name:<{wide}}  {cell}")
-    return lines
 
 
 def _number(value: float, unit: str) -> str:
@@ -174,29 +189,3 @@ def _number(value: float, unit: str) -> str:
         if float(text) not in (0.0, 100.0):
             return text
     return f"{percent:.1f}"
-
-
-def _differences(report: RankingReport, names: Sequence[str]) -> list[str]:
-    shown = [c for c in report.comparisons if c.row in names]
-    if not shown:
-        return []
-    lines = [
-        "",
-        "Paired differences on the same scenes; named where Holm's p is below "
-        f"{SIGNIFICANT:g}",
-    ]
-    wide = max(len(METRICS[c.metric].title) for c in shown)
-    last = ("", "")
-    for c in shown:
-        if (c.row, c.reference) != last:
-            last = (c.row, c.reference)
-            lines.append(f"{c.row} minus {c.reference}")
-        d, unit = c.difference, METRICS[c.metric].unit
-        scale, name = (100.0, "points") if unit == "%" else (1.0, unit)
-        mean, low, high, se = (scale * x for x in (d.mean, d.low, d.high, d.se))
-        interval = f"[{low:+.3f}, {high:+.3f}]"
-        lines.append(
-            f"  {METRICS[c.metric].title:<{wide}}  {mean:+8.3f} {interval:<18}"
-            f" {name:<6}  s.e. {se:.3f}  p {d.p:.3f}, Holm {c.p_holm:.3f}  {c.verdict}"
-        )
-    return lines

@@ -232,36 +232,13 @@ def train_grid(
         for rate in leaky_rates
         for seed in seeds
     ]
-    runs = iter(_side_by_side(frozen, config, grid, keep))
-    return {rate: [next(runs) for _ in seeds] for rate in leaky_rates}
-
-
-def train_with_each(
-    frozen: FeatureBatch, config: TrainConfig, optimizers: Sequence[str]
-) -> dict[str, Learned]:
-    """One configuration with several optimisers, as members of one program.
-
-    Each takes the steps that `train_learner` would take: same first weights, same
-    batches, its own state.
-    """
-    each = [dataclasses.replace(config, optimizer=name) for name in optimizers]
-    runs = _side_by_side(frozen, config, each, None)
-    return dict(zip(optimizers, runs, strict=True))
-
-
-def _side_by_side(
-    frozen: FeatureBatch,
-    config: TrainConfig,
-    members: Sequence[TrainConfig],
-    keep: Sequence[str] | None,
-) -> list[Learned]:
-    """Members of one program; candidates, batches, normaliser are of `config`."""
     normaliser = normaliser_of(frozen, config, keep)
-    fitted = fit(frozen, normaliser, config, members_of(members))
-    return [
-        _learned(jax.tree.map(lambda leaf, n=n: leaf[n], fitted), normaliser, own)
-        for n, own in enumerate(members)
-    ]
+    fitted = fit(frozen, normaliser, config, members_of(grid))
+    each = [jax.tree.map(lambda leaf, n=n: leaf[n], fitted) for n in range(len(grid))]
+    runs = iter(
+        _learned(one, normaliser, own) for one, own in zip(each, grid, strict=True)
+    )
+    return {rate: [next(runs) for _ in seeds] for rate in leaky_rates}
 
 
 def train_learner(

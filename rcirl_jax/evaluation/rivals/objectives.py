@@ -1,4 +1,4 @@
-"""What a tuner of the hand-set cost minimises: ranking error, or driving.
+"""What a tuner of the hand-set cost minimises: the error of what it chooses.
 
 A problem knows how many queries (candidates looked at) one evaluation takes, so
 that budgets can be compared with a learner's. Vectors are those of
@@ -8,7 +8,7 @@ that budgets can be compared with a learner's. Vectors are those of
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -23,23 +23,12 @@ from rcirl_jax.evaluation.ranking.score import (
     distances,
     horizon_mask,
 )
-from rcirl_jax.evaluation.rivals.cma_es import Objective, equal_budget, tune
+from rcirl_jax.evaluation.rivals.cma_es import Objective
 from rcirl_jax.planner.prediction import as_seen
-from rcirl_jax.planner.rank import RankConfig
-from rcirl_jax.reward import TUNABLE, LatticeCost, lattice_terms, tuned, weighted_cost
+from rcirl_jax.reward import lattice_terms, tuned, weighted_cost
 from rcirl_jax.reward.hand import LatticeTerms
 from rcirl_jax.sampling import SamplerConfig, sample
 from rcirl_jax.sampling.sampler import num_candidates
-from rcirl_jax.simulation.metrics import CaseMetrics, nuplan_score
-from rcirl_jax.simulation.rows import Row, tuned_row
-from rcirl_jax.simulation.suite import (
-    FULL_S,
-    catalogue_set,
-    drive_row,
-    rollout_config,
-    suite_refs,
-)
-from rcirl_jax.simulation.world.careful import judges
 from rcirl_jax.train.featurise import human_of
 from rcirl_jax.types import Candidates, Demonstration
 from rcirl_jax.units import HORIZON_S
@@ -55,7 +44,6 @@ class Problem:
 
     objective: Objective  # [n, 8] -> [n], lower is better
     queries: int  # candidates looked at in one evaluation of one vector
-    title: str  # what the value is, with its unit
 
 
 class RankedScenes(NamedTuple):
@@ -64,9 +52,6 @@ class RankedScenes(NamedTuple):
     terms: LatticeTerms  # [S, K, ...]
     fde: jax.Array  # [S, K] m
     feasible: jax.Array  # [S, K] bool
-
-
-# -------------------------------------------------------------------- ranking
 
 
 def ranking_problem(
@@ -95,15 +80,9 @@ def ranking_problem(
         )
     rows, index = drawn_rows(dataset, setup, max_scenes, seed)
     scenes = ranked_scenes(rows, index, setup.sampler, setup.horizon_s)
-    return distance_problem(functools.partial(mean_fde, scenes), scenes.fde, setup)
-
-
-def distance_problem(
-    objective: Objective, fde: jax.Array, setup: RankingSetup
-) -> Problem:
-    """A mean FDE over the candidates whose FDE [S, K] is given, as a problem."""
-    title = f"mean FDE at {setup.horizon_s:g} s, m"
-    return Problem(objective=objective, queries=int(fde.size), title=title)
+    return Problem(
+        objective=functools.partial(mean_fde, scenes), queries=int(scenes.fde.size)
+    )
 
 
 def drawn_rows(
@@ -219,81 +198,13 @@ def _mean_fde(scenes: RankedScenes, vectors: jax.Array) -> jax.Array:
     return jnp.mean(jax.lax.map(of_scene, scenes), axis=0)
 
 
-# ---------------------------------------------------------------- closed loop
-
-
-def suite_problem(
-    suite: str,
-    per_family: int,
-    duration_s: float,
-    catalogue_seed: int,
-    plan_every: int = 1,
-) -> Problem:
-    """Driving with the hand-set cost behind the ranking planner, over some cases.
-
-        objective = share of cases with an at-fault collision - mean nuPlan score
-
-    An at-fault collision also lowers nuPlan's score of its case, to 0 but for
-    objects, so it counts up to twice. IDM's distances are the reference of
-    nuPlan's progress, as in the table. One program drives the vectors in turn.
-
-    Args:
-      suite: "smoke", "full" or families separated by commas.
-      per_family: cases of each family.
-      duration_s: of a case, 1 to 120 s.
-      catalogue_seed: of the cases.
-      plan_every: steps of 0.1 s between two plans.
-
-    Raises:
-      InputError: an unknown family, or a count or duration out of range.
-    """
-    if not 1.0 <= duration_s <= FULL_S:
-        raise InputError(f"--duration: {duration_s}: expected 1 to {FULL_S:g} s")
-    cases = catalogue_set(suite_refs(suite, per_family, catalogue_seed), duration_s)
-    total = len(cases.ids)
-    built = cases.build(0, total)
-    config = RankConfig()
-    idm = next(row for row in judges() if row.name == "IDM")
-    rollout = rollout_config(idm, duration_s, plan_every)
-
-    def drive(row: Row) -> CaseMetrics:
-        return drive_row(row, lambda *_: built, total, rollout, chunk=total)
-
-    reference = drive(idm).progress
-
-    def objective(vectors: np.ndarray) -> np.ndarray:
-        rows = [tuned_row(tuned(jnp.asarray(x, jnp.float32)), config) for x in vectors]
-        return np.array([-drive_value(drive(row), reference) for row in rows])
-
-    plans = total * rollout.steps // rollout.plan_every
-    return Problem(
-        objective=objective,
-        queries=plans * num_candidates(config.sampler),
-        title="share of at-fault collisions - mean nuPlan score",
-    )
-
-
-def drive_value(metrics: CaseMetrics, reference: jax.Array) -> float:
-    """Mean nuPlan score minus the share of cases with an at-fault collision.
-
-    Args:
-      metrics: [C].
-      reference: [C] m, distance the reference driver made.
-    """
-    score = np.mean(np.asarray(nuplan_score(metrics, reference)[0], np.float64))
-    return float(score - np.mean(np.asarray(metrics.at_fault) > 0))
-
-
-# --------------------------------------------------------------------- budget
-
-
 def learner_budget(
     dataset: Demonstrations, sampler: SamplerConfig, epochs: int, problem: Problem
 ) -> int:
     """Evaluations of a problem with the queries of a learner's training.
 
-    The learner sees every training scene of the dataset with all candidates of its
-    sampler in every epoch; see `equal_budget`.
+    The learner compares K candidates with the human in each of S scenes, E times; an
+    evaluation of one vector looks at `problem.queries` Q: floor(S K E / Q).
 
     Args:
       dataset: the learner's.
@@ -304,44 +215,11 @@ def learner_budget(
     Raises:
       InputError: less than one evaluation.
     """
-    return equal_budget(
-        scenes=dataset.indices("train").size,
-        candidates=num_candidates(sampler),
-        epochs=epochs,
-        queries_per_evaluation=problem.queries,
-    )
-
-
-def tune_hand_set(
-    problem: Problem, held_out: Problem, *, budget: int, sigma: float, seed: int
-) -> tuple[LatticeCost, dict[str, Any]]:
-    """Search from Apollo's weights; the best cost found and JSON-ready facts.
-
-    Args:
-      problem: what is tuned on.
-      held_out: what is not; evaluated for Apollo's and the tuned weights only.
-      budget: most evaluations.
-      sigma: first spread of the log-weights.
-      seed: of the search.
-
-    Returns:
-      The cost, and: objective (by problem: default, tuned), what it is, the tuned
-      vector, the search's history.
-    """
-    start = np.zeros(len(TUNABLE))
-    result = tune(problem.objective, start, sigma, budget, seed)
-    named = {"tuned_on": problem, "held_out": held_out}
-    both = np.stack([start, result.vector])
-    found = {name: x.objective(both).tolist() for name, x in named.items()}
-    return tuned(jnp.asarray(result.vector, jnp.float32)), {
-        "objective": {k: {"default": v[0], "tuned": v[1]} for k, v in found.items()},
-        "objective_is": problem.title,
-        "log_factors": dict(zip(TUNABLE, result.vector.tolist(), strict=True)),
-        "search": {
-            "method": result.method,
-            "evaluations": result.evaluations,
-            "queries_per_evaluation": problem.queries,
-            "seconds": round(result.seconds, 2),
-            "history": list(result.history),
-        },
-    }
+    scenes = dataset.indices("train").size
+    queries = scenes * num_candidates(sampler) * epochs
+    if queries < problem.queries:
+        raise InputError(
+            f"--epochs: {epochs}: {queries:,} queries: expected at least the "
+            f"{problem.queries:,} of one evaluation"
+        )
+    return queries // problem.queries

@@ -27,7 +27,6 @@ from rcirl_jax.evaluation.ranking.score import (
 from rcirl_jax.evaluation.rivals.cma_es import tune
 from rcirl_jax.evaluation.rivals.objectives import (
     Problem,
-    distance_problem,
     drawn_rows,
     in_chunks,
     in_scene_chunks,
@@ -105,7 +104,7 @@ def idm_problem(
     scenes = driven_scenes(rows, index, setup.sampler, setup.horizon_s)
     on_path = setup.sampler.mode == "speed"
     objective = functools.partial(mean_driven_fde, scenes, on_path=on_path)
-    return distance_problem(objective, scenes.fde, setup)
+    return Problem(objective=objective, queries=int(scenes.fde.size))
 
 
 def driven_scenes(
@@ -195,7 +194,7 @@ def tuned_rivals(
                 dataset, setup.sampler, epochs, problem
             )
             start = np.zeros(len(names))
-            best = tune(problem.objective, start, SIGMA, budget, seed).vector
+            best, _ = tune(problem.objective, start, SIGMA, budget, seed)
             found[row].append(rival(jnp.asarray(best, jnp.float32)))
     return found
 
@@ -213,7 +212,7 @@ def tune_idm(
     own = dataclasses.replace(setup, split="train")
     problem = idm_problem(dataset, own, LONG_SCENES)
     start = np.zeros(len(TUNABLE_IDM))
-    best = tune(problem.objective, start, SIGMA, evaluations, 0).vector
+    best, _ = tune(problem.objective, start, SIGMA, evaluations, 0)
     found = idm_of(jnp.asarray(best, jnp.float32)).fields()
     return Idm(**{name: float(value) for name, value in found.items()})
 

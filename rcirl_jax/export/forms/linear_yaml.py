@@ -10,8 +10,6 @@ the nearest terms of that planner's cost.yaml. Its terms are integrals of square
 of absolute values over seconds, so the weights are matched where a feature departs from
 the usual by its spread: a start for its planner, not the same cost. A free linear
 reward has none: it wants more of a feature or less, never the usual.
-
-A tuned hand-set cost is exact in `apollo_lattice`: the names of Apollo's flags.
 """
 
 from collections.abc import Mapping
@@ -20,7 +18,6 @@ import numpy as np
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.reader import Reward
-from rcirl_jax.reward import LatticeCost
 
 SCHEMA = "rcirl-jax/linear-cost"
 SCHEMA_VERSION = 1
@@ -38,18 +35,6 @@ FRENETIX_NONE = (
     *("jerk", "lateral_jerk", "path_length", "lane_center_offset", "velocity"),
     *("distance_to_obstacles", "prediction", "responsibility"),
 )
-
-# Apollo's flag -> field of LatticeCost
-APOLLO = {
-    "weight_lon_objective": "objective",
-    "weight_lon_jerk": "jerk",
-    "weight_lon_collision": "collision",
-    "weight_lat_offset": "lateral_offset",
-    "weight_lat_comfort": "lateral_comfort",
-    "weight_centripetal_acceleration": "centripetal",
-    "weight_target_speed": "objective_speed",
-    "weight_dist_travelled": "objective_distance",
-}
 
 
 def linear_costs(reward: Reward) -> tuple[np.ndarray, np.ndarray]:
@@ -128,14 +113,6 @@ def _frenetix(reward: Reward, above: np.ndarray, below: np.ndarray) -> dict[str,
             cost = max(0.5 * float(above[i] + below[i]), 0.0)
             found[name] = cost * per_second / float(reward.scale[i]) ** (power - 1)
     return found
-
-
-def lattice_yaml(cost: LatticeCost, source: str) -> str:
-    """The document of a hand-set cost, by the names of Apollo's flags."""
-    lines = [*_head({"hand_weights": source}), "apollo_lattice:"]
-    for flag, field in APOLLO.items():
-        lines.append(f"  {flag}: {_number(float(getattr(cost, field)))}")
-    return "\n".join(lines) + "\n"
 
 
 def _head(source: Mapping[str, str]) -> list[str]:

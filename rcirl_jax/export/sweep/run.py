@@ -26,7 +26,6 @@ from rcirl_jax.evaluation.ranking.sweep import (
 )
 from rcirl_jax.evaluation.statistics import ClusterBootstrap
 from rcirl_jax.export.from_run import verification_samples, write_weights
-from rcirl_jax.export.reader import Reward
 from rcirl_jax.export.sweep.choice import judged
 from rcirl_jax.export.sweep.folder import (
     SWEEP,
@@ -124,7 +123,7 @@ def _train(
         for part in executor.stream(piece, todo):
             for number, member in enumerate(part.members):
                 output = weights_file(folder, member)
-                write_member(output, part, number, samples(), config, made_by)
+                _write_member(output, part, number, samples(), config, made_by)
             parts[part.hidden].append(part)
             bar.update(len(part.members))
             if sum(len(p.members) for p in parts[part.hidden]) == len(
@@ -135,14 +134,14 @@ def _train(
     return {shape_name(hidden): group or {} for hidden, group in groups.items()}
 
 
-def write_member(
+def _write_member(
     output: Path,
     part: Part,
     number: int,
     samples: tuple[np.ndarray, np.ndarray],
     config: SweepConfig,
     made_by: Mapping[str, object],
-) -> Reward:
+) -> None:
     """Write the weights file of one trained member.
 
     Args:
@@ -168,9 +167,7 @@ def write_member(
     }
     params = jax.tree.map(lambda x: jnp.asarray(x[number]), part.params)
     normaliser = jax.tree.map(jnp.asarray, part.normaliser)
-    return write_weights(
-        output, params, normaliser, member, samples, provenance, part.seen
-    )
+    write_weights(output, params, normaliser, member, samples, provenance, part.seen)
 
 
 def _peak_memory_gib() -> float:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.report.case.drive import plan_start, road_in_plane, worst_step
+from rcirl_jax.report.player.drive import plan_start, road_in_plane, worst_step
 from rcirl_jax.simulation.cases import (
     ROAD_STEP_M,
     STEP_S,

@@ -1,6 +1,6 @@
 """Charts of numbers with intervals: rows of a table, curves with bands."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -109,17 +109,4 @@ def curves_panel(axis: Axes, x: ArrayLike, curves: Mapping[str, np.ndarray]) -> 
             axis.fill_between(
                 at, mean - error, mean + error, color=colour, alpha=0.18, lw=0
             )
-    axis.legend(fontsize=8, frameon=False)
-
-
-def interval_curves(
-    axis: Axes, x: ArrayLike, curves: Mapping[str, Sequence[Interval]]
-) -> None:
-    """Curves of estimates with their intervals as bands."""
-    at = np.asarray(x, float)
-    for number, (name, points) in enumerate(curves.items()):
-        value, low, high = np.array(points, float).T
-        colour = CURVES[number % len(CURVES)]
-        axis.plot(at, value, "o-", color=colour, ms=3, lw=1.6, label=name)
-        axis.fill_between(at, low, high, color=colour, alpha=0.15, lw=0)
     axis.legend(fontsize=8, frameon=False)

@@ -164,28 +164,6 @@ def _draw_speeds(
     label(axis, "speed: human (solid), chosen (dashed)", "t, s", "m/s")
 
 
-def discount_factors(path: Path, gammas: Mapping[str, np.ndarray]) -> Path:
-    """PNG of gamma_t; several seeds of a row [R, T] are drawn as a band."""
-    made, axes = figure(1, 1, 6.4, 4.0)
-    axis = axes[0, 0]
-    for colour, (name, rows) in zip(
-        CLASS_COLOURS.values(), gammas.items(), strict=False
-    ):
-        table = np.atleast_2d(rows)
-        # the sign of gamma is free (the network's sign goes with it): show |.|
-        sign = np.sign(table.sum(axis=1, keepdims=True))
-        table = table * np.where(sign == 0.0, 1.0, sign)
-        axis.plot(TIMES_S, table.mean(axis=0), "o-", color=colour, label=name, ms=4)
-        if len(table) > 1:
-            axis.fill_between(
-                TIMES_S, table.min(axis=0), table.max(axis=0), color=colour, alpha=0.2
-            )
-    axis.axhline(0.0, color=HUMAN, lw=0.6)
-    axis.legend(fontsize=8, frameon=False)
-    label(axis, "learned time weights", "t, s", "gamma_t")
-    return save(made, path)
-
-
 def training_curve(
     path: Path, steps: np.ndarray, series: Mapping[str, np.ndarray]
 ) -> Path:

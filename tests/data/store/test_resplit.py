@@ -10,7 +10,6 @@ from rcirl_jax.data.store.resplit import (
     by_vehicle,
     fewer,
     folds_by_recording,
-    halves,
     held_out,
 )
 from rcirl_jax.errors import InputError
@@ -45,7 +44,7 @@ class Rows:
 
 @pytest.mark.parametrize(
     "split",
-    [by_vehicle(Rows(), 0.25, 3), by_recording(Rows(), [0, 2]), *halves(Rows())],
+    [by_vehicle(Rows(), 0.25, 3), by_recording(Rows(), [0, 2])],
 )
 def test_no_vehicle_is_the_ego_on_both_sides(split):
     train, test = (set(split.load(name).vehicle) for name in ("train", "test"))
@@ -94,12 +93,6 @@ def test_fewer_is_nested_and_keeps_the_test_rows():
     assert set(few.indices("train")) <= set(more.indices("train"))
     assert np.unique(few.load("train").vehicle).size == 4
     np.testing.assert_array_equal(few.indices("test"), Rows().test)
-
-
-def test_halves_are_disjoint_and_complete():
-    a, b = halves(Rows())
-    both = np.sort(np.concatenate([a.indices(None), b.indices(None)]))
-    np.testing.assert_array_equal(both, np.arange(200))
 
 
 def test_overlap_and_nothing_are_refused():

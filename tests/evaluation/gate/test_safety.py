@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.exact import clopper_pearson
-from rcirl_jax.evaluation.gate.decision import judge
-from rcirl_jax.evaluation.gate.exact import (
+from rcirl_jax.evaluation.exact import (
     ALPHA,
     NUISANCE_ALPHA,
     NUISANCE_STEPS,
+    clopper_pearson,
     no_more_faults,
     scores,
 )
+from rcirl_jax.evaluation.gate.decision import judge
 from rcirl_jax.evaluation.gate.output import format_verdict
 from rcirl_jax.evaluation.gate.types import NULLS, GateConfig, Likeness
 from tests.evaluation.gate.test_gate import (

@@ -1,6 +1,7 @@
 """The report: numbers traced back to the scenes, text that lines up."""
 
 import dataclasses
+import itertools
 import json
 
 import numpy as np
@@ -212,17 +213,13 @@ def test_table_fits_lines_up_and_orders_its_rows(report, width):
     lines = format_table(report, width).splitlines()
     assert max(len(line) for line in lines) <= width
     table = lines[: next(i for i, x in enumerate(lines) if x.startswith("Paired"))]
-    assert max(len(line) for line in table) <= width
-    rules = [i for i, line in enumerate(table) if line.startswith("---")]
-    assert len(rules) >= 2
-    for at in rules:
-        block = table[at - 2 : at + 1 + len(report.rows) + 1]  # one spread line
-        names = [line[:24].strip() for line in block[3:]]
-        starts = [n for n in names if not n.startswith("sd over")]
+    blocks = [i for i, line in enumerate(table) if line == ""]
+    assert len(blocks) >= 3
+    for at, end in itertools.pairwise(blocks):
+        rows = [line for line in table[at + 3 : end] if not line.startswith("  sd")]
         order = ("rc-irl", "twin", *(x for x in RIVALS if x in report.rows))
-        assert all(n.startswith(o) for n, o in zip(starts, order, strict=True))
-        ends = {len(line) for line in block if not line.startswith("  sd")}
-        assert ends == {len(table[at])}  # right-aligned to the rule
+        assert all(n.startswith(o) for n, o in zip(rows, order, strict=True))
+        assert len({len(line) for line in (table[at + 1], *rows)}) == 1  # right-aligned
     for how in METRICS.values():
         assert how.title in "\n".join(table)
 

@@ -16,7 +16,7 @@ import numpy as np
 from rcirl_jax.data.importers.apollo.obstacles import Obstacles
 from rcirl_jax.data.importers.apollo.records import Record
 from rcirl_jax.data.importers.options import section
-from rcirl_jax.data.readers.reading import reading
+from rcirl_jax.data.readers.long_logs import reading
 from rcirl_jax.data.readers.wire import ENUM_NAME, Plan, WireError, decode
 from rcirl_jax.errors import InputError
 

@@ -1,1 +1,0 @@
-"""One drive as a page: what happened, when and why it failed."""
