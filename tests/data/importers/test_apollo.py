@@ -695,7 +695,7 @@ HEADER = fixture.header()
         (HEADER + fixture.section(2, message([(1, 5)])), "message: number"),
         (HEADER + fixture.section(2, b"\xff" * 11), "varint: no end"),
         (HEADER + fixture.section(2, b"\x0b"), "field 1: wire type 3"),
-        (HEADER + fixture.section(2, b"\x09\x0d" + bytes(7)), "no messages, nor"),
+        (HEADER + fixture.section(2, b"\x09" + bytes(7)), "8 bytes of 7 left"),
         (HEADER + fixture.section(4, b"\x0a\x05"), "corrupt: expected a cyber record"),
         (HEADER + fixture.section(4, message([(1, b"\xff")])), "bad UTF-8"),
     ],

@@ -153,19 +153,19 @@ def _read_part(
                 if topic in ("perception", "prediction"):
                     obstacles[channel] = Obstacles(readings[channel].names["type"])
             check_size("message", content)
-            found = readings[channel].parse(bytes(content))
+            message = readings[channel].parse(bytes(content))
         except DecodeError as error:
             raise InputError(
                 f"{record.path}: {channel}: message {numbers[topic]}: {error}: "
                 "expected an Apollo message"
             ) from error
         if channel in obstacles:
-            seen = _seen(found, topic)
+            seen = _seen(message, topic)
             held = sum(found.count for found in obstacles.values())
             check_held(f"{record.path}: {channel}", held + len(seen))
-            obstacles[channel].add(found.header.timestamp_sec, time * 1e-9, seen)
+            obstacles[channel].add(message.header.timestamp_sec, time * 1e-9, seen)
         else:
-            _add(rows, topic, time * 1e-9, found, readings[channel].names)
+            _add(rows, topic, time * 1e-9, message, readings[channel].names)
         numbers[topic] += 1
     if not record.is_complete:
         rows.notes.append(f"{record.path.name} was never closed; read to its end")

@@ -159,10 +159,8 @@ class Record:
                     own = (channel.message_type, channel.proto_desc)
                     self.channels[channel.name] = own
                 elif kind == CHUNK_BODY:
-                    singles = (
-                        _bytes(v) for number, v in _fields(section) if number == 1
-                    )
-                    found = (_message(single) for single in singles)
+                    parts = _fields(section)
+                    found = (_message(value) for number, value in parts if number == 1)
                     yield from (message for message in found if wanted(message[0]))
                 show(len(section))
         except DecodeError as error:
@@ -222,10 +220,10 @@ def check_size(what: str, content: memoryview) -> None:
         raise DecodeError(f"{what}: {len(content)} bytes of at most {MAX_BYTES}")
 
 
-def _message(buffer: memoryview) -> tuple[str, int, memoryview]:
+def _message(single: int | memoryview) -> tuple[str, int, memoryview]:
     """SingleMessage: channel_name 1, time 2, content 3."""
     name, time, content = "", 0, memoryview(b"")
-    for number, value in _fields(buffer):
+    for number, value in _fields(_bytes(single)):
         if number == 1:
             name = bytes(_bytes(value)).decode(errors="replace")
         elif number == 2 and isinstance(value, int):
@@ -243,18 +241,22 @@ def _fields(buffer: memoryview) -> Iterator[tuple[int, int | memoryview]]:
     at, end = 0, len(buffer)
     while at < end:
         key, at = _varint(buffer, at)
-        wire = key & 7
-        if wire not in (VARINT, LENGTH, *SIZES):
-            raise DecodeError(f"field {key >> 3}: wire type {wire}")
-        if wire in SIZES:
-            at += SIZES[wire]
+        number, wire = key >> 3, key & 7
+        if wire == VARINT:
+            value, at = _varint(buffer, at)
+            yield number, value
             continue
-        value, at = _varint(buffer, at)
         if wire == LENGTH:
-            if value > end - at:
-                raise DecodeError(f"field {key >> 3}: {value} bytes of {end - at} left")
-            value, at = buffer[at : at + value], at + value
-        yield key >> 3, value
+            size, at = _varint(buffer, at)
+        elif wire in SIZES:
+            size = SIZES[wire]
+        else:
+            raise DecodeError(f"field {number}: wire type {wire}")
+        if size > end - at:
+            raise DecodeError(f"field {number}: {size} bytes of {end - at} left")
+        if wire == LENGTH:
+            yield number, buffer[at : at + size]
+        at += size
 
 
 def _varint(buffer: memoryview, at: int) -> tuple[int, int]:
