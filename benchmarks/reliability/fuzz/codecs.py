@@ -20,6 +20,9 @@ from xml.etree.ElementTree import Element, tostring
 import google_crc32c
 import msgpack
 from defusedxml import ElementTree
+from google.protobuf.empty_pb2 import Empty
+from google.protobuf.message import DecodeError
+from google.protobuf.unknown_fields import UnknownFieldSet
 
 from benchmarks.reliability.fuzz import containers
 from benchmarks.reliability.fuzz.trees import (
@@ -32,10 +35,12 @@ from benchmarks.reliability.fuzz.trees import (
     odd_scalar,
 )
 from rcirl_jax.data.readers.tfrecord import FOOTER, FRAME_BYTES, HEADER, mask
-from rcirl_jax.data.readers.wire import FIXED32, FIXED64, LENGTH, VARINT, fields
 
 Codec = Callable[[bytes, random.Random], bytes]
 HUGE = "0x" + "f" * 4000  # Python reads it, and writes no decimal of so many digits
+VARINT, LENGTH = 0, 2  # wire types of protocol buffers
+# of numbers of one size: as the library gives them, and as what they are changed
+FIXED = {1: ("<Q", "<d"), 5: ("<I", "<f")}
 MAX_NESTED = 12  # levels of messages that are gone into
 CELLS = (
     *("", " ", "0", "-1", "1e300", "-1e300", "1e12", "NaN", "inf", "-inf", "1e-320"),
@@ -223,14 +228,17 @@ def _packed(parts: Iterable[tuple[int, int, Any]]) -> bytes:
         out.append(varint(number << 3 | wire))
         if wire == VARINT:
             out.append(varint(value))
+        elif wire == LENGTH:
+            out.append(varint(len(value)) + value)
         else:
-            out.append((varint(len(value)) if wire == LENGTH else b"") + bytes(value))
+            out.append(struct.pack(FIXED[wire][0], value))
     return b"".join(out)
 
 
 def message(data: bytes, rng: random.Random, depth: int = 0) -> bytes:
     """A protocol buffer: one field somewhere in the messages it holds."""
-    parts = list(fields(memoryview(data)))
+    found = UnknownFieldSet(Empty.FromString(data))
+    parts = [(field.field_number, field.wire_type, field.data) for field in found]
     if not parts:
         return varint(rng.randrange(1, 30) << 3) + varint(rng.choice((0, 1, 2**63)))
     at, kind = rng.randrange(len(parts)), rng.randrange(10)
@@ -252,19 +260,17 @@ def _wire_value(wire: int, value: Any, rng: random.Random, depth: int) -> Any:  
     if wire == VARINT:
         odd = odd_scalar(rng)
         return odd if type(odd) is int else near(value, rng).__int__()
-    if wire == FIXED64:
-        return struct.pack("<d", _real(rng))
-    if wire == FIXED32:
-        return struct.pack("<f", _real(rng))
-    inner = bytes(value)
+    if wire in FIXED:
+        whole, real = FIXED[wire]
+        return struct.unpack(whole, struct.pack(real, _real(rng)))[0]
     if depth < MAX_NESTED and rng.random() < 0.85:
         try:
-            return message(inner, rng, depth + 1)
-        except (ValueError, OverflowError):
+            return message(value, rng, depth + 1)
+        except (DecodeError, ValueError, OverflowError):
             pass
     if rng.random() < 0.3:
         return rng.choice(TEXTS).encode(errors="surrogatepass")
-    return mutate_bytes(inner, rng)
+    return mutate_bytes(value, rng)
 
 
 def _real(rng: random.Random) -> float:

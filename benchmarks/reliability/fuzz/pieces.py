@@ -1,16 +1,18 @@
-"""Parts of importers that are read alone: maps, geometries, messages, frames."""
+"""Parts of importers that are read alone: maps, geometries, descriptors, frames."""
 
+import contextlib
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from google.protobuf.message import DecodeError
 
 from benchmarks.reliability.fuzz.targets import Bytes, OneFile, Target
+from rcirl_jax.data.importers.apollo import messages
+from rcirl_jax.data.importers.apollo.descriptors import reading_of
 from rcirl_jax.data.importers.lanelet2 import map as lanelet2
 from rcirl_jax.data.importers.nuplan import geopackage
 from rcirl_jax.data.readers import tfrecord
-from rcirl_jax.data.readers.wire import Schema, WireError, fields, packed_sint32
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.metrics import METRICS
 from tests.data.importers.formats import apollo, interaction, nuplan, osm, waymo
@@ -45,36 +47,24 @@ def geometry_target(folder: Path) -> Target:
     return Bytes(read, [("bytes", blob) for blob in (*seeds, many)], ["layer"])
 
 
-def wire_target(folder: Path) -> Target:
-    """Protocol buffers: fields, descriptors, packed numbers."""
+def descriptors_target(folder: Path) -> Target:
+    """Descriptors of Apollo's messages, by which sound messages are read."""
+    made = {
+        "localization": apollo.localization(1.0),
+        "chassis": apollo.chassis(1.0),
+        "perception": apollo.perception(1.0),
+    }
+    channels = [messages.TOPICS[topic][0] for topic in made]
 
     def read(data: bytes) -> None:
-        view = memoryview(data)
-        for part in (lambda: list(fields(view)), lambda: Schema().add(view)):
-            _refuse(part)
-        _refuse(lambda: packed_sint32(view))
+        for (topic, message), channel in zip(made.items(), channels, strict=True):
+            kind = apollo.CHANNELS[channel][0]
+            # importers put the file's name before what these say
+            with contextlib.suppress(DecodeError):
+                reading_of(kind, data, messages.WANTED[topic]).parse(message)
 
-    descriptors = [desc for _, desc in apollo.CHANNELS.values()][:3]
-    seeds = [
-        apollo.perception(1.0),
-        apollo.localization(1.0),
-        *map(_plain, descriptors),
-    ]
-    return Bytes(read, [("message", bytes(seed)) for seed in seeds], ["message"])
-
-
-def _plain(description: object) -> bytes:
-    return (
-        description if isinstance(description, bytes) else apollo.message(description)
-    )
-
-
-def _refuse(read: Callable[[], object]) -> None:
-    """Importers put the file's name before what these say."""
-    try:
-        read()
-    except WireError:
-        return
+    seeds = [("message", apollo.CHANNELS[channel][1]) for channel in channels]
+    return Bytes(read, seeds, ["message"])
 
 
 def tfrecord_target(folder: Path) -> Target:

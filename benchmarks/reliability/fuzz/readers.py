@@ -321,7 +321,7 @@ def sweeps(folder: Path) -> Target:
 
 READERS: dict[str, Reader] = {
     "weights": Reader(make=weights, share=5, words=("sha256", "<f4", "tanh")),
-    "wire": Reader(make=pieces.wire_target, share=4),
+    "descriptors": Reader(make=pieces.descriptors_target, share=4),
     "geometry": Reader(make=pieces.geometry_target, share=4),
     "tfrecord": Reader(make=pieces.tfrecord_target, share=3),
     "sealed": Reader(make=sealed, words=("schema_version", "shards")),

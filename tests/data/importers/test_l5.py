@@ -12,13 +12,13 @@ from rcirl_jax.data.importers import parts, read_recordings
 from rcirl_jax.data.importers.l5 import map as l5_map
 from rcirl_jax.data.importers.l5 import reader as l5
 from rcirl_jax.data.importers.l5 import scenes as l5_scenes
+from rcirl_jax.data.importers.l5.messages import read_message
 from rcirl_jax.data.readers import zarr2
-from rcirl_jax.data.readers.wire import WireError, packed_sint32
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import load_toml, spec_root
 from rcirl_jax.types import Kind
 from tests.data.importers.formats import l5 as fixture
-from tests.data.importers.formats.waymo import message, varint
+from tests.data.importers.formats.waymo import Packed, message, varint
 
 
 def packaged():
@@ -605,15 +605,21 @@ def test_malformed_map(folder, content):
         read(folder)
 
 
-def test_packed_numbers():
-    rng = np.random.default_rng(3)
-    values = rng.integers(-(2**31), 2**31, 500)
-    raw = b"".join(varint(fixture.zigzag(value)) for value in values.tolist())
-    np.testing.assert_array_equal(packed_sint32(memoryview(raw)), values)
-    assert packed_sint32(memoryview(b"")).size == 0
-    for bad in (b"\x80", b"\x01\xff", b"\xff" * 12 + b"\x01"):
-        with pytest.raises(WireError):
-            packed_sint32(memoryview(bad))
+def test_steps_of_a_bound_of_any_size(tmp_path):
+    """Steps are packed and zigzag-coded, of 1 to 5 bytes."""
+    steps = np.array([-(2**31), 2**31 - 1, 0, -1, 64, -65, 10_000_000])
+    body = message([(1, Packed(fixture.zigzag(step) for step in steps.tolist()))])
+    np.testing.assert_array_equal(
+        read_message(element(3, [(3, body)])).elements[0].element.lane.left.x, steps
+    )
+
+
+def test_a_map_of_many_bytes_is_refused(folder, monkeypatch):
+    monkeypatch.setattr(l5_map, "MAX_MAP_BYTES", 500)
+    with pytest.raises(
+        InputError, match=r"\.pb: size: \d+ bytes: expected at most 500"
+    ):
+        read(folder)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -1,4 +1,5 @@
 """Apollo cyber records: `records` is the file, `messages` and `obstacles` its content.
 
-A new channel or message field is read in `messages`; `reader` makes recordings of it.
+`descriptors` tells how messages are read. A new channel or message field is read in
+`messages`; `reader` makes recordings of it.
 """

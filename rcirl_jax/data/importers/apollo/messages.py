@@ -1,23 +1,23 @@
 """Messages of an Apollo drive as rows of numbers, about a minute at a time.
 
-Fields are looked up by name in the record's own descriptors; those that a
-release of Apollo lacks are NaN or 0.
+A new field of a message is named in `WANTED` and read in `_add`.
 """
 
 import collections
 import dataclasses
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from google.protobuf.message import DecodeError
 
+from rcirl_jax.data.importers.apollo.descriptors import ENUM, Reading, reading_of
 from rcirl_jax.data.importers.apollo.obstacles import Obstacles
-from rcirl_jax.data.importers.apollo.records import Record
+from rcirl_jax.data.importers.apollo.records import Record, check_size
 from rcirl_jax.data.importers.options import section
 from rcirl_jax.data.readers.long_logs import reading
-from rcirl_jax.data.readers.wire import ENUM_NAME, Plan, WireError, decode
+from rcirl_jax.data.readers.protobuf import Message
 from rcirl_jax.errors import InputError
 
 LOCALIZATION = "/apollo/localization/pose"
@@ -35,31 +35,33 @@ TOPICS = {
     # since Apollo 9; who listens late is given the last of the history
     "command": ("/apollo/planning/command", "/apollo/planning_command_history"),
 }
-POINT = {"x": None, "y": None}
-STAMP = {"timestamp_sec": None}
+NAN = float("nan")
+# fields and what they are where they are not set
+POINT = {"x": NAN, "y": NAN}
+STAMP = {"timestamp_sec": 0.0}
 OBSTACLE = {
-    "id": None,
+    "id": 0,
     "position": POINT,
-    "theta": None,
+    "theta": 0.0,
     "velocity": POINT,
-    "length": None,
-    "width": None,
-    "type": ENUM_NAME,
-    "timestamp": None,
+    "length": 0.0,
+    "width": 0.0,
+    "type": ENUM,
+    "timestamp": 0.0,
 }
 ROUTE = {"routing_request": {"waypoint": [{"pose": POINT}]}}
 WANTED = {
     "localization": {
         "header": STAMP,
-        "measurement_time": None,
+        "measurement_time": 0.0,
         "pose": {
             "position": POINT,
-            "orientation": dict.fromkeys(("qx", "qy", "qz", "qw")),
+            "orientation": dict.fromkeys(("qx", "qy", "qz", "qw"), NAN),
             "linear_velocity": POINT,
-            "heading": None,
+            "heading": NAN,
         },
     },
-    "chassis": {"header": STAMP, "speed_mps": None, "driving_mode": ENUM_NAME},
+    "chassis": {"header": STAMP, "speed_mps": NAN, "driving_mode": ENUM},
     "perception": {"header": STAMP, "perception_obstacle": [OBSTACLE]},
     "prediction": {
         "header": STAMP,
@@ -72,7 +74,6 @@ WANTED = {
 MANUAL = "COMPLETE_MANUAL"  # driving mode of a human driver
 MAX_ROWS = 5_000_000  # obstacle states held at once
 PIECE_S = 60.0  # s of recording after which rows are handed on
-NAN = float("nan")
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -137,7 +138,7 @@ def _read_part(
     numbers: collections.Counter[str],
     show: Callable[[int], object],
 ) -> Iterator[Rows]:
-    plans: dict[str, Plan] = {}
+    readings: dict[str, Reading] = {}
     obstacles: dict[str, Obstacles] = {}
     rows, began = Rows(), None
     for channel, time, content in record.messages(topics.__contains__, show):
@@ -147,22 +148,24 @@ def _read_part(
             rows, began = Rows(), time
         topic = topics[channel]
         try:
-            if channel not in plans:
-                plans[channel] = _plan(record, channel, topic)
+            if channel not in readings:
+                readings[channel] = _reading(record, channel, topic)
                 if topic in ("perception", "prediction"):
-                    where = f"{record.path}: {channel}"
-                    obstacles[channel] = Obstacles(where, plans[channel])
-            if channel in obstacles:
-                obstacles[channel].add(time * 1e-9, content)
-                held = sum(found.count for found in obstacles.values())
-                check_held(f"{record.path}: {channel}", held)
-            else:
-                _add(rows, topic, time * 1e-9, decode(plans[channel], content))
-        except WireError as error:
+                    obstacles[channel] = Obstacles(readings[channel].names["type"])
+            check_size("message", content)
+            message = readings[channel].parse(bytes(content))
+        except DecodeError as error:
             raise InputError(
                 f"{record.path}: {channel}: message {numbers[topic]}: {error}: "
                 "expected an Apollo message"
             ) from error
+        if channel in obstacles:
+            seen = _seen(message, topic)
+            held = sum(found.count for found in obstacles.values())
+            check_held(f"{record.path}: {channel}", held + len(seen))
+            obstacles[channel].add(message.header.timestamp_sec, time * 1e-9, seen)
+        else:
+            _add(rows, topic, time * 1e-9, message, readings[channel].names)
         numbers[topic] += 1
     if not record.is_complete:
         rows.notes.append(f"{record.path.name} was never closed; read to its end")
@@ -178,11 +181,10 @@ def _finished(
     return rows
 
 
-def _plan(record: Record, channel: str, topic: str) -> Plan:
+def _reading(record: Record, channel: str, topic: str) -> Reading:
     if channel not in record.channels:
-        raise WireError("no descriptor before its first message")
-    message, schema = record.channels[channel]
-    return schema.plan(message, WANTED[topic])
+        raise DecodeError("no descriptor before its first message")
+    return reading_of(*record.channels[channel], WANTED[topic])
 
 
 def check_held(where: str, count: int) -> None:
@@ -194,42 +196,51 @@ def check_held(where: str, count: int) -> None:
         )
 
 
-def _add(rows: Rows, topic: str, time: float, found: dict[str, Any]) -> None:
-    """Append a decoded message to its topic's rows."""
-    stamp = found.get("header", {}).get("timestamp_sec", 0.0)
+def _seen(message: Message, topic: str) -> Sequence[Message]:
+    """Perception's obstacles, of its own message or of prediction's."""
+    if topic == "perception":
+        return message.perception_obstacle
+    return [
+        predicted.perception_obstacle
+        for predicted in message.prediction_obstacle
+        if predicted.HasField("perception_obstacle")
+    ]
+
+
+def _add(
+    rows: Rows,
+    topic: str,
+    time: float,
+    message: Message,
+    names: Mapping[str, Mapping[int, str]],
+) -> None:
+    """Append a message of another topic to its rows; `names` are those of enums."""
     if topic == "localization":
-        pose = found.get("pose", {})
-        rows.localization.append(
-            (
-                stamp,
-                time,
-                found.get("measurement_time", 0.0),
-                *_point(pose, "position"),
-                _heading(pose),
-                math.hypot(*_point(pose, "linear_velocity")),
-            )
+        pose = message.pose
+        row = (
+            *(message.header.timestamp_sec, time, message.measurement_time),
+            *(pose.position.x, pose.position.y, _heading(pose)),
+            math.hypot(pose.linear_velocity.x, pose.linear_velocity.y),
         )
+        rows.localization.append(row)
     elif topic == "chassis":
-        is_manual = found.get("driving_mode", MANUAL) == MANUAL
-        rows.chassis.append((stamp, time, found.get("speed_mps", NAN), is_manual))
+        mode = names["driving_mode"].get(message.driving_mode)
+        is_manual = mode == MANUAL or not message.HasField("driving_mode")
+        stamp, speed = message.header.timestamp_sec, message.speed_mps
+        rows.chassis.append((stamp, time, speed, is_manual))
     else:
-        found = found.get("lane_follow_command", found)
-        waypoints = found.get("routing_request", {}).get("waypoint", [])
-        x, y = _point(waypoints[-1], "pose") if waypoints else (NAN, NAN)
-        if np.isfinite(x) and np.isfinite(y):
-            rows.routing.append((time, float(x), float(y)))
+        route = message.lane_follow_command if topic == "command" else message
+        waypoints = route.routing_request.waypoint
+        x, y = (waypoints[-1].pose.x, waypoints[-1].pose.y) if waypoints else (NAN, NAN)
+        if math.isfinite(x) and math.isfinite(y):
+            rows.routing.append((time, x, y))
 
 
-def _point(message: dict[str, Any], field: str) -> tuple[float, float]:
-    point = message.get(field, {})
-    return point.get("x", NAN), point.get("y", NAN)
-
-
-def _heading(pose: dict[str, Any]) -> float:
+def _heading(pose: Message) -> float:
     """Heading [rad] from east; the quaternion turns (right, forward, up) from east."""
-    if "heading" in pose:
-        return pose["heading"]
-    q = pose.get("orientation", {})
-    qx, qy, qz, qw = (q.get(name, NAN) for name in ("qx", "qy", "qz", "qw"))
+    if pose.HasField("heading"):
+        return pose.heading
+    q = pose.orientation
+    qx, qy, qz, qw = q.qx, q.qy, q.qz, q.qw
     yaw = np.arctan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz))
     return float(yaw + 0.5 * np.pi)

@@ -5,7 +5,7 @@ parts of one drive make one Recording, or one per window of a long drive, made
 while they are read. Messages are decoded by the descriptors in
 the record (modules/common_msgs in the Apollo sources: localization.proto,
 chassis.proto, perception_obstacle.proto, prediction_obstacle.proto,
-routing.proto), so no Apollo or protobuf package is needed.
+routing.proto), so no Apollo package is needed.
 
 Traps: a pose is that of the rear axle's centre, not of the box; the quaternion's
 zero is north, the heading's is east; messages are irregular and on clocks of

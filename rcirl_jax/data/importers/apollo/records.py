@@ -15,26 +15,36 @@ import struct
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
+from google.protobuf.message import DecodeError
+
 from rcirl_jax.data.importers.files import files_below
-from rcirl_jax.data.readers.wire import (
-    MAX_DEPTH,
-    Schema,
-    WireError,
-    fields,
-    nested,
-    text,
-)
+from rcirl_jax.data.readers.protobuf import Field, parser
 from rcirl_jax.errors import InputError
 
 HEAD = struct.Struct("<i4xq")  # type and size of a section
 HEADER_BYTES = 2048  # bytes that the header's section takes
 HEADER, CHUNK_HEADER, CHUNK_BODY, INDEX, CHANNEL = range(5)
 COMPRESSION = {1: "BZ2", 2: "LZ4"}
-MAX_DESCRIPTOR_BYTES = 64 * 1024**2  # bytes of one channel's descriptors
+MAX_BYTES = 16 * 1024**2  # bytes of a message, or of a channel's descriptors
+VARINT, LENGTH = 0, 2  # wire types
+SIZES = {1: 8, 5: 4}  # bytes of those of one size
 # NAME.record, or a part .record.00000; some releases add when it began, .112907, and
 # cyber_recorder what it did to a copy
 NAME = re.compile(
     r"[^/]+?\.record(?:\.(?P<part>\d{1,9})(?:\.\d{1,20})?)?(?:\.(?:split|recover))?"
+)
+
+read_header = parser(
+    {"Header": {"compress": Field("int64", 3), "is_complete": Field("bool", 13)}}
+)
+read_channel = parser(
+    {
+        "Channel": {
+            "name": Field("string", 1),
+            "message_type": Field("string", 2),
+            "proto_desc": Field("bytes", 3),
+        }
+    }
 )
 
 
@@ -109,8 +119,8 @@ class Record:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        # channel -> (message type, its descriptors)
-        self.channels: dict[str, tuple[str, Schema]] = {}
+        # channel -> (message type, its descriptors: a ProtoDesc)
+        self.channels: dict[str, tuple[str, bytes]] = {}
         self.is_complete = True
 
     def __enter__(self) -> "Record":
@@ -144,15 +154,16 @@ class Record:
         try:
             for kind, section in self._sections():
                 if kind == CHANNEL:
-                    self._add_channel(section)
+                    check_size("descriptors", section)
+                    channel = read_channel(bytes(section))
+                    own = (channel.message_type, channel.proto_desc)
+                    self.channels[channel.name] = own
                 elif kind == CHUNK_BODY:
-                    for number, _, value in fields(section):
-                        if number == 1:
-                            found = _message(nested(value), wanted)
-                            if found is not None:
-                                yield found
+                    parts = _fields(section)
+                    found = (_message(value) for number, value in parts if number == 1)
+                    yield from (message for message in found if wanted(message[0]))
                 show(len(section))
-        except WireError as error:
+        except DecodeError as error:
             raise InputError(
                 f"{self.path}: {error}: expected a cyber record"
             ) from error
@@ -187,64 +198,80 @@ class Record:
         )
 
     def _read_header(self, kind: int, size: int) -> None:
-        """Compress 3, is_complete 13."""
         whole = HEAD.size + HEADER_BYTES <= len(self._data)
         if kind != HEADER or not 0 <= size <= HEADER_BYTES or not whole:
             raise InputError(
                 f"{self.path}: header: type {kind}, {size} bytes: "
                 "expected that of a cyber record"
             )
-        header = dict.fromkeys((3, 13), 0)
-        for number, _, value in fields(self._data[HEAD.size : HEAD.size + size]):
-            if number in header and isinstance(value, int):
-                header[number] = value
-        if header[3] != 0:
-            name = COMPRESSION.get(header[3], str(header[3]))
+        header = read_header(bytes(self._data[HEAD.size : HEAD.size + size]))
+        if header.compress != 0:
+            name = COMPRESSION.get(header.compress, str(header.compress))
             raise InputError(
                 f"{self.path}: header: compress: {name}: expected none "
                 "(no Apollo release writes compressed chunks)"
             )
-        self.is_complete = header[13] != 0
-
-    def _add_channel(self, section: memoryview) -> None:
-        """Channel: name 1, message_type 2, proto_desc 3."""
-        name, message, schema = "", "", Schema()
-        for number, _, value in fields(section):
-            if number == 1:
-                name = text(value)
-            elif number == 2:
-                message = text(value)
-            elif number == 3:
-                if len(nested(value)) > MAX_DESCRIPTOR_BYTES:
-                    raise WireError(f"channel {name}: descriptors too large")
-                _add_descriptors(schema, nested(value), set(), 0)
-        self.channels[name] = (message, schema)
+        self.is_complete = header.is_complete
 
 
-def _add_descriptors(
-    schema: Schema, buffer: memoryview, seen: set[bytes], depth: int
-) -> None:
-    """ProtoDesc: desc 1, dependencies 2, each a ProtoDesc."""
-    if depth > MAX_DEPTH:
-        raise WireError(f"descriptors: nested deeper than {MAX_DEPTH}")
-    for number, _, value in fields(buffer):
-        if number == 1 and bytes(nested(value)) not in seen:
-            seen.add(bytes(nested(value)))
-            schema.add(nested(value))
-        elif number == 2:
-            _add_descriptors(schema, nested(value), seen, depth + 1)
+def check_size(what: str, content: memoryview) -> None:
+    """Parsed, a message takes many times its bytes."""
+    if len(content) > MAX_BYTES:
+        raise DecodeError(f"{what}: {len(content)} bytes of at most {MAX_BYTES}")
 
 
-def _message(
-    buffer: memoryview, wanted: Callable[[str], bool]
-) -> tuple[str, int, memoryview] | None:
-    """SingleMessage: channel_name 1, time 2, content 3; None if not wanted."""
+def _message(single: int | memoryview) -> tuple[str, int, memoryview]:
+    """SingleMessage: channel_name 1, time 2, content 3."""
     name, time, content = "", 0, memoryview(b"")
-    for number, _, value in fields(buffer):
+    for number, value in _fields(_bytes(single)):
         if number == 1:
-            name = text(value)
+            name = bytes(_bytes(value)).decode(errors="replace")
         elif number == 2 and isinstance(value, int):
             time = value
         elif number == 3:
-            content = nested(value)
-    return (name, time, content) if wanted(name) else None
+            content = _bytes(value)
+    return name, time, content
+
+
+def _fields(buffer: memoryview) -> Iterator[tuple[int, int | memoryview]]:
+    """(number, value) of a message's whole numbers and bytes; nothing is copied.
+
+    By hand: the library would read and copy every picture and point cloud of a drive.
+    """
+    at, end = 0, len(buffer)
+    while at < end:
+        key, at = _varint(buffer, at)
+        number, wire = key >> 3, key & 7
+        if wire == VARINT:
+            value, at = _varint(buffer, at)
+            yield number, value
+            continue
+        if wire == LENGTH:
+            size, at = _varint(buffer, at)
+        elif wire in SIZES:
+            size = SIZES[wire]
+        else:
+            raise DecodeError(f"field {number}: wire type {wire}")
+        if size > end - at:
+            raise DecodeError(f"field {number}: {size} bytes of {end - at} left")
+        if wire == LENGTH:
+            yield number, buffer[at : at + size]
+        at += size
+
+
+def _varint(buffer: memoryview, at: int) -> tuple[int, int]:
+    """(value, place behind it) of a base-128 number of at most ten bytes."""
+    if at < len(buffer) and buffer[at] < 0x80:  # most are short
+        return buffer[at], at + 1
+    value = 0
+    for place, byte in enumerate(buffer[at : at + 10]):
+        value |= (byte & 0x7F) << (7 * place)
+        if byte < 0x80:
+            return value, at + place + 1
+    raise DecodeError("varint: no end within ten bytes")
+
+
+def _bytes(value: int | memoryview) -> memoryview:
+    if isinstance(value, int):
+        raise DecodeError("message: number: expected bytes")
+    return value

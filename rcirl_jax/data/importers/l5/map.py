@@ -1,9 +1,8 @@
 """Semantic map of the L5 data: lanes, speed limits, stop signs, light faces.
 
-Layout: l5kit/data/proto/road_network.proto (package pb.lyft.maps); the field
-numbers below are those of its messages. Points are centimetres in a local frame
-of each lane (east, north, up at a latitude and longitude); meta.json holds the
-transform of the dataset's world to Earth-centred coordinates.
+Points are centimetres in a local frame of each lane (east, north, up at a latitude
+and longitude); meta.json holds the transform of the dataset's world to Earth-centred
+coordinates.
 """
 
 import dataclasses
@@ -11,38 +10,24 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from google.protobuf.message import DecodeError
 
+from rcirl_jax.data.importers.l5.messages import COLOURS, read_message
 from rcirl_jax.data.importers.options import path_option
 from rcirl_jax.data.importers.projection import FLATTENING, SEMI_MAJOR_M
 from rcirl_jax.data.importers.shapes import between_bounds, check_coordinates, moves
-from rcirl_jax.data.readers.wire import (
-    Value,
-    WireError,
-    fields,
-    nested,
-    packed_sint32,
-    text,
-)
+from rcirl_jax.data.readers.protobuf import Message
 from rcirl_jax.data.readers.zarr2 import read_json
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane, Signal
 
-MAX_MAP_BYTES = 1024**3  # bytes; the public map has some 10 MB
+MAX_MAP_BYTES = 32 * 1024**2  # bytes; the public map has some 10 MB
 MAX_META_BYTES = 16 * 1024**2  # bytes of meta.json
 MARGIN_M = 150.0  # m of map around the tracks
 HOLD_S = 1.0  # s, a light unseen keeps its state this long
 MAX_LIMIT_MPS = 60.0  # m/s; faster "limits" are none
-SEGMENT, LANE, CONTROL = 1, 3, 4  # fields of MapElement.Element
 ONLY_BIKE = 4  # AccessRestriction.Type
 BACKWARD = 3  # RoadNetworkSegment.TravelDirection
-STOP_SIGN, TRAFFIC_LIGHT = 7, 29  # fields of TrafficControlElement
-# its fields that are faces of one colour: round, arrows, U-turn, flashing
-COLOURS = {
-    **dict.fromkeys((11, 30, 32, 38, 41, 44, 10), "red"),
-    **dict.fromkeys((12, 36, 37, 39, 42, 45, 9), "yellow"),
-    **dict.fromkeys((13, 31, 33, 40, 43, 46), "green"),
-}
-NOTHING = memoryview(b"")
 STATES = ("red", "yellow", "green")  # ties of a vote go to the first
 
 
@@ -111,9 +96,10 @@ class SemanticMap:
                 f"expected at most {MAX_MAP_BYTES}"
             )
         try:
-            raw = list(self._elements(memoryview(file.read_bytes())))
-        except WireError as error:
+            fragment = read_message(file.read_bytes())
+        except DecodeError as error:
             raise InputError(f"{file}: {error}: expected a semantic map") from error
+        raw = list(self._elements(fragment))
         lanes = {lane.id: lane for lane in map(self._lane, raw) if lane is not None}
         if not lanes:
             raise InputError(f"{file}: lanes: none: expected a semantic map")
@@ -169,74 +155,57 @@ class SemanticMap:
             state=tuple(STATES[k] if k >= 0 else "off" for k in state[change]),
         )
 
-    def _elements(self, buffer: memoryview) -> Iterator[_RawLane]:
+    def _elements(self, fragment: Message) -> Iterator[_RawLane]:
         """Lanes of a MapFragment; limits and controls are kept on the way."""
-        for number, _, element in fields(buffer):
-            if number != 2:
-                continue
-            entry = {key: nested(v) for key, _, v in fields(nested(element)) if key < 3}
-            name = _id(entry.get(1, NOTHING))
-            for kind, _, value in fields(entry.get(2, NOTHING)):
-                if kind == SEGMENT:
-                    self._limits[name] = _limits(nested(value))
-                elif kind == CONTROL:
-                    self._add_control(name, nested(value))
-                elif kind == LANE:
-                    lane = self._raw_lane(name, nested(value))
-                    yield from () if lane is None else (lane,)
+        for entry in fragment.elements:
+            name, element = entry.id.id, entry.element
+            if element.HasField("segment"):
+                segment = element.segment
+                self._limits[name] = segment.limit, segment.limit_backward
+            if element.HasField("control"):
+                self._add_control(name, element.control)
+            if element.HasField("lane"):
+                lane = self._raw_lane(name, element.lane)
+                yield from () if lane is None else (lane,)
 
-    def _add_control(self, name: str, buffer: memoryview) -> None:
-        for number, _, value in fields(buffer):
-            if number == STOP_SIGN:
-                self._stop_signs.add(name)
-            elif number in COLOURS:
-                self._faces[name] = COLOURS[number]
-            elif number == TRAFFIC_LIGHT:
-                parts = fields(nested(value))
-                self._lights[name] = tuple(
-                    _id(nested(v)) for n, _, v in parts if n == 3
-                )
+    def _add_control(self, name: str, control: Message) -> None:
+        if control.HasField("stop_sign"):
+            self._stop_signs.add(name)
+        if control.HasField("light"):
+            self._lights[name] = tuple(face.id for face in control.light.faces)
+        for field, _ in control.ListFields():
+            if field.number in COLOURS:
+                self._faces[name] = COLOURS[field.number]
 
-    def _raw_lane(self, name: str, buffer: memoryview) -> _RawLane | None:
-        """Lane message; None for stubs without bounds and for bicycle lanes."""
-        one: dict[int, memoryview] = {}
-        many: dict[int, list[str]] = {5: [], 8: []}
-        backward = False
-        for number, _, value in fields(buffer):
-            if number in many:
-                many[number].append(_id(nested(value)))
-            elif number == 12:
-                backward = value == BACKWARD
-            elif isinstance(value, memoryview):
-                one[number] = value
-        access = {n: v for n, _, v in fields(one.get(11, NOTHING))}
-        if not {2, 3, 4} <= one.keys() or access.get(1) == ONLY_BIKE:
+    def _raw_lane(self, name: str, lane: Message) -> _RawLane | None:
+        """A lane; None for stubs without bounds and for bicycle lanes."""
+        is_whole = all(map(lane.HasField, ("frame", "left", "right")))
+        if not is_whole or lane.access.type == ONLY_BIKE:
             return None
-        frame = _frame(one[2])
-        left, right = (self._bound(name, one[side], frame) for side in (3, 4))
+        frame = _frame(lane.frame)
+        left, right = (self._bound(name, b, frame) for b in (lane.left, lane.right))
         if min(len(left), len(right)) < 2:
             return None
-        sides = [_id(one[key]) if key in one else "" for key in (6, 7)]
         return _RawLane(
             id=name,
             left=left,
             right=right,
-            parent=_id(one[1]) if 1 in one else "",
-            backward=backward,
-            ahead=tuple(many[5]),
-            beside=(sides[0] or None, sides[1] or None),
-            controls=tuple(many[8]),
+            parent=lane.parent.id,
+            backward=lane.direction == BACKWARD,
+            ahead=tuple(other.id for other in lane.ahead),
+            beside=(lane.beside_left.id or None, lane.beside_right.id or None),
+            controls=tuple(control.id for control in lane.controls),
         )
 
-    def _bound(self, name: str, buffer: memoryview, frame: np.ndarray) -> np.ndarray:
+    def _bound(self, name: str, bound: Message, frame: np.ndarray) -> np.ndarray:
         """A lane bound [m, 2] m in the world; points that repeat are dropped."""
-        found = {number: value for number, _, value in fields(buffer)}
-        steps = [packed_sint32(nested(found.get(axis, NOTHING))) for axis in (1, 2)]
-        up = packed_sint32(nested(found.get(3, NOTHING)))
-        if steps[0].size != steps[1].size:
-            raise WireError(f"lane {name}: {steps[0].size} x for {steps[1].size} y")
-        up = up if up.size == steps[0].size else np.zeros(steps[0].size, np.int64)
-        local = 0.01 * np.cumsum(np.stack([*steps, up]), axis=1)  # cm to m
+        x, y, up = (np.array(steps, np.int64) for steps in (bound.x, bound.y, bound.z))
+        if x.size != y.size:
+            raise InputError(
+                f"{self.file}: lane {name}: {x.size} x for {y.size} y: expected as many"
+            )
+        up = up if up.size == x.size else np.zeros(x.size, np.int64)
+        local = 0.01 * np.cumsum(np.stack([x, y, up]), axis=1)  # cm to m
         ones = np.ones((1, local.shape[1]))
         world = (self._to_world @ frame @ np.concatenate([local, ones]))[:2].T
         check_coordinates(self.file, f"lane {name}", ("x", "y"), world)
@@ -286,37 +255,15 @@ class SemanticMap:
         )
 
 
-def _id(buffer: memoryview) -> str:
-    """GlobalId: id 1."""
-    return next((text(value) for number, _, value in fields(buffer) if number == 1), "")
-
-
-def _limits(buffer: memoryview) -> tuple[float, float]:
-    """Speed limits [m/s] of a RoadNetworkSegment: 9, backward 10; 0 if unknown."""
-    found = {number: value for number, _, value in fields(buffer)}
-    return _fixed32(found.get(9), "<f4"), _fixed32(found.get(10), "<f4")
-
-
-def _fixed32(value: Value | None, kind: str) -> float:
-    """A number of four bytes; 0 where the field is not set."""
-    if value is None:
-        return 0.0
-    if len(nested(value)) != 4:
-        raise WireError(f"{len(nested(value))} bytes: expected a number of four")
-    return float(np.frombuffer(nested(value), kind)[0])
-
-
-def _frame(buffer: memoryview) -> np.ndarray:
+def _frame(geo: Message) -> np.ndarray:
     """GeoFrame -> [4, 4] transform of local metres to Earth-centred ones.
 
-    Origin (1) in 1e-7 degrees on the WGS84 ellipsoid; bearing (2) in degrees
-    clockwise from north to the local y axis.
+    Origin in 1e-7 degrees on the WGS84 ellipsoid; bearing in degrees clockwise from
+    north to the local y axis.
     """
-    found = {number: value for number, _, value in fields(buffer)}
-    place = {n: v for n, _, v in fields(nested(found.get(1, NOTHING)))}
-    degrees = [1e-7 * _fixed32(place.get(key), "<i4") for key in (1, 2)]
-    latitude, longitude = np.deg2rad(degrees)
-    turn = np.deg2rad(_fixed32(found.get(2), "<f4"))
+    origin = geo.origin
+    latitude, longitude = np.deg2rad([1e-7 * origin.latitude, 1e-7 * origin.longitude])
+    turn = np.deg2rad(geo.bearing)
     east = np.array([-np.sin(longitude), np.cos(longitude), 0.0])
     up = np.array(
         [

@@ -7,7 +7,8 @@ begins there: it is the path across the junction.
 """
 
 import dataclasses
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -23,24 +24,14 @@ from rcirl_jax.data.importers.waymo.widths import (
     Segments,
     half_widths,
 )
-from rcirl_jax.data.readers.wire_columns import Fields, Record
+from rcirl_jax.data.readers.protobuf import Message, columns
 from rcirl_jax.data.recording import MAX_SPEED_MPS
+from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane, Signal
 from rcirl_jax.units import MPH_MPS
 
-# field numbers of map.proto
-FEATURE_ID, LANE, ROAD_LINE, ROAD_EDGE, STOP_SIGN = 1, 3, 4, 5, 7
-SPEED_LIMIT_MPH, LANE_TYPE, LANE_POLYLINE = 1, 2, 8
-ENTRY_LANES, EXIT_LANES = 9, 10
-NEIGHBOURS = {"left": 11, "right": 12}
-BOUNDARIES = {"left": 13, "right": 14}
-LINE_POLYLINE = 2
-SIGN_LANE, SIGN_POSITION = 1, 2
-LANE_STATES = 1
-POINT = {1: "double", 2: "double"}  # x, y
-NEIGHBOUR = {1: "int", 2: "int", 3: "int"}  # feature_id, self_start, self_end
-BOUNDARY = {1: "int", 2: "int", 3: "int"}  # lane_start, lane_end, feature_id
-LANE_STATE = {1: "int", 2: "int", 3: "message"}  # lane, state, stop_point
+NEIGHBOUR = ("feature_id", "self_start_index", "self_end_index")
+BOUNDARY = ("lane_start_index", "lane_end_index", "boundary_feature_id")
 LANE_TYPES = {0: "undefined", 1: "freeway", 2: "surface_street", 3: "bike_lane"}
 DRIVEN = ("undefined", "freeway", "surface_street")
 WIDTH_M = 3.5  # m, of lanes without boundaries
@@ -63,97 +54,85 @@ class _Stop:
 
 
 def read_map(
-    record: Record,
-    features: np.ndarray,
-    steps: np.ndarray,
-    t: np.ndarray,
-    origin: np.ndarray,
-    spec: dict,
+    where: str, scenario: Message, t: np.ndarray, origin: np.ndarray, spec: dict
 ) -> tuple[tuple[Lane, ...], tuple[Signal, ...], list[str]]:
     """Lanes, signals and notes of one scenario.
 
     Args:
-      record: the scenario.
-      features: [n, 2] spans of its map features.
-      steps: [len(t) or 0, 2] spans of its dynamic map states.
+      where: names file and record in errors.
+      scenario: the message.
       t: [T] s, times of the steps.
       origin: [2] m, subtracted from all points.
       spec: source TOML.
     """
-    wanted = (FEATURE_ID, LANE, ROAD_LINE, ROAD_EDGE, STOP_SIGN)
-    found = [record.walk(span, wanted) for span in features]
-    signals, points, flashing = _signals(record, steps, t, origin, spec)
-    signs = _stop_signs(record, found, origin)
+    features = scenario.map_features
+    signals, points, flashing = _signals(
+        where, scenario.dynamic_map_states, t, origin, spec
+    )
+    signs = _stop_signs(where, features, origin)
     stops = _Stop(
         points={**signs, **points},
         signals=frozenset(int(signal.id) for signal in signals),
         signs=frozenset(signs) | flashing,
     )
-    lanes, notes = _lanes(record, found, stops, origin, spec)
+    lanes, notes = _lanes(where, features, stops, origin, spec)
     return lanes, signals, notes
 
 
-def _points(record: Record, spans: np.ndarray, origin: np.ndarray) -> np.ndarray:
+def _points(where: str, messages: Iterable[Message], origin: np.ndarray) -> np.ndarray:
     """Map points [n, 2] m; heights are not read."""
-    columns = record.columns(spans, POINT)
-    points = np.stack([columns[1], columns[2]], axis=1)
-    check_coordinates(record.where, "map points", ("x", "y"), points)
+    points = columns(messages, "x", "y")
+    check_coordinates(where, "map points", ("x", "y"), points)
     return points - origin
 
 
-def _messages(record: Record, found: Sequence[Fields], kind: int) -> dict[int, tuple]:
-    """Feature id -> span of its data, of all features of a kind."""
-    spans = {}
-    for feature in found:
-        span = feature.last(kind)
-        if span is not None:
-            key = feature.whole(FEATURE_ID)
-            if key in spans:
-                raise record.error(f"map feature {key}: met twice", "once")
-            spans[key] = span
-    return spans
+def _by_id(where: str, features: Iterable[Message], kind: str) -> dict[int, Message]:
+    """Feature id -> its data, of all features of a kind."""
+    found = {}
+    for feature in features:
+        if feature.HasField(kind):
+            if feature.id in found:
+                raise InputError(
+                    f"{where}: map feature {feature.id}: met twice: expected once"
+                )
+            found[feature.id] = getattr(feature, kind)
+    return found
 
 
 def _polylines(
-    record: Record, parts: dict[int, np.ndarray], origin: np.ndarray
+    where: str, lines: Mapping[int, Message], origin: np.ndarray
 ) -> dict[int, np.ndarray]:
-    """Feature id -> points [n, 2] m, all decoded in one go."""
-    if not parts:
+    """Feature id -> points [n, 2] m of its polyline."""
+    if not lines:
         return {}
-    points = _points(record, np.concatenate(list(parts.values())), origin)
-    ends = np.cumsum([len(spans) for spans in parts.values()])[:-1]
-    return dict(zip(parts, np.split(points, ends), strict=True))
+    parts = [line.polyline for line in lines.values()]
+    points = _points(where, itertools.chain.from_iterable(parts), origin)
+    ends = np.cumsum([len(part) for part in parts])[:-1]
+    return dict(zip(lines, np.split(points, ends), strict=True))
 
 
 # ---------------------------------------------------------------------- lanes
 
 
 def _lanes(
-    record: Record,
-    found: Sequence[Fields],
+    where: str,
+    features: Sequence[Message],
     stops: _Stop,
     origin: np.ndarray,
     spec: dict,
 ) -> tuple[tuple[Lane, ...], list[str]]:
-    every = {
-        key: record.walk(span, range(SPEED_LIMIT_MPH, BOUNDARIES["right"] + 1))
-        for key, span in _messages(record, found, LANE).items()
-    }
+    every = _by_id(where, features, "lane")
     wanted = lane_types(spec, tuple(LANE_TYPES.values()), DRIVEN)
     driven = {
-        key: head
-        for key, head in every.items()
-        if LANE_TYPES.get(head.whole(LANE_TYPE), "undefined") in wanted
+        key: lane
+        for key, lane in every.items()
+        if LANE_TYPES.get(lane.type, "undefined") in wanted
     }
-    centres = _polylines(
-        record,
-        {key: head.spans(LANE_POLYLINE) for key, head in driven.items()},
-        origin,
-    )
+    centres = _polylines(where, driven, origin)
     heads = {key: driven[key] for key, line in centres.items() if moves(line).sum() > 1}
     width = 0.5 * number(spec, "lane_width_m", WIDTH_M)
-    bounds = Bounds(_bound_lines(record, found, origin))
-    lanes = _built(record, heads, centres, bounds, stops, width)
+    bounds = Bounds(_bound_lines(where, features, origin))
+    lanes = _built(where, heads, centres, bounds, stops, width)
     notes = []
     if len(every) > len(driven):
         notes.append(
@@ -165,8 +144,8 @@ def _lanes(
 
 
 def _built(
-    record: Record,
-    heads: dict[int, Fields],
+    where: str,
+    heads: Mapping[int, Message],
     centres: dict[int, np.ndarray],
     bounds: Bounds,
     stops: _Stop,
@@ -177,13 +156,13 @@ def _built(
         return ()
     order, lines = list(heads.values()), [centres[key] for key in heads]
     left, right = (
-        half_widths(lines, bounds, _segments(record, order, side), default)
+        half_widths(lines, bounds, _segments(where, order, side), default)
         for side in ("left", "right")
     )
-    beside = [_neighbours(record, order, side) for side in ("left", "right")]
-    exits = {key: dict.fromkeys(head.wholes(EXIT_LANES)) for key, head in heads.items()}
+    beside = [_neighbours(order, side) for side in ("left", "right")]
+    exits = {key: dict.fromkeys(head.exit_lanes) for key, head in heads.items()}
     for key, head in heads.items():
-        for before in head.wholes(ENTRY_LANES):
+        for before in head.entry_lanes:
             exits.get(before, {})[key] = None
     lanes = []
     for row, (key, head) in enumerate(heads.items()):
@@ -193,7 +172,7 @@ def _built(
             centre=lines[row][keep],
             left_width=left[row][keep],
             right_width=right[row][keep],
-            speed_limit=_limit(record, key, head),
+            speed_limit=_limit(where, key, head),
             successors=tuple(map(str, exits[key])),
             left=beside[0][row],
             right=beside[1][row],
@@ -205,51 +184,55 @@ def _built(
 
 
 def _bound_lines(
-    record: Record, found: Sequence[Fields], origin: np.ndarray
+    where: str, features: Sequence[Message], origin: np.ndarray
 ) -> dict[int, np.ndarray]:
     """Road lines and road edges as points [n, 2] m by feature id."""
-    parts = {}
-    for kind in (ROAD_LINE, ROAD_EDGE):
-        for key, span in _messages(record, found, kind).items():
-            spans = record.walk(span, (LINE_POLYLINE,)).spans(LINE_POLYLINE)
-            if len(spans):
-                parts[key] = spans
-    return _polylines(record, parts, origin)
+    both = [_by_id(where, features, kind) for kind in ("road_line", "road_edge")]
+    lines = {key: line for kind in both for key, line in kind.items() if line.polyline}
+    return _polylines(where, lines, origin)
 
 
-def _segments(record: Record, heads: Sequence[Fields], side: str) -> Segments:
+def _segments(where: str, heads: Sequence[Message], side: str) -> Segments:
     """What bounds the lanes on one side."""
-    spans = [head.spans(BOUNDARIES[side]) for head in heads]
-    first, last, line = record.columns(np.concatenate(spans), BOUNDARY).values()
-    size = len(record.data)  # no lane has more points
+    lane, table = _of_lanes(heads, f"{side}_boundaries", BOUNDARY)
+    first, last, line = table.T
+    size = max(len(head.polyline) for head in heads)  # no lane has more points
     first, last = np.clip(first, 0, size), np.clip(last, -1, size)
     total = int(np.maximum(last - first + 1, 0).sum())
     if total > MAX_POINTS:
-        raise record.error(
-            f"{side}_boundaries: {total} points", f"at most {MAX_POINTS}"
+        raise InputError(
+            f"{where}: {side}_boundaries: {total} points: expected at most {MAX_POINTS}"
         )
-    lane = np.repeat(np.arange(len(heads)), [len(own) for own in spans])
     return Segments(lane=lane, first=first, last=last, line=line)
 
 
-def _neighbours(record: Record, heads: Sequence[Fields], side: str) -> list[str | None]:
+def _neighbours(heads: Sequence[Message], side: str) -> list[str | None]:
     """Per lane the neighbour along its longest part; all go the same way."""
-    spans = [head.spans(NEIGHBOURS[side]) for head in heads]
-    key, first, last = record.columns(np.concatenate(spans), NEIGHBOUR).values()
-    lane = np.repeat(np.arange(len(heads)), [len(own) for own in spans])
+    lane, table = _of_lanes(heads, f"{side}_neighbors", NEIGHBOUR)
+    key, first, last = table.T
     found: list[str | None] = [None] * len(heads)
     for row in np.argsort(last - first, kind="stable"):
         found[lane[row]] = str(int(key[row]))
     return found
 
 
-def _limit(record: Record, key: int, head: Fields) -> float | None:
+def _of_lanes(
+    heads: Sequence[Message], field: str, names: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """What lanes repeat in a field: numbers of the lanes [n], int64 [n, names]."""
+    parts = [getattr(head, field) for head in heads]
+    lane = np.repeat(np.arange(len(heads)), [len(part) for part in parts])
+    items = itertools.chain.from_iterable(parts)
+    return lane, columns(items, *names, dtype=np.int64)
+
+
+def _limit(where: str, key: int, head: Message) -> float | None:
     """Speed limit m/s; zero stands for unknown."""
-    limit = head.double(SPEED_LIMIT_MPH)
+    limit = head.speed_limit_mph
     if not 0.0 <= limit * MPH_MPS < MAX_SPEED_MPS:
-        raise record.error(
-            f"lane {key}: speed_limit_mph: {limit:g}",
-            f"0 to {MAX_SPEED_MPS / MPH_MPS:.0f}",
+        raise InputError(
+            f"{where}: lane {key}: speed_limit_mph: {limit:g}: "
+            f"expected 0 to {MAX_SPEED_MPS / MPH_MPS:.0f}"
         )
     return limit * MPH_MPS or None
 
@@ -266,45 +249,48 @@ def _stopped(lane: Lane, point: np.ndarray | None) -> Lane:
 
 
 def _stop_signs(
-    record: Record, found: Sequence[Fields], origin: np.ndarray
+    where: str, features: Sequence[Message], origin: np.ndarray
 ) -> dict[int, np.ndarray]:
     """Lane id -> position [2] m of the sign that governs it."""
     signs: dict[int, np.ndarray] = {}
-    for span in _messages(record, found, STOP_SIGN).values():
-        sign = record.walk(span, (SIGN_LANE, SIGN_POSITION))
-        place = sign.last(SIGN_POSITION)
-        if place is not None:
-            point = _points(record, np.array([place]), origin)[0]
-            signs.update({lane: point for lane in sign.wholes(SIGN_LANE)})
+    for sign in _by_id(where, features, "stop_sign").values():
+        if sign.HasField("position"):
+            point = _points(where, [sign.position], origin)[0]
+            signs.update(dict.fromkeys(sign.lane, point))
     return signs
 
 
 def _signals(
-    record: Record, steps: np.ndarray, t: np.ndarray, origin: np.ndarray, spec: dict
+    where: str,
+    steps: Sequence[Message],
+    t: np.ndarray,
+    origin: np.ndarray,
+    spec: dict,
 ) -> tuple[tuple[Signal, ...], dict[int, np.ndarray], frozenset[int]]:
     """Signals by the lane they govern, stop points, lanes of flashing red."""
     if len(steps) not in (0, t.size):
-        raise record.error(
-            f"dynamic_map_states: {len(steps)}", f"{t.size}, one per timestamp"
+        raise InputError(
+            f"{where}: dynamic_map_states: {len(steps)}: "
+            f"expected {t.size}, one per timestamp"
         )
-    spans = [record.walk(step, (LANE_STATES,)).spans(LANE_STATES) for step in steps]
-    counts = np.array([len(own) for own in spans], np.int64)
-    if not counts.sum():
+    heads = itertools.chain.from_iterable(step.lane_states for step in steps)
+    lane, state = columns(heads, "lane", "state", dtype=np.int64).T
+    if not lane.size:
         return (), {}, frozenset()
-    lane, state, stop = record.columns(np.concatenate(spans), LANE_STATE).values()
     bad = np.flatnonzero((state < 0) | (state >= len(COLOURS)))
     if bad.size:
-        raise record.error(
-            f"lane {lane[bad[0]]}: signal state {state[bad[0]]}",
-            f"0 to {len(COLOURS) - 1}",
+        raise InputError(
+            f"{where}: lane {lane[bad[0]]}: signal state {state[bad[0]]}: "
+            f"expected 0 to {len(COLOURS) - 1}"
         )
     ids, rows = np.unique(lane, return_inverse=True)
     if ids.size * t.size > MAX_COLOURS:
-        raise record.error(
-            f"dynamic_map_states: {ids.size} lanes over {t.size} steps",
-            f"at most {MAX_COLOURS} states",
+        raise InputError(
+            f"{where}: dynamic_map_states: {ids.size} lanes over {t.size} steps: "
+            f"expected at most {MAX_COLOURS} states"
         )
     colours = np.full((ids.size, t.size), OFF, np.int8)
+    counts = [len(step.lane_states) for step in steps]
     step = np.repeat(np.arange(len(steps)), counts)
     # of two heads for one lane the first that is known counts: it is written last
     known = np.flatnonzero(COLOURS[state] != OFF)[::-1]
@@ -314,12 +300,17 @@ def _signals(
         _signal(str(key), _bridged(row, t, gap), t)
         for key, row in zip(ids, colours, strict=True)
     )
-    has_point = np.flatnonzero(stop[:, 1] > stop[:, 0])[::-1]
-    points = _points(record, stop[has_point], origin)
+    stops = {
+        head.lane: head.stop_point
+        for step in reversed(steps)  # of two points of one lane the first counts
+        for head in reversed(step.lane_states)
+        if head.HasField("stop_point")
+    }
+    points = _points(where, stops.values(), origin)
     flashing = np.bincount(rows, state == FLASHING_STOP) > 0.5 * np.bincount(rows)
     return (
         signals,
-        dict(zip(lane[has_point].tolist(), points, strict=True)),
+        dict(zip(stops, points, strict=True)),
         frozenset(ids[flashing].tolist()),
     )
 
