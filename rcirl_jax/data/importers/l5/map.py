@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.importers.options import path_option
-from rcirl_jax.data.importers.projection import FLATTENING, SEMI_MAJOR_M
+from rcirl_jax.data.importers.projection import earth_centred
 from rcirl_jax.data.importers.shapes import between_bounds, check_coordinates, moves
 from rcirl_jax.data.readers.wire import (
     Value,
@@ -317,6 +317,8 @@ def _frame(buffer: memoryview) -> np.ndarray:
     degrees = [1e-7 * _fixed32(place.get(key), "<i4") for key in (1, 2)]
     latitude, longitude = np.deg2rad(degrees)
     turn = np.deg2rad(_fixed32(found.get(2), "<f4"))
+    if abs(degrees[0]) > 90.0 or abs(degrees[1]) > 180.0:
+        raise WireError(f"frame at latitude, longitude {degrees}: not on Earth")
     east = np.array([-np.sin(longitude), np.cos(longitude), 0.0])
     up = np.array(
         [
@@ -326,13 +328,11 @@ def _frame(buffer: memoryview) -> np.ndarray:
         ]
     )
     north = np.cross(up, east)
-    square = FLATTENING * (2.0 - FLATTENING)  # 1, of the eccentricity
-    normal = SEMI_MAJOR_M / np.sqrt(1.0 - square * np.sin(latitude) ** 2)
     frame = np.eye(4)
     frame[:3, 0] = np.cos(turn) * east - np.sin(turn) * north
     frame[:3, 1] = np.sin(turn) * east + np.cos(turn) * north
     frame[:3, 2] = up
-    frame[:3, 3] = normal * up * np.array([1.0, 1.0, 1.0 - square])
+    frame[:3, 3] = earth_centred(*degrees)
     return frame
 
 
