@@ -3,6 +3,7 @@
 Host numpy, float64. Sources: the score statistic of Tango, Statistics in Medicine 17
 (1998); the exact unconditional test built on it, Sidik, Statistics in Medicine 22
 (2003); the interval of the nuisance parameter, Berger and Boos, JASA 89 (1994).
+By hand, because scipy's exact tests are of unpaired counts and without a margin.
 """
 
 import numpy as np
