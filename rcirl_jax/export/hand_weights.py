@@ -6,21 +6,35 @@
 What else is in the file (history of a search, provenance) is for people.
 """
 
-import contextlib
 import dataclasses
-import math
 import os
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Annotated
+
+import msgspec
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.reward import TUNED_ROW, LatticeCost
 from rcirl_jax.runtime.atomic_files import read_json, write_json
+from rcirl_jax.runtime.checked import checked
 
 SCHEMA = "rcirl-jax/hand-weights"
 SCHEMA_VERSION = 1
 # divisors and shares; all other fields may be 0
 _POSITIVE = ("speed_share", "jerk_bound", "collision_sigma", "offset_scale")
+_MOST = sys.float_info.max  # finite
+_ABOVE_0 = Annotated[float, msgspec.Meta(gt=0.0, le=_MOST)]
+_FROM_0 = Annotated[float, msgspec.Meta(ge=0.0, le=_MOST)]
+_WEIGHTS = msgspec.defstruct(
+    "_WEIGHTS",
+    [
+        (field.name, _ABOVE_0 if field.name in _POSITIVE else _FROM_0)
+        for field in dataclasses.fields(LatticeCost)
+    ],
+    forbid_unknown_fields=True,
+)
 
 
 def write_hand_weights(
@@ -78,24 +92,5 @@ def load_hand_weights(path: str | os.PathLike[str]) -> LatticeCost:
     for name, expected in {"schema": SCHEMA, "schema_version": SCHEMA_VERSION}.items():
         if found.get(name) != expected:
             raise InputError(f"{path}: {name}: {found.get(name)}: expected {expected}")
-    weights = found.get("weights")
-    names = [field.name for field in dataclasses.fields(LatticeCost)]
-    if not isinstance(weights, dict) or set(weights) != set(names):
-        given = set(weights) if isinstance(weights, dict) else set()
-        wrong = ", ".join(sorted(given ^ set(names)))
-        raise InputError(f"{path}: weights: {wrong}: expected the cost's fields")
-    return LatticeCost(**{name: _number(path, name, weights[name]) for name in names})
-
-
-def _number(path: str | os.PathLike[str], name: str, value: object) -> float:
-    number = math.nan
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        with contextlib.suppress(OverflowError):
-            number = float(value)
-    if not math.isfinite(number) or number < 0.0:
-        raise InputError(
-            f"{path}: weights: {name}: {value}: expected a finite number, 0 or more"
-        )
-    if name in _POSITIVE and number == 0.0:
-        raise InputError(f"{path}: weights: {name}: 0: expected above 0")
-    return number
+    weights = checked(found.get("weights"), _WEIGHTS, f"{path}: weights")
+    return LatticeCost(**msgspec.structs.asdict(weights))
