@@ -1,4 +1,4 @@
-"""What JSON holds, as types: one line says which value does not fit."""
+"""What JSON and TOML hold, as types: one line says which value does not fit."""
 
 import contextlib
 import re
@@ -29,7 +29,7 @@ MOST = 80  # characters of a value in a message
 
 
 def checked(found: object, kind: type[Kind], where: object) -> Kind:
-    """A body of JSON as a type: nothing is converted but whole numbers to floats.
+    """A body as a type; only whole numbers become floats, and lists tuples.
 
     Args:
       found: dicts, lists, texts, numbers, true or false, None.
