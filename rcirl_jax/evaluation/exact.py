@@ -4,14 +4,17 @@ Host floats. Sources: Clopper and Pearson, Biometrika 26 (1934); McNemar,
 Psychometrika 12 (1947), in its exact binomial form; Tango, Statistics in Medicine 17
 (1998); the exact unconditional test built on its statistic, Sidik, Statistics in
 Medicine 22 (2003), with the nuisance parameter's interval of Berger and Boos, JASA 89
-(1994); Holm, Scand. J. Statist. 6 (1979).
+(1994); Holm, Scand. J. Statist. 6 (1979). All but the first two are by hand, because
+scipy has no interval or test with a margin of paired rates and no family-wise
+adjustment.
 """
 
 import math
 import statistics
 
 import numpy as np
-from scipy.special import bdtr, bdtrc, betainc, betaincinv, ndtr
+import scipy  # loads scipy.stats, half a second, where it is first used
+from scipy.special import bdtr, bdtrc, ndtr
 
 from rcirl_jax.errors import InputError
 
@@ -38,19 +41,16 @@ def clopper_pearson(
 ) -> tuple[float, float]:
     """Exact two-sided interval of a rate with k events in n trials.
 
-    low solves P(X >= k; low) = alpha / 2, that is I_low(k, n - k + 1), and high
-    solves P(X <= k; high) = alpha / 2, with the regularised incomplete beta
-    function I. The ends are 0 for k = 0 and 1 for k = n.
+    P(X >= k; low) = P(X <= k; high) = (1 - confidence) / 2, X ~ Binomial(n, rate).
+    The ends are 0 for k = 0 and 1 for k = n.
     """
     if not 0 <= k <= n or n < 1 or not 0.0 < confidence < 1.0:
         raise InputError(
             f"clopper_pearson: k, n, confidence: {k}, {n}, {confidence}:"
             " expected 0 <= k <= n, n >= 1 and confidence in (0, 1)"
         )
-    tail = 0.5 * (1.0 - confidence)
-    low = 0.0 if k == 0 else float(betaincinv(k, n - k + 1, tail))
-    high = 1.0 if k == n else 1.0 - float(betaincinv(n - k, k + 1, tail))
-    return low, high
+    found = scipy.stats.binomtest(k, n).proportion_ci(confidence, method="exact")
+    return float(found.low), float(found.high)
 
 
 def mcnemar_exact(b: int, c: int) -> float:
@@ -61,10 +61,7 @@ def mcnemar_exact(b: int, c: int) -> float:
     """
     if min(b, c) < 0:
         raise InputError(f"mcnemar_exact: b, c: {b}, {c}: expected counts >= 0")
-    n, k = b + c, min(b, c)
-    if 2 * k == n:
-        return 1.0
-    return min(1.0, 2.0 * float(betainc(n - k, k + 1, 0.5)))
+    return float(scipy.stats.binomtest(b, b + c).pvalue) if b + c else 1.0
 
 
 def tango(

@@ -6,6 +6,8 @@ numpy, float64. Axes: `R` runs, `S` scenes, `C` clusters, `n` resamples.
 
 Sources: Davison and Hinkley, Bootstrap Methods and their Application (1997),
 chapter 5 (percentile intervals) and 3.8 (clusters). Tests of counts: `exact`.
+By hand, because `scipy.stats.bootstrap` draws values, not clusters, and anew for each
+statistic.
 """
 
 import dataclasses

@@ -6,14 +6,20 @@
 """
 
 import dataclasses
-import math
 from pathlib import Path
+from typing import Annotated
 
-from rcirl_jax.errors import InputError
+import msgspec
+
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm
 from rcirl_jax.runtime.atomic_files import read_json, write_json
+from rcirl_jax.runtime.checked import checked
 
 FIELDS = tuple(field.name for field in dataclasses.fields(Idm))
+_POSITIVE = Annotated[float, msgspec.Meta(gt=0.0, lt=1e6)]
+_IDM = msgspec.defstruct(
+    "_IDM", [(name, _POSITIVE) for name in FIELDS], forbid_unknown_fields=True
+)
 
 
 def write_tuned_idm(path: Path, idm: Idm) -> None:
@@ -28,16 +34,8 @@ def read_tuned_idm(path: Path) -> Idm:
       InputError: unreadable, or a field that is missing, unknown, or not a finite
         number above 0; one line naming it.
     """
-    body = read_json(path, "JSON, a tuned IDM")
-    given = set(body) if isinstance(body, dict) else set()
-    if given != set(FIELDS):
-        wrong = ", ".join(sorted(map(str, given ^ set(FIELDS))))
-        raise InputError(f"{path}: {wrong}: expected the fields {', '.join(FIELDS)}")
-    for name, value in body.items():
-        number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not number or not 0.0 < value < 1e6 or not math.isfinite(value):
-            raise InputError(f"{path}: {name}: {value}: expected a number above 0")
-    return Idm(**{name: float(value) for name, value in body.items()})
+    found = checked(read_json(path, "JSON, a tuned IDM"), _IDM, path)
+    return Idm(**msgspec.structs.asdict(found))
 
 
 def idm_fields(path: str | None) -> tuple[tuple[str, float], ...]:

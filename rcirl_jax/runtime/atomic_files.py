@@ -60,7 +60,8 @@ def write_whole(path: Path, content: str | bytes) -> None:
 def locked(path: Path, *, wait: bool = True) -> Iterator[IO[bytes]]:
     """A file open for appending, held by this process alone; made if missing.
 
-    Where the file system has no locks, nobody is kept out.
+    Where the file system has no locks, nobody is kept out. By hand, because filelock
+    holds a file of its own, which would stay beside every file written.
 
     Args:
       path: of the file.

@@ -6,7 +6,8 @@ on where it was made. Pieces have to be idempotent: one that is lost with its
 process or node is done again.
 
 Ray does the scheduling, the transport and the retries; this module only keeps
-the order and bounds what is in flight.
+the order and bounds what is in flight. Processes are the standard library's, because
+loky's outlive a killed parent, do no lost piece again and start a third slower.
 """
 
 import collections

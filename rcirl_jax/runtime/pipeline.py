@@ -15,15 +15,19 @@ import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import msgspec
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.atomic_files import locked, read_json, write_json
+from rcirl_jax.runtime.checked import checked
 from rcirl_jax.runtime.specs import spec_root
 
 FILE = "stages.json"
 LOCK = ".lock"  # in a folder that one process at a time works in
 SCHEMA_VERSION = 1
+FileName = Annotated[str, msgspec.Meta(pattern=r"\A[^\0]*\Z")]
 
 
 def file_sha256(path: Path) -> str:
@@ -47,6 +51,15 @@ def code_sha256() -> str:
         for file in sorted(root.rglob(pattern)):
             found[f"{pattern} {file.relative_to(root)}"] = file_sha256(file)
     return digest(found)
+
+
+class _Record(msgspec.Struct):
+    """What is used of a stage's record."""
+
+    key: str
+    outputs: dict[FileName, str]  # sha256 of each
+    inputs: dict = {}
+    seconds: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -150,30 +163,13 @@ class Stages:
             raise InputError(
                 f"{path}: schema_version: {version}: expected {SCHEMA_VERSION}"
             )
-        if not isinstance(stages, dict):
-            raise InputError(f"{path}: stages: damaged: expected a table")
-        for name, record in stages.items():
-            if not _is_record(record):
-                raise InputError(f"{path}: {name}: damaged: expected a stage's record")
+        for name, record in checked(stages, dict, f"{path}: stages").items():
+            checked(record, _Record, f"{path}: {name}")
         return stages
 
     def _write(self, stages: Mapping[str, Any]) -> None:
         body = {"schema_version": SCHEMA_VERSION, "stages": dict(stages)}
         write_json(self.folder / FILE, body)
-
-
-def _is_record(record: object) -> bool:
-    """Whether it is what `Stages.run` writes of a stage."""
-    made = record.get("outputs") if isinstance(record, dict) else None
-    if not isinstance(record, dict) or not isinstance(made, dict):
-        return False
-    texts = [record.get("key"), *made.values()]
-    return (
-        all(isinstance(text, str) for text in texts)
-        and all("\0" not in file for file in made)
-        and isinstance(record.get("inputs", {}), dict)
-        and isinstance(record.get("seconds", 0.0), int | float)
-    )
 
 
 @contextlib.contextmanager

@@ -24,6 +24,7 @@ from orbax.checkpoint import v1 as ocp
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.atomic_files import read_json, write_json
+from rcirl_jax.runtime.checked import checked
 from rcirl_jax.runtime.pipeline import digest, file_sha256
 from rcirl_jax.train.processes import is_first
 from rcirl_jax.train.state import TrainState
@@ -175,12 +176,7 @@ def read_position(path: Path) -> dict[str, int]:
     Raises:
       InputError: the file is none.
     """
-    position = read_json(path, "a data position")
-    if not isinstance(position, dict) or not all(
-        type(number) is int for number in position.values()
-    ):
-        raise InputError(f"{path}: {position}: expected numbers by name")
-    return position
+    return checked(read_json(path, "a data position"), dict[str, int], path)
 
 
 def _check_room(folder: Path, state: TrainState) -> None:

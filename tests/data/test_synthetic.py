@@ -374,12 +374,12 @@ def test_schedule_covers_the_recording(offset, end):
         ("rate_hz = 10.0", "rate_hz = -1.0", "rate_hz"),
         ("rate_hz = 10.0", 'rate_hz = "fast"', "rate_hz"),
         ("warmup_s", "warm_up_s", "warm_up_s"),
-        ('road = "stop_sign"', 'road = "moon"', "recordings[7].road"),
-        ("count = 6", "count = 1.5", "recordings[4].count"),
-        ("count = 6", "count = 0", "recordings[4].count"),
-        ("seed = 7", "sead = 7", "recordings[7].sead"),
-        ("density_veh_per_km = 12.0\n", "", "recordings[4].density_veh_per_km"),
-        ("duration_s = 60.0", "duration_s = nan", "recordings[1].duration_s"),
+        ('road = "stop_sign"', 'road = "moon"', "recordings[7]: road"),
+        ("count = 6", "count = 1.5", "recordings[4]: count"),
+        ("count = 6", "count = 0", "recordings[4]: count"),
+        ("seed = 7", "sead = 7", "recordings[7]: sead"),
+        ("density_veh_per_km = 12.0\n", "", "recordings[4]: density_veh_per_km"),
+        ("duration_s = 60.0", "duration_s = nan", "recordings[1]: duration_s"),
         ("[1.0, 0.1, 0.7, 1.3]", "[1.0, 0.1]", "drivers.speed_factor"),
         ("jam_gap_m = [1.0, 4.0]", "jam_gap_m = [4.0, 1.0]", "drivers.jam_gap_m"),
         ("jam_gap_m = [1.0", "jam_gap_m = [0.0", "drivers.jam_gap_m"),
@@ -408,7 +408,7 @@ def test_recordings_of_all_entries_are_limited(tmp_path, monkeypatch):
     monkeypatch.setattr(synthetic, "MAX_RECORDINGS", 6)
     synthetic.recordings(path, load_toml(DEFAULT))
     monkeypatch.setattr(synthetic, "MAX_RECORDINGS", 5)
-    with pytest.raises(InputError, match=r"recordings\[2\]\.count: 3 after 3"):
+    with pytest.raises(InputError, match=r"recordings\[2\]: count: 3 after 3"):
         synthetic.recordings(path, load_toml(DEFAULT))
 
 

@@ -30,10 +30,10 @@ def test_a_tuned_idm_comes_back_and_is_a_row(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"headway": -1.0}, "headway: -1.0: expected a number above 0"),
+        ({"headway": -1.0}, "headway: -1.0: expected a number > 0"),
         ({"headway": "1"}, "headway: 1: expected a number"),
         ({"headway": True}, "headway: True: expected a number"),
-        ({"gap": 1.0}, "gap: expected the fields"),
+        ({"gap": 1.0}, "gap: unknown"),
         (None, "expected JSON, a tuned IDM"),
     ],
 )

@@ -1,12 +1,12 @@
 """The page of a dataset: complete, self-contained, safe, and true to the manifest."""
 
-import dataclasses
 import re
 import subprocess
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -104,7 +104,7 @@ def test_each_filter_hides_the_scenes_without_its_tag(page):
 def test_names_from_the_logs_are_text(dataset, tmp_path):
     manifest = dataset.manifest
     quality = manifest.quality | {"notes": [HOSTILE], "num_notes": 1}
-    hostile = dataclasses.replace(
+    hostile = msgspec.structs.replace(
         manifest,
         quality=quality,
         sources=[{"source": HOSTILE, "licence": HOSTILE}],

@@ -108,14 +108,14 @@ def test_outputs_that_no_stage_makes_are_one_line(stages, name):
         *(
             (json.dumps({"schema_version": 1, "stages": stages}), message)
             for stages, message in (
-                ([], "stages: damaged"),
-                ({"a": 5}, "a: damaged: expected a stage's record"),
-                ({"a": []}, "a: damaged"),
-                ({"a": {"key": "k", "outputs": 5}}, "a: damaged"),
-                ({"a": {"key": "k", "outputs": [[1]]}}, "a: damaged"),
-                ({"a": {"key": "k", "outputs": {"f": 1}}}, "a: damaged"),
-                ({"b": {"key": "k", "outputs": {"f\0": "x"}}}, "b: damaged"),
-                ({"b": {"outputs": {}}}, "b: damaged"),
+                ([], r"stages: \[\]: expected an object"),
+                ({"a": 5}, "a: 5: expected an object"),
+                ({"a": []}, r"a: \[\]: expected an object"),
+                ({"a": {"key": "k", "outputs": 5}}, "a: outputs: 5: expected an obj"),
+                ({"a": {"key": "k", "outputs": [[1]]}}, "a: outputs: .*: expected an"),
+                ({"a": {"key": "k", "outputs": {"f": 1}}}, "'f': 1}: expected a text"),
+                ({"b": {"key": "k", "outputs": {"f\0": "x"}}}, "b: outputs: .*: exp"),
+                ({"b": {"outputs": {}}}, "b: key: missing"),
             )
         ),
     ],

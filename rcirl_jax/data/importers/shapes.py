@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.errors import InputError
+from rcirl_jax.errors import InputError, extra_module
 
 FAR_M = 1e4  # m; coordinates beyond it are moved to a local origin
 ORIGIN_STEP_M = 1000.0  # m, local origins are multiples of it
@@ -53,14 +53,23 @@ def check_coordinates(
         )
 
 
+def arc_length(points: np.ndarray) -> np.ndarray:
+    """Length [n] m of a polyline [n, 2] up to each of its points."""
+    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+
+
 def fractions(points: np.ndarray) -> np.ndarray:
     """Arc length at each point over the line's length, [n] from 0 to 1."""
-    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    arc = arc_length(points)
     return arc / max(arc[-1], 1e-9)
 
 
 def resample(points: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Points [len(at), 2] of a polyline at fractions of its length."""
+    """Points [len(at), 2] of a polyline at fractions of its length.
+
+    By hand, because shapely starts at the line's beginning for every point: 9 times
+    slower at 100 points of 100, 230 times at 512 of 2,000.
+    """
     share = fractions(points)
     return np.stack([np.interp(at, share, points[:, i]) for i in (0, 1)], axis=1)
 
@@ -88,15 +97,11 @@ def between_bounds(
 
 
 def distance_to_line(points: np.ndarray, line: np.ndarray) -> np.ndarray:
-    """Distance [n] m of points [n, 2] from a polyline [m >= 1, 2]."""
-    if len(line) == 1:
-        return np.hypot(*(points - line[0]).T)
-    start, step = line[:-1], np.diff(line, axis=0)
-    offset = points[:, None] - start[None]
-    square = np.maximum(np.sum(step * step, axis=1), 1e-12)
-    share = np.clip(np.einsum("nmk,mk->nm", offset, step) / square, 0.0, 1.0)
-    offset -= share[..., None] * step
-    return np.sqrt(np.einsum("nmk,nmk->nm", offset, offset).min(axis=1))
+    """Distance [n] m of points [n, 2] from a polyline [m >= 1, 2], by shapely."""
+    shapely = extra_module("shapely")
+    # its lines have two points or more
+    whole = shapely.linestrings(line if len(line) > 1 else np.tile(line, (2, 1)))
+    return shapely.distance(shapely.points(points), whole)
 
 
 def line_across(
@@ -105,7 +110,8 @@ def line_across(
     """End points [2, 2] m, left first, of a line across a lane near a point.
 
     It lies where the point's projection falls on the centre line, which is its
-    first or last point if the given one lies before or behind the lane.
+    first or last point if the given one lies before or behind the lane. By hand,
+    because shapely gives the place but not the piece of the line that it lies on.
 
     Args:
       centre: [m >= 2, 2] m, consecutive points differ.

@@ -17,7 +17,6 @@ whole recording finds it in `Spill.minutes`.
 
 import contextlib
 import dataclasses
-import fcntl
 import itertools
 import multiprocessing
 import shutil
@@ -32,6 +31,7 @@ import tqdm
 from rcirl_jax.data.readers import csv_stream
 from rcirl_jax.data.readers.csv_stream import Field
 from rcirl_jax.errors import InputError
+from rcirl_jax.runtime.atomic_files import locked
 from rcirl_jax.types import Recording, Track
 
 BLOCK_S = 60.0  # s of a piece
@@ -140,14 +140,11 @@ def _of_log(track: Track, fragments: dict[str, list[float]]) -> Track:
 def scratch() -> Iterator[Path]:
     """A locked folder for scratch files; removes those that killed imports left."""
     for left in Path(tempfile.gettempdir()).glob(f"{SCRATCH}*/{LOCK}"):
-        with contextlib.suppress(OSError), left.open() as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # not while in use
+        with contextlib.suppress(OSError), locked(left, wait=False):  # not while in use
             shutil.rmtree(left.parent, ignore_errors=True)
-    with tempfile.TemporaryDirectory(prefix=SCRATCH) as name:
-        folder = Path(name)
-        with (folder / LOCK).open("w") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
-            yield folder
+    made = tempfile.TemporaryDirectory(prefix=SCRATCH)
+    with made as name, locked(Path(name) / LOCK):
+        yield Path(name)
 
 
 def _within(rows: np.ndarray, t: int, begin: float, end: float) -> np.ndarray:

@@ -100,7 +100,10 @@ def _fronts(tracks: Sequence[Track]) -> _Fronts:
 
 
 def _crossings(fronts: _Fronts, line: np.ndarray) -> np.ndarray:
-    """Time [s] at which each front that does first crosses the segment [2, 2]."""
+    """Time [s] at which each front that does first crosses the segment [2, 2].
+
+    By hand, because shapely first makes a line of every step: 50 times slower.
+    """
     (x0, y0), (x1, y1) = line
     dx, dy = x1 - x0, y1 - y0
     side = (fronts.x - x0) * dy - (fronts.y - y0) * dx

@@ -6,37 +6,23 @@ a misspelt one does not silently keep its default.
 
 import dataclasses
 import functools
-import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import msgspec
 
 from rcirl_jax.errors import InputError, as_input_error
+from rcirl_jax.runtime.checked import checked
 from rcirl_jax.runtime.specs import load_toml, spec_root
 from rcirl_jax.simulation.cases import NUM_MOVES, NUM_PHASES
 from rcirl_jax.simulation.catalogue.expressions import Expression
 
-DISTRIBUTIONS = {"uniform": 2, "normal": 2, "lognormal": 2, "choice": None}
+DISTRIBUTIONS = ("uniform", "normal", "lognormal", "choice")
 KINDS = ("vehicle", "cyclist", "pedestrian", "static")
 MODELS = ("lane", "oncoming", "crossing")
 LINE_KINDS = ("light", "stop_sign")
 LARGEST = 1e9  # of a parameter's numbers
-TOP = {
-    "family",
-    "title",
-    "source",
-    "cases",
-    "parameters",
-    "derived",
-    "road",
-    "curve",
-    "limit",
-    "shift",
-    "line",
-    "agent",
-    "perception",
-    "compound",
-}
 ROAD = {
     "speed_limit": None,
     "ego_speed": None,
@@ -69,12 +55,7 @@ DRIVER = (
     "lapse_start",
     "lapse_end",
 )
-FLAGS = {
-    "relative": False,
-    "reacts": True,
-    "obeys_lines": True,
-    "changes_lane": False,
-}
+FLAGS = ("relative", "reacts", "obeys_lines", "changes_lane")
 AGENT = {
     "count": 1.0,
     "appear_s": "start",
@@ -87,6 +68,58 @@ AGENT = {
     "arrival_s": "inf",
 }
 PERCEPTION = ("sigma_position", "sigma_speed", "latency", "dropout")
+
+Text = Annotated[str, msgspec.Meta(min_length=1)]
+Number = Annotated[float, msgspec.Meta(ge=-LARGEST, le=LARGEST)]
+Pair = Annotated[list[Number], msgspec.Meta(min_length=2, max_length=2)]
+Formula = str | bool | int | float
+Triple = tuple[Formula, Formula, Formula]
+
+
+class _File(msgspec.Struct, forbid_unknown_fields=True):
+    """A family as it is written; tables of expressions are checked one by one."""
+
+    family: Text
+    title: Text
+    source: Text
+    cases: Annotated[int, msgspec.Meta(ge=1)]
+    parameters: dict[str, Any] = {}
+    derived: dict[str, Any] = {}
+    road: dict[str, Any] = {}
+    curve: list[dict] = []
+    limit: list[dict] = []
+    shift: list[dict] = []
+    line: list[dict] = []
+    agent: list[dict] = []
+    perception: dict[str, Any] = {}
+    compound: list[str] = []
+
+
+class _Drawn(msgspec.Struct, forbid_unknown_fields=True):
+    """[parameters.NAME] as it is written: one of `DISTRIBUTIONS`."""
+
+    unit: str
+    meaning: str
+    uniform: Pair | None = None
+    normal: Pair | None = None
+    lognormal: Pair | None = None
+    choice: Annotated[list[Number], msgspec.Meta(min_length=1)] | None = None
+    clip: tuple[float, float] | None = None
+    per: str = "event"
+
+
+class _Agent(msgspec.Struct):
+    """What of an [[agent]] is no expression of `AGENT` or `DRIVER`."""
+
+    kind: str
+    model: str = "lane"
+    relative: bool = False
+    reacts: bool = True
+    obeys_lines: bool = True
+    changes_lane: bool = False
+    # (start, speed, rate), (start, l, speed)
+    phases: Annotated[list[Triple], msgspec.Meta(max_length=NUM_PHASES)] = []
+    moves: Annotated[list[Triple], msgspec.Meta(max_length=NUM_MOVES)] = []
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -167,65 +200,37 @@ def load_family(name_or_path: str) -> Family:
 
 
 def _read(path: Path, spec: dict[str, Any]) -> Family:
-    _known(path, "", spec, TOP)
-    for key in ("family", "title", "source"):
-        if not isinstance(spec.get(key), str) or not spec[key]:
-            raise InputError(f"{path}: {key}: {spec.get(key)!r}: expected a text")
-    if spec["family"] != path.stem:
+    found = checked(spec, _File, path)
+    if found.family != path.stem:
         raise InputError(
-            f"{path}: family: {spec['family']}: expected the file's name, {path.stem}"
+            f"{path}: family: {found.family}: expected the file's name, {path.stem}"
         )
-    cases = spec.get("cases")
-    if not isinstance(cases, int) or isinstance(cases, bool) or cases < 1:
-        raise InputError(f"{path}: cases: {cases!r}: expected a whole number >= 1")
-    compound = spec.get("compound", [])
-    if not isinstance(compound, list) or not all(isinstance(x, str) for x in compound):
-        raise InputError(f"{path}: compound: {compound!r}: expected family names")
     own = [key for key in (*ELEMENTS, "agent") if key in spec]
-    if compound and own:
+    if found.compound and own:
         raise InputError(f"{path}: compound: with {own[0]}: expected either, not both")
+    perception = dict.fromkeys(PERCEPTION, 0.0)
     return Family(
-        name=spec["family"],
-        title=spec["title"],
-        source=spec["source"],
-        cases=cases,
+        name=found.family,
+        title=found.title,
+        source=found.source,
+        cases=found.cases,
         path=str(path),
         parameters=tuple(
-            _parameter(path, name, row)
-            for name, row in _table(path, spec, "parameters").items()
+            _parameter(path, name, row) for name, row in found.parameters.items()
         ),
         derived={
-            name: Expression(text, f"{path}: derived.{name}")
-            for name, text in _table(path, spec, "derived").items()
+            name: _expression(path, f"derived.{name}", text)
+            for name, text in found.derived.items()
         },
-        road=_fields(path, "road", _table(path, spec, "road"), ROAD),
+        road=_fields(path, "road", found.road, ROAD),
         elements={
-            key: tuple(_element(path, key, row) for row in _rows(path, spec, key))
+            key: tuple(_element(path, key, row) for row in getattr(found, key))
             for key in ELEMENTS
         },
-        agents=tuple(_agent(path, row) for row in _rows(path, spec, "agent")),
-        perception=_fields(
-            path,
-            "perception",
-            _table(path, spec, "perception"),
-            dict.fromkeys(PERCEPTION, 0.0),
-        ),
-        compound=tuple(compound),
+        agents=tuple(_agent(path, row) for row in found.agent),
+        perception=_fields(path, "perception", found.perception, perception),
+        compound=tuple(found.compound),
     )
-
-
-def _table(path: Path, spec: dict, key: str) -> dict:
-    found = spec.get(key, {})
-    if not isinstance(found, dict):
-        raise InputError(f"{path}: {key}: expected a table")
-    return found
-
-
-def _rows(path: Path, spec: dict, key: str) -> list[dict]:
-    found = spec.get(key, [])
-    if not isinstance(found, list) or not all(isinstance(x, dict) for x in found):
-        raise InputError(f"{path}: {key}: expected [[{key}]] tables")
-    return found
 
 
 def _known(path: Path, where: str, row: Mapping, allowed: set[str]) -> None:
@@ -236,50 +241,26 @@ def _known(path: Path, where: str, row: Mapping, allowed: set[str]) -> None:
             )
 
 
-def _is_numbers(value: object, largest: float = LARGEST) -> bool:
-    return isinstance(value, list) and all(
-        isinstance(x, int | float)
-        and not isinstance(x, bool)
-        and -largest <= x <= largest
-        for x in value
-    )
-
-
-def _parameter(path: Path, name: str, row: Any) -> Parameter:  # noqa: ANN401
+def _parameter(path: Path, name: str, row: object) -> Parameter:
     where = f"{path}: parameters.{name}"
-    if not isinstance(row, dict) or not name.isidentifier():
-        raise InputError(f"{where}: expected a name and a table")
-    _known(
-        path,
-        f"parameters.{name}.",
-        row,
-        {*DISTRIBUTIONS, "clip", "per", "unit", "meaning"},
-    )
-    chosen = [key for key in DISTRIBUTIONS if key in row]
+    if not name.isidentifier():
+        raise InputError(f"{where}: expected a name")
+    found = checked(row, _Drawn, where)
+    chosen = [key for key in DISTRIBUTIONS if getattr(found, key) is not None]
     if len(chosen) != 1:
-        raise InputError(f"{where}: {chosen}: expected one of {list(DISTRIBUTIONS)}")
-    arguments, count = row[chosen[0]], DISTRIBUTIONS[chosen[0]]
-    numbers = _is_numbers(arguments) and arguments
-    if not numbers or (count and len(arguments) != count):
-        raise InputError(f"{where}: {chosen[0]}: {arguments}: expected numbers")
-    if row.get("per", "event") not in ("case", "event"):
-        raise InputError(f"{where}: per: {row['per']}: expected case or event")
-    for key in ("unit", "meaning"):
-        if not isinstance(row.get(key), str):
-            raise InputError(f"{where}: {key}: missing: expected a text")
-    clip = row.get("clip")
-    if clip is not None and (
-        not _is_numbers(clip, math.inf) or len(clip) != 2 or clip[0] > clip[1]
-    ):
-        raise InputError(f"{where}: clip: {clip}: expected [low, high]")
+        raise InputError(f"{where}: {chosen}: expected one of {DISTRIBUTIONS}")
+    if found.per not in ("case", "event"):
+        raise InputError(f"{where}: per: {found.per}: expected case or event")
+    if found.clip is not None and not found.clip[0] <= found.clip[1]:
+        raise InputError(f"{where}: clip: {found.clip}: expected [low, high]")
     return Parameter(
         name=name,
         distribution=chosen[0],
-        arguments=tuple(float(x) for x in arguments),
-        clip=None if clip is None else (float(clip[0]), float(clip[1])),
-        per_case=row.get("per") == "case",
-        unit=row["unit"],
-        meaning=row["meaning"],
+        arguments=tuple(getattr(found, chosen[0])),
+        clip=found.clip,
+        per_case=found.per == "case",
+        unit=found.unit,
+        meaning=found.meaning,
     )
 
 
@@ -328,7 +309,8 @@ def _element(path: Path, key: str, row: dict) -> Element:
 
 
 def _agent(path: Path, row: dict) -> AgentSpec:
-    special = {"kind", "model", "when", "phases", "moves", *FLAGS}
+    found = checked(row, _Agent, f"{path}: agent")
+    special = {"when", *found.__struct_fields__}
     rest = {name: value for name, value in row.items() if name not in special}
     optional = {
         key: rest.pop(key) for key in (*DRIVER, "length", "width") if key in rest
@@ -336,33 +318,20 @@ def _agent(path: Path, row: dict) -> AgentSpec:
     fields = _fields(path, "agent", rest, AGENT)
     for key, value in optional.items():
         fields[key] = _expression(path, f"agent.{key}", value)
-    for key in FLAGS:
-        if not isinstance(row.get(key, False), bool):
-            raise InputError(
-                f"{path}: agent.{key}: {row[key]!r}: expected true or false"
-            )
     return AgentSpec(
-        kind=_one_of(path, "agent.kind", row.get("kind"), KINDS),
-        model=_one_of(path, "agent.model", row.get("model", "lane"), MODELS),
+        kind=_one_of(path, "agent.kind", found.kind, KINDS),
+        model=_one_of(path, "agent.model", found.model, MODELS),
         when=_when(path, "agent", row),
-        flags={key: row.get(key, default) for key, default in FLAGS.items()},
+        flags={key: getattr(found, key) for key in FLAGS},
         fields=fields,
-        phases=_triples(path, "agent.phases", row.get("phases", []), NUM_PHASES),
-        moves=_triples(path, "agent.moves", row.get("moves", []), NUM_MOVES),
+        phases=_triples(path, "agent.phases", found.phases),
+        moves=_triples(path, "agent.moves", found.moves),
     )
 
 
 def _triples(
-    path: Path,
-    where: str,
-    rows: Any,  # noqa: ANN401
-    most: int,
+    path: Path, where: str, rows: Sequence[Triple]
 ) -> tuple[tuple[Expression, ...], ...]:
-    if not isinstance(rows, list) or len(rows) > most:
-        raise InputError(f"{path}: {where}: expected at most {most} triples")
-    for row in rows:
-        if not isinstance(row, list) or len(row) != 3:
-            raise InputError(f"{path}: {where}: {row!r}: expected three expressions")
     return tuple(
         tuple(_expression(path, where, value) for value in row) for row in rows
     )

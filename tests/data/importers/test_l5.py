@@ -597,6 +597,8 @@ def element(kind, body):
         element(3, [(2, [(2, 1)]), (3, [(1, b"\x02")]), (4, b"")]),  # 1 x, no y
         element(3, [(2, varint(2 << 3 | 1) + bytes(8)), (3, b""), (4, b"")]),
         element(1, varint(9 << 3 | 1) + bytes(8)),
+        # a frame at 200 degrees north
+        element(3, [(2, [(1, fixture.fixed32(1, 2 * 10**9))]), (3, b""), (4, b"")]),
     ],
 )
 def test_malformed_map(folder, content):

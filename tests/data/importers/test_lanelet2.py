@@ -1,9 +1,9 @@
 """Lanelet2 maps: geometry, links, rules, positions; hostile and broken files."""
 
+import sys
+
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from rcirl_jax.data.importers.lanelet2 import map as lanelet2
 from rcirl_jax.data.importers.lanelet2 import rules as lanelet2_rules
@@ -49,10 +49,17 @@ def test_utm_against_proj(latitude, longitude, zone, expected):
     np.testing.assert_allclose(found[0], expected, atol=1e-6)
 
 
-@given(x=st.floats(-3e4, 3e4), y=st.floats(-3e4, 3e4))
-def test_degrees_and_back(x, y):
-    latitude, longitude = osm.degrees([(x, y)], 32, UTM_ORIGIN)[0]
-    np.testing.assert_allclose(project([latitude], [longitude])[0], (x, y), atol=1e-6)
+def test_the_other_side_of_the_globe_stays_finite():
+    """Lanes there are told apart by their distance, which has to be a number."""
+    places = utm(np.zeros(4), np.array([93.0, -87.0, 183.0, 3.0]), 31)
+    np.testing.assert_allclose(np.abs(places[:3]).max(axis=1), 2e7, rtol=1e-3)
+    np.testing.assert_allclose(places[3], (5e5, 0.0), atol=1e-6)
+
+
+def test_without_pyproj_is_one_line(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyproj", None)
+    with pytest.raises(InputError, match=r"pyproj: not installed .*rcirl-jax\[logs\]"):
+        utm(np.zeros(1), np.zeros(1), 31)
 
 
 def test_southern_hemisphere_is_moved():

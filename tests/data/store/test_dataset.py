@@ -364,7 +364,7 @@ def test_a_shard_without_rows_is_one_line(copy):
     [
         (lambda m: m.update(schema_version=1), "schema_version: 1: expected 2"),
         (lambda m: m.pop("schema_version"), "schema_version: None: expected 2"),
-        (lambda m: m.pop("quality"), "quality: expected"),
+        (lambda m: m.pop("quality"), "quality: missing: expected"),
         (lambda m: m["arrays"].pop("human.s"), "arrays: human.s: None: expected"),
         (
             lambda m: m["arrays"]["human.s"].update(dtype="float64"),

@@ -5,6 +5,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from rcirl_jax.data.importers.shapes import arc_length
 from rcirl_jax.data.readers.xml import Fields
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Ghost, Signal
@@ -134,6 +135,6 @@ def _goal_point(
 
 def _densify(line: np.ndarray) -> np.ndarray:
     """[n, 2] m, about one point a metre along a polyline."""
-    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    arc = arc_length(line)
     at = np.linspace(0.0, arc[-1], int(arc[-1]) + 2)
     return np.stack([np.interp(at, arc, line[:, i]) for i in (0, 1)], axis=1)

@@ -4,6 +4,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from rcirl_jax.data.importers.shapes import MIN_HALF_WIDTH_M, fractions, resample
 from rcirl_jax.data.readers.xml import Fields
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane
@@ -11,7 +12,6 @@ from rcirl_jax.types import Lane
 # of the countries that the format knows; others use the German ids
 LIMIT_SIGNS = ("R2-1", "274", "274.1", "r301")  # US, German (also zones), Spanish
 STOP_SIGNS = ("R1-1", "206", "r2")  # US, German, Spanish
-MIN_HALF_WIDTH_M = 0.1  # m, lanelets taper to a point at forks
 
 
 def read_lanes(
@@ -59,16 +59,6 @@ def _bound(element: Element, tag: str, fields: Fields, where: str) -> np.ndarray
     return np.array(points)
 
 
-def _fractions(points: np.ndarray) -> np.ndarray:
-    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-    return arc / max(arc[-1], 1e-9)
-
-
-def _resample(points: np.ndarray, at: np.ndarray) -> np.ndarray:
-    share = _fractions(points)
-    return np.stack([np.interp(at, share, points[:, i]) for i in (0, 1)], axis=1)
-
-
 def _read_lanelet(
     element: Element, fields: Fields, limits: dict[str, float], stops: set[str]
 ) -> Lane:
@@ -77,8 +67,8 @@ def _read_lanelet(
     left = _bound(element, "leftBound", fields, where)
     right = _bound(element, "rightBound", fields, where)
     if len(left) != len(right):
-        at = np.unique(np.concatenate([_fractions(left), _fractions(right)]))
-        left, right = _resample(left, at), _resample(right, at)
+        at = np.unique(np.concatenate([fractions(left), fractions(right)]))
+        left, right = resample(left, at), resample(right, at)
     half = np.maximum(0.5 * np.hypot(*(left - right).T), MIN_HALF_WIDTH_M)
     signs = [ref.get("ref", "") for ref in element.iter("trafficSignRef")]
     limit = element.find("speedLimit")

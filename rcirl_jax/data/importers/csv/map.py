@@ -8,6 +8,7 @@ from scipy.spatial import KDTree
 
 from rcirl_jax.data.importers.lanes import StraightLane, straight_lanes
 from rcirl_jax.data.importers.options import number, path_option
+from rcirl_jax.data.importers.shapes import arc_length
 from rcirl_jax.data.readers.tables import read_table
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane, Track
@@ -148,7 +149,7 @@ def _paths(tracks: tuple[Track, ...], width: float, limit: float) -> tuple[Lane,
     lanes: list[Lane] = []
     for track in longest[:MAX_PATHS]:
         points = np.stack([track.x, track.y], axis=1)
-        arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+        arc = arc_length(points)
         keep = points[np.unique(arc // PATH_STEP_M, return_index=True)[1]]
         if len(keep) < 3 or any(_near(keep, lane.centre, width) for lane in lanes):
             continue

@@ -14,7 +14,7 @@ from google.protobuf.message import DecodeError
 
 from rcirl_jax.data.importers.l5.messages import COLOURS, read_message
 from rcirl_jax.data.importers.options import path_option
-from rcirl_jax.data.importers.projection import FLATTENING, SEMI_MAJOR_M
+from rcirl_jax.data.importers.projection import earth_centred
 from rcirl_jax.data.importers.shapes import between_bounds, check_coordinates, moves
 from rcirl_jax.data.readers.protobuf import Message
 from rcirl_jax.data.readers.zarr2 import read_json
@@ -261,8 +261,10 @@ def _frame(geo: Message) -> np.ndarray:
     Origin in 1e-7 degrees on the WGS84 ellipsoid; bearing in degrees clockwise from
     north to the local y axis.
     """
-    origin = geo.origin
-    latitude, longitude = np.deg2rad([1e-7 * origin.latitude, 1e-7 * origin.longitude])
+    degrees = [1e-7 * geo.origin.latitude, 1e-7 * geo.origin.longitude]
+    if abs(degrees[0]) > 90.0 or abs(degrees[1]) > 180.0:
+        raise DecodeError(f"frame at latitude, longitude {degrees}: not on Earth")
+    latitude, longitude = np.deg2rad(degrees)
     turn = np.deg2rad(geo.bearing)
     east = np.array([-np.sin(longitude), np.cos(longitude), 0.0])
     up = np.array(
@@ -273,13 +275,11 @@ def _frame(geo: Message) -> np.ndarray:
         ]
     )
     north = np.cross(up, east)
-    square = FLATTENING * (2.0 - FLATTENING)  # 1, of the eccentricity
-    normal = SEMI_MAJOR_M / np.sqrt(1.0 - square * np.sin(latitude) ** 2)
     frame = np.eye(4)
     frame[:3, 0] = np.cos(turn) * east - np.sin(turn) * north
     frame[:3, 1] = np.sin(turn) * east + np.cos(turn) * north
     frame[:3, 2] = up
-    frame[:3, 3] = normal * up * np.array([1.0, 1.0, 1.0 - square])
+    frame[:3, 3] = earth_centred(*degrees)
     return frame
 
 

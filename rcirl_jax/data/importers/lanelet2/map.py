@@ -26,6 +26,13 @@ from rcirl_jax.data.importers.lanelet2.rules import (
     stop_of,
     tag_of,
 )
+from rcirl_jax.data.importers.shapes import (
+    MAX_COORDINATE_M,
+    MIN_HALF_WIDTH_M,
+    arc_length,
+    fractions,
+    resample,
+)
 from rcirl_jax.data.readers.xml import read_xml
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane
@@ -39,11 +46,9 @@ NOT_FOR_VEHICLES = (
     *("sidewalk", "pedestrian", "emergency_lane"),
 )
 MAX_FILE_BYTES = 256 * 1024**2  # bytes, larger files are refused
-MIN_HALF_WIDTH_M = 0.1  # m, lanelets taper to a point at forks
 MIN_STEP_M = 0.25  # m between points of a lane
 SAME_PLACE_M = 1e-3  # m, end points that near are one
 MAX_LATITUDE = 84.0  # degrees, UTM ends there
-MAX_COORDINATE_M = 1e8  # m, farther is no place on earth
 MAX_NODES = 5_000_000  # of all bounds; 2500 km of lanes, a point a metre
 BACKWARDS = "-back"  # appended to the id of a two-way lanelet's other direction
 
@@ -182,20 +187,12 @@ def _resample_both(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray
     Of shares nearer than MIN_STEP_M only one counts: both bounds of a bend have
     points at almost the same place.
     """
-    shares, length = [], 0.0
-    for line in (a, b):
-        arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
-        shares.append(arc / max(arc[-1], 1e-9))
-        length = max(length, float(arc[-1]))
-    at = np.unique(np.concatenate([*shares, [0.0, 1.0]]))
+    length = max(float(arc_length(line)[-1]) for line in (a, b))
+    at = np.unique(np.concatenate([fractions(a), fractions(b), [0.0, 1.0]]))
     steps = np.round(at * length / MIN_STEP_M)
     at = at[np.unique(steps, return_index=True)[1]]
     at = np.append(at[at < 1.0], 1.0) if at.size > 1 else np.array([0.0, 1.0])
-    both = [
-        np.stack([np.interp(at, share, line[:, i]) for i in (0, 1)], axis=1)
-        for share, line in zip(shares, (a, b), strict=True)
-    ]
-    return both[0], both[1]
+    return resample(a, at), resample(b, at)
 
 
 def _link(world: OsmMap, lanelets: list[_Lanelet]) -> Iterator[Lane]:

@@ -2,7 +2,8 @@
 
 Specification: www.geopackage.org/spec, clause 2.1.3: a blob is a head "GP",
 version, flags, srs_id and an optional envelope, then well-known binary. Numbers
-of points are checked against the blob's length before anything is read.
+of points are checked against the blob's length before anything is read. By hand,
+because shapely's reader is no faster and 80 kB of nested lines end its process.
 """
 
 import re

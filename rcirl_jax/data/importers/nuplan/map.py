@@ -36,7 +36,6 @@ MAX_HALF_WIDTH_M = 6.0  # m; a bound farther off is another lane's
 MAX_LIMIT_MPS = 60.0  # m/s; faster "limits" are none
 STOP_SIGN = 1  # stop_polygon_type_fid
 NONE = -1  # no feature's number
-BLOCK = 256  # points measured at once; memory grows with it and the bound
 FOLDERS_UP = 6  # folders above a log in which those of maps are looked for
 SAFE_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,99}")
 CENTRES = ("lane_fid", "lane_connector_fid")
@@ -179,8 +178,7 @@ class NuplanMap:
         (line,) = self._lines("boundaries", [self._bounds[fid]])
         if not len(line):
             return default
-        blocks = np.split(centre, np.arange(BLOCK, len(centre), BLOCK))
-        apart = np.concatenate([distance_to_line(block, line) for block in blocks])
+        apart = distance_to_line(centre, line)
         return np.clip(apart, MIN_HALF_WIDTH_M, MAX_HALF_WIDTH_M)
 
     def _read_centres(

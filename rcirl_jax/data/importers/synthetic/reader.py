@@ -7,10 +7,12 @@ vehicle-disjoint group of its own.
 
 import dataclasses
 import math
+import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, get_args
+from typing import Annotated
 
+import msgspec
 import numpy as np
 
 from rcirl_jax.data.recording import LEAVE_OUT, validate_recording
@@ -19,25 +21,11 @@ from rcirl_jax.data.synthetic.roads import lanes, to_world
 from rcirl_jax.data.synthetic.stops import schedule
 from rcirl_jax.data.synthetic.traffic import Log
 from rcirl_jax.errors import InputError
+from rcirl_jax.runtime.checked import checked
+from rcirl_jax.runtime.settings import check_names
 from rcirl_jax.runtime.specs import load_toml
 from rcirl_jax.types import Kind, Recording, Signal, Track
 
-TOP_KEYS = {
-    "source": str,
-    "licence": str,
-    "rate_hz": (2.0, 50.0),
-    "warmup_s": (0.0, 600.0),
-    "position_noise_m": (0.0, 1.0),
-    "drivers": dict,
-    "recordings": list,
-}
-ENTRY_KEYS = {
-    "road": str,
-    "count": (1, 10000),
-    "duration_s": (1.0, 3600.0),
-    "density_veh_per_km": (1.0, 60.0),
-    "seed": (0, 2**63 - 1),
-}
 # driver settings that may be zero; all others are above it
 MAY_BE_ZERO = (
     "delay_s",
@@ -49,7 +37,6 @@ MAY_BE_ZERO = (
     "sign_wait_s",
     "destination_share",
 )
-WHOLE = ("count", "seed")  # keys that take integers
 MAX_RECORDINGS = 100_000  # of all entries
 BATCH = 32  # recordings simulated together, at most
 SEEN_FROM_M = 30.0  # m, tracks begin this far from the road's start
@@ -57,6 +44,30 @@ SEEN_UNTIL_M = 60.0  # m, and end this far before its end
 MIN_TRACK_S = 1.0  # s, shorter tracks are dropped
 POSITION_STREAM = 1  # last part of a seed: the stream of the position noise
 TRAFFIC_STREAM = 0  # last part of a seed: the stream of the simulation
+
+Text = Annotated[str, msgspec.Meta(min_length=1)]
+
+
+class _File(msgspec.Struct, forbid_unknown_fields=True):
+    """The TOML as it is written."""
+
+    source: Text
+    licence: Text
+    rate_hz: Annotated[float, msgspec.Meta(ge=2.0, le=50.0)]
+    warmup_s: Annotated[float, msgspec.Meta(ge=0.0, le=600.0)]
+    position_noise_m: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
+    drivers: dict
+    recordings: Annotated[list[dict], msgspec.Meta(min_length=1)]
+
+
+class _Entry(msgspec.Struct, forbid_unknown_fields=True):
+    """One of [[recordings]]."""
+
+    road: str
+    count: Annotated[int, msgspec.Meta(ge=1, le=10_000)]
+    duration_s: Annotated[float, msgspec.Meta(ge=1.0, le=3600.0)]
+    density_veh_per_km: Annotated[float, msgspec.Meta(ge=1.0, le=60.0)]
+    seed: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
@@ -74,7 +85,7 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     packaged = {key: value for key, value in spec.items() if key != LEAVE_OUT}
     settings = {**packaged, **own}
     settings["drivers"] = {**_table(spec, "drivers"), **_table(own, "drivers")}
-    _check_keys(path, "", settings, TOP_KEYS)
+    checked(settings, _File, path)
     drivers = driver_config(path, settings["drivers"])
     jobs = _jobs(path, settings)
     return (
@@ -88,110 +99,52 @@ def _table(spec: dict, key: str) -> dict:
     return value if isinstance(value, dict) else {key: value}
 
 
-def _check_keys(path: Path, where: str, found: dict, allowed: dict) -> None:
-    """Every key known, present, of its type and in its range."""
-    for key in found:
-        if key not in allowed:
-            raise InputError(
-                f"{path}: {where}{key}: unknown: expected {', '.join(allowed)}"
-            )
-    for key, rule in allowed.items():
-        if key not in found:
-            raise InputError(f"{path}: {where}{key}: missing")
-        value = found[key]
-        if isinstance(rule, type):
-            if not isinstance(value, rule) or not value:
-                raise InputError(
-                    f"{path}: {where}{key}: {value!r}: expected {rule.__name__}"
-                )
-            continue
-        low, high = rule
-        kinds = (int,) if key in WHOLE else (int, float)
-        if not _is_number(value, kinds) or not low <= value <= high:
-            kind = "an integer" if key in WHOLE else "a number"
-            raise InputError(
-                f"{path}: {where}{key}: {value!r}: expected {kind} "
-                f"from {low:g} to {high:g}"
-            )
-
-
-def _is_number(value: Any, kinds: tuple[type, ...] = (int, float)) -> bool:  # noqa: ANN401
-    if not isinstance(value, kinds) or isinstance(value, bool):
-        return False
-    try:
-        return math.isfinite(value)
-    except OverflowError:  # an integer beyond any float
-        return False
-
-
 def driver_config(path: Path, found: dict) -> DriverConfig:
     """The drivers that a TOML's `drivers` table describes; InputError names a key."""
-    fields = {field.name: field.type for field in dataclasses.fields(DriverConfig)}
-    values = {}
-    for key in found:
-        if key not in fields:
+    fields = [field.name for field in dataclasses.fields(DriverConfig)]
+    check_names(f"{path}: drivers.", found, fields)
+    made = checked(found, DriverConfig, f"{path}: drivers")
+    for key, value in vars(made).items():
+        # a number, [low, high] or [mean, sd, low, high]; the sd may be zero
+        numbers = value if isinstance(value, tuple) else (value,)
+        bounds = numbers[-2:]
+        least = 0.0 if key in MAY_BE_ZERO else sys.float_info.min
+        most = 1.0 if key == "destination_share" else sys.float_info.max
+        good = least <= bounds[0] <= bounds[-1] <= most
+        if not good or not all(0.0 <= x <= most for x in numbers):
+            sign = ">= 0" if key in MAY_BE_ZERO else "> 0"
             raise InputError(
-                f"{path}: drivers.{key}: unknown: expected {', '.join(fields)}"
+                f"{path}: drivers.{key}: {value}: expected {sign}, low <= high"
+                + (", at most 1" if most == 1.0 else "")
             )
-    for key, kind in fields.items():
-        if key not in found:
-            raise InputError(f"{path}: drivers.{key}: missing")
-        values[key] = _driver_value(path, key, found[key], kind)
-    return DriverConfig(**values)
-
-
-def _driver_value(
-    path: Path,
-    key: str,
-    value: Any,  # noqa: ANN401
-    kind: Any,  # noqa: ANN401
-) -> float | tuple[float, ...]:
-    """One distribution: a number, [low, high] or [mean, sd, low, high]; all >= 0."""
-    size: int = 1 if kind is float else len(get_args(kind))
-    form = {1: "a number", 2: "[low, high]", 4: "[mean, sd, low, high]"}[size]
-    sign = ">= 0" if key in MAY_BE_ZERO else "> 0"
-    numbers: list[Any] = value if isinstance(value, list) and size > 1 else [value]
-    good = len(numbers) == size and all(_is_number(x) and x >= 0.0 for x in numbers)
-    # the sd of a spread may be zero; its mean and bounds follow the key's rule
-    bounds = numbers[-2:] if size > 1 else numbers
-    good = good and (sign == ">= 0" or bounds[0] > 0.0)
-    if not good or bounds[0] > bounds[-1]:
-        raise InputError(
-            f"{path}: drivers.{key}: {value!r}: expected {form}, {sign}, low <= high"
-        )
-    if key == "destination_share" and numbers[0] > 1.0:
-        raise InputError(f"{path}: drivers.{key}: {value!r}: expected 0 to 1")
-    return float(numbers[0]) if size == 1 else tuple(float(x) for x in numbers)
+    return made
 
 
 def _jobs(path: Path, settings: dict) -> list[tuple[str, RunConfig]]:
     """(name, run) of every recording."""
     jobs = []
-    for number, entry in enumerate(settings["recordings"], start=1):
-        where = f"recordings[{number}]."
-        if not isinstance(entry, dict):
-            raise InputError(f"{path}: recordings: {entry!r}: expected tables")
-        _check_keys(path, where, entry, ENTRY_KEYS)
-        if entry["road"] not in ROADS:
+    for number, row in enumerate(settings["recordings"], start=1):
+        where = f"{path}: recordings[{number}]"
+        entry = checked(row, _Entry, where)
+        if entry.road not in ROADS:
             raise InputError(
-                f"{path}: {where}road: {entry['road']}: "
-                f"expected one of {', '.join(ROADS)}"
+                f"{where}: road: {entry.road}: expected one of {', '.join(ROADS)}"
             )
-        if len(jobs) + entry["count"] > MAX_RECORDINGS:
+        if len(jobs) + entry.count > MAX_RECORDINGS:
             raise InputError(
-                f"{path}: {where}count: {entry['count']} after {len(jobs)}: "
+                f"{where}: count: {entry.count} after {len(jobs)}: "
                 f"expected up to {MAX_RECORDINGS} of all entries"
             )
-        for index in range(entry["count"]):
+        for index in range(entry.count):
             run = RunConfig(
-                road=entry["road"],
-                duration_s=float(entry["duration_s"]),
-                density_veh_per_km=float(entry["density_veh_per_km"]),
-                seed=(entry["seed"], index, TRAFFIC_STREAM),
+                road=entry.road,
+                duration_s=entry.duration_s,
+                density_veh_per_km=entry.density_veh_per_km,
+                seed=(entry.seed, index, TRAFFIC_STREAM),
                 rate_hz=float(settings["rate_hz"]),
                 warmup_s=float(settings["warmup_s"]),
             )
-            jobs.append((f"{entry['road']}-{number:02d}-{index:03d}", run))
+            jobs.append((f"{entry.road}-{number:02d}-{index:03d}", run))
     return jobs
 
 

@@ -3,6 +3,8 @@
 A lane names the road lines and edges beside it, each for a range of its points.
 All distances of a scenario are found in one go: the nearest point of the named
 line comes from a tree over (x, y, line number), where other lines are far away.
+By hand, because shapely walks a whole line for each point: 1.7 times slower with 200
+lines of 200 points, and without bound with more.
 """
 
 import dataclasses

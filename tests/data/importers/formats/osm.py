@@ -6,8 +6,7 @@ turns right and leads south. A footpath and a two-way access road lie beside it.
 """
 
 import numpy as np
-
-from rcirl_jax.data.importers.projection import utm
+import pyproj
 
 WIDTH = 3.5  # m, of every lane
 TURN_X, RADIUS = 80.0, 15.0  # m, where the right turn begins; of its centre line
@@ -80,19 +79,11 @@ RULES = {
 
 
 def degrees(points, zone, origin):
-    """[n, 2] latitude and longitude of local metres, by Newton's method."""
-    target = np.asarray(points, float) + origin
-    found = np.tile([50.0, 6.0 * zone - 183.0], (len(target), 1))
-    if abs(origin[1]) < 1e6:
-        found[:, 0] = 0.0
-    for _ in range(30):
-        here = utm(found[:, 0], found[:, 1], zone)
-        step = 1e-4
-        north = (utm(found[:, 0] + step, found[:, 1], zone) - here) / step
-        east = (utm(found[:, 0], found[:, 1] + step, zone) - here) / step
-        jacobian = np.stack([north, east], axis=2)
-        found += np.linalg.solve(jacobian, (target - here)[..., None])[..., 0]
-    return found
+    """[n, 2] latitude and longitude of local metres."""
+    project = pyproj.Proj(proj="utm", zone=zone, ellps="WGS84")
+    east, north = np.transpose(np.asarray(points, float) + origin)
+    longitude, latitude = project(east, north, inverse=True)
+    return np.stack([latitude, longitude], axis=1)
 
 
 def lanelet_map(path, place, shift=(0.0, 0.0), lanelets=None, extra=""):
