@@ -48,7 +48,7 @@ def recall(folder: Path) -> None:
 
 def main() -> None:
     """The run's flags -> its page."""
-    folder = Path(flags.FLAGS["workdir"].value)
+    folder = Path(str(flags.FLAGS["workdir"].value))
     recall(folder)
     with only_one(folder):
         draw_again(autotune.made_run(), autotune.sources())
