@@ -612,9 +612,9 @@ def pose_with(**changes):
         (pose_with(t=1e9), r"timestamp_sec: .* s from first to last"),
         (b"", r"timestamp_sec: .* s from first to last"),
         (message([(1, fixture.stamped(0.3))]), r"pose: x: nan"),
-        (b"\xff\xff", r"message 3: .*corrupt: expected an Apollo message"),
-        (b"\x0a\x05\x00", r"message 3: .*corrupt"),
-        (b"\x0b", r"message 3: .*corrupt"),
+        (b"\xff\xff", r"message 3: Error parsing message .*expected an Apollo message"),
+        (b"\x0a\x05\x00", r"message 3: Error parsing message"),
+        (b"\x0b", r"message 3: Error parsing message"),
         # of another type than the descriptors say: as if not set
         (message([(1, 7)]), r"timestamp_sec: .* s from first to last"),
         (message([(1, fixture.stamped(0.3)), (2, [(1, [(1, 5)])])]), r"pose: x: nan"),
@@ -696,8 +696,11 @@ HEADER = fixture.header()
         (HEADER + fixture.section(2, b"\xff" * 11), "varint: no end"),
         (HEADER + fixture.section(2, b"\x0b"), "field 1: wire type 3"),
         (HEADER + fixture.section(2, b"\x09" + bytes(7)), "8 bytes of 7 left"),
-        (HEADER + fixture.section(4, b"\x0a\x05"), "corrupt: expected a cyber record"),
-        (HEADER + fixture.section(4, message([(1, b"\xff")])), "bad UTF-8"),
+        (
+            HEADER + fixture.section(4, b"\x0a\x05"),
+            "Error parsing message .*expected a cyber record",
+        ),
+        (HEADER + fixture.section(4, message([(1, b"\xff")])), "Error parsing message"),
     ],
 )
 def test_malformed_record(tmp_path, content, expected):
@@ -759,7 +762,7 @@ def estimate(*parts):
             channel(estimate(fixture.field_of("header", 1, 11, type_name=".x.Y"))),
             "message type x.Y: not among the descriptors",
         ),
-        (channel(message([(1, b"\xff\xff")])), "corrupt"),
+        (channel(message([(1, b"\xff\xff")])), "Error parsing message"),
         (channel(message([(1, [(4, [(2, [(3, b"x")])])])])), "not among the desc"),
     ],
 )
