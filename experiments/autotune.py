@@ -17,10 +17,10 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments import margins, training
-from experiments.common import cutting, provenance, run
-from experiments.executor import executor
-from experiments.signals import checked_signals, signals_asked
+from experiments.flags import margins, training
+from experiments.flags.common import cutting, provenance, run
+from experiments.flags.executor import executor
+from experiments.flags.signals import checked_signals, signals_asked
 from rcirl_jax.autotune.config import TuneConfig
 from rcirl_jax.autotune.loop import STAGES, tune
 from rcirl_jax.autotune.rehearsal import TEACHERS

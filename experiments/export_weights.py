@@ -20,7 +20,7 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments.common import provenance, run
+from experiments.flags.common import provenance, run
 from rcirl_jax.data.store.joined import open_datasets
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.forms.linear_yaml import reward_yaml

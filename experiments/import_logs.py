@@ -13,9 +13,9 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments.common import cutting, made_by_file, run
-from experiments.executor import executor
-from experiments.signals import checked_signals
+from experiments.flags.common import cutting, made_by_file, run
+from experiments.flags.executor import executor
+from experiments.flags.signals import checked_signals
 from rcirl_jax.data.importers import IMPORTERS
 from rcirl_jax.data.importing import ImportConfig, import_parts
 from rcirl_jax.data.parts import leaving_out, parts_of

@@ -12,7 +12,7 @@ from pathlib import Path
 from absl import flags
 
 from experiments import autotune
-from experiments.common import run
+from experiments.flags.common import run
 from rcirl_jax.autotune.loop import draw_again
 from rcirl_jax.errors import UNFORESEEN, InputError
 from rcirl_jax.runtime.pipeline import FILE, Stages, only_one
