@@ -8,6 +8,7 @@ from rcirl_jax.data.importers.files import is_input
 from rcirl_jax.data.importers.openacc.drive import COLUMN, is_drive
 from rcirl_jax.data.readers.tables.columnar import is_columnar
 from rcirl_jax.data.readers.tables.layout import BLANKS
+from rcirl_jax.data.readers.tables.streams import head_of
 from rcirl_jax.data.readers.tables.table import Table, open_table
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import load_toml, spec_root
@@ -116,10 +117,10 @@ def _is_platoon(file: Path) -> bool:
     if is_columnar(file) or not is_drive(file):
         return False
     try:
-        head = file.open(encoding="utf-8-sig", errors="replace").read(2**16)
-    except OSError:
+        lines = head_of(file)[1]
+    except InputError:
         return False
-    names = (name.strip() for name in head.replace("\n", ",").split(","))
+    names = (name.strip() for line in lines for name in line.split(","))
     return sum(bool(COLUMN.fullmatch(name)) for name in names) > 2
 
 

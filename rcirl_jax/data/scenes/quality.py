@@ -11,7 +11,7 @@ from rcirl_jax.data.scenes.filters import REASONS
 from rcirl_jax.data.scenes.lines import TOO_FEW
 from rcirl_jax.data.scenes.smoothing import HARSH_MPS2, harsh_share
 from rcirl_jax.data.store.dataset import Dataset
-from rcirl_jax.types import Decision, Demonstration, Kind, Recording, Tag
+from rcirl_jax.types import Decision, Demonstration, Kind, Recording, RowCounts, Tag
 
 HEADWAY_STEP_S = 0.01  # s, to which headways are counted
 SPEED_STEP_MPS = 0.05  # m/s, likewise
@@ -230,7 +230,8 @@ def format_quality(report: dict) -> str:
     if "rows" in report:
         rows = report["rows"]
         dropped = dropped_rows(rows)
-        why = ", ".join(f"{n:,} {k}" for k, n in rows.items() if n and k != "read")
+        kinds = [f.name for f in dataclasses.fields(RowCounts) if rows.get(f.name)]
+        why = ", ".join(f"{rows[kind]:,} {kind}" for kind in kinds if kind != "read")
         lines.append(
             f"rows dropped: {dropped:,} of {rows['read']:,} "
             f"({dropped / rows['read']:.2%}): {why}"

@@ -80,7 +80,7 @@ def recognised_form(
     if travel.size < ENOUGH:
         return None
     names = [said] if said else list(CONVENTIONS)
-    units = [unit] if unit else ["rad", "deg"]
+    units = [unit] if unit else ["deg"] if _is_large(headings) else ["rad", "deg"]
     apart = {
         (name, one): _apart(HeadingForm(name=name, unit=one), headings, travel)
         for one, name in itertools.product(units, names)
@@ -94,17 +94,19 @@ def recognised_form(
     note = (
         f"headings read as {best[0]} in {best[1]}, which fits the direction of travel"
     )
-    is_said = best == usual and (said or best[0] == "ccw_from_x") and unit
-    return HeadingForm(name=best[0], unit=best[1], note="" if is_said else note)
+    is_usual = best[0] == (said or "ccw_from_x") and best[1] == (unit or "rad")
+    return HeadingForm(name=best[0], unit=best[1], note="" if is_usual else note)
 
 
 def unjudged_form(headings: np.ndarray, unit: str, spec: AnyMapping) -> HeadingForm:
     """The form where too few road users move: as declared, else the usual one."""
-    known = headings[np.isfinite(headings)]
-    large = bool(known.size) and float(np.max(np.abs(known))) > 2.0 * math.pi + 0.1
-    return HeadingForm(
-        name=declared(spec) or "ccw_from_x", unit=unit or ("deg" if large else "rad")
-    )
+    by_size = "deg" if _is_large(headings[np.isfinite(headings)]) else "rad"
+    return HeadingForm(name=declared(spec) or "ccw_from_x", unit=unit or by_size)
+
+
+def _is_large(headings: np.ndarray) -> bool:
+    """Whether angles are too large for radians of one turn."""
+    return bool(headings.size) and bool(np.max(np.abs(headings)) > 2.0 * math.pi + 0.1)
 
 
 def _apart(form: HeadingForm, headings: np.ndarray, travel: np.ndarray) -> float:

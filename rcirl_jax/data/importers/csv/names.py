@@ -138,7 +138,7 @@ def _score(
     hits = [known.index(word) for word in words if word in known]
     if not hits or own & OTHER:
         return None
-    if field in ("x", "y") and own & MOTION:
+    if field in ("x", "y", "lat", "lon") and own & MOTION:
         return None
     return len(own) - 1, min(hits)
 

@@ -147,7 +147,7 @@ def _clock(table: Table, raw: AnyMapping[str, np.ndarray], guess: Guess) -> None
         unit = "iso"
     else:
         unit = unit_of(name, ("ms", "us", "ns", "s")) or _unit_by_step(name, step)
-        guess.units["t"] = unit
+    guess.units["t"] = unit
     factor = {"iso": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}.get(unit)
     if factor is None or not math.isfinite(step):
         guess.open.append("rate_hz: rows per second of one road user; 10 is assumed")

@@ -23,6 +23,7 @@ MAX_COLUMNS = 10_000  # of a table; logs have some dozens
 SAMPLE_CELLS = 20_000  # cells of the head from which decimals are recognised
 DELIMITERS = {"tab": "\t", "space": " ", "comma": ",", "semicolon": ";", "pipe": "|"}
 TRIED = ("\t", ";", "|", ",")  # delimiters, the likelier first where two cut as well
+HASHES = ("#", "%")  # before comments, and before the header where it is one
 BLANKS = " "  # a delimiter that stands for any run of blanks and tabs
 GROUPS = ",.'’ \u00a0\u202f"  # what may stand between thousands
 MARKED = frozenset(GROUPS) - {"."}
@@ -91,6 +92,7 @@ def recognise(path: Path, section: Mapping) -> tuple[Layout, list[list[str]]]:
     """
     given = _options(path, section)
     encoding, lines = head_of(path, given.get("encoding", ""))
+    lines = [line.lstrip("#% ") if line[:1] in HASHES else line for line in lines]
     quote = _quote(given, lines)
     delimiter = given.get("delimiter") or _delimiter(lines, quote)
     rows = cells_of(lines, delimiter, quote)
@@ -99,7 +101,6 @@ def recognise(path: Path, section: Mapping) -> tuple[Layout, list[list[str]]]:
     else:
         at = min(given.get("skip", _header_line(rows)), len(rows) - 1)
         header, first = [name.strip() for name in rows[at]], at + 1
-        header[0] = header[0].lstrip("#% \ufeff")
     if not any(header):
         raise InputError(f"{path}: header: empty: expected column names and rows")
     if len(header) > MAX_COLUMNS:

@@ -135,7 +135,8 @@ def _recognised(path: Path, data: bytes) -> str:
             return name
     # of letters, digits and commas every other byte is 0
     for first, name in ((1, "utf-16-le"), (0, "utf-16-be")):
-        if len(data) > 3 and data[first::2].count(0) > 0.4 * len(data):
+        zeros = data[first::2].count(0), data[1 - first :: 2].count(0)
+        if zeros[0] > 0.4 * len(data) and zeros[1] < 0.05 * len(data):
             return name
     try:
         codecs.getincrementaldecoder("utf-8")().decode(data)

@@ -20,7 +20,7 @@ from rcirl_jax.data.readers.tables.columnar import (
     is_columnar,
     schema_of,
 )
-from rcirl_jax.data.readers.tables.layout import Layout, recognise
+from rcirl_jax.data.readers.tables.layout import NUMBER, Layout, recognise
 from rcirl_jax.data.readers.tables.ledger import LINE, Ledger
 from rcirl_jax.data.readers.tables.text_rows import text_batches
 from rcirl_jax.errors import InputError, did_you_mean, extra_module
@@ -85,7 +85,7 @@ class Table:
             raise InputError(f"{where}: met twice: expected once")
         known = [name for name in self.header if name]
         hint = did_you_mean(column, known)
-        if not hint and known and not any(c.isalpha() for c in "".join(known)):
+        if sum(bool(NUMBER.fullmatch(name)) for name in known) > len(known) / 2:
             hint = "; no header? name the columns by names in [table]"
         raise InputError(
             f"{where}: missing: expected it among {_shortened(known)}{hint}"
