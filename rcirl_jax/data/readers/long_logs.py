@@ -166,7 +166,8 @@ class Spill:
         self.held = 0  # bytes in the buffers
         self.given = 0.0  # minutes given as pieces
         self._tables: dict[str, np.ndarray] = {}
-        self._tidied: set[int] = set()  # numbers of recordings
+        self._met: set[int] = set()  # numbers of recordings
+        self._tidied: set[int] = set()
 
     def add(self, batch: dict) -> None:
         """Sort a batch's rows into their minutes."""
@@ -178,6 +179,7 @@ class Spill:
         recording = np.zeros(len(rows), np.int64)
         if "recording" in self.names:
             recording = rows[:, self.names.index("recording")].astype(np.int64)
+            self._met.update(np.unique(recording).tolist())
             rows, recording = self._of_wanted(rows, recording)
         minute = np.floor(rows[:, self.names.index("t")] / BLOCK_S).astype(np.int64)
         order = np.lexsort((minute, recording))  # stable: the file's order inside
@@ -223,7 +225,9 @@ class Spill:
 
     def recordings(self) -> list[str | None]:
         """Values of `recording` met, left out ones too; [None] without the field."""
-        return list(self.texts.get("recording", [None]))
+        if "recording" not in self.texts:
+            return [None]
+        return [text for text, n in self.texts["recording"].items() if n in self._met]
 
     def _minutes(self, recording: str | None) -> tuple[int, list[int]]:
         """A recording's number, and its minutes in the order of time."""

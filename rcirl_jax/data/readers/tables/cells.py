@@ -176,8 +176,10 @@ def texts(column: Any, lower: bool) -> tuple[np.ndarray, list[str], np.ndarray]:
     coded = column if types.is_dictionary(column.type) else column.dictionary_encode()
     found = coded.dictionary
     names = [_name(str(value), lower) for value in found.to_pylist()]
-    codes = coded.indices.fill_null(len(names)).to_numpy(zero_copy_only=False)
-    names.append("")
+    codes = coded.indices
+    if codes.null_count:
+        codes, names = codes.fill_null(len(names)), [*names, ""]
+    codes = codes.to_numpy(zero_copy_only=False)
     long = np.array([len(name) > TEXT_CHARS for name in names])
     return codes.astype(np.int64), names, long[codes]
 

@@ -9,9 +9,9 @@ from rcirl_jax.types import RowCounts
 
 LINE = "line"  # column: of each row in the file; the number of the row in Parquet
 SAID = {
-    "unreadable": "unreadable rows dropped",
-    "repeated": "rows met twice, used once",
-    "doubled": "rows of a road user met twice in one frame, one of them used",
+    "unreadable": "unreadable rows dropped; first: {first}",
+    "repeated": "rows met twice, used once",  # wherever they stand
+    "doubled": "rows of a road user twice in one frame, one used; first: {first}",
 }
 MAX_BAD_ROWS = 0.01  # share of rows that may be dropped; the option of this name
 
@@ -60,7 +60,7 @@ class Ledger:
         names = [field.name for field in dataclasses.fields(RowCounts)]
         since = {name: getattr(self, name) - getattr(self.told, name) for name in names}
         notes = [
-            f"{since[why]} {what}; first: {self.firsts.pop(why)}"
+            f"{since[why]} {what.format(first=self.firsts.pop(why))}"
             for why, what in SAID.items()
             if since[why]
         ]

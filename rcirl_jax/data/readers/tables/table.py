@@ -261,7 +261,7 @@ def _readable(
         for field, column in zip(fields, columns, strict=True)
         if field.needed and field.name not in COMMON
     ]
-    blank = np.all(own, axis=0) if own else np.zeros(count, bool)
+    blank = np.all(own, axis=0) if len(own) > 1 else np.zeros(count, bool)
     dropped = np.zeros(count, bool)
     for field, column in zip(fields, columns, strict=True):
         dropped |= column.wrong | (column.empty & field.needed)
