@@ -12,7 +12,8 @@ from rcirl_jax.data.cut import Cut, digest
 from rcirl_jax.data.importers import parts, read_part
 from rcirl_jax.data.importing import Progress, import_parts
 from rcirl_jax.data.parts import Part
-from rcirl_jax.data.readers import csv_stream, long_logs
+from rcirl_jax.data.readers import reading
+from rcirl_jax.data.readers.tables import streams
 from rcirl_jax.data.scenes.quality import QualityReport
 from rcirl_jax.types import Kind, Recording, Track
 from tests.data import small_logs
@@ -118,8 +119,8 @@ def test_a_long_csv_moves_the_bar_and_keeps_its_bytes(tmp_path, monkeypatch, cap
     import_parts([part], tmp_path / "plain", config)
     capsys.readouterr()
 
-    monkeypatch.setattr(csv_stream, "READ_BYTES", 2**14)
-    monkeypatch.setattr(long_logs, "DELAY_S", 0.0)
+    monkeypatch.setattr(streams, "READ_BYTES", 2**14)
+    monkeypatch.setattr(reading, "DELAY_S", 0.0)
     Clock(monkeypatch, step=1.0)
     import_parts([part], tmp_path / "data", config)
     lines = drawn(capsys)
@@ -158,7 +159,7 @@ def test_formats_with_long_parts_say_how_much_is_read(tmp_path):
 
 def test_a_record_shows_how_much_is_read(tmp_path, monkeypatch, capsys):
     """Apollo's drives are one recording each, so the first reading has a bar."""
-    monkeypatch.setattr(long_logs, "DELAY_S", 0.0)
+    monkeypatch.setattr(reading, "DELAY_S", 0.0)
     Clock(monkeypatch, step=1.0)
     found("apollo", apollo.write(tmp_path).input)
     assert any(0 < share < 100 for share in shares(drawn(capsys)))
@@ -169,16 +170,16 @@ def test_quick_reading_and_workers_show_no_bar(tmp_path, monkeypatch, capsys):
     path.write_text("t\n" * 1000)
 
     def read():
-        with long_logs.reading(path, [path]) as show:
+        with reading.reading(path, [path]) as show:
             for _ in itertools.repeat(None, 10):
                 show(300)  # more than there is
         return drawn(capsys)
 
     assert read() == []
-    monkeypatch.setattr(long_logs, "DELAY_S", 0.0)
+    monkeypatch.setattr(reading, "DELAY_S", 0.0)
     clock = Clock(monkeypatch, step=1.0)
     assert max(shares(read())) == 100
-    monkeypatch.setattr(long_logs.multiprocessing, "parent_process", lambda: clock)
+    monkeypatch.setattr(reading.multiprocessing, "parent_process", lambda: clock)
     assert read() == []
 
 
