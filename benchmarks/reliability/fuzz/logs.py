@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.reliability.fuzz import tables
 from benchmarks.reliability.fuzz.codecs import toml_text
 from benchmarks.reliability.fuzz.targets import Several, Target
 from rcirl_jax.data import importers
@@ -52,14 +53,18 @@ def parse_once() -> None:
 
 
 def log_target(
-    name: str, make: Callable[[Path], tuple[Path, list[Path]]], options: str = ""
+    name: str,
+    make: Callable[[Path], tuple[Path, list[Path]]],
+    options: str = "",
+    spec: str = "",
 ) -> Callable[[Path], Target]:
     """A whole import: what `make` writes, read as by the command.
 
     Args:
       name: of the format.
       make: folder -> (input, its files).
-      options: lines put before the packaged source TOML's.
+      options: lines put before the source TOML's.
+      spec: text of the source TOML; "": the packaged one.
     """
 
     def target(folder: Path) -> Target:
@@ -68,7 +73,7 @@ def log_target(
         place, files = make(log)
         source = folder / "source.toml"
         packaged = load_toml(spec_root() / "sources" / f"{name}.toml")
-        source.write_text(options + toml_text(packaged))
+        source.write_text(options + (spec or toml_text(packaged)))
 
         def read() -> None:
             collections.deque(read_recordings(name, place, source), maxlen=0)
@@ -115,13 +120,6 @@ def make_commonroad(folder: Path) -> tuple[Path, list[Path]]:
     groups = folder / "independent_groups.csv"
     groups.write_text(f"file,group\n{file.name},3\nUSA_Test-2_1_T-1.xml,4\n")
     return folder, [file, groups]
-
-
-def make_csv(folder: Path) -> tuple[Path, list[Path]]:
-    """Three cars."""
-    log = folder / "log.csv"
-    writers.table(log, writers.CSV_COLUMNS, writers.csv_rows(count=25))
-    return folder, [log]
 
 
 def make_ngsim(folder: Path) -> tuple[Path, list[Path]]:
@@ -319,8 +317,15 @@ LOGS = {
     "argoverse2": log_target("argoverse2", make_argoverse2),
     "commonroad": log_target("commonroad", make_commonroad),
     "csv": several(
-        log_target("csv", make_csv), log_target("csv", make_csv, "long_bytes = 1\n")
+        log_target("csv", tables.make_csv),
+        log_target("csv", tables.make_csv, "long_bytes = 1\n"),
+        log_target("csv", tables.make_columns),
+        log_target("csv", tables.make_spreadsheet, spec=tables.PEOPLE),
+        log_target("csv", tables.make_degrees, spec=tables.DEGREES),
+        log_target("csv", tables.make_frames, spec=tables.FRAMES),
+        log_target("csv", tables.make_drives, "long_bytes = 1\n", spec=tables.DRIVES),
     ),
+    "suggest": tables.suggest_target,
     "interaction": several(
         log_target("interaction", make_interaction),
         log_target("interaction", make_challenge),

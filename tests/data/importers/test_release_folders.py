@@ -77,7 +77,7 @@ def test_openacc_tables_that_are_no_drives(tmp_path):
 def test_damaged_openacc_drives_are_named(tmp_path, damaged):
     drive(tmp_path / "part1.csv", 1)
     (tmp_path / "part2.csv").write_bytes(damaged)
-    with pytest.raises(InputError, match=r"part2\.csv: (column Time|header)"):
+    with pytest.raises(InputError, match=r"part2\.csv: (column Time|header|rows)"):
         names("openacc", tmp_path)
 
 

@@ -19,6 +19,7 @@ MAX_LINE = 2**24  # characters of a line; pNEUMA writes a drive of minutes into 
 MAX_SPAN = 20  # lines of one row, by line ends inside of quotes
 HEAD_LINES = 60  # lines from which a layout is recognised
 HEAD_BYTES = 2**16  # bytes read at a time for them
+MIN_ASCII = 0.2  # share of a head's characters; another encoding has fewer
 PACKED = {
     b"\x1f\x8b": "gzip",
     b"\x28\xb5\x2f\xfd": "zstd",
@@ -113,6 +114,10 @@ def head_of(path: Path, encoding: str = "") -> tuple[str, list[str]]:
         raise line_error(path)
     if not whole.strip():
         raise InputError(f"{path}: rows: none: expected a header and rows")
+    if sum(map(str.isascii, whole)) < MIN_ASCII * len(whole):  # digits are
+        raise InputError(
+            f"{path}: header: hardly any ASCII as {encoding}: expected a table"
+        )
     return encoding, whole.removesuffix("\n").split("\n")[:HEAD_LINES]
 
 
@@ -151,9 +156,10 @@ def _decoder(path: Path, encoding: str) -> io.IncrementalNewlineDecoder:
     """Bytes -> text, line feeds at its lines' ends; bad bytes show as numbers."""
     try:
         made = codecs.getincrementaldecoder(encoding)("backslashreplace")
-        if not isinstance(made.decode(b"", final=True), str):
+        if not isinstance(made.decode(b"t,1\n", final=True), str):
             raise LookupError(encoding)
-    except (LookupError, UnicodeError) as error:
+        made.reset()
+    except (LookupError, ValueError) as error:
         raise InputError(
             f"{path}: table.encoding: {encoding[:40]}: expected one that Python knows, "
             "such as utf-8, utf-16, cp1252"
