@@ -18,12 +18,11 @@ from experiments.flags.common import processor, provenance
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.data.scenes.config import CollectConfig
-from rcirl_jax.data.store.dataset import Dataset, open_dataset
-from rcirl_jax.data.store.writer import DatasetWriter
+from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import RewardConfig, init_reward, pinned
 from rcirl_jax.runtime.atomic_files import write_json
-from rcirl_jax.types import Demonstration, Normaliser, RewardParams
+from rcirl_jax.types import Normaliser, RewardParams
 
 STRIDE_S = 60.0  # s between planning frames of the synthetic dataset
 
@@ -120,34 +119,6 @@ def untrained(preset: str = "paper21") -> tuple[RewardParams, Normaliser]:
     return params, Normaliser(
         lower=lower, upper=upper, location=location, scale=upper - lower
     )
-
-
-def stored_scenes(
-    folder: Path, rows: Demonstration, count: int, shard: int = 4096
-) -> Dataset:
-    """A dataset of `count` scenes, all for training, that repeat `rows`.
-
-    Speed at the start differs by a thousandth and the frame is the row's number.
-    """
-    writer, rng = DatasetWriter(folder), np.random.default_rng(0)
-    for start in range(0, count, shard):
-        number = np.arange(start, min(start + shard, count))
-        picked = jax.tree.map(lambda x, n=number: x[n % x.shape[0]], rows)
-        ego, zero = picked.scene.ego, np.zeros(number.size, np.int32)
-        speed = ego.v * (1.0 + 1e-3 * rng.standard_normal(number.size))
-        scene = picked.scene.replace(ego=ego.replace(v=speed.astype(np.float32)))
-        picked = picked.replace(
-            scene=scene,
-            vehicle=zero,
-            group=zero,
-            recording=zero,
-            frame=number.astype(np.int32),
-        )
-        writer.write_shard(start // shard, picked, [])
-    names: dict = {key: ["made"] for key in ("recordings", "groups", "vehicles")}
-    rest: dict = {"rate_hz": [10.0], "sources": [], "quality": {}, "import": {}}
-    writer.finish({**names, **rest, "splits": {"train": ["made"]}})
-    return open_dataset(folder, verify=False)
 
 
 # source TOML of generated CSV logs: one straight lane

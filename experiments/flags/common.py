@@ -172,13 +172,6 @@ def floats(values: list[str], flag: str) -> tuple[float, ...]:
         raise InputError(f"--{flag}: {values}: expected numbers") from error
 
 
-def whole_numbers(values: list[str], flag: str) -> list[int]:
-    """A comma list of numbers above zero, with the flag's name on error."""
-    if not values or not all(value.isdecimal() and int(value) for value in values):
-        raise InputError(f"--{flag}: {values}: expected whole numbers above 0")
-    return [int(value) for value in values]
-
-
 def hidden_sizes(values: list[str], flag: str = "hidden_size") -> tuple[int, ...]:
     """Units per layer: "15", "32,16", or "0" for the linear reward."""
     try:
@@ -230,18 +223,17 @@ def provenance(weights: Sequence[str] = (), *, logs: Sequence[Part] = ()) -> dic
 
 
 def made_by_file(
-    weights: Sequence[str] = (), more: Mapping[str, object] | None = None
+    more: Mapping[str, object] | None = None,
 ) -> Callable[[Dataset], None]:
     """What writes a new dataset's made_by.json: its hash, provenance and `more`.
 
     Args:
-      weights: weights files that decided what the dataset holds.
       more: further facts.
     """
 
     def write(dataset: Dataset) -> None:
         facts = {"data_hash": dataset.hash, **(more or {})}
-        dataset.write_facts({**facts, "made_by": provenance(weights)})
+        dataset.write_facts({**facts, "made_by": provenance()})
 
     return write
 

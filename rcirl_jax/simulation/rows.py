@@ -28,7 +28,6 @@ from rcirl_jax.planner.rank import (
 )
 from rcirl_jax.planner.yielding import Yielding, yielding_policy
 from rcirl_jax.reward import RewardConfig, init_reward, pinned
-from rcirl_jax.reward.hand import TUNED_ROW, LatticeCost
 from rcirl_jax.reward.speed_dp import SPEED_DP_ROW
 from rcirl_jax.types import Normaliser, RewardParams
 
@@ -82,12 +81,6 @@ def dp_row(
     """A learned reward planning by dynamic programming, every `plan_every` steps."""
     policy = dp_policy(feature_map(preset), activation, config, dp)
     return Row(name=name, policy=policy, params=weights, plan_every=plan_every)
-
-
-def tuned_row(cost: LatticeCost, config: RankConfig) -> Row:
-    """The hand-set cost with other weights, ranking like the hand-set one."""
-    policy = rank_policy(hand_score, config)
-    return Row(name=TUNED_ROW, policy=policy, params=cost.fields())
 
 
 def human_row() -> Row:

@@ -223,8 +223,6 @@ def train_grid(
     config: TrainConfig,
     leaky_rates: Sequence[float],
     seeds: Sequence[int],
-    *,
-    keep: Sequence[str] | None = None,
 ) -> dict[float, list[Learned]]:
     """Leaky rates x seeds as members of one program; they share the batch order."""
     grid = [
@@ -232,7 +230,7 @@ def train_grid(
         for rate in leaky_rates
         for seed in seeds
     ]
-    normaliser = normaliser_of(frozen, config, keep)
+    normaliser = normaliser_of(frozen, config)
     fitted = fit(frozen, normaliser, config, members_of(grid))
     each = [jax.tree.map(lambda leaf, n=n: leaf[n], fitted) for n in range(len(grid))]
     runs = iter(
