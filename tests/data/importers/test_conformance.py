@@ -334,6 +334,37 @@ def test_damaged_files(name, damage, tmp_path):
         assert not target.exists(), f"{path.name}: code was executed"
 
 
+def damaged(content, rng, is_head_kept):
+    """The content with up to 30 bytes changed, or one; its head may be kept."""
+    start = len(content) // 10 if is_head_kept else 0
+    changed = bytearray(content)
+    for place in rng.integers(start, len(content), rng.choice([1, 4, 30])):
+        changed[place] = rng.integers(0, 256)
+    return bytes(changed)
+
+
+def test_changed_bytes_are_one_line_or_read(name, tmp_path):
+    fixture = write(name, tmp_path)
+    whole = [digest(recording) for recording in read(name, fixture)]
+    rng = np.random.default_rng(0)
+    for path in fixture.files:
+        content, refusals = path.read_bytes(), 0
+        for attempt in range(16):
+            path.write_bytes(damaged(content, rng, attempt % 2))
+            try:
+                recordings = read(name, fixture)
+            except InputError as error:
+                assert "\n" not in str(error)  # noqa: PT017
+                refusals += 1
+            else:
+                for recording in recordings:
+                    validate_recording(recording)
+                if path in fixture.checked:
+                    assert [digest(recording) for recording in recordings] == whole
+        path.write_bytes(content)
+        assert refusals > 4 or path not in fixture.checked
+
+
 def test_the_last_line_needs_no_newline(name, tmp_path):
     fixture = write(name, tmp_path)
     whole = [digest(recording) for recording in read(name, fixture)]

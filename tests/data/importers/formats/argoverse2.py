@@ -232,6 +232,7 @@ def write(folder):
         tracks=expected(),
         num_lanes=6,
         files=files,
+        checked=files[:1],
         numbers={files[1]: '"x": ([^,}]*)'},
         is_counted=True,
     )

@@ -289,4 +289,5 @@ def write(folder):
         num_lanes=4,
         num_signals=1,
         files=(path,),
+        checked=(path,),
     )
