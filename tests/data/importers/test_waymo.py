@@ -307,7 +307,7 @@ def shown(folder, states, **options):
     return scenario(folder, options, f7=rows)
 
 
-COLOURS = "off red yellow green red yellow green off off".split()
+COLOURS = ["off", *2 * ["red", "yellow", "green"], "off", "off"]
 
 
 @pytest.mark.parametrize(("state", "colour"), [*enumerate(COLOURS)])

@@ -113,24 +113,23 @@ def write_log(path):
     x = users["ego"].x - AHEAD - 8.0 * EARLY_S + CENTRE[0]
     y = users["ego"].y + CENTRE[1]
     stamps = [START_US + round(t * 1e6) for t in STAMPS.tolist()]
-    turned, speed, log = (1.0, 0.0, 0.0, 0.0), (8.0, 0.0, 0.0), (32611, token(1))
+    rest = (1.0, *[0.0] * 3, 8.0, 0.0, 0.0, 32611, token(1))  # turned, speed, log
+    early = [stamp - round(EARLY_S * 1e6) for stamp in stamps]
     pose = [
-        (token(3000 + k), stamp - round(EARLY_S * 1e6), float(x[k]), float(y[k]), 600.0)
-        + (*turned, *speed, *log)
-        for k, stamp in enumerate(stamps)
+        (token(3000 + k), early[k], float(x[k]), float(y[k]), 600.0, *rest)
+        for k in range(161)
     ]
     # of an image, which no point cloud refers to
-    pose.append((token(9000), START_US + 11, *[0.0] * 10, *log))
+    pose.append((token(9000), START_US + 11, *[0.0] * 10, 32611, token(1)))
     links = [(None, None, token(3000 + k), token(2), token(4)) for k in range(161)]
     cloud = [
         (token(5000 + k), *links[k], f"{k}.pcd", stamp)
         for k, stamp in enumerate(stamps)
     ]
-    tracks = [
-        (TRACK[name], token(100 + CATEGORIES.index(CATEGORY[users[name].kind])))
-        + (users[name].width, users[name].length, 1.6)
-        for name in LABELS
-    ]
+    tracks = []
+    for name in LABELS:
+        kind = token(100 + CATEGORIES.index(CATEGORY[users[name].kind]))
+        tracks.append((TRACK[name], kind, users[name].width, users[name].length, 1.6))
     lights = []
     for k in range(161):
         state = "green" if k >= GREEN_FROM else "red"
