@@ -144,16 +144,12 @@ $(VENV)/.bench: pyproject.toml | setup
 bench: export JAX_PLATFORMS = cpu
 bench: $(VENV)/.bench
 	$(BIN)/python -m benchmarks.training
-	$(BIN)/python -m benchmarks.layouts
-	$(BIN)/python -m benchmarks.scaling
 	$(BIN)/python -m benchmarks.sweep
 	$(BIN)/python -m benchmarks.suite
 	taskset -c 0 $(BIN)/python -m benchmarks.dp
 	taskset -c 0 $(BIN)/python -m benchmarks.single_plan
 	taskset -c 0 $(BIN)/python -m benchmarks.onboard
 	$(BIN)/python -m benchmarks.importing --data=$(RECORDINGS)
-	$(BIN)/python -m benchmarks.streaming
-	$(BIN)/python -m benchmarks.memory
 	$(BIN)/python -m benchmarks.paper_scale
 	$(BIN)/python -m benchmarks.plots
 

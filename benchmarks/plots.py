@@ -1,11 +1,10 @@
-"""Draws docs/performance.png and docs/scaling.png from benchmarks/results.
+"""Draws docs/performance.png from benchmarks/results/training.json.
 
     python -m benchmarks.plots
 
-performance.png: queries (or candidates) per second on one core and on all, of ours
-the faster way to use them. Rows of all cores that were taken on a busy machine are
-not drawn (see `benchmarks.training`). scaling.png: what a training step does per
-second as one size grows. A picture whose numbers are not there is left out.
+Queries (or candidates) per second on one core and on all, of ours the faster way to
+use them. Rows of all cores that were taken on a busy machine are not drawn (see
+`benchmarks.training`).
 """
 
 import json
@@ -29,14 +28,6 @@ BARS = {
     "ours/": ("ours, cached features", CHOSEN),
     "end_to_end/": ("ours, end to end", CHOSEN),
     "candidates/": ("candidates with features", CLASS_COLOURS["follow"]),
-}
-
-# curve of scaling.json: (its axis, what is counted per second, how that is called)
-CURVES = {
-    "candidates": ("candidates of a scene", "candidates_per_s", "candidates/s"),
-    "obstacles": ("obstacle slots of a scene", "candidates_per_s", "candidates/s"),
-    "scenes": ("scenes of a batch", "queries_per_s", "queries/s"),
-    "devices": ("devices", "queries_per_s", "queries/s"),
 }
 
 
@@ -67,31 +58,10 @@ def _bars(found: dict) -> Figure:
     return made
 
 
-def _curves(found: dict) -> Figure:
-    """A panel per size that grows."""
-    made, axes = figure(1, len(CURVES), 3.0 * len(CURVES), 2.6)
-    for axis, (name, (size, rate, unit)) in zip(axes[0], CURVES.items(), strict=True):
-        at = [point[name] for point in found[name]]
-        axis.plot(at, [point[rate] / 1e6 for point in found[name]], "o-", color=CHOSEN)
-        axis.set_xscale("log", base=2)
-        axis.set_xticks(at, [f"{x:,}" for x in at], minor=False)
-        axis.set_ylim(0.0, 1.05 * axis.get_ylim()[1])
-        label(axis, size, "", f"million {unit}")
-    return made
-
-
-PICTURES = {"performance": ("training", _bars), "scaling": ("scaling", _curves)}
-
-
 def main(_: list[str]) -> None:
-    """Every picture whose numbers are there."""
-    for picture, (name, draw) in PICTURES.items():
-        source = Path(_RESULTS.value) / f"{name}.json"
-        if not source.exists():
-            print(f"left out: {picture}.png: {source}: not there")
-            continue
-        made = draw(json.loads(source.read_text()))
-        print(f"written: {save(made, Path(_OUTPUT.value) / f'{picture}.png')}")
+    """The picture of what `benchmarks.training` wrote."""
+    made = _bars(json.loads((Path(_RESULTS.value) / "training.json").read_text()))
+    print(f"written: {save(made, Path(_OUTPUT.value) / 'performance.png')}")
 
 
 if __name__ == "__main__":

@@ -17,15 +17,16 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments import margins, training
-from experiments.common import cutting, provenance, run
-from experiments.executor import executor
-from experiments.signals import checked_signals, signals_asked
+from experiments.flags import margins, training
+from experiments.flags.common import cutting, provenance, run
+from experiments.flags.executor import executor
+from experiments.flags.signals import checked_signals, signals_asked
 from rcirl_jax.autotune.config import TuneConfig
 from rcirl_jax.autotune.loop import STAGES, tune
 from rcirl_jax.autotune.rehearsal import TEACHERS
 from rcirl_jax.autotune.run import Run
 from rcirl_jax.data.importers import IMPORTERS
+from rcirl_jax.data.importers.recognise import recognised_format
 from rcirl_jax.data.importing import ImportConfig
 from rcirl_jax.data.logs import Logs
 from rcirl_jax.errors import InputError, did_you_mean
@@ -37,7 +38,7 @@ _DATA = flags.DEFINE_list("data", None, "datasets, instead of imports")
 _SYNTHETIC = flags.DEFINE_bool(
     "synthetic", False, "embedded synthetic traffic instead of data"
 )
-_FORMAT = flags.DEFINE_list("format", None, "of each --input")
+_FORMAT = flags.DEFINE_list("format", None, "of each --input (default: recognised)")
 _INPUT = flags.DEFINE_list("input", None, "recordings to import, one or several logs")
 _SOURCE = flags.DEFINE_list("source", None, "TOML of columns and units of each --input")
 _CUT = cutting(said=training.AS_SAID)
@@ -122,24 +123,22 @@ def sources() -> list[str | Logs]:
         return list(_DATA.value)
     if _SYNTHETIC.value:
         return [_logs("synthetic", None, None)]
-    inputs, formats = _INPUT.value or [], _FORMAT.value or []
-    count, sources = len(inputs), _SOURCE.value or []
-    if len(formats) != count or len(sources) not in (0, count):
+    inputs = [Path(path) for path in _INPUT.value or []]
+    count = len(inputs)
+    named = _SOURCE.value or [""] * count
+    if len(named) != count or len(_FORMAT.value or inputs) != count:
         raise InputError(
-            f"--format, --source: {len(formats)} and {len(sources)}: expected one for "
-            f"each of the {count} --input"
+            f"--format, --source: {len(_FORMAT.value or [])} and "
+            f"{len(_SOURCE.value or [])}: expected one for each of the {count} --input"
         )
-    for name in formats:
+    sources = [Path(source) if source else None for source in named]
+    for name in _FORMAT.value or []:
         if name not in IMPORTERS:
             known = ", ".join(sorted(IMPORTERS))
             hint = did_you_mean(name, IMPORTERS)
             raise InputError(f"--format: {name}: expected one of {known}{hint}")
-    return [
-        _logs(name, Path(path), Path(source) if source else None)
-        for name, path, source in zip(
-            formats, inputs, sources or [""] * count, strict=True
-        )
-    ]
+    formats = _FORMAT.value or map(recognised_format, inputs, sources)
+    return list(map(_logs, formats, inputs, sources))
 
 
 def _logs(name: str, path: Path | None, source: Path | None) -> Logs:

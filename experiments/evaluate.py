@@ -10,8 +10,8 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments.common import provenance, run
-from experiments.executor import executor
+from experiments.flags.common import provenance, run
+from experiments.flags.executor import executor
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments.common import provenance, run
+from experiments.flags.common import provenance, run
 from rcirl_jax.data.store.joined import open_datasets
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.forms.linear_yaml import reward_yaml
@@ -62,12 +62,12 @@ def main() -> None:
     elif _ONNX.value or _YAML.value:
         raise InputError("--onnx, --yaml: expected --weights with them")
     elif files:
-        made = exported_run(Path(_WORKDIR.value))
+        made = exported_run(Path(str(_WORKDIR.value)))
         for name, path in files.items():
             write_stablehlo(path, made, FORMS[name])
             print(f"written: {path}")
     else:
-        workdir = Path(_WORKDIR.value)
+        workdir = Path(str(_WORKDIR.value))
         output = Path(_OUTPUT.value or workdir / "weights.msgpack")
         dataset = open_datasets(_DATA.value or datasets_of(workdir))
         reward = export_run(workdir, dataset, output, ranges=_RANGES.value)

@@ -15,9 +15,9 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments import margins
-from experiments.common import provenance, run
-from experiments.executor import executor
+from experiments.flags import margins
+from experiments.flags.common import provenance, run
+from experiments.flags.executor import executor
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.files import runs_of

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments import margins
-from experiments.common import provenance, run
+from experiments.flags import margins
+from experiments.flags.common import provenance, run
 from rcirl_jax.evaluation.closed_loop.files import runs_of
 from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, run_suite
 from rcirl_jax.evaluation.gate.errors import made_rows, table, tallied, with_faults

@@ -33,9 +33,9 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments import training
-from experiments.common import provenance, run, unread
-from experiments.holdout import splits
+from experiments.flags import training
+from experiments.flags.common import provenance, run, unread
+from experiments.flags.holdout import splits
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.evaluation.ranking.evaluate import (

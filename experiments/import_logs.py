@@ -1,6 +1,11 @@
 """Import recorded driving into a dataset.
 
     python -m experiments.import_logs --format=commonroad --input=DIR --output=DATASET
+    python -m experiments.import_logs --suggest=log.csv
+
+The second line writes the TOML of --source for a table (log.toml, or --output), and
+shows its first rows as understood, what was recognised and what is not known. Without
+--format an input is recognised by its names.
 
 Prints the data-quality report and writes it into DATASET/manifest.json; commit,
 versions, flags and the oracle floor stand in DATASET/made_by.json. An interrupted
@@ -13,21 +18,29 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments.common import cutting, made_by_file, run
-from experiments.executor import executor
-from experiments.signals import checked_signals
+from experiments.flags.common import cutting, made_by_file, run
+from experiments.flags.executor import executor
+from experiments.flags.signals import checked_signals
 from rcirl_jax.data.importers import IMPORTERS
+from rcirl_jax.data.importers.csv.suggest import suggested
+from rcirl_jax.data.importers.files import table_stem
+from rcirl_jax.data.importers.recognise import recognised_format
 from rcirl_jax.data.importing import ImportConfig, import_parts
 from rcirl_jax.data.parts import leaving_out, parts_of
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.data.scenes.quality import format_quality, format_splits
 from rcirl_jax.data.store.dataset import Dataset
+from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, oracle_floor
+from rcirl_jax.runtime.atomic_files import write_whole
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.sampling.config import MODES
 
 _FORMAT = flags.DEFINE_enum(
-    "format", "synthetic", sorted(IMPORTERS), "log format to read"
+    "format", None, sorted(IMPORTERS), "log format to read (default: recognised)"
+)
+_SUGGEST = flags.DEFINE_string(
+    "suggest", None, "table for which the TOML of --source is written; no import"
 )
 _INPUT = flags.DEFINE_string(
     "input", None, "file or folder (synthetic: a TOML of recordings)"
@@ -35,7 +48,7 @@ _INPUT = flags.DEFINE_string(
 _SOURCE = flags.DEFINE_string(
     "source", None, "TOML that maps columns and units (default: data_specs/sources)"
 )
-_OUTPUT = flags.DEFINE_string("output", None, "dataset to write", required=True)
+_OUTPUT = flags.DEFINE_string("output", None, "dataset to write")
 _OVERWRITE = flags.DEFINE_bool("overwrite", False, "replace a finished dataset")
 _CUT = cutting(CollectConfig())
 _MIN_FUTURE = flags.DEFINE_float("min_future", 5.2, "s of recording a scene needs")
@@ -59,15 +72,21 @@ _SPLIT_SEED = flags.DEFINE_integer("split_seed", 0, "order in which groups are d
 
 
 def main() -> None:
-    """Flags -> one import."""
+    """Flags -> one import, or the TOML for one."""
+    if _SUGGEST.value:
+        suggest(Path(_SUGGEST.value))
+        return
+    if not _OUTPUT.value:
+        raise InputError("--output: not given: expected the dataset to write")
     places = executor()
-    parts = parts_of(
-        _FORMAT.value,
-        Path(_INPUT.value) if _INPUT.value else None,
-        Path(_SOURCE.value) if _SOURCE.value else None,
-    )
+    path = Path(_INPUT.value) if _INPUT.value else None
+    source = Path(_SOURCE.value) if _SOURCE.value else None
+    form = _FORMAT.value or recognised_format(path, source)
+    if _FORMAT.value is None and path is not None:
+        print(f"--format={form}: recognised", flush=True)
+    parts = parts_of(form, path, source)
     config = ImportConfig(
-        format=_FORMAT.value,
+        format=form,
         collect=_CUT(
             CollectConfig(
                 smoothing_s=_SMOOTHING.value,
@@ -108,6 +127,25 @@ def main() -> None:
             f"{floor['horizon_s']:g} s, {floor['scenes']} scenes"
         )
     print(f"dataset: {_OUTPUT.value}")
+
+
+def suggest(table: Path) -> None:
+    """Write a source TOML for a table, and show what it makes of the first rows."""
+    if not table.is_file():
+        raise InputError(f"{table}: --suggest: missing: expected a table")
+    target = Path(_OUTPUT.value or f"{table_stem(table)}.toml")
+    if target.exists() and not _OVERWRITE.value:
+        raise InputError(
+            f"{target}: there already: expected --overwrite, or another --output"
+        )
+    found = suggested(table)
+    write_whole(target, found.toml)
+    print(*found.lines, sep="\n")
+    print(
+        f"\nwritten: {target}; read it through, then\n"
+        f"  python -m experiments.import_logs --format=csv --source={target} "
+        f"--input={table} --output=DATASET"
+    )
 
 
 def _floors(dataset: Dataset) -> list[dict]:

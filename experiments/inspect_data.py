@@ -11,7 +11,7 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments.common import provenance, run
+from experiments.flags.common import provenance, run
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.report.data.page import choose_rows, write_data_page

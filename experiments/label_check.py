@@ -14,8 +14,8 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments.common import provenance, run
-from experiments.executor import executor
+from experiments.flags.common import provenance, run
+from experiments.flags.executor import executor
 from rcirl_jax.evaluation.labels.scores import format_labels
 from rcirl_jax.evaluation.labels.traffic import measure_traffic
 from rcirl_jax.report.data.label_picture import label_chart

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments.common import provenance, run
+from experiments.flags.common import provenance, run
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.closed_loop import table_rows
 from rcirl_jax.report.player.page import write_replay_page

@@ -1,9 +1,10 @@
 """Draw the page of a tuning run again, as this version draws it.
 
-    python -m experiments.report --workdir=RUN
+    python -m experiments.report --workdir=RUN [--output=report.html]
 
 RUN is of `experiments.autotune`, finished up to its verdict. Its settings and sources
-are those that RUN/stages.json has noted; nothing but RUN/report.html is made.
+are those that RUN/stages.json has noted; nothing but RUN/report.html, and its copy
+--output, is made.
 """
 
 from collections.abc import Mapping
@@ -12,10 +13,13 @@ from pathlib import Path
 from absl import flags
 
 from experiments import autotune
-from experiments.common import run
+from experiments.flags.common import run
 from rcirl_jax.autotune.loop import draw_again
 from rcirl_jax.errors import UNFORESEEN, InputError
+from rcirl_jax.runtime.atomic_files import write_whole
 from rcirl_jax.runtime.pipeline import FILE, Stages, only_one
+
+_OUTPUT = flags.DEFINE_string("output", None, "copy of RUN/report.html to write")
 
 NOT_OF_A_RUN = ("workdir", "executor", "workers", "ray_address")
 
@@ -48,10 +52,13 @@ def recall(folder: Path) -> None:
 
 def main() -> None:
     """The run's flags -> its page."""
-    folder = Path(flags.FLAGS["workdir"].value)
+    folder = Path(str(flags.FLAGS["workdir"].value))
     recall(folder)
     with only_one(folder):
-        draw_again(autotune.made_run(), autotune.sources())
+        made = autotune.made_run()
+        draw_again(made, autotune.sources())
+    if _OUTPUT.value:
+        write_whole(Path(_OUTPUT.value), made.page.read_bytes())
 
 
 if __name__ == "__main__":

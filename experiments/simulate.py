@@ -18,8 +18,8 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments.common import provenance, run
-from experiments.executor import executor
+from experiments.flags.common import provenance, run
+from experiments.flags.executor import executor
 from rcirl_jax.data.importers import IMPORTERS
 from rcirl_jax.data.parts import Part, parts_of, recordings_of_all
 from rcirl_jax.data.store.joined import JoinedDatasets, open_datasets

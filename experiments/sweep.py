@@ -18,10 +18,10 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments import training
-from experiments.common import floats, hidden_sizes, provenance, run, unread
-from experiments.executor import executor
-from experiments.recipe import AS_SAID
+from experiments.flags import training
+from experiments.flags.common import floats, hidden_sizes, provenance, run, unread
+from experiments.flags.executor import executor
+from experiments.flags.recipe import AS_SAID
 from rcirl_jax.evaluation.ranking.sweep import CHOICES, SweepConfig
 from rcirl_jax.export.sweep.result import table
 from rcirl_jax.export.sweep.run import run_sweep

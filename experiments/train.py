@@ -16,8 +16,8 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments import training
-from experiments.common import provenance, run
+from experiments.flags import training
+from experiments.flags.common import provenance, run
 from rcirl_jax.data.store.joined import open_datasets
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.parallel import PARALLEL

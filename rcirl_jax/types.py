@@ -278,6 +278,16 @@ class Ghost:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class RowCounts:
+    """Rows of a table that an importer read, and those of them that it dropped."""
+
+    read: int = 0
+    unreadable: int = 0  # a cell that cannot be read, or a needed one that is empty
+    repeated: int = 0  # equal to another
+    doubled: int = 0  # one road user, twice in one frame
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Recording:
     """One log, importer-independent. What every importer must produce."""
 
@@ -293,6 +303,8 @@ class Recording:
     group: str | None = None
     default_speed_limit: float = 29.06  # m/s, where a lane has none (65 mph)
     notes: tuple[str, ...] = ()  # shown in the quality report
+    # of the table behind it, counted once where a file holds several recordings
+    rows: RowCounts = dataclasses.field(default=RowCounts(), compare=False)
     # a piece of a log too long for memory: the log's name, and the times [s] from
     # the first to before the second at which scenes begin; tracks reach beyond
     piece_of: str | None = None

@@ -46,7 +46,7 @@ from benchmarks.reliability.memory import (
     peak_problems,
     thinned,
 )
-from experiments.common import provenance, run
+from experiments.flags.common import provenance, run
 from rcirl_jax.data.store.files import MARK
 from rcirl_jax.data.store.shards import shard_key
 from rcirl_jax.errors import InputError

@@ -45,7 +45,7 @@ from benchmarks.reliability.memory import (
     memory_growth,
 )
 from benchmarks.reliability.small import SHARD_SCENES
-from experiments.common import provenance, run
+from experiments.flags.common import provenance, run
 from rcirl_jax.autotune.config import TuneConfig
 from rcirl_jax.autotune.loop import tune
 from rcirl_jax.autotune.run import Run

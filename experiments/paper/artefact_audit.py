@@ -14,7 +14,7 @@ candidate in 63 %: the recording leaves a trace. `--quick`: under a minute.
 
 import numpy as np
 
-from experiments.common import run
+from experiments.flags.common import run
 from experiments.paper.common import (
     base,
     dataset,

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import ttest_ind
 
-from experiments.common import run
+from experiments.flags.common import run
 from experiments.paper.common import base, dataset, fixed, picture, seeds, write
 from rcirl_jax.evaluation.exact import holm
 from rcirl_jax.evaluation.ranking.learners import (

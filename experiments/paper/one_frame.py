@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from absl import flags
 
-from experiments.common import run
+from experiments.flags.common import run
 from experiments.paper.common import (
     OUTPUT,
     as_used,

@@ -12,7 +12,7 @@ mean nothing.
 
 import numpy as np
 
-from experiments.common import run
+from experiments.flags.common import run
 from experiments.paper.common import HORIZON, base, dataset, picture, seeds, write
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.evaluation.ranking.format import format_table

@@ -38,7 +38,7 @@ import numpy as np
 from absl import flags
 from numpy.typing import ArrayLike
 
-from experiments.common import made_by_file, provenance, run
+from experiments.flags.common import made_by_file, provenance, run
 from experiments.paper.common import (
     DATA,
     HORIZON,

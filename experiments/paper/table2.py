@@ -17,7 +17,7 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments.common import run
+from experiments.flags.common import run
 from experiments.paper import rank_against_gan
 from experiments.paper.common import (
     OUTPUT,

@@ -1,7 +1,7 @@
 """The fast layout: V of `module.ValueNetwork` with the points along the long axis.
 
 For the package's own R_theta only. Values and gradients are the module's
-(tests/reward/test_module.py); `benchmarks.layouts` says what it saves on a CPU.
+(tests/reward/test_module.py).
 """
 
 from collections.abc import Sequence

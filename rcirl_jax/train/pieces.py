@@ -2,8 +2,8 @@
 
 On a CPU a piece of the network's work is one scene: its features (0.2 MB for 122
 candidates) and hidden units stay in a core's cache from the forward to the backward
-pass; several scenes at once take longer (`benchmarks.layouts`). Candidates and
-features are made for a block of scenes before that.
+pass; several scenes at once take longer. Candidates and features are made for a block
+of scenes before that.
 """
 
 from collections.abc import Callable

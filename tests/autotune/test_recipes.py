@@ -83,7 +83,7 @@ def test_a_file_of_ones_own(tmp_path):
 
 FLAGS = """
 from absl import flags
-from experiments import training
+from experiments.flags import training
 flags.FLAGS(["x", *{given}])
 c = training.training_config()
 print(c.loss, c.reward.hidden, c.leaky_rate, c.futures, c.positive, c.reward.pin)

@@ -10,12 +10,8 @@ import pytest
 from tests.helpers.commands import fresh as command
 
 SMALL = {
-    "layouts": ["--rounds=1", "--calls=1", "--steps=1"],
-    "memory": ["--steps=200"],
     "paper_scale": ["--seconds=1"],
-    "scaling": ["--rounds=1", "--seconds=0.01"],
     "single_plan": ["--calls=5"],
-    "streaming": ["--scenes=1000", "--steps=5"],
     "suite": ["--duration=1", "--rounds=1", "--single=1"],
     "sweep": ["--members=8", "--scenes=64", "--single=1", "--rounds=1", "--commands=1"],
 }

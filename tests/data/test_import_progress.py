@@ -12,7 +12,8 @@ from rcirl_jax.data.cut import Cut, digest
 from rcirl_jax.data.importers import parts, read_part
 from rcirl_jax.data.importing import Progress, import_parts
 from rcirl_jax.data.parts import Part
-from rcirl_jax.data.readers import csv_stream, reading
+from rcirl_jax.data.readers import reading
+from rcirl_jax.data.readers.tables import streams
 from rcirl_jax.data.scenes.quality import QualityReport
 from rcirl_jax.types import Kind, Recording, Track
 from tests.data import small_logs
@@ -118,7 +119,7 @@ def test_a_long_csv_moves_the_bar_and_keeps_its_bytes(tmp_path, monkeypatch, cap
     import_parts([part], tmp_path / "plain", config)
     capsys.readouterr()
 
-    monkeypatch.setattr(csv_stream, "READ_BYTES", 2**14)
+    monkeypatch.setattr(streams, "READ_BYTES", 2**14)
     monkeypatch.setattr(reading, "DELAY_S", 0.0)
     Clock(monkeypatch, step=1.0)
     import_parts([part], tmp_path / "data", config)

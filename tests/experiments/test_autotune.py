@@ -77,9 +77,11 @@ def test_a_small_loop(tmp_path):
     again = fresh("experiments.autotune", *flags)
     assert all(kept(again).values()), again.stdout
     (run / "report.html").unlink()
-    drawn = command("experiments.report", f"--workdir={run}")
+    copy = tmp_path / "copy.html"
+    drawn = command("experiments.report", f"--workdir={run}", f"--output={copy}")
     assert kept(drawn) == {"report": False}, drawn.stderr[-2000:]
     assert verdict["decision"] in (run / "report.html").read_text()
+    assert copy.read_bytes() == (run / "report.html").read_bytes()
     assert 'id="training-heading"' in page
     assert all(kept(fresh("experiments.autotune", *flags)).values())
     dataset = open_dataset(*run.glob("dataset-*"))

@@ -15,7 +15,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
-from experiments import common
+from experiments.flags import common
 from tests.conftest import REPO
 
 LOCKS = sorted((REPO / "requirements").glob("*.lock"))

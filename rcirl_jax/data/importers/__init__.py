@@ -13,6 +13,7 @@ from pathlib import Path
 
 from rcirl_jax.data.importers.files import with_log_names
 from rcirl_jax.data.importers.options import check_types
+from rcirl_jax.data.readers.tables.streams import refuse_pointer
 from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.runtime.atomic_files import is_text
 from rcirl_jax.runtime.specs import load_toml, spec_root
@@ -45,6 +46,8 @@ CSV_PARTS = ("csv", "ngsim")
 def read_part(name: str, path: Path, spec: dict) -> Iterator[Recording]:
     """All recordings of one part, each validated; arguments as of `parts`."""
     importer: Importer = _module(name).recordings
+    for file in files_of(name, path):
+        refuse_pointer(file)
     with as_input_error(str(path), f"a sound log of format {name}"):
         yield from importer(path, spec)
 

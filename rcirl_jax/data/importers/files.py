@@ -5,6 +5,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from rcirl_jax.data.importers.options import number
+from rcirl_jax.data.readers.tables.columnar import is_columnar
+from rcirl_jax.data.readers.tables.streams import packing
 from rcirl_jax.errors import InputError
 
 # what importers read besides the input itself
@@ -14,6 +16,9 @@ MAP_FOLDERS = ("maps", "nuplan-maps-v1.0")
 
 # bytes; a longer file is read in pieces (at once it takes ten times as much)
 LONG_BYTES = 64 * 2**20
+PACKED_TIMES = 8  # text that is packed, or in Parquet, is as many times as long
+PACKED_ENDINGS = (".gz", ".zst", ".bz2")
+TABLE_ENDINGS = (".csv", ".tsv", ".txt", ".parquet", ".feather", ".arrow")
 
 
 def input_files(path: Path, pattern: str) -> list[Path]:
@@ -101,7 +106,21 @@ def listing(path: Path) -> list:
     return [[str(file), stat.st_size, stat.st_mtime_ns] for file, stat in stats]
 
 
+def table_stem(path: Path) -> str:
+    """Name of a table's file without its endings: log of log.csv.gz."""
+    name = path.name
+    for endings in (PACKED_ENDINGS, TABLE_ENDINGS):
+        name = next((name.removesuffix(e) for e in endings if name.endswith(e)), name)
+    return name if name != path.name else path.stem
+
+
 def is_long_file(path: Path, spec: dict) -> bool:
-    """Whether a file is read in pieces; `long_bytes` of the TOML sets from where."""
+    """Whether a file is read in pieces; `long_bytes` of the TOML sets from where.
+
+    It is bytes of text: what is packed counts as so many times as long.
+    """
     limit = number(spec, "long_bytes", LONG_BYTES)
-    return path.is_file() and path.stat().st_size > limit
+    if not path.is_file():
+        return False
+    is_packed = packing(path) is not None or is_columnar(path)
+    return path.stat().st_size * (PACKED_TIMES if is_packed else 1) > limit

@@ -12,24 +12,23 @@ order is found inside a minute only. Rows may come in any order of road users; s
 space of about the file's size is needed. An importer that needs something of the
 whole recording finds it in `Spill.minutes`.
 
-`csv_stream` reads a CSV; an importer may bring a reader of its own.
+Rows come as batches of `tables`, or as an importer makes them of these.
 """
 
 import contextlib
 import dataclasses
 import itertools
-import multiprocessing
 import shutil
 import tempfile
-from collections.abc import Callable, Container, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tqdm
 
-from rcirl_jax.data.readers import csv_stream
-from rcirl_jax.data.readers.csv_stream import Field
+from rcirl_jax.data.readers.reading import reading
+from rcirl_jax.data.readers.tables.ledger import LINE, Ledger
+from rcirl_jax.data.readers.tables.repair import single_rows
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.atomic_files import locked
 from rcirl_jax.types import Recording, Track
@@ -45,7 +44,6 @@ MAX_WINDOWS = 60  # of a minute
 BUFFER_BYTES = 64 * 2**20  # bytes of rows held before they go to scratch files
 SCRATCH = "rcirl-scratch-"  # how folders of scratch files begin
 LOCK = "lock"  # in such a folder, held while it is in use
-DELAY_S = 2.0  # s; what is read faster shows no bar
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -74,43 +72,35 @@ class Piece:
 @contextlib.contextmanager
 def spilled(
     path: Path,
-    fields: list[Field],
+    read: Callable[[Callable[[int], object]], Iterable[dict]],
+    ledger: Ledger,
     wanted: Container[str] | None = None,
-    read: Callable[[Path, list[Field]], Iterator[dict]] | None = None,
+    apart: Container[str] = (),
+    places: tuple[str, str] = ("x", "y"),
 ) -> Iterator["Spill"]:
     """The rows of a file in scratch files, removed afterwards.
 
     Args:
-      path: CSV with a header, or what `read` reads.
-      fields: at least t [s], id.
+      path: file, whose reading shows a bar.
+      read: batches of rows, at least t [s] and id; it calls what it is given with the
+        bytes just read.
+      ledger: of the file.
       wanted: values of the `recording` field whose rows are kept; None: all.
-      read: columns of READ_BYTES at a time; default `csv_stream.batches`.
+      apart: columns in which rows may differ that repeat each other.
+      places: columns that say where a road user is.
 
     Raises:
-      InputError: unreadable text, a cell that is no finite number, or more
-        than MAX_BLOCKS minutes.
+      InputError: no rows, more bad ones than the ledger allows, or more than
+        MAX_BLOCKS minutes.
     """
     with scratch() as folder:
-        spill = Spill(path, fields, folder, wanted)
-        batches = (read or csv_stream.batches)(path, fields)  # each of READ_BYTES
+        spill = Spill(path, folder, ledger, wanted, apart, places)
         with reading(path, [path]) as show:
-            for batch in batches:
+            for batch in read(show):
                 spill.add(batch)
-                show(csv_stream.READ_BYTES)
-        if not any(spill.recordings()) and not spill.blocks:
-            raise InputError(f"{path}: rows: none: expected one at least")
+        ledger.check()
         spill.flush()
         yield spill
-
-
-def pieces(path: Path, fields: list[Field], max_gap_s: float) -> Iterator[Piece]:
-    """All pieces of a file, recording by recording in the order of time.
-
-    Arguments and errors as of `spilled` and `Spill.pieces`.
-    """
-    with spilled(path, fields) as spill:
-        for recording in spill.recordings():
-            yield from spill.pieces(recording, max_gap_s)
 
 
 def piece_of(log: str, made: Recording, piece: Piece) -> Recording:
@@ -158,26 +148,35 @@ class Spill:
     def __init__(
         self,
         path: Path,
-        fields: list[Field],
         folder: Path,
+        ledger: Ledger,
         wanted: Container[str] | None = None,
+        apart: Container[str] = (),
+        places: tuple[str, str] = ("x", "y"),
     ) -> None:
-        self.path, self.folder, self.wanted = path, folder, wanted
-        self.names = [field.name for field in fields]
-        self.texts = {field.name: {} for field in fields if field.text}
+        self.path, self.folder, self.ledger = path, folder, ledger
+        self.wanted, self.apart, self.places = wanted, apart, places
+        self.names: list[str] = []  # of the columns, as in the first batch
+        self.texts: dict[str, dict[str, int]] = {}  # field -> text -> its number
         self.blocks: dict[int, set[int]] = {}  # number of a recording -> minutes
         self.buffers: dict[tuple[int, int], list[np.ndarray]] = {}
         self.held = 0  # bytes in the buffers
         self.given = 0.0  # minutes given as pieces
         self._tables: dict[str, np.ndarray] = {}
+        self._met: set[int] = set()  # numbers of recordings
+        self._tidied: set[int] = set()
 
     def add(self, batch: dict) -> None:
         """Sort a batch's rows into their minutes."""
+        if not self.names:
+            self.names = list(batch)
+            self.texts = {n: {} for n in batch if isinstance(batch[n], tuple)}
         columns = [self._numbers(name, batch[name]) for name in self.names]
         rows = np.stack(columns, axis=1)
         recording = np.zeros(len(rows), np.int64)
         if "recording" in self.names:
             recording = rows[:, self.names.index("recording")].astype(np.int64)
+            self._met.update(np.unique(recording).tolist())
             rows, recording = self._of_wanted(rows, recording)
         minute = np.floor(rows[:, self.names.index("t")] / BLOCK_S).astype(np.int64)
         order = np.lexsort((minute, recording))  # stable: the file's order inside
@@ -223,7 +222,9 @@ class Spill:
 
     def recordings(self) -> list[str | None]:
         """Values of `recording` met, left out ones too; [None] without the field."""
-        return list(self.texts.get("recording", [None]))
+        if "recording" not in self.texts:
+            return [None]
+        return [text for text, n in self.texts["recording"].items() if n in self._met]
 
     def _minutes(self, recording: str | None) -> tuple[int, list[int]]:
         """A recording's number, and its minutes in the order of time."""
@@ -236,9 +237,27 @@ class Spill:
         raw = np.fromfile(self.folder / f"{code}_{minute}", np.float64)
         return raw.reshape(-1, len(self.names))
 
+    def _tidy(self, code: int, minutes: list[int]) -> None:
+        """Leave each road user of a recording one row a frame, once."""
+        if code in self._tidied:
+            return
+        self._tidied.add(code)
+        for minute in minutes:
+            rows = self._rows(code, minute)
+            values = {name: rows[:, place] for place, name in enumerate(self.names)}
+            compared = [n for n in values if n != LINE and n not in self.apart]
+            kept = single_rows(values, self.ledger, compared, self._named, self.places)
+            if not kept.all():
+                rows[kept].tofile(self.folder / f"{code}_{minute}")
+
+    def _named(self, user: float) -> str:
+        """An id as it stands in the file."""
+        return str(self._table("id")[int(user)]) if "id" in self.texts else f"{user:g}"
+
     def minutes(self, recording: str | None) -> Iterator[dict[str, np.ndarray]]:
         """Field -> [n] of each minute alone, t as in the file."""
         code, minutes = self._minutes(recording)
+        self._tidy(code, minutes)
         for minute in minutes:
             yield self._values(self._rows(code, minute))
 
@@ -286,6 +305,7 @@ class Spill:
           max_gap_s: a road user unseen for longer is another fragment.
         """
         code, minutes = self._minutes(recording)
+        self._tidy(code, minutes)
         users: list[str] = list(self.texts.get("id", {}))
         t, user = self.names.index("t"), self.names.index("id")
         fragments = self._fragments(code, minutes, max_gap_s)
@@ -317,29 +337,3 @@ class Spill:
                     progress=self.given / total,
                     window=window if count > 1 else None,
                 )
-
-
-@contextlib.contextmanager
-def reading(path: Path, files: Sequence[Path]) -> Iterator[Callable[[int], object]]:
-    """A function to be called with the bytes just read of the files.
-
-    The bar stands below that of the import, shows bytes/s and the time left, and
-    goes when all is read. Processes that the import started show none.
-
-    Args:
-      path: named in the bar.
-      files: all that will be read.
-    """
-    with tqdm.tqdm(
-        total=sum(file.stat().st_size for file in files if file.is_file()),
-        desc=f"{path.name}: read",
-        unit="B",
-        unit_scale=True,
-        unit_divisor=1024,
-        leave=False,
-        delay=DELAY_S,
-        mininterval=0.5,
-        disable=multiprocessing.parent_process() is not None,
-    ) as bar:
-        # the last piece may be short
-        yield lambda size: bar.update(min(size, bar.total - bar.n))

@@ -2,6 +2,7 @@
 
 import collections
 import dataclasses
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from rcirl_jax.data.scenes.filters import REASONS
 from rcirl_jax.data.scenes.lines import TOO_FEW
 from rcirl_jax.data.scenes.smoothing import HARSH_MPS2, harsh_share
 from rcirl_jax.data.store.dataset import Dataset
-from rcirl_jax.types import Decision, Demonstration, Kind, Recording, Tag
+from rcirl_jax.types import Decision, Demonstration, Kind, Recording, RowCounts, Tag
 
 HEADWAY_STEP_S = 0.01  # s, to which headways are counted
 SPEED_STEP_MPS = 0.05  # m/s, likewise
@@ -51,6 +52,8 @@ class QualityReport:
     futures: collections.Counter = dataclasses.field(
         default_factory=collections.Counter
     )
+    # of tables: rows read, and those dropped by why
+    rows: collections.Counter = dataclasses.field(default_factory=collections.Counter)
     notes: list[str] = dataclasses.field(default_factory=list)
     refused: int = 0  # recordings left out
 
@@ -63,6 +66,7 @@ class QualityReport:
         """Count a recording's tracks, noise, drop reasons and notes."""
         recording = collector.recording
         self.recordings += 1
+        self.rows.update({k: n for k, n in vars(recording.rows).items() if n})
         for smooth in collector.tracks:
             own = collector.own_frames(smooth)
             self.tracks += collector.begins_here(smooth)
@@ -137,11 +141,17 @@ class QualityReport:
             "tags": dict(self.tags),
             "decisions": dict(self.decisions),
             "dropped": {name: self.dropped.get(name, 0) for name in REASONS},
-            # said only where it happened: the manifests of before keep their hash
+            # said only where it happened: the manifests of others keep their hash
+            **({"rows": dict(self.rows)} if dropped_rows(self.rows) else {}),
             **({"refused": self.refused} if self.refused else {}),
             "notes": self.notes[:200],
             "num_notes": len(self.notes),
         }
+
+
+def dropped_rows(rows: Mapping[str, int]) -> int:
+    """Rows of tables that were dropped."""
+    return sum(count for why, count in rows.items() if why != "read")
 
 
 def _headways(demonstrations: Demonstration) -> np.ndarray:
@@ -217,6 +227,15 @@ def format_quality(report: dict) -> str:
         lines.append(left + right)
     decisions = ", ".join(f"{k} {v:,}" for k, v in report["decisions"].items())
     lines += ["", f"decisions per obstacle: {decisions}"]
+    if "rows" in report:
+        rows = report["rows"]
+        dropped = dropped_rows(rows)
+        kinds = [f.name for f in dataclasses.fields(RowCounts) if rows.get(f.name)]
+        why = ", ".join(f"{rows[kind]:,} {kind}" for kind in kinds if kind != "read")
+        lines.append(
+            f"rows dropped: {dropped:,} of {rows['read']:,} "
+            f"({dropped / rows['read']:.2%}): {why}"
+        )
     if report.get("refused"):
         lines.append(f"{report['refused']} recordings refused and left out")
     if report["num_notes"]:

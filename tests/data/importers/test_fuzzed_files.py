@@ -22,8 +22,9 @@ from rcirl_jax.data.importers.interaction import reader as interaction
 from rcirl_jax.data.importers.l5 import map as l5_map
 from rcirl_jax.data.importers.levelx import map as levelx_lanes
 from rcirl_jax.data.importers.nuplan import map as nuplan_map
-from rcirl_jax.data.readers.parquet import read_columns
 from rcirl_jax.data.readers.sqlite import Database
+from rcirl_jax.data.readers.tables import table
+from rcirl_jax.data.readers.tables.ledger import Ledger
 from rcirl_jax.data.readers.xml import read_xml
 from rcirl_jax.data.readers.zarr2 import StructuredArray
 from rcirl_jax.evaluation.closed_loop.files import read_runs
@@ -333,7 +334,7 @@ def test_clocks_that_stand_still_or_would_fill_the_memory(tmp_path):
     apollo.write(tmp_path / "drive")
     line = line_of("apollo", tmp_path / "drive", "rate_hz = 1e9")
     assert "rate_hz: 1e+09: expected at most 1000" in line
-    rows = "".join(f"{k * 1e-5:.5f},a,{k * 1e-4:.4f},0\n" for k in range(200))
+    rows = "".join(f"{k * 1e-5:.5f},a,{k * 1e-2:.4f},0\n" for k in range(200))
     log.write_text(f"t,id,x,y\n{rows}")
     columns = "\n".join(f'{name} = "{name}"' for name in ("t", "id", "x", "y"))
     line = line_of("csv", log, f"rate_hz = 1e5\n[columns]\n{columns}\n")
@@ -354,14 +355,20 @@ def test_a_table_of_groups_is_a_file_beside_the_logs(tmp_path):
 # ------------------------------------------------------------------------ readers
 
 
-def test_row_groups_that_claim_too_much(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("name", "words"), [("MAX_GROUP_BYTES", "row group: "), ("MAX_ROWS", "rows: 100")]
+)
+def test_row_groups_that_claim_too_much(tmp_path, monkeypatch, name, words):
     file = tmp_path / "x.parquet"
     pq.write_table(pa.table({"a": list(range(100))}), file)
-    limits = ("MAX_GROUP_BYTES", "row group: "), ("MAX_ROWS", "rows: 100")
-    for name, words in limits:
-        with monkeypatch.context() as patch:
-            patch.setattr(f"rcirl_jax.data.readers.parquet.{name}", 10)
-            assert f"x.parquet: {words}" in refused(read_columns, file, ["a"], [], [])
+
+    def numbers():
+        opened = table.open_table(file)
+        return table.read(opened, table.fields_of(opened, ["a"]), Ledger(path=file))
+
+    np.testing.assert_array_equal(numbers()["a"], np.arange(100.0))
+    monkeypatch.setattr(f"rcirl_jax.data.readers.tables.columnar.{name}", 10)
+    assert f"x.parquet: {words}" in refused(numbers)
 
 
 ZARRAY = {"zarr_format": 2, "shape": [1], "chunks": [1], "dtype": [[], ["a"]]}

@@ -8,6 +8,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind
 from tests.data.importers.formats import interaction as fixture
 from tests.data.importers.formats import interaction_challenge as challenge
+from tests.data.importers.writers import strict
 
 
 def read(path, source=None):
@@ -237,7 +238,7 @@ def test_gap_splits_a_track(scene, root):
         ("1,1,100,car,1005.000", "1,1,100,car,inf", "line 2: x: 'inf'"),
         ("1,1,100,car,1005.000", "1,1,100,car,1e300", "x: 1e+300"),
         ("1,1,100,car,1005.000", "1,1,1e200,car,1005.000", "timestamp_ms: 1e+200"),
-        ("1,1,100,car,", "1,1,200,car,", "id 1: t: 200: met twice"),
+        ("1,1,100,car,", "1,1,200,car,", "line 3: id 1: met twice in one frame"),
         ("1,1,100,car,1005.000,", "1,1,100,car,", "line 2: 10 cells: expected 11"),
     ],
 )
@@ -248,7 +249,7 @@ def test_malformed(scene, root, old, new, found):
         assert len(only(root).tracks) == 5
         return
     with pytest.raises(InputError) as error:
-        read(root)
+        read(root, strict(root / "strict.toml", "interaction"))
     message = str(error.value)
     assert message.startswith(str(path))
     assert found in message

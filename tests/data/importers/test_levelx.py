@@ -385,7 +385,7 @@ def test_missing_companion(motorway, kind):
         ("tracks", "\n1,1,", "\n1,1.5,", "track number: 1.5"),
         ("tracks", "\n1,1,", "\nx,1,", "line 2: frame: 'x'"),
         ("tracks", "\n1,1,", "\n1e300,1,", "frame: 1e+300"),
-        ("tracks", "\n1,1,", "\n2,1,", "id 1: t: 2: met twice"),
+        ("tracks", "\n1,1,", "\n2,1,", "line 3: id 1: met twice in one frame"),
         ("tracks", "\n1,1,2.58", "\n1,1,nan", "line 2: x: 'nan'"),
         ("tracks", "\n1,1,2.58", "\n1,1,1e300", "x: 1e+300"),
         ("tracks", "\n1,1,2.58", "\n1,1", "line 2: 24 cells: expected 25"),

@@ -174,8 +174,9 @@ def test_separators_between_thousands(tmp_path):
     assert digest(only(tmp_path / "a.csv")) == digest(plain)
     text = (tmp_path / "a.csv").read_text()
     (tmp_path / "a.csv").write_text(text.replace('"800,003,', '"800,03,', 1))
+    source = w.strict(tmp_path / "strict.toml", "ngsim")
     with pytest.raises(InputError, match=r"a\.csv: line 113: Global_Time: '800,03,"):
-        read(tmp_path / "a.csv")
+        read(tmp_path / "a.csv", source)
 
 
 def test_release_with_every_log_twice(tmp_path):
@@ -257,7 +258,7 @@ def conflicting():
         ([*w.ngsim_rows(), [1, 2, 3]], 41, "3 cells"),
         ([row[:-1] for row in w.ngsim_rows()], 1, "17 cells"),
         (backwards(), None, "id 1: t: 10 after 39"),
-        (conflicting(), None, "id 1: t: 3: met twice"),
+        (conflicting(), 5, "id 1: met twice in one frame"),
         ([[*r[:11], 9.9 * r[11], *r[12:]] for r in w.ngsim_rows()], None, "speed"),
         ([[r[0], 3 * r[1], *r[2:]] for r in w.ngsim_rows()], None, "t: median step 3"),
     ],

@@ -10,6 +10,7 @@ from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.errors import InputError
 from tests.data.importers.formats import ngsim_pairs as fixture
+from tests.data.importers.writers import strict
 
 FOOT = fixture.FOOT
 
@@ -132,7 +133,7 @@ def test_only_the_follower_is_an_expert(tmp_path):
         ("x_leader", "leader", "column x_leader: missing"),
         ("t,x_follower", "t,t", "column t: met twice"),
         ("\n293.3,", "\nnow,", "line 3: t: 'now'"),
-        ("\n293.3,", "\n293.2,", "t: 0: met twice"),
+        ("\n293.3,", "\n293.2,", "line 3: id 1032: met twice in one frame"),
         ("\n293.3,", "\n1e300,", "t: 1e+300"),
         (",14.3,", ",15.9,", "line 2: spacing"),
         (",14.3,", ",,", "line 2: leader_length: ''"),
@@ -148,7 +149,7 @@ def test_malformed(tmp_path, old, new, found):
         # the median length still holds; the file's own spacing is checked
         edit(path, ",55.7", ",75.7")
     with pytest.raises(InputError) as error:
-        read(path)
+        read(path, strict(tmp_path / "strict.toml", "ngsim_pairs"))
     message = str(error.value)
     assert message.startswith(str(path))
     assert found in message

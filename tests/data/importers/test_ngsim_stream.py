@@ -7,7 +7,7 @@ from rcirl_jax.data.cut import cut, digest
 from rcirl_jax.data.importers import parts, read_part
 from rcirl_jax.data.importing import import_parts
 from rcirl_jax.data.parts import Part, is_long
-from rcirl_jax.data.readers import csv_stream
+from rcirl_jax.data.readers.tables import streams
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
 from tests.data.importers import writers as w
@@ -63,8 +63,9 @@ def write(path, shuffled=False):
     return w.ngsim_csv(path, rows, sites=sites)
 
 
-def read(path, long_bytes=None):
+def read(path, long_bytes=None, **options):
     _, spec = parts("ngsim", path)
+    spec = {**spec, **options}
     if long_bytes is not None:
         spec = {**spec, "long_bytes": long_bytes}
     return list(read_part("ngsim", path, spec))
@@ -109,7 +110,7 @@ def native(path, stamp=BEGIN["i-80"][0]):
 
 
 def test_pieces_of_the_native_text_are_those_of_the_csv(tmp_path, monkeypatch):
-    monkeypatch.setattr(csv_stream, "READ_BYTES", 10_000)
+    monkeypatch.setattr(streams, "READ_BYTES", 10_000)
     path = native(tmp_path / "native.txt")
     rows = [line.split() for line in path.read_text().splitlines()]
     table = w.ngsim_csv(tmp_path / "native.csv", rows)
@@ -124,19 +125,19 @@ def test_pieces_of_the_native_text_are_those_of_the_csv(tmp_path, monkeypatch):
         ("far", r"line 2000: Local_Y: 'far': expected a finite number"),
         ("nan", r"line 2000: Local_Y: 'nan': expected a finite number"),
         ("1 2", r"line 2000: 19 cells: expected 18"),
-        ("1e30", r"row 2000: Local_Y: 1e\+30: expected within"),
+        ("1e30", r"line 2000: Local_Y: 1e\+30: expected within"),
         ("\xff", r"line 2000: Local_Y: '.*': expected a finite number"),
     ],
 )
 def test_bad_cells_of_a_long_text_are_one_line(tmp_path, monkeypatch, cell, message):
-    monkeypatch.setattr(csv_stream, "READ_BYTES", 10_000)
+    monkeypatch.setattr(streams, "READ_BYTES", 10_000)
     path = native(tmp_path / "native.txt")
     lines = path.read_text().splitlines()
     cells = lines[1999].split()
     lines[1999] = " ".join([*cells[:5], cell, *cells[6:]])
     path.write_text("\n".join(lines), encoding="latin-1")
     with pytest.raises(InputError, match=message) as caught:
-        read(path, 1)
+        read(path, 1, max_bad_rows=0.0)
     assert "\n" not in str(caught.value)
 
 
@@ -189,7 +190,7 @@ def test_separators_between_thousands(tmp_path):
     text = path.read_text()
     path.write_text(text.replace('"1,118,847,', '"1,118,8x7,', 1))
     with pytest.raises(InputError, match=r"portal\.csv: line \d+: Global_Time: '1,118"):
-        read(path, 1)
+        read(path, 1, max_bad_rows=0.0)
 
 
 @pytest.mark.parametrize(
@@ -205,7 +206,7 @@ def test_bad_cells_are_one_line(tmp_path, column, cell, message):
     rows[10][column] = cell
     path = w.ngsim_csv(tmp_path / "portal.csv", rows, sites=sites)
     with pytest.raises(InputError, match=message) as caught:
-        read(path, 1)
+        read(path, 1, max_bad_rows=0.0)
     assert "\n" not in str(caught.value)
 
 

@@ -12,6 +12,7 @@ from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.errors import InputError
 from tests.data.importers.formats import openacc as fixture
 from tests.data.importers.formats.drives import straight
+from tests.data.importers.writers import strict
 
 
 def read(path, source=None):
@@ -301,7 +302,7 @@ def test_standing_cars_make_no_lanes():
         ("Speed1", "Speed2", "column 'Speed2': met twice"),
         ("\n0.1,", "\nsoon,", "line 8: Time: 'soon'"),
         ("\n0.1,", "\n,", "line 8: Time: ''"),
-        ("\n0.1,", "\n0.0,", "t: 0: met twice"),
+        ("\n0.1,", "\n0.0,", "line 8: id of the row: met twice in one frame"),
         ("\n0.1,", "\n1e300,", "Time: 1e+300"),
         ("\n0.1,", "\n0.1,7,", "line 8: 28 cells: expected 27"),
         ("\n0.1,14", "\n0.1,fast14", "line 8: Speed1: 'fast14"),
@@ -314,7 +315,7 @@ def test_malformed(tmp_path, old, new, found):
     assert old in text
     path.write_text(text.replace(old, new, 1))
     with pytest.raises(InputError) as error:
-        read(path)
+        read(path, strict(tmp_path / "strict.toml", "openacc"))
     message = str(error.value)
     assert message.startswith(str(path))
     assert found in message
@@ -335,7 +336,7 @@ def test_absurd_cells(tmp_path, column, cell, found):
     columns = fixture.table(fixture.cars())
     columns[column][2] = cell
     with pytest.raises(InputError) as error:
-        read(drive(tmp_path, columns))
+        read(drive(tmp_path, columns), strict(tmp_path / "strict.toml", "openacc"))
     assert found in str(error.value)
     assert "\n" not in str(error.value)
 

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.runtime.specs import spec_root
+
 DT = 0.1  # s
 SPEED = 15.0  # m/s, of every car in these files
 POINT = "<point><x>{}</x><y>{}</y></point>"
@@ -189,8 +191,17 @@ def csv_rows(*, cars=3, count=40, feet=1.0):
     return rows
 
 
+def strict(path: Path, name: str):
+    """The packaged source TOML of a format, by which no row may be bad."""
+    text = (spec_root() / "sources" / f"{name}.toml").read_text()
+    assert "max_bad_rows = 0.01" in text
+    path.write_text(text.replace("max_bad_rows = 0.01", "max_bad_rows = 0.0"))
+    return path
+
+
 CSV_SPEC = """
 licence = "test"
+max_bad_rows = 0.0
 [columns]
 {columns}
 [units]

@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from experiments.common import git_commit
+from experiments.flags.common import git_commit
 from rcirl_jax.data.importers import parts
 from rcirl_jax.data.importing import ImportConfig, import_parts
 from rcirl_jax.data.parts import Part, recordings_of

@@ -105,7 +105,7 @@ class _Types:
         """Make the table of a message type; its name in the tables."""
         if message not in self._messages:
             raise DecodeError(f"message type {message}: not among the descriptors")
-        own = f"M{len(self.tables)}"
+        own = f"Message{len(self.tables)}"
         table = self.tables[own] = {}
         known = {field.name: field for field in self._messages[message].field}
         for place, (name, want) in enumerate(wanted.items()):

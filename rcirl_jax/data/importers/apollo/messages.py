@@ -16,8 +16,8 @@ from rcirl_jax.data.importers.apollo.descriptors import ENUM, Reading, reading_o
 from rcirl_jax.data.importers.apollo.obstacles import Obstacles
 from rcirl_jax.data.importers.apollo.records import Record, check_size
 from rcirl_jax.data.importers.options import section
-from rcirl_jax.data.readers.long_logs import reading
 from rcirl_jax.data.readers.protobuf import Message
+from rcirl_jax.data.readers.reading import reading
 from rcirl_jax.errors import InputError
 
 LOCALIZATION = "/apollo/localization/pose"

@@ -37,7 +37,8 @@ from rcirl_jax.data.importers.shapes import (
     origin_notes,
 )
 from rcirl_jax.data.importers.tracks import split_tracks
-from rcirl_jax.data.readers.parquet import read_columns
+from rcirl_jax.data.readers.tables.ledger import Ledger
+from rcirl_jax.data.readers.tables.table import fields_of, open_table, read
 from rcirl_jax.data.recording import MAX_SPEED_MPS, validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Recording, Track
@@ -88,7 +89,7 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
 
 
 def _read_scenario(file: Path, spec: dict) -> Recording:
-    table = read_columns(file, NUMBERS, TEXT, OPTIONAL)
+    table = _read_rows(file)
     name = _constant(file, table, "scenario_id")
     group = _constant(file, table, "slice_id") if "slice_id" in table else name
     clock = _clock(file, table)
@@ -111,6 +112,17 @@ def _read_scenario(file: Path, spec: dict) -> Recording:
         default_speed_limit=number(spec, "speed_limit", LIMIT_MPS),
         notes=(*origin_notes(origin), *clock.notes, *notes, *lane_notes),
     )
+
+
+def _read_rows(file: Path) -> dict[str, np.ndarray]:
+    """The columns of a scenario, none of whose cells is empty."""
+    source = open_table(file)
+    if source.layout is not None:
+        raise InputError(f"{file}: parquet: text: expected Parquet")
+    needed = [name for name in (*NUMBERS, *TEXT) if name not in OPTIONAL]
+    needed += [name for name in OPTIONAL if name in source.header]
+    ledger = Ledger(path=file, unit=source.unit, allowed=0.0)
+    return read(source, fields_of(source, needed, texts=TEXT), ledger)
 
 
 def _constant(file: Path, table: dict[str, np.ndarray], field: str) -> str:

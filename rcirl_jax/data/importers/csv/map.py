@@ -1,6 +1,7 @@
 """Lanes of a generic CSV log: given ones, the lane column's, or the cars' paths."""
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,8 @@ from scipy.spatial import KDTree
 from rcirl_jax.data.importers.lanes import StraightLane, straight_lanes
 from rcirl_jax.data.importers.options import number, path_option
 from rcirl_jax.data.importers.shapes import arc_length
-from rcirl_jax.data.readers.tables import read_table
+from rcirl_jax.data.readers.tables.ledger import Ledger
+from rcirl_jax.data.readers.tables.table import Field, open_table, read
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane, Track
 
@@ -31,6 +33,8 @@ class LogTable:
     rate_hz: float
     origin: np.ndarray  # [2] m, subtracted from x, y
     notes: tuple[str, ...]
+    # positions in the file's coordinates [n, 2] -> metres, before the origin is taken
+    metres: Callable[[np.ndarray], np.ndarray] = np.asarray
 
 
 def lane_file_of(spec: dict) -> str:
@@ -69,8 +73,7 @@ def _lanes_from_file(path: Path, name: str) -> list[dict]:
         raise InputError(
             f"{path}: lanes.file: {name}: expected this CSV beside the log"
         )
-    text = ("id", "left", "right", "successor")
-    table = read_table(table_path, LANE_COLUMNS, LANE_OPTIONAL, text)
+    table = _lane_points(table_path)
     lanes = []
     for lane in dict.fromkeys(table["id"].tolist()):
         rows = np.flatnonzero(table["id"] == lane)
@@ -80,11 +83,30 @@ def _lanes_from_file(path: Path, name: str) -> list[dict]:
                 "id": lane,
                 "points": np.stack([table["x"][rows], table["y"][rows]], axis=1),
                 "successors": sorted(set(found.pop("successor", [])) - {""}),
-                **{k: v[0] for k, v in found.items() if k != "width" and v[0] != ""},
+                **{
+                    k: v[0]
+                    for k, v in found.items()
+                    if k != "width" and _is_known(v[0])
+                },
                 **({"width": found["width"]} if "width" in found else {}),
             }
         )
     return lanes
+
+
+def _lane_points(path: Path) -> dict[str, np.ndarray]:
+    """Columns of the lanes' own table, with those that may be missing."""
+    table, texts = open_table(path), ("id", "left", "right", "successor")
+    names = [*LANE_COLUMNS, *(n for n in LANE_OPTIONAL if n in table.header)]
+    fields = [
+        Field(name=n, column=n, text=n in texts, needed=n in LANE_COLUMNS)
+        for n in names
+    ]
+    return read(table, fields, Ledger(path=path, allowed=0.0))
+
+
+def _is_known(value: str | float) -> bool:
+    return value != "" and value == value
 
 
 def _given_lane(table: LogTable, lane: dict, default_width: float) -> Lane:
@@ -106,7 +128,7 @@ def _given_lane(table: LogTable, lane: dict, default_width: float) -> Lane:
     left, right = lane.get("left"), lane.get("right")
     return Lane(
         id=name,
-        centre=points - table.origin,
+        centre=table.metres(points) - table.origin,
         left_width=np.broadcast_to(half, (len(points),)).copy(),
         right_width=np.broadcast_to(half, (len(points),)).copy(),
         speed_limit=speed_limit,
@@ -126,7 +148,7 @@ def _straight(
         towards[track.id.split("#")[0]] = float(track.x[-1] - track.x[0])
     travel = np.array([towards.get(str(i), 0.0) for i in table.values["id"]])
     found = []
-    for name in np.unique(names):
+    for name in np.unique(names[names != ""]):
         rows = names == name
         centre = float(np.median(y[rows]))
         if np.median(np.abs(y[rows] - centre)) > 0.5 * width:
@@ -140,7 +162,7 @@ def _straight(
                 forward=bool(np.median(travel[rows]) >= 0.0),
             )
         )
-    return found
+    return found or None
 
 
 def _paths(tracks: tuple[Track, ...], width: float, limit: float) -> tuple[Lane, ...]:

@@ -1,216 +1,205 @@
-"""Generic CSV with a TOML mapping: a user's own logs need no code.
+"""Tables of a user's own with a TOML mapping: logs need no code.
 
 data_specs/sources/csv_example.toml explains every option of the mapping. Large
 coordinates and clocks lose their origin here, in float64: the package computes
 in float32 later.
 """
 
-import itertools
-from collections.abc import Iterator
+import dataclasses
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.data.importers.csv.earth import projected
 from rcirl_jax.data.importers.csv.map import (
     LIMIT_MPS,
     LogTable,
     lane_file_of,
     lanes_of,
 )
-from rcirl_jax.data.importers.files import input_files, is_long_file
-from rcirl_jax.data.importers.options import number, patterns, section, unit_factor
-from rcirl_jax.data.importers.tracks import spans_of, split_tracks, travel_heading
-from rcirl_jax.data.readers import csv_stream, long_logs
-from rcirl_jax.data.readers.sparse_tables import (
-    MAX_PLACE_M,
-    MAX_TIME,
-    MAX_VELOCITY_MPS,
-    check_range,
+from rcirl_jax.data.importers.csv.mapping import Mapping, mapping_of
+from rcirl_jax.data.importers.csv.meaning import Meaning, meaning_of
+from rcirl_jax.data.importers.csv.users import track_of
+from rcirl_jax.data.importers.files import (
+    input_files,
+    is_long_file,
+    log_name,
+    table_stem,
 )
-from rcirl_jax.data.readers.tables import read_header, read_table
+from rcirl_jax.data.importers.options import number, patterns, section
+from rcirl_jax.data.importers.tracks import split_tracks
+from rcirl_jax.data.readers import long_logs
+from rcirl_jax.data.readers.tables.ledger import LINE, Ledger, allowed_share
+from rcirl_jax.data.readers.tables.repair import single_rows
+from rcirl_jax.data.readers.tables.table import Table, batches, open_table, read
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Kind, Recording, Track
+from rcirl_jax.types import Recording
 
-NEEDED = ("t", "id", "x", "y")
-OPTIONAL = (
-    *("heading", "speed", "length", "width"),
-    *("kind", "lane", "recording", "automated"),
-)
-EXPECTED = (*NEEDED, "automated")  # errors where they are named and not there
-TEXT = ("id", "kind", "lane", "recording")
-LENGTH_UNITS = ("m", "ft")
-ALLOWED_UNITS = {
-    "t": ("s", "ms", "us", "ns", "frame"),
-    "x": LENGTH_UNITS,
-    "y": LENGTH_UNITS,
-    "length": LENGTH_UNITS,
-    "width": LENGTH_UNITS,
-    "speed": ("m/s", "km/h", "mph", "ft/s"),
-    "heading": ("rad", "deg"),
-}
-# in the file's unit: what no log can mean
-LIMITS = {
-    "t": MAX_TIME,
-    "x": MAX_PLACE_M,
-    "y": MAX_PLACE_M,
-    "speed": MAX_VELOCITY_MPS,
-    "heading": MAX_PLACE_M,
-}
-KINDS = ("vehicle", "cyclist", "pedestrian", "static")
-# box centre ahead of the recorded position, in box lengths
-REFERENCE = {"centre": 0.0, "front": -0.5, "rear": 0.5}
-SIZE_M = {"length": 4.5, "width": 1.8}  # m, a car
-RATE_HZ = 10.0  # 1/s
+PATTERNS = (
+    *("*.csv", "*.csv.gz", "*.csv.zst", "*.tsv", "*.parquet", "*.feather"),
+)  # of files that are read; of those called alike the first pattern's
 MAX_GAP_STEPS = 5.5  # missing rows bridged inside one track
 FAR_M = 1e4  # m; coordinates beyond it (UTM) are moved to a local origin
 ORIGIN_STEP_M = 1000.0  # m, local origins are multiples of it
+STILL_M = 0.5  # m; a log in which all road users stay within it is in degrees
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Log:
+    """One file, its mapping and what becomes of its rows."""
+
+    table: Table
+    spec: dict
+    mapping: Mapping
+    ledger: Ledger
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return self.table.path
+
+    @property
+    def name(self) -> str:
+        """Name of its recording, or what its recordings' names begin with."""
+        return log_name(self.path, self.spec, own_name(self.path))
+
+    def metres(self, points: np.ndarray) -> np.ndarray:
+        """Positions [n, 2] of the file in metres."""
+        if self.mapping.middle is None:
+            return points
+        degrees = points * self.mapping.degrees
+        east, north = projected(degrees[:, 0], degrees[:, 1], self.mapping.middle)
+        return np.stack([east, north], axis=1)
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
-    """The CSV files; each can be read alone."""
+    """The tables; each can be read alone.
+
+    Of files in one folder with one name that of the first pattern counts: it is the
+    same log.
+    """
     lane_file = lane_file_of(spec)
-    found = [input_files(path, pattern) for pattern in patterns(spec, ("*.csv",))]
-    every = dict.fromkeys(itertools.chain.from_iterable(found))  # each file once
-    files = [file for file in every if file.name != lane_file]
+    wanted = patterns(spec, PATTERNS)
+    found: dict[tuple[Path, str], Path] = {}
+    failed: InputError | None = None
+    for pattern in wanted:
+        try:
+            files = input_files(path, pattern)
+        except InputError as error:
+            failed = failed or error
+            continue
+        for file in files:
+            found.setdefault((file.parent, table_stem(file)), file)
+    files = [file for file in found.values() if file.name != lane_file]
+    if not found and failed is not None:
+        expected = ", ".join(wanted)
+        raise InputError(f"{path}: no file matches {expected}: expected log files")
     if not files:
         raise InputError(f"{path}: files: only {lane_file}: expected logs beside it")
     return files
 
 
+def own_name(file: Path) -> str:
+    """Name of a log, as long as no other folder has one called alike."""
+    return table_stem(file)
+
+
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """One Recording per file, or per value of the `recording` column."""
     for file in parts(path, spec):
-        if is_long_file(file, spec):
-            yield from _long_recordings(file, spec)
-            continue
-        for name, table in _read_tables(file, spec):
-            yield validate_recording(_recording(name, table, spec), file)
-
-
-def _long_recordings(path: Path, spec: dict) -> Iterator[Recording]:
-    """One Recording per minute of a file too long for memory."""
-    columns, rate, header = _columns(path, spec), _rate(spec), read_header(path)
-    units, notes, fields = _factors(path, spec, rate), [], []
-    for field, (column, sign) in columns.items():
-        if column in header:
-            factor = sign * units.get(field, 1.0)
-            fields.append(
-                csv_stream.Field(
-                    name=field,
-                    column=column,
-                    factor=factor,
-                    text=field in TEXT,
-                    limit=_limit(field, units),
-                )
+        log = opened(file, spec)
+        found = _long(log) if is_long_file(file, spec) else _whole(log)
+        for made in found:
+            counts, notes = log.ledger.news()
+            notes = (*made.notes, *notes)
+            yield validate_recording(
+                dataclasses.replace(made, rows=counts, notes=notes), file
             )
-        elif field in EXPECTED:
-            raise InputError(
-                f"{path}: column {column}: missing: expected it among {header}"
-            )
-        else:
-            notes.append(f"no column '{column}': {field} computed or by default")
-    for piece in long_logs.pieces(path, fields, MAX_GAP_STEPS / rate):
-        log = path.stem if piece.recording is None else f"{path.stem}-{piece.recording}"
-        table = _localise(path, piece.values, rate, notes, start=0.0)
-        made = _recording(f"{log}-{piece.label}", table, spec)
-        yield validate_recording(long_logs.piece_of(log, made, piece), path)
 
 
-def _columns(path: Path, spec: dict) -> dict[str, tuple[str, float]]:
-    """Field -> column name and sign ("-name" turns an axis round)."""
-    columns = section(spec, "columns")
-    unknown = sorted(set(columns) - set(NEEDED) - set(OPTIONAL))
-    if unknown:
-        raise InputError(
-            f"{path}: columns.{unknown[0]}: unknown: "
-            f"expected {', '.join((*NEEDED, *OPTIONAL))}"
-        )
-    for field in NEEDED:
-        if field not in columns:
-            raise InputError(f"{path}: columns.{field}: missing: expected a column")
-    found = {}
-    for field, column in columns.items():
-        if not isinstance(column, str) or not column:
-            raise InputError(f"{path}: columns.{field}: {column}: expected a name")
-        turned = column.startswith("-") and field not in TEXT
-        found[field] = (column[1:], -1.0) if turned else (column, 1.0)
-    texts = {found[field][0] for field in TEXT if field in found}
-    for field, (column, _) in found.items():
-        if field not in TEXT and column in texts:
-            raise InputError(
-                f"{path}: columns.{field}: {column}: expected a column of numbers, "
-                "not one that is read as text"
-            )
-    return found
-
-
-def _rate(spec: dict) -> float:
-    rate = number({**spec, **section(spec, "defaults")}, "rate_hz", RATE_HZ)
-    if rate <= 0.0:
-        raise InputError(f"source TOML: rate_hz: {rate:g}: expected > 0")
-    return rate
-
-
-def _read_tables(path: Path, spec: dict) -> Iterator[tuple[str, LogTable]]:
-    """(name, table) of every recording in a file."""
-    columns = _columns(path, spec)
-    raw = read_table(
-        path,
-        [columns[field][0] for field in EXPECTED if field in columns],
-        [columns[field][0] for field in OPTIONAL if field in columns],
-        [columns[field][0] for field in TEXT if field in columns],
+def opened(file: Path, spec: dict) -> Log:
+    """A file with its mapping, none of whose rows is read."""
+    table = open_table(file, section(spec, "table"))
+    return Log(
+        table=table,
+        spec=spec,
+        mapping=mapping_of(table, spec),
+        ledger=Ledger(path=file, unit=table.unit, allowed=allowed_share(spec)),
     )
-    rate = _rate(spec)
-    units = _factors(path, spec, rate)
-    values, notes = {}, []
-    for field, (column, sign) in columns.items():
-        if column not in raw:
-            notes.append(f"no column '{column}': {field} computed or by default")
-        elif field in TEXT:
-            values[field] = raw[column]
-        else:
-            check_range(path, raw, (column,), _limit(field, units))
-            values[field] = sign * units.get(field, 1.0) * raw[column]
+
+
+def _whole(log: Log) -> Iterator[Recording]:
+    """Recordings of a file that is held as a whole."""
+    values = read(log.table, log.mapping.fields, log.ledger)
     names = values.pop("recording", None)
-    parts = np.unique(names) if names is not None else [None]
-    for part in parts:
+    found = {}
+    for part in [None] if names is None else np.unique(names).tolist():
         rows = slice(None) if names is None else names == part
-        found = {field: column[rows] for field, column in values.items()}
-        name = path.stem if part is None else f"{path.stem}-{part}"
-        yield name, _localise(path, found, rate, notes)
+        found[part] = _placed(log, {n: column[rows] for n, column in values.items()})
+    meaning = _meaning(log, found.values(), np.unique(values.get("automated", [])))
+    for part, rows in found.items():
+        compared = [name for name in rows if name != LINE]
+        kept = single_rows(rows, log.ledger, compared)
+        rows = {name: column[kept] for name, column in rows.items()}
+        table = _localise(log, rows, meaning)
+        name = log.name if part is None else f"{log.name}-{part}"
+        yield _recording(name, table, log, meaning)
 
 
-def _factors(path: Path, spec: dict, rate: float) -> dict[str, float]:
-    factors = {}
-    for field, unit in section(spec, "units").items():
-        if field not in ALLOWED_UNITS:
-            raise InputError(
-                f"{path}: units.{field}: unknown: expected {', '.join(ALLOWED_UNITS)}"
-            )
-        if field == "t" and unit == "frame":
-            factors[field] = 1.0 / rate
-        else:
-            factors[field] = unit_factor(path, field, unit, ALLOWED_UNITS[field])
-    return factors
+def _long(log: Log) -> Iterator[Recording]:
+    """One Recording per minute of a file too long for memory."""
+    with long_logs.spilled(
+        log.path,
+        lambda show: batches(log.table, log.mapping.fields, log.ledger, show),
+        log.ledger,
+    ) as spill:
+        minutes = (
+            _placed(log, minute)
+            for recording in spill.recordings()
+            for minute in spill.minutes(recording)
+        )
+        meaning = _meaning(log, minutes, spill.texts.get("automated", {}))
+        for recording in spill.recordings():
+            name = log.name if recording is None else f"{log.name}-{recording}"
+            gap_s = MAX_GAP_STEPS / log.mapping.rate_hz
+            for piece in spill.pieces(recording, gap_s):
+                rows = _placed(log, piece.values)
+                table = _localise(log, rows, meaning, start=0.0)
+                made = _recording(f"{name}-{piece.label}", table, log, meaning)
+                yield long_logs.piece_of(name, made, piece)
 
 
-def _limit(field: str, units: dict[str, float]) -> float:
-    """What a field's numbers stay within, in the file's unit."""
-    limit = LIMITS.get(field, np.inf)
-    return limit / min(units.get("t", 1.0), 1.0) if field == "t" else limit
+def _meaning(
+    log: Log, rows: Iterable[dict[str, np.ndarray]], automated: Iterable[str]
+) -> Meaning:
+    return meaning_of(log.path, rows, automated, log.mapping, log.spec)
+
+
+def _placed(log: Log, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Rows with x and y in metres."""
+    points = np.stack([values["x"], values["y"]], axis=1)
+    x, y = log.metres(points).T
+    return {**values, "x": x, "y": y}
 
 
 def _localise(
-    path: Path,
-    values: dict,
-    rate: float,
-    notes: list[str],
+    log: Log,
+    values: dict[str, np.ndarray],
+    meaning: Meaning,
     start: float | None = None,
 ) -> LogTable:
     """Start the clock at 0 (or at `start`), move far coordinates near the origin."""
-    notes = list(notes)
+    values = meaning.applied(values)
+    notes = [*log.mapping.notes, *meaning.notes]
     values["t"] = values["t"] - (values["t"].min() if start is None else start)
+    span = max(np.ptp(values["x"]), np.ptp(values["y"]))
+    if not log.mapping.has_units and 0.0 < span < STILL_M:
+        raise InputError(
+            f"{log.path}: x, y: all within {span:.3g} m: expected road users that move;"
+            ' longitude and latitude? say units.x = "deg", units.y = "deg"'
+        )
     middle = np.array([np.median(values["x"]), np.median(values["y"])])
     origin = np.zeros(2)
     if np.any(np.abs(middle) > FAR_M):
@@ -218,18 +207,27 @@ def _localise(
         notes.append(f"local origin at x = {origin[0]:.0f} m, y = {origin[1]:.0f} m")
     values["x"], values["y"] = values["x"] - origin[0], values["y"] - origin[1]
     return LogTable(
-        path=path, values=values, rate_hz=rate, origin=origin, notes=tuple(notes)
+        path=log.path,
+        values=values,
+        rate_hz=log.mapping.rate_hz,
+        origin=origin,
+        notes=tuple(notes),
+        metres=log.metres,
     )
 
 
-def _recording(name: str, table: LogTable, spec: dict) -> Recording:
+def _recording(name: str, table: LogTable, log: Log, meaning: Meaning) -> Recording:
+    spec = log.spec
     pieces = split_tracks(
         table.path,
         table.values["id"],
         table.values["t"],
         MAX_GAP_STEPS / table.rate_hz,
+        reuse=0.0,  # rows may come in any order
     )
-    tracks = tuple(_track(label, table, rows, spec) for label, rows in pieces)
+    tracks = tuple(
+        track_of(label, table, rows, spec, meaning) for label, rows in pieces
+    )
     lanes, notes = lanes_of(table, spec, tracks)
     return Recording(
         name=name,
@@ -241,55 +239,3 @@ def _recording(name: str, table: LogTable, spec: dict) -> Recording:
         default_speed_limit=number(spec, "speed_limit", LIMIT_MPS),
         notes=(*table.notes, *notes),
     )
-
-
-def _track(name: str, table: LogTable, rows: np.ndarray, spec: dict) -> Track:
-    defaults = section(spec, "defaults")
-    values = {field: column[rows] for field, column in table.values.items()}
-    t, x, y = values["t"], values["x"], values["y"]
-    heading = values.get("heading")
-    if heading is None:
-        heading = travel_heading(t, x, y)
-    speed = values.get("speed")
-    if speed is None:
-        speed = (
-            np.hypot(np.gradient(x, t), np.gradient(y, t))
-            if t.size > 1
-            else np.zeros(t.shape)
-        )
-    size = {
-        field: float(np.median(values[field]))
-        if field in values
-        else number(defaults, field, SIZE_M[field])
-        for field in SIZE_M
-    }
-    reference = spec.get("reference_point", "centre")
-    if reference not in REFERENCE:
-        raise InputError(
-            f"source TOML: reference_point: {reference}: "
-            f"expected one of {', '.join(REFERENCE)}"
-        )
-    ahead = REFERENCE[reference] * size["length"]
-    found = str(values["kind"][0] if "kind" in values else defaults.get("kind", ""))
-    return Track(
-        id=name,
-        kind=_kind(table.path, name, found, spec),
-        length=size["length"],
-        width=size["width"],
-        t=t,
-        x=x + ahead * np.cos(heading),
-        y=y + ahead * np.sin(heading),
-        heading=heading,
-        speed=speed,
-        automated=spans_of(t, values.get("automated", np.zeros(t.size)) != 0.0),
-    )
-
-
-def _kind(path: Path, name: str, found: str, spec: dict) -> Kind:
-    kind = str(section(spec, "kinds").get(found, found or "vehicle")).lower()
-    if kind not in KINDS:
-        raise InputError(
-            f"{path}: id {name}: kind: {found}: expected one of {', '.join(KINDS)}, "
-            "or an entry in [kinds]"
-        )
-    return Kind[kind.upper()]

@@ -26,25 +26,32 @@ from rcirl_jax.data.importers.files import (
     log_name,
 )
 from rcirl_jax.data.importers.lanelet2.map import read_lanelet2
-from rcirl_jax.data.importers.options import number, path_option
+from rcirl_jax.data.importers.options import number, path_option, section
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.projection import utm, utm_zone
 from rcirl_jax.data.importers.tracks import split_tracks, travel_heading
-from rcirl_jax.data.readers.sparse_tables import (
+from rcirl_jax.data.readers.tables.ledger import LINE, Ledger, allowed_share
+from rcirl_jax.data.readers.tables.repair import single_rows
+from rcirl_jax.data.readers.tables.table import (
     MAX_PLACE_M,
     MAX_TIME,
     MAX_VELOCITY_MPS,
-    check_range,
-    read_sparse_table,
+    fields_of,
+    open_table,
+    read,
 )
-from rcirl_jax.data.readers.tables import read_header
 from rcirl_jax.data.recording import accepted, validate_recording
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Kind, Lane, Recording, Track
+from rcirl_jax.types import Kind, Lane, Recording, RowCounts, Track
 
 NEEDED = ("track_id", "timestamp_ms", "agent_type", "x", "y", "vx", "vy")
 OPTIONAL = ("case_id", "psi_rad", "length", "width")
-TEXT = {"track_id": 16, "agent_type": 24}  # characters kept
+TEXT = ("track_id", "agent_type")
+LIMITS = {
+    "timestamp_ms": MAX_TIME,
+    **dict.fromkeys(("x", "y"), MAX_PLACE_M),
+    **dict.fromkeys(("vx", "vy"), MAX_VELOCITY_MPS),
+}
 VEHICLES = "vehicle_tracks_"
 PEDESTRIANS = "pedestrian_tracks_"
 # files of a release that are no logs: predictions to hand in, 1 s observations
@@ -86,22 +93,38 @@ class _Scene:
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """One Recording per vehicle file, or per case of a challenge file."""
     for file in parts(path, spec):
-        header = read_header(file)
-        table = _read(file, header)
+        table, ledger = _read(file, spec)
         scene = _scene(file, spec)
-        if "case_id" in header:
-            yield from _cases(table, scene)
+        if np.isfinite(table["case_id"]).any():
+            for made in _cases(table, scene):
+                yield _with_rows(made, ledger)
             continue
         partner = file.with_name(file.name.replace(VEHICLES, PEDESTRIANS, 1))
+        ledgers = [ledger]
         if partner != file and partner.is_file():
-            extra = _read(partner, read_header(partner))
+            extra, others = _read(partner, spec)
             table = {k: np.concatenate([table[k], extra[k]]) for k in table}
+            ledgers.append(others)
         number_ = file.stem.removeprefix(VEHICLES).removeprefix(PEDESTRIANS)
         own = f"{_scene_name(file)}-{number_}"
         name = log_name(file, spec, own)
         # logs of one name may be copies of each other
         group = None if name == own else own
-        yield validate_recording(_recording(name, table, scene, group), file)
+        made = _recording(name, table, scene, group)
+        yield validate_recording(_with_rows(made, *ledgers), file)
+
+
+def _with_rows(made: Recording, *ledgers: Ledger) -> Recording:
+    """A recording that says what became of the rows of its files."""
+    found = [ledger.news() for ledger in ledgers]
+    counts = {
+        field.name: sum(getattr(rows, field.name) for rows, _ in found)
+        for field in dataclasses.fields(RowCounts)
+    }
+    notes = [note for _, dropped in found for note in dropped]
+    return dataclasses.replace(
+        made, rows=RowCounts(**counts), notes=(*made.notes, *notes)
+    )
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
@@ -127,7 +150,7 @@ def _is_log(path: Path) -> bool:
     if path.name.startswith((VEHICLES, PEDESTRIANS)) or path.stem.endswith(SETS):
         return True
     try:
-        header = read_header(path)
+        header = open_table(path).header
     except InputError:
         return False
     return {"track_id", "timestamp_ms"} <= set(header)
@@ -151,26 +174,33 @@ def _scene_name(path: Path) -> str:
     )
 
 
-def _read(path: Path, header: list[str]) -> dict[str, np.ndarray]:
-    """All columns this module uses; NaN where a file or a cell has none."""
-    for name in NEEDED:
-        if name not in header:
-            raise InputError(
-                f"{path}: column {name}: missing: expected it among {header}"
-            )
-    chosen = [*NEEDED, *(name for name in OPTIONAL if name in header)]
-    table = read_sparse_table(path, header, chosen, TEXT)
-    for name in NEEDED:
-        values = table[name]
-        empty = values == "" if name in TEXT else ~np.isfinite(values)
-        if empty.any():
-            row = int(np.flatnonzero(empty)[0]) + 2
-            raise InputError(f"{path}: line {row}: {name}: '': expected a value")
-    check_range(path, table, ("x", "y"), MAX_PLACE_M)
-    check_range(path, table, ("vx", "vy"), MAX_VELOCITY_MPS)
-    check_range(path, table, ("timestamp_ms",), MAX_TIME)
-    count = table["x"].size
-    return {n: table.get(n, np.full(count, np.nan)) for n in (*NEEDED, *OPTIONAL)}
+def _read(path: Path, spec: dict) -> tuple[dict[str, np.ndarray], Ledger]:
+    """All columns this module uses, and what became of the rows.
+
+    NaN where a file or a cell has none; each road user is met once in a frame.
+    """
+    source = open_table(path, section(spec, "table"))
+    ledger = Ledger(path=path, unit=source.unit, allowed=allowed_share(spec))
+    fields = fields_of(source, NEEDED, OPTIONAL, texts=TEXT, limits=LIMITS)
+    table = read(source, fields, ledger)
+    none = np.full(table["x"].size, np.nan)
+    table = {name: table.get(name, none) for name in (*NEEDED, *OPTIONAL, LINE)}
+    if "case_id" in source.header and not np.isfinite(table["case_id"]).all():
+        line = table[LINE][~np.isfinite(table["case_id"])][0]
+        raise InputError(f"{path}: line {line}: case_id: '': expected a number")
+    users, codes = np.unique(table["track_id"], return_inverse=True)
+    cases = np.unique(table["case_id"], return_inverse=True)[1]
+    kept = single_rows(
+        {
+            **table,
+            "t": table["timestamp_ms"],
+            "id": (cases * users.size + codes).astype(float),
+        },
+        ledger,
+        [*NEEDED, *OPTIONAL],
+        lambda code: users[int(code) % users.size],
+    )
+    return {name: column[kept] for name, column in table.items()}, ledger
 
 
 def _scene(path: Path, spec: dict) -> _Scene:
@@ -230,8 +260,6 @@ def _cases(table: dict[str, np.ndarray], scene: _Scene) -> Iterator[Recording]:
     """One Recording per case; all of a file are one group, they share vehicles."""
     order = np.argsort(table["case_id"], kind="stable")
     case = table["case_id"][order]
-    if not np.isfinite(case).all():
-        raise InputError(f"{scene.path}: case_id: '': expected a number in every row")
     for rows in np.split(order, np.flatnonzero(np.diff(case)) + 1):
         part = {field: values[rows] for field, values in table.items()}
         log = log_name(scene.path, scene.spec, scene.path.stem)

@@ -13,9 +13,7 @@ are separated by semicolons, the map is a Lanelet2 file of the location in
 degrees, moved by the recording's UTM origin, a trailer is a track of its own.
 """
 
-import csv
 import dataclasses
-import itertools
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -24,17 +22,21 @@ import numpy as np
 from rcirl_jax.data.importers.files import files_below, log_name
 from rcirl_jax.data.importers.lanelet2.map import read_lanelet2
 from rcirl_jax.data.importers.levelx.map import find_map, marked_lanes
-from rcirl_jax.data.importers.options import number
+from rcirl_jax.data.importers.options import number, section
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.projection import utm, utm_zone
 from rcirl_jax.data.importers.tracks import split_tracks, travel_heading
-from rcirl_jax.data.readers.sparse_tables import (
+from rcirl_jax.data.readers.tables.ledger import Ledger, allowed_share
+from rcirl_jax.data.readers.tables.repair import single_rows
+from rcirl_jax.data.readers.tables.table import (
     MAX_PLACE_M,
     MAX_TIME,
     MAX_VELOCITY_MPS,
-    check_range,
+    Table,
+    fields_of,
+    open_table,
+    read,
 )
-from rcirl_jax.data.readers.tables import read_header, read_table, rows_of
 from rcirl_jax.data.recording import check_span, validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Lane, Recording, Track
@@ -46,6 +48,13 @@ CENTRE = (
     *("frame", "trackId", "xCenter", "yCenter", "heading", "width", "length"),
     *("xVelocity", "yVelocity"),
 )
+LIMITS = {
+    "frame": MAX_TIME,
+    **dict.fromkeys(
+        ("x", "y", "xCenter", "yCenter", "width", "height", "length"), MAX_PLACE_M
+    ),
+    **dict.fromkeys(("xVelocity", "yVelocity"), MAX_VELOCITY_MPS),
+}
 KINDS = {
     "pedestrian": Kind.PEDESTRIAN,
     "animal": Kind.PEDESTRIAN,
@@ -89,9 +98,9 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     for file in parts(path, spec):
         if not file.name.endswith(SUFFIX):
             raise InputError(f"{file}: name: {file.name}: expected XX{SUFFIX}")
-        header = read_header(file)
-        read = _read_centres if "xCenter" in header else _read_corners
-        yield validate_recording(read(file, spec), file)
+        table = open_table(file, section(spec, "table"))
+        made = _read_centres if "xCenter" in table.header else _read_corners
+        yield validate_recording(made(table, spec), file)
 
 
 def _other(path: Path, suffix: str) -> Path:
@@ -108,19 +117,15 @@ def _beside(path: Path, suffix: str) -> Path:
 
 def _read_meta(path: Path) -> dict[str, str]:
     """The one row of a recordingMeta.csv, as text."""
-    names = read_header(path)
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as handle:
-            rows = (row for _, row in rows_of(handle) if row)
-            rows = list(itertools.islice(rows, 1, 3))
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: text: {error}: expected CSV text") from error
-    if len(rows) != 1 or len(rows[0]) != len(names):
+    table = open_table(path, {"delimiter": ","})  # semicolons stand inside of cells
+    rows = [list(row) for row in table.head]
+    if len(rows) != 1 or len(rows[0]) != len(table.header):
         sizes = [len(row) for row in rows][:3]
         raise InputError(
-            f"{path}: rows: {len(rows)} of {sizes} cells: expected one of {len(names)}"
+            f"{path}: rows: {len(rows)} of {sizes} cells: "
+            f"expected one of {len(table.header)}"
         )
-    return dict(zip(names, (cell.strip() for cell in rows[0]), strict=True))
+    return dict(zip(table.header, (cell.strip() for cell in rows[0]), strict=True))
 
 
 def _meta_number(
@@ -154,18 +159,28 @@ def _limit(path: Path, meta: dict[str, str]) -> float | None:
 
 
 def _read_rows(
-    path: Path, columns: tuple[str, ...], metres: tuple[str, ...]
-) -> dict[str, np.ndarray]:
-    rows = read_table(path, columns, (), ())
-    check_range(path, rows, metres, MAX_PLACE_M)
-    check_range(path, rows, ("xVelocity", "yVelocity"), MAX_VELOCITY_MPS)
-    check_range(path, rows, ("frame",), MAX_TIME)
-    return rows
+    table: Table, columns: tuple[str, ...], spec: dict
+) -> tuple[dict[str, np.ndarray], Ledger]:
+    """The tracks' rows, each road user once in a frame, and what became of others."""
+    ledger = Ledger(
+        path=table.path, unit=table.unit, allowed=allowed_share(spec, default=0.0)
+    )
+    rows = read(table, fields_of(table, columns, limits=LIMITS), ledger)
+    frame, user, x, y = columns[:4]
+    kept = single_rows(
+        {**rows, "t": rows[frame], "id": rows[user]},
+        ledger,
+        columns,
+        "{:g}".format,
+        (x, y),
+    )
+    return {name: column[kept] for name, column in rows.items()}, ledger
 
 
-def _read_corners(path: Path, spec: dict) -> Recording:
+def _read_corners(table: Table, spec: dict) -> Recording:
     """highD: corners of boxes, lanes by the y of their markings."""
-    rows = _read_rows(path, CORNER, ("x", "y", "width", "height"))
+    path = table.path
+    rows, ledger = _read_rows(table, CORNER, spec)
     users = _read_users(_beside(path, USERS), "id", "drivingDirection")
     meta_path = _beside(path, "_recordingMeta.csv")
     meta = _read_meta(meta_path)
@@ -197,12 +212,14 @@ def _read_corners(path: Path, spec: dict) -> Recording:
     check_span(str(path), "x", x)
     along = (float(x.min()), float(x.max()))
     lanes = marked_lanes(meta_path, meta, along, limit, (y, rows["xVelocity"]))
-    return _recording(path, spec, rate, tracks, lanes, limit, _user_notes(ids, users))
+    notes = _user_notes(ids, users)
+    return _recording(path, spec, rate, tracks, lanes, limit, notes, ledger)
 
 
-def _read_centres(path: Path, spec: dict) -> Recording:
+def _read_centres(table: Table, spec: dict) -> Recording:
     """inD, rounD, exiD, uniD: centres of boxes, lanes from a map."""
-    rows = _read_rows(path, CENTRE, ("xCenter", "yCenter", "width", "length"))
+    path = table.path
+    rows, ledger = _read_rows(table, CENTRE, spec)
     users = _read_users(_beside(path, USERS), "trackId", None)
     meta_path = _beside(path, "_recordingMeta.csv")
     meta = _read_meta(meta_path)
@@ -219,7 +236,7 @@ def _read_centres(path: Path, spec: dict) -> Recording:
     trailers = sum(users[int(i)].kind == "trailer" for i in np.unique(ids))
     if trailers:
         notes.append(f"{trailers} trailers are obstacles of kind cyclist, no experts")
-    return _recording(path, spec, rate, tracks, lanes, limit, notes)
+    return _recording(path, spec, rate, tracks, lanes, limit, notes, ledger)
 
 
 def _centred_track(
@@ -253,7 +270,9 @@ def _read_users(path: Path, key: str, direction: str | None) -> dict[int, _User]
     """Track number -> what tracksMeta says of it."""
     rows, *ends = LIFE
     wanted = [key, "class", *ends, *([direction] if direction else [])]
-    table = read_table(path, wanted, (rows,), ["class"])
+    source = open_table(path)
+    fields = fields_of(source, wanted, (rows,), texts=("class",))
+    table = read(source, fields, Ledger(path=path, allowed=0.0))
     first, last = (table[end] for end in ends)
     lives = zip(table.get(rows, last - first + 1.0), first, last, strict=True)
     towards = table[direction] if direction else np.zeros(table[key].size)
@@ -350,7 +369,9 @@ def _recording(
     lanes: tuple[Lane, ...],
     limit: float | None,
     notes: list[str],
+    ledger: Ledger,
 ) -> Recording:
+    counts, dropped = ledger.news()
     default = number(spec, "default_speed_limit", LIMIT_MPS)
     return Recording(
         name=log_name(path, spec, own_name(path)),
@@ -360,5 +381,6 @@ def _recording(
         tracks=tuple(tracks),
         lanes=lanes,
         default_speed_limit=limit if limit is not None else default,
-        notes=tuple(notes),
+        notes=(*notes, *dropped),
+        rows=counts,
     )

@@ -24,7 +24,7 @@ SWITCH_S = 4.0  # s, a lane change takes 3 to 6 s
 LIMIT_MPS = 29.06  # m/s, 65 mph
 SIZE_M = (4.5, 1.8)  # m, a car
 
-Table = dict[str, np.ndarray]  # column -> [n], SI units; "frame" is the clock
+Rows = dict[str, np.ndarray]  # column -> [n], SI units; "frame" is the clock
 
 
 class Survey:
@@ -35,15 +35,13 @@ class Survey:
 
     def __init__(self) -> None:
         self.lateral = False  # any lateral position
-        self._repeated = 0
         self._without: dict[str, set[float]] = {"length": set(), "width": set()}
         # lane -> different Local_X and how often each is met; ends of Local_Y
         self._across: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self._along: dict[int, tuple[float, float]] = {}
 
-    def add(self, table: Table) -> None:
-        """Take in rows; those that repeat another are removed from `table`."""
-        self._repeated += drop_repeated(table)
+    def add(self, table: Rows) -> None:
+        """Take in rows."""
         self.lateral |= bool(np.any(table["Local_X"] != 0.0))
         for field, users in self._without.items():
             users.update(table["Vehicle_ID"][table[f"v_{field.title()}"] <= 0.0])
@@ -55,15 +53,13 @@ class Survey:
             self._along[lane] = min(lower, float(y.min())), max(upper, float(y.max()))
 
     def notes(self) -> list[str]:
-        """What was missing or repeated."""
+        """What was missing."""
         notes = []
         if not self.lateral:
             notes.append("no lateral positions; built from lane numbers")
         for field, users in self._without.items():
             if users:
                 notes.append(f"{len(users)} vehicles without {field}; default by class")
-        if self._repeated:
-            notes.append(f"{self._repeated} rows met twice, used once")
         return notes
 
     def lanes(self, path: Path, spec: Mapping) -> tuple[Lane, ...]:
@@ -104,37 +100,22 @@ def _median(values: np.ndarray, counts: np.ndarray) -> float:
     return float(np.mean(values[np.searchsorted(ends, middle, side="right")]))
 
 
-def drop_repeated(table: Table) -> int:
-    """Remove rows that repeat another in every value; returns how many."""
-    values = [v for name, v in table.items() if name not in (SITE, "Preceding")]
-    order = np.lexsort((np.arange(values[0].size), table["frame"], table["Vehicle_ID"]))
-    stacked = np.stack(values, axis=1)[order]
-    repeated = np.all(stacked[1:] == stacked[:-1], axis=1)
-    if not repeated.any():
-        return 0
-    keep = np.ones(order.size, bool)
-    keep[order[1:][repeated]] = False
-    for name in table:
-        table[name] = table[name][keep]
-    return int(repeated.sum())
-
-
 def site_recording(
     path: Path,
     name: str,
-    table: Table,
+    table: Rows,
     spec: dict,
     survey: Survey,
     *,
     stamped: bool,
     notes: list[str],
 ) -> Recording:
-    """A Recording of rows without repeats.
+    """A Recording of some rows.
 
     Args:
       path: named in errors.
       name: of the Recording.
-      table: rows of the site, all or of a minute.
+      table: rows of the site, all or of a minute, each vehicle once in a frame.
       spec: source TOML.
       survey: of the whole site.
       stamped: the clock is Global_Time; rows may come in any order.
@@ -160,7 +141,7 @@ def site_recording(
     )
 
 
-def _leader_missing(table: Table) -> np.ndarray:
+def _leader_missing(table: Rows) -> np.ndarray:
     """[n] bool: the row names a vehicle ahead that has no row at that time."""
     named = table["Preceding"] > 0.0
     users = np.concatenate([table["Vehicle_ID"], table["Preceding"]])
@@ -171,7 +152,7 @@ def _leader_missing(table: Table) -> np.ndarray:
 
 
 def _track(
-    name: str, table: Table, rows: np.ndarray, spec: dict, lateral: bool
+    name: str, table: Rows, rows: np.ndarray, spec: dict, lateral: bool
 ) -> Track:
     frame_s = positive(spec, "frame_s", FRAME_S)
     sizes = spec.get("sizes", {})

@@ -15,10 +15,9 @@ hold every log twice, as text and as CSV, in folders of their own; those of the
 arterials have no column Location to say what they are, but 24 columns.
 """
 
-import functools
-from collections.abc import Callable, Iterator, Sequence
+import dataclasses
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NoReturn, TextIO
 
 import numpy as np
 
@@ -27,32 +26,33 @@ from rcirl_jax.data.importers.ngsim.map import (
     FRAME_S,
     MAX_FRAME_GAP,
     SITE,
+    Rows,
     Survey,
-    Table,
-    drop_repeated,
     site_recording,
 )
-from rcirl_jax.data.importers.options import patterns, positive, unit_factor
-from rcirl_jax.data.readers import csv_stream, long_logs
-from rcirl_jax.data.readers.sparse_tables import (
+from rcirl_jax.data.importers.options import patterns, positive, section, unit_factor
+from rcirl_jax.data.readers import long_logs
+from rcirl_jax.data.readers.tables.layout import BLANKS
+from rcirl_jax.data.readers.tables.ledger import LINE, Ledger, allowed_share
+from rcirl_jax.data.readers.tables.repair import single_rows
+from rcirl_jax.data.readers.tables.table import (
     MAX_PLACE_M,
     MAX_TIME,
-    check_range,
-)
-from rcirl_jax.data.readers.tables import (
-    check_row,
-    is_grouped,
-    lines_of,
-    load_rows,
-    read_header,
-    read_table,
+    Field,
+    Table,
+    batches,
+    open_table,
+    read,
 )
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Recording
 
 NEEDED = ("Vehicle_ID", "Frame_ID", "Local_Y", "v_Vel", "Lane_ID")
+KNOWN = tuple(name.lower() for name in NEEDED)
 OPTIONAL = ("Local_X", "v_Length", "v_Width", "v_Class", "Global_Time", "Preceding")
+APART = ("Preceding",)  # columns in which rows that repeat each other may differ
+PLACES = ("Local_Y", "Local_X")  # where a road user is
 JUNCTION = "Int_ID"  # a column of arterials, empty for freeways
 ARTERIAL_COLUMNS = 24  # of an arterial's native text
 LOGS = "trajectories"  # start of the logs' names in the releases
@@ -90,34 +90,39 @@ def own_name(file: Path) -> str:
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
-    """One Recording per file and site; of a long CSV, per site and minute."""
+    """One Recording per file and site; of a long file, per site and minute."""
     for file in parts(path, spec):
-        factor = unit_factor(file, "unit", spec.get("unit", "ft"), ("ft", "m"))
-        is_csv = _has_header(file)
-        if is_long_file(file, spec):
-            found = _long_recordings(file, spec, factor, is_csv)
-        else:
-            table = _read_csv(file) if is_csv else _read_text(file, spec)
-            found = _whole_recordings(file, spec, factor, table)
-        for recording in found:
-            yield validate_recording(recording, file)
+        table = _open(file, spec)
+        ledger = Ledger(
+            path=file,
+            unit=table.unit,
+            allowed=allowed_share(spec),
+            repeats_are_bad=False,  # the portal's files hold some
+        )
+        read_ = _long_recordings if is_long_file(file, spec) else _whole_recordings
+        for made in read_(table, spec, ledger):
+            counts, notes = ledger.news()
+            notes = (*made.notes, *notes)
+            yield validate_recording(
+                dataclasses.replace(made, rows=counts, notes=notes), file
+            )
 
 
-def _whole_recordings(
-    path: Path, spec: dict, factor: float, table: Table
-) -> Iterator[Recording]:
-    for name, limit in LIMITS.items():
-        check_range(path, table, (name,), limit)
-    for name in LENGTHS:
-        table[name] = table[name] * factor
-    sites = np.unique(table[SITE]).tolist() if SITE in table else [None]
+def _whole_recordings(table: Table, spec: dict, ledger: Ledger) -> Iterator[Recording]:
+    path, values = table.path, read(table, _fields(table, spec), ledger)
+    sites = np.unique(values[SITE]).tolist() if SITE in values else [None]
     known, left_out = _known_sites(path, sites, spec)
     frame_s = positive(spec, "frame_s", FRAME_S)
     for site in known:
-        rows = slice(None) if site is None else table[SITE] == site
-        part = {name: values[rows] for name, values in table.items() if name != SITE}
+        rows = slice(None) if site is None else values[SITE] == site
+        part = {name: column[rows] for name, column in values.items() if name != SITE}
+        part = _complete(part)
         stamped = _has_stamps(part["Global_Time"])
         part["frame"] = _clock(part, frame_s, stamped)
+        part["id"], part["t"] = part["Vehicle_ID"], part["frame"]
+        compared = [name for name in part if name not in (LINE, *APART)]
+        kept = single_rows(part, ledger, compared, "{:g}".format, PLACES)
+        part = {name: column[kept] for name, column in part.items()}
         survey = Survey()
         survey.add(part)
         notes = [*left_out, *survey.notes()]
@@ -127,54 +132,32 @@ def _whole_recordings(
         )
 
 
-def _long_recordings(
-    path: Path, spec: dict, factor: float, is_csv: bool
-) -> Iterator[Recording]:
+def _long_recordings(table: Table, spec: dict, ledger: Ledger) -> Iterator[Recording]:
     """One Recording per site and minute; lanes and notes are the site's."""
-    frame_s = positive(spec, "frame_s", FRAME_S)
-    if is_csv:
-        header = _read_header(path)
-        read = functools.partial(csv_stream.batches, grouped=is_grouped(path))
-    else:
-        header, read = _text_columns(spec), functools.partial(_text_batches, spec=spec)
-    names = _columns(header)
-    for name in NEEDED:
-        if names[name] not in header:
-            raise InputError(
-                f"{path}: column {names[name]}: missing: expected it among {header}"
-            )
-    stamped = names["Global_Time"] in header and _has_stamps_long(
-        path, names["Global_Time"], read
-    )
+    path, frame_s = table.path, positive(spec, "frame_s", FRAME_S)
+    fields = _fields(table, spec)
+    stamped = _has_stamps_long(table, fields)
     clock, step = ("Global_Time", 1e-3) if stamped else ("Frame_ID", frame_s)
+    names = _columns(table.header)
     fields = [
-        csv_stream.Field(
-            name="t", column=names[clock], factor=step, limit=LIMITS[clock]
-        ),
-        csv_stream.Field(name="id", column=names["Vehicle_ID"]),
-        *(
-            csv_stream.Field(
-                name=n,
-                column=names[n],
-                factor=factor if n in LENGTHS else 1.0,
-                limit=LIMITS.get(n, np.inf),
-            )
-            for n in (*NEEDED, *OPTIONAL)
-            if names[n] in header
-        ),
+        *(f for f in fields if f.name != SITE),
+        Field(name="t", column=names[clock], factor=step, limit=LIMITS[clock]),
+        Field(name="id", column=names["Vehicle_ID"]),
+        *(dataclasses.replace(f, name="recording") for f in fields if f.name == SITE),
     ]
-    if is_csv and names[SITE] in header:
-        fields.append(
-            csv_stream.Field(
-                name="recording", column=names[SITE], text=True, lower=True
-            )
-        )
 
-    def table_of(values: Table) -> Table:
+    def table_of(values: Rows) -> Rows:
         return _complete({**values, "frame": np.round(values["t"] / frame_s)})
 
     gap_s = (MAX_FRAME_GAP + 0.5) * frame_s
-    with long_logs.spilled(path, fields, spec.get("locations"), read) as spill:
+    with long_logs.spilled(
+        path,
+        lambda show: batches(table, fields, ledger, show),
+        ledger,
+        wanted=spec.get("locations"),
+        apart=APART,
+        places=PLACES,
+    ) as spill:
         sites = spill.recordings()
         known, left_out = _known_sites(path, sites, spec)
         for site in known:
@@ -183,10 +166,9 @@ def _long_recordings(
                 survey.add(table_of(values))
             notes = [*left_out, *survey.notes()]  # once, with the first minute
             for piece in spill.pieces(site, gap_s):
-                table, name = table_of(piece.values), f"{log}-{piece.label}"
-                drop_repeated(table)
+                rows, name = table_of(piece.values), f"{log}-{piece.label}"
                 made = site_recording(
-                    path, name, table, spec, survey, stamped=stamped, notes=notes
+                    path, name, rows, spec, survey, stamped=stamped, notes=notes
                 )
                 yield long_logs.piece_of(log, made, piece)
                 notes = []
@@ -220,38 +202,58 @@ def _has_stamps(stamps: np.ndarray) -> bool:
     return bool(stamps.min() > 0.0 and stamps.max() > stamps.min())
 
 
-def _has_stamps_long(
-    path: Path,
-    column: str,
-    read: Callable[[Path, list[csv_stream.Field]], Iterator[dict]],
-) -> bool:
+def _has_stamps_long(table: Table, fields: Sequence[Field]) -> bool:
     """`_has_stamps` of a whole file, read a few MiB at a time."""
-    field = csv_stream.Field(name="stamps", column=column)
-    found = (batch["stamps"] for batch in read(path, [field]))
+    own = [field for field in fields if field.name == "Global_Time"]
+    if not own:
+        return False
+    uncounted = Ledger(path=table.path)
+    found = (batch["Global_Time"] for batch in batches(table, own, uncounted))
     ends = [(part.min(), part.max()) for part in found if part.size]
     return bool(ends) and _has_stamps(np.array(ends))
 
 
-def _clock(table: Table, frame_s: float, stamped: bool) -> np.ndarray:
+def _clock(rows: Rows, frame_s: float, stamped: bool) -> np.ndarray:
     """Whole frames since the recording's first, from Global_Time if it is there."""
     if stamped:
-        stamps = table["Global_Time"]
+        stamps = rows["Global_Time"]
         frames = np.round((stamps - stamps.min()) / (1000.0 * frame_s))
     else:
-        frames = table["Frame_ID"] - table["Frame_ID"].min()
+        frames = rows["Frame_ID"] - rows["Frame_ID"].min()
     return np.round(frames)
 
 
-def _has_header(path: Path) -> bool:
-    """Whether the file is the portal's CSV rather than the native text."""
-    try:
-        with path.open(encoding="utf-8-sig") as handle:
-            first = next(lines_of(handle), "")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: text: {error}: expected NGSIM rows") from error
-    if not first.strip():
-        raise InputError(f"{path}: rows: none: expected NGSIM rows")
-    return "," in first
+def _open(path: Path, spec: dict) -> Table:
+    """The portal's table, or the native text, whose columns the TOML names.
+
+    Raises:
+      InputError: a column is missing, or it is an arterial's file.
+    """
+    options = section(spec, "table")
+    table = open_table(path, options)
+    if _is_native(table):
+        columns = _text_columns(spec)
+        if len(table.header) == ARTERIAL_COLUMNS != len(columns):
+            raise InputError(
+                f"{path}: line 1: {len(table.header)} cells: expected {len(columns)}; "
+                "arterials have no straight lanes"
+            )
+        table = open_table(path, {"names": columns, "skip": 0, **options})
+    lower = [name.lower() for name in table.header]
+    if JUNCTION.lower() in lower and SITE.lower() not in lower:
+        raise InputError(
+            f"{path}: column {SITE}: missing: expected it beside {JUNCTION}; "
+            "arterials have no straight lanes"
+        )
+    return table
+
+
+def _is_native(table: Table) -> bool:
+    """Whether it is the native text, which has no header."""
+    if table.layout is None or {n.lower() for n in table.header} & set(KNOWN):
+        return False
+    is_numeric = not any(c.isalpha() for c in "".join(table.header))
+    return is_numeric or table.layout.delimiter == BLANKS
 
 
 def _columns(header: Sequence[str]) -> dict[str, str]:
@@ -260,37 +262,28 @@ def _columns(header: Sequence[str]) -> dict[str, str]:
     return {n: actual.get(n.lower(), n) for n in (*NEEDED, *OPTIONAL, SITE)}
 
 
-def _read_header(path: Path) -> list[str]:
-    """Column names; those of an arterial that does not say so are refused."""
-    header = read_header(path)
-    lower = [name.lower() for name in header]
-    if JUNCTION.lower() in lower and SITE.lower() not in lower:
-        raise InputError(
-            f"{path}: column {SITE}: missing: expected it beside {JUNCTION}; "
-            "arterials have no straight lanes"
+def _fields(table: Table, spec: dict) -> list[Field]:
+    """Columns that are read, in SI units; those that may be missing are, if there."""
+    factor = unit_factor(table.path, "unit", spec.get("unit", "ft"), ("ft", "m"))
+    names = _columns(table.header)
+    return [
+        Field(
+            name=name,
+            column=names[name],
+            text=name == SITE,
+            lower=name == SITE,
+            factor=factor if name in LENGTHS else 1.0,
+            limit=LIMITS.get(name, np.inf),
         )
-    return header
+        for name in (*NEEDED, *OPTIONAL, SITE)
+        if name in NEEDED or names[name] in table.header
+    ]
 
 
-def _read_csv(path: Path) -> Table:
-    names = _columns(_read_header(path))
-    found = read_table(
-        path,
-        [names[n] for n in NEEDED],
-        [names[n] for n in (*OPTIONAL, SITE)],
-        [names[SITE]],
-        grouped=is_grouped(path),
-    )
-    table = _complete({n: found[names[n]] for n in names if names[n] in found})
-    if SITE in table:
-        table[SITE] = np.char.lower(table[SITE])
-    return table
-
-
-def _complete(table: Table) -> Table:
+def _complete(rows: Rows) -> Rows:
     """Zeros for optional columns that a file has not."""
-    none = np.zeros(table["Frame_ID"].size)
-    return {name: table.get(name, none) for name in (*NEEDED, *OPTIONAL)} | table
+    none = np.zeros(rows["Frame_ID"].size)
+    return {name: rows.get(name, none) for name in (*NEEDED, *OPTIONAL)} | rows
 
 
 def _text_columns(spec: dict) -> list[str]:
@@ -302,67 +295,3 @@ def _text_columns(spec: dict) -> list[str]:
         if name not in columns:
             raise InputError(f"source TOML: columns: {name}: missing: expected it")
     return columns
-
-
-def _read_text(path: Path, spec: dict) -> Table:
-    columns = _text_columns(spec)
-    wanted = [name for name in (*NEEDED, *OPTIONAL) if name in columns]
-    values = np.concatenate(list(_text_rows(path, columns)))
-    return _complete({name: values[:, columns.index(name)] for name in wanted})
-
-
-def _text_batches(
-    path: Path, fields: list[csv_stream.Field], spec: dict
-) -> Iterator[Table]:
-    """`csv_stream.batches` of the native text."""
-    columns, start = _text_columns(spec), 1
-    for values in _text_rows(path, columns):
-        found = {field.name: values[:, columns.index(field.column)] for field in fields}
-        yield {
-            field.name: csv_stream.in_si(path, found[field.name], field, start)
-            for field in fields
-        }
-        start += len(values)
-
-
-def _text_rows(path: Path, columns: list[str]) -> Iterator[np.ndarray]:
-    """Numbers [n, columns] of the native text, READ_BYTES at a time."""
-    try:
-        with path.open(encoding="utf-8-sig") as handle:
-            for lines in _pieces(handle):
-                values = load_rows(lines, "f8", None)
-                if len(values) and values.shape[1] != len(columns):
-                    raise ValueError(values.shape)
-                if not np.isfinite(values).all():
-                    raise ValueError(values)
-                yield values.reshape(-1, len(columns))
-    except ValueError:  # also of bytes that are no text
-        _find_bad_line(path, columns)
-
-
-def _pieces(handle: TextIO) -> Iterator[list[str]]:
-    """Lines of READ_BYTES or a little more."""
-    lines, held = [], 0
-    for line in lines_of(handle):
-        lines.append(line)
-        held += len(line)
-        if held >= csv_stream.READ_BYTES:
-            yield lines
-            lines, held = [], 0
-    if lines:
-        yield lines
-
-
-def _find_bad_line(path: Path, columns: list[str]) -> NoReturn:
-    """Name the first line that is not a row of numbers."""
-    with path.open(encoding="utf-8", errors="replace") as handle:
-        for line, text in enumerate(lines_of(handle), start=1):
-            if text.strip():
-                cells = text.split()
-                if len(cells) == ARTERIAL_COLUMNS != len(columns):
-                    raise InputError(
-                        f"{path}: line {line}: {len(cells)} cells: expected "
-                        f"{len(columns)}; arterials have no straight lanes"
-                    )
-                check_row(path, line, cells, columns, columns)
-    raise InputError(f"{path}: rows: unreadable: expected {len(columns)} numbers each")

@@ -14,22 +14,30 @@ the file (a Ghost ahead says so, and its scenes are dropped).
 """
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from rcirl_jax.data.importers.files import input_files
 from rcirl_jax.data.importers.lanes import StraightLane, straight_lanes
-from rcirl_jax.data.importers.options import number, one_pattern, unit_factor
+from rcirl_jax.data.importers.options import (
+    number,
+    one_pattern,
+    section,
+    unit_factor,
+)
 from rcirl_jax.data.importers.tracks import split_tracks
-from rcirl_jax.data.readers.sparse_tables import (
+from rcirl_jax.data.readers.tables.ledger import LINE, Ledger, allowed_share
+from rcirl_jax.data.readers.tables.repair import single_rows
+from rcirl_jax.data.readers.tables.table import (
     MAX_PLACE_M,
     MAX_TIME,
     MAX_VELOCITY_MPS,
-    check_range,
+    fields_of,
+    open_table,
+    read,
 )
-from rcirl_jax.data.readers.tables import lines_of, read_table
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Ghost, Kind, Recording, Track
@@ -42,6 +50,11 @@ LANE_WIDTH_M = 3.6576  # m, 12 ft
 LENGTH_M = 4.5  # m, of a follower that leads in no file
 WIDTH_M = 1.8  # m
 MAX_GAP_FRAMES = 5.5  # frames missing inside one track
+LIMITS = {
+    "t": MAX_TIME,
+    **dict.fromkeys(("x_follower", "x_leader"), MAX_PLACE_M),
+    **dict.fromkeys(("v_follower", "v_leader"), MAX_VELOCITY_MPS),
+}
 MARGIN_M = 50.0  # m of lane beyond the first and last position
 SPACING_FT = 0.5  # tolerance of spacing against the positions
 
@@ -50,7 +63,7 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """One Recording of two cars per file."""
     files = input_files(path, one_pattern(spec, "**/*_f*_l*.csv"))
     groups = _groups(files)
-    lengths = _leader_lengths(files)
+    lengths = _leader_lengths(files, section(spec, "table"))
     for file in files:
         recording = _read_pair(file, spec, groups[file], lengths)
         yield validate_recording(recording, file)
@@ -85,18 +98,16 @@ def _groups(files: Sequence[Path]) -> dict[Path, str]:
     return {file: first[root(_ids(file)[:2])] for file in files}
 
 
-def _leader_lengths(files: Sequence[Path]) -> dict[tuple[str, str], float]:
+def _leader_lengths(
+    files: Sequence[Path], options: Mapping
+) -> dict[tuple[str, str], float]:
     """(run, car) -> length in the files' unit, of every car that leads somewhere."""
     lengths = {}
     for file in files:
         run, _, leader = _ids(file)
         try:
-            with file.open(encoding="utf-8-sig") as handle:
-                lines = lines_of(handle)
-                names = next(lines, "").strip().split(",")
-                cells = next(lines, "").strip().split(",")
-            length = float(cells[names.index("leader_length")])
-        except (UnicodeDecodeError, ValueError, IndexError):
+            length = float(open_table(file, options).samples("leader_length")[0])
+        except (InputError, ValueError, IndexError):
             continue  # reported when the file itself is read
         if np.isfinite(length):
             lengths[run, leader] = length
@@ -106,10 +117,7 @@ def _leader_lengths(files: Sequence[Path]) -> dict[tuple[str, str], float]:
 def _read_pair(
     path: Path, spec: dict, group: str, lengths: dict[tuple[str, str], float]
 ) -> Recording:
-    table = read_table(path, COLUMNS, ("spacing",), ())
-    check_range(path, table, ("x_follower", "x_leader"), MAX_PLACE_M)
-    check_range(path, table, ("v_follower", "v_leader"), MAX_VELOCITY_MPS)
-    check_range(path, table, ("t",), MAX_TIME)
+    table, ledger = _read_rows(path, spec)
     factor = unit_factor(path, "unit", str(spec.get("unit", "ft")), ("ft", "m"))
     run, follower, leader = _ids(path)
     length = float(np.median(table["leader_length"]))
@@ -144,6 +152,7 @@ def _read_pair(
         for part, rows in pieces
     )
     limit = number(spec, "speed_limit", LIMIT_MPS)
+    counts, dropped = ledger.news()
     lane = StraightLane(
         id="1",
         y=0.0,
@@ -161,8 +170,26 @@ def _read_pair(
         group=group,
         ghosts=(_ghost(tracks, lane.upper),),
         default_speed_limit=limit,
-        notes=tuple(notes),
+        notes=(*notes, *dropped),
+        rows=counts,
     )
+
+
+def _read_rows(path: Path, spec: dict) -> tuple[dict[str, np.ndarray], Ledger]:
+    """Rows of a pair, each time once, and what became of the others."""
+    source = open_table(path, section(spec, "table"))
+    ledger = Ledger(path=path, unit=source.unit, allowed=allowed_share(spec))
+    fields = fields_of(source, COLUMNS, ("spacing",), limits=LIMITS)
+    rows = read(source, fields, ledger)
+    pair = {**rows, "id": np.zeros(rows["t"].size)}
+    kept = single_rows(
+        pair,
+        ledger,
+        [name for name in rows if name != LINE],
+        lambda _: _ids(path)[1],
+        ("x_follower", "x_leader"),
+    )
+    return {name: column[kept] for name, column in rows.items()}, ledger
 
 
 def _ghost(tracks: Sequence[Track], end: float) -> Ghost:
@@ -180,6 +207,6 @@ def _check_spacing(path: Path, table: dict[str, np.ndarray], length: float) -> N
     if wrong.any():
         row = int(np.flatnonzero(wrong)[0])
         raise InputError(
-            f"{path}: line {row + 2}: spacing: {table['spacing'][row]:g}: expected "
-            f"{gap[row]:g}, x_leader - x_follower - leader_length"
+            f"{path}: line {table[LINE][row]}: spacing: {table['spacing'][row]:g}: "
+            f"expected {gap[row]:g}, x_leader - x_follower - leader_length"
         )

@@ -7,12 +7,17 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.importers.projection import utm, utm_zone
-from rcirl_jax.data.readers.sparse_tables import (
+from rcirl_jax.data.readers.tables.ledger import Ledger
+from rcirl_jax.data.readers.tables.repair import single_rows
+from rcirl_jax.data.readers.tables.streams import head_of
+from rcirl_jax.data.readers.tables.table import (
     MAX_PLACE_M,
     MAX_TIME,
     MAX_VELOCITY_MPS,
-    check_range,
-    read_sparse_table,
+    Field,
+    Table,
+    open_table,
+    read,
 )
 from rcirl_jax.errors import InputError
 
@@ -20,8 +25,11 @@ COLUMN = re.compile(r"(Speed|Lat|Lon|E|N|IVS|Driver)(\d{1,3})")
 # first cells of the metadata lines
 METADATA = ("date", "vehicle_order", "number_of_vehicles", "acc", "distance_setting")
 MAX_HEADER_LINES = 30  # lines looked at for the row of column names
-MAX_LINE_CHARS = 65536
-DRIVER_CHARS = 16  # characters kept of a Driver cell
+LIMITS = {
+    "Speed": MAX_VELOCITY_MPS,
+    "E": MAX_PLACE_M,
+    "N": MAX_PLACE_M,
+}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -33,6 +41,7 @@ class Drive:
     t: np.ndarray  # [n] s, from 0
     cars: dict[int, dict[str, np.ndarray]]  # number -> x, y, speed [n], maybe more
     notes: tuple[str, ...]
+    ledger: Ledger  # of its rows
 
 
 def is_drive(path: Path) -> bool:
@@ -50,18 +59,13 @@ def is_drive(path: Path) -> bool:
 def _first_lines(path: Path) -> list[list[str]]:
     """Cells of the lines down to the column names, or of the first ones."""
     lines: list[list[str]] = []
-    try:
-        with path.open(encoding="utf-8-sig") as handle:
-            while len(lines) < MAX_HEADER_LINES and not _ends_with_names(lines):
-                text = handle.readline(MAX_LINE_CHARS)
-                if not text:
-                    break
-                cells = [cell.strip().strip('"') for cell in text.strip().split(",")]
-                while cells and not cells[-1]:
-                    cells.pop()
-                lines.append(cells)
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: header: {error}: expected CSV text") from error
+    for text in head_of(path)[1][:MAX_HEADER_LINES]:
+        cells = [cell.strip().strip('"') for cell in text.strip().split(",")]
+        while cells and not cells[-1]:
+            cells.pop()
+        lines.append(cells)
+        if _ends_with_names(lines):
+            break
     return lines
 
 
@@ -88,8 +92,12 @@ def _check_names(path: Path, names: list[str]) -> None:
         raise InputError(f"{path}: column {twice[0]!r}: met twice: expected once")
 
 
-def read_drive(path: Path) -> Drive:
+def read_drive(path: Path, allowed: float) -> Drive:
     """A file's cars that have positions, checked.
+
+    Args:
+      path: file.
+      allowed: share of bad rows.
 
     Raises:
       InputError: no table of a drive, or numbers beyond any place, speed or time.
@@ -100,37 +108,55 @@ def read_drive(path: Path) -> Drive:
         match = COLUMN.fullmatch(name)
         if match is not None:
             columns.setdefault(int(match[2]), {})[match[1]] = name
-    chosen = [
-        header[0],
-        *(name for found in columns.values() for name in found.values()),
-    ]
-    text = {name: DRIVER_CHARS for name in chosen if name.startswith("Driver")}
-    table = read_sparse_table(path, header, chosen, text, skip)
-    time = table[header[0]]
-    if not np.isfinite(time).all():
-        row = int(np.flatnonzero(~np.isfinite(time))[0])
-        raise InputError(f"{path}: line {skip + 1 + row}: Time: '': expected a number")
-    check_range(path, {"Time": time}, ("Time",), MAX_TIME)
+    source = open_table(path, {"delimiter": ",", "names": header, "skip": skip})
+    ledger = Ledger(path=path, unit=source.unit, allowed=allowed)
+    table = _read_rows(source, header[0], columns, ledger)
     cars, without = {}, []
     for car, found in sorted(columns.items()):
         if "Speed" not in found:
             continue
         values = {field: table[name] for field, name in found.items()}
-        check_range(path, table, (found["Speed"],), MAX_VELOCITY_MPS)
         if not ({"E", "N"} <= set(found) or {"Lat", "Lon"} <= set(found)):
             without.append(car)
             continue
-        places = [name for field, name in found.items() if field in ("E", "N")]
-        check_range(path, table, places, MAX_PLACE_M)
         cars[car] = _located(values)
     if not cars:
         raise InputError(
             f"{path}: columns: {header[:8]}: expected Speed1, E1, N1 of one car or more"
         )
     notes = [f"car {car} has no positions; left out" for car in without]
+    time = table[header[0]]
     return Drive(
-        path=path, about=about, t=time - time.min(), cars=cars, notes=tuple(notes)
+        path=path,
+        about=about,
+        t=time - time.min(),
+        cars=cars,
+        notes=tuple(notes),
+        ledger=ledger,
     )
+
+
+def _read_rows(
+    source: Table, time: str, columns: dict[int, dict[str, str]], ledger: Ledger
+) -> dict[str, np.ndarray]:
+    """Rows of a drive, each time once."""
+    fields = [Field(name=time, column=time, limit=MAX_TIME)]
+    fields += [
+        Field(
+            name=name,
+            column=name,
+            needed=False,
+            text=part == "Driver",
+            limit=LIMITS.get(part, np.inf),
+        )
+        for found in columns.values()
+        for part, name in found.items()
+    ]
+    rows = read(source, fields, ledger)
+    drive = {**rows, "t": rows[time], "id": np.zeros(rows[time].size)}
+    compared = [field.name for field in fields]
+    kept = single_rows(drive, ledger, compared, lambda _: "of the row")
+    return {name: column[kept] for name, column in rows.items()}
 
 
 def _located(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -17,6 +17,7 @@ are none: specifications, lists of settings, a campaign of one car's speeds.
 Drives last up to hours: they are cut into Recordings of `block_s`.
 """
 
+import dataclasses
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,6 +30,7 @@ from rcirl_jax.data.importers.options import number, one_pattern
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.shapes import local_origin
 from rcirl_jax.data.importers.tracks import spans_of, split_tracks, travel_heading
+from rcirl_jax.data.readers.tables.ledger import allowed_share
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Recording, Track
@@ -61,9 +63,13 @@ def own_name(file: Path) -> str:
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """Recordings of `block_s` seconds, file by file."""
     for file in parts(path, spec):
-        drive = read_drive(file)
+        drive = read_drive(file, allowed_share(spec))
         for block in _blocks(drive, spec):
-            yield validate_recording(block, file)
+            counts, notes = drive.ledger.news()
+            notes = (*block.notes, *notes)
+            yield validate_recording(
+                dataclasses.replace(block, rows=counts, notes=notes), file
+            )
 
 
 def _blocks(drive: Drive, spec: dict) -> Iterator[Recording]:

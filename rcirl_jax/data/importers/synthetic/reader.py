@@ -102,7 +102,7 @@ def _table(spec: dict, key: str) -> dict:
 def driver_config(path: Path, found: dict) -> DriverConfig:
     """The drivers that a TOML's `drivers` table describes; InputError names a key."""
     fields = [field.name for field in dataclasses.fields(DriverConfig)]
-    check_names(f"{path}: drivers.", found, fields)
+    check_names(f"{path}: drivers: ", found, fields)
     made = checked(found, DriverConfig, f"{path}: drivers")
     for key, value in vars(made).items():
         # a number, [low, high] or [mean, sd, low, high]; the sd may be zero
@@ -114,7 +114,7 @@ def driver_config(path: Path, found: dict) -> DriverConfig:
         if not good or not all(0.0 <= x <= most for x in numbers):
             sign = ">= 0" if key in MAY_BE_ZERO else "> 0"
             raise InputError(
-                f"{path}: drivers.{key}: {value}: expected {sign}, low <= high"
+                f"{path}: drivers: {key}: {value}: expected {sign}, low <= high"
                 + (", at most 1" if most == 1.0 else "")
             )
     return made

@@ -50,6 +50,8 @@ class Fixture:
     is_counted: bool = False
     # whether a position may be missing here and there (NaN)
     has_holes: bool = False
+    # whether a row that cannot be read is dropped and counted
+    drops_rows: bool = False
 
 
 def cell(column: int, separator: str = ",") -> str:

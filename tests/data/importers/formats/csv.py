@@ -42,5 +42,6 @@ def write(folder):
         },
         num_lanes=2,
         files=(path,),
+        drops_rows=True,
         numbers={path: cell(COLUMNS.index("x"))},
     )

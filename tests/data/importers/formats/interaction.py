@@ -96,5 +96,6 @@ def write(folder):
         tracks={n: samples(u, steps) for n, (_, u, steps) in road_users().items()},
         num_lanes=osm.NUM_LANES,
         files=(*tracks, place_of_map),
+        drops_rows=True,
         numbers={**dict.fromkeys(tracks, x), place_of_map: " x='([^']*)'"},
     )

@@ -44,6 +44,7 @@ def write(folder):
         tracks=tracks,
         num_lanes=osm.NUM_LANES,
         files=(log, place),
+        drops_rows=True,
         numbers={
             log: cell(1 + VEHICLE_COLUMNS.index("x")),
             place: " x='([^']*)'",

@@ -32,5 +32,6 @@ def write(folder):
         num_lanes=2,
         has_heading=False,
         files=(path,),
+        drops_rows=True,
         numbers={path: cell(w.NGSIM_COLUMNS.index("Local_Y"), " ")},
     )

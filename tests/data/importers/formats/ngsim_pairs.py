@@ -78,5 +78,6 @@ def write(folder):
         tracks={name: car(name, length) for name, length in lengths.items()},
         num_lanes=1,
         files=files,
+        drops_rows=True,
         numbers=dict.fromkeys(files, cell(COLUMNS.index("x_follower"))),
     )

@@ -115,6 +115,7 @@ def write(folder):
         num_lanes=1,
         has_heading=False,
         files=(log,),
+        drops_rows=True,
         numbers={log: cell([*columns].index("E1"))},
         has_holes=True,
     )

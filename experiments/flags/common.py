@@ -263,7 +263,7 @@ def git_commit() -> str:
 
     An installed package reports nothing, even below another repository's folder.
     """
-    root = Path(__file__).resolve().parents[1]
+    root = Path(__file__).resolve().parents[2]
     if shutil.which("git") is None:
         return ""
     # neither a folder above nor a hook's variables may name another repository
@@ -280,7 +280,7 @@ def git_commit() -> str:
         )
         return done.stdout.strip() if done.returncode == 0 else ""
 
-    if not git("ls-files", "experiments/common.py"):  # installed beside its files
+    if not git("ls-files", "experiments/flags/common.py"):  # installed beside its files
         return ""
     commit = git("rev-parse", "HEAD")
     dirty = git("status", "--porcelain", "--untracked-files=no")

@@ -9,8 +9,8 @@ from typing import Any
 
 from absl import flags
 
-from experiments.common import floats, hidden_sizes
-from experiments.recipe import AS_SAID, recipe
+from experiments.flags.common import floats, hidden_sizes
+from experiments.flags.recipe import AS_SAID, recipe
 from rcirl_jax.autotune.recipes import reward_config
 from rcirl_jax.data.store.joined import EQUAL
 from rcirl_jax.errors import InputError

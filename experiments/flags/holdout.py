@@ -2,7 +2,7 @@
 
 from absl import flags
 
-from experiments.common import alone
+from experiments.flags.common import alone
 from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.data.store.resplit import HOLDOUTS, folds_by_recording, held_out
 from rcirl_jax.errors import InputError

@@ -1,0 +1,374 @@
+"""What the columns of a user's table mean: the source TOML, and what it leaves open.
+
+The TOML says which column is which field, in which unit, with which scale and offset.
+What it does not say is recognised by the columns' names and first cells: ISO times,
+latitude and longitude. A column name with {id} stands for one column per road user, of
+tables with one row per frame.
+"""
+
+import dataclasses
+import math
+import re
+from collections.abc import Mapping as AnyMapping
+from collections.abc import Sequence
+
+import numpy as np
+
+from rcirl_jax.data.importers.options import UNITS, number, section
+from rcirl_jax.data.readers.tables.cells import CLOCK, EMPTY, ISO
+from rcirl_jax.data.readers.tables.layout import NUMBER
+from rcirl_jax.data.readers.tables.table import (
+    MAX_PLACE_M,
+    MAX_TIME,
+    MAX_VELOCITY_MPS,
+    Field,
+    Table,
+)
+from rcirl_jax.data.recording import LEAVE_OUT, PIECE
+from rcirl_jax.errors import InputError, did_you_mean
+
+NEEDED = ("t", "id", "x", "y")
+TEXT = ("id", "kind", "lane", "recording", "automated")
+OPTIONAL = (
+    *("heading", "speed", "vx", "vy", "length", "width"),
+    *("kind", "lane", "recording", "automated"),
+)
+EXPECTED = (*NEEDED, "automated")  # errors where they are named and not there
+EARTH = {"lat": "y", "lon": "x"}  # names of x and y in degrees
+CLOCKS = ("s", "ms", "us", "ns", "min", "h", "day", "frame")
+LENGTHS = ("m", "ft", "km", "cm", "mm")
+SPEEDS = ("m/s", "km/h", "mph", "ft/s", "kn")
+ANGLES = ("rad", "deg")
+ALLOWED_UNITS = {
+    "t": (*CLOCKS, ISO),
+    **dict.fromkeys(("x", "y"), (*LENGTHS, *ANGLES)),
+    **dict.fromkeys(("length", "width"), LENGTHS),
+    **dict.fromkeys(("speed", "vx", "vy"), SPEEDS),
+    "heading": ANGLES,
+}
+# in the file's unit: what no log can mean
+LIMITS = {
+    "t": MAX_TIME,
+    **dict.fromkeys(("x", "y"), MAX_PLACE_M),
+    **dict.fromkeys(("speed", "vx", "vy"), MAX_VELOCITY_MPS),
+    "heading": MAX_PLACE_M,
+}
+DEGREES = {"x": 180.0, "y": 90.0}
+# of the source TOML, besides those that an import adds
+OPTIONS = (
+    *("source", "licence", "pattern", "rate_hz", "speed_limit", "lane_width_m"),
+    *("reference_point", "max_bad_rows", "heading_convention", "automated_values"),
+    *("long_bytes", "columns", "units", "scale", "offset", "defaults", "kinds"),
+    *("lanes", "table"),
+)
+ADDED = (LEAVE_OUT, PIECE, "log_names")
+RATE_HZ = 10.0  # 1/s
+MIDDLE_DIGITS = 2  # of latitude and longitude of the projection's middle
+HOLE = "{id}"  # in a column's name: which road user's it is
+WORDS = {
+    "x": {"lon", "lng", "long", "longitude", "längengrad", "laengengrad"},
+    "y": {"lat", "latitude", "breitengrad"},
+}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Mapping:
+    """The fields of one table, and how its positions and headings are meant."""
+
+    fields: tuple[Field, ...]
+    rate_hz: float
+    # latitude and longitude [deg] of the projection's middle; None: x and y are metres
+    middle: tuple[float, float] | None = None
+    degrees: float = 1.0  # of latitude and longitude in the file's unit
+    heading_unit: str = ""  # rad or deg; "": recognised
+    has_units: bool = True  # whether the TOML says the unit of x and y
+    notes: tuple[str, ...] = ()
+
+
+def mapping_of(table: Table, spec: AnyMapping) -> Mapping:
+    """The mapping of a table by its source TOML.
+
+    Raises:
+      InputError: an unknown field or unit, a needed column that is missing.
+    """
+    for name in spec:
+        if name not in (*OPTIONS, *ADDED):
+            raise InputError(
+                f"source TOML: {name}: unknown: expected one of {', '.join(OPTIONS)}"
+                f"{did_you_mean(name, OPTIONS)}"
+            )
+    rate = number({**spec, **section(spec, "defaults")}, "rate_hz", RATE_HZ)
+    if rate <= 0.0:
+        raise InputError(f"source TOML: rate_hz: {rate:g}: expected > 0")
+    columns, units, notes = _columns(table, spec)
+    _check_sections(table, spec, units)
+    found, missing = _found(table, columns)
+    notes += missing
+    middle, degrees = None, 1.0
+    if units.get("x") in ANGLES:
+        degrees = 1.0 if units["x"] == "deg" else math.degrees(1.0)
+        middle = _middle(table, found, degrees, spec)
+        notes.append(
+            f"latitude, longitude projected about {middle[0]:g}, {middle[1]:g} degrees"
+        )
+    fields = []
+    for field, name, user in found:
+        form, factor = "", 1.0
+        if field == "t":
+            form, factor = _time(table, name, units.get("t"), rate, notes)
+        elif field in units and field != "heading" and units[field] not in ANGLES:
+            factor = UNITS[units[field]]
+        fields.append(_field(field, name, user, form, factor, units, spec))
+    return Mapping(
+        fields=tuple(fields),
+        rate_hz=rate,
+        middle=middle,
+        degrees=degrees,
+        heading_unit=units.get("heading", ""),
+        has_units="x" in section(spec, "units") or middle is not None,
+        notes=tuple(notes),
+    )
+
+
+def _columns(
+    table: Table, spec: AnyMapping
+) -> tuple[dict[str, str], dict[str, str], list[str]]:
+    """(field -> column, field -> unit, notes), latitude and longitude as y and x."""
+    columns, units = dict(section(spec, "columns")), dict(section(spec, "units"))
+    _check_names(table, columns)
+    notes: list[str] = []
+    for name, field in EARTH.items():
+        if name in columns:
+            if field in columns:
+                raise InputError(
+                    f"{table.path}: columns.{name}: {columns[name]}: expected it, or "
+                    f"columns.{field}, not both"
+                )
+            columns[field] = columns.pop(name)
+            units[field] = units.pop(name, "deg")
+    is_wide = HOLE in columns.get("x", "")
+    for field in NEEDED:
+        if field not in columns and not (is_wide and field == "id"):
+            raise InputError(
+                f"{table.path}: columns.{field}: missing: expected a column"
+            )
+    if is_wide and "id" in columns:
+        raise InputError(
+            f"{table.path}: columns.id: {columns['id']}: expected none beside "
+            f"columns.x = {columns['x']!r}, whose {HOLE} is the id"
+        )
+    _check_texts(table, columns)
+    if "x" not in units and "y" not in units and not is_wide:
+        columns, units = _recognised_earth(table, columns, units, notes)
+    return columns, units, notes
+
+
+def _check_names(table: Table, columns: AnyMapping[str, object]) -> None:
+    """All fields are known, and each names a column."""
+    every = (*NEEDED, *OPTIONAL, *EARTH)
+    for field, column in columns.items():
+        if field not in every:
+            raise InputError(
+                f"{table.path}: columns.{field}: unknown: expected "
+                f"{', '.join(every)}{did_you_mean(field, every)}"
+            )
+        if not isinstance(column, str) or not column:
+            raise InputError(
+                f"{table.path}: columns.{field}: {column}: expected a name"
+            )
+
+
+def _check_texts(table: Table, columns: AnyMapping[str, str]) -> None:
+    """No column of numbers is one that is read as text."""
+    texts = {columns[field] for field in TEXT if field in columns}
+    for field, column in columns.items():
+        if field not in TEXT and column in texts:
+            raise InputError(
+                f"{table.path}: columns.{field}: {column}: expected a column of "
+                "numbers, not one that is read as text"
+            )
+
+
+def words_of(name: str) -> set[str]:
+    """Words of a column's name, in small letters: gpsLon and GPS_Lon hold lon."""
+    return {word.lower() for word in re.findall(r"[A-Z]?[^\W\d_A-Z]+|[A-Z]+", name)}
+
+
+def _recognised_earth(
+    table: Table, columns: dict[str, str], units: dict[str, str], notes: list[str]
+) -> tuple[dict[str, str], dict[str, str]]:
+    """The columns, with x and y in degrees where their names and cells say so."""
+    for x, y in (("x", "y"), ("y", "x")):
+        named = WORDS["x"] & words_of(columns[x]) and WORDS["y"] & words_of(columns[y])
+        if not named or {columns["x"], columns["y"]} - set(table.header):
+            continue
+        cells = {"x": columns[x], "y": columns[y]}
+        if all(_within(table, cells[axis], DEGREES[axis]) for axis in "xy"):
+            notes.append(f"columns {columns[x]}, {columns[y]}: longitude and latitude")
+            return {**columns, **cells}, {**units, "x": "deg", "y": "deg"}
+    return columns, units
+
+
+def sampled(table: Table, column: str) -> np.ndarray:
+    """The numbers among the first cells of a column."""
+    cells = table.samples(column)
+    if table.layout is not None and table.layout.decimal == ",":
+        cells = [cell.replace(",", ".") for cell in cells]
+    return np.array([float(cell) for cell in cells if NUMBER.fullmatch(cell)])
+
+
+def _scaled(field: str, spec: AnyMapping) -> tuple[float, float]:
+    """Scale and offset of a field, also under its name as latitude or longitude."""
+    alias = next((name for name, own in EARTH.items() if own == field), field)
+    scale, offset = section(spec, "scale"), section(spec, "offset")
+    return (
+        number(scale, field, number(scale, alias, 1.0)),
+        number(offset, field, number(offset, alias, 0.0)),
+    )
+
+
+def _within(table: Table, column: str, limit: float) -> bool:
+    found = sampled(table, column)
+    return bool(found.size) and bool(np.all(np.abs(found) <= limit))
+
+
+def _middle(
+    table: Table,
+    found: Sequence[tuple[str, str, str | None]],
+    degrees: float,
+    spec: AnyMapping,
+) -> tuple[float, float]:
+    """Latitude and longitude [deg] near the first rows, rounded."""
+    places = []
+    for axis in ("y", "x"):
+        names = [name.lstrip("-") for field, name, _ in found if field == axis]
+        values = np.concatenate([sampled(table, name) for name in names])
+        scale, offset = _scaled(axis, spec)
+        known = (values[values != 0.0] * scale + offset) * degrees
+        known = known[np.abs(known) <= DEGREES[axis]]
+        places.append(
+            round(float(np.median(known)), MIDDLE_DIGITS) if known.size else 0.0
+        )
+    return places[0], places[1]
+
+
+def _check_sections(table: Table, spec: AnyMapping, units: dict[str, str]) -> None:
+    """Units are known; scales and offsets are numbers of fields that have a unit."""
+    for field, unit in units.items():
+        if field not in ALLOWED_UNITS:
+            raise InputError(
+                f"{table.path}: units.{field}: unknown: "
+                f"expected {', '.join((*ALLOWED_UNITS, *EARTH))}"
+            )
+        is_pattern = field == "t" and "%" in str(unit)
+        if unit not in ALLOWED_UNITS[field] and not is_pattern:
+            raise InputError(
+                f"{table.path}: units.{field}: {unit}: "
+                f"expected one of {', '.join(ALLOWED_UNITS[field])}"
+            )
+    if (units.get("x") in ANGLES) != (units.get("y") in ANGLES):
+        raise InputError(
+            f"{table.path}: units.x, units.y: {units.get('x', 'm')} and "
+            f"{units.get('y', 'm')}: expected both in degrees or both in metres"
+        )
+    for name in ("scale", "offset"):
+        for field in section(spec, name):
+            if field not in (*ALLOWED_UNITS, *EARTH):
+                raise InputError(
+                    f"{table.path}: {name}.{field}: unknown: "
+                    f"expected {', '.join((*ALLOWED_UNITS, *EARTH))}"
+                )
+
+
+def _found(
+    table: Table, columns: AnyMapping[str, str]
+) -> tuple[list[tuple[str, str, str | None]], list[str]]:
+    """(field, column with its sign, user) of all columns, and notes on missing ones."""
+    found: list[tuple[str, str, str | None]] = []
+    missing: list[str] = []
+    users = _users(table, columns) if HOLE in columns.get("x", "") else []
+    for field, name in columns.items():
+        plain = name.removeprefix("-") if field not in TEXT else name
+        sign = name[: len(name) - len(plain)]
+        for user in users if HOLE in name else [None]:
+            column = plain if user is None else plain.replace(HOLE, user)
+            if column in table.header:
+                found.append((field, sign + column, user))
+            elif field in EXPECTED:
+                table.place(column)  # says that it is missing
+            elif user is None:
+                missing.append(f"no column '{column}': {field} computed or by default")
+    return found, missing
+
+
+def _users(table: Table, columns: AnyMapping[str, str]) -> list[str]:
+    """Road users that have both an x and a y in a row per frame."""
+    own = []
+    for field in ("x", "y"):
+        name = columns[field].removeprefix("-")
+        before, _, after = name.partition(HOLE)
+        pattern = re.compile(f"{re.escape(before)}(.+){re.escape(after)}")
+        matches = (pattern.fullmatch(column) for column in table.header)
+        own.append([match[1] for match in matches if match])
+    users = [user for user in own[0] if user in own[1]]
+    numbered = [user for user in users if user.isdigit()]
+    if not users:
+        raise InputError(
+            f"{table.path}: columns.x: {columns['x']}: expected columns of this name "
+            f"and of {columns['y']} in the header, such as for {HOLE} = 1"
+        )
+    return numbered or users
+
+
+def _time(
+    table: Table, name: str, unit: str | None, rate: float, notes: list[str]
+) -> tuple[str, float]:
+    """(form, factor) of the clock; ISO where nothing is said and the cells are."""
+    cells = [c for c in table.samples(name.lstrip("-")) if c.lower() not in EMPTY]
+    first = cells[0] if cells else ""
+    is_iso = bool(re.match(r"\d{4}-?\d\d-?\d\d[T ]|\d{4}/\d\d/\d\d", first))
+    is_iso |= bool(re.match(CLOCK, first))
+    if unit is None and is_iso:
+        notes.append(f"column {name}: ISO times")
+        return ISO, 1.0
+    if unit == ISO or (unit is not None and "%" in unit):
+        return unit, 1.0
+    if is_iso:
+        raise InputError(
+            f"{table.path}: units.t: {unit}: the cells of {name} are such as "
+            f"'{first[:40]}': expected {ISO}"
+        )
+    return "", 1.0 / rate if unit == "frame" else UNITS[unit or "s"]
+
+
+def _field(
+    field: str,
+    name: str,
+    user: str | None,
+    form: str,
+    factor: float,
+    units: AnyMapping[str, str],
+    spec: AnyMapping,
+) -> Field:
+    """One column as the reader takes it; "-name" turns an axis round."""
+    plain = name.removeprefix("-") if field not in TEXT else name
+    scale, offset = _scaled(field, spec)
+    limit = LIMITS.get(field, np.inf)
+    unit = units.get(field)
+    if field == "t":
+        limit = math.inf if form else limit / min(factor, 1.0)
+    elif unit in ANGLES and field in DEGREES:
+        limit = DEGREES[field] * (UNITS["deg"] if unit == "rad" else 1.0)
+    return Field(
+        name=field,
+        column=plain,
+        needed=field in (*NEEDED, "recording"),
+        text=field in TEXT,
+        form=form,
+        scale=scale,
+        offset=offset,
+        factor=-factor if plain != name else factor,
+        limit=limit,
+        zero_is_empty=unit in ANGLES and field in DEGREES,
+        user=user,
+    )

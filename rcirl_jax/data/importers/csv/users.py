@@ -1,0 +1,83 @@
+"""A road user of a user's table: its rows, with what they do not say."""
+
+import collections
+from pathlib import Path
+
+import numpy as np
+
+from rcirl_jax.data.importers.csv.map import LogTable
+from rcirl_jax.data.importers.csv.meaning import Meaning
+from rcirl_jax.data.importers.options import KINDS, number, section
+from rcirl_jax.data.importers.perception import speed_of
+from rcirl_jax.data.importers.tracks import spans_of, travel_heading
+from rcirl_jax.errors import InputError
+from rcirl_jax.types import Kind, Track
+
+# box centre ahead of the recorded position, in box lengths
+REFERENCE = {"centre": 0.0, "front": -0.5, "rear": 0.5}
+SIZE_M = {"length": 4.5, "width": 1.8}  # m, a car
+
+
+def track_of(
+    name: str, table: LogTable, rows: np.ndarray, spec: dict, meaning: Meaning
+) -> Track:
+    """A track of some rows of a table; unknown cells are filled.
+
+    Headings and speeds by the positions, sizes and kinds by the road user's other
+    rows, else by [defaults].
+    """
+    values = {field: column[rows] for field, column in table.values.items()}
+    t, x, y = values["t"], values["x"], values["y"]
+    heading = _filled(values.get("heading"), travel_heading(t, x, y))
+    speed = _filled(values.get("speed"), speed_of(t, x, y))
+    size = {field: _size(field, values, spec) for field in SIZE_M}
+    reference = spec.get("reference_point", "centre")
+    if reference not in REFERENCE:
+        raise InputError(
+            f"source TOML: reference_point: {reference}: "
+            f"expected one of {', '.join(REFERENCE)}"
+        )
+    ahead = REFERENCE[reference] * size["length"]
+    automated = np.zeros(t.size, bool)
+    if "automated" in values:
+        automated = meaning.automated(values["automated"])
+    return Track(
+        id=name,
+        kind=_kind(table.path, name, values, spec),
+        length=size["length"],
+        width=size["width"],
+        t=t,
+        x=x + ahead * np.cos(heading),
+        y=y + ahead * np.sin(heading),
+        heading=heading,
+        speed=speed,
+        automated=spans_of(t, automated),
+    )
+
+
+def _filled(known: np.ndarray | None, otherwise: np.ndarray) -> np.ndarray:
+    """Values [n] where they are known, else others."""
+    return otherwise if known is None else np.where(np.isnan(known), otherwise, known)
+
+
+def _size(field: str, values: dict[str, np.ndarray], spec: dict) -> float:
+    """Median of the known lengths or widths [m]."""
+    known = values.get(field, np.zeros(0))
+    known = known[np.isfinite(known)]
+    if known.size:
+        return float(np.median(known))
+    return number(section(spec, "defaults"), field, SIZE_M[field])
+
+
+def _kind(path: Path, name: str, values: dict[str, np.ndarray], spec: dict) -> Kind:
+    """The most frequent kind that is known."""
+    texts = values.get("kind", np.zeros(0, str))
+    known = collections.Counter(texts[texts != ""].tolist()).most_common(1)
+    found = known[0][0] if known else str(section(spec, "defaults").get("kind", ""))
+    kind = str(section(spec, "kinds").get(found, found or "vehicle")).lower()
+    if kind not in KINDS:
+        raise InputError(
+            f"{path}: id {name}: kind: {found}: expected one of {', '.join(KINDS)}, "
+            "or an entry in [kinds]"
+        )
+    return Kind[kind.upper()]

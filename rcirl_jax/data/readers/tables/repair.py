@@ -1,0 +1,103 @@
+"""A road user is in one place at a time: rows that say otherwise are repaired."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from rcirl_jax.data.readers.tables.ledger import LINE, Ledger
+
+
+def single_rows(
+    values: Mapping[str, np.ndarray],
+    ledger: Ledger,
+    compared: Sequence[str],
+    name_of: Callable[[Any], str] = str,
+    places: tuple[str, str] = ("x", "y"),
+) -> np.ndarray:
+    """Which rows [n] are kept, so that each road user is met once in a frame.
+
+    Of rows that are equal in everything compared the first is kept. Of others with
+    one id and time, that which continues the track: the nearest to where the road
+    user was before (else: is after). Both are counted in the ledger.
+
+    Args:
+      values: t, id, `line` and the places, [n] each; id as text or numbers.
+      ledger: of the file.
+      compared: names of the columns in which repeated rows are equal.
+      name_of: an id as the file has it.
+      places: names of the positions; one that is not there is 0.
+
+    Raises:
+      InputError: more rows than the ledger allows.
+    """
+    t = values["t"]
+    codes = values["id"]
+    if codes.dtype.kind != "f":
+        codes = np.unique(codes, return_inverse=True)[1]
+    kept = np.ones(t.size, bool)
+    order = np.lexsort((t, codes))  # stable: the file's order inside
+    same = (np.diff(codes[order]) == 0) & (np.diff(t[order]) == 0.0)
+    if not same.any():
+        return kept
+    shared = order[np.concatenate([same, [False]]) | np.concatenate([[False], same])]
+    columns = [
+        np.unique(values[name][shared], return_inverse=True)[1] for name in compared
+    ]
+    columns += [t[shared], codes[shared]]
+    inner = np.lexsort((shared, *columns))
+    equal = np.all([np.diff(column[inner]) == 0 for column in columns], axis=0)
+    repeats = shared[inner[1:][equal]]
+    kept[repeats] = False
+    if repeats.size:
+        who = _named(values, repeats.min(), ledger, name_of)
+        ledger.drop("repeated", f"{who}: the same row again", repeats.size)
+    order = order[kept[order]]
+    same = (np.diff(codes[order]) == 0) & (np.diff(t[order]) == 0.0)
+    if same.any():
+        first = order[1:][same].min()
+        who = _named(values, first, ledger, name_of)
+        ledger.drop("doubled", f"{who}: met twice in one frame", int(same.sum()))
+    ledger.check()
+    none = np.zeros(t.size)
+    where = np.stack([values.get(name, none) for name in places])
+    starts = np.flatnonzero(np.concatenate([[True], ~same]))
+    ends = np.append(starts[1:], order.size)
+    several = ends - starts > 1
+    for low, high in zip(starts[several], ends[several], strict=True):
+        kept[order[low:high]] = False
+        kept[_continuing(where, codes, order, low, high, kept)] = True
+    return kept
+
+
+def _named(
+    values: Mapping[str, np.ndarray],
+    row: int,
+    ledger: Ledger,
+    name_of: Callable[[Any], str],
+) -> str:
+    return f"{ledger.unit} {values[LINE][row]:.0f}: id {name_of(values['id'][row])}"
+
+
+def _continuing(
+    where: np.ndarray,
+    codes: np.ndarray,
+    order: np.ndarray,
+    low: int,
+    high: int,
+    kept: np.ndarray,
+) -> int:
+    """Of rows order[low:high] of one road user and time, that nearest to its track."""
+    rows = order[low:high]
+    before = low - 1
+    while before >= 0 and not kept[order[before]]:
+        before -= 1
+    near = None
+    if before >= 0 and codes[order[before]] == codes[rows[0]]:
+        near = order[before]
+    elif high < order.size and codes[order[high]] == codes[rows[0]]:
+        near = order[high]
+    if near is None:
+        return int(rows[0])
+    apart = np.hypot(*(where[:, rows] - where[:, [near]]))
+    return int(rows[np.argmin(apart)])

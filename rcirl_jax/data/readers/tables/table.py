@@ -1,0 +1,369 @@
+"""Tables as people have them: one reader of text, Parquet and Feather.
+
+`open_table` finds how a table is written, `batches` gives its columns in SI units a
+few MiB at a time, `read` all of them. A row that cannot be read, or lacks a needed
+cell, is dropped and counted in a `Ledger`, which refuses a table of too many; an empty
+cell elsewhere is unknown. Every row keeps its line in the file, under `LINE`.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rcirl_jax.data.readers.tables import cells
+from rcirl_jax.data.readers.tables.columnar import (
+    columnar_batches,
+    first_cells,
+    is_columnar,
+    schema_of,
+)
+from rcirl_jax.data.readers.tables.layout import NUMBER, Layout, recognise
+from rcirl_jax.data.readers.tables.ledger import LINE, Ledger
+from rcirl_jax.data.readers.tables.text_rows import text_batches
+from rcirl_jax.errors import InputError, did_you_mean, extra_module
+
+SAMPLES = 60  # rows from which the meaning of a column is recognised
+COMMON = ("t", "recording")  # fields that say when and where, not who
+MAX_BYTES = 2**30  # of a table that is held whole: a few times the longest known
+MAX_ROWS = 10_000_000  # likewise
+CUT_IT = "cut it into recordings (a csv or NGSIM log: lower long_bytes)"
+MAX_PLACE_M = 1e8  # m, farther is no place on earth
+MAX_VELOCITY_MPS = 1e4  # m/s; keeps squares finite, recording.py has the true limit
+MAX_TIME = 1e14  # s, ms or frames; ms since 1970 are 2e12
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Field:
+    """A column of the file, and what its cells mean.
+
+    A number is (cell * scale + offset) * factor; a text is taken as it is.
+    """
+
+    name: str
+    column: str
+    needed: bool = True  # a row without it is none; else empty cells are unknown
+    text: bool = False
+    lower: bool = False  # text in small letters
+    form: str = ""  # of a time: `cells.ISO` or a pattern of strptime; "": a number
+    scale: float = 1.0
+    offset: float = 0.0
+    factor: float = 1.0  # of the unit
+    limit: float = np.inf  # in the file's unit; beyond it a number is absurd
+    zero_is_empty: bool = False  # a receiver without a fix is at 0 degrees
+    # whose column it is, in a table that has a row for all of a moment
+    user: str | None = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Table:
+    """A table whose columns are known."""
+
+    path: Path
+    header: tuple[str, ...]
+    layout: Layout | None = None  # None: Parquet or Feather
+    head: tuple[tuple[str, ...], ...] = ()  # cells of the first rows, of a text
+
+    @property
+    def unit(self) -> str:
+        """What rows are counted by."""
+        return "row" if self.layout is None else "line"
+
+    def place(self, column: str) -> int:
+        """Number of a column.
+
+        Raises:
+          InputError: it is missing, or met twice.
+        """
+        count = self.header.count(column)
+        if count == 1:
+            return self.header.index(column)
+        where = f"{self.path}: column {column}"
+        if count:
+            raise InputError(f"{where}: met twice: expected once")
+        known = [name for name in self.header if name]
+        hint = did_you_mean(column, known)
+        if sum(bool(NUMBER.fullmatch(name)) for name in known) > len(known) / 2:
+            hint = "; no header? name the columns by names in [table]"
+        raise InputError(
+            f"{where}: missing: expected it among {_shortened(known)}{hint}"
+        )
+
+    def samples(self, column: str) -> list[str]:
+        """Cells of a column in the first rows, as text."""
+        place = self.place(column)
+        if self.layout is None:
+            return first_cells(self.path, column, SAMPLES)
+        return [row[place].strip() for row in self.head if len(row) > place]
+
+
+def _shortened(names: Sequence[str]) -> list[str]:
+    return [*names[:40], *(["..."] if len(names) > 40 else [])]
+
+
+def open_table(path: Path, options: Mapping | None = None) -> Table:
+    """A table of any of the forms, its layout recognised.
+
+    Args:
+      path: file.
+      options: [table] of the source TOML, which wins over what is recognised.
+
+    Raises:
+      InputError: no table.
+    """
+    if is_columnar(path):
+        return Table(path=path, header=tuple(schema_of(path).names))
+    layout, rows = recognise(path, options or {})
+    head = tuple(tuple(row) for row in rows)
+    return Table(path=path, header=layout.header, layout=layout, head=head)
+
+
+def fields_of(
+    table: Table,
+    needed: Sequence[str],
+    optional: Sequence[str] = (),
+    *,
+    texts: Sequence[str] = (),
+    limits: Mapping[str, float] | None = None,
+) -> list[Field]:
+    """Columns as fields of their own names: those needed, and others that are there.
+
+    Args:
+      table: of `open_table`.
+      needed: columns without which a row is none.
+      optional: columns that may be missing, and whose cells may be empty.
+      texts: names among both that are no numbers.
+      limits: of numbers; beyond them they are absurd.
+    """
+    return [
+        Field(
+            name=name,
+            column=name,
+            needed=name in needed,
+            text=name in texts,
+            limit=(limits or {}).get(name, np.inf),
+        )
+        for name in (*needed, *optional)
+        if name in needed or name in table.header
+    ]
+
+
+def batches(
+    table: Table,
+    fields: Sequence[Field],
+    ledger: Ledger,
+    show: Callable[[int], object] | None = None,
+) -> Iterator[dict[str, Any]]:
+    """Columns of a few MiB of rows; texts as (codes, names).
+
+    Args:
+      table: of `open_table`.
+      fields: what is read; with `user`, the rows of all users come below each other.
+      ledger: what is dropped is added to it.
+      show: called with the bytes of the file just read.
+
+    Raises:
+      InputError: a column is missing or of another type, or the file is damaged.
+    """
+    places = [table.place(field.column) for field in fields]
+    if table.layout is not None:
+        for made in text_batches(table.path, table.layout, places, show):
+            for line, why in made.unreadable:
+                ledger.drop("unreadable", f"line {line}: {why}")
+            ledger.read += len(made.unreadable)
+            yield _batch(table, fields, made.columns, made.lines, ledger)
+        return
+    done, size, last = 0, table.path.stat().st_size, 0.0
+    for columns, share in columnar_batches(table.path, [f.column for f in fields]):
+        rows = np.arange(done + 1, done + 1 + len(columns[0]))
+        done += rows.size
+        if show is not None:
+            show(round(size * (share - last)))
+        last = share
+        yield _batch(table, fields, columns, rows, ledger)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Column:
+    """A field's cells of a batch."""
+
+    values: np.ndarray  # [n] numbers in the file's unit, or codes of names
+    names: list[str] | None
+    empty: np.ndarray  # [n]
+    wrong: np.ndarray  # [n] unreadable, or absurd
+
+
+def _column(table: Table, field: Field, cell: Any) -> _Column:  # noqa: ANN401
+    """Cells as numbers or texts, still with those that cannot be read."""
+    try:
+        if field.text:
+            codes, names, wrong = cells.texts(cell, field.lower)
+            empty = np.array([not name for name in names])[codes]
+            return _Column(codes, names, empty, wrong)
+        if field.form:
+            values, wrong = cells.times(cell, field.form)
+        else:
+            values, wrong = cells.numbers(cell, table.layout)
+    except (TypeError, extra_module("pyarrow").ArrowException) as error:
+        why = " ".join(str(error).split())[:200]
+        raise InputError(f"{table.path}: column {field.column}: {why}") from error
+    if field.scale != 1.0 or field.offset:
+        values = values * field.scale + field.offset
+    wrong = wrong | (np.abs(values) > field.limit)
+    empty = np.isnan(values) & ~wrong
+    return _Column(values, None, empty | (field.zero_is_empty & (values == 0.0)), wrong)
+
+
+def _batch(
+    table: Table,
+    fields: Sequence[Field],
+    found: Sequence[Any],
+    lines: np.ndarray,
+    ledger: Ledger,
+) -> dict[str, Any]:
+    """A batch's readable rows, of all users below each other."""
+    columns = [_column(table, f, c) for f, c in zip(fields, found, strict=True)]
+    users = list(dict.fromkeys(f.user for f in fields if f.user is not None))
+    parts = []
+    for user in users or [None]:
+        own = [k for k, field in enumerate(fields) if field.user in (None, user)]
+        kept = _readable(
+            [fields[k] for k in own],
+            [columns[k] for k in own],
+            lambda k, row, own=own: _complaint(
+                table, fields[own[k]], columns[own[k]], found[own[k]], lines, row
+            ),
+            ledger,
+        )
+        part: dict[str, Any] = {LINE: lines[kept]}
+        for k in own:
+            values, names = columns[k].values[kept], columns[k].names
+            whole = values * fields[k].factor if names is None else (values, names)
+            part[fields[k].name] = whole
+        if user is not None:
+            part["id"] = (np.full(int(kept.sum()), users.index(user)), users)
+        parts.append(part)
+    return parts[0] if len(parts) == 1 else _below_each_other(parts)
+
+
+def _readable(
+    fields: Sequence[Field],
+    columns: Sequence[_Column],
+    complaint: Callable[[int, int], str],
+    ledger: Ledger,
+) -> np.ndarray:
+    """Rows [n] that are kept; those without anything but a time are none at all."""
+    count = columns[0].values.size
+    own = [
+        column.empty
+        for field, column in zip(fields, columns, strict=True)
+        if field.needed and field.name not in COMMON
+    ]
+    blank = np.all(own, axis=0) if len(own) > 1 else np.zeros(count, bool)
+    dropped = np.zeros(count, bool)
+    for field, column in zip(fields, columns, strict=True):
+        dropped |= column.wrong | (column.empty & field.needed)
+    dropped &= ~blank
+    ledger.read += count - int(blank.sum())
+    if dropped.any():
+        row = int(np.flatnonzero(dropped)[0])
+        first = next(
+            k
+            for k, (field, column) in enumerate(zip(fields, columns, strict=True))
+            if column.wrong[row] or (column.empty[row] and field.needed)
+        )
+        ledger.drop("unreadable", complaint(first, row), int(dropped.sum()))
+    return ~dropped & ~blank
+
+
+def _complaint(
+    table: Table,
+    field: Field,
+    column: _Column,
+    found: Any,  # noqa: ANN401
+    lines: np.ndarray,
+    row: int,
+) -> str:
+    """What is wrong with a cell."""
+    cell = found[row].as_py()
+    text = "" if cell is None else str(cell)
+    shown = f"'{text[:40]}{'...' if len(text) > 40 else ''}'"
+    where = f"{table.unit} {lines[row]}: {field.column}: {shown}"
+    if field.text:
+        long = f"up to {cells.TEXT_CHARS} characters"
+        return f"{where}: expected {long if column.wrong[row] else 'a text'}"
+    if np.isfinite(column.values[row]) and abs(column.values[row]) > field.limit:
+        far = f"{field.column}: {column.values[row]:g}"
+        return f"{table.unit} {lines[row]}: {far}: expected within {field.limit:g}"
+    expected = f"a time as {field.form}" if field.form else "a finite number"
+    return f"{where}: expected {expected}"
+
+
+def _below_each_other(parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Batches of the same fields as one; a column that some lack is unknown there."""
+    names = dict.fromkeys(name for part in parts for name in part)
+    made: dict[str, Any] = {}
+    for name in names:
+        columns = [part.get(name) for part in parts]
+        if any(isinstance(column, tuple) for column in columns):
+            made[name] = _texts_below(parts, name)
+        else:
+            filled = [
+                np.full(part[LINE].size, np.nan) if column is None else column
+                for part, column in zip(parts, columns, strict=True)
+            ]
+            made[name] = np.concatenate(filled)
+    return made
+
+
+def _texts_below(
+    parts: Sequence[dict[str, Any]], name: str
+) -> tuple[np.ndarray, list[str]]:
+    """(codes, names) of a text in several batches."""
+    known: dict[str, int] = {}
+    codes = []
+    for part in parts:
+        own, names = part.get(name, (np.zeros(part[LINE].size, np.int64), [""]))
+        mine = [known.setdefault(text, len(known)) for text in names]
+        codes.append(np.array(mine, np.int32)[own])
+    return np.concatenate(codes), list(known)
+
+
+def read(
+    table: Table, fields: Sequence[Field], ledger: Ledger
+) -> dict[str, np.ndarray]:
+    """All readable rows: numbers float64, NaN where unknown; texts str, "" likewise.
+
+    Raises:
+      InputError: as `batches`; a table too long to be held whole, without rows, or
+        with more unreadable ones than the ledger allows.
+    """
+    size = table.path.stat().st_size
+    if size > MAX_BYTES:
+        raise InputError(
+            f"{table.path}: size: {size >> 20} MiB: expected {MAX_BYTES >> 20} at "
+            f"most; {CUT_IT}"
+        )
+    parts, rows = [], 0
+    for batch in batches(table, fields, ledger):
+        parts.append(batch)
+        rows += batch[LINE].size
+        if rows > MAX_ROWS:
+            raise InputError(
+                f"{table.path}: rows: more than {MAX_ROWS}: expected fewer; {CUT_IT}"
+            )
+    ledger.check()
+    whole = _below_each_other(parts)
+    for name, column in whole.items():
+        if isinstance(column, tuple):
+            codes, names = column
+            longest = max(map(len, names))
+            if 4 * longest * rows > MAX_BYTES:  # numpy gives all cells as much room
+                raise InputError(
+                    f"{table.path}: {name}: {rows} rows of texts up to {longest} "
+                    f"characters: expected {MAX_BYTES >> 20} MiB at most; {CUT_IT}"
+                )
+            whole[name] = np.array(names)[codes]
+    return whole

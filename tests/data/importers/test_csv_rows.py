@@ -1,0 +1,261 @@
+"""Rows that are wrong: unknown cells, unreadable and repeated rows, how many may be."""
+
+import numpy as np
+import pytest
+
+from rcirl_jax.data.importing import import_parts
+from rcirl_jax.data.parts import parts_of
+from rcirl_jax.data.scenes.quality import QualityReport, format_quality
+from rcirl_jax.errors import InputError
+from rcirl_jax.types import Kind
+from tests.data.importers import people
+from tests.data.small_logs import CONFIG
+
+LONG = pytest.mark.parametrize(
+    "long_bytes", [1, 10**9], ids=["in pieces", "whole"]
+)  # fmt: skip
+
+
+def write(folder, table, header=people.HEADER, **layout):
+    path = folder / "log.csv"
+    path.write_text(people.text(table, header, **layout))
+    return path
+
+
+def refused(path, source):
+    with pytest.raises(InputError) as caught:
+        people.read(path, source)
+    (line,) = str(caught.value).splitlines()
+    assert line.startswith(str(path))
+    return line
+
+
+def with_cell(row, name, value):
+    table = people.rows()
+    table[row][people.HEADER.index(name)] = value
+    return table
+
+
+EMPTY = ["", "NaN", "nan", "NA", "N/A", "null", "None", "-", "\\N", "#N/A", " "]
+
+
+@LONG
+@pytest.mark.parametrize("empty", EMPTY)
+def test_empty_cells_that_are_not_needed_are_unknown(tmp_path, empty, long_bytes):
+    """Half the speeds and headings, most lengths and kinds."""
+    table = people.rows()
+    for k, row in enumerate(table):
+        row[4] = row[4] if k % 2 else empty
+        row[5] = row[5] if k % 3 else empty
+        row[6] = row[6] if k % 11 == 0 else empty
+        row[7] = row[7] if k % 13 == 0 else empty
+    source = people.spec(tmp_path, more=f"long_bytes = {long_bytes}")
+    found = people.only(write(tmp_path, table), source)
+    people.assert_same(found)
+    assert people.rows_of(found) == (720, 0, 0, 0)
+    assert {track.kind for track in found.tracks} == {Kind.VEHICLE}
+
+
+def test_columns_that_hold_nothing_are_by_default(tmp_path):
+    table = people.rows()
+    for row in table:
+        row[4] = row[5] = row[6] = row[7] = ""
+    rest = '[defaults]\nlength = 4.2\nkind = "cyclist"'
+    found = people.only(write(tmp_path, table), people.spec(tmp_path, rest=rest))
+    assert {track.length for track in found.tracks} == {4.2}
+    assert {track.kind for track in found.tracks} == {Kind.CYCLIST}
+
+
+def test_lanes_that_are_unknown_here_and_there(tmp_path):
+    header = (*people.HEADER, "lane")
+    table = [
+        [*row, "" if k % 3 else f"L{int(row[1][3:]) % 2}"]
+        for k, row in enumerate(people.rows())
+    ]
+    found = people.only(write(tmp_path, table, header), people.spec(tmp_path, header))
+    assert [lane.id for lane in found.lanes] == ["L0", "L1"]
+
+
+@LONG
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("x", "", "line 12: x: '': expected a finite number"),
+        ("x", "nan", "line 12: x: 'nan': expected a finite number"),
+        ("y", "inf", "line 12: y: 'inf': expected a finite number"),
+        ("y", "12..5", "line 12: y: '12..5': expected a finite number"),
+        ("y", "0x1F", "line 12: y: '0x1F': expected a finite number"),
+        ("speed", "quick", "line 12: speed: 'quick': expected a finite number"),
+        ("x", "1e30", "line 12: x: 1e+30: expected within 1e+08"),
+        ("t", "1e300", "line 12: t: 1e+300: expected within 1e+14"),
+        ("id", "", "line 12: id: '': expected a text"),
+        ("id", "c" * 65, "line 12: id: 'c" + "c" * 39 + "...': expected up to 64"),
+        ("kind", "car,car", "line 12: 9 cells: expected 8"),
+        ("kind", '"car', "line 12: a quote without an end"),
+    ],
+)
+def test_a_bad_row_is_dropped_or_named(tmp_path, name, value, words, long_bytes):
+    path = write(tmp_path, with_cell(10, name, value))
+    more = f"long_bytes = {long_bytes}\n"
+    found = people.only(path, people.spec(tmp_path, more=more))
+    assert people.rows_of(found) == (720, 1, 0, 0)
+    assert sum(track.t.size for track in found.tracks) == 719
+    assert any(f"1 unreadable rows dropped; first: {words}" in n for n in found.notes)
+    line = refused(path, people.spec(tmp_path, more=more + "max_bad_rows = 0.0"))
+    assert words in line
+    assert line.endswith(
+        "1 of 720 rows are bad: expected up to 0 % (max_bad_rows of the TOML)"
+    )
+
+
+@LONG
+def test_lines_are_those_of_the_file(tmp_path, long_bytes):
+    """With empty lines, remarks over several lines and bad rows before."""
+    header = (*people.HEADER, "remark")
+    table = [
+        [*row, '"two\nlines"' if k < 50 else ""] for k, row in enumerate(people.rows())
+    ]
+    table[60][2], table[700][3] = "west", "north"
+    lines = people.text(table, header).split("\n")
+    lines[20:20] = ["", ""]
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(lines))
+    west, north = (
+        1 + next(k for k, line in enumerate(lines) if word in line)
+        for word in ("west", "north")
+    )
+    more = f"long_bytes = {long_bytes}\nmax_bad_rows = 0.0"
+    line = refused(path, people.spec(tmp_path, more=more))
+    assert f"line {west}: x: 'west'" in line
+    assert north == 1 + 2 + 50 + 700 + 1
+    path.write_text(path.read_text().replace("west", "1.0"))
+    line = refused(path, people.spec(tmp_path, more=more))
+    assert f"line {north}: y: 'north'" in line
+
+
+@LONG
+def test_rows_that_are_met_again_are_used_once(tmp_path, long_bytes):
+    """Beside each other and far apart."""
+    table = people.rows()
+    table = [*table[:101], table[100], *table[101:], table[3], table[3]]
+    source = people.spec(tmp_path, more=f"long_bytes = {long_bytes}")
+    found = people.only(write(tmp_path, table), source)
+    people.assert_same(found)
+    assert people.rows_of(found) == (723, 0, 3, 0)
+    assert "3 rows met twice, used once" in found.notes
+    strict = people.spec(
+        tmp_path, more=f"long_bytes = {long_bytes}\nmax_bad_rows = 0.001"
+    )
+    line = refused(tmp_path / "log.csv", strict)
+    assert "line 103: id car4: the same row again; 3 of 723 rows are bad" in line
+
+
+@LONG
+def test_a_road_user_in_two_places_at_once(tmp_path, long_bytes):
+    """The row that continues the track is kept, whichever comes first."""
+    table = people.rows()
+    for at, first in ((300, True), (350, False), (1, True)):
+        odd = list(table[at])
+        odd[2] += 60.0
+        table.insert(at if first else at + 1, odd)
+    source = people.spec(tmp_path, more=f"long_bytes = {long_bytes}")
+    found = people.only(write(tmp_path, table), source)
+    people.assert_same(found)
+    assert people.rows_of(found) == (723, 0, 0, 3)
+    assert any(
+        "3 rows of a road user twice in one frame, one used; first: line" in note
+        for note in found.notes
+    )
+
+
+def test_ids_that_are_not_unique_are_refused(tmp_path):
+    """Two recordings in one file and no column that says so."""
+    table = [*people.rows(), *people.column(people.rows(), "y", lambda y: y + 40.0)]
+    line = refused(write(tmp_path, table), people.spec(tmp_path))
+    assert "id car0: met twice in one frame; 720 of 1440 rows are bad" in line
+
+
+@LONG
+def test_rows_in_any_order(tmp_path, long_bytes):
+    order = np.random.default_rng(0).permutation(720)
+    table = [people.rows()[k] for k in order]
+    source = people.spec(tmp_path, more=f"long_bytes = {long_bytes}")
+    people.assert_same(people.only(write(tmp_path, table), source))
+
+
+@LONG
+def test_frames_without_anybody_are_no_bad_rows(tmp_path, long_bytes):
+    """As SUMO's table has them."""
+    empty = [[f"{-0.1 * k:.1f}", *[""] * 7] for k in range(200, 0, -1)]
+    source = people.spec(tmp_path, more=f"long_bytes = {long_bytes}")
+    found = people.only(write(tmp_path, [*empty, *people.rows()]), source)
+    people.assert_same(found)
+    assert people.rows_of(found) == (720, 0, 0, 0)
+
+
+@LONG
+def test_a_share_of_bad_rows_is_allowed(tmp_path, long_bytes):
+    table = people.rows()
+    for row in table[:36]:
+        row[2] = "?"
+    path = write(tmp_path, table)
+    more = f"long_bytes = {long_bytes}\n"
+    line = refused(path, people.spec(tmp_path, more=more))
+    assert "line 2: x: '?'" in line
+    assert "36 of 720 rows are bad: expected up to 1 %" in line
+    found = people.only(path, people.spec(tmp_path, more=more + "max_bad_rows = 0.05"))
+    assert found.rows.unreadable == 36
+
+
+@pytest.mark.parametrize(
+    ("share", "words"),
+    [
+        ("1.0", "max_bad_rows: 1: expected a share from 0 to below 1"),
+        ("-0.1", "max_bad_rows: -0.1: expected a share"),
+        ("true", "max_bad_rows: True: expected"),
+    ],
+)
+def test_wrong_shares(tmp_path, share, words):
+    path = write(tmp_path, people.rows())
+    source = people.spec(tmp_path, more=f"max_bad_rows = {share}")
+    with pytest.raises(InputError) as caught:
+        people.read(path, source)
+    assert "max_bad_rows: " in str(caught.value)
+
+
+@LONG
+def test_a_file_cut_inside_its_last_line_is_refused(tmp_path, long_bytes):
+    path = write(tmp_path, people.rows())
+    path.write_text(path.read_text()[:-20])
+    line = refused(path, people.spec(tmp_path, more=f"long_bytes = {long_bytes}"))
+    assert "line 721: " in line
+    assert "the last line breaks off: expected a whole file" in line
+
+
+def test_several_recordings_count_the_rows_of_their_file_once(tmp_path):
+    header = (*people.HEADER, "recording")
+    table = [[*row, drive] for drive in "ab" for row in people.rows()]
+    table[5][2] = "west"
+    table[1000:1000] = [table[1000]]
+    found = people.read(write(tmp_path, table, header), people.spec(tmp_path, header))
+    assert [people.rows_of(made) for made in found] == [(1441, 1, 0, 0), (0, 0, 1, 0)]
+
+
+@LONG
+def test_an_import_counts_what_it_dropped(tmp_path, long_bytes):
+    table = people.rows()
+    table[5][2] = "west"
+    table.insert(100, table[100])
+    path = write(tmp_path, table)
+    source = people.spec(tmp_path, more=f"long_bytes = {long_bytes}")
+    manifest = import_parts(parts_of("csv", path, source), tmp_path / "data", CONFIG)
+    assert manifest.quality["rows"] == {"read": 721, "unreadable": 1, "repeated": 1}
+    said = format_quality(manifest.quality)
+    assert "rows dropped: 2 of 721 (0.28%): 1 unreadable, 1 repeated" in said
+    assert any("line 7: x: 'west'" in note for note in manifest.quality["notes"])
+
+
+def test_a_report_of_nothing_dropped_does_not_say_so():
+    report = QualityReport()
+    report.rows.update({"read": 10})
+    assert "rows" not in report.as_dict()
