@@ -15,11 +15,10 @@ from rcirl_jax.data.importers import parts, read_recordings
 from rcirl_jax.data.importers.apollo import messages as apollo_messages
 from rcirl_jax.data.importers.apollo import reader as apollo
 from rcirl_jax.data.importers.apollo import records as apollo_records
-from rcirl_jax.data.importers.apollo.descriptors import ENUM, reading_of
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.types import Kind
 from tests.data.importers.formats import apollo as fixture
-from tests.data.importers.formats.waymo import Packed, Single, message, varint
+from tests.data.importers.formats.waymo import Single, message, varint
 from tests.helpers import logs
 from tests.helpers.logs import refused, tracks_of
 
@@ -82,12 +81,6 @@ def test_drive_of_two_parts(whole):
     assert whole.lanes
 
 
-def test_part_reads_those_that_follow(tmp_path):
-    first, second = fixture.write(tmp_path).files
-    assert only(first).tracks[0].t.size == 81
-    assert only(second).tracks[0].t.size < 81
-
-
 def test_parts_are_drives(tmp_path):
     fixture.write(tmp_path)
     write(tmp_path / "demo_3.5.record", ego_only())
@@ -107,8 +100,13 @@ def test_parts_are_drives(tmp_path):
 
 
 def test_parts_named_by_when_they_began(tmp_path):
-    """As Apollo 10 and others name them; copies of a part are not read twice."""
+    """As Apollo 10 and others name them; copies of a part are not read twice.
+
+    A part reads those that follow it.
+    """
     first, second = fixture.write(tmp_path).files
+    assert only(first).tracks[0].t.size == 81
+    assert only(second).tracks[0].t.size < 81
     first.rename(tmp_path / f"{first.name}.091215")
     second.rename(tmp_path / f"{second.name}.20210723091219")
     shutil.copy(tmp_path / f"{first.name}.091215", f"{first}.091215.split")
@@ -131,11 +129,18 @@ def test_a_folder_for_each_drive_and_copies_that_cyber_recorder_made(tmp_path):
     ]
 
 
-def test_what_a_longer_file_left_behind(tmp_path):
-    """A record is written over without being emptied first; its index is its end."""
+def test_records_that_were_never_closed_or_left_more_behind(tmp_path):
+    """A record is written over without being emptied first; its index is its end.
+
+    Where the computer lost power there is no index, and the header not completed.
+    """
     path = write(tmp_path / "a.record", ego_only())
     path.write_bytes(path.read_bytes() + fixture.record(ego_only(8.0))[-3000:])
     assert only(path).tracks[0].t.size == 21
+    content = write(path, ego_only(), complete=False).read_bytes()
+    index = len(fixture.section(3, message([(1, [(1, 4), (2, 2064)])])))
+    path.write_bytes(content[:-index])
+    assert has_note(only(path), "never closed")
 
 
 def test_prediction_where_perception_is_missing(tmp_path):
@@ -145,16 +150,13 @@ def test_prediction_where_perception_is_missing(tmp_path):
     assert has_note(found, "those of prediction")
 
 
-def test_heading_from_the_quaternion(tmp_path):
-    ego = only(tmp_path, ego_only(heading=False)).tracks[0]
+def test_heading_from_the_quaternion_and_speed_of_the_chassis(tmp_path):
+    """Speed where localization has none; else differences of positions."""
+    messages = ego_only(heading=False, velocity=False)
+    (ego,) = only(tmp_path, messages).tracks
     np.testing.assert_allclose(ego.heading, 0.0, atol=1e-9)
     np.testing.assert_allclose(ego.x, 0.8 * np.arange(21), atol=1e-3)
-
-
-def test_speed_of_the_chassis(tmp_path):
-    """Where localization has none; else differences of positions."""
-    messages = ego_only(velocity=False)
-    np.testing.assert_allclose(only(tmp_path, messages).tracks[0].speed, 8.0, atol=1e-3)
+    np.testing.assert_allclose(ego.speed, 8.0, atol=1e-3)
     for k in range(0, 21, 5):
         content = message([(5, Single(7.5)), (25, fixture.stamped(0.1 * k))])
         messages.append((CHASSIS, 0.1 * k, content))
@@ -217,31 +219,13 @@ def test_unknown_class(tmp_path, choice, number, kind):
     assert [t.kind for t in found if t.id == "12"] == ([] if kind is None else [kind])
 
 
-def test_size_that_was_not_measured(tmp_path):
+def test_states_and_sizes_that_are_none(tmp_path):
     found = tracks_of(only(tmp_path, perceived({5: None, 6: 0.0})))["12"]
     assert (found.length, found.width) == (4.5, 1.8)
-
-
-def test_states_that_are_none_are_left_out(tmp_path):
     messages = perceived({1: -1}) + perceived({2: None})[21:]
     recording = only(tmp_path, messages)
     assert [found.id for found in recording.tracks] == ["ego"]
     assert has_note(recording, "22 obstacle states without")
-
-
-def test_obstacles_with_long_contours(tmp_path):
-    """Fields of no interest are skipped."""
-    contour = message([(8, fixture.point(1.0, 2.0))] * 300)
-    messages = ego_only()
-    for k in range(11):
-        item = message(fixture.seen_at(0.1 * k)[0]) + contour
-        other = message(fixture.seen_at(0.1 * k)[1])
-        content = message([(1, item), (1, other), (2, fixture.stamped(0.1 * k))])
-        messages.append((PERCEPTION, 0.1 * k, content))
-    found = tracks_of(only(tmp_path, messages))["12"]
-    np.testing.assert_allclose(found.x, 25.0 + 0.8 * np.arange(11), atol=1e-6)
-    assert (found.kind, found.length, found.width) == (Kind.VEHICLE, 4.5, 1.9)
-    np.testing.assert_allclose(found.speed, 8.0)
 
 
 def test_message_twice_and_out_of_order(tmp_path):
@@ -352,12 +336,9 @@ def test_each_routing_begins_a_leg(tmp_path):
     assert ends == [(0.0, 2.0), (2.1, 3.6), (3.7, 5.0)]
     whole = only(tmp_path, ego_only(5.0)).tracks[0]
     np.testing.assert_array_equal(np.concatenate([leg.x for leg in legs]), whole.x)
-
-
-def test_no_destination_before_a_late_routing(tmp_path):
-    late = [(ROUTING, 3.0, fixture.routing(*place(0)))]
-    found = destinations(only(tmp_path, ego_only(5.0) + late))
-    assert found == {"ego": None, "ego-leg2": place(0)}
+    # none before a late one
+    late = only(tmp_path, [*ego_only(5.0), (ROUTING, 3.0, fixture.routing(*place(0)))])
+    assert destinations(late) == {"ego": None, "ego-leg2": place(0)}
 
 
 # -------------------------------------------------------------------- windows
@@ -484,15 +465,6 @@ def test_rows_held_are_limited(tmp_path, monkeypatch, piece):
     assert "more than 100 obstacle states" in line
 
 
-def test_record_that_was_never_closed(tmp_path):
-    """Written while the computer lost power: no index, header not completed."""
-    path = write(tmp_path / "a.record", ego_only(), complete=False)
-    content = path.read_bytes()
-    index = len(fixture.section(3, message([(1, [(1, 4), (2, 2064)])])))
-    path.write_bytes(content[:-index])
-    assert has_note(only(path), "never closed")
-
-
 def test_options(tmp_path):
     size = {"length": 4.0, "width": 1.7, "rear_axle_to_centre": 0.0}
     found = only(tmp_path, ego_only(), rate_hz=5.0, ego=size, speed_limit=8.0)
@@ -591,9 +563,7 @@ def test_messages_of_many_bytes(tmp_path, monkeypatch):
         ({2: fixture.point(1e300, 0.0)}, r"obstacles: .*x: 1e\+300"),
         ({3: float("nan")}, r"obstacles: .*theta: nan"),
         ({4: fixture.point(500.0, 0.0)}, r"speed: 500"),
-        ({5: -2.0}, r"length: -2 m: expected 0 to"),
-        ({5: float("inf")}, r"length: inf"),
-        ({6: 1e9}, r"width: 1e\+09 m"),
+        ({5: -2.0, 6: 1e9}, r"length: -2 m: expected 0 to"),
     ],
 )
 def test_absurd_obstacles(tmp_path, changes, words):
@@ -710,27 +680,3 @@ def test_hostile_descriptors(tmp_path, channels, words):
     line = refused(only, tmp_path, perceived({}), channels=channels)
     assert words in line
     assert "a.record: " in line
-
-
-def test_numbers_of_every_type():
-    """Against the encoding's specification: zigzag, two's complement, fixed."""
-    kinds = ("int64", "sint32", "sfixed32", "sfixed64", "fixed32", "fixed64", "float")
-    kinds += ("bool", "/p.M.E")
-    fields = [f"{n} {k + 1} {kinds[k]}" for k, n in enumerate("abcdefghi")]
-    text = f"M: {', '.join(fields)}\nM/E: UP -1"
-    desc = fixture.proto_desc(fixture.file_of("p", text))
-    wanted = {**dict.fromkeys("abcdefgh", 0), "i": ENUM, "lacking": np.nan}
-    parse, names = reading_of("p.M", desc, wanted)
-    assert names == {"i": {-1: "UP"}}
-    raw = message([(1, -5), (2, 9)])
-    raw += varint(3 << 3 | 5) + struct.pack("<i", -7)
-    raw += varint(4 << 3 | 1) + struct.pack("<q", -8)
-    raw += varint(5 << 3 | 5) + struct.pack("<I", 2**32 - 1)
-    raw += varint(6 << 3 | 1) + struct.pack("<Q", 2**64 - 1)
-    raw += message([(7, Single(0.5)), (8, True), (9, -1), (10, Packed([1])), (11, "x")])
-    found = parse(raw)
-    assert [getattr(found, name) for name in "abcdefghi"] == [
-        *(-5, -5, -7, -8, 2**32 - 1, 2**64 - 1, 0.5, True, -1)
-    ]
-    assert np.isnan(found.lacking)
-    assert parse(b"").a == 0

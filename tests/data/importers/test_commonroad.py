@@ -293,6 +293,8 @@ MALFORMED = [
     (moved(w.state(1, "nan", 0)), "x: 'nan'"),
     (moved(w.state(1, 1.5, "1e999")), "y: '1e999'"),
     (moved(*FEET), "feet taken for metres"),
+    # a clock of a century
+    (moved(w.state(2 * 10**10, 3, 0)), "time: 2e+10: expected steps up to 1e+06"),
     (w.lanelet() + w.car() + w.car(y=4), "id: 10"),
     (moved(*[w.state(1, 1.5, 0)] * 2), "time: 1"),
     (moved(w.state(3, 4.5, 0), w.state(2, 3, 0)), "time: 2"),

@@ -264,6 +264,11 @@ BAD_OPTIONS = [
     (f"rate_hz = {HEX}", "rate_hz: a number of 16000 bits: expected at most 63"),
     ("units = 'm'", "units: m: expected a table"),
     ("columns = {t = 3}", "columns.t: 3: expected a text"),
+    ("columns = 3", "columns: 3: expected a table"),
+    ("pattern = 3", "pattern: 3: expected file names"),
+    ("units = 3", "units: 3: expected a table"),
+    ("lanes = [3]", "lanes: [3]: expected tables"),
+    ("defaults = 3", "defaults: 3: expected a table"),
     ("speed_limit = 1" + "0" * 400, "bits: expected at most 63"),
     (
         'columns = {t = "t", id = "id", x = "id", y = "y"}',

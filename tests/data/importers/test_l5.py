@@ -14,11 +14,10 @@ from rcirl_jax.data.importers import parts, read_recordings
 from rcirl_jax.data.importers.l5 import map as l5_map
 from rcirl_jax.data.importers.l5 import reader as l5
 from rcirl_jax.data.importers.l5 import scenes as l5_scenes
-from rcirl_jax.data.importers.l5.messages import read_message
 from rcirl_jax.data.readers import zarr2
 from rcirl_jax.types import Kind
 from tests.data.importers.formats import l5 as fixture
-from tests.data.importers.formats.waymo import Packed, message, varint
+from tests.data.importers.formats.waymo import message, varint
 from tests.helpers import logs
 from tests.helpers.logs import lanes_of, refused, tracks_of
 
@@ -300,18 +299,6 @@ def test_far_world_gets_a_local_origin(dataset):
     assert abs(tracks_of(recording)["ego"].x[0]) < 1000.0
 
 
-@pytest.mark.parametrize(
-    ("choice", "kinds"),
-    [
-        *(("vehicle", [Kind.VEHICLE]), ("static", [Kind.STATIC])),
-        *(("auto", [Kind.STATIC]), ("drop", [])),
-    ],
-)
-def test_unknown_class(folder, choice, kinds):
-    tracks = read(folder, unknown=choice)[0].tracks
-    assert [track.kind for track in tracks if track.id == "99"] == kinds
-
-
 def test_options(folder):
     assert read(folder, min_probability=1.1, unknown="drop")[0].tracks[-1].id == "ego"
     size = {"length": 5.0, "width": 2.0, "centre_ahead": 1.2}
@@ -323,6 +310,8 @@ def test_options(folder):
     assert not ego.is_human(0.0, 1.0)
     human = read(folder, recording_car="human")[0]
     assert tracks_of(human)["ego"].is_human(0.0, 1.0)
+    tracks = read(folder, unknown="vehicle")[0].tracks
+    assert [track.kind for track in tracks if track.id == "99"] == [Kind.VEHICLE]
     bad = {"recording_car": "x", "ego": 3, "unknown": "x", "rate_hz": 0}
     for name, value in {**bad, "min_probability": "x"}.items():
         assert f"source TOML: {name}" in refused(read, folder, **{name: value})
@@ -510,13 +499,10 @@ def element(kind, body):
 
 BAD_MAPS = [
     b"",
-    b"\x12\xff\xff\xff\xff\xff\xff\xff\xff\xff\x01",  # a length beyond the file
     b"\x12" + b"\xff" * 30,  # a varint without end
-    b"\x0b",  # a wire type that is none
     message([(2, 5)]),  # a number instead of an element
     element(3, b"\xff"),
     element(3, [(2, [(2, 1)]), (3, [(1, b"\x02")]), (4, b"")]),  # 1 x, no y
-    element(3, [(2, varint(2 << 3 | 1) + bytes(8)), (3, b""), (4, b"")]),
     element(1, varint(9 << 3 | 1) + bytes(8)),
     # a frame at 200 degrees north
     element(3, [(2, [(1, fixture.fixed32(1, 2 * 10**9))]), (3, b""), (4, b"")]),
@@ -527,12 +513,3 @@ BAD_MAPS = [
 def test_malformed_map(folder, content):
     (folder / "semantic_map" / "semantic_map.pb").write_bytes(content)
     assert re.search(r"semantic_map\.pb: .*expected", refused(read, folder))
-
-
-def test_steps_of_a_bound_of_any_size(tmp_path):
-    """Steps are packed and zigzag-coded, of 1 to 5 bytes."""
-    steps = np.array([-(2**31), 2**31 - 1, 0, -1, 64, -65, 10_000_000])
-    body = message([(1, Packed(fixture.zigzag(step) for step in steps.tolist()))])
-    np.testing.assert_array_equal(
-        read_message(element(3, [(3, body)])).elements[0].element.lane.left.x, steps
-    )

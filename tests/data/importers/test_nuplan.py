@@ -327,6 +327,8 @@ def test_systems_of_coordinates(folder, city, srs, to, zone):
 
 
 def test_optional_layers_and_columns(folder, city):
+    edit(city, "DELETE FROM stop_polygons")
+    assert not any(lane.stop_sign for lane in only(folder).lanes)
     edit(
         city,
         "DROP TABLE boundaries; DROP TABLE stop_polygons; DROP TABLE "

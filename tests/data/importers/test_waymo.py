@@ -140,21 +140,16 @@ def test_up_to_a_tenth_of_the_tracks_may_be_impossible(tmp_path, name):
 
 
 def test_history_only_as_in_the_testing_files(tmp_path):
-    """11 states, and dynamic map states of the same steps."""
+    """11 states, and dynamic map states of the same steps; packed, late stamps."""
     user = straight(w.T[:11], (w.EAST, w.NORTH), 0.0, 5.0)
     recording = scenario(
         tmp_path,
-        f1=[float(stamp) for stamp in w.STAMPS[:11]],
+        f1=[np.asarray(w.STAMPS[:11] + 1e9, "<f8").tobytes()],
         f2=[w.track(1, 1, user, range(11))],
         f7=[[(1, w.signal_state(30))] for _ in range(11)],
     )
-    assert recording.tracks[0].t[-1] == pytest.approx(1.0, abs=1e-3)
+    np.testing.assert_allclose(recording.tracks[0].t, w.T[:11], atol=1e-4)
     assert not any("windows" in note for note in recording.notes)
-
-
-def test_stamps_may_start_anywhere_and_be_packed(tmp_path):
-    recording = scenario(tmp_path, f1=[np.asarray(w.STAMPS + 1e9, "<f8").tobytes()])
-    np.testing.assert_allclose(recording.tracks[0].t, w.T, atol=1e-4)
 
 
 def test_notes_on_the_recording_car_and_shared_vehicles(whole):
@@ -276,7 +271,10 @@ def test_no_map_and_no_limits(tmp_path):
     assert (recording.lanes, recording.signals) == ((), ())
     assert recording.default_speed_limit == 15.65
     lane = w.lane(1, w.eastward(0.0, 0.0, 50.0), limit=0.0)
-    assert scenario(tmp_path, f8=[lane]).lanes[0].speed_limit is None
+    # without an id it is named by its place
+    recording = scenario(tmp_path, f8=[lane], f5=[])
+    assert recording.name == "a.tfrecord-0"
+    assert recording.lanes[0].speed_limit is None
 
 
 # -------------------------------------------------------------------- signals
@@ -368,10 +366,6 @@ def test_files_of_all_names_and_folders(tmp_path):
     assert len(parts("waymo", tmp_path)[0]) == 3
 
 
-def test_a_scenario_without_an_id_is_named_by_its_place(tmp_path):
-    assert scenario(tmp_path, f5=[]).name == "a.tfrecord-0"
-
-
 def test_records_are_read_one_by_one_up_to_a_limit(tmp_path):
     path = put(tmp_path, b"one", b"", b"three" * 1000)
     assert list(read_records(path)) == [b"one", b"", b"three" * 1000]
@@ -458,8 +452,6 @@ BAD = [
     ({"f8": [w.lane(1, [(0.0, 0.0), (NAN, 1.0)])]}, "map points: x: nan"),
     ({"f8": [w.lane(1, w.eastward(0, 0, 9))] * 2}, "map feature 1: met twice"),
     ({"f8": [[(1, 1), (3, b"\xff\xff")]]}, "expected Scenario"),
-    (raw(b"\x09\x00"), "expected Scenario"),
-    (raw(b"\x0c"), "expected Scenario"),
     (raw(b"\x12\xff"), "expected Scenario"),
     ({"f5": [b"\xff\xfe"]}, "expected Scenario"),
 ]
