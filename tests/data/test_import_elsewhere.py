@@ -1,6 +1,5 @@
 """Imports in other processes, on a Ray cluster, and killed: the same bytes."""
 
-import os
 import signal
 import subprocess
 import sys
@@ -27,6 +26,13 @@ ALL_SCENES = ImportConfig(
 TWO = Processes(2)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few_scenes_in_a_shard():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(importing, "SHARD_SCENES", 30)
+        yield
+
+
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory):
     return write_logs(tmp_path_factory.mktemp("logs"))
@@ -36,17 +42,14 @@ def logs(tmp_path_factory):
 def local(logs, tmp_path_factory):
     """What an import in this process writes, in shards of few scenes."""
     folder = tmp_path_factory.mktemp("local") / "data"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(importing, "SHARD_SCENES", 30)
-        import_parts(logs, folder, CONFIG)
+    import_parts(logs, folder, CONFIG)
     assert len(list(folder.rglob("shard.json"))) > 2
     return files_of(folder)
 
 
 @pytest.mark.multiprocess
-def test_two_processes_write_the_bytes_of_one(logs, local, tmp_path, monkeypatch):
-    monkeypatch.setattr(importing, "SHARD_SCENES", 30)
-    import_parts(logs, tmp_path / "data", CONFIG, executor=Processes(2))
+def test_two_processes_write_the_bytes_of_one(logs, local, tmp_path):
+    import_parts(logs, tmp_path / "data", CONFIG, executor=TWO)
     assert files_of(tmp_path / "data") == local
 
 
@@ -140,7 +143,7 @@ def test_bad_input_elsewhere_is_the_same_line_and_leaves_nothing(logs, tmp_path)
     parts = write_logs(broken)
     (broken / "log03.csv").write_text("t,id,x,y\n0.0,a,far,0\n")
     with pytest.raises(InputError, match=r"log03\.csv: line 2: x: 'far': expected a"):
-        import_parts(parts, tmp_path / "data", CONFIG, executor=Processes(2))
+        import_parts(parts, tmp_path / "data", CONFIG, executor=TWO)
     assert not (tmp_path / "data").exists()
 
 
@@ -210,8 +213,7 @@ class Losing:
             yield result
 
 
-def test_lost_workers_leave_what_is_finished(logs, local, tmp_path, monkeypatch):
-    monkeypatch.setattr(importing, "SHARD_SCENES", 30)
+def test_lost_workers_leave_what_is_finished(logs, local, tmp_path):
     data = tmp_path / "data"
     with pytest.raises(LostWorkError):
         import_parts(logs, data, CONFIG, executor=Losing(4))
@@ -230,66 +232,13 @@ def test_no_cluster_is_one_line():
         Ray("127.0.0.1:1")
 
 
-KILLED = """
-import sys
-from pathlib import Path
-from rcirl_jax.data import importing
-from tests.data.small_logs import CONFIG, write_logs
-importing.SHARD_SCENES = 30
-parts = write_logs(Path(sys.argv[1]))
-print("ready", flush=True)
-importing.import_parts(parts, sys.argv[2], CONFIG)
-"""
-
-
-def start(logs, data):
-    """The import in a process of its own, once it is about to start."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", KILLED, str(logs), str(data)],
-        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
-    )  # fmt: skip
-    assert process.stdout.readline() == "ready\n"
-    return process
-
-
-def killed_and_resumed(logs, data, moments, local):
-    """Kill at the moments [s after the start], then let it end; same bytes."""
-    kills = 0
-    for moment in moments:
-        process = start(logs, data)
-        try:
-            process.wait(timeout=moment)
-        except subprocess.TimeoutExpired:
-            os.kill(process.pid, signal.SIGKILL)
-            kills += 1
-        process.wait()
-        process.stdout.close()
-        if (data / "manifest.json").exists():
-            break
-    last = start(logs, data) if not (data / "manifest.json").exists() else None
-    if last is not None:
-        assert last.wait(timeout=300) == 0
-        last.stdout.close()
-    assert files_of(data) == local
-    return kills
-
-
-def duration(logs, data):
-    begin = time.monotonic()
-    process = start(logs, data)
-    begin = time.monotonic()
-    assert process.wait(timeout=300) == 0
-    process.stdout.close()
-    return time.monotonic() - begin
-
-
-DYING = """
+STARTED = """
 import os, signal, sys
 from pathlib import Path
-from rcirl_jax.data.store import files
 from rcirl_jax.data import importing
+from rcirl_jax.data.store import files
 from tests.data.small_logs import CONFIG, write_logs
-importing.SHARD_SCENES = 30
+
 write, left = files.Files.write_many, int(sys.argv[3])
 
 def dying(self, values):
@@ -301,36 +250,58 @@ def dying(self, values):
     write(self, values)
 
 files.Files.write_many = dying
-importing.import_parts(write_logs(Path(sys.argv[1])), sys.argv[2], CONFIG)
+importing.SHARD_SCENES = 30
+parts = write_logs(Path(sys.argv[1]))
+print("ready", flush=True)
+importing.import_parts(parts, sys.argv[2], CONFIG)
 """
+
+
+def imported(logs, data, *, writes=10**9, kill_s=300.0):
+    """An import in a process of its own: (how it ended, how long it took [s]).
+
+    It dies in the middle of a write after some, or is killed some seconds after its
+    start.
+    """
+    arguments = map(str, (logs, data, writes))
+    with subprocess.Popen(
+        [sys.executable, "-c", STARTED, *arguments],
+        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+    ) as process:  # fmt: skip
+        assert process.stdout.readline() == "ready\n"
+        begin = time.monotonic()
+        try:
+            process.wait(timeout=kill_s)
+        except subprocess.TimeoutExpired:
+            process.kill()
+    return process.returncode, time.monotonic() - begin
 
 
 @pytest.mark.multiprocess
 def test_an_import_that_dies_while_it_writes_resumes_to_the_same_bytes(local, tmp_path):
-    """Death in the middle of the first shard, of a later mark, of a later shard."""
+    """Death in the middle of a later mark, and of a later shard."""
     data = tmp_path / "data"
-    for writes in (0, 3, 2):
-        done = subprocess.run(
-            [sys.executable, "-c", DYING, tmp_path / "logs", data, str(writes)],
-            capture_output=True, text=True, timeout=300, check=False,
-        )  # fmt: skip
-        assert done.returncode == -signal.SIGKILL, done.stderr[-2000:]
+    for writes in (3, 2):
+        ended, _ = imported(tmp_path / "logs", data, writes=writes)
+        assert ended == -signal.SIGKILL
         assert not (data / "manifest.json").exists()
-    last = start(tmp_path / "logs", data)
-    assert last.wait(timeout=300) == 0
-    last.stdout.close()
+    import_parts(write_logs(tmp_path / "logs"), data, CONFIG)
     assert files_of(data) == local
 
 
 @pytest.mark.slow
-def test_twenty_kills_at_random_moments(logs, local, tmp_path):
-    whole = duration(tmp_path / "logs", tmp_path / "whole")
+def test_twenty_kills_at_random_moments(local, tmp_path):
+    logs = tmp_path / "logs"
+    _, whole = imported(logs, tmp_path / "whole")
     rng, kills = np.random.default_rng(1), 0
     for attempt in range(40):
-        moment = [float(rng.uniform(0.0, 1.1) * whole)]
-        kills += killed_and_resumed(
-            tmp_path / "logs", tmp_path / f"data{attempt}", moment, local
-        )
+        data, moment = tmp_path / f"data{attempt}", rng.uniform(0.0, 1.1) * whole
+        ended, _ = imported(logs, data, kill_s=moment)
+        if ended == -signal.SIGKILL:
+            kills += 1
+            if not (data / "manifest.json").exists():
+                assert imported(logs, data)[0] == 0
+        assert files_of(data) == local
         if kills >= 20:
             return
     pytest.fail(f"only {kills} imports were killed before they ended")

@@ -247,7 +247,7 @@ def make_nuplan(folder: Path) -> tuple[Path, list[Path]]:
     database = sqlite3.connect(log)
     database.execute("DELETE FROM lidar_pc WHERE timestamp > ?", (late,))
     of_clouds = "lidar_pc_token NOT IN (SELECT token FROM lidar_pc)"
-    for table in ("lidar_box", "traffic_light_status", "scenario_tag"):
+    for table in ("lidar_box", "traffic_light_status"):
         database.execute(f"DELETE FROM {table} WHERE {of_clouds}")
     database.execute("DELETE FROM ego_pose WHERE timestamp > ?", (late,))
     _packed(database)

@@ -3,8 +3,6 @@
 import dataclasses
 import importlib
 import os
-import re
-import sqlite3
 import subprocess
 import sys
 
@@ -18,23 +16,10 @@ from rcirl_jax.data.readers.tables import streams
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.errors import InputError, as_input_error
-from tests.data.importers.formats import (
-    commonroad,
-    csv,
-    levelx_highd,
-    ngsim,
-    nuplan,
-    openacc,
-)
+from tests.data.importers.formats import csv, levelx_highd, ngsim
 from tests.data.importers.writers import strict
 from tests.helpers.commands import command
-
-
-def only_line(name, path, source=None):
-    with pytest.raises(InputError) as caught:
-        list(read_recordings(name, path, source))
-    (line,) = str(caught.value).splitlines()
-    return line
+from tests.helpers.logs import read, refused
 
 
 def made(folder):
@@ -54,37 +39,17 @@ def replace_cell(file, row, column, value, separator=","):
     file.write_text("\n".join(lines) + "\n")
 
 
-def test_a_clock_of_a_century_beside_a_standing_obstacle(tmp_path):
-    fixture = commonroad.write(tmp_path)
-    (file,) = fixture.files
-    text = file.read_text()
-    latest = max(map(int, re.findall(r"<exact>(\d+)</exact>", text)))
-    before, _, after = text.rpartition(f"<exact>{latest}</exact>")
-    file.write_text(f"{before}<exact>20000000000</exact>{after}")
-    line = only_line("commonroad", fixture.input)
-    assert "time: 2e+10: expected steps up to 1e+06" in line
-
-
 def test_one_wrong_cell_does_not_make_a_lane_across_the_globe(tmp_path):
     fixture = levelx_highd.write(made(tmp_path / "highd"))
     (tracks,) = [f for f in fixture.files if f.name.endswith("_tracks.csv")]
     replace_cell(tracks, 50, "x", "9e7")
-    line = only_line("levelx", fixture.input)
+    line = refused(read, "levelx", fixture.input)
     assert "x: 9e+07 m, the median is " in line
     fixture = ngsim.write(made(tmp_path / "ngsim"))
     replace_cell(fixture.files[0], 50, 5, "1e12", " ")
     source = strict(tmp_path / "strict.toml", "ngsim")
-    line = only_line("ngsim", fixture.input, source)
+    line = refused(read, "ngsim", fixture.input, source)
     assert "line 51: Local_Y: 1e+12: expected within 1e+08" in line
-    fixture = openacc.write(made(tmp_path / "openacc"))
-    file = fixture.files[0]
-    rows = file.read_text().splitlines()
-    head = next(i for i, row in enumerate(rows) if row.startswith("Time"))
-    cells = rows[head + 60].split(",")
-    cells[rows[head].split(",").index("N1")] = "-9e7"
-    rows[head + 60] = ",".join(cells)
-    file.write_text("\n".join(rows) + "\n")
-    assert "y: -9e+07 m, the median is " in only_line("openacc", file)
 
 
 @pytest.mark.parametrize("long_bytes", [1, 10**9])
@@ -100,7 +65,7 @@ def test_a_csv_cell_beyond_any_place_or_time(long_bytes, cell, column, tmp_path)
     columns = "\n".join(f'{name} = "{name}"' for name in ("t", "id", "x", "y", "lane"))
     options = f"long_bytes = {long_bytes}\nmax_bad_rows = 0.0"
     source.write_text(f"{options}\n[columns]\n{columns}\n")
-    line = only_line("csv", log, source)
+    line = refused(read, "csv", log, source)
     assert (
         f"line 61: {column}: {float(cell):g}" in line
         or f"{column}: {float(cell)}" in line
@@ -126,7 +91,7 @@ def test_a_log_that_is_held_whole_has_a_size(name, tmp_path):
     file = first_file(name, tmp_path / "in")
     with file.open("r+b") as opened:
         opened.truncate(2**40)  # its rows, and a terabyte of nothing
-    line = only_line(importer_of(name), tmp_path / "in")
+    line = refused(read, importer_of(name), tmp_path / "in")
     assert f"{file.name}: size: {2**20} MiB: expected 1024 at most" in line
 
 
@@ -145,7 +110,7 @@ def test_a_line_without_an_end_is_not_held(name, where, tmp_path, monkeypatch):
     if where == "cell":
         text = "".join(rows[:-1]) + 2**16 * " " + rows[-1]
     file.write_text(text)
-    line = only_line(importer_of(name), tmp_path / "in")
+    line = refused(read, importer_of(name), tmp_path / "in")
     assert file.name in line
     assert "a line of more than 16384 characters: expected one a row" in line
 
@@ -175,38 +140,8 @@ def test_a_long_log_with_a_line_without_an_end(tmp_path):
             file.write("0.1,a,0.0,0.0,1," * 2**12)
     names = "\n".join(f'{name} = "{name}"' for name in ("t", "id", "x", "y", "lane"))
     source.write_text(f"long_bytes = 1\n[columns]\n{names}\n")
-    line = only_line("csv", log, source)
+    line = refused(read, "csv", log, source)
     assert "a line of more than 16777216 characters: expected one a row" in line
-
-
-@pytest.mark.parametrize(
-    ("text", "line"),
-    [
-        ("columns = 3", "columns: 3: expected a table"),
-        ("pattern = 3", "pattern: 3: expected file names"),
-        ("units = 3", "units: 3: expected a table"),
-        ("lanes = [3]", "lanes: [3]: expected tables"),
-        ("defaults = 3", "defaults: 3: expected a table"),
-    ],
-)
-def test_options_of_another_type(text, line, tmp_path):
-    log, source = tmp_path / "log.csv", tmp_path / "source.toml"
-    rows = [f"{k / 10:.1f},a,{k}.0,0.0" for k in range(40)]
-    log.write_text("\n".join(["t,id,x,y", *rows]) + "\n")
-    columns = "\n".join(f'{name} = "{name}"' for name in ("t", "id", "x", "y"))
-    rest = "" if text.startswith("columns") else f"[columns]\n{columns}\n"
-    source.write_text(f"{text}\n{rest}")
-    assert line in only_line("csv", log, source)
-
-
-def test_a_map_without_stop_polygons(tmp_path):
-    fixture = nuplan.write(tmp_path)
-    whole = list(read_recordings("nuplan", fixture.input))
-    (layers,) = tmp_path.rglob("*.gpkg")
-    with sqlite3.connect(layers) as database:
-        database.execute("DELETE FROM stop_polygons")
-    found = list(read_recordings("nuplan", fixture.input))
-    assert [len(x.tracks) for x in found] == [len(x.tracks) for x in whole]
 
 
 def test_what_no_check_foresaw_is_one_line_that_names_the_place(tmp_path, monkeypatch):
@@ -218,7 +153,7 @@ def test_what_no_check_foresaw_is_one_line_that_names_the_place(tmp_path, monkey
 
     module = importers.importlib.import_module("rcirl_jax.data.importers.csv.reader")
     monkeypatch.setattr(module, "recordings", broken)
-    line = only_line("csv", fixture.input)
+    line = refused(read, "csv", fixture.input)
     assert "KeyError: 'stations' (test_absurd.py:" in line
     assert line.endswith("expected a sound log of format csv")
 

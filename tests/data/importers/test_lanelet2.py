@@ -10,8 +10,8 @@ from rcirl_jax.data.importers.lanelet2 import rules as lanelet2_rules
 from rcirl_jax.data.importers.lanelet2.map import read_lanelet2
 from rcirl_jax.data.importers.lanelet2.rules import members
 from rcirl_jax.data.importers.projection import utm, utm_zone
-from rcirl_jax.errors import InputError
 from tests.data.importers.formats import osm
+from tests.helpers.logs import refused
 
 UTM_ORIGIN = np.array([297631.3187, 5629917.34465])
 
@@ -58,8 +58,9 @@ def test_the_other_side_of_the_globe_stays_finite():
 
 def test_without_pyproj_is_one_line(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyproj", None)
-    with pytest.raises(InputError, match=r"pyproj: not installed .*rcirl-jax\[logs\]"):
-        utm(np.zeros(1), np.zeros(1), 31)
+    line = refused(utm, np.zeros(1), np.zeros(1), 31)
+    assert line.startswith("pyproj: not installed ")
+    assert "rcirl-jax[logs]" in line
 
 
 def test_southern_hemisphere_is_moved():
@@ -92,11 +93,9 @@ def test_links(lanes):
 
 
 def test_neighbours_of_the_same_direction(tmp_path):
-    both = {
-        "1": (["path_north"], ["path_south"], osm.ROAD, []),
-        "2": (["path_south"], ["middle_3"], osm.ROAD, []),
-    }
-    lanes, _ = read(metres(tmp_path, lanelets=both))
+    one = (["path_north"], ["path_south"], osm.ROAD, [])
+    other = (["path_south"], ["middle_3"], osm.ROAD, [])
+    lanes, _ = read(metres(tmp_path, lanelets={"1": one, "2": other}))
     assert (lanes["1"].left, lanes["1"].right) == (None, "2")
     assert (lanes["2"].left, lanes["2"].right) == ("1", None)
 
@@ -256,50 +255,32 @@ def test_lanelets_without_two_bounds_are_noted(tmp_path):
     assert notes == ["2 lanelets without two bounds left out"]
 
 
-BOMB = (
-    '<?xml version="1.0"?><!DOCTYPE b [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;">]>'
-    "<osm>&b;</osm>"
-)
-EXTERNAL = (
-    '<?xml version="1.0"?><!DOCTYPE b [<!ENTITY x SYSTEM "file:///etc/hostname">]>'
-    "<osm>&x;</osm>"
-)
+MALFORMED = [
+    ("<osm><node", "well-formed"),
+    ("", "well-formed"),
+    ("<gpx/>", "root: 'gpx': expected osm"),
+    ("<osm/>", "lanelet: none"),
+    ("<osm><node id='1'/></osm>", "node 1: position"),
+    ("<osm><node id='1' lat='a' lon='2'/></osm>", "node 1: position"),
+    ("<osm><node id='1' lat='nan' lon='2'/></osm>", "node 1: position"),
+    ("<osm><node id='1' lat='90' lon='2'/></osm>", "expected at most 84, 180"),
+    ("<osm><node id='1' x='1e300' y='2'/></osm>", "expected at most 1e+08"),
+    ("<osm><node id='1' x='1' y='2'/><node id='2' lat='1' lon='1'/></osm>", "node 2"),
+]
 
 
-@pytest.mark.parametrize(
-    ("text", "field"),
-    [
-        (BOMB, "entities"),
-        (EXTERNAL, "entities"),
-        ("<osm><node", "well-formed"),
-        ("", "well-formed"),
-        ("<gpx/>", "root: 'gpx': expected osm"),
-        ("<osm/>", "lanelet: none"),
-        ("<osm><node id='1'/></osm>", "node 1: position"),
-        ("<osm><node id='1' lat='a' lon='2'/></osm>", "node 1: position"),
-        ("<osm><node id='1' lat='nan' lon='2'/></osm>", "node 1: position"),
-        ("<osm><node id='1' lat='90' lon='2'/></osm>", "expected at most 84, 180"),
-        ("<osm><node id='1' x='1e300' y='2'/></osm>", "expected at most 1e+08"),
-        (
-            "<osm><node id='1' x='1' y='2'/><node id='2' lat='1' lon='1'/></osm>",
-            "node 2",
-        ),
-    ],
-)
-def test_malformed(tmp_path, text, field):
+@pytest.mark.parametrize(("text", "words"), MALFORMED)
+def test_malformed(tmp_path, text, words):
     path = tmp_path / "bad.osm"
     path.write_text(text)
-    with pytest.raises(InputError) as error:
-        read(path)
-    assert str(error.value).startswith(str(path))
-    assert field in str(error.value)
-    assert "\n" not in str(error.value)
+    line = refused(read, path)
+    assert line.startswith(str(path))
+    assert words in line
 
 
 def test_too_large_a_file(tmp_path, monkeypatch):
     monkeypatch.setattr(lanelet2, "MAX_FILE_BYTES", 100)
-    with pytest.raises(InputError, match="size"):
-        read(metres(tmp_path))
+    assert "size" in refused(read, metres(tmp_path))
 
 
 def test_nodes_and_ways_of_bounds_are_limited(tmp_path, monkeypatch):
@@ -310,8 +291,6 @@ def test_nodes_and_ways_of_bounds_are_limited(tmp_path, monkeypatch):
     monkeypatch.setattr(lanelet2, "MAX_NODES", 2 * points)
     assert set(read(path)[0]) == {"1", "2"}
     monkeypatch.setattr(lanelet2, "MAX_NODES", 2 * points - 1)
-    with pytest.raises(InputError, match=f"lanelet 2: {2 * points} nodes"):
-        read(path)
+    assert f"lanelet 2: {2 * points} nodes" in refused(read, path)
     monkeypatch.setattr(lanelet2_rules, "MAX_WAYS", 2)
-    with pytest.raises(InputError, match="3 ways: expected up to 2"):
-        read(path)
+    assert "3 ways: expected up to 2" in refused(read, path)

@@ -1,6 +1,7 @@
 """nuPlan logs and maps: SQLite of others, geometry blobs, windows, lights."""
 
 import collections
+import functools
 import hashlib
 import os
 import pickle
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 from rcirl_jax.data.cut import cut
-from rcirl_jax.data.importers import parts, read_recordings
+from rcirl_jax.data.importers import parts
 from rcirl_jax.data.importers.nuplan import geopackage
 from rcirl_jax.data.importers.nuplan import map as nuplan_map
 from rcirl_jax.data.importers.nuplan import reader as nuplan
@@ -21,25 +22,13 @@ from rcirl_jax.data.readers import long_logs
 from rcirl_jax.data.readers import sqlite as sqlite_ro
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.errors import InputError
-from rcirl_jax.runtime.specs import load_toml, spec_root
-from rcirl_jax.types import Kind
 from tests.data.importers.formats import nuplan as fixture
+from tests.helpers import logs
+from tests.helpers.logs import lanes_of, refused, tracks_of
 
 DRIVE = "2021.06.14.21.57.33_veh-38"
-
-
-def read(path, **options):
-    spec = load_toml(spec_root() / "sources" / "nuplan.toml")
-    return list(nuplan.recordings(path, {**spec, **options}))
-
-
-def only(path, **options):
-    (recording,) = read(path, **options)
-    return recording
-
-
-def lanes_of(recording):
-    return {lane.id: lane for lane in recording.lanes}
+read = functools.partial(logs.read, "nuplan")
+only = functools.partial(logs.only, "nuplan")
 
 
 @pytest.fixture(scope="module")
@@ -56,49 +45,61 @@ def folder(original, tmp_path):
 
 
 @pytest.fixture
+def city(folder):
+    """The file of the map."""
+    return folder.parents[2] / "maps" / fixture.CITY / "9.15.1915" / "map.gpkg"
+
+
+@pytest.fixture
 def log(original, tmp_path):
     """A log without a map."""
     name = f"{fixture.NAME}.db"
     return shutil.copy(original[0] / original[1] / name, tmp_path / name)
 
 
-def edit(path, *statements):
+@pytest.fixture(scope="module")
+def whole(original):
+    """The recording of the log, with its map."""
+    return only(original[0] / original[1])
+
+
+def edit(path, *statements, values=None):
     database = sqlite3.connect(path)
     for statement in statements:
-        database.executescript(statement)
+        if values is None:
+            database.executescript(statement)
+        else:
+            database.execute(statement, values)
     database.commit()
     database.close()
+
+
+def in_pairs(text):
+    """The two sides of each line "change | words"."""
+    return [tuple(line.split(" | ")) for line in text.strip().splitlines()]
 
 
 # ---------------------------------------------------------------- well-formed
 
 
-def test_log_becomes_a_recording(folder):
-    recording = only(folder)
-    assert recording.name == fixture.NAME
-    assert (recording.rate_hz, recording.group) == (20.0, DRIVE)
-    assert any("x = 664000 m, y = 3997000 m" in note for note in recording.notes)
-    kinds = {track.id: track.kind for track in recording.tracks}
-    assert kinds["ego"] == Kind.VEHICLE
-    assert kinds[fixture.TRACK["walker"].hex()] == Kind.PEDESTRIAN
-    assert kinds[fixture.TRACK["bike"].hex()] == Kind.CYCLIST
-    assert kinds[fixture.TRACK["cone"].hex()] == Kind.STATIC
+def test_log_becomes_a_recording(whole):
+    assert (whole.name, whole.rate_hz, whole.group) == (fixture.NAME, 20.0, DRIVE)
+    assert any("x = 664000 m, y = 3997000 m" in note for note in whole.notes)
 
 
-def test_ego_is_the_box_at_the_clouds_time(folder):
+def test_ego_is_the_box_at_the_clouds_time(whole, log):
     """Rear axle, 3 ms early -> centre, at the time of the point cloud."""
-    ego = only(folder).tracks[0]
+    ego = whole.tracks[0]
     np.testing.assert_allclose(ego.x, fixture.road_users()["ego"].x, atol=2e-3)
     np.testing.assert_allclose(ego.t, fixture.STAMPS, atol=1e-6)
-    turned = only(
-        folder, ego={"rear_axle_to_centre": 0.0, "length": 4.0, "width": 1.7}
-    ).tracks[0]
-    assert turned.x[0] == pytest.approx(-fixture.AHEAD, abs=2e-3)
-    assert (turned.length, turned.width) == (4.0, 1.7)
+    size = {"rear_axle_to_centre": 0.0, "length": 4.0, "width": 1.7}
+    other = only(log, ego=size).tracks[0]
+    assert other.x[0] == pytest.approx(-fixture.AHEAD, abs=2e-3)
+    assert (other.length, other.width) == (4.0, 1.7)
 
 
 @pytest.mark.parametrize("indexed", [True, False])
-def test_rows_in_any_order(folder, log, indexed):
+def test_rows_in_any_order(whole, log, indexed):
     """A database has no order of rows: here that of the tokens, as of a key."""
     for table in ("lidar_box", "lidar_pc", "ego_pose", "traffic_light_status"):
         edit(
@@ -110,25 +111,23 @@ def test_rows_in_any_order(folder, log, indexed):
     if not indexed:
         edit(log, "DROP INDEX ix_lidar_pc_timestamp")
         edit(log, "DROP INDEX ix_lidar_box_lidar_pc_token")
-    found, expected = only(log), only(folder)
-    assert [track.id for track in found.tracks] == [t.id for t in expected.tracks]
-    for one, other in zip(found.tracks, expected.tracks, strict=True):
+    found = only(log)
+    assert [track.id for track in found.tracks] == [t.id for t in whole.tracks]
+    for one, other in zip(found.tracks, whole.tracks, strict=True):
         np.testing.assert_array_equal(one.t, other.t)
         np.testing.assert_array_equal(one.x, other.x)
-    assert [s.state for s in found.signals] == [s.state for s in expected.signals]
+    assert [s.state for s in found.signals] == [s.state for s in whole.signals]
 
 
 def test_heading_from_the_quaternion(log):
-    half = 0.35
-    edit(log, f"UPDATE ego_pose SET qw = {np.cos(half)}, qz = {np.sin(half)}")
-    np.testing.assert_allclose(only(log).tracks[0].heading, 2.0 * half)
+    edit(log, f"UPDATE ego_pose SET qw = {np.cos(0.35)}, qz = {np.sin(0.35)}")
+    np.testing.assert_allclose(only(log).tracks[0].heading, 0.7)
 
 
 @pytest.mark.parametrize(
     ("name", "drive"),
     [
         (fixture.NAME, DRIVE),
-        ("2021.06.14.21.57.33_veh-38_01008_01518", DRIVE),
         ("2021.06.14.21.57.33_veh-08_01008_01518", "2021.06.14.21.57.33_veh-08"),
         ("my_log_00001_00002", "my_log_00001_00002"),
         (f"{DRIVE}_00017", f"{DRIVE}_00017"),
@@ -138,11 +137,11 @@ def test_logs_of_one_drive_are_one_group(name, drive):
     assert nuplan.drive_of(name) == drive
 
 
-def test_windows_hold_the_scenes_of_the_log(folder, monkeypatch):
+def test_windows_hold_the_scenes_of_the_log(original, whole, monkeypatch):
     """Surroundings are shortened to those of a log of 8 s."""
     monkeypatch.setattr(long_logs, "BEFORE_S", 1.0)
     monkeypatch.setattr(long_logs, "AFTER_S", 2.5)
-    found = read(folder, window_s=3.0)
+    found = read(original[0] / original[1], window_s=3.0)
     assert [r.name for r in found] == [f"{fixture.NAME}-{k:03d}" for k in range(3)]
     assert {(r.group, r.piece_of) for r in found} == {(DRIVE, fixture.NAME)}
     egos = [recording.tracks[0] for recording in found]
@@ -157,106 +156,98 @@ def test_windows_hold_the_scenes_of_the_log(folder, monkeypatch):
     config = CollectConfig(
         min_future_s=1.5, require_obstacles=False, require_speed_change=False
     )
-    whole, apart = (
+    one, apart = (
         collections.Counter(
             (name, int(frame))
             for made in (cut(recording, config) for recording in recordings)
             for name, frame in zip(made.vehicles, made.scenes.frame, strict=True)
         )
-        for recordings in ([only(folder)], found)
+        for recordings in ([whole], found)
     )
     assert max(apart.values()) == 1
-    assert whole.total() > 40
-    assert apart == whole
+    assert one.total() > 40
+    assert apart == one
 
 
 def test_parts_are_logs(folder):
     shutil.copy(folder / f"{fixture.NAME}.db", folder / "b.db")
     found, _ = parts("nuplan", folder)
     assert [part.name for part in found] == [f"{fixture.NAME}.db", "b.db"]
-    assert [r.name for r in read_recordings("nuplan", folder)] == [fixture.NAME, "b"]
+    assert [recording.name for recording in read(folder)] == [fixture.NAME, "b"]
 
 
-def test_file_is_left_as_it_is(log):
-    before = hashlib.sha256(log.read_bytes()).hexdigest()
-    only(log)
-    assert hashlib.sha256(log.read_bytes()).hexdigest() == before
-    assert [path.name for path in log.parent.iterdir()] == [log.name]
+def test_file_is_left_as_it_is_and_those_beside_it_are_not_read(log):
+    """immutable=1: a planted journal changes nothing; nor do odd names of files.
+
+    A URI must not take ? and # in a name for its own.
+    """
+    odd = log.rename(log.with_name("a?mode=rwc#%41 b.db"))
+    before = hashlib.sha256(odd.read_bytes()).hexdigest()
+    for suffix in ("-wal", "-journal", "-shm"):
+        odd.with_name(odd.name + suffix).write_bytes(os.urandom(4096))
+    assert only(odd).name == "a?mode=rwc#%41 b"
+    assert hashlib.sha256(odd.read_bytes()).hexdigest() == before
+    assert len(list(odd.parent.iterdir())) == 4
 
 
-def test_odd_names_of_files(tmp_path):
-    """A URI must not take ? and # in a name for its own."""
-    path = fixture.write_log(tmp_path / "a?mode=rwc#%41 b.db")
-    assert only(path).name == "a?mode=rwc#%41 b"
-
-
-def test_pickles_in_the_file_are_not_loaded(log, tmp_path):
+def test_pickles_and_triggers_of_the_file_are_not_run(log, tmp_path):
     class Bomb:
         def __reduce__(self):
             return os.mkdir, (str(tmp_path / "executed"),)
 
-    database = sqlite3.connect(log)
-    bomb = pickle.dumps(Bomb())
-    database.execute("UPDATE lidar SET translation = ?, rotation = ?", (bomb, bomb))
-    database.commit()
-    database.close()
-    only(log)
+    bomb = (pickle.dumps(Bomb()),) * 2
+    edit(log, "UPDATE lidar SET translation = ?, rotation = ?", values=bomb)
+    trigger = "BEFORE INSERT ON log BEGIN SELECT load_extension('x'); END"
+    edit(log, f"CREATE TRIGGER t {trigger}")
+    assert only(log).tracks
     assert not (tmp_path / "executed").exists()
 
 
 def test_missing_velocity_comes_from_positions(log):
     edit(log, "UPDATE lidar_box SET vx = NULL", "UPDATE ego_pose SET vy = NULL")
-    tracks = {track.id: track for track in only(log).tracks}
-    np.testing.assert_allclose(tracks["ego"].speed, 8.0, atol=0.1)
-    car = tracks[fixture.TRACK["car"].hex()]
-    np.testing.assert_allclose(car.speed, 8.0, atol=0.1)
+    tracks = tracks_of(only(log))
+    for name in ("ego", fixture.TRACK["12"].hex()):
+        np.testing.assert_allclose(tracks[name].speed, 8.0, atol=0.1)
 
 
-def test_ego_alone(log):
+def test_ego_alone_on_its_path(log):
     edit(log, "DELETE FROM lidar_box")
     recording = only(log)
     assert [track.id for track in recording.tracks] == ["ego"]
-    assert any("alone" in note for note in recording.notes)
+    assert recording.lanes[0].id == "path-0"
+    for word in ("alone", "no map here"):
+        assert any(word in note for note in recording.notes)
 
 
 # ------------------------------------------------------------------------ map
 
 
-def test_lanes_of_the_map(folder):
-    lanes = lanes_of(only(folder))
+def test_lanes_of_the_map(whole):
+    lanes = lanes_of(whole)
     assert set(lanes) == {"61", "62", "63", "connector-71", "connector-72"}
-    lane = lanes["61"]
-    np.testing.assert_allclose(
-        lane.centre[[0, -1]], [[-60.0, 0.0], [60.0, 0.0]], atol=5e-3
-    )
-    np.testing.assert_allclose(lane.left_width, 1.75, atol=5e-3)
-    np.testing.assert_allclose(lane.right_width, 1.75, atol=5e-3)
+    lane, right, last = lanes["61"], lanes["62"], lanes["63"]
+    np.testing.assert_allclose(lane.centre[[0, -1]], [[-60, 0], [60, 0]], atol=5e-3)
+    for width in (lane.left_width, lane.right_width):
+        np.testing.assert_allclose(width, 1.75, atol=5e-3)
     assert lane.speed_limit == pytest.approx(11.176)
-    assert (lane.left, lane.right) == ("62", None)
-    assert lanes["62"].right == "61"
+    assert (lane.left, lane.right, right.right) == ("62", None, "61")
     assert lane.successors == ("connector-71", "connector-72")
     assert lanes["connector-72"].successors == ("63",)
     assert lanes["connector-72"].speed_limit == pytest.approx(8.9)
-    assert lanes["63"].speed_limit is None
+    assert last.speed_limit is None
     # no bounds in the map
-    np.testing.assert_array_equal(lanes["63"].left_width, 1.75)
+    np.testing.assert_array_equal(last.left_width, 1.75)
 
 
-def test_stop_lines_and_signs(folder):
-    lanes = lanes_of(only(folder))
+def test_stop_lines_signs_and_lights(whole):
+    lanes = lanes_of(whole)
     line, sign = lanes["connector-72"].stop_line, lanes["63"].stop_line
-    assert line is not None
-    assert sign is not None
     np.testing.assert_allclose(line, [[62.0, 1.75], [62.0, -1.75]], atol=0.02)
-    assert lanes["connector-71"].signal_ids == ("71",)
-    assert not lanes["connector-71"].stop_sign
-    assert lanes["63"].stop_sign
     assert sign[0, 0] == pytest.approx(148.5, abs=0.02)
+    assert lanes["connector-71"].signal_ids == ("71",)
+    assert {name for name, lane in lanes.items() if lane.stop_sign} == {"63"}
     assert lanes["61"].stop_line is None
-
-
-def test_lights(folder):
-    signals = {signal.id: signal for signal in only(folder).signals}
+    signals = {signal.id: signal for signal in whole.signals}
     assert signals["71"].state == ("red", "green")
     green = fixture.STAMPS[fixture.GREEN_FROM]
     np.testing.assert_allclose(signals["71"].start, [0.0, green], atol=1e-6)
@@ -273,55 +264,37 @@ def test_light_without_status_for_a_second_is_off(log):
     signals = {signal.id: signal for signal in only(log).signals}
     assert signals["71"].state == ("red", "off", "red", "green")
     assert signals["71"].start[1] == pytest.approx(2.95, abs=0.06)
-
-
-def test_without_lights(log):
     edit(log, "DROP TABLE traffic_light_status")
     assert only(log).signals == ()
 
 
-def test_without_a_map_lanes_are_paths(log):
-    recording = only(log)
-    assert recording.lanes[0].id == "path-0"
-    assert any("no map here" in note for note in recording.notes)
-
-
 @pytest.mark.parametrize(
-    ("version", "location"),
+    ("version", "location", "is_found"),
     [
-        ("us-nv-las-vegas-strip", "x"),
-        ("us-nv-las-vegas-strip.gpkg", "x"),
-        (None, "las_vegas"),
-        ("nuplan-maps-v1.0", "us-nv-las-vegas-strip"),
+        ("us-nv-las-vegas-strip", "x", True),
+        ("us-nv-las-vegas-strip.gpkg", "x", True),
+        (None, "las_vegas", True),
+        ("nuplan-maps-v1.0", "us-nv-las-vegas-strip", True),
+        # what leaves the folder, or could be several maps
+        *[(name, "/etc", False) for name in ("../maps/us-nv-las-vegas-strip", "..")],
+        *[(name, "/etc", False) for name in ("", "us-")],
     ],
 )
-def test_map_is_found_by_name(folder, version, location):
-    path = folder / f"{fixture.NAME}.db"
-    value = "NULL" if version is None else f"'{version}'"
-    edit(path, f"UPDATE log SET map_version = {value}, location = '{location}'")
-    assert "61" in lanes_of(only(folder))
-
-
-@pytest.mark.parametrize("name", ["../maps/us-nv-las-vegas-strip", "..", "", "us-"])
-def test_map_names_cannot_leave_the_folder(folder, name):
-    path = folder / f"{fixture.NAME}.db"
-    edit(path, f"UPDATE log SET map_version = '{name}', location = '/etc'")
+def test_map_is_found_by_name(folder, version, location, is_found):
+    sql = "UPDATE log SET map_version = ?, location = ?"
+    edit(folder / f"{fixture.NAME}.db", sql, values=(version, location))
     (folder.parents[2] / "maps" / "us-ma-boston").mkdir()
-    assert only(folder).lanes[0].id == "path-0"
+    assert only(folder).lanes[0].id == ("61" if is_found else "path-0")
 
 
-def test_maps_as_the_archive_unpacks_them(folder):
+def test_latest_version_of_a_map_as_the_archive_unpacks_it(folder, city):
     """nuplan-maps-v1.1.zip holds a folder nuplan-maps-v1.0."""
+    latest = city.parents[1] / "9.17.0000" / "map.gpkg"
+    fixture.write_map(latest)
+    edit(latest, "DELETE FROM lane_connectors")
     maps = folder.parents[2] / "maps"
     (maps / "nuplan-maps-v1.0.json").write_text("{}")
     maps.rename(maps.with_name("nuplan-maps-v1.0"))
-    assert "61" in lanes_of(only(folder))
-
-
-def test_latest_version_of_a_map(folder):
-    city = folder.parents[2] / "maps" / fixture.CITY
-    fixture.write_map(city / "9.17.0000" / "map.gpkg")
-    edit(city / "9.17.0000" / "map.gpkg", "DELETE FROM lane_connectors")
     assert set(lanes_of(only(folder))) == {"61", "62", "63"}
 
 
@@ -330,8 +303,7 @@ def test_maps_option(folder, tmp_path):
     assert only(folder).lanes[0].id == "path-0"
     for place in ("../elsewhere", str(tmp_path / "elsewhere")):
         assert "61" in lanes_of(only(folder, maps=place))
-    with pytest.raises(InputError, match=r"source TOML: maps: gone: no map of"):
-        only(folder, maps="gone")
+    assert "source TOML: maps: gone: no map of" in refused(only, folder, maps="gone")
 
 
 def in_utm(points):
@@ -347,18 +319,18 @@ def in_utm(points):
         (4326, fixture.degrees, "26911"),
     ],
 )
-def test_systems_of_coordinates(folder, srs, to, zone):
-    path = folder.parents[2] / "maps" / fixture.CITY / "9.15.1915" / "map.gpkg"
-    path.unlink()
-    fixture.write_map(path, to=to, srs=srs, zone=zone)
+def test_systems_of_coordinates(folder, city, srs, to, zone):
+    city.unlink()
+    fixture.write_map(city, to=to, srs=srs, zone=zone)
     centre = lanes_of(only(folder))["61"].centre
     np.testing.assert_allclose(centre[0], [-60.0, 0.0], atol=5e-3)
 
 
-def test_optional_layers_and_columns(folder):
-    path = folder.parents[2] / "maps" / fixture.CITY / "9.15.1915" / "map.gpkg"
+def test_optional_layers_and_columns(folder, city):
+    edit(city, "DELETE FROM stop_polygons")
+    assert not any(lane.stop_sign for lane in only(folder).lanes)
     edit(
-        path,
+        city,
         "DROP TABLE boundaries; DROP TABLE stop_polygons; DROP TABLE "
         "gen_lane_connectors_scaled_width_polygons; DROP TABLE gpkg_geometry_columns;"
         "ALTER TABLE lanes_polygons DROP COLUMN left_boundary_fid;"
@@ -367,29 +339,26 @@ def test_optional_layers_and_columns(folder):
         "UPDATE lane_connectors SET exit_lane_fid = '61', entry_lane_fid = 63.0;",
     )
     lanes = lanes_of(only(folder))
-    assert lanes["61"].left is None
-    assert lanes["61"].speed_limit is None
+    assert (lanes["61"].left, lanes["61"].speed_limit) == (None, None)
     assert lanes["61"].successors == ("connector-71", "connector-72")
     assert lanes["connector-72"].successors == ("63",)
     assert lanes["connector-72"].stop_line is None
 
 
 @pytest.mark.parametrize("column", ["geometry", 'the "shape", or 1'])
-def test_names_of_geometry_columns(folder, column):
+def test_names_of_geometry_columns(whole, folder, city, column):
     """A GeoPackage says of each layer which column holds its geometries."""
-    whole = lanes_of(only(folder))
-    path = folder.parents[2] / "maps" / fixture.CITY / "9.15.1915" / "map.gpkg"
     quoted = column.replace('"', '""')
     for layer in ("baseline_paths", "boundaries", "stop_polygons"):
         edit(
-            path,
+            city,
             f'ALTER TABLE {layer} RENAME COLUMN geom TO "{quoted}"',
             f"UPDATE gpkg_geometry_columns SET column_name = '{column}' "
             f"WHERE table_name = '{layer}'",
         )
-    found = lanes_of(only(folder))
-    assert list(found) == list(whole)
-    for name, lane in whole.items():
+    found, expected = lanes_of(only(folder)), lanes_of(whole)
+    assert list(found) == list(expected)
+    for name, lane in expected.items():
         np.testing.assert_array_equal(found[name].centre, lane.centre)
         np.testing.assert_array_equal(found[name].left_width, lane.left_width)
         np.testing.assert_equal(found[name].stop_line, lane.stop_line)
@@ -406,131 +375,80 @@ def points(values, order="<"):
     return struct.pack(order + "I", len(values)) + values.astype(order + "f8").tobytes()
 
 
-LINE = [[1.0, 2.0], [3.0, 4.0]]
-LINE_Z = [[1.0, 2.0, 9.0], [3.0, 4.0, 9.0]]
-LINE_ZM = [[1.0, 2.0, 9.0, 8.0], [3.0, 4.0, 9.0, 8.0]]
+ONE, TWO, MANY = (struct.pack("<I", count) for count in (1, 2, 2**32 - 1))
+LINE = np.array([[1.0, 2.0], [3.0, 4.0]])
+LINE_Z = np.column_stack([LINE, [9.0, 9.0]])
+LINE_ZM = np.column_stack([LINE_Z, [8.0, 8.0]])
+SHORT, RING = blob(2, points(LINE[:1]))[8:], blob(3, ONE + points(LINE))[8:]
+GEOMETRIES = [
+    blob(2, points(LINE)),
+    blob(2, points(LINE, ">"), order=">"),
+    *(blob(kind, points(LINE_Z)) for kind in (1002, 2002, 0x80000002)),
+    *(blob(kind, points(LINE_ZM)) for kind in (3002, 0xC0000002)),
+    blob(3, TWO + points(LINE) + points(LINE[:1])),
+    blob(5, TWO + SHORT + blob(2, points(LINE))[8:]),
+    blob(6, ONE + RING),
+]
+MALFORMED = [
+    *(None, "GP", b"", b"XX" + bytes(20)),
+    b"GP\x00\x0f" + bytes(40),  # no such envelope
+    b"GP\x00\x01" + bytes(4) + b"\x07" + bytes(20),
+    *(blob(2, b""), blob(2, MANY), blob(2, struct.pack("<I", 3) + bytes(32))),
+    blob(1, points(LINE)),  # a point
+    *(blob(3, MANY), blob(5, MANY), blob(9999, points(LINE))),
+    blob(5, ONE + blob(5, ONE)[8:] * 50),
+]
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        blob(2, points(LINE)),
-        blob(2, points(LINE, ">"), order=">"),
-        blob(1002, points(LINE_Z)),
-        blob(2002, points(LINE_Z)),
-        blob(3002, points(LINE_ZM)),
-        blob(0x80000002, points(LINE_Z)),
-        blob(0xC0000002, points(LINE_ZM)),
-        blob(3, struct.pack("<I", 2) + points(LINE) + points(LINE[:1])),
-        blob(
-            5,
-            struct.pack("<I", 2)
-            + blob(2, points(LINE[:1]))[8:]
-            + blob(2, points(LINE))[8:],
-        ),
-        blob(
-            6,
-            struct.pack("<I", 1) + blob(3, struct.pack("<I", 1) + points(LINE))[8:],
-        ),
-    ],
-)
+@pytest.mark.parametrize("content", GEOMETRIES)
 def test_geometries(content):
     np.testing.assert_array_equal(geopackage.points_of(content), LINE)
+    assert geopackage.points_of(content[:3] + b"\x11" + content[4:]).shape == (0, 2)
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        None,
-        "GP",
-        b"",
-        b"XX" + bytes(20),
-        b"GP\x00\x0f" + bytes(40),  # no such envelope
-        blob(2, b""),
-        blob(2, struct.pack("<I", 2**32 - 1)),
-        blob(2, struct.pack("<I", 3) + bytes(32)),
-        blob(1, points(LINE)),  # a point
-        blob(3, struct.pack("<I", 2**32 - 1)),
-        blob(5, struct.pack("<I", 2**32 - 1)),
-        blob(5, struct.pack("<I", 1) + blob(5, struct.pack("<I", 1))[8:] * 50),
-        blob(9999, points(LINE)),
-        b"GP\x00\x01" + bytes(4) + b"\x07" + bytes(20),
-    ],
-)
+@pytest.mark.parametrize("content", MALFORMED)
 def test_malformed_geometries(content):
     with pytest.raises(ValueError, match=r"\w"):
         geopackage.points_of(content)
 
 
-def test_empty_geometry():
-    assert geopackage.points_of(blob(2, points(LINE), flags=0x11)).shape == (0, 2)
+BAD_MAPS = """
+DELETE FROM meta | projectedCoordSystem: missing: expected a UTM zone
+DROP TABLE meta | projectedCoordSystem: missing: expected a UTM zone
+UPDATE meta SET value = 'epsg:3857' | epsg:3857: expected a UTM zone
+UPDATE meta SET value = 7.5 | projectedCoordSystem: 7.5
+UPDATE gpkg_geometry_columns SET srs_id = 3857 | srs_id: 3857: expected 4326
+UPDATE gpkg_geometry_columns SET column_name = 'shape' | stop_polygons.shape: missing
+ALTER TABLE gpkg_geometry_columns DROP COLUMN column_name | columns.column_name: missing
+UPDATE baseline_paths SET geom = x'00' | baseline_paths.geom: no GeoPackage
+UPDATE boundaries SET geom = 'x' | boundaries.geom: no GeoPackage
+DROP TABLE baseline_paths | table baseline_paths: missing
+DROP TABLE lanes_polygons | table lanes_polygons: missing
+ALTER TABLE lanes_polygons DROP COLUMN lane_fid | lanes_polygons.lane_fid: missing
+"""
+VIEW = "DROP TABLE lane_connectors; CREATE VIEW lane_connectors AS SELECT 1"
+TWO_LINES = "UPDATE gpkg_geometry_columns SET column_name = 'two' || char(10) || 'x'"
+MORE = [
+    (VIEW, "lane_connectors: a view: expected a table"),
+    (TWO_LINES, "stop_polygons.two x: missing"),
+]
 
 
-@pytest.mark.parametrize(
-    ("statement", "expected"),
-    [
-        ("DELETE FROM meta", "projectedCoordSystem: missing: expected a UTM zone"),
-        ("DROP TABLE meta", "projectedCoordSystem: missing: expected a UTM zone"),
-        ("UPDATE meta SET value = 'epsg:3857'", "epsg:3857: expected a UTM zone"),
-        ("UPDATE meta SET value = 7.5", "projectedCoordSystem: 7.5"),
-        (
-            "UPDATE gpkg_geometry_columns SET srs_id = 3857",
-            "srs_id: 3857: expected 4326",
-        ),
-        (
-            "UPDATE gpkg_geometry_columns SET column_name = 'shape'",
-            "stop_polygons.shape: missing",
-        ),
-        (
-            "UPDATE gpkg_geometry_columns SET column_name = 'two' || char(10) || 'x'",
-            "stop_polygons.two x: missing",
-        ),
-        (
-            "ALTER TABLE gpkg_geometry_columns DROP COLUMN column_name",
-            "gpkg_geometry_columns.column_name: missing",
-        ),
-        (
-            "UPDATE baseline_paths SET geom = x'00'",
-            "baseline_paths.geom: no GeoPackage",
-        ),
-        ("UPDATE boundaries SET geom = 'x'", "boundaries.geom: no GeoPackage"),
-        ("DROP TABLE baseline_paths", "table baseline_paths: missing"),
-        ("DROP TABLE lanes_polygons", "table lanes_polygons: missing"),
-        (
-            "ALTER TABLE lanes_polygons DROP COLUMN lane_fid",
-            "lanes_polygons.lane_fid: missing",
-        ),
-        (
-            "DROP TABLE lane_connectors; CREATE VIEW lane_connectors AS SELECT 1",
-            "lane_connectors: a view: expected a table",
-        ),
-    ],
-)
-def test_malformed_map(folder, statement, expected):
-    path = folder.parents[2] / "maps" / fixture.CITY / "9.15.1915" / "map.gpkg"
-    edit(path, statement)
-    with pytest.raises(InputError) as error:
-        only(folder)
-    assert expected in str(error.value)
-    assert str(error.value).startswith(str(path))
-    assert "\n" not in str(error.value)
+@pytest.mark.parametrize(("statement", "words"), [*in_pairs(BAD_MAPS), *MORE])
+def test_malformed_map(folder, city, statement, words):
+    edit(city, statement)
+    line = refused(only, folder)
+    assert words in line
+    assert line.startswith(str(city))
 
 
-def test_lines_are_limited(folder, monkeypatch):
-    monkeypatch.setattr(geopackage, "MAX_POINTS", 11)
-    with pytest.raises(InputError, match=r"geom: \d+ points: expected at most 11"):
-        only(folder)
-
-
-def test_map_off_the_earth(folder):
-    path = folder.parents[2] / "maps" / fixture.CITY / "9.15.1915" / "map.gpkg"
+def test_map_off_the_earth_or_of_too_many_points(folder, city, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(geopackage, "MAX_POINTS", 11)
+        assert "points: expected at most 11" in refused(only, folder)
     wild = fixture.geometry(2, [[500.0, 95.0], [0.0, 0.0]], to=np.asarray)
-    database = sqlite3.connect(path)
-    database.execute("UPDATE baseline_paths SET geom = ? WHERE fid = 1", (wild,))
-    database.commit()
-    database.close()
-    with pytest.raises(InputError, match=r"baseline_paths\.geom: 500: expected longit"):
-        only(folder)
+    edit(city, "UPDATE baseline_paths SET geom = ? WHERE fid = 1", values=(wild,))
+    assert "baseline_paths.geom: 500: expected longitude" in refused(only, folder)
 
 
 # -------------------------------------------------------------------- hostile
@@ -539,95 +457,64 @@ ENDLESS = """WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n)
   SELECT CAST(x AS BLOB) AS token, CAST(x AS BLOB) AS lidar_pc_token,
   CAST(x AS BLOB) AS track_token, x AS x, x AS y, x AS yaw, x AS vx, x AS vy,
   x AS width, x AS length FROM n"""
+VIRTUAL = "fts4(lidar_pc_token, track_token, x, y, yaw, vx, vy, width, length)"
+GENERATED = """CREATE TABLE category (token BLOB, other TEXT,
+  name TEXT GENERATED ALWAYS AS (hex(zeroblob(20000000))) VIRTUAL);
+  INSERT INTO category (token, other) SELECT category_token, 1 FROM track"""
+SCHEMA = "PRAGMA writable_schema = ON; UPDATE sqlite_master SET"
+PROGRAMS = [
+    (f"DROP TABLE lidar_box; CREATE VIEW lidar_box AS {ENDLESS}", "lidar_box: a view"),
+    (
+        f"DROP TABLE lidar_box; CREATE VIRTUAL TABLE lidar_box USING {VIRTUAL}",
+        "lidar_box: a virtual table: expected a table",
+    ),
+    (f"DROP TABLE category; {GENERATED}", "expected a readable SQLite file"),
+    (f"{SCHEMA} sql = 'nonsense' WHERE name = 'lidar_box'", "expected a readable SQ"),
+    (f"{SCHEMA} rootpage = 999999 WHERE name = 'lidar_box'", "expected a"),
+]
+LAST = "UPDATE lidar_pc SET timestamp = 9223372036854775807 WHERE filename = '1.pcd'"
+BAD_LOGS = f"""
+DROP TABLE lidar_box | table lidar_box: missing
+DROP TABLE log | table log: missing
+DELETE FROM log | table log: no rows
+DELETE FROM lidar_pc | lidar_pc: no row with an ego pose
+DELETE FROM ego_pose | lidar_pc: no row with an ego pose
+ALTER TABLE lidar_box DROP COLUMN yaw | lidar_box.yaw: missing
+UPDATE lidar_box SET x = 'far' | lidar_box.x: 'far': expected a number
+UPDATE lidar_box SET x = '1.5 m' | lidar_box.x: '1.5 m': expected a number
+UPDATE lidar_box SET x = x'31' | lidar_box.x: b'1': expected a number
+UPDATE lidar_box SET x = 9e999 | lidar_box: x: inf
+UPDATE lidar_box SET x = NULL | lidar_box: x: nan
+UPDATE lidar_box SET yaw = NULL | heading: nan: expected a finite number
+UPDATE lidar_box SET length = -1 | length: -1 m: expected 0 to
+UPDATE lidar_box SET width = 1e9 | width: 1e+09 m: expected 0 to
+UPDATE lidar_box SET vx = 300 | speed: 300
+UPDATE lidar_box SET track_token = 'abc' | track_token: 'abc': expected a
+UPDATE lidar_box SET track_token = zeroblob(99) | track_token: b'
+DELETE FROM track | track_token:
+UPDATE category SET name = 'alien' | category.name: 'alien': expected one
+UPDATE category SET name = x'ff' | category.name: b'
+UPDATE category SET name = NULL | category.name: None: expected one
+UPDATE ego_pose SET x = NULL | ego_pose.x: NULL: expected a number
+UPDATE ego_pose SET x = 1e300 | ego_pose: x: 1e+300
+UPDATE ego_pose SET qw = 0 | ego_pose.qw, qx, qy, qz: norm 0: expected 1
+UPDATE lidar_pc SET timestamp = NULL | lidar_pc.timestamp: NULL
+UPDATE lidar_pc SET timestamp = 'now' | lidar_pc.timestamp: 'now'
+UPDATE lidar_pc SET timestamp = 5 | timestamp:
+UPDATE lidar_pc SET timestamp = timestamp / 1000 | timestamp:
+{LAST} | timestamp:
+UPDATE traffic_light_status SET lane_connector_id = 'x' | connector_id: 'x'
+"""
 
 
-@pytest.mark.parametrize(
-    ("statement", "expected"),
-    [
-        (
-            f"DROP TABLE lidar_box; CREATE VIEW lidar_box AS {ENDLESS}",
-            "lidar_box: a view: expected a table",
-        ),
-        (
-            "DROP TABLE lidar_box; CREATE VIRTUAL TABLE lidar_box USING "
-            "fts4(lidar_pc_token, track_token, x, y, yaw, vx, vy, width, length)",
-            "lidar_box: a virtual table: expected a table",
-        ),
-        (
-            "DROP TABLE category; CREATE TABLE category (token BLOB, other TEXT, "
-            "name TEXT GENERATED ALWAYS AS (hex(zeroblob(20000000))) VIRTUAL);"
-            "INSERT INTO category (token, other) SELECT category_token, 1 FROM track",
-            "expected a readable SQLite file",
-        ),
-        ("DROP TABLE lidar_box", "table lidar_box: missing"),
-        ("DROP TABLE log", "table log: missing"),
-        ("DELETE FROM log", "table log: no rows"),
-        ("DELETE FROM lidar_pc", "lidar_pc: no row with an ego pose"),
-        ("DELETE FROM ego_pose", "lidar_pc: no row with an ego pose"),
-        ("ALTER TABLE lidar_box DROP COLUMN yaw", "lidar_box.yaw: missing"),
-        ("UPDATE lidar_box SET x = 'far'", "lidar_box.x: 'far': expected a number"),
-        ("UPDATE lidar_box SET x = '1.5 m'", "lidar_box.x: '1.5 m': expected a number"),
-        ("UPDATE lidar_box SET x = x'31'", "lidar_box.x: b'1': expected a number"),
-        ("UPDATE lidar_box SET x = 9e999", "lidar_box: x: inf"),
-        ("UPDATE lidar_box SET x = NULL", "lidar_box: x: nan"),
-        ("UPDATE lidar_box SET yaw = NULL", "heading: nan: expected a finite number"),
-        ("UPDATE lidar_box SET length = -1", "length: -1 m: expected 0 to"),
-        ("UPDATE lidar_box SET width = 1e9", "width: 1e+09 m: expected 0 to"),
-        ("UPDATE lidar_box SET vx = 300", "speed: 300"),
-        ("UPDATE lidar_box SET track_token = 'abc'", "track_token: 'abc': expected a"),
-        (
-            "UPDATE lidar_box SET track_token = zeroblob(99)",
-            "track_token: b'",
-        ),
-        ("DELETE FROM track", "track_token: "),
-        ("UPDATE category SET name = 'alien'", "category.name: 'alien': expected one"),
-        ("UPDATE category SET name = x'ff'", "category.name: b'"),
-        ("UPDATE category SET name = NULL", "category.name: None: expected one"),
-        ("UPDATE ego_pose SET x = NULL", "ego_pose.x: NULL: expected a number"),
-        ("UPDATE ego_pose SET x = 1e300", "ego_pose: x: 1e+300"),
-        ("UPDATE ego_pose SET qw = 0", "ego_pose.qw, qx, qy, qz: norm 0: expected 1"),
-        ("UPDATE lidar_pc SET timestamp = NULL", "lidar_pc.timestamp: NULL"),
-        ("UPDATE lidar_pc SET timestamp = 'now'", "lidar_pc.timestamp: 'now'"),
-        ("UPDATE lidar_pc SET timestamp = 5", "timestamp: "),
-        ("UPDATE lidar_pc SET timestamp = timestamp / 1000", "timestamp: "),
-        (
-            "UPDATE lidar_pc SET timestamp = 9223372036854775807 WHERE filename "
-            "= '1.pcd'",
-            "timestamp: ",
-        ),
-        (
-            "UPDATE traffic_light_status SET lane_connector_id = 'x'",
-            "connector_id: 'x'",
-        ),
-        (
-            "PRAGMA writable_schema = ON; UPDATE sqlite_master SET sql = 'nonsense' "
-            "WHERE name = 'lidar_box'",
-            "expected a readable SQLite file",
-        ),
-        (
-            "PRAGMA writable_schema = ON; UPDATE sqlite_master SET rootpage = 999999 "
-            "WHERE name = 'lidar_box'",
-            "expected a",
-        ),
-    ],
-)
-def test_malformed_log(log, statement, expected):
+@pytest.mark.parametrize(("statement", "words"), [*PROGRAMS, *in_pairs(BAD_LOGS)])
+def test_malformed_log(log, statement, words):
     edit(log, statement)
     start = time.monotonic()
-    with pytest.raises(InputError) as error:
-        read(log)
-    assert expected in str(error.value)
-    assert str(error.value).startswith(str(log))
-    assert "\n" not in str(error.value)
+    line = refused(read, log)
+    assert words in line
+    assert line.startswith(str(log))
     assert time.monotonic() - start < 20.0
-
-
-def test_triggers_do_not_run(log):
-    edit(
-        log,
-        "CREATE TRIGGER t BEFORE INSERT ON log BEGIN SELECT load_extension('x'); END",
-    )
-    assert only(log).tracks
 
 
 def test_work_is_bounded(log, monkeypatch):
@@ -653,71 +540,36 @@ def test_only_select_is_authorised(log):
                 database.numbers(sql, ("x",), 10)
 
 
+@pytest.mark.parametrize(
+    "content", [b"SQLite format 3\x00" + fill * 5000 for fill in (b"\0", b"\xff")]
+)
+def test_not_a_database(tmp_path, content):
+    (tmp_path / "a.db").write_bytes(content)
+    assert "expected" in refused(read, tmp_path)
+
+
+def test_a_file_cut_short_says_so(log):
+    log.write_bytes(log.read_bytes()[:50000])
+    assert "size: 50000 bytes: expected " in refused(read, log)
+
+
 def test_rows_are_limited(log, monkeypatch):
     monkeypatch.setattr(nuplan, "MAX_BOXES", 100)
-    with pytest.raises(InputError, match=r"lidar_box\.track_token: more than 100 rows"):
-        read(log)
-
-
-def test_extra_wal_file_is_not_read(log):
-    """immutable=1: a planted journal changes nothing."""
-    for suffix in ("-wal", "-journal", "-shm"):
-        (log.parent / (log.name + suffix)).write_bytes(os.urandom(4096))
-    assert only(log).tracks
+    assert "lidar_box.track_token: more than 100 rows" in refused(read, log)
 
 
 @pytest.mark.parametrize(
-    ("content", "expected"),
+    ("option", "words"),
     [
-        (b"", "database: b'': expected a SQLite file"),
-        (b"SQLite format 3\x00", "expected a SQLite file"),
-        (b"SQLite format 3\x00" + bytes(5000), "expected"),
-        (b"SQLite format 3\x00" + b"\xff" * 5000, "expected"),
+        ({"window_s": 0}, "source TOML"),
+        ({"window_s": 1e-9}, "source TOML"),
+        ({"ego": 1}, "source TOML"),
+        ({"rate_hz": "x"}, "source TOML"),
+        ({"rate_hz": 10.0}, " s: expected 0.1 s"),
     ],
 )
-def test_not_a_database(tmp_path, content, expected):
-    path = tmp_path / "a.db"
-    path.write_bytes(content)
-    with pytest.raises(InputError, match=expected):
-        read(tmp_path)
-
-
-def test_truncated(log):
-    log.write_bytes(log.read_bytes()[:50000])
-    with pytest.raises(
-        InputError, match=r"size: 50000 bytes: expected \d+ bytes; trunc"
-    ):
-        read(log)
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_flipped_bytes_are_one_line(log, seed):
-    content = log.read_bytes()
-    rng = np.random.default_rng(seed)
-    for _ in range(12):
-        damaged = bytearray(content)
-        for place in rng.integers(0, len(content), 30):
-            damaged[place] = rng.integers(0, 256)
-        damaged[: 4 * 4096] = content[: 4 * 4096] if seed % 2 else damaged[: 4 * 4096]
-        log.write_bytes(damaged)
-        try:
-            read(log)
-        except InputError as error:
-            line = str(error)
-            assert "\n" not in line
-
-
-@pytest.mark.parametrize(
-    "options", [{"window_s": 0}, {"window_s": 1e-9}, {"ego": 1}, {"rate_hz": "x"}]
-)
-def test_options_are_checked(log, options):
-    with pytest.raises(InputError, match="source TOML"):
-        read(log, **options)
-
-
-def test_wrong_rate(log):
-    with pytest.raises(InputError, match=r"t: median step .*: expected 0\.1 s"):
-        read(log, rate_hz=10.0)
+def test_options_are_checked(log, option, words):
+    assert words in refused(read, log, **option)
 
 
 def test_zone_of():

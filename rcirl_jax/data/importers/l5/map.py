@@ -96,10 +96,9 @@ class SemanticMap:
                 f"expected at most {MAX_MAP_BYTES}"
             )
         try:
-            fragment = read_message(file.read_bytes())
+            raw = list(self._elements(read_message(file.read_bytes())))
         except DecodeError as error:
             raise InputError(f"{file}: {error}: expected a semantic map") from error
-        raw = list(self._elements(fragment))
         lanes = {lane.id: lane for lane in map(self._lane, raw) if lane is not None}
         if not lanes:
             raise InputError(f"{file}: lanes: none: expected a semantic map")

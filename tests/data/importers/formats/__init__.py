@@ -40,6 +40,8 @@ class Fixture:
     has_heading: bool = True  # False: computed from the positions
     # files whose truncation, garbling or removal has to be one clear line
     files: tuple[Path, ...] = ()
+    # of these, files with checksums: a changed byte is seen, or in no part that is read
+    checked: tuple[Path, ...] = ()
     # text file -> pattern whose group is a number that is read, a position if there
     # is one: anything else in its place has to be one clear line
     numbers: dict[Path, str] = dataclasses.field(default_factory=dict)

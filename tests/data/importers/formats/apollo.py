@@ -8,10 +8,11 @@ of the drive is in a file of its own.
 import struct
 
 import numpy as np
+from google.protobuf import descriptor_pb2
 
 from rcirl_jax.types import Kind
 from tests.data.importers.formats import Fixture
-from tests.data.importers.formats.drives import arc, samples, straight
+from tests.data.importers.formats.drives import samples, seen_by_a_car
 from tests.data.importers.formats.waymo import Single, message
 
 START_S = 1627031535.25  # s, of the first localization
@@ -22,273 +23,95 @@ GRID = 0.1 * np.arange(81)
 LATE_S = 0.08  # s, from the measurement of perception to its message
 GAP = (3.0, 5.0)  # s, in which obstacle 19 is hidden
 SEEN = {"17": (2.0, 6.5)}  # s, others: the whole drive
-DOUBLE, FLOAT, INT32, BOOL, STRING, MESSAGE, ENUM = 1, 2, 5, 8, 9, 11, 14
 TYPE = {Kind.VEHICLE: 5, Kind.CYCLIST: 4, Kind.PEDESTRIAN: 3, Kind.STATIC: 2}
 
 
 def road_users(t):
     """Id -> motion in metres about CENTRE at times t [s]."""
-    return {
-        "ego": straight(t, (0.0, 0.0), 0.0, 8.0, size=(4.933, 2.11)),
-        "12": straight(t, (25.0, 0.0), 0.0, 8.0),
-        "15": arc(t, (60.0, 0.0), 0.0, 7.0, 25.0, size=(5.2, 2.0)),
-        "17": straight(t, (-30.0, 3.5), 0.0, 11.0),
-        "19": straight(t, (-10.0, 3.5), 0.0, 9.0, size=(11.0, 2.6)),
-        "23": straight(
-            t, (50.0, -6.0), np.pi / 2, 1.3, kind=Kind.PEDESTRIAN, size=(0.6, 0.6)
-        ),
-        "27": straight(t, (0.0, -2.0), 0.0, 5.0, kind=Kind.CYCLIST, size=(1.7, 0.6)),
-        "31": straight(t, (40.0, -3.0), 0.0, 0.0, kind=Kind.STATIC, size=(0.4, 0.4)),
-    }
+    return seen_by_a_car(t, (4.933, 2.11))
 
 
 # ---------------------------------------------------------------- descriptors
 
-
-def field_of(name, number, kind, *, type_name="", repeated=False):
-    """FieldDescriptorProto."""
-    parts = [(1, name), (3, number), (4, 3 if repeated else 1), (5, kind)]
-    return message([*parts, *([(6, type_name)] if type_name else [])])
-
-
-def type_of(name, fields, *, enums=()):
-    """DescriptorProto."""
-    parts = [(1, name), *[(2, item) for item in fields]]
-    return message([*parts, *[(4, item) for item in enums]])
-
-
-def enum_of(name, values):
-    """EnumDescriptorProto."""
-    items = [message([(1, label), (2, number)]) for label, number in values]
-    return message([(1, name), *[(2, item) for item in items]])
-
-
-def file_of(name, package, types, needs=()):
-    """FileDescriptorProto."""
-    parts = [(1, name), (2, package), *[(3, other) for other in needs]]
-    return message([*parts, *[(4, item) for item in types]])
-
-
-def xyz(name):
-    return type_of(name, [field_of(n, k + 1, DOUBLE) for k, n in enumerate("xyz")])
-
-
-QUATERNION = type_of(
-    "Quaternion",
-    [field_of(n, k + 1, DOUBLE) for k, n in enumerate(("qx", "qy", "qz", "qw"))],
-)
-HEADER = file_of(
-    "modules/common_msgs/basic_msgs/header.proto",
-    "apollo.common",
-    [
-        type_of(
-            "Header",
-            [
-                field_of("timestamp_sec", 1, DOUBLE),
-                field_of("module_name", 2, STRING),
-                field_of("sequence_num", 3, 13),
-            ],
-        )
-    ],
-)
-GEOMETRY = file_of(
-    "modules/common_msgs/basic_msgs/geometry.proto",
-    "apollo.common",
-    [xyz("PointENU"), xyz("Point3D"), QUATERNION],
-)
+# package -> its messages, a field as "name number type", a type of messages with a
+# dot before it, a list with a star behind it; enums of a message are "Message/Enum"
+PACKAGES = {
+    "apollo.common": """
+Header: timestamp_sec 1 double, module_name 2 string, sequence_num 3 uint32
+PointENU: x 1 double, y 2 double, z 3 double
+Point3D: x 1 double, y 2 double, z 3 double
+Quaternion: qx 1 double, qy 2 double, qz 3 double, qw 4 double
+""",
+    "apollo.localization": """
+Pose: position 1 .apollo.common.PointENU, orientation 2 .apollo.common.Quaternion,\
+ linear_velocity 3 .apollo.common.Point3D, heading 6 double
+LocalizationEstimate: header 1 .apollo.common.Header,\
+ pose 2 .apollo.localization.Pose, measurement_time 4 double
+""",
+    "apollo.canbus": """
+Chassis: engine_started 3 bool, speed_mps 5 float,\
+ driving_mode 21 /apollo.canbus.Chassis.DrivingMode, header 25 .apollo.common.Header
+Chassis/DrivingMode: COMPLETE_MANUAL 0, COMPLETE_AUTO_DRIVE 1
+""",
+    "apollo.perception": """
+PerceptionObstacle: id 1 int32, position 2 .apollo.common.Point3D, theta 3 double,\
+ velocity 4 .apollo.common.Point3D, length 5 double, width 6 double, height 7 double,\
+ type 10 /apollo.perception.PerceptionObstacle.Type, timestamp 11 double
+PerceptionObstacle/Type: UNKNOWN 0, UNKNOWN_MOVABLE 1, UNKNOWN_UNMOVABLE 2,\
+ PEDESTRIAN 3, BICYCLE 4, VEHICLE 5
+PerceptionObstacles: perception_obstacle 1 .apollo.perception.PerceptionObstacle*,\
+ header 2 .apollo.common.Header
+""",
+    "apollo.prediction": """
+PredictionObstacle: perception_obstacle 1 .apollo.perception.PerceptionObstacle,\
+ timestamp 2 double
+PredictionObstacles: header 1 .apollo.common.Header,\
+ prediction_obstacle 2 .apollo.prediction.PredictionObstacle*
+""",
+    "apollo.routing": """
+LaneWaypoint: pose 3 .apollo.common.PointENU
+RoutingRequest: waypoint 2 .apollo.routing.LaneWaypoint*
+RoutingResponse: header 1 .apollo.common.Header,\
+ routing_request 4 .apollo.routing.RoutingRequest
+""",
+    "apollo.planning": """
+ParkingCommand: parking_spot_id 2 string
+PlanningCommand: header 1 .apollo.common.Header, command_id 2 int64,\
+ lane_follow_command 3 .apollo.routing.RoutingResponse,\
+ parking_command 6 .apollo.planning.ParkingCommand,\
+ custom_command 7 .google.protobuf.Any
+""",
+}
 
 
-def header_field(number):
-    return field_of("header", number, MESSAGE, type_name=".apollo.common.Header")
+def file_of(package, text):
+    """FileDescriptorProto of messages as in PACKAGES."""
+    file = descriptor_pb2.FileDescriptorProto(name=f"{package}.proto", package=package)
+    messages = {}
+    for line in text.strip().splitlines():
+        name, _, entries = line.partition(":")
+        name, _, enum = name.partition("/")
+        entries = [entry.split() for entry in entries.split(",") if entry.strip()]
+        if enum:
+            values = messages[name].enum_type.add(name=enum).value
+            for label, number in entries:
+                values.add(name=label, number=int(number))
+        else:
+            messages[name] = file.message_type.add(name=name)
+            for entry in entries:
+                _add_field(messages[name].field.add(), *entry)
+    return file.SerializeToString()
 
 
-def common(name, number, kind):
-    return field_of(name, number, MESSAGE, type_name=f".apollo.common.{kind}")
-
-
-POSE = file_of(
-    "modules/common_msgs/localization_msgs/pose.proto",
-    "apollo.localization",
-    [
-        type_of(
-            "Pose",
-            [
-                common("position", 1, "PointENU"),
-                common("orientation", 2, "Quaternion"),
-                common("linear_velocity", 3, "Point3D"),
-                field_of("heading", 6, DOUBLE),
-            ],
-        )
-    ],
-)
-LOCALIZATION = file_of(
-    "modules/common_msgs/localization_msgs/localization.proto",
-    "apollo.localization",
-    [
-        type_of(
-            "LocalizationEstimate",
-            [
-                header_field(1),
-                field_of("pose", 2, MESSAGE, type_name=".apollo.localization.Pose"),
-                field_of("measurement_time", 4, DOUBLE),
-            ],
-        )
-    ],
-)
-MODES = enum_of("DrivingMode", [("COMPLETE_MANUAL", 0), ("COMPLETE_AUTO_DRIVE", 1)])
-CHASSIS = file_of(
-    "modules/common_msgs/chassis_msgs/chassis.proto",
-    "apollo.canbus",
-    [
-        type_of(
-            "Chassis",
-            [
-                field_of("engine_started", 3, BOOL),
-                field_of("speed_mps", 5, FLOAT),
-                field_of(
-                    "driving_mode",
-                    21,
-                    ENUM,
-                    type_name=".apollo.canbus.Chassis.DrivingMode",
-                ),
-                header_field(25),
-            ],
-            enums=[MODES],
-        )
-    ],
-)
-TYPES = enum_of(
-    "Type",
-    [
-        ("UNKNOWN", 0),
-        ("UNKNOWN_MOVABLE", 1),
-        ("UNKNOWN_UNMOVABLE", 2),
-        ("PEDESTRIAN", 3),
-        ("BICYCLE", 4),
-        ("VEHICLE", 5),
-    ],
-)
-OBSTACLE = "apollo.perception.PerceptionObstacle"
-PERCEPTION = file_of(
-    "modules/common_msgs/perception_msgs/perception_obstacle.proto",
-    "apollo.perception",
-    [
-        type_of(
-            "PerceptionObstacle",
-            [
-                field_of("id", 1, INT32),
-                common("position", 2, "Point3D"),
-                field_of("theta", 3, DOUBLE),
-                common("velocity", 4, "Point3D"),
-                field_of("length", 5, DOUBLE),
-                field_of("width", 6, DOUBLE),
-                field_of("height", 7, DOUBLE),
-                field_of("type", 10, ENUM, type_name=f".{OBSTACLE}.Type"),
-                field_of("timestamp", 11, DOUBLE),
-            ],
-            enums=[TYPES],
-        ),
-        type_of(
-            "PerceptionObstacles",
-            [
-                field_of(
-                    "perception_obstacle",
-                    1,
-                    MESSAGE,
-                    type_name=f".{OBSTACLE}",
-                    repeated=True,
-                ),
-                header_field(2),
-            ],
-        ),
-    ],
-)
-PREDICTION = file_of(
-    "modules/common_msgs/prediction_msgs/prediction_obstacle.proto",
-    "apollo.prediction",
-    [
-        type_of(
-            "PredictionObstacle",
-            [
-                field_of("perception_obstacle", 1, MESSAGE, type_name=f".{OBSTACLE}"),
-                field_of("timestamp", 2, DOUBLE),
-            ],
-        ),
-        type_of(
-            "PredictionObstacles",
-            [
-                header_field(1),
-                field_of(
-                    "prediction_obstacle",
-                    2,
-                    MESSAGE,
-                    type_name=".apollo.prediction.PredictionObstacle",
-                    repeated=True,
-                ),
-            ],
-        ),
-    ],
-)
-ROUTING = file_of(
-    "modules/common_msgs/routing_msgs/routing.proto",
-    "apollo.routing",
-    [
-        type_of("LaneWaypoint", [common("pose", 3, "PointENU")]),
-        type_of(
-            "RoutingRequest",
-            [
-                field_of(
-                    "waypoint",
-                    2,
-                    MESSAGE,
-                    type_name=".apollo.routing.LaneWaypoint",
-                    repeated=True,
-                )
-            ],
-        ),
-        type_of(
-            "RoutingResponse",
-            [
-                header_field(1),
-                field_of(
-                    "routing_request",
-                    4,
-                    MESSAGE,
-                    type_name=".apollo.routing.RoutingRequest",
-                ),
-            ],
-        ),
-    ],
-)
-COMMAND = file_of(
-    "modules/common_msgs/planning_msgs/planning_command.proto",
-    "apollo.planning",
-    [
-        type_of("ParkingCommand", [field_of("parking_spot_id", 2, STRING)]),
-        type_of(
-            "PlanningCommand",
-            [
-                header_field(1),
-                field_of("command_id", 2, 3),
-                field_of(
-                    "lane_follow_command",
-                    3,
-                    MESSAGE,
-                    type_name=".apollo.routing.RoutingResponse",
-                ),
-                field_of(
-                    "parking_command",
-                    6,
-                    MESSAGE,
-                    type_name=".apollo.planning.ParkingCommand",
-                ),
-                field_of(
-                    "custom_command", 7, MESSAGE, type_name=".google.protobuf.Any"
-                ),
-            ],
-        ),
-    ],
-)
+def _add_field(field, name, number, kind):
+    field.name, field.number = name, int(number)
+    is_list, kind = kind.endswith("*"), kind.rstrip("*")
+    field.label = field.LABEL_REPEATED if is_list else field.LABEL_OPTIONAL
+    named = {".": field.TYPE_MESSAGE, "/": field.TYPE_ENUM}
+    if kind[0] in named:
+        field.type, field.type_name = named[kind[0]], f".{kind[1:]}"
+    else:
+        field.type = field.Type.Value(f"TYPE_{kind.upper()}")
 
 
 def proto_desc(main, *needs):
@@ -296,31 +119,35 @@ def proto_desc(main, *needs):
     return message([(1, main), *[(2, other) for other in needs]])
 
 
-_HEADER, _GEOMETRY = proto_desc(HEADER), proto_desc(GEOMETRY)
-COMMANDS = (
-    "apollo.planning.PlanningCommand",
-    proto_desc(COMMAND, _HEADER, proto_desc(ROUTING, _HEADER, _GEOMETRY)),
-)
+_COMMON = proto_desc(file_of("apollo.common", PACKAGES["apollo.common"]))
+
+
+def described(package, *needs, text=None):
+    """ProtoDesc of a package, of those that it imports, and of the common one."""
+    text = PACKAGES[package] if text is None else text
+    return proto_desc(file_of(package, text), *map(described, needs), _COMMON)
+
+
+COMMANDS = ("apollo.planning.PlanningCommand",)
+COMMANDS += (described("apollo.planning", "apollo.routing"),)
+OBSTACLES = "/apollo/perception/obstacles"
 CHANNELS = {
     "/apollo/localization/pose": (
         "apollo.localization.LocalizationEstimate",
-        proto_desc(LOCALIZATION, _HEADER, proto_desc(POSE, _GEOMETRY)),
+        described("apollo.localization"),
     ),
-    "/apollo/canbus/chassis": (
-        "apollo.canbus.Chassis",
-        proto_desc(CHASSIS, _HEADER),
-    ),
-    "/apollo/perception/obstacles": (
+    "/apollo/canbus/chassis": ("apollo.canbus.Chassis", described("apollo.canbus")),
+    OBSTACLES: (
         "apollo.perception.PerceptionObstacles",
-        proto_desc(PERCEPTION, _HEADER, _GEOMETRY),
+        described("apollo.perception"),
     ),
     "/apollo/prediction": (
         "apollo.prediction.PredictionObstacles",
-        proto_desc(PREDICTION, _HEADER, proto_desc(PERCEPTION, _HEADER, _GEOMETRY)),
+        described("apollo.prediction", "apollo.perception"),
     ),
     "/apollo/routing_response": (
         "apollo.routing.RoutingResponse",
-        proto_desc(ROUTING, _HEADER, _GEOMETRY),
+        described("apollo.routing"),
     ),
     "/apollo/sensor/camera/front_6mm/image": ("apollo.drivers.Image", b""),
 }
@@ -419,7 +246,7 @@ def perception_times():
     return t
 
 
-def drive(*, obstacles="perception"):
+def drive(*, obstacles=OBSTACLES):
     """(channel, s since START_S, content) of the whole drive, by time."""
     found = [
         ("/apollo/routing_response", 0.0, routing(CENTRE[0] + 300.0, CENTRE[1] + 1.0))
@@ -429,10 +256,8 @@ def drive(*, obstacles="perception"):
         found.append(("/apollo/localization/pose", t, localization(t)))
         found.append(("/apollo/canbus/chassis", t, chassis(t)))
     for t in perception_times().tolist():
-        make = perception if obstacles == "perception" else prediction
-        name = "/apollo/perception/obstacles"
-        name = name if obstacles == "perception" else "/apollo/prediction"
-        found.append((name, t + LATE_S, make(t)))
+        made = {OBSTACLES: perception, "/apollo/prediction": prediction}
+        found.append((obstacles, t + LATE_S, made[obstacles](t)))
     found.append(("/apollo/sensor/camera/front_6mm/image", 1.0, bytes(5000)))
     return sorted(found, key=lambda item: item[1])
 

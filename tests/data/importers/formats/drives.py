@@ -31,22 +31,12 @@ def straight(t, start, heading, speed, *, wave=0.0, kind=Kind.VEHICLE, size=(4.5
     )
 
 
-def arc(
-    t,
-    start,
-    heading,
-    speed,
-    radius,
-    *,
-    wave=0.0,
-    kind=Kind.VEHICLE,
-    size=(4.5, 1.9),
-):
+def arc(t, start, heading, speed, radius, *, wave=0.0, size=(4.5, 1.9)):
     """Along a circle; radius [m] > 0 turns left, < 0 right."""
     station, speeds = motion(t, speed, wave)
     angle = heading + station / radius
     return Written(
-        kind=kind,
+        kind=Kind.VEHICLE,
         length=size[0],
         width=size[1],
         t=t,
@@ -55,6 +45,26 @@ def arc(
         heading=(angle + np.pi) % (2.0 * np.pi) - np.pi,
         speed=speeds,
     )
+
+
+def seen_by_a_car(t, ego):
+    """Id -> road user of what one car's perception sees; `ego` is the car's size [m].
+
+    A leader, one that turns left, two beside, a walker, a cyclist and a post.
+    """
+    walker = {"kind": Kind.PEDESTRIAN, "size": (0.6, 0.6)}
+    cyclist = {"kind": Kind.CYCLIST, "size": (1.7, 0.6)}
+    post = {"kind": Kind.STATIC, "size": (0.4, 0.4)}
+    return {
+        "ego": straight(t, (0.0, 0.0), 0.0, 8.0, size=ego),
+        "12": straight(t, (25.0, 0.0), 0.0, 8.0),
+        "15": arc(t, (60.0, 0.0), 0.0, 7.0, 25.0, size=(5.2, 2.0)),
+        "17": straight(t, (-30.0, 3.5), 0.0, 11.0),
+        "19": straight(t, (-10.0, 3.5), 0.0, 9.0, size=(11.0, 2.6)),
+        "23": straight(t, (50.0, -6.0), np.pi / 2, 1.3, **walker),
+        "27": straight(t, (0.0, -2.0), 0.0, 5.0, **cyclist),
+        "31": straight(t, (40.0, -3.0), 0.0, 0.0, **post),
+    }
 
 
 def samples(written, rows):

@@ -10,11 +10,12 @@ import json
 import struct
 
 import numpy as np
+import pyproj
 import tensorstore
 
 from rcirl_jax.types import Kind
 from tests.data.importers.formats import Fixture
-from tests.data.importers.formats.drives import arc, samples, straight
+from tests.data.importers.formats.drives import samples, seen_by_a_car
 from tests.data.importers.formats.waymo import Packed, Single, message, varint
 
 T = 0.1 * np.arange(100)
@@ -67,25 +68,11 @@ WORLD_TO_ECEF = np.array(
 
 def road_users():
     """Id -> motion; 17 is seen for a part of the scene, 19 with a gap."""
-    x, y = CENTRE
-    users = {
-        "ego": straight(STAMPS, (x, y), 0.0, 8.0, size=(4.87, 1.85)),
-        "12": straight(STAMPS, (x + 25.0, y), 0.0, 8.0),
-        "15": arc(STAMPS, (x + 60.0, y), 0.0, 7.0, 25.0, size=(5.2, 2.0)),
-        "17": straight(STAMPS, (x - 30.0, y + 3.5), 0.0, 11.0),
-        "19": straight(STAMPS, (x - 10.0, y + 3.5), 0.0, 9.0, size=(11.0, 2.6)),
-        "23": straight(
-            STAMPS,
-            (x + 50.0, y - 6.0),
-            np.pi / 2,
-            1.3,
-            kind=Kind.PEDESTRIAN,
-            size=(0.6, 0.6),
-        ),
-        "27": straight(
-            STAMPS, (x, y - 2.0), 0.0, 5.0, kind=Kind.CYCLIST, size=(1.7, 0.6)
-        ),
-    }
+    users = seen_by_a_car(STAMPS, (4.87, 1.85))
+    del users["31"]
+    for name, user in users.items():
+        x, y = user.x + CENTRE[0], user.y + CENTRE[1]
+        users[name] = dataclasses.replace(user, x=x, y=y)
     users["17"] = samples(users["17"], slice(30, 80))
     return users
 
@@ -93,18 +80,16 @@ def road_users():
 GAP = slice(40, 60)  # frames in which 19 is hidden
 
 
-def visible():
-    """Id of the file -> the frames it is seen in, and its motion."""
-    rows = {name: np.arange(100) for name in road_users() if name != "ego"}
-    rows["17"] = np.arange(30, 80)
-    rows["19"] = np.delete(np.arange(100), GAP)
-    return rows
+# id -> the frames it is seen in
+VISIBLE = {name: np.arange(100) for name in road_users() if name != "ego"}
+VISIBLE["17"] = np.arange(30, 80)
+VISIBLE["19"] = np.delete(np.arange(100), GAP)
 
 
 def agents(users):
     """All agents, and the interval of each frame."""
     records, frames = [], []
-    for name, frame in visible().items():
+    for name, frame in VISIBLE.items():
         user = users[name]
         at = np.searchsorted(user.t, STAMPS[frame])
         part = np.zeros(frame.size, AGENT_DTYPE)
@@ -153,30 +138,20 @@ def write_array(folder, records, chunk):
         for name in records.dtype.names
         for shape in [records.dtype[name].shape]
     ]
+    blosc = {"id": "blosc", "cname": "lz4", "clevel": 5, "shuffle": 1, "blocksize": 0}
     metadata = {
         "zarr_format": 2,
         "shape": [records.size],
         "chunks": [chunk],
         "dtype": [["record", "|u1", [records.dtype.itemsize]]],
-        "compressor": {
-            "id": "blosc",
-            "cname": "lz4",
-            "clevel": 5,
-            "shuffle": 1,
-            "blocksize": 0,
-        },
+        "compressor": blosc,
         "filters": None,
         "fill_value": None,
         "order": "C",
     }
-    store = tensorstore.open(
-        {
-            "driver": "zarr",
-            "kvstore": {"driver": "file", "path": str(folder)},
-            "metadata": metadata,
-        },
-        create=True,
-    ).result()
+    place = {"driver": "file", "path": str(folder)}
+    spec = {"driver": "zarr", "kvstore": place, "metadata": metadata}
+    store = tensorstore.open(spec, create=True).result()
     shape = (records.size, records.dtype.itemsize)
     raw = np.ascontiguousarray(records).view(np.uint8).reshape(shape)
     store.write(raw).result()
@@ -229,30 +204,12 @@ def name_of(text):
 
 
 def to_local(world):
-    """Centimetres [n, 2] in the frame of the map's lanes."""
-    latitude, longitude = np.deg2rad(np.array([LATITUDE, LONGITUDE]) * 1e-7)
-    a, f = 6378137.0, 1.0 / 298.257223563
-    e2 = f * (2.0 - f)
-    n = a / np.sqrt(1.0 - e2 * np.sin(latitude) ** 2)
-    origin = np.array(
-        [
-            n * np.cos(latitude) * np.cos(longitude),
-            n * np.cos(latitude) * np.sin(longitude),
-            n * (1.0 - e2) * np.sin(latitude),
-        ]
-    )
-    sin_a, cos_a = np.sin(longitude), np.cos(longitude)
-    sin_b, cos_b = np.sin(latitude), np.cos(latitude)
-    enu = np.array(
-        [
-            [-sin_a, cos_a, 0.0],
-            [-sin_b * cos_a, -sin_b * sin_a, cos_b],
-            [cos_b * cos_a, cos_b * sin_a, sin_b],
-        ]
-    )
+    """Centimetres [n, 3] in the frame of the map's lanes."""
     points = np.concatenate([world, np.zeros((len(world), 1))], axis=1)
     ecef = points @ WORLD_TO_ECEF[:3, :3].T + WORLD_TO_ECEF[:3, 3]
-    return 100.0 * ((ecef - origin) @ enu.T)
+    place = f"lat_0={LATITUDE * 1e-7} lon_0={LONGITUDE * 1e-7}"
+    local = pyproj.Transformer.from_pipeline(f"+proj=topocentric {place} ellps=WGS84")
+    return 100.0 * np.stack(local.transform(*ecef.T), axis=1)
 
 
 def bound(points):
@@ -293,20 +250,14 @@ def write_map(path, controls=(RED, GREEN), inside=()):
 
     last = np.array([[x + 60.0, y], [x + 160.0, y]])
     faces = [(3, name_of(face)) for face in (RED, GREEN)]
+    linked = {"ahead": ("b1", "c1"), "beside": ((0, "a2"),)}
     elements = [
         element("seg", 1, message([(9, Single(11.176))])),
         element("jun", 5, b""),
         element(RED, 4, message([(11, b"")])),
         element(GREEN, 4, message([(13, b"")])),
         element(LIGHT, 4, message([(29, message(faces))])),
-        lane(
-            "a1",
-            along(1.75),
-            along(-1.75),
-            ahead=("b1", "c1"),
-            beside=((0, "a2"),),
-            controls=controls,
-        ),
+        lane("a1", along(1.75), along(-1.75), **linked, controls=controls),
         # drawn against the traffic: the left bound lies to the right of the points
         lane("a2", along(5.25)[::-1], along(1.75)[::-1], beside=((1, "a1"),)),
         lane("b1", turn(23.25), turn(26.75), parent="jun"),
@@ -331,18 +282,14 @@ def write(folder):
     return Fixture(
         input=folder,
         rate_hz=10.0,
-        tracks={name: dataclasses.replace(user) for name, user in users.items()},
+        tracks=users,
         num_lanes=4,
         num_signals=1,
         files=(
-            dataset / "scenes" / ".zarray",
-            dataset / "scenes" / "0",
-            dataset / "frames" / "1",
-            dataset / "agents" / ".zarray",
-            dataset / "agents" / "0",
-            dataset / "traffic_light_faces" / "0",
-            semantic_map,
-            meta,
+            *(dataset / name / ".zarray" for name in ("scenes", "agents")),
+            *(dataset / name / "0" for name in ("scenes", "agents")),
+            *(dataset / "frames" / "1", dataset / "traffic_light_faces" / "0"),
+            *(semantic_map, meta),
         ),
         numbers={
             dataset / "scenes" / ".zarray": r'"shape": \[\s*(\d+)',

@@ -114,22 +114,10 @@ def polyline(number, rows):
 
 def lane(key, rows, *, limit=25.0, kind=2, entry=(), leave=(), sides=(), neighbours=()):
     """A lane feature; sides and neighbours are (field number, message)."""
-    return [
-        (1, key),
-        (
-            3,
-            [
-                (1, limit),
-                (2, kind),
-                (3, False),
-                *polyline(8, rows),
-                *([(9, Packed(entry))] if entry else []),
-                *([(10, Packed(leave))] if leave else []),
-                *sides,
-                *neighbours,
-            ],
-        ),
-    ]
+    parts = [(1, limit), (2, kind), (3, False), *polyline(8, rows)]
+    parts += [(9, Packed(entry))] if entry else []
+    parts += [(10, Packed(leave))] if leave else []
+    return [(1, key), (3, [*parts, *sides, *neighbours])]
 
 
 def boundary(number, first, last, key):
@@ -161,21 +149,17 @@ def map_features():
         (EAST + 40.0 + 15.0 * np.sin(a), NORTH + WIDTH + 15.0 * (1.0 - np.cos(a)))
         for a in angle
     ]
+    first = {
+        "sides": [boundary(13, 0, last, 901), boundary(14, 0, last, 902)],
+        "neighbours": [neighbour(11, 102, 0, last)],
+    }
+    second = {
+        "sides": [boundary(14, 0, last, 901)],
+        "neighbours": [neighbour(12, 101, 0, last)],
+    }
     return [
-        lane(
-            101,
-            south,
-            leave=(103,),
-            sides=[boundary(13, 0, last, 901), boundary(14, 0, last, 902)],
-            neighbours=[neighbour(11, 102, 0, last)],
-        ),
-        lane(
-            102,
-            north,
-            leave=(104,),
-            sides=[boundary(14, 0, last, 901)],
-            neighbours=[neighbour(12, 101, 0, last)],
-        ),
+        lane(101, south, leave=(103,), **first),
+        lane(102, north, leave=(104,), **second),
         lane(103, eastward(0.0, 40.0, 120.0), entry=(101,), limit=35.0),
         lane(104, turn, entry=(102,)),
         lane(105, [(EAST + 40.0, NORTH + 9.0)]),  # a lane of one point: left out
@@ -198,40 +182,23 @@ def signal_state(step):
 def road_users():
     """Track id -> (object type, road user, steps where it is valid)."""
     every = range(NUM_STEPS)
+    walker = {"kind": Kind.PEDESTRIAN, "size": (0.8, 0.75)}
+    cyclist = {"kind": Kind.CYCLIST, "size": (1.7, 0.7)}
+
+    def east(x, y, speed, **more):
+        return straight(T, (EAST + x, NORTH + y), 0.0, speed, **more)
+
     return {
-        2314: (1, straight(T, (EAST - 50.0, NORTH), 0.0, 8.0, wave=3.0), every),
+        2314: (1, east(-50.0, 0.0, 8.0, wave=3.0), every),
         2320: (1, arc(T, (EAST + 40.0, NORTH + WIDTH), 0.0, 6.0, 15.0), every),
-        2325: (1, straight(T, (EAST - 80.0, NORTH), 0.0, 10.0), range(12, 60)),
+        2325: (1, east(-80.0, 0.0, 10.0), range(12, 60)),
         # three invalid steps are bridged, thirty end the track
         2331: (
-            1,
-            straight(T, (EAST - 40.0, NORTH + WIDTH), 0.0, 7.0),
+            *(1, east(-40.0, WIDTH, 7.0)),
             [*range(0, 20), *range(23, 40), *range(70, NUM_STEPS)],
         ),
-        2340: (
-            2,
-            straight(
-                T,
-                (EAST + 20.0, NORTH - 6.0),
-                1.5,
-                1.3,
-                kind=Kind.PEDESTRIAN,
-                size=(0.8, 0.75),
-            ),
-            every,
-        ),
-        2341: (
-            3,
-            straight(
-                T,
-                (EAST - 30.0, NORTH - 4.0),
-                0.0,
-                4.5,
-                kind=Kind.CYCLIST,
-                size=(1.7, 0.7),
-            ),
-            range(0, 80),
-        ),
+        2340: (2, straight(T, (EAST + 20, NORTH - 6), 1.5, 1.3, **walker), every),
+        2341: (3, east(-30.0, -4.0, 4.5, **cyclist), range(0, 80)),
     }
 
 
@@ -289,4 +256,5 @@ def write(folder):
         num_lanes=4,
         num_signals=1,
         files=(path,),
+        checked=(path,),
     )

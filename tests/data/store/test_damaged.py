@@ -1,0 +1,294 @@
+"""Damaged datasets, and those made to harm: one line that names the file."""
+
+import json
+import os
+import re
+import shutil
+
+import numpy as np
+import pytest
+
+from rcirl_jax.data.store import files, manifest
+from rcirl_jax.data.store.dataset import open_dataset
+from rcirl_jax.data.store.shards import describe
+from tests.data.store.test_dataset import SIZES, write
+from tests.helpers.logs import refused
+
+DEEP = 100_000  # levels
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("store") / "dataset"
+    write(folder)
+    return folder
+
+
+@pytest.fixture
+def copy(made, tmp_path):
+    return shutil.copytree(made, tmp_path / "copy")
+
+
+@pytest.fixture
+def small(tmp_path):
+    """A dataset of one shard with two rows."""
+    write(tmp_path / "d", (2,))
+    return tmp_path / "d"
+
+
+def flip(place):
+    """Change one bit; of a place None: somewhere."""
+
+    def apply(data):
+        rng = np.random.default_rng(len(data))
+        bad = bytearray(data)
+        bad[rng.integers(len(data)) if place is None else place] ^= 1 << rng.integers(8)
+        return bytes(bad)
+
+    return apply
+
+
+DAMAGES = {
+    **{"first bit": flip(0), "last bit": flip(-1), "some bit": flip(None)},
+    # the last byte of the JSON files is a line end, which says nothing
+    **{f"cut at {n}": lambda data, n=n: data.rstrip()[:n] for n in (0, 10, -1)},
+    "missing": lambda data: None,
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damaged_files_are_named(copy, damage):
+    """Both JSON files, and a share of the others: all damages together every one."""
+    every = sorted(path for path in copy.rglob("*") if path.is_file())
+    share = every[list(DAMAGES).index(damage) :: len(DAMAGES)]
+    for path in {*share, copy / "manifest.json", copy / "shards/00001/shard.json"}:
+        name, good = str(path.relative_to(copy)), path.read_bytes()
+        bad = DAMAGES[damage](good)
+        path.unlink()
+        if bad is not None:
+            path.write_bytes(bad)
+        line = refused(open_dataset, copy)
+        assert f"{name}: " in line
+        if path.name not in ("manifest.json", "shard.json"):
+            assert f"{name}: shard {int(name.split('/')[1])}: " in line
+            assert describe(good)["sha256"] in line
+            same = bad is not None and len(bad) == len(good)
+            assert not same or describe(bad)["sha256"] in line
+        path.write_bytes(good)
+    open_dataset(copy)
+
+
+def test_missing_and_exchanged_shards_are_named(copy):
+    where = "shards/00001/shard.json: shard 1:"
+    shutil.rmtree(copy / "shards/00001")
+    assert f"{where} missing" in refused(open_dataset, copy)
+    shutil.copytree(copy / "shards/00002", copy / "shards/00001")
+    assert f"{where} sha256" in refused(open_dataset, copy)
+
+
+def test_crc32c_lets_no_wrong_row_through(copy):
+    """Damage that is not looked for is found when its rows are read."""
+    victim = copy / "shards/00001/human.s/c/0/0"
+    good = victim.read_bytes()
+    rng = np.random.default_rng(0)
+    for at in [20, *rng.integers(0, len(good), 40).tolist()]:
+        bad = bytearray(good)
+        bad[at] ^= 1 << int(rng.integers(8))
+        victim.write_bytes(bad)
+        dataset = open_dataset(copy, verify=False)
+        dataset.read(np.arange(SIZES[0]))
+        line = refused(dataset.read, np.arange(SIZES[0], sum(SIZES)))
+        assert "shards/00001/human.s: cannot be read" in line
+    shutil.rmtree(copy / "shards/00002")
+    line = refused(dataset.read, np.array([dataset.count - 1]))
+    assert "shards/00002/scene.ego.s: cannot be read" in line
+
+
+def test_an_array_of_another_shape_is_named(copy):
+    folder = copy / "shards/00001"
+    shutil.rmtree(folder / "human.s")
+    shutil.copytree(folder / "decisions", folder / "human.s")
+    line = refused(open_dataset(copy, verify=False).load, None)
+    assert re.search(r"human.s: shard 1: int32 .*expected float32", line)
+
+
+@pytest.mark.parametrize("rows", [(40_000_000, 256), (40_000_000, 40_000_000)])
+def test_an_array_in_other_chunks_is_named(copy, rows):
+    """The blocks of a store are unpacked whole: a huge one would fill the memory."""
+    path = copy / "shards/00001/human.s/zarr.json"
+    meta = json.loads(path.read_text())
+    chunk, block = ([count, *meta["shape"][1:]] for count in rows)
+    chunk[0] -= chunk[0] % block[0]
+    meta["chunk_grid"]["configuration"]["chunk_shape"] = chunk
+    meta["codecs"][0]["configuration"]["chunk_shape"] = block
+    path.write_text(json.dumps(meta))
+    line = refused(open_dataset(copy, verify=False).indices, "train")
+    assert re.search(r"human.s: shard 1: chunks .*expected \(\(40", line)
+
+
+# ------------------------------------------------------------- with right digests
+
+
+def reseal(folder, change_shard=None, change=None):
+    """Change shard.json or manifest.json, and make the digests above it right."""
+    mark, top = folder / "shards/00000/shard.json", folder / "manifest.json"
+    shard, whole = json.loads(mark.read_text()), json.loads(top.read_text())
+    if change_shard:
+        shard.pop("sha256")
+        change_shard(shard)
+        mark.write_bytes(manifest.seal(shard, "sha256"))
+        whole["shards"][0]["sha256"] = json.loads(mark.read_text())["sha256"]
+    whole.pop("hash")
+    if change:
+        change(whole)
+    top.write_bytes(manifest.seal(whole, "hash"))
+
+
+def test_a_shard_without_rows_is_one_line(copy):
+    for path in (copy / "shards/00001").glob("*/zarr.json"):
+        meta = json.loads(path.read_text())
+        meta["shape"][0] = 0
+        path.write_text(json.dumps(meta))
+    reseal(copy, change=lambda m: m["shards"][1].update(count=0))
+    reseal(copy, change=lambda m: m.update(count=sum(SIZES) - SIZES[1]))
+    dataset = open_dataset(copy, verify=False)
+    assert re.search(r"shard 1: chunks .*expected", refused(dataset._arrays, 1))
+
+
+ROWS = "vehicle/c/0"
+X = describe(b"x")
+
+
+def entry(key, value):
+    """A change of `files`: None takes an entry away, a text means another entry."""
+
+    def change(shard):
+        found = shard["files"]
+        if value is None:
+            found.pop(key)
+        else:
+            found[key] = found[value] if isinstance(value, str) else value
+
+    return change
+
+
+OUT = ("../../../secret", "a/../../x", "/etc/passwd", "./x", "a//b", "")
+BELOW = "expected a key below the shard"
+BAD_SHARDS = [
+    *[(entry(key, X), f"files: {re.escape(key)}.*{BELOW}") for key in OUT],
+    (entry("human.s/\0", X), r"files: 'human.s/\\x00': expected a printable key"),
+    (entry("a\nb", X), r"files: 'a\\nb': expected a printable key"),
+    (entry("\ud800", X), "not JSON"),
+    # zarr reads zeros where nothing is
+    (entry(ROWS, None), f"files: {ROWS}: expected two of every array"),
+    (entry("x", ROWS), "files: x: expected two of every array"),
+    (entry(ROWS, {"bytes": 0, "sha256": "missing"}), f"files: {ROWS}: .*a text"),
+    (entry(ROWS, X | {"bytes": True}), f"files: {ROWS}: .*expected a whole number"),
+    (entry(ROWS, X), f"files: {ROWS}: 1 bytes: expected 20 at least for 2 rows"),
+    # an array of a billion rows is not made of a small file
+    (lambda s: s.update(count=10**9), "bytes: expected 62500004 at least for 10"),
+    (lambda s: s.pop("lineage"), "lineage: missing: expected"),
+    (lambda s: s.update(extra=1), "extra: unknown: expected"),
+    (lambda s: s.update(files=[]), "files: .*: expected an object"),
+    (entry("x", 3), "files: x: 3: expected an object"),
+    (entry("x", {}), "files: x: bytes: missing: expected"),
+    (lambda s: s.update(lineage=[{}]), r"lineage: \[0\]\.name: missing"),
+]
+
+
+@pytest.mark.parametrize(("change", "words"), BAD_SHARDS)
+def test_shards_that_are_none(small, change, words):
+    (small.parent / "secret").write_text("x")
+    reseal(small, change)
+    assert re.search(f"shard.json: .*{words}", refused(open_dataset, small))
+
+
+GROUPS, FLOAT32 = "splits: .*expected every group", ".*float64.*expected .*float32"
+BAD_MANIFESTS = [
+    (lambda m: m.update(schema_version=1), "schema_version: 1: expected 2"),
+    (lambda m: m.pop("schema_version"), "schema_version: None: expected 2"),
+    (lambda m: m.pop("quality"), "quality: missing: expected"),
+    (lambda m: m["arrays"].pop("human.s"), "arrays: human.s: None: expected"),
+    (lambda m: m["arrays"]["human.s"].update(dtype="float64"), FLOAT32),
+    (lambda m: m["time_grid_s"].pop(), "time_grid_s"),
+    (lambda m: m["shards"][0].update(count=3), "shard 0: int32 .*expected"),
+    (lambda m: m.update(count=-1), "count: -1: expected a whole number >= 0"),
+    (lambda m: m.update(count=True), "count: True: expected a whole number"),
+    (lambda m: m.update(count=1), "count: 1: expected 2, the sum of its shards"),
+    (lambda m: m.update(count=10**15), "count: 10{15}: expected a whole number <="),
+    (lambda m: m.update(count=2**31 + 1), "count: .*: expected a whole num"),
+    (lambda m: m.update(arrays=3), "arrays: 3: expected an object"),
+    (lambda m: m.update(shards={}), "shards: {}: expected a list"),
+    (lambda m: m["shards"].append(3), r"shards\[1\]: 3: expected an object"),
+    (lambda m: m.update(splits=[]), r"splits: \[\]: expected an object"),
+    (lambda m: m.update(groups=[1]), r"groups\[0\]: 1: expected a text"),
+    (lambda m: m["splits"].popitem(), GROUPS),
+    (lambda m: m["splits"].update(a=["g0"]), GROUPS),
+    (lambda m: m["splits"].update(a=["odd"]), GROUPS),
+    (lambda m: m.update(rate_hz="10"), "rate_hz: 10: expected a list"),
+    (lambda m: m.update(sources=[""]), r"sources\[0\]: : expected an object"),
+    (lambda m: m["sources"].append({"\udfff": 1}), "not JSON"),
+]
+
+
+@pytest.mark.parametrize(("change", "words"), BAD_MANIFESTS)
+def test_manifests_that_are_none(small, change, words):
+    reseal(small, change=change)
+    assert re.search(words, refused(open_dataset, small))
+
+
+# which json.loads takes from bytes
+SURROGATE = b'"groups%b"' % "\ud800".encode(errors="surrogatepass")
+BAD_TEXTS = [
+    *[(rb"^.*$", text, "") for text in (b"", b"[]", b"null", b"{")],
+    (rb"^.*$", b'{"schema_version": NaN}', ""),
+    (rb"^.*$", b"[" * DEEP + b"]" * DEEP, "not JSON"),
+    (rb'"groups"', SURROGATE, "not JSON"),
+    (rb'"count": \d+,', b'"count": 1e999,', "1e999 is no finite number"),
+]
+
+
+@pytest.mark.parametrize(("pattern", "text", "words"), BAD_TEXTS)
+def test_manifests_of_texts_that_are_none(small, pattern, text, words):
+    file = small / "manifest.json"
+    file.write_bytes(re.sub(pattern, text, file.read_bytes(), count=1, flags=re.DOTALL))
+    line = refused(open_dataset, small)
+    assert "manifest.json: " in line
+    assert words in line
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [("[" * 10**5, "JSON"), ('{"made_by": "\\ud800"}', "JSON"), ("[1]", "an object")],
+)
+def test_facts_that_are_none(small, text, words):
+    (small / files.FACTS).write_text(text)
+    line = refused(open_dataset(small).facts)
+    assert re.search(rf"made_by\.json: .*expected {words}", line)
+
+
+HUGE = [
+    *[("manifest.json", f"{2**30} at most"), ("made_by.json", f"{2**28} at most")],
+    ("shards/00000/shard.json", f"{2**28} at most"),
+    ("shards/00000/human.s/c/0/0", "sha256 not taken"),
+]
+
+
+@pytest.mark.parametrize(("name", "words"), HUGE)
+def test_a_terabyte_in_a_dataset_is_not_read(small, name, words):
+    with (small / name).open("ab") as opened:
+        opened.truncate(2**40)
+    line = refused(lambda: open_dataset(small).facts())
+    assert re.search(rf"{name}: .*{2**40} bytes", line)
+    assert words in line
+
+
+def test_a_link_out_of_a_dataset_is_read_as_what_it_shows(small, tmp_path):
+    file = small / "shards/00000/human.s/c/0/0"
+    (tmp_path / "secret").write_text("x")
+    file.unlink()
+    file.symlink_to(tmp_path / "secret")
+    assert "human.s/c/0/0: shard 0: 1 bytes" in refused(open_dataset, small)
+    file.unlink()
+    os.mkfifo(file)  # which would be waited for
+    assert "human.s/c/0/0: expected a file" in refused(open_dataset, small)

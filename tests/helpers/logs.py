@@ -1,0 +1,46 @@
+"""Logs as tests read them: recordings, or the one line that refuses them."""
+
+import importlib
+
+import pytest
+
+from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.errors import InputError
+from rcirl_jax.runtime.specs import load_toml, spec_root
+
+
+def packaged(form):
+    """The options of a format's packaged TOML."""
+    return load_toml(spec_root() / "sources" / f"{form}.toml")
+
+
+def read(form, path, source=None, **options):
+    """All recordings of an input; `options` take the place of packaged ones."""
+    if not options:
+        return list(read_recordings(form, path, source))
+    reader = importlib.import_module(f"rcirl_jax.data.importers.{form}.reader")
+    return list(reader.recordings(path, {**packaged(form), **options}))
+
+
+def only(form, path, source=None, **options):
+    """The only recording of an input."""
+    (recording,) = read(form, path, source, **options)
+    return recording
+
+
+def refused(call, *args, **options):
+    """The line with which a call refuses its input."""
+    with pytest.raises(InputError) as caught:
+        call(*args, **options)
+    (line,) = str(caught.value).splitlines()
+    return line
+
+
+def lanes_of(recording):
+    """Lanes by their ids."""
+    return {lane.id: lane for lane in recording.lanes}
+
+
+def tracks_of(recording):
+    """Tracks by their ids."""
+    return {track.id: track for track in recording.tracks}
