@@ -23,7 +23,8 @@ from rcirl_jax.export import (
     load_weights,
     save,
 )
-from tests.export import test_old_files, test_reader
+from tests.export import test_old_files, wrong
+from tests.export.test_reader import refusal
 from tests.helpers.weights_files import (
     example_samples,
     example_weights,
@@ -277,7 +278,7 @@ def test_damaged_files_are_refused_with_one_line(programs, tmp_path):
     files = [VALID[:length] for length in range(0, len(VALID), 3)]
     for _ in range(2000):
         bits = rng.integers(0, 8 * len(GATED), rng.integers(1, 9))
-        files.append(test_reader.flipped(GATED, set(bits.tolist())))
+        files.append(wrong.flipped(GATED, set(bits.tolist())))
     files += [rng.bytes(int(size)) for size in rng.integers(1, 200, 500)]
     files.append(VALID.replace(b"sha256\xd9\x40", b"sha256\xd9\x40" + b"0" * 64)[:-64])
     for line in verdicts(programs, files, tmp_path):
@@ -289,30 +290,15 @@ def test_damaged_files_are_refused_with_one_line(programs, tmp_path):
 
 
 def test_wrong_fields_are_named_as_by_the_python_reader(programs, tmp_path):
-    """The cases of the Python reader's own tests."""
-    fields = [
-        test_reader.tampered(path, value)
-        for path, value, _ in _cases(test_reader.test_a_wrong_field_is_named)
-    ]
-    fields += [
-        test_reader.tampered(["anchor", *path], value, test_reader.ANCHORED)
-        for path, value, _ in _cases(test_reader.test_a_wrong_anchor_is_named)
-    ]
-    files = [data for data, _ in _cases(test_reader.test_a_wrong_file_is_refused)]
-    assert len(fields) > 80
-    assert len(files) > 20
-    lines = verdicts(programs, fields + files, tmp_path)
-    later = "schema_version: 5: expected 1, 2, 3 or 4, all this reader supports"
-    assert f"w: {later}" in lines
-    for data, line in zip(fields + files, lines, strict=True):
-        field = test_reader.refusal(data).split(": ")[0]
+    files = [wrong.tampered(path, value) for path, value, _ in wrong.FIELDS]
+    files += [data for data, _ in wrong.FILES]
+    lines = verdicts(programs, files, tmp_path)
+    assert f"w: {wrong.LATER}" in lines
+    for data, line in zip(files, lines, strict=True):
+        field = refusal(data).split(": ")[0]
         # The Python reader counts times that do not increase from the second one.
         place = "times[1]" if "increasing" in line else field
         assert line.startswith(f"w: {place}: ")
-
-
-def _cases(test):
-    return next(mark.args[1] for mark in test.pytestmark if mark.name == "parametrize")
 
 
 def test_bodies_changed_and_hashed_again_get_the_verdict_of_the_python_reader(
@@ -335,7 +321,7 @@ def test_bodies_changed_and_hashed_again_get_the_verdict_of_the_python_reader(
                         del changed[at]
                     case _:
                         changed.insert(at, int(rng.integers(0, 256)))
-            files.append(test_reader.sealed(bytes(changed), schema_version=version))
+            files.append(wrong.sealed(bytes(changed), schema_version=version))
     expected = [is_valid(data) for data in files]
     assert 100 < sum(expected) < len(files) - 1000
     found = [line == "ok" for line in verdicts(programs, files, tmp_path)]
@@ -353,8 +339,8 @@ def test_huge_lengths_and_deep_nesting_cost_nothing(programs, tmp_path):
     bombs += [b"\x91" * 10**6, b"\xdc\x0f\xff" * 10**5, b"\xdc\x10\0" + b"\x90" * 4096]
     bombs += [b"\xdc\x10\0" + (b"\xdc\x10\0" + b"\0" * 4096) * 4096]
     size = {"shape": [4096, 4096], "dtype": "<f4", "data": b""}
-    bombs += [test_reader.sealed(bomb) for bomb in bombs]
-    bombs.append(test_reader.tampered(["layers", 0, "kernel"], size))
+    bombs += [wrong.sealed(bomb) for bomb in bombs]
+    bombs.append(wrong.tampered(["layers", 0, "kernel"], size))
     for line in verdicts(programs, bombs, tmp_path):
         assert line.startswith("w: ")
         assert len(line) < 400
