@@ -84,8 +84,9 @@ def main() -> None:
     else:
         found = trained()
         files, names = [*found.values()], [*found]
+    rows = table_rows(files, BASELINES, names=names)
     made_by = as_used(files)
-    table("suite", table_rows(files, BASELINES, names=names), "full", None, made_by)
+    table("suite", rows, "full", None, made_by)
     alone = [file for file in files if open_reward(file).anchor is None]
     if alone:
         rows = table_rows(alone[:1], ("hand-set", "IDM"), dp=True)

@@ -10,7 +10,6 @@ from rcirl_jax.autotune.recipes import load_recipe, recipe_names
 from rcirl_jax.errors import InputError
 from rcirl_jax.reward import RewardConfig
 from rcirl_jax.runtime.specs import load_toml, spec_root
-from tests.helpers.commands import command
 
 PAPER = spec_root() / "recipes" / "paper.toml"
 
@@ -153,16 +152,3 @@ def test_sweeps_and_rankings_train_as_the_recipe_says(code, tmp_path):
         assert "constraint='nonnegative'" in said(*few, code=code)
     else:
         assert f"reward={RewardConfig()}" in made  # its learners say
-
-
-def test_the_tuning_loop_says_what_it_needs(tmp_path):
-    done = command("experiments.autotune", f"--workdir={tmp_path / 'run'}")
-    assert done.returncode == 2
-    assert done.stderr.count("\n") == 1
-    assert "--data, --input, --synthetic: expected one of them" in done.stderr
-    flags = (f"--workdir={tmp_path / 'run'}", "--synthetic", "--recipe=tunde")
-    done = command("experiments.autotune", *flags)
-    assert "did you mean tuned?" in done.stderr
-    flags = (f"--workdir={tmp_path / 'run'}", "--input=x", "--format=ngsmi")
-    done = command("experiments.autotune", *flags)
-    assert "did you mean ngsim?" in done.stderr

@@ -11,10 +11,7 @@ import tomllib
 
 import pytest
 
-from rcirl_jax.evaluation.exact import tango
 from rcirl_jax.evaluation.gate.types import EXIT_CODES, GateConfig
-from rcirl_jax.evaluation.ranking.format import markdown_table
-from rcirl_jax.evaluation.ranking.table import from_json
 from tests.docs.pages import (
     ALL,
     DOCS,
@@ -27,7 +24,7 @@ from tests.docs.pages import (
     section,
     spans,
     table,
-)
+)  # fmt: skip
 
 PRESETS = sorted((REPO / "data_specs" / "features").glob("*.toml"))
 MODULE = r"(?<![\w/.])((?:experiments|benchmarks)(?:\.[a-z_0-9]+)+)\b"
@@ -141,12 +138,10 @@ def values():
     found = {}
     for _, module, rest in commands():
         for flag, value in VALUE.findall(rest):
+            value = value.rstrip("`.,]")
             # N stands for a number; jsonl is the format that extending.md adds
-            if not PLACEHOLDER.search(value) and value.strip("`.,]") not in (
-                "N",
-                "jsonl",
-            ):
-                found.setdefault(module, []).append((flag, value.rstrip("`.,]")))
+            if not PLACEHOLDER.search(value) and value not in ("N", "jsonl"):
+                found.setdefault(module, []).append((flag, value))
     return found
 
 
@@ -175,15 +170,13 @@ def test_commands_name_modules_and_flags():
                      for name in FLAG.findall(rest)}  # fmt: skip
             wrong += [f"{page}: {module}: --{name}" for name in sorted(names - flags)]
     assert not wrong, "\n".join(wrong)
-    assert len(commands()) > 50
-    assert len({module for _, module, _ in commands() if is_main(module)}) > 20
+    assert len(known_flags()[0]) > 15
 
 
 def test_commands_have_values_that_their_flags_take():
     """--suite=smok, --epochs=ten: a page would say what no longer runs."""
-    known, refused = known_flags()
+    refused = known_flags()[1]
     assert not refused, "\n".join(refused)
-    assert sum(len(given) for name, given in values().items() if name in known) > 60
 
 
 # -------------------------------------------------------------------- numbers
@@ -202,51 +195,12 @@ def test_the_feature_dictionary_is_the_preset(preset):
         ], spec["name"]
 
 
-def test_every_feature_is_defined_once():
-    text = (DOCS / "features.md").read_text()
-    names = [
-        spec["name"]
-        for preset in PRESETS
-        for spec in tomllib.loads(preset.read_text())["feature"]
-    ]
-    headings = re.findall(r"^### `(\w+)`$", text, re.M)
-    assert sorted(headings) == sorted(set(names))
-    for name in headings:
-        assert "Source:" in section(text, f"### `{name}`"), name
-
-
-def test_the_gates_margins_are_those_of_the_code():
-    rows = table(section((DOCS / "gate.md").read_text(), "## Margins"))
+def test_the_gates_margins_and_exit_status_are_those_of_the_code():
+    text = (DOCS / "gate.md").read_text()
+    rows = table(section(text, "## Margins"))
     stated = {row[0].removeprefix("--").removesuffix("_margin"): row[1] for row in rows}
     assert {k: float(v) for k, v in stated.items()} == GateConfig().margins
-
-
-def needed(margin, gained, lost):
-    """Fewest cases with Tango's lower end above -margin; it rises with the cases."""
-    low, high = gained + lost, 1
-    while high <= low or tango(gained, lost, high)[0] <= -margin:
-        high *= 2
-    while high - low > 1:
-        middle = (low + high) // 2
-        if tango(gained, lost, middle)[0] > -margin:
-            high = middle
-        else:
-            low = middle
-    return high
-
-
-def test_the_gates_numbers_of_cases_are_tangos():
-    text = (DOCS / "gate.md").read_text()
-    rows = table(section(text, "## How many cases a margin takes"))
-    pairs = [(0, 0), (0, 1), (1, 1), (0, 2), (5, 5)]
-    for row in rows:
-        margin = float(row[0].removesuffix(" %")) / 100.0
-        found = [int(cell.replace(",", "")) for cell in row[1:]]
-        assert found == [needed(margin, *pair) for pair in pairs], row
-
-
-def test_the_verdicts_exit_status_is_the_codes():
-    rows = table(section((DOCS / "gate.md").read_text(), "## Verdicts and exit status"))
+    rows = table(section(text, "## Verdicts and exit status"))
     assert {row[0]: int(row[2]) for row in rows} == EXIT_CODES
 
 
@@ -270,15 +224,3 @@ def test_the_site_builds_and_needs_no_network(tmp_path):
         text = page.read_text()
         assert not loaded.search(text), page
         assert not styles.search(text), page
-
-
-# ------------------------------------------------------------- printed results
-
-RANKINGS = sorted((REPO / "benchmarks" / "results").glob("human_likeness_*.json"))
-
-
-@pytest.mark.parametrize("file", RANKINGS, ids=lambda file: file.stem)
-def test_rankings_are_printed_as_they_are_stored(file):
-    report = from_json(json.loads(file.read_text()))
-    pages = [(DOCS / name).read_text() for name in ("results.md", "rankings.md")]
-    assert any(markdown_table(report) in page for page in pages)

@@ -1,17 +1,8 @@
 """Scenes to be tuned on, and what a row of an evaluation chooses in them."""
 
-import jax
 import numpy as np
 
 from rcirl_jax.evaluation.ranking.score import score_scenes
-from tests.helpers.scenes import T, demonstration
-
-
-def long_rows(count):
-    """Demonstrations in random scenes, all of 8 s."""
-    rows = jax.tree.map(lambda *x: np.stack(x), *map(demonstration, range(count)))
-    scene = rows.scene.replace(time_valid=np.ones((count, T), bool))
-    return rows.replace(scene=scene, future_s=np.full(count, 8.0, np.float32))
 
 
 def scored_rivals(rows, sampler, tuned):

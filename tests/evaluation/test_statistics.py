@@ -92,21 +92,15 @@ def test_copies_of_a_scene_add_no_certainty():
     assert copied.high == pytest.approx(once.high)
 
 
-@pytest.mark.parametrize("runs", [2, 3, 10])
-def test_spread_between_runs_enters_the_interval_unbiased(runs):
-    offsets = np.random.default_rng(2).normal(size=runs)
-    values = np.repeat(offsets[:, None], 40, axis=1)
-    found = combine_seeds(values, ClusterBootstrap(np.arange(40), 8000))
+@pytest.mark.parametrize(("runs", "spread"), [(2, 0.0), (3, 0.0), (10, 0.0), (8, 4.0)])
+def test_runs_and_vehicles_add_in_variance(runs, spread):
+    """The spread between runs enters unbiased."""
+    rng = np.random.default_rng(3)
+    offsets, scenes = rng.normal(size=(runs, 1)), spread * rng.normal(size=(1, 60))
+    found = combine_seeds(offsets + scenes, ClusterBootstrap(np.arange(60), 8000))
     assert found.seed_sd == pytest.approx(offsets.std(ddof=1))
     assert found.seed_se == pytest.approx(offsets.std(ddof=1) / np.sqrt(runs))
-    assert found.se == pytest.approx(found.seed_se, rel=0.04)
-
-
-def test_runs_and_vehicles_add_in_variance():
-    rng = np.random.default_rng(3)
-    offsets, scenes = rng.normal(size=(8, 1)), rng.normal(size=(1, 60)) * 4.0
-    found = combine_seeds(offsets + scenes, ClusterBootstrap(np.arange(60), 8000))
-    want = np.hypot(offsets.std(ddof=1) / np.sqrt(8), scenes.std() / np.sqrt(60))
+    want = np.hypot(found.seed_se, scenes.std() / np.sqrt(60))
     assert found.se == pytest.approx(want, rel=0.04)
 
 
@@ -118,27 +112,22 @@ def clustered(rng, vehicles=40):
 
 
 def test_interval_covers_the_truth_as_often_as_it_says():
+    """Over vehicles, and over runs and vehicles."""
     rng = np.random.default_rng(4)
-    hits = naive = 0
-    for i in range(300):
+    hits = naive = of_runs = 0
+    for i in range(250):
         x, clusters = clustered(rng)
-        found = combine_seeds(x, ClusterBootstrap(clusters, 400, seed=i))
+        bootstrap = ClusterBootstrap(clusters, 400, seed=i)
+        found = combine_seeds(x, bootstrap)
         hits += found.low <= 0.0 <= found.high
         wrong = combine_seeds(x, ClusterBootstrap(np.arange(x.size), 400, seed=i))
         naive += wrong.low <= 0.0 <= wrong.high
-    assert 0.90 <= hits / 300 <= 0.99
-    assert naive / 300 < 0.80  # scenes taken for independent: far too sure
-
-
-def test_interval_over_runs_and_vehicles_covers_the_truth():
-    rng = np.random.default_rng(5)
-    hits = 0
-    for i in range(250):
-        x, clusters = clustered(rng)
         values = x + 0.3 * rng.normal(size=(8, 1)) + rng.normal(size=(8, x.size))
-        found = combine_seeds(values, ClusterBootstrap(clusters, 400, seed=i))
-        hits += found.low <= 0.0 <= found.high
-    assert 0.89 <= hits / 250 <= 0.99
+        found = combine_seeds(values, bootstrap)
+        of_runs += found.low <= 0.0 <= found.high
+    assert 0.90 <= hits / 250 <= 0.99
+    assert 0.89 <= of_runs / 250 <= 0.99
+    assert naive / 250 < 0.80  # scenes taken for independent: far too sure
 
 
 def test_paired_difference_sees_what_the_scenes_share():
@@ -270,22 +259,24 @@ def test_clusters_that_all_say_the_same_are_no_certainty(groups, named):
     assert (same.mean, same.low, same.high, same.p) == (0.0, 0.0, 0.0, 1.0)
 
 
-def test_bad_input_is_refused():
-    with pytest.raises(InputError, match="at least 2"):
-        ClusterBootstrap(np.zeros(5, int))
-    bootstrap = ClusterBootstrap(np.arange(5))
-    with pytest.raises(InputError, match="expected"):
-        bootstrap.means(np.ones(4))
-    with pytest.raises(InputError, match="all finite"):
-        bootstrap.means(np.full(5, np.nan))
-    with pytest.raises(InputError, match="weight"):
-        bootstrap.means(np.ones(5), np.array([1.0, 1.0, 1.0, 1.0, 0.0]))
-    for bad in ((-1, 3), (4, 3), (0, 0)):
-        with pytest.raises(InputError, match="clopper_pearson"):
-            clopper_pearson(*bad)
-    with pytest.raises(InputError, match="holm"):
-        holm(np.array([0.2, np.nan]))
-    with pytest.raises(InputError, match="mcnemar"):
-        mcnemar_exact(-1, 2)
-    with pytest.raises(InputError, match="rule_of_three"):
-        rule_of_three(0)
+BOOTSTRAP = ClusterBootstrap(np.arange(5))
+
+
+@pytest.mark.parametrize(
+    ("work", "says"),
+    [
+        (lambda: ClusterBootstrap(np.zeros(5, int)), "at least 2"),
+        (lambda: BOOTSTRAP.means(np.ones(4)), "expected"),
+        (lambda: BOOTSTRAP.means(np.full(5, np.nan)), "all finite"),
+        (lambda: BOOTSTRAP.means(np.ones(5), np.arange(5.0)), "weight"),
+        (lambda: clopper_pearson(-1, 3), "clopper_pearson"),
+        (lambda: clopper_pearson(4, 3), "clopper_pearson"),
+        (lambda: clopper_pearson(0, 0), "clopper_pearson"),
+        (lambda: holm(np.array([0.2, np.nan])), "holm"),
+        (lambda: mcnemar_exact(-1, 2), "mcnemar"),
+        (lambda: rule_of_three(0), "rule_of_three"),
+    ],
+)
+def test_bad_input_is_refused(work, says):
+    with pytest.raises(InputError, match=says):
+        work()

@@ -27,24 +27,3 @@ def test_a_reward_against_itself(tmp_path):
     hashes = body["result_sha256"]
     assert hashes["candidate"] == hashes["incumbent"] != hashes["IDM"]
     assert body["made_by"]["flags"]["cases"] == 20
-
-
-@pytest.mark.multiprocess
-@pytest.mark.parametrize(
-    ("flags", "message"),
-    [
-        (("--incumbent=nobody",), "nobody"),
-        (("--progress_margin=-1",), "--progress_margin: -1.0: expected within (0, 1)"),
-        (("--duration=0.1",), "--duration: 0.1: expected 1 to 120 s"),
-        (("--suite=cut_in,cut_in",), "a family twice"),
-    ],
-)
-def test_wrong_flags_are_one_line(flags, message, tmp_path):
-    file = random_weights(tmp_path / "w.msgpack")
-    out = f"--output={tmp_path}/v.json"
-    (tmp_path / "v.json").write_text("the verdict of another candidate")
-    done = command("experiments.gate", f"--candidate={file}", out, *SHORT, *flags)
-    assert done.returncode == 2
-    (line,) = done.stderr.strip().splitlines()
-    assert message in line
-    assert not (tmp_path / "v.json").exists()

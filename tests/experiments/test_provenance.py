@@ -11,7 +11,7 @@ from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.export.reader import load_weights
 from rcirl_jax.runtime.pipeline import file_sha256
 from tests.data.small_logs import CONFIG, write_logs
-from tests.helpers.commands import command
+from tests.helpers.commands import succeeded
 from tests.helpers.weights_files import random_weights
 
 COMMON = ("flags", "git_commit", "code_sha256", "versions")
@@ -63,15 +63,13 @@ def test_it_says_what_made_it(name, root, tmp_path):
     flags, files, hashes = ARTEFACTS[name]
     out = tmp_path / "out"
     given = [flag.format(root=root, out=out) for flag in flags]
-    done = command(f"experiments.{name}", *given)
-    assert done.returncode == 0, done.stderr[-2000:]
+    succeeded(f"experiments.{name}", *given)
     weights = root / "w.msgpack"
+    logs = sorted(root.glob("logs/*.csv"))
     expected = {
         "weights_sha256": {str(weights): load_weights(weights).sha256},
         "data_hash": open_dataset(root / "data").hash,
-        "logs_sha256": {
-            str(file): file_sha256(file) for file in sorted(root.glob("logs/*.csv"))
-        },
+        "logs_sha256": {str(file): file_sha256(file) for file in logs},
     }
     for file in files:
         made_by = said(out / file)

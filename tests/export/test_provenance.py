@@ -11,7 +11,7 @@ from rcirl_jax.export.loading import open_reward
 from rcirl_jax.runtime.atomic_files import write_json
 from rcirl_jax.train.state import TrainConfig
 from tests.helpers import weights_files
-from tests.helpers.commands import command
+from tests.helpers.commands import refused
 
 
 def with_provenance(tmp_path, monkeypatch, **entries):
@@ -75,12 +75,9 @@ def test_one_dataset_or_several(tmp_path):
     assert datasets_of(run_on(tmp_path, ["a", "b"])) == ["a", "b"]
 
 
-@pytest.mark.parametrize(
-    "text", ["[1]", "nul", '{"flags": [1]}', '{"flags": {"data": 5}}']
-)
-def test_a_run_that_is_none_is_one_line(tmp_path, text):
-    (tmp_path / "run.json").write_text(text)
-    done = command("experiments.export_weights", f"--workdir={tmp_path}")
-    assert done.returncode == 2
-    (said,) = done.stderr.strip().splitlines()
-    assert "run.json: " in said
+def test_a_run_that_is_none_is_one_line(tmp_path):
+    for text in ("[1]", "nul", '{"flags": [1]}'):
+        (tmp_path / "run.json").write_text(text)
+        assert "run.json: " in refused(
+            "experiments.export_weights", f"--workdir={tmp_path}"
+        )

@@ -5,8 +5,6 @@ import dataclasses
 import hashlib
 import json
 import math
-import os
-import stat
 import struct
 from types import SimpleNamespace
 
@@ -19,7 +17,6 @@ from hypothesis import strategies as st
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.export import (
-    WeightsError,
     decode_weights,
     load_weights,
     pack,
@@ -122,6 +119,8 @@ def test_same_input_same_bytes_whatever_the_order_of_keys(tmp_path):
     other = dataclasses.replace(
         weights, provenance=turned, loss={"leaky_rate": 0.05, "name": "rank"}
     )
+    other_order = tuple(map(np.asfortranarray, weights.kernels))
+    other = dataclasses.replace(other, kernels=other_order)
     first, second = tmp_path / "a.msgpack", tmp_path / "b.msgpack"
     reward = save(first, weights, *samples)
     save(second, other, *samples)
@@ -190,84 +189,72 @@ def test_a_reader_written_from_the_page_scores_the_samples(by_context):
     np.testing.assert_allclose(scored, values, rtol=1e-5, atol=1e-5)
 
 
-def test_arrays_in_another_memory_order_are_the_same_file():
-    weights = example_weights()
-    turned = tuple(np.asfortranarray(kernel) for kernel in weights.kernels)
-    other = dataclasses.replace(weights, kernels=turned)
-    assert pack(other, *example_samples(weights)) == packed()
-
-
 def test_schema_describes_the_body_and_refuses_others():
     path = spec_root() / "reward_weights.schema.json"
     schema = json.loads(path.read_text(encoding="utf-8"))
     jsonschema.Draft202012Validator.check_schema(schema)
     validator = jsonschema.Draft202012Validator(schema)
-    body = to_json(packed(hidden=(4, 2)))
-    validator.validate(body)
-    json.dumps(body, allow_nan=False)
+    kinds = ({"hidden": (4, 2)}, {"by_context": True}, {"seen": True})
+    body, gated, ranged = (to_json(packed(**kind)) for kind in kinds)
+    anchored = to_json(packed(anchored=True))
+    for made in (body, gated, ranged, anchored):
+        validator.validate(made)
+        json.dumps(made, allow_nan=False)
     gamma = np.frombuffer(base64.b64decode(body["gamma"]["data"]), "<f4")
     np.testing.assert_array_equal(gamma, example_weights(hidden=(4, 2)).gamma)
-    keys = set(reader.BODY_KEYS)
-    assert set(schema["required"]) == keys
-    assert set(schema["properties"]) == {*keys, "context", "seen", "anchor"}
-    gated = to_json(packed(by_context=True))
-    validator.validate(gated)
-    assert not validator.is_valid({**gated, "context": 1})
-    ranged = to_json(packed(by_context=True, seen=True))
-    validator.validate(ranged)
-    assert not validator.is_valid({**ranged, "seen": ranged["gamma"]})
-    anchored = to_json(packed(anchored=True))
-    validator.validate(anchored)
-    anchor = anchored["anchor"]
-    assert set(schema["properties"]["anchor"]["required"]) == set(reader.ANCHOR_KEYS)
-    assert set(schema["properties"]["anchor"]["properties"]) == set(reader.ANCHOR_KEYS)
-    for key in reader.ANCHOR_KEYS:
-        less = {k: v for k, v in anchor.items() if k != key}
-        for wrong in (less, {**anchor, key: True}, {**anchor, "extra": 1}):
-            assert not validator.is_valid({**anchored, "anchor": wrong})
-    less = {k: v for k, v in anchored.items() if k != "seen"}
-    assert not validator.is_valid(less)
-    assert schema["properties"]["activation"]["enum"] == sorted(ACTIVATIONS)
+    found, anchor = schema["properties"], schema["properties"]["anchor"]
+    assert set(schema["required"]) == set(reader.BODY_KEYS)
+    assert set(found) == {*reader.BODY_KEYS, "context", "seen", "anchor"}
+    assert set(anchor["required"]) == set(anchor["properties"])
+    assert set(anchor["required"]) == set(reader.ANCHOR_KEYS)
+    assert found["activation"]["enum"] == sorted(ACTIVATIONS)
+
+    def less(made, key):
+        return {k: v for k, v in made.items() if k != key}
+
+    wrong = [
+        {**gated, "context": 1}, {**ranged, "seen": ranged["gamma"]},
+        less(anchored, "seen"), {**body, "extra": 1},
+        {**body, "gamma": {**body["gamma"], "dtype": "<f8"}},
+    ]  # fmt: skip
     for key in reader.BODY_KEYS:
-        assert not validator.is_valid({k: v for k, v in body.items() if k != key})
-        assert not validator.is_valid({**body, key: True})
-    assert not validator.is_valid({**body, "extra": 1})
-    assert not validator.is_valid({**body, "gamma": {**body["gamma"], "dtype": "<f8"}})
+        wrong += [less(body, key), {**body, key: True}]
+    for key in reader.ANCHOR_KEYS:
+        box = anchored["anchor"]
+        others = (less(box, key), {**box, key: True}, {**box, "extra": 1})
+        wrong += [{**anchored, "anchor": other} for other in others]
+    assert not any(map(validator.is_valid, wrong))
+
+
+ENDLESS: dict = {}
+ENDLESS["self"] = ENDLESS
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        # what the reader says of the file that would be written
         ({"scale": np.array([1.0, 0.0, 1.0])}, "normaliser.scale[1]: 0: expected over"),
-        ({"lower": np.array([0.0, 99.0, 0.0])}, "normaliser.lower[1]: 99: expected at"),
-        ({"gamma": np.ones(5)}, "gamma.shape: [5]: expected [4]"),
         ({"gamma": np.array([1.0, 1.0, 1e39, 1.0])}, "gamma[2]: inf: expected finite"),
+        ({"preset": 3}, "preset: 3: expected a text"),
+        # what never becomes a file
+        ({"preset": object()}, "can not serialize"),
         ({"gamma": "many"}, "gamma: <U4: expected an array of numbers"),
         ({"gamma": [[1.0], [1.0, 2.0]]}, "gamma: setting an array element"),
-        ({"times": np.array([0.0, 1.0, 1.0, 2.0])}, "times[1]: 1: expected increasing"),
-        ({"times": np.arange(1.0, 5.0)}, "times[0]: 1: expected 0 s first"),
-        ({"activation": "gelu"}, "activation: gelu: expected one of tanh"),
         ({"biases": ()}, "biases: 0 biases: expected one for each kernel"),
-        ({"preset": 3}, "preset: 3: expected a text"),
-        ({"preset": object()}, "can not serialize"),
-        ({"features": ()}, "features: list of 0: expected a list of 1 to 64"),
-        ({"loss": {"name": "rank"}}, "loss.leaky_rate: missing: expected the keys"),
         ({"provenance": {}}, "provenance.dataset_sha256: missing: expected a value"),
-        (
-            {"provenance": {**provenance(), "metrics": {"fde": math.nan}}},
-            "provenance: nan: expected texts, finite numbers",
-        ),
-        (
-            {"provenance": {**provenance(), "seed": 2**70}},
-            "Integer value out of range",
-        ),
-        (
-            {"provenance": {**provenance(), "flags": {1: 2}}},
-            "provenance.flags: key 1: expected a text",
-        ),
-        (
-            {"provenance": {**provenance(), "flags": {"a": b"x"}}},
-            "provenance.flags.a: bytes: expected texts, numbers",
+        *(
+            ({"provenance": {**provenance(), **entry}}, message)
+            for entry, message in (
+                (
+                    {"metrics": {"fde": math.nan}},
+                    "provenance: nan: expected texts",
+                ),
+                ({"seed": 2**70}, "Integer value out of range"),
+                ({"flags": {1: 2}}, "provenance.flags: key 1: expected a text"),
+                ({"flags": {"a": b"x"}}, "provenance.flags.a: bytes: expected texts"),
+                ({"flags": ENDLESS}, "at most 8 levels"),
+            )
         ),
     ],
 )
@@ -285,15 +272,10 @@ def test_what_a_reader_would_refuse_is_never_written(changes, message, tmp_path)
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"incumbent": ""}, "anchor.incumbent: : expected a text"),
-        ({"low": -1.0}, "anchor.low: -1: expected at least 0"),
         ({"high": 0.1}, "anchor.high: 0.1: expected at least low, 0.25"),
         ({"high": [1.0]}, "anchor.high: list: expected texts, numbers"),
-        ({"scale": np.zeros(3)}, "anchor.scale[0]: 0: expected over 0"),
-        ({"kernel": np.ones((2, 4))}, "anchor.kernel.shape: [2, 4]: expected [3, "),
         ({"bias": "many"}, "anchor.bias: <U4: expected an array of numbers"),
         ({"out": np.ones(3)}, "anchor.out.shape: [3]: expected [4]"),
-        ({"offset": np.float32(0.0)}, "anchor.offset.shape: list of 0: expected [1]"),
         ({"high": 1e300}, "anchor.gain[0]: inf: expected finite numbers"),
     ],
 )
@@ -328,61 +310,6 @@ def test_samples_of_other_weights_are_refused():
         pack(weights, *none)
 
 
-def test_deep_or_endless_provenance_is_one_clear_line():
-    endless: dict = {}
-    endless["self"] = endless
-    weights = dataclasses.replace(
-        example_weights(), provenance={**provenance(), "flags": endless}
-    )
-    with pytest.raises(InputError, match="at most 8 levels"):
-        pack(weights, *example_samples(weights))
-
-
-def test_interrupted_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
-    path = tmp_path / "weights.msgpack"
-    weights = example_weights()
-    save(path, weights, *example_samples(weights))
-    before = path.read_bytes()
-    seen = []
-
-    def fail(source, target):
-        seen.append((source.parent, target, source.read_bytes()))
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "replace", fail)
-    other = example_weights(seed=8)
-    with pytest.raises(InputError, match="path: No space left on device: expected"):
-        save(path, other, *example_samples(other))
-    # The whole file was there, in the same folder, before it took the name.
-    assert seen == [(tmp_path, path, pack(other, *example_samples(other)))]
-    assert [item.name for item in tmp_path.iterdir()] == ["weights.msgpack"]
-    assert path.read_bytes() == before
-
-
-def test_file_and_folder_are_on_disk_before_save_returns(tmp_path, monkeypatch):
-    synced = []
-    real = os.fsync
-
-    def record(descriptor):
-        mode = os.fstat(descriptor).st_mode
-        synced.append("folder" if stat.S_ISDIR(mode) else "file")
-        real(descriptor)
-
-    monkeypatch.setattr(os, "fsync", record)
-    weights = example_weights()
-    save(tmp_path / "weights.msgpack", weights, *example_samples(weights))
-    assert synced == ["file", "folder"]
-    assert (tmp_path / "weights.msgpack").stat().st_mode & 0o077 == (
-        0o077 & 0o666 & ~_umask()
-    )
-
-
-def _umask():
-    mask = os.umask(0o022)
-    os.umask(mask)
-    return mask
-
-
 @pytest.mark.parametrize("where", ["folder", "file/weights"])
 def test_bad_places_are_one_line(tmp_path, where):
     (tmp_path / "folder").mkdir()
@@ -393,8 +320,3 @@ def test_bad_places_are_one_line(tmp_path, where):
     assert str(caught.value).startswith(f"{tmp_path / where}: path: ")
     assert "\n" not in str(caught.value)
     assert len(list(tmp_path.rglob("*"))) == 2
-
-
-def test_to_json_refuses_what_the_reader_refuses():
-    with pytest.raises(WeightsError, match="weights: size"):
-        to_json(b"")

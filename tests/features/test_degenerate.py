@@ -176,20 +176,14 @@ def test_slopes_by_parameters_are_finite(loss):
     for name, made in batches().items():
         grads, sums = take_sums(params, normaliser(), made, config)
         assert finite((grads, sums)), name
-        nothing = name == "all infeasible"
-        assert (float(sums.terms) == 0.0) == nothing
-        if nothing:
-            assert not any(np.asarray(x).any() for x in jax.tree.leaves(grads))
-
-
-def test_identical_candidates_tie():
-    """Nobody wins a comparison with itself, and the rank loss has no slope."""
-    config = TrainConfig(sampler=SMALL)
-    params = init_state(config, normaliser()).params
-    made = batches()["identical candidates"]
-    grads, sums = take_sums(params, normaliser(), made, config)
-    assert float(sums.wins) == pytest.approx(0.5 * float(sums.pairs), rel=1e-2)
-    assert max(np.abs(x).max() for x in jax.tree.leaves(grads)) < 1e-2
+        most = max(np.abs(x).max() for x in jax.tree.leaves(grads))
+        assert (float(sums.terms) == 0.0) == (name == "all infeasible")
+        if name == "all infeasible":
+            assert most == 0.0
+        if name == "identical candidates" and loss == "rank":
+            # nobody wins a comparison with itself, and there is no slope
+            assert float(sums.wins) == pytest.approx(0.5 * float(sums.pairs), rel=1e-2)
+            assert most < 1e-2
 
 
 # -------------------------------------------------------- the operator's oracle

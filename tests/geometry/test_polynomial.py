@@ -71,10 +71,7 @@ def test_tiny_durations_stay_finite(duration):
 @given(v0=speeds, v1=speeds, s1=st.floats(0, 200, width=32), d=durations)
 def test_hermite_is_that_of_scipy(v0, v1, s1, d):
     x = jnp.linspace(0.0, 1.0, 9)
-    ends, slopes = (
-        (jnp.float32(3.0), jnp.float32(s1)),
-        (jnp.float32(v0), jnp.float32(v1)),
-    )
+    ends, slopes = (tuple(map(jnp.float32, x)) for x in ((3.0, s1), (v0, v1)))
     expected = CubicHermiteSpline([0.0, d], [3.0, s1], [v0, v1])(np.linspace(0, d, 9))
     found = hermite(x, *ends, slopes, d)
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-3)

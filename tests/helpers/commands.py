@@ -72,6 +72,22 @@ def command(module, *flags):
         return subprocess.CompletedProcess((module, *flags), status, *said)
 
 
+def succeeded(module, *flags):
+    """The same, which has to end well."""
+    done = command(module, *flags)
+    assert done.returncode == 0, done.stdout[-500:] + done.stderr[-2000:]
+    return done
+
+
+def refused(module, *flags):
+    """The one line of a command that ends with status 2."""
+    done = command(module, *flags)
+    assert done.returncode == 2, done.stdout[-500:] + done.stderr[-2000:]
+    (line,) = done.stderr.strip().splitlines()
+    assert line.startswith("error: ")
+    return line
+
+
 def fresh(module, *flags, compiler=QUICKLY):
     """The same in an interpreter of its own, its compiler with these flags."""
     return subprocess.run(

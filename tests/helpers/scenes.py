@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rcirl_jax.sampling import sample
+from rcirl_jax.sampling import sample, trajectory_from_positions
 from rcirl_jax.types import (
     NUM_TAGS,
     Demonstration,
@@ -54,34 +54,24 @@ def scene(
     for slot, box in enumerate(boxes):
         centre = box["s"] + box.get("speed", 0.0) * TIMES_S
         half_s, half_l = 0.5 * box.get("length", 4.5), 0.5 * box.get("width", 1.8)
-        arrays["s_lower"][slot], arrays["s_upper"][slot] = (
-            centre - half_s,
-            centre + half_s,
-        )
-        arrays["l_lower"][slot] = box.get("l", 0.0) - half_l
-        arrays["l_upper"][slot] = box.get("l", 0.0) + half_l
+        for axis, middle, half in (
+            ("s", centre, half_s),
+            ("l", box.get("l", 0.0), half_l),
+        ):
+            arrays[f"{axis}_lower"][slot] = middle - half
+            arrays[f"{axis}_upper"][slot] = middle + half
         speed[slot] = box.get("speed", 0.0)
         valid[slot] = box.get("valid", True)
         kind[slot] = box.get("kind", Kind.VEHICLE)
     full = lambda value: jnp.broadcast_to(_f(value), (P,))  # noqa: E731
     return Scene(
         ego=Ego(
-            s=_f(0.0),
-            l=_f(l),
-            dl=_f(0.0),
-            ddl=_f(0.0),
-            v=_f(v),
-            a=_f(a),
-            length=_f(4.9),
-            width=_f(2.0),
+            s=_f(0.0), l=_f(l), dl=_f(0.0), ddl=_f(0.0), v=_f(v), a=_f(a),
+            length=_f(4.9), width=_f(2.0),
         ),
         path=Path(
-            kappa=full(kappa),
-            l=full(path_l),
-            speed_limit=full(speed_limit),
-            lane_left=full(1.8),
-            lane_right=full(-1.8),
-            road_left=full(5.4),
+            kappa=full(kappa), l=full(path_l), speed_limit=full(speed_limit),
+            lane_left=full(1.8), lane_right=full(-1.8), road_left=full(5.4),
             road_right=full(-5.4),
         ),
         obstacles=Obstacles(
@@ -94,7 +84,7 @@ def scene(
         ),
         time_valid=jnp.arange(T) < num_valid,
         tags=jnp.zeros(NUM_TAGS, bool),
-    )
+    )  # fmt: skip
 
 
 def random_scene(seed):
@@ -144,8 +134,6 @@ def batch(scenes):
 
 def demonstration(seed):
     """A demonstration with a random human in a random scene (numpy leaves)."""
-    from rcirl_jax.sampling import trajectory_from_positions
-
     made = random_scene(seed)
     human: Trajectory = trajectory_from_positions(made, *random_positions(seed, made))
     rows = Demonstration(

@@ -106,77 +106,64 @@ def packed(**changes):
 
 
 def loop_value(weights, features, valid):
-    """V by plain float64 loops, from the equation and nothing else."""
+    """V by a float64 loop over the times, from the equation and nothing else."""
     act = {
-        "tanh": math.tanh,
-        "relu": lambda x: x if x > 0.0 else 0.0,
-        "leaky_relu": lambda x: x if x > 0.0 else float(weights.leaky_slope) * x,
+        "tanh": np.tanh,
+        "relu": lambda x: np.where(x > 0.0, x, 0.0),
+        "leaky_relu": lambda x: np.where(x > 0.0, x, float(weights.leaky_slope) * x),
         "identity": lambda x: x,
     }[weights.activation]
-    count = len(weights.features)
-
-    def normalised(t):
-        x = []
-        for f in range(count):
-            clipped = max(float(features[t, f]), float(weights.lower[f]))
-            clipped = min(clipped, float(weights.upper[f]))
-            x.append((clipped - float(weights.location[f])) / float(weights.scale[f]))
-        return x
-
-    gain, first = [1.0] * count, normalised(0)
+    lower, upper, location, scale = (
+        np.asarray(getattr(weights, name), np.float64) for name in reader.RANGES
+    )
+    rows = (np.clip(np.float64(features), lower, upper) - location) / scale
     if weights.context is not None:
-        for f in range(count):
-            sums = [first[i] * float(weights.context[i, f]) for i in range(count)]
-            gain[f] = 2.0 / (1.0 + math.exp(-sum(sums)))
-    total = 0.0
-    for t in range(len(weights.times)):
-        x = [g * v for g, v in zip(gain, normalised(t), strict=True)]
-        for layer in range(len(weights.kernels)):
-            kernel, bias = weights.kernels[layer], weights.biases[layer]
-            y = []
-            for column in range(kernel.shape[1]):
-                start = float(bias[column])
-                products = [
-                    x[row] * float(kernel[row, column]) for row in range(len(x))
-                ]
-                y.append(start + sum(products))
-            last = layer == len(weights.kernels) - 1
-            x = y if last else [act(item) for item in y]
-        total += float(weights.gamma[t]) * x[0] if valid[t] else 0.0
+        rows = rows * 2.0 / (1.0 + np.exp(-rows[0] @ np.float64(weights.context)))
+    total, last = 0.0, len(weights.kernels) - 1
+    for t in np.flatnonzero(valid):
+        x = rows[t]
+        for layer in range(last + 1):
+            x = x @ np.float64(weights.kernels[layer]) + weights.biases[layer]
+            x = x if layer == last else act(x)
+        total += float(weights.gamma[t]) * x[0]
     return total
 
 
 def loop_gain(anchor, first):
-    """The gain of V by plain float64 loops; `first` is [F]."""
-    total = float(anchor.offset[0])
-    for unit in range(len(anchor.bias)):
-        x = float(anchor.bias[unit])
-        for f in range(len(first)):
-            z = (float(first[f]) - float(anchor.location[f])) / float(anchor.scale[f])
-            x += max(-5.0, min(5.0, z)) * float(anchor.kernel[f, unit])
-        total += float(anchor.out[unit]) * math.tanh(x)
-    return anchor.low + (anchor.high - anchor.low) / (1.0 + math.exp(-total))
+    """The gain of V in float64; `first` is [F]."""
+    z = np.clip((np.float64(first) - anchor.location) / anchor.scale, -5.0, 5.0)
+    x = np.tanh(z @ np.float64(anchor.kernel) + anchor.bias) @ np.float64(anchor.out)
+    return anchor.low + (anchor.high - anchor.low) / (
+        1.0 + math.exp(-x - anchor.offset[0])
+    )
+
+
+SPECS = feature_map("paper21").specs
+LOWER = np.array([spec.lower for spec in SPECS], np.float32)
+UPPER = np.array([spec.upper for spec in SPECS], np.float32)
+
+
+def of_the_preset(made, **changes):
+    """Weights that read the features of the paper's preset at the usual times."""
+    features = tuple(
+        FeatureSpec(name=s.name, unit=s.unit, none_value=s.none) for s in SPECS
+    )
+    own = {"preset": "paper21", "times": TIMES_S, "leaky_slope": LEAKY_SLOPE}
+    own |= {"lower": LOWER, "upper": UPPER, "features": features}
+    return dataclasses.replace(made, **{**own, **changes})
 
 
 def random_weights(path, seed=2):
     """A file of the paper's shape, 21-15-1, that every main accepts."""
-    rng, specs = np.random.default_rng(seed), feature_map("paper21").specs
-    made = example_weights(features=len(specs), times=TIMES_S.size, hidden=(15,))
-    made = dataclasses.replace(
+    made = example_weights(features=len(SPECS), times=TIMES_S.size, hidden=(15,))
+    made = of_the_preset(
         made,
-        preset="paper21",
-        features=tuple(
-            FeatureSpec(name=s.name, unit=s.unit, none_value=s.none) for s in specs
-        ),
-        lower=np.array([s.lower for s in specs]),
-        upper=np.array([s.upper for s in specs]),
-        location=np.array([0.5 * (s.lower + s.upper) for s in specs]),
-        scale=np.array([0.3 * (s.upper - s.lower) for s in specs]),
-        times=TIMES_S,
-        leaky_slope=LEAKY_SLOPE,
+        location=0.5 * (LOWER + UPPER),
+        scale=0.3 * (UPPER - LOWER),
         biases=(*made.biases[:-1], np.zeros(1, np.float32)),  # as training leaves it
     )
-    x = rng.normal(size=(3, TIMES_S.size, len(specs))).astype(np.float32)
+    shape = (3, TIMES_S.size, len(SPECS))
+    x = np.random.default_rng(seed).normal(size=shape).astype(np.float32)
     valid = np.ones(x.shape[:2], bool)
     values = [loop_value(made, *one) for one in zip(x, valid, strict=True)]
     save(path, made, x, valid, np.array(values))
@@ -185,45 +172,34 @@ def random_weights(path, seed=2):
 
 def trained_network(hidden, activation, by_context, count):
     """Effective weights of a random network, inputs, masks and the trainer's values."""
-    specs, rng = feature_map("paper21").specs, np.random.default_rng(3)
-    lower = np.array([spec.lower for spec in specs], np.float32)
-    upper = np.array([spec.upper for spec in specs], np.float32)
+    rng, size = np.random.default_rng(3), len(SPECS)
     normaliser = Normaliser(
-        lower=jnp.asarray(lower),
-        upper=jnp.asarray(upper),
-        location=jnp.asarray(rng.uniform(lower, upper), jnp.float32),
-        scale=jnp.asarray(0.2 * (upper - lower)),
+        lower=jnp.asarray(LOWER),
+        upper=jnp.asarray(UPPER),
+        location=jnp.asarray(rng.uniform(LOWER, UPPER), jnp.float32),
+        scale=jnp.asarray(0.2 * (UPPER - LOWER)),
     )
     context = feature_map("paper21").context if by_context else ()
     config = RewardConfig(hidden=hidden, activation=activation, context=context)
-    raw = init_reward(jax.random.key(5), len(specs), config)
+    raw = init_reward(jax.random.key(5), size, config)
     raw = raw.replace(gamma=jnp.asarray(rng.normal(size=18), jnp.float32))
     if by_context:
-        drawn = rng.normal(scale=0.2, size=(len(specs),) * 2)
+        drawn = rng.normal(scale=0.2, size=(size, size))
         raw = raw.replace(context=jnp.asarray(drawn, jnp.float32))
     effective = pinned(raw, config)
-    wide = 0.5 * (upper - lower)
-    features = rng.uniform(lower - wide, upper + wide, (count, 18, len(specs)))
+    wide = 0.5 * (UPPER - LOWER)
+    features = rng.uniform(LOWER - wide, UPPER + wide, (count, 18, size))
     features = features.astype(np.float32)
     valid = np.arange(18) < rng.integers(11, 19, (count, 1))
-    expected = np.asarray(
-        trained_value(
-            raw, normaliser, jnp.asarray(features), jnp.asarray(valid), config
-        )
-    )
-    weights = dataclasses.replace(
+    x, mask = jnp.asarray(features), jnp.asarray(valid)
+    expected = np.asarray(trained_value(raw, normaliser, x, mask, config))
+    weights = of_the_preset(
         example_weights(),
-        features=tuple(
-            FeatureSpec(name=spec.name, unit=spec.unit, none_value=spec.none)
-            for spec in specs
-        ),
         **{name: getattr(normaliser, name) for name in reader.RANGES},
-        times=TIMES_S,
         gamma=effective.gamma,
         context=effective.context,
         kernels=effective.kernels,
         biases=(*effective.biases, np.zeros(1)),
         activation=activation,
-        leaky_slope=LEAKY_SLOPE,
     )
     return weights, features, valid, expected

@@ -23,7 +23,8 @@ from rcirl_jax.export import (
     load_weights,
     save,
 )
-from tests.export import test_old_files, test_reader
+from tests.export import test_old_files, wrong
+from tests.export.test_reader import refusal
 from tests.helpers.weights_files import (
     example_samples,
     example_weights,
@@ -93,12 +94,18 @@ def is_valid(data):
 # ------------------------------------------------------------------------ scores
 
 
-def trained_file(path, hidden, activation, by_context):
-    """A file of a random network, with 10,000 inputs, masks and JAX's values."""
-    made = trained_network(hidden, activation, by_context, 10_000)
-    weights, features, valid, expected = made
-    reward = save(path, weights, features[:16], valid[:16], expected[:16])
-    return reward, features, valid, expected
+def scores(programs, kind, path, *arrays):
+    """What the C++ reader makes of arrays, float32."""
+    files = []
+    for number, array in enumerate(arrays):
+        files.append(path.with_name(str(number)))
+        as_bytes = np.uint8 if array.dtype == bool else np.float32
+        array.astype(as_bytes).tofile(files[-1])
+    return np.frombuffer(run(programs / "reader", kind, path, *files), np.float32)
+
+
+def assert_close(found, expected):
+    assert np.all(np.abs(found - expected) <= 1e-5 * np.maximum(1.0, np.abs(expected)))
 
 
 @pytest.mark.parametrize(
@@ -119,20 +126,15 @@ def test_ten_thousand_scores_equal_python_and_jax(
     programs, tmp_path, hidden, activation, by_context
 ):
     path = tmp_path / "weights.msgpack"
-    reward, features, valid, jax_values = trained_file(
-        path, hidden, activation, by_context
-    )
-    features.tofile(tmp_path / "features")
-    valid.astype(np.uint8).tofile(tmp_path / "valid")
-    command = (programs / "reader", "score", path, tmp_path / "features")
-    for mask in ((), (tmp_path / "valid",)):
-        found = np.frombuffer(run(*command, *mask), np.float32)
-        expected = reward.value(features, valid if mask else None)
-        close = 1e-5 * np.maximum(1.0, np.abs(expected))
-        assert np.ptp(expected) > 0.1
-        assert np.all(np.abs(found - expected) <= close)
-        if mask:
-            assert np.all(np.abs(found - jax_values) <= close)
+    made = trained_network(hidden, activation, by_context, 10_000)
+    weights, features, valid, jax_values = made
+    reward = save(path, weights, features[:16], valid[:16], jax_values[:16])
+    found = scores(programs, "score", path, features)
+    assert np.ptp(found) > 0.1
+    assert_close(found, reward.value(features))
+    found = scores(programs, "score", path, features, valid)
+    assert_close(found, reward.value(features, valid))
+    assert_close(found, jax_values)
 
 
 def test_ten_thousand_totals_equal_python(programs, tmp_path):
@@ -143,15 +145,10 @@ def test_ten_thousand_totals_equal_python(programs, tmp_path):
     features[:9999].reshape(-1, 3, 4, 21)[:, 1, 0] = features[:9999:3, 0]  # alike
     valid = np.arange(4) < rng.integers(1, 5, (10_000, 1))
     own = rng.normal(scale=5.0, size=10_000).astype(np.float32)
-    for name, data in (("x", features), ("own", own), ("valid", np.uint8(valid))):
-        data.tofile(tmp_path / name)
-    command = (programs / "reader", "total", path, tmp_path / "x", tmp_path / "own")
-    for mask in ((), (tmp_path / "valid",)):
-        found = np.frombuffer(run(*command, *mask), np.float32)
-        expected = reward.total(features, own, valid if mask else None)
-        assert np.ptp(expected) > 1.0
-        close = 1e-5 * np.maximum(1.0, np.abs(expected))
-        assert np.all(np.abs(found - expected) <= close)
+    for mask in ((), (valid,)):
+        found = scores(programs, "total", path, features, own, *mask)
+        assert np.ptp(found) > 1.0
+        assert_close(found, reward.total(features, own, *mask))
 
 
 def test_ten_thousand_gains_equal_python(programs, tmp_path):
@@ -169,10 +166,7 @@ def test_ten_thousand_gains_equal_python(programs, tmp_path):
     features[::50, 0, 3] = rng.choice([-np.inf, np.inf, 3e38], 200)
     features[::70, 0, 0] = np.nan  # does not matter to the gain, but to V
     features[::40, 0, 5] = np.nan
-    features.tofile(tmp_path / "x")
-    np.zeros(10_000, np.float32).tofile(tmp_path / "own")
-    command = (programs / "reader", "total", path, tmp_path / "x", tmp_path / "own")
-    found = np.frombuffer(run(*command), np.float32)
+    found = scores(programs, "total", path, features, np.zeros(10_000))
     none = np.isnan(features[:, 0]).any(axis=1)
     np.testing.assert_array_equal(np.isneginf(found), none)
     expected = reward.gain(features[~none])
@@ -182,13 +176,9 @@ def test_ten_thousand_gains_equal_python(programs, tmp_path):
 
 @pytest.mark.parametrize("version", [1, 2, 3, 4])
 def test_an_old_file_scores_as_it_did(programs, tmp_path, version):
-    path, features, valid, expected = test_old_files.golden(version)
-    features.astype(np.float32).tofile(tmp_path / "features")
-    valid.astype(np.uint8).tofile(tmp_path / "valid")
-    command = (programs / "reader", "score", path)
-    bytes_out = run(*command, tmp_path / "features", tmp_path / "valid")
-    found = np.frombuffer(bytes_out, np.float32)
-    assert np.all(np.abs(found - expected) <= 1e-5 * np.maximum(1.0, np.abs(expected)))
+    golden, features, valid, expected = test_old_files.golden(version)
+    path = shutil.copy(golden, tmp_path / "weights.msgpack")
+    assert_close(scores(programs, "score", path, features, valid), expected)
 
 
 @pytest.mark.parametrize("data", [VALID, GATED, RANGED, BOTH, ANCHORED])
@@ -277,7 +267,7 @@ def test_damaged_files_are_refused_with_one_line(programs, tmp_path):
     files = [VALID[:length] for length in range(0, len(VALID), 3)]
     for _ in range(2000):
         bits = rng.integers(0, 8 * len(GATED), rng.integers(1, 9))
-        files.append(test_reader.flipped(GATED, set(bits.tolist())))
+        files.append(wrong.flipped(GATED, set(bits.tolist())))
     files += [rng.bytes(int(size)) for size in rng.integers(1, 200, 500)]
     files.append(VALID.replace(b"sha256\xd9\x40", b"sha256\xd9\x40" + b"0" * 64)[:-64])
     for line in verdicts(programs, files, tmp_path):
@@ -289,30 +279,15 @@ def test_damaged_files_are_refused_with_one_line(programs, tmp_path):
 
 
 def test_wrong_fields_are_named_as_by_the_python_reader(programs, tmp_path):
-    """The cases of the Python reader's own tests."""
-    fields = [
-        test_reader.tampered(path, value)
-        for path, value, _ in _cases(test_reader.test_a_wrong_field_is_named)
-    ]
-    fields += [
-        test_reader.tampered(["anchor", *path], value, test_reader.ANCHORED)
-        for path, value, _ in _cases(test_reader.test_a_wrong_anchor_is_named)
-    ]
-    files = [data for data, _ in _cases(test_reader.test_a_wrong_file_is_refused)]
-    assert len(fields) > 80
-    assert len(files) > 20
-    lines = verdicts(programs, fields + files, tmp_path)
-    later = "schema_version: 5: expected 1, 2, 3 or 4, all this reader supports"
-    assert f"w: {later}" in lines
-    for data, line in zip(fields + files, lines, strict=True):
-        field = test_reader.refusal(data).split(": ")[0]
+    files = [wrong.tampered(path, value) for path, value, _ in wrong.FIELDS]
+    files += [data for data, _ in wrong.FILES]
+    lines = verdicts(programs, files, tmp_path)
+    assert f"w: {wrong.LATER}" in lines
+    for data, line in zip(files, lines, strict=True):
+        field = refusal(data).split(": ")[0]
         # The Python reader counts times that do not increase from the second one.
         place = "times[1]" if "increasing" in line else field
         assert line.startswith(f"w: {place}: ")
-
-
-def _cases(test):
-    return next(mark.args[1] for mark in test.pytestmark if mark.name == "parametrize")
 
 
 def test_bodies_changed_and_hashed_again_get_the_verdict_of_the_python_reader(
@@ -335,7 +310,7 @@ def test_bodies_changed_and_hashed_again_get_the_verdict_of_the_python_reader(
                         del changed[at]
                     case _:
                         changed.insert(at, int(rng.integers(0, 256)))
-            files.append(test_reader.sealed(bytes(changed), schema_version=version))
+            files.append(wrong.sealed(bytes(changed), schema_version=version))
     expected = [is_valid(data) for data in files]
     assert 100 < sum(expected) < len(files) - 1000
     found = [line == "ok" for line in verdicts(programs, files, tmp_path)]
@@ -353,8 +328,8 @@ def test_huge_lengths_and_deep_nesting_cost_nothing(programs, tmp_path):
     bombs += [b"\x91" * 10**6, b"\xdc\x0f\xff" * 10**5, b"\xdc\x10\0" + b"\x90" * 4096]
     bombs += [b"\xdc\x10\0" + (b"\xdc\x10\0" + b"\0" * 4096) * 4096]
     size = {"shape": [4096, 4096], "dtype": "<f4", "data": b""}
-    bombs += [test_reader.sealed(bomb) for bomb in bombs]
-    bombs.append(test_reader.tampered(["layers", 0, "kernel"], size))
+    bombs += [wrong.sealed(bomb) for bomb in bombs]
+    bombs.append(wrong.tampered(["layers", 0, "kernel"], size))
     for line in verdicts(programs, bombs, tmp_path):
         assert line.startswith("w: ")
         assert len(line) < 400

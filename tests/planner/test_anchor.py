@@ -85,10 +85,6 @@ def test_an_anchored_file_drives_anchored(tmp_path, monkeypatch):
     assert float(rows[0].params.high) == 2.0
     with pytest.raises(InputError, match="without an anchor"):
         table_rows([path], [], dp=True)
-
-
-def test_another_own_cost_is_not_known_here(tmp_path):
-    reward = anchored(open_reward(str(random_weights(tmp_path / "w.msgpack"))), 0.0)
     assert reward.anchor is not None
     other = dataclasses.replace(reward.anchor, incumbent="mine")
     with pytest.raises(InputError, match=r"anchor\.incumbent: mine"):

@@ -75,20 +75,18 @@ def scene_of(seed):
 
 
 @pytest.mark.parametrize("by_context", [False, True])
-@pytest.mark.parametrize("seed", range(12))
-def test_value_of_the_plan_is_the_networks_own(seed, by_context):
-    made, own = scene_of(seed), weights(seed, by_context)
-    plan = planner(MIDDLE)(made, own)
-    if not bool(plan.feasible):
-        assert float(plan.value) < -1e4
-        return
-    again = float(network_value(made, plan.trajectory, own))
-    assert float(plan.value) == pytest.approx(again, rel=1e-4, abs=1e-4)
-
-
-def test_some_of_these_scenes_are_feasible_and_have_obstacles_in_the_way():
-    plans = [planner(MIDDLE)(scene_of(s), weights(s)) for s in range(12)]
-    assert sum(bool(plan.feasible) for plan in plans) >= 8
+def test_value_of_the_plan_is_the_networks_own(by_context):
+    feasible = 0
+    for seed in range(12):
+        made, own = scene_of(seed), weights(seed, by_context)
+        plan = planner(MIDDLE)(made, own)
+        feasible += bool(plan.feasible)
+        again = float(network_value(made, plan.trajectory, own))
+        if bool(plan.feasible):
+            assert float(plan.value) == pytest.approx(again, rel=1e-4, abs=1e-4)
+        else:
+            assert float(plan.value) < -1e4
+    assert feasible >= 8
 
 
 def free(made):

@@ -43,10 +43,8 @@ def dense_contact(made, x, steps=40):
         right, left = np.asarray(o.l_lower[n]), np.asarray(o.l_upper[n])
         s, l = np.asarray(x.s), np.asarray(x.l)
         middle, across = 0.5 * (low + high), 0.5 * (right + left)
-        if (
-            middle[0] < s[0]
-            and abs(across[0] - l[0]) < half_l[0] + (left - right)[0] / 2
-        ):
+        beside = abs(across[0] - l[0]) >= half_l[0] + (left - right)[0] / 2
+        if middle[0] < s[0] and not beside:
             continue
         for i in range(17):
             if not (o.valid[n, i] and o.valid[n, i + 1]):
@@ -54,11 +52,10 @@ def dense_contact(made, x, steps=40):
             u = np.linspace(0, 1, steps)
             at = lambda a, i=i, u=u: a[i] + u * (a[i + 1] - a[i])  # noqa: E731
             wide = lambda a, i=i: max(a[i], a[i + 1])  # noqa: E731
-            near_s = np.abs(at(middle) - at(s)) <= wide(half_s) + wide((high - low) / 2)
-            near_l = np.abs(at(across) - at(l)) <= wide(half_l) + wide(
-                (left - right) / 2
-            )
-            if np.any(near_s & near_l):
+            reach_s = wide(half_s) + wide((high - low) / 2)
+            reach_l = wide(half_l) + wide((left - right) / 2)
+            near_s = np.abs(at(middle) - at(s)) <= reach_s
+            if np.any(near_s & (np.abs(at(across) - at(l)) <= reach_l)):
                 return TIMES_S[i]
     return np.inf
 

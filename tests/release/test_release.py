@@ -23,6 +23,7 @@ VERSIONS = ("3.11.7", "3.12.1", "3.13.0", "3.14.0")
 PIN = re.compile(
     r"^([\w.-]+)==(\S+)(?: ; ([^\\\n]+?))?((?: \\\n    --hash=\S+)+)$", re.M
 )
+HASH = re.compile(r"sha256:[0-9a-f]{64} ?\\?\n?\s*")
 
 
 def pins(name):
@@ -52,14 +53,14 @@ def asked(extra, environment):
             yield requirement
 
 
-@pytest.mark.parametrize("file", LOCKS, ids=lambda file: file.stem)
-def test_locked_files_have_hashes_and_no_place(file):
-    text = file.read_text()
-    assert "://" not in text
-    assert "--only-binary :all:" in text
-    for requirement, hashes in pins(file.stem):
-        assert hashes, requirement
-        assert all(re.fullmatch(r"sha256:[0-9a-f]{64} ?\\?\n?\s*", h) for h in hashes)
+def test_locked_files_have_hashes_and_no_place():
+    for file in LOCKS:
+        text = file.read_text()
+        assert "://" not in text
+        assert "--only-binary :all:" in text
+        for requirement, hashes in pins(file.stem):
+            assert hashes, requirement
+            assert all(HASH.fullmatch(h) for h in hashes), requirement
 
 
 def locked_for(name, version):
@@ -81,22 +82,17 @@ def locked_for(name, version):
     ("name", "extra"), [("all", "all"), ("test", "test"), ("floor", "quick")]
 )
 def test_what_the_project_asks_for_is_locked_once(name, extra, version):
+    """The floor is the lowest allowed on the oldest Python, as newer have no wheels."""
     locked, environment = locked_for(name, version)
     wanted = list(asked(extra, environment))
     assert len(wanted) > 15
     for requirement in wanted:
         found = locked[canonicalize_name(requirement.name)]
         assert requirement.specifier.contains(found), f"{requirement}: {found}"
+        if (name, version) == ("floor", VERSIONS[0]):
+            (bound,) = (s.version for s in requirement.specifier if s.operator == ">=")
+            assert Version(found) == Version(bound), requirement
     assert {"hatchling", "editables"} <= locked.keys()
-
-
-def test_the_floor_is_the_lowest_that_is_allowed():
-    """On the oldest Python; newer ones have no wheels of some."""
-    locked, environment = locked_for("floor", VERSIONS[0])
-    for requirement in asked("quick", environment):
-        (bound,) = (s.version for s in requirement.specifier if s.operator == ">=")
-        found = locked[canonicalize_name(requirement.name)]
-        assert Version(found) == Version(bound), requirement
 
 
 def test_users_get_the_versions_that_are_tested():
@@ -106,47 +102,40 @@ def test_users_get_the_versions_that_are_tested():
 
 # -------------------------------------------------------------------- advisories
 
-ANSWERS = {
-    "clean": [{"name": "numpy", "version": "2.0.0", "vulns": []}],
-    "flawed": [
-        {
-            "name": "numpy",
-            "version": "2.0.0",
-            "vulns": [{"id": "X-1", "fix_versions": ["2.0.1"]}],
-        }
-    ],
-    "silent": [{"name": "numpy", "version": "2.0.0", "skip_reason": "not there"}],
-    "broken": None,
-}
+KNOWN = {"vulns": [{"id": "X-1", "fix_versions": ["2.0.1"]}]}
 
 
 @pytest.mark.parametrize(
     ("answer", "status", "said"),
     [
-        ("clean", 0, "audit: 1 locked versions, no known vulnerability"),
-        ("flawed", 1, "numpy 2.0.0: X-1, fixed in 2.0.1"),
-        ("silent", 2, "error: audit: 1 of 1 locked versions not audited"),
-        ("broken", 2, "pip-audit: no such host"),
+        ({"vulns": []}, 0, "audit: 1 locked versions, no known vulnerability"),
+        (KNOWN, 1, "numpy 2.0.0: X-1, fixed in 2.0.1"),
+        (
+            {"skip_reason": "none"},
+            2,
+            "error: audit: 1 of 1 locked versions not audited",
+        ),
+        (None, 2, "pip-audit: no such host"),
     ],
 )
 def test_an_audit_that_nobody_answers_is_not_passed(tmp_path, answer, status, said):
     """With a pip-audit of our own making beside the Python."""
-    body = ANSWERS[answer]
-    told = "" if body is None else json.dumps({"dependencies": body})
-    tool = tmp_path / "pip-audit"
+    told = ""
+    if answer is not None:
+        numpy = {"name": "numpy", "version": "2.0.0", **answer}
+        told = json.dumps({"dependencies": [numpy]})
+    tool, lock = tmp_path / "pip-audit", tmp_path / "a.lock"
     tool.write_text(f"#!/bin/sh\necho 'no such host' >&2\necho '{told}'\n")
     tool.chmod(0o755)
     (tmp_path / "python").symlink_to(sys.executable)
-    lock = tmp_path / "a.lock"
     lock.write_text("numpy==2.0.0 ; python_version < '3.12' \\\n    --hash=sha256:0\n")
     done = subprocess.run(
         [tmp_path / "python", REPO / ".ci" / "audit.py", lock],
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == status, done.stderr
-    lines = (done.stdout + done.stderr).splitlines()
-    assert len(lines) == 1
-    assert said in lines[0]
+    (line,) = (done.stdout + done.stderr).splitlines()
+    assert said in line
 
 
 # ------------------------------------------------------------------------- wheel
@@ -196,14 +185,14 @@ def commit_of(root, monkeypatch):
     return common.git_commit()
 
 
-def test_the_commit_is_the_checkouts(repository, monkeypatch):
+def test_the_commit_is_the_checkouts_that_knows_the_package(repository, monkeypatch):
     head = git(repository, "rev-parse", "HEAD")
     assert commit_of(repository, monkeypatch) == head
     (repository / "experiments" / "common.py").write_text("2")
     assert commit_of(repository, monkeypatch) == head + "+"
-
-
-def test_an_installed_package_reports_no_other_repository(repository, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "which", lambda name: None)
+        assert commit_of(repository, patch) == ""
     inside = repository / "venv" / "site-packages"
     inside.mkdir(parents=True)
     assert commit_of(inside, monkeypatch) == ""
@@ -217,9 +206,4 @@ def test_a_package_put_beside_the_files_of_another_repository(repository, monkey
     git(repository, "commit", "--quiet", "--message=second")
     (repository / "experiments").mkdir()
     (repository / "experiments" / "common.py").write_text("1")
-    assert commit_of(repository, monkeypatch) == ""
-
-
-def test_no_git_is_no_commit(repository, monkeypatch):
-    monkeypatch.setattr(shutil, "which", lambda name: None)
     assert commit_of(repository, monkeypatch) == ""

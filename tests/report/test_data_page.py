@@ -1,10 +1,7 @@
 """The page of a dataset: complete, self-contained, safe, and true to the manifest."""
 
 import re
-import subprocess
-import sys
 from html.parser import HTMLParser
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -17,8 +14,8 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.report.data.page import TAG_NAMES, choose_rows, write_data_page
 from rcirl_jax.types import Tag
 from tests.data.small_logs import CONFIG, write_logs
+from tests.helpers.commands import refused, succeeded
 
-REPO = Path(__file__).resolve().parents[2]
 FACTS = {"git_commit": "abc", "versions": {"jax": "1"}, "flags": {"scenes": 3}}
 HOSTILE = '"><script>alert(1)</script><img src=x onerror=alert(2)>'
 
@@ -139,39 +136,25 @@ def test_chosen_rows_cover_the_tags_and_are_the_same_each_time():
     assert choose_rows(tags[:3], 24) == [0, 1, 2]
 
 
-@pytest.mark.parametrize(
-    ("wanted", "line"),
-    [
-        (["turnig"], r"--tags: turnig: expected stopping, "),
-        (["standing"], r"--tags: standing: no such scene in the dataset"),
-    ],
-)
-def test_a_tag_that_nobody_has_is_one_line(wanted, line):
-    with pytest.raises(InputError, match=line):
-        choose_rows(np.zeros((9, len(Tag)), bool), 5, wanted)
-
-
-def test_rows_beyond_the_end_are_one_line(dataset, tmp_path):
-    with pytest.raises(InputError, match=r"--rows: 100000: expected 0 to \d+"):
-        write_data_page(tmp_path / "a.html", dataset, [100000], "Dataset a", FACTS)
+def test_what_there_is_not_is_one_line(dataset, tmp_path):
+    none = np.zeros((9, len(Tag)), bool)
+    for work, line in (
+        (lambda: choose_rows(none, 5, ["turnig"]), "turnig: expected stopping, "),
+        (lambda: choose_rows(none, 5, ["standing"]), "standing: no such scene in the"),
+        (lambda: write_data_page(tmp_path / "a.html", dataset, [10**6], "a", FACTS),
+         r"--rows: 1000000: expected 0 to \d+"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=line):
+            work()
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.multiprocess
 def test_by_command(dataset, tmp_path):
-    def inspect(*flags):
-        return subprocess.run(
-            [sys.executable, "-m", "experiments.inspect_data", *flags,
-             f"--data={dataset._files.folder}", f"--output={tmp_path / 'out'}"],
-            capture_output=True, text=True, check=False, cwd=REPO,
-        )  # fmt: skip
-
-    bad = inspect("--rows=1,two")
-    assert bad.returncode == 2
-    assert bad.stderr.strip().endswith("expected row numbers")
+    flags = (f"--data={dataset._files.folder}", f"--output={tmp_path / 'out'}")
+    line = refused("experiments.inspect_data", *flags, "--rows=1,two")
+    assert line.endswith("expected row numbers")
     assert not (tmp_path / "out").exists()
-    done = inspect("--rows=1,2")
-    assert done.returncode == 0, done.stderr
-    assert "page: " in done.stdout
+    succeeded("experiments.inspect_data", *flags, "--rows=1,2")
     names = sorted(path.name for path in (tmp_path / "out" / "scenes").iterdir())
     assert names == ["scene0000001.png", "scene0000002.png"]

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from rcirl_jax.report.player.drive import plan_start, road_in_plane, worst_step
 from rcirl_jax.simulation.cases import STEP_S, Record, Snapshot
 from rcirl_jax.units import TIMES_S
-from tests.helpers.commands import command
+from tests.helpers.commands import succeeded
 from tests.helpers.weights_files import random_weights
 
 STEPS = 200
@@ -37,14 +37,9 @@ def drive(*, crash=False, planned=1):
     made = (np.arange(STEPS) // planned) * planned
     begin = np.append(0.0, s)[made]
     record = blank(
-        Record,
-        valid=valid,
-        s=s,
-        a=np.sin(time),
-        clearance=clearance,
-        collision=collision,
-        at_fault=collision,
-    )
+        Record, valid=valid, s=s, a=np.sin(time), clearance=clearance,
+        collision=collision, at_fault=collision,
+    )  # fmt: skip
     return record, blank(Snapshot, plan_s=begin[:, None] + 11.0 * TIMES_S[None])
 
 
@@ -65,20 +60,11 @@ def test_road_in_plane_against_an_integrator():
     grid = np.arange(200) * 2.0
     kappa = 0.02 * np.sin(grid / 30.0)
     x, y, heading = road_in_plane(kappa)
-    bend = lambda s, z: (  # noqa: E731
-        np.cos(z[2]),
-        np.sin(z[2]),
-        np.interp(s, grid, kappa),
-    )
+    bend = lambda s, z: (np.cos(z[2]), np.sin(z[2]), np.interp(s, grid, kappa))  # noqa: E731
     truth = solve_ivp(
-        bend,
-        (0.0, grid[-1]),
-        (0.0, 0.0, 0.0),
-        t_eval=grid,
-        rtol=1e-9,
-        atol=1e-9,
+        bend, (0.0, grid[-1]), (0.0, 0.0, 0.0), t_eval=grid, rtol=1e-9, atol=1e-9,
         max_step=0.5,
-    ).y
+    ).y  # fmt: skip
     np.testing.assert_allclose(heading, truth[2], atol=1e-6)
     # chords are of second order: centimetres after 400 m
     np.testing.assert_allclose(np.stack([x, y]), truth[:2], atol=0.05)
@@ -98,8 +84,7 @@ def test_a_case_is_one_page_with_the_player(tmp_path):
     weights = random_weights(tmp_path / "w.msgpack")
     case = ("--case=stopped_lead/000@0", "--row=IDM", "--duration=2")
     flags = (f"--weights={weights}", *case, f"--output={tmp_path / 'out'}")
-    done = command("experiments.replay", *flags)
-    assert done.returncode == 0, done.stderr[-2000:]
+    done = succeeded("experiments.replay", *flags)
     (page,) = (tmp_path / "out").iterdir()
     text = page.read_text()
     assert not re.search(r'(src|href)="(?!data:|#)', text)

@@ -40,21 +40,16 @@ def metrics(seed, spoiled=None):
         first = FAMILIES.index(spoiled) * EACH
         faults[first : first + 12] = 1
     holds[faults > 0] = False
-    values.update(
-        samples=samples,
-        inside=(samples[:, None] - 9 * ~holds).astype(int),
-        inside_filtered=np.tile(samples[:, None], 2).astype(int),
-        holds=holds,
-        holds_filtered=holds[:, 4:],
-        at_fault=faults,
-        collisions=faults,
-        progress=1000.0 * rng.uniform(0.8, 1.2, size=count),
-        min_ttc=rng.uniform(1.0, 9.0, size=count),
-    )
-    for name in ("drivable", "direction", "ttc_bound", "speed_compliance", "comfort"):
-        values[name] = np.ones(count)
-    values["no_fault"] = 1.0 - faults
-    return CaseMetrics(**values)
+    values |= {
+        "samples": samples, "inside": (samples[:, None] - 9 * ~holds).astype(int),
+        "inside_filtered": np.tile(samples[:, None], 2).astype(int),
+        "holds": holds, "holds_filtered": holds[:, 4:],
+        "at_fault": faults, "collisions": faults, "no_fault": 1.0 - faults,
+        "progress": 1000.0 * rng.uniform(0.8, 1.2, size=count),
+        "min_ttc": rng.uniform(1.0, 9.0, size=count),
+    }  # fmt: skip
+    good = ("drivable", "direction", "ttc_bound", "speed_compliance", "comfort")
+    return CaseMetrics(**{**values, **dict.fromkeys(good, np.ones(count))})
 
 
 def suite_and_verdict():
@@ -103,21 +98,14 @@ def sweep():
     rows, members = {}, {}
     for rate, value in ((0.01, 2.0), (0.05, 1.5), (0.2, 1.8)):
         rows[f"rate {rate}"] = {
-            "hidden": "15",
-            "leaky_rate": rate,
-            "learning_rate": 1e-3,
-            "members": [f"m{rate}"],
-            "finite": True,
+            "hidden": "15", "leaky_rate": rate, "learning_rate": 1e-3,
+            "members": [f"m{rate}"], "finite": True,
             "validation": {"top1_fde": found(value)},
-        }
+        }  # fmt: skip
         members[f"m{rate}"] = {"validation": {"top1_fde": value}}
+    metric = {"metric": "top1_fde", "title": "top-1 FDE", "unit": "m"}
     return {
-        "choose_by": {
-            "metric": "top1_fde",
-            "title": "top-1 FDE",
-            "unit": "m",
-            "higher_is_better": False,
-        },
+        "choose_by": {**metric, "higher_is_better": False},
         "chosen": {"configuration": "rate 0.05", "test": {"top1_fde": found(1.6)}},
         "configurations": rows,
         "members": members,

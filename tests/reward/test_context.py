@@ -8,7 +8,6 @@ import pytest
 from rcirl_jax.errors import InputError
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import Normaliser, RewardConfig, init_reward, pinned, value
-from rcirl_jax.reward.fast import rows_value
 from rcirl_jax.reward.module import conditioned
 from rcirl_jax.units import TIMES_S
 
@@ -70,23 +69,6 @@ def test_acceleration_and_jerk_at_the_start_set_no_gain():
     moved = x.at[:, 0, names.index("velocity")].add(0.1)
     other = value(params, normaliser(), moved, mask, CONFIG)
     assert np.abs(other - values[0]).max() > 1e-4
-
-
-@pytest.mark.parametrize("hidden", [(), (15,), (8, 4)])
-def test_both_layouts_agree(hidden):
-    config = RewardConfig(hidden=hidden, context=COLUMNS)
-    params, valid = draw(config), jnp.arange(T) < 14
-    x = features()
-    want = value(params, normaliser(), x, jnp.tile(valid, (K, 1)), config)
-    rows = [x[:, :, f].T for f in range(F)]
-    got = rows_value(
-        pinned(params, config),
-        normaliser(),
-        rows,
-        valid,
-        config.hidden_activation,
-    )
-    np.testing.assert_allclose(got, want, rtol=2e-5, atol=2e-5)
 
 
 def test_a_context_of_another_length_is_refused():

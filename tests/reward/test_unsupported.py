@@ -25,9 +25,8 @@ def rows(count=4000):
     upper = np.array([s.upper for s in FEATURES.specs])
     made = rng.uniform(lower, upper, (count, FEATURES.num_features))
     for name in NEVER:
-        made[:, FEATURES.names.index(name)] = FEATURES.specs[
-            FEATURES.names.index(name)
-        ].none
+        at = FEATURES.names.index(name)
+        made[:, at] = FEATURES.specs[at].none
     return made
 
 

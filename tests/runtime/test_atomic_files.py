@@ -1,5 +1,7 @@
 """Files that are there whole or not at all, also with two writers."""
 
+import os
+import stat
 import subprocess
 import sys
 
@@ -71,40 +73,55 @@ def test_an_old_file_stays_if_the_new_one_cannot_be(tmp_path):
     assert [x.name for x in tmp_path.iterdir()] == ["a.json"]
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"{", "a.json: Expecting .*: expected colours"),
-        (b"\xff\xfe", "a.json: .*utf-8.*: expected colours"),
-        (b"[" * 100_000, "a.json: nested too deep: expected colours"),
-        (b"[" * (MAX_DEPTH + 1) + b"]" * (MAX_DEPTH + 1), "nested too deep"),
-        (b"1" * 5000, "a.json: .*digits.*: expected colours"),
-        (b'{"\\ud800": 1}', "a.json: .*surrogates.*: expected colours"),
-        (b'["a\\uDC00"]', "a.json: .*surrogates.*: expected colours"),
-    ],
-)
-def test_json_that_is_none_is_one_line(tmp_path, content, message):
-    (tmp_path / "a.json").write_bytes(content)
-    with pytest.raises(InputError, match=message):
-        read_json(tmp_path / "a.json", "colours")
+def test_an_interrupted_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
+    path, seen = tmp_path / "a.json", []
+    write_whole(path, "old")
+
+    def fail(source, target):
+        seen.append((source.parent, target, source.read_text()))
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", fail)
+        with pytest.raises(OSError, match=r"No space left on device: .*a\.json"):
+            write_whole(path, "new")
+    # the whole file was there, in the same folder, before it took the name
+    assert seen == [(tmp_path, path, "new")]
+    assert [item.name for item in tmp_path.iterdir()] == ["a.json"]
+    assert path.read_text() == "old"
+
+
+def test_file_and_folder_are_on_disk_before_a_write_returns(tmp_path, monkeypatch):
+    synced, real = [], os.fsync
+
+    def record(descriptor):
+        synced.append(stat.S_ISDIR(os.fstat(descriptor).st_mode))
+        real(descriptor)
+
+    monkeypatch.setattr(os, "fsync", record)
+    write_whole(tmp_path / "a.json", "text")
+    assert synced == [False, True]
+    mask = os.umask(0o022)
+    os.umask(mask)
+    assert (tmp_path / "a.json").stat().st_mode & 0o077 == 0o066 & ~mask
 
 
 @pytest.mark.parametrize(
     "text",
-    [
-        *(
-            '"\ud800"',
-            '"\udfff"',
-            b'"\xed\xa0\x80"',
-            '{"\\uDEAD": 1}',
-            '["\\ud83d \\ude97"]',
-        ),
-        *("{", b"\xff", "[" * 10**5, "1" * 5000),
-    ],
-)
-def test_json_from_outside_is_a_body_or_a_value_error(text):
+    ["{", b"\xff\xfe", "[" * 10**5, "[" * (MAX_DEPTH + 1) + "]" * (MAX_DEPTH + 1),
+     "1" * 5000, '"\ud800"', b'"\xed\xa0\x80"', '{"\\ud800": 1}', '["a\\uDC00"]',
+     '["\\ud83d \\ude97"]'],
+)  # fmt: skip
+def test_json_that_is_none_is_one_line(tmp_path, text):
     with pytest.raises(ValueError, match=r"."):
         parse_json(text)
+    content = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
+    (tmp_path / "a.json").write_bytes(content)
+    with pytest.raises(InputError, match=r"a\.json: .*: expected colours"):
+        read_json(tmp_path / "a.json", "colours")
+    for path in (tmp_path / "none.json", tmp_path):
+        with pytest.raises(InputError, match=f"{path.name}: .*: expected colours"):
+            read_json(path, "colours")
 
 
 def test_finite_json_has_no_other_numbers():
@@ -132,9 +149,3 @@ def test_json_of_any_size_takes_little_memory(tmp_path):
     assert read_json(path, "colours") == {}
     path.write_text("[" * MAX_DEPTH + "]" * MAX_DEPTH)
     assert isinstance(read_json(path, "colours"), list)
-
-
-def test_json_that_is_not_there_is_one_line(tmp_path):
-    for path in (tmp_path / "none.json", tmp_path):
-        with pytest.raises(InputError, match=f"{path.name}: .*: expected colours"):
-            read_json(path, "colours")

@@ -24,18 +24,18 @@ def fails(item):
     yield item
 
 
-def dies_once(folder):
+def dies_once(marked):
     """Kills its own process the first time."""
-
-    marked = Path(folder)
     if not marked.exists():
         marked.touch()
         os.kill(os.getpid(), signal.SIGKILL)
     yield marked.name
 
 
-def dies(item):
-    os.kill(os.getpid(), signal.SIGKILL)
+def slow_or_deadly(item):
+    if item == "killer":
+        os.kill(os.getpid(), signal.SIGKILL)
+    time.sleep(0.5)
     yield item
 
 
@@ -91,13 +91,9 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path):
 
 
 @pytest.mark.parametrize("make", [Here, lambda: Processes(2)], ids=["here", "two"])
-def test_results_keep_the_order_of_the_items(make):
+def test_results_and_errors_come_as_they_are_in_the_order_of_the_items(make):
     got = list(make().stream(twice, range(1, 9)))
     assert got == [x for item in range(1, 9) for x in (item, -item)]
-
-
-@pytest.mark.parametrize("make", [Here, lambda: Processes(2)], ids=["here", "two"])
-def test_an_error_of_a_piece_arrives_as_it_is(make):
     results = make().stream(fails, range(6))
     assert [next(results) for _ in range(3)] == [0, 1, 2]
     with pytest.raises(InputError, match=r"^three\.csv: x: 3"):
@@ -111,34 +107,17 @@ def test_a_piece_lost_with_its_process_is_done_again(tmp_path):
     assert list(Processes(2).stream(dies_once, items)) == ["a", "b", "c"]
 
 
-def test_a_piece_that_always_kills_its_process_is_one_line():
-    with pytest.raises(InputError, match=r"^7: its process was killed 3 times: exp"):
-        list(Processes(1).stream(dies, [7]))
-
-
-def slow_or_deadly(item):
-    if item == "killer":
-        os.kill(os.getpid(), signal.SIGKILL)
-    time.sleep(0.5)
-    yield item
-
-
-def test_the_guilty_piece_is_named_and_the_others_are_done():
+def test_a_piece_that_always_kills_its_process_is_named_and_the_others_are_done():
     results = Processes(2).stream(slow_or_deadly, ["healthy", "killer", "later"])
     assert next(results) == "healthy"
-    with pytest.raises(InputError, match=r"^killer: its process was killed"):
+    with pytest.raises(InputError, match=r"^killer: its process was killed 3 times: "):
         next(results)
 
 
 def test_no_more_items_are_taken_than_the_workers_need():
     taken = []
-
-    def items():
-        for item in range(100):
-            taken.append(item)
-            yield item
-
-    results = Processes(1).stream(twice, items())
+    items = (taken.append(item) or item for item in range(100))
+    results = Processes(1).stream(twice, items)
     next(results)
     assert len(taken) <= 4
     results.close()

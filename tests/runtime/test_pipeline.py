@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -29,11 +30,11 @@ def test_a_stage_is_done_once_for_its_inputs(stages):
     assert (stages.folder / "one.txt").read_text() == "c"
 
 
-@pytest.mark.parametrize("harm", ["edit", "delete"])
+@pytest.mark.parametrize("harm", [Path.unlink, lambda path: path.write_text("other")])
 def test_a_harmed_output_is_made_again(stages, harm):
     step(stages, "a", {"x": 1})
     path = stages.folder / "one.txt"
-    path.write_text("other") if harm == "edit" else path.unlink()
+    harm(path)
     assert step(stages, "a", {"x": 1})
     assert path.read_text() == "a"
 
@@ -77,25 +78,18 @@ def test_what_would_mislead_goes_before_the_work(stages):
     assert list(stages.read()) == ["weights"]
 
 
-def test_nothing_outside_the_folder_is_removed(stages):
+@pytest.mark.parametrize("name", ["../outside.txt", "one.txt/x", "a" * 300, "folder"])
+def test_outputs_that_no_stage_makes_are_one_line(stages, name):
+    """And nothing outside of the folder is removed."""
     outside = stages.folder.parent / "outside.txt"
     outside.write_text("precious")
-    step(stages, "a", {}, "one")
-    text = (stages.folder / FILE).read_text().replace("one.txt", "../outside.txt")
-    (stages.folder / FILE).write_text(text)
-    with pytest.raises(InputError, match="expected a file of the run's folder"):
-        stages.run("two", {}, [], lambda: None, stale=["one"])
-    assert outside.read_text() == "precious"
-
-
-@pytest.mark.parametrize("name", ["one.txt/x", "a" * 300, "folder"])
-def test_outputs_that_no_stage_makes_are_one_line(stages, name):
     step(stages, "a", {}, "one")
     (stages.folder / "folder").mkdir()
     text = (stages.folder / FILE).read_text().replace("one.txt", name)
     (stages.folder / FILE).write_text(text)
-    with pytest.raises(InputError, match=rf"{FILE}: one: {name}: .*: expected a file"):
+    with pytest.raises(InputError, match=rf"{FILE}: one: {name}: .*expected a file of"):
         stages.run("two", {}, [], lambda: None, stale=["one"])
+    assert outside.read_text() == "precious"
 
 
 @pytest.mark.parametrize(
@@ -103,15 +97,12 @@ def test_outputs_that_no_stage_makes_are_one_line(stages, name):
     [
         ("{", "expected the stages of a run"),
         ("[]", "schema_version: None: expected 1"),
-        ("[" * 100_000, "nested too deep: expected the stages of a run"),
-        (json.dumps({"schema_version": 9, "stages": {}}), "9: expected 1"),
+        ('{"schema_version": 9, "stages": {}}', "9: expected 1"),
         *(
             (json.dumps({"schema_version": 1, "stages": stages}), message)
             for stages, message in (
                 ([], r"stages: \[\]: expected an object"),
                 ({"a": 5}, "a: 5: expected an object"),
-                ({"a": []}, r"a: \[\]: expected an object"),
-                ({"a": {"key": "k", "outputs": 5}}, "a: outputs: 5: expected an obj"),
                 ({"a": {"key": "k", "outputs": [[1]]}}, "a: outputs: .*: expected an"),
                 ({"a": {"key": "k", "outputs": {"f": 1}}}, "'f': 1}: expected a text"),
                 ({"b": {"key": "k", "outputs": {"f\0": "x"}}}, "b: outputs: .*: exp"),
@@ -131,50 +122,46 @@ def test_what_made_a_stage_is_noted_and_decides_nothing(stages):
     path = stages.folder / "a.txt"
 
     def made(commit):
-        facts = {"git_commit": commit, "flags": {"seed": 1}, "versions": {}}
-        work = lambda: path.write_text("x")  # noqa: E731
+        work, facts = lambda: path.write_text("x"), {"git_commit": commit}
         return stages.run("a", {"x": 1}, [path], work, made_by=facts)
 
     assert made("abc")
     record = stages.read()["a"]
-    assert record["made_by"] == {
-        "git_commit": "abc", "flags": {"seed": 1}, "versions": {},
-    }  # fmt: skip
+    assert record["made_by"] == {"git_commit": "abc"}
     assert not made("def")
     assert stages.read()["a"] == record  # of the commit that did the work
 
 
+HOLDING = """
+import sys, time
+from pathlib import Path
+from rcirl_jax.runtime.pipeline import only_one
+with only_one(Path(sys.argv[1])):
+    print('held', flush=True)
+    time.sleep(float(sys.argv[2]))
+"""
+
+
+def holding(folder, seconds):
+    """A process that holds the folder for so long, if nobody else does."""
+    return subprocess.Popen(
+        [sys.executable, "-c", HOLDING, str(folder), str(seconds)], text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+
+
 @pytest.mark.multiprocess
-def test_a_second_process_is_refused(tmp_path):
-    code = (
-        "import sys; from pathlib import Path\n"
-        "from rcirl_jax.runtime.pipeline import only_one\n"
-        "with only_one(Path(sys.argv[1])): print('held')"
-    )
-    command = [sys.executable, "-c", code, str(tmp_path)]
+def test_a_second_process_is_refused_and_a_killed_one_holds_nothing(tmp_path):
     with only_one(tmp_path):
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        assert done.returncode != 0
-        assert "in use by another process" in done.stderr
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.stdout == "held\n"
-
-
-@pytest.mark.multiprocess
-def test_a_killed_process_holds_nothing(tmp_path):
-    code = (
-        "import sys, time; from pathlib import Path\n"
-        "from rcirl_jax.runtime.pipeline import only_one\n"
-        "with only_one(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
-    )
-    command = [sys.executable, "-c", code, str(tmp_path)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    assert process.stdout.readline() == "held\n"
+        out, err = holding(tmp_path, 0).communicate()
+        assert out == ""
+        assert "in use by another process" in err
+    first = holding(tmp_path, 60)
+    assert first.stdout.readline() == "held\n"
     with pytest.raises(InputError, match=f"{tmp_path}: in use"), only_one(tmp_path):
         pass
-    process.kill()
-    process.wait()
-    process.stdout.close()
+    first.kill()
+    first.communicate()
     with only_one(tmp_path):
         assert (tmp_path / LOCK).exists()
 
@@ -184,8 +171,6 @@ def test_a_lock_that_leaves_nothing(tmp_path):
     deep = tmp_path / "a" / "b"
     with only_one(deep, leave_nothing=True):
         assert (deep / LOCK).exists()
-        with pytest.raises(InputError, match="in use"), only_one(deep):
-            pass
     assert list(tmp_path.iterdir()) == []
     with only_one(deep, leave_nothing=True):
         (deep / "kept").write_text("x")

@@ -25,28 +25,18 @@ class Outer:
 
 
 def test_values_get_the_types_of_their_fields():
-    found = {
-        "name": "a",
-        "flag": True,
-        "count": 3,
-        "rate": 1,
-        "limit": 2,
-        "pairs": [[1, 2], [0.5, 3]],
-        "inner": {"sizes": [8, 4]},
-    }
+    found = {"name": "a", "flag": True, "count": 3, "rate": 1, "limit": 2}
+    found |= {"pairs": [[1, 2], [0.5, 3]], "inner": {"sizes": [8, 4]}}
     made = typed_settings(Outer, found)
+    pairs, inner = ((1.0, 2), (0.5, 3)), Inner(sizes=(8, 4))
     assert made == Outer(
-        name="a",
-        flag=True,
-        count=3,
-        rate=1.0,
-        limit=2.0,
-        pairs=((1.0, 2), (0.5, 3)),
-        inner=Inner(sizes=(8, 4)),
+        name="a", flag=True, count=3, rate=1.0, limit=2.0, pairs=pairs, inner=inner
     )
     assert [type(made.rate), type(made.limit), type(made.pairs[0][0])] == [float] * 3
     assert typed_settings(Outer, {"limit": None}).limit is None
     assert typed_fields(Outer, {}, "") == {}
+    with pytest.raises(InputError, match="rate: unknown"):
+        typed_fields(Outer, {"rate": 1.0}, "", ("rate",))
 
 
 @pytest.mark.parametrize(
@@ -55,12 +45,9 @@ def test_values_get_the_types_of_their_fields():
         ({"name": 1}, "name: 1: expected a text"),
         ({"flag": 1}, "flag: 1: expected true or false"),
         ({"count": True}, "count: True: expected int"),
-        ({"count": 1.0}, "count: 1.0: expected int"),
         ({"count": 2**31}, "count: 2147483648: expected int"),
         ({"rate": float("nan")}, "rate: nan: expected float"),
         ({"rate": "1"}, "rate: '1': expected float"),
-        ({"rate": None}, "rate: None: expected float"),
-        ({"limit": "no"}, "limit: 'no': expected float"),
         ({"pairs": 3}, "pairs: 3: expected a list"),
         ({"pairs": [[1, 2], [3]]}, "pairs[1]: [3]: expected a list of 2"),
         ({"pairs": [[1, 0.5]]}, "pairs[0][1]: 0.5: expected int"),
@@ -74,8 +61,3 @@ def test_a_value_of_another_type_is_one_line(found, says):
     with pytest.raises(InputError) as caught:
         typed_fields(Outer, found, "file: ")
     assert str(caught.value).startswith(f"file: {says}")
-
-
-def test_fields_left_out_are_unknown():
-    with pytest.raises(InputError, match="rate: unknown"):
-        typed_fields(Outer, {"rate": 1.0}, "", ("rate",))

@@ -109,11 +109,8 @@ def test_lateral_profiles_reach_the_neighbouring_lanes():
 
 def test_lanes_beyond_the_road_are_not_feasible():
     made = scene(v=15.0)
-    narrow = made.replace(
-        path=made.path.replace(
-            road_left=made.path.lane_left, road_right=made.path.lane_right
-        )
-    )
+    lane = {"road_left": made.path.lane_left, "road_right": made.path.lane_right}
+    narrow = made.replace(path=made.path.replace(**lane))
     candidates = SAMPLE["path_speed"](jax.random.key(0), narrow)
     ends = np.asarray(candidates.trajectory.l)[np.asarray(candidates.feasible), -1]
     assert np.abs(ends).max() < 1.0

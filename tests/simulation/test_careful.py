@@ -30,12 +30,8 @@ def test_cc_brakes_at_two_seconds():
 
 def test_fsm_grows_as_the_gap_shrinks():
     gaps = jnp.linspace(120.0, 1.0, 60)
-    brakes = np.array(
-        [
-            fsm_braking(g, jnp.float32(20.0), jnp.float32(0.0), jnp.float32(5.0), C)
-            for g in gaps
-        ]
-    )
+    v, lead, a = jnp.float32(20.0), jnp.float32(0.0), jnp.float32(5.0)
+    brakes = np.array([fsm_braking(g, v, lead, a, C) for g in gaps])
     assert brakes[0] == 0.0
     assert (np.diff(brakes) >= -1e-5).all()
     assert brakes[-1] == pytest.approx(C.b_max)
@@ -43,35 +39,18 @@ def test_fsm_grows_as_the_gap_shrinks():
     assert proactive.size > 0  # it brakes before the conflict is critical
 
 
-def test_a_visible_standing_car_is_avoided_by_both():
-    case = make_case([{"s": 120.0, "v": 0.0, "kind": Kind.STATIC}], speed=15.0)
+@pytest.mark.parametrize(
+    ("wall", "crashes"), [({"s": 120.0}, False), ({"s": 60.0, "appear_s": 50.0}, True)]
+)
+def test_what_can_be_seen_is_avoided_by_both_and_a_sudden_wall_by_neither(
+    wall, crashes
+):
+    case = make_case([{"v": 0.0, "kind": Kind.STATIC, **wall}], speed=15.0)
     for row in judges()[:2]:
-        record, _ = drive(
-            [case],
-            policy=row.policy,
-            params=None,
-            command_delay=row.command_delay,
-            braking_jerk=row.braking_jerk,
-        )
-        assert record.collision.sum() == 0
-        assert record.v[0, -1] < 0.1
-
-
-def test_a_wall_out_of_nowhere_is_avoided_by_neither():
-    case = make_case(
-        [{"s": 60.0, "v": 0.0, "kind": Kind.STATIC, "appear_s": 50.0}], speed=15.0
-    )
-    crashed = []
-    for row in judges()[:2]:
-        record, _ = drive(
-            [case],
-            policy=row.policy,
-            params=None,
-            command_delay=row.command_delay,
-            braking_jerk=row.braking_jerk,
-        )
-        crashed.append(record.collision.sum() > 0)
-    assert all(crashed)
+        how = {"command_delay": row.command_delay, "braking_jerk": row.braking_jerk}
+        record, _ = drive([case], policy=row.policy, params=None, **how)
+        assert (record.collision.sum() > 0) == crashes
+        assert crashes or record.v[0, -1] < 0.1
 
 
 def metrics(**values):

@@ -10,6 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rcirl_jax.geometry.boxes import Box, contact_interval
+from rcirl_jax.planner.baselines import Idm
+from rcirl_jax.planner.rank import idm_policy
 from rcirl_jax.simulation.world import judge
 from rcirl_jax.simulation.world.agents import come_and_go
 from rcirl_jax.simulation.world.lines import halting
@@ -37,17 +39,16 @@ def at(agent, ego_v=10.0, ego_l=0.0, heading=0.0, kappa=0.0, lanes=(1, 1)):
 
 
 def test_fault_follows_nuplans_types():
-    ahead, behind = {"s": 4.6, "v": 5.0}, {"s": -4.6, "v": 15.0}
-    standing = {"s": -4.6, "v": 15.0}
+    behind = {"s": -4.6, "v": 15.0}
     beside = {"s": -0.5, "l": 1.9, "v": 10.0}
-    parked = {"s": 4.6, "v": 0.0, "kind": Kind.STATIC}
     cases = [
-        (ahead, 10.0, 0.0, True),  # into the car ahead
+        ({"s": 4.6, "v": 5.0}, 10.0, 0.0, True),  # into the car ahead
         (behind, 10.0, 0.0, False),  # hit from behind
-        (standing, 0.0, 0.0, False),  # a standing ego is never at fault
+        (behind, 0.0, 0.0, False),  # a standing ego is never at fault
+        ({"s": 4.6, "v": 0.0}, 0.0, 0.0, False),
         (beside, 10.0, 0.0, False),  # side contact inside the own lane
         (beside, 10.0, 1.0, True),  # side contact while straddling lanes
-        (parked, 10.0, 0.0, True),
+        ({"s": 4.6, "v": 0.0, "kind": Kind.STATIC}, 10.0, 0.0, True),
     ]
     for agent, v, l, fault in cases:
         found, _ = at(agent, ego_v=v, ego_l=l)
@@ -55,22 +56,20 @@ def test_fault_follows_nuplans_types():
         assert bool(found.at_fault) is fault, agent
 
 
+def polygon(x, y, angle, length, width):
+    box = shapely.box(-length / 2, -width / 2, length / 2, width / 2)
+    box = shapely.affinity.rotate(box, angle, (0, 0), use_radians=True)
+    return shapely.affinity.translate(box, x, y)
+
+
 def test_clearance_on_a_bend_is_that_of_boxes_in_the_plane():
     kappa, rng = 0.03, np.random.default_rng(0)
 
     def plane(s, l, heading):
         """True x, y, angle on a circle of constant curvature."""
-        turn = kappa * s
-        return (
-            (1 / kappa - l) * np.sin(turn),
-            1 / kappa - (1 / kappa - l) * np.cos(turn),
-            heading + turn,
-        )
-
-    def polygon(x, y, angle, length, width):
-        box = shapely.box(-length / 2, -width / 2, length / 2, width / 2)
-        box = shapely.affinity.rotate(box, angle, (0, 0), use_radians=True)
-        return shapely.affinity.translate(box, x, y)
+        turn, radius = kappa * s, 1 / kappa - l
+        x, y = radius * np.sin(turn), 1 / kappa - radius * np.cos(turn)
+        return x, y, heading + turn
 
     for _ in range(20):
         s, l = float(rng.uniform(-15, 15)), float(rng.uniform(-6, 6))
@@ -101,11 +100,7 @@ def test_contact_interval_equals_dense_sampling(drawn):
     first = Box(x=f(0), y=f(0), heading=f(own), length=f(4.9), width=f(2.1))
     second = Box(x=f(x), y=f(y), heading=f(angle), length=f(length), width=f(width))
     enter, leave = (float(t) for t in interval(first, second, f(vx), f(vy)))
-    mine = shapely.affinity.rotate(
-        shapely.box(-2.45, -1.05, 2.45, 1.05), own, (0, 0), use_radians=True
-    )
-    box = shapely.box(-length / 2, -width / 2, length / 2, width / 2)
-    box = shapely.affinity.rotate(box, angle, (0, 0), use_radians=True)
+    mine, box = polygon(0, 0, own, 4.9, 2.1), polygon(0, 0, angle, length, width)
     for t in np.linspace(0.0, 4.0, 41):
         other = shapely.affinity.translate(box, x + vx * t, y + vy * t)
         apart = mine.distance(other)
@@ -162,9 +157,6 @@ def test_a_light_that_has_demanded_a_stop_does_so_until_it_is_green():
 
 def test_a_served_stop_sign_is_not_run():
     """Brake to rest 2 m before the line, then go."""
-    from rcirl_jax.planner.baselines import Idm
-    from rcirl_jax.planner.rank import idm_policy
-
     sign = {"kind": 2, "s": 60.0}
     case = make_case(lines=[sign], speed=10.0)
     record, _ = drive([case], steps=400, policy=idm_policy(Idm()), params=None)

@@ -100,18 +100,20 @@ def test_a_case_ends_where_the_mask_ends():
     assert not short.replay.present[:, 33:].any()
 
 
+def with_obstacle(one, slot, kind, valid, **leaves):
+    """The case of a scene with other values in one slot."""
+    o = one.scene.obstacles
+    changed = {"kind": kind, "valid": valid, **leaves}
+    tables = {name: np.array(getattr(o, name)) for name in changed}
+    for name, table in tables.items():
+        table[slot] = changed[name]
+    obstacles = o.replace(**tables)
+    return case_of(one.replace(scene=one.scene.replace(obstacles=obstacles)))
+
+
 def test_a_line_that_demands_a_stop_for_a_time_is_a_red_light():
     one = jax.tree.map(lambda x: np.asarray(x)[0], stored(1))
-    o = one.scene.obstacles
-    slot = 15
-    valid = o.valid.copy()
-    valid[slot] = np.arange(18) < 10
-    kind = o.kind.copy()
-    kind[slot] = Kind.STOP
-    lower = o.s_lower.copy()
-    lower[slot] = 40.0
-    lined = o.replace(valid=valid, kind=kind, s_lower=lower)
-    case = case_of(one.replace(scene=one.scene.replace(obstacles=lined)))
+    case = with_obstacle(one, 15, Kind.STOP, np.arange(18) < 10, s_lower=40.0)
     assert float(case.lines.s[0]) == 40.0
     assert float(case.lines.red[0]) == pytest.approx(10 * 8 / 17, rel=1e-5)
     assert float(case.lines.offset[0]) == float(case.lines.green[0])
@@ -138,16 +140,13 @@ def test_a_turning_body_has_the_size_that_it_has_along_an_axis():
     low_high = {"s_lower": 20 + s - half_s, "s_upper": 20 + s + half_s}
     low_high |= {"l_lower": l - half_l, "l_upper": l + half_l}
     low_high |= {"speed": 4.0 * np.cos(heading) * 17 / 8}
+    kind = np.full_like(one.scene.obstacles.kind, Kind.NONE)
+    valid = np.zeros_like(one.scene.obstacles.valid)
+    nobody = one.scene.obstacles.replace(kind=kind, valid=valid)
+    empty = one.replace(scene=one.scene.replace(obstacles=nobody))
     for seen in (slice(0, 18), slice(0, 12), slice(6, 18)):
-        valid = np.zeros((16, 18), bool)
-        valid[0, seen] = True
-        kind = np.where(np.arange(16) == 0, Kind.VEHICLE, Kind.NONE)
-        changed = {}
-        for name, values in low_high.items():
-            changed[name] = getattr(one.scene.obstacles, name).copy()
-            changed[name][0] = values
-        o = one.scene.obstacles.replace(kind=kind, valid=valid, **changed)
-        case = case_of(one.replace(scene=one.scene.replace(obstacles=o)))
+        there = np.isin(np.arange(18), np.arange(18)[seen])
+        case = with_obstacle(empty, 0, Kind.VEHICLE, there, **low_high)
         assert float(case.agents.length[0]) == pytest.approx(10.0, abs=0.1)
         assert float(case.agents.width[0]) == pytest.approx(2.5, abs=0.1)
 
@@ -162,10 +161,7 @@ def test_distances_are_those_of_the_drives(tmp_path):
         held_out_likeness(held_out([Rows(stored(3))], 3), [])
     two = stored(3).replace(vehicle=np.array([0, 1, 1], np.int32))
     drives = held_out([Rows(two)], 3)
-    rows = [
-        Row(name="coast", policy=coast),
-        Row(name="IDM", policy=idm_policy(Idm())),
-    ]
+    rows = [Row(name="coast", policy=coast), Row(name="IDM", policy=idm_policy(Idm()))]
     report = held_out_likeness(drives, rows)
     coasted = report.rows["coast"]
     apart = lambda t: 0.1 * t**2 - 0.04 * t  # noqa: E731
@@ -175,12 +171,10 @@ def test_distances_are_those_of_the_drives(tmp_path):
     assert coasted.distance[0] == pytest.approx(mean, abs=0.02)
     assert report.rows[RECORDED_HUMAN].distance.max() < 0.02
     assert report.unlikeness(RECORDED_HUMAN)["acceleration"] == 0.0
-    assert "coast" in report.text()
     minus = report.differences("coast")["IDM"].mean
     apart_of = report.distance["coast"] - report.distance["IDM"]
     assert minus == pytest.approx(float(apart_of.mean()))
     assert f"{minus:+.2f} [" in report.text()
-    assert set(report.distance) == {"coast", "IDM"}
     write_arrays(tmp_path / "x.npz", report.likeness)
     back = read_arrays(tmp_path / "x.npz")
     assert isinstance(back, Likeness)
@@ -201,12 +195,9 @@ def test_distances_are_those_of_the_drives(tmp_path):
     ],
 )
 def test_damaged_distances_are_one_line(tmp_path, name, array, says):
-    arrays = {
-        "names": np.array(["a", "b"]),
-        "distance": np.ones((2, 3)),
-        "clusters": np.arange(3),
-    }
-    arrays = {n: x for n, x in {**arrays, name: array}.items() if x is not None}
+    good = {"names": np.array(["a", "b"]), "distance": np.ones((2, 3))}
+    arrays = {**good, "clusters": np.arange(3), name: array}
+    arrays = {n: x for n, x in arrays.items() if x is not None}
     path = tmp_path / "x.npz"
     np.savez(path, **arrays)
     with pytest.raises(InputError) as caught:
@@ -227,14 +218,8 @@ def test_jensen_shannon_of_known_samples():
     expected = -(0.75 * np.log2(0.75) + 0.25 * np.log2(0.25)) - 0.5
     assert jensen_shannon(a, mixed, "jerk") == pytest.approx(np.sqrt(expected))
     assert jensen_shannon(a[:0], b[:0], "jerk") == 0.0
-
-
-def test_jensen_shannon_of_nearly_equal_samples_is_a_number():
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        a = rng.uniform(-8.0, 8.0, 10_000)
-        b = np.append(a[1:], 0.0)
-        assert 0.0 <= jensen_shannon(a, b, "jerk") < 0.01
+    nearly = np.random.default_rng(0).uniform(-8.0, 8.0, 10_000)
+    assert 0.0 <= jensen_shannon(nearly, np.append(nearly[1:], 0.0), "jerk") < 0.01
 
 
 def test_a_split_without_scenes_is_one_line():

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rcirl_jax.simulation.cases import Case
 from tests.simulation.drives import drive
 from tests.simulation.worlds import make_case
 
@@ -46,23 +47,19 @@ PAIRS = (
 FOLLOWER_START = 100.0  # m, front bumper
 
 
-def parameters(pair: dict) -> dict:
-    names = ("headway", "standstill", "acceleration", "braking", "desired")
-    return {name: pair[name] for name in names}
+def case_of(pair: dict) -> Case:
+    names = ("headway", "standstill", "acceleration", "braking", "desired", "v")
+    rear = FOLLOWER_START - 0.5 * LENGTH
+    leader = {"s": rear + pair["gap"] + LENGTH, "v": pair["lead"],
+              "phases": pair["phases"], "desired": 60.0, "reacts": False}  # fmt: skip
+    follower = {"s": rear, **{name: pair[name] for name in names}}
+    return make_case([leader, follower], speed=0.0)
 
 
 @functools.cache
 def ours() -> tuple[np.ndarray, np.ndarray]:
     """Fronts [m] and speeds [m/s], each [pairs, steps, (leader, follower)]."""
-    cases = []
-    for pair in PAIRS:
-        rear = FOLLOWER_START - 0.5 * LENGTH
-        ahead = rear + pair["gap"] + LENGTH
-        leader = {"s": ahead, "v": pair["lead"], "phases": pair["phases"],
-                  "desired": 60.0, "reacts": False}  # fmt: skip
-        follower = {"s": rear, "v": pair["v"], **parameters(pair)}
-        cases.append(make_case([leader, follower], speed=0.0))
-    _, shot = drive(cases, steps=STEPS)
+    _, shot = drive([case_of(pair) for pair in PAIRS], steps=STEPS)
     return shot.agents.s[:, :, :2] + 0.5 * LENGTH, shot.agents.v[:, :, :2]
 
 
@@ -147,33 +144,20 @@ def theirs(tmp_path_factory: pytest.TempPathFactory) -> tuple[np.ndarray, np.nda
     return run_sumo(tmp_path_factory.mktemp("sumo"), ours()[1][:, :, 0])
 
 
-def test_the_leaders_drive_the_same_in_both(theirs):
-    """The comparison below is of the followers only if this holds."""
+def test_the_follower_drives_as_sumos_idm_behind_the_same_leader(theirs):
     front, speed = ours()
-    np.testing.assert_allclose(theirs[1][:, :, 0], speed[:, :, 0], atol=1e-3)
-    np.testing.assert_allclose(theirs[0][:, :, 0], front[:, :, 0], atol=5e-3)
-
-
-@pytest.mark.parametrize("pair", range(len(PAIRS)))
-def test_the_follower_drives_as_sumos_idm(pair, theirs):
-    front, speed = ours()
-    assert np.ptp(speed[pair, :, 1]) > 3.0  # there is something to compare
-    np.testing.assert_allclose(
-        speed[pair, :, 1], theirs[1][pair, :, 1], atol=SPEED_TOLERANCE, rtol=0.0
-    )
-    np.testing.assert_allclose(
-        front[pair, :, 1], theirs[0][pair, :, 1], atol=POSITION_TOLERANCE, rtol=0.0
-    )
+    assert (np.ptp(speed[:, :, 1], axis=1) > 3.0).all()  # there is something to compare
+    exact = {"rtol": 0.0}
+    np.testing.assert_allclose(speed[..., 0], theirs[1][..., 0], atol=1e-3, **exact)
+    np.testing.assert_allclose(front[..., 0], theirs[0][..., 0], atol=5e-3, **exact)
+    for mine, other, most in ((speed, theirs[1], SPEED_TOLERANCE),
+                              (front, theirs[0], POSITION_TOLERANCE)):  # fmt: skip
+        np.testing.assert_allclose(mine[..., 1], other[..., 1], atol=most, **exact)
 
 
 def test_the_comparison_sees_a_wrong_headway(theirs):
     """A follower with another parameter departs by far more than the tolerance."""
-    wrong = dict(PAIRS[0], headway=1.5)
-    rear = FOLLOWER_START - 0.5 * LENGTH
-    leader = {"s": rear + wrong["gap"] + LENGTH, "v": wrong["lead"],
-              "phases": wrong["phases"], "desired": 60.0, "reacts": False}  # fmt: skip
-    follower = {"s": rear, "v": wrong["v"], **parameters(wrong)}
-    case = make_case([leader, follower], speed=0.0)
+    case = case_of(dict(PAIRS[0], headway=1.5))
     _, shot = drive([case] * len(PAIRS), steps=STEPS)  # the compiled shape of `ours`
     front = shot.agents.s[0, :, 1] + 0.5 * LENGTH
     assert np.abs(front - theirs[0][0, :, 1]).max() > 10.0 * POSITION_TOLERANCE

@@ -5,7 +5,6 @@ import shutil
 import subprocess
 import sys
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -24,6 +23,7 @@ from rcirl_jax.train.loop import _like
 from rcirl_jax.train.state import TrainConfig
 from tests.conftest import REPO
 from tests.data.small_logs import files_of
+from tests.helpers.stored import assert_same_bits
 
 CONFIG = TrainConfig()
 
@@ -53,20 +53,27 @@ def saved(state, tmp_path_factory):
     return folder
 
 
+@pytest.fixture
+def folder(saved, tmp_path):
+    """A copy, to be harmed."""
+    return shutil.copytree(saved, tmp_path / "c")
+
+
 def restored(folder, state):
     """(step, position, lines) of a run that goes on there."""
     checkpoints = Checkpoints(folder)
     found, position = checkpoints.restore(state)
     checkpoints.close()
     step = int(found.step)
-    for a, b in zip(leaves(found), leaves(at(state, step)), strict=True):
-        np.testing.assert_array_equal(a, b)
+    assert_same_bits(found, at(state, step))
     return step, position["index"], checkpoints.passed_over
 
 
-def leaves(state):
-    plain = state.replace(key=jax.random.key_data(state.key))
-    return [np.asarray(leaf) for leaf in jax.tree.leaves(plain)]
+def harmed(folder, *names, steps="234"):
+    """Remove files of checkpoints."""
+    for step in steps:
+        for name in names:
+            (folder / step / name).unlink()
 
 
 def flip(path, rng):
@@ -102,18 +109,10 @@ def test_harm_to_any_file_is_found_and_named(saved, state, tmp_path, harm):
         assert not (folder / "4").exists()
 
 
-def test_a_file_too_many_is_damage(saved, state, tmp_path):
-    shutil.copytree(saved, tmp_path / "c")
-    (tmp_path / "c" / "4" / "state" / "more").write_text("x")
-    assert restored(tmp_path / "c", state)[0] == 3
-
-
-def test_steps_after_a_damaged_one_are_saved_again(saved, state, tmp_path):
-    """Twice: what was put aside before makes room."""
-    folder = tmp_path / "c"
-    shutil.copytree(saved, folder)
-    for _ in range(2):
-        (folder / "4" / DIGESTS).write_text("{}")
+def test_steps_after_a_damaged_one_are_saved_again(folder, state):
+    """Twice: what was put aside before makes room. Also after a file too many."""
+    for harm in (DIGESTS, "state/more"):
+        (folder / "4" / harm).write_text("{}")
         checkpoints = Checkpoints(folder)
         assert checkpoints.latest_step() == 3
         checkpoints.save(at(state, 4), {"epoch": 0, "index": 4})
@@ -121,11 +120,9 @@ def test_steps_after_a_damaged_one_are_saved_again(saved, state, tmp_path):
         assert restored(folder, state) == (4, 4, [])
 
 
-def test_two_damaged_ones_are_two_lines(saved, state, tmp_path):
-    folder = tmp_path / "c"
-    shutil.copytree(saved, folder)
-    (folder / "4" / "_CHECKPOINT_METADATA").unlink()
-    (folder / "3" / DIGESTS).unlink()  # killed before it was noted
+def test_two_damaged_ones_are_two_lines(folder, state):
+    harmed(folder, "_CHECKPOINT_METADATA", steps="4")
+    harmed(folder, DIGESTS, steps="3")  # killed before it was noted
     step, _, lines = restored(folder, state)
     assert step == 2
     first, second = (line.partition("checkpoint ")[2] for line in lines)
@@ -133,10 +130,8 @@ def test_two_damaged_ones_are_two_lines(saved, state, tmp_path):
     assert second.startswith(f"3: {DIGESTS}: missing, it was not finished; ")
 
 
-def test_no_whole_one_is_one_line_and_nothing_is_touched(saved, tmp_path):
-    folder = tmp_path / "c"
-    shutil.copytree(saved, folder)
-    for step in ("2", "3", "4"):
+def test_no_whole_one_is_one_line_and_nothing_is_touched(folder):
+    for step in "234":
         (folder / step / "state" / "manifest.ocdbt").write_bytes(b"")
     before = files_of(folder)
     with pytest.raises(InputError, match=r"checkpoint 4: state/manifest\.ocdbt: damag"):
@@ -144,14 +139,12 @@ def test_no_whole_one_is_one_line_and_nothing_is_touched(saved, tmp_path):
     assert files_of(folder) == before
 
 
-def test_who_only_reads_leaves_everything_as_it_is(saved, state, tmp_path):
+def test_who_only_reads_leaves_everything_as_it_is(folder, state, tmp_path):
     """Also what a training beside it is just writing."""
-    folder = tmp_path / "c"
-    shutil.copytree(saved, folder)
     half = folder / "5.orbax-checkpoint-tmp-7" / "state"
     half.mkdir(parents=True)
     (half / "d").write_text("half")
-    (folder / "4" / DIGESTS).unlink()
+    harmed(folder, DIGESTS, steps="4")
     before = files_of(folder)
     checkpoints = Checkpoints(folder, read_only=True)
     assert int(checkpoints.restore(state)[0].step) == 3
@@ -162,24 +155,17 @@ def test_who_only_reads_leaves_everything_as_it_is(saved, state, tmp_path):
 
 
 @pytest.mark.parametrize("missing", [(DIGESTS,), (DIGESTS, POSITION)])
-def test_checkpoints_of_older_versions_are_taken(saved, state, tmp_path, missing):
+def test_checkpoints_of_older_versions_are_taken(folder, state, missing):
     """Also one that a run of today left there when it was killed."""
-    folder = tmp_path / "c"
-    shutil.copytree(saved, folder)
-    for step in ("2", "3", "4"):
-        for name in missing:
-            (folder / step / name).unlink()
+    harmed(folder, *missing)
     (folder / SEALED).unlink()
     assert restored(folder, state) == (4, 4, [])
 
 
 @pytest.mark.parametrize("text", ['["epoch"]', '{"epoch": "0"}', "3"])
-def test_a_position_of_no_numbers_is_named(saved, state, tmp_path, text):
-    folder = tmp_path / "c"
-    shutil.copytree(saved, folder)
-    for step in ("2", "3", "4"):
-        (folder / step / DIGESTS).unlink()
-        (folder / step / POSITION).write_text(text)
+def test_a_position_of_no_numbers_is_named(folder, state, text):
+    harmed(folder, DIGESTS)
+    (folder / "4" / POSITION).write_text(text)
     (folder / SEALED).unlink()
     checkpoints = Checkpoints(folder)
     with pytest.raises(InputError, match=r"4/position\.json: .*expected numbers"):
@@ -200,13 +186,11 @@ def test_restoring_again_and_again_keeps_little(saved, state):
     checkpoints.close()
 
 
-def test_a_first_checkpoint_that_was_not_finished_is_not_trusted(saved, tmp_path):
+def test_a_first_checkpoint_that_was_not_finished_is_not_trusted(folder):
     """Killed between its files and their digests: nobody knows what is in them."""
-    folder = tmp_path / "c"
-    shutil.copytree(saved, folder)
-    for step in ("2", "3"):
+    for step in "23":
         shutil.rmtree(folder / step)
-    (folder / "4" / DIGESTS).unlink()
+    harmed(folder, DIGESTS, steps="4")
     checkpoints = Checkpoints(folder)
     assert checkpoints.latest_step() is None
     (line,) = checkpoints.passed_over
@@ -239,10 +223,8 @@ checkpoints.close()
 
 
 @pytest.mark.multiprocess
-def test_no_room_is_one_line_and_room_is_taken_when_there_is_some(saved, tmp_path):
+def test_no_room_is_one_line_and_room_is_taken_when_there_is_some(folder):
     """Of two attempts to save the first finds no room, the second does."""
-    folder = tmp_path / "c"
-    shutil.copytree(saved, folder)
     done = subprocess.run(
         [sys.executable, "-c", FULL, str(folder)],
         capture_output=True, text=True, check=False, cwd=REPO, timeout=120,

@@ -6,8 +6,6 @@ import shutil
 import signal
 import time
 
-import jax
-import numpy as np
 import pytest
 
 from rcirl_jax.data.importing import import_parts
@@ -16,13 +14,11 @@ from rcirl_jax.data.store.writer import DatasetWriter
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime import signals as interrupts
 from rcirl_jax.runtime.pipeline import only_one
-from rcirl_jax.train.checkpoint import DIGESTS
 from rcirl_jax.train.loop import restore_run, train
 from rcirl_jax.train.running import Running
 from tests.data.small_logs import CONFIG as IMPORT
 from tests.data.small_logs import files_of, write_logs
-from tests.data.store.test_dataset import finish_fields, lineage
-from tests.helpers.scenes import batch, demonstration
+from tests.helpers.stored import assert_same_bits
 from tests.train.worker import CONFIG
 
 STEPS = 6  # 21 rows, batches of 8, two epochs
@@ -30,14 +26,8 @@ SHARD_JUMPS = 3  # of the time of day, in an import that is cut short once
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("faults") / "d"
-    writer = DatasetWriter(folder)
-    for index in range(4):
-        rows = [demonstration(seed) for seed in range(7 * index, 7 * index + 7)]
-        writer.write_shard(index, jax.tree.map(np.asarray, batch(rows)), lineage(index))
-    writer.finish(finish_fields())
-    return open_dataset(folder)
+def dataset(four_shards):
+    return open_dataset(four_shards)
 
 
 class StopError(Exception):
@@ -62,7 +52,7 @@ def trained(dataset, workdir, stop_after=None, each=lambda step: None):
 
 @pytest.fixture(scope="module")
 def undisturbed(dataset, tmp_path_factory):
-    return leaves(trained(dataset, tmp_path_factory.mktemp("undisturbed")).state)
+    return trained(dataset, tmp_path_factory.mktemp("undisturbed")).state
 
 
 @pytest.fixture(scope="module")
@@ -78,54 +68,39 @@ def run(cut_short, tmp_path):
     return shutil.copytree(cut_short, tmp_path / "run")
 
 
-def leaves(state):
-    plain = state.replace(key=jax.random.key_data(state.key))
-    return [np.asarray(leaf) for leaf in jax.tree.leaves(plain)]
-
-
-def assert_same_bits(state, expected):
-    for a, b in zip(leaves(state), expected, strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
 def steps_of(workdir):
     lines = (workdir / "metrics.jsonl").read_text().splitlines()
     return [json.loads(line)["step"] for line in lines]
 
 
 def test_a_run_goes_on_before_a_damaged_checkpoint(dataset, undisturbed, run, capsys):
+    """And after a line of its metrics that a kill cut."""
     victim = next((run / "checkpoints" / "5" / "state" / "d").iterdir())
-    raw = bytearray(victim.read_bytes())
-    raw[len(raw) // 2] ^= 8
-    victim.write_bytes(raw)
+    victim.write_bytes(victim.read_bytes()[:-1])
+    metrics = run / "metrics.jsonl"
+    metrics.write_bytes(metrics.read_bytes()[:-9])
     with pytest.raises(InputError, match=r"checkpoint 5: .* run the training again"):
         restore_run(run, CONFIG)  # what is exported is never an older state
     result = trained(dataset, run)
-    said = [x for x in capsys.readouterr().err.splitlines() if "checkpoint" in x]
-    assert len(said) == 1
-    assert "checkpoint 5: state/d/" in said[0]
-    assert said[0].endswith("damaged; the one before it that is whole: 4")
+    (line,) = [x for x in capsys.readouterr().err.splitlines() if "checkpoint" in x]
+    assert "checkpoint 5: state/d/" in line
+    assert line.endswith("damaged; the one before it that is whole: 4")
     assert_same_bits(result.state, undisturbed)
     assert steps_of(run) == list(range(1, STEPS + 1))
     assert_same_bits(restore_run(run, CONFIG), undisturbed)
 
 
-def test_without_a_whole_checkpoint_nothing_is_touched(dataset, run):
+def test_a_folder_in_use_or_without_a_whole_checkpoint_is_left_alone(dataset, run):
+    before = files_of(run)
+    with only_one(run), pytest.raises(InputError, match=f"{run}: in use by another"):
+        trained(dataset, run)
+    assert files_of(run) == before
     for folder in (run / "checkpoints").glob("[0-9]*"):
         (folder / "_CHECKPOINT_METADATA").unlink()
     before = files_of(run)
     with pytest.raises(InputError, match=r"expected one that is whole; use another -"):
         trained(dataset, run)
     assert files_of(run) == before
-
-
-def test_metrics_cut_in_a_line_go_on_with_the_next(dataset, undisturbed, run):
-    path = run / "metrics.jsonl"
-    path.write_bytes(path.read_bytes()[:-9])  # step 5, whose state is saved
-    (run / "metrics.jsonl.tmp").write_text("left by a kill")
-    result = trained(dataset, run)
-    assert_same_bits(result.state, undisturbed)
-    assert steps_of(run) == [1, 2, 3, 4, 6]
 
 
 def test_told_to_end_it_saves_the_step_it_is_in(
@@ -144,14 +119,6 @@ def test_told_to_end_it_saves_the_step_it_is_in(
     interrupts._Heard.number = None
     assert_same_bits(trained(dataset, tmp_path).state, undisturbed)
     assert steps_of(tmp_path) == list(range(1, STEPS + 1))
-
-
-def test_a_folder_in_use_is_refused(dataset, undisturbed, run):
-    before = files_of(run)
-    with only_one(run), pytest.raises(InputError, match=f"{run}: in use by another"):
-        trained(dataset, run)
-    assert files_of(run) == before
-    assert_same_bits(trained(dataset, run).state, undisturbed)
 
 
 class Clock:
@@ -177,43 +144,20 @@ def age(folder, by_s):
         os.utime(path, (when, when))
 
 
-def test_the_time_of_day_jumps_in_a_save(dataset, undisturbed, tmp_path, monkeypatch):
+def test_the_time_of_day_decides_nothing(dataset, undisturbed, tmp_path, monkeypatch):
     """Orbax gives up a save that took 300 s of it: one line, the same bits again."""
-    clock = Clock()
+    clock, ends, result = Clock(), [], None
     monkeypatch.setattr(time, "time", clock)
-    ends, result = [], None
     while result is None and len(ends) <= STEPS:
         try:
             result = trained(dataset, tmp_path, each=lambda _: clock.jump())
         except InputError as error:
             ends.append(str(error))
+            age(tmp_path, 86400.0 * (-1) ** len(ends))
     assert ends  # a jump met a save
     assert all("checkpoints: cannot be written: " in line for line in ends)
     assert result is not None, ends
     assert clock.jumps >= STEPS
-    assert_same_bits(result.state, undisturbed)
-    assert steps_of(tmp_path) == list(range(1, STEPS + 1))
-
-
-@pytest.mark.parametrize("by_s", [86400.0, -86400.0])
-def test_the_time_of_day_decides_nothing(
-    dataset, undisturbed, tmp_path, monkeypatch, by_s
-):
-    clock = Clock()
-    monkeypatch.setattr(time, "time", clock)
-
-    def jump_after(step):
-        """Once it is saved: orbax gives a save 300 s of the time of day."""
-        noted = tmp_path / "checkpoints" / str(step) / DIGESTS
-        while not noted.exists():
-            time.sleep(0.01)
-        clock.jump()
-
-    for stop_after in (2, 5):
-        trained(dataset, tmp_path, stop_after, jump_after)
-        age(tmp_path, by_s)
-    result = trained(dataset, tmp_path, each=jump_after)
-    assert clock.jumps == STEPS
     assert_same_bits(result.state, undisturbed)
     assert steps_of(tmp_path) == list(range(1, STEPS + 1))
     kept = sorted(x.name for x in (tmp_path / "checkpoints").glob("[0-9]*"))

@@ -7,14 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.evaluation.ranking.learners import (
-    train_learner,
-    untrained,
-)
+from rcirl_jax.evaluation.ranking.learners import train_learner, untrained
 from rcirl_jax.features import feature_map
 from rcirl_jax.train.frozen import Members, fit, freeze, members_of
 from rcirl_jax.train.state import TrainState
-from rcirl_jax.train.step import init_state, make_train_step
+from rcirl_jax.train.step import compare, init_state, make_train_step, mined
 from tests.train.test_step import CONFIG, batch, human_is_better, normaliser, rows
 
 SHORT = dataclasses.replace(CONFIG, epochs=3)
@@ -52,9 +49,8 @@ def test_a_member_takes_the_steps_of_the_training_step(optimizer):
         assert float(fitted.loss[0, epoch]) == pytest.approx(
             float(metrics.loss_sum / metrics.terms), rel=1e-3, abs=1e-5
         )
-    for a, b in zip(
-        jax.tree.leaves(fitted.params), jax.tree.leaves(state.params), strict=True
-    ):
+    pairs = map(jax.tree.leaves, (fitted.params, state.params))
+    for a, b in zip(*pairs, strict=True):
         np.testing.assert_allclose(a[0], b, rtol=2e-3, atol=2e-5)
     assert bool(fitted.finite.all())
 
@@ -69,9 +65,8 @@ def test_members_do_not_know_of_each_other():
     for m in range(3):
         one = jax.tree.map(lambda x, m=m: x[m : m + 1], grid)
         alone = fit(human_is_better(), normaliser(), SHORT, one)
-        for a, b in zip(
-            jax.tree.leaves(alone.params), jax.tree.leaves(together.params), strict=True
-        ):
+        pairs = map(jax.tree.leaves, (alone.params, together.params))
+        for a, b in zip(*pairs, strict=True):
             np.testing.assert_allclose(a[0], b[m], rtol=1e-3, atol=1e-5)
     assert len({float(x) for x in together.loss[:, -1]}) == 3
 
@@ -92,11 +87,8 @@ def test_untrained_rows_are_the_first_parameters():
     for run, first in zip(runs, untrained(runs), strict=True):
         assert first.normaliser is run.normaliser
         assert first.loss.size == 0
-        jax.tree.map(
-            lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5),
-            run.params,
-            first.params,
-        )
+        for a, b in zip(*map(jax.tree.leaves, (run.params, first.params)), strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-5)
     assert not np.array_equal(*(x.params.kernels[0] for x in untrained(runs)))
 
 
@@ -104,8 +96,6 @@ def test_mining_keeps_what_the_reward_values_most():
     config = dataclasses.replace(CONFIG, hard_negatives=2, hard_pool=3)
     made = freeze(rows(), np.arange(16), config)
     state = init_state(config, normaliser())
-    from rcirl_jax.train.step import compare, mined
-
     kept = jax.jit(mined, static_argnums=3)(state.params, normaliser(), made, config)
     compared = jax.jit(compare, static_argnums=3)
     values = compared(state.params, normaliser(), made, config.reward).candidates

@@ -9,7 +9,6 @@ import pytest
 
 from rcirl_jax.data import importing
 from rcirl_jax.data.cut import Cut
-from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.rows import check_finite
 from rcirl_jax.data.store.writer import DatasetWriter
 from rcirl_jax.errors import InputError
@@ -28,8 +27,8 @@ from rcirl_jax.train import loop
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.units import HORIZON_S
-from tests.data.store.test_dataset import finish_fields, lineage
-from tests.helpers.scenes import batch, demonstration
+from tests.helpers.stored import rows_of
+from tests.helpers.stored import stored as written
 from tests.train.test_step import SMALL
 from tests.train.test_sweep import config_of
 
@@ -40,7 +39,7 @@ TRAINED, HELD_OUT = 6, 9
 
 
 def rows():
-    made = jax.tree.map(np.asarray, batch([demonstration(i) for i in range(COUNT)]))
+    made = rows_of(range(COUNT))
     return made.replace(future_s=np.full(COUNT, HORIZON_S, np.float32))
 
 
@@ -52,10 +51,7 @@ def stored(folder, row=None, value=np.nan):
         limit[row, 40] = value
         path = made.scene.path.replace(speed_limit=limit)
         made = made.replace(scene=made.scene.replace(path=path))
-    writer = DatasetWriter(folder)
-    writer.write_shard(0, made, lineage(0))
-    writer.finish(finish_fields())
-    return open_dataset(folder)
+    return written(folder, [made])
 
 
 def line(row):
@@ -66,27 +62,21 @@ LIMIT = r"scene\.path\.speed_limit: not finite: expected finite numbers"
 
 
 @pytest.mark.parametrize("value", [np.nan, -np.inf])
-def test_a_stored_scene_is_named_before_training(tmp_path, value):
+def test_a_stored_scene_is_named_before_training_sweep_and_ranking(tmp_path, value):
     data = stored(tmp_path / "d", TRAINED, value)
-    with pytest.raises(InputError, match=f"^train: {line(TRAINED)}{LIMIT}$"):
-        train(data, tmp_path / "run", CONFIG)
-    with pytest.raises(InputError, match=f"^train: {line(TRAINED)}{LIMIT}$"):
-        train_learners(data, learner_configs(["hinge"], CONFIG), [0])
+    sweep = config_of(tmp_path / "d", base=dataclasses.replace(CONFIG, seed=3))
+    learners = learner_configs(["hinge"], CONFIG)
+    held, split = stored(tmp_path / "held", HELD_OUT), r"(split validation|train)"
+    for work, place in (
+        (lambda: train(data, tmp_path / "run", CONFIG), f"train: {line(TRAINED)}"),
+        (lambda: train_learners(data, learners, [0]), f"train: {line(TRAINED)}"),
+        (lambda: next(train_group((6,), sweep)), f"{split}: {line(TRAINED)}"),
+        (lambda: evaluate_ranking(held, {}, SETUP), f"split test: {line(HELD_OUT)}"),
+    ):
+        with pytest.raises(InputError, match=f"^{place}{LIMIT}$"):
+            work()
     assert not (tmp_path / "run" / "run.json").exists()
-
-
-def test_a_sweep_names_it(tmp_path):
-    stored(tmp_path / "d", TRAINED)
-    config = config_of(tmp_path / "d", base=dataclasses.replace(CONFIG, seed=3))
-    held = rf"(split validation|train): {line(TRAINED)}{LIMIT}"
-    with pytest.raises(InputError, match=held):
-        next(train_group((6,), config))
-
-
-def test_a_ranking_names_it(tmp_path):
-    data = stored(tmp_path / "d", HELD_OUT)
-    with pytest.raises(InputError, match=f"^split test: {line(HELD_OUT)}{LIMIT}$"):
-        evaluate_ranking(data, {}, SETUP)
+    check_finite("test", rows(), np.arange(COUNT))
 
 
 def test_the_guard_looks_up_a_scene_that_no_check_saw(tmp_path, monkeypatch):
@@ -160,10 +150,6 @@ def test_an_import_refuses_a_scene_that_is_not_finite(tmp_path):
                  "vehicles": ["v"] * COUNT, "groups": ["g"] * COUNT})  # fmt: skip
     with pytest.raises(InputError, match=r"^log: scene 5 \(.*\): scene\.ego\.v: not"):
         work.add(cut)
-
-
-def test_finite_scenes_pass():
-    check_finite("test", rows(), np.arange(COUNT))
 
 
 def test_a_suite_names_row_and_case():

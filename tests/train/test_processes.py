@@ -8,17 +8,14 @@ import subprocess
 import sys
 import time
 
-import jax
 import numpy as np
 import pytest
 
-from rcirl_jax.data.store.writer import DatasetWriter
 from rcirl_jax.errors import InputError
 from rcirl_jax.train.loop import restore_run
 from rcirl_jax.train.processes import EXIT_LOST, join_processes
 from tests.conftest import REPO
-from tests.data.store.test_dataset import finish_fields, lineage
-from tests.helpers.scenes import batch, demonstration
+from tests.helpers.stored import assert_same_bits, leaves
 from tests.train.worker import CONFIG
 
 pytestmark = pytest.mark.multiprocess
@@ -28,15 +25,8 @@ STEPS = 6  # 21 rows, batches of 8, two epochs: the last batch of an epoch has 5
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("processes") / "d"
-    writer = DatasetWriter(folder)
-    for index in range(4):
-        rows = [demonstration(seed) for seed in range(7 * index, 7 * index + 7)]
-        stacked = jax.tree.map(np.asarray, batch(rows))
-        writer.write_shard(index, stacked, lineage(index))
-    writer.finish(finish_fields())
-    return folder
+def data(four_shards):
+    return four_shards
 
 
 def free_port():
@@ -61,24 +51,18 @@ def start(data, workdir, parallel, processes, devices, **changes):
         "pause_s": 0.0,
         **changes,
     }
-    env = {
-        **os.environ,
-        "JAX_PLATFORMS": "cpu",
-        "JAX_NUM_CPU_DEVICES": str(devices),
-        "XLA_FLAGS": QUICK,
-    }
+    env = {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": QUICK}
+    env["JAX_NUM_CPU_DEVICES"] = str(devices)
     workers = []
     for number in range(processes):
         own = json.dumps({**job, "process_id": number if several else None})
         with (workdir / f"stderr_{number}").open("w") as stderr:
-            worker = subprocess.Popen(
-                [sys.executable, "-m", "tests.train.worker", own],
-                cwd=REPO,
-                env=env,
-                stdout=subprocess.DEVNULL,
-                stderr=stderr,
+            command = [sys.executable, "-m", "tests.train.worker", own]
+            workers.append(
+                subprocess.Popen(
+                    command, cwd=REPO, env=env, stdout=subprocess.DEVNULL, stderr=stderr
+                )
             )
-        workers.append(worker)
     return workers
 
 
@@ -92,10 +76,8 @@ def finished(workers, workdir):
     return [json.loads(name.read_text()) for name in names]
 
 
-def leaves(workdir):
-    state = restore_run(workdir, CONFIG)
-    plain = state.replace(key=jax.random.key_data(state.key))
-    return [np.asarray(leaf) for leaf in jax.tree.leaves(plain)]
+def state_of(workdir):
+    return restore_run(workdir, CONFIG)
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +98,7 @@ def undisturbed(data, tmp_path_factory):
 
 def assert_equal_runs(one, other):
     """Sums over devices are added in another order: equal to rounding, no further."""
-    for a, b in zip(leaves(one), leaves(other), strict=True):
+    for a, b in zip(leaves(state_of(one)), leaves(state_of(other)), strict=True):
         np.testing.assert_allclose(a, b, rtol=2e-4, atol=2e-5)
 
 
@@ -158,33 +140,9 @@ def test_one_process_writes_what_is_written_once(undisturbed):
     assert "%" not in (folder / "stderr_1").read_text()  # no second progress bar
 
 
-def assert_same_bits(one, other):
-    for a, b in zip(leaves(one), leaves(other), strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
 def test_streamed_and_loaded_rows_give_the_same_weights(data, undisturbed, tmp_path):
     finished(start(data, tmp_path, "jit", 1, 1, in_memory_mb=100.0), tmp_path)
-    assert_same_bits(tmp_path, undisturbed["1x1"][0])
-
-
-@pytest.mark.slow
-def test_killed_processes_resume_to_the_bit(data, undisturbed, tmp_path):
-    """Both die inside the second epoch; then again, with the rows in memory."""
-    workers = start(data, tmp_path, "jit_sharded", 2, 2, kill_after=4)
-    codes = [workers[0].wait(600)]
-    # the other one may have lost its peer just before its own signal
-    workers[1].kill()
-    codes.append(workers[1].wait(60))
-    assert codes[0] == -signal.SIGKILL
-    assert codes[1] != 0
-    assert not list(tmp_path.glob("process_*.json"))
-    again = start(data, tmp_path, "jit_sharded", 2, 2, in_memory_mb=100.0)
-    seen = finished(again, tmp_path)
-    assert [process["steps"] for process in seen] == [STEPS - 4, STEPS - 4]
-    assert_same_bits(tmp_path, undisturbed["2x2"][0])
-    lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
-    assert [json.loads(line)["step"] for line in lines] == list(range(1, STEPS + 1))
+    assert_same_bits(state_of(tmp_path), state_of(undisturbed["1x1"][0]))
 
 
 def lines_of(workdir, number):
@@ -219,7 +177,7 @@ def test_who_loses_another_process_ends_with_one_line(
         assert "another process is lost" in said[0]
         assert "Traceback" not in (tmp_path / f"stderr_{other}").read_text()
     finished(start(data, tmp_path, "jit_sharded", 2, 2), tmp_path)
-    assert_same_bits(tmp_path, undisturbed["2x2"][0])
+    assert_same_bits(state_of(tmp_path), state_of(undisturbed["2x2"][0]))
 
 
 @pytest.mark.slow
@@ -237,24 +195,30 @@ def test_one_process_told_to_end_stops_all_at_the_same_step(
     assert 1 <= int(steps[0]) < STEPS
     assert (tmp_path / "checkpoints" / steps[0]).is_dir()
     finished(start(data, tmp_path, "jit_sharded", 2, 2), tmp_path)
-    assert_same_bits(tmp_path, undisturbed["2x2"][0])
+    assert_same_bits(state_of(tmp_path), state_of(undisturbed["2x2"][0]))
 
 
 @pytest.mark.slow
-def test_processes_agree_on_the_checkpoint_before_a_damaged_one(
-    data, undisturbed, tmp_path
-):
+@pytest.mark.parametrize("damaged", [False, True])
+def test_killed_processes_resume_to_the_bit(data, undisturbed, tmp_path, damaged):
+    """Both die inside the second epoch; a damaged checkpoint is passed over by both."""
     workers = start(data, tmp_path, "jit_sharded", 2, 2, kill_after=4)
-    for worker in workers:
-        worker.wait(600)
-    noted = tmp_path / "checkpoints" / "4" / "_CHECKPOINT_METADATA"
-    noted.write_bytes(noted.read_bytes()[:-1])
-    seen = finished(start(data, tmp_path, "jit_sharded", 2, 2), tmp_path)
+    assert workers[0].wait(600) == -signal.SIGKILL
+    workers[1].kill()  # it may have lost its peer just before its own signal
+    assert workers[1].wait(60) != 0
+    assert not list(tmp_path.glob("process_*.json"))
+    if damaged:
+        noted = tmp_path / "checkpoints" / "4" / "_CHECKPOINT_METADATA"
+        noted.write_bytes(noted.read_bytes()[:-1])
+    again = start(data, tmp_path, "jit_sharded", 2, 2, in_memory_mb=100.0)
     # the one before is of step 3, at the end of the first epoch
-    assert [process["steps"] for process in seen] == [STEPS - 3, STEPS - 3]
-    assert_same_bits(tmp_path, undisturbed["2x2"][0])
+    left = STEPS - (3 if damaged else 4)
+    assert [process["steps"] for process in finished(again, tmp_path)] == [left, left]
+    assert_same_bits(state_of(tmp_path), state_of(undisturbed["2x2"][0]))
+    lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(line)["step"] for line in lines] == list(range(1, STEPS + 1))
     said = [lines_of(tmp_path, number) for number in (0, 1)]
-    assert sum("checkpoint 4: _CHECKPOINT_METADATA" in x for x in said[0]) == 1
+    assert sum("checkpoint 4: _CHECKPOINT_METADATA" in x for x in said[0]) == damaged
     assert not any("checkpoint 4" in x for x in said[1])
 
 

@@ -14,7 +14,6 @@ import pytest
 
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.resplit import Resplit, with_validation
-from rcirl_jax.data.store.writer import DatasetWriter
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking import sweep
 from rcirl_jax.evaluation.ranking.sweep import (
@@ -38,8 +37,8 @@ from rcirl_jax.train.pieces import piece_size
 from rcirl_jax.train.state import Facts, FeatureBatch, TrainConfig
 from rcirl_jax.units import HORIZON_S
 from tests.conftest import REPO
-from tests.data.store.test_dataset import finish_fields, lineage
-from tests.helpers.scenes import batch, demonstration
+from tests.data.small_logs import files_of
+from tests.helpers.stored import rows_of, stored
 from tests.train.test_step import SMALL, normaliser
 
 BASE = TrainConfig(
@@ -53,11 +52,9 @@ MADE_BY = {"git_commit": "abc"}
 def data(tmp_path_factory):
     """Random scenes, one vehicle each, in four groups of which one is the test."""
     folder = tmp_path_factory.mktemp("sweep") / "d"
-    rows = jax.tree.map(np.asarray, batch([demonstration(i) for i in range(SCENES)]))
-    rows = rows.replace(future_s=np.full(SCENES, HORIZON_S, np.float32))
-    writer = DatasetWriter(folder)
-    writer.write_shard(0, rows, lineage(0))
-    writer.finish(finish_fields())
+    rows = rows_of(range(SCENES))
+    future = np.full(SCENES, HORIZON_S, np.float32)
+    stored(folder, [rows.replace(future_s=future)])
     return folder
 
 
@@ -101,22 +98,15 @@ def test_members_equal_single_runs(data, monkeypatch):
     made = freeze(split.load("train"), split.indices("train"), BASE)
     for part in parts:
         for number, member in list(enumerate(part.members))[::3]:
-            alone = fit(made, part.normaliser, member_base(member), one(member))
+            # batches and candidates are the sweep's, whatever the member's seed
+            base = dataclasses.replace(member, seed=BASE.seed)
+            alone = fit(made, part.normaliser, base, members_of([member]))
             for a, b in zip(
                 jax.tree.leaves(part.params), jax.tree.leaves(alone.params), strict=True
             ):
                 np.testing.assert_allclose(a[number], b[0], rtol=1e-3, atol=2e-5)
             assert part.loss[number] == pytest.approx(float(alone.loss[0, -1]), 1e-3)
     assert len({float(x) for part in parts for x in part.loss}) == 8
-
-
-def member_base(member):
-    """Batches and candidates are the sweep's, whatever the member's seed."""
-    return dataclasses.replace(member, seed=BASE.seed)
-
-
-def one(member):
-    return members_of([member])
 
 
 def test_a_group_is_one_compile_however_many_chunks(data, monkeypatch):
@@ -197,7 +187,9 @@ def test_times_that_no_scene_compares_change_nothing():
 def test_everything_is_written_and_loads(finished, tmp_path):
     folder, report = finished
     assert json.loads((folder / "sweep.json").read_text()) == report
+    assert [*report["members"]] == [member_name(x) for x in config_of("d").members()]
     assert len(report["members"]) == 16
+    assert next(iter(report["members"])) == "h6_a0.05_r0.003_s0"
     for name, member in report["members"].items():
         reward = open_reward(str(folder / "weights" / f"{name}.msgpack"))
         assert reward.sha256 == member["sha256"]
@@ -205,34 +197,21 @@ def test_everything_is_written_and_loads(finished, tmp_path):
         assert reward.provenance["git_commit"] == "abc"
         assert reward.loss["leaky_rate"] == member["leaky_rate"]
     chosen = report["chosen"]
-    assert (folder / "best.msgpack").read_bytes() == (
-        folder / "weights" / f"{chosen['member']}.msgpack"
-    ).read_bytes()
-    assert {n: g["compiles"] for n, g in report["groups"].items()} == {
-        "6": 1,
-        "linear": 1,
-    }
-    means = {
-        n: np.mean(
-            [report["members"][m]["validation"]["top1_fde"] for m in c["members"]]
-        )
-        for n, c in report["configurations"].items()
-    }
+    best_file = folder / "weights" / f"{chosen['member']}.msgpack"
+    assert (folder / "best.msgpack").read_bytes() == best_file.read_bytes()
+    compiles = {name: group["compiles"] for name, group in report["groups"].items()}
+    assert compiles == {"6": 1, "linear": 1}
+    score = lambda m: report["members"][m]["validation"]["top1_fde"]  # noqa: E731
+    known = report["configurations"].items()
+    means = {name: np.mean([score(m) for m in x["members"]]) for name, x in known}
     assert min(means, key=means.get) == chosen["configuration"]
-    text = table(report)
-    assert text.count("<- chosen") == 1
-    assert f"{chosen['test']['top1_fde']['value']:.3f}" in text
+    assert f"{chosen['test']['top1_fde']['value']:.3f}" in table(report)
     picture = sweep_picture(tmp_path / "sweep.png", report)
     assert picture.read_bytes()[:4] == b"\x89PNG"
-
-
-def test_the_compiled_scorer_is_the_readers(finished):
-    reward = open_reward(str(finished[0] / "best.msgpack"))
-    x = np.asarray(many().points[:4])
+    reward, x = open_reward(str(folder / "best.msgpack")), np.asarray(many().points[:4])
     valid = np.ones(x.shape[:-1], bool)
-    np.testing.assert_allclose(
-        compiled_scorer(reward)(x, valid), reward.value(x, valid), rtol=1e-5, atol=1e-5
-    )
+    found = compiled_scorer(reward)(x, valid)
+    np.testing.assert_allclose(found, reward.value(x, valid), rtol=1e-5, atol=1e-5)
 
 
 def test_a_finished_group_is_not_trained_again(data, finished, tmp_path, monkeypatch):
@@ -245,22 +224,22 @@ def test_a_finished_group_is_not_trained_again(data, finished, tmp_path, monkeyp
         trained.append(hidden)
         return real(hidden, config)
 
+    def again():
+        trained.clear()
+        made = run_sweep(config_of(data), folder, Here(), MADE_BY)
+        assert untimed(made) == untimed(report)
+        return [*trained]
+
     monkeypatch.setattr(folders, "train_group", seen)
-    again = run_sweep(config_of(data), folder, Here(), MADE_BY)
-    assert trained == []
-    assert untimed(again) == untimed(report)
+    assert again() == []
     lost = next(m for m in report["members"] if m.startswith("h6_"))
     (folder / "weights" / f"{lost}.msgpack").write_bytes(b"cut short")
-    again = run_sweep(config_of(data), folder, Here(), MADE_BY)
-    assert trained == [(6,)]
-    assert untimed(again) == untimed(report)
+    assert again() == [(6,)]
     file = folder / "groups" / "6.json"
     group = json.loads(file.read_text())
     del group["facts"]
     file.write_text(json.dumps(group))
-    again = run_sweep(config_of(data), folder, Here(), MADE_BY)
-    assert trained == [(6,), (6,)]
-    assert untimed(again) == untimed(report)
+    assert again() == [(6,)]
 
 
 def test_other_settings_or_data_in_the_folder_are_one_line(data, finished):
@@ -272,17 +251,13 @@ def test_other_settings_or_data_in_the_folder_are_one_line(data, finished):
         run_sweep(config_of(data, base=longer), folder, Here(), {})
 
 
-def contents(folder):
-    return {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-
-
 def test_a_sweep_in_use_is_refused(data, finished):
     folder = finished[0]
     with only_one(folder):
-        before = contents(folder)
+        before = files_of(folder)
         with pytest.raises(InputError, match="in use by another proc"):
             run_sweep(config_of(data), folder, Here(), MADE_BY)
-        assert contents(folder) == before
+        assert files_of(folder) == before
 
 
 RAY = """
@@ -392,10 +367,3 @@ def test_validation_shares_no_vehicle_with_the_fit(data):
 def test_wrong_settings_are_one_line(changes, message):
     with pytest.raises(InputError, match=message):
         config_of("d", **changes)
-
-
-def test_names_tell_members_apart():
-    names = [member_name(one) for one in config_of("d").members()]
-    assert len(set(names)) == 16
-    assert names[0] == "h6_a0.05_r0.003_s0"
-    assert names[-1] == "hlinear_a0.3_r0.03_s1"

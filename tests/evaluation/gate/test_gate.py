@@ -32,18 +32,11 @@ def drives(seed=0, jerky=0.4, hard=0.15, way=1000.0):
     holds = np.ones((CASES, len(COLUMNS)), bool)
     holds[:, J] = rng.uniform(size=CASES) >= jerky
     holds[:, A] = rng.uniform(size=CASES) >= hard
-    ones = np.ones(CASES)
-    values.update(
-        holds=holds,
-        progress=way * rng.uniform(0.8, 1.2, size=CASES),
-        no_fault=ones,
-        drivable=ones,
-        direction=ones,
-        ttc_bound=ones,
-        speed_compliance=ones,
-        comfort=holds[:, J].astype(float),
-    )
-    return CaseMetrics(**values)
+    good = ("no_fault", "drivable", "direction", "ttc_bound", "speed_compliance")
+    values |= dict.fromkeys(good, np.ones(CASES))
+    values |= {"holds": holds, "comfort": holds[:, J].astype(float)}
+    progress = way * rng.uniform(0.8, 1.2, size=CASES)
+    return CaseMetrics(**{**values, "progress": progress})
 
 
 def likeness(seed=0, name="incumbent", **factors):
@@ -109,20 +102,22 @@ def check_of(verdict, name):
 # ------------------------------------------------------------------- the decision
 
 
-def test_the_same_reward_is_no_difference():
+def further(metrics, factor, cases=slice(None)):
+    """Progress times a factor, in some cases."""
+    way = np.array(metrics.progress)
+    way[cases] *= factor
+    return metrics.replace(progress=way)
+
+
+def test_the_same_is_no_difference_and_a_smoother_one_ships():
     verdict = decide(drives(), drives())
-    assert verdict.decision == "no difference"
-    assert verdict.exit_code == 3
+    assert (verdict.decision, verdict.exit_code) == ("no difference", 3)
     assert not verdict.look_at
     assert not verdict.new_faults
     assert all(check.outcome != "fail" for check in verdict.checks)
-
-
-def test_a_smoother_reward_ships():
-    verdict = decide(smoother(drives()), drives())
-    assert verdict.decision == "ship"
-    assert verdict.exit_code == 0
-    assert any("|jerk| below 6 m/s³" in reason for reason in verdict.reasons)
+    better = decide(smoother(drives()), drives())
+    assert (better.decision, better.exit_code) == ("ship", 0)
+    assert any("|jerk| below 6 m/s³" in reason for reason in better.reasons)
 
 
 def test_nothing_ships_on_a_part_of_the_suite():
@@ -137,7 +132,7 @@ def test_nothing_ships_on_a_part_of_the_suite():
     assert "a part of the suite: cases of 2 s" in format_verdict(none)
 
 
-@pytest.mark.parametrize("families", [2, 3, 5, 20])
+@pytest.mark.parametrize("families", [2, 20])
 def test_exchangeable_rewards_hardly_ever_ship(families):
     """Two rewards of one quality, drawn anew: gains are false alarms, 5 % at most."""
     wide = dict.fromkeys(("collision_free", "min_ttc", "speed_limit", "on_road"), 0.5)
@@ -154,9 +149,7 @@ def test_exchangeable_rewards_hardly_ever_ship(families):
 
 
 def test_a_slower_reward_is_refused():
-    slow = drives()
-    slow = slow.replace(progress=0.97 * np.array(slow.progress))
-    verdict = decide(slow, drives())
+    verdict = decide(further(drives(), 0.97), drives())
     assert verdict.decision == "do not ship"
     assert failed(verdict) == {"progress"}
 
@@ -166,26 +159,25 @@ def test_progress_is_compared_within_the_families():
 
     Drawn as clusters the interval would reach below -1 %: 1.96 x 4 % / sqrt(20).
     """
-    base = drives()
     sign = np.where(np.arange(CASES) // EACH % 2, 1.04, 0.96)
-    verdict = decide(base.replace(progress=sign * np.array(base.progress)), base)
-    check = next(
-        c for c in verdict.checks if c.kind == "no loss" and c.name == "progress"
-    )
-    assert check.outcome == "pass"
-    assert abs(check.low) < 0.003
+    verdict = decide(further(drives(), sign), drives())
+    checks = [c for c in verdict.checks if (c.kind, c.name) == ("no loss", "progress")]
+    assert checks[0].outcome == "pass"
+    assert abs(checks[0].low) < 0.003
 
 
-def test_a_loss_in_one_family_alone_is_found():
+def test_a_loss_in_one_family_alone_is_found_and_looked_at_first():
     """One family of twenty drives 40 % slower, all others a little faster."""
-    some = slice(3 * EACH, 4 * EACH)
-    base = drives()
-    way = 1.03 * np.array(base.progress)
-    way[some] *= 0.6
-    verdict = decide(base.replace(progress=way), base)
+    base, some = drives(), slice(3 * EACH, 4 * EACH)
+    verdict = decide(further(further(base, 1.03), 0.6, some), base)
     assert failed(verdict) == {"family03, progress"}
     near = broken(base, np.arange(3 * EACH, 3 * EACH + 15), ttc_bound=0)
     assert "family03, clean drives" in failed(decide(near, base))
+    two = further(further(base, 0.8, some), 0.9, slice(5 * EACH, 6 * EACH))
+    verdict = decide(two, base)
+    assert {"family03, progress", "family05, progress"} <= failed(verdict)
+    first = [case.partition("/")[0] for case in verdict.look_at[:2]]
+    assert sorted(first) == ["family03", "family05"]
 
 
 @pytest.mark.parametrize(("lost", "outcome"), [(9, "pass"), (12, "fail")])
@@ -199,10 +191,9 @@ def test_clean_drives_of_a_family(lost, outcome):
 
 def test_a_family_whose_cases_prove_nothing_is_open():
     """Slower in one family by chance: neither lost for certain nor not lost."""
-    base, rng = drives(), np.random.default_rng(9)
-    way = np.array(base.progress)
-    way[:EACH] *= 0.93 + 0.4 * rng.normal(size=EACH)
-    check = check_of(decide(base.replace(progress=way), base), "family00, progress")
+    noise = 0.93 + 0.4 * np.random.default_rng(9).normal(size=EACH)
+    verdict = decide(further(drives(), noise, slice(EACH)), drives())
+    check = check_of(verdict, "family00, progress")
     assert check.low < -0.1 < check.high
     assert check.outcome == "open"
 
@@ -215,22 +206,11 @@ def test_families_that_are_level_pass_however_differently_they_drive():
         some = family * EACH + rng.permutation(EACH)[:20]
         base = broken(base, some[:10], ttc_bound=0)
         mine = broken(mine, some[10:], ttc_bound=0)
-    way = np.array(base.progress) * (1.0 + 0.15 * rng.normal(size=CASES))
-    verdict = decide(mine.replace(progress=np.maximum(way, 0.0)), base)
+    apart = np.maximum(1.0 + 0.15 * rng.normal(size=CASES), 0.0)
+    verdict = decide(further(mine, apart), base)
     outcomes = {c.outcome for c in verdict.checks if c.kind == "families"}
     assert outcomes == {"pass"}
     assert verdict.decision == "no difference"
-
-
-def test_the_first_cases_to_look_at_are_of_families_that_failed():
-    base = drives()
-    way = np.array(base.progress)
-    way[3 * EACH : 4 * EACH] *= 0.8
-    way[5 * EACH : 6 * EACH] *= 0.9
-    verdict = decide(base.replace(progress=way), base)
-    assert {"family03, progress", "family05, progress"} <= failed(verdict)
-    first = [case.partition("/")[0] for case in verdict.look_at[:2]]
-    assert sorted(first) == ["family03", "family05"]
 
 
 def test_a_gain_does_not_pay_for_comfort():
@@ -238,8 +218,7 @@ def test_a_gain_does_not_pay_for_comfort():
     base = drives()
     holds = np.array(base.holds)
     holds[::10, J] = False
-    fast = base.replace(holds=holds, progress=1.1 * np.array(base.progress))
-    verdict = decide(fast, base)
+    verdict = decide(further(base, 1.1).replace(holds=holds), base)
     assert verdict.decision == "do not ship"
     assert "j_station" in failed(verdict)
     assert "But better: progress +10.0 %" in verdict.sentence
@@ -248,28 +227,24 @@ def test_a_gain_does_not_pay_for_comfort():
 def part_of(whole, keep):
     """The same pair on some of its cases."""
 
-    def part(metrics):
-        fields = dataclasses.fields(CaseMetrics)
-        cut = {f.name: np.asarray(getattr(metrics, f.name))[keep] for f in fields}
-        return CaseMetrics(**cut)
+    def cut(one):
+        if isinstance(one, CaseMetrics):
+            fields = dataclasses.fields(CaseMetrics)
+            values = {f.name: np.asarray(getattr(one, f.name))[keep] for f in fields}
+            return CaseMetrics(**values)
+        return (
+            {k: cut(v) for k, v in one.items()} if isinstance(one, dict) else one[keep]
+        )
 
-    return dataclasses.replace(
-        whole,
-        candidate=part(whole.candidate),
-        incumbent=part(whole.incumbent),
-        nulls={name: part(one) for name, one in whole.nulls.items()},
-        families=whole.families[keep],
-        ids=whole.ids[keep],
-        reference=whole.reference[keep],
-        preventable=whole.preventable[keep],
-    )
+    names = ("candidate", "incumbent", "nulls", "families", "ids", "reference")
+    parts = {name: cut(getattr(whole, name)) for name in (*names, "preventable")}
+    return dataclasses.replace(whole, **parts)
 
 
 def test_too_few_cases_cannot_be_judged():
     few = part_of(pair(drives(), drives()), slice(0, 600))
     verdict = judge(few, GateConfig())
-    assert verdict.decision == "could not judge"
-    assert verdict.exit_code == 2
+    assert (verdict.decision, verdict.exit_code) == ("could not judge", 2)
     assert "600 cases can never prove" in verdict.reasons[0]
     names = [f"family{i // 8}" for i in range(600)]
     scattered = judge(dataclasses.replace(few, families=names), GateConfig())
@@ -301,38 +276,18 @@ def test_few_families_are_said_in_words_and_intervals_stay_where_shares_can_be()
 
 def test_bad_input_is_one_line():
     good = drives()
-    with pytest.raises(InputError, match="family00/003@0: progress: not a finite"):
-        pair(broken(good, [3], progress=np.nan), good)
-    twice = [*pair(good, good).ids[:-1], "family00/003@0"]
-    with pytest.raises(InputError, match="family00/003@0: met twice"):
-        dataclasses.replace(pair(good, good), ids=twice)
-    with pytest.raises(InputError, match="--min_ttc_margin: 0: expected within"):
-        GateConfig(min_ttc=0)
-    with pytest.raises(InputError, match="--primary: reward: expected some of"):
-        GateConfig(primary=("reward",))
-    with pytest.raises(InputError, match="--accept: a/1@0: met twice"):
-        GateConfig(accept=("a/1@0", "a/1@0"))
-
-
-def test_the_sentence_says_what_is_worse_where_and_what_to_do():
-    base = drives()
-    way = np.array(base.progress)
-    way[3 * EACH : 4 * EACH] *= 0.8
-    way[3 * EACH : 3 * EACH + 12] *= 0.3
-    verdict = judge(
-        pair(smoother(base).replace(progress=way), base, name="hand-set",
-             likeness=likeness(name="hand-set")),
-        GateConfig(),
-    )  # fmt: skip
-    lost = 100.0 * (1.0 - way[600:800].sum() / np.array(base.progress)[600:800].sum())
-    assert verdict.sentence.startswith(
-        "Do not ship: on 4,000 cases, against hand-set, the candidate makes"
-    )
-    assert f"{lost:.1f} % less progress in family03" in verdict.sentence
-    assert "(less than half as far in 12 of 200 drives)" in verdict.sentence
-    assert "But better: |jerk| below 6 m/s³ in " in verdict.sentence
-    assert verdict.sentence.endswith(f"Next: replay {verdict.look_at[0]}.")
-    assert verdict.look_at[0].startswith("family03/")
+    both = pair(good, good)
+    twice = [*both.ids[:-1], "family00/003@0"]
+    nan = broken(good, [3], progress=np.nan)
+    for work, says in (
+        (lambda: pair(nan, good), "family00/003@0: progress: not a finite"),
+        (lambda: dataclasses.replace(both, ids=twice), "family00/003@0: met twice"),
+        (lambda: GateConfig(min_ttc=0), "--min_ttc_margin: 0: expected within"),
+        (lambda: GateConfig(primary=("reward",)), "--primary: reward: expected some"),
+        (lambda: GateConfig(accept=("a/1@0", "a/1@0")), "--accept: a/1@0: met twice"),
+    ):
+        with pytest.raises(InputError, match=says):
+            work()
 
 
 def test_sentences_fit_three_lines_however_much_is_wrong():
@@ -341,24 +296,24 @@ def test_sentences_fit_three_lines_however_much_is_wrong():
     for mine, theirs in ((bad, drives()), (drives(), bad), (drives(), drives())):
         for known in (None, likeness()):
             verdict = judge(pair(mine, theirs, likeness=known, nulls={}), GateConfig())
-            lines = textwrap.wrap(verdict.sentence, 100)
-            assert len(lines) <= 3
+            assert len(textwrap.wrap(verdict.sentence, 100)) <= 3
             assert "..." not in verdict.sentence
 
 
-def test_text_and_json_say_the_same(tmp_path):
-    config = GateConfig()
-    faults = broken(drives(), np.arange(12), at_fault=1)
-    verdict = judge(pair(faults, drives()), config)
-    text = format_verdict(verdict)
-    assert text.startswith("Do not ship: on 4,000 cases")
-    assert "verdict: DO NOT SHIP" in text
-    assert max(map(len, text.splitlines())) <= 132
+def test_the_sentence_names_the_worst_family_and_the_json_says_the_same(tmp_path):
+    config, some = GateConfig(), slice(3 * EACH, 4 * EACH)
+    base = drives()
+    mine = further(further(base, 0.8, some), 0.3, slice(3 * EACH, 3 * EACH + 12))
+    verdict = judge(pair(mine, base), config)
+    lost = 100.0 - 100.0 * mine.progress[some].sum() / np.sum(base.progress[some])
+    assert f"{lost:.1f} % less progress in family03" in verdict.sentence
+    assert verdict.sentence.endswith(f"Next: replay {verdict.look_at[0]}.")
+    assert verdict.look_at[0].startswith("family03/")
+    assert max(map(len, format_verdict(verdict).splitlines())) <= 132
     write_verdict(tmp_path / "verdict.json", verdict, config, {"files": {}})
     body = json.loads((tmp_path / "verdict.json").read_text())
     assert list(body)[:2] == ["sentence", "decision"]
-    assert body["sentence"] == verdict.sentence
-    assert body["decision"] == verdict.decision
+    assert (body["sentence"], body["decision"]) == (verdict.sentence, "do not ship")
     assert body["exit_code"] == EXIT_CODES[verdict.decision] == 3
     assert len(body["checks"]) == len(verdict.checks)
     assert all(check["title"] for check in body["checks"])

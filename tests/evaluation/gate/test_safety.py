@@ -94,9 +94,6 @@ def test_how_many_cases_without_any_fault_it_takes():
     assert (least, most) == (1474, 1533)
     assert no_more_faults(0, 0, least - 1, 0.0025) > ALPHA
     assert no_more_faults(0, 0, most, 0.0025) <= ALPHA
-
-
-def test_bad_counts_are_one_line():
     with pytest.raises(InputError, match="no_more_faults: gained, lost, n, margin"):
         no_more_faults(3, 3, 5, 0.1)
 
@@ -105,7 +102,7 @@ def test_bad_counts_are_one_line():
 
 
 @pytest.mark.parametrize(("field", "name"), OFFENCES)
-def test_a_handful_of_faults_on_each_side_is_no_difference(field, name):
+def test_clearly_more_faults_are_refused_and_as_many_are_no_difference(field, name):
     mine = broken(drives(), spread(3), **{field: 1})
     theirs = broken(drives(), spread(3, start=5), **{field: 1})
     verdict = decide(mine, theirs)
@@ -113,17 +110,12 @@ def test_a_handful_of_faults_on_each_side_is_no_difference(field, name):
     assert (check.outcome, check.gained, check.lost) == ("pass", 3, 3)
     assert verdict.decision == "no difference"
     assert len(verdict.new_faults) == 3
-
-
-@pytest.mark.parametrize(("field", "name"), OFFENCES)
-def test_clearly_more_faults_are_refused_however_smooth(field, name):
+    # McNemar, 8 against 1: p = 0.039; the nulls drive as the incumbent does here
     mine = smoother(broken(drives(), spread(8), **{field: 1}))
     theirs = broken(drives(), spread(1, start=5), **{field: 1})
     verdict = decide(mine, theirs)
     assert verdict.decision == "do not ship"
-    # McNemar, 8 against 1: p = 0.039; the nulls drive as the incumbent does here
     assert failed(verdict) == {name, *(f"{name}, {null}" for null in NULLS)}
-    assert "has 8 new" in verdict.sentence
     assert verdict.look_at[0] == "family00/000@0"
 
 
@@ -173,21 +165,10 @@ def test_an_accepted_case_does_not_count():
     assert (check.outcome, check.lost) == ("pass", 3)
     assert verdict.decision == "ship"
     assert [fault.accepted for fault in verdict.new_faults] == [True] * 2 + [False] * 3
-    assert f"{ids[0]}: preventable at-fault collision (accepted)" in (
-        format_verdict(verdict)
-    )
-
-
-def test_what_is_no_new_fault_cannot_be_accepted():
-    mine = broken(drives(), spread(2), at_fault=1)
-    with pytest.raises(InputError) as found:
-        decide(mine, drives(), accept=("family01/000@1",))
-    assert str(found.value) == (
-        "--accept: family01/000@1: no case with a new fault: expected some of"
-        " family00/000@0, family00/097@0"
-    )
-    with pytest.raises(InputError, match="expected none, for there is none"):
-        decide(drives(), drives(), accept=("family01/000@1",))
+    some, none = f"expected some of {ids[0]}, ", "expected none, for there is none"
+    for candidate, says in ((mine, some), (drives(), none)):
+        with pytest.raises(InputError, match=f"--accept: family01/000@1: .*{says}"):
+            decide(candidate, theirs, accept=("family01/000@1",))
 
 
 # ----------------------------------------------------------------- nulls and likeness
@@ -231,52 +212,42 @@ def test_the_candidate_is_nearer_than_every_null(factors, outcome):
     assert verdict.decision == decisions[outcome]
 
 
+def judge_by(known):
+    """Two rewards that drive alike."""
+    return judge(pair(drives(), drives(), likeness=known), GateConfig())
+
+
 def test_nearer_to_the_human_is_a_gain_and_farther_a_loss():
-    nearer = judge(
-        pair(drives(), drives(), likeness=likeness(candidate=0.9)), GateConfig()
-    )
-    assert nearer.decision == "ship"
-    assert "% nearer to the human" in nearer.sentence
-    farther = judge(
-        pair(smoother(drives()), drives(), likeness=likeness(candidate=1.1)),
-        GateConfig(),
-    )
-    assert failed(farther) == {"likeness"}
-    assert "% farther from the human" in farther.sentence
+    nearer, farther = (likeness(candidate=factor) for factor in (0.9, 1.1))
+    assert judge_by(nearer).decision == "ship"
+    verdict = judge(pair(smoother(drives()), drives(), likeness=farther), GateConfig())
+    assert failed(verdict) == {"likeness"}
 
 
 def test_the_interval_of_likeness_is_over_recordings():
     """Nearer in nearly every drive of one recording says little of others."""
     known = likeness()
     distance = dict(known.distance)
-    distance["candidate"] = np.where(known.clusters == 0, 0.5, 1.0) * np.asarray(
-        distance["incumbent"]
-    )
-    verdict = judge(
-        pair(drives(), drives(),
-             likeness=Likeness(distance=distance, clusters=known.clusters)),
-        GateConfig(),
-    )  # fmt: skip
+    factor = np.where(known.clusters == 0, 0.5, 1.0)
+    distance["candidate"] = factor * np.asarray(distance["incumbent"])
+    verdict = judge_by(Likeness(distance=distance, clusters=known.clusters))
     gains = [c for c in verdict.checks if c.kind == "gain" and c.name == "likeness"]
     assert gains[0].difference > 0.0
     assert gains[0].outcome == "open"
     alone = Likeness(distance=distance, clusters=known.clusters % 3)
-    few = judge(pair(drives(), drives(), likeness=alone), GateConfig())
+    few = judge_by(alone)
     assert few.decision == "could not judge"
     assert any("3 vehicles are too few" in reason for reason in few.reasons)
 
 
 def test_bad_likeness_is_one_line():
     known = likeness()
-    with pytest.raises(InputError, match=r"likeness: candidate: shape \(3,\): expec"):
-        dataclasses.replace(known, distance={"candidate": np.ones(3)})
-    bad = {"candidate": np.where(np.arange(240) == 7, -1.0, 1.0)}
-    with pytest.raises(InputError, match=r"likeness: candidate: drive 7: -1\.0: expec"):
-        dataclasses.replace(known, distance=bad)
+    few, bad = np.ones(3), np.where(np.arange(240) == 7, -1.0, 1.0)
     without = {k: v for k, v in known.distance.items() if k != "+velocity"}
-    with pytest.raises(InputError, match=r"likeness: \+velocity: expected a row of"):
-        judge(
-            pair(drives(), drives(),
-                 likeness=dataclasses.replace(known, distance=without)),
-            GateConfig(),
-        )  # fmt: skip
+    for distance, says in (
+        ({"candidate": few}, r"likeness: candidate: shape \(3,\): expec"),
+        ({"candidate": bad}, r"likeness: candidate: drive 7: -1\.0: expec"),
+        (without, r"likeness: \+velocity: expected a row of"),
+    ):
+        with pytest.raises(InputError, match=says):
+            judge_by(dataclasses.replace(known, distance=distance))

@@ -9,13 +9,7 @@ import pytest
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.insight.attribution import attribute
-from rcirl_jax.reward import (
-    Normaliser,
-    RewardConfig,
-    RewardParams,
-    normalise,
-    value,
-)
+from rcirl_jax.reward import Normaliser, RewardConfig, RewardParams, normalise, value
 from rcirl_jax.units import NUM_TIMES
 
 T, F = NUM_TIMES, 21
@@ -62,10 +56,8 @@ def difference(params, a, b, activation="tanh"):
 
 def trajectories(seed=1):
     """Two [T, F] of normalised features with variance 1, some beyond the bounds."""
-    rng = np.random.default_rng(seed)
-    norm = normaliser()
-    a, b = rng.normal(0, 1, (2, T, F))
-    return (floats(norm.location + norm.scale * x) for x in (a, b))
+    rng, norm = np.random.default_rng(seed), normaliser()
+    return [floats(norm.location + norm.scale * x) for x in rng.normal(0, 1, (2, T, F))]
 
 
 def test_linear_reward_gives_the_terms_of_its_sum():
@@ -95,54 +87,39 @@ def test_relus_add_up_more_slowly():
         assert got == pytest.approx(want, rel=1.0 / steps)
 
 
-def test_exchanging_the_trajectories_changes_the_sign():
-    params = network()
-    a, b = trajectories()
-    there = run(params, normaliser(), a, b, VALID, "tanh")
-    back = run(params, normaliser(), b, a, VALID, "tanh")
+def test_exchanging_the_trajectories_changes_the_sign_and_pairs_may_be_mapped():
+    params, (a, b) = network(), trajectories()
+    both = jax.jit(
+        jax.vmap(lambda x, y: attribute(params, normaliser(), x, y, VALID, "tanh"))
+    )
+    there, back = both(jnp.stack([a, b]), jnp.stack([b, a]))
     np.testing.assert_allclose(there, -back, atol=1e-5)
+    one = run(params, normaliser(), a, b, VALID, "tanh")
+    np.testing.assert_allclose(there, one, atol=1e-5)
 
 
-def test_a_feature_that_does_not_differ_gets_nothing():
-    params = network()
-    a, b = trajectories()
+def test_a_feature_counts_up_to_its_bound_and_one_that_does_not_differ_gets_nothing():
+    params, (a, b) = network(), trajectories()
     a = a.at[:, 4].set(b[:, 4])
     # beyond its upper bound in both: the network sees no difference either
     a, b = a.at[:, 9].set(8.0), b.at[:, 9].set(50.0)
     got = np.asarray(run(params, normaliser(), a, b, VALID, "tanh"))
     np.testing.assert_array_equal(got[:, [4, 9]], 0.0)
     assert np.all(np.abs(got[VALID][:, [0, 3]]) > 0.0)
-
-
-def test_a_clipped_feature_counts_up_to_its_bound():
-    params = network()
-    _, b = trajectories()
-    at_bound, beyond = b.at[:, 2].set(7.0), b.at[:, 2].set(700.0)
-    np.testing.assert_array_equal(
-        run(params, normaliser(), at_bound, b, VALID, "tanh"),
-        run(params, normaliser(), beyond, b, VALID, "tanh"),
-    )
+    ends = [
+        run(params, normaliser(), b.at[:, 2].set(end), b, VALID, "tanh")
+        for end in (7.0, 700.0)
+    ]
+    np.testing.assert_array_equal(*ends)
 
 
 def test_invalid_times_contribute_nothing_whatever_is_there():
-    params = network()
-    a, b = trajectories()
+    params, (a, b) = network(), trajectories()
     a, b = a.at[~VALID].set(jnp.nan), b.at[~VALID].set(1e6)
     got = np.asarray(run(params, normaliser(), a, b, VALID, "tanh"))
     np.testing.assert_array_equal(got[~VALID], 0.0)
     assert np.all(np.isfinite(got))
     assert float(got.sum()) == pytest.approx(difference(params, a, b), rel=1e-3)
-
-
-def test_several_pairs_by_vmap():
-    params = network()
-    first, second = tuple(trajectories(1)), tuple(trajectories(2))
-    a, b = (jnp.stack(rows) for rows in zip(first, second, strict=True))
-    mapped = jax.jit(
-        jax.vmap(lambda x, y: attribute(params, normaliser(), x, y, VALID, "tanh"))
-    )
-    one = run(params, normaliser(), *second, VALID, "tanh")
-    np.testing.assert_allclose(mapped(a, b)[1], one, atol=1e-5)
 
 
 def test_input_that_does_not_fit_is_refused():

@@ -93,38 +93,29 @@ def test_a_true_phase_is_confirmed():
     checks = checked(drives_of(number, 0.0) for number in range(12))
     assert len(checks) == 2
     assert checks[0].verdict == "confirmed"
-    assert checks[0].crossings == 12
-    assert checks[0].stands == 6
-    assert checks[0].red_written == 0.0
-    assert checks[0].stands_red_written == 1.0
+    assert (checks[0].crossings, checks[0].stands) == (12, 6)
+    assert (checks[0].red_written, checks[0].stands_red_written) == (0.0, 1.0)
     assert checks[0].best_offset_s == 0.0
     assert "confirmed" in format_phases(checks)
 
 
-def test_a_shifted_phase_is_rejected_and_its_shift_found():
+def test_a_shifted_phase_is_rejected_and_one_that_means_nothing_not_confirmed():
     check = checked(drives_of(number, 25.0) for number in range(12))[0]
     assert check.verdict == "rejected"
     assert check.red_written > 0.9
     assert abs(check.best_offset_s - 35.0) <= 10.0
     assert check.red_best == 0.0
-
-
-def test_a_phase_per_file_that_means_nothing_is_not_confirmed():
-    rng = np.random.default_rng(1)
+    rng = np.random.default_rng(1)  # a phase per file
     made = [drives_of(number, rng.uniform(0.0, 60.0)) for number in range(12)]
     assert checked(made)[0].verdict in ("rejected", "not contradicted")
 
 
-def test_period():
+def test_periods_and_who_stands_at_the_line():
     assert period(light(0.0)) == pytest.approx(60.0)
     always = Signal(id="s", start=np.array([0.0]), state=("red",))
     assert period(always) is None
-
-
-def test_only_the_first_of_a_queue_stands_at_the_line():
-    made = drives_of(1, 0.0)
-    stands = first_stands(made, made.lanes[1])
-    assert list(stands) == [0]
+    made = drives_of(1, 0.0)  # only the first of a queue does
+    assert list(first_stands(made, made.lanes[1])) == [0]
 
 
 @pytest.mark.multiprocess
@@ -164,14 +155,12 @@ def test_an_import_can_ask_all_files_itself(monkeypatch, capsys):
     made = [drives_of(number, 0.0) for number in range(12)]
     monkeypatch.setattr(signals, "recordings_in", lambda one: [(None, one)])
     monkeypatch.setattr(signals, "items", lambda parts, _: iter(parts))
-    with flagsaver.as_parsed(signals="pooled"):
-        assert signals_asked() == "pooled"
-        assert checked_signals(made, Here()) == verdicts(made)
+    flags.FLAGS.mark_as_parsed()
+    for given, asked in (({"signals": "pooled"}, verdicts(made)), ({}, None)):
+        with flagsaver.as_parsed(**given):
+            assert signals_asked() == given.get("signals", "")
+            assert checked_signals(made, Here()) == asked
     assert "confirmed" in capsys.readouterr().out
-    with flagsaver.flagsaver():
-        flags.FLAGS.mark_as_parsed()
-        assert signals_asked() == ""
-        assert checked_signals(made, Here()) is None
 
 
 def test_a_verdict_on_a_line_comes_before_all_rules():

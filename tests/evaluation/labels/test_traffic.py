@@ -11,8 +11,8 @@ from rcirl_jax.evaluation.labels.made_traffic import Drive, cuts_in, decision
 from rcirl_jax.evaluation.labels.scores import format_labels
 from rcirl_jax.evaluation.labels.traffic import measure_traffic
 from rcirl_jax.runtime.executors import Processes
-from rcirl_jax.types import Decision, Tag
-from tests.helpers.commands import command
+from rcirl_jax.types import Decision
+from tests.helpers.commands import succeeded
 
 ROADS = ("arterial_signals", "highway_s_curve")
 FLOOR = 0.9  # precision and recall of a class with ten cases or more
@@ -59,21 +59,13 @@ def test_the_truth_does_not_come_from_the_labels(monkeypatch):
 def test_labels_do_not_depend_on_where_they_are_made():
     again = measure_traffic(1, "ngsim", seed=7, roads=ROADS, executor=Processes(2))
     assert again == report()
-
-
-def test_the_table_names_every_class():
-    text = format_labels(report())
-    named = set(Tag.__members__) - {"REHEARSED"}  # says who drove, not how
-    for name in [*Decision.__members__, *named]:
-        assert f"\n{name.lower():<14}" in text
-    json.dumps(report().as_dict(), allow_nan=False)
+    json.dumps(again.as_dict(), allow_nan=False)
 
 
 @pytest.mark.slow
 def test_command(tmp_path):
     flags = ("--quick", "--noise=none", f"--output={tmp_path}")
-    done = command("experiments.label_check", *flags)
-    assert done.returncode == 0, done.stderr
+    succeeded("experiments.label_check", *flags)
     body = json.loads((tmp_path / "labels.json").read_text())
     assert body["none"]["cases"] > 500
     assert all(score["wrong"] <= 2 for score in body["none"]["decisions"])
@@ -130,13 +122,13 @@ def test_the_truth_of_two_cars(ego, other, truth):
 
 def test_who_cuts_in():
     enters = car(30.0, changing(4, 2, 2.0))
-    assert cuts_in(EGO, enters, RATE_HZ) is True
-    assert cuts_in(EGO, car(-30.0, changing(4, 2, 2.0)), RATE_HZ) is False
-    assert cuts_in(EGO, car(30.0, 2), RATE_HZ) is False
-    assert cuts_in(EGO, car(30.0, 4), RATE_HZ) is False
-    assert cuts_in(EGO, car(30.0, changing(4, 2, 0.5)), RATE_HZ) is None
-    assert cuts_in(OUT, enters, RATE_HZ) is None
-    assert cuts_in(EGO, None, RATE_HZ) is None
+    for ego, other, truth in (
+        (EGO, enters, True), (EGO, car(-30.0, changing(4, 2, 2.0)), False),
+        (EGO, car(30.0, 2), False), (EGO, car(30.0, 4), False),
+        (EGO, car(30.0, changing(4, 2, 0.5)), None), (OUT, enters, None),
+        (EGO, None, None),
+    ):  # fmt: skip
+        assert cuts_in(ego, other, RATE_HZ) is truth
 
 
 @pytest.mark.parametrize(

@@ -179,17 +179,13 @@ def test_many_rows_can_still_differ_after_holms_correction(outcomes):
         (-0.21, 0.04, False, "better"),
         (0.21, 0.05, True, "no difference"),
         (-0.21, 0.06, False, "no difference"),
+        (0.0, 1.0, True, "no difference"),
     ],
 )
 def test_a_word_needs_a_small_adjusted_p(mean, p_holm, higher_is_better, word):
     """Not the difference's own p, nor standard errors: many are looked at."""
     d = Difference(mean=mean, low=0.1, high=1.0, se=0.01, p=0.001)
     assert verdict(d, p_holm, higher_is_better) == word
-
-
-def test_no_spread_and_no_difference_is_no_difference():
-    d = Difference(mean=0.0, low=0.0, high=0.0, se=0.0, p=1.0)
-    assert verdict(d, 1.0, True) == "no difference"
 
 
 def test_rates_at_the_ends_carry_the_exact_bound_of_vehicles(report):
@@ -203,13 +199,10 @@ def test_rates_at_the_ends_carry_the_exact_bound_of_vehicles(report):
     assert (rank.value, rank.high) == (1.0, 1.0)
     assert rank.low == pytest.approx(1.0 - bound)
     assert not report.rows["random"]["crash_rate"].exact
-    text = format_table(report)
-    assert f"0 (<= {100 * bound:.1f})" in text
-    assert f"100 (>= {100 - 100 * bound:.1f})" in text
 
 
-@pytest.mark.parametrize("width", [100, 110, 120])
-def test_table_fits_lines_up_and_orders_its_rows(report, width):
+@pytest.mark.parametrize("width", [100, 120])
+def test_table_fits_lines_up_and_has_the_numbers_of_the_report(report, width):
     lines = format_table(report, width).splitlines()
     assert max(len(line) for line in lines) <= width
     table = lines[: next(i for i, x in enumerate(lines) if x.startswith("Paired"))]
@@ -220,31 +213,15 @@ def test_table_fits_lines_up_and_orders_its_rows(report, width):
         order = ("rc-irl", "twin", *(x for x in RIVALS if x in report.rows))
         assert all(n.startswith(o) for n, o in zip(rows, order, strict=True))
         assert len({len(line) for line in (table[at + 1], *rows)}) == 1  # right-aligned
-    for how in METRICS.values():
-        assert how.title in "\n".join(table)
-
-
-def test_table_prints_the_numbers_of_the_report(report):
-    text = format_table(report)
+    text = "\n".join(lines)
     found = report.rows["hand-set"]["top1_fde"]
     assert f"{found.value:.2f} [{found.low:.2f}, {found.high:.2f}]" in text
-    assert "rc-irl (3 runs)" in text
-    assert "sd over runs" in text
     for c in report.comparisons:
         if c.row not in RIVALS and c.metric == "top1_fde":
             assert f"{c.difference.mean:+.3f} [" in text
-    assert "rc-irl minus hand-set" in text
-    assert "IDM minus hand-set" not in text
-
-
-def test_rivals_alone_are_compared_with_each_other(scorers, outcomes):
-    some = {name: scorers[name] for name in ("random", "hand-set")}
-    text = format_table(build_report(some, outcomes, num_resamples=100))
-    assert "random minus hand-set" in text
-    assert "hand-set minus random" in text
-    alone = build_report({"IDM": scorers["IDM"]}, outcomes, num_resamples=100)
-    assert alone.comparisons == ()
-    assert "Paired" not in format_table(alone)
+    bound = 100.0 - 100.0 * 0.05 ** (1.0 / VEHICLES)
+    assert f"0 (<= {bound:.1f})" in text
+    assert f"100 (>= {100.0 - bound:.1f})" in text
 
 
 def test_a_tiny_rate_is_not_printed_as_zero(report):
@@ -256,76 +233,57 @@ def test_a_tiny_rate_is_not_printed_as_zero(report):
     assert "0.03 [0.0, 99.99]" in text
 
 
-def test_few_vehicles_are_said(scorers, outcomes):
-    few = dataclasses.replace(outcomes, cluster=outcomes.cluster % 6)
-    text = format_table(build_report(scorers, few, num_resamples=100))
-    assert "Fewer than 20 vehicles" in text
+def test_one_row_alone_is_compared_with_nobody(scorers, outcomes):
+    alone = build_report({"IDM": scorers["IDM"]}, outcomes, num_resamples=100)
+    assert alone.comparisons == ()
+    assert "Paired" not in format_table(alone)
 
 
 def test_json_is_plain_versioned_and_complete(report):
     made = to_json(report)
-    again = json.loads(json.dumps(made, allow_nan=False))
-    assert again == made
-    assert made["schema"] == "rcirl-jax/ranking-report"
-    assert made["schema_version"] == 1
-    assert made["miss_threshold_m"] == 6.0
-    assert made["failure_m"] == 10.0
+    assert json.loads(json.dumps(made, allow_nan=False)) == made
+    assert (made["schema"], made["schema_version"]) == ("rcirl-jax/ranking-report", 1)
+    assert (made["miss_threshold_m"], made["failure_m"]) == (6.0, 10.0)
     assert set(made["rows"]["rc-irl"]) == set(METRICS) == set(made["metrics"])
-    found = report.rows["rc-irl"]["top1_fde"]
-    stored = made["rows"]["rc-irl"]["top1_fde"]
-    assert stored == pytest.approx(dataclasses.asdict(found), rel=1e-8)
-    assert made["rows"]["IDM"]["top1_fde"]["seed_sd"] is None
+    found = dataclasses.asdict(report.rows["rc-irl"]["top1_fde"])
+    assert made["rows"]["rc-irl"]["top1_fde"] == pytest.approx(found, rel=1e-8)
     assert len(made["comparisons"]) == len(report.comparisons)
-
-
-def test_json_of_a_later_version_is_refused(report):
-    later = {**to_json(report), "schema_version": 2, "added": 1}
+    assert from_json(made).counts == report.counts
     with pytest.raises(InputError, match=r"report: schema: .*, 2\): expected .*, 1\)"):
-        from_json(later)
-    assert from_json(to_json(report)).counts == report.counts
-
-
-def test_json_refuses_what_is_not_finite(report):
+        from_json({**made, "schema_version": 2, "added": 1})
     broken = dataclasses.replace(report.oracle_floor, se=float("nan"))
     with pytest.raises(InputError, match=r"oracle_floor\.se: nan"):
         to_json(dataclasses.replace(report, oracle_floor=broken))
 
 
 def test_bad_input_is_refused(scorers, outcomes, report):
-    with pytest.raises(InputError, match="at least one row"):
-        build_report({}, outcomes)
-    with pytest.raises(InputError, match="references: nobody"):
-        build_report(scorers, outcomes, references=["nobody"])
-    with pytest.raises(InputError, match="IDM: no runs"):
-        build_report({"IDM": []}, outcomes)
-    lacking = {k: v for k, v in scorers["IDM"][0].items() if k != "mrr"}
-    with pytest.raises(InputError, match="IDM: mrr: missing"):
-        build_report({"IDM": [lacking]}, outcomes)
-    short = {k: v[:5] for k, v in scorers["IDM"][0].items()}
-    with pytest.raises(InputError, match="not of 240 scenes"):
-        build_report({"IDM": [scorers["IDM"][0], short]}, outcomes)
+    whole = scorers["IDM"][0]
+    lacking = {k: v for k, v in whole.items() if k != "mrr"}
+    short = {k: v[:5] for k, v in whole.items()}
+    for rows, more, says in (
+        ({}, {}, "at least one row"),
+        (scorers, {"references": ["nobody"]}, "references: nobody"),
+        ({"IDM": []}, {}, "IDM: no runs"),
+        ({"IDM": [lacking]}, {}, "IDM: mrr: missing"),
+        ({"IDM": [whole, short]}, {}, "not of 240 scenes"),
+    ):
+        with pytest.raises(InputError, match=says):
+            build_report(rows, outcomes, **more)
     with pytest.raises(InputError, match="width"):
         format_table(report, 99)
 
 
-def test_markdown_has_the_report_s_numbers_and_the_difference_to_one_row(
-    scorers, outcomes
-):
+def test_markdown_has_the_numbers_and_the_difference_to_one_row(scorers, outcomes):
     report = build_report(scorers, outcomes, references=["twin"])
     head, rule, *rows = markdown_table(report, "twin").splitlines()
-    cells = {
-        line.split(" | ")[0].strip("| "): line.strip("| ").split(" | ") for line in rows
-    }
     assert len(rule.split("|")) == len(head.split("|"))
     assert len(rows) == len(scorers)
-    found = report.rows["rc-irl"]["top1_fde"]
-    assert cells["rc-irl (3 runs)"][1] == (
-        f"{found.value:.2f} [{found.low:.2f}, {found.high:.2f}]"
-    )
-    (apart,) = (
-        c for c in report.comparisons if (c.row, c.metric) == ("rc-irl", "top1_fde")
-    )
-    said = cells["rc-irl (3 runs)"][-1]
-    assert said.startswith(f"{apart.difference.mean:+.2f} [")
-    assert ("p < 0.01" in said) == (apart.p_holm < 0.01)
-    assert "minus" not in markdown_table(report, "nobody")
+    cells = {
+        row.split(" | ")[0].strip("| "): row.strip("| ").split(" | ") for row in rows
+    }
+    own, found = cells["rc-irl (3 runs)"], report.rows["rc-irl"]["top1_fde"]
+    assert own[1] == f"{found.value:.2f} [{found.low:.2f}, {found.high:.2f}]"
+    pairs = {(c.row, c.metric): c for c in report.comparisons}
+    apart = pairs["rc-irl", "top1_fde"]
+    assert own[-1].startswith(f"{apart.difference.mean:+.2f} [")
+    assert ("p < 0.01" in own[-1]) == (apart.p_holm < 0.01)

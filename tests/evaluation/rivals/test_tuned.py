@@ -16,16 +16,12 @@ from rcirl_jax.evaluation.rivals.tuned import (
     idm_of,
     mean_driven_fde,
 )
-from rcirl_jax.planner.baselines import (
-    TUNED_IDM_ROW,
-    Idm,
-    closeness,
-    idm_trajectory,
-)
+from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm, closeness, idm_trajectory
 from rcirl_jax.reward import LatticeCost
 from rcirl_jax.sampling import SamplerConfig
-from tests.evaluation.driven import long_rows, mean_chosen_fde, scored_rivals
+from tests.evaluation.driven import mean_chosen_fde, scored_rivals
 from tests.helpers.scenes import sampled
+from tests.helpers.stored import long_rows
 
 SMALL = SamplerConfig(num_random=16, cruise_times=(4.0,), edge_times=(4.0,))
 SCENES = 24
@@ -57,9 +53,12 @@ def test_zeros_are_the_usual_driver_and_bounds_hold():
     wild = idm_of(jnp.full(len(TUNABLE_IDM), 50.0))
     assert float(wild.headway) == pytest.approx(Idm().headway * np.exp(3.0))
     assert float(wild.max_braking) == Idm().max_braking
+    (numbers,) = as_numbers([Idm(headway=1.2)])
+    assert numbers["headway"] == pytest.approx(1.2)
+    assert set(numbers) == set(Idm().fields())
 
 
-def test_the_objective_is_what_the_ranking_report_measures():
+def test_the_search_comes_close_to_a_hidden_driver_by_what_the_report_measures():
     rows, hidden = driven_by_a_hidden_driver(), idm_of(jnp.asarray(HIDDEN, jnp.float32))
     tuned = {TUNED_IDM_ROW: hidden, "again": Idm(), "cost": LatticeCost()}
     scored = scored_rivals(rows, SMALL, tuned)
@@ -72,16 +71,11 @@ def test_the_objective_is_what_the_ranking_report_measures():
     found = [mean_chosen_fde(scored, name) for name in ("IDM", TUNED_IDM_ROW)]
     scenes = driven_scenes(rows, INDEX, SMALL, 8.0)
     both = np.stack([np.zeros(len(TUNABLE_IDM)), HIDDEN])
-    np.testing.assert_allclose(found, mean_driven_fde(scenes, both, True), atol=0.05)
-
-
-def test_the_search_comes_close_to_a_hidden_driver():
-    scenes = driven_scenes(driven_by_a_hidden_driver(), INDEX, SMALL, 8.0)
-    start = np.zeros(len(TUNABLE_IDM))
-    usual, hidden = mean_driven_fde(scenes, np.stack([start, HIDDEN]), True)
+    usual, hidden = mean_driven_fde(scenes, both, True)
+    np.testing.assert_allclose(found, [usual, hidden], atol=0.05)
     assert hidden < 0.05
-    _, found = tune(lambda x: mean_driven_fde(scenes, x, True), start, 1.0, 200, 0)
-    assert found < 0.5 * usual
+    _, best = tune(lambda x: mean_driven_fde(scenes, x, True), both[0], 1.0, 200, 0)
+    assert best < 0.5 * usual
 
 
 def test_candidates_are_those_of_the_evaluation():
@@ -90,12 +84,6 @@ def test_candidates_are_those_of_the_evaluation():
     one = jax.tree.map(lambda x: jnp.asarray(x[3]), rows.scene)
     expected = sampled(candidates_key(jnp.asarray(3)), one, SMALL).trajectory
     np.testing.assert_allclose(scenes.everyone.s[3], expected.s, atol=1e-3)
-
-
-def test_numbers_of_a_rival():
-    (numbers,) = as_numbers([Idm(headway=1.2)])
-    assert numbers["headway"] == pytest.approx(1.2)
-    assert set(numbers) == set(Idm().fields())
 
 
 def test_distances_alone_are_those_of_the_scores():

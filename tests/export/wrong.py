@@ -1,0 +1,199 @@
+"""Files that no reader takes, and the field that each names: of Python and of C++.
+
+`FIELDS` are of the body of a valid file: the path of one, another value, a part of the
+line. `FILES` are whole ones.
+"""
+
+import hashlib
+from typing import cast
+
+import msgpack
+import numpy as np
+
+from tests.helpers.weights_files import packed
+
+VALID = packed()
+ANCHORED = packed(anchored=True)
+
+
+def dump(value) -> bytes:
+    return cast("bytes", msgpack.packb(value))
+
+
+def array(*shape, fill=1.0):
+    data = np.full(shape, fill, "<f4").tobytes()
+    return {"shape": list(shape), "dtype": "<f4", "data": data}
+
+
+def falling(*shape):
+    """An array n, n - 1, ..., 1."""
+    size = int(np.prod(shape))
+    return {**array(*shape), "data": np.arange(size, 0, -1, "<f4").tobytes()}
+
+
+def sealed(body, /, **outer):
+    """A file with this body and the right hash."""
+    body = body if isinstance(body, bytes) else dump(body)
+    digest = hashlib.sha256(body).hexdigest()
+    head = {"magic": "RCIRLW", "schema_version": 1, "body": body, "sha256": digest}
+    return dump({**head, **outer})
+
+
+def body_of(data=VALID):
+    return msgpack.unpackb(msgpack.unpackb(data)["body"])
+
+
+def tampered(path, value, data=None):
+    """A valid file with one field of its body replaced, and hashed again."""
+    data = data or (ANCHORED if path[0] == "anchor" else VALID)
+    body = body_of(data)
+    *way, last = path
+    place = body
+    for step in way:
+        place = place[step]
+    place[last] = value
+    return sealed(body, schema_version=msgpack.unpackb(data)["schema_version"])
+
+
+def flipped(data, bits):
+    changed = bytearray(data)
+    for bit in bits:
+        changed[bit // 8] ^= 1 << (bit % 8)
+    return bytes(changed)
+
+
+ANCHOR_FIELDS = (
+    ([], None, "anchor: None: expected a map"),
+    ([], {}, "anchor.incumbent: missing: expected the keys incumbent, low, high"),
+    (["extra"], 1, "anchor.extra: unknown: expected the keys incumbent, low, high"),
+    (["incumbent"], 5, "anchor.incumbent: 5: expected a text"),
+    (["incumbent"], "", "anchor.incumbent: : expected a text of 1 to 64"),
+    (["incumbent"], "x" * 65, "anchor.incumbent: xxx"),
+    (["low"], -0.5, "anchor.low: -0.5: expected at least 0"),
+    (["low"], True, "anchor.low: True: expected a finite number"),
+    (["low"], 2, "anchor.high: 1.5: expected at least low, 2"),
+    (["low"], 0.2, "anchor.gain[0]: "),
+    (["high"], float("inf"), "anchor.high: inf: expected a finite number"),
+    (["high"], 1e300, "anchor.gain[0]: "),
+    (["high"], None, "anchor.high: None: expected a finite number"),
+    (["location"], array(2), "anchor.location.shape: [2]: expected [3]"),
+    (["location"], array(3, fill=np.inf), "anchor.location[0]: inf: expected fin"),
+    (["location", "data"], b"\0" * 11, "anchor.location.data: bytes of 11"),
+    (["scale"], array(3, fill=0.0), "anchor.scale[0]: 0: expected over 0"),
+    (["scale"], array(3, 1), "anchor.scale.shape: list of 2: expected [3]"),
+    (["kernel"], array(4, 3), "anchor.kernel.shape: [4, 3]: expected [3, "),
+    (["kernel"], array(3, 0), "anchor.kernel.shape: [3, 0]: expected [3, "),
+    (["kernel"], array(3, 4097), "anchor.kernel.shape: [3, 4097]: expected [3, "),
+    (["kernel"], array(3, 5), "anchor.bias.shape: [4]: expected [5]"),
+    (["bias"], array(4, fill=np.nan), "anchor.bias[0]: nan: expected finite"),
+    (["out"], array(1), "anchor.out.shape: [1]: expected [4]"),
+    (["out"], array(4, fill=3e38), "anchor.gain["),
+    (["offset"], array(2), "anchor.offset.shape: [2]: expected [1]"),
+    (["offset"], 0.5, "anchor.offset: 0.5: expected a map"),
+    (["gain"], array(3), "anchor.gain.shape: [3]: expected [4]"),
+    (["gain"], array(4, fill=np.nan), "anchor.gain[0]: nan: expected finite"),
+    (["gain"], array(4, fill=9.0), "anchor.gain[0]: 9: expected the gain of the"),
+)
+FIELDS = (
+    (["preset"], 5, "preset: 5: expected a text"),
+    (["preset"], "x" * 65, "preset: xxx"),
+    (["features"], {}, "features: dict of 0: expected a list of 1 to 64"),
+    (["features"], [1], "features[0]: 1: expected a map"),
+    (["features"], [{}] * 65, "features: list of 65"),
+    (["features", 1, "name"], "feature0", "features[1].name: feature0: expected a"),
+    (["features", 1, "unit"], "", "features[1].unit: : expected a text"),
+    (["features", 1, "none_value"], True, "none_value: True: expected a finite"),
+    (["features", 1, "none_value"], float("inf"), "none_value: inf"),
+    (["features", 1, "extra"], 1, "features[1].extra: unknown: expected the keys"),
+    (["normaliser", "scale"], array(3, fill=0.0), "normaliser.scale[0]: 0"),
+    (["normaliser", "scale"], array(3, fill=np.nan), "normaliser.scale[0]: nan"),
+    (["normaliser", "upper"], array(3, fill=-99.0), "normaliser.lower[0]"),
+    (["normaliser", "location"], array(2), "location.shape: [2]: expected [3]"),
+    (["times"], array(4), "times[0]: 1: expected 0 s first"),
+    (["times"], array(4, fill=0.0), "times[0]: 0: expected increasing"),
+    (["times"], array(257), "times.shape: [257]: expected"),
+    (["times"], array(0), "times.shape: [0]: expected"),
+    (["times"], [0.0, 1.0], "times: list of 2: expected a map"),
+    (["gamma"], array(3), "gamma.shape: [3]: expected [4]"),
+    (["gamma"], array(4, 1), "gamma.shape: list of 2: expected [4]"),
+    (["gamma", "shape"], "four", "gamma.shape: four: expected [4]"),
+    (["gamma", "shape"], [4.0], "gamma.shape: [4.0]: expected [4]"),
+    (["gamma", "shape"], [2**63], "gamma.shape: [9223372036854775808]"),
+    (["gamma", "dtype"], ">f4", "gamma.dtype: >f4: expected <f4"),
+    (["gamma", "data"], b"\0" * 15, "gamma.data: bytes of 15: expected 16 bytes"),
+    (["gamma", "data"], "x" * 16, "gamma.data: xxxxxxxxxxxxxxxx: expected 16"),
+    (["gamma"], array(4, fill=np.inf), "gamma[0]: inf: expected finite numbers"),
+    (["layers"], [], "layers: list of 0: expected a list of 1 to 16"),
+    (["layers"], [{}] * 17, "layers: list of 17"),
+    (["layers", 0, "kernel"], array(2, 5), "kernel.shape: [2, 5]: expected [3, "),
+    (["layers", 1, "kernel"], array(4, 1), "layers[1].kernel.shape: [4, 1]: expe"),
+    (["layers", 1], {"kernel": array(5, 2), "bias": array(2)}, "expected 1 output"),
+    (["layers", 0, "kernel"], array(3, 4097), "kernel.shape: [3, 4097]: expected"),
+    (["layers", 0, "bias"], array(4), "layers[0].bias.shape: [4]: expected [5]"),
+    (["layers", 0, "bias"], None, "layers[0].bias: None: expected a map"),
+    (["activation"], "gelu", "activation: gelu: expected one of tanh, relu"),
+    (["activation"], ["tanh"], "activation: list of 1"),
+    (["leaky_slope"], float("nan"), "leaky_slope: nan: expected a finite number"),
+    (["loss"], {"name": "rank"}, "loss.leaky_rate: missing"),
+    (["loss", "leaky_rate"], "a", "loss.leaky_rate: a: expected a finite number"),
+    (["provenance"], [], "provenance: list of 0: expected a map"),
+    (["provenance", "x"], b"1", "provenance: bytes of 1: expected texts, finite"),
+    (["provenance", "x"], float("inf"), "provenance: inf"),
+    (["provenance", "x"], [[[[[[[[]]]]]]]], "provenance: list of 0: expected"),
+    (["provenance", "x"], [0] * 4097, "exceeds max_array_len"),
+    (["provenance", "x"], [[0] * 4000] * 17, "too many entries: expected at most"),
+    (["provenance", "x"], "x" * 70_000, "exceeds max_str_len"),
+    (["provenance", "x"], msgpack.Timestamp(1), "exceeds max_ext_len"),
+    (["provenance", b"x"], 1, "a key used twice or not a text"),
+    (["samples"], {}, "samples.features: missing"),
+    (["samples", "value"], array(4, fill=99.0), "samples[0]: scored"),
+    (["samples", "value"], array(257), "samples.value.shape: [257]"),
+    (["samples", "valid"], array(4, 4, fill=0.5), "samples.valid[0, 0]: 0.5"),
+    (["samples", "features"], array(4, 4, 2), "features.shape: [4, 4, 2]: expe"),
+    (["extra"], 1, "body.extra: unknown: expected the keys preset"),
+    *((["anchor", *path], value, line) for path, value, line in ANCHOR_FIELDS),
+)
+
+
+def _versioned(version, message, **more):
+    """A body with fields of another version than its file says."""
+    return sealed({**body_of(), **more}, schema_version=version), message
+
+
+LATER = "schema_version: 5: expected 1, 2, 3 or 4, all this reader supports"
+FILES = (
+    (b"", "size: 0 bytes or more: expected 1 to 67108864 bytes"),
+    (VALID[:-1], "file: ValueError Unpack failed: incomplete input: expected one"),
+    (VALID + VALID, "file: ExtraData"),
+    (b"not a weights file", "file: ExtraData"),
+    (b"\xc1", "file: FormatError"),
+    (b"\x91" * 5000, "file: "),
+    (b"\xdd\xff\xff\xff\xff", "file: ValueError 4294967295 exceeds max_array_len"),
+    (dump([1]), "magic: missing or another: expected 'RCIRLW'"),
+    (dump({1: 1}), "file: ValueError int is not allowed for map key"),
+    (b"\x82\xa1a\x01\xa1a\x02", "file: a key used twice"),
+    (sealed(body_of(), magic="RCIRLX"), "magic: missing or another"),
+    # whatever a later version adds, its number is what is named
+    (sealed(b"later", schema_version=5, signature="x"), LATER),
+    _versioned(3, "body.seen: missing: expected the keys"),
+    _versioned(1, "body.seen: unknown: expected", seen=array(2, 3)),
+    _versioned(3, "seen.shape: [1, 3]: expected [2, 3]", seen=array(1, 3)),
+    _versioned(3, "seen[0, 0]: 6: expected at most the high", seen=falling(2, 3)),
+    _versioned(4, "body.anchor: missing: expected the keys", seen=array(2, 3)),
+    _versioned(3, "body.anchor: unknown: expected", seen=array(2, 3), anchor={}),
+    _versioned(2, "body.context: missing: expected the keys"),
+    _versioned(1, "body.context: unknown: expected", context=array(2, 2)),
+    _versioned(2, "context.shape: [1, 2]: expected", context=array(1, 2)),
+    (
+        tampered(["samples", "valid"], array(4, 4, fill=0.0), ANCHORED),
+        "samples.valid[0, 0]: 0: expected 1 at the first time",
+    ),
+    (sealed(body_of(), schema_version=True), "schema_version: True: expected 1, 2"),
+    (sealed(body_of(), extra=1), "file.extra: unknown"),
+    (sealed(body_of(), sha256="0" * 64), "sha256: "),
+    (sealed(body_of(), sha256=5), "expected 5; the file is damaged"),
+    (sealed(body_of(), body="text", sha256="no bytes"), "sha256: no bytes"),
+    (sealed(b""), "body: ValueError"),
+    (sealed(dump(body_of()) + b"\0"), "body: ExtraData"),
+    (sealed([1]), "body: list of 1: expected a map"),
+)
