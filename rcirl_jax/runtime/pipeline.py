@@ -163,9 +163,10 @@ class Stages:
             raise InputError(
                 f"{path}: schema_version: {version}: expected {SCHEMA_VERSION}"
             )
-        for name, record in checked(stages, dict, f"{path}: stages").items():
+        known = checked(stages, dict, f"{path}: stages")
+        for name, record in known.items():
             checked(record, _Record, f"{path}: {name}")
-        return stages
+        return known
 
     def _write(self, stages: Mapping[str, Any]) -> None:
         body = {"schema_version": SCHEMA_VERSION, "stages": dict(stages)}

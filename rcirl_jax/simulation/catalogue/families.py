@@ -208,7 +208,7 @@ def _read(path: Path, spec: dict[str, Any]) -> Family:
     own = [key for key in (*ELEMENTS, "agent") if key in spec]
     if found.compound and own:
         raise InputError(f"{path}: compound: with {own[0]}: expected either, not both")
-    perception = dict.fromkeys(PERCEPTION, 0.0)
+    perception: dict[str, float | str | None] = dict.fromkeys(PERCEPTION, 0.0)
     return Family(
         name=found.family,
         title=found.title,

@@ -5,6 +5,7 @@ import math
 import re
 from collections.abc import Mapping as AnyMapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -104,7 +105,7 @@ def shown(rows: AnyMapping[str, np.ndarray]) -> list[str]:
     origin = rows["t"].min()
     cells = [[f"{n} [{SHOWN_UNITS[n]}]" if n in SHOWN_UNITS else n for n in names]]
     for row in np.argsort(rows[LINE], kind="stable")[:ROWS_SHOWN]:
-        values = {name: rows[name][row] for name in names}
+        values: dict[str, Any] = {name: rows[name][row] for name in names}
         values["t"] = values["t"] - origin
         if "heading" in values:
             turn = np.angle(np.exp(1j * values["heading"]))
