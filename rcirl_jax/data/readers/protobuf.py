@@ -1,7 +1,7 @@
 """Messages read by the protobuf library, with tables instead of .proto files.
 
 A table names the fields that are read; the library skips all others, and those of
-another wire type. Parsed messages take up to 50 times the bytes of a file made for
+another wire type. Parsed messages take up to 60 times the bytes of a file made for
 it, so callers limit these first. The library itself refuses 100 nested messages.
 """
 
