@@ -292,7 +292,7 @@ def _found(
         sign = name[: len(name) - len(plain)]
         for user in users if HOLE in name else [None]:
             column = plain if user is None else plain.replace(HOLE, user)
-            if column in table.header:
+            if table.has(column):
                 found.append((field, sign + column, user))
             elif field in EXPECTED:
                 table.place(column)  # says that it is missing
@@ -310,7 +310,8 @@ def _users(table: Table, columns: AnyMapping[str, str]) -> list[str]:
         pattern = re.compile(f"{re.escape(before)}(.+){re.escape(after)}")
         matches = (pattern.fullmatch(column) for column in table.header)
         own.append([match[1] for match in matches if match])
-    users = [user for user in own[0] if user in own[1]]
+    both = set(own[1])
+    users = [user for user in own[0] if user in both]
     numbered = [user for user in users if user.isdigit()]
     if not users:
         raise InputError(
