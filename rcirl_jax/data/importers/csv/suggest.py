@@ -33,7 +33,7 @@ from rcirl_jax.data.importers.csv.suggestion import (
 from rcirl_jax.data.readers.tables.cells import EMPTY
 from rcirl_jax.data.readers.tables.ledger import LINE
 from rcirl_jax.data.readers.tables.table import Table, batches, open_table
-from rcirl_jax.errors import InputError
+from rcirl_jax.errors import InputError, as_input_error
 
 USUAL_RATES = (1, 2, 4, 5, 10, 12.5, 15, 20, 24, 25, 29.97, 30, 50, 60, 100, 120)
 RATE_FITS = 0.1  # relative
@@ -56,6 +56,11 @@ def suggested(path: Path) -> Suggestion:
     Raises:
       InputError: no table, or one without columns that look like time, id and places.
     """
+    with as_input_error(str(path), "a table with a row per road user and time"):
+        return _suggested(path)
+
+
+def _suggested(path: Path) -> Suggestion:
     table = open_table(path)
     columns, said = _columns(table)
     guess = Guess(columns=columns, said=said)

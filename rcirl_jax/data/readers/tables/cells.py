@@ -180,7 +180,7 @@ def texts(column: Any, lower: bool) -> tuple[np.ndarray, list[str], np.ndarray]:
     if codes.null_count:
         codes, names = codes.fill_null(len(names)), [*names, ""]
     codes = codes.to_numpy(zero_copy_only=False)
-    long = np.array([len(name) > TEXT_CHARS for name in names])
+    long = np.array([len(name) > TEXT_CHARS for name in names], bool)
     return codes.astype(np.int64), names, long[codes]
 
 
