@@ -10,7 +10,6 @@ import csv
 import dataclasses
 import functools
 import itertools
-import math
 import re
 import string
 from collections.abc import Mapping, Sequence
@@ -21,6 +20,7 @@ from rcirl_jax.data.readers.tables.streams import head_of
 from rcirl_jax.errors import InputError
 
 MAX_COLUMNS = 10_000  # of a table; logs have some dozens
+MOST = 0.8  # share of a head's rows that repeat their last columns
 SAMPLE_CELLS = 20_000  # cells of the head from which decimals are recognised
 DELIMITERS = {"tab": "\t", "space": " ", "comma": ",", "semicolon": ";", "pipe": "|"}
 TRIED = ("\t", ";", "|", ",")  # delimiters, the likelier first where two cut as well
@@ -273,13 +273,15 @@ def _usual(counts: Sequence[int], filled: Sequence[int]) -> int:
 def _repeating(width: int, rows: Sequence[Sequence[str]]) -> int:
     """Last columns of the header that longer rows go on repeating, 0 of a usual table.
 
-    All rows are longer, by different multiples of one number of cells.
+    Nearly all rows are longer, by different multiples of one number of cells.
     """
-    lengths = {len(_trimmed(row)) - width for row in rows}
-    if len(lengths) < 2 or min(lengths) <= 0:
+    more = [len(_trimmed(row)) - width for row in rows]
+    if len(set(more)) < 2 or sum(count > 0 for count in more) < MOST * len(more):
         return 0
-    group = math.gcd(*lengths)
-    return group if 1 < group <= width else 0
+    for group in range(width, 1, -1):
+        if sum(count % group == 0 for count in more) >= MOST * len(more):
+            return group
+    return 0
 
 
 def _trimmed(row: Sequence[str]) -> list[str]:
