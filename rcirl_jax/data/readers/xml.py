@@ -8,6 +8,7 @@ from xml.etree.ElementTree import Element, ParseError
 
 import numpy as np
 
+from rcirl_jax.data.readers.tables.streams import refuse_pointer
 from rcirl_jax.errors import InputError
 
 
@@ -26,6 +27,7 @@ def read_xml(path: Path, tag: str, max_bytes: int) -> Element:
     from defusedxml import DefusedXmlException
     from defusedxml import ElementTree as Safe
 
+    refuse_pointer(path)
     size = path.stat().st_size
     if size > max_bytes:
         raise InputError(f"{path}: size: {size} bytes: expected at most {max_bytes}")

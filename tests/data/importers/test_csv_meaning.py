@@ -119,6 +119,7 @@ NAMES = [
     ("Longitude", "Latitude"),
     ("gps_lng", "gps_lat"),
     ("positionLon", "positionLat"),
+    ("GPSLongitude", "GPSLatitude"),
     ("LONG [deg]", "LAT [deg]"),
 ]
 
@@ -510,6 +511,17 @@ def test_a_row_per_vehicle_as_in_pneuma(tmp_path, long_bytes):
         np.testing.assert_allclose(track.heading, 0.0, atol=0.01)
         assert np.ptp(track.x) == pytest.approx(np.trapezoid(real, track.t), abs=0.1)
     assert found.rows.read == 570
+
+
+def test_a_row_per_vehicle_that_breaks_off(tmp_path):
+    """The others say how many columns repeat."""
+    path = tmp_path / "log.csv"
+    path.write_text(pneuma().replace("; \n", "; 37.97; 23.7; \n", 1))
+    columns = {field: name for field, name in PNEUMA.items() if field != "kind"}
+    source = people.spec(tmp_path, columns, units='speed = "km/h"')
+    found = people.only(path, source)
+    assert people.rows_of(found) == (571, 1, 0, 0)
+    assert any("first: line 2: 6 cells: expected 10" in note for note in found.notes)
 
 
 def test_a_cell_inside_of_a_long_row_is_named_by_its_line(tmp_path):

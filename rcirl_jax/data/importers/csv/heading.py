@@ -29,6 +29,7 @@ SPAN_S = 0.5  # s over which a direction of travel is taken
 MOVED_M = 1.0  # m in that time; slower road users have none
 ENOUGH = 20  # directions of travel by which a convention is judged
 FITS = math.radians(20.0)  # rad from the direction of travel, in the median
+FITS_WELL = math.radians(8.0)  # rad; what another convention than the usual has to
 SURE = math.radians(3.0)  # rad; nearer than this the usual convention is kept
 
 
@@ -87,7 +88,7 @@ def recognised_form(
     }
     usual = next(iter(apart))
     best = min(apart, key=lambda form: apart[form])
-    if apart[usual] <= max(SURE, 2.0 * apart[best]):
+    if apart[usual] <= max(SURE, 2.0 * apart[best]) or apart[best] > FITS_WELL:
         best = usual
     if apart[best] > FITS:
         raise InputError(_contradiction(path, apart[best], headings, travel))
@@ -119,14 +120,15 @@ def _contradiction(
     path: Path, apart: float, headings: np.ndarray, travel: np.ndarray
 ) -> str:
     """What is wrong with the headings, and what would be right, if anything."""
+    units = ("deg",) if _is_large(headings) else ("rad", "deg")
     forms = [
         HeadingForm(name=name, unit=unit)
-        for unit, name in itertools.product(("rad", "deg"), CONVENTIONS)
+        for unit, name in itertools.product(units, CONVENTIONS)
     ]
     found = {form: _apart(form, headings, travel) for form in forms}
     best = min(forms, key=lambda form: found[form])
     hint = "leave columns.heading out to take the direction of travel"
-    if found[best] <= FITS:
+    if found[best] <= FITS_WELL:
         hint = f'{OPTION} = "{best.name}" with units.heading = "{best.unit}" fits'
     return (
         f"{path}: heading: {math.degrees(apart):.0f} degrees from the direction of "

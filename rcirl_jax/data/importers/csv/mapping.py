@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rcirl_jax.data.importers.options import UNITS, number, section
-from rcirl_jax.data.readers.tables.cells import CLOCK, EMPTY, ISO
+from rcirl_jax.data.readers.tables.cells import EMPTY, ISO
 from rcirl_jax.data.readers.tables.layout import NUMBER
 from rcirl_jax.data.readers.tables.table import (
     MAX_PLACE_M,
@@ -63,6 +63,8 @@ OPTIONS = (
 )
 ADDED = (LEAVE_OUT, PIECE, "log_names")
 RATE_HZ = 10.0  # 1/s
+ISO_TIMES = r"\d{4}-\d\d-\d\d[T ]|\d{8}T\d|\d{4}/\d\d/\d\d |\d{1,2}:\d\d"  # as read
+WORD = r"[A-Z]+(?![^\W\d_A-Z])|[A-Z]?[^\W\d_A-Z]+"  # of a name in camel case too
 MIDDLE_DIGITS = 2  # of latitude and longitude of the projection's middle
 HOLE = "{id}"  # in a column's name: which road user's it is
 WORDS = {
@@ -191,7 +193,7 @@ def _check_texts(table: Table, columns: AnyMapping[str, str]) -> None:
 
 def words_of(name: str) -> set[str]:
     """Words of a column's name, in small letters: gpsLon and GPS_Lon hold lon."""
-    return {word.lower() for word in re.findall(r"[A-Z]?[^\W\d_A-Z]+|[A-Z]+", name)}
+    return {word.lower() for word in re.findall(WORD, name)}
 
 
 def _recognised_earth(
@@ -292,7 +294,7 @@ def _found(
         sign = name[: len(name) - len(plain)]
         for user in users if HOLE in name else [None]:
             column = plain if user is None else plain.replace(HOLE, user)
-            if column in table.header:
+            if table.has(column):
                 found.append((field, sign + column, user))
             elif field in EXPECTED:
                 table.place(column)  # says that it is missing
@@ -310,7 +312,8 @@ def _users(table: Table, columns: AnyMapping[str, str]) -> list[str]:
         pattern = re.compile(f"{re.escape(before)}(.+){re.escape(after)}")
         matches = (pattern.fullmatch(column) for column in table.header)
         own.append([match[1] for match in matches if match])
-    users = [user for user in own[0] if user in own[1]]
+    both = set(own[1])
+    users = [user for user in own[0] if user in both]
     numbered = [user for user in users if user.isdigit()]
     if not users:
         raise InputError(
@@ -326,8 +329,7 @@ def _time(
     """(form, factor) of the clock; ISO where nothing is said and the cells are."""
     cells = [c for c in table.samples(name.lstrip("-")) if c.lower() not in EMPTY]
     first = cells[0] if cells else ""
-    is_iso = bool(re.match(r"\d{4}-?\d\d-?\d\d[T ]|\d{4}/\d\d/\d\d", first))
-    is_iso |= bool(re.match(CLOCK, first))
+    is_iso = re.match(ISO_TIMES, first) is not None
     if unit is None and is_iso:
         notes.append(f"column {name}: ISO times")
         return ISO, 1.0

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Mapping, Sequence
 
-from rcirl_jax.data.importers.csv.mapping import words_of
+from rcirl_jax.data.importers.csv.mapping import WORD, words_of
 
 # field -> words of a name, the likelier first
 WORDS: Mapping[str, tuple[str, ...]] = {
@@ -89,8 +89,7 @@ def plain_words(name: str) -> list[str]:
     """Words of a column's name without those of a unit."""
     bare = re.sub(r"[\[(].*?[\])]", " ", name)
     units = {text for texts in UNITS.values() for text in texts if len(text) > 1}
-    found = re.findall(r"[A-Z]?[^\W\d_A-Z]+|[A-Z]+|\d+", bare)
-    words = [word.lower() for word in found]
+    words = [word.lower() for word in re.findall(rf"{WORD}|\d+", bare)]
     return [w for w in words if w not in units and w not in ("kf", "smoothed", "raw")]
 
 

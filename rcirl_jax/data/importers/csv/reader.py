@@ -179,6 +179,8 @@ def _meaning(
 
 def _placed(log: Log, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Rows with x and y in metres."""
+    if log.mapping.middle is None:
+        return values
     points = np.stack([values["x"], values["y"]], axis=1)
     x, y = log.metres(points).T
     return {**values, "x": x, "y": y}

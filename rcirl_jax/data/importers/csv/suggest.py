@@ -4,7 +4,10 @@ Names of columns, units in them and the numbers of the first rows tell what can 
 The TOML is read back like any other: what is shown is what an import would take.
 """
 
+import contextlib
 import dataclasses
+import datetime
+import itertools
 import math
 import re
 from collections.abc import Mapping as AnyMapping
@@ -30,11 +33,16 @@ from rcirl_jax.data.importers.csv.suggestion import (
     toml_of,
     unknown,
 )
+from rcirl_jax.data.importers.options import UNITS
 from rcirl_jax.data.readers.tables.cells import EMPTY
+from rcirl_jax.data.readers.tables.layout import NUMBER
 from rcirl_jax.data.readers.tables.ledger import LINE
-from rcirl_jax.data.readers.tables.table import Table, batches, open_table
-from rcirl_jax.errors import InputError
+from rcirl_jax.data.readers.tables.table import MAX_TIME, Table, batches, open_table
+from rcirl_jax.errors import InputError, as_input_error
 
+# of times that are written neither as a number nor as ISO
+DATES = ("%d.%m.%Y", "%d.%m.%y", "%d/%m/%Y", "%m/%d/%Y", "%d-%m-%Y")
+TIMES_OF_DAY = ("%H:%M:%S.%f", "%H:%M:%S,%f", "%H:%M:%S", "%I:%M:%S.%f %p")
 USUAL_RATES = (1, 2, 4, 5, 10, 12.5, 15, 20, 24, 25, 29.97, 30, 50, 60, 100, 120)
 RATE_FITS = 0.1  # relative
 LONG_CAR_M = 9.0  # m; a longer median vehicle was measured in feet
@@ -56,15 +64,21 @@ def suggested(path: Path) -> Suggestion:
     Raises:
       InputError: no table, or one without columns that look like time, id and places.
     """
+    with as_input_error(str(path), "a table with a row per road user and time"):
+        return _suggested(path)
+
+
+def _suggested(path: Path) -> Suggestion:
     table = open_table(path)
     columns, said = _columns(table)
     guess = Guess(columns=columns, said=said)
-    raw = _first_rows(path, {"columns": columns, "max_bad_rows": 0.5})
+    _time_form(table, guess)
+    raw = _first_rows(path, guess.spec())
     _clock(table, raw, guess)
     _lengths(table, raw, guess)
     _heading_and_speed(table, raw, guess)
     _texts(raw, guess)
-    rows, meaning, mapping = _understood(path, guess.spec())
+    rows, meaning, mapping = _without_wrong_headings(path, guess)
     lines = [
         *recognised(table, guess, mapping, meaning),
         *unknown(table, guess),
@@ -134,6 +148,21 @@ def _first_rows(path: Path, spec: AnyMapping) -> dict[str, np.ndarray]:
     raise InputError(f"{path}: rows: none: expected rows below the header")
 
 
+def _time_form(table: Table, guess: Guess) -> None:
+    """Unit of times that are no seconds, milliseconds or frames: by the first cell."""
+    cells = [c for c in table.samples(guess.columns["t"]) if c.lower() not in EMPTY]
+    first = cells[0] if cells else ""
+    if re.match(r"\d{4}[-/]\d|\d{8}T\d|\d{1,2}:\d", first):
+        guess.units["t"] = "iso"
+    elif NUMBER.fullmatch(first) and abs(float(first)) > MAX_TIME:
+        guess.units["t"] = "ns" if float(first) > 1e3 * MAX_TIME else "us"
+    for date, rest in itertools.product(DATES, TIMES_OF_DAY):
+        with contextlib.suppress(ValueError):
+            datetime.datetime.strptime(first, f"{date} {rest}")
+            guess.units["t"] = f"{date} {rest}"
+            return
+
+
 def _clock(table: Table, raw: AnyMapping[str, np.ndarray], guess: Guess) -> None:
     """Unit of the time and rows per second, by the step of the road users' times."""
     ids = np.unique(raw["id"], return_inverse=True)[1]
@@ -141,18 +170,14 @@ def _clock(table: Table, raw: AnyMapping[str, np.ndarray], guess: Guess) -> None
     steps = np.diff(raw["t"][order])[np.diff(ids[order]) == 0]
     steps = steps[steps > 0.0]
     step = float(np.median(steps)) if steps.size else math.nan
-    cells = [c for c in table.samples(guess.columns["t"]) if c.lower() not in EMPTY]
-    name = guess.columns["t"]
-    if cells and re.search(r"\d[:]\d", cells[0]):
-        unit = "iso"
-    else:
+    if "t" not in guess.units:
+        name = guess.columns["t"]
         unit = unit_of(name, ("ms", "us", "ns", "s")) or _unit_by_step(name, step)
-    guess.units["t"] = unit
-    factor = {"iso": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}.get(unit)
-    if factor is None or not math.isfinite(step):
+        guess.units["t"], step = unit, step * UNITS.get(unit, math.nan)
+    if not math.isfinite(step):
         guess.open.append("rate_hz: rows per second of one road user; 10 is assumed")
         return
-    rate = 1.0 / (step * factor)
+    rate = 1.0 / step
     near = min(USUAL_RATES, key=lambda usual: abs(rate / usual - 1.0))
     guess.rate_hz = near if abs(rate / near - 1.0) < RATE_FITS else float(f"{rate:.4g}")
     guess.said.append(
@@ -164,8 +189,8 @@ def _unit_by_step(name: str, step: float) -> str:
     """Unit of a clock whose rows are so far apart."""
     if "frame" in name.lower() and step == round(step) < 10:
         return "frame"
-    for unit, size in (("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)):
-        if 0.005 <= step / size <= 2.0:
+    for unit in ("s", "ms", "us", "ns", "day"):
+        if 0.005 <= step * UNITS[unit] <= 2.0:
             return unit
     return "s"
 
@@ -206,7 +231,7 @@ def _heading_and_speed(
 
 def _speed_unit(path: Path, guess: Guess) -> str:
     """The unit in which speeds are those of the positions; "" if none is."""
-    rows, _, mapping = _understood(path, guess.spec())
+    rows, _, mapping = _without_wrong_headings(path, guess)
     ids = np.unique(rows["id"], return_inverse=True)[1]
     order = np.lexsort((rows["t"], ids))
     step = max(round(0.5 * mapping.rate_hz), 1)
@@ -238,6 +263,21 @@ def _texts(raw: AnyMapping[str, np.ndarray], guess: Guess) -> None:
         texts = {text.lower() for text in np.unique(raw["automated"]).tolist()}
         if not texts <= {"", "0", "1", *YES, *NO}:
             del guess.columns["automated"]
+
+
+def _without_wrong_headings(
+    path: Path, guess: Guess
+) -> tuple[dict[str, np.ndarray], Meaning, Mapping]:
+    """What is understood, by the positions where headings contradict them."""
+    try:
+        return _understood(path, guess.spec())
+    except InputError as error:
+        if "heading" not in guess.columns:
+            raise
+        guess.open.append(str(error).removeprefix(f"{path}: "))
+        for part in (guess.columns, guess.units):
+            part.pop("heading", None)
+        return _understood(path, guess.spec())
 
 
 def _understood(

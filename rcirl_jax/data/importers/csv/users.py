@@ -1,6 +1,7 @@
 """A road user of a user's table: its rows, with what they do not say."""
 
 import collections
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -28,8 +29,8 @@ def track_of(
     """
     values = {field: column[rows] for field, column in table.values.items()}
     t, x, y = values["t"], values["x"], values["y"]
-    heading = _filled(values.get("heading"), travel_heading(t, x, y))
-    speed = _filled(values.get("speed"), speed_of(t, x, y))
+    heading = _filled(values.get("heading"), lambda: travel_heading(t, x, y))
+    speed = _filled(values.get("speed"), lambda: speed_of(t, x, y))
     size = {field: _size(field, values, spec) for field in SIZE_M}
     reference = spec.get("reference_point", "centre")
     if reference not in REFERENCE:
@@ -55,9 +56,14 @@ def track_of(
     )
 
 
-def _filled(known: np.ndarray | None, otherwise: np.ndarray) -> np.ndarray:
+def _filled(
+    known: np.ndarray | None, otherwise: Callable[[], np.ndarray]
+) -> np.ndarray:
     """Values [n] where they are known, else others."""
-    return otherwise if known is None else np.where(np.isnan(known), otherwise, known)
+    if known is None:
+        return otherwise()
+    unknown = np.isnan(known)
+    return np.where(unknown, otherwise(), known) if unknown.any() else known
 
 
 def _size(field: str, values: dict[str, np.ndarray], spec: dict) -> float:
@@ -71,9 +77,12 @@ def _size(field: str, values: dict[str, np.ndarray], spec: dict) -> float:
 
 def _kind(path: Path, name: str, values: dict[str, np.ndarray], spec: dict) -> Kind:
     """The most frequent kind that is known."""
-    texts = values.get("kind", np.zeros(0, str))
-    known = collections.Counter(texts[texts != ""].tolist()).most_common(1)
-    found = known[0][0] if known else str(section(spec, "defaults").get("kind", ""))
+    texts = values.get("kind", np.zeros(1, str))
+    found = str(texts[0])
+    if np.any(texts != found):
+        known = collections.Counter(texts[texts != ""].tolist())
+        found = known.most_common(1)[0][0]
+    found = found or str(section(spec, "defaults").get("kind", ""))
     kind = str(section(spec, "kinds").get(found, found or "vehicle")).lower()
     if kind not in KINDS:
         raise InputError(

@@ -21,7 +21,14 @@ EMPTY = (
     *("-", "--", "?", "\\n"),
 )
 WHOLE = re.compile(r"([-+]?\d+)[.,]0+")  # 12.0, as tables write numbers with holes
-CLOCK = r"^\d{1,2}:\d{2}(:\d{2}(\.\d*)?)?$"
+# what ISO writes otherwise, pattern -> replacement; a clock alone is of the first day
+NEARLY_ISO = (
+    (r",(\d+)", r".\1"),
+    (r"^(\d{4})/(\d\d)/(\d\d)", r"\1-\2-\3"),
+    (r" ?(UTC|GMT|utc|z)$", "Z"),
+    (r"^(\d:)", r"0\1"),
+    (r"^(\d\d:)", r"1970-01-01 \1"),
+)
 ISO = "iso"  # times as ISO 8601 writes them
 EPOCH = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
 Found = tuple[np.ndarray, np.ndarray]  # values [n], whether each is unreadable [n]
@@ -131,17 +138,22 @@ def times(column: Any, form: str) -> Found:  # noqa: ANN401
     cells = _known(compute.utf8_trim_whitespace(column.cast(arrow.string())))
     if form != ISO:
         return _each(cells, lambda text: datetime.datetime.strptime(text, form))
-    cells = compute.replace_substring(cells, ",", ".")
-    clock = compute.match_substring_regex(cells, CLOCK)
-    day = compute.binary_join_element_wise("1970-01-01 ", cells, "")
-    padded = compute.replace_substring_regex(day, r" (\d:)", r" 0\1")
-    cells = compute.if_else(clock, padded, cells)
-    for zone in (None, "UTC"):
-        found = _cast(cells, arrow.timestamp("ns", zone))
-        if found is not None:
-            values = _seconds(found)
-            return values, np.zeros(len(values), bool)
+    for change in (lambda same: same, _as_iso):
+        cells = change(cells)
+        for zone in (None, "UTC"):
+            found = _cast(cells, arrow.timestamp("ns", zone))
+            if found is not None:
+                values = _seconds(found)
+                return values, np.zeros(len(values), bool)
     return _each(cells, datetime.datetime.fromisoformat)
+
+
+def _as_iso(cells: Any) -> Any:  # noqa: ANN401
+    """Times that are nearly ISO's: 10:00:00,1 and 2024/05/20 10:00:00 UTC."""
+    compute = extra_module("pyarrow.compute")
+    for wrong, right in NEARLY_ISO:
+        cells = compute.replace_substring_regex(cells, wrong, right)
+    return cells
 
 
 def _each(cells: Any, parse: Callable[[str], datetime.datetime]) -> Found:  # noqa: ANN401
@@ -180,7 +192,7 @@ def texts(column: Any, lower: bool) -> tuple[np.ndarray, list[str], np.ndarray]:
     if codes.null_count:
         codes, names = codes.fill_null(len(names)), [*names, ""]
     codes = codes.to_numpy(zero_copy_only=False)
-    long = np.array([len(name) > TEXT_CHARS for name in names])
+    long = np.array([len(name) > TEXT_CHARS for name in names], bool)
     return codes.astype(np.int64), names, long[codes]
 
 

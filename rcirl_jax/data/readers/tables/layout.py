@@ -9,7 +9,7 @@ import collections
 import csv
 import dataclasses
 import functools
-import math
+import itertools
 import re
 import string
 from collections.abc import Mapping, Sequence
@@ -20,6 +20,7 @@ from rcirl_jax.data.readers.tables.streams import head_of
 from rcirl_jax.errors import InputError
 
 MAX_COLUMNS = 10_000  # of a table; logs have some dozens
+MOST = 0.8  # share of a head's rows that repeat their last columns
 SAMPLE_CELLS = 20_000  # cells of the head from which decimals are recognised
 DELIMITERS = {"tab": "\t", "space": " ", "comma": ",", "semicolon": ";", "pipe": "|"}
 TRIED = ("\t", ";", "|", ",")  # delimiters, the likelier first where two cut as well
@@ -221,7 +222,7 @@ def _delimiter(lines: Sequence[str], quote: str) -> str:
         return lines[0][-1]
     best, most = BLANKS, (0.0, 0)
     for mark in TRIED:
-        counts = [len(row) for row in cells_of(lines, mark, quote)]
+        counts = [_count(line, mark, quote) for line in lines]
         width, times = max(
             collections.Counter(counts).items(), key=lambda item: (item[1], item[0])
         )
@@ -238,31 +239,49 @@ def _delimiter(lines: Sequence[str], quote: str) -> str:
     return best if best != BLANKS else (BLANKS if max(blanks) > 1 else ",")
 
 
+def _count(line: str, mark: str, quote: str) -> int:
+    """Number of a line's cells."""
+    if quote and quote in line:
+        return len(cells_of([line], mark, quote)[0])
+    return line.count(mark) + 1
+
+
 def _header_line(rows: Sequence[Sequence[str]]) -> int:
-    """The first line with as many cells as most, or one fewer (names of rows)."""
-    filled = [row for row in rows if any(cell.strip() for cell in row)]
-    counts = collections.Counter(len(row) for row in filled)
-    width, times = max(counts.items(), key=lambda item: (item[1], item[0]))
-    if times > 1:
-        for at, row in enumerate(rows):
-            if len(row) == width or (len(row) == width - 1 and len(row) > 1):
-                return at
-    for at, row in enumerate(rows):
-        if len(row) > 1:
+    """The first line with as many cells as most, or one fewer (names of rows).
+
+    Empty cells at the ends of lines count, or not.
+    """
+    wholes = [len(row) for row in rows]
+    filled = [len(_trimmed(row)) for row in rows]
+    wanted = {_usual(wholes, filled), _usual(filled, filled)} - {0}
+    for at, counts in enumerate(zip(wholes, filled, strict=True)):
+        if counts[1] > 1 and any(c in (w, w - 1) for c in counts for w in wanted):
             return at
-    return next(at for at, row in enumerate(rows) if any(c.strip() for c in row))
+    several = (at for at, count in enumerate(filled) if count > 1)
+    return next(several, next(at for at, count in enumerate(filled) if count))
+
+
+def _usual(counts: Sequence[int], filled: Sequence[int]) -> int:
+    """What most lines count that are not empty; 0: each another number."""
+    known = [count for count, some in zip(counts, filled, strict=True) if some]
+    usual, times = max(
+        collections.Counter(known).items(), key=lambda item: (item[1], item[0])
+    )
+    return usual if times > 1 else 0
 
 
 def _repeating(width: int, rows: Sequence[Sequence[str]]) -> int:
     """Last columns of the header that longer rows go on repeating, 0 of a usual table.
 
-    All rows are longer, by different multiples of one number of cells.
+    Nearly all rows are longer, by different multiples of one number of cells.
     """
-    lengths = {len(_trimmed(row)) - width for row in rows}
-    if len(lengths) < 2 or min(lengths) <= 0:
+    more = [len(_trimmed(row)) - width for row in rows]
+    if len(set(more)) < 2 or sum(count > 0 for count in more) < MOST * len(more):
         return 0
-    group = math.gcd(*lengths)
-    return group if 1 < group <= width else 0
+    for group in range(width, 1, -1):
+        if sum(count % group == 0 for count in more) >= MOST * len(more):
+            return group
+    return 0
 
 
 def _trimmed(row: Sequence[str]) -> list[str]:
@@ -282,7 +301,8 @@ def _has_row_names(header: Sequence[str], rows: Sequence[Sequence[str]]) -> bool
 
 def _decimal(rows: Sequence[Sequence[str]], delimiter: str) -> tuple[str, str]:
     """(decimal mark, mark between thousands) of the numbers in rows."""
-    every = [cell.strip() for row in rows for cell in row][:SAMPLE_CELLS]
+    cells = itertools.chain.from_iterable(rows)
+    every = [cell.strip() for cell in itertools.islice(cells, SAMPLE_CELLS)]
     points = any("." in cell and NUMBER.fullmatch(cell) for cell in every)
     # few cells are numbers with anything but a point
     odd = [c for c in every if c.count(".") > 1 or not MARKED.isdisjoint(c)]

@@ -104,17 +104,18 @@ def head_of(path: Path, encoding: str = "") -> tuple[str, list[str]]:
     with unpacked(path) as (stream, _):
         data = stream.read(HEAD_BYTES)
         encoding = encoding or _recognised(path, data)
-        decoder, found, ended = _decoder(path, encoding), "", False
+        decode, found, ended = _Decoder(path, encoding), "", False
         while not ended and found.count("\n") < HEAD_LINES and len(found) <= MAX_LINE:
             ended = not data
-            found += decoder.decode(bytes(data), final=ended)
+            found += decode(data)
             data = stream.read(HEAD_BYTES)
     whole = found if ended else found[: found.rfind("\n") + 1]
     if not whole and not ended:
         raise line_error(path)
     if not whole.strip():
         raise InputError(f"{path}: rows: none: expected a header and rows")
-    if sum(map(str.isascii, whole)) < MIN_ASCII * len(whole):  # digits are
+    some = whole[:HEAD_BYTES]
+    if sum(map(str.isascii, some)) < MIN_ASCII * len(some):  # digits are
         raise InputError(
             f"{path}: header: hardly any ASCII as {encoding}: expected a table"
         )
@@ -152,19 +153,29 @@ def _recognised(path: Path, data: bytes) -> str:
     return "utf-8"
 
 
-def _decoder(path: Path, encoding: str) -> io.IncrementalNewlineDecoder:
+class _Decoder:
     """Bytes -> text, line feeds at its lines' ends; bad bytes show as numbers."""
-    try:
-        made = codecs.getincrementaldecoder(encoding)("backslashreplace")
-        if not isinstance(made.decode(b"t,1\n", final=True), str):
-            raise LookupError(encoding)
-        made.reset()
-    except (LookupError, ValueError) as error:
-        raise InputError(
-            f"{path}: table.encoding: {encoding[:40]}: expected one that Python knows, "
-            "such as utf-8, utf-16, cp1252"
-        ) from error
-    return io.IncrementalNewlineDecoder(made, translate=True)
+
+    def __init__(self, path: Path, encoding: str) -> None:
+        self._path, self._encoding = path, encoding
+        try:
+            made = codecs.getincrementaldecoder(encoding)("backslashreplace")
+        except (LookupError, ValueError) as error:
+            raise InputError(
+                f"{path}: table.encoding: {encoding[:40]}: expected one that Python "
+                "knows, such as utf-8, utf-16, cp1252"
+            ) from error
+        self._made = io.IncrementalNewlineDecoder(made, translate=True)
+
+    def __call__(self, data: bytes) -> str:
+        """The text of the next bytes; none end it."""
+        try:
+            return self._made.decode(bytes(data), final=not data)
+        except (TypeError, ValueError) as error:  # no text, or no mark of utf-16
+            why = " ".join(str(error).split())[:100]
+            raise InputError(
+                f"{self._path}: text: {why}: expected {self._encoding[:40]}"
+            ) from error
 
 
 def blocks(
@@ -181,11 +192,11 @@ def blocks(
     Raises:
       InputError: a damaged archive, a line without an end.
     """
-    decoder, rest, line, at = _decoder(path, encoding), "", 1, 0
+    decode, rest, line, at = _Decoder(path, encoding), "", 1, 0
     with unpacked(path) as (stream, file):
         while True:
             data = stream.read(READ_BYTES)
-            rest += decoder.decode(bytes(data), final=not data)
+            rest += decode(data)
             if show is not None:
                 show(file.tell() - at)
                 at = file.tell()

@@ -7,6 +7,7 @@ cell elsewhere is unknown. Every row keeps its line in the file, under `LINE`.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -71,17 +72,28 @@ class Table:
         """What rows are counted by."""
         return "row" if self.layout is None else "line"
 
+    @functools.cached_property
+    def _places(self) -> dict[str, list[int]]:
+        found: dict[str, list[int]] = {}
+        for place, name in enumerate(self.header):
+            found.setdefault(name, []).append(place)
+        return found
+
+    def has(self, column: str) -> bool:
+        """Whether there is a column of this name."""
+        return column in self._places
+
     def place(self, column: str) -> int:
         """Number of a column.
 
         Raises:
           InputError: it is missing, or met twice.
         """
-        count = self.header.count(column)
-        if count == 1:
-            return self.header.index(column)
+        found = self._places.get(column, [])
+        if len(found) == 1:
+            return found[0]
         where = f"{self.path}: column {column}"
-        if count:
+        if found:
             raise InputError(f"{where}: met twice: expected once")
         known = [name for name in self.header if name]
         hint = did_you_mean(column, known)
@@ -146,7 +158,7 @@ def fields_of(
             limit=(limits or {}).get(name, np.inf),
         )
         for name in (*needed, *optional)
-        if name in needed or name in table.header
+        if name in needed or table.has(name)
     ]
 
 
@@ -189,31 +201,58 @@ def batches(
 class _Column:
     """A field's cells of a batch."""
 
+    field: Field
+    cells: Any  # as they are in the file
     values: np.ndarray  # [n] numbers in the file's unit, or codes of names
     names: list[str] | None
     empty: np.ndarray  # [n]
     wrong: np.ndarray  # [n] unreadable, or absurd
 
+    @property
+    def bad(self) -> np.ndarray:
+        """Whether a row [n] cannot be used for this cell."""
+        return self.wrong | (self.empty & self.field.needed)
 
-def _column(table: Table, field: Field, cell: Any) -> _Column:  # noqa: ANN401
+    def kept(self, rows: np.ndarray) -> Any:  # noqa: ANN401
+        """Some rows in SI units; (codes, names) of texts."""
+        if self.names is not None:
+            return self.values[rows], self.names
+        return self.values[rows] * self.field.factor
+
+    def complaint(self, row: int, where: str) -> str:
+        """What is wrong with the cell of a row."""
+        field, value = self.field, self.values[row]
+        cell = self.cells[row].as_py()
+        text = "" if cell is None else str(cell)
+        shown = f"'{text[:40]}{'...' if len(text) > 40 else ''}'"
+        expected = f"a time as {field.form}" if field.form else "a finite number"
+        if self.names is not None:
+            long = f"up to {cells.TEXT_CHARS} characters"
+            expected = long if self.wrong[row] else "a text"
+        elif np.isfinite(value) and abs(value) > field.limit:
+            shown, expected = f"{value:g}", f"within {field.limit:g}"
+        return f"{where}: {field.column}: {shown}: expected {expected}"
+
+
+def _column(table: Table, field: Field, found: Any) -> _Column:  # noqa: ANN401
     """Cells as numbers or texts, still with those that cannot be read."""
     try:
         if field.text:
-            codes, names, wrong = cells.texts(cell, field.lower)
-            empty = np.array([not name for name in names])[codes]
-            return _Column(codes, names, empty, wrong)
+            codes, names, wrong = cells.texts(found, field.lower)
+            empty = np.array([not name for name in names], bool)[codes]
+            return _Column(field, found, codes, names, empty, wrong)
         if field.form:
-            values, wrong = cells.times(cell, field.form)
+            values, wrong = cells.times(found, field.form)
         else:
-            values, wrong = cells.numbers(cell, table.layout)
+            values, wrong = cells.numbers(found, table.layout)
     except (TypeError, extra_module("pyarrow").ArrowException) as error:
         why = " ".join(str(error).split())[:200]
         raise InputError(f"{table.path}: column {field.column}: {why}") from error
     if field.scale != 1.0 or field.offset:
         values = values * field.scale + field.offset
     wrong = wrong | (np.abs(values) > field.limit)
-    empty = np.isnan(values) & ~wrong
-    return _Column(values, None, empty | (field.zero_is_empty & (values == 0.0)), wrong)
+    empty = (np.isnan(values) & ~wrong) | (field.zero_is_empty & (values == 0.0))
+    return _Column(field, found, values, None, empty, wrong)
 
 
 def _batch(
@@ -224,81 +263,38 @@ def _batch(
     ledger: Ledger,
 ) -> dict[str, Any]:
     """A batch's readable rows, of all users below each other."""
-    columns = [_column(table, f, c) for f, c in zip(fields, found, strict=True)]
-    users = list(dict.fromkeys(f.user for f in fields if f.user is not None))
+    common: list[_Column] = []
+    owned: dict[str, list[_Column]] = {}
+    for field, cell in zip(fields, found, strict=True):
+        own = common if field.user is None else owned.setdefault(field.user, [])
+        own.append(_column(table, field, cell))
+    users = list(owned)
     parts = []
-    for user in users or [None]:
-        own = [k for k, field in enumerate(fields) if field.user in (None, user)]
-        kept = _readable(
-            [fields[k] for k in own],
-            [columns[k] for k in own],
-            lambda k, row, own=own: _complaint(
-                table, fields[own[k]], columns[own[k]], found[own[k]], lines, row
-            ),
-            ledger,
-        )
-        part: dict[str, Any] = {LINE: lines[kept]}
-        for k in own:
-            values, names = columns[k].values[kept], columns[k].names
-            whole = values * fields[k].factor if names is None else (values, names)
-            part[fields[k].name] = whole
-        if user is not None:
-            part["id"] = (np.full(int(kept.sum()), users.index(user)), users)
-        parts.append(part)
+    for number, columns in enumerate(owned.values() or [[]]):
+        columns = [*common, *columns]
+        rows = _readable(table, columns, lines, ledger)
+        part = {column.field.name: column.kept(rows) for column in columns}
+        if users:
+            part["id"] = np.full(int(rows.sum()), number), users
+        parts.append({LINE: lines[rows], **part})
     return parts[0] if len(parts) == 1 else _below_each_other(parts)
 
 
 def _readable(
-    fields: Sequence[Field],
-    columns: Sequence[_Column],
-    complaint: Callable[[int, int], str],
-    ledger: Ledger,
+    table: Table, columns: Sequence[_Column], lines: np.ndarray, ledger: Ledger
 ) -> np.ndarray:
     """Rows [n] that are kept; those without anything but a time are none at all."""
-    count = columns[0].values.size
-    own = [
-        column.empty
-        for field, column in zip(fields, columns, strict=True)
-        if field.needed and field.name not in COMMON
-    ]
-    blank = np.all(own, axis=0) if len(own) > 1 else np.zeros(count, bool)
-    dropped = np.zeros(count, bool)
-    for field, column in zip(fields, columns, strict=True):
-        dropped |= column.wrong | (column.empty & field.needed)
-    dropped &= ~blank
-    ledger.read += count - int(blank.sum())
+    own = [c.empty for c in columns if c.field.needed and c.field.name not in COMMON]
+    blank = np.all(own, axis=0) if len(own) > 1 else np.zeros(lines.size, bool)
+    bad = np.any([column.bad for column in columns], axis=0)
+    dropped = bad & ~blank
+    ledger.read += int(np.sum(~blank))
     if dropped.any():
-        row = int(np.flatnonzero(dropped)[0])
-        first = next(
-            k
-            for k, (field, column) in enumerate(zip(fields, columns, strict=True))
-            if column.wrong[row] or (column.empty[row] and field.needed)
-        )
-        ledger.drop("unreadable", complaint(first, row), int(dropped.sum()))
-    return ~dropped & ~blank
-
-
-def _complaint(
-    table: Table,
-    field: Field,
-    column: _Column,
-    found: Any,  # noqa: ANN401
-    lines: np.ndarray,
-    row: int,
-) -> str:
-    """What is wrong with a cell."""
-    cell = found[row].as_py()
-    text = "" if cell is None else str(cell)
-    shown = f"'{text[:40]}{'...' if len(text) > 40 else ''}'"
-    where = f"{table.unit} {lines[row]}: {field.column}: {shown}"
-    if field.text:
-        long = f"up to {cells.TEXT_CHARS} characters"
-        return f"{where}: expected {long if column.wrong[row] else 'a text'}"
-    if np.isfinite(column.values[row]) and abs(column.values[row]) > field.limit:
-        far = f"{field.column}: {column.values[row]:g}"
-        return f"{table.unit} {lines[row]}: {far}: expected within {field.limit:g}"
-    expected = f"a time as {field.form}" if field.form else "a finite number"
-    return f"{where}: expected {expected}"
+        row = int(np.argmax(dropped))
+        first = next(column for column in columns if column.bad[row])
+        where = f"{table.unit} {lines[row]}"
+        ledger.drop("unreadable", first.complaint(row, where), int(dropped.sum()))
+    return ~bad & ~blank
 
 
 def _below_each_other(parts: Sequence[dict[str, Any]]) -> dict[str, Any]:

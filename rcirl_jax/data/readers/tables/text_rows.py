@@ -5,6 +5,7 @@ unreadable, unless what it has too much is empty; a last line that breaks off en
 reading. Rows that go on repeating their last columns are unfolded into one a group.
 """
 
+import csv
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -88,7 +89,7 @@ def _parsed(
     text: str, layout: Layout, places: Sequence[int]
 ) -> tuple[list[Any], list[tuple[int, int]]]:
     """Columns of text, and (number from 0, cells) of each row of another length."""
-    arrow, csv = extra_module("pyarrow"), extra_module("pyarrow.csv")
+    arrow, reading = extra_module("pyarrow"), extra_module("pyarrow.csv")
     names = [f"c{place}" for place in range(len(layout.header))]
     wanted = [names[place] for place in places]
     odd: list[tuple[int, int]] = []
@@ -98,18 +99,18 @@ def _parsed(
         return "skip"
 
     data = text.encode()
-    table = csv.read_csv(
+    table = reading.read_csv(
         arrow.BufferReader(data),
-        read_options=csv.ReadOptions(
+        read_options=reading.ReadOptions(
             use_threads=False, block_size=len(data) + 1, column_names=names
         ),
-        parse_options=csv.ParseOptions(
+        parse_options=reading.ParseOptions(
             delimiter=layout.delimiter,
             quote_char=layout.quote or False,
             newlines_in_values=True,
             invalid_row_handler=skipped,
         ),
-        convert_options=csv.ConvertOptions(
+        convert_options=reading.ConvertOptions(
             column_types=dict.fromkeys(wanted, arrow.string()),
             include_columns=list(dict.fromkeys(wanted)),
             strings_can_be_null=False,
@@ -139,7 +140,7 @@ def _careful_rows(
     while at < len(every):
         row, line, span = every[at], first + at, 1
         if layout.quote and row.count(layout.quote) % 2:
-            span = _span(every, at, layout.quote)
+            span = _span(every, at, layout)
             if not span:
                 unreadable.append((line, "a quote without an end"))
                 at += 1
@@ -153,14 +154,19 @@ def _careful_rows(
     return rows, lines, unreadable
 
 
-def _span(every: Sequence[str], at: int, quote: str) -> int:
+def _span(every: Sequence[str], at: int, layout: Layout) -> int:
     """Lines of a row that goes on inside of quotes; 0: they have no end."""
-    count = 0
-    for span, line in enumerate(every[at : at + MAX_SPAN], start=1):
-        count += line.count(quote)
-        if count % 2 == 0:
-            return span
-    return 0
+    reader = csv.reader(
+        every[at : at + MAX_SPAN],
+        delimiter=layout.delimiter,
+        quotechar=layout.quote,
+        strict=True,
+    )
+    try:
+        next(reader)
+    except csv.Error as error:
+        return 0 if "unexpected end" in str(error) else 1
+    return reader.line_num
 
 
 def _unfolded(row: str, layout: Layout) -> list[str]:
