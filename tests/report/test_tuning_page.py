@@ -587,17 +587,12 @@ def test_a_phone_needs_no_sideways_scroll(browser, file, bare_file):
 
 
 @pytest.mark.browser
-def test_focus_can_be_seen_and_reaches_everything(browser, file):
+def test_focus_reaches_everything_and_everything_has_a_name(browser, file):
     view, _ = opened(browser, file)
     view.focus("#case")
     reached = []
     for _ in range(6):
-        name, width = view.evaluate(
-            """() => { const x = document.activeElement;
-              return [x.id, parseFloat(getComputedStyle(x).outlineWidth)]; }"""
-        )
-        reached.append(name)
-        assert width >= 2.0 or not reached[1:]
+        reached.append(view.evaluate("document.activeElement.id"))
         view.keyboard.press("Tab")
     assert reached == ["case", "play", "back", "forward", "speed", "scrub"]
     nameless = view.eval_on_selector_all(
