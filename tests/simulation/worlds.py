@@ -67,17 +67,9 @@ def make_agents(agents):
 
 
 def make_case(
-    agents=(),
-    lines=(),
-    speed=10.0,
-    limit=15.0,
-    kappa=0.0,
-    path_l=0.0,
-    lanes=(0, 0),
-    steps=1200,
-    seed=0,
-    **perception,
-):
+    agents=(), lines=(), speed=10.0, limit=15.0, kappa=0.0, path_l=0.0, lanes=(0, 0),
+    steps=1200, seed=0, **perception,
+):  # fmt: skip
     """A straight (or given) road; lines are dicts of Lines fields."""
     grid = np.ones((NUM_ROAD,), np.float32)
     slots = {
