@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from benchmarks.reliability.fuzz import codecs, contract
 from benchmarks.reliability.fuzz.readers import READERS, shares
 from rcirl_jax.errors import InputError, as_input_error
-from rcirl_jax.export.from_run import read_config
 from rcirl_jax.export.sweep.result import read_sweep
 from rcirl_jax.features import mapping
 from rcirl_jax.report.ranking.sweep_picture import sweep_picture
@@ -85,24 +84,6 @@ def test_a_sweep_that_is_read_can_be_drawn(tmp_path):
             sweep_picture(tmp_path / "sweep.png", report)
             drawings += 1
     assert drawings == 20
-
-
-@pytest.mark.parametrize(
-    ("where", "name", "value"),
-    [
-        ("sampler", "num_random", 10**60),
-        ("sampler", "cruise_times", [2.0, [3.0]]),
-        ("reward", "hidden", 15),
-    ],
-)
-def test_settings_of_other_types(tmp_path, where, name, value):
-    READERS["runs"].make(tmp_path / "made")
-    file = tmp_path / "made" / "run.json"
-    found = json.loads(file.read_text())
-    found["config"][where][name] = value
-    file.write_text(json.dumps(found))
-    with pytest.raises(InputError, match=rf"run\.json: {where}\.{name}.*: expected"):
-        read_config(tmp_path / "made")
 
 
 def test_a_planted_defect_and_refused_memory_are_breaches(tmp_path, monkeypatch):

@@ -2,23 +2,21 @@
 
 import subprocess
 import sys
-from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
-from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, drive_here, run_suite
+from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, run_suite
 from rcirl_jax.evaluation.ranking.score import score_scenes
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.spread import SuiteJob, drive_piece, spread
 from rcirl_jax.runtime.executors import Here, Processes
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.simulation.suite import suite_refs
+from tests.conftest import REPO
 from tests.helpers.weights_files import random_weights
 from tests.train.test_step import rows
-
-REPO = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -60,14 +58,6 @@ def scored(weights, executor):
     return leaves(vars(made))
 
 
-@pytest.mark.slow
-@pytest.mark.multiprocess
-def test_a_suite_does_not_depend_on_where_it_is_driven(weights):
-    job, config = job_of(weights), SuiteConfig(chunk=1)
-    here = run_suite(job.rows(), job.cases(), config, drive_here)
-    assert here.facts["result_sha256"] == driven(weights, Processes(2))
-
-
 def test_a_piece_is_its_part_of_the_whole(weights):
     job, config = job_of(weights), SuiteConfig(chunk=30)
     name = job.rows()[0].name
@@ -77,33 +67,33 @@ def test_a_piece_is_its_part_of_the_whole(weights):
         np.testing.assert_array_equal(a, b[1:3])
 
 
-@pytest.mark.slow
-@pytest.mark.multiprocess
-def test_a_ranking_does_not_depend_on_where_it_is_scored(weights):
-    here, there = scored(weights, Here()), scored(weights, Processes(2))
-    for a, b in zip(here, there, strict=True):
+def assert_same_as_here(weights, there):
+    assert driven(weights, there) == driven(weights, Here()), "suite"
+    for a, b in zip(scored(weights, there), scored(weights, Here()), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
 RAY = """
 import sys
-import numpy as np
 import ray
-from rcirl_jax.runtime.executors import Here, Ray
-from tests.export.test_spread import driven, scored
+from rcirl_jax.runtime.executors import Ray
+from tests.export.test_spread import assert_same_as_here
 ray.init(num_cpus=2, log_to_driver=False, logging_level="ERROR")
-weights, cluster = sys.argv[1], Ray("auto")
-assert driven(weights, cluster) == driven(weights, Here()), "suite"
-for a, b in zip(scored(weights, cluster), scored(weights, Here()), strict=True):
-    np.testing.assert_array_equal(a, b)
+assert_same_as_here(sys.argv[1], Ray("auto"))
 ray.shutdown()
 """
 
 
 @pytest.mark.slow
+@pytest.mark.multiprocess
+def test_suites_and_rankings_do_not_depend_on_processes(weights):
+    """As simulate and gate drive them, and evaluate ranks."""
+    assert_same_as_here(weights, Processes(2))
+
+
+@pytest.mark.slow
 @pytest.mark.ray
-def test_neither_depends_on_ray(weights):
-    """Suites (simulate, gate) and rankings (evaluate) on a cluster of two CPUs."""
+def test_suites_and_rankings_do_not_depend_on_ray(weights):
     pytest.importorskip("ray")
     done = subprocess.run(
         [sys.executable, "-c", RAY, str(weights)],

@@ -71,43 +71,34 @@ def test_thousand_inputs_equal_the_trained_network(activation, hidden, by_contex
     assert np.all(np.abs(found - expected) <= 1e-5 * np.maximum(1.0, np.abs(expected)))
 
 
+def assert_back(found, made, names):
+    for name in names:
+        given, back = getattr(made, name), getattr(found, name)
+        if isinstance(back, np.ndarray):
+            given, back = [given], [back]
+        for one, other in zip(given, back, strict=True):
+            np.testing.assert_array_equal(one, other)
+            assert not other.flags.writeable
+
+
 def test_everything_comes_back_as_it_was_given():
-    weights = example_weights(hidden=(4, 2), activation="leaky_relu")
+    weights = example_weights(hidden=(4, 2), activation="leaky_relu", anchored=True)
     reward = decode_weights(pack(weights, *example_samples(weights)))
-    for name in ("lower", "upper", "location", "scale", "times", "gamma"):
-        np.testing.assert_array_equal(getattr(reward, name), getattr(weights, name))
-        assert not getattr(reward, name).flags.writeable
-    for name in ("kernels", "biases"):
-        for found, given_array in zip(
-            getattr(reward, name), getattr(weights, name), strict=True
-        ):
-            np.testing.assert_array_equal(found, given_array)
+    numbers = ("lower", "upper", "location", "scale", "times", "gamma")
+    assert_back(reward, weights, (*numbers, "kernels", "biases"))
     assert reward.names == tuple(spec.name for spec in weights.features)
     assert reward.units == tuple(spec.unit for spec in weights.features)
     assert reward.none_values == tuple(spec.none_value for spec in weights.features)
     assert (reward.activation, reward.leaky_slope) == ("leaky_relu", 0.01)
-    assert reward.preset == "test"
-    assert reward.loss == weights.loss
+    assert (reward.preset, reward.loss) == ("test", weights.loss)
     assert reward.provenance == provenance()
     assert type(reward.provenance["metrics"]["steps"]) is int
-
-
-def test_an_anchor_comes_back_as_it_was_given():
-    weights = example_weights(anchored=True)
-    reward = decode_weights(pack(weights, *example_samples(weights)))
     made, found = weights.anchor, reward.anchor
     assert made is not None
     assert found is not None
+    assert_back(found, made, reader.ANCHOR_ARRAYS)
     for name in ("incumbent", "low", "high"):
         assert getattr(found, name) == getattr(made, name)
-    for name in reader.ANCHOR_ARRAYS:
-        np.testing.assert_array_equal(getattr(found, name), getattr(made, name))
-        assert not getattr(found, name).flags.writeable
-    as_doubles = {n: np.float64(getattr(made, n)) for n in reader.ANCHOR_ARRAYS}
-    numbers = {"low": np.float32(made.low), "high": np.float32(made.high)}
-    other = dataclasses.replace(made, **as_doubles, **numbers)
-    same = dataclasses.replace(weights, anchor=other)
-    assert pack(same, *example_samples(weights)) == packed(anchored=True)
     assert decode_weights(packed(seen=True)).anchor is None
 
 
@@ -117,18 +108,18 @@ def test_same_input_same_bytes_whatever_the_order_of_keys(tmp_path):
     turned = {key: provenance()[key] for key in reversed(provenance())}
     turned["flags"] = dict(reversed(list(turned["flags"].items())))
     other = dataclasses.replace(
-        weights, provenance=turned, loss={"leaky_rate": 0.05, "name": "rank"}
+        weights,
+        provenance=turned,
+        loss={"leaky_rate": 0.05, "name": "rank"},
+        kernels=tuple(map(np.asfortranarray, weights.kernels)),  # in memory
+        gamma=np.float64(weights.gamma),
     )
-    other_order = tuple(map(np.asfortranarray, weights.kernels))
-    other = dataclasses.replace(other, kernels=other_order)
     first, second = tmp_path / "a.msgpack", tmp_path / "b.msgpack"
     reward = save(first, weights, *samples)
     save(second, other, *samples)
     assert first.read_bytes() == second.read_bytes() == pack(weights, *samples)
     assert reward.sha256 == load_weights(second).sha256
-    assert pack(example_weights(seed=9), *example_samples(example_weights(seed=9))) != (
-        first.read_bytes()
-    )
+    assert packed(seed=9) != first.read_bytes()
 
 
 def test_layout_is_the_documented_one():
@@ -141,19 +132,18 @@ def test_layout_is_the_documented_one():
     assert outer["sha256"] == hashlib.sha256(outer["body"]).hexdigest()
     body = msgpack.unpackb(outer["body"])
     assert tuple(body) == reader.BODY_KEYS
-    gated = msgpack.unpackb(packed(by_context=True))
-    assert gated["schema_version"] == 2
-    assert tuple(msgpack.unpackb(gated["body"])) == (*reader.BODY_KEYS, "context")
-    for by_context, more in ((False, ("seen",)), (True, ("seen", "context"))):
-        ranged = msgpack.unpackb(packed(by_context=by_context, seen=True))
-        assert ranged["schema_version"] == 3
-        assert tuple(msgpack.unpackb(ranged["body"])) == (*reader.BODY_KEYS, *more)
-    for by_context, more in ((False, ()), (True, ("context",))):
-        added = msgpack.unpackb(packed(by_context=by_context, anchored=True))
-        assert added["schema_version"] == 4
-        found = msgpack.unpackb(added["body"])
-        assert tuple(found) == (*reader.BODY_KEYS, "seen", *more, "anchor")
-        assert tuple(found["anchor"]) == reader.ANCHOR_KEYS
+    for version, kinds, more in (
+        (2, ("by_context",), ("context",)),
+        (3, ("seen",), ("seen",)),
+        (3, ("seen", "by_context"), ("seen", "context")),
+        (4, ("anchored",), ("seen", "anchor")),
+        (4, ("anchored", "by_context"), ("seen", "context", "anchor")),
+    ):
+        other = msgpack.unpackb(packed(**dict.fromkeys(kinds, True)))
+        assert other["schema_version"] == version
+        found = msgpack.unpackb(other["body"])
+        assert tuple(found) == (*reader.BODY_KEYS, *more)
+        assert version < 4 or tuple(found["anchor"]) == reader.ANCHOR_KEYS
     kernel = body["layers"][0]["kernel"]
     assert (kernel["shape"], kernel["dtype"]) == ([3, 5], "<f4")
     weights = example_weights()
@@ -246,10 +236,7 @@ ENDLESS["self"] = ENDLESS
         *(
             ({"provenance": {**provenance(), **entry}}, message)
             for entry, message in (
-                (
-                    {"metrics": {"fde": math.nan}},
-                    "provenance: nan: expected texts",
-                ),
+                ({"metrics": {"fde": math.nan}}, "provenance: nan: expected texts"),
                 ({"seed": 2**70}, "Integer value out of range"),
                 ({"flags": {1: 2}}, "provenance.flags: key 1: expected a text"),
                 ({"flags": {"a": b"x"}}, "provenance.flags.a: bytes: expected texts"),

@@ -34,16 +34,9 @@ def _f(value):
 
 
 def scene(
-    *,
-    v=13.0,
-    a=0.0,
-    l=0.0,
-    boxes=(),
-    kappa=0.0,
-    speed_limit=25.0,
-    num_valid=T,
+    *, v=13.0, a=0.0, l=0.0, boxes=(), kappa=0.0, speed_limit=25.0, num_valid=T,
     path_l=0.0,
-):
+):  # fmt: skip
     """A straight three-lane road; `boxes` are dicts of s, l, speed, kind, ..."""
     shape = (N, T)
     arrays = {
@@ -94,17 +87,12 @@ def random_scene(seed):
     for _ in range(rng.integers(0, N + 1)):
         kind = Kind(rng.integers(1, 7))
         line = kind in (Kind.STOP, Kind.VIRTUAL)
-        boxes.append(
-            {
-                "s": rng.uniform(-40.0, 120.0),
-                "l": 0.0 if line else rng.uniform(-6.0, 6.0),
-                "speed": 0.0 if kind >= Kind.STATIC else rng.uniform(-3.0, 20.0),
-                "length": 0.0 if line else rng.uniform(0.5, 12.0),
-                "width": 40.0 if line else rng.uniform(0.5, 2.5),
-                "kind": kind,
-                "valid": rng.uniform(size=T) < 0.8,
-            }
-        )
+        box = {"kind": kind, "s": rng.uniform(-40.0, 120.0)}
+        box["l"] = 0.0 if line else rng.uniform(-6.0, 6.0)
+        box["speed"] = 0.0 if kind >= Kind.STATIC else rng.uniform(-3.0, 20.0)
+        box["length"] = 0.0 if line else rng.uniform(0.5, 12.0)
+        box["width"] = 40.0 if line else rng.uniform(0.5, 2.5)
+        boxes.append({**box, "valid": rng.uniform(size=T) < 0.8})
     made = scene(
         v=rng.uniform(0.0, 25.0),
         a=rng.uniform(-2.0, 2.0),

@@ -32,25 +32,17 @@ def provenance():
 
 
 def example_weights(
-    seed=0,
-    features=3,
-    times=4,
-    hidden=(5,),
-    activation="tanh",
-    by_context=False,
-    seen=False,
-    anchored=False,
-):
+    seed=0, features=3, times=4, hidden=(5,), activation="tanh", by_context=False,
+    seen=False, anchored=False,
+):  # fmt: skip
     rng = np.random.default_rng(seed)
     sizes = (features, *hidden, 1)
     draw = lambda *shape: rng.normal(size=shape).astype(np.float32)  # noqa: E731
     return RewardWeights(
         preset="test",
         features=tuple(
-            FeatureSpec(
-                name=f"feature{i}", unit="m/s²" if i else "m", none_value=10 * i
-            )
-            for i in range(features)
+            FeatureSpec(name=f"feature{i}", unit=unit, none_value=10 * i)
+            for i, unit in enumerate(["m", *["m/s²"] * (features - 1)])
         ),
         lower=-1.0 - rng.random(features, np.float32),
         upper=1.0 + rng.random(features, np.float32),
@@ -77,16 +69,10 @@ def example_anchor(seed=0, features=3, units=4):
     kernel = draw(features, units)
     kernel[: features - 1 and 1] = 0.0
     return Anchor(
-        incumbent="hand-set",
-        low=0.25,
-        high=1.5,
-        location=draw(features),
-        scale=0.2 + rng.random(features, np.float32),
-        kernel=kernel,
-        bias=draw(units),
-        out=draw(units),
-        offset=draw(1),
-    )
+        incumbent="hand-set", low=0.25, high=1.5, location=draw(features),
+        scale=0.2 + rng.random(features, np.float32), kernel=kernel,
+        bias=draw(units), out=draw(units), offset=draw(1),
+    )  # fmt: skip
 
 
 def example_samples(weights, count=4, seed=1):

@@ -130,10 +130,8 @@ def test_chosen_rows_cover_the_tags_and_are_the_same_each_time():
     assert tags[rows].any(axis=0).all()
     assert 4321 in rows
     only = choose_rows(tags, 50, ["turning"])
-    assert len(only) == 50
-    assert tags[only, Tag.TURNING].all()
+    assert tags[only, Tag.TURNING].sum() == len(only) == 50
     assert max(only) - min(only) > 2500
-    assert choose_rows(tags[:3], 24) == [0, 1, 2]
 
 
 def test_what_there_is_not_is_one_line(dataset, tmp_path):

@@ -56,37 +56,25 @@ def suite_and_verdict():
     """The suite's report and the gate's verdict of the same made-up drives."""
     names = [name for name in FAMILIES for _ in range(EACH)]
     ids = [f"{name}/{i % EACH:03d}@0" for i, name in enumerate(names)]
-    runs = {
-        "candidate": metrics(0, "stop_and_go"),
-        "hand-set": metrics(1),
-        "IDM": metrics(2),
-    }
+    spoiled = metrics(0, "stop_and_go")
+    runs = {"candidate": spoiled, "hand-set": metrics(1), "IDM": metrics(2)}
     none, way = np.zeros(len(names), bool), np.full(len(names), 1100.0)
     suite = summarise(runs, names, none, none, "IDM", way)
     pair = Pair(
-        candidate=runs["candidate"],
-        incumbent=runs["hand-set"],
-        families=names,
-        ids=ids,
-        reference=way,
-        preventable=~none,
-        name="hand-set",
-    )
+        candidate=runs["candidate"], incumbent=runs["hand-set"], families=names,
+        ids=ids, reference=way, preventable=~none, name="hand-set",
+    )  # fmt: skip
     verdict = judge(pair, GateConfig())
     return suite, dataclasses.replace(verdict, look_at=(*PLAYED, *verdict.look_at[:4]))
 
 
 def ranking():
     rng, shape = np.random.default_rng(0), (60, 8)
-    fde = rng.gamma(2.0, 2.0, shape)
+    fde, every = rng.gamma(2.0, 2.0, shape), np.ones(shape, bool)
     outcomes = Outcomes(
-        fde=fde,
-        ade=0.4 * fde,
-        crash=np.zeros(shape, bool),
-        feasible=np.ones(shape, bool),
-        cluster=np.arange(60) % 12,
-        human_crash=np.zeros(60, bool),
-    )
+        fde=fde, ade=0.4 * fde, crash=~every, feasible=every,
+        cluster=np.arange(60) % 12, human_crash=np.zeros(60, bool),
+    )  # fmt: skip
     table = {"candidate": [scene_metrics(-fde, np.ones(60), outcomes)]}
     table["random"] = [scene_metrics(*random_scorer(0, shape), outcomes)]
     return build_report(table, outcomes, num_resamples=200)
@@ -132,20 +120,13 @@ def small_report(folder, replays):
     (workdir / "metrics.jsonl").write_text("\n".join(map(json.dumps, lines)))
     suite, verdict = suite_and_verdict()
     return TuningReport(
-        likeness="row  distance m\ncandidate  1.75\n",
-        verdict=verdict,
-        gate=GateConfig(),
-        suite=suite,
-        incumbent="hand-set",
-        ranking=ranking(),
+        likeness="row  distance m\ncandidate  1.75\n", verdict=verdict,
+        gate=GateConfig(), suite=suite, incumbent="hand-set", ranking=ranking(),
         rewards={"candidate": candidate, "incumbent": incumbent},
-        dataset=open_dataset(folder / "set"),
-        replays=replays,
-        workdir=workdir,
-        sweep=sweep(),
-        training_runs=3,
+        dataset=open_dataset(folder / "set"), replays=replays, workdir=workdir,
+        sweep=sweep(), training_runs=3,
         facts={"flags": {"seed": 3}, "git_commit": "abc", "stages": {"train": "12ef"}},
-    )
+    )  # fmt: skip
 
 
 def cheap_rows():

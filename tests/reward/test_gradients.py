@@ -82,32 +82,23 @@ def drawn(name, config, seed):
     if name == "gan":
         params = params.replace(offset=as32(rng.normal()))
     normaliser = Normaliser(
-        lower=as32(np.full(F, -3.0)),
-        upper=as32(np.full(F, 3.0)),
-        location=as32(rng.normal(size=F)),
-        scale=as32(rng.uniform(0.5, 2.0, F)),
-    )
+        lower=as32(np.full(F, -3.0)), upper=as32(np.full(F, 3.0)),
+        location=as32(rng.normal(size=F)), scale=as32(rng.uniform(0.5, 2.0, F)),
+    )  # fmt: skip
     pairs = lambda *x: as32(rng.uniform(*x, (B, K)))  # noqa: E731
     facts = Facts(
-        human_distance=as32(rng.uniform(0, 1, B)),
-        human_collides=jnp.zeros(B, bool),
-        distance=pairs(0, 20),
-        collides=pairs(0, 1) < 0.3,
-        breaks_rule=pairs(0, 1),
-        human_density=as32(rng.normal(size=B)),
-        density=pairs(-1, 1),
-    )
+        human_distance=as32(rng.uniform(0, 1, B)), human_collides=jnp.zeros(B, bool),
+        distance=pairs(0, 20), collides=pairs(0, 1) < 0.3, breaks_rule=pairs(0, 1),
+        human_density=as32(rng.normal(size=B)), density=pairs(-1, 1),
+    )  # fmt: skip
     counts = rng.random((B, K)) < 0.7
     counts[:, 0], counts[1] = True, False  # one scene has nothing to compare
     made = FeatureBatch(
         human=as32(rng.normal(0, 2, (B, T, F))),
-        candidates=as32(rng.normal(0, 2, (B, F, T, K))),
-        feasible=jnp.asarray(counts),
+        candidates=as32(rng.normal(0, 2, (B, F, T, K))), feasible=jnp.asarray(counts),
         time_valid=jnp.arange(T) < jnp.asarray(rng.integers(1, T + 1, (B, 1))),
-        facts=facts,
-        weight=jnp.ones(B),
-        index=jnp.arange(B),
-    )
+        facts=facts, weight=jnp.ones(B), index=jnp.arange(B),
+    )  # fmt: skip
     return params, normaliser, made
 
 

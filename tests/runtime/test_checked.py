@@ -43,15 +43,11 @@ def test_a_body_that_fits_keeps_its_values():
     ("body", "line"),
     [
         (3, "3: expected an object"),
-        (None, "None: expected an object"),
         ({}, "count: missing: expected a value"),
         ({"count": "3"}, "count: 3: expected a whole number"),
-        ({"count": 3.0}, "count: 3.0: expected a whole number"),
         ({"count": True}, "count: True: expected a whole number"),
         ({"count": 1, "note": 2}, "note: 2: expected a text or none"),
-        ({"count": 1, "import": []}, "import: []: expected an object"),
         ({"count": 1, "parts": {}}, "parts: {}: expected a list"),
-        ({"count": 1, "parts": [3]}, "parts[0]: 3: expected an object"),
         ({"count": 1, "parts": [{}]}, "parts[0].shares: missing: expected a value"),
         (
             {"count": 1, "parts": [{"shares": [1], "x` - at `$[7]": 2}]},

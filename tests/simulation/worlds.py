@@ -19,34 +19,16 @@ from rcirl_jax.simulation.cases import (
 from rcirl_jax.types import Kind
 
 DRIVER = {
-    "desired": 15.0,
-    "headway": 1.4,
-    "standstill": 2.0,
-    "acceleration": 1.4,
-    "braking": 2.0,
-    "delay": 0.0,
-    "reacts": True,
-    "obeys_lines": True,
-    "changes_lane": False,
-    "politeness": 0.2,
-    "threshold": 0.2,
-    "lapse_start": np.inf,
-    "lapse_end": np.inf,
-}
+    "desired": 15.0, "headway": 1.4, "standstill": 2.0, "acceleration": 1.4,
+    "braking": 2.0, "delay": 0.0, "reacts": True, "obeys_lines": True,
+    "changes_lane": False, "politeness": 0.2, "threshold": 0.2,
+    "lapse_start": np.inf, "lapse_end": np.inf,
+}  # fmt: skip
 AGENT = {
-    "kind": Kind.VEHICLE,
-    "length": 4.6,
-    "width": 1.9,
-    "appear_s": -np.inf,
-    "appear_t": 0.0,
-    "relative": False,
-    "s": 50.0,
-    "l": 0.0,
-    "heading": 0.0,
-    "v": 10.0,
-    "v_share": 0.0,
-    "arrival_s": np.inf,
-}
+    "kind": Kind.VEHICLE, "length": 4.6, "width": 1.9, "appear_s": -np.inf,
+    "appear_t": 0.0, "relative": False, "s": 50.0, "l": 0.0, "heading": 0.0,
+    "v": 10.0, "v_share": 0.0, "arrival_s": np.inf,
+}  # fmt: skip
 EMPTY = AGENT | {"kind": Kind.NONE, "appear_s": np.inf, "s": 0.0, "v": 0.0}
 BOOLS = ("reacts", "obeys_lines", "changes_lane", "relative")
 
@@ -66,23 +48,17 @@ def make_agents(agents):
     """
     rows = [AGENT | DRIVER | dict(agent) for agent in agents]
     rows += [EMPTY | DRIVER] * (NUM_AGENTS - len(rows))
-    script = {
-        "start": np.full((NUM_AGENTS, NUM_PHASES), np.inf, np.float32),
-        "speed": np.zeros((NUM_AGENTS, NUM_PHASES), np.float32),
-        "rate": np.ones((NUM_AGENTS, NUM_PHASES), np.float32),
-        "move_start": np.full((NUM_AGENTS, NUM_MOVES), np.inf, np.float32),
-        "move_l": np.zeros((NUM_AGENTS, NUM_MOVES), np.float32),
-        "move_speed": np.ones((NUM_AGENTS, NUM_MOVES), np.float32),
-    }
+    full = lambda n, value: np.full((NUM_AGENTS, n), value, np.float32)  # noqa: E731
+    phases, moves = ("start", "speed", "rate"), ("move_start", "move_l", "move_speed")
+    script = dict(
+        zip(phases, (full(NUM_PHASES, x) for x in (np.inf, 0, 1)), strict=True)
+    )
+    script |= zip(moves, (full(NUM_MOVES, x) for x in (np.inf, 0, 1)), strict=True)
     for i, row in enumerate(rows):
-        for p, (start, speed, rate) in enumerate(row.get("phases", ())):
-            script["start"][i, p] = start
-            script["speed"][i, p] = speed
-            script["rate"][i, p] = rate
-        for m, (start, l, speed) in enumerate(row.get("moves", ())):
-            script["move_start"][i, m] = start
-            script["move_l"][i, m] = l
-            script["move_speed"][i, m] = speed
+        for given, names in (("phases", phases), ("moves", moves)):
+            for number, values in enumerate(row.get(given, ())):
+                for name, value in zip(names, values, strict=True):
+                    script[name][i, number] = value
     return Agents(
         **{name: _column(rows, name) for name in AGENT},
         driver=Driver(**{name: _column(rows, name) for name in DRIVER}),
@@ -91,17 +67,9 @@ def make_agents(agents):
 
 
 def make_case(
-    agents=(),
-    lines=(),
-    speed=10.0,
-    limit=15.0,
-    kappa=0.0,
-    path_l=0.0,
-    lanes=(0, 0),
-    steps=1200,
-    seed=0,
-    **perception,
-):
+    agents=(), lines=(), speed=10.0, limit=15.0, kappa=0.0, path_l=0.0, lanes=(0, 0),
+    steps=1200, seed=0, **perception,
+):  # fmt: skip
     """A straight (or given) road; lines are dicts of Lines fields."""
     grid = np.ones((NUM_ROAD,), np.float32)
     slots = {

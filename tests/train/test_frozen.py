@@ -3,13 +3,12 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from rcirl_jax.evaluation.ranking.learners import train_learner, untrained
 from rcirl_jax.features import feature_map
-from rcirl_jax.train.frozen import Members, fit, freeze, members_of
+from rcirl_jax.train.frozen import fit, freeze, members_of
 from rcirl_jax.train.state import TrainState
 from rcirl_jax.train.step import compare, init_state, make_train_step, mined
 from tests.train.test_step import CONFIG, batch, human_is_better, normaliser, rows
@@ -53,22 +52,6 @@ def test_a_member_takes_the_steps_of_the_training_step(optimizer):
     for a, b in zip(*pairs, strict=True):
         np.testing.assert_allclose(a[0], b, rtol=2e-3, atol=2e-5)
     assert bool(fitted.finite.all())
-
-
-def test_members_do_not_know_of_each_other():
-    grid = Members(
-        seed=jnp.asarray([0, 1, 1], jnp.uint32),
-        learning_rate=jnp.asarray([0.003, 0.003, 0.03]),
-        leaky_rate=jnp.asarray([0.05, 0.3, 0.05]),
-    )
-    together = fit(human_is_better(), normaliser(), SHORT, grid)
-    for m in range(3):
-        one = jax.tree.map(lambda x, m=m: x[m : m + 1], grid)
-        alone = fit(human_is_better(), normaliser(), SHORT, one)
-        pairs = map(jax.tree.leaves, (alone.params, together.params))
-        for a, b in zip(*pairs, strict=True):
-            np.testing.assert_allclose(a[0], b[m], rtol=1e-3, atol=1e-5)
-    assert len({float(x) for x in together.loss[:, -1]}) == 3
 
 
 def test_the_last_batch_may_be_short_and_counts_every_scene_once():

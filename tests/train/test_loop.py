@@ -224,6 +224,10 @@ def test_a_run_of_a_later_version_is_refused(dataset, run, tmp_path):
         (tmp_path / "run.json").write_text(text)
         with pytest.raises(InputError, match=r"run\.json: .*expected the file of a tr"):
             check_run(tmp_path, CONFIG, dataset)
+    body["config"] = dataclasses.asdict(CONFIG) | {"reward": {"hidden": 15}}
+    (tmp_path / "run.json").write_text(json.dumps(body))
+    with pytest.raises(InputError, match=r"run\.json: reward\.hidden: 15: expected a"):
+        read_config(tmp_path)
 
 
 def test_every_scene_counts_once_for_the_normaliser(dataset, monkeypatch):

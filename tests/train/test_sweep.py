@@ -60,14 +60,9 @@ def data(tmp_path_factory):
 
 def config_of(data, **changes):
     settings = {
-        "data": (str(data),),
-        "base": BASE,
-        "hidden_sizes": ((6,), ()),
-        "leaky_rates": (0.05, 0.3),
-        "learning_rates": (0.003, 0.03),
-        "seeds": 2,
-        "validation": 0.3,
-    }
+        "data": (str(data),), "base": BASE, "hidden_sizes": ((6,), ()), "seeds": 2,
+        "leaky_rates": (0.05, 0.3), "learning_rates": (0.003, 0.03), "validation": 0.3,
+    }  # fmt: skip
     return SweepConfig(**{**settings, **changes})
 
 
@@ -141,20 +136,18 @@ def many(scenes=16, candidates=128):
     shape, pairs = (scenes, candidates, 18, middle.size), (scenes, candidates)
     around = lambda *x: middle + 0.1 * width * rng.normal(size=x)  # noqa: E731
     distance = jnp.asarray(rng.uniform(0.0, 9.0, pairs), jnp.float32)
+    of_scenes, of_pairs = jnp.zeros(scenes), jnp.zeros(pairs)
+    facts = Facts(
+        human_distance=of_scenes, human_collides=jnp.zeros(scenes, bool),
+        distance=distance, collides=distance > 8.0, breaks_rule=of_pairs,
+        human_density=of_scenes, density=of_pairs,
+    )  # fmt: skip
     return FeatureBatch(
         human=jnp.asarray(around(scenes, *shape[2:]), jnp.float32),
         candidates=jnp.asarray(around(*shape), jnp.float32).transpose(0, 3, 2, 1),
         feasible=jnp.asarray(rng.random(pairs) < 0.8),
         time_valid=jnp.ones((scenes, 18), bool),
-        facts=Facts(
-            human_distance=jnp.zeros(scenes),
-            human_collides=jnp.zeros(scenes, bool),
-            distance=distance,
-            collides=distance > 8.0,
-            breaks_rule=jnp.zeros(pairs),
-            human_density=jnp.zeros(scenes),
-            density=jnp.zeros(pairs),
-        ),
+        facts=facts,
         weight=jnp.ones(scenes),
         index=jnp.arange(scenes, dtype=jnp.int32),
     )

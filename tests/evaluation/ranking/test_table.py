@@ -34,17 +34,14 @@ SCENES, CANDIDATES, VEHICLES = 240, 12, 40
 
 @pytest.fixture(scope="module")
 def outcomes():
-    rng = np.random.default_rng(0)
-    shape = (SCENES, CANDIDATES)
+    rng, shape = np.random.default_rng(0), (SCENES, CANDIDATES)
     fde = rng.gamma(2.0, 2.0, shape)
+    crash, feasible = rng.random(shape) < 0.2, rng.random(shape) < 0.8
+    cluster = rng.permutation(np.arange(SCENES) % VEHICLES)
     return Outcomes(
-        fde=fde,
-        ade=0.4 * fde,
-        crash=rng.random(shape) < 0.2,
-        feasible=rng.random(shape) < 0.8,
-        cluster=rng.permutation(np.arange(SCENES) % VEHICLES),
+        fde=fde, ade=0.4 * fde, crash=crash, feasible=feasible, cluster=cluster,
         human_crash=np.zeros(SCENES, bool),
-    )
+    )  # fmt: skip
 
 
 def scored(outcomes, noise, seed, crash_weight=0.0):
@@ -83,10 +80,8 @@ def test_estimates_are_plain_means_over_runs_and_scenes(report, scorers):
             assert found.value == pytest.approx(np.mean(means), abs=1e-12)
             assert found.low <= found.value + 1e-12
             assert found.high >= found.value - 1e-12
-            if len(runs) == 1:
-                assert found.seed_sd is None
-            else:
-                assert found.seed_sd == pytest.approx(np.std(means, ddof=1))
+            sd = np.std(means, ddof=1) if len(runs) > 1 else None
+            assert found.seed_sd == (sd if sd is None else pytest.approx(sd))
 
 
 def test_counts_and_oracle_floor(report, outcomes):
@@ -106,14 +101,10 @@ def test_counts_and_oracle_floor(report, outcomes):
 def test_two_parts_pooled_are_the_whole(report, scorers, outcomes):
     def part(rows):
         of = lambda x: x[rows] if isinstance(x, np.ndarray) else x  # noqa: E731
-        return Ranked(
-            table={
-                name: [{metric: of(x) for metric, x in run.items()} for run in runs]
-                for name, runs in scorers.items()
-            },
-            outcomes=Outcomes(**{k: of(x) for k, x in vars(outcomes).items()}),
-            group=of(outcomes.cluster % 5),
-        )
+        every = lambda found: {name: of(x) for name, x in found.items()}  # noqa: E731
+        table = {name: [*map(every, runs)] for name, runs in scorers.items()}
+        some = Outcomes(**every(vars(outcomes)))
+        return Ranked(table=table, outcomes=some, group=of(outcomes.cluster % 5))
 
     joined = pooled([part(np.s_[:90]), part(np.s_[90:])])
     again = build_report(
@@ -125,14 +116,10 @@ def test_two_parts_pooled_are_the_whole(report, scorers, outcomes):
 
 def test_differences_are_row_minus_reference(report, scorers):
     compared = [name for name, how in METRICS.items() if how.compared]
-    pairs = {(c.row, c.reference) for c in report.comparisons}
-    assert pairs == {
-        (row, name)
-        for name in ("hand-set", "IDM", "random")
-        for row in scorers
-        if row != name
-    }
-    assert len(report.comparisons) == len(pairs) * len(compared)
+    pairs = itertools.product(scorers, ("hand-set", "IDM", "random"))
+    wanted = {pair for pair in pairs if pair[0] != pair[1]}
+    assert {(c.row, c.reference) for c in report.comparisons} == wanted
+    assert len(report.comparisons) == len(wanted) * len(compared)
     for c in report.comparisons:
         ours = np.mean([run[c.metric].mean() for run in scorers[c.row]])
         theirs = np.mean([run[c.metric].mean() for run in scorers[c.reference]])
