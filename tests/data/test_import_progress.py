@@ -90,7 +90,7 @@ def test_parts_that_do_not_say_move_the_bar_as_a_whole(monkeypatch, capsys):
             clock.now += 1.0
             progress.show(made(part, None), quality(1))
         raise KeyError
-    assert shares(drawn(capsys)) == [0, 0, 0, 25, 25, 50, 75]
+    assert shares(drawn(capsys)) == [0, 0, 0, 25, 25, 50, 75, 75]
 
 
 def test_a_long_csv_moves_the_bar_and_keeps_its_bytes(tmp_path, monkeypatch, capsys):

@@ -158,8 +158,8 @@ def test_what_no_check_foresaw_is_one_line_that_names_the_place(tmp_path, monkey
     assert line.endswith("expected a sound log of format csv")
 
 
-def test_a_recording_that_cannot_be_cut_is_one_line(monkeypatch):
-    recording = next(read_recordings("synthetic", None))
+def test_a_recording_that_cannot_be_cut_is_one_line(tmp_path, monkeypatch):
+    (recording,) = read("csv", csv.write(tmp_path).input)
     monkeypatch.setattr(
         "rcirl_jax.data.scenes.lanes._densify", lambda *_: np.zeros(2**62)
     )
@@ -202,7 +202,7 @@ def test_names_that_are_no_text(tmp_path):
     odd.write_text("t,id,x,y\n")
     with pytest.raises(InputError, match=r"name: 'a\\udcff\.csv': expected UTF-8"):
         next(read_recordings("csv", odd))
-    recording = next(read_recordings("synthetic", None))
+    (recording,) = read("csv", csv.write(made(tmp_path / "log")).input)
     track = dataclasses.replace(recording.tracks[0], id="\ud800")
     for field, value in (
         *(("name", "\udcff"), ("group", "\udcff"), ("licence", "\udcff")),

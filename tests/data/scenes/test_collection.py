@@ -409,9 +409,9 @@ def other(value):
         return not value
     if isinstance(value, tuple):
         return (*value, value[-1]) if value else ("x",)
-    if value is None:
-        return "x"
-    return value + ("x" if isinstance(value, str) else 1)
+    if isinstance(value, str):
+        return value + "x"
+    return value + 1 if isinstance(value, int | float | np.ndarray) else "x"
 
 
 @pytest.mark.parametrize("kind", [Recording, Track, Lane, Signal])

@@ -325,7 +325,7 @@ def test_abort_leaves_nothing(tmp_path, monkeypatch, existed, writes):
     with contextlib.suppress(Interrupted):
         writer.write_shard(0, make_rows(5), [])
         writer.write_shard(1, make_rows(5), [])
-    assert list(folder.rglob("zarr.json"))
+    assert any(path.is_file() for path in folder.rglob("*"))
     writer.abort()
     left = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*"))
     assert left == (["deep", "deep/dataset"] if existed else [])
@@ -373,8 +373,7 @@ def test_folders_with_other_files_are_refused(tmp_path, overwrite, name):
 def test_places_that_are_none(tmp_path):
     (tmp_path / "file").write_text("hello")
     assert "file" in refused(DatasetWriter, tmp_path / "file")
-    below = DatasetWriter(tmp_path / "file" / "below")
-    assert "file" in refused(below.write_shard, 0, make_rows(2), [])
+    assert "file" in refused(write, tmp_path / "file" / "below", (2,))
     (tmp_path / os.fsdecode(b"caf\xe9.txt")).touch()
     for use in (open_dataset, DatasetWriter):
         line = refused(use, tmp_path)

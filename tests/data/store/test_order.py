@@ -6,11 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.order import BatchIterator
-from rcirl_jax.data.store.writer import DatasetWriter
-from rcirl_jax.errors import InputError
-from tests.data.store.test_dataset import finish_fields, make_rows
+from tests.data.store.test_dataset import make_rows
+from tests.helpers.logs import refused
 
 
 def take(batches, count):
@@ -80,23 +78,6 @@ def test_processes_share_the_same_global_batches(processes):
     assert all(part.state() == whole.state() for part in parts)
 
 
-def test_dataset_and_memory_give_the_same_batches(tmp_path):
-    writer = DatasetWriter(tmp_path / "d")
-    writer.write_shard(0, make_rows(30), [])
-    writer.write_shard(1, make_rows(11, seed=1), [])
-    writer.finish(finish_fields())
-    dataset = open_dataset(tmp_path / "d")
-    chosen = dataset.indices("train")
-    disk = BatchIterator(dataset, batch_size=8, seed=0, indices=chosen)
-    memory = BatchIterator(dataset.load("train"), batch_size=8, seed=0)
-    for _ in range(9):
-        (one, weight, rows), (two, same, places) = next(disk), next(memory)
-        assert equal((one, weight), (two, same))
-        assert np.array_equal(rows, chosen[places])
-    whole = BatchIterator(dataset, batch_size=41, seed=0)
-    assert sorted(next(whole)[2].tolist()) == list(range(41))
-
-
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
@@ -108,8 +89,8 @@ def test_dataset_and_memory_give_the_same_batches(tmp_path):
     ],
 )
 def test_bad_settings(settings, words):
-    with pytest.raises(InputError, match=words):
-        BatchIterator(make_rows(6), **{"batch_size": 4, "seed": 0, **settings})
+    known = {"batch_size": 4, "seed": 0, **settings}
+    assert words in refused(BatchIterator, make_rows(6), **known)
 
 
 @pytest.mark.parametrize(
@@ -123,7 +104,6 @@ def test_bad_settings(settings, words):
 )
 def test_states_of_other_runs_are_refused(change, words):
     batches = BatchIterator(make_rows(6), batch_size=4, seed=0)
-    with pytest.raises(InputError, match=words):
-        batches.restore({**batches.state(), **change})
-    with pytest.raises(InputError, match="epoch: missing"):
-        batches.restore({"position": 0, "seed": 0})
+    assert words in refused(batches.restore, {**batches.state(), **change})
+    line = refused(batches.restore, {"position": 0, "seed": 0})
+    assert "epoch: missing" in line

@@ -216,6 +216,6 @@ def write(folder):
         num_lanes=6,
         files=files,
         checked=files[:1],
-        numbers={files[1]: '"x": ([^,}]*)'},
+        numbers={files[1]: r'left_lane_boundary": \[\{"x": ([^,}]*)'},
         is_counted=True,
     )
