@@ -172,8 +172,8 @@ def git(folder, *words):
 def repository(tmp_path):
     """A repository with one commit of a file, ours if it is a checkout."""
     git(tmp_path, "init", "--quiet")
-    (tmp_path / "experiments").mkdir()
-    (tmp_path / "experiments" / "common.py").write_text("1")
+    (tmp_path / "experiments" / "flags").mkdir(parents=True)
+    (tmp_path / "experiments" / "flags" / "common.py").write_text("1")
     git(tmp_path, "add", ".")
     git(tmp_path, "commit", "--quiet", "--message=first")
     return tmp_path
@@ -181,14 +181,16 @@ def repository(tmp_path):
 
 def commit_of(root, monkeypatch):
     """What the package says when it lies in `root`."""
-    monkeypatch.setattr(common, "__file__", str(root / "experiments" / "common.py"))
+    monkeypatch.setattr(
+        common, "__file__", str(root / "experiments" / "flags" / "common.py")
+    )
     return common.git_commit()
 
 
 def test_the_commit_is_the_checkouts_that_knows_the_package(repository, monkeypatch):
     head = git(repository, "rev-parse", "HEAD")
     assert commit_of(repository, monkeypatch) == head
-    (repository / "experiments" / "common.py").write_text("2")
+    (repository / "experiments" / "flags" / "common.py").write_text("2")
     assert commit_of(repository, monkeypatch) == head + "+"
     with monkeypatch.context() as patch:
         patch.setattr(shutil, "which", lambda name: None)
@@ -204,6 +206,6 @@ def test_a_package_put_beside_the_files_of_another_repository(repository, monkey
     """As `pip install --target=.` does: git does not know it."""
     git(repository, "mv", "experiments", "theirs")
     git(repository, "commit", "--quiet", "--message=second")
-    (repository / "experiments").mkdir()
-    (repository / "experiments" / "common.py").write_text("1")
+    (repository / "experiments" / "flags").mkdir(parents=True)
+    (repository / "experiments" / "flags" / "common.py").write_text("1")
     assert commit_of(repository, monkeypatch) == ""

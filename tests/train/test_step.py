@@ -356,7 +356,7 @@ def test_any_optimiser_of_optax_takes_steps(name):
             params = optax.apply_updates(params, updates)
         return params
 
-    by_array = jax.jit(lambda rate: steps(make_rule(config, name, rate)))(0.01)
+    by_array = jax.jit(lambda rate: steps(make_rule(config, rate)))(0.01)
     fixed = jax.jit(lambda: steps(make_optimizer(config)))()
     for a, b, old in zip(*map(jax.tree.leaves, (by_array, fixed, first)), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-6)

@@ -120,7 +120,7 @@ def test_many_members_fit():
     config = dataclasses.replace(BASE, batch_size=batch_size, reward=reward)
     who = members_of([config] * members)
     order = jax.random.key(0)
-    given = (many(64), normaliser(), order, who, config, 18, (config.optimizer,))
+    given = (many(64), normaliser(), order, who, config, 18)
     lowered = frozen._fit.lower(*given)
     held = lowered.compile().memory_analysis().temp_size_in_bytes
     one_layer = 4 * members * batch_size * 128 * 18 * 64
