@@ -6,6 +6,8 @@ import platform
 import shutil
 import subprocess
 import sys
+import tempfile
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
@@ -24,6 +26,7 @@ from rcirl_jax.runtime.atomic_files import is_text
 from rcirl_jax.runtime.pipeline import code_sha256
 
 EXIT_BAD_INPUT = 2
+EXIT_FAULT = 70  # of this program, as sysexits.h has it
 # variables that decide how numbers are rounded
 COMPILER = (
     *("XLA_FLAGS", "JAX_ENABLE_X64", "JAX_DISABLE_JIT"),
@@ -38,8 +41,9 @@ NO_MEMORY = "RESOURCE_EXHAUSTED"  # how JAX's errors begin that come of its want
 def run(main: Callable[[], None]) -> None:
     """Run a main; bad input becomes one line on stderr and exit status 2.
 
-    So do a place that cannot be written and memory that is not given. SIGTERM ends
-    with 143, SIGINT with 130, within ten seconds (`rcirl_jax.runtime.signals`).
+    So do a place that cannot be written and memory that is not given. A fault of the
+    program is one line too, with status 70, and its traceback a file to report. SIGTERM
+    ends with 143, SIGINT with 130, within ten seconds (`rcirl_jax.runtime.signals`).
     """
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
@@ -60,7 +64,8 @@ def run(main: Callable[[], None]) -> None:
         except (MemoryError, jax.errors.JaxRuntimeError) as error:
             why = " ".join(str(error).split())[:200]
             if not isinstance(error, MemoryError) and not why.startswith(NO_MEMORY):
-                raise
+                print(f"error: {_fault(error)}", file=sys.stderr)
+                sys.exit(EXIT_FAULT)
             print(
                 f"error: memory: {why or 'refused'}: expected more for this work",
                 file=sys.stderr,
@@ -68,6 +73,9 @@ def run(main: Callable[[], None]) -> None:
             sys.exit(EXIT_BAD_INPUT)
         except interrupts.Interrupted as stop:
             _leave(stop.number)
+        except Exception as error:
+            print(f"error: {_fault(error)}", file=sys.stderr)
+            sys.exit(EXIT_FAULT)
 
     interrupts.install()
     app.run(guarded, flags_parser=_parse)
@@ -78,6 +86,22 @@ def _about(error: OSError) -> str:
     known = error.filename is not None and error.strerror is not None
     text = f"{error.filename}: {error.strerror}" if known else str(error)
     return " ".join(text.split())
+
+
+def _fault(error: Exception) -> str:
+    """One line on an error that nothing foresaw; its traceback goes to a file."""
+    lines = traceback.format_exception(error)
+    with tempfile.NamedTemporaryFile(
+        "w", prefix="rcirl-jax-fault-", suffix=".txt", delete=False
+    ) as file:
+        file.write(" ".join(sys.argv) + "\n" + "".join(lines))
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    why = " ".join(str(error).split())[:200]
+    return (
+        f"{type(error).__name__}: {why} ({Path(place.filename).name}:{place.lineno}): "
+        "a fault of rcirl-jax, not of your input; please report it as CONTRIBUTING.md "
+        f"says, with the file {file.name}"
+    )
 
 
 def _leave(number: int) -> None:

@@ -103,7 +103,7 @@ def test_who_reverses_stands_or_walks_is_not_judged():
 )
 def test_sizes_are_judged_by_each_other_and_by_the_lanes(change, lane_width, words):
     wrong = changed(lambda track: change)
-    with pytest.raises(InputError, match="^log: (length|width): median") as error:
+    with pytest.raises(InputError, match=r"^log: (length|width): median") as error:
         validate_recording(recording(*wrong, lanes=(lane(lane_width),)))
     assert words in str(error.value)
 
@@ -117,6 +117,6 @@ def test_speeds_in_another_unit_are_named(factor, words):
     slow = [
         dataclasses.replace(one, x=one.x * 8 / 15, y=one.y * 8 / 15) for one in wrong
     ]
-    with pytest.raises(InputError, match="^log: speed: ") as error:
+    with pytest.raises(InputError, match=r"^log: speed: ") as error:
         validate_recording(recording(*slow))
     assert words in str(error.value)
