@@ -1,6 +1,5 @@
 """What the experiment files share: running, reading flags, provenance."""
 
-import dataclasses
 import os
 import platform
 import shutil
@@ -17,7 +16,6 @@ from absl import app, flags, logging
 
 from rcirl_jax import __version__
 from rcirl_jax.data.parts import Part, logs_sha256
-from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.reader import load_weights
@@ -150,42 +148,6 @@ def unread(*names: str) -> None:
     """Flags of other files that a command does not read: unknown to it, unrecorded."""
     for name in names:
         delattr(flags.FLAGS, name)
-
-
-def cutting(
-    defaults: CollectConfig | None = None, said: str = ""
-) -> Callable[[CollectConfig], CollectConfig]:
-    """Define --stride, --keep_steady, --keep_free_road; returns what applies them.
-
-    Args:
-      defaults: the flags' defaults. None: they have none, and one that is not given
-        leaves a config as it is.
-      said: the end of their help.
-    """
-    stride = flags.DEFINE_float(
-        "stride",
-        None if defaults is None else defaults.stride_s,
-        "s between planning frames of a driver" + said,
-    )
-    keep = {
-        field: flags.DEFINE_bool(
-            name,
-            None if defaults is None else not getattr(defaults, field),
-            f"keep scenes without {what} (the paper drops them)" + said,
-        )
-        for field, name, what in (
-            ("require_speed_change", "keep_steady", "speed change"),
-            ("require_obstacles", "keep_free_road", "obstacles"),
-        )
-    }
-
-    def applied(config: CollectConfig) -> CollectConfig:
-        given = {name: not x.value for name, x in keep.items() if x.value is not None}
-        if stride.value is not None:
-            config = dataclasses.replace(config, stride_s=stride.value)
-        return dataclasses.replace(config, **given)
-
-    return applied
 
 
 def floats(values: list[str], flag: str) -> tuple[float, ...]:

@@ -73,6 +73,8 @@ def validate_recording(
 ) -> Recording:
     """The recording with references to unknown lanes and signals dropped.
 
+    One without traffic is no error: an import counts and skips it.
+
     Args:
       recording: what an importer read.
       file: named in errors; default: the recording's name.
@@ -88,7 +90,7 @@ def validate_recording(
             f"{name}: rate_hz: {recording.rate_hz:g}: expected up to {MAX_RATE_HZ:g}"
         )
     if not recording.tracks:
-        raise InputError(f"{name}: tracks: none: expected at least one road user")
+        return recording  # counted as empty, and skipped
     _check_texts(name, recording)
     _check_unique(name, "track id", [track.id for track in recording.tracks])
     _check_unique(name, "lane id", [lane.id for lane in recording.lanes])

@@ -71,6 +71,20 @@ def test_one_too_many_ends_the_import(tmp_path):
     assert not (tmp_path / "data").exists()
 
 
+def test_a_share_is_judged_at_the_end(tmp_path):
+    logs = shard(tmp_path / "logs", good("a"), BAD, good("b"))
+    half = dataclasses.replace(STRICT, leave_out_share=0.5)
+    made = import_parts(logs, tmp_path / "data", half)
+    assert made.quality["refused"] == 1
+    assert made.import_flags["leave_out_share"] == 0.5
+    few = dataclasses.replace(STRICT, leave_out_share=0.3)
+    with pytest.raises(
+        InputError, match=r"1 of 3 recordings refused, .*record 1: .*up to 30 %"
+    ):
+        import_parts(logs, tmp_path / "other", few)
+    assert not (tmp_path / "other").exists()
+
+
 def test_without_it_the_first_one_ends_the_import(tmp_path):
     (strict,) = shard(tmp_path / "logs", good("a"), BAD)
     with pytest.raises(InputError, match="record 1: "):
@@ -119,6 +133,6 @@ def test_the_command(tmp_path):
     dataset = open_dataset(tmp_path / "data")
     facts = dataset.facts()
     assert facts["data_hash"] == dataset.hash
-    assert facts["made_by"]["flags"]["leave_out"] == 1
+    assert facts["made_by"]["flags"]["leave_out"] == "1"
     assert facts["made_by"]["git_commit"] == git_commit()
     assert [floor["candidates"] > 100 for floor in facts["oracle_floor"]] == [True] * 2
