@@ -21,17 +21,18 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.importers.files import (
+    given_map,
     input_files,
     is_input,
     log_name,
 )
 from rcirl_jax.data.importers.lanelet2.map import read_lanelet2
-from rcirl_jax.data.importers.options import number, path_option, section
+from rcirl_jax.data.importers.options import number, section
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.projection import utm, utm_zone
 from rcirl_jax.data.importers.tracks import split_tracks, travel_heading
-from rcirl_jax.data.readers.tables.ledger import LINE, Ledger, allowed_share
-from rcirl_jax.data.readers.tables.repair import single_rows
+from rcirl_jax.data.readers.tables.ledger import LINE, Ledger, allowed_share, with_news
+from rcirl_jax.data.readers.tables.repair import once
 from rcirl_jax.data.readers.tables.table import (
     MAX_PLACE_M,
     MAX_TIME,
@@ -42,7 +43,7 @@ from rcirl_jax.data.readers.tables.table import (
 )
 from rcirl_jax.data.recording import accepted, validate_recording
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Kind, Lane, Recording, RowCounts, Track
+from rcirl_jax.types import Kind, Lane, Recording, Track
 
 NEEDED = ("track_id", "timestamp_ms", "agent_type", "x", "y", "vx", "vy")
 OPTIONAL = ("case_id", "psi_rad", "length", "width")
@@ -93,38 +94,23 @@ class _Scene:
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """One Recording per vehicle file, or per case of a challenge file."""
     for file in parts(path, spec):
-        table, ledger = _read(file, spec)
-        scene = _scene(file, spec)
-        if np.isfinite(table["case_id"]).any():
-            for made in _cases(table, scene):
-                yield _with_rows(made, ledger)
+        rows, ledger = _read(file, spec)
+        scene, ledgers = _scene(file, spec), [ledger]
+        if np.isfinite(rows["case_id"]).any():
+            for made in _cases(rows, scene):
+                yield with_news(made, ledger)
             continue
         partner = file.with_name(file.name.replace(VEHICLES, PEDESTRIANS, 1))
-        ledgers = [ledger]
         if partner != file and partner.is_file():
-            extra, others = _read(partner, spec)
-            table = {k: np.concatenate([table[k], extra[k]]) for k in table}
-            ledgers.append(others)
-        number_ = file.stem.removeprefix(VEHICLES).removeprefix(PEDESTRIANS)
-        own = f"{_scene_name(file)}-{number_}"
+            others, ledger = _read(partner, spec)
+            rows = {k: np.concatenate([rows[k], others[k]]) for k in rows}
+            ledgers.append(ledger)
+        own = own_name(file)
         name = log_name(file, spec, own)
         # logs of one name may be copies of each other
         group = None if name == own else own
-        made = _recording(name, table, scene, group)
-        yield validate_recording(_with_rows(made, *ledgers), file)
-
-
-def _with_rows(made: Recording, *ledgers: Ledger) -> Recording:
-    """A recording that says what became of the rows of its files."""
-    found = [ledger.news() for ledger in ledgers]
-    counts = {
-        field.name: sum(getattr(rows, field.name) for rows, _ in found)
-        for field in dataclasses.fields(RowCounts)
-    }
-    notes = [note for _, dropped in found for note in dropped]
-    return dataclasses.replace(
-        made, rows=RowCounts(**counts), notes=(*made.notes, *notes)
-    )
+        made = _recording(name, rows, scene, group)
+        yield validate_recording(with_news(made, *ledgers), file)
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
@@ -182,53 +168,39 @@ def _read(path: Path, spec: dict) -> tuple[dict[str, np.ndarray], Ledger]:
     source = open_table(path, section(spec, "table"))
     ledger = Ledger(path=path, unit=source.unit, allowed=allowed_share(spec))
     fields = fields_of(source, NEEDED, OPTIONAL, texts=TEXT, limits=LIMITS)
-    table = read(source, fields, ledger)
-    none = np.full(table["x"].size, np.nan)
-    table = {name: table.get(name, none) for name in (*NEEDED, *OPTIONAL, LINE)}
-    if "case_id" in source.header and not np.isfinite(table["case_id"]).all():
-        line = table[LINE][~np.isfinite(table["case_id"])][0]
+    rows = read(source, fields, ledger)
+    none = np.full(rows[LINE].size, np.nan)
+    rows = {name: rows.get(name, none) for name in (*NEEDED, *OPTIONAL, LINE)}
+    if "case_id" in source.header and not np.isfinite(rows["case_id"]).all():
+        line = rows[LINE][~np.isfinite(rows["case_id"])][0]
         raise InputError(f"{path}: line {line}: case_id: '': expected a number")
-    users, codes = np.unique(table["track_id"], return_inverse=True)
-    cases = np.unique(table["case_id"], return_inverse=True)[1]
-    kept = single_rows(
-        {
-            **table,
-            "t": table["timestamp_ms"],
-            "id": (cases * users.size + codes).astype(float),
-        },
-        ledger,
-        [*NEEDED, *OPTIONAL],
-        lambda code: users[int(code) % users.size],
-    )
-    return {name: column[kept] for name, column in table.items()}, ledger
+    users, codes = np.unique(rows["track_id"], return_inverse=True)
+    cases = np.unique(rows["case_id"], return_inverse=True)[1]
+    rows["user"] = (cases * users.size + codes).astype(float)
+
+    def named(code: float) -> str:
+        return str(users[int(code) % users.size])
+
+    return once(rows, ledger, "timestamp_ms", "user", name_of=named), ledger
 
 
 def _scene(path: Path, spec: dict) -> _Scene:
     place = _find_map(path, spec)
     limit = number(spec, "default_speed_limit", LIMIT_MPS)
-    if place is None:
-        note = "no map found; lanes fitted to the longest paths"
-        return _Scene(path=path, spec=spec, lanes=None, limit=limit, notes=(note,))
-    zone = utm_zone(0.0)
-    origin = utm(np.zeros(1), np.zeros(1), zone)
-    lanes, notes = read_lanelet2(place, lambda a, b: utm(a, b, zone) - origin)
-    limits = [lane.speed_limit for lane in lanes if lane.speed_limit is not None]
-    return _Scene(
-        path=path,
-        spec=spec,
-        lanes=lanes,
-        limit=float(np.median(limits)) if limits else limit,
-        notes=tuple(notes),
-    )
+    lanes, notes = None, ["no map found; lanes fitted to the longest paths"]
+    if place is not None:
+        zone = utm_zone(0.0)
+        origin = utm(np.zeros(1), np.zeros(1), zone)
+        lanes, notes = read_lanelet2(place, lambda a, b: utm(a, b, zone) - origin)
+        known = [lane.speed_limit for lane in lanes if lane.speed_limit is not None]
+        limit = float(np.median(known)) if known else limit
+    return _Scene(path=path, spec=spec, lanes=lanes, limit=limit, notes=tuple(notes))
 
 
 def _find_map(path: Path, spec: dict) -> Path | None:
     """maps/SCENE.osm_xy or .osm in a folder above; the option `map` names one."""
     folders = [folder / "maps" for folder in path.resolve().parents[:MAPS_UP]]
-    if spec.get("map"):
-        given = Path(path_option(spec, "map"))
-        if not given.exists():
-            raise InputError(f"{given}: map: missing: expected a file or folder")
+    if (given := given_map(spec)) is not None:
         if given.is_file():
             return given
         folders = [given]

@@ -44,7 +44,7 @@ class Survey:
         """Take in rows."""
         self.lateral |= bool(np.any(table["Local_X"] != 0.0))
         for field, users in self._without.items():
-            users.update(table["Vehicle_ID"][table[f"v_{field.title()}"] <= 0.0])
+            users.update(table["id"][table[f"v_{field.title()}"] <= 0.0])
         driven = table["Lane_ID"].astype(int)
         for lane in np.unique(driven).tolist():
             x, y = (table[name][driven == lane] for name in ("Local_X", "Local_Y"))
@@ -124,7 +124,7 @@ def site_recording(
     frame_s = positive(spec, "frame_s", FRAME_S)
     # with stamps no step back has a meaning
     reuse = 0.0 if stamped else REUSE_S / frame_s
-    vehicles = table["Vehicle_ID"].astype(np.int64)
+    vehicles = table["id"].astype(np.int64)
     pieces = split_tracks(path, vehicles, table["frame"], MAX_FRAME_GAP, reuse)
     lateral = survey.lateral
     table = {**table, "leader_missing": _leader_missing(table)}
@@ -144,7 +144,7 @@ def site_recording(
 def _leader_missing(table: Rows) -> np.ndarray:
     """[n] bool: the row names a vehicle ahead that has no row at that time."""
     named = table["Preceding"] > 0.0
-    users = np.concatenate([table["Vehicle_ID"], table["Preceding"]])
+    users = np.concatenate([table["id"], table["Preceding"]])
     number = np.unique(users, return_inverse=True)[1].reshape(2, -1)
     frames = np.unique(table["frame"], return_inverse=True)[1].reshape(-1)
     own, ahead = number * (frames.max() + 1) + frames
