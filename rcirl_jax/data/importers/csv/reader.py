@@ -22,6 +22,7 @@ from rcirl_jax.data.importers.csv.map import (
 from rcirl_jax.data.importers.csv.mapping import Mapping, mapping_of
 from rcirl_jax.data.importers.csv.meaning import Meaning, meaning_of
 from rcirl_jax.data.importers.csv.users import track_of
+from rcirl_jax.data.importers.declared import open_log
 from rcirl_jax.data.importers.files import (
     firsts_of_a_name,
     is_input,
@@ -29,12 +30,12 @@ from rcirl_jax.data.importers.files import (
     log_name,
     table_stem,
 )
-from rcirl_jax.data.importers.options import number, patterns, section
+from rcirl_jax.data.importers.options import number, patterns
 from rcirl_jax.data.importers.shapes import local_origin, origin_notes
 from rcirl_jax.data.importers.tracks import split_tracks
 from rcirl_jax.data.readers.long_logs import piece_of, rows_of
-from rcirl_jax.data.readers.tables.ledger import Ledger, allowed_share, with_news
-from rcirl_jax.data.readers.tables.table import Table, open_table
+from rcirl_jax.data.readers.tables.ledger import Ledger, with_news
+from rcirl_jax.data.readers.tables.table import Table
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Recording
@@ -118,13 +119,8 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
 
 def opened(file: Path, spec: dict) -> Log:
     """A file with its mapping, none of whose rows is read."""
-    table = open_table(file, section(spec, "table"))
-    return Log(
-        table=table,
-        spec=spec,
-        mapping=mapping_of(table, spec),
-        ledger=Ledger(path=file, unit=table.unit, allowed=allowed_share(spec)),
-    )
+    table, ledger = open_log(file, spec)
+    return Log(table=table, spec=spec, mapping=mapping_of(table, spec), ledger=ledger)
 
 
 def _recordings(log: Log, is_long: bool) -> Iterator[Recording]:

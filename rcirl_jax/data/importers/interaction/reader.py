@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.data.importers.declared import Columns, Rows, open_log
 from rcirl_jax.data.importers.files import (
     given_map,
     input_files,
@@ -27,32 +28,25 @@ from rcirl_jax.data.importers.files import (
     log_name,
 )
 from rcirl_jax.data.importers.lanelet2.map import read_lanelet2
-from rcirl_jax.data.importers.options import number, section
+from rcirl_jax.data.importers.options import number
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.projection import utm, utm_zone
 from rcirl_jax.data.importers.tracks import split_tracks, travel_heading
-from rcirl_jax.data.readers.tables.ledger import LINE, Ledger, allowed_share, with_news
+from rcirl_jax.data.readers.tables.ledger import LINE, Ledger, with_news
 from rcirl_jax.data.readers.tables.repair import once
-from rcirl_jax.data.readers.tables.table import (
-    MAX_PLACE_M,
-    MAX_TIME,
-    MAX_VELOCITY_MPS,
-    fields_of,
-    open_table,
-    read,
-)
+from rcirl_jax.data.readers.tables.table import open_table, read
 from rcirl_jax.data.recording import accepted, validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Lane, Recording, Track
 
-NEEDED = ("track_id", "timestamp_ms", "agent_type", "x", "y", "vx", "vy")
-OPTIONAL = ("case_id", "psi_rad", "length", "width")
-TEXT = ("track_id", "agent_type")
-LIMITS = {
-    "timestamp_ms": MAX_TIME,
-    **dict.fromkeys(("x", "y"), MAX_PLACE_M),
-    **dict.fromkeys(("vx", "vy"), MAX_VELOCITY_MPS),
-}
+TABLE = Columns(
+    needed={
+        **{"track_id": "text", "timestamp_ms": "time", "agent_type": "text"},
+        **{"x": "place", "y": "place", "vx": "speed", "vy": "speed"},
+    },
+    optional=dict.fromkeys(("case_id", "psi_rad", "length", "width"), "number"),
+    t="timestamp_ms",
+)
 VEHICLES = "vehicle_tracks_"
 PEDESTRIANS = "pedestrian_tracks_"
 # files of a release that are no logs: predictions to hand in, 1 s observations
@@ -160,28 +154,26 @@ def _scene_name(path: Path) -> str:
     )
 
 
-def _read(path: Path, spec: dict) -> tuple[dict[str, np.ndarray], Ledger]:
+def _read(path: Path, spec: dict) -> tuple[Rows, Ledger]:
     """All columns this module uses, and what became of the rows.
 
-    NaN where a file or a cell has none; each road user is met once in a frame.
+    NaN where a file or a cell has none; a road user is one of a case.
     """
-    source = open_table(path, section(spec, "table"))
-    ledger = Ledger(path=path, unit=source.unit, allowed=allowed_share(spec))
-    fields = fields_of(source, NEEDED, OPTIONAL, texts=TEXT, limits=LIMITS)
-    rows = read(source, fields, ledger)
-    none = np.full(rows[LINE].size, np.nan)
-    rows = {name: rows.get(name, none) for name in (*NEEDED, *OPTIONAL, LINE)}
-    if "case_id" in source.header and not np.isfinite(rows["case_id"]).all():
-        line = rows[LINE][~np.isfinite(rows["case_id"])][0]
+    table, ledger = open_log(path, spec)
+    rows = read(table, TABLE.fields(table), ledger)
+    rows = dict.fromkeys(TABLE.optional, np.full(rows[LINE].size, np.nan)) | rows
+    unknown = ~np.isfinite(rows["case_id"])
+    if table.has("case_id") and unknown.any():
+        line = rows[LINE][unknown][0]
         raise InputError(f"{path}: line {line}: case_id: '': expected a number")
     users, codes = np.unique(rows["track_id"], return_inverse=True)
     cases = np.unique(rows["case_id"], return_inverse=True)[1]
     rows["user"] = (cases * users.size + codes).astype(float)
 
-    def named(code: float) -> str:
-        return str(users[int(code) % users.size])
+    def name_of(user: float) -> str:
+        return str(users[int(user) % users.size])
 
-    return once(rows, ledger, "timestamp_ms", "user", name_of=named), ledger
+    return once(rows, ledger, TABLE.t, "user", name_of=name_of), ledger
 
 
 def _scene(path: Path, spec: dict) -> _Scene:
@@ -228,7 +220,7 @@ def _is_numbered(one: str, other: str) -> bool:
     return long.removeprefix(short).isdigit() and not short[-1:].isdigit()
 
 
-def _cases(table: dict[str, np.ndarray], scene: _Scene) -> Iterator[Recording]:
+def _cases(table: Rows, scene: _Scene) -> Iterator[Recording]:
     """One Recording per case; all of a file are one group, they share vehicles."""
     order = np.argsort(table["case_id"], kind="stable")
     case = table["case_id"][order]
@@ -240,9 +232,7 @@ def _cases(table: dict[str, np.ndarray], scene: _Scene) -> Iterator[Recording]:
         yield accepted(make, name, scene.path, scene.spec)
 
 
-def _recording(
-    name: str, table: dict[str, np.ndarray], scene: _Scene, group: str | None
-) -> Recording:
+def _recording(name: str, table: Rows, scene: _Scene, group: str | None) -> Recording:
     stamps = table["timestamp_ms"]
     table["t"] = (stamps - stamps.min()) / 1000.0
     pieces = split_tracks(scene.path, table["track_id"], stamps, MAX_GAP_MS)
@@ -271,9 +261,7 @@ def _recording(
 MOTORISED = ("car", "truck", "bus", "van", "motorcycle", "vehicle")
 
 
-def _track(
-    name: str, rows: np.ndarray, table: dict[str, np.ndarray], scene: _Scene
-) -> Track:
+def _track(name: str, rows: np.ndarray, table: Rows, scene: _Scene) -> Track:
     t, x, y, psi = (table[field][rows] for field in ("t", "x", "y", "psi_rad"))
     speed = np.hypot(table["vx"][rows], table["vy"][rows])
     agent = str(table["agent_type"][rows[0]]).lower()

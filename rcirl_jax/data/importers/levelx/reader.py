@@ -19,19 +19,17 @@ from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.data.importers.declared import Columns, Rows, open_log
 from rcirl_jax.data.importers.files import files_below, log_name
 from rcirl_jax.data.importers.lanelet2.map import read_lanelet2
 from rcirl_jax.data.importers.levelx.map import find_map, marked_lanes
-from rcirl_jax.data.importers.options import number, section
+from rcirl_jax.data.importers.options import number
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.projection import utm, utm_zone
 from rcirl_jax.data.importers.tracks import split_tracks, travel_heading
-from rcirl_jax.data.readers.tables.ledger import Ledger, allowed_share, with_news
-from rcirl_jax.data.readers.tables.repair import once
+from rcirl_jax.data.readers.tables.ledger import Ledger, with_news
 from rcirl_jax.data.readers.tables.table import (
     MAX_PLACE_M,
-    MAX_TIME,
-    MAX_VELOCITY_MPS,
     Table,
     fields_of,
     open_table,
@@ -42,21 +40,28 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Lane, Recording, Track
 
 SUFFIX, USERS, META = "_tracks.csv", "_tracksMeta.csv", "_recordingMeta.csv"
-# field -> column of the two layouts
-CORNER = {
-    **{"frame": "frame", "id": "id", "x": "x", "y": "y"},
-    **{"length": "width", "width": "height", "vx": "xVelocity", "vy": "yVelocity"},
-}
-CENTRE = {
-    **{"frame": "frame", "id": "trackId", "x": "xCenter", "y": "yCenter"},
-    **{"heading": "heading", "width": "width", "length": "length"},
-    **{"vx": "xVelocity", "vy": "yVelocity"},
-}
-LIMITS = {
-    "frame": MAX_TIME,
-    **dict.fromkeys(("x", "y", "width", "length"), MAX_PLACE_M),
-    **dict.fromkeys(("vx", "vy"), MAX_VELOCITY_MPS),
-}
+MOVES = {"vx": "speed", "vy": "speed"}
+CORNER = Columns(
+    needed={
+        **{"frame": "time", "id": "number", "x": "place", "y": "place"},
+        **{"length": "place", "width": "place", **MOVES},
+    },
+    called={"length": "width", "width": "height", "vx": "xVelocity", "vy": "yVelocity"},
+    t="frame",
+    name_of="{:g}".format,
+)
+CENTRE = Columns(
+    needed={
+        **{"frame": "time", "id": "number", "x": "place", "y": "place"},
+        **{"heading": "number", "width": "place", "length": "place", **MOVES},
+    },
+    called={
+        **{"id": "trackId", "x": "xCenter", "y": "yCenter"},
+        **{"vx": "xVelocity", "vy": "yVelocity"},
+    },
+    t="frame",
+    name_of="{:g}".format,
+)
 KINDS = {
     "pedestrian": Kind.PEDESTRIAN,
     "animal": Kind.PEDESTRIAN,
@@ -74,7 +79,6 @@ FAR_M = 200.0  # m; a map that far from all tracks is not theirs
 LANE_WIDTH_M = 3.5  # m, of lanes fitted to paths
 LIMIT_MPS = 36.11  # m/s, 130 km/h, advised where German motorways have no limit
 SIZE_M = (0.5, 0.5)  # m, length and width of a road user without a box
-Rows = dict[str, np.ndarray]  # field -> [n]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -139,10 +143,7 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     for file in parts(path, spec):
         if not file.name.endswith(SUFFIX):
             raise InputError(f"{file}: name: {file.name}: expected XX{SUFFIX}")
-        table = open_table(file, section(spec, "table"))
-        ledger = Ledger(
-            path=file, unit=table.unit, allowed=allowed_share(spec, default=0.0)
-        )
+        table, ledger = open_log(file, spec, allowed=0.0)
         made = _recording(table, spec, ledger)
         yield validate_recording(with_news(made, ledger), file)
 
@@ -176,10 +177,9 @@ def _recording(table: Table, spec: dict, ledger: Ledger) -> Recording:
     """Boxes by their corners (highD), or by their centres (inD and its sisters)."""
     path, is_corner = table.path, "xCenter" not in table.header
     columns = CORNER if is_corner else CENTRE
-    fields = fields_of(table, [*columns], limits=LIMITS, columns=columns)
-    rows = once(read(table, fields, ledger), ledger, "frame", name_of="{:g}".format)
+    rows = columns.read(table, ledger)
     direction = "drivingDirection" if is_corner else None
-    users = _read_users(_beside(path, USERS), columns["id"], direction)
+    users = _read_users(_beside(path, USERS), columns.called.get("id", "id"), direction)
     meta = _read_meta(_beside(path, META))
     rate = meta.rate
     rows["t"] = (rows["frame"] - rows["frame"].min()) / rate

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.data.importers.declared import Rows
 from rcirl_jax.data.importers.lanes import StraightLane, straight_lanes
 from rcirl_jax.data.importers.options import number, positive
 from rcirl_jax.data.importers.tracks import spans_of, split_tracks, travel_heading
@@ -23,8 +24,6 @@ LANE_WIDTH_M = 3.6576  # m, 12 ft, US freeway
 SWITCH_S = 4.0  # s, a lane change takes 3 to 6 s
 LIMIT_MPS = 29.06  # m/s, 65 mph
 SIZE_M = (4.5, 1.8)  # m, a car
-
-Rows = dict[str, np.ndarray]  # column -> [n], SI units; "frame" is the clock
 
 
 class Survey:

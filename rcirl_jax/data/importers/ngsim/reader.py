@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.data.importers.declared import Columns, Rows, open_log
 from rcirl_jax.data.importers.files import (
     firsts_of_a_name,
     input_files,
@@ -33,44 +34,32 @@ from rcirl_jax.data.importers.ngsim.map import (
     FRAME_S,
     MAX_FRAME_GAP,
     SITE,
-    Rows,
     Survey,
     site_recording,
 )
 from rcirl_jax.data.importers.options import patterns, positive, section, unit_factor
 from rcirl_jax.data.readers.long_logs import piece_of, rows_of
 from rcirl_jax.data.readers.tables.layout import BLANKS
-from rcirl_jax.data.readers.tables.ledger import Ledger, allowed_share, with_news
-from rcirl_jax.data.readers.tables.table import (
-    MAX_PLACE_M,
-    MAX_TIME,
-    Field,
-    Table,
-    batches,
-    fields_of,
-    open_table,
-)
+from rcirl_jax.data.readers.tables.ledger import Ledger, with_news
+from rcirl_jax.data.readers.tables.table import Field, Table, batches
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Recording
 
-NEEDED = ("Vehicle_ID", "Frame_ID", "Local_Y", "v_Vel", "Lane_ID")
-KNOWN = tuple(name.lower() for name in NEEDED)
-OPTIONAL = ("Local_X", "v_Length", "v_Width", "v_Class", "Global_Time", "Preceding")
 CLOCK = "Global_Time"
+COLUMNS = {
+    **{"Vehicle_ID": "count", "Frame_ID": "time", "Local_Y": "place"},
+    **{"v_Vel": "place", "Lane_ID": "count"},
+    **{"Local_X": "place", "v_Length": "place", "v_Width": "place"},
+    **{"v_Class": "count", CLOCK: "time", "Preceding": "count", SITE: "text"},
+}  # column -> what its cells are
+NEEDED = tuple(COLUMNS)[:5]
+OPTIONAL = tuple(COLUMNS)[5:-1]
 APART = ("Preceding",)  # columns in which rows that repeat each other may differ
 PLACES = ("Local_Y", "Local_X")  # where a road user is
 JUNCTION = "Int_ID"  # a column of arterials, empty for freeways
 ARTERIAL_COLUMNS = 24  # of an arterial's native text
 LOGS = "trajectories"  # start of the logs' names in the releases
-LENGTHS = ("Local_X", "Local_Y", "v_Length", "v_Width", "v_Vel")
-MAX_NUMBER = 1e12  # of a vehicle or lane; larger ones are no numbers of anything
-# in the file's unit: what no log can mean
-LIMITS = {
-    **dict.fromkeys(("Vehicle_ID", "Lane_ID", "v_Class", "Preceding"), MAX_NUMBER),
-    **dict.fromkeys(("Frame_ID", "Global_Time"), MAX_TIME),
-    **dict.fromkeys(LENGTHS, MAX_PLACE_M),
-}
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
@@ -99,13 +88,8 @@ own_name = table_stem  # of a log, as long as no other folder has one called ali
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """One Recording per file and site; of a long file, per site and minute."""
     for file in parts(path, spec):
-        table = _open(file, spec)
-        ledger = Ledger(
-            path=file,
-            unit=table.unit,
-            allowed=allowed_share(spec),
-            repeats_are_bad=False,  # the portal's files hold some
-        )
+        table, ledger = _open(file, spec)
+        ledger.repeats_are_bad = False  # the portal's files hold some
         for made in _recordings(table, spec, ledger):
             yield validate_recording(with_news(made, ledger), file)
 
@@ -164,20 +148,20 @@ def _has_stamps(table: Table) -> bool:
     column = _column(table, CLOCK)
     if not table.has(column):
         return False
-    fields = fields_of(table, [CLOCK], limits=LIMITS, columns={CLOCK: column})
-    found = (batch[CLOCK] for batch in batches(table, fields, Ledger(path=table.path)))
-    ends = np.array([(part.min(), part.max()) for part in found if part.size])
+    fields = Columns(needed={CLOCK: COLUMNS[CLOCK]}, called={CLOCK: column})
+    uncounted = Ledger(path=table.path)
+    read = (part[CLOCK] for part in batches(table, fields.fields(table), uncounted))
+    ends = np.array([(part.min(), part.max()) for part in read if part.size])
     return bool(ends.size and ends.min() > 0.0 and ends.max() > ends.min())
 
 
-def _open(path: Path, spec: dict) -> Table:
+def _open(path: Path, spec: dict) -> tuple[Table, Ledger]:
     """The portal's table, or the native text, whose columns the TOML names.
 
     Raises:
       InputError: a column is missing, or it is an arterial's file.
     """
-    options = section(spec, "table")
-    table = open_table(path, options)
+    table, ledger = open_log(path, spec)
     if _is_native(table):
         columns = _text_columns(spec)
         if len(table.header) == ARTERIAL_COLUMNS != len(columns):
@@ -185,19 +169,19 @@ def _open(path: Path, spec: dict) -> Table:
                 f"{path}: line 1: {len(table.header)} cells: expected {len(columns)}; "
                 "arterials have no straight lanes"
             )
-        table = open_table(path, {"names": columns, "skip": 0, **options})
-    lower = [name.lower() for name in table.header]
-    if JUNCTION.lower() in lower and SITE.lower() not in lower:
+        options = {"names": columns, "skip": 0, **section(spec, "table")}
+        table, ledger = open_log(path, {**spec, "table": options})
+    if table.has(_column(table, JUNCTION)) and not table.has(_column(table, SITE)):
         raise InputError(
             f"{path}: column {SITE}: missing: expected it beside {JUNCTION}; "
             "arterials have no straight lanes"
         )
-    return table
+    return table, ledger
 
 
 def _is_native(table: Table) -> bool:
     """Whether it is the native text, which has no header."""
-    if table.layout is None or {n.lower() for n in table.header} & set(KNOWN):
+    if table.layout is None or any(table.has(_column(table, name)) for name in NEEDED):
         return False
     is_numeric = not any(c.isalpha() for c in "".join(table.header))
     return is_numeric or table.layout.delimiter == BLANKS
@@ -211,19 +195,19 @@ def _column(table: Table, name: str) -> str:
 def _fields(table: Table, spec: dict, stamped: bool) -> list[Field]:
     """Columns that are read, in SI units; those that may be missing are, if there."""
     unit = unit_factor(table.path, "unit", spec.get("unit", "ft"), ("ft", "m"))
-    clock, step = (CLOCK, 1e-3) if stamped else ("Frame_ID", None)
-    called = {clock: "t", "Vehicle_ID": "id", SITE: "recording"}
-    columns = {name: _column(table, name) for name in (*NEEDED, *OPTIONAL, SITE)}
-    found = [name for name, own in columns.items() if name in NEEDED or table.has(own)]
-    factors = dict.fromkeys(LENGTHS, unit)
-    factors[clock] = step or positive(spec, "frame_s", FRAME_S)
-    fields = fields_of(
-        table, found, texts=(SITE,), limits=LIMITS, columns=columns, factors=factors
-    )
-    return [
-        dataclasses.replace(f, name=called.get(f.name, f.name), lower=f.text)
-        for f in fields
-    ]
+    clock = CLOCK if stamped else "Frame_ID"
+    named = {clock: "t", "Vehicle_ID": "id", SITE: "recording"}
+    actual = {name: _column(table, name) for name in COLUMNS}
+    found = {
+        named.get(name, name): kind
+        for name, kind in COLUMNS.items()
+        if name in NEEDED or table.has(actual[name])
+    }
+    factors = {name: unit for name, kind in found.items() if kind == "place"}
+    factors["t"] = 1e-3 if stamped else positive(spec, "frame_s", FRAME_S)
+    called = {named.get(name, name): column for name, column in actual.items()}
+    fields = Columns(needed=found, called=called, factors=factors).fields(table)
+    return [dataclasses.replace(field, lower=field.text) for field in fields]
 
 
 def _complete(rows: Rows) -> Rows:

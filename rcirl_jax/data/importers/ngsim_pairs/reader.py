@@ -13,6 +13,7 @@ file; there is no lateral position and no lane; whom the leader follows is not i
 the file (a Ghost ahead says so, and its scenes are dropped).
 """
 
+import dataclasses
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -21,6 +22,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from rcirl_jax.data.importers.declared import Columns, Rows, open_log
 from rcirl_jax.data.importers.files import input_files
 from rcirl_jax.data.importers.lanes import StraightLane, straight_lanes
 from rcirl_jax.data.importers.options import (
@@ -31,21 +33,21 @@ from rcirl_jax.data.importers.options import (
     unit_factor,
 )
 from rcirl_jax.data.importers.tracks import split_tracks
-from rcirl_jax.data.readers.tables.ledger import LINE, Ledger, allowed_share, with_news
-from rcirl_jax.data.readers.tables.repair import once
-from rcirl_jax.data.readers.tables.table import (
-    MAX_PLACE_M,
-    MAX_TIME,
-    MAX_VELOCITY_MPS,
-    fields_of,
-    open_table,
-    read,
-)
+from rcirl_jax.data.readers.tables.ledger import LINE, with_news
+from rcirl_jax.data.readers.tables.table import open_table
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Ghost, Kind, Recording, Track
 
-COLUMNS = ("t", "x_follower", "v_follower", "x_leader", "v_leader", "leader_length")
+TABLE = Columns(
+    needed={
+        **{"t": "time", "x_follower": "place", "v_follower": "speed"},
+        **{"x_leader": "place", "v_leader": "speed", "leader_length": "number"},
+    },
+    optional={"spacing": "number"},
+    user=None,
+    places=("x_follower", "x_leader"),
+)
 NAME = re.compile(r"(?P<run>.*?)_?f(?P<follower>\d+)_l(?P<leader>\d+)(_\d+)?")
 RATE_HZ = 10.0  # 1/s
 LIMIT_MPS = 29.06  # m/s, 65 mph
@@ -53,11 +55,6 @@ LANE_WIDTH_M = 3.6576  # m, 12 ft
 LENGTH_M = 4.5  # m, of a follower that leads in no file
 WIDTH_M = 1.8  # m
 MAX_GAP_FRAMES = 5.5  # frames missing inside one track
-LIMITS = {
-    "t": MAX_TIME,
-    **dict.fromkeys(("x_follower", "x_leader"), MAX_PLACE_M),
-    **dict.fromkeys(("v_follower", "v_leader"), MAX_VELOCITY_MPS),
-}
 MARGIN_M = 50.0  # m of lane beyond the first and last position
 SPACING_FT = 0.5  # tolerance of spacing against the positions
 
@@ -68,16 +65,9 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     groups = _groups(files)
     lengths = _leader_lengths(files, section(spec, "table"))
     for file in files:
-        source = open_table(file, section(spec, "table"))
-        ledger = Ledger(path=file, unit=source.unit, allowed=allowed_share(spec))
-        fields = fields_of(source, COLUMNS, ("spacing",), limits=LIMITS)
-        rows = once(
-            read(source, fields, ledger),
-            ledger,
-            user=None,
-            places=("x_follower", "x_leader"),
-            name_of=lambda _, file=file: _ids(file)[1],
-        )
+        table, ledger = open_log(file, spec)
+        columns = dataclasses.replace(TABLE, name_of=lambda _, f=file: _ids(f)[1])
+        rows = columns.read(table, ledger)
         made = _recording(file, spec, rows, groups[file], lengths)
         yield validate_recording(with_news(made, ledger), file)
 
@@ -121,7 +111,7 @@ def _leader_lengths(
 def _recording(
     path: Path,
     spec: dict,
-    table: dict[str, np.ndarray],
+    table: Rows,
     group: str,
     lengths: dict[tuple[str, str], float],
 ) -> Recording:
@@ -180,7 +170,7 @@ def _recording(
     )
 
 
-def _check_spacing(path: Path, table: dict[str, np.ndarray], length: float) -> None:
+def _check_spacing(path: Path, table: Rows, length: float) -> None:
     """The file's own spacing says that positions are those of front bumpers."""
     if "spacing" not in table:
         return

@@ -7,19 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.data.importers.declared import Columns
 from rcirl_jax.data.importers.projection import utm, utm_zone
 from rcirl_jax.data.readers.tables.ledger import Ledger
-from rcirl_jax.data.readers.tables.repair import once
 from rcirl_jax.data.readers.tables.streams import head_of
-from rcirl_jax.data.readers.tables.table import (
-    MAX_PLACE_M,
-    MAX_TIME,
-    MAX_VELOCITY_MPS,
-    Table,
-    fields_of,
-    open_table,
-    read,
-)
+from rcirl_jax.data.readers.tables.table import Table, open_table
 from rcirl_jax.errors import InputError
 
 COLUMN = re.compile(r"(Speed|Lat|Lon|E|N|IVS|Driver)(\d{1,3})")
@@ -27,11 +19,7 @@ COLUMN = re.compile(r"(Speed|Lat|Lon|E|N|IVS|Driver)(\d{1,3})")
 METADATA = ("date", "vehicle_order", "number_of_vehicles", "acc", "distance_setting")
 SIZE_M = (4.6, 1.85)  # m, a car whose model is not listed
 MAX_HEADER_LINES = 30  # lines looked at for the row of column names
-LIMITS = {
-    "Speed": MAX_VELOCITY_MPS,
-    "E": MAX_PLACE_M,
-    "N": MAX_PLACE_M,
-}
+KINDS = {"Driver": "text", "Speed": "speed", "E": "place", "N": "place"}  # of cells
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -130,16 +118,13 @@ def read_drive(table: Table, spec: Mapping, ledger: Ledger) -> Drive:
         if match is not None:
             columns.setdefault(int(match[2]), {})[match[1]] = name
     names = {name: part for own in columns.values() for part, name in own.items()}
-    fields = fields_of(
-        table,
-        [time],
-        [*names],
-        texts=[name for name, part in names.items() if part == "Driver"],
-        limits={time: MAX_TIME}
-        | {name: LIMITS[part] for name, part in names.items() if part in LIMITS},
-    )
-    rows = read(table, fields, ledger)
-    rows = once(rows, ledger, time, None, name_of=lambda _: "of the row")
+    rows = Columns(
+        needed={time: "time"},
+        optional={name: KINDS.get(part, "number") for name, part in names.items()},
+        t=time,
+        user=None,
+        name_of=lambda _: "of the row",
+    ).read(table, ledger)
     about = {cells[0].lower(): cells[1:] for cells in _first_lines(path)[:-1] if cells}
     cars, notes = {}, []
     for number, found in sorted(columns.items()):

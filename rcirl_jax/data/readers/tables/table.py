@@ -139,32 +139,26 @@ def fields_of(
     *,
     texts: Sequence[str] = (),
     limits: Mapping[str, float] | None = None,
-    columns: Mapping[str, str] | None = None,
-    factors: Mapping[str, float] | None = None,
 ) -> list[Field]:
-    """Fields that a format declares: those needed, and others whose column is there.
+    """Columns as fields of their own names: those needed, and others that are there.
 
     Args:
       table: of `open_table`.
-      needed: fields without which a row is none.
-      optional: fields whose column may be missing, and whose cells may be empty.
+      needed: columns without which a row is none.
+      optional: columns that may be missing, and whose cells may be empty.
       texts: names among both that are no numbers.
       limits: of numbers; beyond them they are absurd.
-      columns: names of columns; that of the field where none is given.
-      factors: of units; 1 where none is given.
     """
-    columns = columns or {}
     return [
         Field(
             name=name,
-            column=columns.get(name, name),
+            column=name,
             needed=name in needed,
             text=name in texts,
             limit=(limits or {}).get(name, np.inf),
-            factor=(factors or {}).get(name, 1.0),
         )
         for name in (*needed, *optional)
-        if name in needed or table.has(columns.get(name, name))
+        if name in needed or table.has(name)
     ]
 
 
