@@ -6,8 +6,8 @@ import numpy as np
 import pyproj
 import pytest
 
-from rcirl_jax.data.importers.csv.earth import projected
 from rcirl_jax.data.importers.csv.heading import CONVENTIONS
+from rcirl_jax.data.importers.projection import projected
 from rcirl_jax.errors import InputError
 from tests.data.importers import people
 

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.importers.csv.earth import projected
 from rcirl_jax.data.importers.csv.map import (
     LIMIT_MPS,
     LogTable,
@@ -31,6 +30,7 @@ from rcirl_jax.data.importers.files import (
     table_stem,
 )
 from rcirl_jax.data.importers.options import number, patterns
+from rcirl_jax.data.importers.projection import projected
 from rcirl_jax.data.importers.shapes import local_origin, origin_notes
 from rcirl_jax.data.importers.tracks import split_tracks
 from rcirl_jax.data.readers.long_logs import piece_of, rows_of
