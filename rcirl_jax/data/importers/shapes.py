@@ -100,11 +100,16 @@ def between_bounds(
 
 
 def distance_to_line(points: np.ndarray, line: np.ndarray) -> np.ndarray:
-    """Distance [n] m of points [n, 2] from a polyline [m >= 1, 2], by shapely."""
+    """Distance [n] m of points [n, 2] from a polyline [m >= 1, 2], by shapely.
+
+    The shortest line from one that is prepared is found by a tree; a distance by
+    walking along it for every point.
+    """
     shapely = extra_module("shapely")
     # its lines have two points or more
     whole = shapely.linestrings(line if len(line) > 1 else np.tile(line, (2, 1)))
-    return shapely.distance(shapely.points(points), whole)
+    shapely.prepare(whole)
+    return shapely.length(shapely.shortest_line(whole, shapely.points(points)))
 
 
 def line_across(
