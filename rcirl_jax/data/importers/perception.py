@@ -137,17 +137,14 @@ def _check(path: Path, boxes: Boxes) -> None:
     """Everything is finite, and no box is absurdly large."""
     for field in FIELDS:
         values = getattr(boxes, field)
-        wrong = ~np.isfinite(values)
-        expected = "a finite number"
+        wrong, expected = ~np.isfinite(values), ": expected a finite number"
         if field in ("length", "width") and not wrong.any():
             wrong = (values < 0.0) | (values > MAX_SIZE_M)
-            expected = f"0 to {MAX_SIZE_M:g} m"
+            expected = f" m: expected 0 to {MAX_SIZE_M:g} m"
         if wrong.any():
             row = np.flatnonzero(wrong)[0]
-            raise InputError(
-                f"{path}: id {boxes.names[int(boxes.ids[row])]}: {field}: "
-                f"{values[row]:g}: expected {expected}"
-            )
+            name = boxes.names[int(boxes.ids[row])]
+            raise InputError(f"{path}: id {name}: {field}: {values[row]:g}{expected}")
 
 
 def _track(

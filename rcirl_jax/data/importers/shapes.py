@@ -103,13 +103,16 @@ def distance_to_line(points: np.ndarray, line: np.ndarray) -> np.ndarray:
     """Distance [n] m of points [n, 2] from a polyline [m >= 1, 2], by shapely.
 
     The shortest line from one that is prepared is found by a tree; a distance by
-    walking along it for every point.
+    walking along it for every point. Near zero, coordinates lose no digits.
     """
     shapely = extra_module("shapely")
     # its lines have two points or more
-    whole = shapely.linestrings(line if len(line) > 1 else np.tile(line, (2, 1)))
+    near = line - line[0] if len(line) > 1 else np.zeros((2, 2))
+    whole = shapely.linestrings(near)
     shapely.prepare(whole)
-    return shapely.length(shapely.shortest_line(whole, shapely.points(points)))
+    return shapely.length(
+        shapely.shortest_line(whole, shapely.points(points - line[0]))
+    )
 
 
 def line_across(
