@@ -2,26 +2,22 @@
 
     python -m experiments.simulate --weights=FILE[,FILE...] --suite=full|smoke|FAMILY \
         --output=DIR
-    python -m experiments.simulate --weights=FILE --suite=recorded --format=FORMAT \
-        --input=LOGS --output=DIR
-    python -m experiments.simulate --weights=FILE --suite=heldout --data=DATASET \
-        --output=DIR
+    python -m experiments.simulate --weights=FILE --suite=recorded|heldout \
+        --data=DATASET[,DATASET] --output=DIR
 
 Every case is driven at 10 Hz; safety filter and candidates are the same for all
-rows; on recorded scenes the recorded human is one of them. Writes table.txt,
-suite.json and cases.csv. A case is drawn by experiments.replay from its id. Held-out
-drives of datasets say how near to the human each row is: table.txt and likeness.json.
+rows. Writes table.txt, suite.json and cases.csv. A case is drawn by experiments.replay
+from its id. Held-out drives of datasets, up to 8 s among the recorded traffic, have the
+recorded human as one of the rows: `recorded` says the same of them as of the other
+suites, `heldout` how near to the human each row is (table.txt and likeness.json).
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from absl import flags
 
 from experiments.flags.common import provenance, run
 from experiments.flags.executor import executor
-from rcirl_jax.data.importers import IMPORTERS
-from rcirl_jax.data.parts import Part, parts_of, recordings_of_all
 from rcirl_jax.data.store.joined import JoinedDatasets, open_datasets
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.likeness import DRIVES, held_out_likeness
@@ -36,13 +32,11 @@ from rcirl_jax.export.spread import SuiteJob, spread
 from rcirl_jax.export.tuned_idm import idm_fields, idm_left_out
 from rcirl_jax.planner.safety import TRACKS
 from rcirl_jax.runtime.atomic_files import write_json, write_whole
-from rcirl_jax.simulation.recorded.config import RecordedConfig
-from rcirl_jax.simulation.recorded.scenes import held_out
+from rcirl_jax.simulation.recorded.scenes import HeldOut, held_out
 from rcirl_jax.simulation.rows import BASELINES, human_row
 from rcirl_jax.simulation.suite import (
     FULL_S,
     SMOKE_S,
-    CaseSet,
     recorded_set,
     suite_refs,
 )
@@ -51,10 +45,7 @@ _WEIGHTS = flags.DEFINE_list("weights", None, "weights files", required=True)
 _SUITE = flags.DEFINE_string(
     "suite", "smoke", "full, smoke, recorded, heldout, or families with commas"
 )
-_DATA = flags.DEFINE_list("data", [], "datasets of --suite=heldout")
-_FORMAT = flags.DEFINE_enum("format", "commonroad", sorted(IMPORTERS), "of --input")
-_INPUT = flags.DEFINE_string("input", None, "recordings of --suite=recorded")
-_SMOOTHING = flags.DEFINE_float("smoothing", 4.1, "s, window on recorded positions")
+_DATA = flags.DEFINE_list("data", [], "datasets of --suite=recorded, heldout")
 _OUTPUT = flags.DEFINE_string("output", None, "folder to write", required=True)
 _BASELINES = flags.DEFINE_list("baselines", ",".join(BASELINES), "rival rows, or empty")
 _IDM = flags.DEFINE_string("tuned_idm", None, "JSON of autotune: a further row")
@@ -68,29 +59,12 @@ _EVERY = flags.DEFINE_integer("plan_every", 1, "steps of 0.1 s between two plans
 _CHUNK = flags.DEFINE_integer("chunk", 180, "cases driven together; bounds memory")
 _SEED = flags.DEFINE_integer("catalogue_seed", 0, "seed of the cases")
 
-
-def _logs() -> list[Part]:
-    """The recordings of --suite=recorded; none of another suite."""
-    if _SUITE.value != "recorded":
-        return []
-    if not _INPUT.value:
-        raise InputError("--input: not given: expected the recordings to replay")
-    return parts_of(_FORMAT.value, Path(_INPUT.value))
-
-
-def _recorded(logs: Sequence[Part]) -> CaseSet:
-    """Drives cut out of recordings."""
-    config = RecordedConfig(
-        smoothing_s=_SMOOTHING.value,
-        max_cases=_CASES.value,
-        max_duration_s=_DURATION.value or FULL_S,
-    )
-    return recorded_set(recordings_of_all(logs), config)
+OF_DATA = ("recorded", "heldout")  # suites of --data
 
 
 def _job() -> SuiteJob:
     """Rows and catalogue cases that the flags name."""
-    elsewhere = _SUITE.value in ("recorded", "heldout")
+    elsewhere = _SUITE.value in OF_DATA
     duration = _DURATION.value or (SMOKE_S if _SUITE.value == "smoke" else FULL_S)
     if not 1.0 <= duration <= FULL_S:
         raise InputError(f"--duration: {duration}: expected 1 to {FULL_S:g} s")
@@ -108,14 +82,21 @@ def _job() -> SuiteJob:
     )
 
 
-def _held_out(job: SuiteJob) -> None:
-    """Every row, and the recorded human, over held-out drives."""
+def _drives() -> tuple[HeldOut, str]:
+    """Held-out drives of --data, and its hash."""
     if _DURATION.value:
-        raise InputError("--duration: of --suite=heldout: drives last as their records")
+        raise InputError(
+            f"--duration: with --suite={_SUITE.value}: drives last as their records"
+        )
+    if not _DATA.value:
+        raise InputError(f"--data: not given: expected with --suite={_SUITE.value}")
     data = open_datasets(_DATA.value)
     sources = data.parts if isinstance(data, JoinedDatasets) else [data]
-    made_by = {**provenance(_WEIGHTS.value), "data_hash": data.hash}
-    drives = held_out(sources, _CASES.value or DRIVES, _SEED.value)
+    return held_out(sources, _CASES.value or DRIVES, _SEED.value), data.hash
+
+
+def _likeness(job: SuiteJob, drives: HeldOut, made_by: dict) -> None:
+    """Every row, and the recorded human, over held-out drives."""
     report = held_out_likeness(drives, job.rows(), _EVERY.value)
     folder = Path(_OUTPUT.value)
     write_whole(folder / "table.txt", report.text())
@@ -135,22 +116,26 @@ def main() -> None:
         raise InputError(
             f"--suite: {_SUITE.value}: expected --workers=1: drives run here"
         )
-    if _SUITE.value == "heldout":
-        _held_out(job)
-        return
-    if _DATA.value:
-        raise InputError(f"--data: with --suite={_SUITE.value}: expected heldout")
-    rows, drive, logs = job.rows(), drive_here, _logs()
-    if logs:
-        cases = _recorded(logs)
-        rows.append(human_row())
-    else:
+    if job.refs and _DATA.value:
+        raise InputError(
+            f"--data: with --suite={_SUITE.value}: expected {' or '.join(OF_DATA)}"
+        )
+    # of the files as they are read, not hours later
+    made_by = provenance(_WEIGHTS.value)
+    rows, drive = job.rows(), drive_here
+    if job.refs:
         cases = job.cases()
         if places.workers > 1:
             drive = spread(places, job)
+    else:
+        drives, data_hash = _drives()
+        made_by["data_hash"] = data_hash
+        if _SUITE.value == "heldout":
+            _likeness(job, drives, made_by)
+            return
+        cases = recorded_set(drives)
+        rows.append(human_row())
     config = SuiteConfig(plan_every=_EVERY.value, chunk=_CHUNK.value)
-    # of the files as they are read, not hours later
-    made_by = provenance(_WEIGHTS.value, logs=logs)
     result = run_suite(rows, cases, config, drive)
     print(write_suite(result, Path(_OUTPUT.value), made_by))
     for name, facts in result.timings.items():

@@ -14,7 +14,6 @@ import jax
 from absl import app, flags, logging
 
 from rcirl_jax import __version__
-from rcirl_jax.data.parts import Part, logs_sha256
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.errors import InputError
@@ -185,25 +184,20 @@ def hidden_sizes(values: list[str], flag: str = "hidden_size") -> tuple[int, ...
     return sizes
 
 
-def provenance(weights: Sequence[str] = (), *, logs: Sequence[Part] = ()) -> dict:
+def provenance(weights: Sequence[str] = ()) -> dict:
     """Flags of one experiment file, git commit, versions and machine.
 
     Starts JAX's devices: after `join_processes` where there are several processes.
 
     Args:
       weights: weights files that were read; their hashes name them.
-      logs: recordings that were read without an import, likewise.
 
     Raises:
       InputError: a weights file is missing or damaged.
-      OSError: a recording cannot be read.
     """
     own = flags.FLAGS.get_key_flags_for_module(sys.argv[0])
     packages = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
-    read = {
-        "weights_sha256": {str(path): load_weights(path).sha256 for path in weights},
-        "logs_sha256": logs_sha256(logs),
-    }
+    read = {str(path): load_weights(path).sha256 for path in weights}
     return {
         "flags": {flag.name: flag.value for flag in own},
         "git_commit": git_commit(),
@@ -218,7 +212,7 @@ def provenance(weights: Sequence[str] = (), *, logs: Sequence[Part] = ()) -> dic
         **processor(),
         "device": jax.devices()[0].device_kind,
         "devices": jax.device_count(),
-        **{name: hashes for name, hashes in read.items() if hashes},
+        **({"weights_sha256": read} if read else {}),
     }
 
 
