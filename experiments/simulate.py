@@ -18,33 +18,25 @@ from absl import flags
 
 from experiments.flags.common import provenance, run
 from experiments.flags.executor import executor
+from experiments.flags.suite import CASES, DURATION, EVERY, SEED, SUITE
 from rcirl_jax.data.store.joined import JoinedDatasets, open_datasets
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.likeness import DRIVES, held_out_likeness
 from rcirl_jax.evaluation.closed_loop.suite import (
     SuiteConfig,
-    drive_here,
     run_suite,
     worst_cases,
     write_suite,
 )
-from rcirl_jax.export.spread import SuiteJob, spread
-from rcirl_jax.export.tuned_idm import idm_fields, idm_left_out
+from rcirl_jax.export.spread import SuiteJob, drive_by
+from rcirl_jax.export.tuned_idm import idm_left_out, read_tuned_idm
 from rcirl_jax.planner.safety import TRACKS
 from rcirl_jax.runtime.atomic_files import write_json, write_whole
 from rcirl_jax.simulation.recorded.scenes import HeldOut, held_out
 from rcirl_jax.simulation.rows import BASELINES, human_row
-from rcirl_jax.simulation.suite import (
-    FULL_S,
-    SMOKE_S,
-    recorded_set,
-    suite_refs,
-)
+from rcirl_jax.simulation.suite import case_duration, recorded_set, suite_refs
 
 _WEIGHTS = flags.DEFINE_list("weights", None, "weights files", required=True)
-_SUITE = flags.DEFINE_string(
-    "suite", "smoke", "full, smoke, recorded, heldout, or families with commas"
-)
 _DATA = flags.DEFINE_list("data", [], "datasets of --suite=recorded, heldout")
 _OUTPUT = flags.DEFINE_string("output", None, "folder to write", required=True)
 _BASELINES = flags.DEFINE_list("baselines", ",".join(BASELINES), "rival rows, or empty")
@@ -53,51 +45,43 @@ _DP = flags.DEFINE_bool("dp", False, "also drive the first weights by DP")
 _FILTER = flags.DEFINE_enum(
     "filter", "full", TRACKS, "full, or collision: the reward decides the rest"
 )
-_CASES = flags.DEFINE_integer("cases", None, "per family, else in all")
-_DURATION = flags.DEFINE_float("duration", None, "s per case at most (smoke 20)")
-_EVERY = flags.DEFINE_integer("plan_every", 1, "steps of 0.1 s between two plans")
 _CHUNK = flags.DEFINE_integer("chunk", 180, "cases driven together; bounds memory")
-_SEED = flags.DEFINE_integer("catalogue_seed", 0, "seed of the cases")
 
+flags.set_default(SUITE, "smoke")
 OF_DATA = ("recorded", "heldout")  # suites of --data
 
 
 def _job() -> SuiteJob:
     """Rows and catalogue cases that the flags name."""
-    elsewhere = _SUITE.value in OF_DATA
-    duration = _DURATION.value or (SMOKE_S if _SUITE.value == "smoke" else FULL_S)
-    if not 1.0 <= duration <= FULL_S:
-        raise InputError(f"--duration: {duration}: expected 1 to {FULL_S:g} s")
-    if elsewhere and _CASES.value is not None and _CASES.value < 1:
-        raise InputError(f"--cases: {_CASES.value}: expected at least 1")
+    elsewhere = SUITE.value in OF_DATA
+    if elsewhere and CASES.value is not None and CASES.value < 1:
+        raise InputError(f"--cases: {CASES.value}: expected at least 1")
     return SuiteJob(
         weights=tuple(_WEIGHTS.value),
         baselines=tuple(_BASELINES.value),
-        refs=() if elsewhere else suite_refs(_SUITE.value, _CASES.value, _SEED.value),
-        duration_s=duration,
-        plan_every=_EVERY.value,
+        refs=() if elsewhere else suite_refs(SUITE.value, CASES.value, SEED.value),
+        duration_s=case_duration(SUITE.value, DURATION.value),
+        plan_every=EVERY.value,
         dp=_DP.value,
-        tuned_idm=idm_fields(_IDM.value),
+        tuned_idm=read_tuned_idm(Path(_IDM.value)) if _IDM.value else None,
         track=_FILTER.value,
     )
 
 
 def _drives() -> tuple[HeldOut, str]:
     """Held-out drives of --data, and its hash."""
-    if _DURATION.value:
+    if DURATION.value:
         raise InputError(
-            f"--duration: with --suite={_SUITE.value}: drives last as their records"
+            f"--duration: of --suite={SUITE.value}: drives last as their records"
         )
-    if not _DATA.value:
-        raise InputError(f"--data: not given: expected with --suite={_SUITE.value}")
     data = open_datasets(_DATA.value)
     sources = data.parts if isinstance(data, JoinedDatasets) else [data]
-    return held_out(sources, _CASES.value or DRIVES, _SEED.value), data.hash
+    return held_out(sources, CASES.value or DRIVES, SEED.value), data.hash
 
 
 def _likeness(job: SuiteJob, drives: HeldOut, made_by: dict) -> None:
     """Every row, and the recorded human, over held-out drives."""
-    report = held_out_likeness(drives, job.rows(), _EVERY.value)
+    report = held_out_likeness(drives, job.rows(), EVERY.value)
     folder = Path(_OUTPUT.value)
     write_whole(folder / "table.txt", report.text())
     write_json(folder / "likeness.json", {**report.as_dict(), "made_by": made_by})
@@ -114,29 +98,27 @@ def main() -> None:
         print(said)
     if not job.refs and places.workers > 1:
         raise InputError(
-            f"--suite: {_SUITE.value}: expected --workers=1: drives run here"
+            f"--suite: {SUITE.value}: expected --workers=1: drives run here"
         )
     if job.refs and _DATA.value:
         raise InputError(
-            f"--data: with --suite={_SUITE.value}: expected {' or '.join(OF_DATA)}"
+            f"--data: with --suite={SUITE.value}: expected {' or '.join(OF_DATA)}"
         )
     # of the files as they are read, not hours later
     made_by = provenance(_WEIGHTS.value)
-    rows, drive = job.rows(), drive_here
+    rows = job.rows()
     if job.refs:
         cases = job.cases()
-        if places.workers > 1:
-            drive = spread(places, job)
     else:
         drives, data_hash = _drives()
         made_by["data_hash"] = data_hash
-        if _SUITE.value == "heldout":
+        if SUITE.value == "heldout":
             _likeness(job, drives, made_by)
             return
         cases = recorded_set(drives)
         rows.append(human_row())
-    config = SuiteConfig(plan_every=_EVERY.value, chunk=_CHUNK.value)
-    result = run_suite(rows, cases, config, drive)
+    config = SuiteConfig(plan_every=EVERY.value, chunk=_CHUNK.value)
+    result = run_suite(rows, cases, config, drive_by(places, job))
     print(write_suite(result, Path(_OUTPUT.value), made_by))
     for name, facts in result.timings.items():
         print(f"{name}: {facts['seconds']} s, {facts['plans_per_s']:,} plans/s")

@@ -98,6 +98,18 @@ def suite_refs(
     return tuple(refs)
 
 
+def case_duration(suite: str, given: float | None) -> float:
+    """S of a case: as given, else those of the suite.
+
+    Raises:
+      InputError: none that a case can have.
+    """
+    duration = given or (SMOKE_S if suite == "smoke" else FULL_S)
+    if not 1.0 <= duration <= FULL_S:
+        raise InputError(f"--duration: {duration}: expected 1 to {FULL_S:g} s")
+    return duration
+
+
 def build(refs: Sequence[CaseRef], duration_s: float) -> Case:
     """The cases of refs, stacked [B, ...] in their order; numpy leaves."""
     places: dict[tuple[str, int], list[int]] = {}

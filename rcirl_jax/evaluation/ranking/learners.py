@@ -194,25 +194,17 @@ def normaliser_of(
     return made.replace(scale=jnp.where(kept, made.scale, jnp.inf))
 
 
-def train_grid(
-    frozen: FeatureBatch,
-    config: TrainConfig,
-    leaky_rates: Sequence[float],
-    seeds: Sequence[int],
-) -> dict[float, list[Learned]]:
-    """Leaky rates x seeds as members of one program; they share the batch order."""
-    grid = [
-        dataclasses.replace(config, seed=seed, leaky_rate=rate)
-        for rate in leaky_rates
-        for seed in seeds
-    ]
+def train_together(
+    frozen: FeatureBatch, config: TrainConfig, seeds: Sequence[int]
+) -> list[Learned]:
+    """Several seeds as members of one program; they share the batch order."""
+    members = [dataclasses.replace(config, seed=seed) for seed in seeds]
     normaliser = normaliser_of(frozen, config)
-    fitted = fit(frozen, normaliser, config, members_of(grid))
-    each = [jax.tree.map(lambda leaf, n=n: leaf[n], fitted) for n in range(len(grid))]
-    runs = iter(
-        _learned(one, normaliser, own) for one, own in zip(each, grid, strict=True)
-    )
-    return {rate: [next(runs) for _ in seeds] for rate in leaky_rates}
+    fitted = fit(frozen, normaliser, config, members_of(members))
+    return [
+        _learned(jax.tree.map(lambda leaf, n=n: leaf[n], fitted), normaliser, own)
+        for n, own in enumerate(members)
+    ]
 
 
 def train_learner(
