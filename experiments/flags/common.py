@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
+from typing import NoReturn
 
 import jax
 from absl import app, flags, logging
@@ -51,25 +52,25 @@ def run(main: Callable[[], None]) -> None:
                 raise InputError(f"{argv[1]}: unexpected argument: expected --flags")
             main()
         except InputError as error:
-            print(f"error: {error}", file=sys.stderr)
-            sys.exit(EXIT_BAD_INPUT)
+            _refuse(error)
         except OSError as error:
-            print(f"error: {_about(error)}", file=sys.stderr)
-            sys.exit(EXIT_BAD_INPUT)
+            _refuse(_about(error))
         except (MemoryError, jax.errors.JaxRuntimeError) as error:
             why = " ".join(str(error).split())[:200]
             if not isinstance(error, MemoryError) and not why.startswith(NO_MEMORY):
                 raise
-            print(
-                f"error: memory: {why or 'refused'}: expected more for this work",
-                file=sys.stderr,
-            )
-            sys.exit(EXIT_BAD_INPUT)
+            _refuse(f"memory: {why or 'refused'}: expected more for this work")
         except interrupts.Interrupted as stop:
             _leave(stop.number)
 
     interrupts.install()
     app.run(guarded, flags_parser=_parse)
+
+
+def _refuse(what: object) -> NoReturn:
+    """One line on stderr, exit status 2."""
+    print(f"error: {what}", file=sys.stderr)
+    sys.exit(EXIT_BAD_INPUT)
 
 
 def _about(error: OSError) -> str:
@@ -104,13 +105,11 @@ def _parse(argv: list[str]) -> list[str]:
     """
     odd = [text for text in argv if not is_text(text)]
     if odd:
-        print(f"error: {odd[0]!a}: expected UTF-8", file=sys.stderr)
-        sys.exit(EXIT_BAD_INPUT)
+        _refuse(f"{odd[0]!a}: expected UTF-8")
     try:
         return flags.FLAGS(argv)
     except flags.Error as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(EXIT_BAD_INPUT)
+        _refuse(" ".join(str(error).split()))
 
 
 def alone(flag: str, *others: str) -> None:

@@ -284,7 +284,7 @@ class _Run:
     def close(self) -> None:
         if self.writer is not None:
             self.writer.close()
-        self.progress.__exit__(None, None, None)
+        self.progress.close()
 
     def epochs_from(
         self,
