@@ -10,12 +10,12 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
+from typing import NoReturn
 
 import jax
 from absl import app, flags, logging
 
 from rcirl_jax import __version__
-from rcirl_jax.data.parts import Part, logs_sha256
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.reader import load_weights
@@ -54,21 +54,15 @@ def run(main: Callable[[], None]) -> None:
                 raise InputError(f"{argv[1]}: unexpected argument: expected --flags")
             main()
         except InputError as error:
-            print(f"error: {error}", file=sys.stderr)
-            sys.exit(EXIT_BAD_INPUT)
+            _refuse(error)
         except OSError as error:
-            print(f"error: {_about(error)}", file=sys.stderr)
-            sys.exit(EXIT_BAD_INPUT)
+            _refuse(_about(error))
         except (MemoryError, jax.errors.JaxRuntimeError) as error:
             why = " ".join(str(error).split())[:200]
             if not isinstance(error, MemoryError) and not why.startswith(NO_MEMORY):
                 print(f"error: {_fault(error)}", file=sys.stderr)
                 sys.exit(EXIT_FAULT)
-            print(
-                f"error: memory: {why or 'refused'}: expected more for this work",
-                file=sys.stderr,
-            )
-            sys.exit(EXIT_BAD_INPUT)
+            _refuse(f"memory: {why or 'refused'}: expected more for this work")
         except interrupts.Interrupted as stop:
             _leave(stop.number)
         except Exception as error:
@@ -77,6 +71,12 @@ def run(main: Callable[[], None]) -> None:
 
     interrupts.install()
     app.run(guarded, flags_parser=_parse)
+
+
+def _refuse(what: object) -> NoReturn:
+    """One line on stderr, exit status 2."""
+    print(f"error: {what}", file=sys.stderr)
+    sys.exit(EXIT_BAD_INPUT)
 
 
 def _about(error: OSError) -> str:
@@ -127,13 +127,11 @@ def _parse(argv: list[str]) -> list[str]:
     """
     odd = [text for text in argv if not is_text(text)]
     if odd:
-        print(f"error: {odd[0]!a}: expected UTF-8", file=sys.stderr)
-        sys.exit(EXIT_BAD_INPUT)
+        _refuse(f"{odd[0]!a}: expected UTF-8")
     try:
         return flags.FLAGS(argv)
     except flags.Error as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(EXIT_BAD_INPUT)
+        _refuse(" ".join(str(error).split()))
 
 
 def alone(flag: str, *others: str) -> None:
@@ -171,25 +169,20 @@ def hidden_sizes(values: list[str], flag: str = "hidden_size") -> tuple[int, ...
     return sizes
 
 
-def provenance(weights: Sequence[str] = (), *, logs: Sequence[Part] = ()) -> dict:
+def provenance(weights: Sequence[str] = ()) -> dict:
     """Flags of one experiment file, git commit, versions and machine.
 
     Starts JAX's devices: after `join_processes` where there are several processes.
 
     Args:
       weights: weights files that were read; their hashes name them.
-      logs: recordings that were read without an import, likewise.
 
     Raises:
       InputError: a weights file is missing or damaged.
-      OSError: a recording cannot be read.
     """
     own = flags.FLAGS.get_key_flags_for_module(sys.argv[0])
     packages = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
-    read = {
-        "weights_sha256": {str(path): load_weights(path).sha256 for path in weights},
-        "logs_sha256": logs_sha256(logs),
-    }
+    read = {str(path): load_weights(path).sha256 for path in weights}
     return {
         "flags": {flag.name: flag.value for flag in own},
         "git_commit": git_commit(),
@@ -204,7 +197,7 @@ def provenance(weights: Sequence[str] = (), *, logs: Sequence[Part] = ()) -> dic
         **processor(),
         "device": jax.devices()[0].device_kind,
         "devices": jax.device_count(),
-        **{name: hashes for name, hashes in read.items() if hashes},
+        **({"weights_sha256": read} if read else {}),
     }
 
 
