@@ -11,7 +11,7 @@ programs compiled, seconds. The first quarter of the rounds is warm-up; after it
 may not rise by more than 5 % or 50 MiB, whichever is more (`memory.growth`), what is in
 use by `IN_USE_MB` a round, blocks by `BLOCKS` a round; of the system's threads no more
 than `THREADS` may be kept, and nothing else may rise at all, not by one
-(`memory.count_growth`; gc's objects, which are some of the blocks, and seconds are
+(`memory.growth`; gc's objects, which are some of the blocks, and seconds are
 noted only), and every round's outputs have to be the first round's to the bit. Ends
 with 1 otherwise.
 
@@ -39,7 +39,6 @@ from benchmarks.reliability.jobs import Facts, jobs, write_logs
 from benchmarks.reliability.memory import (
     WARM_UP,
     Growth,
-    count_growth,
     growth,
     in_use_mb,
     memory_growth,
@@ -249,8 +248,8 @@ class Soak:
             "rss_mb": memory_growth(series.rss_mb),
             "in_use_mb": growth(series.in_use_mb, IN_USE_MB * rises),
             "blocks": growth(series.blocks, BLOCKS * rises),
-            "threads": count_growth(series.threads, THREADS),
-            **{name: count_growth(getattr(series, name)) for name in counted},
+            "threads": growth(series.threads, THREADS, counted=True),
+            **{n: growth(getattr(series, n), counted=True) for n in counted},
         }
 
     def problems(self) -> list[str]:
