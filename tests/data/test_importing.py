@@ -101,9 +101,6 @@ def test_too_many_names_leave_what_is_finished(tmp_path, monkeypatch, three, nam
     assert files_of(out) == whole
 
 
-# --------------------------------------------------------------------------- splits
-
-
 def late(track, since):
     """The track's samples from `since` s on."""
     keep = track.t >= since - 1e-6

@@ -48,9 +48,6 @@ def with_ego(start, *others, **more):
 PAIR = with_ego(20.0, car("lead", speeding_up(60.0)))
 
 
-# ---------------------------------------------------------------- motion and paths
-
-
 def test_only_what_a_human_drove_is_a_demonstration():
     """One second of automation takes the scenes whose history or future it is in."""
     tracks = [
@@ -188,9 +185,6 @@ def test_on_overlapping_branches_the_track_keeps_to_one():
     assert graph.chain("in", ["in", "right", "left", "left"]) == ("in", "left")
 
 
-# -------------------------------------------------------------------------- labels
-
-
 def entering(t):
     """From the left lane into the middle one between 2 and 5 s."""
     return WIDTH * (1.0 - smooth_step(t, 2, 3))
@@ -252,9 +246,6 @@ def test_labels_of_scenes_side_by_side_are_those_of_each_alone():
         decisions, tags = labels_of(row)  # no leading axis
         np.testing.assert_array_equal(decisions, row["decisions"])
         np.testing.assert_array_equal(tags, row["tags"])
-
-
-# ------------------------------------------------------------- lines and destinations
 
 
 def braking_to(line, start=20.0, v=12.0, after=0.2):
@@ -329,9 +320,6 @@ def test_destination_is_a_virtual_obstacle():
     slot = int(np.flatnonzero(row["obstacles.kind"] == Kind.VIRTUAL)[0])
     assert row["decisions"][slot] == Decision.STOP
     assert row["obstacles.s_lower"][slot, 0] == pytest.approx(36.25, abs=0.4)
-
-
-# --------------------------------------------------------------- filters and reports
 
 
 def hard():

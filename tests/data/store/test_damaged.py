@@ -108,9 +108,6 @@ def test_an_array_in_other_chunks_is_named(copy, rows):
     assert re.search(r"human.s: shard 1: chunks .*expected \(\(40", line)
 
 
-# ------------------------------------------------------------- with right digests
-
-
 def reseal(folder, change_shard=None, change=None):
     """Change shard.json or manifest.json, and make the digests above it right."""
     mark, top = folder / "shards/00000/shard.json", folder / "manifest.json"

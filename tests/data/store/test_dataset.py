@@ -158,9 +158,6 @@ def test_read_gives_rows_in_the_order_asked(made, asked, verify):
             dataset.read(np.array(bad))
 
 
-# ------------------------------------------------------------------ not finished
-
-
 def test_a_dataset_of_an_old_version_says_to_import_again(tmp_path):
     """Written by the first code with datasets, never made anew: without rates."""
     with tarfile.open(GOLDEN / "dataset_1.tar.xz") as archive:
@@ -181,9 +178,6 @@ def test_no_dataset_and_interrupted_import_are_told_apart(copy, tmp_path):
     ):
         assert words in refused(open_dataset, place)
     assert not (tmp_path / "nowhere").exists()
-
-
-# --------------------------------------------------------------------- writer
 
 
 class Interrupted(BaseException):
