@@ -22,6 +22,7 @@ from xml.etree.ElementTree import Element, tostring
 
 import google_crc32c
 import msgpack
+import numpy as np
 import pyarrow
 import pyarrow.parquet
 from defusedxml import ElementTree
@@ -264,22 +265,28 @@ def archive_of(members: dict[str, bytes], method: int = zipfile.ZIP_STORED) -> b
     return out.getvalue()
 
 
-def _arrays(data: bytes) -> dict[str, list]:
-    """Of an npz: member -> [what its head claims, its numbers as bytes]."""
+def _npz(data: bytes, rng: random.Random) -> bytes:
+    """Members as values, or as what a head claims and the bytes of the numbers."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         whole = {name: archive.read(name) for name in archive.namelist()}
-    return {
-        n: [ast.literal_eval(x[10:128].decode()), x[128:]] for n, x in whole.items()
+    tree = {
+        name: [ast.literal_eval(content[10:128].decode()), content[128:]]
+        if rng.random() < 0.5
+        else np.load(io.BytesIO(content)).tolist()
+        for name, content in whole.items()
     }
+    made = changed_tree(tree, rng)
+    return archive_of({str(name): _npy(value) for name, value in made.items()})
 
 
-def _npz(arrays: dict[str, list]) -> bytes:
-    members = {}
-    for name, (head, numbers) in arrays.items():
-        text = repr(head).encode().ljust(117) + b"\n"
+def _npy(value: Any) -> bytes:  # noqa: ANN401
+    if isinstance(value, list) and len(value) == 2 and isinstance(value[1], bytes):
+        text = repr(value[0]).encode().ljust(117) + b"\n"
         size = len(text).to_bytes(2, "little")
-        members[str(name)] = b"\x93NUMPY\x01\x00" + size + text + bytes(numbers)
-    return archive_of(members)
+        return b"\x93NUMPY\x01\x00" + size + text + value[1]
+    out = io.BytesIO()
+    np.save(out, np.asarray(value), allow_pickle=False)
+    return out.getvalue()
 
 
 def _lines(data: bytes) -> list:
@@ -293,7 +300,7 @@ CODECS: dict[str, Codec] = {
     "json": in_tree(json.loads, lambda tree: json.dumps(tree).encode()),
     "json_lines": in_tree(_lines, lambda x: "\n".join(map(json.dumps, x)).encode()),
     "message": message,
-    "npz": in_tree(_arrays, _npz),
+    "npz": _npz,
     "parquet": in_tree(_columns, _parquet),
     "sha256": in_tree(json.loads, lambda tree: resealed(tree, "sha256")),
     "sqlite": in_tree(_tables, _sqlite),
