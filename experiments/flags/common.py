@@ -60,23 +60,21 @@ def run(main: Callable[[], None]) -> None:
         except (MemoryError, jax.errors.JaxRuntimeError) as error:
             why = " ".join(str(error).split())[:200]
             if not isinstance(error, MemoryError) and not why.startswith(NO_MEMORY):
-                print(f"error: {_fault(error)}", file=sys.stderr)
-                sys.exit(EXIT_FAULT)
+                _refuse(_fault(error), EXIT_FAULT)
             _refuse(f"memory: {why or 'refused'}: expected more for this work")
         except interrupts.Interrupted as stop:
             _leave(stop.number)
         except Exception as error:
-            print(f"error: {_fault(error)}", file=sys.stderr)
-            sys.exit(EXIT_FAULT)
+            _refuse(_fault(error), EXIT_FAULT)
 
     interrupts.install()
     app.run(guarded, flags_parser=_parse)
 
 
-def _refuse(what: object) -> NoReturn:
-    """One line on stderr, exit status 2."""
+def _refuse(what: object, status: int = EXIT_BAD_INPUT) -> NoReturn:
+    """One line on stderr, and the exit status."""
     print(f"error: {what}", file=sys.stderr)
-    sys.exit(EXIT_BAD_INPUT)
+    sys.exit(status)
 
 
 def _about(error: OSError) -> str:

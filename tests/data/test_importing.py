@@ -141,17 +141,6 @@ def test_too_many_names_leave_what_is_finished(tmp_path, monkeypatch, three, nam
     assert files_of(out) == whole
 
 
-# --------------------------------------------------------------------------- splits
-
-
-def test_no_vehicle_in_both_splits(tmp_path, three):
-    import_logs(three, tmp_path / "data", CONFIG)
-    dataset = open_dataset(tmp_path / "data")
-    train, test = dataset.load("train"), dataset.load("test")
-    assert not set(train.vehicle.tolist()) & set(test.vehicle.tolist())
-    assert not set(train.group.tolist()) & set(test.group.tolist())
-
-
 def late(track, since):
     """The track's samples from `since` s on."""
     keep = track.t >= since - 1e-6

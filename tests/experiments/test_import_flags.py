@@ -15,5 +15,5 @@ def test_a_count_or_a_share_is_left_out(text, found):
 
 @pytest.mark.parametrize("text", ["-1", "0.5", "100%", "-3%", "few", "nan%", ""])
 def test_other_words_are_refused(text):
-    with pytest.raises(InputError, match="--leave_out: .*expected a count"):
+    with pytest.raises(InputError, match=r"--leave_out: .*expected a count"):
         left_out(text)
