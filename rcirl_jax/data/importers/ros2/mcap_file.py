@@ -91,6 +91,11 @@ class McapFile:
             for key, channel in summary.channels.items()
         }
 
+    def span(self) -> tuple[int, int] | None:
+        """When the first and the last message were recorded, ns; None: not known."""
+        counted = self._summary and self._summary.statistics
+        return counted and (counted.message_start_time, counted.message_end_time)
+
     def messages(self, wanted: Collection[str]) -> Iterator[Sent]:
         """Messages on the wanted topics, in the order of recording."""
         numbers = dict.fromkeys(wanted, 0)

@@ -7,6 +7,7 @@ the file.
 import array
 import contextlib
 from collections.abc import Iterator, Mapping
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,7 @@ class Rows:
     def __init__(self, names: dict[str, int]) -> None:
         self.names = names  # of obstacles, with their numbers
         self._values = {role: array.array("d") for role in COLUMNS}
-        self.progress = 0.0  # share of the bag's bytes that is read
+        self.progress = 1.0  # share of the bag, or of its file, that is read with them
 
     def add(self, role: str, row: Row) -> None:
         """One row, in the order of the role's columns."""
@@ -54,15 +55,17 @@ def open_file(path: Path) -> McapFile | SqliteFile:
 def read_bag(files: list[Path], spec: dict) -> Iterator[Rows]:
     """All wanted messages of a bag, piece by piece in the order of recording."""
     roles, names = _roles(files, spec), {}
-    total = sum(file.stat().st_size for file in files)
-    done = 0
+    sizes = [file.stat().st_size for file in files]
+    done = 0.0  # bytes
     with reading(files[0], files) as show:
-        for file in files:
-            done += file.stat().st_size
+        for file, before, size in zip(
+            files, accumulate(sizes, initial=0), sizes, strict=False
+        ):
             for rows in _read_file(file, roles, spec, names):
-                rows.progress = min(done / max(total, 1), 1.0)
+                read = before + rows.progress * size
+                show(int(read - done))
+                done, rows.progress = read, min(read / max(sum(sizes), 1), 1.0)
                 yield rows
-            show(file.stat().st_size)
 
 
 def _roles(files: list[Path], spec: dict) -> dict[str, str]:
@@ -133,10 +136,11 @@ def _read_file(
     rows, began = Rows(names), None
     readings: dict[str, _Reading] = {}
     with open_file(path) as opened:
-        own = opened.topics()
+        own, span = opened.topics(), opened.span()
         for sent in opened.messages([name for name in roles if name in own]):
             began = sent.logged if began is None else began
             if abs(sent.logged - began) > PIECE_S * 1e9:
+                rows.progress = _share(sent.logged, span)
                 yield rows
                 rows, began = Rows(names), sent.logged
             if sent.topic not in readings:
@@ -145,6 +149,12 @@ def _read_file(
                 )
             readings[sent.topic].add(rows, sent)
     yield rows
+
+
+def _share(logged: int, span: tuple[int, int] | None) -> float:
+    """Share of a file's time that is over; none where its span is not known."""
+    first, last = span or (logged, logged + 1)
+    return min(max((logged - first) / max(last - first, 1), 0.0), 1.0)
 
 
 class _Reading:

@@ -62,6 +62,18 @@ class SqliteFile:
                         raise self._database.error(where, repr(cell)[:40], "a text")
                 yield row
 
+    def span(self) -> tuple[int, int] | None:
+        """When the first and the last message were recorded, ns; None: not known."""
+        self._database.need("messages", MESSAGES)
+        ends = []
+        for way in ("ASC", "DESC"):
+            sql = f"SELECT timestamp FROM messages ORDER BY timestamp {way} LIMIT 1"
+            found = self._database.chunks(sql, ("messages.timestamp",), 1)
+            ends += [row[0] for rows in found for row in rows]
+        if len(ends) != 2 or not all(isinstance(end, int) for end in ends):
+            return None
+        return ends[0], ends[1]
+
     def messages(self, wanted: Collection[str]) -> Iterator[Sent]:
         """Messages on the wanted topics, in the order of recording."""
         self._database.need("messages", MESSAGES)
