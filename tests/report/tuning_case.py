@@ -7,7 +7,7 @@ import numpy as np
 
 from rcirl_jax.data.importing import import_parts
 from rcirl_jax.data.store.dataset import open_dataset
-from rcirl_jax.evaluation.closed_loop.summary import summarise
+from rcirl_jax.evaluation.closed_loop.files import SuiteRuns
 from rcirl_jax.evaluation.gate.decision import judge
 from rcirl_jax.evaluation.gate.types import GateConfig, Pair
 from rcirl_jax.evaluation.ranking.metrics import Outcomes, random_scorer, scene_metrics
@@ -53,13 +53,16 @@ def metrics(seed, spoiled=None):
 
 
 def suite_and_verdict():
-    """The suite's report and the gate's verdict of the same made-up drives."""
+    """The suite's drives and the gate's verdict of the same made-up drives."""
     names = [name for name in FAMILIES for _ in range(EACH)]
     ids = [f"{name}/{i % EACH:03d}@0" for i, name in enumerate(names)]
     spoiled = metrics(0, "stop_and_go")
     runs = {"candidate": spoiled, "hand-set": metrics(1), "IDM": metrics(2)}
     none, way = np.zeros(len(names), bool), np.full(len(names), 1100.0)
-    suite = summarise(runs, names, none, none, "IDM", way)
+    suite = SuiteRuns(
+        rows=runs, ids=tuple(ids), groups=tuple(names), preventable=none, trivial=none,
+        reference="IDM", way=way,
+    )  # fmt: skip
     pair = Pair(
         candidate=runs["candidate"], incumbent=runs["hand-set"], families=names,
         ids=ids, reference=way, preventable=~none, name="hand-set",
