@@ -125,7 +125,7 @@ def _rate(spec: dict) -> float:
 def _windows(held: Held, files: list[Path], bag: _Bag) -> Iterator[Recording]:
     """Recordings of a bag, each made once what it needs is read."""
     window = longest_window(bag.spec)
-    windows, count = Windows(bag.name, name_of(bag.path), MAX_GAP_S), 0
+    windows, count = Windows(bag.name, bag.name, MAX_GAP_S), 0
 
     def take(low: float, high: float) -> Iterator[Recording]:
         made = _recording(held.view(*around((low, high))), (low, high), bag)
@@ -143,6 +143,7 @@ def _windows(held: Held, files: list[Path], bag: _Bag) -> Iterator[Recording]:
             yield from take(count * window, (count + 1) * window)
             count = following(held.end - LATE_S - AFTER_S)
             held.forget(around((count * window, 0.0))[0])
+    _check_ego(held, bag)
     if count == 0 and held.end <= window:
         whole = (-math.inf, math.inf)
         made = _recording(held.view(*whole), whole, bag)
@@ -152,6 +153,17 @@ def _windows(held: Held, files: list[Path], bag: _Bag) -> Iterator[Recording]:
         is_last = held.end <= low + window
         yield from take(low, held.end + 1.0 if is_last else low + window)
         count = following(held.end)
+
+
+def _check_ego(held: Held, bag: _Bag) -> None:
+    """Messages of the ego say where it is, or there is no topic of it."""
+    if held.has_ego or not section(bag.spec, "topics").get("ego"):
+        return
+    frames = section(bag.spec, "frames")
+    raise InputError(
+        f"{bag.path}: ego: no message says where {frames.get('base')} is in "
+        f"{frames.get('map')}: expected such a transform ([frames] of the source TOML)"
+    )
 
 
 def _recording(held: Held, within: tuple[float, float], bag: _Bag) -> Recording | None:
@@ -263,8 +275,12 @@ def _obstacles(held: Held, spec: dict, rate: float) -> tuple[list[Track], list[s
     """Tracks of the obstacles, and notes on what was left out."""
     table = held.tables["obstacles"]
     own = list(held.names).index(car) if (car := _ego_id(spec)) in held.names else -1
-    table = table[(table[:, 8] != LEFT_OUT) & (table[:, 1] != own)]
-    table, notes = _on_the_map(held, table)
+    table = table[table[:, 1] != own]
+    flat = table[:, 8] == LEFT_OUT
+    table, notes = _on_the_map(held, table[~flat])
+    if flat.any():
+        count = np.count_nonzero(flat)
+        notes.append(f"{count} states of what is driven over or under left out")
     check_coordinates(held.path, "obstacles", ("x", "y"), table[:, 2:4])
     number_of, ids = np.unique(table[:, 1].astype(np.int64), return_inverse=True)
     names = list(held.names)
