@@ -255,6 +255,9 @@ CREATE INDEX timestamp_idx ON messages (timestamp ASC);
     if definitions:
         database.execute("""CREATE TABLE message_definitions(id INTEGER PRIMARY KEY,
  topic_type TEXT, encoding TEXT, encoded_message_definition TEXT, hash TEXT)""")
+    # a topic without messages, as rosbag2 lists all that it was asked for
+    silent = (7, ODOMETRY + "/silent", "nav_msgs/msg/Odometry", "cdr", "", "")
+    database.execute("INSERT INTO topics VALUES (?,?,?,?,?,?)", silent)
     topics = {}
     with mcap_file.open("rb") as file:
         for schema, channel, message in make_reader(file).iter_messages():
