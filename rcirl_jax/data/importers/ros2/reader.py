@@ -21,16 +21,12 @@ import numpy as np
 
 from rcirl_jax.data.importers.clock import on_clock
 from rcirl_jax.data.importers.files import log_name
-from rcirl_jax.data.importers.options import (
-    number,
-    positive,
-    recording_car,
-    section,
-)
+from rcirl_jax.data.importers.options import positive, recording_car, section
 from rcirl_jax.data.importers.perception import (
     Boxes,
     Windows,
     around,
+    ego_boxes,
     longest_window,
     placed,
     tracks_of,
@@ -56,7 +52,7 @@ from rcirl_jax.data.importers.tracks import spans_of, travel_heading
 from rcirl_jax.data.readers.long_logs import AFTER_S
 from rcirl_jax.data.recording import MAX_RATE_HZ, validate_recording
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Kind, Recording, Track
+from rcirl_jax.types import Recording, Track
 
 RATE_HZ = 10.0  # 1/s
 MAX_GAP_S = 0.55  # s without a message inside one track
@@ -219,30 +215,14 @@ def _what_is_missing(held: Held, within: tuple[float, float]) -> list[str]:
 
 def _ego(held: Held, spec: dict, rate: float) -> list[Track]:
     """The recording car's box, moved from its base_link to its centre."""
-    size = {
-        name: number(section(spec, "ego"), name, default)
-        for name, default in EGO.items()
-    }
     t, x, y, heading, speed = held.tables["ego"].T
     check_coordinates(held.path, "ego", ("x", "y"), held.tables["ego"][:, 1:3])
     if np.isnan(speed).any():
         speed = np.where(np.isnan(speed), _measured(t, held.tables["velocity"]), speed)
-    ahead = size["rear_axle_to_centre"]
-    boxes = Boxes(
-        ids=np.zeros(t.size, np.int64),
-        names=("ego",),
-        t=t,
-        x=x + ahead * np.cos(heading),
-        y=y + ahead * np.sin(heading),
-        heading=heading,
-        speed=speed,
-        length=np.full(t.size, size["length"]),
-        width=np.full(t.size, size["width"]),
-        kind=np.full(t.size, int(Kind.VEHICLE)),
-    )
+    boxes = ego_boxes(spec, EGO, t, x, y, heading, speed)
+    boxes = on_clock(boxes, rate, MAX_GAP_S)
     automated = _automated(held, spec)
-    found, _ = tracks_of(held.path, on_clock(boxes, rate, MAX_GAP_S), MAX_GAP_S)
-    return [dataclasses.replace(track, automated=automated) for track in found]
+    return tracks_of(held.path, boxes, MAX_GAP_S, automated=automated)[0]
 
 
 def _measured(t: np.ndarray, velocity: np.ndarray) -> np.ndarray:
