@@ -118,7 +118,7 @@ def test_lanes_of_a_lanelet2_map(tmp_path):
     line = line_of(tmp_path, ego(), **ALONE, map=str(far))
     assert "map: no lane within 200 m of the tracks around x = 81008 m" in line
     line = line_of(tmp_path, ego(), **ALONE, map="nowhere.osm")
-    assert line == "nowhere.osm: map: missing: expected a Lanelet2 map"
+    assert line == ("source TOML: map: nowhere.osm: missing: expected a Lanelet2 map")
 
 
 def test_lanes_of_a_table_beside_the_bag(tmp_path):

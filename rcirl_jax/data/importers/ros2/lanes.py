@@ -54,7 +54,9 @@ def given_lanes(path: Path, spec: dict) -> Given | None:
         raise InputError(f"source TOML: map: {place}: and lanes.file: expected one")
     if place:
         if not Path(place).is_file():
-            raise InputError(f"{place}: map: missing: expected a Lanelet2 map")
+            raise InputError(
+                f"source TOML: map: {place}: missing: expected a Lanelet2 map"
+            )
         lanes, notes = read_lanelet2(Path(place), _on_square)
         return Given(lanes=lanes, notes=tuple(notes))
     if not spec.get("lanes"):

@@ -12,6 +12,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane
 
 HOLD_S = 1.0  # s, a light unseen keeps its state this long
+STAMP_S = 1e-6  # s, to which stamps are exact
 NEAR_M = 3.0  # m from a lane's centre line to a place on its stop line
 
 
@@ -47,7 +48,8 @@ def signals_of(table: np.ndarray, names: Sequence[str], clock: np.ndarray) -> tu
         mine = table[table[:, 1] == float(name)]
         if len(mine):
             t, _, state = mine[np.argsort(mine[:, 0], kind="stable")].T
-            states = held(clock + 1e-6, t, state.astype(np.int64), HOLD_S)
+            hold = HOLD_S + 2.0 * STAMP_S
+            states = held(clock + STAMP_S, t, state.astype(np.int64), hold)
             found.append(signal_of(name, clock, states))
     return tuple(found)
 
