@@ -158,7 +158,8 @@ def _check_ego(held: Held, bag: _Bag) -> None:
     frames = section(bag.spec, "frames")
     raise InputError(
         f"{bag.path}: ego: no message says where {frames.get('base')} is in "
-        f"{frames.get('map')}: expected such a transform ([frames] of the source TOML)"
+        f"{frames.get('map')}: expected such a transform; [frames] of the source TOML "
+        "names the frames, topics.ego other topics"
     )
 
 
