@@ -16,7 +16,8 @@ from rcirl_jax.report.ranking.sweep_picture import sweep_picture
 from rcirl_jax.runtime import pipeline
 from tests.helpers.commands import fresh
 
-FEW = ("apollo", "nuplan", "argoverse2", "l5", "interaction", "suite", "scenarios")
+FEW = ("apollo", "nuplan", "argoverse2", "l5", "interaction", "ros2")
+FEW += ("suite", "scenarios")
 
 
 @pytest.fixture(autouse=True)

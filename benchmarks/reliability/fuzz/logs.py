@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from mcap.writer import CompressionType
 
 from benchmarks.reliability.fuzz import tables
 from benchmarks.reliability.fuzz.forms import toml_text
@@ -31,6 +32,7 @@ from tests.data.importers.formats import (
     nuplan,
     openacc,
     osm,
+    ros2,
     waymo,
 )
 
@@ -308,6 +310,18 @@ def make_apollo(folder: Path) -> tuple[Path, list[Path]]:
     return folder, files
 
 
+def make_ros2(folder: Path) -> tuple[Path, list[Path]]:
+    """A short drive in both storages, without checksums that would see any change."""
+    kept = [item for item in ros2.drive() if item[2] < SHORT_S]
+    bag = folder / "drive"
+    bag.mkdir()
+    plain = {"compression": CompressionType.NONE, "crcs": False}
+    files = [ros2.mcap(bag / "a.mcap", kept, **plain), folder / "b.db3"]
+    ros2.sqlite(files[1], files[0])
+    ros2.metadata(bag, ["a.mcap"])
+    return folder, [*files, bag / "metadata.yaml"]
+
+
 def _step(name: str, often: tuple[str, ...]) -> int:
     return 5 if name in often else 1
 
@@ -342,5 +356,6 @@ LOGS = {
     "ngsim_pairs": log_target("ngsim_pairs", make_ngsim_pairs),
     "nuplan": log_target("nuplan", make_nuplan),
     "openacc": log_target("openacc", make_openacc),
+    "ros2": log_target("ros2", make_ros2),
     "waymo": log_target("waymo", make_waymo),
 }

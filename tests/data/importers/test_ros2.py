@@ -151,6 +151,9 @@ def test_the_ego_by_tf(tmp_path):
     topics = {"ego": [ODOMETRY, "/tf"], "obstacles": []}
     (track,) = only(tmp_path, messages, topics=topics).tracks
     assert_as_driven(track, "ego")
+    frames = {"map": "map", "base": "rear_axle"}
+    line = line_of(tmp_path / "a.mcap", topics=topics, frames=frames)
+    assert "a.mcap: ego: no message says where rear_axle is in map: expected" in line
 
 
 def test_who_drives(tmp_path):
@@ -257,9 +260,11 @@ def test_classes_of_autoware(tmp_path, number, kind):
     def change(found, user):
         found["classification"] = [{"label": number, "probability": 0.9}]
 
-    tracks = tracks_of(only(tmp_path, [*ego(), *seen(tracked_objects(change))]))
-    found = tracks.get(label("12"))
+    made = only(tmp_path, [*ego(), *seen(tracked_objects(change))])
+    found = tracks_of(made).get(label("12"))
     assert (found and found.kind) == kind
+    note = "41 states of what is driven over or under left out"
+    assert has_note(made, note) == (found is None)
 
 
 def carla(t):

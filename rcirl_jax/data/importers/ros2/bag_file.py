@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import io
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -64,7 +65,9 @@ def decoder_of(path: Path, name: str, topic: Topic) -> Decoder:
     schema = extra_module("mcap.records", EXTRA).Schema(
         id=1, name=topic.type, encoding="ros2msg", data=topic.schema
     )
-    with damaged(where, "a message definition of ROS 2"):
+    # the parser prints the line that it cannot read, which the error says as well
+    quiet = contextlib.redirect_stderr(io.StringIO())
+    with damaged(where, "a message definition of ROS 2"), quiet:
         return decoders.DecoderFactory().decoder_for("cdr", schema)
 
 

@@ -28,6 +28,7 @@ class Held:
         self.names: dict[str, int] = {}  # of obstacles, with their numbers
         self.progress = 0.0  # share of the bag's bytes that is read
         self.end = -math.inf  # s, of the last place
+        self.has_ego = False  # whether any of them is the ego's
         self._start: float | None = None  # s, the stamp that is 0 here
         self._since = -math.inf  # s, rows from before it were forgotten
 
@@ -52,6 +53,7 @@ class Held:
             table = table if self._start is None else self._shifted(table)
             self.tables[role] = np.concatenate([self.tables[role], table])
         self.names, self.progress = rows.names, rows.progress
+        self.has_ego = self.has_ego or len(new["ego"]) > 0
         check_held(str(self.path), len(self.tables["obstacles"]))
         if clock.size and self._start is not None:
             self._check_span(clock.min() - self._start, clock.max() - self._start)

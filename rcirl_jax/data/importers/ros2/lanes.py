@@ -8,13 +8,12 @@ import numpy as np
 
 from rcirl_jax.data.importers.csv.map import LogTable, lane_file_of, lanes_of
 from rcirl_jax.data.importers.lanelet2.map import read_lanelet2
-from rcirl_jax.data.importers.options import path_option, positive
-from rcirl_jax.data.importers.paths import path_lanes
+from rcirl_jax.data.importers.options import path_option
+from rcirl_jax.data.importers.perception import fitted_lanes
 from rcirl_jax.data.importers.projection import utm, utm_zone
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane, Track
 
-LANE_WIDTH_M = 3.5  # m
 LIMIT_MPS = 13.41  # m/s, 30 mph, where nothing better is known
 SQUARE_M = 1e5  # m, of MGRS, to whose corner Autoware's maps are relative
 MARGIN_M = 200.0  # m around the tracks in which lanes are kept
@@ -55,7 +54,9 @@ def given_lanes(path: Path, spec: dict) -> Given | None:
         raise InputError(f"source TOML: map: {place}: and lanes.file: expected one")
     if place:
         if not Path(place).is_file():
-            raise InputError(f"{place}: map: missing: expected a Lanelet2 map")
+            raise InputError(
+                f"source TOML: map: {place}: missing: expected a Lanelet2 map"
+            )
         lanes, notes = read_lanelet2(Path(place), _on_square)
         return Given(lanes=lanes, notes=tuple(notes))
     if not spec.get("lanes"):
@@ -93,11 +94,8 @@ def lanes_for(
       InputError: none of the given lanes is near.
     """
     if given is None:
-        width = positive(spec, "lane_width_m", LANE_WIDTH_M)
-        limit = positive(spec, "speed_limit", LIMIT_MPS)
-        lanes = path_lanes(tracks, width, limit)
-        note = f"no map given; {len(lanes)} lanes fitted to the longest paths"
-        return lanes, [note]
+        lanes, note = fitted_lanes(tracks, spec, LIMIT_MPS)
+        return lanes, [f"no map given; {note}"]
     lanes = given.near(*places)
     if not lanes:
         x, y = (float(np.median(values)) for values in places[:2])

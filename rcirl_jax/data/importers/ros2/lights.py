@@ -6,12 +6,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from rcirl_jax.data.importers.options import section
-from rcirl_jax.data.importers.ros2.readings import STATES
 from rcirl_jax.data.importers.shapes import distance_to_line, line_across
+from rcirl_jax.data.importers.signals import held, signal_of
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Lane, Signal
+from rcirl_jax.types import Lane
 
 HOLD_S = 1.0  # s, a light unseen keeps its state this long
+STAMP_S = 1e-6  # s, to which stamps are exact
 NEAR_M = 3.0  # m from a lane's centre line to a place on its stop line
 
 
@@ -38,7 +39,7 @@ def signals_of(table: np.ndarray, names: Sequence[str], clock: np.ndarray) -> tu
     """One Signal for each group that was seen.
 
     Args:
-      table: t [s], group, state (place in STATES) of each time it was seen [n, 3].
+      table: [n, 3] t [s], group and state (by `signals.STATES`) whenever it was seen.
       names: of the groups that are wanted.
       clock: [m > 0] s, of the recording.
     """
@@ -46,22 +47,11 @@ def signals_of(table: np.ndarray, names: Sequence[str], clock: np.ndarray) -> tu
     for name in names:
         mine = table[table[:, 1] == float(name)]
         if len(mine):
-            found.append(
-                _signal(name, mine[np.argsort(mine[:, 0], kind="stable")], clock)
-            )
+            t, _, state = mine[np.argsort(mine[:, 0], kind="stable")].T
+            hold = HOLD_S + 2.0 * STAMP_S
+            states = held(clock + STAMP_S, t, state.astype(np.int64), hold)
+            found.append(signal_of(name, clock, states))
     return tuple(found)
-
-
-def _signal(name: str, mine: np.ndarray, clock: np.ndarray) -> Signal:
-    """One light as intervals; off where it is unseen for HOLD_S."""
-    last = np.searchsorted(mine[:, 0], clock + 1e-6, side="right") - 1
-    seen, state = mine[np.maximum(last, 0), 0], mine[np.maximum(last, 0), 2]
-    fresh = (last >= 0) & (clock - seen <= HOLD_S)
-    now = np.where(fresh, state, 0.0).astype(np.int64)
-    change = np.flatnonzero(np.diff(now, prepend=-1) != 0)
-    return Signal(
-        id=name, start=clock[change], state=tuple(STATES[k] for k in now[change])
-    )
 
 
 def with_stop_lines(

@@ -82,14 +82,14 @@ class McapFile:
                 "section; `mcap recover FILE -o NEW` writes one"
             )
         counts = summary.statistics and summary.statistics.channel_message_counts
-        return {
-            channel.topic: _topic(
-                channel,
-                summary.schemas.get(channel.schema_id),
-                counts.get(key, 0) if counts else None,
-            )
-            for key, channel in summary.channels.items()
-        }
+        found: dict[str, Topic] = {}
+        for key, channel in summary.channels.items():
+            schema = summary.schemas.get(channel.schema_id)
+            topic = _topic(channel, schema, counts.get(key, 0) if counts else None)
+            # several publishers are several channels, of which some may be silent
+            if topic.count != 0 or channel.topic not in found:
+                found[channel.topic] = topic
+        return found
 
     def span(self) -> tuple[int, int] | None:
         """When the first and the last message were recorded, ns; None: not known."""

@@ -142,8 +142,9 @@ def _of_primitive(kind: int, dimensions: list[float]) -> tuple[float, float]:
         return dimensions[0], dimensions[1]
     # radius: the only number of a sphere, behind the height of the others
     place = 0 if kind == SPHERE else 1
-    round_ = BOX < kind <= CONE and len(dimensions) > place
-    return (2.0 * dimensions[place],) * 2 if round_ else (0.0, 0.0)
+    is_round = BOX < kind <= CONE and len(dimensions) > place
+    diameter = 2.0 * dimensions[place] if is_round else 0.0
+    return diameter, diameter
 
 
 def _detections(message: Message, where: str, kinds: Mapping) -> Iterator[Found]:

@@ -21,16 +21,12 @@ import numpy as np
 
 from rcirl_jax.data.importers.clock import on_clock
 from rcirl_jax.data.importers.files import log_name
-from rcirl_jax.data.importers.options import (
-    number,
-    positive,
-    recording_car,
-    section,
-)
+from rcirl_jax.data.importers.options import positive, recording_car, section
 from rcirl_jax.data.importers.perception import (
     Boxes,
     Windows,
     around,
+    ego_boxes,
     longest_window,
     placed,
     tracks_of,
@@ -56,7 +52,7 @@ from rcirl_jax.data.importers.tracks import spans_of, travel_heading
 from rcirl_jax.data.readers.long_logs import AFTER_S
 from rcirl_jax.data.recording import MAX_RATE_HZ, validate_recording
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Kind, Recording, Track
+from rcirl_jax.types import Recording, Track
 
 RATE_HZ = 10.0  # 1/s
 MAX_GAP_S = 0.55  # s without a message inside one track
@@ -125,7 +121,7 @@ def _rate(spec: dict) -> float:
 def _windows(held: Held, files: list[Path], bag: _Bag) -> Iterator[Recording]:
     """Recordings of a bag, each made once what it needs is read."""
     window = longest_window(bag.spec)
-    windows, count = Windows(bag.name, name_of(bag.path), MAX_GAP_S), 0
+    windows, count = Windows(bag.name, bag.name, MAX_GAP_S), 0
 
     def take(low: float, high: float) -> Iterator[Recording]:
         made = _recording(held.view(*around((low, high))), (low, high), bag)
@@ -143,6 +139,7 @@ def _windows(held: Held, files: list[Path], bag: _Bag) -> Iterator[Recording]:
             yield from take(count * window, (count + 1) * window)
             count = following(held.end - LATE_S - AFTER_S)
             held.forget(around((count * window, 0.0))[0])
+    _check_ego(held, bag)
     if count == 0 and held.end <= window:
         whole = (-math.inf, math.inf)
         made = _recording(held.view(*whole), whole, bag)
@@ -152,6 +149,18 @@ def _windows(held: Held, files: list[Path], bag: _Bag) -> Iterator[Recording]:
         is_last = held.end <= low + window
         yield from take(low, held.end + 1.0 if is_last else low + window)
         count = following(held.end)
+
+
+def _check_ego(held: Held, bag: _Bag) -> None:
+    """Messages of the ego say where it is, or there is no topic of it."""
+    if held.has_ego or not section(bag.spec, "topics").get("ego"):
+        return
+    frames = section(bag.spec, "frames")
+    raise InputError(
+        f"{bag.path}: ego: no message says where {frames.get('base')} is in "
+        f"{frames.get('map')}: expected such a transform; [frames] of the source TOML "
+        "names the frames, topics.ego other topics"
+    )
 
 
 def _recording(held: Held, within: tuple[float, float], bag: _Bag) -> Recording | None:
@@ -207,30 +216,14 @@ def _what_is_missing(held: Held, within: tuple[float, float]) -> list[str]:
 
 def _ego(held: Held, spec: dict, rate: float) -> list[Track]:
     """The recording car's box, moved from its base_link to its centre."""
-    size = {
-        name: number(section(spec, "ego"), name, default)
-        for name, default in EGO.items()
-    }
     t, x, y, heading, speed = held.tables["ego"].T
     check_coordinates(held.path, "ego", ("x", "y"), held.tables["ego"][:, 1:3])
     if np.isnan(speed).any():
         speed = np.where(np.isnan(speed), _measured(t, held.tables["velocity"]), speed)
-    ahead = size["rear_axle_to_centre"]
-    boxes = Boxes(
-        ids=np.zeros(t.size, np.int64),
-        names=("ego",),
-        t=t,
-        x=x + ahead * np.cos(heading),
-        y=y + ahead * np.sin(heading),
-        heading=heading,
-        speed=speed,
-        length=np.full(t.size, size["length"]),
-        width=np.full(t.size, size["width"]),
-        kind=np.full(t.size, int(Kind.VEHICLE)),
-    )
+    boxes = ego_boxes(spec, EGO, t, x, y, heading, speed)
+    boxes = on_clock(boxes, rate, MAX_GAP_S)
     automated = _automated(held, spec)
-    found, _ = tracks_of(held.path, on_clock(boxes, rate, MAX_GAP_S), MAX_GAP_S)
-    return [dataclasses.replace(track, automated=automated) for track in found]
+    return tracks_of(held.path, boxes, MAX_GAP_S, automated=automated)[0]
 
 
 def _measured(t: np.ndarray, velocity: np.ndarray) -> np.ndarray:
@@ -263,8 +256,12 @@ def _obstacles(held: Held, spec: dict, rate: float) -> tuple[list[Track], list[s
     """Tracks of the obstacles, and notes on what was left out."""
     table = held.tables["obstacles"]
     own = list(held.names).index(car) if (car := _ego_id(spec)) in held.names else -1
-    table = table[(table[:, 8] != LEFT_OUT) & (table[:, 1] != own)]
-    table, notes = _on_the_map(held, table)
+    table = table[table[:, 1] != own]
+    flat = table[:, 8] == LEFT_OUT
+    table, notes = _on_the_map(held, table[~flat])
+    if flat.any():
+        count = np.count_nonzero(flat)
+        notes.append(f"{count} states of what is driven over or under left out")
     check_coordinates(held.path, "obstacles", ("x", "y"), table[:, 2:4])
     number_of, ids = np.unique(table[:, 1].astype(np.int64), return_inverse=True)
     names = list(held.names)

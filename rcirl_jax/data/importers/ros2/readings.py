@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from rcirl_jax.data.importers.ros2 import objects
 from rcirl_jax.data.importers.ros2.bag_file import Message
 from rcirl_jax.data.importers.ros2.poses import Pose, pose_of
+from rcirl_jax.data.importers.signals import STATES
 from rcirl_jax.errors import InputError
 
 NAN = math.nan
@@ -30,7 +31,6 @@ MANUAL = 4
 COLOURS = {1: "red", 2: "yellow", 3: "green"}
 OFF = (1, 13)  # SOLID_OFF
 CIRCLES = (1, 5)
-STATES = ("off", "red", "yellow", "green")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -35,12 +35,20 @@ class SqliteFile:
     def topics(self) -> dict[str, Topic]:
         """Topics by name."""
         self._database.need("topics", TOPICS)
+        self._database.need("messages", MESSAGES)
         definitions = self._definitions()
+        sql = "SELECT DISTINCT topic_id FROM messages"
+        met = self._database.chunks(sql, ("messages.topic_id",), MAX_TOPICS)
+        used = {row[0] for rows in met for row in rows}
         found = {}
-        for _, name, kind, encoding in self._texts("topics", TOPICS):
+        for key, name, kind, encoding in self._texts("topics", TOPICS):
             how, text = definitions.get(kind, ("", ""))
             found[name] = Topic(
-                type=kind, encoding=encoding, schema_encoding=how, schema=text.encode()
+                type=kind,
+                encoding=encoding,
+                schema_encoding=how,
+                schema=text.encode(),
+                count=None if key in used else 0,
             )
         return found
 

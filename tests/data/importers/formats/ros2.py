@@ -9,6 +9,7 @@ import math
 import sqlite3
 
 import numpy as np
+from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from mcap_ros2.writer import Writer
 
@@ -180,23 +181,23 @@ def drive():
 # ------------------------------------------------- messages of short drives
 
 
-def times(seconds=2.0):
-    return (0.05 * np.arange(round(20 * seconds) + 1)).tolist()
+def times(seconds=2.0, step=0.05):
+    return (step * np.arange(round(seconds / step) + 1)).tolist()
 
 
-def ego(seconds=2.0, change=lambda message: None):
+def ego(seconds=2.0, change=lambda message: None, step=0.05):
     """The ego's odometry, each message changed."""
     found = []
-    for t in times(seconds):
+    for t in times(seconds, step):
         message = odometry(t)
         change(message)
         found.append((ODOMETRY, "nav_msgs/Odometry", t, message))
     return found
 
 
-def seen(make, kind=TRACKED, seconds=2.0):
+def seen(make, kind=TRACKED, seconds=2.0, step=0.05):
     """Messages of obstacles, each made for a time."""
-    return [(OBJECTS, kind, t, make(t)) for t in times(seconds)]
+    return [(OBJECTS, kind, t, make(t)) for t in times(seconds, step)]
 
 
 def tracked_objects(change=lambda found, user: None, names=("12",)):
@@ -216,15 +217,15 @@ def tracked_objects(change=lambda found, user: None, names=("12",)):
 # ------------------------------------------------------------------------ bags
 
 
-def mcap(path, messages, *, compression=CompressionType.ZSTD, definitions=definition):
+def mcap(path, messages, *, compression=CompressionType.ZSTD, crcs=True):
     """An MCAP file of (topic, type, s, message)."""
     with path.open("wb") as file:
-        writer = Writer(file, chunk_size=100_000, compression=compression)
+        writer = Writer(file, 100_000, compression, enable_crcs=crcs)
         schemas = {}
         for topic, kind, t, message in messages:
             if kind not in schemas:
                 name = kind.replace("/", "/msg/")
-                schemas[kind] = writer.register_msgdef(name, definitions(kind))
+                schemas[kind] = writer.register_msgdef(name, definition(kind))
             ns = START_NS + round(t * 1e9)
             writer.write_message(topic, schemas[kind], message, ns)
         writer.finish()
@@ -243,8 +244,6 @@ def metadata(folder, names, storage="mcap", **other):
 
 def sqlite(path, mcap_file, *, definitions=True):
     """The messages of an MCAP file in rosbag2's SQLite storage."""
-    from mcap.reader import make_reader
-
     database = sqlite3.connect(path)
     database.executescript("""
 CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT,
@@ -256,6 +255,9 @@ CREATE INDEX timestamp_idx ON messages (timestamp ASC);
     if definitions:
         database.execute("""CREATE TABLE message_definitions(id INTEGER PRIMARY KEY,
  topic_type TEXT, encoding TEXT, encoded_message_definition TEXT, hash TEXT)""")
+    # a topic without messages, as rosbag2 lists all that it was asked for
+    silent = (7, ODOMETRY + "/silent", "nav_msgs/msg/Odometry", "cdr", "", "")
+    database.execute("INSERT INTO topics VALUES (?,?,?,?,?,?)", silent)
     topics = {}
     with mcap_file.open("rb") as file:
         for schema, channel, message in make_reader(file).iter_messages():
