@@ -227,13 +227,6 @@ def test_conventions_of_headings(tmp_path, turn, convention, unit, said):
     people.assert_same(people.only(tmp_path / "log.csv", source), turn)
 
 
-def test_a_compass_in_pieces(tmp_path):
-    cell = as_written("cw_from_north", "deg")
-    path = write(tmp_path, people.column(people.rows(0.5), "heading", cell))
-    more = "long_bytes = 1"
-    people.assert_same(people.only(path, people.spec(tmp_path, more=more)), 0.5)
-
-
 def test_headings_of_noise_keep_the_usual_convention(tmp_path):
     rng = np.random.default_rng(0)
     noisy = lambda heading: heading + rng.normal(0.0, 0.15)  # noqa: E731

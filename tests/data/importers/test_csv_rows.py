@@ -207,31 +207,6 @@ def test_a_share_of_bad_rows_is_allowed(tmp_path, long_bytes):
     assert found.rows.unreadable == 36
 
 
-@pytest.mark.parametrize(
-    ("share", "words"),
-    [
-        ("1.0", "max_bad_rows: 1: expected a share from 0 to below 1"),
-        ("-0.1", "max_bad_rows: -0.1: expected a share"),
-        ("true", "max_bad_rows: True: expected"),
-    ],
-)
-def test_wrong_shares(tmp_path, share, words):
-    path = write(tmp_path, people.rows())
-    source = people.spec(tmp_path, more=f"max_bad_rows = {share}")
-    with pytest.raises(InputError) as caught:
-        people.read(path, source)
-    assert "max_bad_rows: " in str(caught.value)
-
-
-@LONG
-def test_a_file_cut_inside_its_last_line_is_refused(tmp_path, long_bytes):
-    path = write(tmp_path, people.rows())
-    path.write_text(path.read_text()[:-20])
-    line = refused(path, people.spec(tmp_path, more=f"long_bytes = {long_bytes}"))
-    assert "line 721: " in line
-    assert "the last line breaks off: expected a whole file" in line
-
-
 def test_several_recordings_count_the_rows_of_their_file_once(tmp_path):
     header = (*people.HEADER, "recording")
     table = [[*row, drive] for drive in "ab" for row in people.rows()]

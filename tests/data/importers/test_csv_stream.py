@@ -201,13 +201,6 @@ def test_names_with_a_hash_and_padded_headers_are_read(tmp_path):
     assert {track.id for track in made.tracks} == {"c#0", "c#1", "c#2"}
 
 
-def test_a_wrong_limit_is_one_line(tmp_path):
-    path = tmp_path / "log.csv"
-    spec = {**write(path, rows_of(seconds=30.0, cars=3)), "long_bytes": "256MB"}
-    with pytest.raises(InputError, match="long_bytes: 256MB: expected a number"):
-        cuts(path, spec)
-
-
 def test_settings_change_the_digest_of_a_piece(tmp_path):
     path = tmp_path / "log.csv"
     spec = {**write(path, rows_of(seconds=70.0, cars=4)), "long_bytes": 1}

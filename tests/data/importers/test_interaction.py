@@ -71,13 +71,6 @@ def test_pedestrians_alone(scene):
     assert [track.id for track in only(scene).tracks] == ["P13", "P4"]
 
 
-def test_recordings_of_several_scenes_have_names_of_their_own(root, scene):
-    other = root / "recorded_trackfiles" / "DR_DEU_Merging_MT"
-    fixture.write_scene(other, fixture.road_users())
-    names = [recording.name for recording in read(root)]
-    assert names == ["DR_DEU_Merging_MT-000", f"{fixture.SCENE}-000"]
-
-
 def test_frames_may_start_at_zero(root, scene):
     whole = only(root)
     for kind in ("vehicle", "pedestrian"):
@@ -190,13 +183,6 @@ def test_observations_and_submissions_are_left_out(cases):
         path.parent.mkdir(exist_ok=True)
         path.write_text("not read")
     assert len(read(cases.parent.parent)) == 2
-
-
-def test_columns_of_the_test_sets(cases):
-    header, *rows = cases.read_text().splitlines()
-    header += ",track_to_predict,interesting_agent"
-    cases.write_text("\n".join([header, *(row + ",0.0,1.0" for row in rows)]) + "\n")
-    assert len(read(cases)) == 2
 
 
 def test_unknown_agents_are_vehicles(scene, root):

@@ -271,26 +271,6 @@ def test_malformed_rows(tmp_path, writer, rows, line, field):
     assert "\n" not in message
 
 
-@pytest.mark.parametrize(
-    ("content", "field"),
-    [
-        (b"", "rows"),
-        (b"\n\n", "rows"),
-        (b"\x00\xff\xfe\x01" * 4000, "text"),
-        (b"1 2 3\n", "3 cells"),
-        (b"Vehicle_ID,Frame_ID\n1,2\n", "column Local_Y: missing"),
-        (b"Vehicle_ID,Vehicle_ID\n1,2\n", "met twice"),
-    ],
-)
-def test_not_ngsim(tmp_path, content, field):
-    path = tmp_path / "bad.txt"
-    path.write_bytes(content)
-    with pytest.raises(InputError) as error:
-        read(path)
-    assert field in str(error.value)
-    assert str(path) in str(error.value)
-
-
 def test_feet_declared_as_metres(tmp_path):
     source = tmp_path / "metres.toml"
     text = (spec_root() / "sources" / "ngsim.toml").read_text()
@@ -319,8 +299,3 @@ def test_recorded_i80(data_dir):
     np.testing.assert_allclose(track.speed, rows[:, 11] * w.FOOT)
     assert [lane.id for lane in recording.lanes] == ["1", "2", "3", "4", "5", "6", "9"]
     assert any("lateral" in note for note in recording.notes)
-
-
-@pytest.mark.dataset
-def test_recorded_folder_skips_the_notice(data_dir):
-    assert len(read(data_dir / "ngsim_i80_native")) == 1
