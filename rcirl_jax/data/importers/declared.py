@@ -24,6 +24,7 @@ from rcirl_jax.data.readers.tables.table import (
     MAX_VELOCITY_MPS,
     Field,
     Table,
+    fields_of,
     open_table,
     read,
 )
@@ -60,18 +61,16 @@ class Columns:
 
     def fields(self, table: Table) -> list[Field]:
         """Fields of a table: those needed, and others whose column is there."""
-        return [
-            Field(
-                name=name,
-                column=self.called.get(name, name),
-                needed=name in self.needed,
-                text=kind == "text",
-                limit=LIMITS[kind],
-                factor=self.factors.get(name, 1.0),
-            )
-            for name, kind in {**self.needed, **self.optional}.items()
-            if name in self.needed or table.has(self.called.get(name, name))
-        ]
+        kinds = {**self.needed, **self.optional}
+        return fields_of(
+            table,
+            [*self.needed],
+            [*self.optional],
+            texts=[name for name, kind in kinds.items() if kind == "text"],
+            limits={name: LIMITS[kind] for name, kind in kinds.items()},
+            columns=self.called,
+            factors=self.factors,
+        )
 
     def read(self, table: Table, ledger: Ledger) -> Rows:
         """Rows in SI units, each road user once in a frame.
