@@ -11,15 +11,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import spec_root
 from rcirl_jax.types import Kind
 from tests.data.importers import writers as w
-
-
-def read(path, source):
-    return list(read_recordings("csv", path, source))
-
-
-def only(path, source):
-    (recording,) = read(path, source)
-    return recording
+from tests.data.importers.people import only, read
 
 
 def log(folder, rows=None, header=w.CSV_COLUMNS):

@@ -11,16 +11,8 @@ import pyarrow.feather
 import pyarrow.parquet as pq
 import pytest
 
-from rcirl_jax.errors import InputError
 from tests.data.importers import people
-
-
-def refused(path, source):
-    with pytest.raises(InputError) as caught:
-        people.read(path, source)
-    (line,) = str(caught.value).splitlines()
-    assert line.startswith(str(path)), line
-    return line
+from tests.data.importers.people import LONG, refused
 
 
 def quoted_commas():
@@ -97,7 +89,7 @@ LAYOUTS = {
 }
 
 
-@pytest.mark.parametrize("long_bytes", [1, 10**9], ids=["in pieces", "whole"])
+@LONG
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_layouts_are_recognised(tmp_path, layout, long_bytes):
     path = tmp_path / "log.csv"
@@ -274,7 +266,7 @@ def test_a_nested_column_is_no_number(tmp_path):
     assert "column x: type list<" in refused(path, people.spec(tmp_path))
 
 
-@pytest.mark.parametrize("long_bytes", [1, 10**9], ids=["in pieces", "whole"])
+@LONG
 @pytest.mark.parametrize("packed", ["gzip", "zstd", "bz2", "gzip by its bytes"])
 def test_packed_texts(tmp_path, packed, long_bytes):
     data = people.text(people.rows(), between=";").encode()

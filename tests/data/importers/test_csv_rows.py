@@ -6,28 +6,10 @@ import pytest
 from rcirl_jax.data.importing import import_parts
 from rcirl_jax.data.parts import parts_of
 from rcirl_jax.data.scenes.quality import QualityReport, format_quality
-from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind
 from tests.data.importers import people
+from tests.data.importers.people import LONG, refused, write
 from tests.data.small_logs import CONFIG
-
-LONG = pytest.mark.parametrize(
-    "long_bytes", [1, 10**9], ids=["in pieces", "whole"]
-)  # fmt: skip
-
-
-def write(folder, table, header=people.HEADER, **layout):
-    path = folder / "log.csv"
-    path.write_text(people.text(table, header, **layout))
-    return path
-
-
-def refused(path, source):
-    with pytest.raises(InputError) as caught:
-        people.read(path, source)
-    (line,) = str(caught.value).splitlines()
-    assert line.startswith(str(path))
-    return line
 
 
 def with_cell(row, name, value):
