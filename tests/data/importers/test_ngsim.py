@@ -123,23 +123,20 @@ def test_csv_is_the_same_as_text(tmp_path):
         assert (one.id, one.length, one.width) == (other.id, other.length, other.width)
 
 
+def stamped(rows, begin=8e11):
+    """Rows with Global_Time: 100 ms a frame."""
+    return [[*row[:3], begin + 100 * row[1], *row[4:]] for row in rows]
+
+
 def test_portal_sites_and_periods(tmp_path):
     """Vehicle and frame numbers start anew in each period and at each site."""
-    early, late = w.ngsim_rows(), w.ngsim_rows()
-    for begin, rows in ((9e11, late), (8e11, early)):
-        for k, row in enumerate(rows):
-            row[3] = begin + 100 * k
-    rows = late + early + w.ngsim_rows() + w.ngsim_rows()
+    begins = (9e11, 8e11, 7e11, 6e11)
+    rows = [row for begin in begins for row in stamped(w.ngsim_rows(), begin)]
     sites = ["us-101"] * 80 + ["i-80"] * 40 + ["lankershim"] * 40
     found = read(w.ngsim_csv(tmp_path / "all.csv", rows, sites=sites))
     assert [recording.name for recording in found] == ["all-i-80", "all-us-101"]
     assert [len(recording.tracks) for recording in found] == [1, 2]
     assert all("lankershim" in recording.notes[0] for recording in found)
-
-
-def stamped(rows, begin=8e11):
-    """Rows with Global_Time: 100 ms a frame."""
-    return [[*row[:3], begin + 100 * row[1], *row[4:]] for row in rows]
 
 
 def periods():

@@ -202,6 +202,11 @@ def _recognised_earth(
     return columns, units
 
 
+def first_cell(table: Table, column: str) -> str:
+    """The first cell of a column that is not empty, "" without one."""
+    return next((c for c in table.samples(column) if c.lower() not in EMPTY), "")
+
+
 def sampled(table: Table, column: str) -> np.ndarray:
     """The numbers among the first cells of a column."""
     cells = table.samples(column)
@@ -315,8 +320,7 @@ def _time(
     table: Table, name: str, unit: str | None, rate: float, notes: list[str]
 ) -> tuple[str, float]:
     """(form, factor) of the clock; ISO where nothing is said and the cells are."""
-    cells = [c for c in table.samples(name.lstrip("-")) if c.lower() not in EMPTY]
-    first = cells[0] if cells else ""
+    first = first_cell(table, name.lstrip("-"))
     is_iso = re.match(ISO_TIMES, first) is not None
     if unit is None and is_iso:
         notes.append(f"column {name}: ISO times")
