@@ -5,7 +5,7 @@ import pytest
 
 from rcirl_jax.data.importing import import_parts
 from rcirl_jax.data.parts import parts_of
-from rcirl_jax.data.scenes.quality import QualityReport, format_quality
+from rcirl_jax.data.scenes.quality import format_quality
 from rcirl_jax.types import Kind
 from tests.data.importers import people
 from tests.data.importers.people import LONG, refused, write
@@ -210,9 +210,3 @@ def test_an_import_counts_what_it_dropped(tmp_path, long_bytes):
     said = format_quality(manifest.quality)
     assert "rows dropped: 2 of 721 (0.28%): 1 unreadable, 1 repeated" in said
     assert any("line 7: x: 'west'" in note for note in manifest.quality["notes"])
-
-
-def test_a_report_of_nothing_dropped_does_not_say_so():
-    report = QualityReport()
-    report.rows.update({"read": 10})
-    assert "rows" not in report.as_dict()

@@ -71,19 +71,6 @@ def test_pedestrians_alone(scene):
     assert [track.id for track in only(scene).tracks] == ["P13", "P4"]
 
 
-def test_frames_may_start_at_zero(root, scene):
-    whole = only(root)
-    for kind in ("vehicle", "pedestrian"):
-        path = scene / f"{kind}_tracks_000.csv"
-        header, *rows = path.read_text().splitlines()
-        cells = [row.split(",") for row in rows]
-        for row in cells:
-            row[1], row[2] = str(int(row[1]) - 1), str(int(row[2]) - 100)
-        path.write_text("\n".join([header, *(",".join(row) for row in cells)]) + "\n")
-    for one, other in zip(only(root).tracks, whole.tracks, strict=True):
-        np.testing.assert_allclose(one.t, other.t)
-
-
 @pytest.mark.parametrize("kept", [".osm_xy", ".osm"])
 def test_map_in_metres_and_in_degrees(root, kept):
     both = {lane.id: lane for lane in only(root).lanes}
