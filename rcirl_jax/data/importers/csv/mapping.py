@@ -107,15 +107,18 @@ def mapping_of(table: Table, spec: AnyMapping) -> Mapping:
         notes.append(
             f"latitude, longitude projected about {middle[0]:g}, {middle[1]:g} degrees"
         )
-    form, factor = _time(table, columns["t"], units.get("t"), rate, notes)
-    fields = [_field(field, name, user, units, spec) for field, name, user in found]
+    clock = next(name for field, name, _ in found if field == "t")
+    form, factor = _time(table, clock, units.get("t"), rate, notes)
     limit = math.inf if form else LIMITS["t"] / min(factor, 1.0)
-    clock = {"form": form, "factor": factor, "limit": limit}
+    fields = [_field(field, name, user, units, spec) for field, name, user in found]
+    fields = [
+        dataclasses.replace(f, form=form, limit=limit, factor=f.factor * factor)
+        if f.name == "t"
+        else f
+        for f in fields
+    ]
     return Mapping(
-        fields=tuple(
-            dataclasses.replace(field, **clock) if field.name == "t" else field
-            for field in fields
-        ),
+        fields=tuple(fields),
         rate_hz=rate,
         middle=middle,
         degrees=degrees,
@@ -349,7 +352,7 @@ def _field(
     is_place_on_earth = unit in ANGLES and field in DEGREES
     if is_place_on_earth:
         limit = DEGREES[field] * (UNITS["deg"] if unit == "rad" else 1.0)
-    elif unit in UNITS and field != "heading":
+    elif unit in UNITS and field not in ("heading", "t"):
         factor = UNITS[unit]
     return Field(
         name=field,
