@@ -54,7 +54,6 @@ def rows_of(
     ledger: Ledger,
     *,
     is_long: bool,
-    wanted: Container[str] | None = None,
     apart: Container[str] = (),
     places: tuple[str, str] = ("x", "y"),
 ) -> Iterator["Held | Spill"]:
@@ -66,7 +65,6 @@ def rows_of(
       ledger: of the file.
       is_long: the rows go to scratch files, which are removed afterwards; a bar
         shows the reading.
-      wanted: values of the `recording` field whose rows are kept; None: all.
       apart: columns in which rows may differ that repeat each other.
       places: columns that say where a road user is.
 
@@ -78,7 +76,7 @@ def rows_of(
         yield Held(read(table, fields, ledger), ledger, apart, places)
         return
     with scratch() as folder:
-        spill = Spill(table.path, folder, ledger, wanted, apart, places)
+        spill = Spill(table.path, folder, ledger, apart, places)
         with reading(table.path, [table.path]) as show:
             for batch in batches(table, fields, ledger, show):
                 spill.add(batch)
@@ -136,12 +134,11 @@ class Spill:
         path: Path,
         folder: Path,
         ledger: Ledger,
-        wanted: Container[str] | None,
         apart: Container[str],
         places: tuple[str, str],
     ) -> None:
         self.path, self.folder, self.ledger = path, folder, ledger
-        self.wanted, self.apart, self.places = wanted, apart, places
+        self.apart, self.places = apart, places
         self.names: list[str] = []  # of the columns, as in the first batch
         self.texts: dict[str, dict[str, int]] = {}  # field -> text -> its number
         self.blocks: dict[int, set[int]] = {}  # number of a recording -> minutes
@@ -149,7 +146,6 @@ class Spill:
         self.held = 0  # bytes in the buffers
         self.given = 0.0  # minutes given as pieces
         self._tables: dict[str, np.ndarray] = {}
-        self._met: set[int] = set()  # numbers of recordings
         self._tidied: set[int] = set()
 
     def add(self, batch: dict) -> None:
@@ -162,8 +158,6 @@ class Spill:
         recording = np.zeros(len(rows), np.int64)
         if "recording" in self.names:
             recording = rows[:, self.names.index("recording")].astype(np.int64)
-            self._met.update(np.unique(recording).tolist())
-            rows, recording = self._of_wanted(rows, recording)
         minute = np.floor(rows[:, self.names.index("t")] / BLOCK_S).astype(np.int64)
         order = np.lexsort((minute, recording))  # stable: the file's order inside
         keys = np.stack([recording, minute], axis=1)[order]
@@ -190,14 +184,6 @@ class Spill:
         mine = [known.setdefault(text, len(known)) for text in texts]
         return np.array(mine, np.float64)[codes]
 
-    def _of_wanted(
-        self, rows: np.ndarray, recording: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        if self.wanted is None:
-            return rows, recording
-        kept = np.array([name in self.wanted for name in self.texts["recording"]])
-        return rows[kept[recording]], recording[kept[recording]]
-
     def flush(self) -> None:
         """Write what is held to the scratch files."""
         for (recording, minute), rows in self.buffers.items():
@@ -207,10 +193,11 @@ class Spill:
         self.buffers, self.held = {}, 0
 
     def recordings(self) -> list[str | None]:
-        """Values of `recording` met, left out ones too; [None] without the field."""
-        if "recording" not in self.texts:
-            return [None]
-        return [text for text, n in self.texts["recording"].items() if n in self._met]
+        """Values of `recording`; [None] without the field."""
+        known = self.texts.get("recording", {})
+        return [text for text, number in known.items() if number in self.blocks] or [
+            None
+        ]
 
     def texts_of(self, field: str) -> list[str]:
         """All that a field of texts holds."""

@@ -102,7 +102,6 @@ def _recordings(table: Table, spec: dict, ledger: Ledger) -> Iterator[Recording]
         _fields(table, spec, stamped),
         ledger,
         is_long=is_long_file(path, spec),
-        wanted=spec.get("locations"),
         apart=APART,
         places=PLACES,
     ) as rows:
