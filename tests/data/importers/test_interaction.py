@@ -58,6 +58,14 @@ def test_who_rides_is_decided_by_the_source(root, tmp_path):
     assert kinds["P13"] == Kind.PEDESTRIAN
 
 
+def test_what_a_toml_leaves_out_is_as_in_the_packaged_one(root, tmp_path):
+    source = tmp_path / "s.toml"
+    source.write_text('source = "mine"\n')
+    found, packaged = only(root, source), logs.packaged("interaction")
+    assert (found.source, found.licence) == ("mine", packaged["licence"])
+    assert found.rate_hz == packaged["rate_hz"]
+
+
 def test_inputs_from_the_release_down_to_a_file(root, scene):
     whole = only(root)
     for path in (root / "recorded_trackfiles", scene, scene / "vehicle_tracks_000.csv"):
