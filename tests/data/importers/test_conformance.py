@@ -23,6 +23,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import load_toml, spec_root
 from rcirl_jax.types import Kind
 from tests.data.importers import formats
+from tests.helpers import logs
 from tests.helpers.logs import refused
 
 SPEED_TOLERANCE_MPS = 0.3  # m/s
@@ -329,6 +330,45 @@ def test_damaged_files(name, sound, damage, tmp_path):
             if "number" in damage and fixture.drops_rows and not fixture.has_holes:
                 assert sum(made.rows.unreadable for made in recordings) == 1
         assert not target.exists(), f"{path.name}: code was executed"
+
+
+def of_all(table):
+    """(name, number or words, what is done) of every entry of a table of fixtures."""
+    found = []
+    for name, module in sorted(MODULES.items()):
+        entries = getattr(module, table, {})
+        pairs = entries.items() if isinstance(entries, dict) else enumerate(entries)
+        found += [pytest.param(name, *pair, id=f"{name}: {pair[0]}") for pair in pairs]
+    return found
+
+
+@pytest.mark.parametrize(("name", "words", "harm"), of_all("HARMS"))
+def test_what_is_wrong_in_a_file_is_named(name, words, harm, tmp_path):
+    """Values that no road, clock or user has; tables and fields of another form."""
+    fixture = write(name, tmp_path)
+    harm(fixture)
+    line = refused(read, name, fixture)
+    assert words in line
+    assert "expected" in line
+    assert line.startswith(str(tmp_path))
+
+
+@pytest.mark.parametrize(("name", "number", "option"), of_all("OPTIONS"))
+def test_what_is_wrong_in_an_option_is_named(name, number, option, tmp_path):
+    (key,), place = option, write(name, tmp_path).input
+    line = refused(logs.read, format_of(name), place, **option)
+    assert line.startswith(f"source TOML: {key}")
+
+
+def test_options_of_another_type_are_named(name, sound, tmp_path):
+    """Every one that the packaged TOML has, but those whose readers take several."""
+    source = tmp_path / "source.toml"
+    for key, value in spec_of(name).items():
+        if key in ("pattern", "topics"):
+            continue
+        source.write_text(f"{key} = {3 if isinstance(value, str) else repr('x')}")
+        line = refused(read_recordings, format_of(name), sound[0].input, source)
+        assert line.startswith(f"source TOML: {key}: ")
 
 
 def damaged(content, rng, is_head_kept):
