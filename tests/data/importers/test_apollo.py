@@ -432,25 +432,14 @@ def test_a_long_silence_is_stepped_over(tmp_path, monkeypatch, silence, piece):
     assert len(looked_at) < 10
 
 
-@pytest.mark.parametrize("piece", [1.0, 60.0])
-def test_rows_held_are_limited(tmp_path, monkeypatch, piece):
-    """Also where no single piece has too many."""
-    monkeypatch.setattr(apollo_messages, "PIECE_S", piece)
+def test_rows_held_are_limited(tmp_path, monkeypatch):
     monkeypatch.setattr(apollo_messages, "MAX_ROWS", 100)
     line = refused(read, in_parts(tmp_path, long_drive(8.0), 1))
     assert "more than 100 obstacle states" in line
 
 
-def test_options(tmp_path):
-    size = {"length": 4.0, "width": 1.7, "rear_axle_to_centre": 0.0}
-    found = only(tmp_path, ego_only(), rate_hz=5.0, ego=size, speed_limit=8.0)
-    ego = found.tracks[0]
-    assert (ego.t.size, ego.length, ego.width) == (11, 4.0, 1.7)
-    assert ego.x[0] == pytest.approx(-fixture.AHEAD)
-    assert found.default_speed_limit == 8.0
-    # a channel or a list of them, whichever the packaged file has
-    for topics in ({"localization": [LOCALIZATION]}, {"routing": "/x"}):
-        assert only(tmp_path, ego_only(), topics=topics).tracks
+def test_a_clock_of_another_rate(tmp_path):
+    assert only(tmp_path, ego_only(), rate_hz=5.0).tracks[0].t.size == 11
 
 
 @pytest.mark.dataset

@@ -10,8 +10,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from rcirl_jax.data.importers.argoverse2 import reader as argoverse2
-from rcirl_jax.data.readers.tables import columnar, table
 from rcirl_jax.types import Kind
 from tests.data.importers.formats import argoverse2 as w
 from tests.helpers import logs
@@ -57,7 +55,6 @@ def test_lanes(whole):
 
 def test_options(tmp_path):
     assert len(scenario(tmp_path, lane_types=["VEHICLE", "BIKE"]).lanes) == 7
-    assert scenario(tmp_path, speed_limit=11.2).default_speed_limit == 11.2
     recording = scenario(tmp_path, min_category=1)
     assert "138902" not in tracks_of(recording)
     assert any("3 tracks below category 1" in note for note in recording.notes)
@@ -67,9 +64,6 @@ def test_options(tmp_path):
     kinds = {**PACKAGED["kinds"], "cyclist": "vehicle"}
     tracks = tracks_of(scenario(tmp_path, kinds=kinds))
     assert tracks["139408"].kind == Kind.VEHICLE
-    for driver, found in (("automated", {"AV"}), ("human", set())):
-        tracks = scenario(tmp_path, recording_car=driver).tracks
-        assert {track.id for track in tracks if track.automated} == found
 
 
 def test_every_type_has_a_kind_and_a_size():
@@ -106,21 +100,6 @@ def test_other_types_of_the_same_columns(tmp_path):
     assert tracks[w.FOCAL].t.size == w.NUM_STEPS
 
 
-def test_far_coordinates_get_a_local_origin(tmp_path):
-    table, lanes = w.columns(), w.vector_map()
-    table["position_x"] = [x + 60_000.0 for x in table["position_x"]]
-    for lane in lanes["lane_segments"].values():
-        for side in ("left", "right"):
-            for point in lane[f"{side}_lane_boundary"]:
-                point["x"] += 60_000.0
-    recording = scenario(tmp_path, table=table, lanes=lanes)
-    assert "local origin at x = 60000 m, y = 1000 m" in recording.notes
-    car, centre = tracks_of(recording)["AV"], recording.lanes[0].centre
-    np.testing.assert_allclose(car.x, w.EAST + 1.5 * w.WIDTH, atol=1e-6)
-    np.testing.assert_allclose(car.y[0], w.NORTH - 1000.0, atol=1e-6)
-    np.testing.assert_allclose(centre[:, 0], w.EAST + w.WIDTH / 2, atol=0.01)
-
-
 def test_wild_fragments_are_left_out(tmp_path):
     table = w.columns()
     table["velocity_x"][table["track_id"].index("138902")] = 300.0
@@ -129,64 +108,12 @@ def test_wild_fragments_are_left_out(tmp_path):
     assert any("1 track fragments of impossible" in note for note in recording.notes)
 
 
-def test_up_to_a_tenth_of_the_tracks_may_be_too_fast(tmp_path):
-    """One state of one track in twelve; sizes of the source TOML are no outliers."""
-    table = w.columns()
-    rows = [row for row, name in enumerate(table["track_id"]) if name == "AV"]
-    for copy in range(12):
-        for key, values in table.items():
-            values += [f"c{copy}" if key == "track_id" else values[r] for r in rows]
-    table["velocity_x"][-5] = 95.0
-    recording = scenario(tmp_path, table=table)
-    assert "c10" in tracks_of(recording)
-    assert "c11" not in tracks_of(recording)
-    assert "1 tracks with an impossible size or speed left out" in recording.notes
-    sizes = {**PACKAGED["sizes"], "bus": [112.0, 2.6]}
-    assert "length: 11" in refused(scenario, tmp_path, table=table, sizes=sizes)
-
-
 def test_stamps_that_are_not_10_hz_are_noted(tmp_path):
     table = w.columns()
     table["end_timestamp"] = [w.START_NS + 4.9e9] * len(table["timestep"])
     recording = scenario(tmp_path, table=table)
     assert any("0.1 s assumed" in note for note in recording.notes)
     assert recording.tracks[0].t[-1] > 5.0
-
-
-def test_a_small_file_of_many_rows(tmp_path, monkeypatch):
-    """A million equal cells take 5 kB on disk."""
-    path, _ = w.write_scenario(tmp_path)
-    cells = pa.array(np.zeros(1_000_000, np.int8))
-    names = (*argoverse2.NUMBERS, *argoverse2.TEXT)
-    pq.write_table(pa.table(dict.fromkeys(names, cells)), path)
-    assert path.stat().st_size < 100_000
-    monkeypatch.setattr(table, "MAX_ROWS", 500_000)
-    assert "rows: more than 500000: expected fewer" in refused(read, path)
-
-
-@pytest.mark.parametrize(
-    ("where", "name", "most", "words"),
-    [
-        (table, "MAX_ROWS", 500, "rows: more than 500: expected fewer"),
-        (columnar, "MAX_GROUP_BYTES", 5000, "bytes: expected at most 5000"),
-        (table, "MAX_BYTES", 5000, "size: "),
-        (columnar, "MAX_COLUMNS", 5, "columns: 18"),
-    ],
-)
-def test_sizes_are_limited(tmp_path, monkeypatch, where, name, most, words):
-    monkeypatch.setattr(where, name, most)
-    assert words in refused(scenario, tmp_path)
-
-
-def test_bytes_of_texts_are_limited(tmp_path, monkeypatch):
-    path, _ = w.write_scenario(tmp_path)
-    rows, longest = pq.read_table(path).num_rows, len(w.columns()["scenario_id"][0])
-    size = max(4 * rows * longest, path.stat().st_size)
-    monkeypatch.setattr(table, "MAX_BYTES", size)
-    only(path)
-    monkeypatch.setattr(table, "MAX_BYTES", size - 1)
-    line, words = refused(read, path), f"{rows} rows of texts up to {longest}"
-    assert f"scenario_id: {words}" in line or "size: " in line
 
 
 def test_a_missing_package_is_one_line(tmp_path, monkeypatch):

@@ -259,20 +259,13 @@ POINT, NAN = {"x": 1.0, "y": 2.0, "z": 3.0}, float("nan")
 # what is done to the table or the map, and what the line says
 HARMS = {
     "row 4: position_x: 'nan': expected a finite": cells("position_x", NAN, ONE),
-    "row 4: heading: '': expected a finite number": cells("heading", None, ONE),
-    "row 4: track_id: '': expected a text": cells("track_id", None, ONE),
     "row 1: position_x: 'left': expected a finite": cells("position_x", "left"),
-    "position_x: 1e+12": cells("position_x", 1e12, ONE),
     # the recording car's own speed is measured: if that is wrong, so is the file
     "track AV: speed: 300": cells("velocity_x", 300.0, ONE),
     "row 3: timestep: 110: expected a whole number from 0": cells("timestep", 110, ONE),
     "t: 2: met twice": cells("timestep", 2, ONE),
-    "goes backwards": cells("timestep", 0, ONE),
     "row 3: object_category: 7: expected 0 to 3": cells("object_category", 7, ONE),
-    "scenario_id: ['": cells("scenario_id", "x", ONE),
     "track 138902: object_type: tank": cells("object_type", "tank"),
-    "num_timestamps: 1e+12": cells("num_timestamps", 10**12),
-    "column heading: type list": cells("heading", [1.0]),
     "column track_id: type binary: expected text": cells("track_id", b"\xff\xfe"),
     # 100 MB when written out, refused without that
     "expected up to 64 characters": cells("track_id", "x" * 100_000),
@@ -281,9 +274,6 @@ HARMS = {
     "205119002...].id: 7": segment_with(id="7"),
     "lane segment 205119001: id: met twice": segment_with(id=205119001),
     "].left_lane_boundary": segment_with(left_lane_boundary=[POINT]),
-    "left_lane_boundary: x: 1e+300": segment_with(
-        left_lane_boundary=[POINT, {"x": 1e300, "y": 2}]
-    ),
     "right_lane_boundary: x: nan at point 1": segment_with(
         right_lane_boundary=[POINT, {"x": NAN, "y": 2}]
     ),

@@ -339,26 +339,17 @@ HARMS = {
     "lidar_pc: no row with an ego pose": sql(0, "DELETE FROM ego_pose"),
     "lidar_box.yaw: missing": sql(0, "ALTER TABLE lidar_box DROP COLUMN yaw"),
     "lidar_box.x: '1.5 m': expected a number": set_to("lidar_box", "x", "'1.5 m'"),
-    "lidar_box.x: b'1': expected a number": set_to("lidar_box", "x", "x'31'"),
-    "lidar_box: x: inf": set_to("lidar_box", "x", "9e999"),
     "lidar_box: x: nan": set_to("lidar_box", "x", "NULL"),
-    "heading: nan: expected a finite number": set_to("lidar_box", "yaw", "NULL"),
     "length: -1 m: expected 0 to": set_to("lidar_box", "length", "-1"),
-    "speed: 300": set_to("lidar_box", "vx", "300"),
     "track_token: 'abc': expected a": set_to("lidar_box", "track_token", "'abc'"),
-    "track_token: b'": set_to("lidar_box", "track_token", "zeroblob(99)"),
     "track_token: ": sql(0, "DELETE FROM track"),
     "category.name: 'alien': expected one": set_to("category", "name", "'alien'"),
-    "category.name: None: expected one": set_to("category", "name", "NULL"),
     "ego_pose.x: NULL: expected a number": set_to("ego_pose", "x", "NULL"),
-    "ego_pose: x: 1e+300": set_to("ego_pose", "x", "1e300"),
     "qw, qx, qy, qz: norm 0: expected 1": set_to("ego_pose", "qw", "0"),
-    "lidar_pc.timestamp: 'now'": set_to("lidar_pc", "timestamp", "'now'"),
     "median step": set_to("lidar_pc", "timestamp", "timestamp * 1000 % 86400000000"),
     "us from first to last": sql(0, LAST),
     "connector_id: 'x'": set_to("traffic_light_status", "lane_connector_id", "'x'"),
     "projectedCoordSystem: missing: expected a UTM zone": sql(1, "DELETE FROM meta"),
-    "epsg:3857: expected a UTM zone": sql(1, "UPDATE meta SET value = 'epsg:3857'"),
     "srs_id: 3857: expected 4326": sql(1, f"{GEOM_OF} srs_id = 3857"),
     "stop_polygons.two x: missing": sql(
         1, f"{GEOM_OF} column_name = 'two' || char(10) || 'x'"
@@ -368,12 +359,6 @@ HARMS = {
     ),
     "baseline_paths.geom: 500: expected longitude": sql(
         1, "UPDATE baseline_paths SET geom = ?", values=(WILD,)
-    ),
-    "lane_connectors: a view": sql(
-        1, "DROP TABLE lane_connectors; CREATE VIEW lane_connectors AS SELECT 1"
-    ),
-    "lanes_polygons.lane_fid: missing": sql(
-        1, "ALTER TABLE lanes_polygons DROP COLUMN lane_fid"
     ),
 }
 OPTIONS = [{"window_s": 0}, {"window_s": 1e-9}, {"ego": 1}, {"maps": "gone"}]
