@@ -251,7 +251,7 @@ def test_options(folder):
 
 BAD_METADATA = [
     ({"shape": [2, 3]}, "shape: [2, 3]: expected a list"),
-    ({"shape": [10**12]}, "shape.0: 1000000000000: expected a whole number <= "),
+    ({"shape": [10**12]}, "shape[0]: 1000000000000: expected a whole number <= "),
     ({"chunks": [0]}, "chunks: 0 records"),
     ({"chunks": [10**9]}, "chunks: 1000000000 records: expected 1 to"),
     ({"dtype": "<f8"}, "dtype: <f8: expected a list"),

@@ -46,7 +46,7 @@ class _Segment(msgspec.Struct):
 
 
 class _Map(msgspec.Struct):
-    lane_segments: dict[str, _Segment]
+    lane_segments: dict[str, dict]
 
 
 def read_lanes(

@@ -271,9 +271,9 @@ HARMS = {
     "expected up to 64 characters": cells("track_id", "x" * 100_000),
     "column velocity_y: missing": without("velocity_y"),
     "lane_type: RAIL": segment_with(lane_type="RAIL"),
-    "205119002...].id: 7": segment_with(id="7"),
+    "lane segment 205119002: id: 7: expected a whole": segment_with(id="7"),
     "lane segment 205119001: id: met twice": segment_with(id=205119001),
-    "].left_lane_boundary": segment_with(left_lane_boundary=[POINT]),
+    "left_lane_boundary: [{": segment_with(left_lane_boundary=[POINT]),
     "right_lane_boundary: x: nan at point 1": segment_with(
         right_lane_boundary=[POINT, {"x": NAN, "y": 2}]
     ),

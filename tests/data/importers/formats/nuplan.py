@@ -346,7 +346,6 @@ HARMS = {
     "category.name: 'alien': expected one": set_to("category", "name", "'alien'"),
     "ego_pose.x: NULL: expected a number": set_to("ego_pose", "x", "NULL"),
     "qw, qx, qy, qz: norm 0: expected 1": set_to("ego_pose", "qw", "0"),
-    "median step": set_to("lidar_pc", "timestamp", "timestamp * 1000 % 86400000000"),
     "us from first to last": sql(0, LAST),
     "connector_id: 'x'": set_to("traffic_light_status", "lane_connector_id", "'x'"),
     "projectedCoordSystem: missing: expected a UTM zone": sql(1, "DELETE FROM meta"),
