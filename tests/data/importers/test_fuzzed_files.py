@@ -91,29 +91,20 @@ METRICS = "expected the metrics of a suite"
 BAD_MEMBERS = [
     *[
         ("way", head(shape) + bytes(64), "of float64 in 64 bytes: expected the")
-        for shape in ((2**62,), (2**40, 2), (10**30,), (-1,))
+        for shape in ((2**62,), (10**30,), (-1,))
     ],
     # texts of no length take no room in the file, and as Python's some gigabytes
     ("names", head((10**6,), "<U0"), "names: 1000000 values in 0 bytes"),
     # a list of many times nothing would take terabytes
-    *[
-        (name, head((2**40, 0, 0), kind), NOTHING)
-        for name in ("names", "ids", "groups", "way")
-        for kind in ("<f8", "<U1")
-    ],
+    *[("ids", head((2**40, 0, 0), kind), NOTHING) for kind in ("<f8", "<U1")],
     *[("way", head(2, kind), METRICS) for kind in ("(,)f8", "f8,(", "f9", "")],
-    *[
-        ("ids", texts(order, point), BAD_TEXT)
-        for order in "<>"
-        for point in (0x110000, 2**32 - 1, 0xD800)
-    ],
+    *[("ids", texts("<", point), BAD_TEXT) for point in (0x110000, 0xD800)],
+    ("ids", texts(">", 2**32 - 1), BAD_TEXT),
     *[
         (name, npy(np.array(values)), METRICS)
         for name, values in (
             *[("way", ["far", "near"]), ("names", ["ours", "ours"])],
-            *[("groups", [1, 2]), ("reference", [1.0]), ("trivial", [1.0, 1.0])],
-            *[("row0.progress", ["a", "b"]), ("row0.progress", np.ones((2, 7, 7)))],
-            ("row0.inside", np.ones((2, 5))),
+            *[("groups", [1, 2]), ("row0.inside", np.ones((2, 5)))],
         )
     ],
     ("row0.start_time", None, METRICS),

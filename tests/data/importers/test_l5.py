@@ -188,13 +188,13 @@ def test_light_of_a_lane(whole):
 
 def test_light_unseen_for_a_second_is_off(tmp_path):
     semantic_map = map_of(fixture.write_map(tmp_path / "m.pb"))
-    seen = l5_map.LightFaces(
+    (signal,) = semantic_map.signals(
+        lanes_around(semantic_map),
         t=0.1 * np.arange(40),
         frame=np.array([3, 4, 30]),
         face=np.array([fixture.RED, fixture.RED, fixture.GREEN]),
         is_active=np.ones(3, bool),
     )
-    (signal,) = semantic_map.signals(lanes_around(semantic_map), seen)
     assert signal.state == ("off", "red", "off", "green")
     np.testing.assert_allclose(signal.start, [0.0, 0.3, 1.5, 3.0])
 
