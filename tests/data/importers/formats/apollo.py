@@ -96,18 +96,11 @@ Index: indexes 1 .SingleIndex*
 MESSAGES = classes({**PACKAGES, "cyber": CYBER})
 
 
-def proto_desc(main, *needs):
-    """ProtoDesc: a file and those it imports, each once per importer."""
-    content = main.SerializeToString()
-    return MESSAGES.ProtoDesc(desc=content, dependencies=needs)
-
-
-_COMMON = proto_desc(file_of("apollo.common", PACKAGES["apollo.common"]))
-
-
 def _described(package, *needs, text=None):
-    text = PACKAGES[package] if text is None else text
-    return proto_desc(file_of(package, text), *map(_described, needs), _COMMON)
+    """ProtoDesc: a file and those it imports, each once per importer."""
+    content = file_of(package, text or PACKAGES[package]).SerializeToString()
+    needs = needs if package == "apollo.common" else (*needs, "apollo.common")
+    return MESSAGES.ProtoDesc(desc=content, dependencies=map(_described, needs))
 
 
 def described(package, *needs, text=None):
