@@ -7,8 +7,7 @@ import struct
 import numpy as np
 import pytest
 
-from rcirl_jax.data.importers import parts
-from rcirl_jax.data.importers.shapes import distance_to_line
+from rcirl_jax.data.importers import parts, shapes
 from rcirl_jax.data.readers.tfrecord import read_records
 from rcirl_jax.types import Kind
 from tests.data.importers.formats import waymo as w
@@ -201,12 +200,14 @@ def test_boundaries_of_a_part_far_ones_and_unknown_ones(tmp_path):
     np.testing.assert_allclose(lane.right_width, 1.75)
 
 
-def test_distances_from_a_bent_line_and_from_a_point():
-    line = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 5.0]]) + 4e6
-    points = np.array([[5.0, 2.0], [-3.0, 4.0], [12.0, 9.0], [10.0, 3.0]]) + 4e6
-    away = distance_to_line(points, line)
-    np.testing.assert_allclose(away, [2.0, 5.0, np.hypot(2.0, 4.0), 0.0], atol=1e-9)
-    np.testing.assert_allclose(distance_to_line(points[:2], line[:1]), [29**0.5, 5.0])
+def test_distances_from_a_bent_line_and_from_a_point(monkeypatch):
+    monkeypatch.setattr(shapes, "CHUNK", 4)
+    bent = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 5.0]]) + 4e6
+    points = np.array([[5.0, 2.0], [-3.0, 4.0], [12.0, 9.0], [10.0, 3.0]] * 2) + 4e6
+    lines, which = [bent, bent[:1]], np.repeat([0, 1], 4)
+    away = shapes.distances_to_lines(points, lines, which)
+    expected = [2.0, 5.0, 20**0.5, 0.0, 29**0.5, 5.0, 15.0, 109**0.5]
+    np.testing.assert_allclose(away, expected, atol=1e-9)
 
 
 def test_exits_entries_and_the_longest_neighbour(tmp_path):
