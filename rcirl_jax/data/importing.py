@@ -297,7 +297,7 @@ class _Import:
 
     def _check_share_left_out(self) -> None:
         refused, share = self.quality.refused, self.config.leave_out_share
-        recordings = len(self.recordings.table)
+        recordings = len(self.recordings)
         if share and refused > share * recordings:
             raise InputError(
                 f"import: {refused} of {recordings} recordings refused, the first: "
