@@ -226,19 +226,24 @@ def make_waymo(folder: Path) -> tuple[Path, list[Path]]:
     tracks = [waymo.track(key, *values) for key, values in users]
     file = folder / "training.tfrecord-00000-of-01000"
     road = [_thinned(feature) for feature in waymo.map_features()]
-    scenario = waymo.scenario(f2=tracks, f4=[2320], f8=road)
+    changes = {"objects_of_interest": [2320], "map_features": road}
+    scenario = waymo.scenario(tracks=tracks, **changes)
     file.write_bytes(waymo.tfrecord([scenario]))
     return folder, [file]
 
 
-def _thinned(feature: list) -> list:
-    """A map feature with every tenth of its points; indices of sides are left out."""
-    (key, kind), rest = feature[1][:2] if len(feature) > 1 else (0, 0), feature[2:]
-    if not isinstance(kind, list):
-        return feature
-    points = [item for item in kind if item[0] in (2, 8) and isinstance(item[1], list)]
-    others = [i for i in kind if i not in points and i[0] not in (11, 12, 13, 14)]
-    return [feature[0], (key, [*others, *points[::10]]), *rest]
+def _thinned(feature: dict) -> dict:
+    """A map feature with every tenth of its points; what has indices is left out."""
+    return {
+        name: value
+        if name == "id"
+        else {
+            key: part[::10] if key == "polyline" else part
+            for key, part in value.items()
+            if not key.endswith(("_boundaries", "_neighbors"))
+        }
+        for name, value in feature.items()
+    }
 
 
 def make_nuplan(folder: Path) -> tuple[Path, list[Path]]:

@@ -5,6 +5,7 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
+import shapely
 from google.protobuf.message import DecodeError
 
 from benchmarks.reliability.fuzz.targets import Bytes, OneFile, Target
@@ -42,7 +43,8 @@ def geometry_target(folder: Path) -> Target:
             raise InputError(f"layer: {error}: expected a geometry") from error
 
     line = np.array([[0.0, 0.0], [5.0, 1.0], [9.0, 1.0]])
-    seeds = [nuplan.geometry(kind, line) for kind in (2, 3)]
+    shapes = (shapely.LineString, shapely.Polygon)
+    seeds = [nuplan.geometry(shape, line) for shape in shapes]
     many = seeds[0][:40] + b"\x01\x05\0\0\0\x02\0\0\0" + 2 * seeds[0][40:]
     return Bytes(read, [("bytes", blob) for blob in (*seeds, many)], ["layer"])
 
@@ -54,14 +56,14 @@ def descriptors_target(folder: Path) -> Target:
         "chassis": apollo.chassis(1.0),
         "perception": apollo.perception(1.0),
     }
-    channels = [messages.TOPICS[topic][0] for topic in made]
+    channels = [messages.TOPICS[topic].channels[0] for topic in made]
 
     def read(data: bytes) -> None:
         for (topic, message), channel in zip(made.items(), channels, strict=True):
             kind = apollo.CHANNELS[channel][0]
             # importers put the file's name before what these say
             with contextlib.suppress(DecodeError):
-                reading_of(kind, data, messages.WANTED[topic]).parse(message)
+                reading_of(kind, data, messages.TOPICS[topic].wanted).parse(message)
 
     seeds = [("message", apollo.CHANNELS[channel][1]) for channel in channels]
     return Bytes(read, seeds, ["message"])
