@@ -18,8 +18,9 @@ from pathlib import Path
 from absl import flags
 
 from experiments.flags import margins, training
-from experiments.flags.common import cutting, provenance, run
+from experiments.flags.common import provenance, run
 from experiments.flags.executor import executor
+from experiments.flags.importing import import_flags
 from experiments.flags.signals import checked_signals, signals_asked
 from experiments.flags.suite import suite
 from rcirl_jax.autotune.config import TuneConfig
@@ -42,7 +43,7 @@ _SYNTHETIC = flags.DEFINE_bool(
 _FORMAT = flags.DEFINE_list("format", None, "of each --input (default: recognised)")
 _INPUT = flags.DEFINE_list("input", None, "recordings to import, one or several logs")
 _SOURCE = flags.DEFINE_list("source", None, "TOML of columns and units of each --input")
-_CUT = cutting(said=training.AS_SAID)
+_IMPORT = import_flags(said=training.AS_SAID)
 _INCUMBENT = flags.DEFINE_string(
     "incumbent", "hand-set", "weights file that drives today, or a baseline"
 )
@@ -139,7 +140,7 @@ def _logs(name: str, path: Path | None, source: Path | None) -> Logs:
         format=name,
         input=path,
         source=source,
-        config=ImportConfig(format=name, collect=_CUT(training.recipe().collect)),
+        config=_IMPORT(ImportConfig(format=name, collect=training.recipe().collect)),
         signals=signals_asked(),
         checked=checked_signals,
     )

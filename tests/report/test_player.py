@@ -14,12 +14,10 @@ from rcirl_jax.simulation.cases import STEP_S
 from rcirl_jax.simulation.recorded.scenes import held_out
 from rcirl_jax.simulation.rollout import LANES, drive_cases
 from rcirl_jax.simulation.suite import (
-    catalogue_set,
     drive_row,
     drive_with_logs,
     recorded_set,
     rollout_config,
-    suite_refs,
 )
 from tests.report.tuning_case import PLAYED, SECONDS, cheap_rows, small_cases
 from tests.simulation.stored import Rows, stored
@@ -103,18 +101,6 @@ def test_a_crash_ends_the_drive_and_shows_who_was_hit(replays):
     drive = replays[1].drives[0]
     for plan, speed in zip(drive.plan, drive.v, strict=True):
         assert plan == pytest.approx([k * speed for k in (1, 2, 3, 4, 5)], abs=0.4)
-
-
-@pytest.mark.slow
-def test_a_red_light_is_among_what_failed():
-    refs = suite_refs("red_light", 1)
-    (one,) = make_replays(cheap_rows()[:1], catalogue_set(refs, 10.0), [refs[0].id], 1)
-    (drive,) = one.drives
-    assert [what for _, what in drive.events] == ["red light run"]
-    assert drive.summary.endswith("fails red lights")
-    assert any(drive.red)
-    at = round(drive.start / one.frame_s) - 1
-    assert one.lines[drive.red[at][0]] - drive.s[at] < 4.0  # its front is at the line
 
 
 def test_a_case_that_the_suite_does_not_have():

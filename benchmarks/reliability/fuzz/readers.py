@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.reliability.fuzz import pieces
-from benchmarks.reliability.fuzz.codecs import resealed, toml_text
+from benchmarks.reliability.fuzz.forms import resealed, toml_text
 from benchmarks.reliability.fuzz.logs import LOGS
 from benchmarks.reliability.fuzz.targets import Bytes, OneFile, Reader, Target
 from rcirl_jax.data.importers.synthetic import reader as synthetic
