@@ -10,18 +10,14 @@ import pytest
 from rcirl_jax.evaluation.closed_loop.robustness import (
     Disturbance,
     disturbed,
-    steadiness,
 )
 from rcirl_jax.planner.optimality import emergency_stop, optimality_gap
 from rcirl_jax.planner.rank import (
     ONLINE,
-    RankConfig,
-    constant_speed_policy,
-    rank_policy,
 )
 from rcirl_jax.sampling.kinematics import trajectory_on_path
 from rcirl_jax.units import TIMES_S
-from tests.helpers.scenes import batch, random_scene, sampled, scene
+from tests.helpers.scenes import random_scene, sampled, scene
 from tests.planner.test_dp import COARSE, FEATURES, SCORE, SHAPE, one, planner, weights
 from tests.planner.test_safety import judge
 
@@ -73,15 +69,3 @@ def test_disturbances_move_bodies_and_nothing_else():
     size = many.obstacles.s_upper - many.obstacles.s_lower
     np.testing.assert_allclose(size[:, 0], 4.5, atol=1e-3)
     np.testing.assert_array_equal(many.path.l[0], front.path.l)
-
-
-def test_who_does_not_look_is_steady():
-    scenes = batch([random_scene(i) for i in range(3)])
-    found = steadiness(constant_speed_policy, None, scenes, Disturbance(samples=8))
-    np.testing.assert_allclose(found["acceleration_std"], 0.0, atol=1e-6)
-    ego = 8.0 * Disturbance().sigma_ego
-    assert (found["end_station_std"] < 3.0 * ego).all()
-    learned = steadiness(
-        rank_policy(SCORE, RankConfig()), weights(), scenes, Disturbance(samples=8)
-    )
-    assert learned["acceleration_std"].max() > 0.0

@@ -53,6 +53,7 @@ from rcirl_jax.train.metrics import pairs_won
 from rcirl_jax.train.running import check_run, describe_run
 from rcirl_jax.train.state import TrainConfig
 from tests.data.store import test_dataset as test_store
+from tests.helpers.stored import sweep_result
 from tests.helpers.weights_files import packed, random_weights
 
 ROWS = 2  # of a dataset
@@ -295,7 +296,7 @@ def sweeps(folder: Path) -> Target:
         learning_rates=(1e-3,),
         seeds=1,
     )
-    write_json(folder / SWEEP, pieces.sweep_result())
+    write_json(folder / SWEEP, sweep_result())
     claim(config, folder, data_hash)
     (member,) = config.members()
     weights = weights_file(folder, member)

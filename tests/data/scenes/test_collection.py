@@ -114,10 +114,7 @@ def test_rates_at_the_frame(a, l_dot):
 def test_the_speed_limit_is_what_a_planner_may_drive():
     """From 300 m on 5 m/s, beyond the scene's 254 m: braked for with 1 m/s^2."""
     x = np.arange(0.0, 301.0, 5.0)
-    lanes = (
-        lane("a", x, 0.0, 25.0, successors=("b",)),
-        lane("b", 300.0 + x, 0.0, 5.0),
-    )
+    lanes = (lane("a", x, 0.0, 25.0, successors=("b",)), lane("b", 300.0 + x, 0.0, 5.0))
     row = first_scene(dataclasses.replace(PAIR, lanes=lanes))
     here = 20.0 + 12.0 * 0.5 + 0.5 * 0.3 * 0.5**2
     to_go = 300.0 - here - 2.0 * np.arange(128)
