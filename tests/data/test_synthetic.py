@@ -259,22 +259,6 @@ def test_roads_are_what_they_say(name):
         assert road.kappa.min() < 0.0 < road.kappa.max()
 
 
-def test_lanes_are_linked_and_parallel(default):
-    for recording in default[::4]:
-        lanes = {lane.id: lane for lane in recording.lanes}
-        for lane in recording.lanes:
-            steps = np.linalg.norm(np.diff(lane.centre, axis=0), axis=1)
-            assert steps.max() < 2.7
-            for following in lane.successors:
-                gap = lanes[following].centre[0] - lane.centre[-1]
-                np.testing.assert_allclose(gap, 0.0, atol=1e-9)
-            if lane.left is not None:
-                assert lanes[lane.left].right == lane.id
-                apart = np.linalg.norm(lanes[lane.left].centre - lane.centre, axis=1)
-                width = lane.left_width + lanes[lane.left].right_width
-                np.testing.assert_allclose(apart, width, atol=1e-6)
-
-
 @settings(max_examples=20)
 @given(st.floats(0.0, 49.9), st.floats(5.0, 300.0))
 def test_schedule_covers_the_recording(offset, end):

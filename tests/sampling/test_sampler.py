@@ -165,19 +165,3 @@ def test_speed_envelope_equals_its_definition():
             ways = stations[i:] - stations[i]
             expected = np.sqrt(np.min(cap[i:] + 2.0 * b * ways))
             assert row[i] == pytest.approx(expected, rel=1e-3)
-
-
-@pytest.mark.parametrize("change", [(15.0, 8.0, 60.0), (8.0, 15.0, 20.0)])
-def test_envelope_drives_up_to_a_changing_limit(change):
-    """Below it throughout, and close to it where there was time to get there."""
-    first, second, station = change
-    made = stepped_scene(first, second, station, v=0.95 * first)
-    candidates = SAMPLE["speed"](jax.random.key(0), made)
-    index = family(candidates, "envelope")[0]
-    s, v = candidates.trajectory.s[index], np.asarray(candidates.trajectory.v[index])
-    limit = np.asarray(jnp.interp(s, STATION_STEP_M * jnp.arange(made.path.l.size),
-                                  made.path.speed_limit))  # fmt: skip
-    assert (v[1:] <= limit[1:] + 0.1).all()
-    assert v[-1] > 0.85 * second
-    assert np.asarray(candidates.feasible)[index]
-    assert np.abs(candidates.trajectory.a[index]).max() < 2.5

@@ -146,13 +146,6 @@ def test_the_path_turns_along_the_lane_after_the_record():
     )
 
 
-def test_time_mask_of_a_short_track():
-    row = first_scene(recording(car("ego", speeding_up(20.0), seconds=6.5)))
-    assert row["future_s"] == pytest.approx(6.0)
-    assert row["time_valid"].sum() == np.sum(TIMES_S <= 6.0)
-    assert row["s_at_5s"] == pytest.approx(12.15 * 5 + 0.5 * 0.3 * 25, abs=0.05)
-
-
 def test_the_branch_that_was_driven():
     x = np.arange(0, 101, 5.0)
     lanes = (
