@@ -9,6 +9,7 @@ from rcirl_jax.data import importing
 from rcirl_jax.data.cut import Cut
 from rcirl_jax.data.importers import parts, read_part
 from rcirl_jax.data.importing import Progress
+from rcirl_jax.data.readers import reading
 from rcirl_jax.data.scenes.quality import QualityReport
 from tests.data.importers.formats import l5, nuplan, waymo
 
@@ -85,3 +86,21 @@ def test_formats_with_long_parts_say_how_much_is_read(tmp_path):
     assert len(progress) > 2
     np.testing.assert_allclose(np.diff([0.0, *progress]), 1.0 / len(progress))
     assert found("l5", l5.write(tmp_path / "l5").input) == [0.5, 1.0]
+
+
+def test_only_what_takes_long_in_no_worker_shows_a_bar(tmp_path, monkeypatch, capsys):
+    path = tmp_path / "log.csv"
+    path.write_text("t\n" * 1000)
+
+    def read():
+        with reading.reading(path, [path]) as show:
+            for _ in range(10):
+                show(300)  # more than there is
+        return drawn(capsys)
+
+    assert read() == []
+    monkeypatch.setattr(reading, "DELAY_S", 0.0)
+    clock = Clock(monkeypatch, step=1.0)
+    assert max(shares(read())) == 100
+    monkeypatch.setattr(reading.multiprocessing, "parent_process", lambda: clock)
+    assert read() == []

@@ -10,6 +10,12 @@ import pytest
 from rcirl_jax.evaluation.closed_loop.robustness import (
     Disturbance,
     disturbed,
+    spread_over,
+    steadiness,
+    summary,
+)
+    Disturbance,
+    disturbed,
 )
 from rcirl_jax.planner.optimality import emergency_stop, optimality_gap
 from rcirl_jax.planner.rank import (
@@ -17,7 +23,7 @@ from rcirl_jax.planner.rank import (
 )
 from rcirl_jax.sampling.kinematics import trajectory_on_path
 from rcirl_jax.units import TIMES_S
-from tests.helpers.scenes import random_scene, sampled, scene
+from tests.helpers.scenes import batch, random_scene, sampled, scene
 from tests.planner.test_dp import COARSE, FEATURES, SCORE, SHAPE, one, planner, weights
 from tests.planner.test_safety import judge
 
@@ -69,3 +75,17 @@ def test_disturbances_move_bodies_and_nothing_else():
     size = many.obstacles.s_upper - many.obstacles.s_lower
     np.testing.assert_allclose(size[:, 0], 4.5, atol=1e-3)
     np.testing.assert_array_equal(many.path.l[0], front.path.l)
+
+
+def test_who_does_not_look_is_steady_and_frames_of_one_drive_are_alike():
+    many = batch([random_scene(seed) for seed in range(7)])
+    few, case = spread_over(3, many, np.arange(7))
+    assert case.tolist() == [0, 3, 6]
+    found = steadiness(constant_speed_policy, None, few, Disturbance(samples=8))
+    np.testing.assert_allclose(found["acceleration_std"], 0.0, atol=1e-6)
+    values, drives = np.repeat(np.arange(10.0), 3), np.repeat(np.arange(10), 3)
+    widths = [
+        found["high"] - found["low"]
+        for found in (summary(values, drives), summary(values, np.arange(30)))
+    ]
+    assert widths[0] > 1.3 * widths[1]

@@ -15,6 +15,7 @@ from rcirl_jax.evaluation.ranking.score import candidates_key
 from rcirl_jax.report.markup import interval
 from rcirl_jax.report.ranking.frames import _sampled
 from rcirl_jax.report.tuning.contributions import NUM_CANDIDATES, contributions
+from rcirl_jax.report.tuning.verdict_sections import outcome_of
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.simulation.metrics import COLUMNS
 from rcirl_jax.units import TIMES_S
@@ -101,6 +102,13 @@ def test_every_check_is_there_with_its_interval(page, report):
         assert words in [row[1] for row in cells], check.name
         if check.outcome == "fail":
             assert "FAIL" in [row[3] for row in cells]
+
+
+def test_a_loss_is_never_called_no_difference(report):
+    (check, *_) = [check for check in report.verdict.checks if check.kind == "gain"]
+    for p, word in ((0.004, "worse"), (0.2, "no difference")):
+        seen = dataclasses.replace(check, difference=-0.02, p=p, outcome="open")
+        assert outcome_of(seen) == (word, "open")
 
 
 def test_the_papers_table_is_the_suites(page, report):
