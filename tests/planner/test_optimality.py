@@ -14,12 +14,10 @@ from rcirl_jax.evaluation.closed_loop.robustness import (
     steadiness,
     summary,
 )
-    Disturbance,
-    disturbed,
-)
 from rcirl_jax.planner.optimality import emergency_stop, optimality_gap
 from rcirl_jax.planner.rank import (
     ONLINE,
+    constant_speed_policy,
 )
 from rcirl_jax.sampling.kinematics import trajectory_on_path
 from rcirl_jax.units import TIMES_S
