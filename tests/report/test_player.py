@@ -11,7 +11,7 @@ from rcirl_jax.report.player.replays import AHEAD_M, BEHIND_M, FRAME_STEPS, make
 from rcirl_jax.simulation import rollout
 from rcirl_jax.simulation import suite as suite_module
 from rcirl_jax.simulation.cases import STEP_S
-from rcirl_jax.simulation.recorded.config import RecordedConfig
+from rcirl_jax.simulation.recorded.scenes import held_out
 from rcirl_jax.simulation.rollout import LANES, drive_cases
 from rcirl_jax.simulation.suite import (
     drive_row,
@@ -20,7 +20,7 @@ from rcirl_jax.simulation.suite import (
     rollout_config,
 )
 from tests.report.tuning_case import PLAYED, SECONDS, cheap_rows, small_cases
-from tests.simulation.test_recorded import traffic
+from tests.simulation.stored import Rows, stored
 
 
 def driven(row, cases, count):
@@ -110,9 +110,8 @@ def test_a_case_that_the_suite_does_not_have():
 
 
 @pytest.mark.slow
-def test_the_recorded_human_drives_beside_the_others(tmp_path):
-    config = RecordedConfig(max_duration_s=6.0, max_cases=1, smoothing_s=0.0, steps=60)
-    cases = recorded_set([traffic(tmp_path, "urban_turn_left")], config)
+def test_the_recorded_human_drives_beside_the_others():
+    cases = recorded_set(held_out([Rows(stored(1))], 1))
     (one,) = make_replays(cheap_rows(), cases, cases.ids, 1)
     assert [drive.row for drive in one.drives] == [
         "candidate", "hand-set", "recorded human",

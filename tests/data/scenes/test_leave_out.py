@@ -61,6 +61,20 @@ def test_one_scenario_of_a_file_is_left_out(tmp_path):
     assert "leave_out" not in plain.import_flags
 
 
+def test_a_share_is_judged_at_the_end(tmp_path):
+    logs = shard(tmp_path / "logs", good("a"), BAD, good("b"))
+    half = dataclasses.replace(STRICT, leave_out_share=0.5)
+    made = import_parts(logs, tmp_path / "data", half)
+    assert made.quality["refused"] == 1
+    assert made.import_flags["leave_out_share"] == 0.5
+    few = dataclasses.replace(STRICT, leave_out_share=0.3)
+    with pytest.raises(
+        InputError, match=r"1 of 3 recordings refused, .*record 1: .*up to 30 %"
+    ):
+        import_parts(logs, tmp_path / "other", few)
+    assert not (tmp_path / "other").exists()
+
+
 @pytest.mark.parametrize(
     ("config", "words"),
     [(LENIENT, r"record 3: .*; recordings left out before: 1"), (STRICT, "record 1: ")],
@@ -102,6 +116,6 @@ def test_the_command(tmp_path):
     dataset = open_dataset(tmp_path / "data")
     facts = dataset.facts()
     assert facts["data_hash"] == dataset.hash
-    assert facts["made_by"]["flags"]["leave_out"] == 1
+    assert facts["made_by"]["flags"]["leave_out"] == "1"
     assert facts["made_by"]["git_commit"] == git_commit()
     assert [floor["candidates"] > 100 for floor in facts["oracle_floor"]] == [True] * 2
