@@ -26,7 +26,8 @@ def scene(**changes):
         {**usual, "s": 400.0},
     ]
     made = scenes.scene(v=8.0, speed_limit=13.9, boxes=boxes)
-    made = jax.tree.map(np.array, made.replace(time_valid=TIMES_S < 6.3, **changes))
+    made = made.replace(**{"time_valid": TIMES_S < 6.3, **changes})
+    made = jax.tree.map(np.array, made)
     rows, decisions = scenes.demonstration(0), np.zeros(len(made.obstacles.kind), int)
     decisions[:4] = Decision.FOLLOW, Decision.STOP, Decision.NUDGE_LEFT, Decision.IGNORE
     human = jax.tree.map(np.zeros_like, rows.human)
