@@ -14,13 +14,7 @@ import msgpack
 import numpy as np
 import pytest
 
-from rcirl_jax.export import (
-    Guard,
-    WeightsError,
-    decode_weights,
-    load_weights,
-    save,
-)
+from rcirl_jax.export import Guard, WeightsError, decode_weights, load_weights, save
 from tests.export import test_old_files, wrong
 from tests.export.test_reader import refusal
 from tests.helpers.weights_files import (

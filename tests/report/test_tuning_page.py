@@ -15,6 +15,7 @@ from rcirl_jax.evaluation.ranking.score import candidates_key
 from rcirl_jax.report.pages import interval
 from rcirl_jax.report.ranking.frames import _sampled
 from rcirl_jax.report.tuning.contributions import NUM_CANDIDATES, contributions
+from rcirl_jax.report.tuning.verdict_sections import outcome_of
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.simulation.metrics import COLUMNS
 from rcirl_jax.units import TIMES_S
@@ -22,7 +23,6 @@ from tests.report.test_data_page import HOSTILE, Page
 from tests.report.tuning_case import PLAYED
 
 MAX_BYTES = 3e6
-ANCHORS = re.compile(r'<section id="(\w+)"')
 
 
 def section(page, anchor):
@@ -149,6 +149,13 @@ def test_every_check_is_there_with_its_interval(page, report):
             assert "FAIL" in [row[3] for row in cells]
 
 
+def test_a_loss_is_never_called_no_difference(report):
+    (check, *_) = [check for check in report.verdict.checks if check.kind == "gain"]
+    for p, word in ((0.004, "worse"), (0.2, "no difference")):
+        seen = dataclasses.replace(check, difference=-0.02, p=p, outcome="open")
+        assert outcome_of(seen) == (word, "open")
+
+
 def test_the_papers_table_is_the_suites(page, report):
     found = rows(page, "suite")
     suite = report.suite.report()
@@ -178,22 +185,6 @@ def test_ranking_and_gamma_are_the_reports(page, report):
         gamma = reward.gamma * np.sign(reward.gamma.sum())
         shown = [number(table[f"{t:.2f}"][0][place]) for t in TIMES_S]
         assert shown == pytest.approx(gamma / np.abs(gamma).max(), abs=6e-4)
-
-
-def test_feature_shares_are_those_of_the_contributions(page, report):
-    found = contributions(report.dataset, report.rewards)
-    for name in report.rewards:
-        assert sum(row.share[name].value for row in found.rows) == pytest.approx(1.0)
-    table = rows(page, "features")
-    for row in found.rows:
-        if row.share["candidate"].high > 0.0:
-            cells = table[row.feature][0]
-            mine, theirs = (row.share[name].value for name in report.rewards)
-            for cell, share in zip(cells, (mine, theirs, mine - theirs), strict=False):
-                assert number(cell) == pytest.approx(100.0 * share, abs=0.05)
-            silent = row.difference.low <= 0.0 <= row.difference.high
-            assert (cells[3] == "no difference") == silent
-    assert len({row.difference.mean > 0.0 for row in found.rows}) == 2
 
 
 def test_a_linear_rewards_shares_are_its_terms(report):

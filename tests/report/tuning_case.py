@@ -20,6 +20,7 @@ from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics
 from rcirl_jax.simulation.rows import Row
 from rcirl_jax.simulation.suite import catalogue_set, suite_refs
 from tests.data.small_logs import CONFIG, write_logs
+from tests.helpers.stored import sweep_result
 from tests.helpers.weights_files import random_weights
 
 FAMILIES, EACH = ("stop_and_go", "cut_in", "red_light"), 40
@@ -83,29 +84,6 @@ def ranking():
     return build_report(table, outcomes, num_resamples=200)
 
 
-def sweep():
-    """What `export.sweep` writes, as far as the page reads it."""
-    found = lambda v: {"value": v, "low": v - 0.3, "high": v + 0.3, "seed_sd": None}  # noqa: E731
-    rows, members = {}, {}
-    for rate, value in ((0.01, 2.0), (0.05, 1.5), (0.2, 1.8)):
-        rows[f"rate {rate}"] = {
-            "hidden": "15", "leaky_rate": rate, "learning_rate": 1e-3,
-            "members": [f"m{rate}"], "finite": True,
-            "validation": {"top1_fde": found(value)},
-        }  # fmt: skip
-        members[f"m{rate}"] = {"validation": {"top1_fde": value}}
-    metric = {"metric": "top1_fde", "title": "top-1 FDE", "unit": "m"}
-    return {
-        "choose_by": {**metric, "higher_is_better": False},
-        "chosen": {"configuration": "rate 0.05", "test": {"top1_fde": found(1.6)}},
-        "configurations": rows,
-        "members": members,
-        "scenes": {"train": 30, "validation": 10, "test": 10},
-        "validation_by": "vehicle",
-        "groups": {},
-    }
-
-
 def small_report(folder, replays):
     """The report; everything but the drives, the frames and the features is made up."""
     import_parts(write_logs(folder / "logs", 4), folder / "set", CONFIG)
@@ -127,7 +105,7 @@ def small_report(folder, replays):
         gate=GateConfig(), suite=suite, incumbent="hand-set", ranking=ranking(),
         rewards={"candidate": candidate, "incumbent": incumbent},
         dataset=open_dataset(folder / "set"), replays=replays, workdir=workdir,
-        sweep=sweep(), training_runs=3,
+        sweep=sweep_result(), training_runs=3,
         facts={"flags": {"seed": 3}, "git_commit": "abc", "stages": {"train": "12ef"}},
     )  # fmt: skip
 

@@ -124,20 +124,14 @@ def make_commonroad(folder: Path) -> tuple[Path, list[Path]]:
     return folder, [file, groups]
 
 
-def make_ngsim(folder: Path) -> tuple[Path, list[Path]]:
-    """Two cars, in both of the public forms."""
+def make_ngsim(folder: Path, site: str = "") -> tuple[Path, list[Path]]:
+    """Two cars, in either of the public forms: with a site's name or without."""
     rows = writers.ngsim_rows(count=25)
     rows += writers.ngsim_rows(vehicle=2, lane=1, local_x=6.0, count=25)
-    text = writers.ngsim_text(folder / "trajectories-0400-0415.txt", rows)
-    return folder, [text]
-
-
-def make_ngsim_csv(folder: Path) -> tuple[Path, list[Path]]:
-    """Two cars at a site that is named."""
-    rows = writers.ngsim_rows(count=25)
-    rows += writers.ngsim_rows(vehicle=2, lane=1, local_x=6.0, count=25)
-    file = writers.ngsim_csv(folder / "log.csv", rows, sites=["us-101"] * len(rows))
-    return folder, [file]
+    if site:
+        file = folder / "log.csv"
+        return folder, [writers.ngsim_csv(file, rows, sites=[site] * len(rows))]
+    return folder, [writers.ngsim_text(folder / "trajectories-0400-0415.txt", rows)]
 
 
 def make_ngsim_pairs(folder: Path) -> tuple[Path, list[Path]]:
@@ -213,11 +207,6 @@ def make_openacc(folder: Path) -> tuple[Path, list[Path]]:
     lines = log.read_text().splitlines()
     log.write_text("\n".join(lines[: 2 * ROWS]) + "\n")
     return fixture.input, [log, folder / "Vehicles_specifications.csv"]
-
-
-def make_argoverse2(folder: Path) -> tuple[Path, list[Path]]:
-    """A scenario and its map."""
-    return _whole(argoverse2.write(folder))
 
 
 def make_waymo(folder: Path) -> tuple[Path, list[Path]]:
@@ -301,12 +290,11 @@ def _decompress(folder: Path) -> None:
 
 def make_apollo(folder: Path) -> tuple[Path, list[Path]]:
     """A short drive in two parts; every tenth pose."""
-    found: dict[str, list] = {}
-    for item in apollo.drive():
-        if item[1] < SHORT_S:
-            found.setdefault(item[0], []).append(item)
     often = ("/apollo/localization/pose", "/apollo/canbus/chassis")
-    kept = [m for name, all_of in found.items() for m in all_of[:: _step(name, often)]]
+    short = [item for item in apollo.drive() if item[1] < SHORT_S]
+    kept = [item for item in short if item[0] not in often]
+    for name in often:
+        kept += [item for item in short if item[0] == name][::5]
     kept.sort(key=lambda item: item[1])
     files = [folder / f"2021.record.{part:05d}" for part in (0, 1)]
     half = len(kept) // 2
@@ -327,13 +315,11 @@ def make_ros2(folder: Path) -> tuple[Path, list[Path]]:
     return folder, [*files, bag / "metadata.yaml"]
 
 
-def _step(name: str, often: tuple[str, ...]) -> int:
-    return 5 if name in often else 1
-
-
 LOGS = {
     "apollo": log_target("apollo", make_apollo),
-    "argoverse2": log_target("argoverse2", make_argoverse2),
+    "argoverse2": log_target(
+        "argoverse2", lambda folder: _whole(argoverse2.write(folder))
+    ),
     "commonroad": log_target("commonroad", make_commonroad),
     "csv": several(
         log_target("csv", tables.make_csv),
@@ -355,7 +341,7 @@ LOGS = {
     ),
     "ngsim": several(
         log_target("ngsim", make_ngsim),
-        log_target("ngsim", make_ngsim_csv),
+        log_target("ngsim", functools.partial(make_ngsim, site="us-101")),
         log_target("ngsim", make_ngsim, "long_bytes = 1\n"),
     ),
     "ngsim_pairs": log_target("ngsim_pairs", make_ngsim_pairs),
