@@ -156,7 +156,8 @@ def row_name(reward: Reward) -> str:
     loss = str(reward.loss.get("name"))
     by_scene = "" if reward.context is None else ", by context"
     on = "" if reward.anchor is None else f", on {reward.anchor.incumbent}"
-    return f"{name.get(loss, loss)} {shape if hidden else 'linear'}{by_scene}{on}"
+    words = name.get(loss, loss.replace("_", " "))
+    return f"{words} {shape if hidden else 'linear'}{by_scene}{on}"
 
 
 def load_runs(

@@ -142,3 +142,7 @@ COLUMNS: dict[str, Callable[[Frame], jax.Array]] = {
     "sidepass_rear_distance": _nearest("sidepass_rear", "distance"),
     "sidepass_rear_speed": _nearest("sidepass_rear", "speed"),
 }
+
+# features that candidates of a scene do not share at t = 0: they say how a candidate
+# begins, not where (`FeatureMap.context` leaves them out)
+OF_CANDIDATE_AT_START = frozenset({"acceleration", "jerk"})

@@ -15,7 +15,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.features.columns import COLUMNS, Frame, candidate_frames, make_frame
+from rcirl_jax.features.columns import (
+    COLUMNS,
+    OF_CANDIDATE_AT_START,
+    Frame,
+    candidate_frames,
+    make_frame,
+)
 from rcirl_jax.runtime.specs import load_toml, spec_root
 from rcirl_jax.types import Candidates, Scene, Trajectory
 
@@ -44,7 +50,7 @@ class FeatureMap:
     @property
     def context(self) -> tuple[int, ...]:
         """Per feature: 1 if all candidates of a scene share it at t = 0."""
-        return tuple(int(n not in ("acceleration", "jerk")) for n in self.names)
+        return tuple(int(name not in OF_CANDIDATE_AT_START) for name in self.names)
 
     @property
     def names(self) -> tuple[str, ...]:

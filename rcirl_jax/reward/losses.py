@@ -15,16 +15,20 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+MARGIN_CEILING_M = 10.0  # m, distance beyond which the hinge asks for no more
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LossConfig:
-    """Constants of the losses. Each loss reads its own; sweeps may trace them."""
+    """Constants of the losses. Each loss reads its own; sweeps may trace them.
+
+    Every field has one of its name in `train.state.TrainConfig`, whose default holds.
+    """
 
     # rank: a, the slope for candidates below the human
     leaky_rate: ArrayLike = 0.05
-    # hinge: margin per metre of mean distance to the human, and its ceiling (m)
+    # hinge: margin per metre of mean distance to the human
     margin_distance: float = 0.2
-    margin_ceiling: float = 10.0
     # hinge: margin of a candidate that collides, and of one against the rules
     margin_collision: float = 4.0
     margin_rule: float = 2.0
@@ -82,7 +86,7 @@ def task_margin(c: Compared, config: LossConfig) -> Float[Array, "b k"]:
 
     Source: Ratliff et al. (ICML 2006), with the task loss of Sadat et al. (2019).
     """
-    near = jnp.minimum(c.distance, config.margin_ceiling)
+    near = jnp.minimum(c.distance, MARGIN_CEILING_M)
     return (
         config.margin_distance * near
         + config.margin_collision * c.collides

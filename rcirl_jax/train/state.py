@@ -57,16 +57,16 @@ LEARNED_FUTURES = (*FUTURES, "both")
 ADMISSIBLE_IN = ("none", "rehearsed", "all")
 
 
-# least, most, in words
+# least, most, in words; constants of losses are >= 0 unless they are named
 RANGES: dict[str, tuple[float, float, str]] = {
+    **dict.fromkeys(
+        [field.name for field in dataclasses.fields(LossConfig)], (0.0, np.inf, ">= 0")
+    ),
     **dict.fromkeys(
         ("leaky_rate", "learning_rate"), (1e-12, 1.0 - 1e-6, "between 0 and 1")
     ),
     **dict.fromkeys(
-        (
-            *("halve_every", "hard_negatives", "weight_decay", "clip_norm"),
-            *("margin_distance", "margin_collision", "margin_rule"),
-        ),
+        ("halve_every", "hard_negatives", "weight_decay", "clip_norm"),
         (0.0, np.inf, ">= 0"),
     ),
     **dict.fromkeys(("batch_size", "epochs", "hard_pool"), (1, np.inf, ">= 1")),
@@ -175,7 +175,7 @@ class TrainConfig:
     def loss_config(self) -> LossConfig:
         """Constants of the losses."""
         names = [field.name for field in dataclasses.fields(LossConfig)]
-        return LossConfig(**{n: getattr(self, n) for n in names if hasattr(self, n)})
+        return LossConfig(**{name: getattr(self, name) for name in names})
 
 
 class TrainState(flax.struct.PyTreeNode, kw_only=True):

@@ -1,7 +1,9 @@
 """Conformance of F: every feature of every preset."""
 
 import functools
+import re
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +14,7 @@ from hypothesis import strategies as st
 from rcirl_jax.errors import InputError
 from rcirl_jax.features import feature_map
 from rcirl_jax.features.columns import COLUMNS
+from rcirl_jax.runtime.specs import spec_root
 from rcirl_jax.sampling import (
     SamplerConfig,
     sample,
@@ -23,8 +26,13 @@ from rcirl_jax.units import TIMES_S
 from tests.features.oracle import point
 from tests.helpers.scenes import batch, random_positions, random_scene, scene, unfused
 
-PRESETS = ("paper21", "apollo21")
-UNITS = {"m", "1", "1/m", "s", "m/s", "m/s^2", "m/s^3"}
+PRESETS = sorted(path.stem for path in (spec_root() / "features").glob("*.toml"))
+UNIT = re.compile(r"1|(1|m|s|rad)(/(m|s))?(\^\d)?")
+# what a trajectory is without anybody else
+OWN_MOTION = (
+    *("l", "dl", "ddl", "curvature", "station", "time", "velocity", "speed_limit"),
+    *("acceleration", "jerk", "lateral_acceleration"),
+)
 JITTED = {preset: jax.jit(feature_map(preset)) for preset in PRESETS}
 FROM_POSITIONS = jax.jit(trajectory_from_positions)
 
@@ -37,9 +45,9 @@ def drive(seed):
 @pytest.mark.parametrize("preset", PRESETS)
 def test_declared(preset):
     features = feature_map(preset)
-    assert features.num_features == 21
+    assert features.num_features == int(re.search(r"\d+$", preset)[0])
     for spec in features.specs:
-        assert spec.unit in UNITS
+        assert UNIT.fullmatch(spec.unit)
         assert spec.meaning
         assert spec.lower <= spec.none <= spec.upper
 
@@ -71,6 +79,18 @@ def test_equals_the_oracle(preset, seed):
             assert found[i, column] == pytest.approx(
                 expected[name], rel=2e-4, abs=2e-3
             ), (name, i)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_none_values_without_obstacles(preset):
+    features = feature_map(preset)
+    empty = scene()
+    s = empty.ego.v * jnp.asarray(TIMES_S)
+    straight = FROM_POSITIONS(empty, s, jnp.zeros_like(s))
+    found = np.asarray(JITTED[preset](empty, straight))
+    for column, spec in enumerate(features.specs):
+        if spec.name not in OWN_MOTION:
+            assert (found[:, column] == spec.none).all(), spec.name
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -142,6 +162,32 @@ def test_classes_by_hand():
     assert at("stop_distance", s=12.45, kind=Kind.STOP, **line) == pytest.approx(10.0)
     virtual = at("virtual_distance", s=12.45, kind=Kind.VIRTUAL, **line)
     assert virtual == pytest.approx(10.0)
+
+
+def test_running_a_red_light_counts_once_and_only_on_red():
+    features = feature_map("paper21")
+    column = features.names.index("collision_distance")
+    red = np.zeros(TIMES_S.size, bool)
+    red[:9] = True
+
+    def closest(v, valid):
+        line = {"kind": Kind.STOP, "length": 0.0, "width": 40.0}
+        made = scene(v=v, boxes=[{"s": 30.0, "valid": valid, **line}])
+        s = v * jnp.asarray(TIMES_S)
+        drive = trajectory_from_positions(made, s, jnp.zeros_like(s))
+        return np.asarray(features(made, drive))[:, column]
+
+    assert (closest(10.0, red) < 0.0).sum() == 1
+    assert (closest(10.0, ~red) < 0.0).sum() == 0
+    assert (closest(1.0, red) < 0.0).sum() == 0
+
+
+def test_compiles_once_for_many_scenes():
+    features = feature_map("paper21")
+    counted = chex.assert_max_traces(features.__call__, n=1)
+    run = jax.jit(counted)
+    for seed in range(4):
+        run(*drive(seed))
 
 
 def test_unknown_preset_is_one_line():
