@@ -55,13 +55,9 @@ class ImportConfig:
         return self.leave_out > 0 or self.leave_out_share > 0.0
 
 
-def _number(table: dict[str, int], name: str) -> int:
-    """A name's number, in order of first appearance."""
-    return table.setdefault(name, len(table))
-
-
 def _numbers(table: dict[str, int], names: Iterable[str]) -> np.ndarray:
-    return np.array([_number(table, name) for name in names], np.int32)
+    """Numbers of names, in order of first appearance."""
+    return np.array([table.setdefault(name, len(table)) for name in names], np.int32)
 
 
 class Progress:
@@ -145,9 +141,8 @@ class _Import:
         self.rates: set[float] = set()
         self.next_shard = 0
         self.done: collections.deque[dict] = collections.deque()
-        for info in writer.committed():
+        for self.next_shard, info in enumerate(writer.committed(), 1):
             self.done += info.lineage
-            self.next_shard += 1
 
     @property
     def known(self) -> dict[str, str]:
@@ -162,7 +157,7 @@ class _Import:
         if not made.refused:
             self.sources[made.source] = made.licence
             self.rates.add(made.rate_hz)
-        number = _number(self.recordings, made.name)
+        number = self.recordings.setdefault(made.name, len(self.recordings))
         if self.done:
             self._replay(self.done.popleft(), made)
             return
@@ -308,10 +303,9 @@ class _Import:
     def _flags(self) -> dict:
         """What the manifest says of the settings; what is left out only where it is."""
         found = dataclasses.asdict(self.config)
-        for name in ("leave_out", "leave_out_share"):
-            if not found[name]:
-                del found[name]
-        return found | {"split_by": self.split_by}
+        unused = {name for name in ("leave_out", "leave_out_share") if not found[name]}
+        kept = {name: value for name, value in found.items() if name not in unused}
+        return kept | {"split_by": self.split_by}
 
 
 def import_logs(
@@ -374,8 +368,7 @@ def import_parts(
         parts = leaving_out(parts)
 
     def cuts(known: dict[str, str]) -> Iterable[Cut]:
-        settings = {"config": config.collect, "done": known}
-        work = functools.partial(cut_item, **settings)
+        work = functools.partial(cut_item, config=config.collect, done=known)
         return places.stream(work, items(parts, places.workers))
 
     return _import(cuts, len(parts), output, config, overwrite, before_commit)

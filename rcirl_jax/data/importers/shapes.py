@@ -128,6 +128,11 @@ def distances_to_lines(
     return found
 
 
+def distance_to_line(points: np.ndarray, line: np.ndarray) -> np.ndarray:
+    """Distance [n] m of points [n, 2] from one polyline [m >= 1, 2]."""
+    return distances_to_lines(points, [line], np.zeros(len(points), np.int64))
+
+
 def line_across(
     centre: np.ndarray, left: np.ndarray, right: np.ndarray, point: np.ndarray
 ) -> np.ndarray:

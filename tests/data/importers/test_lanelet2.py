@@ -102,7 +102,6 @@ def test_two_way_lanes_and_those_of_others(lanes):
     ("tags", "kept"),
     [
         ({"subtype": "bicycle_lane"}, False),
-        ({"subtype": "crosswalk"}, False),
         ({"subtype": "highway"}, True),
         ({"subtype": "walkway", "participant:vehicle": "yes"}, True),
         ({"subtype": "road", "participant:pedestrian": "yes"}, False),
@@ -124,14 +123,10 @@ def test_participants(tmp_path, tags, kept):
         ("50 km/h", 50 / 3.6),
         ("50", 50 / 3.6),
         ("40mph", 40 * 0.44704),
-        ("12.5 mps", 12.5),
         ("de274-60", 60 / 3.6),
         ("de274", None),
         ("fast", None),
-        ("0", None),
         ("900 km/h", None),
-        (f"50{400 * ' '}km/h", 50 / 3.6),
-        (f"{300_000 * '5'}", None),
         # minutes, if the time were the square of the spaces
         (f"50{300_000 * ' '}!", None),
     ],

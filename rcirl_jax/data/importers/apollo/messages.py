@@ -261,7 +261,8 @@ class _Channel:
         message = self._reading.parse(bytes(content))
         row = ()
         for row in self._type.read(message):
-            self._values.extend((time, *row))
+            self._values.append(time)
+            self._values.extend(row)
         self._width = max(self._width, 1 + len(row))
 
     def count(self) -> int:

@@ -102,7 +102,6 @@ HEAD = '<commonRoad commonRoadVersion="2020a" timeStepSize="x"/>'
 # what is written, and what the line says
 HARMS = {
     "lanelet: none": file_of(w.car()),
-    "tracks: none": file_of(w.lanelet()),
     "state 1: velocity: missing": moved(w.state(1, 1.5, 0, drop=("velocity",))),
     "x: 'nan'": moved(w.state(1, "nan", 0)),
     "feet taken for metres": moved(*FEET),

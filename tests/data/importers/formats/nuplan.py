@@ -341,7 +341,9 @@ HARMS = {
     "lidar_box.x: '1.5 m': expected a number": set_to("lidar_box", "x", "'1.5 m'"),
     "lidar_box: x: nan": set_to("lidar_box", "x", "NULL"),
     "length: -1 m: expected 0 to": set_to("lidar_box", "length", "-1"),
-    "track_token: 'abc': expected a": set_to("lidar_box", "track_token", "'abc'"),
+    "track_token: of no track: expected a track": set_to(
+        "lidar_box", "track_token", "'abc'"
+    ),
     "track_token: ": sql(0, "DELETE FROM track"),
     "category.name: 'alien': expected one": set_to("category", "name", "'alien'"),
     "ego_pose.x: NULL: expected a number": set_to("ego_pose", "x", "NULL"),
