@@ -25,7 +25,7 @@ Importer = Callable[[Path, dict], Iterator[Recording]]
 # a folder each, whose `reader` is loaded only when the format is asked for
 IMPORTERS = (
     *("apollo", "argoverse2", "commonroad", "csv", "interaction", "l5", "levelx"),
-    *("ngsim", "ngsim_pairs", "nuplan", "openacc", "synthetic", "waymo"),
+    *("ngsim", "ngsim_pairs", "nuplan", "openacc", "ros2", "synthetic", "waymo"),
 )
 
 # formats of which one part (see `parts`) is a file with a few recordings
@@ -39,7 +39,7 @@ SMALL_PARTS = (
 )
 # formats of which one part is a file with many recordings, and the bytes of the
 # longest one whose scenes may be held at once (docs/formats, "Large inputs")
-SHARD_BYTES = {"apollo": 2**28, "nuplan": 2**28, "waymo": 2**30}
+SHARD_BYTES = {"apollo": 2**28, "nuplan": 2**28, "ros2": 2**28, "waymo": 2**30}
 # formats whose packaged TOML says what holds where a user's own says nothing
 DECLARED = ("interaction", "levelx", "ngsim", "ngsim_pairs", "openacc")
 # formats of which one part is a file that is read in pieces where it is long
