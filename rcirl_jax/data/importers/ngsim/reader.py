@@ -149,8 +149,13 @@ def _has_stamps(table: Table) -> bool:
     fields = Columns(needed={CLOCK: COLUMNS[CLOCK]}, called={CLOCK: column})
     uncounted = Ledger(path=table.path)
     read = (part[CLOCK] for part in batches(table, fields.fields(table), uncounted))
-    ends = np.array([(part.min(), part.max()) for part in read if part.size])
-    return bool(ends.size and ends.min() > 0.0 and ends.max() > ends.min())
+    lowest, highest = np.inf, -np.inf
+    for part in read:
+        if part.size:
+            lowest, highest = min(lowest, part.min()), max(highest, part.max())
+        if lowest <= 0.0:
+            return False
+    return bool(highest > lowest)
 
 
 def _open(path: Path, spec: dict) -> tuple[Table, Ledger]:
