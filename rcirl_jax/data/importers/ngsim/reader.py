@@ -146,6 +146,8 @@ def _has_stamps(table: Table) -> bool:
     column = _column(table, CLOCK)
     if not table.has(column):
         return False
+    if any(cell and not cell.strip("0.") for cell in table.samples(column)):
+        return False  # nothing else is read where the first rows say 0
     fields = Columns(needed={CLOCK: COLUMNS[CLOCK]}, called={CLOCK: column})
     uncounted = Ledger(path=table.path)
     read = (part[CLOCK] for part in batches(table, fields.fields(table), uncounted))
