@@ -146,11 +146,18 @@ def _has_stamps(table: Table) -> bool:
     column = _column(table, CLOCK)
     if not table.has(column):
         return False
+    if any(cell and not cell.strip("0.") for cell in table.samples(column)):
+        return False  # nothing else is read where the first rows say 0
     fields = Columns(needed={CLOCK: COLUMNS[CLOCK]}, called={CLOCK: column})
     uncounted = Ledger(path=table.path)
     read = (part[CLOCK] for part in batches(table, fields.fields(table), uncounted))
-    ends = np.array([(part.min(), part.max()) for part in read if part.size])
-    return bool(ends.size and ends.min() > 0.0 and ends.max() > ends.min())
+    lowest, highest = np.inf, -np.inf
+    for part in read:
+        if part.size:
+            lowest, highest = min(lowest, part.min()), max(highest, part.max())
+        if lowest <= 0.0:
+            return False
+    return bool(highest > lowest)
 
 
 def _open(path: Path, spec: dict) -> tuple[Table, Ledger]:
