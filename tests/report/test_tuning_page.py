@@ -23,6 +23,7 @@ from tests.report.test_data_page import HOSTILE, Page
 from tests.report.tuning_case import PLAYED
 
 MAX_BYTES = 3e6
+ANCHORS = re.compile(r'<section id="(\w+)"')
 
 
 def section(page, anchor):
