@@ -12,6 +12,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from rcirl_jax.data.recording import MAX_SPEED_MPS
 from rcirl_jax.data.scenes import filters, labels
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.data.scenes.lanes import LaneFrame, LaneGraph, project
@@ -322,6 +323,8 @@ class Collector:
         s = s - motion.s0
         seen = valid & (s > -VIEW_BEHIND_M) & (s < GRID_M[-1])
         seen &= np.abs(l - motion.l[0]) < VIEW_BESIDE_M
+        # where a road meets itself, the nearest station jumps
+        seen &= np.abs(speed) < MAX_SPEED_MPS
         apart = np.abs(s - motion.v0 * TIMES_S) + 4.0 * np.abs(l - motion.l[0])
         relevance = np.min(np.where(seen, apart, np.inf), axis=1)
         order = np.argsort(relevance, kind="stable")

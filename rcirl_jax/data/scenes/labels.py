@@ -88,6 +88,22 @@ def _decide_line(scenes: dict, speed: np.ndarray) -> np.ndarray:
     return np.where(stands.any(axis=-1), Decision.STOP, Decision.IGNORE)
 
 
+def _changes_lane(scenes: dict) -> np.ndarray:
+    """[...] bool: moves by half a lane's width, towards where the road has a lane.
+
+    Where it has none, positions that wander change no lane.
+    """
+    valid, l = scenes["time_valid"], scenes["human.l"]
+    half = 0.5 * lane_width(scenes)
+    found = np.zeros(half.shape, bool)
+    for side, name in ((1.0, "left"), (-1.0, "right")):
+        lane = side * scenes[f"path.lane_{name}"]
+        room = np.max(side * scenes[f"path.road_{name}"] - lane, axis=-1)
+        move = np.max(np.where(valid, side * (l - l[..., :1]), 0.0), axis=-1)
+        found |= (move > half) & (room > half)
+    return found
+
+
 def _at(values: np.ndarray, index: np.ndarray) -> np.ndarray:
     """The values [..., k] at one index [...] of their last axis."""
     return np.take_along_axis(values, index[..., None], axis=-1)[..., 0]
@@ -97,7 +113,7 @@ def _tags(
     scenes: dict, decisions: np.ndarray, met: Meetings, speed: np.ndarray
 ) -> np.ndarray:
     """[..., G] bool."""
-    valid, s, l = scenes["time_valid"], scenes["human.s"], scenes["human.l"]
+    valid, s = scenes["time_valid"], scenes["human.s"]
     end = valid.shape[-1] - 1 - np.argmax(valid[..., ::-1], axis=-1)  # [...]
     early, late = speed[..., 0], _at(speed, end)
     slowest = np.min(np.where(valid, speed, np.inf), axis=-1)
@@ -105,7 +121,6 @@ def _tags(
     kappa, kind = scenes["path.kappa"], scenes["obstacles.kind"]
     driven = np.arange(kappa.shape[-1]) * STATION_STEP_M <= _at(s, end)[..., None]
     bend = np.abs(np.sum(np.where(driven, kappa, 0.0), axis=-1) * STATION_STEP_M)
-    aside = np.max(np.where(valid, np.abs(l - l[..., :1]), 0.0), axis=-1)
     # without `is_light` a stop sign cannot be told from a red light
     light = scenes.get(IS_LIGHT, kind == Kind.STOP) & (kind == Kind.STOP)
     is_red = light & scenes["obstacles.valid"][..., 0]
@@ -115,7 +130,7 @@ def _tags(
         Tag.CRUISING: (fastest - slowest < CRUISE_RANGE_MPS) & (slowest > CRUISE_MPS),
         Tag.FOLLOWING: (decisions == Decision.FOLLOW).any(axis=-1),
         Tag.TURNING: bend > TURN_RAD,
-        Tag.LANE_CHANGE: aside > 0.5 * lane_width(scenes),
+        Tag.LANE_CHANGE: _changes_lane(scenes),
         Tag.YIELDING: (decisions == Decision.YIELD).any(axis=-1),
         Tag.OVERTAKING: (decisions == Decision.OVERTAKE).any(axis=-1),
         Tag.NUDGING: (decisions >= Decision.NUDGE_LEFT).any(axis=-1),

@@ -57,6 +57,7 @@ BOUNDS = ("s_lower", "s_upper", "l_lower", "l_upper")
 FIELDS = (
     *(f"obstacles.{name}" for name in (*BOUNDS, "speed", "valid", "kind")),
     *("human.s", "human.l", "path.l", "path.lane_left", "path.lane_right"),
+    *("path.road_left", "path.road_right"),
     *("ego.length", "ego.width", "time_valid"),
 )
 
@@ -76,6 +77,7 @@ class Meetings:
     s: np.ndarray  # m, the obstacle's middle
     l: np.ndarray  # m
     path_l: np.ndarray  # m, the human's own path at the obstacle's station
+    on_road: np.ndarray  # bool, its middle is on a lane that goes the human's way
     speed: np.ndarray  # m/s, of the obstacle along the path
     human_l: np.ndarray  # [..., 1, T] m
     human_speed: np.ndarray  # [..., 1, T] m/s
@@ -134,6 +136,8 @@ def meetings(scenes: dict) -> Meetings:
         s=s,
         l=l,
         path_l=path_l,
+        on_road=(l < _path_at(scenes["path.road_left"], s))
+        & (l > _path_at(scenes["path.road_right"], s)),
         speed=scenes["obstacles.speed"],
         human_l=human_l,
         human_speed=human_speed(scenes)[..., None, :],
@@ -150,7 +154,7 @@ def lane_width(scenes: dict) -> np.ndarray:
 
 
 def _path_at(path: np.ndarray, s: np.ndarray) -> np.ndarray:
-    """[..., N, T] m, lateral offset of the human's own path [..., P] at stations s.
+    """[..., N, T] m, of a number [..., P] along the human's path at stations s.
 
     Linear between the stations of the path, constant beyond its ends.
     """
@@ -217,7 +221,7 @@ def follows(m: Meetings) -> np.ndarray:
     there = m.on_path | (m.ahead & m.in_line(0.5))
     begin, end = first(there), last(there)
     seconds = np.count_nonzero(there, axis=-1) * (TIMES_S[1] - TIMES_S[0])
-    to_the_end = (end == last(m.seen)) & (at(m.speed, end) > MOVING_MPS)
+    to_the_end = end == last(m.seen)
     to_the_end &= (seconds >= TO_THE_END_S) | is_lead(m)
     along = at(m.s, end) - at(m.s, begin)
     across = np.abs(at(m.l - m.path_l, end) - at(m.l - m.path_l, begin))
@@ -236,9 +240,10 @@ def is_lead(m: Meetings) -> np.ndarray:
 def comes(m: Meetings, seconds: float, metres: float) -> np.ndarray:
     """[..., N] bool: comes onto the path as the nearest ahead, and near.
 
-    It moves towards the path itself, by more than the path moves towards it; who is
-    ahead from the start does not come. Near is a gap below `seconds` of the human's
-    speed and `metres`.
+    It moves towards the path itself, by more than the path moves towards it, and from
+    a lane beside or by more than a lane: positions that wander on a single lane
+    do not come. Nor does who is ahead from the start. Near is a gap below `seconds`
+    of the human's speed and `metres`.
     """
     there = m.blocks & m.ahead
     index, begin, end = first(there), first(m.seen), last(m.on_path)
@@ -249,6 +254,7 @@ def comes(m: Meetings, seconds: float, metres: float) -> np.ndarray:
     offset = np.abs(m.l - m.path_l)
     towards = at(offset, end) < at(offset, begin) - OWN_MOVE_M
     moves = (own > path) & towards
+    moves &= at(m.on_road, begin) | (own > m.lane[..., 0])
     return m.on_path.any(axis=-1) & ~is_lead(m) & moves & is_nearest & near
 
 
