@@ -13,6 +13,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import psutil
 
 from experiments.flags.common import processor, provenance
 from rcirl_jax.data.importers import read_recordings
@@ -91,8 +92,7 @@ def write(
 
 def resident_mb() -> float:
     """Memory of this process now, MiB."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+    return psutil.Process().memory_info().rss / 2**20
 
 
 @contextlib.contextmanager

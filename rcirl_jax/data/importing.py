@@ -22,7 +22,7 @@ import tqdm
 from rcirl_jax.data.cut import Cut, cut, cut_item, whole_of
 from rcirl_jax.data.parts import Part, items, leaving_out
 from rcirl_jax.data.scenes.config import CollectConfig
-from rcirl_jax.data.scenes.quality import QualityReport
+from rcirl_jax.data.scenes.quality import QualityReport, remedies
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.data.store.files import Files
 from rcirl_jax.data.store.manifest import Manifest
@@ -47,6 +47,13 @@ class ImportConfig:
     split_seed: int = 0
     # recordings that may be refused and are left out; the next one ends the import
     leave_out: int = 0
+    # share of all recordings that may be refused, in place of a count
+    leave_out_share: float = 0.0
+
+    @property
+    def leaves_out(self) -> bool:
+        """Whether any recording may be refused and left out."""
+        return self.leave_out > 0 or self.leave_out_share > 0.0
 
 
 class _Numbers:
@@ -129,6 +136,7 @@ class _Import:
         self.recordings, self.groups = _Numbers(), _Numbers()
         self.vehicles = _Numbers()
         self.quality = QualityReport()
+        self.first_refused = ""  # in words
         self.sizes: dict[str, int] = {}
         # of the scenes in `pending`: name and first sight of each one's vehicle
         self.pending: list[Demonstration] = []
@@ -153,6 +161,7 @@ class _Import:
         """Take over one recording's scenes."""
         if made.name in self.recordings.table:
             raise InputError(f"{made.name}: name: met twice: expected once")
+        self.first_refused = self.first_refused or made.refused or ""
         if not made.refused:
             self.sources[made.source] = made.licence
             self.rates.add(made.rate_hz)
@@ -178,7 +187,8 @@ class _Import:
             self.drivers += zip(made.vehicles, made.first_seen, strict=True)
             self.logs.add(made.log)
         self._count(entry)
-        if self.quality.refused > self.config.leave_out:
+        too_many = self.quality.refused > self.config.leave_out
+        if too_many and not self.config.leave_out_share:
             raise InputError(
                 f"{made.refused}; recordings left out before: {self.config.leave_out}"
             )
@@ -255,11 +265,16 @@ class _Import:
                 f"{self.done[0]['name']}: missing: expected all recordings of the "
                 "interrupted import; use another --output"
             )
+        self._check_share_left_out()
         if self.quality.scenes == 0:
-            drops = {k: v for k, v in self.quality.dropped.items() if v}
+            if self.quality.empty and not self.quality.recordings:
+                raise InputError(
+                    f"import: {self.quality.empty} recordings, none with traffic: "
+                    "expected at least one road user"
+                )
+            why = remedies(self.quality.dropped) or "none was long enough"
             raise InputError(
-                f"import: 0 scenes kept of {self.quality.tracks} tracks: "
-                f"dropped because {drops}: expected at least one scene"
+                f"import: 0 scenes kept of {self.quality.tracks} tracks: {why}"
             )
         self._split_one_group()
         self._close_shard()
@@ -288,11 +303,22 @@ class _Import:
             before_commit,
         )
 
+    def _check_share_left_out(self) -> None:
+        refused, share = self.quality.refused, self.config.leave_out_share
+        recordings = len(self.recordings.table)
+        if share and refused > share * recordings:
+            raise InputError(
+                f"import: {refused} of {recordings} recordings refused, the first: "
+                f"{self.first_refused}: expected up to {100.0 * share:g} % "
+                "(--leave_out)"
+            )
+
     def _flags(self) -> dict:
-        """What the manifest says of the settings; `leave_out` only where it is used."""
+        """What the manifest says of the settings; what is left out only where it is."""
         found = dataclasses.asdict(self.config)
-        if not found["leave_out"]:
-            del found["leave_out"]
+        for name in ("leave_out", "leave_out_share"):
+            if not found[name]:
+                del found[name]
         return found | {"split_by": self.split_by}
 
 
@@ -352,7 +378,7 @@ def import_parts(
       InputError: as `import_logs`.
     """
     places = executor or Here()
-    if config.leave_out:
+    if config.leaves_out:
         parts = leaving_out(parts)
 
     def cuts(known: dict[str, str]) -> Iterable[Cut]:

@@ -36,6 +36,13 @@ def refused(call, *args, **options):
     return line
 
 
+def edit(path, old, new, count=1):
+    """Put other text where `old` stands in a file."""
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, count))
+
+
 def lanes_of(recording):
     """Lanes by their ids."""
     return {lane.id: lane for lane in recording.lanes}

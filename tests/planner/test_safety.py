@@ -123,24 +123,32 @@ def test_a_body_that_slips_through_between_two_times_is_caught():
     assert float(found[0]) == pytest.approx(float(TIMES_S[4]))
 
 
-def test_lines_are_walls_until_they_are_passed():
-    wall = with_obstacle(Kind.STOP, 30.0, 0.0, length=0.1, width=40.0)
-    assert not bool(judge(wall, straight(wall, 10.0)).admissible[0])
-    assert bool(judge(wall, straight(wall, 2.0)).admissible[0])
-    passed = with_obstacle(Kind.STOP, 1.0, 0.0, length=0.1, width=40.0)
-    assert bool(judge(passed, straight(passed, 10.0)).admissible[0])
+def on_path(made, **changes):
+    flat = jnp.ones_like(made.path.l)
+    paths = {name: value * flat for name, value in changes.items()}
+    return made.replace(path=made.path.replace(**paths))
 
 
-def test_road_edge_and_speed_limit():
-    free = with_obstacle(Kind.NONE, 0.0, 0.0)
-    assert bool(judge(free, straight(free, 10.0)).admissible[0])
-    narrow = free.replace(path=free.path.replace(
-        road_right=jnp.where(jnp.arange(128) > 15, -0.5, -6.0)))  # fmt: skip
-    assert not bool(judge(narrow, straight(narrow, 10.0)).admissible[0])
-    slow = free.replace(path=free.path.replace(
-        speed_limit=jnp.full_like(free.path.l, 8.0)))  # fmt: skip
-    assert not bool(judge(slow, straight(slow, 10.0)).admissible[0])
-    assert bool(judge(slow, straight(slow, 7.9)).admissible[0])
+FREE = with_obstacle(Kind.NONE, 0.0, 0.0)
+LINE = {"length": 0.1, "width": 40.0}
+
+
+@pytest.mark.parametrize(
+    ("made", "v", "admissible"),
+    [
+        (FREE, 10.0, True),
+        (with_obstacle(Kind.STOP, 30.0, 0.0, **LINE), 10.0, False),
+        (with_obstacle(Kind.STOP, 30.0, 0.0, **LINE), 2.0, True),
+        # passed already
+        (with_obstacle(Kind.STOP, 1.0, 0.0, **LINE), 10.0, True),
+        (on_path(FREE, road_right=jnp.where(jnp.arange(128) > 15, -0.5, -6.0)), 10.0,
+         False),
+        (on_path(FREE, speed_limit=8.0), 10.0, False),
+        (on_path(FREE, speed_limit=8.0), 7.9, True),
+    ],
+)  # fmt: skip
+def test_lines_road_edges_and_limits(made, v, admissible):
+    assert bool(judge(made, straight(made, v)).admissible[0]) is admissible
 
 
 def test_distance_to_the_leader_follows_rss():

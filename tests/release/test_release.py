@@ -100,8 +100,6 @@ def test_users_get_the_versions_that_are_tested():
     assert {(pin.name, str(pin.specifier)) for pin, _ in pins("all")} <= tested
 
 
-# -------------------------------------------------------------------- advisories
-
 KNOWN = {"vulns": [{"id": "X-1", "fix_versions": ["2.0.1"]}]}
 
 
@@ -138,9 +136,6 @@ def test_an_audit_that_nobody_answers_is_not_passed(tmp_path, answer, status, sa
     assert said in line
 
 
-# ------------------------------------------------------------------------- wheel
-
-
 def test_the_wheel_holds_what_the_package_reads(tmp_path):
     builder = WheelBuilder(str(REPO))
     (wheel,) = builder.build(directory=str(tmp_path), versions=["standard"])
@@ -155,9 +150,6 @@ def test_the_wheel_holds_what_the_package_reads(tmp_path):
     assert len(wanted) > 300
     assert wanted <= packed
     assert {"rcirl_jax/py.typed", "licenses/LICENSE", "licenses/NOTICE"} <= packed
-
-
-# ------------------------------------------------------------------------ commit
 
 
 def git(folder, *words):
@@ -188,24 +180,19 @@ def commit_of(root, monkeypatch):
 
 
 def test_the_commit_is_the_checkouts_that_knows_the_package(repository, monkeypatch):
+    """Not of one that a package lies beside, as by `pip install --target=.`."""
     head = git(repository, "rev-parse", "HEAD")
+    own = repository / "experiments" / "flags" / "common.py"
     assert commit_of(repository, monkeypatch) == head
-    (repository / "experiments" / "flags" / "common.py").write_text("2")
+    own.write_text("2")
     assert commit_of(repository, monkeypatch) == head + "+"
     with monkeypatch.context() as patch:
         patch.setattr(shutil, "which", lambda name: None)
         assert commit_of(repository, patch) == ""
-    inside = repository / "venv" / "site-packages"
-    inside.mkdir(parents=True)
-    assert commit_of(inside, monkeypatch) == ""
-    monkeypatch.setenv("GIT_DIR", str(repository / ".git"))
-    assert commit_of(inside, monkeypatch) == ""
-
-
-def test_a_package_put_beside_the_files_of_another_repository(repository, monkeypatch):
-    """As `pip install --target=.` does: git does not know it."""
     git(repository, "mv", "experiments", "theirs")
     git(repository, "commit", "--quiet", "--message=second")
-    (repository / "experiments" / "flags").mkdir(parents=True)
-    (repository / "experiments" / "flags" / "common.py").write_text("1")
+    own.parent.mkdir(parents=True)
+    own.write_text("1")
     assert commit_of(repository, monkeypatch) == ""
+    monkeypatch.setenv("GIT_DIR", str(repository / ".git"))
+    assert commit_of(repository / "venv", monkeypatch) == ""

@@ -11,18 +11,16 @@ from rcirl_jax.report.player.replays import AHEAD_M, BEHIND_M, FRAME_STEPS, make
 from rcirl_jax.simulation import rollout
 from rcirl_jax.simulation import suite as suite_module
 from rcirl_jax.simulation.cases import STEP_S
-from rcirl_jax.simulation.recorded.config import RecordedConfig
+from rcirl_jax.simulation.recorded.scenes import held_out
 from rcirl_jax.simulation.rollout import LANES, drive_cases
 from rcirl_jax.simulation.suite import (
-    catalogue_set,
     drive_row,
     drive_with_logs,
     recorded_set,
     rollout_config,
-    suite_refs,
 )
 from tests.report.tuning_case import PLAYED, SECONDS, cheap_rows, small_cases
-from tests.simulation.test_recorded import traffic
+from tests.simulation.stored import Rows, stored
 
 
 def driven(row, cases, count):
@@ -105,18 +103,6 @@ def test_a_crash_ends_the_drive_and_shows_who_was_hit(replays):
         assert plan == pytest.approx([k * speed for k in (1, 2, 3, 4, 5)], abs=0.4)
 
 
-@pytest.mark.slow
-def test_a_red_light_is_among_what_failed():
-    refs = suite_refs("red_light", 1)
-    (one,) = make_replays(cheap_rows()[:1], catalogue_set(refs, 10.0), [refs[0].id], 1)
-    (drive,) = one.drives
-    assert [what for _, what in drive.events] == ["red light run"]
-    assert drive.summary.endswith("fails red lights")
-    assert any(drive.red)
-    at = round(drive.start / one.frame_s) - 1
-    assert one.lines[drive.red[at][0]] - drive.s[at] < 4.0  # its front is at the line
-
-
 def test_a_case_that_the_suite_does_not_have():
     with pytest.raises(InputError, match="cut_in/007@0: expected a case"):
         make_replays(cheap_rows(), small_cases(), ["cut_in/007@0"], 1)
@@ -124,9 +110,8 @@ def test_a_case_that_the_suite_does_not_have():
 
 
 @pytest.mark.slow
-def test_the_recorded_human_drives_beside_the_others(tmp_path):
-    config = RecordedConfig(max_duration_s=6.0, max_cases=1, smoothing_s=0.0, steps=60)
-    cases = recorded_set([traffic(tmp_path, "urban_turn_left")], config)
+def test_the_recorded_human_drives_beside_the_others():
+    cases = recorded_set(held_out([Rows(stored(1))], 1))
     (one,) = make_replays(cheap_rows(), cases, cases.ids, 1)
     assert [drive.row for drive in one.drives] == [
         "candidate", "hand-set", "recorded human",

@@ -11,7 +11,6 @@ from rcirl_jax.data.store.rows import row_spec
 from rcirl_jax.errors import InputError
 from rcirl_jax.report.data import scene_picture
 from rcirl_jax.report.data.scene_picture import draw_scene
-from rcirl_jax.report.data.scene_view import describe_scene
 from rcirl_jax.types import Decision, Kind, Tag
 from rcirl_jax.units import TIMES_S
 
@@ -94,16 +93,6 @@ def test_boxes_and_bars_stand_where_the_obstacles_are(drawn):
         wanted = getattr(rows.scene.obstacles, name)[CAR][valid]
         np.testing.assert_allclose(ends[:, side, 1], wanted)
     assert not of_slot(graph, PEDESTRIAN)  # beside the driver's path
-
-
-def test_the_legend_and_the_words_name_every_slot(drawn):
-    (legend,) = drawn(scene()).legends
-    words = [text.get_text() for text in legend.get_texts()]
-    for expected in ("follow: 0", "stop: 1", "nudge left: 2", "ignore: 3"):
-        assert expected in words
-    said = describe_scene(scene(), 7)
-    for expected in ("Scene 7", "Vehicle 0, 20 m", "Pedestrian 2, 30 m"):
-        assert expected in said
 
 
 def test_what_cannot_be_drawn_is_one_line(tmp_path):

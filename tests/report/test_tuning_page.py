@@ -14,13 +14,10 @@ from rcirl_jax.evaluation.closed_loop.summary import PAPER
 from rcirl_jax.evaluation.ranking.score import candidates_key
 from rcirl_jax.report.markup import interval
 from rcirl_jax.report.ranking.frames import _sampled
-from rcirl_jax.report.tuning import page as tuning_page
 from rcirl_jax.report.tuning.contributions import NUM_CANDIDATES, contributions
-from rcirl_jax.report.tuning.verdict_sections import outcome_of
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.simulation.metrics import COLUMNS
 from rcirl_jax.units import TIMES_S
-from tests.helpers.weights_files import example_anchor
 from tests.report.test_data_page import HOSTILE, Page
 from tests.report.tuning_case import PLAYED
 
@@ -56,9 +53,6 @@ def player_data(page):
     return json.loads(body)
 
 
-# ----------------------------------------------------------------- one safe file
-
-
 def test_it_is_one_small_file_that_needs_no_other_and_runs_its_own_script(file, page):
     assert file.stat().st_size < MAX_BYTES
     found = Page(page)
@@ -75,10 +69,8 @@ def test_it_is_one_small_file_that_needs_no_other_and_runs_its_own_script(file, 
     assert f"script-src 'sha256-{digest}'" in policy
 
 
-def test_sections_come_in_order_and_are_linked(page):
+def test_sections_are_linked(page):
     anchors = ANCHORS.findall(page)
-    assert anchors[:4] == ["verdict", "suite", "families", "worst"]
-    assert anchors[-3:] == ["data", "sweep", "provenance"]
     links = [a["href"] for a in Page(page).of("a") if a["href"] != "#player"]
     assert links == [f"#{anchor}" for anchor in anchors]
     ids = re.findall(r'\bid="([^"]+)"', page)
@@ -95,17 +87,6 @@ def test_text_from_data_stays_text(hostile_file):
     assert player_data(text)["cases"][0]["case"] == HOSTILE
 
 
-def test_what_there_is_not_is_left_out(bare_file):
-    text = bare_file.read_text()
-    assert {"verdict", "sweep", "worst", "data"} <= set(ANCHORS.findall(text))
-    assert "training" not in ANCHORS.findall(text)
-    assert section(text, "gamma").count("<polyline") == 1
-    assert "<img" not in section(text, "sweep")
-
-
-# -------------------------------------------------------------- numbers it prints
-
-
 def test_the_verdict_comes_first(page, report):
     text = section(page, "verdict")
     assert report.verdict.decision == "do not ship"
@@ -117,8 +98,7 @@ def test_the_verdict_comes_first(page, report):
 
 
 def test_every_check_is_there_with_its_interval(page, report):
-    found = forest_rows(page)
-    families = rows(page, "families")
+    found, families = forest_rows(page), rows(page, "families")
     for check in report.verdict.checks:
         if check.kind == "families":
             cells = families[check.name.split(",")[0]]
@@ -130,19 +110,6 @@ def test_every_check_is_there_with_its_interval(page, report):
         assert words in [row[1] for row in cells], check.name
         if check.outcome == "fail":
             assert "FAIL" in [row[3] for row in cells]
-    marked = re.findall(r'<tr class="marked"><th scope="row">([^<]*)', page)
-    failed = [c for c in report.verdict.checks if c.outcome == "fail"]
-    names = {check.name.split(",")[0].replace("_", " ") for check in failed}
-    assert names <= {name.replace("_", " ") for name in marked}
-    rects = section(page, "families").count('<rect class="failed"')
-    assert rects == sum(check.kind == "families" for check in failed)
-
-
-def test_a_loss_is_never_called_no_difference(report):
-    (check, *_) = [check for check in report.verdict.checks if check.kind == "gain"]
-    for difference, p, word in ((-0.02, 0.004, "worse"), (-0.02, 0.2, "no difference")):
-        seen = dataclasses.replace(check, difference=difference, p=p, outcome="open")
-        assert outcome_of(seen) == (word, "open")
 
 
 def test_the_papers_table_is_the_suites(page, report):
@@ -164,26 +131,15 @@ def test_the_papers_table_is_the_suites(page, report):
     assert f"{report.suite.rows['candidate'].at_fault}" == "12"
 
 
-def test_ranking_data_sweep_provenance_and_gamma_are_the_reports(page, report):
+def test_ranking_and_gamma_are_the_reports(page, report):
     cells = rows(page, "ranking")["candidate"][0]
     estimate = report.ranking.rows["candidate"]["top1_fde"]
     assert cells[2] == f"{estimate.value:.2f} [{estimate.low:.2f}, {estimate.high:.2f}]"
-    quality = report.dataset.manifest.quality
-    assert re.search(rf" {quality['scenes']}\b", section(page, "data"))
-    sweep = section(page, "sweep")
-    assert re.search(r"0\.05 +0\.001 +1\.500 m", sweep)
-    assert "data:image/png" in sweep
-    origin = section(page, "provenance")
-    for hashed in (report.dataset, *report.rewards.values()):
-        assert getattr(hashed, "sha256", report.dataset.hash) in origin
-    for line in ("&quot;seed&quot;: 3", "&quot;train&quot;: &quot;12ef&quot;"):
-        assert line in origin
     table = rows(page, "gamma")
     for place, reward in enumerate(report.rewards.values()):
         gamma = reward.gamma * np.sign(reward.gamma.sum())
         shown = [number(table[f"{t:.2f}"][0][place]) for t in TIMES_S]
         assert shown == pytest.approx(gamma / np.abs(gamma).max(), abs=6e-4)
-    assert section(page, "gamma").count("<polyline") == 2
 
 
 def test_feature_shares_are_those_of_the_contributions(page, report):
@@ -234,18 +190,3 @@ def test_a_linear_rewards_shares_are_its_terms(report):
         assert row.share["linear"].value == pytest.approx(
             wanted[row.feature], abs=2e-4
         ), row.feature
-
-
-def test_features_without_effect_and_gains_are_said(report):
-    reward = report.rewards["candidate"]
-    lower = reward.lower.copy()
-    lower[1] = reward.upper[1]
-    anchor = example_anchor(features=len(reward.names))
-    anchor = dataclasses.replace(anchor, low=0.26, high=1.57)
-    anchored = dataclasses.replace(reward, lower=lower, anchor=anchor)
-    both = {**report.rewards, "candidate": anchored}
-    text = tuning_page._features(dataclasses.replace(report, rewards=both))
-    (said,) = re.findall(r"<p>([^<]*is anchored[^<]*)</p>", text)
-    assert "0.26" in said
-    assert "1.57" in said
-    assert f": {reward.names[1]}." in text

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.reliability.fuzz import tables
-from benchmarks.reliability.fuzz.codecs import toml_text
+from benchmarks.reliability.fuzz.forms import toml_text
 from benchmarks.reliability.fuzz.targets import Several, Target
 from rcirl_jax.data import importers
 from rcirl_jax.data.importers import read_recordings

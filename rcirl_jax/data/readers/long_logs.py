@@ -1,18 +1,17 @@
-"""Long logs of rows: imported in pieces of a minute or less, in bounded memory.
+"""Logs of rows, by recording; long ones in pieces of a minute or less.
 
-The file is read once, a few MiB at a time, and its rows are written to scratch
-files by recording and minute. Each minute is then a Recording of its own, with
-rows before and after it, so that scenes and filters do not end at the border.
-When each road user was first seen, also after gaps, is found for the whole log
-first, so that vehicles and their groups are those of a log read at once.
+A log that fits is held, and each of its recordings is one piece. A long one is read
+once, a few MiB at a time, and its rows are written to scratch files by recording and
+minute. Each minute is then a Recording of its own, with rows before and after it, so
+that scenes and filters do not end at the border. When each road user was first seen,
+also after gaps, is found for the whole log first, so that vehicles and their groups
+are those of a log read at once.
 
 What differs from a file that fits: lanes that are not given are fitted minute by
 minute, the given path is known for 28 s beyond the minute only, and a row out of
 order is found inside a minute only. Rows may come in any order of road users; scratch
 space of about the file's size is needed. An importer that needs something of the
-whole recording finds it in `Spill.minutes`.
-
-Rows come as batches of `tables`, or as an importer makes them of these.
+whole recording finds it in `minutes`.
 """
 
 import contextlib
@@ -20,15 +19,16 @@ import dataclasses
 import itertools
 import shutil
 import tempfile
-from collections.abc import Callable, Container, Iterable, Iterator
+from collections.abc import Container, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rcirl_jax.data.readers.reading import reading
-from rcirl_jax.data.readers.tables.ledger import LINE, Ledger
-from rcirl_jax.data.readers.tables.repair import single_rows
+from rcirl_jax.data.readers.tables.ledger import Ledger
+from rcirl_jax.data.readers.tables.repair import once, single_rows
+from rcirl_jax.data.readers.tables.table import Field, Table, batches, read
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.atomic_files import locked
 from rcirl_jax.types import Recording, Track
@@ -61,30 +61,34 @@ class Piece:
     fragments: dict[str, list[float]]
     progress: float  # share of the file's pieces up to this one
     window: int | None = None  # of the minute; None: the minute is one piece
+    is_whole: bool = False  # the recording is one piece
 
     @property
     def label(self) -> str:
-        """The number as names of recordings have it."""
+        """What names of recordings end with."""
         rest = "" if self.window is None else f".{self.window:02d}"
-        return f"{self.number:05d}{rest}"
+        return "" if self.is_whole else f"-{self.number:05d}{rest}"
 
 
 @contextlib.contextmanager
-def spilled(
-    path: Path,
-    read: Callable[[Callable[[int], object]], Iterable[dict]],
+def rows_of(
+    table: Table,
+    fields: Sequence[Field],
     ledger: Ledger,
+    *,
+    is_long: bool,
     wanted: Container[str] | None = None,
     apart: Container[str] = (),
     places: tuple[str, str] = ("x", "y"),
-) -> Iterator["Spill"]:
-    """The rows of a file in scratch files, removed afterwards.
+) -> Iterator["Held | Spill"]:
+    """The rows of a table, each road user once in a frame.
 
     Args:
-      path: file, whose reading shows a bar.
-      read: batches of rows, at least t [s] and id; it calls what it is given with the
-        bytes just read.
+      table: of `open_table`.
+      fields: what is read, at least t [s] and id.
       ledger: of the file.
+      is_long: the rows go to scratch files, which are removed afterwards; a bar
+        shows the reading.
       wanted: values of the `recording` field whose rows are kept; None: all.
       apart: columns in which rows may differ that repeat each other.
       places: columns that say where a road user is.
@@ -93,10 +97,13 @@ def spilled(
       InputError: no rows, more bad ones than the ledger allows, or more than
         MAX_BLOCKS minutes.
     """
+    if not is_long:
+        yield Held(read(table, fields, ledger), ledger, apart, places)
+        return
     with scratch() as folder:
-        spill = Spill(path, folder, ledger, wanted, apart, places)
-        with reading(path, [path]) as show:
-            for batch in read(show):
+        spill = Spill(table.path, folder, ledger, wanted, apart, places)
+        with reading(table.path, [table.path]) as show:
+            for batch in batches(table, fields, ledger, show):
                 spill.add(batch)
         ledger.check()
         spill.flush()
@@ -105,6 +112,8 @@ def spilled(
 
 def piece_of(log: str, made: Recording, piece: Piece) -> Recording:
     """A piece's Recording as a part of the log: its tracks named as in the whole."""
+    if piece.is_whole:
+        return made
     return dataclasses.replace(
         made,
         tracks=tuple(_of_log(track, piece.fragments) for track in made.tracks),
@@ -142,6 +151,54 @@ def _within(rows: np.ndarray, t: int, begin: float, end: float) -> np.ndarray:
     return rows[(rows[:, t] >= begin) & (rows[:, t] < end)]
 
 
+class Held:
+    """Rows by recording, of a log that fits into memory."""
+
+    def __init__(
+        self,
+        rows: dict[str, np.ndarray],
+        ledger: Ledger,
+        apart: Container[str],
+        places: tuple[str, str],
+    ) -> None:
+        self.rows, self.ledger, self.apart, self.places = rows, ledger, apart, places
+        self._of = rows.pop("recording", None)
+        self._tidied: dict[str | None, dict[str, np.ndarray]] = {}
+
+    def recordings(self) -> list[str | None]:
+        """Values of `recording`; [None] without the field."""
+        return [None] if self._of is None else np.unique(self._of).tolist()
+
+    def texts_of(self, field: str) -> list[str]:
+        """All that a field of texts holds."""
+        return np.unique(self.rows.get(field, [])).tolist()
+
+    def minutes(self, recording: str | None) -> Iterator[dict[str, np.ndarray]]:
+        """Field -> [n] of a recording, t as in the file."""
+        if recording not in self._tidied:
+            own = self.rows
+            if recording is not None:
+                chosen = self._of == recording
+                own = {name: column[chosen] for name, column in own.items()}
+            plain = str if own["id"].dtype.kind == "U" else "{:g}".format
+            options = {"places": self.places, "apart": self.apart, "name_of": plain}
+            self._tidied[recording] = once(own, self.ledger, **options)
+        yield self._tidied[recording]
+
+    def pieces(self, recording: str | None, max_gap_s: float) -> Iterator[Piece]:
+        """The recording as one piece; arguments as of `Spill.pieces`."""
+        for values in self.minutes(recording):
+            yield Piece(
+                recording=recording,
+                number=0,
+                values={**values, "t": values["t"] - values["t"].min()},
+                within=(-np.inf, np.inf),
+                fragments={},
+                progress=1.0,
+                is_whole=True,
+            )
+
+
 class Spill:
     """Rows by recording and minute in scratch files of float64."""
 
@@ -150,9 +207,9 @@ class Spill:
         path: Path,
         folder: Path,
         ledger: Ledger,
-        wanted: Container[str] | None = None,
-        apart: Container[str] = (),
-        places: tuple[str, str] = ("x", "y"),
+        wanted: Container[str] | None,
+        apart: Container[str],
+        places: tuple[str, str],
     ) -> None:
         self.path, self.folder, self.ledger = path, folder, ledger
         self.wanted, self.apart, self.places = wanted, apart, places
@@ -226,6 +283,10 @@ class Spill:
             return [None]
         return [text for text, n in self.texts["recording"].items() if n in self._met]
 
+    def texts_of(self, field: str) -> list[str]:
+        """All that a field of texts holds."""
+        return list(self.texts.get(field, ()))
+
     def _minutes(self, recording: str | None) -> tuple[int, list[int]]:
         """A recording's number, and its minutes in the order of time."""
         code = 0 if recording is None else self.texts["recording"][recording]
@@ -245,8 +306,15 @@ class Spill:
         for minute in minutes:
             rows = self._rows(code, minute)
             values = {name: rows[:, place] for place, name in enumerate(self.names)}
-            compared = [n for n in values if n != LINE and n not in self.apart]
-            kept = single_rows(values, self.ledger, compared, self._named, self.places)
+            kept = single_rows(
+                values,
+                values["t"],
+                values["id"],
+                self.ledger,
+                self.places,
+                self.apart,
+                self._named,
+            )
             if not kept.all():
                 rows[kept].tofile(self.folder / f"{code}_{minute}")
 

@@ -100,7 +100,7 @@ class Database:
             raise self.error(
                 table, f"a {'virtual table' if virtual else kind}", "a table"
             )
-        cursor = self._execute(f'SELECT * FROM "{table}" LIMIT 0', ())
+        cursor = self._execute(f"SELECT * FROM {_quoted(table)} LIMIT 0", ())
         return tuple(entry[0] for entry in cursor.description or ())
 
     def need(self, table: str, columns: Sequence[str]) -> None:
@@ -114,6 +114,28 @@ class Database:
                     f"{table}.{column}", "missing", f"it among {', '.join(found)}"
                 )
 
+    def table(
+        self,
+        name: str,
+        columns: Sequence[str],
+        most: int,
+        optional: Sequence[str] = (),
+    ) -> list[tuple]:
+        """All rows of a table: the columns, which have to be there, and optional ones.
+
+        Args:
+          name: of the table.
+          columns: their names, which the file may have chosen.
+          most: rows allowed.
+          optional: other columns, or NULL where there are none.
+        """
+        self.need(name, columns)
+        known = self.columns(name)
+        chosen = [_quoted(column) for column in columns]
+        chosen += [_quoted(one) if one in known else "NULL" for one in optional]
+        sql = f"SELECT {', '.join(chosen)} FROM {_quoted(name)}"
+        return [row for rows in self.chunks(sql, (name,), most) for row in rows]
+
     def numbers(
         self, sql: str, names: Sequence[str], most: int, values: tuple = ()
     ) -> np.ndarray:
@@ -126,7 +148,7 @@ class Database:
           values: of its parameters.
         """
         parts = [
-            self._floats(rows, names) for rows in self.chunks(sql, names, most, values)
+            self.floats(rows, names) for rows in self.chunks(sql, names, most, values)
         ]
         return np.concatenate(parts) if parts else np.zeros((0, len(names)))
 
@@ -141,23 +163,15 @@ class Database:
                 raise self.error(names[0], f"more than {most} rows", "fewer")
             yield rows
 
-    def _floats(self, rows: list[tuple], names: Sequence[str]) -> np.ndarray:
-        return np.stack(
-            [
-                self.column(cells, name)
-                for cells, name in zip(zip(*rows, strict=True), names, strict=True)
-            ],
-            axis=1,
-        )
-
-    def column(self, cells: tuple, name: str) -> np.ndarray:
-        """Cells of one column as float64; NULL is NaN, text and blobs are errors."""
-        # numpy would read numbers out of text
-        wrong = set(map(type, cells)) - {int, float, type(None)}
-        if wrong:
-            bad = next(cell for cell in cells if type(cell) in wrong)
-            raise self.error(name, repr(bad)[:40], "a number")
-        return np.array(cells, np.float64)
+    def floats(self, rows: Sequence[tuple], names: Sequence[str]) -> np.ndarray:
+        """[rows, columns] float64; NULL is NaN, text and blobs are errors."""
+        for name, cells in zip(names, zip(*rows, strict=True), strict=True):
+            # numpy would read numbers out of text
+            wrong = set(map(type, cells)) - {int, float, type(None)}
+            if wrong:
+                bad = next(cell for cell in cells if type(cell) in wrong)
+                raise self.error(name, repr(bad)[:40], "a number")
+        return np.array(rows, np.float64)
 
     def _rows(self, sql: str, values: tuple) -> Iterator[list[tuple]]:
         cursor = self._execute(sql, values)
@@ -183,6 +197,10 @@ class Database:
         if self._ticks < 0:
             return self.error("query", "too much work for the file's size", "tables")
         return self.error("database", str(error), "a readable SQLite file")
+
+
+def _quoted(name: str) -> str:
+    return '"' + name.replace('"', '""') + '"'
 
 
 def _authorise(action: int, *_: object) -> int:

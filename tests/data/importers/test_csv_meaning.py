@@ -6,8 +6,8 @@ import numpy as np
 import pyproj
 import pytest
 
-from rcirl_jax.data.importers.csv.earth import projected
 from rcirl_jax.data.importers.csv.heading import CONVENTIONS
+from rcirl_jax.data.importers.projection import projected
 from rcirl_jax.errors import InputError
 from tests.data.importers import people
 
@@ -68,16 +68,6 @@ def test_iso_times(tmp_path, form, long_bytes):
 def test_times_by_a_pattern(tmp_path, pattern, form):
     table = people.column(people.rows(), "t", form)
     source = people.spec(tmp_path, units=f't = "{pattern}"')
-    people.assert_same(people.only(write(tmp_path, table), source))
-
-
-@pytest.mark.parametrize(
-    ("unit", "factor"),
-    [("ms", 1e3), ("us", 1e6), ("min", 1 / 60), ("h", 1 / 3600), ("frame", 10.0)],
-)
-def test_units_of_time(tmp_path, unit, factor):
-    table = people.column(people.rows(), "t", lambda t: f"{t * factor:.9f}")
-    source = people.spec(tmp_path, units=f't = "{unit}"')
     people.assert_same(people.only(write(tmp_path, table), source))
 
 
@@ -347,15 +337,6 @@ def test_scale_and_offset_of_columns(tmp_path):
     assert "scale.kind: unknown: expected t, x, y" in refused(
         tmp_path / "log.csv", source
     )
-
-
-@pytest.mark.parametrize(
-    ("unit", "factor"), [("km/h", 3.6), ("kn", 3600.0 / 1852.0), ("mph", 1 / 0.44704)]
-)
-def test_units_of_speed(tmp_path, unit, factor):
-    table = people.column(people.rows(), "speed", lambda v: v * factor)
-    source = people.spec(tmp_path, units=f'speed = "{unit}"')
-    people.assert_same(people.only(write(tmp_path, table), source), speed=0.005)
 
 
 def test_unknown_options_are_one_line(tmp_path):

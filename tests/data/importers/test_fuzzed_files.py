@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from benchmarks.reliability.fuzz.containers import archive_of
+from benchmarks.reliability.fuzz.forms import archive_of
 from benchmarks.reliability.fuzz.readers import suite
 from rcirl_jax.data import importers
 from rcirl_jax.data.importers import read_recordings

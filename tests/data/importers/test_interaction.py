@@ -1,29 +1,18 @@
 """INTERACTION: recordings with pedestrians, cases of the challenge, maps."""
 
+import functools
+
 import numpy as np
 import pytest
 
-from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind
 from tests.data.importers.formats import interaction as fixture
 from tests.data.importers.formats import interaction_challenge as challenge
-from tests.data.importers.writers import strict
+from tests.helpers import logs
 
-
-def read(path, source=None):
-    return list(read_recordings("interaction", path, source))
-
-
-def only(path, source=None):
-    (recording,) = read(path, source)
-    return recording
-
-
-def edit(path, old, new, count=1):
-    text = path.read_text()
-    assert old in text
-    path.write_text(text.replace(old, new, count))
+read = functools.partial(logs.read, "interaction")
+only = functools.partial(logs.only, "interaction")
 
 
 @pytest.fixture
@@ -223,55 +212,3 @@ def test_gap_splits_a_track(scene, root):
     lines = path.read_text().splitlines()
     path.write_text("\n".join(lines[:50] + lines[60:]) + "\n")
     assert "1#2" in [track.id for track in only(root).tracks]
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "found"),
-    [
-        ("psi_rad", "psi", None),
-        ("timestamp_ms", "time", "column timestamp_ms: missing"),
-        ("track_id,frame_id", "track_id,track_id", "column track_id: met twice"),
-        ("1,1,100,car,1005.000", "1,1,100,car,", "line 2: x: ''"),
-        ("1,1,100,car,1005.000", "1,1,,car,1005.000", "line 2: timestamp_ms: ''"),
-        ("1,1,100,car", ",1,100,car", "line 2: track_id: ''"),
-        ("1,1,100,car,1005.000", "1,1,100,car,west", "line 2: x: 'west'"),
-        ("1,1,100,car,1005.000", "1,1,100,car,inf", "line 2: x: 'inf'"),
-        ("1,1,100,car,1005.000", "1,1,100,car,1e300", "x: 1e+300"),
-        ("1,1,100,car,1005.000", "1,1,1e200,car,1005.000", "timestamp_ms: 1e+200"),
-        ("1,1,100,car,", "1,1,200,car,", "line 3: id 1: met twice in one frame"),
-        ("1,1,100,car,1005.000,", "1,1,100,car,", "line 2: 10 cells: expected 11"),
-    ],
-)
-def test_malformed(scene, root, old, new, found):
-    path = scene / "vehicle_tracks_000.csv"
-    edit(path, old, new)
-    if found is None:
-        assert len(only(root).tracks) == 5
-        return
-    with pytest.raises(InputError) as error:
-        read(root, strict(root / "strict.toml", "interaction"))
-    message = str(error.value)
-    assert message.startswith(str(path))
-    assert found in message
-    assert "\n" not in message
-
-
-def test_bad_pedestrians_are_named(scene, root):
-    path = scene / "pedestrian_tracks_000.csv"
-    edit(path, "track_id", "id")
-    with pytest.raises(InputError, match="pedestrian_tracks_000"):
-        read(root)
-
-
-def test_case_without_a_number(cases):
-    edit(cases, "\n1.0,", "\n,")
-    with pytest.raises(InputError, match="case_id"):
-        read(cases)
-
-
-def test_bad_map_is_named(root):
-    path = root / "maps" / f"{fixture.SCENE}.osm_xy"
-    edit(path, "x='", "x='east")
-    with pytest.raises(InputError) as error:
-        read(root)
-    assert str(error.value).startswith(str(path))

@@ -1,26 +1,21 @@
 """NGSIM: native text and portal CSV, with and without lateral positions."""
 
+import functools
 import time
 
 import numpy as np
 import pytest
 
 from rcirl_jax.data.cut import digest
-from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import spec_root
 from tests.data.importers import writers as w
+from tests.helpers import logs
+
+read = functools.partial(logs.read, "ngsim")
+only = functools.partial(logs.only, "ngsim")
 
 LANE_M = 3.6576  # m, 12 ft
-
-
-def read(path, source=None):
-    return list(read_recordings("ngsim", path, source))
-
-
-def only(path, source=None):
-    (recording,) = read(path, source)
-    return recording
 
 
 def test_native_text_in_metres_with_left_positive(tmp_path):

@@ -119,28 +119,6 @@ def test_pieces_of_the_native_text_are_those_of_the_csv(tmp_path, monkeypatch):
     assert [digest(made) for made in texts] == [digest(made) for made in tables]
 
 
-@pytest.mark.parametrize(
-    ("cell", "message"),
-    [
-        ("far", r"line 2000: Local_Y: 'far': expected a finite number"),
-        ("nan", r"line 2000: Local_Y: 'nan': expected a finite number"),
-        ("1 2", r"line 2000: 19 cells: expected 18"),
-        ("1e30", r"line 2000: Local_Y: 1e\+30: expected within"),
-        ("\xff", r"line 2000: Local_Y: '.*': expected a finite number"),
-    ],
-)
-def test_bad_cells_of_a_long_text_are_one_line(tmp_path, monkeypatch, cell, message):
-    monkeypatch.setattr(streams, "READ_BYTES", 10_000)
-    path = native(tmp_path / "native.txt")
-    lines = path.read_text().splitlines()
-    cells = lines[1999].split()
-    lines[1999] = " ".join([*cells[:5], cell, *cells[6:]])
-    path.write_text("\n".join(lines), encoding="latin-1")
-    with pytest.raises(InputError, match=message) as caught:
-        read(path, 1, max_bad_rows=0.0)
-    assert "\n" not in str(caught.value)
-
-
 def test_notes_name_what_is_left_out_and_repeated(tmp_path):
     first = read(write(tmp_path / "portal.csv"), 1)[0]
     assert first.notes == (
@@ -181,33 +159,6 @@ def test_without_stamps_the_frames_are_the_clock(tmp_path):
     assert [made.name for made in pieces] == ["one-00000", "one-00001"]
     users = {track.id for made in pieces for track in made.tracks}
     assert users == {track.id for track in whole.tracks}
-
-
-def test_separators_between_thousands(tmp_path):
-    plain = [digest(made) for made in read(write(tmp_path / "portal.csv"), 1)]
-    path = w.grouped(tmp_path / "portal.csv")
-    assert [digest(made) for made in read(path, 1)] == plain
-    text = path.read_text()
-    path.write_text(text.replace('"1,118,847,', '"1,118,8x7,', 1))
-    with pytest.raises(InputError, match=r"portal\.csv: line \d+: Global_Time: '1,118"):
-        read(path, 1, max_bad_rows=0.0)
-
-
-@pytest.mark.parametrize(
-    ("column", "cell", "message"),
-    [
-        (5, "far", r"line 12: Local_Y: 'far': expected a finite number"),
-        (3, "", r"line 12: Global_Time: '': expected a finite number"),
-        (11, "inf", r"line 12: v_Vel: 'inf': expected a finite number"),
-    ],
-)
-def test_bad_cells_are_one_line(tmp_path, column, cell, message):
-    rows, sites = portal(cars=2)
-    rows[10][column] = cell
-    path = w.ngsim_csv(tmp_path / "portal.csv", rows, sites=sites)
-    with pytest.raises(InputError, match=message) as caught:
-        read(path, 1, max_bad_rows=0.0)
-    assert "\n" not in str(caught.value)
 
 
 def test_unreadable_files_are_one_line(tmp_path):

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.importers.csv.flags import NO, YES
+from rcirl_jax.data.importers.csv.heading import half_seconds, is_large
 from rcirl_jax.data.importers.csv.mapping import (
     ALLOWED_UNITS,
     HOLE,
@@ -215,34 +216,27 @@ def _heading_and_speed(
 ) -> None:
     """Units of angles by their size; of speeds by the speed of the positions."""
     if "heading" in guess.columns:
-        known = raw["heading"][np.isfinite(raw["heading"])]
-        large = bool(known.size) and np.max(np.abs(known)) > 2.0 * math.pi + 0.1
+        large = is_large(raw["heading"][np.isfinite(raw["heading"])])
         said = unit_of(guess.columns["heading"], ("deg", "rad"))
         guess.units["heading"] = said or ("deg" if large else "rad")
     for field in ("speed", "vx", "vy"):
         if field in guess.columns:
             said = unit_of(guess.columns[field], ALLOWED_UNITS["speed"])
             guess.units[field] = said or "m/s"
-    if "speed" in guess.columns and not unit_of(
-        guess.columns["speed"], ALLOWED_UNITS["speed"]
-    ):
-        guess.units["speed"] = _speed_unit(table.path, guess) or "m/s"
+            if field == "speed" and not said:
+                guess.units[field] = _speed_unit(table.path, guess) or "m/s"
 
 
 def _speed_unit(path: Path, guess: Guess) -> str:
     """The unit in which speeds are those of the positions; "" if none is."""
     rows, _, mapping = _without_wrong_headings(path, guess)
-    ids = np.unique(rows["id"], return_inverse=True)[1]
-    order = np.lexsort((rows["t"], ids))
-    step = max(round(0.5 * mapping.rate_hz), 1)
-    ends = order[step:], order[:-step]
-    same = ids[ends[0]] == ids[ends[1]]
-    moved = np.hypot(*(rows[axis][ends[0]] - rows[axis][ends[1]] for axis in "xy"))
-    real = moved / np.maximum(rows["t"][ends[0]] - rows["t"][ends[1]], 1e-9)
-    used = same & (real > 2.0) & np.isfinite(rows["speed"][ends[1]])
+    first, _, last = half_seconds(rows, mapping.rate_hz)
+    dx, dy, dt = (rows[name][last] - rows[name][first] for name in ("x", "y", "t"))
+    real, found = np.hypot(dx, dy) / np.maximum(dt, 1e-9), rows["speed"][first]
+    used = (real > 2.0) & np.isfinite(found)
     if used.sum() < 10:
         return ""
-    ratio = float(np.median(np.abs(rows["speed"][ends[1]][used]) / real[used]))
+    ratio = float(np.median(np.abs(found[used]) / real[used]))
     unit = min(SPEED_RATIOS, key=lambda name: abs(ratio / SPEED_RATIOS[name] - 1.0))
     if abs(ratio / SPEED_RATIOS[unit] - 1.0) > 0.06:
         guess.open.append(f"units.speed: {ratio:.3g} times the speed of the positions")

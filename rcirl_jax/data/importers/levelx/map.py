@@ -1,11 +1,12 @@
 """Lanes of leveLXData recordings: highD's markings, and where a map lies."""
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.importers.options import path_option
+from rcirl_jax.data.importers.files import given_map
 from rcirl_jax.data.recording import check_lanes_length
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane
@@ -17,7 +18,7 @@ MAP_FOLDERS = ("maps", "lanelets", "lanelet2")
 
 def marked_lanes(
     path: Path,
-    meta: dict[str, str],
+    meta: Mapping[str, str],
     along: tuple[float, float],
     limit: float | None,
     rows: tuple[np.ndarray, np.ndarray],
@@ -50,7 +51,7 @@ def marked_lanes(
 SIDES = {"upper": -1.0, "lower": 1.0}
 
 
-def _markings(path: Path, meta: dict[str, str], field: str) -> np.ndarray:
+def _markings(path: Path, meta: Mapping[str, str], field: str) -> np.ndarray:
     """[m] m, y of the markings from top to bottom (y up)."""
     text = meta.get(field, "")
     try:
@@ -72,11 +73,8 @@ def _carriageway(
     along: tuple[float, float],
     limit: float | None,
 ) -> list[Lane]:
-    x = np.linspace(
-        along[0] - MARGIN_M,
-        along[1] + MARGIN_M,
-        int((along[1] - along[0] + 2.0 * MARGIN_M) / STEP_M) + 2,
-    )
+    lower, upper = along[0] - MARGIN_M, along[1] + MARGIN_M
+    x = np.linspace(lower, upper, int((upper - lower) / STEP_M) + 2)
     x = x if forward else x[::-1]
     count = len(marks) - 1
     # the lane above (smaller number) is to the left of one driven towards +x
@@ -108,10 +106,7 @@ def find_map(path: Path, location: str, spec: dict) -> Path | None:
     lanelets/location4.osm) beside the folder `data`. The option `map` names a
     file, or a folder to look into.
     """
-    if spec.get("map"):
-        given = Path(path_option(spec, "map"))
-        if not given.exists():
-            raise InputError(f"{given}: map: missing: expected a file or folder")
+    if (given := given_map(spec)) is not None:
         if given.is_file():
             return given
         return _of_location(sorted(given.rglob("*.osm")), location)

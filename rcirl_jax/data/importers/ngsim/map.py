@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.data.importers.declared import Rows
 from rcirl_jax.data.importers.lanes import StraightLane, straight_lanes
 from rcirl_jax.data.importers.options import number, positive
 from rcirl_jax.data.importers.tracks import spans_of, split_tracks, travel_heading
@@ -23,8 +24,6 @@ LANE_WIDTH_M = 3.6576  # m, 12 ft, US freeway
 SWITCH_S = 4.0  # s, a lane change takes 3 to 6 s
 LIMIT_MPS = 29.06  # m/s, 65 mph
 SIZE_M = (4.5, 1.8)  # m, a car
-
-Rows = dict[str, np.ndarray]  # column -> [n], SI units; "frame" is the clock
 
 
 class Survey:
@@ -44,7 +43,7 @@ class Survey:
         """Take in rows."""
         self.lateral |= bool(np.any(table["Local_X"] != 0.0))
         for field, users in self._without.items():
-            users.update(table["Vehicle_ID"][table[f"v_{field.title()}"] <= 0.0])
+            users.update(table["id"][table[f"v_{field.title()}"] <= 0.0])
         driven = table["Lane_ID"].astype(int)
         for lane in np.unique(driven).tolist():
             x, y = (table[name][driven == lane] for name in ("Local_X", "Local_Y"))
@@ -124,7 +123,7 @@ def site_recording(
     frame_s = positive(spec, "frame_s", FRAME_S)
     # with stamps no step back has a meaning
     reuse = 0.0 if stamped else REUSE_S / frame_s
-    vehicles = table["Vehicle_ID"].astype(np.int64)
+    vehicles = table["id"].astype(np.int64)
     pieces = split_tracks(path, vehicles, table["frame"], MAX_FRAME_GAP, reuse)
     lateral = survey.lateral
     table = {**table, "leader_missing": _leader_missing(table)}
@@ -144,7 +143,7 @@ def site_recording(
 def _leader_missing(table: Rows) -> np.ndarray:
     """[n] bool: the row names a vehicle ahead that has no row at that time."""
     named = table["Preceding"] > 0.0
-    users = np.concatenate([table["Vehicle_ID"], table["Preceding"]])
+    users = np.concatenate([table["id"], table["Preceding"]])
     number = np.unique(users, return_inverse=True)[1].reshape(2, -1)
     frames = np.unique(table["frame"], return_inverse=True)[1].reshape(-1)
     own, ahead = number * (frames.max() + 1) + frames

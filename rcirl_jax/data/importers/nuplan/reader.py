@@ -20,12 +20,13 @@ import numpy as np
 
 from rcirl_jax.data.importers.files import files_below, log_name
 from rcirl_jax.data.importers.nuplan.map import NuplanMap, find_map
-from rcirl_jax.data.importers.options import number, one_pattern, positive, section
-from rcirl_jax.data.importers.paths import path_lanes
+from rcirl_jax.data.importers.options import one_pattern, positive
 from rcirl_jax.data.importers.perception import (
     Boxes,
     Windows,
     around,
+    ego_boxes,
+    fitted_lanes,
     longest_window,
     placed,
     tracks_of,
@@ -34,6 +35,7 @@ from rcirl_jax.data.importers.shapes import (
     check_coordinates,
     origin_notes,
 )
+from rcirl_jax.data.importers.signals import STATES, held, signal_of
 from rcirl_jax.data.readers.sqlite import Database
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
@@ -60,7 +62,6 @@ KIND_NAMES = {
     "czone_sign": Kind.STATIC,
     "generic_object": Kind.STATIC,
 }
-STATES = ("off", "red", "yellow", "green")  # any other status is off
 POSE_SQL = """SELECT lp.timestamp, ep.timestamp, ep.x, ep.y, ep.qw, ep.qx, ep.qy,
   ep.qz, ep.vx, ep.vy FROM lidar_pc AS lp JOIN ego_pose AS ep
   ON lp.ego_pose_token = ep.token"""
@@ -84,7 +85,6 @@ MAX_GAP_S = 0.55  # s without a box inside one track
 HOLD_S = 1.0  # s, a light without status keeps its state this long
 MAX_STAMP_GAP_S = 0.2  # s, between a lidar_pc and the pose linked to it
 LIMIT_MPS = 15.65  # m/s, 35 mph
-LANE_WIDTH_M = 3.5  # m
 # Chrysler Pacifica: 4.049 m before, 1.127 m behind the rear axle
 EGO = {"length": 5.176, "width": 2.297, "rear_axle_to_centre": 1.461}  # m
 
@@ -209,14 +209,10 @@ def _recording(log: _Log, poses: np.ndarray) -> Recording:
     x, y, origin, tracks = placed(tracks)
     lanes: tuple[Lane, ...] = ()
     if log.road is not None:
-        lanes = log.road.lanes(x, y, origin)
+        lanes = log.road.roads.around(x, y, origin)
     if not lanes:
-        lanes = path_lanes(
-            tracks,
-            positive(spec, "lane_width_m", LANE_WIDTH_M),
-            positive(spec, "speed_limit", LIMIT_MPS),
-        )
-        notes.append(f"no map here; {len(lanes)} lanes fitted to the longest paths")
+        lanes, note = fitted_lanes(tracks, spec, LIMIT_MPS)
+        notes.append(f"no map here; {note}")
     return Recording(
         name=log.name,
         group=log.group,
@@ -236,10 +232,6 @@ def _ego(path: Path, poses: np.ndarray, start: float, spec: dict) -> list[Track]
 
     Poses were taken a little earlier or later: x(t) = x_p + dx/dt (t - t_p).
     """
-    size = {
-        name: number(section(spec, "ego"), name, default)
-        for name, default in EGO.items()
-    }
     t, stamp = (poses[:, :2] - start).T * 1e-6
     x, y, qw, qx, qy, qz, vx, vy = poses[:, 2:].T
     heading = np.arctan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz))
@@ -249,24 +241,14 @@ def _ego(path: Path, poses: np.ndarray, start: float, spec: dict) -> list[Track]
         raise InputError(
             f"{path}: ego_pose.qw, qx, qy, qz: norm {norm[bad[0]]:g}: expected 1"
         )
-    ahead = size["rear_axle_to_centre"]
-    x, y = x + ahead * np.cos(heading), y + ahead * np.sin(heading)
+    boxes = ego_boxes(spec, EGO, t, x, y, heading, np.hypot(vx, vy))
     rising = t.size > 1 and bool(np.all(np.diff(stamp) > 0.0))
     if rising and np.max(np.abs(t - stamp)) <= MAX_STAMP_GAP_S:
-        x = x + np.gradient(x, stamp) * (t - stamp)
-        y = y + np.gradient(y, stamp) * (t - stamp)
-    boxes = Boxes(
-        ids=np.zeros(t.size, np.int64),
-        names=("ego",),
-        t=t,
-        x=x,
-        y=y,
-        heading=heading,
-        speed=np.hypot(vx, vy),
-        length=np.full(t.size, size["length"]),
-        width=np.full(t.size, size["width"]),
-        kind=np.full(t.size, int(Kind.VEHICLE)),
-    )
+        moved = {
+            name: place + np.gradient(place, stamp) * (t - stamp)
+            for name, place in (("x", boxes.x), ("y", boxes.y))
+        }
+        boxes = dataclasses.replace(boxes, **moved)
     return tracks_of(path, boxes, MAX_GAP_S)[0]
 
 
@@ -277,21 +259,13 @@ def _others(log: _Log, first: float, last: float) -> tuple[list[Track], list[str
     bounds = (int(first), int(last))
     tokens, values = [], []
     for rows in database.chunks(BOX_SQL, names, MAX_BOXES, bounds):
-        columns = list(zip(*rows, strict=True))
-        tokens.append(_tokens(database, columns[0]))
-        values.append(
-            np.stack(
-                [
-                    database.column(c, n)
-                    for c, n in zip(columns[1:], names[1:], strict=True)
-                ]
-            )
-        )
+        tokens.append(_tokens(database, tuple(row[0] for row in rows)))
+        values.append(database.floats([row[1:] for row in rows], names[1:]))
     if not tokens:
         return [], ["no boxes recorded; the ego is alone"]
-    table = np.concatenate(values, axis=1)
-    order = np.argsort(table[0], kind="stable")  # rows are stored in any order
-    t, x, y, yaw, vx, vy, length, width = table[:, order]
+    table = np.concatenate(values)
+    order = np.argsort(table[:, 0], kind="stable")  # rows are stored in any order
+    t, x, y, yaw, vx, vy, length, width = table[order].T.copy()
     check_coordinates(database.path, "lidar_box", ("x", "y"), np.stack([x, y], axis=1))
     found, ids = np.unique(np.concatenate(tokens)[order], return_inverse=True)
     size = found.dtype.itemsize
@@ -338,42 +312,19 @@ def _signals(database: Database, clock: np.ndarray, start: float) -> tuple[Signa
         return ()
     database.need("traffic_light_status", LIGHTS)
     names = ("lidar_pc.timestamp", "traffic_light_status.lane_connector_id")
+    rows, states = [np.zeros((0, 2))], [np.zeros(0, np.int64)]
     bounds = (int(clock[0]), int(clock[-1]))
-    rows, states = [np.zeros((0, 2))], []
     for part in database.chunks(LIGHT_SQL, LIGHTS, MAX_BOXES, bounds):
-        columns = list(zip(*part, strict=True))
-        rows.append(
-            np.stack(
-                [
-                    database.column(c, n)
-                    for c, n in zip(columns[:2], names, strict=True)
-                ],
-                axis=1,
-            )
-        )
-        states += [STATES.index(s) if s in STATES else 0 for s in columns[2]]
-    table, state = np.concatenate(rows), np.array(states, np.int64)
+        rows.append(database.floats([row[:2] for row in part], names))
+        # any other status is off
+        known = [STATES.index(s) if s in STATES else 0 for *_, s in part]
+        states.append(np.array(known, np.int64))
+    table, state = np.concatenate(rows), np.concatenate(states)
+    order = np.argsort(table[:, 0], kind="stable")
+    seen, connectors, state = *table[order].T, state[order]
     found = []
-    for connector in np.unique(table[:, 1][np.isfinite(table[:, 1])]):
-        mine = np.flatnonzero(table[:, 1] == connector)
-        mine = mine[np.argsort(table[mine, 0], kind="stable")]
-        found.append(_signal(str(int(connector)), clock, table[mine, 0], state[mine]))
-    return tuple(
-        dataclasses.replace(signal, start=(signal.start - start) * 1e-6)
-        for signal in found
-    )
-
-
-def _signal(
-    connector: str, clock: np.ndarray, seen: np.ndarray, state: np.ndarray
-) -> Signal:
-    """One light as intervals [us], from its states seen at some times [us]."""
-    last = np.searchsorted(seen, clock, side="right") - 1
-    fresh = (last >= 0) & (clock - seen[np.maximum(last, 0)] <= HOLD_S * 1e6)
-    now = np.where(fresh, state[np.maximum(last, 0)], 0)
-    change = np.flatnonzero(np.diff(now, prepend=-1) != 0)
-    return Signal(
-        id=connector,
-        start=clock[change],
-        state=tuple(STATES[k] for k in now[change]),
-    )
+    for connector in np.unique(connectors[np.isfinite(connectors)]):
+        mine = connectors == connector
+        shown = held(clock, seen[mine], state[mine], HOLD_S * 1e6)
+        found.append(signal_of(str(int(connector)), (clock - start) * 1e-6, shown))
+    return tuple(found)
