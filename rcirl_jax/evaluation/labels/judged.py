@@ -126,7 +126,7 @@ def compare(recording: Recording, judged: list[Judged]) -> Iterator[Pair]:
     for one in judged:
         frame = round(one.time_s * recording.rate_hz)
         by_scene.setdefault((one.track, frame), []).append(one)
-    ids = [track.id for track in recording.tracks]
+    ids = [track.id for track in collector.recording.tracks]
     for row in collector.scenes():
         for one in by_scene.get((ids[row["track"]], int(row["frame"])), ()):
             slots = [i for i, t in enumerate(row["obstacles.track"]) if t >= 0]

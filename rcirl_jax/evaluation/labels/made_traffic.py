@@ -211,9 +211,10 @@ def cuts_in(
         return False
     if came is None:  # behind, or in the lane from the start
         return False if common[0] or other.s[0] < ego.s[0] else None
-    if not came.is_nearest or came.headway_s > CUT_IN_S[1]:
+    if came.headway_s > CUT_IN_S[1]:
         return False
-    surely = other.changes and np.argmax(common) >= ENTERS_S * rate_hz
+    surely = other.changes and came.is_nearest
+    surely = surely and np.argmax(common) >= ENTERS_S * rate_hz
     return True if surely and came.headway_s < CUT_IN_S[0] else None
 
 

@@ -57,7 +57,7 @@ BEND = 0.003  # 1/m, in sharper bends speeds along parallel lanes differ
 def judge(recording: Recording, log: Log) -> Iterator[list[Verdict] | str]:
     """Verdicts of every scene of a recording, or why a frame was dropped."""
     collector = Collector(recording, COLLECT)
-    numbers = [int(track.id[1:]) for track in recording.tracks]
+    numbers = [int(track.id[1:]) for track in collector.recording.tracks]
     for row in collector.scenes():
         first = int(row["frame"])
         seconds = TIMES_S[row["time_valid"]][-1]
