@@ -12,10 +12,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from rcirl_jax.data.scenes.config import CollectConfig
-from rcirl_jax.types import Recording, Track
+from rcirl_jax.types import Kind, Recording, Track
 
 STANDING_MPS = 0.5  # m/s, at the end that meets the other fragment
-SAME_PLACE_M = 1.0  # m between the centres; boxes of neighbours are farther apart
+SAME_PLACE_M = 1.0  # m between the centres, at most, and
+SAME_PLACE = 0.5  # of the smaller one's longer side: two bodies are farther apart
+HULKS = (Kind.VEHICLE, Kind.STATIC)  # perception takes a parked car for either
 EDGE_S = 0.25  # s from the recording's ends: such a track may have been longer
 SERIES = ("t", "x", "y", "heading", "speed")
 JOINED, SHORT, SMALL = "fragments joined", "too short", "too small"
@@ -64,13 +66,10 @@ def joined(tracks: Sequence[Track], gap_s: float) -> list[Track]:
     it begins at most `gap_s` after the other ends, or while it is there.
     """
     order = sorted(range(len(tracks)), key=lambda i: float(tracks[i].t[0]))
-    begins, ends = (
-        np.array([_sample(track, at) for track in tracks]).reshape(-1, 4)
-        for at in (0, -1)
-    )
+    ends = np.array([_sample(track, -1) for track in tracks]).reshape(-1, 4)
     made: dict[int, Track] = {}
     for number in order:
-        before = _goes_on_for(made, begins[number], ends, gap_s)
+        before = _goes_on_for(made, tracks[number], ends, gap_s)
         if before is None:
             made[number] = tracks[number]
         else:
@@ -81,27 +80,31 @@ def joined(tracks: Sequence[Track], gap_s: float) -> list[Track]:
 
 
 def _goes_on_for(
-    made: dict[int, Track], begin: np.ndarray, ends: np.ndarray, gap_s: float
+    made: dict[int, Track], after: Track, ends: np.ndarray, gap_s: float
 ) -> int | None:
     """The number of the track that stands where another begins, or None."""
-    t, x, y, speed = begin
+    t, x, y, speed = _sample(after, 0)
     if speed >= STANDING_MPS:
         return None
     near = (t <= ends[:, 0] + gap_s) & (ends[:, 3] < STANDING_MPS)
     near &= np.hypot(ends[:, 1] - x, ends[:, 2] - y) < SAME_PLACE_M
     for number in np.flatnonzero(near).tolist():
-        if number in made and _stands_from(made[number], t, x, y):
+        if number in made and _is_same(made[number], after):
             return number
     return None
 
 
-def _stands_from(track: Track, t: float, x: float, y: float) -> bool:
-    """Whether a track that began before t stands at a place from then to its end."""
-    if track.t[0] >= t:
+def _is_same(before: Track, after: Track) -> bool:
+    """Whether a track stands where another begins, from then to its own end."""
+    alike = before.kind == after.kind or {before.kind, after.kind} <= {*HULKS}
+    t, x, y, _ = _sample(after, 0)
+    if before.t[0] >= t or not alike:
         return False
-    rest = slice(int(np.searchsorted(track.t, t, side="right")) - 1, None)
-    near = np.hypot(track.x[rest] - x, track.y[rest] - y) < SAME_PLACE_M
-    return bool(near.all() and (np.abs(track.speed[rest]) < STANDING_MPS).all())
+    size = min(max(track.length, track.width) for track in (before, after))
+    reach = min(SAME_PLACE_M, SAME_PLACE * size)
+    rest = slice(int(np.searchsorted(before.t, t, side="right")) - 1, None)
+    near = np.hypot(before.x[rest] - x, before.y[rest] - y) < reach
+    return bool(near.all() and (np.abs(before.speed[rest]) < STANDING_MPS).all())
 
 
 def _sample(track: Track, at: int) -> tuple[float, float, float, float]:

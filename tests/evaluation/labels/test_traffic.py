@@ -146,9 +146,9 @@ def test_the_truth_of_one_that_comes_in(arrival, truth, cut):
 
 
 def test_drivers_brake_for_who_comes_in_near_and_slow():
-    """20 m/s on an empty road; the other comes in 15 m ahead at 16 m/s, or far away."""
+    """20 m/s on an empty road; the other comes in 15 m ahead at 16 m/s, or far off."""
     assert met(gap=15.0, v=16.0).brakes is True
-    assert met(gap=15.0, v=16.0).headway_s == pytest.approx(0.55, abs=0.01)
+    assert met(gap=15.0, v=16.0).headway_s == pytest.approx(0.75)
     assert met(gap=120.0, v=22.0).brakes is False
     # its leader makes it brake already
     assert met(gap=15.0, v=16.0, leader=20.0).brakes is None
