@@ -7,7 +7,8 @@ whose drivers' own state is the truth, are labelled and compared; position noise
 NGSIM, or none. --workers and --executor spread the recordings.
 --platoons simulated single files of cars have no overtaking, nudge or lane change.
 --judged=FOLDER compares with verdicts of a person on recorded scenes
-(data_specs/labels/judged_scenes.json); the folder holds the recordings.
+(data_specs/labels/judged_scenes.json); the folder holds the recordings. --sheets=DIR
+draws these scenes without their labels, to be judged again.
 
 Writes labels.json and labels.png. Four recordings of each entry take some
 minutes per noise. Expected: above 95 % everywhere.
@@ -19,10 +20,15 @@ from absl import flags
 
 from experiments.flags.common import provenance, run
 from experiments.flags.executor import executor
-from rcirl_jax.evaluation.labels.judged import measure_judged, read_verdicts
+from rcirl_jax.evaluation.labels.judged import (
+    judged_scenes,
+    measure_judged,
+    read_verdicts,
+)
 from rcirl_jax.evaluation.labels.platoons import measure_platoons
 from rcirl_jax.evaluation.labels.scores import format_labels, format_scores
 from rcirl_jax.evaluation.labels.traffic import measure_traffic
+from rcirl_jax.report.data.judging_sheet import draw_sheets
 from rcirl_jax.report.data.label_picture import label_chart
 from rcirl_jax.runtime.atomic_files import write_json
 
@@ -30,6 +36,7 @@ _TRAFFIC = flags.DEFINE_integer("traffic", 4, "recordings of each road simulated
 _NOISE = flags.DEFINE_list("noise", ["ngsim", "none"], "none, white, ngsim, rough")
 _PLATOONS = flags.DEFINE_integer("platoons", 0, "single-file platoons simulated", 0)
 _JUDGED = flags.DEFINE_string("judged", None, "folder of the judged recordings")
+_SHEETS = flags.DEFINE_string("sheets", None, "folder for pictures of judged scenes")
 _SEED = flags.DEFINE_integer("seed", 0, "of the traffic and the noise")
 _OUTPUT = flags.DEFINE_string("output", "out/label_check", "folder to write")
 _QUICK = flags.DEFINE_bool("quick", False, "one recording of each road, one noise")
@@ -62,7 +69,10 @@ def main() -> None:
 
 def _judged(data: Path, tables: dict) -> dict:
     """Scores of the judged scenes, JSON-ready; shown and added to the tables."""
-    scores = measure_judged(read_verdicts(), data)
+    found = judged_scenes(read_verdicts(), data)
+    scores = measure_judged(found)
+    if _SHEETS.value:
+        print(f"{draw_sheets(Path(_SHEETS.value), found)} sheets in {_SHEETS.value}")
     for batch, found in scores.items():
         print("\n".join(format_scores(f"judged, {batch}", found)), "\n")
     tables["judged scenes"] = scores["all"]

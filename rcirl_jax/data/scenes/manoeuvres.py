@@ -52,6 +52,9 @@ CUT_IN_S, CUT_IN_M = 3.0, 5.0  # s of the human's speed and m to the bumper
 NEXT_LANE = 2.0  # lanes aside, at most, from which one changes into the human's
 OVERTAKEN_LINE = 0.6  # lanes aside, at most, of one in the line that the human leaves
 
+# a station that jumps: farther from what the speeds at both ends make of it than
+JUMP_M, JUMP_MPS = 10.0, 3.0  # m, and m/s of the time between
+
 BOUNDS = ("s_lower", "s_upper", "l_lower", "l_upper")
 # what manoeuvres are read from
 FIELDS = (
@@ -209,7 +212,22 @@ def overtaken(m: Meetings) -> np.ndarray:
     beside = at(m.aside, first(passed)) < m.lane[..., 0]
     moves = at(m.speed, first(passed)) > STANDING_MPS
     moves |= at(m.speed, last(m.ahead)) > MOVING_MPS
-    return passed.any(axis=-1) & (before | after).any(axis=-1) & beside & moves
+    in_line = (before | after).any(axis=-1)
+    return passed.any(axis=-1) & in_line & beside & moves & _drove(m, passed)
+
+
+def _drove(m: Meetings, passed: np.ndarray) -> np.ndarray:
+    """[..., N] bool: drove from ahead to behind, at the speed that it has.
+
+    Where a road meets itself, the nearest station of one far ahead is behind.
+    """
+    end = first(passed)
+    until = m.ahead & (TIMES_S[end][..., None] > TIMES_S)
+    begin = last(until)
+    seconds = TIMES_S[end] - TIMES_S[begin]
+    way = 0.5 * (at(m.speed, begin) + at(m.speed, end)) * seconds
+    off = np.abs(at(m.s, end) - at(m.s, begin) - way)
+    return off < JUMP_M + JUMP_MPS * seconds
 
 
 def follows(m: Meetings) -> np.ndarray:

@@ -6,7 +6,7 @@ the labels of those obstacles compared.
 """
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import msgspec
@@ -32,7 +32,7 @@ TRUTH = {
 }
 CUT_IN = "cut_in"  # beside the decision, yes or no
 NUDGES = (Decision.NUDGE_LEFT, Decision.NUDGE_RIGHT)
-SAME_TIME_S = 1e-3  # s
+MAX_LOST = 0.05  # of the scenes, which an import may drop by now
 
 
 class Judged(msgspec.Struct, frozen=True, array_like=True):
@@ -62,9 +62,6 @@ class Verdicts(msgspec.Struct, frozen=True):
     scenes: list[Judged]
 
 
-Pair = tuple[str, str, str]  # batch, truth, label
-
-
 def read_verdicts(path: Path | None = None) -> Verdicts:
     """The verdicts of a file, by default the packaged ones.
 
@@ -85,29 +82,17 @@ def read_verdicts(path: Path | None = None) -> Verdicts:
     return found
 
 
-def measure_judged(verdicts: Verdicts, data: Path) -> dict[str, tuple[ClassScore, ...]]:
-    """Scores of each batch, and of "all" of them.
+Found = tuple[Judged, dict, int | None]  # verdict, row of its scene, obstacle's slot
 
-    Args:
-      verdicts: what a person said.
-      data: folder of the sites' recordings.
 
-    Raises:
-      InputError: no recordings there, or a scene that the import does not keep.
-    """
-    pairs: list[Pair] = []
-    for name, site in verdicts.sites.items():
-        wanted = [one for one in verdicts.scenes if one.site == name]
-        for made in read_recordings(site.format, data / site.folder):
-            pairs += compare(
-                made, [one for one in wanted if one.recording == made.name]
-            )
-    if len(pairs) != 2 * len(verdicts.scenes):
-        raise InputError(
-            f"{data}: {len(pairs) // 2} of {len(verdicts.scenes)} judged scenes: "
-            "expected all of them; verdicts hold for the recordings they were made of"
-        )
-    batches = sorted({one.batch for one in verdicts.scenes})
+def measure_judged(found: Sequence[Found]) -> dict[str, tuple[ClassScore, ...]]:
+    """Scores of each batch, and of "all" of them."""
+    pairs = [
+        (one.batch, *pair)
+        for one, row, slot in found
+        for pair in _pairs(one, row, slot)
+    ]
+    batches = sorted({one.batch for one, _, _ in found})
     return {
         batch: class_scores(
             (*dict.fromkeys(TRUTH.values()), CUT_IN),
@@ -117,8 +102,33 @@ def measure_judged(verdicts: Verdicts, data: Path) -> dict[str, tuple[ClassScore
     }
 
 
-def compare(recording: Recording, judged: list[Judged]) -> Iterator[Pair]:
-    """(batch, truth, label) of each verdict on a recording, and of its cut-in."""
+def judged_scenes(verdicts: Verdicts, data: Path) -> list[Found]:
+    """Every verdict with its scene, cut anew.
+
+    Args:
+      verdicts: what a person said.
+      data: folder of the sites' recordings.
+
+    Raises:
+      InputError: no recordings there, or a scene that the import does not keep.
+    """
+    found: list[Found] = []
+    for name, site in verdicts.sites.items():
+        wanted = [one for one in verdicts.scenes if one.site == name]
+        for made in read_recordings(site.format, data / site.folder):
+            here = [one for one in wanted if one.recording == made.name]
+            found += scenes_of(made, here)
+    lost = len(verdicts.scenes) - len(found)
+    if lost > MAX_LOST * len(verdicts.scenes):
+        raise InputError(
+            f"{data}: {lost} of {len(verdicts.scenes)} judged scenes are not there: "
+            "expected the recordings that the verdicts were made of"
+        )
+    return found
+
+
+def scenes_of(recording: Recording, judged: Sequence[Judged]) -> Iterator[Found]:
+    """The verdicts on a recording, each with its scene."""
     if not judged:
         return
     collector = Collector(recording, CollectConfig())
@@ -131,16 +141,16 @@ def compare(recording: Recording, judged: list[Judged]) -> Iterator[Pair]:
         for one in by_scene.get((ids[row["track"]], int(row["frame"])), ()):
             slots = [i for i, t in enumerate(row["obstacles.track"]) if t >= 0]
             named = [i for i in slots if ids[row["obstacles.track"][i]] == one.obstacle]
-            yield from _pairs(row, named[0] if named else None, one)
+            yield one, row, named[0] if named else None
 
 
-def _pairs(row: dict, slot: int | None, one: Judged) -> Iterator[Pair]:
-    """The pairs of one verdict; an obstacle without a slot is ignored."""
+def _pairs(one: Judged, row: dict, slot: int | None) -> list[tuple[str, str]]:
+    """(truth, label) of a decision and of a cut-in; without a slot it is ignored."""
     decision = Decision.IGNORE if slot is None else Decision(row["decisions"][slot])
     label = "nudge" if decision in NUDGES else decision.name.lower()
-    yield one.batch, TRUTH[one.verdict], label
     cuts = False
     if slot is not None:
         scene = {name: np.asarray(row[name]) for name in manoeuvres.FIELDS}
         cuts = bool(manoeuvres.cuts_in(manoeuvres.meetings(scene))[slot])
-    yield one.batch, CUT_IN if one.cut_in else "", CUT_IN if cuts else ""
+    said = (CUT_IN if one.cut_in else "", CUT_IN if cuts else "")
+    return [(TRUTH[one.verdict], label), said]
