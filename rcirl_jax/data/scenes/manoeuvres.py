@@ -125,14 +125,13 @@ def meetings(scenes: dict) -> Meetings:
     behind = seen & (s_upper < human_s - half_length)
     s, l = 0.5 * (s_lower + s_upper), 0.5 * (l_lower + l_upper)
     path_l = _path_at(scenes["path.l"], s)
-    reach = half_width + LATERAL_BUFFER_M
     lane = lane_width(scenes)[..., None, None]
     return Meetings(
         seen=seen,
         ahead=ahead,
         behind=behind,
         abreast=seen & ~ahead & ~behind,
-        blocks=seen & (np.maximum(l_lower - path_l, path_l - l_upper) < reach),
+        blocks=seen & blocking(scenes),
         aside=np.maximum(l_lower - human_l, human_l - l_upper) - half_width,
         to_left=l > human_l,
         gap=s_lower - human_s - half_length,
@@ -148,6 +147,16 @@ def meetings(scenes: dict) -> Meetings:
         lane=lane,
         human_off=np.abs(human_l) + half_width - 0.5 * lane,
     )
+
+
+def blocking(scenes: dict) -> np.ndarray:
+    """[..., N, T] bool: the obstacle's box overlaps the human's own path laterally."""
+    s_lower, s_upper, l_lower, l_upper = (scenes[f"obstacles.{x}"] for x in BOUNDS)
+    path_l = _path_at(scenes["path.l"], 0.5 * (s_lower + s_upper))
+    reach = 0.5 * np.asarray(scenes["ego.width"])[..., None, None] + LATERAL_BUFFER_M
+    beside = np.maximum(l_lower - path_l, path_l - l_upper)
+    is_there = (scenes["obstacles.kind"] != Kind.NONE)[..., None]
+    return scenes["obstacles.valid"] & (beside < reach) & is_there
 
 
 def lane_width(scenes: dict) -> np.ndarray:
