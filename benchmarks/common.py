@@ -6,7 +6,7 @@ import os
 import platform
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 
@@ -62,6 +62,19 @@ def timed(call: Callable[[], object], count: int, warm_up: int = 20) -> list[flo
     return seconds
 
 
+def in_turn(
+    ways: Mapping[str, Callable[[], object]], rounds: int
+) -> dict[str, list[float]]:
+    """Seconds of every way in each round, one way after the other."""
+    taken: dict[str, list[float]] = {name: [] for name in ways}
+    for _ in range(rounds):
+        for name, way in ways.items():
+            begin = time.perf_counter()
+            jax.block_until_ready(way())
+            taken[name].append(time.perf_counter() - begin)
+    return taken
+
+
 def write(
     name: str,
     result: dict,
@@ -87,6 +100,7 @@ def write(
     if data:
         made["data_hash"] = open_dataset(data, verify=False).hash
     write_json(path, {**result, "made_by": made, "machine": machine()})
+    print(f"written: {path}")
     return path
 
 

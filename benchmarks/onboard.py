@@ -73,7 +73,7 @@ def main(_: list[str]) -> None:
                 row = {"wall": percentiles(wall), "processor": percentiles(used)}
                 result[f"{build}_{name}"] = row
                 print(f"{build}, {name}: {row}")
-    print(f"written: {write('onboard', result, _OUTPUT.value)}")
+    write("onboard", result, _OUTPUT.value)
 
 
 if __name__ == "__main__":

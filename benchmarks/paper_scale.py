@@ -163,7 +163,7 @@ def main() -> None:
     if not result["complete"]:
         result["extrapolated_seconds_of_the_full_run"] = needed
         print(f"extrapolated, not run: {needed / 3600:.1f} h for the full amount")
-    print("written:", write("paper_scale", result, _OUTPUT.value, data=_DATA.value))
+    write("paper_scale", result, _OUTPUT.value, data=_DATA.value)
 
 
 if __name__ == "__main__":

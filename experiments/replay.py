@@ -12,7 +12,7 @@ from absl import flags
 
 from experiments.flags.common import provenance, run
 from rcirl_jax.export.closed_loop import table_rows
-from rcirl_jax.report.player.page import write_replay_page
+from rcirl_jax.report.player.player import write_replay_page
 from rcirl_jax.report.player.replays import make_replays
 from rcirl_jax.simulation.rows import BASELINES, Row
 from rcirl_jax.simulation.suite import (

@@ -61,7 +61,6 @@ from rcirl_jax.train.running import Running
 from rcirl_jax.train.state import TrainConfig
 
 _SECONDS = flags.DEFINE_float("seconds", 1200.0, "of the whole soak")
-_ROUNDS = flags.DEFINE_integer("rounds", 0, "most rounds; 0: as many as there is time")
 _LEAK = flags.DEFINE_float("leak", 0.0, "MiB kept of every round, to be found")
 _OUTPUT = flags.DEFINE_string("output", "benchmarks/results", "folder of the JSON")
 
@@ -69,7 +68,6 @@ STRIDE_S = 2.0  # s between planning frames
 BATCH, CHECKPOINT_EVERY, STOP_AT = 8, 3, 5  # the resume repeats two steps
 CASES, DURATION_S = 2, 2.0  # of every family, and s of each; the gate wants 30
 DRAWN = 1  # scenes of the page of the data
-NIGHT_S = 8 * 3600.0
 COMPILED = "/jax/core/compile/backend_compile_duration"
 # a round; most of 1,490 that are kept are tensorstore's JSON that orbax asks for
 BLOCKS = 3_000
@@ -147,20 +145,6 @@ def _logs() -> Logs:
     return Logs(format="csv", input=Path("logs"), source=None, config=config)
 
 
-def _page() -> None:
-    """The page of the data, beside that of the run."""
-    (data,) = Path("run").glob("dataset-*")
-    dataset = open_dataset(data)
-    rows = choose_rows(dataset.column("scene.tags"), DRAWN)
-    write_data_page(Path("data/index.html"), dataset, rows, "a night's data", {})
-
-
-def _outputs() -> Facts:
-    """Digests of what has to be the same in every round."""
-    page = file_sha256(Path("data/index.html"))
-    return {**jobs(Path())["autotune"].outcome(Path()), "data/index.html": page}
-
-
 def _work(facts: Mapping[str, object]) -> Facts:
     """One round in the present folder: the digests of what came out."""
     write_logs(Path("logs"))
@@ -171,8 +155,12 @@ def _work(facts: Mapping[str, object]) -> Facts:
     if not list(Path("run").glob("train-*/seed-0/checkpoints/*/sha256.json")):
         raise ValueError("the training was to stop after a checkpoint")
     tune(_run(facts, Running()), [_logs()])
-    _page()
-    return _outputs()
+    (data,) = Path("run").glob("dataset-*")
+    dataset, page = open_dataset(data), Path("data/index.html")
+    rows = choose_rows(dataset.column("scene.tags"), DRAWN)
+    write_data_page(page, dataset, rows, "a night's data", {})
+    outcome = jobs(Path())["autotune"].outcome(Path())
+    return {**outcome, str(page): file_sha256(page)}
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -238,13 +226,11 @@ class Soak:
 
 def within(growths: Mapping[str, Growth]) -> str:
     """What a run without problems has shown: slopes within limits, not none."""
-    rss, used, blocks = (growths[x] for x in ("rss_mb", "in_use_mb", "blocks"))
-    return (
-        f"within the limit: {rss.per_round:.2f} MB a round [{rss.low:.2f}, "
-        f"{rss.high:.2f}], {rss.by:.0f} in all (limit {rss.allowed:.0f}), in use "
-        f"{used.per_round:.2f} [{used.low:.2f}, {used.high:.2f}], {used.by:.1f} in all "
-        f"(limit {used.allowed:.1f}), {blocks.per_round:,.0f} blocks a round, "
-        f"{blocks.by:,.0f} in all (limit {blocks.allowed:,.0f})"
+    watched = {name: growths[name] for name in ("rss_mb", "in_use_mb", "blocks")}
+    return "within the limit: " + ", ".join(
+        f"{name} {x.per_round:,.2f} a round [{x.low:,.2f}, {x.high:,.2f}], {x.by:,.1f} "
+        f"in all (limit {x.allowed:,.1f})"
+        for name, x in watched.items()
     )
 
 
@@ -252,8 +238,6 @@ def save(soak: Soak) -> list[str]:
     """Write soak.json; the problems."""
     growths, problems = soak.growths(), soak.problems()
     seconds = soak.series["seconds"]
-    usual = sum(seconds[1:]) / max(len(seconds) - 1, 1)
-    rss, night = growths["rss_mb"], NIGHT_S / usual
     result = {
         "rounds": soak.rounds,
         "seconds": round(sum(seconds), 1),
@@ -262,10 +246,6 @@ def save(soak: Soak) -> list[str]:
         "outcome": problems[0] if problems else within(growths),
         "problems": problems,
         "growth": growths,
-        # the slope carried on; not measured
-        "extrapolated_mb_in_8_hours": [
-            round(x * night, 1) for x in (rss.per_round, rss.low, rss.high)
-        ],
         "programs_of_the_last_round": soak.late_programs,
         "series": soak.series,
     }
@@ -277,10 +257,8 @@ def main() -> None:
     """Rounds until the time is over."""
     importing.SHARD_SCENES = SHARD_SCENES  # several shards a dataset
     facts, soak = provenance(), Soak()
-    end, most = time.monotonic() + _SECONDS.value, _ROUNDS.value or 10**9
+    end = time.monotonic() + _SECONDS.value
     while soak.rounds < LEAST_ROUNDS or time.monotonic() < end:
-        if soak.rounds >= most:
-            break
         soak.round(facts)
         if soak.rounds % 10 == 0:
             save(soak)

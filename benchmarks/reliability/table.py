@@ -81,10 +81,7 @@ def words(command: str) -> list[str]:
     first, *rest = shlex.split(command)
     if first == "python":
         rest.append(f"--output={_OUTPUT.value if flags.FLAGS.is_parsed() else ''}")
-    own = {
-        "pytest": [sys.executable, "-m", "pytest", "-q"],
-        "python": [sys.executable],
-    }
+    own = {"pytest": [sys.executable, "-m", "pytest", "-q"], "python": [sys.executable]}
     return [*own.get(first, [first]), *rest]
 
 

@@ -5,6 +5,8 @@
 //   reader total WEIGHTS FEATURES OWN [MASK]  -> as score, on top of float32 values OWN [K]
 //   reader guard WEIGHTS FEATURES [MASK]  -> of each plan of 4 candidates "0 or 1, the
 //                                            feature's place, its share"
+//   reader features WEIGHTS CASES         -> for each case of CASES (tests/flat.hpp, float32)
+//                                            float32 features [K, T, F] and scores [K]
 //   reader check BATCH                    -> for each file of BATCH, its bytes after
 //                                            their number as uint64, "ok" or its refusal
 #include <cstdint>
@@ -14,6 +16,8 @@
 #include <string_view>
 #include <vector>
 
+#include "flat.hpp"
+#include "rcirl/features.hpp"
 #include "rcirl/guard.hpp"
 #include "rcirl/reward.hpp"
 
@@ -89,6 +93,43 @@ int guard(const Given& given) {
   return 0;
 }
 
+bool write(const std::vector<float>& values) {
+  return std::fwrite(values.data(), 4, values.size(), stdout) == values.size();
+}
+
+int features(const char* weights, const char* cases) {
+  rcirl::Reward reward;
+  rcirl::FeatureMap columns;
+  rcirl::Status status = rcirl::load(weights, &reward);
+  if (status.ok()) status = rcirl::feature_map(reward, &columns);
+  if (!status.ok()) {
+    std::fprintf(stderr, "%s\n", status.message().c_str());
+    return 2;
+  }
+  const std::vector<char> bytes = contents(cases);
+  std::vector<float> numbers(bytes.size() / 4);
+  if (!numbers.empty()) std::memcpy(numbers.data(), bytes.data(), 4 * numbers.size());
+  Numbers source = {numbers.data(), numbers.data() + numbers.size()};
+  rcirl::Workspace workspace = reward.workspace();
+  Case one;
+  while (source.at != source.end) {
+    if (!take_case(source, &one)) return 2;
+    status = rcirl::check(one.scene);
+    if (!status.ok()) {
+      std::fprintf(stderr, "%s\n", status.message().c_str());
+      return 2;
+    }
+    const rcirl::Candidates candidates = one.candidates();
+    std::vector<float> found(candidates.count * rcirl::kTimes * columns.size());
+    std::vector<float> scores(candidates.count);
+    columns.compute(one.scene, candidates, found.data());
+    reward.score(found.data(), candidates.count, columns.mask(one.scene), &workspace,
+                 scores.data());
+    if (!write(found) || !write(scores)) return 1;
+  }
+  return 0;
+}
+
 int check(const char* batch) {
   const std::vector<char> bytes = contents(batch);
   for (std::size_t at = 0; at + 8 <= bytes.size();) {
@@ -110,6 +151,7 @@ int check(const char* batch) {
 int main(int count, char** arguments) {
   const std::string mode = count > 1 ? arguments[1] : "";
   if (mode == "check" && count == 3) return check(arguments[2]);
+  if (mode == "features" && count == 4) return features(arguments[2], arguments[3]);
   if ((mode == "score" || mode == "guard") && (count == 4 || count == 5)) {
     Given given;
     if (!given.read(arguments[2], arguments[3], count == 5 ? arguments[4] : nullptr)) return 2;
@@ -120,8 +162,8 @@ int main(int count, char** arguments) {
     if (!given.read(arguments[2], arguments[3], count == 6 ? arguments[5] : nullptr)) return 2;
     return total(given, arguments[4]);
   }
-  std::fprintf(stderr, 
+  std::fprintf(stderr,
                "reader: arguments: expected score or guard WEIGHTS FEATURES [MASK] | "
-               "total WEIGHTS FEATURES OWN [MASK] | check BATCH\n");
+               "total WEIGHTS FEATURES OWN [MASK] | features WEIGHTS CASES | check BATCH\n");
   return 2;
 }

@@ -66,7 +66,7 @@ def _draw(
         TuningReport(
             verdict=judged,
             gate=run.config.gate,
-            suite=suite_runs(run).report(),
+            suite=suite_runs(run),
             incumbent=incumbent,
             ranking=from_json(read_json(run.folder / "ranking.json", "a ranking")),
             rewards=rewards,

@@ -13,7 +13,6 @@ import functools
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -56,17 +55,13 @@ class ImportConfig:
         return self.leave_out > 0 or self.leave_out_share > 0.0
 
 
-class _Numbers:
-    """Numbers for names, in order of first appearance."""
+def _number(table: dict[str, int], name: str) -> int:
+    """A name's number, in order of first appearance."""
+    return table.setdefault(name, len(table))
 
-    def __init__(self) -> None:
-        self.table: dict[str, int] = {}
 
-    def of(self, name: str) -> int:
-        return self.table.setdefault(name, len(self.table))
-
-    def names(self) -> list[str]:
-        return list(self.table)
+def _numbers(table: dict[str, int], names: Iterable[str]) -> np.ndarray:
+    return np.array([_number(table, name) for name in names], np.int32)
 
 
 class Progress:
@@ -133,8 +128,10 @@ class _Import:
 
     def __init__(self, writer: DatasetWriter, config: ImportConfig) -> None:
         self.writer, self.config = writer, config
-        self.recordings, self.groups = _Numbers(), _Numbers()
-        self.vehicles = _Numbers()
+        # names to their numbers
+        self.recordings: dict[str, int] = {}
+        self.groups: dict[str, int] = {}
+        self.vehicles: dict[str, int] = {}
         self.quality = QualityReport()
         self.first_refused = ""  # in words
         self.sizes: dict[str, int] = {}
@@ -159,13 +156,13 @@ class _Import:
 
     def add(self, made: Cut) -> None:
         """Take over one recording's scenes."""
-        if made.name in self.recordings.table:
+        if made.name in self.recordings:
             raise InputError(f"{made.name}: name: met twice: expected once")
         self.first_refused = self.first_refused or made.refused or ""
         if not made.refused:
             self.sources[made.source] = made.licence
             self.rates.add(made.rate_hz)
-        number = self.recordings.of(made.name)
+        number = _number(self.recordings, made.name)
         if self.done:
             self._replay(self.done.popleft(), made)
             return
@@ -178,8 +175,8 @@ class _Import:
         }
         if made.scenes is not None:
             scenes = made.scenes.replace(
-                vehicle=self._numbers(self.vehicles, made.vehicles),
-                group=self._numbers(self.groups, made.groups),
+                vehicle=_numbers(self.vehicles, made.vehicles),
+                group=_numbers(self.groups, made.groups),
                 recording=np.full_like(made.scenes.recording, number),
             )
             check_finite(made.name, scenes, np.arange(len(made.vehicles)))
@@ -196,9 +193,6 @@ class _Import:
         if sum(block.vehicle.shape[0] for block in self.pending) >= SHARD_SCENES:
             self._close_shard()
 
-    def _numbers(self, numbers: _Numbers, names: list[str]) -> Any:  # noqa: ANN401
-        return np.array([numbers.of(name) for name in names], np.int32)
-
     def _count(self, entry: dict) -> None:
         self.quality.merge(entry["quality"])
         for name, scenes in entry["groups"].items():
@@ -211,10 +205,8 @@ class _Import:
                 f"{made.name}: input or settings changed since the interrupted "
                 "import: expected the same; use another --output"
             )
-        for vehicle in entry["vehicles"]:
-            self.vehicles.of(vehicle)
-        for group in entry["groups"]:
-            self.groups.of(group)
+        _numbers(self.vehicles, entry["vehicles"])
+        _numbers(self.groups, entry["groups"])
         self._count(entry)
 
     def _close_shard(self) -> None:
@@ -248,8 +240,8 @@ class _Import:
             first_seen, vehicles, self.config.test_fraction
         )
         names = [f"{group}/{block}" for block in blocks]
-        self.groups, start = _Numbers(), 0
-        numbers = self._numbers(self.groups, names)
+        self.groups, start = {}, 0
+        numbers = _numbers(self.groups, names)
         joined = jax.tree.map(lambda *x: np.concatenate(x), *self.pending)
         self.pending = [joined.replace(group=numbers)]
         self.sizes = dict(collections.Counter(names))
@@ -293,9 +285,9 @@ class _Import:
                     {"source": source, "licence": licence}
                     for source, licence in sorted(self.sources.items())
                 ],
-                "recordings": self.recordings.names(),
-                "groups": self.groups.names(),
-                "vehicles": self.vehicles.names(),
+                "recordings": list(self.recordings),
+                "groups": list(self.groups),
+                "vehicles": list(self.vehicles),
                 "splits": splits,
                 "quality": self.quality.as_dict(),
                 "import": self._flags(),
@@ -305,7 +297,7 @@ class _Import:
 
     def _check_share_left_out(self) -> None:
         refused, share = self.quality.refused, self.config.leave_out_share
-        recordings = len(self.recordings.table)
+        recordings = len(self.recordings)
         if share and refused > share * recordings:
             raise InputError(
                 f"import: {refused} of {recordings} recordings refused, the first: "

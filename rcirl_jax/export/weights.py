@@ -231,11 +231,10 @@ def _anchor(
     anchor: reader.Anchor, features: int, samples_x: np.ndarray
 ) -> dict[str, Any]:
     """The map `anchor`, with the gains of the samples as its reader has them."""
-    numbers = {key: getattr(anchor, key) for key in reader.ANCHOR_NUMBERS}
     arrays = {key: getattr(anchor, key) for key in reader.ANCHOR_ARRAYS}
     box = {
         "incumbent": anchor.incumbent,
-        **_plain(numbers),
+        **{key: _plain(getattr(anchor, key)) for key in reader.ANCHOR_NUMBERS},
         **{key: _array(f"anchor.{key}", item) for key, item in arrays.items()},
         "gain": None,
     }

@@ -1,6 +1,5 @@
 """Imports in other processes, on a Ray cluster, and killed: the same bytes."""
 
-import signal
 import subprocess
 import sys
 
@@ -217,46 +216,3 @@ def test_no_cluster_is_one_line():
     pytest.importorskip("ray")
     with pytest.raises(InputError, match=r"--ray_address: 127\.0\.0\.1:1: "):
         Ray("127.0.0.1:1")
-
-
-STARTED = """
-import os, signal, sys
-from pathlib import Path
-from rcirl_jax.data import importing
-from rcirl_jax.data.store import files
-from tests.data.small_logs import CONFIG, write_logs
-
-write, left = files.Files.write_many, int(sys.argv[3])
-
-def dying(self, values):
-    global left
-    left -= 1
-    if left < 0:  # half of what it had to write is there
-        write(self, dict(list(values.items())[: len(values) // 2]))
-        os.kill(os.getpid(), signal.SIGKILL)
-    write(self, values)
-
-files.Files.write_many = dying
-importing.SHARD_SCENES = 30
-parts = write_logs(Path(sys.argv[1]))
-importing.import_parts(parts, sys.argv[2], CONFIG)
-"""
-
-
-def dead_after(logs, data, writes):
-    """How an import ended that dies in the middle of a write after some."""
-    arguments = map(str, (logs, data, writes))
-    words = [sys.executable, "-c", STARTED, *arguments]
-    return subprocess.run(words, check=False, capture_output=True).returncode
-
-
-@pytest.mark.multiprocess
-def test_an_import_that_dies_while_it_writes_resumes_to_the_same_bytes(local, tmp_path):
-    """Death in the middle of a later mark, and of a later shard."""
-    data = tmp_path / "data"
-    for writes in (3, 2):
-        ended = dead_after(tmp_path / "logs", data, writes)
-        assert ended == -signal.SIGKILL
-        assert not (data / "manifest.json").exists()
-    import_parts(write_logs(tmp_path / "logs"), data, CONFIG)
-    assert files_of(data) == local

@@ -8,13 +8,9 @@ import pytest
 from rcirl_jax.data import importing
 from rcirl_jax.data.cut import Cut
 from rcirl_jax.data.importers import parts, read_part
-from rcirl_jax.data.importing import Progress, import_parts
-from rcirl_jax.data.parts import Part
+from rcirl_jax.data.importing import Progress
 from rcirl_jax.data.readers import reading
-from rcirl_jax.data.readers.tables import streams
 from rcirl_jax.data.scenes.quality import QualityReport
-from tests.data import small_logs
-from tests.data.importers import test_csv_stream as long_csv
 from tests.data.importers.formats import l5, nuplan, waymo
 
 
@@ -76,27 +72,6 @@ def test_time_left_by_the_share_of_one_part(monkeypatch, capsys):
     assert drawn(capsys)[-1].startswith("import: 100% [01:00<00:00, 6,000 scenes")
 
 
-def test_a_long_csv_moves_the_bar_and_keeps_its_bytes(tmp_path, monkeypatch, capsys):
-    """One file of three minutes: both readings are shown, data are the same."""
-    path = tmp_path / "log.csv"
-    spec = {**long_csv.write(path, long_csv.rows_of(cars=8)), "long_bytes": 1}
-    part = Part(format="csv", input=path, spec=spec)
-    import_parts([part], tmp_path / "plain", small_logs.CONFIG)
-    assert not [x for x in drawn(capsys) if ": read:" in x]  # it is quick
-    monkeypatch.setattr(streams, "READ_BYTES", 2**14)
-    monkeypatch.setattr(reading, "DELAY_S", 0.0)
-    Clock(monkeypatch, step=1.0)
-    import_parts([part], tmp_path / "data", small_logs.CONFIG)
-    lines = drawn(capsys)
-    first = [line for line in lines if line.startswith("log.csv: read:")]
-    assert any(0 < share < 100 for share in shares(first))
-    second = [line for line in lines if line.startswith("import:")]
-    assert sorted(shares(second)) == shares(second)
-    assert set(shares(second)) == {0, 33, 67, 100}
-    written = [small_logs.files_of(tmp_path / name) for name in ("plain", "data")]
-    assert written[0] == written[1]
-
-
 def found(name, path, **changes):
     (part,), spec = parts(name, path)
     return [made.progress for made in read_part(name, part, {**spec, **changes})]
@@ -111,3 +86,21 @@ def test_formats_with_long_parts_say_how_much_is_read(tmp_path):
     assert len(progress) > 2
     np.testing.assert_allclose(np.diff([0.0, *progress]), 1.0 / len(progress))
     assert found("l5", l5.write(tmp_path / "l5").input) == [0.5, 1.0]
+
+
+def test_only_what_takes_long_in_no_worker_shows_a_bar(tmp_path, monkeypatch, capsys):
+    path = tmp_path / "log.csv"
+    path.write_text("t\n" * 1000)
+
+    def read():
+        with reading.reading(path, [path]) as show:
+            for _ in range(10):
+                show(300)  # more than there is
+        return drawn(capsys)
+
+    assert read() == []
+    monkeypatch.setattr(reading, "DELAY_S", 0.0)
+    clock = Clock(monkeypatch, step=1.0)
+    assert max(shares(read())) == 100
+    monkeypatch.setattr(reading.multiprocessing, "parent_process", lambda: clock)
+    assert read() == []

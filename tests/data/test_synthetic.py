@@ -1,6 +1,5 @@
 """Synthetic traffic: deterministic, collision free, human, lawful."""
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +10,11 @@ from hypothesis import strategies as st
 
 from rcirl_jax.data.importers.synthetic import reader as synthetic
 from rcirl_jax.data.recording import validate_recording
-from rcirl_jax.data.synthetic import ROADS, RunConfig
+from rcirl_jax.data.synthetic import ROADS
 from rcirl_jax.data.synthetic.drivers import DRIVER, idm_acceleration
 from rcirl_jax.data.synthetic.roads import to_world
 from rcirl_jax.data.synthetic.state import Neighbours, State
 from rcirl_jax.data.synthetic.stops import schedule
-from rcirl_jax.data.synthetic.traffic import Traffic
 from rcirl_jax.runtime.specs import load_toml, spec_root
 from rcirl_jax.types import Recording, Track
 from tests.helpers.logs import refused
@@ -131,16 +129,6 @@ def test_boxes_never_overlap(default, tmp_path, road):
         assert overlaps(recording) == 0, recording.name
 
 
-def test_lateral_acceleration_in_turns_is_comfortable(default):
-    for recording in default:
-        for track in recording.tracks:
-            if track.t.size < 10 or "turn" not in recording.name:
-                continue
-            yaw_rate = np.gradient(np.unwrap(track.heading), 0.1)
-            lateral = np.abs(yaw_rate * track.speed)
-            assert lateral.max() < 3.0, (recording.name, track.id)
-
-
 def test_positions_agree_with_heading_speed_and_clock(tmp_path):
     for road in ROADS:
         for track in make(tmp_path, road=road)[0].tracks:
@@ -217,28 +205,6 @@ def closed_form_gap(v: float, v0: float) -> float:
     return (2.0 + 1.3 * v) / np.sqrt(1.0 - (v / v0) ** 4)
 
 
-def test_platoon_settles_at_the_equilibrium_gap():
-    config = synthetic.driver_config(DEFAULT, load_toml(DEFAULT)["drivers"])
-    config = dataclasses.replace(config, noise_mps2=0.0)
-    about = {"road": "highway_straight", "seed": (0,), "warmup_s": 0.0}
-    run = RunConfig(**about, duration_s=10.0, density_veh_per_km=5.0)
-    traffic = Traffic([run], config)
-    source, state = traffic.sources[0], traffic.state
-    state.vehicle[:] = -1
-    for name, value in SAME.items():
-        source.pool[name] = value
-    v, v0 = 15.0, 30.0
-    source.pool["speed_factor"][source.used] = v / v0  # the leader
-    gap = closed_form_gap(v, v0)
-    for place in range(5):
-        traffic.add(0, 1, 330.0 - place * (4.5 + 1.2 * gap), v)
-    source.next_arrival[:] = np.inf
-    while state.s.max() < 1090.0 and state.alive.sum() == 5:
-        traffic.step()
-    order = np.sort(state.s[state.alive])[::-1]
-    np.testing.assert_allclose(-np.diff(order) - 4.5, gap, rtol=0.01)
-
-
 @settings(max_examples=20)
 @given(st.floats(0.0, 28.0))
 def test_idm_is_at_rest_in_its_equilibrium_gap(v):
@@ -291,22 +257,6 @@ def test_roads_are_what_they_say(name):
     if name == "highway_s_curve":
         assert 290.0 <= 1.0 / np.abs(road.kappa).max() <= 800.0
         assert road.kappa.min() < 0.0 < road.kappa.max()
-
-
-def test_lanes_are_linked_and_parallel(default):
-    for recording in default[::4]:
-        lanes = {lane.id: lane for lane in recording.lanes}
-        for lane in recording.lanes:
-            steps = np.linalg.norm(np.diff(lane.centre, axis=0), axis=1)
-            assert steps.max() < 2.7
-            for following in lane.successors:
-                gap = lanes[following].centre[0] - lane.centre[-1]
-                np.testing.assert_allclose(gap, 0.0, atol=1e-9)
-            if lane.left is not None:
-                assert lanes[lane.left].right == lane.id
-                apart = np.linalg.norm(lanes[lane.left].centre - lane.centre, axis=1)
-                width = lane.left_width + lanes[lane.left].right_width
-                np.testing.assert_allclose(apart, width, atol=1e-6)
 
 
 @settings(max_examples=20)

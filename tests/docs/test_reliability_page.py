@@ -1,6 +1,5 @@
 """docs/reliability.md: what its rows name is there, and how a row is run."""
 
-import json
 import re
 import sys
 
@@ -8,7 +7,6 @@ import pytest
 
 from benchmarks.reliability import table
 from benchmarks.reliability.table import Row, rows_of, words
-from rcirl_jax.errors import InputError
 from tests.docs.pages import DOCS, REPO
 
 ROWS = rows_of((DOCS / "reliability.md").read_text())
@@ -45,19 +43,3 @@ def test_a_row_whose_tests_are_skipped_has_not_run(tmp_path):
         command = f"pytest {test} -p no:cacheprovider -k {chosen}"
         row = Row(fault="a", count="1", minutes=1, command=command)
         assert table.ran(row)["status"] == status
-
-
-def test_a_row_is_run_again_if_it_failed_or_the_code_is_another(tmp_path):
-    """Or if it depends on what others publish."""
-    path = tmp_path / "reliability.json"
-    told = [("make a", 0, "this"), ("make b", 1, "this"), ("make c", 0, "other"),
-            (table.WORLD[0], 0, "this")]  # fmt: skip
-    rows = [
-        {"fault": "a", "command": command, "status": status, "tree_sha256": code}
-        for command, status, code in told
-    ]
-    path.write_text(json.dumps({"rows": rows}))
-    assert [*table.as_stated_before(path, "this")] == [("a", "make a")]
-    path.write_text("[]")
-    with pytest.raises(InputError, match=r"reliability\.json: expected a result of"):
-        table.as_stated_before(path, "this")

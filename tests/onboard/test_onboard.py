@@ -9,19 +9,12 @@ import re
 import shutil
 import struct
 import subprocess
-from pathlib import Path
 
 import msgpack
 import numpy as np
 import pytest
 
-from rcirl_jax.export import (
-    Guard,
-    WeightsError,
-    decode_weights,
-    load_weights,
-    save,
-)
+from rcirl_jax.export import Guard, WeightsError, decode_weights, load_weights, save
 from tests.export import test_old_files, wrong
 from tests.export.test_reader import refusal
 from tests.helpers.weights_files import (
@@ -30,8 +23,8 @@ from tests.helpers.weights_files import (
     packed,
     trained_network,
 )
+from tests.onboard.programs import ONBOARD, built, configured, run
 
-ONBOARD = Path(__file__).resolve().parents[2] / "onboard"
 VALID = packed(features=2, times=3, hidden=(4,))
 GATED = packed(features=2, times=3, hidden=(4,), by_context=True)
 RANGED = packed(features=2, times=3, hidden=(4,), seen=True)
@@ -39,37 +32,9 @@ BOTH = packed(features=2, times=3, hidden=(4,), by_context=True, seen=True)
 ANCHORED = packed(features=2, times=3, hidden=(4,), by_context=True, anchored=True)
 
 
-def run(*command, **options):
-    done = subprocess.run(
-        [str(part) for part in command], capture_output=True, check=False, **options
-    )
-    assert done.returncode == 0, (done.stdout + done.stderr).decode()[-4000:]
-    return done.stdout
-
-
-def configured(folder, *flags):
-    """A build folder, or a skip with the reason."""
-    compiler = os.environ.get("CXX", "c++")
-    for tool in ("cmake", compiler):
-        if shutil.which(tool) is None:
-            pytest.skip(f"{tool} not found")
-    probe = '#if !__has_include(<msgpack/unpack_template.h>)\n#error "none"\n#endif\n'
-    flag = ("-x", "c++", "-fsyntax-only", "-")
-    headers = subprocess.run(
-        [compiler, *flag], input=probe.encode(), capture_output=True, check=False
-    )
-    if headers.returncode:
-        pytest.skip("msgpack/unpack_template.h not found: install libmsgpack-dev")
-    run("cmake", "-S", ONBOARD, "-B", folder, "-DRCIRL_WERROR=ON", *flags)
-    return folder
-
-
 @pytest.fixture(scope="module")
 def programs(tmp_path_factory):
-    flags = ("-DRCIRL_SANITIZE=ON", "-DCMAKE_CXX_FLAGS_RELEASE=-O1")
-    folder = configured(tmp_path_factory.mktemp("onboard"), *flags)
-    run("cmake", "--build", folder, "--parallel", 2, "--target", "reader", "choose")
-    return folder
+    return built(tmp_path_factory.mktemp("onboard"), "reader", "choose")
 
 
 def verdicts(programs, files, folder):

@@ -84,31 +84,13 @@ def straight(made, v):
     )
 
 
-def with_obstacle(kind, s, l, v=10.0, speed=0.0, sideways=0.0, length=4.0, width=1.8):
+def with_obstacle(kind, s, l, v=10.0, sideways=0.0, **box):
     """A straight empty road with one obstacle; the ego drives v."""
-    made = jax.tree.map(jnp.asarray, scene())
-    o, t = made.obstacles, jnp.asarray(TIMES_S)
-    empty = jnp.zeros_like(o.s_lower)
-    row = lambda x: empty.at[0].set(x)  # noqa: E731
-    return made.replace(
-        ego=made.ego.replace(v=jnp.float32(v), a=jnp.float32(0), l=jnp.float32(0),
-                             dl=jnp.float32(0), ddl=jnp.float32(0)),
-        path=made.path.replace(
-            l=jnp.zeros_like(made.path.l), kappa=jnp.zeros_like(made.path.kappa),
-            speed_limit=jnp.full_like(made.path.l, 30.0),
-            road_left=jnp.full_like(made.path.l, 6.0),
-            road_right=jnp.full_like(made.path.l, -6.0),
-        ),
-        obstacles=o.replace(
-            s_lower=row(s - length / 2 + speed * t),
-            s_upper=row(s + length / 2 + speed * t),
-            l_lower=row(l - width / 2 + sideways * t),
-            l_upper=row(l + width / 2 + sideways * t),
-            speed=row(speed + 0.0 * t), valid=jnp.zeros_like(o.valid).at[0].set(True),
-            kind=jnp.zeros_like(o.kind).at[0].set(int(kind)),
-        ),
-        time_valid=jnp.ones_like(made.time_valid),
-    )  # fmt: skip
+    usual = {"length": 4.0, "width": 1.8, "kind": kind, "s": s, "l": l}
+    made = scene(v=v, speed_limit=30.0, boxes=[{**usual, **box}] * (kind != Kind.NONE))
+    o, aside = made.obstacles, sideways * jnp.asarray(TIMES_S)
+    edges = {"l_lower": o.l_lower + aside, "l_upper": o.l_upper + aside}
+    return made.replace(obstacles=o.replace(**edges))
 
 
 def test_a_body_that_slips_through_between_two_times_is_caught():

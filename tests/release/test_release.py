@@ -100,30 +100,23 @@ def test_users_get_the_versions_that_are_tested():
     assert {(pin.name, str(pin.specifier)) for pin, _ in pins("all")} <= tested
 
 
-KNOWN = {"vulns": [{"id": "X-1", "fix_versions": ["2.0.1"]}]}
+NONE = "error: audit: 1 of 1 locked versions not audited"
+FOUND = {"vulns": [{"id": "X-1", "fix_versions": ["2.0.1"]}]}
 
 
 @pytest.mark.parametrize(
     ("answer", "status", "said"),
     [
-        ({"vulns": []}, 0, "audit: 1 locked versions, no known vulnerability"),
-        (KNOWN, 1, "numpy 2.0.0: X-1, fixed in 2.0.1"),
-        (
-            {"skip_reason": "none"},
-            2,
-            "error: audit: 1 of 1 locked versions not audited",
-        ),
-        (None, 2, "pip-audit: no such host"),
+        (FOUND, 1, "numpy 2.0.0: X-1, fixed in 2.0.1"),
+        ({"skip_reason": "none"}, 2, NONE),
     ],
 )
 def test_an_audit_that_nobody_answers_is_not_passed(tmp_path, answer, status, said):
     """With a pip-audit of our own making beside the Python."""
-    told = ""
-    if answer is not None:
-        numpy = {"name": "numpy", "version": "2.0.0", **answer}
-        told = json.dumps({"dependencies": [numpy]})
+    numpy = {"name": "numpy", "version": "2.0.0", **answer}
+    told = json.dumps({"dependencies": [numpy]})
     tool, lock = tmp_path / "pip-audit", tmp_path / "a.lock"
-    tool.write_text(f"#!/bin/sh\necho 'no such host' >&2\necho '{told}'\n")
+    tool.write_text(f"#!/bin/sh\necho '{told}'\n")
     tool.chmod(0o755)
     (tmp_path / "python").symlink_to(sys.executable)
     lock.write_text("numpy==2.0.0 ; python_version < '3.12' \\\n    --hash=sha256:0\n")

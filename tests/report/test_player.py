@@ -48,7 +48,7 @@ def test_frames_are_the_drives_own(replays):
             driven_m = record.s[number, : last + 1].max()
             assert drive.summary.startswith(f"{driven_m:.0f} m driven, ")
             hit = bool(record.at_fault[number, : last + 1].any())
-            assert ("fails collision free" in drive.summary) == hit
+            assert ("at-fault collision" in drive.summary) == hit
             for name, half in (("s", 0.051), ("l", 0.0051), ("v", 0.051)):
                 shown = getattr(drive, name)
                 wanted = getattr(record, name)[number, steps]
@@ -86,8 +86,8 @@ def test_the_drives_are_those_of_the_suite():
 
 def test_a_crash_ends_the_drive_and_shows_who_was_hit(replays):
     crashed, fine = replays[0].drives
-    assert "collision of its own fault" in crashed.end
-    assert crashed.events[0][1] == "collision of its own fault"
+    assert "at-fault collision" in crashed.end
+    assert crashed.events[0][1] == "at-fault collision"
     when = crashed.events[0][0]
     assert when < SECONDS - 0.3
     assert len(crashed.s) == int(np.ceil(when / STEP_S / FRAME_STEPS - 1e-6))
@@ -120,3 +120,22 @@ def test_the_recorded_human_drives_beside_the_others():
     at = FRAME_STEPS * (np.arange(len(human.s)) + 1)
     assert human.s == pytest.approx(log[np.minimum(at, len(log) - 1)], abs=0.06)
     assert not any(human.plan)
+
+
+def test_a_case_says_when_its_drives_part(replays):
+    one, two = replays[0].drives[:2]
+    when = replays[0].apart
+    at = one.t.index(when)
+    gap = np.abs(np.subtract(one.s[: at + 1], two.s[: at + 1]))
+    speeds = np.abs(np.subtract(one.v[: at + 1], two.v[: at + 1]))
+    assert gap[-1] > 2.0 or speeds[-1] > 1.0
+    assert (gap[:-1] <= 2.0).all()
+    assert (speeds[:-1] <= 1.0).all()
+
+
+def test_the_last_frame_is_the_end_of_the_drive(replays):
+    for one in replays:
+        for drive in one.drives:
+            assert len(drive.t) == len(drive.s)
+            assert np.diff(drive.t)[:-1] == pytest.approx(FRAME_STEPS * STEP_S)
+            assert 0.0 < drive.t[-1] - drive.t[-2] <= FRAME_STEPS * STEP_S + 1e-6

@@ -101,9 +101,7 @@ def test_padding_and_infeasible_candidates_count_nothing(name):
         loss_sums(name, whole, CONFIG), loss_sums(name, part, CONFIG), strict=True
     ):
         assert float(a) == pytest.approx(float(b), rel=1e-6)
-    wild = whole._replace(
-        candidates=jnp.where(whole.counts, whole.candidates, jnp.inf),
-    )
+    wild = whole._replace(candidates=jnp.where(whole.counts, whole.candidates, jnp.inf))
     assert float(loss_sums(name, wild, CONFIG).loss) == pytest.approx(
         float(loss_sums(name, whole, CONFIG).loss), rel=1e-6
     )

@@ -44,6 +44,7 @@ from rcirl_jax.train.metrics import pairs_won
 from rcirl_jax.train.running import check_run, describe_run
 from rcirl_jax.train.state import TrainConfig
 from tests.data.store import test_dataset as test_store
+from tests.helpers.stored import sweep_result
 from tests.helpers.weights_files import packed
 
 ROWS = 2  # of a dataset
@@ -277,7 +278,7 @@ def metrics(folder: Path) -> Target:
 def sweeps(folder: Path) -> Target:
     """The result of a sweep; what it resumes from are `stages`."""
     folder.mkdir(parents=True)
-    write_json(folder / SWEEP, pieces.sweep_result())
+    write_json(folder / SWEEP, sweep_result())
     names = (str(folder),)
     return Target(lambda: read_sweep(folder), [folder / SWEEP], names)
 

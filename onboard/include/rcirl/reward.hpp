@@ -34,21 +34,9 @@
 #include <vector>
 
 #include "rcirl/detail/decode.hpp"
+#include "rcirl/status.hpp"
 
 namespace rcirl {
-
-// Success, or one line "FILE: field: value: expected ...".
-class [[nodiscard]] Status {
- public:
-  Status() = default;
-  explicit Status(std::string_view message) : message_(detail::one_line(message)) {}
-
-  bool ok() const { return message_.empty(); }
-  const std::string& message() const { return message_; }
-
- private:
-  std::string message_;
-};
 
 // Which times of which trajectories count: bytes of 0 and 1.
 struct Mask {

@@ -5,18 +5,14 @@ its importer. Numbers have limits by what they are: beyond them no log means any
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rcirl_jax.data.importers.options import section
-from rcirl_jax.data.readers.tables.ledger import (
-    MAX_BAD_ROWS,
-    Ledger,
-    allowed_share,
-)
+from rcirl_jax.data.readers.tables.ledger import Ledger, allowed_share
 from rcirl_jax.data.readers.tables.repair import once
 from rcirl_jax.data.readers.tables.table import (
     MAX_PLACE_M,
@@ -24,24 +20,43 @@ from rcirl_jax.data.readers.tables.table import (
     MAX_VELOCITY_MPS,
     Field,
     Table,
+    fields_of,
     open_table,
     read,
 )
+from rcirl_jax.types import Kind
 
 Rows = dict[str, np.ndarray]  # field -> [n]
+KINDS = {
+    **dict.fromkeys(("pedestrian", "person", "animal"), Kind.PEDESTRIAN),
+    # a trailer is in the way of others like any body that moves, but nobody drives it:
+    # only vehicles are experts (Argoverse 2's "unknown" and Waymo's "other" likewise)
+    **dict.fromkeys(("bicycle", "bicyclist", "cyclist", "trailer"), Kind.CYCLIST),
+    **dict.fromkeys(("car", "van", "truck", "bus", "truck_bus"), Kind.VEHICLE),
+    **dict.fromkeys(("motorcycle", "vehicle"), Kind.VEHICLE),
+}  # class of a road user, in small letters -> what it is; others are vehicles
 LIMITS = {
     **{"time": MAX_TIME, "place": MAX_PLACE_M, "speed": MAX_VELOCITY_MPS},
     **{"count": 1e12, "number": np.inf, "text": np.inf},
 }
 
 
-def open_log(
-    path: Path, spec: Mapping, allowed: float = MAX_BAD_ROWS
-) -> tuple[Table, Ledger]:
+def with_numbers_and_texts(spec: dict, packaged: Mapping) -> dict:
+    """A user's source TOML, with the packaged one's options that are no tables."""
+    plain = (bool, int, float, str)
+    return {k: v for k, v in packaged.items() if isinstance(v, plain)} | spec
+
+
+def open_log(path: Path, spec: Mapping) -> tuple[Table, Ledger]:
     """A table as its source TOML says, and what will become of its rows."""
     table = open_table(path, section(spec, "table"))
-    share = allowed_share(spec, allowed)
-    return table, Ledger(path=path, unit=table.unit, allowed=share)
+    return table, Ledger(path=path, unit=table.unit, allowed=allowed_share(spec))
+
+
+def unknown_kinds(what: str, found: Iterable[str]) -> list[str]:
+    """The note on classes that nobody knows."""
+    unknown = sorted(set(found) - {*KINDS})
+    return [f"{what} taken for vehicles: {', '.join(unknown)}"] if unknown else []
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -60,18 +75,16 @@ class Columns:
 
     def fields(self, table: Table) -> list[Field]:
         """Fields of a table: those needed, and others whose column is there."""
-        return [
-            Field(
-                name=name,
-                column=self.called.get(name, name),
-                needed=name in self.needed,
-                text=kind == "text",
-                limit=LIMITS[kind],
-                factor=self.factors.get(name, 1.0),
-            )
-            for name, kind in {**self.needed, **self.optional}.items()
-            if name in self.needed or table.has(self.called.get(name, name))
-        ]
+        kinds = {**self.needed, **self.optional}
+        return fields_of(
+            table,
+            [*self.needed],
+            [*self.optional],
+            texts=[name for name, kind in kinds.items() if kind == "text"],
+            limits={name: LIMITS[kind] for name, kind in kinds.items()},
+            columns=self.called,
+            factors=self.factors,
+        )
 
     def read(self, table: Table, ledger: Ledger) -> Rows:
         """Rows in SI units, each road user once in a frame.

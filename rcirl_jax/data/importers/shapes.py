@@ -14,6 +14,7 @@ ORIGIN_STEP_M = 1000.0  # m, local origins are multiples of it
 MAX_COORDINATE_M = 1e8  # m, farther than any map projection on Earth reaches
 MIN_HALF_WIDTH_M = 0.1  # m, lanes taper to a point at forks
 MARGIN_M = 150.0  # m of a map that are read around the tracks
+CHUNK = 100_000  # points whose distances are found at once
 FRACTION_DIGITS = 7  # fractions of a line that differ by less are one
 
 
@@ -99,20 +100,32 @@ def between_bounds(
     return centre[keep], half[keep]
 
 
-def distance_to_line(points: np.ndarray, line: np.ndarray) -> np.ndarray:
-    """Distance [n] m of points [n, 2] from a polyline [m >= 1, 2], by shapely.
+def distances_to_lines(
+    points: np.ndarray, lines: Sequence[np.ndarray], which: np.ndarray
+) -> np.ndarray:
+    """Distance [n] m of points [n, 2] from polylines, by shapely.
 
     The shortest line from one that is prepared is found by a tree; a distance by
     walking along it for every point. Near zero, coordinates lose no digits.
+
+    Args:
+      points: m.
+      lines: [m >= 1, 2] m each.
+      which: [n] number of each point's line.
     """
     shapely = extra_module("shapely")
+    corner = lines[0][0]
     # its lines have two points or more
-    near = line - line[0] if len(line) > 1 else np.zeros((2, 2))
-    whole = shapely.linestrings(near)
+    long = [line if len(line) > 1 else np.tile(line, (2, 1)) for line in lines]
+    owner = np.repeat(np.arange(len(long)), [len(line) for line in long])
+    whole = shapely.linestrings(np.concatenate(long) - corner, indices=owner)
     shapely.prepare(whole)
-    return shapely.length(
-        shapely.shortest_line(whole, shapely.points(points - line[0]))
-    )
+    found = np.empty(len(points))
+    for start in range(0, len(points), CHUNK):
+        part = slice(start, start + CHUNK)
+        places = shapely.points(points[part] - corner)
+        found[part] = shapely.length(shapely.shortest_line(whole[which[part]], places))
+    return found
 
 
 def line_across(

@@ -25,9 +25,10 @@ from typing import Any
 
 import numpy as np
 
+from rcirl_jax.data.readers.held_logs import Held, Piece
 from rcirl_jax.data.readers.reading import reading
 from rcirl_jax.data.readers.tables.ledger import Ledger
-from rcirl_jax.data.readers.tables.repair import once, single_rows
+from rcirl_jax.data.readers.tables.repair import single_rows
 from rcirl_jax.data.readers.tables.table import Field, Table, batches, read
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.atomic_files import locked
@@ -46,30 +47,6 @@ SCRATCH = "rcirl-scratch-"  # how folders of scratch files begin
 LOCK = "lock"  # in such a folder, held while it is in use
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Piece:
-    """Rows of one minute of one recording, and of its surroundings.
-
-    Of a minute too crowded for memory it is a window, counted by `window`.
-    """
-
-    recording: str | None  # value of the `recording` field
-    number: int  # of the minute, from the recording's first
-    values: dict[str, np.ndarray]  # field -> [n], t since the recording's start
-    within: tuple[float, float]  # s, the minute or the window itself
-    # id -> s, when the whole log first saw it, and when again after each gap
-    fragments: dict[str, list[float]]
-    progress: float  # share of the file's pieces up to this one
-    window: int | None = None  # of the minute; None: the minute is one piece
-    is_whole: bool = False  # the recording is one piece
-
-    @property
-    def label(self) -> str:
-        """What names of recordings end with."""
-        rest = "" if self.window is None else f".{self.window:02d}"
-        return "" if self.is_whole else f"-{self.number:05d}{rest}"
-
-
 @contextlib.contextmanager
 def rows_of(
     table: Table,
@@ -77,7 +54,6 @@ def rows_of(
     ledger: Ledger,
     *,
     is_long: bool,
-    wanted: Container[str] | None = None,
     apart: Container[str] = (),
     places: tuple[str, str] = ("x", "y"),
 ) -> Iterator["Held | Spill"]:
@@ -89,7 +65,6 @@ def rows_of(
       ledger: of the file.
       is_long: the rows go to scratch files, which are removed afterwards; a bar
         shows the reading.
-      wanted: values of the `recording` field whose rows are kept; None: all.
       apart: columns in which rows may differ that repeat each other.
       places: columns that say where a road user is.
 
@@ -101,7 +76,7 @@ def rows_of(
         yield Held(read(table, fields, ledger), ledger, apart, places)
         return
     with scratch() as folder:
-        spill = Spill(table.path, folder, ledger, wanted, apart, places)
+        spill = Spill(table.path, folder, ledger, apart, places)
         with reading(table.path, [table.path]) as show:
             for batch in batches(table, fields, ledger, show):
                 spill.add(batch)
@@ -151,54 +126,6 @@ def _within(rows: np.ndarray, t: int, begin: float, end: float) -> np.ndarray:
     return rows[(rows[:, t] >= begin) & (rows[:, t] < end)]
 
 
-class Held:
-    """Rows by recording, of a log that fits into memory."""
-
-    def __init__(
-        self,
-        rows: dict[str, np.ndarray],
-        ledger: Ledger,
-        apart: Container[str],
-        places: tuple[str, str],
-    ) -> None:
-        self.rows, self.ledger, self.apart, self.places = rows, ledger, apart, places
-        self._of = rows.pop("recording", None)
-        self._tidied: dict[str | None, dict[str, np.ndarray]] = {}
-
-    def recordings(self) -> list[str | None]:
-        """Values of `recording`; [None] without the field."""
-        return [None] if self._of is None else np.unique(self._of).tolist()
-
-    def texts_of(self, field: str) -> list[str]:
-        """All that a field of texts holds."""
-        return np.unique(self.rows.get(field, [])).tolist()
-
-    def minutes(self, recording: str | None) -> Iterator[dict[str, np.ndarray]]:
-        """Field -> [n] of a recording, t as in the file."""
-        if recording not in self._tidied:
-            own = self.rows
-            if recording is not None:
-                chosen = self._of == recording
-                own = {name: column[chosen] for name, column in own.items()}
-            plain = str if own["id"].dtype.kind == "U" else "{:g}".format
-            options = {"places": self.places, "apart": self.apart, "name_of": plain}
-            self._tidied[recording] = once(own, self.ledger, **options)
-        yield self._tidied[recording]
-
-    def pieces(self, recording: str | None, max_gap_s: float) -> Iterator[Piece]:
-        """The recording as one piece; arguments as of `Spill.pieces`."""
-        for values in self.minutes(recording):
-            yield Piece(
-                recording=recording,
-                number=0,
-                values={**values, "t": values["t"] - values["t"].min()},
-                within=(-np.inf, np.inf),
-                fragments={},
-                progress=1.0,
-                is_whole=True,
-            )
-
-
 class Spill:
     """Rows by recording and minute in scratch files of float64."""
 
@@ -207,12 +134,11 @@ class Spill:
         path: Path,
         folder: Path,
         ledger: Ledger,
-        wanted: Container[str] | None,
         apart: Container[str],
         places: tuple[str, str],
     ) -> None:
         self.path, self.folder, self.ledger = path, folder, ledger
-        self.wanted, self.apart, self.places = wanted, apart, places
+        self.apart, self.places = apart, places
         self.names: list[str] = []  # of the columns, as in the first batch
         self.texts: dict[str, dict[str, int]] = {}  # field -> text -> its number
         self.blocks: dict[int, set[int]] = {}  # number of a recording -> minutes
@@ -220,7 +146,6 @@ class Spill:
         self.held = 0  # bytes in the buffers
         self.given = 0.0  # minutes given as pieces
         self._tables: dict[str, np.ndarray] = {}
-        self._met: set[int] = set()  # numbers of recordings
         self._tidied: set[int] = set()
 
     def add(self, batch: dict) -> None:
@@ -233,8 +158,6 @@ class Spill:
         recording = np.zeros(len(rows), np.int64)
         if "recording" in self.names:
             recording = rows[:, self.names.index("recording")].astype(np.int64)
-            self._met.update(np.unique(recording).tolist())
-            rows, recording = self._of_wanted(rows, recording)
         minute = np.floor(rows[:, self.names.index("t")] / BLOCK_S).astype(np.int64)
         order = np.lexsort((minute, recording))  # stable: the file's order inside
         keys = np.stack([recording, minute], axis=1)[order]
@@ -261,14 +184,6 @@ class Spill:
         mine = [known.setdefault(text, len(known)) for text in texts]
         return np.array(mine, np.float64)[codes]
 
-    def _of_wanted(
-        self, rows: np.ndarray, recording: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        if self.wanted is None:
-            return rows, recording
-        kept = np.array([name in self.wanted for name in self.texts["recording"]])
-        return rows[kept[recording]], recording[kept[recording]]
-
     def flush(self) -> None:
         """Write what is held to the scratch files."""
         for (recording, minute), rows in self.buffers.items():
@@ -278,10 +193,11 @@ class Spill:
         self.buffers, self.held = {}, 0
 
     def recordings(self) -> list[str | None]:
-        """Values of `recording` met, left out ones too; [None] without the field."""
-        if "recording" not in self.texts:
-            return [None]
-        return [text for text, n in self.texts["recording"].items() if n in self._met]
+        """Values of `recording`; [None] without the field."""
+        known = self.texts.get("recording", {})
+        return [text for text, number in known.items() if number in self.blocks] or [
+            None
+        ]
 
     def texts_of(self, field: str) -> list[str]:
         """All that a field of texts holds."""

@@ -21,6 +21,8 @@ STEPS_PER_BYTE = 20  # instructions of the virtual machine per byte of the file
 MIN_STEPS = 50_000_000  # instructions granted to the smallest file
 CHECK_STEPS = 1_000_000  # instructions between checks
 CHUNK_ROWS = 1024  # rows fetched at once; more keep Python's collector busy
+# sqlite3's own messages may hold bytes of the file that are no text
+FAULTS = (sqlite3.Error, sqlite3.Warning, OverflowError, UnicodeDecodeError)
 ALLOWED = (sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ)
 
 
@@ -32,6 +34,8 @@ class Database:
 
     def __enter__(self) -> "Database":
         self._check_head()
+        self._ticks = max(MIN_STEPS, STEPS_PER_BYTE * self.path.stat().st_size)
+        self._ticks //= CHECK_STEPS
         uri = f"{self.path.resolve().as_uri()}?mode=ro&immutable=1"
         try:
             self._connection = sqlite3.connect(uri, uri=True, isolation_level=None)
@@ -39,16 +43,14 @@ class Database:
             raise self.error("database", str(error), "a SQLite file") from error
         try:
             for pragma in ("trusted_schema=OFF", "query_only=ON", "cell_size_check=ON"):
-                self._connection.execute(f"PRAGMA {pragma}")
-        except sqlite3.Error as error:
+                self._execute(f"PRAGMA {pragma}", ())
+        except InputError:
             self._connection.close()
-            raise self.error("database", str(error), "a SQLite file") from error
+            raise
         limit = self._connection.setlimit
         limit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_VALUE_BYTES)
         limit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
         limit(sqlite3.SQLITE_LIMIT_TRIGGER_DEPTH, 1)
-        budget = max(MIN_STEPS, STEPS_PER_BYTE * self.path.stat().st_size)
-        self._ticks = budget // CHECK_STEPS
         self._connection.set_progress_handler(self._tick, CHECK_STEPS)
         self._connection.set_authorizer(_authorise)
         return self
@@ -147,10 +149,10 @@ class Database:
           most: rows allowed.
           values: of its parameters.
         """
-        parts = [
-            self.floats(rows, names) for rows in self.chunks(sql, names, most, values)
-        ]
-        return np.concatenate(parts) if parts else np.zeros((0, len(names)))
+        parts = [np.zeros((0, len(names)))]
+        for rows in self.chunks(sql, names, most, values):
+            parts.append(self.floats(rows, names))
+        return np.concatenate(parts)
 
     def chunks(
         self, sql: str, names: Sequence[str], most: int, values: tuple = ()
@@ -175,22 +177,16 @@ class Database:
 
     def _rows(self, sql: str, values: tuple) -> Iterator[list[tuple]]:
         cursor = self._execute(sql, values)
-        while True:
-            try:
-                rows = cursor.fetchmany(CHUNK_ROWS)
-            except (sqlite3.Error, OverflowError, UnicodeDecodeError) as error:
-                raise self._failed(error) from error
-            if not rows:
-                return
-            yield rows
+        try:
+            while rows := cursor.fetchmany(CHUNK_ROWS):
+                yield rows
+        except FAULTS as error:
+            raise self._failed(error) from error
 
     def _execute(self, sql: str, values: tuple) -> sqlite3.Cursor:
         try:
             return self._connection.execute(sql, values)
-        # sqlite3's own messages may hold bytes of the file that are no text
-        except (
-            *(sqlite3.Error, sqlite3.Warning, OverflowError, UnicodeDecodeError),
-        ) as error:
+        except FAULTS as error:
             raise self._failed(error) from error
 
     def _failed(self, error: Exception) -> InputError:

@@ -294,13 +294,13 @@ def format_quality(report: dict) -> str:
         lines.append(left + right)
     decisions = ", ".join(f"{k} {v:,}" for k, v in report["decisions"].items())
     lines += ["", f"decisions per obstacle: {decisions}"]
-    lines += _oddities(report)
+    lines += oddities(report)
     if any(TOO_FEW in note for note in report["notes"]):
         lines.append(HOW_TO_POOL)
     return "\n".join(lines)
 
 
-def _oddities(report: Mapping) -> list[str]:
+def oddities(report: Mapping) -> list[str]:
     """What was dropped, left out, skipped, guessed and noted."""
     lines = []
     if "flicker" in report:

@@ -19,7 +19,7 @@ import dataclasses
 import math
 
 import numpy as np
-from scipy.optimize import brentq
+from scipy.optimize import root_scalar
 
 from rcirl_jax.errors import InputError
 
@@ -261,7 +261,10 @@ def fit_temperature(values: np.ndarray, outcomes: Outcomes) -> float:
     elif slope(high) <= 0.0:
         at = high
     else:
-        at = brentq(slope, low, high, xtol=TEMPERATURE_TOLERANCE)
+        found = root_scalar(
+            slope, method="brentq", bracket=(low, high), xtol=TEMPERATURE_TOLERANCE
+        )
+        at = float(found.root)
     return float(spread * np.exp(-at))
 
 

@@ -28,7 +28,6 @@ from rcirl_jax.evaluation.ranking.sweep import (
 )
 from rcirl_jax.evaluation.statistics import ClusterBootstrap
 from rcirl_jax.export.from_run import verification_samples, write_weights
-from rcirl_jax.export.reader import Reward
 from rcirl_jax.export.sweep.choice import judged
 from rcirl_jax.export.sweep.folder import (
     SWEEP,
@@ -135,15 +134,7 @@ def _train(
         piece = functools.partial(train_group, config=config)
         for part in executor.stream(piece, todo):
             hidden, made = part.hidden, members[part.hidden]
-            for number, member in enumerate(part.members):
-                output = weights_file(folder, member)
-                reward = _write_member(output, part, number, samples(), config, made_by)
-                made[member_name(member)] = {
-                    "sha256": reward.sha256,
-                    "loss": float(part.loss[number]),
-                    "pairs_won": float(part.wins[number]),
-                    "finite": bool(part.finite[number]),
-                }
+            made |= _write_members(folder, part, samples(), config, made_by)
             parts[hidden].append(part)
             bar.update(len(part.members))
             if len(made) == len(config.group(hidden)):
@@ -165,41 +156,44 @@ def _facts(parts: Sequence[Part]) -> dict:
     }
 
 
-def _write_member(
-    output: Path,
+def _write_members(
+    folder: Path,
     part: Part,
-    number: int,
     samples: tuple[np.ndarray, np.ndarray],
     config: SweepConfig,
     made_by: Mapping[str, object],
-) -> Reward:
-    """Write the weights file of one trained member.
+) -> dict[str, dict]:
+    """Write the weights files of trained members; what is known of each, by name.
 
     Args:
-      output: the file.
-      part: that it was trained in.
-      number: its place there.
+      folder: of the sweep.
+      part: the members.
       samples: of `verification_samples`.
-      config: the sweep; the file keeps all of it but where the data lie.
+      config: the sweep; a file keeps all of it but where the data lie.
       made_by: provenance, with the hash of the data.
     """
-    member = part.members[number]
-    metrics = {"loss": part.loss[number], "pair_accuracy": part.wins[number]}
-    provenance = {
-        "git_commit": None,
-        "flags": {},
-        "versions": {},
-        **made_by,
-        "seed": member.seed,
-        "metrics": {name: float(x) for name, x in metrics.items()},
-        "mode": member.sampler.mode,
-        "config": json.loads(json.dumps(dataclasses.asdict(member))),
-        "sweep": grid_of(config),
-    }
-    params = jax.tree.map(lambda x: jnp.asarray(x[number]), part.params)
+    found = {}
     normaliser = jax.tree.map(jnp.asarray, part.normaliser)
-    of = (params, normaliser, member, samples, provenance, part.seen)
-    return write_weights(output, *of)
+    for number, member in enumerate(part.members):
+        loss, won = float(part.loss[number]), float(part.wins[number])
+        provenance = {
+            "git_commit": None,
+            "flags": {},
+            "versions": {},
+            **made_by,
+            "seed": member.seed,
+            "metrics": {"loss": loss, "pair_accuracy": won},
+            "mode": member.sampler.mode,
+            "config": json.loads(json.dumps(dataclasses.asdict(member))),
+            "sweep": grid_of(config),
+        }
+        params = jax.tree.map(lambda x, n=number: jnp.asarray(x[n]), part.params)
+        of = (params, normaliser, member, samples, provenance, part.seen)
+        reward = write_weights(weights_file(folder, member), *of)
+        fine = bool(part.finite[number])
+        known = {"sha256": reward.sha256, "loss": loss, "pairs_won": won}
+        found[member_name(member)] = {**known, "finite": fine}
+    return found
 
 
 def _peak_memory_gib() -> float:

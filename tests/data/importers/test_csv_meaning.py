@@ -8,22 +8,8 @@ import pytest
 
 from rcirl_jax.data.importers.csv.heading import CONVENTIONS
 from rcirl_jax.data.importers.projection import projected
-from rcirl_jax.errors import InputError
 from tests.data.importers import people
-
-
-def write(folder, table, header=people.HEADER, **layout):
-    path = folder / "log.csv"
-    path.write_text(people.text(table, header, **layout))
-    return path
-
-
-def refused(path, source):
-    with pytest.raises(InputError) as caught:
-        people.read(path, source)
-    (line,) = str(caught.value).splitlines()
-    return line
-
+from tests.data.importers.people import LONG, refused, write
 
 # ------------------------------------------------------------------------- times
 
@@ -47,7 +33,7 @@ TIMES = {
 }
 
 
-@pytest.mark.parametrize("long_bytes", [1, 10**9], ids=["in pieces", "whole"])
+@LONG
 @pytest.mark.parametrize("form", TIMES)
 def test_iso_times(tmp_path, form, long_bytes):
     table = people.column(people.rows(), "t", TIMES[form])
@@ -227,13 +213,6 @@ def test_conventions_of_headings(tmp_path, turn, convention, unit, said):
     people.assert_same(people.only(tmp_path / "log.csv", source), turn)
 
 
-def test_a_compass_in_pieces(tmp_path):
-    cell = as_written("cw_from_north", "deg")
-    path = write(tmp_path, people.column(people.rows(0.5), "heading", cell))
-    more = "long_bytes = 1"
-    people.assert_same(people.only(path, people.spec(tmp_path, more=more)), 0.5)
-
-
 def test_headings_of_noise_keep_the_usual_convention(tmp_path):
     rng = np.random.default_rng(0)
     noisy = lambda heading: heading + rng.normal(0.0, 0.15)  # noqa: E731
@@ -291,7 +270,7 @@ def velocities(turn, table=None):
 VELOCITY = (*people.HEADER[:4], "vx", "vy", *people.HEADER[6:])
 
 
-@pytest.mark.parametrize("long_bytes", [1, 10**9], ids=["in pieces", "whole"])
+@LONG
 def test_velocities_stand_for_speed_and_heading(tmp_path, long_bytes):
     path = write(tmp_path, velocities(0.7), VELOCITY)
     source = people.spec(tmp_path, VELOCITY, more=f"long_bytes = {long_bytes}")
@@ -358,7 +337,7 @@ FLAGS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("long_bytes", [1, 10**9], ids=["in pieces", "whole"])
+@LONG
 @pytest.mark.parametrize(("yes", "no"), FLAGS)
 def test_flags(tmp_path, yes, no, long_bytes):
     """An automation drives car1 from 2 s on, and nobody else."""
@@ -405,7 +384,7 @@ def wide_frames(name, cars=people.CARS):
     return header, list(lines.values())
 
 
-@pytest.mark.parametrize("long_bytes", [1, 10**9], ids=["in pieces", "whole"])
+@LONG
 @pytest.mark.parametrize(
     ("name", "columns"),
     [
@@ -474,7 +453,7 @@ PNEUMA = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("long_bytes", [1, 10**9], ids=["in pieces", "whole"])
+@LONG
 def test_a_row_per_vehicle_as_in_pneuma(tmp_path, long_bytes):
     path = tmp_path / "20181024_d1_0830_0900.csv"
     path.write_text(pneuma())

@@ -201,13 +201,6 @@ def test_names_with_a_hash_and_padded_headers_are_read(tmp_path):
     assert {track.id for track in made.tracks} == {"c#0", "c#1", "c#2"}
 
 
-def test_a_wrong_limit_is_one_line(tmp_path):
-    path = tmp_path / "log.csv"
-    spec = {**write(path, rows_of(seconds=30.0, cars=3)), "long_bytes": "256MB"}
-    with pytest.raises(InputError, match="long_bytes: 256MB: expected a number"):
-        cuts(path, spec)
-
-
 def test_settings_change_the_digest_of_a_piece(tmp_path):
     path = tmp_path / "log.csv"
     spec = {**write(path, rows_of(seconds=70.0, cars=4)), "long_bytes": 1}
@@ -224,14 +217,13 @@ from rcirl_jax.data.importers import parts
 from rcirl_jax.data.readers import long_logs
 from rcirl_jax.data.readers.tables import streams
 from rcirl_jax.data.readers.tables.ledger import Ledger
-from rcirl_jax.data.readers.tables.table import batches, fields_of, open_table
+from rcirl_jax.data.readers.tables.table import fields_of, open_table
 # what is held is reached in the shorter log already
 streams.READ_BYTES, long_logs.BUFFER_BYTES = 2**18, 2**20
 path = Path(sys.argv[1])
 table, ledger = open_table(path), Ledger(path=path)
 fields = fields_of(table, ("t", "id", "x", "y"), texts=("id",))
-read = lambda show: batches(table, fields, ledger, show)
-with long_logs.spilled(path, read, ledger) as spill:
+with long_logs.rows_of(table, fields, ledger, is_long=True) as spill:
     rows = sum(len(piece.values["t"]) for piece in spill.pieces(None, 0.55))
 print(rows, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """

@@ -58,6 +58,14 @@ def test_who_rides_is_decided_by_the_source(root, tmp_path):
     assert kinds["P13"] == Kind.PEDESTRIAN
 
 
+def test_what_a_toml_leaves_out_is_as_in_the_packaged_one(root, tmp_path):
+    source = tmp_path / "s.toml"
+    source.write_text('source = "mine"\n')
+    found, packaged = only(root, source), logs.packaged("interaction")
+    assert (found.source, found.licence) == ("mine", packaged["licence"])
+    assert found.rate_hz == packaged["rate_hz"]
+
+
 def test_inputs_from_the_release_down_to_a_file(root, scene):
     whole = only(root)
     for path in (root / "recorded_trackfiles", scene, scene / "vehicle_tracks_000.csv"):
@@ -69,26 +77,6 @@ def test_inputs_from_the_release_down_to_a_file(root, scene):
 def test_pedestrians_alone(scene):
     (scene / "vehicle_tracks_000.csv").unlink()
     assert [track.id for track in only(scene).tracks] == ["P13", "P4"]
-
-
-def test_recordings_of_several_scenes_have_names_of_their_own(root, scene):
-    other = root / "recorded_trackfiles" / "DR_DEU_Merging_MT"
-    fixture.write_scene(other, fixture.road_users())
-    names = [recording.name for recording in read(root)]
-    assert names == ["DR_DEU_Merging_MT-000", f"{fixture.SCENE}-000"]
-
-
-def test_frames_may_start_at_zero(root, scene):
-    whole = only(root)
-    for kind in ("vehicle", "pedestrian"):
-        path = scene / f"{kind}_tracks_000.csv"
-        header, *rows = path.read_text().splitlines()
-        cells = [row.split(",") for row in rows]
-        for row in cells:
-            row[1], row[2] = str(int(row[1]) - 1), str(int(row[2]) - 100)
-        path.write_text("\n".join([header, *(",".join(row) for row in cells)]) + "\n")
-    for one, other in zip(only(root).tracks, whole.tracks, strict=True):
-        np.testing.assert_allclose(one.t, other.t)
 
 
 @pytest.mark.parametrize("kept", [".osm_xy", ".osm"])
@@ -190,13 +178,6 @@ def test_observations_and_submissions_are_left_out(cases):
         path.parent.mkdir(exist_ok=True)
         path.write_text("not read")
     assert len(read(cases.parent.parent)) == 2
-
-
-def test_columns_of_the_test_sets(cases):
-    header, *rows = cases.read_text().splitlines()
-    header += ",track_to_predict,interesting_agent"
-    cases.write_text("\n".join([header, *(row + ",0.0,1.0" for row in rows)]) + "\n")
-    assert len(read(cases)) == 2
 
 
 def test_unknown_agents_are_vehicles(scene, root):

@@ -97,16 +97,6 @@ def test_options(tmp_path):
         read(path, source)
 
 
-def test_lengths_beyond_any_lorry(tmp_path):
-    path = fixture.write_pair(tmp_path, "1032", "1025", "00046")
-    path.write_text(path.read_text().replace(",14.3,", ",143.0,"))
-    text = path.read_text().splitlines()
-    rows = [",".join(row.split(",")[:8] + row.split(",")[9:]) for row in text]
-    path.write_text("\n".join(rows) + "\n")
-    with pytest.raises(InputError, match=r"track 1025: length: 43\.58"):
-        read(path)
-
-
 def test_only_the_follower_is_an_expert(tmp_path):
     """Whom the leader follows is not in the file: its scenes are dropped."""
     path = fixture.write_pair(tmp_path, "1032", "1025", "00046")

@@ -130,15 +130,6 @@ def test_layouts_of_the_campaigns(tmp_path):
     assert [track.length for track in recording.tracks[:2]] == [4.46, 4.01]
 
 
-def test_cars_with_fewer_columns(tmp_path):
-    """The target car has no vehicle 2; the third has no altitude."""
-    columns = fixture.table(fixture.cars())
-    for name in ("Speed2", "Lat2", "Lon2", "Alt2", "E2", "N2", "U2", "Driver2", "Alt3"):
-        del columns[name]
-    recording = only(drive(tmp_path, columns))
-    assert [track.id for track in recording.tracks][:2] == ["1-Audi(A8)", "3-BMW(X5)"]
-
-
 def test_car_without_positions_is_noted(tmp_path):
     columns = fixture.table(fixture.cars())
     for name in ("Lat2", "Lon2", "E2", "N2"):

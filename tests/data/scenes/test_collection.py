@@ -114,10 +114,7 @@ def test_rates_at_the_frame(a, l_dot):
 def test_the_speed_limit_is_what_a_planner_may_drive():
     """From 300 m on 5 m/s, beyond the scene's 254 m: braked for with 1 m/s^2."""
     x = np.arange(0.0, 301.0, 5.0)
-    lanes = (
-        lane("a", x, 0.0, 25.0, successors=("b",)),
-        lane("b", 300.0 + x, 0.0, 5.0),
-    )
+    lanes = (lane("a", x, 0.0, 25.0, successors=("b",)), lane("b", 300.0 + x, 0.0, 5.0))
     row = first_scene(dataclasses.replace(PAIR, lanes=lanes))
     here = 20.0 + 12.0 * 0.5 + 0.5 * 0.3 * 0.5**2
     to_go = 300.0 - here - 2.0 * np.arange(128)
@@ -147,13 +144,6 @@ def test_the_path_turns_along_the_lane_after_the_record():
     np.testing.assert_array_equal(
         given_path(driver_of(stands, 0, 10.0), 0, 0.0, 1e3), 1.0
     )
-
-
-def test_time_mask_of_a_short_track():
-    row = first_scene(recording(car("ego", speeding_up(20.0), seconds=6.5)))
-    assert row["future_s"] == pytest.approx(6.0)
-    assert row["time_valid"].sum() == np.sum(TIMES_S <= 6.0)
-    assert row["s_at_5s"] == pytest.approx(12.15 * 5 + 0.5 * 0.3 * 25, abs=0.05)
 
 
 def test_the_branch_that_was_driven():

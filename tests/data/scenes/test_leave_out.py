@@ -34,11 +34,11 @@ def shard(folder, *scenarios):
 
 
 def good(name):
-    return waymo.scenario(f5=[f"scenario-{name}"])
+    return waymo.scenario(scenario_id=f"scenario-{name}")
 
 
 # times that go backwards
-BAD = waymo.scenario(f1=[float(x) for x in waymo.STAMPS[::-1]], f5=["scenario-bad"])
+BAD = waymo.scenario(timestamps_seconds=waymo.STAMPS[::-1], scenario_id="scenario-bad")
 
 
 def test_one_scenario_of_a_file_is_left_out(tmp_path):
@@ -80,7 +80,9 @@ def test_a_share_is_judged_at_the_end(tmp_path):
     [(LENIENT, r"record 3: .*; recordings left out before: 1"), (STRICT, "record 1: ")],
 )
 def test_one_too_many_ends_the_import(tmp_path, config, words):
-    other = waymo.scenario(f1=[0.0] * waymo.NUM_STEPS, f5=["scenario-worse"])
+    other = waymo.scenario(
+        timestamps_seconds=[0.0] * waymo.NUM_STEPS, scenario_id="scenario-worse"
+    )
     logs = shard(tmp_path / "logs", good("a"), BAD, good("b"), other)
     with pytest.raises(InputError, match=words):
         import_parts(logs, tmp_path / "data", config)

@@ -112,8 +112,7 @@ def test_a_track_that_another_goes_on_for_ends_nothing():
 @pytest.mark.parametrize(("seconds", "kept"), [(3.4, False), (3.6, True)])
 def test_scenes_that_end_too_early_are_dropped_and_counted(seconds, kept):
     made = recording(
-        car("ego", steady(0.0), seconds=6.0),
-        car("lead", steady(30.0), seconds=seconds),
+        car("ego", steady(0.0), seconds=6.0), car("lead", steady(30.0), seconds=seconds)
     )
     config = dataclasses.replace(NO_FILTER, stride_s=10.0)
     collector = Collector(made, config)
@@ -173,11 +172,7 @@ def ngsim_pair(folder, *, leads=45, named=70):
 
 @pytest.mark.parametrize(
     ("given", "missing"),
-    [
-        ({}, ((4.5, np.inf),)),
-        ({"named": 60}, ((4.5, 6.0),)),
-        ({"leads": 70}, ()),
-    ],
+    [({}, ((4.5, np.inf),)), ({"named": 60}, ((4.5, 6.0),)), ({"leads": 70}, ())],
 )
 def test_ngsim_names_its_leaders(tmp_path, given, missing):
     (made,) = read_recordings("ngsim", ngsim_pair(tmp_path, **given))

@@ -156,11 +156,6 @@ BAD_SHARDS = [
     # an array of a billion rows is not made of a small file
     (lambda s: s.update(count=10**9), "bytes: expected 62500004 at least for 10"),
     (lambda s: s.pop("lineage"), "lineage: missing: expected"),
-    (lambda s: s.update(extra=1), "extra: unknown: expected"),
-    (lambda s: s.update(files=[]), "files: .*: expected an object"),
-    (entry("x", 3), "files: x: 3: expected an object"),
-    (entry("x", {}), "files: x: bytes: missing: expected"),
-    (lambda s: s.update(lineage=[{}]), r"lineage: \[0\]\.name: missing"),
 ]
 
 
@@ -174,27 +169,18 @@ def test_shards_that_are_none(small, change, words):
 GROUPS, FLOAT32 = "splits: .*expected every group", ".*float64.*expected .*float32"
 BAD_MANIFESTS = [
     (lambda m: m.update(schema_version=1), "schema_version: 1: expected 2"),
-    (lambda m: m.pop("schema_version"), "schema_version: None: expected 2"),
     (lambda m: m.pop("quality"), "quality: missing: expected"),
     (lambda m: m["arrays"].pop("human.s"), "arrays: human.s: None: expected"),
     (lambda m: m["arrays"]["human.s"].update(dtype="float64"), FLOAT32),
     (lambda m: m["time_grid_s"].pop(), "time_grid_s"),
     (lambda m: m["shards"][0].update(count=3), "shard 0: float32 .*expected"),
     (lambda m: m.update(count=-1), "count: -1: expected a whole number >= 0"),
-    (lambda m: m.update(count=True), "count: True: expected a whole number"),
     (lambda m: m.update(count=1), "count: 1: expected 2, the sum of its shards"),
     (lambda m: m.update(count=10**15), "count: 10{15}: expected a whole number <="),
     (lambda m: m.update(count=2**31 + 1), "count: .*: expected a whole num"),
-    (lambda m: m.update(arrays=3), "arrays: 3: expected an object"),
-    (lambda m: m.update(shards={}), "shards: {}: expected a list"),
-    (lambda m: m["shards"].append(3), r"shards\[1\]: 3: expected an object"),
-    (lambda m: m.update(splits=[]), r"splits: \[\]: expected an object"),
-    (lambda m: m.update(groups=[1]), r"groups\[0\]: 1: expected a text"),
     (lambda m: m["splits"].popitem(), GROUPS),
     (lambda m: m["splits"].update(a=["g0"]), GROUPS),
     (lambda m: m["splits"].update(a=["odd"]), GROUPS),
-    (lambda m: m.update(rate_hz="10"), "rate_hz: 10: expected a list"),
-    (lambda m: m.update(sources=[""]), r"sources\[0\]: : expected an object"),
     (lambda m: m["sources"].append({"\udfff": 1}), "not JSON"),
 ]
 

@@ -204,8 +204,7 @@ FILES = 2 * len(jax.tree.leaves(row_spec())) + 1
 
 
 @pytest.mark.parametrize(
-    "writes",
-    [0, 1, FILES - 1, FILES, FILES + 9, 3 * FILES - 1, 3 * FILES],
+    "writes", [0, 1, FILES - 1, FILES, FILES + 9, 3 * FILES - 1, 3 * FILES]
 )
 def test_interrupted_import_resumes_to_the_same_bytes(
     made, tmp_path, monkeypatch, writes

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from google.protobuf import descriptor_pb2 as pb
 from google.protobuf.message import DecodeError
 
-from rcirl_jax.data.readers.protobuf import Field, Message, parser
+from rcirl_jax.data.readers.protobuf import Field, Message, parser, table_of
 
 ENUM = "enum"  # a field that is wanted as the number of an enum's value
 UNSET = -1  # that number where the message does not set it
@@ -31,14 +31,8 @@ LACKING = 2**29 - 1  # the highest number of a field, for one that a release lac
 NOTHING = ""  # type of such a field
 NO_NUMBERS = ("string", "bytes", "message", "group", "enum")
 
-_read_proto_desc = parser(
-    {
-        "ProtoDesc": {
-            "desc": Field("bytes", 1),
-            "dependencies": Field("ProtoDesc", 2, repeated=True),
-        }
-    }
-)
+PROTO_DESC = "ProtoDesc: desc 1 bytes, dependencies 2 ProtoDesc*"
+_read_proto_desc = parser(table_of(PROTO_DESC))
 
 
 class Reading(NamedTuple):

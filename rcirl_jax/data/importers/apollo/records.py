@@ -18,7 +18,7 @@ from pathlib import Path
 from google.protobuf.message import DecodeError
 
 from rcirl_jax.data.importers.files import files_below
-from rcirl_jax.data.readers.protobuf import Field, parser
+from rcirl_jax.data.readers.protobuf import parser, table_of
 from rcirl_jax.errors import InputError
 
 HEAD = struct.Struct("<i4xq")  # type and size of a section
@@ -33,18 +33,9 @@ NAME = re.compile(
     r"[^/]+?\.record(?:\.(?P<part>\d{1,9})(?:\.\d{1,20})?)?(?:\.(?:split|recover))?"
 )
 
-read_header = parser(
-    {"Header": {"compress": Field("int64", 3), "is_complete": Field("bool", 13)}}
-)
-read_channel = parser(
-    {
-        "Channel": {
-            "name": Field("string", 1),
-            "message_type": Field("string", 2),
-            "proto_desc": Field("bytes", 3),
-        }
-    }
-)
+CHANNEL_FIELDS = "name 1 string, message_type 2 string, proto_desc 3 bytes"
+read_header = parser(table_of("Header: compress 3 int64, is_complete 13 bool"))
+read_channel = parser(table_of(f"Channel: {CHANNEL_FIELDS}"))
 
 
 class Run:

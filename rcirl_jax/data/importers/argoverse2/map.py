@@ -6,6 +6,7 @@ the motion data set also hold a `centerline`, those of the sensor data set do
 not; it is not read. There are no speed limits, signals or stop lines.
 """
 
+import collections
 import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal
@@ -46,7 +47,7 @@ class _Segment(msgspec.Struct):
 
 
 class _Map(msgspec.Struct):
-    lane_segments: dict[str, _Segment]
+    lane_segments: dict[str, dict]
 
 
 def read_lanes(
@@ -60,10 +61,12 @@ def read_lanes(
       spec: source TOML; `lane_types` names the types that are read.
     """
     wanted = lane_types(spec, LANE_TYPES, DRIVEN)
-    segments = checked(
-        read_json(path, "JSON", MAX_FILE_BYTES), _Map, path
-    ).lane_segments
-    kept = [one for one in segments.values() if one.lane_type in wanted]
+    content = read_json(path, "JSON", MAX_FILE_BYTES)
+    segments = [
+        checked(segment, _Segment, f"{path}: lane segment {key[:40]}")
+        for key, segment in checked(content, _Map, path).lane_segments.items()
+    ]
+    kept = [segment for segment in segments if segment.lane_type in wanted]
     if not kept:
         raise InputError(
             f"{path}: lane_segments: {len(segments)}, none of type "
@@ -72,8 +75,7 @@ def read_lanes(
     found = [_lane(path, segment, origin) for segment in kept]
     lanes = {lane.id: lane for lane in found}
     if len(lanes) < len(found):
-        ids = [lane.id for lane in found]
-        twice = next(name for name in ids if ids.count(name) > 1)
+        ((twice, _),) = collections.Counter(one.id for one in found).most_common(1)
         raise InputError(f"{path}: lane segment {twice}: id: met twice: expected once")
     whole = {name: lane for name, lane in lanes.items() if len(lane.centre) > 1}
     notes = []

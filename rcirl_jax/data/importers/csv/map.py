@@ -10,7 +10,7 @@ from rcirl_jax.data.importers.lanes import StraightLane, straight_lanes
 from rcirl_jax.data.importers.options import number, path_option
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.readers.tables.ledger import Ledger
-from rcirl_jax.data.readers.tables.table import Field, open_table, read
+from rcirl_jax.data.readers.tables.table import fields_of, open_table, read
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane, Track
 
@@ -70,7 +70,9 @@ def _lanes_from_file(path: Path, name: str) -> list[dict]:
         raise InputError(
             f"{path}: lanes.file: {name}: expected this CSV beside the log"
         )
-    table = _lane_points(table_path)
+    opened, texts = open_table(table_path), ("id", "left", "right", "successor")
+    fields = fields_of(opened, LANE_COLUMNS, LANE_OPTIONAL, texts=texts)
+    table = read(opened, fields, Ledger(path=table_path, allowed=0.0))
     lanes = []
     for lane in dict.fromkeys(table["id"].tolist()):
         rows = np.flatnonzero(table["id"] == lane)
@@ -89,17 +91,6 @@ def _lanes_from_file(path: Path, name: str) -> list[dict]:
             }
         )
     return lanes
-
-
-def _lane_points(path: Path) -> dict[str, np.ndarray]:
-    """Columns of the lanes' own table, with those that may be missing."""
-    table, texts = open_table(path), ("id", "left", "right", "successor")
-    names = [*LANE_COLUMNS, *(n for n in LANE_OPTIONAL if n in table.header)]
-    fields = [
-        Field(name=n, column=n, text=n in texts, needed=n in LANE_COLUMNS)
-        for n in names
-    ]
-    return read(table, fields, Ledger(path=path, allowed=0.0))
 
 
 def _is_known(value: str | float) -> bool:

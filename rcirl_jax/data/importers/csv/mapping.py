@@ -107,15 +107,18 @@ def mapping_of(table: Table, spec: AnyMapping) -> Mapping:
         notes.append(
             f"latitude, longitude projected about {middle[0]:g}, {middle[1]:g} degrees"
         )
-    form, factor = _time(table, columns["t"], units.get("t"), rate, notes)
-    fields = [_field(field, name, user, units, spec) for field, name, user in found]
+    clock = next(name for field, name, _ in found if field == "t")
+    form, factor = _time(table, clock, units.get("t"), rate, notes)
     limit = math.inf if form else LIMITS["t"] / min(factor, 1.0)
-    clock = {"form": form, "factor": factor, "limit": limit}
+    fields = [_field(field, name, user, units, spec) for field, name, user in found]
+    fields = [
+        dataclasses.replace(f, form=form, limit=limit, factor=f.factor * factor)
+        if f.name == "t"
+        else f
+        for f in fields
+    ]
     return Mapping(
-        fields=tuple(
-            dataclasses.replace(field, **clock) if field.name == "t" else field
-            for field in fields
-        ),
+        fields=tuple(fields),
         rate_hz=rate,
         middle=middle,
         degrees=degrees,
@@ -200,6 +203,11 @@ def _recognised_earth(
             notes.append(f"columns {columns[x]}, {columns[y]}: longitude and latitude")
             return {**columns, **cells}, {**units, "x": "deg", "y": "deg"}
     return columns, units
+
+
+def first_cell(table: Table, column: str) -> str:
+    """The first cell of a column that is not empty, "" without one."""
+    return next((c for c in table.samples(column) if c.lower() not in EMPTY), "")
 
 
 def sampled(table: Table, column: str) -> np.ndarray:
@@ -315,8 +323,7 @@ def _time(
     table: Table, name: str, unit: str | None, rate: float, notes: list[str]
 ) -> tuple[str, float]:
     """(form, factor) of the clock; ISO where nothing is said and the cells are."""
-    cells = [c for c in table.samples(name.lstrip("-")) if c.lower() not in EMPTY]
-    first = cells[0] if cells else ""
+    first = first_cell(table, name.lstrip("-"))
     is_iso = re.match(ISO_TIMES, first) is not None
     if unit is None and is_iso:
         notes.append(f"column {name}: ISO times")
@@ -345,7 +352,7 @@ def _field(
     is_place_on_earth = unit in ANGLES and field in DEGREES
     if is_place_on_earth:
         limit = DEGREES[field] * (UNITS["deg"] if unit == "rad" else 1.0)
-    elif unit in UNITS and field != "heading":
+    elif unit in UNITS and field not in ("heading", "t"):
         factor = UNITS[unit]
     return Field(
         name=field,

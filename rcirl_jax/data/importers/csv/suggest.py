@@ -23,6 +23,7 @@ from rcirl_jax.data.importers.csv.mapping import (
     NEEDED,
     OPTIONAL,
     Mapping,
+    first_cell,
 )
 from rcirl_jax.data.importers.csv.meaning import Meaning, meaning_of, with_velocity
 from rcirl_jax.data.importers.csv.names import fields_by_name, kind_by_name, unit_of
@@ -34,8 +35,7 @@ from rcirl_jax.data.importers.csv.suggestion import (
     toml_of,
     unknown,
 )
-from rcirl_jax.data.importers.options import UNITS
-from rcirl_jax.data.readers.tables.cells import EMPTY
+from rcirl_jax.data.importers.options import KINDS, UNITS
 from rcirl_jax.data.readers.tables.layout import NUMBER
 from rcirl_jax.data.readers.tables.ledger import LINE
 from rcirl_jax.data.readers.tables.table import MAX_TIME, Table, batches, open_table
@@ -151,8 +151,7 @@ def _first_rows(path: Path, spec: AnyMapping) -> dict[str, np.ndarray]:
 
 def _time_form(table: Table, guess: Guess) -> None:
     """Unit of times that are no seconds, milliseconds or frames: by the first cell."""
-    cells = [c for c in table.samples(guess.columns["t"]) if c.lower() not in EMPTY]
-    first = cells[0] if cells else ""
+    first = first_cell(table, guess.columns["t"])
     if re.match(r"\d{4}[-/]\d|\d{8}T\d|\d{1,2}:\d", first):
         guess.units["t"] = "iso"
     elif NUMBER.fullmatch(first) and abs(float(first)) > MAX_TIME:
@@ -249,7 +248,7 @@ def _texts(raw: AnyMapping[str, np.ndarray], guess: Guess) -> None:
     """Kinds by their names; flags only where they are yes or no."""
     if "kind" in guess.columns:
         for text in np.unique(raw["kind"]).tolist():
-            if text and text not in ("vehicle", "cyclist", "pedestrian", "static"):
+            if text and text not in KINDS:
                 guess.kinds[text] = kind_by_name(text) or "vehicle"
                 if not kind_by_name(text):
                     guess.open.append(f"kinds: {text}: taken for a vehicle")

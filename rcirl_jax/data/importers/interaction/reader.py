@@ -20,7 +20,13 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.importers.declared import Columns, Rows, open_log
+from rcirl_jax.data.importers.declared import (
+    KINDS,
+    Columns,
+    Rows,
+    open_log,
+    unknown_kinds,
+)
 from rcirl_jax.data.importers.files import (
     given_map,
     input_files,
@@ -54,19 +60,9 @@ LEFT_OUT = ("_sub.csv", "_obs.csv")
 SETS = ("_train", "_val", "_test", "_obs")
 # folders below a scene's, made by the data set's own split_train_val_script.py
 SPLITS = ("train", "val", "sorted")
-KINDS = {
-    "pedestrian": Kind.PEDESTRIAN,
-    "person": Kind.PEDESTRIAN,
-    "bicycle": Kind.CYCLIST,
-    "cyclist": Kind.CYCLIST,
-}
 EITHER = "pedestrian/bicycle"
 MAPS_UP = 5  # folders above a log in which that of the maps is looked for
-RATE_HZ = 10.0  # 1/s
 MAX_GAP_MS = 550.0  # ms missing inside one track
-FAST_MPS = 3.5  # m/s; who of "pedestrian/bicycle" is faster rides
-LANE_WIDTH_M = 3.5  # m, of lanes fitted to paths
-LIMIT_MPS = 13.41  # m/s, 30 mph, where the map says nothing
 SIZES_M = {
     Kind.PEDESTRIAN: (0.5, 0.5),
     Kind.CYCLIST: (1.8, 0.6),
@@ -178,7 +174,7 @@ def _read(path: Path, spec: dict) -> tuple[Rows, Ledger]:
 
 def _scene(path: Path, spec: dict) -> _Scene:
     place = _find_map(path, spec)
-    limit = number(spec, "default_speed_limit", LIMIT_MPS)
+    limit = number(spec, "default_speed_limit")
     lanes, notes = None, ["no map found; lanes fitted to the longest paths"]
     if place is not None:
         zone = utm_zone(0.0)
@@ -238,18 +234,17 @@ def _recording(name: str, table: Rows, scene: _Scene, group: str | None) -> Reco
     pieces = split_tracks(scene.path, table["track_id"], stamps, MAX_GAP_MS)
     notes = list(scene.notes)
     tracks = tuple(_track(label, rows, table, scene) for label, rows in pieces)
-    unknown = set(np.unique(table["agent_type"])) - {EITHER, *KINDS, *MOTORISED}
-    if unknown:
-        notes.append(f"agent types taken for vehicles: {', '.join(sorted(unknown))}")
+    kinds = set(np.unique(table["agent_type"])) - {EITHER}
+    notes += unknown_kinds("agent types", kinds)
     lanes = scene.lanes
     if lanes is None:
-        width = number(scene.spec, "lane_width_m", LANE_WIDTH_M)
+        width = number(scene.spec, "lane_width_m")
         lanes = path_lanes(tracks, width, None)
     return Recording(
         name=name,
-        source=str(scene.spec.get("source", "INTERACTION dataset")),
-        licence=str(scene.spec.get("licence", "INTERACTION: research use only")),
-        rate_hz=number(scene.spec, "rate_hz", RATE_HZ),
+        source=scene.spec["source"],
+        licence=scene.spec["licence"],
+        rate_hz=number(scene.spec, "rate_hz"),
         tracks=tracks,
         lanes=lanes,
         group=group,
@@ -258,16 +253,13 @@ def _recording(name: str, table: Rows, scene: _Scene, group: str | None) -> Reco
     )
 
 
-MOTORISED = ("car", "truck", "bus", "van", "motorcycle", "vehicle")
-
-
 def _track(name: str, rows: np.ndarray, table: Rows, scene: _Scene) -> Track:
     t, x, y, psi = (table[field][rows] for field in ("t", "x", "y", "psi_rad"))
     speed = np.hypot(table["vx"][rows], table["vy"][rows])
     agent = str(table["agent_type"][rows[0]]).lower()
     kind = KINDS.get(agent, Kind.VEHICLE)
     if agent == EITHER:
-        fast = number(scene.spec, "cyclist_speed_mps", FAST_MPS)
+        fast = number(scene.spec, "cyclist_speed_mps")
         rides = float(np.percentile(speed, 90.0)) > fast
         kind = Kind.CYCLIST if rides else Kind.PEDESTRIAN
     sizes = []

@@ -5,8 +5,7 @@ and longitude); meta.json holds the transform of the dataset's world to Earth-ce
 coordinates.
 """
 
-import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -34,16 +33,6 @@ HOLD_S = 1.0  # s, a light unseen keeps its state this long
 MAX_LIMIT_MPS = 60.0  # m/s; faster "limits" are none
 ONLY_BIKE = 4  # AccessRestriction.Type
 BACKWARD = 3  # RoadNetworkSegment.TravelDirection
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class LightFaces:
-    """Faces of traffic lights as seen in the frames of a scene."""
-
-    t: np.ndarray  # [frames] s
-    frame: np.ndarray  # [n] number of the frame, ascending
-    face: np.ndarray  # [n] id, text
-    is_active: np.ndarray  # [n] bool, lit
 
 
 def find_map(folder: Path, spec: dict) -> Path | None:
@@ -99,30 +88,42 @@ class SemanticMap:
         every = list(lanes.values())
         self.roads = Roads([lane.centre for lane in every], every.__getitem__)
 
-    def signals(self, lanes: tuple[Lane, ...], seen: LightFaces) -> tuple:
+    def signals(
+        self,
+        lanes: Sequence[Lane],
+        t: np.ndarray,
+        frame: np.ndarray,
+        face: np.ndarray,
+        is_active: np.ndarray,
+    ) -> tuple[Signal, ...]:
         """One signal per set of faces that governs a lane and was seen.
 
         The state of a frame is the colour that most lit faces of the set show;
         a set unseen for a second is off.
-        """
-        names = dict.fromkeys(name for lane in lanes for name in lane.signal_ids)
-        found = (self._signal(name, seen) for name in names)
-        return tuple(signal for signal in found if signal is not None)
 
-    def _signal(self, name: str, seen: LightFaces) -> Signal | None:
-        members = name.split("|")
-        colours = np.array([STATES.index(self._faces[face]) for face in members])
-        rows = np.flatnonzero(np.isin(seen.face, members))
-        if rows.size == 0:
-            return None
-        order = np.argsort(members)
-        place = order[np.searchsorted(np.array(members)[order], seen.face[rows])]
-        votes = np.zeros((seen.t.size, len(STATES)), np.int64)
-        np.add.at(votes, (seen.frame[rows], colours[place]), seen.is_active[rows])
-        frames = np.unique(seen.frame[rows])
-        # without a vote it is off; ties go to the first
-        states = held(seen.t, seen.t[frames], votes[frames].argmax(axis=1), HOLD_S)
-        return signal_of(name, seen.t, states)
+        Args:
+          lanes: of the scene.
+          t: [frames] s.
+          frame: [n] number of the frame in which a face was seen, ascending.
+          face: [n] its id, text.
+          is_active: [n] whether it was lit.
+        """
+        found = []
+        for name in dict.fromkeys(name for lane in lanes for name in lane.signal_ids):
+            members = np.array(name.split("|"))
+            colours = np.array([STATES.index(self._faces[one]) for one in members])
+            rows = np.flatnonzero(np.isin(face, members))
+            if rows.size == 0:
+                continue
+            order = np.argsort(members)
+            place = order[np.searchsorted(members[order], face[rows])]
+            votes = np.zeros((t.size, len(STATES)), np.int64)
+            np.add.at(votes, (frame[rows], colours[place]), is_active[rows])
+            frames = np.unique(frame[rows])
+            # without a vote it is off; ties go to the first
+            states = held(t, t[frames], votes[frames].argmax(axis=1), HOLD_S)
+            found.append(signal_of(name, t, states))
+        return tuple(found)
 
     def _elements(self, fragment: Message) -> Iterator[tuple[str, Message]]:
         """Lanes of a MapFragment by id; limits and controls are kept on the way.

@@ -21,7 +21,6 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.importers.l5.map import (
-    LightFaces,
     SemanticMap,
     find_map,
     world_to_ecef,
@@ -304,10 +303,5 @@ def _signals(
         f"{where}: {FACE_INTERVAL}", dataset.faces, frames[FACE_INTERVAL]
     )
     status = faces["traffic_light_face_status"]
-    seen = LightFaces(
-        t=t,
-        frame=frame,
-        face=faces["face_id"],
-        is_active=status.argmax(axis=1) == 0 if faces.size else np.zeros(0, bool),
-    )
-    return semantic_map.signals(lanes, seen), []
+    lit = status.argmax(axis=1) == 0 if faces.size else np.zeros(0, bool)
+    return semantic_map.signals(lanes, t, frame, faces["face_id"], lit), []

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.importers.files import given_map
+from rcirl_jax.data.importers.lanes import StraightLane, parallel_lane
 from rcirl_jax.data.recording import check_lanes_length
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane
 
 MARGIN_M = 50.0  # m of lane beyond the first and last position
-STEP_M = 5.0  # m between points of a lane
 MAP_FOLDERS = ("maps", "lanelets", "lanelet2")
 
 
@@ -73,29 +73,15 @@ def _carriageway(
     along: tuple[float, float],
     limit: float | None,
 ) -> list[Lane]:
-    lower, upper = along[0] - MARGIN_M, along[1] + MARGIN_M
-    x = np.linspace(lower, upper, int((upper - lower) / STEP_M) + 2)
-    x = x if forward else x[::-1]
-    count = len(marks) - 1
     # the lane above (smaller number) is to the left of one driven towards +x
-    left, right = (-1, 1) if forward else (1, -1)
-    lanes = []
-    for place in range(count):
-        half = np.full(x.shape, 0.5 * (marks[place] - marks[place + 1]))
-        y = 0.5 * (marks[place] + marks[place + 1])
-        sides = [place + left, place + right]
-        names = [str(first + s) if 0 <= s < count else None for s in sides]
-        lanes.append(
-            Lane(
-                id=str(first + place),
-                centre=np.stack([x, np.full(x.shape, y)], axis=1),
-                left_width=half,
-                right_width=half,
-                speed_limit=limit,
-                left=names[0],
-                right=names[1],
-            )
-        )
+    ends = {"lower": along[0] - MARGIN_M, "upper": along[1] + MARGIN_M}
+    numbers, lanes = range(first, first + len(marks) - 1), []
+    for number, above, below in zip(numbers, marks, marks[1:], strict=False):
+        half, y = 0.5 * (above - below), 0.5 * (above + below)
+        around = [number - 1, number + 1] if forward else [number + 1, number - 1]
+        ids = [str(n) if n in numbers else None for n in around]
+        lane = StraightLane(id=str(number), y=y, forward=forward, **ends)
+        lanes.append(parallel_lane(lane, (half, half), ids, limit))
     return lanes
 
 

@@ -19,7 +19,13 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.importers.declared import Columns, Rows, open_log
+from rcirl_jax.data.importers.declared import (
+    KINDS,
+    Columns,
+    Rows,
+    open_log,
+    unknown_kinds,
+)
 from rcirl_jax.data.importers.files import files_below, log_name
 from rcirl_jax.data.importers.lanelet2.map import read_lanelet2
 from rcirl_jax.data.importers.levelx.map import find_map, marked_lanes
@@ -62,22 +68,10 @@ CENTRE = Columns(
     t="frame",
     name_of="{:g}".format,
 )
-KINDS = {
-    "pedestrian": Kind.PEDESTRIAN,
-    "animal": Kind.PEDESTRIAN,
-    "bicycle": Kind.CYCLIST,
-    "bicyclist": Kind.CYCLIST,
-    # in the way of others like any body that moves, but nobody drives it: only
-    # vehicles are experts (Argoverse 2's "unknown" and Waymo's "other" likewise)
-    "trailer": Kind.CYCLIST,
-}
-MOTORISED = ("car", "van", "truck", "bus", "truck_bus", "motorcycle")
 LIFE = ("numFrames", "initialFrame", "finalFrame")  # of a track, in tracksMeta
 MAX_GAP_FRAMES = 5.5  # frames missing inside one track
 MAX_ID = 2**53  # beyond it float64 does not count
 FAR_M = 200.0  # m; a map that far from all tracks is not theirs
-LANE_WIDTH_M = 3.5  # m, of lanes fitted to paths
-LIMIT_MPS = 36.11  # m/s, 130 km/h, advised where German motorways have no limit
 SIZE_M = (0.5, 0.5)  # m, length and width of a road user without a box
 
 
@@ -143,7 +137,7 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     for file in parts(path, spec):
         if not file.name.endswith(SUFFIX):
             raise InputError(f"{file}: name: {file.name}: expected XX{SUFFIX}")
-        table, ledger = open_log(file, spec, allowed=0.0)
+        table, ledger = open_log(file, spec)
         made = _recording(table, spec, ledger)
         yield validate_recording(with_news(made, ledger), file)
 
@@ -200,11 +194,11 @@ def _recording(table: Table, spec: dict, ledger: Ledger) -> Recording:
         notes = []
     else:
         lanes, notes = _mapped_lanes(path, meta, tracks, spec)
-    default = number(spec, "default_speed_limit", LIMIT_MPS)
+    default = number(spec, "default_speed_limit")
     return Recording(
         name=log_name(path, spec, own_name(path)),
-        source=str(spec.get("source", "leveLXData")),
-        licence=str(spec.get("licence", "leveLXData terms: non-commercial use")),
+        source=spec["source"],
+        licence=spec["licence"],
         rate_hz=rate,
         tracks=tuple(tracks),
         lanes=lanes,
@@ -305,9 +299,7 @@ def _user_notes(met: set[int], users: dict[int, _User]) -> list[str]:
     """Tracks without rows, classes that this module does not know, and trailers."""
     missing = len(set(users) - met)
     notes = [f"{missing} tracks of tracksMeta have no rows"] if missing else []
-    unknown = {user.kind for user in users.values()} - {*KINDS, *MOTORISED}
-    if unknown:
-        notes.append(f"classes taken for vehicles: {', '.join(sorted(unknown))}")
+    notes += unknown_kinds("classes", {user.kind for user in users.values()})
     trailers = sum(users[number].kind == "trailer" for number in met)
     if trailers:
         notes.append(f"{trailers} trailers are obstacles of kind cyclist, no experts")
@@ -330,6 +322,6 @@ def _mapped_lanes(
         if min(apart) < FAR_M:
             return lanes, notes
         why = f"{place.name} lies elsewhere"
-    width = number(spec, "lane_width_m", LANE_WIDTH_M)
+    width = number(spec, "lane_width_m")
     lanes = path_lanes(tracks, width, None)
     return lanes, [f"{why}; {len(lanes)} lanes fitted to the longest paths"]

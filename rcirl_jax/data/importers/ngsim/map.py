@@ -15,14 +15,10 @@ from rcirl_jax.data.importers.options import number, positive
 from rcirl_jax.data.importers.tracks import spans_of, split_tracks, travel_heading
 from rcirl_jax.types import Kind, Lane, Recording, Track
 
-FRAME_S = 0.1  # s
 SITE = "Location"
 MAX_FRAME_GAP = 1  # frames; a larger gap starts a new track
 REUSE_S = 60.0  # s; a step back by more is a number given to another vehicle
 MARGIN_M = 50.0  # m of lane beyond the first and last position
-LANE_WIDTH_M = 3.6576  # m, 12 ft, US freeway
-SWITCH_S = 4.0  # s, a lane change takes 3 to 6 s
-LIMIT_MPS = 29.06  # m/s, 65 mph
 SIZE_M = (4.5, 1.8)  # m, a car
 
 
@@ -63,7 +59,7 @@ class Survey:
 
     def lanes(self, path: Path, spec: Mapping) -> tuple[Lane, ...]:
         """One straight lane per lane number, over where it was driven +- 50 m."""
-        width = number(spec, "lane_width_m", LANE_WIDTH_M)
+        width = number(spec, "lane_width_m")
         found = [
             StraightLane(
                 id=str(lane),
@@ -75,7 +71,7 @@ class Survey:
             )
             for lane, (lower, upper) in sorted(self._along.items())
         ]
-        limit = number(spec, "speed_limit", LIMIT_MPS)
+        limit = number(spec, "speed_limit")
         return straight_lanes(path, found, width, limit)
 
 
@@ -120,7 +116,7 @@ def site_recording(
       stamped: the clock is Global_Time; rows may come in any order.
       notes: of this Recording.
     """
-    frame_s = positive(spec, "frame_s", FRAME_S)
+    frame_s = positive(spec, "frame_s")
     # with stamps no step back has a meaning
     reuse = 0.0 if stamped else REUSE_S / frame_s
     vehicles = table["id"].astype(np.int64)
@@ -130,12 +126,12 @@ def site_recording(
     tracks = [_track(name, table, rows, spec, lateral) for name, rows in pieces]
     return Recording(
         name=name,
-        source=spec.get("source", "NGSIM"),
-        licence=spec.get("licence", "unknown"),
+        source=spec["source"],
+        licence=spec["licence"],
         rate_hz=1.0 / frame_s,
         tracks=tuple(tracks),
         lanes=survey.lanes(path, spec),
-        default_speed_limit=number(spec, "speed_limit", LIMIT_MPS),
+        default_speed_limit=number(spec, "speed_limit"),
         notes=tuple(notes),
     )
 
@@ -153,7 +149,7 @@ def _leader_missing(table: Rows) -> np.ndarray:
 def _track(
     name: str, table: Rows, rows: np.ndarray, spec: dict, lateral: bool
 ) -> Track:
-    frame_s = positive(spec, "frame_s", FRAME_S)
+    frame_s = positive(spec, "frame_s")
     sizes = spec.get("sizes", {})
     kind = str(int(table["v_Class"][rows[0]]))
     default = sizes.get(kind, sizes.get("0", SIZE_M))
@@ -187,8 +183,8 @@ def _lateral_from_lanes(lane: np.ndarray, spec: dict) -> np.ndarray:
     with t_k midway between the last sample in the old lane and the first in the
     new one.
     """
-    width = number(spec, "lane_width_m", LANE_WIDTH_M)
-    span = number(spec, "lane_switch_s", SWITCH_S) / positive(spec, "frame_s", FRAME_S)
+    width = number(spec, "lane_width_m")
+    span = number(spec, "lane_switch_s") / positive(spec, "frame_s")
     y = np.full(lane.shape, -width * (lane[0] - 0.5))
     samples = np.arange(lane.size)
     for at in np.flatnonzero(np.diff(lane) != 0.0):

@@ -31,7 +31,6 @@ from rcirl_jax.data.importers.files import (
     table_stem,
 )
 from rcirl_jax.data.importers.ngsim.map import (
-    FRAME_S,
     MAX_FRAME_GAP,
     SITE,
     Survey,
@@ -96,14 +95,13 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
 
 def _recordings(table: Table, spec: dict, ledger: Ledger) -> Iterator[Recording]:
     """Lanes and notes are those of a whole site, also of its minutes."""
-    path, frame_s = table.path, positive(spec, "frame_s", FRAME_S)
+    path, frame_s = table.path, positive(spec, "frame_s")
     stamped = _has_stamps(table)
     with rows_of(
         table,
         _fields(table, spec, stamped),
         ledger,
         is_long=is_long_file(path, spec),
-        wanted=spec.get("locations"),
         apart=APART,
         places=PLACES,
     ) as rows:
@@ -194,7 +192,7 @@ def _column(table: Table, name: str) -> str:
 
 def _fields(table: Table, spec: dict, stamped: bool) -> list[Field]:
     """Columns that are read, in SI units; those that may be missing are, if there."""
-    unit = unit_factor(table.path, "unit", spec.get("unit", "ft"), ("ft", "m"))
+    unit = unit_factor(table.path, "unit", spec["unit"], ("ft", "m"))
     clock = CLOCK if stamped else "Frame_ID"
     named = {clock: "t", "Vehicle_ID": "id", SITE: "recording"}
     actual = {name: _column(table, name) for name in COLUMNS}
@@ -204,7 +202,7 @@ def _fields(table: Table, spec: dict, stamped: bool) -> list[Field]:
         if name in NEEDED or table.has(actual[name])
     }
     factors = {name: unit for name, kind in found.items() if kind == "place"}
-    factors["t"] = 1e-3 if stamped else positive(spec, "frame_s", FRAME_S)
+    factors["t"] = 1e-3 if stamped else positive(spec, "frame_s")
     called = {named.get(name, name): column for name, column in actual.items()}
     fields = Columns(needed=found, called=called, factors=factors).fields(table)
     return [dataclasses.replace(field, lower=field.text) for field in fields]

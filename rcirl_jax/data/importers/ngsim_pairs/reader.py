@@ -49,11 +49,6 @@ TABLE = Columns(
     places=("x_follower", "x_leader"),
 )
 NAME = re.compile(r"(?P<run>.*?)_?f(?P<follower>\d+)_l(?P<leader>\d+)(_\d+)?")
-RATE_HZ = 10.0  # 1/s
-LIMIT_MPS = 29.06  # m/s, 65 mph
-LANE_WIDTH_M = 3.6576  # m, 12 ft
-LENGTH_M = 4.5  # m, of a follower that leads in no file
-WIDTH_M = 1.8  # m
 MAX_GAP_FRAMES = 5.5  # frames missing inside one track
 MARGIN_M = 50.0  # m of lane beyond the first and last position
 SPACING_FT = 0.5  # tolerance of spacing against the positions
@@ -115,16 +110,16 @@ def _recording(
     group: str,
     lengths: dict[tuple[str, str], float],
 ) -> Recording:
-    factor = unit_factor(path, "unit", str(spec.get("unit", "ft")), ("ft", "m"))
+    factor = unit_factor(path, "unit", spec["unit"], ("ft", "m"))
     run, follower, leader = _ids(path)
     length = float(np.median(table["leader_length"]))
     _check_spacing(path, table, length)
     own = lengths.get((run, follower))
     notes = ["no lateral positions; both cars on one straight lane"]
     if own is None:
-        own = number(spec, "follower_length_m", LENGTH_M) / factor
+        own = number(spec, "follower_length_m") / factor
         notes.append(f"length of follower {follower} unknown; default")
-    rate = positive(spec, "rate_hz", RATE_HZ)
+    rate = positive(spec, "rate_hz")
     # t is rounded to the clock: it is written with the noise of floating point
     frames = np.round((table["t"] - table["t"].min()) * rate)
     pieces = split_tracks(path, np.zeros(frames.size, int), frames, MAX_GAP_FRAMES)
@@ -133,7 +128,7 @@ def _recording(
             id=name + part.removeprefix("0"),
             kind=Kind.VEHICLE,
             length=size * factor,
-            width=number(spec, "width_m", WIDTH_M),
+            width=number(spec, "width_m"),
             t=frames[rows] / rate,
             x=(table[f"x_{role}"][rows] - 0.5 * size) * factor,
             y=np.zeros(rows.shape),
@@ -146,19 +141,19 @@ def _recording(
         )
         for part, rows in pieces
     )
-    limit = number(spec, "speed_limit", LIMIT_MPS)
+    limit = number(spec, "speed_limit")
     lane = StraightLane(
         id="1",
         y=0.0,
         lower=min(float(track.x.min()) for track in tracks) - MARGIN_M,
         upper=max(float(track.x.max()) for track in tracks) + MARGIN_M,
     )
-    width = number(spec, "lane_width_m", LANE_WIDTH_M)
+    width = number(spec, "lane_width_m")
     last, end = max(float(track.t[-1]) for track in tracks), (lane.upper, 0.0)
     return Recording(
         name=path.stem,
-        source=str(spec.get("source", "NGSIM I-80 leader-follower pairs")),
-        licence=str(spec.get("licence", "NGSIM: U.S. DOT FHWA, doi 10.21949/1504477")),
+        source=spec["source"],
+        licence=spec["licence"],
         rate_hz=rate,
         tracks=tracks,
         lanes=straight_lanes(path, [lane], width, limit),

@@ -23,7 +23,7 @@ from rcirl_jax.data.importers.options import path_option
 from rcirl_jax.data.importers.shapes import (
     MIN_HALF_WIDTH_M,
     Roads,
-    distance_to_line,
+    distances_to_lines,
     line_across,
     moves,
 )
@@ -147,7 +147,7 @@ class NuplanMap:
             (line,) = self._layers.lines("boundaries", [self._bounds[fid]])
         if not len(line):
             return np.full(len(centre), HALF_WIDTH_M)
-        apart = distance_to_line(centre, line)
+        apart = distances_to_lines(centre, [line], np.zeros(len(centre), int))
         return np.clip(apart, MIN_HALF_WIDTH_M, MAX_HALF_WIDTH_M)
 
     def _signs(self, *, connectors: bool) -> dict[int, int]:

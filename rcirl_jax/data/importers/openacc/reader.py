@@ -40,12 +40,8 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Recording, Track
 
 NOT_LOGS = re.compile(r"(?i).*(spec|note|readme|label).*")
-RATE_HZ = 10.0  # 1/s
-BLOCK_S = 120.0  # s of a drive in one Recording
 MIN_BLOCK_S = 1.0  # s that they may be
 MAX_GAP_STEPS = 5.5  # missing rows bridged inside one track
-LANE_WIDTH_M = 3.5  # m, of lanes fitted to paths
-LIMIT_MPS = 36.11  # m/s, 130 km/h, the motorways and tracks driven
 DRIVERS = ("human", "all")  # whose drives are demonstrations
 
 
@@ -74,14 +70,14 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
 
 def _blocks(drive: Drive, spec: dict) -> Iterator[Recording]:
     """Parts of a drive; those without a car in motion or at rest are left out."""
-    block_s = number(spec, "block_s", BLOCK_S)
-    rate = number(spec, "rate_hz", RATE_HZ)
+    block_s = number(spec, "block_s")
+    rate = number(spec, "rate_hz")
     if rate <= 0.0 or not (block_s == 0.0 or block_s >= MIN_BLOCK_S):
         raise InputError(
             f"source TOML: rate_hz, block_s: {rate:g}, {block_s:g}: expected above 0, "
             f"and at least {MIN_BLOCK_S:g} s or 0 (whole drives)"
         )
-    if (wanted := spec.get("drivers", DRIVERS[0])) not in DRIVERS:
+    if (wanted := spec["drivers"]) not in DRIVERS:
         raise InputError(f"source TOML: drivers: {wanted}: expected one of {DRIVERS}")
     part = np.zeros(drive.t.size) if block_s == 0.0 else drive.t // block_s
     order = np.argsort(part, kind="stable")
@@ -90,7 +86,7 @@ def _blocks(drive: Drive, spec: dict) -> Iterator[Recording]:
         car.number: spans_of(drive.t, (car.modes != "human") & (wanted != "all"))
         for car in drive.cars.values()
     }
-    width = number(spec, "lane_width_m", LANE_WIDTH_M)
+    width = number(spec, "lane_width_m")
     notes = [*drive.notes, *_driver_notes(drive), *_spacing_notes(drive)]
     name, found = log_name(drive.path, spec, own_name(drive.path)), False
     for block, rows in zip(numbers, np.split(order, firsts[1:]), strict=True):
@@ -101,16 +97,14 @@ def _blocks(drive: Drive, spec: dict) -> Iterator[Recording]:
         fitted = f"no map; {len(lanes)} lanes fitted to the paths driven"
         yield Recording(
             name=name if numbers.size == 1 else f"{name}-{int(block):04d}",
-            source=str(spec.get("source", "OpenACC, JRC")),
-            licence=str(
-                spec.get("licence", "European Commission, reuse with attribution")
-            ),
+            source=spec["source"],
+            licence=spec["licence"],
             rate_hz=rate,
             tracks=tracks,
             lanes=lanes,
             # files of one day share cars and drivers
             group=f"drives of {drive.date}" if drive.date else drive.path.stem,
-            default_speed_limit=number(spec, "default_speed_limit", LIMIT_MPS),
+            default_speed_limit=number(spec, "default_speed_limit"),
             notes=(*notes, *origin, fitted),
         )
     if not found:

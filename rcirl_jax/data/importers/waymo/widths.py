@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from rcirl_jax.data.importers.shapes import MIN_HALF_WIDTH_M, distance_to_line
+from rcirl_jax.data.importers.shapes import MIN_HALF_WIDTH_M, distances_to_lines
 
 MAX_HALF_WIDTH_M = 5.0  # m; a farther line does not bound the lane
 MEASURE_STEP = 4  # points (2 m) between those at which widths are measured
@@ -53,19 +53,10 @@ def half_widths(
         place = np.arange(owner.size) - np.repeat(np.cumsum(count) - count, count)
         point = np.minimum(low[owner] + MEASURE_STEP * place, high[owner])
         row = begins[segments.lane[owner]] + point
-        half[row] = _distances(np.concatenate(lanes)[row], lines, segments.line[owner])
+        keys, which = np.unique(segments.line[owner], return_inverse=True)
+        bounds = [lines[key] for key in keys.tolist()]
+        half[row] = distances_to_lines(np.concatenate(lanes)[row], bounds, which)
     return [_filled(part, default) for part in np.split(half, begins[1:])]
-
-
-def _distances(
-    points: np.ndarray, lines: Mapping[int, np.ndarray], line: np.ndarray
-) -> np.ndarray:
-    """Distance [n] m of points [n, 2] from the lines of the given ids [n]."""
-    order = np.argsort(line, kind="stable")
-    found = np.empty(len(points))
-    for rows in np.split(order, np.flatnonzero(np.diff(line[order])) + 1):
-        found[rows] = distance_to_line(points[rows], lines[int(line[rows[0]])])
-    return found
 
 
 def _filled(half: np.ndarray, default: float) -> np.ndarray:

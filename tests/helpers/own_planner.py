@@ -1,0 +1,128 @@
+"""F outside of this package against F inside: scenes out, answers in."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rcirl_jax.export import FeatureSpec, RewardWeights, save
+from rcirl_jax.export.loading import reward_params
+from rcirl_jax.export.own_planner import features as plain
+from rcirl_jax.features import FeatureMap, feature_map
+from rcirl_jax.planner.rank import learned_score
+from rcirl_jax.sampling.kinematics import trajectory_from_positions, trajectory_on_path
+from rcirl_jax.types import Candidates
+from rcirl_jax.units import TIMES_S
+from tests.helpers.weights_files import example_weights, loop_value
+
+TOLERANCE = 1e-5  # of max(1, |x|)
+
+
+def every_column():
+    """A feature map of all the columns that any preset has."""
+    presets = [feature_map(name) for name in ("paper21", "apollo21")]
+    specs = {spec.name: spec for preset in presets for spec in preset.specs}
+    return FeatureMap("every", tuple(specs.values()))
+
+
+def drawn_reward(path, columns, hidden=(15,), by_context=False, seed=3):
+    """A weights file of these columns at the usual times, of weights as trained."""
+    specs, rng = columns.specs, np.random.default_rng(seed)
+    size = len(specs)
+    drawn = example_weights(seed, size, TIMES_S.size, hidden, "tanh", by_context)
+    lower, upper = (
+        np.array([getattr(s, n) for s in specs]) for n in ("lower", "upper")
+    )
+    made: RewardWeights = dataclasses.replace(
+        drawn,
+        preset=columns.preset,
+        features=tuple(
+            FeatureSpec(name=s.name, unit=s.unit, none_value=s.none) for s in specs
+        ),
+        lower=lower,
+        upper=upper,
+        location=np.array([spec.none for spec in specs]),
+        scale=0.3 * (upper - lower),
+        times=TIMES_S,
+        kernels=tuple(kernel / np.sqrt(len(kernel)) for kernel in drawn.kernels),
+        biases=(*drawn.biases[:-1], np.zeros(1)),  # as training leaves it
+        gamma=drawn.gamma / np.sqrt(TIMES_S.size),
+        context=None if drawn.context is None else drawn.context / size,
+    )
+    x = rng.uniform(lower, upper, (3, TIMES_S.size, size)).astype(np.float32)
+    valid = np.ones(x.shape[:2], bool)
+    values = [loop_value(made, *one) for one in zip(x, valid, strict=True)]
+    return save(path, made, x, valid, np.array(values))
+
+
+@functools.cache
+def _answers(columns, activation, on_path):
+    score = learned_score(columns, activation)
+
+    def of_one(params, scene, s, l):
+        if on_path:
+            motion = jax.vmap(trajectory_on_path, (None, 0))(scene, s)
+        else:
+            motion = jax.vmap(trajectory_from_positions, (None, 0, 0))(scene, s, l)
+        both = Candidates(
+            trajectory=motion,
+            feasible=jnp.ones(s.shape[0], bool),
+            family=jnp.zeros(s.shape[0], jnp.int32),
+        )
+        return columns.of_candidates(scene, both), score(params, scene, both)
+
+    return jax.jit(jax.vmap(of_one, (None, 0, 0, 0)))
+
+
+def jax_answers(columns, reward, scenes, s, l=None):
+    """Features [n, K, T, F] and values [n, K] of JAX.
+
+    Stations and offsets are [n, K, T]; without offsets candidates are on the path.
+    """
+    program = _answers(columns, reward.activation, l is None)
+    found = program(reward_params(reward), scenes, s, s if l is None else l)
+    return tuple(np.asarray(x) for x in found)
+
+
+def numpy_answers(reward, scene, s, l=None):
+    """The same of one plain scene by the file for planners; s, l [K, T]."""
+    found = plain.FeatureMap(reward.names, reward.units)(scene, s, l)
+    return found, reward.value(found, scene.time_valid)
+
+
+def entries(scene, s, l=None):
+    """A case as pairs (label, numbers), as in onboard/conformance/README.md."""
+    yield "ego", list(dataclasses.asdict(scene.ego).values())
+    for label, name in (("kappa", "kappa"), ("path_l", "l"), ("speed_limit",) * 2):
+        yield label, getattr(scene.path, name)
+    yield "num_valid", [scene.num_valid]
+    yield "obstacles", [len(scene.obstacles)]
+    for box in scene.obstacles:
+        yield "kind", [box.kind]
+        for name in ("s_lower", "s_upper", "l_lower", "l_upper", "speed", "valid"):
+            yield name, getattr(box, name)
+    yield "candidates", [len(s)]
+    yield "on_path", [l is None]
+    for k in range(len(s)):
+        yield "s", s[k]
+        if l is not None:
+            yield "l", l[k]
+
+
+def as_numbers(scene, s, l=None):
+    """The numbers of `entries` one after the other, float32."""
+    return np.concatenate([np.asarray(x, np.float32) for _, x in entries(scene, s, l)])
+
+
+def error(found, expected):
+    """Largest |found - expected| / max(1, |expected|); inf where one is not finite."""
+    apart = np.abs(np.asarray(found, float) - expected)
+    apart /= np.maximum(1.0, np.abs(expected))
+    return float(np.max(np.nan_to_num(apart, nan=np.inf), initial=0.0))
+
+
+def in_valid_times(scenes, features):
+    """Features [n, K, T, F] with 0 at times that do not count."""
+    return np.where(np.asarray(scenes.time_valid)[:, None, :, None], features, 0.0)
