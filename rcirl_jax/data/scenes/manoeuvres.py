@@ -236,7 +236,7 @@ def _drove(m: Meetings, passed: np.ndarray) -> np.ndarray:
     seconds = TIMES_S[end] - TIMES_S[begin]
     way = 0.5 * (at(m.speed, begin) + at(m.speed, end)) * seconds
     off = np.abs(at(m.s, end) - at(m.s, begin) - way)
-    return off < JUMP_M + JUMP_MPS * seconds
+    return np.asarray(off < JUMP_M + JUMP_MPS * seconds)
 
 
 def follows(m: Meetings) -> np.ndarray:

@@ -65,9 +65,9 @@ class Drive:
         return bool(between) and is_single(first) and is_single(last) and last != first
 
 
-def is_single(mask: int | np.ndarray) -> bool | np.ndarray:
+def is_single(mask: int) -> bool:
     """One lane alone."""
-    return (mask > 0) & (mask & (mask - 1) == 0)
+    return mask > 0 and mask & (mask - 1) == 0
 
 
 def drive_of(log: Log, number: int, window: slice) -> Drive | None:
@@ -102,7 +102,8 @@ def decision(
     if not common.any() or behind.all():
         return Decision.IGNORE
     if ahead[0] and behind[-1]:
-        alone = is_single(ego.lanes) & (ego.lanes == other.lanes)
+        alone = np.array([is_single(mask) for mask in ego.lanes.tolist()])
+        alone &= ego.lanes == other.lanes
         return Decision.OVERTAKE if (alone & (ahead | behind)).any() else None
     if ego.is_steady and ahead[common].all():
         return _ahead(common, other, rate_hz, came)
@@ -117,8 +118,9 @@ def _ahead(
     alone = np.count_nonzero(other.lanes == other.lanes[0])
     if other.is_steady or (goes and alone >= FOLLOWED_S * rate_hz):
         return Decision.FOLLOW
-    comes = other.changes and bool(common[-1]) and came is not None
-    if not comes or np.argmax(common) < ENTERS_S * rate_hz or not came.is_nearest:
+    comes = other.changes and bool(common[-1])
+    comes &= bool(np.argmax(common) >= ENTERS_S * rate_hz)
+    if came is None or not comes or not came.is_nearest:
         return None
     if came.brakes and came.headway_s < CUT_IN_S[0]:
         return Decision.YIELD
