@@ -261,7 +261,7 @@ def follows(m: Meetings) -> np.ndarray:
 def is_lead(m: Meetings) -> np.ndarray:
     """[..., N] bool: ahead on the path from the start."""
     at_start = TIMES_S <= FOLLOW_ONSET_S
-    return (m.blocks & m.ahead & at_start).any(axis=-1)
+    return np.asarray((m.blocks & m.ahead & at_start).any(axis=-1))
 
 
 def comes(m: Meetings, seconds: float, metres: float) -> np.ndarray:
