@@ -175,42 +175,6 @@ def test_on_overlapping_branches_the_track_keeps_to_one():
     assert graph.chain("in", ["in", "right", "left", "left"]) == ("in", "left")
 
 
-def entering(t):
-    """From the left lane into the middle one between 2 and 5 s."""
-    return WIDTH * (1.0 - smooth_step(t, 2, 3))
-
-
-def parked(side):
-    return car("parked", lambda t: 70.0, y=side, kind=Kind.STATIC)
-
-
-D = Decision
-# the ego's start, the other, where its rear end is at the frame, decision, tags
-SITUATIONS = [
-    (20.0, car("lead", speeding_up(50.0)), 27.75, D.FOLLOW, [Tag.FOLLOWING]),
-    # a car from the left lane enters ahead after three seconds, or behind
-    (
-        *(20.0, car("cutter", speeding_up(38.0), y=entering), 15.75),
-        *(D.YIELD, [Tag.CUT_IN, Tag.YIELDING]),
-    ),
-    (
-        *(40.0, car("late", speeding_up(25.0), y=entering), -17.25),
-        *(D.OVERTAKE, [Tag.OVERTAKING]),
-    ),
-    # a car that is behind from the start
-    (40.0, car("rear", speeding_up(15.0)), -27.25, D.IGNORE, []),
-    (20.0, parked(-2.6), 41.67, D.NUDGE_LEFT, [Tag.NUDGING]),
-    (20.0, parked(2.6), 41.67, D.NUDGE_RIGHT, [Tag.NUDGING]),
-]
-
-
-@pytest.mark.parametrize(("start", "other", "at", "decision", "tags"), SITUATIONS)
-def test_decisions_and_tags(start, other, at, decision, tags):
-    row = first_scene(with_ego(start, other))
-    assert Decision(row["decisions"][slot_of(row, at)]) == decision
-    assert all(row["tags"][tag] for tag in tags)
-
-
 def test_a_lead_that_drives_out_of_view_is_followed():
     """It is in the way until nobody sees it any more, here for less than 2 s."""
     ego = car("ego", lambda t: 20.0 + 14.0 * t)
