@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rcirl_jax.export.loading import open_reward
-from rcirl_jax.report.tuning.curves import responses
+from rcirl_jax.export.responses import responses
 from tests.helpers.weights_files import random_weights
 
 
