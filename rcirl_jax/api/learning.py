@@ -4,7 +4,7 @@ import dataclasses
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from rcirl_jax.autotune.config import TuneConfig
 from rcirl_jax.autotune.evidence import verdict_of
@@ -74,7 +74,7 @@ def train_reward(
     config.reward.check_own()
     folder = Path(workdir)
     named = _named(data)
-    dataset = data if named is None else open_datasets(named)
+    dataset = cast(Demonstrations, data) if named is None else open_datasets(named)
     flags = {"data": named, "recipe": recipe, "seed": seed, **settings}
     train(dataset, folder, config, provenance={"flags": flags, **provenance()})
     return export_run(folder, dataset, folder / "weights.msgpack")
