@@ -321,7 +321,7 @@ def _futures(
         s, l = frame.project(np.stack([x, y], axis=1))
         s, l = s - s0, l
         tilt = np.unwrap(frame.tilt(s + s0, heading))
-        rate = np.gradient(s, t) if t.size > 1 else np.array([body.speed])
+        rate = np.gradient(s, t) if t.size > 1 else body.speed * np.cos(tilt)
         s, l, tilt, rate = (np.interp(TIMES_S, t, z) for z in (s, l, tilt, rate))
         half_s, half_l = _extents(body.length * ones, body.width * ones, tilt)
         boxes = (
