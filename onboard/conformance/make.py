@@ -1,17 +1,17 @@
 """Writes `cases.txt` and its weights files: scenes, and what F and V are in JAX.
 
-    python -m onboard.conformance.make
+    python -m onboard.conformance.make [FOLDER]
 
 The same code gives the same scenes; answers of other versions of JAX may differ in the
 last digits. README.md says how a case reads.
 """
 
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import jax
 import numpy as np
-from absl import app, flags
 
 from rcirl_jax.export.own_planner.plain import plain_scene
 from rcirl_jax.features import feature_map
@@ -23,7 +23,6 @@ from tests.helpers.own_planner import drawn_reward, entries, jax_answers
 from tests.helpers.scenes import scene
 
 HERE = Path(__file__).parent
-_OUTPUT = flags.DEFINE_string("output", str(HERE), "folder of the files")
 REWARDS = {"paper21": False, "apollo21": True}  # preset, gains by the scene
 DRAWN = 8  # random scenes
 HEAD = "# Made by onboard/conformance/make.py; README.md says how it reads.\n"
@@ -73,10 +72,9 @@ def line(label: str, numbers: np.ndarray) -> str:
     return " ".join([label, *texts])
 
 
-def main(_: list[str]) -> None:
+def main(folder: Path) -> None:
     """Write the three files."""
-    folder, text = Path(_OUTPUT.value), [HEAD]
-    rewards = {}
+    text, rewards = [HEAD], {}
     for preset, by_context in REWARDS.items():
         columns = feature_map(preset)
         path = folder / f"{preset}.msgpack"
@@ -102,4 +100,4 @@ def main(_: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    app.run(main)
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else HERE)
