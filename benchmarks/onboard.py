@@ -31,6 +31,7 @@ from tests.helpers.scenes import random_scene
 from tests.helpers.weights_files import example_samples, example_weights
 
 _CALLS = flags.DEFINE_integer("calls", 2000, "calls that are timed")
+_PARTS = flags.DEFINE_list("parts", "scores,features", "what is timed, each a file")
 _BUILD = flags.DEFINE_string("build", "build", "folder of the two builds")
 _OUTPUT = flags.DEFINE_string("output", "benchmarks/results", "folder of the JSON")
 
@@ -106,19 +107,19 @@ def planning_frames() -> Iterator[tuple[Scene, np.ndarray, np.ndarray]]:
         yield made, s[0], l[0]
 
 
-def with_features(programs: dict[str, Path], folder: Path) -> dict:
+def features(programs: dict[str, Path], folder: Path) -> dict:
     """Features and scores together, on crowded scenes."""
     reward = own_planner.drawn_reward(folder / "reward", feature_map("paper21"))
     frames, file = list(planning_frames()), folder / "cases"
     plain = [(plain_scene(scene), *ways) for scene, *ways in frames]
     np.concatenate([own_planner.as_numbers(*case) for case in plain]).tofile(file)
     rows = {
-        f"features_{build}": measured(path / "bench_features", reward.file, file)
+        build: measured(path / "bench_features", reward.file, file)
         for build, path in programs.items()
     }
-    rows["features_jax"] = here(jax_call(reward, frames), _CALLS.value)
+    rows["jax"] = here(jax_call(reward, frames), _CALLS.value)
     numpy_call = lambda i: own_planner.numpy_answers(reward, *plain[i % SCENES])  # noqa: E731
-    rows["features_numpy"] = here(numpy_call, NUMPY_CALLS)
+    rows["numpy"] = here(numpy_call, NUMPY_CALLS)
     return rows
 
 
@@ -129,25 +130,32 @@ def jax_call(reward: Reward, frames: list) -> Callable[[int], object]:
     return lambda i: jax.block_until_ready(score(*given[i % SCENES]))
 
 
+def scores(programs: dict[str, Path], folder: Path) -> dict:
+    """Scores alone, of every network."""
+    rows = {}
+    for name, shape in NETWORKS.items():
+        path, weights = folder / name, network(*shape)
+        save(path, weights, *example_samples(weights))
+        for build, program in programs.items():
+            rows[f"{build}_{name}"] = measured(program / "bench", path, CANDIDATES)
+    return rows
+
+
 def main(_: list[str]) -> None:
-    """Time every network, and features with the usual one, in both builds."""
-    result: dict = {"calls": _CALLS.value, "pause_us": PAUSE_US}
+    """Time the parts that are asked for, in both builds."""
     programs = {
         "portable": built("onboard", "OFF"),
         "native": built("onboard_native", "ON"),
     }
-    with tempfile.TemporaryDirectory() as folder:
-        for name, shape in NETWORKS.items():
-            path, weights = Path(folder) / name, network(*shape)
-            save(path, weights, *example_samples(weights))
-            for build, program in programs.items():
-                row = measured(program / "bench", path, CANDIDATES)
-                result[f"{build}_{name}"] = row
-                print(f"{build}, {name}: {row}")
-        for name, row in with_features(programs, Path(folder)).items():
-            result[name] = row
-            print(f"{name}: {row}")
-    print(f"written: {write('onboard', result, _OUTPUT.value)}")
+    parts = {"scores": ("onboard", scores), "features": ("onboard_features", features)}
+    for part in _PARTS.value:
+        name, timed_part = parts[part]
+        with tempfile.TemporaryDirectory() as folder:
+            rows = timed_part(programs, Path(folder))
+        for row, times in rows.items():
+            print(f"{row}: {times}")
+        result = {"calls": _CALLS.value, "pause_us": PAUSE_US, **rows}
+        print(f"written: {write(name, result, _OUTPUT.value)}")
 
 
 if __name__ == "__main__":
