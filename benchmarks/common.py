@@ -6,13 +6,14 @@ import os
 import platform
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import psutil
 
 from experiments.flags.common import processor, provenance
 from rcirl_jax.data.importers import read_recordings
@@ -61,6 +62,19 @@ def timed(call: Callable[[], object], count: int, warm_up: int = 20) -> list[flo
     return seconds
 
 
+def in_turn(
+    ways: Mapping[str, Callable[[], object]], rounds: int
+) -> dict[str, list[float]]:
+    """Seconds of every way in each round, one way after the other."""
+    taken: dict[str, list[float]] = {name: [] for name in ways}
+    for _ in range(rounds):
+        for name, way in ways.items():
+            begin = time.perf_counter()
+            jax.block_until_ready(way())
+            taken[name].append(time.perf_counter() - begin)
+    return taken
+
+
 def write(
     name: str,
     result: dict,
@@ -86,13 +100,13 @@ def write(
     if data:
         made["data_hash"] = open_dataset(data, verify=False).hash
     write_json(path, {**result, "made_by": made, "machine": machine()})
+    print(f"written: {path}")
     return path
 
 
 def resident_mb() -> float:
     """Memory of this process now, MiB."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+    return psutil.Process().memory_info().rss / 2**20
 
 
 @contextlib.contextmanager

@@ -16,16 +16,16 @@ import jax.numpy as jnp
 import numpy as np
 from absl import app, flags
 
-from benchmarks.common import percentiles, write
+from benchmarks.common import percentiles, untrained, write
 from rcirl_jax.export.loading import open_reward, reward_params
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.dp import plan_dp
 from rcirl_jax.planner.grid import DpConfig, Weights
 from rcirl_jax.planner.rank import ONLINE, Score, learned_score
 from rcirl_jax.planner.safety import check
-from rcirl_jax.reward import RewardConfig, init_reward, pinned
+from rcirl_jax.reward import RewardConfig
 from rcirl_jax.sampling import num_candidates, sample
-from rcirl_jax.types import Normaliser, Scene
+from rcirl_jax.types import Scene
 from tests.helpers.scenes import random_scene
 
 _WEIGHTS = flags.DEFINE_string("weights", None, "weights file (default: random)")
@@ -41,14 +41,10 @@ def _reward() -> tuple:
     if _WEIGHTS.value:
         reward = open_reward(_WEIGHTS.value)
         return reward_params(reward), reward.activation
-    shape = RewardConfig()
-    specs = feature_map("paper21").specs
-    lower = jnp.asarray([s.lower for s in specs])
-    upper = jnp.asarray([s.upper for s in specs])
-    middle, scale = 0.5 * (lower + upper), 0.25 * (upper - lower)
-    normaliser = Normaliser(lower=lower, upper=upper, location=middle, scale=scale)
-    params = pinned(init_reward(jax.random.key(0), 21, shape), shape)
-    return (params, normaliser), shape.activation
+    params, norm = untrained()
+    middle, scale = 0.5 * (norm.lower + norm.upper), 0.25 * (norm.upper - norm.lower)
+    scaled = norm.replace(location=middle, scale=scale)
+    return (params, scaled), RewardConfig().activation
 
 
 def _ranking(count: int, weights: Weights, score: Score) -> Planner:
@@ -111,8 +107,7 @@ def main(_: list[str]) -> None:
     for name, found in result.items():
         print(f"{name}: {found}")
     known = [_WEIGHTS.value] if _WEIGHTS.value else []
-    path = write("dp", result, _OUTPUT.value, weights=known)
-    print(f"written: {path}")
+    write("dp", result, _OUTPUT.value, weights=known)
 
 
 if __name__ == "__main__":

@@ -155,7 +155,7 @@ def main(_: list[str]) -> None:
         for row, times in rows.items():
             print(f"{row}: {times}")
         result = {"calls": _CALLS.value, "pause_us": PAUSE_US, **rows}
-        print(f"written: {write(name, result, _OUTPUT.value)}")
+        write(name, result, _OUTPUT.value)
 
 
 if __name__ == "__main__":

@@ -124,7 +124,7 @@ def main(_: list[str]) -> None:
             }
             most = {name: max(apart.values()) for name, apart in worst.items()}
             print(f"{path}: {dataset.count} scenes, largest difference {most}")
-    print(f"written: {write('own_planner', result, _OUTPUT.value)}")
+    write("own_planner", result, _OUTPUT.value)
 
 
 if __name__ == "__main__":

@@ -41,7 +41,7 @@ _DATA = flags.DEFINE_string("data", None, "scenes to cycle (default: synthetic)"
 _FULL = flags.DEFINE_bool("full", False, "run everything instead of a slice")
 _SECONDS = flags.DEFINE_float("seconds", 60.0, "length of the slice")
 _BATCH = flags.DEFINE_integer("batch_size", 0, "frames; 0: 256, accelerators 65536")
-_HOW = flags.DEFINE_string("parallel", "jit", "jit, pmap, shard_map or jit_sharded")
+_HOW = flags.DEFINE_string("parallel", "jit", "jit, pmap or shard_map")
 _OUTPUT = flags.DEFINE_string("output", "benchmarks/results", "folder of the JSON")
 
 FRAMES, QUERIES, EPOCHS = 718_000_000, 2_800_000_000, 2
@@ -83,7 +83,7 @@ def make_steps(config: TrainConfig, how: str, steps: int) -> Callable:
     The sums are loss, pairs won and pairs. A step that the last one of an epoch
     follows takes the epoch's next frames: frame numbers are modulo FRAMES.
     """
-    train_step = make_train_step(config, whole=how == "jit_sharded")
+    train_step = make_train_step(config)
 
     def run(held: tuple, first: jax.Array, *, axis_name: str | None = None) -> tuple:
         rows = held[1]
@@ -163,7 +163,7 @@ def main() -> None:
     if not result["complete"]:
         result["extrapolated_seconds_of_the_full_run"] = needed
         print(f"extrapolated, not run: {needed / 3600:.1f} h for the full amount")
-    print("written:", write("paper_scale", result, _OUTPUT.value, data=_DATA.value))
+    write("paper_scale", result, _OUTPUT.value, data=_DATA.value)
 
 
 if __name__ == "__main__":

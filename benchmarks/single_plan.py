@@ -24,12 +24,6 @@ _CALLS = flags.DEFINE_integer("calls", 2000, "plans that are timed")
 _OUTPUT = flags.DEFINE_string("output", "benchmarks/results", "folder of the JSON")
 
 
-def sampler_of(count: int) -> object:
-    """The closed loop's sampler with random profiles up to `count` candidates."""
-    missing = count - num_candidates(ONLINE)
-    return dataclasses.replace(ONLINE, num_random=ONLINE.num_random + missing)
-
-
 def main(_: list[str]) -> None:
     """Time 512 and 64 candidates."""
     weights = untrained()
@@ -37,7 +31,9 @@ def main(_: list[str]) -> None:
     scenes = [jax.tree.map(jnp.asarray, random_scene(i)) for i in range(32)]
     result = {}
     for count in (64, 512):
-        config = RankConfig(sampler=sampler_of(count))
+        missing = count - num_candidates(ONLINE)
+        sampler = dataclasses.replace(ONLINE, num_random=ONLINE.num_random + missing)
+        config = RankConfig(sampler=sampler)
         plan = jax.jit(rank_policy(score, config))
         turn = iter(np.arange(10**9))
         key = jax.random.key(0)
@@ -47,7 +43,7 @@ def main(_: list[str]) -> None:
 
         result[f"rank_{count}"] = percentiles(timed(call, _CALLS.value))
         print(f"rank, {count} candidates: {result[f'rank_{count}']}")
-    print(f"written: {write('single_plan', result, _OUTPUT.value)}")
+    write("single_plan", result, _OUTPUT.value)
 
 
 if __name__ == "__main__":

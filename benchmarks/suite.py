@@ -13,14 +13,13 @@ second, and the result says so.
 
 import functools
 import os
-import time
 from collections.abc import Callable
 
 import jax
 import numpy as np
 from absl import app, flags
 
-from benchmarks.common import untrained, write
+from benchmarks.common import in_turn, untrained, write
 from rcirl_jax.planner.rank import RankConfig
 from rcirl_jax.simulation.cases import STEP_S
 from rcirl_jax.simulation.metrics import MetricsConfig, case_metrics
@@ -84,12 +83,7 @@ def main(_: list[str]) -> None:
     for name in ROWS:
         row = baseline_row(name, "paper21", normaliser, RankConfig())
         ways = _ways(row, refs, duration_s)
-        taken: dict[str, list[float]] = {way: [] for way in ways}
-        for _ in range(_ROUNDS.value + 1):
-            for way, drive in ways.items():
-                begin = time.perf_counter()
-                jax.block_until_ready(drive())
-                taken[way].append(time.perf_counter() - begin)
+        taken = in_turn(ways, _ROUNDS.value + 1)
         first = {way: round(seconds[0], 2) for way, seconds in taken.items()}
         median = {way: float(np.median(x[1:])) for way, x in taken.items()}
         plans = {"together": len(refs) * steps, "one at a time": _SINGLE.value * steps}
@@ -104,7 +98,7 @@ def main(_: list[str]) -> None:
             "full_suite_is": "measured" if _FULL.value else "extrapolated",
         }
         print(f"{name}: {result['rows'][name]}", flush=True)
-    print(f"written: {write('suite', result, _OUTPUT.value)}")
+    write("suite", result, _OUTPUT.value)
 
 
 if __name__ == "__main__":

@@ -20,14 +20,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import jax
 import numpy as np
 from absl import app, flags
 
-from benchmarks.common import dataset_or_synthetic, write
+from benchmarks.common import dataset_or_synthetic, in_turn, write
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.evaluation.ranking.learners import normaliser_of
 from rcirl_jax.evaluation.ranking.sweep import MEMBERS_AT_ONCE
@@ -50,12 +49,6 @@ _ROUNDS = flags.DEFINE_integer("rounds", 5, "rounds")
 _COMMANDS = flags.DEFINE_integer("commands", 2, "rounds of the commands; 0: none")
 _DATA = flags.DEFINE_string("data", None, "dataset of the commands (default: made)")
 _OUTPUT = flags.DEFINE_string("output", "benchmarks/results", "folder of the JSON")
-
-
-def _seconds(call: Callable[[], object]) -> float:
-    begin = time.perf_counter()
-    jax.block_until_ready(call())
-    return time.perf_counter() - begin
 
 
 def _grid(config: TrainConfig) -> list[Members]:
@@ -103,9 +96,7 @@ def _commands() -> dict:
     sweep, alone = (float(np.median(taken[name])) for name in ("sweep", "train"))
     return {
         "scenes": scenes,
-        "seconds": {
-            name: [round(x, 2) for x in found] for name, found in taken.items()
-        },
+        "seconds": {n: [round(x, 2) for x in found] for n, found in taken.items()},
         "seconds_of_all_members": {
             "sweep": round(sweep, 2),
             "train": round(alone * _MEMBERS.value, 2),
@@ -152,10 +143,7 @@ def main(_: list[str]) -> None:
         with compiles() as found:
             jax.block_until_ready(way())
         compiled[name] = found
-    taken: dict[str, list[float]] = {name: [] for name in ways}
-    for _ in range(_ROUNDS.value):
-        for name, way in ways.items():
-            taken[name].append(_seconds(way))
+    taken = in_turn(ways, _ROUNDS.value)
     each_run = -(-_SCENES.value // config.batch_size) * _EPOCHS.value
     times = {
         "sweep": 1.0,
@@ -181,7 +169,7 @@ def main(_: list[str]) -> None:
         result["commands"] = _commands()
     for name, found in result.items():
         print(f"{name}: {found}")
-    print("written:", write("sweep", result, _OUTPUT.value, data=_DATA.value))
+    write("sweep", result, _OUTPUT.value, data=_DATA.value)
 
 
 if __name__ == "__main__":

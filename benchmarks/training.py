@@ -334,7 +334,7 @@ def main(_: list[str]) -> None:
         number = _CORES.value
         result = {f"cores_{number}": _here(path, number)} if number else _both(path)
     result = {**result, "torch": torch.__version__, "scenes": _SCENES.value}
-    print("written:", write("training", result, _OUTPUT.value, data=_DATA.value))
+    write("training", result, _OUTPUT.value, data=_DATA.value)
 
 
 if __name__ == "__main__":

@@ -18,9 +18,11 @@ from pathlib import Path
 from absl import flags
 
 from experiments.flags import margins, training
-from experiments.flags.common import cutting, provenance, run
+from experiments.flags.common import provenance, run
 from experiments.flags.executor import executor
+from experiments.flags.importing import import_flags
 from experiments.flags.signals import checked_signals, signals_asked
+from experiments.flags.suite import suite
 from rcirl_jax.autotune.config import TuneConfig
 from rcirl_jax.autotune.loop import STAGES, tune
 from rcirl_jax.autotune.rehearsal import TEACHERS
@@ -41,7 +43,7 @@ _SYNTHETIC = flags.DEFINE_bool(
 _FORMAT = flags.DEFINE_list("format", None, "of each --input (default: recognised)")
 _INPUT = flags.DEFINE_list("input", None, "recordings to import, one or several logs")
 _SOURCE = flags.DEFINE_list("source", None, "TOML of columns and units of each --input")
-_CUT = cutting(said=training.AS_SAID)
+_IMPORT = import_flags(said=training.AS_SAID)
 _INCUMBENT = flags.DEFINE_string(
     "incumbent", "hand-set", "weights file that drives today, or a baseline"
 )
@@ -56,11 +58,6 @@ _DRIVES = flags.DEFINE_integer(
 )
 _PARALLEL = flags.DEFINE_string("parallel", "jit", "how the devices share a batch")
 _HORIZON = flags.DEFINE_float("horizon", 5.0, "s at which distances are taken")
-_SUITE = flags.DEFINE_string("suite", "full", "full, smoke, or families with commas")
-_CASES = flags.DEFINE_integer("cases", None, "cases per family")
-_DURATION = flags.DEFINE_float("duration", None, "s per case at most")
-_SEED = flags.DEFINE_integer("catalogue_seed", 0, "seed of the cases")
-_EVERY = flags.DEFINE_integer("plan_every", 1, "steps of 0.1 s between two plans")
 _SWEEP = flags.DEFINE_string(
     "sweep", None, "folder of experiments.sweep, to be shown in the report"
 )
@@ -91,11 +88,7 @@ def made_run() -> Run:
         seeds=recipe.seeds if _SEEDS.value is None else _SEEDS.value,
         drives=_DRIVES.value,
         horizon_s=_HORIZON.value,
-        suite=_SUITE.value,
-        cases=_CASES.value,
-        duration_s=_DURATION.value,
-        catalogue_seed=_SEED.value,
-        plan_every=_EVERY.value,
+        **suite(),
         sweep=Path(_SWEEP.value) if _SWEEP.value else None,
     )
     return Run(
@@ -147,7 +140,7 @@ def _logs(name: str, path: Path | None, source: Path | None) -> Logs:
         format=name,
         input=path,
         source=source,
-        config=ImportConfig(format=name, collect=_CUT(training.recipe().collect)),
+        config=_IMPORT(ImportConfig(format=name, collect=training.recipe().collect)),
         signals=signals_asked(),
         checked=checked_signals,
     )

@@ -18,6 +18,7 @@ from absl import flags
 from experiments.flags import margins
 from experiments.flags.common import provenance, run
 from experiments.flags.executor import executor
+from experiments.flags.suite import suite
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.files import runs_of
@@ -26,7 +27,7 @@ from rcirl_jax.evaluation.gate.decision import judge
 from rcirl_jax.evaluation.gate.output import format_verdict, write_verdict
 from rcirl_jax.evaluation.gate.runs import pair_of
 from rcirl_jax.export.gate_job import drive_job, gate_job, left_out
-from rcirl_jax.export.tuned_idm import idm_fields, idm_left_out
+from rcirl_jax.export.tuned_idm import idm_left_out, read_tuned_idm
 from rcirl_jax.planner.safety import TRACKS
 from rcirl_jax.simulation.recorded.scenes import held_out
 from rcirl_jax.simulation.rows import BASELINES
@@ -36,10 +37,6 @@ _INCUMBENT = flags.DEFINE_string(
     "incumbent", "hand-set", "weights file, or a baseline: " + ", ".join(BASELINES)
 )
 _OUTPUT = flags.DEFINE_string("output", None, "JSON to write", required=True)
-_SUITE = flags.DEFINE_string("suite", "full", "full, smoke, or families with commas")
-_CASES = flags.DEFINE_integer("cases", None, "cases per family")
-_DURATION = flags.DEFINE_float("duration", None, "s per case at most (smoke 20)")
-_SEED = flags.DEFINE_integer("catalogue_seed", 0, "seed of the cases")
 _DATA = flags.DEFINE_list(
     "data", [], "datasets whose held-out drives measure human-likeness"
 )
@@ -48,7 +45,6 @@ _IDM = flags.DEFINE_string("tuned_idm", None, "JSON of autotune: a further row")
 _FILTER = flags.DEFINE_enum(
     "filter", "full", TRACKS, "full; collision: no verdict ships, the reward decides"
 )
-_EVERY = flags.DEFINE_integer("plan_every", 1, "steps of 0.1 s between two plans")
 
 
 def main() -> None:
@@ -61,13 +57,9 @@ def main() -> None:
     job, incumbent = gate_job(
         _CANDIDATE.value,
         _INCUMBENT.value,
-        suite=_SUITE.value,
-        cases=_CASES.value,
-        duration_s=_DURATION.value,
-        catalogue_seed=_SEED.value,
-        plan_every=_EVERY.value,
+        **suite(),
         rivals=("IDM", *(name for name in config.nulls if name in BASELINES)),
-        tuned_idm=idm_fields(_IDM.value),
+        tuned_idm=read_tuned_idm(Path(_IDM.value)) if _IDM.value else None,
         track=_FILTER.value,
     )
     if said := idm_left_out(_IDM.value):

@@ -14,12 +14,14 @@ finished shards stay); bad input leaves nothing behind. Of large releases a few 
 recordings may be left out (--leave_out), counted and named in the report.
 """
 
+import dataclasses
 from pathlib import Path
 
 from absl import flags
 
-from experiments.flags.common import cutting, made_by_file, run
+from experiments.flags.common import made_by_file, run
 from experiments.flags.executor import executor
+from experiments.flags.importing import import_flags
 from experiments.flags.signals import checked_signals
 from rcirl_jax.data.importers import IMPORTERS
 from rcirl_jax.data.importers.csv.suggest import suggested
@@ -27,7 +29,6 @@ from rcirl_jax.data.importers.files import table_stem
 from rcirl_jax.data.importers.recognise import recognised_format
 from rcirl_jax.data.importing import ImportConfig, import_parts
 from rcirl_jax.data.parts import leaving_out, parts_of
-from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.data.scenes.quality import format_quality, format_splits
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.errors import InputError
@@ -50,25 +51,8 @@ _SOURCE = flags.DEFINE_string(
 )
 _OUTPUT = flags.DEFINE_string("output", None, "dataset to write")
 _OVERWRITE = flags.DEFINE_bool("overwrite", False, "replace a finished dataset")
-_CUT = cutting(CollectConfig())
-_MIN_FUTURE = flags.DEFINE_float("min_future", 5.2, "s of recording a scene needs")
-_MIN_HISTORY = flags.DEFINE_float(
-    "min_history", 0.5, "s of recording before a planning frame"
-)
-_MIN_SURROUNDINGS = flags.DEFINE_float(
-    "min_surroundings",
-    3.0,
-    "s until someone whom the human reacts to leaves the record, at least",
-)
-_SMOOTHING = flags.DEFINE_float("smoothing", 4.1, "s, window of the position filter")
-_TEST_FRACTION = flags.DEFINE_float(
-    "test_fraction", 0.25, "share of scenes held out, by vehicle-disjoint group"
-)
-_LEAVE_OUT = flags.DEFINE_integer(
-    "leave_out", 0, "recordings that may be refused and are left out, counted", 0
-)
+_IMPORT = import_flags()
 _FLOOR = flags.DEFINE_float("horizon", 5.0, "s at which the oracle floor is taken")
-_SPLIT_SEED = flags.DEFINE_integer("split_seed", 0, "order in which groups are dealt")
 
 
 def main() -> None:
@@ -85,23 +69,12 @@ def main() -> None:
     if _FORMAT.value is None and path is not None:
         print(f"--format={form}: recognised", flush=True)
     parts = parts_of(form, path, source)
-    config = ImportConfig(
-        format=form,
-        collect=_CUT(
-            CollectConfig(
-                smoothing_s=_SMOOTHING.value,
-                min_future_s=_MIN_FUTURE.value,
-                min_history_s=_MIN_HISTORY.value,
-                min_surroundings_s=_MIN_SURROUNDINGS.value,
-                signal_checks=checked_signals(
-                    leaving_out(parts) if _LEAVE_OUT.value else parts, places
-                ),
-            )
-        ),
-        test_fraction=_TEST_FRACTION.value,
-        split_seed=_SPLIT_SEED.value,
-        leave_out=_LEAVE_OUT.value,
+    config = _IMPORT(ImportConfig(format=form))
+    signals = checked_signals(
+        leaving_out(parts) if config.leaves_out else parts, places
     )
+    collect = dataclasses.replace(config.collect, signal_checks=signals)
+    config = dataclasses.replace(config, collect=collect)
     floors: list[dict] = []
     splits: list[str] = []
 

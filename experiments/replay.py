@@ -11,12 +11,16 @@ from pathlib import Path
 from absl import flags
 
 from experiments.flags.common import provenance, run
-from rcirl_jax.errors import InputError
 from rcirl_jax.export.closed_loop import table_rows
-from rcirl_jax.report.player.page import write_replay_page
+from rcirl_jax.report.player.player import write_replay_page
 from rcirl_jax.report.player.replays import make_replays
 from rcirl_jax.simulation.rows import BASELINES, Row
-from rcirl_jax.simulation.suite import FULL_S, case_ref, catalogue_set
+from rcirl_jax.simulation.suite import (
+    FULL_S,
+    case_duration,
+    case_ref,
+    catalogue_set,
+)
 
 _WEIGHTS = flags.DEFINE_string("weights", None, "weights file", required=True)
 _CASE = flags.DEFINE_string("case", None, "id, for example cut_in/017@0", required=True)
@@ -35,9 +39,8 @@ def _row() -> Row:
 
 def main() -> None:
     """Flags -> case.html."""
-    if not 1.0 <= _DURATION.value <= FULL_S:
-        raise InputError(f"--duration: {_DURATION.value}: expected 1 to {FULL_S:g} s")
-    cases = catalogue_set([case_ref(_CASE.value)], _DURATION.value)
+    duration = case_duration("", _DURATION.value)
+    cases = catalogue_set([case_ref(_CASE.value)], duration)
     (replay,) = make_replays([_row()], cases, cases.ids, _EVERY.value)
     facts = provenance([_WEIGHTS.value])
     page = write_replay_page(Path(_OUTPUT.value) / "case.html", replay, facts)

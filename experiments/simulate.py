@@ -2,59 +2,42 @@
 
     python -m experiments.simulate --weights=FILE[,FILE...] --suite=full|smoke|FAMILY \
         --output=DIR
-    python -m experiments.simulate --weights=FILE --suite=recorded --format=FORMAT \
-        --input=LOGS --output=DIR
-    python -m experiments.simulate --weights=FILE --suite=heldout --data=DATASET \
-        --output=DIR
+    python -m experiments.simulate --weights=FILE --suite=recorded|heldout \
+        --data=DATASET[,DATASET] --output=DIR
 
 Every case is driven at 10 Hz; safety filter and candidates are the same for all
-rows; on recorded scenes the recorded human is one of them. Writes table.txt,
-suite.json and cases.csv. A case is drawn by experiments.replay from its id. Held-out
-drives of datasets say how near to the human each row is: table.txt and likeness.json.
+rows. Writes table.txt, suite.json and cases.csv. A case is drawn by experiments.replay
+from its id. Held-out drives of datasets, up to 8 s among the recorded traffic, have the
+recorded human as one of the rows: `recorded` says the same of them as of the other
+suites, `heldout` how near to the human each row is (table.txt and likeness.json).
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from absl import flags
 
 from experiments.flags.common import provenance, run
 from experiments.flags.executor import executor
-from rcirl_jax.data.importers import IMPORTERS
-from rcirl_jax.data.parts import Part, parts_of, recordings_of_all
+from experiments.flags.suite import CASES, DURATION, EVERY, SEED, SUITE
 from rcirl_jax.data.store.joined import JoinedDatasets, open_datasets
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.likeness import DRIVES, held_out_likeness
 from rcirl_jax.evaluation.closed_loop.suite import (
     SuiteConfig,
-    drive_here,
     run_suite,
     worst_cases,
     write_suite,
 )
-from rcirl_jax.export.spread import SuiteJob, spread
-from rcirl_jax.export.tuned_idm import idm_fields, idm_left_out
+from rcirl_jax.export.spread import SuiteJob, drive_by
+from rcirl_jax.export.tuned_idm import idm_left_out, read_tuned_idm
 from rcirl_jax.planner.safety import TRACKS
 from rcirl_jax.runtime.atomic_files import write_json, write_whole
-from rcirl_jax.simulation.recorded.config import RecordedConfig
-from rcirl_jax.simulation.recorded.scenes import held_out
+from rcirl_jax.simulation.recorded.scenes import HeldOut, held_out
 from rcirl_jax.simulation.rows import BASELINES, human_row
-from rcirl_jax.simulation.suite import (
-    FULL_S,
-    SMOKE_S,
-    CaseSet,
-    recorded_set,
-    suite_refs,
-)
+from rcirl_jax.simulation.suite import case_duration, recorded_set, suite_refs
 
 _WEIGHTS = flags.DEFINE_list("weights", None, "weights files", required=True)
-_SUITE = flags.DEFINE_string(
-    "suite", "smoke", "full, smoke, recorded, heldout, or families with commas"
-)
-_DATA = flags.DEFINE_list("data", [], "datasets of --suite=heldout")
-_FORMAT = flags.DEFINE_enum("format", "commonroad", sorted(IMPORTERS), "of --input")
-_INPUT = flags.DEFINE_string("input", None, "recordings of --suite=recorded")
-_SMOOTHING = flags.DEFINE_float("smoothing", 4.1, "s, window on recorded positions")
+_DATA = flags.DEFINE_list("data", [], "datasets of --suite=recorded, heldout")
 _OUTPUT = flags.DEFINE_string("output", None, "folder to write", required=True)
 _BASELINES = flags.DEFINE_list("baselines", ",".join(BASELINES), "rival rows, or empty")
 _IDM = flags.DEFINE_string("tuned_idm", None, "JSON of autotune: a further row")
@@ -62,61 +45,43 @@ _DP = flags.DEFINE_bool("dp", False, "also drive the first weights by DP")
 _FILTER = flags.DEFINE_enum(
     "filter", "full", TRACKS, "full, or collision: the reward decides the rest"
 )
-_CASES = flags.DEFINE_integer("cases", None, "per family, else in all")
-_DURATION = flags.DEFINE_float("duration", None, "s per case at most (smoke 20)")
-_EVERY = flags.DEFINE_integer("plan_every", 1, "steps of 0.1 s between two plans")
 _CHUNK = flags.DEFINE_integer("chunk", 180, "cases driven together; bounds memory")
-_SEED = flags.DEFINE_integer("catalogue_seed", 0, "seed of the cases")
 
-
-def _logs() -> list[Part]:
-    """The recordings of --suite=recorded; none of another suite."""
-    if _SUITE.value != "recorded":
-        return []
-    if not _INPUT.value:
-        raise InputError("--input: not given: expected the recordings to replay")
-    return parts_of(_FORMAT.value, Path(_INPUT.value))
-
-
-def _recorded(logs: Sequence[Part]) -> CaseSet:
-    """Drives cut out of recordings."""
-    config = RecordedConfig(
-        smoothing_s=_SMOOTHING.value,
-        max_cases=_CASES.value,
-        max_duration_s=_DURATION.value or FULL_S,
-    )
-    return recorded_set(recordings_of_all(logs), config)
+flags.set_default(SUITE, "smoke")
+OF_DATA = ("recorded", "heldout")  # suites of --data
 
 
 def _job() -> SuiteJob:
     """Rows and catalogue cases that the flags name."""
-    elsewhere = _SUITE.value in ("recorded", "heldout")
-    duration = _DURATION.value or (SMOKE_S if _SUITE.value == "smoke" else FULL_S)
-    if not 1.0 <= duration <= FULL_S:
-        raise InputError(f"--duration: {duration}: expected 1 to {FULL_S:g} s")
-    if elsewhere and _CASES.value is not None and _CASES.value < 1:
-        raise InputError(f"--cases: {_CASES.value}: expected at least 1")
+    elsewhere = SUITE.value in OF_DATA
+    if elsewhere and CASES.value is not None and CASES.value < 1:
+        raise InputError(f"--cases: {CASES.value}: expected at least 1")
     return SuiteJob(
         weights=tuple(_WEIGHTS.value),
         baselines=tuple(_BASELINES.value),
-        refs=() if elsewhere else suite_refs(_SUITE.value, _CASES.value, _SEED.value),
-        duration_s=duration,
-        plan_every=_EVERY.value,
+        refs=() if elsewhere else suite_refs(SUITE.value, CASES.value, SEED.value),
+        duration_s=case_duration(SUITE.value, DURATION.value),
+        plan_every=EVERY.value,
         dp=_DP.value,
-        tuned_idm=idm_fields(_IDM.value),
+        tuned_idm=read_tuned_idm(Path(_IDM.value)) if _IDM.value else None,
         track=_FILTER.value,
     )
 
 
-def _held_out(job: SuiteJob) -> None:
-    """Every row, and the recorded human, over held-out drives."""
-    if _DURATION.value:
-        raise InputError("--duration: of --suite=heldout: drives last as their records")
+def _drives() -> tuple[HeldOut, str]:
+    """Held-out drives of --data, and its hash."""
+    if DURATION.value:
+        raise InputError(
+            f"--duration: of --suite={SUITE.value}: drives last as their records"
+        )
     data = open_datasets(_DATA.value)
     sources = data.parts if isinstance(data, JoinedDatasets) else [data]
-    made_by = {**provenance(_WEIGHTS.value), "data_hash": data.hash}
-    drives = held_out(sources, _CASES.value or DRIVES, _SEED.value)
-    report = held_out_likeness(drives, job.rows(), _EVERY.value)
+    return held_out(sources, CASES.value or DRIVES, SEED.value), data.hash
+
+
+def _likeness(job: SuiteJob, drives: HeldOut, made_by: dict) -> None:
+    """Every row, and the recorded human, over held-out drives."""
+    report = held_out_likeness(drives, job.rows(), EVERY.value)
     folder = Path(_OUTPUT.value)
     write_whole(folder / "table.txt", report.text())
     write_json(folder / "likeness.json", {**report.as_dict(), "made_by": made_by})
@@ -133,25 +98,27 @@ def main() -> None:
         print(said)
     if not job.refs and places.workers > 1:
         raise InputError(
-            f"--suite: {_SUITE.value}: expected --workers=1: drives run here"
+            f"--suite: {SUITE.value}: expected --workers=1: drives run here"
         )
-    if _SUITE.value == "heldout":
-        _held_out(job)
-        return
-    if _DATA.value:
-        raise InputError(f"--data: with --suite={_SUITE.value}: expected heldout")
-    rows, drive, logs = job.rows(), drive_here, _logs()
-    if logs:
-        cases = _recorded(logs)
-        rows.append(human_row())
-    else:
-        cases = job.cases()
-        if places.workers > 1:
-            drive = spread(places, job)
-    config = SuiteConfig(plan_every=_EVERY.value, chunk=_CHUNK.value)
+    if job.refs and _DATA.value:
+        raise InputError(
+            f"--data: with --suite={SUITE.value}: expected {' or '.join(OF_DATA)}"
+        )
     # of the files as they are read, not hours later
-    made_by = provenance(_WEIGHTS.value, logs=logs)
-    result = run_suite(rows, cases, config, drive)
+    made_by = provenance(_WEIGHTS.value)
+    rows = job.rows()
+    if job.refs:
+        cases = job.cases()
+    else:
+        drives, data_hash = _drives()
+        made_by["data_hash"] = data_hash
+        if SUITE.value == "heldout":
+            _likeness(job, drives, made_by)
+            return
+        cases = recorded_set(drives)
+        rows.append(human_row())
+    config = SuiteConfig(plan_every=EVERY.value, chunk=_CHUNK.value)
+    result = run_suite(rows, cases, config, drive_by(places, job))
     print(write_suite(result, Path(_OUTPUT.value), made_by))
     for name, facts in result.timings.items():
         print(f"{name}: {facts['seconds']} s, {facts['plans_per_s']:,} plans/s")

@@ -85,11 +85,12 @@ def as_input_error(what: str, expected: str) -> Iterator[None]:
         ) from error
 
 
-def extra_module(name: str) -> ModuleType:
-    """A module of the extra [logs]; one clear line where it is not installed."""
+def extra_module(name: str, extra: str = "logs") -> ModuleType:
+    """A module of an extra; one clear line where it is not installed."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
         raise InputError(
-            f"{name}: not installed ({error}): expected pip install 'rcirl-jax[logs]'"
+            f"{name}: not installed ({error}): expected "
+            f"pip install 'rcirl-jax[{extra}]'"
         ) from error

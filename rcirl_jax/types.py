@@ -216,7 +216,10 @@ class Track:
     automated: tuple[tuple[float, float], ...] = dataclasses.field(
         default=(), metadata={"in_digest": "unless default"}
     )
-
+    # the log does not say length and width, and what they are taken for is a guess
+    size_assumed: bool = dataclasses.field(
+        default=False, metadata={"in_digest": "unless default"}
+    )
     # s, (begin, end) of times at which the log names a leader of this driver that it
     # does not hold
     leader_missing: tuple[tuple[float, float], ...] = dataclasses.field(
@@ -248,6 +251,10 @@ class Lane:
     stop_line: np.ndarray | None = None  # [2, 2] m, end points
     signal_ids: tuple[str, ...] = ()  # signals that govern the stop line
     stop_sign: bool = False  # the stop line demands a stop at any time
+    # the log does not say the widths, and what they are taken for is a guess
+    width_assumed: bool = dataclasses.field(
+        default=False, metadata={"in_digest": "unless default"}
+    )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

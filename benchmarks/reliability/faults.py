@@ -5,10 +5,11 @@
 import, train, sweep and autotune run on small synthetic data. Each runs once
 undisturbed; then it is killed at random moments, again and again, started by the same
 command each time, and when it has ended by itself its outputs are compared to the bit.
-Half of the moments are uniform over the whole run (`--moments=run`: all). The others
-(`--moments=work`: all) are, in turn, as soon as some but not all of its things are
+Half of the moments are uniform over the whole run. The others are, in turn, as soon as
+some but not all of its things are
 finished (shards, checkpoints, shapes of a sweep, stages), and uniform over the time
-after the first. A command that no kill found so half done is a problem.
+after the first (`--work`: all are). A command that no kill found so half done is a
+problem.
 `--signal=TERM` (to the process, as a cluster does) and `INT` (to its group, as a
 terminal does) also hold the seconds to the end and the exit status against what is
 promised. `--broken_resume` has trainings
@@ -17,7 +18,6 @@ forget where in the data they were: this file has to say so and end with 1.
 Writes faults_SIGNAL.json after every comparison, one row per command.
 """
 
-import collections
 import dataclasses
 import itertools
 import os
@@ -43,12 +43,7 @@ SHARES = {"import": 15, "train": 15, "sweep": 10, "autotune": 10}  # of 50 kills
 _KILLS = flags.DEFINE_integer("kills", 50, "over all commands", 1)
 _JOBS = flags.DEFINE_list("commands", list(SHARES), "which of them")
 _SIGNAL = flags.DEFINE_enum("signal", "KILL", SIGNALS, "that ends them")
-_MOMENTS = flags.DEFINE_enum(
-    "moments",
-    "both",
-    ["run", "work", "both"],
-    "over the whole run, once something is finished, or half and half",
-)
+_WORK = flags.DEFINE_bool("work", False, "all moments once something is finished")
 _SEED = flags.DEFINE_integer("seed", 0, "of the moments")
 _BROKEN = flags.DEFINE_bool("broken_resume", False, "break the resume of trainings")
 _OUTPUT = flags.DEFINE_string("output", "benchmarks/results", "folder of the JSON")
@@ -59,12 +54,6 @@ MOST_S = 1800.0  # s after which a command counts as hanging
 PROMISED_S = 10.0  # s from a signal to the end
 IN_A_ROW = 4  # kills before a command may end
 LOOK_S = 0.005  # s between two looks at what is finished
-MOMENTS = {
-    "run": "uniform over the run",
-    "work": "half with some things finished, half uniform over the time after one",
-    "both": "half uniform over the run, a quarter with some things finished, a "
-    "quarter uniform over the time after one",
-}
 FINISHED = "holds a finished dataset"  # killed between its last file and its end
 
 
@@ -73,7 +62,6 @@ class Row:
     """What came of one command."""
 
     fault: str
-    injected: str
     command: str
     undisturbed_s: float
     first_finished_s: float  # when the undisturbed run had finished something
@@ -86,10 +74,9 @@ class Row:
     # things that were finished at each kill: shards, checkpoints, shapes, stages
     progress_at_kill: list[int] = dataclasses.field(default_factory=list)
     seconds_to_end: list[float] = dataclasses.field(default_factory=list)
-    exit_statuses: dict[str, int] = dataclasses.field(default_factory=dict)
 
 
-def start(job: Job, folder: Path, *, broken: bool = False) -> subprocess.Popen:
+def start(job: Job, folder: Path) -> subprocess.Popen:
     """The command in a process group of its own; what it says goes to said.txt."""
     cache = os.environ.get("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".jax_cache"))
     env = {
@@ -98,16 +85,11 @@ def start(job: Job, folder: Path, *, broken: bool = False) -> subprocess.Popen:
         "JAX_PLATFORMS": "cpu",
         "JAX_COMPILATION_CACHE_DIR": cache,
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.1",
-        **({BROKEN: "1"} if broken else {}),
     }
+    words = [sys.executable, "-m", WRAPPER, job.module, *job.flags]
     with (folder / "said.txt").open("a") as said:
         return subprocess.Popen(
-            [sys.executable, "-m", WRAPPER, job.module, *job.flags],
-            cwd=folder,
-            env=env,
-            stdout=said,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
+            words, cwd=folder, env=env, stdout=said, stderr=said, start_new_session=True
         )
 
 
@@ -123,14 +105,14 @@ def until_finished(
     return time.monotonic() - begin
 
 
-def to_the_end(job: Job, folder: Path, *, broken: bool = False) -> tuple[float, float]:
+def to_the_end(job: Job, folder: Path) -> tuple[float, float]:
     """Run it undisturbed; seconds to the end, and until something was finished.
 
     Raises:
       InputError: it failed or did not end.
     """
     begin = time.monotonic()
-    process = start(job, folder, broken=broken)
+    process = start(job, folder)
     first_s = until_finished(job, folder, process)
     try:
         status = process.wait(MOST_S)
@@ -151,7 +133,7 @@ def killed(job: Job, folder: Path, share: float, row: Row, moment: str) -> bool:
     finished. In a folder where they are, after a share of all its time.
     """
     number = signal.Signals[f"SIG{_SIGNAL.value}"]
-    process = start(job, folder, broken=_BROKEN.value)
+    process = start(job, folder)
     begin = time.monotonic()
     half = max(row.things // 2, 1)
     count = {"run": 0, "after": 1, "between": 1 + int(share * half)}[moment]
@@ -178,24 +160,21 @@ def killed(job: Job, folder: Path, share: float, row: Row, moment: str) -> bool:
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
         status = process.wait()
-        row.problems.append(f"alive {3.0 * PROMISED_S:.0f} s after the signal")
     seconds = time.monotonic() - sent
     row.seconds_to_end.append(round(seconds, 2))
-    if number != signal.SIGKILL:
-        # before Python hears signals they end it as they end any process; an end of
-        # its own may come between the last look and the signal
-        row.exit_statuses[str(status)] = row.exit_statuses.get(str(status), 0) + 1
-        early = [] if waits else [-number]
-        if status not in (128 + number, 0, *early):
-            row.problems.append(f"exit status {status} after SIG{_SIGNAL.value}")
-        if seconds > PROMISED_S:
-            row.problems.append(f"{seconds:.1f} s to the end")
+    # before Python hears signals they end it as they end any process; an end of
+    # its own may come between the last look and the signal
+    early = [] if waits else [-number]
+    if number != signal.SIGKILL and status not in (128 + number, 0, *early):
+        row.problems.append(f"exit status {status} after SIG{_SIGNAL.value}")
+    if seconds > PROMISED_S:
+        row.problems.append(f"{seconds:.1f} s to the end")
     return True
 
 
 def _moments(count: int) -> list[str]:
-    """Of so many kills; `both`: half, rounded up, wait for what is finished."""
-    work = {"run": 0, "work": count, "both": (count + 1) // 2}[_MOMENTS.value]
+    """Of so many kills: half, rounded up, or all wait for what is finished."""
+    work = count if _WORK.value else (count + 1) // 2
     waiting = itertools.islice(itertools.cycle(("between", "after")), work)
     return [*waiting, *["run"] * (count - work)]
 
@@ -216,7 +195,7 @@ def disturbed(job: Job, root: Path, count: int, row: Row, expected: Facts) -> No
                 break
             row.count += 1
         try:
-            to_the_end(job, folder, broken=_BROKEN.value)
+            to_the_end(job, folder)
             found = job.outcome(folder)
             names = sorted(found.keys() | expected.keys())
             different = [x for x in names if found.get(x) != expected.get(x)]
@@ -253,6 +232,8 @@ def main() -> None:
     root = Path(tempfile.mkdtemp(prefix="rcirl-faults-"))
     write_logs(root / "logs")
     known = jobs(root)
+    if _BROKEN.value:
+        os.environ[BROKEN] = "1"
     # a dataset for the others to work on, and programs in the cache
     to_the_end(known["import"], root)
     total = sum(SHARES[name] for name in _JOBS.value)
@@ -266,7 +247,6 @@ def main() -> None:
         expected, again = job.outcome(folder), job.outcome(warm)
         row = Row(
             fault=f"SIG{_SIGNAL.value}",
-            injected=f"at moments {MOMENTS[_MOMENTS.value]}, then run again",
             command=f"{job.module} {' '.join(job.flags)}".replace(str(root), "ROOT"),
             undisturbed_s=round(seconds, 2),
             first_finished_s=round(first_s, 2),
@@ -277,9 +257,8 @@ def main() -> None:
             row.problems.append(f"two undisturbed runs differ: {odd[:5]}")
         count = max(round(_KILLS.value * SHARES[name] / total), 1)
         disturbed(job, root, count, row, expected)
-    problems = collections.Counter(x for row in _ROWS.values() for x in row.problems)
-    if problems:
-        print(f"{sum(problems.values())} problems; what was left: {root}")
+    if problems := sum(len(row.problems) for row in _ROWS.values()):
+        print(f"{problems} problems; what was left: {root}")
         sys.exit(1)
     shutil.rmtree(root)
 

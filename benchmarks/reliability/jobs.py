@@ -20,9 +20,9 @@ from rcirl_jax.export.from_run import read_config
 from rcirl_jax.export.weights import to_json
 from rcirl_jax.runtime.pipeline import FILE, digest, file_sha256
 from rcirl_jax.train.loop import restore_run
+from tests.data import small_logs
 
 Facts = Mapping[str, str]  # what came out -> digest
-LOGS, CARS, SECONDS = 8, 4, 20.0
 SAID = ("ranking.json", "verdict.json")  # what a tuning run says
 
 
@@ -39,17 +39,7 @@ class Job:
 
 def write_logs(folder: Path) -> None:
     """CSV logs of platoons on a straight road."""
-    folder.mkdir(parents=True)
-    t = np.arange(0.0, SECONDS, 0.1)
-    for number in range(LOGS):
-        rng = np.random.default_rng(number)
-        lines = ["t,id,x,y"]
-        for car in range(CARS):
-            speed = 12.0 + 2.0 * np.sin(0.4 * t + rng.uniform(0.0, 6.0))
-            x = 30.0 * (CARS - 1 - car) + np.cumsum(speed) * 0.1
-            rows = zip(t, x, strict=True)
-            lines += [f"{a:.1f},{number}-{car},{b:.3f},0" for a, b in rows]
-        (folder / f"log{number:02d}.csv").write_text("\n".join(lines) + "\n")
+    small_logs.write_logs(folder, files=8, seconds=20.0)
 
 
 def jobs(root: Path) -> dict[str, Job]:

@@ -10,8 +10,7 @@ says so.
 
 import: `--scenes` scenes of one generated log (platoons in waves, 2 GB for 10 million)
 by `experiments.import_logs` as a user would call it, with its usual filters and
-stride, onto the disk. `--seconds=N` imports a slice instead, as many scenes as a small
-first import says that take N seconds; what 10 million take is then extrapolated.
+stride, onto the disk, which has to have room for the log and the dataset.
 
 A thread looks at resident memory every second, with all worker processes (what they
 share counts in each). Bounded: the median over the last tenth of the work is at most
@@ -25,26 +24,26 @@ import dataclasses
 import json
 import os
 import resource
-import shutil
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from absl import flags
 
-from benchmarks.common import LANE_TOML, resident_mb, untrained, write
+from benchmarks.common import LANE_TOML, untrained, write
 from benchmarks.reliability.memory import (
+    BOUNDED,
+    FINISHING_MB,
+    PEAK_MB,
     Level,
     Sample,
     Watch,
-    finishing_problems,
     level,
-    peak_problems,
     thinned,
+    too_much,
 )
 from experiments.flags.common import provenance, run
 from rcirl_jax.data.store.files import MARK
@@ -75,19 +74,15 @@ _ROWS = flags.DEFINE_list("rows", ["hand-set", "IDM"], "baselines that drive")
 _DURATION = flags.DEFINE_float("duration", FULL_S, "s of a case")
 _CHUNK = flags.DEFINE_integer("chunk", 180, "cases driven together", 1)
 _SCENES = flags.DEFINE_integer("scenes", 10_000_000, "of the import", 1)
-_SECONDS = flags.DEFINE_float("seconds", 0.0, "of a slice of the import; 0: all of it")
 _CARS = flags.DEFINE_integer("cars", 100, "at any time in the imported log", 1)
-_PROBE = flags.DEFINE_integer("probe", 40_000, "scenes of the small first import", 1)
 _WORKERS = flags.DEFINE_integer("processes", 2, "workers of the import", 1)
 _FOLDER = flags.DEFINE_string("folder", None, "where logs and datasets are written")
 _OUTPUT = flags.DEFINE_string("output", "benchmarks/results", "folder of the JSON")
 
 STAY_S = 60.0  # s that a car is seen
 CAR_ROWS = 600
-CAR_SCENES = 100  # about; the small first import says how many
-LEAST_SHARDS = 3  # seen one after the other, so that there is a rate
-SLICE_SHARDS = 15  # at least, so that every tenth of a slice is seen
-BOUNDED = "bounded"
+CAR_SCENES = 100  # about
+LEAST_SHARDS = 15  # seen one after the other, so that every tenth of them is
 # read in pieces from the first byte on, so that a slice is read as the whole is
 TOML = "long_bytes = 1\n" + LANE_TOML
 
@@ -117,7 +112,7 @@ class Watched:
     def __call__(self, row: Row, cases: CaseSet, config: SuiteConfig) -> CaseMetrics:
         """All cases with one row; its memory is in `rows`."""
         done, total = 0.0, len(cases.ids)
-        watch = Watch(os.getpid(), lambda: done)
+        watch, begin = Watch(os.getpid(), lambda: done), time.monotonic()
 
         def build(first: int, last: int) -> object:
             nonlocal done
@@ -125,14 +120,9 @@ class Watched:
             watch.look()
             return cases.build(first, last)
 
-        begin = time.monotonic()
-        watch.start()
-        try:
+        with watch.every(1.0):
             made = drive_here(row, dataclasses.replace(cases, build=build), config)
-        finally:
-            watch.stop()
-        seconds = time.monotonic() - begin
-        done = float(total)
+        seconds, done = time.monotonic() - begin, float(total)
         watch.look()
         self.samples[row.name] = watch.samples
         self.rows[row.name] = {
@@ -145,41 +135,25 @@ class Watched:
         return made
 
 
-def rows_of(names: Sequence[str]) -> list[Row]:
-    """The baselines that drive."""
-    config = RankConfig()
-    return [baseline_row(name, "paper21", untrained()[1], config) for name in names]
-
-
 def suite() -> list[str]:
     """Drive it; what grew."""
     if not 1.0 <= _DURATION.value <= FULL_S:
         raise InputError(f"--duration: {_DURATION.value}: expected 1 to {FULL_S:g} s")
-    before, begin = resident_mb(), time.monotonic()
+    begin = time.monotonic()
     refs = refs_of(_CASES.value)
     cases = catalogue_set(refs, _DURATION.value)
-    named = resident_mb()
-    watched, config = Watched(), SuiteConfig(chunk=_CHUNK.value)
-    made = run_suite(rows_of(_ROWS.value), cases, config, watched)
-    driven = resident_mb()
+    watched, config, planner = Watched(), SuiteConfig(chunk=_CHUNK.value), RankConfig()
+    norm = untrained()[1]
+    rows = [baseline_row(name, "paper21", norm, planner) for name in _ROWS.value]
+    made = run_suite(rows, cases, config, watched)
     with tempfile.TemporaryDirectory(dir=_FOLDER.value) as folder:
         write_suite(made, Path(folder), provenance())
         files = {x.name: x.stat().st_size for x in Path(folder).iterdir()}
-    short = _DURATION.value < FULL_S
     result = {
         "cases": len(refs),
         "catalogue_seeds": 1 + refs[-1].seed,
         "duration_s": _DURATION.value,
-        "is": f"cases of {_DURATION.value:g} s instead of {FULL_S:g} s"
-        if short
-        else "cases of full length",
         "seconds": round(time.monotonic() - begin, 1),
-        "rss_mb": {
-            "before": round(before, 1),
-            "with_names_and_parameters": round(named, 1),
-            "driven": round(driven, 1),
-            "summarised_and_written": round(resident_mb(), 1),
-        },
         "peak_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10, 1),
         "rows": watched.rows,
         "result_sha256": made.facts["result_sha256"],
@@ -191,7 +165,7 @@ def suite() -> list[str]:
     first = next(iter(watched.rows.values()))["at_the_end"]
     return [
         *(f"suite: {name}: {outcome}" for name, outcome in odd.items()),
-        *(f"suite: {line}" for line in peak_problems(first, result["peak_mb"])),
+        *(f"suite: {x}" for x in too_much(result["peak_mb"], first + PEAK_MB)),
     ]
 
 
@@ -222,80 +196,6 @@ def write_log(path: Path, rows: int) -> int:
     return written
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Imported:
-    """One import by its command."""
-
-    rows: int
-    log_bytes: int
-    scenes: int
-    shards: int
-    dataset_bytes: int
-    seconds: float
-    scenes_per_s: float  # while shards are written, without start and checks
-    cutting: list[Sample]  # up to the last full shard
-    finishing: list[Sample]  # the rest, manifest, checks, oracle floor
-    quality: dict
-
-
-def import_rows(folder: Path, rows: int) -> Imported:
-    """Write a log and import it, watched.
-
-    Raises:
-      InputError: the import failed, or was too small to be watched.
-    """
-    log, toml, data = folder / "log.csv", folder / "log.toml", folder / "data"
-    toml.write_text(TOML)
-    written = write_log(log, rows)
-    words = [sys.executable, "-m", "experiments.import_logs", "--format=csv"]
-    words += [f"--input={log}", f"--source={toml}", f"--output={data}"]
-    words += [f"--workers={_WORKERS.value}"]
-    env = {**os.environ, "TMPDIR": str(folder), "JAX_PLATFORMS": "cpu"}
-    begin = time.monotonic()
-    process = subprocess.Popen(words, env=env)
-    written_scenes = Committed(data)
-    watch = Watch(process.pid, written_scenes, every_s=_every(rows))
-    watch.start()
-    status = process.wait()
-    seconds = time.monotonic() - begin
-    watch.stop()
-    if status != 0:
-        raise InputError(f"import: exit status {status}: expected a finished dataset")
-    quality = json.loads((data / "manifest.json").read_text())["quality"]
-    # a look at a process that has just ended
-    samples = [sample for sample in watch.samples if sample.mb]
-    shards = sorted({sample.done for sample in samples})
-    if len(shards) < LEAST_SHARDS:
-        raise InputError(
-            f"import: {quality['scenes']} scenes, {len(shards)} shards seen: expected "
-            f"{LEAST_SHARDS} at least: more scenes"
-        )
-    # the last shard is written when everything has been cut
-    last = next(x.seconds for x in samples if x.done >= shards[-2])
-    cutting = [x for x in samples if x.seconds <= last]
-    first = next(x for x in samples if x.done)
-    made = Imported(
-        rows=written,
-        log_bytes=log.stat().st_size,
-        scenes=quality["scenes"],
-        shards=len(written_scenes.counts),
-        dataset_bytes=sum(x.stat().st_size for x in data.rglob("*") if x.is_file()),
-        seconds=seconds,
-        scenes_per_s=(cutting[-1].done - first.done) / (last - first.seconds),
-        cutting=cutting,
-        finishing=samples[len(cutting) :],
-        quality=quality,
-    )
-    shutil.rmtree(data)
-    log.unlink()
-    return made
-
-
-def _every(rows: int) -> float:
-    """Seconds between two looks: often in a short import."""
-    return 0.1 if rows < 1_000_000 else 1.0
-
-
 class Committed:
     """How many scenes lie in shards that are whole; each is read once."""
 
@@ -312,78 +212,66 @@ class Committed:
         return self._data / shard_key(number) / MARK
 
 
-def _fits(folder: Path, scenes: float, probe: Imported) -> None:
-    """Refuse what the disk has no room for: the log twice, and the dataset."""
-    each = (2 * probe.log_bytes + probe.dataset_bytes) / probe.scenes
-    needed, free = scenes * each, shutil.disk_usage(folder).free
-    if needed > 0.9 * free:
-        raise InputError(
-            f"--scenes: {scenes:,.0f}: {needed / 2**30:.1f} GiB: expected 90 % of "
-            f"the {free / 2**30:.1f} GiB that are free at most; see --seconds"
-        )
-
-
 def imports() -> list[str]:
-    """A small one, then the slice or all of it; what grew."""
+    """Write a log and import it, watched; what grew.
+
+    Raises:
+      InputError: the import failed, or was too small to be watched.
+    """
     with tempfile.TemporaryDirectory(dir=_FOLDER.value) as place:
         folder = Path(place)
-        probe = import_rows(folder, _PROBE.value * CAR_ROWS // CAR_SCENES)
-        scenes = float(_SCENES.value)
-        if _SECONDS.value:
-            least = SLICE_SHARDS * probe.scenes / probe.shards
-            scenes = min(scenes, max(_SECONDS.value * probe.scenes_per_s, least))
-        print(f"{probe.scenes_per_s:,.0f} scenes/s: {scenes:,.0f} scenes", flush=True)
-        _fits(folder, scenes, probe)
-        made = import_rows(folder, int(1.01 * scenes * probe.rows / probe.scenes))
-    found = level(made.cutting, made.cutting[-1].done)
-    at_the_end = max((sample.all_mb for sample in made.finishing), default=0.0)
+        log, toml, data = folder / "log.csv", folder / "log.toml", folder / "data"
+        toml.write_text(TOML)
+        rows = write_log(log, int(1.02 * _SCENES.value * CAR_ROWS / CAR_SCENES))
+        words = [sys.executable, "-m", "experiments.import_logs", "--format=csv"]
+        words += [f"--input={log}", f"--source={toml}", f"--output={data}"]
+        words += [f"--workers={_WORKERS.value}"]
+        env = {**os.environ, "TMPDIR": place, "JAX_PLATFORMS": "cpu"}
+        begin, process = time.monotonic(), subprocess.Popen(words, env=env)
+        written = Committed(data)
+        watch = Watch(process.pid, written)
+        with watch.every(0.1 if rows < 1_000_000 else 1.0):
+            status = process.wait()
+        seconds = time.monotonic() - begin
+        if status != 0:
+            raise InputError(f"import: exit status {status}: expected a dataset")
+        quality = json.loads((data / "manifest.json").read_text())["quality"]
+        files = [x.stat().st_size for x in data.rglob("*") if x.is_file()]
+        log_bytes = log.stat().st_size
+    shards = sorted({sample.done for sample in watch.samples})
+    if len(shards) < LEAST_SHARDS:
+        raise InputError(
+            f"import: {quality['scenes']} scenes, {len(shards)} shards seen: expected "
+            f"{LEAST_SHARDS} at least: more scenes"
+        )
+    # the last shard is written when everything has been cut
+    last = next(x.seconds for x in watch.samples if x.done >= shards[-2])
+    cutting = [x for x in watch.samples if x.seconds <= last]
+    finishing = watch.samples[len(cutting) :]
+    found = level(cutting, cutting[-1].done)
+    at_the_end = max((sample.all_mb for sample in finishing), default=0.0)
     result = {
-        "is": f"a slice of {_SECONDS.value:g} s" if _SECONDS.value else "all of it",
-        "scenes": made.scenes,
-        "shards": made.shards,
-        "rows": made.rows,
-        "log_bytes": made.log_bytes,
-        "dataset_bytes": made.dataset_bytes,
-        "bytes_per_scene": round(made.dataset_bytes / made.scenes),
+        "scenes": quality["scenes"],
+        "shards": len(written.counts),
+        "rows": rows,
+        "log_bytes": log_bytes,
+        "dataset_bytes": sum(files),
+        "bytes_per_scene": round(sum(files) / quality["scenes"]),
         "workers": _WORKERS.value,
-        "seconds": round(made.seconds, 1),
-        "scenes_per_s": round(made.scenes / made.seconds, 1),
-        "scenes_per_s_while_cutting": round(made.scenes_per_s, 1),
+        "seconds": round(seconds, 1),
+        "scenes_per_s": round(quality["scenes"] / seconds, 1),
         "cutting": whole(found),
-        "main_process_mb_at_most": round(max(x.mb for x in made.cutting), 1),
+        "main_process_mb_at_most": round(max(x.mb for x in cutting), 1),
         "finishing_mb_at_most": round(at_the_end, 1),
-        "finishing_seconds": round(made.seconds - made.cutting[-1].seconds, 1),
-        **_extrapolated(made, found),
-        "dropped": made.quality["dropped"],
-        "first_import": {
-            "scenes": probe.scenes,
-            "seconds": round(probe.seconds, 1),
-            "scenes_per_s_while_cutting": round(probe.scenes_per_s, 1),
-        },
-        "series": thinned([*made.cutting, *made.finishing]),
+        "finishing_seconds": round(seconds - last, 1),
+        "dropped": quality["dropped"],
+        "series": thinned(watch.samples),
     }
     write("load_import", result, _OUTPUT.value)
     print({k: v for k, v in result.items() if k != "series"}, flush=True)
     grown = [] if found.outcome == BOUNDED else [found.outcome]
-    return [f"import: {x}" for x in (*grown, *finishing_problems(found, at_the_end))]
-
-
-def _extrapolated(made: Imported, found: Level) -> dict:
-    """What `--scenes` would take at this rate and slope, if this was a slice."""
-    if made.scenes >= _SCENES.value:
-        return {}
-    factor, more = _SCENES.value / made.scenes, _SCENES.value - made.scenes
-    mb = [round(found.at_the_end + more * slope) for slope in found.mb_per_unit]
-    return {
-        "extrapolated": {
-            "scenes": _SCENES.value,
-            "hours": round(factor * made.seconds / 3600.0, 2),
-            "dataset_gib": round(factor * made.dataset_bytes / 2**30, 1),
-            "log_gib": round(factor * made.log_bytes / 2**30, 2),
-            "mb_while_cutting": mb[0],
-            "mb_while_cutting_interval": mb[1:],
-        }
-    }
+    held = too_much(at_the_end, found.at_the_end + FINISHING_MB)
+    return [f"import: {x}" for x in (*grown, *held)]
 
 
 def main() -> None:

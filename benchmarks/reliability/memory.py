@@ -5,15 +5,15 @@ between all pairs of points: a spike, or noise around a level, does not move it.
 interval (Sen's) takes the points as independent; those of a process are not quite.
 """
 
+import contextlib
 import ctypes
 import dataclasses
-import os
 import threading
 import time
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
+import psutil
 from numpy.typing import ArrayLike
 from scipy import stats
 
@@ -27,6 +27,7 @@ PEAK_MB = 1_000.0  # that a moment may hold above the level
 # and to what ends an import: 160 to 420 were seen, the most of 10 million scenes, whose
 # index would take more in Python's objects
 FINISHING_MB = 600.0
+BOUNDED = "bounded"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -43,83 +44,6 @@ class Growth:
     allowed: float
     # by more than allowed, and shown to rise at all
     grows: bool
-
-
-class _Malloc(ctypes.Structure):
-    """glibc's mallinfo2 (2.33), bytes over all arenas."""
-
-    _fields_ = [
-        (name, ctypes.c_size_t)
-        for name in (
-            "arena", "ordblks", "smblks", "hblks", "hblkhd",
-            "usmblks", "fsmblks", "uordblks", "fordblks", "keepcost",
-        )
-    ]  # fmt: skip
-
-
-def in_use_mb() -> float:
-    """What malloc has given and not got back, MiB.
-
-    Resident memory has the room besides that it keeps or gives back as it likes, and
-    falls by hundreds of MiB at once.
-    """
-    ask = ctypes.CDLL(None).mallinfo2
-    ask.restype = _Malloc
-    found = ask()
-    return (found.uordblks + found.hblkhd) / 2**20
-
-
-def growth(values: ArrayLike, allowed: float) -> Growth:
-    """Whether a series of one value a round grows.
-
-    Args:
-      values: one a round, from the first on; the warm-up is dropped here.
-      allowed: rise over the watched rounds that does not count.
-
-    Raises:
-      ValueError: too few rounds to tell.
-    """
-    watched = _watched(values)
-    if watched.size < LEAST:
-        raise ValueError(f"{watched.size} rounds: expected {LEAST} after the warm-up")
-    slope, low, high = _slope(np.arange(watched.size), watched)
-    by = slope * (watched.size - 1)
-    return Growth(
-        per_round=slope,
-        low=low,
-        high=high,
-        rounds=watched.size,
-        by=by,
-        allowed=allowed,
-        grows=bool(by > allowed and low > 0.0),
-    )
-
-
-def memory_growth(values: ArrayLike) -> Growth:
-    """Of a series of MiB: more than `SHARE` of it and more than `MB` is growth."""
-    usual = float(np.median(_watched(values)))
-    return growth(values, max(SHARE * usual, MB))
-
-
-def count_growth(values: ArrayLike, allowed: int = 0) -> Growth:
-    """Of a series of numbers of things: more than `allowed` of them kept is growth.
-
-    That is, all of the last `LOOKS` rounds have so many more than any of the first that
-    are watched. One thing kept once does not move the slope, which is the median of
-    pairs; a number that now and then is one higher is no growth.
-    """
-    watched = _watched(values)
-    slope = growth(values, 0.5)
-    kept = float(watched[-LOOKS:].min() - watched[:LOOKS].max())
-    if kept <= allowed:
-        return slope
-    return dataclasses.replace(slope, by=max(slope.by, kept), grows=True)
-
-
-def _watched(values: ArrayLike) -> np.ndarray:
-    """Without the warm-up."""
-    every = np.asarray(values, np.float64)
-    return every[int(WARM_UP * every.size) :]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -146,6 +70,77 @@ class Level:
     outcome: str  # bounded, or what it is instead
 
 
+class _Malloc(ctypes.Structure):
+    """glibc's mallinfo2 (2.33), bytes over all arenas."""
+
+    _fields_ = [
+        (name, ctypes.c_size_t)
+        for name in (
+            "arena", "ordblks", "smblks", "hblks", "hblkhd",
+            "usmblks", "fsmblks", "uordblks", "fordblks", "keepcost",
+        )
+    ]  # fmt: skip
+
+
+def in_use_mb() -> float:
+    """What malloc has given and not got back, MiB.
+
+    Resident memory has the room besides that it keeps or gives back as it likes, and
+    falls by hundreds of MiB at once.
+    """
+    ask = ctypes.CDLL(None).mallinfo2
+    ask.restype = _Malloc
+    found = ask()
+    return (found.uordblks + found.hblkhd) / 2**20
+
+
+def growth(values: ArrayLike, allowed: float = 0.0, *, counted: bool = False) -> Growth:
+    """Whether a series of one value a round grows; the warm-up is dropped here.
+
+    Of counted things more than `allowed` kept is growth: all of the last `LOOKS`
+    rounds have so many more than any of the first that are watched. One thing kept
+    once does not move the slope, which is the median of pairs; a number that now and
+    then is one higher is no growth.
+
+    Args:
+      values: one a round, from the first on.
+      allowed: rise over the watched rounds that does not count.
+      counted: they are numbers of things.
+
+    Raises:
+      ValueError: too few rounds to tell.
+    """
+    watched = _watched(values)
+    if watched.size < LEAST:
+        raise ValueError(f"{watched.size} rounds: expected {LEAST} after the warm-up")
+    slope, low, high = _slope(np.arange(watched.size), watched)
+    by = slope * (watched.size - 1)
+    grows = bool(by > (0.5 if counted else allowed) and low > 0.0)
+    kept = float(watched[-LOOKS:].min() - watched[:LOOKS].max())
+    if counted and kept > allowed:
+        by, grows = max(by, kept), True
+    return Growth(
+        per_round=slope,
+        low=low,
+        high=high,
+        rounds=watched.size,
+        by=by,
+        allowed=allowed,
+        grows=grows,
+    )
+
+
+def memory_growth(values: ArrayLike) -> Growth:
+    """Of a series of MiB: more than `SHARE` of it and more than `MB` is growth."""
+    return growth(values, max(SHARE * float(np.median(_watched(values))), MB))
+
+
+def _watched(values: ArrayLike) -> np.ndarray:
+    """Without the warm-up."""
+    every = np.asarray(values, np.float64)
+    return every[int(WARM_UP * every.size) :]
+
+
 def level(samples: Sequence[Sample], total: float) -> Level:
     """What memory does in a phase of `total` units of work.
 
@@ -159,39 +154,25 @@ def level(samples: Sequence[Sample], total: float) -> Level:
     if not early.size or not late.size or half.sum() < LEAST:
         raise ValueError(f"{len(samples)} looks at memory: expected more in each tenth")
     before, after = float(np.median(early)), float(np.median(late))
-    allowed = max(PHASE_SHARE * before, PHASE_MB)
-    grown = after - before
-    at_most, limit = float(mb.max()), max(before, after) + PEAK_MB
-    outcome = "bounded"
-    if grown > allowed:
-        outcome = f"grew by {grown:.0f} MiB"
-    elif at_most > limit:
-        outcome = f"held {at_most:.0f} MiB, expected {limit:.0f} at most"
+    allowed, at_most = max(PHASE_SHARE * before, PHASE_MB), float(mb.max())
+    held = too_much(at_most, max(before, after) + PEAK_MB)
+    outcome = held[0] if held else BOUNDED
+    if after - before > allowed:
+        outcome = f"grew by {after - before:.0f} MiB"
     return Level(
         after_a_tenth=before,
         at_the_end=after,
         at_most=at_most,
-        grown=grown,
+        grown=after - before,
         allowed=allowed,
         mb_per_unit=_slope(done[half] * total, mb[half]),
         outcome=outcome,
     )
 
 
-def peak_problems(usual: float, at_most: float) -> list[str]:
-    """Phases of one process may hold `PEAK_MB` more than the first usually did."""
-    limit = usual + PEAK_MB
-    if at_most <= limit:
-        return []
-    return [f"held {at_most:.0f} MiB, expected {limit:.0f} at most"]
-
-
-def finishing_problems(cutting: Level, at_most: float) -> list[str]:
-    """What ends an import may hold `FINISHING_MB` more than the end of cutting did."""
-    limit = cutting.at_the_end + FINISHING_MB
-    if at_most <= limit:
-        return []
-    return [f"finishing held {at_most:.0f} MiB, expected {limit:.0f} at most"]
+def too_much(at_most: float, limit: float) -> list[str]:
+    """What is wrong with having held so much [MiB]; nothing up to the limit."""
+    return [f"held {at_most:.0f} MiB, expected {limit:.0f} at most"][: at_most > limit]
 
 
 def _slope(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
@@ -204,66 +185,49 @@ def _slope(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
     return slope, low, high
 
 
-class Watch(threading.Thread):
-    """Looks at a process and all below it until told to stop or it is gone."""
+class Watch:
+    """Looks at a process and all below it, now or again and again."""
 
-    def __init__(
-        self, pid: int, done: Callable[[], float], every_s: float = 1.0
-    ) -> None:
-        """Ready to `start`.
-
-        Args:
-          pid: of the process.
-          done: how much of the work is done.
-          every_s: between two looks.
-        """
-        super().__init__(daemon=True)
+    def __init__(self, pid: int, done: Callable[[], float]) -> None:
+        """Of the process `pid`; `done` says how much of the work is done."""
         self.samples: list[Sample] = []
-        self._pid, self._done, self._every_s = pid, done, every_s
-        self._begin, self._stop_now = time.monotonic(), threading.Event()
+        self._process, self._done = psutil.Process(pid), done
+        self._begin = time.monotonic()
 
     def look(self) -> None:
-        """Look once, now."""
-        own = resident_of(self._pid)
-        below = sum(map(resident_of, below_of(self._pid)))
-        seconds = time.monotonic() - self._begin
-        self.samples.append(
-            Sample(seconds=seconds, mb=own, all_mb=own + below, done=self._done())
-        )
+        """Look once, now; a process that has ended is not seen."""
+        with contextlib.suppress(psutil.NoSuchProcess):
+            own, below = self._process.memory_info().rss, 0
+            for child in self._process.children(recursive=True):
+                with contextlib.suppress(psutil.NoSuchProcess):
+                    below += child.memory_info().rss
+            sample = Sample(
+                seconds=time.monotonic() - self._begin,
+                mb=own / 2**20,
+                all_mb=(own + below) / 2**20,
+                done=self._done(),
+            )
+            self.samples += [sample] if own else []
 
-    def run(self) -> None:
-        """Look again and again; a process that has ended has no memory."""
-        while not self._stop_now.wait(self._every_s) and resident_of(self._pid):
-            self.look()
+    @contextlib.contextmanager
+    def every(self, seconds: float) -> Iterator[None]:
+        """Look so often inside the `with` block."""
+        over = threading.Event()
 
-    def stop(self) -> None:
-        """No look after this."""
-        self._stop_now.set()
-        self.join()
+        def looks() -> None:
+            while not over.wait(seconds):
+                self.look()
+
+        thread = threading.Thread(target=looks, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            thread.join()
 
 
 def thinned(samples: Sequence[Sample], most: int = 200) -> list[Sample]:
     """At most so many, evenly over time, for a file."""
     at = np.unique(np.linspace(0, len(samples) - 1, most).astype(int))
     return [samples[place] for place in at] if samples else []
-
-
-def resident_of(pid: int) -> float:
-    """Resident memory of a process, MiB; 0 if there is none."""
-    try:
-        pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-    except (OSError, IndexError):
-        return 0.0
-    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
-
-
-def below_of(pid: int) -> list[int]:
-    """Its children, and theirs."""
-    found = []
-    for task in Path(f"/proc/{pid}/task").glob("*/children"):
-        try:
-            direct = [int(word) for word in task.read_text().split()]
-        except OSError:
-            continue
-        found += direct + [inner for child in direct for inner in below_of(child)]
-    return found

@@ -11,7 +11,7 @@ programs compiled, seconds. The first quarter of the rounds is warm-up; after it
 may not rise by more than 5 % or 50 MiB, whichever is more (`memory.growth`), what is in
 use by `IN_USE_MB` a round, blocks by `BLOCKS` a round; of the system's threads no more
 than `THREADS` may be kept, and nothing else may rise at all, not by one
-(`memory.count_growth`; gc's objects, which are some of the blocks, and seconds are
+(`memory.growth`; gc's objects, which are some of the blocks, and seconds are
 noted only), and every round's outputs have to be the first round's to the bit. Ends
 with 1 otherwise.
 
@@ -22,7 +22,6 @@ Writes soak.json after every tenth round and at the end.
 import contextlib
 import dataclasses
 import gc
-import json
 import os
 import sys
 import tempfile
@@ -32,6 +31,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import jax
+import psutil
 from absl import flags
 
 from benchmarks.common import resident_mb, write
@@ -39,7 +39,6 @@ from benchmarks.reliability.jobs import Facts, jobs, write_logs
 from benchmarks.reliability.memory import (
     WARM_UP,
     Growth,
-    count_growth,
     growth,
     in_use_mb,
     memory_growth,
@@ -57,12 +56,11 @@ from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.evaluation.gate.types import GateConfig
 from rcirl_jax.report.data.page import choose_rows, write_data_page
 from rcirl_jax.runtime.executors import Here
-from rcirl_jax.runtime.pipeline import digest, file_sha256
+from rcirl_jax.runtime.pipeline import file_sha256
 from rcirl_jax.train.running import Running
 from rcirl_jax.train.state import TrainConfig
 
 _SECONDS = flags.DEFINE_float("seconds", 1200.0, "of the whole soak")
-_ROUNDS = flags.DEFINE_integer("rounds", 0, "most rounds; 0: as many as there is time")
 _LEAK = flags.DEFINE_float("leak", 0.0, "MiB kept of every round, to be found")
 _OUTPUT = flags.DEFINE_string("output", "benchmarks/results", "folder of the JSON")
 
@@ -70,7 +68,6 @@ STRIDE_S = 2.0  # s between planning frames
 BATCH, CHECKPOINT_EVERY, STOP_AT = 8, 3, 5  # the resume repeats two steps
 CASES, DURATION_S = 2, 2.0  # of every family, and s of each; the gate wants 30
 DRAWN = 1  # scenes of the page of the data
-NIGHT_S = 8 * 3600.0
 COMPILED = "/jax/core/compile/backend_compile_duration"
 # a round; most of 1,490 that are kept are tensorstore's JSON that orbax asks for
 BLOCKS = 3_000
@@ -86,34 +83,19 @@ class _Stopped(Exception):
     """The training was told to stop here."""
 
 
-@dataclasses.dataclass(kw_only=True)
-class Series:
-    """One value a round."""
-
-    rss_mb: list[float] = dataclasses.field(default_factory=list)
-    in_use_mb: list[float] = dataclasses.field(default_factory=list)  # of malloc
-    open_files: list[int] = dataclasses.field(default_factory=list)
-    threads: list[int] = dataclasses.field(default_factory=list)  # of the system
-    python_threads: list[int] = dataclasses.field(default_factory=list)
-    live_arrays: list[int] = dataclasses.field(default_factory=list)
-    objects: list[int] = dataclasses.field(default_factory=list)  # that gc lists
-    blocks: list[int] = dataclasses.field(default_factory=list)  # also of all others
-    compiled: list[int] = dataclasses.field(default_factory=list)  # in the round
-    seconds: list[float] = dataclasses.field(default_factory=list)
-
-    def add(self, compiled: int, seconds: float) -> None:
-        """Look at this process at the end of a round."""
-        gc.collect()
-        self.rss_mb.append(round(resident_mb(), 1))
-        self.in_use_mb.append(round(in_use_mb(), 2))
-        self.open_files.append(len(os.listdir("/proc/self/fd")))
-        self.threads.append(len(os.listdir("/proc/self/task")))
-        self.python_threads.append(threading.active_count())
-        self.live_arrays.append(len(jax.live_arrays()))
-        self.objects.append(len(gc.get_objects()))
-        self.blocks.append(sys.getallocatedblocks())
-        self.compiled.append(compiled)
-        self.seconds.append(round(seconds, 2))
+def look() -> dict[str, float]:
+    """At this process, at the end of a round."""
+    gc.collect()
+    return {
+        "rss_mb": round(resident_mb(), 1),
+        "in_use_mb": round(in_use_mb(), 2),  # of malloc
+        "open_files": psutil.Process().num_fds(),
+        "threads": psutil.Process().num_threads(),  # of the system
+        "python_threads": threading.active_count(),
+        "live_arrays": len(jax.live_arrays()),
+        "objects": len(gc.get_objects()),  # that gc lists
+        "blocks": sys.getallocatedblocks(),  # also of all others
+    }
 
 
 @contextlib.contextmanager
@@ -163,30 +145,6 @@ def _logs() -> Logs:
     return Logs(format="csv", input=Path("logs"), source=None, config=config)
 
 
-def _page() -> None:
-    """The page of the data, beside that of the run."""
-    (data,) = Path("run").glob("dataset-*")
-    dataset = open_dataset(data)
-    rows = choose_rows(dataset.column("scene.tags"), DRAWN)
-    write_data_page(Path("data/index.html"), dataset, rows, "a night's data", {})
-
-
-def _plain(name: str) -> dict:
-    """A JSON of the run without what made it: names of files that hold times."""
-    body = json.loads((Path("run") / name).read_text())
-    del body["made_by"]
-    return body
-
-
-def _outputs() -> Facts:
-    """Digests of what has to be the same in every round."""
-    return {
-        **jobs(Path())["autotune"].outcome(Path()),
-        **{name: digest(_plain(name)) for name in ("ranking.json", "verdict.json")},
-        "data/index.html": file_sha256(Path("data/index.html")),
-    }
-
-
 def _work(facts: Mapping[str, object]) -> Facts:
     """One round in the present folder: the digests of what came out."""
     write_logs(Path("logs"))
@@ -197,22 +155,19 @@ def _work(facts: Mapping[str, object]) -> Facts:
     if not list(Path("run").glob("train-*/seed-0/checkpoints/*/sha256.json")):
         raise ValueError("the training was to stop after a checkpoint")
     tune(_run(facts, Running()), [_logs()])
-    _page()
-    return _outputs()
-
-
-def one_round(facts: Mapping[str, object]) -> Facts:
-    """One round in a new folder, which is removed."""
-    new = tempfile.TemporaryDirectory(prefix="rcirl-soak-")
-    with new as folder, contextlib.chdir(folder):
-        return _work(facts)
+    (data,) = Path("run").glob("dataset-*")
+    dataset, page = open_dataset(data), Path("data/index.html")
+    rows = choose_rows(dataset.column("scene.tags"), DRAWN)
+    write_data_page(page, dataset, rows, "a night's data", {})
+    outcome = jobs(Path())["autotune"].outcome(Path())
+    return {**outcome, str(page): file_sha256(page)}
 
 
 @dataclasses.dataclass(kw_only=True)
 class Soak:
     """What came of it so far."""
 
-    series: Series = dataclasses.field(default_factory=Series)
+    series: dict[str, list[float]] = dataclasses.field(default_factory=dict)
     first: Facts = dataclasses.field(default_factory=dict)
     # round -> outputs that were not the first round's
     different: dict[int, list[str]] = dataclasses.field(default_factory=dict)
@@ -222,13 +177,13 @@ class Soak:
     @property
     def rounds(self) -> int:
         """That are finished."""
-        return len(self.series.seconds)
+        return len(self.series.get("seconds", []))
 
     def round(self, facts: Mapping[str, object]) -> None:
-        """One more."""
-        begin = time.monotonic()
-        with compiles() as programs:
-            made = one_round(facts)
+        """One more, in a new folder, which is removed."""
+        begin, new = time.monotonic(), tempfile.TemporaryDirectory(prefix="rcirl-soak-")
+        with compiles() as programs, new as folder, contextlib.chdir(folder):
+            made = _work(facts)
         if _LEAK.value:
             self.kept.append(bytearray(os.urandom(int(_LEAK.value * 2**20))))
         self.first = self.first or made
@@ -237,8 +192,11 @@ class Soak:
         if odd:
             self.different[self.rounds + 1] = odd
             print(f"different from the first round: {', '.join(odd)}", flush=True)
-        self.late_programs = programs
-        self.series.add(len(programs), time.monotonic() - begin)
+        self.late_programs, seen = programs, look()
+        seen |= {"compiled": len(programs), "seconds": time.monotonic() - begin}
+        for name, value in seen.items():
+            self.series.setdefault(name, []).append(round(value, 2))
+        print(f"round {self.rounds}: {seen}", flush=True)
 
     def growths(self) -> dict[str, Growth]:
         """Of every series that may not grow."""
@@ -246,11 +204,11 @@ class Soak:
         rises = self.rounds - int(WARM_UP * self.rounds) - 1  # from round to round
         counted = ("open_files", "python_threads", "live_arrays", "compiled")
         return {
-            "rss_mb": memory_growth(series.rss_mb),
-            "in_use_mb": growth(series.in_use_mb, IN_USE_MB * rises),
-            "blocks": growth(series.blocks, BLOCKS * rises),
-            "threads": count_growth(series.threads, THREADS),
-            **{name: count_growth(getattr(series, name)) for name in counted},
+            "rss_mb": memory_growth(series["rss_mb"]),
+            "in_use_mb": growth(series["in_use_mb"], IN_USE_MB * rises),
+            "blocks": growth(series["blocks"], BLOCKS * rises),
+            "threads": growth(series["threads"], THREADS, counted=True),
+            **{n: growth(series[n], counted=True) for n in counted},
         }
 
     def problems(self) -> list[str]:
@@ -268,22 +226,18 @@ class Soak:
 
 def within(growths: Mapping[str, Growth]) -> str:
     """What a run without problems has shown: slopes within limits, not none."""
-    rss, used, blocks = (growths[x] for x in ("rss_mb", "in_use_mb", "blocks"))
-    return (
-        f"within the limit: {rss.per_round:.2f} MB a round [{rss.low:.2f}, "
-        f"{rss.high:.2f}], {rss.by:.0f} in all (limit {rss.allowed:.0f}), in use "
-        f"{used.per_round:.2f} [{used.low:.2f}, {used.high:.2f}], {used.by:.1f} in all "
-        f"(limit {used.allowed:.1f}), {blocks.per_round:,.0f} blocks a round, "
-        f"{blocks.by:,.0f} in all (limit {blocks.allowed:,.0f})"
+    watched = {name: growths[name] for name in ("rss_mb", "in_use_mb", "blocks")}
+    return "within the limit: " + ", ".join(
+        f"{name} {x.per_round:,.2f} a round [{x.low:,.2f}, {x.high:,.2f}], {x.by:,.1f} "
+        f"in all (limit {x.allowed:,.1f})"
+        for name, x in watched.items()
     )
 
 
 def save(soak: Soak) -> list[str]:
     """Write soak.json; the problems."""
     growths, problems = soak.growths(), soak.problems()
-    seconds = soak.series.seconds
-    usual = sum(seconds[1:]) / max(len(seconds) - 1, 1)
-    rss, night = growths["rss_mb"], NIGHT_S / usual
+    seconds = soak.series["seconds"]
     result = {
         "rounds": soak.rounds,
         "seconds": round(sum(seconds), 1),
@@ -292,10 +246,6 @@ def save(soak: Soak) -> list[str]:
         "outcome": problems[0] if problems else within(growths),
         "problems": problems,
         "growth": growths,
-        # the slope carried on; not measured
-        "extrapolated_mb_in_8_hours": [
-            round(x * night, 1) for x in (rss.per_round, rss.low, rss.high)
-        ],
         "programs_of_the_last_round": soak.late_programs,
         "series": soak.series,
     }
@@ -307,19 +257,9 @@ def main() -> None:
     """Rounds until the time is over."""
     importing.SHARD_SCENES = SHARD_SCENES  # several shards a dataset
     facts, soak = provenance(), Soak()
-    end, most = time.monotonic() + _SECONDS.value, _ROUNDS.value or 10**9
+    end = time.monotonic() + _SECONDS.value
     while soak.rounds < LEAST_ROUNDS or time.monotonic() < end:
-        if soak.rounds >= most:
-            break
         soak.round(facts)
-        s = soak.series
-        print(
-            f"round {soak.rounds}: {s.seconds[-1]} s, {s.rss_mb[-1]} MiB, "
-            f"{s.in_use_mb[-1]} in use, "
-            f"{s.open_files[-1]} files, {s.threads[-1]} threads, "
-            f"{s.live_arrays[-1]} arrays, {s.compiled[-1]} programs",
-            flush=True,
-        )
         if soak.rounds % 10 == 0:
             save(soak)
     problems = save(soak)

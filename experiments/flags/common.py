@@ -1,21 +1,21 @@
 """What the experiment files share: running, reading flags, provenance."""
 
-import dataclasses
 import os
 import platform
 import shutil
 import subprocess
 import sys
+import tempfile
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
+from typing import NoReturn
 
 import jax
 from absl import app, flags, logging
 
 from rcirl_jax import __version__
-from rcirl_jax.data.parts import Part, logs_sha256
-from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.reader import load_weights
@@ -24,6 +24,7 @@ from rcirl_jax.runtime.atomic_files import is_text
 from rcirl_jax.runtime.pipeline import code_sha256
 
 EXIT_BAD_INPUT = 2
+EXIT_FAULT = 70  # of this program, as sysexits.h has it
 # variables that decide how numbers are rounded
 COMPILER = (
     *("XLA_FLAGS", "JAX_ENABLE_X64", "JAX_DISABLE_JIT"),
@@ -38,8 +39,9 @@ NO_MEMORY = "RESOURCE_EXHAUSTED"  # how JAX's errors begin that come of its want
 def run(main: Callable[[], None]) -> None:
     """Run a main; bad input becomes one line on stderr and exit status 2.
 
-    So do a place that cannot be written and memory that is not given. SIGTERM ends
-    with 143, SIGINT with 130, within ten seconds (`rcirl_jax.runtime.signals`).
+    So do a place that cannot be written and memory that is not given. A fault of the
+    program is one line too, with status 70, and its traceback a file to report. SIGTERM
+    ends with 143, SIGINT with 130, within ten seconds (`rcirl_jax.runtime.signals`).
     """
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
@@ -52,25 +54,27 @@ def run(main: Callable[[], None]) -> None:
                 raise InputError(f"{argv[1]}: unexpected argument: expected --flags")
             main()
         except InputError as error:
-            print(f"error: {error}", file=sys.stderr)
-            sys.exit(EXIT_BAD_INPUT)
+            _refuse(error)
         except OSError as error:
-            print(f"error: {_about(error)}", file=sys.stderr)
-            sys.exit(EXIT_BAD_INPUT)
+            _refuse(_about(error))
         except (MemoryError, jax.errors.JaxRuntimeError) as error:
             why = " ".join(str(error).split())[:200]
             if not isinstance(error, MemoryError) and not why.startswith(NO_MEMORY):
-                raise
-            print(
-                f"error: memory: {why or 'refused'}: expected more for this work",
-                file=sys.stderr,
-            )
-            sys.exit(EXIT_BAD_INPUT)
+                _refuse(_fault(error), EXIT_FAULT)
+            _refuse(f"memory: {why or 'refused'}: expected more for this work")
         except interrupts.Interrupted as stop:
             _leave(stop.number)
+        except Exception as error:
+            _refuse(_fault(error), EXIT_FAULT)
 
     interrupts.install()
     app.run(guarded, flags_parser=_parse)
+
+
+def _refuse(what: object, status: int = EXIT_BAD_INPUT) -> NoReturn:
+    """One line on stderr, and the exit status."""
+    print(f"error: {what}", file=sys.stderr)
+    sys.exit(status)
 
 
 def _about(error: OSError) -> str:
@@ -78,6 +82,22 @@ def _about(error: OSError) -> str:
     known = error.filename is not None and error.strerror is not None
     text = f"{error.filename}: {error.strerror}" if known else str(error)
     return " ".join(text.split())
+
+
+def _fault(error: Exception) -> str:
+    """One line on an error that nothing foresaw; its traceback goes to a file."""
+    lines = traceback.format_exception(error)
+    with tempfile.NamedTemporaryFile(
+        "w", prefix="rcirl-jax-fault-", suffix=".txt", delete=False
+    ) as file:
+        file.write(" ".join(sys.argv) + "\n" + "".join(lines))
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    why = " ".join(str(error).split())[:200]
+    return (
+        f"{type(error).__name__}: {why} ({Path(place.filename).name}:{place.lineno}): "
+        "a fault of rcirl-jax, not of your input; please report it as CONTRIBUTING.md "
+        f"says, with the file {file.name}"
+    )
 
 
 def _leave(number: int) -> None:
@@ -105,13 +125,11 @@ def _parse(argv: list[str]) -> list[str]:
     """
     odd = [text for text in argv if not is_text(text)]
     if odd:
-        print(f"error: {odd[0]!a}: expected UTF-8", file=sys.stderr)
-        sys.exit(EXIT_BAD_INPUT)
+        _refuse(f"{odd[0]!a}: expected UTF-8")
     try:
         return flags.FLAGS(argv)
     except flags.Error as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(EXIT_BAD_INPUT)
+        _refuse(" ".join(str(error).split()))
 
 
 def alone(flag: str, *others: str) -> None:
@@ -126,42 +144,6 @@ def unread(*names: str) -> None:
     """Flags of other files that a command does not read: unknown to it, unrecorded."""
     for name in names:
         delattr(flags.FLAGS, name)
-
-
-def cutting(
-    defaults: CollectConfig | None = None, said: str = ""
-) -> Callable[[CollectConfig], CollectConfig]:
-    """Define --stride, --keep_steady, --keep_free_road; returns what applies them.
-
-    Args:
-      defaults: the flags' defaults. None: they have none, and one that is not given
-        leaves a config as it is.
-      said: the end of their help.
-    """
-    stride = flags.DEFINE_float(
-        "stride",
-        None if defaults is None else defaults.stride_s,
-        "s between planning frames of a driver" + said,
-    )
-    keep = {
-        field: flags.DEFINE_bool(
-            name,
-            None if defaults is None else not getattr(defaults, field),
-            f"keep scenes without {what} (the paper drops them)" + said,
-        )
-        for field, name, what in (
-            ("require_speed_change", "keep_steady", "speed change"),
-            ("require_obstacles", "keep_free_road", "obstacles"),
-        )
-    }
-
-    def applied(config: CollectConfig) -> CollectConfig:
-        given = {name: not x.value for name, x in keep.items() if x.value is not None}
-        if stride.value is not None:
-            config = dataclasses.replace(config, stride_s=stride.value)
-        return dataclasses.replace(config, **given)
-
-    return applied
 
 
 def floats(values: list[str], flag: str) -> tuple[float, ...]:
@@ -185,25 +167,20 @@ def hidden_sizes(values: list[str], flag: str = "hidden_size") -> tuple[int, ...
     return sizes
 
 
-def provenance(weights: Sequence[str] = (), *, logs: Sequence[Part] = ()) -> dict:
+def provenance(weights: Sequence[str] = ()) -> dict:
     """Flags of one experiment file, git commit, versions and machine.
 
     Starts JAX's devices: after `join_processes` where there are several processes.
 
     Args:
       weights: weights files that were read; their hashes name them.
-      logs: recordings that were read without an import, likewise.
 
     Raises:
       InputError: a weights file is missing or damaged.
-      OSError: a recording cannot be read.
     """
     own = flags.FLAGS.get_key_flags_for_module(sys.argv[0])
     packages = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
-    read = {
-        "weights_sha256": {str(path): load_weights(path).sha256 for path in weights},
-        "logs_sha256": logs_sha256(logs),
-    }
+    read = {str(path): load_weights(path).sha256 for path in weights}
     return {
         "flags": {flag.name: flag.value for flag in own},
         "git_commit": git_commit(),
@@ -218,7 +195,7 @@ def provenance(weights: Sequence[str] = (), *, logs: Sequence[Part] = ()) -> dic
         **processor(),
         "device": jax.devices()[0].device_kind,
         "devices": jax.device_count(),
-        **{name: hashes for name, hashes in read.items() if hashes},
+        **({"weights_sha256": read} if read else {}),
     }
 
 

@@ -67,7 +67,7 @@ from rcirl_jax.evaluation.ranking.learners import (
     FrozenSets,
     Learned,
     fitting_rows,
-    train_grid,
+    train_together,
 )
 from rcirl_jax.evaluation.ranking.score import candidates_key
 from rcirl_jax.evaluation.statistics import (
@@ -150,8 +150,7 @@ def trained(
     numbers = seeds(least=2)
     frozen, found = FrozenSets(data).of(shared), []
     for loss, config in learners.items():
-        grid = train_grid(frozen, config, [config.leaky_rate], numbers)
-        runs = grid[config.leaky_rate]
+        runs = train_together(frozen, config, numbers)
         wins = np.mean([one.wins[-1] for one in runs])
         print(f"{loss}: {100.0 * wins:.1f} % of training pairs won", flush=True)
         found += runs

@@ -109,7 +109,6 @@ def suite_job(run: Run, *, tuned: bool = True) -> tuple[SuiteJob, str]:
     Without the tuned IDM (`tuned` false) before there is one.
     """
     config = run.config
-    idm = dataclasses.asdict(read_tuned_idm(run.tuned_idm)) if tuned else {}
     return gate_job(
         str(run.weights),
         config.incumbent,
@@ -119,7 +118,7 @@ def suite_job(run: Run, *, tuned: bool = True) -> tuple[SuiteJob, str]:
         catalogue_seed=config.catalogue_seed,
         plan_every=config.plan_every,
         rivals=RIVALS,
-        tuned_idm=tuple(idm.items()),
+        tuned_idm=read_tuned_idm(run.tuned_idm) if tuned else None,
     )
 
 

@@ -53,7 +53,7 @@ def tune(run: Run, given: Sequence[str | Logs], last: str = STAGES[-1]) -> None:
         "rank": lambda: rank(run, dataset),
         "simulate": lambda: (simulate(run), likeness(run, sources)),
         "gate": lambda: gate(run, verdict),
-        "report": lambda: report(run, verdict, dataset, given),
+        "report": lambda: report(run, verdict, dataset, sources),
     }
     for name in STAGES[: STAGES.index(last) + 1]:
         steps[name]()
@@ -77,7 +77,7 @@ def draw_again(run: Run, given: Sequence[str | Logs]) -> None:
     shares = shares_of(run.config.data_weights, len(given))
     sources = [kept_source(run, one, number) for number, one in enumerate(given)]
     dataset = sources[0] if len(sources) == 1 else JoinedDatasets(sources, shares)
-    report(run, functools.cache(lambda: verdict_of(run)), dataset, given)
+    report(run, functools.cache(lambda: verdict_of(run)), dataset, sources)
     run.say(f"report to open: {run.page}")
 
 

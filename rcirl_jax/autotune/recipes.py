@@ -13,7 +13,7 @@ given beside it win.
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -71,36 +71,32 @@ def load_recipe(name: str) -> Recipe:
         )
     body = load_toml(path)
     check_names(f"{path}: ", body, TABLES)
-    train = _table(path, "train", body.get("train", {}))
-    reward = _table(path, "train.reward", train.pop("reward", {}))
-    sampler = _table(path, "train.sampler", train.pop("sampler", {}))
-    tuning = _table(path, "autotune", body.get("autotune", {}))
+    train = _table(path, "train", body)
+    reward = _table(path, "train.reward", train)
+    sampler = _table(path, "train.sampler", train)
+    tuning = _table(path, "autotune", body)
     check_names(f"{path}: [autotune] ", tuning, ("seeds",))
     seeds = tuning.get("seeds", 1)
     if type(seeds) is not int or seeds < 1:
         raise InputError(f"{path}: [autotune] seeds: {seeds}: expected at least 1")
-    settings = _typed(path, "train", TrainConfig, train, NOT_OF_A_RECIPE)
-    made = {
-        "reward": _reward(path, reward, settings.get("features", "paper21")),
-        "sampler": _made(path, "train.sampler", SamplerConfig, sampler),
-    }
-    collect = _table(path, "collect", body.get("collect", {}))
-    rehearsal = _table(path, "rehearsal", body.get("rehearsal", {}))
-    rehearsed = _made(path, "rehearsal", Rehearsal, rehearsal)
-    anchor = _table(path, "anchor", body.get("anchor", {}))
-    anchored = _made(path, "anchor", Anchoring, anchor)
-    if anchored.wanted and not rehearsed.datasets:
+    settings = typed_fields(TrainConfig, train, f"{path}: [train] ", NOT_OF_A_RECIPE)
+    settings["reward"] = _reward(path, reward, settings.get("features", "paper21"))
+    settings["sampler"] = _made(path, "train.sampler", SamplerConfig, sampler)
+    rehearsal = _made(path, "rehearsal", Rehearsal, _table(path, "rehearsal", body))
+    anchor = _made(path, "anchor", Anchoring, _table(path, "anchor", body))
+    if anchor.wanted and not rehearsal.datasets:
         raise InputError(
             f"{path}: [rehearsal] teacher: none: expected one with an [anchor]: its "
             "drives show what was not recorded"
         )
+    collect, none = _table(path, "collect", body), ("signal_checks",)
     return Recipe(
         name=path.stem if name in known else name,
         about=str(body.get("about", "")),
-        train=_built(path, "train", TrainConfig, {**settings, **made}),
-        collect=_made(path, "collect", CollectConfig, collect, ("signal_checks",)),
-        rehearsal=rehearsed,
-        anchor=anchored,
+        train=_built(path, "train", TrainConfig, settings),
+        collect=_made(path, "collect", CollectConfig, collect, none),
+        rehearsal=rehearsal,
+        anchor=anchor,
         seeds=seeds,
     )
 
@@ -125,34 +121,29 @@ def _reward(path: Path, found: dict, features: str) -> RewardConfig:
         raise InputError(
             f"{path}: [{where}] by_context: {by_context}: expected true or false"
         )
-    typed = _typed(path, where, RewardConfig, found, ("context", "signs"))
-    try:
-        return reward_config(features, typed, by_context)
-    except (InputError, ValueError) as error:
-        raise InputError(f"{path}: [{where}] {error}") from error
+    known = f"{path}: [{where}] "
+    typed = typed_fields(RewardConfig, found, known, ("context", "signs"))
+    made = lambda **settings: reward_config(features, settings, by_context)  # noqa: E731
+    return _built(path, where, made, typed)
 
 
 def _made(
     path: Path, where: str, kind: type, found: dict, without: tuple[str, ...] = ()
 ) -> Any:  # noqa: ANN401
-    return _built(path, where, kind, _typed(path, where, kind, found, without))
+    typed = typed_fields(kind, found, f"{path}: [{where}] ", without)
+    return _built(path, where, kind, typed)
 
 
-def _built(path: Path, where: str, kind: type, values: dict) -> Any:  # noqa: ANN401
+def _built(path: Path, where: str, kind: Callable, values: dict) -> Any:  # noqa: ANN401
     try:
         return kind(**values)
     except (InputError, ValueError) as error:
         raise InputError(f"{path}: [{where}] {error}") from error
 
 
-def _table(path: Path, where: str, found: object) -> dict:
+def _table(path: Path, where: str, body: dict) -> dict:
+    """The table [where], taken out of the one that holds it; empty without one."""
+    found = body.pop(where.rpartition(".")[2], {})
     if not isinstance(found, dict):
         raise InputError(f"{path}: {where}: {found}: expected a table [{where}]")
     return dict(found)
-
-
-def _typed(
-    path: Path, where: str, kind: type, found: dict, without: tuple[str, ...]
-) -> dict[str, Any]:
-    """The values of a table [where] of the recipe, of the types of their fields."""
-    return typed_fields(kind, found, f"{path}: [{where}] ", without)

@@ -56,13 +56,11 @@ class Rehearsal:
                 f"rehearsal: teacher: {self.teacher}: expected one of "
                 f"{', '.join(TEACHERS)}"
             )
-        for name in ("cases", "takeover_cases"):
-            if getattr(self, name) < 1:
+        for name, low in (("cases", 1), ("takeover_cases", 1), ("rounds", 0)):
+            if getattr(self, name) < low:
                 raise InputError(
-                    f"rehearsal: {name}: {getattr(self, name)}: expected at least 1"
+                    f"rehearsal: {name}: {getattr(self, name)}: expected at least {low}"
                 )
-        if self.rounds < 0:
-            raise InputError(f"rehearsal: rounds: {self.rounds}: expected at least 0")
         if self.catalogue_seed <= SUITE_SEED:
             raise InputError(
                 f"rehearsal: catalogue_seed: {self.catalogue_seed}: expected above "

@@ -6,8 +6,7 @@ from collections.abc import Callable, Sequence
 from rcirl_jax.autotune.evidence import suite_job, suite_runs
 from rcirl_jax.autotune.rewards import kept_workdir
 from rcirl_jax.autotune.run import Run
-from rcirl_jax.data.logs import Logs
-from rcirl_jax.data.parts import parts_of
+from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.evaluation.gate.runs import CANDIDATE, INCUMBENT
 from rcirl_jax.evaluation.gate.types import Verdict
@@ -15,21 +14,23 @@ from rcirl_jax.evaluation.ranking.table import from_json
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.sweep.folder import SWEEP
 from rcirl_jax.export.sweep.result import read_sweep
-from rcirl_jax.report.player.recorded_replays import recorded_replays
 from rcirl_jax.report.player.replays import Replay, make_replays
 from rcirl_jax.report.tuning.page import TuningReport, write_tuning_page
 from rcirl_jax.runtime.atomic_files import read_json
 from rcirl_jax.runtime.pipeline import file_sha256
+from rcirl_jax.simulation.recorded.scenes import held_out
+from rcirl_jax.simulation.suite import recorded_set
 from rcirl_jax.train.state import FUTURES
 
 REPLAYS = 6  # cases to play in the report
+RECORDED = 2  # held-out drives, of all sources
 
 
 def report(
     run: Run,
     verdict: Callable[[], Verdict],
     dataset: Demonstrations,
-    given: Sequence[str | Logs],
+    sources: Sequence[Dataset],
 ) -> None:
     """report.html from everything before it."""
     made_from = ("ranking.json", "suite/metrics.npz", "verdict.json")
@@ -38,12 +39,11 @@ def report(
         "weights": file_sha256(run.weights),
         "incumbent": run.incumbent_hash(),
         "dataset": dataset.hash,
-        "recorded": [not isinstance(one, str) for one in given],
         "recipe": run.config.recipe,
     }
     if run.config.sweep:
         inputs["sweep"] = file_sha256(run.config.sweep / SWEEP)
-    draw = functools.partial(_draw, run, verdict, dataset, given)
+    draw = functools.partial(_draw, run, verdict, dataset, sources)
     run.stage("report", inputs, [run.page], draw)
 
 
@@ -51,7 +51,7 @@ def _draw(
     run: Run,
     verdict: Callable[[], Verdict],
     dataset: Demonstrations,
-    given: Sequence[str | Logs],
+    sources: Sequence[Dataset],
 ) -> None:
     _, incumbent = suite_job(run)
     judged = verdict()
@@ -66,17 +66,17 @@ def _draw(
         TuningReport(
             verdict=judged,
             gate=run.config.gate,
-            suite=suite_runs(run).report(),
+            suite=suite_runs(run),
             incumbent=incumbent,
             ranking=from_json(read_json(run.folder / "ranking.json", "a ranking")),
             rewards=rewards,
             dataset=dataset,
-            replays=_replays(run, judged, given),
+            replays=_replays(run, judged, sources),
             workdir=kept_workdir(run, seed),
             sweep=read_sweep(sweep) if sweep else None,
             likeness=(run.folder / "likeness.txt").read_text(),
             training_runs=run.config.seeds,
-            facts={**facts, "stages": _stages(run, len(given))},
+            facts={**facts, "stages": _stages(run, len(sources))},
         ),
     )
 
@@ -95,15 +95,13 @@ def _stages(run: Run, sources: int) -> dict:
     }
 
 
-def _replays(run: Run, verdict: Verdict, given: Sequence[str | Logs]) -> list[Replay]:
-    """Cases worth a look, then drives of the recordings given."""
+def _replays(run: Run, verdict: Verdict, sources: Sequence[Dataset]) -> list[Replay]:
+    """Cases worth a look, then a few held-out drives beside the human."""
     job, incumbent = suite_job(run)
     drivers = [row for row in job.rows() if row.name in (CANDIDATE, incumbent)]
     shown = verdict.look_at[:REPLAYS] or job.cases().ids[:2]
-    every = run.config.plan_every
-    replays = make_replays(drivers, job.cases(), shown, every)
-    for one in given:
-        if isinstance(one, Logs):
-            parts = parts_of(one.format, one.input, one.source)
-            replays += recorded_replays(drivers, parts, every)
-    return replays
+    every, recorded = run.config.plan_every, recorded_set(held_out(sources, RECORDED))
+    return [
+        *make_replays(drivers, job.cases(), shown, every),
+        *make_replays(drivers, recorded, recorded.ids, every),
+    ]

@@ -126,6 +126,10 @@ def cut(
         report.add_refusal(recording)
         refused = {"quality": report.state(), "refused": recording.refused}
         return Cut(**about, **{**nothing, **refused})
+    if not recording.tracks:
+        report = QualityReport()
+        report.add_empty(recording)
+        return Cut(**about, **{**nothing, "quality": report.state()})
     with as_input_error(recording.name, "a sound recording"):
         collector = Collector(recording, config)
         parts, tracks = _assembled(recording, collector)

@@ -13,7 +13,6 @@ import functools
 import time
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -22,7 +21,7 @@ import tqdm
 from rcirl_jax.data.cut import Cut, cut, cut_item, whole_of
 from rcirl_jax.data.parts import Part, items, leaving_out
 from rcirl_jax.data.scenes.config import CollectConfig
-from rcirl_jax.data.scenes.quality import QualityReport
+from rcirl_jax.data.scenes.quality import QualityReport, remedies
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.data.store.files import Files
 from rcirl_jax.data.store.manifest import Manifest
@@ -47,19 +46,22 @@ class ImportConfig:
     split_seed: int = 0
     # recordings that may be refused and are left out; the next one ends the import
     leave_out: int = 0
+    # share of all recordings that may be refused, in place of a count
+    leave_out_share: float = 0.0
+
+    @property
+    def leaves_out(self) -> bool:
+        """Whether any recording may be refused and left out."""
+        return self.leave_out > 0 or self.leave_out_share > 0.0
 
 
-class _Numbers:
-    """Numbers for names, in order of first appearance."""
+def _number(table: dict[str, int], name: str) -> int:
+    """A name's number, in order of first appearance."""
+    return table.setdefault(name, len(table))
 
-    def __init__(self) -> None:
-        self.table: dict[str, int] = {}
 
-    def of(self, name: str) -> int:
-        return self.table.setdefault(name, len(self.table))
-
-    def names(self) -> list[str]:
-        return list(self.table)
+def _numbers(table: dict[str, int], names: Iterable[str]) -> np.ndarray:
+    return np.array([_number(table, name) for name in names], np.int32)
 
 
 class Progress:
@@ -126,9 +128,12 @@ class _Import:
 
     def __init__(self, writer: DatasetWriter, config: ImportConfig) -> None:
         self.writer, self.config = writer, config
-        self.recordings, self.groups = _Numbers(), _Numbers()
-        self.vehicles = _Numbers()
+        # names to their numbers
+        self.recordings: dict[str, int] = {}
+        self.groups: dict[str, int] = {}
+        self.vehicles: dict[str, int] = {}
         self.quality = QualityReport()
+        self.first_refused = ""  # in words
         self.sizes: dict[str, int] = {}
         # of the scenes in `pending`: name and first sight of each one's vehicle
         self.pending: list[Demonstration] = []
@@ -151,12 +156,13 @@ class _Import:
 
     def add(self, made: Cut) -> None:
         """Take over one recording's scenes."""
-        if made.name in self.recordings.table:
+        if made.name in self.recordings:
             raise InputError(f"{made.name}: name: met twice: expected once")
+        self.first_refused = self.first_refused or made.refused or ""
         if not made.refused:
             self.sources[made.source] = made.licence
             self.rates.add(made.rate_hz)
-        number = self.recordings.of(made.name)
+        number = _number(self.recordings, made.name)
         if self.done:
             self._replay(self.done.popleft(), made)
             return
@@ -169,8 +175,8 @@ class _Import:
         }
         if made.scenes is not None:
             scenes = made.scenes.replace(
-                vehicle=self._numbers(self.vehicles, made.vehicles),
-                group=self._numbers(self.groups, made.groups),
+                vehicle=_numbers(self.vehicles, made.vehicles),
+                group=_numbers(self.groups, made.groups),
                 recording=np.full_like(made.scenes.recording, number),
             )
             check_finite(made.name, scenes, np.arange(len(made.vehicles)))
@@ -178,16 +184,14 @@ class _Import:
             self.drivers += zip(made.vehicles, made.first_seen, strict=True)
             self.logs.add(made.log)
         self._count(entry)
-        if self.quality.refused > self.config.leave_out:
+        too_many = self.quality.refused > self.config.leave_out
+        if too_many and not self.config.leave_out_share:
             raise InputError(
                 f"{made.refused}; recordings left out before: {self.config.leave_out}"
             )
         self.lineage.append(entry)
         if sum(block.vehicle.shape[0] for block in self.pending) >= SHARD_SCENES:
             self._close_shard()
-
-    def _numbers(self, numbers: _Numbers, names: list[str]) -> Any:  # noqa: ANN401
-        return np.array([numbers.of(name) for name in names], np.int32)
 
     def _count(self, entry: dict) -> None:
         self.quality.merge(entry["quality"])
@@ -201,10 +205,8 @@ class _Import:
                 f"{made.name}: input or settings changed since the interrupted "
                 "import: expected the same; use another --output"
             )
-        for vehicle in entry["vehicles"]:
-            self.vehicles.of(vehicle)
-        for group in entry["groups"]:
-            self.groups.of(group)
+        _numbers(self.vehicles, entry["vehicles"])
+        _numbers(self.groups, entry["groups"])
         self._count(entry)
 
     def _close_shard(self) -> None:
@@ -238,8 +240,8 @@ class _Import:
             first_seen, vehicles, self.config.test_fraction
         )
         names = [f"{group}/{block}" for block in blocks]
-        self.groups, start = _Numbers(), 0
-        numbers = self._numbers(self.groups, names)
+        self.groups, start = {}, 0
+        numbers = _numbers(self.groups, names)
         joined = jax.tree.map(lambda *x: np.concatenate(x), *self.pending)
         self.pending = [joined.replace(group=numbers)]
         self.sizes = dict(collections.Counter(names))
@@ -255,11 +257,16 @@ class _Import:
                 f"{self.done[0]['name']}: missing: expected all recordings of the "
                 "interrupted import; use another --output"
             )
+        self._check_share_left_out()
         if self.quality.scenes == 0:
-            drops = {k: v for k, v in self.quality.dropped.items() if v}
+            if self.quality.empty and not self.quality.recordings:
+                raise InputError(
+                    f"import: {self.quality.empty} recordings, none with traffic: "
+                    "expected at least one road user"
+                )
+            why = remedies(self.quality.dropped) or "none was long enough"
             raise InputError(
-                f"import: 0 scenes kept of {self.quality.tracks} tracks: "
-                f"dropped because {drops}: expected at least one scene"
+                f"import: 0 scenes kept of {self.quality.tracks} tracks: {why}"
             )
         self._split_one_group()
         self._close_shard()
@@ -278,9 +285,9 @@ class _Import:
                     {"source": source, "licence": licence}
                     for source, licence in sorted(self.sources.items())
                 ],
-                "recordings": self.recordings.names(),
-                "groups": self.groups.names(),
-                "vehicles": self.vehicles.names(),
+                "recordings": list(self.recordings),
+                "groups": list(self.groups),
+                "vehicles": list(self.vehicles),
                 "splits": splits,
                 "quality": self.quality.as_dict(),
                 "import": self._flags(),
@@ -288,11 +295,22 @@ class _Import:
             before_commit,
         )
 
+    def _check_share_left_out(self) -> None:
+        refused, share = self.quality.refused, self.config.leave_out_share
+        recordings = len(self.recordings)
+        if share and refused > share * recordings:
+            raise InputError(
+                f"import: {refused} of {recordings} recordings refused, the first: "
+                f"{self.first_refused}: expected up to {100.0 * share:g} % "
+                "(--leave_out)"
+            )
+
     def _flags(self) -> dict:
-        """What the manifest says of the settings; `leave_out` only where it is used."""
+        """What the manifest says of the settings; what is left out only where it is."""
         found = dataclasses.asdict(self.config)
-        if not found["leave_out"]:
-            del found["leave_out"]
+        for name in ("leave_out", "leave_out_share"):
+            if not found[name]:
+                del found[name]
         return found | {"split_by": self.split_by}
 
 
@@ -352,7 +370,7 @@ def import_parts(
       InputError: as `import_logs`.
     """
     places = executor or Here()
-    if config.leave_out:
+    if config.leaves_out:
         parts = leaving_out(parts)
 
     def cuts(known: dict[str, str]) -> Iterable[Cut]:

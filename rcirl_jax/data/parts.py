@@ -1,7 +1,6 @@
 """What an import can read apart: parts of the input, and the pieces of a long one."""
 
 import dataclasses
-import itertools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -17,7 +16,6 @@ from rcirl_jax.data.importers import parts as inputs_of
 from rcirl_jax.data.importers.files import is_long_file
 from rcirl_jax.data.recording import LEAVE_OUT, PIECE, refusal
 from rcirl_jax.errors import InputError
-from rcirl_jax.runtime.pipeline import file_sha256
 from rcirl_jax.types import Recording
 
 
@@ -46,19 +44,6 @@ def parts_of(
     """All parts of an input, in order; arguments and errors as `importers.parts`."""
     found, spec = inputs_of(name, input_path, source)
     return [Part(format=name, input=path, spec=spec) for path in found]
-
-
-def logs_sha256(parts: Sequence[Part]) -> dict[str, str]:
-    """Sha256 of every log file of the parts, by its path; maps beside are not read.
-
-    Raises:
-      OSError: a file cannot be read.
-    """
-    found: set[Path] = set()
-    for part in parts:
-        for path in files_of(part.format, part.input):
-            found |= set(path.rglob("*")) if path.is_dir() else {path}
-    return {str(file): file_sha256(file) for file in sorted(found) if file.is_file()}
 
 
 def leaving_out(parts: Sequence[Part]) -> list[Part]:
@@ -99,11 +84,6 @@ def recordings_of(part: Part) -> Iterator[Recording]:
         if not part.spec.get(LEAVE_OUT):
             raise
         yield refusal(f"{part.label}, the rest", error)
-
-
-def recordings_of_all(parts: Sequence[Part]) -> Iterator[Recording]:
-    """All recordings of the parts, one after the other."""
-    return itertools.chain.from_iterable(map(recordings_of, parts))
 
 
 def is_long(part: Part) -> bool:

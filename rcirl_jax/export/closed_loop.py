@@ -10,6 +10,7 @@ from rcirl_jax.export.reader import Reward
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.anchor import Anchored, anchored_score
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm
+from rcirl_jax.planner.dp import dp_policy
 from rcirl_jax.planner.grid import DpConfig
 from rcirl_jax.planner.rank import (
     Params,
@@ -24,7 +25,6 @@ from rcirl_jax.planner.safety import SafetyConfig
 from rcirl_jax.simulation.rows import (
     Row,
     baseline_row,
-    dp_row,
 )
 
 DP_EVERY = 10  # steps between two plans of the DP row: it costs 1,000 rankings
@@ -96,9 +96,10 @@ def table_rows(
             "no sum over points"
         )
     if dp:
-        slow = max(plan_every, DP_EVERY)
-        of = (params, preset, first.activation, config, DpConfig(), slow)
-        rows.insert(1, dp_row(f"{rows[0].name} DP", *of))
+        policy = dp_policy(feature_map(preset), first.activation, config, DpConfig())
+        every, name = max(plan_every, DP_EVERY), f"{rows[0].name} DP"
+        row = Row(name=name, policy=policy, params=params, plan_every=every)
+        rows.insert(1, row)
     rows += [baseline_row(name, preset, params[1], config) for name in baselines]
     if tuned_idm is not None:
         rows.append(Row(name=TUNED_IDM_ROW, policy=idm_policy(tuned_idm)))

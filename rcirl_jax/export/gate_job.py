@@ -8,15 +8,15 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.suite import (
     SuiteConfig,
     SuiteResult,
-    drive_here,
     run_suite,
 )
 from rcirl_jax.evaluation.gate.runs import CANDIDATE, INCUMBENT, repeats
-from rcirl_jax.export.spread import SuiteJob, spread
+from rcirl_jax.export.spread import SuiteJob, drive_by
+from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.runtime.executors import Executor
 from rcirl_jax.simulation.cases import STEP_S
 from rcirl_jax.simulation.rows import BASELINES
-from rcirl_jax.simulation.suite import FULL_S, SMOKE_S, CaseRef, suite_refs
+from rcirl_jax.simulation.suite import FULL_S, CaseRef, case_duration, suite_refs
 
 
 def gate_job(
@@ -29,7 +29,7 @@ def gate_job(
     catalogue_seed: int,
     plan_every: int,
     rivals: Sequence[str] = ("IDM",),
-    tuned_idm: tuple[tuple[str, float], ...] = (),
+    tuned_idm: Idm | None = None,
     track: str = "full",
 ) -> tuple[SuiteJob, str]:
     """The suite that both drive, and the name of the incumbent's row.
@@ -43,16 +43,14 @@ def gate_job(
       catalogue_seed: of the cases.
       plan_every: steps of 0.1 s between two plans.
       rivals: further baselines.
-      tuned_idm: fields of a further IDM row; empty without one.
+      tuned_idm: of a further row.
       track: of the safety filter, `SafetyConfig.track`.
 
     Raises:
       InputError: a duration, suite or count that cannot be.
     """
     learned = incumbent not in BASELINES
-    duration = duration_s or (SMOKE_S if suite == "smoke" else FULL_S)
-    if not 1.0 <= duration <= FULL_S:
-        raise InputError(f"--duration: {duration}: expected 1 to {FULL_S:g} s")
+    duration = case_duration(suite, duration_s)
     if learned and not Path(incumbent).is_file():
         raise InputError(
             f"--incumbent: {incumbent}: expected a weights file or one of "
@@ -80,8 +78,7 @@ def drive_job(job: SuiteJob, executor: Executor) -> SuiteResult:
       InputError: the candidate's drives do not repeat.
     """
     rows, config = job.rows(), SuiteConfig(plan_every=job.plan_every)
-    drive = spread(executor, job) if executor.workers > 1 else drive_here
-    result = run_suite(rows, job.cases(), config, drive)
+    result = run_suite(rows, job.cases(), config, drive_by(executor, job))
     repeats(rows[0], result, config)
     return result
 

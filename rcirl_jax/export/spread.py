@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import tqdm
 
-from rcirl_jax.evaluation.closed_loop.suite import Drive, SuiteConfig
+from rcirl_jax.evaluation.closed_loop.suite import Drive, SuiteConfig, drive_here
 from rcirl_jax.export.closed_loop import table_rows
 from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.runtime.executors import Executor
@@ -40,7 +40,7 @@ class SuiteJob:
     plan_every: int = 1
     dp: bool = False
     names: tuple[str, ...] = ()  # of the learned rows; else after loss and shape
-    tuned_idm: tuple[tuple[str, float], ...] = ()  # fields of a further IDM row
+    tuned_idm: Idm | None = None  # of a further row
     track: str = "full"  # of the safety filter
 
     def rows(self) -> list[Row]:
@@ -52,7 +52,7 @@ class SuiteJob:
             dp=self.dp,
             names=self.names,
             track=self.track,
-            tuned_idm=Idm(**dict(self.tuned_idm)) if self.tuned_idm else None,
+            tuned_idm=self.tuned_idm,
         )
 
     def cases(self) -> CaseSet:
@@ -101,3 +101,8 @@ def spread(executor: Executor, job: SuiteJob) -> Drive:
         return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
     return drive
+
+
+def drive_by(executor: Executor, job: SuiteJob) -> Drive:
+    """`spread` where there are other processes, else this one drives."""
+    return spread(executor, job) if executor.workers > 1 else drive_here

@@ -38,13 +38,6 @@ def read_tuned_idm(path: Path) -> Idm:
     return Idm(**msgspec.structs.asdict(found))
 
 
-def idm_fields(path: str | None) -> tuple[tuple[str, float], ...]:
-    """A file's fields in order, as `SuiteJob` keeps them; none without a file."""
-    if path is None:
-        return ()
-    return tuple(dataclasses.asdict(read_tuned_idm(Path(path))).items())
-
-
 def idm_left_out(path: str | None) -> str:
     """What a command says where --tuned_idm names no file; "" where it names one."""
     return "" if path else f"left out: {TUNED_IDM_ROW}: --tuned_idm is not given"

@@ -158,7 +158,7 @@ def _pack_checked(
             "sha256": hashlib.sha256(body).hexdigest(),
         }
         data = _dump(outer)
-    except (_FieldError, OverflowError, TypeError, ValueError) as error:
+    except (OverflowError, RecursionError, TypeError, ValueError) as error:
         # msgpack itself refuses integers over 64 bits and lone surrogates.
         raise InputError(f"{file}: {error}") from error
     try:
@@ -180,18 +180,14 @@ def _dump(value: dict[str, Any]) -> bytes:
     return cast("bytes", msgpack.packb(value, use_bin_type=True))
 
 
-class _FieldError(Exception):
-    """A field that cannot be packed; the caller puts the file's name in front."""
-
-
 def _body(weights: RewardWeights, samples: tuple[np.ndarray, ...]) -> dict[str, Any]:
     """The body map, in the order of `reader.BODY_KEYS`; then what there is besides."""
     if len(weights.kernels) != len(weights.biases):
         found = f"{len(weights.biases)} biases"
-        raise _FieldError(f"biases: {found}: expected one for each kernel")
+        raise ValueError(f"biases: {found}: expected one for each kernel")
     for key in PROVENANCE_KEYS:
         if key not in weights.provenance:
-            raise _FieldError(f"provenance.{key}: missing: expected a value or None")
+            raise ValueError(f"provenance.{key}: missing: expected a value or None")
     more = {
         name: _array(name, value)
         for name, value in (("seen", weights.seen), ("context", weights.context))
@@ -199,13 +195,13 @@ def _body(weights: RewardWeights, samples: tuple[np.ndarray, ...]) -> dict[str, 
     }
     if weights.anchor is not None:
         if weights.seen is None:
-            raise _FieldError("seen: missing: expected ranges in an anchored reward")
+            raise ValueError("seen: missing: expected ranges in an anchored reward")
         more["anchor"] = _anchor(weights.anchor, len(weights.features), samples[0])
     layers = zip(weights.kernels, weights.biases, strict=True)
     names = ("features", "valid", "value")
     return {
         "preset": weights.preset,
-        "features": [_plain("features", vars(spec), 1) for spec in weights.features],
+        "features": [_plain(vars(spec)) for spec in weights.features],
         "normaliser": {
             key: _array(f"normaliser.{key}", getattr(weights, key))
             for key in reader.RANGES
@@ -220,9 +216,9 @@ def _body(weights: RewardWeights, samples: tuple[np.ndarray, ...]) -> dict[str, 
             for index, (kernel, bias) in enumerate(layers)
         ],
         "activation": weights.activation,
-        "leaky_slope": _plain("leaky_slope", weights.leaky_slope, 0),
-        "loss": _plain("loss", weights.loss, 1),
-        "provenance": _plain("provenance", weights.provenance, reader.MAX_DEPTH),
+        "leaky_slope": _plain(weights.leaky_slope),
+        "loss": _plain(weights.loss),
+        "provenance": _plain(weights.provenance),
         "samples": {
             name: _array(f"samples.{name}", sample)
             for name, sample in zip(names, samples, strict=True)
@@ -235,11 +231,10 @@ def _anchor(
     anchor: reader.Anchor, features: int, samples_x: np.ndarray
 ) -> dict[str, Any]:
     """The map `anchor`, with the gains of the samples as its reader has them."""
-    numbers = {key: getattr(anchor, key) for key in reader.ANCHOR_NUMBERS}
     arrays = {key: getattr(anchor, key) for key in reader.ANCHOR_ARRAYS}
     box = {
         "incumbent": anchor.incumbent,
-        **{key: _plain(f"anchor.{key}", item, 0) for key, item in numbers.items()},
+        **{key: _plain(getattr(anchor, key)) for key in reader.ANCHOR_NUMBERS},
         **{key: _array(f"anchor.{key}", item) for key, item in arrays.items()},
         "gain": None,
     }
@@ -256,33 +251,17 @@ def _anchor(
 def _array(field: str, value: np.ndarray) -> dict[str, Any]:
     """{shape, dtype, data}: float32, little endian; `tobytes` gives C order."""
     try:
-        array = np.asarray(value)
+        with np.errstate(over="ignore"):  # to inf, which the reader refuses by place
+            array = np.asarray(value, "<f4")
     except (TypeError, ValueError) as error:
-        raise _FieldError(f"{field}: {error}: expected an array") from error
-    if array.dtype.kind not in "fiub":
-        raise _FieldError(f"{field}: {array.dtype}: expected an array of numbers")
-    with np.errstate(over="ignore"):  # to inf, which the reader refuses by place
-        array = array.astype("<f4")
+        raise ValueError(f"{field}: {error}: expected an array of numbers") from error
     return {"shape": list(array.shape), "dtype": "<f4", "data": array.tobytes()}
 
 
-def _plain(field: str, value: Any, depth: int) -> Any:  # noqa: ANN401
-    """Plain msgpack types, map keys sorted, numpy scalars as Python numbers."""
-    if isinstance(value, np.generic):
-        value = value.item()
-    if value is None or isinstance(value, str | bool | int | float):
-        return value
-    if depth == 0 or not isinstance(value, Mapping | list | tuple):
-        kind = type(value).__name__
-        raise _FieldError(
-            f"{field}: {kind}: expected texts, numbers, lists and maps, "
-            f"at most {reader.MAX_DEPTH} levels"
-        )
-    if not isinstance(value, Mapping):
-        return [_plain(field, item, depth - 1) for item in value]
-    for key in value:
-        if not isinstance(key, str):
-            raise _FieldError(f"{field}: key {key!r}: expected a text")
-    return {
-        key: _plain(f"{field}.{key}", value[key], depth - 1) for key in sorted(value)
-    }
+def _plain(value: Any) -> Any:  # noqa: ANN401
+    """The same with map keys sorted, and numpy scalars as Python numbers."""
+    if isinstance(value, Mapping):
+        return {key: _plain(value[key]) for key in sorted(value)}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value.item() if isinstance(value, np.generic) else value

@@ -1,6 +1,7 @@
 """One look for all pictures: colour-blind safe colours, names, sizes."""
 
 import io
+import re
 from pathlib import Path
 
 import matplotlib as mpl
@@ -8,6 +9,7 @@ import matplotlib as mpl
 mpl.use("Agg")
 
 import matplotlib.pyplot as plt
+from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -53,3 +55,26 @@ def save(made: Figure, path: Path) -> Path:
     plt.close(made)
     write_whole(path, drawn.getvalue())
     return path
+
+
+def svg(made: Figure, name: str) -> Markup:
+    """The figure as inline SVG, and free it.
+
+    Black takes the colour of the page's text. Ids are those that the drawing refers to,
+    with its name before, so that several drawings stand in one page.
+    """
+    drawn = io.StringIO()
+    settings = {"svg.fonttype": "none", "svg.hashsalt": name}
+    with mpl.rc_context(settings):
+        made.savefig(drawn, format="svg", transparent=True, metadata={"Date": None})
+    plt.close(made)
+    text = drawn.getvalue()
+    text = re.sub(
+        r"<metadata>.*?</metadata>", "", text[text.index("<svg") :], flags=re.S
+    )
+    used = set(re.findall(r"#([\w-]+)[\")]", text))
+    keep = lambda found: f' id="{name}-{found[1]}"' if found[1] in used else ""  # noqa: E731
+    text = re.sub(r' id="([\w.-]+)"', keep, text)
+    text = re.sub(r'(url\(#|href="#)', rf"\1{name}-", text)
+    text = re.sub(r"#000000", "currentColor", text)
+    return Markup(re.sub(r"\n\s*", "\n", text))

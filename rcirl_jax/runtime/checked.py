@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from rcirl_jax.errors import InputError
+from rcirl_jax.errors import InputError, did_you_mean
 
 Kind = TypeVar("Kind")
 # msgspec's words: on a field, and on anything else
@@ -55,7 +55,8 @@ def _said(found: Any, kind: Any, message: str) -> str:  # noqa: ANN401
             return f"{name}: missing: expected a value"
         known = () if field[3] else msgspec.structs.fields(kind)
         names = ", ".join(one.encode_name for one in known)
-        return f"{name}: unknown: expected {names or 'no such field'}"
+        near = did_you_mean(field[2], [one.encode_name for one in known])
+        return f"{name}: unknown: expected {names or 'no such field'}{near}"
     match = VALUE.fullmatch(message)
     words, place = (match[1], match[2] or "") if match else (message, "")
     with contextlib.suppress(LookupError, TypeError):

@@ -95,12 +95,34 @@ class Stages:
         Raises:
           InputError: the work left an output unwritten.
         """
-        known = self.read().get(name, {})
-        if known.get("key") == digest(inputs) and self._intact(known, outputs):
+        if self.is_done(name, inputs, outputs):
             return False
         begin = time.monotonic()
         self._forget(stale)
         work()
+        self.note(name, inputs, outputs, time.monotonic() - begin, made_by)
+        return True
+
+    def is_done(
+        self, name: str, inputs: Mapping[str, Any], outputs: Sequence[Path]
+    ) -> bool:
+        """Whether a stage was done from these inputs and its outputs are whole."""
+        known = self.read().get(name, {})
+        return known.get("key") == digest(inputs) and self._intact(known, outputs)
+
+    def note(
+        self,
+        name: str,
+        inputs: Mapping[str, Any],
+        outputs: Sequence[Path],
+        seconds: float,
+        made_by: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Note that a stage has been done; arguments as of `run`.
+
+        Raises:
+          InputError: an output is missing.
+        """
         made = {}
         for path in outputs:
             if not path.is_file():
@@ -110,11 +132,10 @@ class Stages:
             "key": digest(inputs),
             "inputs": dict(inputs),
             "outputs": made,
-            "seconds": round(time.monotonic() - begin, 1),
+            "seconds": round(seconds, 1),
             **({"made_by": dict(made_by)} if made_by else {}),
         }
         self._write({**self.read(), name: record})
-        return True
 
     def _forget(self, names: Sequence[str]) -> None:
         """Remove the outputs of stages, then their records."""

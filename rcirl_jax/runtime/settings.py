@@ -1,16 +1,14 @@
 """Settings from TOML, JSON or msgpack: values checked against a dataclass's fields."""
 
 import dataclasses
-import types
 import typing
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 from rcirl_jax.errors import InputError, did_you_mean
+from rcirl_jax.runtime.checked import checked
 
 MOST = 2**31  # numbers are nearer to 0 than this
-# how types are called in a message
-NAMES = {str: "a text", bool: "true or false"}
 
 
 def typed_settings(kind: type, found: Mapping[str, Any], where: str = "") -> Any:  # noqa: ANN401
@@ -32,8 +30,7 @@ def typed_fields(
     """Values as the types of a dataclass's fields: lists as tuples, int as float.
 
     Args:
-      kind: the dataclass; its fields are bool, int, float, str, tuples, dataclasses,
-        or one of them or None.
+      kind: the dataclass.
       found: values by the names of fields.
       where: stands before the name in a message, with what parts the two.
       without: fields that may not be given.
@@ -63,28 +60,20 @@ def check_names(where: str, found: Mapping[str, Any], known: Sequence[str]) -> N
 
 
 def _value(kind: Any, value: Any, where: str) -> Any:  # noqa: ANN401
-    """One value as a type.
+    """One value as a type; of a dataclass every name is known."""
+    kind = typing.cast(type, kind)
+    if dataclasses.is_dataclass(kind) and isinstance(value, dict):
+        return typed_settings(kind, value, f"{where}.")
+    made = checked(value, kind, where)
+    if not all(abs(number) < MOST for number in _numbers(made)):  # NaN is not below
+        raise InputError(f"{where}: {value}: expected numbers between +-{MOST}")
+    return made
 
-    Raises:
-      InputError: it is of another type.
-    """
-    if typing.get_origin(kind) in {types.UnionType, typing.Union}:
-        kinds = typing.get_args(kind)
-        if value is None and type(None) in kinds:
-            return None
-        return _value(next(k for k in kinds if k is not type(None)), value, where)
-    parts = typing.get_args(kind)
-    if parts and isinstance(value, list):
-        kinds = parts[:1] * len(value) if parts[-1] is ... else parts
-        if len(kinds) == len(value):
-            pairs = enumerate(zip(kinds, value, strict=True))
-            return tuple(_value(k, v, f"{where}[{i}]") for i, (k, v) in pairs)
-    elif dataclasses.is_dataclass(kind) and isinstance(value, dict):
-        return typed_settings(typing.cast(type, kind), value, f"{where}.")
-    elif type(value) is kind and kind in NAMES:
-        return value
-    elif kind in {int, float} and type(value) in {int, kind} and abs(value) < MOST:
-        return float(value) if kind is float else value  # NaN is not below
-    length = f"a list of {len(parts)}" if parts and parts[-1] is not ... else "a list"
-    name = length if parts else NAMES.get(kind, getattr(kind, "__name__", str(kind)))
-    raise InputError(f"{where}: {value!r}: expected {name}")
+
+def _numbers(made: object) -> Iterator[float]:
+    """All numbers of a value."""
+    if isinstance(made, int | float):
+        yield made
+    elif isinstance(made, tuple):
+        for one in made:
+            yield from _numbers(one)

@@ -11,8 +11,6 @@ import jax
 from rcirl_jax.errors import InputError
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.baselines import Idm
-from rcirl_jax.planner.dp import dp_policy
-from rcirl_jax.planner.grid import DpConfig
 from rcirl_jax.planner.rank import (
     Params,
     Policy,
@@ -67,20 +65,6 @@ def learned_row(
     """A learned reward, ranking; weights are effective (pinned) parameters."""
     score = learned_score(feature_map(preset), activation)
     return Row(name=name, policy=rank_policy(score, config), params=weights)
-
-
-def dp_row(
-    name: str,
-    weights: tuple[RewardParams, Normaliser],
-    preset: str,
-    activation: str,
-    config: RankConfig,
-    dp: DpConfig,
-    plan_every: int,
-) -> Row:
-    """A learned reward planning by dynamic programming, every `plan_every` steps."""
-    policy = dp_policy(feature_map(preset), activation, config, dp)
-    return Row(name=name, policy=policy, params=weights, plan_every=plan_every)
 
 
 def human_row() -> Row:

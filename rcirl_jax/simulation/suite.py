@@ -3,7 +3,7 @@
     full        every family of data_specs/scenarios, as many cases as it declares
     smoke       one case of every family, 20 s
     FAMILY[,F]  all cases of the named families
-    recorded    drives cut out of recordings; the others leave the log if need be
+    recorded    held-out scenes of datasets; the others leave the log if need be
 
 Cases are built, driven and reduced to metrics chunk by chunk, so memory does
 not depend on how many there are; every chunk has the same shapes, so a row
@@ -11,12 +11,11 @@ compiles once.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import jax
 import numpy as np
 
-from rcirl_jax.data.recording import Recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.simulation.cases import STEP_S, Case, Record, Snapshot
 from rcirl_jax.simulation.catalogue.build import (
@@ -28,10 +27,10 @@ from rcirl_jax.simulation.catalogue.build import (
     parse_case_id,
 )
 from rcirl_jax.simulation.metrics import CaseMetrics, MetricsConfig, case_metrics
-from rcirl_jax.simulation.recorded.cases import recorded_cases
-from rcirl_jax.simulation.recorded.config import RecordedConfig
+from rcirl_jax.simulation.recorded.scenes import DATASET, HeldOut
 from rcirl_jax.simulation.rollout import LANES, RolloutConfig, drive_cases
 from rcirl_jax.simulation.rows import Row
+from rcirl_jax.units import HORIZON_S
 
 SMOKE_S = 20.0  # s of a smoke case
 FULL_S = 120.0  # s of a case of the paper's suite
@@ -99,6 +98,18 @@ def suite_refs(
     return tuple(refs)
 
 
+def case_duration(suite: str, given: float | None) -> float:
+    """S of a case: as given, else those of the suite.
+
+    Raises:
+      InputError: none that a case can have.
+    """
+    duration = given or (SMOKE_S if suite == "smoke" else FULL_S)
+    if not 1.0 <= duration <= FULL_S:
+        raise InputError(f"--duration: {duration}: expected 1 to {FULL_S:g} s")
+    return duration
+
+
 def build(refs: Sequence[CaseRef], duration_s: float) -> Case:
     """The cases of refs, stacked [B, ...] in their order; numpy leaves."""
     places: dict[tuple[str, int], list[int]] = {}
@@ -141,21 +152,17 @@ def catalogue_set(refs: Sequence[CaseRef], duration_s: float) -> CaseSet:
     )
 
 
-def recorded_set(recordings: Iterable[Recording], config: RecordedConfig) -> CaseSet:
-    """Drives of recordings, all of them in memory; grouped by recording.
-
-    Raises:
-      InputError: no drive is suitable.
-    """
-    cases, ids = recorded_cases(recordings, config)
-    assert cases.replay is not None
-    steps = cases.replay.ego_s.shape[1] - 1
+def recorded_set(drives: HeldOut) -> CaseSet:
+    """Held-out drives of datasets; grouped by recording, "DATASET:RECORDING"."""
     return CaseSet(
-        ids=ids,
-        groups=tuple(name.rsplit(":", 1)[0] for name in ids),
-        parameters=tuple({} for _ in ids),
-        build=lambda first, last: jax.tree.map(lambda x: x[first:last], cases),
-        duration_s=steps * STEP_S,
+        ids=drives.ids,
+        groups=tuple(
+            f"{number // DATASET}:{number % DATASET}"
+            for number in drives.recording.tolist()
+        ),
+        parameters=tuple({} for _ in drives.ids),
+        build=lambda first, last: jax.tree.map(lambda x: x[first:last], drives.cases),
+        duration_s=HORIZON_S,
     )
 
 

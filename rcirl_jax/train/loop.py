@@ -174,8 +174,7 @@ def step_of(config: TrainConfig, parallel: str) -> Parallel:
     Raises:
       InputError: as `parallelise`.
     """
-    train_step = make_train_step(config, whole=parallel == "jit_sharded")
-    return parallelise(train_step, parallel, config.batch_size)
+    return parallelise(make_train_step(config), parallel, config.batch_size)
 
 
 def _train(
@@ -285,7 +284,7 @@ class _Run:
     def close(self) -> None:
         if self.writer is not None:
             self.writer.close()
-        self.progress.__exit__(None, None, None)
+        self.progress.close()
 
     def epochs_from(
         self,

@@ -5,10 +5,9 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
-from typing import Any, TextIO
+from typing import Any
 
 import tqdm
 
@@ -16,8 +15,6 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.atomic_files import named, parse_json, write_whole
 
 MAX_STEP = 2**63 - 1  # what 64 bits hold
-MAX_BYTES = 2**32  # of a metrics.jsonl: some 27 million steps
-MAX_LINE = 2**16  # characters of one of its lines
 
 
 class MetricsWriter:
@@ -66,33 +63,18 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
 
     A line that a crash or a full disk cut short is left out, and so is one without a
     step; values that are neither numbers nor null are left out of theirs.
-
-    Raises:
-      InputError: a file of more than `MAX_BYTES`.
     """
     rows = []
     if not path.is_file():
         return rows
-    if (size := path.stat().st_size) > MAX_BYTES:
-        raise InputError(f"{path}: {size} bytes: expected {MAX_BYTES} at most")
     with path.open(errors="replace") as file:
-        for line in _lines(file):
+        for line in file:
             with contextlib.suppress(ValueError):
                 found = parse_json(line)
                 step = found.get("step") if isinstance(found, dict) else None
                 if type(step) is int and abs(step) <= MAX_STEP:
                     rows.append({k: v for k, v in found.items() if _is_number(v)})
     return rows
-
-
-def _lines(file: TextIO) -> Iterator[str]:
-    """Lines of a text, without those of more than `MAX_LINE` characters."""
-    is_start = True
-    while piece := file.readline(MAX_LINE):
-        is_end = piece.endswith("\n")
-        if is_start and (is_end or len(piece) < MAX_LINE):
-            yield piece
-        is_start = is_end
 
 
 def pairs_won(path: Path, steps: int) -> float:
@@ -208,13 +190,6 @@ class Progress:
         """Wall time since the bar was made."""
         return time.perf_counter() - self._since
 
-    def __enter__(self) -> "Progress":
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
+        """Leave the bar as it is."""
         self._bar.close()

@@ -77,13 +77,7 @@ def sharded(step: Step, num_devices: int) -> Step:
     )
 
 
-def jit_sharded(step: Step, num_devices: int) -> Step:
-    """The step under jit with shardings: the compiler splits it and adds the sums."""
-    everywhere, rows = _shardings(num_devices)
-    return jax.jit(step, in_shardings=(everywhere, rows), out_shardings=everywhere)
-
-
-MANY = {"pmap": pmapped, "shard_map": sharded, "jit_sharded": jit_sharded}
+MANY = {"pmap": pmapped, "shard_map": sharded}
 PARALLEL = ("jit", *MANY)
 
 

@@ -17,7 +17,7 @@ from rcirl_jax.train.state import TrainConfig
 class Running:
     """How a run goes about its work; nothing here changes its result."""
 
-    # "jit", or over the devices of all processes "pmap", "shard_map", "jit_sharded"
+    # "jit", or over the devices of all processes "pmap" or "shard_map"
     parallel: str = "jit"
     # MiB of scenes up to which the training split is loaded whole
     in_memory_mb: float = 1024.0

@@ -159,7 +159,7 @@ def as_tree(params: Parameters) -> Any:  # noqa: ANN401
 
 
 def batch_sums(
-    state: TrainState, batch: Batch | FeatureBatch, config: TrainConfig, *, whole: bool
+    state: TrainState, batch: Batch | FeatureBatch, config: TrainConfig
 ) -> tuple[tuple[Parameters, LossSums], jax.Array]:
     """((gradient of the loss sum, sums), scenes with bad values [B, F + 1]) of a batch.
 
@@ -176,36 +176,32 @@ def batch_sums(
         return found, jnp.concatenate([bad_values(part), bad_facts(part)], axis=1)
 
     def learn_from(part: Batch) -> tuple:
-        made = featurise(key, part, config, features)
-        return learn(made) if whole else _by_pieces(learn, made)
+        return _by_pieces(learn, featurise(key, part, config, features))
 
     if isinstance(batch, FeatureBatch):
-        return learn(batch) if whole else _by_pieces(learn, batch)
-    if whole:
-        return learn_from(batch)
+        return _by_pieces(learn, batch)
     candidates = num_candidates(config.sampler) + config.hard_drawn
     size = block_size(batch.weight.shape[0], candidates)
     return _by_pieces(learn_from, batch, size)
 
 
 def make_train_step(
-    config: TrainConfig, *, whole: bool = False
+    config: TrainConfig,
 ) -> Callable[..., tuple[TrainState, StepMetrics]]:
     """`train_step(state, batch, *, axis_name=None) -> (state, metrics)`.
 
     `batch` is a Batch (everything is made on the device) or a FeatureBatch.
     With `axis_name` the step runs inside pmap or shard_map and sums over that
-    axis. `whole` works the batch off at once, for a compiler that shares it over
-    devices by itself and would gather it for a loop. A step whose loss or gradient
-    is not finite leaves the state as it was and says so in the metrics; not by
-    `optax.apply_if_finite`, which sees updates only: it cannot name scene and feature.
+    axis. A step whose loss or gradient is not finite leaves the state as it was and
+    says so in the metrics; not by `optax.apply_if_finite`, which sees updates only: it
+    cannot name scene and feature.
     """
     optimizer = make_optimizer(config)
 
     def train_step(
         state: TrainState, batch: Batch | FeatureBatch, *, axis_name: str | None = None
     ) -> tuple[TrainState, StepMetrics]:
-        (grads, sums), bad = batch_sums(state, batch, config, whole=whole)
+        (grads, sums), bad = batch_sums(state, batch, config)
         nonfinite, first_bad = count_bad(bad, batch.index)
         if axis_name is not None:
             sums, grads, nonfinite = jax.lax.psum((sums, grads, nonfinite), axis_name)

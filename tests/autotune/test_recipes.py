@@ -47,7 +47,7 @@ def test_the_papers_own_setting():
     [
         ("[train]\nlos = 'rank'", r"los: unknown: .*did you mean loss\?"),
         ("[trains]\n", r"trains: unknown: .*did you mean train\?"),
-        ("[train]\nepochs = 'many'", r"epochs: 'many': expected int"),
+        ("[train]\nepochs = 'many'", r"epochs: many: expected a whole number"),
         ("[train]\nepochs = 0", r"--epochs: 0: expected >= 1"),
         ("[train.reward]\nhidden = 15", r"hidden: 15: expected a list"),
         ("[train.reward]\nby_context = 1", r"by_context: 1: expected true or false"),

@@ -6,11 +6,9 @@ import random
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from benchmarks.reliability.fuzz import codecs, contract
-from benchmarks.reliability.fuzz.readers import READERS, shares
+from benchmarks.reliability.fuzz import contract, forms
+from benchmarks.reliability.fuzz.readers import READERS
 from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.export.sweep.result import read_sweep
 from rcirl_jax.features import mapping
@@ -18,7 +16,8 @@ from rcirl_jax.report.ranking.sweep_picture import sweep_picture
 from rcirl_jax.runtime import pipeline
 from tests.helpers.commands import fresh
 
-FEW = ("apollo", "nuplan", "argoverse2", "l5", "interaction", "suite", "scenarios")
+FEW = ("apollo", "nuplan", "argoverse2", "l5", "interaction", "ros2")
+FEW += ("suite", "scenarios")
 
 
 @pytest.fixture(autouse=True)
@@ -32,7 +31,7 @@ def drawn(target, count, seed):
     rng = random.Random(seed)
     for _ in range(count):
         index = rng.randrange(len(target.seeds))
-        content = codecs.mutate(target.seeds[index], target.forms[index], rng)
+        content = forms.mutate(target.seeds[index], target.forms[index], rng)
         yield bytes([index]) + content
 
 
@@ -42,34 +41,15 @@ def breach_of(target, data):
     return contract.verdict(target.read, target.names)[0]
 
 
-# where in the file, bytes that go, bytes that come
-EDIT = st.tuples(st.floats(0.0, 1.0), st.integers(0, 9), st.binary(max_size=9))
-
-
 @pytest.mark.parametrize("name", sorted(READERS))
 def test_a_reader_returns_or_says_one_line(name, tmp_path):
-    """Whole files, mutated ones, and ones with any pieces replaced."""
-    target, few = READERS[name].make(tmp_path / "made"), name in FEW
+    """Whole files, and mutated ones."""
+    target = READERS[name].make(tmp_path / "made")
     for index, content in enumerate(target.seeds):
         target.put(bytes([index]) + content)
         assert contract.verdict(target.read, target.names) == (None, None), index
-    for data in drawn(target, 15 if few else 60, name):
+    for data in drawn(target, 25 if name in FEW else 90, name):
         assert breach_of(target, data) is None
-
-    @settings(max_examples=10 if few else 30, derandomize=True, deadline=None,
-              database=None)  # fmt: skip
-    @given(
-        index=st.integers(0, len(target.seeds) - 1),
-        edits=st.lists(EDIT, min_size=1, max_size=4),
-    )
-    def holds(index, edits):
-        content = target.seeds[index]
-        for where, gone, new in edits:
-            at = int(where * len(content))
-            content = content[:at] + new + content[at + gone :]
-        assert breach_of(target, bytes([index]) + content) is None
-
-    holds()
 
 
 def test_a_sweep_that_is_read_can_be_drawn(tmp_path):
@@ -86,7 +66,9 @@ def test_a_sweep_that_is_read_can_be_drawn(tmp_path):
     assert drawings == 20
 
 
-def test_a_planted_defect_and_refused_memory_are_breaches(tmp_path, monkeypatch):
+def test_a_planted_defect_refused_memory_and_places_outside_are_seen(
+    tmp_path, monkeypatch
+):
     """A stage's record is not looked at; half of all memory is asked for."""
     monkeypatch.setattr(pipeline, "checked", lambda body, kind, where: body)
     target = READERS["stages"].make(tmp_path / "made")
@@ -98,60 +80,24 @@ def test_a_planted_defect_and_refused_memory_are_breaches(tmp_path, monkeypatch)
         with as_input_error("a.csv", "rows"):
             np.empty(2**62, np.uint8)
 
-    breach, line = contract.verdict(read, ["a.csv"])
-    assert breach.kind.startswith("MemoryError at ")
-    assert line.startswith("a.csv: MemoryError: Unable to allocate 4.00 EiB")
-
-
-@pytest.mark.parametrize(
-    ("line", "kind"),
-    [
-        ("two\nlines of a.csv", "not one printable line"),
-        ("a.csv: \x1b[31m", "not one printable line"),
-        ("a.csv: " + "x" * 5000, "a line too long"),
-        ("field: 3: expected 4", "no file named"),
-        ("a.csv: field: 3: expected 4", None),
-        (str(InputError("a.csv: \x1b[0m\ud800\u2028\0 " + "9" * 9000)), None),
-    ],
-)
-def test_what_a_refusal_may_say(line, kind):
-    found = contract.refusal_breach(line, ["a.csv"])
-    assert (found and found.kind) == kind
-
-
-def test_places_outside_are_seen(tmp_path):
-    watch = contract.Watch(tmp_path / "own")
-    (tmp_path / "own").mkdir()
-    secret = tmp_path / "secret"
-    secret.write_text("x")
+    assert contract.verdict(read, ["a.csv"])[0].kind.startswith("MemoryError at ")
+    watch, secret = contract.Watch(tmp_path / "made"), tmp_path / "secret"
     with watch:
-        (tmp_path / "own" / "fine").write_text("x")
+        (tmp_path / "made" / "fine").write_text("x")
     assert watch.seen == []
-    with watch:  # one hides none that comes after it
+    with watch:
         secret.write_text("y")
-        secret.read_text()
         secret.unlink()
-    kinds = [breach.kind for breach in watch.seen]
-    assert kinds == ["written outside", "read outside", "os.remove"]
-    other = contract.Breach("KeyError", "")
-    assert contract.broken_by(other, watch.seen[1:2], True) == [other]
-
-
-def test_every_reader_has_its_share():
-    dealt = shares(list(READERS), 1_000_000)
-    assert sum(dealt.values()) >= 1_000_000
-    assert min(dealt.values()) >= sum(dealt.values()) // 60
+    assert [x.kind for x in watch.seen] == ["written outside", "os.remove"]
 
 
 @pytest.mark.slow
 @pytest.mark.multiprocess
-def test_the_command_writes_a_row_per_reader_and_is_guided_or_refuses(tmp_path):
+def test_the_command_writes_a_row_per_reader(tmp_path):
     """Guided in an environment with atheris (`make reliability`)."""
     flags = ("--readers=stages,tfrecord", "--inputs=400", f"--output={tmp_path}")
-    done = fresh("benchmarks.reliability.fuzz", *flags)
-    if not importlib.util.find_spec("atheris"):
-        assert (done.returncode, list(tmp_path.iterdir())) == (2, [])
-        done = fresh("benchmarks.reliability.fuzz", *flags, "--unguided")
+    plain = [] if importlib.util.find_spec("atheris") else ["--unguided"]
+    done = fresh("benchmarks.reliability.fuzz", *flags, *plain)
     assert done.returncode == 0, done.stdout + done.stderr
     rows = json.loads((tmp_path / "fuzz.json").read_text())["rows"]
     assert [row["reader"] for row in rows] == ["stages", "tfrecord"]

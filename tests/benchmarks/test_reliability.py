@@ -48,7 +48,7 @@ def test_disturbed_commands_come_to_the_same(tmp_path, signal, kills):
 
 
 def test_a_broken_resume_is_found(tmp_path):
-    flags = ("--commands=train", "--kills=2", "--moments=work", "--broken_resume")
+    flags = ("--commands=train", "--kills=2", "--work", "--broken_resume")
     done, (row,) = harness(tmp_path, *flags)
     assert done.returncode == 1
     assert row["outcome"].startswith("different: ")

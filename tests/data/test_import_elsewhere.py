@@ -1,11 +1,8 @@
 """Imports in other processes, on a Ray cluster, and killed: the same bytes."""
 
-import signal
 import subprocess
 import sys
-import time
 
-import numpy as np
 import pytest
 
 from rcirl_jax.data import importing
@@ -92,32 +89,21 @@ def here(shards, tmp_path_factory):
 
 
 @pytest.mark.multiprocess
-def test_shards_are_read_by_the_workers(shards, here, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("count", "long", "read_here"), [(None, (), []), (None, [1], [1]), (1, (), [0])]
+)
+def test_shards_are_read_by_the_workers_but_long_ones_and_few(
+    shards, here, tmp_path, monkeypatch, count, long, read_here
+):
+    """One that is longer than the limit, or fewer than workers: in this process."""
+    inputs = [part.input for part in shards]
+    if long:
+        known = [inputs[number] for number in long]
+        monkeypatch.setattr(dealing, "is_long", lambda part: part.input in known)
     read = reads_of_this_process(monkeypatch)
-    manifest = import_parts(shards, tmp_path / "data", ALL_SCENES, executor=TWO)
-    assert read == []
-    assert files_of(tmp_path / "data") == here
-    waymos = [f"scenario-{shard}-{letter}" for shard in range(4) for letter in "ab"]
-    assert manifest.recordings[: len(waymos)] == waymos
-    assert {"sample-000000", "sample-000001"} < set(manifest.recordings)
-
-
-@pytest.mark.multiprocess
-def test_long_shards_are_read_here_between_others(shards, here, tmp_path, monkeypatch):
-    """One shard is longer than the limit: it alone is read in this process."""
-    long = shards[1].input
-    monkeypatch.setattr(dealing, "is_long", lambda part: part.input == long)
-    read = reads_of_this_process(monkeypatch)
-    import_parts(shards, tmp_path / "data", ALL_SCENES, executor=TWO)
-    assert read == [long.name]
-    assert files_of(tmp_path / "data") == here
-
-
-@pytest.mark.multiprocess
-def test_fewer_shards_than_workers_are_read_here(shards, tmp_path, monkeypatch):
-    read = reads_of_this_process(monkeypatch)
-    import_parts(shards[:1], tmp_path / "data", ALL_SCENES, executor=TWO)
-    assert read == [shards[0].input.name]
+    import_parts(shards[:count], tmp_path / "data", ALL_SCENES, executor=TWO)
+    assert read == [inputs[number].name for number in read_here]
+    assert count or files_of(tmp_path / "data") == here
 
 
 def test_a_shard_is_long_beyond_its_formats_limit(shards, monkeypatch):
@@ -230,78 +216,3 @@ def test_no_cluster_is_one_line():
     pytest.importorskip("ray")
     with pytest.raises(InputError, match=r"--ray_address: 127\.0\.0\.1:1: "):
         Ray("127.0.0.1:1")
-
-
-STARTED = """
-import os, signal, sys
-from pathlib import Path
-from rcirl_jax.data import importing
-from rcirl_jax.data.store import files
-from tests.data.small_logs import CONFIG, write_logs
-
-write, left = files.Files.write_many, int(sys.argv[3])
-
-def dying(self, values):
-    global left
-    left -= 1
-    if left < 0:  # half of what it had to write is there
-        write(self, dict(list(values.items())[: len(values) // 2]))
-        os.kill(os.getpid(), signal.SIGKILL)
-    write(self, values)
-
-files.Files.write_many = dying
-importing.SHARD_SCENES = 30
-parts = write_logs(Path(sys.argv[1]))
-print("ready", flush=True)
-importing.import_parts(parts, sys.argv[2], CONFIG)
-"""
-
-
-def imported(logs, data, *, writes=10**9, kill_s=300.0):
-    """An import in a process of its own: (how it ended, how long it took [s]).
-
-    It dies in the middle of a write after some, or is killed some seconds after its
-    start.
-    """
-    arguments = map(str, (logs, data, writes))
-    with subprocess.Popen(
-        [sys.executable, "-c", STARTED, *arguments],
-        stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
-    ) as process:  # fmt: skip
-        assert process.stdout.readline() == "ready\n"
-        begin = time.monotonic()
-        try:
-            process.wait(timeout=kill_s)
-        except subprocess.TimeoutExpired:
-            process.kill()
-    return process.returncode, time.monotonic() - begin
-
-
-@pytest.mark.multiprocess
-def test_an_import_that_dies_while_it_writes_resumes_to_the_same_bytes(local, tmp_path):
-    """Death in the middle of a later mark, and of a later shard."""
-    data = tmp_path / "data"
-    for writes in (3, 2):
-        ended, _ = imported(tmp_path / "logs", data, writes=writes)
-        assert ended == -signal.SIGKILL
-        assert not (data / "manifest.json").exists()
-    import_parts(write_logs(tmp_path / "logs"), data, CONFIG)
-    assert files_of(data) == local
-
-
-@pytest.mark.slow
-def test_twenty_kills_at_random_moments(local, tmp_path):
-    logs = tmp_path / "logs"
-    _, whole = imported(logs, tmp_path / "whole")
-    rng, kills = np.random.default_rng(1), 0
-    for attempt in range(40):
-        data, moment = tmp_path / f"data{attempt}", rng.uniform(0.0, 1.1) * whole
-        ended, _ = imported(logs, data, kill_s=moment)
-        if ended == -signal.SIGKILL:
-            kills += 1
-            if not (data / "manifest.json").exists():
-                assert imported(logs, data)[0] == 0
-        assert files_of(data) == local
-        if kills >= 20:
-            return
-    pytest.fail(f"only {kills} imports were killed before they ended")

@@ -10,7 +10,7 @@ from rcirl_jax.data import importing
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.data.recording import validate_recording
-from rcirl_jax.data.scenes.quality import format_splits
+from rcirl_jax.data.scenes.quality import format_quality, format_splits
 from rcirl_jax.data.store import files
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.rows import check_finite
@@ -77,8 +77,48 @@ def test_bad_input_in_the_middle_leaves_nothing(tmp_path, three):
     assert not (tmp_path / "out").exists()
     lonely = recording(car("ego", speeding_up(20.0), seconds=3.0))
     line = refused(import_logs, [lonely], tmp_path / "out", CONFIG)
-    assert "0 scenes kept of 1 tracks" in line
+    assert "0 scenes kept of 1 tracks: 1 future_too_short: try a lower" in line
     assert not (tmp_path / "out").exists()
+
+
+def test_a_recording_without_traffic_is_counted_and_skipped(tmp_path, three):
+    empty = dataclasses.replace(three[0], name="empty", tracks=())
+    import_logs(three, tmp_path / "plain", CONFIG)
+    made = import_logs([validate_recording(empty), *three], tmp_path / "out", CONFIG)
+    plain = open_dataset(tmp_path / "plain")
+    assert made.count == plain.count
+    assert (made.quality["recordings"], made.quality["empty"]) == (3, 1)
+    assert any(note == "empty: no traffic" for note in made.quality["notes"])
+    assert "1 recordings without traffic skipped" in format_quality(made.quality)
+    line = refused(import_logs, [empty], tmp_path / "none", CONFIG)
+    assert "1 recordings, none with traffic" in line
+    assert not (tmp_path / "none").exists()
+
+
+def test_what_is_guessed_is_counted(tmp_path, three):
+    """No limits and sizes in one of three recordings."""
+    lanes = [dataclasses.replace(x, speed_limit=None) for x in three[0].lanes]
+    lanes = (*lanes[:1], *(dataclasses.replace(x, speed_limit=9.0) for x in lanes[1:]))
+    tracks = [dataclasses.replace(x, size_assumed=True) for x in three[0].tracks]
+    odd = dataclasses.replace(three[0], lanes=lanes, tracks=tuple(tracks))
+    known = [
+        dataclasses.replace(
+            one,
+            lanes=tuple(dataclasses.replace(x, speed_limit=9.0) for x in one.lanes),
+        )
+        for one in three[1:]
+    ]
+    quality = import_logs([odd, *known], tmp_path / "out", CONFIG).quality
+    count = {"speed limit": 1, "width": 0, "size": len(tracks)}
+    whole = {
+        "lanes": sum(len(one.lanes) for one in three),
+        "road users": sum(len(one.tracks) for one in three),
+    }
+    assert quality["assumed"] == {**count, **whole}
+    note = f"{odd.name}: assumed: 1 speed limit 29.06 m/s, {len(tracks)} size"
+    assert note in quality["notes"]
+    said = f"speed limit of 1 of {whole['lanes']} lanes, size of {len(tracks)} of"
+    assert said in format_quality(quality)
 
 
 @pytest.mark.usefixtures("small_shards")
@@ -99,17 +139,6 @@ def test_too_many_names_leave_what_is_finished(tmp_path, monkeypatch, three, nam
     import_logs(named, out, CONFIG)
     assert all(path.stat().st_mtime_ns == when for path, when in kept.items())
     assert files_of(out) == whole
-
-
-# --------------------------------------------------------------------------- splits
-
-
-def test_no_vehicle_in_both_splits(tmp_path, three):
-    import_logs(three, tmp_path / "data", CONFIG)
-    dataset = open_dataset(tmp_path / "data")
-    train, test = dataset.load("train"), dataset.load("test")
-    assert not set(train.vehicle.tolist()) & set(test.vehicle.tolist())
-    assert not set(train.group.tolist()) & set(test.group.tolist())
 
 
 def late(track, since):

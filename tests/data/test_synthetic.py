@@ -1,6 +1,5 @@
 """Synthetic traffic: deterministic, collision free, human, lawful."""
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +10,11 @@ from hypothesis import strategies as st
 
 from rcirl_jax.data.importers.synthetic import reader as synthetic
 from rcirl_jax.data.recording import validate_recording
-from rcirl_jax.data.synthetic import ROADS, RunConfig
+from rcirl_jax.data.synthetic import ROADS
 from rcirl_jax.data.synthetic.drivers import DRIVER, idm_acceleration
 from rcirl_jax.data.synthetic.roads import to_world
 from rcirl_jax.data.synthetic.state import Neighbours, State
 from rcirl_jax.data.synthetic.stops import schedule
-from rcirl_jax.data.synthetic.traffic import Traffic
 from rcirl_jax.runtime.specs import load_toml, spec_root
 from rcirl_jax.types import Recording, Track
 from tests.helpers.logs import refused
@@ -99,32 +97,28 @@ def front_crossing(track: Track, line: np.ndarray) -> float | None:
     return float(track.t[1:][hit][0]) if hit.any() else None
 
 
-def test_same_seed_is_identical_and_another_is_not(tmp_path):
-    first, again = make(tmp_path, noise=0.03), make(tmp_path, noise=0.03)
-    other = make(tmp_path, noise=0.03, seed=4)
+def test_seed_decides_and_the_batch_does_not(tmp_path):
+    first, again, other = (make(tmp_path, seed=seed, noise=0.03) for seed in (3, 3, 4))
     np.testing.assert_array_equal(positions(first[0]), positions(again[0]))
-    assert [t.id for t in first[0].tracks] == [t.id for t in again[0].tracks]
-    assert positions(first[0]).shape != positions(other[0]).shape or not np.allclose(
-        positions(first[0]), positions(other[0])
-    )
-
-
-def test_recording_does_not_depend_on_its_batch(tmp_path):
-    alone = make(tmp_path, count=1)[0]
-    together = make(tmp_path, count=3)
+    assert not np.array_equal(positions(first[0]), positions(other[0]))
+    alone, together = make(tmp_path)[0], make(tmp_path, count=3)
     np.testing.assert_allclose(positions(alone), positions(together[0]), atol=1e-6)
-    names = [recording.name for recording in together]
-    assert len(set(names)) == 3
-    assert [recording.group for recording in together] == names
+    assert len({recording.group for recording in together}) == 3
 
 
-def test_default_is_large_and_valid(default):
-    assert len(default) == 25
+def test_default_is_large_valid_and_human(default):
     assert {r.name.split("-")[0] for r in default} == set(ROADS)
     for recording in default:
         validate_recording(recording)
-    long = sum(t.t.size >= 200 for r in default for t in r.tracks)
-    assert long >= 500
+    tracks = [t for r in default for t in r.tracks if t.t.size > 5]
+    assert sum(t.t.size >= 200 for t in tracks) >= 500
+    a = np.concatenate([np.gradient(t.speed, 0.1) for t in tracks])
+    j = np.concatenate([np.gradient(np.gradient(t.speed, 0.1), 0.1) for t in tracks])
+    assert -8.0 < a.min() < a.max() < 2.6
+    # hard braking is rare in human driving, but everyday braking is there
+    assert np.mean(a < -4.0) < 2e-3
+    assert np.mean(a < -1.0) > 0.01
+    assert np.mean(np.abs(j) > 5.0) < 2e-3
 
 
 @pytest.mark.parametrize("road", [None, *sorted(ROADS)])
@@ -133,28 +127,6 @@ def test_boxes_never_overlap(default, tmp_path, road):
     few = {"duration": 20.0, "count": 2, "seed": 77}
     for recording in make(tmp_path, road=road, **few) if road else default:
         assert overlaps(recording) == 0, recording.name
-
-
-def test_accelerations_and_jerks_are_human(default):
-    tracks = [t for r in default for t in r.tracks if t.t.size > 5]
-    a = np.concatenate([np.gradient(t.speed, 0.1) for t in tracks])
-    j = np.concatenate([np.gradient(np.gradient(t.speed, 0.1), 0.1) for t in tracks])
-    assert a.min() > -8.0
-    assert a.max() < 2.6
-    # hard braking is rare in human driving, but everyday braking is there
-    assert np.mean(a < -4.0) < 2e-3
-    assert np.mean(a < -1.0) > 0.01
-    assert np.mean(np.abs(j) > 5.0) < 2e-3
-
-
-def test_lateral_acceleration_in_turns_is_comfortable(default):
-    for recording in default:
-        for track in recording.tracks:
-            if track.t.size < 10 or "turn" not in recording.name:
-                continue
-            yaw_rate = np.gradient(np.unwrap(track.heading), 0.1)
-            lateral = np.abs(yaw_rate * track.speed)
-            assert lateral.max() < 3.0, (recording.name, track.id)
 
 
 def test_positions_agree_with_heading_speed_and_clock(tmp_path):
@@ -205,28 +177,19 @@ def test_stop_signs_are_obeyed(default):
 
 
 def test_lane_changes_happen_and_are_smooth(default):
-    changes = 0
-    for recording in default:
-        if "highway_straight" not in recording.name:
-            continue
-        for track in recording.tracks:
-            offset = track.y - track.y[0]
-            changes += int(abs(offset[-1]) > 2.5)
-            assert np.abs(np.diff(track.y)).max() < 0.45
-    assert changes > 30
+    roads = [r for r in default if "highway_straight" in r.name]
+    tracks = [track for recording in roads for track in recording.tracks]
+    assert all(np.abs(np.diff(track.y)).max() < 0.45 for track in tracks)
+    assert sum(abs(track.y[-1] - track.y[0]) > 2.5 for track in tracks) > 30
 
 
 def test_some_drivers_reach_their_destination(default):
     tracks = [t for r in default for t in r.tracks if t.destination is not None]
-    assert len(tracks) >= 15
-    share = len(tracks) / sum(len(r.tracks) for r in default)
-    assert 0.01 < share < 0.08
-    gaps = []
-    for track in tracks:
-        if track.speed[-1] < 0.1:
-            x, y = track.destination
-            gaps.append(np.hypot(track.x[-1] - x, track.y[-1] - y))
-    assert np.sum(np.array(gaps) < 2.0) >= 10
+    assert 0.01 < len(tracks) / sum(len(r.tracks) for r in default) < 0.08
+    ends = [(t.x[-1], t.y[-1]) for t in tracks if t.speed[-1] < 0.1]
+    wanted = [t.destination for t in tracks if t.speed[-1] < 0.1]
+    gaps = np.linalg.norm(np.subtract(ends, wanted), axis=1)
+    assert np.sum(gaps < 2.0) >= 10
 
 
 # one driver and car for everybody; values inside the human ranges
@@ -240,28 +203,6 @@ SAME = {
 def closed_form_gap(v: float, v0: float) -> float:
     """s_e = (s0 + v T) / sqrt(1 - (v / v0)^4), m."""
     return (2.0 + 1.3 * v) / np.sqrt(1.0 - (v / v0) ** 4)
-
-
-def test_platoon_settles_at_the_equilibrium_gap():
-    config = synthetic.driver_config(DEFAULT, load_toml(DEFAULT)["drivers"])
-    config = dataclasses.replace(config, noise_mps2=0.0)
-    about = {"road": "highway_straight", "seed": (0,), "warmup_s": 0.0}
-    run = RunConfig(**about, duration_s=10.0, density_veh_per_km=5.0)
-    traffic = Traffic([run], config)
-    source, state = traffic.sources[0], traffic.state
-    state.vehicle[:] = -1
-    for name, value in SAME.items():
-        source.pool[name] = value
-    v, v0 = 15.0, 30.0
-    source.pool["speed_factor"][source.used] = v / v0  # the leader
-    gap = closed_form_gap(v, v0)
-    for place in range(5):
-        traffic.add(0, 1, 330.0 - place * (4.5 + 1.2 * gap), v)
-    source.next_arrival[:] = np.inf
-    while state.s.max() < 1090.0 and state.alive.sum() == 5:
-        traffic.step()
-    order = np.sort(state.s[state.alive])[::-1]
-    np.testing.assert_allclose(-np.diff(order) - 4.5, gap, rtol=0.01)
 
 
 @settings(max_examples=20)
@@ -318,22 +259,6 @@ def test_roads_are_what_they_say(name):
         assert road.kappa.min() < 0.0 < road.kappa.max()
 
 
-def test_lanes_are_linked_and_parallel(default):
-    for recording in default[::4]:
-        lanes = {lane.id: lane for lane in recording.lanes}
-        for lane in recording.lanes:
-            steps = np.linalg.norm(np.diff(lane.centre, axis=0), axis=1)
-            assert steps.max() < 2.7
-            for following in lane.successors:
-                gap = lanes[following].centre[0] - lane.centre[-1]
-                np.testing.assert_allclose(gap, 0.0, atol=1e-9)
-            if lane.left is not None:
-                assert lanes[lane.left].right == lane.id
-                apart = np.linalg.norm(lanes[lane.left].centre - lane.centre, axis=1)
-                width = lane.left_width + lanes[lane.left].right_width
-                np.testing.assert_allclose(apart, width, atol=1e-6)
-
-
 @settings(max_examples=20)
 @given(st.floats(0.0, 49.9), st.floats(5.0, 300.0))
 def test_schedule_covers_the_recording(offset, end):
@@ -353,21 +278,16 @@ def test_schedule_covers_the_recording(offset, end):
     ("old", "new", "field"),
     [
         ("rate_hz = 10.0", "rate_hz = -1.0", "rate_hz"),
-        ("rate_hz = 10.0", 'rate_hz = "fast"', "rate_hz"),
         ("warmup_s", "warm_up_s", "warm_up_s"),
         ('road = "stop_sign"', 'road = "moon"', "recordings[7]: road"),
-        ("count = 6", "count = 1.5", "recordings[4]: count"),
         ("count = 6", "count = 0", "recordings[4]: count"),
         ("seed = 7", "sead = 7", "recordings[7]: sead"),
         ("density_veh_per_km = 12.0\n", "", "recordings[4]: density_veh_per_km"),
         ("duration_s = 60.0", "duration_s = nan", "recordings[1]: duration_s"),
         ("[1.0, 0.1, 0.7, 1.3]", "[1.0, 0.1]", "drivers: speed_factor"),
         ("jam_gap_m = [1.0, 4.0]", "jam_gap_m = [4.0, 1.0]", "drivers: jam_gap_m"),
-        ("jam_gap_m = [1.0", "jam_gap_m = [0.0", "drivers: jam_gap_m"),
-        ("jerk_mps3 = 3.0", "jerk_mps3 = true", "drivers: jerk_mps3"),
         ("politeness", "rudeness", "drivers: rudeness"),
         ("destination_share = 0.05", "destination_share = 2.0", "destination_share"),
-        ('source = "', "source = 1 # ", "source"),
     ],
 )
 def test_bad_toml_is_one_clear_line(tmp_path, old, new, field):
@@ -378,20 +298,3 @@ def test_bad_toml_is_one_clear_line(tmp_path, old, new, field):
     line = refused(synthetic.recordings, path, load_toml(path))
     assert str(path) in line
     assert field in line
-
-
-def test_recordings_of_all_entries_are_limited(tmp_path, monkeypatch):
-    path = tmp_path / "many.toml"
-    text = SMALL.format(noise=0.0, road="stop_sign", count=3, duration=10.0, seed=3)
-    path.write_text(text + text[text.index("[[") :])
-    monkeypatch.setattr(synthetic, "MAX_RECORDINGS", 6)
-    synthetic.recordings(path, load_toml(DEFAULT))
-    monkeypatch.setattr(synthetic, "MAX_RECORDINGS", 5)
-    line = refused(synthetic.recordings, path, load_toml(DEFAULT))
-    assert "recordings[2]: count: 3 after 3" in line
-
-
-def test_broken_toml_names_the_file(tmp_path):
-    path = tmp_path / "broken.toml"
-    path.write_text("rate_hz = = 1")
-    assert "broken.toml" in refused(synthetic.recordings, path, {})

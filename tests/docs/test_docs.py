@@ -1,6 +1,5 @@
 """The pages name things that exist: pages, anchors, files, commands, flags, numbers."""
 
-import functools
 import importlib.util
 import json
 import os
@@ -36,9 +35,6 @@ PLACEHOLDER = re.compile(r"[A-Z]{3}")  # NAME.toml, SCENE.csv
 BUILT_IN = {"help", "helpfull"}
 # what has a path's shape in prose, but is made by a command or by the reader
 ELSEWHERE = {"out", "build"}
-
-
-# ------------------------------------------------------------- links and paths
 
 
 @pytest.mark.parametrize("page", ALL, ids=name_of)
@@ -88,8 +84,6 @@ def test_make_targets_exist(page):
         for target in re.findall(r"^make ([a-z-]+)\b", block, re.M):
             assert re.search(rf"^{target}:", makefile, re.M), target
 
-
-# ------------------------------------------------------------------- commands
 
 LIST_FLAGS = """
 import importlib, json, sys
@@ -145,7 +139,6 @@ def values():
     return found
 
 
-@functools.cache
 def known_flags():
     """Module -> its flags, and values that are none; one process imports all."""
     named = sorted({module for _, module, _ in commands() if is_main(module)})
@@ -158,28 +151,21 @@ def known_flags():
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def test_commands_name_modules_and_flags():
-    wrong = []
+def test_commands_name_modules_flags_and_values_that_they_take():
+    """--suite=smok, --epochs=ten: a page would say what no longer runs."""
+    known, refused = known_flags()
+    wrong = [*refused]
     for page, module, rest in commands():
         path = REPO / module.replace(".", "/")
         if not path.with_suffix(".py").is_file() and not path.is_dir():
             wrong.append(f"{page}: {module}: no such module")
         elif is_main(module):
-            flags = set(known_flags()[0][module]) | BUILT_IN
+            flags = set(known[module]) | BUILT_IN
             names = {name.removeprefix("no") if name not in flags else name
                      for name in FLAG.findall(rest)}  # fmt: skip
             wrong += [f"{page}: {module}: --{name}" for name in sorted(names - flags)]
     assert not wrong, "\n".join(wrong)
-    assert len(known_flags()[0]) > 15
-
-
-def test_commands_have_values_that_their_flags_take():
-    """--suite=smok, --epochs=ten: a page would say what no longer runs."""
-    refused = known_flags()[1]
-    assert not refused, "\n".join(refused)
-
-
-# -------------------------------------------------------------------- numbers
+    assert len(known) > 15
 
 
 @pytest.mark.parametrize("preset", PRESETS, ids=lambda path: path.stem)
@@ -202,9 +188,6 @@ def test_the_gates_margins_and_exit_status_are_those_of_the_code():
     assert {k: float(v) for k, v in stated.items()} == GateConfig().margins
     rows = table(section(text, "## Verdicts and exit status"))
     assert {row[0]: int(row[2]) for row in rows} == EXIT_CODES
-
-
-# ----------------------------------------------------------------------- site
 
 
 def test_the_site_builds_and_needs_no_network(tmp_path):

@@ -1,14 +1,12 @@
 """docs/reliability.md: what its rows name is there, and how a row is run."""
 
-import json
 import re
 import sys
 
 import pytest
 
 from benchmarks.reliability import table
-from benchmarks.reliability.table import Row, rows_of, summed_up, words
-from rcirl_jax.errors import InputError
+from benchmarks.reliability.table import Row, rows_of, words
 from tests.docs.pages import DOCS, REPO
 
 ROWS = rows_of((DOCS / "reliability.md").read_text())
@@ -35,36 +33,6 @@ def test_what_a_row_runs_is_there(row):
         assert word in names or f'"{word}"' in text, word
 
 
-def test_a_row_without_minutes_is_one_line():
-    assert {row.command for row in ROWS} >= set(table.WORLD)
-    line = "| SIGKILL | at random | 3 | the same | soon | `make test` |"
-    with pytest.raises(InputError, match="SIGKILL: minutes: soon: expected a number"):
-        rows_of(line)
-    assert rows_of("| a | b |\n" + line.replace("soon", "2"))[0].command == "make test"
-
-
-TWO = "12 passed in 3.10s\nmake[1]: Leaving directory '/x'\n"
-BAD = "make: *** [Makefile:9: x] Error 1"
-
-
-@pytest.mark.parametrize(
-    ("stdout", "stderr", "status", "said", "skipped"),
-    [
-        (TWO, "WARNING: Location '/x' is ignored", 0, "12 passed in 3.10s", False),
-        ("1 passed, 2 skipped in 0.1s\n" + TWO, "", 0,
-         "1 passed, 2 skipped in 0.1s", True),
-        ("5 skipped files\n", "", 0, "5 skipped files", False),
-        ("1 failed, 3 passed in 1.0s\n", BAD, 2, "1 failed, 3 passed in 1.0s", False),
-        (TWO, f"error: audit: none\n{BAD}\n", 2, "error: audit: none", False),
-        ("fuzz: 4,259,727 inputs, no crash\n", "stat::peak_rss_mb: 616", 0,
-         "fuzz: 4,259,727 inputs, no crash", False),
-        ("", "", 0, "", False),
-    ],
-)  # fmt: skip
-def test_what_sums_it_up(stdout, stderr, status, said, skipped):
-    assert summed_up(stdout, stderr, status) == (said, skipped)
-
-
 @pytest.mark.multiprocess
 def test_a_row_whose_tests_are_skipped_has_not_run(tmp_path):
     test = tmp_path / "test_it.py"
@@ -75,20 +43,3 @@ def test_a_row_whose_tests_are_skipped_has_not_run(tmp_path):
         command = f"pytest {test} -p no:cacheprovider -k {chosen}"
         row = Row(fault="a", count="1", minutes=1, command=command)
         assert table.ran(row)["status"] == status
-
-
-def test_a_row_is_run_again_if_it_failed_or_the_code_is_another(tmp_path):
-    """Or if it depends on what others publish."""
-    path = tmp_path / "reliability.json"
-    told = [("make a", 0, "this"), ("make b", 1, "this"), ("make c", 0, "other"),
-            (table.WORLD[0], 0, "this")]  # fmt: skip
-    rows = [
-        {"fault": "a", "command": command, "status": status, "tree_sha256": code}
-        for command, status, code in told
-    ]
-    path.write_text(json.dumps({"rows": rows}))
-    assert [*table.as_stated_before(path, "this")] == [("a", "make a")]
-    path.write_text("[]")
-    with pytest.raises(InputError, match=r"reliability\.json: expected a result of"):
-        table.as_stated_before(path, "this")
-    assert table.as_stated_before(tmp_path / "none.json", "this") == {}

@@ -75,9 +75,6 @@ def test_all_commands_run_in_order(folder):
     def of(part):
         return "".join(text for line, text in said.items() if part in line)
 
-    assert "scenes kept" in of("import_logs")
-    assert "verdict: DO NOT SHIP" in of("autotune")
-    assert "verdict: COULD NOT JUDGE" in of("experiments.gate")
     for made in ("look/index.html", "tune/report.html", "case/case.html"):
         assert (folder / "out" / made).stat().st_size > 1000, made
     assert (folder / "out" / "verdict.json").is_file()

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -218,6 +218,7 @@ def test_mcnemar_is_twice_the_smaller_tail_of_coins(b, c):
     assert mcnemar_exact(b, c) == mcnemar_exact(c, b)
 
 
+@example([0.02, 0.022, 0.9])  # the second, alone, would be rejected at 0.05
 @given(st.lists(st.floats(0.0, 1.0), min_size=0, max_size=8))
 def test_holm_equals_the_step_down_rule(p):
     adjusted = holm(np.array(p))

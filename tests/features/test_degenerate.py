@@ -121,9 +121,6 @@ def test_random_scenes_have_finite_slopes(seed, moves, num):
     assert finite(slope(made, s))
 
 
-# ------------------------------------------------------------------- the losses
-
-
 def demonstrations():
     """The scenes, each with a human who keeps the ego's speed."""
     like = jax.tree.map(jnp.asarray, demonstration(0))
@@ -184,9 +181,6 @@ def test_slopes_by_parameters_are_finite(loss):
             # nobody wins a comparison with itself, and there is no slope
             assert float(sums.wins) == pytest.approx(0.5 * float(sums.pairs), rel=1e-2)
             assert most < 1e-2
-
-
-# -------------------------------------------------------- the operator's oracle
 
 
 @given(

@@ -82,16 +82,6 @@ def test_many_points_are_projected_as_one_by_one_also_between_legs(legs_apart):
         np.testing.assert_array_equal(one, other)
 
 
-@given(seed=st.integers(0, 1000))
-def test_round_trip_from_cartesian(seed):
-    line = line_of(curve("s_curve"))
-    rng = np.random.default_rng(seed)
-    base = curve("s_curve")[rng.integers(5, 90)]
-    point = base + rng.uniform(-5.0, 5.0, 2)
-    back = placed(line, *project_points(line, point[None]))
-    np.testing.assert_allclose(back[0], point, atol=0.01)
-
-
 @pytest.mark.parametrize("kind", ["straight", "circle", "s_curve"])
 def test_shapely_projects_to_the_same_station(kind):
     points = curve(kind)

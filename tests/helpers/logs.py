@@ -4,7 +4,9 @@ import importlib
 
 import pytest
 
+from rcirl_jax.data.cut import cut
 from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import load_toml, spec_root
 
@@ -36,6 +38,13 @@ def refused(call, *args, **options):
     return line
 
 
+def edit(path, old, new, count=1):
+    """Put other text where `old` stands in a file."""
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, count))
+
+
 def lanes_of(recording):
     """Lanes by their ids."""
     return {lane.id: lane for lane in recording.lanes}
@@ -44,3 +53,17 @@ def lanes_of(recording):
 def tracks_of(recording):
     """Tracks by their ids."""
     return {track.id: track for track in recording.tracks}
+
+
+def scenes_of(recordings, min_future_s):
+    """(track, frame) -> its human's stations, of all scenes; each is met once."""
+    config = CollectConfig(
+        require_obstacles=False, require_speed_change=False, min_future_s=min_future_s
+    )
+    found = {}
+    for made in (cut(recording, config) for recording in recordings):
+        for row, name in enumerate(made.vehicles):
+            key = (name.rpartition(":")[2], int(made.scenes.frame[row]))
+            assert key not in found, "one scene twice"
+            found[key] = made.scenes.human.s[row]
+    return found

@@ -18,7 +18,6 @@ DONE = "#2097152\tpulse  cov: 9\nDone 4259000 runs in 721 second(s)\nstat::a: 1\
          "fuzz: 4,259,727 inputs, no crash\n", 0),
         (DONE, 77, "", 77),
         (DONE.replace("4259000", "3999"), 0, "", 1),
-        ("INFO: nothing\n", 0, "", 1),
     ],
 )  # fmt: skip
 def test_the_last_line(said, status, out, ends):

@@ -149,20 +149,6 @@ def test_equals_brute_force_on_a_small_lattice(seed):
     np.testing.assert_array_equal(np.asarray(plan.n)[:6], best[:6])
 
 
-@pytest.mark.slow
-def test_a_nested_lattice_is_never_worse():
-    fine = DpConfig(step=1.0, max_speed=26.0, max_way=160.0)
-    gains = []
-    for seed in (1, 4, 5):
-        made, w = scene_of(seed), weights(seed)
-        values = [float(planner(c)(made, w).value) for c in (COARSE, MIDDLE, fine)]
-        assert values[1] >= values[0] - 1e-3
-        assert values[2] >= values[1] - 1e-3
-        gains.append((values[1] - values[0], values[2] - values[1]))
-    # it converges: the second halving gains less than the first, on the whole
-    assert sum(b for _, b in gains) < sum(a for a, _ in gains)
-
-
 def test_walls_and_bodies_are_not_entered():
     for seed in range(6):
         made = scene_of(seed)

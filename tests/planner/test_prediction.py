@@ -7,7 +7,6 @@ import pytest
 
 from rcirl_jax.data.scenes.assemble import assemble
 from rcirl_jax.data.scenes.collect import Collector
-from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.planner.plan import held
 from rcirl_jax.planner.prediction import (
     NUM_BODIES,
@@ -17,13 +16,12 @@ from rcirl_jax.planner.prediction import (
     predict,
     relevant,
 )
-from rcirl_jax.simulation.recorded.cases import recorded_cases
-from rcirl_jax.simulation.recorded.config import RecordedConfig
+from rcirl_jax.simulation.recorded.scenes import case_of
 from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases
-from rcirl_jax.types import Kind, Track
+from rcirl_jax.types import Kind
 from rcirl_jax.units import DT_S, TIMES_S
 from tests.helpers.scenes import random_scene, scene
-from tests.simulation.test_recorded import straight
+from tests.simulation.stored import CUT, straight, tracks
 
 PREDICT = jax.jit(predict)
 AS_SEEN = jax.jit(as_seen)
@@ -41,22 +39,50 @@ def bodies(*rows):
     return jax.tree.map(jnp.asarray, Bodies(**leaves))
 
 
-def test_without_a_leader_the_present_acceleration_fades():
-    made = scene(v=0.0, l=-30.0)
-    s, l, v = PREDICT(bodies({"s": 20.0, "speed": 10.0, "a": 1.0}), made.ego, made.path)
-    steps = np.exp(-TIMES_S[:-1].astype(float) / 2.0) * DT_S
-    speed = 10.0 + np.append(0.0, np.cumsum(steps))
-    np.testing.assert_allclose(v[0], speed, atol=1e-4)
-    way = np.append(0.0, np.cumsum(0.5 * (speed[1:] + speed[:-1]) * DT_S))
-    np.testing.assert_allclose(s[0], 20.0 + way, atol=1e-3)
-    np.testing.assert_allclose(l[0], 0.0, atol=1e-6)
+FADING = 10.0 + np.append(
+    0.0, np.cumsum(np.exp(-TIMES_S[:-1].astype(float) / 2.0) * DT_S)
+)
+CAR, STOPS, WALKER = {"s": 9.0, "speed": 8.0}, Kind.STATIC, Kind.PEDESTRIAN
+# the others, and of the first of them a leaf and its values; lanes are 3.6 m wide
+ALONE = {
+    "the present acceleration fades": (
+        [{"speed": 10.0, "a": 1.0}],
+        {"v": FADING, "l": 0.0 * TIMES_S},
+    ),
+    "hard braking goes on until standing": (
+        [{**CAR, "a": -4.0}],
+        {"v": np.maximum(8.0 - 4.0 * TIMES_S, 0.0)},
+    ),
+    "who crosses keeps its velocity": (
+        [{"l": -6.0, "l_dot": 1.4, "kind": WALKER}],
+        {"l": -6.0 + 1.4 * TIMES_S},
+    ),
+    "who comes towards keeps its velocity": (
+        [{"s": 80.0, "l": 3.5, "speed": -9.0}],
+        {"s": 80.0 - 9.0 * TIMES_S},
+    ),
+    "a lane change ends in the middle of the lane": (
+        [{"l": 0.5, "speed": 12.0, "l_dot": 0.8}],
+        {"l": np.minimum(0.5 + 0.8 * TIMES_S, 3.6)},
+    ),
+    "who stands waits for the leader": ([{}, {"s": 8.0}], {"s": 0.0 * TIMES_S}),
+    "static things stay": ([{"s": 30.0, "kind": STOPS}], {"s": 0 * TIMES_S + 30.0}),
+}
 
 
-def test_hard_braking_goes_on_until_standing():
+@pytest.mark.parametrize("name", ALONE)
+def test_what_is_predicted_of_one(name):
+    rows, wanted = ALONE[name]
     made = scene(v=0.0, l=-30.0)
-    s, _, v = PREDICT(bodies({"s": 9.0, "speed": 8.0, "a": -4.0}), made.ego, made.path)
-    np.testing.assert_allclose(v[0], np.maximum(8.0 - 4.0 * TIMES_S, 0.0), atol=1e-4)
-    assert float(s[0, -1]) == pytest.approx(9.0 + 8.0, abs=0.3)
+    found = dict(zip("slv", PREDICT(bodies(*rows), made.ego, made.path), strict=True))
+    for leaf, values in wanted.items():
+        np.testing.assert_allclose(found[leaf][0], values, atol=1e-3)
+
+
+def test_who_stands_follows_a_leader_that_drives_off():
+    made = scene(v=0.0, l=-30.0)
+    s, _, _ = PREDICT(bodies({}, {"s": 8.0, "speed": 6.0}), made.ego, made.path)
+    assert float(s[0, -1]) > 5.0
 
 
 def test_a_follower_slows_down_behind_its_leader_and_keeps_its_headway():
@@ -69,36 +95,6 @@ def test_a_follower_slows_down_behind_its_leader_and_keeps_its_headway():
     # alone it would be where the leader is
     alone, _, _ = PREDICT(bodies({"s": 0.0, "speed": 15.0}), made.ego, made.path)
     assert float(alone[0, -1]) == pytest.approx(120.0, abs=1e-3)
-
-
-def test_who_stands_waits_for_the_leader_and_static_things_stay():
-    made = scene(v=0.0, l=-30.0)
-    queue = bodies({"s": 0.0}, {"s": 8.0}, {"s": 30.0, "kind": Kind.STATIC})
-    s, _, _ = PREDICT(queue, made.ego, made.path)
-    np.testing.assert_allclose(s, np.array([0.0, 8.0, 30.0])[:, None] + 0 * s)
-    moving = bodies({"s": 0.0}, {"s": 8.0, "speed": 6.0})
-    s, _, _ = PREDICT(moving, made.ego, made.path)
-    assert float(s[0, -1]) > 5.0
-
-
-def test_crossing_and_oncoming_bodies_keep_their_velocity():
-    made = scene(v=0.0)
-    both = bodies(
-        {"s": 20.0, "l": -6.0, "l_dot": 1.4, "kind": Kind.PEDESTRIAN},
-        {"s": 80.0, "l": 3.5, "speed": -9.0},
-    )
-    s, l, v = PREDICT(both, made.ego, made.path)
-    np.testing.assert_allclose(l[0], -6.0 + 1.4 * TIMES_S, atol=1e-5)
-    np.testing.assert_allclose(s[1], 80.0 - 9.0 * TIMES_S, atol=1e-4)
-    np.testing.assert_allclose(v[1], -9.0)
-
-
-def test_a_lane_change_ends_in_the_middle_of_the_lane():
-    made = scene(v=0.0)  # lanes 3.6 m wide, the ego's centred at 0
-    _, l, _ = PREDICT(
-        bodies({"s": 20.0, "l": 0.5, "speed": 12.0, "l_dot": 0.8}), made.ego, made.path
-    )
-    np.testing.assert_allclose(l[0], np.minimum(0.5 + 0.8 * TIMES_S, 3.6), atol=1e-4)
 
 
 def test_the_most_relevant_bodies_come_first():
@@ -126,17 +122,6 @@ def test_what_is_seen_depends_on_the_present_alone(seed):
     assert one.obstacles.kind.shape == (NUM_BODIES + 2,)
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_to_look_twice_shows_the_same(seed):
-    once = AS_SEEN(jax.tree.map(jnp.asarray, random_scene(seed)))
-    twice = AS_SEEN(once)
-    known = np.asarray(once.obstacles.valid)
-    for name in ("s_lower", "s_upper", "l_lower", "l_upper", "speed"):
-        a, b = (np.asarray(getattr(x.obstacles, name)) for x in (once, twice))
-        np.testing.assert_allclose(a[known], b[known], atol=1e-3)
-    np.testing.assert_array_equal(known, twice.obstacles.valid)
-
-
 @pytest.mark.parametrize("predicted", [True, False])
 def test_either_future_of_a_scene(predicted):
     made = jax.tree.map(jnp.asarray, random_scene(2))
@@ -152,45 +137,22 @@ def test_either_future_of_a_scene(predicted):
 # ------------------------------------------------------------- through both doors
 
 
-def tracks():
-    """An ego at 12 m/s behind a leader that brakes, a car beside, one behind."""
-    t = np.arange(0.0, 20.01, 0.1)
-
-    def track(name, s0, v0, a, y):
-        moving = np.minimum(t, -v0 / a) if a < 0 else t
-        x = s0 + v0 * moving + 0.5 * a * moving**2
-        return Track(
-            id=name, kind=Kind.VEHICLE, length=4.6, width=1.9, t=t, x=x,
-            y=np.full_like(t, y), heading=0.0 * t, speed=np.maximum(v0 + a * t, 0.0),
-        )  # fmt: skip
-
-    return (
-        track("ego", 60.0, 12.0, -0.2, 0.0),
-        track("leader", 100.0, 12.0, -0.3, 0.0),
-        track("beside", 70.0, 13.0, 0.0, 3.5),
-        track("behind", 30.0, 11.0, 0.0, 0.0),
-    )
-
-
 def test_one_scene_through_both_doors():
-    """A log as training data and the same log driven: equal arrays."""
+    """A log as training data, and driven from a scene of a second before: equal."""
     recording = straight(tracks())
-    config = CollectConfig(
-        smoothing_s=0.0, require_speed_change=False, require_obstacles=False
-    )
-    rows = [row for row in Collector(recording, config).scenes() if row["track"] == 0]
-    row = rows[4]
-    frame, none = int(row["frame"]), [0]
-    made = assemble([row], vehicles=none, groups=none, recording=0)
+    rows = [row for row in Collector(recording, CUT).scenes() if row["track"] == 0]
+    first, last = rows[2], rows[4]
+    steps, none = int(last["frame"] - first["frame"]), [0, 0]
+    made = assemble([first, last], vehicles=none, groups=none, recording=0)
     assert made.scene.time_valid.all()
-    offline = AS_SEEN(jax.tree.map(lambda x: jnp.asarray(x[0]), made.scene))
+    offline = AS_SEEN(jax.tree.map(lambda x: jnp.asarray(x[1]), made.scene))
 
-    cases, ids = recorded_cases([recording], RecordedConfig(smoothing_s=0.0))
+    case = case_of(jax.tree.map(lambda x: np.asarray(x)[0], made))
+    cases = jax.tree.map(lambda x: np.asarray(x)[None], case)
     human = lambda params, scene, key, before: held(scene.ego.v, 0.0 * scene.ego.v)  # noqa: E731
-    config = RolloutConfig(steps=frame + 10, follow_log=True, scenes=True)
+    config = RolloutConfig(steps=steps + 10, follow_log=True, scenes=True)
     _, _, scenes = drive_cases(human, None, cases, config)
-    ego = ids.index("hand:ego")
-    online = jax.tree.map(lambda x: np.asarray(x)[ego, frame], scenes)
+    online = jax.tree.map(lambda x: np.asarray(x)[0, steps], scenes)
 
     np.testing.assert_array_equal(offline.time_valid, online.time_valid)
     np.testing.assert_array_equal(offline.obstacles.valid, online.obstacles.valid)
@@ -202,7 +164,7 @@ def test_one_scene_through_both_doors():
         ("ego", ("s", "l", "dl", "v", "a", "length", "width"), ..., 2e-3),
         ("path", roads, ..., 2e-3),
         ("obstacles", ("kind", "a", "l_dot"), known, 5e-3),
-        ("obstacles", boxes, known, 2e-2),
+        ("obstacles", boxes, known, 5e-2),
     ):
         for name in names:
             one, two = (getattr(getattr(x, part), name) for x in (offline, online))

@@ -27,7 +27,6 @@ from rcirl_jax.planner.rank import (
     rank_policy,
     velocity_score,
 )
-from rcirl_jax.reward import RewardConfig, value
 from rcirl_jax.types import Kind
 from tests.helpers.scenes import random_scene, sampled
 from tests.planner.test_dp import weights
@@ -54,28 +53,6 @@ def test_drives_the_best_admissible_candidate(seed):
     if ok.any():
         best = int(np.argmax(np.where(ok, scores, -np.inf)))
         np.testing.assert_allclose(plan.s, candidates.trajectory.s[best], atol=1e-3)
-
-
-def test_scores_are_the_reward_of_training():
-    made = scene_of(2)
-    candidates = sampled(jax.random.key(0), made, ONLINE)
-    params, norm = weights()
-    mask = jnp.broadcast_to(made.time_valid, (64, 18))
-    shape = RewardConfig(pin="none")
-    expected = value(
-        params, norm, FEATURES.of_candidates(made, candidates), mask, shape
-    )
-    np.testing.assert_allclose(
-        SCORE((params, norm), made, candidates), expected, rtol=1e-5, atol=1e-5
-    )
-
-
-def test_order_of_the_obstacles_does_not_matter():
-    made, key = scene_of(3), jax.random.key(3)
-    order = jnp.asarray(np.random.default_rng(0).permutation(16))
-    shuffled = made.replace(obstacles=jax.tree.map(lambda x: x[order], made.obstacles))
-    one, two = POLICY(weights(), made, key), POLICY(weights(), shuffled, key)
-    np.testing.assert_allclose(one.s, two.s, atol=1e-3)
 
 
 def test_command_leads_the_lag_so_that_the_plan_is_met():

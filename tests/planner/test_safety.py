@@ -84,31 +84,13 @@ def straight(made, v):
     )
 
 
-def with_obstacle(kind, s, l, v=10.0, speed=0.0, sideways=0.0, length=4.0, width=1.8):
+def with_obstacle(kind, s, l, v=10.0, sideways=0.0, **box):
     """A straight empty road with one obstacle; the ego drives v."""
-    made = jax.tree.map(jnp.asarray, scene())
-    o, t = made.obstacles, jnp.asarray(TIMES_S)
-    empty = jnp.zeros_like(o.s_lower)
-    row = lambda x: empty.at[0].set(x)  # noqa: E731
-    return made.replace(
-        ego=made.ego.replace(v=jnp.float32(v), a=jnp.float32(0), l=jnp.float32(0),
-                             dl=jnp.float32(0), ddl=jnp.float32(0)),
-        path=made.path.replace(
-            l=jnp.zeros_like(made.path.l), kappa=jnp.zeros_like(made.path.kappa),
-            speed_limit=jnp.full_like(made.path.l, 30.0),
-            road_left=jnp.full_like(made.path.l, 6.0),
-            road_right=jnp.full_like(made.path.l, -6.0),
-        ),
-        obstacles=o.replace(
-            s_lower=row(s - length / 2 + speed * t),
-            s_upper=row(s + length / 2 + speed * t),
-            l_lower=row(l - width / 2 + sideways * t),
-            l_upper=row(l + width / 2 + sideways * t),
-            speed=row(speed + 0.0 * t), valid=jnp.zeros_like(o.valid).at[0].set(True),
-            kind=jnp.zeros_like(o.kind).at[0].set(int(kind)),
-        ),
-        time_valid=jnp.ones_like(made.time_valid),
-    )  # fmt: skip
+    usual = {"length": 4.0, "width": 1.8, "kind": kind, "s": s, "l": l}
+    made = scene(v=v, speed_limit=30.0, boxes=[{**usual, **box}] * (kind != Kind.NONE))
+    o, aside = made.obstacles, sideways * jnp.asarray(TIMES_S)
+    edges = {"l_lower": o.l_lower + aside, "l_upper": o.l_upper + aside}
+    return made.replace(obstacles=o.replace(**edges))
 
 
 def test_a_body_that_slips_through_between_two_times_is_caught():
@@ -123,24 +105,32 @@ def test_a_body_that_slips_through_between_two_times_is_caught():
     assert float(found[0]) == pytest.approx(float(TIMES_S[4]))
 
 
-def test_lines_are_walls_until_they_are_passed():
-    wall = with_obstacle(Kind.STOP, 30.0, 0.0, length=0.1, width=40.0)
-    assert not bool(judge(wall, straight(wall, 10.0)).admissible[0])
-    assert bool(judge(wall, straight(wall, 2.0)).admissible[0])
-    passed = with_obstacle(Kind.STOP, 1.0, 0.0, length=0.1, width=40.0)
-    assert bool(judge(passed, straight(passed, 10.0)).admissible[0])
+def on_path(made, **changes):
+    flat = jnp.ones_like(made.path.l)
+    paths = {name: value * flat for name, value in changes.items()}
+    return made.replace(path=made.path.replace(**paths))
 
 
-def test_road_edge_and_speed_limit():
-    free = with_obstacle(Kind.NONE, 0.0, 0.0)
-    assert bool(judge(free, straight(free, 10.0)).admissible[0])
-    narrow = free.replace(path=free.path.replace(
-        road_right=jnp.where(jnp.arange(128) > 15, -0.5, -6.0)))  # fmt: skip
-    assert not bool(judge(narrow, straight(narrow, 10.0)).admissible[0])
-    slow = free.replace(path=free.path.replace(
-        speed_limit=jnp.full_like(free.path.l, 8.0)))  # fmt: skip
-    assert not bool(judge(slow, straight(slow, 10.0)).admissible[0])
-    assert bool(judge(slow, straight(slow, 7.9)).admissible[0])
+FREE = with_obstacle(Kind.NONE, 0.0, 0.0)
+LINE = {"length": 0.1, "width": 40.0}
+
+
+@pytest.mark.parametrize(
+    ("made", "v", "admissible"),
+    [
+        (FREE, 10.0, True),
+        (with_obstacle(Kind.STOP, 30.0, 0.0, **LINE), 10.0, False),
+        (with_obstacle(Kind.STOP, 30.0, 0.0, **LINE), 2.0, True),
+        # passed already
+        (with_obstacle(Kind.STOP, 1.0, 0.0, **LINE), 10.0, True),
+        (on_path(FREE, road_right=jnp.where(jnp.arange(128) > 15, -0.5, -6.0)), 10.0,
+         False),
+        (on_path(FREE, speed_limit=8.0), 10.0, False),
+        (on_path(FREE, speed_limit=8.0), 7.9, True),
+    ],
+)  # fmt: skip
+def test_lines_road_edges_and_limits(made, v, admissible):
+    assert bool(judge(made, straight(made, v)).admissible[0]) is admissible
 
 
 def test_distance_to_the_leader_follows_rss():

@@ -51,30 +51,17 @@ def clock(view):
 
 
 @pytest.mark.browser
-def test_it_opens_without_complaint_and_draws(browser, file):
+def test_it_draws_plays_and_moves_by_keys(browser, file):
     view, wrong = opened(browser, file)
     canvases = view.query_selector_all(".views canvas")
     assert len(canvases) == 4
     for number, canvas in enumerate(canvases):
-        colours = canvas.evaluate(COLOURS)
         own = "213,94,0" if number < 2 else "0,114,178"
-        assert own in colours
-        assert len(colours) > 5
-        row = "candidate" if number < 2 else "hand-set"
-        assert f"of {row}" in canvas.get_attribute("aria-label")
-    broken = view.eval_on_selector_all("img", "all => all.filter(x => !x.naturalWidth)")
-    assert broken == []
-    assert wrong == []
-    view.close()
-
-
-@pytest.mark.browser
-def test_play_and_keys_move_the_player(browser, file):
-    view, wrong = opened(browser, file)
+        assert own in canvas.evaluate(COLOURS)
+    picture = lambda: view.locator(".views canvas").first.evaluate("c => c.toDataURL()")  # noqa: E731
     view.focus("#player")
     view.keyboard.press("Home")
-    first = clock(view)
-    before = view.locator(".views canvas").first.evaluate("c => c.toDataURL()")
+    before = picture()
     view.click("#play")
     for _ in range(100):  # the page's policy forbids Playwright's own waiting
         view.wait_for_timeout(100)
@@ -82,66 +69,40 @@ def test_play_and_keys_move_the_player(browser, file):
             break
     assert clock(view) > 1.0
     view.keyboard.press("Space")
-    assert view.locator(".views canvas").first.evaluate("c => c.toDataURL()") != before
-    view.focus("#scrub")
-    view.keyboard.press("Home")
-    assert clock(view) == first == pytest.approx(0.2)
+    assert picture() != before
     for key, wanted in (
-        ("ArrowRight", 0.4), ("ArrowRight", 0.6), ("ArrowLeft", 0.4), ("End", SECONDS),
+        ("Home", 0.2), ("ArrowRight", 0.4), ("ArrowLeft", 0.2), ("End", SECONDS),
     ):  # fmt: skip
         view.keyboard.press(key)
         assert clock(view) == pytest.approx(wanted)
-    view.click("#back")
-    assert clock(view) == pytest.approx(SECONDS - 0.2)
-    assert "collision of its own fault." in view.inner_text(".drive >> nth=0")
     view.click("#events button >> nth=0")
     assert clock(view) < SECONDS - 0.3
-    view.select_option("#case", "1")
-    assert PLAYED[1] in view.inner_text("#clock")
-    view.click("a[data-case='0']")
-    assert PLAYED[0] in view.inner_text("#clock")
-    assert view.evaluate("document.activeElement.id") == "player"
-    assert wrong == []
-    view.close()
-
-
-@pytest.mark.browser
-def test_a_phone_needs_no_sideways_scroll(browser, file, bare_file):
-    for shown in (file, bare_file):
-        view, wrong = opened(browser, shown, width=390, height=844)
-        assert view.evaluate("document.documentElement.scrollWidth") <= 390
-        outside = view.evaluate(
-            """() => [...document.querySelectorAll("body *")].filter((x) =>
-              !x.closest(".wide, svg, thead") && x.getBoundingClientRect().right > 391
-            ).map((x) => x.outerHTML.slice(0, 80))"""
-        )
-        assert (outside, wrong) == ([], [])
-        view.close()
-
-
-@pytest.mark.browser
-def test_focus_reaches_everything_and_everything_has_a_name(browser, file):
-    view, _ = opened(browser, file)
-    view.focus("#case")
-    reached = []
-    for _ in range(6):
-        reached.append(view.evaluate("document.activeElement.id"))
-        view.keyboard.press("Tab")
-    assert reached == ["case", "play", "back", "forward", "speed", "scrub"]
+    for select, case in (("select", PLAYED[1]), ("link", PLAYED[0])):
+        if select == "select":
+            view.select_option("#case", "1")
+        else:
+            view.click("a[data-case='0']")
+        assert case in view.inner_text("#clock")
+    broken = view.eval_on_selector_all("img", "all => all.filter(x => !x.naturalWidth)")
     nameless = view.eval_on_selector_all(
         "button, select, input, canvas[role=img], svg[role=img], img, [role=region]",
         """all => all.filter((x) => !(x.textContent.trim() || x.ariaLabel || x.alt
           || x.labels?.length)).map((x) => x.outerHTML.slice(0, 80))""",
     )
-    assert nameless == []
+    assert (broken, nameless, wrong) == ([], [], [])
     view.close()
 
 
 @pytest.mark.browser
-def test_markup_in_the_data_does_not_run(browser, hostile_file):
-    view, wrong = opened(browser, hostile_file)
-    assert HOSTILE in view.inner_text("#clock")
-    view.click("#events button >> nth=0")
-    assert HOSTILE in view.inner_text("#events")
-    assert wrong == []
-    view.close()
+def test_a_phone_needs_no_sideways_scroll_and_markup_in_the_data_does_not_run(
+    browser, file, bare_file, hostile_file
+):
+    for shown in (file, bare_file, hostile_file):
+        view, wrong = opened(browser, shown, width=390, height=844)
+        if shown != hostile_file:
+            assert view.evaluate("document.documentElement.scrollWidth") <= 390
+        else:
+            view.click("#events button >> nth=0")
+            assert HOSTILE in view.inner_text("#clock") + view.inner_text("#events")
+        assert wrong == []
+        view.close()

@@ -70,8 +70,6 @@ def test_it_is_one_file_that_needs_no_other(page):
         assert not any(name.startswith("on") for name in attrs)
     assert "url(" not in page
     assert len(found.of("img")) == 3
-    for image, row in zip(found.of("img"), (0, 3, 5), strict=True):
-        assert image["alt"].startswith(f"Scene {row}, ")
 
 
 def test_counts_and_reasons_are_those_of_the_manifest(page, dataset):
@@ -136,14 +134,11 @@ def test_chosen_rows_cover_the_tags_and_are_the_same_each_time():
 
 def test_what_there_is_not_is_one_line(dataset, tmp_path):
     none = np.zeros((9, len(Tag)), bool)
-    for work, line in (
-        (lambda: choose_rows(none, 5, ["turnig"]), "turnig: expected stopping, "),
-        (lambda: choose_rows(none, 5, ["standing"]), "standing: no such scene in the"),
-        (lambda: write_data_page(tmp_path / "a.html", dataset, [10**6], "a", FACTS),
-         r"--rows: 1000000: expected 0 to \d+"),
-    ):  # fmt: skip
-        with pytest.raises(InputError, match=line):
-            work()
+    for tag, line in (("turnig", "expected stopping, "), ("standing", "no such scene")):
+        with pytest.raises(InputError, match=f"{tag}: {line}"):
+            choose_rows(none, 5, [tag])
+    with pytest.raises(InputError, match=r"--rows: 1000000: expected 0 to \d+"):
+        write_data_page(tmp_path / "a.html", dataset, [10**6], "a", FACTS)
     assert not list(tmp_path.iterdir())
 
 

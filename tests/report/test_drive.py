@@ -1,15 +1,14 @@
 """Of one simulated drive: its worst moment, its road, when a plan was made."""
 
-import dataclasses
 import json
 import re
+import types
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 from rcirl_jax.report.player.drive import plan_start, road_in_plane, worst_step
-from rcirl_jax.simulation.cases import STEP_S, Record, Snapshot
+from rcirl_jax.simulation.cases import STEP_S
 from rcirl_jax.units import TIMES_S
 from tests.helpers.commands import succeeded
 from tests.helpers.weights_files import random_weights
@@ -17,12 +16,6 @@ from tests.helpers.weights_files import random_weights
 STEPS = 200
 SPEED = 12.0  # m/s
 HIT = 150  # step of the crash
-
-
-def blank(kind, /, **leaves):
-    """A node with the given leaves; the others are not read by the pictures."""
-    names = [field.name for field in dataclasses.fields(kind)]
-    return kind(**({name: np.float32(0) for name in names} | leaves))
 
 
 def drive(*, crash=False, planned=1):
@@ -34,42 +27,40 @@ def drive(*, crash=False, planned=1):
     valid = np.ones(STEPS, bool)
     if crash:
         collision[HIT], valid[HIT + 1 :], clearance[HIT] = 1, False, -0.2
-    made = (np.arange(STEPS) // planned) * planned
-    begin = np.append(0.0, s)[made]
-    record = blank(
-        Record, valid=valid, s=s, a=np.sin(time), clearance=clearance,
-        collision=collision, at_fault=collision,
+    begin = np.append(0.0, s)[(np.arange(STEPS) // planned) * planned]
+    record = types.SimpleNamespace(
+        valid=valid, s=s, a=np.sin(time), clearance=clearance, collision=collision,
+        at_fault=collision,
     )  # fmt: skip
-    return record, blank(Snapshot, plan_s=begin[:, None] + 11.0 * TIMES_S[None])
+    plan = begin[:, None] + 11.0 * TIMES_S[None]
+    return record, types.SimpleNamespace(plan_s=plan)
 
 
-def test_worst_step_prefers_the_crash():
-    record, _ = drive(crash=True)
-    assert worst_step(record) == HIT
-    not_at_fault = record.replace(at_fault=np.zeros(STEPS))
-    assert worst_step(not_at_fault) == HIT
-    record, _ = drive()
-    assert worst_step(record) == int(np.argmin(record.clearance))
-    late = record.replace(valid=np.arange(STEPS) < 50)
-    assert worst_step(late) == int(np.argmin(record.clearance[:50]))
-    alone = record.replace(clearance=np.full(STEPS, np.inf))
-    assert worst_step(alone) == int(np.argmin(record.a))
+@pytest.mark.parametrize(
+    ("crash", "changes", "worst"),
+    [
+        (True, {}, lambda r: HIT),
+        (True, {"at_fault": np.zeros(STEPS)}, lambda r: HIT),
+        (False, {}, lambda r: np.argmin(r.clearance)),
+        (
+            False,
+            {"valid": np.arange(STEPS) < 50},
+            lambda r: np.argmin(r.clearance[:50]),
+        ),
+        (False, {"clearance": np.full(STEPS, np.inf)}, lambda r: np.argmin(r.a)),
+    ],
+)
+def test_worst_step_prefers_the_crash(crash, changes, worst):
+    record, _ = drive(crash=crash)
+    for name, values in changes.items():
+        setattr(record, name, values)
+    assert worst_step(record) == int(worst(record))
 
 
-def test_road_in_plane_against_an_integrator():
-    grid = np.arange(200) * 2.0
-    kappa = 0.02 * np.sin(grid / 30.0)
-    x, y, heading = road_in_plane(kappa)
-    bend = lambda s, z: (np.cos(z[2]), np.sin(z[2]), np.interp(s, grid, kappa))  # noqa: E731
-    truth = solve_ivp(
-        bend, (0.0, grid[-1]), (0.0, 0.0, 0.0), t_eval=grid, rtol=1e-9, atol=1e-9,
-        max_step=0.5,
-    ).y  # fmt: skip
-    np.testing.assert_allclose(heading, truth[2], atol=1e-6)
-    # chords are of second order: centimetres after 400 m
-    np.testing.assert_allclose(np.stack([x, y]), truth[:2], atol=0.05)
+def test_a_circle_in_the_plane():
     x, y, heading = road_in_plane(np.full(101, 0.01))
     np.testing.assert_allclose(np.hypot(x, y - 100.0), 100.0, rtol=1e-9)
+    np.testing.assert_allclose(np.diff(heading), 0.02, rtol=1e-9)
 
 
 @pytest.mark.parametrize("planned", [1, 5])
@@ -86,14 +77,10 @@ def test_a_case_is_one_page_with_the_player(tmp_path):
     flags = (f"--weights={weights}", *case, f"--output={tmp_path / 'out'}")
     done = succeeded("experiments.replay", *flags)
     (page,) = (tmp_path / "out").iterdir()
-    text = page.read_text()
-    assert not re.search(r'(src|href)="(?!data:|#)', text)
     block = r'<script type="application/json" id="replays">(.*?)</script>'
-    (data,) = re.findall(block, text)
+    (data,) = re.findall(block, page.read_text())
     (found,) = json.loads(data)["cases"]
-    assert found["case"] == "stopped_lead/000@0"
     (driven,) = found["drives"]
-    assert driven["row"] == "IDM"
+    assert (found["case"], driven["row"]) == ("stopped_lead/000@0", "IDM")
     assert len(driven["s"]) == 10  # 2 s at 5 Hz
-    assert driven["summary"] in text
     assert driven["summary"] in done.stdout

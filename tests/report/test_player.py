@@ -11,18 +11,16 @@ from rcirl_jax.report.player.replays import AHEAD_M, BEHIND_M, FRAME_STEPS, make
 from rcirl_jax.simulation import rollout
 from rcirl_jax.simulation import suite as suite_module
 from rcirl_jax.simulation.cases import STEP_S
-from rcirl_jax.simulation.recorded.config import RecordedConfig
+from rcirl_jax.simulation.recorded.scenes import held_out
 from rcirl_jax.simulation.rollout import LANES, drive_cases
 from rcirl_jax.simulation.suite import (
-    catalogue_set,
     drive_row,
     drive_with_logs,
     recorded_set,
     rollout_config,
-    suite_refs,
 )
 from tests.report.tuning_case import PLAYED, SECONDS, cheap_rows, small_cases
-from tests.simulation.test_recorded import traffic
+from tests.simulation.stored import Rows, stored
 
 
 def driven(row, cases, count):
@@ -50,7 +48,7 @@ def test_frames_are_the_drives_own(replays):
             driven_m = record.s[number, : last + 1].max()
             assert drive.summary.startswith(f"{driven_m:.0f} m driven, ")
             hit = bool(record.at_fault[number, : last + 1].any())
-            assert ("fails collision free" in drive.summary) == hit
+            assert ("at-fault collision" in drive.summary) == hit
             for name, half in (("s", 0.051), ("l", 0.0051), ("v", 0.051)):
                 shown = getattr(drive, name)
                 wanted = getattr(record, name)[number, steps]
@@ -88,8 +86,8 @@ def test_the_drives_are_those_of_the_suite():
 
 def test_a_crash_ends_the_drive_and_shows_who_was_hit(replays):
     crashed, fine = replays[0].drives
-    assert "collision of its own fault" in crashed.end
-    assert crashed.events[0][1] == "collision of its own fault"
+    assert "at-fault collision" in crashed.end
+    assert crashed.events[0][1] == "at-fault collision"
     when = crashed.events[0][0]
     assert when < SECONDS - 0.3
     assert len(crashed.s) == int(np.ceil(when / STEP_S / FRAME_STEPS - 1e-6))
@@ -105,18 +103,6 @@ def test_a_crash_ends_the_drive_and_shows_who_was_hit(replays):
         assert plan == pytest.approx([k * speed for k in (1, 2, 3, 4, 5)], abs=0.4)
 
 
-@pytest.mark.slow
-def test_a_red_light_is_among_what_failed():
-    refs = suite_refs("red_light", 1)
-    (one,) = make_replays(cheap_rows()[:1], catalogue_set(refs, 10.0), [refs[0].id], 1)
-    (drive,) = one.drives
-    assert [what for _, what in drive.events] == ["red light run"]
-    assert drive.summary.endswith("fails red lights")
-    assert any(drive.red)
-    at = round(drive.start / one.frame_s) - 1
-    assert one.lines[drive.red[at][0]] - drive.s[at] < 4.0  # its front is at the line
-
-
 def test_a_case_that_the_suite_does_not_have():
     with pytest.raises(InputError, match="cut_in/007@0: expected a case"):
         make_replays(cheap_rows(), small_cases(), ["cut_in/007@0"], 1)
@@ -124,9 +110,8 @@ def test_a_case_that_the_suite_does_not_have():
 
 
 @pytest.mark.slow
-def test_the_recorded_human_drives_beside_the_others(tmp_path):
-    config = RecordedConfig(max_duration_s=6.0, max_cases=1, smoothing_s=0.0, steps=60)
-    cases = recorded_set([traffic(tmp_path, "urban_turn_left")], config)
+def test_the_recorded_human_drives_beside_the_others():
+    cases = recorded_set(held_out([Rows(stored(1))], 1))
     (one,) = make_replays(cheap_rows(), cases, cases.ids, 1)
     assert [drive.row for drive in one.drives] == [
         "candidate", "hand-set", "recorded human",
@@ -135,3 +120,22 @@ def test_the_recorded_human_drives_beside_the_others(tmp_path):
     at = FRAME_STEPS * (np.arange(len(human.s)) + 1)
     assert human.s == pytest.approx(log[np.minimum(at, len(log) - 1)], abs=0.06)
     assert not any(human.plan)
+
+
+def test_a_case_says_when_its_drives_part(replays):
+    one, two = replays[0].drives[:2]
+    when = replays[0].apart
+    at = one.t.index(when)
+    gap = np.abs(np.subtract(one.s[: at + 1], two.s[: at + 1]))
+    speeds = np.abs(np.subtract(one.v[: at + 1], two.v[: at + 1]))
+    assert gap[-1] > 2.0 or speeds[-1] > 1.0
+    assert (gap[:-1] <= 2.0).all()
+    assert (speeds[:-1] <= 1.0).all()
+
+
+def test_the_last_frame_is_the_end_of_the_drive(replays):
+    for one in replays:
+        for drive in one.drives:
+            assert len(drive.t) == len(drive.s)
+            assert np.diff(drive.t)[:-1] == pytest.approx(FRAME_STEPS * STEP_S)
+            assert 0.0 < drive.t[-1] - drive.t[-2] <= FRAME_STEPS * STEP_S + 1e-6

@@ -1,19 +1,16 @@
 """The picture of a recorded scene shows what its arrays say."""
 
-import dataclasses
-
 import jax
 import numpy as np
 import pytest
 from matplotlib import pyplot
 
-from rcirl_jax.data.store.rows import row_spec
 from rcirl_jax.errors import InputError
 from rcirl_jax.report.data import scene_picture
 from rcirl_jax.report.data.scene_picture import draw_scene
-from rcirl_jax.report.data.scene_view import describe_scene
-from rcirl_jax.types import Decision, Kind, Tag
+from rcirl_jax.types import Decision, Kind
 from rcirl_jax.units import TIMES_S
+from tests.helpers import scenes
 
 CAR, LIGHT, PEDESTRIAN, FAR = range(4)  # slots
 TIMES = TIMES_S.size
@@ -21,43 +18,21 @@ TIMES = TIMES_S.size
 
 def scene(**changes):
     """A car ahead at 8 m/s, a stop line, a pedestrian aside, somebody far ahead."""
-    rows = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), row_spec())
-    path, obstacles = rows.scene.path, rows.scene.obstacles
-    shape, grid = obstacles.s_lower.shape, path.l.shape
-    kind, decisions = np.zeros(shape[0], np.int32), np.zeros(shape[0], np.int32)
-    kind[:4] = Kind.VEHICLE, Kind.STOP, Kind.PEDESTRIAN, Kind.VEHICLE
+    usual = {"length": 4.0, "width": 2.0}
+    boxes = [
+        {**usual, "s": 20.0, "speed": 8.0},
+        {**usual, "s": 70.0, "length": 0.0, "kind": Kind.STOP},
+        {**usual, "s": 30.0, "l": -2.5, "kind": Kind.PEDESTRIAN},
+        {**usual, "s": 400.0},
+    ]
+    made = scenes.scene(v=8.0, speed_limit=13.9, boxes=boxes)
+    made = made.replace(**{"time_valid": TIMES_S < 6.3, **changes})
+    made = jax.tree.map(np.array, made)
+    rows, decisions = scenes.demonstration(0), np.zeros(len(made.obstacles.kind), int)
     decisions[:4] = Decision.FOLLOW, Decision.STOP, Decision.NUDGE_LEFT, Decision.IGNORE
-    s = np.zeros(shape, np.float32)
-    s[CAR], s[LIGHT], s[PEDESTRIAN], s[FAR] = 20.0 + 8.0 * TIMES_S, 70.0, 30.0, 400.0
-    l = np.zeros(shape, np.float32)
-    l[PEDESTRIAN] = -2.5
-    half = np.where(kind == Kind.STOP, 0.0, 2.0)[:, None].astype(np.float32)
-    tags = np.zeros(len(Tag), bool)
-    tags[[Tag.FOLLOWING, Tag.STOPPING]] = True
-    valid = np.broadcast_to((kind != Kind.NONE)[:, None], shape).copy()
-    full = lambda value: np.full(grid, value, np.float32)  # noqa: E731
-    change = dataclasses.replace
-    speed = np.float32(8.0)
-    human = change(
-        rows.human, s=(speed * TIMES_S).astype("f4"), v=np.full(TIMES, speed)
-    )
-    ego = change(rows.scene.ego, v=speed, length=np.float32(4), width=np.float32(2))
-    path = change(
-        path, speed_limit=full(13.9), lane_left=full(1.75), lane_right=full(-1.75),
-        road_left=full(5.25), road_right=full(-1.75),
-    )  # fmt: skip
-    obstacles = change(
-        obstacles, s_lower=s - half, s_upper=s + half, l_lower=l - 1.0,
-        l_upper=l + 1.0, valid=valid, kind=kind,
-    )  # fmt: skip
-    made = change(
-        rows.scene, ego=ego, tags=tags, time_valid=TIMES_S < 6.3, path=path,
-        obstacles=obstacles,
-    )  # fmt: skip
-    return change(
-        rows, scene=change(made, **changes), human=human, decisions=decisions,
-        future_s=np.float32(6.4),
-    )  # fmt: skip
+    human = jax.tree.map(np.zeros_like, rows.human)
+    human = human.replace(s=(8.0 * TIMES_S).astype("f4"), v=np.full(TIMES, 8.0, "f4"))
+    return rows.replace(scene=made, human=human, decisions=decisions)
 
 
 @pytest.fixture
@@ -94,16 +69,6 @@ def test_boxes_and_bars_stand_where_the_obstacles_are(drawn):
         wanted = getattr(rows.scene.obstacles, name)[CAR][valid]
         np.testing.assert_allclose(ends[:, side, 1], wanted)
     assert not of_slot(graph, PEDESTRIAN)  # beside the driver's path
-
-
-def test_the_legend_and_the_words_name_every_slot(drawn):
-    (legend,) = drawn(scene()).legends
-    words = [text.get_text() for text in legend.get_texts()]
-    for expected in ("follow: 0", "stop: 1", "nudge left: 2", "ignore: 3"):
-        assert expected in words
-    said = describe_scene(scene(), 7)
-    for expected in ("Scene 7", "Vehicle 0, 20 m", "Pedestrian 2, 30 m"):
-        assert expected in said
 
 
 def test_what_cannot_be_drawn_is_one_line(tmp_path):

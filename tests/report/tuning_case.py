@@ -7,11 +7,11 @@ import numpy as np
 
 from rcirl_jax.data.importing import import_parts
 from rcirl_jax.data.store.dataset import open_dataset
-from rcirl_jax.evaluation import Outcomes, build_report, scene_metrics
-from rcirl_jax.evaluation.closed_loop.summary import summarise
+from rcirl_jax.evaluation.closed_loop.files import SuiteRuns
 from rcirl_jax.evaluation.gate.decision import judge
 from rcirl_jax.evaluation.gate.types import GateConfig, Pair
-from rcirl_jax.evaluation.ranking.metrics import random_scorer
+from rcirl_jax.evaluation.ranking.metrics import Outcomes, random_scorer, scene_metrics
+from rcirl_jax.evaluation.ranking.table import build_report
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.planner.rank import constant_speed_policy, idm_policy
@@ -20,6 +20,7 @@ from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics
 from rcirl_jax.simulation.rows import Row
 from rcirl_jax.simulation.suite import catalogue_set, suite_refs
 from tests.data.small_logs import CONFIG, write_logs
+from tests.helpers.stored import sweep_result
 from tests.helpers.weights_files import random_weights
 
 FAMILIES, EACH = ("stop_and_go", "cut_in", "red_light"), 40
@@ -53,13 +54,16 @@ def metrics(seed, spoiled=None):
 
 
 def suite_and_verdict():
-    """The suite's report and the gate's verdict of the same made-up drives."""
+    """The suite's drives and the gate's verdict of the same made-up drives."""
     names = [name for name in FAMILIES for _ in range(EACH)]
     ids = [f"{name}/{i % EACH:03d}@0" for i, name in enumerate(names)]
     spoiled = metrics(0, "stop_and_go")
     runs = {"candidate": spoiled, "hand-set": metrics(1), "IDM": metrics(2)}
     none, way = np.zeros(len(names), bool), np.full(len(names), 1100.0)
-    suite = summarise(runs, names, none, none, "IDM", way)
+    suite = SuiteRuns(
+        rows=runs, ids=tuple(ids), groups=tuple(names), preventable=none, trivial=none,
+        reference="IDM", way=way,
+    )  # fmt: skip
     pair = Pair(
         candidate=runs["candidate"], incumbent=runs["hand-set"], families=names,
         ids=ids, reference=way, preventable=~none, name="hand-set",
@@ -78,29 +82,6 @@ def ranking():
     table = {"candidate": [scene_metrics(-fde, np.ones(60), outcomes)]}
     table["random"] = [scene_metrics(*random_scorer(0, shape), outcomes)]
     return build_report(table, outcomes, num_resamples=200)
-
-
-def sweep():
-    """What `export.sweep` writes, as far as the page reads it."""
-    found = lambda v: {"value": v, "low": v - 0.3, "high": v + 0.3, "seed_sd": None}  # noqa: E731
-    rows, members = {}, {}
-    for rate, value in ((0.01, 2.0), (0.05, 1.5), (0.2, 1.8)):
-        rows[f"rate {rate}"] = {
-            "hidden": "15", "leaky_rate": rate, "learning_rate": 1e-3,
-            "members": [f"m{rate}"], "finite": True,
-            "validation": {"top1_fde": found(value)},
-        }  # fmt: skip
-        members[f"m{rate}"] = {"validation": {"top1_fde": value}}
-    metric = {"metric": "top1_fde", "title": "top-1 FDE", "unit": "m"}
-    return {
-        "choose_by": {**metric, "higher_is_better": False},
-        "chosen": {"configuration": "rate 0.05", "test": {"top1_fde": found(1.6)}},
-        "configurations": rows,
-        "members": members,
-        "scenes": {"train": 30, "validation": 10, "test": 10},
-        "validation_by": "vehicle",
-        "groups": {},
-    }
 
 
 def small_report(folder, replays):
@@ -124,7 +105,7 @@ def small_report(folder, replays):
         gate=GateConfig(), suite=suite, incumbent="hand-set", ranking=ranking(),
         rewards={"candidate": candidate, "incumbent": incumbent},
         dataset=open_dataset(folder / "set"), replays=replays, workdir=workdir,
-        sweep=sweep(), training_runs=3,
+        sweep=sweep_result(), training_runs=3,
         facts={"flags": {"seed": 3}, "git_commit": "abc", "stages": {"train": "12ef"}},
     )  # fmt: skip
 

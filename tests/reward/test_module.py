@@ -11,7 +11,6 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import (
     RewardConfig,
-    effective_network,
     init_reward,
     init_tree,
     pinned,
@@ -78,21 +77,6 @@ def test_the_fast_layout_is_the_module(name, by_context, scenes):
 
     near = lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-5, atol=2e-5)  # noqa: E731
     jax.tree.map(near, both(fast), both(by_module))
-
-
-@pytest.mark.parametrize("by_context", [False, True])
-@pytest.mark.parametrize("name", CONFIGS)
-def test_first_parameters_are_those_of_flax_but_for_the_draw(name, by_context):
-    made = config(name, by_context)
-    params = init_reward(jax.random.key(0), F, made)
-    network, variables = effective_network(params, made)
-    x = jnp.zeros((T, F))
-    own = network.init(jax.random.key(0), x, jnp.ones(T, bool))
-    shapes = lambda tree: jax.tree.map(jnp.shape, tree)  # noqa: E731
-    assert shapes(own) == shapes(variables)
-    if made.pin == "unit":
-        return
-    np.testing.assert_array_equal(own["params"]["gamma"], variables["params"]["gamma"])
 
 
 @pytest.mark.parametrize(

@@ -5,9 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.data.scenes.assemble import assemble
-from rcirl_jax.data.scenes.collect import Collector
-from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.likeness import (
     held_out_likeness,
@@ -29,36 +26,9 @@ from rcirl_jax.simulation.recorded.scenes import (
 )
 from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases
 from rcirl_jax.simulation.rows import RECORDED_HUMAN, Row
+from rcirl_jax.simulation.suite import recorded_set
 from rcirl_jax.types import Kind
-from tests.planner.test_prediction import tracks
-from tests.simulation.test_recorded import straight
-
-
-def stored(count=6):
-    """Demonstrations [n] of a hand-made log: a leader that brakes, others beside."""
-    config = CollectConfig(
-        smoothing_s=0.0, require_speed_change=False, require_obstacles=False
-    )
-    rows = [r for r in Collector(straight(tracks()), config).scenes()]
-    rows = [row for row in rows if row["track"] in (0, 3)][:count]
-    numbers = [row["track"] for row in rows]
-    return assemble(rows, vehicles=numbers, groups=numbers, recording=0)
-
-
-class Rows:
-    """As much of a dataset as held-out drives ask for."""
-
-    def __init__(self, rows):
-        self.rows = rows
-
-    def indices(self, split):
-        return np.arange(self.rows.vehicle.size if split == "test" else 0)
-
-    def column(self, name):
-        return np.asarray(getattr(self.rows, name))
-
-    def read(self, index):
-        return jax.tree.map(lambda x: np.asarray(x)[index], self.rows)
+from tests.simulation.stored import Rows, stored
 
 
 def coast(params, scene, key, before):
@@ -109,6 +79,38 @@ def with_obstacle(one, slot, kind, valid, **leaves):
         table[slot] = changed[name]
     obstacles = o.replace(**tables)
     return case_of(one.replace(scene=one.scene.replace(obstacles=obstacles)))
+
+
+def test_the_others_drive_as_medians_once_they_leave_the_log():
+    one = jax.tree.map(lambda x: np.asarray(x)[0], stored(1))
+    road, times = np.asarray(one.scene.path.speed_limit), np.arange(18)
+    fast = case_of(one).agents.driver
+    assert road == pytest.approx(20.0)
+    assert fast.desired[:3] == pytest.approx(16.0)  # 0.8 of the limit
+    there = {"valid": times < 18, "s_lower": 90.0, "s_upper": 94.0}
+    for kind, speed, desired in (
+        (Kind.VEHICLE, 25.0, 25.0), (Kind.PEDESTRIAN, 0.0, 0.0), (Kind.STATIC, 0.0, 0.0)
+    ):  # fmt: skip
+        way = speed * times * 8.0 / 17.0
+        moved = {**there, "s_lower": 90.0 + way, "s_upper": 94.0 + way, "speed": speed}
+        agents = with_obstacle(one, 0, kind, **moved).agents
+        assert agents.driver.desired[0] == pytest.approx(desired, abs=1e-3)
+        assert bool(agents.driver.reacts[0]) == (kind == Kind.VEHICLE)
+        assert (agents.script.start[0, 0] == 0.0) == (kind == Kind.STATIC)
+    usual = {"headway": 1.4, "standstill": 2.0, "acceleration": 1.4, "braking": 2.0}
+    for name, value in {**usual, "delay": 0.4}.items():
+        np.testing.assert_allclose(getattr(fast, name), value)
+
+
+def test_held_out_drives_are_a_suite():
+    drives = held_out([Rows(stored(3)), Rows(stored(2))], 5)
+    cases = recorded_set(drives)
+    assert cases.ids == ("0:0", "0:1", "0:2", "1:0", "1:1")
+    assert cases.groups == ("0:0",) * 3 + ("1:0",) * 2
+    assert cases.duration_s == 8.0
+    last = cases.build(4, 5)
+    assert last.replay.ego_s.shape == (1, STEPS + 1)
+    np.testing.assert_array_equal(last.seed, drives.cases.seed[4:])
 
 
 def test_a_line_that_demands_a_stop_for_a_time_is_a_red_light():

@@ -12,15 +12,11 @@ import pytest
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.data.store.dataset import open_dataset
-from rcirl_jax.data.store.resplit import Resplit
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.evaluate import (
     RankingSetup,
     evaluate_ranking,
     oracle_floor,
-    pooled,
-    rank_scenes,
-    report_of,
 )
 from rcirl_jax.evaluation.ranking.learners import FrozenSets, train_learner
 from rcirl_jax.export.forms.stablehlo import exported_run
@@ -239,34 +235,3 @@ def test_every_scene_counts_once_for_the_normaliser(dataset, monkeypatch):
     again = fit_normaliser_on(dataset, other, features)
     for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(a, b)
-
-
-@pytest.mark.slow
-def test_pooled_parts_are_the_whole(dataset, run, tmp_path):
-    """Held-out scenes judged in two parts: the report of all of them at once."""
-    reward = export_run(run[0], dataset, tmp_path / "weights.msgpack")
-    runs, preset, _ = load_runs([reward.file])
-    (scorer,) = next(iter(runs.values()))
-    # rows out of alphabetical order, runs that differ
-    learned = {"z": [scorer, lambda x, valid: -scorer(x, valid)], "a": [scorer]}
-    setup = RankingSetup(preset=preset, sampler=SMALL)
-    train_rows, rows = dataset.indices("train"), dataset.indices("test")
-    cuts = [rows[: rows.size // 3], rows[rows.size // 3 :]]
-    parts = [Resplit(dataset, {"train": train_rows, "test": cut}) for cut in cuts]
-    ranked = [rank_scenes(part, learned, setup) for part in parts]
-    assert [part.group.size for part in ranked] == [len(cut) for cut in cuts]
-    whole, joined = evaluate_ranking(dataset, learned, setup), pooled(ranked)
-    # the random order is drawn for each part anew
-    assert joined.table["random"][0]["mrr"].size == rows.size
-    assert list(joined.table) == list(ranked[0].table)
-    assert list(joined.table)[:2] == ["z", "a"]
-    runs_of_z = [run["top1_fde"].mean() for run in joined.table["z"]]
-    assert runs_of_z[0] != pytest.approx(runs_of_z[1])
-    assert joined.table["a"][0]["top1_fde"].mean() == pytest.approx(runs_of_z[0])
-    found = report_of(joined)
-    for name in set(whole.rows) - {"random"}:
-        for metric, row in whole.rows[name].items():
-            other = found.rows[name][metric]
-            assert (other.value, other.low, other.high) == pytest.approx(
-                (row.value, row.low, row.high), rel=1e-6
-            ), (name, metric)

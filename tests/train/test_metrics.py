@@ -48,16 +48,6 @@ def test_values_that_are_no_numbers_are_left_out(tmp_path):
     assert last_metrics(tmp_path) == kept
 
 
-def test_metrics_of_any_size_take_little_memory(tmp_path):
-    long = ['{"step": 2, "a": "' + 70_000 * "x" + '"}', 2**16 * "x" + line(4)]
-    path = write(tmp_path, [line(1), *long, line(3)])
-    assert [row["step"] for row in read_metrics(path)] == [1, 3]
-    with path.open("r+b") as file:
-        file.truncate(2**40)  # a terabyte of nothing
-    with pytest.raises(InputError, match=r"metrics\.jsonl: \d+ bytes: expected 429"):
-        read_metrics(path)
-
-
 def test_pairs_won_are_those_of_the_last_steps(tmp_path):
     lines = [line(1), line(2, pairs=10.0, pair_accuracy=0.5), line(3, pairs=30.0)]
     path = write(tmp_path, lines)

@@ -86,8 +86,8 @@ def undisturbed(data, tmp_path_factory):
     root = tmp_path_factory.mktemp("runs")
     shapes = {
         "1x1": ("jit", 1, 1),
-        "1x4": ("jit_sharded", 1, 4),
-        "2x2": ("jit_sharded", 2, 2),
+        "1x4": ("shard_map", 1, 4),
+        "2x2": ("shard_map", 2, 2),
     }
     runs = {name: start(data, root / name, *how) for name, how in shapes.items()}
     return {
@@ -109,7 +109,7 @@ def test_many_devices_equal_one(undisturbed, name):
 
 @pytest.mark.slow
 def test_four_processes_of_devices_equal_one(data, undisturbed, tmp_path):
-    seen = finished(start(data, tmp_path, "jit_sharded", 4, 1), tmp_path)
+    seen = finished(start(data, tmp_path, "shard_map", 4, 1), tmp_path)
     assert len(seen) == 4
     assert_equals_one_device(undisturbed, tmp_path, seen)
 
@@ -156,7 +156,7 @@ def test_who_loses_another_process_ends_with_one_line(
     steps: with SIGABRT and lines of its own.
     """
     workers = start(
-        *(data, tmp_path, "jit_sharded", 2, 2),
+        *(data, tmp_path, "shard_map", 2, 2),
         kill_after=2, victims=[victim], pause_s=0.2,
     )  # fmt: skip
     other = 1 - victim
@@ -170,7 +170,7 @@ def test_who_loses_another_process_ends_with_one_line(
         assert len(said) == 1
         assert "another process is lost" in said[0]
         assert "Traceback" not in (tmp_path / f"stderr_{other}").read_text()
-    finished(start(data, tmp_path, "jit_sharded", 2, 2), tmp_path)
+    finished(start(data, tmp_path, "shard_map", 2, 2), tmp_path)
     assert_same_bits(state_of(tmp_path), state_of(undisturbed["2x2"][0]))
 
 
@@ -178,7 +178,7 @@ def test_who_loses_another_process_ends_with_one_line(
 def test_one_process_told_to_end_stops_all_at_the_same_step(
     data, undisturbed, tmp_path
 ):
-    workers = start(data, tmp_path, "jit_sharded", 2, 2, pause_s=1.5)
+    workers = start(data, tmp_path, "shard_map", 2, 2, pause_s=1.5)
     while not (tmp_path / "step_1").exists():
         assert workers[1].poll() is None, lines_of(tmp_path, 1)[-20:]
         time.sleep(0.05)
@@ -188,38 +188,35 @@ def test_one_process_told_to_end_stops_all_at_the_same_step(
     assert steps[0] == steps[1]
     assert 1 <= int(steps[0]) < STEPS
     assert (tmp_path / "checkpoints" / steps[0]).is_dir()
-    finished(start(data, tmp_path, "jit_sharded", 2, 2), tmp_path)
+    finished(start(data, tmp_path, "shard_map", 2, 2), tmp_path)
     assert_same_bits(state_of(tmp_path), state_of(undisturbed["2x2"][0]))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("damaged", [False, True])
-def test_killed_processes_resume_to_the_bit(data, undisturbed, tmp_path, damaged):
-    """Both die inside the second epoch; a damaged checkpoint is passed over by both."""
-    workers = start(data, tmp_path, "jit_sharded", 2, 2, kill_after=4)
+def test_killed_processes_resume_to_the_bit(data, undisturbed, tmp_path):
+    """Both die inside the second epoch, and pass over a damaged checkpoint."""
+    workers = start(data, tmp_path, "shard_map", 2, 2, kill_after=4)
     assert workers[0].wait(600) == -signal.SIGKILL
     workers[1].kill()  # it may have lost its peer just before its own signal
     assert workers[1].wait(60) != 0
     assert not list(tmp_path.glob("process_*.json"))
-    if damaged:
-        noted = tmp_path / "checkpoints" / "4" / "_CHECKPOINT_METADATA"
-        noted.write_bytes(noted.read_bytes()[:-1])
-    again = start(data, tmp_path, "jit_sharded", 2, 2, in_memory_mb=100.0)
+    noted = tmp_path / "checkpoints" / "4" / "_CHECKPOINT_METADATA"
+    noted.write_bytes(noted.read_bytes()[:-1])
+    again = start(data, tmp_path, "shard_map", 2, 2, in_memory_mb=100.0)
     # the one before is of step 3, at the end of the first epoch
-    left = STEPS - (3 if damaged else 4)
-    assert [process["steps"] for process in finished(again, tmp_path)] == [left, left]
+    left = [STEPS - 3] * 2
+    assert [process["steps"] for process in finished(again, tmp_path)] == left
     assert_same_bits(state_of(tmp_path), state_of(undisturbed["2x2"][0]))
     lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
     assert [json.loads(line)["step"] for line in lines] == list(range(1, STEPS + 1))
     said = [lines_of(tmp_path, number) for number in (0, 1)]
-    assert sum("checkpoint 4: _CHECKPOINT_METADATA" in x for x in said[0]) == damaged
+    assert sum("checkpoint 4: _CHECKPOINT_METADATA" in x for x in said[0]) == 1
     assert not any("checkpoint 4" in x for x in said[1])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("parallel", ["pmap", "shard_map"])
-def test_other_ways_of_sharing(data, undisturbed, tmp_path, parallel):
-    finished(start(data, tmp_path, parallel, 2, 2), tmp_path)
+def test_another_way_of_sharing(data, undisturbed, tmp_path):
+    finished(start(data, tmp_path, "pmap", 2, 2), tmp_path)
     assert_equal_runs(tmp_path, undisturbed["1x1"][0])
 
 

@@ -18,7 +18,7 @@ from rcirl_jax.train.facts import log_density
 from rcirl_jax.train.featurise import _featurised, featurised
 from rcirl_jax.train.finite import bad_values, check_step
 from rcirl_jax.train.loop import to_device_batch
-from rcirl_jax.train.parallel import jit_sharded, parallelise, pmapped, sharded, single
+from rcirl_jax.train.parallel import parallelise, pmapped, sharded, single
 from rcirl_jax.train.pieces import in_pieces
 from rcirl_jax.train.state import OPTIMIZERS, TrainConfig, make_optimizer, make_rule
 from rcirl_jax.train.step import gradient_sums, init_state, make_train_step
@@ -57,7 +57,7 @@ def weights_of(state):
     return np.concatenate([np.ravel(x) for x in jax.tree.leaves(state.params)])
 
 
-@pytest.mark.parametrize("how", [pmapped, sharded, jit_sharded])
+@pytest.mark.parametrize("how", [pmapped, sharded])
 @pytest.mark.parametrize("masked", [False, True])
 def test_eight_devices_equal_one(how, masked):
     """Also with uneven shards: weights that leave some devices nearly empty."""
@@ -107,10 +107,13 @@ def test_scene_by_scene_and_block_by_block_is_the_step_of_the_whole(monkeypatch)
     """Of features, and of features made for a few scenes at a time."""
     state, scenes, made = init_state(CONFIG, normaliser()), batch(), cached()
     assert in_pieces(made)[0].size > 1
-    whole = jax.jit(make_train_step(CONFIG, whole=True))
-    of_scenes = whole(state, scenes)
+    with monkeypatch.context() as patch:
+        patch.setattr(pieces, "piece_size", lambda size, _: size)
+        patch.setattr(pieces, "TRAJECTORIES", 10**9)
+        whole = jax.jit(make_train_step(CONFIG))
+        of_scenes, of_features = whole(state, scenes), whole(state, made)
     step = jax.jit(make_train_step(CONFIG))
-    assert_same_step(step(state, made), whole(state, made))
+    assert_same_step(step(state, made), of_features)
     count, most = scenes.weight.shape[0], num_candidates(CONFIG.sampler)
     monkeypatch.setattr(pieces, "TRAJECTORIES", 2 * most)
     assert pieces.block_size(count, most) == 2 < count
@@ -141,17 +144,6 @@ def test_a_feature_that_is_the_same_everywhere_gets_no_gradient():
     grads, _ = jax.jit(lambda p: gradient_sums(p, same, made, CONFIG))(params)
     assert np.abs(grads.kernels[0][3]).max() == 0.0
     assert np.abs(grads.kernels[0]).max() > 0.0
-
-
-def test_devices_that_share_a_batch_keep_their_scenes():
-    """The compiler adds sums over devices and moves no features."""
-    made = cached()
-    step = jit_sharded(make_train_step(CONFIG, whole=True), 8)
-    text = step.lower(init_state(CONFIG, normaliser()), made).compile().as_text()
-    assert "all-reduce" in text
-    points = made.candidates.size // made.candidates.shape[1]
-    assert not [line for line in text.splitlines() if "all-gather" in line
-                and str(points) in line]  # fmt: skip
 
 
 @pytest.mark.parametrize(

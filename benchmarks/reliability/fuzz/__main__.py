@@ -47,10 +47,10 @@ _SEED = flags.DEFINE_integer("seed", 0, "of the inputs")
 _COPIES = flags.DEFINE_integer("copies", 0, "most of one piece, at random; 0: a few", 0)
 _UNGUIDED = flags.DEFINE_bool("unguided", False, "at random, without atheris")
 _OUTPUT = flags.DEFINE_string("output", "benchmarks/results", "folder of the JSON")
-MOST_DEATHS = 20  # of a reader's processes
 SLACK_S = 60.0  # s for seeds, on top of what a reader is given
-# "#1500 DONE cov: 699 ft: 1863 corp: 141/156Kb ..."
+# "#1500 DONE cov: 699 ft: 1863 corp: 141/156Kb ...", libFuzzer's last line
 PROGRESS = re.compile(r"#\d+\s+\w+\s+cov: (\d+) ft: (\d+) corp: (\d+)/")
+ENDED = re.compile(r"stat::number_of_executed_units:\s*(\d+)")
 PEAK = re.compile(r"stat::peak_rss_mb:\s+(\d+)")
 
 
@@ -86,21 +86,6 @@ def is_guided() -> bool:
     return not (_COPIES.value or _UNGUIDED.value)
 
 
-def start(row: Row, folder: Path, inputs: int, seconds: int) -> tuple[int, str]:
-    """One process; (exit status, what it said)."""
-    said = folder / "said.txt"
-    # a fork, so that imports and their instrumentation are paid for once
-    process = multiprocessing.get_context("fork").Process(
-        target=_child, args=(row.reader, folder, inputs, seconds)
-    )
-    process.start()
-    process.join(seconds + SLACK_S)
-    if process.is_alive():
-        process.kill()
-        process.join()
-    return process.exitcode or 0, said.read_text(errors="replace")
-
-
 def _child(name: str, folder: Path, inputs: int, seconds: int) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     with (folder / "said.txt").open("w") as file:
@@ -110,7 +95,7 @@ def _child(name: str, folder: Path, inputs: int, seconds: int) -> None:
 
 
 def fuzzed(name: str, inputs: int, seconds: int, output: Path) -> Row:
-    """All inputs of a reader; a process that dies is followed by another."""
+    """All inputs of a reader, in a process of its own."""
     row = Row(
         reader=name,
         mutator=f"{'atheris' if is_guided() else 'at random'}, by form",
@@ -121,56 +106,43 @@ def fuzzed(name: str, inputs: int, seconds: int, output: Path) -> Row:
     begin = time.monotonic()
     place = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
     with tempfile.TemporaryDirectory(prefix="fuzz-", dir=place) as made:
-        folder = Path(made) / name
+        folder = Path(made)
         for part in ("corpus", "crashes"):
-            (folder / part).mkdir(parents=True)
-        for _ in range(MOST_DEATHS):
-            left = seconds - round(time.monotonic() - begin)
-            if row.inputs >= inputs or left <= 0:
-                break
-            status, said = start(row, folder, inputs - row.inputs, left)
-            if not account(row, folder, status, said):
-                break
-        keep(row, folder, output)
+            (folder / part).mkdir()
+        # a fork, so that imports and their instrumentation are paid for once
+        process = multiprocessing.get_context("fork").Process(
+            target=_child, args=(name, folder, inputs, seconds)
+        )
+        process.start()
+        process.join(seconds + SLACK_S)
+        process.kill()
+        process.join()
+        account(row, folder, process.exitcode or 0)
+        if files := sorted((folder / "crashes").iterdir()):
+            kept = output / "crashes" / name
+            kept.mkdir(parents=True, exist_ok=True)
+            for file in files:
+                shutil.copy(file, kept)
     row.seconds = round(time.monotonic() - begin, 1)
     return row
 
 
-def account(row: Row, folder: Path, status: int, said: str) -> bool:
-    """Add what a process did to the row; whether another should follow."""
-    found = {"inputs": 0, "slowest_s": 0.0, "unforeseen": {}}
-    with contextlib.suppress(OSError, ValueError):
+def account(row: Row, folder: Path, status: int) -> None:
+    """What the process of a reader has left, into its row."""
+    found, said = {}, (folder / "said.txt").read_text(errors="replace")
+    with contextlib.suppress(OSError):
         found = json.loads((folder / "status.json").read_text())
-        (folder / "status.json").unlink()
-    ended = re.search(r"stat::number_of_executed_units:\s*(\d+)", said)
-    row.inputs += max(found["inputs"], int(ended[1]) if ended else 0)
-    row.slowest_s = max(row.slowest_s, found["slowest_s"])
-    for where, count in found["unforeseen"].items():
-        row.unforeseen[where] = row.unforeseen.get(where, 0) + count
+    counted = [int(x) for x in ENDED.findall(said)]
+    row.inputs = max(found.get("inputs", 0), *counted, 0)
+    row.slowest_s = found.get("slowest_s", 0.0)
+    row.unforeseen = found.get("unforeseen", {})
+    row.crashes = found.get("breaches", [])
     for line in PROGRESS.findall(said)[-1:]:
         row.covered, row.features, row.corpus = map(int, line)
-    for peak in PEAK.findall(said):
-        row.peak_mib = max(row.peak_mib, int(peak))
+    row.peak_mib = max(map(int, PEAK.findall(said)), default=0)
     if status != 0:
-        last = (said.strip().splitlines() or [""])[-1][:200]
-        reason = re.search(r"SUMMARY: (.*)", said)
-        row.crashes.append(f"process: {status}: {reason[1] if reason else last}")
-    return status != 0 and found["inputs"] > 0
-
-
-def keep(row: Row, folder: Path, output: Path) -> None:
-    """Save the inputs that broke a promise, and one for each unforeseen place."""
-    path = folder / "breaches.jsonl"
-    lines = path.read_text().splitlines() if path.exists() else []
-    for entry in map(json.loads, lines):
-        if entry["what"] == "breach":
-            row.crashes.append(f"{entry['file']}: {entry['kind']}: {entry['text']}")
-    files = sorted((folder / "crashes").iterdir())
-    if files:
-        kept = output / "crashes" / row.reader
-        kept.mkdir(parents=True, exist_ok=True)
-        for file in files:
-            shutil.copy(file, kept / file.name)
+        reason = re.findall(r"SUMMARY: (.*)", said) or said.strip().splitlines() or [""]
+        row.crashes.append(f"process: {status}: {reason[-1][:200]}")
 
 
 def main() -> None:
@@ -180,35 +152,28 @@ def main() -> None:
         raise InputError("atheris: not installed: expected, or --unguided")
     result = "fuzz_copies" if _COPIES.value else "fuzz"
     output.mkdir(parents=True, exist_ok=True)
-    rows = []
+    rows: list[Row] = []
     for name, inputs in shares(names, _INPUTS.value).items():
         row = fuzzed(name, inputs, _SECONDS.value, output)
-        rows.append(dataclasses.asdict(row))
+        rows.append(row)
         print(
             f"{name}: {row.inputs:,} inputs, {row.seconds:.0f} s, corpus {row.corpus}, "
             f"features {row.features}, crashes {len(row.crashes)}, "
             f"unforeseen {sum(row.unforeseen.values())}",
+            *(f"  {line}" for line in row.crashes),
+            sep="\n",
             flush=True,
         )
-        for line in row.crashes:
-            print(f"  {line}", flush=True)
         write_json(output / f"{result}.json", {"rows": rows})
     limits = {"seconds": child.MAX_S, "bytes": child.MAX_BYTES}
     write(result, {"rows": rows, "limits": limits}, str(output))
-    total, broken = (sum(map(count, rows)) for count in (_inputs, _crashes))
+    total = sum(row.inputs for row in rows)
+    broken = sum(len(row.crashes) for row in rows)
     print(f"{total:,} inputs, {broken} crashes")
     if total < _INPUTS.value:
         print(f"expected {_INPUTS.value:,} inputs: give it more --seconds")
     if broken or total < _INPUTS.value:
         sys.exit(1)
-
-
-def _inputs(row: dict) -> int:
-    return row["inputs"]
-
-
-def _crashes(row: dict) -> int:
-    return len(row["crashes"])
 
 
 if __name__ == "__main__":

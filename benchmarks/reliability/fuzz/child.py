@@ -1,8 +1,8 @@
 """One reader under the fuzzer, in a process that may die.
 
-Its folder has corpus/ and crashes/ of the reader; what was broken is appended to
-breaches.jsonl, and status.json says how far it is. Coverage of our code guides what is
-tried next (atheris), or inputs are drawn at random.
+Its folder has corpus/ and crashes/ of the reader; status.json says how far it is and
+what was broken. Coverage of our code guides what is tried next (atheris), or inputs
+are drawn at random.
 """
 
 import contextlib
@@ -14,18 +14,18 @@ import io
 import json
 import os
 import random
-import resource
 import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 MAX_S = 10  # s that one input may take
 MAX_BYTES = 2 * 2**30  # bytes of memory on top of what the imports take
 PACKAGE = "benchmarks.reliability.fuzz"
 INSTRUMENTED = {"rcirl_jax", "tomllib", "defusedxml"}
-GROWTH = 2**28  # bytes of memory that one input is kept for
 EVERY_S = 1.0  # s between two writings of the status
 
 
@@ -38,19 +38,19 @@ class Session:
     """Runs inputs and keeps account."""
 
     def __init__(self, name: str, folder: Path, seed: int) -> None:
-        """Make the reader's target and remember what earlier processes found."""
-        readers = importlib.import_module(f"{PACKAGE}.readers")
-        importlib.import_module(f"{PACKAGE}.logs").parse_once()
-        self._codecs = importlib.import_module(f"{PACKAGE}.codecs")
-        self._contract = importlib.import_module(f"{PACKAGE}.contract")
-        work = folder / "work" / str(os.getpid())
+        """Make the reader's target; our code is imported here, not before."""
+        readers, self._contract, self._forms, logs = (
+            importlib.import_module(f"{PACKAGE}.{module}")
+            for module in ("readers", "contract", "forms", "logs")
+        )
+        logs.parse_once()
+        work = folder / "work"
         self.reader = readers.READERS[name]
         self.target = self.reader.make(work)
-        self._folder, self._rng = folder, random.Random(seed)
-        self.inputs, self._slowest, self._last = 0, 0.0, 0.0
-        self._peak = 0  # bytes resident, at most
+        self._folder, self._rng, self._last = folder, random.Random(seed), 0.0
+        self.inputs, self._slowest = 0, 0.0
+        self._breaches: dict[str, str] = {}  # kind -> file and text of the first
         self._unforeseen: dict[str, int] = {}
-        self._known = _known(folder)
         self._watch = self._contract.Watch(folder)
         tempfile.tempdir = str(work)
 
@@ -65,20 +65,18 @@ class Session:
                 self.target.read, self.target.names, elsewhere
             )
         spent = time.perf_counter() - begin
-        self._note_growth(data, "reading")
         broken = self._contract.broken_by(breach, self._watch.seen, elsewhere)
         if spent > MAX_S:
             broken.append(self._contract.Breach("too long", f"{spent:.0f} s"))
         self._slowest = max(self._slowest, spent)
-        if line is not None:
-            for place in self._contract.UNFORESEEN.findall(line):
-                if place not in self._unforeseen:
-                    self._keep(data, "unforeseen", place, line)
-                self._unforeseen[place] = self._unforeseen.get(place, 0) + 1
+        for place in self._contract.UNFORESEEN.findall(line or ""):
+            if place not in self._unforeseen:
+                self._keep(data, "unforeseen")
+            self._unforeseen[place] = self._unforeseen.get(place, 0) + 1
         for breach in broken:
-            if breach.kind not in self._known:
-                self._known.add(breach.kind)
-                self._keep(data, "breach", breach.kind, breach.text)
+            if breach.kind not in self._breaches:
+                kept = self._keep(data, "breach")
+                self._breaches[breach.kind] = f"{kept}: {breach.kind}: {breach.text}"
         if begin - self._last > EVERY_S:
             self._last = begin
             self.write_status()
@@ -93,21 +91,12 @@ class Session:
         if plain is not None and rng.random() < 0.3:
             made = plain(data[1:], most - 1)
         else:
-            made = self._codecs.mutate(data[1:], self.target.forms[index], rng)
-        self._note_growth(data, "changing")
+            made = self._forms.mutate(data[1:], self.target.forms[index], rng)
         return bytes([index]) + made[: most - 1]
-
-    def _note_growth(self, data: bytes, doing: str) -> None:
-        """Keep what took much memory: libFuzzer looks once a second, at another."""
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-        if self._peak and peak > self._peak + GROWTH:
-            self._keep(data, "memory", doing, f"{doing}: {peak >> 20} MiB")
-        self._peak = max(self._peak, peak)
 
     def draw(self) -> bytes:
         """A mutated seed, without anything that guides."""
-        index = self._rng.randrange(len(self.target.seeds))
-        data = bytes([index]) + self.target.seeds[index]
+        data = b""
         for _ in range(self._rng.choice((1, 1, 2, 3))):
             data = self.mutate(data, 2**22, self._rng.getrandbits(32))
         return data
@@ -118,30 +107,16 @@ class Session:
             "inputs": self.inputs,
             "slowest_s": round(self._slowest, 3),
             "unforeseen": self._unforeseen,
+            "breaches": [*self._breaches.values()],
         }
         path = self._folder / "status.json"
         path.with_suffix(".new").write_text(json.dumps(found))
         path.with_suffix(".new").rename(path)
 
-    def _keep(self, data: bytes, what: str, kind: str, text: str) -> None:
+    def _keep(self, data: bytes, what: str) -> str:
         name = f"{what}-{hashlib.sha256(data).hexdigest()[:12]}"
         (self._folder / "crashes" / name).write_bytes(data)
-        line = {"what": what, "kind": kind, "text": text, "file": name}
-        with (self._folder / "breaches.jsonl").open("a") as file:
-            file.write(json.dumps(line) + "\n")
-
-
-def _known(folder: Path) -> set[str]:
-    path = folder / "breaches.jsonl"
-    lines = path.read_text().splitlines() if path.exists() else []
-    return {json.loads(line)["kind"] for line in lines}
-
-
-def limit_memory() -> None:
-    """What the process maps now, and so much more."""
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
-    most = pages * resource.getpagesize() + MAX_BYTES
-    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+        return name
 
 
 def guided(session: Session, folder: Path, arguments: list[str]) -> None:
@@ -151,12 +126,12 @@ def guided(session: Session, folder: Path, arguments: list[str]) -> None:
     longest = max(map(len, session.target.seeds))
     for index, seed in enumerate(session.target.seeds):
         (folder / "corpus" / f"seed-{index:02d}").write_bytes(bytes([index]) + seed)
-    words = "".join(f'"{_escaped(word)}"\n' for word in session.reader.words)
-    (folder / "words").write_text(words or '"0"\n')
-    rss = int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+    escaped = ["".join(f"\\x{b:02x}" for b in w.encode()) for w in session.reader.words]
+    (folder / "words").write_text("".join(f'"{x}"\n' for x in escaped) or '"0"\n')
+    most = psutil.Process().memory_info().rss + MAX_BYTES
     flags = [
         f"-timeout={MAX_S}",
-        f"-rss_limit_mb={(rss + MAX_BYTES) // 2**20}",
+        f"-rss_limit_mb={most // 2**20}",
         f"-max_len={longest + 2048}",
         f"-artifact_prefix={folder}/crashes/",
         f"-dict={folder}/words",
@@ -169,18 +144,6 @@ def guided(session: Session, folder: Path, arguments: list[str]) -> None:
     given = ["fuzz", *flags, *arguments, str(folder / "corpus")]
     atheris.Setup(given, session.run, custom_mutator=mutator)
     atheris.Fuzz()
-
-
-def _escaped(word: str) -> str:
-    return "".join(f"\\x{byte:02x}" for byte in word.encode())
-
-
-def drawn(session: Session, inputs: int, seconds: float) -> None:
-    """Seeds mutated at random."""
-    end = time.monotonic() + seconds
-    while session.inputs < inputs and time.monotonic() < end:
-        session.run(session.draw())
-    session.write_status()
 
 
 @contextlib.contextmanager
@@ -214,16 +177,19 @@ def fuzz(
 
     At most `copies` of a piece, if not 0; guided by coverage (atheris) or at random.
     """
-    trees = importlib.import_module(f"{PACKAGE}.trees")
-    trees.COPIES = copies or trees.COPIES
-    session = Session(name, folder, seed)
+    changes = importlib.import_module(f"{PACKAGE}.changes")
+    changes.COPIES = copies or changes.COPIES
+    session, end = Session(name, folder, seed), time.monotonic() + seconds
     for index, content in enumerate(session.target.seeds):
         session.run(bytes([index]) + content)
     gc.collect()
     gc.freeze()  # what the imports made is never looked through again
-    limit_memory()
+    mapped = psutil.Process().memory_info().vms + MAX_BYTES
+    psutil.Process().rlimit(psutil.RLIMIT_AS, (mapped, mapped))
     if guide:
         limits = [f"-runs={inputs}", f"-max_total_time={seconds}", f"-seed={seed}"]
         guided(session, folder, limits)
-    else:
-        drawn(session, inputs, seconds)
+    while session.inputs < inputs and time.monotonic() < end:
+        session.run(session.draw())
+    session.write_status()
+    os._exit(0)  # without what libraries do at the end of a fork

@@ -81,29 +81,25 @@ class Watch:
             self._see(event, str(args))
 
     def _opened(self, path: object, flags: object) -> None:
-        if not isinstance(path, str | bytes | os.PathLike):
-            return
         writes = isinstance(flags, int) and bool(flags & WRITING)
-        name = os.path.abspath(os.fsdecode(path))
         if writes and not self._is_inside(path):
-            self._see("written outside", name)
-        elif not name.startswith(self._readable):
-            self._see("read outside", name)
+            self._see("written outside", str(path))
+        elif not self._is_inside(path, self._readable):
+            self._see("read outside", str(path))
 
-    def _is_inside(self, path: Any) -> bool:  # noqa: ANN401 - whatever was opened
+    def _is_inside(self, path: Any, places: tuple[str, ...] = ("/dev/",)) -> bool:  # noqa: ANN401 - whatever was opened
         if not isinstance(path, str | bytes | os.PathLike):
             return True
-        return os.path.abspath(os.fsdecode(path)).startswith((self._folder, "/dev/"))
+        return os.path.abspath(os.fsdecode(path)).startswith((self._folder, *places))
 
 
 def _placed(args: tuple) -> Any:  # noqa: ANN401 - whatever was changed
     """The path of an event; one that is relative to an open folder made whole."""
-    name, rest = args[0], args[1:]
-    folders = [number for number in rest if type(number) is int and number > 2]
-    if isinstance(name, str) and not os.path.isabs(name) and folders:
+    folders = [number for number in args[1:] if type(number) is int and number > 2]
+    if isinstance(args[0], str) and not os.path.isabs(args[0]) and folders:
         with contextlib.suppress(OSError):
-            return os.path.join(os.readlink(f"/proc/self/fd/{folders[-1]}"), name)
-    return name
+            return os.path.join(os.readlink(f"/proc/self/fd/{folders[-1]}"), args[0])
+    return args[0]
 
 
 def refusal_breach(

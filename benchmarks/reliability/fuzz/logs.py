@@ -9,9 +9,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from mcap.writer import CompressionType
 
 from benchmarks.reliability.fuzz import tables
-from benchmarks.reliability.fuzz.codecs import toml_text
+from benchmarks.reliability.fuzz.forms import toml_text
 from benchmarks.reliability.fuzz.targets import Several, Target
 from rcirl_jax.data import importers
 from rcirl_jax.data.importers import read_recordings
@@ -31,6 +32,7 @@ from tests.data.importers.formats import (
     nuplan,
     openacc,
     osm,
+    ros2,
     waymo,
 )
 
@@ -122,20 +124,14 @@ def make_commonroad(folder: Path) -> tuple[Path, list[Path]]:
     return folder, [file, groups]
 
 
-def make_ngsim(folder: Path) -> tuple[Path, list[Path]]:
-    """Two cars, in both of the public forms."""
+def make_ngsim(folder: Path, site: str = "") -> tuple[Path, list[Path]]:
+    """Two cars, in either of the public forms: with a site's name or without."""
     rows = writers.ngsim_rows(count=25)
     rows += writers.ngsim_rows(vehicle=2, lane=1, local_x=6.0, count=25)
-    text = writers.ngsim_text(folder / "trajectories-0400-0415.txt", rows)
-    return folder, [text]
-
-
-def make_ngsim_csv(folder: Path) -> tuple[Path, list[Path]]:
-    """Two cars at a site that is named."""
-    rows = writers.ngsim_rows(count=25)
-    rows += writers.ngsim_rows(vehicle=2, lane=1, local_x=6.0, count=25)
-    file = writers.ngsim_csv(folder / "log.csv", rows, sites=["us-101"] * len(rows))
-    return folder, [file]
+    if site:
+        file = folder / "log.csv"
+        return folder, [writers.ngsim_csv(file, rows, sites=[site] * len(rows))]
+    return folder, [writers.ngsim_text(folder / "trajectories-0400-0415.txt", rows)]
 
 
 def make_ngsim_pairs(folder: Path) -> tuple[Path, list[Path]]:
@@ -213,30 +209,30 @@ def make_openacc(folder: Path) -> tuple[Path, list[Path]]:
     return fixture.input, [log, folder / "Vehicles_specifications.csv"]
 
 
-def make_argoverse2(folder: Path) -> tuple[Path, list[Path]]:
-    """A scenario and its map."""
-    return _whole(argoverse2.write(folder))
-
-
 def make_waymo(folder: Path) -> tuple[Path, list[Path]]:
     """A scenario of few road users."""
     users = [*waymo.road_users().items()][:FEW]
     tracks = [waymo.track(key, *values) for key, values in users]
     file = folder / "training.tfrecord-00000-of-01000"
     road = [_thinned(feature) for feature in waymo.map_features()]
-    scenario = waymo.scenario(f2=tracks, f4=[2320], f8=road)
+    changes = {"objects_of_interest": [2320], "map_features": road}
+    scenario = waymo.scenario(tracks=tracks, **changes)
     file.write_bytes(waymo.tfrecord([scenario]))
     return folder, [file]
 
 
-def _thinned(feature: list) -> list:
-    """A map feature with every tenth of its points; indices of sides are left out."""
-    (key, kind), rest = feature[1][:2] if len(feature) > 1 else (0, 0), feature[2:]
-    if not isinstance(kind, list):
-        return feature
-    points = [item for item in kind if item[0] in (2, 8) and isinstance(item[1], list)]
-    others = [i for i in kind if i not in points and i[0] not in (11, 12, 13, 14)]
-    return [feature[0], (key, [*others, *points[::10]]), *rest]
+def _thinned(feature: dict) -> dict:
+    """A map feature with every tenth of its points; what has indices is left out."""
+    return {
+        name: value
+        if name == "id"
+        else {
+            key: part[::10] if key == "polyline" else part
+            for key, part in value.items()
+            if not key.endswith(("_boundaries", "_neighbors"))
+        }
+        for name, value in feature.items()
+    }
 
 
 def make_nuplan(folder: Path) -> tuple[Path, list[Path]]:
@@ -294,12 +290,11 @@ def _decompress(folder: Path) -> None:
 
 def make_apollo(folder: Path) -> tuple[Path, list[Path]]:
     """A short drive in two parts; every tenth pose."""
-    found: dict[str, list] = {}
-    for item in apollo.drive():
-        if item[1] < SHORT_S:
-            found.setdefault(item[0], []).append(item)
     often = ("/apollo/localization/pose", "/apollo/canbus/chassis")
-    kept = [m for name, all_of in found.items() for m in all_of[:: _step(name, often)]]
+    short = [item for item in apollo.drive() if item[1] < SHORT_S]
+    kept = [item for item in short if item[0] not in often]
+    for name in often:
+        kept += [item for item in short if item[0] == name][::5]
     kept.sort(key=lambda item: item[1])
     files = [folder / f"2021.record.{part:05d}" for part in (0, 1)]
     half = len(kept) // 2
@@ -308,13 +303,23 @@ def make_apollo(folder: Path) -> tuple[Path, list[Path]]:
     return folder, files
 
 
-def _step(name: str, often: tuple[str, ...]) -> int:
-    return 5 if name in often else 1
+def make_ros2(folder: Path) -> tuple[Path, list[Path]]:
+    """A short drive in both storages, without checksums that would see any change."""
+    kept = [item for item in ros2.drive() if item[2] < SHORT_S]
+    bag = folder / "drive"
+    bag.mkdir()
+    plain = {"compression": CompressionType.NONE, "crcs": False}
+    files = [ros2.mcap(bag / "a.mcap", kept, **plain), folder / "b.db3"]
+    ros2.sqlite(files[1], files[0])
+    ros2.metadata(bag, ["a.mcap"])
+    return folder, [*files, bag / "metadata.yaml"]
 
 
 LOGS = {
     "apollo": log_target("apollo", make_apollo),
-    "argoverse2": log_target("argoverse2", make_argoverse2),
+    "argoverse2": log_target(
+        "argoverse2", lambda folder: _whole(argoverse2.write(folder))
+    ),
     "commonroad": log_target("commonroad", make_commonroad),
     "csv": several(
         log_target("csv", tables.make_csv),
@@ -336,11 +341,12 @@ LOGS = {
     ),
     "ngsim": several(
         log_target("ngsim", make_ngsim),
-        log_target("ngsim", make_ngsim_csv),
+        log_target("ngsim", functools.partial(make_ngsim, site="us-101")),
         log_target("ngsim", make_ngsim, "long_bytes = 1\n"),
     ),
     "ngsim_pairs": log_target("ngsim_pairs", make_ngsim_pairs),
     "nuplan": log_target("nuplan", make_nuplan),
     "openacc": log_target("openacc", make_openacc),
+    "ros2": log_target("ros2", make_ros2),
     "waymo": log_target("waymo", make_waymo),
 }

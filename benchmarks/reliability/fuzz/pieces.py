@@ -1,10 +1,10 @@
 """Parts of importers that are read alone: maps, geometries, descriptors, frames."""
 
 import contextlib
-import dataclasses
 from pathlib import Path
 
 import numpy as np
+import shapely
 from google.protobuf.message import DecodeError
 
 from benchmarks.reliability.fuzz.targets import Bytes, OneFile, Target
@@ -14,7 +14,6 @@ from rcirl_jax.data.importers.lanelet2 import map as lanelet2
 from rcirl_jax.data.importers.nuplan import geopackage
 from rcirl_jax.data.readers import tfrecord
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.ranking.metrics import METRICS
 from tests.data.importers.formats import apollo, interaction, nuplan, osm, waymo
 
 
@@ -42,7 +41,8 @@ def geometry_target(folder: Path) -> Target:
             raise InputError(f"layer: {error}: expected a geometry") from error
 
     line = np.array([[0.0, 0.0], [5.0, 1.0], [9.0, 1.0]])
-    seeds = [nuplan.geometry(kind, line) for kind in (2, 3)]
+    shapes = (shapely.LineString, shapely.Polygon)
+    seeds = [nuplan.geometry(shape, line) for shape in shapes]
     many = seeds[0][:40] + b"\x01\x05\0\0\0\x02\0\0\0" + 2 * seeds[0][40:]
     return Bytes(read, [("bytes", blob) for blob in (*seeds, many)], ["layer"])
 
@@ -54,14 +54,14 @@ def descriptors_target(folder: Path) -> Target:
         "chassis": apollo.chassis(1.0),
         "perception": apollo.perception(1.0),
     }
-    channels = [messages.TOPICS[topic][0] for topic in made]
+    channels = [messages.TOPICS[topic].channels[0] for topic in made]
 
     def read(data: bytes) -> None:
         for (topic, message), channel in zip(made.items(), channels, strict=True):
             kind = apollo.CHANNELS[channel][0]
             # importers put the file's name before what these say
             with contextlib.suppress(DecodeError):
-                reading_of(kind, data, messages.WANTED[topic]).parse(message)
+                reading_of(kind, data, messages.TOPICS[topic].wanted).parse(message)
 
     seeds = [("message", apollo.CHANNELS[channel][1]) for channel in channels]
     return Bytes(read, seeds, ["message"])
@@ -73,31 +73,3 @@ def tfrecord_target(folder: Path) -> Target:
     file = folder / "x.tfrecord"
     file.write_bytes(waymo.tfrecord([b"\x08\x01" * 9, b"", b"\x12\x03abc"]))
     return Target(lambda: list(tfrecord.read_records(file)), [file])
-
-
-def sweep_result() -> dict[str, object]:
-    """What a sweep of two leaky rates and two seeds says, with made-up numbers."""
-    estimate = {"value": 1.5, "low": 1.0, "high": 2.0, "seed_sd": 0.1}
-    members, rows = {}, {}
-    for rate in (0.01, 0.1):
-        names = [f"15_a{rate:g}_s{seed}" for seed in (0, 1)]
-        of = {"hidden": "15", "leaky_rate": rate, "learning_rate": 1e-3}
-        for name in names:
-            members[name] = {**of, "validation": {"top1_fde": 1.5}, "finite": True}
-        held_out = {"top1_fde": estimate}
-        rows[f"15_a{rate:g}"] = {
-            **of, "members": names, "finite": True, "validation": held_out,
-        }  # fmt: skip
-    chosen, test = next(iter(rows)), {"top1_fde": estimate}
-    facts = {"members": 4, "seconds": 3.0, "compiles": 1, "compile_seconds": 0.5}
-    return {
-        "validation_by": "vehicles",
-        "scenes": {"train": 8, "validation": 4, "test": 4},
-        "groups": {"15": facts},
-        "choose_by": {
-            "metric": "top1_fde", **dataclasses.asdict(METRICS["top1_fde"])
-        },
-        "members": members,
-        "configurations": rows,
-        "chosen": {"configuration": chosen, "member": names[0], "test": test},
-    }  # fmt: skip

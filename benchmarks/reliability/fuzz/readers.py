@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.reliability.fuzz import pieces
-from benchmarks.reliability.fuzz.codecs import resealed, toml_text
+from benchmarks.reliability.fuzz.forms import resealed, toml_text
 from benchmarks.reliability.fuzz.logs import LOGS
 from benchmarks.reliability.fuzz.targets import Bytes, OneFile, Reader, Target
 from rcirl_jax.data.importers.synthetic import reader as synthetic
@@ -27,19 +27,10 @@ from rcirl_jax.evaluation.closed_loop.files import (
 )
 from rcirl_jax.evaluation.closed_loop.likeness import read_arrays, write_arrays
 from rcirl_jax.evaluation.gate.types import Likeness
-from rcirl_jax.evaluation.ranking.sweep import SweepConfig, member_name, shape_name
 from rcirl_jax.export.from_run import last_metrics, read_config
-from rcirl_jax.export.loading import check_provenance, open_reward
+from rcirl_jax.export.loading import check_provenance
 from rcirl_jax.export.reader import decode_weights
-from rcirl_jax.export.sweep.folder import (
-    GROUP_FACTS,
-    SWEEP,
-    claim,
-    data_of,
-    finished_group,
-    settings_of,
-    weights_file,
-)
+from rcirl_jax.export.sweep.folder import SWEEP
 from rcirl_jax.export.sweep.result import read_sweep
 from rcirl_jax.features import mapping
 from rcirl_jax.runtime.atomic_files import write_json
@@ -53,7 +44,8 @@ from rcirl_jax.train.metrics import pairs_won
 from rcirl_jax.train.running import check_run, describe_run
 from rcirl_jax.train.state import TrainConfig
 from tests.data.store import test_dataset as test_store
-from tests.helpers.weights_files import packed, random_weights
+from tests.helpers.stored import sweep_result
+from tests.helpers.weights_files import packed
 
 ROWS = 2  # of a dataset
 CASES = 2  # of a suite
@@ -284,39 +276,11 @@ def metrics(folder: Path) -> Target:
 
 
 def sweeps(folder: Path) -> Target:
-    """A sweep's folder: its result, and what a resumed sweep takes from it."""
+    """The result of a sweep; what it resumes from are `stages`."""
     folder.mkdir(parents=True)
-    data_hash, made_by, hidden = "d" * 64, {"git_commit": "2fe49aa"}, (15,)
-    config = SweepConfig(
-        data=("d",),
-        base=TrainConfig(),
-        hidden_sizes=(hidden,),
-        leaky_rates=(0.01,),
-        learning_rates=(1e-3,),
-        seeds=1,
-    )
-    write_json(folder / SWEEP, pieces.sweep_result())
-    claim(config, folder, data_hash)
-    (member,) = config.members()
-    weights = weights_file(folder, member)
-    weights.parent.mkdir()
-    random_weights(weights)
-    group = folder / "groups" / f"{shape_name(hidden)}.json"
-    one = {"sha256": open_reward(str(weights)).sha256, "finite": True}
-    settings = {**settings_of(config), **data_of(made_by)}
-    facts = dict.fromkeys(GROUP_FACTS, 1.0)
-    members = {member_name(member): one}
-    write_json(group, {"facts": facts, "members": members, "settings": settings})
-    if finished_group(config, folder, hidden, made_by) is None:
-        raise AssertionError(f"{group}: not as a sweep takes it")
-
-    def read() -> None:
-        read_sweep(folder)
-        claim(config, folder, data_hash)
-        finished_group(config, folder, hidden, made_by)
-
+    write_json(folder / SWEEP, sweep_result())
     names = (str(folder),)
-    return Target(read, [folder / SWEEP, folder / "settings.json", group], names)
+    return Target(lambda: read_sweep(folder), [folder / SWEEP], names)
 
 
 READERS: dict[str, Reader] = {

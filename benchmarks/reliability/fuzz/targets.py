@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from benchmarks.reliability.fuzz.codecs import form_of
+from benchmarks.reliability.fuzz.forms import form_of
 
 
 class Target:

@@ -11,6 +11,7 @@ import types
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from rcirl_jax.data.importers.declared import with_numbers_and_texts
 from rcirl_jax.data.importers.files import with_log_names
 from rcirl_jax.data.importers.options import check_types
 from rcirl_jax.data.readers.tables.streams import refuse_pointer
@@ -24,7 +25,7 @@ Importer = Callable[[Path, dict], Iterator[Recording]]
 # a folder each, whose `reader` is loaded only when the format is asked for
 IMPORTERS = (
     *("apollo", "argoverse2", "commonroad", "csv", "interaction", "l5", "levelx"),
-    *("ngsim", "ngsim_pairs", "nuplan", "openacc", "synthetic", "waymo"),
+    *("ngsim", "ngsim_pairs", "nuplan", "openacc", "ros2", "synthetic", "waymo"),
 )
 
 # formats of which one part (see `parts`) is a file with a few recordings
@@ -38,7 +39,9 @@ SMALL_PARTS = (
 )
 # formats of which one part is a file with many recordings, and the bytes of the
 # longest one whose scenes may be held at once (docs/formats, "Large inputs")
-SHARD_BYTES = {"apollo": 2**28, "nuplan": 2**28, "waymo": 2**30}
+SHARD_BYTES = {"apollo": 2**28, "nuplan": 2**28, "ros2": 2**28, "waymo": 2**30}
+# formats whose packaged TOML says what holds where a user's own says nothing
+DECLARED = ("interaction", "levelx", "ngsim", "ngsim_pairs", "openacc")
 # formats of which one part is a file that is read in pieces where it is long
 CSV_PARTS = ("csv", "ngsim")
 
@@ -97,6 +100,8 @@ def parts(
     if source is not None:
         with as_input_error(str(source), options):
             check_types(spec, load_toml(packaged))
+        if name in DECLARED:
+            spec = with_numbers_and_texts(spec, load_toml(packaged))
     if input_path is None:
         if name != "synthetic":
             raise InputError("--input: not given: expected a file or folder")

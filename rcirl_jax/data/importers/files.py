@@ -1,10 +1,10 @@
 """Which files of an input an importer reads."""
 
 import collections
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
-from rcirl_jax.data.importers.options import number
+from rcirl_jax.data.importers.options import number, path_option
 from rcirl_jax.data.readers.tables.columnar import is_columnar
 from rcirl_jax.data.readers.tables.streams import packing
 from rcirl_jax.errors import InputError
@@ -51,6 +51,22 @@ def files_matching(path: Path, wanted: Sequence[str], what: str) -> list[Path]:
             f"{path}: no file matches {', '.join(wanted)}: expected {what}"
         )
     return files
+
+
+def firsts_of_a_name(files: Iterable[Path]) -> list[Path]:
+    """Files in one folder with one name are the same log: the first of them counts."""
+    found: dict[tuple[Path, str], Path] = {}
+    for file in files:
+        found.setdefault((file.parent, table_stem(file)), file)
+    return [*found.values()]
+
+
+def given_map(spec: Mapping) -> Path | None:
+    """The file or folder of maps that the option `map` names; None without it."""
+    given = path_option(spec, "map")
+    if given and not Path(given).exists():
+        raise InputError(f"{given}: map: missing: expected a file or folder")
+    return Path(given) if given else None
 
 
 def is_input(folder: Path, file: Path) -> bool:

@@ -42,24 +42,39 @@ def straight_lanes(
         below = _beside(lane, found, width, -1.0)
         up = 0.5 * width if above is None else 0.5 * (above.y - lane.y)
         down = 0.5 * width if below is None else 0.5 * (lane.y - below.y)
-        x = np.linspace(
-            lane.lower, lane.upper, int((lane.upper - lane.lower) / LANE_STEP_M) + 2
-        )
         left, right = (above, below) if lane.forward else (below, above)
         sides = (up, down) if lane.forward else (down, up)
-        x = x if lane.forward else x[::-1]
-        lanes.append(
-            Lane(
-                id=lane.id,
-                centre=np.stack([x, np.full(x.shape, lane.y)], axis=1),
-                left_width=np.full(x.shape, sides[0]),
-                right_width=np.full(x.shape, sides[1]),
-                speed_limit=limit,
-                left=None if left is None else left.id,
-                right=None if right is None else right.id,
-            )
-        )
+        ids = [None if beside is None else beside.id for beside in (left, right)]
+        lanes.append(parallel_lane(lane, sides, ids, limit))
     return tuple(lanes)
+
+
+def parallel_lane(
+    lane: StraightLane,
+    sides: tuple[float, float],
+    beside: Sequence[str | None],
+    limit: float | None,
+) -> Lane:
+    """A lane parallel to the x axis, driven the way that it is.
+
+    Args:
+      lane: where it lies.
+      sides: m, from the centre line to the left and right bound.
+      beside: ids of the lanes to the left and to the right.
+      limit: m/s, or None.
+    """
+    steps = int((lane.upper - lane.lower) / LANE_STEP_M)
+    x = np.linspace(lane.lower, lane.upper, steps + 2)
+    x = x if lane.forward else x[::-1]
+    return Lane(
+        id=lane.id,
+        centre=np.stack([x, np.full(x.shape, lane.y)], axis=1),
+        left_width=np.full(x.shape, sides[0]),
+        right_width=np.full(x.shape, sides[1]),
+        speed_limit=limit,
+        left=beside[0],
+        right=beside[1],
+    )
 
 
 def _beside(

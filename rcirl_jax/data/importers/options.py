@@ -36,7 +36,7 @@ UNITS = {
 KINDS = ("vehicle", "cyclist", "pedestrian", "static")
 
 
-def number(spec: Mapping, key: str, default: float) -> float:
+def number(spec: Mapping, key: str, default: float = math.nan) -> float:
     """A finite number from a source TOML."""
     value = spec.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float):
@@ -67,7 +67,7 @@ def section(spec: Mapping, key: str) -> dict:
     return value
 
 
-def positive(spec: Mapping, key: str, default: float) -> float:
+def positive(spec: Mapping, key: str, default: float = math.nan) -> float:
     """A number > 0 from a source TOML."""
     value = number(spec, key, default)
     if value <= 0.0:

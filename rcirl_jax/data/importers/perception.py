@@ -12,13 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.importers.options import number
+from rcirl_jax.data.importers.options import number, positive, section
+from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.shapes import local_origin
 from rcirl_jax.data.importers.tracks import split_tracks
 from rcirl_jax.data.readers import long_logs
 from rcirl_jax.data.recording import LENGTH_RANGE_M, MAX_SPEED_MPS, WIDTH_RANGE_M
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Kind, Recording, Track
+from rcirl_jax.types import Kind, Lane, Recording, Track
 
 UNKNOWN = -1  # kind of a box whose class the log does not know
 UNKNOWN_CHOICES = ("auto", "drop", "static", "vehicle")
@@ -27,6 +28,7 @@ MAX_OUTLIERS = 0.1  # share of tracks dropped as outliers; more is an error
 ONE_OF = 5  # tracks of which one may always be an outlier
 WINDOW_S = 300.0  # s, longest window of a drive
 MIN_WINDOW_S = 1.0  # s that it may be; each window costs as much as its surroundings
+LANE_WIDTH_M = 3.5  # m, of lanes fitted to paths
 MAX_SIZE_M = 200.0  # m, of a box; beyond it the file is wrong, not the tracker
 FIELDS = ("t", "x", "y", "heading", "length", "width")
 
@@ -47,8 +49,49 @@ class Boxes:
     kind: np.ndarray  # [n] int, `Kind` or UNKNOWN
 
 
+def ego_boxes(
+    spec: Mapping,
+    usual: Mapping[str, float],
+    t: np.ndarray,
+    x: np.ndarray,
+    y: np.ndarray,
+    heading: np.ndarray,
+    speed: np.ndarray,
+) -> Boxes:
+    """Boxes of the recording car, id "ego", by its poses [n].
+
+    Args:
+      spec: source TOML; the table `ego` has the car's measures.
+      usual: where it has not: length, width, and how far ahead of a pose's place the
+        box's centre lies, m.
+      t: s.
+      x: m.
+      y: m.
+      heading: rad.
+      speed: m/s; NaN: from the positions.
+    """
+    own = section(spec, "ego")
+    length, width, ahead = (number(own, name, m) for name, m in usual.items())
+    return Boxes(
+        ids=np.zeros(t.size, np.int64),
+        names=("ego",),
+        t=t,
+        x=x + ahead * np.cos(heading),
+        y=y + ahead * np.sin(heading),
+        heading=heading,
+        speed=speed,
+        length=np.full(t.size, length),
+        width=np.full(t.size, width),
+        kind=np.full(t.size, int(Kind.VEHICLE)),
+    )
+
+
 def tracks_of(
-    path: Path, boxes: Boxes, max_gap_s: float, unknown: str = "auto"
+    path: Path,
+    boxes: Boxes,
+    max_gap_s: float,
+    unknown: str = "auto",
+    automated: tuple[tuple[float, float], ...] = (),
 ) -> tuple[list[Track], list[str]]:
     """Tracks of the boxes, in the order of their ids, and notes on what was left out.
 
@@ -63,6 +106,7 @@ def tracks_of(
       max_gap_s: s without a box inside one track.
       unknown: what objects of unknown class become: "drop", "static",
         "vehicle", or by whether they moved ("auto").
+      automated: of all tracks.
 
     Raises:
       InputError: a number that is not finite, an absurd size, or a time met
@@ -80,7 +124,7 @@ def tracks_of(
         name = boxes.names[int(boxes.ids[rows[0]])]
         seen[name] = seen.get(name, 0) + 1
         label = name if seen[name] == 1 else f"{name}#{seen[name]}"
-        track = _track(label, boxes, rows, unknown)
+        track = _track(label, boxes, rows, unknown, automated)
         dropped += track is None
         tracks += [] if track is None else [track]
     tracks, notes = without_outliers(tracks)
@@ -90,27 +134,26 @@ def tracks_of(
 
 
 def _check(path: Path, boxes: Boxes) -> None:
+    """Everything is finite, and no box is absurdly large."""
     for field in FIELDS:
         values = getattr(boxes, field)
-        bad = np.flatnonzero(~np.isfinite(values))
-        if bad.size:
-            name = boxes.names[int(boxes.ids[bad[0]])]
-            raise InputError(
-                f"{path}: id {name}: {field}: {values[bad[0]]}: "
-                "expected a finite number"
-            )
-    for field in ("length", "width"):
-        values = getattr(boxes, field)
-        bad = np.flatnonzero((values < 0.0) | (values > MAX_SIZE_M))
-        if bad.size:
-            name = boxes.names[int(boxes.ids[bad[0]])]
-            raise InputError(
-                f"{path}: id {name}: {field}: {values[bad[0]]:g} m: "
-                f"expected 0 to {MAX_SIZE_M:g} m"
-            )
+        wrong, expected = ~np.isfinite(values), ": expected a finite number"
+        if field in ("length", "width") and not wrong.any():
+            wrong = (values < 0.0) | (values > MAX_SIZE_M)
+            expected = f" m: expected 0 to {MAX_SIZE_M:g} m"
+        if wrong.any():
+            row = np.flatnonzero(wrong)[0]
+            name = boxes.names[int(boxes.ids[row])]
+            raise InputError(f"{path}: id {name}: {field}: {values[row]:g}{expected}")
 
 
-def _track(name: str, boxes: Boxes, rows: np.ndarray, unknown: str) -> Track | None:
+def _track(
+    name: str,
+    boxes: Boxes,
+    rows: np.ndarray,
+    unknown: str,
+    automated: tuple[tuple[float, float], ...],
+) -> Track | None:
     """One track, or None where its class is unknown and such are dropped."""
     t, x, y = boxes.t[rows], boxes.x[rows], boxes.y[rows]
     # most frequent class; the shift makes UNKNOWN a count of its own
@@ -135,6 +178,7 @@ def _track(name: str, boxes: Boxes, rows: np.ndarray, unknown: str) -> Track | N
         y=y,
         heading=boxes.heading[rows],
         speed=speed,
+        automated=automated,
     )
 
 
@@ -251,3 +295,18 @@ def placed(
         for track in tracks
     ]
     return x, y, origin, moved
+
+
+def fitted_lanes(
+    tracks: Sequence[Track], spec: Mapping, limit: float
+) -> tuple[tuple[Lane, ...], str]:
+    """Lanes along the paths that were driven, and a note of their number.
+
+    Args:
+      tracks: of one recording.
+      spec: source TOML.
+      limit: m/s, where it has none.
+    """
+    width = positive(spec, "lane_width_m", LANE_WIDTH_M)
+    lanes = path_lanes(tracks, width, positive(spec, "speed_limit", limit))
+    return lanes, f"{len(lanes)} lanes fitted to the longest paths"

@@ -34,3 +34,15 @@ def earth_centred(latitude: float, longitude: float) -> np.ndarray:
     system = "+proj=cart +ellps=WGS84"
     project = extra_module("pyproj").Transformer.from_pipeline(system).transform
     return np.array(project(longitude, latitude, 0.0))
+
+
+def projected(
+    longitude: np.ndarray, latitude: np.ndarray, middle: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """East and north [n] m of a middle (latitude, longitude), all in degrees.
+
+    A transverse Mercator projection of true scale through the middle: north is up
+    there, so that compass headings are those of the positions.
+    """
+    system = {"proj": "tmerc", "ellps": "WGS84", "lat_0": middle[0], "lon_0": middle[1]}
+    return extra_module("pyproj").Proj(**system, k=1.0)(longitude, latitude)

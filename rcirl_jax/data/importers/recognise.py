@@ -22,6 +22,8 @@ NAMES = {
     "*.zarr": "l5",
     "*.record": "apollo",
     "*.record.*": "apollo",
+    "*.mcap": "ros2",
+    "*.db3": "ros2",
     "scenario_*.parquet": "argoverse2",
     "*.toml": "synthetic",
 }

@@ -1,16 +1,20 @@
 """Local origins and polylines, shared by the importers of vector maps."""
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from rcirl_jax.errors import InputError, extra_module
+from rcirl_jax.types import Lane
 
 FAR_M = 1e4  # m; coordinates beyond it are moved to a local origin
 ORIGIN_STEP_M = 1000.0  # m, local origins are multiples of it
 MAX_COORDINATE_M = 1e8  # m, farther than any map projection on Earth reaches
 MIN_HALF_WIDTH_M = 0.1  # m, lanes taper to a point at forks
+MARGIN_M = 150.0  # m of a map that are read around the tracks
+CHUNK = 100_000  # points whose distances are found at once
 FRACTION_DIGITS = 7  # fractions of a line that differ by less are one
 
 
@@ -96,12 +100,32 @@ def between_bounds(
     return centre[keep], half[keep]
 
 
-def distance_to_line(points: np.ndarray, line: np.ndarray) -> np.ndarray:
-    """Distance [n] m of points [n, 2] from a polyline [m >= 1, 2], by shapely."""
+def distances_to_lines(
+    points: np.ndarray, lines: Sequence[np.ndarray], which: np.ndarray
+) -> np.ndarray:
+    """Distance [n] m of points [n, 2] from polylines, by shapely.
+
+    The shortest line from one that is prepared is found by a tree; a distance by
+    walking along it for every point. Near zero, coordinates lose no digits.
+
+    Args:
+      points: m.
+      lines: [m >= 1, 2] m each.
+      which: [n] number of each point's line.
+    """
     shapely = extra_module("shapely")
+    corner = lines[0][0]
     # its lines have two points or more
-    whole = shapely.linestrings(line if len(line) > 1 else np.tile(line, (2, 1)))
-    return shapely.distance(shapely.points(points), whole)
+    long = [line if len(line) > 1 else np.tile(line, (2, 1)) for line in lines]
+    owner = np.repeat(np.arange(len(long)), [len(line) for line in long])
+    whole = shapely.linestrings(np.concatenate(long) - corner, indices=owner)
+    shapely.prepare(whole)
+    found = np.empty(len(points))
+    for start in range(0, len(points), CHUNK):
+        part = slice(start, start + CHUNK)
+        places = shapely.points(points[part] - corner)
+        found[part] = shapely.length(shapely.shortest_line(whole[which[part]], places))
+    return found
 
 
 def line_across(
@@ -129,3 +153,35 @@ def line_across(
     at = nearest + share[nearest]
     sides = [np.interp(at, np.arange(len(centre)), width) for width in (left, right)]
     return foot[nearest] + np.array([sides[0], -sides[1]])[:, None] * normal
+
+
+class Roads:
+    """Lanes of a large map in the log's world, found by place.
+
+    Args:
+      centres: [m >= 2, 2] m, centre line of each lane.
+      lane: makes a lane by its number.
+    """
+
+    def __init__(
+        self, centres: Sequence[np.ndarray], lane: Callable[[int], Lane]
+    ) -> None:
+        self._lane = lane
+        boxes = [(line.min(axis=0), line.max(axis=0)) for line in centres]
+        self._low, self._high = np.array(boxes).reshape(-1, 2, 2).swapaxes(0, 1)
+
+    def around(
+        self, x: np.ndarray, y: np.ndarray, origin: np.ndarray
+    ) -> tuple[Lane, ...]:
+        """Lanes around positions [m], less the origin."""
+        low = np.array([x.min(), y.min()]) - MARGIN_M
+        high = np.array([x.max(), y.max()]) + MARGIN_M
+        near = (self._high >= low).all(axis=1) & (self._low <= high).all(axis=1)
+        return tuple(
+            dataclasses.replace(
+                lane,
+                centre=lane.centre - origin,
+                stop_line=None if lane.stop_line is None else lane.stop_line - origin,
+            )
+            for lane in map(self._lane, np.flatnonzero(near).tolist())
+        )

@@ -1,18 +1,17 @@
-"""Long logs of rows: imported in pieces of a minute or less, in bounded memory.
+"""Logs of rows, by recording; long ones in pieces of a minute or less.
 
-The file is read once, a few MiB at a time, and its rows are written to scratch
-files by recording and minute. Each minute is then a Recording of its own, with
-rows before and after it, so that scenes and filters do not end at the border.
-When each road user was first seen, also after gaps, is found for the whole log
-first, so that vehicles and their groups are those of a log read at once.
+A log that fits is held, and each of its recordings is one piece. A long one is read
+once, a few MiB at a time, and its rows are written to scratch files by recording and
+minute. Each minute is then a Recording of its own, with rows before and after it, so
+that scenes and filters do not end at the border. When each road user was first seen,
+also after gaps, is found for the whole log first, so that vehicles and their groups
+are those of a log read at once.
 
 What differs from a file that fits: lanes that are not given are fitted minute by
 minute, the given path is known for 28 s beyond the minute only, and a row out of
 order is found inside a minute only. Rows may come in any order of road users; scratch
 space of about the file's size is needed. An importer that needs something of the
-whole recording finds it in `Spill.minutes`.
-
-Rows come as batches of `tables`, or as an importer makes them of these.
+whole recording finds it in `minutes`.
 """
 
 import contextlib
@@ -20,15 +19,17 @@ import dataclasses
 import itertools
 import shutil
 import tempfile
-from collections.abc import Callable, Container, Iterable, Iterator
+from collections.abc import Container, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from rcirl_jax.data.readers.held_logs import Held, Piece
 from rcirl_jax.data.readers.reading import reading
-from rcirl_jax.data.readers.tables.ledger import LINE, Ledger
+from rcirl_jax.data.readers.tables.ledger import Ledger
 from rcirl_jax.data.readers.tables.repair import single_rows
+from rcirl_jax.data.readers.tables.table import Field, Table, batches, read
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.atomic_files import locked
 from rcirl_jax.types import Recording, Track
@@ -46,46 +47,24 @@ SCRATCH = "rcirl-scratch-"  # how folders of scratch files begin
 LOCK = "lock"  # in such a folder, held while it is in use
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Piece:
-    """Rows of one minute of one recording, and of its surroundings.
-
-    Of a minute too crowded for memory it is a window, counted by `window`.
-    """
-
-    recording: str | None  # value of the `recording` field
-    number: int  # of the minute, from the recording's first
-    values: dict[str, np.ndarray]  # field -> [n], t since the recording's start
-    within: tuple[float, float]  # s, the minute or the window itself
-    # id -> s, when the whole log first saw it, and when again after each gap
-    fragments: dict[str, list[float]]
-    progress: float  # share of the file's pieces up to this one
-    window: int | None = None  # of the minute; None: the minute is one piece
-
-    @property
-    def label(self) -> str:
-        """The number as names of recordings have it."""
-        rest = "" if self.window is None else f".{self.window:02d}"
-        return f"{self.number:05d}{rest}"
-
-
 @contextlib.contextmanager
-def spilled(
-    path: Path,
-    read: Callable[[Callable[[int], object]], Iterable[dict]],
+def rows_of(
+    table: Table,
+    fields: Sequence[Field],
     ledger: Ledger,
-    wanted: Container[str] | None = None,
+    *,
+    is_long: bool,
     apart: Container[str] = (),
     places: tuple[str, str] = ("x", "y"),
-) -> Iterator["Spill"]:
-    """The rows of a file in scratch files, removed afterwards.
+) -> Iterator["Held | Spill"]:
+    """The rows of a table, each road user once in a frame.
 
     Args:
-      path: file, whose reading shows a bar.
-      read: batches of rows, at least t [s] and id; it calls what it is given with the
-        bytes just read.
+      table: of `open_table`.
+      fields: what is read, at least t [s] and id.
       ledger: of the file.
-      wanted: values of the `recording` field whose rows are kept; None: all.
+      is_long: the rows go to scratch files, which are removed afterwards; a bar
+        shows the reading.
       apart: columns in which rows may differ that repeat each other.
       places: columns that say where a road user is.
 
@@ -93,10 +72,13 @@ def spilled(
       InputError: no rows, more bad ones than the ledger allows, or more than
         MAX_BLOCKS minutes.
     """
+    if not is_long:
+        yield Held(read(table, fields, ledger), ledger, apart, places)
+        return
     with scratch() as folder:
-        spill = Spill(path, folder, ledger, wanted, apart, places)
-        with reading(path, [path]) as show:
-            for batch in read(show):
+        spill = Spill(table.path, folder, ledger, apart, places)
+        with reading(table.path, [table.path]) as show:
+            for batch in batches(table, fields, ledger, show):
                 spill.add(batch)
         ledger.check()
         spill.flush()
@@ -105,6 +87,8 @@ def spilled(
 
 def piece_of(log: str, made: Recording, piece: Piece) -> Recording:
     """A piece's Recording as a part of the log: its tracks named as in the whole."""
+    if piece.is_whole:
+        return made
     return dataclasses.replace(
         made,
         tracks=tuple(_of_log(track, piece.fragments) for track in made.tracks),
@@ -150,12 +134,11 @@ class Spill:
         path: Path,
         folder: Path,
         ledger: Ledger,
-        wanted: Container[str] | None = None,
-        apart: Container[str] = (),
-        places: tuple[str, str] = ("x", "y"),
+        apart: Container[str],
+        places: tuple[str, str],
     ) -> None:
         self.path, self.folder, self.ledger = path, folder, ledger
-        self.wanted, self.apart, self.places = wanted, apart, places
+        self.apart, self.places = apart, places
         self.names: list[str] = []  # of the columns, as in the first batch
         self.texts: dict[str, dict[str, int]] = {}  # field -> text -> its number
         self.blocks: dict[int, set[int]] = {}  # number of a recording -> minutes
@@ -163,7 +146,6 @@ class Spill:
         self.held = 0  # bytes in the buffers
         self.given = 0.0  # minutes given as pieces
         self._tables: dict[str, np.ndarray] = {}
-        self._met: set[int] = set()  # numbers of recordings
         self._tidied: set[int] = set()
 
     def add(self, batch: dict) -> None:
@@ -176,8 +158,6 @@ class Spill:
         recording = np.zeros(len(rows), np.int64)
         if "recording" in self.names:
             recording = rows[:, self.names.index("recording")].astype(np.int64)
-            self._met.update(np.unique(recording).tolist())
-            rows, recording = self._of_wanted(rows, recording)
         minute = np.floor(rows[:, self.names.index("t")] / BLOCK_S).astype(np.int64)
         order = np.lexsort((minute, recording))  # stable: the file's order inside
         keys = np.stack([recording, minute], axis=1)[order]
@@ -204,14 +184,6 @@ class Spill:
         mine = [known.setdefault(text, len(known)) for text in texts]
         return np.array(mine, np.float64)[codes]
 
-    def _of_wanted(
-        self, rows: np.ndarray, recording: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        if self.wanted is None:
-            return rows, recording
-        kept = np.array([name in self.wanted for name in self.texts["recording"]])
-        return rows[kept[recording]], recording[kept[recording]]
-
     def flush(self) -> None:
         """Write what is held to the scratch files."""
         for (recording, minute), rows in self.buffers.items():
@@ -221,10 +193,15 @@ class Spill:
         self.buffers, self.held = {}, 0
 
     def recordings(self) -> list[str | None]:
-        """Values of `recording` met, left out ones too; [None] without the field."""
-        if "recording" not in self.texts:
-            return [None]
-        return [text for text, n in self.texts["recording"].items() if n in self._met]
+        """Values of `recording`; [None] without the field."""
+        known = self.texts.get("recording", {})
+        return [text for text, number in known.items() if number in self.blocks] or [
+            None
+        ]
+
+    def texts_of(self, field: str) -> list[str]:
+        """All that a field of texts holds."""
+        return list(self.texts.get(field, ()))
 
     def _minutes(self, recording: str | None) -> tuple[int, list[int]]:
         """A recording's number, and its minutes in the order of time."""
@@ -245,8 +222,15 @@ class Spill:
         for minute in minutes:
             rows = self._rows(code, minute)
             values = {name: rows[:, place] for place, name in enumerate(self.names)}
-            compared = [n for n in values if n != LINE and n not in self.apart]
-            kept = single_rows(values, self.ledger, compared, self._named, self.places)
+            kept = single_rows(
+                values,
+                values["t"],
+                values["id"],
+                self.ledger,
+                self.places,
+                self.apart,
+                self._named,
+            )
             if not kept.all():
                 rows[kept].tofile(self.folder / f"{code}_{minute}")
 

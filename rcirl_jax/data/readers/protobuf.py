@@ -28,6 +28,23 @@ class Field(NamedTuple):
 Types = Mapping[str, Mapping[str, Field]]  # message -> field -> what it is
 
 
+def table_of(schema: str) -> Types:
+    """A table from lines "MESSAGE: FIELD NUMBER KIND, ...", the first one's first.
+
+    A star behind the kind says that it is repeated, "=5" that 5 is its default.
+    """
+    table: dict[str, dict[str, Field]] = {}
+    for line in schema.strip().splitlines():
+        message, _, fields = line.partition(":")
+        table[message] = {}
+        for name, number, text in map(str.split, filter(str.strip, fields.split(","))):
+            kind, _, default = text.partition("=")
+            is_list = kind.endswith("*")
+            found = Field(kind.rstrip("*"), int(number), is_list, default)
+            table[message][name] = found
+    return table
+
+
 def parser(types: Types) -> Callable[[bytes], Message]:
     """What parses the first message of a table; it raises `DecodeError`.
 

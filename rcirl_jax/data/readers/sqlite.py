@@ -21,6 +21,8 @@ STEPS_PER_BYTE = 20  # instructions of the virtual machine per byte of the file
 MIN_STEPS = 50_000_000  # instructions granted to the smallest file
 CHECK_STEPS = 1_000_000  # instructions between checks
 CHUNK_ROWS = 1024  # rows fetched at once; more keep Python's collector busy
+# sqlite3's own messages may hold bytes of the file that are no text
+FAULTS = (sqlite3.Error, sqlite3.Warning, OverflowError, UnicodeDecodeError)
 ALLOWED = (sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ)
 
 
@@ -32,6 +34,8 @@ class Database:
 
     def __enter__(self) -> "Database":
         self._check_head()
+        self._ticks = max(MIN_STEPS, STEPS_PER_BYTE * self.path.stat().st_size)
+        self._ticks //= CHECK_STEPS
         uri = f"{self.path.resolve().as_uri()}?mode=ro&immutable=1"
         try:
             self._connection = sqlite3.connect(uri, uri=True, isolation_level=None)
@@ -39,16 +43,14 @@ class Database:
             raise self.error("database", str(error), "a SQLite file") from error
         try:
             for pragma in ("trusted_schema=OFF", "query_only=ON", "cell_size_check=ON"):
-                self._connection.execute(f"PRAGMA {pragma}")
-        except sqlite3.Error as error:
+                self._execute(f"PRAGMA {pragma}", ())
+        except InputError:
             self._connection.close()
-            raise self.error("database", str(error), "a SQLite file") from error
+            raise
         limit = self._connection.setlimit
         limit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_VALUE_BYTES)
         limit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
         limit(sqlite3.SQLITE_LIMIT_TRIGGER_DEPTH, 1)
-        budget = max(MIN_STEPS, STEPS_PER_BYTE * self.path.stat().st_size)
-        self._ticks = budget // CHECK_STEPS
         self._connection.set_progress_handler(self._tick, CHECK_STEPS)
         self._connection.set_authorizer(_authorise)
         return self
@@ -100,7 +102,7 @@ class Database:
             raise self.error(
                 table, f"a {'virtual table' if virtual else kind}", "a table"
             )
-        cursor = self._execute(f'SELECT * FROM "{table}" LIMIT 0', ())
+        cursor = self._execute(f"SELECT * FROM {_quoted(table)} LIMIT 0", ())
         return tuple(entry[0] for entry in cursor.description or ())
 
     def need(self, table: str, columns: Sequence[str]) -> None:
@@ -114,6 +116,28 @@ class Database:
                     f"{table}.{column}", "missing", f"it among {', '.join(found)}"
                 )
 
+    def table(
+        self,
+        name: str,
+        columns: Sequence[str],
+        most: int,
+        optional: Sequence[str] = (),
+    ) -> list[tuple]:
+        """All rows of a table: the columns, which have to be there, and optional ones.
+
+        Args:
+          name: of the table.
+          columns: their names, which the file may have chosen.
+          most: rows allowed.
+          optional: other columns, or NULL where there are none.
+        """
+        self.need(name, columns)
+        known = self.columns(name)
+        chosen = [_quoted(column) for column in columns]
+        chosen += [_quoted(one) if one in known else "NULL" for one in optional]
+        sql = f"SELECT {', '.join(chosen)} FROM {_quoted(name)}"
+        return [row for rows in self.chunks(sql, (name,), most) for row in rows]
+
     def numbers(
         self, sql: str, names: Sequence[str], most: int, values: tuple = ()
     ) -> np.ndarray:
@@ -125,10 +149,10 @@ class Database:
           most: rows allowed.
           values: of its parameters.
         """
-        parts = [
-            self._floats(rows, names) for rows in self.chunks(sql, names, most, values)
-        ]
-        return np.concatenate(parts) if parts else np.zeros((0, len(names)))
+        parts = [np.zeros((0, len(names)))]
+        for rows in self.chunks(sql, names, most, values):
+            parts.append(self.floats(rows, names))
+        return np.concatenate(parts)
 
     def chunks(
         self, sql: str, names: Sequence[str], most: int, values: tuple = ()
@@ -141,48 +165,38 @@ class Database:
                 raise self.error(names[0], f"more than {most} rows", "fewer")
             yield rows
 
-    def _floats(self, rows: list[tuple], names: Sequence[str]) -> np.ndarray:
-        return np.stack(
-            [
-                self.column(cells, name)
-                for cells, name in zip(zip(*rows, strict=True), names, strict=True)
-            ],
-            axis=1,
-        )
-
-    def column(self, cells: tuple, name: str) -> np.ndarray:
-        """Cells of one column as float64; NULL is NaN, text and blobs are errors."""
-        # numpy would read numbers out of text
-        wrong = set(map(type, cells)) - {int, float, type(None)}
-        if wrong:
-            bad = next(cell for cell in cells if type(cell) in wrong)
-            raise self.error(name, repr(bad)[:40], "a number")
-        return np.array(cells, np.float64)
+    def floats(self, rows: Sequence[tuple], names: Sequence[str]) -> np.ndarray:
+        """[rows, columns] float64; NULL is NaN, text and blobs are errors."""
+        for name, cells in zip(names, zip(*rows, strict=True), strict=True):
+            # numpy would read numbers out of text
+            wrong = set(map(type, cells)) - {int, float, type(None)}
+            if wrong:
+                bad = next(cell for cell in cells if type(cell) in wrong)
+                raise self.error(name, repr(bad)[:40], "a number")
+        return np.array(rows, np.float64)
 
     def _rows(self, sql: str, values: tuple) -> Iterator[list[tuple]]:
         cursor = self._execute(sql, values)
-        while True:
-            try:
-                rows = cursor.fetchmany(CHUNK_ROWS)
-            except (sqlite3.Error, OverflowError, UnicodeDecodeError) as error:
-                raise self._failed(error) from error
-            if not rows:
-                return
-            yield rows
+        try:
+            while rows := cursor.fetchmany(CHUNK_ROWS):
+                yield rows
+        except FAULTS as error:
+            raise self._failed(error) from error
 
     def _execute(self, sql: str, values: tuple) -> sqlite3.Cursor:
         try:
             return self._connection.execute(sql, values)
-        # sqlite3's own messages may hold bytes of the file that are no text
-        except (
-            *(sqlite3.Error, sqlite3.Warning, OverflowError, UnicodeDecodeError),
-        ) as error:
+        except FAULTS as error:
             raise self._failed(error) from error
 
     def _failed(self, error: Exception) -> InputError:
         if self._ticks < 0:
             return self.error("query", "too much work for the file's size", "tables")
         return self.error("database", str(error), "a readable SQLite file")
+
+
+def _quoted(name: str) -> str:
+    return '"' + name.replace('"', '""') + '"'
 
 
 def _authorise(action: int, *_: object) -> int:

@@ -9,12 +9,14 @@ so it is told that a record is plain bytes, and numpy gives them their meaning.
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.runtime.atomic_files import is_text, parse_json
+from rcirl_jax.runtime.atomic_files import is_text, read_json
+from rcirl_jax.runtime.checked import checked
 
 MAX_METADATA_BYTES = 1024**2  # bytes of a .zarray
 MAX_RECORD_BYTES = 64 * 1024  # bytes of one record
@@ -23,7 +25,29 @@ MAX_READ_BYTES = 2 * 1024**3  # bytes read at once
 MAX_RECORDS = 10**11  # records of an array; the largest public set has 4 * 10^9
 CACHE_BYTES = 64 * 1024**2  # bytes of decompressed chunks kept
 BLOSC_HEADER = 16  # bytes; uint32 at 4: size decompressed, at 12: compressed
-TYPE = re.compile(r"[<|]?(?:([fiu][1248])|(U)([1-9][0-9]{0,3}))")
+# little-endian numbers and short texts only; object arrays would be pickles
+TYPE = re.compile(r"[<|]?([fiu][1248]|U[1-9][0-9]{0,3})")
+
+_Extent = tuple[Annotated[int, msgspec.Meta(ge=0, le=MAX_RECORDS)]]
+_Shape = Annotated[
+    list[Annotated[int, msgspec.Meta(ge=1, le=1024)]], msgspec.Meta(max_length=3)
+]
+_Field = Annotated[list[str | _Shape], msgspec.Meta(min_length=2, max_length=3)]
+
+
+class _Blosc(msgspec.Struct):
+    id: Literal["blosc"]
+
+
+class _Metadata(msgspec.Struct):
+    """What is read of a .zarray."""
+
+    zarr_format: Literal[2]
+    shape: _Extent
+    chunks: _Extent
+    dtype: Annotated[list[_Field], msgspec.Meta(min_length=1, max_length=64)]
+    compressor: _Blosc | None = None
+    filters: Annotated[list, msgspec.Meta(max_length=0)] | None = None
 
 
 class StructuredArray:
@@ -38,10 +62,10 @@ class StructuredArray:
         """
         self.path = folder
         file = folder / ".zarray"
-        meta = read_json(file, MAX_METADATA_BYTES)
-        self.size = _extent(file, meta, "shape", MAX_RECORDS)
-        self.chunk = _extent(file, meta, "chunks", MAX_RECORDS)
-        self.dtype = _dtype(file, meta.get("dtype"))
+        body = read_json(file, "the metadata of an array", MAX_METADATA_BYTES)
+        meta = checked(body, _Metadata, file)
+        (self.size,), (self.chunk,) = meta.shape, meta.chunks
+        self.dtype = _dtype(file, meta.dtype)
         _check_fields(file, self.dtype, fields)
         self._texts = [name for name in fields if self.dtype[name].base.kind == "U"]
         if self.chunk < 1 or self.chunk * self.dtype.itemsize > MAX_CHUNK_BYTES:
@@ -49,7 +73,7 @@ class StructuredArray:
                 f"{file}: chunks: {self.chunk} records: expected 1 to "
                 f"{MAX_CHUNK_BYTES // self.dtype.itemsize}"
             )
-        self._compressor = _compressor(file, meta)
+        self._is_packed = meta.compressor is not None
         self._store = None
         self._checked: set[int] = set()
 
@@ -86,25 +110,26 @@ class StructuredArray:
         if self._store is None:
             import tensorstore
 
-            self._store = tensorstore.open(
-                {
-                    "driver": "zarr",
-                    "kvstore": {"driver": "file", "path": str(self.path.resolve())},
-                    "metadata": {
-                        "zarr_format": 2,
-                        "shape": [self.size],
-                        "chunks": [self.chunk],
-                        "dtype": [["record", "|u1", [self.dtype.itemsize]]],
-                        "compressor": self._compressor,
-                        "filters": None,
-                        "fill_value": None,
-                        "order": "C",
-                    },
-                    "context": {"cache_pool": {"total_bytes_limit": CACHE_BYTES}},
-                },
-                open=True,
-                assume_metadata=True,
-            ).result()
+            # what decompresses is written in each chunk; here it only has to be valid
+            blosc = {"id": "blosc", "cname": "lz4", "clevel": 5, "shuffle": 1}
+            metadata = {
+                "zarr_format": 2,
+                "shape": [self.size],
+                "chunks": [self.chunk],
+                "dtype": [["record", "|u1", [self.dtype.itemsize]]],
+                "compressor": {**blosc, "blocksize": 0} if self._is_packed else None,
+                "filters": None,
+                "fill_value": None,
+                "order": "C",
+            }
+            spec = {
+                "driver": "zarr",
+                "kvstore": {"driver": "file", "path": str(self.path.resolve())},
+                "metadata": metadata,
+                "context": {"cache_pool": {"total_bytes_limit": CACHE_BYTES}},
+            }
+            found = tensorstore.open(spec, open=True, assume_metadata=True)
+            self._store = found.result()
         return self._store
 
     def _check_chunk(self, number: int) -> None:
@@ -119,7 +144,7 @@ class StructuredArray:
             raise InputError(
                 f"{file}: chunk: {error.strerror}: expected a file"
             ) from error
-        if self._compressor is not None:
+        if self._is_packed:
             if len(head) < BLOSC_HEADER:
                 raise InputError(f"{file}: chunk: {size} bytes: expected blosc data")
             found = int.from_bytes(head[4:8], "little")
@@ -133,65 +158,24 @@ class StructuredArray:
         self._checked.add(number)
 
 
-def read_json(file: Path, max_bytes: int) -> dict:
-    """A small JSON object."""
-    try:
-        size = file.stat().st_size
-        content = file.read_bytes() if size <= max_bytes else b""
-    except OSError as error:
-        raise InputError(f"{file}: {error.strerror}: expected a file") from error
-    if size > max_bytes:
-        raise InputError(f"{file}: size: {size} bytes: expected at most {max_bytes}")
-    try:
-        found = parse_json(content)
-    except ValueError as error:
-        raise InputError(f"{file}: json: {_brief(error)}: expected JSON") from error
-    if not isinstance(found, dict):
-        raise InputError(f"{file}: json: {type(found).__name__}: expected an object")
-    return found
-
-
 def _brief(error: Exception) -> str:
     """First line of a message, short."""
     return (str(error).splitlines() or [type(error).__name__])[0][:120]
 
 
-def _extent(file: Path, meta: dict, key: str, limit: int) -> int:
-    """The only number of a list such as [20802]."""
-    if meta.get("zarr_format") != 2:
-        raise InputError(f"{file}: zarr_format: {meta.get('zarr_format')}: expected 2")
-    value = meta.get(key)
-    if (
-        not isinstance(value, list)
-        or len(value) != 1
-        or type(value[0]) is not int
-        or not 0 <= value[0] <= limit
-    ):
-        raise InputError(f"{file}: {key}: {str(value)[:40]}: expected one size")
-    return value[0]
-
-
-def _dtype(file: Path, fields: object) -> np.dtype:
-    """Numbers and short texts only; object arrays would be pickles."""
-    if not isinstance(fields, list) or not 0 < len(fields) <= 64:
-        raise InputError(
-            f"{file}: dtype: {str(fields)[:40]}: expected a list of fields"
-        )
+def _dtype(file: Path, fields: list[list]) -> np.dtype:
+    """The type of a record, by its fields [name, type] or [name, type, shape]."""
     parts = []
     for field in fields:
-        whole = isinstance(field, list) and len(field) >= 2
-        name, kind, *shape = field if whole else ("", "")
+        name, kind, *shape = field
+        is_shape = all(isinstance(part, list) for part in shape)
         match = TYPE.fullmatch(kind) if isinstance(kind, str) else None
-        shape = shape[0] if len(shape) == 1 else shape
-        sizes = isinstance(shape, list) and all(
-            type(size) is int and 0 < size <= 1024 for size in shape
-        )
-        if not (isinstance(name, str) and name and match and sizes and len(shape) <= 3):
+        if not (isinstance(name, str) and name and match and is_shape):
             raise InputError(
                 f"{file}: dtype: {str(field)[:60]}: "
                 "expected [name, little-endian number or text, shape]"
             )
-        parts.append((name, "<" + kind.lstrip("<|"), tuple(shape)))
+        parts.append((name, f"<{match[1]}", *map(tuple, shape)))
     try:
         dtype = np.dtype(parts)
     except ValueError as error:
@@ -219,17 +203,3 @@ def _check_fields(
                 f"{file}: dtype: {name}: {found}: expected shape {shape}, "
                 f"kind {' or '.join(kinds)}"
             )
-
-
-def _compressor(file: Path, meta: dict) -> dict | None:
-    if meta.get("filters"):
-        raise InputError(f"{file}: filters: {str(meta['filters'])[:40]}: expected none")
-    found = meta.get("compressor")
-    if found is None:
-        return None
-    if not isinstance(found, dict) or found.get("id") != "blosc":
-        raise InputError(
-            f"{file}: compressor: {str(found)[:60]}: expected blosc or none"
-        )
-    # what decompresses is written in each chunk; these only have to be valid
-    return {"id": "blosc", "cname": "lz4", "clevel": 5, "shuffle": 1, "blocksize": 0}

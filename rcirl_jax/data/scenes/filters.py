@@ -20,6 +20,20 @@ REASONS = {
     "surroundings_end": "someone the human reacts to leaves the record too early",
 }
 
+# what to do where too much is dropped for a reason
+REMEDIES = {
+    "future_too_short": "a lower --min_future, or longer recordings",
+    "off_map": "look at map and traffic with experiments.inspect_data: one frame?",
+    "not_human": "look at how the log says who drives (columns.automated)",
+    "far_from_road": "look at the lanes' widths with experiments.inspect_data",
+    "too_noisy": "a longer --smoothing",
+    "no_speed_change": "--keep_steady",
+    "no_obstacles": "--keep_free_road",
+    "overlapping_boxes": "look at the sizes and headings of the boxes",
+    "follows_missing_car": "a log with the missing leaders",
+    "surroundings_end": "a lower --min_surroundings",
+}
+
 MIN_SPEED_CHANGE_MPS = 0.5  # m/s over the scene
 MAX_ACCELERATION_MPS2 = 6.0  # m/s^2, beyond a road car's usual grip use
 MAX_JERK_MPS3 = 15.0  # m/s^3

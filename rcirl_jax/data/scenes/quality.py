@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from rcirl_jax.data.scenes.collect import Collector
-from rcirl_jax.data.scenes.filters import REASONS
+from rcirl_jax.data.scenes.filters import REASONS, REMEDIES
 from rcirl_jax.data.scenes.lines import TOO_FEW
 from rcirl_jax.data.scenes.smoothing import HARSH_MPS2, harsh_share
 from rcirl_jax.data.store.dataset import Dataset
@@ -17,6 +17,8 @@ HEADWAY_STEP_S = 0.01  # s, to which headways are counted
 SPEED_STEP_MPS = 0.05  # m/s, likewise
 FUTURE_STEP_S = 0.05  # s, likewise
 HEADWAY_EDGES_S = (0.5, 1.0, 1.5, 2.0, 3.0)  # s, bins of the headway histogram
+# what a log may leave to a guess
+LIMIT, WIDTH, SIZE = "speed limit", "width", "size"
 HOW_TO_POOL = (
     "written lights that the crossings of one file cannot bear out give no stop "
     "labels: `--signals=pooled` of an import asks the drivers of all files together"
@@ -56,11 +58,35 @@ class QualityReport:
     rows: collections.Counter = dataclasses.field(default_factory=collections.Counter)
     notes: list[str] = dataclasses.field(default_factory=list)
     refused: int = 0  # recordings left out
+    empty: int = 0  # recordings without traffic
+    # lanes without a speed limit or width, road users without a size, and all of them
+    assumed: collections.Counter = dataclasses.field(
+        default_factory=collections.Counter
+    )
 
     def add_refusal(self, recording: Recording) -> None:
         """Count a recording that is left out, and note why."""
         self.refused += 1
         self.notes.append(f"left out: {recording.refused}")
+
+    def add_empty(self, recording: Recording) -> None:
+        """Count and note a recording in which nobody drives."""
+        self.empty += 1
+        self.notes += [
+            f"{recording.name}: {x}" for x in ("no traffic", *recording.notes)
+        ]
+
+    def _add_assumed(self, recording: Recording) -> None:
+        """Count what the log does not say and is guessed; note it of each recording."""
+        found = assumed(recording)
+        self.assumed.update(found)
+        self.assumed["lanes"] += len(recording.lanes)
+        self.assumed["road users"] += len(recording.tracks)
+        words = ", ".join(f"{count} {what}" for what, count in found.items() if count)
+        if words:
+            limit = f"speed limit {recording.default_speed_limit:.2f} m/s"
+            words = words.replace("speed limit", limit)
+            self.notes.append(f"{recording.name}: assumed: {words}")
 
     def add_recording(self, collector: Collector) -> None:
         """Count a recording's tracks, noise, drop reasons and notes."""
@@ -82,6 +108,7 @@ class QualityReport:
         self.shortened += collector.ended["shortened"]
         self.times += collector.ended["times"]
         self.times_cut += collector.ended["times_cut"]
+        self._add_assumed(recording)
         notes = [*recording.notes, *collector.signal_notes]
         self.notes += [f"{recording.name}: {note}" for note in notes]
 
@@ -102,6 +129,9 @@ class QualityReport:
             (self.futures, np.asarray(demonstrations.future_s), FUTURE_STEP_S),
         ):
             counts.update(map(str, np.round(values / step).astype(int).tolist()))
+
+    def _any_assumed(self) -> bool:
+        return any(self.assumed[what] for what in (LIMIT, WIDTH, SIZE))
 
     def state(self) -> dict:
         """All sums and lists, JSON-ready; `merge` takes it back."""
@@ -144,9 +174,37 @@ class QualityReport:
             # said only where it happened: the manifests of others keep their hash
             **({"rows": dict(self.rows)} if dropped_rows(self.rows) else {}),
             **({"refused": self.refused} if self.refused else {}),
+            **({"empty": self.empty} if self.empty else {}),
+            **({"assumed": dict(self.assumed)} if self._any_assumed() else {}),
             "notes": self.notes[:200],
             "num_notes": len(self.notes),
         }
+
+
+def assumed(recording: Recording) -> dict[str, int]:
+    """How many lanes and road users of a recording go by a guess."""
+    return {
+        LIMIT: sum(lane.speed_limit is None for lane in recording.lanes),
+        WIDTH: sum(lane.width_assumed for lane in recording.lanes),
+        SIZE: sum(track.size_assumed for track in recording.tracks),
+    }
+
+
+def _assumed_line(counts: Mapping[str, int]) -> str:
+    parts = [
+        f"{what} of {counts[what]:,} of {counts[whole]:,} {whole}"
+        for what, whole in ((LIMIT, "lanes"), (WIDTH, "lanes"), (SIZE, "road users"))
+        if counts.get(what)
+    ]
+    return f"assumed, for the log does not say it: {', '.join(parts)}"
+
+
+def remedies(dropped: Mapping[str, int]) -> str:
+    """Why scenes were dropped, most frequent first, and what to do about each."""
+    counts = sorted(dropped.items(), key=lambda item: -item[1])
+    return "; ".join(
+        f"{count:,} {name}: try {REMEDIES[name]}" for name, count in counts if count
+    )
 
 
 def dropped_rows(rows: Mapping[str, int]) -> int:
@@ -227,6 +285,15 @@ def format_quality(report: dict) -> str:
         lines.append(left + right)
     decisions = ", ".join(f"{k} {v:,}" for k, v in report["decisions"].items())
     lines += ["", f"decisions per obstacle: {decisions}"]
+    lines += oddities(report)
+    if any(TOO_FEW in note for note in report["notes"]):
+        lines.append(HOW_TO_POOL)
+    return "\n".join(lines)
+
+
+def oddities(report: Mapping) -> list[str]:
+    """What was dropped, left out, skipped, guessed and noted."""
+    lines = []
     if "rows" in report:
         rows = report["rows"]
         dropped = dropped_rows(rows)
@@ -238,11 +305,13 @@ def format_quality(report: dict) -> str:
         )
     if report.get("refused"):
         lines.append(f"{report['refused']} recordings refused and left out")
+    if report.get("empty"):
+        lines.append(f"{report['empty']} recordings without traffic skipped")
+    if report.get("assumed"):
+        lines.append(_assumed_line(report["assumed"]))
     if report["num_notes"]:
         lines.append(f"{report['num_notes']} notes; first: {report['notes'][0]}")
-    if any(TOO_FEW in note for note in report["notes"]):
-        lines.append(HOW_TO_POOL)
-    return "\n".join(lines)
+    return lines
 
 
 def format_splits(dataset: Dataset) -> str:

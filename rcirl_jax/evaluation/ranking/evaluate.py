@@ -100,7 +100,7 @@ def _temperatures(
     rows, index = covered_rows(dataset, "train", setup.horizon_s)
     chosen = np.random.default_rng(0).permutation(index.size)[:TEMPERATURE_SCENES]
     rows, index = jax.tree.map(lambda x: x[chosen], rows), index[chosen]
-    scored = _score(rows, index, setup, scorers, executor)
+    scored = score_rows(rows, index, setup, scorers, executor)
     outcomes = outcomes_of(scored, rows, setup)
     values = {
         **scored.values,
@@ -110,18 +110,19 @@ def _temperatures(
     return {name: fit_temperature(v, outcomes) for name, v in values.items()}
 
 
-def _numbered(rows: Mapping[str, Sequence[Run]]) -> dict[str, Run]:
+def numbered(rows: Mapping[str, Sequence[Run]]) -> dict[str, Run]:
     """Each run by itself: row -> runs becomes "row#0" -> run, ..."""
     return {f"{n}#{i}": x for n, runs in rows.items() for i, x in enumerate(runs)}
 
 
-def _score(
+def score_rows(
     rows: Demonstration,
     index: np.ndarray,
     setup: RankingSetup,
     scorers: Mapping[str, Scorer | OnTop],
     executor: Executor | None = None,
 ) -> Scored:
+    """`score_scenes` of a setup; its tuned rivals by the names of `numbered`."""
     return score_scenes(
         rows,
         index,
@@ -130,7 +131,7 @@ def _score(
         horizon_s=setup.horizon_s,
         scorers=scorers,
         futures=setup.futures,
-        tuned=_numbered(setup.tuned),
+        tuned=numbered(setup.tuned),
         executor=executor,
     )
 
@@ -166,10 +167,10 @@ def rank_scenes(
     Raises:
       InputError: no scene of the split covers the horizon.
     """
-    flat = _numbered(learned)
+    flat = numbered(learned)
     rows, index = covered_rows(dataset, setup.split, setup.horizon_s)
     temperatures = _temperatures(dataset, setup, flat, executor)
-    scored = _score(rows, index, setup, flat, executor)
+    scored = score_rows(rows, index, setup, flat, executor)
     outcomes = outcomes_of(scored, rows, setup)
 
     def metrics(name: str) -> dict[str, np.ndarray]:

@@ -27,78 +27,53 @@ from rcirl_jax.train.frozen import Fitted, first_params, fit, freeze, members_of
 from rcirl_jax.train.loop import CHUNK, NORMALISER_SCENES, rows_that_count
 from rcirl_jax.train.state import FeatureBatch, TrainConfig
 
-LINEAR = RewardConfig(hidden=(), pin="none")
-FREE = RewardConfig(pin="none")
-
-# What a learner changes of the shared configuration. The linear rewards are not
-# pinned: with unit norm their values cannot grow to the spread that a logistic or
-# listwise loss asks for. "Free" says the same of the paper's network, whatever
-# the loss; the rank loss has no such row, for it is homogeneous in the scale.
-LEARNERS: dict[str, dict] = {
-    "RC-IRL rank": {"loss": "rank"},
-    "rank linear": {"loss": "rank", "reward": RewardConfig(hidden=())},
-    "rank non-negative": {
-        "loss": "rank",
-        "reward": RewardConfig(hidden=(), constraint="nonnegative"),
-    },
-    "RC-IRL logistic": {"loss": "logistic"},
-    "logistic free": {"loss": "logistic", "reward": FREE},
-    "hinge": {"loss": "hinge"},
-    "hinge free": {"loss": "hinge", "reward": FREE},
-    "MaxEnt": {"loss": "listwise"},
-    "MaxEnt free": {"loss": "listwise", "reward": FREE},
-    "MaxEnt linear": {"loss": "listwise", "reward": LINEAR},
-    "MaxEnt 64": {"loss": "listwise", "reward": RewardConfig(hidden=(64,))},
-    "MaxEnt monotone": {
-        "loss": "listwise",
-        "reward": RewardConfig(constraint="monotone"),
-    },
-    "MaxEnt monotone 64": {
-        "loss": "listwise",
-        "reward": RewardConfig(hidden=(64,), constraint="monotone"),
-    },
-    "MaxEnt 32-16": {"loss": "listwise", "reward": RewardConfig(hidden=(32, 16))},
-    "MaxEnt monotone 32-16": {
-        "loss": "listwise",
-        "reward": RewardConfig(hidden=(32, 16), constraint="monotone"),
-    },
-    "soft labels": {"loss": "soft"},
-    "soft labels free": {"loss": "soft", "reward": FREE},
-    "soft labels linear": {"loss": "soft", "reward": LINEAR},
-    "GAN": {"loss": "gan"},
-    "GAN free": {"loss": "gan", "reward": FREE},
-    # as in the paper: the recorded curve itself is the positive
-    "RC-IRL rank on curves": {"loss": "rank", "positive": "human"},
-    "RC-IRL logistic on curves": {"loss": "logistic", "positive": "human"},
-    "logistic free on curves": {
-        "loss": "logistic",
-        "positive": "human",
-        "reward": FREE,
-    },
-    "GAN on curves": {"loss": "gan", "positive": "human"},
-    "GAN free on curves": {"loss": "gan", "positive": "human", "reward": FREE},
-    "logistic linear": {"loss": "logistic", "reward": LINEAR},
-    "logistic non-negative": {
-        "loss": "logistic",
-        "reward": RewardConfig(hidden=(), pin="none", constraint="nonnegative"),
-    },
-    "logistic 64": {"loss": "logistic", "reward": RewardConfig(hidden=(64,))},
-    "logistic 32-16": {"loss": "logistic", "reward": RewardConfig(hidden=(32, 16))},
-    "logistic monotone": {
-        "loss": "logistic",
-        "reward": RewardConfig(constraint="monotone"),
-    },
-    "logistic by context": {"loss": "logistic"},
-    "non-negative by context": {
-        "loss": "logistic",
-        "reward": RewardConfig(hidden=(), pin="none", constraint="nonnegative"),
-    },
-    "logistic, hard negatives": {
-        "loss": "logistic",
-        "hard_negatives": 12,
-        "hard_pool": 3,
-    },
-}
+# What a learner changes of the shared configuration: loss, fields of its network,
+# others of its training. The linear rewards are not pinned: with unit norm their
+# values cannot grow to the spread that a logistic or listwise loss asks for. "Free"
+# says the same of the paper's network, whatever the loss; the rank loss has no such
+# row, for it is homogeneous in the scale.
+FREE = {"pin": "none"}
+LINEAR = {"hidden": (), **FREE}
+COSTS = {**LINEAR, "constraint": "nonnegative"}
+MONOTONE = {"constraint": "monotone"}
+ON_CURVES = {"positive": "human"}  # as in the paper: the recorded curve itself
+LEARNERS: dict[str, tuple[str, dict, dict]] = {
+    "RC-IRL rank": ("rank", {}, {}),
+    "rank linear": ("rank", {"hidden": ()}, {}),
+    "rank non-negative": ("rank", {"hidden": (), "constraint": "nonnegative"}, {}),
+    "RC-IRL logistic": ("logistic", {}, {}),
+    "logistic free": ("logistic", FREE, {}),
+    "hinge": ("hinge", {}, {}),
+    "hinge free": ("hinge", FREE, {}),
+    "MaxEnt": ("listwise", {}, {}),
+    "MaxEnt free": ("listwise", FREE, {}),
+    "MaxEnt linear": ("listwise", LINEAR, {}),
+    "MaxEnt 64": ("listwise", {"hidden": (64,)}, {}),
+    "MaxEnt monotone": ("listwise", MONOTONE, {}),
+    "MaxEnt monotone 64": ("listwise", {"hidden": (64,), **MONOTONE}, {}),
+    "MaxEnt 32-16": ("listwise", {"hidden": (32, 16)}, {}),
+    "MaxEnt monotone 32-16": ("listwise", {"hidden": (32, 16), **MONOTONE}, {}),
+    "soft labels": ("soft", {}, {}),
+    "soft labels free": ("soft", FREE, {}),
+    "soft labels linear": ("soft", LINEAR, {}),
+    "GAN": ("gan", {}, {}),
+    "GAN free": ("gan", FREE, {}),
+    "RC-IRL rank on curves": ("rank", {}, ON_CURVES),
+    "RC-IRL logistic on curves": ("logistic", {}, ON_CURVES),
+    "logistic free on curves": ("logistic", FREE, ON_CURVES),
+    "GAN on curves": ("gan", {}, ON_CURVES),
+    "GAN free on curves": ("gan", FREE, ON_CURVES),
+    "logistic linear": ("logistic", LINEAR, {}),
+    "logistic non-negative": ("logistic", COSTS, {}),
+    "logistic 64": ("logistic", {"hidden": (64,)}, {}),
+    "logistic 32-16": ("logistic", {"hidden": (32, 16)}, {}),
+    "logistic monotone": ("logistic", MONOTONE, {}),
+    "logistic by context": ("logistic", {}, {}),
+    "non-negative by context": ("logistic", COSTS, {}),
+    "logistic, hard negatives": (
+        "logistic", {}, {"hard_negatives": 12, "hard_pool": 3},
+    ),
+}  # fmt: skip
 
 # one program for all runs of a shape: their weights are arguments
 _value = jax.jit(value, static_argnums=4)
@@ -143,9 +118,10 @@ def learner_config(name: str, base: TrainConfig) -> TrainConfig:
     """
     if name not in LEARNERS:
         raise InputError(f"--learners: {name}: expected some of {sorted(LEARNERS)}")
-    config = dataclasses.replace(base, **LEARNERS[name])
+    loss, network, more = LEARNERS[name]
+    config = dataclasses.replace(base, loss=loss, **more)
     features = feature_map(config.features)
-    reward = config.reward
+    reward = dataclasses.replace(base.reward, **network)
     if reward.constraint == "monotone":
         reward = dataclasses.replace(reward, signs=features.signs)
     if name in BY_CONTEXT:
@@ -218,25 +194,17 @@ def normaliser_of(
     return made.replace(scale=jnp.where(kept, made.scale, jnp.inf))
 
 
-def train_grid(
-    frozen: FeatureBatch,
-    config: TrainConfig,
-    leaky_rates: Sequence[float],
-    seeds: Sequence[int],
-) -> dict[float, list[Learned]]:
-    """Leaky rates x seeds as members of one program; they share the batch order."""
-    grid = [
-        dataclasses.replace(config, seed=seed, leaky_rate=rate)
-        for rate in leaky_rates
-        for seed in seeds
-    ]
+def train_together(
+    frozen: FeatureBatch, config: TrainConfig, seeds: Sequence[int]
+) -> list[Learned]:
+    """Several seeds as members of one program; they share the batch order."""
+    members = [dataclasses.replace(config, seed=seed) for seed in seeds]
     normaliser = normaliser_of(frozen, config)
-    fitted = fit(frozen, normaliser, config, members_of(grid))
-    each = [jax.tree.map(lambda leaf, n=n: leaf[n], fitted) for n in range(len(grid))]
-    runs = iter(
-        _learned(one, normaliser, own) for one, own in zip(each, grid, strict=True)
-    )
-    return {rate: [next(runs) for _ in seeds] for rate in leaky_rates}
+    fitted = fit(frozen, normaliser, config, members_of(members))
+    return [
+        _learned(jax.tree.map(lambda leaf, n=n: leaf[n], fitted), normaliser, own)
+        for n, own in enumerate(members)
+    ]
 
 
 def train_learner(

@@ -16,9 +16,10 @@ Host numpy, float64. Axes: `S` scenes, `K` candidates.
 """
 
 import dataclasses
-from collections.abc import Callable
+import math
 
 import numpy as np
+from scipy.optimize import root_scalar
 
 from rcirl_jax.errors import InputError
 
@@ -33,8 +34,7 @@ MISS_LIMITS_M = (6.0, 8.0)  # m
 
 # Bounds of a fitted temperature, in units of the values' spread within scenes.
 TEMPERATURE_RANGE = (1e-4, 1e4)  # 1
-NEWTON_STEPS = 60  # safeguarded: bisection alone reaches 1e-16 of the bracket
-NEWTON_TOLERANCE = 1e-13  # step in log temperature at which the fit is done
+TEMPERATURE_TOLERANCE = 1e-13  # of its logarithm
 
 
 @dataclasses.dataclass(frozen=True)
@@ -216,10 +216,9 @@ def fit_temperature(values: np.ndarray, outcomes: Outcomes) -> float:
     """Temperature with the least mean NLL of the nearest candidate.
 
     With b = 1 / temperature, NLL(b) = mean[log sum_k exp(b v_k) - b v_nearest]
-    is convex in b, and NLL'(b) = mean[E_b(v) - v_nearest] grows with slope
-    mean[Var_b(v)]. The root is found by Newton steps in log b, inside a bracket
-    that shrinks by bisection where a step would leave it. Values are divided by
-    their spread first, so that fit(c v) = c fit(v). Use TRAINING scenes only.
+    is convex in b, and NLL'(b) = mean[E_b(v) - v_nearest] grows with b. Its root in
+    log b is found by Brent's method. Values are divided by their spread first, so
+    that fit(c v) = c fit(v). Use TRAINING scenes only.
 
     Args:
       values: [S, K] values of the training scenes' candidates.
@@ -249,40 +248,24 @@ def fit_temperature(values: np.ndarray, outcomes: Outcomes) -> float:
     scaled = centred / spread
     target = _pick(scaled, _nearest(outcomes)[some])
 
-    def slope(log_b: float) -> tuple[float, float]:
-        """NLL'(b) and the Newton step of its root in log b."""
-        b = np.exp(log_b)
-        logits = np.where(feasible, b * scaled, -np.inf)
+    def slope(log_b: float) -> float:
+        """NLL'(b), times the scenes."""
+        logits = np.where(feasible, np.exp(log_b) * scaled, -np.inf)
         weight = np.exp(logits - logits.max(axis=1, keepdims=True))
         weight /= weight.sum(axis=1, keepdims=True)
-        mean = np.sum(weight * scaled, axis=1)
-        variance = np.sum(weight * (scaled - mean[:, None]) ** 2)
-        first = float(np.sum(mean - target))
-        return first, -first / max(float(b * variance), 1e-300)
+        return float(np.sum(np.sum(weight * scaled, axis=1) - target))
 
-    low, high = (-np.log(x) for x in reversed(TEMPERATURE_RANGE))
-    return float(spread * np.exp(-_root(slope, float(low), float(high))))
-
-
-def _root(
-    slope: Callable[[float], tuple[float, float]], low: float, high: float
-) -> float:
-    """Root of an increasing function in [low, high], or the end next to it."""
-    if slope(low)[0] >= 0.0:
-        return low
-    if slope(high)[0] <= 0.0:
-        return high
-    at = 0.5 * (low + high)
-    for _ in range(NEWTON_STEPS):
-        first, step = slope(at)
-        low, high = (at, high) if first < 0.0 else (low, at)
-        proposed = at + step
-        if not low < proposed < high:
-            proposed = 0.5 * (low + high)
-        moved, at = abs(proposed - at), proposed
-        if moved < NEWTON_TOLERANCE:
-            break
-    return at
+    low, high = (-math.log(x) for x in reversed(TEMPERATURE_RANGE))
+    if slope(low) >= 0.0:
+        at = low
+    elif slope(high) <= 0.0:
+        at = high
+    else:
+        found = root_scalar(
+            slope, method="brentq", bracket=(low, high), xtol=TEMPERATURE_TOLERANCE
+        )
+        at = float(found.root)
+    return float(spread * np.exp(-at))
 
 
 def _expect_shape(where: str, name: str, array: np.ndarray, shape: tuple) -> None:

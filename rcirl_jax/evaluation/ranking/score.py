@@ -33,7 +33,7 @@ from rcirl_jax.reward import (
 from rcirl_jax.runtime.executors import Executor, Here
 from rcirl_jax.sampling import SamplerConfig, sample
 from rcirl_jax.train.featurise import human_of
-from rcirl_jax.types import Demonstration, Scene, Trajectory
+from rcirl_jax.types import Candidates, Demonstration, Scene, Trajectory
 from rcirl_jax.units import DT_S, NUM_TIMES, TIMES_S
 
 CHUNK = 128  # scenes per device call; padded, so that it compiles once
@@ -238,16 +238,34 @@ class Measured:
     ade: np.ndarray  # [S, K] m, mean over times up to the horizon
 
 
+def measured(
+    index: jax.Array,
+    demonstration: Demonstration,
+    scene: Scene,
+    sampler: SamplerConfig,
+    horizon_s: float,
+) -> tuple[Candidates, jax.Array, jax.Array]:
+    """Candidates of a dataset row as evaluations make them, FDE and ADE [K] m.
+
+    Args:
+      index: dataset row, which seeds the candidates.
+      demonstration: the row.
+      scene: its own, or as the planner sees it.
+      sampler: sampler configuration.
+      horizon_s: s in (0, 8].
+    """
+    human = human_of(demonstration, sampler)
+    made = sample(candidates_key(index), scene, sampler)
+    far = jax.vmap(lambda x: distances(demonstration, human, x, horizon_s))
+    return made, *far(made.trajectory)
+
+
 @functools.cache
 def _measure_batch(sampler: SamplerConfig, horizon_s: float, futures: str) -> Callable:
     def one(index: jax.Array, demonstration: Demonstration) -> dict:
-        human = human_of(demonstration, sampler)
         scene = demonstration.scene
         scene = as_seen(scene) if futures == "predicted" else scene
-        made = sample(candidates_key(index), scene, sampler)
-        fde, ade = jax.vmap(lambda x: distances(demonstration, human, x, horizon_s))(
-            made.trajectory
-        )
+        made, fde, ade = measured(index, demonstration, scene, sampler, horizon_s)
         return {"feasible": made.feasible, "fde": fde, "ade": ade}
 
     return jax.jit(jax.vmap(one))

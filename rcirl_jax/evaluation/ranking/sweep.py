@@ -27,11 +27,13 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.evaluate import (
     RankingSetup,
     covered_rows,
+    numbered,
     outcomes_of,
+    score_rows,
 )
 from rcirl_jax.evaluation.ranking.learners import fitting_rows, normaliser_of
 from rcirl_jax.evaluation.ranking.metrics import METRICS, scene_metrics
-from rcirl_jax.evaluation.ranking.score import Scorer, score_scenes
+from rcirl_jax.evaluation.ranking.score import Scorer
 from rcirl_jax.evaluation.statistics import ClusterBootstrap, Estimate, combine_seeds
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import Normaliser, RewardParams, seen_range
@@ -249,16 +251,7 @@ def held_out_scores(
     """
     rows, index = covered_rows(split, name, setup.horizon_s)
     vehicles = ClusterBootstrap(np.asarray(rows.vehicle))
-    scored = score_scenes(
-        rows,
-        index,
-        preset=setup.preset,
-        sampler=setup.sampler,
-        horizon_s=setup.horizon_s,
-        futures=setup.futures,
-        scorers={f"{n}#{i}": f for n, fs in runs.items() for i, f in enumerate(fs)},
-        executor=executor,
-    )
+    scored = score_rows(rows, index, setup, numbered(runs), executor)
     outcomes = outcomes_of(scored, rows, setup)
 
     def of(key: str) -> dict[str, np.ndarray]:

@@ -32,6 +32,7 @@ from rcirl_jax.evaluation.statistics import (
 )
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW
 from rcirl_jax.reward import LONG_ROW, SPEED_DP_ROW, TUNED_ROW
+from rcirl_jax.runtime.checked import checked
 
 SCHEMA = "rcirl-jax/ranking-report"
 SCHEMA_VERSION = 1
@@ -309,24 +310,7 @@ def from_json(body: Mapping[str, Any]) -> RankingReport:
         raise InputError(
             f"report: schema: {version}: expected {(SCHEMA, SCHEMA_VERSION)}"
         )
-    try:
-        estimate = lambda found: Estimate(**found)  # noqa: E731
-        fields = {f.name: body[f.name] for f in dataclasses.fields(RankingReport)}
-        fields["rows"] = {
-            row: {metric: estimate(found) for metric, found in metrics.items()}
-            for row, metrics in body["rows"].items()
-        }
-        fields["comparisons"] = tuple(
-            Comparison(**{**found, "difference": Difference(**found["difference"])})
-            for found in body["comparisons"]
-        )
-        medians = body["human_rank_median"]
-        fields["human_rank_median"] = {row: estimate(x) for row, x in medians.items()}
-        for name in ("oracle_floor", "oracle_floor_median"):
-            fields[name] = estimate(body[name])
-    except (KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"report: {error}: expected a ranking report") from error
-    return RankingReport(**fields)
+    return checked(body, RankingReport, "report")
 
 
 def _plain(node: object, where: str) -> "dict | list | str | float | int | bool | None":

@@ -1,131 +1,165 @@
-"""What a tuner of the hand-set cost minimises: the error of what it chooses.
+"""What a tuner of a rival minimises: the error of what the rival chooses.
 
-A problem knows how many queries (candidates looked at) one evaluation takes, so
-that budgets can be compared with a learner's. Vectors are those of
-`rcirl_jax.reward.tuned`; zeros are Apollo's weights.
+A rival is the hand-set cost or the IDM. A problem knows how many queries (candidates
+looked at) one evaluation takes, so that budgets can be compared with a learner's. A
+vector of zeros is the usual rival.
 """
 
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, covered_rows
-from rcirl_jax.evaluation.ranking.score import (
-    CHUNK,
-    candidates_key,
-    distances,
-    horizon_mask,
-)
+from rcirl_jax.evaluation.ranking.score import CHUNK, Rival, horizon_mask, measured
 from rcirl_jax.evaluation.rivals.cma_es import Objective
+from rcirl_jax.planner.baselines import Idm, closeness, idm_trajectory
 from rcirl_jax.planner.prediction import as_seen
-from rcirl_jax.reward import lattice_terms, tuned, weighted_cost
+from rcirl_jax.reward import TUNABLE, lattice_terms, tuned, weighted_cost
 from rcirl_jax.reward.hand import LatticeTerms
-from rcirl_jax.sampling import SamplerConfig, sample
+from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.sampling.sampler import num_candidates
-from rcirl_jax.train.featurise import human_of
-from rcirl_jax.types import Candidates, Demonstration
-from rcirl_jax.units import HORIZON_S
-
-Scenes = TypeVar("Scenes")  # a pytree of [S, ...] arrays
+from rcirl_jax.types import Demonstration, Scene, Trajectory
 
 POPULATION_CHUNK = 8  # vectors per device call; padded, so that it compiles once
+
+# What a tuner may change of the driver model, in the order of its vector.
+TUNABLE_IDM = (
+    *("headway", "standstill_gap", "acceleration", "braking"),
+    "speed_share",
+)
+LARGEST_IDM_LOG = 3.0  # a parameter is within a factor exp(3) = 20 of the usual one
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Tunable:
+    """A kind of rival: its parameters, and how it values candidates."""
+
+    names: tuple[str, ...]  # of the parameters, in the order of a vector
+    rival: Callable[[jax.Array], Rival]  # of a vector [d], which may be traced
+    # (scene, candidates [K, T], mask [T]) -> what the values need
+    known: Callable[[Scene, Trajectory, jax.Array], Any]
+    # (that, a rival, whether candidates keep to the path) -> [K], higher is better
+    values: Callable[[Any, Any, bool], jax.Array]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Problem:
-    """An objective of the hand-set cost's weights."""
+    """An objective of a rival's parameters."""
 
-    objective: Objective  # [n, 8] -> [n], lower is better
+    objective: Objective  # [n, d] -> [n], lower is better
     queries: int  # candidates looked at in one evaluation of one vector
 
 
-class RankedScenes(NamedTuple):
+class ValuedScenes(NamedTuple):
     """S scenes with K candidates each, on device."""
 
-    terms: LatticeTerms  # [S, K, ...]
+    known: Any  # of `Tunable.known`, leaves [S, ...]
     fde: jax.Array  # [S, K] m
     feasible: jax.Array  # [S, K] bool
 
 
-def ranking_problem(
+def idm_of(vector: Float[Array, " d"]) -> Idm:
+    """The driver model of a tuner's vector of logarithms; zeros are the usual one.
+
+        parameter_i = usual_i exp(clip(x_i, -3, 3))
+
+    Args:
+      vector: [5] x, in the order of `TUNABLE_IDM`; may be traced.
+    """
+    usual = Idm()
+    factor = jnp.exp(jnp.clip(vector, -LARGEST_IDM_LOG, LARGEST_IDM_LOG))
+    changed = {n: getattr(usual, n) * factor[i] for i, n in enumerate(TUNABLE_IDM)}
+    return dataclasses.replace(usual, **changed)
+
+
+def _cost_terms(scene: Scene, everyone: Trajectory, mask: jax.Array) -> LatticeTerms:
+    cut = scene.replace(time_valid=mask)
+    return jax.vmap(lambda x: lattice_terms(cut, x))(everyone)
+
+
+def _nearness(known: tuple, driver: Idm, on_path: bool) -> jax.Array:
+    scene, everyone, mask = known
+    way = idm_trajectory(scene, on_path, driver)
+    return jax.vmap(lambda x: closeness(x, way, mask))(everyone)
+
+
+HAND_SET = Tunable(
+    names=TUNABLE,
+    rival=tuned,
+    known=_cost_terms,
+    values=lambda terms, cost, _: -jax.vmap(lambda x: weighted_cost(x, cost))(terms),
+)
+DRIVER = Tunable(
+    names=TUNABLE_IDM,
+    rival=idm_of,
+    known=lambda *known: known,
+    values=_nearness,
+)
+
+
+def problem(
+    kind: Tunable,
     dataset: Demonstrations,
     setup: RankingSetup,
-    max_scenes: int | None = None,
+    max_scenes: int,
     seed: int = 0,
 ) -> Problem:
-    """Mean FDE [m] of the cheapest candidate over scenes of the setup's split.
+    """Mean FDE [m] of the candidate that a rival values most.
 
     The candidates and distances are those of `evaluate_ranking`; like there, a
     scene without a feasible candidate is charged with candidate 0.
 
     Args:
+      kind: of the rival.
       dataset: an open dataset.
-      setup: sampler, horizon, split; tune on "train" only.
-      max_scenes: at most so many, drawn by the seed; None: all.
+      setup: sampler, horizon, split; tune on "train" only. With `futures` of
+        "predicted" rivals see what the planner sees.
+      max_scenes: at most so many, drawn by the seed.
       seed: of the draw.
 
     Raises:
-      InputError: a horizon out of (0, 8] s, or no scene of the split covers it.
-    """
-    if not 0.0 < setup.horizon_s <= HORIZON_S:
-        raise InputError(
-            f"--horizon: {setup.horizon_s}: expected above 0, at most {HORIZON_S:g} s"
-        )
-    rows, index = drawn_rows(dataset, setup, max_scenes, seed)
-    scenes = ranked_scenes(rows, index, setup.sampler, setup.horizon_s)
-    return Problem(
-        objective=functools.partial(mean_fde, scenes), queries=int(scenes.fde.size)
-    )
-
-
-def drawn_rows(
-    dataset: Demonstrations, setup: RankingSetup, max_scenes: int | None, seed: int
-) -> tuple[Demonstration, np.ndarray]:
-    """Scenes that cover the horizon and their dataset rows, some drawn by the seed.
-
-    With `setup.futures` of "predicted" they hold what the planner sees.
+      InputError: no scene of the split covers the horizon.
     """
     rows, index = covered_rows(dataset, setup.split, setup.horizon_s)
     chosen = np.random.default_rng(seed).permutation(index.size)[:max_scenes]
     chosen = np.sort(chosen)
     rows = jax.tree.map(lambda x: x[chosen], rows)
     if setup.futures == "predicted":
-        seen = jax.tree.map(np.asarray, _seen(rows.scene))
-        rows = rows.replace(scene=seen)
-    return rows, index[chosen]
+        rows = rows.replace(scene=jax.tree.map(np.asarray, _seen(rows.scene)))
+    scenes = valued_scenes(kind, rows, index[chosen], setup.sampler, setup.horizon_s)
+    on_path = setup.sampler.mode == "speed"
+    objective = functools.partial(mean_fde, kind, scenes, on_path=on_path)
+    return Problem(objective=objective, queries=int(scenes.fde.size))
 
 
 _seen = jax.jit(jax.vmap(as_seen))
 
 
-def ranked_scenes(
-    rows: Demonstration, index: np.ndarray, sampler: SamplerConfig, horizon_s: float
-) -> RankedScenes:
-    """Candidates, their distances and their terms, made once and kept on device.
+def valued_scenes(
+    kind: Tunable,
+    rows: Demonstration,
+    index: np.ndarray,
+    sampler: SamplerConfig,
+    horizon_s: float,
+) -> ValuedScenes:
+    """Candidates, their distances and what a rival needs, made once, a few at a time.
 
     Args:
+      kind: of the rival.
       rows: S demonstrations (numpy) whose recorded future covers the horizon.
       index: [S] dataset rows; they seed the candidates.
       sampler: sampler configuration.
       horizon_s: s in (0, 8].
     """
-    return in_scene_chunks(_make_scenes(sampler, float(horizon_s)), rows, index)
-
-
-def in_scene_chunks(
-    make: Callable[[jax.Array, Demonstration], Scenes],
-    rows: Demonstration,
-    index: np.ndarray,
-) -> Scenes:
-    """What `make` makes of S scenes, a few at a time, compiled once."""
-    parts = []
+    make, parts = _make_scenes(kind, sampler, float(horizon_s)), []
     for start in range(0, index.size, CHUNK):
         picked = np.minimum(np.arange(start, start + CHUNK), index.size - 1)
         taken = jax.tree.map(lambda x, picked=picked: jnp.asarray(x[picked]), rows)
@@ -136,15 +170,13 @@ def in_scene_chunks(
 
 
 @functools.lru_cache(maxsize=8)
-def _make_scenes(
-    sampler: SamplerConfig, horizon_s: float
-) -> Callable[[jax.Array, Demonstration], RankedScenes]:
-    def one(index: jax.Array, demonstration: Demonstration) -> RankedScenes:
+def _make_scenes(kind: Tunable, sampler: SamplerConfig, horizon_s: float) -> Callable:
+    def one(index: jax.Array, demonstration: Demonstration) -> ValuedScenes:
         scene = demonstration.scene
-        candidates, fde = measured(index, demonstration, sampler, horizon_s)
-        cut = scene.replace(time_valid=horizon_mask(scene, horizon_s))
-        return RankedScenes(
-            terms=jax.vmap(lambda x: lattice_terms(cut, x))(candidates.trajectory),
+        candidates, fde, _ = measured(index, demonstration, scene, sampler, horizon_s)
+        mask = horizon_mask(scene, horizon_s)
+        return ValuedScenes(
+            known=kind.known(scene, candidates.trajectory, mask),
             fde=fde,
             feasible=candidates.feasible,
         )
@@ -152,46 +184,35 @@ def _make_scenes(
     return jax.jit(jax.vmap(one))
 
 
-def measured(
-    index: jax.Array,
-    demonstration: Demonstration,
-    sampler: SamplerConfig,
-    horizon_s: float,
-) -> tuple[Candidates, jax.Array]:
-    """The candidates of a dataset row as evaluations make them, and their FDE [K] m."""
-    human = human_of(demonstration, sampler)
-    candidates = sample(candidates_key(index), demonstration.scene, sampler)
-    far = jax.vmap(lambda x: distances(demonstration, human, x, horizon_s)[0])
-    return candidates, far(candidates.trajectory)
-
-
-def mean_fde(scenes: RankedScenes, vectors: np.ndarray) -> np.ndarray:
-    """[n] m, mean FDE of the cheapest feasible candidate under each vector [n, 8]."""
-    return in_chunks(functools.partial(_mean_fde, scenes), vectors)
-
-
-def in_chunks(
-    objective: Callable[[jax.Array], jax.Array], vectors: np.ndarray
+def mean_fde(
+    kind: Tunable, scenes: ValuedScenes, vectors: np.ndarray, *, on_path: bool = True
 ) -> np.ndarray:
-    """[n] float64, an objective of several vectors [n, d], compiled for a few."""
-    vectors = np.asarray(vectors, np.float32)
-    found = []
+    """[n] m, mean FDE of the feasible candidate that each rival [n, d] values most.
+
+    Args:
+      kind: of the rivals.
+      scenes: of `valued_scenes`.
+      vectors: their parameters, a few at a time.
+      on_path: the candidates keep to the given path.
+    """
+    vectors, found = np.asarray(vectors, np.float32), []
     for start in range(0, len(vectors), POPULATION_CHUNK):
         picked = np.arange(start, start + POPULATION_CHUNK)
         some = jnp.asarray(vectors[np.minimum(picked, len(vectors) - 1)])
-        found.append(np.asarray(objective(some), np.float64))
+        found.append(np.asarray(_mean_fde(kind, on_path, scenes, some), np.float64))
     return np.concatenate(found)[: len(vectors)]
 
 
-@jax.jit
-def _mean_fde(scenes: RankedScenes, vectors: jax.Array) -> jax.Array:
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _mean_fde(
+    kind: Tunable, on_path: bool, scenes: ValuedScenes, vectors: jax.Array
+) -> jax.Array:
     """[n] m, scene by scene: fast on CPUs, and few sums in one fusion (see xla.py)."""
 
-    def of_scene(one: RankedScenes) -> jax.Array:
+    def of_scene(one: ValuedScenes) -> jax.Array:
         def of_vector(vector: jax.Array) -> jax.Array:
-            weights = tuned(vector)
-            cost = jax.vmap(lambda x: weighted_cost(x, weights))(one.terms)
-            return one.fde[jnp.argmin(jnp.where(one.feasible, cost, jnp.inf))]
+            values = kind.values(one.known, kind.rival(vector), on_path)
+            return one.fde[jnp.argmax(jnp.where(one.feasible, values, -jnp.inf))]
 
         return jax.vmap(of_vector)(vectors)
 

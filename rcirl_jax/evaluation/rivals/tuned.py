@@ -9,155 +9,29 @@ looks for those whose choices end nearest to the human. Rows:
 """
 
 import dataclasses
-import functools
-from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Sequence
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup
-from rcirl_jax.evaluation.ranking.score import (
-    Rival,
-    horizon_mask,
-)
+from rcirl_jax.evaluation.ranking.score import Rival
 from rcirl_jax.evaluation.rivals.cma_es import tune
 from rcirl_jax.evaluation.rivals.objectives import (
+    DRIVER,
+    HAND_SET,
     Problem,
-    drawn_rows,
-    in_chunks,
-    in_scene_chunks,
+    Tunable,
     learner_budget,
-    measured,
-    ranking_problem,
+    problem,
 )
-from rcirl_jax.planner.baselines import (
-    TUNED_IDM_ROW,
-    Idm,
-    closeness,
-    idm_trajectory,
-)
-from rcirl_jax.reward import LONG_ROW, TUNABLE, TUNED_ROW, tuned
-from rcirl_jax.sampling import SamplerConfig
-from rcirl_jax.types import Demonstration, Scene, Trajectory
+from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm
+from rcirl_jax.reward import LONG_ROW, TUNED_ROW
 
 TUNING_SCENES = 256  # training scenes of a search with a learner's queries, at most
 LONG_SCENES = 1024  # of the long search
 SIGMA = 1.0  # first spread of the log-weights
-
-# What a tuner may change of the driver model, in the order of its vector.
-TUNABLE_IDM = (
-    "headway",
-    "standstill_gap",
-    "acceleration",
-    "braking",
-    "speed_share",
-)
-LARGEST_IDM_LOG = 3.0  # a parameter is within a factor exp(3) = 20 of the usual one
-
-
-class DrivenScenes(NamedTuple):
-    """S scenes with K candidates each, on device."""
-
-    scene: Scene  # [S, ...]
-    everyone: Trajectory  # [S, K, T]
-    mask: jax.Array  # [S, T] bool, valid times up to the horizon
-    fde: jax.Array  # [S, K] m
-    feasible: jax.Array  # [S, K] bool
-
-
-def idm_of(vector: Float[Array, " d"]) -> Idm:
-    """The driver model of a tuner's vector of logarithms; zeros are the usual one.
-
-        parameter_i = usual_i exp(clip(x_i, -3, 3))
-
-    Args:
-      vector: [5] x, in the order of `TUNABLE_IDM`; may be traced.
-    """
-    usual = Idm()
-    factor = jnp.exp(jnp.clip(vector, -LARGEST_IDM_LOG, LARGEST_IDM_LOG))
-    changed = {n: getattr(usual, n) * factor[i] for i, n in enumerate(TUNABLE_IDM)}
-    return dataclasses.replace(usual, **changed)
-
-
-def idm_problem(
-    dataset: Demonstrations,
-    setup: RankingSetup,
-    max_scenes: int | None = None,
-    seed: int = 0,
-) -> Problem:
-    """Mean FDE [m] of the candidate nearest to the IDM driver, as `ranking_problem`.
-
-    Args:
-      dataset: an open dataset.
-      setup: sampler, horizon, split; tune on "train" only.
-      max_scenes: at most so many, drawn by the seed; None: all.
-      seed: of the draw.
-
-    Raises:
-      InputError: no scene of the split covers the horizon.
-    """
-    rows, index = drawn_rows(dataset, setup, max_scenes, seed)
-    scenes = driven_scenes(rows, index, setup.sampler, setup.horizon_s)
-    on_path = setup.sampler.mode == "speed"
-    objective = functools.partial(mean_driven_fde, scenes, on_path=on_path)
-    return Problem(objective=objective, queries=int(scenes.fde.size))
-
-
-def driven_scenes(
-    rows: Demonstration, index: np.ndarray, sampler: SamplerConfig, horizon_s: float
-) -> DrivenScenes:
-    """Candidates and their distances, made once and kept on device.
-
-    Args:
-      rows: S demonstrations (numpy) whose recorded future covers the horizon.
-      index: [S] dataset rows; they seed the candidates.
-      sampler: sampler configuration.
-      horizon_s: s in (0, 8].
-    """
-    return in_scene_chunks(_make_scenes(sampler, float(horizon_s)), rows, index)
-
-
-@functools.lru_cache(maxsize=8)
-def _make_scenes(
-    sampler: SamplerConfig, horizon_s: float
-) -> Callable[[jax.Array, Demonstration], DrivenScenes]:
-    def one(index: jax.Array, demonstration: Demonstration) -> DrivenScenes:
-        candidates, fde = measured(index, demonstration, sampler, horizon_s)
-        return DrivenScenes(
-            scene=demonstration.scene,
-            everyone=candidates.trajectory,
-            mask=horizon_mask(demonstration.scene, horizon_s),
-            fde=fde,
-            feasible=candidates.feasible,
-        )
-
-    return jax.jit(jax.vmap(one))
-
-
-def mean_driven_fde(
-    scenes: DrivenScenes, vectors: np.ndarray, on_path: bool
-) -> np.ndarray:
-    """[n] m, mean FDE of the feasible candidate nearest to each driver [n, 5]."""
-    return in_chunks(functools.partial(_mean_fde, on_path, scenes), vectors)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _mean_fde(on_path: bool, scenes: DrivenScenes, vectors: jax.Array) -> jax.Array:
-    """[n] m for vectors [n, 5]; scene by scene, few sums in one fusion (see xla.py)."""
-
-    def of_scene(one: DrivenScenes) -> jax.Array:
-        def of_vector(vector: jax.Array) -> jax.Array:
-            way = idm_trajectory(one.scene, on_path, idm_of(vector))
-            near = jax.vmap(lambda x: closeness(x, way, one.mask))(one.everyone)
-            return one.fde[jnp.argmax(jnp.where(one.feasible, near, -jnp.inf))]
-
-        return jax.vmap(of_vector)(vectors)
-
-    return jnp.mean(jax.lax.map(of_scene, scenes), axis=0)
 
 
 def tuned_rivals(
@@ -178,25 +52,27 @@ def tuned_rivals(
       long: evaluations of the long row; 0 leaves it out.
     """
     own = dataclasses.replace(setup, split="train")
-    # row -> what is tuned on, parameters, what a vector means, scenes, evaluations
+    # row -> what is tuned, scenes, evaluations
     searches = {
-        TUNED_IDM_ROW: (idm_problem, TUNABLE_IDM, idm_of, TUNING_SCENES, 0),
-        TUNED_ROW: (ranking_problem, TUNABLE, tuned, TUNING_SCENES, 0),
-        LONG_ROW: (ranking_problem, TUNABLE, tuned, LONG_SCENES, long),
+        TUNED_IDM_ROW: (DRIVER, TUNING_SCENES, 0),
+        TUNED_ROW: (HAND_SET, TUNING_SCENES, 0),
+        LONG_ROW: (HAND_SET, LONG_SCENES, long),
     }
     if not long:
         del searches[LONG_ROW]
     found: dict[str, list[Rival]] = {row: [] for row in searches}
-    for row, (make, names, rival, scenes, evaluations) in searches.items():
+    for row, (kind, scenes, evaluations) in searches.items():
         for seed in seeds:
-            problem = make(dataset, own, scenes, seed)
-            budget = evaluations or learner_budget(
-                dataset, setup.sampler, epochs, problem
-            )
-            start = np.zeros(len(names))
-            best, _ = tune(problem.objective, start, SIGMA, budget, seed)
-            found[row].append(rival(jnp.asarray(best, jnp.float32)))
+            made = problem(kind, dataset, own, scenes, seed)
+            budget = evaluations or learner_budget(dataset, setup.sampler, epochs, made)
+            found[row].append(_best(kind, made, budget, seed))
     return found
+
+
+def _best(kind: Tunable, made: Problem, budget: int, seed: int) -> Rival:
+    """The rival that a search finds."""
+    best, _ = tune(made.objective, np.zeros(len(kind.names)), SIGMA, budget, seed)
+    return kind.rival(jnp.asarray(best, jnp.float32))
 
 
 def tune_idm(
@@ -210,10 +86,8 @@ def tune_idm(
       evaluations: of the search.
     """
     own = dataclasses.replace(setup, split="train")
-    problem = idm_problem(dataset, own, LONG_SCENES)
-    start = np.zeros(len(TUNABLE_IDM))
-    best, _ = tune(problem.objective, start, SIGMA, evaluations, 0)
-    found = idm_of(jnp.asarray(best, jnp.float32)).fields()
+    made = problem(DRIVER, dataset, own, LONG_SCENES)
+    found = _best(DRIVER, made, evaluations, 0).fields()
     return Idm(**{name: float(value) for name, value in found.items()})
 
 

@@ -2,10 +2,11 @@
 
 import collections
 import dataclasses
+import datetime
 import functools
 import json
 import resource
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import jax
@@ -19,6 +20,7 @@ from rcirl_jax.evaluation.ranking.sweep import (
     Hidden,
     Part,
     SweepConfig,
+    member_name,
     open_split,
     row_name,
     shape_name,
@@ -29,17 +31,14 @@ from rcirl_jax.export.from_run import verification_samples, write_weights
 from rcirl_jax.export.sweep.choice import judged
 from rcirl_jax.export.sweep.folder import (
     SWEEP,
-    claim,
-    data_of,
-    finish_group,
-    finished_group,
+    check_settings,
     grid_of,
     settings_of,
     weights_file,
 )
-from rcirl_jax.runtime.atomic_files import write_json, write_whole
+from rcirl_jax.runtime.atomic_files import read_json, write_json, write_whole
 from rcirl_jax.runtime.executors import Executor
-from rcirl_jax.runtime.pipeline import only_one
+from rcirl_jax.runtime.pipeline import Stages, code_sha256, only_one
 from rcirl_jax.train.state import TrainConfig
 
 
@@ -78,8 +77,8 @@ def _sweep(
 ) -> dict:
     """`run_sweep` in a folder that is this sweep's alone."""
     dataset, split, by = opened
-    created = claim(config, folder, dataset.hash)
-    made_by = {**provenance, "dataset_sha256": dataset.hash, "created": created}
+    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    made_by = {**provenance, "dataset_sha256": dataset.hash, "created": now}
     for name in ("validation", "test"):  # what would fail only after the training
         held_out, _ = covered_rows(split, name, config.setup.horizon_s)
         ClusterBootstrap(np.asarray(held_out.vehicle))
@@ -110,64 +109,91 @@ def _train(
     made_by: Mapping[str, object],
 ) -> dict[str, dict]:
     """The groups' files by shape, after training those that are missing."""
-    groups = {
-        h: finished_group(config, folder, h, made_by) for h in config.hidden_sizes
+    stages, settings = Stages(folder=folder), settings_of(config)
+    settings["dataset_sha256"] = made_by["dataset_sha256"]
+    check_settings(stages, settings)
+    inputs = {**settings, "code": code_sha256()}
+    files = {
+        h: folder / "groups" / f"{shape_name(h)}.json" for h in config.hidden_sizes
     }
-    todo = [hidden for hidden, group in groups.items() if group is None]
+
+    def outputs(hidden: Hidden) -> list[Path]:
+        members = [weights_file(folder, member) for member in config.group(hidden)]
+        return [*members, files[hidden]]
+
+    todo = [h for h in files if not stages.is_done(shape_name(h), inputs, outputs(h))]
     samples = functools.cache(lambda: verification_samples(split, config.base))
-    total = len(config.members())
-    done = total - sum(len(config.group(hidden)) for hidden in todo)
+    total, missing = (
+        sum(len(config.group(hidden)) for hidden in some) for some in (files, todo)
+    )
     parts: dict[Hidden, list[Part]] = collections.defaultdict(list)
-    with tqdm.tqdm(total=total, initial=done, desc="sweep", unit="member") as bar:
+    members: dict[Hidden, dict[str, dict]] = collections.defaultdict(dict)
+    with tqdm.tqdm(
+        total=total, initial=total - missing, desc="sweep", unit="member"
+    ) as bar:
         piece = functools.partial(train_group, config=config)
         for part in executor.stream(piece, todo):
-            for number, member in enumerate(part.members):
-                output = weights_file(folder, member)
-                _write_member(output, part, number, samples(), config, made_by)
-            parts[part.hidden].append(part)
+            hidden, made = part.hidden, members[part.hidden]
+            made |= _write_members(folder, part, samples(), config, made_by)
+            parts[hidden].append(part)
             bar.update(len(part.members))
-            if sum(len(p.members) for p in parts[part.hidden]) == len(
-                config.group(part.hidden)
-            ):
-                settings = {**settings_of(config), **data_of(made_by)}
-                groups[part.hidden] = finish_group(folder, parts[part.hidden], settings)
-    return {shape_name(hidden): group or {} for hidden, group in groups.items()}
+            if len(made) == len(config.group(hidden)):
+                facts = _facts(parts[hidden])
+                write_json(files[hidden], {"facts": facts, "members": made})
+                of = (inputs, outputs(hidden), facts["seconds"])
+                stages.note(shape_name(hidden), *of)
+    return {shape_name(h): read_json(file, "a group") for h, file in files.items()}
 
 
-def _write_member(
-    output: Path,
+def _facts(parts: Sequence[Part]) -> dict:
+    """How a group trained, in numbers."""
+    compiled = [seconds for part in parts for seconds in part.compile_s]
+    return {
+        "members": sum(len(part.members) for part in parts),
+        "seconds": round(sum(part.seconds for part in parts), 3),
+        "compiles": len(compiled),
+        "compile_seconds": round(sum(compiled), 3),
+    }
+
+
+def _write_members(
+    folder: Path,
     part: Part,
-    number: int,
     samples: tuple[np.ndarray, np.ndarray],
     config: SweepConfig,
     made_by: Mapping[str, object],
-) -> None:
-    """Write the weights file of one trained member.
+) -> dict[str, dict]:
+    """Write the weights files of trained members; what is known of each, by name.
 
     Args:
-      output: the file.
-      part: that it was trained in.
-      number: its place there.
+      folder: of the sweep.
+      part: the members.
       samples: of `verification_samples`.
-      config: the sweep; the file keeps all of it but where the data lie.
+      config: the sweep; a file keeps all of it but where the data lie.
       made_by: provenance, with the hash of the data.
     """
-    member = part.members[number]
-    metrics = {"loss": part.loss[number], "pair_accuracy": part.wins[number]}
-    provenance = {
-        "git_commit": None,
-        "flags": {},
-        "versions": {},
-        **made_by,
-        "seed": member.seed,
-        "metrics": {name: float(x) for name, x in metrics.items()},
-        "mode": member.sampler.mode,
-        "config": json.loads(json.dumps(dataclasses.asdict(member))),
-        "sweep": grid_of(config),
-    }
-    params = jax.tree.map(lambda x: jnp.asarray(x[number]), part.params)
+    found = {}
     normaliser = jax.tree.map(jnp.asarray, part.normaliser)
-    write_weights(output, params, normaliser, member, samples, provenance, part.seen)
+    for number, member in enumerate(part.members):
+        loss, won = float(part.loss[number]), float(part.wins[number])
+        provenance = {
+            "git_commit": None,
+            "flags": {},
+            "versions": {},
+            **made_by,
+            "seed": member.seed,
+            "metrics": {"loss": loss, "pair_accuracy": won},
+            "mode": member.sampler.mode,
+            "config": json.loads(json.dumps(dataclasses.asdict(member))),
+            "sweep": grid_of(config),
+        }
+        params = jax.tree.map(lambda x, n=number: jnp.asarray(x[n]), part.params)
+        of = (params, normaliser, member, samples, provenance, part.seen)
+        reward = write_weights(weights_file(folder, member), *of)
+        fine = bool(part.finite[number])
+        known = {"sha256": reward.sha256, "loss": loss, "pairs_won": won}
+        found[member_name(member)] = {**known, "finite": fine}
+    return found
 
 
 def _peak_memory_gib() -> float:

@@ -1,9 +1,8 @@
 """Named cases driven again by several rows, thinned for a player in a web page.
 
 A frame holds the ego, the agents near it, its plan and the stop lines that demand
-a stop. Frame i is the moment (i + 1) * FRAME_STEPS * 0.1 s; the last one is the end of
-the drive. Numbers are rounded to what a screen can show: a drive of 120 s takes about
-100 kB of JSON.
+a stop; the last one is the end of the drive. Numbers are rounded to what a screen can
+show: a drive of 120 s takes about 100 kB of JSON.
 """
 
 import dataclasses
@@ -23,7 +22,7 @@ from rcirl_jax.simulation.cases import (
     Record,
     Snapshot,
 )
-from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics
+from rcirl_jax.simulation.metrics import CaseMetrics
 from rcirl_jax.simulation.rows import RECORDED_HUMAN, Row, human_row
 from rcirl_jax.simulation.suite import CaseSet, drive_with_logs, rollout_config
 from rcirl_jax.types import Kind
@@ -32,6 +31,16 @@ from rcirl_jax.units import TIMES_S
 MAX_CASES = 6  # cases of a page
 FRAME_STEPS = 2  # simulator steps between two frames: 5 Hz
 BEHIND_M, AHEAD_M = 45.0, 110.0  # m of road around the ego in which agents are kept
+APART_M, APART_MPS = 2.0, 1.0  # m, m/s at which two drives have parted
+# a column of the table that does not hold, in words
+BROKEN = (
+    "at-fault collision",
+    "above the speed limit",
+    "|acceleration| above 4 m/s²",
+    "|lateral acceleration| above 4 m/s²",
+    "|jerk| above 6 m/s³",
+    "|lateral jerk| above 6 m/s³",
+)
 PLAN_AHEAD_S = np.arange(1.0, 6.0)  # s ahead of the frame at which the plan is kept
 
 
@@ -45,6 +54,7 @@ class Drive:
     events: list[tuple[float, str]]
     start: float  # s, the moment to look at first
     end: str  # what ended the drive before its time, or ""
+    t: list[float]  # [I] s
     s: list[float]  # [I] m, station
     l: list[float]  # [I] m
     heading: list[float]  # [I] rad, against the reference line
@@ -65,7 +75,9 @@ class Replay:
     case: str
     group: str
     parameters: dict[str, float]
-    frame_s: float  # s between frames
+    frame_s: float  # s between frames, but the last two
+    # s, when the first two drives part
+    apart: float | None
     road_step: float  # m between the points of the road
     x: list[float]  # [R] m, reference line
     y: list[float]  # [R] m
@@ -140,7 +152,8 @@ def thin(
         summary=_summary(metrics),
         events=events,
         start=start,
-        end="ended by a collision of its own fault" if short else "",
+        end="ended by an at-fault collision" if short else "",
+        t=_rounded((steps + 1) * STEP_S, 1),
         s=_rounded(record.s[steps], 1),
         l=_rounded(record.l[steps], 2),
         heading=_rounded(record.heading[steps], 3),
@@ -197,7 +210,7 @@ def _events(
     time = lambda step: round((int(step) + 1) * STEP_S, 1)  # noqa: E731
     found = []
     for name, happens in (
-        ("collision of its own fault", record.at_fault > 0),
+        ("at-fault collision", record.at_fault > 0),
         ("collision", (record.collision > 0) & (record.at_fault == 0)),
         ("red light run", record.red_light),
         ("stop sign run", record.stop_sign),
@@ -217,19 +230,36 @@ def _events(
     return sorted(found), start
 
 
+def broken_bounds(found: CaseMetrics) -> list[str]:
+    """What a drive breaks, in words; leaves are scalars, or [6] per column."""
+    broken = [
+        words
+        for words, holds in zip(BROKEN, found.holds, strict=True)
+        if not holds and not (found.at_fault > 0 and words != BROKEN[0])
+    ]
+    lines = {"red light run": found.red_lights, "stop sign run": found.stop_signs}
+    return broken + [words for words, count in lines.items() if count > 0]
+
+
+def _apart(drives: Sequence[Drive]) -> float | None:
+    """When the first two drives are `APART_M` or `APART_MPS` apart, or one ends."""
+    if len(drives) < 2:
+        return None
+    one, two = drives[:2]
+    count = min(len(one.s), len(two.s))
+    far = np.abs(np.subtract(one.s[:count], two.s[:count])) > APART_M
+    far |= np.abs(np.subtract(one.v[:count], two.v[:count])) > APART_MPS
+    if far.any():
+        return one.t[int(np.argmax(far))]
+    return None if len(one.s) == len(two.s) else one.t[count - 1]
+
+
 def _summary(found: CaseMetrics) -> str:
     """The drive's own numbers in one line."""
-    failed = [
-        name.replace("_", " ")
-        for name, holds in zip(COLUMNS, found.holds, strict=True)
-        if not holds
-    ]
-    for name in ("red_lights", "stop_signs"):
-        if getattr(found, name) > 0:
-            failed.append(name.replace("_", " "))
+    failed = broken_bounds(found)
     gap = float(found.min_clearance)
     near = f"closest {max(gap, 0.0):.1f} m" if np.isfinite(gap) else "nobody near"
-    broken = f"fails {', '.join(failed)}" if failed else "all bounds hold, no line run"
+    broken = ", ".join(failed) or "all bounds hold, no line run"
     return f"{float(found.progress):.0f} m driven, {near}, {broken}"
 
 
@@ -251,6 +281,7 @@ def _replay(
         group=cases.groups[place],
         parameters={k: round(float(v), 3) for k, v in cases.parameters[place].items()},
         frame_s=FRAME_STEPS * STEP_S,
+        apart=_apart(drives),
         road_step=ROAD_STEP_M,
         x=_rounded(x[:count], 2),
         y=_rounded(y[:count], 2),

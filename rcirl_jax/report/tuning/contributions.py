@@ -54,6 +54,9 @@ class Contributions:
     rows: tuple[Contribution, ...]
     scenes: int
     vehicles: int
+    # by reward: raw features of the humans [S, T, F] and of candidates [S, K, T, F]
+    features: Mapping[str, tuple[np.ndarray, np.ndarray]]
+    valid: np.ndarray  # [S, T] bool, inside the recorded future
 
 
 def contributions(
@@ -77,13 +80,14 @@ def contributions(
     bootstrap = ClusterBootstrap(np.asarray(rows.vehicle))
     first = next(iter(rewards.values()))
     sampler = SamplerConfig(mode=str(first.provenance.get("mode", "speed")))
-    shares = {
+    found = {
         name: _shares(reward, rows, index, sampler) for name, reward in rewards.items()
     }
+    shares = {name: one[0] for name, one in found.items()}
     units = {
         f: u for r in rewards.values() for f, u in zip(r.names, r.units, strict=True)
     }
-    found = [_row(name, unit, shares, bootstrap) for name, unit in units.items()]
+    table = [_row(name, unit, shares, bootstrap) for name, unit in units.items()]
     leading = next(iter(rewards))
 
     def size(row: Contribution) -> float:
@@ -91,9 +95,11 @@ def contributions(
         return 0.0 if share is None else share.value
 
     return Contributions(
-        rows=tuple(sorted(found, key=lambda row: -size(row))),
+        rows=tuple(sorted(table, key=lambda row: -size(row))),
         scenes=len(index),
         vehicles=bootstrap.num_clusters,
+        features={name: one[1:] for name, one in found.items()},
+        valid=np.asarray(rows.scene.time_valid),
     )
 
 
@@ -120,24 +126,29 @@ def _row(
 
 def _shares(
     reward: Reward, rows: Demonstration, index: np.ndarray, sampler: SamplerConfig
-) -> dict[str, np.ndarray]:
-    """Feature -> [S] share of the scene's value differences; 0 where there are none."""
+) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+    """Feature -> [S] share of the scene's value differences; 0 where there are none.
+
+    And the features of the humans [S, T, F] and of the candidates [S, K, T, F].
+    """
     each = _absolute(reward.preset, sampler, reward.activation)
-    found = each(reward_params(reward), index.astype(np.int32), rows)
-    found = np.asarray(found, np.float64)
+    found, mine, theirs = jax.tree.map(
+        np.asarray, each(reward_params(reward), index.astype(np.int32), rows)
+    )
+    found = found.astype(np.float64)
     total = found.sum(axis=1, keepdims=True)
     shares = np.divide(found, total, out=np.zeros_like(found), where=total > 0.0)
-    return dict(zip(reward.names, shares.T, strict=True))
+    return dict(zip(reward.names, shares.T, strict=True)), mine, theirs
 
 
 @functools.cache
 def _absolute(preset: str, sampler: SamplerConfig, activation: str) -> Callable:
-    """(weights, rows [S], scenes [S]) -> [S, F] mean |contribution|, scene by scene."""
+    """(weights, rows [S], scenes [S]) -> mean |contribution| [S, F], and features."""
     features = feature_map(preset)
 
     def one(
         weights: tuple[RewardParams, Normaliser], row: jax.Array, given: Demonstration
-    ) -> jax.Array:
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
         scene = given.scene
         candidates = sample(candidates_key(row), scene, sampler)
         order = jnp.argsort(~candidates.feasible, stable=True)
@@ -146,10 +157,11 @@ def _absolute(preset: str, sampler: SamplerConfig, activation: str) -> Callable:
         taken = order[places.astype(jnp.int32)]
         chosen = jax.tree.map(lambda x: x[taken], candidates)
         mine = features(scene, human_of(given, sampler))
+        theirs = features.of_candidates(scene, chosen)
         apart = jax.vmap(
             lambda x: attribute(*weights, mine, x, scene.time_valid, activation, STEPS)
-        )(features.of_candidates(scene, chosen))
-        return jnp.mean(jnp.abs(jnp.sum(apart, axis=1)), axis=0)
+        )(theirs)
+        return jnp.mean(jnp.abs(jnp.sum(apart, axis=1)), axis=0), mine, theirs
 
     return jax.jit(
         lambda weights, index, scenes: jax.lax.map(

@@ -1,4 +1,4 @@
-"""What the gate and the suite say, as HTML: verdict, table of the paper, families."""
+"""What the gate and the suite say, as tables and cards of the report."""
 
 from collections.abc import Mapping, Sequence
 
@@ -13,8 +13,8 @@ from rcirl_jax.evaluation.closed_loop.summary import (
 from rcirl_jax.evaluation.exact import CONFIDENCE
 from rcirl_jax.evaluation.gate.output import OUTCOMES, RANKS, TITLES
 from rcirl_jax.evaluation.gate.types import Check, GateConfig, Verdict
-from rcirl_jax.report.charts import interval_axis, interval_cell
-from rcirl_jax.report.markup import Markup, folded, interval, table, text
+from rcirl_jax.report.charts import forest_axis, forest_cell
+from rcirl_jax.report.pages import Table, interval, number, part
 from rcirl_jax.simulation.metrics import COLUMNS
 
 SIGNIFICANT = 1.0 - CONFIDENCE
@@ -40,90 +40,72 @@ DECISIONS = {  # class, what it means
 KINDS = ("safety", "no loss", "nulls", "likeness", "gain")
 
 
-def verdict_section(
-    verdict: Verdict, gate: GateConfig, incumbent: str, played: Sequence[str]
-) -> str:
-    """Decision in words, reasons, checks over all cases, what to look at.
-
-    Args:
-      verdict: of `evaluation.gate.decision.judge`.
-      gate: its margins.
-      incumbent: name of the row that was compared with.
-      played: ids of the cases in the player, in its order.
-    """
+def verdict_view(verdict: Verdict) -> dict:
+    """The decision and why, for the template."""
     kind, words = DECISIONS[verdict.decision]
-    reasons = "".join(f"<li>{text(reason)}</li>" for reason in verdict.reasons)
-    parts = [
-        f'<div class="decision {kind}"><strong>{text(words)}</strong>'
-        f"<p>{text(verdict.sentence)}</p><ul>{reasons}</ul></div>",
-        f"<p>Candidate against {text(incumbent)} on the same {verdict.cases:,} cases "
-        f"of {verdict.families} families; differences are candidate minus incumbent, "
-        f"in % of cases or of the incumbent's way, with {LEVEL} intervals."
-        + (f" A part of the suite: {text(verdict.part)}." if verdict.part else "")
-        + "</p>",
-        _look_at(verdict, played),
-    ]
-    for name in KINDS:
-        checks = [check for check in verdict.checks if check.kind == name]
+    return {
+        "kind": kind,
+        "words": words,
+        "sentence": verdict.sentence,
+        "reasons": verdict.reasons,
+        "cases": verdict.cases,
+        "families": verdict.families,
+        "part": verdict.part,
+    }
+
+
+def checks_tables(verdict: Verdict) -> list[Table]:
+    """Checks over all cases, a forest plot for each kind."""
+    tables = []
+    for kind in KINDS:
+        checks = [check for check in verdict.checks if check.kind == kind]
         if checks:
             names = [check.name.replace("_", " ") for check in checks]
-            parts.append(forest(TITLES[name], checks, names))
-    rows = [(name.replace("_", " "), value) for name, value in _margins(gate)]
-    parts.append(folded("Margins, declared before", table("", ("", ""), rows)))
-    return "\n".join(parts)
+            tables.append(forest(TITLES[kind], checks, names))
+    return tables
 
 
-def _margins(gate: GateConfig) -> list[tuple[str, str]]:
-    found = {k: v for k, v in vars(gate).items() if isinstance(v, float)}
-    margins = [(name, f"{100.0 * value:g} %") for name, value in found.items()]
-    return [*margins, ("primary metrics", ", ".join(gate.primary))]
+def margins_table(gate: GateConfig) -> Table:
+    """What counts as no loss."""
+    margins = [
+        (name.replace("_", " "), f"{100.0 * value:g} %")
+        for name, value in gate.margins.items()
+    ]
+    rows = [*margins, ("primary metrics", ", ".join(gate.primary))]
+    return Table(caption="Margins, declared before", heads=("", ""), rows=rows)
 
 
-def _look_at(verdict: Verdict, played: Sequence[str]) -> str:
-    """Cases that differ most, those in the player as links to it."""
-    if not verdict.look_at:
-        return "<p>No case is driven worse by the candidate.</p>"
-    items = []
-    for case in verdict.look_at:
-        name = text(case)
-        if case in played:
-            place = list(played).index(case)
-            name = f'<a href="#player" data-case="{place}">{name}</a>'
-        items.append(name)
-    return (
-        f"<p>Look first at: {', '.join(items)}. Links play here; any case is driven "
-        "and drawn again by <code>python -m experiments.replay --weights=FILE "
-        "--case=ID --output=DIR</code>.</p>"
-    )
-
-
-def forest(title: str, checks: Sequence[Check], names: Sequence[str]) -> str:
+def forest(title: str, checks: Sequence[Check], names: Sequence[str]) -> Table:
     """Checks as rows of a forest plot on one axis, with their numbers."""
-    limit = max(100.0 * max(abs(c.low), abs(c.high), c.margin or 0.0) for c in checks)
-    limit = max(limit, 0.1)
-    rows: list[Sequence[object]] = [("", interval_axis(limit, "%"), "", "", "")]
+    measured = [check for check in checks if check.measured]
+    limit = max(
+        [
+            0.1,
+            *(100.0 * max(abs(c.low), abs(c.high), c.margin or 0.0) for c in measured),
+        ]
+    )
+    rows: list[Sequence[object]] = [("", forest_axis(limit, "%"), "", "", "")]
     failing = []
     for name, check in zip(names, checks, strict=True):
-        value, low, high = (
-            100.0 * x for x in (check.difference, check.low, check.high)
-        )
-        numbers = interval((value, low, high), 2, signed=True) + " %"
         word, kind = outcome_of(check)
+        said = part("outcome", kind, word)
+        if not check.measured:
+            rows.append((name, "", "not measured", check.note, said))
+            continue
+        found = tuple(100.0 * x for x in (check.difference, check.low, check.high))
+        numbers = interval(found, 2, signed=True) + " %"
         if kind == "fail":
             failing.append(name)
-        cell = interval_cell(
-            value,
-            low,
-            high,
+        cell = forest_cell(
+            found,
             limit=limit,
             margin=None if check.margin is None else 100.0 * check.margin,
             failed=kind == "fail",
             words=f"{name}: {numbers}, {word}",
         )
-        said = Markup(f'<span class="outcome {kind}">{word}</span>')
         rows.append((name, cell, numbers, _evidence(check), said))
     heads = ("", "", f"difference [{LEVEL}]", "cases, p", "")
-    return table(title, heads, rows, kind="forest", marked=failing)
+    return Table(caption=title, heads=heads, rows=rows, kind="forest", marked=failing)
 
 
 def outcome_of(check: Check) -> tuple[str, str]:
@@ -146,9 +128,9 @@ def _p(p: float) -> str:
     return f"p {p:.3f}" if p >= 0.001 else "p < 0.001"
 
 
-def families_section(verdict: Verdict) -> str:
+def families_tables(verdict: Verdict) -> list[Table]:
     """Two forest plots: clean drives and progress per family, the worst first."""
-    plots = []
+    tables = []
     for kind in ("clean drives", "progress"):
         checks = [
             check
@@ -158,45 +140,33 @@ def families_section(verdict: Verdict) -> str:
         checks.sort(key=lambda c: (RANKS[c.outcome], c.difference))
         if checks:
             names = [check.name.removesuffix(f", {kind}") for check in checks]
-            plots.append(forest(kind.capitalize(), checks, names))
-    if not plots:
-        return "<p>No family has two cases or more.</p>"
-    lead = (
-        "<p>Candidate minus incumbent per family, the worst first. A family passes if "
-        "its interval lies above the dashed margin, and fails (square) if a loss is "
-        "detected with p &lt; 0.05 after Holm over the families; else it is open: too "
-        "few cases. Intervals are per family and not adjusted. Cases: only the "
-        "candidate clean, only the incumbent.</p>"
-    )
-    return "\n".join([lead, *plots])
+            tables.append(forest(kind.capitalize(), checks, names))
+    return tables
 
 
-def suite_section(suite: SuiteReport, marked: Sequence[str]) -> str:
+def suite_view(suite: SuiteReport, marked: Sequence[str]) -> dict:
     """The paper's table per case and per sample, safety and progress, differences."""
-    parts = [
-        f"<p>{suite.cases:,} cases of {len(suite.families)} groups; "
-        f"{suite.preventable:,} preventable by a careful driver, {suite.trivial:,} "
-        f"trivial. Cells: % with the exact {LEVEL} interval; (≥): rule of three where "
-        "nothing failed.</p>"
-    ]
+    lead = (
+        f"{suite.cases:,} cases of {len(suite.families)} groups; {suite.preventable:,} "
+        f"preventable by a careful driver, {suite.trivial:,} trivial."
+    )
     heads = ("", *(SHORT[name] for name in COLUMNS))
     paper = [(name, *(f"{x:.2f}" for x in row)) for name, row in PAPER.items()]
+    tables = []
     for field, title in (
-        (
-            "per_case",
-            "Per case: every sample of a drive inside the bound, no own fault",
-        ),
+        ("per_case", "Per case: every sample inside the bound, no at-fault collision"),
         ("per_sample", "Per sample: 10 Hz; intervals take samples for independent"),
     ):
         rows = [
             (name, *(_rate(getattr(row, field)[c]) for c in COLUMNS))
             for name, row in suite.rows.items()
         ]
-        parts.append(table(title, heads, [*rows, *paper], marked=marked))
-    parts.append(_safety(suite.rows, suite.reference, marked))
+        found = Table(caption=title, heads=heads, rows=[*rows, *paper], marked=marked)
+        tables.append(found)
+    tables.append(_safety(suite.rows, suite.reference, marked))
     if suite.comparisons:
-        parts.append(_comparisons(suite.comparisons))
-    return "\n".join(parts)
+        tables.append(_comparisons(suite.comparisons))
+    return {"lead": lead, "tables": tables}
 
 
 def _rate(rate: Rate) -> str:
@@ -209,10 +179,11 @@ def _rate(rate: Rate) -> str:
 
 def _safety(
     rows: Mapping[str, RowSummary], reference: str, marked: Sequence[str]
-) -> str:
+) -> Table:
     heads = (
-        "", "own faults", "preventable", "to pedestrians, cyclists", "collisions",
-        "red lights", "stop signs", "off road", "progress", f"nuPlan [{LEVEL}]",
+        "", "at-fault collisions", "preventable", "with pedestrians, cyclists",
+        "collisions", "red lights", "stop signs", "off road", "progress",
+        f"nuPlan [{LEVEL}]",
     )  # fmt: skip
     body = [
         (
@@ -229,11 +200,11 @@ def _safety(
         )
         for name, row in rows.items()
     ]  # fmt: skip
-    title = f"Safety (counts) and progress, % of {reference}'s way"
-    return table(title, heads, body, marked=marked)
+    title = f"Safety (counts) and progress, % of {reference}'s"
+    return Table(caption=title, heads=heads, rows=body, marked=marked)
 
 
-def _comparisons(comparisons: Sequence[Comparison]) -> str:
+def _comparisons(comparisons: Sequence[Comparison]) -> Table:
     """First row minus every other; what is not significant is said to be none."""
     first = comparisons[0].a
     heads = ("", *(SHORT[name] for name in COLUMNS), "progress, m", "nuPlan")
@@ -255,4 +226,78 @@ def _comparisons(comparisons: Sequence[Comparison]) -> str:
         "other passes (exact McNemar, Holm over the columns); no difference also where "
         "the interval over families contains 0"
     )
-    return table(title, heads, rows, kind="wrap")
+    return Table(caption=title, heads=heads, rows=rows, kind="wrap")
+
+
+def cards(
+    verdict: Verdict, suite: SuiteReport, incumbent: str
+) -> list[dict[str, object]]:
+    """Five cards: decision, nearer to the human, safety, comfort, progress."""
+    kind, _ = DECISIONS[verdict.decision]
+    return [
+        {
+            "title": "Verdict",
+            "value": verdict.decision.capitalize(),
+            "words": f"{verdict.cases:,} cases, {len(verdict.new_faults)} new faults",
+            "kind": kind,
+        },
+        _amount(verdict, "Nearer to the human", ("likeness",), "on held-out drives"),
+        _safety_card(verdict, suite, incumbent),
+        _amount(
+            verdict,
+            "Comfort",
+            ("a_station", "j_station"),
+            "points of drives within 4 m/s² and 6 m/s³",
+        ),
+        _amount(verdict, "Progress", ("progress",), f"of {incumbent}'s"),
+    ]
+
+
+def _amount(
+    verdict: Verdict, title: str, names: Sequence[str], words: str
+) -> dict[str, object]:
+    """A card on checks that measure an amount; the worst outcome colours it."""
+    ranked = ("gain", "likeness", "no loss", "nulls")
+    known = {
+        name: [c for c in verdict.checks if c.name == name and c.measured]
+        for name in names
+    }
+    found = [
+        min(checks, key=lambda c: ranked.index(c.kind))
+        for checks in known.values()
+        if checks
+    ]
+    if not found:
+        return {"title": title, "value": "–", "words": "not measured", "kind": "open"}
+    values = " / ".join(number(100.0 * c.difference, 1, signed=True) for c in found)
+    ends = "; ".join(
+        f"[{number(100.0 * c.low, 1)}, {number(100.0 * c.high, 1)}]" for c in found
+    )
+    every = [c for checks in known.values() for c in checks]
+    kind = "refused" if any(c.outcome == "fail" for c in every) else "open"
+    if kind == "open" and all(c.low > 0.0 for c in found):
+        kind = "ship"
+    unit = "" if words.startswith("points") else " %"
+    return {
+        "title": title,
+        "value": values + unit,
+        "words": f"{words} {ends}",
+        "kind": kind,
+    }
+
+
+def _safety_card(
+    verdict: Verdict, suite: SuiteReport, incumbent: str
+) -> dict[str, object]:
+    mine = next(iter(suite.rows.values()))
+    theirs = suite.rows[incumbent]
+    failed = any(c.kind == "safety" and c.outcome == "fail" for c in verdict.checks)
+    fewer = mine.at_fault <= theirs.at_fault and mine.red_lights <= theirs.red_lights
+    return {
+        "title": "Safety",
+        "value": f"{mine.at_fault} / {theirs.at_fault}",
+        "words": "at-fault collisions, candidate / incumbent; red lights "
+        f"{mine.red_lights} / {theirs.red_lights}, stop signs {mine.stop_signs} / "
+        f"{theirs.stop_signs}",
+        "kind": "refused" if failed else "ship" if fewer else "open",
+    }

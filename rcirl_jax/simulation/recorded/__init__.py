@@ -1,1 +1,1 @@
-"""Recordings -> cases: others as recorded, the ego driven by the planner."""
+"""Stored scenes -> cases: others as recorded, the ego driven by the planner."""

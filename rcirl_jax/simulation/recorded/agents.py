@@ -1,10 +1,7 @@
 """The other road users of a recorded drive, as agents of its case."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from rcirl_jax.geometry.boxes import Box, overlaps
 from rcirl_jax.simulation.cases import (
     NUM_AGENTS,
     NUM_MOVES,
@@ -14,13 +11,16 @@ from rcirl_jax.simulation.cases import (
     Script,
     node,
 )
-from rcirl_jax.simulation.recorded.config import RecordedConfig
 from rcirl_jax.types import Kind
 
+# median drivers of the IDM population: T s, s0 m, a and b m/s^2, reaction s
+MEDIAN = {"headway": 1.4, "standstill": 2.0, "acceleration": 1.4, "braking": 2.0}
+MEDIAN |= {"delay": 0.4}
+LIMIT_SHARE = 0.8  # 1, desired speed = max(fastest recorded, this share of the limit)
 KEEPS_LANE = 0.17  # sin of 10 degrees; who heads so keeps a lane (agents.LANE_TILT)
 
 
-def agents_of(tables: dict, limit: np.ndarray, config: RecordedConfig) -> Agents:
+def agents_of(tables: dict, limit: np.ndarray) -> Agents:
     """Who the replayed agents are, and how they drive once they leave the log.
 
     They never appear by themselves (`appear_s` = inf): the log brings them.
@@ -30,7 +30,7 @@ def agents_of(tables: dict, limit: np.ndarray, config: RecordedConfig) -> Agents
     first = np.argmax(present, axis=1)[:, None]
     start = lambda key: np.take_along_axis(tables[key], first, 1)[:, 0]  # noqa: E731
     fastest = np.max(np.where(present, tables["v"], 0.0), axis=1)
-    share = np.max(np.where(present, limit, 0.0), axis=1)
+    share = np.max(np.where(present, limit * LIMIT_SHARE, 0.0), axis=1)
     share = np.where(kind == Kind.VEHICLE, share, 0.0)
     sine, cosine = (
         np.sum(np.where(present, wave(tables["heading"]), 0.0), axis=1)
@@ -43,10 +43,7 @@ def agents_of(tables: dict, limit: np.ndarray, config: RecordedConfig) -> Agents
     driver = node(
         Driver,
         desired=np.maximum(fastest, share).astype(np.float32),
-        **{
-            name: fill(getattr(config, name))
-            for name in ("headway", "standstill", "acceleration", "braking", "delay")
-        },
+        **{name: fill(value) for name, value in MEDIAN.items()},
         reacts=drives_by_itself,
         obeys_lines=kind == Kind.VEHICLE,
         changes_lane=np.zeros(NUM_AGENTS, bool),
@@ -80,30 +77,3 @@ def agents_of(tables: dict, limit: np.ndarray, config: RecordedConfig) -> Agents
         driver=driver,
         script=script,
     )
-
-
-def touches(length: float, width: float, own: dict, tables: dict) -> bool:
-    """Whether the human's box meets an agent's anywhere in the log."""
-    x, y = (tables[name] - own[name] for name in "xy")
-    reach = 0.5 * (length + width + tables["length"] + tables["width"])[:, None]
-    near = tables["present"] & (np.hypot(x, y) < reach)
-    slot, step = np.nonzero(near)
-    if slot.size == 0:
-        return False
-    count = -(-slot.size // 256) * 256  # few sizes compile
-    slot, step = np.resize(slot, count), np.resize(step, count)
-    single = lambda *values: [jnp.asarray(v, jnp.float32) for v in values]  # noqa: E731
-    zero = np.zeros(count)
-    one = single(zero, zero, own["yaw"][step], zero + length, zero + width)
-    size = (tables["length"][slot], tables["width"][slot])
-    other = single(x[slot, step], y[slot, step], tables["yaw"][slot, step], *size)
-    return bool(np.any(_meet(one, other)))
-
-
-@jax.jit
-def _meet(one: list[jax.Array], other: list[jax.Array]) -> jax.Array:
-    """Whether boxes overlap, [q]; each a list of the leaves of `Box`."""
-    box = lambda row: Box(  # noqa: E731
-        x=row[0], y=row[1], heading=row[2], length=row[3], width=row[4]
-    )
-    return jax.vmap(lambda a, b: overlaps(box(a), box(b)))(one, other)

@@ -35,12 +35,12 @@ from rcirl_jax.simulation.cases import (
     perfect_perception,
 )
 from rcirl_jax.simulation.recorded.agents import agents_of
-from rcirl_jax.simulation.recorded.config import RecordedConfig
 from rcirl_jax.types import Demonstration, Kind
 from rcirl_jax.units import DT_S, HORIZON_S, NUM_STATIONS, STATION_STEP_M, TIMES_S
 
 STEPS = round(HORIZON_S / STEP_S)  # of a case; one with a shorter record is padded
 CLOCK_S = np.arange(STEPS + 1) * STEP_S  # [STEPS + 1] s
+DATASET = 2**40  # apart are the numbers of two datasets
 LONG_S = 1000.0  # s, a light that does not change within the case
 MOVING_MPS = 0.5  # m/s, above which the direction of motion is the heading
 EDGE_MARGIN_M = 0.3  # m between the human's box and the drivable area's edge
@@ -84,8 +84,8 @@ def held_out(
         at = drawn_evenly(recording, vehicle, share, seed)
         parts.append(dataset.read(index[at]))
         ids += [f"{number}:{row}" for row in index[at].tolist()]
-        vehicles.append(number * 2**40 + vehicle[at])
-        recordings.append(number * 2**40 + recording[at])
+        vehicles.append(number * DATASET + vehicle[at])
+        recordings.append(number * DATASET + recording[at])
     if not parts:
         raise InputError(
             f"held-out drives: split {split}: 0 scenes: expected a dataset with some"
@@ -138,7 +138,7 @@ def case_of(one: Demonstration) -> Case:
     It lasts as long as the human's future and all that the human reacts to are
     recorded (`time_valid`).
     """
-    scene, single, config = one.scene, np.float32, RecordedConfig()
+    scene, single = one.scene, np.float32
     until = min(float(one.future_s), TIMES_S[np.asarray(scene.time_valid)].max())
     steps = min(int(until / STEP_S + 1e-3), STEPS)
     human = _hermite(one.human.s, one.human.v, np.ones(TIMES_S.size, bool))
@@ -157,7 +157,7 @@ def case_of(one: Demonstration) -> Case:
         ego_width=single(scene.ego.width),
         road=_road(one),
         lines=lines,
-        agents=agents_of(tables, limit * config.limit_share, config),
+        agents=agents_of(tables, limit),
         perception=perfect_perception(),
         replay=node(
             Replay,
@@ -166,7 +166,7 @@ def case_of(one: Demonstration) -> Case:
             ego_s=ego_s.astype(single),
             ego_l=np.interp(CLOCK_S, TIMES_S, one.human.l).astype(single),
             ego_v=np.gradient(ego_s, STEP_S).astype(single),
-            turns_reactive=np.bool_(config.turns_reactive),
+            turns_reactive=np.bool_(True),
         ),
     )
 

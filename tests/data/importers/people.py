@@ -1,11 +1,17 @@
 """A drive as people hand it over: the same rows in every layout that tables have."""
 
-import numpy as np
+import functools
 
-from rcirl_jax.data.importers import read_recordings
+import numpy as np
+import pytest
+
+from tests.helpers import logs
 
 CARS, SECONDS, RATE = 6, 12.0, 10.0
 LANE_M = 3.5
+LONG = pytest.mark.parametrize(
+    "long_bytes", [1, 10**9], ids=["in pieces", "whole"]
+)  # both ways in which a table is read
 HEADER = ("t", "id", "x", "y", "heading", "speed", "length", "kind")
 
 
@@ -71,13 +77,19 @@ def spec(folder, columns=HEADER, units="", more="", rest=""):
     return path
 
 
-def read(path, source):
-    return list(read_recordings("csv", path, source))
+def write(folder, table, header=HEADER, **layout):
+    """log.csv, a table of text."""
+    path = folder / "log.csv"
+    path.write_text(text(table, header, **layout))
+    return path
 
 
-def only(path, source):
-    (recording,) = read(path, source)
-    return recording
+read, only = functools.partial(logs.read, "csv"), functools.partial(logs.only, "csv")
+
+
+def refused(path, source):
+    """The line with which a table is refused."""
+    return logs.refused(read, path, source)
 
 
 def assert_same(found, turn=0.0, *, place=0.002, angle=0.02, speed=0.35):

@@ -52,27 +52,6 @@ def test_one_wrong_cell_does_not_make_a_lane_across_the_globe(tmp_path):
     assert "line 51: Local_Y: 1e+12: expected within 1e+08" in line
 
 
-@pytest.mark.parametrize("long_bytes", [1, 10**9])
-@pytest.mark.parametrize(
-    ("cell", "column"), [("1e300", "t"), ("1e200", "x"), ("-9e9", "y")]
-)
-def test_a_csv_cell_beyond_any_place_or_time(long_bytes, cell, column, tmp_path):
-    rows = ["t,id,x,y,lane"]
-    rows += [f"{k / 10:.1f},a,{k}.0,0.0,1" for k in range(120)]
-    log, source = tmp_path / "log.csv", tmp_path / "source.toml"
-    log.write_text("\n".join(rows) + "\n")
-    replace_cell(log, 60, column, cell)
-    columns = "\n".join(f'{name} = "{name}"' for name in ("t", "id", "x", "y", "lane"))
-    options = f"long_bytes = {long_bytes}\nmax_bad_rows = 0.0"
-    source.write_text(f"{options}\n[columns]\n{columns}\n")
-    line = refused(read, "csv", log, source)
-    assert (
-        f"line 61: {column}: {float(cell):g}" in line
-        or f"{column}: {float(cell)}" in line
-    )
-    assert "expected" in line
-
-
 WHOLE = ["interaction", "levelx_highd", "ngsim_pairs", "openacc"]
 
 
@@ -129,19 +108,6 @@ def test_rows_that_go_on_in_quotes_have_an_end(tmp_path):
     (found,) = read_recordings("csv", log)
     assert (found.rows.read, found.rows.unreadable) == (300, 0)
     assert [track.id for track in found.tracks] == ["a", "a b c"]
-
-
-def test_a_long_log_with_a_line_without_an_end(tmp_path):
-    """Read in pieces, by another reader, which says where it stopped."""
-    log, source = tmp_path / "log.csv", tmp_path / "source.toml"
-    with log.open("w") as file:
-        file.write("t,id,x,y,lane\n0.0,a,0.0,0.0,1\n")
-        for _ in range(400):
-            file.write("0.1,a,0.0,0.0,1," * 2**12)
-    names = "\n".join(f'{name} = "{name}"' for name in ("t", "id", "x", "y", "lane"))
-    source.write_text(f"long_bytes = 1\n[columns]\n{names}\n")
-    line = refused(read, "csv", log, source)
-    assert "a line of more than 16777216 characters: expected one a row" in line
 
 
 def test_what_no_check_foresaw_is_one_line_that_names_the_place(tmp_path, monkeypatch):

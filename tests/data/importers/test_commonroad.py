@@ -39,6 +39,10 @@ def test_both_versions(tmp_path, version):
     assert (recording.name, recording.rate_hz) == ("a", pytest.approx(10.0))
     track, *standing = recording.tracks
     assert (track.id, track.kind, track.length, track.width) == ("10", 1, 4.4, 1.8)
+    found = (("motorcycle", Kind.VEHICLE), ("bicycle", Kind.CYCLIST))
+    for kind, expected in (*found, ("pedestrian", Kind.PEDESTRIAN)):
+        made = scenario(tmp_path, w.lanelet(), w.car(kind=kind))
+        assert made.tracks[0].kind == expected
     steps = np.arange(40)
     np.testing.assert_allclose(track.t, 0.1 * steps)
     np.testing.assert_allclose(track.x, 1.5 * steps)
@@ -50,18 +54,6 @@ def test_both_versions(tmp_path, version):
         np.testing.assert_allclose(one.t, track.t)
         assert np.ptp(one.x) == 0.0
         assert not one.speed.any()
-
-
-@pytest.mark.parametrize(
-    ("kind", "expected"),
-    [
-        *(("truck", Kind.VEHICLE), ("motorcycle", Kind.VEHICLE)),
-        *(("bicycle", Kind.CYCLIST), ("pedestrian", Kind.PEDESTRIAN)),
-    ],
-)
-def test_kinds(tmp_path, kind, expected):
-    made = scenario(tmp_path, w.lanelet(), w.car(kind=kind))
-    assert made.tracks[0].kind == expected
 
 
 def test_samples_of_standing_things_are_limited(tmp_path, monkeypatch):
@@ -273,64 +265,6 @@ def test_provenance_follows_the_source_attribute(tmp_path):
     other = w.commonroad(tmp_path / "b.xml")
     other.write_text(other.read_text().replace("NGSIM test", "by hand"))
     assert "NGSIM" not in only(other).licence
-
-
-# ------------------------------------------------------------------------- malformed
-
-
-def moved(*states, **options):
-    """A car of some states on a lanelet."""
-    return w.lanelet() + w.car(states=list(states), **options)
-
-
-FEET = [w.state(k, 1.5 * k / w.FOOT, 0) for k in range(1, 40)]
-LONG = w.BOX.replace("4.4", "4400")
-MALFORMED = [
-    (w.car(), "lanelet"),
-    (w.lanelet(), "tracks"),
-    (moved(w.state(1, 1.5, 0, drop=("velocity",))), "state 1: velocity: missing"),
-    (moved(w.state(1, 1.5, 0, drop=("position",))), "state 1: position: missing"),
-    (moved(w.state(1, "nan", 0)), "x: 'nan'"),
-    (moved(w.state(1, 1.5, "1e999")), "y: '1e999'"),
-    (moved(*FEET), "feet taken for metres"),
-    # a clock of a century
-    (moved(w.state(2 * 10**10, 3, 0)), "time: 2e+10: expected steps up to 1e+06"),
-    (w.lanelet() + w.car() + w.car(y=4), "id: 10"),
-    (moved(*[w.state(1, 1.5, 0)] * 2), "time: 1"),
-    (moved(w.state(3, 4.5, 0), w.state(2, 3, 0)), "time: 2"),
-    (w.lanelet() + w.car(shape="<blob/>"), "shape: blob"),
-    (w.lanelet() + w.car(shape=LONG), "length: 4400"),
-    (road(left=[(0, 1)]), "leftBound"),
-    (w.lanelet() + road(), "lane id: 1"),
-    (road() + w.light("7", [("pink", 9)]), "pink"),
-    (road() + w.light("7", [("red", -1)]), "duration"),
-    (road() + w.light("7", [("red", 1e-9)]), "red for 1e-09"),
-    (road() + w.light("7", [("red", 1e300)]), "red for 1e+300"),
-    (w.lanelet() + w.car(version="2018b").replace("dynamic<", "odd<"), "role"),
-]
-DOCUMENTS = [
-    (b"<other/>", "root: 'other'"),
-    (b'<commonRoad commonRoadVersion="1999"/>', "commonRoadVersion"),
-    (b'<commonRoad commonRoadVersion="2020a" timeStepSize="x"/>', "timeStepSize"),
-    (b'<?xml version="1.0" encoding="klingon"?><commonRoad/>', "xml"),
-]
-
-
-@pytest.mark.parametrize(("content", "words"), [*MALFORMED, *DOCUMENTS])
-def test_malformed(tmp_path, content, words):
-    path = tmp_path / "bad.xml"
-    if isinstance(content, bytes):
-        path.write_bytes(content)
-    else:
-        w.commonroad(path, content)
-    line = refused(read, path)
-    assert line.startswith(str(path))
-    assert words in line
-
-
-def test_too_large_a_file(tmp_path, monkeypatch):
-    monkeypatch.setattr(commonroad, "MAX_FILE_BYTES", 100)
-    assert "size" in refused(scenario, tmp_path)
 
 
 # -------------------------------------------------------------------------- recorded

@@ -5,10 +5,7 @@ module named otherwise than its format says so by FORMAT.
 """
 
 import importlib
-import os
-import pickle
 import pkgutil
-import re
 
 import numpy as np
 import pytest
@@ -23,6 +20,8 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import load_toml, spec_root
 from rcirl_jax.types import Kind
 from tests.data.importers import formats
+from tests.data.importers.damage import DAMAGES, text_of
+from tests.helpers import logs
 from tests.helpers.logs import refused
 
 SPEED_TOLERANCE_MPS = 0.3  # m/s
@@ -202,103 +201,6 @@ def test_imports_end_to_end(name, sound, tmp_path):
 # ---------------------------------------------------------------- damaged files
 
 
-class Bomb:
-    """Unpickling it creates a file."""
-
-    def __init__(self, target):
-        self.target = str(target)
-
-    def __reduce__(self):
-        return os.mkdir, (self.target,)
-
-
-def text_of(path):
-    """Content of a text file; None: it is none."""
-    try:
-        text = path.read_bytes().decode()
-    except UnicodeDecodeError:
-        return None
-    return None if "\0" in text else text
-
-
-def truncate(share):
-    """Cut at a share of the file: of text, in the middle of the line there."""
-
-    def apply(path, fixture, target):
-        content = path.read_bytes()
-        cut = int(share * len(content))
-        if text_of(path) is not None:
-            begin, end = content.rfind(b"\n", 0, cut) + 1, content.find(b"\n", cut)
-            cut = (begin + (end if end >= 0 else len(content))) // 2
-        path.write_bytes(content[:cut])
-        return True
-
-    return apply
-
-
-def drop_lines(path, fixture, target):
-    """Cut text between two lines, at nine tenths."""
-    text = text_of(path)
-    if text is None:
-        return False
-    path.write_text(text[: text.rfind("\n", 0, int(0.9 * len(text))) + 1])
-    return True
-
-
-def garble(path, fixture, target):
-    size = max(min(path.stat().st_size, 20000), 64)
-    path.write_bytes(np.random.default_rng(7).bytes(size))
-    return True
-
-
-def empty(path, fixture, target):
-    path.write_bytes(b"")
-    return True
-
-
-def remove(path, fixture, target):
-    path.unlink()
-    return True
-
-
-def plant_pickle(path, fixture, target):
-    path.write_bytes(pickle.dumps(Bomb(target)) * 3)
-    return True
-
-
-def write_number(value):
-    """Write something else for a number in the middle of a text file."""
-
-    def apply(path, fixture, target):
-        if path not in fixture.numbers:
-            return False
-        text = path.read_text()
-        found = list(re.finditer(fixture.numbers[path], text, re.MULTILINE))
-        start, end = found[len(found) // 2].span(1)
-        path.write_text(text[:start] + value + text[end:])
-        return True
-
-    return apply
-
-
-# damage -> (what is done, if it can be; whether a valid result is allowed too)
-DAMAGES = {
-    "truncated at 30 %": (truncate(0.3), lambda fixture: False),
-    "truncated at 90 %": (truncate(0.9), lambda fixture: False),
-    "truncated between lines": (drop_lines, lambda fixture: not fixture.is_counted),
-    "emptied": (empty, lambda fixture: False),
-    "random bytes": (garble, lambda fixture: False),
-    "a pickle": (plant_pickle, lambda fixture: False),
-    "removed": (remove, lambda fixture: True),
-    "a word for a number": (write_number('"west"'), lambda fixture: fixture.drops_rows),
-    "an absurd number": (write_number("1e30"), lambda fixture: fixture.drops_rows),
-    "no number": (
-        write_number("NaN"),
-        lambda fixture: fixture.drops_rows or fixture.has_holes,
-    ),
-}
-
-
 @pytest.mark.parametrize("damage", sorted(DAMAGES))
 def test_damaged_files(name, sound, damage, tmp_path):
     """One line that names the file, or (rows end cleanly, optional) a result.
@@ -329,6 +231,59 @@ def test_damaged_files(name, sound, damage, tmp_path):
             if "number" in damage and fixture.drops_rows and not fixture.has_holes:
                 assert sum(made.rows.unreadable for made in recordings) == 1
         assert not target.exists(), f"{path.name}: code was executed"
+
+
+def of_all(table):
+    """(name, number or words, what is done) of every entry of a table of fixtures."""
+    found = []
+    for name, module in sorted(MODULES.items()):
+        entries = getattr(module, table, {})
+        pairs = entries.items() if isinstance(entries, dict) else enumerate(entries)
+        found += [pytest.param(name, *pair, id=f"{name}: {pair[0]}") for pair in pairs]
+    return found
+
+
+@pytest.mark.parametrize(("name", "words", "harm"), of_all("HARMS"))
+def test_what_is_wrong_in_a_file_is_named(name, words, harm, tmp_path):
+    """Values that no road, clock or user has; tables and fields of another form."""
+    fixture = write(name, tmp_path)
+    harm(fixture)
+    line = refused(read, name, fixture)
+    assert words in line
+    assert "expected" in line
+    assert line.startswith(str(tmp_path))
+
+
+@pytest.mark.parametrize(("name", "number", "option"), of_all("OPTIONS"))
+def test_what_is_wrong_in_an_option_is_named(name, number, option, tmp_path):
+    (key,), place = option, write(name, tmp_path).input
+    line = refused(logs.read, format_of(name), place, **option)
+    assert line.startswith(f"source TOML: {key}")
+
+
+def test_options_of_the_recording_car_and_of_limits(name, sound):
+    """Where a format has them: its size, who drives it, the limit of other lanes."""
+    spec, place = spec_of(name), sound[0].input
+    if "ego" in spec:
+        size = {**spec["ego"], "length": 4.0, "width": 1.7}
+        made = logs.read(format_of(name), place, ego=size, speed_limit=9.0)[0]
+        ego = logs.tracks_of(made)["ego"]
+        assert (ego.length, ego.width, made.default_speed_limit) == (4.0, 1.7, 9.0)
+    if "recording_car" in spec:
+        for driver, is_other in (("automated", True), ("human", False)):
+            found = logs.read(format_of(name), place, recording_car=driver)
+            assert any(t.automated for r in found for t in r.tracks) == is_other
+
+
+def test_options_of_another_type_are_named(name, sound, tmp_path):
+    """Every one that the packaged TOML has, but those whose readers take several."""
+    source = tmp_path / "source.toml"
+    for key, value in spec_of(name).items():
+        if key in ("pattern", "topics"):
+            continue
+        source.write_text(f"{key} = {3 if isinstance(value, str) else repr('x')}")
+        line = refused(read_recordings, format_of(name), sound[0].input, source)
+        assert line.startswith(f"source TOML: {key}: ")
 
 
 def damaged(content, rng, is_head_kept):

@@ -1,28 +1,17 @@
 """The generic CSV importer: mapping, units, lanes, malformed tables."""
 
-import tracemalloc
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rcirl_jax.data.importers import read_recordings
-from rcirl_jax.data.importers.csv import map as csv_lanes
 from rcirl_jax.data.importers.lanes import StraightLane, straight_lanes
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import spec_root
 from rcirl_jax.types import Kind
 from tests.data.importers import writers as w
-
-
-def read(path, source):
-    return list(read_recordings("csv", path, source))
-
-
-def only(path, source):
-    (recording,) = read(path, source)
-    return recording
+from tests.data.importers.people import only, read
 
 
 def log(folder, rows=None, header=w.CSV_COLUMNS):
@@ -43,20 +32,22 @@ def test_rows_become_tracks_and_lanes(tmp_path):
     assert recording.group is None
 
 
-def test_several_patterns_read_each_file_once(tmp_path):
-    source = w.csv_spec(tmp_path / "s.toml")
-    source.write_text('pattern = ["*.csv", "log*"]\n' + source.read_text())
-    log(tmp_path)
-    assert [made.name for made in read(tmp_path, source)] == ["log"]
-
-
 @given(
     length=st.sampled_from([("m", 1.0), ("ft", 0.3048)]),
     speed=st.sampled_from(
-        [("m/s", 1.0), ("km/h", 1 / 3.6), ("mph", 0.44704), ("ft/s", 0.3048)]
+        [
+            ("m/s", 1.0),
+            ("km/h", 1 / 3.6),
+            ("mph", 0.44704),
+            ("ft/s", 0.3048),
+            ("kn", 1852 / 3600),
+        ]
     ),
     clock=st.sampled_from(
-        [("s", 1.0), ("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9), ("frame", 0.1)]
+        [
+            *(("s", 1.0), ("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9), ("frame", 0.1)),
+            *(("min", 60.0), ("h", 3600.0), ("day", 86400.0)),
+        ]
     ),
     angle=st.sampled_from([("rad", 1.0), ("deg", np.pi / 180)]),
     origin=st.sampled_from([0.0, 1.6e9]),
@@ -111,19 +102,6 @@ def test_far_coordinates_get_a_local_origin(tmp_path):
     assert any("local origin" in note for note in recording.notes)
 
 
-def test_rows_of_an_automation_are_no_demonstration(tmp_path):
-    """A column of the log says who drives; also in a log read in pieces."""
-    rows = [[*row, 1 if 10 <= k % 40 < 25 else 0] for k, row in enumerate(w.csv_rows())]
-    path = log(tmp_path, rows, (*w.CSV_COLUMNS, "auto"))
-    columns = {**{name: name for name in w.CSV_COLUMNS}, "automated": "auto"}
-    source = w.csv_spec(tmp_path / "s.toml", columns=columns)
-    whole = only(path, source)
-    source.write_text("long_bytes = 1\n" + source.read_text())
-    for made in (whole, only(path, source)):
-        for track in made.tracks:
-            np.testing.assert_allclose(track.automated, [(1.0, 2.5)])
-
-
 @pytest.mark.parametrize(("point", "shift"), [("front", -2.25), ("rear", 2.25)])
 def test_reference_point(tmp_path, point, shift):
     source = w.csv_spec(tmp_path / "s.toml")
@@ -140,14 +118,6 @@ def test_turned_axis_and_named_kinds(tmp_path):
     track = only(log(tmp_path, rows, header), source).tracks[2]
     np.testing.assert_allclose(track.y, -7.0)
     assert track.kind == Kind.VEHICLE
-
-
-def test_recording_column_separates(tmp_path):
-    rows = [[*row, drive] for drive in ("a", "b") for row in w.csv_rows()]
-    columns = (*w.CSV_COLUMNS, "recording")
-    source = w.csv_spec(tmp_path / "s.toml", columns=columns)
-    found = read(log(tmp_path, rows, columns), source)
-    assert [recording.name for recording in found] == ["log-a", "log-b"]
 
 
 def test_gap_splits_a_track(tmp_path):
@@ -186,19 +156,6 @@ def test_lanes_along_paths_where_none_are_known(tmp_path):
     recording = only(log(tmp_path, rows, header), source)
     assert sorted(lane.centre[0, 1] for lane in recording.lanes) == [-7.0, -3.5, 0.0]
     assert any("fitted" in note for note in recording.notes)
-
-
-def test_long_paths_are_compared_in_little_memory():
-    """A path beside another one, a lane's width away or nearly so."""
-    x = 5.0 * np.arange(2000)
-    line, beside = (np.stack([x, np.full(x.shape, y)], axis=1) for y in (0.0, 3.5))
-    tracemalloc.start()
-    found = [csv_lanes._near(beside, line, width) for width in (3.5, 3.6)]
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert found == [False, True]
-    assert not csv_lanes._near(beside[::-1], line, 3.6)
-    assert peak < 50 * line.nbytes
 
 
 LANES = """
@@ -261,14 +218,6 @@ def scaled(column, factor):
 @pytest.mark.parametrize(
     ("rows", "field"),
     [
-        ([], "rows"),
-        (changed(3, 2, "nan"), "line 5: x: 'nan'"),
-        (changed(3, 3, "inf"), "line 5: y: 'inf'"),
-        (changed(3, 1, ""), "line 5: id: ''"),
-        (changed(3, 4, "quick"), "line 5: speed: 'quick'"),
-        ([*w.csv_rows(), [1, 2]], "line 122: 2 cells"),
-        ([*w.csv_rows(), [*w.csv_rows()[0], 1]], "line 122: 9 cells"),
-        ([*w.csv_rows(), w.csv_rows()[-1]], "line 122: id car2: the same row again"),
         (w.csv_rows(feet=1 / 0.3048), "feet taken for metres"),
         (scaled(5, 1 / 0.3048), "length: median 14.8 m"),
         (scaled(5, 0.3048), "length: median 1.4 m: expected 2 to 9 m; metres taken"),
@@ -292,36 +241,14 @@ def test_malformed_rows(tmp_path, rows, field):
 
 
 def test_buses_are_no_feet(tmp_path):
-    """Two of three are 12 m long; three of three would be feet."""
-    rows = w.csv_rows()
+    """Two of three are 12 m long, or all of two; three of three would be feet."""
+    rows, source = w.csv_rows(), w.csv_spec(tmp_path / "s.toml")
     for row in rows:
         row[5] = 4.5 if row[1] == "car0" else 12.0
-    path = log(tmp_path, rows)
-    (recording,) = read(path, w.csv_spec(tmp_path / "s.toml"))
-    assert sorted(track.length for track in recording.tracks) == [4.5, 12.0, 12.0]
-
-
-@pytest.mark.parametrize("long_bytes", [1, 10**9])
-@pytest.mark.parametrize("cells", [1, 4, 7, 8])
-def test_a_file_cut_inside_its_last_line(tmp_path, cells, long_bytes):
-    """Fewer cells than the header are refused; a whole line needs no newline."""
-    path = w.table(tmp_path / "log.csv", w.CSV_COLUMNS, w.csv_rows())
-    source = w.csv_spec(tmp_path / "s.toml")
-    source.write_text(f"long_bytes = {long_bytes}\n" + source.read_text())
-    *lines, last = path.read_text().splitlines()
-    path.write_text("\n".join([*lines, ",".join(last.split(",")[:cells])]))
-    if cells == len(w.CSV_COLUMNS):
-        assert sum(track.t.size for r in read(path, source) for track in r.tracks) > 0
-        return
-    with pytest.raises(InputError) as error:
-        read(path, source)
-    assert str(error.value).startswith(f"{path}: line 121: {cells} cells: expected 8; ")
-
-
-def test_two_lorries_are_no_error(tmp_path):
-    rows = [row for row in scaled(5, 3.6) if row[1] != "car2"]
-    recording = only(log(tmp_path, rows), w.csv_spec(tmp_path / "s.toml"))
-    assert recording.tracks[0].length == pytest.approx(16.2)
+    found = only(log(tmp_path, rows), source)
+    assert [track.length for track in found.tracks] == [4.5, 12.0, 12.0]
+    found = only(log(tmp_path, [row for row in rows if row[1] != "car0"]), source)
+    assert [track.length for track in found.tracks] == [12.0, 12.0]
 
 
 @pytest.mark.parametrize(
@@ -352,55 +279,10 @@ def test_malformed_mapping(tmp_path, columns, units, extra, field):
     assert field in str(error.value)
 
 
-@pytest.mark.parametrize("text", ["[columns", "\udcff", None])
-def test_unreadable_mapping(tmp_path, text):
-    source = tmp_path / "s.toml"
-    if text is not None:
-        source.write_bytes(text.encode("utf-8", "surrogateescape"))
-    with pytest.raises(InputError, match=r"s\.toml"):
-        read(log(tmp_path), source)
-
-
-def test_texts_are_whole_or_refused(tmp_path):
-    """Two ids that begin alike are two cars, as in files of any length."""
-    source = w.csv_spec(tmp_path / "s.toml")
-    at = w.CSV_COLUMNS.index("id")
-    for size, ending in ((64, ""), (65, r"id: .*expected up to 64 characters")):
-        rows = [[*x[:at], f"{x[at]:x>{size}}", *x[at + 1 :]] for x in w.csv_rows()]
-        if ending:
-            with pytest.raises(InputError, match=ending):
-                read(log(tmp_path, rows), source)
-        else:
-            assert len(only(log(tmp_path, rows), source).tracks) == 3
-
-
-def test_header_met_twice_and_garbage(tmp_path):
-    source = w.csv_spec(tmp_path / "s.toml")
-    with pytest.raises(InputError, match="column t: met twice"):
-        read(log(tmp_path, header=("t", *w.CSV_COLUMNS[:-1])), source)
-    for content in (b"", b"\x00\xff\xfe\x01" * 5000):
-        (tmp_path / "log.csv").write_bytes(content)
-        with pytest.raises(InputError, match=r"log\.csv"):
-            read(tmp_path / "log.csv", source)
-
-
-def test_more_columns_than_logs_have(tmp_path):
-    names = ",".join(f"c{number}" for number in range(10_001))
-    (tmp_path / "log.csv").write_text(f"{names}\n1\n")
-    source = w.csv_spec(tmp_path / "s.toml")
-    with pytest.raises(InputError, match=r"header: 10001 columns: expected up to"):
-        read(tmp_path, source)
-
-
-@pytest.mark.parametrize("name", ["commonroad", "csv", "ngsim"])
-def test_empty_folder_and_missing_path(tmp_path, name):
-    for path in (tmp_path, tmp_path / "nowhere"):
-        with pytest.raises(InputError) as error:
-            list(read_recordings(name, path, None))
-        assert str(path) in str(error.value)
-    with pytest.raises(InputError, match="--input"):
-        read_recordings(name, None, None)
-    with pytest.raises(InputError, match="--format"):
+def test_an_input_and_a_format_have_to_be_given(tmp_path):
+    with pytest.raises(InputError, match="--input: not given: expected a file or"):
+        read_recordings("csv", None, None)
+    with pytest.raises(InputError, match="--format: xlsx: expected one of"):
         read_recordings("xlsx", tmp_path, None)
 
 

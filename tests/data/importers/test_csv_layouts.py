@@ -11,16 +11,8 @@ import pyarrow.feather
 import pyarrow.parquet as pq
 import pytest
 
-from rcirl_jax.errors import InputError
 from tests.data.importers import people
-
-
-def refused(path, source):
-    with pytest.raises(InputError) as caught:
-        people.read(path, source)
-    (line,) = str(caught.value).splitlines()
-    assert line.startswith(str(path)), line
-    return line
+from tests.data.importers.people import LONG, refused
 
 
 def quoted_commas():
@@ -91,13 +83,14 @@ LAYOUTS = {
     "a hash before the header": "# " + people.text(people.rows(), between=" "),
     "delimiters at the ends": ends(";"),
     "row names": row_names(),
+    "empty lines": blank_lines(),
     "index column": index_column(),
     "remarks of several lines": remarks(),
     "no newline at the end": people.text(people.rows()).rstrip("\n"),
 }
 
 
-@pytest.mark.parametrize("long_bytes", [1, 10**9], ids=["in pieces", "whole"])
+@LONG
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_layouts_are_recognised(tmp_path, layout, long_bytes):
     path = tmp_path / "log.csv"
@@ -106,14 +99,6 @@ def test_layouts_are_recognised(tmp_path, layout, long_bytes):
     found = people.only(path, source)
     people.assert_same(found)
     assert people.rows_of(found) == (720, 0, 0, 0)
-
-
-def test_empty_lines_are_no_rows(tmp_path):
-    path = tmp_path / "log.csv"
-    path.write_text(blank_lines())
-    found = people.only(path, people.spec(tmp_path))
-    people.assert_same(found)
-    assert found.rows.unreadable == 0
 
 
 @pytest.mark.parametrize(
@@ -134,11 +119,13 @@ def test_encodings_are_recognised(tmp_path, encoding):
         ({"between": ";"}, 'delimiter = "semicolon"'),
         ({"between": "\t", "decimal": ","}, 'delimiter = "tab"\ndecimal = ","'),
         ({"quote": '"'}, "quote = '\"'"),
+        ({"above": "a,a,a,a,a,a,a,b\n" * 3}, "skip = 3"),
     ],
 )
 def test_what_the_toml_says_wins(tmp_path, written, table):
     path = tmp_path / "log.csv"
-    path.write_text(people.text(people.rows(), **written))
+    above = written.pop("above", "")
+    path.write_text(above + people.text(people.rows(), **written))
     source = people.spec(tmp_path, rest=f"[table]\n{table}")
     people.assert_same(people.only(path, source))
 
@@ -151,14 +138,6 @@ def test_a_table_without_a_header(tmp_path):
     assert "no header? name the columns by names in [table]" in line
     names = f"names = {list(people.HEADER)}".replace("'", '"')
     source = people.spec(tmp_path, rest=f"[table]\n{names}")
-    people.assert_same(people.only(path, source))
-
-
-def test_lines_above_that_look_like_rows(tmp_path):
-    path = tmp_path / "log.csv"
-    above = "".join(f"{'a,' * 7}b\n" for _ in range(3))
-    path.write_text(above + people.text(people.rows()))
-    source = people.spec(tmp_path, rest="[table]\nskip = 3")
     people.assert_same(people.only(path, source))
 
 
@@ -274,7 +253,7 @@ def test_a_nested_column_is_no_number(tmp_path):
     assert "column x: type list<" in refused(path, people.spec(tmp_path))
 
 
-@pytest.mark.parametrize("long_bytes", [1, 10**9], ids=["in pieces", "whole"])
+@LONG
 @pytest.mark.parametrize("packed", ["gzip", "zstd", "bz2", "gzip by its bytes"])
 def test_packed_texts(tmp_path, packed, long_bytes):
     data = people.text(people.rows(), between=";").encode()
@@ -319,6 +298,10 @@ def test_packed_bytes_without_an_end_are_not_held(tmp_path):
         (b"PAR1" + bytes(60), "expected Parquet"),
         (b"ARROW1" + bytes(60), "expected Feather"),
         (b"\x1f\x8b" + bytes(60), "gzip: "),
+        (
+            ",".join(f"c{k}" for k in range(10_001)).encode(),
+            "10001 columns",
+        ),
         (b"", "rows: none"),
         (b"\n \n\n", "rows: none"),
         (b"\xff\xfe" + bytes(range(1, 255)) * 3, "header: hardly any ASCII as utf-16"),

@@ -6,24 +6,10 @@ import numpy as np
 import pyproj
 import pytest
 
-from rcirl_jax.data.importers.csv.earth import projected
 from rcirl_jax.data.importers.csv.heading import CONVENTIONS
-from rcirl_jax.errors import InputError
+from rcirl_jax.data.importers.projection import projected
 from tests.data.importers import people
-
-
-def write(folder, table, header=people.HEADER, **layout):
-    path = folder / "log.csv"
-    path.write_text(people.text(table, header, **layout))
-    return path
-
-
-def refused(path, source):
-    with pytest.raises(InputError) as caught:
-        people.read(path, source)
-    (line,) = str(caught.value).splitlines()
-    return line
-
+from tests.data.importers.people import LONG, refused, write
 
 # ------------------------------------------------------------------------- times
 
@@ -47,7 +33,7 @@ TIMES = {
 }
 
 
-@pytest.mark.parametrize("long_bytes", [1, 10**9], ids=["in pieces", "whole"])
+@LONG
 @pytest.mark.parametrize("form", TIMES)
 def test_iso_times(tmp_path, form, long_bytes):
     table = people.column(people.rows(), "t", TIMES[form])
@@ -68,16 +54,6 @@ def test_iso_times(tmp_path, form, long_bytes):
 def test_times_by_a_pattern(tmp_path, pattern, form):
     table = people.column(people.rows(), "t", form)
     source = people.spec(tmp_path, units=f't = "{pattern}"')
-    people.assert_same(people.only(write(tmp_path, table), source))
-
-
-@pytest.mark.parametrize(
-    ("unit", "factor"),
-    [("ms", 1e3), ("us", 1e6), ("min", 1 / 60), ("h", 1 / 3600), ("frame", 10.0)],
-)
-def test_units_of_time(tmp_path, unit, factor):
-    table = people.column(people.rows(), "t", lambda t: f"{t * factor:.9f}")
-    source = people.spec(tmp_path, units=f't = "{unit}"')
     people.assert_same(people.only(write(tmp_path, table), source))
 
 
@@ -237,13 +213,6 @@ def test_conventions_of_headings(tmp_path, turn, convention, unit, said):
     people.assert_same(people.only(tmp_path / "log.csv", source), turn)
 
 
-def test_a_compass_in_pieces(tmp_path):
-    cell = as_written("cw_from_north", "deg")
-    path = write(tmp_path, people.column(people.rows(0.5), "heading", cell))
-    more = "long_bytes = 1"
-    people.assert_same(people.only(path, people.spec(tmp_path, more=more)), 0.5)
-
-
 def test_headings_of_noise_keep_the_usual_convention(tmp_path):
     rng = np.random.default_rng(0)
     noisy = lambda heading: heading + rng.normal(0.0, 0.15)  # noqa: E731
@@ -301,7 +270,7 @@ def velocities(turn, table=None):
 VELOCITY = (*people.HEADER[:4], "vx", "vy", *people.HEADER[6:])
 
 
-@pytest.mark.parametrize("long_bytes", [1, 10**9], ids=["in pieces", "whole"])
+@LONG
 def test_velocities_stand_for_speed_and_heading(tmp_path, long_bytes):
     path = write(tmp_path, velocities(0.7), VELOCITY)
     source = people.spec(tmp_path, VELOCITY, more=f"long_bytes = {long_bytes}")
@@ -349,15 +318,6 @@ def test_scale_and_offset_of_columns(tmp_path):
     )
 
 
-@pytest.mark.parametrize(
-    ("unit", "factor"), [("km/h", 3.6), ("kn", 3600.0 / 1852.0), ("mph", 1 / 0.44704)]
-)
-def test_units_of_speed(tmp_path, unit, factor):
-    table = people.column(people.rows(), "speed", lambda v: v * factor)
-    source = people.spec(tmp_path, units=f'speed = "{unit}"')
-    people.assert_same(people.only(write(tmp_path, table), source), speed=0.005)
-
-
 def test_unknown_options_are_one_line(tmp_path):
     path = write(tmp_path, people.rows())
     line = refused(path, people.spec(tmp_path, more="speedlimit = 20.0"))
@@ -377,7 +337,7 @@ FLAGS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("long_bytes", [1, 10**9], ids=["in pieces", "whole"])
+@LONG
 @pytest.mark.parametrize(("yes", "no"), FLAGS)
 def test_flags(tmp_path, yes, no, long_bytes):
     """An automation drives car1 from 2 s on, and nobody else."""
@@ -424,7 +384,7 @@ def wide_frames(name, cars=people.CARS):
     return header, list(lines.values())
 
 
-@pytest.mark.parametrize("long_bytes", [1, 10**9], ids=["in pieces", "whole"])
+@LONG
 @pytest.mark.parametrize(
     ("name", "columns"),
     [
@@ -493,7 +453,7 @@ PNEUMA = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("long_bytes", [1, 10**9], ids=["in pieces", "whole"])
+@LONG
 def test_a_row_per_vehicle_as_in_pneuma(tmp_path, long_bytes):
     path = tmp_path / "20181024_d1_0830_0900.csv"
     path.write_text(pneuma())

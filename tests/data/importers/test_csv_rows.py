@@ -5,29 +5,11 @@ import pytest
 
 from rcirl_jax.data.importing import import_parts
 from rcirl_jax.data.parts import parts_of
-from rcirl_jax.data.scenes.quality import QualityReport, format_quality
-from rcirl_jax.errors import InputError
+from rcirl_jax.data.scenes.quality import format_quality
 from rcirl_jax.types import Kind
 from tests.data.importers import people
+from tests.data.importers.people import LONG, refused, write
 from tests.data.small_logs import CONFIG
-
-LONG = pytest.mark.parametrize(
-    "long_bytes", [1, 10**9], ids=["in pieces", "whole"]
-)  # fmt: skip
-
-
-def write(folder, table, header=people.HEADER, **layout):
-    path = folder / "log.csv"
-    path.write_text(people.text(table, header, **layout))
-    return path
-
-
-def refused(path, source):
-    with pytest.raises(InputError) as caught:
-        people.read(path, source)
-    (line,) = str(caught.value).splitlines()
-    assert line.startswith(str(path))
-    return line
 
 
 def with_cell(row, name, value):
@@ -207,31 +189,6 @@ def test_a_share_of_bad_rows_is_allowed(tmp_path, long_bytes):
     assert found.rows.unreadable == 36
 
 
-@pytest.mark.parametrize(
-    ("share", "words"),
-    [
-        ("1.0", "max_bad_rows: 1: expected a share from 0 to below 1"),
-        ("-0.1", "max_bad_rows: -0.1: expected a share"),
-        ("true", "max_bad_rows: True: expected"),
-    ],
-)
-def test_wrong_shares(tmp_path, share, words):
-    path = write(tmp_path, people.rows())
-    source = people.spec(tmp_path, more=f"max_bad_rows = {share}")
-    with pytest.raises(InputError) as caught:
-        people.read(path, source)
-    assert "max_bad_rows: " in str(caught.value)
-
-
-@LONG
-def test_a_file_cut_inside_its_last_line_is_refused(tmp_path, long_bytes):
-    path = write(tmp_path, people.rows())
-    path.write_text(path.read_text()[:-20])
-    line = refused(path, people.spec(tmp_path, more=f"long_bytes = {long_bytes}"))
-    assert "line 721: " in line
-    assert "the last line breaks off: expected a whole file" in line
-
-
 def test_several_recordings_count_the_rows_of_their_file_once(tmp_path):
     header = (*people.HEADER, "recording")
     table = [[*row, drive] for drive in "ab" for row in people.rows()]
@@ -253,9 +210,3 @@ def test_an_import_counts_what_it_dropped(tmp_path, long_bytes):
     said = format_quality(manifest.quality)
     assert "rows dropped: 2 of 721 (0.28%): 1 unreadable, 1 repeated" in said
     assert any("line 7: x: 'west'" in note for note in manifest.quality["notes"])
-
-
-def test_a_report_of_nothing_dropped_does_not_say_so():
-    report = QualityReport()
-    report.rows.update({"read": 10})
-    assert "rows" not in report.as_dict()

@@ -184,29 +184,6 @@ def test_recordings_of_one_file_stay_apart(tmp_path):
         )
 
 
-LAST = "999.0,c9,5,0\n"  # a whole row behind the bad one
-
-
-@pytest.mark.parametrize(
-    ("bad", "message"),
-    [
-        ("9.0,c1,far,0\n", r"log\.csv: line 902: x: 'far': expected a finite number"),
-        ("9.0,c1,,0\n", r"log\.csv: line 902: x: '': expected a finite number"),
-        ("9.0,c1,nan,0\n", r"log\.csv: line 902: x: 'nan': expected a finite number"),
-        ("9.0,c1,5\n", r"log\.csv: line 902: 3 cells: expected 4"),
-    ],
-)
-def test_bad_cells_are_one_line_and_leave_nothing(tmp_path, bad, message):
-    path = tmp_path / "log.csv"
-    rows = rows_of(seconds=40.0, cars=3)[:900]
-    spec = {**write(path, rows, extra=bad + LAST), "long_bytes": 1, "max_bad_rows": 0.0}
-    part = Part(format="csv", input=path, spec=spec)
-    with pytest.raises(InputError, match=message) as caught:
-        import_parts([part], tmp_path / "data", CONFIG)
-    assert "\n" not in str(caught.value)
-    assert not (tmp_path / "data").exists()
-
-
 def test_a_wrong_unit_of_time_is_found(tmp_path, monkeypatch):
     path = tmp_path / "log.csv"
     monkeypatch.setattr(long_logs, "MAX_BLOCKS", 3)
@@ -222,22 +199,6 @@ def test_names_with_a_hash_and_padded_headers_are_read(tmp_path):
     path.write_text(text)
     (made,) = read_part("csv", path, spec)
     assert {track.id for track in made.tracks} == {"c#0", "c#1", "c#2"}
-
-
-def test_a_text_that_is_too_long_is_one_line(tmp_path):
-    path = tmp_path / "log.csv"
-    rows = rows_of(seconds=10.0, cars=2)
-    written = write(path, rows, f"10.0,{'c' * 65},0,0\n")
-    spec = {**written, "long_bytes": 1, "max_bad_rows": 0.0}
-    with pytest.raises(InputError, match=r"id: 'c{40}\.\.\.': expected up to 64"):
-        cuts(path, spec)
-
-
-def test_a_wrong_limit_is_one_line(tmp_path):
-    path = tmp_path / "log.csv"
-    spec = {**write(path, rows_of(seconds=30.0, cars=3)), "long_bytes": "256MB"}
-    with pytest.raises(InputError, match="long_bytes: 256MB: expected a number"):
-        cuts(path, spec)
 
 
 def test_settings_change_the_digest_of_a_piece(tmp_path):
@@ -256,14 +217,13 @@ from rcirl_jax.data.importers import parts
 from rcirl_jax.data.readers import long_logs
 from rcirl_jax.data.readers.tables import streams
 from rcirl_jax.data.readers.tables.ledger import Ledger
-from rcirl_jax.data.readers.tables.table import batches, fields_of, open_table
+from rcirl_jax.data.readers.tables.table import fields_of, open_table
 # what is held is reached in the shorter log already
 streams.READ_BYTES, long_logs.BUFFER_BYTES = 2**18, 2**20
 path = Path(sys.argv[1])
 table, ledger = open_table(path), Ledger(path=path)
 fields = fields_of(table, ("t", "id", "x", "y"), texts=("id",))
-read = lambda show: batches(table, fields, ledger, show)
-with long_logs.spilled(path, read, ledger) as spill:
+with long_logs.rows_of(table, fields, ledger, is_long=True) as spill:
     rows = sum(len(piece.values["t"]) for piece in spill.pieces(None, 0.55))
 print(rows, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """

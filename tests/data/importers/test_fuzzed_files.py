@@ -13,11 +13,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from benchmarks.reliability.fuzz.containers import archive_of
+from benchmarks.reliability.fuzz.forms import archive_of
 from benchmarks.reliability.fuzz.readers import suite
 from rcirl_jax.data import importers
 from rcirl_jax.data.importers import read_recordings
-from rcirl_jax.data.importers.argoverse2.map import read_lanes
 from rcirl_jax.data.importers.interaction import reader as interaction
 from rcirl_jax.data.importers.l5 import map as l5_map
 from rcirl_jax.data.importers.levelx import map as levelx_lanes
@@ -26,13 +25,11 @@ from rcirl_jax.data.readers.sqlite import Database
 from rcirl_jax.data.readers.tables import table
 from rcirl_jax.data.readers.tables.ledger import Ledger
 from rcirl_jax.data.readers.xml import read_xml
-from rcirl_jax.data.readers.zarr2 import StructuredArray
 from rcirl_jax.evaluation.closed_loop.files import read_runs
 from rcirl_jax.runtime.specs import load_toml, spec_root
 from rcirl_jax.train import checkpoint
 from tests.conftest import REPO
 from tests.data.importers import writers
-from tests.data.importers.formats import apollo
 from tests.helpers.logs import read, refused
 
 DEEP = 100_000  # levels
@@ -94,29 +91,20 @@ METRICS = "expected the metrics of a suite"
 BAD_MEMBERS = [
     *[
         ("way", head(shape) + bytes(64), "of float64 in 64 bytes: expected the")
-        for shape in ((2**62,), (2**40, 2), (10**30,), (-1,))
+        for shape in ((2**62,), (10**30,), (-1,))
     ],
     # texts of no length take no room in the file, and as Python's some gigabytes
     ("names", head((10**6,), "<U0"), "names: 1000000 values in 0 bytes"),
     # a list of many times nothing would take terabytes
-    *[
-        (name, head((2**40, 0, 0), kind), NOTHING)
-        for name in ("names", "ids", "groups", "way")
-        for kind in ("<f8", "<U1")
-    ],
+    *[("ids", head((2**40, 0, 0), kind), NOTHING) for kind in ("<f8", "<U1")],
     *[("way", head(2, kind), METRICS) for kind in ("(,)f8", "f8,(", "f9", "")],
-    *[
-        ("ids", texts(order, point), BAD_TEXT)
-        for order in "<>"
-        for point in (0x110000, 2**32 - 1, 0xD800)
-    ],
+    *[("ids", texts("<", point), BAD_TEXT) for point in (0x110000, 0xD800)],
+    ("ids", texts(">", 2**32 - 1), BAD_TEXT),
     *[
         (name, npy(np.array(values)), METRICS)
         for name, values in (
             *[("way", ["far", "near"]), ("names", ["ours", "ours"])],
-            *[("groups", [1, 2]), ("reference", [1.0]), ("trivial", [1.0, 1.0])],
-            *[("row0.progress", ["a", "b"]), ("row0.progress", np.ones((2, 7, 7)))],
-            ("row0.inside", np.ones((2, 5))),
+            *[("groups", [1, 2]), ("row0.inside", np.ones((2, 5)))],
         )
     ],
     ("row0.start_time", None, METRICS),
@@ -260,6 +248,10 @@ BAD_OPTIONS = [
     (f'pattern = "{"x" * 300}"', "expected file names"),
     (f'pattern = "{"x/" * 600}x"', "/x: expected file names"),
     ("rate_hz = [1]", "rate_hz: [1]: expected a number"),
+    ('long_bytes = "256MB"', "long_bytes: 256MB: expected a number"),
+    ("max_bad_rows = 1.0", "max_bad_rows: 1: expected a share from 0 to below 1"),
+    ("max_bad_rows = -0.1", "max_bad_rows: -0.1: expected a share"),
+    ("max_bad_rows = true", "max_bad_rows: True: expected"),
     ("rate_hz = 5" + "0" * 18, "expected at most 1e+18"),
     (f"rate_hz = {HEX}", "rate_hz: a number of 16000 bits: expected at most 63"),
     ("units = 'm'", "units: m: expected a table"),
@@ -335,10 +327,6 @@ def test_clocks_that_stand_still_or_would_fill_the_memory(tmp_path):
 
     log = writers.ngsim_csv(tmp_path / "log.csv", writers.ngsim_rows())
     assert "frame_s: 0: expected > 0" in line_of("ngsim", log, "frame_s = 0")
-    (tmp_path / "drive").mkdir()
-    apollo.write(tmp_path / "drive")
-    line = line_of("apollo", tmp_path / "drive", "rate_hz = 1e9")
-    assert "rate_hz: 1e+09: expected at most 1000" in line
     rows = "".join(f"{k * 1e-5:.5f},a,{k * 1e-2:.4f},0\n" for k in range(200))
     log.write_text(f"t,id,x,y\n{rows}")
     columns = "\n".join(f'{name} = "{name}"' for name in ("t", "id", "x", "y"))
@@ -347,14 +335,6 @@ def test_clocks_that_stand_still_or_would_fill_the_memory(tmp_path):
     source.write_text("rate_hz = 1" + "0" * 400)
     line = refused(read, "synthetic", source)
     assert "rate_hz: a number of 1329 bits: expected at most 63" in line
-
-
-def test_a_table_of_groups_is_a_file_beside_the_logs(tmp_path):
-    writers.commonroad(tmp_path / "a.xml")
-    for name in ("../groups.csv", "/etc/passwd", "x" * 300):
-        line = refused(read, "commonroad", tmp_path, groups=name)
-        assert "groups: " in line
-        assert line.endswith("expected a file name")
 
 
 # ------------------------------------------------------------------------ readers
@@ -374,27 +354,6 @@ def test_row_groups_that_claim_too_much(tmp_path, monkeypatch, name, words):
     np.testing.assert_array_equal(numbers()["a"], np.arange(100.0))
     monkeypatch.setattr(f"rcirl_jax.data.readers.tables.columnar.{name}", 10)
     assert f"x.parquet: {words}" in refused(numbers)
-
-
-ZARRAY = {"zarr_format": 2, "shape": [1], "chunks": [1], "dtype": [[], ["a"]]}
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        (json.dumps(ZARRAY), "dtype: []: expected [name, "),
-        ('{"dtype": [["\\ud800", "<f8"]]}', ".zarray: json: "),
-    ],
-)
-def test_metadata_of_arrays_that_are_none(tmp_path, text, words):
-    (tmp_path / ".zarray").write_text(text)
-    assert words in refused(StructuredArray, tmp_path, {})
-
-
-def test_half_a_surrogate_pair_in_a_map(tmp_path):
-    (tmp_path / "map.json").write_text('{"lane_segments": {"\\ud800": 3}}')
-    line = refused(read_lanes, tmp_path / "map.json", np.zeros(2), {})
-    assert "map.json: json: " in line
 
 
 def test_a_database_whose_errors_are_no_text(tmp_path):

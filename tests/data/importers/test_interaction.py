@@ -1,29 +1,18 @@
 """INTERACTION: recordings with pedestrians, cases of the challenge, maps."""
 
+import functools
+
 import numpy as np
 import pytest
 
-from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind
 from tests.data.importers.formats import interaction as fixture
 from tests.data.importers.formats import interaction_challenge as challenge
-from tests.data.importers.writers import strict
+from tests.helpers import logs
 
-
-def read(path, source=None):
-    return list(read_recordings("interaction", path, source))
-
-
-def only(path, source=None):
-    (recording,) = read(path, source)
-    return recording
-
-
-def edit(path, old, new, count=1):
-    text = path.read_text()
-    assert old in text
-    path.write_text(text.replace(old, new, count))
+read = functools.partial(logs.read, "interaction")
+only = functools.partial(logs.only, "interaction")
 
 
 @pytest.fixture
@@ -69,6 +58,14 @@ def test_who_rides_is_decided_by_the_source(root, tmp_path):
     assert kinds["P13"] == Kind.PEDESTRIAN
 
 
+def test_what_a_toml_leaves_out_is_as_in_the_packaged_one(root, tmp_path):
+    source = tmp_path / "s.toml"
+    source.write_text('source = "mine"\n')
+    found, packaged = only(root, source), logs.packaged("interaction")
+    assert (found.source, found.licence) == ("mine", packaged["licence"])
+    assert found.rate_hz == packaged["rate_hz"]
+
+
 def test_inputs_from_the_release_down_to_a_file(root, scene):
     whole = only(root)
     for path in (root / "recorded_trackfiles", scene, scene / "vehicle_tracks_000.csv"):
@@ -80,26 +77,6 @@ def test_inputs_from_the_release_down_to_a_file(root, scene):
 def test_pedestrians_alone(scene):
     (scene / "vehicle_tracks_000.csv").unlink()
     assert [track.id for track in only(scene).tracks] == ["P13", "P4"]
-
-
-def test_recordings_of_several_scenes_have_names_of_their_own(root, scene):
-    other = root / "recorded_trackfiles" / "DR_DEU_Merging_MT"
-    fixture.write_scene(other, fixture.road_users())
-    names = [recording.name for recording in read(root)]
-    assert names == ["DR_DEU_Merging_MT-000", f"{fixture.SCENE}-000"]
-
-
-def test_frames_may_start_at_zero(root, scene):
-    whole = only(root)
-    for kind in ("vehicle", "pedestrian"):
-        path = scene / f"{kind}_tracks_000.csv"
-        header, *rows = path.read_text().splitlines()
-        cells = [row.split(",") for row in rows]
-        for row in cells:
-            row[1], row[2] = str(int(row[1]) - 1), str(int(row[2]) - 100)
-        path.write_text("\n".join([header, *(",".join(row) for row in cells)]) + "\n")
-    for one, other in zip(only(root).tracks, whole.tracks, strict=True):
-        np.testing.assert_allclose(one.t, other.t)
 
 
 @pytest.mark.parametrize("kept", [".osm_xy", ".osm"])
@@ -203,13 +180,6 @@ def test_observations_and_submissions_are_left_out(cases):
     assert len(read(cases.parent.parent)) == 2
 
 
-def test_columns_of_the_test_sets(cases):
-    header, *rows = cases.read_text().splitlines()
-    header += ",track_to_predict,interesting_agent"
-    cases.write_text("\n".join([header, *(row + ",0.0,1.0" for row in rows)]) + "\n")
-    assert len(read(cases)) == 2
-
-
 def test_unknown_agents_are_vehicles(scene, root):
     path = scene / "vehicle_tracks_000.csv"
     path.write_text(path.read_text().replace(",car,", ",tram,"))
@@ -223,55 +193,3 @@ def test_gap_splits_a_track(scene, root):
     lines = path.read_text().splitlines()
     path.write_text("\n".join(lines[:50] + lines[60:]) + "\n")
     assert "1#2" in [track.id for track in only(root).tracks]
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "found"),
-    [
-        ("psi_rad", "psi", None),
-        ("timestamp_ms", "time", "column timestamp_ms: missing"),
-        ("track_id,frame_id", "track_id,track_id", "column track_id: met twice"),
-        ("1,1,100,car,1005.000", "1,1,100,car,", "line 2: x: ''"),
-        ("1,1,100,car,1005.000", "1,1,,car,1005.000", "line 2: timestamp_ms: ''"),
-        ("1,1,100,car", ",1,100,car", "line 2: track_id: ''"),
-        ("1,1,100,car,1005.000", "1,1,100,car,west", "line 2: x: 'west'"),
-        ("1,1,100,car,1005.000", "1,1,100,car,inf", "line 2: x: 'inf'"),
-        ("1,1,100,car,1005.000", "1,1,100,car,1e300", "x: 1e+300"),
-        ("1,1,100,car,1005.000", "1,1,1e200,car,1005.000", "timestamp_ms: 1e+200"),
-        ("1,1,100,car,", "1,1,200,car,", "line 3: id 1: met twice in one frame"),
-        ("1,1,100,car,1005.000,", "1,1,100,car,", "line 2: 10 cells: expected 11"),
-    ],
-)
-def test_malformed(scene, root, old, new, found):
-    path = scene / "vehicle_tracks_000.csv"
-    edit(path, old, new)
-    if found is None:
-        assert len(only(root).tracks) == 5
-        return
-    with pytest.raises(InputError) as error:
-        read(root, strict(root / "strict.toml", "interaction"))
-    message = str(error.value)
-    assert message.startswith(str(path))
-    assert found in message
-    assert "\n" not in message
-
-
-def test_bad_pedestrians_are_named(scene, root):
-    path = scene / "pedestrian_tracks_000.csv"
-    edit(path, "track_id", "id")
-    with pytest.raises(InputError, match="pedestrian_tracks_000"):
-        read(root)
-
-
-def test_case_without_a_number(cases):
-    edit(cases, "\n1.0,", "\n,")
-    with pytest.raises(InputError, match="case_id"):
-        read(cases)
-
-
-def test_bad_map_is_named(root):
-    path = root / "maps" / f"{fixture.SCENE}.osm_xy"
-    edit(path, "x='", "x='east")
-    with pytest.raises(InputError) as error:
-        read(root)
-    assert str(error.value).startswith(str(path))

@@ -4,7 +4,6 @@ import functools
 import json
 import re
 import shutil
-import struct
 
 import numpy as np
 import pytest
@@ -17,7 +16,6 @@ from rcirl_jax.data.importers.l5 import scenes as l5_scenes
 from rcirl_jax.data.readers import zarr2
 from rcirl_jax.types import Kind
 from tests.data.importers.formats import l5 as fixture
-from tests.data.importers.formats.waymo import message, varint
 from tests.helpers import logs
 from tests.helpers.logs import lanes_of, refused, tracks_of
 
@@ -31,7 +29,7 @@ def map_of(file):
 
 
 def lanes_around(semantic_map):
-    return semantic_map.lanes(*fixture.CENTRE[:, None], np.zeros(2))
+    return semantic_map.roads.around(*fixture.CENTRE[:, None], np.zeros(2))
 
 
 @pytest.fixture(scope="module")
@@ -45,43 +43,14 @@ def folder(tmp_path):
     return fixture.write(tmp_path).input
 
 
-DTYPES = {
-    **{"scenes": fixture.SCENE_DTYPE, "frames": fixture.FRAME_DTYPE},
-    "agents": fixture.AGENT_DTYPE,
-}
-
-
 @pytest.fixture
 def dataset(tmp_path):
-    """One scene without a map: (folder, function that rewrites an array)."""
-    path = tmp_path / "one.zarr"
-    fixture.write_zarr(path, scenes=1)
-
-    def change(name, edit):
-        kinds = {n: (np.dtype(d).kind, tuple(*s)) for n, d, *s in DTYPES[name]}
-        array = zarr2.StructuredArray(path / name, kinds)
-        records = array.read(0, array.size).copy()
-        edited = edit(records)
-        shutil.rmtree(path / name)
-        records = records if edited is None else edited
-        fixture.write_array(path / name, records, array.chunk)
-
-    return path, change
+    """One scene without a map."""
+    fixture.write_zarr(tmp_path / "one.zarr", scenes=1)
+    return tmp_path / "one.zarr"
 
 
 # --------------------------------------------------------------------- scenes
-
-
-def test_scenes_become_recordings(whole):
-    first, second = whole
-    assert (first.name, second.name) == ("sample-000000", "sample-000001")
-    assert first.rate_hz == 10.0
-    names = {"ego", "12", "15", "17", "19", "19#2", "23", "27"}
-    assert set(tracks_of(first)) == names
-    assert "CC BY-NC-SA" in first.licence
-    assert any("unknown class" in note for note in first.notes)
-    # scenes of one host that follow each other show the same cars
-    assert first.group == second.group == "host-a013-from-1572643684"
 
 
 def test_groups_of_other_hosts_and_days():
@@ -125,11 +94,6 @@ def test_scene_in_two_datasets(folder):
     assert f"train.zarr: {words} sample.zarr: expected once" in line
     assert len(read(folder, pattern="sample.zarr")) == 2
     assert len(read(scenes / "train.zarr")) == 1
-
-
-@pytest.mark.parametrize("inner", ["", "scenes", "scenes/sample.zarr"])
-def test_dataset_is_found(folder, inner):
-    assert [len(found.lanes) for found in read(folder / inner)] == [4, 4]
 
 
 @pytest.mark.parametrize("few", [1, 2, 5])
@@ -224,35 +188,31 @@ def test_light_of_a_lane(whole):
 
 def test_light_unseen_for_a_second_is_off(tmp_path):
     semantic_map = map_of(fixture.write_map(tmp_path / "m.pb"))
-    seen = l5_map.LightFaces(
+    (signal,) = semantic_map.signals(
+        lanes_around(semantic_map),
         t=0.1 * np.arange(40),
         frame=np.array([3, 4, 30]),
         face=np.array([fixture.RED, fixture.RED, fixture.GREEN]),
         is_active=np.ones(3, bool),
     )
-    (signal,) = semantic_map.signals(lanes_around(semantic_map), seen)
     assert signal.state == ("off", "red", "off", "green")
     np.testing.assert_allclose(signal.start, [0.0, 0.3, 1.5, 3.0])
 
 
 def test_without_a_map_of_the_place_lanes_are_paths(dataset):
-    (recording,) = read(dataset[0].parent)
+    (recording,) = read(dataset.parent)
     assert recording.signals == ()
     assert recording.lanes[0].id == "path-0"
     assert any("fitted to the longest paths" in note for note in recording.notes)
     matrix = fixture.WORLD_TO_ECEF.copy()
     matrix[:3, 3] += 1e5
-    beside = dataset[0].with_name("meta.json")
+    beside = dataset.with_name("meta.json")
     beside.write_text(json.dumps({"pose_to_ecef": matrix.tolist()}))
     fixture.write_map(beside.with_name("semantic_map.pb"))
-    assert read(dataset[0].parent)[0].lanes[0].id == "path-0"
-
-
-def test_map_named_in_the_source(dataset):
-    fixture.write_map(dataset[0].parent / "other" / "palo.pb")
-    assert len(read(dataset[0].parent, map="other/palo.pb")[0].lanes) == 4
-    line = refused(read, dataset[0].parent, map="gone.pb")
-    assert "source TOML: map: gone.pb: expected" in line
+    assert read(dataset.parent)[0].lanes[0].id == "path-0"
+    beside.unlink()
+    beside.with_name("semantic_map.pb").rename(dataset.parent / "palo.pb")
+    assert len(read(dataset.parent, map="palo.pb")[0].lanes) == 4
 
 
 def test_format_version_1_has_no_lights(folder):
@@ -267,204 +227,74 @@ def test_format_version_1_has_no_lights(folder):
 
 def test_older_number_types(dataset):
     """Early releases had float32 positions and int32 ids."""
-    path, change = dataset
     older = {"<f8": "<f4", "<u8": "<i4"}
 
     def narrow(records):
         kinds = [(n, np.dtype(d).str, *s) for n, d, *s in fixture.AGENT_DTYPE]
         kinds = [(name, older.get(kind, kind), *s) for name, kind, *s in kinds]
-        out = np.zeros(records.size, kinds)
-        for name in out.dtype.names:
-            out[name] = records[name]
-        return out
+        return records.astype(kinds)
 
-    change("agents", narrow)
-    found, expected = tracks_of(read(path)[0])["12"], fixture.road_users()["12"]
+    fixture.change(dataset, "agents", narrow)
+    found, expected = tracks_of(read(dataset)[0])["12"], fixture.road_users()["12"]
     np.testing.assert_allclose(found.x, expected.x, atol=1e-3)
-
-
-def test_far_world_gets_a_local_origin(dataset):
-    path, change = dataset
-
-    def move(name):
-        def edit(records):
-            records[name][:, :2] += [500000.0, 4140000.0]
-
-        return edit
-
-    change("agents", move("centroid"))
-    change("frames", move("ego_translation"))
-    (recording,) = read(path)
-    assert any("local origin" in note for note in recording.notes)
-    assert abs(tracks_of(recording)["ego"].x[0]) < 1000.0
 
 
 def test_options(folder):
     assert read(folder, min_probability=1.1, unknown="drop")[0].tracks[-1].id == "ego"
-    size = {"length": 5.0, "width": 2.0, "centre_ahead": 1.2}
-    recording = read(folder, ego=size, speed_limit=9.0)[0]
-    ego = tracks_of(recording)["ego"]
-    assert (ego.length, ego.width) == (5.0, 2.0)
+    ego = tracks_of(read(folder, ego={"centre_ahead": 1.2})[0])["ego"]
     assert ego.x[0] == pytest.approx(fixture.CENTRE[0] + 1.2)
-    assert recording.default_speed_limit == 9.0
-    assert not ego.is_human(0.0, 1.0)
-    human = read(folder, recording_car="human")[0]
-    assert tracks_of(human)["ego"].is_human(0.0, 1.0)
     tracks = read(folder, unknown="vehicle")[0].tracks
     assert [track.kind for track in tracks if track.id == "99"] == [Kind.VEHICLE]
-    bad = {"recording_car": "x", "ego": 3, "unknown": "x", "rate_hz": 0}
-    for name, value in {**bad, "min_probability": "x"}.items():
-        assert f"source TOML: {name}" in refused(read, folder, **{name: value})
 
 
-def test_a_few_outliers_are_left_out(dataset):
-    """One box of 90 m among many tracks is the tracker's mistake, not the file's."""
-    path, change = dataset
-
-    def add(records):
-        many = np.tile(records[records["track_id"] == 12][:1], 20)
-        many["track_id"] = np.arange(200, 220)
-        many["extent"][0, 0] = 90.0
-        return np.concatenate([many, records])
-
-    def shift(records):
-        records["agent_index_interval"] += 20
-        records["agent_index_interval"][0, 0] = 0
-
-    change("agents", add)
-    change("frames", shift)
-    (recording,) = read(path)
-    assert any("1 tracks with an impossible size" in note for note in recording.notes)
-    assert "200" not in tracks_of(recording)
-
-
-# ------------------------------------------------------------------ malformed
-
-
-def put(name, value, row=5):
-    def edit(records):
-        records[name][row] = value
-
-    return edit
-
-
-def put_character(name, point):
-    """The first character of a text of the first record."""
-
-    def edit(records):
-        start = records.dtype.fields[name][1]
-        character = np.frombuffer(np.uint32(point).tobytes(), np.uint8)
-        records.view(np.uint8)[start : start + 4] = character
-
-    return edit
-
-
-def in_microseconds(records):
-    records["timestamp"] //= 1000
-
-
-NAN, INF, FRAMES = float("nan"), float("inf"), "frame_index_interval"
-BAD_VALUES = [
-    ("agents", put("centroid", NAN), r"centroid: x: nan"),
-    ("agents", put("centroid", 1e300), r"centroid: x: 1e\+300"),
-    ("agents", put("extent", INF), r"length: inf"),
-    ("agents", put("extent", -1.0), r"length: -1 m: expected 0 to"),
-    ("agents", put("extent", 1e6), r"length: 1e\+06 m: expected 0 to"),
-    ("agents", put("yaw", NAN), r"heading: nan: expected a finite"),
-    ("agents", put("velocity", 1e4, slice(0, 3)), r"speed: 14142"),
-    ("agents", put("label_probabilities", NAN), r"label_probabilities"),
-    ("agents", put("track_id", 15, 0), r"met twice"),
-    ("frames", put("ego_translation", NAN), r"ego_translation: x: nan"),
-    ("frames", put("ego_rotation", 0.0), r"ego_rotation: .*rotation matrix"),
-    ("frames", put("ego_rotation", NAN), r"ego_rotation: .*rotation matrix"),
-    ("frames", put("timestamp", 0), r"id 0: t: .*goes backwards"),
-    ("frames", in_microseconds, r"timestamp: median step .*: expected 0\.1 s"),
-    ("frames", put("agent_index_interval", [-1, 9]), r"interval within 0"),
-    ("frames", put("agent_index_interval", [9, 1]), r"interval within 0"),
-    ("frames", put("agent_index_interval", [0, 10**15]), r"interval within"),
-    ("scenes", put_character("host", 2**31), r"host: characters that are none"),
-    ("scenes", put_character("host", 0xDCFF), r"host: characters that are none"),
-    ("scenes", put(FRAMES, [0, 0], 0), r"expected frames"),
-    ("scenes", put(FRAMES, [0, 999], 0), r"interval within"),
-    ("scenes", put(FRAMES, [-(2**63), 2**63 - 1], 0), r"int"),
-]
-
-
-@pytest.mark.parametrize(("array", "edit", "words"), BAD_VALUES)
-def test_absurd_values(dataset, array, edit, words):
-    path, change = dataset
-    change(array, edit)
-    line = refused(read, path)
-    assert re.search(words, line)
-    assert str(path) in line
-
+# ------------------------------------------------------------------- arrays
 
 BAD_METADATA = [
-    ({"zarr_format": 3}, "zarr_format: 3: expected 2"),
-    ({"shape": [10**12]}, "shape: .*: expected one size"),
-    *[({"shape": bad}, "shape") for bad in ([-1], [2, 3], [True], "x")],
+    ({"shape": [2, 3]}, "shape: [2, 3]: expected a list"),
+    ({"shape": [10**12]}, "shape[0]: 1000000000000: expected a whole number <= "),
     ({"chunks": [0]}, "chunks: 0 records"),
     ({"chunks": [10**9]}, "chunks: 1000000000 records: expected 1 to"),
     ({"dtype": "<f8"}, "dtype: <f8: expected a list"),
-    ({"dtype": [["x", "|O"]]}, "dtype"),
-    ({"filters": [{"id": "pickle"}]}, "filters: .*pickle.*: expected none"),
-    ({"compressor": {"id": "zlib"}}, "compressor: .*: expected blosc"),
-    ({"compressor": 7}, "compressor: 7: expected blosc"),
-    (["centroid", "|O"], r"dtype: \['centroid', '\|O'\]"),
-    (["centroid", "<f8", [3]], r"dtype: centroid: .*expected shape"),
-    (["centroid", "<i8", [2]], r"dtype: centroid: .*kind f"),
-    (["centroid", ">f8", [2]], r"dtype: .*little-endian"),
-    (["centroid", "<f8", [2**40]], r"dtype"),
-    (["middle", "<f8", [2]], r"dtype: centroid: missing"),
-    (["yaw", "<f8", [2]], r"dtype: .*: expected different names"),
-    ("x", r"dtype"),
-    (["centroid", "<f8", [2], 1], r"dtype"),
+    ({"filters": [{"id": "pickle"}]}, "filters: "),
+    ({"compressor": {"id": "zlib"}}, "compressor.id: zlib: "),
+    (["centroid", "|O"], "dtype: ['centroid', '|O']: expected [name, little-endian"),
+    (["centroid", ">f8", [2]], "dtype: ['centroid', '>f8', [2]]: expected [name, "),
+    (["centroid", "<f8", [3]], "dtype: centroid: ('<f8', (3,)): expected shape (2,)"),
+    (["centroid", "<f8", [2**40]], "dtype"),
+    (["middle", "<f8", [2]], "dtype: centroid: missing"),
+    (["yaw", "<f8", [2]], "expected different names"),
 ]
 
 
 @pytest.mark.parametrize(("change", "words"), BAD_METADATA)
 def test_malformed_metadata(dataset, change, words):
     """Other fields, or another first field of a record."""
-    file = dataset[0] / "agents" / ".zarray"
+    file = dataset / "agents" / ".zarray"
     found = json.loads(file.read_text())
     if isinstance(change, dict):
         found.update(change)
     else:
         found["dtype"][0] = change
     file.write_text(json.dumps(found))
-    assert re.search(rf"\.zarray: {words}", refused(read, dataset[0]))
-
-
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        *[(bad, "json") for bad in (b"", b"[" * 100000, b"\xff\xfe")],
-        (b"[1]", "json: list: expected an object"),
-        (b" " * 2**21, "size: 2097152 bytes: expected at most"),
-    ],
-)
-def test_malformed_json(dataset, content, words):
-    (dataset[0] / "frames" / ".zarray").write_bytes(content)
-    assert words in refused(read, dataset[0])
+    line = refused(read, dataset)
+    assert line.startswith(f"{file}: ")
+    assert words in line
 
 
 @pytest.mark.parametrize(
     ("place", "content", "words"),
     [
         # blosc's own size is compared with the metadata before it is unpacked
-        (4, struct.pack("<I", 2**31 - 1), "0: chunk: 2147483647 bytes decompressed"),
+        (4, b"\xff\xff\xff\x7f", "0: chunk: 2147483647 bytes decompressed"),
         (16, b"\xff" * 184, ": records 0 to "),
     ],
 )
 def test_damaged_chunk(dataset, place, content, words):
-    chunk = dataset[0] / "agents" / "0"
+    chunk = dataset / "agents" / "0"
     changed = bytearray(chunk.read_bytes())
     changed[place : place + len(content)] = content
     chunk.write_bytes(changed)
-    line = refused(read, dataset[0])
-    assert "agents" in line
-    assert words in line
-    assert "expected" in line
+    assert words in refused(read, dataset)
 
 
 def test_limits(folder, monkeypatch):
@@ -474,42 +304,3 @@ def test_limits(folder, monkeypatch):
     monkeypatch.setattr(zarr2, "MAX_READ_BYTES", 1000)
     line = refused(read, folder)
     assert re.search(r"frames: records 0 to 100: .*at most 1000", line)
-
-
-def test_folder_without_data(tmp_path):
-    assert "no scenes/.zarray and no folder *.zarr" in refused(read, tmp_path)
-    (tmp_path / "a.zarr").mkdir()
-    assert "frames/.zarray: No such file" in refused(read, tmp_path)
-
-
-@pytest.mark.parametrize(
-    "content",
-    ["x", [[1.0]], [[0.0] * 4] * 4, [[1.0, {}]], [[10**400] * 4] * 4],
-)
-def test_malformed_meta(folder, content):
-    (folder / "meta.json").write_text(json.dumps({"world_to_ecef": content}))
-    line = refused(read, folder)
-    assert "meta.json: world_to_ecef: " in line
-    assert "expected a rigid" in line
-
-
-def element(kind, body):
-    return message([(2, [(1, [(1, b"x")]), (2, [(kind, body)])])])
-
-
-BAD_MAPS = [
-    b"",
-    b"\x12" + b"\xff" * 30,  # a varint without end
-    message([(2, 5)]),  # a number instead of an element
-    element(3, b"\xff"),
-    element(3, [(2, [(2, 1)]), (3, [(1, b"\x02")]), (4, b"")]),  # 1 x, no y
-    element(1, varint(9 << 3 | 1) + bytes(8)),
-    # a frame at 200 degrees north
-    element(3, [(2, [(1, fixture.fixed32(1, 2 * 10**9))]), (3, b""), (4, b"")]),
-]
-
-
-@pytest.mark.parametrize("content", BAD_MAPS)
-def test_malformed_map(folder, content):
-    (folder / "semantic_map" / "semantic_map.pb").write_bytes(content)
-    assert re.search(r"semantic_map\.pb: .*expected", refused(read, folder))

@@ -1,26 +1,21 @@
 """NGSIM: native text and portal CSV, with and without lateral positions."""
 
+import functools
 import time
 
 import numpy as np
 import pytest
 
 from rcirl_jax.data.cut import digest
-from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import spec_root
 from tests.data.importers import writers as w
+from tests.helpers import logs
+
+read = functools.partial(logs.read, "ngsim")
+only = functools.partial(logs.only, "ngsim")
 
 LANE_M = 3.6576  # m, 12 ft
-
-
-def read(path, source=None):
-    return list(read_recordings("ngsim", path, source))
-
-
-def only(path, source=None):
-    (recording,) = read(path, source)
-    return recording
 
 
 def test_native_text_in_metres_with_left_positive(tmp_path):
@@ -128,23 +123,20 @@ def test_csv_is_the_same_as_text(tmp_path):
         assert (one.id, one.length, one.width) == (other.id, other.length, other.width)
 
 
+def stamped(rows, begin=8e11):
+    """Rows with Global_Time: 100 ms a frame."""
+    return [[*row[:3], begin + 100 * row[1], *row[4:]] for row in rows]
+
+
 def test_portal_sites_and_periods(tmp_path):
     """Vehicle and frame numbers start anew in each period and at each site."""
-    early, late = w.ngsim_rows(), w.ngsim_rows()
-    for begin, rows in ((9e11, late), (8e11, early)):
-        for k, row in enumerate(rows):
-            row[3] = begin + 100 * k
-    rows = late + early + w.ngsim_rows() + w.ngsim_rows()
+    begins = (9e11, 8e11, 7e11, 6e11)
+    rows = [row for begin in begins for row in stamped(w.ngsim_rows(), begin)]
     sites = ["us-101"] * 80 + ["i-80"] * 40 + ["lankershim"] * 40
     found = read(w.ngsim_csv(tmp_path / "all.csv", rows, sites=sites))
     assert [recording.name for recording in found] == ["all-i-80", "all-us-101"]
     assert [len(recording.tracks) for recording in found] == [1, 2]
     assert all("lankershim" in recording.notes[0] for recording in found)
-
-
-def stamped(rows, begin=8e11):
-    """Rows with Global_Time: 100 ms a frame."""
-    return [[*row[:3], begin + 100 * row[1], *row[4:]] for row in rows]
 
 
 def periods():
@@ -276,26 +268,6 @@ def test_malformed_rows(tmp_path, writer, rows, line, field):
     assert "\n" not in message
 
 
-@pytest.mark.parametrize(
-    ("content", "field"),
-    [
-        (b"", "rows"),
-        (b"\n\n", "rows"),
-        (b"\x00\xff\xfe\x01" * 4000, "text"),
-        (b"1 2 3\n", "3 cells"),
-        (b"Vehicle_ID,Frame_ID\n1,2\n", "column Local_Y: missing"),
-        (b"Vehicle_ID,Vehicle_ID\n1,2\n", "met twice"),
-    ],
-)
-def test_not_ngsim(tmp_path, content, field):
-    path = tmp_path / "bad.txt"
-    path.write_bytes(content)
-    with pytest.raises(InputError) as error:
-        read(path)
-    assert field in str(error.value)
-    assert str(path) in str(error.value)
-
-
 def test_feet_declared_as_metres(tmp_path):
     source = tmp_path / "metres.toml"
     text = (spec_root() / "sources" / "ngsim.toml").read_text()
@@ -324,8 +296,3 @@ def test_recorded_i80(data_dir):
     np.testing.assert_allclose(track.speed, rows[:, 11] * w.FOOT)
     assert [lane.id for lane in recording.lanes] == ["1", "2", "3", "4", "5", "6", "9"]
     assert any("lateral" in note for note in recording.notes)
-
-
-@pytest.mark.dataset
-def test_recorded_folder_skips_the_notice(data_dir):
-    assert len(read(data_dir / "ngsim_i80_native")) == 1

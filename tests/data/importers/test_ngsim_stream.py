@@ -5,15 +5,11 @@ import pytest
 
 from rcirl_jax.data.cut import cut, digest
 from rcirl_jax.data.importers import parts, read_part
-from rcirl_jax.data.importing import import_parts
-from rcirl_jax.data.parts import Part, is_long
 from rcirl_jax.data.readers.tables import streams
-from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
 from tests.data.importers import writers as w
 from tests.data.importers.test_csv_stream import scenes_by_name
 from tests.data.small_logs import CONFIG
-from tests.helpers.commands import count_and_peak
 
 LANE_FT = 12.0
 BEGIN = {"us-101": (1118846979700.0, 1118850579700.0), "i-80": (1113433135300.0,)}
@@ -119,28 +115,6 @@ def test_pieces_of_the_native_text_are_those_of_the_csv(tmp_path, monkeypatch):
     assert [digest(made) for made in texts] == [digest(made) for made in tables]
 
 
-@pytest.mark.parametrize(
-    ("cell", "message"),
-    [
-        ("far", r"line 2000: Local_Y: 'far': expected a finite number"),
-        ("nan", r"line 2000: Local_Y: 'nan': expected a finite number"),
-        ("1 2", r"line 2000: 19 cells: expected 18"),
-        ("1e30", r"line 2000: Local_Y: 1e\+30: expected within"),
-        ("\xff", r"line 2000: Local_Y: '.*': expected a finite number"),
-    ],
-)
-def test_bad_cells_of_a_long_text_are_one_line(tmp_path, monkeypatch, cell, message):
-    monkeypatch.setattr(streams, "READ_BYTES", 10_000)
-    path = native(tmp_path / "native.txt")
-    lines = path.read_text().splitlines()
-    cells = lines[1999].split()
-    lines[1999] = " ".join([*cells[:5], cell, *cells[6:]])
-    path.write_text("\n".join(lines), encoding="latin-1")
-    with pytest.raises(InputError, match=message) as caught:
-        read(path, 1, max_bad_rows=0.0)
-    assert "\n" not in str(caught.value)
-
-
 def test_notes_name_what_is_left_out_and_repeated(tmp_path):
     first = read(write(tmp_path / "portal.csv"), 1)[0]
     assert first.notes == (
@@ -148,29 +122,6 @@ def test_notes_name_what_is_left_out_and_repeated(tmp_path):
         "3 vehicles without length; default by class",
         "3 rows met twice, used once",
     )
-
-
-def test_the_dataset_is_that_of_the_sorted_file(tmp_path):
-    found = []
-    for shuffled in (False, True):
-        path = write(tmp_path / str(shuffled) / "portal.csv", shuffled)
-        _, spec = parts("ngsim", path)
-        part = Part(format="ngsim", input=path, spec={**spec, "long_bytes": 1})
-        assert is_long(part)
-        import_parts([part], tmp_path / f"data-{shuffled}", CONFIG)
-        found.append(open_dataset(tmp_path / f"data-{shuffled}"))
-    files = [
-        {str(f.relative_to(d)): f.read_bytes() for f in d.rglob("*") if f.is_file()}
-        for d in (tmp_path / "data-False", tmp_path / "data-True")
-    ]
-    assert files[0] == files[1]
-    assert found[0].manifest.vehicles == found[1].manifest.vehicles
-
-
-def test_a_short_file_is_not_read_in_pieces(tmp_path):
-    path = write(tmp_path / "portal.csv")
-    _, spec = parts("ngsim", path)
-    assert not is_long(Part(format="ngsim", input=path, spec=spec))
 
 
 def test_without_stamps_the_frames_are_the_clock(tmp_path):
@@ -183,71 +134,8 @@ def test_without_stamps_the_frames_are_the_clock(tmp_path):
     assert users == {track.id for track in whole.tracks}
 
 
-def test_separators_between_thousands(tmp_path):
-    plain = [digest(made) for made in read(write(tmp_path / "portal.csv"), 1)]
-    path = w.grouped(tmp_path / "portal.csv")
-    assert [digest(made) for made in read(path, 1)] == plain
-    text = path.read_text()
-    path.write_text(text.replace('"1,118,847,', '"1,118,8x7,', 1))
-    with pytest.raises(InputError, match=r"portal\.csv: line \d+: Global_Time: '1,118"):
-        read(path, 1, max_bad_rows=0.0)
-
-
-@pytest.mark.parametrize(
-    ("column", "cell", "message"),
-    [
-        (5, "far", r"line 12: Local_Y: 'far': expected a finite number"),
-        (3, "", r"line 12: Global_Time: '': expected a finite number"),
-        (11, "inf", r"line 12: v_Vel: 'inf': expected a finite number"),
-    ],
-)
-def test_bad_cells_are_one_line(tmp_path, column, cell, message):
-    rows, sites = portal(cars=2)
-    rows[10][column] = cell
-    path = w.ngsim_csv(tmp_path / "portal.csv", rows, sites=sites)
-    with pytest.raises(InputError, match=message) as caught:
-        read(path, 1, max_bad_rows=0.0)
-    assert "\n" not in str(caught.value)
-
-
-def test_unreadable_files_are_one_line(tmp_path):
-    path = tmp_path / "portal.csv"
-    path.write_text("Vehicle_ID,Frame_ID\n1,2\n")
-    with pytest.raises(InputError, match="column Local_Y: missing"):
-        read(path, 1)
-    path.write_text(",".join(w.NGSIM_COLUMNS) + "\n")
-    with pytest.raises(InputError, match="rows: none"):
-        read(path, 1)
+def test_a_portal_without_a_freeway(tmp_path):
     rows = vehicle(1, 0, 1.2e12, 40)
-    w.ngsim_csv(path, rows, sites=["peachtree"] * 40)
+    path = w.ngsim_csv(tmp_path / "portal.csv", rows, sites=["peachtree"] * 40)
     with pytest.raises(InputError, match="Location: peachtree: expected one of us-101"):
         read(path, 1)
-
-
-MEMORY = """
-import resource, sys
-from pathlib import Path
-from rcirl_jax.data.importers import parts, read_part
-path = Path(sys.argv[1])
-_, spec = parts("ngsim", path)
-spec["long_bytes"] = 1
-made = sum(1 for _ in read_part("ngsim", path, spec))
-print(made, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
-"""
-
-
-@pytest.mark.slow
-def test_memory_does_not_grow_with_the_file(tmp_path):
-    """Eight times the minutes, nearly the same peak."""
-    peaks = []
-    for minutes in (10, 80):
-        path = tmp_path / f"{minutes}.csv"
-        with path.open("w") as file:
-            file.write(",".join([*w.NGSIM_COLUMNS, "Location"]) + "\n")
-            for number in range(minutes * 10):
-                rows = vehicle(number, 60 * number, 1.2e12, 1200)
-                file.writelines(f"{','.join(map(str, r))},i-80\n" for r in rows)
-        made, peak = count_and_peak(MEMORY, path)
-        assert made >= minutes
-        peaks.append(peak)
-    assert peaks[1] < 1.3 * peaks[0]

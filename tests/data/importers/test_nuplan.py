@@ -1,28 +1,17 @@
 """nuPlan logs and maps: SQLite of others, geometry blobs, windows, lights."""
 
-import collections
 import functools
-import hashlib
-import os
-import pickle
 import shutil
-import sqlite3
-import struct
-import time
 
 import numpy as np
 import pytest
+import shapely
 
-from rcirl_jax.data.cut import cut
-from rcirl_jax.data.importers import parts
 from rcirl_jax.data.importers.nuplan import geopackage
-from rcirl_jax.data.importers.nuplan import map as nuplan_map
 from rcirl_jax.data.importers.nuplan import reader as nuplan
 from rcirl_jax.data.readers import long_logs
-from rcirl_jax.data.readers import sqlite as sqlite_ro
-from rcirl_jax.data.scenes.config import CollectConfig
-from rcirl_jax.errors import InputError
 from tests.data.importers.formats import nuplan as fixture
+from tests.data.importers.formats.nuplan import edit
 from tests.helpers import logs
 from tests.helpers.logs import lanes_of, refused, tracks_of
 
@@ -63,32 +52,13 @@ def whole(original):
     return only(original[0] / original[1])
 
 
-def edit(path, *statements, values=None):
-    database = sqlite3.connect(path)
-    for statement in statements:
-        if values is None:
-            database.executescript(statement)
-        else:
-            database.execute(statement, values)
-    database.commit()
-    database.close()
-
-
-def in_pairs(text):
-    """The two sides of each line "change | words"."""
-    return [tuple(line.split(" | ")) for line in text.strip().splitlines()]
-
-
 # ---------------------------------------------------------------- well-formed
-
-
-def test_log_becomes_a_recording(whole):
-    assert (whole.name, whole.rate_hz, whole.group) == (fixture.NAME, 20.0, DRIVE)
-    assert any("x = 664000 m, y = 3997000 m" in note for note in whole.notes)
 
 
 def test_ego_is_the_box_at_the_clouds_time(whole, log):
     """Rear axle, 3 ms early -> centre, at the time of the point cloud."""
+    assert (whole.name, whole.rate_hz, whole.group) == (fixture.NAME, 20.0, DRIVE)
+    assert any("x = 664000 m, y = 3997000 m" in note for note in whole.notes)
     ego = whole.tracks[0]
     np.testing.assert_allclose(ego.x, fixture.road_users()["ego"].x, atol=2e-3)
     np.testing.assert_allclose(ego.t, fixture.STAMPS, atol=1e-6)
@@ -96,10 +66,11 @@ def test_ego_is_the_box_at_the_clouds_time(whole, log):
     other = only(log, ego=size).tracks[0]
     assert other.x[0] == pytest.approx(-fixture.AHEAD, abs=2e-3)
     assert (other.length, other.width) == (4.0, 1.7)
+    edit(log, f"UPDATE ego_pose SET qw = {np.cos(0.35)}, qz = {np.sin(0.35)}")
+    np.testing.assert_allclose(only(log).tracks[0].heading, 0.7)
 
 
-@pytest.mark.parametrize("indexed", [True, False])
-def test_rows_in_any_order(whole, log, indexed):
+def test_rows_in_any_order_and_without_indices(whole, log):
     """A database has no order of rows: here that of the tokens, as of a key."""
     for table in ("lidar_box", "lidar_pc", "ego_pose", "traffic_light_status"):
         edit(
@@ -108,20 +79,15 @@ def test_rows_in_any_order(whole, log, indexed):
             f"INSERT INTO {table} SELECT * FROM kept ORDER BY substr(hex(token), 5);"
             "DROP TABLE kept;",
         )
-    if not indexed:
-        edit(log, "DROP INDEX ix_lidar_pc_timestamp")
-        edit(log, "DROP INDEX ix_lidar_box_lidar_pc_token")
+    edit(
+        log, "DROP INDEX ix_lidar_pc_timestamp; DROP INDEX ix_lidar_box_lidar_pc_token"
+    )
     found = only(log)
     assert [track.id for track in found.tracks] == [t.id for t in whole.tracks]
     for one, other in zip(found.tracks, whole.tracks, strict=True):
         np.testing.assert_array_equal(one.t, other.t)
         np.testing.assert_array_equal(one.x, other.x)
     assert [s.state for s in found.signals] == [s.state for s in whole.signals]
-
-
-def test_heading_from_the_quaternion(log):
-    edit(log, f"UPDATE ego_pose SET qw = {np.cos(0.35)}, qz = {np.sin(0.35)}")
-    np.testing.assert_allclose(only(log).tracks[0].heading, 0.7)
 
 
 @pytest.mark.parametrize(
@@ -153,54 +119,9 @@ def test_windows_hold_the_scenes_of_the_log(original, whole, monkeypatch):
     assert {ego.first_seen_s for ego in egos} == {0.0}
     for recording, ego in zip(found, egos, strict=True):
         assert all(signal.start[0] == ego.t[0] for signal in recording.signals)
-    config = CollectConfig(
-        min_future_s=1.5, require_obstacles=False, require_speed_change=False
-    )
-    one, apart = (
-        collections.Counter(
-            (name, int(frame))
-            for made in (cut(recording, config) for recording in recordings)
-            for name, frame in zip(made.vehicles, made.scenes.frame, strict=True)
-        )
-        for recordings in ([whole], found)
-    )
-    assert max(apart.values()) == 1
-    assert one.total() > 40
-    assert apart == one
-
-
-def test_parts_are_logs(folder):
-    shutil.copy(folder / f"{fixture.NAME}.db", folder / "b.db")
-    found, _ = parts("nuplan", folder)
-    assert [part.name for part in found] == [f"{fixture.NAME}.db", "b.db"]
-    assert [recording.name for recording in read(folder)] == [fixture.NAME, "b"]
-
-
-def test_file_is_left_as_it_is_and_those_beside_it_are_not_read(log):
-    """immutable=1: a planted journal changes nothing; nor do odd names of files.
-
-    A URI must not take ? and # in a name for its own.
-    """
-    odd = log.rename(log.with_name("a?mode=rwc#%41 b.db"))
-    before = hashlib.sha256(odd.read_bytes()).hexdigest()
-    for suffix in ("-wal", "-journal", "-shm"):
-        odd.with_name(odd.name + suffix).write_bytes(os.urandom(4096))
-    assert only(odd).name == "a?mode=rwc#%41 b"
-    assert hashlib.sha256(odd.read_bytes()).hexdigest() == before
-    assert len(list(odd.parent.iterdir())) == 4
-
-
-def test_pickles_and_triggers_of_the_file_are_not_run(log, tmp_path):
-    class Bomb:
-        def __reduce__(self):
-            return os.mkdir, (str(tmp_path / "executed"),)
-
-    bomb = (pickle.dumps(Bomb()),) * 2
-    edit(log, "UPDATE lidar SET translation = ?, rotation = ?", values=bomb)
-    trigger = "BEFORE INSERT ON log BEGIN SELECT load_extension('x'); END"
-    edit(log, f"CREATE TRIGGER t {trigger}")
-    assert only(log).tracks
-    assert not (tmp_path / "executed").exists()
+    one, apart = logs.scenes_of([whole], 1.5), logs.scenes_of(found, 1.5)
+    assert len(one) > 40
+    assert set(apart) == set(one)
 
 
 def test_missing_velocity_comes_from_positions(log):
@@ -364,46 +285,43 @@ def test_names_of_geometry_columns(whole, folder, city, column):
         np.testing.assert_equal(found[name].stop_line, lane.stop_line)
 
 
-def blob(kind, body, *, order="<", flags=1):
-    mark = b"\x01" if order == "<" else b"\x00"
-    head = b"GP" + bytes([0, flags]) + struct.pack("<i", 4326)
-    return head + mark + struct.pack(order + "I", kind) + body
+def blob(*shapes, order=1, **dimensions):
+    """A GeoPackage blob without an envelope, as shapely writes well-known binary."""
+    made = shapely.to_wkb(shapes[0], byte_order=order, **dimensions)
+    return b"GP\x00\x01" + bytes(4) + made
 
 
-def points(values, order="<"):
-    values = np.asarray(values, np.float64)
-    return struct.pack(order + "I", len(values)) + values.astype(order + "f8").tobytes()
-
-
-ONE, TWO, MANY = (struct.pack("<I", count) for count in (1, 2, 2**32 - 1))
 LINE = np.array([[1.0, 2.0], [3.0, 4.0]])
-LINE_Z = np.column_stack([LINE, [9.0, 9.0]])
-LINE_ZM = np.column_stack([LINE_Z, [8.0, 8.0]])
-SHORT, RING = blob(2, points(LINE[:1]))[8:], blob(3, ONE + points(LINE))[8:]
+RING = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [0.0, 0.0]])
+HOLE = np.array([[2.0, 0.5], [3.0, 0.5], [3.0, 1.0], [2.0, 0.5]])
+SHORT = shapely.LineString([[7.0, 7.0], [7.0, 8.0]])
+TALL = shapely.force_3d(shapely.LineString(LINE), 9.0)
+LONG = shapely.LineString(RING)
 GEOMETRIES = [
-    blob(2, points(LINE)),
-    blob(2, points(LINE, ">"), order=">"),
-    *(blob(kind, points(LINE_Z)) for kind in (1002, 2002, 0x80000002)),
-    *(blob(kind, points(LINE_ZM)) for kind in (3002, 0xC0000002)),
-    blob(3, TWO + points(LINE) + points(LINE[:1])),
-    blob(5, TWO + SHORT + blob(2, points(LINE))[8:]),
-    blob(6, ONE + RING),
+    *[(blob(shapely.LineString(LINE), order=order), LINE) for order in (0, 1)],
+    *[(blob(TALL, flavor=flavor), LINE) for flavor in ("iso", "extended")],
+    (blob(shapely.Polygon(RING, [HOLE])), RING),
+    (blob(shapely.MultiLineString([SHORT, LONG])), RING),
+    (blob(shapely.MultiPolygon([shapely.Polygon(RING)])), RING),
+    (b"GP\x00\x11" + blob(SHORT)[4:], np.zeros((0, 2))),  # said to be empty
 ]
+
+
+@pytest.mark.parametrize(("content", "points"), GEOMETRIES)
+def test_geometries(content, points):
+    np.testing.assert_array_equal(geopackage.points_of(content), points)
+
+
+NESTED = blob(shapely.GeometryCollection([shapely.MultiLineString([SHORT])]))
 MALFORMED = [
     *(None, "GP", b"", b"XX" + bytes(20)),
     b"GP\x00\x0f" + bytes(40),  # no such envelope
-    b"GP\x00\x01" + bytes(4) + b"\x07" + bytes(20),
-    *(blob(2, b""), blob(2, MANY), blob(2, struct.pack("<I", 3) + bytes(32))),
-    blob(1, points(LINE)),  # a point
-    *(blob(3, MANY), blob(5, MANY), blob(9999, points(LINE))),
-    blob(5, ONE + blob(5, ONE)[8:] * 50),
+    blob(shapely.Point(1.0, 2.0)),
+    *(blob(LONG)[:cut] for cut in (9, 12, 30)),
+    # more points, rings or lines than there are bytes
+    *(blob(shape)[:13] + b"\xff" * 4 for shape in (LONG, shapely.Polygon(RING))),
+    NESTED[:9] + b"\x05" + NESTED[10:],  # lines of lines
 ]
-
-
-@pytest.mark.parametrize("content", GEOMETRIES)
-def test_geometries(content):
-    np.testing.assert_array_equal(geopackage.points_of(content), LINE)
-    assert geopackage.points_of(content[:3] + b"\x11" + content[4:]).shape == (0, 2)
 
 
 @pytest.mark.parametrize("content", MALFORMED)
@@ -412,145 +330,9 @@ def test_malformed_geometries(content):
         geopackage.points_of(content)
 
 
-BAD_MAPS = """
-DELETE FROM meta | projectedCoordSystem: missing: expected a UTM zone
-DROP TABLE meta | projectedCoordSystem: missing: expected a UTM zone
-UPDATE meta SET value = 'epsg:3857' | epsg:3857: expected a UTM zone
-UPDATE meta SET value = 7.5 | projectedCoordSystem: 7.5
-UPDATE gpkg_geometry_columns SET srs_id = 3857 | srs_id: 3857: expected 4326
-UPDATE gpkg_geometry_columns SET column_name = 'shape' | stop_polygons.shape: missing
-ALTER TABLE gpkg_geometry_columns DROP COLUMN column_name | columns.column_name: missing
-UPDATE baseline_paths SET geom = x'00' | baseline_paths.geom: no GeoPackage
-UPDATE boundaries SET geom = 'x' | boundaries.geom: no GeoPackage
-DROP TABLE baseline_paths | table baseline_paths: missing
-DROP TABLE lanes_polygons | table lanes_polygons: missing
-ALTER TABLE lanes_polygons DROP COLUMN lane_fid | lanes_polygons.lane_fid: missing
-"""
-VIEW = "DROP TABLE lane_connectors; CREATE VIEW lane_connectors AS SELECT 1"
-TWO_LINES = "UPDATE gpkg_geometry_columns SET column_name = 'two' || char(10) || 'x'"
-MORE = [
-    (VIEW, "lane_connectors: a view: expected a table"),
-    (TWO_LINES, "stop_polygons.two x: missing"),
-]
-
-
-@pytest.mark.parametrize(("statement", "words"), [*in_pairs(BAD_MAPS), *MORE])
-def test_malformed_map(folder, city, statement, words):
-    edit(city, statement)
-    line = refused(only, folder)
-    assert words in line
-    assert line.startswith(str(city))
-
-
-def test_map_off_the_earth_or_of_too_many_points(folder, city, monkeypatch):
-    with monkeypatch.context() as patch:
-        patch.setattr(geopackage, "MAX_POINTS", 11)
-        assert "points: expected at most 11" in refused(only, folder)
-    wild = fixture.geometry(2, [[500.0, 95.0], [0.0, 0.0]], to=np.asarray)
-    edit(city, "UPDATE baseline_paths SET geom = ? WHERE fid = 1", values=(wild,))
-    assert "baseline_paths.geom: 500: expected longitude" in refused(only, folder)
-
-
-# -------------------------------------------------------------------- hostile
-
-ENDLESS = """WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n)
-  SELECT CAST(x AS BLOB) AS token, CAST(x AS BLOB) AS lidar_pc_token,
-  CAST(x AS BLOB) AS track_token, x AS x, x AS y, x AS yaw, x AS vx, x AS vy,
-  x AS width, x AS length FROM n"""
-VIRTUAL = "fts4(lidar_pc_token, track_token, x, y, yaw, vx, vy, width, length)"
-GENERATED = """CREATE TABLE category (token BLOB, other TEXT,
-  name TEXT GENERATED ALWAYS AS (hex(zeroblob(20000000))) VIRTUAL);
-  INSERT INTO category (token, other) SELECT category_token, 1 FROM track"""
-SCHEMA = "PRAGMA writable_schema = ON; UPDATE sqlite_master SET"
-PROGRAMS = [
-    (f"DROP TABLE lidar_box; CREATE VIEW lidar_box AS {ENDLESS}", "lidar_box: a view"),
-    (
-        f"DROP TABLE lidar_box; CREATE VIRTUAL TABLE lidar_box USING {VIRTUAL}",
-        "lidar_box: a virtual table: expected a table",
-    ),
-    (f"DROP TABLE category; {GENERATED}", "expected a readable SQLite file"),
-    (f"{SCHEMA} sql = 'nonsense' WHERE name = 'lidar_box'", "expected a readable SQ"),
-    (f"{SCHEMA} rootpage = 999999 WHERE name = 'lidar_box'", "expected a"),
-]
-LAST = "UPDATE lidar_pc SET timestamp = 9223372036854775807 WHERE filename = '1.pcd'"
-BAD_LOGS = f"""
-DROP TABLE lidar_box | table lidar_box: missing
-DROP TABLE log | table log: missing
-DELETE FROM log | table log: no rows
-DELETE FROM lidar_pc | lidar_pc: no row with an ego pose
-DELETE FROM ego_pose | lidar_pc: no row with an ego pose
-ALTER TABLE lidar_box DROP COLUMN yaw | lidar_box.yaw: missing
-UPDATE lidar_box SET x = 'far' | lidar_box.x: 'far': expected a number
-UPDATE lidar_box SET x = '1.5 m' | lidar_box.x: '1.5 m': expected a number
-UPDATE lidar_box SET x = x'31' | lidar_box.x: b'1': expected a number
-UPDATE lidar_box SET x = 9e999 | lidar_box: x: inf
-UPDATE lidar_box SET x = NULL | lidar_box: x: nan
-UPDATE lidar_box SET yaw = NULL | heading: nan: expected a finite number
-UPDATE lidar_box SET length = -1 | length: -1 m: expected 0 to
-UPDATE lidar_box SET width = 1e9 | width: 1e+09 m: expected 0 to
-UPDATE lidar_box SET vx = 300 | speed: 300
-UPDATE lidar_box SET track_token = 'abc' | track_token: 'abc': expected a
-UPDATE lidar_box SET track_token = zeroblob(99) | track_token: b'
-DELETE FROM track | track_token:
-UPDATE category SET name = 'alien' | category.name: 'alien': expected one
-UPDATE category SET name = x'ff' | category.name: b'
-UPDATE category SET name = NULL | category.name: None: expected one
-UPDATE ego_pose SET x = NULL | ego_pose.x: NULL: expected a number
-UPDATE ego_pose SET x = 1e300 | ego_pose: x: 1e+300
-UPDATE ego_pose SET qw = 0 | ego_pose.qw, qx, qy, qz: norm 0: expected 1
-UPDATE lidar_pc SET timestamp = NULL | lidar_pc.timestamp: NULL
-UPDATE lidar_pc SET timestamp = 'now' | lidar_pc.timestamp: 'now'
-UPDATE lidar_pc SET timestamp = 5 | timestamp:
-UPDATE lidar_pc SET timestamp = timestamp / 1000 | timestamp:
-{LAST} | timestamp:
-UPDATE traffic_light_status SET lane_connector_id = 'x' | connector_id: 'x'
-"""
-
-
-@pytest.mark.parametrize(("statement", "words"), [*PROGRAMS, *in_pairs(BAD_LOGS)])
-def test_malformed_log(log, statement, words):
-    edit(log, statement)
-    start = time.monotonic()
-    line = refused(read, log)
-    assert words in line
-    assert line.startswith(str(log))
-    assert time.monotonic() - start < 20.0
-
-
-def test_work_is_bounded(log, monkeypatch):
-    """A join without end stops after steps in proportion to the file."""
-    monkeypatch.setattr(sqlite_ro, "MIN_STEPS", 1_000_000)
-    monkeypatch.setattr(sqlite_ro, "STEPS_PER_BYTE", 0)
-    with sqlite_ro.Database(log) as database:
-        sql = "SELECT a.x FROM lidar_box AS a, lidar_box AS b, lidar_box AS c"
-        with pytest.raises(InputError, match="too much work for the file's size"):
-            database.numbers(sql, ("x",), 10**12)
-
-
-def test_only_select_is_authorised(log):
-    with sqlite_ro.Database(log) as database:
-        for sql in (
-            "DELETE FROM log",
-            "ATTACH DATABASE ':memory:' AS other",
-            "SELECT load_extension('x')",
-            "PRAGMA writable_schema = ON",
-            "WITH RECURSIVE n(x) AS (SELECT 1 UNION SELECT x FROM n) SELECT x FROM n",
-        ):
-            with pytest.raises(InputError, match="database: "):
-                database.numbers(sql, ("x",), 10)
-
-
-@pytest.mark.parametrize(
-    "content", [b"SQLite format 3\x00" + fill * 5000 for fill in (b"\0", b"\xff")]
-)
-def test_not_a_database(tmp_path, content):
-    (tmp_path / "a.db").write_bytes(content)
-    assert "expected" in refused(read, tmp_path)
-
-
-def test_a_file_cut_short_says_so(log):
-    log.write_bytes(log.read_bytes()[:50000])
-    assert "size: 50000 bytes: expected " in refused(read, log)
+def test_a_map_of_too_many_points(folder, monkeypatch):
+    monkeypatch.setattr(geopackage, "MAX_POINTS", 11)
+    assert "points: expected at most 11" in refused(only, folder)
 
 
 def test_rows_are_limited(log, monkeypatch):
@@ -558,24 +340,8 @@ def test_rows_are_limited(log, monkeypatch):
     assert "lidar_box.track_token: more than 100 rows" in refused(read, log)
 
 
-@pytest.mark.parametrize(
-    ("option", "words"),
-    [
-        ({"window_s": 0}, "source TOML"),
-        ({"window_s": 1e-9}, "source TOML"),
-        ({"ego": 1}, "source TOML"),
-        ({"rate_hz": "x"}, "source TOML"),
-        ({"rate_hz": 10.0}, " s: expected 0.1 s"),
-    ],
-)
-def test_options_are_checked(log, option, words):
-    assert words in refused(read, log, **option)
-
-
 def test_zone_of():
     assert geopackage.zone_of("epsg:32648") == (48, False)
     assert geopackage.zone_of(32719) == (19, True)
     for bad in ("epsg:4326", None, "32661", "x32611"):
         assert geopackage.zone_of(bad) is None
-    assert nuplan_map._fid("61") == 61
-    assert nuplan_map._fids("31, 32,x") == (31, 32)

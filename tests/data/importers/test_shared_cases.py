@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from rcirl_jax.data.cut import cut
-from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.scenes.config import CollectConfig
-from rcirl_jax.errors import InputError
 from tests.conftest import REPO
 from tests.data.importers import people
 
@@ -118,28 +116,6 @@ def lines_of(case):
     return gzip.decompress((case / "flight.csv.gz").read_bytes()).decode().splitlines()
 
 
-REWRITTEN = {
-    "semicolons": lambda lines: "\n".join(line.replace(",", ";") for line in lines),
-    "a mark and decimal commas": lambda lines: (
-        "\ufeff" + "\n".join(x.replace(",", ";").replace(".", ",") for x in lines)
-    ),
-    "an index column": lambda lines: "\n".join(
-        f"{'' if k == 0 else k},{line}" for k, line in enumerate(lines)
-    ),
-}
-
-
-@of("30_drone_recording")
-@pytest.mark.parametrize("form", REWRITTEN)
-def test_a_drone_recording_rewritten(case, tmp_path, form):
-    other = people.only(case, named(tmp_path, case, "*.parquet"))
-    log = tmp_path / "flight.csv"
-    log.write_text(REWRITTEN[form](lines_of(case)))
-    found = people.only(log, case / "map.toml")
-    assert_drone(found, other)
-    assert people.rows_of(found) == (16495, 0, 1, 0)
-
-
 @of("30_drone_recording")
 def test_a_drone_recording_with_empty_cells(case, tmp_path):
     """Optional ones are unknown; a row without a place is dropped and counted."""
@@ -163,18 +139,3 @@ def test_a_drone_recording_with_empty_cells(case, tmp_path):
     for track in found.tracks:
         assert np.isfinite(track.speed).all()
         assert np.isfinite(track.heading).all()
-
-
-@of("10_lfs_pointer")
-@pytest.mark.parametrize(
-    ("name", "file"),
-    [
-        ("csv", "log.csv"),
-        ("levelx", "01_tracks.csv"),
-        ("commonroad", "a.xml"),
-        ("waymo", "log.tfrecord"),
-    ],
-)
-def test_git_lfs_pointers(case, name, file):
-    with pytest.raises(InputError, match=r"Git LFS pointer: .* run git lfs pull"):
-        list(read_recordings(name, case / file))

@@ -34,11 +34,11 @@ def shard(folder, *scenarios):
 
 
 def good(name):
-    return waymo.scenario(f5=[f"scenario-{name}"])
+    return waymo.scenario(scenario_id=f"scenario-{name}")
 
 
 # times that go backwards
-BAD = waymo.scenario(f1=[float(x) for x in waymo.STAMPS[::-1]], f5=["scenario-bad"])
+BAD = waymo.scenario(timestamps_seconds=waymo.STAMPS[::-1], scenario_id="scenario-bad")
 
 
 def test_one_scenario_of_a_file_is_left_out(tmp_path):
@@ -61,20 +61,31 @@ def test_one_scenario_of_a_file_is_left_out(tmp_path):
     assert "leave_out" not in plain.import_flags
 
 
-def test_one_too_many_ends_the_import(tmp_path):
-    other = waymo.scenario(f1=[0.0] * waymo.NUM_STEPS, f5=["scenario-worse"])
-    logs = shard(tmp_path / "logs", good("a"), BAD, good("b"), other)
+def test_a_share_is_judged_at_the_end(tmp_path):
+    logs = shard(tmp_path / "logs", good("a"), BAD, good("b"))
+    half = dataclasses.replace(STRICT, leave_out_share=0.5)
+    made = import_parts(logs, tmp_path / "data", half)
+    assert made.quality["refused"] == 1
+    assert made.import_flags["leave_out_share"] == 0.5
+    few = dataclasses.replace(STRICT, leave_out_share=0.3)
     with pytest.raises(
-        InputError, match=r"record 3: .*; recordings left out before: 1"
+        InputError, match=r"1 of 3 recordings refused, .*record 1: .*up to 30 %"
     ):
-        import_parts(logs, tmp_path / "data", LENIENT)
-    assert not (tmp_path / "data").exists()
+        import_parts(logs, tmp_path / "other", few)
+    assert not (tmp_path / "other").exists()
 
 
-def test_without_it_the_first_one_ends_the_import(tmp_path):
-    (strict,) = shard(tmp_path / "logs", good("a"), BAD)
-    with pytest.raises(InputError, match="record 1: "):
-        import_parts([strict], tmp_path / "data", STRICT)
+@pytest.mark.parametrize(
+    ("config", "words"),
+    [(LENIENT, r"record 3: .*; recordings left out before: 1"), (STRICT, "record 1: ")],
+)
+def test_one_too_many_ends_the_import(tmp_path, config, words):
+    other = waymo.scenario(
+        timestamps_seconds=[0.0] * waymo.NUM_STEPS, scenario_id="scenario-worse"
+    )
+    logs = shard(tmp_path / "logs", good("a"), BAD, good("b"), other)
+    with pytest.raises(InputError, match=words):
+        import_parts(logs, tmp_path / "data", config)
     assert not (tmp_path / "data").exists()
 
 
@@ -89,18 +100,6 @@ def test_a_file_that_breaks_off_gives_what_it_has(tmp_path):
     assert made.count == rest.count > 0
     assert made.quality["refused"] == 1
     assert "logs/log01.csv, the rest" in made.recordings
-
-
-def test_it_may_be_asked_for_where_nothing_is_refused(tmp_path):
-    file = tmp_path / "one.toml"
-    file.write_text(
-        '[[recordings]]\nroad = "highway_straight"\ncount = 1\nduration_s = 40.0\n'
-        "density_veh_per_km = 9.0\nseed = 1\n"
-    )
-    found, spec = parts("synthetic", file)
-    logs = [Part(format="synthetic", input=path, spec=spec) for path in found]
-    config = dataclasses.replace(LENIENT, format="synthetic")
-    assert import_parts(logs, tmp_path / "data", config).quality.get("refused", 0) == 0
 
 
 def test_the_command(tmp_path):
@@ -119,6 +118,6 @@ def test_the_command(tmp_path):
     dataset = open_dataset(tmp_path / "data")
     facts = dataset.facts()
     assert facts["data_hash"] == dataset.hash
-    assert facts["made_by"]["flags"]["leave_out"] == 1
+    assert facts["made_by"]["flags"]["leave_out"] == "1"
     assert facts["made_by"]["git_commit"] == git_commit()
     assert [floor["candidates"] > 100 for floor in facts["oracle_floor"]] == [True] * 2

@@ -8,13 +8,11 @@ import shutil
 import numpy as np
 import pytest
 
-from rcirl_jax.data.store import files, manifest
+from rcirl_jax.data.store import manifest
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.shards import describe
 from tests.data.store.test_dataset import SIZES, write
 from tests.helpers.logs import refused
-
-DEEP = 100_000  # levels
 
 
 @pytest.fixture(scope="module")
@@ -78,14 +76,6 @@ def test_damaged_files_are_named(copy, damage):
     open_dataset(copy)
 
 
-def test_missing_and_exchanged_shards_are_named(copy):
-    where = "shards/00001/shard.json: shard 1:"
-    shutil.rmtree(copy / "shards/00001")
-    assert f"{where} missing" in refused(open_dataset, copy)
-    shutil.copytree(copy / "shards/00002", copy / "shards/00001")
-    assert f"{where} sha256" in refused(open_dataset, copy)
-
-
 def test_crc32c_lets_no_wrong_row_through(copy):
     """Damage that is not looked for is found when its rows are read."""
     victim = copy / "shards/00001/human.s/c/0/0"
@@ -104,14 +94,6 @@ def test_crc32c_lets_no_wrong_row_through(copy):
     assert "shards/00002/scene.ego.s: cannot be read" in line
 
 
-def test_an_array_of_another_shape_is_named(copy):
-    folder = copy / "shards/00001"
-    shutil.rmtree(folder / "human.s")
-    shutil.copytree(folder / "decisions", folder / "human.s")
-    line = refused(open_dataset(copy, verify=False).load, None)
-    assert re.search(r"human.s: shard 1: int32 .*expected float32", line)
-
-
 @pytest.mark.parametrize("rows", [(40_000_000, 256), (40_000_000, 40_000_000)])
 def test_an_array_in_other_chunks_is_named(copy, rows):
     """The blocks of a store are unpacked whole: a huge one would fill the memory."""
@@ -124,9 +106,6 @@ def test_an_array_in_other_chunks_is_named(copy, rows):
     path.write_text(json.dumps(meta))
     line = refused(open_dataset(copy, verify=False).indices, "train")
     assert re.search(r"human.s: shard 1: chunks .*expected \(\(40", line)
-
-
-# ------------------------------------------------------------- with right digests
 
 
 def reseal(folder, change_shard=None, change=None):
@@ -142,17 +121,6 @@ def reseal(folder, change_shard=None, change=None):
     if change:
         change(whole)
     top.write_bytes(manifest.seal(whole, "hash"))
-
-
-def test_a_shard_without_rows_is_one_line(copy):
-    for path in (copy / "shards/00001").glob("*/zarr.json"):
-        meta = json.loads(path.read_text())
-        meta["shape"][0] = 0
-        path.write_text(json.dumps(meta))
-    reseal(copy, change=lambda m: m["shards"][1].update(count=0))
-    reseal(copy, change=lambda m: m.update(count=sum(SIZES) - SIZES[1]))
-    dataset = open_dataset(copy, verify=False)
-    assert re.search(r"shard 1: chunks .*expected", refused(dataset._arrays, 1))
 
 
 ROWS = "vehicle/c/0"
@@ -188,11 +156,6 @@ BAD_SHARDS = [
     # an array of a billion rows is not made of a small file
     (lambda s: s.update(count=10**9), "bytes: expected 62500004 at least for 10"),
     (lambda s: s.pop("lineage"), "lineage: missing: expected"),
-    (lambda s: s.update(extra=1), "extra: unknown: expected"),
-    (lambda s: s.update(files=[]), "files: .*: expected an object"),
-    (entry("x", 3), "files: x: 3: expected an object"),
-    (entry("x", {}), "files: x: bytes: missing: expected"),
-    (lambda s: s.update(lineage=[{}]), r"lineage: \[0\]\.name: missing"),
 ]
 
 
@@ -206,27 +169,18 @@ def test_shards_that_are_none(small, change, words):
 GROUPS, FLOAT32 = "splits: .*expected every group", ".*float64.*expected .*float32"
 BAD_MANIFESTS = [
     (lambda m: m.update(schema_version=1), "schema_version: 1: expected 2"),
-    (lambda m: m.pop("schema_version"), "schema_version: None: expected 2"),
     (lambda m: m.pop("quality"), "quality: missing: expected"),
     (lambda m: m["arrays"].pop("human.s"), "arrays: human.s: None: expected"),
     (lambda m: m["arrays"]["human.s"].update(dtype="float64"), FLOAT32),
     (lambda m: m["time_grid_s"].pop(), "time_grid_s"),
     (lambda m: m["shards"][0].update(count=3), "shard 0: float32 .*expected"),
     (lambda m: m.update(count=-1), "count: -1: expected a whole number >= 0"),
-    (lambda m: m.update(count=True), "count: True: expected a whole number"),
     (lambda m: m.update(count=1), "count: 1: expected 2, the sum of its shards"),
     (lambda m: m.update(count=10**15), "count: 10{15}: expected a whole number <="),
     (lambda m: m.update(count=2**31 + 1), "count: .*: expected a whole num"),
-    (lambda m: m.update(arrays=3), "arrays: 3: expected an object"),
-    (lambda m: m.update(shards={}), "shards: {}: expected a list"),
-    (lambda m: m["shards"].append(3), r"shards\[1\]: 3: expected an object"),
-    (lambda m: m.update(splits=[]), r"splits: \[\]: expected an object"),
-    (lambda m: m.update(groups=[1]), r"groups\[0\]: 1: expected a text"),
     (lambda m: m["splits"].popitem(), GROUPS),
     (lambda m: m["splits"].update(a=["g0"]), GROUPS),
     (lambda m: m["splits"].update(a=["odd"]), GROUPS),
-    (lambda m: m.update(rate_hz="10"), "rate_hz: 10: expected a list"),
-    (lambda m: m.update(sources=[""]), r"sources\[0\]: : expected an object"),
     (lambda m: m["sources"].append({"\udfff": 1}), "not JSON"),
 ]
 
@@ -237,34 +191,11 @@ def test_manifests_that_are_none(small, change, words):
     assert re.search(words, refused(open_dataset, small))
 
 
-# which json.loads takes from bytes
-SURROGATE = b'"groups%b"' % "\ud800".encode(errors="surrogatepass")
-BAD_TEXTS = [
-    *[(rb"^.*$", text, "") for text in (b"", b"[]", b"null", b"{")],
-    (rb"^.*$", b'{"schema_version": NaN}', ""),
-    (rb"^.*$", b"[" * DEEP + b"]" * DEEP, "not JSON"),
-    (rb'"groups"', SURROGATE, "not JSON"),
-    (rb'"count": \d+,', b'"count": 1e999,', "1e999 is no finite number"),
-]
-
-
-@pytest.mark.parametrize(("pattern", "text", "words"), BAD_TEXTS)
-def test_manifests_of_texts_that_are_none(small, pattern, text, words):
-    file = small / "manifest.json"
-    file.write_bytes(re.sub(pattern, text, file.read_bytes(), count=1, flags=re.DOTALL))
-    line = refused(open_dataset, small)
-    assert "manifest.json: " in line
-    assert words in line
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [("[" * 10**5, "JSON"), ('{"made_by": "\\ud800"}', "JSON"), ("[1]", "an object")],
-)
-def test_facts_that_are_none(small, text, words):
-    (small / files.FACTS).write_text(text)
-    line = refused(open_dataset(small).facts)
-    assert re.search(rf"made_by\.json: .*expected {words}", line)
+def test_a_fifo_in_a_dataset_is_not_waited_for(small):
+    file = small / "shards/00000/human.s/c/0/0"
+    file.unlink()
+    os.mkfifo(file)
+    assert "human.s/c/0/0: expected a file" in refused(open_dataset, small)
 
 
 HUGE = [
@@ -281,14 +212,3 @@ def test_a_terabyte_in_a_dataset_is_not_read(small, name, words):
     line = refused(lambda: open_dataset(small).facts())
     assert re.search(rf"{name}: .*{2**40} bytes", line)
     assert words in line
-
-
-def test_a_link_out_of_a_dataset_is_read_as_what_it_shows(small, tmp_path):
-    file = small / "shards/00000/human.s/c/0/0"
-    (tmp_path / "secret").write_text("x")
-    file.unlink()
-    file.symlink_to(tmp_path / "secret")
-    assert "human.s/c/0/0: shard 0: 1 bytes" in refused(open_dataset, small)
-    file.unlink()
-    os.mkfifo(file)  # which would be waited for
-    assert "human.s/c/0/0: expected a file" in refused(open_dataset, small)

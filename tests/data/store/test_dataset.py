@@ -1,13 +1,8 @@
 import contextlib
-import gc
 import hashlib
 import json
-import os
-import re
 import shutil
-import sys
 import tarfile
-import tracemalloc
 from pathlib import Path
 
 import jax
@@ -19,9 +14,8 @@ from hypothesis import strategies as st
 
 from rcirl_jax.data.store import files
 from rcirl_jax.data.store.dataset import open_dataset
-from rcirl_jax.data.store.rows import leaf_specs, row_spec
+from rcirl_jax.data.store.rows import row_spec
 from rcirl_jax.data.store.writer import DatasetWriter
-from tests.helpers import scenes
 from tests.helpers.logs import refused
 
 GOLDEN = Path(__file__).parent / "golden"
@@ -114,85 +108,32 @@ def test_facts_stand_beside_the_manifest(copy):
     assert again.hash == dataset.hash
 
 
-def test_round_trip_is_bit_identical(made):
-    dataset = open_dataset(made)
-    assert dataset.count == sum(SIZES)
-    assert_same(dataset.load(None), joined())
-
-
-def test_real_scenes_fit_the_row_layout(tmp_path):
-    rows = jax.tree.map(lambda *x: np.stack(x), *map(scenes.demonstration, range(3)))
-    writer = DatasetWriter(tmp_path)
-    writer.write_shard(0, rows, [])
-    writer.finish(finish_fields())
-    assert_same(open_dataset(tmp_path).load(None), rows)
-
-
-@given(
-    asked=st.lists(st.integers(0, sum(SIZES) - 1), max_size=60), verify=st.booleans()
-)
-def test_read_gives_rows_in_the_order_asked(made, asked, verify):
-    rows = np.array(asked, np.int64)
-    found = open_dataset(made, verify=verify).read(rows)
-    assert_same(found, jax.tree.map(lambda leaf: leaf[rows], joined()))
-
-
-@pytest.mark.parametrize("rows", [[-1], [sum(SIZES)], [[0]]])
-def test_read_refuses_rows_that_do_not_exist(made, rows):
-    with pytest.raises(IndexError, match="expected a list of numbers below"):
-        open_dataset(made, verify=False).read(np.array(rows))
-
-
-def test_splits_follow_the_groups(made):
-    dataset = open_dataset(made)
-    whole = joined()
+def test_rows_splits_and_manifest_are_those_written(made):
+    """To the bit; digests are those of the bytes, and the splits follow the groups."""
+    dataset, whole = open_dataset(made), joined()
+    assert_same(dataset.load(None), whole)
     for split, wanted in (("train", [0, 2, 3]), ("test", [1])):
-        expected = [i for i, group in enumerate(whole.group) if group in wanted]
-        assert dataset.indices(split).tolist() == expected
-        assert_same(
-            dataset.load(split),
-            jax.tree.map(lambda leaf, at=expected: leaf[at], whole),
-        )
-    assert dataset.indices(None).tolist() == list(range(sum(SIZES)))
+        expected = np.flatnonzero(np.isin(whole.group, wanted))
+        assert dataset.indices(split).tolist() == expected.tolist()
+        part = jax.tree.map(lambda leaf, at=expected: leaf[at], whole)
+        assert_same(dataset.load(split), part)
     assert "splits: val: expected test, train" in refused(dataset.indices, "val")
-
-
-def test_manifest_says_what_the_dataset_is(made):
     raw = json.loads((made / "manifest.json").read_text())
     stated = raw.pop("hash")
     plain = json.dumps(raw, sort_keys=True, separators=(",", ":")).encode()
-    manifest = open_dataset(made).manifest
+    manifest = dataset.manifest
     assert manifest.hash == stated == hashlib.sha256(plain).hexdigest()
-    assert manifest.count == sum(SIZES)
-    assert [shard["count"] for shard in manifest.shards] == list(SIZES)
-    valid = {"shape": [16, 18], "dtype": "bool"}
-    assert manifest.arrays["scene.obstacles.valid"] == valid
     given = finish_fields()
     assert manifest.import_flags == given.pop("import")
     assert {name: getattr(manifest, name) for name in given} == given
-    for number in range(len(SIZES)):
+    for number, shard in enumerate(manifest.shards):
         folder = made / f"shards/{number:05d}"
         mark = json.loads((folder / "shard.json").read_text())
-        assert mark["lineage"] == lineage(number)
-        assert mark["sha256"] == manifest.shards[number]["sha256"]
-        made_of = {f"recording {number}": "0" * 64}
-        assert manifest.shards[number]["recordings"] == made_of
-        files = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
-        assert files == {*mark["files"], "shard.json"}
+        assert (shard["count"], mark["lineage"]) == (SIZES[number], lineage(number))
+        assert mark["sha256"] == shard["sha256"]
         for name, stated in mark["files"].items():
             data = (folder / name).read_bytes()
             assert stated["sha256"] == hashlib.sha256(data).hexdigest()
-
-
-def test_same_scenes_give_the_same_bytes(made, tmp_path):
-    """zstd and crc32c in blocks of rows."""
-    write(tmp_path / "again")
-    assert every_byte(tmp_path / "again") == every_byte(made)
-    metadata = json.loads((made / "shards/00000/scene.path.l/zarr.json").read_text())
-    (codec,) = metadata["codecs"]
-    names = [inner["name"] for inner in codec["configuration"]["codecs"]]
-    assert (codec["name"], names) == ("sharding_indexed", ["bytes", "zstd", "crc32c"])
-    assert codec["configuration"]["chunk_shape"][0] < SIZES[0]
 
 
 @pytest.mark.parametrize("scheme", ["memory", "file"])
@@ -205,7 +146,16 @@ def test_urls(scheme, tmp_path):
     assert "finished dataset" in refused(DatasetWriter, url)
 
 
-# ------------------------------------------------------------------ not finished
+@given(
+    asked=st.lists(st.integers(0, sum(SIZES) - 1), max_size=60), verify=st.booleans()
+)
+def test_read_gives_rows_in_the_order_asked(made, asked, verify):
+    rows = np.array(asked, np.int64)
+    dataset = open_dataset(made, verify=verify)
+    assert_same(dataset.read(rows), jax.tree.map(lambda leaf: leaf[rows], joined()))
+    for bad in ([-1], [sum(SIZES)], [[0]]):
+        with pytest.raises(IndexError, match="expected a list of numbers below"):
+            dataset.read(np.array(bad))
 
 
 def test_a_dataset_of_an_old_version_says_to_import_again(tmp_path):
@@ -228,9 +178,6 @@ def test_no_dataset_and_interrupted_import_are_told_apart(copy, tmp_path):
     ):
         assert words in refused(open_dataset, place)
     assert not (tmp_path / "nowhere").exists()
-
-
-# --------------------------------------------------------------------- writer
 
 
 class Interrupted(BaseException):
@@ -257,8 +204,7 @@ FILES = 2 * len(jax.tree.leaves(row_spec())) + 1
 
 
 @pytest.mark.parametrize(
-    "writes",
-    [0, 1, FILES - 1, FILES, FILES + 9, 3 * FILES - 1, 3 * FILES],
+    "writes", [0, 1, FILES - 1, FILES, FILES + 9, 3 * FILES - 1, 3 * FILES]
 )
 def test_interrupted_import_resumes_to_the_same_bytes(
     made, tmp_path, monkeypatch, writes
@@ -288,30 +234,6 @@ def test_resuming_stops_at_the_first_damaged_shard(made, copy):
     assert every_byte(copy) == every_byte(made)
 
 
-def test_lineages_of_written_shards_are_not_kept(tmp_path):
-    """A long log has one of 94 kB a minute; what is kept is a digest of each name."""
-    writer = DatasetWriter(tmp_path)
-    writer.write_shard(0, make_rows(1), lineage(0))  # once: caches fill
-    tracemalloc.start()
-    vehicles = [f"vehicle {i}" for i in range(100_000)]  # 6.5 MB
-    writer.write_shard(1, make_rows(1), [{**lineage(1)[0], "vehicles": vehicles}])
-    del vehicles
-    kept, _ = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert kept < 1e6
-    assert len(writer.committed()[1].lineage[0]["vehicles"]) == 100_000
-
-
-def test_a_shorter_import_leaves_no_old_shards(copy):
-    (copy / "manifest.json").unlink()
-    (copy / "shards/00001/shard.json").unlink()
-    writer = DatasetWriter(copy)
-    assert len(writer.committed()) == 1
-    writer.finish(finish_fields())
-    assert sorted(path.name for path in (copy / "shards").iterdir()) == ["00000"]
-    assert open_dataset(copy).count == SIZES[0]
-
-
 @pytest.mark.parametrize("existed", [False, True])
 @pytest.mark.parametrize("writes", [1, 5, 30, FILES + 1, 2 * FILES])
 def test_abort_leaves_nothing(tmp_path, monkeypatch, existed, writes):
@@ -329,21 +251,6 @@ def test_abort_leaves_nothing(tmp_path, monkeypatch, existed, writes):
     writer.abort()
     left = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*"))
     assert left == (["deep", "deep/dataset"] if existed else [])
-
-
-def test_abort_keeps_what_it_resumed_from_and_what_is_finished(copy):
-    (copy / "manifest.json").unlink()
-    shutil.rmtree(copy / "shards/00002")
-    (copy / "notes.txt").write_text("mine")
-    before = every_byte(copy)
-    writer = DatasetWriter(copy)
-    writer.write_shard(2, make_rows(5), [])
-    writer.abort()
-    assert every_byte(copy) == before
-    writer = DatasetWriter(copy)
-    write(copy, start=2, writer=writer)
-    writer.abort()
-    assert open_dataset(copy).count == sum(SIZES)
 
 
 def test_overwriting(made, copy):
@@ -368,16 +275,6 @@ def test_folders_with_other_files_are_refused(tmp_path, overwrite, name):
     line = refused(DatasetWriter, tmp_path, overwrite=overwrite)
     assert f"holds {name}, not a dataset" in line
     assert path.read_text() == "precious"
-
-
-def test_places_that_are_none(tmp_path):
-    (tmp_path / "file").write_text("hello")
-    assert "file" in refused(DatasetWriter, tmp_path / "file")
-    assert "file" in refused(write, tmp_path / "file" / "below", (2,))
-    (tmp_path / os.fsdecode(b"caf\xe9.txt")).touch()
-    for use in (open_dataset, DatasetWriter):
-        line = refused(use, tmp_path)
-        assert re.search(rf"^{tmp_path}: holds b'caf.*expected names", line)
 
 
 def test_a_full_disk_keeps_the_shards_before(tmp_path, monkeypatch):
@@ -407,53 +304,33 @@ def test_a_vehicle_in_two_splits_is_refused(tmp_path):
     assert "interrupted" in refused(open_dataset, tmp_path)
 
 
-def test_wrong_calls(tmp_path):
-    rows = make_rows(6)
-    writer = DatasetWriter(tmp_path)
-    with pytest.raises(ValueError, match="0 shards"):
-        writer.finish(finish_fields())
-    with pytest.raises(ValueError, match="shard 1: expected 0 next"):
-        writer.write_shard(1, rows, [])
-    with pytest.raises(ValueError, match="0 rows"):
-        writer.write_shard(0, make_rows(0), [])
-    with pytest.raises(ValueError, match=r"frame: int64 \(6,\): expected int32"):
-        writer.write_shard(0, rows.replace(frame=rows.frame.astype(np.int64)), [])
-    with pytest.raises(ValueError, match=r"decisions: int32 \(6, 15\)"):
-        writer.write_shard(0, rows.replace(decisions=rows.decisions[:, 1:]), [])
+@pytest.mark.parametrize(
+    ("index", "change", "words"),
+    [
+        (1, lambda rows: rows, "shard 1: expected 0 next"),
+        (0, lambda rows: jax.tree.map(lambda x: x[:0], rows), "0 rows"),
+        (0, lambda rows: rows.replace(frame=rows.frame.astype(np.int64)),
+         r"frame: int64 \(6,\): expected int32"),
+        (0, lambda rows: rows.replace(decisions=rows.decisions[:, 1:]),
+         r"decisions: int32 \(6, 15\)"),
+    ],
+)  # fmt: skip
+def test_wrong_shards(tmp_path, index, change, words):
+    with pytest.raises(ValueError, match=words):
+        DatasetWriter(tmp_path).write_shard(index, change(make_rows(6)), [])
     assert list(tmp_path.iterdir()) == []
-    writer.write_shard(0, rows, [])
-    for changes, words in (
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
         ({"extra": 1}, "extra"),
         ({"vehicles": ["v0"]}, r"vehicle: \d+ to \d+: 1 names"),
         ({"splits": {"train": ["g0"], "test": ["g1"]}}, "every group exactly once"),
-    ):
-        with pytest.raises(ValueError, match=words):
-            writer.finish(finish_fields(**changes))
-
-
-def test_what_cannot_be_deleted_is_one_line(tmp_path, monkeypatch):
-    place = files.Files(str(tmp_path / "d"))
-
-    class Stuck:
-        def delete_range(self, _):
-            raise ValueError("PERMISSION_DENIED: no [source locations='here']")
-
-    monkeypatch.setattr(place, "kv", Stuck())
-    with pytest.raises(
-        OSError, match=r"d/shards: cannot be deleted: PERMISSION_DENIED: no$"
-    ):
-        place.remove("shards", "shardt")
-
-
-def test_opening_again_and_again_keeps_nothing(tmp_path):
-    """A training over many shards opens their arrays thousands of times."""
-    write(tmp_path / "d")
-    open_dataset(tmp_path / "d")
-    gc.collect()
-    before = sys.getallocatedblocks()
-    for _ in range(10):
-        open_dataset(tmp_path / "d")
-    gc.collect()
-    assert (sys.getallocatedblocks() - before) / 10 < len(
-        leaf_specs()
-    )  # 12 an array before
+    ],
+)
+def test_wrong_ends(tmp_path, changes, words):
+    writer = DatasetWriter(tmp_path)
+    writer.write_shard(0, make_rows(6), [])
+    with pytest.raises(ValueError, match=words):
+        writer.finish(finish_fields(**changes))

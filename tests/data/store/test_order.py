@@ -1,5 +1,3 @@
-import json
-
 import jax
 import numpy as np
 import pytest
@@ -48,34 +46,6 @@ def test_order_depends_on_epoch_and_seed():
     assert first != second
     assert order(0, 2) == [first, second]
     assert order(1, 1) != [first]
-
-
-@given(count=st.integers(1, 20), size=st.integers(1, 8), cut=st.integers(0, 30))
-def test_restored_iterator_continues_to_the_bit(count, size, cut):
-    rows = make_rows(count)
-    batches = BatchIterator(rows, batch_size=size, seed=4)
-    take(batches, cut)
-    state = json.loads(json.dumps(batches.state()))
-    resumed = BatchIterator(rows, batch_size=size, seed=4)
-    resumed.restore(state)
-    assert equal(take(resumed, 7), take(batches, 7))
-    assert resumed.state() == batches.state()
-
-
-@pytest.mark.parametrize("processes", [2, 4])
-def test_processes_share_the_same_global_batches(processes):
-    rows = make_rows(21)
-    whole = BatchIterator(rows, batch_size=8, seed=2)
-    parts = [
-        BatchIterator(rows, batch_size=8, seed=2, shard_index=i, num_shards=processes)
-        for i in range(processes)
-    ]
-    for _ in range(7):
-        batch, weight, index = next(whole)
-        pieces = [next(part) for part in parts]
-        joined = jax.tree.map(lambda *x: np.concatenate(x), *pieces)
-        assert equal(joined, (batch, weight, index))
-    assert all(part.state() == whole.state() for part in parts)
 
 
 @pytest.mark.parametrize(

@@ -121,19 +121,6 @@ def test_streams_restart_anywhere_to_the_bit(dataset, cut):
         assert equal(take(resumed, 5), take(batches, 5))
 
 
-def test_the_next_epoch_is_planned_while_this_one_is_used(dataset, monkeypatch):
-    planned = []
-
-    def watched(seed, epoch, blocks):
-        planned.append((epoch, threading.current_thread() is threading.main_thread()))
-        return epoch_order(seed, epoch, blocks)
-
-    monkeypatch.setattr(pipeline, "epoch_order", watched)
-    batches = BatchIterator(dataset, batch_size=16, seed=4)
-    take(batches, 2 * batches.batches_per_epoch + 1)
-    assert planned == [(0, True), (1, False), (2, False)]
-
-
 def test_a_process_reads_its_own_rows_once_an_epoch(dataset, narrow):
     read = []
     for part in range(2):

@@ -8,23 +8,26 @@ import numpy as np
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation import (
-    Difference,
+from rcirl_jax.evaluation.ranking.evaluate import Ranked, pooled
+from rcirl_jax.evaluation.ranking.format import format_table, markdown_table
+from rcirl_jax.evaluation.ranking.metrics import (
+    METRICS,
     Outcomes,
-    build_report,
     fit_temperature,
-    format_table,
     oracle_scorer,
     random_scorer,
     scene_metrics,
-    to_json,
 )
-from rcirl_jax.evaluation.ranking.evaluate import Ranked, pooled
-from rcirl_jax.evaluation.ranking.format import markdown_table
-from rcirl_jax.evaluation.ranking.metrics import METRICS
-from rcirl_jax.evaluation.ranking.table import RIVALS, from_json, verdict
+from rcirl_jax.evaluation.ranking.table import (
+    RIVALS,
+    build_report,
+    from_json,
+    to_json,
+    verdict,
+)
 from rcirl_jax.evaluation.statistics import (
     ClusterBootstrap,
+    Difference,
     combine_seeds,
     paired_difference,
 )

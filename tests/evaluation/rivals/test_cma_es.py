@@ -12,11 +12,12 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.score import candidates_key
 from rcirl_jax.evaluation.rivals.cma_es import tune
 from rcirl_jax.evaluation.rivals.objectives import (
+    HAND_SET,
     Problem,
-    RankedScenes,
+    ValuedScenes,
     learner_budget,
     mean_fde,
-    ranked_scenes,
+    valued_scenes,
 )
 from rcirl_jax.reward import (
     TUNABLE,
@@ -123,7 +124,7 @@ def some_rows():
 
 
 def ranked(rows):
-    return ranked_scenes(rows, INDEX, SMALL, 8.0)
+    return valued_scenes(HAND_SET, rows, INDEX, SMALL, 8.0)
 
 
 def costs(terms, weights):
@@ -135,7 +136,7 @@ def test_zeros_are_apollos_weights_exactly():
     weights = tuned(jnp.zeros(D))
     for name, value in LatticeCost().fields().items():
         assert float(getattr(weights, name)) == float(value)
-    terms = ranked(some_rows()[0]).terms
+    terms = ranked(some_rows()[0]).known
     for same in (weights, LatticeCost(**LatticeCost().fields())):
         expected = costs(terms, LatticeCost())
         np.testing.assert_array_equal(costs(terms, same), expected)
@@ -164,7 +165,7 @@ def driven_by_the_hidden_cost():
     """Demonstrations whose human is the candidate that a hidden cost chooses."""
     rows, candidates = some_rows()
     scenes, weights = ranked(rows), tuned(jnp.asarray(HIDDEN, jnp.float32))
-    cost = costs(scenes.terms, weights)
+    cost = costs(scenes.known, weights)
     best = np.argmin(np.where(scenes.feasible, cost, np.inf), axis=1)
     human = jax.tree.map(lambda x: np.asarray(x)[INDEX, best], candidates.trajectory)
     return rows.replace(human=human)
@@ -173,10 +174,10 @@ def driven_by_the_hidden_cost():
 def test_the_search_comes_close_to_a_hidden_cost_by_what_the_report_measures():
     rows = driven_by_the_hidden_cost()
     scenes, cost = ranked(rows), tuned(jnp.asarray(HIDDEN, jnp.float32))
-    default, hidden = mean_fde(scenes, np.stack([np.zeros(D), HIDDEN]))
+    default, hidden = mean_fde(HAND_SET, scenes, np.stack([np.zeros(D), HIDDEN]))
     assert default > 10.0
     assert hidden < 0.05  # near ties
-    _, found = tune(lambda x: mean_fde(scenes, x), np.zeros(D), 1.0, 400, 0)
+    _, found = tune(lambda x: mean_fde(HAND_SET, scenes, x), np.zeros(D), 1.0, 400, 0)
     assert found < 0.2 * default
     scored = scored_rivals(rows, SMALL, {TUNED_ROW: cost, "again": LatticeCost()})
     np.testing.assert_allclose(
@@ -197,12 +198,12 @@ def random_ranked(scenes, candidates, seed=0):
     collides = jnp.asarray(rng.uniform(size=shape) < 0.1)
     terms = LatticeTerms(**terms, approach=approach, collides=collides)
     feasible = jnp.asarray(rng.uniform(size=shape) < 0.7).at[0].set(False)
-    return RankedScenes(terms=terms, fde=draw(), feasible=feasible)
+    return ValuedScenes(known=terms, fde=draw(), feasible=feasible)
 
 
 def slowly(scenes, vector):
     """Mean FDE in float64 numpy."""
-    t = {k: np.asarray(x, np.float64) for k, x in scenes.terms._asdict().items()}
+    t = {k: np.asarray(x, np.float64) for k, x in scenes.known._asdict().items()}
     weights = tuned(jnp.asarray(vector, jnp.float32)).fields()
     w = {name: float(x) for name, x in weights.items()}
     reference = np.minimum(w["speed_share"] * t["limit"], t["approach"])
@@ -220,8 +221,9 @@ def test_mean_fde_against_numpy_in_any_company():
     """More sums in one program than jaxlib 0.10.2 gets right at once on a CPU."""
     scenes = random_ranked(600, 70)
     vectors = np.random.default_rng(1).normal(size=(11, D))
-    together = mean_fde(scenes, vectors)
+    of = functools.partial(mean_fde, HAND_SET, scenes)
+    together = of(vectors)
     expected = [slowly(scenes, x) for x in vectors]
     np.testing.assert_allclose(together, expected, atol=0.02)  # near ties
-    np.testing.assert_array_equal(together[::-1], mean_fde(scenes, vectors[::-1]))
-    np.testing.assert_array_equal(together[3:4], mean_fde(scenes, vectors[3:4]))
+    np.testing.assert_array_equal(together[::-1], of(vectors[::-1]))
+    np.testing.assert_array_equal(together[3:4], of(vectors[3:4]))

@@ -9,13 +9,14 @@ import pytest
 
 from rcirl_jax.evaluation.ranking.score import candidates_key, measure_scenes
 from rcirl_jax.evaluation.rivals.cma_es import tune
-from rcirl_jax.evaluation.rivals.tuned import (
+from rcirl_jax.evaluation.rivals.objectives import (
+    DRIVER,
     TUNABLE_IDM,
-    as_numbers,
-    driven_scenes,
     idm_of,
-    mean_driven_fde,
+    mean_fde,
+    valued_scenes,
 )
+from rcirl_jax.evaluation.rivals.tuned import as_numbers
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm, closeness, idm_trajectory
 from rcirl_jax.reward import LatticeCost
 from rcirl_jax.sampling import SamplerConfig
@@ -33,14 +34,15 @@ HIDDEN = np.array([0.5, 0.3, -0.8, -0.5, -0.4])
 def driven_by_a_hidden_driver():
     """Demonstrations of 8 s whose human is the candidate nearest to a hidden driver."""
     rows = long_rows(SCENES)
-    scenes = driven_scenes(rows, INDEX, SMALL, 8.0)
+    scenes = valued_scenes(DRIVER, rows, INDEX, SMALL, 8.0)
     driver = idm_of(jnp.asarray(HIDDEN, jnp.float32))
 
     def nearest(one):
-        way = idm_trajectory(one.scene, True, driver)
-        near = jax.vmap(lambda x: closeness(x, way, one.mask))(one.everyone)
+        scene, everyone, mask = one.known
+        way = idm_trajectory(scene, True, driver)
+        near = jax.vmap(lambda x: closeness(x, way, mask))(everyone)
         best = jnp.argmax(jnp.where(one.feasible, near, -jnp.inf))
-        return jax.tree.map(lambda x: x[best], one.everyone)
+        return jax.tree.map(lambda x: x[best], everyone)
 
     human = jax.tree.map(np.asarray, jax.jit(jax.vmap(nearest))(scenes))
     return rows.replace(human=human)
@@ -69,21 +71,21 @@ def test_the_search_comes_close_to_a_hidden_driver_by_what_the_report_measures()
         scored.values["cost"], scored.values["hand-set"], rtol=1e-5, atol=1e-3
     )
     found = [mean_chosen_fde(scored, name) for name in ("IDM", TUNED_IDM_ROW)]
-    scenes = driven_scenes(rows, INDEX, SMALL, 8.0)
+    scenes = valued_scenes(DRIVER, rows, INDEX, SMALL, 8.0)
     both = np.stack([np.zeros(len(TUNABLE_IDM)), HIDDEN])
-    usual, hidden = mean_driven_fde(scenes, both, True)
+    usual, hidden = mean_fde(DRIVER, scenes, both)
     np.testing.assert_allclose(found, [usual, hidden], atol=0.05)
     assert hidden < 0.05
-    _, best = tune(lambda x: mean_driven_fde(scenes, x, True), both[0], 1.0, 200, 0)
+    _, best = tune(lambda x: mean_fde(DRIVER, scenes, x), both[0], 1.0, 200, 0)
     assert best < 0.5 * usual
 
 
 def test_candidates_are_those_of_the_evaluation():
     rows = driven_by_a_hidden_driver()
-    scenes = driven_scenes(rows, INDEX, SMALL, 8.0)
+    scenes = valued_scenes(DRIVER, rows, INDEX, SMALL, 8.0)
     one = jax.tree.map(lambda x: jnp.asarray(x[3]), rows.scene)
     expected = sampled(candidates_key(jnp.asarray(3)), one, SMALL).trajectory
-    np.testing.assert_allclose(scenes.everyone.s[3], expected.s, atol=1e-3)
+    np.testing.assert_allclose(scenes.known[1].s[3], expected.s, atol=1e-3)
 
 
 def test_distances_alone_are_those_of_the_scores():

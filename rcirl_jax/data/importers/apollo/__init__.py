@@ -1,4 +1,4 @@
-"""Apollo cyber records: `records` is the file, `messages` and `obstacles` its content.
+"""Apollo cyber records: `records` is the file, `messages` its content.
 
 `descriptors` tells how messages are read. A new channel or message field is read in
 `messages`; `reader` makes recordings of it.

@@ -2,9 +2,10 @@
 
 Fields are looked up by name, so that records of every release read alike. What is not
 wanted is not parsed. Fields that a release lacks, and those that a message does not
-set, are NaN or 0.
+set, are NaN, 0 or UNSET.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
@@ -12,9 +13,10 @@ from typing import Any, NamedTuple
 from google.protobuf import descriptor_pb2 as pb
 from google.protobuf.message import DecodeError
 
-from rcirl_jax.data.readers.protobuf import Field, Message, parser
+from rcirl_jax.data.readers.protobuf import Field, Message, parser, table_of
 
 ENUM = "enum"  # a field that is wanted as the number of an enum's value
+UNSET = -1  # that number where the message does not set it
 # field -> its default for a number, ENUM, a dict for a message, a list of one dict for
 # repeated ones
 Wanted = Mapping[str, Any]
@@ -29,14 +31,8 @@ LACKING = 2**29 - 1  # the highest number of a field, for one that a release lac
 NOTHING = ""  # type of such a field
 NO_NUMBERS = ("string", "bytes", "message", "group", "enum")
 
-_read_proto_desc = parser(
-    {
-        "ProtoDesc": {
-            "desc": Field("bytes", 1),
-            "dependencies": Field("ProtoDesc", 2, repeated=True),
-        }
-    }
-)
+PROTO_DESC = "ProtoDesc: desc 1 bytes, dependencies 2 ProtoDesc*"
+_read_proto_desc = parser(table_of(PROTO_DESC))
 
 
 class Reading(NamedTuple):
@@ -72,42 +68,35 @@ def reading_of(message: str, proto_desc: bytes, wanted: Wanted) -> Reading:
 def _contents(found: Message) -> Iterator[bytes]:
     """The FileDescriptorProto of a ProtoDesc and of those that it depends on."""
     yield found.desc
-    for other in found.dependencies:
-        yield from _contents(other)
+    yield from itertools.chain.from_iterable(map(_contents, found.dependencies))
 
 
 class _Types:
-    """Message types by full name, and the tables of those that are wanted."""
+    """Types by full name, and the tables of the messages that are wanted."""
 
     def __init__(self) -> None:
         self.tables: dict[str, dict[str, Field]] = {}
         self.names: dict[str, dict[int, str]] = {}
-        self._messages = {NOTHING: pb.DescriptorProto()}
-        self._enums = {NOTHING: pb.EnumDescriptorProto()}
+        self._known: dict[str, Any] = {NOTHING: pb.DescriptorProto()}
 
-    def add(
-        self,
-        scope: str,
-        messages: Iterable[pb.DescriptorProto],
-        enums: Iterable[pb.EnumDescriptorProto],
-    ) -> None:
+    def add(self, scope: str, messages: Iterable, enums: Iterable) -> None:
         """Types of a file or of a message, and those nested in them."""
-        for enum in enums:
-            self._enums[f"{scope}.{enum.name}".lstrip(".")] = enum
-        for message in messages:
-            name = f"{scope}.{message.name}".lstrip(".")
-            self._messages[name] = message
-            self.add(name, message.nested_type, message.enum_type)
-        if len(self._messages) + len(self._enums) > MAX_TYPES:
+        for found in (*enums, *messages):
+            name = f"{scope}.{found.name}".lstrip(".")
+            self._known[name] = found
+            if isinstance(found, pb.DescriptorProto):
+                self.add(name, found.nested_type, found.enum_type)
+        if len(self._known) > MAX_TYPES:
             raise DecodeError(f"descriptors: more than {MAX_TYPES} types")
 
     def want(self, message: str, wanted: Wanted) -> str:
         """Make the table of a message type; its name in the tables."""
-        if message not in self._messages:
+        found = self._known.get(message)
+        if not isinstance(found, pb.DescriptorProto):
             raise DecodeError(f"message type {message}: not among the descriptors")
         own = f"Message{len(self.tables)}"
         table = self.tables[own] = {}
-        known = {field.name: field for field in self._messages[message].field}
+        known = {field.name: field for field in found.field}
         for place, (name, want) in enumerate(wanted.items()):
             if message != NOTHING and name in NEEDED and name not in known:
                 raise DecodeError(f"field {name}: not among the descriptors")
@@ -125,9 +114,9 @@ class _Types:
             inner = want[0] if isinstance(want, list) else want
             return Field(self.want(below, inner), field.number, repeated)
         if want == ENUM:
-            values = self._enums.get(below, self._enums[NOTHING]).value
+            values = getattr(self._known.get(below), "value", ())
             self.names[str(field.name)] = {value.number: value.name for value in values}
-            return Field("int32", field.number)
+            return Field("int32", field.number, default=str(UNSET))
         is_real = kind in ("double", "float")
         default = "nan" if is_real and math.isnan(want) else ""
         return Field(kind, field.number, default=default)
@@ -142,11 +131,8 @@ def _fits(want: Any, kind: str) -> bool:  # noqa: ANN401 - see Wanted
 def _lacking(name: str, number: int, want: Any) -> pb.FieldDescriptorProto:  # noqa: ANN401 - see Wanted
     """A field as wanted, with a number that no message has."""
     field = pb.FieldDescriptorProto(name=name, number=number, type_name=NOTHING)
-    field.label = (
-        field.LABEL_REPEATED if isinstance(want, list) else field.LABEL_OPTIONAL
-    )
-    if isinstance(want, dict | list):
-        field.type = field.TYPE_MESSAGE
-    else:
-        field.type = field.TYPE_ENUM if want == ENUM else field.TYPE_DOUBLE
+    is_list = isinstance(want, list)
+    field.label = field.LABEL_REPEATED if is_list else field.LABEL_OPTIONAL
+    kinds = {dict: field.TYPE_MESSAGE, list: field.TYPE_MESSAGE, str: field.TYPE_ENUM}
+    field.type = kinds.get(type(want), field.TYPE_DOUBLE)
     return field

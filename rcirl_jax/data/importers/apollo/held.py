@@ -10,20 +10,19 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.importers.apollo.messages import Rows, check_held
-from rcirl_jax.data.importers.apollo.obstacles import COLUMNS
+from rcirl_jax.data.importers.apollo.messages import (
+    OBSTACLES,
+    TOPICS,
+    Rows,
+    check_held,
+)
 from rcirl_jax.errors import InputError
 
 MAX_DURATION_S = 86400.0  # s, of one drive
 CLOCK_TOLERANCE_S = 1.0  # s, two topics' clocks differ by more: not one clock
 REPEAT_S = 1.5  # s; Apollo sends the routing in force again every second
-# columns of each topic's rows, see `Rows`
-WIDTHS = {
-    "localization": 7,
-    "chassis": 4,
-    "perception": COLUMNS,
-    "prediction": COLUMNS,
-}
+# topics whose rows are held; the others are routings
+HELD = ("localization", "chassis", *OBSTACLES)
 
 Leg = tuple[float, tuple[float, float] | None]  # s, from when on; destination, m
 
@@ -34,7 +33,7 @@ class Held:
     def __init__(self, path: Path) -> None:
         """Holds nothing; `path` is named in errors."""
         self.path = path
-        self.tables = {name: np.zeros((0, width)) for name, width in WIDTHS.items()}
+        self.tables = {name: np.zeros((0, TOPICS[name].width)) for name in HELD}
         self.notes: list[str] = []
         self.progress = 0.0  # share of the drive's bytes that is read
         self.is_empty = True  # no position until now
@@ -59,7 +58,7 @@ class Held:
 
     def next_position(self, since: float) -> float:
         """Time [s] of the first position held from a time on; inf without one."""
-        clocks = [self.clock(name) for name in WIDTHS if name != "chassis"]
+        clocks = [self.clock(name) for name in HELD if name != "chassis"]
         clock = np.concatenate(clocks)
         return float(np.min(clock, where=clock >= since, initial=math.inf))
 
@@ -69,16 +68,14 @@ class Held:
         Raises:
           InputError: too many, too long a drive, or rows of windows long taken.
         """
-        for name, width in WIDTHS.items():
-            new = getattr(rows, name)
-            if name not in ("perception", "prediction"):
-                new = [np.array(new, np.float64).reshape(-1, width)]
-            self.tables[name] = np.concatenate([self.tables[name], *new])
-        held = len(self.tables["perception"]) + len(self.tables["prediction"])
-        check_held(str(self.path), held)
-        for routing in rows.routing:
-            if not self._routing or routing[1:] != self._routing[-1][1:]:
-                self._routing.append(routing)
+        for topic, table in rows.tables:
+            if topic in HELD:
+                self.tables[topic] = np.concatenate([self.tables[topic], table])
+                continue
+            for time, x, y in table.tolist():
+                if not self._routing or (x, y) != self._routing[-1][1:]:
+                    self._routing.append((time, x, y))
+        check_held(str(self.path), sum(len(self.tables[name]) for name in OBSTACLES))
         self.notes += rows.notes
         self.progress = rows.progress
         if self._since == -math.inf:

@@ -24,43 +24,35 @@ import numpy as np
 
 from rcirl_jax.data.importers.apollo.held import Held, Leg
 from rcirl_jax.data.importers.apollo.messages import LOCALIZATION, MANUAL, read_drive
-from rcirl_jax.data.importers.apollo.records import (
-    drive_name,
-    first_parts,
-    is_cut,
-    parts_from,
-    run_name,
-)
+from rcirl_jax.data.importers.apollo.records import Run, first_parts
 from rcirl_jax.data.importers.files import log_name
-from rcirl_jax.data.importers.options import number, one_pattern, positive, section
-from rcirl_jax.data.importers.paths import path_lanes
+from rcirl_jax.data.importers.options import one_pattern, positive
 from rcirl_jax.data.importers.perception import (
     Boxes,
     Windows,
     around,
+    ego_boxes,
+    fitted_lanes,
     longest_window,
     placed,
     tracks_of,
 )
-from rcirl_jax.data.importers.shapes import (
-    check_coordinates,
-    origin_notes,
-)
+from rcirl_jax.data.importers.shapes import check_coordinates, origin_notes
 from rcirl_jax.data.importers.tracks import spans_of
 from rcirl_jax.data.readers.long_logs import AFTER_S
 from rcirl_jax.data.recording import MAX_RATE_HZ, validate_recording
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Kind, Recording, Track
+from rcirl_jax.types import Recording, Track
 
 RATE_HZ = 10.0  # 1/s
 MAX_GAP_S = 0.55  # s without a message inside one track
 LATE_S = 2.0  # s, messages of one time are recorded within it
 LIMIT_MPS = 29.06  # m/s, 65 mph
-LANE_WIDTH_M = 3.5  # m
 MAX_SILENCE_S = 1.0  # s without a chassis message, after which nobody knows
 # Lincoln MKZ in Apollo's mkz_example: 3.89 m before, 1.043 m behind the rear axle
 EGO = {"length": 4.933, "width": 2.11, "rear_axle_to_centre": 1.4235}  # m
-NAN = float("nan")
+# what is measured of a box
+MEASURED = ("x", "y", "heading", "speed", "length", "width")
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
@@ -72,12 +64,12 @@ def parts(path: Path, spec: dict) -> list[Path]:
 
 def files_of(first: Path) -> list[Path]:
     """The files of a run, by its first one."""
-    return parts_from(first)
+    return Run(first).files
 
 
 def own_name(first: Path) -> str:
     """Name of a run, as long as no other folder has one called alike."""
-    return run_name(first)
+    return Run(first).name
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
@@ -110,9 +102,8 @@ def _rate(spec: dict) -> float:
 
 def _windows(held: Held, spec: dict) -> Iterator[Recording]:
     """Recordings of a drive, each made once what it needs is read."""
-    name = log_name(held.path, spec, run_name(held.path))
-    window = longest_window(spec)
-    windows, number = Windows(name, drive_name(held.path), MAX_GAP_S), 0
+    run, window, number = Run(held.path), longest_window(spec), 0
+    windows = Windows(log_name(run.first, spec, run.name), run.drive, MAX_GAP_S)
 
     def within() -> tuple[float, float]:
         return number * window, (number + 1) * window
@@ -127,7 +118,7 @@ def _windows(held: Held, spec: dict) -> Iterator[Recording]:
         near = held.next_position((number + 1) * window - MAX_GAP_S) - MAX_GAP_S
         return max(number + 1, math.floor(min(near, last) / window))
 
-    for rows in read_drive(parts_from(held.path), spec):
+    for rows in read_drive(run.files, spec):
         held.add(rows)
         while held.now > around(within())[1] + LATE_S:
             yield from take(*within())
@@ -146,22 +137,17 @@ def _windows(held: Held, spec: dict) -> Iterator[Recording]:
 
 def _recording(held: Held, within: tuple[float, float], spec: dict) -> Recording | None:
     """The tracks of the rows held, with notes on the time within; None: nothing."""
-    path, rate, notes = held.path, _rate(spec), list(held.notes)
-    tracks = _ego(held, spec, rate)
+    run, rate, notes = Run(held.path), _rate(spec), list(held.notes)
     obstacles, obstacle_notes = _obstacles(held, spec, rate)
-    tracks += obstacles
+    tracks = [*_ego(held, spec, rate), *obstacles]
     if not any(t.t[0] < within[1] and t.t[-1] >= within[0] for t in tracks):
         return None
     notes += _what_is_missing(held, within)
     _, _, origin, tracks = placed(tracks)
-    lanes = path_lanes(
-        tracks,
-        positive(spec, "lane_width_m", LANE_WIDTH_M),
-        positive(spec, "speed_limit", LIMIT_MPS),
-    )
+    lanes, lanes_note = fitted_lanes(tracks, spec, LIMIT_MPS)
     return Recording(
-        name=log_name(path, spec, run_name(path)),
-        group=drive_name(path) if is_cut(path) else None,
+        name=log_name(run.first, spec, run.name),
+        group=run.drive if run.is_cut else None,
         source=str(spec.get("source", "Apollo cyber record")),
         licence=str(spec.get("licence", "unknown")),
         rate_hz=rate,
@@ -172,7 +158,7 @@ def _recording(held: Held, within: tuple[float, float], spec: dict) -> Recording
             *notes,
             *obstacle_notes,
             *origin_notes(origin),
-            f"records hold no map; {len(lanes)} lanes fitted to the longest paths",
+            f"records hold no map; {lanes_note}",
         ),
     )
 
@@ -200,36 +186,14 @@ def _what_is_missing(held: Held, within: tuple[float, float]) -> list[str]:
 
 def _ego(held: Held, spec: dict, rate: float) -> list[Track]:
     """The recording car's box, moved from its rear axle to its centre."""
-    size = {
-        name: number(section(spec, "ego"), name, default)
-        for name, default in EGO.items()
-    }
     t, table = held.clock("localization"), held.tables["localization"]
     x, y, heading, speed = table[:, 3:].T
     where = f"{held.path}: {LOCALIZATION}"
     check_coordinates(where, "pose", ("x", "y", "heading"), table[:, 3:6])
     if t.size and not np.isfinite(speed).all():
-        wheels = held.tables["chassis"][:, 2]
-        speed = _chassis_speed(t, held.clock("chassis"), wheels)
-    ahead = size["rear_axle_to_centre"]
-    boxes = _uniform(
-        ids=np.zeros(t.size, np.int64),
-        names=("ego",),
-        t=t,
-        columns=(
-            x + ahead * np.cos(heading),
-            y + ahead * np.sin(heading),
-            heading,
-            speed,
-            np.full(t.size, size["length"]),
-            np.full(t.size, size["width"]),
-        ),
-        kind=np.full(t.size, int(Kind.VEHICLE)),
-        rate=rate,
-    )
-    automated = _automated(held)
-    found, _ = tracks_of(held.path, boxes, MAX_GAP_S)
-    return [dataclasses.replace(track, automated=automated) for track in found]
+        speed = _chassis_speed(t, held)
+    boxes = _on_clock(ego_boxes(spec, EGO, t, x, y, heading, speed), rate)
+    return tracks_of(held.path, boxes, MAX_GAP_S, automated=_automated(held))[0]
 
 
 def _automated(held: Held) -> tuple[tuple[float, float], ...]:
@@ -249,84 +213,67 @@ def _automated(held: Held) -> tuple[tuple[float, float], ...]:
     )
 
 
-def _chassis_speed(t: np.ndarray, clock: np.ndarray, speed: np.ndarray) -> np.ndarray:
+def _chassis_speed(t: np.ndarray, held: Held) -> np.ndarray:
     """Speed [m/s] of the wheels at times t; NaN where there is none."""
+    clock, speed = held.clock("chassis"), held.tables["chassis"][:, 2]
     known = np.isfinite(speed)
     if np.count_nonzero(known) < 2:
-        return np.full(t.shape, NAN)
+        return np.full(t.shape, np.nan)
     order = np.argsort(clock[known], kind="stable")
     return np.interp(t, clock[known][order], speed[known][order])
 
 
 def _obstacles(held: Held, spec: dict, rate: float) -> tuple[list[Track], list[str]]:
-    path, table, clock = held.path, held.tables[held.key], held.clock(held.key)
+    table, clock = held.tables[held.key], held.clock(held.key)
     # a state without a position, or of the ego (negative id), is none
     seen = ~np.isnan(table[:, 4:6]).any(axis=1) & (table[:, 3] >= 0)
     lost = int(np.count_nonzero(~seen))
     table, clock = table[seen], clock[seen]
-    where = f"{path}: obstacles"
+    where = f"{held.path}: obstacles"
     check_coordinates(where, "perception_obstacle", ("x", "y", "theta"), table[:, 4:7])
     number_of, ids = np.unique(table[:, 3].astype(np.int64), return_inverse=True)
-    boxes = _uniform(
+    boxes = Boxes(
         ids=ids,
-        names=tuple(str(found) for found in number_of.tolist()),
+        names=tuple(map(str, number_of.tolist())),
         t=clock,
-        columns=tuple(table[:, 4:10].T),
         kind=table[:, 10].astype(np.int64),
-        rate=rate,
+        **dict(zip(MEASURED, table[:, 4:10].T, strict=True)),
     )
     unknown = str(spec.get("unknown", "auto"))
-    tracks, notes = tracks_of(path, boxes, MAX_GAP_S, unknown)
+    tracks, notes = tracks_of(held.path, _on_clock(boxes, rate), MAX_GAP_S, unknown)
     if lost:
         notes.append(f"{lost} obstacle states without position or id left out")
     return tracks, notes
 
 
-def _uniform(
-    *,
-    ids: np.ndarray,
-    names: tuple[str, ...],
-    t: np.ndarray,
-    columns: tuple[np.ndarray, ...],
-    kind: np.ndarray,
-    rate: float,
-) -> Boxes:
+def _on_clock(boxes: Boxes, rate: float) -> Boxes:
     """Boxes on the clock k / rate, between the messages of each gapless piece.
 
-    Linear interpolation; headings (column 2) are unwrapped first. A piece
-    between two ticks of the clock gives nothing. Of several messages of one
-    time the first counts.
+    Linear interpolation; headings are unwrapped first. A piece between two ticks of
+    the clock gives nothing. Of several messages of one time the first counts.
     """
+    t, ids = boxes.t, boxes.ids
     order = np.lexsort((t, ids))
     step, same = np.diff(t[order]), np.diff(ids[order]) == 0
     order = order[np.concatenate([[True], ~same | (step > 0.0)])[: order.size]]
     step, same = np.diff(t[order]), np.diff(ids[order]) == 0
     breaks = np.flatnonzero(~same | (step > MAX_GAP_S)) + 1
-    parts: list[tuple[np.ndarray, ...]] = []
+    fields = ("ids", "t", "kind", *MEASURED)
+    parts = {field: [getattr(boxes, field)[:0]] for field in fields}
     for rows in np.split(order, breaks) if order.size else []:
         first = math.ceil(float(t[rows[0]]) * rate - 1e-6)
         last = math.floor(float(t[rows[-1]]) * rate + 1e-6)
         clock = np.arange(first, last + 1) / rate
-        values = [column[rows] for column in columns]
-        values[2] = np.unwrap(values[2])
-        at = np.minimum(np.searchsorted(t[rows], clock), rows.size - 1)
-        parts.append(
-            (
-                np.full(clock.size, ids[rows[0]]),
-                clock,
-                *(np.interp(clock, t[rows], value) for value in values),
-                kind[rows][at],
-            )
-        )
-    empty = (np.zeros(0, np.int64), *[np.zeros(0)] * 7, np.zeros(0, np.int64))
-    merged = [np.concatenate(group) for group in zip(empty, *parts, strict=True)]
-    fields = ("t", "x", "y", "heading", "speed", "length", "width")
-    return Boxes(
-        ids=merged[0],
-        names=names,
-        kind=merged[8],
-        **dict(zip(fields, merged[1:8], strict=True)),
-    )
+        at = rows[np.minimum(np.searchsorted(t[rows], clock), rows.size - 1)]
+        parts["ids"].append(ids[at])
+        parts["t"].append(clock)
+        parts["kind"].append(boxes.kind[at])
+        for field in MEASURED:
+            values = getattr(boxes, field)[rows]
+            values = np.unwrap(values) if field == "heading" else values
+            parts[field].append(np.interp(clock, t[rows], values))
+    merged = {field: np.concatenate(values) for field, values in parts.items()}
+    return dataclasses.replace(boxes, **merged)
 
 
 def _with_destinations(

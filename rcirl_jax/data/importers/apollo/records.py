@@ -18,13 +18,12 @@ from pathlib import Path
 from google.protobuf.message import DecodeError
 
 from rcirl_jax.data.importers.files import files_below
-from rcirl_jax.data.readers.protobuf import Field, parser
+from rcirl_jax.data.readers.protobuf import parser, table_of
 from rcirl_jax.errors import InputError
 
 HEAD = struct.Struct("<i4xq")  # type and size of a section
 HEADER_BYTES = 2048  # bytes that the header's section takes
 HEADER, CHUNK_HEADER, CHUNK_BODY, INDEX, CHANNEL = range(5)
-COMPRESSION = {1: "BZ2", 2: "LZ4"}
 MAX_BYTES = 16 * 1024**2  # bytes of a message, or of a channel's descriptors
 VARINT, LENGTH = 0, 2  # wire types
 SIZES = {1: 8, 5: 4}  # bytes of those of one size
@@ -34,35 +33,40 @@ NAME = re.compile(
     r"[^/]+?\.record(?:\.(?P<part>\d{1,9})(?:\.\d{1,20})?)?(?:\.(?:split|recover))?"
 )
 
-read_header = parser(
-    {"Header": {"compress": Field("int64", 3), "is_complete": Field("bool", 13)}}
-)
-read_channel = parser(
-    {
-        "Channel": {
-            "name": Field("string", 1),
-            "message_type": Field("string", 2),
-            "proto_desc": Field("bytes", 3),
-        }
-    }
-)
+CHANNEL_FIELDS = "name 1 string, message_type 2 string, proto_desc 3 bytes"
+read_header = parser(table_of("Header: compress 3 int64, is_complete 13 bool"))
+read_channel = parser(table_of(f"Channel: {CHANNEL_FIELDS}"))
 
 
-def drive_name(file: Path) -> str:
-    """The part of a name before .record."""
-    return file.name.split(".record")[0]
+class Run:
+    """A record and, if it is a part, those that follow: .00000, .00001, ...
 
+    Args:
+      first: its first file.
+    """
 
-def run_name(first: Path) -> str:
-    """Name of a run of parts: its drive's, and its part behind a missing one."""
-    name, number = drive_name(first), _part(first)
-    is_first = number <= min(_parts_of(first), default=0)
-    return name if is_first else f"{name}-{number:05d}"
+    def __init__(self, first: Path) -> None:
+        name, self._number = _drive_and_part(first)
+        self.first, self.drive = first, name.name
+        match = NAME.fullmatch(first.name)
+        is_part = match is not None and match["part"] is not None
+        beside = first.parent.glob("*.record.*") if is_part else ()
+        self._parts = _drives(beside).get(name, {})
+        self.files, number = [first], self._number + 1
+        while number in self._parts:
+            self.files.append(self._parts[number])
+            number += 1
 
+    @property
+    def name(self) -> str:
+        """Its drive's, and its part behind a missing one."""
+        is_first = self._number <= min(self._parts, default=0)
+        return self.drive if is_first else f"{self.drive}-{self._number:05d}"
 
-def is_cut(first: Path) -> bool:
-    """Whether the drive of a run has other parts, which do not follow."""
-    return len(_parts_of(first)) > len(parts_from(first))
+    @property
+    def is_cut(self) -> bool:
+        """Whether the drive has other parts, which do not follow."""
+        return len(self._parts) > len(self.files)
 
 
 def first_parts(folder: Path, pattern: str) -> list[Path]:
@@ -78,40 +82,21 @@ def first_parts(folder: Path, pattern: str) -> list[Path]:
     )
 
 
-def parts_from(file: Path) -> list[Path]:
-    """A record and, if it is a part, those that follow: .00000, .00001, ..."""
-    found, number, chain = _parts_of(file), _part(file), [file]
-    while number + len(chain) in found:
-        chain.append(found[number + len(chain)])
-    return chain
-
-
-def _parts_of(file: Path) -> dict[int, Path]:
-    """Parts of a record's drive by their numbers; none if it is no part."""
-    match = NAME.fullmatch(file.name)
-    if match is None or match["part"] is None:
-        return {}
-    drives = _drives(file.parent.glob("*.record.*"))
-    return drives.get(_drive(file), {})
-
-
-def _drive(file: Path) -> Path:
-    """The drive of a record, told from those of its name in other folders."""
-    return file.parent / drive_name(file)
-
-
 def _drives(files: Iterable[Path]) -> dict[Path, dict[int, Path]]:
     """Parts by drive and number; of a file and its copies the shortest name counts."""
     drives: dict[Path, dict[int, Path]] = {}
     for file in sorted(files):
         if NAME.fullmatch(file.name):
-            drives.setdefault(_drive(file), {}).setdefault(_part(file), file)
+            drive, number = _drive_and_part(file)
+            drives.setdefault(drive, {}).setdefault(number, file)
     return drives
 
 
-def _part(file: Path) -> int:
+def _drive_and_part(file: Path) -> tuple[Path, int]:
+    """Drive of a record, told from those of its name in other folders; its number."""
     match = NAME.fullmatch(file.name)
-    return int(match["part"] or 0) if match else 0
+    number = int(match["part"] or 0) if match else 0
+    return file.parent / file.name.split(".record")[0], number
 
 
 class Record:
@@ -206,9 +191,8 @@ class Record:
             )
         header = read_header(bytes(self._data[HEAD.size : HEAD.size + size]))
         if header.compress != 0:
-            name = COMPRESSION.get(header.compress, str(header.compress))
             raise InputError(
-                f"{self.path}: header: compress: {name}: expected none "
+                f"{self.path}: header: compress: {header.compress}: expected 0, none "
                 "(no Apollo release writes compressed chunks)"
             )
         self.is_complete = header.is_complete

@@ -10,6 +10,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Mapping as AnyMapping
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +47,11 @@ class HeadingForm:
         sign, zero = CONVENTIONS[self.name]
         return sign * UNITS[self.unit] * headings + zero
 
+    def apart(self, headings: np.ndarray, travel: np.ndarray) -> float:
+        """Median angle [rad] between headings and directions of travel."""
+        turn = self.radians(headings) - travel
+        return float(np.median(np.abs(np.angle(np.exp(1j * turn)))))
+
 
 def declared(spec: AnyMapping) -> str:
     """The option `heading_convention`; "": recognised."""
@@ -80,75 +86,67 @@ def recognised_form(
     travel, headings = directions(values, rate_hz)
     if travel.size < ENOUGH:
         return None
-    names = [said] if said else list(CONVENTIONS)
-    units = [unit] if unit else ["deg"] if _is_large(headings) else ["rad", "deg"]
-    apart = {
-        (name, one): _apart(HeadingForm(name=name, unit=one), headings, travel)
-        for one, name in itertools.product(units, names)
-    }
-    usual = next(iter(apart))
-    best = min(apart, key=lambda form: apart[form])
+    possible = ["deg"] if is_large(headings) else ["rad", "deg"]
+
+    def forms(units: Sequence[str], names: Sequence[str]) -> dict[HeadingForm, float]:
+        pairs = itertools.product(units, names)
+        found = (HeadingForm(name=name, unit=one) for one, name in pairs)
+        return {form: form.apart(headings, travel) for form in found}
+
+    apart = forms([unit] if unit else possible, [said] if said else [*CONVENTIONS])
+    usual, best = next(iter(apart)), min(apart, key=lambda form: apart[form])
     if apart[usual] <= max(SURE, 2.0 * apart[best]) or apart[best] > FITS_WELL:
         best = usual
     if apart[best] > FITS:
-        raise InputError(_contradiction(path, apart[best], headings, travel))
+        every = forms(possible, [*CONVENTIONS])
+        right = min(every, key=lambda form: every[form])
+        hint = "leave columns.heading out to take the direction of travel"
+        if every[right] <= FITS_WELL:
+            hint = f'{OPTION} = "{right.name}" with units.heading = "{right.unit}" fits'
+        raise InputError(
+            f"{path}: heading: {math.degrees(apart[best]):.0f} degrees from the "
+            "direction of travel in the median: expected up to "
+            f"{math.degrees(FITS):.0f}; {hint}"
+        )
+    if best == HeadingForm(name=said or "ccw_from_x", unit=unit or "rad"):
+        return best
     note = (
-        f"headings read as {best[0]} in {best[1]}, which fits the direction of travel"
+        f"headings read as {best.name} in {best.unit}, which fits the direction of "
+        "travel"
     )
-    is_usual = best[0] == (said or "ccw_from_x") and best[1] == (unit or "rad")
-    return HeadingForm(name=best[0], unit=best[1], note="" if is_usual else note)
+    return dataclasses.replace(best, note=note)
 
 
 def unjudged_form(headings: np.ndarray, unit: str, spec: AnyMapping) -> HeadingForm:
     """The form where too few road users move: as declared, else the usual one."""
-    by_size = "deg" if _is_large(headings[np.isfinite(headings)]) else "rad"
+    by_size = "deg" if is_large(headings[np.isfinite(headings)]) else "rad"
     return HeadingForm(name=declared(spec) or "ccw_from_x", unit=unit or by_size)
 
 
-def _is_large(headings: np.ndarray) -> bool:
+def is_large(headings: np.ndarray) -> bool:
     """Whether angles are too large for radians of one turn."""
     return bool(headings.size) and bool(np.max(np.abs(headings)) > 2.0 * math.pi + 0.1)
-
-
-def _apart(form: HeadingForm, headings: np.ndarray, travel: np.ndarray) -> float:
-    """Median angle [rad] between headings and directions of travel."""
-    turn = form.radians(headings) - travel
-    return float(np.median(np.abs(np.angle(np.exp(1j * turn)))))
-
-
-def _contradiction(
-    path: Path, apart: float, headings: np.ndarray, travel: np.ndarray
-) -> str:
-    """What is wrong with the headings, and what would be right, if anything."""
-    units = ("deg",) if _is_large(headings) else ("rad", "deg")
-    forms = [
-        HeadingForm(name=name, unit=unit)
-        for unit, name in itertools.product(units, CONVENTIONS)
-    ]
-    found = {form: _apart(form, headings, travel) for form in forms}
-    best = min(forms, key=lambda form: found[form])
-    hint = "leave columns.heading out to take the direction of travel"
-    if found[best] <= FITS_WELL:
-        hint = f'{OPTION} = "{best.name}" with units.heading = "{best.unit}" fits'
-    return (
-        f"{path}: heading: {math.degrees(apart):.0f} degrees from the direction of "
-        f"travel in the median: expected up to {math.degrees(FITS):.0f}; {hint}"
-    )
 
 
 def directions(
     values: AnyMapping[str, np.ndarray], rate_hz: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Directions of travel [m] rad over half a second, and the headings amid them."""
+    first, middle, last = half_seconds(values, rate_hz)
+    dx, dy, dt = (values[name][last] - values[name][first] for name in ("x", "y", "t"))
+    headings = values["heading"][middle]
+    used = (np.hypot(dx, dy) > MOVED_M) & (dt < 4.0 * SPAN_S) & np.isfinite(headings)
+    return np.arctan2(dy[used], dx[used]), headings[used]
+
+
+def half_seconds(
+    values: AnyMapping[str, np.ndarray], rate_hz: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows [m] of one road user each, half a second apart: first, middle and last."""
     codes = np.unique(values["id"], return_inverse=True)[1]
     order = np.lexsort((values["t"], codes))
-    t, x, y, heading = (values[name][order] for name in ("t", "x", "y", "heading"))
     step = max(round(SPAN_S * rate_hz), 1)
-    if t.size <= step:
-        return np.zeros(0), np.zeros(0)
-    dx, dy, dt = (v[step:] - v[:-step] for v in (x, y, t))
-    same = codes[order][step:] == codes[order][:-step]
-    middle = heading[step // 2 : step // 2 + dx.size]
-    moving = same & (np.hypot(dx, dy) > MOVED_M) & (dt < 4.0 * SPAN_S)
-    used = moving & np.isfinite(middle)
-    return np.arctan2(dy[used], dx[used]), middle[used]
+    first, last = order[:-step], order[step:]
+    middle = order[step // 2 : step // 2 + first.size]
+    same = codes[first] == codes[last]
+    return first[same], middle[same], last[same]

@@ -5,19 +5,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from rcirl_jax.data.importers.lanes import StraightLane, straight_lanes
 from rcirl_jax.data.importers.options import number, path_option
-from rcirl_jax.data.importers.shapes import arc_length
+from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.readers.tables.ledger import Ledger
-from rcirl_jax.data.readers.tables.table import Field, open_table, read
+from rcirl_jax.data.readers.tables.table import fields_of, open_table, read
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane, Track
 
 MARGIN_M = 50.0  # m of fitted lane beyond the first and last position
-PATH_STEP_M = 5.0  # m between points of a lane fitted to a path
-MAX_PATHS = 200  # longest tracks tried as lanes
 LANE_COLUMNS = ("id", "x", "y")
 LANE_OPTIONAL = ("width", "speed_limit", "left", "right", "successor")
 LIMIT_MPS = 29.06  # m/s, 65 mph
@@ -61,7 +58,7 @@ def lanes_of(
         if found is not None:
             lanes = straight_lanes(table.path, found, width, limit)
             return lanes, ["straight lanes fitted to the lane column"]
-    lanes = _paths(tracks, width, limit)
+    lanes = path_lanes(tracks, width, limit)
     return lanes, [f"no lanes given; {len(lanes)} fitted to the longest paths"]
 
 
@@ -73,7 +70,9 @@ def _lanes_from_file(path: Path, name: str) -> list[dict]:
         raise InputError(
             f"{path}: lanes.file: {name}: expected this CSV beside the log"
         )
-    table = _lane_points(table_path)
+    opened, texts = open_table(table_path), ("id", "left", "right", "successor")
+    fields = fields_of(opened, LANE_COLUMNS, LANE_OPTIONAL, texts=texts)
+    table = read(opened, fields, Ledger(path=table_path, allowed=0.0))
     lanes = []
     for lane in dict.fromkeys(table["id"].tolist()):
         rows = np.flatnonzero(table["id"] == lane)
@@ -92,17 +91,6 @@ def _lanes_from_file(path: Path, name: str) -> list[dict]:
             }
         )
     return lanes
-
-
-def _lane_points(path: Path) -> dict[str, np.ndarray]:
-    """Columns of the lanes' own table, with those that may be missing."""
-    table, texts = open_table(path), ("id", "left", "right", "successor")
-    names = [*LANE_COLUMNS, *(n for n in LANE_OPTIONAL if n in table.header)]
-    fields = [
-        Field(name=n, column=n, text=n in texts, needed=n in LANE_COLUMNS)
-        for n in names
-    ]
-    return read(table, fields, Ledger(path=path, allowed=0.0))
 
 
 def _is_known(value: str | float) -> bool:
@@ -163,35 +151,3 @@ def _straight(
             )
         )
     return found or None
-
-
-def _paths(tracks: tuple[Track, ...], width: float, limit: float) -> tuple[Lane, ...]:
-    """The paths of the longest tracks as lanes, none within a lane's width."""
-    longest = sorted(tracks, key=lambda t: -np.hypot(np.ptp(t.x), np.ptp(t.y)))
-    lanes: list[Lane] = []
-    for track in longest[:MAX_PATHS]:
-        points = np.stack([track.x, track.y], axis=1)
-        arc = arc_length(points)
-        keep = points[np.unique(arc // PATH_STEP_M, return_index=True)[1]]
-        if len(keep) < 3 or any(_near(keep, lane.centre, width) for lane in lanes):
-            continue
-        half = np.full(len(keep), 0.5 * width)
-        lanes.append(
-            Lane(
-                id=f"path-{len(lanes)}",
-                centre=keep,
-                left_width=half,
-                right_width=half,
-                speed_limit=limit,
-            )
-        )
-    return tuple(lanes)
-
-
-def _near(points: np.ndarray, line: np.ndarray, width: float) -> bool:
-    """Whether most of a path runs within a lane width of a line, the same way."""
-    along = (points[-1] - points[0]) @ (line[-1] - line[0])
-    # of places too far for float64 there is no nearest, and no number in range
-    nearest = line.take(KDTree(line).query(points)[1], axis=0, mode="clip")
-    apart = np.hypot(*(points - nearest).T)
-    return bool(along > 0.0 and np.median(apart) < width)

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rcirl_jax.data.importers.options import UNITS, number, section
+from rcirl_jax.data.importers.options import UNITS, number, positive, section
 from rcirl_jax.data.readers.tables.cells import EMPTY, ISO
 from rcirl_jax.data.readers.tables.layout import NUMBER
 from rcirl_jax.data.readers.tables.table import (
@@ -94,16 +94,10 @@ def mapping_of(table: Table, spec: AnyMapping) -> Mapping:
       InputError: an unknown field or unit, a needed column that is missing.
     """
     for name in spec:
-        if name not in (*OPTIONS, *ADDED):
-            raise InputError(
-                f"source TOML: {name}: unknown: expected one of {', '.join(OPTIONS)}"
-                f"{did_you_mean(name, OPTIONS)}"
-            )
-    rate = number({**spec, **section(spec, "defaults")}, "rate_hz", RATE_HZ)
-    if rate <= 0.0:
-        raise InputError(f"source TOML: rate_hz: {rate:g}: expected > 0")
+        _check_known("source TOML: ", name, OPTIONS, (*OPTIONS, *ADDED))
+    rate = positive({**spec, **section(spec, "defaults")}, "rate_hz", RATE_HZ)
     columns, units, notes = _columns(table, spec)
-    _check_sections(table, spec, units)
+    _check_units(table, spec, units)
     found, missing = _found(table, columns)
     notes += missing
     middle, degrees = None, 1.0
@@ -113,14 +107,16 @@ def mapping_of(table: Table, spec: AnyMapping) -> Mapping:
         notes.append(
             f"latitude, longitude projected about {middle[0]:g}, {middle[1]:g} degrees"
         )
-    fields = []
-    for field, name, user in found:
-        form, factor = "", 1.0
-        if field == "t":
-            form, factor = _time(table, name, units.get("t"), rate, notes)
-        elif field in units and field != "heading" and units[field] not in ANGLES:
-            factor = UNITS[units[field]]
-        fields.append(_field(field, name, user, form, factor, units, spec))
+    clock = next(name for field, name, _ in found if field == "t")
+    form, factor = _time(table, clock, units.get("t"), rate, notes)
+    limit = math.inf if form else LIMITS["t"] / min(factor, 1.0)
+    fields = [_field(field, name, user, units, spec) for field, name, user in found]
+    fields = [
+        dataclasses.replace(f, form=form, limit=limit, factor=f.factor * factor)
+        if f.name == "t"
+        else f
+        for f in fields
+    ]
     return Mapping(
         fields=tuple(fields),
         rate_hz=rate,
@@ -132,18 +128,32 @@ def mapping_of(table: Table, spec: AnyMapping) -> Mapping:
     )
 
 
+def _check_known(
+    where: str, name: str, said: Sequence[str], known: Sequence[str]
+) -> None:
+    """A name is one of those known, of which some are said."""
+    if name not in known:
+        raise InputError(
+            f"{where}{name}: unknown: expected one of {', '.join(said)}"
+            f"{did_you_mean(name, said)}"
+        )
+
+
 def _columns(
     table: Table, spec: AnyMapping
 ) -> tuple[dict[str, str], dict[str, str], list[str]]:
     """(field -> column, field -> unit, notes), latitude and longitude as y and x."""
     columns, units = dict(section(spec, "columns")), dict(section(spec, "units"))
-    _check_names(table, columns)
-    notes: list[str] = []
+    where, every = f"{table.path}: columns.", (*NEEDED, *OPTIONAL, *EARTH)
+    for field, column in columns.items():
+        _check_known(where, field, every, every)
+        if not isinstance(column, str) or not column:
+            raise InputError(f"{where}{field}: {column}: expected a name")
     for name, field in EARTH.items():
         if name in columns:
             if field in columns:
                 raise InputError(
-                    f"{table.path}: columns.{name}: {columns[name]}: expected it, or "
+                    f"{where}{name}: {columns[name]}: expected it, or "
                     f"columns.{field}, not both"
                 )
             columns[field] = columns.pop(name)
@@ -151,42 +161,26 @@ def _columns(
     is_wide = HOLE in columns.get("x", "")
     for field in NEEDED:
         if field not in columns and not (is_wide and field == "id"):
-            raise InputError(
-                f"{table.path}: columns.{field}: missing: expected a column"
-            )
+            raise InputError(f"{where}{field}: missing: expected a column")
     if is_wide and "id" in columns:
         raise InputError(
-            f"{table.path}: columns.id: {columns['id']}: expected none beside "
+            f"{where}id: {columns['id']}: expected none beside "
             f"columns.x = {columns['x']!r}, whose {HOLE} is the id"
         )
-    _check_texts(table, columns)
+    _check_texts(where, columns)
+    notes: list[str] = []
     if "x" not in units and "y" not in units and not is_wide:
         columns, units = _recognised_earth(table, columns, units, notes)
     return columns, units, notes
 
 
-def _check_names(table: Table, columns: AnyMapping[str, object]) -> None:
-    """All fields are known, and each names a column."""
-    every = (*NEEDED, *OPTIONAL, *EARTH)
-    for field, column in columns.items():
-        if field not in every:
-            raise InputError(
-                f"{table.path}: columns.{field}: unknown: expected "
-                f"{', '.join(every)}{did_you_mean(field, every)}"
-            )
-        if not isinstance(column, str) or not column:
-            raise InputError(
-                f"{table.path}: columns.{field}: {column}: expected a name"
-            )
-
-
-def _check_texts(table: Table, columns: AnyMapping[str, str]) -> None:
+def _check_texts(where: str, columns: AnyMapping[str, str]) -> None:
     """No column of numbers is one that is read as text."""
     texts = {columns[field] for field in TEXT if field in columns}
     for field, column in columns.items():
         if field not in TEXT and column in texts:
             raise InputError(
-                f"{table.path}: columns.{field}: {column}: expected a column of "
+                f"{where}{field}: {column}: expected a column of "
                 "numbers, not one that is read as text"
             )
 
@@ -209,6 +203,11 @@ def _recognised_earth(
             notes.append(f"columns {columns[x]}, {columns[y]}: longitude and latitude")
             return {**columns, **cells}, {**units, "x": "deg", "y": "deg"}
     return columns, units
+
+
+def first_cell(table: Table, column: str) -> str:
+    """The first cell of a column that is not empty, "" without one."""
+    return next((c for c in table.samples(column) if c.lower() not in EMPTY), "")
 
 
 def sampled(table: Table, column: str) -> np.ndarray:
@@ -254,14 +253,18 @@ def _middle(
     return places[0], places[1]
 
 
-def _check_sections(table: Table, spec: AnyMapping, units: dict[str, str]) -> None:
+def _check_units(table: Table, spec: AnyMapping, units: dict[str, str]) -> None:
     """Units are known; scales and offsets are numbers of fields that have a unit."""
+    fields = (*ALLOWED_UNITS, *EARTH)
+    scaled = {name: section(spec, name) for name in ("scale", "offset")}
+    for name, own in {"units": units, **scaled}.items():
+        for field in own:
+            if field not in (ALLOWED_UNITS if name == "units" else fields):
+                raise InputError(
+                    f"{table.path}: {name}.{field}: unknown: "
+                    f"expected {', '.join(fields)}"
+                )
     for field, unit in units.items():
-        if field not in ALLOWED_UNITS:
-            raise InputError(
-                f"{table.path}: units.{field}: unknown: "
-                f"expected {', '.join((*ALLOWED_UNITS, *EARTH))}"
-            )
         is_pattern = field == "t" and "%" in str(unit)
         if unit not in ALLOWED_UNITS[field] and not is_pattern:
             raise InputError(
@@ -273,13 +276,6 @@ def _check_sections(table: Table, spec: AnyMapping, units: dict[str, str]) -> No
             f"{table.path}: units.x, units.y: {units.get('x', 'm')} and "
             f"{units.get('y', 'm')}: expected both in degrees or both in metres"
         )
-    for name in ("scale", "offset"):
-        for field in section(spec, name):
-            if field not in (*ALLOWED_UNITS, *EARTH):
-                raise InputError(
-                    f"{table.path}: {name}.{field}: unknown: "
-                    f"expected {', '.join((*ALLOWED_UNITS, *EARTH))}"
-                )
 
 
 def _found(
@@ -327,8 +323,7 @@ def _time(
     table: Table, name: str, unit: str | None, rate: float, notes: list[str]
 ) -> tuple[str, float]:
     """(form, factor) of the clock; ISO where nothing is said and the cells are."""
-    cells = [c for c in table.samples(name.lstrip("-")) if c.lower() not in EMPTY]
-    first = cells[0] if cells else ""
+    first = first_cell(table, name.lstrip("-"))
     is_iso = re.match(ISO_TIMES, first) is not None
     if unit is None and is_iso:
         notes.append(f"column {name}: ISO times")
@@ -347,30 +342,27 @@ def _field(
     field: str,
     name: str,
     user: str | None,
-    form: str,
-    factor: float,
     units: AnyMapping[str, str],
     spec: AnyMapping,
 ) -> Field:
     """One column as the reader takes it; "-name" turns an axis round."""
     plain = name.removeprefix("-") if field not in TEXT else name
     scale, offset = _scaled(field, spec)
-    limit = LIMITS.get(field, np.inf)
-    unit = units.get(field)
-    if field == "t":
-        limit = math.inf if form else limit / min(factor, 1.0)
-    elif unit in ANGLES and field in DEGREES:
+    unit, limit, factor = units.get(field, ""), LIMITS.get(field, np.inf), 1.0
+    is_place_on_earth = unit in ANGLES and field in DEGREES
+    if is_place_on_earth:
         limit = DEGREES[field] * (UNITS["deg"] if unit == "rad" else 1.0)
+    elif unit in UNITS and field not in ("heading", "t"):
+        factor = UNITS[unit]
     return Field(
         name=field,
         column=plain,
         needed=field in (*NEEDED, "recording"),
         text=field in TEXT,
-        form=form,
         scale=scale,
         offset=offset,
         factor=-factor if plain != name else factor,
         limit=limit,
-        zero_is_empty=unit in ANGLES and field in DEGREES,
+        zero_is_empty=is_place_on_earth,
         user=user,
     )

@@ -6,12 +6,12 @@ in float32 later.
 """
 
 import dataclasses
-from collections.abc import Iterable, Iterator
+import itertools
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.importers.csv.earth import projected
 from rcirl_jax.data.importers.csv.map import (
     LIMIT_MPS,
     LogTable,
@@ -21,18 +21,21 @@ from rcirl_jax.data.importers.csv.map import (
 from rcirl_jax.data.importers.csv.mapping import Mapping, mapping_of
 from rcirl_jax.data.importers.csv.meaning import Meaning, meaning_of
 from rcirl_jax.data.importers.csv.users import track_of
+from rcirl_jax.data.importers.declared import open_log
 from rcirl_jax.data.importers.files import (
-    input_files,
+    firsts_of_a_name,
+    is_input,
     is_long_file,
     log_name,
     table_stem,
 )
-from rcirl_jax.data.importers.options import number, patterns, section
+from rcirl_jax.data.importers.options import number, patterns
+from rcirl_jax.data.importers.projection import projected
+from rcirl_jax.data.importers.shapes import local_origin, origin_notes
 from rcirl_jax.data.importers.tracks import split_tracks
-from rcirl_jax.data.readers import long_logs
-from rcirl_jax.data.readers.tables.ledger import LINE, Ledger, allowed_share
-from rcirl_jax.data.readers.tables.repair import single_rows
-from rcirl_jax.data.readers.tables.table import Table, batches, open_table, read
+from rcirl_jax.data.readers.long_logs import piece_of, rows_of
+from rcirl_jax.data.readers.tables.ledger import Ledger, with_news
+from rcirl_jax.data.readers.tables.table import Table
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Recording
@@ -41,8 +44,6 @@ PATTERNS = (
     *("*.csv", "*.csv.gz", "*.csv.zst", "*.tsv", "*.parquet", "*.feather"),
 )  # of files that are read; of those called alike the first pattern's
 MAX_GAP_STEPS = 5.5  # missing rows bridged inside one track
-FAR_M = 1e4  # m; coordinates beyond it (UTM) are moved to a local origin
-ORIGIN_STEP_M = 1000.0  # m, local origins are multiples of it
 STILL_M = 0.5  # m; a log in which all road users stay within it is in degrees
 
 
@@ -73,6 +74,13 @@ class Log:
         east, north = projected(degrees[:, 0], degrees[:, 1], self.mapping.middle)
         return np.stack([east, north], axis=1)
 
+    def placed(self, rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Rows with x and y in metres."""
+        if self.mapping.middle is None:
+            return rows
+        x, y = self.metres(np.stack([rows["x"], rows["y"]], axis=1)).T
+        return {**rows, "x": x, "y": y}
+
 
 def parts(path: Path, spec: dict) -> list[Path]:
     """The tables; each can be read alone.
@@ -80,153 +88,82 @@ def parts(path: Path, spec: dict) -> list[Path]:
     Of files in one folder with one name that of the first pattern counts: it is the
     same log.
     """
-    lane_file = lane_file_of(spec)
-    wanted = patterns(spec, PATTERNS)
-    found: dict[tuple[Path, str], Path] = {}
-    failed: InputError | None = None
-    for pattern in wanted:
-        try:
-            files = input_files(path, pattern)
-        except InputError as error:
-            failed = failed or error
-            continue
-        for file in files:
-            found.setdefault((file.parent, table_stem(file)), file)
-    files = [file for file in found.values() if file.name != lane_file]
-    if not found and failed is not None:
+    lane_file, wanted = lane_file_of(spec), patterns(spec, PATTERNS)
+    found = [path]
+    if path.is_dir():
+        every = (sorted(path.glob(pattern)) for pattern in wanted)
+        matching = itertools.chain.from_iterable(every)
+        found = firsts_of_a_name(file for file in matching if is_input(path, file))
+    if not found:
         expected = ", ".join(wanted)
         raise InputError(f"{path}: no file matches {expected}: expected log files")
+    files = [file for file in found if file.name != lane_file]
     if not files:
         raise InputError(f"{path}: files: only {lane_file}: expected logs beside it")
     return files
 
 
-def own_name(file: Path) -> str:
-    """Name of a log, as long as no other folder has one called alike."""
-    return table_stem(file)
+own_name = table_stem  # of a log, as long as no other folder has one called alike
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
-    """One Recording per file, or per value of the `recording` column."""
+    """One Recording per file, or per value of the `recording` column.
+
+    Of a file too long for memory one per minute.
+    """
     for file in parts(path, spec):
         log = opened(file, spec)
-        found = _long(log) if is_long_file(file, spec) else _whole(log)
-        for made in found:
-            counts, notes = log.ledger.news()
-            notes = (*made.notes, *notes)
-            yield validate_recording(
-                dataclasses.replace(made, rows=counts, notes=notes), file
-            )
+        for made in _recordings(log, is_long_file(file, spec)):
+            yield validate_recording(with_news(made, log.ledger), file)
 
 
 def opened(file: Path, spec: dict) -> Log:
     """A file with its mapping, none of whose rows is read."""
-    table = open_table(file, section(spec, "table"))
-    return Log(
-        table=table,
-        spec=spec,
-        mapping=mapping_of(table, spec),
-        ledger=Ledger(path=file, unit=table.unit, allowed=allowed_share(spec)),
-    )
+    table, ledger = open_log(file, spec)
+    return Log(table=table, spec=spec, mapping=mapping_of(table, spec), ledger=ledger)
 
 
-def _whole(log: Log) -> Iterator[Recording]:
-    """Recordings of a file that is held as a whole."""
-    values = read(log.table, log.mapping.fields, log.ledger)
-    names = values.pop("recording", None)
-    found = {}
-    for part in [None] if names is None else np.unique(names).tolist():
-        rows = slice(None) if names is None else names == part
-        found[part] = _placed(log, {n: column[rows] for n, column in values.items()})
-    meaning = _meaning(log, found.values(), np.unique(values.get("automated", [])))
-    for part, rows in found.items():
-        compared = [name for name in rows if name != LINE]
-        kept = single_rows(rows, log.ledger, compared)
-        rows = {name: column[kept] for name, column in rows.items()}
-        table = _localise(log, rows, meaning)
-        name = log.name if part is None else f"{log.name}-{part}"
-        yield _recording(name, table, log, meaning)
-
-
-def _long(log: Log) -> Iterator[Recording]:
-    """One Recording per minute of a file too long for memory."""
-    with long_logs.spilled(
-        log.path,
-        lambda show: batches(log.table, log.mapping.fields, log.ledger, show),
-        log.ledger,
-    ) as spill:
-        minutes = (
-            _placed(log, minute)
-            for recording in spill.recordings()
-            for minute in spill.minutes(recording)
-        )
-        meaning = _meaning(log, minutes, spill.texts.get("automated", {}))
-        for recording in spill.recordings():
+def _recordings(log: Log, is_long: bool) -> Iterator[Recording]:
+    fields, gap_s = log.mapping.fields, MAX_GAP_STEPS / log.mapping.rate_hz
+    with rows_of(log.table, fields, log.ledger, is_long=is_long) as rows:
+        every = rows.recordings()
+        minutes = (log.placed(part) for one in every for part in rows.minutes(one))
+        automated = rows.texts_of("automated")
+        meaning = meaning_of(log.path, minutes, automated, log.mapping, log.spec)
+        for recording in every:
             name = log.name if recording is None else f"{log.name}-{recording}"
-            gap_s = MAX_GAP_STEPS / log.mapping.rate_hz
-            for piece in spill.pieces(recording, gap_s):
-                rows = _placed(log, piece.values)
-                table = _localise(log, rows, meaning, start=0.0)
-                made = _recording(f"{name}-{piece.label}", table, log, meaning)
-                yield long_logs.piece_of(name, made, piece)
+            for piece in rows.pieces(recording, gap_s):
+                table = _localise(log, log.placed(piece.values), meaning)
+                made = _recording(f"{name}{piece.label}", table, log, meaning)
+                yield piece_of(name, made, piece)
 
 
-def _meaning(
-    log: Log, rows: Iterable[dict[str, np.ndarray]], automated: Iterable[str]
-) -> Meaning:
-    return meaning_of(log.path, rows, automated, log.mapping, log.spec)
-
-
-def _placed(log: Log, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Rows with x and y in metres."""
-    if log.mapping.middle is None:
-        return values
-    points = np.stack([values["x"], values["y"]], axis=1)
-    x, y = log.metres(points).T
-    return {**values, "x": x, "y": y}
-
-
-def _localise(
-    log: Log,
-    values: dict[str, np.ndarray],
-    meaning: Meaning,
-    start: float | None = None,
-) -> LogTable:
-    """Start the clock at 0 (or at `start`), move far coordinates near the origin."""
+def _localise(log: Log, values: dict[str, np.ndarray], meaning: Meaning) -> LogTable:
+    """Move far coordinates near the origin."""
     values = meaning.applied(values)
-    notes = [*log.mapping.notes, *meaning.notes]
-    values["t"] = values["t"] - (values["t"].min() if start is None else start)
-    span = max(np.ptp(values["x"]), np.ptp(values["y"]))
+    x, y = values["x"], values["y"]
+    span = max(np.ptp(x), np.ptp(y))
     if not log.mapping.has_units and 0.0 < span < STILL_M:
         raise InputError(
             f"{log.path}: x, y: all within {span:.3g} m: expected road users that move;"
             ' longitude and latitude? say units.x = "deg", units.y = "deg"'
         )
-    middle = np.array([np.median(values["x"]), np.median(values["y"])])
-    origin = np.zeros(2)
-    if np.any(np.abs(middle) > FAR_M):
-        origin = np.round(middle / ORIGIN_STEP_M) * ORIGIN_STEP_M
-        notes.append(f"local origin at x = {origin[0]:.0f} m, y = {origin[1]:.0f} m")
-    values["x"], values["y"] = values["x"] - origin[0], values["y"] - origin[1]
+    origin = local_origin(x, y)
     return LogTable(
         path=log.path,
-        values=values,
+        values={**values, "x": x - origin[0], "y": y - origin[1]},
         rate_hz=log.mapping.rate_hz,
         origin=origin,
-        notes=tuple(notes),
+        notes=(*log.mapping.notes, *meaning.notes, *origin_notes(origin)),
         metres=log.metres,
     )
 
 
 def _recording(name: str, table: LogTable, log: Log, meaning: Meaning) -> Recording:
-    spec = log.spec
-    pieces = split_tracks(
-        table.path,
-        table.values["id"],
-        table.values["t"],
-        MAX_GAP_STEPS / table.rate_hz,
-        reuse=0.0,  # rows may come in any order
-    )
+    spec, values = log.spec, table.values
+    gap_s = MAX_GAP_STEPS / table.rate_hz
+    # rows may come in any order
+    pieces = split_tracks(table.path, values["id"], values["t"], gap_s, reuse=0.0)
     tracks = tuple(
         track_of(label, table, rows, spec, meaning) for label, rows in pieces
     )

@@ -16,12 +16,14 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.importers.csv.flags import NO, YES
+from rcirl_jax.data.importers.csv.heading import half_seconds, is_large
 from rcirl_jax.data.importers.csv.mapping import (
     ALLOWED_UNITS,
     HOLE,
     NEEDED,
     OPTIONAL,
     Mapping,
+    first_cell,
 )
 from rcirl_jax.data.importers.csv.meaning import Meaning, meaning_of, with_velocity
 from rcirl_jax.data.importers.csv.names import fields_by_name, kind_by_name, unit_of
@@ -33,8 +35,7 @@ from rcirl_jax.data.importers.csv.suggestion import (
     toml_of,
     unknown,
 )
-from rcirl_jax.data.importers.options import UNITS
-from rcirl_jax.data.readers.tables.cells import EMPTY
+from rcirl_jax.data.importers.options import KINDS, UNITS
 from rcirl_jax.data.readers.tables.layout import NUMBER
 from rcirl_jax.data.readers.tables.ledger import LINE
 from rcirl_jax.data.readers.tables.table import MAX_TIME, Table, batches, open_table
@@ -150,8 +151,7 @@ def _first_rows(path: Path, spec: AnyMapping) -> dict[str, np.ndarray]:
 
 def _time_form(table: Table, guess: Guess) -> None:
     """Unit of times that are no seconds, milliseconds or frames: by the first cell."""
-    cells = [c for c in table.samples(guess.columns["t"]) if c.lower() not in EMPTY]
-    first = cells[0] if cells else ""
+    first = first_cell(table, guess.columns["t"])
     if re.match(r"\d{4}[-/]\d|\d{8}T\d|\d{1,2}:\d", first):
         guess.units["t"] = "iso"
     elif NUMBER.fullmatch(first) and abs(float(first)) > MAX_TIME:
@@ -215,34 +215,27 @@ def _heading_and_speed(
 ) -> None:
     """Units of angles by their size; of speeds by the speed of the positions."""
     if "heading" in guess.columns:
-        known = raw["heading"][np.isfinite(raw["heading"])]
-        large = bool(known.size) and np.max(np.abs(known)) > 2.0 * math.pi + 0.1
+        large = is_large(raw["heading"][np.isfinite(raw["heading"])])
         said = unit_of(guess.columns["heading"], ("deg", "rad"))
         guess.units["heading"] = said or ("deg" if large else "rad")
     for field in ("speed", "vx", "vy"):
         if field in guess.columns:
             said = unit_of(guess.columns[field], ALLOWED_UNITS["speed"])
             guess.units[field] = said or "m/s"
-    if "speed" in guess.columns and not unit_of(
-        guess.columns["speed"], ALLOWED_UNITS["speed"]
-    ):
-        guess.units["speed"] = _speed_unit(table.path, guess) or "m/s"
+            if field == "speed" and not said:
+                guess.units[field] = _speed_unit(table.path, guess) or "m/s"
 
 
 def _speed_unit(path: Path, guess: Guess) -> str:
     """The unit in which speeds are those of the positions; "" if none is."""
     rows, _, mapping = _without_wrong_headings(path, guess)
-    ids = np.unique(rows["id"], return_inverse=True)[1]
-    order = np.lexsort((rows["t"], ids))
-    step = max(round(0.5 * mapping.rate_hz), 1)
-    ends = order[step:], order[:-step]
-    same = ids[ends[0]] == ids[ends[1]]
-    moved = np.hypot(*(rows[axis][ends[0]] - rows[axis][ends[1]] for axis in "xy"))
-    real = moved / np.maximum(rows["t"][ends[0]] - rows["t"][ends[1]], 1e-9)
-    used = same & (real > 2.0) & np.isfinite(rows["speed"][ends[1]])
+    first, _, last = half_seconds(rows, mapping.rate_hz)
+    dx, dy, dt = (rows[name][last] - rows[name][first] for name in ("x", "y", "t"))
+    real, found = np.hypot(dx, dy) / np.maximum(dt, 1e-9), rows["speed"][first]
+    used = (real > 2.0) & np.isfinite(found)
     if used.sum() < 10:
         return ""
-    ratio = float(np.median(np.abs(rows["speed"][ends[1]][used]) / real[used]))
+    ratio = float(np.median(np.abs(found[used]) / real[used]))
     unit = min(SPEED_RATIOS, key=lambda name: abs(ratio / SPEED_RATIOS[name] - 1.0))
     if abs(ratio / SPEED_RATIOS[unit] - 1.0) > 0.06:
         guess.open.append(f"units.speed: {ratio:.3g} times the speed of the positions")
@@ -255,7 +248,7 @@ def _texts(raw: AnyMapping[str, np.ndarray], guess: Guess) -> None:
     """Kinds by their names; flags only where they are yes or no."""
     if "kind" in guess.columns:
         for text in np.unique(raw["kind"]).tolist():
-            if text and text not in ("vehicle", "cyclist", "pedestrian", "static"):
+            if text and text not in KINDS:
                 guess.kinds[text] = kind_by_name(text) or "vehicle"
                 if not kind_by_name(text):
                     guess.open.append(f"kinds: {text}: taken for a vehicle")

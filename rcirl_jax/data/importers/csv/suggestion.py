@@ -1,8 +1,10 @@
 """What is suggested for a table, in words: the TOML, what is known, the first rows."""
 
 import dataclasses
+import json
 import math
 import re
+from collections.abc import Callable
 from collections.abc import Mapping as AnyMapping
 from pathlib import Path
 from typing import Any
@@ -126,55 +128,53 @@ def _cell(value: object) -> str:
 
 def toml_of(path: Path, guess: Guess, meaning: Meaning) -> str:
     """The text of the source TOML."""
-    rate = guess.rate_hz or 10.0
-    parts = [
-        f"# How {path.name} is read, as names and first rows suggest. Every option:",
-        "# data_specs/sources/csv_example.toml",
-        f"source = {_text(table_stem(path))}",
-        'licence = "unknown"                    # of the data',
-        f"pattern = {_text('*' + _ending(path))}",
-        "speed_limit = 29.06                    # m/s, where a lane has none",
-        "lane_width_m = 3.5                     # m",
-        'reference_point = "centre"             # what x, y point at, or front, rear',
-        "max_bad_rows = 0.01                    # share of rows that may be dropped",
-        *_convention(meaning),
-        "",
-        "[columns]",
-        *(f"{field} = {_text(name)}" for field, name in guess.columns.items()),
-        "",
-        "[units]",
-        *(f"{field} = {_text(unit)}" for field, unit in guess.units.items()),
-        "",
-        "[defaults]",
-        f"rate_hz = {rate:g}",
-        "length = 4.5                           # m, where nothing is known",
-        "width = 1.8                            # m",
-        'kind = "vehicle"',
-    ]
-    if guess.kinds:
-        parts += ["", "[kinds]"]
-        parts += [
-            f"{_text(name)} = {_text(kind)}" for name, kind in guess.kinds.items()
-        ]
-    return "\n".join(parts) + "\n"
-
-
-def _convention(meaning: Meaning) -> list[str]:
-    """The line on how headings are meant, where they are not as usual."""
-    if meaning.form is None or not meaning.form.note:
-        return []
-    return [f"{OPTION} = {_text(meaning.form.name)}"]
-
-
-def _ending(path: Path) -> str:
-    """Ending of a table's file that the importer looks for."""
+    form = meaning.form  # of headings; said where it is not as usual
     own = path.name.removeprefix(table_stem(path))
-    return own if f"*{own}" in PATTERNS else path.name.removeprefix(path.stem)
+    ending = own if f"*{own}" in PATTERNS else path.name.removeprefix(path.stem)
+    return TOML.format(
+        name=path.name,
+        source=_text(table_stem(path)),
+        pattern=_text(f"*{ending}"),
+        convention=f'{OPTION} = "{form.name}"\n' if form and form.note else "",
+        columns=_table(guess.columns),
+        units=_table(guess.units),
+        rate=guess.rate_hz or 10.0,
+        kinds=f"\n[kinds]\n{_table(guess.kinds, _text)}\n" if guess.kinds else "",
+    )
+
+
+TOML = """\
+# How {name} is read, as names and first rows suggest. Every option:
+# data_specs/sources/csv_example.toml
+source = {source}
+licence = "unknown"                    # of the data
+pattern = {pattern}
+speed_limit = 29.06                    # m/s, where a lane has none
+lane_width_m = 3.5                     # m
+reference_point = "centre"             # what x, y point at, or front, rear
+max_bad_rows = 0.01                    # share of rows that may be dropped
+{convention}
+[columns]
+{columns}
+
+[units]
+{units}
+
+[defaults]
+rate_hz = {rate:g}
+length = 4.5                           # m, where nothing is known
+width = 1.8                            # m
+kind = "vehicle"
+{kinds}"""
+
+
+def _table(
+    values: AnyMapping[str, str], key: Callable[[str], str] = lambda name: name
+) -> str:
+    """Lines of a table of TOML."""
+    return "\n".join(f"{key(name)} = {_text(value)}" for name, value in values.items())
 
 
 def _text(value: str) -> str:
-    """A text of TOML."""
-    plain = value.replace("\\", "\\\\").replace('"', '\\"')
-    return (
-        '"' + "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in plain) + '"'
-    )
+    """A text of TOML, which JSON writes alike."""
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

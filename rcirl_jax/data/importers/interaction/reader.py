@@ -20,38 +20,39 @@ from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.data.importers.declared import (
+    KINDS,
+    Columns,
+    Rows,
+    open_log,
+    unknown_kinds,
+)
 from rcirl_jax.data.importers.files import (
+    given_map,
     input_files,
     is_input,
     log_name,
 )
 from rcirl_jax.data.importers.lanelet2.map import read_lanelet2
-from rcirl_jax.data.importers.options import number, path_option, section
+from rcirl_jax.data.importers.options import number
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.projection import utm, utm_zone
 from rcirl_jax.data.importers.tracks import split_tracks, travel_heading
-from rcirl_jax.data.readers.tables.ledger import LINE, Ledger, allowed_share
-from rcirl_jax.data.readers.tables.repair import single_rows
-from rcirl_jax.data.readers.tables.table import (
-    MAX_PLACE_M,
-    MAX_TIME,
-    MAX_VELOCITY_MPS,
-    fields_of,
-    open_table,
-    read,
-)
+from rcirl_jax.data.readers.tables.ledger import LINE, Ledger, with_news
+from rcirl_jax.data.readers.tables.repair import once
+from rcirl_jax.data.readers.tables.table import open_table, read
 from rcirl_jax.data.recording import accepted, validate_recording
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Kind, Lane, Recording, RowCounts, Track
+from rcirl_jax.types import Kind, Lane, Recording, Track
 
-NEEDED = ("track_id", "timestamp_ms", "agent_type", "x", "y", "vx", "vy")
-OPTIONAL = ("case_id", "psi_rad", "length", "width")
-TEXT = ("track_id", "agent_type")
-LIMITS = {
-    "timestamp_ms": MAX_TIME,
-    **dict.fromkeys(("x", "y"), MAX_PLACE_M),
-    **dict.fromkeys(("vx", "vy"), MAX_VELOCITY_MPS),
-}
+TABLE = Columns(
+    needed={
+        **{"track_id": "text", "timestamp_ms": "time", "agent_type": "text"},
+        **{"x": "place", "y": "place", "vx": "speed", "vy": "speed"},
+    },
+    optional=dict.fromkeys(("case_id", "psi_rad", "length", "width"), "number"),
+    t="timestamp_ms",
+)
 VEHICLES = "vehicle_tracks_"
 PEDESTRIANS = "pedestrian_tracks_"
 # files of a release that are no logs: predictions to hand in, 1 s observations
@@ -59,19 +60,9 @@ LEFT_OUT = ("_sub.csv", "_obs.csv")
 SETS = ("_train", "_val", "_test", "_obs")
 # folders below a scene's, made by the data set's own split_train_val_script.py
 SPLITS = ("train", "val", "sorted")
-KINDS = {
-    "pedestrian": Kind.PEDESTRIAN,
-    "person": Kind.PEDESTRIAN,
-    "bicycle": Kind.CYCLIST,
-    "cyclist": Kind.CYCLIST,
-}
 EITHER = "pedestrian/bicycle"
 MAPS_UP = 5  # folders above a log in which that of the maps is looked for
-RATE_HZ = 10.0  # 1/s
 MAX_GAP_MS = 550.0  # ms missing inside one track
-FAST_MPS = 3.5  # m/s; who of "pedestrian/bicycle" is faster rides
-LANE_WIDTH_M = 3.5  # m, of lanes fitted to paths
-LIMIT_MPS = 13.41  # m/s, 30 mph, where the map says nothing
 SIZES_M = {
     Kind.PEDESTRIAN: (0.5, 0.5),
     Kind.CYCLIST: (1.8, 0.6),
@@ -93,38 +84,23 @@ class _Scene:
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     """One Recording per vehicle file, or per case of a challenge file."""
     for file in parts(path, spec):
-        table, ledger = _read(file, spec)
-        scene = _scene(file, spec)
-        if np.isfinite(table["case_id"]).any():
-            for made in _cases(table, scene):
-                yield _with_rows(made, ledger)
+        rows, ledger = _read(file, spec)
+        scene, ledgers = _scene(file, spec), [ledger]
+        if np.isfinite(rows["case_id"]).any():
+            for made in _cases(rows, scene):
+                yield with_news(made, ledger)
             continue
         partner = file.with_name(file.name.replace(VEHICLES, PEDESTRIANS, 1))
-        ledgers = [ledger]
         if partner != file and partner.is_file():
-            extra, others = _read(partner, spec)
-            table = {k: np.concatenate([table[k], extra[k]]) for k in table}
-            ledgers.append(others)
-        number_ = file.stem.removeprefix(VEHICLES).removeprefix(PEDESTRIANS)
-        own = f"{_scene_name(file)}-{number_}"
+            others, ledger = _read(partner, spec)
+            rows = {k: np.concatenate([rows[k], others[k]]) for k in rows}
+            ledgers.append(ledger)
+        own = own_name(file)
         name = log_name(file, spec, own)
         # logs of one name may be copies of each other
         group = None if name == own else own
-        made = _recording(name, table, scene, group)
-        yield validate_recording(_with_rows(made, *ledgers), file)
-
-
-def _with_rows(made: Recording, *ledgers: Ledger) -> Recording:
-    """A recording that says what became of the rows of its files."""
-    found = [ledger.news() for ledger in ledgers]
-    counts = {
-        field.name: sum(getattr(rows, field.name) for rows, _ in found)
-        for field in dataclasses.fields(RowCounts)
-    }
-    notes = [note for _, dropped in found for note in dropped]
-    return dataclasses.replace(
-        made, rows=RowCounts(**counts), notes=(*made.notes, *notes)
-    )
+        made = _recording(name, rows, scene, group)
+        yield validate_recording(with_news(made, *ledgers), file)
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
@@ -174,61 +150,45 @@ def _scene_name(path: Path) -> str:
     )
 
 
-def _read(path: Path, spec: dict) -> tuple[dict[str, np.ndarray], Ledger]:
+def _read(path: Path, spec: dict) -> tuple[Rows, Ledger]:
     """All columns this module uses, and what became of the rows.
 
-    NaN where a file or a cell has none; each road user is met once in a frame.
+    NaN where a file or a cell has none; a road user is one of a case.
     """
-    source = open_table(path, section(spec, "table"))
-    ledger = Ledger(path=path, unit=source.unit, allowed=allowed_share(spec))
-    fields = fields_of(source, NEEDED, OPTIONAL, texts=TEXT, limits=LIMITS)
-    table = read(source, fields, ledger)
-    none = np.full(table["x"].size, np.nan)
-    table = {name: table.get(name, none) for name in (*NEEDED, *OPTIONAL, LINE)}
-    if "case_id" in source.header and not np.isfinite(table["case_id"]).all():
-        line = table[LINE][~np.isfinite(table["case_id"])][0]
+    table, ledger = open_log(path, spec)
+    rows = read(table, TABLE.fields(table), ledger)
+    rows = dict.fromkeys(TABLE.optional, np.full(rows[LINE].size, np.nan)) | rows
+    unknown = ~np.isfinite(rows["case_id"])
+    if table.has("case_id") and unknown.any():
+        line = rows[LINE][unknown][0]
         raise InputError(f"{path}: line {line}: case_id: '': expected a number")
-    users, codes = np.unique(table["track_id"], return_inverse=True)
-    cases = np.unique(table["case_id"], return_inverse=True)[1]
-    kept = single_rows(
-        {
-            **table,
-            "t": table["timestamp_ms"],
-            "id": (cases * users.size + codes).astype(float),
-        },
-        ledger,
-        [*NEEDED, *OPTIONAL],
-        lambda code: users[int(code) % users.size],
-    )
-    return {name: column[kept] for name, column in table.items()}, ledger
+    users, codes = np.unique(rows["track_id"], return_inverse=True)
+    cases = np.unique(rows["case_id"], return_inverse=True)[1]
+    rows["user"] = (cases * users.size + codes).astype(float)
+
+    def name_of(user: float) -> str:
+        return str(users[int(user) % users.size])
+
+    return once(rows, ledger, TABLE.t, "user", name_of=name_of), ledger
 
 
 def _scene(path: Path, spec: dict) -> _Scene:
     place = _find_map(path, spec)
-    limit = number(spec, "default_speed_limit", LIMIT_MPS)
-    if place is None:
-        note = "no map found; lanes fitted to the longest paths"
-        return _Scene(path=path, spec=spec, lanes=None, limit=limit, notes=(note,))
-    zone = utm_zone(0.0)
-    origin = utm(np.zeros(1), np.zeros(1), zone)
-    lanes, notes = read_lanelet2(place, lambda a, b: utm(a, b, zone) - origin)
-    limits = [lane.speed_limit for lane in lanes if lane.speed_limit is not None]
-    return _Scene(
-        path=path,
-        spec=spec,
-        lanes=lanes,
-        limit=float(np.median(limits)) if limits else limit,
-        notes=tuple(notes),
-    )
+    limit = number(spec, "default_speed_limit")
+    lanes, notes = None, ["no map found; lanes fitted to the longest paths"]
+    if place is not None:
+        zone = utm_zone(0.0)
+        origin = utm(np.zeros(1), np.zeros(1), zone)
+        lanes, notes = read_lanelet2(place, lambda a, b: utm(a, b, zone) - origin)
+        known = [lane.speed_limit for lane in lanes if lane.speed_limit is not None]
+        limit = float(np.median(known)) if known else limit
+    return _Scene(path=path, spec=spec, lanes=lanes, limit=limit, notes=tuple(notes))
 
 
 def _find_map(path: Path, spec: dict) -> Path | None:
     """maps/SCENE.osm_xy or .osm in a folder above; the option `map` names one."""
     folders = [folder / "maps" for folder in path.resolve().parents[:MAPS_UP]]
-    if spec.get("map"):
-        given = Path(path_option(spec, "map"))
-        if not given.exists():
-            raise InputError(f"{given}: map: missing: expected a file or folder")
+    if (given := given_map(spec)) is not None:
         if given.is_file():
             return given
         folders = [given]
@@ -256,7 +216,7 @@ def _is_numbered(one: str, other: str) -> bool:
     return long.removeprefix(short).isdigit() and not short[-1:].isdigit()
 
 
-def _cases(table: dict[str, np.ndarray], scene: _Scene) -> Iterator[Recording]:
+def _cases(table: Rows, scene: _Scene) -> Iterator[Recording]:
     """One Recording per case; all of a file are one group, they share vehicles."""
     order = np.argsort(table["case_id"], kind="stable")
     case = table["case_id"][order]
@@ -268,26 +228,23 @@ def _cases(table: dict[str, np.ndarray], scene: _Scene) -> Iterator[Recording]:
         yield accepted(make, name, scene.path, scene.spec)
 
 
-def _recording(
-    name: str, table: dict[str, np.ndarray], scene: _Scene, group: str | None
-) -> Recording:
+def _recording(name: str, table: Rows, scene: _Scene, group: str | None) -> Recording:
     stamps = table["timestamp_ms"]
     table["t"] = (stamps - stamps.min()) / 1000.0
     pieces = split_tracks(scene.path, table["track_id"], stamps, MAX_GAP_MS)
     notes = list(scene.notes)
     tracks = tuple(_track(label, rows, table, scene) for label, rows in pieces)
-    unknown = set(np.unique(table["agent_type"])) - {EITHER, *KINDS, *MOTORISED}
-    if unknown:
-        notes.append(f"agent types taken for vehicles: {', '.join(sorted(unknown))}")
+    kinds = set(np.unique(table["agent_type"])) - {EITHER}
+    notes += unknown_kinds("agent types", kinds)
     lanes = scene.lanes
     if lanes is None:
-        width = number(scene.spec, "lane_width_m", LANE_WIDTH_M)
+        width = number(scene.spec, "lane_width_m")
         lanes = path_lanes(tracks, width, None)
     return Recording(
         name=name,
-        source=str(scene.spec.get("source", "INTERACTION dataset")),
-        licence=str(scene.spec.get("licence", "INTERACTION: research use only")),
-        rate_hz=number(scene.spec, "rate_hz", RATE_HZ),
+        source=scene.spec["source"],
+        licence=scene.spec["licence"],
+        rate_hz=number(scene.spec, "rate_hz"),
         tracks=tracks,
         lanes=lanes,
         group=group,
@@ -296,18 +253,13 @@ def _recording(
     )
 
 
-MOTORISED = ("car", "truck", "bus", "van", "motorcycle", "vehicle")
-
-
-def _track(
-    name: str, rows: np.ndarray, table: dict[str, np.ndarray], scene: _Scene
-) -> Track:
+def _track(name: str, rows: np.ndarray, table: Rows, scene: _Scene) -> Track:
     t, x, y, psi = (table[field][rows] for field in ("t", "x", "y", "psi_rad"))
     speed = np.hypot(table["vx"][rows], table["vy"][rows])
     agent = str(table["agent_type"][rows[0]]).lower()
     kind = KINDS.get(agent, Kind.VEHICLE)
     if agent == EITHER:
-        fast = number(scene.spec, "cyclist_speed_mps", FAST_MPS)
+        fast = number(scene.spec, "cyclist_speed_mps")
         rides = float(np.percentile(speed, 90.0)) > fast
         kind = Kind.CYCLIST if rides else Kind.PEDESTRIAN
     sizes = []

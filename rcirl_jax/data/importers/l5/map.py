@@ -5,8 +5,7 @@ and longitude); meta.json holds the transform of the dataset's world to Earth-ce
 coordinates.
 """
 
-import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,42 +14,25 @@ from google.protobuf.message import DecodeError
 from rcirl_jax.data.importers.l5.messages import COLOURS, read_message
 from rcirl_jax.data.importers.options import path_option
 from rcirl_jax.data.importers.projection import earth_centred
-from rcirl_jax.data.importers.shapes import between_bounds, check_coordinates, moves
+from rcirl_jax.data.importers.shapes import (
+    Roads,
+    between_bounds,
+    check_coordinates,
+    moves,
+)
+from rcirl_jax.data.importers.signals import STATES, held, signal_of
 from rcirl_jax.data.readers.protobuf import Message
-from rcirl_jax.data.readers.zarr2 import read_json
 from rcirl_jax.errors import InputError
+from rcirl_jax.runtime.atomic_files import read_json
+from rcirl_jax.runtime.checked import checked
 from rcirl_jax.types import Lane, Signal
 
 MAX_MAP_BYTES = 32 * 1024**2  # bytes; the public map has some 10 MB
 MAX_META_BYTES = 16 * 1024**2  # bytes of meta.json
-MARGIN_M = 150.0  # m of map around the tracks
 HOLD_S = 1.0  # s, a light unseen keeps its state this long
 MAX_LIMIT_MPS = 60.0  # m/s; faster "limits" are none
 ONLY_BIKE = 4  # AccessRestriction.Type
 BACKWARD = 3  # RoadNetworkSegment.TravelDirection
-STATES = ("red", "yellow", "green")  # ties of a vote go to the first
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class LightFaces:
-    """Faces of traffic lights as seen in the frames of a scene."""
-
-    t: np.ndarray  # [frames] s
-    frame: np.ndarray  # [n] number of the frame, ascending
-    face: np.ndarray  # [n] id, text
-    is_active: np.ndarray  # [n] bool, lit
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _RawLane:
-    id: str
-    left: np.ndarray  # [m, 2] m, in the world
-    right: np.ndarray  # [k, 2] m
-    parent: str
-    backward: bool
-    ahead: tuple[str, ...]
-    beside: tuple[str | None, str | None]  # left, right
-    controls: tuple[str, ...]
 
 
 def find_map(folder: Path, spec: dict) -> Path | None:
@@ -96,66 +78,58 @@ class SemanticMap:
                 f"expected at most {MAX_MAP_BYTES}"
             )
         try:
-            raw = list(self._elements(read_message(file.read_bytes())))
+            raw = dict(self._elements(read_message(file.read_bytes())))
+            found = (self._lane(name, lane) for name, lane in raw.items())
+            lanes = {lane.id: lane for lane in found if lane is not None}
         except DecodeError as error:
             raise InputError(f"{file}: {error}: expected a semantic map") from error
-        lanes = {lane.id: lane for lane in map(self._lane, raw) if lane is not None}
         if not lanes:
             raise InputError(f"{file}: lanes: none: expected a semantic map")
-        self._lanes = list(lanes.values())
-        self._boxes = np.array(
-            [[lane.centre.min(axis=0), lane.centre.max(axis=0)] for lane in self._lanes]
-        ).reshape(-1, 2, 2)
+        every = list(lanes.values())
+        self.roads = Roads([lane.centre for lane in every], every.__getitem__)
 
-    def lanes(self, x: np.ndarray, y: np.ndarray, origin: np.ndarray) -> tuple:
-        """Lanes around positions [m], less the origin."""
-        low = np.array([x.min(), y.min()]) - MARGIN_M
-        high = np.array([x.max(), y.max()]) + MARGIN_M
-        near = (self._boxes[:, 1] >= low).all(1) & (self._boxes[:, 0] <= high).all(1)
-        return tuple(
-            dataclasses.replace(
-                lane,
-                centre=lane.centre - origin,
-                stop_line=None if lane.stop_line is None else lane.stop_line - origin,
-            )
-            for lane in (self._lanes[index] for index in np.flatnonzero(near))
-        )
-
-    def signals(self, lanes: tuple[Lane, ...], seen: LightFaces) -> tuple:
+    def signals(
+        self,
+        lanes: Sequence[Lane],
+        t: np.ndarray,
+        frame: np.ndarray,
+        face: np.ndarray,
+        is_active: np.ndarray,
+    ) -> tuple[Signal, ...]:
         """One signal per set of faces that governs a lane and was seen.
 
         The state of a frame is the colour that most lit faces of the set show;
         a set unseen for a second is off.
+
+        Args:
+          lanes: of the scene.
+          t: [frames] s.
+          frame: [n] number of the frame in which a face was seen, ascending.
+          face: [n] its id, text.
+          is_active: [n] whether it was lit.
         """
-        names = dict.fromkeys(name for lane in lanes for name in lane.signal_ids)
-        found = (self._signal(name, seen) for name in names)
-        return tuple(signal for signal in found if signal is not None)
+        found = []
+        for name in dict.fromkeys(name for lane in lanes for name in lane.signal_ids):
+            members = np.array(name.split("|"))
+            colours = np.array([STATES.index(self._faces[one]) for one in members])
+            rows = np.flatnonzero(np.isin(face, members))
+            if rows.size == 0:
+                continue
+            order = np.argsort(members)
+            place = order[np.searchsorted(members[order], face[rows])]
+            votes = np.zeros((t.size, len(STATES)), np.int64)
+            np.add.at(votes, (frame[rows], colours[place]), is_active[rows])
+            frames = np.unique(frame[rows])
+            # without a vote it is off; ties go to the first
+            states = held(t, t[frames], votes[frames].argmax(axis=1), HOLD_S)
+            found.append(signal_of(name, t, states))
+        return tuple(found)
 
-    def _signal(self, name: str, seen: LightFaces) -> Signal | None:
-        members = name.split("|")
-        colours = np.array([STATES.index(self._faces[face]) for face in members])
-        rows = np.flatnonzero(np.isin(seen.face, members))
-        if rows.size == 0:
-            return None
-        order = np.argsort(members)
-        place = order[np.searchsorted(np.array(members)[order], seen.face[rows])]
-        votes = np.zeros((seen.t.size, len(STATES)), np.int64)
-        np.add.at(votes, (seen.frame[rows], colours[place]), seen.is_active[rows])
-        state = np.where(votes.any(axis=1), votes.argmax(axis=1), -1)
-        was_seen = np.zeros(seen.t.size, bool)
-        was_seen[seen.frame[rows]] = True
-        last = np.maximum.accumulate(np.where(was_seen, np.arange(seen.t.size), -1))
-        fresh = (last >= 0) & (seen.t - seen.t[last] <= HOLD_S)
-        state = np.where(fresh, state[last], -1)
-        change = np.flatnonzero(np.diff(state, prepend=-2) != 0)
-        return Signal(
-            id=name,
-            start=seen.t[change],
-            state=tuple(STATES[k] if k >= 0 else "off" for k in state[change]),
-        )
+    def _elements(self, fragment: Message) -> Iterator[tuple[str, Message]]:
+        """Lanes of a MapFragment by id; limits and controls are kept on the way.
 
-    def _elements(self, fragment: Message) -> Iterator[_RawLane]:
-        """Lanes of a MapFragment; limits and controls are kept on the way."""
+        Stubs without bounds and bicycle lanes are left out.
+        """
         for entry in fragment.elements:
             name, element = entry.id.id, entry.element
             if element.HasField("segment"):
@@ -164,8 +138,10 @@ class SemanticMap:
             if element.HasField("control"):
                 self._add_control(name, element.control)
             if element.HasField("lane"):
-                lane = self._raw_lane(name, element.lane)
-                yield from () if lane is None else (lane,)
+                lane = element.lane
+                is_whole = all(map(lane.HasField, ("frame", "left", "right")))
+                if is_whole and lane.access.type != ONLY_BIKE:
+                    yield name, lane
 
     def _add_control(self, name: str, control: Message) -> None:
         if control.HasField("stop_sign"):
@@ -175,26 +151,6 @@ class SemanticMap:
         for field, _ in control.ListFields():
             if field.number in COLOURS:
                 self._faces[name] = COLOURS[field.number]
-
-    def _raw_lane(self, name: str, lane: Message) -> _RawLane | None:
-        """A lane; None for stubs without bounds and for bicycle lanes."""
-        is_whole = all(map(lane.HasField, ("frame", "left", "right")))
-        if not is_whole or lane.access.type == ONLY_BIKE:
-            return None
-        frame = _frame(lane.frame)
-        left, right = (self._bound(name, b, frame) for b in (lane.left, lane.right))
-        if min(len(left), len(right)) < 2:
-            return None
-        return _RawLane(
-            id=name,
-            left=left,
-            right=right,
-            parent=lane.parent.id,
-            backward=lane.direction == BACKWARD,
-            ahead=tuple(other.id for other in lane.ahead),
-            beside=(lane.beside_left.id or None, lane.beside_right.id or None),
-            controls=tuple(control.id for control in lane.controls),
-        )
 
     def _bound(self, name: str, bound: Message, frame: np.ndarray) -> np.ndarray:
         """A lane bound [m, 2] m in the world; points that repeat are dropped."""
@@ -221,8 +177,11 @@ class SemanticMap:
             found += faces if faces == (name,) or named.isdisjoint(faces) else ()
         return found
 
-    def _lane(self, raw: _RawLane) -> Lane | None:
-        left, right = raw.left, raw.right
+    def _lane(self, name: str, lane: Message) -> Lane | None:
+        frame = _frame(lane.frame)
+        left, right = (self._bound(name, b, frame) for b in (lane.left, lane.right))
+        if min(len(left), len(right)) < 2:
+            return None
         centre, half = between_bounds(left, right)
         if len(centre) < 2:
             return None
@@ -231,24 +190,26 @@ class SemanticMap:
         if along[0] * across[1] - along[1] * across[0] < 0.0:
             left, right = left[::-1], right[::-1]
             centre, half = centre[::-1], half[::-1]
-        forward, back = self._limits.get(raw.parent, (0.0, 0.0))
-        limit = back if raw.backward and back > 0.0 else forward
-        faces = self._faces_of(raw.controls)
+        parent = lane.parent.id
+        forward, back = self._limits.get(parent, (0.0, 0.0))
+        limit = back if lane.direction == BACKWARD and back > 0.0 else forward
+        controls = tuple(control.id for control in lane.controls)
+        faces = self._faces_of(controls)
         governing = sorted({face for face in faces if face in self._faces})
-        stop_sign = any(name in self._stop_signs for name in raw.controls)
-        stops = bool(governing) or stop_sign
+        stop_sign = any(control in self._stop_signs for control in controls)
         # who is inside a junction was held at its edge: a parent that is no segment
-        at = 0 if raw.parent and raw.parent not in self._limits else -1
+        at = 0 if parent and parent not in self._limits else -1
+        stops = np.stack([left[at], right[at]]) if governing or stop_sign else None
         return Lane(
-            id=raw.id,
+            id=name,
             centre=centre,
             left_width=half,
             right_width=half,
             speed_limit=limit if 0.0 < limit <= MAX_LIMIT_MPS else None,
-            successors=raw.ahead,
-            left=raw.beside[0],
-            right=raw.beside[1],
-            stop_line=np.stack([left[at], right[at]]) if stops else None,
+            successors=tuple(other.id for other in lane.ahead),
+            left=lane.beside_left.id or None,
+            right=lane.beside_right.id or None,
+            stop_line=stops,
             signal_ids=("|".join(governing),) if governing else (),
             stop_sign=stop_sign,
         )
@@ -260,19 +221,14 @@ def _frame(geo: Message) -> np.ndarray:
     Origin in 1e-7 degrees on the WGS84 ellipsoid; bearing in degrees clockwise from
     north to the local y axis.
     """
-    degrees = [1e-7 * geo.origin.latitude, 1e-7 * geo.origin.longitude]
+    degrees = 1e-7 * geo.origin.latitude, 1e-7 * geo.origin.longitude
     if abs(degrees[0]) > 90.0 or abs(degrees[1]) > 180.0:
         raise DecodeError(f"frame at latitude, longitude {degrees}: not on Earth")
     latitude, longitude = np.deg2rad(degrees)
     turn = np.deg2rad(geo.bearing)
-    east = np.array([-np.sin(longitude), np.cos(longitude), 0.0])
-    up = np.array(
-        [
-            np.cos(latitude) * np.cos(longitude),
-            np.cos(latitude) * np.sin(longitude),
-            np.sin(latitude),
-        ]
-    )
+    flat = np.array([np.cos(longitude), np.sin(longitude), 0.0])
+    east = np.array([-flat[1], flat[0], 0.0])
+    up = np.cos(latitude) * flat + np.array([0.0, 0.0, np.sin(latitude)])
     north = np.cross(up, east)
     frame = np.eye(4)
     frame[:3, 0] = np.cos(turn) * east - np.sin(turn) * north
@@ -296,7 +252,7 @@ def world_to_ecef(file: Path, spec: dict) -> np.ndarray:
     meta = next((place for place in places if place.is_file()), None)
     where, found = "source TOML", spec.get("world_to_ecef")
     if meta is not None:
-        content = read_json(meta, MAX_META_BYTES)
+        content = checked(read_json(meta, "an object", MAX_META_BYTES), dict, meta)
         known = content.get("world_to_ecef", content.get("pose_to_ecef"))
         if known is not None:
             where, found = str(meta), known

@@ -1,6 +1,6 @@
 """The fields that are read of L5Kit's road_network.proto (package pb.lyft.maps)."""
 
-from rcirl_jax.data.readers.protobuf import Field, parser
+from rcirl_jax.data.readers.protobuf import parser, table_of
 
 # traffic controls that are faces of one colour: round, arrows, U-turn, flashing
 COLOURS = {
@@ -8,43 +8,23 @@ COLOURS = {
     **dict.fromkeys((12, 36, 37, 39, 42, 45, 9), "yellow"),
     **dict.fromkeys((13, 31, 33, 40, 43, 46), "green"),
 }
-TYPES = {
-    "MapFragment": {"elements": Field("MapElement", 2, repeated=True)},
-    "MapElement": {"id": Field("GlobalId", 1), "element": Field("Element", 2)},
-    "GlobalId": {"id": Field("string", 1)},
-    "Element": {
-        "segment": Field("Segment", 1),
-        "lane": Field("Lane", 3),
-        "control": Field("Control", 4),
-    },
-    "Segment": {"limit": Field("float", 9), "limit_backward": Field("float", 10)},
-    "Lane": {
-        "parent": Field("GlobalId", 1),
-        "frame": Field("GeoFrame", 2),
-        "left": Field("Bound", 3),
-        "right": Field("Bound", 4),
-        "ahead": Field("GlobalId", 5, repeated=True),
-        "beside_left": Field("GlobalId", 6),
-        "beside_right": Field("GlobalId", 7),
-        "controls": Field("GlobalId", 8, repeated=True),
-        "access": Field("Access", 11),
-        "direction": Field("int64", 12),
-    },
-    "GeoFrame": {"origin": Field("GeoPoint", 1), "bearing": Field("float", 2)},
-    "GeoPoint": {"latitude": Field("sfixed32", 1), "longitude": Field("sfixed32", 2)},
-    "Bound": {
-        "x": Field("sint32", 1, repeated=True),
-        "y": Field("sint32", 2, repeated=True),
-        "z": Field("sint32", 3, repeated=True),
-    },
-    "Access": {"type": Field("int64", 1)},
-    "Control": {
-        "stop_sign": Field("Nothing", 7),
-        "light": Field("Light", 29),
-        **{f"face_{number}": Field("Nothing", number) for number in COLOURS},
-    },
-    "Light": {"faces": Field("GlobalId", 3, repeated=True)},
-    "Nothing": {},
-}
+FACES = ", ".join(f"face_{number} {number} Nothing" for number in COLOURS)
+SCHEMA = f"""
+MapFragment: elements 2 MapElement*
+MapElement: id 1 GlobalId, element 2 Element
+GlobalId: id 1 string
+Element: segment 1 Segment, lane 3 Lane, control 4 Control
+Segment: limit 9 float, limit_backward 10 float
+Lane: parent 1 GlobalId, frame 2 GeoFrame, left 3 Bound, right 4 Bound,\
+ ahead 5 GlobalId*, beside_left 6 GlobalId, beside_right 7 GlobalId,\
+ controls 8 GlobalId*, access 11 Access, direction 12 int64
+GeoFrame: origin 1 GeoPoint, bearing 2 float
+GeoPoint: latitude 1 sfixed32, longitude 2 sfixed32
+Bound: x 1 sint32*, y 2 sint32*, z 3 sint32*
+Access: type 1 int64
+Control: stop_sign 7 Nothing, light 29 Light, {FACES}
+Light: faces 3 GlobalId*
+Nothing:
+"""
 
-read_message = parser(TYPES)
+read_message = parser(table_of(SCHEMA))

@@ -21,7 +21,6 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.importers.l5.map import (
-    LightFaces,
     SemanticMap,
     find_map,
     world_to_ecef,
@@ -33,11 +32,12 @@ from rcirl_jax.data.importers.l5.scenes import (
     scenes_of,
     tables_of,
 )
-from rcirl_jax.data.importers.options import number, positive, recording_car, section
-from rcirl_jax.data.importers.paths import path_lanes
+from rcirl_jax.data.importers.options import number, positive, recording_car
 from rcirl_jax.data.importers.perception import (
     UNKNOWN,
     Boxes,
+    ego_boxes,
+    fitted_lanes,
     placed,
     tracks_of,
 )
@@ -85,7 +85,6 @@ PIECE_SCENES = 8  # scenes of a piece; their demonstrations are held at once
 MAX_FRAMES = 36_000  # frames of one scene: an hour
 MAX_AGENTS = 5_000_000  # agent records of one scene
 LIMIT_MPS = 15.65  # m/s, 35 mph: main roads of Palo Alto
-LANE_WIDTH_M = 3.5  # m
 EGO = {"length": 4.87, "width": 1.85, "centre_ahead": 0.0}  # m
 
 
@@ -196,15 +195,11 @@ def _recording(
     x, y, origin, tracks = placed(tracks)
     lanes, signals, map_notes = (), (), []
     if semantic_map is not None:
-        lanes = semantic_map.lanes(x, y, origin)
+        lanes = semantic_map.roads.around(x, y, origin)
         signals, map_notes = _signals(where, dataset, frames, t, semantic_map, lanes)
     if not lanes:
-        lanes = path_lanes(
-            tracks,
-            positive(spec, "lane_width_m", LANE_WIDTH_M),
-            positive(spec, "speed_limit", LIMIT_MPS),
-        )
-        map_notes = [f"no map here; {len(lanes)} lanes fitted to the longest paths"]
+        lanes, note = fitted_lanes(tracks, spec, LIMIT_MPS)
+        map_notes = [f"no map here; {note}"]
     return Recording(
         name=name,
         source=str(spec.get("source", "L5 prediction dataset")),
@@ -220,10 +215,6 @@ def _recording(
 
 def _ego(path: Path, frames: np.ndarray, t: np.ndarray, spec: dict) -> list[Track]:
     """The recording car; its speed comes from its positions."""
-    size = {
-        name: number(section(spec, "ego"), name, default)
-        for name, default in EGO.items()
-    }
     x, y, _ = frames["ego_translation"].astype(np.float64).T
     check_coordinates(path, "ego_translation", ("x", "y"), np.stack([x, y], axis=1))
     ahead = frames["ego_rotation"][:, :2, 0].astype(np.float64)  # [n, 2] unit
@@ -234,23 +225,8 @@ def _ego(path: Path, frames: np.ndarray, t: np.ndarray, spec: dict) -> list[Trac
             "expected a rotation matrix"
         )
     heading = np.arctan2(ahead[:, 1], ahead[:, 0])
-    x = x + size["centre_ahead"] * np.cos(heading)
-    y = y + size["centre_ahead"] * np.sin(heading)
-    boxes = Boxes(
-        ids=np.zeros(t.size, np.int64),
-        names=("ego",),
-        t=t,
-        x=x,
-        y=y,
-        heading=heading,
-        speed=np.full(t.size, np.nan),
-        length=np.full(t.size, size["length"]),
-        width=np.full(t.size, size["width"]),
-        kind=np.full(t.size, int(Kind.VEHICLE)),
-    )
-    automated = recording_car(spec)
-    found, _ = tracks_of(path, boxes, MAX_GAP_S)
-    return [dataclasses.replace(track, automated=automated) for track in found]
+    boxes = ego_boxes(spec, EGO, t, x, y, heading, np.full(t.size, np.nan))
+    return tracks_of(path, boxes, MAX_GAP_S, automated=recording_car(spec))[0]
 
 
 def _others(
@@ -327,10 +303,5 @@ def _signals(
         f"{where}: {FACE_INTERVAL}", dataset.faces, frames[FACE_INTERVAL]
     )
     status = faces["traffic_light_face_status"]
-    seen = LightFaces(
-        t=t,
-        frame=frame,
-        face=faces["face_id"],
-        is_active=status.argmax(axis=1) == 0 if faces.size else np.zeros(0, bool),
-    )
-    return semantic_map.signals(lanes, seen), []
+    lit = status.argmax(axis=1) == 0 if faces.size else np.zeros(0, bool)
+    return semantic_map.signals(lanes, t, frame, faces["face_id"], lit), []

@@ -1,23 +1,24 @@
 """Lanes of leveLXData recordings: highD's markings, and where a map lies."""
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.importers.options import path_option
+from rcirl_jax.data.importers.files import given_map
+from rcirl_jax.data.importers.lanes import StraightLane, parallel_lane
 from rcirl_jax.data.recording import check_lanes_length
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane
 
 MARGIN_M = 50.0  # m of lane beyond the first and last position
-STEP_M = 5.0  # m between points of a lane
 MAP_FOLDERS = ("maps", "lanelets", "lanelet2")
 
 
 def marked_lanes(
     path: Path,
-    meta: dict[str, str],
+    meta: Mapping[str, str],
     along: tuple[float, float],
     limit: float | None,
     rows: tuple[np.ndarray, np.ndarray],
@@ -50,7 +51,7 @@ def marked_lanes(
 SIDES = {"upper": -1.0, "lower": 1.0}
 
 
-def _markings(path: Path, meta: dict[str, str], field: str) -> np.ndarray:
+def _markings(path: Path, meta: Mapping[str, str], field: str) -> np.ndarray:
     """[m] m, y of the markings from top to bottom (y up)."""
     text = meta.get(field, "")
     try:
@@ -72,32 +73,15 @@ def _carriageway(
     along: tuple[float, float],
     limit: float | None,
 ) -> list[Lane]:
-    x = np.linspace(
-        along[0] - MARGIN_M,
-        along[1] + MARGIN_M,
-        int((along[1] - along[0] + 2.0 * MARGIN_M) / STEP_M) + 2,
-    )
-    x = x if forward else x[::-1]
-    count = len(marks) - 1
     # the lane above (smaller number) is to the left of one driven towards +x
-    left, right = (-1, 1) if forward else (1, -1)
-    lanes = []
-    for place in range(count):
-        half = np.full(x.shape, 0.5 * (marks[place] - marks[place + 1]))
-        y = 0.5 * (marks[place] + marks[place + 1])
-        sides = [place + left, place + right]
-        names = [str(first + s) if 0 <= s < count else None for s in sides]
-        lanes.append(
-            Lane(
-                id=str(first + place),
-                centre=np.stack([x, np.full(x.shape, y)], axis=1),
-                left_width=half,
-                right_width=half,
-                speed_limit=limit,
-                left=names[0],
-                right=names[1],
-            )
-        )
+    ends = {"lower": along[0] - MARGIN_M, "upper": along[1] + MARGIN_M}
+    numbers, lanes = range(first, first + len(marks) - 1), []
+    for number, above, below in zip(numbers, marks, marks[1:], strict=False):
+        half, y = 0.5 * (above - below), 0.5 * (above + below)
+        around = [number - 1, number + 1] if forward else [number + 1, number - 1]
+        ids = [str(n) if n in numbers else None for n in around]
+        lane = StraightLane(id=str(number), y=y, forward=forward, **ends)
+        lanes.append(parallel_lane(lane, (half, half), ids, limit))
     return lanes
 
 
@@ -108,10 +92,7 @@ def find_map(path: Path, location: str, spec: dict) -> Path | None:
     lanelets/location4.osm) beside the folder `data`. The option `map` names a
     file, or a folder to look into.
     """
-    if spec.get("map"):
-        given = Path(path_option(spec, "map"))
-        if not given.exists():
-            raise InputError(f"{given}: map: missing: expected a file or folder")
+    if (given := given_map(spec)) is not None:
         if given.is_file():
             return given
         return _of_location(sorted(given.rglob("*.osm")), location)

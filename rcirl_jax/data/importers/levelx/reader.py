@@ -14,24 +14,28 @@ degrees, moved by the recording's UTM origin, a trailer is a track of its own.
 """
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.data.importers.declared import (
+    KINDS,
+    Columns,
+    Rows,
+    open_log,
+    unknown_kinds,
+)
 from rcirl_jax.data.importers.files import files_below, log_name
 from rcirl_jax.data.importers.lanelet2.map import read_lanelet2
 from rcirl_jax.data.importers.levelx.map import find_map, marked_lanes
-from rcirl_jax.data.importers.options import number, section
+from rcirl_jax.data.importers.options import number
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.projection import utm, utm_zone
 from rcirl_jax.data.importers.tracks import split_tracks, travel_heading
-from rcirl_jax.data.readers.tables.ledger import Ledger, allowed_share
-from rcirl_jax.data.readers.tables.repair import single_rows
+from rcirl_jax.data.readers.tables.ledger import Ledger, with_news
 from rcirl_jax.data.readers.tables.table import (
     MAX_PLACE_M,
-    MAX_TIME,
-    MAX_VELOCITY_MPS,
     Table,
     fields_of,
     open_table,
@@ -41,36 +45,33 @@ from rcirl_jax.data.recording import check_span, validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind, Lane, Recording, Track
 
-SUFFIX = "_tracks.csv"
-USERS = "_tracksMeta.csv"
-CORNER = ("frame", "id", "x", "y", "width", "height", "xVelocity", "yVelocity")
-CENTRE = (
-    *("frame", "trackId", "xCenter", "yCenter", "heading", "width", "length"),
-    *("xVelocity", "yVelocity"),
+SUFFIX, USERS, META = "_tracks.csv", "_tracksMeta.csv", "_recordingMeta.csv"
+MOVES = {"vx": "speed", "vy": "speed"}
+CORNER = Columns(
+    needed={
+        **{"frame": "time", "id": "number", "x": "place", "y": "place"},
+        **{"length": "place", "width": "place", **MOVES},
+    },
+    called={"length": "width", "width": "height", "vx": "xVelocity", "vy": "yVelocity"},
+    t="frame",
+    name_of="{:g}".format,
 )
-LIMITS = {
-    "frame": MAX_TIME,
-    **dict.fromkeys(
-        ("x", "y", "xCenter", "yCenter", "width", "height", "length"), MAX_PLACE_M
-    ),
-    **dict.fromkeys(("xVelocity", "yVelocity"), MAX_VELOCITY_MPS),
-}
-KINDS = {
-    "pedestrian": Kind.PEDESTRIAN,
-    "animal": Kind.PEDESTRIAN,
-    "bicycle": Kind.CYCLIST,
-    "bicyclist": Kind.CYCLIST,
-    # in the way of others like any body that moves, but nobody drives it: only
-    # vehicles are experts (Argoverse 2's "unknown" and Waymo's "other" likewise)
-    "trailer": Kind.CYCLIST,
-}
-MOTORISED = ("car", "van", "truck", "bus", "truck_bus", "motorcycle")
+CENTRE = Columns(
+    needed={
+        **{"frame": "time", "id": "number", "x": "place", "y": "place"},
+        **{"heading": "number", "width": "place", "length": "place", **MOVES},
+    },
+    called={
+        **{"id": "trackId", "x": "xCenter", "y": "yCenter"},
+        **{"vx": "xVelocity", "vy": "yVelocity"},
+    },
+    t="frame",
+    name_of="{:g}".format,
+)
 LIFE = ("numFrames", "initialFrame", "finalFrame")  # of a track, in tracksMeta
 MAX_GAP_FRAMES = 5.5  # frames missing inside one track
 MAX_ID = 2**53  # beyond it float64 does not count
 FAR_M = 200.0  # m; a map that far from all tracks is not theirs
-LANE_WIDTH_M = 3.5  # m, of lanes fitted to paths
-LIMIT_MPS = 36.11  # m/s, 130 km/h, advised where German motorways have no limit
 SIZE_M = (0.5, 0.5)  # m, length and width of a road user without a box
 
 
@@ -81,6 +82,44 @@ class _User:
     kind: str  # class in lower case
     direction: float  # highD's drivingDirection, 1 towards -x; else 0
     life: tuple[float, float, float]  # its LIFE
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Meta:
+    """The one row of a recordingMeta.csv, as text."""
+
+    path: Path
+    cells: Mapping[str, str]
+
+    def number(self, field: str, limit: float = np.inf) -> float:
+        """A number, finite and within a limit."""
+        found = self.cells.get(field, "missing")[:40]
+        try:
+            value = float(self.cells.get(field, "nan"))
+        except ValueError:
+            value = float("nan")
+        if not (np.isfinite(value) and abs(value) <= limit):
+            kind = "finite number" if limit == np.inf else f"number within {limit:g}"
+            raise InputError(f"{self.path}: {field}: '{found}': expected a {kind}")
+        return value
+
+    @property
+    def rate(self) -> float:
+        """Frames per second."""
+        rate = self.number("frameRate")
+        if not 1.0 <= rate <= 1000.0:
+            raise InputError(
+                f"{self.path}: frameRate: {rate:g}: expected 1 to 1000 1/s"
+            )
+        return rate
+
+    @property
+    def limit(self) -> float | None:
+        """The speed limit [m/s]; -1 stands for none."""
+        if self.cells.get("speedLimit", "").lower() in ("", "nan"):
+            return None
+        limit = self.number("speedLimit")
+        return limit if limit > 0.0 else None
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
@@ -98,12 +137,13 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     for file in parts(path, spec):
         if not file.name.endswith(SUFFIX):
             raise InputError(f"{file}: name: {file.name}: expected XX{SUFFIX}")
-        table = open_table(file, section(spec, "table"))
-        made = _read_centres if "xCenter" in table.header else _read_corners
-        yield validate_recording(made(table, spec), file)
+        table, ledger = open_log(file, spec)
+        made = _recording(table, spec, ledger)
+        yield validate_recording(with_news(made, ledger), file)
 
 
 def _other(path: Path, suffix: str) -> Path:
+    """The name of the same recording's file with another ending."""
     return path.with_name(path.name.removesuffix(SUFFIX) + suffix)
 
 
@@ -115,154 +155,85 @@ def _beside(path: Path, suffix: str) -> Path:
     return other
 
 
-def _read_meta(path: Path) -> dict[str, str]:
-    """The one row of a recordingMeta.csv, as text."""
+def _read_meta(path: Path) -> _Meta:
     table = open_table(path, {"delimiter": ","})  # semicolons stand inside of cells
-    rows = [list(row) for row in table.head]
-    if len(rows) != 1 or len(rows[0]) != len(table.header):
-        sizes = [len(row) for row in rows][:3]
+    sizes = [len(row) for row in table.head]
+    if sizes != [len(table.header)]:
         raise InputError(
-            f"{path}: rows: {len(rows)} of {sizes} cells: "
+            f"{path}: rows: {len(sizes)} of {sizes[:3]} cells: "
             f"expected one of {len(table.header)}"
         )
-    return dict(zip(table.header, (cell.strip() for cell in rows[0]), strict=True))
+    texts = map(str.strip, table.head[0])
+    return _Meta(path=path, cells=dict(zip(table.header, texts, strict=True)))
 
 
-def _meta_number(
-    path: Path, meta: dict[str, str], field: str, limit: float = np.inf
-) -> float:
-    """A number of a recordingMeta.csv, finite and within a limit."""
-    try:
-        value = float(meta[field])
-    except (KeyError, ValueError):
-        value = float("nan")
-    if not (np.isfinite(value) and abs(value) <= limit):
-        found = meta.get(field, "missing")[:40]
-        kind = "finite number" if limit == np.inf else f"number within {limit:g}"
-        raise InputError(f"{path}: {field}: '{found}': expected a {kind}")
-    return value
-
-
-def _rate(path: Path, meta: dict[str, str]) -> float:
-    rate = _meta_number(path, meta, "frameRate")
-    if not 1.0 <= rate <= 1000.0:
-        raise InputError(f"{path}: frameRate: {rate:g}: expected 1 to 1000 1/s")
-    return rate
-
-
-def _limit(path: Path, meta: dict[str, str]) -> float | None:
-    """The recording's speed limit [m/s]; -1 stands for none."""
-    if meta.get("speedLimit", "").lower() in ("", "nan"):
-        return None
-    limit = _meta_number(path, meta, "speedLimit")
-    return limit if limit > 0.0 else None
-
-
-def _read_rows(
-    table: Table, columns: tuple[str, ...], spec: dict
-) -> tuple[dict[str, np.ndarray], Ledger]:
-    """The tracks' rows, each road user once in a frame, and what became of others."""
-    ledger = Ledger(
-        path=table.path, unit=table.unit, allowed=allowed_share(spec, default=0.0)
-    )
-    rows = read(table, fields_of(table, columns, limits=LIMITS), ledger)
-    frame, user, x, y = columns[:4]
-    kept = single_rows(
-        {**rows, "t": rows[frame], "id": rows[user]},
-        ledger,
-        columns,
-        "{:g}".format,
-        (x, y),
-    )
-    return {name: column[kept] for name, column in rows.items()}, ledger
-
-
-def _read_corners(table: Table, spec: dict) -> Recording:
-    """highD: corners of boxes, lanes by the y of their markings."""
-    path = table.path
-    rows, ledger = _read_rows(table, CORNER, spec)
-    users = _read_users(_beside(path, USERS), "id", "drivingDirection")
-    meta_path = _beside(path, "_recordingMeta.csv")
-    meta = _read_meta(meta_path)
-    rate = _rate(meta_path, meta)
-    t = (rows["frame"] - rows["frame"].min()) / rate
-    x = rows["x"] + 0.5 * rows["width"]
-    y = -(rows["y"] + 0.5 * rows["height"])
-    speed = np.hypot(rows["xVelocity"], rows["yVelocity"])
-    ids, pieces = _pieces(path, rows["id"], rows["frame"], users, spec)
-    tracks = []
-    for name, part in pieces:
-        user = users[int(ids[part[0]])]
-        standing = np.pi if user.direction == 1.0 else 0.0
-        heading = travel_heading(t[part], x[part], y[part], standing)
-        tracks.append(
-            Track(
-                id=name,
-                kind=KINDS.get(user.kind, Kind.VEHICLE),
-                length=float(np.median(rows["width"][part])),
-                width=float(np.median(rows["height"][part])),
-                t=t[part],
-                x=x[part],
-                y=y[part],
-                heading=heading,
-                speed=speed[part],
-            )
-        )
-    limit = _limit(meta_path, meta)
-    check_span(str(path), "x", x)
-    along = (float(x.min()), float(x.max()))
-    lanes = marked_lanes(meta_path, meta, along, limit, (y, rows["xVelocity"]))
-    notes = _user_notes(ids, users)
-    return _recording(path, spec, rate, tracks, lanes, limit, notes, ledger)
-
-
-def _read_centres(table: Table, spec: dict) -> Recording:
-    """inD, rounD, exiD, uniD: centres of boxes, lanes from a map."""
-    path = table.path
-    rows, ledger = _read_rows(table, CENTRE, spec)
-    users = _read_users(_beside(path, USERS), "trackId", None)
-    meta_path = _beside(path, "_recordingMeta.csv")
-    meta = _read_meta(meta_path)
-    rate = _rate(meta_path, meta)
+def _recording(table: Table, spec: dict, ledger: Ledger) -> Recording:
+    """Boxes by their corners (highD), or by their centres (inD and its sisters)."""
+    path, is_corner = table.path, "xCenter" not in table.header
+    columns = CORNER if is_corner else CENTRE
+    rows = columns.read(table, ledger)
+    direction = "drivingDirection" if is_corner else None
+    users = _read_users(_beside(path, USERS), columns.called.get("id", "id"), direction)
+    meta = _read_meta(_beside(path, META))
+    rate = meta.rate
     rows["t"] = (rows["frame"] - rows["frame"].min()) / rate
-    ids, pieces = _pieces(path, rows["trackId"], rows["frame"], users, spec)
+    if is_corner:
+        rows["x"] = rows["x"] + 0.5 * rows["length"]
+        rows["y"] = -(rows["y"] + 0.5 * rows["width"])
+    ids, pieces = _pieces(path, rows["id"], rows["frame"], users, spec)
     tracks = [
-        _centred_track(name, part, rows, users[int(ids[part[0]])].kind, spec)
+        _track(name, {n: rows[n][part] for n in rows}, users[int(ids[part[0]])], spec)
         for name, part in pieces
     ]
-    limit = _limit(meta_path, meta)
-    lanes, notes = _mapped_lanes(path, meta_path, meta, tracks, spec)
-    notes += _user_notes(ids, users)
-    trailers = sum(users[int(i)].kind == "trailer" for i in np.unique(ids))
-    if trailers:
-        notes.append(f"{trailers} trailers are obstacles of kind cyclist, no experts")
-    return _recording(path, spec, rate, tracks, lanes, limit, notes, ledger)
+    limit = meta.limit
+    if is_corner:
+        check_span(str(path), "x", rows["x"])
+        along = (float(rows["x"].min()), float(rows["x"].max()))
+        velocities = (rows["y"], rows["vx"])
+        lanes = marked_lanes(meta.path, meta.cells, along, limit, velocities)
+        notes = []
+    else:
+        lanes, notes = _mapped_lanes(path, meta, tracks, spec)
+    default = number(spec, "default_speed_limit")
+    return Recording(
+        name=log_name(path, spec, own_name(path)),
+        source=spec["source"],
+        licence=spec["licence"],
+        rate_hz=rate,
+        tracks=tuple(tracks),
+        lanes=lanes,
+        default_speed_limit=limit if limit is not None else default,
+        notes=(*notes, *_user_notes(set(ids.tolist()), users)),
+    )
 
 
-def _centred_track(
-    name: str, part: np.ndarray, rows: dict[str, np.ndarray], kind: str, spec: dict
-) -> Track:
-    t, x, y = (rows[field][part] for field in ("t", "xCenter", "yCenter"))
-    heading = np.deg2rad(rows["heading"][part])
-    size = [float(np.median(rows[field][part])) for field in ("length", "width")]
-    if min(size) <= 0.0:
-        default = spec.get("sizes", {}).get(kind, SIZE_M)
+def _track(name: str, rows: Rows, user: _User, spec: dict) -> Track:
+    """One road user without a gap."""
+    t, x, y = rows["t"], rows["x"], rows["y"]
+    size = [float(np.median(rows[field])) for field in ("length", "width")]
+    is_boxed = min(size) > 0.0
+    if not is_boxed:
+        default = spec.get("sizes", {}).get(user.kind, SIZE_M)
         size = [
             found or float(given) for found, given in zip(size, default, strict=True)
         ]
-        if np.ptp(heading) == 0.0:
-            # a road user without a box has no heading either
-            heading = travel_heading(t, x, y, float(heading[0]))
+    heading, standing = None, np.pi if user.direction == 1.0 else 0.0
+    if "heading" in rows:
+        heading = np.deg2rad(rows["heading"])
+        standing = float(heading[0])
+    # a road user without a box has no heading either
+    if heading is None or (not is_boxed and np.ptp(heading) == 0.0):
+        heading = travel_heading(t, x, y, standing)
     return Track(
         id=name,
-        kind=KINDS.get(kind, Kind.VEHICLE),
+        kind=KINDS.get(user.kind, Kind.VEHICLE),
         length=size[0],
         width=size[1],
         t=t,
         x=x,
         y=y,
         heading=heading,
-        speed=np.hypot(rows["xVelocity"][part], rows["yVelocity"][part]),
+        speed=np.hypot(rows["vx"], rows["vy"]),
     )
 
 
@@ -324,63 +295,33 @@ def _check_whole(
                 )
 
 
-def _user_notes(ids: np.ndarray, users: dict[int, _User]) -> list[str]:
-    """Tracks without rows, and classes that this module does not know."""
-    missing = len(set(users) - set(np.unique(ids).tolist()))
+def _user_notes(met: set[int], users: dict[int, _User]) -> list[str]:
+    """Tracks without rows, classes that this module does not know, and trailers."""
+    missing = len(set(users) - met)
     notes = [f"{missing} tracks of tracksMeta have no rows"] if missing else []
-    unknown = {user.kind for user in users.values()} - {*KINDS, *MOTORISED}
-    if unknown:
-        notes.append(f"classes taken for vehicles: {', '.join(sorted(unknown))}")
+    notes += unknown_kinds("classes", {user.kind for user in users.values()})
+    trailers = sum(users[number].kind == "trailer" for number in met)
+    if trailers:
+        notes.append(f"{trailers} trailers are obstacles of kind cyclist, no experts")
     return notes
 
 
 def _mapped_lanes(
-    path: Path, meta_path: Path, meta: dict[str, str], tracks: list[Track], spec: dict
+    path: Path, meta: _Meta, tracks: list[Track], spec: dict
 ) -> tuple[tuple[Lane, ...], list[str]]:
     """Lanes of the location's Lanelet2 map; else fitted to the paths driven."""
-    place = find_map(path, meta.get("locationId", ""), spec)
+    place = find_map(path, meta.cells.get("locationId", ""), spec)
     why = "no map found"
     if place is not None:
-        longitude = _meta_number(meta_path, meta, "lonLocation", 180.0)
+        zone = utm_zone(meta.number("lonLocation", 180.0))
         fields = ("xUtmOrigin", "yUtmOrigin")
-        found = [_meta_number(meta_path, meta, f, MAX_PLACE_M) for f in fields]
-        origin = np.array(found)
-        zone = utm_zone(longitude)
+        origin = np.array([meta.number(field, MAX_PLACE_M) for field in fields])
         lanes, notes = read_lanelet2(place, lambda a, b: utm(a, b, zone) - origin)
-        if _apart(lanes, tracks) < FAR_M:
+        middle = [np.median([np.median(getattr(t, c)) for t in tracks]) for c in "xy"]
+        apart = (float(np.min(np.hypot(*(ln.centre - middle).T))) for ln in lanes)
+        if min(apart) < FAR_M:
             return lanes, notes
         why = f"{place.name} lies elsewhere"
-    width = number(spec, "lane_width_m", LANE_WIDTH_M)
+    width = number(spec, "lane_width_m")
     lanes = path_lanes(tracks, width, None)
     return lanes, [f"{why}; {len(lanes)} lanes fitted to the longest paths"]
-
-
-def _apart(lanes: tuple[Lane, ...], tracks: list[Track]) -> float:
-    """m, from the middle of all tracks to the nearest lane point."""
-    middle = [np.median([np.median(getattr(t, c)) for t in tracks]) for c in "xy"]
-    return min(float(np.min(np.hypot(*(ln.centre - middle).T))) for ln in lanes)
-
-
-def _recording(
-    path: Path,
-    spec: dict,
-    rate: float,
-    tracks: list[Track],
-    lanes: tuple[Lane, ...],
-    limit: float | None,
-    notes: list[str],
-    ledger: Ledger,
-) -> Recording:
-    counts, dropped = ledger.news()
-    default = number(spec, "default_speed_limit", LIMIT_MPS)
-    return Recording(
-        name=log_name(path, spec, own_name(path)),
-        source=str(spec.get("source", "leveLXData")),
-        licence=str(spec.get("licence", "leveLXData terms: non-commercial use")),
-        rate_hz=rate,
-        tracks=tuple(tracks),
-        lanes=lanes,
-        default_speed_limit=limit if limit is not None else default,
-        notes=(*notes, *dropped),
-        rows=counts,
-    )

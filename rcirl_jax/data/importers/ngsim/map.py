@@ -9,22 +9,17 @@ from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.data.importers.declared import Rows
 from rcirl_jax.data.importers.lanes import StraightLane, straight_lanes
 from rcirl_jax.data.importers.options import number, positive
 from rcirl_jax.data.importers.tracks import spans_of, split_tracks, travel_heading
 from rcirl_jax.types import Kind, Lane, Recording, Track
 
-FRAME_S = 0.1  # s
 SITE = "Location"
 MAX_FRAME_GAP = 1  # frames; a larger gap starts a new track
 REUSE_S = 60.0  # s; a step back by more is a number given to another vehicle
 MARGIN_M = 50.0  # m of lane beyond the first and last position
-LANE_WIDTH_M = 3.6576  # m, 12 ft, US freeway
-SWITCH_S = 4.0  # s, a lane change takes 3 to 6 s
-LIMIT_MPS = 29.06  # m/s, 65 mph
 SIZE_M = (4.5, 1.8)  # m, a car
-
-Rows = dict[str, np.ndarray]  # column -> [n], SI units; "frame" is the clock
 
 
 class Survey:
@@ -44,7 +39,7 @@ class Survey:
         """Take in rows."""
         self.lateral |= bool(np.any(table["Local_X"] != 0.0))
         for field, users in self._without.items():
-            users.update(table["Vehicle_ID"][table[f"v_{field.title()}"] <= 0.0])
+            users.update(table["id"][table[f"v_{field.title()}"] <= 0.0])
         driven = table["Lane_ID"].astype(int)
         for lane in np.unique(driven).tolist():
             x, y = (table[name][driven == lane] for name in ("Local_X", "Local_Y"))
@@ -64,7 +59,7 @@ class Survey:
 
     def lanes(self, path: Path, spec: Mapping) -> tuple[Lane, ...]:
         """One straight lane per lane number, over where it was driven +- 50 m."""
-        width = number(spec, "lane_width_m", LANE_WIDTH_M)
+        width = number(spec, "lane_width_m")
         found = [
             StraightLane(
                 id=str(lane),
@@ -76,7 +71,7 @@ class Survey:
             )
             for lane, (lower, upper) in sorted(self._along.items())
         ]
-        limit = number(spec, "speed_limit", LIMIT_MPS)
+        limit = number(spec, "speed_limit")
         return straight_lanes(path, found, width, limit)
 
 
@@ -121,22 +116,22 @@ def site_recording(
       stamped: the clock is Global_Time; rows may come in any order.
       notes: of this Recording.
     """
-    frame_s = positive(spec, "frame_s", FRAME_S)
+    frame_s = positive(spec, "frame_s")
     # with stamps no step back has a meaning
     reuse = 0.0 if stamped else REUSE_S / frame_s
-    vehicles = table["Vehicle_ID"].astype(np.int64)
+    vehicles = table["id"].astype(np.int64)
     pieces = split_tracks(path, vehicles, table["frame"], MAX_FRAME_GAP, reuse)
     lateral = survey.lateral
     table = {**table, "leader_missing": _leader_missing(table)}
     tracks = [_track(name, table, rows, spec, lateral) for name, rows in pieces]
     return Recording(
         name=name,
-        source=spec.get("source", "NGSIM"),
-        licence=spec.get("licence", "unknown"),
+        source=spec["source"],
+        licence=spec["licence"],
         rate_hz=1.0 / frame_s,
         tracks=tuple(tracks),
         lanes=survey.lanes(path, spec),
-        default_speed_limit=number(spec, "speed_limit", LIMIT_MPS),
+        default_speed_limit=number(spec, "speed_limit"),
         notes=tuple(notes),
     )
 
@@ -144,7 +139,7 @@ def site_recording(
 def _leader_missing(table: Rows) -> np.ndarray:
     """[n] bool: the row names a vehicle ahead that has no row at that time."""
     named = table["Preceding"] > 0.0
-    users = np.concatenate([table["Vehicle_ID"], table["Preceding"]])
+    users = np.concatenate([table["id"], table["Preceding"]])
     number = np.unique(users, return_inverse=True)[1].reshape(2, -1)
     frames = np.unique(table["frame"], return_inverse=True)[1].reshape(-1)
     own, ahead = number * (frames.max() + 1) + frames
@@ -154,7 +149,7 @@ def _leader_missing(table: Rows) -> np.ndarray:
 def _track(
     name: str, table: Rows, rows: np.ndarray, spec: dict, lateral: bool
 ) -> Track:
-    frame_s = positive(spec, "frame_s", FRAME_S)
+    frame_s = positive(spec, "frame_s")
     sizes = spec.get("sizes", {})
     kind = str(int(table["v_Class"][rows[0]]))
     default = sizes.get(kind, sizes.get("0", SIZE_M))
@@ -188,8 +183,8 @@ def _lateral_from_lanes(lane: np.ndarray, spec: dict) -> np.ndarray:
     with t_k midway between the last sample in the old lane and the first in the
     new one.
     """
-    width = number(spec, "lane_width_m", LANE_WIDTH_M)
-    span = number(spec, "lane_switch_s", SWITCH_S) / positive(spec, "frame_s", FRAME_S)
+    width = number(spec, "lane_width_m")
+    span = number(spec, "lane_switch_s") / positive(spec, "frame_s")
     y = np.full(lane.shape, -width * (lane[0] - 0.5))
     samples = np.arange(lane.size)
     for at in np.flatnonzero(np.diff(lane) != 0.0):

@@ -13,48 +13,43 @@ file; there is no lateral position and no lane; whom the leader follows is not i
 the file (a Ghost ahead says so, and its scenes are dropped).
 """
 
+import dataclasses
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
+from rcirl_jax.data.importers.declared import Columns, Rows, open_log
 from rcirl_jax.data.importers.files import input_files
 from rcirl_jax.data.importers.lanes import StraightLane, straight_lanes
 from rcirl_jax.data.importers.options import (
     number,
     one_pattern,
+    positive,
     section,
     unit_factor,
 )
 from rcirl_jax.data.importers.tracks import split_tracks
-from rcirl_jax.data.readers.tables.ledger import LINE, Ledger, allowed_share
-from rcirl_jax.data.readers.tables.repair import single_rows
-from rcirl_jax.data.readers.tables.table import (
-    MAX_PLACE_M,
-    MAX_TIME,
-    MAX_VELOCITY_MPS,
-    fields_of,
-    open_table,
-    read,
-)
+from rcirl_jax.data.readers.tables.ledger import LINE, with_news
+from rcirl_jax.data.readers.tables.table import open_table
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Ghost, Kind, Recording, Track
 
-COLUMNS = ("t", "x_follower", "v_follower", "x_leader", "v_leader", "leader_length")
+TABLE = Columns(
+    needed={
+        **{"t": "time", "x_follower": "place", "v_follower": "speed"},
+        **{"x_leader": "place", "v_leader": "speed", "leader_length": "number"},
+    },
+    optional={"spacing": "number"},
+    user=None,
+    places=("x_follower", "x_leader"),
+)
 NAME = re.compile(r"(?P<run>.*?)_?f(?P<follower>\d+)_l(?P<leader>\d+)(_\d+)?")
-RATE_HZ = 10.0  # 1/s
-LIMIT_MPS = 29.06  # m/s, 65 mph
-LANE_WIDTH_M = 3.6576  # m, 12 ft
-LENGTH_M = 4.5  # m, of a follower that leads in no file
-WIDTH_M = 1.8  # m
 MAX_GAP_FRAMES = 5.5  # frames missing inside one track
-LIMITS = {
-    "t": MAX_TIME,
-    **dict.fromkeys(("x_follower", "x_leader"), MAX_PLACE_M),
-    **dict.fromkeys(("v_follower", "v_leader"), MAX_VELOCITY_MPS),
-}
 MARGIN_M = 50.0  # m of lane beyond the first and last position
 SPACING_FT = 0.5  # tolerance of spacing against the positions
 
@@ -65,8 +60,11 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
     groups = _groups(files)
     lengths = _leader_lengths(files, section(spec, "table"))
     for file in files:
-        recording = _read_pair(file, spec, groups[file], lengths)
-        yield validate_recording(recording, file)
+        table, ledger = open_log(file, spec)
+        columns = dataclasses.replace(TABLE, name_of=lambda _, f=file: _ids(f)[1])
+        rows = columns.read(table, ledger)
+        made = _recording(file, spec, rows, groups[file], lengths)
+        yield validate_recording(with_news(made, ledger), file)
 
 
 def _ids(path: Path) -> tuple[str, str, str]:
@@ -79,23 +77,14 @@ def _ids(path: Path) -> tuple[str, str, str]:
 
 def _groups(files: Sequence[Path]) -> dict[Path, str]:
     """Vehicle-disjoint group of each file: files that share a car are joined."""
-    parent: dict[tuple[str, str], tuple[str, str]] = {}
-
-    def root(car: tuple[str, str]) -> tuple[str, str]:
-        parent.setdefault(car, car)
-        while parent[car] != car:
-            parent[car] = parent[parent[car]]
-            car = parent[car]
-        return car
-
-    for file in files:
-        run, follower, leader = _ids(file)
-        parent[root((run, follower))] = root((run, leader))
-    first: dict[tuple[str, str], str] = {}
-    for file in files:
-        run, follower, _ = _ids(file)
-        first.setdefault(root((run, follower)), file.stem)
-    return {file: first[root(_ids(file)[:2])] for file in files}
+    cars = [[(run, car) for car in pair] for run, *pair in map(_ids, files)]
+    every = dict.fromkeys(car for pair in cars for car in pair)
+    numbers = {car: number for number, car in enumerate(every)}
+    edges = np.array([[numbers[car] for car in pair] for pair in cars]).T
+    graph = coo_array((np.ones(len(files)), edges), shape=(len(numbers),) * 2)
+    labels = connected_components(graph, directed=False)[1][edges[0]]
+    first = dict(zip(labels[::-1], files[::-1], strict=True))
+    return {file: first[n].stem for file, n in zip(files, labels, strict=True)}
 
 
 def _leader_lengths(
@@ -114,22 +103,23 @@ def _leader_lengths(
     return lengths
 
 
-def _read_pair(
-    path: Path, spec: dict, group: str, lengths: dict[tuple[str, str], float]
+def _recording(
+    path: Path,
+    spec: dict,
+    table: Rows,
+    group: str,
+    lengths: dict[tuple[str, str], float],
 ) -> Recording:
-    table, ledger = _read_rows(path, spec)
-    factor = unit_factor(path, "unit", str(spec.get("unit", "ft")), ("ft", "m"))
+    factor = unit_factor(path, "unit", spec["unit"], ("ft", "m"))
     run, follower, leader = _ids(path)
     length = float(np.median(table["leader_length"]))
     _check_spacing(path, table, length)
     own = lengths.get((run, follower))
     notes = ["no lateral positions; both cars on one straight lane"]
     if own is None:
-        own = number(spec, "follower_length_m", LENGTH_M) / factor
+        own = number(spec, "follower_length_m") / factor
         notes.append(f"length of follower {follower} unknown; default")
-    rate = number(spec, "rate_hz", RATE_HZ)
-    if rate <= 0.0:
-        raise InputError(f"source TOML: rate_hz: {rate:g}: expected > 0")
+    rate = positive(spec, "rate_hz")
     # t is rounded to the clock: it is written with the noise of floating point
     frames = np.round((table["t"] - table["t"].min()) * rate)
     pieces = split_tracks(path, np.zeros(frames.size, int), frames, MAX_GAP_FRAMES)
@@ -138,7 +128,7 @@ def _read_pair(
             id=name + part.removeprefix("0"),
             kind=Kind.VEHICLE,
             length=size * factor,
-            width=number(spec, "width_m", WIDTH_M),
+            width=number(spec, "width_m"),
             t=frames[rows] / rate,
             x=(table[f"x_{role}"][rows] - 0.5 * size) * factor,
             y=np.zeros(rows.shape),
@@ -151,54 +141,31 @@ def _read_pair(
         )
         for part, rows in pieces
     )
-    limit = number(spec, "speed_limit", LIMIT_MPS)
-    counts, dropped = ledger.news()
+    limit = number(spec, "speed_limit")
     lane = StraightLane(
         id="1",
         y=0.0,
         lower=min(float(track.x.min()) for track in tracks) - MARGIN_M,
         upper=max(float(track.x.max()) for track in tracks) + MARGIN_M,
     )
-    width = number(spec, "lane_width_m", LANE_WIDTH_M)
+    width = number(spec, "lane_width_m")
+    last, end = max(float(track.t[-1]) for track in tracks), (lane.upper, 0.0)
     return Recording(
         name=path.stem,
-        source=str(spec.get("source", "NGSIM I-80 leader-follower pairs")),
-        licence=str(spec.get("licence", "NGSIM: U.S. DOT FHWA, doi 10.21949/1504477")),
+        source=spec["source"],
+        licence=spec["licence"],
         rate_hz=rate,
         tracks=tracks,
         lanes=straight_lanes(path, [lane], width, limit),
         group=group,
-        ghosts=(_ghost(tracks, lane.upper),),
+        # somebody ahead of both cars all the time
+        ghosts=(Ghost(t0=0.0, t1=last, start=end, end=end),),
         default_speed_limit=limit,
-        notes=(*notes, *dropped),
-        rows=counts,
+        notes=tuple(notes),
     )
 
 
-def _read_rows(path: Path, spec: dict) -> tuple[dict[str, np.ndarray], Ledger]:
-    """Rows of a pair, each time once, and what became of the others."""
-    source = open_table(path, section(spec, "table"))
-    ledger = Ledger(path=path, unit=source.unit, allowed=allowed_share(spec))
-    fields = fields_of(source, COLUMNS, ("spacing",), limits=LIMITS)
-    rows = read(source, fields, ledger)
-    pair = {**rows, "id": np.zeros(rows["t"].size)}
-    kept = single_rows(
-        pair,
-        ledger,
-        [name for name in rows if name != LINE],
-        lambda _: _ids(path)[1],
-        ("x_follower", "x_leader"),
-    )
-    return {name: column[kept] for name, column in rows.items()}, ledger
-
-
-def _ghost(tracks: Sequence[Track], end: float) -> Ghost:
-    """Somebody ahead of both cars all the time, at the end of the lane."""
-    last = max(float(track.t[-1]) for track in tracks)
-    return Ghost(t0=0.0, t1=last, start=(end, 0.0), end=(end, 0.0))
-
-
-def _check_spacing(path: Path, table: dict[str, np.ndarray], length: float) -> None:
+def _check_spacing(path: Path, table: Rows, length: float) -> None:
     """The file's own spacing says that positions are those of front bumpers."""
     if "spacing" not in table:
         return

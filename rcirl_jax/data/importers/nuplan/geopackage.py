@@ -18,6 +18,8 @@ from rcirl_jax.data.readers.sqlite import Database
 
 ENVELOPE_BYTES = (0, 32, 48, 48, 64)  # by the flags' envelope code
 LINE, POLYGON, MULTI_LINE, MULTI_POLYGON = 2, 3, 5, 6
+MAX_ROWS = 2_000_000  # rows of one layer; a city has some 1e4
+MAX_NAME = 100  # characters of a column's name
 MAX_POINTS = 20_000  # of one line; a city's longest has some 1e3
 EWKB_Z, EWKB_M = 0x80000000, 0x40000000
 GEOGRAPHIC = 4326  # WGS84 longitude and latitude in degrees
@@ -54,8 +56,15 @@ def _well_known(blob: bytes, at: int, depth: int) -> tuple[list[np.ndarray], int
     if kind == LINE:
         points, at = _points(blob, at, count, size, order)
         return [points], at
-    if kind == POLYGON:
-        return _rings(blob, at, count, size, order)
+    if kind == POLYGON:  # the outer ring is the first; inner ones are stepped over
+        rings = []
+        for _ in range(min(count, len(blob))):
+            if len(blob) < at + 4:
+                raise ValueError("well-known binary cut short")
+            (number,) = struct.unpack_from(order + "I", blob, at)
+            points, at = _points(blob, at + 4, number, size, order)
+            rings.append(points)
+        return rings[:1], at
     if kind in (MULTI_LINE, MULTI_POLYGON):
         found = []
         for _ in range(min(count, len(blob))):
@@ -63,20 +72,6 @@ def _well_known(blob: bytes, at: int, depth: int) -> tuple[list[np.ndarray], int
             found += parts
         return found, at
     raise ValueError(f"geometry type {kind}")
-
-
-def _rings(
-    blob: bytes, at: int, count: int, size: int, order: str
-) -> tuple[list[np.ndarray], int]:
-    """The outer ring, which is the first; inner ones are stepped over."""
-    rings = []
-    for _ in range(min(count, len(blob))):
-        if len(blob) < at + 4:
-            raise ValueError("well-known binary cut short")
-        (number,) = struct.unpack_from(order + "I", blob, at)
-        points, at = _points(blob, at + 4, number, size, order)
-        rings.append(points)
-    return rings[:1], at
 
 
 def _points(
@@ -90,17 +85,44 @@ def _points(
 
 
 class Layers:
-    """Layers of one GeoPackage, projected to one UTM zone."""
+    """Layers of one GeoPackage, projected to one UTM zone.
+
+    Args:
+      database: the opened file.
+      zone: number of the zone.
+      south: whether it is a southern one.
+    """
 
     def __init__(self, database: Database, zone: int, south: bool) -> None:
-        self.database = database
-        self.zone, self.south = zone, south
-        self._srs = _systems(database)
+        self.database, self.zone, self.south = database, zone, south
+        about = "gpkg_geometry_columns"
+        names = ("table_name", "column_name", "srs_id")
+        found = (
+            database.table(about, names, MAX_ROWS) if database.columns(about) else ()
+        )
+        # a short name, of one line for errors
+        self._about = {
+            str(layer): (" ".join(str(column).split())[:MAX_NAME], srs)
+            for layer, column, srs in found
+        }
 
-    def lines(
-        self, table: str, column: str, blobs: Sequence[object]
-    ) -> list[np.ndarray]:
-        """[n, 2] m of each blob of a layer.
+    def blobs(
+        self, layer: str, columns: Sequence[str], optional: Sequence[str] = ()
+    ) -> list[tuple]:
+        """Rows of a layer: geometry, the columns, those that may be missing."""
+        geometry = self._about.get(layer, ("geom", GEOGRAPHIC))[0]
+        return self.database.table(layer, (geometry, *columns), MAX_ROWS, optional)
+
+    def rows(
+        self, layer: str, columns: Sequence[str], optional: Sequence[str] = ()
+    ) -> list[tuple]:
+        """As `blobs`, with the points [n, 2] m of each geometry."""
+        table = self.blobs(layer, columns, optional)
+        lines = self.lines(layer, [row[0] for row in table])
+        return [(line, *row[1:]) for line, row in zip(lines, table, strict=True)]
+
+    def lines(self, layer: str, blobs: Sequence[object]) -> list[np.ndarray]:
+        """[n, 2] m of each geometry of a layer.
 
         Raises:
           InputError: a blob that is no geometry, an unknown system, or a place
@@ -108,7 +130,8 @@ class Layers:
         """
         if not blobs:
             return []
-        database, where = self.database, f"{table}.{column}"
+        column, system = self._about.get(layer, ("geom", GEOGRAPHIC))
+        database, where = self.database, f"{layer}.{column}"
         try:
             found = [points_of(blob) for blob in blobs]
         except ValueError as error:
@@ -117,7 +140,6 @@ class Layers:
         if longest > MAX_POINTS:
             raise database.error(where, f"{longest} points", f"at most {MAX_POINTS}")
         every = np.concatenate([np.zeros((0, 2)), *found])
-        system = self._srs.get(table, GEOGRAPHIC)
         is_degrees = system == GEOGRAPHIC
         limits = np.array([180.0, 84.0]) if is_degrees else MAX_COORDINATE_M
         bad = np.argwhere(~(np.abs(every) <= limits))
@@ -129,23 +151,9 @@ class Layers:
             every = utm(every[:, 1], every[:, 0], self.zone, south=self.south)
         elif zone_of(system) != (self.zone, self.south):
             raise database.error(
-                f"{table}: srs_id", str(system), f"{GEOGRAPHIC} or the log's UTM zone"
+                f"{layer}: srs_id", str(system), f"{GEOGRAPHIC} or the log's UTM zone"
             )
         return np.split(every, np.cumsum([len(line) for line in found])[:-1])
-
-
-def _systems(database: Database) -> dict[str, int]:
-    """srs_id by layer."""
-    if not database.columns("gpkg_geometry_columns"):
-        return {}
-    database.need("gpkg_geometry_columns", ("table_name", "srs_id"))
-    names = ("table_name", "srs_id")
-    rows = database.chunks(
-        "SELECT table_name, srs_id FROM gpkg_geometry_columns", names, 10_000
-    )
-    return {
-        str(table): srs for part in rows for table, srs in part if isinstance(srs, int)
-    }
 
 
 def zone_of(system: object) -> tuple[int, bool] | None:

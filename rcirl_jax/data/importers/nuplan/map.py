@@ -10,6 +10,7 @@ are numbered from left to right.
 """
 
 import dataclasses
+import functools
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,11 +18,12 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.importers.files import MAP_FOLDERS
-from rcirl_jax.data.importers.nuplan.geopackage import Layers, zone_of
+from rcirl_jax.data.importers.nuplan.geopackage import MAX_ROWS, Layers, zone_of
 from rcirl_jax.data.importers.options import path_option
 from rcirl_jax.data.importers.shapes import (
     MIN_HALF_WIDTH_M,
-    distance_to_line,
+    Roads,
+    distances_to_lines,
     line_across,
     moves,
 )
@@ -29,8 +31,6 @@ from rcirl_jax.data.readers.sqlite import Database
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane
 
-MAX_ROWS = 2_000_000  # rows of one layer; a city has some 1e4
-MARGIN_M = 150.0  # m of map around the tracks
 HALF_WIDTH_M = 1.75  # m, where a lane's bounds are not in the map
 MAX_HALF_WIDTH_M = 6.0  # m; a bound farther off is another lane's
 MAX_LIMIT_MPS = 60.0  # m/s; faster "limits" are none
@@ -43,8 +43,6 @@ LANES = ("lane_fid", "lane_group_fid", "lane_index", "speed_limit_mps")
 CONNECTORS = ("fid", "exit_lane_fid", "entry_lane_fid", "speed_limit_mps")
 BOUNDS = ("left_boundary_fid", "right_boundary_fid")
 STOPS = ("fid", "stop_polygon_type_fid")
-GEOMETRY = "geom"  # column of a layer's geometries where the file names none
-MAX_NAME = 100  # characters of a column's name
 CONNECTOR_BOUNDS = "gen_lane_connectors_scaled_width_polygons"
 
 
@@ -106,49 +104,21 @@ class NuplanMap:
     def __init__(self, file: Path) -> None:
         """Reads all tables; geometries of lanes' bounds stay blobs."""
         with Database(file) as database:
-            self._layers = Layers(database, *_zone(database))
-            self._geometry = _geometry_columns(database)
-            self._stops = self._read_stops(database)
-            rows = {**self._connectors(database), **self._lanes_of(database)}
-            self._rows, self._centres = self._read_centres(database, rows)
+            self._layers = layers = Layers(database, *_zone(database))
+            self._stops = _stops(layers)
+            rows = {**self._connectors(database), **self._lanes(database)}
             self._bounds: dict[int, object] = {}
+            centres = _centres(layers)
             if database.columns("boundaries"):
-                columns = ("fid", self._column("boundaries"))
-                table = _table(database, "boundaries", columns)
-                self._bounds = {_fid(fid): blob for fid, blob in table}
-        self._made: dict[int, Lane] = {}
-        self._boxes = np.array(
-            [[line.min(axis=0), line.max(axis=0)] for line in self._centres]
-        ).reshape(-1, 2, 2)
-
-    def lanes(
-        self, x: np.ndarray, y: np.ndarray, origin: np.ndarray
-    ) -> tuple[Lane, ...]:
-        """Lanes around positions [m], less the origin."""
-        low = np.array([x.min(), y.min()]) - MARGIN_M
-        high = np.array([x.max(), y.max()]) + MARGIN_M
-        near = (self._boxes[:, 1] >= low).all(1) & (self._boxes[:, 0] <= high).all(1)
-        found = []
-        for index in np.flatnonzero(near).tolist():
-            if index not in self._made:
-                self._made[index] = self._make(index)
-            lane = self._made[index]
-            stop = None if lane.stop_line is None else lane.stop_line - origin
-            found.append(
-                dataclasses.replace(lane, centre=lane.centre - origin, stop_line=stop)
-            )
-        return tuple(found)
-
-    def _column(self, layer: str) -> str:
-        """Name of a layer's column of geometries."""
-        return self._geometry.get(layer, GEOMETRY)
-
-    def _lines(self, layer: str, blobs: Sequence[object]) -> list[np.ndarray]:
-        """[n, 2] m of each geometry of a layer."""
-        return self._layers.lines(layer, self._column(layer), blobs)
+                table = layers.blobs("boundaries", ("fid",))
+                self._bounds = {_fid(fid): blob for blob, fid in table}
+        self._centres = {name: centres[name] for name in centres if name in rows}
+        self._rows = [rows[name] for name in self._centres]
+        self.roads = Roads([*self._centres.values()], functools.cache(self._make))
 
     def _make(self, index: int) -> Lane:
-        row, centre = self._rows[index], self._centres[index]
+        row = self._rows[index]
+        centre = self._centres[row.id]
         left, right = (self._half_width(fid, centre) for fid in row.bounds)
         stop = None
         if row.signal is not None or row.has_sign:
@@ -172,81 +142,68 @@ class NuplanMap:
 
     def _half_width(self, fid: int, centre: np.ndarray) -> np.ndarray:
         """Distance [n] m of a bound from the centre line's points."""
-        default = np.full(len(centre), HALF_WIDTH_M)
-        if fid not in self._bounds:
-            return default
-        (line,) = self._lines("boundaries", [self._bounds[fid]])
+        line = np.zeros((0, 2))
+        if fid in self._bounds:
+            (line,) = self._layers.lines("boundaries", [self._bounds[fid]])
         if not len(line):
-            return default
-        apart = distance_to_line(centre, line)
+            return np.full(len(centre), HALF_WIDTH_M)
+        apart = distances_to_lines(centre, [line], np.zeros(len(centre), int))
         return np.clip(apart, MIN_HALF_WIDTH_M, MAX_HALF_WIDTH_M)
 
-    def _read_centres(
-        self, database: Database, rows: Mapping[str, _Row]
-    ) -> tuple[list[_Row], list[np.ndarray]]:
-        """Rows that have a centre line, and those lines [n >= 2, 2] m."""
-        columns = (self._column("baseline_paths"), *CENTRES)
-        table = _table(database, "baseline_paths", columns)
-        lines = self._lines("baseline_paths", [row[0] for row in table])
-        found: dict[str, np.ndarray] = {}
-        for (_, lane, connector), line in zip(table, lines, strict=True):
-            fid = _fid(lane)
-            name = _connector_id(_fid(connector)) if fid == NONE else str(fid)
-            line = line[moves(line)] if len(line) else line
-            if name in rows and len(line) >= 2:
-                found[name] = line
-        return [rows[name] for name in found], list(found.values())
-
-    def _lanes_of(self, database: Database) -> dict[str, _Row]:
-        columns = database.columns("lanes_polygons")
-        bounds = BOUNDS if set(BOUNDS) <= set(columns) else ("NULL", "NULL")
-        table = _table(database, "lanes_polygons", (*LANES, *bounds))
-        place = {}
-        for lane, group, index, *_ in table:
-            if NONE not in (_fid(group), _fid(index)):
-                place[_fid(group), _fid(index)] = str(_fid(lane))
-        signs = {
-            lane: fid
-            for fid, (kind, _, lanes, connectors) in self._stops.items()
-            if kind == STOP_SIGN and not connectors
-            for lane in lanes
+    def _signs(self, *, connectors: bool) -> dict[int, int]:
+        """Stop polygon of a stop sign, by the lane or connector that it governs."""
+        return {
+            user: fid
+            for fid, (kind, _, lanes, ways) in self._stops.items()
+            if kind == STOP_SIGN and (connectors or not ways)
+            for user in (ways if connectors else lanes)
         }
+
+    def _lanes(self, database: Database) -> dict[str, _Row]:
+        bounds = BOUNDS
+        if not set(BOUNDS) <= set(database.columns("lanes_polygons")):
+            bounds = ("", "")
+        table = [
+            (*map(_fid, row[:3]), _limit(row[3]), (_fid(row[4]), _fid(row[5])))
+            for row in database.table("lanes_polygons", LANES, MAX_ROWS, bounds)
+        ]
+        place = {
+            (group, index): str(fid)
+            for fid, group, index, *_ in table
+            if NONE not in (group, index)
+        }
+        signs = self._signs(connectors=False)
         found = {}
-        for lane, group, index, limit, left, right in table:
-            fid, number = _fid(lane), _fid(index)
-            beside: list[str | None] = [None, None]
-            if number != NONE:
-                beside = [place.get((_fid(group), number + k)) for k in (-1, 1)]
+        for fid, group, index, limit, beside in table:
+            is_placed = index != NONE
             found[str(fid)] = _Row(
                 id=str(fid),
-                limit=_limit(limit),
-                bounds=(_fid(left), _fid(right)),
+                limit=limit,
+                bounds=beside,
                 successors=tuple(self._leaving.get(fid, ())),
-                left=beside[0],
-                right=beside[1],
+                left=place.get((group, index - 1)) if is_placed else None,
+                right=place.get((group, index + 1)) if is_placed else None,
                 stops=(signs[fid],) if fid in signs else (),
                 has_sign=fid in signs,
             )
         return found
 
     def _connectors(self, database: Database) -> dict[str, _Row]:
-        columns = database.columns("lane_connectors")
-        lights = "traffic_light_stop_line_fids"
-        wanted = (*CONNECTORS, lights if lights in columns else "NULL")
-        bounds = _connector_bounds(database)
-        signs = {
-            connector: fid
-            for fid, (kind, _, _, connectors) in self._stops.items()
-            if kind == STOP_SIGN
-            for connector in connectors
-        }
+        bounds = {}
+        names = ("lane_connector_fid", *BOUNDS)
+        if set(names) <= set(database.columns(CONNECTOR_BOUNDS)):
+            for row in database.table(CONNECTOR_BOUNDS, names, MAX_ROWS):
+                fid, left, right = map(_fid, row)
+                bounds[fid] = left, right
+        signs = self._signs(connectors=True)
         self._leaving: dict[int, list[str]] = {}  # connectors of a lane
         found = {}
-        for number, leaves, enters, limit, stops in _table(
-            database, "lane_connectors", wanted
+        lights = ("traffic_light_stop_line_fids",)
+        for number, leaves, enters, limit, stops in database.table(
+            "lane_connectors", CONNECTORS, MAX_ROWS, lights
         ):
             fid, lines = _fid(number), _fids(stops)
-            name = _connector_id(fid)
+            name = f"connector-{fid}"
             self._leaving.setdefault(_fid(leaves), []).append(name)
             found[name] = _Row(
                 id=name,
@@ -259,54 +216,37 @@ class NuplanMap:
             )
         return found
 
-    def _read_stops(self, database: Database) -> dict[int, tuple]:
-        """Stop polygons: type, middle [2] m, fids of lanes and of connectors."""
-        columns = database.columns("stop_polygons")
-        if not columns:
-            return {}
-        lists = [
-            name if name in columns else "NULL"
-            for name in ("lane_fids", "lane_connector_fids")
-        ]
-        wanted = (self._column("stop_polygons"), *STOPS, *lists)
-        table = _table(database, "stop_polygons", wanted)
-        rings = self._lines("stop_polygons", [row[0] for row in table])
-        found = {}
-        for (_, fid, kind, *users), ring in zip(table, rings, strict=True):
-            if len(ring):
-                middle = ring[:-1].mean(axis=0) if len(ring) > 1 else ring[0]
-                found[_fid(fid)] = (_fid(kind), middle, *map(_fids, users))
-        return found
+
+def _centres(layers: Layers) -> dict[str, np.ndarray]:
+    """Centre lines [n >= 2, 2] m by the id of their lane or connector."""
+    found = {}
+    for line, lane, connector in layers.rows("baseline_paths", CENTRES):
+        fid = _fid(lane)
+        name = f"connector-{_fid(connector)}" if fid == NONE else str(fid)
+        line = line[moves(line)] if len(line) else line
+        if len(line) >= 2:
+            found[name] = line
+    return found
 
 
-def _table(database: Database, table: str, columns: Sequence[str]) -> list[tuple]:
-    """All rows of a layer's columns; "NULL" stands for one that is missing."""
-    database.need(table, [name for name in columns if name != "NULL"])
-    chosen = [name if name == "NULL" else _quoted(name) for name in columns]
-    sql = f'SELECT {", ".join(chosen)} FROM "{table}"'
-    chunks = database.chunks(sql, (table,), MAX_ROWS)
-    return [row for rows in chunks for row in rows]
-
-
-def _quoted(name: str) -> str:
-    """A column's name in SQL; the file may have chosen it."""
-    return '"' + name.replace('"', '""') + '"'
-
-
-def _geometry_columns(database: Database) -> dict[str, str]:
-    """Layer -> its column of geometries; a short name, of one line for errors."""
-    table = "gpkg_geometry_columns"
-    if not database.columns(table):
+def _stops(layers: Layers) -> dict[int, tuple]:
+    """Stop polygons: type, middle [2] m, fids of lanes and of connectors."""
+    if not layers.database.columns("stop_polygons"):
         return {}
-    rows = _table(database, table, ("table_name", "column_name"))
-    return {str(layer): " ".join(str(name).split())[:MAX_NAME] for layer, name in rows}
+    users = ("lane_fids", "lane_connector_fids")
+    found = {}
+    for ring, fid, kind, *lists in layers.rows("stop_polygons", STOPS, users):
+        if len(ring):
+            middle = ring[:-1].mean(axis=0) if len(ring) > 1 else ring[0]
+            found[_fid(fid)] = (_fid(kind), middle, *map(_fids, lists))
+    return found
 
 
 def _zone(database: Database) -> tuple[int, bool]:
     """The UTM zone of a city, from the table meta."""
     value: object = "missing"
     if database.columns("meta"):
-        found = {str(key): v for key, v in _table(database, "meta", ("key", "value"))}
+        found = dict(database.table("meta", ("key", "value"), MAX_ROWS))
         value = found.get("projectedCoordSystem", value)
     zone = zone_of(value)
     if zone is None:
@@ -314,18 +254,6 @@ def _zone(database: Database) -> tuple[int, bool]:
             "meta: projectedCoordSystem", str(value), "a UTM zone such as epsg:32611"
         )
     return zone
-
-
-def _connector_bounds(database: Database) -> dict[int, tuple]:
-    columns = database.columns(CONNECTOR_BOUNDS)
-    if not {"lane_connector_fid", *BOUNDS} <= set(columns):
-        return {}
-    table = _table(database, CONNECTOR_BOUNDS, ("lane_connector_fid", *BOUNDS))
-    return {_fid(fid): (_fid(left), _fid(right)) for fid, left, right in table}
-
-
-def _connector_id(fid: int) -> str:
-    return f"connector-{fid}"
 
 
 def _fid(value: object) -> int:

@@ -20,12 +20,13 @@ import numpy as np
 
 from rcirl_jax.data.importers.files import files_below, log_name
 from rcirl_jax.data.importers.nuplan.map import NuplanMap, find_map
-from rcirl_jax.data.importers.options import number, one_pattern, positive, section
-from rcirl_jax.data.importers.paths import path_lanes
+from rcirl_jax.data.importers.options import one_pattern, positive
 from rcirl_jax.data.importers.perception import (
     Boxes,
     Windows,
     around,
+    ego_boxes,
+    fitted_lanes,
     longest_window,
     placed,
     tracks_of,
@@ -34,6 +35,7 @@ from rcirl_jax.data.importers.shapes import (
     check_coordinates,
     origin_notes,
 )
+from rcirl_jax.data.importers.signals import held, signal_of
 from rcirl_jax.data.readers.sqlite import Database
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
@@ -51,6 +53,7 @@ TABLES = {
     "category": ("token", "name"),
 }
 LIGHTS = ("lidar_pc_token", "lane_connector_id", "status")
+LIGHT = ("lidar_pc.timestamp", "traffic_light_status.lane_connector_id", "status")
 KIND_NAMES = {
     "vehicle": Kind.VEHICLE,
     "bicycle": Kind.CYCLIST,
@@ -60,21 +63,22 @@ KIND_NAMES = {
     "czone_sign": Kind.STATIC,
     "generic_object": Kind.STATIC,
 }
-STATES = ("off", "red", "yellow", "green")  # any other status is off
 POSE_SQL = """SELECT lp.timestamp, ep.timestamp, ep.x, ep.y, ep.qw, ep.qx, ep.qy,
   ep.qz, ep.vx, ep.vy FROM lidar_pc AS lp JOIN ego_pose AS ep
   ON lp.ego_pose_token = ep.token"""
 POSE = ("lidar_pc.timestamp", *[f"ego_pose.{n}" for n in TABLES["ego_pose"][1:]])
-BOX_SQL = """SELECT b.track_token, lp.timestamp, b.x, b.y, b.yaw, b.vx, b.vy,
-  b.length, b.width FROM lidar_box AS b JOIN lidar_pc AS lp
-  ON b.lidar_pc_token = lp.token WHERE lp.timestamp BETWEEN ? AND ?"""
-BOX = ("track_token", "timestamp", "x", "y", "yaw", "vx", "vy", "length", "width")
-LIGHT_SQL = """SELECT lp.timestamp, s.lane_connector_id, s.status
+BOX_SQL = """SELECT t.rowid, lp.timestamp, b.x, b.y, b.yaw, b.vx, b.vy, b.length,
+  b.width FROM lidar_box AS b JOIN lidar_pc AS lp ON b.lidar_pc_token = lp.token
+  LEFT JOIN track AS t ON b.track_token = t.token WHERE lp.timestamp BETWEEN ? AND ?"""
+OF_BOX = ("track_token", "timestamp", "x", "y", "yaw", "vx", "vy", "length", "width")
+BOX = tuple(f"lidar_box.{name}" for name in OF_BOX)
+# any other status is off
+LIGHT_SQL = """SELECT lp.timestamp, s.lane_connector_id, CASE s.status
+  WHEN 'red' THEN 1 WHEN 'yellow' THEN 2 WHEN 'green' THEN 3 ELSE 0 END
   FROM traffic_light_status AS s JOIN lidar_pc AS lp
   ON s.lidar_pc_token = lp.token WHERE lp.timestamp BETWEEN ? AND ?"""
 # of a release: DATE_veh-NN_START_END, the last two s of the drive
 DRIVE = re.compile(r"(?P<drive>.+_veh-\d+)_\d+_\d+")
-MAX_TOKEN_BYTES = 64
 MAX_FRAMES = 10_000_000  # lidar_pc rows
 MAX_DURATION_S = 86400.0  # s, of one log
 MAX_TRACKS = 10_000_000
@@ -84,7 +88,6 @@ MAX_GAP_S = 0.55  # s without a box inside one track
 HOLD_S = 1.0  # s, a light without status keeps its state this long
 MAX_STAMP_GAP_S = 0.2  # s, between a lidar_pc and the pose linked to it
 LIMIT_MPS = 15.65  # m/s, 35 mph
-LANE_WIDTH_M = 3.5  # m
 # Chrysler Pacifica: 4.049 m before, 1.127 m behind the rear axle
 EGO = {"length": 5.176, "width": 2.297, "rear_axle_to_centre": 1.461}  # m
 
@@ -97,7 +100,7 @@ class _Log:
     name: str
     group: str  # the drive; logs of one name may be copies of each other
     poses: np.ndarray  # [n, 10] as POSE, in the order of time
-    kinds: dict[bytes, int]  # token of a track -> Kind
+    users: dict[int, tuple[bytes, int]]  # row of a track -> its token, Kind
     road: NuplanMap | None
     spec: dict
 
@@ -133,7 +136,7 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
                 name=log_name(file, spec, own_name(file)),
                 group=drive_of(own_name(file)),
                 poses=_poses(database),
-                kinds=_kinds(database),
+                users=_users(database),
                 road=roads[map_file] if map_file is not None else None,
                 spec=spec,
             )
@@ -167,18 +170,20 @@ def _poses(database: Database) -> np.ndarray:
     return poses[np.argsort(poses[:, 0], kind="stable")]
 
 
-def _kinds(database: Database) -> dict[bytes, int]:
-    sql = """SELECT t.token, c.name FROM track AS t
+def _users(database: Database) -> dict[int, tuple[bytes, int]]:
+    sql = """SELECT t.rowid, t.token, c.name FROM track AS t
       JOIN category AS c ON t.category_token = c.token"""
-    kinds: dict[bytes, int] = {}
+    users = {}
     for rows in database.chunks(sql, ("track",), MAX_TRACKS):
-        for token, name in rows:
+        for row, token, name in rows:
             if name not in KIND_NAMES:
                 raise database.error(
                     "category.name", repr(name)[:40], f"one of {', '.join(KIND_NAMES)}"
                 )
-            kinds[token] = int(KIND_NAMES[name])
-    return kinds
+            if not isinstance(token, bytes):
+                raise database.error("track.token", repr(token)[:40], "a BLOB")
+            users[row] = token, int(KIND_NAMES[name])
+    return users
 
 
 def _windows(log: _Log) -> Iterator[Recording]:
@@ -209,14 +214,10 @@ def _recording(log: _Log, poses: np.ndarray) -> Recording:
     x, y, origin, tracks = placed(tracks)
     lanes: tuple[Lane, ...] = ()
     if log.road is not None:
-        lanes = log.road.lanes(x, y, origin)
+        lanes = log.road.roads.around(x, y, origin)
     if not lanes:
-        lanes = path_lanes(
-            tracks,
-            positive(spec, "lane_width_m", LANE_WIDTH_M),
-            positive(spec, "speed_limit", LIMIT_MPS),
-        )
-        notes.append(f"no map here; {len(lanes)} lanes fitted to the longest paths")
+        lanes, note = fitted_lanes(tracks, spec, LIMIT_MPS)
+        notes.append(f"no map here; {note}")
     return Recording(
         name=log.name,
         group=log.group,
@@ -236,10 +237,6 @@ def _ego(path: Path, poses: np.ndarray, start: float, spec: dict) -> list[Track]
 
     Poses were taken a little earlier or later: x(t) = x_p + dx/dt (t - t_p).
     """
-    size = {
-        name: number(section(spec, "ego"), name, default)
-        for name, default in EGO.items()
-    }
     t, stamp = (poses[:, :2] - start).T * 1e-6
     x, y, qw, qx, qy, qz, vx, vy = poses[:, 2:].T
     heading = np.arctan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy * qy + qz * qz))
@@ -249,61 +246,36 @@ def _ego(path: Path, poses: np.ndarray, start: float, spec: dict) -> list[Track]
         raise InputError(
             f"{path}: ego_pose.qw, qx, qy, qz: norm {norm[bad[0]]:g}: expected 1"
         )
-    ahead = size["rear_axle_to_centre"]
-    x, y = x + ahead * np.cos(heading), y + ahead * np.sin(heading)
+    boxes = ego_boxes(spec, EGO, t, x, y, heading, np.hypot(vx, vy))
     rising = t.size > 1 and bool(np.all(np.diff(stamp) > 0.0))
     if rising and np.max(np.abs(t - stamp)) <= MAX_STAMP_GAP_S:
-        x = x + np.gradient(x, stamp) * (t - stamp)
-        y = y + np.gradient(y, stamp) * (t - stamp)
-    boxes = Boxes(
-        ids=np.zeros(t.size, np.int64),
-        names=("ego",),
-        t=t,
-        x=x,
-        y=y,
-        heading=heading,
-        speed=np.hypot(vx, vy),
-        length=np.full(t.size, size["length"]),
-        width=np.full(t.size, size["width"]),
-        kind=np.full(t.size, int(Kind.VEHICLE)),
-    )
+        moved = {
+            name: place + np.gradient(place, stamp) * (t - stamp)
+            for name, place in (("x", boxes.x), ("y", boxes.y))
+        }
+        boxes = dataclasses.replace(boxes, **moved)
     return tracks_of(path, boxes, MAX_GAP_S)[0]
 
 
 def _others(log: _Log, first: float, last: float) -> tuple[list[Track], list[str]]:
     """Tracks of the boxes between two times [us]."""
     database = log.database
-    names = tuple(f"lidar_box.{name}" for name in BOX)
     bounds = (int(first), int(last))
-    tokens, values = [], []
-    for rows in database.chunks(BOX_SQL, names, MAX_BOXES, bounds):
-        columns = list(zip(*rows, strict=True))
-        tokens.append(_tokens(database, columns[0]))
-        values.append(
-            np.stack(
-                [
-                    database.column(c, n)
-                    for c, n in zip(columns[1:], names[1:], strict=True)
-                ]
-            )
-        )
-    if not tokens:
+    table = database.numbers(BOX_SQL, BOX, MAX_BOXES, bounds)
+    if not len(table):
         return [], ["no boxes recorded; the ego is alone"]
-    table = np.concatenate(values, axis=1)
-    order = np.argsort(table[0], kind="stable")  # rows are stored in any order
-    t, x, y, yaw, vx, vy, length, width = table[:, order]
-    check_coordinates(database.path, "lidar_box", ("x", "y"), np.stack([x, y], axis=1))
-    found, ids = np.unique(np.concatenate(tokens)[order], return_inverse=True)
-    size = found.dtype.itemsize
-    keys = [token.ljust(size, b"\0") for token in found.tolist()]
-    unknown = next((key for key in keys if key not in log.kinds), None)
-    if unknown is not None:
-        raise database.error(
-            "lidar_box.track_token", unknown.hex(), "a track with a category"
-        )
+    table = table[np.argsort(table[:, 1], kind="stable")]  # they come in any order
+    row, t, x, y, yaw, vx, vy, length, width = table.T.copy()
+    check_coordinates(database.path, "lidar_box", ("x", "y"), table[:, 2:4])
+    found, ids = np.unique(row, return_inverse=True)
+    if not set(found.tolist()) <= log.users.keys():
+        where = "lidar_box.track_token"
+        raise database.error(where, "of no track", "a track with a category")
+    users = [log.users[int(one)] for one in found]
+    order = sorted(range(len(users)), key=lambda one: users[one])
     boxes = Boxes(
-        ids=ids,
-        names=[key.hex() for key in keys],
+        ids=np.argsort(order)[ids],
+        names=[users[one][0].hex() for one in order],
         t=(t - log.poses[0, 0]) * 1e-6,
         x=x,
         y=y,
@@ -311,22 +283,9 @@ def _others(log: _Log, first: float, last: float) -> tuple[list[Track], list[str
         speed=np.hypot(vx, vy),
         length=length,
         width=width,
-        kind=np.array([log.kinds[key] for key in keys])[ids],
+        kind=np.array([kind for _, kind in users])[ids],
     )
     return tracks_of(database.path, boxes, MAX_GAP_S)
-
-
-def _tokens(database: Database, cells: tuple) -> np.ndarray:
-    """Tokens of equal length as numpy bytes; zeros at their ends are lost."""
-    size = len(cells[0]) if isinstance(cells[0], bytes) else 0
-    if set(map(type, cells)) != {bytes} or not 0 < size <= MAX_TOKEN_BYTES:
-        raise database.error(
-            "lidar_box.track_token", repr(cells[0])[:40], "a token (BLOB)"
-        )
-    joined = b"".join(cells)
-    if len(joined) != size * len(cells) or set(map(len, cells)) != {size}:
-        raise database.error("lidar_box.track_token", "unequal lengths", "one length")
-    return np.frombuffer(joined, f"S{size}")
 
 
 def _signals(database: Database, clock: np.ndarray, start: float) -> tuple[Signal, ...]:
@@ -337,43 +296,12 @@ def _signals(database: Database, clock: np.ndarray, start: float) -> tuple[Signa
     if not database.columns("traffic_light_status"):
         return ()
     database.need("traffic_light_status", LIGHTS)
-    names = ("lidar_pc.timestamp", "traffic_light_status.lane_connector_id")
     bounds = (int(clock[0]), int(clock[-1]))
-    rows, states = [np.zeros((0, 2))], []
-    for part in database.chunks(LIGHT_SQL, LIGHTS, MAX_BOXES, bounds):
-        columns = list(zip(*part, strict=True))
-        rows.append(
-            np.stack(
-                [
-                    database.column(c, n)
-                    for c, n in zip(columns[:2], names, strict=True)
-                ],
-                axis=1,
-            )
-        )
-        states += [STATES.index(s) if s in STATES else 0 for s in columns[2]]
-    table, state = np.concatenate(rows), np.array(states, np.int64)
+    table = database.numbers(LIGHT_SQL, LIGHT, MAX_BOXES, bounds)
+    table = table[np.argsort(table[:, 0], kind="stable")]
     found = []
-    for connector in np.unique(table[:, 1][np.isfinite(table[:, 1])]):
-        mine = np.flatnonzero(table[:, 1] == connector)
-        mine = mine[np.argsort(table[mine, 0], kind="stable")]
-        found.append(_signal(str(int(connector)), clock, table[mine, 0], state[mine]))
-    return tuple(
-        dataclasses.replace(signal, start=(signal.start - start) * 1e-6)
-        for signal in found
-    )
-
-
-def _signal(
-    connector: str, clock: np.ndarray, seen: np.ndarray, state: np.ndarray
-) -> Signal:
-    """One light as intervals [us], from its states seen at some times [us]."""
-    last = np.searchsorted(seen, clock, side="right") - 1
-    fresh = (last >= 0) & (clock - seen[np.maximum(last, 0)] <= HOLD_S * 1e6)
-    now = np.where(fresh, state[np.maximum(last, 0)], 0)
-    change = np.flatnonzero(np.diff(now, prepend=-1) != 0)
-    return Signal(
-        id=connector,
-        start=clock[change],
-        state=tuple(STATES[k] for k in now[change]),
-    )
+    for connector in np.unique(table[np.isfinite(table[:, 1]), 1]):
+        seen, _, states = table[table[:, 1] == connector].T
+        shown = held(clock, seen, states.astype(np.int64), HOLD_S * 1e6)
+        found.append(signal_of(str(int(connector)), (clock - start) * 1e-6, shown))
+    return tuple(found)

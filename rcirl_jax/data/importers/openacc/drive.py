@@ -2,46 +2,54 @@
 
 import dataclasses
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.data.importers.declared import Columns
 from rcirl_jax.data.importers.projection import utm, utm_zone
 from rcirl_jax.data.readers.tables.ledger import Ledger
-from rcirl_jax.data.readers.tables.repair import single_rows
 from rcirl_jax.data.readers.tables.streams import head_of
-from rcirl_jax.data.readers.tables.table import (
-    MAX_PLACE_M,
-    MAX_TIME,
-    MAX_VELOCITY_MPS,
-    Field,
-    Table,
-    open_table,
-    read,
-)
+from rcirl_jax.data.readers.tables.table import Table, open_table
 from rcirl_jax.errors import InputError
 
 COLUMN = re.compile(r"(Speed|Lat|Lon|E|N|IVS|Driver)(\d{1,3})")
 # first cells of the metadata lines
 METADATA = ("date", "vehicle_order", "number_of_vehicles", "acc", "distance_setting")
+SIZE_M = (4.6, 1.85)  # m, a car whose model is not listed
 MAX_HEADER_LINES = 30  # lines looked at for the row of column names
-LIMITS = {
-    "Speed": MAX_VELOCITY_MPS,
-    "E": MAX_PLACE_M,
-    "N": MAX_PLACE_M,
-}
+KINDS = {"Driver": "text", "Speed": "speed", "E": "place", "N": "place"}  # of cells
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Car:
+    """One car of a drive, with a sample for each of the drive's rows."""
+
+    number: int  # in the platoon
+    name: str  # number and model
+    size: tuple[float, float]  # m, length and width
+    x: np.ndarray  # [n] m, NaN where it is unknown
+    y: np.ndarray  # [n] m
+    speed: np.ndarray  # [n] m/s
+    modes: np.ndarray  # [n] who drives: "human", "acc" or "unknown"
+    spacing: np.ndarray | None  # [n] m, bumper to bumper to the next car
+
+    @property
+    def known(self) -> np.ndarray:
+        """Whether a sample [n] has a place and a speed."""
+        return np.isfinite(self.x) & np.isfinite(self.y) & np.isfinite(self.speed)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Drive:
-    """One file: its header, and per car the samples."""
+    """One file: when and by whom it was driven."""
 
     path: Path
-    about: dict[str, list[str]]  # metadata, key in lower case -> cells
+    date: str  # "" where the file says none
     t: np.ndarray  # [n] s, from 0
-    cars: dict[int, dict[str, np.ndarray]]  # number -> x, y, speed [n], maybe more
+    cars: dict[int, Car]
     notes: tuple[str, ...]
-    ledger: Ledger  # of its rows
 
 
 def is_drive(path: Path) -> bool:
@@ -73,96 +81,141 @@ def _ends_with_names(lines: list[list[str]]) -> bool:
     return bool(lines and lines[-1]) and lines[-1][0].lower() == "time"
 
 
-def _read_header(path: Path) -> tuple[dict[str, list[str]], list[str], int]:
-    """Metadata, column names, and the number of lines down to the names."""
+def open_drive(path: Path) -> Table:
+    """A drive's table, whose column names stand below the lines of metadata.
+
+    Raises:
+      InputError: no column names, or one of a car met twice.
+    """
     lines = _first_lines(path)
     if not _ends_with_names(lines):
         raise InputError(
             f"{path}: column Time: missing: expected it in the first "
             f"{MAX_HEADER_LINES} lines, below the metadata"
         )
-    _check_names(path, lines[-1])
-    about = {cells[0].lower(): cells[1:] for cells in lines[:-1] if cells}
-    return about, lines[-1], len(lines)
-
-
-def _check_names(path: Path, names: list[str]) -> None:
+    names = lines[-1]
     twice = [n for n in names if COLUMN.fullmatch(n) and names.count(n) > 1]
     if twice:
         raise InputError(f"{path}: column {twice[0]!r}: met twice: expected once")
+    return open_table(path, {"delimiter": ",", "names": names, "skip": len(lines)})
 
 
-def read_drive(path: Path, allowed: float) -> Drive:
+def read_drive(table: Table, spec: Mapping, ledger: Ledger) -> Drive:
     """A file's cars that have positions, checked.
 
     Args:
-      path: file.
-      allowed: share of bad rows.
+      table: of `open_drive`.
+      spec: source TOML.
+      ledger: of the file.
 
     Raises:
       InputError: no table of a drive, or numbers beyond any place, speed or time.
     """
-    about, header, skip = _read_header(path)
+    path, (time, *header) = table.path, table.header
     columns: dict[int, dict[str, str]] = {}
-    for name in header[1:]:
+    for name in header:
         match = COLUMN.fullmatch(name)
         if match is not None:
             columns.setdefault(int(match[2]), {})[match[1]] = name
-    source = open_table(path, {"delimiter": ",", "names": header, "skip": skip})
-    ledger = Ledger(path=path, unit=source.unit, allowed=allowed)
-    table = _read_rows(source, header[0], columns, ledger)
-    cars, without = {}, []
-    for car, found in sorted(columns.items()):
-        if "Speed" not in found:
-            continue
-        values = {field: table[name] for field, name in found.items()}
-        if not ({"E", "N"} <= set(found) or {"Lat", "Lon"} <= set(found)):
-            without.append(car)
-            continue
-        cars[car] = _located(values)
+    names = {name: part for own in columns.values() for part, name in own.items()}
+    rows = Columns(
+        needed={time: "time"},
+        optional={name: KINDS.get(part, "number") for name, part in names.items()},
+        t=time,
+        user=None,
+        name_of=lambda _: "of the row",
+    ).read(table, ledger)
+    about = {cells[0].lower(): cells[1:] for cells in _first_lines(path)[:-1] if cells}
+    cars, notes = {}, []
+    for number, found in sorted(columns.items()):
+        values = {part: rows[name] for part, name in found.items()}
+        if {"E", "N"} <= values.keys() or {"Lat", "Lon"} <= values.keys():
+            if "Speed" in values:
+                cars[number] = _car(path, number, values, about, spec)
+        elif "Speed" in values:
+            notes.append(f"car {number} has no positions; left out")
     if not cars:
         raise InputError(
-            f"{path}: columns: {header[:8]}: expected Speed1, E1, N1 of one car or more"
+            f"{path}: columns: {[time, *header][:8]}: expected Speed1, E1, N1 of one "
+            "car or more"
         )
-    notes = [f"car {car} has no positions; left out" for car in without]
-    time = table[header[0]]
     return Drive(
         path=path,
-        about=about,
-        t=time - time.min(),
+        date="-".join(cell for cell in about.get("date", []) if cell),
+        t=rows[time] - rows[time].min(),
         cars=cars,
         notes=tuple(notes),
-        ledger=ledger,
     )
 
 
-def _read_rows(
-    source: Table, time: str, columns: dict[int, dict[str, str]], ledger: Ledger
-) -> dict[str, np.ndarray]:
-    """Rows of a drive, each time once."""
-    fields = [Field(name=time, column=time, limit=MAX_TIME)]
-    fields += [
-        Field(
-            name=name,
-            column=name,
-            needed=False,
-            text=part == "Driver",
-            limit=LIMITS.get(part, np.inf),
-        )
-        for found in columns.values()
-        for part, name in found.items()
-    ]
-    rows = read(source, fields, ledger)
-    drive = {**rows, "t": rows[time], "id": np.zeros(rows[time].size)}
-    compared = [field.name for field in fields]
-    kept = single_rows(drive, ledger, compared, lambda _: "of the row")
-    return {name: column[kept] for name, column in rows.items()}
+def _car(
+    path: Path,
+    number: int,
+    values: Mapping[str, np.ndarray],
+    about: Mapping[str, list[str]],
+    spec: Mapping,
+) -> Car:
+    """One car by its columns and the lines of metadata, key in lower case -> cells."""
+    names = about.get("vehicle_order", [])
+    model = re.sub(r"\s+", "", names[number - 1]) if 0 < number <= len(names) else ""
+    name = f"{number}-{model[:40]}" if model else str(number)
+    flag = "".join(about.get("acc", []))
+    modes = np.full(values["Speed"].shape, "human" if flag == "0" else "unknown")
+    if "Driver" in values:
+        modes = np.char.lower(values["Driver"])
+        modes = np.where(modes == "", "unknown", modes)
+    x, y = _place(values)
+    return Car(
+        number=number,
+        name=name,
+        size=_size(path, number, name, about, spec),
+        x=x,
+        y=y,
+        speed=values["Speed"],
+        modes=modes,
+        spacing=values.get("IVS"),
+    )
 
 
-def _located(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _size(
+    path: Path,
+    number: int,
+    name: str,
+    about: Mapping[str, list[str]],
+    spec: Mapping,
+) -> tuple[float, float]:
+    """Length and width [m]: of the header, of the model, or a car's."""
+    size = list(_model_size(name, spec.get("sizes", {})))
+    for place, field in enumerate(("length", "width")):
+        for key, cells in about.items():
+            if field in key and 0 < number <= len(cells):
+                try:
+                    size[place] = float(cells[number - 1])
+                except ValueError as error:
+                    raise InputError(
+                        f"{path}: {key[:40]}: '{cells[number - 1][:40]}': "
+                        "expected a number of metres"
+                    ) from error
+    return size[0], size[1]
+
+
+def _model_size(name: str, sizes: Mapping[str, list[float]]) -> tuple[float, float]:
+    """The size of the longest model's name that occurs in a name."""
+
+    def plain(text: str) -> str:
+        return re.sub(r"[^a-z0-9]", "", text.lower())
+
+    known = [key for key in sizes if plain(key) in plain(name)]
+    if not known:
+        return SIZE_M
+    length, width = sizes[max(known, key=len)]
+    return float(length), float(width)
+
+
+def _place(values: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """x, y [m] from E, N, or from latitude and longitude in radians or degrees."""
     if "E" in values and "N" in values:
-        return {**values, "x": values["E"], "y": values["N"]}
+        return values["E"], values["N"]
     degrees = [values[field] for field in ("Lat", "Lon")]
     known = np.isfinite(degrees[0]) & np.isfinite(degrees[1])
     # no latitude in radians is beyond pi / 2
@@ -173,4 +226,4 @@ def _located(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     if known.any():
         zone = utm_zone(float(np.median(degrees[1][known])))
         place[known] = utm(degrees[0][known], degrees[1][known], zone)
-    return {**values, "x": place[:, 0], "y": place[:, 1]}
+    return place[:, 0], place[:, 1]

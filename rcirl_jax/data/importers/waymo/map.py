@@ -18,12 +18,8 @@ from rcirl_jax.data.importers.shapes import (
     line_across,
     moves,
 )
-from rcirl_jax.data.importers.waymo.widths import (
-    MAX_POINTS,
-    Bounds,
-    Segments,
-    half_widths,
-)
+from rcirl_jax.data.importers.signals import STATES, signal_of
+from rcirl_jax.data.importers.waymo.widths import MAX_POINTS, Segments, half_widths
 from rcirl_jax.data.readers.protobuf import Message, columns
 from rcirl_jax.data.recording import MAX_SPEED_MPS
 from rcirl_jax.errors import InputError
@@ -36,8 +32,7 @@ LANE_TYPES = {0: "undefined", 1: "freeway", 2: "surface_street", 3: "bike_lane"}
 DRIVEN = ("undefined", "freeway", "surface_street")
 WIDTH_M = 3.5  # m, of lanes without boundaries
 # LANE_STATE_*: unknown, arrow stop/caution/go, stop/caution/go, flashing stop/caution
-OFF, RED, YELLOW, GREEN = range(4)
-NAMES = ("off", "red", "yellow", "green")
+OFF, RED, YELLOW, GREEN = range(len(STATES))
 COLOURS = np.array([OFF, RED, YELLOW, GREEN, RED, YELLOW, GREEN, OFF, OFF], np.int8)
 FLASHING_STOP = 7  # a stop sign, in effect
 MAX_COLOURS = 50_000_000  # lanes by steps; 1000 lanes over an hour take 36 million
@@ -131,7 +126,7 @@ def _lanes(
     centres = _polylines(where, driven, origin)
     heads = {key: driven[key] for key, line in centres.items() if moves(line).sum() > 1}
     width = 0.5 * number(spec, "lane_width_m", WIDTH_M)
-    bounds = Bounds(_bound_lines(where, features, origin))
+    bounds = _bound_lines(where, features, origin)
     lanes = _built(where, heads, centres, bounds, stops, width)
     notes = []
     if len(every) > len(driven):
@@ -147,7 +142,7 @@ def _built(
     where: str,
     heads: Mapping[int, Message],
     centres: dict[int, np.ndarray],
-    bounds: Bounds,
+    bounds: Mapping[int, np.ndarray],
     stops: _Stop,
     default: float,
 ) -> tuple[Lane, ...]:
@@ -167,19 +162,22 @@ def _built(
     lanes = []
     for row, (key, head) in enumerate(heads.items()):
         keep = moves(lines[row])
+        line, sides = lines[row][keep], (left[row][keep], right[row][keep])
+        point = stops.points.get(key)
         lane = Lane(
             id=str(key),
-            centre=lines[row][keep],
-            left_width=left[row][keep],
-            right_width=right[row][keep],
+            centre=line,
+            left_width=sides[0],
+            right_width=sides[1],
             speed_limit=_limit(where, key, head),
             successors=tuple(map(str, exits[key])),
             left=beside[0][row],
             right=beside[1][row],
             signal_ids=(str(key),) if key in stops.signals else (),
             stop_sign=key in stops.signs,
+            stop_line=None if point is None else line_across(line, *sides, point),
         )
-        lanes.append(_stopped(lane, stops.points.get(key)))
+        lanes.append(lane)
     return tuple(lanes)
 
 
@@ -237,14 +235,6 @@ def _limit(where: str, key: int, head: Message) -> float | None:
     return limit * MPH_MPS or None
 
 
-def _stopped(lane: Lane, point: np.ndarray | None) -> Lane:
-    """The lane with its stop line through a point [2] m, if there is one."""
-    if point is None:
-        return lane
-    line = line_across(lane.centre, lane.left_width, lane.right_width, point)
-    return dataclasses.replace(lane, stop_line=line)
-
-
 # -------------------------------------------------------------------- signals
 
 
@@ -297,7 +287,7 @@ def _signals(
     colours[rows[known], step[known]] = COLOURS[state[known]]
     gap = number(spec, "signal_gap_s", GAP_S)
     signals = tuple(
-        _signal(str(key), _bridged(row, t, gap), t)
+        signal_of(str(key), t, _bridged(row, t, gap))
         for key, row in zip(ids, colours, strict=True)
     )
     stops = {
@@ -324,10 +314,3 @@ def _bridged(colours: np.ndarray, t: np.ndarray, gap: float) -> np.ndarray:
     for first, last in zip(before[fill], after[fill], strict=True):
         filled[first:last] = colours[first]
     return filled
-
-
-def _signal(name: str, colours: np.ndarray, t: np.ndarray) -> Signal:
-    first = np.flatnonzero(np.diff(colours, prepend=-1))
-    return Signal(
-        id=name, start=t[first], state=tuple(NAMES[colour] for colour in colours[first])
-    )

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import RowCounts
+from rcirl_jax.types import Recording, RowCounts
 
 LINE = "line"  # column: of each row in the file; the number of the row in Parquet
 SAID = {
@@ -66,6 +66,17 @@ class Ledger:
         ]
         self.told = RowCounts(**{name: getattr(self, name) for name in names})
         return RowCounts(**since), notes
+
+
+def with_news(made: Recording, *ledgers: Ledger) -> Recording:
+    """A recording that says what became of its files' rows since the one before it."""
+    found = [ledger.news() for ledger in ledgers]
+    names = [field.name for field in dataclasses.fields(RowCounts)]
+    counts = {name: sum(getattr(rows, name) for rows, _ in found) for name in names}
+    notes = [note for _, dropped in found for note in dropped]
+    return dataclasses.replace(
+        made, rows=RowCounts(**counts), notes=(*made.notes, *notes)
+    )
 
 
 def allowed_share(spec: Mapping, default: float = MAX_BAD_ROWS) -> float:

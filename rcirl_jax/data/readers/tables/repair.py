@@ -1,6 +1,6 @@
 """A road user is in one place at a time: rows that say otherwise are repaired."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -8,31 +8,59 @@ import numpy as np
 from rcirl_jax.data.readers.tables.ledger import LINE, Ledger
 
 
+def once(
+    rows: dict[str, np.ndarray],
+    ledger: Ledger,
+    t: str = "t",
+    user: str | None = "id",
+    **options: Any,  # noqa: ANN401
+) -> dict[str, np.ndarray]:
+    """The rows of a table in which each road user is met once in a frame.
+
+    Args:
+      rows: columns [n] of `table.read`.
+      ledger: of the file.
+      t: name of the clock's column.
+      user: name of that of the road users; None: a row is of all of them.
+      **options: of `single_rows`.
+    """
+    users = np.zeros(rows[t].size) if user is None else rows[user]
+    kept = single_rows(rows, rows[t], users, ledger, **options)
+    return rows if kept.all() else {name: rows[name][kept] for name in rows}
+
+
 def single_rows(
     values: Mapping[str, np.ndarray],
+    t: np.ndarray,
+    codes: np.ndarray,
     ledger: Ledger,
-    compared: Sequence[str],
+    places: Sequence[str] = ("x", "y"),
+    apart: Container[str] = (),
     name_of: Callable[[Any], str] = str,
-    places: tuple[str, str] = ("x", "y"),
 ) -> np.ndarray:
     """Which rows [n] are kept, so that each road user is met once in a frame.
 
-    Of rows that are equal in everything compared the first is kept. Of others with
-    one id and time, that which continues the track: the nearest to where the road
-    user was before (else: is after). Both are counted in the ledger.
+    Of rows that are equal in everything that was read the first is kept. Of others
+    with one id and time, that which continues the track: the nearest to where the
+    road user was before (else: is after). Both are counted in the ledger.
 
     Args:
-      values: t, id, `line` and the places, [n] each; id as text or numbers.
+      values: columns [n] that were read, `line` among them.
+      t: [n] clock.
+      codes: [n] ids, text or numbers.
       ledger: of the file.
-      compared: names of the columns in which repeated rows are equal.
-      name_of: an id as the file has it.
       places: names of the positions; one that is not there is 0.
+      apart: names of columns in which rows that repeat each other may differ.
+      name_of: an id as the file has it.
 
     Raises:
       InputError: more rows than the ledger allows.
     """
-    t = values["t"]
-    codes = values["id"]
+    ids = codes
+
+    def named(row: int) -> str:
+        return f"{ledger.unit} {values[LINE][row]:.0f}: id {name_of(ids[row])}"
+
     if codes.dtype.kind != "f":
         codes = np.unique(codes, return_inverse=True)[1]
     kept = np.ones(t.size, bool)
@@ -42,7 +70,9 @@ def single_rows(
         return kept
     shared = order[np.concatenate([same, [False]]) | np.concatenate([[False], same])]
     columns = [
-        np.unique(values[name][shared], return_inverse=True)[1] for name in compared
+        np.unique(values[name][shared], return_inverse=True)[1]
+        for name in values
+        if name != LINE and name not in apart
     ]
     columns += [t[shared], codes[shared]]
     inner = np.lexsort((shared, *columns))
@@ -50,13 +80,13 @@ def single_rows(
     repeats = shared[inner[1:][equal]]
     kept[repeats] = False
     if repeats.size:
-        who = _named(values, repeats.min(), ledger, name_of)
+        who = named(repeats.min())
         ledger.drop("repeated", f"{who}: the same row again", repeats.size)
     order = order[kept[order]]
     same = (np.diff(codes[order]) == 0) & (np.diff(t[order]) == 0.0)
     if same.any():
         first = order[1:][same].min()
-        who = _named(values, first, ledger, name_of)
+        who = named(first)
         ledger.drop("doubled", f"{who}: met twice in one frame", int(same.sum()))
     ledger.check()
     none = np.zeros(t.size)
@@ -68,15 +98,6 @@ def single_rows(
         kept[order[low:high]] = False
         kept[_continuing(where, codes, order, low, high, kept)] = True
     return kept
-
-
-def _named(
-    values: Mapping[str, np.ndarray],
-    row: int,
-    ledger: Ledger,
-    name_of: Callable[[Any], str],
-) -> str:
-    return f"{ledger.unit} {values[LINE][row]:.0f}: id {name_of(values['id'][row])}"
 
 
 def _continuing(

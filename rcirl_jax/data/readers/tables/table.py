@@ -139,26 +139,32 @@ def fields_of(
     *,
     texts: Sequence[str] = (),
     limits: Mapping[str, float] | None = None,
+    columns: Mapping[str, str] | None = None,
+    factors: Mapping[str, float] | None = None,
 ) -> list[Field]:
-    """Columns as fields of their own names: those needed, and others that are there.
+    """Columns as fields: those needed, and others that are there.
 
     Args:
       table: of `open_table`.
-      needed: columns without which a row is none.
-      optional: columns that may be missing, and whose cells may be empty.
+      needed: fields without which a row is none.
+      optional: fields whose column may be missing, and whose cells may be empty.
       texts: names among both that are no numbers.
       limits: of numbers; beyond them they are absurd.
+      columns: names of columns, where they are not those of their fields.
+      factors: of units.
     """
+    own = columns or {}
     return [
         Field(
             name=name,
-            column=name,
+            column=own.get(name, name),
             needed=name in needed,
             text=name in texts,
             limit=(limits or {}).get(name, np.inf),
+            factor=(factors or {}).get(name, 1.0),
         )
         for name in (*needed, *optional)
-        if name in needed or table.has(name)
+        if name in needed or table.has(own.get(name, name))
     ]
 
 

@@ -8,12 +8,11 @@ of the drive is in a file of its own.
 import struct
 
 import numpy as np
-from google.protobuf import descriptor_pb2
 
 from rcirl_jax.types import Kind
 from tests.data.importers.formats import Fixture
 from tests.data.importers.formats.drives import samples, seen_by_a_car
-from tests.data.importers.formats.waymo import Single, message
+from tests.data.importers.formats.proto import classes, file_of, written
 
 START_S = 1627031535.25  # s, of the first localization
 CENTRE = np.array([587000.0, 4141000.0])  # m, UTM zone 10; the local origin
@@ -33,8 +32,6 @@ def road_users(t):
 
 # ---------------------------------------------------------------- descriptors
 
-# package -> its messages, a field as "name number type", a type of messages with a
-# dot before it, a list with a star behind it; enums of a message are "Message/Enum"
 PACKAGES = {
     "apollo.common": """
 Header: timestamp_sec 1 double, module_name 2 string, sequence_num 3 uint32
@@ -79,53 +76,36 @@ ParkingCommand: parking_spot_id 2 string
 PlanningCommand: header 1 .apollo.common.Header, command_id 2 int64,\
  lane_follow_command 3 .apollo.routing.RoutingResponse,\
  parking_command 6 .apollo.planning.ParkingCommand,\
- custom_command 7 .google.protobuf.Any
+ custom_command 7 .apollo.planning.ParkingCommand
 """,
 }
 
 
-def file_of(package, text):
-    """FileDescriptorProto of messages as in PACKAGES."""
-    file = descriptor_pb2.FileDescriptorProto(name=f"{package}.proto", package=package)
-    messages = {}
-    for line in text.strip().splitlines():
-        name, _, entries = line.partition(":")
-        name, _, enum = name.partition("/")
-        entries = [entry.split() for entry in entries.split(",") if entry.strip()]
-        if enum:
-            values = messages[name].enum_type.add(name=enum).value
-            for label, number in entries:
-                values.add(name=label, number=int(number))
-        else:
-            messages[name] = file.message_type.add(name=name)
-            for entry in entries:
-                _add_field(messages[name].field.add(), *entry)
-    return file.SerializeToString()
+# of Cyber RT itself
+CYBER = """
+ProtoDesc: desc 1 bytes, dependencies 2 .ProtoDesc*
+Header: major_version 1 uint32, minor_version 2 uint32, compress 3 int32,\
+ is_complete 13 bool
+Channel: name 1 string, message_type 2 string, proto_desc 3 bytes
+ChunkHeader: begin_time 1 uint64, message_number 3 uint64
+SingleMessage: channel_name 1 string, time 2 uint64, content 3 bytes
+ChunkBody: messages 1 .SingleMessage*
+SingleIndex: type 1 int32, position 2 uint64
+Index: indexes 1 .SingleIndex*
+"""
+MESSAGES = classes({**PACKAGES, "cyber": CYBER})
 
 
-def _add_field(field, name, number, kind):
-    field.name, field.number = name, int(number)
-    is_list, kind = kind.endswith("*"), kind.rstrip("*")
-    field.label = field.LABEL_REPEATED if is_list else field.LABEL_OPTIONAL
-    named = {".": field.TYPE_MESSAGE, "/": field.TYPE_ENUM}
-    if kind[0] in named:
-        field.type, field.type_name = named[kind[0]], f".{kind[1:]}"
-    else:
-        field.type = field.Type.Value(f"TYPE_{kind.upper()}")
-
-
-def proto_desc(main, *needs):
+def _described(package, *needs, text=None):
     """ProtoDesc: a file and those it imports, each once per importer."""
-    return message([(1, main), *[(2, other) for other in needs]])
-
-
-_COMMON = proto_desc(file_of("apollo.common", PACKAGES["apollo.common"]))
+    content = file_of(package, text or PACKAGES[package]).SerializeToString()
+    needs = needs if package == "apollo.common" else (*needs, "apollo.common")
+    return MESSAGES.ProtoDesc(desc=content, dependencies=map(_described, needs))
 
 
 def described(package, *needs, text=None):
-    """ProtoDesc of a package, of those that it imports, and of the common one."""
-    text = PACKAGES[package] if text is None else text
-    return proto_desc(file_of(package, text), *map(described, needs), _COMMON)
+    """Bytes of the ProtoDesc of a package, of those it imports, and the common one."""
+    return _described(package, *needs, text=text).SerializeToString()
 
 
 COMMANDS = ("apollo.planning.PlanningCommand",)
@@ -157,45 +137,49 @@ CHANNELS = {
 
 
 def stamped(t):
-    return [(1, float(START_S + t)), (2, "test")]
+    return {"timestamp_sec": START_S + t, "module_name": "test"}
 
 
 def point(x, y):
-    return [(1, float(x)), (2, float(y)), (3, 0.0)]
+    return {"x": x, "y": y, "z": 0.0}
 
 
-def localization(t, *, heading=True, velocity=True):
+def localization(t, *, later=0.0, heading=True, velocity=True, **changes):
     """The rear axle's pose; the quaternion turns (right, forward, up)."""
     ego = road_users(np.array([t]))["ego"]
     yaw = float(ego.heading[0])
     x = ego.x[0] - AHEAD * np.cos(yaw) + CENTRE[0]
     y = ego.y[0] - AHEAD * np.sin(yaw) + CENTRE[1]
     half = 0.5 * (yaw - 0.5 * np.pi)
-    turned = [(1, 0.0), (2, 0.0), (3, float(np.sin(half))), (4, float(np.cos(half)))]
-    pose = [(1, point(x, y)), (2, turned)]
-    pose += [(3, point(8.0 * np.cos(yaw), 8.0 * np.sin(yaw)))] if velocity else []
-    pose += [(6, yaw)] if heading else []
-    return message([(1, stamped(t + 0.004)), (2, pose), (4, float(START_S + t))])
+    turned = {"qx": 0.0, "qy": 0.0, "qz": np.sin(half), "qw": np.cos(half)}
+    pose = {"position": point(x, y), "orientation": turned}
+    if velocity:
+        pose["linear_velocity"] = point(8.0 * np.cos(yaw), 8.0 * np.sin(yaw))
+    if heading:
+        pose["heading"] = yaw
+    fields = {
+        "header": stamped(t + 0.004 + later),
+        "pose": pose,
+        "measurement_time": START_S + t + later,
+    }
+    return written(MESSAGES.LocalizationEstimate, **{**fields, **changes})
 
 
-def chassis(t, *, manual=True):
-    return message([(5, Single(8.0)), (21, 0 if manual else 1), (25, stamped(t))])
+def chassis(t, *, manual=True, speed=8.0):
+    fields = {"speed_mps": speed, "driving_mode": 0 if manual else 1}
+    return written(MESSAGES.Chassis, **fields, header=stamped(t))
 
 
 def obstacle(name, user, t):
     heading, speed = float(user.heading[0]), float(user.speed[0])
-    velocity = point(speed * np.cos(heading), speed * np.sin(heading))
-    return [
-        (1, int(name)),
-        (2, point(user.x[0] + CENTRE[0], user.y[0] + CENTRE[1])),
-        (3, heading),
-        (4, velocity),
-        (5, float(user.length)),
-        (6, float(user.width)),
-        (7, 1.5),
-        (10, TYPE[user.kind]),
-        (11, float(START_S + t)),
-    ]
+    return {
+        "id": int(name),
+        "position": point(user.x[0] + CENTRE[0], user.y[0] + CENTRE[1]),
+        "theta": heading,
+        "velocity": point(speed * np.cos(heading), speed * np.sin(heading)),
+        **{"length": user.length, "width": user.width, "height": 1.5},
+        **{"type": TYPE[user.kind], "timestamp": START_S + t},
+    }
 
 
 def is_seen(name, t):
@@ -212,29 +196,43 @@ def seen_at(t):
     ]
 
 
+def perceived(t, obstacles, late=LATE_S):
+    """A message of perception, published late."""
+    stamp = stamped(t + late)
+    kind = MESSAGES.PerceptionObstacles
+    return written(kind, perception_obstacle=obstacles, header=stamp)
+
+
 def perception(t):
-    return message([*[(1, item) for item in seen_at(t)], (2, stamped(t + LATE_S))])
+    return perceived(t, seen_at(t))
 
 
 def prediction(t):
-    items = [(2, [(1, item), (2, float(START_S + t))]) for item in seen_at(t)]
-    return message([(1, stamped(t + LATE_S)), *items])
+    seen = [
+        {"perception_obstacle": item, "timestamp": START_S + t} for item in seen_at(t)
+    ]
+    kind = MESSAGES.PredictionObstacles
+    return written(kind, header=stamped(t + LATE_S), prediction_obstacle=seen)
+
+
+def _route(x, y):
+    points = [{"pose": point(*CENTRE)}, {"pose": point(x, y)}]
+    return {"header": stamped(0.0), "routing_request": {"waypoint": points}}
 
 
 def routing(x, y):
-    points = [(2, [(3, point(CENTRE[0], CENTRE[1]))]), (2, [(3, point(x, y))])]
-    return message([(1, stamped(0.0)), (4, points)])
+    return written(MESSAGES.RoutingResponse, **_route(x, y))
 
 
 def command(x, y):
     """Since Apollo 9: the routing inside what planning is told to do."""
-    points = [(2, [(3, point(CENTRE[0], CENTRE[1]))]), (2, [(3, point(x, y))])]
-    follow = [(1, stamped(0.0)), (4, points)]
-    return message([(1, stamped(0.0)), (2, 7), (3, follow)])
+    follow = {"command_id": 7, "lane_follow_command": _route(x, y)}
+    return written(MESSAGES.PlanningCommand, header=stamped(0.0), **follow)
 
 
 def parking():
-    return message([(1, stamped(0.0)), (2, 8), (6, [(2, "451089045")])])
+    spot = {"command_id": 8, "parking_command": {"parking_spot_id": "451089045"}}
+    return written(MESSAGES.PlanningCommand, header=stamped(0.0), **spot)
 
 
 def perception_times():
@@ -270,24 +268,38 @@ def section(kind, content):
 
 
 def header(*, compress=0, complete=True):
-    content = message([(1, 1), (2, 0), (3, compress), (13, complete)])
+    version = {"major_version": 1, "minor_version": 0}
+    made = {**version, "compress": compress, "is_complete": complete}
+    content = written(MESSAGES.Header, **made)
     return section(0, content) + bytes(2048 - len(content))
+
+
+def _channel(name, kind, desc):
+    about = {"name": name, "message_type": kind, "proto_desc": desc}
+    return section(4, written(MESSAGES.Channel, **about))
+
+
+INDEX = section(3, written(MESSAGES.Index, indexes=[{"type": 4, "position": 2064}]))
 
 
 def record(messages, *, channels=None, chunk=200, **options):
     """A record file: header, channels, chunks of messages, index."""
+    channels = CHANNELS if channels is None else channels
     parts = [header(**options)]
-    for name, (kind, desc) in (CHANNELS if channels is None else channels).items():
-        parts.append(section(4, message([(1, name), (2, kind), (3, desc)])))
+    parts += [_channel(name, *found) for name, found in channels.items()]
     for start in range(0, len(messages), chunk):
-        singles = []
-        for name, t, content in messages[start : start + chunk]:
-            time = round((START_S + t) * 1e9)
-            singles.append((1, [(1, name), (2, time), (3, content)]))
-        parts.append(section(1, message([(1, 1), (3, len(singles))])))
-        parts.append(section(2, message(singles)))
-    parts.append(section(3, message([(1, [(1, 4), (2, 2064)])])))
-    return b"".join(parts)
+        singles = [
+            {
+                "channel_name": name,
+                "time": round((START_S + t) * 1e9),
+                "content": content,
+            }
+            for name, t, content in messages[start : start + chunk]
+        ]
+        head = {"begin_time": 1, "message_number": len(singles)}
+        parts.append(section(1, written(MESSAGES.ChunkHeader, **head)))
+        parts.append(section(2, written(MESSAGES.ChunkBody, messages=singles)))
+    return b"".join([*parts, INDEX])
 
 
 def expected():
@@ -324,3 +336,61 @@ def write(folder):
         num_lanes=1,
         files=(first, second),
     )
+
+
+# ---------------------------------------------------------------------- harms
+
+
+def rewritten(made=None, *, name="/apollo/localization/pose", content=None):
+    """What puts other messages of a channel, or bytes, in the place of a drive."""
+
+    def harm(fixture):
+        messages = [
+            (channel, t, made(t) if made and channel == name else message)
+            for channel, t, message in drive()[:200]
+        ]
+        whole = record(messages) if content is None else content
+        fixture.files[0].write_bytes(whole)
+        fixture.files[1].unlink()
+
+    return harm
+
+
+def posed(**pose):
+    pose = {"position": point(*CENTRE), "heading": 0.0, **pose}
+    return rewritten(lambda t: localization(t, pose=pose))
+
+
+def seen(**changes):
+    def made(t):
+        first, *others = seen_at(t)
+        return perceived(t, [{**first, **changes}, *others])
+
+    return rewritten(made, name=OBSTACLES)
+
+
+NAN = float("nan")
+# what is done to the files, and what the line says
+HARMS = {
+    "pose: x: nan": posed(position=point(NAN, 0.0)),
+    "s from first to last": rewritten(
+        lambda t: localization(t, later=1e9 * (0.5 < t < 0.515))
+    ),
+    "expected an Apollo message": rewritten(lambda t: b"\xff\xff"),
+    "x: 1e+300": seen(position=point(1e300, 0.0)),
+    "length: -2 m: expected 0 to": seen(length=-2.0),
+    "no messages, nor obstacles": rewritten(content=record([])),
+    "compress: 2: expected 0, none": rewritten(content=header(compress=2)),
+    "expected a whole record; truncated?": rewritten(
+        content=header() + struct.pack("<i4xq", 2, 2**62)
+    ),
+    "varint: no end": rewritten(content=header() + section(2, b"\xff" * 11)),
+    "Error parsing": rewritten(content=header() + section(4, b"\x0a\x05")),
+}
+# options of values that are none
+OPTIONS = [
+    *[{"rate_hz": rate} for rate in (0, 1e9)],
+    *[{"window_s": window} for window in (0, 1e-320, 0.99)],
+    *[{"topics": bad} for bad in (3, {"pose": "/x"}, {"routing": []})],
+    *[{"ego": 1}, {"unknown": "x"}],
+]

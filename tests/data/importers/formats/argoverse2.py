@@ -219,3 +219,66 @@ def write(folder):
         numbers={files[1]: r'left_lane_boundary": \[\{"x": ([^,}]*)'},
         is_counted=True,
     )
+
+
+# ---------------------------------------------------------------------- harms
+
+
+def cells(column, value, rows=slice(None)):
+    """What puts a value into rows of a column."""
+
+    def harm(fixture):
+        table = columns()
+        table[column][rows] = [value] * len(table[column][rows])
+        write_parquet(fixture.files[0], table)
+
+    return harm
+
+
+def without(column):
+    def harm(fixture):
+        table = pq.read_table(fixture.files[0]).drop_columns(column)
+        pq.write_table(table, fixture.files[0])
+
+    return harm
+
+
+def segment_with(**changes):
+    """What changes fields of a lane segment."""
+
+    def harm(fixture):
+        lanes = vector_map()
+        lanes["lane_segments"]["205119002"].update(changes)
+        fixture.files[1].write_text(json.dumps(lanes))
+
+    return harm
+
+
+ONE = slice(3, 4)
+POINT, NAN = {"x": 1.0, "y": 2.0, "z": 3.0}, float("nan")
+# what is done to the table or the map, and what the line says
+HARMS = {
+    "row 4: position_x: 'nan': expected a finite": cells("position_x", NAN, ONE),
+    "row 1: position_x: 'left': expected a finite": cells("position_x", "left"),
+    # the recording car's own speed is measured: if that is wrong, so is the file
+    "track AV: speed: 300": cells("velocity_x", 300.0, ONE),
+    "row 3: timestep: 110: expected a whole number from 0": cells("timestep", 110, ONE),
+    "t: 2: met twice": cells("timestep", 2, ONE),
+    "row 3: object_category: 7: expected 0 to 3": cells("object_category", 7, ONE),
+    "track 138902: object_type: tank": cells("object_type", "tank"),
+    "column track_id: type binary: expected text": cells("track_id", b"\xff\xfe"),
+    # 100 MB when written out, refused without that
+    "expected up to 64 characters": cells("track_id", "x" * 100_000),
+    "column velocity_y: missing": without("velocity_y"),
+    "lane_type: RAIL": segment_with(lane_type="RAIL"),
+    "lane segment 205119002: id: 7: expected a whole": segment_with(id="7"),
+    "lane segment 205119001: id: met twice": segment_with(id=205119001),
+    "left_lane_boundary: [{": segment_with(left_lane_boundary=[POINT]),
+    "right_lane_boundary: x: nan at point 1": segment_with(
+        right_lane_boundary=[POINT, {"x": NAN, "y": 2}]
+    ),
+}
+OPTIONS = [
+    *[{"sizes": {"vehicle": size}} for size in ("long", [12.0], None)],
+    *[{"lane_types": ["TRAM"]}, {"speed_limit": "fast"}],
+]

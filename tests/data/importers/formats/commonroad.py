@@ -73,3 +73,54 @@ def _moving(name, kind, shape, states, first):
         f'<dynamicObstacle id="{name}"><type>{kind}</type><shape>{shape}</shape>'
         f"{first}<trajectory>{''.join(states)}</trajectory></dynamicObstacle>"
     )
+
+
+# ---------------------------------------------------------------------- harms
+
+
+def file_of(*parts, **options):
+    """What writes a file of other parts."""
+    return lambda fixture: w.commonroad(fixture.files[0], *parts, **options)
+
+
+def moved(*states):
+    return file_of(w.lanelet(), w.car(states=list(states)))
+
+
+def text(content):
+    return lambda fixture: fixture.files[0].write_text(content)
+
+
+def lit(colour, duration):
+    return file_of(ROAD, w.light("7", [(colour, duration)]))
+
+
+ROAD = w.lanelet() + w.car()
+FEET = [w.state(k, 1.5 * k / w.FOOT, 0) for k in range(1, 40)]
+LONG = w.BOX.replace("4.4", "4400")
+HEAD = '<commonRoad commonRoadVersion="2020a" timeStepSize="x"/>'
+# what is written, and what the line says
+HARMS = {
+    "lanelet: none": file_of(w.car()),
+    "tracks: none": file_of(w.lanelet()),
+    "state 1: velocity: missing": moved(w.state(1, 1.5, 0, drop=("velocity",))),
+    "x: 'nan'": moved(w.state(1, "nan", 0)),
+    "feet taken for metres": moved(*FEET),
+    # a clock of a century
+    "time: 2e+10: expected steps up to": moved(w.state(2 * 10**10, 3, 0)),
+    "time: 2: expected increasing": moved(w.state(3, 4.5, 0), w.state(2, 3, 0)),
+    "lane id: 1": file_of(w.lanelet(), ROAD),
+    "shape: blob": file_of(w.lanelet(), w.car(shape="<blob/>")),
+    "length: 4400": file_of(w.lanelet(), w.car(shape=LONG)),
+    "leftBound": file_of(w.lanelet(left=[(0, 1)]), w.car()),
+    "pink for 9": lit("pink", 9),
+    "red for 1e-09": lit("red", 1e-9),
+    "role: odd": file_of(
+        w.lanelet(), w.car(version="2018b").replace("dynamic<", "odd<"), version="2018b"
+    ),
+    "root: 'other'": text("<other/>"),
+    "commonRoadVersion: 1999": text('<commonRoad commonRoadVersion="1999"/>'),
+    "timeStepSize: x": text(HEAD),
+    "xml: ": text('<?xml version="1.0" encoding="klingon"?><commonRoad/>'),
+}
+OPTIONS = [{"groups": name} for name in ("../groups.csv", "/etc/passwd", "x" * 300)]

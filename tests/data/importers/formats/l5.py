@@ -7,16 +7,17 @@ the map's lanes have a local frame of their own, 200 m away.
 
 import dataclasses
 import json
-import struct
+import shutil
 
 import numpy as np
 import pyproj
 import tensorstore
 
+from rcirl_jax.data.readers.zarr2 import StructuredArray
 from rcirl_jax.types import Kind
 from tests.data.importers.formats import Fixture
 from tests.data.importers.formats.drives import samples, seen_by_a_car
-from tests.data.importers.formats.waymo import Packed, Single, message, varint
+from tests.data.importers.formats.proto import classes, written
 
 T = 0.1 * np.arange(100)
 # frames come a few milliseconds early or late
@@ -190,17 +191,29 @@ def write_zarr(folder, *, scenes=2, start=START_NS, host="host-a013"):
 # --------------------------------------------------------------- semantic map
 
 
-def zigzag(value):
-    return (int(value) << 1) ^ (int(value) >> 63)
+FACES = ", ".join(f"face_{number} {number} .Nothing" for number in (11, 13))
+SCHEMA = f"""
+Nothing:
+GlobalId: id 1 bytes
+Segment: speed_limit 9 float
+GeoLocation: lat_e7 1 sfixed32, lng_e7 2 sfixed32
+GeoFrame: origin 1 .GeoLocation
+Boundary: x 1 sint32*, y 2 sint32*, z 3 sint32*
+Lane: parent 1 .GlobalId, frame 2 .GeoFrame, left 3 .Boundary, right 4 .Boundary,\
+ ahead 5 .GlobalId*, beside_left 6 .GlobalId, beside_right 7 .GlobalId,\
+ controls 8 .GlobalId*
+Light: faces 3 .GlobalId*
+Control: light 29 .Light, {FACES}
+Element: segment 1 .Segment, lane 3 .Lane, control 4 .Control, junction 5 .Nothing
+MapElement: id 1 .GlobalId, element 2 .Element
+MapFragment: name 1 bytes, elements 2 .MapElement*
+"""
+MESSAGES = classes({"lyft": SCHEMA})
 
 
-def fixed32(number, value):
-    return varint(number << 3 | 5) + struct.pack("<i", value)
-
-
-def name_of(text):
-    """GlobalId."""
-    return message([(1, text.encode())])
+def ids(names):
+    """GlobalIds."""
+    return [{"id": name.encode()} for name in names]
 
 
 def to_local(world):
@@ -213,25 +226,25 @@ def to_local(world):
 
 
 def bound(points):
-    local = np.round(to_local(np.asarray(points, np.float64)))
-    steps = np.diff(local, axis=0, prepend=np.zeros((1, 3)))
-    axes = [Packed(zigzag(v) for v in axis) for axis in steps.T]
-    return message([(1, axes[0]), (2, axes[1]), (3, axes[2])])
+    local = np.round(to_local(np.asarray(points, np.float64))).astype(int)
+    steps = np.diff(local, axis=0, prepend=np.zeros((1, 3), int))
+    return dict(zip("xyz", steps.T, strict=True))
 
 
-def lane(name, left, right, *, parent="seg", ahead=(), beside=(), controls=()):
-    origin = fixed32(1, LATITUDE) + fixed32(2, LONGITUDE)
-    body = [(1, name_of(parent)), (2, message([(1, origin)]))]
-    body += [(3, bound(left)), (4, bound(right))]
-    body += [(5, name_of(other)) for other in ahead]
-    body += [(6 + k, name_of(other)) for k, other in beside]
-    body += [(8, name_of(control)) for control in controls]
-    return element(name, 3, message(body))
+def lane(name, bounds, *, parent="seg", ahead=(), controls=(), **beside):
+    body = {
+        "parent": {"id": parent.encode()},
+        "frame": {"origin": {"lat_e7": LATITUDE, "lng_e7": LONGITUDE}},
+        **{"left": bound(bounds[0]), "right": bound(bounds[1])},
+        **{"ahead": ids(ahead), "controls": ids(controls)},
+        **{f"beside_{side}": {"id": other.encode()} for side, other in beside.items()},
+    }
+    return element(name, lane=body)
 
 
-def element(name, kind, body):
-    """MapElement with a segment (1), lane (3) or traffic control (4)."""
-    return message([(1, name_of(name)), (2, message([(kind, body)]))])
+def element(name, **kind):
+    """MapElement with a segment, lane, traffic control or junction."""
+    return {"id": {"id": name.encode()}, "element": kind}
 
 
 def write_map(path, controls=(RED, GREEN), inside=()):
@@ -249,23 +262,22 @@ def write_map(path, controls=(RED, GREEN), inside=()):
         return centre + radius * np.stack([np.sin(angle), -np.cos(angle)], axis=1)
 
     last = np.array([[x + 60.0, y], [x + 160.0, y]])
-    faces = [(3, name_of(face)) for face in (RED, GREEN)]
-    linked = {"ahead": ("b1", "c1"), "beside": ((0, "a2"),)}
+    linked = {"ahead": ("b1", "c1"), "left": "a2", "controls": controls}
     elements = [
-        element("seg", 1, message([(9, Single(11.176))])),
-        element("jun", 5, b""),
-        element(RED, 4, message([(11, b"")])),
-        element(GREEN, 4, message([(13, b"")])),
-        element(LIGHT, 4, message([(29, message(faces))])),
-        lane("a1", along(1.75), along(-1.75), **linked, controls=controls),
+        element("seg", segment={"speed_limit": 11.176}),
+        element("jun", junction={}),
+        element(RED, control={"face_11": {}}),
+        element(GREEN, control={"face_13": {}}),
+        element(LIGHT, control={"light": {"faces": ids((RED, GREEN))}}),
+        lane("a1", (along(1.75), along(-1.75)), **linked),
         # drawn against the traffic: the left bound lies to the right of the points
-        lane("a2", along(5.25)[::-1], along(1.75)[::-1], beside=((1, "a1"),)),
-        lane("b1", turn(23.25), turn(26.75), parent="jun"),
-        lane("c1", last + HALF, last - HALF, parent="jun", controls=inside),
-        element("stub", 3, message([(1, name_of("seg"))])),
+        lane("a2", (along(5.25)[::-1], along(1.75)[::-1]), right="a1"),
+        lane("b1", (turn(23.25), turn(26.75)), parent="jun"),
+        lane("c1", (last + HALF, last - HALF), parent="jun", controls=inside),
+        element("stub", lane={"parent": {"id": b"seg"}}),
     ]
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(message([(1, "map"), *[(2, item) for item in elements]]))
+    path.write_bytes(written(MESSAGES.MapFragment, name=b"map", elements=elements))
     return path
 
 
@@ -298,3 +310,70 @@ def write(folder):
         },
         is_counted=True,
     )
+
+
+# ---------------------------------------------------------------------- harms
+
+
+def change(dataset, name, edit):
+    """Rewrite an array of a dataset; `edit` may return other records."""
+    array = StructuredArray(dataset / name, {})
+    records = array.read(0, array.size).copy()
+    edited = edit(records)
+    shutil.rmtree(dataset / name)
+    write_array(dataset / name, records if edited is None else edited, array.chunk)
+
+
+def put(array, name, value, row=5):
+    """What puts a value into a row of an array."""
+
+    def edit(records):
+        records[name][row] = value
+
+    return lambda fixture: change(fixture.files[0].parents[1], array, edit)
+
+
+def character(point):
+    """A text whose first character is a number."""
+    return np.array([point, 65], "<u4").view("<U2")[0]
+
+
+def placed(**fields):
+    """What writes a semantic map of one lane of these fields."""
+    body = {"parent": {}, "frame": {}, "left": bound([[0, 0]] * 2), **fields}
+    body.setdefault("right", bound([[0, 1]] * 2))
+    made = written(MESSAGES.MapFragment, elements=[element("x", lane=body)])
+    return lambda fixture: fixture.files[-2].write_bytes(made)
+
+
+def transform(matrix):
+    """What writes another meta.json."""
+    content = json.dumps({"world_to_ecef": matrix})
+    return lambda fixture: fixture.files[-1].write_text(content)
+
+
+NAN, FRAMES = float("nan"), "frame_index_interval"
+# what is done to an array, the map or its transform, and what the line says
+HARMS = {
+    "centroid: x: nan": put("agents", "centroid", NAN),
+    "length: -1 m: expected 0 to": put("agents", "extent", -1.0),
+    "speed: 14142": put("agents", "velocity", 1e4, slice(0, 3)),
+    "label_probabilities: not finite": put("agents", "label_probabilities", NAN),
+    "met twice": put("agents", "track_id", 15, slice(0, 9)),
+    "expected a rotation matrix": put("frames", "ego_rotation", 0.0),
+    "goes backwards": put("frames", "timestamp", 0),
+    "frame 5: [9, 1]: expected an interval": put(
+        "frames", "agent_index_interval", [9, 1]
+    ),
+    "interval within 0 to": put("frames", "agent_index_interval", [0, 10**15]),
+    "host: characters that are none": put("scenes", "host", character(0xDCFF), 0),
+    "[0, 0]: expected frames": put("scenes", FRAMES, [0, 0], 0),
+    "expected a rigid 4 x 4 matrix": transform([[0.0] * 4] * 4),
+    "lanes: none: expected a semantic map": placed(),
+    "2 x for 0 y: expected as many": placed(left={"x": [1, 1]}),
+    "not on Earth": placed(frame={"origin": {"lat_e7": 2 * 10**9}}),
+}
+OPTIONS = [
+    *[{"recording_car": "x"}, {"ego": 3}, {"unknown": "x"}, {"rate_hz": 0}],
+    *[{"min_probability": "x"}, {"map": "gone.pb"}],
+]

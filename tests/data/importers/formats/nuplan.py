@@ -11,6 +11,7 @@ import sqlite3
 import struct
 
 import numpy as np
+import shapely
 
 from rcirl_jax.types import Kind
 from tests.data.importers.formats import Fixture, osm
@@ -159,15 +160,13 @@ def degrees(points):
     return osm.degrees(points, ZONE, CENTRE)[:, ::-1]
 
 
-def geometry(kind, points, *, srs=4326, to=degrees):
-    """A GeoPackage blob: head with an envelope, then WKB (2 line, 3 polygon)."""
-    place = to(points)
-    low, high = place.min(axis=0), place.max(axis=0)
-    envelope = struct.pack("<4d", low[0], high[0], low[1], high[1])
+def geometry(shape, points, *, srs=4326, to=degrees):
+    """A GeoPackage blob: head with an envelope, then the WKB of a shape of shapely."""
+    made = shape(to(points))
+    low_x, low_y, high_x, high_y = made.bounds
+    envelope = struct.pack("<4d", low_x, high_x, low_y, high_y)
     head = b"GP" + bytes([0, 0b00000011]) + struct.pack("<i", srs) + envelope
-    count = struct.pack("<I", 1) if kind == 3 else b""
-    body = struct.pack("<I", len(place)) + place.astype("<f8").tobytes()
-    return head + b"\x01" + struct.pack("<I", kind) + count + body
+    return head + shapely.to_wkb(made, byte_order=1)
 
 
 MAP_TABLES = """
@@ -216,13 +215,16 @@ def left_turn(radius):
 def write_map(path, *, to=degrees, srs=4326, zone="epsg:32611"):
     """Lanes 61 (y = 0), 62 (y = 3.5), 63; connectors 71 (left), 72 (straight)."""
 
-    def geom(kind, points):
-        return geometry(kind, points, srs=srs, to=to)
+    def geom(shape, points):
+        return geometry(shape, points, srs=srs, to=to)
 
     edges = {11: line(-60, 60, -1.75), 12: line(-60, 60, 1.75), 13: line(-60, 60, 5.25)}
     edges |= {14: left_turn(23.25), 15: left_turn(26.75)}
-    straight_on, turn = geom(2, line(60, 90, 0.0)), geom(2, left_turn(25.0))
-    area = geom(3, box(-60, 60, -1.75, 1.75))
+    straight_on, turn = (
+        geom(shapely.LineString, line(60, 90, 0.0)),
+        geom(shapely.LineString, left_turn(25.0)),
+    )
+    area = geom(shapely.Polygon, box(-60, 60, -1.75, 1.75))
     rows = {
         "gpkg_geometry_columns": [
             (layer, "geom", "GEOMETRY", srs, 0, 0) for layer in LAYERS
@@ -231,11 +233,13 @@ def write_map(path, *, to=degrees, srs=4326, zone="epsg:32611"):
             (1, "projectedCoordSystem", zone),
             (2, "geographicCoordSystem", "epsg:4326"),
         ],
-        "boundaries": [(fid, geom(2, p), "1", 0) for fid, p in edges.items()],
+        "boundaries": [
+            (fid, geom(shapely.LineString, p), "1", 0) for fid, p in edges.items()
+        ],
         "baseline_paths": [
-            (1, geom(2, line(-60, 60, 0.0)), 0, 61, None),
-            (2, geom(2, line(-60, 60, 3.5)), 0, 62, None),
-            (3, geom(2, line(90, 150, 0.0)), 0, 63, None),
+            (1, geom(shapely.LineString, line(-60, 60, 0.0)), 0, 61, None),
+            (2, geom(shapely.LineString, line(-60, 60, 3.5)), 0, 62, None),
+            (3, geom(shapely.LineString, line(90, 150, 0.0)), 0, 63, None),
             (4, turn, 2, None, 71),
             (5, straight_on, 2, None, 72),
         ],
@@ -250,8 +254,16 @@ def write_map(path, *, to=degrees, srs=4326, zone="epsg:32611"):
         ],
         "gen_lane_connectors_scaled_width_polygons": [(1, area, 71, 14, 15)],
         "stop_polygons": [
-            (31, geom(3, box(61.5, 62.5, -1.75, 5.25)), 2, 8, "", "71,72", "1"),
-            (32, geom(3, box(148, 149, -1.75, 1.75)), 1, 9, "63", "", ""),
+            (
+                31,
+                geom(shapely.Polygon, box(61.5, 62.5, -1.75, 5.25)),
+                2,
+                8,
+                "",
+                "71,72",
+                "1",
+            ),
+            (32, geom(shapely.Polygon, box(148, 149, -1.75, 1.75)), 1, 9, "63", "", ""),
         ],
     }
     return made(path, MAP_TABLES, rows)
@@ -276,3 +288,76 @@ def write(folder):
         num_signals=2,
         files=(log, road),
     )
+
+
+# ---------------------------------------------------------------------- harms
+
+
+def edit(path, *statements, values=None):
+    """Change a database by SQL: scripts, or statements with values."""
+    database = sqlite3.connect(path)
+    for statement in statements:
+        if values is None:
+            database.executescript(statement)
+        else:
+            database.execute(statement, values)
+    database.commit()
+    database.close()
+
+
+def sql(place, *statements, values=None):
+    """What changes the log (0) or the map (1)."""
+    return lambda fixture: edit(fixture.files[place], *statements, values=values)
+
+
+def set_to(table, column, value):
+    return sql(0, f"UPDATE {table} SET {column} = {value}")
+
+
+ENDLESS = """WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n)
+  SELECT x AS lidar_pc_token, x AS track_token, x AS x, x AS y, x AS yaw, x AS vx,
+  x AS vy, x AS width, x AS length FROM n"""
+VIRTUAL = "fts4(lidar_pc_token, track_token, x, y, yaw, vx, vy, width, length)"
+GENERATED = """CREATE TABLE category (token BLOB, other TEXT,
+  name TEXT GENERATED ALWAYS AS (hex(zeroblob(20000000))) VIRTUAL);
+  INSERT INTO category (token, other) SELECT category_token, 1 FROM track"""
+SCHEMA = "PRAGMA writable_schema = ON; UPDATE sqlite_master SET"
+NO_BOX = "DROP TABLE lidar_box;"
+LAST = "UPDATE lidar_pc SET timestamp = 9223372036854775807 WHERE filename = '1.pcd'"
+WILD = geometry(shapely.LineString, [[500.0, 95.0], [0.0, 0.0]], to=np.asarray)
+GEOM_OF = "UPDATE gpkg_geometry_columns SET"
+# what is done to the log or the map, and what the line says
+HARMS = {
+    "lidar_box: a view": sql(0, f"{NO_BOX} CREATE VIEW lidar_box AS {ENDLESS}"),
+    "lidar_box: a virtual table: expected a table": sql(
+        0, f"{NO_BOX} CREATE VIRTUAL TABLE lidar_box USING {VIRTUAL}"
+    ),
+    "a readable SQLite file": sql(0, f"DROP TABLE category; {GENERATED}"),
+    "database: malformed": sql(0, f"{SCHEMA} sql = 'nonsense' WHERE name = 'track'"),
+    "table lidar_box: missing": sql(0, NO_BOX),
+    "table log: no rows": sql(0, "DELETE FROM log"),
+    "lidar_pc: no row with an ego pose": sql(0, "DELETE FROM ego_pose"),
+    "lidar_box.yaw: missing": sql(0, "ALTER TABLE lidar_box DROP COLUMN yaw"),
+    "lidar_box.x: '1.5 m': expected a number": set_to("lidar_box", "x", "'1.5 m'"),
+    "lidar_box: x: nan": set_to("lidar_box", "x", "NULL"),
+    "length: -1 m: expected 0 to": set_to("lidar_box", "length", "-1"),
+    "track_token: 'abc': expected a": set_to("lidar_box", "track_token", "'abc'"),
+    "track_token: ": sql(0, "DELETE FROM track"),
+    "category.name: 'alien': expected one": set_to("category", "name", "'alien'"),
+    "ego_pose.x: NULL: expected a number": set_to("ego_pose", "x", "NULL"),
+    "qw, qx, qy, qz: norm 0: expected 1": set_to("ego_pose", "qw", "0"),
+    "us from first to last": sql(0, LAST),
+    "connector_id: 'x'": set_to("traffic_light_status", "lane_connector_id", "'x'"),
+    "projectedCoordSystem: missing: expected a UTM zone": sql(1, "DELETE FROM meta"),
+    "srs_id: 3857: expected 4326": sql(1, f"{GEOM_OF} srs_id = 3857"),
+    "stop_polygons.two x: missing": sql(
+        1, f"{GEOM_OF} column_name = 'two' || char(10) || 'x'"
+    ),
+    "baseline_paths.geom: no GeoPackage": sql(
+        1, "UPDATE baseline_paths SET geom = x'00'"
+    ),
+    "baseline_paths.geom: 500: expected longitude": sql(
+        1, "UPDATE baseline_paths SET geom = ?", values=(WILD,)
+    ),
+}
+OPTIONS = [{"window_s": 0}, {"window_s": 1e-9}, {"ego": 1}, {"maps": "gone"}]

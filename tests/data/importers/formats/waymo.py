@@ -1,10 +1,4 @@
-"""A Waymo Open Motion scenario, written with a tiny protobuf encoder.
-
-A message is a list of (field number, value); the value's type says how it is
-written: bool and int as varints, float as a double, `Single` as a float, str and
-bytes with their length, a list as a nested message, `Packed` as packed varints.
-Field numbers are those of the public scenario.proto and map.proto.
-"""
+"""A Waymo Open Motion scenario, as of the public scenario.proto and map.proto."""
 
 import struct
 
@@ -14,7 +8,37 @@ import numpy as np
 from rcirl_jax.types import Kind
 from tests.data.importers.formats import Fixture
 from tests.data.importers.formats.drives import arc, samples, straight
+from tests.data.importers.formats.proto import classes, written
 
+# enums are numbers, so that such as are none can be written
+SCHEMA = """
+ObjectState: center_x 2 double, center_y 3 double, center_z 4 double, length 5 float,\
+ width 6 float, height 7 float, heading 8 float, velocity_x 9 float,\
+ velocity_y 10 float, valid 11 bool
+Track: id 1 int32, object_type 2 int32, states 3 .ObjectState*
+MapPoint: x 1 double, y 2 double, z 3 double
+LaneState: lane 1 int64, state 2 int32, stop_point 3 .MapPoint
+DynamicMapState: lane_states 1 .LaneState*
+Boundary: lane_start_index 1 int32, lane_end_index 2 int32,\
+ boundary_feature_id 3 int64, boundary_type 4 int32
+Neighbor: feature_id 1 int64, self_start_index 2 int32, self_end_index 3 int32,\
+ neighbor_start_index 4 int32, neighbor_end_index 5 int32, boundaries 6 .Boundary*
+Lane: speed_limit_mph 1 double, type 2 int32, interpolating 3 bool,\
+ polyline 8 .MapPoint*, entry_lanes 9 int64*, exit_lanes 10 int64*,\
+ left_neighbors 11 .Neighbor*, right_neighbors 12 .Neighbor*,\
+ left_boundaries 13 .Boundary*, right_boundaries 14 .Boundary*
+Line: type 1 int32, polyline 2 .MapPoint*
+Area: polygon 1 .MapPoint*
+StopSign: lane 1 int64*, position 2 .MapPoint
+MapFeature: id 1 int64, lane 3 .Lane, road_line 4 .Line, road_edge 5 .Line,\
+ stop_sign 7 .StopSign, crosswalk 8 .Area, driveway 10 .Area
+Prediction: track_index 1 int32, difficulty 2 int32
+Scenario: timestamps_seconds 1 double*, tracks 2 .Track*, objects_of_interest 4 int32*,\
+ scenario_id 5 string, sdc_track_index 6 int32, dynamic_map_states 7 .DynamicMapState*,\
+ map_features 8 .MapFeature*, current_time_index 10 int32,\
+ tracks_to_predict 11 .Prediction*, lidar 12 bytes*
+"""
+MESSAGES = classes({"waymo": SCHEMA})
 SCENARIO = "637f20cafde22ff8"
 NUM_STEPS = 91
 T = np.arange(NUM_STEPS) * 0.1
@@ -23,43 +47,6 @@ STAMPS = T + np.where(T > 0.0, 2e-5 * np.sin(np.arange(NUM_STEPS)), 0.0)
 EAST, NORTH = 8240.0, -2690.0  # m, from an arbitrary origin
 WIDTH = 3.6  # m, of a lane
 MPH = 0.44704  # m/s
-
-
-class Single(float):
-    """A number written as a 4-byte float."""
-
-
-class Packed(list):
-    """Whole numbers written packed."""
-
-
-def varint(value):
-    value &= (1 << 64) - 1
-    out = bytearray()
-    while value >= 0x80:
-        out.append(value & 0x7F | 0x80)
-        value >>= 7
-    return bytes([*out, value])
-
-
-def field(number, value):
-    if isinstance(value, bool | int):
-        return varint(number << 3) + varint(int(value))
-    if isinstance(value, Single):
-        return varint(number << 3 | 5) + struct.pack("<f", value)
-    if isinstance(value, float):
-        return varint(number << 3 | 1) + struct.pack("<d", value)
-    if isinstance(value, Packed):
-        data = b"".join(varint(item) for item in value)
-    elif isinstance(value, str):
-        data = value.encode()
-    else:
-        data = value if isinstance(value, bytes) else message(value)
-    return varint(number << 3 | 2) + varint(len(data)) + data
-
-
-def message(fields):
-    return b"".join(field(number, value) for number, value in fields)
 
 
 def masked_crc(data):
@@ -82,56 +69,52 @@ def tfrecord(records):
 def state(user, row):
     """ObjectState with all fields, as the published files have them."""
     heading, speed = float(user.heading[row]), float(user.speed[row])
-    return [
-        (2, float(user.x[row])),
-        (3, float(user.y[row])),
-        (4, -11.5),
-        (5, Single(user.length)),
-        (6, Single(user.width)),
-        (7, Single(1.6)),
-        (8, Single(heading)),
-        (9, Single(speed * np.cos(heading))),
-        (10, Single(speed * np.sin(heading))),
-        (11, True),
-    ]
+    return {
+        **{"center_x": user.x[row], "center_y": user.y[row], "center_z": -11.5},
+        **{"length": user.length, "width": user.width, "height": 1.6},
+        **{"heading": heading, "velocity_x": speed * np.cos(heading)},
+        **{"velocity_y": speed * np.sin(heading), "valid": True},
+    }
 
 
-def track(key, kind, user, seen):
+def track(key, kind, user, seen, **changes):
+    """A track with a state per step; `changes` are made to those that are seen."""
+    seen = set(seen)
     states = [
-        (3, state(user, row) if row in set(seen) else [(11, False)])
+        {**state(user, row), **changes} if row in seen else {"valid": False}
         for row in range(user.t.size)
     ]
-    return [(1, key), (2, kind), *states]
+    return {"id": key, "object_type": kind, "states": states}
 
 
 def point(x, y):
-    return [(1, float(x)), (2, float(y)), (3, -11.5)]
+    return {"x": x, "y": y, "z": -11.5}
 
 
-def polyline(number, rows):
-    return [(number, point(x, y)) for x, y in rows]
+def polyline(rows):
+    return [point(x, y) for x, y in rows]
 
 
-def lane(key, rows, *, limit=25.0, kind=2, entry=(), leave=(), sides=(), neighbours=()):
-    """A lane feature; sides and neighbours are (field number, message)."""
-    parts = [(1, limit), (2, kind), (3, False), *polyline(8, rows)]
-    parts += [(9, Packed(entry))] if entry else []
-    parts += [(10, Packed(leave))] if leave else []
-    return [(1, key), (3, [*parts, *sides, *neighbours])]
+def lane(key, rows, *, speed_limit_mph=25.0, kind=2, **more):
+    """A lane feature with more fields of it."""
+    body = {"speed_limit_mph": speed_limit_mph, "type": kind, "interpolating": False}
+    return {"id": key, "lane": {**body, "polyline": polyline(rows), **more}}
 
 
-def boundary(number, first, last, key):
-    return (number, [(1, first), (2, last), (3, key), (4, 2)])
+def boundary(first, last, key):
+    ends = {"lane_start_index": first, "lane_end_index": last}
+    return {**ends, "boundary_feature_id": key, "boundary_type": 2}
 
 
-def neighbour(number, key, first, last):
-    spans = [(2, first), (3, last), (4, first), (5, last)]
-    return (number, [(1, key), *spans, boundary(6, first, last, 901)])
+def neighbour(key, first, last):
+    own = {"feature_id": key, "self_start_index": first, "self_end_index": last}
+    other = {"neighbor_start_index": first, "neighbor_end_index": last}
+    return {**own, **other, "boundaries": [boundary(first, last, 901)]}
 
 
-def line(key, rows, kind=4):
-    """A road line (4) or road edge (5)."""
-    return [(1, key), (kind, [(1, 2), *polyline(2, rows)])]
+def line(key, rows, kind="road_line"):
+    """A road line or road edge."""
+    return {"id": key, kind: {"type": 2, "polyline": polyline(rows)}}
 
 
 def eastward(y, first, last, step=0.5):
@@ -150,33 +133,40 @@ def map_features():
         for a in angle
     ]
     first = {
-        "sides": [boundary(13, 0, last, 901), boundary(14, 0, last, 902)],
-        "neighbours": [neighbour(11, 102, 0, last)],
+        "left_boundaries": [boundary(0, last, 901)],
+        "right_boundaries": [boundary(0, last, 902)],
+        "left_neighbors": [neighbour(102, 0, last)],
     }
     second = {
-        "sides": [boundary(14, 0, last, 901)],
-        "neighbours": [neighbour(12, 101, 0, last)],
+        "right_boundaries": [boundary(0, last, 901)],
+        "right_neighbors": [neighbour(101, 0, last)],
     }
+    sign = {"lane": [104], "position": point(EAST + 39.0, NORTH + 8.0)}
     return [
-        lane(101, south, leave=(103,), **first),
-        lane(102, north, leave=(104,), **second),
-        lane(103, eastward(0.0, 40.0, 120.0), entry=(101,), limit=35.0),
-        lane(104, turn, entry=(102,)),
+        lane(101, south, exit_lanes=[103], **first),
+        lane(102, north, exit_lanes=[104], **second),
+        lane(103, eastward(0.0, 40.0, 120.0), entry_lanes=[101], speed_limit_mph=35.0),
+        lane(104, turn, entry_lanes=[102]),
         lane(105, [(EAST + 40.0, NORTH + 9.0)]),  # a lane of one point: left out
         lane(106, eastward(-4.0, -60.0, 40.0), kind=3),  # a bicycle lane
         line(901, eastward(WIDTH / 2, -60.0, 40.0, 5.0)),
-        line(902, eastward(-2.0, -80.0, 60.0, 20.0), kind=5),
-        [(1, 903), (7, [(1, 104), (2, point(EAST + 39.0, NORTH + 8.0))])],
-        [(1, 904), (8, polyline(1, eastward(0.0, 30.0, 34.0)))],  # crosswalk
-        [(1, 905), (10, polyline(1, eastward(9.0, 0.0, 4.0)))],  # driveway
+        line(902, eastward(-2.0, -80.0, 60.0, 20.0), "road_edge"),
+        {"id": 903, "stop_sign": sign},
+        {"id": 904, "crosswalk": {"polygon": polyline(eastward(0.0, 30.0, 34.0))}},
+        {"id": 905, "driveway": {"polygon": polyline(eastward(9.0, 0.0, 4.0))}},
     ]
 
 
-def signal_state(step):
+def shown(*states, **more):
+    """A DynamicMapState of lane 103."""
+    return {"lane_states": [{"lane": 103, "state": state, **more} for state in states]}
+
+
+def signal_states(step):
     """Red, unseen for half a second, red, green; seen first at step 3."""
     if step < 3 or 20 <= step < 25:
-        return []
-    return [(1, 103), (2, 4 if step < 50 else 6), (3, point(EAST + 40.0, NORTH))]
+        return {}
+    return shown(4 if step < 50 else 6, stop_point=point(EAST + 40.0, NORTH))
 
 
 def road_users():
@@ -203,23 +193,19 @@ def road_users():
 
 
 def scenario(**changes):
-    """All fields of a Scenario by number; `changes` replace some: f2=[...]."""
-    users = road_users()
+    """Bytes of a Scenario; `changes` replace some of its fields."""
     fields = {
-        "f1": [float(stamp) for stamp in STAMPS],
-        "f2": [track(key, *values) for key, values in users.items()],
-        "f7": [[(1, s)] if (s := signal_state(k)) else [] for k in range(NUM_STEPS)],
-        "f8": map_features(),
-        "f4": [2320, 2325],
-        "f5": [SCENARIO],
-        "f6": [0],
-        "f10": [10],
-        "f11": [[(1, 1), (2, 1)]],
+        "timestamps_seconds": STAMPS,
+        "tracks": [track(key, *values) for key, values in road_users().items()],
+        "dynamic_map_states": [signal_states(step) for step in range(NUM_STEPS)],
+        "map_features": map_features(),
+        "objects_of_interest": [2320, 2325],
+        "scenario_id": SCENARIO,
+        "sdc_track_index": 0,
+        "current_time_index": 10,
+        "tracks_to_predict": [{"track_index": 1, "difficulty": 1}],
     }
-    fields.update(changes)
-    return message(
-        [(int(key[1:]), item) for key, items in fields.items() for item in items]
-    )
+    return written(MESSAGES.Scenario, **{**fields, **changes})
 
 
 def expected():
@@ -238,7 +224,9 @@ def write_shards(folder, shards=4):
     """Files of two scenarios each, in a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     for shard in range(shards):
-        records = [scenario(f5=[f"scenario-{shard}-{letter}"]) for letter in "ab"]
+        records = [
+            scenario(scenario_id=f"scenario-{shard}-{letter}") for letter in "ab"
+        ]
         name = f"training_20s.tfrecord-{shard:05d}-of-01000"
         (folder / name).write_bytes(tfrecord(records))
 
@@ -258,3 +246,54 @@ def write(folder):
         files=(path,),
         checked=(path,),
     )
+
+
+# ---------------------------------------------------------------------- harms
+
+
+def with_fields(**changes):
+    """What writes a scenario with other fields."""
+
+    def harm(fixture):
+        fixture.files[0].write_bytes(tfrecord([scenario(**changes)]))
+
+    return harm
+
+
+def stamped(values):
+    return with_fields(timestamps_seconds=values)
+
+
+def cars(*, key=1, kind=1, count=1, rows=range(NUM_STEPS), **changes):
+    user = road_users()[2314][1]
+    return with_fields(tracks=[track(key, kind, user, rows, **changes)] * count)
+
+
+def road(*features):
+    return with_fields(map_features=list(features))
+
+
+NAN, SHORT = float("nan"), eastward(0, 0, 9)
+# what is done to the scenario, and what the line says
+HARMS = {
+    "timestamps_seconds: [] (0): expected increasing times": stamped([]),
+    "timestamps_seconds: 9.00002e+06 s": stamped(STAMPS * 1e6),
+    "per second: expected 10 (unit s)": stamped(STAMPS * 10),
+    "track 2314: 91 states: expected 50": stamped(STAMPS[:50]),
+    "tracks: none: expected Scenario": with_fields(tracks=[]),
+    "track id: 1: met twice": cars(count=2),
+    "track 1: object_type: 9: expected one of vehicle": cars(kind=9),
+    "center_x: nan": cars(center_x=NAN),
+    "speed: 500": cars(velocity_x=500.0),
+    "width: -2 m": cars(width=-2.0),
+    "dynamic_map_states: 90: expected 91": with_fields(dynamic_map_states=[{}] * 90),
+    "lane 103: signal state 77": with_fields(dynamic_map_states=[shown(77)] * 91),
+    "speed_limit_mph: nan": road(lane(1, SHORT, speed_limit_mph=NAN)),
+    "map points: x: nan": road(lane(1, [(0.0, 0.0), (NAN, 1.0)])),
+    "map feature 1: met twice": road(*[lane(1, SHORT)] * 2),
+}
+OPTIONS = [
+    {"kinds": {"vehicle": "boat", "pedestrian": "pedestrian", "cyclist": "cyclist"}},
+    *[{"lane_types": bad} for bad in (["tram"], 3)],
+    {"pattern": [3, "/"]},
+]

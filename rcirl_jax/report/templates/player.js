@@ -1,15 +1,16 @@
 // Plays the drives of a case side by side: bird's eye and station-time graph.
 // Data: the JSON of `report.player.player`: replays, each drive with its `look`, and colours.
-// `report.player.player` puts drawing.js and this file into one strict function.
+// `report.pages` puts drawing.js, this file and cases.js into one strict function.
 const at = (id) => document.getElementById(id);
 const root = at("player");
-if (!root) return;
+if (!root) return tables();
 const { cases, colours } = JSON.parse(at("replays").textContent);
 
 let current = null; // the case
 let panels = []; // one per drive: its elements
 let time = 0; // s
 let playing = false;
+const BEFORE_S = 3; // s before the drives part at which a case opens
 let before = null; // timestamp of the last animation frame
 
 // ------------------------------------------------------------------ page
@@ -99,7 +100,8 @@ function show(number) {
   }
   play(false);
   const faults = current.drives.filter((drive) => drive.end);
-  seekFrame((faults[0] || current.drives[0]).start);
+  const look = (faults[0] || current.drives[0]).start;
+  seekFrame(Math.min(look, current.apart === null ? look : current.apart) - BEFORE_S);
 }
 
 function tick(stamp) {
@@ -170,3 +172,4 @@ for (const link of document.querySelectorAll("a[data-case]")) {
 window.addEventListener("resize", () => { if (!playing) render(); });
 window.addEventListener("beforeprint", () => { play(false); render(); });
 show(0);
+tables();

@@ -2,7 +2,8 @@
 // those of player.js.
 const INK = "#222", PALE = "#999";
 const PAST_S = 5, NEXT_S = 8; // window of the station-time graph
-const BELOW_M = 20, ABOVE_M = 80;
+const BELOW_M = 20, ABOVE_M = 60; // and what is driven in MORE_S at the present speed
+const MORE_S = 3;
 const IN_PATH_M = 0.2; // beyond the half widths a body is beside the path
 
 // ------------------------------------------------------------------ geometry
@@ -37,7 +38,7 @@ function seen(s, l, station) {
 // ------------------------------------------------------------------ moments
 
 const frames = (drive) => drive.s.length;
-const endOf = (drive) => frames(drive) * current.frame_s;
+const endOf = (drive) => drive.t[frames(drive) - 1];
 
 function agentsAt(drive, i) {
   const flat = drive.agents[i], found = new Map();
@@ -46,9 +47,10 @@ function agentsAt(drive, i) {
 }
 
 function moment(drive) {
-  const u = Math.min(Math.max(time / current.frame_s - 1, 0), frames(drive) - 1);
-  const i = Math.floor(u + 1e-9), j = Math.min(i + 1, frames(drive) - 1);
-  const f = Math.max(u - i, 0);
+  const last = frames(drive) - 1;
+  const i = Math.min(Math.max(Math.floor(time / current.frame_s + 1e-9) - 1, 0), last);
+  const j = Math.min(i + 1, last), gap = drive.t[j] - drive.t[i];
+  const f = gap > 0 ? Math.min(Math.max((time - drive.t[i]) / gap, 0), 1) : 0;
   const now = { i, plan: drive.plan[i], red: drive.red[i] };
   for (const name of ["s", "l", "heading", "v", "a"]) {
     now[name] = mix(drive[name][i], drive[name][j], f);
@@ -163,12 +165,12 @@ function birdsEye(canvas, drive) {
 
 function stationTime(canvas, drive, now) {
   const { pen, wide, high } = surface(canvas);
-  const left = 34, low = high - 18;
+  const left = 48, low = high - 30, above = ABOVE_M + MORE_S * Math.max(now.v, 0);
   const px = (t) => left + (wide - left) * (t - time + PAST_S) / (PAST_S + NEXT_S);
-  const py = (s) => low - low * (s - now.s + BELOW_M) / (BELOW_M + ABOVE_M);
+  const py = (s) => low - low * (s - now.s + BELOW_M) / (BELOW_M + above);
   const first = Math.max(Math.floor((time - PAST_S) / current.frame_s) - 2, 0);
   const last = (d) => Math.min(Math.ceil((time + NEXT_S) / current.frame_s), frames(d));
-  const when = (i) => (i + 1) * current.frame_s;
+  const when = (d, i) => d.t[i];
   pen.save();
   pen.beginPath();
   pen.rect(left, 0, wide - left, low);
@@ -183,17 +185,17 @@ function stationTime(canvas, drive, now) {
       const half = 0.5 * (long * c + broad * n);
       pen.globalAlpha = 0.55;
       pen.fillStyle = colours[kind];
-      pen.fillRect(px(when(i)) - step, py(s + half), step + 0.5, py(s - half) - py(s + half));
+      pen.fillRect(px(when(drive, i)) - step, py(s + half), step + 0.5, py(s - half) - py(s + half));
       pen.globalAlpha = 1;
     }
     for (const number of drive.red[i]) {
       const y = py(current.lines[number]);
-      line(pen, [[px(when(i)) - step, y], [px(when(i)), y]], colours.stop, 4);
+      line(pen, [[px(when(drive, i)) - step, y], [px(when(drive, i)), y]], colours.stop, 4);
     }
   }
   for (const other of [...current.drives.filter((d) => d !== drive), drive]) {
     const points = [];
-    for (let i = first; i < last(other); i += 1) points.push([px(when(i)), py(other.s[i])]);
+    for (let i = first; i < last(other); i += 1) points.push([px(when(other, i)), py(other.s[i])]);
     line(pen, points, other.look.colour, other === drive ? 3 : 1.2, other.look.dash);
   }
   const plan = now.plan.map((ahead, k) => [px(time + k + 1), py(now.s + ahead)]);
@@ -202,14 +204,21 @@ function stationTime(canvas, drive, now) {
   pen.restore();
   pen.fillStyle = "#333";
   pen.textAlign = "right";
-  for (let m = 0; m <= ABOVE_M - 20; m += 20) {
+  const tick = above > 110 ? 40 : 20;
+  for (let m = 0; m <= above - 10; m += tick) {
     const y = py(now.s + m);
-    pen.fillText(m ? `+${m}` : "0 m", left - 4, y + 4);
+    pen.fillText(m ? `+${m}` : "0", left - 4, y + 4);
     line(pen, [[left, y], [wide, y]], "#ddd", 0.7);
   }
   pen.textAlign = "center";
   for (let t = Math.ceil((time - PAST_S) / 2) * 2; t < time + NEXT_S - 1; t += 2) {
-    if (t >= 0) pen.fillText(`${t} s`, px(t), high - 4);
+    if (t >= 0) pen.fillText(`${t}`, px(t), high - 17);
   }
+  pen.fillText("time, s", (left + wide) / 2, high - 4);
+  pen.save();
+  pen.translate(11, low / 2);
+  pen.rotate(-Math.PI / 2);
+  pen.fillText("ahead of the ego, m", 0, 0);
+  pen.restore();
   line(pen, [[left, 0], [left, low], [wide, low]], "#888", 1);
 }

@@ -1,0 +1,114 @@
+"""The cases in which candidate and incumbent drive most differently."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from markupsafe import Markup
+
+from rcirl_jax.evaluation.closed_loop.files import SuiteRuns
+from rcirl_jax.report.pages import part
+from rcirl_jax.report.player.player import COLOURS, looks
+from rcirl_jax.report.player.replays import Replay, broken_bounds
+from rcirl_jax.simulation.metrics import CaseMetrics, nuplan_score
+
+MOST = 300  # cases of a page
+BEHIND_M, AHEAD_M, BESIDE_M = 20.0, 60.0, 8.0  # m around the ego in a thumbnail
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CaseLine:
+    """One row of the table of cases."""
+
+    case: str
+    family: str
+    candidate: str  # what it breaks; "" if nothing
+    incumbent: str
+    progress: float  # m, candidate minus incumbent
+    nuplan: float  # points of nuPlan's score, likewise
+    fault: bool  # the candidate's, where the incumbent has none
+    place: int | None  # among the cases that the page plays
+    thumbnail: Markup  # its worst moment, if it is played
+
+
+def case_lines(
+    runs: SuiteRuns, incumbent: str, replays: Sequence[Replay]
+) -> list[CaseLine]:
+    """Cases that are played, then those that differ most; the worst first.
+
+    Args:
+      runs: the suite; its first row is the candidate.
+      incumbent: its row.
+      replays: what the page plays; cases that the suite does not have are left out.
+    """
+    mine, theirs = next(iter(runs.rows.values())), runs.rows[incumbent]
+    way = jnp.asarray(runs.way)
+    scores = [100.0 * np.asarray(nuplan_score(x, way)[0]) for x in (mine, theirs)]
+    nuplan = scores[0] - scores[1]
+    progress = np.asarray(mine.progress, float) - np.asarray(theirs.progress, float)
+    fault = np.asarray(mine.at_fault) > np.asarray(theirs.at_fault)
+    played = {replay.case: place for place, replay in enumerate(replays)}
+    is_played = np.array([name in played for name in runs.ids])
+    first = np.lexsort((progress, nuplan, ~fault, ~is_played))[:MOST]
+    lines = []
+    for at in first.tolist():
+        drives = [_drive(runs_, at) for runs_ in (mine, theirs)]
+        words = [", ".join(broken_bounds(drive)) for drive in drives]
+        place = played.get(runs.ids[at])
+        lines.append(
+            CaseLine(
+                case=runs.ids[at],
+                family=runs.groups[at],
+                candidate=words[0],
+                incumbent=words[1],
+                progress=float(progress[at]),
+                nuplan=float(nuplan[at]),
+                fault=bool(fault[at]),
+                place=place,
+                thumbnail=Markup("") if place is None else thumbnail(replays[place]),
+            )
+        )
+    return lines
+
+
+def _drive(metrics: CaseMetrics, at: int) -> CaseMetrics:
+    """One case's numbers."""
+    return jax.tree.map(lambda x: np.asarray(x)[at], metrics)
+
+
+def thumbnail(replay: Replay) -> Markup:
+    """The candidate's moment to look at, from above, along the road, as a small SVG."""
+    drive = replay.drives[0]
+    frame = int(np.argmin(np.abs(np.asarray(drive.t) - drive.start)))
+    here = drive.s[frame]
+    boxes = []
+    flat = drive.agents[frame]
+    for slot, s, l, heading in zip(*(flat[i::4] for i in range(4)), strict=True):
+        kind, length, width = replay.bodies[int(slot)]
+        boxes.append(_box(s - here, l, heading, length, width, COLOURS[kind]))
+    how = looks([one.row for one in replay.drives])
+    for one in reversed(replay.drives):
+        at = min(
+            int(np.argmin(np.abs(np.asarray(one.t) - drive.start))), len(one.s) - 1
+        )
+        pose = (one.s[at] - here, one.l[at], one.heading[at])
+        boxes.append(_box(*pose, *replay.ego, how[one.row].colour))
+    edges = [-edge for edge in replay.edges]
+    words = f"{replay.case} from above at {drive.start:g} s"
+    return part("thumbnail", boxes, edges, (BEHIND_M, AHEAD_M, BESIDE_M), words)
+
+
+def _box(
+    s: float, l: float, heading: float, length: float, width: float, colour: str
+) -> dict:
+    """A body as the template draws it; y points to the right of the road."""
+    return {
+        "x": round(s, 1),
+        "y": round(-l, 1),
+        "turn": round(-np.degrees(heading), 1),
+        "length": length,
+        "width": width,
+        "colour": colour,
+    }
