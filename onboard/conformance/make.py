@@ -12,6 +12,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+import numpy.typing as npt
 
 from rcirl_jax.export.own_planner.plain import plain_scene
 from rcirl_jax.features import feature_map
@@ -66,7 +67,7 @@ def cases() -> Iterator[tuple[str, Scene]]:
         yield f"drawn_{n}", jax.tree.map(lambda x, n=n: x[n], drawn)
 
 
-def line(label: str, numbers: np.ndarray) -> str:
+def line(label: str, numbers: npt.ArrayLike) -> str:
     """A label and numbers, each as short as float32 allows."""
     texts = (f"{float(x):.9g}" for x in np.asarray(numbers, np.float32))
     return " ".join([label, *texts])

@@ -2,6 +2,8 @@
 
 import dataclasses
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -9,8 +11,13 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.export.own_planner.builder import scene_from
 from rcirl_jax.export.own_planner.inputs import Body, Car, CentreLine, Signal
 from rcirl_jax.export.own_planner.plain import plain_scene
+from rcirl_jax.simulation.cases import LineKind
+from rcirl_jax.simulation.world.observe import observe, road_limit
+from rcirl_jax.simulation.world.step import start
 from rcirl_jax.types import Kind
 from rcirl_jax.units import TIMES_S
+from tests.helpers.own_planner import entries
+from tests.simulation.worlds import make_case
 
 EGO = Car(x=50.0, y=0.5, heading=0.1, speed=10.0, length=4.8, width=2.0)
 ROAD = CentreLine(points=[[0.0, 0.0], [150.0, 0.0], [400.0, 0.0]], speed_limit=15.0)
@@ -165,6 +172,46 @@ def test_the_frame_does_not_matter():
         for name in ("s_lower", "s_upper", "l_lower", "l_upper", "speed"):
             got, want = getattr(found, name), getattr(wanted, name)
             np.testing.assert_allclose(got, want, atol=2e-3)
+
+
+def test_it_is_what_the_observer_sees():
+    """A moment of the simulator on a straight road, where x is s and y is l."""
+    agents = [
+        {"s": 60.0, "v": 8.0},
+        {"s": 30.0, "l": 3.5, "v": 14.0},
+        {"s": -25.0, "l": -3.5, "v": 9.0, "heading": 0.1},
+        {"s": 45.0, "l": -4.0, "v": 1.2, "heading": np.pi / 2, "kind": Kind.PEDESTRIAN},
+    ]
+    light = {"kind": LineKind.LIGHT, "s": 90.0, "offset": 12.0, "green": 10.0}
+    case = make_case(agents, [light | {"yellow": 1.0, "red": 60.0}], lanes=(1, 1))
+    case = jax.tree.map(jnp.asarray, case)
+    world = start(case)
+    seen = observe(case, world, road_limit(case.road))
+    own = float(world.ego.s)
+    made = scene_from(
+        ego=Car(x=own, y=0.0, heading=0.0, speed=10.0, length=4.933, width=2.11),
+        centre_line=CentreLine(
+            points=[[own - 60.0, 0.0], [own + 600.0, 0.0]], speed_limit=15.0,
+            lane_width=3.5, road_left=5.75, road_right=5.75,
+        ),
+        obstacles=[
+            Body(
+                kind=Kind(case.agents.kind[i]).name.lower(),
+                x=float(world.agents.s[i]), y=float(world.agents.l[i]),
+                heading=float(world.agents.heading[i]), speed=float(world.agents.v[i]),
+                length=4.6, width=1.9,
+            )
+            for i in range(len(agents))
+        ],
+        signals=[Signal(x=90.0, y=0.0, state="red")],
+    )  # fmt: skip
+    for found, wanted in zip(
+        entries(plain_scene(made), ()), entries(plain_scene(seen), ()), strict=True
+    ):
+        assert found[0] == wanted[0]
+        np.testing.assert_allclose(found[1], wanted[1], atol=2e-3, err_msg=found[0])
+    for name, bound in vars(seen.path).items():
+        np.testing.assert_allclose(getattr(made.path, name), bound, atol=1e-3)
 
 
 LINES = {"ego": EGO, "body": LEAD, "road": ROAD}

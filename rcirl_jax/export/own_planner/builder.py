@@ -103,16 +103,12 @@ def scene_from(
     if predictions is not None:
         futures = _futures(frame, obstacles, predictions, s0)
         seen = _with_futures(seen, futures, most_relevant(bodies, now))
-    as_float = lambda x: jnp.asarray(np.asarray(x))  # noqa: E731
-    return jax.tree.map(
-        as_float,
-        Scene(
-            ego=now,
-            path=road,
-            obstacles=seen,
-            time_valid=np.ones(NUM_TIMES, bool),
-            tags=np.zeros(NUM_TAGS, bool),
-        ),
+    return Scene(
+        ego=now,
+        path=road,
+        obstacles=seen,
+        time_valid=jnp.ones(NUM_TIMES, bool),
+        tags=jnp.zeros(NUM_TAGS, bool),
     )
 
 
@@ -146,7 +142,7 @@ class _Frame:
         values = np.asarray(getattr(self.line, name), float)
         return np.interp(s, self.grid, values, right=0.0 if name == "kappa" else None)
 
-    def tilt(self, s: np.ndarray, heading: np.ndarray) -> np.ndarray:
+    def tilt(self, s: np.ndarray, heading: np.ndarray | float) -> np.ndarray:
         """Headings against the line's, in (-pi, pi]."""
         apart = np.asarray(heading) - self.table("heading", s)
         return np.arctan2(np.sin(apart), np.cos(apart))
