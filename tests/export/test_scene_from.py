@@ -222,7 +222,18 @@ LINES = {"ego": EGO, "body": LEAD, "road": ROAD}
     [
         ({"ego": {"length": 0.0}}, "ego.length: 0.0: expected over 0 m"),
         ({"ego": {"speed": -1.0}}, "ego.speed: -1.0: expected 0 m/s or more"),
-        ({"ego": {"x": float("nan")}}, "ego.x: nan: expected finite numbers"),
+        (
+            {"ego": {"x": float("nan")}},
+            "ego.x: nan: expected finite numbers up to 1e+09",
+        ),
+        (
+            {"ego": {"x": 2e9}},
+            "ego.x: 2000000000.0: expected finite numbers up to 1e+09",
+        ),
+        (
+            {"road": {"points": [[0.0009 * i, 0.0] for i in range(2000)]}},
+            "centre_line.points: 2000 points, 0 m long: expected a line of 1 m to 100 km",
+        ),
         ({"ego": {"x": "here"}}, "ego.x: here: expected numbers"),
         ({"ego": {"heading": 90.0}}, "ego.heading: 90: expected radians, not degrees"),
         (
@@ -247,7 +258,7 @@ LINES = {"ego": EGO, "body": LEAD, "road": ROAD}
         ),
         (
             {"road": {"points": [[0.0, 0.0]]}},
-            "centre_line.points: 1 points, 0 m long: expected a line of 1 m at least",
+            "centre_line.points: 1 points, 0 m long: expected a line of 1 m to 100 km",
         ),
         (
             {"road": {"points": [0.0, 1.0]}},

@@ -51,14 +51,13 @@ def test_random_surroundings_give_the_scene_of_python(program, first):
     [
         ({"length": 0.0}, "ego.length: 0: expected over 0 m"),
         ({"speed": -1.0}, "ego.speed: -1: expected 0 m/s or more"),
-        ({"x": float("nan")}, "ego.x: nan: expected a finite number"),
+        ({"x": float("nan")}, "ego.x: nan: expected a finite number up to 1e9"),
         ({"heading": 90.0}, "ego.heading: 90: expected radians, not degrees"),
-        ({"speed": 1e300}, None),
+        ({"speed": 1e300}, "ego.speed: 1e+300: expected a finite number up to 1e9"),
     ],
 )
 def test_wrong_input_has_one_line(program, changes, line):
     given = drawn(0)
     given["ego"] = dataclasses.replace(given["ego"], **changes)
     found = in_cpp(program, given)
-    assert found == f"scene_from: {line}" if line else found.startswith("scene_from: ")
-    assert "\n" not in found
+    assert found == f"scene_from: {line}"

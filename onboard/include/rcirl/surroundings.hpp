@@ -3,6 +3,7 @@
 #ifndef RCIRL_SURROUNDINGS_HPP_
 #define RCIRL_SURROUNDINGS_HPP_
 
+#include <algorithm>
 #include <cmath>
 #include <cstddef>
 #include <string>
@@ -69,6 +70,8 @@ struct Surroundings {
 
 namespace detail {
 
+constexpr double kMost = 1e9;  // of any number
+
 inline std::string fault(const std::string& field, double value, const std::string& expected) {
   return "scene_from: " + field + ": " + number_text(value) + ": expected " + expected;
 }
@@ -78,7 +81,7 @@ inline std::string wrong_number(const std::string& name,
                                 const std::vector<std::pair<const char*, double>>& values) {
   for (const auto& [field, value] : values) {
     const std::string place = name + "." + field, key = field;
-    if (!std::isfinite(value)) return fault(place, value, "a finite number");
+    if (!(std::abs(value) <= kMost)) return fault(place, value, "a finite number up to 1e9");
     if ((key == "length" || key == "width") && value <= 0.0) return fault(place, value, "over 0 m");
     if (key == "heading" && std::abs(value) > 12.6) {
       return fault(place, value, "radians, not degrees");
@@ -90,11 +93,14 @@ inline std::string wrong_number(const std::string& name,
 inline std::string wrong_polyline(const std::string& name, const std::vector<XY>& points) {
   double length = 0.0;
   for (std::size_t i = 0; i < points.size(); ++i) {
-    if (!std::isfinite(points[i][0]) || !std::isfinite(points[i][1])) {
-      return fault(index_text(name, i), points[i][0], "finite numbers");
+    const double most = std::max(std::abs(points[i][0]), std::abs(points[i][1]));
+    if (!(most <= kMost) || std::isnan(points[i][1])) {
+      return fault(index_text(name, i), points[i][0], "finite numbers up to 1e9");
     }
     if (i == 0) continue;
-    length += std::hypot(points[i][0] - points[i - 1][0], points[i][1] - points[i - 1][1]);
+    const double step =
+        std::hypot(points[i][0] - points[i - 1][0], points[i][1] - points[i - 1][1]);
+    if (step > kSamePlaceM) length += step;
   }
   return length >= 1.0 && length <= 1e5 ? "" : fault(name, length, "a line of 1 m to 100 km");
 }

@@ -10,6 +10,9 @@ import numpy as np
 from rcirl_jax.errors import InputError, did_you_mean
 
 BODY_KINDS = ("vehicle", "cyclist", "pedestrian", "static")
+MOST = 1e9  # of any number
+SAME_PLACE_M = 1e-3  # m, a step of a line that is none
+LONGEST_M = 1e5  # m, line
 STATES = ("red", "stop", "yellow", "green", "off")  # of a signal; "stop": a sign
 
 
@@ -84,12 +87,13 @@ def check_one_of(field: str, value: object, known: Sequence[str]) -> None:
 
 
 def floats(field: str, given: Any) -> np.ndarray:  # noqa: ANN401
-    """Finite float64 numbers."""
+    """Finite float64 numbers that a road may have."""
     try:
         array = np.asarray(given, float)
     except (TypeError, ValueError):
         raise InputError(f"scene_from: {field}: {given}: expected numbers") from None
-    check(field, given, np.all(np.isfinite(array)), "finite numbers")
+    good = np.all(np.abs(array) <= MOST)  # a NaN is not
+    check(field, given, good, f"finite numbers up to {MOST:g}")
     return array
 
 
@@ -102,11 +106,12 @@ def table(field: str, given: Any, columns: int) -> np.ndarray:  # noqa: ANN401
 
 
 def polyline(field: str, given: Any) -> np.ndarray:  # noqa: ANN401
-    """Points [m, 2] of a line of some length."""
+    """Points [m, 2] of a line of some length; steps below a millimetre do not count."""
     points = table(field, given, 2)
-    length = float(np.sum(np.hypot(*np.diff(points, axis=0).T)))
+    steps = np.hypot(*np.diff(points, axis=0).T)
+    length = float(np.sum(steps[steps > SAME_PLACE_M]))
     found = f"{len(points)} points, {length:.3g} m long"
-    check(field, found, length >= 1.0, "a line of 1 m at least")
+    check(field, found, 1.0 <= length <= LONGEST_M, "a line of 1 m to 100 km")
     return points
 
 

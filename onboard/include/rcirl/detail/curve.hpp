@@ -13,6 +13,7 @@ namespace rcirl::detail {
 
 constexpr double kLineStepM = 2.0;    // m between grid points of a line
 constexpr double kSmoothing = 30.0;   // penalty of the spline on second derivatives
+constexpr double kSamePlaceM = 1e-3;  // m, a step of a polyline that is none
 constexpr int kNewtonSteps = 6;       // after the nearest grid point
 using XY = std::array<double, 2>;     // m
 
@@ -93,7 +94,7 @@ class Line {
       const double step =
           std::hypot(points[i][0] - points[i - 1][0], points[i][1] - points[i - 1][1]);
       length_ += step;
-      if (step <= 1e-3) continue;
+      if (step <= kSamePlaceM) continue;
       xs.push_back(points[i][0]);
       ys.push_back(points[i][1]);
       arc.push_back(arc.back() + std::hypot(xs.back() - xs[xs.size() - 2],
