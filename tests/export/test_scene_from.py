@@ -232,7 +232,8 @@ LINES = {"ego": EGO, "body": LEAD, "road": ROAD}
         ),
         (
             {"road": {"points": [[0.0009 * i, 0.0] for i in range(2000)]}},
-            "centre_line.points: 2000 points, 0 m long: expected a line of 1 m to 100 km",
+            "centre_line.points: 2000 points, 0 m long: expected a line of 1 m to "
+            "100 km",
         ),
         ({"ego": {"x": "here"}}, "ego.x: here: expected numbers"),
         ({"ego": {"heading": 90.0}}, "ego.heading: 90: expected radians, not degrees"),
