@@ -13,7 +13,7 @@ from pathlib import Path
 
 from rcirl_jax.data.importers.declared import with_numbers_and_texts
 from rcirl_jax.data.importers.files import with_log_names
-from rcirl_jax.data.importers.options import check_types
+from rcirl_jax.data.importers.options import STATED, check_types
 from rcirl_jax.data.readers.tables.streams import refuse_pointer
 from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.runtime.atomic_files import is_text
@@ -96,12 +96,14 @@ def parts(
     packaged = spec_root() / "sources" / f"{name}.toml"
     spec_path = source or packaged
     spec = load_toml(spec_path)
+    own = [] if source is None else sorted(spec)
     options = f"options as in the TOML of format {name}"
     if source is not None:
         with as_input_error(str(source), options):
             check_types(spec, load_toml(packaged))
         if name in DECLARED:
             spec = with_numbers_and_texts(spec, load_toml(packaged))
+    spec = {**spec, STATED: own}
     if input_path is None:
         if name != "synthetic":
             raise InputError("--input: not given: expected a file or folder")

@@ -1,5 +1,6 @@
 """Rows at irregular times, put onto the uniform clock of a recording."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -39,7 +40,7 @@ def on_clock(boxes: Boxes, rate_hz: float, max_gap_s: float) -> Boxes:
             part[field] = np.interp(clock, t[rows], values)
         parts.append({**part, "kind": boxes.kind[rows][at]})
     merged = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-    return Boxes(names=boxes.names, **merged)
+    return dataclasses.replace(boxes, **merged)
 
 
 def _nothing() -> dict[str, np.ndarray]:

@@ -9,6 +9,8 @@ from rcirl_jax.types import Kind
 from rcirl_jax.units import FOOT_M, MPH_MPS
 
 LARGEST = 10**18  # of an integer
+# added to a spec: names of the options that the user's own TOML has
+STATED = "stated"
 MAX_NAME = 255  # bytes of a file's name
 MAX_PATH = 2048  # bytes of a path; systems take 4096, with the folder before it
 MAX_PARTS = 32  # of a pattern, which pathlib matches by recursion
@@ -48,6 +50,14 @@ def number(spec: Mapping, key: str, default: float = math.nan) -> float:
     if not math.isfinite(found):
         raise InputError(f"source TOML: {key}: {value}: expected a finite number")
     return found
+
+
+def stated(spec: Mapping, key: str) -> float | None:
+    """A number > 0 that the user's own TOML states; None where it is a default.
+
+    What somebody says of a site is known; what a packaged TOML says of all is a guess.
+    """
+    return positive(spec, key) if key in spec.get(STATED, ()) else None
 
 
 def unit_factor(path: Path, field: str, unit: str, allowed: Sequence[str]) -> float:

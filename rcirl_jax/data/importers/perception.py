@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.importers.options import number, positive, section
+from rcirl_jax.data.importers.options import STATED, number, positive, section, stated
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.shapes import local_origin
 from rcirl_jax.data.importers.tracks import split_tracks
@@ -29,6 +29,13 @@ ONE_OF = 5  # tracks of which one may always be an outlier
 WINDOW_S = 300.0  # s, longest window of a drive
 MIN_WINDOW_S = 1.0  # s that it may be; each window costs as much as its surroundings
 LANE_WIDTH_M = 3.5  # m, of lanes fitted to paths
+# m, [length, width] of road users of which none is known; others: 1 m
+SIZES_M = {
+    Kind.VEHICLE: (4.5, 1.8),
+    Kind.CYCLIST: (1.8, 0.6),
+    Kind.PEDESTRIAN: (0.5, 0.5),
+}
+OTHER_SIZE_M = (1.0, 1.0)  # m
 MAX_SIZE_M = 200.0  # m, of a box; beyond it the file is wrong, not the tracker
 FIELDS = ("t", "x", "y", "heading", "length", "width")
 
@@ -44,9 +51,10 @@ class Boxes:
     y: np.ndarray  # [n] m
     heading: np.ndarray  # [n] rad
     speed: np.ndarray  # [n] m/s; NaN: from the positions
-    length: np.ndarray  # [n] m
-    width: np.ndarray  # [n] m
+    length: np.ndarray  # [n] m; NaN: not known
+    width: np.ndarray  # [n] m; NaN: not known
     kind: np.ndarray  # [n] int, `Kind` or UNKNOWN
+    size_assumed: bool = False  # no log says the sizes
 
 
 def ego_boxes(
@@ -83,6 +91,7 @@ def ego_boxes(
         length=np.full(t.size, length),
         width=np.full(t.size, width),
         kind=np.full(t.size, int(Kind.VEHICLE)),
+        size_assumed="ego" not in spec.get(STATED, ()),
     )
 
 
@@ -96,7 +105,8 @@ def tracks_of(
     """Tracks of the boxes, in the order of their ids, and notes on what was left out.
 
     A gap longer than `max_gap_s` starts another track, "id#2". Size and class
-    are the median and the most frequent of a track. Trackers lose objects now
+    are the median and the most frequent of a track; where no size is known it is that
+    of its class. Trackers lose objects now
     and then: tracks with an impossible size or speed are left out, unless they
     are more than a tenth, which points at a wrong file.
 
@@ -138,8 +148,8 @@ def _check(path: Path, boxes: Boxes) -> None:
     for field in FIELDS:
         values = getattr(boxes, field)
         wrong, expected = ~np.isfinite(values), ": expected a finite number"
-        if field in ("length", "width") and not wrong.any():
-            wrong = (values < 0.0) | (values > MAX_SIZE_M)
+        if field in ("length", "width"):
+            wrong = (values < 0.0) | (values > MAX_SIZE_M)  # NaN is not known
             expected = f" m: expected 0 to {MAX_SIZE_M:g} m"
         if wrong.any():
             row = np.flatnonzero(wrong)[0]
@@ -158,6 +168,11 @@ def _track(
     t, x, y = boxes.t[rows], boxes.x[rows], boxes.y[rows]
     # most frequent class; the shift makes UNKNOWN a count of its own
     kind = int(np.argmax(np.bincount(boxes.kind[rows] - UNKNOWN))) + UNKNOWN
+    usual = SIZES_M.get(Kind(max(kind, 0)), OTHER_SIZE_M)
+    length, width = (
+        _median(sizes[rows], default)
+        for sizes, default in zip((boxes.length, boxes.width), usual, strict=True)
+    )
     if kind == UNKNOWN:
         if unknown == "drop":
             return None
@@ -171,8 +186,9 @@ def _track(
     return Track(
         id=name,
         kind=Kind(kind),
-        length=max(float(np.median(boxes.length[rows])), LENGTH_RANGE_M[0]),
-        width=max(float(np.median(boxes.width[rows])), WIDTH_RANGE_M[0]),
+        length=max(length[0], LENGTH_RANGE_M[0]),
+        width=max(width[0], WIDTH_RANGE_M[0]),
+        size_assumed=boxes.size_assumed or length[1] or width[1],
         t=t,
         x=x,
         y=y,
@@ -180,6 +196,12 @@ def _track(
         speed=speed,
         automated=automated,
     )
+
+
+def _median(sizes: np.ndarray, default: float) -> tuple[float, bool]:
+    """The median [m] of the known sizes, or the default; whether it is this one."""
+    known = sizes[np.isfinite(sizes)]
+    return (float(np.median(known)), False) if known.size else (default, True)
 
 
 def speed_of(t: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -298,15 +320,12 @@ def placed(
 
 
 def fitted_lanes(
-    tracks: Sequence[Track], spec: Mapping, limit: float
+    tracks: Sequence[Track], spec: Mapping
 ) -> tuple[tuple[Lane, ...], str]:
     """Lanes along the paths that were driven, and a note of their number.
 
-    Args:
-      tracks: of one recording.
-      spec: source TOML.
-      limit: m/s, where it has none.
+    Their limit is what the user's own TOML states, if it does.
     """
     width = positive(spec, "lane_width_m", LANE_WIDTH_M)
-    lanes = path_lanes(tracks, width, positive(spec, "speed_limit", limit))
+    lanes = path_lanes(tracks, width, stated(spec, "speed_limit"))
     return lanes, f"{len(lanes)} lanes fitted to the longest paths"

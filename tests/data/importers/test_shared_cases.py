@@ -9,8 +9,10 @@ import pytest
 
 from rcirl_jax.data.cut import cut
 from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.data.scenes.quality import assumed
 from tests.conftest import REPO
 from tests.data.importers import people
+from tests.helpers import logs
 
 # beside the recordings (`data_dir` of conftest.py)
 CASES = (
@@ -139,3 +141,13 @@ def test_a_drone_recording_with_empty_cells(case, tmp_path):
     for track in found.tracks:
         assert np.isfinite(track.speed).all()
         assert np.isfinite(track.heading).all()
+
+
+@of("15_argentina_limit")
+def test_signs_of_other_countries(case):
+    """The lanes' limits are those of the signs, of whatever country."""
+    found = logs.read("commonroad", case)
+    assert len(found) == 11
+    for recording in found:
+        assert [lane.speed_limit for lane in recording.lanes] == [11.111]
+        assert not any(assumed(recording).values())

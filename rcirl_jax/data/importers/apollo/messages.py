@@ -37,13 +37,6 @@ KIND_NAMES = {
     "VEHICLE": Kind.VEHICLE,
     "UNKNOWN_UNMOVABLE": Kind.STATIC,
 }
-# m, [length, width] where perception measured none; others: 1 m
-SIZES_M = {
-    Kind.VEHICLE: (4.5, 1.8),
-    Kind.CYCLIST: (1.8, 0.6),
-    Kind.PEDESTRIAN: (0.5, 0.5),
-}
-OTHER_SIZE_M = (1.0, 1.0)  # m
 NAN = float("nan")
 # fields and what they are where they are not set
 POINT = {"x": NAN, "y": NAN}
@@ -92,17 +85,15 @@ def _chassis(table: np.ndarray, names: Names) -> np.ndarray:
 def _obstacles(table: np.ndarray, names: Names) -> np.ndarray:
     """Times [s] as of a localization; id; x, y; heading; speed; length, width; kind.
 
-    NaN where a position or velocity was not recorded.
+    NaN where a position, velocity or size was not recorded.
     """
     head, (vx, vy, length, width, number) = table[:, :7], table[:, 7:].T
     numbers, inverse = np.unique(number, return_inverse=True)
     kinds = [KIND_NAMES.get(names["type"].get(int(n), ""), UNKNOWN) for n in numbers]
-    sizes = [SIZES_M.get(Kind(max(kind, 0)), OTHER_SIZE_M) for kind in kinds]
-    usual = np.array(sizes, np.float64).reshape(-1, 2)[inverse].T
     series = (
         np.hypot(vx, vy),
-        np.where(length == 0.0, usual[0], length),
-        np.where(width == 0.0, usual[1], width),
+        np.where(length == 0.0, np.nan, length),
+        np.where(width == 0.0, np.nan, width),
         np.array(kinds, np.float64)[inverse],
     )
     return np.concatenate([head[:, [1, 0, *range(2, 7)]], np.stack(series, 1)], axis=1)

@@ -218,6 +218,7 @@ def _track(
         kind=kind,
         length=length,
         width=width,
+        size_assumed=True,
         t=table["timestep"][rows] * clock.step,
         x=table["position_x"][rows],
         y=table["position_y"][rows],

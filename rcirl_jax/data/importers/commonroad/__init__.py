@@ -1,1 +1,1 @@
-"""CommonRoad XML scenarios: `reader`, `map` for lanelets, `extras` for signals."""
+"""CommonRoad XML scenarios: `reader`, `map`, `signs` by country, `extras`."""

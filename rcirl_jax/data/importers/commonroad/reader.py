@@ -34,7 +34,6 @@ MAX_FILE_BYTES = 512 * 1024**2  # bytes, larger files are refused
 MAX_STEP = 1e6  # of the clock: a day at 10 Hz
 MAX_STANDING = 20_000_000  # samples of standing things: 500 over an hour at 10 Hz
 DEFAULT_LIMIT_MPS = 29.06  # m/s, 65 mph, where the source TOML names none
-MIN_LIMIT_MPS = 5.0  # m/s, likewise; lower signs are converter artefacts
 # roots of what lies beside interactive scenarios: SUMO's files, solutions, other maps
 OTHER_ROOTS = (
     *("net", "routes", "additional", "configuration", "sumoConfiguration"),
@@ -131,9 +130,7 @@ def _read_file(path: Path, spec: dict, groups: dict[str, str]) -> Recording:
     if group is None:
         group = path.stem
         notes.append("no vehicle-disjoint group given; the file is its own group")
-    lanes, lane_notes = read_lanes(
-        root, fields, {"min_speed_limit": MIN_LIMIT_MPS, **spec}
-    )
+    lanes, lane_notes = read_lanes(root, fields, spec)
     centres = {lane.id: lane.centre for lane in lanes}
     source, licence = _provenance(root.get("source", "CommonRoad"), spec)
     return Recording(

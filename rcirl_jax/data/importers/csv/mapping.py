@@ -14,7 +14,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rcirl_jax.data.importers.options import UNITS, number, positive, section
+from rcirl_jax.data.importers.options import (
+    STATED,
+    UNITS,
+    number,
+    positive,
+    section,
+)
 from rcirl_jax.data.readers.tables.cells import EMPTY, ISO
 from rcirl_jax.data.readers.tables.layout import NUMBER
 from rcirl_jax.data.readers.tables.table import (
@@ -61,7 +67,7 @@ OPTIONS = (
     *("long_bytes", "columns", "units", "scale", "offset", "defaults", "kinds"),
     *("lanes", "table"),
 )
-ADDED = (LEAVE_OUT, PIECE, "log_names")
+ADDED = (LEAVE_OUT, PIECE, STATED, "log_names")
 RATE_HZ = 10.0  # 1/s
 ISO_TIMES = r"\d{4}-\d\d-\d\d[T ]|\d{8}T\d|\d{4}/\d\d/\d\d |\d{1,2}:\d\d"  # as read
 WORD = r"[A-Z]+(?![^\W\d_A-Z])|[A-Z]?[^\W\d_A-Z]+"  # of a name in camel case too

@@ -29,6 +29,7 @@ class Car:
     number: int  # in the platoon
     name: str  # number and model
     size: tuple[float, float]  # m, length and width
+    size_assumed: bool  # the file does not say both
     x: np.ndarray  # [n] m, NaN where it is unknown
     y: np.ndarray  # [n] m
     speed: np.ndarray  # [n] m/s
@@ -165,10 +166,12 @@ def _car(
         modes = np.char.lower(values["Driver"])
         modes = np.where(modes == "", "unknown", modes)
     x, y = _place(values)
+    size, is_said = _size(path, number, name, about, spec)
     return Car(
         number=number,
         name=name,
-        size=_size(path, number, name, about, spec),
+        size=size,
+        size_assumed=not is_said,
         x=x,
         y=y,
         speed=values["Speed"],
@@ -183,12 +186,16 @@ def _size(
     name: str,
     about: Mapping[str, list[str]],
     spec: Mapping,
-) -> tuple[float, float]:
-    """Length and width [m]: of the header, of the model, or a car's."""
-    size = list(_model_size(name, spec.get("sizes", {})))
+) -> tuple[tuple[float, float], bool]:
+    """Length and width [m]: of the header, of the model, or a car's.
+
+    And whether the header says both.
+    """
+    size, said = list(_model_size(name, spec.get("sizes", {}))), set()
     for place, field in enumerate(("length", "width")):
         for key, cells in about.items():
             if field in key and 0 < number <= len(cells):
+                said.add(field)
                 try:
                     size[place] = float(cells[number - 1])
                 except ValueError as error:
@@ -196,7 +203,7 @@ def _size(
                         f"{path}: {key[:40]}: '{cells[number - 1][:40]}': "
                         "expected a number of metres"
                     ) from error
-    return size[0], size[1]
+    return (size[0], size[1]), len(said) == len(size)
 
 
 def _model_size(name: str, sizes: Mapping[str, list[float]]) -> tuple[float, float]:

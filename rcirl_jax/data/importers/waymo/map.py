@@ -151,7 +151,7 @@ def _built(
         return ()
     order, lines = list(heads.values()), [centres[key] for key in heads]
     left, right = (
-        half_widths(lines, bounds, _segments(where, order, side), default)
+        half_widths(lines, bounds, _segments(where, order, side))
         for side in ("left", "right")
     )
     beside = [_neighbours(order, side) for side in ("left", "right")]
@@ -162,7 +162,12 @@ def _built(
     lanes = []
     for row, (key, head) in enumerate(heads.items()):
         keep = moves(lines[row])
-        line, sides = lines[row][keep], (left[row][keep], right[row][keep])
+        found = [side[row] for side in (left, right)]
+        line = lines[row][keep]
+        sides = tuple(
+            np.full(len(line), default) if half is None else half[keep]
+            for half in found
+        )
         point = stops.points.get(key)
         lane = Lane(
             id=str(key),
@@ -176,6 +181,7 @@ def _built(
             signal_ids=(str(key),) if key in stops.signals else (),
             stop_sign=key in stops.signs,
             stop_line=None if point is None else line_across(line, *sides, point),
+            width_assumed=any(half is None for half in found),
         )
         lanes.append(lane)
     return tuple(lanes)

@@ -1,0 +1,92 @@
+"""What no log says is counted: limits, widths of lanes, sizes of road users."""
+
+import collections
+
+import pytest
+
+from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.scenes.quality import assumed
+from tests.data.importers import people
+from tests.data.importers.test_conformance import MODULES, format_of, write
+from tests.helpers import logs
+
+# of each fixture: lanes without a limit, lanes of an unmeasured width, road users of an
+# unmeasured size. Fitted lanes have neither limit nor width, and no log says how large
+# the car is that recorded it (`ego`), or a road user that only its centre stands for.
+COUNTS = {
+    "apollo": (4, 4, 1),  # the ego
+    "argoverse2": (6, 0, 8),  # sizes by type
+    "commonroad": (2, 0, 0),
+    "csv": (2, 2, 0),  # straight lanes, bounded by each other on one side only
+    "interaction": (2, 0, 2),  # a pedestrian and a cyclist without boxes
+    "interaction_challenge": (4, 0, 2),
+    "l5": (4, 0, 2),  # the ego, in two scenes
+    "levelx": (2, 0, 2),  # a pedestrian and a cyclist without boxes
+    "levelx_highd": (4, 0, 0),
+    "ngsim": (0, 2, 0),  # the limit of the two sites is known
+    "ngsim_pairs": (0, 2, 4),
+    "nuplan": (2, 2, 1),  # the ego
+    "openacc": (2, 2, 4),  # sizes by model
+    "ros2": (4, 4, 1),  # the ego
+    "waymo": (0, 3, 0),
+}
+
+
+def counts(recordings):
+    """(limits, widths, sizes) that are a guess."""
+    found = collections.Counter()
+    for recording in recordings:
+        found.update(assumed(recording))
+    return found["speed limit"], found["width"], found["size"]
+
+
+@pytest.mark.parametrize("name", sorted(MODULES))
+def test_of_every_format(name, tmp_path):
+    recordings = read_recordings(format_of(name), write(name, tmp_path).input)
+    assert counts(recordings) == COUNTS[name]
+
+
+def test_what_the_users_own_toml_states_is_no_guess(tmp_path):
+    """Its limit is that of fitted lanes, its [ego] the size of the recording car."""
+    place = write("apollo", tmp_path).input
+    source = tmp_path / "drives.toml"
+    source.write_text("rate_hz = 10.0\n")
+    assert counts(read_recordings("apollo", place, source)) == COUNTS["apollo"]
+    source.write_text("speed_limit = 13.9\n[ego]\nlength = 4.4\nwidth = 1.9\n")
+    (made,) = read_recordings("apollo", place, source)
+    assert counts([made]) == (0, 4, 0)
+    assert {lane.speed_limit for lane in made.lanes} == {made.default_speed_limit}
+    assert made.default_speed_limit == 13.9
+
+
+def test_a_table_of_ones_own(tmp_path):
+    """Without sizes, without widths; cells may be empty here and there."""
+    bare = people.write(tmp_path, [row[:4] for row in people.rows()], people.HEADER[:4])
+    source = people.spec(tmp_path, people.HEADER[:4])
+    made = people.only(bare, source)
+    assert counts([made]) == (len(made.lanes), len(made.lanes), people.CARS)
+    table = people.column(people.rows(), "length", lambda _: "")
+    table[0][people.HEADER.index("length")] = 4.5  # of car0, whose width nobody says
+    source = people.spec(tmp_path, more="speed_limit = 13.9\n")
+    made = people.only(people.write(tmp_path, table), source)
+    assert counts([made]) == (0, len(made.lanes), people.CARS)
+    assert [track.length for track in made.tracks] == [4.5] * people.CARS
+    header = (*people.HEADER, "width")
+    table = [[*row, 1.9 if row[1] != "car0" else ""] for row in people.rows()]
+    made = people.only(
+        people.write(tmp_path, table, header), people.spec(tmp_path, header)
+    )
+    assert counts([made])[2] == 1
+
+
+def test_lanes_of_a_table_beside_the_log(tmp_path):
+    """One without a width, or without it at one point, has the usual one there."""
+    log = people.write(tmp_path, people.rows())
+    lanes = tmp_path / "lanes.csv"
+    lanes.write_text(
+        "id,x,y,width\n1,0,0,4\n1,200,0,4\n2,0,-3.5,\n2,200,-3.5,3\n3,0,9,\n3,200,9,\n"
+    )
+    source = people.spec(tmp_path, rest='[lanes]\nfile = "lanes.csv"\n')
+    made = logs.lanes_of(people.only(log, source))
+    assert [lane.width_assumed for lane in made.values()] == [False, True, True]
+    assert made["2"].left_width.tolist() == [1.75, 1.5]
