@@ -12,8 +12,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from rcirl_jax.data.importers.declared import with_numbers_and_texts
-from rcirl_jax.data.importers.files import with_log_names
+from rcirl_jax.data.importers.files import log_name, with_log_names
 from rcirl_jax.data.importers.options import STATED, check_types
+from rcirl_jax.data.readers.tables.ledger import NoRowsError
 from rcirl_jax.data.readers.tables.streams import refuse_pointer
 from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.runtime.atomic_files import is_text
@@ -52,7 +53,23 @@ def read_part(name: str, path: Path, spec: dict) -> Iterator[Recording]:
     for file in files_of(name, path):
         refuse_pointer(file)
     with as_input_error(str(path), f"a sound log of format {name}"):
-        yield from importer(path, spec)
+        try:
+            yield from importer(path, spec)
+        except NoRowsError as error:
+            yield _empty(log_name(path, spec, path.name), error)
+
+
+def _empty(name: str, error: NoRowsError) -> Recording:
+    """What stands for a file in which nobody drives; imports count and skip it."""
+    return Recording(
+        name=name,
+        source="",
+        licence="",
+        rate_hz=0.0,
+        tracks=(),
+        lanes=(),
+        notes=(str(error),),
+    )
 
 
 def pieces(name: str, path: Path, spec: dict) -> list[dict]:

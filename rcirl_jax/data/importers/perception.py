@@ -15,7 +15,7 @@ import numpy as np
 from rcirl_jax.data.importers.options import STATED, number, positive, section, stated
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.shapes import local_origin
-from rcirl_jax.data.importers.tracks import split_tracks
+from rcirl_jax.data.importers.tracks import once_each, split_tracks
 from rcirl_jax.data.readers import long_logs
 from rcirl_jax.data.recording import LENGTH_RANGE_M, MAX_SPEED_MPS, WIDTH_RANGE_M
 from rcirl_jax.errors import InputError
@@ -37,6 +37,7 @@ SIZES_M = {
 }
 OTHER_SIZE_M = (1.0, 1.0)  # m
 MAX_SIZE_M = 200.0  # m, of a box; beyond it the file is wrong, not the tracker
+ARRAYS = ("ids", "t", "x", "y", "heading", "speed", "length", "width", "kind")
 FIELDS = ("t", "x", "y", "heading", "length", "width")
 
 
@@ -108,7 +109,8 @@ def tracks_of(
     are the median and the most frequent of a track; where no size is known it is that
     of its class. Trackers lose objects now
     and then: tracks with an impossible size or speed are left out, unless they
-    are more than a tenth, which points at a wrong file.
+    are more than a tenth, which points at a wrong file. A box that is met twice at one
+    time counts once, likewise.
 
     Args:
       path: named in errors.
@@ -119,7 +121,7 @@ def tracks_of(
       automated: of all tracks.
 
     Raises:
-      InputError: a number that is not finite, an absurd size, or a time met
+      InputError: a number that is not finite, an absurd size, or many times met
         twice by one id.
     """
     if unknown not in UNKNOWN_CHOICES:
@@ -129,6 +131,10 @@ def tracks_of(
     if boxes.t.size == 0:
         return [], []
     _check(path, boxes)
+    kept, doubled = once_each(boxes.ids, boxes.t)
+    if doubled:
+        rows = {name: getattr(boxes, name)[kept] for name in ARRAYS}
+        boxes = dataclasses.replace(boxes, **rows)
     tracks, dropped, seen = [], 0, {}
     for _, rows in split_tracks(path, boxes.ids, boxes.t, max_gap_s):
         name = boxes.names[int(boxes.ids[rows[0]])]
@@ -140,7 +146,7 @@ def tracks_of(
     tracks, notes = without_outliers(tracks)
     if dropped:
         notes.append(f"{dropped} tracks of unknown class left out")
-    return tracks, notes
+    return tracks, [*doubled, *notes]
 
 
 def _check(path: Path, boxes: Boxes) -> None:

@@ -17,6 +17,7 @@ from rcirl_jax.data.importers.apollo.descriptors import (
     ENUM,
     UNSET,
     Reading,
+    UndescribedError,
     Wanted,
     reading_of,
 )
@@ -200,6 +201,7 @@ def read_drive(parts: list[Path], spec: dict) -> Iterator[Rows]:
     """All wanted messages of the files of one drive, piece by piece."""
     topics = _topics(spec)
     numbers = dict.fromkeys(TOPICS, 0)  # messages of each topic
+    undescribed: dict[str, str] = {}  # channel -> what is wrong with it
     done, total = 0, sum(part.stat().st_size for part in parts if part.is_file())
     with reading(parts[0], parts) as show:
 
@@ -210,9 +212,12 @@ def read_drive(parts: list[Path], spec: dict) -> Iterator[Rows]:
 
         for part in parts:
             with Record(part) as record:
-                for rows in _read_part(record, topics, numbers, count):
+                for rows in _read_part(record, topics, numbers, undescribed, count):
                     rows.progress = min(done / max(total, 1), 1.0)
                     yield rows
+    if undescribed and not any(numbers.values()):
+        channel, why = next(iter(undescribed.items()))
+        raise InputError(f"{parts[0]}: {channel}: {why}: expected an Apollo message")
 
 
 def _topics(spec: dict) -> dict[str, str]:
@@ -238,7 +243,7 @@ class _Channel:
 
     def __init__(self, record: Record, channel: str, topic: str) -> None:
         if channel not in record.channels:
-            raise DecodeError("no descriptor before its first message")
+            raise UndescribedError("no descriptors before its first message")
         self.topic, self._type = topic, TOPICS[topic]
         self._reading: Reading = reading_of(
             *record.channels[channel], self._type.wanted
@@ -273,11 +278,17 @@ def _read_part(
     record: Record,
     topics: dict[str, str],
     numbers: dict[str, int],
+    undescribed: dict[str, str],
     show: Callable[[int], object],
 ) -> Iterator[Rows]:
+    """Rows of a file; channels without descriptors are noted once and passed over."""
     channels: dict[str, _Channel] = {}
-    began = None
-    for channel, time, content in record.messages(topics.__contains__, show):
+    began, notes = None, []
+
+    def is_wanted(channel: str) -> bool:
+        return channel in topics and channel not in undescribed
+
+    for channel, time, content in record.messages(is_wanted, show):
         began = time if began is None else began
         if abs(time - began) > PIECE_S * 1e9:
             yield Rows(tables=[found.rows() for found in channels.values()])
@@ -287,6 +298,11 @@ def _read_part(
             if channel not in channels:
                 channels[channel] = _Channel(record, channel, topic)
             channels[channel].add(time * 1e-9, content)
+        except UndescribedError as error:
+            undescribed[channel] = str(error)
+            lost = "; who drove is not known" if topic == "chassis" else ""
+            notes.append(f"{channel}: not read: {error}{lost}")
+            continue
         except DecodeError as error:
             raise InputError(
                 f"{record.path}: {channel}: message {numbers[topic]}: {error}: "
@@ -296,7 +312,7 @@ def _read_part(
             seen = [one.count() for one in channels.values() if one.topic in OBSTACLES]
             check_held(f"{record.path}: {channel}", sum(seen))
         numbers[topic] += 1
-    rows = Rows(tables=[found.rows() for found in channels.values()])
+    rows = Rows(tables=[found.rows() for found in channels.values()], notes=notes)
     if not record.is_complete:
         rows.notes.append(f"{record.path.name} was never closed; read to its end")
     yield rows

@@ -23,6 +23,7 @@ from rcirl_jax.data.importers.commonroad.extras import (
 from rcirl_jax.data.importers.commonroad.map import read_lanes
 from rcirl_jax.data.importers.files import files_below, log_name
 from rcirl_jax.data.importers.options import is_file_name, one_pattern
+from rcirl_jax.data.importers.tracks import of_one_name
 from rcirl_jax.data.readers.xml import Fields, read_xml
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
@@ -196,13 +197,15 @@ def _is_standing(element: Element, fields: Fields) -> bool | None:
 def _read_tracks(
     root: Element, fields: Fields, dt: float
 ) -> tuple[list[Track], list[str]]:
-    tracks, standing, unrecorded = [], [], 0
+    tracks, standing, unrecorded, doubled = [], [], 0, 0
     for element in root:
         stands = _is_standing(element, fields)
         if stands:
             standing.append(element)
         elif stands is False and element.find("trajectory") is not None:
-            tracks.append(_read_moving(element, fields, dt))
+            track, again = _read_moving(element, fields, dt)
+            tracks.append(track)
+            doubled += again
         elif stands is False:
             unrecorded += 1
     first = min((float(track.t[0]) for track in tracks), default=0.0)
@@ -214,17 +217,30 @@ def _read_tracks(
             f"steps: expected up to {MAX_STANDING} samples"
         )
     tracks += [_read_standing(element, fields, clock) for element in standing]
-    notes = []
+    tracks, notes = of_one_name(tracks)
+    if doubled:
+        notes.append(f"{doubled} states of a step met twice, one used")
+    if regions := _regions(root):
+        notes.append(f"{regions} states in a region, taken to be in its middle")
     if unrecorded:
         notes.append(f"{unrecorded} obstacles without a trajectory left out")
     return tracks, notes
 
 
-def _read_moving(element: Element, fields: Fields, dt: float) -> Track:
+def _regions(root: Element) -> int:
+    """How many states have a region for a place."""
+    states = (state for tag in ("initialState", "state") for state in root.iter(tag))
+    places = (state.find("position") for state in states)
+    return sum(place is not None and place.find("point") is None for place in places)
+
+
+def _read_moving(element: Element, fields: Fields, dt: float) -> tuple[Track, int]:
+    """A track, and how many of its states were left out."""
     where = f"obstacle {element.get('id')}"
     states = [fields.child(element, "initialState", where)]
     states += element.iterfind("trajectory/state")
     rows = np.array([_read_state(state, fields, where, dt) for state in states])
+    rows = rows[np.append(True, np.diff(rows[:, 0]) != 0.0)]  # the first of a step
     backwards = np.flatnonzero(np.diff(rows[:, 0]) <= 0.0)
     if backwards.size:
         step = rows[backwards[0] + 1, 0] / dt
@@ -232,7 +248,8 @@ def _read_moving(element: Element, fields: Fields, dt: float) -> Track:
             f"{fields.path}: {where}: time: {step:g}: expected increasing steps"
         )
     kind = (element.findtext("type") or "unknown").strip().lower()
-    return _track(element, fields, KINDS.get(kind, Kind.VEHICLE), rows.T.copy())
+    track = _track(element, fields, KINDS.get(kind, Kind.VEHICLE), rows.T.copy())
+    return track, len(states) - len(rows)
 
 
 def _read_state(state: Element, fields: Fields, where: str, dt: float) -> tuple:

@@ -253,6 +253,8 @@ def _header_line(rows: Sequence[Sequence[str]]) -> int:
     """
     wholes = [len(row) for row in rows]
     filled = [len(_trimmed(row)) for row in rows]
+    if not any(filled):
+        return 0
     wanted = {_usual(wholes, filled), _usual(filled, filled)} - {0}
     for at, counts in enumerate(zip(wholes, filled, strict=True)):
         if counts[1] > 1 and any(c in (w, w - 1) for c in counts for w in wanted):
