@@ -13,7 +13,8 @@ from pathlib import Path
 
 from rcirl_jax.data.importers.declared import with_numbers_and_texts
 from rcirl_jax.data.importers.files import log_name, with_log_names
-from rcirl_jax.data.importers.options import STATED, check_types
+from rcirl_jax.data.importers.format import Format
+from rcirl_jax.data.importers.options import STATED, check_options
 from rcirl_jax.data.readers.tables.ledger import NoRowsError
 from rcirl_jax.data.readers.tables.streams import refuse_pointer
 from rcirl_jax.errors import InputError, as_input_error
@@ -87,6 +88,11 @@ def files_of(name: str, path: Path) -> list[Path]:
     return [path] if found is None else found(path)
 
 
+def format_of(name: str) -> Format:
+    """What a format says of itself, without its reader."""
+    return importlib.import_module(f"{__name__}.{name}").FORMAT
+
+
 def _module(name: str) -> types.ModuleType:
     return importlib.import_module(f"{__name__}.{name}.reader")
 
@@ -117,7 +123,7 @@ def parts(
     options = f"options as in the TOML of format {name}"
     if source is not None:
         with as_input_error(str(source), options):
-            check_types(spec, load_toml(packaged))
+            check_options(spec, load_toml(packaged), format_of(name))
         if name in DECLARED:
             spec = with_numbers_and_texts(spec, load_toml(packaged))
     spec = {**spec, STATED: own}

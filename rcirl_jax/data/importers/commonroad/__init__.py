@@ -1,1 +1,5 @@
 """CommonRoad XML scenarios: `reader`, `map`, `signs` by country, `extras`."""
+
+from rcirl_jax.data.importers.format import Format
+
+FORMAT = Format()

@@ -1,1 +1,7 @@
 """Waymo Open Motion (TFRecord): `reader`, `map` for lanes, `widths` of lanes."""
+
+from rcirl_jax.data.importers.format import Format
+
+FORMAT = Format(
+    free=("kinds",),
+)
