@@ -13,6 +13,7 @@ from absl import flags
 from experiments.flags.common import provenance, run
 from experiments.flags.executor import executor
 from rcirl_jax.data.store.dataset import open_dataset
+from rcirl_jax.data.store.resplit import with_tags
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.evaluation.ranking.format import format_table
@@ -25,6 +26,7 @@ _DATA = flags.DEFINE_string("data", None, "dataset", required=True)
 _OUTPUT = flags.DEFINE_string("output", None, "JSON to write")
 _HORIZON = flags.DEFINE_float("horizon", 5.0, "s at which distances are taken")
 _SPLIT = flags.DEFINE_string("split", "test", "split that is ranked")
+_TAGS = flags.DEFINE_list("tags", [], "only scenes with one of these tags")
 _FILTER = flags.DEFINE_bool(
     "drop_collisions", False, "rank only candidates that meet nothing, in every row"
 )
@@ -43,7 +45,7 @@ def main() -> None:
         split=_SPLIT.value,
         drop_collisions=_FILTER.value,
     )
-    dataset = open_dataset(_DATA.value)
+    dataset = with_tags(open_dataset(_DATA.value), _TAGS.value)
     report = evaluate_ranking(dataset, learned, setup, executor())
     print(format_table(report, _WIDTH.value))
     if _OUTPUT.value:

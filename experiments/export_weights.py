@@ -22,6 +22,7 @@ from absl import flags
 
 from experiments.flags.common import provenance, run
 from rcirl_jax.data.store.joined import open_datasets
+from rcirl_jax.data.store.resplit import with_tags
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.forms.linear_yaml import reward_yaml
 from rcirl_jax.export.forms.onnx_model import write_onnx
@@ -31,7 +32,7 @@ from rcirl_jax.export.forms.stablehlo import (
     exported_run,
     write_stablehlo,
 )
-from rcirl_jax.export.from_run import datasets_of, export_run
+from rcirl_jax.export.from_run import datasets_of, export_run, tags_of
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.runtime.atomic_files import write_json, write_whole
@@ -70,6 +71,7 @@ def main() -> None:
         workdir = Path(str(_WORKDIR.value))
         output = Path(_OUTPUT.value or workdir / "weights.msgpack")
         dataset = open_datasets(_DATA.value or datasets_of(workdir))
+        dataset = with_tags(dataset, tags_of(workdir))
         reward = export_run(workdir, dataset, output, ranges=_RANGES.value)
         print(f"{output}: {len(reward.names)} features, sha256 {reward.sha256[:16]}...")
 

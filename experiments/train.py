@@ -19,6 +19,7 @@ from absl import flags
 from experiments.flags import training
 from experiments.flags.common import provenance, run
 from rcirl_jax.data.store.joined import open_datasets
+from rcirl_jax.data.store.resplit import with_tags
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.parallel import PARALLEL
 from rcirl_jax.train.processes import is_first, join_processes
@@ -26,6 +27,9 @@ from rcirl_jax.train.running import Running
 
 _DATA = flags.DEFINE_list(
     "data", None, "dataset made by import_logs; several are joined", required=True
+)
+_TAGS = flags.DEFINE_list(
+    "tags", [], "only scenes with one of these tags, e.g. lane_change,cut_in"
 )
 _WORKDIR = flags.DEFINE_string("workdir", None, "run folder", required=True)
 _SEED = flags.DEFINE_integer("seed", 0, "of initial weights, batches, candidates")
@@ -51,6 +55,7 @@ def main() -> None:
     """Flags -> one training run."""
     join_processes(_COORDINATOR.value, _PROCESSES.value, _PROCESS.value)
     dataset = open_datasets(_DATA.value, _VERIFY.value, training.DATA_WEIGHTS.value)
+    dataset = with_tags(dataset, _TAGS.value)
     config = training.training_config(seed=_SEED.value)
     running = Running(
         parallel=_PARALLEL.value,

@@ -82,7 +82,7 @@ _OUTPUT = flags.DEFINE_string("output", "benchmarks/results", "folder of the JSO
 STAY_S = 60.0  # s that a car is seen
 CAR_ROWS = 600
 CAR_SCENES = 100  # about
-LEAST_SHARDS = 15  # seen one after the other, so that every tenth of them is
+LEAST_SHARDS = 11  # seen one after the other, so that every tenth of them is
 # read in pieces from the first byte on, so that a slice is read as the whole is
 TOML = "long_bytes = 1\n" + LANE_TOML
 

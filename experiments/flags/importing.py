@@ -18,6 +18,13 @@ NUMBERS = (
         "min_surroundings_s",
         "s until someone whom the human reacts to leaves the record, at least",
     ),
+    ("min_life", "min_life_s", "s, shorter tracks do not become obstacles"),
+    ("min_size", "min_size_m", "m, nor do bodies whose longer side is below it"),
+    (
+        "join_gap",
+        "join_gap_s",
+        "s between fragments of one standing body that are joined, at most",
+    ),
     ("smoothing", "smoothing_s", "s, window of the position filter"),
 )
 FILTERS = (

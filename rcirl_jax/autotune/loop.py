@@ -25,7 +25,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.gate.output import format_verdict
 from rcirl_jax.evaluation.gate.runs import CANDIDATE
 from rcirl_jax.export.loading import open_reward
-from rcirl_jax.report.tuning.page import anchor_words
+from rcirl_jax.report.tuning.features import anchor_words
 
 STAGES = ("import", "rehearse", "train", "rank", "simulate", "gate", "report")
 

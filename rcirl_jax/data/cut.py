@@ -14,10 +14,10 @@ import jax
 import numpy as np
 
 from rcirl_jax.data.parts import Item, recordings_in
+from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.data.scenes.assemble import CHUNK, assemble
 from rcirl_jax.data.scenes.collect import Collector
 from rcirl_jax.data.scenes.config import CollectConfig
-from rcirl_jax.data.scenes.quality import QualityReport
 from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.types import Demonstration, Recording, Track
 
@@ -132,7 +132,7 @@ def cut(
         return Cut(**about, **{**nothing, "quality": report.state()})
     with as_input_error(recording.name, "a sound recording"):
         collector = Collector(recording, config)
-        parts, tracks = _assembled(recording, collector)
+        parts, tracks = _assembled(collector)
     report = QualityReport()
     report.add_recording(collector)
     if not tracks:
@@ -151,7 +151,7 @@ def cut(
 
 
 def _assembled(
-    recording: Recording, collector: Collector
+    collector: Collector,
 ) -> tuple[list[Demonstration], list[Track]]:
     """Scenes as they are stored, a few at a time, and the track of each.
 
@@ -161,7 +161,7 @@ def _assembled(
     while some := list(itertools.islice(rows, CHUNK)):
         none = [0] * len(some)
         parts.append(assemble(some, vehicles=none, groups=none, recording=0))
-        tracks += [recording.tracks[row["track"]] for row in some]
+        tracks += [collector.recording.tracks[row["track"]] for row in some]
     return parts, tracks
 
 

@@ -79,6 +79,11 @@ def datasets_of(workdir: Path) -> list[str]:
     return names
 
 
+def tags_of(workdir: Path) -> list[str]:
+    """The tags of scenes that a run's flags name, [] for all scenes."""
+    return list(read_config(workdir)[1].get("flags", {}).get("tags") or [])
+
+
 def reward_weights(
     params: RewardParams,
     normaliser: Normaliser,

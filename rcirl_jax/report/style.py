@@ -64,8 +64,7 @@ def svg(made: Figure, name: str) -> Markup:
     with its name before, so that several drawings stand in one page.
     """
     drawn = io.StringIO()
-    settings = {"svg.fonttype": "none", "svg.hashsalt": name}
-    with mpl.rc_context(settings):
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
         made.savefig(drawn, format="svg", transparent=True, metadata={"Date": None})
     plt.close(made)
     text = drawn.getvalue()

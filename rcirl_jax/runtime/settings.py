@@ -61,10 +61,9 @@ def check_names(where: str, found: Mapping[str, Any], known: Sequence[str]) -> N
 
 def _value(kind: Any, value: Any, where: str) -> Any:  # noqa: ANN401
     """One value as a type; of a dataclass every name is known."""
-    kind = typing.cast(type, kind)
     if dataclasses.is_dataclass(kind) and isinstance(value, dict):
-        return typed_settings(kind, value, f"{where}.")
-    made = checked(value, kind, where)
+        return typed_settings(typing.cast(Any, kind), value, f"{where}.")
+    made = checked(value, typing.cast(Any, kind), where)
     if not all(abs(number) < MOST for number in _numbers(made)):  # NaN is not below
         raise InputError(f"{where}: {value}: expected numbers between +-{MOST}")
     return made

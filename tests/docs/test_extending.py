@@ -41,7 +41,7 @@ def changed(folder, addition):
         if language == "diff":
             path = folder / "change.diff"
             path.write_text(content)
-            run(["git", "apply", "--whitespace=error", path.name], folder)
+            run(["git", "apply", "-C1", "--whitespace=error", path.name], folder)
         elif content.startswith(".venv/bin/python -m pytest"):
             checks.append([sys.executable, *shlex.split(content)[1:]])
         else:

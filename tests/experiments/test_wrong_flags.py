@@ -37,6 +37,8 @@ WRONG = (
     (f"{TUNE} --synthetic --recipe=tunde", "did you mean tuned?"),
     (f"{TUNE} --input=x --format=ngsmi", "did you mean ngsim?"),
     (f"{TUNE} --synthetic --incumbent=nobody.msgpack", "nobody.msgpack"),
+    (f"{TUNE} --synthetic --leave_out=few", "--leave_out: few: expected a count"),
+    (f"{TRAIN} --tags=turnig", "--tags: turnig: expected some of"),
     (f"{TUNE} --synthetic --seeds=0", "--seeds: 0: expected at least 1"),
     (f"{TUNE} --synthetic --format=ngsim", "--input: not given"),
     (f"{TUNE} --synthetic --suite=all", "--suite: all: expected full"),

@@ -12,8 +12,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from rcirl_jax.data.recording import MAX_SPEED_MPS
 from rcirl_jax.data.scenes import filters, labels
 from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.data.scenes.flicker import steady_tracks
 from rcirl_jax.data.scenes.lanes import LaneFrame, LaneGraph, project
 from rcirl_jax.data.scenes.lines import line_obstacles, trusted_signals
 from rcirl_jax.data.scenes.motion import (
@@ -25,6 +27,7 @@ from rcirl_jax.data.scenes.motion import (
     given_path,
     human_motion,
 )
+from rcirl_jax.data.scenes.relevance import distances
 from rcirl_jax.data.scenes.smoothing import SmoothTrack, smooth_track
 from rcirl_jax.data.scenes.surroundings import surroundings_end
 from rcirl_jax.geometry.limits import LOOK_AHEAD_M, planning_limit
@@ -52,7 +55,9 @@ class Collector:
     """Cuts one recording into demonstrations; `dropped` counts the reasons."""
 
     def __init__(self, recording: Recording, config: CollectConfig) -> None:
-        self.recording = recording
+        # without tracks that flicker; `flicker` counts them
+        self.recording, self.flicker = steady_tracks(recording, config)
+        recording = self.recording
         self.config = config
         self.rate = recording.rate_hz
         self.tracks = [
@@ -274,7 +279,7 @@ class Collector:
         lines = line_obstacles(frame, smooth.track, self.signals, clock, motion)
         room = NUM_OBSTACLES - len(lines)
         others = np.flatnonzero(seen)
-        near, boxes = self._boxes(self.view(frame), others, clock, motion, room)
+        near, boxes = self._boxes(row, self.view(frame), others, clock, motion, room)
         end = len(lines) + min(len(near), room)
         for name in BOX:
             table = np.zeros((NUM_OBSTACLES, TIMES_S.size), boxes[name].dtype)
@@ -300,6 +305,7 @@ class Collector:
 
     def _boxes(
         self,
+        row: dict,
         view: FrameTracks,
         others: np.ndarray,
         clock: np.ndarray,
@@ -322,10 +328,12 @@ class Collector:
         s = s - motion.s0
         seen = valid & (s > -VIEW_BEHIND_M) & (s < GRID_M[-1])
         seen &= np.abs(l - motion.l[0]) < VIEW_BESIDE_M
-        apart = np.abs(s - motion.v0 * TIMES_S) + 4.0 * np.abs(l - motion.l[0])
-        relevance = np.min(np.where(seen, apart, np.inf), axis=1)
-        order = np.argsort(relevance, kind="stable")
-        order = order[np.isfinite(relevance[order])]
+        # where a road meets itself, the nearest station jumps
+        seen &= np.abs(speed) < MAX_SPEED_MPS
+        half = 0.5 * (self._size[others, 1] + row["ego.width"])
+        apart = distances(s, l, seen, half, motion.v0, row["path.l"])
+        order = np.argsort(apart, kind="stable")
+        order = order[np.isfinite(apart[order])]
         most = order[:room]
         s, l, tilt = s[most], l[most], tilt[most]
         along, across = np.abs(np.cos(tilt)), np.abs(np.sin(tilt))

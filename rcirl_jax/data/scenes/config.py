@@ -24,6 +24,12 @@ class CollectConfig:
     # s, at least, until someone whom the human reacts to leaves the record: a scene
     # that is shorter then is dropped, others end there
     min_surroundings_s: float = 3.0
+    # s, shorter tracks are no obstacles: perception that flickers
+    min_life_s: float = 1.0
+    # m, nor are bodies whose longer side is below it
+    min_size_m: float = 0.2
+    # s between two fragments of one standing body that are joined
+    join_gap_s: float = 5.0
     # the paper's two filters
     require_obstacles: bool = True
     require_speed_change: bool = True
@@ -38,5 +44,8 @@ class CollectConfig:
             raise InputError(
                 f"min_surroundings_s: {self.min_surroundings_s}: expected [1, 8]"
             )
+        for name in ("min_life_s", "min_size_m", "join_gap_s"):
+            if not getattr(self, name) >= 0.0:
+                raise InputError(f"{name}: {getattr(self, name)}: expected >= 0")
         if self.stride_s <= 0.0:
             raise InputError(f"stride_s: {self.stride_s}: expected > 0")

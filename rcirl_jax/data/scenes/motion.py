@@ -87,7 +87,7 @@ def human_motion(driver: Driver, start: int, length: float) -> Motion | None:
     """
     future = driver.s[start:]
     within = future[: int(HORIZON_S * driver.rate) + 2]
-    if within[0] <= 0.0 or within[-1] >= length:
+    if within.min() <= 0.0 or within.max() >= length:
         return None
     seconds = np.arange(future.size) / driver.rate
     future_s = float(min(seconds[-1], HORIZON_S))

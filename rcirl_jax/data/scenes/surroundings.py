@@ -7,7 +7,7 @@ that the record shows. So the scene's mask ends there.
 
 import numpy as np
 
-from rcirl_jax.data.scenes.labels import (
+from rcirl_jax.data.scenes.manoeuvres import (
     LATERAL_BUFFER_M,
     MOVING_MPS,
     NUDGE_RANGE_M,

@@ -13,8 +13,8 @@ import numpy as np
 
 from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.data.store.splits import TEST, TRAIN, assign_groups
-from rcirl_jax.errors import InputError
-from rcirl_jax.types import Demonstration
+from rcirl_jax.errors import InputError, did_you_mean
+from rcirl_jax.types import Demonstration, Tag
 
 HOLDOUTS = ("groups", "vehicles", "recording", "validation")
 HELD_OUT = 0.25  # share of the vehicles, or of the training scenes
@@ -135,6 +135,39 @@ def folds_by_recording(dataset: Demonstrations, count: int) -> list[Resplit]:
         parts[least].append(int(names[at]))
         held[least] += sizes[at]
     return [by_recording(dataset, sorted(part)) for part in parts]
+
+
+def with_tags(dataset: Demonstrations, names: Sequence[str]) -> Demonstrations:
+    """Only the scenes with one of these tags; all of them without a name.
+
+    Args:
+      dataset: any dataset with splits "train" and "test".
+      names: of `Tag`, in small letters.
+
+    Raises:
+      InputError: an unknown tag, or a split in which no scene has one.
+    """
+    if not names:
+        return dataset
+    known = [tag.name.lower() for tag in Tag]
+    for name in names:
+        if name not in known:
+            raise InputError(
+                f"--tags: {name}: expected some of {', '.join(known)}"
+                + did_you_mean(name, known)
+            )
+    numbers = [known.index(name) for name in names]
+    splits = {}
+    for split in (TRAIN, TEST):
+        tags = np.asarray(dataset.load(split).scene.tags)
+        chosen = tags[:, numbers].any(axis=1)
+        splits[split] = dataset.indices(split)[chosen]
+        if tags.size and not chosen.any():
+            raise InputError(
+                f"--tags: {', '.join(names)}: none of {len(tags)} scenes of the split "
+                f"{split} has one: expected at least one"
+            )
+    return Resplit(dataset, {k: rows for k, rows in splits.items() if rows.size})
 
 
 def fewer(dataset: Demonstrations, count: int, seed: int) -> Resplit:

@@ -2,16 +2,17 @@
 
 The drivers of `data.synthetic` follow, change lanes and stop by their own models. What
 they did is read from their lanes, stations and speeds without noise, never from
-`data/scenes/labels.py`. With E and O the lanes of the labelled driver and of another
-car over the window, and "ahead" of box before box:
+`data/scenes/labels.py`. Their wishes are in `reactions`. With E and O the lanes of
+the labelled driver and of another car over the window, and "ahead" of box before box:
 
-    E steady, O the same lane all the time, ahead            follow; behind: ignore
-    E steady, O leaves that lane after FOLLOWED_S, ahead     follow; behind: ignore
-    E steady, O comes into it, ahead                         yield (and a cut-in)
-    E steady, O comes into it, behind                        overtake
-    E changes lane, O stays in the old one, is passed        overtake
-    E changes lane, O was ahead in the new one, is passed    overtake
-    never a common lane, passed slowly and near              nudge; else ignore
+    O ahead, later behind, with a common lane                overtake
+    O behind all the time                                    ignore
+    E steady, O the same lane all the time, ahead            follow
+    E steady, O leaves that lane after FOLLOWED_S, ahead     follow
+    E steady, O comes into it, ahead                         yield if E wants to brake
+                                                             for it; else follow
+    never a common lane                                      ignore: these drivers
+                                                             never move aside
 
 All else is left unscored, as is what lies near the edge of a definition.
 """
@@ -24,15 +25,13 @@ import numpy as np
 from rcirl_jax.data.synthetic.roads import GRID_M
 from rcirl_jax.data.synthetic.stops import schedule
 from rcirl_jax.data.synthetic.traffic import Log
+from rcirl_jax.evaluation.labels.reactions import Arrival
 from rcirl_jax.types import Decision, Tag
 
 CLEAR_M = 1.0  # m between bumpers beyond doubt
 FOLLOWED_S = 2.5  # s in the way beyond doubt for a followed car (rule: 2 s)
-COMES_M = 55.0  # m, who comes into the lane farther away is not scored
 ENTERS_S = 1.0  # s after the frame from which coming into the lane counts
-NUDGE_M = (2.7, 3.3)  # m beside: surely near, surely not (rule: 3 m)
-SLOWER_MPS = (2.4, 1.6)  # m/s: surely passed, surely not (rule: 2 m/s)
-PASSING_S = 0.7  # s of it, so that one of the times of the scene sees it
+CUT_IN_S = (2.6, 4.2)  # s of headway: surely near, surely not (rule: 3 s and 5 m)
 STANDS_MPS = 0.05  # m/s, beyond doubt
 ROLLS_MPS = 1.0  # m/s, surely not standing
 STANDS_S = 1.0  # s
@@ -85,62 +84,48 @@ def drive_of(log: Log, number: int, window: slice) -> Drive | None:
 # ----------------------------------------------------------------- decisions
 
 
-def decision(ego: Drive, other: Drive, rate_hz: float) -> Decision | None:
-    """What the driver decided about the other (module docstring); None: unscored."""
+def decision(
+    ego: Drive, other: Drive, rate_hz: float, came: Arrival | None = None
+) -> Decision | None:
+    """What the driver decided about the other (module docstring); None: unscored.
+
+    Args:
+      ego: the driver.
+      other: another car.
+      rate_hz: samples per second.
+      came: how the other comes into the driver's lane, if it does.
+    """
     apart = other.s - ego.s
     half = 0.5 * (ego.length + other.length)
+    ahead, behind = apart > half + CLEAR_M, apart < -half - CLEAR_M
     common = (ego.lanes & other.lanes) != 0
-    if not common.any():
-        return _beside(ego, other, rate_hz)
-    if ego.is_steady:
-        return _in_lane(common, apart, half, other, rate_hz)
-    if ego.changes and other.is_steady:
-        was_old = other.lanes[0] == ego.lanes[0]
-        behind = apart < -half - CLEAR_M
-        if apart[0] > half + CLEAR_M and behind[-1]:
-            return Decision.OVERTAKE
-        return Decision.IGNORE if was_old and behind.all() else None
+    if not common.any() or behind.all():
+        return Decision.IGNORE
+    if ahead[0] and behind[-1]:
+        alone = np.array([is_single(mask) for mask in ego.lanes.tolist()])
+        alone &= ego.lanes == other.lanes
+        return Decision.OVERTAKE if (alone & (ahead | behind)).any() else None
+    if ego.is_steady and ahead[common].all():
+        return _ahead(common, other, rate_hz, came)
     return None
 
 
-def _in_lane(
-    common: np.ndarray, apart: np.ndarray, half: float, other: Drive, rate_hz: float
+def _ahead(
+    common: np.ndarray, other: Drive, rate_hz: float, came: Arrival | None
 ) -> Decision | None:
-    """About somebody who is in a steady driver's lane, or comes or goes."""
-    ahead, behind = apart > half + CLEAR_M, apart < -half - CLEAR_M
-    stays = other.is_steady
+    """About somebody ahead in a steady driver's lane, or who comes or goes."""
     goes = other.changes and bool(common[0])
-    enters = int(np.argmax(common))
-    comes = other.changes and bool(common[-1]) and enters >= ENTERS_S * rate_hz
-    near = abs(apart[enters]) < COMES_M and abs(apart[0]) < COMES_M
-    if behind[common].all():
-        if stays or goes:
-            return Decision.IGNORE
-        return Decision.OVERTAKE if comes and near else None
-    if not ahead[common].all():
-        return None
     alone = np.count_nonzero(other.lanes == other.lanes[0])
-    if stays or (goes and alone >= FOLLOWED_S * rate_hz):
+    if other.is_steady or (goes and alone >= FOLLOWED_S * rate_hz):
         return Decision.FOLLOW
-    return Decision.YIELD if comes and near else None
-
-
-def _beside(ego: Drive, other: Drive, rate_hz: float) -> Decision | None:
-    """About somebody in other lanes all the time."""
-    half = 0.5 * (ego.length + other.length)
-    abreast = np.abs(other.s - ego.s) < half
-    gap = np.abs(other.l - ego.l) - 0.5 * (ego.width + other.width)
-    slower = ego.v - other.v
-    surely = abreast & (gap < NUDGE_M[0]) & (slower > SLOWER_MPS[0])
-    maybe = np.abs(other.s - ego.s) < half + CLEAR_M
-    maybe &= (gap < NUDGE_M[1]) & (slower > SLOWER_MPS[1])
-    if not maybe.any():
-        return Decision.IGNORE
-    if np.count_nonzero(surely) < PASSING_S * rate_hz:
+    comes = other.changes and bool(common[-1])
+    comes &= bool(np.argmax(common) >= ENTERS_S * rate_hz)
+    if came is None or not comes or not came.is_nearest:
         return None
-    at = np.argmax(surely)
-    is_left = ego.l[at] > other.l[at]
-    return Decision.NUDGE_LEFT if is_left else Decision.NUDGE_RIGHT
+    if came.brakes and came.headway_s < CUT_IN_S[0]:
+        return Decision.YIELD
+    lasts = np.count_nonzero(common) >= FOLLOWED_S * rate_hz
+    return Decision.FOLLOW if came.brakes is False and lasts else None
 
 
 def line_decision(log: Log, ego: Drive, rate_hz: float) -> Decision | None:
@@ -217,17 +202,22 @@ def clear(*margins: float) -> bool | None:
     return True if all(value > doubt for value, doubt in pairs) else None
 
 
-def cuts_in(ego: Drive, other: Drive | None, rate_hz: float) -> bool | None:
-    """Whether the other comes into a steady driver's lane, ahead."""
+def cuts_in(
+    ego: Drive, other: Drive | None, rate_hz: float, came: Arrival | None = None
+) -> bool | None:
+    """Whether the other changes lane into the gap ahead of a steady driver."""
     if other is None or not ego.is_steady:
         return None
     common = (ego.lanes & other.lanes) != 0
-    if not common.any() or (common.all() and other.is_steady):
+    if not common.any() or other.is_steady:
         return False
-    made = decision(ego, other, rate_hz)
-    if made == Decision.YIELD:
-        return True
-    return None if made is None else False
+    if came is None:  # behind, or in the lane from the start
+        return False if common[0] or other.s[0] < ego.s[0] else None
+    if came.headway_s > CUT_IN_S[1]:
+        return False
+    surely = other.changes and came.is_nearest
+    surely = surely and np.argmax(common) >= ENTERS_S * rate_hz
+    return True if surely and came.headway_s < CUT_IN_S[0] else None
 
 
 def red_light(log: Log, ego: Drive, now: float) -> bool | None:

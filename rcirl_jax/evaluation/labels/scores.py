@@ -8,7 +8,7 @@ scenes; rates of independent cases, with exact binomial intervals.
 
 import collections
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import tqdm
 
@@ -114,13 +114,25 @@ def count_verdicts(judged: Iterable[list[Verdict] | str], noise: str) -> LabelRe
 
 
 def _score(name: str, verdicts: Iterable[Verdict]) -> ClassScore:
-    pairs = [(truth == name, label == name) for _, _, truth, label in verdicts]
-    return ClassScore(
-        name=name.lower(),
-        right=sum(truth and label for truth, label in pairs),
-        wrong=sum(label and not truth for truth, label in pairs),
-        missed=sum(truth and not label for truth, label in pairs),
-    )
+    return class_scores([name], [verdict[2:] for verdict in verdicts])[0]
+
+
+def class_scores(
+    names: Iterable[str], pairs: Sequence[tuple[str, str]]
+) -> tuple[ClassScore, ...]:
+    """A score of each name over pairs of (truth, label)."""
+    found = []
+    for name in names:
+        holds = [(truth == name, label == name) for truth, label in pairs]
+        found.append(
+            ClassScore(
+                name=name.lower(),
+                right=sum(truth and label for truth, label in holds),
+                wrong=sum(label and not truth for truth, label in holds),
+                missed=sum(truth and not label for truth, label in holds),
+            )
+        )
+    return tuple(found)
 
 
 def format_labels(report: LabelReport) -> str:

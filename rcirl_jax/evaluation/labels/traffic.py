@@ -1,7 +1,6 @@
 """Automatic labels against simulated drivers, whose own state is the truth.
 
-`traffic_truth` says what the drivers did. The labelling rules were made before this
-check; one error in them was found and corrected by it (a lead that drives out of view).
+`made_traffic` says what the drivers did, `reactions` what they wanted.
 """
 
 import dataclasses
@@ -35,6 +34,7 @@ from rcirl_jax.evaluation.labels.made_traffic import (
     tags_of_decisions,
 )
 from rcirl_jax.evaluation.labels.noise import NOISES, check_noise, position_errors
+from rcirl_jax.evaluation.labels.reactions import arrival
 from rcirl_jax.evaluation.labels.scores import LabelReport, Verdict, count_verdicts
 from rcirl_jax.runtime.executors import Executor, Here
 from rcirl_jax.runtime.specs import load_toml, spec_root
@@ -57,7 +57,7 @@ BEND = 0.003  # 1/m, in sharper bends speeds along parallel lanes differ
 def judge(recording: Recording, log: Log) -> Iterator[list[Verdict] | str]:
     """Verdicts of every scene of a recording, or why a frame was dropped."""
     collector = Collector(recording, COLLECT)
-    numbers = [int(track.id[1:]) for track in recording.tracks]
+    numbers = [int(track.id[1:]) for track in collector.recording.tracks]
     for row in collector.scenes():
         first = int(row["frame"])
         seconds = TIMES_S[row["time_valid"]][-1]
@@ -90,8 +90,9 @@ def _verdicts(
             continue
         other = drive_of(log, number, window)
         known = settled and other is not None and _is_known(log, ego, other)
-        what = decision(ego, other, rate) if other and known else None
-        truth[number], cut_ins[number] = what, cuts_in(ego, other, rate)
+        came = arrival(log, own, number, window, rate) if other else None
+        what = decision(ego, other, rate, came) if other and known else None
+        truth[number], cut_ins[number] = what, cuts_in(ego, other, rate, came)
         is_near = other is not None and abs(other.s[0] - ego.s[0]) < NEAR_M
         if what is not None and (number in slots or is_near):
             label = _label(row, slots, number)

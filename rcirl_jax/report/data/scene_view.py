@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 
-from rcirl_jax.data.scenes.labels import blocking
+from rcirl_jax.data.scenes.manoeuvres import blocking
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Decision, Demonstration, Kind, Tag
 from rcirl_jax.units import TIMES_S

@@ -25,7 +25,7 @@ BINS = 24  # of the density
 SCENES = 24  # of the contributions' that curves are the mean of
 OUTER = (0.005, 0.995)  # quantiles of the data between which curves are drawn
 COLUMNS = 4  # panels beside each other
-PANEL = 2.35, 1.75  # inches
+PANEL = 2.7, 1.8  # inches
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -28,14 +28,8 @@ def features_view(
                 f"Without effect in the {name}, because they never vary in its "
                 f"training data: {', '.join(reward.unsupported)}."
             )
-        if reward.anchor is not None:
-            anchor = reward.anchor
-            notes.append(
-                f"The {name} is anchored: it drives by V_total = own cost "
-                f"({anchor.incumbent}, negated) + gain V, with a gain from "
-                f"{anchor.low:g}, where nothing like the scene was recorded, to "
-                f"{anchor.high:g}, where all of it was. The curves show V."
-            )
+        if said := anchor_words(name, reward):
+            notes.append(f"{said} The curves show V.")
     if len(rewards) == 1:
         notes.append(
             f"The incumbent, {incumbent}, is no weights file: it has neither gamma nor "
@@ -48,6 +42,18 @@ def features_view(
         "table": _shares(found, list(rewards)),
         "silent": ", ".join(silent),
     }
+
+
+def anchor_words(name: str, reward: Reward) -> str:
+    """One sentence on what an anchored reward drives by; "" of another one."""
+    anchor = reward.anchor
+    if anchor is None:
+        return ""
+    return (
+        f"The {name} is anchored: it drives by V_total = own cost ({anchor.incumbent}, "
+        f"negated) + gain V, with a gain from {anchor.low:g}, where nothing like the "
+        f"scene was recorded, to {anchor.high:g}, where all of it was."
+    )
 
 
 def _counts(share: Mapping) -> bool:

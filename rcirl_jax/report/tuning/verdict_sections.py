@@ -92,7 +92,7 @@ def forest(title: str, checks: Sequence[Check], names: Sequence[str]) -> Table:
         if not check.measured:
             rows.append((name, "", "not measured", check.note, said))
             continue
-        found = tuple(100.0 * x for x in (check.difference, check.low, check.high))
+        found = 100.0 * check.difference, 100.0 * check.low, 100.0 * check.high
         numbers = interval(found, 2, signed=True) + " %"
         if kind == "fail":
             failing.append(name)

@@ -164,6 +164,14 @@ def test_wrong_options_of_the_layout(tmp_path, table, words):
     assert words in refused(path, people.spec(tmp_path, rest=f"[table]\n{table}"))
 
 
+def test_a_table_without_a_cell_is_one_line(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text('"')
+    assert "header: empty: expected column names" in refused(
+        path, people.spec(tmp_path)
+    )
+
+
 @pytest.mark.parametrize(
     ("mark", "point", "between"),
     [

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from rcirl_jax.data.cut import digest
+from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.data.scenes.assemble import assemble
 from rcirl_jax.data.scenes.collect import Collector
@@ -16,7 +17,6 @@ from rcirl_jax.data.scenes.labels import labels_of
 from rcirl_jax.data.scenes.lanes import LaneGraph
 from rcirl_jax.data.scenes.lines import CREEP_M
 from rcirl_jax.data.scenes.motion import FrameTracks, driver_of, given_path
-from rcirl_jax.data.scenes.quality import QualityReport
 from rcirl_jax.data.scenes.smoothing import harsh_share, savgol
 from rcirl_jax.sampling import trajectory_from_positions
 from rcirl_jax.types import Decision, Ghost, Kind, Lane, Recording, Signal, Tag, Track
@@ -173,42 +173,6 @@ def test_on_overlapping_branches_the_track_keeps_to_one():
     got = graph.match(x, y, np.arctan(0.004 * x))
     assert set(got[2:]) == {"left"}
     assert graph.chain("in", ["in", "right", "left", "left"]) == ("in", "left")
-
-
-def entering(t):
-    """From the left lane into the middle one between 2 and 5 s."""
-    return WIDTH * (1.0 - smooth_step(t, 2, 3))
-
-
-def parked(side):
-    return car("parked", lambda t: 70.0, y=side, kind=Kind.STATIC)
-
-
-D = Decision
-# the ego's start, the other, where its rear end is at the frame, decision, tags
-SITUATIONS = [
-    (20.0, car("lead", speeding_up(50.0)), 27.75, D.FOLLOW, [Tag.FOLLOWING]),
-    # a car from the left lane enters ahead after three seconds, or behind
-    (
-        *(20.0, car("cutter", speeding_up(38.0), y=entering), 15.75),
-        *(D.YIELD, [Tag.CUT_IN, Tag.YIELDING]),
-    ),
-    (
-        *(40.0, car("late", speeding_up(25.0), y=entering), -17.25),
-        *(D.OVERTAKE, [Tag.OVERTAKING]),
-    ),
-    # a car that is behind from the start
-    (40.0, car("rear", speeding_up(15.0)), -27.25, D.IGNORE, []),
-    (20.0, parked(-2.6), 41.67, D.NUDGE_LEFT, [Tag.NUDGING]),
-    (20.0, parked(2.6), 41.67, D.NUDGE_RIGHT, [Tag.NUDGING]),
-]
-
-
-@pytest.mark.parametrize(("start", "other", "at", "decision", "tags"), SITUATIONS)
-def test_decisions_and_tags(start, other, at, decision, tags):
-    row = first_scene(with_ego(start, other))
-    assert Decision(row["decisions"][slot_of(row, at)]) == decision
-    assert all(row["tags"][tag] for tag in tags)
 
 
 def test_a_lead_that_drives_out_of_view_is_followed():

@@ -1,5 +1,7 @@
 """Other splits: disjoint, whole vehicles, nested."""
 
+import types
+
 import numpy as np
 import pytest
 
@@ -11,8 +13,10 @@ from rcirl_jax.data.store.resplit import (
     fewer,
     folds_by_recording,
     held_out,
+    with_tags,
 )
 from rcirl_jax.errors import InputError
+from rcirl_jax.types import Tag
 
 
 class Rows:
@@ -118,3 +122,39 @@ def test_folds_hold_out_every_scene_once():
 def test_folds_need_recordings(count):
     with pytest.raises(InputError, match=f"--folds: {count}: expected 2 to 4"):
         folds_by_recording(Rows(), count)
+
+
+class Tagged(Rows):
+    """Every third scene changes lanes; in two training scenes somebody cuts in."""
+
+    def read(self, rows):
+        tags = np.zeros((self.vehicle.size, len(Tag)), bool)
+        tags[::3, Tag.LANE_CHANGE] = True
+        tags[self.indices("train")[:2], Tag.CUT_IN] = True
+        return types.SimpleNamespace(scene=types.SimpleNamespace(tags=tags[rows]))
+
+
+def test_scenes_with_a_tag():
+    data = Tagged()
+    assert with_tags(data, []) is data
+    found = with_tags(data, ["lane_change"])
+    for split in ("train", "test"):
+        rows = data.indices(split)
+        assert found.indices(split).tolist() == rows[rows % 3 == 0].tolist()
+    both = with_tags(data, ["lane_change", "cut_in"]).indices("train")
+    assert set(found.indices("train")) < set(both)
+    assert set(data.indices("train")[:2]) <= set(both)
+    assert found.hash != data.hash
+
+
+@pytest.mark.parametrize(
+    ("tag", "words"),
+    [
+        ("lane_chnge", "lane_chnge: expected some of .*; did you mean lane_change"),
+        ("turning", r"turning: none of \d+ scenes of the split train has one"),
+        ("cut_in", r"cut_in: none of \d+ scenes of the split test has one"),
+    ],
+)
+def test_tags_that_select_nothing_are_one_line(tag, words):
+    with pytest.raises(InputError, match=f"--tags: {words}"):
+        with_tags(Tagged(), [tag])

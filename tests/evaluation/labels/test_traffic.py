@@ -6,15 +6,23 @@ import json
 import numpy as np
 import pytest
 
+from rcirl_jax.data.importers.synthetic.reader import driver_config
+from rcirl_jax.data.synthetic.drivers import sample_drivers
+from rcirl_jax.data.synthetic.roads import ROADS
+from rcirl_jax.data.synthetic.traffic import Log
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.labels.made_traffic import Drive, cuts_in, decision
+from rcirl_jax.evaluation.labels.reactions import Arrival, arrival
 from rcirl_jax.evaluation.labels.scores import format_labels
 from rcirl_jax.evaluation.labels.traffic import measure_traffic
 from rcirl_jax.runtime.executors import Processes
+from rcirl_jax.runtime.specs import load_toml, spec_root
 from rcirl_jax.types import Decision
 from tests.helpers.commands import succeeded
 
-ROADS = ("arterial_signals", "highway_s_curve")
+SYNTHETIC = spec_root() / "sources" / "synthetic.toml"
+DRIVERS = load_toml(SYNTHETIC)["drivers"]
+DRIVEN = ("arterial_signals", "highway_s_curve")
 FLOOR = 0.9  # precision and recall of a class with ten cases or more
 RATE_HZ = 10.0
 COUNT = 81
@@ -23,7 +31,7 @@ CLOCK = np.arange(COUNT) / RATE_HZ
 
 @functools.cache
 def report():
-    return measure_traffic(1, "ngsim", seed=7, roads=ROADS)
+    return measure_traffic(1, "ngsim", seed=7, roads=DRIVEN)
 
 
 def test_labels_say_what_the_drivers_did():
@@ -47,7 +55,7 @@ def test_the_truth_does_not_come_from_the_labels(monkeypatch):
             row["tags"] = np.zeros(18, bool)
 
     monkeypatch.setattr("rcirl_jax.data.scenes.labels.add_labels", nothing)
-    broken = measure_traffic(1, "ngsim", seed=7, roads=ROADS[:1])
+    broken = measure_traffic(1, "ngsim", seed=7, roads=DRIVEN[:1])
     whole = {score.name: score for score in report().decisions}
     for score in broken.decisions:
         if score.name in ("follow", "stop"):
@@ -57,7 +65,7 @@ def test_the_truth_does_not_come_from_the_labels(monkeypatch):
 
 @pytest.mark.multiprocess
 def test_labels_do_not_depend_on_where_they_are_made():
-    again = measure_traffic(1, "ngsim", seed=7, roads=ROADS, executor=Processes(2))
+    again = measure_traffic(1, "ngsim", seed=7, roads=DRIVEN, executor=Processes(2))
     assert again == report()
     json.dumps(again.as_dict(), allow_nan=False)
 
@@ -99,16 +107,12 @@ OUT = car(0.0, changing(2, 1, 1.0), v=25.0)
         (EGO, car(-30.0, 2), Decision.IGNORE),
         (EGO, car(30.0, changing(2, 4, 4.0)), Decision.FOLLOW),
         (EGO, car(30.0, changing(2, 4, 1.0)), None),  # hardly followed
-        (EGO, car(30.0, changing(4, 2, 2.0)), Decision.YIELD),
         (EGO, car(30.0, changing(4, 2, 0.5)), None),  # from the start or later?
-        (EGO, car(90.0, changing(4, 2, 2.0)), None),  # far away
-        (EGO, car(-30.0, changing(4, 2, 2.0)), Decision.OVERTAKE),
+        (EGO, car(-30.0, changing(4, 2, 2.0)), Decision.IGNORE),
         (EGO, car(2.0, changing(4, 2, 2.0)), None),  # not before box
         (EGO, car(30.0, 4), Decision.IGNORE),
-        (EGO, car(30.0, 4, v=14.0), Decision.NUDGE_LEFT),
-        (EGO, car(30.0, 1, v=14.0), Decision.NUDGE_RIGHT),
-        (EGO, car(30.0, 4, v=18.0), Decision.IGNORE),  # as fast within a threshold
-        (EGO, car(10.0, 4, v=18.0), None),
+        (EGO, car(30.0, 4, v=14.0), Decision.IGNORE),  # passed in its lane
+        (EGO, car(20.0, changing(4, 2, 4.0), v=14.0), Decision.OVERTAKE),
         (OUT, car(30.0, 2, v=18.0), Decision.OVERTAKE),
         (OUT, car(30.0, 1, v=18.0), Decision.OVERTAKE),
         (OUT, car(-30.0, 2), Decision.IGNORE),
@@ -120,13 +124,75 @@ def test_the_truth_of_two_cars(ego, other, truth):
     assert decision(ego, other, RATE_HZ) == truth
 
 
+def came(headway=1.5, brakes=None, nearest=True):
+    return Arrival(headway_s=headway, is_nearest=nearest, brakes=brakes)
+
+
+@pytest.mark.parametrize(
+    ("arrival", "truth", "cut"),
+    [
+        (came(brakes=True), Decision.YIELD, True),
+        (came(brakes=False), Decision.FOLLOW, True),
+        (came(brakes=None), None, True),  # too close to say
+        (came(brakes=True, headway=3.0), None, None),  # near or far?
+        (came(brakes=False, headway=5.0), Decision.FOLLOW, False),
+        (came(brakes=True, nearest=False), None, None),
+    ],
+)
+def test_the_truth_of_one_that_comes_in(arrival, truth, cut):
+    other = car(30.0, changing(4, 2, 2.0))
+    assert decision(EGO, other, RATE_HZ, arrival) == truth
+    assert cuts_in(EGO, other, RATE_HZ, arrival) is cut
+
+
+def test_drivers_brake_for_who_comes_in_near_and_slow():
+    """20 m/s on an empty road; the other comes in 15 m ahead at 16 m/s, or far off."""
+    assert met(gap=15.0, v=16.0).brakes is True
+    assert met(gap=15.0, v=16.0).headway_s == pytest.approx(0.75)
+    assert met(gap=120.0, v=22.0).brakes is False
+    # its leader makes it brake already
+    assert met(gap=15.0, v=16.0, leader=20.0).brakes is None
+    assert met(gap=15.0, v=16.0, leader=8.0).is_nearest is False
+
+
+def met(gap, v, leader=None):
+    """The arrival, after 2 s, of a car that starts `gap` [m] and the way ahead."""
+    count = 3 if leader is not None else 2
+    road = ROADS["highway_straight"]()
+    s = np.empty((COUNT, count))
+    s[:, 0] = 200.0 + 20.0 * CLOCK
+    s[:, 1] = 200.0 + gap + 4.6 + (20.0 - v) * 2.0 + v * CLOCK
+    lanes = np.full((COUNT, count), 2)
+    lanes[:, 1] = changing(4, 2, 2.0)
+    speed = np.broadcast_to([20.0, v, v][:count], s.shape)
+    if leader is not None:
+        s[:, 2] = s[:, 0] + leader + 4.6 - 4.0 * (CLOCK - 2.0)
+    drivers = sample_drivers(
+        np.random.default_rng(0), driver_config(SYNTHETIC, DRIVERS), road, count
+    )
+    drivers["speed_factor"] = 20.0 / road.limit[0]
+    for name, value in (("length", 4.6), ("headway", 1.4), ("jam_gap", 2.0)):
+        drivers[name] = value
+    log = Log(
+        road=road,
+        vehicle=np.broadcast_to(np.arange(count), s.shape),
+        s=s,
+        l=np.zeros_like(s),
+        slope=np.zeros_like(s),
+        v=speed,
+        lanes=lanes,
+        drivers=drivers,
+        signal_offset=np.zeros(0),
+    )
+    return arrival(log, 0, 1, slice(0, COUNT), RATE_HZ)
+
+
 def test_who_cuts_in():
     enters = car(30.0, changing(4, 2, 2.0))
     for ego, other, truth in (
-        (EGO, enters, True), (EGO, car(-30.0, changing(4, 2, 2.0)), False),
+        (EGO, car(-30.0, changing(4, 2, 2.0)), False),
         (EGO, car(30.0, 2), False), (EGO, car(30.0, 4), False),
-        (EGO, car(30.0, changing(4, 2, 0.5)), None), (OUT, enters, None),
-        (EGO, None, None),
+        (EGO, None, None), (OUT, enters, None),
     ):  # fmt: skip
         assert cuts_in(ego, other, RATE_HZ) is truth
 

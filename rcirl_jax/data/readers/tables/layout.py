@@ -248,7 +248,7 @@ def _count(line: str, mark: str, quote: str) -> int:
 def _header_line(rows: Sequence[Sequence[str]]) -> int:
     """The first line with as many cells as most, or one fewer (names of rows).
 
-    Empty cells at the ends of lines count, or not.
+    Empty cells at the ends of lines count, or not. The first one if all are empty.
     """
     wholes = [len(row) for row in rows]
     filled = [len(_trimmed(row)) for row in rows]

@@ -8,6 +8,7 @@ import numpy as np
 
 from rcirl_jax.data.scenes.collect import Collector
 from rcirl_jax.data.scenes.filters import REASONS, REMEDIES
+from rcirl_jax.data.scenes.flicker import note_of
 from rcirl_jax.data.scenes.lines import TOO_FEW
 from rcirl_jax.data.scenes.smoothing import HARSH_MPS2, harsh_share
 from rcirl_jax.data.store.dataset import Dataset
@@ -56,6 +57,10 @@ class QualityReport:
     )
     # of tables: rows read, and those dropped by why
     rows: collections.Counter = dataclasses.field(default_factory=collections.Counter)
+    # tracks that were joined or left out, by why
+    flicker: collections.Counter = dataclasses.field(
+        default_factory=collections.Counter
+    )
     notes: list[str] = dataclasses.field(default_factory=list)
     refused: int = 0  # recordings left out
     empty: int = 0  # recordings without traffic
@@ -104,6 +109,9 @@ class QualityReport:
             smoothed = harsh_share(smooth.x[own], smooth.y[own], collector.rate)
             self.harsh_smooth += smoothed[0]
             self.accelerations += count
+        self.flicker.update(collector.flicker)
+        if collector.flicker:
+            self.notes.append(f"{recording.name}: {note_of(collector.flicker)}")
         self.dropped.update(collector.dropped)
         self.shortened += collector.ended["shortened"]
         self.times += collector.ended["times"]
@@ -173,6 +181,7 @@ class QualityReport:
             "dropped": {name: self.dropped.get(name, 0) for name in REASONS},
             # said only where it happened: the manifests of others keep their hash
             **({"rows": dict(self.rows)} if dropped_rows(self.rows) else {}),
+            **({"flicker": dict(self.flicker)} if self.flicker else {}),
             **({"refused": self.refused} if self.refused else {}),
             **({"empty": self.empty} if self.empty else {}),
             **({"assumed": dict(self.assumed)} if self._any_assumed() else {}),
@@ -294,6 +303,8 @@ def format_quality(report: dict) -> str:
 def oddities(report: Mapping) -> list[str]:
     """What was dropped, left out, skipped, guessed and noted."""
     lines = []
+    if "flicker" in report:
+        lines.append(note_of(report["flicker"]))
     if "rows" in report:
         rows = report["rows"]
         dropped = dropped_rows(rows)

@@ -1,0 +1,159 @@
+"""Tracks of a perception that flickers are joined or left out before scenes are cut."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from rcirl_jax.data.quality import QualityReport, format_quality
+from rcirl_jax.data.scenes.collect import Collector
+from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.data.scenes.flicker import JOINED, SHORT, SMALL, joined, steady_tracks
+from rcirl_jax.errors import InputError
+from rcirl_jax.types import Kind
+from tests.helpers.roads import NO_FILTER, SERIES, WIDTH, car, recording, speeding_up
+
+EGO = car("ego", speeding_up(20.0))
+
+
+def between(track, begin, end, name=None):
+    """The part of a track within a time, as a track of its own."""
+    inside = (track.t >= begin - 1e-6) & (track.t <= end + 1e-6)
+    series = {one: getattr(track, one)[inside] for one in SERIES}
+    return dataclasses.replace(track, id=name or track.id, **series)
+
+
+def standing(name="parked", x=80.0, seconds=12.0, **more):
+    return car(name, lambda t: x, y=-WIDTH, seconds=seconds, **more)
+
+
+def starting(t):
+    """Stands at 80 m for 8 s, then drives off."""
+    return 80.0 + 0.5 * np.maximum(t - 8.0, 0.0) ** 2
+
+
+@pytest.mark.parametrize(
+    ("begin", "end", "kept"),
+    [
+        (3.0, 3.9, False),  # 0.9 s
+        (3.0, 4.0, True),  # 1 s
+        (0.0, 0.5, True),  # it may have been there before the recording
+        (11.5, 12.0, True),  # or after it
+    ],
+)
+def test_a_minimum_life(begin, end, kept):
+    made = recording(EGO, between(car("other", speeding_up(60.0)), begin, end))
+    found, counts = steady_tracks(made, CollectConfig())
+    assert [track.id for track in found.tracks] == ["ego", "other"][: 1 + kept]
+    assert counts == ({} if kept else {SHORT: 1})
+
+
+def test_a_life_that_began_before_this_piece_of_the_log():
+    part = between(car("other", speeding_up(60.0)), 3.0, 3.5)
+    whole = dataclasses.replace(part, seen_since=-4.0)
+    assert not steady_tracks(recording(EGO, whole), CollectConfig())[1]
+
+
+def test_a_minimum_size():
+    tracks = [
+        dataclasses.replace(standing(f"{length}"), length=length, width=0.05)
+        for length in (0.1, 0.19, 0.2, 0.6)
+    ]
+    found, counts = steady_tracks(recording(EGO, *tracks), CollectConfig())
+    assert [track.id for track in found.tracks] == ["ego", "0.2", "0.6"]
+    assert counts == {SMALL: 2}
+    found, counts = steady_tracks(recording(*tracks), CollectConfig(min_size_m=0.0))
+    assert len(found.tracks) == 4
+    assert not counts
+
+
+def test_fragments_of_a_standing_body_are_one():
+    whole = standing(kind=Kind.STATIC)
+    parts = [
+        between(whole, 0.0, 2.0, "7"),
+        between(whole, 2.4, 2.6, "8"),  # too short to live alone
+        between(whole, 6.0, 12.0, "9"),
+    ]
+    made = recording(EGO, *parts)
+    found, counts = steady_tracks(made, CollectConfig())
+    assert counts == {JOINED: 2}
+    ego, one = found.tracks
+    assert (ego.id, one.id) == ("ego", "7")
+    assert (one.t[0], one.t[-1]) == (0.0, 12.0)
+    assert one.t.size == sum(part.t.size for part in parts)
+    assert np.all(np.diff(one.t) > 0.0)
+    # in the scene it is one obstacle that is there all the time
+    row = next(iter(Collector(made, NO_FILTER).scenes()))
+    assert np.count_nonzero(row["obstacles.kind"]) == 1
+    assert row["obstacles.valid"][0].all()
+
+
+def test_two_names_at_a_time_for_one_body():
+    whole = standing()
+    one, two = between(whole, 0.0, 6.0, "1"), between(whole, 4.0, 12.0, "2")
+    (made,) = joined([one, two], 5.0)
+    np.testing.assert_allclose(made.t, whole.t)
+
+
+def test_a_waiting_car_that_drives_off_under_another_name():
+    whole = car("a", starting)
+    made = joined([between(whole, 0.0, 5.0, "1"), between(whole, 6.0, 12.0, "2")], 5.0)
+    assert [track.id for track in made] == ["1"]
+    assert made[0].x[-1] == pytest.approx(88.0)
+
+
+@pytest.mark.parametrize(
+    "second",
+    [
+        between(standing("2", x=81.2), 5.0, 12.0),  # another place
+        between(standing("2"), 8.5, 12.0),  # 5.5 s later
+        between(car("2", lambda t: 56.0 + 4.8 * t, y=-WIDTH), 5.0, 12.0),  # drives past
+    ],
+    ids=["elsewhere", "later", "moving"],
+)
+def test_others_are_not_joined(second):
+    first = between(standing("1"), 0.0, 3.0)
+    assert [track.id for track in joined([first, second], 5.0)] == ["1", "2"]
+    leader = [car("1", speeding_up(20.0), seconds=5.0), car("2", speeding_up(60.0))]
+    assert joined(leader, 5.0) == leader
+
+
+def test_two_people_who_wait_side_by_side_are_two():
+    one, two = (
+        dataclasses.replace(
+            between(standing(name, x=x, kind=Kind.PEDESTRIAN), begin, 12.0),
+            length=0.6,
+            width=0.6,
+        )
+        for name, x, begin in (("1", 80.0, 0.0), ("2", 80.7, 3.0))
+    )
+    assert len(joined([one, two], 5.0)) == 2
+    assert len(joined([one, dataclasses.replace(two, x=two.x - 0.6)], 5.0)) == 1
+    rider = dataclasses.replace(two, x=two.x - 0.6, kind=Kind.CYCLIST)
+    assert len(joined([one, rider], 5.0)) == 2
+
+
+def test_they_are_counted_and_shown():
+    parts = [between(standing(), 0.0, 2.0, "7"), between(standing(), 3.0, 12.0, "8")]
+    flash = between(car("flash", speeding_up(60.0)), 3.0, 3.3)
+    collector = Collector(recording(EGO, *parts, flash), NO_FILTER)
+    report, again = QualityReport(), QualityReport()
+    report.add_recording(collector)
+    again.merge(report.state())
+    again.merge(report.state())
+    assert again.as_dict()["flicker"] == {JOINED: 2, SHORT: 2}
+    assert report.notes == [
+        "hand: tracks that flicker: 1 fragments joined, 1 too short"
+    ]
+    assert "1 fragments joined, 1 too short" in format_quality(report.as_dict())
+    assert report.as_dict()["tracks"] == 2
+    # a recording without flicker says nothing
+    quiet = QualityReport()
+    quiet.add_recording(Collector(recording(EGO), NO_FILTER))
+    assert "flicker" not in quiet.as_dict()
+
+
+@pytest.mark.parametrize("name", ["min_life_s", "min_size_m", "join_gap_s"])
+def test_what_cannot_be_meant(name):
+    with pytest.raises(InputError, match=name):
+        CollectConfig(**{name: -1.0})
