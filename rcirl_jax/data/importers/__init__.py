@@ -1,8 +1,9 @@
 """Importers: one folder per log format, each yielding valid Recordings.
 
-Each has `reader.recordings`: (input path, source spec) -> iterator of Recording. The
-spec is the TOML of data_specs/sources (or the user's own). Each passes its recordings
-through `validate_recording` with the file's name.
+A folder with a `reader` is a format; its `FORMAT` (see `format`) says how its files are
+told and how workers share them. The reader has `recordings`: (input path, source spec)
+-> iterator of Recording. The spec is the TOML of data_specs/sources (or the user's
+own). Each passes its recordings through `validate_recording` with the file's name.
 """
 
 import importlib
@@ -25,32 +26,14 @@ from rcirl_jax.types import Recording
 Importer = Callable[[Path, dict], Iterator[Recording]]
 
 # a folder each, whose `reader` is loaded only when the format is asked for
-IMPORTERS = (
-    *("apollo", "argoverse2", "commonroad", "csv", "interaction", "l5", "levelx"),
-    *("ngsim", "ngsim_pairs", "nuplan", "openacc", "ros2", "synthetic", "waymo"),
+IMPORTERS = tuple(
+    sorted(file.parent.name for file in Path(__file__).parent.glob("*/reader.py"))
 )
-
-# formats of which one part (see `parts`) is a file with a few recordings
-SMALL_PARTS = (
-    "argoverse2",
-    "commonroad",
-    "interaction",
-    "levelx",
-    "ngsim_pairs",
-    "openacc",
-)
-# formats of which one part is a file with many recordings, and the bytes of the
-# longest one whose scenes may be held at once (docs/formats, "Large inputs")
-SHARD_BYTES = {"apollo": 2**28, "nuplan": 2**28, "ros2": 2**28, "waymo": 2**30}
-# formats whose packaged TOML says what holds where a user's own says nothing
-DECLARED = ("interaction", "levelx", "ngsim", "ngsim_pairs", "openacc")
-# formats of which one part is a file that is read in pieces where it is long
-CSV_PARTS = ("csv", "ngsim")
 
 
 def read_part(name: str, path: Path, spec: dict) -> Iterator[Recording]:
     """All recordings of one part, each validated; arguments as of `parts`."""
-    importer: Importer = _module(name).recordings
+    importer: Importer = module_of(name).recordings
     for file in files_of(name, path):
         refuse_pointer(file)
     with as_input_error(str(path), f"a sound log of format {name}"):
@@ -78,13 +61,13 @@ def pieces(name: str, path: Path, spec: dict) -> list[dict]:
 
     A format whose module has no `pieces(path, spec)` reads a part as a whole.
     """
-    split = getattr(_module(name), "pieces", None)
+    split = getattr(module_of(name), "pieces", None)
     return [spec] if split is None else split(path, spec)
 
 
 def files_of(name: str, path: Path) -> list[Path]:
     """The files that one part is read from: itself, if its module says nothing."""
-    found = getattr(_module(name), "files_of", None)
+    found = getattr(module_of(name), "files_of", None)
     return [path] if found is None else found(path)
 
 
@@ -93,8 +76,9 @@ def format_of(name: str) -> Format:
     return importlib.import_module(f"{__name__}.{name}").FORMAT
 
 
-def _module(name: str) -> types.ModuleType:
-    return importlib.import_module(f"{__name__}.{name}.reader")
+def module_of(name: str, module: str = "reader") -> types.ModuleType:
+    """A module of a format's folder."""
+    return importlib.import_module(f"{__name__}.{name}.{module}")
 
 
 def parts(
@@ -124,7 +108,7 @@ def parts(
     if source is not None:
         with as_input_error(str(source), options):
             check_options(spec, load_toml(packaged), format_of(name))
-        if name in DECLARED:
+        if format_of(name).is_declared:
             spec = with_numbers_and_texts(spec, load_toml(packaged))
     spec = {**spec, STATED: own}
     if input_path is None:
@@ -133,7 +117,7 @@ def parts(
         input_path = spec_path
     if not input_path.exists():
         raise InputError(f"{input_path}: input: missing: expected a file or folder")
-    module = _module(name)
+    module = module_of(name)
     split = getattr(module, "parts", None)
     with as_input_error(str(input_path), f"logs of format {name}, and {options}"):
         found = [input_path] if split is None else split(input_path, spec)

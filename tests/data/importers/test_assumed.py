@@ -5,31 +5,10 @@ import collections
 import pytest
 
 from rcirl_jax.data.importers import read_recordings
-from rcirl_jax.data.scenes.quality import assumed
+from rcirl_jax.data.quality import assumed
 from tests.data.importers import people
 from tests.data.importers.test_conformance import MODULES, format_of, write
 from tests.helpers import logs
-
-# of each fixture: lanes without a limit, lanes of an unmeasured width, road users of an
-# unmeasured size. Fitted lanes have neither limit nor width, and no log says how large
-# the car is that recorded it (`ego`), or a road user that only its centre stands for.
-COUNTS = {
-    "apollo": (4, 4, 1),  # the ego
-    "argoverse2": (6, 0, 8),  # sizes by type
-    "commonroad": (2, 0, 0),
-    "csv": (2, 2, 0),  # straight lanes, bounded by each other on one side only
-    "interaction": (2, 0, 2),  # a pedestrian and a cyclist without boxes
-    "interaction_challenge": (4, 0, 2),
-    "l5": (4, 0, 2),  # the ego, in two scenes
-    "levelx": (2, 0, 2),  # a pedestrian and a cyclist without boxes
-    "levelx_highd": (4, 0, 0),
-    "ngsim": (0, 2, 0),  # the limit of the two sites is known
-    "ngsim_pairs": (0, 2, 4),
-    "nuplan": (2, 2, 1),  # the ego
-    "openacc": (2, 2, 4),  # sizes by model
-    "ros2": (4, 4, 1),  # the ego
-    "waymo": (0, 3, 0),
-}
 
 
 def counts(recordings):
@@ -42,18 +21,19 @@ def counts(recordings):
 
 @pytest.mark.parametrize("name", sorted(MODULES))
 def test_of_every_format(name, tmp_path):
-    recordings = read_recordings(format_of(name), write(name, tmp_path).input)
-    assert counts(recordings) == COUNTS[name]
+    fixture = write(name, tmp_path)
+    assert counts(read_recordings(format_of(name), fixture.input)) == fixture.assumed
 
 
 def test_what_the_users_own_toml_states_is_no_guess(tmp_path):
     """Its limit is that of fitted lanes, its [ego] the size of the recording car."""
-    place = write("apollo", tmp_path).input
+    fixture = write("apollo", tmp_path)
     source = tmp_path / "drives.toml"
     source.write_text("rate_hz = 10.0\n")
-    assert counts(read_recordings("apollo", place, source)) == COUNTS["apollo"]
+    found = read_recordings("apollo", fixture.input, source)
+    assert counts(found) == fixture.assumed
     source.write_text("speed_limit = 13.9\n[ego]\nlength = 4.4\nwidth = 1.9\n")
-    (made,) = read_recordings("apollo", place, source)
+    (made,) = read_recordings("apollo", fixture.input, source)
     assert counts([made]) == (0, 4, 0)
     assert {lane.speed_limit for lane in made.lanes} == {made.default_speed_limit}
     assert made.default_speed_limit == 13.9

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from rcirl_jax.data.importers.commonroad import extras as commonroad_extras
 from rcirl_jax.data.importers.commonroad import reader as commonroad
-from rcirl_jax.data.scenes.quality import assumed
+from rcirl_jax.data.quality import assumed
 from rcirl_jax.types import Kind
 from tests.data.importers import writers as w
 from tests.helpers import logs

@@ -10,8 +10,8 @@ import pytest
 from rcirl_jax.data.cut import cut
 from rcirl_jax.data.importing import ImportConfig, import_parts
 from rcirl_jax.data.parts import parts_of
+from rcirl_jax.data.quality import assumed
 from rcirl_jax.data.scenes.config import CollectConfig
-from rcirl_jax.data.scenes.quality import assumed
 from tests.conftest import REPO
 from tests.data.importers import people
 from tests.helpers import logs

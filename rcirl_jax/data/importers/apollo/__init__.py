@@ -7,5 +7,7 @@
 from rcirl_jax.data.importers.format import Format
 
 FORMAT = Format(
+    names=("*.record", "*.record.*"),
+    shard_bytes=2**28,
     checked=("pattern", "topics"),
 )

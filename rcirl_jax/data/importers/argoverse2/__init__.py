@@ -3,5 +3,7 @@
 from rcirl_jax.data.importers.format import Format
 
 FORMAT = Format(
+    names=("scenario_*.parquet",),
+    is_small=True,
     free=("kinds", "sizes"),
 )

@@ -2,4 +2,7 @@
 
 from rcirl_jax.data.importers.format import Format
 
-FORMAT = Format()
+FORMAT = Format(
+    names=("*.xml",),
+    is_small=True,
+)

@@ -3,6 +3,7 @@
 from rcirl_jax.data.importers.format import Format
 
 FORMAT = Format(
+    is_cut=True,
     options={
         **{"reference_point": "centre", "heading_convention": "ccw_from_x"},
         **{"automated_values": ["yes"], "long_bytes": 0, "table": {}},

@@ -2,4 +2,6 @@
 
 from rcirl_jax.data.importers.format import Format
 
-FORMAT = Format()
+FORMAT = Format(
+    names=("*.zarr",),
+)

@@ -3,5 +3,8 @@
 from rcirl_jax.data.importers.format import Format
 
 FORMAT = Format(
+    told_by="drive",
+    is_small=True,
+    is_declared=True,
     free=("sizes",),
 )

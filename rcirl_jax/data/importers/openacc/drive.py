@@ -9,6 +9,7 @@ import numpy as np
 
 from rcirl_jax.data.importers.declared import Columns
 from rcirl_jax.data.importers.projection import utm, utm_zone
+from rcirl_jax.data.readers.tables.columnar import is_columnar
 from rcirl_jax.data.readers.tables.ledger import Ledger
 from rcirl_jax.data.readers.tables.streams import head_of
 from rcirl_jax.data.readers.tables.table import Table, open_table
@@ -63,6 +64,19 @@ def is_drive(path: Path) -> bool:
         return any(COLUMN.fullmatch(name) for name in lines[-1])
     firsts = {line[0].lower() for line in lines if line}
     return not firsts or not firsts.isdisjoint(METADATA)
+
+
+def is_log(file: Path, table: Table | None) -> bool:
+    """Whether it is a drive, by several columns of cars, wherever they are named."""
+    del table
+    if is_columnar(file) or not is_drive(file):
+        return False
+    try:
+        lines = head_of(file)[1]
+    except InputError:
+        return False
+    names = (name.strip() for line in lines for name in line.split(","))
+    return sum(bool(COLUMN.fullmatch(name)) for name in names) > 2
 
 
 def _first_lines(path: Path) -> list[list[str]]:

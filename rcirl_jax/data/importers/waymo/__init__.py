@@ -3,5 +3,7 @@
 from rcirl_jax.data.importers.format import Format
 
 FORMAT = Format(
+    names=("*.tfrecord*",),
+    shard_bytes=2**30,
     free=("kinds",),
 )

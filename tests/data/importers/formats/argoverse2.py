@@ -211,6 +211,7 @@ def write(folder):
     files = write_scenario(folder / "train")
     return Fixture(
         input=folder / "train",
+        assumed=(6, 0, 8),  # sizes are by type
         rate_hz=1.0 / STEP_S,
         tracks=expected(),
         num_lanes=6,
