@@ -40,6 +40,8 @@ def read_part(name: str, path: Path, spec: dict) -> Iterator[Recording]:
         try:
             yield from importer(path, spec)
         except NoRowsError as error:
+            if error.path != path:
+                raise  # a table beside the log
             yield _empty(log_name(path, spec, path.name), error)
 
 

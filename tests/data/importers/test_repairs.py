@@ -6,6 +6,7 @@ import pytest
 
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importers.tracks import of_one_name, once_each
+from rcirl_jax.types import Kind
 from tests.data.importers import writers as w
 from tests.data.importers.formats import argoverse2, l5, waymo
 from tests.data.importers.test_conformance import format_of, write
@@ -103,3 +104,11 @@ def test_a_table_without_rows_is_empty(name, tmp_path):
     (made, *_) = read_recordings(format_of(name), log)
     assert made.tracks == ()
     assert has_note(made, "rows: none")
+
+
+def test_no_pedestrians_beside_the_vehicles(tmp_path):
+    log, beside = write("interaction", tmp_path).files[:2]
+    assert beside.name.startswith("pedestrian_tracks")
+    beside.write_text(beside.read_text().partition("\n")[0] + "\n")
+    (made,) = read_recordings("interaction", log)
+    assert {track.kind for track in made.tracks} == {Kind.VEHICLE}

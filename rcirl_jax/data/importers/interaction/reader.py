@@ -13,6 +13,7 @@ empty), their numbers are text ("P4"), "pedestrian/bicycle" is one class, frames
 may start at 0 or 1, challenge files hold what is asked for in SCENE_obs.csv.
 """
 
+import contextlib
 import dataclasses
 import functools
 from collections.abc import Iterator
@@ -39,7 +40,7 @@ from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.perception import SIZES_M
 from rcirl_jax.data.importers.projection import utm, utm_zone
 from rcirl_jax.data.importers.tracks import split_tracks, travel_heading
-from rcirl_jax.data.readers.tables.ledger import LINE, Ledger, with_news
+from rcirl_jax.data.readers.tables.ledger import LINE, Ledger, NoRowsError, with_news
 from rcirl_jax.data.readers.tables.repair import once
 from rcirl_jax.data.readers.tables.table import open_table, read
 from rcirl_jax.data.recording import accepted, validate_recording
@@ -88,9 +89,10 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
             continue
         partner = file.with_name(file.name.replace(VEHICLES, PEDESTRIANS, 1))
         if partner != file and partner.is_file():
-            others, ledger = _read(partner, spec)
-            rows = {k: np.concatenate([rows[k], others[k]]) for k in rows}
-            ledgers.append(ledger)
+            with contextlib.suppress(NoRowsError):  # no pedestrians
+                others, ledger = _read(partner, spec)
+                rows = {k: np.concatenate([rows[k], others[k]]) for k in rows}
+                ledgers.append(ledger)
         own = own_name(file)
         name = log_name(file, spec, own)
         # logs of one name may be copies of each other
