@@ -315,6 +315,7 @@ def test_packed_bytes_without_an_end_are_not_held(tmp_path):
         ),
         (b"", "rows: none"),
         (b"\n \n\n", "rows: none"),
+        (b'\0"', "header: empty"),
         (b"\xff\xfe" + bytes(range(1, 255)) * 3, "header: hardly any ASCII as utf-16"),
     ],
 )

@@ -164,11 +164,11 @@ def _built(
         keep = moves(lines[row])
         found = [side[row] for side in (left, right)]
         line = lines[row][keep]
-        sides = tuple(
-            np.full(len(line), default) if half is None else half[keep]
-            for half in found
-        )
-        point = stops.points.get(key)
+        usual = np.full(len(line), default)
+        sides = [usual if half is None else half[keep] for half in found]
+        across = None
+        if (point := stops.points.get(key)) is not None:
+            across = line_across(line, sides[0], sides[1], point)
         lane = Lane(
             id=str(key),
             centre=line,
@@ -180,7 +180,7 @@ def _built(
             right=beside[1][row],
             signal_ids=(str(key),) if key in stops.signals else (),
             stop_sign=key in stops.signs,
-            stop_line=None if point is None else line_across(line, *sides, point),
+            stop_line=across,
             width_assumed=any(half is None for half in found),
         )
         lanes.append(lane)
