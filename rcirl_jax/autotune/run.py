@@ -14,6 +14,7 @@ RUN/ranking_recorded.json   the same with recorded futures
 RUN/likeness.json      held-out drives: how near to the human (and likeness.npz, .txt)
 RUN/suite/             metrics.npz, suite.json, cases.csv, table.txt
 RUN/verdict.json       of the gate
+RUN/verdict.txt        its checks and the held-out drives as tables
 RUN/report.html        all of it to look at
 RUN/stages.json        what made what (`stages`)
 """
@@ -63,6 +64,11 @@ class Run:
     def weights(self) -> Path:
         """The candidate."""
         return self.folder / "weights.msgpack"
+
+    @property
+    def tables(self) -> Path:
+        """The verdict's checks and the held-out drives as text."""
+        return self.folder / "verdict.txt"
 
     @property
     def page(self) -> Path:
