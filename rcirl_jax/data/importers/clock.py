@@ -13,7 +13,8 @@ FIELDS = ("x", "y", "heading", "speed", "length", "width")
 def on_clock(boxes: Boxes, rate_hz: float, max_gap_s: float) -> Boxes:
     """Boxes on the clock k / rate_hz, between the rows of each gapless piece.
 
-    Linear interpolation; headings are unwrapped first. A piece between two ticks of
+    Linear interpolation; headings are unwrapped first, values of which some are not
+    known are those of the row at or after the tick. A piece between two ticks of
     the clock gives nothing. Of several rows of one road user and time the first counts.
 
     Args:
@@ -37,7 +38,8 @@ def on_clock(boxes: Boxes, rate_hz: float, max_gap_s: float) -> Boxes:
         for field in FIELDS:
             values = getattr(boxes, field)[rows]
             values = np.unwrap(values) if field == "heading" else values
-            part[field] = np.interp(clock, t[rows], values)
+            known = not np.isnan(values).any()
+            part[field] = np.interp(clock, t[rows], values) if known else values[at]
         parts.append({**part, "kind": boxes.kind[rows][at]})
     merged = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     return dataclasses.replace(boxes, **merged)

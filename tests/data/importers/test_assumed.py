@@ -1,11 +1,17 @@
 """What no log says is counted: limits, widths of lanes, sizes of road users."""
 
 import collections
+import dataclasses
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.importers.clock import on_clock
+from rcirl_jax.data.importers.perception import Boxes, tracks_of
 from rcirl_jax.data.quality import assumed
+from rcirl_jax.types import Kind
 from tests.data.importers import people
 from tests.data.importers.test_conformance import MODULES, format_of, write
 from tests.helpers import logs
@@ -70,3 +76,26 @@ def test_lanes_of_a_table_beside_the_log(tmp_path):
     made = logs.lanes_of(people.only(log, source))
     assert [lane.width_assumed for lane in made.values()] == [False, True, True]
     assert made["2"].left_width.tolist() == [1.75, 1.5]
+
+
+def test_sizes_that_are_measured_here_and_there():
+    """The median of those that are; one that never is goes by the class."""
+    t = np.arange(21) * 0.1
+    boxes = Boxes(
+        ids=np.zeros(21, int),
+        names=("7",),
+        t=t,
+        x=8.0 * t,
+        y=0.0 * t,
+        heading=0.0 * t,
+        speed=np.full(21, 8.0),
+        length=np.where(np.arange(21) % 2, np.nan, 5.0),
+        width=np.full(21, np.nan),
+        kind=np.full(21, int(Kind.CYCLIST)),
+    )
+    ((track,), notes) = tracks_of(Path("a.log"), on_clock(boxes, 10.0, 0.5), 0.5)
+    assert (track.length, track.width, track.size_assumed) == (5.0, 0.6, True)
+    known = dataclasses.replace(boxes, width=np.full(21, 0.7))
+    ((track,), notes) = tracks_of(Path("a.log"), on_clock(known, 10.0, 0.5), 0.5)
+    assert (track.length, track.width, track.size_assumed) == (5.0, 0.7, False)
+    assert notes == []

@@ -1,6 +1,8 @@
 """Source TOMLs are closed: what nobody reads is refused, with what it may mean."""
 
 import re
+import subprocess
+import sys
 
 import pytest
 
@@ -75,3 +77,18 @@ def test_other_packaged_files(source, name):
 def test_types_of_options_that_a_packaged_file_leaves_out(name, option):
     with pytest.raises(InputError, match=r"expected (true or false|a )"):
         check(name, option)
+
+
+def test_what_formats_say_is_cheap_to_read():
+    """Their readers, and what these need, are loaded when they are asked for."""
+    code = (
+        "import sys; from rcirl_jax.data.importers import IMPORTERS, format_of; "
+        "[format_of(name) for name in IMPORTERS]; print(*sys.modules)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    loaded = set(done.stdout.split())
+    assert "rcirl_jax.data.importers.waymo" in loaded
+    heavy = {"pyarrow", "google.protobuf", "shapely", "mcap", "tensorstore"}
+    assert not loaded & {*heavy, "rcirl_jax.data.importers.waymo.reader"}
