@@ -154,7 +154,7 @@ class _Import:
         if made.name in self.recordings:
             raise InputError(f"{made.name}: name: met twice: expected once")
         self.first_refused = self.first_refused or made.refused or ""
-        if not made.refused:
+        if made.rate_hz > 0.0:  # neither refused nor a file without rows
             self.sources[made.source] = made.licence
             self.rates.add(made.rate_hz)
         number = self.recordings.setdefault(made.name, len(self.recordings))

@@ -144,7 +144,10 @@ def test_a_table_without_a_header(tmp_path):
 @pytest.mark.parametrize(
     ("table", "words"),
     [
-        ('separator = ";"', "table.separator: unknown: expected delimiter, decimal"),
+        (
+            'separator = ";"',
+            "table.separator: unknown: expected some of delimiter",
+        ),
         ('delimiter = "ab"', "table.delimiter: ab: expected one of tab, space"),
         ("delimiter = 3", "table.delimiter: 3: expected a text"),
         ('decimal = ";"', "table.decimal: ;: expected one of . ,"),
@@ -312,6 +315,7 @@ def test_packed_bytes_without_an_end_are_not_held(tmp_path):
         ),
         (b"", "rows: none"),
         (b"\n \n\n", "rows: none"),
+        (b'\0"', "header: empty"),
         (b"\xff\xfe" + bytes(range(1, 255)) * 3, "header: hardly any ASCII as utf-16"),
     ],
 )

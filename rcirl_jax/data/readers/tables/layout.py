@@ -18,6 +18,7 @@ from typing import Any
 
 from rcirl_jax.data.readers.tables.streams import head_of
 from rcirl_jax.errors import InputError
+from rcirl_jax.runtime.settings import check_names
 
 MAX_COLUMNS = 10_000  # of a table; logs have some dozens
 MOST = 0.8  # share of a head's rows that repeat their last columns
@@ -138,11 +139,9 @@ def _options(path: Path, section: Mapping) -> dict[str, Any]:
       InputError: an unknown option, or one of another form.
     """
     found: dict[str, Any] = {}
+    check_names(f"{path}: table.", section, OPTIONS)
     for name, value in section.items():
         where = f"{path}: table.{name}: {value}"
-        if name not in OPTIONS:
-            known = ", ".join(OPTIONS)
-            raise InputError(f"{path}: table.{name}: unknown: expected {known}")
         if name in ("skip", "repeating"):
             if type(value) is not int or not 0 <= value <= MAX_COLUMNS:
                 raise InputError(f"{where}: expected a number of lines or columns")
