@@ -53,7 +53,7 @@ LIMITS = {
     **dict.fromkeys(("speed", "vx", "vy"), MAX_VELOCITY_MPS),
     "heading": MAX_PLACE_M,
 }
-DEGREES = {"x": 180.0, "y": 90.0}
+DEGREES = {"x": 360.0, "y": 90.0}  # longitude counts from -180 or from 0
 # of the source TOML, besides those that an import adds
 OPTIONS = (
     *("source", "licence", "pattern", "rate_hz", "speed_limit", "lane_width_m"),
@@ -65,6 +65,7 @@ ADDED = (LEAVE_OUT, PIECE, "log_names")
 RATE_HZ = 10.0  # 1/s
 ISO_TIMES = r"\d{4}-\d\d-\d\d[T ]|\d{8}T\d|\d{4}/\d\d/\d\d |\d{1,2}:\d\d"  # as read
 WORD = r"[A-Z]+(?![^\W\d_A-Z])|[A-Z]?[^\W\d_A-Z]+"  # of a name in camel case too
+DEGREE_M = 111_320.0  # m of a degree of latitude
 MIDDLE_DIGITS = 2  # of latitude and longitude of the projection's middle
 HOLE = "{id}"  # in a column's name: which road user's it is
 WORDS = {
@@ -84,7 +85,17 @@ class Mapping:
     degrees: float = 1.0  # of latitude and longitude in the file's unit
     heading_unit: str = ""  # rad or deg; "": recognised
     has_units: bool = True  # whether the TOML says the unit of x and y
+    is_clock: bool = False  # whether t is a time of day
     notes: tuple[str, ...] = ()
+
+    def distance(self, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
+        """Metres [n] of differences in x and y as rows have them, roughly on earth."""
+        if self.middle is None:
+            return np.hypot(dx, dy)
+        turn, north = 360.0 / self.degrees, self.degrees * DEGREE_M
+        east = north * math.cos(math.radians(self.middle[0]))
+        dx = (dx + 0.5 * turn) % turn - 0.5 * turn  # over the 180th meridian
+        return np.hypot(east * dx, north * dy)
 
 
 def mapping_of(table: Table, spec: AnyMapping) -> Mapping:
@@ -124,6 +135,7 @@ def mapping_of(table: Table, spec: AnyMapping) -> Mapping:
         degrees=degrees,
         heading_unit=units.get("heading", ""),
         has_units="x" in section(spec, "units") or middle is not None,
+        is_clock=_is_clock(form, first_cell(table, clock.lstrip("-"))),
         notes=tuple(notes),
     )
 
@@ -247,10 +259,12 @@ def _middle(
         scale, offset = _scaled(axis, spec)
         known = (values[values != 0.0] * scale + offset) * degrees
         known = known[np.abs(known) <= DEGREES[axis]]
+        if axis == "x" and known.size:  # 179.9 and -179.9 are near each other
+            known = known[0] + (known - known[0] + 180.0) % 360.0 - 180.0
         places.append(
             round(float(np.median(known)), MIDDLE_DIGITS) if known.size else 0.0
         )
-    return places[0], places[1]
+    return places[0], (places[1] + 180.0) % 360.0 - 180.0
 
 
 def _check_units(table: Table, spec: AnyMapping, units: dict[str, str]) -> None:
@@ -336,6 +350,13 @@ def _time(
             f"'{first[:40]}': expected {ISO}"
         )
     return "", 1.0 / rate if unit == "frame" else UNITS[unit or "s"]
+
+
+def _is_clock(form: str, first: str) -> bool:
+    """Whether times are those of a day that nobody names."""
+    if form == ISO:
+        return re.match(r"\d{1,2}:\d", first) is not None
+    return bool(re.search("%[HI]", form)) and not re.search("%[djcxU]", form)
 
 
 def _field(
