@@ -326,6 +326,14 @@ def test_unknown_options_are_one_line(tmp_path):
     columns = {**{n: n for n in people.HEADER}, "heding": "heading"}
     line = refused(path, people.spec(tmp_path, columns))
     assert line.endswith("did you mean heading?")
+    line = refused(path, people.spec(tmp_path, rest="[defaults]\nlenght = 4.2"))
+    assert "defaults.lenght: unknown: expected one of rate_hz, length" in line
+    assert line.endswith("did you mean length?")
+    lanes = '[[lanes]]\nid = "a"\npoints = [[0.0, 0.0], [9.0, 0.0]]\nspeedlimit = 9.0'
+    line = refused(path, people.spec(tmp_path, rest=lanes))
+    assert line.endswith("did you mean speed_limit?")
+    line = refused(path, people.spec(tmp_path, rest='[lanes]\nfiel = "lanes.csv"'))
+    assert "source TOML: lanes.fiel: unknown: expected one of file" in line
 
 
 # ------------------------------------------------------------------------- flags
@@ -333,7 +341,8 @@ def test_unknown_options_are_one_line(tmp_path):
 FLAGS = [
     ("yes", "no"), ("Yes", "No"), ("TRUE", "FALSE"), ("true", "false"), ("1", "0"),
     ("1.0", "0.0"), ("2", "0"), ("on", "off"), ("Y", "N"), ("ja", "nein"), ("x", ""),
-    ("ACC", "human"), ("auto", "manual"),
+    ("ACC", "human"), ("auto", "manual"), ("WAHR", "FALSCH"), ("an", "aus"),
+    ("vrai", "faux"), ("aktiv", "inaktiv"), ("Verdadero", "Falso"),
 ]  # fmt: skip
 
 

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from rcirl_jax.data.importers.csv.known import check_known, check_options
 from rcirl_jax.data.importers.options import UNITS, number, positive, section
 from rcirl_jax.data.readers.tables.cells import EMPTY, ISO
 from rcirl_jax.data.readers.tables.layout import NUMBER
@@ -24,8 +25,7 @@ from rcirl_jax.data.readers.tables.table import (
     Field,
     Table,
 )
-from rcirl_jax.data.recording import LEAVE_OUT, PIECE
-from rcirl_jax.errors import InputError, did_you_mean
+from rcirl_jax.errors import InputError
 
 NEEDED = ("t", "id", "x", "y")
 TEXT = ("id", "kind", "lane", "recording", "automated")
@@ -54,14 +54,6 @@ LIMITS = {
     "heading": MAX_PLACE_M,
 }
 DEGREES = {"x": 360.0, "y": 90.0}  # longitude counts from -180 or from 0
-# of the source TOML, besides those that an import adds
-OPTIONS = (
-    *("source", "licence", "pattern", "rate_hz", "speed_limit", "lane_width_m"),
-    *("reference_point", "max_bad_rows", "heading_convention", "automated_values"),
-    *("long_bytes", "columns", "units", "scale", "offset", "defaults", "kinds"),
-    *("lanes", "table"),
-)
-ADDED = (LEAVE_OUT, PIECE, "log_names")
 RATE_HZ = 10.0  # 1/s
 ISO_TIMES = r"\d{4}-\d\d-\d\d[T ]|\d{8}T\d|\d{4}/\d\d/\d\d |\d{1,2}:\d\d"  # as read
 WORD = r"[A-Z]+(?![^\W\d_A-Z])|[A-Z]?[^\W\d_A-Z]+"  # of a name in camel case too
@@ -104,8 +96,7 @@ def mapping_of(table: Table, spec: AnyMapping) -> Mapping:
     Raises:
       InputError: an unknown field or unit, a needed column that is missing.
     """
-    for name in spec:
-        _check_known("source TOML: ", name, OPTIONS, (*OPTIONS, *ADDED))
+    check_options(spec)
     rate = positive({**spec, **section(spec, "defaults")}, "rate_hz", RATE_HZ)
     columns, units, notes = _columns(table, spec)
     _check_units(table, spec, units)
@@ -140,17 +131,6 @@ def mapping_of(table: Table, spec: AnyMapping) -> Mapping:
     )
 
 
-def _check_known(
-    where: str, name: str, said: Sequence[str], known: Sequence[str]
-) -> None:
-    """A name is one of those known, of which some are said."""
-    if name not in known:
-        raise InputError(
-            f"{where}{name}: unknown: expected one of {', '.join(said)}"
-            f"{did_you_mean(name, said)}"
-        )
-
-
 def _columns(
     table: Table, spec: AnyMapping
 ) -> tuple[dict[str, str], dict[str, str], list[str]]:
@@ -158,7 +138,7 @@ def _columns(
     columns, units = dict(section(spec, "columns")), dict(section(spec, "units"))
     where, every = f"{table.path}: columns.", (*NEEDED, *OPTIONAL, *EARTH)
     for field, column in columns.items():
-        _check_known(where, field, every, every)
+        check_known(where, field, every)
         if not isinstance(column, str) or not column:
             raise InputError(f"{where}{field}: {column}: expected a name")
     for name, field in EARTH.items():
