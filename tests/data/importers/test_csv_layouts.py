@@ -329,3 +329,19 @@ def test_a_log_that_lies_twice_in_a_folder_is_read_once(tmp_path):
     found = people.read(tmp_path, people.spec(tmp_path, more=more))
     assert [made.name for made in found] == ["log", "other"]
     np.testing.assert_allclose(found[0].tracks[0].x, found[1].tracks[0].x, atol=1e-3)
+
+
+@pytest.mark.parametrize("form", ["text", "Parquet"])
+def test_names_of_columns_in_another_case(tmp_path, form):
+    header = ["T", "Id", "X", "Y", "Heading", "SPEED", "Length", "kind"]
+    path = people.write(tmp_path, people.rows(), header)
+    if form == "Parquet":
+        columns = zip(*people.rows(), strict=True)
+        pq.write_table(pa.table(dict(zip(header, columns, strict=True))), path)
+    people.assert_same(people.only(path, people.spec(tmp_path)))
+
+
+def test_a_name_in_its_own_case_wins(tmp_path):
+    table = [[*row, 1e3 - row[2]] for row in people.rows()]
+    path = people.write(tmp_path, table, (*people.HEADER, "X"))
+    people.assert_same(people.only(path, people.spec(tmp_path)))

@@ -74,14 +74,20 @@ class Table:
 
     @functools.cached_property
     def _places(self) -> dict[str, list[int]]:
-        found: dict[str, list[int]] = {}
-        for place, name in enumerate(self.header):
-            found.setdefault(name, []).append(place)
-        return found
+        return _numbered(self.header)
+
+    @functools.cached_property
+    def _small(self) -> dict[str, list[int]]:
+        return _numbered([name.casefold() for name in self.header])
+
+    def _found(self, column: str) -> list[int]:
+        """Numbers of the columns of a name, else of that name in another case."""
+        exact = self._places.get(column)
+        return exact or self._small.get(column.casefold(), [])
 
     def has(self, column: str) -> bool:
-        """Whether there is a column of this name."""
-        return column in self._places
+        """Whether there is a column of this name; its case does not matter."""
+        return bool(self._found(column))
 
     def place(self, column: str) -> int:
         """Number of a column.
@@ -89,7 +95,7 @@ class Table:
         Raises:
           InputError: it is missing, or met twice.
         """
-        found = self._places.get(column, [])
+        found = self._found(column)
         if len(found) == 1:
             return found[0]
         where = f"{self.path}: column {column}"
@@ -107,8 +113,16 @@ class Table:
         """Cells of a column in the first rows, as text."""
         place = self.place(column)
         if self.layout is None:
-            return first_cells(self.path, column, SAMPLES)
+            return first_cells(self.path, self.header[place], SAMPLES)
         return [row[place].strip() for row in self.head if len(row) > place]
+
+
+def _numbered(names: Sequence[str]) -> dict[str, list[int]]:
+    """Name -> the numbers of its columns."""
+    found: dict[str, list[int]] = {}
+    for place, name in enumerate(names):
+        found.setdefault(name, []).append(place)
+    return found
 
 
 def _shortened(names: Sequence[str]) -> list[str]:
@@ -194,7 +208,8 @@ def batches(
             yield _batch(table, fields, made.columns, made.lines, ledger)
         return
     done, size, last = 0, table.path.stat().st_size, 0.0
-    for columns, share in columnar_batches(table.path, [f.column for f in fields]):
+    names = [table.header[place] for place in places]
+    for columns, share in columnar_batches(table.path, names):
         rows = np.arange(done + 1, done + 1 + len(columns[0]))
         done += rows.size
         if show is not None:
