@@ -25,6 +25,7 @@ TIMES = {
     "ISO": stamp("2024-05-20T{:02d}:{:02d}:{:06.3f}"),
     "ISO in UTC": stamp("2024-05-20T{:02d}:{:02d}:{:06.3f}Z"),
     "ISO with a zone": stamp("2024-05-20T{:02d}:{:02d}:{:06.3f}+02:00"),
+    "ISO with a zone behind a blank": stamp("2024-05-20 {:02d}:{:02d}:{:06.3f} +0530"),
     "ISO with a blank": stamp("2024-05-20 {:02d}:{:02d}:{:06.3f}"),
     "ISO with a comma": lambda t: f'"2024-05-20 10:00:{t:06.3f}"'.replace(".", ","),
     "ISO with nanoseconds": stamp("2024-05-20 {:02d}:{:02d}:{:06.3f}000000"),
@@ -55,6 +56,22 @@ def test_times_by_a_pattern(tmp_path, pattern, form):
     table = people.column(people.rows(), "t", form)
     source = people.spec(tmp_path, units=f't = "{pattern}"')
     people.assert_same(people.only(write(tmp_path, table), source))
+
+
+@pytest.mark.parametrize(
+    ("pattern", "form"),
+    [
+        ("%d.%m.%Y %H:%M:%S.%f", stamp("03.05.2024 {:02d}:{:02d}:{:06.3f}")),
+        ("%m/%d/%Y %I:%M:%S.%f %p", stamp("05/20/2024 {:02d}:{:02d}:{:06.3f} AM")),
+    ],
+)
+def test_dates_are_recognised(tmp_path, pattern, form):
+    path = write(tmp_path, people.column(people.rows(), "t", form))
+    found = people.only(path, people.spec(tmp_path))
+    people.assert_same(found)
+    assert f"column t: times as {pattern}" in found.notes
+    line = refused(path, people.spec(tmp_path, units='t = "ms"'))
+    assert line.endswith(f"expected {pattern}")
 
 
 def test_dates_in_a_column_of_seconds_are_named(tmp_path):

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from rcirl_jax.data.importers.csv.dates import date_pattern
 from rcirl_jax.data.importers.csv.known import check_known, check_options
 from rcirl_jax.data.importers.options import UNITS, number, positive, section
 from rcirl_jax.data.readers.tables.cells import EMPTY, ISO
@@ -188,7 +189,7 @@ def _recognised_earth(
     """The columns, with x and y in degrees where their names and cells say so."""
     for x, y in (("x", "y"), ("y", "x")):
         named = WORDS["x"] & words_of(columns[x]) and WORDS["y"] & words_of(columns[y])
-        if not named or {columns["x"], columns["y"]} - set(table.header):
+        if not named or not (table.has(columns["x"]) and table.has(columns["y"])):
             continue
         cells = {"x": columns[x], "y": columns[y]}
         if all(_within(table, cells[axis], DEGREES[axis]) for axis in "xy"):
@@ -197,9 +198,14 @@ def _recognised_earth(
     return columns, units
 
 
+def known_cells(table: Table, column: str) -> list[str]:
+    """The first cells of a column that are not empty."""
+    return [cell for cell in table.samples(column) if cell.lower() not in EMPTY]
+
+
 def first_cell(table: Table, column: str) -> str:
     """The first cell of a column that is not empty, "" without one."""
-    return next((c for c in table.samples(column) if c.lower() not in EMPTY), "")
+    return next(iter(known_cells(table, column)), "")
 
 
 def sampled(table: Table, column: str) -> np.ndarray:
@@ -316,18 +322,22 @@ def _users(table: Table, columns: AnyMapping[str, str]) -> list[str]:
 def _time(
     table: Table, name: str, unit: str | None, rate: float, notes: list[str]
 ) -> tuple[str, float]:
-    """(form, factor) of the clock; ISO where nothing is said and the cells are."""
+    """(form, factor) of the clock; where nothing is said, as its first cells are."""
     first = first_cell(table, name.lstrip("-"))
     is_iso = re.match(ISO_TIMES, first) is not None
     if unit is None and is_iso:
         notes.append(f"column {name}: ISO times")
         return ISO, 1.0
+    pattern = date_pattern(known_cells(table, name.lstrip("-")))
+    if unit is None and pattern:
+        notes.append(f"column {name}: times as {pattern}")
+        return pattern, 1.0
     if unit == ISO or (unit is not None and "%" in unit):
         return unit, 1.0
-    if is_iso:
+    if is_iso or pattern:
         raise InputError(
             f"{table.path}: units.t: {unit}: the cells of {name} are such as "
-            f"'{first[:40]}': expected {ISO}"
+            f"'{first[:40]}': expected {pattern or ISO}"
         )
     return "", 1.0 / rate if unit == "frame" else UNITS[unit or "s"]
 

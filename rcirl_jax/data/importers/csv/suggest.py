@@ -4,10 +4,7 @@ Names of columns, units in them and the numbers of the first rows tell what can 
 The TOML is read back like any other: what is shown is what an import would take.
 """
 
-import contextlib
 import dataclasses
-import datetime
-import itertools
 import math
 import re
 from collections.abc import Mapping as AnyMapping
@@ -15,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.data.importers.csv.dates import date_pattern
 from rcirl_jax.data.importers.csv.flags import NO, YES
 from rcirl_jax.data.importers.csv.heading import half_seconds, is_large
 from rcirl_jax.data.importers.csv.mapping import (
@@ -24,6 +22,7 @@ from rcirl_jax.data.importers.csv.mapping import (
     OPTIONAL,
     Mapping,
     first_cell,
+    known_cells,
 )
 from rcirl_jax.data.importers.csv.meaning import Meaning, meaning_of, with_velocity
 from rcirl_jax.data.importers.csv.names import fields_by_name, kind_by_name, unit_of
@@ -41,9 +40,6 @@ from rcirl_jax.data.readers.tables.ledger import LINE
 from rcirl_jax.data.readers.tables.table import MAX_TIME, Table, batches, open_table
 from rcirl_jax.errors import InputError, as_input_error
 
-# of times that are written neither as a number nor as ISO
-DATES = ("%d.%m.%Y", "%d.%m.%y", "%d/%m/%Y", "%m/%d/%Y", "%d-%m-%Y")
-TIMES_OF_DAY = ("%H:%M:%S.%f", "%H:%M:%S,%f", "%H:%M:%S", "%I:%M:%S.%f %p")
 USUAL_RATES = (1, 2, 4, 5, 10, 12.5, 15, 20, 24, 25, 29.97, 30, 50, 60, 100, 120)
 RATE_FITS = 0.1  # relative
 LONG_CAR_M = 9.0  # m; a longer median vehicle was measured in feet
@@ -156,11 +152,8 @@ def _time_form(table: Table, guess: Guess) -> None:
         guess.units["t"] = "iso"
     elif NUMBER.fullmatch(first) and abs(float(first)) > MAX_TIME:
         guess.units["t"] = "ns" if float(first) > 1e3 * MAX_TIME else "us"
-    for date, rest in itertools.product(DATES, TIMES_OF_DAY):
-        with contextlib.suppress(ValueError):
-            datetime.datetime.strptime(first, f"{date} {rest}")
-            guess.units["t"] = f"{date} {rest}"
-            return
+    elif pattern := date_pattern(known_cells(table, guess.columns["t"])):
+        guess.units["t"] = pattern
 
 
 def _clock(table: Table, raw: AnyMapping[str, np.ndarray], guess: Guess) -> None:
