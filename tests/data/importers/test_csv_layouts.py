@@ -61,7 +61,16 @@ def blank_lines():
     return "\n".join([*lines[:40], "", "   ", *lines[40:], "", ""])
 
 
+def units(*texts):
+    """A line below the header says the units."""
+    head, *rows = people.text(people.rows()).splitlines()
+    return "\n".join([head, ",".join(texts), *rows]) + "\n"
+
+
 LAYOUTS = {
+    "units below": units("s", "", "m", "m", "rad", "m/s", "m", ""),
+    "units below, in brackets": units("[s]", "[-]", *["[m]"] * 2, *["[1]"] * 4),
+    "types below": units("double", "string", *["double"] * 5, "string"),
     "commas": people.text(people.rows()),
     "semicolons": people.text(people.rows(), between=";"),
     "tabs": people.text(people.rows(), between="\t"),
@@ -79,6 +88,9 @@ LAYOUTS = {
     "old Mac's line ends": people.text(people.rows(), end="\r"),
     "a line sep=": "sep=;\n" + people.text(people.rows(), between=";"),
     "comments above": preamble(["# exported 2024-05-20", "# by us; from a drone"]),
+    "comments as wide as the table": preamble(
+        ["# site; A40; 1; 2; 3; north; south; 7", "# t; x; in; SI; units; by; us; all"]
+    ),
     "a title above": preamble(["Flight 42", "", "site; A40"]),
     "a hash before the header": "# " + people.text(people.rows(), between=" "),
     "delimiters at the ends": ends(";"),
@@ -345,3 +357,12 @@ def test_a_name_in_its_own_case_wins(tmp_path):
     table = [[*row, 1e3 - row[2]] for row in people.rows()]
     path = people.write(tmp_path, table, (*people.HEADER, "X"))
     people.assert_same(people.only(path, people.spec(tmp_path)))
+
+
+def test_a_row_of_numbers_is_no_line_of_units(tmp_path):
+    """Nor is one in which the first cells are unknown."""
+    table = people.rows()
+    table[0][2:7] = ["NaN"] * 5
+    found = people.only(people.write(tmp_path, table), people.spec(tmp_path))
+    assert people.rows_of(found)[0] >= 719
+    assert [track.t.size for track in found.tracks] == [119, *[120] * 5]

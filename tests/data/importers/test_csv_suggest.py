@@ -2,6 +2,7 @@
 
 import gzip
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -72,6 +73,22 @@ def test_units_of_speed_by_the_positions(tmp_path, unit, factor):
     _, toml, (made,) = taken(path)
     assert toml["units"]["speed"] == unit
     people.assert_same(made, speed=0.01)
+
+
+def test_units_in_a_line_below_the_header(tmp_path):
+    table = people.rows()
+    for name in ("x", "y", "length"):
+        table = people.column(table, name, lambda metres: metres / 0.3048)
+    table = [[*row[:5], *row[6:]] for row in table]  # no speed that tells
+    header = [name for name in people.HEADER if name != "speed"]
+    head, *rows = people.text(table, header).splitlines()
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join([head, "s,,ft,ft,rad,[ft],", *rows, ""]))
+    _, toml, (made,) = taken(path)
+    assert [toml["units"][name] for name in ("x", "y", "length")] == ["ft"] * 3
+    assert made.rows.unreadable == 0
+    ways = [abs(track.x[-1] - track.x[0]) for track in made.tracks]
+    np.testing.assert_allclose(ways, people.rows()[-6][2], atol=0.01)
 
 
 @pytest.mark.parametrize(

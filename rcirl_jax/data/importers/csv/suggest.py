@@ -8,6 +8,7 @@ import dataclasses
 import math
 import re
 from collections.abc import Mapping as AnyMapping
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -165,7 +166,7 @@ def _clock(table: Table, raw: AnyMapping[str, np.ndarray], guess: Guess) -> None
     step = float(np.median(steps)) if steps.size else math.nan
     if "t" not in guess.units:
         name = guess.columns["t"]
-        unit = unit_of(name, ("ms", "us", "ns", "s")) or _unit_by_step(name, step)
+        unit = _said(table, name, ("ms", "us", "ns", "s")) or _unit_by_step(name, step)
         guess.units["t"], step = unit, step * UNITS.get(unit, math.nan)
     if not math.isfinite(step):
         guess.open.append("rate_hz: rows per second of one road user; 10 is assumed")
@@ -176,6 +177,13 @@ def _clock(table: Table, raw: AnyMapping[str, np.ndarray], guess: Guess) -> None
     guess.said.append(
         f"rate_hz = {guess.rate_hz:g}: a row of a road user every {1 / rate:g} s"
     )
+
+
+def _said(table: Table, column: str, allowed: Sequence[str]) -> str:
+    """The unit that a column's name says, or the line below the header."""
+    bare = column.removeprefix("-")
+    own = "" if HOLE in bare else table.unit_of(bare)
+    return unit_of(column, allowed) or unit_of(f"[{own}]", allowed)
 
 
 def _unit_by_step(name: str, step: float) -> str:
@@ -197,7 +205,7 @@ def _lengths(table: Table, raw: AnyMapping[str, np.ndarray], guess: Guess) -> No
     long = bool(known.size) and float(np.median(known)) > LONG_CAR_M
     for field in ("x", "y", "length", "width"):
         if field in guess.columns:
-            said = unit_of(guess.columns[field], ALLOWED_UNITS["length"])
+            said = _said(table, guess.columns[field], ALLOWED_UNITS["length"])
             guess.units[field] = said or ("ft" if long else "m")
     if long:
         guess.said.append(f"length: {np.median(known):.3g} in the median: feet")
@@ -209,11 +217,11 @@ def _heading_and_speed(
     """Units of angles by their size; of speeds by the speed of the positions."""
     if "heading" in guess.columns:
         large = is_large(raw["heading"][np.isfinite(raw["heading"])])
-        said = unit_of(guess.columns["heading"], ("deg", "rad"))
+        said = _said(table, guess.columns["heading"], ("deg", "rad"))
         guess.units["heading"] = said or ("deg" if large else "rad")
     for field in ("speed", "vx", "vy"):
         if field in guess.columns:
-            said = unit_of(guess.columns[field], ALLOWED_UNITS["speed"])
+            said = _said(table, guess.columns[field], ALLOWED_UNITS["speed"])
             guess.units[field] = said or "m/s"
             if field == "speed" and not said:
                 guess.units[field] = _speed_unit(table.path, guess) or "m/s"

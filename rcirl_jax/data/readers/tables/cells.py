@@ -11,15 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from rcirl_jax.data.readers.tables.layout import NUMBER, Layout, grouped
+from rcirl_jax.data.readers.tables.layout import EMPTY, NUMBER, Layout, grouped
 from rcirl_jax.errors import extra_module
 
 TEXT_CHARS = 64  # characters of a text cell
-# texts that say that nothing is known, in small letters
-EMPTY = (
-    *("", "nan", "na", "n/a", "#n/a", "null", "none", "nil", "nat", "<na>"),
-    *("-", "--", "?", "\\n"),
-)
 WHOLE = re.compile(r"([-+]?\d+)[.,]0+")  # 12.0, as tables write numbers with holes
 # what ISO writes otherwise, pattern -> replacement; a clock alone is of the first day
 NEARLY_ISO = (

@@ -109,6 +109,11 @@ class Table:
             f"{where}: missing: expected it among {_shortened(known)}{hint}"
         )
 
+    def unit_of(self, column: str) -> str:
+        """The unit of a column by the line below the header; "" without one."""
+        units = self.layout.units if self.layout else ()
+        return units[self.place(column)].strip("[]() ") if units else ""
+
     def samples(self, column: str) -> list[str]:
         """Cells of a column in the first rows, as text."""
         place = self.place(column)
