@@ -75,6 +75,35 @@ def test_units_of_speed_by_the_positions(tmp_path, unit, factor):
     people.assert_same(made, speed=0.01)
 
 
+@pytest.mark.parametrize(("unit", "factor"), [("m/s", 1.0), ("km/h", 3.6)])
+def test_units_of_velocities_by_the_positions(tmp_path, unit, factor):
+    turn = 2.0
+    header = ("t", "id", "x", "y", "vx", "vy", "length", "kind")
+    ways = factor * np.array([np.cos(turn), np.sin(turn)])
+    table = [[*r[:4], *(r[5] * ways).tolist(), *r[6:]] for r in people.rows(turn)]
+    path = people.write(tmp_path, table, header)
+    _, toml, (made,) = taken(path)
+    assert (toml["units"]["vx"], toml["units"]["vy"]) == (unit, unit)
+    people.assert_same(made, turn, speed=0.01)
+
+
+@pytest.mark.parametrize("rate", [10.0, 25.0, 30.0])
+@pytest.mark.parametrize(("unit", "factor"), [("m/s", 1.0), ("km/h", 3.6)])
+def test_the_rate_of_frames_by_the_speeds(tmp_path, rate, unit, factor):
+    table = []
+    for k in range(200):
+        for car in range(4):
+            x = 14.0 * k / rate - 30.0 * car
+            table.append([1000 + k, car, x, 0.0, 14.0 * factor])
+    path = people.write(tmp_path, table, ("frame", "id", "x", "y", "speed"))
+    _, toml, (made,) = taken(path)
+    assert (toml["units"]["t"], toml["defaults"]["rate_hz"]) == ("frame", rate)
+    assert toml["units"]["speed"] == unit
+    for track in made.tracks:
+        np.testing.assert_allclose(track.speed, 14.0, atol=0.01)
+        np.testing.assert_allclose(np.diff(track.t), 1.0 / rate, atol=1e-6)
+
+
 def test_units_in_a_line_below_the_header(tmp_path):
     table = people.rows()
     for name in ("x", "y", "length"):
@@ -124,7 +153,9 @@ def test_iso_times_and_degrees_in_parquet(tmp_path):
 def test_frames_have_a_rate_that_is_not_known(tmp_path):
     table = people.column(people.rows(), "t", lambda t: round(10 * t))
     path = tmp_path / "log.csv"
-    path.write_text(people.text(table, ("frame", *people.HEADER[1:])))
+    header = ("frame", *people.HEADER[1:5], "length", "kind")  # no speeds that tell it
+    plain = [[*row[:5], *row[6:]] for row in table]
+    path.write_text(people.text(plain, header))
     found, toml, _ = taken(path)
     assert toml["units"]["t"] == "frame"
     assert any(line.startswith("not known: rate_hz") for line in found.lines)

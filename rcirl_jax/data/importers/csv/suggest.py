@@ -21,6 +21,7 @@ from rcirl_jax.data.importers.csv.mapping import (
     HOLE,
     NEEDED,
     OPTIONAL,
+    RATE_HZ,
     Mapping,
     first_cell,
     known_cells,
@@ -43,6 +44,8 @@ from rcirl_jax.errors import InputError, as_input_error
 
 USUAL_RATES = (1, 2, 4, 5, 10, 12.5, 15, 20, 24, 25, 29.97, 30, 50, 60, 100, 120)
 RATE_FITS = 0.1  # relative
+FRAMES_FIT = 0.02  # likewise, of a rate that speeds tell
+NO_RATE = "rate_hz: rows per second of one road user; 10 is assumed"
 LONG_CAR_M = 9.0  # m; a longer median vehicle was measured in feet
 # recorded speed over that of the positions, both in m/s if it were m/s
 SPEED_RATIOS = {"m/s": 1.0, "km/h": 3.6, "ft/s": 3.2808, "mph": 2.2369, "kn": 1.9438}
@@ -169,7 +172,7 @@ def _clock(table: Table, raw: AnyMapping[str, np.ndarray], guess: Guess) -> None
         unit = _said(table, name, ("ms", "us", "ns", "s")) or _unit_by_step(name, step)
         guess.units["t"], step = unit, step * UNITS.get(unit, math.nan)
     if not math.isfinite(step):
-        guess.open.append("rate_hz: rows per second of one road user; 10 is assumed")
+        guess.open.append(NO_RATE)
         return
     rate = 1.0 / step
     near = min(USUAL_RATES, key=lambda usual: abs(rate / usual - 1.0))
@@ -219,30 +222,59 @@ def _heading_and_speed(
         large = is_large(raw["heading"][np.isfinite(raw["heading"])])
         said = _said(table, guess.columns["heading"], ("deg", "rad"))
         guess.units["heading"] = said or ("deg" if large else "rad")
-    for field in ("speed", "vx", "vy"):
-        if field in guess.columns:
-            said = _said(table, guess.columns[field], ALLOWED_UNITS["speed"])
-            guess.units[field] = said or "m/s"
-            if field == "speed" and not said:
-                guess.units[field] = _speed_unit(table.path, guess) or "m/s"
+    speeds = [field for field in ("speed", "vx", "vy") if field in guess.columns]
+    said = {f: _said(table, guess.columns[f], ALLOWED_UNITS["speed"]) for f in speeds}
+    guess.units.update({field: said[field] or "m/s" for field in speeds})
+    told = ["speed"] if "speed" in speeds else speeds  # by which the speed is known
+    if told == ["vy"] or told == ["vx"] or not told:
+        return
+    if guess.rate_hz is None:
+        _rate_of_frames(table.path, guess)
+    if not any(said[field] for field in told):
+        unit = _speed_unit(table.path, guess) or "m/s"
+        guess.units.update(dict.fromkeys(told, unit))
 
 
 def _speed_unit(path: Path, guess: Guess) -> str:
     """The unit in which speeds are those of the positions; "" if none is."""
-    rows, _, mapping = _without_wrong_headings(path, guess)
-    first, _, last = half_seconds(rows, mapping.rate_hz)
-    dx, dy, dt = (rows[name][last] - rows[name][first] for name in ("x", "y", "t"))
-    real, found = np.hypot(dx, dy) / np.maximum(dt, 1e-9), rows["speed"][first]
-    used = (real > 2.0) & np.isfinite(found)
-    if used.sum() < 10:
+    ratio = _speed_ratio(path, guess)
+    if ratio is None:
         return ""
-    ratio = float(np.median(np.abs(found[used]) / real[used]))
     unit = min(SPEED_RATIOS, key=lambda name: abs(ratio / SPEED_RATIOS[name] - 1.0))
     if abs(ratio / SPEED_RATIOS[unit] - 1.0) > 0.06:
         guess.open.append(f"units.speed: {ratio:.3g} times the speed of the positions")
         return ""
     guess.said.append(f"units.speed = {unit}: {ratio:.3g} times the positions' m/s")
     return unit
+
+
+def _speed_ratio(path: Path, guess: Guess) -> float | None:
+    """Recorded speed over that of the positions; None: too few road users move."""
+    rows, _, mapping = _without_wrong_headings(path, guess)
+    first, _, last = half_seconds(rows, mapping.rate_hz)
+    dx, dy, dt = (rows[name][last] - rows[name][first] for name in ("x", "y", "t"))
+    real, found = np.hypot(dx, dy) / np.maximum(dt, 1e-9), rows["speed"][first]
+    used = (real > 2.0) & np.isfinite(found)
+    return (
+        float(np.median(np.abs(found[used]) / real[used])) if used.sum() > 9 else None
+    )
+
+
+def _rate_of_frames(path: Path, guess: Guess) -> None:
+    """The usual rate at which frames are apart as recorded speeds say, if one is."""
+    ratio = _speed_ratio(path, guess)
+    if ratio is None:
+        return
+    for unit, times in SPEED_RATIOS.items():
+        rate = RATE_HZ * ratio / times
+        near = min(USUAL_RATES, key=lambda usual: abs(rate / usual - 1.0))
+        if abs(rate / near - 1.0) < FRAMES_FIT:
+            guess.rate_hz = near
+            guess.open.remove(NO_RATE)
+            guess.said.append(
+                f"rate_hz = {near:g}: by the speeds, if they are in {unit}"
+            )
+            return
 
 
 def _texts(raw: AnyMapping[str, np.ndarray], guess: Guess) -> None:
