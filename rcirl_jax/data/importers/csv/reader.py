@@ -41,7 +41,8 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.types import Recording
 
 PATTERNS = (
-    *("*.csv", "*.csv.gz", "*.csv.zst", "*.tsv", "*.parquet", "*.feather"),
+    *("*.csv", "*.csv.gz", "*.csv.zst", "*.csv.bz2"),
+    *("*.tsv", "*.tsv.gz", "*.tsv.zst", "*.tsv.bz2", "*.parquet", "*.feather"),
 )  # of files that are read; of those called alike the first pattern's
 MAX_GAP_STEPS = 5.5  # missing rows bridged inside one track
 STILL_M = 0.5  # m; a log in which all road users stay within it is in degrees
