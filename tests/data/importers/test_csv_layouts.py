@@ -366,3 +366,14 @@ def test_a_row_of_numbers_is_no_line_of_units(tmp_path):
     found = people.only(people.write(tmp_path, table), people.spec(tmp_path))
     assert people.rows_of(found)[0] >= 719
     assert [track.t.size for track in found.tracks] == [119, *[120] * 5]
+
+
+@LONG
+@pytest.mark.parametrize("mark", [".", ","])
+def test_numbers_as_text_in_parquet(tmp_path, mark, long_bytes):
+    columns = zip(*people.rows(), strict=True)
+    cells = [[people.cell(value, mark) for value in column] for column in columns]
+    path = tmp_path / "log.parquet"
+    pq.write_table(pa.table(dict(zip(people.HEADER, cells, strict=True))), path)
+    source = people.spec(tmp_path, more=f"long_bytes = {long_bytes}")
+    people.assert_same(people.only(path, source))

@@ -211,7 +211,7 @@ def first_cell(table: Table, column: str) -> str:
 def sampled(table: Table, column: str) -> np.ndarray:
     """The numbers among the first cells of a column."""
     cells = table.samples(column)
-    if table.layout is not None and table.layout.decimal == ",":
+    if table.marks(column)[0] == ",":
         cells = [cell.replace(",", ".") for cell in cells]
     return np.array([float(cell) for cell in cells if NUMBER.fullmatch(cell)])
 

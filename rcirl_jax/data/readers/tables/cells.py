@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from rcirl_jax.data.readers.tables.layout import EMPTY, NUMBER, Layout, grouped
+from rcirl_jax.data.readers.tables.layout import EMPTY, NUMBER, grouped
 from rcirl_jax.errors import extra_module
 
 TEXT_CHARS = 64  # characters of a text cell
@@ -37,8 +37,10 @@ def is_texts(column: Any) -> bool:  # noqa: ANN401
     return types.is_string(kind) or types.is_large_string(kind)
 
 
-def numbers(column: Any, layout: Layout | None) -> Found:  # noqa: ANN401
+def numbers(column: Any, decimal: str, thousands: str) -> Found:  # noqa: ANN401
     """A column of numbers [n] float64, NaN where a cell is empty.
+
+    The marks are those of numbers written as text.
 
     Raises:
       TypeError: a column of Parquet's that holds no numbers.
@@ -47,7 +49,6 @@ def numbers(column: Any, layout: Layout | None) -> Found:  # noqa: ANN401
     if not is_texts(column):
         values = _plain(column)
         return values, np.isinf(values)
-    decimal, thousands = (layout.decimal, layout.thousands) if layout else (".", "")
     cells = column.cast(arrow.string())
     found = _cast(cells, arrow.float64()) if decimal == "." else None
     if found is None:

@@ -126,7 +126,7 @@ def recognise(path: Path, section: Mapping) -> tuple[Layout, list[list[str]]]:
         )
     if not repeating and "names" not in given and _has_row_names(header, below):
         header = ["", *header]
-    decimal, thousands = _decimal(below, delimiter)
+    decimal, thousands = decimal_of(below, delimiter)
     layout = Layout(
         encoding=encoding,
         delimiter=delimiter,
@@ -345,7 +345,7 @@ def _has_row_names(header: Sequence[str], rows: Sequence[Sequence[str]]) -> bool
     )
 
 
-def _decimal(rows: Sequence[Sequence[str]], delimiter: str) -> tuple[str, str]:
+def decimal_of(rows: Sequence[Sequence[str]], delimiter: str) -> tuple[str, str]:
     """(decimal mark, mark between thousands) of the numbers in rows."""
     cells = itertools.chain.from_iterable(rows)
     every = [cell.strip() for cell in itertools.islice(cells, SAMPLE_CELLS)]

@@ -21,7 +21,7 @@ from rcirl_jax.data.readers.tables.columnar import (
     is_columnar,
     schema_of,
 )
-from rcirl_jax.data.readers.tables.layout import NUMBER, Layout, recognise
+from rcirl_jax.data.readers.tables.layout import NUMBER, Layout, decimal_of, recognise
 from rcirl_jax.data.readers.tables.ledger import LINE, Ledger
 from rcirl_jax.data.readers.tables.text_rows import text_batches
 from rcirl_jax.errors import InputError, did_you_mean, extra_module
@@ -113,6 +113,12 @@ class Table:
         """The unit of a column by the line below the header; "" without one."""
         units = self.layout.units if self.layout else ()
         return units[self.place(column)].strip("[]() ") if units else ""
+
+    def marks(self, column: str) -> tuple[str, str]:
+        """(decimal mark, mark between thousands) of numbers written as text."""
+        if self.layout is not None:
+            return self.layout.decimal, self.layout.thousands
+        return decimal_of([self.samples(column)], "")
 
     def samples(self, column: str) -> list[str]:
         """Cells of a column in the first rows, as text."""
@@ -270,7 +276,8 @@ def _column(table: Table, field: Field, found: Any) -> _Column:  # noqa: ANN401
         if field.form:
             values, wrong = cells.times(found, field.form)
         else:
-            values, wrong = cells.numbers(found, table.layout)
+            marks = table.marks(field.column) if cells.is_texts(found) else (".", "")
+            values, wrong = cells.numbers(found, *marks)
     except (TypeError, extra_module("pyarrow").ArrowException) as error:
         why = " ".join(str(error).split())[:200]
         raise InputError(f"{table.path}: column {field.column}: {why}") from error
