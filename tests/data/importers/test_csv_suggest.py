@@ -104,6 +104,23 @@ def test_the_rate_of_frames_by_the_speeds(tmp_path, rate, unit, factor):
         np.testing.assert_allclose(np.diff(track.t), 1.0 / rate, atol=1e-6)
 
 
+def test_every_fifth_frame(tmp_path):
+    table = people.column(people.rows(), "t", lambda t: round(50 * t) + 5)
+    path = people.write(tmp_path, table, ("frame", *people.HEADER[1:]))
+    _, toml, (made,) = taken(path)
+    assert (toml["scale"]["t"], toml["defaults"]["rate_hz"]) == (0.2, 10.0)
+    people.assert_same(made)
+
+
+def test_raw_degrees_are_one_line(tmp_path):
+    header = [*people.HEADER[:2], "lon", "lat", *people.HEADER[4:]]
+    path = people.write(tmp_path, degrees(people.rows(), "{:.0f}", 1e7), header)
+    with pytest.raises(
+        InputError, match=r"lat: 3797\d+: expected degrees; .* \[scale\]"
+    ):
+        suggested(path)
+
+
 def test_units_in_a_line_below_the_header(tmp_path):
     table = people.rows()
     for name in ("x", "y", "length"):

@@ -18,6 +18,7 @@ from rcirl_jax.data.importers.csv.flags import NO, YES
 from rcirl_jax.data.importers.csv.heading import half_seconds, is_large
 from rcirl_jax.data.importers.csv.mapping import (
     ALLOWED_UNITS,
+    DEGREES,
     HOLE,
     NEEDED,
     OPTIONAL,
@@ -25,6 +26,7 @@ from rcirl_jax.data.importers.csv.mapping import (
     Mapping,
     first_cell,
     known_cells,
+    sampled,
 )
 from rcirl_jax.data.importers.csv.meaning import Meaning, meaning_of, with_velocity
 from rcirl_jax.data.importers.csv.names import fields_by_name, kind_by_name, unit_of
@@ -74,6 +76,7 @@ def _suggested(path: Path) -> Suggestion:
     columns, said = _columns(table)
     guess = Guess(columns=columns, said=said)
     _time_form(table, guess)
+    _check_degrees(table, guess)
     raw = _first_rows(path, guess.spec())
     _clock(table, raw, guess)
     _lengths(table, raw, guess)
@@ -160,6 +163,21 @@ def _time_form(table: Table, guess: Guess) -> None:
         guess.units["t"] = pattern
 
 
+def _check_degrees(table: Table, guess: Guess) -> None:
+    """Latitudes are degrees; of raw numbers nobody knows how many make one.
+
+    Raises:
+      InputError: they are too large.
+    """
+    found = sampled(table, guess.columns["lat"]) if "lat" in guess.columns else None
+    if found is not None and found.size and np.abs(found).min() > DEGREES["y"]:
+        raise InputError(
+            f"{table.path}: {guess.columns['lat']}: {found[0]:.12g}: expected degrees; "
+            "if these are raw numbers, write the TOML by hand, with their [scale], "
+            "such as lat = 1e-7, lon = 1e-7"
+        )
+
+
 def _clock(table: Table, raw: AnyMapping[str, np.ndarray], guess: Guess) -> None:
     """Unit of the time and rows per second, by the step of the road users' times."""
     ids = np.unique(raw["id"], return_inverse=True)[1]
@@ -170,6 +188,9 @@ def _clock(table: Table, raw: AnyMapping[str, np.ndarray], guess: Guess) -> None
     if "t" not in guess.units:
         name = guess.columns["t"]
         unit = _said(table, name, ("ms", "us", "ns", "s")) or _unit_by_step(name, step)
+        if unit == "frame" and step > 1.0:
+            guess.scale["t"] = 1.0 / step
+            guess.said.append(f"scale.t: every {step:g}th frame has rows")
         guess.units["t"], step = unit, step * UNITS.get(unit, math.nan)
     if not math.isfinite(step):
         guess.open.append(NO_RATE)
