@@ -20,8 +20,8 @@ import tqdm
 
 from rcirl_jax.data.cut import Cut, cut, cut_item, whole_of
 from rcirl_jax.data.parts import Part, items, leaving_out
+from rcirl_jax.data.quality import QualityReport, remedies
 from rcirl_jax.data.scenes.config import CollectConfig
-from rcirl_jax.data.scenes.quality import QualityReport, remedies
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.data.store.files import Files
 from rcirl_jax.data.store.manifest import Manifest
