@@ -377,3 +377,14 @@ def test_numbers_as_text_in_parquet(tmp_path, mark, long_bytes):
     pq.write_table(pa.table(dict(zip(people.HEADER, cells, strict=True))), path)
     source = people.spec(tmp_path, more=f"long_bytes = {long_bytes}")
     people.assert_same(people.only(path, source))
+
+
+def test_a_table_beside_the_logs_that_is_none(tmp_path):
+    people.write(tmp_path, people.rows())
+    (tmp_path / "README.csv").write_text("file,what\nlog.csv,the flight of monday\n")
+    line = refused(tmp_path, people.spec(tmp_path))
+    assert "README.csv: header: ['file', 'what']: none of the columns t, id, x" in line
+    assert "`pattern` of the TOML leaves out" in line
+    people.assert_same(
+        people.only(tmp_path, people.spec(tmp_path, more='pattern = "log*.csv"'))
+    )

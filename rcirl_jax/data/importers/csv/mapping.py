@@ -285,6 +285,8 @@ def _found(
     found: list[tuple[str, str, str | None]] = []
     missing: list[str] = []
     users = _users(table, columns) if HOLE in columns.get("x", "") else []
+    if not users:
+        _check_is_log(table, [columns[field] for field in NEEDED])
     for field, name in columns.items():
         plain = name.removeprefix("-") if field not in TEXT else name
         sign = name[: len(name) - len(plain)]
@@ -297,6 +299,22 @@ def _found(
             elif user is None:
                 missing.append(f"no column '{column}': {field} computed or by default")
     return found, missing
+
+
+def _check_is_log(table: Table, needed: Sequence[str]) -> None:
+    """A table has some of the columns needed, or no header that names any.
+
+    Raises:
+      InputError: it is another table, as a list of files beside the logs is.
+    """
+    if any(table.has(name.lstrip("-")) for name in needed):
+        return
+    if not any(NUMBER.fullmatch(name) for name in table.header):
+        raise InputError(
+            f"{table.path}: header: {[*table.header[:20]]}: none of the columns "
+            f"{', '.join(needed)}: expected a log; `pattern` of the TOML leaves out "
+            "tables that are none"
+        )
 
 
 def _users(table: Table, columns: AnyMapping[str, str]) -> list[str]:
