@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.data.readers.tables.repair import is_far
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Track
 
@@ -15,7 +16,12 @@ MIN_TRAVEL_M = 0.5  # m in that window; below it the heading is held
 
 
 def split_tracks(
-    path: Path, ids: np.ndarray, t: np.ndarray, max_gap: float, reuse: float = np.inf
+    path: Path,
+    ids: np.ndarray,
+    t: np.ndarray,
+    max_gap: float,
+    reuse: float = np.inf,
+    places: np.ndarray | None = None,
 ) -> list[tuple[str, np.ndarray]]:
     """Rows of each track: one road user without a gap.
 
@@ -29,6 +35,7 @@ def split_tracks(
       t: [n] in any unit.
       max_gap: in the unit of t.
       reuse: in the unit of t.
+      places: [n, 2] m; where nobody gets to in time (t in s), another track starts.
 
     Returns:
       (name, row numbers in the order of time) per track.
@@ -60,7 +67,10 @@ def split_tracks(
             f"{path}: t: median step {np.median(step[same]):g}: "
             f"expected at most {max_gap:g}; wrong unit of time or rate?"
         )
-    pieces = np.split(order, np.flatnonzero(~same | (step > max_gap)) + 1)
+    ends = ~same | (step > max_gap)
+    if places is not None:
+        ends |= is_far(step, np.hypot(*np.diff(places[order], axis=0).T))
+    pieces = np.split(order, np.flatnonzero(ends) + 1)
     parts: dict[str, int] = {}
     tracks = []
     for rows in pieces:
