@@ -201,17 +201,23 @@ reliability: setup
 	$(ATHERIS)
 	$(BIN)/python -m benchmarks.reliability.table $(if $(MINUTES),--minutes=$(MINUTES)) $(if $(ANEW),--anew) --output=$(RESULTS)
 
-# The C++ reader under libFuzzer; needs clang and its runtime
+# The C++ reader and F under libFuzzer; needs clang and its runtime
 FUZZ_SECONDS ?= 720
 # fewer than these are a failure
 FUZZ_INPUTS ?= 1000000
+FUZZ_FEATURES ?= 50000
 fuzz: setup
 	$(BIN)/python -m onboard.fuzz.make_corpus --output=out/fuzz/corpus
 	cmake -S onboard -B build/fuzz -DCMAKE_CXX_COMPILER=clang++ -DRCIRL_BUILD_FUZZ=ON
-	cmake --build build/fuzz --target fuzz_load
+	cmake --build build/fuzz --target fuzz_load fuzz_features fuzz_scene
 	$(BIN)/python -m onboard.fuzz.counted $(FUZZ_INPUTS) build/fuzz/fuzz_load \
 	  -dict=out/fuzz/weights.dict -max_len=16384 -timeout=10 \
 	  -max_total_time=$(FUZZ_SECONDS) -print_final_stats=1 out/fuzz/corpus
+	mkdir -p out/fuzz/features out/fuzz/scene
+	$(BIN)/python -m onboard.fuzz.counted $(FUZZ_FEATURES) build/fuzz/fuzz_features \
+	  -max_len=8192 -len_control=0 -timeout=10 -max_total_time=$(FUZZ_SECONDS) out/fuzz/features
+	$(BIN)/python -m onboard.fuzz.counted $(FUZZ_FEATURES) build/fuzz/fuzz_scene \
+	  -max_len=4096 -len_control=0 -timeout=10 -max_total_time=$(FUZZ_SECONDS) out/fuzz/scene
 
 clean:
 	rm -rf $(VENV) out build dist

@@ -19,8 +19,8 @@ from benchmarks.common import write
 from experiments.flags.common import run
 from rcirl_jax.data.cut import cut_item
 from rcirl_jax.data.parts import parts_of, recordings_of
+from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.data.scenes.config import CollectConfig
-from rcirl_jax.data.scenes.quality import QualityReport
 from rcirl_jax.runtime.executors import Executor, Here, Processes
 from rcirl_jax.runtime.specs import spec_root
 

@@ -29,7 +29,7 @@ from rcirl_jax.data.importers.files import table_stem
 from rcirl_jax.data.importers.recognise import recognised_format
 from rcirl_jax.data.importing import ImportConfig, import_parts
 from rcirl_jax.data.parts import leaving_out, parts_of
-from rcirl_jax.data.scenes.quality import format_quality, format_splits
+from rcirl_jax.data.quality import format_quality, format_splits
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, oracle_floor

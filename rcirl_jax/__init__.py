@@ -21,18 +21,19 @@ if TYPE_CHECKING:
     from rcirl_jax.api.insight import feature_prices, response_curves
     from rcirl_jax.api.learning import train_reward, tune
     from rcirl_jax.api.logs import import_logs, read_logs
-    from rcirl_jax.data.store.dataset import Dataset, open_dataset
+    from rcirl_jax.data.store.dataset import open_dataset
     from rcirl_jax.errors import InputError
+    from rcirl_jax.export.own_planner.builder import scene_from
+    from rcirl_jax.export.own_planner.inputs import Body, Car, CentreLine, Signal
     from rcirl_jax.export.reader import Reward, WeightsError, load_weights
-    from rcirl_jax.types import Candidates, Demonstration, Scene
 
 __all__ = [
-    "Candidates",
-    "Dataset",
-    "Demonstration",
+    "Body",
+    "Car",
+    "CentreLine",
     "InputError",
     "Reward",
-    "Scene",
+    "Signal",
     "WeightsError",
     "as_seen",
     "candidates_from",
@@ -47,6 +48,7 @@ __all__ = [
     "read_logs",
     "response_curves",
     "sample_candidates",
+    "scene_from",
     "score_candidates",
     "simulate",
     "train_reward",
@@ -56,8 +58,11 @@ __all__ = [
 # name -> the module that has it
 _PLACES = {
     **dict.fromkeys(("read_logs", "import_logs"), "api.logs"),
-    **dict.fromkeys(("Dataset", "open_dataset"), "data.store.dataset"),
-    **dict.fromkeys(("Candidates", "Demonstration", "Scene"), "types"),
+    "open_dataset": "data.store.dataset",
+    "scene_from": "export.own_planner.builder",
+    **dict.fromkeys(
+        ("Body", "Car", "CentreLine", "Signal"), "export.own_planner.inputs"
+    ),
     **dict.fromkeys(("as_seen", "sample_candidates"), "api.candidates"),
     **dict.fromkeys(("candidates_from", "compute_features"), "api.candidates"),
     "score_candidates": "api.candidates",

@@ -28,7 +28,7 @@ def source(run: Run, given: str | Logs, number: int) -> Dataset:
         "files": listing(given.input) if given.input else [],
         **({"signals": given.signals} if given.signals else {}),
     }
-    key = digest({**inputs, **run.code()})[:8]
+    key = digest({**inputs, **run.code(__name__)})[:8]
     folder = run.folder / f"dataset-{key}"
 
     def work() -> None:
@@ -92,7 +92,7 @@ def _rehearsed(run: Run, number: int, learner: Path | None) -> Dataset:
         "teacher": run.incumbent_hash() if plan.teacher == "incumbent" else "",
         "learner": file_sha256(learner) if learner else "",
     }
-    key = digest({**inputs, **run.code()})[:8]
+    key = digest({**inputs, **run.code(__name__)})[:8]
     folder = run.folder / f"rehearsal-{key}" / str(number)
 
     def work() -> None:

@@ -24,7 +24,7 @@ from rcirl_jax.evaluation.closed_loop.likeness import (
 )
 from rcirl_jax.evaluation.closed_loop.suite import write_suite
 from rcirl_jax.evaluation.gate.decision import judge
-from rcirl_jax.evaluation.gate.output import write_verdict
+from rcirl_jax.evaluation.gate.output import format_verdict, write_verdict
 from rcirl_jax.evaluation.gate.runs import CANDIDATE, INCUMBENT, pair_of
 from rcirl_jax.evaluation.gate.types import Verdict
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
@@ -198,6 +198,9 @@ def gate(run: Run, verdict: Callable[[], Verdict]) -> None:
         files = {"candidate": str(run.weights), "incumbent": run.config.incumbent}
         runs = {"training_runs": run.config.seeds}
         facts = {"files": files, **runs, "made_by": run.provenance()}
-        write_verdict(path, verdict(), run.config.gate, facts)
+        found = verdict()
+        write_verdict(path, found, run.config.gate, facts)
+        drives = (run.folder / "likeness.txt").read_text()
+        write_whole(run.tables, f"{drives}\n{format_verdict(found)}\n")
 
-    run.stage("gate", inputs, [path], work)
+    run.stage("gate", inputs, [path, run.tables], work)

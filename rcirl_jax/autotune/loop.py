@@ -5,6 +5,7 @@ The order of the stages and what is printed; each stage's work is in `demonstrat
 """
 
 import functools
+import textwrap
 from collections.abc import Callable, Sequence
 
 from rcirl_jax.autotune.demonstrations import kept_source, source, with_rehearsal
@@ -22,8 +23,9 @@ from rcirl_jax.autotune.run import Run
 from rcirl_jax.data.logs import Logs
 from rcirl_jax.data.store.joined import Demonstrations, JoinedDatasets, shares_of
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.gate.output import format_verdict
 from rcirl_jax.evaluation.gate.runs import CANDIDATE
+from rcirl_jax.evaluation.gate.types import Verdict
+from rcirl_jax.evaluation.gate.words import WIDTH
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.report.tuning.features import anchor_words
 
@@ -58,13 +60,25 @@ def tune(run: Run, given: Sequence[str | Logs], last: str = STAGES[-1]) -> None:
     for name in STAGES[: STAGES.index(last) + 1]:
         steps[name]()
     if last in ("gate", "report"):
-        run.say((run.folder / "likeness.txt").read_text())
-        run.say(format_verdict(verdict()))
+        run.say(_ending(run, verdict()))
     if last not in ("import", "rehearse"):
-        run.say(f"weights: {run.weights}")
         run.say(_said_of_weights(run))
+        run.say(f"weights: {run.weights}")
     if last == "report":
         run.say(f"report to open: {run.page}")
+
+
+def _ending(run: Run, verdict: Verdict) -> str:
+    """The verdict, why, where the tables are, and what to look at; a few lines."""
+    lines = ["", f"verdict: {verdict.decision.upper()}"]
+    lines += textwrap.wrap(verdict.sentence, WIDTH)
+    lines.append(f"all tables: {run.tables}")
+    if verdict.look_at:
+        lines.append(
+            f"replay: python -m experiments.replay --weights={run.weights} "
+            f"--case={verdict.look_at[0]} --output={run.folder / 'case'}"
+        )
+    return "\n".join(lines)
 
 
 def draw_again(run: Run, given: Sequence[str | Logs]) -> None:

@@ -81,7 +81,7 @@ def workdir_of(run: Run, dataset: Demonstrations, seed: int) -> Path:
 def kept_workdir(run: Run, seed: int) -> Path:
     """The folder of a finished training run, by what is noted of it."""
     noted = run.stages.read().get(f"train {seed}", {}).get("inputs", {})
-    decided = ("config", "dataset", *run.code())
+    decided = ("config", "dataset", *run.code(__name__))
     key = digest({name: noted.get(name) for name in decided})[:8]
     return run.folder / f"train-{key}" / f"seed-{seed}"
 
@@ -95,7 +95,7 @@ def _anchor_file(run: Run, drives: int) -> Path | None:
 def _inputs(run: Run, dataset: Demonstrations) -> dict:
     """What decides a training besides its seed and anchor."""
     settings = dataclasses.asdict(run.config.train)
-    return {"config": settings, "dataset": dataset.hash, **run.code()}
+    return {"config": settings, "dataset": dataset.hash, **run.code(__name__)}
 
 
 def _train_one(

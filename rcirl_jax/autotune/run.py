@@ -14,11 +14,13 @@ RUN/ranking_recorded.json   the same with recorded futures
 RUN/likeness.json      held-out drives: how near to the human (and likeness.npz, .txt)
 RUN/suite/             metrics.npz, suite.json, cases.csv, table.txt
 RUN/verdict.json       of the gate
+RUN/verdict.txt        its checks and the held-out drives as tables
 RUN/report.html        all of it to look at
 RUN/stages.json        what made what (`stages`)
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -27,8 +29,9 @@ from rcirl_jax.autotune.config import TuneConfig
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.reader import Reward
+from rcirl_jax.runtime.code import code_of
 from rcirl_jax.runtime.executors import Executor
-from rcirl_jax.runtime.pipeline import Stages, code_sha256, file_sha256
+from rcirl_jax.runtime.pipeline import Stages, file_sha256
 from rcirl_jax.simulation.rows import BASELINES
 from rcirl_jax.train.running import Running
 
@@ -63,6 +66,11 @@ class Run:
         return self.folder / "weights.msgpack"
 
     @property
+    def tables(self) -> Path:
+        """The verdict's checks and the held-out drives as text."""
+        return self.folder / "verdict.txt"
+
+    @property
     def page(self) -> Path:
         """The report to open."""
         return self.folder / "report.html"
@@ -85,20 +93,21 @@ class Run:
         outputs: list[Path],
         work: Callable[[], object],
     ) -> None:
-        """Do a stage's work unless it was done from these inputs by this code.
+        """Do a stage's work unless it was done from these inputs by the code it uses.
 
         Arguments as of `Stages.run`; what the stage makes `STALE` is removed first.
         """
-        facts = {**inputs, **self.code()}
+        function = work.func if isinstance(work, functools.partial) else work
+        facts = {**inputs, **self.code(function.__module__)}
         kind = name.partition(" ")[0]
         stale = STALE.get(kind, ())
         made_by = {key: self.facts[key] for key in NOTED if key in self.facts}
         done = self.stages.run(name, facts, outputs, work, stale, made_by)
         self.say(f"[{name}] {'done' if done else 'as before, kept'}")
 
-    def code(self) -> dict:
-        """What made a stage besides its inputs."""
-        return {"code": code_sha256(), "versions": self.facts["versions"]}
+    def code(self, module: str) -> dict:
+        """What made a stage besides its inputs: the code that a module uses."""
+        return {"code": code_of([module]), "versions": self.facts["versions"]}
 
     def sign(self, dataset: Dataset) -> None:
         """Say beside a dataset of this run what made it."""

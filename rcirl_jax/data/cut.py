@@ -14,10 +14,10 @@ import jax
 import numpy as np
 
 from rcirl_jax.data.parts import Item, recordings_in
+from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.data.scenes.assemble import CHUNK, assemble
 from rcirl_jax.data.scenes.collect import Collector
 from rcirl_jax.data.scenes.config import CollectConfig
-from rcirl_jax.data.scenes.quality import QualityReport
 from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.types import Demonstration, Recording, Track
 

@@ -20,8 +20,8 @@ import tqdm
 
 from rcirl_jax.data.cut import Cut, cut, cut_item, whole_of
 from rcirl_jax.data.parts import Part, items, leaving_out
+from rcirl_jax.data.quality import QualityReport, remedies
 from rcirl_jax.data.scenes.config import CollectConfig
-from rcirl_jax.data.scenes.quality import QualityReport, remedies
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.data.store.files import Files
 from rcirl_jax.data.store.manifest import Manifest
@@ -154,7 +154,7 @@ class _Import:
         if made.name in self.recordings:
             raise InputError(f"{made.name}: name: met twice: expected once")
         self.first_refused = self.first_refused or made.refused or ""
-        if not made.refused:
+        if made.rate_hz > 0.0:  # neither refused nor a file without rows
             self.sources[made.source] = made.licence
             self.rates.add(made.rate_hz)
         number = self.recordings.setdefault(made.name, len(self.recordings))

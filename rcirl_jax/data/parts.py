@@ -5,10 +5,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from rcirl_jax.data.importers import (
-    CSV_PARTS,
-    SHARD_BYTES,
-    SMALL_PARTS,
     files_of,
+    format_of,
     pieces,
     read_part,
 )
@@ -90,12 +88,13 @@ def is_long(part: Part) -> bool:
     """Whether a part's recordings may be too many to be held at once."""
     if PIECE in part.spec:
         return False
-    if part.format in CSV_PARTS:
+    form = format_of(part.format)
+    if form.is_cut:
         return is_long_file(part.input, part.spec)
-    if part.format in SHARD_BYTES and part.input.is_file():
+    if form.shard_bytes and part.input.is_file():
         files = files_of(part.format, part.input)
-        return sum(file.stat().st_size for file in files) > SHARD_BYTES[part.format]
-    return part.format not in SMALL_PARTS
+        return sum(file.stat().st_size for file in files) > form.shard_bytes
+    return not form.is_small
 
 
 def _pieces(part: Part) -> list[Part]:

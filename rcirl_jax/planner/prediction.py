@@ -54,12 +54,21 @@ class Bodies(flax.struct.PyTreeNode, kw_only=True):
     present: jax.Array  # bool
 
 
-def relevant(bodies: Bodies, ego: Ego) -> Bodies:
-    """The `NUM_BODIES` bodies that matter most, nearest first; absent ones fill up."""
+def most_relevant(bodies: Bodies, ego: Ego) -> jax.Array:
+    """Places [NUM_BODIES] of the bodies that matter most, nearest first.
+
+    Absent ones fill up.
+    """
     ds = bodies.s - ego.s
     ahead = jnp.where(ds < 0.0, -BEHIND_WEIGHT * ds, ds)
     distance = ahead + ASIDE_WEIGHT * jnp.abs(bodies.l - ego.l)
     _, index = jax.lax.top_k(jnp.where(bodies.present, -distance, -jnp.inf), NUM_BODIES)
+    return index
+
+
+def relevant(bodies: Bodies, ego: Ego) -> Bodies:
+    """The `NUM_BODIES` bodies that matter most."""
+    index = most_relevant(bodies, ego)
     return jax.tree.map(lambda x: x[index], bodies)
 
 

@@ -24,9 +24,9 @@ import jax
 import numpy as np
 import tqdm
 
+from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.data.scenes.assemble import assemble
 from rcirl_jax.data.scenes.labels import add_labels
-from rcirl_jax.data.scenes.quality import QualityReport
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.data.store.files import Files
 from rcirl_jax.data.store.manifest import Manifest

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 import rcirl_jax
+from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.errors import InputError
 
 MOST = 25  # names that a newcomer has to look through
 SLOW = {"tune"}  # its stages are those of `experiments.autotune`, which has its tests
-TYPES = {"Candidates", "Demonstration", "InputError", "Reward", "Scene", "WeightsError"}
+TYPES = {"Body", "Car", "CentreLine", "Signal", "InputError", "Reward", "WeightsError"}
 
 
 def test_every_name_is_loaded_documented_and_typed():
@@ -44,13 +45,17 @@ def test_reading_weights_loads_no_jax():
     assert done.stdout.strip() == "False"
 
 
-@pytest.mark.parametrize("name", sorted(set(rcirl_jax.__all__) - SLOW - TYPES))
+SHOWN = {name: getattr(rcirl_jax, name) for name in rcirl_jax.__all__}
+SHOWN |= {"Dataset": Dataset}
+
+
+@pytest.mark.parametrize("name", sorted(set(SHOWN) - SLOW - TYPES))
 def test_the_example_runs(name, examples, monkeypatch):
     """Each in the folder that docs/api.md describes."""
     monkeypatch.chdir(examples)
     known = {"rcirl_jax": rcirl_jax, "np": np}
     finder = doctest.DocTestFinder(recurse=False)
-    (found,) = finder.find(getattr(rcirl_jax, name), name, globs=known)
+    (found,) = finder.find(SHOWN[name], name, globs=known)
     assert found.examples, f"{name}: no example"
     said = []
     doctest.DocTestRunner().run(found, out=said.append)

@@ -8,6 +8,7 @@ import pytest
 from rcirl_jax.data import importing
 from rcirl_jax.data import parts as dealing
 from rcirl_jax.data.importers import parts
+from rcirl_jax.data.importers.format import Format
 from rcirl_jax.data.importing import ImportConfig, import_parts
 from rcirl_jax.data.parts import Part, is_long, recordings_of
 from rcirl_jax.data.scenes.config import CollectConfig
@@ -115,10 +116,11 @@ def test_a_shard_is_long_beyond_its_formats_limit(shards, monkeypatch):
         found = dealing.files_of(name, part.input)
         assert len(found) == files
         size = sum(file.stat().st_size for file in found)
-        monkeypatch.setitem(dealing.SHARD_BYTES, name, size)
-        assert not is_long(part)
-        monkeypatch.setitem(dealing.SHARD_BYTES, name, size - 1)
-        assert is_long(part)
+        for limit, expected in ((size, False), (size - 1, True)):
+            form = Format(shard_bytes=limit)
+            monkeypatch.setattr(dealing, "format_of", lambda _, form=form: form)
+            assert is_long(part) == expected
+        monkeypatch.undo()
     folder = Part(format="waymo", input=shards[0].input.parent, spec={})
     assert is_long(folder)  # any number of shards
 

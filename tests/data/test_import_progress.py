@@ -9,8 +9,8 @@ from rcirl_jax.data import importing
 from rcirl_jax.data.cut import Cut
 from rcirl_jax.data.importers import parts, read_part
 from rcirl_jax.data.importing import Progress
+from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.data.readers import reading
-from rcirl_jax.data.scenes.quality import QualityReport
 from tests.data.importers.formats import l5, nuplan, waymo
 
 

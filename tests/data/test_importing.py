@@ -9,8 +9,8 @@ import pytest
 from rcirl_jax.data import importing
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
+from rcirl_jax.data.quality import format_quality, format_splits
 from rcirl_jax.data.recording import validate_recording
-from rcirl_jax.data.scenes.quality import format_quality, format_splits
 from rcirl_jax.data.store import files
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.rows import check_finite

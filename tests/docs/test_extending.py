@@ -29,7 +29,7 @@ def copied(folder):
     for name in COPIED:
         ignored = shutil.ignore_patterns("__pycache__")
         shutil.copytree(REPO / name, folder / name, ignore=ignored)
-    for name in ("pyproject.toml", "README.md", "BUILD.md"):
+    for name in ("pyproject.toml", "README.md", "BUILD.md", "mkdocs.yml", "Makefile"):
         shutil.copy(REPO / name, folder / name)
     return folder
 

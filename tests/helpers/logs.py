@@ -6,6 +6,7 @@ import pytest
 
 from rcirl_jax.data.cut import cut
 from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.importers.options import STATED
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import load_toml, spec_root
@@ -21,7 +22,8 @@ def read(form, path, source=None, **options):
     if not options:
         return list(read_recordings(form, path, source))
     reader = importlib.import_module(f"rcirl_jax.data.importers.{form}.reader")
-    return list(reader.recordings(path, {**packaged(form), **options}))
+    spec = {**packaged(form), **options, STATED: sorted(options)}
+    return list(reader.recordings(path, spec))
 
 
 def only(form, path, source=None, **options):

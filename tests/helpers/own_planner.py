@@ -57,23 +57,34 @@ def drawn_reward(path, columns, hidden=(15,), by_context=False, seed=3):
     return save(path, made, x, valid, np.array(values))
 
 
+def _candidates(scene, s, l):
+    """Candidates of one scene from [K, T] positions; l None: on the path."""
+    if l is None:
+        motion = jax.vmap(trajectory_on_path, (None, 0))(scene, s)
+    else:
+        motion = jax.vmap(trajectory_from_positions, (None, 0, 0))(scene, s, l)
+    return Candidates(
+        trajectory=motion,
+        feasible=jnp.ones(s.shape[0], bool),
+        family=jnp.zeros(s.shape[0], jnp.int32),
+    )
+
+
 @functools.cache
 def _answers(columns, activation, on_path):
     score = learned_score(columns, activation)
 
     def of_one(params, scene, s, l):
-        if on_path:
-            motion = jax.vmap(trajectory_on_path, (None, 0))(scene, s)
-        else:
-            motion = jax.vmap(trajectory_from_positions, (None, 0, 0))(scene, s, l)
-        both = Candidates(
-            trajectory=motion,
-            feasible=jnp.ones(s.shape[0], bool),
-            family=jnp.zeros(s.shape[0], jnp.int32),
-        )
+        both = _candidates(scene, s, None if on_path else l)
         return columns.of_candidates(scene, both), score(params, scene, both)
 
     return jax.jit(jax.vmap(of_one, (None, 0, 0, 0)))
+
+
+def compiled_score(columns, reward):
+    """A compiled function (scene, s, l [K, T]) -> values [K] of one planning frame."""
+    score, params = learned_score(columns, reward.activation), reward_params(reward)
+    return jax.jit(lambda scene, s, l: score(params, scene, _candidates(scene, s, l)))
 
 
 def jax_answers(columns, reward, scenes, s, l=None):

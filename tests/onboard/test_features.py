@@ -79,7 +79,14 @@ def assert_equal(reader, given, folder, scenes, s, l):
         assert error(np.stack([v for _, v in found]), values) <= TOLERANCE
 
 
-@pytest.mark.parametrize("seed", range(10_000 // BATCH))
+SEEDS = range(10_000 // BATCH)
+QUICK = 8  # of the seeds
+
+
+@pytest.mark.parametrize(
+    "seed",
+    [*SEEDS[:QUICK], *(pytest.param(i, marks=pytest.mark.slow) for i in SEEDS[QUICK:])],
+)
 def test_ten_thousand_random_scenes_equal_jax(reader, given, tmp_path, seed):
     rng = np.random.default_rng(seed)
     scenes = drawn_scenes.scenes(rng, BATCH)

@@ -117,12 +117,14 @@ inline std::size_t FeatureMap::compute(const Scene& scene, const Candidates& can
       detail::fill_columns(scene.ego, t, x[t], near, columns);
       for (std::size_t k = 0; k < lanes; ++k) {
         float* out = features + (first + k) * row + t * size();
-        for (std::size_t f = 0; f < size(); ++f) {
-          out[f] = known[k] ? columns[columns_[f]].at[k] : kNan;
-        }
+        for (std::size_t f = 0; f < size(); ++f) out[f] = columns[columns_[f]].at[k];
       }
     }
-    refused += lanes - static_cast<std::size_t>(std::count(known, known + lanes, true));
+    for (std::size_t k = 0; k < lanes; ++k) {
+      float* out = features + (first + k) * row;
+      if (!known[k]) std::fill(out, out + row, kNan);
+      refused += !known[k];
+    }
   }
   return refused;
 }

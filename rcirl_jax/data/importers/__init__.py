@@ -1,8 +1,9 @@
 """Importers: one folder per log format, each yielding valid Recordings.
 
-Each has `reader.recordings`: (input path, source spec) -> iterator of Recording. The
-spec is the TOML of data_specs/sources (or the user's own). Each passes its recordings
-through `validate_recording` with the file's name.
+A folder with a `reader` is a format; its `FORMAT` (see `format`) says how its files are
+told and how workers share them. The reader has `recordings`: (input path, source spec)
+-> iterator of Recording. The spec is the TOML of data_specs/sources (or the user's
+own). Each passes its recordings through `validate_recording` with the file's name.
 """
 
 import importlib
@@ -12,8 +13,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from rcirl_jax.data.importers.declared import with_numbers_and_texts
-from rcirl_jax.data.importers.files import with_log_names
-from rcirl_jax.data.importers.options import check_types
+from rcirl_jax.data.importers.files import log_name, with_log_names
+from rcirl_jax.data.importers.format import Format
+from rcirl_jax.data.importers.options import STATED, check_options
+from rcirl_jax.data.readers.tables.ledger import NoRowsError
 from rcirl_jax.data.readers.tables.streams import refuse_pointer
 from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.runtime.atomic_files import is_text
@@ -23,36 +26,36 @@ from rcirl_jax.types import Recording
 Importer = Callable[[Path, dict], Iterator[Recording]]
 
 # a folder each, whose `reader` is loaded only when the format is asked for
-IMPORTERS = (
-    *("apollo", "argoverse2", "commonroad", "csv", "interaction", "l5", "levelx"),
-    *("ngsim", "ngsim_pairs", "nuplan", "openacc", "ros2", "synthetic", "waymo"),
+IMPORTERS = tuple(
+    sorted(file.parent.name for file in Path(__file__).parent.glob("*/reader.py"))
 )
-
-# formats of which one part (see `parts`) is a file with a few recordings
-SMALL_PARTS = (
-    "argoverse2",
-    "commonroad",
-    "interaction",
-    "levelx",
-    "ngsim_pairs",
-    "openacc",
-)
-# formats of which one part is a file with many recordings, and the bytes of the
-# longest one whose scenes may be held at once (docs/formats, "Large inputs")
-SHARD_BYTES = {"apollo": 2**28, "nuplan": 2**28, "ros2": 2**28, "waymo": 2**30}
-# formats whose packaged TOML says what holds where a user's own says nothing
-DECLARED = ("interaction", "levelx", "ngsim", "ngsim_pairs", "openacc")
-# formats of which one part is a file that is read in pieces where it is long
-CSV_PARTS = ("csv", "ngsim")
 
 
 def read_part(name: str, path: Path, spec: dict) -> Iterator[Recording]:
     """All recordings of one part, each validated; arguments as of `parts`."""
-    importer: Importer = _module(name).recordings
+    importer: Importer = module_of(name).recordings
     for file in files_of(name, path):
         refuse_pointer(file)
     with as_input_error(str(path), f"a sound log of format {name}"):
-        yield from importer(path, spec)
+        try:
+            yield from importer(path, spec)
+        except NoRowsError as error:
+            if error.path != path:
+                raise  # a table beside the log
+            yield _empty(log_name(path, spec, path.name), error)
+
+
+def _empty(name: str, error: NoRowsError) -> Recording:
+    """What stands for a file in which nobody drives; imports count and skip it."""
+    return Recording(
+        name=name,
+        source="",
+        licence="",
+        rate_hz=0.0,
+        tracks=(),
+        lanes=(),
+        notes=(str(error),),
+    )
 
 
 def pieces(name: str, path: Path, spec: dict) -> list[dict]:
@@ -60,18 +63,24 @@ def pieces(name: str, path: Path, spec: dict) -> list[dict]:
 
     A format whose module has no `pieces(path, spec)` reads a part as a whole.
     """
-    split = getattr(_module(name), "pieces", None)
+    split = getattr(module_of(name), "pieces", None)
     return [spec] if split is None else split(path, spec)
 
 
 def files_of(name: str, path: Path) -> list[Path]:
     """The files that one part is read from: itself, if its module says nothing."""
-    found = getattr(_module(name), "files_of", None)
+    found = getattr(module_of(name), "files_of", None)
     return [path] if found is None else found(path)
 
 
-def _module(name: str) -> types.ModuleType:
-    return importlib.import_module(f"{__name__}.{name}.reader")
+def format_of(name: str) -> Format:
+    """What a format says of itself, without its reader."""
+    return importlib.import_module(f"{__name__}.{name}").FORMAT
+
+
+def module_of(name: str, module: str = "reader") -> types.ModuleType:
+    """A module of a format's folder."""
+    return importlib.import_module(f"{__name__}.{name}.{module}")
 
 
 def parts(
@@ -96,19 +105,21 @@ def parts(
     packaged = spec_root() / "sources" / f"{name}.toml"
     spec_path = source or packaged
     spec = load_toml(spec_path)
+    own = [] if source is None else sorted(spec)
     options = f"options as in the TOML of format {name}"
     if source is not None:
         with as_input_error(str(source), options):
-            check_types(spec, load_toml(packaged))
-        if name in DECLARED:
+            check_options(spec, load_toml(packaged), format_of(name))
+        if format_of(name).is_declared:
             spec = with_numbers_and_texts(spec, load_toml(packaged))
+    spec = {**spec, STATED: own}
     if input_path is None:
         if name != "synthetic":
             raise InputError("--input: not given: expected a file or folder")
         input_path = spec_path
     if not input_path.exists():
         raise InputError(f"{input_path}: input: missing: expected a file or folder")
-    module = _module(name)
+    module = module_of(name)
     split = getattr(module, "parts", None)
     with as_input_error(str(input_path), f"logs of format {name}, and {options}"):
         found = [input_path] if split is None else split(input_path, spec)

@@ -1,5 +1,6 @@
 """Rows at irregular times, put onto the uniform clock of a recording."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -12,7 +13,8 @@ FIELDS = ("x", "y", "heading", "speed", "length", "width")
 def on_clock(boxes: Boxes, rate_hz: float, max_gap_s: float) -> Boxes:
     """Boxes on the clock k / rate_hz, between the rows of each gapless piece.
 
-    Linear interpolation; headings are unwrapped first. A piece between two ticks of
+    Linear interpolation; headings are unwrapped first, values of which some are not
+    known are those of the row at or after the tick. A piece between two ticks of
     the clock gives nothing. Of several rows of one road user and time the first counts.
 
     Args:
@@ -36,10 +38,11 @@ def on_clock(boxes: Boxes, rate_hz: float, max_gap_s: float) -> Boxes:
         for field in FIELDS:
             values = getattr(boxes, field)[rows]
             values = np.unwrap(values) if field == "heading" else values
-            part[field] = np.interp(clock, t[rows], values)
+            known = not np.isnan(values).any()
+            part[field] = np.interp(clock, t[rows], values) if known else values[at]
         parts.append({**part, "kind": boxes.kind[rows][at]})
     merged = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-    return Boxes(names=boxes.names, **merged)
+    return dataclasses.replace(boxes, **merged)
 
 
 def _nothing() -> dict[str, np.ndarray]:

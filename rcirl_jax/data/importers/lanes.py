@@ -30,7 +30,8 @@ def straight_lanes(
     """Lanes parallel to the x axis, with bounds midway between neighbours.
 
     Lanes are neighbours if they are driven the same way and no more than
-    `NEIGHBOUR_WIDTHS` lane widths apart; outer bounds lie half a width out.
+    `NEIGHBOUR_WIDTHS` lane widths apart; outer bounds lie half a width out, which is a
+    guess.
     """
     for lane in found:
         ends = np.array([lane.lower, lane.upper])
@@ -45,7 +46,9 @@ def straight_lanes(
         left, right = (above, below) if lane.forward else (below, above)
         sides = (up, down) if lane.forward else (down, up)
         ids = [None if beside is None else beside.id for beside in (left, right)]
-        lanes.append(parallel_lane(lane, sides, ids, limit))
+        made = parallel_lane(lane, sides, ids, limit)
+        is_guessed = above is None or below is None
+        lanes.append(dataclasses.replace(made, width_assumed=is_guessed))
     return tuple(lanes)
 
 

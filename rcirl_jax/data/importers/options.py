@@ -1,14 +1,19 @@
 """Options of a source TOML, checked where an importer takes them."""
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
+from rcirl_jax.data.importers.format import Format
 from rcirl_jax.errors import InputError
+from rcirl_jax.runtime.settings import check_names
 from rcirl_jax.types import Kind
 from rcirl_jax.units import FOOT_M, MPH_MPS
 
 LARGEST = 10**18  # of an integer
+# added to a spec: names of the options that the user's own TOML has
+STATED = "stated"
 MAX_NAME = 255  # bytes of a file's name
 MAX_PATH = 2048  # bytes of a path; systems take 4096, with the folder before it
 MAX_PARTS = 32  # of a pattern, which pathlib matches by recursion
@@ -48,6 +53,14 @@ def number(spec: Mapping, key: str, default: float = math.nan) -> float:
     if not math.isfinite(found):
         raise InputError(f"source TOML: {key}: {value}: expected a finite number")
     return found
+
+
+def stated(spec: Mapping, key: str) -> float | None:
+    """A number > 0 that the user's own TOML states; None where it is a default.
+
+    What somebody says of a site is known; what a packaged TOML says of all is a guess.
+    """
+    return positive(spec, key) if key in spec.get(STATED, ()) else None
 
 
 def unit_factor(path: Path, field: str, unit: str, allowed: Sequence[str]) -> float:
@@ -161,21 +174,40 @@ def path_option(spec: Mapping, key: str) -> str:
     return value
 
 
-# options of several types, which their readers check
-CHECKED = ("pattern", "topics")
+def check_options(spec: Mapping, packaged: Mapping, form: Format) -> None:
+    """Options are known, and have the types of those that the format has.
 
+    In a table whose values are all of one type any value is of that type.
 
-def check_types(spec: Mapping, packaged: Mapping) -> None:
-    """Options have the types of those that the packaged TOML has.
-
-    In a table whose values are all of one type any name is allowed, and of that type.
+    Args:
+      spec: the user's own TOML.
+      packaged: that of the format.
+      form: what the format says of itself.
 
     Raises:
-      InputError: the first one that has another.
+      InputError: the first one that is not known (with the nearest that is), or has
+        another type.
     """
+    known = {**packaged, **form.options}
+    check_names("source TOML: ", spec, [*known])
     for key, value in spec.items():
-        if key in packaged and key not in CHECKED:
-            _check_type(f"source TOML: {key}", value, packaged[key])
+        if key not in form.checked:
+            _check_type(f"source TOML: {key}", value, known[key])
+        if key not in form.free:
+            _check_tables(f"source TOML: {key}", value, [known[key]])
+
+
+def _check_tables(where: str, value: object, known: Sequence) -> None:
+    """Tables, also in lists, have the names of known ones."""
+    known = [*known, *(item for one in known if isinstance(one, list) for item in one)]
+    tables = [one for one in known if isinstance(one, dict)]
+    if isinstance(value, dict):
+        check_names(f"{where}.", value, [*dict.fromkeys(itertools.chain(*tables))])
+        for name, item in value.items():
+            below = [table[name] for table in tables if name in table]
+            _check_tables(f"{where}.{name}", item, below)
+    for item in value if isinstance(value, list) and tables else ():
+        _check_tables(where, item, tables)
 
 
 def _check_type(where: str, value: object, like: object) -> None:

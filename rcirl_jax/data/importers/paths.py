@@ -43,7 +43,7 @@ def path_lanes(
 
     Args:
       tracks: road users; others than vehicles make no lanes.
-      width: m, of every lane.
+      width: m, of every lane; nobody has measured it.
       limit: m/s, or None.
     """
     vehicles = [track for track in tracks if track.kind == Kind.VEHICLE]
@@ -142,6 +142,7 @@ def _append(
             left_width=half,
             right_width=half,
             speed_limit=limit,
+            width_assumed=True,
             successors=() if after < 0 else (f"path-{after}",),
         )
     )

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.importers.options import number, positive, section
+from rcirl_jax.data.importers.options import STATED, number, positive, section, stated
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.importers.shapes import local_origin
-from rcirl_jax.data.importers.tracks import split_tracks
+from rcirl_jax.data.importers.tracks import once_each, split_tracks
 from rcirl_jax.data.readers import long_logs
 from rcirl_jax.data.recording import LENGTH_RANGE_M, MAX_SPEED_MPS, WIDTH_RANGE_M
 from rcirl_jax.errors import InputError
@@ -29,7 +29,15 @@ ONE_OF = 5  # tracks of which one may always be an outlier
 WINDOW_S = 300.0  # s, longest window of a drive
 MIN_WINDOW_S = 1.0  # s that it may be; each window costs as much as its surroundings
 LANE_WIDTH_M = 3.5  # m, of lanes fitted to paths
+# m, [length, width] of road users of which none is known; others: 1 m
+SIZES_M = {
+    Kind.VEHICLE: (4.5, 1.8),
+    Kind.CYCLIST: (1.8, 0.6),
+    Kind.PEDESTRIAN: (0.5, 0.5),
+}
+OTHER_SIZE_M = (1.0, 1.0)  # m
 MAX_SIZE_M = 200.0  # m, of a box; beyond it the file is wrong, not the tracker
+ARRAYS = ("ids", "t", "x", "y", "heading", "speed", "length", "width", "kind")
 FIELDS = ("t", "x", "y", "heading", "length", "width")
 
 
@@ -44,9 +52,10 @@ class Boxes:
     y: np.ndarray  # [n] m
     heading: np.ndarray  # [n] rad
     speed: np.ndarray  # [n] m/s; NaN: from the positions
-    length: np.ndarray  # [n] m
-    width: np.ndarray  # [n] m
+    length: np.ndarray  # [n] m; NaN: not known
+    width: np.ndarray  # [n] m; NaN: not known
     kind: np.ndarray  # [n] int, `Kind` or UNKNOWN
+    size_assumed: bool = False  # no log says the sizes
 
 
 def ego_boxes(
@@ -83,6 +92,7 @@ def ego_boxes(
         length=np.full(t.size, length),
         width=np.full(t.size, width),
         kind=np.full(t.size, int(Kind.VEHICLE)),
+        size_assumed="ego" not in spec.get(STATED, ()),
     )
 
 
@@ -96,9 +106,11 @@ def tracks_of(
     """Tracks of the boxes, in the order of their ids, and notes on what was left out.
 
     A gap longer than `max_gap_s` starts another track, "id#2". Size and class
-    are the median and the most frequent of a track. Trackers lose objects now
+    are the median and the most frequent of a track; where no size is known it is that
+    of its class. Trackers lose objects now
     and then: tracks with an impossible size or speed are left out, unless they
-    are more than a tenth, which points at a wrong file.
+    are more than a tenth, which points at a wrong file. A box that is met twice at one
+    time counts once, likewise.
 
     Args:
       path: named in errors.
@@ -109,7 +121,7 @@ def tracks_of(
       automated: of all tracks.
 
     Raises:
-      InputError: a number that is not finite, an absurd size, or a time met
+      InputError: a number that is not finite, an absurd size, or many times met
         twice by one id.
     """
     if unknown not in UNKNOWN_CHOICES:
@@ -119,6 +131,10 @@ def tracks_of(
     if boxes.t.size == 0:
         return [], []
     _check(path, boxes)
+    kept, doubled = once_each(boxes.ids, boxes.t)
+    if doubled:
+        rows = {name: getattr(boxes, name)[kept] for name in ARRAYS}
+        boxes = dataclasses.replace(boxes, **rows)
     tracks, dropped, seen = [], 0, {}
     for _, rows in split_tracks(path, boxes.ids, boxes.t, max_gap_s):
         name = boxes.names[int(boxes.ids[rows[0]])]
@@ -130,7 +146,7 @@ def tracks_of(
     tracks, notes = without_outliers(tracks)
     if dropped:
         notes.append(f"{dropped} tracks of unknown class left out")
-    return tracks, notes
+    return tracks, [*doubled, *notes]
 
 
 def _check(path: Path, boxes: Boxes) -> None:
@@ -138,8 +154,8 @@ def _check(path: Path, boxes: Boxes) -> None:
     for field in FIELDS:
         values = getattr(boxes, field)
         wrong, expected = ~np.isfinite(values), ": expected a finite number"
-        if field in ("length", "width") and not wrong.any():
-            wrong = (values < 0.0) | (values > MAX_SIZE_M)
+        if field in ("length", "width"):
+            wrong = (values < 0.0) | (values > MAX_SIZE_M)  # NaN is not known
             expected = f" m: expected 0 to {MAX_SIZE_M:g} m"
         if wrong.any():
             row = np.flatnonzero(wrong)[0]
@@ -158,6 +174,11 @@ def _track(
     t, x, y = boxes.t[rows], boxes.x[rows], boxes.y[rows]
     # most frequent class; the shift makes UNKNOWN a count of its own
     kind = int(np.argmax(np.bincount(boxes.kind[rows] - UNKNOWN))) + UNKNOWN
+    usual = SIZES_M.get(Kind(max(kind, 0)), OTHER_SIZE_M)
+    length, width = (
+        _median(sizes[rows], default)
+        for sizes, default in zip((boxes.length, boxes.width), usual, strict=True)
+    )
     if kind == UNKNOWN:
         if unknown == "drop":
             return None
@@ -171,8 +192,9 @@ def _track(
     return Track(
         id=name,
         kind=Kind(kind),
-        length=max(float(np.median(boxes.length[rows])), LENGTH_RANGE_M[0]),
-        width=max(float(np.median(boxes.width[rows])), WIDTH_RANGE_M[0]),
+        length=max(length[0], LENGTH_RANGE_M[0]),
+        width=max(width[0], WIDTH_RANGE_M[0]),
+        size_assumed=boxes.size_assumed or length[1] or width[1],
         t=t,
         x=x,
         y=y,
@@ -180,6 +202,12 @@ def _track(
         speed=speed,
         automated=automated,
     )
+
+
+def _median(sizes: np.ndarray, default: float) -> tuple[float, bool]:
+    """The median [m] of the known sizes, or the default; whether it is this one."""
+    known = sizes[np.isfinite(sizes)]
+    return (float(np.median(known)), False) if known.size else (default, True)
 
 
 def speed_of(t: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -298,15 +326,12 @@ def placed(
 
 
 def fitted_lanes(
-    tracks: Sequence[Track], spec: Mapping, limit: float
+    tracks: Sequence[Track], spec: Mapping
 ) -> tuple[tuple[Lane, ...], str]:
     """Lanes along the paths that were driven, and a note of their number.
 
-    Args:
-      tracks: of one recording.
-      spec: source TOML.
-      limit: m/s, where it has none.
+    Their limit is what the user's own TOML states, if it does.
     """
     width = positive(spec, "lane_width_m", LANE_WIDTH_M)
-    lanes = path_lanes(tracks, width, positive(spec, "speed_limit", limit))
+    lanes = path_lanes(tracks, width, stated(spec, "speed_limit"))
     return lanes, f"{len(lanes)} lanes fitted to the longest paths"

@@ -4,38 +4,14 @@ import itertools
 from collections.abc import Iterator
 from pathlib import Path
 
+from rcirl_jax.data.importers import IMPORTERS, format_of, module_of
 from rcirl_jax.data.importers.files import is_input
-from rcirl_jax.data.importers.openacc.drive import COLUMN, is_drive
-from rcirl_jax.data.readers.tables.columnar import is_columnar
-from rcirl_jax.data.readers.tables.layout import BLANKS
-from rcirl_jax.data.readers.tables.streams import head_of
 from rcirl_jax.data.readers.tables.table import Table, open_table
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import load_toml, spec_root
 
 MAX_FILES = 200  # of a folder that are looked at
-# how a file or folder is called -> its format
-NAMES = {
-    "*.xml": "commonroad",
-    "*.tfrecord*": "waymo",
-    "*.db": "nuplan",
-    "*.zarr": "l5",
-    "*.record": "apollo",
-    "*.record.*": "apollo",
-    "*.mcap": "ros2",
-    "*.db3": "ros2",
-    "scenario_*.parquet": "argoverse2",
-    "*.toml": "synthetic",
-}
 TABLES = ("*.csv", "*.tsv", "*.txt", "*.parquet", "*.feather", "*.gz", "*.zst")
-# columns in small letters that tell a data set
-COLUMNS = {
-    "levelx": ({"frame", "id", "xvelocity"}, {"frame", "trackid", "xcenter"}),
-    "interaction": ({"track_id", "timestamp_ms", "agent_type"},),
-    "ngsim": ({"vehicle_id", "frame_id", "local_y", "v_vel", "lane_id"},),
-    "ngsim_pairs": ({"x_follower", "x_leader", "leader_length"},),
-}
-NATIVE_COLUMNS = 18  # of NGSIM's own text, which has no header
 
 
 def recognised_format(path: Path | None, source: Path | None = None) -> str:
@@ -75,7 +51,8 @@ def _candidates(path: Path) -> Iterator[Path]:
     """The input, or what is in the folder: those whose names say most first."""
     yield path
     if path.is_dir():
-        for pattern in (*NAMES, *TABLES):
+        names = (name for form in IMPORTERS for name in format_of(form).names)
+        for pattern in (*names, *TABLES):
             yield from (
                 p for p in path.rglob(pattern) if p.is_dir() or is_input(path, p)
             )
@@ -83,47 +60,37 @@ def _candidates(path: Path) -> Iterator[Path]:
 
 def _format_of(file: Path, source: Path | None) -> str:
     """The format of one file or folder, "" where it is none that is known."""
-    for pattern, name in NAMES.items():
-        if file.match(pattern):
+    for name in IMPORTERS:
+        if any(map(file.match, format_of(name).names)):
             return name
     if not file.is_file():
         return ""
     try:
         table = open_table(file)
     except InputError:
-        return "openacc" if _is_platoon(file) else ""
+        return _told(file, None)
     return _table_format(table, source)
 
 
 def _table_format(table: Table, source: Path | None) -> str:
     header = {name.lower() for name in table.header}
-    for name, wanted in COLUMNS.items():
-        if any(columns <= header for columns in wanted):
+    for name in IMPORTERS:
+        if any(columns <= header for columns in format_of(name).columns):
             return name
-    is_native = table.layout is not None and table.layout.delimiter == BLANKS
-    if is_native and len(table.header) == NATIVE_COLUMNS and _is_numeric(table.header):
-        return "ngsim"
-    if _is_platoon(table.path):
-        return "openacc"
+    if name := _told(table.path, table):
+        return name
     packaged = load_toml(spec_root() / "sources" / "csv.toml")["columns"]
     needed = {packaged[field] for field in ("t", "id", "x", "y")}
     return "csv" if source is not None or needed <= set(table.header) else ""
 
 
-def _is_numeric(cells: tuple[str, ...]) -> bool:
-    return not any(c.isalpha() for cell in cells for c in cell)
-
-
-def _is_platoon(file: Path) -> bool:
-    """Whether it is a drive of OpenACC."""
-    if is_columnar(file) or not is_drive(file):
-        return False
-    try:
-        lines = head_of(file)[1]
-    except InputError:
-        return False
-    names = (name.strip() for line in lines for name in line.split(","))
-    return sum(bool(COLUMN.fullmatch(name)) for name in names) > 2
+def _told(file: Path, table: Table | None) -> str:
+    """The format that tells a table by more than its columns, "" if none does."""
+    for name in IMPORTERS:
+        told_by = format_of(name).told_by
+        if told_by and module_of(name, told_by).is_log(file, table):
+            return name
+    return ""
 
 
 def _unknown(path: Path) -> str:

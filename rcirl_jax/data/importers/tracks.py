@@ -1,17 +1,27 @@
 """Rows of a table -> tracks: who is one road user, where it heads, for how long."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.data.readers.tables.repair import is_far
 from rcirl_jax.errors import InputError
+from rcirl_jax.types import Track
 
 HEADING_WINDOW_S = 1.0  # s, heading is the direction of travel over this window
+MAX_DOUBLED = 0.01  # share of rows that repeat an id at one time; more is an error
+MAX_NAMESAKES = 0.1  # share of tracks with the id of another, likewise
 MIN_TRAVEL_M = 0.5  # m in that window; below it the heading is held
 
 
 def split_tracks(
-    path: Path, ids: np.ndarray, t: np.ndarray, max_gap: float, reuse: float = np.inf
+    path: Path,
+    ids: np.ndarray,
+    t: np.ndarray,
+    max_gap: float,
+    reuse: float = np.inf,
+    places: np.ndarray | None = None,
 ) -> list[tuple[str, np.ndarray]]:
     """Rows of each track: one road user without a gap.
 
@@ -25,6 +35,7 @@ def split_tracks(
       t: [n] in any unit.
       max_gap: in the unit of t.
       reuse: in the unit of t.
+      places: [n, 2] m; where nobody gets to in time (t in s), another track starts.
 
     Returns:
       (name, row numbers in the order of time) per track.
@@ -56,7 +67,10 @@ def split_tracks(
             f"{path}: t: median step {np.median(step[same]):g}: "
             f"expected at most {max_gap:g}; wrong unit of time or rate?"
         )
-    pieces = np.split(order, np.flatnonzero(~same | (step > max_gap)) + 1)
+    ends = ~same | (step > max_gap)
+    if places is not None:
+        ends |= is_far(step, np.hypot(*np.diff(places[order], axis=0).T))
+    pieces = np.split(order, np.flatnonzero(ends) + 1)
     parts: dict[str, int] = {}
     tracks = []
     for rows in pieces:
@@ -64,6 +78,44 @@ def split_tracks(
         parts[name] = parts.get(name, 0) + 1
         tracks.append((name if parts[name] == 1 else f"{name}#{parts[name]}", rows))
     return tracks
+
+
+def once_each(ids: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    """Rows [n] of which each id has one at a time, and a note on the others.
+
+    The first of several counts. All rows where too many are doubled: then the file is
+    wrong, and `split_tracks` says so.
+
+    Args:
+      ids: [m] of each row.
+      t: [m] in any unit.
+    """
+    order = np.lexsort((t, ids))  # stable: the file's order inside
+    same = (np.diff(ids[order]) == 0) & (np.diff(t[order]) == 0.0)
+    doubled = order[1:][same]
+    if not 0 < doubled.size <= max(MAX_DOUBLED * t.size, 1.0):
+        return np.arange(t.size), []
+    kept = np.delete(np.arange(t.size), doubled)
+    what = "states of a road user met twice at one time, one used"
+    return kept, [f"{doubled.size} {what}"]
+
+
+def of_one_name(tracks: Sequence[Track]) -> tuple[list[Track], list[str]]:
+    """Tracks of which each has a name of its own, and a note on the others.
+
+    The longest of several of one name counts. All of them where more than a tenth, and
+    more than one, are too many: then the file is wrong, and validation says so.
+    """
+    longest: dict[str, Track] = {}
+    for track in tracks:
+        known = longest.get(track.id)
+        if known is None or track.t.size > known.t.size:
+            longest[track.id] = track
+    lost = len(tracks) - len(longest)
+    if not 0 < lost <= max(MAX_NAMESAKES * len(tracks), 1.0):
+        return [*tracks], []
+    kept = [track for track in tracks if longest[track.id] is track]
+    return kept, [f"{lost} tracks with the id of another left out"]
 
 
 def spans_of(t: np.ndarray, holds: np.ndarray) -> tuple[tuple[float, float], ...]:

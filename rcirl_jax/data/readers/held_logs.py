@@ -5,8 +5,9 @@ from collections.abc import Container, Iterator
 
 import numpy as np
 
+from rcirl_jax.data.readers.tables.clock import after_midnight
 from rcirl_jax.data.readers.tables.ledger import Ledger
-from rcirl_jax.data.readers.tables.repair import once
+from rcirl_jax.data.readers.tables.repair import Distance, once, reachable_rows
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -42,8 +43,11 @@ class Held:
         ledger: Ledger,
         apart: Container[str],
         places: tuple[str, str],
+        distance: Distance | None = None,
+        is_clock: bool = False,
     ) -> None:
         self.rows, self.ledger, self.apart, self.places = rows, ledger, apart, places
+        self.distance, self.is_clock = distance, is_clock
         self._of = rows.pop("recording", None)
         self._tidied: dict[str | None, dict[str, np.ndarray]] = {}
 
@@ -64,7 +68,13 @@ class Held:
                 own = {name: column[chosen] for name, column in own.items()}
             plain = str if own["id"].dtype.kind == "U" else "{:g}".format
             options = {"places": self.places, "apart": self.apart, "name_of": plain}
-            self._tidied[recording] = once(own, self.ledger, **options)
+            if self.is_clock:
+                own = {**own, "t": after_midnight(own["t"])}
+            own = once(own, self.ledger, **options)
+            if self.distance is not None:
+                kept = reachable_rows(own, self.ledger, self.distance, plain)
+                own = {name: column[kept] for name, column in own.items()}
+            self._tidied[recording] = own
         yield self._tidied[recording]
 
     def pieces(self, recording: str | None, max_gap_s: float) -> Iterator[Piece]:

@@ -27,8 +27,14 @@ import numpy as np
 
 from rcirl_jax.data.readers.held_logs import Held, Piece
 from rcirl_jax.data.readers.reading import reading
+from rcirl_jax.data.readers.tables.clock import DAY_S, after_midnight
 from rcirl_jax.data.readers.tables.ledger import Ledger
-from rcirl_jax.data.readers.tables.repair import single_rows
+from rcirl_jax.data.readers.tables.repair import (
+    Distance,
+    is_far,
+    reachable_rows,
+    single_rows,
+)
 from rcirl_jax.data.readers.tables.table import Field, Table, batches, read
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.atomic_files import locked
@@ -56,6 +62,8 @@ def rows_of(
     is_long: bool,
     apart: Container[str] = (),
     places: tuple[str, str] = ("x", "y"),
+    distance: Distance | None = None,
+    is_clock: bool = False,
 ) -> Iterator["Held | Spill"]:
     """The rows of a table, each road user once in a frame.
 
@@ -67,21 +75,27 @@ def rows_of(
         shows the reading.
       apart: columns in which rows may differ that repeat each other.
       places: columns that say where a road user is.
+      distance: of differences in x and y; places that cannot be reached are then
+        dropped, and an id that goes on elsewhere is seen anew there. None: neither.
+      is_clock: t is a time of day, which may go over midnight.
 
     Raises:
       InputError: no rows, more bad ones than the ledger allows, or more than
         MAX_BLOCKS minutes.
     """
     if not is_long:
-        yield Held(read(table, fields, ledger), ledger, apart, places)
+        rows = read(table, fields, ledger)
+        yield Held(rows, ledger, apart, places, distance, is_clock)
         return
     with scratch() as folder:
-        spill = Spill(table.path, folder, ledger, apart, places)
+        spill = Spill(table.path, folder, ledger, apart, places, distance)
         with reading(table.path, [table.path]) as show:
             for batch in batches(table, fields, ledger, show):
                 spill.add(batch)
         ledger.check()
         spill.flush()
+        if is_clock:
+            spill.pass_midnight()
         yield spill
 
 
@@ -136,9 +150,10 @@ class Spill:
         ledger: Ledger,
         apart: Container[str],
         places: tuple[str, str],
+        distance: Distance | None = None,
     ) -> None:
         self.path, self.folder, self.ledger = path, folder, ledger
-        self.apart, self.places = apart, places
+        self.apart, self.places, self.distance = apart, places, distance
         self.names: list[str] = []  # of the columns, as in the first batch
         self.texts: dict[str, dict[str, int]] = {}  # field -> text -> its number
         self.blocks: dict[int, set[int]] = {}  # number of a recording -> minutes
@@ -192,6 +207,20 @@ class Spill:
                     file.write(np.ascontiguousarray(part).tobytes())
         self.buffers, self.held = {}, 0
 
+    def pass_midnight(self) -> None:
+        """Minutes after midnight become those of the next day."""
+        days = round(DAY_S / BLOCK_S)
+        for code, minutes in self.blocks.items():
+            found = np.array(sorted(minutes), float)
+            later = after_midnight(found * BLOCK_S) > found * BLOCK_S
+            for minute in found[later].astype(int).tolist():
+                rows = self._rows(code, minute)
+                rows[:, self.names.index("t")] += DAY_S
+                (self.folder / f"{code}_{minute}").unlink()
+                rows.tofile(self.folder / f"{code}_{minute + days}")
+                minutes.remove(minute)
+                minutes.add(minute + days)
+
     def recordings(self) -> list[str | None]:
         """Values of `recording`; [None] without the field."""
         known = self.texts.get("recording", {})
@@ -231,6 +260,11 @@ class Spill:
                 self.apart,
                 self._named,
             )
+            if self.distance is not None:
+                once = {name: column[kept] for name, column in values.items()}
+                kept[kept] = reachable_rows(
+                    once, self.ledger, self.distance, self._named
+                )
             if not kept.all():
                 rows[kept].tofile(self.folder / f"{code}_{minute}")
 
@@ -265,21 +299,28 @@ class Spill:
     ) -> dict[int, list[float]]:
         """Number of id -> times [s] at which it is first seen, or again."""
         found: dict[int, list[float]] = {}
-        last: dict[int, float] = {}
-        t, user = self.names.index("t"), self.names.index("id")
+        names = ("id", "t", *(self.places if self.distance else ()))
+        columns = [self.names.index(name) for name in names]
+        last = np.zeros((0, len(columns)))  # row of each road user so far
         for minute in minutes:
-            rows = self._rows(code, minute)[:, [user, t]]
+            rows = np.concatenate([last, self._rows(code, minute)[:, columns]])
             rows = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
-            same = np.diff(rows[:, 0]) == 0.0
-            later = same & (np.diff(rows[:, 1]) > max_gap_s)
-            starts = np.flatnonzero(np.concatenate([[True], ~same | later]))
-            ends = np.concatenate([starts[1:] - 1, [len(rows) - 1]])
-            for low, high in zip(starts.tolist(), ends.tolist(), strict=True):
-                key, begin = int(rows[low, 0]), float(rows[low, 1])
-                if begin - last.get(key, -np.inf) > max_gap_s:
-                    found.setdefault(key, []).append(begin)
-                last[key] = float(rows[high, 1])
+            steps = np.diff(rows, axis=0)
+            same = steps[:, 0] == 0.0
+            for user, begin in rows[np.concatenate([[True], ~same]), :2].tolist():
+                found.setdefault(int(user), [begin])
+            again = np.flatnonzero(same & self._is_again(steps, max_gap_s)) + 1
+            for user, begin in rows[again, :2].tolist():
+                found[int(user)].append(begin)
+            last = rows[np.concatenate([~same, [True]])]
         return found
+
+    def _is_again(self, steps: np.ndarray, max_gap_s: float) -> np.ndarray:
+        """Whether steps [n] in id, t, x, y lead to another track of an id."""
+        again = steps[:, 1] > max_gap_s
+        if self.distance is None:
+            return again
+        return again | is_far(steps[:, 1], self.distance(*steps[:, 2:].T))
 
     def pieces(self, recording: str | None, max_gap_s: float) -> Iterator[Piece]:
         """Every minute of a recording with its surroundings, in the order of time.

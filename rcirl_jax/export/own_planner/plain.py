@@ -10,14 +10,14 @@ PATH = ("kappa", "l", "speed_limit")
 
 
 def plain_scene(scene: Scene) -> features.Scene:
-    """One scene in plain numbers; empty slots are left out."""
+    """One scene in plain numbers; what is never there is left out."""
     ego = {name: float(value) for name, value in vars(scene.ego).items()}
     kinds = np.asarray(scene.obstacles.kind)
     tables = {name: np.asarray(getattr(scene.obstacles, name)) for name in BOX}
     boxes = [
         features.Obstacle(kind=kind, **{name: x[n] for name, x in tables.items()})
         for n, kind in enumerate(kinds.tolist())
-        if kind != Kind.NONE
+        if kind != Kind.NONE and tables["valid"][n].any()
     ]
     return features.Scene(
         ego=features.Ego(**ego),

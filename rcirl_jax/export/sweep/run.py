@@ -37,8 +37,9 @@ from rcirl_jax.export.sweep.folder import (
     weights_file,
 )
 from rcirl_jax.runtime.atomic_files import read_json, write_json, write_whole
+from rcirl_jax.runtime.code import code_of
 from rcirl_jax.runtime.executors import Executor
-from rcirl_jax.runtime.pipeline import Stages, code_sha256, only_one
+from rcirl_jax.runtime.pipeline import Stages, only_one
 from rcirl_jax.train.state import TrainConfig
 
 
@@ -112,7 +113,7 @@ def _train(
     stages, settings = Stages(folder=folder), settings_of(config)
     settings["dataset_sha256"] = made_by["dataset_sha256"]
     check_settings(stages, settings)
-    inputs = {**settings, "code": code_sha256()}
+    inputs = {**settings, "code": code_of([__name__])}
     files = {
         h: folder / "groups" / f"{shape_name(h)}.json" for h in config.hidden_sizes
     }

@@ -12,8 +12,8 @@ import jax
 import numpy as np
 import tqdm
 
+from rcirl_jax.data.quality import oddities
 from rcirl_jax.data.scenes.filters import REASONS
-from rcirl_jax.data.scenes.quality import oddities
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.report.data.scene_picture import draw_scene

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.scenes.quality import format_quality
+from rcirl_jax.data.quality import format_quality
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.evaluation.closed_loop.files import SuiteRuns

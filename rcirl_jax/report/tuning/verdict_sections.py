@@ -19,22 +19,11 @@ from rcirl_jax.simulation.metrics import COLUMNS
 
 SIGNIFICANT = 1.0 - CONFIDENCE
 LEVEL = f"{100.0 * CONFIDENCE:g} %"
-DECISIONS = {  # class, what it means
-    "ship": ("ship", "Ship: the candidate may replace the incumbent."),
-    "do not ship": (
-        "refused",
-        "Do not ship: the candidate is worse where it must not be.",
-    ),
-    "no difference": (
-        "refused",
-        "No difference: keep the incumbent. Nothing is worse beyond the margins, and "
-        "nothing is better.",
-    ),
-    "could not judge": (
-        "open",
-        "Could not judge: too few cases to prove that nothing is lost. Keep the "
-        "incumbent, or drive more cases.",
-    ),
+LOOKS = {  # classes of the decisions
+    "ship": "ship",
+    "do not ship": "refused",
+    "no difference": "refused",
+    "could not judge": "open",
 }
 # families have a section of their own
 KINDS = ("safety", "no loss", "nulls", "likeness", "gain")
@@ -42,10 +31,9 @@ KINDS = ("safety", "no loss", "nulls", "likeness", "gain")
 
 def verdict_view(verdict: Verdict) -> dict:
     """The decision and why, for the template."""
-    kind, words = DECISIONS[verdict.decision]
     return {
-        "kind": kind,
-        "words": words,
+        "kind": LOOKS[verdict.decision],
+        "decision": verdict.decision,
         "sentence": verdict.sentence,
         "reasons": verdict.reasons,
         "cases": verdict.cases,
@@ -233,13 +221,12 @@ def cards(
     verdict: Verdict, suite: SuiteReport, incumbent: str
 ) -> list[dict[str, object]]:
     """Five cards: decision, nearer to the human, safety, comfort, progress."""
-    kind, _ = DECISIONS[verdict.decision]
     return [
         {
             "title": "Verdict",
             "value": verdict.decision.capitalize(),
             "words": f"{verdict.cases:,} cases, {len(verdict.new_faults)} new faults",
-            "kind": kind,
+            "kind": LOOKS[verdict.decision],
         },
         _amount(verdict, "Nearer to the human", ("likeness",), "on held-out drives"),
         _safety_card(verdict, suite, incumbent),

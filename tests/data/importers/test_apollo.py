@@ -349,10 +349,10 @@ def nested(depth):
 
 
 BAD_DESCRIPTORS = [
-    (None, "no descriptor before its first message"),
-    (b"", "LocalizationEstimate: not among the descriptors"),
+    (None, "no descriptors before its first message"),
+    (b"", "LocalizationEstimate: no descriptors"),
     (b"\xff\xff", "Error parsing message"),
-    (nested(90) * 2, "LocalizationEstimate: not among the descriptors"),
+    (nested(90) * 2, "LocalizationEstimate: no descriptors"),
     (estimate(), "field header: not among the descriptors"),
     (estimate("header 1 int32"), "Estimate.header: type int32: another is known"),
     (estimate("header 1 .x.Y*"), "header: type message: another is known"),
@@ -369,6 +369,17 @@ def test_hostile_descriptors(tmp_path, desc, words):
     line = refused(only, tmp_path, ego_only(), channels=channels)
     assert words in line
     assert "a.record: " in line
+
+
+def test_a_channel_without_descriptors_is_noted(tmp_path):
+    """The others are read; of a record that holds no other one is named."""
+    at = 0.1
+    sent = [(CHASSIS, at, b"\x0d\0\0\0\0"), (CHASSIS, at, b""), *ego_only()]
+    described = fixture.CHANNELS | {CHASSIS: ("apollo.canbus.Chassis", b"")}
+    made = only(tmp_path, sent, channels=described)
+    assert made.tracks[0].t.size == 21
+    (note,) = [note for note in made.notes if CHASSIS in note]
+    assert note.endswith("no descriptors; who drove is not known")
 
 
 def test_messages_of_many_bytes(tmp_path, monkeypatch):

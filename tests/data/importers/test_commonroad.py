@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from rcirl_jax.data.importers.commonroad import extras as commonroad_extras
 from rcirl_jax.data.importers.commonroad import reader as commonroad
+from rcirl_jax.data.quality import assumed
 from rcirl_jax.types import Kind
 from tests.data.importers import writers as w
 from tests.helpers import logs
@@ -131,14 +132,40 @@ def test_speed_limits(tmp_path):
     assert scenario(tmp_path, body, version="2018b").lanes[0].speed_limit == 20.0
 
 
-def test_signs_of_countries(tmp_path):
-    ref = '<trafficSignRef ref="50"/>'
-    for kind in ("R2-1", "274", "274.1", "r301"):
-        parts = (road(ref), w.sign("50", kind, 8.33))
-        assert scenario(tmp_path, *parts).lanes[0].speed_limit == 8.33
-    for kind in ("R1-1", "206", "r2"):
-        parts = (road(f"<stopLine>{ref}</stopLine>"), w.sign("50", kind))
-        assert scenario(tmp_path, *parts).lanes[0].stop_sign
+def of_sign(folder, country, kind, limit=8.33, extra=""):
+    """The recording of a lane behind one sign, in a country's file."""
+    sign = w.sign("50", kind, limit)
+    ref = f'{extra}<trafficSignRef ref="50"/>{extra.replace("<", "</")}'
+    path = w.commonroad(folder / "a.xml", road(ref), sign)
+    if country:
+        logs.edit(path, "<commonRoad ", f'<commonRoad benchmarkID="{country}_A-1_1" ')
+    return only(path)
+
+
+def test_limits_of_countries(tmp_path):
+    """By CommonRoad's tables; German ids hold everywhere, any where nobody says."""
+    kinds = {
+        **{"ARG": "R15", "AUS": "R4-1", "BEL": "C43", "ESP": "r301", "FRA": "B14"},
+        **{"GRC": "\N{GREEK CAPITAL LETTER RHO}-32", "HRV": "B31", "PRI": "R2-1"},
+        **{"RUS": "3.24", "USA": "R2-1", "DEU": "274-50", "C-DEU": "274.1"},
+        **{"CHN": "274", "ITA": "274", "ZAM": "274"},
+    }
+    for country, kind in kinds.items():
+        for name in (country, ""):
+            (lane,) = of_sign(tmp_path, name, kind).lanes
+            assert lane.speed_limit == 8.33, (name, kind)
+    for kind in ("R1-1", "206", "r2", "R27", "B5", "AB4", "2.5", "B02"):
+        assert of_sign(tmp_path, "", kind, None, "<stopLine>").lanes[0].stop_sign
+
+
+def test_a_number_on_an_unknown_sign_is_noted(tmp_path):
+    """Croatia's B14 limits the mass, in tons; Germany's 262 does so everywhere."""
+    for country, kind in (("HRV", "B14"), ("", "Z9")):
+        made = of_sign(tmp_path, country, kind)
+        assert made.lanes[0].speed_limit is None
+        assert any(f"unknown id: 1 {kind}" in note for note in made.notes)
+        assert assumed(made)["speed limit"] == 1
+    assert not any("unknown id" in note for note in of_sign(tmp_path, "", "262").notes)
 
 
 def test_stop_lines_signs_and_lights(tmp_path):

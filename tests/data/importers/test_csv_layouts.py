@@ -61,7 +61,16 @@ def blank_lines():
     return "\n".join([*lines[:40], "", "   ", *lines[40:], "", ""])
 
 
+def units(*texts):
+    """A line below the header says the units."""
+    head, *rows = people.text(people.rows()).splitlines()
+    return "\n".join([head, ",".join(texts), *rows]) + "\n"
+
+
 LAYOUTS = {
+    "units below": units("s", "", "m", "m", "rad", "m/s", "m", ""),
+    "units below, in brackets": units("[s]", "[-]", *["[m]"] * 2, *["[1]"] * 4),
+    "types below": units("double", "string", *["double"] * 5, "string"),
     "commas": people.text(people.rows()),
     "semicolons": people.text(people.rows(), between=";"),
     "tabs": people.text(people.rows(), between="\t"),
@@ -79,6 +88,9 @@ LAYOUTS = {
     "old Mac's line ends": people.text(people.rows(), end="\r"),
     "a line sep=": "sep=;\n" + people.text(people.rows(), between=";"),
     "comments above": preamble(["# exported 2024-05-20", "# by us; from a drone"]),
+    "comments as wide as the table": preamble(
+        ["# site; A40; 1; 2; 3; north; south; 7", "# t; x; in; SI; units; by; us; all"]
+    ),
     "a title above": preamble(["Flight 42", "", "site; A40"]),
     "a hash before the header": "# " + people.text(people.rows(), between=" "),
     "delimiters at the ends": ends(";"),
@@ -144,7 +156,10 @@ def test_a_table_without_a_header(tmp_path):
 @pytest.mark.parametrize(
     ("table", "words"),
     [
-        ('separator = ";"', "table.separator: unknown: expected delimiter, decimal"),
+        (
+            'separator = ";"',
+            "table.separator: unknown: expected some of delimiter",
+        ),
         ('delimiter = "ab"', "table.delimiter: ab: expected one of tab, space"),
         ("delimiter = 3", "table.delimiter: 3: expected a text"),
         ('decimal = ";"', "table.decimal: ;: expected one of . ,"),
@@ -312,6 +327,7 @@ def test_packed_bytes_without_an_end_are_not_held(tmp_path):
         ),
         (b"", "rows: none"),
         (b"\n \n\n", "rows: none"),
+        (b'\0"', "header: empty"),
         (b"\xff\xfe" + bytes(range(1, 255)) * 3, "header: hardly any ASCII as utf-16"),
     ],
 )
@@ -329,3 +345,50 @@ def test_a_log_that_lies_twice_in_a_folder_is_read_once(tmp_path):
     found = people.read(tmp_path, people.spec(tmp_path, more=more))
     assert [made.name for made in found] == ["log", "other"]
     np.testing.assert_allclose(found[0].tracks[0].x, found[1].tracks[0].x, atol=1e-3)
+
+
+@pytest.mark.parametrize("form", ["text", "Parquet"])
+def test_names_of_columns_in_another_case(tmp_path, form):
+    header = ["T", "Id", "X", "Y", "Heading", "SPEED", "Length", "kind"]
+    path = people.write(tmp_path, people.rows(), header)
+    if form == "Parquet":
+        columns = zip(*people.rows(), strict=True)
+        pq.write_table(pa.table(dict(zip(header, columns, strict=True))), path)
+    people.assert_same(people.only(path, people.spec(tmp_path)))
+
+
+def test_a_name_in_its_own_case_wins(tmp_path):
+    table = [[*row, 1e3 - row[2]] for row in people.rows()]
+    path = people.write(tmp_path, table, (*people.HEADER, "X"))
+    people.assert_same(people.only(path, people.spec(tmp_path)))
+
+
+def test_a_row_of_numbers_is_no_line_of_units(tmp_path):
+    """Nor is one in which the first cells are unknown."""
+    table = people.rows()
+    table[0][2:7] = ["NaN"] * 5
+    found = people.only(people.write(tmp_path, table), people.spec(tmp_path))
+    assert people.rows_of(found)[0] >= 719
+    assert [track.t.size for track in found.tracks] == [119, *[120] * 5]
+
+
+@LONG
+@pytest.mark.parametrize("mark", [".", ","])
+def test_numbers_as_text_in_parquet(tmp_path, mark, long_bytes):
+    columns = zip(*people.rows(), strict=True)
+    cells = [[people.cell(value, mark) for value in column] for column in columns]
+    path = tmp_path / "log.parquet"
+    pq.write_table(pa.table(dict(zip(people.HEADER, cells, strict=True))), path)
+    source = people.spec(tmp_path, more=f"long_bytes = {long_bytes}")
+    people.assert_same(people.only(path, source))
+
+
+def test_a_table_beside_the_logs_that_is_none(tmp_path):
+    people.write(tmp_path, people.rows())
+    (tmp_path / "README.csv").write_text("file,what\nlog.csv,the flight of monday\n")
+    line = refused(tmp_path, people.spec(tmp_path))
+    assert "README.csv: header: ['file', 'what']: none of the columns t, id, x" in line
+    assert "`pattern` of the TOML leaves out" in line
+    people.assert_same(
+        people.only(tmp_path, people.spec(tmp_path, more='pattern = "log*.csv"'))
+    )

@@ -5,7 +5,7 @@ import pytest
 
 from rcirl_jax.data.importing import import_parts
 from rcirl_jax.data.parts import parts_of
-from rcirl_jax.data.scenes.quality import format_quality
+from rcirl_jax.data.quality import format_quality
 from rcirl_jax.types import Kind
 from tests.data.importers import people
 from tests.data.importers.people import LONG, refused, write

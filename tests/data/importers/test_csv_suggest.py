@@ -2,6 +2,7 @@
 
 import gzip
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -74,6 +75,68 @@ def test_units_of_speed_by_the_positions(tmp_path, unit, factor):
     people.assert_same(made, speed=0.01)
 
 
+@pytest.mark.parametrize(("unit", "factor"), [("m/s", 1.0), ("km/h", 3.6)])
+def test_units_of_velocities_by_the_positions(tmp_path, unit, factor):
+    turn = 2.0
+    header = ("t", "id", "x", "y", "vx", "vy", "length", "kind")
+    ways = factor * np.array([np.cos(turn), np.sin(turn)])
+    table = [[*r[:4], *(r[5] * ways).tolist(), *r[6:]] for r in people.rows(turn)]
+    path = people.write(tmp_path, table, header)
+    _, toml, (made,) = taken(path)
+    assert (toml["units"]["vx"], toml["units"]["vy"]) == (unit, unit)
+    people.assert_same(made, turn, speed=0.01)
+
+
+@pytest.mark.parametrize("rate", [10.0, 25.0, 30.0])
+@pytest.mark.parametrize(("unit", "factor"), [("m/s", 1.0), ("km/h", 3.6)])
+def test_the_rate_of_frames_by_the_speeds(tmp_path, rate, unit, factor):
+    table = []
+    for k in range(200):
+        for car in range(4):
+            x = 14.0 * k / rate - 30.0 * car
+            table.append([1000 + k, car, x, 0.0, 14.0 * factor])
+    path = people.write(tmp_path, table, ("frame", "id", "x", "y", "speed"))
+    _, toml, (made,) = taken(path)
+    assert (toml["units"]["t"], toml["defaults"]["rate_hz"]) == ("frame", rate)
+    assert toml["units"]["speed"] == unit
+    for track in made.tracks:
+        np.testing.assert_allclose(track.speed, 14.0, atol=0.01)
+        np.testing.assert_allclose(np.diff(track.t), 1.0 / rate, atol=1e-6)
+
+
+def test_every_fifth_frame(tmp_path):
+    table = people.column(people.rows(), "t", lambda t: round(50 * t) + 5)
+    path = people.write(tmp_path, table, ("frame", *people.HEADER[1:]))
+    _, toml, (made,) = taken(path)
+    assert (toml["scale"]["t"], toml["defaults"]["rate_hz"]) == (0.2, 10.0)
+    people.assert_same(made)
+
+
+def test_raw_degrees_are_one_line(tmp_path):
+    header = [*people.HEADER[:2], "lon", "lat", *people.HEADER[4:]]
+    path = people.write(tmp_path, degrees(people.rows(), "{:.0f}", 1e7), header)
+    with pytest.raises(
+        InputError, match=r"lat: 3797\d+: expected degrees; .* \[scale\]"
+    ):
+        suggested(path)
+
+
+def test_units_in_a_line_below_the_header(tmp_path):
+    table = people.rows()
+    for name in ("x", "y", "length"):
+        table = people.column(table, name, lambda metres: metres / 0.3048)
+    table = [[*row[:5], *row[6:]] for row in table]  # no speed that tells
+    header = [name for name in people.HEADER if name != "speed"]
+    head, *rows = people.text(table, header).splitlines()
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join([head, "s,,ft,ft,rad,[ft],", *rows, ""]))
+    _, toml, (made,) = taken(path)
+    assert [toml["units"][name] for name in ("x", "y", "length")] == ["ft"] * 3
+    assert made.rows.unreadable == 0
+    ways = [abs(track.x[-1] - track.x[0]) for track in made.tracks]
+    np.testing.assert_allclose(ways, people.rows()[-6][2], atol=0.01)
+
+
 @pytest.mark.parametrize(
     ("step", "name", "unit"),
     [(1.0, "time", "s"), (1e3, "time", "ms"), (1e6, "time", "us"), (1e9, "time", "ns")],
@@ -107,7 +170,9 @@ def test_iso_times_and_degrees_in_parquet(tmp_path):
 def test_frames_have_a_rate_that_is_not_known(tmp_path):
     table = people.column(people.rows(), "t", lambda t: round(10 * t))
     path = tmp_path / "log.csv"
-    path.write_text(people.text(table, ("frame", *people.HEADER[1:])))
+    header = ("frame", *people.HEADER[1:5], "length", "kind")  # no speeds that tell it
+    plain = [[*row[:5], *row[6:]] for row in table]
+    path.write_text(people.text(plain, header))
     found, toml, _ = taken(path)
     assert toml["units"]["t"] == "frame"
     assert any(line.startswith("not known: rate_hz") for line in found.lines)

@@ -298,7 +298,7 @@ def test_a_map_whose_path_is_too_long(find, tmp_path):
 def test_options_that_no_check_foresaw(tmp_path, monkeypatch):
     source = tmp_path / "source.toml"
     source.write_text("rate_hz = 1")
-    monkeypatch.setattr(importers, "check_types", lambda *_: {}["x"])
+    monkeypatch.setattr(importers, "check_options", lambda *_: {}["x"])
     line = refused(importers.parts, "csv", tmp_path, source)
     assert line.startswith(f"{source}: ")
     assert line.endswith("expected options as in the TOML of format csv")

@@ -1,6 +1,8 @@
 """ROS 2 bags: lights, lanes, storages, windows, and files that are refused."""
 
+import contextlib
 import math
+import sqlite3
 import sys
 
 import numpy as np
@@ -151,6 +153,21 @@ def test_sqlite_storage_is_the_same(tmp_path):
     old = fixture.sqlite(tmp_path / "old.db3", bag / "drive_0.mcap", definitions=False)
     line = line_of(old)
     assert f"{old}: {ODOMETRY} (nav_msgs/msg/Odometry): schema encoding: ''" in line
+
+
+def test_a_topic_without_a_definition_is_noted(tmp_path):
+    """Where it need not be there; what says who drove is missed in words."""
+    bag = fixture.write(tmp_path).input / "drive" / "drive_0.mcap"
+    file = fixture.sqlite(tmp_path / "other.db3", bag)
+    with contextlib.closing(sqlite3.connect(file)) as database, database:
+        database.execute(
+            "DELETE FROM message_definitions WHERE topic_type LIKE '%ControlMode%'"
+        )
+    made = only(file)
+    assert {track.id for track in made.tracks} >= {"ego"}
+    (note,) = [note for note in made.notes if "not read" in note]
+    assert note.startswith("/vehicle/status/control_mode (autoware_vehicle_msgs/msg/")
+    assert note.endswith("who drove is not known")
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))

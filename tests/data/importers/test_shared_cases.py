@@ -8,9 +8,13 @@ import numpy as np
 import pytest
 
 from rcirl_jax.data.cut import cut
+from rcirl_jax.data.importing import ImportConfig, import_parts
+from rcirl_jax.data.parts import parts_of
+from rcirl_jax.data.quality import assumed
 from rcirl_jax.data.scenes.config import CollectConfig
 from tests.conftest import REPO
 from tests.data.importers import people
+from tests.helpers import logs
 
 # beside the recordings (`data_dir` of conftest.py)
 CASES = (
@@ -139,3 +143,42 @@ def test_a_drone_recording_with_empty_cells(case, tmp_path):
     for track in found.tracks:
         assert np.isfinite(track.speed).all()
         assert np.isfinite(track.heading).all()
+
+
+@of("13_apollo_empty_desc")
+def test_a_channel_without_descriptors(case):
+    (found,) = logs.read("apollo", case)
+    assert found.tracks
+    assert any("/apollo/canbus/chassis: not read" in note for note in found.notes)
+
+
+@of("16_commonroad_region_position")
+def test_positions_that_are_regions(case):
+    """Through the rectangles' centres, at the midpoints of the intervals."""
+    (found,) = logs.read("commonroad", case)
+    for track in found.tracks:
+        np.testing.assert_allclose(np.diff(track.x), 1.5)
+        np.testing.assert_allclose(track.y, 0.0)
+        np.testing.assert_allclose(track.heading, 0.0, atol=1e-12)
+        np.testing.assert_allclose(track.speed, 15.0)
+    assert any("states in a region" in note for note in found.notes)
+
+
+@of("18_empty_scenario")
+def test_a_file_without_traffic_beside_another(case, tmp_path):
+    collect = CollectConfig(require_speed_change=False)
+    config = ImportConfig(format="commonroad", collect=collect, test_fraction=0.0)
+    made = import_parts(parts_of("commonroad", case), tmp_path / "out", config)
+    assert made.count == 10
+    assert made.quality["empty"] == 1
+    assert "a_no_traffic: no traffic" in made.quality["notes"]
+
+
+@of("15_argentina_limit")
+def test_signs_of_other_countries(case):
+    """The lanes' limits are those of the signs, of whatever country."""
+    found = logs.read("commonroad", case)
+    assert len(found) == 11
+    for recording in found:
+        assert [lane.speed_limit for lane in recording.lanes] == [11.111]
+        assert not any(assumed(recording).values())

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from rcirl_jax.data.cut import digest
+from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.data.scenes.assemble import assemble
 from rcirl_jax.data.scenes.collect import Collector
@@ -16,7 +17,6 @@ from rcirl_jax.data.scenes.labels import labels_of
 from rcirl_jax.data.scenes.lanes import LaneGraph
 from rcirl_jax.data.scenes.lines import CREEP_M
 from rcirl_jax.data.scenes.motion import FrameTracks, driver_of, given_path
-from rcirl_jax.data.scenes.quality import QualityReport
 from rcirl_jax.data.scenes.smoothing import harsh_share, savgol
 from rcirl_jax.sampling import trajectory_from_positions
 from rcirl_jax.types import Decision, Ghost, Kind, Lane, Recording, Signal, Tag, Track

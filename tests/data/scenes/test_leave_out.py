@@ -7,9 +7,9 @@ import pytest
 from rcirl_jax.data.importers import parts
 from rcirl_jax.data.importing import ImportConfig, import_parts
 from rcirl_jax.data.parts import Part, recordings_of
+from rcirl_jax.data.quality import format_quality
 from rcirl_jax.data.recording import LEAVE_OUT
 from rcirl_jax.data.scenes.config import CollectConfig
-from rcirl_jax.data.scenes.quality import format_quality
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.provenance import git_commit

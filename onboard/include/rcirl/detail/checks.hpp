@@ -18,14 +18,6 @@
 
 namespace rcirl::detail {
 
-// A double as float32; what lies beyond becomes infinite, as numpy makes it.
-inline float narrow(double value) {
-  constexpr float kMost = std::numeric_limits<float>::max();
-  constexpr float kInfinity = std::numeric_limits<float>::infinity();
-  if (std::abs(value) <= static_cast<double>(kMost)) return static_cast<float>(value);
-  return value > 0.0 ? kInfinity : -kInfinity;
-}
-
 // What stands at a node; never the inside of a list, map or bytes.
 inline std::string show(const Node& node) {
   switch (node.kind) {

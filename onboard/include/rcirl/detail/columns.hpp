@@ -83,11 +83,14 @@ static_assert(sizeof kColumns / sizeof kColumns[0] == kNumColumns, "a name for e
 // distance is the key plus `sign` times the station.
 inline void write_nearest(const Nearest& nearest, float sign, float cap, const Point& x,
                           Lanes* distance, Lanes* speed) {
+  Lanes found, relative;
   for (std::size_t k = 0; k < kLanes; ++k) {
-    const float found = nearest.key.at[k] + sign * x.s.at[k];
-    const bool known = found < cap;
-    distance->at[k] = known ? found : cap;
-    speed->at[k] = known ? nearest.speed.at[k] - x.v.at[k] : 0.0f;
+    found.at[k] = nearest.key.at[k] + sign * x.s.at[k];
+    relative.at[k] = nearest.speed.at[k] - x.v.at[k];
+  }
+  for (std::size_t k = 0; k < kLanes; ++k) {
+    distance->at[k] = found.at[k] < cap ? found.at[k] : cap;
+    speed->at[k] = found.at[k] < cap ? relative.at[k] : 0.0f;
   }
 }
 
@@ -107,12 +110,15 @@ inline void fill_columns(const Ego& ego, std::size_t t, const Point& x, const Re
     out[kStation].at[k] = x.s.at[k] - ego.s;
     out[kTime].at[k] = time;
     out[kLateralAcceleration].at[k] = x.v.at[k] * x.v.at[k] * x.kappa.at[k];
-    const float square = near.signed_square.at[k], overrun = near.overrun.at[k];
-    float apart = square > 0.0f ? std::sqrt(square) : square;
-    apart = overrun > 0.0f ? std::min(apart, -overrun) : apart;
-    apart = std::min(std::max(apart, kMinCollisionM), kObstacleCapM);
-    out[kCollisionDistance].at[k] = apart;
-    out[kCollision].at[k] = apart < 0.0f ? 1.0f : 0.0f;
+  }
+  Lanes apart = near.signed_square;
+  for (float& one : apart.at) one = one > 0.0f ? std::sqrt(one) : one;
+  for (std::size_t k = 0; k < kLanes; ++k) {
+    const float overrun = near.overrun.at[k], over = std::min(apart.at[k], -overrun);
+    const float nearer = overrun > 0.0f ? over : apart.at[k];
+    const float capped = std::min(std::max(nearer, kMinCollisionM), kObstacleCapM);
+    out[kCollisionDistance].at[k] = capped;
+    out[kCollision].at[k] = capped < 0.0f ? 1.0f : 0.0f;
   }
   const auto write = [&](const Nearest& nearest, float sign, float cap, Column distance,
                          Column speed) {

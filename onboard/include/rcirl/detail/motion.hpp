@@ -24,7 +24,8 @@ constexpr std::size_t kSlopePoints = 3;  // grid points on each side of a slope 
 
 // A path with its slopes, point by point, so that one look-up finds all.
 struct PathTable {
-  enum Column { kL, kDl, kDdl, kKappa, kDkappa, kLimit, kColumns };
+  // rows of eight, so that a look-up is a few vector instructions
+  enum Column { kL, kDl, kDdl, kKappa, kDkappa, kLimit, kColumns = 8 };
 
   float at[kStations][kColumns];
 };
@@ -37,7 +38,7 @@ inline float table_slope(const Stations& table, std::size_t p, std::size_t point
 }
 
 inline PathTable tabulated(const Path& path) {
-  PathTable table;
+  PathTable table = {};
   Stations dl;
   for (std::size_t p = 0; p < kStations; ++p) dl[p] = table_slope(path.l, p, kSlopePoints);
   for (std::size_t p = 0; p < kStations; ++p) {
@@ -62,7 +63,8 @@ struct Point {
 
 // Curvature of the path driven, left positive (Werling 2010, app. I).
 inline float driven_curvature(float kappa, float dkappa, float l, float dl, float ddl) {
-  const float shrink = std::max(1.0f - kappa * l, kMinShrink);
+  const float room = 1.0f - kappa * l;
+  const float shrink = room < kMinShrink ? kMinShrink : room;
   const float tangent = dl / shrink;
   const float cosine = 1.0f / std::sqrt(1.0f + tangent * tangent);
   const float bend = ddl + (dkappa * l + kappa * dl) * tangent;
@@ -102,13 +104,16 @@ inline void by_time(const Scene& scene, Point* x) {
 inline void by_station(Point* x, Lanes Point::*y, float first, Lanes Point::*slope) {
   for (std::size_t t = 0; t < kTimes; ++t) {
     const Point &ahead = x[std::min(t + 1, kTimes - 1)], &behind = x[t > 0 ? t - 1 : 0];
+    Lanes counted, divisor;
     for (std::size_t k = 0; k < kLanes; ++k) {
       const float advance = ahead.s.at[k] - behind.s.at[k];
       const float change = (ahead.*y).at[k] - (behind.*y).at[k];
-      const bool moves = advance > kMinAdvanceM;
-      const float divided = change / (moves ? advance : 1.0f);
-      (x[t].*slope).at[k] = t == 0 ? first : moves ? divided : 0.0f;
+      counted.at[k] = advance > kMinAdvanceM ? change : 0.0f;
+      divisor.at[k] = advance > kMinAdvanceM ? advance : 1.0f;
     }
+    Lanes& out = x[t].*slope;
+    for (std::size_t k = 0; k < kLanes; ++k) out.at[k] = counted.at[k] / divisor.at[k];
+    if (t == 0) std::fill(out.at, out.at + kLanes, first);
   }
 }
 

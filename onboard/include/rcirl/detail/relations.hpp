@@ -11,7 +11,6 @@
 #include <algorithm>
 #include <cmath>
 #include <cstddef>
-#include <cstdint>
 
 #include "rcirl/detail/motion.hpp"
 
@@ -25,10 +24,6 @@ constexpr float kLateralCapM = 10.0f;    // m, lateral "none"
 constexpr float kMinCollisionM = -10.0f; // m, deepest penetration told apart
 constexpr float kFarM = 1e6f;            // m, "no such obstacle"
 
-struct alignas(64) Marks {
-  std::int32_t at[kLanes];  // 0 or 1; as wide as a float, so that loops become vectors
-};
-
 // The nearest member of a class so far.
 struct Nearest {
   Lanes key, speed;
@@ -38,23 +33,27 @@ struct Nearest {
     std::fill(speed.at, speed.at + kLanes, 0.0f);
   }
 
-  // Of two at the very same key the slower counts: order does not matter.
-  void meet(const Marks& member, const Lanes& keys, float its_speed) {
+  // An obstacle with these keys, kFarM where it is no member. Of two at the very same key
+  // the slower counts: order does not matter.
+  void meet(const Lanes& keys, float its_speed) {
     for (std::size_t k = 0; k < kLanes; ++k) {
-      const float offered = member.at[k] ? keys.at[k] : kFarM;
-      const bool tie = (offered == key.at[k]) & (its_speed < speed.at[k]);
-      const bool wins = (offered < key.at[k]) | tie;
-      key.at[k] = offered < key.at[k] ? offered : key.at[k];
-      speed.at[k] = wins ? its_speed : speed.at[k];
+      const float best = key.at[k], offered = keys.at[k], now = speed.at[k];
+      const float slower = its_speed < now ? its_speed : now;
+      const float tied = offered == best ? slower : now;
+      speed.at[k] = offered < best ? its_speed : tied;
+      key.at[k] = offered < best ? offered : best;
     }
   }
-
-  void meet(const Marks& member, float one_key, float its_speed) {
-    Lanes keys;
-    std::fill(keys.at, keys.at + kLanes, one_key);
-    meet(member, keys, its_speed);
-  }
 };
+
+// By value: GCC makes no vectors of `std::max`, which picks an address.
+inline float larger(float one, float other) { return one < other ? other : one; }
+
+inline Lanes larger(const Lanes& one, const Lanes& other) {
+  Lanes most;
+  for (std::size_t k = 0; k < kLanes; ++k) most.at[k] = larger(one.at[k], other.at[k]);
+  return most;
+}
 
 struct Relations {
   Nearest follow;    // in the way and ahead
@@ -68,36 +67,43 @@ struct Relations {
   Lanes overrun;        // m, how far a demanding line was just crossed
 };
 
+// One comparison in each step: GCC turns loops with more into branches, not vectors. A key
+// of kFarM means no member, so that of two conditions the larger key holds.
 inline void meet_body(const Ego& ego, const Obstacle& box, std::size_t t, const Point& x,
                       Relations* found) {
   const float lower = box.s_lower[t] - 0.5f * ego.length;
   const float upper = box.s_upper[t] + 0.5f * ego.length;
   const float right = box.l_lower[t] - 0.5f * ego.width;
   const float left = box.l_upper[t] + 0.5f * ego.width;
-  Lanes aside;
-  Marks follow, overtake, nudge, front, rear;
+  Lanes aside, gap, depth, square, ahead, behind, abreast, in_way, in_range, beside;
   for (std::size_t k = 0; k < kLanes; ++k) {
-    aside.at[k] = std::max(right - x.l.at[k], x.l.at[k] - left);
-    const float gap = std::max(lower - x.s.at[k], x.s.at[k] - upper);
-    const std::int32_t in_way = aside.at[k] < kLateralBufferM;
-    const std::int32_t beside = (in_way ^ 1) & (aside.at[k] < kNudgeRangeM);
-    const std::int32_t ahead = x.s.at[k] <= lower, behind = x.s.at[k] >= upper;
-    follow.at[k] = in_way & ahead;
-    overtake.at[k] = in_way & behind;
-    front.at[k] = beside & ahead;
-    rear.at[k] = beside & behind;
-    nudge.at[k] = beside & (gap < 0.0f);
-    const float apart = std::max(gap, 0.0f), off = std::max(aside.at[k], 0.0f);
-    const float depth = std::max(gap, aside.at[k]);
-    const float own = depth < 0.0f ? depth : apart * apart + off * off;
-    found->signed_square.at[k] = std::min(found->signed_square.at[k], own);
+    const float s = x.s.at[k], l = x.l.at[k];
+    aside.at[k] = larger(right - l, l - left);
+    gap.at[k] = larger(lower - s, s - upper);
+    ahead.at[k] = s <= lower ? lower : kFarM;
+    behind.at[k] = s >= upper ? -upper : kFarM;
+  }
+  for (std::size_t k = 0; k < kLanes; ++k) {
+    const float across = aside.at[k], along = gap.at[k];
+    abreast.at[k] = along < 0.0f ? across : kFarM;
+    in_way.at[k] = across < kLateralBufferM ? -kFarM : kFarM;
+    in_range.at[k] = across < kNudgeRangeM ? -kFarM : kFarM;
+    const float apart = larger(along, 0.0f), off = larger(across, 0.0f);
+    square.at[k] = apart * apart + off * off;
+    depth.at[k] = larger(along, across);
+  }
+  for (std::size_t k = 0; k < kLanes; ++k) {
+    const float own = depth.at[k] < 0.0f ? depth.at[k] : square.at[k];
+    const float closest = found->signed_square.at[k];
+    found->signed_square.at[k] = own < closest ? own : closest;
+    beside.at[k] = larger(in_range.at[k], -in_way.at[k]);
   }
   const float speed = box.speed[t];
-  found->follow.meet(follow, lower, speed);
-  found->overtake.meet(overtake, -upper, speed);
-  found->front.meet(front, lower, speed);
-  found->rear.meet(rear, -upper, speed);
-  found->nudge.meet(nudge, aside, speed);
+  found->follow.meet(larger(in_way, ahead), speed);
+  found->overtake.meet(larger(in_way, behind), speed);
+  found->front.meet(larger(beside, ahead), speed);
+  found->rear.meet(larger(beside, behind), speed);
+  found->nudge.meet(larger(beside, abreast), speed);
 }
 
 // A stop line, or the destination. A line counts as overrun at the time where the front
@@ -106,15 +112,18 @@ inline void meet_line(const Ego& ego, const Obstacle& box, std::size_t t, const 
                       Relations* found) {
   const bool stops = box.kind == ObstacleKind::kStop;
   const float wall = box.s_lower[t] - 0.5f * ego.length;
-  Marks ahead;
-  for (std::size_t k = 0; k < kLanes; ++k) ahead.at[k] = x[t].s.at[k] <= wall;
-  (stops ? found->stop : found->goal).meet(ahead, wall, box.speed[t]);
+  Lanes keys;
+  for (std::size_t k = 0; k < kLanes; ++k) keys.at[k] = x[t].s.at[k] <= wall ? wall : kFarM;
+  (stops ? found->stop : found->goal).meet(keys, box.speed[t]);
   if (!stops || (t > 0 && box.valid[t - 1] == 0)) return;
+  const float wall_before = t > 0 ? box.s_lower[t - 1] - 0.5f * ego.length : kFarM;
+  const Lanes& before = x[t > 0 ? t - 1 : 0].s;
+  Lanes over;
   for (std::size_t k = 0; k < kLanes; ++k) {
-    const float over = x[t].s.at[k] - wall;
-    const bool before = t == 0 || x[t - 1].s.at[k] <= box.s_lower[t - 1] - 0.5f * ego.length;
-    const float counted = (over > 0.0f) & before ? over : 0.0f;
-    found->overrun.at[k] = std::max(found->overrun.at[k], counted);
+    over.at[k] = before.at[k] <= wall_before ? x[t].s.at[k] - wall : 0.0f;
+  }
+  for (std::size_t k = 0; k < kLanes; ++k) {
+    found->overrun.at[k] = larger(found->overrun.at[k], over.at[k]);
   }
 }
 

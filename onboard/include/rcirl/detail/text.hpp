@@ -1,13 +1,23 @@
-// Numbers, places and lines of messages.
+// Numbers as float32, and as texts; places and lines of messages.
 #ifndef RCIRL_DETAIL_TEXT_HPP_
 #define RCIRL_DETAIL_TEXT_HPP_
 
+#include <cmath>
 #include <cstddef>
 #include <cstdio>
+#include <limits>
 #include <string>
 #include <string_view>
 
 namespace rcirl::detail {
+
+// A double as float32; what lies beyond becomes infinite, as numpy makes it.
+inline float narrow(double value) {
+  constexpr float kMost = std::numeric_limits<float>::max();
+  constexpr float kInfinity = std::numeric_limits<float>::infinity();
+  if (std::abs(value) <= static_cast<double>(kMost)) return static_cast<float>(value);
+  return value > 0.0 ? kInfinity : -kInfinity;
+}
 
 inline std::string number_text(double value) {
   char text[32];

@@ -35,6 +35,10 @@ PROTO_DESC = "ProtoDesc: desc 1 bytes, dependencies 2 ProtoDesc*"
 _read_proto_desc = parser(table_of(PROTO_DESC))
 
 
+class UndescribedError(DecodeError):
+    """A channel that its record does not describe."""
+
+
 class Reading(NamedTuple):
     """How a message type is read."""
 
@@ -51,11 +55,14 @@ def reading_of(message: str, proto_desc: bytes, wanted: Wanted) -> Reading:
       wanted: fields of the message.
 
     Raises:
+      UndescribedError: there are no descriptors.
       DecodeError: damaged descriptors, an unknown message type, a field of another
         type than wanted, or none that is needed.
     """
-    types = _Types()
-    for content in dict.fromkeys(_contents(_read_proto_desc(proto_desc))):
+    types, found = _Types(), [*dict.fromkeys(_contents(_read_proto_desc(proto_desc)))]
+    if not any(found):
+        raise UndescribedError(f"message type {message}: no descriptors")
+    for content in found:
         file = pb.FileDescriptorProto.FromString(content)
         types.add(file.package, file.message_type, file.enum_type)
     types.want(message, wanted)

@@ -17,6 +17,7 @@ from rcirl_jax.data.importers.apollo.descriptors import (
     ENUM,
     UNSET,
     Reading,
+    UndescribedError,
     Wanted,
     reading_of,
 )
@@ -37,13 +38,6 @@ KIND_NAMES = {
     "VEHICLE": Kind.VEHICLE,
     "UNKNOWN_UNMOVABLE": Kind.STATIC,
 }
-# m, [length, width] where perception measured none; others: 1 m
-SIZES_M = {
-    Kind.VEHICLE: (4.5, 1.8),
-    Kind.CYCLIST: (1.8, 0.6),
-    Kind.PEDESTRIAN: (0.5, 0.5),
-}
-OTHER_SIZE_M = (1.0, 1.0)  # m
 NAN = float("nan")
 # fields and what they are where they are not set
 POINT = {"x": NAN, "y": NAN}
@@ -92,17 +86,15 @@ def _chassis(table: np.ndarray, names: Names) -> np.ndarray:
 def _obstacles(table: np.ndarray, names: Names) -> np.ndarray:
     """Times [s] as of a localization; id; x, y; heading; speed; length, width; kind.
 
-    NaN where a position or velocity was not recorded.
+    NaN where a position, velocity or size was not recorded.
     """
     head, (vx, vy, length, width, number) = table[:, :7], table[:, 7:].T
     numbers, inverse = np.unique(number, return_inverse=True)
     kinds = [KIND_NAMES.get(names["type"].get(int(n), ""), UNKNOWN) for n in numbers]
-    sizes = [SIZES_M.get(Kind(max(kind, 0)), OTHER_SIZE_M) for kind in kinds]
-    usual = np.array(sizes, np.float64).reshape(-1, 2)[inverse].T
     series = (
         np.hypot(vx, vy),
-        np.where(length == 0.0, usual[0], length),
-        np.where(width == 0.0, usual[1], width),
+        np.where(length == 0.0, np.nan, length),
+        np.where(width == 0.0, np.nan, width),
         np.array(kinds, np.float64)[inverse],
     )
     return np.concatenate([head[:, [1, 0, *range(2, 7)]], np.stack(series, 1)], axis=1)
@@ -209,6 +201,7 @@ def read_drive(parts: list[Path], spec: dict) -> Iterator[Rows]:
     """All wanted messages of the files of one drive, piece by piece."""
     topics = _topics(spec)
     numbers = dict.fromkeys(TOPICS, 0)  # messages of each topic
+    undescribed: dict[str, str] = {}  # channel -> what is wrong with it
     done, total = 0, sum(part.stat().st_size for part in parts if part.is_file())
     with reading(parts[0], parts) as show:
 
@@ -219,9 +212,12 @@ def read_drive(parts: list[Path], spec: dict) -> Iterator[Rows]:
 
         for part in parts:
             with Record(part) as record:
-                for rows in _read_part(record, topics, numbers, count):
+                for rows in _read_part(record, topics, numbers, undescribed, count):
                     rows.progress = min(done / max(total, 1), 1.0)
                     yield rows
+    if undescribed and not any(numbers.values()):
+        channel, why = next(iter(undescribed.items()))
+        raise InputError(f"{parts[0]}: {channel}: {why}: expected an Apollo message")
 
 
 def _topics(spec: dict) -> dict[str, str]:
@@ -247,7 +243,7 @@ class _Channel:
 
     def __init__(self, record: Record, channel: str, topic: str) -> None:
         if channel not in record.channels:
-            raise DecodeError("no descriptor before its first message")
+            raise UndescribedError("no descriptors before its first message")
         self.topic, self._type = topic, TOPICS[topic]
         self._reading: Reading = reading_of(
             *record.channels[channel], self._type.wanted
@@ -282,11 +278,17 @@ def _read_part(
     record: Record,
     topics: dict[str, str],
     numbers: dict[str, int],
+    undescribed: dict[str, str],
     show: Callable[[int], object],
 ) -> Iterator[Rows]:
+    """Rows of a file; channels without descriptors are noted once and passed over."""
     channels: dict[str, _Channel] = {}
-    began = None
-    for channel, time, content in record.messages(topics.__contains__, show):
+    began, notes = None, []
+
+    def is_wanted(channel: str) -> bool:
+        return channel in topics and channel not in undescribed
+
+    for channel, time, content in record.messages(is_wanted, show):
         began = time if began is None else began
         if abs(time - began) > PIECE_S * 1e9:
             yield Rows(tables=[found.rows() for found in channels.values()])
@@ -296,6 +298,11 @@ def _read_part(
             if channel not in channels:
                 channels[channel] = _Channel(record, channel, topic)
             channels[channel].add(time * 1e-9, content)
+        except UndescribedError as error:
+            undescribed[channel] = str(error)
+            lost = "; who drove is not known" if topic == "chassis" else ""
+            notes.append(f"{channel}: not read: {error}{lost}")
+            continue
         except DecodeError as error:
             raise InputError(
                 f"{record.path}: {channel}: message {numbers[topic]}: {error}: "
@@ -305,7 +312,7 @@ def _read_part(
             seen = [one.count() for one in channels.values() if one.topic in OBSTACLES]
             check_held(f"{record.path}: {channel}", sum(seen))
         numbers[topic] += 1
-    rows = Rows(tables=[found.rows() for found in channels.values()])
+    rows = Rows(tables=[found.rows() for found in channels.values()], notes=notes)
     if not record.is_complete:
         rows.notes.append(f"{record.path.name} was never closed; read to its end")
     yield rows

@@ -25,6 +25,7 @@ import numpy as np
 from rcirl_jax.data.importers.apollo.held import Held, Leg
 from rcirl_jax.data.importers.apollo.messages import LOCALIZATION, MANUAL, read_drive
 from rcirl_jax.data.importers.apollo.records import Run, first_parts
+from rcirl_jax.data.importers.clock import on_clock
 from rcirl_jax.data.importers.files import log_name
 from rcirl_jax.data.importers.options import one_pattern, positive
 from rcirl_jax.data.importers.perception import (
@@ -144,7 +145,7 @@ def _recording(held: Held, within: tuple[float, float], spec: dict) -> Recording
         return None
     notes += _what_is_missing(held, within)
     _, _, origin, tracks = placed(tracks)
-    lanes, lanes_note = fitted_lanes(tracks, spec, LIMIT_MPS)
+    lanes, lanes_note = fitted_lanes(tracks, spec)
     return Recording(
         name=log_name(run.first, spec, run.name),
         group=run.drive if run.is_cut else None,
@@ -192,7 +193,8 @@ def _ego(held: Held, spec: dict, rate: float) -> list[Track]:
     check_coordinates(where, "pose", ("x", "y", "heading"), table[:, 3:6])
     if t.size and not np.isfinite(speed).all():
         speed = _chassis_speed(t, held)
-    boxes = _on_clock(ego_boxes(spec, EGO, t, x, y, heading, speed), rate)
+    boxes = ego_boxes(spec, EGO, t, x, y, heading, speed)
+    boxes = on_clock(boxes, rate, MAX_GAP_S)
     return tracks_of(held.path, boxes, MAX_GAP_S, automated=_automated(held))[0]
 
 
@@ -240,40 +242,11 @@ def _obstacles(held: Held, spec: dict, rate: float) -> tuple[list[Track], list[s
         **dict(zip(MEASURED, table[:, 4:10].T, strict=True)),
     )
     unknown = str(spec.get("unknown", "auto"))
-    tracks, notes = tracks_of(held.path, _on_clock(boxes, rate), MAX_GAP_S, unknown)
+    boxes = on_clock(boxes, rate, MAX_GAP_S)
+    tracks, notes = tracks_of(held.path, boxes, MAX_GAP_S, unknown)
     if lost:
         notes.append(f"{lost} obstacle states without position or id left out")
     return tracks, notes
-
-
-def _on_clock(boxes: Boxes, rate: float) -> Boxes:
-    """Boxes on the clock k / rate, between the messages of each gapless piece.
-
-    Linear interpolation; headings are unwrapped first. A piece between two ticks of
-    the clock gives nothing. Of several messages of one time the first counts.
-    """
-    t, ids = boxes.t, boxes.ids
-    order = np.lexsort((t, ids))
-    step, same = np.diff(t[order]), np.diff(ids[order]) == 0
-    order = order[np.concatenate([[True], ~same | (step > 0.0)])[: order.size]]
-    step, same = np.diff(t[order]), np.diff(ids[order]) == 0
-    breaks = np.flatnonzero(~same | (step > MAX_GAP_S)) + 1
-    fields = ("ids", "t", "kind", *MEASURED)
-    parts = {field: [getattr(boxes, field)[:0]] for field in fields}
-    for rows in np.split(order, breaks) if order.size else []:
-        first = math.ceil(float(t[rows[0]]) * rate - 1e-6)
-        last = math.floor(float(t[rows[-1]]) * rate + 1e-6)
-        clock = np.arange(first, last + 1) / rate
-        at = rows[np.minimum(np.searchsorted(t[rows], clock), rows.size - 1)]
-        parts["ids"].append(ids[at])
-        parts["t"].append(clock)
-        parts["kind"].append(boxes.kind[at])
-        for field in MEASURED:
-            values = getattr(boxes, field)[rows]
-            values = np.unwrap(values) if field == "heading" else values
-            parts[field].append(np.interp(clock, t[rows], values))
-    merged = {field: np.concatenate(values) for field, values in parts.items()}
-    return dataclasses.replace(boxes, **merged)
 
 
 def _with_destinations(

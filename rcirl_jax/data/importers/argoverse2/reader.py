@@ -36,7 +36,7 @@ from rcirl_jax.data.importers.shapes import (
     local_origin,
     origin_notes,
 )
-from rcirl_jax.data.importers.tracks import split_tracks
+from rcirl_jax.data.importers.tracks import once_each, split_tracks
 from rcirl_jax.data.readers.tables.ledger import Ledger
 from rcirl_jax.data.readers.tables.table import fields_of, open_table, read
 from rcirl_jax.data.recording import MAX_SPEED_MPS, validate_recording
@@ -178,9 +178,13 @@ def _read_tracks(
             f"{file}: row {bad[0]}: object_category: {category[bad[0]]:g}: "
             f"expected 0 to {MAX_CATEGORY}"
         )
+    users = np.unique(table["track_id"], return_inverse=True)[1]
+    kept, notes = once_each(users, table["timestep"])
+    table = {name: column[kept] for name, column in table.items()}
+    category = table["object_category"]
     speed = np.hypot(table["velocity_x"], table["velocity_y"])
     least = number(spec, "min_category", FRAGMENT)
-    tracks, notes, low, wild = [], [], 0, 0
+    tracks, low, wild = [], 0, 0
     pieces = split_tracks(file, table["track_id"], table["timestep"], MAX_GAP_STEPS)
     for name, rows in pieces:
         if category[rows[0]] < least:
@@ -218,6 +222,7 @@ def _track(
         kind=kind,
         length=length,
         width=width,
+        size_assumed=True,
         t=table["timestep"][rows] * clock.step,
         x=table["position_x"][rows],
         y=table["position_y"][rows],

@@ -1,1 +1,8 @@
-"""CommonRoad XML scenarios: `reader`, `map` for lanelets, `extras` for signals."""
+"""CommonRoad XML scenarios: `reader`, `map`, `signs` by country, `extras`."""
+
+from rcirl_jax.data.importers.format import Format
+
+FORMAT = Format(
+    names=("*.xml",),
+    is_small=True,
+)

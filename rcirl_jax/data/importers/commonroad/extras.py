@@ -23,9 +23,30 @@ MAX_INTERVALS = 5_000_000  # of all lights; 100 lights over a day take a tenth o
 
 
 def position(state: Element, fields: Fields, where: str) -> tuple[float, float]:
-    """(x, y) m of a state's point."""
+    """(x, y) m of a state's point, or of the middle of its region."""
     place = fields.child(state, "position", where)
-    return fields.point(fields.child(place, "point", f"{where}: position"), where)
+    point = place.find("point")
+    if point is None and (middle := region_middle(place, fields, where)) is not None:
+        return middle
+    point = fields.child(place, "point", f"{where}: position")
+    return fields.point(point, where)
+
+
+def region_middle(
+    place: Element, fields: Fields, where: str
+) -> tuple[float, float] | None:
+    """(x, y) m in the middle of the shapes of a position; None without any.
+
+    The mean of the centres of rectangles and circles, and of polygons' corners.
+    """
+    middles = [fields.point(centre, where) for centre in place.iterfind("*/center")]
+    for polygon in place.iterfind("polygon"):
+        corners = [fields.point(one, where) for one in polygon.iterfind("point")]
+        middles += [np.mean(corners, axis=0)] if corners else []
+    if not middles:
+        return None
+    x, y = np.mean(middles, axis=0).tolist()
+    return x, y
 
 
 def read_signals(
@@ -111,14 +132,10 @@ def _goal_point(
     where the car gets at its initial speed (the lanelet's end would mean up to
     75 m/s in the NGSIM files); without a position, the coasted point itself.
     """
-    centre = goal.find("position/*/center")
-    if centre is not None:
-        return np.array(fields.point(centre, where))
-    corners = [
-        fields.point(point, where) for point in goal.iterfind("position/polygon/point")
-    ]
-    if corners:
-        return np.mean(corners, axis=0)
+    place = goal.find("position")
+    middle = None if place is None else region_middle(place, fields, where)
+    if middle is not None:
+        return np.array(middle)
     names = [ref.get("ref", "") for ref in goal.iterfind("position/lanelet")]
     lines = [lanes[name] for name in dict.fromkeys(names) if name in lanes]
     if not lines:

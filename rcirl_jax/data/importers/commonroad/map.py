@@ -4,51 +4,27 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from rcirl_jax.data.importers.commonroad.signs import Signs
+from rcirl_jax.data.importers.options import number
 from rcirl_jax.data.importers.shapes import MIN_HALF_WIDTH_M, fractions, resample
 from rcirl_jax.data.readers.xml import Fields
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane
 
-# of the countries that the format knows; others use the German ids
-LIMIT_SIGNS = ("R2-1", "274", "274.1", "r301")  # US, German (also zones), Spanish
-STOP_SIGNS = ("R1-1", "206", "r2")  # US, German, Spanish
+MIN_LIMIT_MPS = 5.0  # m/s, where the source TOML says none; lower signs are artefacts
 
 
 def read_lanes(
     root: Element, fields: Fields, spec: dict
 ) -> tuple[tuple[Lane, ...], list[str]]:
     """All lanelets of a file as lanes, and notes about what was ignored."""
-    limits, stops, notes = _read_signs(root, fields, float(spec["min_speed_limit"]))
+    signs = Signs(root, fields, number(spec, "min_speed_limit", MIN_LIMIT_MPS))
     lanes = tuple(
-        _read_lanelet(element, fields, limits, stops)
-        for element in root.iterfind("lanelet")
+        _read_lanelet(element, fields, signs) for element in root.iterfind("lanelet")
     )
     if not lanes:
         raise InputError(f"{fields.path}: lanelet: none: expected a road network")
-    return lanes, notes
-
-
-def _read_signs(
-    root: Element, fields: Fields, lowest: float
-) -> tuple[dict[str, float], set[str], list[str]]:
-    limits: dict[str, float] = {}
-    stops: set[str] = set()
-    ignored = 0
-    for sign in root.iterfind("trafficSign"):
-        name = sign.get("id", "")
-        for element in sign.iterfind("trafficSignElement"):
-            kind = (element.findtext("trafficSignID") or "").strip()
-            value = element.find("additionalValue")
-            if kind in STOP_SIGNS:
-                stops.add(name)
-            elif kind in LIMIT_SIGNS and value is not None:
-                limit = fields.number(value, f"trafficSign {name}")
-                if limit >= lowest:
-                    limits[name] = limit
-                else:
-                    ignored += 1
-    notes = [f"{ignored} speed limits below {lowest:g} m/s ignored"] if ignored else []
-    return limits, stops, notes
+    return lanes, signs.notes()
 
 
 def _bound(element: Element, tag: str, fields: Fields, where: str) -> np.ndarray:
@@ -59,9 +35,7 @@ def _bound(element: Element, tag: str, fields: Fields, where: str) -> np.ndarray
     return np.array(points)
 
 
-def _read_lanelet(
-    element: Element, fields: Fields, limits: dict[str, float], stops: set[str]
-) -> Lane:
+def _read_lanelet(element: Element, fields: Fields, signs: Signs) -> Lane:
     name = element.get("id", "(no id)")
     where = f"lanelet {name}"
     left = _bound(element, "leftBound", fields, where)
@@ -70,12 +44,13 @@ def _read_lanelet(
         at = np.unique(np.concatenate([fractions(left), fractions(right)]))
         left, right = resample(left, at), resample(right, at)
     half = np.maximum(0.5 * np.hypot(*(left - right).T), MIN_HALF_WIDTH_M)
-    signs = [ref.get("ref", "") for ref in element.iter("trafficSignRef")]
+    own = [ref.get("ref", "") for ref in element.iter("trafficSignRef")]
     limit = element.find("speedLimit")
     if limit is not None:
         speed_limit: float | None = fields.number(limit, where)
     else:
-        speed_limit = next((limits[sign] for sign in signs if sign in limits), None)
+        limits = (signs.limits[sign] for sign in own if sign in signs.limits)
+        speed_limit = next(limits, None)
     stop = element.find("stopLine")
     return Lane(
         id=name,
@@ -88,7 +63,7 @@ def _read_lanelet(
         right=_neighbour(element, "adjacentRight"),
         stop_line=_stop_line(stop, fields, where, left, right),
         signal_ids=tuple(r.get("ref", "") for r in element.iterfind("trafficLightRef")),
-        stop_sign=stop is not None and any(sign in stops for sign in signs),
+        stop_sign=stop is not None and not signs.stops.isdisjoint(own),
     )
 
 

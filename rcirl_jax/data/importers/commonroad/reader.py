@@ -23,6 +23,7 @@ from rcirl_jax.data.importers.commonroad.extras import (
 from rcirl_jax.data.importers.commonroad.map import read_lanes
 from rcirl_jax.data.importers.files import files_below, log_name
 from rcirl_jax.data.importers.options import is_file_name, one_pattern
+from rcirl_jax.data.importers.tracks import of_one_name
 from rcirl_jax.data.readers.xml import Fields, read_xml
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
@@ -34,7 +35,6 @@ MAX_FILE_BYTES = 512 * 1024**2  # bytes, larger files are refused
 MAX_STEP = 1e6  # of the clock: a day at 10 Hz
 MAX_STANDING = 20_000_000  # samples of standing things: 500 over an hour at 10 Hz
 DEFAULT_LIMIT_MPS = 29.06  # m/s, 65 mph, where the source TOML names none
-MIN_LIMIT_MPS = 5.0  # m/s, likewise; lower signs are converter artefacts
 # roots of what lies beside interactive scenarios: SUMO's files, solutions, other maps
 OTHER_ROOTS = (
     *("net", "routes", "additional", "configuration", "sumoConfiguration"),
@@ -131,9 +131,7 @@ def _read_file(path: Path, spec: dict, groups: dict[str, str]) -> Recording:
     if group is None:
         group = path.stem
         notes.append("no vehicle-disjoint group given; the file is its own group")
-    lanes, lane_notes = read_lanes(
-        root, fields, {"min_speed_limit": MIN_LIMIT_MPS, **spec}
-    )
+    lanes, lane_notes = read_lanes(root, fields, spec)
     centres = {lane.id: lane.centre for lane in lanes}
     source, licence = _provenance(root.get("source", "CommonRoad"), spec)
     return Recording(
@@ -199,13 +197,15 @@ def _is_standing(element: Element, fields: Fields) -> bool | None:
 def _read_tracks(
     root: Element, fields: Fields, dt: float
 ) -> tuple[list[Track], list[str]]:
-    tracks, standing, unrecorded = [], [], 0
+    tracks, standing, unrecorded, doubled = [], [], 0, 0
     for element in root:
         stands = _is_standing(element, fields)
         if stands:
             standing.append(element)
         elif stands is False and element.find("trajectory") is not None:
-            tracks.append(_read_moving(element, fields, dt))
+            track, again = _read_moving(element, fields, dt)
+            tracks.append(track)
+            doubled += again
         elif stands is False:
             unrecorded += 1
     first = min((float(track.t[0]) for track in tracks), default=0.0)
@@ -217,17 +217,30 @@ def _read_tracks(
             f"steps: expected up to {MAX_STANDING} samples"
         )
     tracks += [_read_standing(element, fields, clock) for element in standing]
-    notes = []
+    tracks, notes = of_one_name(tracks)
+    if doubled:
+        notes.append(f"{doubled} states of a step met twice, one used")
+    if regions := _regions(root):
+        notes.append(f"{regions} states in a region, taken to be in its middle")
     if unrecorded:
         notes.append(f"{unrecorded} obstacles without a trajectory left out")
     return tracks, notes
 
 
-def _read_moving(element: Element, fields: Fields, dt: float) -> Track:
+def _regions(root: Element) -> int:
+    """How many states have a region for a place."""
+    states = (state for tag in ("initialState", "state") for state in root.iter(tag))
+    places = (state.find("position") for state in states)
+    return sum(place is not None and place.find("point") is None for place in places)
+
+
+def _read_moving(element: Element, fields: Fields, dt: float) -> tuple[Track, int]:
+    """A track, and how many of its states were left out."""
     where = f"obstacle {element.get('id')}"
     states = [fields.child(element, "initialState", where)]
     states += element.iterfind("trajectory/state")
     rows = np.array([_read_state(state, fields, where, dt) for state in states])
+    rows = rows[np.append(True, np.diff(rows[:, 0]) != 0.0)]  # the first of a step
     backwards = np.flatnonzero(np.diff(rows[:, 0]) <= 0.0)
     if backwards.size:
         step = rows[backwards[0] + 1, 0] / dt
@@ -235,7 +248,8 @@ def _read_moving(element: Element, fields: Fields, dt: float) -> Track:
             f"{fields.path}: {where}: time: {step:g}: expected increasing steps"
         )
     kind = (element.findtext("type") or "unknown").strip().lower()
-    return _track(element, fields, KINDS.get(kind, Kind.VEHICLE), rows.T.copy())
+    track = _track(element, fields, KINDS.get(kind, Kind.VEHICLE), rows.T.copy())
+    return track, len(states) - len(rows)
 
 
 def _read_state(state: Element, fields: Fields, where: str, dt: float) -> tuple:

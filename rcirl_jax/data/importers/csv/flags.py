@@ -7,11 +7,14 @@ from rcirl_jax.data.readers.tables.layout import NUMBER
 from rcirl_jax.errors import InputError
 
 YES = (
-    *("yes", "y", "true", "t", "on", "x", "ja", "j", "oui", "si", "sí", "sim"),
+    *("yes", "y", "true", "t", "on", "x", "ja", "j", "oui", "si", "sí", "sim", "sì"),
+    *("wahr", "w", "vrai", "verdadero", "vero", "waar", "an", "ein", "aktiv", "active"),
+    *("enabled", "activated"),
     *("auto", "automated", "automatic", "autonomous", "av", "acc", "cacc", "engaged"),
 )
 NO = (
-    *("no", "n", "false", "f", "off", "nein", "non", "não", "nao"),
+    *("no", "n", "false", "f", "off", "nein", "non", "não", "nao", "nee", "falsch"),
+    *("faux", "falso", "onwaar", "aus", "inaktiv", "inactive", "disabled"),
     *("manual", "human", "driver", "hv", "disengaged"),
 )
 OPTION = "automated_values"

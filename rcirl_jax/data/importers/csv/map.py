@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.importers.lanes import StraightLane, straight_lanes
-from rcirl_jax.data.importers.options import number, path_option
+from rcirl_jax.data.importers.options import number, path_option, stated
 from rcirl_jax.data.importers.paths import path_lanes
 from rcirl_jax.data.readers.tables.ledger import Ledger
 from rcirl_jax.data.readers.tables.table import fields_of, open_table, read
@@ -47,7 +47,7 @@ def lanes_of(
     given = spec.get("lanes", [])
     if isinstance(given, dict):
         given = _lanes_from_file(table.path, lane_file_of(spec))
-    limit = number(spec, "speed_limit", LIMIT_MPS)
+    limit = stated(spec, "speed_limit")
     width = number(spec, "lane_width_m", LANE_WIDTH_M)
     if not all(isinstance(lane, dict) for lane in given):
         raise InputError(f"source TOML: lanes: {given}: expected tables [[lanes]]")
@@ -102,7 +102,9 @@ def _given_lane(table: LogTable, lane: dict, default_width: float) -> Lane:
     where = f"{table.path}: lanes {name}"
     try:
         points = np.array(lane.get("points", []), np.float64)
-        half = 0.5 * np.array(lane.get("width", default_width), np.float64)
+        width = np.array(lane.get("width", np.nan), np.float64)
+        is_guessed = bool(np.isnan(width).any())
+        half = 0.5 * np.where(np.isnan(width), default_width, width)
         limit = lane.get("speed_limit")
         speed_limit = None if limit is None else float(limit)
     except (ValueError, TypeError) as error:
@@ -123,6 +125,7 @@ def _given_lane(table: LogTable, lane: dict, default_width: float) -> Lane:
         successors=tuple(str(s) for s in lane.get("successors", [])),
         left=None if left is None else str(left),
         right=None if right is None else str(right),
+        width_assumed=is_guessed,
     )
 
 

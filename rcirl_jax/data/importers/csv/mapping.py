@@ -14,7 +14,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rcirl_jax.data.importers.options import UNITS, number, positive, section
+from rcirl_jax.data.importers.csv.dates import date_pattern
+from rcirl_jax.data.importers.options import (
+    UNITS,
+    number,
+    positive,
+    section,
+)
 from rcirl_jax.data.readers.tables.cells import EMPTY, ISO
 from rcirl_jax.data.readers.tables.layout import NUMBER
 from rcirl_jax.data.readers.tables.table import (
@@ -24,8 +30,8 @@ from rcirl_jax.data.readers.tables.table import (
     Field,
     Table,
 )
-from rcirl_jax.data.recording import LEAVE_OUT, PIECE
-from rcirl_jax.errors import InputError, did_you_mean
+from rcirl_jax.errors import InputError
+from rcirl_jax.runtime.settings import check_names
 
 NEEDED = ("t", "id", "x", "y")
 TEXT = ("id", "kind", "lane", "recording", "automated")
@@ -53,18 +59,11 @@ LIMITS = {
     **dict.fromkeys(("speed", "vx", "vy"), MAX_VELOCITY_MPS),
     "heading": MAX_PLACE_M,
 }
-DEGREES = {"x": 180.0, "y": 90.0}
-# of the source TOML, besides those that an import adds
-OPTIONS = (
-    *("source", "licence", "pattern", "rate_hz", "speed_limit", "lane_width_m"),
-    *("reference_point", "max_bad_rows", "heading_convention", "automated_values"),
-    *("long_bytes", "columns", "units", "scale", "offset", "defaults", "kinds"),
-    *("lanes", "table"),
-)
-ADDED = (LEAVE_OUT, PIECE, "log_names")
+DEGREES = {"x": 360.0, "y": 90.0}  # longitude counts from -180 or from 0
 RATE_HZ = 10.0  # 1/s
 ISO_TIMES = r"\d{4}-\d\d-\d\d[T ]|\d{8}T\d|\d{4}/\d\d/\d\d |\d{1,2}:\d\d"  # as read
 WORD = r"[A-Z]+(?![^\W\d_A-Z])|[A-Z]?[^\W\d_A-Z]+"  # of a name in camel case too
+DEGREE_M = 111_320.0  # m of a degree of latitude
 MIDDLE_DIGITS = 2  # of latitude and longitude of the projection's middle
 HOLE = "{id}"  # in a column's name: which road user's it is
 WORDS = {
@@ -84,7 +83,17 @@ class Mapping:
     degrees: float = 1.0  # of latitude and longitude in the file's unit
     heading_unit: str = ""  # rad or deg; "": recognised
     has_units: bool = True  # whether the TOML says the unit of x and y
+    is_clock: bool = False  # whether t is a time of day
     notes: tuple[str, ...] = ()
+
+    def distance(self, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
+        """Metres [n] of differences in x and y as rows have them, roughly on earth."""
+        if self.middle is None:
+            return np.hypot(dx, dy)
+        turn, north = 360.0 / self.degrees, self.degrees * DEGREE_M
+        east = north * math.cos(math.radians(self.middle[0]))
+        dx = (dx + 0.5 * turn) % turn - 0.5 * turn  # over the 180th meridian
+        return np.hypot(east * dx, north * dy)
 
 
 def mapping_of(table: Table, spec: AnyMapping) -> Mapping:
@@ -93,8 +102,6 @@ def mapping_of(table: Table, spec: AnyMapping) -> Mapping:
     Raises:
       InputError: an unknown field or unit, a needed column that is missing.
     """
-    for name in spec:
-        _check_known("source TOML: ", name, OPTIONS, (*OPTIONS, *ADDED))
     rate = positive({**spec, **section(spec, "defaults")}, "rate_hz", RATE_HZ)
     columns, units, notes = _columns(table, spec)
     _check_units(table, spec, units)
@@ -124,19 +131,9 @@ def mapping_of(table: Table, spec: AnyMapping) -> Mapping:
         degrees=degrees,
         heading_unit=units.get("heading", ""),
         has_units="x" in section(spec, "units") or middle is not None,
+        is_clock=_is_clock(form, first_cell(table, clock.lstrip("-"))),
         notes=tuple(notes),
     )
-
-
-def _check_known(
-    where: str, name: str, said: Sequence[str], known: Sequence[str]
-) -> None:
-    """A name is one of those known, of which some are said."""
-    if name not in known:
-        raise InputError(
-            f"{where}{name}: unknown: expected one of {', '.join(said)}"
-            f"{did_you_mean(name, said)}"
-        )
 
 
 def _columns(
@@ -146,7 +143,7 @@ def _columns(
     columns, units = dict(section(spec, "columns")), dict(section(spec, "units"))
     where, every = f"{table.path}: columns.", (*NEEDED, *OPTIONAL, *EARTH)
     for field, column in columns.items():
-        _check_known(where, field, every, every)
+        check_names(where, {field: column}, every)
         if not isinstance(column, str) or not column:
             raise InputError(f"{where}{field}: {column}: expected a name")
     for name, field in EARTH.items():
@@ -196,7 +193,7 @@ def _recognised_earth(
     """The columns, with x and y in degrees where their names and cells say so."""
     for x, y in (("x", "y"), ("y", "x")):
         named = WORDS["x"] & words_of(columns[x]) and WORDS["y"] & words_of(columns[y])
-        if not named or {columns["x"], columns["y"]} - set(table.header):
+        if not named or not (table.has(columns["x"]) and table.has(columns["y"])):
             continue
         cells = {"x": columns[x], "y": columns[y]}
         if all(_within(table, cells[axis], DEGREES[axis]) for axis in "xy"):
@@ -205,15 +202,20 @@ def _recognised_earth(
     return columns, units
 
 
+def known_cells(table: Table, column: str) -> list[str]:
+    """The first cells of a column that are not empty."""
+    return [cell for cell in table.samples(column) if cell.lower() not in EMPTY]
+
+
 def first_cell(table: Table, column: str) -> str:
     """The first cell of a column that is not empty, "" without one."""
-    return next((c for c in table.samples(column) if c.lower() not in EMPTY), "")
+    return next(iter(known_cells(table, column)), "")
 
 
 def sampled(table: Table, column: str) -> np.ndarray:
     """The numbers among the first cells of a column."""
     cells = table.samples(column)
-    if table.layout is not None and table.layout.decimal == ",":
+    if table.marks(column)[0] == ",":
         cells = [cell.replace(",", ".") for cell in cells]
     return np.array([float(cell) for cell in cells if NUMBER.fullmatch(cell)])
 
@@ -247,10 +249,12 @@ def _middle(
         scale, offset = _scaled(axis, spec)
         known = (values[values != 0.0] * scale + offset) * degrees
         known = known[np.abs(known) <= DEGREES[axis]]
+        if axis == "x" and known.size:  # 179.9 and -179.9 are near each other
+            known = known[0] + (known - known[0] + 180.0) % 360.0 - 180.0
         places.append(
             round(float(np.median(known)), MIDDLE_DIGITS) if known.size else 0.0
         )
-    return places[0], places[1]
+    return places[0], (places[1] + 180.0) % 360.0 - 180.0
 
 
 def _check_units(table: Table, spec: AnyMapping, units: dict[str, str]) -> None:
@@ -258,12 +262,8 @@ def _check_units(table: Table, spec: AnyMapping, units: dict[str, str]) -> None:
     fields = (*ALLOWED_UNITS, *EARTH)
     scaled = {name: section(spec, name) for name in ("scale", "offset")}
     for name, own in {"units": units, **scaled}.items():
-        for field in own:
-            if field not in (ALLOWED_UNITS if name == "units" else fields):
-                raise InputError(
-                    f"{table.path}: {name}.{field}: unknown: "
-                    f"expected {', '.join(fields)}"
-                )
+        known = ALLOWED_UNITS if name == "units" else fields
+        check_names(f"{table.path}: {name}.", own, [*known])
     for field, unit in units.items():
         is_pattern = field == "t" and "%" in str(unit)
         if unit not in ALLOWED_UNITS[field] and not is_pattern:
@@ -285,6 +285,8 @@ def _found(
     found: list[tuple[str, str, str | None]] = []
     missing: list[str] = []
     users = _users(table, columns) if HOLE in columns.get("x", "") else []
+    if not users:
+        _check_is_log(table, [columns[field] for field in NEEDED])
     for field, name in columns.items():
         plain = name.removeprefix("-") if field not in TEXT else name
         sign = name[: len(name) - len(plain)]
@@ -297,6 +299,22 @@ def _found(
             elif user is None:
                 missing.append(f"no column '{column}': {field} computed or by default")
     return found, missing
+
+
+def _check_is_log(table: Table, needed: Sequence[str]) -> None:
+    """A table has some of the columns needed, or no header that names any.
+
+    Raises:
+      InputError: it is another table, as a list of files beside the logs is.
+    """
+    if any(table.has(name.lstrip("-")) for name in needed):
+        return
+    if not any(NUMBER.fullmatch(name) for name in table.header):
+        raise InputError(
+            f"{table.path}: header: {[*table.header[:20]]}: none of the columns "
+            f"{', '.join(needed)}: expected a log; `pattern` of the TOML leaves out "
+            "tables that are none"
+        )
 
 
 def _users(table: Table, columns: AnyMapping[str, str]) -> list[str]:
@@ -322,20 +340,31 @@ def _users(table: Table, columns: AnyMapping[str, str]) -> list[str]:
 def _time(
     table: Table, name: str, unit: str | None, rate: float, notes: list[str]
 ) -> tuple[str, float]:
-    """(form, factor) of the clock; ISO where nothing is said and the cells are."""
+    """(form, factor) of the clock; where nothing is said, as its first cells are."""
     first = first_cell(table, name.lstrip("-"))
     is_iso = re.match(ISO_TIMES, first) is not None
     if unit is None and is_iso:
         notes.append(f"column {name}: ISO times")
         return ISO, 1.0
+    pattern = date_pattern(known_cells(table, name.lstrip("-")))
+    if unit is None and pattern:
+        notes.append(f"column {name}: times as {pattern}")
+        return pattern, 1.0
     if unit == ISO or (unit is not None and "%" in unit):
         return unit, 1.0
-    if is_iso:
+    if is_iso or pattern:
         raise InputError(
             f"{table.path}: units.t: {unit}: the cells of {name} are such as "
-            f"'{first[:40]}': expected {ISO}"
+            f"'{first[:40]}': expected {pattern or ISO}"
         )
     return "", 1.0 / rate if unit == "frame" else UNITS[unit or "s"]
+
+
+def _is_clock(form: str, first: str) -> bool:
+    """Whether times are those of a day that nobody names."""
+    if form == ISO:
+        return re.match(r"\d{1,2}:\d", first) is not None
+    return bool(re.search("%[HI]", form)) and not re.search("%[djcxU]", form)
 
 
 def _field(

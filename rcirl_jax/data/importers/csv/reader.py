@@ -41,7 +41,8 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.types import Recording
 
 PATTERNS = (
-    *("*.csv", "*.csv.gz", "*.csv.zst", "*.tsv", "*.parquet", "*.feather"),
+    *("*.csv", "*.csv.gz", "*.csv.zst", "*.csv.bz2"),
+    *("*.tsv", "*.tsv.gz", "*.tsv.zst", "*.tsv.bz2", "*.parquet", "*.feather"),
 )  # of files that are read; of those called alike the first pattern's
 MAX_GAP_STEPS = 5.5  # missing rows bridged inside one track
 STILL_M = 0.5  # m; a log in which all road users stay within it is in degrees
@@ -125,7 +126,14 @@ def opened(file: Path, spec: dict) -> Log:
 
 def _recordings(log: Log, is_long: bool) -> Iterator[Recording]:
     fields, gap_s = log.mapping.fields, MAX_GAP_STEPS / log.mapping.rate_hz
-    with rows_of(log.table, fields, log.ledger, is_long=is_long) as rows:
+    with rows_of(
+        log.table,
+        fields,
+        log.ledger,
+        is_long=is_long,
+        distance=log.mapping.distance,
+        is_clock=log.mapping.is_clock,
+    ) as rows:
         every = rows.recordings()
         minutes = (log.placed(part) for one in every for part in rows.minutes(one))
         automated = rows.texts_of("automated")
@@ -163,7 +171,10 @@ def _recording(name: str, table: LogTable, log: Log, meaning: Meaning) -> Record
     spec, values = log.spec, table.values
     gap_s = MAX_GAP_STEPS / table.rate_hz
     # rows may come in any order
-    pieces = split_tracks(table.path, values["id"], values["t"], gap_s, reuse=0.0)
+    places = np.stack([values["x"], values["y"]], axis=1)
+    pieces = split_tracks(
+        table.path, values["id"], values["t"], gap_s, reuse=0.0, places=places
+    )
     tracks = tuple(
         track_of(label, table, rows, spec, meaning) for label, rows in pieces
     )

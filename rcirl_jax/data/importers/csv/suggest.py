@@ -4,26 +4,29 @@ Names of columns, units in them and the numbers of the first rows tell what can 
 The TOML is read back like any other: what is shown is what an import would take.
 """
 
-import contextlib
 import dataclasses
-import datetime
-import itertools
 import math
 import re
 from collections.abc import Mapping as AnyMapping
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.data.importers.csv.dates import date_pattern
 from rcirl_jax.data.importers.csv.flags import NO, YES
 from rcirl_jax.data.importers.csv.heading import half_seconds, is_large
 from rcirl_jax.data.importers.csv.mapping import (
     ALLOWED_UNITS,
+    DEGREES,
     HOLE,
     NEEDED,
     OPTIONAL,
+    RATE_HZ,
     Mapping,
     first_cell,
+    known_cells,
+    sampled,
 )
 from rcirl_jax.data.importers.csv.meaning import Meaning, meaning_of, with_velocity
 from rcirl_jax.data.importers.csv.names import fields_by_name, kind_by_name, unit_of
@@ -41,11 +44,10 @@ from rcirl_jax.data.readers.tables.ledger import LINE
 from rcirl_jax.data.readers.tables.table import MAX_TIME, Table, batches, open_table
 from rcirl_jax.errors import InputError, as_input_error
 
-# of times that are written neither as a number nor as ISO
-DATES = ("%d.%m.%Y", "%d.%m.%y", "%d/%m/%Y", "%m/%d/%Y", "%d-%m-%Y")
-TIMES_OF_DAY = ("%H:%M:%S.%f", "%H:%M:%S,%f", "%H:%M:%S", "%I:%M:%S.%f %p")
 USUAL_RATES = (1, 2, 4, 5, 10, 12.5, 15, 20, 24, 25, 29.97, 30, 50, 60, 100, 120)
 RATE_FITS = 0.1  # relative
+FRAMES_FIT = 0.02  # likewise, of a rate that speeds tell
+NO_RATE = "rate_hz: rows per second of one road user; 10 is assumed"
 LONG_CAR_M = 9.0  # m; a longer median vehicle was measured in feet
 # recorded speed over that of the positions, both in m/s if it were m/s
 SPEED_RATIOS = {"m/s": 1.0, "km/h": 3.6, "ft/s": 3.2808, "mph": 2.2369, "kn": 1.9438}
@@ -74,6 +76,7 @@ def _suggested(path: Path) -> Suggestion:
     columns, said = _columns(table)
     guess = Guess(columns=columns, said=said)
     _time_form(table, guess)
+    _check_degrees(table, guess)
     raw = _first_rows(path, guess.spec())
     _clock(table, raw, guess)
     _lengths(table, raw, guess)
@@ -156,11 +159,23 @@ def _time_form(table: Table, guess: Guess) -> None:
         guess.units["t"] = "iso"
     elif NUMBER.fullmatch(first) and abs(float(first)) > MAX_TIME:
         guess.units["t"] = "ns" if float(first) > 1e3 * MAX_TIME else "us"
-    for date, rest in itertools.product(DATES, TIMES_OF_DAY):
-        with contextlib.suppress(ValueError):
-            datetime.datetime.strptime(first, f"{date} {rest}")
-            guess.units["t"] = f"{date} {rest}"
-            return
+    elif pattern := date_pattern(known_cells(table, guess.columns["t"])):
+        guess.units["t"] = pattern
+
+
+def _check_degrees(table: Table, guess: Guess) -> None:
+    """Latitudes are degrees; of raw numbers nobody knows how many make one.
+
+    Raises:
+      InputError: they are too large.
+    """
+    found = sampled(table, guess.columns["lat"]) if "lat" in guess.columns else None
+    if found is not None and found.size and np.abs(found).min() > DEGREES["y"]:
+        raise InputError(
+            f"{table.path}: {guess.columns['lat']}: {found[0]:.12g}: expected degrees; "
+            "if these are raw numbers, write the TOML by hand, with their [scale], "
+            "such as lat = 1e-7, lon = 1e-7"
+        )
 
 
 def _clock(table: Table, raw: AnyMapping[str, np.ndarray], guess: Guess) -> None:
@@ -172,10 +187,13 @@ def _clock(table: Table, raw: AnyMapping[str, np.ndarray], guess: Guess) -> None
     step = float(np.median(steps)) if steps.size else math.nan
     if "t" not in guess.units:
         name = guess.columns["t"]
-        unit = unit_of(name, ("ms", "us", "ns", "s")) or _unit_by_step(name, step)
+        unit = _said(table, name, ("ms", "us", "ns", "s")) or _unit_by_step(name, step)
+        if unit == "frame" and step > 1.0:
+            guess.scale["t"] = 1.0 / step
+            guess.said.append(f"scale.t: every {step:g}th frame has rows")
         guess.units["t"], step = unit, step * UNITS.get(unit, math.nan)
     if not math.isfinite(step):
-        guess.open.append("rate_hz: rows per second of one road user; 10 is assumed")
+        guess.open.append(NO_RATE)
         return
     rate = 1.0 / step
     near = min(USUAL_RATES, key=lambda usual: abs(rate / usual - 1.0))
@@ -183,6 +201,13 @@ def _clock(table: Table, raw: AnyMapping[str, np.ndarray], guess: Guess) -> None
     guess.said.append(
         f"rate_hz = {guess.rate_hz:g}: a row of a road user every {1 / rate:g} s"
     )
+
+
+def _said(table: Table, column: str, allowed: Sequence[str]) -> str:
+    """The unit that a column's name says, or the line below the header."""
+    bare = column.removeprefix("-")
+    own = "" if HOLE in bare else table.unit_of(bare)
+    return unit_of(column, allowed) or unit_of(f"[{own}]", allowed)
 
 
 def _unit_by_step(name: str, step: float) -> str:
@@ -204,7 +229,7 @@ def _lengths(table: Table, raw: AnyMapping[str, np.ndarray], guess: Guess) -> No
     long = bool(known.size) and float(np.median(known)) > LONG_CAR_M
     for field in ("x", "y", "length", "width"):
         if field in guess.columns:
-            said = unit_of(guess.columns[field], ALLOWED_UNITS["length"])
+            said = _said(table, guess.columns[field], ALLOWED_UNITS["length"])
             guess.units[field] = said or ("ft" if long else "m")
     if long:
         guess.said.append(f"length: {np.median(known):.3g} in the median: feet")
@@ -216,32 +241,61 @@ def _heading_and_speed(
     """Units of angles by their size; of speeds by the speed of the positions."""
     if "heading" in guess.columns:
         large = is_large(raw["heading"][np.isfinite(raw["heading"])])
-        said = unit_of(guess.columns["heading"], ("deg", "rad"))
+        said = _said(table, guess.columns["heading"], ("deg", "rad"))
         guess.units["heading"] = said or ("deg" if large else "rad")
-    for field in ("speed", "vx", "vy"):
-        if field in guess.columns:
-            said = unit_of(guess.columns[field], ALLOWED_UNITS["speed"])
-            guess.units[field] = said or "m/s"
-            if field == "speed" and not said:
-                guess.units[field] = _speed_unit(table.path, guess) or "m/s"
+    speeds = [field for field in ("speed", "vx", "vy") if field in guess.columns]
+    said = {f: _said(table, guess.columns[f], ALLOWED_UNITS["speed"]) for f in speeds}
+    guess.units.update({field: said[field] or "m/s" for field in speeds})
+    told = ["speed"] if "speed" in speeds else speeds  # by which the speed is known
+    if told == ["vy"] or told == ["vx"] or not told:
+        return
+    if guess.rate_hz is None:
+        _rate_of_frames(table.path, guess)
+    if not any(said[field] for field in told):
+        unit = _speed_unit(table.path, guess) or "m/s"
+        guess.units.update(dict.fromkeys(told, unit))
 
 
 def _speed_unit(path: Path, guess: Guess) -> str:
     """The unit in which speeds are those of the positions; "" if none is."""
-    rows, _, mapping = _without_wrong_headings(path, guess)
-    first, _, last = half_seconds(rows, mapping.rate_hz)
-    dx, dy, dt = (rows[name][last] - rows[name][first] for name in ("x", "y", "t"))
-    real, found = np.hypot(dx, dy) / np.maximum(dt, 1e-9), rows["speed"][first]
-    used = (real > 2.0) & np.isfinite(found)
-    if used.sum() < 10:
+    ratio = _speed_ratio(path, guess)
+    if ratio is None:
         return ""
-    ratio = float(np.median(np.abs(found[used]) / real[used]))
     unit = min(SPEED_RATIOS, key=lambda name: abs(ratio / SPEED_RATIOS[name] - 1.0))
     if abs(ratio / SPEED_RATIOS[unit] - 1.0) > 0.06:
         guess.open.append(f"units.speed: {ratio:.3g} times the speed of the positions")
         return ""
     guess.said.append(f"units.speed = {unit}: {ratio:.3g} times the positions' m/s")
     return unit
+
+
+def _speed_ratio(path: Path, guess: Guess) -> float | None:
+    """Recorded speed over that of the positions; None: too few road users move."""
+    rows, _, mapping = _without_wrong_headings(path, guess)
+    first, _, last = half_seconds(rows, mapping.rate_hz)
+    dx, dy, dt = (rows[name][last] - rows[name][first] for name in ("x", "y", "t"))
+    real, found = np.hypot(dx, dy) / np.maximum(dt, 1e-9), rows["speed"][first]
+    used = (real > 2.0) & np.isfinite(found)
+    return (
+        float(np.median(np.abs(found[used]) / real[used])) if used.sum() > 9 else None
+    )
+
+
+def _rate_of_frames(path: Path, guess: Guess) -> None:
+    """The usual rate at which frames are apart as recorded speeds say, if one is."""
+    ratio = _speed_ratio(path, guess)
+    if ratio is None:
+        return
+    for unit, times in SPEED_RATIOS.items():
+        rate = RATE_HZ * ratio / times
+        near = min(USUAL_RATES, key=lambda usual: abs(rate / usual - 1.0))
+        if abs(rate / near - 1.0) < FRAMES_FIT:
+            guess.rate_hz = near
+            guess.open.remove(NO_RATE)
+            guess.said.append(
+                f"rate_hz = {near:g}: by the speeds, if they are in {unit}"
+            )
+            return
 
 
 def _texts(raw: AnyMapping[str, np.ndarray], guess: Guess) -> None:

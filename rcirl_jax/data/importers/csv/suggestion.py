@@ -34,6 +34,7 @@ class Guess:
     columns: dict[str, str]
     said: list[str]
     units: dict[str, str] = dataclasses.field(default_factory=dict)
+    scale: dict[str, float] = dataclasses.field(default_factory=dict)
     kinds: dict[str, str] = dataclasses.field(default_factory=dict)
     rate_hz: float | None = None
     open: list[str] = dataclasses.field(default_factory=list)  # what is not known
@@ -44,6 +45,7 @@ class Guess:
         return {
             "columns": self.columns,
             "units": self.units,
+            "scale": self.scale,
             "kinds": self.kinds,
             "max_bad_rows": 0.5,
             **rate,
@@ -138,6 +140,7 @@ def toml_of(path: Path, guess: Guess, meaning: Meaning) -> str:
         convention=f'{OPTION} = "{form.name}"\n' if form and form.note else "",
         columns=_table(guess.columns),
         units=_table(guess.units),
+        scale=f"\n[scale]\n{_numbers(guess.scale)}\n" if guess.scale else "",
         rate=guess.rate_hz or 10.0,
         kinds=f"\n[kinds]\n{_table(guess.kinds, _text)}\n" if guess.kinds else "",
     )
@@ -159,7 +162,7 @@ max_bad_rows = 0.01                    # share of rows that may be dropped
 
 [units]
 {units}
-
+{scale}
 [defaults]
 rate_hz = {rate:g}
 length = 4.5                           # m, where nothing is known
@@ -173,6 +176,11 @@ def _table(
 ) -> str:
     """Lines of a table of TOML."""
     return "\n".join(f"{key(name)} = {_text(value)}" for name, value in values.items())
+
+
+def _numbers(values: AnyMapping[str, float]) -> str:
+    """Lines of a table of TOML with numbers."""
+    return "\n".join(f"{name} = {value!r}" for name, value in values.items())
 
 
 def _text(value: str) -> str:

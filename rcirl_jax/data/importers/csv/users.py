@@ -31,7 +31,7 @@ def track_of(
     t, x, y = values["t"], values["x"], values["y"]
     heading = _filled(values.get("heading"), lambda: travel_heading(t, x, y))
     speed = _filled(values.get("speed"), lambda: speed_of(t, x, y))
-    size = {field: _size(field, values, spec) for field in SIZE_M}
+    size, is_guessed = _sizes(values, spec)
     reference = spec.get("reference_point", "centre")
     if reference not in REFERENCE:
         raise InputError(
@@ -47,6 +47,7 @@ def track_of(
         kind=_kind(table.path, name, values, spec),
         length=size["length"],
         width=size["width"],
+        size_assumed=is_guessed,
         t=t,
         x=x + ahead * np.cos(heading),
         y=y + ahead * np.sin(heading),
@@ -66,13 +67,18 @@ def _filled(
     return np.where(unknown, otherwise(), known) if unknown.any() else known
 
 
-def _size(field: str, values: dict[str, np.ndarray], spec: dict) -> float:
-    """Median of the known lengths or widths [m]."""
-    known = values.get(field, np.zeros(0))
-    known = known[np.isfinite(known)]
-    if known.size:
-        return float(np.median(known))
-    return number(section(spec, "defaults"), field, SIZE_M[field])
+def _sizes(values: dict[str, np.ndarray], spec: dict) -> tuple[dict[str, float], bool]:
+    """Medians of the known lengths and widths [m], and whether any is a default."""
+    known = {field: values.get(field, np.zeros(0)) for field in SIZE_M}
+    known = {field: sizes[np.isfinite(sizes)] for field, sizes in known.items()}
+    usual = section(spec, "defaults")
+    size = {
+        field: float(np.median(sizes))
+        if sizes.size
+        else number(usual, field, SIZE_M[field])
+        for field, sizes in known.items()
+    }
+    return size, not all(sizes.size for sizes in known.values())
 
 
 def _kind(path: Path, name: str, values: dict[str, np.ndarray], spec: dict) -> Kind:

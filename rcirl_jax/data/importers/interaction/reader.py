@@ -13,6 +13,7 @@ empty), their numbers are text ("P4"), "pedestrian/bicycle" is one class, frames
 may start at 0 or 1, challenge files hold what is asked for in SCENE_obs.csv.
 """
 
+import contextlib
 import dataclasses
 import functools
 from collections.abc import Iterator
@@ -36,9 +37,10 @@ from rcirl_jax.data.importers.files import (
 from rcirl_jax.data.importers.lanelet2.map import read_lanelet2
 from rcirl_jax.data.importers.options import number
 from rcirl_jax.data.importers.paths import path_lanes
+from rcirl_jax.data.importers.perception import SIZES_M
 from rcirl_jax.data.importers.projection import utm, utm_zone
 from rcirl_jax.data.importers.tracks import split_tracks, travel_heading
-from rcirl_jax.data.readers.tables.ledger import LINE, Ledger, with_news
+from rcirl_jax.data.readers.tables.ledger import LINE, Ledger, NoRowsError, with_news
 from rcirl_jax.data.readers.tables.repair import once
 from rcirl_jax.data.readers.tables.table import open_table, read
 from rcirl_jax.data.recording import accepted, validate_recording
@@ -63,11 +65,6 @@ SPLITS = ("train", "val", "sorted")
 EITHER = "pedestrian/bicycle"
 MAPS_UP = 5  # folders above a log in which that of the maps is looked for
 MAX_GAP_MS = 550.0  # ms missing inside one track
-SIZES_M = {
-    Kind.PEDESTRIAN: (0.5, 0.5),
-    Kind.CYCLIST: (1.8, 0.6),
-    Kind.VEHICLE: (4.5, 1.8),
-}  # m, length and width where the file has none
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -92,9 +89,10 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
             continue
         partner = file.with_name(file.name.replace(VEHICLES, PEDESTRIANS, 1))
         if partner != file and partner.is_file():
-            others, ledger = _read(partner, spec)
-            rows = {k: np.concatenate([rows[k], others[k]]) for k in rows}
-            ledgers.append(ledger)
+            with contextlib.suppress(NoRowsError):  # no pedestrians
+                others, ledger = _read(partner, spec)
+                rows = {k: np.concatenate([rows[k], others[k]]) for k in rows}
+                ledgers.append(ledger)
         own = own_name(file)
         name = log_name(file, spec, own)
         # logs of one name may be copies of each other
@@ -262,16 +260,18 @@ def _track(name: str, rows: np.ndarray, table: Rows, scene: _Scene) -> Track:
         fast = number(scene.spec, "cyclist_speed_mps")
         rides = float(np.percentile(speed, 90.0)) > fast
         kind = Kind.CYCLIST if rides else Kind.PEDESTRIAN
-    sizes = []
+    sizes, guessed = [], False
     for field, default in zip(("length", "width"), SIZES_M[kind], strict=True):
         known = table[field][rows]
         known = known[np.isfinite(known) & (known > 0.0)]
         sizes.append(float(np.median(known)) if known.size else default)
+        guessed |= not known.size
     return Track(
         id=name,
         kind=kind,
         length=sizes[0],
         width=sizes[1],
+        size_assumed=guessed,
         t=t,
         x=x,
         y=y,

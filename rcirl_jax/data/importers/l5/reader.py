@@ -198,7 +198,7 @@ def _recording(
         lanes = semantic_map.roads.around(x, y, origin)
         signals, map_notes = _signals(where, dataset, frames, t, semantic_map, lanes)
     if not lanes:
-        lanes, note = fitted_lanes(tracks, spec, LIMIT_MPS)
+        lanes, note = fitted_lanes(tracks, spec)
         map_notes = [f"no map here; {note}"]
     return Recording(
         name=name,

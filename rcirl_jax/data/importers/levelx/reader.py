@@ -229,6 +229,7 @@ def _track(name: str, rows: Rows, user: _User, spec: dict) -> Track:
         kind=KINDS.get(user.kind, Kind.VEHICLE),
         length=size[0],
         width=size[1],
+        size_assumed=not is_boxed,
         t=t,
         x=x,
         y=y,

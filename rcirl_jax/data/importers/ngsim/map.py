@@ -4,6 +4,7 @@ Lanes, the notes and whether there are lateral positions belong to the whole sit
 `Survey` finds them, also where only a minute of rows is held at a time.
 """
 
+import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -71,8 +72,12 @@ class Survey:
             )
             for lane, (lower, upper) in sorted(self._along.items())
         ]
-        limit = number(spec, "speed_limit")
-        return straight_lanes(path, found, width, limit)
+        lanes = straight_lanes(path, found, width, number(spec, "speed_limit"))
+        guessed = not self.lateral
+        return tuple(
+            dataclasses.replace(lane, width_assumed=guessed or lane.width_assumed)
+            for lane in lanes
+        )
 
 
 def _counted(
@@ -153,8 +158,10 @@ def _track(
     sizes = spec.get("sizes", {})
     kind = str(int(table["v_Class"][rows[0]]))
     default = sizes.get(kind, sizes.get("0", SIZE_M))
-    length = float(table["v_Length"][rows[0]]) or float(default[0])
-    width = float(table["v_Width"][rows[0]]) or float(default[1])
+    size = [float(table[column][rows[0]]) for column in ("v_Length", "v_Width")]
+    length, width = (
+        own or float(usual) for own, usual in zip(size, default, strict=True)
+    )
     x = table["Local_Y"][rows] - 0.5 * length
     if lateral:
         y = -table["Local_X"][rows]
@@ -166,6 +173,7 @@ def _track(
         kind=Kind.VEHICLE,
         length=length,
         width=width,
+        size_assumed=0.0 in size,
         t=t,
         x=x,
         y=y,

@@ -129,6 +129,7 @@ def _recording(
             kind=Kind.VEHICLE,
             length=size * factor,
             width=number(spec, "width_m"),
+            size_assumed=True,  # no file says a width
             t=frames[rows] / rate,
             x=(table[f"x_{role}"][rows] - 0.5 * size) * factor,
             y=np.zeros(rows.shape),

@@ -119,7 +119,9 @@ class NuplanMap:
     def _make(self, index: int) -> Lane:
         row = self._rows[index]
         centre = self._centres[row.id]
-        left, right = (self._half_width(fid, centre) for fid in row.bounds)
+        found = [self._half_width(fid, centre) for fid in row.bounds]
+        usual = np.full(len(centre), HALF_WIDTH_M)
+        left, right = (usual if half is None else half for half in found)
         stop = None
         if row.signal is not None or row.has_sign:
             places = [self._stops[fid][1] for fid in row.stops if fid in self._stops]
@@ -138,15 +140,16 @@ class NuplanMap:
             stop_line=stop,
             signal_ids=() if row.signal is None else (row.signal,),
             stop_sign=row.has_sign,
+            width_assumed=any(half is None for half in found),
         )
 
-    def _half_width(self, fid: int, centre: np.ndarray) -> np.ndarray:
-        """Distance [n] m of a bound from the centre line's points."""
+    def _half_width(self, fid: int, centre: np.ndarray) -> np.ndarray | None:
+        """Distance [n] m of a bound from the centre line's points; None of no bound."""
         line = np.zeros((0, 2))
         if fid in self._bounds:
             (line,) = self._layers.lines("boundaries", [self._bounds[fid]])
         if not len(line):
-            return np.full(len(centre), HALF_WIDTH_M)
+            return None
         apart = distance_to_line(centre, line)
         return np.clip(apart, MIN_HALF_WIDTH_M, MAX_HALF_WIDTH_M)
 

@@ -216,7 +216,7 @@ def _recording(log: _Log, poses: np.ndarray) -> Recording:
     if log.road is not None:
         lanes = log.road.roads.around(x, y, origin)
     if not lanes:
-        lanes, note = fitted_lanes(tracks, spec, LIMIT_MPS)
+        lanes, note = fitted_lanes(tracks, spec)
         notes.append(f"no map here; {note}")
     return Recording(
         name=log.name,

@@ -9,6 +9,7 @@ import numpy as np
 
 from rcirl_jax.data.importers.declared import Columns
 from rcirl_jax.data.importers.projection import utm, utm_zone
+from rcirl_jax.data.readers.tables.columnar import is_columnar
 from rcirl_jax.data.readers.tables.ledger import Ledger
 from rcirl_jax.data.readers.tables.streams import head_of
 from rcirl_jax.data.readers.tables.table import Table, open_table
@@ -29,6 +30,7 @@ class Car:
     number: int  # in the platoon
     name: str  # number and model
     size: tuple[float, float]  # m, length and width
+    size_assumed: bool  # the file does not say both
     x: np.ndarray  # [n] m, NaN where it is unknown
     y: np.ndarray  # [n] m
     speed: np.ndarray  # [n] m/s
@@ -62,6 +64,19 @@ def is_drive(path: Path) -> bool:
         return any(COLUMN.fullmatch(name) for name in lines[-1])
     firsts = {line[0].lower() for line in lines if line}
     return not firsts or not firsts.isdisjoint(METADATA)
+
+
+def is_log(file: Path, table: Table | None) -> bool:
+    """Whether it is a drive, by several columns of cars, wherever they are named."""
+    del table
+    if is_columnar(file) or not is_drive(file):
+        return False
+    try:
+        lines = head_of(file)[1]
+    except InputError:
+        return False
+    names = (name.strip() for line in lines for name in line.split(","))
+    return sum(bool(COLUMN.fullmatch(name)) for name in names) > 2
 
 
 def _first_lines(path: Path) -> list[list[str]]:
@@ -165,10 +180,12 @@ def _car(
         modes = np.char.lower(values["Driver"])
         modes = np.where(modes == "", "unknown", modes)
     x, y = _place(values)
+    size, is_said = _size(path, number, name, about, spec)
     return Car(
         number=number,
         name=name,
-        size=_size(path, number, name, about, spec),
+        size=size,
+        size_assumed=not is_said,
         x=x,
         y=y,
         speed=values["Speed"],
@@ -183,12 +200,16 @@ def _size(
     name: str,
     about: Mapping[str, list[str]],
     spec: Mapping,
-) -> tuple[float, float]:
-    """Length and width [m]: of the header, of the model, or a car's."""
-    size = list(_model_size(name, spec.get("sizes", {})))
+) -> tuple[tuple[float, float], bool]:
+    """Length and width [m]: of the header, of the model, or a car's.
+
+    And whether the header says both.
+    """
+    size, said = list(_model_size(name, spec.get("sizes", {}))), set()
     for place, field in enumerate(("length", "width")):
         for key, cells in about.items():
             if field in key and 0 < number <= len(cells):
+                said.add(field)
                 try:
                     size[place] = float(cells[number - 1])
                 except ValueError as error:
@@ -196,7 +217,7 @@ def _size(
                         f"{path}: {key[:40]}: '{cells[number - 1][:40]}': "
                         "expected a number of metres"
                     ) from error
-    return size[0], size[1]
+    return (size[0], size[1]), len(said) == len(size)
 
 
 def _model_size(name: str, sizes: Mapping[str, list[float]]) -> tuple[float, float]:

@@ -171,6 +171,7 @@ def _tracks(
                     kind=Kind.VEHICLE,
                     length=car.size[0],
                     width=car.size[1],
+                    size_assumed=car.size_assumed,
                     t=t,
                     x=x,
                     y=y,

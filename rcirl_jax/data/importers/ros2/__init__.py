@@ -5,3 +5,13 @@
 beside the road. A new type of message is a function in `readings.TYPES` or
 `objects.TYPES`; `reader` makes recordings.
 """
+
+from rcirl_jax.data.importers.format import Format
+
+FORMAT = Format(
+    names=("*.mcap", "*.db3"),
+    shard_bytes=2**28,
+    options={"lanes": {"file": "lanes.csv"}},
+    free=("lights", "kinds"),
+    checked=("pattern", "topics", "lanes"),
+)

@@ -27,6 +27,11 @@ class Topic:
     schema: bytes  # the definition
     count: int | None = None  # messages, where the file says it
 
+    @property
+    def is_described(self) -> bool:
+        """Whether the file holds a definition of its messages."""
+        return self.schema_encoding == "ros2msg"
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Sent:
@@ -50,7 +55,7 @@ def decoder_of(path: Path, name: str, topic: Topic) -> Decoder:
             f"{where}: message_encoding: {topic.encoding!r}: expected cdr, which ROS 2 "
             "writes; convert the topic, or name another in [topics] of the source TOML"
         )
-    if topic.schema_encoding != "ros2msg":
+    if not topic.is_described:
         raise InputError(
             f"{where}: schema encoding: {topic.schema_encoding!r}: expected ros2msg, "
             "the definition inside the file; record it anew with `ros2 bag convert` "

@@ -26,6 +26,7 @@ class Held:
         self.path = path
         self.tables = {role: np.zeros((0, len(COLUMNS[role]))) for role in COLUMNS}
         self.names: dict[str, int] = {}  # of obstacles, with their numbers
+        self.notes: list[str] = []
         self.progress = 0.0  # share of the bag's bytes that is read
         self.end = -math.inf  # s, of the last place
         self.has_ego = False  # whether any of them is the ego's
@@ -53,6 +54,7 @@ class Held:
             table = table if self._start is None else self._shifted(table)
             self.tables[role] = np.concatenate([self.tables[role], table])
         self.names, self.progress = rows.names, rows.progress
+        self.notes += rows.notes
         self.has_ego = self.has_ego or len(new["ego"]) > 0
         check_held(str(self.path), len(self.tables["obstacles"]))
         if clock.size and self._start is not None:
@@ -76,8 +78,9 @@ class Held:
             )
 
     def view(self, low: float, high: float) -> "Held":
-        """Rows from one time [s] to before another."""
+        """Rows from one time [s] to before another, and the notes since the last."""
         view = copy.copy(self)
+        self.notes = []
         view.tables = {role: self._rows(role, low, high) for role in self.tables}
         return view
 

@@ -94,7 +94,7 @@ def lanes_for(
       InputError: none of the given lanes is near.
     """
     if given is None:
-        lanes, note = fitted_lanes(tracks, spec, LIMIT_MPS)
+        lanes, note = fitted_lanes(tracks, spec)
         return lanes, [f"no map given; {note}"]
     lanes = given.near(*places)
     if not lanes:

@@ -33,6 +33,7 @@ class Rows:
         self.names = names  # of obstacles, with their numbers
         self._values = {role: array.array("d") for role in COLUMNS}
         self.progress = 1.0  # share of the bag, or of its file, that is read with them
+        self.notes: list[str] = []
 
     def add(self, role: str, row: Row) -> None:
         """One row, in the order of the role's columns."""
@@ -54,7 +55,7 @@ def open_file(path: Path) -> McapFile | SqliteFile:
 
 def read_bag(files: list[Path], spec: dict) -> Iterator[Rows]:
     """All wanted messages of a bag, piece by piece in the order of recording."""
-    roles, names = _roles(files, spec), {}
+    (roles, notes), names = _roles(files, spec), {}
     sizes = [file.stat().st_size for file in files]
     done = 0.0  # bytes
     with reading(files[0], files) as show:
@@ -65,11 +66,14 @@ def read_bag(files: list[Path], spec: dict) -> Iterator[Rows]:
                 read = before + rows.progress * size
                 show(int(read - done))
                 done, rows.progress = read, min(read / max(sum(sizes), 1), 1.0)
+                rows.notes, notes = notes, []
                 yield rows
 
 
-def _roles(files: list[Path], spec: dict) -> dict[str, str]:
+def _roles(files: list[Path], spec: dict) -> tuple[dict[str, str], list[str]]:
     """Topic -> role: of each role the first topic named that has messages.
+
+    One that nobody can read is noted and passed over, unless it has to be there.
 
     Raises:
       InputError: a needed role has none, or its type is unknown.
@@ -80,15 +84,28 @@ def _roles(files: list[Path], spec: dict) -> dict[str, str]:
             for name, topic in opened.topics().items():
                 if topic.count != 0:
                     known.setdefault(name, topic)
-    roles = {}
+    roles, notes = {}, []
     for role, names in _topics(spec).items():
-        found = next((name for name in names if name in known), None)
+        met = [name for name in names if name in known]
+        found = next((name for name in met if _is_read(role, known[name])), None)
         if found is not None:
-            _check_type(files[0], role, found, known[found])
             roles[found] = role
+        elif met and role in NEEDED:
+            _check_type(files[0], role, met[0], known[met[0]])
+            roles[met[0]] = role  # says that it has no definition
         elif role in NEEDED and names:
             raise InputError(_missing(files[0], role, names, known))
-    return roles
+        elif met:
+            kind = known[met[0]].type
+            notes.append(
+                f"{met[0]} ({kind}): not read, of another type or without a definition"
+                + ("; who drove is not known" if role == "driver" else "")
+            )
+    return roles, notes
+
+
+def _is_read(role: str, topic: Topic) -> bool:
+    return topic.type in TYPES[role] and topic.is_described
 
 
 def _missing(

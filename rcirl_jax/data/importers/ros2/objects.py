@@ -43,13 +43,6 @@ CLASSES = {
 CYLINDER, POLYGON = 1, 2  # Shape.type
 BOX, SPHERE, CONE = 1, 2, 4  # SolidPrimitive.type; 3 is CYLINDER
 HAS_NO_HEADING, HAS_NO_SIGN = 0, 1  # TrackedObjectKinematics.orientation_availability
-# m, [length, width] where none is measured; others: 1 m
-SIZES_M = {
-    int(Kind.VEHICLE): (4.5, 1.8),
-    int(Kind.CYCLIST): (1.8, 0.6),
-    int(Kind.PEDESTRIAN): (0.5, 0.5),
-}
-OTHER_SIZE_M = (1.0, 1.0)  # m
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,15 +52,12 @@ class Found:
     name: str  # the same in every message
     pose: Pose  # of the box centre; heading NaN: by the direction of travel
     speed: float  # m/s; NaN: from the positions
-    size: tuple[float, float]  # m, length and width; 0: that of its kind
+    size: tuple[float, float]  # m, length and width; 0: not known
     kind: int
 
     def row(self, number: int, in_base: float) -> tuple[float, ...]:
         """COLUMNS of it, by its number among the names of the drive."""
-        usual = SIZES_M.get(self.kind, OTHER_SIZE_M)
-        length, width = (
-            own or other for own, other in zip(self.size, usual, strict=True)
-        )
+        length, width = (size or math.nan for size in self.size)
         place = self.pose.x, self.pose.y, self.pose.heading, self.speed
         return (float(number), *place, length, width, float(self.kind), in_base)
 

@@ -184,6 +184,7 @@ def _recording(held: Held, within: tuple[float, float], bag: _Bag) -> Recording 
         signals=signals_of(held.tables["lights"], list(bag.lights), _clock(tracks)),
         default_speed_limit=positive(spec, "speed_limit", LIMIT_MPS),
         notes=(
+            *held.notes,
             *_what_is_missing(held, within),
             *notes,
             *origin_notes(origin),

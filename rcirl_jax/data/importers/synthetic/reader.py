@@ -15,6 +15,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
+from rcirl_jax.data.importers.options import STATED
 from rcirl_jax.data.recording import LEAVE_OUT, validate_recording
 from rcirl_jax.data.synthetic import ROADS, DriverConfig, RunConfig, simulate
 from rcirl_jax.data.synthetic.roads import lanes, to_world
@@ -81,8 +82,8 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
       InputError: an unknown key or a bad value, before anything is simulated.
     """
     own = load_toml(path)
-    # the import's own switch says nothing here: none of these is refused
-    packaged = {key: value for key, value in spec.items() if key != LEAVE_OUT}
+    # what an import adds says nothing here: none of these is refused
+    packaged = {k: v for k, v in spec.items() if k not in (LEAVE_OUT, STATED)}
     settings = {**packaged, **own}
     settings["drivers"] = {**_table(spec, "drivers"), **_table(own, "drivers")}
     checked(settings, _File, path)

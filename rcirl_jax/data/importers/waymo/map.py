@@ -151,7 +151,7 @@ def _built(
         return ()
     order, lines = list(heads.values()), [centres[key] for key in heads]
     left, right = (
-        half_widths(lines, bounds, _segments(where, order, side), default)
+        half_widths(lines, bounds, _segments(where, order, side))
         for side in ("left", "right")
     )
     beside = [_neighbours(order, side) for side in ("left", "right")]
@@ -162,8 +162,13 @@ def _built(
     lanes = []
     for row, (key, head) in enumerate(heads.items()):
         keep = moves(lines[row])
-        line, sides = lines[row][keep], (left[row][keep], right[row][keep])
-        point = stops.points.get(key)
+        found = [side[row] for side in (left, right)]
+        line = lines[row][keep]
+        usual = np.full(len(line), default)
+        sides = [usual if half is None else half[keep] for half in found]
+        across = None
+        if (point := stops.points.get(key)) is not None:
+            across = line_across(line, sides[0], sides[1], point)
         lane = Lane(
             id=str(key),
             centre=line,
@@ -175,7 +180,8 @@ def _built(
             right=beside[1][row],
             signal_ids=(str(key),) if key in stops.signals else (),
             stop_sign=key in stops.signs,
-            stop_line=None if point is None else line_across(line, *sides, point),
+            stop_line=across,
+            width_assumed=any(half is None for half in found),
         )
         lanes.append(lane)
     return tuple(lanes)

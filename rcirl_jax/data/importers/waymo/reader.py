@@ -36,6 +36,7 @@ from rcirl_jax.data.importers.shapes import (
     local_origin,
     origin_notes,
 )
+from rcirl_jax.data.importers.tracks import of_one_name
 from rcirl_jax.data.importers.waymo.map import read_map
 from rcirl_jax.data.importers.waymo.messages import read_message
 from rcirl_jax.data.readers.protobuf import Message, columns
@@ -214,7 +215,9 @@ def _tracks(
             found = _pieces(where, track, states, row, seen, spec)
             automated = recording_car(spec) if row == recorder else ()
             tracks += [dataclasses.replace(t, automated=automated) for t in found]
+    tracks, doubled = of_one_name(tracks)
     tracks, notes = without_outliers(tracks)
+    notes += doubled
     if unset:
         notes.append(f"{unset} tracks of unset type left out")
     if unseen:

@@ -29,17 +29,16 @@ def half_widths(
     lanes: Sequence[np.ndarray],
     lines: Mapping[int, np.ndarray],
     segments: Segments,
-    default: float,
-) -> list[np.ndarray]:
+) -> list[np.ndarray | None]:
     """Distance [n] m of each lane's points from what bounds them on one side.
 
-    Measured at every fourth point, interpolated between, held beyond.
+    Measured at every fourth point, interpolated between, held beyond; None of lanes
+    without a known bound.
 
     Args:
       lanes: points [n, 2] m of each lane.
       lines: feature id -> points [m >= 1, 2] m.
       segments: of that side.
-      default: m, of lanes without a known bound.
     """
     sizes = np.array([len(lane) for lane in lanes], np.int64)
     begins = np.cumsum(sizes) - sizes
@@ -56,13 +55,13 @@ def half_widths(
         keys, which = np.unique(segments.line[owner], return_inverse=True)
         bounds = [lines[key] for key in keys.tolist()]
         half[row] = distances_to_lines(np.concatenate(lanes)[row], bounds, which)
-    return [_filled(part, default) for part in np.split(half, begins[1:])]
+    return [_filled(part) for part in np.split(half, begins[1:])]
 
 
-def _filled(half: np.ndarray, default: float) -> np.ndarray:
+def _filled(half: np.ndarray) -> np.ndarray | None:
     """Half widths with the points between and beyond the measured ones."""
     known = np.flatnonzero(half <= MAX_HALF_WIDTH_M)  # NaN compares false
     if not known.size:
-        return np.full(half.shape, default)
+        return None
     filled = np.interp(np.arange(half.size), known, half[known])
     return np.maximum(filled, MIN_HALF_WIDTH_M)

@@ -11,21 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from rcirl_jax.data.readers.tables.layout import NUMBER, Layout, grouped
+from rcirl_jax.data.readers.tables.layout import EMPTY, NUMBER, grouped
 from rcirl_jax.errors import extra_module
 
 TEXT_CHARS = 64  # characters of a text cell
-# texts that say that nothing is known, in small letters
-EMPTY = (
-    *("", "nan", "na", "n/a", "#n/a", "null", "none", "nil", "nat", "<na>"),
-    *("-", "--", "?", "\\n"),
-)
 WHOLE = re.compile(r"([-+]?\d+)[.,]0+")  # 12.0, as tables write numbers with holes
 # what ISO writes otherwise, pattern -> replacement; a clock alone is of the first day
 NEARLY_ISO = (
     (r",(\d+)", r".\1"),
     (r"^(\d{4})/(\d\d)/(\d\d)", r"\1-\2-\3"),
     (r" ?(UTC|GMT|utc|z)$", "Z"),
+    (r" ([-+]\d\d:?\d\d|[-+]\d\d)$", r"\1"),
     (r"^(\d:)", r"0\1"),
     (r"^(\d\d:)", r"1970-01-01 \1"),
 )
@@ -41,8 +37,10 @@ def is_texts(column: Any) -> bool:  # noqa: ANN401
     return types.is_string(kind) or types.is_large_string(kind)
 
 
-def numbers(column: Any, layout: Layout | None) -> Found:  # noqa: ANN401
+def numbers(column: Any, decimal: str, thousands: str) -> Found:  # noqa: ANN401
     """A column of numbers [n] float64, NaN where a cell is empty.
+
+    The marks are those of numbers written as text.
 
     Raises:
       TypeError: a column of Parquet's that holds no numbers.
@@ -51,7 +49,6 @@ def numbers(column: Any, layout: Layout | None) -> Found:  # noqa: ANN401
     if not is_texts(column):
         values = _plain(column)
         return values, np.isinf(values)
-    decimal, thousands = (layout.decimal, layout.thousands) if layout else (".", "")
     cells = column.cast(arrow.string())
     found = _cast(cells, arrow.float64()) if decimal == "." else None
     if found is None:

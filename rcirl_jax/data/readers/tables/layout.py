@@ -18,6 +18,7 @@ from typing import Any
 
 from rcirl_jax.data.readers.tables.streams import head_of
 from rcirl_jax.errors import InputError
+from rcirl_jax.runtime.settings import check_names
 
 MAX_COLUMNS = 10_000  # of a table; logs have some dozens
 MOST = 0.8  # share of a head's rows that repeat their last columns
@@ -27,6 +28,11 @@ TRIED = ("\t", ";", "|", ",")  # delimiters, the likelier first where two cut as
 HASHES = ("#", "%")  # before comments, and before the header where it is one
 BLANKS = " "  # a delimiter that stands for any run of blanks and tabs
 GROUPS = ",.'’ \u00a0\u202f"  # what may stand between thousands
+# texts that say that nothing is known, in small letters
+EMPTY = (
+    *("", "nan", "na", "n/a", "#n/a", "null", "none", "nil", "nat", "<na>"),
+    *("-", "--", "?", "\\n"),
+)
 MARKED = frozenset(GROUPS) - {"."}
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
@@ -52,6 +58,7 @@ class Layout:
     thousands: str = ""  # between groups of three digits; "": none
     skip: int = 0  # lines above the first row, the header's among them
     header: tuple[str, ...] = ()
+    units: tuple[str, ...] = ()  # of the columns, in a line below the header
     # last columns of the header that a row goes on repeating: pNEUMA's one row a drive
     repeating: int = 0
 
@@ -93,7 +100,7 @@ def recognise(path: Path, section: Mapping) -> tuple[Layout, list[list[str]]]:
     """
     given = _options(path, section)
     encoding, lines = head_of(path, given.get("encoding", ""))
-    lines = [line.lstrip("#% ") if line[:1] in HASHES else line for line in lines]
+    lines = _without_hashes(lines)
     quote = _quote(given, lines)
     delimiter = given.get("delimiter") or _delimiter(lines, quote)
     rows = cells_of(lines, delimiter, quote)
@@ -109,6 +116,9 @@ def recognise(path: Path, section: Mapping) -> tuple[Layout, list[list[str]]]:
             f"{path}: header: {len(header)} columns: expected up to {MAX_COLUMNS}"
         )
     below = [row for row in rows[first:] if any(cell.strip() for cell in row)]
+    units: Sequence[str] = ()
+    if "names" not in given and _are_units(below, len(header)):
+        units, first, below = below[0], first + 1, below[1:]
     repeating = given.get("repeating", _repeating(len(header), below))
     if repeating > len(header):
         raise InputError(
@@ -117,7 +127,7 @@ def recognise(path: Path, section: Mapping) -> tuple[Layout, list[list[str]]]:
         )
     if not repeating and "names" not in given and _has_row_names(header, below):
         header = ["", *header]
-    decimal, thousands = _decimal(below, delimiter)
+    decimal, thousands = decimal_of(below, delimiter)
     layout = Layout(
         encoding=encoding,
         delimiter=delimiter,
@@ -126,9 +136,44 @@ def recognise(path: Path, section: Mapping) -> tuple[Layout, list[list[str]]]:
         thousands=given.get("thousands", thousands),
         skip=first,
         header=tuple(header),
+        units=tuple(unit.strip() for unit in units),
         repeating=repeating,
     )
     return layout, below
+
+
+def _without_hashes(lines: Sequence[str]) -> list[str]:
+    """Lines without the marks of comments; comments are empty.
+
+    They are all that is marked above a header without a mark; else the last marked
+    line may be the header itself.
+    """
+    plain = [line for line in lines if line[:1] not in HASHES and line.strip()]
+    cells = re.split(r"[,;|\t]", plain[0]) if plain else []
+    has_header = len(cells) > 1 and not any(
+        NUMBER.fullmatch(cell.strip(" \"'")) for cell in cells
+    )
+    return [
+        line if line[:1] not in HASHES else ("" if has_header else line.lstrip("#% "))
+        for line in lines
+    ]
+
+
+def _are_units(rows: Sequence[Sequence[str]], width: int) -> bool:
+    """Whether the first row says the units of columns: words where others count."""
+    if len(rows) < 3 or len(rows[0]) != width:
+        return False
+    words = 0
+    for cell, *others in zip(*(row[:width] for row in rows[:3]), strict=False):
+        text = cell.strip()
+        if not all(
+            NUMBER.fullmatch(other.strip().replace(",", ".")) for other in others
+        ):
+            continue
+        if NUMBER.fullmatch(text.replace(",", ".")):
+            return False
+        words += text.lower() not in EMPTY
+    return words > 0
 
 
 def _options(path: Path, section: Mapping) -> dict[str, Any]:
@@ -138,11 +183,9 @@ def _options(path: Path, section: Mapping) -> dict[str, Any]:
       InputError: an unknown option, or one of another form.
     """
     found: dict[str, Any] = {}
+    check_names(f"{path}: table.", section, OPTIONS)
     for name, value in section.items():
         where = f"{path}: table.{name}: {value}"
-        if name not in OPTIONS:
-            known = ", ".join(OPTIONS)
-            raise InputError(f"{path}: table.{name}: unknown: expected {known}")
         if name in ("skip", "repeating"):
             if type(value) is not int or not 0 <= value <= MAX_COLUMNS:
                 raise InputError(f"{where}: expected a number of lines or columns")
@@ -301,7 +344,7 @@ def _has_row_names(header: Sequence[str], rows: Sequence[Sequence[str]]) -> bool
     )
 
 
-def _decimal(rows: Sequence[Sequence[str]], delimiter: str) -> tuple[str, str]:
+def decimal_of(rows: Sequence[Sequence[str]], delimiter: str) -> tuple[str, str]:
     """(decimal mark, mark between thousands) of the numbers in rows."""
     cells = itertools.chain.from_iterable(rows)
     every = [cell.strip() for cell in itertools.islice(cells, SAMPLE_CELLS)]

@@ -16,6 +16,14 @@ SAID = {
 MAX_BAD_ROWS = 0.01  # share of rows that may be dropped; the option of this name
 
 
+class NoRowsError(InputError):
+    """A table has a header and no rows: of a log, nobody drove."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(f"{path}: rows: none: expected rows below the header")
+        self.path = path
+
+
 @dataclasses.dataclass
 class Ledger:
     """What became of the rows of one file."""
@@ -48,7 +56,7 @@ class Ledger:
     def check(self) -> None:
         """Raises: InputError: no rows, or more bad ones than are allowed."""
         if self.read == 0:
-            raise InputError(f"{self.path}: rows: none: expected rows below the header")
+            raise NoRowsError(self.path)
         if self.bad > self.allowed * self.read or self.bad == self.read:
             raise InputError(
                 f"{self.path}: {self.first}; {self.bad} of {self.read} rows are bad: "

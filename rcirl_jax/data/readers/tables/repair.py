@@ -1,4 +1,4 @@
-"""A road user is in one place at a time: rows that say otherwise are repaired."""
+"""A road user is in one place at a time, and near where it was: rows are repaired."""
 
 from collections.abc import Callable, Container, Mapping, Sequence
 from typing import Any
@@ -6,6 +6,11 @@ from typing import Any
 import numpy as np
 
 from rcirl_jax.data.readers.tables.ledger import LINE, Ledger
+
+FASTEST_MPS = 100.0  # m/s; nobody covers a distance faster
+FAR_M = 25.0  # m; nearer than this positions may just be inaccurate
+SPIKE_ROWS = 3  # of one road user far from all its others: no place, but an error
+MOST_FAR = 0.5  # share of far steps; of more the unit is wrong, which is found later
 
 
 def once(
@@ -97,6 +102,76 @@ def single_rows(
     for low, high in zip(starts[several], ends[several], strict=True):
         kept[order[low:high]] = False
         kept[_continuing(where, codes, order, low, high, kept)] = True
+    return kept
+
+
+Distance = Callable[[np.ndarray, np.ndarray], np.ndarray]  # dx, dy -> m, [n] each
+
+
+def is_far(dt: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """Whether one road user cannot cover a distance [m] in a time [s], [n] each."""
+    return distance > np.maximum(FAR_M, FASTEST_MPS * dt)
+
+
+def reachable_rows(
+    values: Mapping[str, np.ndarray],
+    ledger: Ledger,
+    distance: Distance,
+    name_of: Callable[[Any], str] = str,
+) -> np.ndarray:
+    """Which rows [n] are kept, so that no road user is far away for a moment.
+
+    A cell of 9999 among others is such a place: up to `SPIKE_ROWS` rows that nobody
+    reaches from the rows before, or leaves to those after. They count as unreadable.
+
+    Args:
+      values: columns [n] that were read: t [s], id, x, y and `line`.
+      ledger: of the file.
+      distance: of differences in x and y.
+      name_of: an id as the file has it.
+
+    Raises:
+      InputError: more rows than the ledger allows.
+    """
+    codes = np.unique(values["id"], return_inverse=True)[1]
+    order = np.lexsort((values["t"], codes))
+    t, x, y = (values[name][order] for name in ("t", "x", "y"))
+    kept = _without_spikes(codes[order], t, x, y, distance)
+    dropped = order[~kept]
+    if dropped.size:
+        row = dropped[np.argmin(values[LINE][dropped])]
+        user = f"{ledger.unit} {values[LINE][row]:.0f}: id {name_of(values['id'][row])}"
+        place = f"{values['x'][row]:.9g}, {values['y'][row]:.9g}"
+        why = f"{user}: x, y: {place}: expected a place near its rows before and after"
+        ledger.drop("unreadable", why, dropped.size)
+        ledger.check()
+    return kept[np.argsort(order)]
+
+
+def _without_spikes(
+    codes: np.ndarray, t: np.ndarray, x: np.ndarray, y: np.ndarray, distance: Distance
+) -> np.ndarray:
+    """Which rows [n], in the order of road users and times, are no spikes.
+
+    Those amid a track go first: a row behind one may then be near the others.
+    """
+    kept = np.ones(t.size, bool)
+    for amid in (True, False):
+        rows = np.flatnonzero(kept)
+        same = np.diff(codes[rows]) == 0
+        way = distance(np.diff(x[rows]), np.diff(y[rows]))
+        far = same & is_far(np.diff(t[rows]), way)
+        if not far.any() or far.sum() > MOST_FAR * same.sum():
+            break
+        starts = np.flatnonzero(np.concatenate([[True], ~same | far]))
+        ends = np.append(starts[1:], rows.size)
+        cut = np.concatenate([[False], far, [False]])  # far from the row before
+        alone = np.stack([cut[starts], cut[ends]])
+        spikes = (ends - starts <= SPIKE_ROWS) & (
+            alone.all(axis=0) if amid else alone.any(axis=0)
+        )
+        for low, high in zip(starts[spikes], ends[spikes], strict=True):
+            kept[rows[low:high]] = False
     return kept
 
 

@@ -21,7 +21,7 @@ from rcirl_jax.data.readers.tables.columnar import (
     is_columnar,
     schema_of,
 )
-from rcirl_jax.data.readers.tables.layout import NUMBER, Layout, recognise
+from rcirl_jax.data.readers.tables.layout import NUMBER, Layout, decimal_of, recognise
 from rcirl_jax.data.readers.tables.ledger import LINE, Ledger
 from rcirl_jax.data.readers.tables.text_rows import text_batches
 from rcirl_jax.errors import InputError, did_you_mean, extra_module
@@ -74,14 +74,20 @@ class Table:
 
     @functools.cached_property
     def _places(self) -> dict[str, list[int]]:
-        found: dict[str, list[int]] = {}
-        for place, name in enumerate(self.header):
-            found.setdefault(name, []).append(place)
-        return found
+        return _numbered(self.header)
+
+    @functools.cached_property
+    def _small(self) -> dict[str, list[int]]:
+        return _numbered([name.casefold() for name in self.header])
+
+    def _found(self, column: str) -> list[int]:
+        """Numbers of the columns of a name, else of that name in another case."""
+        exact = self._places.get(column)
+        return exact or self._small.get(column.casefold(), [])
 
     def has(self, column: str) -> bool:
-        """Whether there is a column of this name."""
-        return column in self._places
+        """Whether there is a column of this name; its case does not matter."""
+        return bool(self._found(column))
 
     def place(self, column: str) -> int:
         """Number of a column.
@@ -89,7 +95,7 @@ class Table:
         Raises:
           InputError: it is missing, or met twice.
         """
-        found = self._places.get(column, [])
+        found = self._found(column)
         if len(found) == 1:
             return found[0]
         where = f"{self.path}: column {column}"
@@ -103,12 +109,31 @@ class Table:
             f"{where}: missing: expected it among {_shortened(known)}{hint}"
         )
 
+    def unit_of(self, column: str) -> str:
+        """The unit of a column by the line below the header; "" without one."""
+        units = self.layout.units if self.layout else ()
+        return units[self.place(column)].strip("[]() ") if units else ""
+
+    def marks(self, column: str) -> tuple[str, str]:
+        """(decimal mark, mark between thousands) of numbers written as text."""
+        if self.layout is not None:
+            return self.layout.decimal, self.layout.thousands
+        return decimal_of([self.samples(column)], "")
+
     def samples(self, column: str) -> list[str]:
         """Cells of a column in the first rows, as text."""
         place = self.place(column)
         if self.layout is None:
-            return first_cells(self.path, column, SAMPLES)
+            return first_cells(self.path, self.header[place], SAMPLES)
         return [row[place].strip() for row in self.head if len(row) > place]
+
+
+def _numbered(names: Sequence[str]) -> dict[str, list[int]]:
+    """Name -> the numbers of its columns."""
+    found: dict[str, list[int]] = {}
+    for place, name in enumerate(names):
+        found.setdefault(name, []).append(place)
+    return found
 
 
 def _shortened(names: Sequence[str]) -> list[str]:
@@ -194,7 +219,8 @@ def batches(
             yield _batch(table, fields, made.columns, made.lines, ledger)
         return
     done, size, last = 0, table.path.stat().st_size, 0.0
-    for columns, share in columnar_batches(table.path, [f.column for f in fields]):
+    names = [table.header[place] for place in places]
+    for columns, share in columnar_batches(table.path, names):
         rows = np.arange(done + 1, done + 1 + len(columns[0]))
         done += rows.size
         if show is not None:
@@ -250,7 +276,8 @@ def _column(table: Table, field: Field, found: Any) -> _Column:  # noqa: ANN401
         if field.form:
             values, wrong = cells.times(found, field.form)
         else:
-            values, wrong = cells.numbers(found, table.layout)
+            marks = table.marks(field.column) if cells.is_texts(found) else (".", "")
+            values, wrong = cells.numbers(found, *marks)
     except (TypeError, extra_module("pyarrow").ArrowException) as error:
         why = " ".join(str(error).split())[:200]
         raise InputError(f"{table.path}: column {field.column}: {why}") from error

@@ -35,6 +35,10 @@ class Fixture:
     tracks: dict[str, Written]  # by the id that the importer gives
     num_lanes: int  # at least so many lanes; 0 if the format has none
     num_signals: int = 0
+    # lanes without a limit, lanes of an unmeasured width, and road users of an
+    # unmeasured size: fitted lanes have neither limit nor width, and few logs say how
+    # large the car is that recorded them
+    assumed: tuple[int, int, int] = (0, 0, 0)
     # position error allowed by the format's rounding
     tolerance_m: float = 0.02
     has_heading: bool = True  # False: computed from the positions

@@ -331,6 +331,7 @@ def write(folder):
     second.write_bytes(record(messages[half:]))
     return Fixture(
         input=folder,
+        assumed=(4, 4, 1),  # fitted lanes; the ego
         rate_hz=10.0,
         tracks=expected(),
         num_lanes=1,

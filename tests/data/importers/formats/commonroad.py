@@ -51,6 +51,7 @@ def write(folder):
     assert step == 1.5
     return Fixture(
         input=folder,
+        assumed=(2, 0, 0),
         rate_hz=10.0,
         tracks={
             "10": first,

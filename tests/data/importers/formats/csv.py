@@ -36,6 +36,7 @@ def write(folder):
     path = w.table(folder / "log.csv", COLUMNS, rows)
     return Fixture(
         input=folder,
+        assumed=(2, 2, 0),  # straight lanes, bounded by each other on one side only
         rate_hz=10.0,
         tracks={
             name: samples(u, steps) for name, (u, steps, _) in road_users().items()

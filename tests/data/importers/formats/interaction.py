@@ -92,6 +92,7 @@ def write(folder):
     place_of_map, x = maps / f"{SCENE}.osm_xy", cell(VEHICLE_COLUMNS.index("x"))
     return Fixture(
         input=folder,
+        assumed=(2, 0, 2),  # a pedestrian and a cyclist have no boxes
         rate_hz=10.0,
         tracks={n: samples(u, steps) for n, (_, u, steps) in road_users().items()},
         num_lanes=osm.NUM_LANES,

@@ -40,6 +40,7 @@ def write(folder):
     assert np.isfinite([t.x[0] for t in tracks.values()]).all()
     return Fixture(
         input=folder / "train",
+        assumed=(4, 0, 2),  # a pedestrian in each case
         rate_hz=10.0,
         tracks=tracks,
         num_lanes=osm.NUM_LANES,

@@ -293,6 +293,7 @@ def write(folder):
     users["19#2"] = samples(gapped, slice(GAP.stop, None))
     return Fixture(
         input=folder,
+        assumed=(4, 0, 2),  # the ego, in two scenes
         rate_hz=10.0,
         tracks=users,
         num_lanes=4,

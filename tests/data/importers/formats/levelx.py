@@ -120,6 +120,7 @@ def write(folder):
     cells = zip([data / name for name in names], map(cell, columns), strict=True)
     return Fixture(
         input=folder,
+        assumed=(2, 0, 2),  # a pedestrian and a cyclist have no boxes
         rate_hz=RATE,
         tracks={n: samples(u, frames) for n, (_, u, frames) in road_users().items()},
         num_lanes=osm.NUM_LANES,

@@ -99,6 +99,7 @@ def write(folder):
     patterns = (cell(ROW_COLUMNS.index("x")), frame, r";([\d.]+);")
     return Fixture(
         input=folder,
+        assumed=(4, 0, 0),
         rate_hz=RATE,
         tracks={n: samples(u, f) for n, (*_, u, f) in road_users().items()},
         num_lanes=4,

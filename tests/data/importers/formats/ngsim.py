@@ -23,6 +23,7 @@ def write(folder):
 
     return Fixture(
         input=folder,
+        assumed=(0, 2, 0),  # the limit of the two sites is known
         rate_hz=10.0,
         tracks={
             "1": car(0, 120, 18.0),

@@ -74,6 +74,7 @@ def write(folder):
     lengths = {"1025": 14.3 * FOOT, "1032": 15.2 * FOOT, "1040": 4.5}
     return Fixture(
         input=folder,
+        assumed=(0, 2, 4),  # no file says a width
         rate_hz=10.0,
         tracks={name: car(name, length) for name, length in lengths.items()},
         num_lanes=1,

@@ -282,6 +282,7 @@ def write(folder):
     found[TRACK["19"].hex() + "#2"] = samples(users["19"], slice(GAP.stop, None))
     return Fixture(
         input=log.parent,
+        assumed=(2, 2, 1),  # the ego
         rate_hz=20.0,
         tracks=found,
         num_lanes=5,

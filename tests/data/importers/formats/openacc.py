@@ -110,6 +110,7 @@ def write(folder):
     (folder / "Vehicles_specifications.csv").write_text("Vehicles,Max power (kW)\n")
     return Fixture(
         input=folder,
+        assumed=(2, 2, 4),  # sizes are by model
         rate_hz=10.0,
         tracks=road_users(),
         num_lanes=1,

@@ -309,6 +309,7 @@ def write(folder):
     metadata(bag, names)
     return Fixture(
         input=folder,
+        assumed=(4, 4, 1),  # fitted lanes; the ego
         rate_hz=10.0,
         tracks=expected(),
         num_lanes=1,

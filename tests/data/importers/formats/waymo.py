@@ -239,6 +239,7 @@ def write(folder):
     path.write_bytes(tfrecord([scenario()]))
     return Fixture(
         input=place,
+        assumed=(0, 3, 0),  # lanes that no line bounds on one side
         rate_hz=10.0,
         tracks=expected(),
         num_lanes=4,
@@ -281,7 +282,7 @@ HARMS = {
     "per second: expected 10 (unit s)": stamped(STAMPS * 10),
     "track 2314: 91 states: expected 50": stamped(STAMPS[:50]),
     "tracks: none: expected Scenario": with_fields(tracks=[]),
-    "track id: 1: met twice": cars(count=2),
+    "track id: 1: met twice": cars(count=3),
     "track 1: object_type: 9: expected one of vehicle": cars(kind=9),
     "center_x: nan": cars(center_x=NAN),
     "speed: 500": cars(velocity_x=500.0),

@@ -1,0 +1,104 @@
+"""Writes `cases.txt` and its weights files: scenes, and what F and V are in JAX.
+
+    python -m onboard.conformance.make [FOLDER]
+
+The same code gives the same scenes; answers of other versions of JAX may differ in the
+last digits. README.md says how a case reads.
+"""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import numpy as np
+import numpy.typing as npt
+
+from rcirl_jax.export.own_planner.plain import plain_scene
+from rcirl_jax.features import feature_map
+from rcirl_jax.runtime.atomic_files import write_whole
+from rcirl_jax.types import Kind, Scene
+from rcirl_jax.units import TIMES_S
+from tests.helpers import drawn_scenes
+from tests.helpers.own_planner import drawn_reward, entries, jax_answers
+from tests.helpers.scenes import scene
+
+HERE = Path(__file__).parent
+REWARDS = {"paper21": False, "apollo21": True}  # preset, gains by the scene
+DRAWN = 8  # random scenes
+HEAD = "# Made by onboard/conformance/make.py; README.md says how it reads.\n"
+UNTIL = np.arange(TIMES_S.size) < 9  # a light's first half
+LINE = {"length": 0.1, "width": 40.0, "kind": Kind.STOP}
+LEAD = {"s": 30.0, "speed": 8.0}
+
+
+def hand_made() -> dict[str, Scene]:
+    """Scenes of one matter each, on a straight road unless said otherwise."""
+    return {
+        "free_road": scene(),
+        "standing": scene(v=0.0, boxes=[{"s": 8.0}]),
+        "bend": scene(kappa=0.02, l=1.0, path_l=0.5, boxes=[LEAD]),
+        "tight_bend": scene(v=4.0, kappa=0.19, l=5.0),
+        "follow": scene(boxes=[LEAD]),
+        "overtaken": scene(v=5.0, boxes=[{"s": -20.0, "speed": 15.0}]),
+        "beside": scene(boxes=[{"s": 5.0, "l": 3.5, "speed": 12.0}]),
+        "oncoming": scene(boxes=[{"s": 90.0, "l": 3.4, "speed": -12.0}]),
+        "pedestrian": scene(boxes=[{"s": 25.0, "l": -1.5, "length": 0.6, "kind": 3}]),
+        "parked": scene(boxes=[{"s": 20.0, "l": -2.0, "kind": Kind.STATIC}]),
+        "sides_touch": scene(boxes=[{"s": 0.0, "l": 1.9, "speed": 13.0}]),
+        "two_alike": scene(boxes=[LEAD, {**LEAD, "speed": 7.0, "s": 30.0}]),
+        "red_light": scene(boxes=[{"s": 35.0, **LINE}]),
+        "light_turns_green": scene(boxes=[{"s": 40.0, "valid": UNTIL, **LINE}]),
+        "light_turns_red": scene(boxes=[{"s": 40.0, "valid": ~UNTIL, **LINE}]),
+        "over_the_line": scene(v=2.0, boxes=[{"s": 1.0, **LINE}]),
+        "destination": scene(boxes=[{"s": 50.0, **LINE, "kind": Kind.VIRTUAL}]),
+        "gaps": scene(boxes=[{**LEAD, "valid": np.arange(TIMES_S.size) % 3 > 0}]),
+        "short_horizon": scene(num_valid=6, boxes=[LEAD]),
+        "one_time": scene(num_valid=1, boxes=[LEAD]),
+    }
+
+
+def cases() -> Iterator[tuple[str, Scene]]:
+    """Names and scenes, numpy leaves."""
+    for name, made in hand_made().items():
+        yield name, jax.tree.map(np.asarray, made)
+    drawn = drawn_scenes.scenes(np.random.default_rng(0), DRAWN)
+    for n in range(DRAWN):
+        yield f"drawn_{n}", jax.tree.map(lambda x, n=n: x[n], drawn)
+
+
+def line(label: str, numbers: npt.ArrayLike) -> str:
+    """A label and numbers, each as short as float32 allows."""
+    texts = (f"{float(x):.9g}" for x in np.asarray(numbers, np.float32))
+    return " ".join([label, *texts])
+
+
+def main(folder: Path) -> None:
+    """Write the three files."""
+    text, rewards = [HEAD], {}
+    for preset, by_context in REWARDS.items():
+        columns = feature_map(preset)
+        path = folder / f"{preset}.msgpack"
+        reward = drawn_reward(path, columns, by_context=by_context)
+        rewards[preset] = (columns, reward)
+    for number, (name, made) in enumerate(cases()):
+        preset = tuple(REWARDS)[number % 2]
+        columns, reward = rewards[preset]
+        one = jax.tree.map(lambda x: x[None], made)
+        s, l = drawn_scenes.candidates(np.random.default_rng(number), one, 2)
+        s = np.concatenate([made.ego.v * TIMES_S[None, None], s], axis=1)
+        l = None if number % 3 == 0 else np.concatenate([l[:, :1], l], axis=1)
+        features, values = (x[0] for x in jax_answers(columns, reward, one, s, l))
+        ways = (s[0], None if l is None else l[0])
+        text += [f"case {name}", f"weights {preset}.msgpack"]
+        text.append(" ".join(["columns", *reward.names]))
+        text += [line(*entry) for entry in entries(plain_scene(made), *ways)]
+        text.append("answer")
+        text += [line("features", row) for way in features for row in way]
+        text += [line("scores", values), "end", ""]
+    write_whole(folder / "cases.txt", "\n".join(text).encode())
+    print(f"written: {folder / 'cases.txt'}")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else HERE)

@@ -1,0 +1,358 @@
+"""Planning frames from what a car measures: metres, seconds, radians, Cartesian.
+
+    scene = scene_from(
+        ego=Car(x=3.0, y=0.2, heading=0.0, speed=12.0, length=4.9, width=2.1),
+        centre_line=CentreLine(points=[[0, 0], [300, 0]], speed_limit=13.9),
+        obstacles=[Body(x=40, y=0, heading=0.0, speed=8.0, length=4.5, width=1.8)],
+        signals=[Signal(x=80, y=0, state="red")],
+    )
+
+The scene is what the simulator's observer makes of the same moment, so that a reward
+reads what it learned from: the eight most relevant bodies with a future, the nearest
+line that demands a stop, the destination. The frame: x and y of any one Cartesian
+frame, heading counter-clockwise from its x axis. In C++: rcirl/scene_builder.hpp.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.export.own_planner.inputs import (
+    BODY_KINDS,
+    STATES,
+    Body,
+    Car,
+    CentreLine,
+    Signal,
+    check,
+    check_numbers,
+    check_one_of,
+    check_radians,
+    floats,
+    polyline,
+    table,
+)
+from rcirl_jax.geometry.boxes import frenet_extent
+from rcirl_jax.geometry.frenet import (
+    ReferenceLine,
+    project_points,
+    reference_line_from_polyline,
+)
+from rcirl_jax.geometry.limits import LOOK_AHEAD_M, planning_limit
+from rcirl_jax.planner.prediction import Bodies, most_relevant, obstacles_of
+from rcirl_jax.simulation.world.lines import YELLOW_BRAKING_MPS2
+from rcirl_jax.types import NUM_TAGS, Ego, Kind, Obstacles, Path, Scene
+from rcirl_jax.units import HORIZON_S, NUM_STATIONS, NUM_TIMES, STATION_STEP_M, TIMES_S
+
+BESIDE_M = 20.0  # m beside the centre line beyond which the ego is not on its road
+STEEPEST = 1.2  # rad, tilt beyond which dl/ds grows no more
+MIN_SHRINK = 0.1  # 1, least value of 1 - kappa l
+_obstacles_of = jax.jit(obstacles_of)
+_extents_of = jax.jit(jax.vmap(frenet_extent))
+LONG_GRID_M = np.arange(
+    0.0, (NUM_STATIONS - 1) * STATION_STEP_M + LOOK_AHEAD_M + 1e-6, STATION_STEP_M
+)
+
+
+def scene_from(
+    *,
+    ego: Car,
+    centre_line: CentreLine,
+    obstacles: Sequence[Body] = (),
+    signals: Sequence[Signal] = (),
+    predictions: Sequence[Any] | None = None,
+    path: Any = None,  # noqa: ANN401
+    destination: tuple[float, float] | None = None,
+) -> Scene:
+    """The planning frame of one moment; `plain_scene` turns it into plain numbers.
+
+    Args:
+      ego: the car that is planned for.
+      centre_line: of its lane.
+      obstacles: the others, in any order; the eight most relevant count.
+      signals: stop lines of the lane; the nearest ahead that demands a stop counts.
+      predictions: for each obstacle its future as rows (t, x, y, heading) in s, m and
+        rad, t from 0 on and rising; after the last row it is not there. None: the
+        package's own prediction, which is what training scenes hold by default.
+      path: [m, 2] m, the path along which speed is planned; None: the centre line.
+      destination: (x, y) m where the ego's centre shall come to rest.
+
+    Raises:
+      InputError: names the field, its value and what was expected.
+
+    Examples:
+        >>> from rcirl_jax import Body, Car, CentreLine
+        >>> scene = rcirl_jax.scene_from(
+        ...     ego=Car(x=3.0, y=0.2, heading=0.0, speed=12.0, length=4.9, width=2.1),
+        ...     centre_line=CentreLine(points=[[0, 0], [300, 0]], speed_limit=13.9),
+        ...     obstacles=[Body(x=40, y=0, heading=0, speed=8, length=4.5, width=1.8)],
+        ... )
+        >>> candidates = rcirl_jax.sample_candidates(scene)
+        >>> reward = rcirl_jax.load_weights("weights.msgpack")
+        >>> rcirl_jax.score_candidates(reward, scene, candidates).shape
+        (122,)
+    """
+    check_numbers("ego", ego)
+    check("ego.speed", ego.speed, ego.speed >= 0.0, "0 m/s or more")
+    points = polyline("centre_line.points", centre_line.points)
+    origin = np.array([ego.x, ego.y])
+    frame = _Frame(points - origin, origin)
+    now, s0 = _ego(frame, ego)
+    road = _path(frame, centre_line, path, s0)
+    bodies = _bodies(frame, obstacles, s0)
+    wall = _nearest_line(frame, signals, s0, now)
+    goal = math.inf
+    if destination is not None:
+        (goal,) = frame.stations("destination", [destination]) - s0 + 0.5 * ego.length
+        goal = goal if goal > 0.5 * ego.length else math.inf
+    walls = (jnp.asarray(wall), jnp.asarray(goal))
+    seen = _obstacles_of(bodies, *walls, now, road)
+    if predictions is not None:
+        futures = _futures(frame, obstacles, predictions, s0)
+        seen = _with_futures(seen, futures, most_relevant(bodies, now))
+    return Scene(
+        ego=now,
+        path=road,
+        obstacles=seen,
+        time_valid=jnp.ones(NUM_TIMES, bool),
+        tags=jnp.zeros(NUM_TAGS, bool),
+    )
+
+
+# ------------------------------------------------------------------------ the frame
+
+
+class _Frame:
+    """The Frenet frame of a centre line, around an origin near the ego."""
+
+    def __init__(self, points: np.ndarray, origin: np.ndarray) -> None:
+        self.origin = origin
+        steps = np.hypot(*np.diff(points, axis=0).T)
+        self.length = float(np.sum(steps))
+        size = int(self.length / STATION_STEP_M) + 2
+        self.line: ReferenceLine = reference_line_from_polyline(
+            points, size=size, step=STATION_STEP_M
+        )
+        self.grid = np.arange(size) * STATION_STEP_M
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(s, l) m of points [q, 2] m."""
+        s, l = project_points(self.line, np.asarray(points, float) - self.origin)
+        return s.astype(float), l.astype(float)
+
+    def stations(self, name: str, points: Sequence) -> np.ndarray:
+        """Stations of points [q, 2] m that somebody gave."""
+        return self.project(table(name, points, 2))[0]
+
+    def table(self, name: str, s: np.ndarray) -> np.ndarray:
+        """Heading or curvature of the line at stations; straight beyond its end."""
+        values = np.asarray(getattr(self.line, name), float)
+        return np.interp(s, self.grid, values, right=0.0 if name == "kappa" else None)
+
+    def tilt(self, s: np.ndarray, heading: np.ndarray | float) -> np.ndarray:
+        """Headings against the line's, in (-pi, pi]."""
+        apart = np.asarray(heading) - self.table("heading", s)
+        return np.arctan2(np.sin(apart), np.cos(apart))
+
+
+def _ego(frame: _Frame, ego: Car) -> tuple[Ego, float]:
+    """The ego in the frame, and its station on the line."""
+    (s0,), (l,) = frame.project(np.array([[ego.x, ego.y]]))
+    ahead, need = frame.length - s0, HORIZON_S * ego.speed
+    if s0 < -1e-3:
+        raise InputError(
+            f"scene_from: centre_line: begins {-s0:.1f} m ahead of the ego: expected a "
+            "line from behind it on, in driving direction"
+        )
+    if abs(l) > BESIDE_M:
+        raise InputError(
+            f"scene_from: ego: {abs(l):.1f} m beside the centre line: expected at most "
+            f"{BESIDE_M:g} m; give the line of the lane that it drives on"
+        )
+    if ahead < max(need, 1.0):
+        raise InputError(
+            f"scene_from: centre_line: ends {ahead:.1f} m ahead of the ego: expected "
+            f"{max(need, 1.0):.1f} m, what it drives in {HORIZON_S:g} s"
+        )
+    tilt, kappa = frame.tilt(s0, ego.heading), frame.table("kappa", s0)
+    if abs(tilt) > 0.5 * math.pi:
+        raise InputError(
+            f"scene_from: ego.heading: {math.degrees(tilt):.0f} degrees from the line: "
+            "expected along it, whose points are in driving direction"
+        )
+    shrink = max(1.0 - kappa * l, MIN_SHRINK)
+    values = {
+        "s": 0.0,
+        "l": l,
+        "dl": math.tan(np.clip(tilt, -STEEPEST, STEEPEST)) * shrink,
+        "ddl": ego.curvature - kappa,
+        "v": ego.speed * math.cos(tilt) / shrink,
+        "a": ego.acceleration,
+        "length": ego.length,
+        "width": ego.width,
+    }
+    floats = {name: jnp.asarray(x, jnp.float32) for name, x in values.items()}
+    return Ego(**floats), float(s0)
+
+
+def _path(frame: _Frame, road: CentreLine, path: Any, s0: float) -> Path:  # noqa: ANN401
+    """The line from the ego on, with limits that look ahead (`geometry.limits`)."""
+    stations = s0 + LONG_GRID_M
+    kappa = frame.table("kappa", stations)
+    l = np.zeros_like(stations)
+    if path is not None:
+        at, offsets = frame.project(polyline("path", path))
+        if np.any(np.diff(at) <= 0.0):
+            raise InputError("scene_from: path: turns back: expected driving direction")
+        l = np.interp(stations, at, offsets)
+    limit = planning_limit(kappa, l, _posted(frame, road, stations), STATION_STEP_M)
+    check("centre_line.lane_width", road.lane_width, road.lane_width > 0.0, "over 0 m")
+    half = 0.5 * road.lane_width
+    left, right = (half if x is None else x for x in (road.road_left, road.road_right))
+    flat = np.ones(NUM_STATIONS)
+    tables = {
+        "kappa": kappa,
+        "l": l,
+        "speed_limit": limit,
+        "lane_left": half * flat,
+        "lane_right": -half * flat,
+        "road_left": left * flat,
+        "road_right": -right * flat,
+    }
+    return Path(
+        **{n: jnp.asarray(x[:NUM_STATIONS], jnp.float32) for n, x in tables.items()}
+    )
+
+
+def _posted(frame: _Frame, road: CentreLine, stations: np.ndarray) -> np.ndarray:
+    """Posted limit [R] m/s; a point's limit holds from it on."""
+    limits = np.atleast_1d(floats("centre_line.speed_limit", road.speed_limit))
+    check("centre_line.speed_limit", limits, np.all(limits > 0.0), "over 0 m/s")
+    if limits.shape == (1,):
+        return np.full(stations.shape, limits[0])
+    points = np.asarray(road.points, float)
+    if limits.shape != (len(points),):
+        raise InputError(
+            f"scene_from: centre_line.speed_limit: {limits.size} numbers: expected one "
+            f"for each of the {len(points)} points, or one for all"
+        )
+    at = np.maximum.accumulate(frame.project(points)[0])
+    return limits[np.clip(np.searchsorted(at, stations, "right") - 1, 0, None)]
+
+
+# ----------------------------------------------------------------------- the others
+
+
+def _bodies(frame: _Frame, others: Sequence[Body], s0: float) -> Bodies:
+    """The others in the frame; slots up to the planner's number are filled up."""
+    for n, body in enumerate(others):
+        name = f"obstacles[{n}]"
+        check_numbers(name, body)
+        check_one_of(f"{name}.kind", body.kind, BODY_KINDS)
+    size = max(8, 1 << (len(others) - 1).bit_length())  # few sizes, few compilations
+    column = lambda name: np.array([getattr(b, name) for b in others], float)  # noqa: E731
+    xy = np.stack([column("x"), column("y")], axis=1)
+    s, l = frame.project(xy)
+    tilt = frame.tilt(s, column("heading"))
+    half_s, half_l = _extents(column("length"), column("width"), tilt)
+    kinds = np.array([Kind[body.kind.upper()] for body in others], np.int32)
+    leaves = {
+        "s": s - s0,
+        "l": l,
+        "speed": column("speed") * np.cos(tilt),
+        "l_dot": column("speed") * np.sin(tilt),
+        "a": column("acceleration") * np.cos(tilt),
+        "half_s": half_s,
+        "half_l": half_l,
+    }
+    fill = lambda x: jnp.asarray(np.pad(x, (0, size - len(others))))  # noqa: E731
+    floats = {name: fill(x.astype(np.float32)) for name, x in leaves.items()}
+    present = jnp.arange(size) < len(others)
+    return Bodies(**floats, kind=fill(kinds), present=present)
+
+
+def _extents(
+    length: np.ndarray, width: np.ndarray, tilt: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Half extents [q] m along and across the line of boxes tilted to it."""
+    given = (np.asarray(x, np.float32) for x in (length, width, tilt))
+    along, across = _extents_of(*given)
+    return np.asarray(along), np.asarray(across)
+
+
+def _nearest_line(
+    frame: _Frame, signals: Sequence[Signal], s0: float, now: Ego
+) -> float:
+    """Station of the nearest line ahead of the front that demands a stop; inf: none.
+
+    Yellow does where the ego can still stop, as in the simulator.
+    """
+    nearest = math.inf
+    for n, signal in enumerate(signals):
+        check_numbers(f"signals[{n}]", signal)
+        check_one_of(f"signals[{n}].state", signal.state, STATES)
+        (s,) = frame.stations(f"signals[{n}]", [(signal.x, signal.y)]) - s0
+        way = float(s) - 0.5 * now.length
+        can_stop = float(now.v) ** 2 <= 2.0 * YELLOW_BRAKING_MPS2 * way
+        demands = signal.state in ("red", "stop") or (
+            signal.state == "yellow" and can_stop
+        )
+        if demands and way >= 0.0:
+            nearest = min(nearest, float(s))
+    return nearest
+
+
+def _futures(
+    frame: _Frame, others: Sequence[Body], predictions: Sequence[Any], s0: float
+) -> dict[str, np.ndarray]:
+    """Boxes of given futures at the T times; all [M, T]."""
+    if len(predictions) != len(others):
+        raise InputError(
+            f"scene_from: predictions: {len(predictions)}: expected {len(others)}, one "
+            "for each obstacle"
+        )
+    names = ("s_lower", "s_upper", "l_lower", "l_upper", "speed", "valid")
+    found = {name: np.zeros((len(others), NUM_TIMES)) for name in names}
+    ones = np.ones(NUM_TIMES)
+    for n, (body, given) in enumerate(zip(others, predictions, strict=True)):
+        name = f"predictions[{n}]"
+        t, x, y, heading = table(name, given, 4).T
+        check(
+            f"{name}: t", t, t[0] <= 1e-6 and np.all(np.diff(t) > 0), "from 0 s, rising"
+        )
+        check_radians(f"{name}: heading", float(heading[np.argmax(np.abs(heading))]))
+        s, l = frame.project(np.stack([x, y], axis=1))
+        s, l = s - s0, l
+        tilt = np.unwrap(frame.tilt(s + s0, heading))
+        rate = np.gradient(s, t) if t.size > 1 else body.speed * np.cos(tilt)
+        s, l, tilt, rate = (np.interp(TIMES_S, t, z) for z in (s, l, tilt, rate))
+        half_s, half_l = _extents(body.length * ones, body.width * ones, tilt)
+        boxes = (
+            s - half_s,
+            s + half_s,
+            l - half_l,
+            l + half_l,
+            rate,
+            t[-1] + 1e-6 >= TIMES_S,
+        )
+        for key, values in zip(names, boxes, strict=True):
+            found[key][n] = values
+    return found
+
+
+def _with_futures(seen: Obstacles, futures: dict, first: jax.Array) -> Obstacles:
+    """Obstacles whose bodies have the given futures instead of predicted ones."""
+    count = len(futures["speed"])
+    leaves = {}
+    for name, values in futures.items():
+        table = np.array(getattr(seen, name))
+        for slot, body in enumerate(np.asarray(first).tolist()):
+            if body < count:
+                table[slot] = values[body]
+        leaves[name] = jnp.asarray(table)
+    return seen.replace(**leaves)

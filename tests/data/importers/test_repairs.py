@@ -1,0 +1,114 @@
+"""What can be repaired is, and noted: rows, states and ids that are met twice, regions
+for places, files without rows. What is wrong throughout stays an error."""
+
+import numpy as np
+import pytest
+
+from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.importers.tracks import of_one_name, once_each
+from rcirl_jax.types import Kind
+from tests.data.importers import writers as w
+from tests.data.importers.formats import argoverse2, l5, waymo
+from tests.data.importers.test_conformance import format_of, write
+from tests.helpers import logs
+
+
+def has_note(recording, words):
+    return any(words in note for note in recording.notes)
+
+
+# -------------------------------------------------------------------------- met twice
+
+
+def test_rows_of_one_time_count_once():
+    ids, t = np.array([1, 2, 1, 1, *[3] * 200]), np.array([0.0, 0, 0, 1, *range(200)])
+    kept, (note,) = once_each(ids, t)
+    np.testing.assert_array_equal(kept, [0, 1, *range(3, 204)])
+    assert note.startswith("1 states of a road user met twice")
+    for ids in (np.zeros(204, int), np.arange(204)):  # many of them, and none
+        kept, notes = once_each(ids, np.repeat(t[:102], 2))
+        assert (kept.size, notes) == (204, [])
+
+
+def test_a_scenario_of_argoverse(tmp_path):
+    fixture = argoverse2.write(tmp_path)
+    whole = logs.only("argoverse2", fixture.input)
+    argoverse2.cells("timestep", 2, argoverse2.ONE)(fixture)
+    made = logs.only("argoverse2", fixture.input)
+    assert has_note(made, "1 states of a road user met twice")
+    assert [t.id for t in made.tracks] == [t.id for t in whole.tracks]
+
+
+def test_a_scene_of_l5(tmp_path):
+    """Two boxes of one frame with the same id: the first counts."""
+    fixture = l5.write(tmp_path)
+    l5.put("agents", "track_id", 15, slice(0, 2))(fixture)
+    made = logs.read("l5", fixture.input)[0]
+    assert has_note(made, "1 states of a road user met twice")
+
+
+def test_tracks_of_one_id(tmp_path):
+    """Waymo's and CommonRoad's: the longest counts."""
+    fixture = waymo.write(tmp_path)
+    waymo.cars(count=2)(fixture)
+    made = logs.only("waymo", fixture.input)
+    assert [track.id for track in made.tracks] == ["1"]
+    assert has_note(made, "1 tracks with the id of another left out")
+    parts = (w.lanelet(), w.car(count=20), w.car(count=40))
+    made = logs.only("commonroad", w.commonroad(tmp_path / "a.xml", *parts))
+    assert [track.t.size for track in made.tracks] == [40]
+    assert has_note(made, "1 tracks with the id of another left out")
+    kept, notes = of_one_name([*made.tracks] * 3)
+    assert (len(kept), notes) == (3, [])
+
+
+def test_a_step_of_commonroad(tmp_path):
+    states = [w.state(k, 1.5 * k, 0) for k in (1, 2, 2, 3)]
+    path = w.commonroad(tmp_path / "a.xml", w.lanelet(), w.car(states=states))
+    made = logs.only("commonroad", path)
+    np.testing.assert_allclose(made.tracks[0].x, [0.0, 1.5, 3.0, 4.5])
+    assert has_note(made, "1 states of a step met twice")
+
+
+# ---------------------------------------------------------------------------- regions
+
+CIRCLE = "<circle><radius>1</radius><center><x>3</x><y>1</y></center></circle>"
+POLYGON = "<polygon>{}</polygon>".format(
+    "".join(w.POINT.format(*p) for p in [(2, 0), (4, 0), (4, 2), (2, 2)])
+)
+
+
+@pytest.mark.parametrize("shapes", [CIRCLE, POLYGON, CIRCLE + POLYGON])
+def test_a_region_is_its_middle(tmp_path, shapes):
+    place = w.POINT.format(3, 1)
+    states = [w.state(1, 1.5, 0.5), w.state(2, 3, 1).replace(place, shapes)]
+    path = w.commonroad(tmp_path / "a.xml", w.lanelet(), w.car(states=states))
+    made = logs.only("commonroad", path)
+    np.testing.assert_allclose([made.tracks[0].x[2], made.tracks[0].y[2]], [3.0, 1.0])
+    assert has_note(made, "1 states in a region")
+
+
+# ------------------------------------------------------------------------ without rows
+
+TABLES = ("csv", "interaction", "levelx", "ngsim_pairs", "openacc")
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_a_table_without_rows_is_empty(name, tmp_path):
+    """It is a recording without traffic, which an import counts and skips."""
+    fixture = write(name, tmp_path)
+    log = fixture.files[0]
+    lines = log.read_text().splitlines(keepends=True)
+    head = next(k for k, line in enumerate(lines) if line[:1].isdigit())
+    log.write_text("".join(lines[:head]))
+    (made, *_) = read_recordings(format_of(name), log)
+    assert made.tracks == ()
+    assert has_note(made, "rows: none")
+
+
+def test_no_pedestrians_beside_the_vehicles(tmp_path):
+    log, beside = write("interaction", tmp_path).files[:2]
+    assert beside.name.startswith("pedestrian_tracks")
+    beside.write_text(beside.read_text().partition("\n")[0] + "\n")
+    (made,) = read_recordings("interaction", log)
+    assert {track.kind for track in made.tracks} == {Kind.VEHICLE}

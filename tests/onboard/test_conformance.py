@@ -1,0 +1,141 @@
+"""The conformance cases: they are what JAX says, and the checker finds what differs."""
+
+import hashlib
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from onboard.conformance import check, make
+from rcirl_jax.export import load_weights
+from rcirl_jax.export.own_planner.plain import plain_scene
+from rcirl_jax.units import NUM_TIMES
+from tests.helpers.own_planner import TOLERANCE, entries, error, numpy_answers
+from tests.onboard.programs import ONBOARD
+
+# answers from a file of numbers for each case, named by what is on stdin
+ANSWERS = """
+import hashlib, json, sys
+given = hashlib.sha256(sys.stdin.read().encode()).hexdigest()
+print(*json.load(open({path!r}))[given])
+"""
+
+
+@pytest.fixture(scope="module")
+def cases():
+    return {case.name: case for case in check.read_cases(check.CASES)}
+
+
+def scenes():
+    return dict(make.cases())
+
+
+def positions(case):
+    """The stations and, if there are some, the offsets of a case [K, T]."""
+    rows = [line.split() for line in case.given.splitlines()]
+    found = {"s": [], "l": []}
+    for label, *words in rows:
+        if label in found and len(words) == NUM_TIMES:
+            found[label].append([float(word) for word in words])
+    s, l = (np.array(found[name], np.float32) for name in "sl")
+    return s, l if len(l) else None
+
+
+def test_the_cases_hold_the_scenes_of_the_package(cases):
+    assert list(cases) == list(scenes())
+    for name, made in scenes().items():
+        ways = positions(cases[name])
+        text = [make.line(*x) for x in entries(plain_scene(made), *ways)]
+        assert cases[name].given.splitlines() == [*text, "end"]
+
+
+def test_the_answers_are_those_of_the_numpy_file(cases):
+    """Which is compared with JAX in test_features.py."""
+    for name, made in scenes().items():
+        case = cases[name]
+        reward = load_weights(ONBOARD / "conformance" / case.weights)
+        assert case.columns == list(reward.names)
+        found, values = numpy_answers(reward, plain_scene(made), *positions(case))
+        wanted = np.array(case.rows).reshape(found.shape)
+        valid = case.valid
+        assert error(found[:, :valid], wanted[:, :valid]) <= TOLERANCE
+        assert error(values, np.array(case.scores)) <= TOLERANCE
+
+
+def test_every_column_takes_several_values(cases):
+    found = {}
+    for case in cases.values():
+        for name, column in zip(case.columns, np.array(case.rows).T, strict=True):
+            found.setdefault(name, set()).update(np.round(column, 3).tolist())
+    assert len(found) == 28
+    for name, values in found.items():
+        least = 2 if name in ("collision", "nudge_distance") else 5
+        assert len(values) >= least, name
+
+
+def answers(cases, folder, change):
+    """A program that answers as the file says, but for what `change` does to it."""
+    said = {}
+    for name, case in cases.items():
+        numbers = [value for _, value, _ in case.expected(features_only=False)]
+        said[hashlib.sha256(case.given.encode()).hexdigest()] = change(name, numbers)
+    path = folder / "answers.json"
+    path.write_text(json.dumps(said))
+    return [sys.executable, "-c", ANSWERS.format(path=str(path))]
+
+
+def checked(*command):
+    words = [sys.executable, ONBOARD / "conformance" / "check.py", *command]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    return done.returncode, done.stdout.strip(), done.stderr.strip().splitlines()
+
+
+def test_equal_answers_pass(cases, tmp_path):
+    command = answers(cases, tmp_path, lambda _, numbers: numbers)
+    count = len(cases)
+    assert checked(*command) == (0, f"conformance: {count} of {count} cases equal", [])
+
+
+def test_features_alone_can_be_checked(cases, tmp_path):
+    def without_scores(name, numbers):
+        return numbers[: -len(cases[name].scores)]
+
+    command = answers(cases, tmp_path, without_scores)
+    assert checked("--features-only", *command)[0] == 0
+    status, _, lines = checked(*command)
+    assert status == 1
+    assert lines[0].startswith("free_road: 1134 numbers: expected 1137")
+
+
+def test_one_wrong_number_is_named(cases, tmp_path):
+    def change(name, numbers):
+        place = 21 + cases[name].columns.index("follow_distance")  # time 1
+        return [
+            x + 1e-3 * (name == "follow" and i == place) for i, x in enumerate(numbers)
+        ]
+
+    status, said, lines = checked(*answers(cases, tmp_path, change))
+    assert (status, said) == (
+        1,
+        f"conformance: {len(cases) - 1} of {len(cases)} cases equal",
+    )
+    (line,) = lines
+    assert line.startswith("follow: features: candidate 0, time 1, follow_distance: ")
+
+
+def test_times_that_do_not_count_may_be_anything(cases, tmp_path):
+    def change(name, numbers):
+        case = cases[name]
+        counts = [c for *_, c in case.expected(features_only=False)]
+        return [x if c else 7e7 for x, c in zip(numbers, counts, strict=True)]
+
+    assert checked(*answers(cases, tmp_path, change))[0] == 0
+
+
+def test_programs_that_fail_are_named():
+    status, _, (line,) = checked(sys.executable, "-c", "raise SystemExit(3)")
+    assert (status, line) == (2, "free_road: exit status 3: nothing on stderr")
+    assert checked("/none/such")[0] == 2
+    assert checked()[0] == 2
