@@ -19,8 +19,9 @@ if TYPE_CHECKING:
     )
     from rcirl_jax.api.evidence import format_report, gate, rank, simulate
     from rcirl_jax.api.insight import feature_prices, response_curves
-    from rcirl_jax.api.learning import train_reward, tune
+    from rcirl_jax.api.learning import train_reward
     from rcirl_jax.api.logs import import_logs, read_logs
+    from rcirl_jax.api.tuning import tune
     from rcirl_jax.data.store.dataset import open_dataset
     from rcirl_jax.errors import InputError
     from rcirl_jax.export.own_planner.builder import scene_from
@@ -66,7 +67,8 @@ _PLACES = {
     **dict.fromkeys(("as_seen", "sample_candidates"), "api.candidates"),
     **dict.fromkeys(("candidates_from", "compute_features"), "api.candidates"),
     "score_candidates": "api.candidates",
-    **dict.fromkeys(("train_reward", "tune"), "api.learning"),
+    "train_reward": "api.learning",
+    "tune": "api.tuning",
     **dict.fromkeys(("Reward", "WeightsError", "load_weights"), "export.reader"),
     **dict.fromkeys(("feature_prices", "response_curves"), "api.insight"),
     **dict.fromkeys(("format_report", "gate", "rank", "simulate"), "api.evidence"),

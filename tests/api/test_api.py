@@ -37,8 +37,21 @@ def test_a_name_that_is_none_of_it():
         rcirl_jax.nothing  # noqa: B018
 
 
-def test_reading_weights_loads_no_jax():
-    text = "import sys, rcirl_jax; rcirl_jax.load_weights; print('jax' in sys.modules)"
+@pytest.mark.parametrize(
+    ("names", "absent"),
+    [
+        (["load_weights", "Reward", "InputError"], "jax"),
+        # only the report draws: nobody else needs its extra, or loses a backend to it
+        (sorted(set(rcirl_jax.__all__) - {"tune"}), "matplotlib"),
+    ],
+    ids=["weights", "all but tune"],
+)
+def test_what_a_name_does_not_load(names, absent):
+    text = (
+        "import sys, rcirl_jax\n"
+        f"[getattr(rcirl_jax, name) for name in {names}]\n"
+        f"print({absent!r} in sys.modules)"
+    )
     done = subprocess.run(
         [sys.executable, "-c", text], capture_output=True, text=True, check=True
     )
