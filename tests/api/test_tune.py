@@ -1,21 +1,42 @@
 """The whole loop by one call."""
 
+import json
+import subprocess
+import sys
+
 import pytest
 
+from tests.docs.pages import REPO
+
+TWICE = """
+import sys
 import rcirl_jax
+for _ in range(2):
+    verdict = rcirl_jax.tune(
+        sys.argv[1], sys.argv[2], recipe="quick", epochs=1, suite="stopped_lead",
+        cases=30, duration_s=2.0, drives=8,
+    )
+print("decision:", verdict.decision)
+"""
 
 
 @pytest.mark.slow
+@pytest.mark.multiprocess
 def test_it_ends_with_the_verdict_of_the_folder(examples, tmp_path):
-    given = {"suite": "stopped_lead", "cases": 30, "duration_s": 2.0, "drives": 8}
-    data, run = examples / "data", tmp_path / "run"
-    verdict = rcirl_jax.tune(data, run, recipe="quick", epochs=1, **given)
-    assert verdict.cases == 30
-    assert verdict.decision != "ship"  # on a part of the suite
-    for name in ("weights.msgpack", "report.html", "verdict.json"):
-        assert (run / name).is_file(), name
-    assert verdict.sentence in rcirl_jax.format_report(verdict).replace("\n", " ")
-    before = (run / "weights.msgpack").stat().st_mtime_ns
-    again = rcirl_jax.tune(data, run, recipe="quick", epochs=1, **given)
-    assert again == verdict
-    assert (run / "weights.msgpack").stat().st_mtime_ns == before
+    """And keeps all stages when it is called again."""
+    run = tmp_path / "run"
+    done = subprocess.run(
+        [sys.executable, "-c", TWICE, examples / "data", run],
+        capture_output=True, text=True, check=False, cwd=REPO,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+    verdict = json.loads((run / "verdict.json").read_text())
+    assert verdict["cases"] == 30
+    assert done.stdout.splitlines()[-1] == f"decision: {verdict['decision']}"
+    assert verdict["decision"] != "ship"  # on a part of the suite
+    assert (run / "weights.msgpack").is_file()
+    assert (run / "report.html").is_file()
+    stages = [x for x in done.stdout.splitlines() if x.startswith("[")]
+    half = len(stages) // 2
+    assert not [x for x in stages[:half] if x.endswith("kept")]
+    assert all(x.endswith("kept") for x in stages[half:])
