@@ -50,7 +50,8 @@ EXACT := $(addprefix tests/,evaluation/test_recorded_training.py \
 QUICK_XLA := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false
 TEST = $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal -m "$(MARKS)"
 
-.PHONY: demo test test-slow test-long test-dataset test-floor test-ceiling lint bench docs onboard setup
+.PHONY: demo test test-slow test-long test-dataset test-floor test-ceiling lint bench docs notebooks onboard
+.PHONY: setup
 .PHONY: lock audit wheel clean reliability fuzz
 
 setup: $(VENV)/.installed
@@ -158,6 +159,12 @@ docs: export NO_MKDOCS_2_WARNING = 1
 docs: setup
 	$(BIN)/python -m mkdocs build --strict --quiet
 	@echo "site: build/site/index.html"
+
+# docs/notebooks run anew, with their outputs but not their progress bars; compiled as `make test` does
+notebooks: export PYTHONPATH = .
+notebooks: export XLA_FLAGS = $(QUICK_XLA)
+notebooks: setup
+	$(BIN)/python -m tests.docs.notebooks
 
 # C++ reader; needs cmake, a C++17 compiler and libmsgpack-dev
 onboard:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import psutil
 
-from experiments.flags.common import processor, provenance
+from experiments.flags.common import provenance
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.data.scenes.config import CollectConfig
@@ -23,6 +23,7 @@ from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import RewardConfig, init_reward, pinned
 from rcirl_jax.runtime.atomic_files import write_json
+from rcirl_jax.runtime.provenance import processor
 from rcirl_jax.types import Normaliser, RewardParams
 
 STRIDE_S = 60.0  # s between planning frames of the synthetic dataset

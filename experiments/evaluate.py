@@ -12,13 +12,11 @@ from absl import flags
 
 from experiments.flags.common import provenance, run
 from experiments.flags.executor import executor
+from rcirl_jax.api.evidence import rank
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.resplit import with_tags
-from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.evaluation.ranking.format import format_table
 from rcirl_jax.evaluation.ranking.table import to_json
-from rcirl_jax.export.loading import load_runs
 from rcirl_jax.runtime.atomic_files import write_json
 
 _WEIGHTS = flags.DEFINE_list("weights", None, "weights files", required=True)
@@ -35,18 +33,15 @@ _WIDTH = flags.DEFINE_integer("width", 118, "columns of the printed table")
 
 def main() -> None:
     """Flags -> one report."""
-    if not 0.0 < _HORIZON.value <= 8.0:
-        raise InputError(f"--horizon: {_HORIZON.value}: expected above 0, at most 8 s")
-    learned, preset, sampler = load_runs(_WEIGHTS.value)
-    setup = RankingSetup(
-        preset=preset,
-        sampler=sampler,
+    dataset = with_tags(open_dataset(_DATA.value), _TAGS.value)
+    report = rank(
+        _WEIGHTS.value,
+        dataset,
         horizon_s=_HORIZON.value,
         split=_SPLIT.value,
         drop_collisions=_FILTER.value,
+        executor=executor(),
     )
-    dataset = with_tags(open_dataset(_DATA.value), _TAGS.value)
-    report = evaluate_ranking(dataset, learned, setup, executor())
     print(format_table(report, _WIDTH.value))
     if _OUTPUT.value:
         output = Path(_OUTPUT.value)

@@ -21,15 +21,11 @@ from experiments.flags.executor import executor
 from experiments.flags.suite import suite
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.closed_loop.files import runs_of
-from rcirl_jax.evaluation.closed_loop.likeness import DRIVES, held_out_likeness
-from rcirl_jax.evaluation.gate.decision import judge
+from rcirl_jax.evaluation.closed_loop.likeness import DRIVES
 from rcirl_jax.evaluation.gate.output import format_verdict, write_verdict
-from rcirl_jax.evaluation.gate.runs import pair_of
-from rcirl_jax.export.gate_job import drive_job, gate_job, left_out
+from rcirl_jax.export.gate_job import gate_job, judged
 from rcirl_jax.export.tuned_idm import idm_left_out, read_tuned_idm
 from rcirl_jax.planner.safety import TRACKS
-from rcirl_jax.simulation.recorded.scenes import held_out
 from rcirl_jax.simulation.rows import BASELINES
 
 _CANDIDATE = flags.DEFINE_string("candidate", None, "weights file", required=True)
@@ -65,18 +61,12 @@ def main() -> None:
     if said := idm_left_out(_IDM.value):
         print(said)
     sources = [open_dataset(url) for url in _DATA.value]
-    result = drive_job(job, executor())
-    known = None
-    if sources:
-        report = held_out_likeness(
-            held_out(sources, _DRIVES.value), job.rows(), job.plan_every
-        )
-        known = report.likeness
-        print(report.text())
-    pair = pair_of(runs_of(result), incumbent, config.nulls, known)
-    verdict = judge(pair, config, left_out(job))
+    found = judged(job, incumbent, config, executor(), sources, _DRIVES.value)
+    if found.likeness is not None:
+        print(found.likeness.text())
+    verdict = found.verdict
     files = {"candidate": _CANDIDATE.value, "incumbent": _INCUMBENT.value}
-    facts = {"files": files, **result.facts, "made_by": provenance(job.weights)}
+    facts = {"files": files, **found.facts, "made_by": provenance(job.weights)}
     write_verdict(output, verdict, config, facts)
     print(format_verdict(verdict))
     print(f"written: {output}; exit status {verdict.exit_code}")

@@ -24,9 +24,10 @@ from pathlib import Path
 from absl import flags
 
 from benchmarks.common import write
-from experiments.flags.common import HOOK_VARIABLES, git_commit, run
+from experiments.flags.common import run
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.pipeline import digest, file_sha256
+from rcirl_jax.runtime.provenance import HOOK_VARIABLES, git_commit
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "reliability.md"

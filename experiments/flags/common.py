@@ -1,38 +1,25 @@
 """What the experiment files share: running, reading flags, provenance."""
 
 import os
-import platform
-import shutil
-import subprocess
 import sys
 import tempfile
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import NoReturn
 
 import jax
 from absl import app, flags, logging
 
-from rcirl_jax import __version__
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.reader import load_weights
+from rcirl_jax.runtime import provenance as made_by
 from rcirl_jax.runtime import signals as interrupts
 from rcirl_jax.runtime.atomic_files import is_text
-from rcirl_jax.runtime.pipeline import code_sha256
 
 EXIT_BAD_INPUT = 2
 EXIT_FAULT = 70  # of this program, as sysexits.h has it
-# variables that decide how numbers are rounded
-COMPILER = (
-    *("XLA_FLAGS", "JAX_ENABLE_X64", "JAX_DISABLE_JIT"),
-    *("JAX_DEFAULT_MATMUL_PRECISION", "JAX_NUMPY_DTYPE_PROMOTION"),
-)
-HOOK_VARIABLES = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE")
-
-
 NO_MEMORY = "RESOURCE_EXHAUSTED"  # how JAX's errors begin that come of its want
 
 
@@ -170,7 +157,7 @@ def hidden_sizes(values: list[str], flag: str = "hidden_size") -> tuple[int, ...
 def provenance(weights: Sequence[str] = ()) -> dict:
     """Flags of one experiment file, git commit, versions and machine.
 
-    Starts JAX's devices: after `join_processes` where there are several processes.
+    Starts JAX's devices, as `rcirl_jax.runtime.provenance.provenance`.
 
     Args:
       weights: weights files that were read; their hashes name them.
@@ -179,22 +166,10 @@ def provenance(weights: Sequence[str] = ()) -> dict:
       InputError: a weights file is missing or damaged.
     """
     own = flags.FLAGS.get_key_flags_for_module(sys.argv[0])
-    packages = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
     read = {str(path): load_weights(path).sha256 for path in weights}
     return {
         "flags": {flag.name: flag.value for flag in own},
-        "git_commit": git_commit(),
-        "code_sha256": code_sha256(),
-        "environment": {k: v for k, v in os.environ.items() if k in COMPILER and v},
-        "versions": {
-            "python": platform.python_version(),
-            "rcirl-jax": __version__,
-            **{name: metadata.version(name) for name in (*packages, "tensorstore")},
-        },
-        "machine": platform.machine(),
-        **processor(),
-        "device": jax.devices()[0].device_kind,
-        "devices": jax.device_count(),
+        **made_by.provenance(),
         **({"weights_sha256": read} if read else {}),
     }
 
@@ -213,44 +188,3 @@ def made_by_file(
         dataset.write_facts({**facts, "made_by": provenance()})
 
     return write
-
-
-def processor() -> dict:
-    """Model of the CPU and the cores that this process may use."""
-    model, file = platform.processor(), Path("/proc/cpuinfo")
-    if file.exists():
-        lines = file.read_text().splitlines()
-        names = [x.split(":", 1)[1].strip() for x in lines if "model name" in x]
-        model = names[0] if names else model
-    told = hasattr(os, "sched_getaffinity")  # not on macOS
-    cores = len(os.sched_getaffinity(0)) if told else os.cpu_count()
-    return {"cpu": model, "cores": cores}
-
-
-def git_commit() -> str:
-    """The checkout's commit, with "+" when it has changes; "" outside of one.
-
-    An installed package reports nothing, even below another repository's folder.
-    """
-    root = Path(__file__).resolve().parents[2]
-    if shutil.which("git") is None:
-        return ""
-    # neither a folder above nor a hook's variables may name another repository
-    given = {k: v for k, v in os.environ.items() if k not in HOOK_VARIABLES}
-    env = {**given, "GIT_CEILING_DIRECTORIES": str(root.parent)}
-
-    def git(*words: str) -> str:
-        done = subprocess.run(
-            ["git", "-C", str(root), *words],
-            capture_output=True,
-            text=True,
-            check=False,
-            env=env,
-        )
-        return done.stdout.strip() if done.returncode == 0 else ""
-
-    if not git("ls-files", "experiments/flags/common.py"):  # installed beside its files
-        return ""
-    commit = git("rev-parse", "HEAD")
-    dirty = git("status", "--porcelain", "--untracked-files=no")
-    return commit + ("+" if commit and dirty else "")

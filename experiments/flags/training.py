@@ -11,10 +11,10 @@ from absl import flags
 
 from experiments.flags.common import floats, hidden_sizes
 from experiments.flags.recipe import AS_SAID, recipe
-from rcirl_jax.autotune.recipes import reward_config
+from rcirl_jax.autotune.recipes import departing
 from rcirl_jax.data.store.joined import EQUAL
 from rcirl_jax.errors import InputError
-from rcirl_jax.reward import LOSSES, RewardConfig
+from rcirl_jax.reward import LOSSES
 from rcirl_jax.reward.config import CONSTRAINTS, PINS
 from rcirl_jax.sampling.config import MODES
 from rcirl_jax.train.state import (
@@ -106,36 +106,19 @@ def training_config(
       hidden: units per layer, whatever recipe and flags say.
     """
     base = recipe().train
-    given = _given(_TRAIN)
+    given = _given({**_TRAIN, **_REWARD})
     if (margins := _value(_MARGINS)) is not None:
         if len(margins) != 3:
             raise InputError(f"--margins: {margins}: expected three numbers")
         names = ("margin_distance", "margin_collision", "margin_rule")
         given |= dict(zip(names, floats(margins, "margins"), strict=True))
-    sampler = base.sampler
     if (mode := _value(_MODE)) is not None:
-        sampler = dataclasses.replace(sampler, mode=mode)
-    return dataclasses.replace(
-        base,
-        **given,
-        seed=seed,
-        reward=_network(base.reward, given.get("features", base.features), hidden),
-        sampler=sampler,
-    )
-
-
-def _network(
-    base: RewardConfig, features: str, hidden: tuple[int, ...] | None
-) -> RewardConfig:
-    settings = {n: getattr(base, n) for n in ("hidden", *_REWARD)} | _given(_REWARD)
+        given["sampler"] = dataclasses.replace(base.sampler, mode=mode)
     if (units := _value(_HIDDEN)) is not None:
-        settings["hidden"] = hidden_sizes(units)
+        given["hidden"] = hidden_sizes(units)
     if hidden is not None:
-        settings["hidden"] = hidden
-    by_context = _value(_BY_CONTEXT)
-    return reward_config(
-        features, settings, bool(base.context) if by_context is None else by_context
-    )
+        given["hidden"] = hidden
+    return departing(base, given, seed=seed, by_context=_value(_BY_CONTEXT))
 
 
 def _given(named: Mapping[str, flags.FlagHolder]) -> dict[str, Any]:

@@ -32,6 +32,7 @@ DEFAULT = "tuned"
 TABLES = ("about", "train", "collect", "rehearsal", "anchor", "autotune")
 # of a run, not of a recipe
 NOT_OF_A_RECIPE = ("seed", "reward", "sampler")
+PRESETS_OWN = ("context", "signs")  # of a reward, what its feature preset says
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -114,6 +115,37 @@ def reward_config(
     )
 
 
+def departing(
+    base: TrainConfig,
+    given: Mapping[str, Any],
+    *,
+    seed: int = 0,
+    by_context: bool | None = None,
+) -> TrainConfig:
+    """A training that departs from a recipe's.
+
+    Args:
+      base: the recipe's.
+      given: fields of `TrainConfig`, and of its `RewardConfig` beside them.
+      seed: of initial weights, batches, candidates.
+      by_context: whether the scene sets the gains; None: as in the recipe.
+
+    Raises:
+      InputError: a value that cannot be.
+    """
+    fields = [field.name for field in dataclasses.fields(RewardConfig)]
+    of_reward = [name for name in fields if name not in PRESETS_OWN]
+    settings = {name: getattr(base.reward, name) for name in of_reward}
+    settings |= {name: value for name, value in given.items() if name in of_reward}
+    rest = {name: value for name, value in given.items() if name not in of_reward}
+    reward = reward_config(
+        rest.get("features", base.features),
+        settings,
+        bool(base.reward.context) if by_context is None else by_context,
+    )
+    return dataclasses.replace(base, **rest, seed=seed, reward=reward)
+
+
 def _reward(path: Path, found: dict, features: str) -> RewardConfig:
     where = "train.reward"
     by_context = found.pop("by_context", False)
@@ -122,7 +154,7 @@ def _reward(path: Path, found: dict, features: str) -> RewardConfig:
             f"{path}: [{where}] by_context: {by_context}: expected true or false"
         )
     known = f"{path}: [{where}] "
-    typed = typed_fields(RewardConfig, found, known, ("context", "signs"))
+    typed = typed_fields(RewardConfig, found, known, PRESETS_OWN)
     made = lambda **settings: reward_config(features, settings, by_context)  # noqa: E731
     return _built(path, where, made, typed)
 

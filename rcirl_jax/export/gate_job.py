@@ -1,20 +1,30 @@
-"""Which rows and cases a gate drives, by names and files."""
+"""Which rows and cases a gate drives, by names and files, and what comes of it."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.closed_loop.files import runs_of
+from rcirl_jax.evaluation.closed_loop.likeness import (
+    DRIVES,
+    LikenessReport,
+    held_out_likeness,
+)
 from rcirl_jax.evaluation.closed_loop.suite import (
     SuiteConfig,
     SuiteResult,
     run_suite,
 )
-from rcirl_jax.evaluation.gate.runs import CANDIDATE, INCUMBENT, repeats
+from rcirl_jax.evaluation.gate.decision import judge
+from rcirl_jax.evaluation.gate.runs import CANDIDATE, INCUMBENT, pair_of, repeats
+from rcirl_jax.evaluation.gate.types import GateConfig, Verdict
 from rcirl_jax.export.spread import SuiteJob, drive_by
 from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.runtime.executors import Executor
 from rcirl_jax.simulation.cases import STEP_S
+from rcirl_jax.simulation.recorded.scenes import held_out
 from rcirl_jax.simulation.rows import BASELINES
 from rcirl_jax.simulation.suite import FULL_S, CaseRef, case_duration, suite_refs
 
@@ -81,6 +91,46 @@ def drive_job(job: SuiteJob, executor: Executor) -> SuiteResult:
     result = run_suite(rows, job.cases(), config, drive_by(executor, job))
     repeats(rows[0], result, config)
     return result
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Judged:
+    """A verdict and what it rests on."""
+
+    verdict: Verdict
+    likeness: LikenessReport | None  # of the held-out drives, if there are any
+    facts: Mapping[str, object]  # of the suite: hashes, memory
+
+
+def judged(
+    job: SuiteJob,
+    incumbent: str,
+    config: GateConfig,
+    executor: Executor,
+    sources: Sequence[Dataset] = (),
+    drives: int = DRIVES,
+) -> Judged:
+    """Drive a gate's job and judge it.
+
+    Args:
+      job: of `gate_job`.
+      incumbent: name of its row.
+      config: margins.
+      executor: where cases are driven.
+      sources: datasets whose held-out drives measure human-likeness.
+      drives: of them, in all.
+
+    Raises:
+      InputError: drives that do not repeat, or too few cases.
+    """
+    result, report = drive_job(job, executor), None
+    if sources:
+        recorded = held_out(sources, drives)
+        report = held_out_likeness(recorded, job.rows(), job.plan_every)
+    known = None if report is None else report.likeness
+    pair = pair_of(runs_of(result), incumbent, config.nulls, known)
+    verdict = judge(pair, config, left_out(job))
+    return Judged(verdict=verdict, likeness=report, facts=result.facts)
 
 
 def left_out(job: SuiteJob) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.score import OnTop
 from rcirl_jax.export.reader import Anchor, Reward, WeightsError, load_weights
-from rcirl_jax.features.mapping import feature_map, known_presets
+from rcirl_jax.features.mapping import FeatureMap, feature_map, known_presets
 from rcirl_jax.reward.module import LEAKY_SLOPE, module_value, network_of, variables_of
 from rcirl_jax.reward.support import Support
 from rcirl_jax.sampling import SamplerConfig
@@ -36,18 +36,31 @@ def open_reward(path: str) -> Reward:
     """
     try:
         reward = load_weights(path)
-        known = known_presets()
-        if reward.preset not in known:
-            raise InputError(
-                f"{reward.file}: preset: {reward.preset}: "
-                f"expected one of {', '.join(known)}"
-            )
-        features = feature_map(reward.preset)
+    except WeightsError as error:
+        raise InputError(str(error)) from error
+    features_of(reward)
+    check_provenance(reward.provenance, reward.file)
+    return reward
+
+
+def features_of(reward: Reward) -> FeatureMap:
+    """The features that a reward reads, as this package computes them.
+
+    Raises:
+      InputError: it computes others, or with other units.
+    """
+    known = known_presets()
+    if reward.preset not in known:
+        raise InputError(
+            f"{reward.file}: preset: {reward.preset}: "
+            f"expected one of {', '.join(known)}"
+        )
+    features = feature_map(reward.preset)
+    try:
         reward.check_features(features.names, [s.unit for s in features.specs])
     except WeightsError as error:
         raise InputError(str(error)) from error
-    check_provenance(reward.provenance, reward.file)
-    return reward
+    return features
 
 
 def check_provenance(found: Mapping[str, Any], file: str) -> None:

@@ -273,6 +273,13 @@ def load_weights(path: str | os.PathLike[str]) -> Reward:
     Raises:
       WeightsError: the file is missing, damaged, of another version, out of
         range, or does not reproduce its own verification samples.
+
+    Examples:
+        >>> reward = rcirl_jax.load_weights("weights.msgpack")
+        >>> features = np.tile(reward.none_values, (3, 18, 1))  # three, nothing near
+        >>> features[:, :, reward.names.index("velocity")] = [[8.0], [14.0], [25.0]]
+        >>> reward.value(features).shape
+        (3,)
     """
     try:
         file = os.fsdecode(path)

@@ -2,11 +2,13 @@
 
 import io
 import re
+import sys
 from pathlib import Path
 
 import matplotlib as mpl
 
-mpl.use("Agg")
+if "matplotlib.pyplot" not in sys.modules:  # a notebook keeps the backend that it has
+    mpl.use("Agg")
 
 import matplotlib.pyplot as plt
 from markupsafe import Markup

@@ -1,8 +1,9 @@
 """Which code made something: a hash of the modules that it uses.
 
 A module uses those that it imports anywhere in its text, those that they import, and
-the `__init__` of every package on the way. Docstrings and comments decide nothing. Of
-data_specs the folders count whose reader is among the modules.
+the `__init__` of every package on the way. Docstrings, comments and what stands under
+`if TYPE_CHECKING:` decide nothing. Of data_specs the folders count whose reader is
+among the modules.
 """
 
 import ast
@@ -72,13 +73,22 @@ def _file(name: str, package: Path) -> Path | None:
     return None
 
 
+class _Running(ast.NodeTransformer):
+    """Takes away what only type checkers read."""
+
+    def visit_If(self, node: ast.If) -> ast.AST | list[ast.stmt]:
+        """Of `if TYPE_CHECKING:` what stands under its `else`."""
+        for_types = isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
+        return node.orelse if for_types else self.generic_visit(node)
+
+
 @functools.cache
 def _parsed(path: Path) -> tuple[tuple[str, ...], str]:
     """What a file imports, and the sha256 of its syntax tree without docstrings.
 
     Of `from a import b` both a and a.b count: b may be a module.
     """
-    tree, names = ast.parse(path.read_bytes()), []
+    tree, names = _Running().visit(ast.parse(path.read_bytes())), []
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]

@@ -29,6 +29,7 @@ FAMILIES = (
     "random",
     "hard_negative",
     "in_force",  # what is left of the plan that is being driven
+    "given",  # somebody else's, by its positions
 )
 
 MIN_PHASE_S = 0.5  # s, shortest phase of a two-phase profile

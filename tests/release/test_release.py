@@ -15,9 +15,10 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
-from experiments.flags import common
+from rcirl_jax.runtime import provenance
 from tests.conftest import REPO
 
+OWN = "rcirl_jax/runtime/provenance.py"  # whose commit is asked for
 LOCKS = sorted((REPO / "requirements").glob("*.lock"))
 VERSIONS = ("3.11.7", "3.12.1", "3.13.0", "3.14.0")
 PIN = re.compile(
@@ -157,8 +158,8 @@ def git(folder, *words):
 def repository(tmp_path):
     """A repository with one commit of a file, ours if it is a checkout."""
     git(tmp_path, "init", "--quiet")
-    (tmp_path / "experiments" / "flags").mkdir(parents=True)
-    (tmp_path / "experiments" / "flags" / "common.py").write_text("1")
+    (tmp_path / "rcirl_jax" / "runtime").mkdir(parents=True)
+    (tmp_path / OWN).write_text("1")
     git(tmp_path, "add", ".")
     git(tmp_path, "commit", "--quiet", "--message=first")
     return tmp_path
@@ -166,23 +167,21 @@ def repository(tmp_path):
 
 def commit_of(root, monkeypatch):
     """What the package says when it lies in `root`."""
-    monkeypatch.setattr(
-        common, "__file__", str(root / "experiments" / "flags" / "common.py")
-    )
-    return common.git_commit()
+    monkeypatch.setattr(provenance, "__file__", str(root / OWN))
+    return provenance.git_commit()
 
 
 def test_the_commit_is_the_checkouts_that_knows_the_package(repository, monkeypatch):
     """Not of one that a package lies beside, as by `pip install --target=.`."""
     head = git(repository, "rev-parse", "HEAD")
-    own = repository / "experiments" / "flags" / "common.py"
+    own = repository / OWN
     assert commit_of(repository, monkeypatch) == head
     own.write_text("2")
     assert commit_of(repository, monkeypatch) == head + "+"
     with monkeypatch.context() as patch:
         patch.setattr(shutil, "which", lambda name: None)
         assert commit_of(repository, patch) == ""
-    git(repository, "mv", "experiments", "theirs")
+    git(repository, "mv", "rcirl_jax", "theirs")
     git(repository, "commit", "--quiet", "--message=second")
     own.parent.mkdir(parents=True)
     own.write_text("1")

@@ -44,6 +44,7 @@ def test_what_is_imported_anywhere_is_used(package):
         ("a", '"""Said otherwise."""\n\n# why\nfrom pack.b import value\n', False),
         ("alone", "import os\n", False),
         ("c", "NUMBER = (1)  # one\n", False),
+        ("c", "NUMBER = 1\nif TYPE_CHECKING:\n    from pack import alone\n", False),
     ],
 )
 def test_code_that_is_used_counts_and_words_do_not(package, name, text, counts):

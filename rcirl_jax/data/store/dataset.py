@@ -37,7 +37,17 @@ OPEN_SHARDS = 256  # shards whose arrays are kept open, 60 kB each
 
 
 class Dataset:
-    """A finished dataset, opened with `open_dataset`; rows are numbered 0 .. n-1."""
+    """A finished dataset, opened with `open_dataset`; rows are numbered 0 .. n-1.
+
+    `dataset[row]` is one scene and what the human did in it; loops run over all rows.
+    Of several at once `read` gives stacked arrays.
+
+        >>> dataset = rcirl_jax.open_dataset("data")
+        >>> held_out = dataset.indices("test")
+        >>> one = dataset[held_out[0]]
+        >>> one.human.v.shape, one.human.v.dtype
+        ((18,), dtype('float32'))
+    """
 
     def __init__(self, files: Files, manifest: Manifest) -> None:
         self.manifest = manifest
@@ -45,6 +55,14 @@ class Dataset:
         counts = [shard["count"] for shard in manifest.shards]
         self._starts = np.cumsum([0, *counts])
         self._open: dict[int, dict[str, ts.TensorStore]] = {}
+
+    def __getitem__(self, row: int) -> Demonstration:
+        """One row; numpy leaves without the row's axis.
+
+        Raises:
+          IndexError: no such row.
+        """
+        return jax.tree.map(lambda leaf: leaf[0], self.read(np.array([row])))
 
     @property
     def hash(self) -> str:
@@ -216,6 +234,12 @@ def open_dataset(url: str | os.PathLike[str], verify: bool = True) -> Dataset:
     Raises:
       InputError: no dataset, an interrupted import, another schema version, or
         damage; names the file.
+
+    Examples:
+        >>> dataset = rcirl_jax.open_dataset("data")
+        >>> train, test = dataset.indices("train"), dataset.indices("test")
+        >>> dataset.count == len(train) + len(test)
+        True
     """
     files = Files(url)
     raw = files.read_json(MANIFEST)

@@ -84,6 +84,18 @@ def scene_from(
 
     Raises:
       InputError: names the field, its value and what was expected.
+
+    Examples:
+        >>> from rcirl_jax import Body, Car, CentreLine
+        >>> scene = rcirl_jax.scene_from(
+        ...     ego=Car(x=3.0, y=0.2, heading=0.0, speed=12.0, length=4.9, width=2.1),
+        ...     centre_line=CentreLine(points=[[0, 0], [300, 0]], speed_limit=13.9),
+        ...     obstacles=[Body(x=40, y=0, heading=0, speed=8, length=4.5, width=1.8)],
+        ... )
+        >>> candidates = rcirl_jax.sample_candidates(scene)
+        >>> reward = rcirl_jax.load_weights("weights.msgpack")
+        >>> rcirl_jax.score_candidates(reward, scene, candidates).shape
+        (122,)
     """
     check_numbers("ego", ego)
     check("ego.speed", ego.speed, ego.speed >= 0.0, "0 m/s or more")

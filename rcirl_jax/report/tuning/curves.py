@@ -1,14 +1,5 @@
-"""How a reward's value follows each feature: response curves in physical units.
+"""Response curves as a picture: a panel for each feature."""
 
-    R_i(u) = mean over scenes of V(x with x_ti = u at all t), minus its value at the
-             median of what people drove, over the standard deviation of V among the
-             candidates of a scene
-
-x are the features of held-out humans. A reward's scale is free, so the unit is the
-spread among candidates: what one more standard deviation is worth.
-"""
-
-import dataclasses
 from collections.abc import Mapping
 
 import numpy as np
@@ -16,69 +7,14 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 
 from rcirl_jax.export.reader import Reward
+from rcirl_jax.export.responses import OUTER, Response, responses
 from rcirl_jax.report.charts import LOOKS, style_of
 from rcirl_jax.report.style import CANDIDATE, figure, svg
 from rcirl_jax.report.tuning.contributions import Contributions
 
-POINTS = 33  # of a curve
 BINS = 24  # of the density
-SCENES = 24  # of the contributions' that curves are the mean of
-OUTER = (0.005, 0.995)  # quantiles of the data between which curves are drawn
 COLUMNS = 4  # panels beside each other
 PANEL = 2.7, 1.8  # inches
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Response:
-    """One feature's curve for one reward."""
-
-    at: np.ndarray  # [POINTS] in the feature's unit
-    value: np.ndarray  # [POINTS] in standard deviations of V among candidates
-    supported: tuple[float, float]  # outside, the reward does not change
-
-
-def responses(
-    reward: Reward, mine: np.ndarray, theirs: np.ndarray, valid: np.ndarray
-) -> dict[str, Response]:
-    """Curves of all features that the reward uses.
-
-    Args:
-      reward: V is its `value`, also where it is anchored.
-      mine: [S, T, F] raw features of humans.
-      theirs: [S, K, T, F] of candidates of the same scenes.
-      valid: [S, T] bool; elsewhere features do not count.
-    """
-    few = slice(None, None, max(len(mine) // SCENES, 1))
-    spread = float(np.mean(np.std(reward.value(theirs, valid[:, None]), axis=1)))
-    human, mask = mine[few], valid[few]
-    found = {}
-    for i, name in enumerate(reward.names):
-        if reward.lower[i] >= reward.upper[i]:
-            continue
-        seen = (
-            mine[..., i][valid],
-            theirs[..., i][np.broadcast_to(valid[:, None], theirs.shape[:-1])],
-        )
-        low, high = np.quantile(np.concatenate(seen), OUTER)
-        low, high = min(low, reward.lower[i]), max(high, reward.upper[i])
-        low, high = np.clip((low, high), *_around(reward, i))
-        at = np.linspace(low, high, POINTS)
-        held = np.repeat(human[None], POINTS + 1, axis=0)
-        held[..., i] = np.append(at, np.median(seen[0]))[:, None, None]
-        values = np.mean(reward.value(held, mask), axis=1)
-        found[name] = Response(
-            at=at,
-            value=(values[:-1] - values[-1]) / max(spread, 1e-9),
-            supported=(float(reward.lower[i]), float(reward.upper[i])),
-        )
-    return found
-
-
-def _around(reward: Reward, i: int) -> tuple[float, float]:
-    """A feature's range in training, and a quarter of it more on either side."""
-    low, high = float(reward.lower[i]), float(reward.upper[i])
-    more = 0.25 * (high - low)
-    return low - more, high + more
 
 
 def response_curves(rewards: Mapping[str, Reward], found: Contributions) -> Markup:

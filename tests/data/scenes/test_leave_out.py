@@ -4,7 +4,6 @@ import dataclasses
 
 import pytest
 
-from experiments.flags.common import git_commit
 from rcirl_jax.data.importers import parts
 from rcirl_jax.data.importing import ImportConfig, import_parts
 from rcirl_jax.data.parts import Part, recordings_of
@@ -13,6 +12,7 @@ from rcirl_jax.data.recording import LEAVE_OUT
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
+from rcirl_jax.runtime.provenance import git_commit
 from tests.data.importers.formats import waymo
 from tests.data.small_logs import CONFIG, write_logs
 from tests.helpers import commands

@@ -1,0 +1,229 @@
+"""What is known of weights: ranking of held-out scenes, closed loop, verdict."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from rcirl_jax.data.store.dataset import Dataset, open_dataset
+from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.closed_loop.likeness import DRIVES
+from rcirl_jax.evaluation.closed_loop.output import format_suite
+from rcirl_jax.evaluation.closed_loop.suite import (
+    SuiteConfig,
+    SuiteResult,
+    run_suite,
+    write_suite,
+)
+from rcirl_jax.evaluation.gate.output import format_verdict, write_verdict
+from rcirl_jax.evaluation.gate.types import GateConfig, Verdict
+from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
+from rcirl_jax.evaluation.ranking.format import format_table
+from rcirl_jax.evaluation.ranking.table import RankingReport
+from rcirl_jax.export.gate_job import gate_job, judged
+from rcirl_jax.export.loading import load_runs, open_reward
+from rcirl_jax.export.spread import SuiteJob, drive_by
+from rcirl_jax.runtime.executors import Executor, Here
+from rcirl_jax.runtime.provenance import provenance
+from rcirl_jax.simulation.rows import BASELINES
+from rcirl_jax.simulation.suite import case_duration, suite_refs
+
+Place = str | os.PathLike[str]
+
+
+def rank(
+    weights: Place | Sequence[Place],
+    data: Place | Demonstrations,
+    *,
+    horizon_s: float = 5.0,
+    split: str = "test",
+    drop_collisions: bool = False,
+    executor: Executor | None = None,
+) -> RankingReport:
+    """Rank the candidates of held-out scenes by rewards, beside all baselines.
+
+    Args:
+      weights: file, or files; those of one loss and shape are the seeds of one row.
+      data: a dataset or its folder.
+      horizon_s: s at which distances to the human are taken, up to 8.
+      split: of the dataset.
+      drop_collisions: rank only candidates that meet nothing, in every row.
+      executor: where scenes are scored, of `rcirl_jax.runtime.executors`; None: here.
+
+    Returns:
+      The report: by row and metric an estimate with its 95 % interval, and paired
+      differences. `format_report` makes a table of it.
+
+    Raises:
+      InputError: files that cannot be read or do not fit together, or no scene that is
+        recorded so long.
+
+    Examples:
+        >>> report = rcirl_jax.rank("weights.msgpack", "data")
+        >>> report.rows["oracle"]["top1_fde"].value < 10.0  # m
+        True
+    """
+    if not 0.0 < horizon_s <= 8.0:
+        raise InputError(f"--horizon: {horizon_s}: expected above 0, at most 8 s")
+    learned, preset, sampler = load_runs(_files(weights))
+    setup = RankingSetup(
+        preset=preset,
+        sampler=sampler,
+        horizon_s=horizon_s,
+        split=split,
+        drop_collisions=drop_collisions,
+    )
+    dataset = open_dataset(data) if isinstance(data, str | os.PathLike) else data
+    return evaluate_ranking(dataset, learned, setup, executor)
+
+
+def simulate(
+    weights: Place | Sequence[Place],
+    *,
+    suite: str = "smoke",
+    cases: int | None = None,
+    duration_s: float | None = None,
+    baselines: Sequence[str] = BASELINES,
+    plan_every: int = 1,
+    output: Place | None = None,
+    executor: Executor | None = None,
+) -> SuiteResult:
+    """Drive rewards through the closed loop, beside rivals on the same cases.
+
+    Args:
+      weights: file, or files, a row each.
+      suite: "smoke" (a case of each family), "full", or families with commas.
+      cases: of each family; None: as declared.
+      duration_s: s of a case; None: 120, of "smoke" 20.
+      baselines: rival rows; none are driven for ().
+      plan_every: steps of 0.1 s between two plans.
+      output: folder for table.txt, suite.json and cases.csv; None: nothing is written.
+      executor: where cases are driven, of `rcirl_jax.runtime.executors`; None: here.
+
+    Returns:
+      The drives: `report` has rates with exact intervals by row, `runs` every metric of
+      every case. `format_report` makes a table of it.
+
+    Raises:
+      InputError: files that cannot be read, or a suite, family or row that is unknown.
+
+    Examples:
+        >>> result = rcirl_jax.simulate(
+        ...     "weights.msgpack", suite="stopped_lead", cases=2, duration_s=2.0,
+        ...     baselines=(),
+        ... )
+        >>> result.cases.ids
+        ('stopped_lead/000@0', 'stopped_lead/001@0')
+    """
+    job = SuiteJob(
+        weights=tuple(_files(weights)),
+        baselines=tuple(baselines),
+        refs=suite_refs(suite, cases),
+        duration_s=case_duration(suite, duration_s),
+        plan_every=plan_every,
+    )
+    made_by = _made_by(job)
+    config = SuiteConfig(plan_every=plan_every)
+    drive = drive_by(executor or Here(), job)
+    result = run_suite(job.rows(), job.cases(), config, drive)
+    if output is not None:
+        write_suite(result, Path(output), made_by)
+    return result
+
+
+def gate(
+    candidate: Place,
+    incumbent: Place = "hand-set",
+    *,
+    data: Place | Dataset | Sequence[Place | Dataset] = (),
+    suite: str = "full",
+    cases: int | None = None,
+    duration_s: float | None = None,
+    drives: int = DRIVES,
+    margins: GateConfig | None = None,
+    output: Place | None = None,
+    executor: Executor | None = None,
+) -> Verdict:
+    """Judge whether a candidate may replace the incumbent.
+
+    Both drive the same cases; never is a learned reward the judge (docs/gate.md).
+
+    Args:
+      candidate: weights file.
+      incumbent: weights file, or a baseline's name.
+      data: datasets whose held-out drives say how near to people it drives; without
+        any that is not measured, and nothing ships.
+      suite: as `simulate`; nothing ships on a part of "full".
+      cases: as `simulate`.
+      duration_s: as `simulate`.
+      drives: held-out drives in all.
+      margins: what counts as a loss; None: those of docs/gate.md.
+      output: JSON to write; None: nothing is written.
+      executor: as `simulate`.
+
+    Returns:
+      The verdict: `decision` is "ship", "do not ship", "no difference" or "could not
+      judge"; `sentence`, `reasons` and `look_at` (ids of cases) say why.
+
+    Raises:
+      InputError: files that cannot be read, or fewer than 30 cases.
+
+    Examples:
+        >>> verdict = rcirl_jax.gate(
+        ...     "weights.msgpack", "constant V", suite="stopped_lead", cases=30,
+        ...     duration_s=2.0,
+        ... )
+        >>> verdict.decision == "ship"  # on a part of the suite
+        False
+    """
+    config = margins or GateConfig()
+    job, row = gate_job(
+        os.fspath(candidate),
+        os.fspath(incumbent),
+        suite=suite,
+        cases=cases,
+        duration_s=duration_s,
+        catalogue_seed=0,
+        plan_every=1,
+        rivals=("IDM", *(name for name in config.nulls if name in BASELINES)),
+    )
+    sources = [
+        one if isinstance(one, Dataset) else open_dataset(one) for one in _each(data)
+    ]
+    found = judged(job, row, config, executor or Here(), sources, drives)
+    if output is not None:
+        files = {"candidate": os.fspath(candidate), "incumbent": os.fspath(incumbent)}
+        facts = {"files": files, **found.facts, "made_by": _made_by(job)}
+        write_verdict(Path(output), found.verdict, config, facts)
+    return found.verdict
+
+
+def format_report(found: RankingReport | SuiteResult | Verdict) -> str:
+    """Make a table to be printed of what `rank`, `simulate` or `gate` found.
+
+    Examples:
+        >>> report = rcirl_jax.rank("weights.msgpack", "data")
+        >>> table = rcirl_jax.format_report(report)
+        >>> "hand-set" in table, "oracle" in table
+        (True, True)
+    """
+    if isinstance(found, Verdict):
+        return format_verdict(found)
+    if isinstance(found, SuiteResult):
+        return format_suite(found.report)
+    return format_table(found)
+
+
+def _files(weights: Place | Sequence[Place]) -> list[str]:
+    return [os.fspath(one) for one in _each(weights)]
+
+
+def _each(given: object) -> list:
+    """What may be one or several as a list."""
+    return list(given) if isinstance(given, list | tuple) else [given]
+
+
+def _made_by(job: SuiteJob) -> dict:
+    """Provenance of a suite, with the hashes of its rewards."""
+    hashes = {file: open_reward(file).sha256 for file in job.weights}
+    return {**provenance(), "weights_sha256": hashes}
