@@ -90,6 +90,6 @@ def prices(reward: Reward, mine: np.ndarray, valid: np.ndarray) -> dict[str, flo
         moved = np.repeat(mine[None], 2, axis=0)
         moved[0, ..., i] += step
         moved[1, ..., i] -= step
-        values = reward.value(moved, valid).mean(axis=1, dtype=np.float64)
+        values = np.asarray(reward.value(moved, valid).mean(axis=1, dtype=np.float64))
         found[name] = float(values[0] - values[1]) / (2.0 * float(step))
     return found

@@ -1,5 +1,6 @@
 """The loop by its command: once, again; `slow`: changed, damaged."""
 
+import html
 import json
 
 import pytest
@@ -53,7 +54,7 @@ def test_a_small_loop(tmp_path):
     assert verdict["files"]["incumbent"] == "hand-set"
     page = (run / "report.html").read_text()
     assert verdict["decision"] in page
-    assert f"&quot;recipe&quot;: &quot;{own}&quot;" in page
+    assert f'"recipe": "{own}"' in html.unescape(page)
     assert verdict["training_runs"] == 1
     left_out = "30 cases, 4,110 of the full suite's left out; cases of 2 s instead of"
     assert verdict["part"].startswith(left_out)

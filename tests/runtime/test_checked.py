@@ -79,5 +79,7 @@ def test_what_does_not_fit_is_one_line(body, line):
 
 
 def test_an_unknown_field_is_told_the_known_ones():
-    with pytest.raises(InputError, match=r"^a: share: unknown: expected shares$"):
+    with pytest.raises(
+        InputError, match=r"^a: share: unknown: expected shares; did you mean shares\?$"
+    ):
         checked({"shares": [1], "share": 2}, Part, "a")

@@ -22,7 +22,7 @@ from tests.helpers.stored import assert_same_bits
 from tests.train.worker import CONFIG
 
 STEPS = 6  # 21 rows, batches of 8, two epochs
-SHARD_JUMPS = 3  # of the time of day, in an import that is cut short once
+SHARD_JUMPS = 4  # one for each of three shards, and for the one that is cut short
 
 
 @pytest.fixture(scope="module")

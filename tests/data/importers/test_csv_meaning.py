@@ -344,13 +344,14 @@ def test_unknown_options_are_one_line(tmp_path):
     line = refused(path, people.spec(tmp_path, columns))
     assert line.endswith("did you mean heading?")
     line = refused(path, people.spec(tmp_path, rest="[defaults]\nlenght = 4.2"))
-    assert "defaults.lenght: unknown: expected one of rate_hz, length" in line
+    assert "defaults.lenght: unknown: expected some of rate_hz, length" in line
     assert line.endswith("did you mean length?")
     lanes = '[[lanes]]\nid = "a"\npoints = [[0.0, 0.0], [9.0, 0.0]]\nspeedlimit = 9.0'
     line = refused(path, people.spec(tmp_path, rest=lanes))
     assert line.endswith("did you mean speed_limit?")
     line = refused(path, people.spec(tmp_path, rest='[lanes]\nfiel = "lanes.csv"'))
-    assert "source TOML: lanes.fiel: unknown: expected one of file" in line
+    assert "source TOML: lanes.fiel: unknown: expected some of" in line
+    assert line.endswith("did you mean file?")
 
 
 # ------------------------------------------------------------------------- flags
