@@ -146,6 +146,7 @@ def test_an_import_refuses_a_scene_that_is_not_finite(tmp_path):
         DatasetWriter(tmp_path / "d"), importing.ImportConfig(format="synthetic")
     )
     known = {f.name: None for f in dataclasses.fields(Cut)}
+    known |= {"rate_hz": 10.0}
     cut = Cut(**{**known, "name": "log", "scenes": made, "quality": {}, "refused": "",
                  "vehicles": ["v"] * COUNT, "groups": ["g"] * COUNT})  # fmt: skip
     with pytest.raises(InputError, match=r"^log: scene 5 \(.*\): scene\.ego\.v: not"):
