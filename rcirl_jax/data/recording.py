@@ -57,14 +57,13 @@ def accepted(
 
 def refusal(name: str, error: InputError) -> Recording:
     """What stands for a recording that is left out."""
+    return dataclasses.replace(empty_recording(name), refused=str(error))
+
+
+def empty_recording(name: str, *notes: str) -> Recording:
+    """What stands for a file in which nobody drives; imports count and skip it."""
     return Recording(
-        name=name,
-        source="",
-        licence="",
-        rate_hz=0.0,
-        tracks=(),
-        lanes=(),
-        refused=str(error),
+        name=name, source="", licence="", rate_hz=0.0, tracks=(), lanes=(), notes=notes
     )
 
 

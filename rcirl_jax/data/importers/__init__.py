@@ -18,6 +18,7 @@ from rcirl_jax.data.importers.format import Format
 from rcirl_jax.data.importers.options import STATED, check_options
 from rcirl_jax.data.readers.tables.ledger import NoRowsError
 from rcirl_jax.data.readers.tables.streams import refuse_pointer
+from rcirl_jax.data.recording import empty_recording
 from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.runtime.atomic_files import is_text
 from rcirl_jax.runtime.specs import load_toml, spec_root
@@ -42,20 +43,7 @@ def read_part(name: str, path: Path, spec: dict) -> Iterator[Recording]:
         except NoRowsError as error:
             if error.path != path:
                 raise  # a table beside the log
-            yield _empty(log_name(path, spec, path.name), error)
-
-
-def _empty(name: str, error: NoRowsError) -> Recording:
-    """What stands for a file in which nobody drives; imports count and skip it."""
-    return Recording(
-        name=name,
-        source="",
-        licence="",
-        rate_hz=0.0,
-        tracks=(),
-        lanes=(),
-        notes=(str(error),),
-    )
+            yield empty_recording(log_name(path, spec, path.name), str(error))
 
 
 def pieces(name: str, path: Path, spec: dict) -> list[dict]:

@@ -16,6 +16,7 @@ from rcirl_jax.data.importers.apollo.messages import (
     Rows,
     check_held,
 )
+from rcirl_jax.data.importers.messages import between
 from rcirl_jax.errors import InputError
 
 MAX_DURATION_S = 86400.0  # s, of one drive
@@ -56,7 +57,7 @@ class Held:
         recorded = [table[-1, 1] for table in tables if len(table)]
         return max(recorded, default=-math.inf) + self._offset - self._start
 
-    def next_position(self, since: float) -> float:
+    def next_place(self, since: float) -> float:
         """Time [s] of the first position held from a time on; inf without one."""
         clocks = [self.clock(name) for name in HELD if name != "chassis"]
         clock = np.concatenate(clocks)
@@ -144,11 +145,7 @@ class Held:
 
     def _rows(self, name: str, low: float, high: float = math.inf) -> np.ndarray:
         """Rows between two times [s], the chassis' in force at the first included."""
-        clock = self.clock(name)
-        kept = (clock >= low) & (clock < high)
-        before = np.where(clock < low, clock, -np.inf)
-        if name == "chassis" and (clock < low).any():
-            kept[np.argmax(before)] = True
+        kept = between(self.clock(name), low, high, is_state=name == "chassis")
         return self.tables[name][kept]
 
     def legs(self) -> list[Leg]:

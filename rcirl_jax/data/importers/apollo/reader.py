@@ -16,7 +16,6 @@ and the ego is another track from each new one on.
 """
 
 import dataclasses
-import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -27,11 +26,11 @@ from rcirl_jax.data.importers.apollo.messages import LOCALIZATION, MANUAL, read_
 from rcirl_jax.data.importers.apollo.records import Run, first_parts
 from rcirl_jax.data.importers.clock import on_clock
 from rcirl_jax.data.importers.files import log_name
+from rcirl_jax.data.importers.messages import clock_rate, drive_windows
 from rcirl_jax.data.importers.options import one_pattern, positive
 from rcirl_jax.data.importers.perception import (
     Boxes,
     Windows,
-    around,
     ego_boxes,
     fitted_lanes,
     longest_window,
@@ -40,14 +39,12 @@ from rcirl_jax.data.importers.perception import (
 )
 from rcirl_jax.data.importers.shapes import check_coordinates, origin_notes
 from rcirl_jax.data.importers.tracks import spans_of
-from rcirl_jax.data.readers.long_logs import AFTER_S
-from rcirl_jax.data.recording import MAX_RATE_HZ, validate_recording
+from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Recording, Track
 
 RATE_HZ = 10.0  # 1/s
 MAX_GAP_S = 0.55  # s without a message inside one track
-LATE_S = 2.0  # s, messages of one time are recorded within it
 LIMIT_MPS = 29.06  # m/s, 65 mph
 MAX_SILENCE_S = 1.0  # s without a chassis message, after which nobody knows
 # Lincoln MKZ in Apollo's mkz_example: 3.89 m before, 1.043 m behind the rear axle
@@ -86,59 +83,28 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
                 "expected at least one of them"
             )
         if not found:
+            rate = clock_rate(spec, RATE_HZ)
             raise InputError(
-                f"{first}: tracks: none on a clock of {_rate(spec):g} Hz: "
-                "expected a longer record"
+                f"{first}: tracks: none on a clock of {rate:g} Hz: expected a longer "
+                "record"
             )
 
 
-def _rate(spec: dict) -> float:
-    rate = positive(spec, "rate_hz", RATE_HZ)
-    if rate > MAX_RATE_HZ:
-        raise InputError(
-            f"source TOML: rate_hz: {rate:g}: expected at most {MAX_RATE_HZ:g}"
-        )
-    return rate
-
-
 def _windows(held: Held, spec: dict) -> Iterator[Recording]:
-    """Recordings of a drive, each made once what it needs is read."""
-    run, window, number = Run(held.path), longest_window(spec), 0
-    windows = Windows(log_name(run.first, spec, run.name), run.drive, MAX_GAP_S)
-
-    def within() -> tuple[float, float]:
-        return number * window, (number + 1) * window
-
-    def take(low: float, high: float) -> Iterator[Recording]:
-        made = _recording(held.view(*around((low, high))), (low, high), spec)
-        if made is not None:
-            yield windows.recording(made, number, (low, high), held.progress)
-
-    def following(last: float) -> int:
-        """The next window near a position, or else the one at a time [s]."""
-        near = held.next_position((number + 1) * window - MAX_GAP_S) - MAX_GAP_S
-        return max(number + 1, math.floor(min(near, last) / window))
-
-    for rows in read_drive(run.files, spec):
-        held.add(rows)
-        while held.now > around(within())[1] + LATE_S:
-            yield from take(*within())
-            number = following(held.now - LATE_S - AFTER_S)
-            held.forget(around(within())[0])
-    if number == 0 and held.end <= window:
-        whole = (-math.inf, math.inf)
-        made = _recording(held.view(*whole), whole, spec)
-        yield from [] if made is None else [made]
-        return
-    while (low := number * window) < held.end:
-        is_last = held.end <= low + window
-        yield from take(low, held.end + 1.0 if is_last else low + window)
-        number = following(held.end)
+    """Recordings of a drive."""
+    run = Run(held.path)
+    return drive_windows(
+        held,
+        read_drive(run.files, spec),
+        Windows(log_name(run.first, spec, run.name), run.drive, MAX_GAP_S),
+        longest_window(spec),
+        lambda view, within: _recording(view, within, spec),
+    )
 
 
 def _recording(held: Held, within: tuple[float, float], spec: dict) -> Recording | None:
     """The tracks of the rows held, with notes on the time within; None: nothing."""
-    run, rate, notes = Run(held.path), _rate(spec), list(held.notes)
+    run, rate, notes = Run(held.path), clock_rate(spec, RATE_HZ), list(held.notes)
     obstacles, obstacle_notes = _obstacles(held, spec, rate)
     tracks = [*_ego(held, spec, rate), *obstacles]
     if not any(t.t[0] < within[1] and t.t[-1] >= within[0] for t in tracks):

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.data.importers.messages import between
 from rcirl_jax.data.importers.ros2.messages import Rows, check_held
 from rcirl_jax.data.importers.ros2.readings import COLUMNS
 from rcirl_jax.errors import InputError
@@ -32,6 +33,11 @@ class Held:
         self.has_ego = False  # whether any of them is the ego's
         self._start: float | None = None  # s, the stamp that is 0 here
         self._since = -math.inf  # s, rows from before it were forgotten
+
+    @property
+    def now(self) -> float:
+        """Time [s] that the bag is read up to."""
+        return self.end
 
     def next_place(self, since: float) -> float:
         """Time [s] of the first place held from a time on; inf without one."""
@@ -92,8 +98,4 @@ class Held:
     def _rows(self, role: str, low: float, high: float = math.inf) -> np.ndarray:
         """Rows between two times [s]; who drove at the first is known from before."""
         table = self.tables[role]
-        clock = table[:, 0]
-        kept = (clock >= low) & (clock < high)
-        if role == "driver" and (clock < low).any():
-            kept[np.argmax(np.where(clock < low, clock, -np.inf))] = True
-        return table[kept]
+        return table[between(table[:, 0], low, high, is_state=role == "driver")]

@@ -13,7 +13,6 @@ speak in the ego's own frame; a drive may be the planner's own, not a human's.
 """
 
 import dataclasses
-import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -21,11 +20,11 @@ import numpy as np
 
 from rcirl_jax.data.importers.clock import on_clock
 from rcirl_jax.data.importers.files import log_name
+from rcirl_jax.data.importers.messages import clock_rate, drive_windows
 from rcirl_jax.data.importers.options import positive, recording_car, section
 from rcirl_jax.data.importers.perception import (
     Boxes,
     Windows,
-    around,
     ego_boxes,
     longest_window,
     placed,
@@ -44,19 +43,17 @@ from rcirl_jax.data.importers.ros2.lights import (
     signals_of,
     with_stop_lines,
 )
-from rcirl_jax.data.importers.ros2.messages import read_bag
+from rcirl_jax.data.importers.ros2.messages import Rows, read_bag
 from rcirl_jax.data.importers.ros2.objects import LEFT_OUT
 from rcirl_jax.data.importers.ros2.poses import from_the_ego
 from rcirl_jax.data.importers.shapes import check_coordinates, origin_notes
 from rcirl_jax.data.importers.tracks import spans_of, travel_heading
-from rcirl_jax.data.readers.long_logs import AFTER_S
-from rcirl_jax.data.recording import MAX_RATE_HZ, validate_recording
+from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Recording, Track
 
 RATE_HZ = 10.0  # 1/s
 MAX_GAP_S = 0.55  # s without a message inside one track
-LATE_S = 2.0  # s, messages of one time are recorded within it
 MAX_SILENCE_S = 1.0  # s without a message on who drives, after which nobody knows
 # m; Autoware's sample_vehicle (vehicle_info.param.yaml): overhangs 1.0 and 1.1, wheel
 # base 2.79, tread 1.64 and 0.128 on either side
@@ -103,52 +100,27 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
             found = True
             yield validate_recording(recording, first)
         if not found:
+            rate = clock_rate(spec, RATE_HZ)
             raise InputError(
-                f"{first}: tracks: none on a clock of {_rate(spec):g} Hz: expected a "
-                "longer bag"
+                f"{first}: tracks: none on a clock of {rate:g} Hz: expected a longer "
+                "bag"
             )
 
 
-def _rate(spec: dict) -> float:
-    rate = positive(spec, "rate_hz", RATE_HZ)
-    if rate > MAX_RATE_HZ:
-        raise InputError(
-            f"source TOML: rate_hz: {rate:g}: expected at most {MAX_RATE_HZ:g}"
-        )
-    return rate
-
-
 def _windows(held: Held, files: list[Path], bag: _Bag) -> Iterator[Recording]:
-    """Recordings of a bag, each made once what it needs is read."""
-    window = longest_window(bag.spec)
-    windows, count = Windows(bag.name, bag.name, MAX_GAP_S), 0
+    """Recordings of a bag."""
 
-    def take(low: float, high: float) -> Iterator[Recording]:
-        made = _recording(held.view(*around((low, high))), (low, high), bag)
-        if made is not None:
-            yield windows.recording(made, count, (low, high), held.progress)
+    def rows() -> Iterator[Rows]:
+        yield from read_bag(files, bag.spec)
+        _check_ego(held, bag)
 
-    def following(last: float) -> int:
-        """The next window near a place, or else the one at a time [s]."""
-        near = held.next_place((count + 1) * window - MAX_GAP_S) - MAX_GAP_S
-        return max(count + 1, math.floor(min(near, last) / window))
-
-    for rows in read_bag(files, bag.spec):
-        held.add(rows)
-        while held.end > (count + 1) * window + AFTER_S + LATE_S:
-            yield from take(count * window, (count + 1) * window)
-            count = following(held.end - LATE_S - AFTER_S)
-            held.forget(around((count * window, 0.0))[0])
-    _check_ego(held, bag)
-    if count == 0 and held.end <= window:
-        whole = (-math.inf, math.inf)
-        made = _recording(held.view(*whole), whole, bag)
-        yield from [] if made is None else [made]
-        return
-    while (low := count * window) < held.end:
-        is_last = held.end <= low + window
-        yield from take(low, held.end + 1.0 if is_last else low + window)
-        count = following(held.end)
+    return drive_windows(
+        held,
+        rows(),
+        Windows(bag.name, bag.name, MAX_GAP_S),
+        longest_window(bag.spec),
+        lambda view, within: _recording(view, within, bag),
+    )
 
 
 def _check_ego(held: Held, bag: _Bag) -> None:
@@ -165,7 +137,7 @@ def _check_ego(held: Held, bag: _Bag) -> None:
 
 def _recording(held: Held, within: tuple[float, float], bag: _Bag) -> Recording | None:
     """The tracks of the rows held, with notes on the time within; None: nothing."""
-    spec, rate = bag.spec, _rate(bag.spec)
+    spec, rate = bag.spec, clock_rate(bag.spec, RATE_HZ)
     obstacles, notes = _obstacles(held, spec, rate)
     tracks = [*_ego(held, spec, rate), *obstacles]
     if not any(t.t[0] < within[1] and t.t[-1] >= within[0] for t in tracks):
