@@ -23,6 +23,7 @@ from experiments.flags.executor import executor
 from experiments.flags.importing import import_flags
 from experiments.flags.signals import checked_signals, signals_asked
 from experiments.flags.suite import suite
+from experiments.flags.trackers import trackers
 from rcirl_jax.autotune.config import TuneConfig
 from rcirl_jax.autotune.loop import STAGES, tune
 from rcirl_jax.autotune.rehearsal import TEACHERS
@@ -95,7 +96,10 @@ def made_run() -> Run:
         folder=Path(_WORKDIR.value),
         config=config,
         executor=executor(),
-        running=Running(parallel=_PARALLEL.value),
+        running=Running(
+            parallel=_PARALLEL.value,
+            trackers=trackers(),
+        ),
         facts=provenance(),
     )
 

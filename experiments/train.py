@@ -18,6 +18,7 @@ from absl import flags
 
 from experiments.flags import training
 from experiments.flags.common import provenance, run
+from experiments.flags.trackers import trackers
 from rcirl_jax.data.store.joined import open_datasets
 from rcirl_jax.data.store.resplit import with_tags
 from rcirl_jax.train.loop import train
@@ -62,6 +63,7 @@ def main() -> None:
         in_memory_mb=_IN_MEMORY.value,
         prefetch=_PREFETCH.value,
         checkpoint_every=_SAVE.value,
+        trackers=trackers(),
     )
     result = train(
         dataset,
