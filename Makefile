@@ -52,7 +52,7 @@ TEST = $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal -m "$(MARKS)"
 
 .PHONY: demo test test-slow test-long test-dataset test-floor test-ceiling lint bench docs notebooks onboard
 .PHONY: setup
-.PHONY: lock audit wheel clean reliability fuzz
+.PHONY: lock audit wheel clean reliability fuzz accelerator
 
 setup: $(VENV)/.installed
 
@@ -153,6 +153,11 @@ bench: $(VENV)/.bench
 	$(BIN)/python -m benchmarks.importing --data=$(RECORDINGS)
 	$(BIN)/python -m benchmarks.paper_scale
 	$(BIN)/python -m benchmarks.plots
+
+# Everything that an accelerator is asked, in eight minutes, with the Python and JAX that are
+# there (`PYTHON=python3.12`): nothing is downloaded or built. `SMALL=--small` rehearses it on a CPU
+accelerator:
+	$(PYTHON) -m benchmarks.accelerator $(SMALL) --output=$(RESULTS)
 
 # Documentation as a site; warnings are errors
 docs: export NO_MKDOCS_2_WARNING = 1
