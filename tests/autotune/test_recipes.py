@@ -81,7 +81,7 @@ def test_a_file_of_ones_own(tmp_path):
 
 FLAGS = """
 from absl import flags
-from experiments.flags import training
+from rcirl_jax.commands.flags import training
 flags.FLAGS(["x", *{given}])
 c = training.training_config()
 print(c.loss, c.reward.hidden, c.leaky_rate, c.futures, c.positive, c.reward.pin)

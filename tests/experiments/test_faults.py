@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 MAIN = """
-from experiments.flags.common import run
+from rcirl_jax.commands.flags.common import run
 def main():
     raise ZeroDivisionError("scene\\n7")
 run(main)

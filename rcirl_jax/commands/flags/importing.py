@@ -1,4 +1,4 @@
-"""Flags of an import, alike in every command that imports."""
+"""Importing: which scenes are kept of the logs, and how they are held out."""
 
 import dataclasses
 from collections.abc import Callable

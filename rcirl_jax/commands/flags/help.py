@@ -1,0 +1,121 @@
+"""The help of a command: what it does, its usual flags, then all others by subject."""
+
+import inspect
+import re
+import sys
+import textwrap
+from collections.abc import Callable, Iterable
+from types import ModuleType
+
+from absl import flags
+
+OURS = ("rcirl_jax.commands.", "experiments.")  # modules whose flags are a command's
+ASKED = {"-h": False, "-?": False, "-help": False, "--help": False} | {
+    "--helpshort": False,
+    "-helpfull": True,
+    "--helpfull": True,
+}
+WIDTH, INDENT = 100, 20  # columns
+FROM_FILE = "--flagfile=FILE reads flags from a file, one a line."
+
+
+def own_flags() -> dict[str, list[flags.Flag]]:
+    """The flags of the command that runs, by the module that defines them.
+
+    Second names (`also_named`) are left out.
+    """
+    found = {
+        module: [flag for flag in some if not second_name(flag)]
+        for module, some in flags.FLAGS.flags_by_module_dict().items()
+        if module == sys.argv[0] or module.startswith(OURS)
+    }
+    return {module: some for module, some in found.items() if some}
+
+
+def also_named(old: str, name: str) -> None:
+    """Let a flag be given by an old name too, which help does not show."""
+    flags.DEFINE_alias(old, name)
+
+
+def second_name(flag: flags.Flag) -> bool:
+    """Whether a flag is another's second name."""
+    return str(flag.help).startswith("Alias for --")
+
+
+def asked_for(argv: list[str], main: Callable) -> str | None:
+    """The help that the arguments ask for; None: they ask for none."""
+    given = argv[1 : argv.index("--")] if "--" in argv else argv[1:]
+    for word in given:
+        if word in ASKED:
+            return help_text(module_of(main), full=ASKED[word])
+    return None
+
+
+def module_of(main: Callable) -> ModuleType:
+    """The module of a command's main."""
+    return sys.modules[main.__module__]
+
+
+def help_text(module: ModuleType, *, full: bool) -> str:
+    """What `--help` or, in full, `--helpfull` says of a command.
+
+    Args:
+      module: its docstring is the text, `USUAL` the names of its usual flags (all where
+        it has none).
+      full: with all other flags, by the module that defines them.
+    """
+    own = own_flags()
+    every = {flag.name: flag for some in own.values() for flag in some}
+    usual = getattr(module, "USUAL", tuple(every))
+    parts = [inspect.cleandoc(module.__doc__ or "")]
+    parts.append(_listed("usual flags:", (every[name] for name in usual)))
+    hidden = len(every) - len(usual)
+    if full:
+        for name, some in own.items():
+            rest = [flag for flag in some if flag.name not in usual]
+            if rest:
+                parts.append(_listed(f"{_subject(name, module)}:", rest))
+        parts.append(FROM_FILE)
+    elif hidden:
+        parts.append(f"--helpfull shows {hidden} more. {FROM_FILE}")
+    else:
+        parts.append(FROM_FILE)
+    return "\n\n".join(parts)
+
+
+def example(module: ModuleType) -> str:
+    """The first command of a docstring, "" without one."""
+    text = re.sub(r"\\\n\s*", "", module.__doc__ or "")
+    found = re.search(r"^ {4}(\S.*?)(?: {2,}.*)?$", text, re.M)
+    return found[1] if found else ""
+
+
+def _subject(name: str, command: ModuleType) -> str:
+    """The first line of a module's docstring; "others" for the command itself."""
+    module = sys.modules.get(name)
+    if module in (None, command) or not (module and module.__doc__):
+        return "other flags"
+    return module.__doc__.strip().splitlines()[0].rstrip(".")
+
+
+def _listed(heading: str, some: Iterable[flags.Flag]) -> str:
+    return "\n".join([heading, *map(_line, some)])
+
+
+def _line(flag: flags.Flag) -> str:
+    """A flag, what it is and its default, in as few lines as it takes."""
+    name = f"  --{'[no]' if flag.boolean else ''}{flag.name}"
+    said = str(flag.help)
+    if values := getattr(flag.parser, "enum_values", None):
+        said += f": {', '.join(values)}"
+    if flag.default not in (None, "", False, []):
+        said += f" (default: {flag.default_as_str.strip(chr(39))})"
+    begin, rest = f"{name}  ".ljust(INDENT), " " * INDENT
+    lines = textwrap.wrap(
+        said,
+        WIDTH,
+        initial_indent=begin,
+        subsequent_indent=rest,
+        break_on_hyphens=False,
+    )
+    return "\n".join(lines)
