@@ -53,7 +53,8 @@ class Run:
     executor: Executor
     running: Running
     facts: Mapping[str, Any]  # provenance: commit, versions, flags
-    say: Callable[[str], object] = print
+    say: Callable[[str], object] = functools.partial(print, flush=True)
+    done: list[str] = dataclasses.field(default_factory=list)  # stages, by this process
 
     @property
     def stages(self) -> Stages:
@@ -103,6 +104,8 @@ class Run:
         stale = STALE.get(kind, ())
         made_by = {key: self.facts[key] for key in NOTED if key in self.facts}
         done = self.stages.run(name, facts, outputs, work, stale, made_by)
+        if done:
+            self.done.append(name)
         self.say(f"[{name}] {'done' if done else 'as before, kept'}")
 
     def code(self, module: str) -> dict:

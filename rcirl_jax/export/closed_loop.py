@@ -75,8 +75,9 @@ def table_rows(
 ) -> list[Row]:
     """Learned rows first, in the order of the files, then the baselines.
 
-    Rows are named as by `row_names`, or bear `names`, one per file. The first drives again by `dp`. A tuned IDM comes
-    last. `track` is the safety filter's (`SafetyConfig`).
+    Rows are named as by `row_names`, or bear `names`, one per file. The first drives
+    again by `dp`. A tuned IDM comes last. `track` is the safety filter's
+    (`SafetyConfig`).
 
     Raises:
       InputError: no file, an unreadable one, one twice without `names`, path_speed

@@ -112,7 +112,7 @@ def test_a_flag_given_beside_the_recipe_wins():
 SWEEP = """
 import sys
 from pathlib import Path
-from experiments import sweep
+from rcirl_jax.commands import sweep
 sweep.run_sweep = lambda config, *_: (print(config), sys.exit(0))
 sweep.flags.FLAGS(["x", "--data=d", "--output=o", *{given}])
 sweep.main()

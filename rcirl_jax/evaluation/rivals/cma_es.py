@@ -68,7 +68,7 @@ def tune(
         bar.set_postfix(best=f"{lowest:.4g}")
         return np.where(finite, found, found[finite].max(initial=0.0) + 1.0)
 
-    with tqdm.tqdm(total=budget, desc="CMA-ES") as bar:
+    with tqdm.tqdm(total=budget, desc="tune a rival", unit="try") as bar:
         evaluate(first[None])
         while used < budget:
             search = cma.CMAEvolutionStrategy(
