@@ -17,7 +17,7 @@ HEAD, TAIL = 1400, 400  # characters kept of the ends of a line too long
 # packages that are in an extra only
 EXTRAS = {
     **dict.fromkeys(("jinja2", "markupsafe", "matplotlib"), "report"),
-    **dict.fromkeys(("defusedxml", "google", "pyarrow", "pyproj", "shapely"), "logs"),
+    **dict.fromkeys(("defusedxml", "pyarrow", "pyproj", "shapely"), "logs"),
 }
 
 

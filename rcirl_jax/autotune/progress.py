@@ -143,7 +143,5 @@ def in_words(seconds: float) -> str:
     """A duration: "40 s", "12 min", "1 h 05 min"."""
     if seconds < 59.5:
         return f"{seconds:.0f} s"
-    minutes = round(seconds / 60.0)
-    return (
-        f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02} min"
-    )
+    hours, minutes = divmod(round(seconds / 60.0), 60)
+    return f"{hours} h {minutes:02} min" if hours else f"{minutes} min"

@@ -44,6 +44,11 @@ STALE = {
 NOTED = ("git_commit", "code_sha256", "versions", "flags")  # of every stage
 
 
+def _say(line: str) -> None:
+    """A line that is seen at once, also where it goes into a file."""
+    print(line, flush=True)
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Run:
     """One run folder with its settings."""
@@ -53,7 +58,7 @@ class Run:
     executor: Executor
     running: Running
     facts: Mapping[str, Any]  # provenance: commit, versions, flags
-    say: Callable[[str], object] = functools.partial(print, flush=True)
+    say: Callable[[str], object] = _say
     done: list[str] = dataclasses.field(default_factory=list)  # stages, by this process
 
     @property

@@ -51,7 +51,7 @@ _SYNTHETIC = flags.DEFINE_bool(
 _FORMAT = flags.DEFINE_list("format", None, "of each --input, else recognised")
 _INPUT = flags.DEFINE_list("input", None, "instead: logs to import")
 _SOURCE = flags.DEFINE_list("source", None, "TOML of columns and units of each --input")
-_IMPORT = import_flags(said=training.AS_SAID)
+_IMPORT = import_flags()
 _INCUMBENT = flags.DEFINE_string(
     "incumbent", "hand-set", "weights file that drives today, or a baseline"
 )

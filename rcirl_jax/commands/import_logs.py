@@ -24,6 +24,7 @@ from rcirl_jax.commands.flags.common import made_by_file
 from rcirl_jax.commands.flags.executor import executor
 from rcirl_jax.commands.flags.horizon import HORIZON
 from rcirl_jax.commands.flags.importing import import_flags
+from rcirl_jax.commands.flags.recipe import recipe
 from rcirl_jax.commands.flags.signals import checked_signals
 from rcirl_jax.data.importers import IMPORTERS
 from rcirl_jax.data.importers.csv.suggest import suggested
@@ -40,8 +41,8 @@ from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.sampling.config import MODES
 
 USUAL = (
-    *("input", "output", "format", "source", "suggest", "overwrite", "stride"),
-    *("test_fraction", "leave_out", "workers"),
+    *("input", "output", "format", "source", "suggest", "overwrite", "recipe"),
+    *("stride", "test_fraction", "leave_out", "workers"),
 )
 _FORMAT = flags.DEFINE_enum(
     "format", None, sorted(IMPORTERS), "log format to read, else recognised"
@@ -79,7 +80,7 @@ def main() -> None:
     if _FORMAT.value is None and path is not None:
         print(f"--format={form}: recognised", flush=True)
     parts = parts_of(form, path, source)
-    config = _IMPORT(ImportConfig(format=form))
+    config = _IMPORT(ImportConfig(format=form, collect=recipe().collect))
     signals = checked_signals(
         leaving_out(parts) if config.leaves_out else parts, places
     )

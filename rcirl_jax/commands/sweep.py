@@ -1,4 +1,4 @@
-"""Train a grid of rewards side by side, choose by held-out scenes, export all.
+r"""Train a grid of rewards side by side, choose by held-out scenes, export all.
 
     rcirl sweep --data=DATASET --output=DIR --recipe=paper \
         --leaky_rates=0.01,0.05,0.2 --hidden_sizes=15,32x16 --seeds=4
@@ -21,8 +21,8 @@ from absl import flags
 from rcirl_jax.commands.flags import training
 from rcirl_jax.commands.flags.common import floats, hidden_sizes, provenance, unread
 from rcirl_jax.commands.flags.executor import executor
+from rcirl_jax.commands.flags.help import AS_SAID
 from rcirl_jax.commands.flags.horizon import HORIZON
-from rcirl_jax.commands.flags.recipe import AS_SAID
 from rcirl_jax.evaluation.ranking.sweep import CHOICES, SweepConfig
 from rcirl_jax.export.sweep.result import table
 from rcirl_jax.export.sweep.run import run_sweep

@@ -8,7 +8,7 @@ with exit status 143 and 130. A damaged checkpoint is named and the one before i
 Several processes (RUN and DATASET on a file system that all of them see), each with
 its own --process_id:
 
-    rcirl train --data=DATASET --output=RUN --parallel=shard_map \
+    rcirl train --data=DATASET --output=RUN --parallel=shard_map
         --coordinator_address=HOST:PORT --num_processes=2 --process_id=0
 """
 

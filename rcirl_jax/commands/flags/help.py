@@ -16,6 +16,8 @@ ASKED = {"-h": False, "-?": False, "-help": False, "--help": False} | {
     "--helpfull": True,
 }
 WIDTH, INDENT = 100, 20  # columns
+LONGEST = 40  # characters of a default
+AS_SAID = " (default: the recipe's)"  # end of the help of a flag beside a recipe
 FROM_FILE = "--flagfile=FILE reads flags from a file, one a line."
 
 
@@ -105,14 +107,18 @@ def _listed(heading: str, some: Iterable[flags.Flag]) -> str:
 def _line(flag: flags.Flag) -> str:
     """A flag, what it is and its default, in as few lines as it takes."""
     name = f"  --{'[no]' if flag.boolean else ''}{flag.name}"
-    said = str(flag.help)
+    said = re.sub(r"^<.*?>: ", "", str(flag.help))  # absl's list of an enum's values
+    default = AS_SAID if said.endswith(AS_SAID) else ""
+    said = said.removesuffix(AS_SAID)
     if values := getattr(flag.parser, "enum_values", None):
         said += f": {', '.join(values)}"
     if flag.default not in (None, "", False, []):
-        said += f" (default: {flag.default_as_str.strip(chr(39))})"
+        shown = str(flag.default_as_str)[1:-1]
+        shown = shown if len(shown) <= LONGEST else f"{shown[:LONGEST]}..."
+        default = f" (default: {shown})"
     begin, rest = f"{name}  ".ljust(INDENT), " " * INDENT
     lines = textwrap.wrap(
-        said,
+        said + default,
         WIDTH,
         initial_indent=begin,
         subsequent_indent=rest,

@@ -9,7 +9,6 @@ RECIPE = flags.DEFINE_string(
     DEFAULT,
     "tuned, paper, quick, or a TOML file: decides all that no flag beside it says",
 )
-AS_SAID = " (default: the recipe's)"  # end of the help of a flag beside it
 
 
 def recipe() -> Recipe:

@@ -11,7 +11,8 @@ from absl import flags
 
 from rcirl_jax.autotune.recipes import departing
 from rcirl_jax.commands.flags.common import floats, hidden_sizes
-from rcirl_jax.commands.flags.recipe import AS_SAID, recipe
+from rcirl_jax.commands.flags.help import AS_SAID
+from rcirl_jax.commands.flags.recipe import recipe
 from rcirl_jax.data.store.joined import EQUAL
 from rcirl_jax.errors import InputError
 from rcirl_jax.reward import LOSSES

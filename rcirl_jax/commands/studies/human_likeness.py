@@ -2,11 +2,10 @@
 
     rcirl human-likeness --data=DATASET --output=DIR [--seeds=10]
 
-Every learner is trained with every seed on the same candidates of the training scenes
-and ranks the same candidates of the held-out scenes, beside random, untrained, constant
-speed, IDM, both hand-set and oracle rows. Of the scenes recorded as long as the horizon
-none is dropped; a crash of the chosen candidate is charged. Its name says a learner's
-loss and network; all else is as the --recipe says, and a flag given beside it wins.
+Every learner is trained with every seed on the same candidates and ranks the same
+held-out candidates, beside random, untrained, constant speed, IDM, hand-set and oracle
+rows. No scene is dropped, crashes are charged. Its name says a learner's loss and
+network; all else is as the --recipe says, and a flag given beside it wins.
 
 --holdout: `groups`, the dataset's split by groups of vehicles; `vehicles`, a quarter of
 them (drawn by --split_seed); `recording`, those numbered --recording; `validation`, a
@@ -58,10 +57,10 @@ USUAL = (
 )
 _DATA = flags.DEFINE_string("data", None, "dataset of `rcirl import`", required=True)
 _OUTPUT = flags.DEFINE_string("output", "out/likeness", "folder to write")
-_LEARNERS = flags.DEFINE_list("learners", list(LEARNERS), "rows to train")
+_LEARNERS = flags.DEFINE_list("learners", list(LEARNERS), "rows to train, else all")
 _SEEDS = flags.DEFINE_integer("seeds", 10, "training runs per learner", lower_bound=1)
 _TUNED = flags.DEFINE_integer(
-    "tuned", 0, "hand-set and IDM tuned on each split, so many times", 0
+    "tuned", 0, "hand-set and IDM tuned so many times on each split", 0
 )
 _LONG = flags.DEFINE_integer(
     "tuned_long", 3000, "evaluations of the hand-set cost's long search, or 0", 0

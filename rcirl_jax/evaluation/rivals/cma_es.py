@@ -42,14 +42,10 @@ def tune(
       The best vector [d] and its value.
 
     Raises:
-      InputError: the package `cma` is missing, or no value is finite.
+      InputError: no value is finite.
     """
-    try:
-        import cma
-    except ImportError as error:
-        raise InputError(
-            "cma: not installed: expected the extra tune: pip install 'rcirl-jax[tune]'"
-        ) from error
+    import cma  # a second, which only tuning takes
+
     best, lowest, used = np.asarray(start, np.float64), math.inf, 0
     normal = np.random.Generator(np.random.Philox(seed)).standard_normal
     options = {**_QUIET, "randn": lambda *shape: normal(shape)}
