@@ -13,7 +13,7 @@ from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.errors import InputError
 
 MOST = 25  # names that a newcomer has to look through
-SLOW = {"tune"}  # its stages are those of `experiments.autotune`, which has its tests
+SLOW = {"tune"}  # its stages are those of `rcirl autotune`, which has its tests
 TYPES = {"Body", "Car", "CentreLine", "Signal", "InputError", "Reward", "WeightsError"}
 
 

@@ -182,6 +182,6 @@ def test_names_that_are_no_text(tmp_path):
 
 
 def test_flags_that_are_no_text(tmp_path):
-    ended = command("experiments.import_logs", "--format=csv", "--input=a\udcff")
+    ended = command("rcirl_jax", "import", "--format=csv", "--input=a\udcff")
     assert ended.returncode == 2
     assert ended.stderr == "error: '--input=a\\udcff': expected UTF-8\n"
