@@ -23,7 +23,9 @@ COMPILED = "/jax/core/compile/backend_compile_duration"
 TRAINED_S, DRIVEN_S, RANKED_S = 5e-4, 4.5e-4, 0.02
 SEARCH_S, GATE_S, PAGE_S = 20.0, 2.0, 30.0
 DRIVE_S = 8.0  # of a held-out drive
-LEAST_S = 5.0  # s of work that says how fast a machine is
+# s that count as work done at the usual speed, before there is any: short stages say
+# little of how fast a machine is
+USUAL_S = 60.0
 # the last part of each stage, by the names of stages.json
 LAST = {
     "train": "export",
@@ -100,10 +102,8 @@ class Clock:
         expected = (work or {}).get(name, 0.0)
         if len(self._run.done) > done and expected:
             took = time.monotonic() - begin - (self._compiled - compiled)
-            self._worked, self._took = (
-                self._worked + expected,
-                self._took + max(took, 0.0),
-            )
+            self._worked += expected
+            self._took += max(took, 0.0)
 
     def line(self, name: str, work: Mapping[str, float] | None) -> str:
         """What is said when a stage begins."""
@@ -113,7 +113,7 @@ class Clock:
         if work is None:
             return text
         left = sum(work.get(one, 0.0) for one in self._to_do(self._names[number - 1 :]))
-        left *= self._took / self._worked if self._worked > LEAST_S else 1.0
+        left *= (self._took + USUAL_S) / (self._worked + USUAL_S)
         return f"{text}, about {in_words(left)} left, compiling not counted"
 
     def _to_do(self, names: Sequence[str]) -> list[str]:

@@ -50,8 +50,8 @@ def test_the_time_left_grows_with_what_is_not_compiled(monkeypatch):
         time.now += 30.0
         run.done.append("import 0")
     with clock.stage("rehearse", WORK):
-        time.now += 300.0  # twice as slow as two usual cores, the rest is compiling
-        clock.hear(progress.COMPILED, 180.0)
+        time.now += 300.0
+        clock.hear(progress.COMPILED, 120.0)  # of the rest 60 s are usual, 120 s more
         clock.hear("another event", 100.0)
         run.done.append("rehearse 0")
     with clock.stage("train", WORK):

@@ -10,11 +10,10 @@ from types import ModuleType
 from absl import flags
 
 OURS = ("rcirl_jax.commands.", "experiments.")  # modules whose flags are a command's
-ASKED = {"-h": False, "-?": False, "-help": False, "--help": False} | {
-    "--helpshort": False,
-    "-helpfull": True,
-    "--helpfull": True,
-}
+SHARED = "rcirl_jax.commands.flags."  # of them, those of a subject each
+# what asks for help -> whether for all of it
+ASKED = dict.fromkeys(("-h", "-?", "-help", "--help", "--helpshort"), False)
+ASKED |= dict.fromkeys(("-helpfull", "--helpfull"), True)
 WIDTH, INDENT = 100, 20  # columns
 LONGEST = 40  # characters of a default
 AS_SAID = " (default: the recipe's)"  # end of the help of a flag beside a recipe
@@ -69,19 +68,18 @@ def help_text(module: ModuleType, *, full: bool) -> str:
     own = own_flags()
     every = {flag.name: flag for some in own.values() for flag in some}
     usual = getattr(module, "USUAL", tuple(every))
+    rest = {
+        name: [flag for flag in some if flag.name not in usual]
+        for name, some in own.items()
+    }
     parts = [inspect.cleandoc(module.__doc__ or "")]
-    parts.append(_listed("usual flags:", (every[name] for name in usual)))
-    hidden = len(every) - len(usual)
+    parts.append(_listed("usual flags", [every[name] for name in usual]))
     if full:
-        for name, some in own.items():
-            rest = [flag for flag in some if flag.name not in usual]
-            if rest:
-                parts.append(_listed(f"{_subject(name, module)}:", rest))
-        parts.append(FROM_FILE)
-    elif hidden:
-        parts.append(f"--helpfull shows {hidden} more. {FROM_FILE}")
-    else:
-        parts.append(FROM_FILE)
+        parts += [_listed(_subject(name), some) for name, some in rest.items() if some]
+    hidden = 0 if full else len(every) - len(usual)
+    parts.append(
+        f"--helpfull shows {hidden} more. {FROM_FILE}" if hidden else FROM_FILE
+    )
     return "\n\n".join(parts)
 
 
@@ -92,16 +90,15 @@ def example(module: ModuleType) -> str:
     return found[1] if found else ""
 
 
-def _subject(name: str, command: ModuleType) -> str:
-    """The first line of a module's docstring; "others" for the command itself."""
-    module = sys.modules.get(name)
-    if module in (None, command) or not (module and module.__doc__):
-        return "other flags"
-    return module.__doc__.strip().splitlines()[0].rstrip(".")
+def _subject(name: str) -> str:
+    """What the flags of a module are about: the first line of its docstring."""
+    if not name.startswith(SHARED):
+        return "Other flags"
+    return str(sys.modules[name].__doc__).splitlines()[0].rstrip(".")
 
 
 def _listed(heading: str, some: Iterable[flags.Flag]) -> str:
-    return "\n".join([heading, *map(_line, some)])
+    return "\n".join([f"{heading}:", *map(_line, some)])
 
 
 def _line(flag: flags.Flag) -> str:
