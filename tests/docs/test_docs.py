@@ -33,7 +33,7 @@ FLAG = re.compile(r"(?<!\S)--([a-z_0-9]+)")
 VALUE = re.compile(r"(?<![\w-])--([a-z_0-9]+)=([^\s\\]+)")
 PATH = re.compile(r"[\w.-]+/[\w./*-]*")
 PLACEHOLDER = re.compile(r"[A-Z]{3}")  # NAME.toml, SCENE.csv
-BUILT_IN = {"help", "helpfull"}
+BUILT_IN = {"help", "helpfull", "flagfile"}
 # what has a path's shape in prose, but is made by a command or by the reader
 ELSEWHERE = {"out", "build"}
 
