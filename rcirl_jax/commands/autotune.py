@@ -24,7 +24,7 @@ from rcirl_jax.autotune.run import Run
 from rcirl_jax.commands.flags import margins, training
 from rcirl_jax.commands.flags.common import provenance
 from rcirl_jax.commands.flags.executor import executor
-from rcirl_jax.commands.flags.help import also_named
+from rcirl_jax.commands.flags.help import AS_SAID, also_named
 from rcirl_jax.commands.flags.horizon import HORIZON
 from rcirl_jax.commands.flags.importing import import_flags
 from rcirl_jax.commands.flags.signals import checked_signals, signals_asked
@@ -56,10 +56,10 @@ _INCUMBENT = flags.DEFINE_string(
     "incumbent", "hand-set", "weights file that drives today, or a baseline"
 )
 _SEEDS = flags.DEFINE_integer(
-    "seeds", None, "training runs; the median one drives" + training.AS_SAID
+    "seeds", None, "training runs; the median one drives" + AS_SAID
 )
 _TEACHER = flags.DEFINE_enum(
-    "teacher", None, TEACHERS, "who rehearses the catalogue" + training.AS_SAID
+    "teacher", None, TEACHERS, "who rehearses the catalogue" + AS_SAID
 )
 _DRIVES = flags.DEFINE_integer(
     "drives", 240, "held-out recorded drives that measure human-likeness"
