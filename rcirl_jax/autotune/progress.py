@@ -81,11 +81,12 @@ class Clock:
         self._known = {*run.stages.read()}  # stages of an earlier run
         self._lock = threading.Lock()
 
-    def hear(self, event: str, seconds: float, **_: object) -> None:
+    def hear(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
         """One measurement of JAX's."""
+        del kwargs
         if event == COMPILED:
             with self._lock:
-                self._compiled += seconds
+                self._compiled += duration_secs
 
     @contextlib.contextmanager
     def stage(self, name: str, work: Mapping[str, float] | None) -> Iterator[None]:

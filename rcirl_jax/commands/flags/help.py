@@ -11,9 +11,10 @@ from absl import flags
 
 OURS = ("rcirl_jax.commands.", "experiments.")  # modules whose flags are a command's
 SHARED = "rcirl_jax.commands.flags."  # of them, those of a subject each
-# what asks for help -> whether for all of it
-ASKED = dict.fromkeys(("-h", "-?", "-help", "--help", "--helpshort"), False)
-ASKED |= dict.fromkeys(("-helpfull", "--helpfull"), True)
+SHORT, FULL = (
+    ("-h", "-?", "-help", "--help", "--helpshort"),
+    ("-helpfull", "--helpfull"),
+)
 WIDTH, INDENT = 100, 20  # columns
 LONGEST = 40  # characters of a default
 AS_SAID = " (default: the recipe's)"  # end of the help of a flag beside a recipe
@@ -47,8 +48,8 @@ def asked_for(argv: list[str], main: Callable) -> str | None:
     """The help that the arguments ask for; None: they ask for none."""
     given = argv[1 : argv.index("--")] if "--" in argv else argv[1:]
     for word in given:
-        if word in ASKED:
-            return help_text(module_of(main), full=ASKED[word])
+        if word in (*SHORT, *FULL):
+            return help_text(module_of(main), full=word in FULL)
     return None
 
 

@@ -94,7 +94,7 @@ def write_tuning_page(path: Path, report: TuningReport) -> Path:
     frames = lambda folder: draw_frames(  # noqa: E731
         report.dataset, reward, sampler, folder, NUM_FRAMES
     )
-    training = lambda folder: draw_training(workdir, folder)  # noqa: E731
+    training = lambda folder: draw_training(workdir, folder) if workdir else []  # noqa: E731
     sections: dict[str, Callable[[], object]] = {
         "verdict": lambda: verdict_view(verdict),
         "cards": lambda: cards(verdict, suite, report.incumbent),
@@ -111,7 +111,7 @@ def write_tuning_page(path: Path, report: TuningReport) -> Path:
         ),
         "gamma": lambda: _gamma(report.rewards),
         "frames": lambda: _drawn(frames),
-        "training": lambda: _drawn(training) if workdir else [],
+        "training": lambda: _drawn(training),
         "data": lambda: _data(report.dataset),
         "sweep": lambda: _sweep(report.sweep),
         "provenance": lambda: _provenance(report),
