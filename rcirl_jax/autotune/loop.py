@@ -74,7 +74,7 @@ def tune(run: Run, given: Sequence[str | Logs], last: str = STAGES[-1]) -> None:
             with time.stage(name, work_of(run, job, known)):
                 steps[name]()
     if last in ("gate", "report"):
-        run.say(_ending(run, verdict(), page))
+        run.say(_ending(run, verdict(), page, job.refs[0].id))
     elif last not in ("import", "rehearse"):
         run.say(f"weights: {run.weights}")
 
@@ -102,14 +102,21 @@ def _drawn(
     return f"report to open: {run.page}"
 
 
-def _ending(run: Run, verdict: Verdict, page: Sequence[str]) -> str:
-    """The verdict, why, where all of it is, what to do next; about eight lines."""
+def _ending(run: Run, verdict: Verdict, page: Sequence[str], first: str) -> str:
+    """The verdict, why, where all of it is, what to do next; about eight lines.
+
+    Args:
+      run: whose verdict it is.
+      verdict: of the gate.
+      page: a line on the report, if it was asked for.
+      first: case to look at where the verdict names none.
+    """
     lines = ["", f"verdict: {verdict.decision.upper()}"]
     lines += textwrap.wrap(verdict.sentence, WIDTH)
     lines += [f"weights: {run.weights}", f"all tables: {run.tables}", *page]
-    if verdict.look_at:
-        what = f"replay --weights={run.weights} --case={verdict.look_at[0]}"
-        lines.append(f"next: rcirl {what} --output={run.folder / 'case'}")
+    case = (*verdict.look_at, first)[0]
+    replay = f"rcirl replay --weights={run.weights} --case={case}"
+    lines.append(f"next: {replay} --output={run.folder / 'case'}")
     return "\n".join(lines)
 
 
