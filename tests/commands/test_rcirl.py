@@ -29,8 +29,8 @@ REQUIRED = {
     "human-likeness": "data",
     "gate-errors": "output",
 }
-# Help of every command, and what it says where no flag is given, in one process that has
-# what an installation without extras has; absl knows one flag of a name
+# Help of every command, and what it says where no flag is given, in one process that
+# has what an installation without extras has; absl knows one flag of a name
 EVERY = """
 import importlib, json, sys
 from absl import flags
