@@ -73,8 +73,8 @@ $(VENV)/.installed: pyproject.toml $(if $(LOCK),$(LOCK)/test.lock) | $(BIN)/pyth
 # The main job, end to end, on synthetic human traffic: import, train, rank, simulate, gate, report.
 # Most of its time is compiling, which is a third shorter without XLA's fusion emitters.
 demo: $(VENV)/.all
-	XLA_FLAGS="--xla_cpu_use_fusion_emitters=false $(XLA_FLAGS)" $(BIN)/python -m experiments.autotune --synthetic --recipe=quick \
-	  --workdir=$(OUT) --cases=4 --duration=20 --drives=40
+	XLA_FLAGS="--xla_cpu_use_fusion_emitters=false $(XLA_FLAGS)" $(BIN)/rcirl autotune --synthetic --recipe=quick \
+	  --output=$(OUT) --cases=4 --duration=20 --drives=40
 
 test: setup
 	$(TEST) $(EXACT)
@@ -113,9 +113,9 @@ test-ceiling:
 	build/ceiling/bin/python $(PIP) install --editable '.[quick]'
 	build/ceiling/bin/python $(QUICKLY)
 
-# Source distribution, a wheel made of it, and the quick tests far from this folder in an environment
-# of what the wheel itself asks for with its extra `quick`, in the locked versions: what it does not
-# name is not there. Versions without hashes: pip wants hashes of all or of none, and the wheel has none
+# Source distribution, a wheel made of it, and far from this folder, in an environment of what the
+# wheel itself asks for, in the locked versions: the help of every command without any extra, and the
+# quick tests with the extra `quick`. What it does not name is not there. Versions without hashes: pip wants hashes of all or of none, and the wheel has none
 wheel: setup
 	rm -rf dist
 	$(BIN)/python -m hatchling build --target sdist
@@ -124,11 +124,13 @@ wheel: setup
 	  trap 'rm -rf "$$away"' EXIT; set -e; \
 	  $(BIN)/python -m venv $$away/venv; cp -R tests pyproject.toml $$away; cd $$away; \
 	  sed -n 's/^\([a-z0-9].*[^ ]\) *\\$$/\1/p' $$lock > locked.txt; \
+	  venv/bin/python $(PIP) install --constraint locked.txt "$$wheel"; \
+	  for name in $$(venv/bin/python -c 'from rcirl_jax.commands.rcirl import COMMANDS as x; print(*x)'); do \
+	    venv/bin/rcirl $$name --help > $$name.txt; done; \
 	  venv/bin/python $(PIP) install --constraint locked.txt "$$wheel[quick]"; \
 	  venv/bin/python -m pip check; \
-	  venv/bin/python -c 'import experiments, rcirl_jax as r; print(r.__file__)'; \
-	  venv/bin/python $(QUICKLY); \
-	  venv/bin/python -m experiments.autotune --helpfull | grep -q workdir
+	  venv/bin/python -c 'import rcirl_jax as r; print(r.__file__)'; \
+	  venv/bin/python $(QUICKLY)
 
 lint: setup
 	$(BIN)/ruff check .

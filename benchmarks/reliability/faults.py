@@ -35,7 +35,7 @@ from absl import flags
 from benchmarks.common import write
 from benchmarks.reliability.jobs import Facts, Job, jobs, write_logs
 from benchmarks.reliability.small import BROKEN
-from experiments.flags.common import run
+from rcirl_jax.commands.flags.common import run
 from rcirl_jax.errors import InputError
 
 SIGNALS = ("KILL", "TERM", "INT")

@@ -58,7 +58,7 @@ def jobs(root: Path) -> dict[str, Job]:
         Job(
             name="train",
             module="experiments.train",
-            flags=(data, "--workdir=run", *steps, "--checkpoint_every=3"),
+            flags=(data, "--output=run", *steps, "--checkpoint_every=3"),
             outcome=_of_training,
             finished=_files_like("run/checkpoints/*/sha256.json"),  # 3 are kept
         ),
@@ -76,7 +76,7 @@ def jobs(root: Path) -> dict[str, Job]:
             name="autotune",
             module="experiments.autotune",
             flags=(
-                *(*logs, "--workdir=run", "--stride=2", "--batch_size=8"),
+                *(*logs, "--output=run", "--stride=2", "--batch_size=8"),
                 *("--epochs=1", "--suite=free_cruise,stopped_lead"),
                 *("--cases=15", "--duration=2"),  # the gate judges no fewer
             ),

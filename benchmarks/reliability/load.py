@@ -45,7 +45,7 @@ from benchmarks.reliability.memory import (
     thinned,
     too_much,
 )
-from experiments.flags.common import provenance, run
+from rcirl_jax.commands.flags.common import provenance, run
 from rcirl_jax.data.store.files import MARK
 from rcirl_jax.data.store.shards import shard_key
 from rcirl_jax.errors import InputError

@@ -44,10 +44,10 @@ from benchmarks.reliability.memory import (
     memory_growth,
 )
 from benchmarks.reliability.small import SHARD_SCENES
-from experiments.flags.common import provenance, run
 from rcirl_jax.autotune.config import TuneConfig
 from rcirl_jax.autotune.loop import tune
 from rcirl_jax.autotune.run import Run
+from rcirl_jax.commands.flags.common import provenance, run
 from rcirl_jax.data import importing
 from rcirl_jax.data.importing import ImportConfig
 from rcirl_jax.data.logs import Logs

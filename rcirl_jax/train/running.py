@@ -64,7 +64,7 @@ def check_run(workdir: Path, config: TrainConfig, dataset: Demonstrations) -> No
         if before != setting and name != "epochs":
             raise InputError(
                 f"{path}: {name}: {before}: expected {setting} to resume; "
-                "use another --workdir for other settings"
+                "use another --output for other settings"
             )
 
 

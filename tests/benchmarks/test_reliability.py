@@ -62,8 +62,8 @@ def root(tmp_path_factory):
     for name in ("import", "train"):
         job = jobs(folder)[name]
         assert limited(folder, None, job.module, *job.flags).returncode == 0
-    export = ("--workdir=run", "--output=w.msgpack")
-    assert limited(folder, None, "experiments.export_weights", *export).returncode == 0
+    export = ("--run=run", "--output=w.msgpack")
+    assert limited(folder, None, "rcirl_jax", "export", *export).returncode == 0
     return folder
 
 
@@ -121,10 +121,10 @@ def flags_of(root, name):
         flags = [x for x in known[name].flags if not x.startswith("--workers")]
         return known[name].module, flags
     if name == "export":
-        data = f"--workdir={root / 'run'}", f"--data={root / 'data'}"
-        return "experiments.export_weights", (*data, "--output=w.msgpack")
+        data = f"--run={root / 'run'}", f"--data={root / 'data'}"
+        return "rcirl_jax", ("export", *data, "--output=w.msgpack")
     data = f"--data={root / 'data'}", "--scenes=4"
-    return "experiments.inspect_data", (*data, "--output=look")
+    return "rcirl_jax", ("inspect", *data, "--output=look")
 
 
 @pytest.mark.parametrize(
@@ -188,11 +188,7 @@ def test_a_place_that_cannot_be_is_one_line(root, tmp_path, name):
     """Below a file, where nobody can make a folder, whoever runs it."""
     (tmp_path / "file").write_text("here")
     module, flags = flags_of(root, name)
-    places = ("--output=", "--workdir=run")
-    below = [
-        x.replace("=", f"={tmp_path}/file/", 1) if x.startswith(places) else x
-        for x in flags
-    ]
+    below = [x.replace("--output=", f"--output={tmp_path}/file/") for x in flags]
     line = refusal(limited(tmp_path, None, module, *below))
     assert f"{tmp_path}/file" in line
     assert [x.name for x in tmp_path.iterdir()] == ["file"]

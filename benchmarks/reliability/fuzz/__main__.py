@@ -36,7 +36,7 @@ from benchmarks.reliability.fuzz import child
 with child.instrumented():
     from benchmarks.common import write
     from benchmarks.reliability.fuzz.readers import READERS, shares
-    from experiments.flags.common import run
+    from rcirl_jax.commands.flags.common import run
     from rcirl_jax.errors import InputError
     from rcirl_jax.runtime.atomic_files import write_json
 

@@ -152,7 +152,9 @@ def test_faults_of_other_kinds_pass():
     ],
 )
 def test_memory_that_is_not_given_is_one_line(work, said):
-    script = f"from experiments.flags.common import run; run(lambda: exec({work!r}))"
+    script = (
+        f"from rcirl_jax.commands.flags.common import run; run(lambda: exec({work!r}))"
+    )
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=False
     )
@@ -180,6 +182,6 @@ def test_names_that_are_no_text(tmp_path):
 
 
 def test_flags_that_are_no_text(tmp_path):
-    ended = command("experiments.import_logs", "--format=csv", "--input=a\udcff")
+    ended = command("rcirl_jax", "import", "--format=csv", "--input=a\udcff")
     assert ended.returncode == 2
     assert ended.stderr == "error: '--input=a\\udcff': expected UTF-8\n"

@@ -246,17 +246,17 @@ def test_by_its_command(tmp_path):
     log, target = tmp_path / "log.csv.gz", tmp_path / "mine.toml"
     log.write_bytes(gzip.compress(people.text(people.rows(), between=";").encode()))
     flags = (f"--suggest={log}", f"--output={target}")
-    done = command("experiments.import_logs", *flags)
+    done = command("rcirl_jax", "import", *flags)
     assert done.returncode == 0, done.stderr
     assert "recognised: text in utf-8, semicolon between cells" in done.stdout
     assert f"--source={target} --input={log}" in done.stdout
     people.assert_same(people.only(log, target))
-    again = command("experiments.import_logs", *flags)
+    again = command("rcirl_jax", "import", *flags)
     assert again.returncode == 2
     assert again.stderr.startswith(
         f"error: {target}: there already: expected --overwrite"
     )
-    done = command("experiments.import_logs", "--suggest=nowhere.csv")
+    done = command("rcirl_jax", "import", "--suggest=nowhere.csv")
     assert done.stderr == "error: nowhere.csv: --suggest: missing: expected a table\n"
-    done = command("experiments.import_logs", "--format=csv")
+    done = command("rcirl_jax", "import", "--format=csv")
     assert done.stderr.startswith("error: --output: not given: expected")

@@ -1,12 +1,12 @@
-"""Flags of an import, alike in every command that imports."""
+"""Importing: which scenes are kept of the logs, and how they are held out."""
 
 import dataclasses
 from collections.abc import Callable
 
 from absl import flags
 
+from rcirl_jax.commands.flags.help import AS_SAID
 from rcirl_jax.data.importing import ImportConfig
-from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.errors import InputError
 
 NUMBERS = (
@@ -33,24 +33,15 @@ FILTERS = (
 )
 
 
-def import_flags(said: str = "") -> Callable[[ImportConfig], ImportConfig]:
-    """Define the flags; returns what applies those given to a config.
-
-    Args:
-      said: what help says of a flag that is not given; "": the config's own defaults.
-    """
-    usual = CollectConfig()
-
-    def default(value: object) -> str:
-        return said or f" (default: {value})"
-
+def import_flags() -> Callable[[ImportConfig], ImportConfig]:
+    """Define the flags; returns what applies those given to a config."""
     numbers = {
-        field: flags.DEFINE_float(name, None, help_ + default(getattr(usual, field)))
+        field: flags.DEFINE_float(name, None, help_ + AS_SAID)
         for name, field, help_ in NUMBERS
     }
     filters = {
         field: flags.DEFINE_bool(
-            name, None, f"keep scenes without {what} (the paper drops them){said}"
+            name, None, f"keep scenes without {what} (the paper drops them){AS_SAID}"
         )
         for name, field, what in FILTERS
     }

@@ -1,4 +1,4 @@
-"""The flags that say what the gate takes for a loss and for a gain."""
+"""The gate: what it takes for a loss and for a gain."""
 
 import dataclasses
 

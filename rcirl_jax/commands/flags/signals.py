@@ -1,4 +1,4 @@
-"""The flag that says which written traffic lights an import uses."""
+"""Traffic lights: which written ones an import uses."""
 
 from collections.abc import Sequence
 

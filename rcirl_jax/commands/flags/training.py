@@ -1,4 +1,4 @@
-"""The recipe of a training run, and the flags that may depart from it.
+"""Training: what may depart from the recipe.
 
 A recipe holds everything that decides a run; no command has a default of its own.
 """
@@ -9,9 +9,10 @@ from typing import Any
 
 from absl import flags
 
-from experiments.flags.common import floats, hidden_sizes
-from experiments.flags.recipe import AS_SAID, recipe
 from rcirl_jax.autotune.recipes import departing
+from rcirl_jax.commands.flags.common import floats, hidden_sizes
+from rcirl_jax.commands.flags.help import AS_SAID
+from rcirl_jax.commands.flags.recipe import recipe
 from rcirl_jax.data.store.joined import EQUAL
 from rcirl_jax.errors import InputError
 from rcirl_jax.reward import LOSSES

@@ -1,8 +1,8 @@
-"""The flags that say which scenes of a dataset are held out."""
+"""Which scenes of a dataset are held out."""
 
 from absl import flags
 
-from experiments.flags.common import alone
+from rcirl_jax.commands.flags.common import alone
 from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.data.store.resplit import HOLDOUTS, folds_by_recording, held_out
 from rcirl_jax.errors import InputError

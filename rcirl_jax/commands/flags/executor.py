@@ -1,4 +1,4 @@
-"""The flags that say where independent pieces of work run."""
+"""Where independent pieces of work run."""
 
 from absl import flags
 

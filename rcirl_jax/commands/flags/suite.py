@@ -1,4 +1,4 @@
-"""The flags that say which closed-loop cases are driven, and how often is planned."""
+"""Closed loop: which cases are driven, and how often is planned."""
 
 from typing import Any
 

@@ -1,13 +1,14 @@
-"""The flag that names a recipe: everything that decides a training run."""
+"""The recipe: everything that decides a training run."""
 
 from absl import flags
 
 from rcirl_jax.autotune.recipes import DEFAULT, Recipe, load_recipe
 
 RECIPE = flags.DEFINE_string(
-    "recipe", DEFAULT, "name in data_specs/recipes, or a TOML file"
+    "recipe",
+    DEFAULT,
+    "tuned, paper, quick, or a TOML file: decides all that no flag beside it says",
 )
-AS_SAID = "; default: as the recipe says"  # end of the help of a flag beside it
 
 
 def recipe() -> Recipe:

@@ -1,6 +1,8 @@
-"""What the experiment files share: running, reading flags, provenance."""
+"""What the commands share: running, reading flags, provenance."""
 
+import functools
 import os
+import re
 import sys
 import tempfile
 import traceback
@@ -11,8 +13,9 @@ from typing import NoReturn
 import jax
 from absl import app, flags, logging
 
+from rcirl_jax.commands.flags.help import asked_for, example, module_of, own_flags
 from rcirl_jax.data.store.dataset import Dataset
-from rcirl_jax.errors import InputError
+from rcirl_jax.errors import InputError, extra_of
 from rcirl_jax.export.reader import load_weights
 from rcirl_jax.runtime import provenance as made_by
 from rcirl_jax.runtime import signals as interrupts
@@ -33,7 +36,6 @@ def run(main: Callable[[], None]) -> None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
 
     logging.set_verbosity(logging.WARNING)
-    _own_the_shared_flags()
 
     def guarded(argv: list[str]) -> None:
         try:
@@ -52,10 +54,12 @@ def run(main: Callable[[], None]) -> None:
         except interrupts.Interrupted as stop:
             _leave(stop.number)
         except Exception as error:
+            if known := extra_of(error):
+                _refuse(known)
             _refuse(_fault(error), EXIT_FAULT)
 
     interrupts.install()
-    app.run(guarded, flags_parser=_parse)
+    app.run(guarded, flags_parser=functools.partial(_parse, main))
 
 
 def _refuse(what: object, status: int = EXIT_BAD_INPUT) -> NoReturn:
@@ -94,29 +98,32 @@ def _leave(number: int) -> None:
     interrupts.leave(number)
 
 
-def _own_the_shared_flags() -> None:
-    """Flags that a main imports from other experiment files count as its own.
-
-    --help then shows them, and provenance records them.
-    """
-    for module, found in flags.FLAGS.flags_by_module_dict().items():
-        if module.startswith("experiments."):
-            for flag in found:
-                flags.FLAGS.register_key_flag_for_module(sys.argv[0], flag)
-
-
-def _parse(argv: list[str]) -> list[str]:
-    """Absl's parser, with its complaints as one line.
+def _parse(main: Callable, argv: list[str]) -> list[str]:
+    """Absl's parser, with our help, and its complaints as one line.
 
     Names of files that are no UTF-8 could not be written into what is made of them.
     """
     odd = [text for text in argv if not is_text(text)]
     if odd:
         _refuse(f"{odd[0]!a}: expected UTF-8")
+    if text := asked_for(argv, main):
+        print(text)
+        sys.exit(0)
     try:
         return flags.FLAGS(argv)
     except flags.Error as error:
-        _refuse(" ".join(str(error).split()))
+        _refuse(_missing(str(error), main) or " ".join(str(error).split()))
+
+
+def _missing(complaint: str, main: Callable) -> str:
+    """One line on required flags that were not given; "" if it is about others."""
+    names = re.findall(r"^flag --(\w+)=None: ", complaint, re.M)
+    if not names:
+        return ""
+    wanted = "; ".join(str(flags.FLAGS[name].help) for name in names)
+    shown = example(module_of(main))
+    given = f"{', '.join(f'--{name}' for name in names)}: not given: expected {wanted}"
+    return f"{given}; for example: {shown}" if shown else given
 
 
 def alone(flag: str, *others: str) -> None:
@@ -155,7 +162,7 @@ def hidden_sizes(values: list[str], flag: str = "hidden_size") -> tuple[int, ...
 
 
 def provenance(weights: Sequence[str] = ()) -> dict:
-    """Flags of one experiment file, git commit, versions and machine.
+    """Flags of the command, git commit, versions and machine.
 
     Starts JAX's devices, as `rcirl_jax.runtime.provenance.provenance`.
 
@@ -165,7 +172,7 @@ def provenance(weights: Sequence[str] = ()) -> dict:
     Raises:
       InputError: a weights file is missing or damaged.
     """
-    own = flags.FLAGS.get_key_flags_for_module(sys.argv[0])
+    own = [flag for some in own_flags().values() for flag in some]
     read = {str(path): load_weights(path).sha256 for path in weights}
     return {
         "flags": {flag.name: flag.value for flag in own},
