@@ -12,7 +12,8 @@ from rcirl_jax.data.importers.csv.suggest import suggested
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import load_toml
 from tests.data.importers import people
-from tests.data.importers.test_csv_meaning import degrees, pneuma, wide_frames
+from tests.data.importers.test_csv_meaning import pneuma, wide_frames
+from tests.data.importers.test_csv_ways import degrees
 from tests.helpers.commands import command
 
 
@@ -75,18 +76,6 @@ def test_units_of_speed_by_the_positions(tmp_path, unit, factor):
     people.assert_same(made, speed=0.01)
 
 
-@pytest.mark.parametrize(("unit", "factor"), [("m/s", 1.0), ("km/h", 3.6)])
-def test_units_of_velocities_by_the_positions(tmp_path, unit, factor):
-    turn = 2.0
-    header = ("t", "id", "x", "y", "vx", "vy", "length", "kind")
-    ways = factor * np.array([np.cos(turn), np.sin(turn)])
-    table = [[*r[:4], *(r[5] * ways).tolist(), *r[6:]] for r in people.rows(turn)]
-    path = people.write(tmp_path, table, header)
-    _, toml, (made,) = taken(path)
-    assert (toml["units"]["vx"], toml["units"]["vy"]) == (unit, unit)
-    people.assert_same(made, turn, speed=0.01)
-
-
 @pytest.mark.parametrize("rate", [10.0, 25.0, 30.0])
 @pytest.mark.parametrize(("unit", "factor"), [("m/s", 1.0), ("km/h", 3.6)])
 def test_the_rate_of_frames_by_the_speeds(tmp_path, rate, unit, factor):
@@ -102,14 +91,6 @@ def test_the_rate_of_frames_by_the_speeds(tmp_path, rate, unit, factor):
     for track in made.tracks:
         np.testing.assert_allclose(track.speed, 14.0, atol=0.01)
         np.testing.assert_allclose(np.diff(track.t), 1.0 / rate, atol=1e-6)
-
-
-def test_every_fifth_frame(tmp_path):
-    table = people.column(people.rows(), "t", lambda t: round(50 * t) + 5)
-    path = people.write(tmp_path, table, ("frame", *people.HEADER[1:]))
-    _, toml, (made,) = taken(path)
-    assert (toml["scale"]["t"], toml["defaults"]["rate_hz"]) == (0.2, 10.0)
-    people.assert_same(made)
 
 
 def test_raw_degrees_are_one_line(tmp_path):
@@ -167,17 +148,6 @@ def test_iso_times_and_degrees_in_parquet(tmp_path):
     assert "recognised: t: column datetime, iso" in found.lines
 
 
-def test_frames_have_a_rate_that_is_not_known(tmp_path):
-    table = people.column(people.rows(), "t", lambda t: round(10 * t))
-    path = tmp_path / "log.csv"
-    header = ("frame", *people.HEADER[1:5], "length", "kind")  # no speeds that tell it
-    plain = [[*row[:5], *row[6:]] for row in table]
-    path.write_text(people.text(plain, header))
-    found, toml, _ = taken(path)
-    assert toml["units"]["t"] == "frame"
-    assert any(line.startswith("not known: rate_hz") for line in found.lines)
-
-
 def test_a_row_per_frame(tmp_path):
     header, table = wide_frames("{axis}_{car}")
     path = tmp_path / "log.csv"
@@ -198,13 +168,6 @@ def test_a_row_per_vehicle(tmp_path):
     assert toml["units"]["speed"] == "km/h"
     assert len(made.tracks) == 6
     assert any("a row per road user, which repeats lat, lon" in x for x in found.lines)
-
-
-def test_columns_that_look_like_nothing(tmp_path):
-    path = tmp_path / "log.csv"
-    path.write_text("alpha,beta\n1,2\n3,4\n")
-    with pytest.raises(InputError, match=r"no column looks like t, id, x, y: expected"):
-        suggested(path)
 
 
 @pytest.mark.parametrize(
