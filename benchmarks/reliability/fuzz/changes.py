@@ -26,7 +26,6 @@ BYTES = (
 OTHERS = (None, True, False, [], {}, [[]], {"": {}}, [None])
 TOKEN = re.compile(r"[\w.+-]+|\s+|.", re.S)  # numbers, names, marks
 GROWN = 2000  # nodes more, after which a tree is changed no further
-MAX_DEEP = 900  # levels put around a value; writers of more recurse too deeply
 most_copies = [20]  # of one piece, in its place
 
 
@@ -102,19 +101,10 @@ def _places(tree: Any) -> list[tuple[Any, Any]]:  # noqa: ANN401
     return found
 
 
-def _deep(value: Any, rng: random.Random) -> Any:  # noqa: ANN401
-    """The value inside of many lists."""
-    for _ in range(rng.choice((1, 10, 70, MAX_DEEP))):
-        value = [value]
-    return value
-
-
 def _change(node: Any, key: Any, rng: random.Random) -> None:  # noqa: ANN401
     """One node made another, removed, doubled or renamed; few are put deep inside."""
     kind = rng.randrange(40)
-    if kind == 0:
-        node[key] = _deep(node[key], rng)
-    elif kind < 17:
+    if kind < 17:
         node[key] = near(node[key], rng)
     elif kind < 27:
         node[key] = odd(rng)

@@ -18,9 +18,6 @@ from typing import Any
 
 import google_crc32c
 import msgpack
-import numpy as np
-import pyarrow
-import pyarrow.parquet
 from google.protobuf.empty_pb2 import Empty
 from google.protobuf.message import DecodeError
 from google.protobuf.unknown_fields import UnknownFieldSet
@@ -161,15 +158,6 @@ def _sqlite(data: bytes, rng: random.Random) -> bytes:
         return base.serialize()
 
 
-def _parquet(data: bytes, rng: random.Random) -> bytes:
-    columns = pyarrow.parquet.read_table(io.BytesIO(data)).to_pydict()
-    columns = changed_tree(columns, rng)
-    out, rows = io.BytesIO(), max(map(len, columns.values()))
-    made = {k: (v * rows)[:rows] for k, v in columns.items()}  # all of one length
-    pyarrow.parquet.write_table(pyarrow.table(made), out, row_group_size=1 + rows // 2)
-    return out.getvalue()
-
-
 def archive_of(members: dict[str, bytes], method: int = zipfile.ZIP_STORED) -> bytes:
     """A zip archive of these files."""
     out = io.BytesIO()
@@ -179,27 +167,11 @@ def archive_of(members: dict[str, bytes], method: int = zipfile.ZIP_STORED) -> b
     return out.getvalue()
 
 
-def _npz(data: bytes, rng: random.Random) -> bytes:
-    """One member as values, or its bytes."""
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
-    name = rng.choice([*members])
-    if rng.random() < 0.5:
-        members[name] = changed_bytes(members[name], rng)
-    else:
-        out, values = io.BytesIO(), np.load(io.BytesIO(members[name])).tolist()
-        np.save(out, np.asarray(changed_tree(values, rng)), allow_pickle=False)
-        members[name] = out.getvalue()
-    return archive_of(members)
-
-
 CODECS: dict[str, Codec] = {
     "manifest.json": _sealed("hash"),
     "shard.json": _sealed("sha256"),
     ".tfrecord": _tfrecord,
     ".record": _cyber,
-    ".parquet": _parquet,
-    ".npz": _npz,
     ".db": _sqlite,
     ".gpkg": _sqlite,
     ".pb": message,

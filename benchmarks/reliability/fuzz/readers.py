@@ -44,8 +44,7 @@ from rcirl_jax.train import checkpoint
 from rcirl_jax.train.metrics import pairs_won
 from rcirl_jax.train.running import check_run, describe_run
 from rcirl_jax.train.state import TrainConfig
-from tests.data.importers import formats
-from tests.data.importers.csv_tables import TABLES
+from tests.data.importers import formats, people, test_csv_meaning, test_csv_ways
 from tests.data.store import test_dataset as test_store
 from tests.helpers.stored import sweep_result
 from tests.helpers.weights_files import packed
@@ -91,16 +90,21 @@ def log(form: str, write: Callable[[Path], formats.Fixture]) -> Callable:
     return target
 
 
+WAYS = ("decimal commas", "ISO with a zone", "degrees", "Parquet: as they are", "bz2")
+
+
 def tables(folder: Path) -> Target:
     """Tables of a user's own, each with its TOML."""
+    ways = [test_csv_ways.WAYS[name] for name in WAYS]
+    ways += [test_csv_meaning.side_by_side(), test_csv_meaning.a_row_per_vehicle()]
     files = []
-    for number, (log, spec) in enumerate(TABLES):
-        files += [folder / f"{number}.csv", folder / f"{number}.toml"]
-        files[-2].write_text(log)
-        files[-1].write_text(spec)
+    for number, way in enumerate(ways):
+        place = folder / str(number)
+        place.mkdir()
+        files += people.put(place, way, "long_bytes = 1\nmax_bad_rows = 0.2")
 
     def read(file: Path) -> None:
-        log, spec = file.with_suffix(".csv"), file.with_suffix(".toml")
+        log, spec = file.parent / "log.csv", file.parent / "map.toml"
         collections.deque(read_recordings("csv", log, spec), maxlen=0)
 
     return Target(read=read, files=files)

@@ -118,7 +118,7 @@ def test_a_long_silence_is_stepped_over(tmp_path, monkeypatch, silence, piece):
 
 
 def test_rows_held_are_limited(tmp_path, monkeypatch):
-    monkeypatch.setattr(apollo_messages, "MAX_ROWS", 100)
+    monkeypatch.setattr("rcirl_jax.data.importers.messages.MAX_ROWS", 100)
     line = refused(read, in_parts(tmp_path, long_drive(8.0), 1))
     assert "more than 100 obstacle states" in line
 

@@ -9,7 +9,7 @@ import pytest
 
 from rcirl_jax.data.importers.projection import projected
 from tests.data.importers import people
-from tests.data.importers.people import LONG, refused, write
+from tests.data.importers.people import LONG, Way, of, refused, write
 from tests.data.importers.test_csv_ways import MIDDLE, degrees, stored
 
 # ------------------------------------------------------------------------ places
@@ -116,6 +116,14 @@ def wide_frames(name, cars=people.CARS):
     return header, list(lines.values())
 
 
+def side_by_side(name="{axis}_{car}", columns="{axis}_{id}"):
+    """That table, and what its columns mean."""
+    header, table = wide_frames(name)
+    fields = {"x": "x", "y": "y", "speed": "v"}
+    named = {f: columns.replace("{axis}", axis) for f, axis in fields.items()}
+    return of(table, header, columns={"t": "time", **named})
+
+
 @LONG
 @pytest.mark.parametrize(
     ("name", "columns"),
@@ -127,14 +135,8 @@ def wide_frames(name, cars=people.CARS):
     ],
 )
 def test_one_row_per_frame(tmp_path, name, columns, long_bytes):
-    header, table = wide_frames(name)
-    path = write(tmp_path, table, header, between=";")
-    fields = {"x": "x", "y": "y", "speed": "v"}
-    named = {f: columns.replace("{axis}", axis) for f, axis in fields.items()}
-    source = people.spec(
-        tmp_path, {"t": "time", **named}, more=f"long_bytes = {long_bytes}"
-    )
-    found = people.only(path, source)
+    way = side_by_side(name, columns)
+    found = people.only(*people.put(tmp_path, way, f"long_bytes = {long_bytes}"))
     assert [t.id for t in found.tracks] == ["0", "1", "2", "2#2", "3", "4", "5"]
     sizes = {track.id: track.t.size for track in found.tracks}
     assert (sizes["0"], sizes["2"], sizes["2#2"]) == (120, 40, 70)
@@ -179,22 +181,20 @@ def pneuma(form="{:.6f}"):
     return "\n".join(lines) + "\n"
 
 
-PNEUMA = {
-    "t": "time", "id": "track_id", "y": "lat", "x": "lon", "speed": "speed",
-    "kind": "type",
-}  # fmt: skip
+def a_row_per_vehicle():
+    """That text, and what its columns mean."""
+    columns = {
+        **{"t": "time", "id": "track_id", "y": "lat", "x": "lon", "speed": "speed"},
+        "kind": "type",
+    }
+    kinds = 'Car = "vehicle"\n"Heavy Vehicle" = "vehicle"'
+    return Way(content=pneuma(), columns=columns, units='speed = "km/h"', rest=kinds)
 
 
 @LONG
 def test_a_row_per_vehicle_as_in_pneuma(tmp_path, long_bytes):
-    path = tmp_path / "20181024_d1_0830_0900.csv"
-    path.write_text(pneuma())
-    kinds = 'Car = "vehicle"\n"Heavy Vehicle" = "vehicle"'
-    source = people.spec(
-        tmp_path, PNEUMA, units='speed = "km/h"', more=f"long_bytes = {long_bytes}",
-        rest=kinds,
-    )  # fmt: skip
-    found = people.only(path, source)
+    way = a_row_per_vehicle()
+    found = people.only(*people.put(tmp_path, way, f"long_bytes = {long_bytes}"))
     assert [track.id for track in found.tracks] == list("012345")
     assert [t.t.size for t in found.tracks] == [120, 110, 100, 90, 80, 70]
     for track in found.tracks:
@@ -207,19 +207,16 @@ def test_a_row_per_vehicle_as_in_pneuma(tmp_path, long_bytes):
 
 def test_a_row_per_vehicle_that_breaks_off(tmp_path):
     """The others say how many columns repeat."""
-    path = tmp_path / "log.csv"
+    path, source = people.put(tmp_path, a_row_per_vehicle())
     path.write_text(pneuma().replace("; \n", "; 37.97; 23.7; \n", 1))
-    columns = {field: name for field, name in PNEUMA.items() if field != "kind"}
-    source = people.spec(tmp_path, columns, units='speed = "km/h"')
     found = people.only(path, source)
     assert people.rows_of(found) == (571, 1, 0, 0)
     assert any("first: line 2: 6 cells: expected 10" in note for note in found.notes)
 
 
 def test_a_cell_inside_of_a_long_row_is_named_by_its_line(tmp_path):
-    path = tmp_path / "log.csv"
+    path, source = people.put(tmp_path, a_row_per_vehicle(), "max_bad_rows = 0.0")
     path.write_text(pneuma().replace("; 55.0", "; fast", 1))
-    source = people.spec(tmp_path, PNEUMA, more="max_bad_rows = 0.0")
     assert "line 2: speed: 'fast" in refused(path, source)
 
 

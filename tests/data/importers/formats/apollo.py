@@ -365,6 +365,6 @@ HARMS = {
 OPTIONS = [
     *[{"rate_hz": rate} for rate in (0, 1e9)],
     *[{"window_s": window} for window in (0, 1e-320, 0.99)],
-    *[{"topics": bad} for bad in (3, {"pose": "/x"}, {"routing": []})],
+    *[{"topics": bad} for bad in (3, {"pose": "/x"}, {"routing": [3]})],
     *[{"ego": 1}, {"unknown": "x"}],
 ]
