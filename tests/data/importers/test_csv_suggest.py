@@ -12,6 +12,7 @@ from rcirl_jax.data.importers.csv.suggest import suggested
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import load_toml
 from tests.data.importers import people
+from tests.data.importers.people import column, of, rows
 from tests.data.importers.test_csv_meaning import pneuma, wide_frames
 from tests.data.importers.test_csv_ways import degrees
 from tests.helpers.commands import command
@@ -63,19 +64,6 @@ def test_a_german_table_of_a_spreadsheet(tmp_path):
     assert " ".join(shown[1].split()) == "0.00 car0 588000.00 0.00 28.65 15.80 4.50 Pkw"
 
 
-@pytest.mark.parametrize(
-    ("unit", "factor"),
-    [("m/s", 1.0), ("km/h", 3.6), ("mph", 2.23694), ("ft/s", 3.28084)],
-)
-def test_units_of_speed_by_the_positions(tmp_path, unit, factor):
-    path = tmp_path / "log.csv"
-    table = people.column(people.rows(), "speed", lambda v: v * factor)
-    path.write_text(people.text(table))
-    _, toml, (made,) = taken(path)
-    assert toml["units"]["speed"] == unit
-    people.assert_same(made, speed=0.01)
-
-
 @pytest.mark.parametrize("rate", [10.0, 25.0, 30.0])
 @pytest.mark.parametrize(("unit", "factor"), [("m/s", 1.0), ("km/h", 3.6)])
 def test_the_rate_of_frames_by_the_speeds(tmp_path, rate, unit, factor):
@@ -118,17 +106,34 @@ def test_units_in_a_line_below_the_header(tmp_path):
     np.testing.assert_allclose(ways, people.rows()[-6][2], atol=0.01)
 
 
-@pytest.mark.parametrize(
-    ("step", "name", "unit"),
-    [(1.0, "time", "s"), (1e3, "time", "ms"), (1e6, "time", "us"), (1e9, "time", "ns")],
-)
-def test_units_of_time_by_the_step(tmp_path, step, name, unit):
-    path = tmp_path / "log.csv"
-    table = people.column(people.rows(), "t", lambda t: f"{t * step:.3f}")
-    path.write_text(people.text(table, (name, *people.HEADER[1:])))
+SPEEDS = {"m/s": 1.0, "km/h": 3.6, "mph": 2.23694, "ft/s": 3.28084}
+STEPS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+# by the positions, and by the step
+UNITS = [
+    *[
+        ("speed", unit, of(column(rows(), "speed", lambda v, f=factor: v * f)))
+        for unit, factor in SPEEDS.items()
+    ],
+    *[
+        (
+            "t",
+            unit,
+            of(
+                column(rows(), "t", lambda t, f=factor: f"{t * f:.3f}"),
+                ("time", *people.HEADER[1:]),
+            ),
+        )
+        for unit, factor in STEPS.items()
+    ],
+]
+
+
+@pytest.mark.parametrize(("field", "unit", "way"), UNITS)
+def test_units(tmp_path, field, unit, way):
+    path, _ = people.put(tmp_path, way)
     _, toml, (made,) = taken(path)
-    assert toml["units"]["t"] == unit
-    people.assert_same(made)
+    assert toml["units"][field] == unit
+    people.assert_same(made, speed=0.01)
 
 
 def test_iso_times_and_degrees_in_parquet(tmp_path):
