@@ -51,8 +51,8 @@ def rise(values: Sequence[float]) -> float:
     all pairs of rounds: a spike, or noise around a level, does not move it.
     """
     left = watched(values)
-    slope = stats.theilslopes(left, np.arange(left.size))[0]
-    return float(slope) * (left.size - 1)
+    found = np.asarray(stats.theilslopes(left, np.arange(left.size)), np.float64)
+    return float(found[0]) * (left.size - 1)
 
 
 def kept(counts: Sequence[float]) -> float:

@@ -179,7 +179,8 @@ def _what_is_missing(held: Held, within: tuple[float, float]) -> list[str]:
     notes = [] if len(tables["ego"]) else ["no places of the ego; no ego track"]
     if not len(tables["obstacles"]):
         notes.append("no obstacles recorded; the ego is alone")
-    return notes + automatic_notes(*tables["driver"].T, within, "driven by hand")
+    clock, by_hand = tables["driver"].T
+    return notes + automatic_notes(clock, by_hand, within, "driven by hand")
 
 
 def _ego(held: Held, spec: dict, rate: float) -> list[Track]:
@@ -187,7 +188,8 @@ def _ego(held: Held, spec: dict, rate: float) -> list[Track]:
     t, x, y, heading, speed = held.tables["ego"].T
     check_coordinates(held.path, "ego", ("x", "y"), held.tables["ego"][:, 1:3])
     if np.isnan(speed).any():
-        measured = speed_at(t, *held.tables["velocity"].T)
+        clock, velocity = held.tables["velocity"].T
+        measured = speed_at(t, clock, velocity)
         speed = np.where(np.isnan(speed), measured, speed)
     boxes = ego_boxes(spec, EGO, t, x, y, heading, speed)
     boxes = on_clock(boxes, rate, MAX_GAP_S)
@@ -203,7 +205,8 @@ def _automated(held: Held, spec: dict) -> tuple[tuple[float, float], ...]:
     """
     if not len(held.tables["driver"]):
         return recording_car({"recording_car": "human", **spec})
-    return automatic_spans(*held.tables["driver"].T)
+    clock, by_hand = held.tables["driver"].T
+    return automatic_spans(clock, by_hand)
 
 
 def _obstacles(held: Held, spec: dict, rate: float) -> tuple[list[Track], list[str]]:
