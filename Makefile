@@ -21,10 +21,6 @@ install = $(if $(LOCK),\
   $(1)/bin/python $(PIP) install --no-deps --no-build-isolation --editable .,\
   $(1)/bin/python $(PIP) install --editable '.[$(2)]')
 
-# What guides the fuzzing of readers
-ATHERIS = $(BIN)/python $(PIP) install $(if $(LOCK),--require-hashes \
-  --requirement $(LOCK)/fuzz.lock,--requirement requirements/fuzz.in)
-
 # Minutes; they touch every dependency: logs, store, two epochs, resume, export, readers, pages
 QUICK := $(addprefix tests/train/test_loop.py::test_,resume_is_bitwise run_writes_what_it_should \
   export_and_rank exported_values_are_the_trainers) \
@@ -91,7 +87,6 @@ test-slow: setup
 
 # The long rows of docs/reliability.md, each by its command; hours, and `make fuzz` wants clang
 test-long: setup
-	$(ATHERIS)
 	$(BIN)/python -m pytest -q -m long
 
 # The quick tests with the oldest versions allowed; they run among newer neighbours that
@@ -190,7 +185,6 @@ lock: build/tools/.installed
 	$(COMPILE) $(PROJECT) --extra all --constraint requirements/test.lock --output-file requirements/all.lock
 	$(COMPILE) $(PROJECT) --extra quick --resolution lowest-direct --output-file requirements/floor.lock
 	$(COMPILE) requirements/tools.in --output-file requirements/tools.lock
-	$(COMPILE) requirements/fuzz.in --output-file requirements/fuzz.lock
 
 build/tools/.installed: $(if $(LOCK),$(LOCK)/tools.lock,requirements/tools.in)
 	$(PYTHON) -m venv build/tools
@@ -199,13 +193,12 @@ build/tools/.installed: $(if $(LOCK),$(LOCK)/tools.lock,requirements/tools.in)
 
 # Known vulnerabilities of the locked versions; `AUDIT=--vulnerability-service=osv` asks elsewhere
 audit: build/tools/.installed
-	build/tools/bin/python .ci/audit.py $(AUDIT) $(addprefix requirements/,all.lock test.lock tools.lock fuzz.lock)
+	build/tools/bin/python .ci/audit.py $(AUDIT) $(addprefix requirements/,all.lock test.lock tools.lock)
 
 # Every row of docs/reliability.md that has not come out as stated with this code before;
 # `MINUTES=2` leaves out what takes longer, `ANEW=1` runs all. Rows that depend on what others
 # publish, audit and test-ceiling, are run each time
 reliability: setup
-	$(ATHERIS)
 	$(BIN)/python -m benchmarks.reliability.table $(if $(MINUTES),--minutes=$(MINUTES)) $(if $(ANEW),--anew) --output=$(RESULTS)
 
 # The C++ reader and F under libFuzzer; needs clang and its runtime

@@ -37,6 +37,12 @@ class Job:
     finished: Callable[[Path], int]  # things in its folder that are finished
 
 
+def different(found: Facts, expected: Facts) -> list[str]:
+    """What did not come out as expected, by name."""
+    names = sorted(found.keys() | expected.keys())
+    return [name for name in names if found.get(name) != expected.get(name)]
+
+
 def write_logs(folder: Path) -> None:
     """CSV logs of platoons on a straight road."""
     small_logs.write_logs(folder, files=8, seconds=20.0)

@@ -20,13 +20,6 @@ def test_every_format_is_told_by_its_files(name, tmp_path):
     assert recognised_format(fixture.input) == format_of(name)
 
 
-def test_no_input_is_synthetic_traffic(tmp_path):
-    assert recognised_format(None) == "synthetic"
-    toml = tmp_path / "traffic.toml"
-    toml.write_text("rate_hz = 10.0\n")
-    assert recognised_format(toml) == "synthetic"
-
-
 def test_ngsim_in_both_forms(tmp_path):
     text = w.ngsim_text(tmp_path / "a.txt", w.ngsim_rows())
     table = w.ngsim_csv(tmp_path / "a.csv", w.ngsim_rows())
