@@ -85,9 +85,7 @@ def _together(
 
 def _without(views: Sequence[View | None], crashed: np.ndarray) -> list[View | None]:
     """Views of those that have not crashed."""
-    return [
-        None if out else view for view, out in zip(views, crashed, strict=True)
-    ]
+    return [None if out else view for view, out in zip(views, crashed, strict=True)]
 
 
 def _log(

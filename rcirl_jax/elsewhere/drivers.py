@@ -32,6 +32,7 @@ class Free(flax.struct.PyTreeNode, kw_only=True):
     """What is ahead of the front bumper in the ego's corridor; inf: nothing."""
 
     body: jax.Array  # [] m, the rear of the nearest body
+    speed: jax.Array  # [] m/s of that body along the road; 0 without one
     line: jax.Array  # [] m, a line that demands a stop
 
 
@@ -90,7 +91,9 @@ def ahead(scene: Scene) -> Free:
     is_line = obstacles.kind == Kind.STOP
     nearest = lambda which: jnp.min(jnp.where(in_way & which, gap, jnp.inf))  # noqa: E731
     is_body = ~is_line & (obstacles.kind != Kind.VIRTUAL)
-    return Free(body=nearest(is_body), line=nearest(is_line))
+    first = jnp.argmin(jnp.where(in_way & is_body, gap, jnp.inf))
+    speed = jnp.where((in_way & is_body)[first], obstacles.speed[first, 0], 0.0)
+    return Free(body=nearest(is_body), speed=speed, line=nearest(is_line))
 
 
 class Next(flax.struct.PyTreeNode, kw_only=True):
