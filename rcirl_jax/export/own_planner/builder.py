@@ -53,6 +53,7 @@ from rcirl_jax.units import HORIZON_S, NUM_STATIONS, NUM_TIMES, STATION_STEP_M, 
 BESIDE_M = 20.0  # m beside the centre line beyond which the ego is not on its road
 STEEPEST = 1.2  # rad, tilt beyond which dl/ds grows no more
 MIN_SHRINK = 0.1  # 1, least value of 1 - kappa l
+GRID_BLOCK = 256  # points: grids are a multiple, so that few sizes compile
 _extents_of = jax.jit(jax.vmap(frenet_extent))
 LONG_GRID_M = np.arange(
     0.0, (NUM_STATIONS - 1) * STATION_STEP_M + LOOK_AHEAD_M + 1e-6, STATION_STEP_M
@@ -157,6 +158,7 @@ class LineFrame:
         points = polyline("centre_line.points", road.points) - self.origin
         self.length = float(np.sum(np.hypot(*np.diff(points, axis=0).T)))
         size = int(self.length / STATION_STEP_M) + 2
+        size = -(-size // GRID_BLOCK) * GRID_BLOCK
         line = reference_line_from_polyline(points, size=size, step=STATION_STEP_M)
         self.line: ReferenceLine = jax.device_get(line)
         self.grid = np.arange(size) * STATION_STEP_M
