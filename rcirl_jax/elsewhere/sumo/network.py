@@ -132,19 +132,16 @@ def _traffic(number: int, kind: Kind) -> Iterator[tuple[float, str]]:
     """(begin s, element) of the flows of a corridor and of its ego."""
     east = main_road(number)
     west = [f"{number}.r{k}" for k in range(JUNCTIONS, -1, -1)]
-    turning = 0.3 * kind.main / JUNCTIONS
     flows = [(east, 0.7 * kind.main), (west, 0.7 * kind.main)]
     for k in range(1, JUNCTIONS + 1):
         a, b, d, e = (f"{number}.{side}{k}" for side in "abde")
         back = JUNCTIONS + 1 - k  # edges of the way back before the junction
-        flows += [([*east[:k], b], 0.5 * turning), ([*east[:k], e], 0.5 * turning)]
+        off, cross = 0.15 * kind.main / JUNCTIONS, 0.4 * kind.side
         flows += [
-            ([*west[:back], e], 0.5 * turning),
-            ([*west[:back], b], 0.5 * turning),
+            ([*way, out], off) for way in (east[:k], west[:back]) for out in (b, e)
         ]
-        flows += [([a, *east[k:]], 0.4 * kind.side), ([d, *east[k:]], 0.2 * kind.side)]
-        flows += [([a, e], 0.4 * kind.side), ([d, b], 0.4 * kind.side)]
-        flows += [([d, *west[back:]], 0.4 * kind.side)]
+        flows += [([a, *east[k:]], cross), ([d, *east[k:]], 0.5 * cross)]
+        flows += [([a, e], cross), ([d, b], cross), ([d, *west[back:]], cross)]
     for n, (edges, rate) in enumerate(flows):
         yield (
             0.0,

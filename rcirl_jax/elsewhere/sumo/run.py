@@ -19,13 +19,15 @@ import numpy as np
 from rcirl_jax.elsewhere.simulators import STEP_S, Move, Running, View
 from rcirl_jax.elsewhere.sumo.network import KINDS, WARM_UP_S, main_road, write
 from rcirl_jax.elsewhere.way import Way
-from rcirl_jax.export.own_planner.inputs import Body, Car, CentreLine, Signal
+from rcirl_jax.export.own_planner.inputs import Body, Car, Signal
+from rcirl_jax.units import HORIZON_S
 
 KRAUSS = "Krauss"
 ENTRY_S = 30  # s that egos may wait for a gap at the corridors' beginning
 NEAR_M = 150.0  # m within which others are shown
 SIGNAL_M = 250.0  # m within which lights are
 STATES = {"r": "red", "u": "red", "y": "yellow", "Y": "yellow"}  # others: green
+MOST_MPS = 25.0  # m/s, above every speed of an ego
 FREE = 0  # no checks of speed or of lane changes
 
 
@@ -149,10 +151,12 @@ class Ego:
         libsumo.vehicle.setSpeed(self.name, move.speed)
         self._acceleration = move.acceleration
 
-    def look(self, others: Sequence[Body]) -> View:
-        """What is seen now."""
+    def look(self, others: Sequence[Body]) -> View | None:
+        """What is seen now; None: the way ends within the planner's horizon."""
         get, front = libsumo.vehicle, self._front()
         length, width = self._size
+        if front + MOST_MPS * HORIZON_S > self._way.stations[-1]:
+            return None
         x, y, heading, curvature = self._way.place(front - 0.5 * length)
         own = get.getAcceleration(self.name)
         before, self._next = self._next, self._light()
@@ -266,5 +270,5 @@ def _command(network: Path, routes: Path, episodes: Sequence[str]) -> list[str]:
 
 
 def _heading(angle: float) -> float:
-    """rad counter-clockwise from x, of SUMO's degrees clockwise from y."""
+    """Heading in rad counter-clockwise from x, of degrees clockwise from y."""
     return math.remainder(math.radians(90.0 - angle), math.tau)
