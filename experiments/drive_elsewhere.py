@@ -1,0 +1,60 @@
+"""Drive a reward and its rivals in a simulator that somebody else wrote.
+
+    python -m experiments.drive_elsewhere --simulator=highway_env|sumo --weights=FILE \
+        --episodes=N --output=DIR
+
+The rows drive the same episodes, at 10 Hz behind the same safety filter; the last are
+the simulator's own drivers. Writes table.txt, episodes.csv and elsewhere.json:
+docs/simulators.md.
+"""
+
+from pathlib import Path
+
+from absl import flags
+
+from experiments.flags.common import provenance, run
+from rcirl_jax.elsewhere.drive import drive_all, entrants
+from rcirl_jax.elsewhere.simulators import SIMULATORS, open_simulator
+from rcirl_jax.elsewhere.table import Table, entry_of
+from rcirl_jax.errors import InputError
+from rcirl_jax.export.closed_loop import table_rows
+
+ROWS = ("hand-set", "IDM", "constant V", "+velocity", "random weights")
+_SIMULATOR = flags.DEFINE_string(
+    "simulator", None, f"one of {', '.join(SIMULATORS)}", required=True
+)
+_WEIGHTS = flags.DEFINE_list("weights", None, "weights files", required=True)
+_OUTPUT = flags.DEFINE_string("output", None, "folder to write", required=True)
+_EPISODES = flags.DEFINE_integer("episodes", 500, "how many, 2 at least")
+_SECONDS = flags.DEFINE_float("seconds", 30.0, "s that an episode lasts")
+_SEED = flags.DEFINE_integer("seed", 0, "of the episodes")
+_BASELINES = flags.DEFINE_list("baselines", ",".join(ROWS), "rival rows, or empty")
+
+
+def main() -> None:
+    """Flags -> one table."""
+    if _EPISODES.value < 2:
+        raise InputError(f"--episodes: {_EPISODES.value}: expected at least 2")
+    if not 1.0 <= _SECONDS.value <= 600.0:
+        raise InputError(f"--seconds: {_SECONDS.value:g}: expected 1 to 600 s")
+    simulator = open_simulator(_SIMULATOR.value)
+    made_by = provenance(_WEIGHTS.value)
+    rows = table_rows(_WEIGHTS.value, _BASELINES.value)
+    names = simulator.episodes(_EPISODES.value, _SEED.value)
+    entries = []
+    for entrant in entrants(simulator, rows):
+        drives = drive_all(simulator, entrant, names, _SECONDS.value, print)
+        entries.append(entry_of(entrant.name, drives))
+    against = [row.name for row in rows if row.name == "hand-set"]
+    table = Table(
+        simulator=simulator.name,
+        episodes=names,
+        entries=entries,
+        against=[*against, simulator.own_drivers[0]],
+    )
+    print(table.write(Path(_OUTPUT.value), made_by))
+    print(f"written: {_OUTPUT.value}/table.txt, episodes.csv, elsewhere.json")
+
+
+if __name__ == "__main__":
+    run(main)
