@@ -1,7 +1,7 @@
 """Drive a reward and its rivals in a simulator that somebody else wrote.
 
-    python -m experiments.drive_elsewhere --simulator=highway_env|sumo --weights=FILE \
-        --episodes=N --output=DIR
+    python -m experiments.drive_elsewhere --weights=FILE --episodes=N \
+        --output=DIR --simulator=highway_env|sumo|commonroad
 
 The rows drive the same episodes, at 10 Hz behind the same safety filter; the last are
 the simulator's own drivers. Writes table.txt, episodes.csv and elsewhere.json:
@@ -23,6 +23,7 @@ ROWS = ("hand-set", "IDM", "constant V", "+velocity", "random weights")
 _SIMULATOR = flags.DEFINE_string(
     "simulator", None, f"one of {', '.join(SIMULATORS)}", required=True
 )
+_OPTIONS = flags.DEFINE_list("options", [], "NAME=VALUE of the simulator, several by ,")
 _WEIGHTS = flags.DEFINE_list("weights", None, "weights files", required=True)
 _OUTPUT = flags.DEFINE_string("output", None, "folder to write", required=True)
 _EPISODES = flags.DEFINE_integer("episodes", 500, "how many, 2 at least")
@@ -37,7 +38,8 @@ def main() -> None:
         raise InputError(f"--episodes: {_EPISODES.value}: expected at least 2")
     if not 1.0 <= _SECONDS.value <= 600.0:
         raise InputError(f"--seconds: {_SECONDS.value:g}: expected 1 to 600 s")
-    simulator = open_simulator(_SIMULATOR.value)
+    options = dict(option.partition("=")[::2] for option in _OPTIONS.value)
+    simulator = open_simulator(_SIMULATOR.value, **options)
     made_by = provenance(_WEIGHTS.value)
     rows = table_rows(_WEIGHTS.value, _BASELINES.value)
     names = simulator.episodes(_EPISODES.value, _SEED.value)

@@ -1,7 +1,7 @@
 """CommonRoad scenarios as episodes: a process of the other environment for each.
 
 The ego is put on the reference path where its plan has it; an offset that it has at
-first fades over 40 m. The others drive as they were recorded and react to nobody, so
+first fades away. The others drive as they were recorded and react to nobody, so
 that a crash counts only where it is the ego's fault. The own drivers are the reactive
 planner by its own cost and, where weights are given, by the reward as its cost.
 """
@@ -14,18 +14,16 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rcirl_jax.elsewhere.simulators import STEP_S, LockStep, Move, View
-from rcirl_jax.elsewhere.way import Way
+from rcirl_jax.elsewhere.way import Way, fading
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.own_planner.inputs import Body, Car
 
 DEFAULT = "reactive planner"
 BY_REWARD = "reactive planner, reward as cost"
 WORKER = "rcirl_jax.elsewhere.commonroad.worker"
-ROOT = Path(__file__).resolve().parents[3]
+PIPE = subprocess.PIPE
 LENGTH_M, WIDTH_M = 4.508, 1.61  # m, of the car that the reactive planner plans for
 LANE_WIDTH_M = 3.5  # m
-FADING_M = 40.0  # m of way after which the ego is on the reference path
-SAID = 400  # characters of a worker's last words that are shown
 
 
 class CommonRoad:
@@ -33,8 +31,8 @@ class CommonRoad:
 
     Args:
       scenarios: the folder.
-      python: interpreter of an environment with `commonroad-reactive-planner` and
-        msgpack.
+      python: interpreter of an environment with `commonroad-reactive-planner`, msgpack
+        and, without what it depends on, this package.
       weights: of the reward that is the planner's cost; "": none.
     """
 
@@ -73,12 +71,10 @@ class Replay:
     """
 
     def __init__(self, command: Sequence[str | Path]) -> None:
-        pipe = subprocess.PIPE
         words = [str(word) for word in command]
+        self.python = words[0]
         try:
-            self.process = subprocess.Popen(
-                words, stdin=pipe, stdout=pipe, stderr=pipe, text=True, cwd=ROOT
-            )
+            self.process = subprocess.Popen(words, stdin=PIPE, stdout=PIPE, text=True)
         except OSError as error:
             raise InputError(
                 f"python: {words[0]}: {error.strerror}: expected an interpreter with "
@@ -92,18 +88,15 @@ class Replay:
         self.line = Way(self.now["line"], self.now["limit"], LANE_WIDTH_M)
         x, y, *_ = self.now["ego"]
         self.begin = self.station = self.line.station(x, y)
-        at, left, along, _ = self.line.place(self.station)
-        self.offset = (y - left) * math.cos(along) - (x - at) * math.sin(along)
+        self.offset = self.line.offset(x, y)
         self.way = 0.0
 
     def _heard(self) -> dict:
         """What the worker says; {} where the scenario is over."""
         assert self.process.stdout is not None
-        assert self.process.stderr is not None
         line = self.process.stdout.readline()
         if not line:
-            said = self.process.stderr.read().strip()[-SAID:]
-            raise InputError(f"commonroad: the worker ended: {said}")
+            raise InputError(f"python: {self.python}: ended: what it said stands above")
         return json.loads(line) or {}
 
     def look(self) -> View | None:
@@ -145,19 +138,16 @@ class Replay:
     def _moved(self, move: Move) -> list[float]:
         """The ego a way farther on its line."""
         self.station += move.way
-        share = min((self.station - self.begin) / FADING_M, 1.0)
-        aside = self.offset * (1.0 - share) ** 2 * (1.0 + 2.0 * share)
+        aside, slope = fading(self.offset, self.station - self.begin)
         x, y, heading, curvature = self.line.place(self.station)
         x, y = x - aside * math.sin(heading), y + aside * math.cos(heading)
-        return [x, y, heading, move.speed, move.acceleration, curvature]
+        turn = heading + math.atan(slope)
+        return [x, y, turn, move.speed, move.acceleration, curvature]
 
     def close(self) -> None:
         """End the process."""
-        for stream in (self.process.stdin, self.process.stdout, self.process.stderr):
-            if stream is not None:
-                stream.close()
         self.process.kill()
-        self.process.wait()
+        self.process.communicate()
 
 
 def _body(row: list) -> Body:

@@ -3,9 +3,9 @@
     python -m rcirl_jax.elsewhere.commonroad.worker SCENARIO [default|WEIGHTS]
 
 Says what there is at first as a line of JSON, then, for every line that it reads, what
-there is a step later; `null` where the scenario is over. The others drive as they were
-recorded. With a second argument the ego is driven by the reactive planner: by its own
-cost, or by a reward as its cost. Its settings are its own but for the horizon, 8 s.
+there is a step later; `null` where the scenario is over. The others drive as recorded.
+With a second argument the reactive planner drives the ego: by its own cost, or by a
+reward as its cost. Its settings are the default ones but for the horizon, 8 s.
 """
 
 import json
@@ -45,7 +45,7 @@ KINDS = {"bicycle": "cyclist", "pedestrian": "pedestrian"}
 
 
 class Scenario:
-    """A scenario file, its first planning problem and the reference path to the goal."""
+    """A scenario file, its first planning problem and the reference path there."""
 
     def __init__(self, path: str) -> None:
         self.scenario, problems = CommonRoadFileReader(path).open()
@@ -106,13 +106,8 @@ def kind_of(body: Any) -> str:  # noqa: ANN401
 
 def size_of(body: Any) -> tuple[float, float]:  # noqa: ANN401
     """Length and width m of the box around a body's shape."""
-    shape = body.obstacle_shape
-    if hasattr(shape, "length"):
-        return float(shape.length), float(shape.width)
-    if hasattr(shape, "radius"):
-        return 2.0 * float(shape.radius), 2.0 * float(shape.radius)
-    length, width = np.ptp(shape.vertices, axis=0)
-    return float(length), float(width)
+    left, low, right, high = body.obstacle_shape.shapely_object.bounds
+    return float(right - left), float(high - low)
 
 
 class Planned:
@@ -184,12 +179,14 @@ def scene_of(
     kappa = np.interp(at, system.ref_pos, system.ref_curv, right=0.0)
     shrink = max(1.0 - kappa[0] * l, 0.1)
     last = now + round(HORIZON_S / given.scenario.dt)
+    there = [o for o in given.scenario.obstacles if o.state_at_time(now) is not None]
+    away = lambda o: np.hypot(*(o.state_at_time(now).position - centre))  # noqa: E731
     boxes = []
-    for body in nearest(given, centre, now):
+    for body in sorted(there, key=away)[:NEAREST]:
         rows = given.projected(body, now, last)
         if len(rows):
-            rows[:, 1] -= s
-            boxes.append(obstacle(kind_of(body), size_of(body), rows))
+            boxes.append(obstacle(kind_of(body), size_of(body), rows - [0, s, 0, 0, 0]))
+    known = (given.recorded - now) * given.scenario.dt + 1e-6 >= TIMES_S
     scene = Scene(
         ego=Ego(
             l=l,
@@ -206,21 +203,9 @@ def scene_of(
             speed_limit=speed_limits(kappa, given.limit(centre)),
         ),
         obstacles=boxes,
-        num_valid=known_times((given.recorded - now) * given.scenario.dt),
+        num_valid=max(int(np.sum(known)), 2),
     )
     return scene, float(s)
-
-
-def known_times(seconds: float) -> int:
-    """How many times lie in what was recorded, two at least."""
-    return max(int(np.sum(seconds + 1e-6 >= TIMES_S)), 2)
-
-
-def nearest(given: Scenario, centre: np.ndarray, now: int) -> list:
-    """The bodies that are nearest now."""
-    there = [o for o in given.scenario.obstacles if o.state_at_time(now) is not None]
-    away = lambda o: np.hypot(*(o.state_at_time(now).position - centre))  # noqa: E731
-    return sorted(there, key=away)[:NEAREST]
 
 
 def seen(given: Scenario, driver: Planned | None, step: int) -> dict:
