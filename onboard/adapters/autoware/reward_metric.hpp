@@ -31,8 +31,7 @@ namespace rcirl_autoware {
 namespace ranker = ::autoware::trajectory_ranker;
 using rcirl::detail::XY;
 
-constexpr double kAroundM = 300.0;              // m from the ego that lanes are looked at
-constexpr double kKilometreAnHour = 1.0 / 3.6;  // m/s
+constexpr double kAroundM = 300.0;  // m from the ego that lanes are looked at
 
 template <typename Pose>
 double yaw(const Pose& pose) {
@@ -60,7 +59,7 @@ class RewardMetric : public ranker::metrics::MetricInterface {
       : MetricInterface("RcirlReward") {
     status_ = rcirl::load(weights == nullptr ? "RCIRL_WEIGHTS" : weights, &reward_);
     if (status_.ok()) status_ = rcirl::feature_map(reward_, &columns_);
-    if (!status_.ok()) report(status_);
+    if (!status_.ok()) RCLCPP_ERROR_STREAM(rclcpp::get_logger("rcirl"), status_.message());
   }
 
   void evaluate(const std::shared_ptr<ranker::DataInterface>& result,
@@ -73,10 +72,6 @@ class RewardMetric : public ranker::metrics::MetricInterface {
   bool is_deviation() const override { return false; }
 
  private:
-  static void report(const rcirl::Status& status) {
-    RCLCPP_ERROR_STREAM(rclcpp::get_logger("rcirl"), status.message());
-  }
-
   // The middle of the box, where the ranker has the rear axle's.
   template <typename Pose>
   XY centre(const Pose& pose) const {
@@ -92,7 +87,7 @@ class RewardMetric : public ranker::metrics::MetricInterface {
     rcirl::Scene scene;
     const rcirl::Status made = rcirl::scene_from(now, &scene);
     if (!made.ok()) {
-      report(made);
+      RCLCPP_ERROR_STREAM(rclcpp::get_logger("rcirl"), made.message());
       return 0.0f;
     }
     std::vector<float> s(2 * rcirl::kTimes), l(2 * rcirl::kTimes, scene.ego.l);
@@ -161,7 +156,7 @@ class RewardMetric : public ranker::metrics::MetricInterface {
       for (const auto& point : lanelet.centerline()) {
         if (std::hypot(point.x() - now->ego.x, point.y() - now->ego.y) > kAroundM) continue;
         points.push_back({point.x(), point.y()});
-        limits.push_back(kKilometreAnHour * lanelet.attributeOr("speed_limit", 50.0));
+        limits.push_back(lanelet.attributeOr("speed_limit", 50.0) / 3.6);
       }
     }
     if (points.size() < 2) return;  // `scene_from` says what is missing

@@ -82,6 +82,7 @@ class Replay:
             ) from None
         self.now = self._heard()
         if abs(self.now["dt"] - STEP_S) > 1e-6:
+            self.close()
             raise InputError(
                 f"{words[3]}: timeStepSize: {self.now['dt']:g}: expected {STEP_S:g} s"
             )
@@ -96,6 +97,7 @@ class Replay:
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
         if not line:
+            self.close()
             raise InputError(f"python: {self.python}: ended: what it said stands above")
         return json.loads(line) or {}
 

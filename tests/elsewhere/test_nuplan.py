@@ -1,0 +1,132 @@
+"""The planner for nuPlan against stand-ins of its public interface."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from rcirl_jax.elsewhere.nuplan import reward_planner
+from rcirl_jax.errors import InputError
+from tests.elsewhere import nuplan_stand_in as theirs
+from tests.onboard.programs import ONBOARD
+
+WEIGHTS = str(ONBOARD / "conformance" / "paper21.msgpack")
+X, Y = 664000.0, 3997000.0  # m, UTM: float32 alone would be off by decimetres
+
+
+def place(x, y):
+    return (X + x, Y + y)
+
+
+def road():
+    """100 m, a connector of 30 m that bends by nothing, 300 m; beside it a dead end."""
+    before = theirs.Lane("10", place(-60, 0), place(0, 0), 12.0)
+    first = theirs.Lane("11", place(0, 0), place(100, 0), 12.0)
+    side = theirs.Lane("12", place(0, 3.5), place(100, 3.5), 12.0)
+    turn = theirs.Lane("20", place(100, 0), place(130, 0))
+    dead = theirs.Lane("21", place(100, 0), place(120, 20))
+    last = theirs.Lane("31", place(130, 0), place(430, 0), 12.0)
+    before.then(first)
+    first.then(dead, turn)
+    turn.then(last)
+    return theirs.Map(b1=[first, side], c2=[dead, turn], b3=[last])
+
+
+@pytest.fixture
+def planner(monkeypatch):
+    theirs.install(monkeypatch)
+    made = reward_planner(WEIGHTS)
+    given = SimpleNamespace(
+        route_roadblock_ids=["b1", "c2", "gone", "b3"], map_api=road()
+    )
+    made.initialize(given)
+    return made
+
+
+def ego(x=20.0, y=0.0, speed=10.0, heading=0.0):
+    return theirs.EgoState(
+        center=theirs.StateSE2(*place(x, y), heading),
+        center_velocity_2d=theirs.StateVector2D(speed, 0.0),
+        center_acceleration_2d=theirs.StateVector2D(0.0, 0.0),
+        tire_steering_angle=0.0,
+        time_point=theirs.TimePoint(5_000_000),
+    )
+
+
+def planned(planner, state, *bodies, lights=None):
+    """The planned states as rows (t s, x, y, heading, speed)."""
+    observation = theirs.DetectionsTracks(SimpleNamespace(tracked_objects=bodies))
+    history = SimpleNamespace(current_state=(state, observation))
+    given = SimpleNamespace(history=history, traffic_light_data=lights)
+    found = planner.compute_trajectory(given)
+    assert isinstance(found, theirs.InterpolatedTrajectory)
+    assert found.states[0] is state
+    return np.array(
+        [
+            (
+                1e-6 * (s.time_point.time_us - state.time_point.time_us),
+                s.center.x - X,
+                s.center.y - Y,
+                s.center.heading,
+                s.center_velocity_2d.x,
+            )
+            for s in found.states
+        ]
+    )
+
+
+def light(name, status):
+    return SimpleNamespace(lane_connector_id=name, status=theirs.Light[status])
+
+
+def car(x, speed):
+    return theirs.tracked("VEHICLE", *place(x, 0.0), speed)
+
+
+def test_it_has_the_shape_of_an_abstract_planner(planner):
+    assert isinstance(planner, theirs.AbstractPlanner)
+    assert planner.requires_scenario is False
+    assert planner.observation_type() is theirs.DetectionsTracks
+    assert isinstance(planner.name(), str)
+
+
+def test_a_plan_lasts_for_8_s_and_moves_as_it_says(planner):
+    t, x, _, _, v = planned(planner, ego()).T
+    np.testing.assert_allclose(t, 0.1 * np.arange(81), atol=1e-6)
+    np.testing.assert_allclose(np.gradient(x, t)[1:-1], v[1:-1], atol=0.1)
+    assert x[0] == 20.0
+    assert x[-1] > 30.0
+
+
+def test_it_follows_the_route_and_comes_back_to_its_middle(planner):
+    """The dead end beside the connector is not taken."""
+    state = ego(x=60.0, y=0.8, speed=12.0)
+    _, x, y, heading, _ = planned(planner, state, car(160.0, 12.0)).T
+    gone = x - x[0]
+    np.testing.assert_allclose(y[1:], 0.8 * np.exp(-gone[1:] / 15.0), atol=2e-2)
+    np.testing.assert_allclose(heading[1:], np.arctan(-y[1:] / 15.0), atol=5e-3)
+
+
+def test_it_stops_behind_who_stands_and_before_a_red_light(planner):
+    bodies = [theirs.tracked("TRAFFIC_CONE", *place(70.0, 0.0), size=(0.6, 0.6))]
+    *_, x, _, _, v = planned(planner, ego(), *bodies).T
+    assert x[-1] + 2.6 < 70.0
+    lights = [light(99, "RED"), light(20, "RED")]
+    x = planned(planner, ego(x=40.0), lights=lights)[:, 1]
+    assert x[-1] + 2.6 <= 100.0
+    assert v[-1] < 3.0
+
+
+def test_a_green_light_stops_nobody(planner):
+    red, green = (
+        planned(planner, ego(x=60.0), lights=[light(20, s)])[-1, 1]
+        for s in ("RED", "GREEN")
+    )
+    assert green > red + 5.0
+
+
+def test_a_route_without_lanes_is_refused(planner):
+    with pytest.raises(InputError, match="route_roadblock_ids: no lanes"):
+        planner.initialize(
+            SimpleNamespace(route_roadblock_ids=["gone"], map_api=road())
+        )
