@@ -5,6 +5,7 @@ sampler and safety filter, planning at 10 Hz with plans that are kept. The ego f
 its plan as the ego of our own simulator does, through a drive train with a lag.
 """
 
+import dataclasses
 import functools
 import math
 from collections.abc import Callable, Sequence
@@ -16,15 +17,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.elsewhere.simulators import STEP_S, Move, View
+from rcirl_jax.errors import InputError
 from rcirl_jax.export.own_planner.builder import LineFrame, Parts, scene_of
+from rcirl_jax.geometry.frenet import ReferenceLine, nearest_of, project_lanes
 from rcirl_jax.planner.plan import Plan, command, later, no_plan, stations_from_now
 from rcirl_jax.planner.rank import Policy
 from rcirl_jax.simulation.rows import Row
 from rcirl_jax.simulation.world.vehicle import Vehicle
 from rcirl_jax.types import Kind, Scene
-from rcirl_jax.units import TIMES_S
+from rcirl_jax.units import STATION_STEP_M, TIMES_S
 
 SLOTS = 32  # bodies of a view that are looked at, the nearest ones
+MOST_LINES = 6  # signals likewise
+GRID = 1280  # points of a line's grid: 2.56 km
 CORRIDOR_MARGIN_M = 0.2  # m beside the ego's width within which a body is ahead of it
 
 
@@ -45,30 +50,66 @@ class Seen:
 
     def __init__(self, lanes: int) -> None:
         self._frames: list[LineFrame | None] = [None] * lanes
-        self._parts: list[Parts | None] = [None] * lanes
+        self._last: list[View | None] = [None] * lanes
+        self._lines: ReferenceLine | None = None  # of all lanes
 
     def scenes(self, views: Sequence[View | None]) -> tuple[Scene, Free]:
         """Scenes [B] and what is ahead; an episode that is over keeps its last one."""
         for n, view in enumerate(views):
             if view is not None:
-                self._parts[n] = self._look(n, view)
-        some = next(parts for parts in self._parts if parts is not None)
-        every = [some if parts is None else parts for parts in self._parts]
-        return _scenes(jax.tree.map(lambda *x: np.stack(x), *every))
+                self._last[n] = _with_few(view)
+        some = next(view for view in self._last if view is not None)
+        every = [some if view is None else view for view in self._last]
+        frames = [self._frame(n, view) for n, view in enumerate(every)]
+        if self._lines is None:
+            lines = [frame.line for frame in frames]
+            self._lines = jax.tree.map(lambda *x: np.stack(x), *lines)
+        points = np.zeros((len(every), SLOTS + MOST_LINES + 2, 2), np.float32)
+        near, counts = np.zeros(points.shape[:2], np.int32), []
+        for n, (frame, view) in enumerate(zip(frames, every, strict=True)):
+            seen = view.ego, view.obstacles, view.signals, view.destination
+            given = frame.points(*seen)
+            counts.append(len(given))
+            points[n, : len(given)] = given
+            near[n, : len(given)] = nearest_of(frame.line, given)
+        placed = project_lanes(self._lines, points[..., 0], points[..., 1], near)
+        s, l = jax.device_get(placed)
+        parts = [
+            frame.parts(
+                s[n, : counts[n]],
+                l[n, : counts[n]],
+                view.ego,
+                view.obstacles,
+                view.signals,
+                slots=SLOTS,
+            )
+            for n, (frame, view) in enumerate(zip(frames, every, strict=True))
+        ]
+        scenes, free = _scenes(jax.tree.map(lambda *x: np.stack(x), *parts))
+        return scenes, jax.device_get(free)
 
-    def _look(self, lane: int, view: View) -> Parts:
+    def _frame(self, lane: int, view: View) -> LineFrame:
+        """The frame of a lane's line, made where it is another line than before."""
         frame = self._frames[lane]
         if frame is None or frame.road is not view.centre_line:
-            frame = LineFrame(view.centre_line, (view.ego.x, view.ego.y))
-            self._frames[lane] = frame
-        away = lambda b: math.hypot(b.x - view.ego.x, b.y - view.ego.y)  # noqa: E731
-        return frame.parts(
-            ego=view.ego,
-            obstacles=sorted(view.obstacles, key=away)[:SLOTS],
-            signals=view.signals,
-            destination=view.destination,
-            slots=SLOTS,
-        )
+            frame = LineFrame(view.centre_line, (view.ego.x, view.ego.y), GRID)
+            if frame.grid.size > GRID:
+                raise InputError(
+                    f"centre line: {frame.length:.0f} m long: expected at most "
+                    f"{GRID * STATION_STEP_M:.0f} m, the part that is driven"
+                )
+            self._frames[lane], self._lines = frame, None
+        return frame
+
+
+def _with_few(view: View) -> View:
+    """The view with its nearest bodies and signals, as many as a batch has room for."""
+    away = lambda b: math.hypot(b.x - view.ego.x, b.y - view.ego.y)  # noqa: E731
+    return dataclasses.replace(
+        view,
+        obstacles=sorted(view.obstacles, key=away)[:SLOTS],
+        signals=sorted(view.signals, key=away)[:MOST_LINES],
+    )
 
 
 @jax.jit
@@ -151,7 +192,7 @@ class Driver:
         self._row, self._step = row, _step_of(row.policy, Vehicle())
         spread = lambda x: jnp.broadcast_to(x, (len(seeds), *jnp.shape(x)))  # noqa: E731
         self._plans = jax.tree.map(spread, no_plan())
-        self._keys = jax.vmap(jax.random.key)(jnp.asarray(seeds))
+        self._keys = jax.vmap(jax.random.key)(np.asarray(seeds, np.uint32))
         self._time = 0
 
     def moves(self, scenes: Scene) -> tuple[list[Move], np.ndarray]:

@@ -22,14 +22,14 @@ from rcirl_jax.export.own_planner.inputs import Body, Car
 
 # kind: environment, what differs from its own configuration, x m where it ends
 KINDS = {
-    "highway": ("highway-v0", {"lanes_count": 3, "vehicles_count": 16}, math.inf),
+    "highway": ("highway-v0", {"lanes_count": 3, "vehicles_count": 12}, math.inf),
     "dense": (
         "highway-v0",
-        {"lanes_count": 3, "vehicles_count": 16, "vehicles_density": 2},
+        {"lanes_count": 3, "vehicles_count": 12, "vehicles_density": 2},
         math.inf,
     ),
     # its lanes say 20 m/s, which its IDMVehicles keep too; it ends behind the ramp
-    "merge": ("merge-v0", {}, 370.0),
+    "merge": ("merge-v1", {}, 370.0),
 }
 KEEPS, CHANGES = "IDMVehicle in its lane", "IDMVehicle, overtaking"
 POINT_STEP_M = 2.0  # m between points of a centre line
@@ -57,7 +57,7 @@ class Planned(Vehicle):
 
 
 class HighwayEnv:
-    """Episodes of highway-v0 and merge-v0."""
+    """Episodes of highway-v0 and merge-v1."""
 
     name = "highway_env"
     own_drivers = (KEEPS, CHANGES)

@@ -111,15 +111,18 @@ def _box(body: Body | Car) -> Box:
 
 def _against(ego: Car, body: Body) -> Contact | None:
     dx, dy = body.x - ego.x, body.y - ego.y
-    size = lambda b: math.hypot(b.length, b.width)  # noqa: E731
-    if math.hypot(dx, dy) > 0.5 * (size(ego) + size(body)):
+    turn = body.heading - ego.heading
+    cosine, sine = math.cos(ego.heading), math.sin(ego.heading)
+    along, across = dx * cosine + dy * sine, dy * cosine - dx * sine
+    turned = abs(math.cos(turn)), abs(math.sin(turn))
+    reach = 0.5 * (body.length * turned[0] + body.width * turned[1])
+    aside = 0.5 * (body.length * turned[1] + body.width * turned[0])
+    # two of the axes that may separate them; the others are asked where these do not
+    if abs(along) > 0.5 * ego.length + reach or abs(across) > 0.5 * ego.width + aside:
         return None
     here = dataclasses.replace(ego, x=0.0, y=0.0)
     if _separation(_box(here), _box(dataclasses.replace(body, x=dx, y=dy))) > 0.0:
         return None
-    turn = body.heading - ego.heading
-    along = dx * math.cos(ego.heading) + dy * math.sin(ego.heading)
-    reach = 0.5 * (body.length * abs(math.cos(turn)) + body.width * abs(math.sin(turn)))
     front = along >= -0.25 * ego.length and along + reach > 0.5 * ego.length
     stands = body.speed <= STOPPED_EGO_MPS
     vx = body.speed * math.cos(turn) - ego.speed

@@ -19,7 +19,7 @@ from rcirl_jax.evaluation.exact import clopper_pearson, mcnemar_exact
 from rcirl_jax.evaluation.statistics import (
     ClusterBootstrap,
     Difference,
-    bootstrap_mean,
+    combine_seeds,
     paired_difference,
 )
 from rcirl_jax.runtime.atomic_files import write_json, write_whole
@@ -158,7 +158,7 @@ def _numbers(entry: Entry, which: np.ndarray, bootstrap: ClusterBootstrap) -> di
         low, high = clopper_pearson(count, total)
         found[key] = {"value": count / total, "low": low, "high": high, "count": count}
     for key, values in entry.means.items():
-        mean = bootstrap_mean(values[which], bootstrap)
+        mean = combine_seeds(values[which], bootstrap)
         found[key] = {"value": mean.value, "low": mean.low, "high": mean.high}
     return found
 

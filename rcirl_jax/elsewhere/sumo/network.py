@@ -23,7 +23,7 @@ from rcirl_jax.errors import InputError
 
 JUNCTIONS = 7
 BLOCK_M = (180.0, 320.0)  # m between junctions
-BEND_M = 12.0  # m that a junction lies beside the straight line at most
+BEND_M = 3.0  # m that a junction lies aside: nobody has to slow down
 SIDE_M = 150.0  # m, length of side roads
 APART_M = 1000.0  # m between corridors
 LIGHTS = 0.7  # 1, share of junctions with lights

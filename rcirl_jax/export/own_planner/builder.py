@@ -100,12 +100,9 @@ def scene_from(
     """
     check_numbers("ego", ego)
     frame = LineFrame(centre_line, (ego.x, ego.y))
+    points = frame.points(ego, obstacles, signals, destination)
     parts = frame.parts(
-        ego=ego,
-        obstacles=obstacles,
-        signals=signals,
-        path=path,
-        destination=destination,
+        *project_points(frame.line, points), ego, obstacles, signals, path
     )
     scene = _scene_of(parts)
     if predictions is None:
@@ -151,37 +148,32 @@ class LineFrame:
     Args:
       road: the line.
       origin: (x, y) m, a place near the ego from which float32 numbers are precise.
+      size: points of its grid, at least; lines of one size make a batch.
     """
 
-    def __init__(self, road: CentreLine, origin: tuple[float, float]) -> None:
+    def __init__(
+        self, road: CentreLine, origin: tuple[float, float], size: int = 0
+    ) -> None:
         self.road, self.origin = road, np.asarray(origin, float)
         points = polyline("centre_line.points", road.points) - self.origin
         self.length = float(np.sum(np.hypot(*np.diff(points, axis=0).T)))
-        size = int(self.length / STATION_STEP_M) + 2
-        size = -(-size // GRID_BLOCK) * GRID_BLOCK
-        line = reference_line_from_polyline(points, size=size, step=STATION_STEP_M)
+        count = max(int(self.length / STATION_STEP_M) + 2, size)
+        count = -(-count // GRID_BLOCK) * GRID_BLOCK
+        line = reference_line_from_polyline(points, size=count, step=STATION_STEP_M)
         self.line: ReferenceLine = jax.device_get(line)
-        self.grid = np.arange(size) * STATION_STEP_M
+        self.grid = np.arange(count) * STATION_STEP_M
+        self.posted = _posted_limits(self)
 
-    def parts(
+    def points(
         self,
-        *,
         ego: Car,
         obstacles: Sequence[Body] = (),
         signals: Sequence[Signal] = (),
-        path: Any = None,  # noqa: ANN401
         destination: tuple[float, float] | None = None,
-        slots: int = 0,
-    ) -> Parts:
-        """One moment on the line; see `scene_from`.
+    ) -> np.ndarray:
+        """Places [q, 2] m of a moment, from the origin, to be projected on the line.
 
-        Args:
-          ego: the car that is planned for.
-          obstacles: the others.
-          signals: stop lines.
-          path: along which speed is planned; None: the line.
-          destination: (x, y) m or None.
-          slots: of bodies, at least; moments of one number of slots make a batch.
+        Those of the ego, the obstacles, the signals and, if any, the destination.
 
         Raises:
           InputError: names the field, its value and what was expected.
@@ -190,19 +182,41 @@ class LineFrame:
         check("ego.speed", ego.speed, ego.speed >= 0.0, "0 m/s or more")
         _check_others(obstacles, signals)
         ends = [] if destination is None else table("destination", [destination], 2)
-        places = [ego, *obstacles, *signals]
-        points = np.array([*((p.x, p.y) for p in places), *ends])
-        s, l = self.project(points)
+        places = [(p.x, p.y) for p in (ego, *obstacles, *signals)]
+        return np.array([*places, *ends]) - self.origin
+
+    def parts(
+        self,
+        s: np.ndarray,
+        l: np.ndarray,
+        ego: Car,
+        obstacles: Sequence[Body] = (),
+        signals: Sequence[Signal] = (),
+        path: Any = None,  # noqa: ANN401
+        slots: int = 0,
+    ) -> Parts:
+        """One moment on the line; see `scene_from`.
+
+        Args:
+          s: [q] m, stations of `points`.
+          l: [q] m, their offsets.
+          ego: the car that is planned for.
+          obstacles: the others.
+          signals: stop lines.
+          path: along which speed is planned; None: the line.
+          slots: of bodies, at least; moments of one number of slots make a batch.
+        """
+        s, l = s.astype(float), l.astype(float)
         s0, first = float(s[0]), 1 + len(obstacles)
+        last = first + len(signals)
         now = _ego(self, ego, s0, float(l[0]))
-        lines = s[first : first + len(signals)] - s0
-        goal = s[-1] - s0 + 0.5 * ego.length if len(ends) else math.inf
+        goal = s[last] - s0 + 0.5 * ego.length if last < s.size else math.inf
         goal = goal if goal > 0.5 * ego.length else math.inf
         return Parts(
             ego=now,
             path=_path(self, path, s0),
             bodies=_bodies(self, obstacles, s[1:first] - s0, l[1:first], s0, slots),
-            wall=np.float32(_nearest_line(signals, lines, now)),
+            wall=np.float32(_nearest_line(signals, s[first:last] - s0, now)),
             goal=np.float32(goal),
             station=np.float32(s0),
         )
@@ -272,7 +286,9 @@ def _path(frame: LineFrame, path: Any, s0: float) -> Path:  # noqa: ANN401
         if np.any(np.diff(at) <= 0.0):
             raise InputError("scene_from: path: turns back: expected driving direction")
         l = np.interp(stations, at, offsets)
-    limit = planning_limit(kappa, l, _posted(frame, stations), STATION_STEP_M)
+    at, limits = frame.posted
+    posted = limits[np.clip(np.searchsorted(at, stations, "right") - 1, 0, None)]
+    limit = planning_limit(kappa, l, posted, STATION_STEP_M)
     check("centre_line.lane_width", road.lane_width, road.lane_width > 0.0, "over 0 m")
     half = 0.5 * road.lane_width
     left, right = (half if x is None else x for x in (road.road_left, road.road_right))
@@ -289,21 +305,19 @@ def _path(frame: LineFrame, path: Any, s0: float) -> Path:  # noqa: ANN401
     return Path(**{n: np.float32(x[:NUM_STATIONS]) for n, x in tables.items()})
 
 
-def _posted(frame: LineFrame, stations: np.ndarray) -> np.ndarray:
-    """Posted limit [R] m/s; a point's limit holds from it on."""
-    road = frame.road
-    limits = np.atleast_1d(floats("centre_line.speed_limit", road.speed_limit))
+def _posted_limits(frame: LineFrame) -> tuple[np.ndarray, np.ndarray]:
+    """Stations [m] m from which posted limits [m] m/s hold."""
+    limits = np.atleast_1d(floats("centre_line.speed_limit", frame.road.speed_limit))
     check("centre_line.speed_limit", limits, np.all(limits > 0.0), "over 0 m/s")
     if limits.shape == (1,):
-        return np.full(stations.shape, limits[0])
-    points = np.asarray(road.points, float)
+        return np.zeros(1), limits
+    points = np.asarray(frame.road.points, float)
     if limits.shape != (len(points),):
         raise InputError(
             f"scene_from: centre_line.speed_limit: {limits.size} numbers: expected one "
             f"for each of the {len(points)} points, or one for all"
         )
-    at = np.maximum.accumulate(frame.project(points)[0])
-    return limits[np.clip(np.searchsorted(at, stations, "right") - 1, 0, None)]
+    return np.maximum.accumulate(frame.project(points)[0]), limits
 
 
 # ----------------------------------------------------------------------- the others
@@ -329,22 +343,25 @@ def _bodies(
 ) -> Bodies:
     """The others in the frame, s from the ego on; filled up to few sizes."""
     size = max(8, slots, 1 << (len(others) - 1).bit_length())  # few compilations
-    fill = lambda x: np.pad(np.asarray(x), (0, size - len(others)))  # noqa: E731
-    column = lambda name: fill([float(getattr(b, name)) for b in others])  # noqa: E731
-    tilt = frame.tilt(fill(s) + s0, column("heading"))
-    half_s, half_l = _extents(column("length"), column("width"), tilt)
+    rows = np.zeros((size, 6))
+    kinds = np.zeros(size, np.int32)
+    for n, b in enumerate(others):
+        rows[n] = b.heading, b.speed, b.acceleration, b.length, b.width, s[n]
+        kinds[n] = Kind[b.kind.upper()]
+    heading, speed, acceleration, length, width, station = rows.T
+    tilt = frame.tilt(station + s0, heading)
+    half_s, half_l = _extents(length, width, tilt)
     leaves = {
-        "s": fill(s),
-        "l": fill(l),
-        "speed": column("speed") * np.cos(tilt),
-        "l_dot": column("speed") * np.sin(tilt),
-        "a": column("acceleration") * np.cos(tilt),
+        "s": station,
+        "l": np.append(l, np.zeros(size - len(others))),
+        "speed": speed * np.cos(tilt),
+        "l_dot": speed * np.sin(tilt),
+        "a": acceleration * np.cos(tilt),
         "half_s": half_s,
         "half_l": half_l,
     }
-    kinds = np.array([Kind[body.kind.upper()] for body in others], np.int32)
-    floats = {name: x.astype(np.float32) for name, x in leaves.items()}
-    return Bodies(**floats, kind=fill(kinds), present=np.arange(size) < len(others))
+    floats = {name: np.float32(x) for name, x in leaves.items()}
+    return Bodies(**floats, kind=kinds, present=np.arange(size) < len(others))
 
 
 def _extents(
