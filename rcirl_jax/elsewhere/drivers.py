@@ -19,7 +19,7 @@ import numpy as np
 from rcirl_jax.elsewhere.simulators import STEP_S, Move, View
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.own_planner.builder import LineFrame, Parts, scene_of
-from rcirl_jax.geometry.frenet import ReferenceLine, nearest_of, project_lanes
+from rcirl_jax.geometry.frenet import ReferenceLine, project_lanes
 from rcirl_jax.planner.plan import Plan, command, later, no_plan, stations_from_now
 from rcirl_jax.planner.rank import Policy
 from rcirl_jax.simulation.rows import Row
@@ -63,7 +63,7 @@ class Seen:
         frames = [self._frame(n, view) for n, view in enumerate(every)]
         if self._lines is None:
             lines = [frame.line for frame in frames]
-            self._lines = jax.tree.map(lambda *x: np.stack(x), *lines)
+            self._lines = jax.tree.map(lambda *x: jnp.stack(x), *lines)
         points = np.zeros((len(every), SLOTS + MOST_LINES + 2, 2), np.float32)
         near, counts = np.zeros(points.shape[:2], np.int32), []
         for n, (frame, view) in enumerate(zip(frames, every, strict=True)):
@@ -71,7 +71,7 @@ class Seen:
             given = frame.points(*seen)
             counts.append(len(given))
             points[n, : len(given)] = given
-            near[n, : len(given)] = nearest_of(frame.line, given)
+            near[n, : len(given)] = frame.tree.query(given)[1]
         placed = project_lanes(self._lines, points[..., 0], points[..., 1], near)
         s, l = jax.device_get(placed)
         parts = [

@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.elsewhere.simulators import STEP_S, View
@@ -101,11 +102,11 @@ _separation = jax.jit(separation)
 
 def _box(body: Body | Car) -> Box:
     return Box(
-        x=np.float32(body.x),
-        y=np.float32(body.y),
-        heading=np.float32(body.heading),
-        length=np.float32(body.length),
-        width=np.float32(body.width),
+        x=jnp.float32(body.x),
+        y=jnp.float32(body.y),
+        heading=jnp.float32(body.heading),
+        length=jnp.float32(body.length),
+        width=jnp.float32(body.width),
     )
 
 

@@ -137,21 +137,16 @@ def _project(
     return _from_nearest(line, x, y, some[jnp.argmin(distance)])
 
 
-def nearest_of(line: ReferenceLine, points: np.ndarray) -> np.ndarray:
-    """Index [q] of the grid point next to each of points [q, 2] m; numpy.
-
-    By a tree: trying all takes most of an import's time.
-    """
-    tree = KDTree(np.stack([line.x, line.y], axis=1))
-    return np.asarray(tree.query(points)[1], np.int32)
-
-
 def project_points(
     line: ReferenceLine, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(s, l) m of points [q, 2], numpy; padded so that few sizes compile."""
+    """(s, l) m of points [q, 2], numpy; padded so that few sizes compile.
+
+    A tree finds the nearest grid points: trying all takes most of an import's time.
+    """
     points = np.asarray(points, np.float32)
-    near = nearest_of(line, points)
+    tree = KDTree(np.stack([line.x, line.y], axis=1))
+    near = np.asarray(tree.query(points)[1])
     parts = []
     for start in range(0, len(points), CHUNK):
         taken = points[start : start + CHUNK]

@@ -124,7 +124,7 @@ def _types() -> list[str]:
         f'<vType id="truck" vClass="truck" length="10" accel="1.3" '
         f'probability="{TRUCKS}" {spread}/>',
         "</vTypeDistribution>",
-        '<vType id="ego" speedFactor="1"/>',
+        '<vType id="ego" speedFactor="1" speedDev="0"/>',
     ]
 
 

@@ -21,6 +21,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial import KDTree
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.own_planner.inputs import (
@@ -159,8 +160,12 @@ class LineFrame:
         self.length = float(np.sum(np.hypot(*np.diff(points, axis=0).T)))
         count = max(int(self.length / STATION_STEP_M) + 2, size)
         count = -(-count // GRID_BLOCK) * GRID_BLOCK
-        line = reference_line_from_polyline(points, size=count, step=STATION_STEP_M)
-        self.line: ReferenceLine = jax.device_get(line)
+        self.line: ReferenceLine = reference_line_from_polyline(
+            points, size=count, step=STATION_STEP_M
+        )
+        tables = ("x", "y", "heading", "kappa")
+        self.tables = {n: np.asarray(getattr(self.line, n)) for n in tables}
+        self.tree = KDTree(np.stack([self.tables["x"], self.tables["y"]], axis=1))
         self.grid = np.arange(count) * STATION_STEP_M
         self.posted = _posted_limits(self)
 
@@ -228,7 +233,7 @@ class LineFrame:
 
     def table(self, name: str, s: np.ndarray) -> np.ndarray:
         """Heading or curvature of the line at stations; straight beyond its end."""
-        values = getattr(self.line, name)
+        values = self.tables[name]
         return np.interp(s, self.grid, values, right=0.0 if name == "kappa" else None)
 
     def tilt(self, s: np.ndarray, heading: np.ndarray | float) -> np.ndarray:
