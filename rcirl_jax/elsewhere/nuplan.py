@@ -8,6 +8,7 @@ fades away. Tested against stand-ins that follow nuPlan's public interface, not 
 nuPlan: neither the devkit nor its data are among what this package depends on.
 """
 
+import importlib
 import math
 from types import SimpleNamespace
 from typing import Any
@@ -29,34 +30,25 @@ LANE_WIDTH_M = 3.6  # m
 KINDS = {"VEHICLE": "vehicle", "PEDESTRIAN": "pedestrian", "BICYCLE": "cyclist"}
 
 
+# what of nuPlan is made or asked for here, and the module below `nuplan` that has it
+THEIRS = {
+    "AbstractPlanner": "planning.simulation.planner.abstract_planner",
+    "DetectionsTracks": "planning.simulation.observation.observation_type",
+    "EgoState": "common.actor_state.ego_state",
+    "InterpolatedTrajectory": "planning.simulation.trajectory.interpolated_trajectory",
+    "SemanticMapLayer": "common.maps.maps_datatypes",
+    "StateSE2": "common.actor_state.state_representation",
+    "StateVector2D": "common.actor_state.state_representation",
+    "TimePoint": "common.actor_state.state_representation",
+}
+
+
 def reward_planner(weights: str, seed: int = 0) -> Any:  # noqa: ANN401
     """An `AbstractPlanner` that drives by a weights file; nuPlan is imported here."""
-    from nuplan.common.actor_state.ego_state import EgoState
-    from nuplan.common.actor_state.state_representation import (
-        StateSE2,
-        StateVector2D,
-        TimePoint,
-    )
-    from nuplan.common.maps.maps_datatypes import SemanticMapLayer
-    from nuplan.planning.simulation.observation.observation_type import (
-        DetectionsTracks,
-    )
-    from nuplan.planning.simulation.planner.abstract_planner import AbstractPlanner
-    from nuplan.planning.simulation.trajectory.interpolated_trajectory import (
-        InterpolatedTrajectory,
-    )
-
-    theirs = SimpleNamespace(
-        EgoState=EgoState,
-        StateSE2=StateSE2,
-        StateVector2D=StateVector2D,
-        TimePoint=TimePoint,
-        SemanticMapLayer=SemanticMapLayer,
-        DetectionsTracks=DetectionsTracks,
-        InterpolatedTrajectory=InterpolatedTrajectory,
-    )
-    kind = type("RewardPlanner", (Planner, AbstractPlanner), {})
-    return kind(weights, seed, theirs)
+    of = {name: importlib.import_module(f"nuplan.{at}") for name, at in THEIRS.items()}
+    theirs = {name: getattr(module, name) for name, module in of.items()}
+    kind = type("RewardPlanner", (Planner, theirs["AbstractPlanner"]), {})
+    return kind(weights, seed, SimpleNamespace(**theirs))
 
 
 class Planner:
@@ -81,15 +73,14 @@ class Planner:
 
     def initialize(self, initialization: Any) -> None:  # noqa: ANN401
         """Take the route: which lanes lead farthest along it."""
-        layers, blocks = self._theirs.SemanticMapLayer, []
-        for name in initialization.route_roadblock_ids:
-            find = initialization.map_api.get_map_object
-            block = find(name, layers.ROADBLOCK)
-            blocks.append(block or find(name, layers.ROADBLOCK_CONNECTOR))
-        # lane: m that its route still has, and the next lane
+        layers = self._theirs.SemanticMapLayer
+        find = initialization.map_api.get_map_object
+        # lane: m that its route still has, itself and the next lane
         self._route: dict[str, tuple[float, Any, Any]] = {}
-        for block in reversed([block for block in blocks if block is not None]):
-            for edge in block.interior_edges:
+        for name in reversed(initialization.route_roadblock_ids):
+            block = find(name, layers.ROADBLOCK)
+            block = block or find(name, layers.ROADBLOCK_CONNECTOR)
+            for edge in block.interior_edges if block else ():
                 after = [e for e in edge.outgoing_edges if e.id in self._route]
                 follows = max(after, key=lambda e: self._route[e.id][0], default=None)
                 left = self._route[follows.id][0] if follows else 0.0
@@ -120,12 +111,8 @@ class Planner:
             edge = self._route[edge.id][2]
         self._stops = {str(edge.id): _points(edge)[0] for edge in chain}
         points = np.concatenate([_points(edge) for edge in chain])
-        limits = np.concatenate(
-            [
-                np.full(len(_points(edge)), edge.speed_limit_mps or USUAL_LIMIT_MPS)
-                for edge in chain
-            ]
-        )
+        posted = [edge.speed_limit_mps or USUAL_LIMIT_MPS for edge in chain]
+        limits = np.repeat(posted, [len(_points(edge)) for edge in chain])
         last = points[-1] - points[-2]
         points = np.vstack([points, points[-1] + BEYOND_M * last / np.hypot(*last)])
         self._way = Way(points, np.append(limits, limits[-1]), LANE_WIDTH_M)
