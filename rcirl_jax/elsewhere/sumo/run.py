@@ -142,7 +142,6 @@ class Ego:
         self._acceleration = 0.0
         self._start = self._front()
         self._next = self._light()
-        libsumo.vehicle.setLaneChangeMode(name, FREE)
         if own is None:
             libsumo.vehicle.setSpeedMode(name, FREE)
 
@@ -240,6 +239,8 @@ def _warm_up(egos: Sequence[str]) -> None:
     """Let the traffic drive until every ego is on its road, or has waited enough."""
     while libsumo.simulation.getTime() < WARM_UP_S + ENTRY_S:
         libsumo.simulationStep()
+        for name in set(egos) & set(libsumo.simulation.getDepartedIDList()):
+            libsumo.vehicle.setLaneChangeMode(name, FREE)
         if set(egos) <= set(libsumo.vehicle.getIDList()):
             return
 
