@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from rcirl_jax.elsewhere.commonroad.cost import RewardCost, obstacle, speed_limits
+from rcirl_jax.elsewhere.commonroad.cost import RewardCost, obstacle
 from rcirl_jax.elsewhere.commonroad.simulator import (
     BY_REWARD,
     DEFAULT,
@@ -23,7 +23,6 @@ from rcirl_jax.elsewhere.simulators import Move, open_simulator
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.own_planner.features import Ego, FeatureMap, Path, Scene
 from rcirl_jax.export.reader import load_weights
-from rcirl_jax.geometry.limits import planning_limit
 from rcirl_jax.units import TIMES_S
 from tests.data.importers import writers as w
 from tests.onboard.programs import ONBOARD
@@ -81,12 +80,6 @@ def test_a_known_future_is_a_box_along_the_road():
     np.testing.assert_allclose(box.l_lower[0], 3.0 - 0.9, atol=1e-6)
     np.testing.assert_allclose(box.l_upper[8], 3.0 - 2 * TIMES_S[8] + 0.9, atol=1e-5)
     np.testing.assert_allclose(box.speed, 0.0, atol=1e-6)
-
-
-def test_limits_are_those_of_the_package():
-    kappa = 0.03 * np.sin(np.arange(128) / 9.0) ** 3
-    wanted = planning_limit(kappa, np.zeros(128), np.full(128, 14.0), 2.0)
-    np.testing.assert_allclose(speed_limits(kappa, 14.0), wanted, rtol=1e-9)
 
 
 # ----------------------------------------------------- episodes, by a stand-in worker

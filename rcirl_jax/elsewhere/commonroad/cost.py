@@ -16,8 +16,6 @@ from typing import Any
 import numpy as np
 
 from rcirl_jax.export.own_planner.features import (
-    NUM_STATIONS,
-    STATION_STEP_M,
     TIMES_S,
     FeatureMap,
     Kind,
@@ -25,10 +23,6 @@ from rcirl_jax.export.own_planner.features import (
     Scene,
 )
 from rcirl_jax.export.reader import load_weights
-
-COMFORT_BRAKING_MPS2 = 1.0  # m/s^2, with which a lower limit is approached
-CENTRIPETAL_MPS2 = 2.0  # m/s^2, in curves
-STRAIGHT_PER_M = 1e-5  # 1/m, curvature below which a road counts as straight
 
 
 class RewardCost:
@@ -61,18 +55,6 @@ class RewardCost:
         s, l = (np.interp(TIMES_S, time, x)[None] for x in (s, l))
         features = self.columns(self.scene, s, l)
         return -float(self.reward.value(features, self.scene.time_valid)[0])
-
-
-def speed_limits(kappa: np.ndarray, posted: float) -> np.ndarray:
-    """What may be driven [P] m/s: posted, curves, and braking for both.
-
-    As `geometry.limits.planning_limit`, which needs JAX.
-    """
-    sharp = np.maximum(np.abs(kappa), STRAIGHT_PER_M)
-    limit = np.minimum(posted, np.sqrt(CENTRIPETAL_MPS2 / sharp))
-    limit = np.minimum(limit, np.append(limit[1:], limit[-1]))
-    ramp = 2.0 * COMFORT_BRAKING_MPS2 * STATION_STEP_M * np.arange(NUM_STATIONS)
-    return np.sqrt(np.minimum.accumulate((limit**2 + ramp)[::-1])[::-1] - ramp)
 
 
 def obstacle(kind: str, size: tuple[float, float], track: np.ndarray) -> Obstacle:

@@ -27,7 +27,7 @@ from commonroad_rp.utility.utils_coordinate_system import (
     create_initial_ref_path,
 )
 
-from rcirl_jax.elsewhere.commonroad.cost import RewardCost, obstacle, speed_limits
+from rcirl_jax.elsewhere.commonroad.cost import RewardCost, obstacle
 from rcirl_jax.export.own_planner.features import (
     HORIZON_S,
     NUM_STATIONS,
@@ -37,6 +37,7 @@ from rcirl_jax.export.own_planner.features import (
     Path,
     Scene,
 )
+from rcirl_jax.geometry.limits import LOOK_AHEAD_M, planning_limit
 
 BEHIND_M, AHEAD_M = 60.0, 400.0  # m by which a reference path goes on straight
 USUAL_LIMIT_MPS = 29.06  # m/s, where no sign says another: 65 mph
@@ -52,10 +53,7 @@ class Scenario:
         self.problem = next(iter(problems.planning_problem_dict.values()))
         network, others = self.scenario.lanelet_network, self.scenario.dynamic_obstacles
         points = create_initial_ref_path(network, self.problem)
-        first, last = points[0] - points[1], points[-1] - points[-2]
-        behind = points[0] + BEHIND_M * first / np.hypot(*first)
-        ahead = points[-1] + AHEAD_M * last / np.hypot(*last)
-        self.system = create_coordinate_system(np.vstack([behind, points, ahead]))
+        self.system = create_coordinate_system(longer(points))
         self.first = self.problem.initial_state.time_step
         # the last step at which somebody was recorded
         ends = [o.prediction.final_time_step for o in others if o.prediction]
@@ -96,6 +94,17 @@ class Scenario:
             t = (step - first) * self.scenario.dt
             rows.append((t, s, l, turn, speed))
         return np.array(rows).reshape(-1, 5)
+
+
+def longer(points: np.ndarray) -> np.ndarray:
+    """A path that goes on straight at both ends, as its last two metres do."""
+    arc = np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
+    near = np.interp([2.0, arc[-1] - 2.0], arc, np.arange(len(points)))
+    inner = points[near.round().astype(int)]
+    ways = (points[[0, -1]] - inner) / np.hypot(*(points[[0, -1]] - inner).T)[:, None]
+    behind = points[0] + np.arange(BEHIND_M, 0.0, -1.0)[:, None] * ways[0]
+    ahead = points[-1] + np.arange(1.0, AHEAD_M)[:, None] * ways[1]
+    return np.vstack([behind, points, ahead])
 
 
 def kind_of(body: Any) -> str:  # noqa: ANN401
@@ -175,8 +184,11 @@ def scene_of(
     s, l = system.convert_to_curvilinear_coords(*centre)
     road = np.interp(s, system.ref_pos, system.ref_theta)
     turn = float(np.angle(np.exp(1j * (state.orientation - road))))
-    at = s + STATION_STEP_M * np.arange(NUM_STATIONS)
+    size = NUM_STATIONS + int(LOOK_AHEAD_M / STATION_STEP_M)
+    at = s + STATION_STEP_M * np.arange(size)
     kappa = np.interp(at, system.ref_pos, system.ref_curv, right=0.0)
+    posted = np.full(size, given.limit(centre))
+    limit = planning_limit(kappa, 0.0 * at, posted, STATION_STEP_M)
     shrink = max(1.0 - kappa[0] * l, 0.1)
     last = now + round(HORIZON_S / given.scenario.dt)
     there = [o for o in given.scenario.obstacles if o.state_at_time(now) is not None]
@@ -198,9 +210,9 @@ def scene_of(
             width=car.width,
         ),
         path=Path(
-            kappa=kappa,
+            kappa=kappa[:NUM_STATIONS],
             l=np.zeros(NUM_STATIONS),
-            speed_limit=speed_limits(kappa, given.limit(centre)),
+            speed_limit=limit[:NUM_STATIONS],
         ),
         obstacles=boxes,
         num_valid=max(int(np.sum(known)), 2),
