@@ -71,6 +71,31 @@ def entry_of(name: str, drives: Sequence[Drive]) -> Entry:
     return Entry(name=name, means=means, rates=rates)
 
 
+def driven_before(file: Path, episodes: Sequence[str]) -> dict[str, Entry]:
+    """The entries of an `episodes.csv` over the same episodes, by name.
+
+    Raises:
+      InputError: it is none, or of other episodes.
+    """
+    with file.open(newline="") as lines:
+        rows = list(csv.DictReader(lines))
+    found: dict[str, list[dict]] = {}
+    for row in rows:
+        found.setdefault(row.get("driver", ""), []).append(row)
+    entries = {}
+    for name, drives in found.items():
+        if [drive.get("episode") for drive in drives] != list(episodes):
+            raise InputError(
+                f"--also: {file}: {name}: other episodes: expected those of --episodes "
+                "and --seed"
+            )
+        get = lambda key, of=drives: np.array([float(x[key]) for x in of])  # noqa: E731
+        means = {key: get(key) for key in MEANS}
+        rates = {key: get(key) > 0.0 for key in RATES}
+        entries[name] = Entry(name=name, means=means, rates=rates)
+    return entries
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Table:
     """Entries over the same episodes; differences are to the `against` ones."""
