@@ -22,16 +22,16 @@ from rcirl_jax.export.own_planner.inputs import Body, Car
 
 # kind: environment, what differs from its own configuration, x m where it ends
 KINDS = {
-    "highway": ("highway-v0", {"lanes_count": 3, "vehicles_count": 12}, math.inf),
+    "highway": ("highway-v0", {"lanes_count": 3, "vehicles_count": 8}, math.inf),
     "dense": (
         "highway-v0",
-        {"lanes_count": 3, "vehicles_count": 12, "vehicles_density": 2},
+        {"lanes_count": 3, "vehicles_count": 8, "vehicles_density": 2},
         math.inf,
     ),
     # its lanes say 20 m/s, which its IDMVehicles keep too; it ends behind the ramp
     "merge": ("merge-v1", {}, 370.0),
 }
-KEEPS, CHANGES = "IDMVehicle in its lane", "IDMVehicle, overtaking"
+KEEPS, CHANGES = "IDMVehicle in its lane", "IDMVehicle overtaking"
 POINT_STEP_M = 2.0  # m between points of a centre line
 BEHIND_M, AHEAD_M = 30.0, 1500.0  # m of a lane before and beyond the ego's first place
 NEAR_M = 200.0  # m within which others are shown

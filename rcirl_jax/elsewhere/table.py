@@ -7,7 +7,7 @@ intervals resample episodes, differences are of the same episodes.
 import csv
 import dataclasses
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,19 +25,19 @@ from rcirl_jax.evaluation.statistics import (
 from rcirl_jax.runtime.atomic_files import write_json, write_whole
 from rcirl_jax.simulation.metrics import COLUMNS
 
-# number of an episode: its heading in the table, unit, decimals
+# number of an episode: its heading in the table
 MEANS = {
-    "mean_speed": ("speed", "m/s", 2),
-    "progress": ("progress", "m", 1),
-    "rms_a": ("rms a", "m/s2", 2),
-    "rms_j": ("rms jerk", "m/s3", 2),
-    "min_a": ("min a", "m/s2", 2),
-    "standing_share": ("standing", "1", 3),
-    "fallback_share": ("fallback", "1", 4),
+    "mean_speed": "speed m/s",
+    "progress": "progress m",
+    "rms_a": "rms a m/s2",
+    "rms_j": "rms jerk m/s3",
+    "min_a": "min a m/s2",
+    "standing_share": "standing",
+    "fallback_share": "fallback",
 }
 # yes or no of an episode
 RATES = {
-    "at_fault": "crash of own fault",
+    "at_fault": "crash, own fault",
     "collisions": "crash",
     "red_lights": "red light run",
     "a_station": "|a| < 4 held",
@@ -69,6 +69,39 @@ def entry_of(name: str, drives: Sequence[Drive]) -> Entry:
     }
     means = {key: np.asarray(getattr(found, key), float) for key in MEANS}
     return Entry(name=name, means=means, rates=rates)
+
+
+def driven_before(file: Path, episodes: Sequence[str]) -> dict[str, Entry]:
+    """The entries of an `episodes.csv` over the same episodes, by name.
+
+    Raises:
+      InputError: it is none, or of other episodes.
+    """
+    with file.open(newline="") as lines:
+        rows = list(csv.DictReader(lines))
+    found: dict[str, list[dict]] = {}
+    for row in rows:
+        found.setdefault(row.get("driver", ""), []).append(row)
+    entries = {}
+    for name, drives in found.items():
+        if [drive.get("episode") for drive in drives] != list(episodes):
+            raise InputError(
+                f"--also: {file}: {name}: other episodes: expected those of --episodes "
+                "and --seed"
+            )
+        try:
+            numbers = {
+                key: np.array([float(drive[key]) for drive in drives])
+                for key in (*MEANS, *RATES)
+            }
+        except (KeyError, ValueError) as error:
+            raise InputError(
+                f"--also: {file}: {name}: {error}: expected an episodes.csv"
+            ) from None
+        means = {key: numbers[key] for key in MEANS}
+        rates = {key: numbers[key] > 0.0 for key in RATES}
+        entries[name] = Entry(name=name, means=means, rates=rates)
+    return entries
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -118,14 +151,24 @@ class Table:
         }
 
     def text(self, body: Mapping) -> str:
-        """Of `as_dict`: a table for each kind, then the differences over all."""
-        lines = [f"{self.simulator}: {len(self.episodes)} episodes"]
+        """Of `as_dict`: rates and means of each kind, then the differences over all."""
+        lines = [f"{self.simulator}: {len(self.episodes)} episodes, 95 % intervals"]
         for group, found in body["groups"].items():
-            lines += ["", f"{group}: {found['episodes']} episodes, 95 % intervals"]
-            lines += _rows(found["rows"])
+            rows = found["rows"]
+            lines += ["", f"{group}, {found['episodes']} episodes: % of them with"]
+            lines += _table(RATES, rows, lambda x: _cell(x["value"], x, 100.0, 1))
+            lines += ["", f"{group}: mean of the episodes"]
+            lines += _table(MEANS, rows, _mean)
         for other in self.against:
-            lines += ["", f"Difference to {other}, the same episodes, all kinds"]
-            lines += _differences(body["groups"]["all"]["differences"], other)
+            pairs = body["groups"]["all"]["differences"]
+            rows = {
+                pair.removesuffix(f" - {other}"): numbers
+                for pair, numbers in pairs.items()
+                if pair.endswith(f" - {other}")
+            }
+            lines += ["", f"Less {other}, the same episodes; * leaves out 0"]
+            lines += _table(RATES, rows, _less(100.0, 1), "points of %")
+            lines += ["", *_table(MEANS, rows, _less(1.0, 2))]
         return "\n".join(lines) + "\n"
 
     def csv(self) -> str:
@@ -181,43 +224,33 @@ def _apart(
     return found
 
 
-def _rows(rows: Mapping) -> list[str]:
-    """Lines of the table of one kind."""
-    header = [
-        "",
-        *RATES.values(),
-        *(f"{name}, {unit}" for name, unit, _ in MEANS.values()),
+def _table(
+    columns: Mapping[str, str],
+    rows: Mapping[str, Mapping],
+    cell: Callable[[Mapping], str],
+    corner: str = "",
+) -> list[str]:
+    """Lines: a driver each, a column for each of its numbers."""
+    cells = [
+        [name, *(cell(found[key]) for key in columns)] for name, found in rows.items()
     ]
-    lines = []
-    for name, found in rows.items():
-        cells = [
-            f"{100 * x['value']:.1f} [{100 * x['low']:.1f},{100 * x['high']:.1f}]"
-            for x in (found[key] for key in RATES)
-        ]
-        for key, (_, _, digits) in MEANS.items():
-            x = found[key]
-            low, high = f"{x['low']:.{digits}f}", f"{x['high']:.{digits}f}"
-            cells.append(f"{x['value']:.{digits}f} [{low},{high}]")
-        lines.append([name, *cells])
-    return text_table(header, lines)
+    return text_table([corner, *columns.values()], cells)
 
 
-def _differences(found: Mapping, other: str) -> list[str]:
-    """Lines of the differences to one driver; a star: the interval leaves out 0."""
-    header = ["", *RATES.values(), *(name for name, _, _ in MEANS.values())]
-    lines = []
-    for pair, numbers in found.items():
-        name, _, to = pair.rpartition(" - ")
-        if to != other:
-            continue
-        cells = []
-        for key in (*RATES, *MEANS):
-            scale, digits = (100, 1) if key in RATES else (1, MEANS[key][2])
-            x = numbers[key]
-            star = "" if x["low"] <= 0.0 <= x["high"] else "*"
-            cells.append(
-                f"{scale * x['mean']:+.{digits}f} [{scale * x['low']:+.{digits}f},"
-                f"{scale * x['high']:+.{digits}f}]{star}"
-            )
-        lines.append([name, *cells])
-    return text_table(header, lines)
+def _cell(value: float, ends: Mapping, scale: float, digits: int) -> str:
+    low, high = (f"{scale * ends[end]:.{digits}f}" for end in ("low", "high"))
+    return f"{scale * value:.{digits}f} [{low},{high}]"
+
+
+def _mean(x: Mapping) -> str:
+    return _cell(x["value"], x, 1.0, 2)
+
+
+def _less(scale: float, digits: int) -> Callable[[Mapping], str]:
+    """Cells of differences."""
+
+    def cell(x: Mapping) -> str:
+        star = " " if x["low"] <= 0.0 <= x["high"] else "*"
+        return _cell(x["mean"], x, scale, digits) + star
+
+    return cell

@@ -21,14 +21,14 @@ import sumo
 
 from rcirl_jax.errors import InputError
 
-JUNCTIONS = 7
+JUNCTIONS = 6
 BLOCK_M = (180.0, 320.0)  # m between junctions
 BEND_M = 3.0  # m that a junction lies aside: nobody has to slow down
 SIDE_M = 150.0  # m, length of side roads
 APART_M = 1000.0  # m between corridors
 LIGHTS = 0.7  # 1, share of junctions with lights
 LIMITS_MPS = (8.33, 13.89, 16.67, 19.44)  # m/s: 30, 50, 60 and 70 km/h
-WARM_UP_S = 90  # s before the egos start
+WARM_UP_S = 60  # s before the egos start
 TRUCKS = 0.1  # 1, share of the traffic
 
 
@@ -132,7 +132,7 @@ def _traffic(number: int, kind: Kind) -> Iterator[tuple[float, str]]:
     """(begin s, element) of the flows of a corridor and of its ego."""
     east = main_road(number)
     west = [f"{number}.r{k}" for k in range(JUNCTIONS, -1, -1)]
-    flows = [(east, 0.7 * kind.main), (west, 0.7 * kind.main)]
+    flows = [(east, 0.7 * kind.main), (west, 0.3 * kind.main)]
     for k in range(1, JUNCTIONS + 1):
         a, b, d, e = (f"{number}.{side}{k}" for side in "abde")
         back = JUNCTIONS + 1 - k  # edges of the way back before the junction
