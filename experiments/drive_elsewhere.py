@@ -70,7 +70,8 @@ def main() -> None:
         raise InputError(f"--episodes: {_EPISODES.value}: expected at least 2")
     if not 1.0 <= _SECONDS.value <= 600.0:
         raise InputError(f"--seconds: {_SECONDS.value:g}: expected 1 to 600 s")
-    options = dict(option.partition("=")[::2] for option in _OPTIONS.value)
+    parts = [option.partition("=") for option in _OPTIONS.value]
+    options = {name: value for name, _, value in parts}
     simulator = open_simulator(_SIMULATOR.value, **options)
     made_by = provenance(_WEIGHTS.value)
     names = simulator.episodes(_EPISODES.value, _SEED.value)

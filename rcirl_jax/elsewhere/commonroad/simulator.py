@@ -124,18 +124,16 @@ class Replay:
         )
 
     def step(self, move: Move | None) -> None:
-        """0.1 s on."""
+        """0.1 s on; an ego that nobody drives stays where it is."""
         assert self.process.stdin is not None
-        before = self.now
         self.process.stdin.write("\n")
         self.process.stdin.flush()
-        said = self._heard()
-        if said and move is not None:
-            said = {"limit": before["limit"], **said, "ego": self._moved(move)}
+        x, y, *_ = self.now["ego"]
+        ego = self.now["ego"] if move is None else self._moved(move)
+        said, limit = self._heard(), self.now["limit"]
+        self.now = {"ego": ego, "limit": limit, **said} if said else {}
         if said:
-            x, y, *_ = before["ego"]
-            self.way += math.hypot(said["ego"][0] - x, said["ego"][1] - y)
-        self.now = said
+            self.way += math.hypot(self.now["ego"][0] - x, self.now["ego"][1] - y)
 
     def _moved(self, move: Move) -> list[float]:
         """The ego a way farther on its line."""

@@ -8,6 +8,7 @@ With a second argument the reactive planner drives the ego: by its own cost, or 
 reward as its cost. Its settings are the default ones but for the horizon, 8 s.
 """
 
+# pyright: reportMissingImports=false, reportAttributeAccessIssue=false
 import json
 import os
 import sys
