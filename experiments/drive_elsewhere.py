@@ -5,7 +5,7 @@
 
 The rows drive the same episodes, at 10 Hz behind the same safety filter; the last are
 the simulator's own drivers. Writes table.txt, episodes.csv and elsewhere.json:
-docs/simulators.md.
+docs/simulators.md. A run that was ended goes on with --also=DIR.
 """
 
 from collections.abc import Sequence
@@ -14,9 +14,15 @@ from pathlib import Path
 from absl import flags
 
 from experiments.flags.common import provenance, run
-from rcirl_jax.elsewhere.drive import drive_all, entrants
+from rcirl_jax.elsewhere.drive import Entrant, drive, entrants, groups
 from rcirl_jax.elsewhere.simulators import SIMULATORS, Simulator, open_simulator
-from rcirl_jax.elsewhere.table import Entry, Table, driven_before, entry_of
+from rcirl_jax.elsewhere.table import (
+    Results,
+    numbers_of,
+    read_results,
+    table_of,
+    write_results,
+)
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.closed_loop import table_rows
 
@@ -36,31 +42,35 @@ _ALSO = flags.DEFINE_list(
 )
 
 
-def _driven(simulator: Simulator, names: Sequence[str]) -> list[Entry]:
-    """The entries in the order of the table: driven here, or read from --also."""
-    rows = table_rows(_WEIGHTS.value, _BASELINES.value)
-    known: dict[str, Entry] = {}
-    for folder in _ALSO.value:
-        known |= driven_before(Path(folder) / "episodes.csv", names)
-    every = entrants(simulator, rows)
-    wanted = _ONLY.value or [entrant.name for entrant in every]
-    if missing := set(wanted) - {entrant.name for entrant in every}:
+def _entrants(simulator: Simulator) -> list[Entrant]:
+    """Who drives: --rows of those that there are."""
+    every = entrants(simulator, table_rows(_WEIGHTS.value, _BASELINES.value))
+    names = [entrant.name for entrant in every]
+    if missing := set(_ONLY.value) - set(names):
         raise InputError(
-            f"--rows: {', '.join(sorted(missing))}: expected some of "
-            f"{'; '.join(entrant.name for entrant in every)}"
+            f"--rows: {', '.join(sorted(missing))}: expected some of {', '.join(names)}"
         )
-    entries = []
-    for entrant in every:
-        if entrant.name in known:
-            entries.append(known[entrant.name])
-        elif entrant.name in wanted:
-            drives = drive_all(simulator, entrant, names, _SECONDS.value, _say)
-            entries.append(entry_of(entrant.name, drives))
-    return entries
+    return [x for x in every if not _ONLY.value or x.name in _ONLY.value]
 
 
-def _say(line: str) -> None:
-    print(line, flush=True)
+def _drive(simulator: Simulator, who: Sequence[Entrant]) -> Results:
+    """All episodes by everybody, group by group; what is known is not driven again."""
+    results: Results = {}
+    for folder in _ALSO.value:
+        for name, drives in read_results(Path(folder) / "episodes.csv").items():
+            results.setdefault(name, {}).update(drives)
+    names = simulator.episodes(_EPISODES.value, _SEED.value)
+    for group in groups(simulator, names):
+        for entrant in who:
+            known = results.setdefault(entrant.name, {})
+            if not all(name in known for name in group):
+                known |= numbers_of(drive(simulator, entrant, group, _SECONDS.value))
+        write_results(Path(_OUTPUT.value) / "episodes.csv", results)
+        print(f"driven: {group[-1]}, {names.index(group[-1]) + 1} episodes", flush=True)
+    return {
+        name: {n: drives[n] for n in names if n in drives}
+        for name, drives in results.items()
+    }
 
 
 def main() -> None:
@@ -71,15 +81,9 @@ def main() -> None:
         raise InputError(f"--seconds: {_SECONDS.value:g}: expected 1 to 600 s")
     simulator = open_simulator(_SIMULATOR.value)
     made_by = provenance(_WEIGHTS.value)
-    names = simulator.episodes(_EPISODES.value, _SEED.value)
-    entries = _driven(simulator, names)
-    against = {"hand-set", simulator.own_drivers[0]}
-    table = Table(
-        simulator=simulator.name,
-        episodes=names,
-        entries=entries,
-        against=[entry.name for entry in entries if entry.name in against],
-    )
+    results = _drive(simulator, _entrants(simulator))
+    against = ["hand-set", simulator.own_drivers[0]]
+    table = table_of(simulator.name, results, against)
     print(table.write(Path(_OUTPUT.value), made_by))
     print(f"written: {_OUTPUT.value}/table.txt, episodes.csv, elsewhere.json")
 
