@@ -8,9 +8,11 @@ the simulator's own drivers. Writes table.txt, episodes.csv and elsewhere.json:
 docs/simulators.md. A run that was ended goes on with --also=DIR.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
+from typing import Any
 
+import msgspec
 from absl import flags
 
 from experiments.flags.common import provenance, run
@@ -25,6 +27,8 @@ from rcirl_jax.elsewhere.table import (
 )
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.closed_loop import table_rows
+from rcirl_jax.runtime.atomic_files import read_json, write_json
+from rcirl_jax.runtime.checked import checked
 
 ROWS = ("hand-set", "IDM", "constant V", "+velocity", "random weights")
 _SIMULATOR = flags.DEFINE_string(
@@ -36,29 +40,43 @@ _EPISODES = flags.DEFINE_integer("episodes", 500, "how many, 2 at least")
 _SECONDS = flags.DEFINE_float("seconds", 30.0, "s that an episode lasts")
 _SEED = flags.DEFINE_integer("seed", 0, "of the episodes")
 _BASELINES = flags.DEFINE_list("baselines", ",".join(ROWS), "rival rows, or empty")
-_ONLY = flags.DEFINE_list("rows", [], "names of the rows to drive; empty: all")
 _ALSO = flags.DEFINE_list(
     "also", [], "outputs over the same episodes, whose rows are not driven again"
 )
 
 
-def _entrants(simulator: Simulator) -> list[Entrant]:
-    """Who drives: --rows of those that there are."""
-    every = entrants(simulator, table_rows(_WEIGHTS.value, _BASELINES.value))
-    names = [entrant.name for entrant in every]
-    if missing := set(_ONLY.value) - set(names):
-        raise InputError(
-            f"--rows: {', '.join(sorted(missing))}: expected some of {', '.join(names)}"
-        )
-    return [x for x in every if not _ONLY.value or x.name in _ONLY.value]
+class _MadeBy(msgspec.Struct):
+    """What is read of an output's made_by.json."""
+
+    flags: dict[str, Any]
+    weights_sha256: dict[str, str]
 
 
-def _drive(simulator: Simulator, who: Sequence[Entrant]) -> Results:
-    """All episodes by everybody, group by group; what is known is not driven again."""
+def _driven_before(made_by: Mapping, fixed: Set[str]) -> Results:
+    """What --also has: rows that rest on weights only where they are the same.
+
+    Raises:
+      InputError: it drove elsewhere or for another time.
+    """
     results: Results = {}
-    for folder in _ALSO.value:
-        for name, drives in read_results(Path(folder) / "episodes.csv").items():
-            results.setdefault(name, {}).update(drives)
+    for folder in map(Path, _ALSO.value):
+        file = folder / "made_by.json"
+        found = read_json(file, "an output of drive_elsewhere")
+        then = checked(found, _MadeBy, file)
+        for flag in ("simulator", "seconds"):
+            was, now = then.flags.get(flag), made_by["flags"][flag]
+            if was != now:
+                raise InputError(f"--also: {folder}: --{flag}: {was}: expected {now}")
+        now = list(made_by["weights_sha256"].values())
+        differ = list(then.weights_sha256.values()) != now
+        for name, drives in read_results(folder / "episodes.csv").items():
+            if name in fixed or not differ:
+                results.setdefault(name, {}).update(drives)
+    return results
+
+
+def _drive(simulator: Simulator, who: Sequence[Entrant], results: Results) -> Results:
+    """All episodes by everybody, group by group; what is known is not driven again."""
     names = simulator.episodes(_EPISODES.value, _SEED.value)
     for group in groups(simulator, names):
         for entrant in who:
@@ -66,7 +84,7 @@ def _drive(simulator: Simulator, who: Sequence[Entrant]) -> Results:
             if not all(name in known for name in group):
                 known |= numbers_of(drive(simulator, entrant, group, _SECONDS.value))
         write_results(Path(_OUTPUT.value) / "episodes.csv", results)
-        print(f"driven: {group[-1]}, {names.index(group[-1]) + 1} episodes", flush=True)
+        print(f"driven: {names.index(group[-1]) + 1} of {len(names)}", flush=True)
     return {
         name: {n: drives[n] for n in names if n in drives}
         for name, drives in results.items()
@@ -81,7 +99,11 @@ def main() -> None:
         raise InputError(f"--seconds: {_SECONDS.value:g}: expected 1 to 600 s")
     simulator = open_simulator(_SIMULATOR.value)
     made_by = provenance(_WEIGHTS.value)
-    results = _drive(simulator, _entrants(simulator))
+    who = entrants(simulator, table_rows(_WEIGHTS.value, _BASELINES.value))
+    fixed = {*_BASELINES.value, *simulator.own_drivers} - {"random weights"}
+    before = _driven_before(made_by, fixed)
+    write_json(Path(_OUTPUT.value) / "made_by.json", made_by)
+    results = _drive(simulator, who, before)
     against = ["hand-set", simulator.own_drivers[0]]
     table = table_of(simulator.name, results, against)
     print(table.write(Path(_OUTPUT.value), made_by))
