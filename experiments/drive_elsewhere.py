@@ -5,20 +5,30 @@
 
 The rows drive the same episodes, at 10 Hz behind the same safety filter; the last are
 the simulator's own drivers. Writes table.txt, episodes.csv and elsewhere.json:
-docs/simulators.md.
+docs/simulators.md. A run that was ended goes on with --also=DIR.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
+from typing import Any
 
+import msgspec
 from absl import flags
 
 from experiments.flags.common import provenance, run
-from rcirl_jax.elsewhere.drive import drive_all, entrants
+from rcirl_jax.elsewhere.drive import Entrant, drive, entrants, groups
 from rcirl_jax.elsewhere.simulators import SIMULATORS, Simulator, open_simulator
-from rcirl_jax.elsewhere.table import Entry, Table, driven_before, entry_of
+from rcirl_jax.elsewhere.table import (
+    Results,
+    numbers_of,
+    read_results,
+    table_of,
+    write_results,
+)
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.closed_loop import table_rows
+from rcirl_jax.runtime.atomic_files import read_json, write_json
+from rcirl_jax.runtime.checked import checked
 
 ROWS = ("hand-set", "IDM", "constant V", "+velocity", "random weights")
 _SIMULATOR = flags.DEFINE_string(
@@ -31,37 +41,55 @@ _EPISODES = flags.DEFINE_integer("episodes", 500, "how many, 2 at least")
 _SECONDS = flags.DEFINE_float("seconds", 30.0, "s that an episode lasts")
 _SEED = flags.DEFINE_integer("seed", 0, "of the episodes")
 _BASELINES = flags.DEFINE_list("baselines", ",".join(ROWS), "rival rows, or empty")
-_ONLY = flags.DEFINE_list("rows", [], "names of the rows to drive; empty: all")
 _ALSO = flags.DEFINE_list(
     "also", [], "outputs over the same episodes, whose rows are not driven again"
 )
 
 
-def _driven(simulator: Simulator, names: Sequence[str]) -> list[Entry]:
-    """The entries in the order of the table: driven here, or read from --also."""
-    rows = table_rows(_WEIGHTS.value, _BASELINES.value)
-    known: dict[str, Entry] = {}
-    for folder in _ALSO.value:
-        known |= driven_before(Path(folder) / "episodes.csv", names)
-    every = entrants(simulator, rows)
-    wanted = _ONLY.value or [entrant.name for entrant in every]
-    if missing := set(wanted) - {entrant.name for entrant in every}:
-        raise InputError(
-            f"--rows: {', '.join(sorted(missing))}: expected some of "
-            f"{'; '.join(entrant.name for entrant in every)}"
-        )
-    entries = []
-    for entrant in every:
-        if entrant.name in known:
-            entries.append(known[entrant.name])
-        elif entrant.name in wanted:
-            drives = drive_all(simulator, entrant, names, _SECONDS.value, _say)
-            entries.append(entry_of(entrant.name, drives))
-    return entries
+class _MadeBy(msgspec.Struct):
+    """What is read of an output's made_by.json."""
+
+    flags: dict[str, Any]
+    weights_sha256: dict[str, str]
 
 
-def _say(line: str) -> None:
-    print(line, flush=True)
+def _driven_before(made_by: Mapping, fixed: Set[str]) -> Results:
+    """What --also has: rows that rest on weights only where they are the same.
+
+    Raises:
+      InputError: it drove elsewhere or for another time.
+    """
+    results: Results = {}
+    for folder in map(Path, _ALSO.value):
+        file = folder / "made_by.json"
+        found = read_json(file, "an output of drive_elsewhere")
+        then = checked(found, _MadeBy, file)
+        for flag in ("simulator", "seconds"):
+            was, now = then.flags.get(flag), made_by["flags"][flag]
+            if was != now:
+                raise InputError(f"--also: {folder}: --{flag}: {was}: expected {now}")
+        now = list(made_by["weights_sha256"].values())
+        differ = list(then.weights_sha256.values()) != now
+        for name, drives in read_results(folder / "episodes.csv").items():
+            if name in fixed or not differ:
+                results.setdefault(name, {}).update(drives)
+    return results
+
+
+def _drive(simulator: Simulator, who: Sequence[Entrant], results: Results) -> Results:
+    """All episodes by everybody, group by group; what is known is not driven again."""
+    names = simulator.episodes(_EPISODES.value, _SEED.value)
+    for group in groups(simulator, names):
+        for entrant in who:
+            known = results.setdefault(entrant.name, {})
+            if not all(name in known for name in group):
+                known |= numbers_of(drive(simulator, entrant, group, _SECONDS.value))
+        write_results(Path(_OUTPUT.value) / "episodes.csv", results)
+        print(f"driven: {names.index(group[-1]) + 1} of {len(names)}", flush=True)
+    return {
+        name: {n: drives[n] for n in names if n in drives}
+        for name, drives in results.items()
+    }
 
 
 def main() -> None:
@@ -74,15 +102,13 @@ def main() -> None:
     options = {name: value for name, _, value in parts}
     simulator = open_simulator(_SIMULATOR.value, **options)
     made_by = provenance(_WEIGHTS.value)
-    names = simulator.episodes(_EPISODES.value, _SEED.value)
-    entries = _driven(simulator, names)
-    against = {"hand-set", simulator.own_drivers[0]}
-    table = Table(
-        simulator=simulator.name,
-        episodes=names,
-        entries=entries,
-        against=[entry.name for entry in entries if entry.name in against],
-    )
+    who = entrants(simulator, table_rows(_WEIGHTS.value, _BASELINES.value))
+    fixed = {*_BASELINES.value, *simulator.own_drivers} - {"random weights"}
+    before = _driven_before(made_by, fixed)
+    write_json(Path(_OUTPUT.value) / "made_by.json", made_by)
+    results = _drive(simulator, who, before)
+    against = ["hand-set", simulator.own_drivers[0]]
+    table = table_of(simulator.name, results, against)
     print(table.write(Path(_OUTPUT.value), made_by))
     print(f"written: {_OUTPUT.value}/table.txt, episodes.csv, elsewhere.json")
 

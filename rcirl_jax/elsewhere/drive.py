@@ -5,7 +5,7 @@ The only loop over time of this room: look, plan for all episodes at once, step.
 
 import dataclasses
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -29,35 +29,24 @@ def entrants(simulator: Simulator, rows: Sequence[Row]) -> list[Entrant]:
     return ours + [Entrant(name=name) for name in simulator.own_drivers]
 
 
-def drive_all(
-    simulator: Simulator,
-    entrant: Entrant,
-    episodes: Sequence[str],
-    seconds: float,
-    said: Callable[[str], None] = lambda line: None,
+def groups(simulator: Simulator, episodes: Sequence[str]) -> list[Sequence[str]]:
+    """Episodes as they run in lock step; who drives them depends on nothing else."""
+    size = simulator.together
+    return [episodes[n : n + size] for n in range(0, len(episodes), size)]
+
+
+def drive(
+    simulator: Simulator, entrant: Entrant, episodes: Sequence[str], seconds: float
 ) -> list[Drive]:
-    """Every episode, as many in lock step as the simulator takes.
+    """One of `groups`, driven by somebody.
 
     Args:
       simulator: where.
       entrant: who.
       episodes: names from `simulator.episodes`.
       seconds: that an episode lasts; a collision ends it earlier.
-      said: is told how far it is.
     """
-    drives: list[Drive] = []
-    for first in range(0, len(episodes), simulator.together):
-        group = episodes[first : first + simulator.together]
-        drives += _together(simulator, entrant, group, round(seconds / STEP_S))
-        said(f"{entrant.name}: {len(drives)} of {len(episodes)} episodes")
-    return drives
-
-
-def _together(
-    simulator: Simulator, entrant: Entrant, episodes: Sequence[str], steps: int
-) -> list[Drive]:
-    """Episodes in lock step."""
-    row = entrant.row
+    row, steps = entrant.row, round(seconds / STEP_S)
     running = simulator.start(episodes, entrant.name if row is None else None)
     # batches have one size, so that each row is compiled once
     lanes = simulator.together

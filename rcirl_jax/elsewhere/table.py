@@ -46,6 +46,59 @@ RATES = {
 }
 
 
+Numbers = dict[str, float]  # of one drive, keys of MEANS and RATES
+Results = dict[str, dict[str, Numbers]]  # by driver and episode
+
+
+def numbers_of(drives: Sequence[Drive]) -> dict[str, Numbers]:
+    """The numbers of drives, by episode."""
+    found = measure(drives)
+    holds = dict(zip(COLUMNS, found.holds.T, strict=True))
+    columns = {key: getattr(found, key) for key in MEANS} | {
+        "at_fault": found.at_fault > 0,
+        "collisions": found.collisions > 0,
+        "red_lights": found.red_lights > 0,
+        "a_station": holds["a_station"],
+        "j_station": holds["j_station"],
+        "nuplan_comfort": found.comfort > 0.0,
+    }
+    return {
+        drive.episode: {key: float(values[n]) for key, values in columns.items()}
+        for n, drive in enumerate(drives)
+    }
+
+
+def write_results(file: Path, results: Results) -> None:
+    """One line a driver and episode."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["driver", "episode", *MEANS, *RATES])
+    for name, drives in results.items():
+        for episode, numbers in drives.items():
+            cells = [f"{numbers[key]:.6g}" for key in (*MEANS, *RATES)]
+            writer.writerow([name, episode, *cells])
+    write_whole(file, text.getvalue())
+
+
+def read_results(file: Path) -> Results:
+    """What `write_results` wrote.
+
+    Raises:
+      InputError: it did not.
+    """
+    found: Results = {}
+    with file.open(newline="") as lines:
+        for n, row in enumerate(csv.DictReader(lines)):
+            try:
+                numbers = {key: float(row[key]) for key in (*MEANS, *RATES)}
+                found.setdefault(row["driver"], {})[row["episode"]] = numbers
+            except (KeyError, TypeError, ValueError) as error:
+                raise InputError(
+                    f"{file}: row {n + 1}: {error}: expected an episodes.csv"
+                ) from None
+    return found
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Entry:
     """One driver's episodes; arrays [N]."""
@@ -55,53 +108,18 @@ class Entry:
     rates: dict[str, np.ndarray]  # bool
 
 
-def entry_of(name: str, drives: Sequence[Drive]) -> Entry:
-    """The numbers of a driver."""
-    found = measure(drives)
-    holds = dict(zip(COLUMNS, found.holds.T, strict=True))
-    rates = {
-        "at_fault": found.at_fault > 0,
-        "collisions": found.collisions > 0,
-        "red_lights": found.red_lights > 0,
-        "a_station": holds["a_station"],
-        "j_station": holds["j_station"],
-        "nuplan_comfort": found.comfort > 0.0,
-    }
-    means = {key: np.asarray(getattr(found, key), float) for key in MEANS}
-    return Entry(name=name, means=means, rates=rates)
-
-
-def driven_before(file: Path, episodes: Sequence[str]) -> dict[str, Entry]:
-    """The entries of an `episodes.csv` over the same episodes, by name.
-
-    Raises:
-      InputError: it is none, or of other episodes.
-    """
-    with file.open(newline="") as lines:
-        rows = list(csv.DictReader(lines))
-    found: dict[str, list[dict]] = {}
-    for row in rows:
-        found.setdefault(row.get("driver", ""), []).append(row)
-    entries = {}
-    for name, drives in found.items():
-        if [drive.get("episode") for drive in drives] != list(episodes):
-            raise InputError(
-                f"--also: {file}: {name}: other episodes: expected those of --episodes "
-                "and --seed"
-            )
-        try:
-            numbers = {
-                key: np.array([float(drive[key]) for drive in drives])
-                for key in (*MEANS, *RATES)
-            }
-        except (KeyError, ValueError) as error:
-            raise InputError(
-                f"--also: {file}: {name}: {error}: expected an episodes.csv"
-            ) from None
-        means = {key: numbers[key] for key in MEANS}
-        rates = {key: numbers[key] > 0.0 for key in RATES}
-        entries[name] = Entry(name=name, means=means, rates=rates)
-    return entries
+def table_of(simulator: str, results: Results, against: Sequence[str]) -> "Table":
+    """The table over the episodes that every driver has driven."""
+    first, *others = results.values()
+    episodes = [name for name in first if all(name in other for other in others)]
+    entries = []
+    for name, drives in results.items():
+        column = lambda key, of=drives: np.array([of[e][key] for e in episodes])  # noqa: E731
+        means = {key: column(key) for key in MEANS}
+        rates = {key: column(key) > 0.0 for key in RATES}
+        entries.append(Entry(name=name, means=means, rates=rates))
+    known = [name for name in against if name in results]
+    return Table(simulator=simulator, episodes=episodes, entries=entries, against=known)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -171,24 +189,11 @@ class Table:
             lines += ["", *_table(MEANS, rows, _less(1.0, 2))]
         return "\n".join(lines) + "\n"
 
-    def csv(self) -> str:
-        """One line a driver and episode."""
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(["driver", "episode", *MEANS, *RATES])
-        for entry in self.entries:
-            for n, episode in enumerate(self.episodes):
-                means = [f"{values[n]:.6g}" for values in entry.means.values()]
-                rates = [int(values[n]) for values in entry.rates.values()]
-                writer.writerow([entry.name, episode, *means, *rates])
-        return text.getvalue()
-
     def write(self, folder: Path, made_by: Mapping) -> str:
-        """table.txt, episodes.csv and elsewhere.json; returns the table."""
+        """table.txt and elsewhere.json; returns the table."""
         body = self.as_dict()
         text = self.text(body)
         write_whole(folder / "table.txt", text)
-        write_whole(folder / "episodes.csv", self.csv())
         write_json(folder / "elsewhere.json", {**body, "made_by": dict(made_by)})
         return text
 
