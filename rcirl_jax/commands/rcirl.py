@@ -27,6 +27,10 @@ COMMANDS = {
         "studies.human_likeness",
         "compare learners: who chooses most like a human?",
     ),
+    "drive-elsewhere": (
+        "studies.drive_elsewhere",
+        "drive in simulators that others wrote: highway-env, SUMO, CommonRoad",
+    ),
     "label-check": ("studies.label_check", "are the automatic labels right?"),
     "gate-errors": ("studies.gate_errors", "how often is the gate wrong?"),
 }

@@ -159,6 +159,10 @@ def project_points(
     return both[0], both[1]
 
 
+# as `_project`, for lanes: lines [B, M], x, y and near [B, q]
+project_lanes = jax.jit(jax.vmap(_project))
+
+
 def path_curvature(
     kappa: Float[Array, ""],
     dkappa: Float[Array, ""],

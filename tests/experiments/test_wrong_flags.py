@@ -12,6 +12,7 @@ TRAIN = "train --data={data} --output={out}"
 TUNE = "autotune --output={out}"
 GATE = "gate --candidate={weights} --output={out}.json --suite=free_cruise"
 DRIVE = "simulate --weights={weights} --output={out} --baselines="
+ELSEWHERE = "drive_elsewhere --weights={weights} --output={out}"
 EXPORT = "export_weights --weights={weights}"
 RANK = "human_likeness --data={data} --output={out}"
 FOLDS = f"{RANK} --folds=2"
@@ -31,6 +32,9 @@ WRONG = (
     ("export_weights --run=nowhere", "run.json: missing"),
     ("export_weights --onnx={out}", "--run, --weights: expected one of them"),
     ("export_weights --yaml={out} --run=x", "expected --weights with"),
+    (f"{ELSEWHERE} --simulator=sumoo", "did you mean sumo?"),
+    (f"{ELSEWHERE} --simulator=sumo --episodes=1", "--episodes: 1: expected at least"),
+    (f"{ELSEWHERE} --simulator=sumo --seconds=0", "--seconds: 0: expected 1 to 600 s"),
     (f"{EXPORT} --yaml={{out}}", "expected a linear reward"),
     (EXPORT, "--onnx, --stablehlo"),
     (TUNE, "--data, --input, --synthetic: expected one of them"),

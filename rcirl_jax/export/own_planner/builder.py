@@ -17,9 +17,11 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial import KDTree
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.own_planner.inputs import (
@@ -52,7 +54,7 @@ from rcirl_jax.units import HORIZON_S, NUM_STATIONS, NUM_TIMES, STATION_STEP_M, 
 BESIDE_M = 20.0  # m beside the centre line beyond which the ego is not on its road
 STEEPEST = 1.2  # rad, tilt beyond which dl/ds grows no more
 MIN_SHRINK = 0.1  # 1, least value of 1 - kappa l
-_obstacles_of = jax.jit(obstacles_of)
+GRID_BLOCK = 256  # points: grids are a multiple, so that few sizes compile
 _extents_of = jax.jit(jax.vmap(frenet_extent))
 LONG_GRID_M = np.arange(
     0.0, (NUM_STATIONS - 1) * STATION_STEP_M + LOOK_AHEAD_M + 1e-6, STATION_STEP_M
@@ -98,60 +100,140 @@ def scene_from(
         (122,)
     """
     check_numbers("ego", ego)
-    check("ego.speed", ego.speed, ego.speed >= 0.0, "0 m/s or more")
-    points = polyline("centre_line.points", centre_line.points)
-    origin = np.array([ego.x, ego.y])
-    frame = _Frame(points - origin, origin)
-    now, s0 = _ego(frame, ego)
-    road = _path(frame, centre_line, path, s0)
-    bodies = _bodies(frame, obstacles, s0)
-    wall = _nearest_line(frame, signals, s0, now)
-    goal = math.inf
-    if destination is not None:
-        (goal,) = frame.stations("destination", [destination]) - s0 + 0.5 * ego.length
-        goal = goal if goal > 0.5 * ego.length else math.inf
-    walls = (jnp.asarray(wall), jnp.asarray(goal))
-    seen = _obstacles_of(bodies, *walls, now, road)
-    if predictions is not None:
-        futures = _futures(frame, obstacles, predictions, s0)
-        seen = _with_futures(seen, futures, most_relevant(bodies, now))
+    frame = LineFrame(centre_line, (ego.x, ego.y))
+    points = frame.points(ego, obstacles, signals, destination)
+    parts = frame.parts(
+        *project_points(frame.line, points), ego, obstacles, signals, path
+    )
+    scene = _scene_of(parts)
+    if predictions is None:
+        return scene
+    futures = _futures(frame, obstacles, predictions, float(parts.station))
+    first = most_relevant(parts.bodies, parts.ego)
+    return scene.replace(obstacles=_with_futures(scene.obstacles, futures, first))
+
+
+class Parts(flax.struct.PyTreeNode, kw_only=True):
+    """What is known of one moment before the others' future is predicted; numpy."""
+
+    ego: Ego
+    path: Path
+    bodies: Bodies
+    wall: np.ndarray  # [] m, the nearest line that demands a stop; inf
+    goal: np.ndarray  # [] m, where the front comes to rest; inf
+    station: np.ndarray  # [] m, of the ego on its line
+
+
+def scene_of(parts: Parts) -> Scene:
+    """The planning frame of one moment; pure, so that many are made by one `vmap`."""
     return Scene(
-        ego=now,
-        path=road,
-        obstacles=seen,
+        ego=parts.ego,
+        path=parts.path,
+        obstacles=obstacles_of(
+            parts.bodies, parts.wall, parts.goal, parts.ego, parts.path
+        ),
         time_valid=jnp.ones(NUM_TIMES, bool),
         tags=jnp.zeros(NUM_TAGS, bool),
     )
 
 
+_scene_of = jax.jit(scene_of)
+
+
 # ------------------------------------------------------------------------ the frame
 
 
-class _Frame:
-    """The Frenet frame of a centre line, around an origin near the ego."""
+class LineFrame:
+    """The Frenet frame of a centre line; smoothed once, for all moments on it.
 
-    def __init__(self, points: np.ndarray, origin: np.ndarray) -> None:
-        self.origin = origin
-        steps = np.hypot(*np.diff(points, axis=0).T)
-        self.length = float(np.sum(steps))
-        size = int(self.length / STATION_STEP_M) + 2
+    Args:
+      road: the line.
+      origin: (x, y) m, a place near the ego from which float32 numbers are precise.
+      size: points of its grid, at least; lines of one size make a batch.
+    """
+
+    def __init__(
+        self, road: CentreLine, origin: tuple[float, float], size: int = 0
+    ) -> None:
+        self.road, self.origin = road, np.asarray(origin, float)
+        points = polyline("centre_line.points", road.points) - self.origin
+        self.length = float(np.sum(np.hypot(*np.diff(points, axis=0).T)))
+        count = max(int(self.length / STATION_STEP_M) + 2, size)
+        count = -(-count // GRID_BLOCK) * GRID_BLOCK
         self.line: ReferenceLine = reference_line_from_polyline(
-            points, size=size, step=STATION_STEP_M
+            points, size=count, step=STATION_STEP_M
         )
-        self.grid = np.arange(size) * STATION_STEP_M
+        tables = ("x", "y", "heading", "kappa")
+        self.tables = {n: np.asarray(getattr(self.line, n)) for n in tables}
+        self.tree = KDTree(np.stack([self.tables["x"], self.tables["y"]], axis=1))
+        self.grid = np.arange(count) * STATION_STEP_M
+        self.posted = _posted_limits(self)
+
+    def points(
+        self,
+        ego: Car,
+        obstacles: Sequence[Body] = (),
+        signals: Sequence[Signal] = (),
+        destination: tuple[float, float] | None = None,
+    ) -> np.ndarray:
+        """Places [q, 2] m of a moment, from the origin, to be projected on the line.
+
+        Those of the ego, the obstacles, the signals and, if any, the destination.
+
+        Raises:
+          InputError: names the field, its value and what was expected.
+        """
+        check_numbers("ego", ego)
+        check("ego.speed", ego.speed, ego.speed >= 0.0, "0 m/s or more")
+        _check_others(obstacles, signals)
+        ends = [] if destination is None else table("destination", [destination], 2)
+        places = [(p.x, p.y) for p in (ego, *obstacles, *signals)]
+        return np.array([*places, *ends]) - self.origin
+
+    def parts(
+        self,
+        s: np.ndarray,
+        l: np.ndarray,
+        ego: Car,
+        obstacles: Sequence[Body] = (),
+        signals: Sequence[Signal] = (),
+        path: Any = None,  # noqa: ANN401
+        slots: int = 0,
+    ) -> Parts:
+        """One moment on the line; see `scene_from`.
+
+        Args:
+          s: [q] m, stations of `points`.
+          l: [q] m, their offsets.
+          ego: the car that is planned for.
+          obstacles: the others.
+          signals: stop lines.
+          path: along which speed is planned; None: the line.
+          slots: of bodies, at least; moments of one number of slots make a batch.
+        """
+        s, l = s.astype(float), l.astype(float)
+        s0, first = float(s[0]), 1 + len(obstacles)
+        last = first + len(signals)
+        now = _ego(self, ego, s0, float(l[0]))
+        goal = s[last] - s0 + 0.5 * ego.length if last < s.size else math.inf
+        goal = goal if goal > 0.5 * ego.length else math.inf
+        return Parts(
+            ego=now,
+            path=_path(self, path, s0),
+            bodies=_bodies(self, obstacles, s[1:first] - s0, l[1:first], s0, slots),
+            wall=np.float32(_nearest_line(signals, s[first:last] - s0, now)),
+            goal=np.float32(goal),
+            station=np.float32(s0),
+        )
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(s, l) m of points [q, 2] m."""
         s, l = project_points(self.line, np.asarray(points, float) - self.origin)
         return s.astype(float), l.astype(float)
 
-    def stations(self, name: str, points: Sequence) -> np.ndarray:
-        """Stations of points [q, 2] m that somebody gave."""
-        return self.project(table(name, points, 2))[0]
-
     def table(self, name: str, s: np.ndarray) -> np.ndarray:
         """Heading or curvature of the line at stations; straight beyond its end."""
-        values = np.asarray(getattr(self.line, name), float)
+        values = self.tables[name]
         return np.interp(s, self.grid, values, right=0.0 if name == "kappa" else None)
 
     def tilt(self, s: np.ndarray, heading: np.ndarray | float) -> np.ndarray:
@@ -160,9 +242,8 @@ class _Frame:
         return np.arctan2(np.sin(apart), np.cos(apart))
 
 
-def _ego(frame: _Frame, ego: Car) -> tuple[Ego, float]:
-    """The ego in the frame, and its station on the line."""
-    (s0,), (l,) = frame.project(np.array([[ego.x, ego.y]]))
+def _ego(frame: LineFrame, ego: Car, s0: float, l: float) -> Ego:
+    """The ego in the frame, from its station and offset on the line."""
     ahead, need = frame.length - s0, HORIZON_S * ego.speed
     if s0 < -1e-3:
         raise InputError(
@@ -196,12 +277,12 @@ def _ego(frame: _Frame, ego: Car) -> tuple[Ego, float]:
         "length": ego.length,
         "width": ego.width,
     }
-    floats = {name: jnp.asarray(x, jnp.float32) for name, x in values.items()}
-    return Ego(**floats), float(s0)
+    return Ego(**{name: np.float32(x) for name, x in values.items()})
 
 
-def _path(frame: _Frame, road: CentreLine, path: Any, s0: float) -> Path:  # noqa: ANN401
+def _path(frame: LineFrame, path: Any, s0: float) -> Path:  # noqa: ANN401
     """The line from the ego on, with limits that look ahead (`geometry.limits`)."""
+    road = frame.road
     stations = s0 + LONG_GRID_M
     kappa = frame.table("kappa", stations)
     l = np.zeros_like(stations)
@@ -210,7 +291,9 @@ def _path(frame: _Frame, road: CentreLine, path: Any, s0: float) -> Path:  # noq
         if np.any(np.diff(at) <= 0.0):
             raise InputError("scene_from: path: turns back: expected driving direction")
         l = np.interp(stations, at, offsets)
-    limit = planning_limit(kappa, l, _posted(frame, road, stations), STATION_STEP_M)
+    at, limits = frame.posted
+    posted = limits[np.clip(np.searchsorted(at, stations, "right") - 1, 0, None)]
+    limit = planning_limit(kappa, l, posted, STATION_STEP_M)
     check("centre_line.lane_width", road.lane_width, road.lane_width > 0.0, "over 0 m")
     half = 0.5 * road.lane_width
     left, right = (half if x is None else x for x in (road.road_left, road.road_right))
@@ -224,56 +307,66 @@ def _path(frame: _Frame, road: CentreLine, path: Any, s0: float) -> Path:  # noq
         "road_left": left * flat,
         "road_right": -right * flat,
     }
-    return Path(
-        **{n: jnp.asarray(x[:NUM_STATIONS], jnp.float32) for n, x in tables.items()}
-    )
+    return Path(**{n: np.float32(x[:NUM_STATIONS]) for n, x in tables.items()})
 
 
-def _posted(frame: _Frame, road: CentreLine, stations: np.ndarray) -> np.ndarray:
-    """Posted limit [R] m/s; a point's limit holds from it on."""
-    limits = np.atleast_1d(floats("centre_line.speed_limit", road.speed_limit))
+def _posted_limits(frame: LineFrame) -> tuple[np.ndarray, np.ndarray]:
+    """Stations [m] m from which posted limits [m] m/s hold."""
+    limits = np.atleast_1d(floats("centre_line.speed_limit", frame.road.speed_limit))
     check("centre_line.speed_limit", limits, np.all(limits > 0.0), "over 0 m/s")
     if limits.shape == (1,):
-        return np.full(stations.shape, limits[0])
-    points = np.asarray(road.points, float)
+        return np.zeros(1), limits
+    points = np.asarray(frame.road.points, float)
     if limits.shape != (len(points),):
         raise InputError(
             f"scene_from: centre_line.speed_limit: {limits.size} numbers: expected one "
             f"for each of the {len(points)} points, or one for all"
         )
-    at = np.maximum.accumulate(frame.project(points)[0])
-    return limits[np.clip(np.searchsorted(at, stations, "right") - 1, 0, None)]
+    return np.maximum.accumulate(frame.project(points)[0]), limits
 
 
 # ----------------------------------------------------------------------- the others
 
 
-def _bodies(frame: _Frame, others: Sequence[Body], s0: float) -> Bodies:
-    """The others in the frame; slots up to the planner's number are filled up."""
+def _check_others(others: Sequence[Body], signals: Sequence[Signal]) -> None:
+    """Every number of the others and every name has to be a known one."""
     for n, body in enumerate(others):
-        name = f"obstacles[{n}]"
-        check_numbers(name, body)
-        check_one_of(f"{name}.kind", body.kind, BODY_KINDS)
-    size = max(8, 1 << (len(others) - 1).bit_length())  # few sizes, few compilations
-    column = lambda name: np.array([getattr(b, name) for b in others], float)  # noqa: E731
-    xy = np.stack([column("x"), column("y")], axis=1)
-    s, l = frame.project(xy)
-    tilt = frame.tilt(s, column("heading"))
-    half_s, half_l = _extents(column("length"), column("width"), tilt)
-    kinds = np.array([Kind[body.kind.upper()] for body in others], np.int32)
+        check_numbers(f"obstacles[{n}]", body)
+        check_one_of(f"obstacles[{n}].kind", body.kind, BODY_KINDS)
+    for n, signal in enumerate(signals):
+        check_numbers(f"signals[{n}]", signal)
+        check_one_of(f"signals[{n}].state", signal.state, STATES)
+
+
+def _bodies(
+    frame: LineFrame,
+    others: Sequence[Body],
+    s: np.ndarray,
+    l: np.ndarray,
+    s0: float,
+    slots: int,
+) -> Bodies:
+    """The others in the frame, s from the ego on; filled up to few sizes."""
+    size = max(8, slots, 1 << (len(others) - 1).bit_length())  # few compilations
+    rows = np.zeros((size, 6))
+    kinds = np.zeros(size, np.int32)
+    for n, b in enumerate(others):
+        rows[n] = b.heading, b.speed, b.acceleration, b.length, b.width, s[n]
+        kinds[n] = Kind[b.kind.upper()]
+    heading, speed, acceleration, length, width, station = rows.T
+    tilt = frame.tilt(station + s0, heading)
+    half_s, half_l = _extents(length, width, tilt)
     leaves = {
-        "s": s - s0,
-        "l": l,
-        "speed": column("speed") * np.cos(tilt),
-        "l_dot": column("speed") * np.sin(tilt),
-        "a": column("acceleration") * np.cos(tilt),
+        "s": station,
+        "l": np.append(l, np.zeros(size - len(others))),
+        "speed": speed * np.cos(tilt),
+        "l_dot": speed * np.sin(tilt),
+        "a": acceleration * np.cos(tilt),
         "half_s": half_s,
         "half_l": half_l,
     }
-    fill = lambda x: jnp.asarray(np.pad(x, (0, size - len(others))))  # noqa: E731
-    floats = {name: fill(x.astype(np.float32)) for name, x in leaves.items()}
-    present = jnp.arange(size) < len(others)
-    return Bodies(**floats, kind=fill(kinds), present=present)
+    floats = {name: np.float32(x) for name, x in leaves.items()}
+    return Bodies(**floats, kind=kinds, present=np.arange(size) < len(others))
 
 
 def _extents(
@@ -285,19 +378,14 @@ def _extents(
     return np.asarray(along), np.asarray(across)
 
 
-def _nearest_line(
-    frame: _Frame, signals: Sequence[Signal], s0: float, now: Ego
-) -> float:
+def _nearest_line(signals: Sequence[Signal], stations: np.ndarray, now: Ego) -> float:
     """Station of the nearest line ahead of the front that demands a stop; inf: none.
 
     Yellow does where the ego can still stop, as in the simulator.
     """
     nearest = math.inf
-    for n, signal in enumerate(signals):
-        check_numbers(f"signals[{n}]", signal)
-        check_one_of(f"signals[{n}].state", signal.state, STATES)
-        (s,) = frame.stations(f"signals[{n}]", [(signal.x, signal.y)]) - s0
-        way = float(s) - 0.5 * now.length
+    for signal, s in zip(signals, stations, strict=True):
+        way = float(s) - 0.5 * float(now.length)
         can_stop = float(now.v) ** 2 <= 2.0 * YELLOW_BRAKING_MPS2 * way
         demands = signal.state in ("red", "stop") or (
             signal.state == "yellow" and can_stop
@@ -308,7 +396,7 @@ def _nearest_line(
 
 
 def _futures(
-    frame: _Frame, others: Sequence[Body], predictions: Sequence[Any], s0: float
+    frame: LineFrame, others: Sequence[Body], predictions: Sequence[Any], s0: float
 ) -> dict[str, np.ndarray]:
     """Boxes of given futures at the T times; all [M, T]."""
     if len(predictions) != len(others):

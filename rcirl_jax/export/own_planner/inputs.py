@@ -1,6 +1,7 @@
 """What people give to `scene_from`, and its checks: SI, radians, Cartesian."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -11,6 +12,7 @@ from rcirl_jax.errors import InputError, did_you_mean
 
 BODY_KINDS = ("vehicle", "cyclist", "pedestrian", "static")
 MOST = 1e9  # of any number
+MOST_RAD = 4.0 * math.pi  # of a heading
 SAME_PLACE_M = 1e-3  # m, a step of a line that is none
 LONGEST_M = 1e5  # m, line
 STATES = ("red", "stop", "yellow", "green", "off")  # of a signal; "stop": a sign
@@ -80,10 +82,9 @@ def check(field: str, value: object, good: object, expected: str) -> None:
 
 def check_one_of(field: str, value: object, known: Sequence[str]) -> None:
     """A name has to be a known one."""
-    names = ", ".join(known)
-    check(
-        field, value, value in known, f"one of {names}{did_you_mean(str(value), known)}"
-    )
+    if value not in known:
+        names = ", ".join(known)
+        check(field, value, False, f"one of {names}{did_you_mean(str(value), known)}")
 
 
 def floats(field: str, given: Any) -> np.ndarray:  # noqa: ANN401
@@ -117,18 +118,23 @@ def polyline(field: str, given: Any) -> np.ndarray:  # noqa: ANN401
 
 def check_numbers(name: str, given: Car | Body | Signal) -> None:
     """Every number of a car, a body or a signal has to be finite and in range."""
-    for field in dataclasses.fields(given):
-        if field.type is not float:
-            continue
-        place, value = f"{name}.{field.name}", getattr(given, field.name)
-        check(place, value, floats(place, value).ndim == 0, "a number")
-        if field.name in ("length", "width"):
-            check(place, value, value > 0.0, "over 0 m")
-        if field.name == "heading":
-            check_radians(place, value)
+    for field in _number_fields(type(given)):
+        value = getattr(given, field)
+        if type(value) is not float or not abs(value) <= MOST:
+            place = f"{name}.{field}"
+            check(place, value, floats(place, value).ndim == 0, "a number")
+        if field in ("length", "width") and not value > 0.0:
+            check(f"{name}.{field}", value, False, "over 0 m")
+        if field == "heading" and abs(value) > MOST_RAD:
+            check_radians(f"{name}.{field}", value)
+
+
+@functools.cache
+def _number_fields(kind: type) -> tuple[str, ...]:
+    return tuple(f.name for f in dataclasses.fields(kind) if f.type is float)
 
 
 def check_radians(field: str, heading: float) -> None:
     """A heading of many turns is one in degrees."""
-    good = abs(heading) <= 4.0 * math.pi
+    good = abs(heading) <= MOST_RAD
     check(field, f"{heading:g}", good, "radians, not degrees")
