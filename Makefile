@@ -21,10 +21,6 @@ install = $(if $(LOCK),\
   $(1)/bin/python $(PIP) install --no-deps --no-build-isolation --editable .,\
   $(1)/bin/python $(PIP) install --editable '.[$(2)]')
 
-# What guides the fuzzing of readers
-ATHERIS = $(BIN)/python $(PIP) install $(if $(LOCK),--require-hashes \
-  --requirement $(LOCK)/fuzz.lock,--requirement requirements/fuzz.in)
-
 # Minutes; they touch every dependency: logs, store, two epochs, resume, export, readers, pages
 QUICK := $(addprefix tests/train/test_loop.py::test_,resume_is_bitwise run_writes_what_it_should \
   export_and_rank exported_values_are_the_trainers) \
@@ -52,7 +48,7 @@ TEST = $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal -m "$(MARKS)"
 
 .PHONY: demo test test-slow test-long test-dataset test-floor test-ceiling lint bench docs notebooks onboard
 .PHONY: setup
-.PHONY: lock audit wheel clean reliability fuzz
+.PHONY: lock audit wheel clean reliability fuzz accelerator
 
 setup: $(VENV)/.installed
 
@@ -73,8 +69,8 @@ $(VENV)/.installed: pyproject.toml $(if $(LOCK),$(LOCK)/test.lock) | $(BIN)/pyth
 # The main job, end to end, on synthetic human traffic: import, train, rank, simulate, gate, report.
 # Most of its time is compiling, which is a third shorter without XLA's fusion emitters.
 demo: $(VENV)/.all
-	XLA_FLAGS="--xla_cpu_use_fusion_emitters=false $(XLA_FLAGS)" $(BIN)/python -m experiments.autotune --synthetic --recipe=quick \
-	  --workdir=$(OUT) --cases=4 --duration=20 --drives=40
+	XLA_FLAGS="--xla_cpu_use_fusion_emitters=false $(XLA_FLAGS)" $(BIN)/rcirl autotune --synthetic --recipe=quick \
+	  --output=$(OUT) --cases=4 --duration=20 --drives=40
 
 test: setup
 	$(TEST) $(EXACT)
@@ -91,7 +87,6 @@ test-slow: setup
 
 # The long rows of docs/reliability.md, each by its command; hours, and `make fuzz` wants clang
 test-long: setup
-	$(ATHERIS)
 	$(BIN)/python -m pytest -q -m long
 
 # The quick tests with the oldest versions allowed; they run among newer neighbours that
@@ -113,9 +108,9 @@ test-ceiling:
 	build/ceiling/bin/python $(PIP) install --editable '.[quick]'
 	build/ceiling/bin/python $(QUICKLY)
 
-# Source distribution, a wheel made of it, and the quick tests far from this folder in an environment
-# of what the wheel itself asks for with its extra `quick`, in the locked versions: what it does not
-# name is not there. Versions without hashes: pip wants hashes of all or of none, and the wheel has none
+# Source distribution, a wheel made of it, and far from this folder, in an environment of what the
+# wheel itself asks for, in the locked versions: the help of every command without any extra, and the
+# quick tests with the extra `quick`. What it does not name is not there. Versions without hashes: pip wants hashes of all or of none, and the wheel has none
 wheel: setup
 	rm -rf dist
 	$(BIN)/python -m hatchling build --target sdist
@@ -124,11 +119,13 @@ wheel: setup
 	  trap 'rm -rf "$$away"' EXIT; set -e; \
 	  $(BIN)/python -m venv $$away/venv; cp -R tests pyproject.toml $$away; cd $$away; \
 	  sed -n 's/^\([a-z0-9].*[^ ]\) *\\$$/\1/p' $$lock > locked.txt; \
+	  venv/bin/python $(PIP) install --constraint locked.txt "$$wheel"; \
+	  for name in $$(venv/bin/python -c 'from rcirl_jax.commands.rcirl import COMMANDS as x; print(*x)'); do \
+	    venv/bin/rcirl $$name --help > $$name.txt; done; \
 	  venv/bin/python $(PIP) install --constraint locked.txt "$$wheel[quick]"; \
 	  venv/bin/python -m pip check; \
-	  venv/bin/python -c 'import experiments, rcirl_jax as r; print(r.__file__)'; \
-	  venv/bin/python $(QUICKLY); \
-	  venv/bin/python -m experiments.autotune --helpfull | grep -q workdir
+	  venv/bin/python -c 'import rcirl_jax as r; print(r.__file__)'; \
+	  venv/bin/python $(QUICKLY)
 
 lint: setup
 	$(BIN)/ruff check .
@@ -153,6 +150,11 @@ bench: $(VENV)/.bench
 	$(BIN)/python -m benchmarks.importing --data=$(RECORDINGS)
 	$(BIN)/python -m benchmarks.paper_scale
 	$(BIN)/python -m benchmarks.plots
+
+# Everything that an accelerator is asked, in eight minutes, with the Python and JAX that are
+# there (`PYTHON=python3.12`): nothing is downloaded or built. `SMALL=--small` rehearses it on a CPU
+accelerator:
+	$(PYTHON) -m benchmarks.accelerator $(SMALL) --output=$(RESULTS)
 
 # Documentation as a site; warnings are errors
 docs: export NO_MKDOCS_2_WARNING = 1
@@ -183,7 +185,6 @@ lock: build/tools/.installed
 	$(COMPILE) $(PROJECT) --extra all --constraint requirements/test.lock --output-file requirements/all.lock
 	$(COMPILE) $(PROJECT) --extra quick --resolution lowest-direct --output-file requirements/floor.lock
 	$(COMPILE) requirements/tools.in --output-file requirements/tools.lock
-	$(COMPILE) requirements/fuzz.in --output-file requirements/fuzz.lock
 
 build/tools/.installed: $(if $(LOCK),$(LOCK)/tools.lock,requirements/tools.in)
 	$(PYTHON) -m venv build/tools
@@ -192,13 +193,12 @@ build/tools/.installed: $(if $(LOCK),$(LOCK)/tools.lock,requirements/tools.in)
 
 # Known vulnerabilities of the locked versions; `AUDIT=--vulnerability-service=osv` asks elsewhere
 audit: build/tools/.installed
-	build/tools/bin/python .ci/audit.py $(AUDIT) $(addprefix requirements/,all.lock test.lock tools.lock fuzz.lock)
+	build/tools/bin/python .ci/audit.py $(AUDIT) $(addprefix requirements/,all.lock test.lock tools.lock)
 
 # Every row of docs/reliability.md that has not come out as stated with this code before;
 # `MINUTES=2` leaves out what takes longer, `ANEW=1` runs all. Rows that depend on what others
 # publish, audit and test-ceiling, are run each time
 reliability: setup
-	$(ATHERIS)
 	$(BIN)/python -m benchmarks.reliability.table $(if $(MINUTES),--minutes=$(MINUTES)) $(if $(ANEW),--anew) --output=$(RESULTS)
 
 # The C++ reader and F under libFuzzer; needs clang and its runtime

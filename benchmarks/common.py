@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import psutil
 
-from experiments.flags.common import provenance
+from rcirl_jax.commands.flags.common import provenance
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.data.scenes.config import CollectConfig

@@ -1,14 +1,16 @@
-"""F outside of this package against F in JAX, on every scene of imported datasets.
+"""F outside of this package against F in JAX, on random and on imported scenes.
 
     python -m benchmarks.own_planner --data=out/us101,out/urban,out/i80
 
-Of every scene the driver's own way and three others, along the given path and with
-offsets of their own: the largest difference of every column and of the score, as a
-share of max(1, |x|), for the numpy file and the C++ headers. Goal: 1e-5.
+Of every scene four ways, of an imported one the driver's own among them, along the
+given path and with offsets of their own: the largest difference of every column and of
+the score, as a share of max(1, |x|), for the numpy file and the C++ headers. Goal:
+1e-5. Without --data random scenes alone.
 """
 
 import subprocess
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -20,15 +22,16 @@ from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.export import Reward
 from rcirl_jax.export.own_planner.plain import plain_scene
 from rcirl_jax.features import FeatureMap
-from rcirl_jax.types import Demonstration
+from rcirl_jax.types import Demonstration, Scene
 from tests.helpers import drawn_scenes, own_planner
 
-_DATA = flags.DEFINE_list("data", None, "datasets, separated by commas", required=True)
+_DATA = flags.DEFINE_list("data", [], "datasets, separated by commas")
+_RANDOM = flags.DEFINE_integer("random", 10_000, "random scenes")
 _BUILD = flags.DEFINE_string("build", "build/onboard", "folder of the C++ programs")
 _OUTPUT = flags.DEFINE_string("output", "benchmarks/results", "folder of the JSON")
 
 BATCH = 250  # scenes at once
-OTHERS = 3  # ways beside the driver's
+WAYS = 4  # of a scene
 
 
 def reader() -> Path:
@@ -52,29 +55,50 @@ def in_cpp(program: Path, reward: Reward, cases: list, folder: Path) -> list:
     return [(row[:-count].reshape(shape), row[-count:]) for row in each]
 
 
-def ways(rows: Demonstration, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Stations and offsets [n, K, T]: the driver's and drawn ones."""
+def imported(rows: Demonstration, seed: int) -> tuple[Scene, np.ndarray, np.ndarray]:
+    """Scenes [n] with stations and offsets [n, K, T]: the driver's and drawn ones."""
     rng = np.random.default_rng(seed)
-    drawn = drawn_scenes.candidates(rng, rows.scene, OTHERS)
+    drawn = drawn_scenes.candidates(rng, rows.scene, WAYS - 1)
     human = (rows.human.s, rows.human.l)
     s, l = (
         np.concatenate([np.asarray(one)[:, None], more], axis=1)
         for one, more in zip(human, drawn, strict=True)
     )
-    return s, l
+    return rows.scene, s, l
+
+
+def random(count: int, seed: int) -> tuple[Scene, np.ndarray, np.ndarray]:
+    """Random scenes with drawn stations and offsets."""
+    rng = np.random.default_rng(seed)
+    scenes = drawn_scenes.scenes(rng, count)
+    return scenes, *drawn_scenes.candidates(rng, scenes, WAYS)
+
+
+def batches(path: str | None) -> Iterator[tuple[Scene, np.ndarray, np.ndarray]]:
+    """The scenes of a dataset, or random ones, up to `BATCH` at once."""
+    if path is None:
+        for first in range(0, _RANDOM.value, BATCH):
+            yield random(min(BATCH, _RANDOM.value - first), first)
+        return
+    dataset = open_dataset(path, verify=False)
+    for first in range(0, dataset.count, BATCH):
+        part = np.arange(first, min(first + BATCH, dataset.count))
+        yield imported(dataset.read(part), first)
 
 
 def differences(
-    rows: Demonstration, seed: int, columns: FeatureMap, reward: Reward, program: Path
+    scenes: Scene,
+    s: np.ndarray,
+    l: np.ndarray,
+    columns: FeatureMap,
+    reward: Reward,
+    program: Path,
 ) -> dict[str, dict[str, float]]:
     """Largest differences of a batch, by implementation and column."""
-    s, l = ways(rows, seed)
-    ones = [jax.tree.map(lambda x, i=i: x[i], rows.scene) for i in range(len(s))]
+    ones = [jax.tree.map(lambda x, i=i: x[i], scenes) for i in range(len(s))]
     found: dict[str, dict[str, float]] = {"numpy": {}, "cpp": {}}
     for offsets in (None, l):
-        wanted, values = own_planner.jax_answers(
-            columns, reward, rows.scene, s, offsets
-        )
+        wanted, values = own_planner.jax_answers(columns, reward, scenes, s, offsets)
         each = [None] * len(s) if offsets is None else offsets
         cases = [(plain_scene(x), *at) for x, *at in zip(ones, s, each, strict=True)]
         with tempfile.TemporaryDirectory() as folder:
@@ -84,10 +108,10 @@ def differences(
             }
         clean = own_planner.in_valid_times
         for name, answer in answers.items():
-            features = clean(rows.scene, np.stack([x for x, _ in answer]))
+            features = clean(scenes, np.stack([x for x, _ in answer]))
             apart = {
                 column: own_planner.error(
-                    features[..., f], clean(rows.scene, wanted)[..., f]
+                    features[..., f], clean(scenes, wanted)[..., f]
                 )
                 for f, column in enumerate(columns.names)
             }
@@ -103,27 +127,29 @@ def larger(found: dict[str, float], more: dict[str, float]) -> None:
 
 
 def main(_: list[str]) -> None:
-    """Compare all scenes of all datasets."""
+    """Compare random scenes and all scenes of all datasets."""
     columns, program, result = own_planner.every_column(), reader(), {}
     with tempfile.TemporaryDirectory() as folder:
         reward = own_planner.drawn_reward(Path(folder) / "reward", columns)
-        for path in _DATA.value:
-            dataset = open_dataset(path, verify=False)
+        for path in [None, *_DATA.value]:
             worst: dict[str, dict[str, float]] = {"numpy": {}, "cpp": {}}
-            for first in range(0, dataset.count, BATCH):
-                part = np.arange(first, min(first + BATCH, dataset.count))
-                rows = dataset.read(part)
-                found = differences(rows, first, columns, reward, program)
+            count = 0
+            for scenes, s, l in batches(path):
+                found = differences(scenes, s, l, columns, reward, program)
+                count += len(s)
                 for name, apart in found.items():
                     larger(worst[name], apart)
-            result[Path(path).name] = {
-                "scenes": dataset.count,
-                "candidates_of_a_scene": 2 * (1 + OTHERS),
-                "data_hash": dataset.hash,
+            name = "random" if path is None else Path(path).name
+            result[name] = {
+                "scenes": count,
+                "candidates_of_a_scene": 2 * WAYS,
+                **(
+                    {"data_hash": open_dataset(path, verify=False).hash} if path else {}
+                ),
                 **worst,
             }
             most = {name: max(apart.values()) for name, apart in worst.items()}
-            print(f"{path}: {dataset.count} scenes, largest difference {most}")
+            print(f"{name}: {count} scenes, largest difference {most}")
     write("own_planner", result, _OUTPUT.value)
 
 

@@ -90,7 +90,7 @@ def _commands() -> dict:
             grid = (f"--leaky_rates={rates}", f"--seeds={seeds}", f"--output={folder}")
             taken["sweep"].append(_command("experiments.sweep", data, folder, *grid))
             folder = Path(name) / "train"
-            one = (f"--seed={number}", f"--workdir={folder}")
+            one = (f"--seed={number}", f"--output={folder}")
             taken["train"].append(_command("experiments.train", data, folder, *one))
         scenes = int(open_dataset(data).indices("train").size)
     sweep, alone = (float(np.median(taken[name])) for name in ("sweep", "train"))

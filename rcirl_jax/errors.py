@@ -1,7 +1,7 @@
 """One error type for bad input: it reads as one clear line, never a traceback.
 
 Library code raises `InputError("FILE: field: value: what was expected")`; the
-experiment files turn it into that line on stderr and exit status 2.
+commands turn it into that line on stderr and exit status 2.
 """
 
 import contextlib
@@ -14,6 +14,11 @@ from pathlib import Path
 from types import ModuleType
 
 HEAD, TAIL = 1400, 400  # characters kept of the ends of a line too long
+# packages that are in an extra only
+EXTRAS = {
+    **dict.fromkeys(("jinja2", "markupsafe", "matplotlib"), "report"),
+    **dict.fromkeys(("defusedxml", "pyarrow", "pyproj", "shapely"), "logs"),
+}
 
 
 class InputError(ValueError):
@@ -94,3 +99,19 @@ def extra_module(name: str, extra: str = "logs") -> ModuleType:
             f"{name}: not installed ({error}): expected "
             f"pip install 'rcirl-jax[{extra}]'"
         ) from error
+
+
+def extra_of(error: BaseException) -> InputError | None:
+    """What to install where an import failed for want of an extra; None: for another.
+
+    Args:
+      error: what was raised.
+    """
+    if not isinstance(error, ModuleNotFoundError):
+        return None
+    package = str(error.name).partition(".")[0]
+    if package not in EXTRAS:
+        return None
+    return InputError(
+        f"{package}: not installed: expected pip install 'rcirl-jax[{EXTRAS[package]}]'"
+    )

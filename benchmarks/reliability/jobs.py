@@ -37,6 +37,12 @@ class Job:
     finished: Callable[[Path], int]  # things in its folder that are finished
 
 
+def different(found: Facts, expected: Facts) -> list[str]:
+    """What did not come out as expected, by name."""
+    names = sorted(found.keys() | expected.keys())
+    return [name for name in names if found.get(name) != expected.get(name)]
+
+
 def write_logs(folder: Path) -> None:
     """CSV logs of platoons on a straight road."""
     small_logs.write_logs(folder, files=8, seconds=20.0)
@@ -58,7 +64,7 @@ def jobs(root: Path) -> dict[str, Job]:
         Job(
             name="train",
             module="experiments.train",
-            flags=(data, "--workdir=run", *steps, "--checkpoint_every=3"),
+            flags=(data, "--output=run", *steps, "--checkpoint_every=3"),
             outcome=_of_training,
             finished=_files_like("run/checkpoints/*/sha256.json"),  # 3 are kept
         ),
@@ -76,7 +82,7 @@ def jobs(root: Path) -> dict[str, Job]:
             name="autotune",
             module="experiments.autotune",
             flags=(
-                *(*logs, "--workdir=run", "--stride=2", "--batch_size=8"),
+                *(*logs, "--output=run", "--stride=2", "--batch_size=8"),
                 *("--epochs=1", "--suite=free_cruise,stopped_lead"),
                 *("--cases=15", "--duration=2"),  # the gate judges no fewer
             ),

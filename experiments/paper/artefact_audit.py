@@ -14,7 +14,6 @@ candidate in 63 %: the recording leaves a trace. `--quick`: under a minute.
 
 import numpy as np
 
-from experiments.flags.common import run
 from experiments.paper.common import (
     base,
     dataset,
@@ -24,6 +23,7 @@ from experiments.paper.common import (
     unread,
     write,
 )
+from rcirl_jax.commands.flags.common import run
 from rcirl_jax.evaluation.ranking.learners import FrozenSets, pair_wins, train_learner
 from rcirl_jax.evaluation.statistics import ClusterBootstrap, combine_seeds
 from rcirl_jax.features import feature_map

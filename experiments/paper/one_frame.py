@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 from absl import flags
 
-from experiments.flags.common import run
 from experiments.paper.common import (
     OUTPUT,
     as_used,
@@ -28,6 +27,7 @@ from experiments.paper.common import (
     unread,
     write,
 )
+from rcirl_jax.commands.flags.common import run
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.from_run import export_run
 from rcirl_jax.export.loading import open_reward

@@ -38,7 +38,6 @@ import numpy as np
 from absl import flags
 from numpy.typing import ArrayLike
 
-from experiments.flags.common import made_by_file, provenance, run
 from experiments.paper.common import (
     DATA,
     HORIZON,
@@ -58,6 +57,7 @@ from experiments.paper.common import (
 from rcirl_jax.autotune.anchoring import OWN_COST, Anchoring, fitted_anchor
 from rcirl_jax.autotune.recipes import DEFAULT, load_recipe
 from rcirl_jax.autotune.rehearsal import rehearse
+from rcirl_jax.commands.flags.common import made_by_file, provenance, run
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.data.store.joined import Demonstrations, JoinedDatasets, open_datasets
 from rcirl_jax.errors import InputError

@@ -17,7 +17,6 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments.flags.common import run
 from experiments.paper import rank_against_gan
 from experiments.paper.common import (
     OUTPUT,
@@ -30,6 +29,7 @@ from experiments.paper.common import (
     unread,
 )
 from rcirl_jax.autotune.recipes import DEFAULT, load_recipe
+from rcirl_jax.commands.flags.common import run
 from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, run_suite, write_suite
 from rcirl_jax.export.closed_loop import table_rows
 from rcirl_jax.export.loading import open_reward

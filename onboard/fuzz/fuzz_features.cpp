@@ -4,32 +4,18 @@
 // roads have, so that scenes pass the check. The second is the number of obstacles.
 #include <cmath>
 #include <cstdint>
-#include <cstdlib>
-#include <cstring>
 #include <string>
+#include <utility>
 #include <vector>
 
+#include "bits.hpp"
 #include "rcirl/features.hpp"
 
 namespace {
 
-void require(bool good) {
-  if (!good) std::abort();
-}
-
-// Numbers from bytes, from the start again where they end.
-struct Bits {
-  const std::uint8_t* data;
-  std::size_t size, at = 0;
-  bool folded;
-
-  std::uint8_t byte() { return data[at++ % size]; }
-
+struct Floats : Bits {
   float number() {
-    std::uint8_t bytes[4];
-    for (std::uint8_t& one : bytes) one = byte();
-    float value;
-    std::memcpy(&value, bytes, sizeof value);
+    const float value = raw<float>();
     if (!folded) return value;
     return std::isfinite(value) ? std::fmod(value, 200.0f) : 1.0f;
   }
@@ -40,7 +26,7 @@ struct Bits {
   }
 };
 
-rcirl::Obstacle obstacle(Bits* bits) {
+rcirl::Obstacle obstacle(Floats* bits) {
   rcirl::Obstacle box;
   box.kind = static_cast<rcirl::ObstacleKind>(bits->byte() % (bits->folded ? 7 : 256));
   for (rcirl::Times* table :
@@ -56,7 +42,7 @@ rcirl::Obstacle obstacle(Bits* bits) {
   return box;
 }
 
-rcirl::Scene scene(Bits* bits, std::size_t obstacles) {
+rcirl::Scene scene(Floats* bits, std::size_t obstacles) {
   rcirl::Scene made;
   float* const ego[] = {&made.ego.s, &made.ego.l, &made.ego.dl,     &made.ego.ddl,
                         &made.ego.v, &made.ego.a, &made.ego.length, &made.ego.width};
@@ -107,7 +93,7 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
   if (size < 3) return 0;
   static const rcirl::FeatureMap columns = every_column();
   constexpr std::size_t kCount = 5;
-  Bits bits = {data + 2, size - 2, 0, data[0] % 2 == 1};
+  Floats bits = {{data + 2, size - 2, 0, data[0] % 2 == 1}};
   const rcirl::Scene made = scene(&bits, data[1] % 6);
   std::vector<float> s(kCount * rcirl::kTimes), l(s.size());
   bits.fill(&s);

@@ -4,21 +4,17 @@
 // that schema version, wrapped with the right hash (which no mutation would hit).
 #include <cmath>
 #include <cstdint>
-#include <cstdlib>
 #include <cstring>
 #include <limits>
 #include <string>
 #include <string_view>
 #include <vector>
 
+#include "bits.hpp"
 #include "rcirl/guard.hpp"
 #include "rcirl/reward.hpp"
 
 namespace {
-
-void require(bool good) {
-  if (!good) std::abort();
-}
 
 std::string sealed(std::string_view body, int version) {
   std::string file = "\x84\xa5magic\xa6RCIRLW\xaeschema_version";

@@ -4,38 +4,25 @@
 // roads have.
 #include <cmath>
 #include <cstdint>
-#include <cstdlib>
-#include <cstring>
+#include <string>
+#include <vector>
 
+#include "bits.hpp"
 #include "rcirl/scene_builder.hpp"
 
 namespace {
 
-void require(bool good) {
-  if (!good) std::abort();
-}
-
-// Numbers from bytes, from the start again where they end.
-struct Bits {
-  const std::uint8_t* data;
-  std::size_t size, at = 0;
-  bool folded;
-
-  std::uint8_t byte() { return data[at++ % size]; }
-
+struct Doubles : Bits {
   double number() {
-    std::uint8_t bytes[8];
-    for (std::uint8_t& one : bytes) one = byte();
-    double value;
-    std::memcpy(&value, bytes, sizeof value);
-    if (!folded) return value;
-    return static_cast<double>(static_cast<std::int8_t>(bytes[0])) / 8.0;
+    const std::uint8_t first = data[at % size];
+    const double value = raw<double>();
+    return folded ? static_cast<double>(static_cast<std::int8_t>(first)) / 8.0 : value;
   }
 
   double positive() { return folded ? 0.1 + std::abs(number()) : number(); }
 };
 
-std::vector<rcirl::detail::XY> points(Bits* bits, std::size_t count) {
+std::vector<rcirl::detail::XY> points(Doubles* bits, std::size_t count) {
   std::vector<rcirl::detail::XY> found;
   double x = -40.0, y = 0.0;
   for (std::size_t i = 0; i < count; ++i) {
@@ -47,7 +34,7 @@ std::vector<rcirl::detail::XY> points(Bits* bits, std::size_t count) {
   return found;
 }
 
-rcirl::Surroundings surroundings(Bits* bits) {
+rcirl::Surroundings surroundings(Doubles* bits) {
   rcirl::Surroundings now;
   rcirl::Car& e = now.ego;
   for (double* value : {&e.x, &e.y, &e.heading, &e.acceleration, &e.curvature}) {
@@ -89,7 +76,7 @@ rcirl::Surroundings surroundings(Bits* bits) {
 
 extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size) {
   if (size < 2) return 0;
-  Bits bits = {data + 1, size - 1, 0, data[0] % 2 == 1};
+  Doubles bits = {{data + 1, size - 1, 0, data[0] % 2 == 1}};
   rcirl::Scene scene;
   scene.num_valid = 0;  // as no scene that is made has it
   const rcirl::Status status = rcirl::scene_from(surroundings(&bits), &scene);

@@ -43,7 +43,8 @@ def rank(
     """Rank the candidates of held-out scenes by rewards, beside all baselines.
 
     Args:
-      weights: file, or files; those of one loss and shape are the seeds of one row.
+      weights: file, or files; those of one loss and shape are the seeds of one row, or
+        a row each where two have the same seed.
       data: a dataset or its folder.
       horizon_s: s at which distances to the human are taken, up to 8.
       split: of the dataset.

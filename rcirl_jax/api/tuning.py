@@ -34,7 +34,7 @@ def tune(
     """Go through the whole loop: train, export, rank, drive, judge and report.
 
     The weights are WORKDIR/weights.msgpack, the page to open is WORKDIR/report.html.
-    What is done is kept when it is called again. This is `experiments.autotune`.
+    What is done is kept when it is called again. This is `rcirl autotune`.
 
     Args:
       data: folder of a dataset, or folders of several.

@@ -31,7 +31,7 @@ class TuneConfig:
     duration_s: float | None = None
     catalogue_seed: int = 0
     plan_every: int = 1
-    sweep: Path | None = None  # of `experiments.sweep`, shown in the report
+    sweep: Path | None = None  # of `rcirl sweep`, shown in the report
 
     def __post_init__(self) -> None:
         """Reject what would fail only after the training."""

@@ -1,7 +1,7 @@
 """The tuning loop: data -> rewards -> ranking -> simulation -> verdict -> report.
 
 The order of the stages and what is printed; each stage's work is in `demonstrations`,
-`rewards`, `evidence` and `report`.
+`rewards`, `evidence` and `report`, the time that is left in `progress`.
 """
 
 import functools
@@ -17,17 +17,18 @@ from rcirl_jax.autotune.evidence import (
     suite_job,
     verdict_of,
 )
+from rcirl_jax.autotune.progress import clock, work_of
 from rcirl_jax.autotune.report import report
 from rcirl_jax.autotune.rewards import train_seeds
 from rcirl_jax.autotune.run import Run
 from rcirl_jax.data.logs import Logs
+from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.data.store.joined import Demonstrations, JoinedDatasets, shares_of
-from rcirl_jax.errors import InputError
+from rcirl_jax.errors import InputError, extra_of
 from rcirl_jax.evaluation.gate.runs import CANDIDATE
 from rcirl_jax.evaluation.gate.types import Verdict
 from rcirl_jax.evaluation.gate.words import WIDTH
-from rcirl_jax.export.loading import open_reward
-from rcirl_jax.report.tuning.features import anchor_words
+from rcirl_jax.export.loading import anchor_words, open_reward
 
 STAGES = ("import", "rehearse", "train", "rank", "simulate", "gate", "report")
 
@@ -41,43 +42,81 @@ def tune(run: Run, given: Sequence[str | Logs], last: str = STAGES[-1]) -> None:
       last: the last stage, one of `STAGES`.
     """
     # what would fail only after hours of work
-    suite_job(run, tuned=False)
+    job, _ = suite_job(run, tuned=False)
     shares = shares_of(run.config.data_weights, len(given))
     _check_incumbent(run)
-    sources = [source(run, one, number) for number, one in enumerate(given)]
-    dataset = sources[0] if len(sources) == 1 else JoinedDatasets(sources, shares)
-    everything: list[Demonstrations] = [dataset]
+    sources: list[Dataset] = []
+    everything: list[Demonstrations] = []  # what was imported; that with the rehearsal
     verdict = functools.cache(lambda: verdict_of(run))  # once, where it is asked for
+    page: list[str] = []
+
+    def imported() -> None:
+        sources.extend(source(run, one, number) for number, one in enumerate(given))
+        everything.append(_joined(sources, shares))
+
+    def trained() -> None:
+        train_seeds(run, everything[-1])
+        run.say(_said_of_weights(run))
+
     steps: dict[str, Callable[[], object]] = {
-        "import": lambda: None,
+        "import": imported,
         "rehearse": lambda: everything.append(with_rehearsal(run, sources, shares)),
-        "train": lambda: train_seeds(run, everything[-1]),
-        "rank": lambda: rank(run, dataset),
+        "train": trained,
+        "rank": lambda: rank(run, everything[0]),
         "simulate": lambda: (simulate(run), likeness(run, sources)),
         "gate": lambda: gate(run, verdict),
-        "report": lambda: report(run, verdict, dataset, sources),
+        "report": lambda: page.append(_drawn(run, verdict, everything[0], sources)),
     }
-    for name in STAGES[: STAGES.index(last) + 1]:
-        steps[name]()
+    names = STAGES[: STAGES.index(last) + 1]
+    with clock(run, names) as time:
+        for name in names:
+            known = everything[0] if everything else None
+            with time.stage(name, work_of(run, job, known)):
+                steps[name]()
     if last in ("gate", "report"):
-        run.say(_ending(run, verdict()))
-    if last not in ("import", "rehearse"):
-        run.say(_said_of_weights(run))
+        run.say(_ending(run, verdict(), page, job.refs[0].id))
+    elif last not in ("import", "rehearse"):
         run.say(f"weights: {run.weights}")
-    if last == "report":
-        run.say(f"report to open: {run.page}")
 
 
-def _ending(run: Run, verdict: Verdict) -> str:
-    """The verdict, why, where the tables are, and what to look at; a few lines."""
+def _joined(
+    sources: Sequence[Dataset], shares: Sequence[float] | None
+) -> Demonstrations:
+    """The sources as one."""
+    return sources[0] if len(sources) == 1 else JoinedDatasets(sources, shares)
+
+
+def _drawn(
+    run: Run,
+    verdict: Callable[[], Verdict],
+    dataset: Demonstrations,
+    sources: Sequence[Dataset],
+) -> str:
+    """Draw the page; one line on where it is, or on what it needs and is not there."""
+    try:
+        report(run, verdict, dataset, sources)
+    except ImportError as error:
+        if (missing := extra_of(error)) is None:
+            raise
+        return f"no report: {missing}"
+    return f"report to open: {run.page}"
+
+
+def _ending(run: Run, verdict: Verdict, page: Sequence[str], first: str) -> str:
+    """The verdict, why, where all of it is, what to do next; about eight lines.
+
+    Args:
+      run: whose verdict it is.
+      verdict: of the gate.
+      page: a line on the report, if it was asked for.
+      first: case to look at where the verdict names none.
+    """
     lines = ["", f"verdict: {verdict.decision.upper()}"]
     lines += textwrap.wrap(verdict.sentence, WIDTH)
-    lines.append(f"all tables: {run.tables}")
-    if verdict.look_at:
-        lines.append(
-            f"replay: python -m experiments.replay --weights={run.weights} "
-            f"--case={verdict.look_at[0]} --output={run.folder / 'case'}"
-        )
+    lines += [f"weights: {run.weights}", f"all tables: {run.tables}", *page]
+    case = (*verdict.look_at, first)[0]
+    replay = f"rcirl replay --weights={run.weights} --case={case}"
+    lines.append(f"next: {replay} --output={run.folder / 'case'}")
     return "\n".join(lines)
 
 
@@ -90,7 +129,7 @@ def draw_again(run: Run, given: Sequence[str | Logs]) -> None:
     """
     shares = shares_of(run.config.data_weights, len(given))
     sources = [kept_source(run, one, number) for number, one in enumerate(given)]
-    dataset = sources[0] if len(sources) == 1 else JoinedDatasets(sources, shares)
+    dataset = _joined(sources, shares)
     report(run, functools.cache(lambda: verdict_of(run)), dataset, sources)
     run.say(f"report to open: {run.page}")
 

@@ -44,6 +44,11 @@ STALE = {
 NOTED = ("git_commit", "code_sha256", "versions", "flags")  # of every stage
 
 
+def _say(line: str) -> None:
+    """A line that is seen at once, also where it goes into a file."""
+    print(line, flush=True)
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Run:
     """One run folder with its settings."""
@@ -53,7 +58,8 @@ class Run:
     executor: Executor
     running: Running
     facts: Mapping[str, Any]  # provenance: commit, versions, flags
-    say: Callable[[str], object] = print
+    say: Callable[[str], object] = _say
+    done: list[str] = dataclasses.field(default_factory=list)  # stages, by this process
 
     @property
     def stages(self) -> Stages:
@@ -103,6 +109,8 @@ class Run:
         stale = STALE.get(kind, ())
         made_by = {key: self.facts[key] for key in NOTED if key in self.facts}
         done = self.stages.run(name, facts, outputs, work, stale, made_by)
+        if done:
+            self.done.append(name)
         self.say(f"[{name}] {'done' if done else 'as before, kept'}")
 
     def code(self, module: str) -> dict:

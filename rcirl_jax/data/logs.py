@@ -12,7 +12,7 @@ from rcirl_jax.runtime.executors import Executor
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Logs:
-    """Recordings to import: as `experiments.import_logs` takes them."""
+    """Recordings to import: as `rcirl import` takes them."""
 
     format: str
     input: Path | None

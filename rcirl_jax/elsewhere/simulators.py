@@ -9,6 +9,7 @@ Episodes run in lock step, one ego each, so that all plans of a step are made at
 
 import dataclasses
 import importlib
+import inspect
 from collections.abc import Sequence
 from typing import Any, Protocol
 
@@ -130,14 +131,19 @@ class LockStep:
 SIMULATORS = {
     "highway_env": ("rcirl_jax.elsewhere.highway", "HighwayEnv", "highway"),
     "sumo": ("rcirl_jax.elsewhere.sumo", "Sumo", "sumo"),
+    "commonroad": ("rcirl_jax.elsewhere.commonroad.simulator", "CommonRoad", ""),
 }
 
 
 def open_simulator(name: str, **options: Any) -> Simulator:  # noqa: ANN401
     """The simulator of a name; its package is imported here and not before.
 
+    Args:
+      name: of `SIMULATORS`.
+      **options: of its class.
+
     Raises:
-      InputError: no such name, or its package is not installed.
+      InputError: no such name or option, or its package is not installed.
     """
     if name not in SIMULATORS:
         raise InputError(
@@ -146,7 +152,7 @@ def open_simulator(name: str, **options: Any) -> Simulator:  # noqa: ANN401
         )
     module, kind, extra = SIMULATORS[name]
     try:
-        return getattr(importlib.import_module(module), kind)(**options)
+        simulator = getattr(importlib.import_module(module), kind)
     except ModuleNotFoundError as error:
         if str(error.name).startswith("rcirl_jax"):
             raise
@@ -154,3 +160,11 @@ def open_simulator(name: str, **options: Any) -> Simulator:  # noqa: ANN401
             f"--simulator: {name}: {error.name} is not installed: "
             f"pip install 'rcirl-jax[{extra}]'"
         ) from None
+    try:
+        inspect.signature(simulator).bind(**options)
+    except TypeError as error:
+        known = ", ".join(inspect.signature(simulator).parameters) or "none"
+        raise InputError(
+            f"--options: {error}: expected NAME=VALUE of {known}"
+        ) from None
+    return simulator(**options)

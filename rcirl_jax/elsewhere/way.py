@@ -1,10 +1,14 @@
 """The line that an ego is moved along, smooth, with its heading and curvature."""
 
+import math
+
 import numpy as np
 
 from rcirl_jax.export.own_planner.inputs import CentreLine
 from rcirl_jax.geometry.frenet import reference_line_from_polyline
 from rcirl_jax.units import STATION_STEP_M
+
+FADING_M = 15.0  # m of way in which an offset falls to 1 / e
 
 
 class Way:
@@ -59,7 +63,21 @@ class Way:
             + (y - self._y[n]) * np.sin(h)
         )
 
+    def offset(self, x: float, y: float) -> float:
+        """How far m a place lies left of the line."""
+        at, left, heading, _ = self.place(self.station(x, y))
+        return (y - left) * math.cos(heading) - (x - at) * math.sin(heading)
+
     def limit(self, s: float) -> float:
         """Posted limit m/s at a station."""
         n = int(s / STATION_STEP_M)
         return float(self.limits[min(max(n, 0), len(self.limits) - 1)])
+
+
+def fading(offset: float, way: float) -> tuple[float, float]:
+    """What is left m of an offset from the line after some way m, and its slope by way.
+
+    Exponential: planned anew on the way, it goes on as before.
+    """
+    left = offset * math.exp(-way / FADING_M)
+    return left, -left / FADING_M

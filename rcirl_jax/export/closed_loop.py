@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.export.loading import open_reward, reward_params, row_name, support_of
+from rcirl_jax.export.loading import open_reward, reward_params, row_names, support_of
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.anchor import Anchored, anchored_score
@@ -75,13 +75,13 @@ def table_rows(
 ) -> list[Row]:
     """Learned rows first, in the order of the files, then the baselines.
 
-    Files of one loss and shape are told apart by their seed, then by their path, or
-    rows bear `names`, one per file. The first drives again by `dp`. A tuned IDM comes
-    last. `track` is the safety filter's (`SafetyConfig`).
+    Rows are named as by `row_names`, or bear `names`, one per file. The first drives
+    again by `dp`. A tuned IDM comes last. `track` is the safety filter's
+    (`SafetyConfig`).
 
     Raises:
-      InputError: no file, an unreadable one, path_speed weights, or an unknown
-        baseline.
+      InputError: no file, an unreadable one, one twice without `names`, path_speed
+        weights, or an unknown baseline.
     """
     if not weights:
         raise InputError("--weights: none: expected at least one file")
@@ -111,23 +111,13 @@ def _learned_rows(
 ) -> list[Row]:
     """One row a file, under distinct names."""
     rows: list[Row] = []
-    for number, reward in enumerate(rewards):
+    for reward, name in zip(rewards, names or row_names(rewards), strict=True):
         mode = str(reward.provenance.get("mode", "speed"))
         if mode != "speed":
             raise InputError(
                 f"{reward.file}: mode: {mode}: the closed loop plans speed"
             )
         seed = int(reward.provenance.get("seed") or 0)
-        name = names[number] if names else row_name(reward)
-        taken = {row.name for row in rows}
-        if name in taken:
-            name = f"{name} (seed {seed})"
-        if name in taken:
-            name = f"{row_name(reward)} ({reward.file})"
-        if name in taken:
-            raise InputError(
-                f"--weights: {reward.file}: met twice: expected distinct files"
-            )
         score, params = score_of(reward)
         policy = rank_policy(score, config)
         rows.append(Row(name=name, policy=policy, params=params, seed=seed))

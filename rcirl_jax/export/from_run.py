@@ -51,7 +51,7 @@ def read_config(workdir: Path) -> tuple[TrainConfig, dict]:
     """The configuration a run was made with, and all of run.json."""
     path = workdir / "run.json"
     if not path.is_file():
-        raise InputError(f"{path}: missing: expected a run made by experiments.train")
+        raise InputError(f"{path}: missing: expected a run made by `rcirl train`")
     run = read_json(path, "a run of this version")
     try:
         config = _config_of(run["config"])
@@ -137,7 +137,7 @@ def export_run(
     their values as the trainer computes them.
 
     Args:
-      workdir: run folder of experiments.train.
+      workdir: run folder of `rcirl train`.
       dataset: the dataset of the run (its hash has to match).
       output: file to write, atomically.
       ranges: record what the training saw of each feature (schema version 3), from

@@ -1,7 +1,9 @@
 """Weights files -> scorers, with the features and sampler they were made for."""
 
 import functools
+import os
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -173,13 +175,84 @@ def row_name(reward: Reward) -> str:
     return f"{words} {shape if hidden else 'linear'}{by_scene}{on}"
 
 
+def row_names(rewards: Sequence[Reward]) -> list[str]:
+    """Names of rewards that have a row each: loss, network, and what tells them apart.
+
+    Those of one loss and network are told apart by their seeds or, where two have the
+    same seed, by their files.
+
+    Raises:
+      InputError: a file twice.
+    """
+    short = short_names([reward.file for reward in rewards])
+    groups = _by_row(rewards)
+    names = []
+    for reward, file in zip(rewards, short, strict=True):
+        name = row_name(reward)
+        if len(groups[name]) > 1:
+            own = f"seed {_seed(reward)}" if _are_seeds(groups[name]) else file
+            name = f"{name} ({own})"
+        names.append(name)
+    return names
+
+
+def short_names(files: Sequence[str]) -> list[str]:
+    """The names of files, with as many folders before them as tell them apart.
+
+    Raises:
+      InputError: a file twice.
+    """
+    parts = [Path(os.path.abspath(file)).parts for file in files]
+    for number, one in enumerate(parts):
+        if one in parts[:number]:
+            raise InputError(
+                f"--weights: {files[number]}: met twice: expected distinct files"
+            )
+    names, count = [one[-1] for one in parts], 1
+    while len(set(names)) < len(names):
+        count += 1
+        names = ["/".join(one[-count:]) for one in parts]
+    return names
+
+
+def _by_row(rewards: Sequence[Reward]) -> dict[str, list[Reward]]:
+    """The rewards of each loss and network."""
+    groups: dict[str, list[Reward]] = {}
+    for reward in rewards:
+        groups.setdefault(row_name(reward), []).append(reward)
+    return groups
+
+
+def _seed(reward: Reward) -> int:
+    return int(reward.provenance.get("seed") or 0)
+
+
+def _are_seeds(group: Sequence[Reward]) -> bool:
+    """Whether the rewards of a row have a seed each."""
+    return len(set(map(_seed, group))) == len(group)
+
+
+def anchor_words(name: str, reward: Reward) -> str:
+    """One sentence on what an anchored reward drives by; "" of another one."""
+    anchor = reward.anchor
+    if anchor is None:
+        return ""
+    return (
+        f"The {name} is anchored: it drives by V_total = own cost ({anchor.incumbent}, "
+        f"negated) + gain V, with a gain from {anchor.low:g}, where nothing like the "
+        f"scene was recorded, to {anchor.high:g}, where all of it was."
+    )
+
+
 def load_runs(
     paths: Sequence[str],
 ) -> tuple[dict[str, list[Scorer | OnTop]], str, SamplerConfig]:
     """Scorers by row (files of one loss and shape are its seeds).
 
+    Where two of them have the same seed, each file is a row, as `row_names` has it.
+
     Raises:
-      InputError: the files need different features or sampler modes.
+      InputError: a file twice; files of different features or sampler modes.
     """
     if not paths:
         raise InputError("--weights: none: expected at least one file")
@@ -191,6 +264,9 @@ def load_runs(
         )
     preset, mode = settings.pop()
     runs: dict[str, list[Scorer | OnTop]] = {}
-    for reward in rewards:
-        runs.setdefault(row_name(reward), []).append(scorer_of(reward))
+    groups = _by_row(rewards)
+    for reward, own in zip(rewards, row_names(rewards), strict=True):
+        name = row_name(reward)
+        name = name if _are_seeds(groups[name]) else own
+        runs.setdefault(name, []).append(scorer_of(reward))
     return runs, preset, SamplerConfig(mode=mode)

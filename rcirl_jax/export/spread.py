@@ -10,9 +10,13 @@ from collections.abc import Iterator
 
 import jax
 import numpy as np
-import tqdm
 
-from rcirl_jax.evaluation.closed_loop.suite import Drive, SuiteConfig, drive_here
+from rcirl_jax.evaluation.closed_loop.suite import (
+    Drive,
+    SuiteConfig,
+    bar_of,
+    drive_here,
+)
 from rcirl_jax.export.closed_loop import table_rows
 from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.runtime.executors import Executor
@@ -94,7 +98,7 @@ def spread(executor: Executor, job: SuiteJob) -> Drive:
         ]
         piece = functools.partial(drive_piece, job=job, config=config)
         parts = []
-        with tqdm.tqdm(total=total, desc=row.name, unit="case", mininterval=0.5) as bar:
+        with bar_of(row, total) as bar:
             for made in executor.stream(piece, pieces):
                 parts.append(made)
                 bar.update(len(np.asarray(jax.tree.leaves(made)[0])))

@@ -2,7 +2,7 @@
 
     {"headway": 1.1, "standstill_gap": 2.3, "acceleration": 1.7, ...}
 
-`experiments.autotune` writes RUN/tuned_idm.json from its training scenes.
+`rcirl autotune` writes RUN/tuned_idm.json from its training scenes.
 """
 
 import dataclasses

@@ -7,8 +7,6 @@ One rule for the simulator's observer (`jax.numpy`) and for scenes cut from logs
 from types import ModuleType
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 COMFORT_BRAKING_MPS2 = 1.0  # m/s^2, with which a lower limit is approached
@@ -50,6 +48,8 @@ def planning_limit(
 
 def _remaining_min(x: Any, xp: ModuleType) -> Any:  # noqa: ANN401
     """Min over j >= i of x_j [R]."""
-    if xp is jnp:
-        return jax.lax.cummin(x, axis=0, reverse=True)
-    return np.minimum.accumulate(x[::-1])[::-1]
+    if xp is np:
+        return np.minimum.accumulate(x[::-1])[::-1]
+    from jax import lax  # numpy alone is enough for numpy's arrays
+
+    return lax.cummin(x, axis=0, reverse=True)

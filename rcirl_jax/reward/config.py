@@ -65,7 +65,7 @@ class RewardConfig:
             raise InputError(
                 f"--module: {self.module}: expected none: weights.msgpack, and all "
                 "that reads it, holds the package's own network; for others there are "
-                "experiments.train and experiments.export_weights --stablehlo"
+                "`rcirl train` and `rcirl export --stablehlo`"
             )
 
     @property

@@ -75,8 +75,10 @@ def scenes_value(
     human) of one scene follow one another along that axis: a human between the
     candidates of every time would break each row of the copy. Parts of several
     scenes stand together at every time, so that devices which share the scenes
-    keep their own. Points are normalised in that copy; in the first layer's weights
-    instead, a feature that is the same everywhere would get a gradient from round-off.
+    keep their own. The gains of a context are those of a scene's first column: all
+    columns share them (`module.gains`). Points are normalised in that copy; in the
+    first layer's weights instead, a feature that is the same everywhere would get a
+    gradient from round-off.
 
     Args:
       effective: pinned parameters (`pinned`, or a weights file's).
@@ -96,15 +98,19 @@ def scenes_value(
     points = jnp.clip(points, normaliser.lower[:, None], normaliser.upper[:, None])
     points = (points - normaliser.location[:, None]) * (1.0 / normaliser.scale)[:, None]
     spans = _spans([scenes * times * part.shape[3] for part in parts])
+    kernels = effective.kernels
     if effective.context is not None:
-        shapes = [(-1, scenes, times, part.shape[3]) for part in parts]
-        apart = [
-            points[:, begin:end].reshape(shape)
-            for (begin, end), shape in zip(spans, shapes, strict=True)
-        ]
-        points = _side_by_side([_scaled(effective.context, x) for x in apart])
+        # what is alike for all columns of a scene may stand in the weights: the points
+        # need no copy of their own, and no gradient
+        starts = points.reshape(points.shape[0], scenes, -1)[:, :, 0]
+        gain = 2.0 * jax.nn.sigmoid(product(effective.context.T, starts))
+        if scenes == 1:
+            kernels = (kernels[0] * gain, *kernels[1:])
+        else:
+            apart = points.reshape(points.shape[0], scenes, -1) * gain[:, :, None]
+            points = apart.reshape(points.shape)
     offsets = (*effective.biases, jnp.zeros((1,)))
-    rewards = _layers(effective.kernels, offsets, points, activation)[0]
+    rewards = _layers(kernels, offsets, points, activation)[0]
     weight = jnp.where(time_valid, effective.gamma[:times], 0.0)
     # slices, not a split: its gradient would be joined anew for every hidden unit
     apart = [rewards[begin:end].reshape(scenes, times, -1) for begin, end in spans]
@@ -122,11 +128,3 @@ def _spans(sizes: Sequence[int]) -> list[tuple[int, int]]:
 
 def _side_by_side(parts: Sequence[Float[Array, "f b t _"]]) -> Float[Array, "f n"]:
     return jnp.concatenate([x.reshape(x.shape[0], -1) for x in parts], axis=1)
-
-
-def _scaled(
-    context: Float[Array, "f f"], x: Float[Array, "f b t k"]
-) -> Float[Array, "f b t k"]:
-    """As `module.conditioned`, features first."""
-    gain = jnp.einsum("fg,fbk->gbk", context, x[:, :, 0], precision=EXACT)
-    return x * 2.0 * jax.nn.sigmoid(gain)[:, :, None]

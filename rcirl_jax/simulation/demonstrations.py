@@ -194,7 +194,7 @@ def _drive_all(
     names: list[str] = []
     sizes: dict[str, int] = {}
     shard = 0
-    with tqdm.tqdm(total=len(refs), desc="drive", unit="case") as bar:
+    with tqdm.tqdm(total=len(refs), desc="drive the catalogue", unit="case") as bar:
         for first in range(0, len(refs), CHUNK):
             part = refs[first : first + CHUNK]
             model = yielding_policy(DRIVERS[first // CHUNK % len(DRIVERS)]), None

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 
 from rcirl_jax.features.columns import Frame
 from rcirl_jax.planner.safety import check
+from rcirl_jax.reward.module import product
 from rcirl_jax.train.state import Facts, TrainConfig
 from rcirl_jax.types import Candidates, Scene, Tag, Trajectory
 
@@ -64,7 +65,7 @@ def admitted(scene: Scene, candidates: Candidates, config: TrainConfig) -> jax.A
 def densities(
     driven: Trajectory, x: Trajectory, counts: jax.Array, valid: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Log densities of the driven curve [] and of the candidates [K].
+    """Log densities of the driven curve [] and of the candidates [K] (`log_density`).
 
     Args:
       driven: the human's curve.
@@ -72,10 +73,31 @@ def densities(
       counts: [K] bool, those that the partition function sums over, and the positive.
       valid: [T] bool, times that count.
     """
-    rows = jax.vmap(lambda one: mean_distance(x, one, valid))(x)
+    # the human's own curve, the origin, stands last
+    away = [
+        jnp.pad(a - b, ((0, 1), (0, 0))) for a, b in ((x.s, driven.s), (x.l, driven.l))
+    ]
+    squared = rms_squared(*away, valid)
     others = counts & ~jnp.eye(counts.size, dtype=bool)
-    human = log_density(mean_distance(x, driven, valid), counts)
-    return human, log_density(rows, others)
+    human = log_density(squared[-1, :-1], counts)
+    return human, log_density(squared[:-1, :-1], others)
+
+
+def rms_squared(s: jax.Array, l: jax.Array, valid: jax.Array) -> jax.Array:
+    """Squared RMS distances [K, K] m^2 of K curves over valid times [T].
+
+    d_ij^2 = |p_i|^2 + |p_j|^2 - 2 p_i p_j with each curve as a vector p: a matrix
+    product, where the differences of all pairs take twenty times as long.
+
+    Args:
+      s: [K, T] m, stations from an origin near the curves, for the sake of rounding.
+      l: [K, T] m, offsets likewise.
+      valid: [T] bool.
+    """
+    weight = jnp.sqrt(valid / jnp.sum(valid))
+    p = jnp.concatenate([s * weight, l * weight], axis=1)
+    own = jnp.sum(p * p, axis=1)
+    return jnp.maximum(own[:, None] + own - 2.0 * product(p, p.T), 0.0)
 
 
 def mean_distance(a: Trajectory, b: Trajectory, valid: jax.Array) -> jax.Array:
@@ -84,16 +106,15 @@ def mean_distance(a: Trajectory, b: Trajectory, valid: jax.Array) -> jax.Array:
     return jnp.sum(jnp.where(valid, distance, 0.0), axis=-1) / jnp.sum(valid)
 
 
-def log_density(distance: jax.Array, others: jax.Array) -> jax.Array:
+def log_density(squared: jax.Array, others: jax.Array) -> jax.Array:
     """Log of the kernel density of the candidates [...].
 
-    Each trajectory counts as one sample of its own, so that none has density 0.
+    log(1 + sum over others of exp(-d^2 / (2 KERNEL_M^2))): each trajectory counts as
+    one sample of its own, so that none has density 0.
 
     Args:
-      distance: [..., K] in m, to every candidate.
+      squared: [..., K] in m^2, squared distance to every candidate.
       others: [..., K] bool, candidates that count besides it; a twin of it does.
     """
-    kernel = -0.5 * (distance / KERNEL_M) ** 2
-    own = jnp.zeros_like(distance[..., :1])
-    logits = jnp.where(others, kernel, -jnp.inf)
-    return jax.nn.logsumexp(jnp.concatenate([own, logits], axis=-1), axis=-1)
+    kernel = jnp.exp(-0.5 * squared / KERNEL_M**2)
+    return jnp.log1p(jnp.sum(jnp.where(others, kernel, 0.0), axis=-1))

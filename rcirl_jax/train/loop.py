@@ -25,7 +25,7 @@ from rcirl_jax.data.store.rows import check_finite
 from rcirl_jax.data.store.stream import Prefetch
 from rcirl_jax.errors import InputError
 from rcirl_jax.features import FeatureMap, feature_map
-from rcirl_jax.reward import Normaliser, fit_normaliser
+from rcirl_jax.reward import Normaliser, fit_normaliser, pinned
 from rcirl_jax.runtime.pipeline import only_one
 from rcirl_jax.runtime.signals import Interrupted, asked
 from rcirl_jax.train.checkpoint import Checkpoints
@@ -37,7 +37,8 @@ from rcirl_jax.train.processes import all_stop_after, is_first, with_the_others
 from rcirl_jax.train.running import Running, check_run, describe_run
 from rcirl_jax.train.state import Batch, FeatureBatch, TrainConfig, TrainState
 from rcirl_jax.train.step import StepMetrics, init_state, make_train_step
-from rcirl_jax.types import Demonstration
+from rcirl_jax.train.trackers import flat, time_weights, trackers
+from rcirl_jax.types import Demonstration, RewardParams
 
 CHUNK = 128  # scenes featurised per call where no batch sets their number
 NORMALISER_SCENES = 2048  # training scenes whose features fit the normaliser
@@ -276,7 +277,15 @@ class _Run:
         self.dataset = dataset
         self.per_epoch, first_step = per_epoch, int(state.step)
         total = self.per_epoch * config.epochs
-        self.writer = MetricsWriter(workdir, first_step) if is_first() else None
+        self.trackers = (
+            trackers(running.trackers, workdir, first_step) if is_first() else []
+        )
+        settings = flat(dataclasses.asdict(config))
+        for tracker in self.trackers:
+            tracker.settings(settings)
+        self.writer = (
+            MetricsWriter(workdir, first_step, self.trackers) if is_first() else None
+        )
         self.progress = Progress(total, first_step, "train", shown=is_first())
         self.summaries: list[dict] = []
         self.told: Callable[[], int | None] = lambda: None  # signal to end at
@@ -310,7 +319,16 @@ class _Run:
                 if stop:
                     raise Interrupted(stop)
             self.summaries.append(_summary(epoch, sums))
+            self._draw_time_weights(step, state)
         return state
+
+    def _draw_time_weights(self, step: int, state: TrainState) -> None:
+        """Gamma over time, for the trackers."""
+        if self.trackers and isinstance(state.params, RewardParams):
+            gamma = np.asarray(pinned(state.params, self.config.reward).gamma)
+            if (figure := time_weights(gamma)) is not None:
+                for tracker in self.trackers:
+                    tracker.figure(step, "time weights", figure)
 
     def _told_to_stop(self, step: int) -> int | None:
         """Number of a signal to end after this step, the same in all processes."""

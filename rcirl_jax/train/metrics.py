@@ -1,11 +1,10 @@
-"""Where training writes what it sees: JSON lines, TensorBoard, a progress bar."""
+"""Where training writes what it sees: JSON lines, trackers, a progress bar."""
 
 import contextlib
 import json
 import math
-import os
 import time
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,19 +12,21 @@ import tqdm
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.atomic_files import named, parse_json, write_whole
+from rcirl_jax.train.trackers import Writer
 
 MAX_STEP = 2**63 - 1  # what 64 bits hold
 
 
 class MetricsWriter:
-    """Appends one JSON object a line to metrics.jsonl, and to TensorBoard.
+    """Appends one JSON object a line to metrics.jsonl, and tells the trackers.
 
-    TensorBoard files are written when `tensorboardX` is installed (extra
-    `report`). On resume, lines after the resumed step are dropped first (the file
-    is replaced whole), so that a killed run leaves no step twice.
+    On resume, lines after the resumed step are dropped first (the file is replaced
+    whole), so that a killed run leaves no step twice.
     """
 
-    def __init__(self, folder: Path, resume_step: int = 0) -> None:
+    def __init__(
+        self, folder: Path, resume_step: int = 0, trackers: Sequence[Writer] = ()
+    ) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self._path = folder / "metrics.jsonl"
         kept = []
@@ -34,7 +35,7 @@ class MetricsWriter:
             kept = [json.dumps(row) for row in rows if row["step"] <= resume_step]
         write_whole(self._path, "".join(line + "\n" for line in kept))
         self._file = self._path.open("a", buffering=1)
-        self._board = _tensorboard(folder / "tensorboard", resume_step)
+        self._trackers = trackers
 
     def write(self, step: int, values: dict[str, float]) -> None:
         """One line of finite scalars at a step (others are written as null).
@@ -47,15 +48,15 @@ class MetricsWriter:
             self._file.write(json.dumps({"step": step, **clean}) + "\n")
         except OSError as error:
             raise named(error, self._path) from error
-        if self._board is not None:
-            self._board.write(step, values)
+        for tracker in self._trackers:
+            tracker.scalars(step, values)
 
     def close(self) -> None:
-        """Flush and close both files."""
+        """Flush and close the file and the trackers."""
         with contextlib.suppress(OSError):  # said by `write`, if it was not
             self._file.close()
-        if self._board is not None:
-            self._board.close()
+        for tracker in self._trackers:
+            tracker.close()
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
@@ -96,62 +97,6 @@ def pairs_won(path: Path, steps: int) -> float:
 
 def _is_number(value: Any) -> bool:  # noqa: ANN401
     return value is None or (type(value) in {int, float} and abs(value) < 1e300)
-
-
-def _tensorboard(folder: Path, purge_step: int) -> "_Board | None":
-    try:
-        return _Board(folder, purge_step)
-    except ImportError:
-        return None
-
-
-class _Board:
-    """A TensorBoard file, written by the caller's own thread.
-
-    tensorboardX' own writer hands events to a thread: on a full disk that thread
-    dies, and the training waits for it for ever.
-    """
-
-    FLUSH_S = 10.0  # s between two flushes
-
-    def __init__(self, folder: Path, purge_step: int) -> None:
-        from tensorboardX.event_file_writer import EventsWriter
-        from tensorboardX.proto import event_pb2
-        from tensorboardX.summary import scalar
-
-        self._made: Any = event_pb2  # its classes are made as it is loaded
-        self._folder, self._scalar = folder, scalar
-        folder.mkdir(parents=True, exist_ok=True)
-        # its name has seconds only: two runs in one of them must not share a file
-        own = f".{os.getpid()}.{len(list(folder.iterdir()))}"
-        self._file = EventsWriter(str(folder / "events"), own)
-        self._flushed = time.monotonic()
-        if purge_step:
-            start = self._made.SessionLog(status=self._made.SessionLog.START)
-            self._add(self._made.Event(step=purge_step, session_log=start))
-
-    def write(self, step: int, values: dict[str, float]) -> None:
-        for name, number in values.items():
-            made = {"step": step, "summary": self._scalar(name, number)}
-            self._add(self._made.Event(wall_time=time.time(), **made))
-        if time.monotonic() - self._flushed > self.FLUSH_S:
-            self._flushed = time.monotonic()
-            self._do(self._file.flush)
-
-    def _add(self, event: object) -> None:
-        self._do(lambda: self._file.write_event(event))
-
-    def _do(self, write: Callable[[], object]) -> None:
-        try:
-            write()
-        except OSError as error:
-            raise named(error, self._folder) from error
-
-    def close(self) -> None:
-        with contextlib.suppress(OSError):  # of pictures only
-            self._file.close()
-        with contextlib.suppress(OSError):  # which the first leaves open if it fails
-            self._file._py_recordio_writer.close()
 
 
 class Progress:

@@ -9,7 +9,9 @@ On a CPU wait for every step before the next (the loop does): its devices share 
 pool of threads, and steps that run ahead may wait for each other's sums for ever.
 """
 
+import contextlib
 import dataclasses
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -19,6 +21,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from rcirl_jax.errors import InputError
+from rcirl_jax.runtime.provenance import processor
 
 AXIS = "data"  # the one mesh axis: data parallel
 Step = Callable[..., tuple]
@@ -78,7 +81,29 @@ def sharded(step: Step, num_devices: int) -> Step:
 
 
 MANY = {"pmap": pmapped, "shard_map": sharded}
-PARALLEL = ("jit", *MANY)
+PARALLEL = ("auto", "jit", *MANY)
+LEAST_SCENES = 8  # of a batch that a CPU core gets; with fewer its sums take as long
+
+
+def share_cores(batch_size: int) -> None:
+    """Make JAX count the cores of a CPU as devices, as many as share a batch evenly.
+
+    Before JAX is first used; afterwards, or where XLA_FLAGS or JAX_NUM_CPU_DEVICES say
+    how many there are, nothing happens. Other devices are not touched.
+    """
+    flags = os.environ.get("XLA_FLAGS", "") + os.environ.get("JAX_NUM_CPU_DEVICES", "")
+    if "host_platform_device_count" in flags or flags.isdigit():
+        return
+    most = min(processor()["cores"], batch_size // LEAST_SCENES)
+    count = next((n for n in range(most, 1, -1) if batch_size % n == 0), 1)
+    with contextlib.suppress(RuntimeError):  # JAX is in use
+        jax.config.update("jax_num_cpu_devices", count)
+
+
+def chosen(batch_size: int) -> str:
+    """What "auto" is: all devices where they share a batch evenly, else the first."""
+    many = jax.device_count() > 1 and batch_size % jax.device_count() == 0
+    return "shard_map" if many or jax.process_count() > 1 else "jit"
 
 
 def parallelise(step: Step, how: str, batch_size: int) -> Parallel:
@@ -90,6 +115,7 @@ def parallelise(step: Step, how: str, batch_size: int) -> Parallel:
     """
     if how not in PARALLEL:
         raise InputError(f"--parallel: {how}: expected one of {', '.join(PARALLEL)}")
+    how = chosen(batch_size) if how == "auto" else how
     if how == "jit":
         if jax.process_count() > 1:
             raise InputError(

@@ -25,6 +25,8 @@ class Running:
     prefetch: int = 4
     # steps between checkpoints, besides those at the end of each epoch (0: none)
     checkpoint_every: int = 0
+    # of `rcirl_jax.train.trackers`; None: TensorBoard if it is installed
+    trackers: tuple[str, ...] | None = None
     # called with the number of each finished step
     on_step: Callable[[int], None] = lambda step: None
 
@@ -62,7 +64,7 @@ def check_run(workdir: Path, config: TrainConfig, dataset: Demonstrations) -> No
         if before != setting and name != "epochs":
             raise InputError(
                 f"{path}: {name}: {before}: expected {setting} to resume; "
-                "use another --workdir for other settings"
+                "use another --output for other settings"
             )
 
 

@@ -13,7 +13,7 @@ from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.errors import InputError
 
 MOST = 25  # names that a newcomer has to look through
-SLOW = {"tune"}  # its stages are those of `experiments.autotune`, which has its tests
+SLOW = {"tune"}  # its stages are those of `rcirl autotune`, which has its tests
 TYPES = {"Body", "Car", "CentreLine", "Signal", "InputError", "Reward", "WeightsError"}
 
 
@@ -41,10 +41,10 @@ def test_a_name_that_is_none_of_it():
     ("names", "absent"),
     [
         (["load_weights", "Reward", "InputError"], "jax"),
-        # only the report draws: nobody else needs its extra, or loses a backend to it
-        (sorted(set(rcirl_jax.__all__) - {"tune"}), "matplotlib"),
+        # only a report draws: nobody else needs its extra, or loses a backend to it
+        (rcirl_jax.__all__, "matplotlib"),
     ],
-    ids=["weights", "all but tune"],
+    ids=["weights", "all"],
 )
 def test_what_a_name_does_not_load(names, absent):
     text = (

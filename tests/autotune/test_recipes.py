@@ -81,7 +81,7 @@ def test_a_file_of_ones_own(tmp_path):
 
 FLAGS = """
 from absl import flags
-from experiments.flags import training
+from rcirl_jax.commands.flags import training
 flags.FLAGS(["x", *{given}])
 c = training.training_config()
 print(c.loss, c.reward.hidden, c.leaky_rate, c.futures, c.positive, c.reward.pin)
@@ -112,7 +112,7 @@ def test_a_flag_given_beside_the_recipe_wins():
 SWEEP = """
 import sys
 from pathlib import Path
-from experiments import sweep
+from rcirl_jax.commands import sweep
 sweep.run_sweep = lambda config, *_: (print(config), sys.exit(0))
 sweep.flags.FLAGS(["x", "--data=d", "--output=o", *{given}])
 sweep.main()

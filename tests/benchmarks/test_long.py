@@ -1,8 +1,6 @@
 """The long rows of docs/reliability.md, each by its command: `make test-long`."""
 
 import pytest
-from absl import flags
-from absl.testing import flagsaver
 
 from benchmarks.reliability import table
 
@@ -16,7 +14,5 @@ pytestmark = [pytest.mark.slow, pytest.mark.long, pytest.mark.multiprocess]
 
 @pytest.mark.parametrize("row", LONG, ids=lambda row: row.fault[:40])
 def test_a_long_row_comes_out_as_stated(row, tmp_path):
-    flags.FLAGS(["table"])
-    with flagsaver.flagsaver(output=str(tmp_path)):
-        result = table.ran(row)
+    result = table.ran(row, str(tmp_path))
     assert result["status"] == 0, result["said"]

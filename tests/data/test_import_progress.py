@@ -10,7 +10,6 @@ from rcirl_jax.data.cut import Cut
 from rcirl_jax.data.importers import parts, read_part
 from rcirl_jax.data.importing import Progress
 from rcirl_jax.data.quality import QualityReport
-from rcirl_jax.data.readers import reading
 from tests.data.importers.formats import l5, nuplan, waymo
 
 
@@ -49,10 +48,6 @@ def drawn(capsys):
     return [line.strip() for line in text.split("\r") if line.strip()]
 
 
-def shares(lines):
-    return [int(line.split("%")[0].split(":")[-1]) for line in lines]
-
-
 def test_time_left_by_the_share_of_one_part(monkeypatch, capsys):
     """A quarter of the first of two parts in ten seconds: seventy are left."""
     clock = Clock(monkeypatch)
@@ -86,21 +81,3 @@ def test_formats_with_long_parts_say_how_much_is_read(tmp_path):
     assert len(progress) > 2
     np.testing.assert_allclose(np.diff([0.0, *progress]), 1.0 / len(progress))
     assert found("l5", l5.write(tmp_path / "l5").input) == [0.5, 1.0]
-
-
-def test_only_what_takes_long_in_no_worker_shows_a_bar(tmp_path, monkeypatch, capsys):
-    path = tmp_path / "log.csv"
-    path.write_text("t\n" * 1000)
-
-    def read():
-        with reading.reading(path, [path]) as show:
-            for _ in range(10):
-                show(300)  # more than there is
-        return drawn(capsys)
-
-    assert read() == []
-    monkeypatch.setattr(reading, "DELAY_S", 0.0)
-    clock = Clock(monkeypatch, step=1.0)
-    assert max(shares(read())) == 100
-    monkeypatch.setattr(reading.multiprocessing, "parent_process", lambda: clock)
-    assert read() == []

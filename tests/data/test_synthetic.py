@@ -14,7 +14,6 @@ from rcirl_jax.data.synthetic import ROADS
 from rcirl_jax.data.synthetic.drivers import DRIVER, idm_acceleration
 from rcirl_jax.data.synthetic.roads import to_world
 from rcirl_jax.data.synthetic.state import Neighbours, State
-from rcirl_jax.data.synthetic.stops import schedule
 from rcirl_jax.runtime.specs import load_toml, spec_root
 from rcirl_jax.types import Recording, Track
 from tests.helpers.logs import refused
@@ -143,13 +142,6 @@ def test_positions_agree_with_heading_speed_and_clock(tmp_path):
             assert np.all(np.abs(wrapped) < 0.05), (road, track.id)
 
 
-def test_position_noise_is_added_to_positions_only(tmp_path):
-    clean, noisy = make(tmp_path)[0], make(tmp_path, noise=0.05)[0]
-    assert np.std(positions(noisy) - positions(clean)) == pytest.approx(0.05, rel=0.1)
-    for a, b in zip(clean.tracks, noisy.tracks, strict=True):
-        np.testing.assert_array_equal(a.speed, b.speed)
-
-
 def test_red_lights_are_respected(default):
     counts = {"green": 0, "yellow": 0, "red": 0}
     for recording in default:
@@ -181,15 +173,6 @@ def test_lane_changes_happen_and_are_smooth(default):
     tracks = [track for recording in roads for track in recording.tracks]
     assert all(np.abs(np.diff(track.y)).max() < 0.45 for track in tracks)
     assert sum(abs(track.y[-1] - track.y[0]) > 2.5 for track in tracks) > 30
-
-
-def test_some_drivers_reach_their_destination(default):
-    tracks = [t for r in default for t in r.tracks if t.destination is not None]
-    assert 0.01 < len(tracks) / sum(len(r.tracks) for r in default) < 0.08
-    ends = [(t.x[-1], t.y[-1]) for t in tracks if t.speed[-1] < 0.1]
-    wanted = [t.destination for t in tracks if t.speed[-1] < 0.1]
-    gaps = np.linalg.norm(np.subtract(ends, wanted), axis=1)
-    assert np.sum(gaps < 2.0) >= 10
 
 
 # one driver and car for everybody; values inside the human ranges
@@ -257,21 +240,6 @@ def test_roads_are_what_they_say(name):
     if name == "highway_s_curve":
         assert 290.0 <= 1.0 / np.abs(road.kappa).max() <= 800.0
         assert road.kappa.min() < 0.0 < road.kappa.max()
-
-
-@settings(max_examples=20)
-@given(st.floats(0.0, 49.9), st.floats(5.0, 300.0))
-def test_schedule_covers_the_recording(offset, end):
-    start, state = schedule((22.0, 4.0, 24.0), offset, end)
-    assert start[0] == 0.0
-    assert start[-1] <= end
-    assert np.all(np.diff(start) > 0.0)
-    for t in np.linspace(0.0, end, 40):
-        into = (t + offset) % 50.0
-        if min(abs(into - edge) for edge in (0.0, 22.0, 26.0, 50.0)) < 1e-6:
-            continue
-        colour = "green" if into < 22.0 else "yellow" if into < 26.0 else "red"
-        assert state[np.searchsorted(start, t, side="right") - 1] == colour
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import tomllib
 
 import pytest
 
+from rcirl_jax.commands.rcirl import COMMANDS
 from rcirl_jax.evaluation.gate.types import EXIT_CODES, GateConfig
 from tests.docs.pages import (
     ALL,
@@ -26,13 +27,13 @@ from tests.docs.pages import (
 )  # fmt: skip
 
 PRESETS = sorted((REPO / "data_specs" / "features").glob("*.toml"))
-MODULE = r"(?<![\w/.])((?:experiments|benchmarks)(?:\.[a-z_0-9]+)+)\b"
-COMMAND = re.compile(MODULE + r"([^\n|&]*)")
+MODULE = r"(?:experiments|benchmarks)(?:\.[a-z_0-9]+)+|rcirl [a-z][a-z-]+"
+COMMAND = re.compile(rf"(?<![\w/.])({MODULE})\b([^\n|&]*)")
 FLAG = re.compile(r"(?<!\S)--([a-z_0-9]+)")
 VALUE = re.compile(r"(?<![\w-])--([a-z_0-9]+)=([^\s\\]+)")
 PATH = re.compile(r"[\w.-]+/[\w./*-]*")
 PLACEHOLDER = re.compile(r"[A-Z]{3}")  # NAME.toml, SCENE.csv
-BUILT_IN = {"help", "helpfull"}
+BUILT_IN = {"help", "helpfull", "flagfile"}
 # what has a path's shape in prose, but is made by a command or by the reader
 ELSEWHERE = {"out", "build"}
 
@@ -88,7 +89,7 @@ def test_make_targets_exist(page):
 LIST_FLAGS = """
 import importlib, json, sys
 from absl import flags
-OURS = ("experiments", "benchmarks")
+OURS = ("experiments", "benchmarks", "rcirl_jax.commands")
 found, refused = {}, []
 given = json.load(sys.stdin)
 for name in sys.argv[1:]:
@@ -115,16 +116,24 @@ print(json.dumps([found, refused]))
 def commands():
     """(page, module, text behind it) of every command that a page names."""
     return [
-        (name_of(page), match[1], match[2])
+        (name_of(page), module_of(match[1]), match[2])
         for page in ALL
         for block in code(page.read_text())
         for match in COMMAND.finditer(block)
     ]
 
 
+def module_of(name):
+    """Of a command as a page names it: `rcirl rank`, `experiments.evaluate`."""
+    name, _, command = name.partition(" ")
+    module, _ = COMMANDS.get(command, (command, ""))
+    return f"rcirl_jax.commands.{module}" if command else name
+
+
 def is_main(module):
     path = REPO / (module.replace(".", "/") + ".py")
-    return path.is_file() and 'if __name__ == "__main__"' in path.read_text()
+    ours = module.startswith("rcirl_jax.commands.")
+    return path.is_file() and (ours or 'if __name__ == "__main__"' in path.read_text())
 
 
 def values():

@@ -39,13 +39,14 @@ def folder(tmp_path_factory):
 
 def command(line, folder):
     """Run one line of the page; returns what it printed."""
+    line = re.sub(r"^rcirl ", f"{sys.executable} -m rcirl_jax ", line)
     done = subprocess.run(
         line.replace(".venv/bin/python", sys.executable),
         shell=True, capture_output=True, text=True, check=False, cwd=folder,
         env={**os.environ, "JAX_PLATFORMS": "cpu"}, timeout=1800,
     )  # fmt: skip
     # 40 cases prove no margin of the gate
-    expected = 2 if "experiments.gate" in line else 0
+    expected = 2 if "rcirl_jax gate" in line else 0
     said = done.stdout + done.stderr
     assert done.returncode == expected, f"{line}\n{said[-3000:]}"
     return said

@@ -2,6 +2,7 @@
 
 import html
 import json
+import re
 
 import pytest
 
@@ -39,10 +40,21 @@ def kept(done):
 def test_a_small_loop(tmp_path):
     run, own = tmp_path / "run", tmp_path / "own.toml"
     own.write_text(REHEARSED)
-    flags = (f"--workdir={run}", *SMALL, f"--recipe={own}")
-    done = succeeded("experiments.autotune", *flags)
-    assert done.stdout.rstrip().endswith(f"report to open: {run}/report.html")
-    assert "verdict: " in done.stdout
+    flags = (f"--output={run}", *SMALL, f"--recipe={own}")
+    done = succeeded("rcirl_jax", "autotune", *flags)
+    begun = [x for x in done.stdout.splitlines() if x.startswith("stage ")]
+    names = ("import", "rehearse", "train", "rank", "simulate", "gate", "report")
+    for number, (line, name) in enumerate(zip(begun, names, strict=True), 1):
+        assert re.match(rf"stage {number} of 7: {name}; [\d hmins]+ so far", line), line
+        assert number == 1 or line.endswith(" left, compiling not counted")
+    *_, last = done.stdout.split("\n\n")
+    ending = last.splitlines()
+    assert len(ending) <= 9
+    assert ending[0].startswith("verdict: ")
+    assert f"report to open: {run}/report.html" in ending
+    assert ending[-1].startswith(f"next: rcirl replay --weights={run}/weights.msgpack ")
+    for bar in ("rank the scenes", "drive the cases: candidate", "draw the report"):
+        assert bar in done.stderr
     stages = [
         "import 0", "rehearse 0", "rehearse learner 1", "rehearse 1", "train 0",
         "export", "tune", "rank predicted", "rank recorded", "simulate", "likeness",
@@ -72,16 +84,16 @@ def test_a_small_loop(tmp_path):
     known = {"git_commit", "code_sha256", "versions", "flags"}
     assert all(set(record["made_by"]) == known for record in noted.values())
 
-    again = fresh("experiments.autotune", *flags)
+    again = fresh("rcirl_jax", "autotune", *flags)
     assert all(kept(again).values()), again.stdout
     (run / "report.html").unlink()
     copy = tmp_path / "copy.html"
-    drawn = succeeded("experiments.report", f"--workdir={run}", f"--output={copy}")
+    drawn = succeeded("rcirl_jax", "report", f"--run={run}", f"--output={copy}")
     assert kept(drawn) == {"report": False}
     assert verdict["decision"] in (run / "report.html").read_text()
     assert copy.read_bytes() == (run / "report.html").read_bytes()
     assert 'id="training-heading"' in page
-    assert all(kept(fresh("experiments.autotune", *flags)).values())
+    assert all(kept(fresh("rcirl_jax", "autotune", *flags)).values())
     dataset = open_dataset(*run.glob("dataset-*"))
     assert dataset.facts()["data_hash"] == dataset.hash
     assert "flags" in dataset.facts()["made_by"]
@@ -91,16 +103,16 @@ def test_a_small_loop(tmp_path):
 @pytest.mark.multiprocess
 def test_a_damaged_report_is_drawn_again_and_other_weights_leave_no_verdict(tmp_path):
     run = tmp_path / "run"
-    flags = (f"--workdir={run}", *SMALL)
-    succeeded("experiments.autotune", *flags)
+    flags = (f"--output={run}", *SMALL)
+    succeeded("rcirl_jax", "autotune", *flags)
     page = (run / "report.html").read_bytes()
     (run / "report.html").write_text("damaged")
-    mended = fresh("experiments.autotune", *flags)
+    mended = fresh("rcirl_jax", "autotune", *flags)
     assert [name for name, was in kept(mended).items() if not was] == ["report"]
     assert (run / "report.html").read_bytes() == page
     assert (run / "verdict.json").exists()
     changed = ("--learning_rate=2e-3", "--until=train")
-    told = kept(succeeded("experiments.autotune", *flags, *changed))
+    told = kept(succeeded("rcirl_jax", "autotune", *flags, *changed))
     told = {name: was for name, was in told.items() if name[:8] != "rehearse"}
     assert told == {"import 0": True, "train 0": False, "export": False}
     assert not (run / "verdict.json").exists()
@@ -109,21 +121,21 @@ def test_a_damaged_report_is_drawn_again_and_other_weights_leave_no_verdict(tmp_
 
 @pytest.mark.multiprocess
 def test_a_page_of_no_run_is_one_line(tmp_path):
-    line = refused("experiments.report", f"--workdir={tmp_path}")
+    line = refused("rcirl_jax", "report", f"--run={tmp_path}")
     assert line.endswith("stages.json: gate: missing: expected a run with its verdict")
     made_by = {"flags": {"seeds": []}}
     gate = {"key": "k", "inputs": {}, "outputs": {}, "made_by": made_by}
     stages = {"schema_version": 1, "stages": {"gate": gate}}
     (tmp_path / "stages.json").write_text(json.dumps(stages))
     for flag, message in (("--seeds=2", "--seeds: expected none"), ("", "--seeds: ")):
-        flags = (f"--workdir={tmp_path}", *flag.split())
-        assert message in refused("experiments.report", *flags)
+        flags = (f"--run={tmp_path}", *flag.split())
+        assert message in refused("rcirl_jax", "report", *flags)
 
 
 @pytest.mark.multiprocess
 def test_a_run_in_use_is_one_line(tmp_path):
     run = tmp_path / "run"
     with only_one(run):
-        line = refused("experiments.autotune", f"--workdir={run}", *SMALL)
+        line = refused("rcirl_jax", "autotune", f"--output={run}", *SMALL)
     assert line.startswith(f"error: {run}: in use by another process: ")
     assert [x.name for x in run.iterdir()] == [".lock"]

@@ -16,7 +16,7 @@ def test_a_reward_against_itself(tmp_path):
     names = ("collision_free", "min_ttc", "speed_limit", "on_road", "family_clean")
     margins = [f"--{name}_margin=0.2" for name in names]  # 40 cases prove no less
     flags = (f"--candidate={file}", f"--incumbent={file}", f"--output={out}", *SHORT)
-    done = command("experiments.gate", *flags, *margins)
+    done = command("rcirl_jax", "gate", *flags, *margins)
     assert done.returncode == 2, done.stderr[-2000:]
     assert "verdict: COULD NOT JUDGE" in done.stdout
     assert "left out: IDM, tuned: --tuned_idm is not given" in done.stdout

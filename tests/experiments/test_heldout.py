@@ -20,7 +20,7 @@ def test_held_out_drives_are_measured_against_the_human(tmp_path):
     random_weights(root / "w.msgpack")
     write_tuned_idm(root / "idm.json", Idm(headway=1.0))
     done = succeeded(
-        "experiments.simulate", f"--weights={root}/w.msgpack", f"--output={root}/out",
+        "rcirl_jax", "simulate", f"--weights={root}/w.msgpack", f"--output={root}/out",
         "--baselines=", "--suite=heldout", f"--data={root}/data", "--cases=4",
         f"--tuned_idm={root}/idm.json", "--filter=collision",
     )  # fmt: skip

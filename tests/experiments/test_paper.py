@@ -145,7 +145,7 @@ def test_robustness(tmp_path):
 @pytest.mark.slow
 def test_human_likeness_over_folds(dataset, tmp_path):
     succeeded(
-        "experiments.human_likeness", f"--data={dataset}", f"--output={tmp_path}",
+        "rcirl_jax", "human-likeness", f"--data={dataset}", f"--output={tmp_path}",
         "--learners=RC-IRL rank,GAN", "--seeds=2", "--epochs=1", "--tuned=1",
         "--tuned_long=5", "--folds=2",
     )  # fmt: skip

@@ -20,7 +20,7 @@ def test_a_small_sweep(tmp_path):
         "--quick", f"--data={tmp_path}/d", f"--output={tmp_path}/out",
         "--recipe=paper", "--leaky_rates=0.05,0.3", "--hidden_sizes=0,6x3",
     )  # fmt: skip
-    done = succeeded("experiments.sweep", *flags, "--workers=2")
+    done = succeeded("rcirl_jax", "sweep", *flags, "--workers=2")
     assert "member" in done.stderr
     assert done.stdout.count("<- chosen") == 1
     report = json.loads((tmp_path / "out" / "sweep.json").read_text())
@@ -29,5 +29,5 @@ def test_a_small_sweep(tmp_path):
     assert (tmp_path / "out" / "sweep.png").read_bytes()[:4] == b"\x89PNG"
     best = open_reward(str(tmp_path / "out" / "best.msgpack"))
     assert best.sha256 == report["members"][report["chosen"]["member"]]["sha256"]
-    said = refused("experiments.sweep", *flags, "--epochs=2", "--batch_size=32")
+    said = refused("rcirl_jax", "sweep", *flags, "--epochs=2", "--batch_size=32")
     assert "batch_size: 64: expected 32 to resume" in said

@@ -8,8 +8,8 @@ from rcirl_jax.data.scenes.config import CollectConfig
 from tests.helpers.commands import refused
 from tests.helpers.weights_files import random_weights
 
-TRAIN = "train --data={data} --workdir={out}"
-TUNE = "autotune --workdir={out}"
+TRAIN = "train --data={data} --output={out}"
+TUNE = "autotune --output={out}"
 GATE = "gate --candidate={weights} --output={out}.json --suite=free_cruise"
 DRIVE = "simulate --weights={weights} --output={out} --baselines="
 ELSEWHERE = "drive_elsewhere --weights={weights} --output={out}"
@@ -21,17 +21,17 @@ ONE_FRAME, TABLE2 = ("paper.one_frame --output={out}", "paper.table2 --output={o
 WRONG = (
     ("import_logs --format=commonroad --input=nowhere --output={out}", "nowhere"),
     ("import_logs --format=synthetic --stride=0 --output={out}", "stride"),
-    ("train --data=nowhere --workdir={out}", "nowhere"),
-    ("train --workdir={out}", "data"),
+    ("train --data=nowhere --output={out}", "nowhere"),
+    ("train --output={out}", "data"),
     (f"{TRAIN} --loss=hope", "loss"),
     (f"{TRAIN} --epoch=3", "epoch"),
     (f"{TRAIN} more", "more"),
     (f"{TRAIN} --num_processes=2", "all three"),
     (f"{TRAIN} --parallel=ring", "parallel"),
     ("evaluate --weights=nowhere --data=nowhere", "nowhere"),
-    ("export_weights --workdir=nowhere", "run.json: missing"),
-    ("export_weights --onnx={out}", "--workdir, --weights: expected one of them"),
-    ("export_weights --yaml={out} --workdir=x", "expected --weights with"),
+    ("export_weights --run=nowhere", "run.json: missing"),
+    ("export_weights --onnx={out}", "--run, --weights: expected one of them"),
+    ("export_weights --yaml={out} --run=x", "expected --weights with"),
     (f"{ELSEWHERE} --simulator=sumoo", "did you mean sumo?"),
     (f"{ELSEWHERE} --simulator=sumo --episodes=1", "--episodes: 1: expected at least"),
     (f"{ELSEWHERE} --simulator=sumo --seconds=0", "--seconds: 0: expected 1 to 600 s"),
@@ -109,5 +109,5 @@ def test_wrong_flags_are_one_line_before_any_work(command, message, places, tmp_
 def test_a_gate_that_is_refused_leaves_no_verdict_of_another(places, tmp_path):
     (tmp_path / "v.json").write_text("the verdict of another candidate")
     flags = (f"--candidate={places['weights']}", f"--output={tmp_path}/v.json")
-    refused("experiments.gate", *flags, "--incumbent=nobody")
+    refused("rcirl_jax", "gate", *flags, "--incumbent=nobody")
     assert not (tmp_path / "v.json").exists()

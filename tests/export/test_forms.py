@@ -156,7 +156,7 @@ def test_the_command(tmp_path):
 
     names = ("onnx", "stablehlo", "jax_export")
     forms = [f"--{name}={tmp_path}/{name}" for name in names]
-    succeeded("experiments.export_weights", f"--weights={file}", *forms)
+    succeeded("rcirl_jax", "export", f"--weights={file}", *forms)
     assert all((tmp_path / name).stat().st_size > 1000 for name in names)
     weights = open_reward(str(file))
     for name in names:

@@ -78,6 +78,4 @@ def test_one_dataset_or_several(tmp_path):
 def test_a_run_that_is_none_is_one_line(tmp_path):
     for text in ("[1]", "nul", '{"flags": [1]}'):
         (tmp_path / "run.json").write_text(text)
-        assert "run.json: " in refused(
-            "experiments.export_weights", f"--workdir={tmp_path}"
-        )
+        assert "run.json: " in refused("rcirl_jax", "export", f"--run={tmp_path}")

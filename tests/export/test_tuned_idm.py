@@ -9,6 +9,7 @@ import pytest
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.closed_loop import table_rows
 from rcirl_jax.export.gate_job import gate_job, left_out
+from rcirl_jax.export.loading import load_runs, open_reward, row_name
 from rcirl_jax.export.tuned_idm import read_tuned_idm, write_tuned_idm
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm
 from tests.helpers.weights_files import random_weights
@@ -47,15 +48,33 @@ def test_a_wrong_file_is_one_line(change, message, tmp_path):
 
 
 def test_weights_of_one_shape_and_seed_are_told_apart_by_their_file(tmp_path):
+    """As rows of the closed loop and of a ranking; a name twice takes its folder."""
     one = random_weights(tmp_path / "one.msgpack")
     files = [str(one)]
-    for name in ("two", "three"):
+    for name in ("a/two", "b/two"):
+        (tmp_path / name).parent.mkdir()
         files.append(str(shutil.copy(one, tmp_path / f"{name}.msgpack")))
+    name = row_name(open_reward(files[0]))
+    parent = tmp_path.name
+    shown = [f"{parent}/one.msgpack", "a/two.msgpack", "b/two.msgpack"]
+    expected = [f"{name} ({x})" for x in shown]
+    assert [row.name for row in table_rows(files, [])] == expected
+    assert [*load_runs(files)[0]] == expected
+    assert [row.name for row in table_rows(files[1:2], [])] == [name]
+    for read in (load_runs, lambda twice: table_rows(twice, [])):
+        with pytest.raises(InputError, match="met twice"):
+            read([files[0]] * 2)
+
+
+def test_seeds_of_one_shape_are_rows_of_the_closed_loop_and_one_of_a_ranking(tmp_path):
+    files = [
+        str(random_weights(tmp_path / f"{seed}.msgpack", training_seed=seed))
+        for seed in (0, 1)
+    ]
+    name = row_name(open_reward(files[0]))
     rows = [row.name for row in table_rows(files, [])]
-    assert len(set(rows)) == 3
-    assert files[2] in rows[2]
-    with pytest.raises(InputError, match="met twice"):
-        table_rows([files[0]] * 4, [])
+    assert rows == [f"{name} (seed 0)", f"{name} (seed 1)"]
+    assert {row: len(runs) for row, runs in load_runs(files)[0].items()} == {name: 2}
 
 
 @pytest.mark.parametrize("track", ["full", "collision"])

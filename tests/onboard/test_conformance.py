@@ -4,12 +4,15 @@ import hashlib
 import json
 import subprocess
 import sys
+from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
 
 from onboard.conformance import check, make
 from rcirl_jax.export import load_weights
+from rcirl_jax.export.own_planner import features
 from rcirl_jax.export.own_planner.plain import plain_scene
 from rcirl_jax.units import NUM_TIMES
 from tests.helpers.own_planner import TOLERANCE, entries, error, numpy_answers
@@ -123,6 +126,56 @@ def test_one_wrong_number_is_named(cases, tmp_path):
     )
     (line,) = lines
     assert line.startswith("follow: features: candidate 0, time 1, follow_distance: ")
+
+
+# what stands in the numpy file, the mistake instead, and the columns of the case
+# "follow" that are wrong then
+FAULTS = {
+    "none": ("", "", ()),
+    "one_row_late": (
+        '_numbers(f"{field}.{name}", given, (NUM_TIMES,))',
+        'np.roll(_numbers(f"{field}.{name}", given, (NUM_TIMES,)), 1)',
+        ("collision_distance", "follow_distance"),
+    ),
+    "sign_of_relative_speed": (
+        "np.where(known, self.speed - v, ",
+        "np.where(known, v - self.speed, ",
+        ("follow_speed",),
+    ),
+    "kilometres_an_hour": (
+        '("m/s", lambda frame: frame.x.v)',
+        '("m/s", lambda frame: 3.6 * frame.x.v)',
+        ("velocity",),
+    ),
+}
+
+
+def numpy_file(old, new, monkeypatch):
+    """The numpy file as a module, with one text replaced."""
+    text = Path(features.__file__).read_text()
+    assert not old or text.count(old) == 1
+    module = ModuleType("numpy_file")
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    exec(text.replace(old, new) if old else text, vars(module))
+    return module
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_planted_faults_are_found(cases, tmp_path, monkeypatch, fault):
+    old, new, columns = FAULTS[fault]
+    module, given = numpy_file(old, new, monkeypatch), scenes()
+
+    def of_the_module(name, _):
+        reward = load_weights(ONBOARD / "conformance" / cases[name].weights)
+        scene, ways = plain_scene(given[name]), positions(cases[name])
+        found = module.FeatureMap(reward.names, reward.units)(scene, *ways)
+        values = reward.value(found, scene.time_valid)
+        return [*found.ravel().tolist(), *values.tolist()]
+
+    status, _, lines = checked(*answers(cases, tmp_path, of_the_module))
+    assert status == int(fault != "none")
+    named = [line.split(": ") for line in lines if line.startswith("follow: features")]
+    assert {place.split(", ")[-1] for _, _, place, *_ in named} == set(columns)
 
 
 def test_times_that_do_not_count_may_be_anything(cases, tmp_path):

@@ -134,7 +134,7 @@ def test_the_wheel_holds_what_the_package_reads(tmp_path):
     builder = WheelBuilder(str(REPO))
     (wheel,) = builder.build(directory=str(tmp_path), versions=["standard"])
     packed = {name.split(".dist-info/")[-1] for name in ZipFile(wheel).namelist()}
-    rooms = {"rcirl_jax": "", "experiments": "", "data_specs": "rcirl_jax/"}
+    rooms = {"rcirl_jax": "", "data_specs": "rcirl_jax/"}
     wanted = {
         f"{above}{path.relative_to(REPO)}"
         for room, above in rooms.items()
@@ -144,6 +144,9 @@ def test_the_wheel_holds_what_the_package_reads(tmp_path):
     assert len(wanted) > 300
     assert wanted <= packed
     assert {"rcirl_jax/py.typed", "licenses/LICENSE", "licenses/NOTICE"} <= packed
+    assert "entry_points.txt" in packed
+    # a folder called experiments is the user's own
+    assert not any(name.startswith("experiments/") for name in packed)
 
 
 def git(folder, *words):

@@ -145,9 +145,9 @@ def test_what_there_is_not_is_one_line(dataset, tmp_path):
 @pytest.mark.multiprocess
 def test_by_command(dataset, tmp_path):
     flags = (f"--data={dataset._files.folder}", f"--output={tmp_path / 'out'}")
-    line = refused("experiments.inspect_data", *flags, "--rows=1,two")
+    line = refused("rcirl_jax", "inspect", *flags, "--rows=1,two")
     assert line.endswith("expected row numbers")
     assert not (tmp_path / "out").exists()
-    succeeded("experiments.inspect_data", *flags, "--rows=1,2")
+    succeeded("rcirl_jax", "inspect", *flags, "--rows=1,2")
     names = sorted(path.name for path in (tmp_path / "out" / "scenes").iterdir())
     assert names == ["scene0000001.png", "scene0000002.png"]

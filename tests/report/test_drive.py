@@ -75,7 +75,7 @@ def test_a_case_is_one_page_with_the_player(tmp_path):
     weights = random_weights(tmp_path / "w.msgpack")
     case = ("--case=stopped_lead/000@0", "--row=IDM", "--duration=2")
     flags = (f"--weights={weights}", *case, f"--output={tmp_path / 'out'}")
-    done = succeeded("experiments.replay", *flags)
+    done = succeeded("rcirl_jax", "replay", *flags)
     (page,) = (tmp_path / "out").iterdir()
     block = r'<script type="application/json" id="replays">(.*?)</script>'
     (data,) = re.findall(block, page.read_text())

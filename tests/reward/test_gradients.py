@@ -93,9 +93,11 @@ def drawn(name, config, seed):
     )  # fmt: skip
     counts = rng.random((B, K)) < 0.7
     counts[:, 0], counts[1] = True, False  # one scene has nothing to compare
+    human, candidates = rng.normal(0, 2, (B, T, F)), rng.normal(0, 2, (B, F, T, K))
+    for feature in np.nonzero(config.context)[0]:  # shared at t = 0 in every scene
+        candidates[:, feature, 0] = human[:, :1, feature]
     made = FeatureBatch(
-        human=as32(rng.normal(0, 2, (B, T, F))),
-        candidates=as32(rng.normal(0, 2, (B, F, T, K))), feasible=jnp.asarray(counts),
+        human=as32(human), candidates=as32(candidates), feasible=jnp.asarray(counts),
         time_valid=jnp.arange(T) < jnp.asarray(rng.integers(1, T + 1, (B, 1))),
         facts=facts, weight=jnp.ones(B), index=jnp.arange(B),
     )  # fmt: skip

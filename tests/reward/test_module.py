@@ -48,7 +48,9 @@ def drawn(config):
 def batch():
     rng = np.random.default_rng(2)
     x = jnp.asarray(rng.normal(0.0, 2.0, (B, K, T, F)), jnp.float32)
-    return x, jnp.arange(T) < jnp.array([[T], [11], [7]])
+    # what the gains of a scene are made of is alike for all of its trajectories
+    shared = jnp.where(jnp.asarray(FEATURES.context) > 0, x[:, :1, 0], x[:, :, 0])
+    return x.at[:, :, 0].set(shared), jnp.arange(T) < jnp.array([[T], [11], [7]])
 
 
 @pytest.mark.parametrize("by_context", [False, True])

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ from rcirl_jax.features import feature_map
 from rcirl_jax.reward import LOSSES, Normaliser
 from rcirl_jax.sampling import SamplerConfig, num_candidates
 from rcirl_jax.train import pieces
-from rcirl_jax.train.facts import log_density
+from rcirl_jax.train.facts import densities, log_density
 from rcirl_jax.train.featurise import _featurised, featurised
 from rcirl_jax.train.finite import bad_values, check_step
 from rcirl_jax.train.loop import to_device_batch
@@ -368,9 +369,36 @@ def test_the_gradient_is_cut_down_to_its_norm():
 def test_twins_count_as_often_as_they_are_drawn():
     """Candidates at 0, 0 and 100 m: the twins have twice the density of the third."""
     place = jnp.array([0.0, 0.0, 100.0])
-    distance = jnp.abs(place[:, None] - place)
-    found = log_density(distance, ~jnp.eye(3, dtype=bool))
+    squared = (place[:, None] - place) ** 2
+    found = log_density(squared, ~jnp.eye(3, dtype=bool))
     np.testing.assert_allclose(np.exp(found), [2.0, 2.0, 1.0], rtol=1e-6)
+
+
+def test_densities_are_those_of_a_gaussian_kernel_pair_by_pair():
+    """exp(-d^2 / 8) of RMS distances over the valid times, summed by loops."""
+    rng = np.random.default_rng(0)
+    count, times = 7, 6
+    s, l = rng.normal(0.0, 3.0, (2, count + 1, times)) + 200.0
+    counts, valid = rng.random(count) > 0.3, np.arange(times) < 4
+
+    def curve(at):
+        return SimpleNamespace(
+            s=jnp.asarray(s[at], jnp.float32), l=jnp.asarray(l[at], jnp.float32)
+        )
+
+    human, own = densities(
+        curve(-1), curve(slice(0, -1)), jnp.asarray(counts), jnp.asarray(valid)
+    )
+
+    def kernel(i, j):
+        gap = (s[i] - s[j]) ** 2 + (l[i] - l[j]) ** 2
+        return np.exp(-gap[valid].mean() / (2.0 * 2.0**2))
+
+    def density(i):
+        return np.log(1.0 + sum(kernel(i, j) for j in np.nonzero(counts)[0] if j != i))
+
+    np.testing.assert_allclose(own, [density(i) for i in range(count)], atol=2e-5)
+    np.testing.assert_allclose(human, density(count), atol=2e-5)
 
 
 def test_nearest_positive_is_a_feasible_candidate_and_not_its_own_rival():

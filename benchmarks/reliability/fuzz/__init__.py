@@ -1,1 +1,1 @@
-"""Damaged and hostile files for every reader: mutators, targets, the contract."""
+"""Damaged and hostile files for every reader; the tests run them."""

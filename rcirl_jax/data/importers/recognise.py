@@ -105,6 +105,9 @@ def _unknown(path: Path) -> str:
         return (
             f"{tables[0]}: --format: not given: a table of no known data set: expected "
             "--format=csv with a --source that names its columns, which "
-            f"`python -m experiments.import_logs --suggest={tables[0]}` writes"
+            f"`rcirl import --suggest={tables[0]}` writes"
         )
-    return f"{path}: --format: not given: no files of a known format: expected --format"
+    return (
+        f"{path}: --format: not given: no files of a known format: expected "
+        f"--format=... with one of {', '.join(sorted(IMPORTERS))}"
+    )

@@ -23,9 +23,9 @@ REASONS = {
 # what to do where too much is dropped for a reason
 REMEDIES = {
     "future_too_short": "a lower --min_future, or longer recordings",
-    "off_map": "look at map and traffic with experiments.inspect_data: one frame?",
+    "off_map": "look at map and traffic with `rcirl inspect`: one frame?",
     "not_human": "look at how the log says who drives (columns.automated)",
-    "far_from_road": "look at the lanes' widths with experiments.inspect_data",
+    "far_from_road": "look at the lanes' widths with `rcirl inspect`",
     "too_noisy": "a longer --smoothing",
     "no_speed_change": "--keep_steady",
     "no_obstacles": "--keep_free_road",

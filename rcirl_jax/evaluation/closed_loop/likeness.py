@@ -19,6 +19,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+import tqdm
 from scipy.spatial.distance import jensenshannon
 
 from rcirl_jax.errors import InputError
@@ -245,7 +246,14 @@ def held_out_likeness(
         raise InputError(f"held-out drives: rows {names}: expected distinct names")
     others = [row for row in rows if row.name != RECORDED_HUMAN]
     every = [human_row(), *others]
-    made = two_at_a_time(lambda row: _driven(row, drives, plan_every), every)
+    with tqdm.tqdm(total=len(every), desc="held-out drives", unit="row") as bar:
+
+        def driven(row: Row) -> Driven:
+            found = _driven(row, drives, plan_every)
+            bar.update()
+            return found
+
+        made = two_at_a_time(driven, every)
     found = {row.name: one for row, one in zip(every, made, strict=True)}
     return LikenessReport(
         rows=found,

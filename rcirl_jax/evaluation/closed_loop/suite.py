@@ -63,11 +63,18 @@ class SuiteResult:
     facts: Mapping[str, object]  # hashes, memory
 
 
+def bar_of(row: Row, total: int) -> tqdm.tqdm:
+    """A bar of the cases that a row has driven."""
+    return tqdm.tqdm(
+        total=total, desc=f"drive the cases: {row.name}", unit="case", mininterval=0.5
+    )
+
+
 def drive_here(row: Row, cases: CaseSet, config: SuiteConfig) -> CaseMetrics:
     """All cases with one row, in this process."""
     rollout = rollout_config(row, cases.duration_s, config.plan_every)
     total = len(cases.ids)
-    with tqdm.tqdm(total=total, desc=row.name, unit="case", mininterval=0.5) as bar:
+    with bar_of(row, total) as bar:
         return drive_row(
             row,
             cases.build,

@@ -271,7 +271,7 @@ def train_learners(
 ) -> dict[str, list[Learned]]:
     """All learners of a comparison on the dataset's training split."""
     sets, found = FrozenSets(dataset), {}
-    with tqdm.tqdm(configs.items(), desc="train", unit="learner") as bar:
+    with tqdm.tqdm(configs.items(), desc="train the learners", unit="learner") as bar:
         for name, config in bar:
             bar.set_postfix_str(name)
             found[name] = train_learner(sets.of(config), config, seeds)

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tqdm
 
 from rcirl_jax.data.store.rows import refuse_scenes
 from rcirl_jax.features import FeatureMap, feature_map
@@ -225,7 +226,11 @@ def score_scenes(
         scorers=scorers,
         tuned=tuned or {},
     )
-    parts = (executor or Here()).stream(piece, _chunks(rows, index))
+    parts = []
+    with tqdm.tqdm(total=len(index), desc="rank the scenes", unit="scene") as bar:
+        for part in (executor or Here()).stream(piece, _chunks(rows, index)):
+            parts.append(part)
+            bar.update(len(part["fde"]))
     return Scored(**jax.tree.map(lambda *x: np.concatenate(x), *parts))
 
 

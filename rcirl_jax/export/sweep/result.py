@@ -16,13 +16,13 @@ def read_sweep(folder: Path) -> dict:
       InputError: missing, or not of a finished sweep.
     """
     path = folder / SWEEP
-    report = read_json(path, "the result of experiments.sweep")
+    report = read_json(path, "the result of `rcirl sweep`")
     try:
         table(report)
         _check_grid(report)
     except UNFORESEEN as error:
         raise InputError(
-            f"{path}: {type(error).__name__}: expected the result of experiments.sweep"
+            f"{path}: {type(error).__name__}: expected the result of `rcirl sweep`"
         ) from error
     return report
 

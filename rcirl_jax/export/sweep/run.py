@@ -55,7 +55,7 @@ def run_sweep(
       config: the sweep.
       folder: its folder; a finished group in it is not trained again.
       executor: where groups train and scenes are scored.
-      provenance: of `experiments.flags.common`; kept in every file.
+      provenance: what makes it; kept in every file.
 
     Returns:
       The contents of sweep.json.

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import jax
 import numpy as np
+import tqdm
 from numpy.typing import ArrayLike
 
 from rcirl_jax.errors import InputError
@@ -124,7 +125,7 @@ def make_replays(
     elif not any(row.follow_log for row in rows):
         rows = [*rows, human_row()]
     drives: list[list[Drive]] = [[] for _ in ids]
-    for row in rows:
+    for row in tqdm.tqdm(rows, desc="drive cases to be played", unit="row"):
         config = rollout_config(row, cases.duration_s, plan_every)
         driven = (every, *drive_with_logs(row, every, config))
         for number in range(len(ids)):

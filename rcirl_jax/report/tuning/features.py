@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 
 from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.evaluation.statistics import Difference
+from rcirl_jax.export.loading import anchor_words
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.report.pages import Table, interval, part
 from rcirl_jax.report.tuning.contributions import Contributions, contributions
@@ -42,18 +43,6 @@ def features_view(
         "table": _shares(found, list(rewards)),
         "silent": ", ".join(silent),
     }
-
-
-def anchor_words(name: str, reward: Reward) -> str:
-    """One sentence on what an anchored reward drives by; "" of another one."""
-    anchor = reward.anchor
-    if anchor is None:
-        return ""
-    return (
-        f"The {name} is anchored: it drives by V_total = own cost ({anchor.incumbent}, "
-        f"negated) + gain V, with a gain from {anchor.low:g}, where nothing like the "
-        f"scene was recorded, to {anchor.high:g}, where all of it was."
-    )
 
 
 def _counts(share: Mapping) -> bool:

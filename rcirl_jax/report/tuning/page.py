@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import tqdm
 
 from rcirl_jax.data.quality import format_quality
 from rcirl_jax.data.store.dataset import Dataset
@@ -89,38 +90,43 @@ def write_tuning_page(path: Path, report: TuningReport) -> Path:
     reward = next(iter(report.rewards.values()))
     sampler = SamplerConfig(mode=str(reward.provenance.get("mode", "speed")))
     shown = [entry for entry in CONTENTS if workdir or entry[0] != "training"]
+    verdict, rows = report.verdict, (next(iter(suite.rows)), report.incumbent)
+    frames = lambda folder: draw_frames(  # noqa: E731
+        report.dataset, reward, sampler, folder, NUM_FRAMES
+    )
+    training = lambda folder: draw_training(workdir, folder) if workdir else []  # noqa: E731
+    sections: dict[str, Callable[[], object]] = {
+        "verdict": lambda: verdict_view(verdict),
+        "cards": lambda: cards(verdict, suite, report.incumbent),
+        "cases": lambda: case_lines(report.suite, report.incumbent, report.replays),
+        "replays": lambda: player_data(report.replays),
+        "likeness": lambda: report.likeness,
+        "checks": lambda: checks_tables(verdict),
+        "margins": lambda: margins_table(report.gate),
+        "families": lambda: families_tables(verdict),
+        "suite": lambda: suite_view(suite, rows),
+        "ranking": lambda: ranking_view(report.ranking),
+        "features": lambda: features_view(
+            report.dataset, report.rewards, report.incumbent
+        ),
+        "gamma": lambda: _gamma(report.rewards),
+        "frames": lambda: _drawn(frames),
+        "training": lambda: _drawn(training),
+        "data": lambda: _data(report.dataset),
+        "sweep": lambda: _sweep(report.sweep),
+        "provenance": lambda: _provenance(report),
+    }
+    bar = tqdm.tqdm(sections.items(), desc="draw the report", unit="section")
     return write_page(
         path,
         "tuning.html",
         SCRIPT,
-        title=f"Tuning report: {report.verdict.decision}",
+        title=f"Tuning report: {verdict.decision}",
         contents=shown,
         level=LEVEL,
         runs=report.training_runs,
         incumbent=report.incumbent,
-        verdict=verdict_view(report.verdict),
-        cards=cards(report.verdict, suite, report.incumbent),
-        cases=case_lines(report.suite, report.incumbent, report.replays),
-        replays=player_data(report.replays),
-        likeness=report.likeness,
-        checks=checks_tables(report.verdict),
-        margins=margins_table(report.gate),
-        families=families_tables(report.verdict),
-        suite=suite_view(suite, (next(iter(suite.rows)), report.incumbent)),
-        ranking=ranking_view(report.ranking),
-        features=features_view(report.dataset, report.rewards, report.incumbent),
-        gamma=_gamma(report.rewards),
-        frames=_drawn(
-            lambda folder: draw_frames(
-                report.dataset, reward, sampler, folder, NUM_FRAMES
-            )
-        ),
-        training=_drawn(lambda folder: draw_training(workdir, folder))
-        if workdir
-        else [],
-        data=_data(report.dataset),
-        sweep=_sweep(report.sweep),
-        provenance=_provenance(report),
+        **{name: make() for name, make in bar},
     )
 
 

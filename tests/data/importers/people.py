@@ -1,5 +1,6 @@
 """A drive as people hand it over: the same rows in every layout that tables have."""
 
+import dataclasses
 import functools
 
 import numpy as np
@@ -75,6 +76,36 @@ def spec(folder, columns=HEADER, units="", more="", rest=""):
     path = folder / "map.toml"
     path.write_text(SPEC.format(more=more, columns=lines, units=units, rest=rest))
     return path
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Way:
+    """A file, what its source TOML says, and how near to the drive it is read."""
+
+    content: str | bytes
+    columns: dict | tuple = HEADER
+    units: str = ""
+    more: str = ""
+    rest: str = ""
+    turn: float = 0.0  # rad, of the road
+    place: float = 0.002  # m
+    angle: float = 0.02  # rad
+    speed: float = 0.35  # m/s
+    note: str = ""  # a part of a note of the recording
+
+
+def of(table, header=HEADER, **options):
+    """A table with commas; its columns are named as they are."""
+    return Way(content=text(table, header), **{"columns": tuple(header), **options})
+
+
+def put(folder, way, more=""):
+    """(log, source TOML) of a way, written into a folder."""
+    path, content = folder / "log.csv", way.content
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    more = f"{more}\n{way.more}"
+    options = {"units": way.units, "more": more, "rest": way.rest}
+    return path, spec(folder, way.columns, **options)
 
 
 def write(folder, table, header=HEADER, **layout):

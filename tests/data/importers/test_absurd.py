@@ -6,19 +6,15 @@ import os
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 
 from rcirl_jax.data import importers
-from rcirl_jax.data.cut import cut
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.readers.tables import streams
 from rcirl_jax.data.recording import validate_recording
-from rcirl_jax.data.scenes.config import CollectConfig
-from rcirl_jax.errors import InputError, as_input_error
+from rcirl_jax.errors import InputError
 from tests.data.importers.formats import csv, levelx_highd, ngsim
 from tests.data.importers.writers import strict
-from tests.helpers.commands import command
 from tests.helpers.logs import read, refused
 
 
@@ -124,25 +120,6 @@ def test_what_no_check_foresaw_is_one_line_that_names_the_place(tmp_path, monkey
     assert line.endswith("expected a sound log of format csv")
 
 
-def test_a_recording_that_cannot_be_cut_is_one_line(tmp_path, monkeypatch):
-    (recording,) = read("csv", csv.write(tmp_path).input)
-    monkeypatch.setattr(
-        "rcirl_jax.data.scenes.lanes._densify", lambda *_: np.zeros(2**62)
-    )
-    with pytest.raises(InputError, match=r"expected a sound recording"):
-        cut(recording, CollectConfig())
-
-
-def test_faults_of_other_kinds_pass():
-    with pytest.raises(OSError, match="disk"), as_input_error("file", "anything"):
-        raise OSError("disk")
-    with (
-        pytest.raises(InputError, match=r"^own line$"),
-        as_input_error("file", "anything"),
-    ):
-        raise InputError("own line")
-
-
 @pytest.mark.multiprocess
 @pytest.mark.parametrize(
     ("work", "said"),
@@ -152,7 +129,9 @@ def test_faults_of_other_kinds_pass():
     ],
 )
 def test_memory_that_is_not_given_is_one_line(work, said):
-    script = f"from experiments.flags.common import run; run(lambda: exec({work!r}))"
+    script = (
+        f"from rcirl_jax.commands.flags.common import run; run(lambda: exec({work!r}))"
+    )
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=False
     )
@@ -177,9 +156,3 @@ def test_names_that_are_no_text(tmp_path):
         bad = dataclasses.replace(recording, **{field: value})
         with pytest.raises(InputError, match=r"expected UTF-8 text"):
             validate_recording(bad, "a.csv")
-
-
-def test_flags_that_are_no_text(tmp_path):
-    ended = command("experiments.import_logs", "--format=csv", "--input=a\udcff")
-    assert ended.returncode == 2
-    assert ended.stderr == "error: '--input=a\\udcff': expected UTF-8\n"

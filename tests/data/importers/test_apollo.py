@@ -48,27 +48,6 @@ def has_note(recording, words):
 # ---------------------------------------------------------------- well-formed
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """The recording of the fixture."""
-    return only(fixture.write(tmp_path_factory.mktemp("apollo")).input)
-
-
-def test_drive_of_two_parts(whole):
-    """Obstacles are where they were measured, 80 ms before that is published."""
-    assert (whole.name, whole.rate_hz) == ("20210723091215", 10.0)
-    assert set(tracks_of(whole)) == set(fixture.expected())
-    ego, leader = tracks_of(whole)["ego"], tracks_of(whole)["12"]
-    assert (ego.length, ego.width) == (4.933, 2.11)
-    # across the border of the files
-    np.testing.assert_allclose(ego.t, fixture.GRID, atol=1e-9)
-    assert ego.destination == pytest.approx((300.0, 1.0))
-    np.testing.assert_allclose(leader.x, fixture.expected()["12"].x, atol=5e-3)
-    assert has_note(whole, "x = 587000 m, y = 4141000 m")
-    assert has_note(whole, "records hold no map")
-    assert whole.lanes
-
-
 def test_parts_are_drives(tmp_path):
     """A part reads those that follow; behind a missing one another run begins."""
     first, second = fixture.write(tmp_path).files
@@ -147,23 +126,6 @@ def test_drive_of_the_planner_is_noted(tmp_path):
     assert has_note(made, "75% of the time not in COMPLETE_MANUAL")
     (ego,) = made.tracks
     np.testing.assert_allclose(ego.automated, [(-np.inf, 1.0), (1.5, np.inf)])
-
-
-def test_of_a_silent_chassis_nobody_knows_the_mode(tmp_path):
-    """Before the first message its mode was in force."""
-    for manual, spans in ((True, [(1.2, np.inf)]), (False, [(-np.inf, np.inf)])):
-        messages = [*ego_only(), (CHASSIS, 0.2, fixture.chassis(0.2, manual=manual))]
-        (ego,) = only(tmp_path, messages).tracks
-        np.testing.assert_allclose(ego.automated, spans)
-    (ego,) = only(tmp_path, ego_only()).tracks
-    assert ego.automated == ()
-
-
-def test_obstacles_without_localization(tmp_path):
-    messages = [item for item in fixture.drive() if item[0] == PERCEPTION]
-    recording = only(tmp_path, messages)
-    assert "ego" not in tracks_of(recording)
-    assert has_note(recording, "no ego track")
 
 
 def perceived(count=11, **changes):
@@ -273,22 +235,6 @@ def test_routing_of_every_release(tmp_path, name, channel, make):
     assert not has_note(recording, "no routing")
 
 
-def test_channels_of_other_names(tmp_path):
-    messages = [("/my/pose", t, content) for _, t, content in ego_only()]
-    messages.append(("/my/route", 0.3, fixture.routing(*place(0))))
-    channels = {
-        "/my/pose": fixture.CHANNELS[LOCALIZATION],
-        "/my/route": fixture.CHANNELS[ROUTING],
-    }
-    topics = {"localization": "/my/pose"}
-    recording = only(tmp_path, messages, channels=channels, topics=topics)
-    assert destinations(recording) == {"ego": None}
-    assert has_note(recording, "no routing recorded")
-    topics["routing"] = [ROUTING, "/my/route"]
-    recording = only(tmp_path, messages, channels=channels, topics=topics)
-    assert destinations(recording) == {"ego": place(0)}
-
-
 def test_each_routing_begins_a_leg(tmp_path):
     """The same destination sent again does not; what comes later is not known."""
     times = {0.5: 0, 1.0: 0, 2.04: 1, 3.0: 1, 3.7: 0}
@@ -393,3 +339,13 @@ def test_messages_of_many_bytes(tmp_path, monkeypatch):
     monkeypatch.setattr(limit, 200)
     line = refused(only, tmp_path, ego_only())
     assert re.search(r"descriptors: \d+ bytes of at most 200", line)
+
+
+def test_of_a_silent_chassis_nobody_knows_the_mode(tmp_path):
+    """Before the first message its mode was in force."""
+    for manual, spans in ((True, [(1.2, np.inf)]), (False, [(-np.inf, np.inf)])):
+        messages = [*ego_only(), (CHASSIS, 0.2, fixture.chassis(0.2, manual=manual))]
+        (ego,) = only(tmp_path, messages).tracks
+        np.testing.assert_allclose(ego.automated, spans)
+    (ego,) = only(tmp_path, ego_only()).tracks
+    assert ego.automated == ()

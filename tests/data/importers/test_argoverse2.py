@@ -3,7 +3,6 @@
 import functools
 import json
 import shutil
-import sys
 
 import numpy as np
 import pyarrow as pa
@@ -100,28 +99,12 @@ def test_other_types_of_the_same_columns(tmp_path):
     assert tracks[w.FOCAL].t.size == w.NUM_STEPS
 
 
-def test_wild_fragments_are_left_out(tmp_path):
-    table = w.columns()
-    table["velocity_x"][table["track_id"].index("138902")] = 300.0
-    recording = scenario(tmp_path, table=table)
-    assert "138902" not in tracks_of(recording)
-    assert any("1 track fragments of impossible" in note for note in recording.notes)
-
-
 def test_stamps_that_are_not_10_hz_are_noted(tmp_path):
     table = w.columns()
     table["end_timestamp"] = [w.START_NS + 4.9e9] * len(table["timestep"])
     recording = scenario(tmp_path, table=table)
     assert any("0.1 s assumed" in note for note in recording.notes)
     assert recording.tracks[0].t[-1] > 5.0
-
-
-def test_a_missing_package_is_one_line(tmp_path, monkeypatch):
-    path, _ = w.write_scenario(tmp_path)
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    line = refused(read, path)
-    assert "pyarrow: not installed" in line
-    assert "rcirl-jax[logs]" in line
 
 
 def test_lane_without_length_is_left_out(tmp_path):

@@ -14,7 +14,6 @@ from rcirl_jax.data.quality import assumed
 from rcirl_jax.types import Kind
 from tests.data.importers import people
 from tests.data.importers.test_conformance import MODULES, format_of, write
-from tests.helpers import logs
 
 
 def counts(recordings):
@@ -63,19 +62,6 @@ def test_a_table_of_ones_own(tmp_path):
         people.write(tmp_path, table, header), people.spec(tmp_path, header)
     )
     assert counts([made])[2] == 1
-
-
-def test_lanes_of_a_table_beside_the_log(tmp_path):
-    """One without a width, or without it at one point, has the usual one there."""
-    log = people.write(tmp_path, people.rows())
-    lanes = tmp_path / "lanes.csv"
-    lanes.write_text(
-        "id,x,y,width\n1,0,0,4\n1,200,0,4\n2,0,-3.5,\n2,200,-3.5,3\n3,0,9,\n3,200,9,\n"
-    )
-    source = people.spec(tmp_path, rest='[lanes]\nfile = "lanes.csv"\n')
-    made = logs.lanes_of(people.only(log, source))
-    assert [lane.width_assumed for lane in made.values()] == [False, True, True]
-    assert made["2"].left_width.tolist() == [1.75, 1.5]
 
 
 def test_sizes_that_are_measured_here_and_there():

@@ -79,19 +79,6 @@ def test_shapes_and_their_offsets(tmp_path):
     np.testing.assert_allclose([box.x[0], box.y[0]], [49.0, 12.0])
 
 
-def test_intervals_become_midpoints(tmp_path):
-    between = (
-        "<velocity><intervalStart>14</intervalStart><intervalEnd>16</intervalEnd>"
-        "</velocity></state>"
-    )
-    states = [
-        w.state(k, 1.5 * k, 0, drop=("velocity",)).replace("</state>", between)
-        for k in range(1, 5)
-    ]
-    made = scenario(tmp_path, w.lanelet(), w.car(states=states))
-    np.testing.assert_allclose(made.tracks[0].speed, 15.0)
-
-
 # ---------------------------------------------------------------------------- lanes
 
 
@@ -229,10 +216,6 @@ def test_intervals_of_all_lights_are_limited(tmp_path, monkeypatch):
     assert "trafficLight 8: cycle: 21 turns" in line
 
 
-def test_inactive_light_is_off(tmp_path):
-    assert set(lit(tmp_path, [("red", 9)], active="false").state) == {"off"}
-
-
 # --------------------------------------------------------- missing cars, groups, rest
 
 RECTANGLE = (
@@ -262,13 +245,6 @@ def test_lanelets_of_a_goal_are_limited_and_count_once(tmp_path, monkeypatch):
     np.testing.assert_allclose(ghost.end, (30.0, 0.0), atol=0.6)
 
 
-def test_obstacle_without_trajectory_is_noted(tmp_path):
-    bare = w.car("11", count=1).replace("<trajectory></trajectory>", "")
-    recording = scenario(tmp_path, road(), bare)
-    assert len(recording.tracks) == 1
-    assert any("without a trajectory" in note for note in recording.notes)
-
-
 def test_groups_beside_and_above_the_folder(tmp_path):
     (tmp_path / "xml").mkdir()
     file = w.commonroad(tmp_path / "xml" / "a.xml")
@@ -283,15 +259,6 @@ def test_groups_beside_and_above_the_folder(tmp_path):
         line = refused(read, file)
         assert words in line
         assert "expected file,group" in line
-
-
-def test_provenance_follows_the_source_attribute(tmp_path):
-    ngsim = scenario(tmp_path)
-    assert "10.21949/1504477" in ngsim.licence
-    assert "OpenStreetMap" in ngsim.licence
-    other = w.commonroad(tmp_path / "b.xml")
-    other.write_text(other.read_text().replace("NGSIM test", "by hand"))
-    assert "NGSIM" not in only(other).licence
 
 
 # -------------------------------------------------------------------------- recorded

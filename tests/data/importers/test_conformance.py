@@ -4,9 +4,6 @@ The formats are the modules of tests/data/importers/formats with a function `wri
 module named otherwise than its format says so by FORMAT.
 """
 
-import importlib
-import pkgutil
-
 import numpy as np
 import pytest
 
@@ -14,6 +11,7 @@ from rcirl_jax.data.cut import digest
 from rcirl_jax.data.importers import IMPORTERS, parts, read_part, read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_parts
 from rcirl_jax.data.parts import parts_of
+from rcirl_jax.data.readers import long_logs
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.errors import InputError
@@ -21,6 +19,7 @@ from rcirl_jax.runtime.specs import load_toml, spec_root
 from rcirl_jax.types import Kind
 from tests.data.importers import formats
 from tests.data.importers.damage import DAMAGES, text_of
+from tests.data.importers.formats import format_of
 from tests.helpers import logs
 from tests.helpers.logs import refused
 
@@ -30,20 +29,7 @@ HEADING_TOLERANCE = 0.02  # rad
 TIME_TOLERANCE_S = 0.006  # s, stamps rounded to 10 ms
 
 
-def discover():
-    """Module name -> module, of every fixture."""
-    names = [item.name for item in pkgutil.iter_modules(formats.__path__)]
-    modules = {n: importlib.import_module(f"{formats.__name__}.{n}") for n in names}
-    return {
-        name: module for name, module in modules.items() if hasattr(module, "write")
-    }
-
-
-MODULES = discover()
-
-
-def format_of(name):
-    return getattr(MODULES[name], "FORMAT", name)
+MODULES = formats.modules()
 
 
 def write(name, folder):
@@ -176,6 +162,50 @@ def test_parts_read_apart_make_up_the_whole(name, sound):
     again = read_part(format_of(name), fixture.input, spec)
     assert iter(again) is iter(again)  # one recording at a time
     assert digests(again) == digests(whole)
+
+
+@pytest.mark.parametrize("name", ["apollo", "nuplan", "ros2"])
+def test_windows_hold_the_scenes_of_the_drive(name, tmp_path, monkeypatch):
+    """Road users keep their names; surroundings are shortened to those of 8 s."""
+    monkeypatch.setattr(long_logs, "BEFORE_S", 1.0)
+    monkeypatch.setattr(long_logs, "AFTER_S", 2.5)
+    place = write(name, tmp_path).input
+    whole = logs.only(name, place)
+    found = logs.read(name, place, window_s=3.0)
+    assert [one.name for one in found] == [f"{whole.name}-{k:03d}" for k in range(3)]
+    assert {one.piece_of for one in found} == {whole.name}
+    assert len({one.group for one in found}) == 1
+    begins = [one.scenes_within[0] for one in found]
+    np.testing.assert_allclose(begins, [0.0, 3.0, 6.0], atol=0.7)
+    shares = [one.progress for one in found]
+    assert 0.0 < shares[0] <= shares[1] <= shares[2] <= 1.0
+    users = logs.tracks_of(whole)
+    assert {track.id for one in found for track in one.tracks} == set(users)
+    for track in (track for one in found for track in one.tracks):
+        same = users[track.id]
+        rows = np.searchsorted(same.t, track.t - 1e-6)
+        np.testing.assert_allclose(same.t[rows], track.t, atol=1e-6)
+        own = np.hypot(*np.diff([track.x, track.y]))
+        moved = np.hypot(*np.diff([same.x[rows], same.y[rows]]))
+        np.testing.assert_allclose(own, moved, atol=1e-6)
+    if name == "nuplan":  # others fit their lanes to each window
+        one, apart = logs.scenes_of([whole], 1.5), logs.scenes_of(found, 1.5)
+        assert len(one) > 40
+        assert set(apart) == set(one)
+
+
+MAPS = {".osm", ".osm_xy", ".gpkg", ".pb"}  # of formats that may come without
+
+
+@pytest.mark.parametrize("name", ["interaction", "l5", "levelx", "nuplan"])
+def test_without_a_map_lanes_follow_the_paths(name, tmp_path):
+    fixture = write(name, tmp_path)
+    for file in tmp_path.rglob("*"):
+        if file.suffix in MAPS:
+            file.unlink()
+    made = read(name, fixture)[0]
+    assert made.lanes[0].id == "path-0"
+    assert any("no map" in note for note in made.notes)
 
 
 def imported(name, fixture, output):

@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importers.lanes import StraightLane, straight_lanes
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import spec_root
@@ -93,15 +92,6 @@ def test_heading_and_speed_from_positions(tmp_path):
     np.testing.assert_allclose(track.speed[60:], 0.0, atol=1e-9)
 
 
-def test_far_coordinates_get_a_local_origin(tmp_path):
-    rows = [
-        [r[0], r[1], r[2] + 691000.0, r[3] + 5334000.0, *r[4:]] for r in w.csv_rows()
-    ]
-    recording = only(log(tmp_path, rows), w.csv_spec(tmp_path / "s.toml"))
-    np.testing.assert_allclose(recording.tracks[0].x, 1.5 * np.arange(40))
-    assert any("local origin" in note for note in recording.notes)
-
-
 @pytest.mark.parametrize(("point", "shift"), [("front", -2.25), ("rear", 2.25)])
 def test_reference_point(tmp_path, point, shift):
     source = w.csv_spec(tmp_path / "s.toml")
@@ -120,12 +110,6 @@ def test_turned_axis_and_named_kinds(tmp_path):
     assert track.kind == Kind.VEHICLE
 
 
-def test_gap_splits_a_track(tmp_path):
-    rows = [row for row in w.csv_rows(cars=1) if not 1.0 < row[0] < 2.5]
-    tracks = only(log(tmp_path, rows), w.csv_spec(tmp_path / "s.toml")).tracks
-    assert [track.id for track in tracks] == ["car0", "car0#2"]
-
-
 def test_oncoming_lanes_run_the_other_way(tmp_path):
     rows = w.csv_rows()
     for row in rows:
@@ -137,16 +121,6 @@ def test_oncoming_lanes_run_the_other_way(tmp_path):
     assert (first.left, first.right, second.left) == (None, None, None)
     # bounds of lanes that are not neighbours lie half a lane out
     assert first.left_width[0] == pytest.approx(1.75)
-
-
-def test_straight_lanes_longer_than_roads_are_not_made(tmp_path):
-    found = [
-        StraightLane(id=f"{k}", y=4.0 * k, lower=0.0, upper=9.9e5) for k in range(11)
-    ]
-    lanes = straight_lanes(tmp_path, found[:1], 4.0, None)
-    assert len(lanes[0].centre) > 1e5
-    with pytest.raises(InputError, match=r"lanes: 1\.089e\+07 m long in all: expected"):
-        straight_lanes(tmp_path, found, 4.0, None)
 
 
 def test_lanes_along_paths_where_none_are_known(tmp_path):
@@ -200,12 +174,6 @@ def test_example_mapping_reads_what_it_describes(tmp_path):
     np.testing.assert_allclose(recording.tracks[0].speed, 15.0)
     assert [lane.id for lane in recording.lanes] == ["1", "2"]
     assert recording.notes == ()
-
-
-def changed(place, column, value):
-    rows = w.csv_rows()
-    rows[place][column] = value
-    return rows
 
 
 def scaled(column, factor):
@@ -279,13 +247,6 @@ def test_malformed_mapping(tmp_path, columns, units, extra, field):
     assert field in str(error.value)
 
 
-def test_an_input_and_a_format_have_to_be_given(tmp_path):
-    with pytest.raises(InputError, match="--input: not given: expected a file or"):
-        read_recordings("csv", None, None)
-    with pytest.raises(InputError, match="--format: xlsx: expected one of"):
-        read_recordings("xlsx", tmp_path, None)
-
-
 SI_COLUMNS = {
     "t": "Global_Time",
     "id": "Vehicle_ID",
@@ -315,10 +276,11 @@ def test_recorded_ngsim_subset_in_si(data_dir, tmp_path):
                 assert np.median(np.abs(track.heading)) < 0.1
 
 
-@pytest.mark.dataset
-def test_recorded_ngsim_subset_declared_as_feet(data_dir, tmp_path):
-    path = data_dir / "formats" / "ngsim_reference" / "ngsim_us101_subset_SIunits.csv"
-    units = 't = "ms"\nx = "ft"\ny = "ft"'
-    source = w.csv_spec(tmp_path / "s.toml", columns=SI_COLUMNS, units=units)
-    with pytest.raises(InputError, match="feet taken for metres"):
-        read(path, source)
+def test_straight_lanes_longer_than_roads_are_not_made(tmp_path):
+    found = [
+        StraightLane(id=f"{k}", y=4.0 * k, lower=0.0, upper=9.9e5) for k in range(11)
+    ]
+    lanes = straight_lanes(tmp_path, found[:1], 4.0, None)
+    assert len(lanes[0].centre) > 1e5
+    with pytest.raises(InputError, match=r"lanes: 1\.089e\+07 m long in all: expected"):
+        straight_lanes(tmp_path, found, 4.0, None)

@@ -7,7 +7,7 @@ import pyproj
 import pytest
 
 from tests.data.importers import people
-from tests.data.importers.people import LONG, refused
+from tests.data.importers.people import LONG
 
 X, T, LENGTH = (people.HEADER.index(name) for name in ("x", "t", "length"))
 
@@ -41,14 +41,6 @@ def test_a_place_far_away_for_a_moment_is_dropped(tmp_path, place, long_bytes):
         np.testing.assert_allclose(track.x, own, atol=0.002)
     assert people.rows_of(found) == (720, 4, 0, 0)
     assert any("line 102: id car4: x, y: " in note for note in found.notes)
-
-
-def test_too_many_of_them_are_refused(tmp_path):
-    table = people.rows()
-    for row in range(0, 720, 71):
-        table[row][X] = 9999.0
-    line = refused(people.write(tmp_path, table), people.spec(tmp_path))
-    assert "11 of 720 rows are bad" in line
 
 
 @LONG

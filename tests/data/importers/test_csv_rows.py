@@ -1,12 +1,10 @@
 """Rows that are wrong: unknown cells, unreadable and repeated rows, how many may be."""
 
-import numpy as np
 import pytest
 
 from rcirl_jax.data.importing import import_parts
 from rcirl_jax.data.parts import parts_of
 from rcirl_jax.data.quality import format_quality
-from rcirl_jax.types import Kind
 from tests.data.importers import people
 from tests.data.importers.people import LONG, refused, write
 from tests.data.small_logs import CONFIG
@@ -16,46 +14,6 @@ def with_cell(row, name, value):
     table = people.rows()
     table[row][people.HEADER.index(name)] = value
     return table
-
-
-EMPTY = ["", "NaN", "nan", "NA", "N/A", "null", "None", "-", "\\N", "#N/A", " "]
-
-
-@LONG
-@pytest.mark.parametrize("empty", EMPTY)
-def test_empty_cells_that_are_not_needed_are_unknown(tmp_path, empty, long_bytes):
-    """Half the speeds and headings, most lengths and kinds."""
-    table = people.rows()
-    for k, row in enumerate(table):
-        row[4] = row[4] if k % 2 else empty
-        row[5] = row[5] if k % 3 else empty
-        row[6] = row[6] if k % 11 == 0 else empty
-        row[7] = row[7] if k % 13 == 0 else empty
-    source = people.spec(tmp_path, more=f"long_bytes = {long_bytes}")
-    found = people.only(write(tmp_path, table), source)
-    people.assert_same(found)
-    assert people.rows_of(found) == (720, 0, 0, 0)
-    assert {track.kind for track in found.tracks} == {Kind.VEHICLE}
-
-
-def test_columns_that_hold_nothing_are_by_default(tmp_path):
-    table = people.rows()
-    for row in table:
-        row[4] = row[5] = row[6] = row[7] = ""
-    rest = '[defaults]\nlength = 4.2\nkind = "cyclist"'
-    found = people.only(write(tmp_path, table), people.spec(tmp_path, rest=rest))
-    assert {track.length for track in found.tracks} == {4.2}
-    assert {track.kind for track in found.tracks} == {Kind.CYCLIST}
-
-
-def test_lanes_that_are_unknown_here_and_there(tmp_path):
-    header = (*people.HEADER, "lane")
-    table = [
-        [*row, "" if k % 3 else f"L{int(row[1][3:]) % 2}"]
-        for k, row in enumerate(people.rows())
-    ]
-    found = people.only(write(tmp_path, table, header), people.spec(tmp_path, header))
-    assert [lane.id for lane in found.lanes] == ["L0", "L1"]
 
 
 @LONG
@@ -150,31 +108,6 @@ def test_a_road_user_in_two_places_at_once(tmp_path, long_bytes):
     )
 
 
-def test_ids_that_are_not_unique_are_refused(tmp_path):
-    """Two recordings in one file and no column that says so."""
-    table = [*people.rows(), *people.column(people.rows(), "y", lambda y: y + 40.0)]
-    line = refused(write(tmp_path, table), people.spec(tmp_path))
-    assert "id car0: met twice in one frame; 720 of 1440 rows are bad" in line
-
-
-@LONG
-def test_rows_in_any_order(tmp_path, long_bytes):
-    order = np.random.default_rng(0).permutation(720)
-    table = [people.rows()[k] for k in order]
-    source = people.spec(tmp_path, more=f"long_bytes = {long_bytes}")
-    people.assert_same(people.only(write(tmp_path, table), source))
-
-
-@LONG
-def test_frames_without_anybody_are_no_bad_rows(tmp_path, long_bytes):
-    """As SUMO's table has them."""
-    empty = [[f"{-0.1 * k:.1f}", *[""] * 7] for k in range(200, 0, -1)]
-    source = people.spec(tmp_path, more=f"long_bytes = {long_bytes}")
-    found = people.only(write(tmp_path, [*empty, *people.rows()]), source)
-    people.assert_same(found)
-    assert people.rows_of(found) == (720, 0, 0, 0)
-
-
 @LONG
 def test_a_share_of_bad_rows_is_allowed(tmp_path, long_bytes):
     table = people.rows()
@@ -187,15 +120,6 @@ def test_a_share_of_bad_rows_is_allowed(tmp_path, long_bytes):
     assert "36 of 720 rows are bad: expected up to 1 %" in line
     found = people.only(path, people.spec(tmp_path, more=more + "max_bad_rows = 0.05"))
     assert found.rows.unreadable == 36
-
-
-def test_several_recordings_count_the_rows_of_their_file_once(tmp_path):
-    header = (*people.HEADER, "recording")
-    table = [[*row, drive] for drive in "ab" for row in people.rows()]
-    table[5][2] = "west"
-    table[1000:1000] = [table[1000]]
-    found = people.read(write(tmp_path, table, header), people.spec(tmp_path, header))
-    assert [people.rows_of(made) for made in found] == [(1441, 1, 0, 0), (0, 0, 1, 0)]
 
 
 @LONG

@@ -119,19 +119,6 @@ def test_a_crowded_minute_is_several_pieces(tmp_path, monkeypatch):
     assert [made.progress for made in windows] == sorted(m.progress for m in windows)
 
 
-def test_windows_without_rows_are_no_pieces(tmp_path, monkeypatch):
-    """A last minute that ends early, cut into windows of which some are empty."""
-    path = tmp_path / "log.csv"
-    spec = {**write(path, rows_of(seconds=135.0)), "long_bytes": 1}
-    whole = scenes_by_name(cuts(path, spec))
-    monkeypatch.setattr(long_logs, "MAX_ROWS", 200)
-    windows = cuts(path, spec)
-    assert set(scenes_by_name(windows)) == set(whole)
-    last = max(float(made.name.rpartition("-")[2]) for made in windows)
-    assert int(last) == 2
-    assert len({made.name for made in windows}) == len(windows)
-
-
 def test_a_vehicle_is_in_one_group_whatever_the_piece(tmp_path):
     path = tmp_path / "log.csv"
     spec = {**write(path, rows_of()), "long_bytes": 1}
@@ -145,22 +132,6 @@ def test_a_vehicle_is_in_one_group_whatever_the_piece(tmp_path):
     whole = Part(format="csv", input=path, spec={**spec, "long_bytes": 10**9})
     import_parts([whole], tmp_path / "whole", CONFIG)
     assert set(open_dataset(tmp_path / "whole").manifest.vehicles) == set(names)
-
-
-def test_a_recording_is_on_one_side_where_there_are_several(tmp_path):
-    """Minutes of it are groups of their own, and share traffic at their borders."""
-    found = []
-    for name in ("one", "two", "three"):
-        path = tmp_path / f"{name}.csv"
-        spec = write(path, rows_of(seconds=140.0, cars=12))
-        found.append(Part(format="csv", input=path, spec=spec))
-    import_parts(found, tmp_path / "data", CONFIG)
-    dataset = open_dataset(tmp_path / "data")
-    assert len(dataset.manifest.groups) > 3
-    train, test = (set(dataset.load(x).recording.tolist()) for x in ("train", "test"))
-    assert len(train) == 2
-    assert len(test) == 1
-    assert not train & test
 
 
 def test_recordings_of_one_file_stay_apart(tmp_path):
@@ -190,23 +161,6 @@ def test_a_wrong_unit_of_time_is_found(tmp_path, monkeypatch):
     spec = {**write(path, rows_of()), "long_bytes": 1}
     with pytest.raises(InputError, match=r"t: more than 3 minutes: expected seconds"):
         cuts(path, spec)
-
-
-def test_names_with_a_hash_and_padded_headers_are_read(tmp_path):
-    path = tmp_path / "log.csv"
-    spec = {**write(path, rows_of(seconds=30.0, cars=3)), "long_bytes": 1}
-    text = path.read_text().replace("t,id,x,y", " t , id,x, y").replace(",c", ",c#")
-    path.write_text(text)
-    (made,) = read_part("csv", path, spec)
-    assert {track.id for track in made.tracks} == {"c#0", "c#1", "c#2"}
-
-
-def test_settings_change_the_digest_of_a_piece(tmp_path):
-    path = tmp_path / "log.csv"
-    spec = {**write(path, rows_of(seconds=70.0, cars=4)), "long_bytes": 1}
-    (first, *_) = read_part("csv", path, spec)
-    other = dataclasses.replace(first, scenes_within=(0.0, 30.0))
-    assert cut(first, CONFIG.collect).sha256 != cut(other, CONFIG.collect).sha256
 
 
 MEMORY = """
@@ -262,3 +216,27 @@ def test_memory_does_not_grow_with_the_file(tmp_path):
         assert rows >= minutes * 600 * 80
         peaks.append(peak)
     assert peaks[1] < 1.3 * peaks[0]
+
+
+def test_a_recording_is_on_one_side_where_there_are_several(tmp_path):
+    """Minutes of it are groups of their own, and share traffic at their borders."""
+    found = []
+    for name in ("one", "two", "three"):
+        path = tmp_path / f"{name}.csv"
+        spec = write(path, rows_of(seconds=140.0, cars=12))
+        found.append(Part(format="csv", input=path, spec=spec))
+    import_parts(found, tmp_path / "data", CONFIG)
+    dataset = open_dataset(tmp_path / "data")
+    assert len(dataset.manifest.groups) > 3
+    train, test = (set(dataset.load(x).recording.tolist()) for x in ("train", "test"))
+    assert len(train) == 2
+    assert len(test) == 1
+    assert not train & test
+
+
+def test_settings_change_the_digest_of_a_piece(tmp_path):
+    path = tmp_path / "log.csv"
+    spec = {**write(path, rows_of(seconds=70.0, cars=4)), "long_bytes": 1}
+    (first, *_) = read_part("csv", path, spec)
+    other = dataclasses.replace(first, scenes_within=(0.0, 30.0))
+    assert cut(first, CONFIG.collect).sha256 != cut(other, CONFIG.collect).sha256

@@ -12,7 +12,9 @@ from rcirl_jax.data.importers.csv.suggest import suggested
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import load_toml
 from tests.data.importers import people
-from tests.data.importers.test_csv_meaning import degrees, pneuma, wide_frames
+from tests.data.importers.people import column, of, rows
+from tests.data.importers.test_csv_meaning import pneuma, wide_frames
+from tests.data.importers.test_csv_ways import degrees
 from tests.helpers.commands import command
 
 
@@ -62,31 +64,6 @@ def test_a_german_table_of_a_spreadsheet(tmp_path):
     assert " ".join(shown[1].split()) == "0.00 car0 588000.00 0.00 28.65 15.80 4.50 Pkw"
 
 
-@pytest.mark.parametrize(
-    ("unit", "factor"),
-    [("m/s", 1.0), ("km/h", 3.6), ("mph", 2.23694), ("ft/s", 3.28084)],
-)
-def test_units_of_speed_by_the_positions(tmp_path, unit, factor):
-    path = tmp_path / "log.csv"
-    table = people.column(people.rows(), "speed", lambda v: v * factor)
-    path.write_text(people.text(table))
-    _, toml, (made,) = taken(path)
-    assert toml["units"]["speed"] == unit
-    people.assert_same(made, speed=0.01)
-
-
-@pytest.mark.parametrize(("unit", "factor"), [("m/s", 1.0), ("km/h", 3.6)])
-def test_units_of_velocities_by_the_positions(tmp_path, unit, factor):
-    turn = 2.0
-    header = ("t", "id", "x", "y", "vx", "vy", "length", "kind")
-    ways = factor * np.array([np.cos(turn), np.sin(turn)])
-    table = [[*r[:4], *(r[5] * ways).tolist(), *r[6:]] for r in people.rows(turn)]
-    path = people.write(tmp_path, table, header)
-    _, toml, (made,) = taken(path)
-    assert (toml["units"]["vx"], toml["units"]["vy"]) == (unit, unit)
-    people.assert_same(made, turn, speed=0.01)
-
-
 @pytest.mark.parametrize("rate", [10.0, 25.0, 30.0])
 @pytest.mark.parametrize(("unit", "factor"), [("m/s", 1.0), ("km/h", 3.6)])
 def test_the_rate_of_frames_by_the_speeds(tmp_path, rate, unit, factor):
@@ -102,14 +79,6 @@ def test_the_rate_of_frames_by_the_speeds(tmp_path, rate, unit, factor):
     for track in made.tracks:
         np.testing.assert_allclose(track.speed, 14.0, atol=0.01)
         np.testing.assert_allclose(np.diff(track.t), 1.0 / rate, atol=1e-6)
-
-
-def test_every_fifth_frame(tmp_path):
-    table = people.column(people.rows(), "t", lambda t: round(50 * t) + 5)
-    path = people.write(tmp_path, table, ("frame", *people.HEADER[1:]))
-    _, toml, (made,) = taken(path)
-    assert (toml["scale"]["t"], toml["defaults"]["rate_hz"]) == (0.2, 10.0)
-    people.assert_same(made)
 
 
 def test_raw_degrees_are_one_line(tmp_path):
@@ -137,17 +106,34 @@ def test_units_in_a_line_below_the_header(tmp_path):
     np.testing.assert_allclose(ways, people.rows()[-6][2], atol=0.01)
 
 
-@pytest.mark.parametrize(
-    ("step", "name", "unit"),
-    [(1.0, "time", "s"), (1e3, "time", "ms"), (1e6, "time", "us"), (1e9, "time", "ns")],
-)
-def test_units_of_time_by_the_step(tmp_path, step, name, unit):
-    path = tmp_path / "log.csv"
-    table = people.column(people.rows(), "t", lambda t: f"{t * step:.3f}")
-    path.write_text(people.text(table, (name, *people.HEADER[1:])))
+SPEEDS = {"m/s": 1.0, "km/h": 3.6, "mph": 2.23694, "ft/s": 3.28084}
+STEPS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+# by the positions, and by the step
+UNITS = [
+    *[
+        ("speed", unit, of(column(rows(), "speed", lambda v, f=factor: v * f)))
+        for unit, factor in SPEEDS.items()
+    ],
+    *[
+        (
+            "t",
+            unit,
+            of(
+                column(rows(), "t", lambda t, f=factor: f"{t * f:.3f}"),
+                ("time", *people.HEADER[1:]),
+            ),
+        )
+        for unit, factor in STEPS.items()
+    ],
+]
+
+
+@pytest.mark.parametrize(("field", "unit", "way"), UNITS)
+def test_units(tmp_path, field, unit, way):
+    path, _ = people.put(tmp_path, way)
     _, toml, (made,) = taken(path)
-    assert toml["units"]["t"] == unit
-    people.assert_same(made)
+    assert toml["units"][field] == unit
+    people.assert_same(made, speed=0.01)
 
 
 def test_iso_times_and_degrees_in_parquet(tmp_path):
@@ -165,17 +151,6 @@ def test_iso_times_and_degrees_in_parquet(tmp_path):
     assert toml["columns"]["lat"] == "latitude"
     assert toml["units"]["t"] == "iso"
     assert "recognised: t: column datetime, iso" in found.lines
-
-
-def test_frames_have_a_rate_that_is_not_known(tmp_path):
-    table = people.column(people.rows(), "t", lambda t: round(10 * t))
-    path = tmp_path / "log.csv"
-    header = ("frame", *people.HEADER[1:5], "length", "kind")  # no speeds that tell it
-    plain = [[*row[:5], *row[6:]] for row in table]
-    path.write_text(people.text(plain, header))
-    found, toml, _ = taken(path)
-    assert toml["units"]["t"] == "frame"
-    assert any(line.startswith("not known: rate_hz") for line in found.lines)
 
 
 def test_a_row_per_frame(tmp_path):
@@ -198,13 +173,6 @@ def test_a_row_per_vehicle(tmp_path):
     assert toml["units"]["speed"] == "km/h"
     assert len(made.tracks) == 6
     assert any("a row per road user, which repeats lat, lon" in x for x in found.lines)
-
-
-def test_columns_that_look_like_nothing(tmp_path):
-    path = tmp_path / "log.csv"
-    path.write_text("alpha,beta\n1,2\n3,4\n")
-    with pytest.raises(InputError, match=r"no column looks like t, id, x, y: expected"):
-        suggested(path)
 
 
 @pytest.mark.parametrize(
@@ -246,17 +214,17 @@ def test_by_its_command(tmp_path):
     log, target = tmp_path / "log.csv.gz", tmp_path / "mine.toml"
     log.write_bytes(gzip.compress(people.text(people.rows(), between=";").encode()))
     flags = (f"--suggest={log}", f"--output={target}")
-    done = command("experiments.import_logs", *flags)
+    done = command("rcirl_jax", "import", *flags)
     assert done.returncode == 0, done.stderr
     assert "recognised: text in utf-8, semicolon between cells" in done.stdout
     assert f"--source={target} --input={log}" in done.stdout
     people.assert_same(people.only(log, target))
-    again = command("experiments.import_logs", *flags)
+    again = command("rcirl_jax", "import", *flags)
     assert again.returncode == 2
     assert again.stderr.startswith(
         f"error: {target}: there already: expected --overwrite"
     )
-    done = command("experiments.import_logs", "--suggest=nowhere.csv")
+    done = command("rcirl_jax", "import", "--suggest=nowhere.csv")
     assert done.stderr == "error: nowhere.csv: --suggest: missing: expected a table\n"
-    done = command("experiments.import_logs", "--format=csv")
+    done = command("rcirl_jax", "import", "--format=csv")
     assert done.stderr.startswith("error: --output: not given: expected")

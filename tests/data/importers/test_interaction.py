@@ -5,7 +5,6 @@ import functools
 import numpy as np
 import pytest
 
-from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind
 from tests.data.importers.formats import interaction as fixture
 from tests.data.importers.formats import interaction_challenge as challenge
@@ -44,13 +43,6 @@ def test_vehicles_and_pedestrians_are_one_recording(root):
     assert recording.tracks[0].heading.dtype == np.float64
 
 
-def test_pedestrians_head_where_they_walk(root):
-    (walker,) = [track for track in only(root).tracks if track.id == "P4"]
-    assert (walker.length, walker.width) == (0.5, 0.5)
-    np.testing.assert_allclose(walker.heading, 0.0, atol=1e-3)
-    np.testing.assert_allclose(walker.speed, 1.3, atol=1e-3)
-
-
 def test_who_rides_is_decided_by_the_source(root, tmp_path):
     source = tmp_path / "s.toml"
     source.write_text("cyclist_speed_mps = 6.0\n")
@@ -74,11 +66,6 @@ def test_inputs_from_the_release_down_to_a_file(root, scene):
         assert len(recording.lanes) == len(whole.lanes)
 
 
-def test_pedestrians_alone(scene):
-    (scene / "vehicle_tracks_000.csv").unlink()
-    assert [track.id for track in only(scene).tracks] == ["P13", "P4"]
-
-
 @pytest.mark.parametrize("kept", [".osm_xy", ".osm"])
 def test_map_in_metres_and_in_degrees(root, kept):
     both = {lane.id: lane for lane in only(root).lanes}
@@ -89,27 +76,6 @@ def test_map_in_metres_and_in_degrees(root, kept):
     for lane in lanes:
         np.testing.assert_allclose(lane.centre, both[lane.id].centre, atol=0.01)
     assert lanes[0].speed_limit == pytest.approx(50 / 3.6)
-
-
-def test_without_a_map_lanes_follow_the_paths(root):
-    for path in (root / "maps").iterdir():
-        path.unlink()
-    recording = only(root)
-    assert len(recording.lanes) >= 2
-    assert any("no map found" in note for note in recording.notes)
-    assert recording.default_speed_limit == pytest.approx(13.41)
-
-
-def test_map_of_the_source(root, tmp_path):
-    source = tmp_path / "s.toml"
-    place = root / "maps" / f"{fixture.SCENE}.osm"
-    source.write_text(f'map = "{place}"\n')
-    assert len(only(root, source).lanes) == 7
-    source.write_text(f'map = "{root / "maps"}"\n')
-    assert len(only(root, source).lanes) == 7
-    source.write_text('map = "/nowhere"\n')
-    with pytest.raises(InputError, match="/nowhere: map: missing"):
-        read(root, source)
 
 
 @pytest.mark.parametrize(
@@ -161,35 +127,9 @@ def test_cases_are_recordings_of_one_group(cases):
     assert len(second.lanes) == 7
 
 
-def test_cases_in_any_order_of_rows(cases):
-    names = [recording.name for recording in read(cases)]
-    header, *rows = cases.read_text().splitlines()
-    order = np.random.default_rng(0).permutation(len(rows))
-    rows = sorted((rows[i] for i in order), key=lambda row: float(row.split(",")[3]))
-    cases.write_text("\n".join([header, *rows]) + "\n")
-    found = read(cases)
-    assert [recording.name for recording in found] == names
-    assert [track.id for track in found[0].tracks] == ["1", "P4"]
-
-
 def test_observations_and_submissions_are_left_out(cases):
     for name in ("test_multi-agent/DR_CHN_Merging_ZS0_obs.csv", "DR_A_sub.csv"):
         path = cases.parent.parent / name
         path.parent.mkdir(exist_ok=True)
         path.write_text("not read")
     assert len(read(cases.parent.parent)) == 2
-
-
-def test_unknown_agents_are_vehicles(scene, root):
-    path = scene / "vehicle_tracks_000.csv"
-    path.write_text(path.read_text().replace(",car,", ",tram,"))
-    recording = only(root)
-    assert recording.tracks[0].kind == Kind.VEHICLE
-    assert "agent types taken for vehicles: tram" in recording.notes
-
-
-def test_gap_splits_a_track(scene, root):
-    path = scene / "vehicle_tracks_000.csv"
-    lines = path.read_text().splitlines()
-    path.write_text("\n".join(lines[:50] + lines[60:]) + "\n")
-    assert "1#2" in [track.id for track in only(root).tracks]

@@ -3,7 +3,6 @@
 import functools
 import json
 import re
-import shutil
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from rcirl_jax.data.importers.l5 import map as l5_map
 from rcirl_jax.data.importers.l5 import reader as l5
 from rcirl_jax.data.importers.l5 import scenes as l5_scenes
 from rcirl_jax.data.readers import zarr2
-from rcirl_jax.types import Kind
 from tests.data.importers.formats import l5 as fixture
 from tests.helpers import logs
 from tests.helpers.logs import lanes_of, refused, tracks_of
@@ -109,15 +107,6 @@ def test_pieces_make_up_the_dataset(folder, whole, few, monkeypatch):
     assert about(apart) == about(whole)
 
 
-def test_a_map_that_changed_is_read_again(folder):
-    def governed():
-        return {lane.id for lane in read(folder)[0].lanes if lane.signal_ids}
-
-    assert governed() == {"a1"}
-    fixture.write_map(folder / "semantic_map" / "semantic_map.pb", controls=())
-    assert governed() == set()
-
-
 def test_reads_only_the_scene_it_is_at(folder):
     """Chunks of later scenes are not touched: the full set has 100s of GB."""
     agents = folder / "scenes" / "sample.zarr" / "agents"
@@ -186,19 +175,6 @@ def test_light_of_a_lane(whole):
     np.testing.assert_allclose(signal.start, [0.0, green], atol=1e-6)
 
 
-def test_light_unseen_for_a_second_is_off(tmp_path):
-    semantic_map = map_of(fixture.write_map(tmp_path / "m.pb"))
-    (signal,) = semantic_map.signals(
-        lanes_around(semantic_map),
-        t=0.1 * np.arange(40),
-        frame=np.array([3, 4, 30]),
-        face=np.array([fixture.RED, fixture.RED, fixture.GREEN]),
-        is_active=np.ones(3, bool),
-    )
-    assert signal.state == ("off", "red", "off", "green")
-    np.testing.assert_allclose(signal.start, [0.0, 0.3, 1.5, 3.0])
-
-
 def test_without_a_map_of_the_place_lanes_are_paths(dataset):
     (recording,) = read(dataset.parent)
     assert recording.signals == ()
@@ -213,13 +189,6 @@ def test_without_a_map_of_the_place_lanes_are_paths(dataset):
     beside.unlink()
     beside.with_name("semantic_map.pb").rename(dataset.parent / "palo.pb")
     assert len(read(dataset.parent, map="palo.pb")[0].lanes) == 4
-
-
-def test_format_version_1_has_no_lights(folder):
-    shutil.rmtree(folder / "scenes" / "sample.zarr" / "traffic_light_faces")
-    recording = read(folder)[0]
-    assert recording.signals == ()
-    assert "no traffic lights recorded" in recording.notes
 
 
 # ------------------------------------------------------------------- contents
@@ -237,14 +206,6 @@ def test_older_number_types(dataset):
     fixture.change(dataset, "agents", narrow)
     found, expected = tracks_of(read(dataset)[0])["12"], fixture.road_users()["12"]
     np.testing.assert_allclose(found.x, expected.x, atol=1e-3)
-
-
-def test_options(folder):
-    assert read(folder, min_probability=1.1, unknown="drop")[0].tracks[-1].id == "ego"
-    ego = tracks_of(read(folder, ego={"centre_ahead": 1.2})[0])["ego"]
-    assert ego.x[0] == pytest.approx(fixture.CENTRE[0] + 1.2)
-    tracks = read(folder, unknown="vehicle")[0].tracks
-    assert [track.kind for track in tracks if track.id == "99"] == [Kind.VEHICLE]
 
 
 # ------------------------------------------------------------------- arrays

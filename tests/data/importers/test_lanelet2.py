@@ -177,38 +177,6 @@ def test_rules_about_stopping(tmp_path, monkeypatch, rule, line, sign):
         np.testing.assert_allclose(lane.stop_line, [[96.75, -80.0], [93.25, -80.0]])
 
 
-def test_rules_are_read_once(tmp_path, monkeypatch):
-    """However many lanelets name a rule, and however often."""
-    roles = []
-
-    def counted(element, role, kind):
-        roles.append(role)
-        return members(element, role, kind)
-
-    monkeypatch.setattr(lanelet2_rules, "members", counted)
-    lanelet = (["middle_3"], ["border_3"], osm.ROAD, ["50000", "50001"] * 20)
-    lanes, _ = read(metres(tmp_path, lanelets={"1": lanelet, "2": lanelet}))
-    assert lanes["2"].speed_limit == pytest.approx(50 / 3.6)
-    assert roles.count("yield") == len(osm.RULES)
-    assert roles.count("refers") == len(osm.RULES)
-
-
-def test_a_stop_line_keeps_no_others(tmp_path, monkeypatch):
-    rule = ({"subtype": "traffic_light"}, [("way", "line", "ref_line")] * 9)
-    monkeypatch.setitem(osm.RULES, "50001", rule)
-    lane = read(metres(tmp_path))[0]["30004"]
-    np.testing.assert_allclose(lane.stop_line, [[93.25, -78.0], [96.75, -78.0]])
-    assert lane.stop_line.base is None
-
-
-def test_limit_of_the_last_rule_counts(tmp_path, monkeypatch):
-    slow = ({"subtype": "speed_limit", "sign_type": "de274-30"}, [])
-    monkeypatch.setitem(osm.RULES, "50002", slow)
-    both = {"1": (["middle_3"], ["border_3"], osm.ROAD, ["50000", "50002"])}
-    lanes, _ = read(metres(tmp_path, lanelets=both))
-    assert lanes["1"].speed_limit == pytest.approx(30 / 3.6)
-
-
 def test_positions_in_degrees_and_in_local_tags(tmp_path, lanes):
     place = osm.in_degrees(32, UTM_ORIGIN)
     degrees, _ = read(osm.lanelet_map(tmp_path / "m.osm", place))
@@ -268,3 +236,27 @@ def test_nodes_and_ways_of_bounds_are_limited(tmp_path, monkeypatch):
     assert f"lanelet 2: {2 * points} nodes" in refused(read, path)
     monkeypatch.setattr(lanelet2_rules, "MAX_WAYS", 2)
     assert "3 ways: expected up to 2" in refused(read, path)
+
+
+def test_rules_are_read_once(tmp_path, monkeypatch):
+    """However many lanelets name a rule, and however often."""
+    roles = []
+
+    def counted(element, role, kind):
+        roles.append(role)
+        return members(element, role, kind)
+
+    monkeypatch.setattr(lanelet2_rules, "members", counted)
+    lanelet = (["middle_3"], ["border_3"], osm.ROAD, ["50000", "50001"] * 20)
+    lanes, _ = read(metres(tmp_path, lanelets={"1": lanelet, "2": lanelet}))
+    assert lanes["2"].speed_limit == pytest.approx(50 / 3.6)
+    assert roles.count("yield") == len(osm.RULES)
+    assert roles.count("refers") == len(osm.RULES)
+
+
+def test_a_stop_line_keeps_no_others(tmp_path, monkeypatch):
+    rule = ({"subtype": "traffic_light"}, [("way", "line", "ref_line")] * 9)
+    monkeypatch.setitem(osm.RULES, "50001", rule)
+    lane = read(metres(tmp_path))[0]["30004"]
+    np.testing.assert_allclose(lane.stop_line, [[93.25, -78.0], [96.75, -78.0]])
+    assert lane.stop_line.base is None

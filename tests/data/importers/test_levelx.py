@@ -101,21 +101,6 @@ def test_markings(motorway, marks):
         read(motorway)
 
 
-def test_many_markings_are_read_in_full(motorway):
-    marks = ";".join(f"{8.51 + 4.0 * k:.20f}" for k in range(4))
-    edit(motorway / "01_recordingMeta.csv", "8.51;12.59;16.43", marks)
-    assert len(only(motorway).lanes) == 5
-
-
-def test_marked_lanes_longer_than_roads_are_not_made(tmp_path):
-    marks = [";".join(f"{4 * k}" for k in range(a, a + 7)) for a in (0, 7)]
-    meta = {"upperLaneMarkings": marks[0], "lowerLaneMarkings": marks[1]}
-    rows = (np.zeros(1), np.ones(1))
-    assert len(marked_lanes(tmp_path, meta, (0.0, 400.0), None, rows)) == 12
-    with pytest.raises(InputError, match=r"lanes: 1\.18812e\+07 m long in all"):
-        marked_lanes(tmp_path, meta, (0.0, 9.9e5), None, rows)
-
-
 # -------------------------------------------------------------- inD and sisters
 
 
@@ -125,13 +110,6 @@ def test_headings_in_degrees_and_sizes_of_zero(junction):
     assert (tracks["3"].kind, tracks["3"].length) == (Kind.PEDESTRIAN, 0.5)
     assert (tracks["4"].kind, tracks["4"].length) == (Kind.CYCLIST, 1.8)
     assert tracks["2"].length == 11.5
-
-
-def test_sizes_of_the_source(junction, tmp_path):
-    source = tmp_path / "s.toml"
-    source.write_text("[sizes]\npedestrian = [0.6, 0.4]\n")
-    tracks = {track.id: track for track in only(junction, source).tracks}
-    assert (tracks["3"].length, tracks["3"].width) == (0.6, 0.4)
 
 
 def test_walkers_without_a_heading_get_that_of_their_path(tmp_path):
@@ -230,13 +208,6 @@ def test_map_of_the_source(junction, tmp_path):
         read(junction, source)
 
 
-def test_without_a_map_lanes_follow_the_paths(junction):
-    (junction / "maps" / "lanelets" / "04_aseag" / "location4.osm").unlink()
-    recording = only(junction)
-    assert any("no map found" in note for note in recording.notes)
-    assert len(recording.lanes) >= 2
-
-
 def test_a_map_of_another_place_is_not_used(junction):
     path = junction / "maps" / "lanelets" / "04_aseag" / "location4.osm"
     osm.lanelet_map(path, osm.in_degrees(32, (0.0, 5.2e6)))
@@ -285,14 +256,6 @@ def test_lives_of_tracks(junction, row, other, found):
         read(junction)
 
 
-def test_without_a_number_of_frames_the_ends_count(junction):
-    edit(junction / "data" / "07_tracksMeta.csv", "numFrames", "lifetime")
-    assert len(only(junction).tracks) == 6
-    rows_of(junction / "data" / "07_tracks.csv", lambda k, _: k != 50)
-    with pytest.raises(InputError, match="track 0: numFrames: 299: expected 300"):
-        read(junction)
-
-
 def test_a_part_of_the_rows_on_request(junction, tmp_path):
     """Published samples hold the first rows only, and all of the meta data."""
     rows_of(junction / "data" / "07_tracks.csv", lambda k, _: k < 400)
@@ -301,12 +264,6 @@ def test_a_part_of_the_rows_on_request(junction, tmp_path):
     recording = only(junction, source)
     assert len(recording.tracks) == 2
     assert "4 tracks of tracksMeta have no rows" in recording.notes
-
-
-def test_gap_splits_a_track(junction):
-    rows_of(junction / "data" / "07_tracks.csv", lambda k, _: not 100 < k < 120)
-    edit(junction / "data" / "07_tracksMeta.csv", "0,299,300", "0,299,281")
-    assert [track.id for track in only(junction).tracks][:2] == ["0", "0#2"]
 
 
 # ------------------------------------------------------------------------- both
@@ -325,8 +282,10 @@ def test_classes(junction):
     assert "classes taken for vehicles: tram" in recording.notes
 
 
-def test_name_of_the_file(motorway):
-    path = motorway / "01_tracks.csv"
-    path.rename(motorway / "log.csv")
-    with pytest.raises(InputError, match=r"expected XX_tracks\.csv"):
-        read(motorway / "log.csv")
+def test_marked_lanes_longer_than_roads_are_not_made(tmp_path):
+    marks = [";".join(f"{4 * k}" for k in range(a, a + 7)) for a in (0, 7)]
+    meta = {"upperLaneMarkings": marks[0], "lowerLaneMarkings": marks[1]}
+    rows = (np.zeros(1), np.ones(1))
+    assert len(marked_lanes(tmp_path, meta, (0.0, 400.0), None, rows)) == 12
+    with pytest.raises(InputError, match=r"lanes: 1\.18812e\+07 m long in all"):
+        marked_lanes(tmp_path, meta, (0.0, 9.9e5), None, rows)

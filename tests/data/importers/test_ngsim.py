@@ -8,7 +8,6 @@ import pytest
 
 from rcirl_jax.data.cut import digest
 from rcirl_jax.errors import InputError
-from rcirl_jax.runtime.specs import spec_root
 from tests.data.importers import writers as w
 from tests.helpers import logs
 
@@ -99,15 +98,6 @@ def test_gaps_split_a_vehicle(tmp_path):
     tracks = only(w.ngsim_text(tmp_path / "a.txt", rows)).tracks
     assert [track.id for track in tracks] == ["1", "1#2", "1#3"]
     assert [track.t.size for track in tracks] == [20, 19, 40]
-
-
-def test_rows_of_vehicles_may_be_interleaved(tmp_path):
-    rows = w.ngsim_rows(vehicle=1) + w.ngsim_rows(vehicle=2, local_x=30.0, lane=3)
-    plain = only(w.ngsim_text(tmp_path / "a.txt", rows))
-    rows.sort(key=lambda row: row[1])
-    mixed = only(w.ngsim_text(tmp_path / "b.txt", rows))
-    for one, other in zip(plain.tracks, mixed.tracks, strict=True):
-        np.testing.assert_array_equal(one.x, other.x)
 
 
 def test_csv_is_the_same_as_text(tmp_path):
@@ -219,13 +209,6 @@ def test_stamped_rows_may_come_in_any_order(tmp_path, writer):
     assert whole.tracks[2].t[0] == 3600.0
 
 
-def test_repeated_rows_are_used_once(tmp_path):
-    rows = w.ngsim_rows()
-    recording = only(w.ngsim_text(tmp_path / "a.txt", rows + rows[3:5]))
-    assert recording.tracks[0].t.size == 40
-    assert any("met twice" in note for note in recording.notes)
-
-
 def bad_rows(place, column, value):
     rows = w.ngsim_rows()
     rows[place][column] = value
@@ -266,19 +249,6 @@ def test_malformed_rows(tmp_path, writer, rows, line, field):
     assert message.startswith(str(path))
     assert expected in message
     assert "\n" not in message
-
-
-def test_feet_declared_as_metres(tmp_path):
-    source = tmp_path / "metres.toml"
-    text = (spec_root() / "sources" / "ngsim.toml").read_text()
-    source.write_text(text.replace('unit = "ft"', 'unit = "m"'))
-    rows = [
-        row
-        for vehicle in (1, 2, 3)
-        for row in w.ngsim_rows(vehicle=vehicle, local_x=12.0 * vehicle)
-    ]
-    with pytest.raises(InputError, match="feet taken for metres"):
-        read(w.ngsim_text(tmp_path / "a.txt", rows), source)
 
 
 @pytest.mark.dataset

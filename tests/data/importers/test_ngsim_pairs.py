@@ -34,13 +34,6 @@ def test_front_bumpers_in_feet(tmp_path):
     assert any("length of follower 1032 unknown" in note for note in recording.notes)
 
 
-def test_length_of_a_follower_that_leads_elsewhere(tmp_path):
-    fixture.write(tmp_path)
-    first, second = read(tmp_path)
-    assert first.tracks[0].length == pytest.approx(15.2 * FOOT)
-    assert second.tracks[0].length == 4.5
-
-
 def test_pairs_that_share_a_car_are_one_group(tmp_path):
     for pair in (*fixture.PAIRS, ("1032", "1025", "00099")):
         fixture.write_pair(tmp_path, *pair)
@@ -58,27 +51,12 @@ def test_pairs_that_share_a_car_are_one_group(tmp_path):
     assert groups[other.stem] not in mine
 
 
-def test_manifest_is_no_log_and_folders_are_searched(tmp_path):
-    inner = tmp_path / "train"
-    inner.mkdir()
-    fixture.write(inner)
-    assert len(read(tmp_path)) == 2
-
-
 def test_file_of_another_name(tmp_path):
     path = fixture.write_pair(tmp_path, "1032", "1025", "00046")
     path = path.rename(tmp_path / "mine.csv")
     (recording,) = read(path)
     assert [track.id for track in recording.tracks] == ["follower", "leader"]
     assert recording.group == "mine"
-
-
-def test_gap_splits_both_tracks(tmp_path):
-    path = fixture.write_pair(tmp_path, "1032", "1025", "00046")
-    lines = path.read_text().splitlines()
-    path.write_text("\n".join(lines[:100] + lines[120:]) + "\n")
-    (recording,) = read(path)
-    assert [t.id for t in recording.tracks] == ["1032", "1032#2", "1025", "1025#2"]
 
 
 def test_options(tmp_path):

@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from rcirl_jax.data.cut import cut, digest
+from rcirl_jax.data.cut import cut
 from rcirl_jax.data.importers import parts, read_part
-from rcirl_jax.data.readers.tables import streams
-from rcirl_jax.errors import InputError
 from tests.data.importers import writers as w
 from tests.data.importers.test_csv_stream import scenes_by_name
 from tests.data.small_logs import CONFIG
@@ -100,21 +98,6 @@ def test_pieces_hold_the_scenes_of_the_whole(tmp_path, shuffled):
             np.testing.assert_array_equal(scenes.decisions[row], other.decisions[at])
 
 
-def native(path, stamp=BEGIN["i-80"][0]):
-    rows = [row for n in range(12) for row in vehicle(n, 60 * n, stamp)]
-    return w.ngsim_text(path, rows)
-
-
-def test_pieces_of_the_native_text_are_those_of_the_csv(tmp_path, monkeypatch):
-    monkeypatch.setattr(streams, "READ_BYTES", 10_000)
-    path = native(tmp_path / "native.txt")
-    rows = [line.split() for line in path.read_text().splitlines()]
-    table = w.ngsim_csv(tmp_path / "native.csv", rows)
-    texts, tables = read(path, 1), read(table, 1)
-    assert [made.name for made in texts] == [f"native-0000{k}" for k in range(3)]
-    assert [digest(made) for made in texts] == [digest(made) for made in tables]
-
-
 def test_notes_name_what_is_left_out_and_repeated(tmp_path):
     first = read(write(tmp_path / "portal.csv"), 1)[0]
     assert first.notes == (
@@ -122,20 +105,3 @@ def test_notes_name_what_is_left_out_and_repeated(tmp_path):
         "3 vehicles without length; default by class",
         "3 rows met twice, used once",
     )
-
-
-def test_without_stamps_the_frames_are_the_clock(tmp_path):
-    rows = [row for n in range(6) for row in vehicle(n, 60 * n, 0.0)]
-    rows = [[*row[:3], 0, *row[4:]] for row in rows]
-    path = w.ngsim_csv(tmp_path / "one.csv", rows)
-    (whole,), pieces = read(path), read(path, 1)
-    assert [made.name for made in pieces] == ["one-00000", "one-00001"]
-    users = {track.id for made in pieces for track in made.tracks}
-    assert users == {track.id for track in whole.tracks}
-
-
-def test_a_portal_without_a_freeway(tmp_path):
-    rows = vehicle(1, 0, 1.2e12, 40)
-    path = w.ngsim_csv(tmp_path / "portal.csv", rows, sites=["peachtree"] * 40)
-    with pytest.raises(InputError, match="Location: peachtree: expected one of us-101"):
-        read(path, 1)

@@ -9,7 +9,6 @@ import shapely
 
 from rcirl_jax.data.importers.nuplan import geopackage
 from rcirl_jax.data.importers.nuplan import reader as nuplan
-from rcirl_jax.data.readers import long_logs
 from tests.data.importers.formats import nuplan as fixture
 from tests.data.importers.formats.nuplan import edit
 from tests.helpers import logs
@@ -103,43 +102,6 @@ def test_logs_of_one_drive_are_one_group(name, drive):
     assert nuplan.drive_of(name) == drive
 
 
-def test_windows_hold_the_scenes_of_the_log(original, whole, monkeypatch):
-    """Surroundings are shortened to those of a log of 8 s."""
-    monkeypatch.setattr(long_logs, "BEFORE_S", 1.0)
-    monkeypatch.setattr(long_logs, "AFTER_S", 2.5)
-    found = read(original[0] / original[1], window_s=3.0)
-    assert [r.name for r in found] == [f"{fixture.NAME}-{k:03d}" for k in range(3)]
-    assert {(r.group, r.piece_of) for r in found} == {(DRIVE, fixture.NAME)}
-    egos = [recording.tracks[0] for recording in found]
-    np.testing.assert_allclose(
-        [(ego.t[0], ego.t[-1]) for ego in egos],
-        [(0.0, 5.15), (1.7, 7.8), (4.35, 8.0)],
-        atol=0.051,
-    )
-    assert {ego.first_seen_s for ego in egos} == {0.0}
-    for recording, ego in zip(found, egos, strict=True):
-        assert all(signal.start[0] == ego.t[0] for signal in recording.signals)
-    one, apart = logs.scenes_of([whole], 1.5), logs.scenes_of(found, 1.5)
-    assert len(one) > 40
-    assert set(apart) == set(one)
-
-
-def test_missing_velocity_comes_from_positions(log):
-    edit(log, "UPDATE lidar_box SET vx = NULL", "UPDATE ego_pose SET vy = NULL")
-    tracks = tracks_of(only(log))
-    for name in ("ego", fixture.TRACK["12"].hex()):
-        np.testing.assert_allclose(tracks[name].speed, 8.0, atol=0.1)
-
-
-def test_ego_alone_on_its_path(log):
-    edit(log, "DELETE FROM lidar_box")
-    recording = only(log)
-    assert [track.id for track in recording.tracks] == ["ego"]
-    assert recording.lanes[0].id == "path-0"
-    for word in ("alone", "no map here"):
-        assert any(word in note for note in recording.notes)
-
-
 # ------------------------------------------------------------------------ map
 
 
@@ -175,20 +137,6 @@ def test_stop_lines_signs_and_lights(whole):
     assert signals["72"].state == ("off",)
 
 
-def test_light_without_status_for_a_second_is_off(log):
-    first = fixture.START_US + 2_000_000
-    edit(
-        log,
-        "DELETE FROM traffic_light_status WHERE lidar_pc_token IN (SELECT token "
-        f"FROM lidar_pc WHERE timestamp BETWEEN {first} AND {first + 2_000_000})",
-    )
-    signals = {signal.id: signal for signal in only(log).signals}
-    assert signals["71"].state == ("red", "off", "red", "green")
-    assert signals["71"].start[1] == pytest.approx(2.95, abs=0.06)
-    edit(log, "DROP TABLE traffic_light_status")
-    assert only(log).signals == ()
-
-
 @pytest.mark.parametrize(
     ("version", "location", "is_found"),
     [
@@ -217,14 +165,6 @@ def test_latest_version_of_a_map_as_the_archive_unpacks_it(folder, city):
     (maps / "nuplan-maps-v1.0.json").write_text("{}")
     maps.rename(maps.with_name("nuplan-maps-v1.0"))
     assert set(lanes_of(only(folder))) == {"61", "62", "63"}
-
-
-def test_maps_option(folder, tmp_path):
-    shutil.move(folder.parents[2] / "maps", tmp_path / "elsewhere")
-    assert only(folder).lanes[0].id == "path-0"
-    for place in ("../elsewhere", str(tmp_path / "elsewhere")):
-        assert "61" in lanes_of(only(folder, maps=place))
-    assert "source TOML: maps: gone: no map of" in refused(only, folder, maps="gone")
 
 
 def in_utm(points):
@@ -340,8 +280,8 @@ def test_rows_are_limited(log, monkeypatch):
     assert "lidar_box.track_token: more than 100 rows" in refused(read, log)
 
 
-def test_zone_of():
-    assert geopackage.zone_of("epsg:32648") == (48, False)
-    assert geopackage.zone_of(32719) == (19, True)
-    for bad in ("epsg:4326", None, "32661", "x32611"):
-        assert geopackage.zone_of(bad) is None
+def test_missing_velocity_comes_from_positions(log):
+    edit(log, "UPDATE lidar_box SET vx = NULL", "UPDATE ego_pose SET vy = NULL")
+    tracks = tracks_of(only(log))
+    for name in ("ego", fixture.TRACK["12"].hex()):
+        np.testing.assert_allclose(tracks[name].speed, 8.0, atol=0.1)

@@ -130,14 +130,6 @@ def test_layouts_of_the_campaigns(tmp_path):
     assert [track.length for track in recording.tracks[:2]] == [4.46, 4.01]
 
 
-def test_car_without_positions_is_noted(tmp_path):
-    columns = fixture.table(fixture.cars())
-    for name in ("Lat2", "Lon2", "E2", "N2"):
-        del columns[name]
-    recording = only(drive(tmp_path, columns))
-    assert "car 2 has no positions; left out" in recording.notes
-
-
 def test_only_human_drives_are_demonstrations(tmp_path):
     """Car 2 is driven by its ACC: surroundings of cars 1 and 3."""
     recording = only(drive(tmp_path))
@@ -189,20 +181,6 @@ def test_long_drives_are_cut(tmp_path):
     assert whole.name == "part1"
 
 
-def test_blocks_hold_what_lies_in_them(tmp_path):
-    """Of a driver who changes all the time, the changes in and beside a block."""
-    count = 400
-    columns = {"Time": [f"{0.1 * k:.1f}" for k in range(count)]}
-    columns |= {"Speed1": ["10"] * count, "N1": ["0"] * count}
-    columns["E1"] = [f"{k}" for k in range(count)]
-    columns["Driver1"] = ["Human", "ACC"] * (count // 2)
-    found = read(drive(tmp_path, columns), spec(tmp_path, "block_s = 2.0\n"))
-    assert len(found) == 20
-    for track in (one for made in found for one in made.tracks):
-        assert 9 <= len(track.automated) <= 20
-        assert not track.is_human(float(track.t[2]), float(track.t[4]))
-
-
 def test_far_places_are_moved(tmp_path):
     columns = fixture.table(fixture.cars())
     for car in (1, 2, 3):
@@ -217,12 +195,6 @@ def test_far_places_are_moved(tmp_path):
     assert recording.tracks[0].x[0] < 1000.0
     centres = np.concatenate([lane.centre for lane in recording.lanes])
     assert np.abs(centres).max() < 2000.0
-
-
-def test_specifications_are_no_logs(tmp_path):
-    fixture.write(tmp_path)
-    (tmp_path / "AstaZero_notes.csv").write_text("Equipment,RT Range\n")
-    assert len(read(tmp_path)) == 1
 
 
 def lap(radius, turns, noise=0.0):
@@ -273,33 +245,7 @@ def test_standing_cars_make_no_lanes():
     assert path_lanes([dataclasses.replace(parked, x=5.0 + jitter)], 3.5, None) == ()
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "block_s = 1e-320",
-        'drivers = "robots"',
-        "block_s = -1.0",
-        "rate_hz = 0.0",
-        'rate_hz = "x"',
-    ],
-)
-def test_bad_options(tmp_path, text):
-    with pytest.raises(InputError, match=r"source TOML: "):
-        read(drive(tmp_path), spec(tmp_path, text))
-
-
 def test_columns_but_no_car(tmp_path):
     columns = {"Time": ["0.0", "0.1"], "IVS1": ["1", "2"]}
     with pytest.raises(InputError, match="expected Speed1, E1, N1"):
-        read(drive(tmp_path, columns))
-
-
-def test_empty_columns(tmp_path):
-    columns = {
-        "Time": ["0.0", "0.1"],
-        "Speed1": ["", ""],
-        "E1": ["", ""],
-        "N1": ["", ""],
-    }
-    with pytest.raises(InputError, match="tracks: none"):
         read(drive(tmp_path, columns))

@@ -20,13 +20,6 @@ def test_every_format_is_told_by_its_files(name, tmp_path):
     assert recognised_format(fixture.input) == format_of(name)
 
 
-def test_no_input_is_synthetic_traffic(tmp_path):
-    assert recognised_format(None) == "synthetic"
-    toml = tmp_path / "traffic.toml"
-    toml.write_text("rate_hz = 10.0\n")
-    assert recognised_format(toml) == "synthetic"
-
-
 def test_ngsim_in_both_forms(tmp_path):
     text = w.ngsim_text(tmp_path / "a.txt", w.ngsim_rows())
     table = w.ngsim_csv(tmp_path / "a.csv", w.ngsim_rows())
@@ -67,12 +60,12 @@ def test_an_import_says_what_it_recognised(tmp_path):
     path = tmp_path / "log" / "log.csv"
     path.write_text("a;b\n1;2\n")
     flags = (f"--input={tmp_path / 'log'}", f"--output={tmp_path / 'out'}")
-    done = command("experiments.import_logs", *flags)
+    done = command("rcirl_jax", "import", *flags)
     assert done.returncode == 2
     assert done.stderr.startswith(f"error: {path}: --format: not given: a table of no")
     path.write_text(people.text([row[:7] for row in people.rows()], people.HEADER[:7]))
     more = ("--keep_free_road", "--keep_steady", "--test_fraction=0")
-    done = command("experiments.import_logs", *flags, *more)
+    done = command("rcirl_jax", "import", *flags, *more)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("--format=csv: recognised\n")
 

@@ -6,9 +6,8 @@ import pytest
 
 from rcirl_jax.data.importers import read_recordings
 from rcirl_jax.data.importers.tracks import of_one_name, once_each
-from rcirl_jax.types import Kind
 from tests.data.importers import writers as w
-from tests.data.importers.formats import argoverse2, l5, waymo
+from tests.data.importers.formats import argoverse2, waymo
 from tests.data.importers.test_conformance import format_of, write
 from tests.helpers import logs
 
@@ -39,14 +38,6 @@ def test_a_scenario_of_argoverse(tmp_path):
     assert [t.id for t in made.tracks] == [t.id for t in whole.tracks]
 
 
-def test_a_scene_of_l5(tmp_path):
-    """Two boxes of one frame with the same id: the first counts."""
-    fixture = l5.write(tmp_path)
-    l5.put("agents", "track_id", 15, slice(0, 2))(fixture)
-    made = logs.read("l5", fixture.input)[0]
-    assert has_note(made, "1 states of a road user met twice")
-
-
 def test_tracks_of_one_id(tmp_path):
     """Waymo's and CommonRoad's: the longest counts."""
     fixture = waymo.write(tmp_path)
@@ -60,14 +51,6 @@ def test_tracks_of_one_id(tmp_path):
     assert has_note(made, "1 tracks with the id of another left out")
     kept, notes = of_one_name([*made.tracks] * 3)
     assert (len(kept), notes) == (3, [])
-
-
-def test_a_step_of_commonroad(tmp_path):
-    states = [w.state(k, 1.5 * k, 0) for k in (1, 2, 2, 3)]
-    path = w.commonroad(tmp_path / "a.xml", w.lanelet(), w.car(states=states))
-    made = logs.only("commonroad", path)
-    np.testing.assert_allclose(made.tracks[0].x, [0.0, 1.5, 3.0, 4.5])
-    assert has_note(made, "1 states of a step met twice")
 
 
 # ---------------------------------------------------------------------------- regions
@@ -104,11 +87,3 @@ def test_a_table_without_rows_is_empty(name, tmp_path):
     (made, *_) = read_recordings(format_of(name), log)
     assert made.tracks == ()
     assert has_note(made, "rows: none")
-
-
-def test_no_pedestrians_beside_the_vehicles(tmp_path):
-    log, beside = write("interaction", tmp_path).files[:2]
-    assert beside.name.startswith("pedestrian_tracks")
-    beside.write_text(beside.read_text().partition("\n")[0] + "\n")
-    (made,) = read_recordings("interaction", log)
-    assert {track.kind for track in made.tracks} == {Kind.VEHICLE}

@@ -8,6 +8,7 @@ import pytest
 
 from rcirl_jax.types import Kind
 from tests.data.importers.formats import ros2 as fixture
+from tests.data.importers.formats.drives import DURATION_S
 from tests.data.importers.formats.ros2 import (
     OBJECTS,
     ODOMETRY,
@@ -66,7 +67,7 @@ def test_a_bag_of_two_files(tmp_path):
     assert (made.name, made.rate_hz, made.group) == ("drive", 10.0, None)
     assert set(tracks_of(made)) == set(fixture.expected())
     assert_as_driven(tracks_of(made)["ego"], "ego")
-    assert tracks_of(made)["ego"].is_human(0.0, fixture.DURATION_S)
+    assert tracks_of(made)["ego"].is_human(0.0, DURATION_S)
     assert has_note(made, "x = 81000 m, y = 50000 m")
     assert has_note(made, "no map given")
 

@@ -1,8 +1,6 @@
 """ROS 2 bags: lights, lanes, storages, windows, and files that are refused."""
 
-import contextlib
 import math
-import sqlite3
 import sys
 
 import numpy as np
@@ -11,27 +9,21 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from mcap.writer import Writer as PlainWriter
 
-from rcirl_jax.data.importers import parts, read_recordings
 from tests.data.importers.formats import osm
 from tests.data.importers.formats import ros2 as fixture
 from tests.data.importers.formats.ros2 import (
     OBJECTS,
     ODOMETRY,
     ego,
-    seen,
-    tracked_objects,
 )
 from tests.data.importers.test_ros2 import (
     ALONE,
     PERCEPTION,
     has_note,
-    label,
     line_of,
     only,
-    read,
 )
 from tests.helpers import logs
-from tests.helpers.logs import tracks_of
 
 # -------------------------------------------------------------- lights and lanes
 
@@ -66,33 +58,6 @@ def test_lights_govern_the_lane_at_their_place(tmp_path):
     assert has_note(made, "light 7: no lane within 3 m")
 
 
-def test_a_light_unseen_for_a_second_is_off(tmp_path):
-    def make(t):
-        message = fixture.lights(t)
-        if t > 2.05:
-            message["traffic_light_groups"] = []
-        return message
-
-    signal, _ = of_light(tmp_path, light_messages(make))
-    assert signal.state == ("red", "off")
-    np.testing.assert_allclose(signal.start, [0.0, 3.1], atol=1e-6)
-
-
-def test_lights_of_the_older_package(tmp_path):
-    """SOLID_OFF is 13 there, amber 2."""
-
-    def make(t):
-        status = 13 if t > 3.95 else 14
-        light = {"color": 2, "shape": 5, "status": status, "confidence": 1.0}
-        signals = [{"map_primitive_id": 1034, "lights": [light]}]
-        return {"header": fixture.header(t), "signals": signals}
-
-    kind = "autoware_auto_perception_msgs/TrafficSignalArray"
-    signal, _ = of_light(tmp_path, light_messages(make, kind))
-    assert signal.state == ("yellow", "off")
-    np.testing.assert_allclose(signal.start, [0.0, 4.0], atol=1e-6)
-
-
 @pytest.mark.parametrize("given", ["north", [[1.0]], [[1.0, float("nan")]], [], {}])
 def test_places_of_lights_that_are_none(tmp_path, given):
     line = line_of(tmp_path, ego(), **ALONE, lights={"1034": given})
@@ -123,18 +88,6 @@ def test_lanes_of_a_lanelet2_map(tmp_path):
     assert line == ("source TOML: map: nowhere.osm: missing: expected a Lanelet2 map")
 
 
-def test_lanes_of_a_table_beside_the_bag(tmp_path):
-    x, y = fixture.CENTRE
-    rows = [f"a,{x + k},{y},4.0" for k in (-10.0, 100.0)]
-    (tmp_path / "lanes.csv").write_text("\n".join(["id,x,y,width", *rows]) + "\n")
-    made = only(tmp_path, ego(), **ALONE, lanes={"file": "lanes.csv"})
-    (lane,) = made.lanes
-    np.testing.assert_allclose(lane.centre, [[-10.0, 0.0], [100.0, 0.0]])
-    np.testing.assert_allclose(lane.left_width, 2.0)
-    line = line_of(tmp_path, ego(), **ALONE, lanes={"file": "other.csv"})
-    assert "lanes.file: other.csv: expected this CSV beside the log" in line
-
-
 # -------------------------------------------------------------- bags and windows
 
 
@@ -153,21 +106,6 @@ def test_sqlite_storage_is_the_same(tmp_path):
     old = fixture.sqlite(tmp_path / "old.db3", bag / "drive_0.mcap", definitions=False)
     line = line_of(old)
     assert f"{old}: {ODOMETRY} (nav_msgs/msg/Odometry): schema encoding: ''" in line
-
-
-def test_a_topic_without_a_definition_is_noted(tmp_path):
-    """Where it need not be there; what says who drove is missed in words."""
-    bag = fixture.write(tmp_path).input / "drive" / "drive_0.mcap"
-    file = fixture.sqlite(tmp_path / "other.db3", bag)
-    with contextlib.closing(sqlite3.connect(file)) as database, database:
-        database.execute(
-            "DELETE FROM message_definitions WHERE topic_type LIKE '%ControlMode%'"
-        )
-    made = only(file)
-    assert {track.id for track in made.tracks} >= {"ego"}
-    (note,) = [note for note in made.notes if "not read" in note]
-    assert note.startswith("/vehicle/status/control_mode (autoware_vehicle_msgs/msg/")
-    assert note.endswith("who drove is not known")
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))
@@ -191,49 +129,6 @@ def test_a_file_without_chunks(tmp_path):
     np.testing.assert_array_equal(
         only(path, **ALONE).tracks[0].x, only(sound, **ALONE).tracks[0].x
     )
-
-
-def test_bags_of_a_folder(tmp_path):
-    """Folders with metadata.yaml are bags; names met twice get their folder's."""
-    fixture.write(tmp_path)
-    for day in ("monday", "tuesday"):
-        (tmp_path / day).mkdir()
-        fixture.mcap(tmp_path / day / "a.mcap", [*ego(), *seen(tracked_objects())])
-    (tmp_path / ".trash.mcap").write_bytes(b"")
-    found, _ = parts("ros2", tmp_path)
-    names = [part.relative_to(tmp_path).as_posix() for part in found]
-    assert names == ["drive", "monday/a.mcap", "tuesday/a.mcap"]
-    made = [one.name for one in read_recordings("ros2", tmp_path)]
-    assert made == ["drive", "monday/a", "tuesday/a"]
-
-
-def test_a_long_bag_becomes_windows(tmp_path):
-    """Each scene in one of them; road users keep their names; stamps tell the time."""
-    seconds, others = 150.0, tracked_objects(names=["12", "31"])
-    both = [*ego(seconds, step=0.2), *seen(others, seconds=seconds, step=0.2)]
-    messages = sorted(both, key=lambda item: item[2])
-    path = fixture.mcap(tmp_path / "a.mcap", messages)
-    whole = only(path)
-    made = read(path, window_s=40.0)
-    assert [one.name for one in made] == [f"a-{k:03d}" for k in range(4)]
-    assert {one.group for one in made} == {"a"}
-    within = [one.scenes_within for one in made]
-    assert [begin for begin, _ in within] == [0.0, 40.0, 80.0, 120.0]
-    assert within[-1][1] > seconds
-    shares = [one.progress for one in made]
-    assert shares == sorted(shares)
-    assert 0.0 < shares[0] < shares[-1] == 1.0
-    for name in ("ego", label("12"), label("31")):
-        before = tracks_of(whole)[name]
-        for one in made:
-            low, high = one.scenes_within
-            track = tracks_of(one)[name]
-            assert track.t[0] == pytest.approx(max(low - 5.0, 0.0))
-            assert track.t[-1] == pytest.approx(min(high + 27.8, seconds))
-            rows = np.searchsorted(before.t, track.t - 1e-6)
-            own = np.hypot(*np.diff([track.x, track.y]))
-            moved = np.hypot(*np.diff([before.x[rows], before.y[rows]]))
-            np.testing.assert_allclose(own, moved, atol=1e-6)
 
 
 # -------------------------------------------------------------------- refusals
@@ -337,21 +232,6 @@ def test_without_the_extra(tmp_path, monkeypatch):
         assert line.endswith("expected pip install 'rcirl-jax[ros2]'")
 
 
-def test_metadata(tmp_path):
-    bag = fixture.write(tmp_path).input / "drive"
-    names = ["drive_0.mcap", "drive_1.mcap"]
-    (bag / names[1]).unlink()
-    line = line_of(tmp_path)
-    assert "metadata.yaml: relative_file_paths: drive_1.mcap: missing" in line
-    fixture.metadata(bag, names, compression_mode="MESSAGE")
-    assert "metadata.yaml: compression_mode: MESSAGE: expected" in line_of(tmp_path)
-    fixture.metadata(bag, [])
-    assert "metadata.yaml: relative_file_paths: none: expected" in line_of(tmp_path)
-    (bag / "drive_0.mcap.zstd").write_bytes(b"packed")
-    fixture.metadata(bag, ["drive_0.mcap.zstd"])
-    assert "drive_0.mcap.zstd: compressed as a whole: expected" in line_of(tmp_path)
-
-
 def test_values_of_messages(tmp_path):
     """The line names file, topic, message and field."""
     where = f"{tmp_path / 'a.mcap'}: {ODOMETRY}: message 0: "
@@ -389,3 +269,18 @@ def test_stamps_of_several_clocks(tmp_path):
     messages = [*ego(1.0), *ego(1.0, change=unset)]
     line = line_of(tmp_path, messages, **ALONE)
     assert "header.stamp: 1.7e+09 s from first to last: expected at most 86400" in line
+
+
+def test_lights_of_the_older_package(tmp_path):
+    """SOLID_OFF is 13 there, amber 2."""
+
+    def make(t):
+        status = 13 if t > 3.95 else 14
+        light = {"color": 2, "shape": 5, "status": status, "confidence": 1.0}
+        signals = [{"map_primitive_id": 1034, "lights": [light]}]
+        return {"header": fixture.header(t), "signals": signals}
+
+    kind = "autoware_auto_perception_msgs/TrafficSignalArray"
+    signal, _ = of_light(tmp_path, light_messages(make, kind))
+    assert signal.state == ("yellow", "off")
+    np.testing.assert_allclose(signal.start, [0.0, 4.0], atol=1e-6)

@@ -1,6 +1,5 @@
 """The shared small inputs that people reported, each with what is right for it."""
 
-import gzip
 import os
 from pathlib import Path
 
@@ -13,7 +12,6 @@ from rcirl_jax.data.parts import parts_of
 from rcirl_jax.data.quality import assumed
 from rcirl_jax.data.scenes.config import CollectConfig
 from tests.conftest import REPO
-from tests.data.importers import people
 from tests.helpers import logs
 
 # beside the recordings (`data_dir` of conftest.py)
@@ -22,163 +20,86 @@ CASES = (
 )
 
 
-@pytest.fixture
-def case(request):
-    folder = CASES / request.param
-    if not folder.is_dir():
-        pytest.skip(f"{folder} is not here")
-    return folder
-
-
-def of(name):
-    return pytest.mark.parametrize("case", [name], indirect=True)
+def recordings(name, form="csv"):
+    """What a case is read as, by its own TOML if it has one."""
+    case = CASES / name
+    if not case.is_dir():
+        pytest.skip(f"{case} is not here")
+    source = case / "map.toml"
+    return logs.read(form, case, source if source.is_file() else None)
 
 
 def scenes(recording):
     return len(cut(recording, CollectConfig()).vehicles)
 
 
-@pytest.mark.parametrize("case", ["01_sumo_fcd", "02_semicolon"], indirect=True)
-def test_sumo(case):
-    (found,) = people.read(case, case / "map.toml")
-    assert len(found.tracks) == 6
-    for track in found.tracks:
-        np.testing.assert_allclose(track.heading, 0.0, atol=1e-6)
-    assert 140 <= scenes(found) <= 148
+# case -> tracks, heading [rad] of all of them, fewest and most scenes
+TABLES = {
+    "01_sumo_fcd": (6, 0.0, (140, 148)),
+    "02_semicolon": (6, 0.0, (140, 148)),
+    "11_compass_heading": (None, np.radians(30.0), (1, 10**6)),
+    "20_latlon": (6, None, (100, 10**6)),
+    "21_decimal_comma": (6, None, (100, 10**6)),
+}
 
 
-@of("03_tgsim")
-def test_tgsim(case, tmp_path):
-    """Its automation column says no in every row; said yes, nobody is human."""
+@pytest.mark.parametrize("name", TABLES)
+def test_tables(name):
+    (found,) = recordings(name)
+    tracks, heading, (fewest, most) = TABLES[name]
+    assert tracks in (None, len(found.tracks))
+    if heading is not None:
+        for track in found.tracks:
+            np.testing.assert_allclose(track.heading, heading, atol=1e-3)
+    assert fewest <= scenes(found) <= most
+
+
+def test_an_automation_column_that_says_no_or_yes(tmp_path):
+    recordings("03_tgsim")
+    case = CASES / "03_tgsim"
+    source, log = tmp_path / "map.toml", tmp_path / "run.csv"
+    lane = 'lane = "lane_kf"'
     text = (case / "map.toml").read_text()
-    source = tmp_path / "map.toml"
-    source.write_text(
-        text.replace('lane = "lane_kf"', 'lane = "lane_kf"\nautomated = "av"')
-    )
-    (found,) = people.read(case / "run.csv", source)
-    assert not any(track.automated for track in found.tracks)
-    log = tmp_path / "run.csv"
+    source.write_text(text.replace(lane, f'{lane}\nautomated = "av"'))
     log.write_text((case / "run.csv").read_text().replace(",no,", ",yes,"))
-    (found,) = people.read(log, source)
-    assert all(track.automated for track in found.tracks)
+    for path, expected in ((case / "run.csv", False), (log, True)):
+        (found,) = logs.read("csv", path, source)
+        assert {bool(track.automated) for track in found.tracks} == {expected}
 
 
-@of("11_compass_heading")
-def test_compass(case):
-    (found,) = people.read(case, case / "map.toml")
-    assert any("cw_from_north" in note for note in found.notes)
-    for track in found.tracks:
-        np.testing.assert_allclose(track.heading, np.radians(30.0), atol=1e-3)
-    obstacles = cut(found, CollectConfig()).scenes.scene.obstacles
-    width = (obstacles.l_upper - obstacles.l_lower)[obstacles.valid]
-    assert np.median(width) == pytest.approx(1.80, abs=0.02)
-
-
-@pytest.mark.parametrize("case", ["20_latlon", "21_decimal_comma"], indirect=True)
-def test_degrees_and_decimal_commas(case):
-    (found,) = people.read(case, case / "map.toml")
-    assert len(found.tracks) == 6
-    spans = [np.ptp(track.x) for track in found.tracks]
-    assert 245.0 < min(spans) <= max(spans) < 400.0
-    assert {round(float(np.median(t.y)), 1) for t in found.tracks} == {0.0, -3.5}
-    assert scenes(found) > 100
-
-
-def named(folder, case, pattern):
-    source = folder / "map.toml"
+@pytest.mark.parametrize("pattern", ["*.csv.gz", "*.parquet"])
+def test_a_drone_recording_in_both_forms(pattern, tmp_path):
+    case, source = CASES / "30_drone_recording", tmp_path / "map.toml"
+    if not case.is_dir():
+        pytest.skip(f"{case} is not here")
     text = (case / "map.toml").read_text()
     source.write_text(text.replace('pattern = "*.csv"', f'pattern = "{pattern}"'))
-    return source
-
-
-def assert_drone(found, other):
+    (found,) = logs.read("csv", case, source)
+    assert tuple(vars(found.rows).values()) == (16495, 0, 1, 0)
     assert len(found.tracks) == 52
-    for track, same in zip(found.tracks, other.tracks, strict=True):
-        assert (track.id, track.length, track.width) == (
-            same.id,
-            same.length,
-            same.width,
-        )
-        for field in ("t", "x", "y", "heading", "speed"):
-            np.testing.assert_allclose(
-                getattr(track, field), getattr(same, field), atol=1e-6
-            )
+    assert scenes(found) > 500
 
 
-@of("30_drone_recording")
-def test_a_drone_recording_in_both_forms(case, tmp_path):
-    made = [
-        people.only(case, named(tmp_path, case, pattern))
-        for pattern in ("*.csv.gz", "*.parquet")
-    ]
-    assert_drone(*made)
-    assert [people.rows_of(one) for one in made] == [(16495, 0, 1, 0)] * 2
-    assert scenes(made[0]) == scenes(made[1]) > 500
-
-
-def lines_of(case):
-    return gzip.decompress((case / "flight.csv.gz").read_bytes()).decode().splitlines()
-
-
-@of("30_drone_recording")
-def test_a_drone_recording_with_empty_cells(case, tmp_path):
-    """Optional ones are unknown; a row without a place is dropped and counted."""
-    head, *rows = lines_of(case)
-    columns = head.split(",")
-    cells = [row.split(",") for row in rows]
-    for k, row in enumerate(cells):
-        if k % 50 == 0:
-            row[columns.index("Speed_kmh")] = ""
-        if k % 70 == 0:
-            row[columns.index("Heading_deg")] = "NaN"
-        if k % 1000 == 7:
-            row[columns.index("UTM_E")] = ""
-    log = tmp_path / "flight.csv"
-    log.write_text("\n".join([head, *(",".join(row) for row in cells)]))
-    found = people.only(log, case / "map.toml")
-    assert (found.rows.read, found.rows.unreadable) == (16495, 17)
-    assert found.rows.repeated + found.rows.doubled == 1
-    other = people.only(case, named(tmp_path, case, "*.parquet"))
-    assert abs(scenes(found) - scenes(other)) < 0.05 * scenes(other)
-    for track in found.tracks:
-        assert np.isfinite(track.speed).all()
-        assert np.isfinite(track.heading).all()
-
-
-@of("13_apollo_empty_desc")
-def test_a_channel_without_descriptors(case):
-    (found,) = logs.read("apollo", case)
+def test_logs_of_other_formats():
+    """A channel without descriptors; regions for places; signs of other countries."""
+    (found,) = recordings("13_apollo_empty_desc", "apollo")
     assert found.tracks
     assert any("/apollo/canbus/chassis: not read" in note for note in found.notes)
-
-
-@of("16_commonroad_region_position")
-def test_positions_that_are_regions(case):
-    """Through the rectangles' centres, at the midpoints of the intervals."""
-    (found,) = logs.read("commonroad", case)
+    (found,) = recordings("16_commonroad_region_position", "commonroad")
     for track in found.tracks:
         np.testing.assert_allclose(np.diff(track.x), 1.5)
-        np.testing.assert_allclose(track.y, 0.0)
-        np.testing.assert_allclose(track.heading, 0.0, atol=1e-12)
         np.testing.assert_allclose(track.speed, 15.0)
-    assert any("states in a region" in note for note in found.notes)
-
-
-@of("18_empty_scenario")
-def test_a_file_without_traffic_beside_another(case, tmp_path):
-    collect = CollectConfig(require_speed_change=False)
-    config = ImportConfig(format="commonroad", collect=collect, test_fraction=0.0)
-    made = import_parts(parts_of("commonroad", case), tmp_path / "out", config)
-    assert made.count == 10
-    assert made.quality["empty"] == 1
-    assert "a_no_traffic: no traffic" in made.quality["notes"]
-
-
-@of("15_argentina_limit")
-def test_signs_of_other_countries(case):
-    """The lanes' limits are those of the signs, of whatever country."""
-    found = logs.read("commonroad", case)
+    found = recordings("15_argentina_limit", "commonroad")
     assert len(found) == 11
     for recording in found:
         assert [lane.speed_limit for lane in recording.lanes] == [11.111]
         assert not any(assumed(recording).values())
+
+
+def test_a_file_without_traffic_beside_another(tmp_path):
+    recordings("18_empty_scenario", "commonroad")
+    collect = CollectConfig(require_speed_change=False)
+    config = ImportConfig(format="commonroad", collect=collect, test_fraction=0.0)
+    found = parts_of("commonroad", CASES / "18_empty_scenario")
+    made = import_parts(found, tmp_path / "out", config)
+    assert (made.count, made.quality["empty"]) == (10, 1)

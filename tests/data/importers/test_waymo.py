@@ -7,7 +7,7 @@ import struct
 import numpy as np
 import pytest
 
-from rcirl_jax.data.importers import parts, shapes
+from rcirl_jax.data.importers import shapes
 from rcirl_jax.data.readers.tfrecord import read_records
 from rcirl_jax.types import Kind
 from tests.data.importers.formats import waymo as w
@@ -113,26 +113,6 @@ def test_up_to_a_tenth_of_the_tracks_may_be_impossible(tmp_path, change, rows, w
     assert len(scenario(tmp_path, tracks=traffic(5, 1)).tracks) == 4
     many = refused(scenario, tmp_path, tracks=traffic(20, 3))
     assert f"record 0: track 100: {wrong}" in many
-
-
-def test_history_only_as_in_the_testing_files(tmp_path):
-    """11 states, and dynamic map states of the same steps; late stamps."""
-    user = straight(w.T[:11], (w.EAST, w.NORTH), 0.0, 5.0)
-    recording = scenario(
-        tmp_path,
-        timestamps_seconds=w.STAMPS[:11] + 1e9,
-        tracks=[w.track(1, 1, user, range(11))],
-        dynamic_map_states=[w.signal_states(30)] * 11,
-    )
-    np.testing.assert_allclose(recording.tracks[0].t, w.T[:11], atol=1e-4)
-    assert not any("windows" in note for note in recording.notes)
-
-
-def test_notes_on_the_recording_car_and_shared_vehicles(whole):
-    assert (whole.name, whole.group, whole.rate_hz) == (w.SCENARIO, w.SCENARIO, 10.0)
-    assert "the recording car is track 2314" in whole.notes
-    assert {track.id for track in whole.tracks if track.automated} == {"2314"}
-    assert any("training_20s" in note for note in whole.notes)
 
 
 def test_far_coordinates_get_a_local_origin(whole, tmp_path, monkeypatch):
@@ -284,31 +264,7 @@ def test_short_gaps_between_equal_colours(tmp_path):
     assert signal.state[:3] == ("red", "off", "red")
 
 
-def test_two_heads_of_one_lane_and_a_lane_that_is_not_read(tmp_path):
-    """The first known one counts."""
-    row = w.shown(0, 3, 4)
-    row["lane_states"].append({"lane": 106, "state": 4, "stop_point": w.point(0, 0)})
-    signals = scenario(tmp_path, dynamic_map_states=[row] * 91).signals
-    assert {s.id: s.state for s in signals} == {"103": ("green",), "106": ("red",)}
-
-
 # -------------------------------------------------------------------- framing
-
-
-def test_files_of_all_names_and_folders(tmp_path):
-    names = (
-        "training.tfrecord-00000-of-01000",
-        "validation/uncompressed_scenario_validation_validation.tfrecord-00149-of-00150",
-        "training_20s/a.tfrecord",
-    )
-    for number, name in enumerate(names):
-        place = tmp_path / name
-        data = [w.scenario(scenario_id=f"{number}{letter}") for letter in "ab"]
-        put(place.parent, *data, name=place.name)
-    (tmp_path / "LICENSE").write_text("text")
-    found = sorted(recording.name for recording in read(tmp_path))
-    assert found == ["0a", "0b", "1a", "1b", "2a", "2b"]
-    assert len(parts("waymo", tmp_path)[0]) == 3
 
 
 def test_records_are_read_one_by_one_up_to_a_limit(tmp_path):

@@ -107,12 +107,12 @@ def test_the_command(tmp_path):
     (tmp_path / "logs" / "log01.csv").write_text("t,id,x,y\nnothing\n")
     flags = (f"--input={tmp_path / 'logs'}", f"--output={tmp_path / 'data'}")
     flags = ("--format=csv", "--stride=1", *flags)
-    ends = commands.command("experiments.import_logs", *flags)
+    ends = commands.command("rcirl_jax", "import", *flags)
     assert ends.returncode == 2
     assert ends.stderr.strip().splitlines()[-1].startswith("error: ")
     assert not (tmp_path / "data").exists()
     flags = (*flags, "--leave_out=1", "--signals=pooled")  # which reads the logs too
-    done = commands.command("experiments.import_logs", *flags)
+    done = commands.command("rcirl_jax", "import", *flags)
     assert done.returncode == 0, done.stderr[-2000:]
     assert "1 recordings refused and left out" in done.stdout
     dataset = open_dataset(tmp_path / "data")

@@ -49,11 +49,6 @@ def test_identity_depends_on_parts_and_order():
     assert len(hashes) == 3
 
 
-def test_a_dataset_named_twice_is_refused():
-    with pytest.raises(InputError, match="distinct"):
-        joined.open_datasets(["a", "a"])
-
-
 def test_sources_count_by_their_shares_whatever_their_size():
     """Two training scenes and one: shares 1 and 1 give 3/4, 3/4 and 3/2."""
     parts = [Part([0, 1, 2], [1]), Part([3, 4], [0])]

@@ -97,7 +97,7 @@ def test_by_its_command(tmp_path):
     """Driven: other candidates drive otherwise and as far, slower ones less far."""
     out = tmp_path / "errors.json"
     short = ("--suite=free_cruise,curve_speed", "--cases=15", "--duration=10")
-    succeeded("experiments.gate_errors", f"--output={out}", "--seeds=2", *short)
+    succeeded("rcirl_jax", "gate-errors", f"--output={out}", "--seeds=2", *short)
     body = json.loads(out.read_text())
     assert (body["cases"], body["made_by"]["flags"]["seeds"]) == (60, 2)
     found = {one["candidate"]: one for one in body["kinds"]}

@@ -5,7 +5,7 @@ import pytest
 from absl import flags
 from absl.testing import flagsaver
 
-from experiments.flags.signals import checked_signals, signals_asked
+from rcirl_jax.commands.flags.signals import checked_signals, signals_asked
 from rcirl_jax.data.parts import parts_of, recordings_of
 from rcirl_jax.data.scenes.collect import Collector
 from rcirl_jax.data.scenes.config import CollectConfig

@@ -73,7 +73,7 @@ def test_labels_do_not_depend_on_where_they_are_made():
 @pytest.mark.slow
 def test_command(tmp_path):
     flags = ("--quick", "--noise=none", f"--output={tmp_path}")
-    succeeded("experiments.label_check", *flags)
+    succeeded("rcirl_jax", "label-check", *flags)
     body = json.loads((tmp_path / "labels.json").read_text())
     assert body["none"]["cases"] > 500
     assert all(score["wrong"] <= 2 for score in body["none"]["decisions"])

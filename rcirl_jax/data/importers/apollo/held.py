@@ -10,16 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.importers.apollo.messages import (
-    OBSTACLES,
-    TOPICS,
-    Rows,
-    check_held,
-)
-from rcirl_jax.data.importers.messages import between
-from rcirl_jax.errors import InputError
+from rcirl_jax.data.importers.apollo.messages import OBSTACLES, TOPICS, Rows
+from rcirl_jax.data.importers.messages import between, check_held, check_span
 
-MAX_DURATION_S = 86400.0  # s, of one drive
 CLOCK_TOLERANCE_S = 1.0  # s, two topics' clocks differ by more: not one clock
 REPEAT_S = 1.5  # s; Apollo sends the routing in force again every second
 # topics whose rows are held; the others are routings
@@ -83,7 +76,10 @@ class Held:
             self._settle()
         clock = np.concatenate([self.clock(n) for n in ("localization", self.key)])
         if clock.size:
-            self._check_span(float(clock.min()), float(clock.max()))
+            self.end = max(self.end, float(clock.max()))
+            last = max(self.end, self.now)
+            where = f"{self.path}: timestamp_sec"
+            check_span(where, float(clock.min()), last, self._since)
 
     def _settle(self) -> None:
         """Choose the clock, and where it starts."""
@@ -113,20 +109,6 @@ class Held:
     def clock(self, name: str) -> np.ndarray:
         """Time [s] of each row of a topic."""
         return self._shown(name) - self._start
-
-    def _check_span(self, first: float, last: float) -> None:
-        self.end = max(self.end, last)
-        span = max(last, self.now) - min(first, 0.0)
-        if not span <= MAX_DURATION_S:
-            raise InputError(
-                f"{self.path}: timestamp_sec: {span:g} s from first to last: "
-                f"expected at most {MAX_DURATION_S:g} s"
-            )
-        if first < self._since:
-            raise InputError(
-                f"{self.path}: timestamp_sec: {first:g} s from the start after "
-                f"{self.now:g} s: goes backwards; expected parts in order"
-            )
 
     def view(self, low: float, high: float) -> "Held":
         """Rows from one time [s] to before another, and the notes since the last."""

@@ -22,7 +22,7 @@ from rcirl_jax.data.importers.apollo.descriptors import (
     reading_of,
 )
 from rcirl_jax.data.importers.apollo.records import Record, check_size
-from rcirl_jax.data.importers.options import section
+from rcirl_jax.data.importers.messages import check_held, topics_of
 from rcirl_jax.data.importers.perception import UNKNOWN
 from rcirl_jax.data.readers.protobuf import Message
 from rcirl_jax.data.readers.reading import reading
@@ -30,7 +30,6 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.types import Kind
 
 MANUAL = "COMPLETE_MANUAL"  # driving mode of a human driver
-MAX_ROWS = 5_000_000  # obstacle states held at once
 PIECE_S = 60.0  # s of recording after which rows are handed on
 KIND_NAMES = {
     "PEDESTRIAN": Kind.PEDESTRIAN,
@@ -223,19 +222,11 @@ def read_drive(parts: list[Path], spec: dict) -> Iterator[Rows]:
 def _topics(spec: dict) -> dict[str, str]:
     """Channel -> topic."""
     usual = {name: topic.channels for name, topic in TOPICS.items()}
-    channels: dict[str, str] = {}
-    for topic, names in {**usual, **section(spec, "topics")}.items():
-        if topic not in TOPICS:
-            raise InputError(
-                f"source TOML: topics.{topic}: unknown: expected {', '.join(TOPICS)}"
-            )
-        every = [names] if isinstance(names, str) else names
-        if not isinstance(every, list | tuple) or {*map(type, every)} != {str}:
-            raise InputError(
-                f"source TOML: topics.{topic}: {names}: expected a channel or a list"
-            )
-        channels |= dict.fromkeys(every, topic)
-    return channels
+    return {
+        channel: topic
+        for topic, channels in topics_of(spec, TOPICS, usual).items()
+        for channel in channels
+    }
 
 
 class _Channel:
@@ -316,12 +307,3 @@ def _read_part(
     if not record.is_complete:
         rows.notes.append(f"{record.path.name} was never closed; read to its end")
     yield rows
-
-
-def check_held(where: str, count: int) -> None:
-    """No more obstacle states than MAX_ROWS are held."""
-    if count > MAX_ROWS:
-        raise InputError(
-            f"{where}: more than {MAX_ROWS} obstacle states in a few minutes: "
-            "expected one drive"
-        )

@@ -26,7 +26,16 @@ from rcirl_jax.data.importers.apollo.messages import LOCALIZATION, MANUAL, read_
 from rcirl_jax.data.importers.apollo.records import Run, first_parts
 from rcirl_jax.data.importers.clock import on_clock
 from rcirl_jax.data.importers.files import log_name
-from rcirl_jax.data.importers.messages import clock_rate, drive_windows
+from rcirl_jax.data.importers.messages import (
+    MAX_GAP_S,
+    automatic_notes,
+    automatic_spans,
+    clock_rate,
+    drive_windows,
+    is_anybody,
+    no_tracks,
+    speed_at,
+)
 from rcirl_jax.data.importers.options import one_pattern, positive
 from rcirl_jax.data.importers.perception import (
     Boxes,
@@ -38,15 +47,11 @@ from rcirl_jax.data.importers.perception import (
     tracks_of,
 )
 from rcirl_jax.data.importers.shapes import check_coordinates, origin_notes
-from rcirl_jax.data.importers.tracks import spans_of
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Recording, Track
 
-RATE_HZ = 10.0  # 1/s
-MAX_GAP_S = 0.55  # s without a message inside one track
 LIMIT_MPS = 29.06  # m/s, 65 mph
-MAX_SILENCE_S = 1.0  # s without a chassis message, after which nobody knows
 # Lincoln MKZ in Apollo's mkz_example: 3.89 m before, 1.043 m behind the rear axle
 EGO = {"length": 4.933, "width": 2.11, "rear_axle_to_centre": 1.4235}  # m
 # what is measured of a box
@@ -83,11 +88,7 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
                 "expected at least one of them"
             )
         if not found:
-            rate = clock_rate(spec, RATE_HZ)
-            raise InputError(
-                f"{first}: tracks: none on a clock of {rate:g} Hz: expected a longer "
-                "record"
-            )
+            raise no_tracks(first, spec)
 
 
 def _windows(held: Held, spec: dict) -> Iterator[Recording]:
@@ -104,10 +105,10 @@ def _windows(held: Held, spec: dict) -> Iterator[Recording]:
 
 def _recording(held: Held, within: tuple[float, float], spec: dict) -> Recording | None:
     """The tracks of the rows held, with notes on the time within; None: nothing."""
-    run, rate, notes = Run(held.path), clock_rate(spec, RATE_HZ), list(held.notes)
+    run, rate, notes = Run(held.path), clock_rate(spec), list(held.notes)
     obstacles, obstacle_notes = _obstacles(held, spec, rate)
     tracks = [*_ego(held, spec, rate), *obstacles]
-    if not any(t.t[0] < within[1] and t.t[-1] >= within[0] for t in tracks):
+    if not is_anybody(tracks, within):
         return None
     notes += _what_is_missing(held, within)
     _, _, origin, tracks = placed(tracks)
@@ -132,23 +133,17 @@ def _recording(held: Held, within: tuple[float, float], spec: dict) -> Recording
 
 def _what_is_missing(held: Held, within: tuple[float, float]) -> list[str]:
     """Notes on topics without messages, and on driving that is no human's."""
-    notes, (low, high) = [], within
+    notes = []
     if not len(held.tables["localization"]):
         notes.append("no localization recorded; no ego track")
-    elif not any(start < high and place for start, place in held.legs()):
+    elif not any(start < within[1] and place for start, place in held.legs()):
         notes.append("no routing recorded; the ego's destination is unknown")
     if not len(held.tables[held.key]):
         notes.append("no obstacles recorded; the ego is alone")
     elif held.key == "prediction":
         notes.append("no perception recorded; obstacles are those of prediction")
-    clock = held.clock("chassis")
-    is_manual = held.tables["chassis"][(clock >= low) & (clock < high), 3]
-    automatic = 1.0 - float(np.mean(is_manual)) if is_manual.size else 0.0
-    if automatic > 0.0:
-        notes.append(
-            f"{automatic:.0%} of the time not in {MANUAL}: the ego is no human there"
-        )
-    return notes
+    clock, by_hand = held.clock("chassis"), held.tables["chassis"][:, 3]
+    return notes + automatic_notes(clock, by_hand, within, f"in {MANUAL}")
 
 
 def _ego(held: Held, spec: dict, rate: float) -> list[Track]:
@@ -158,37 +153,12 @@ def _ego(held: Held, spec: dict, rate: float) -> list[Track]:
     where = f"{held.path}: {LOCALIZATION}"
     check_coordinates(where, "pose", ("x", "y", "heading"), table[:, 3:6])
     if t.size and not np.isfinite(speed).all():
-        speed = _chassis_speed(t, held)
+        speed = speed_at(t, held.clock("chassis"), held.tables["chassis"][:, 2])
     boxes = ego_boxes(spec, EGO, t, x, y, heading, speed)
     boxes = on_clock(boxes, rate, MAX_GAP_S)
-    return tracks_of(held.path, boxes, MAX_GAP_S, automated=_automated(held))[0]
-
-
-def _automated(held: Held) -> tuple[tuple[float, float], ...]:
-    """When the chassis was in another mode than a human driver's, or silent.
-
-    The first mode was in force before; without a chassis channel a human drives.
-    """
-    clock, mode = held.clock("chassis"), held.tables["chassis"][:, 3]
-    if not clock.size:
-        return ()
-    order = np.argsort(clock, kind="stable")
-    clock, other = clock[order], mode[order] == 0.0
-    silent = np.diff(clock, append=np.inf) > MAX_SILENCE_S
-    return spans_of(
-        np.concatenate([[-np.inf], clock, clock[silent] + MAX_SILENCE_S]),
-        np.concatenate([other[:1], other, np.ones(np.count_nonzero(silent), bool)]),
-    )
-
-
-def _chassis_speed(t: np.ndarray, held: Held) -> np.ndarray:
-    """Speed [m/s] of the wheels at times t; NaN where there is none."""
-    clock, speed = held.clock("chassis"), held.tables["chassis"][:, 2]
-    known = np.isfinite(speed)
-    if np.count_nonzero(known) < 2:
-        return np.full(t.shape, np.nan)
-    order = np.argsort(clock[known], kind="stable")
-    return np.interp(t, clock[known][order], speed[known][order])
+    # the first mode was in force before; without a chassis channel a human drives
+    automated = automatic_spans(held.clock("chassis"), held.tables["chassis"][:, 3])
+    return tracks_of(held.path, boxes, MAX_GAP_S, automated=automated)[0]
 
 
 def _obstacles(held: Held, spec: dict, rate: float) -> tuple[list[Track], list[str]]:

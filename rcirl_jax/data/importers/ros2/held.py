@@ -10,12 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.importers.messages import between
-from rcirl_jax.data.importers.ros2.messages import Rows, check_held
+from rcirl_jax.data.importers.messages import between, check_held, check_span
+from rcirl_jax.data.importers.ros2.messages import Rows
 from rcirl_jax.data.importers.ros2.readings import COLUMNS
-from rcirl_jax.errors import InputError
 
-MAX_DURATION_S = 86400.0  # s, of one drive
 PLACES = ("ego", "obstacles")  # roles that say where somebody is
 
 
@@ -64,24 +62,12 @@ class Held:
         self.has_ego = self.has_ego or len(new["ego"]) > 0
         check_held(str(self.path), len(self.tables["obstacles"]))
         if clock.size and self._start is not None:
-            self._check_span(clock.min() - self._start, clock.max() - self._start)
+            first, last = clock.min() - self._start, clock.max() - self._start
+            self.end = max(self.end, last)
+            check_span(f"{self.path}: header.stamp", first, self.end, self._since)
 
     def _shifted(self, table: np.ndarray) -> np.ndarray:
         return table - np.array([self._start, *[0.0] * (table.shape[1] - 1)])
-
-    def _check_span(self, first: float, last: float) -> None:
-        self.end = max(self.end, last)
-        span = self.end - min(first, 0.0)
-        if not span <= MAX_DURATION_S:
-            raise InputError(
-                f"{self.path}: header.stamp: {span:g} s from first to last: expected "
-                f"at most {MAX_DURATION_S:g} s; several clocks in one bag?"
-            )
-        if first < self._since:
-            raise InputError(
-                f"{self.path}: header.stamp: {first:g} s from the start after "
-                f"{self.end:g} s: goes backwards; expected one drive"
-            )
 
     def view(self, low: float, high: float) -> "Held":
         """Rows from one time [s] to before another, and the notes since the last."""

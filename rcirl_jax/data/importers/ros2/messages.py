@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rcirl_jax.data.importers.messages import check_held, topics_of
 from rcirl_jax.data.importers.options import section
 from rcirl_jax.data.importers.ros2.bag_file import Sent, Topic, decoder_of
 from rcirl_jax.data.importers.ros2.mcap_file import McapFile
@@ -20,7 +21,6 @@ from rcirl_jax.data.importers.ros2.sqlite_file import SqliteFile
 from rcirl_jax.data.readers.reading import reading
 from rcirl_jax.errors import InputError
 
-MAX_ROWS = 5_000_000  # obstacle states held at once
 MAX_MESSAGE_BYTES = 16 * 2**20  # bytes; decoded, a message takes many times its bytes
 PIECE_S = 60.0  # s of recording after which rows are handed on
 NEEDED = ("ego", "obstacles")
@@ -85,7 +85,8 @@ def _roles(files: list[Path], spec: dict) -> tuple[dict[str, str], list[str]]:
                 if topic.count != 0:
                     known.setdefault(name, topic)
     roles, notes = {}, []
-    for role, names in _topics(spec).items():
+    # of each role the first topic that a bag has counts
+    for role, names in topics_of(spec, COLUMNS, dict.fromkeys(COLUMNS, ())).items():
         met = [name for name in names if name in known]
         found = next((name for name in met if _is_read(role, known[name])), None)
         if found is not None:
@@ -127,23 +128,6 @@ def _check_type(path: Path, role: str, name: str, topic: Topic) -> None:
             f"{path}: {name}: type {topic.type!a:.80}: expected for topics.{role} one "
             f"of {', '.join(TYPES[role])}"
         )
-
-
-def _topics(spec: dict) -> dict[str, list[str]]:
-    """Role -> topics of the TOML, the first that a bag has counts."""
-    found: dict[str, list[str]] = {role: [] for role in COLUMNS}
-    for role, names in section(spec, "topics").items():
-        every = [names] if isinstance(names, str) else names
-        if role not in COLUMNS:
-            raise InputError(
-                f"source TOML: topics.{role}: unknown: expected {', '.join(COLUMNS)}"
-            )
-        if not isinstance(every, list) or not {*map(type, every)} <= {str}:
-            raise InputError(
-                f"source TOML: topics.{role}: {names}: expected a topic or a list"
-            )
-        found[role] = every
-    return found
 
 
 def _read_file(
@@ -220,12 +204,3 @@ def _readable(where: str, kind: str) -> Iterator[None]:
         raise InputError(
             f"{where}: {type(error).__name__}: {str(error)[:200]}: expected a {kind}"
         ) from error
-
-
-def check_held(where: str, count: int) -> None:
-    """No more obstacle states than MAX_ROWS are held."""
-    if count > MAX_ROWS:
-        raise InputError(
-            f"{where}: more than {MAX_ROWS} obstacle states in a few minutes: "
-            "expected one drive"
-        )

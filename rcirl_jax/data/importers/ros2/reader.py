@@ -20,7 +20,16 @@ import numpy as np
 
 from rcirl_jax.data.importers.clock import on_clock
 from rcirl_jax.data.importers.files import log_name
-from rcirl_jax.data.importers.messages import clock_rate, drive_windows
+from rcirl_jax.data.importers.messages import (
+    MAX_GAP_S,
+    automatic_notes,
+    automatic_spans,
+    clock_rate,
+    drive_windows,
+    is_anybody,
+    no_tracks,
+    speed_at,
+)
 from rcirl_jax.data.importers.options import positive, recording_car, section
 from rcirl_jax.data.importers.perception import (
     Boxes,
@@ -47,14 +56,11 @@ from rcirl_jax.data.importers.ros2.messages import Rows, read_bag
 from rcirl_jax.data.importers.ros2.objects import LEFT_OUT
 from rcirl_jax.data.importers.ros2.poses import from_the_ego
 from rcirl_jax.data.importers.shapes import check_coordinates, origin_notes
-from rcirl_jax.data.importers.tracks import spans_of, travel_heading
+from rcirl_jax.data.importers.tracks import travel_heading
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Recording, Track
 
-RATE_HZ = 10.0  # 1/s
-MAX_GAP_S = 0.55  # s without a message inside one track
-MAX_SILENCE_S = 1.0  # s without a message on who drives, after which nobody knows
 # m; Autoware's sample_vehicle (vehicle_info.param.yaml): overhangs 1.0 and 1.1, wheel
 # base 2.79, tread 1.64 and 0.128 on either side
 EGO = {"length": 4.89, "width": 1.896, "rear_axle_to_centre": 1.345}
@@ -100,11 +106,7 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
             found = True
             yield validate_recording(recording, first)
         if not found:
-            rate = clock_rate(spec, RATE_HZ)
-            raise InputError(
-                f"{first}: tracks: none on a clock of {rate:g} Hz: expected a longer "
-                "bag"
-            )
+            raise no_tracks(first, spec)
 
 
 def _windows(held: Held, files: list[Path], bag: _Bag) -> Iterator[Recording]:
@@ -137,10 +139,10 @@ def _check_ego(held: Held, bag: _Bag) -> None:
 
 def _recording(held: Held, within: tuple[float, float], bag: _Bag) -> Recording | None:
     """The tracks of the rows held, with notes on the time within; None: nothing."""
-    spec, rate = bag.spec, clock_rate(bag.spec, RATE_HZ)
+    spec, rate = bag.spec, clock_rate(bag.spec)
     obstacles, notes = _obstacles(held, spec, rate)
     tracks = [*_ego(held, spec, rate), *obstacles]
-    if not any(t.t[0] < within[1] and t.t[-1] >= within[0] for t in tracks):
+    if not is_anybody(tracks, within):
         return None
     x, y, origin, tracks = placed(tracks)
     lanes, lane_notes = lanes_for(bag.lanes, tracks, (x, y, origin), spec)
@@ -173,18 +175,12 @@ def _clock(tracks: list[Track]) -> np.ndarray:
 
 def _what_is_missing(held: Held, within: tuple[float, float]) -> list[str]:
     """Notes on roles without messages, and on driving that is no human's."""
-    tables, (low, high) = held.tables, within
+    tables = held.tables
     notes = [] if len(tables["ego"]) else ["no places of the ego; no ego track"]
     if not len(tables["obstacles"]):
         notes.append("no obstacles recorded; the ego is alone")
-    clock, is_manual = tables["driver"].T
-    inside = is_manual[(clock >= low) & (clock < high)]
-    automatic = 1.0 - float(np.mean(inside)) if inside.size else 0.0
-    if automatic > 0.0:
-        notes.append(
-            f"{automatic:.0%} of the time not driven by hand: the ego is no human there"
-        )
-    return notes
+    clock, by_hand = tables["driver"].T
+    return notes + automatic_notes(clock, by_hand, within, "driven by hand")
 
 
 def _ego(held: Held, spec: dict, rate: float) -> list[Track]:
@@ -192,19 +188,13 @@ def _ego(held: Held, spec: dict, rate: float) -> list[Track]:
     t, x, y, heading, speed = held.tables["ego"].T
     check_coordinates(held.path, "ego", ("x", "y"), held.tables["ego"][:, 1:3])
     if np.isnan(speed).any():
-        speed = np.where(np.isnan(speed), _measured(t, held.tables["velocity"]), speed)
+        clock, velocity = held.tables["velocity"].T
+        measured = speed_at(t, clock, velocity)
+        speed = np.where(np.isnan(speed), measured, speed)
     boxes = ego_boxes(spec, EGO, t, x, y, heading, speed)
     boxes = on_clock(boxes, rate, MAX_GAP_S)
     automated = _automated(held, spec)
     return tracks_of(held.path, boxes, MAX_GAP_S, automated=automated)[0]
-
-
-def _measured(t: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """Speed [m/s] of the topic of velocities at times t; NaN where there is none."""
-    if len(velocity) < 2:
-        return np.full(t.shape, np.nan)
-    clock, speed = velocity[np.argsort(velocity[:, 0], kind="stable")].T
-    return np.interp(t, clock, speed)
 
 
 def _automated(held: Held, spec: dict) -> tuple[tuple[float, float], ...]:
@@ -213,16 +203,10 @@ def _automated(held: Held, spec: dict) -> tuple[tuple[float, float], ...]:
     The first mode was in force before; without that topic `recording_car` of the TOML
     says who drove.
     """
-    clock, manual = held.tables["driver"].T
-    if not clock.size:
+    if not len(held.tables["driver"]):
         return recording_car({"recording_car": "human", **spec})
-    order = np.argsort(clock, kind="stable")
-    clock, other = clock[order], manual[order] == 0.0
-    silent = np.diff(clock, append=np.inf) > MAX_SILENCE_S
-    return spans_of(
-        np.concatenate([[-np.inf], clock, clock[silent] + MAX_SILENCE_S]),
-        np.concatenate([other[:1], other, np.ones(np.count_nonzero(silent), bool)]),
-    )
+    clock, by_hand = held.tables["driver"].T
+    return automatic_spans(clock, by_hand)
 
 
 def _obstacles(held: Held, spec: dict, rate: float) -> tuple[list[Track], list[str]]:

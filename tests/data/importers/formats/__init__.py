@@ -5,7 +5,10 @@ conformance suite reads each back and compares it with what was written.
 """
 
 import dataclasses
+import importlib
+import pkgutil
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 
@@ -56,6 +59,18 @@ class Fixture:
     has_holes: bool = False
     # whether a row that cannot be read is dropped and counted
     drops_rows: bool = False
+
+
+def modules() -> dict[str, ModuleType]:
+    """Module name -> module, of every fixture."""
+    names = [item.name for item in pkgutil.iter_modules(__path__)]
+    found = {name: importlib.import_module(f"{__name__}.{name}") for name in names}
+    return {name: module for name, module in found.items() if hasattr(module, "write")}
+
+
+def format_of(name: str) -> str:
+    """The format of a fixture: its module's name, or what the module says by FORMAT."""
+    return getattr(modules()[name], "FORMAT", name)
 
 
 def cell(column: int, separator: str = ",") -> str:

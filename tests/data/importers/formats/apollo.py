@@ -11,17 +11,19 @@ import numpy as np
 
 from rcirl_jax.types import Kind
 from tests.data.importers.formats import Fixture
-from tests.data.importers.formats.drives import samples, seen_by_a_car
+from tests.data.importers.formats.drives import (
+    GRID,
+    is_seen,
+    perception_times,
+    seen_by_a_car,
+    seen_on_clock,
+)
 from tests.data.importers.formats.proto import classes, file_of, written
 
 START_S = 1627031535.25  # s, of the first localization
 CENTRE = np.array([587000.0, 4141000.0])  # m, UTM zone 10; the local origin
 AHEAD = 1.4235  # m, from the rear axle to the centre of an MKZ
-DURATION_S = 8.0
-GRID = 0.1 * np.arange(81)
 LATE_S = 0.08  # s, from the measurement of perception to its message
-GAP = (3.0, 5.0)  # s, in which obstacle 19 is hidden
-SEEN = {"17": (2.0, 6.5)}  # s, others: the whole drive
 TYPE = {Kind.VEHICLE: 5, Kind.CYCLIST: 4, Kind.PEDESTRIAN: 3, Kind.STATIC: 2}
 
 
@@ -182,11 +184,6 @@ def obstacle(name, user, t):
     }
 
 
-def is_seen(name, t):
-    first, last = SEEN.get(name, (0.0, DURATION_S))
-    return first <= t <= last and not (name == "19" and GAP[0] < t < GAP[1])
-
-
 def seen_at(t):
     users = road_users(np.array([t]))
     return [
@@ -235,15 +232,6 @@ def parking():
     return written(MESSAGES.PlanningCommand, header=stamped(0.0), **spot)
 
 
-def perception_times():
-    """Irregular, 0.08 to 0.12 s apart; the first and last fall on the clock."""
-    t = GRID + 0.01 * np.sin(7.0 * np.arange(GRID.size))
-    t[[0, -1]] = GRID[[0, -1]]
-    for edge in (*GAP, *SEEN["17"]):
-        t[np.argmin(np.abs(GRID - edge))] = edge
-    return t
-
-
 def drive(*, obstacles=OBSTACLES):
     """(channel, s since START_S, content) of the whole drive, by time."""
     found = [
@@ -253,7 +241,7 @@ def drive(*, obstacles=OBSTACLES):
         t = 0.01 * k + (0.002 * np.sin(k) if 0 < k < 800 else 0.0)
         found.append(("/apollo/localization/pose", t, localization(t)))
         found.append(("/apollo/canbus/chassis", t, chassis(t)))
-    for t in perception_times().tolist():
+    for t in perception_times():
         made = {OBSTACLES: perception, "/apollo/prediction": prediction}
         found.append((obstacles, t + LATE_S, made[obstacles](t)))
     found.append(("/apollo/sensor/camera/front_6mm/image", 1.0, bytes(5000)))
@@ -304,22 +292,7 @@ def record(messages, *, channels=None, chunk=200, **options):
 
 def expected():
     """Tracks on the clock of 10 Hz."""
-    users = road_users(GRID)
-    found = {}
-    for name, user in users.items():
-        times = [t for t in perception_times() if name == "ego" or is_seen(name, t)]
-        if name == "19":
-            early = [t for t in times if t <= GAP[0]]
-            found["19#2"] = on_clock(user, [t for t in times if t > GAP[0]])
-            found["19"] = on_clock(user, early)
-        else:
-            found[name] = on_clock(user, times)
-    return found
-
-
-def on_clock(user, times):
-    first, last = round(10.0 * min(times)), round(10.0 * max(times))
-    return samples(user, slice(first, last + 1))
+    return seen_on_clock(road_users(GRID))
 
 
 def write(folder):
@@ -392,6 +365,6 @@ HARMS = {
 OPTIONS = [
     *[{"rate_hz": rate} for rate in (0, 1e9)],
     *[{"window_s": window} for window in (0, 1e-320, 0.99)],
-    *[{"topics": bad} for bad in (3, {"pose": "/x"}, {"routing": []})],
+    *[{"topics": bad} for bad in (3, {"pose": "/x"}, {"routing": [3]})],
     *[{"ego": 1}, {"unknown": "x"}],
 ]

@@ -8,6 +8,11 @@ from rcirl_jax.types import Kind
 from tests.data.importers.formats import Written
 
 WAVE_RAD_S = 0.7  # rad/s, of a changing speed
+# of drives that one car saw, on a clock of 10 Hz
+DURATION_S = 8.0
+GRID = 0.1 * np.arange(81)
+GAP = (3.0, 5.0)  # s, in which 19 is hidden
+SEEN = {"17": (2.0, 6.5)}  # s, others: the whole drive
 
 
 def motion(t, speed, wave):
@@ -65,6 +70,39 @@ def seen_by_a_car(t, ego):
         "27": straight(t, (0.0, -2.0), 0.0, 5.0, **cyclist),
         "31": straight(t, (40.0, -3.0), 0.0, 0.0, **post),
     }
+
+
+def is_seen(name, t):
+    """Whether a road user of `seen_by_a_car` is seen at a time [s]."""
+    first, last = SEEN.get(name, (0.0, DURATION_S))
+    return first <= t <= last and not (name == "19" and GAP[0] < t < GAP[1])
+
+
+def perception_times():
+    """Irregular, 0.08 to 0.12 s apart; the first and last fall on the clock."""
+    t = GRID + 0.01 * np.sin(7.0 * np.arange(GRID.size))
+    t[[0, -1]] = GRID[[0, -1]]
+    for edge in (*GAP, *SEEN["17"]):
+        t[np.argmin(np.abs(GRID - edge))] = edge
+    return t.tolist()
+
+
+def seen_on_clock(users, name_of=str):
+    """Tracks of the road users at `GRID`, by the names that an importer gives."""
+    found = {"ego": users["ego"]}
+    for name, user in users.items():
+        times = [t for t in perception_times() if is_seen(name, t)]
+        if name == "19":
+            found[f"{name_of(name)}#2"] = _on_clock(user, times, GAP[1])
+            times = [t for t in times if t <= GAP[0]]
+        if name != "ego":
+            found[name_of(name)] = _on_clock(user, times, 0.0)
+    return found
+
+
+def _on_clock(user, times, begin):
+    inside = [round(10.0 * t) for t in times if t >= begin]
+    return samples(user, slice(min(inside), max(inside) + 1))
 
 
 def samples(written, rows):

@@ -120,3 +120,7 @@ def write(folder):
         numbers={log: cell([*columns].index("E1"))},
         has_holes=True,
     )
+
+
+# options of values that are none
+OPTIONS = [{"drivers": "robots"}, {"rate_hz": 0.0}]

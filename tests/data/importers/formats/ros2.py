@@ -15,18 +15,20 @@ from mcap_ros2.writer import Writer
 
 from rcirl_jax.types import Kind
 from tests.data.importers.formats import Fixture
-from tests.data.importers.formats.drives import samples, seen_by_a_car
+from tests.data.importers.formats.drives import (
+    GRID,
+    is_seen,
+    perception_times,
+    seen_by_a_car,
+    seen_on_clock,
+)
 from tests.data.importers.formats.ros2_definitions import definition
 
 START_NS = 1_700_000_000_250_000_000  # ns, stamp of the first localization
 CENTRE = np.array([81000.0, 50000.0])  # m on the map; the local origin
 AHEAD = 1.345  # m, from the rear axle to the centre
 EGO_SIZE = (4.89, 1.896)  # m
-DURATION_S = 8.0
-GRID = 0.1 * np.arange(81)
 LATE_S = 0.12  # s, from the measurement of objects to their recording
-GAP = (3.0, 5.0)  # s, in which 19 is hidden
-SEEN = {"17": (2.0, 6.5)}  # s, others: the whole drive
 LABELS = {Kind.VEHICLE: 1, Kind.CYCLIST: 6, Kind.PEDESTRIAN: 7, Kind.STATIC: 0}
 LIGHT = (60.0, 0.0)  # m from CENTRE, where lane of the ego meets a light's stop line
 RED_UNTIL_S = 4.0
@@ -121,11 +123,6 @@ def tracked(name, user, **kinematics):
     }
 
 
-def is_seen(name, t):
-    first, last = SEEN.get(name, (0.0, DURATION_S))
-    return first <= t <= last and not (name == "19" and GAP[0] < t < GAP[1])
-
-
 def others(t):
     """Id -> road user at a time, those seen."""
     users = road_users(np.array([t])).items()
@@ -152,22 +149,13 @@ def control_mode(t, *, mode=4):
     return {"stamp": stamp(t), "mode": mode}
 
 
-def object_times():
-    """Irregular, 0.08 to 0.12 s apart; the first and last fall on the clock."""
-    t = GRID + 0.01 * np.sin(7.0 * np.arange(GRID.size))
-    t[[0, -1]] = GRID[[0, -1]]
-    for edge in (*GAP, *SEEN["17"]):
-        t[np.argmin(np.abs(GRID - edge))] = edge
-    return t.tolist()
-
-
 def drive():
     """(topic, type, s of recording, message) of the whole drive, by time."""
     found = []
     for k in range(161):
         t = 0.05 * k
         found.append((ODOMETRY, "nav_msgs/Odometry", t, odometry(t)))
-    for t in object_times():
+    for t in perception_times():
         found.append((OBJECTS, TRACKED, t + LATE_S, objects(t)))
         kind = "autoware_perception_msgs/TrafficLightGroupArray"
         found.append((LIGHTS, kind, t + LATE_S, lights(t)))
@@ -279,23 +267,7 @@ CREATE INDEX timestamp_idx ON messages (timestamp ASC);
 
 def expected():
     """Tracks on the clock of 10 Hz."""
-    found = {}
-    for name, user in road_users(GRID).items():
-        if name == "ego":
-            found[name] = user
-            continue
-        label = uuid(name).hex()
-        times = [t for t in object_times() if is_seen(name, t)]
-        if name == "19":
-            found[f"{label}#2"] = on_clock(user, [t for t in times if t > GAP[0]])
-            times = [t for t in times if t <= GAP[0]]
-        found[label] = on_clock(user, times)
-    return found
-
-
-def on_clock(user, times):
-    first, last = round(10.0 * min(times)), round(10.0 * max(times))
-    return samples(user, slice(first, last + 1))
+    return seen_on_clock(road_users(GRID), lambda name: uuid(name).hex())
 
 
 def write(folder):

@@ -1,0 +1,58 @@
+// Ten candidates beside two cars, judged by a learned reward: own_planner WEIGHTS.
+// The Python twin, own_planner.py, prints the same numbers.
+#include <algorithm>
+#include <cstdio>
+#include <vector>
+
+#include "rcirl/features.hpp"
+#include "rcirl/scene_builder.hpp"
+
+constexpr double kSpeed = 12.0;  // m/s, the ego's
+
+// A car that keeps its speed. Without a prediction it is predicted as in training.
+rcirl::Other car(double x, double y, double speed) {
+  rcirl::Other made;
+  made.x = x, made.y = y, made.speed = speed, made.length = 4.5, made.width = 1.8;
+  made.prediction = {{0.0, x, y, 0.0}, {8.0, x + 8.0 * speed, y, 0.0}};
+  return made;
+}
+
+// Stations [10, T]: an acceleration of -3 to 1.5 m/s^2, held until the ego stands.
+std::vector<float> candidates() {
+  std::vector<float> s;
+  for (int k = 0; k < 10; ++k) {
+    const double a = -3.0 + 0.5 * k;
+    for (int i = 0; i < 18; ++i) {
+      const double t = std::min(8.0 * i / 17.0, kSpeed / std::max(-a, 1e-9));
+      s.push_back(static_cast<float>(kSpeed * t + 0.5 * a * t * t));
+    }
+  }
+  return s;
+}
+
+int main(int count, char** arguments) {
+  rcirl::Reward reward;
+  rcirl::FeatureMap columns;
+  rcirl::Scene scene;
+  rcirl::Surroundings now;  // metres, radians, any Cartesian frame
+  now.ego.speed = kSpeed, now.ego.length = 4.9, now.ego.width = 2.1;
+  now.line.points = {{-50.0, 0.0}, {300.0, 0.0}};
+  now.line.speed_limit = {13.9};
+  now.others = {car(30.0, 0.0, 8.0), car(-15.0, 3.6, 14.0)};
+  rcirl::Status status = rcirl::load(count == 2 ? arguments[1] : "", &reward);
+  if (status.ok()) status = rcirl::feature_map(reward, &columns);
+  if (status.ok()) status = rcirl::scene_from(now, &scene);
+  if (!status.ok()) {
+    std::fprintf(stderr, "%s\n", status.message().c_str());
+    return 2;
+  }
+  const std::vector<float> s = candidates();
+  std::vector<float> features(10 * rcirl::kTimes * columns.size()), values(10);
+  rcirl::Workspace workspace = reward.workspace();
+  columns.compute(scene, {s.data(), nullptr, 10}, features.data());
+  reward.score(features.data(), 10, columns.mask(scene), &workspace, values.data());
+  for (int k = 0; k < 10; ++k) {
+    std::printf("candidate %d: %.9g\n", k, static_cast<double>(values[static_cast<std::size_t>(k)]));
+  }
+  std::printf("best: candidate %zu\n", rcirl::best(values.data(), 10));
+}

@@ -1,0 +1,1 @@
+"""Comparisons: learners with humans, labels and verdicts with the truth."""

@@ -1,0 +1,101 @@
+"""The worked example of docs/own_planner.md: a stranger's folder, and its C++ twin."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import msgpack
+import numpy as np
+import pytest
+
+from rcirl_jax import Body, Car, CentreLine, load_weights, scene_from
+from rcirl_jax.export import reader
+from rcirl_jax.export.own_planner import features
+from rcirl_jax.export.own_planner.plain import plain_scene
+from tests.helpers.own_planner import TOLERANCE, error, numpy_answers
+from tests.onboard.programs import ONBOARD, built, run
+
+WEIGHTS = sorted((ONBOARD / "conformance").glob("*.msgpack"))
+
+
+@pytest.fixture(scope="module")
+def stranger(tmp_path_factory):
+    """A folder with the two files and the program, and where only two packages are."""
+    folder, packages = (tmp_path_factory.mktemp(name) for name in ("own", "packages"))
+    program = ONBOARD / "example" / "own_planner.py"
+    for file in (features.__file__, reader.__file__, program):
+        shutil.copy(file, folder)
+    for package in (np, msgpack):
+        place = Path(package.__file__).parent
+        for item in place.parent.glob(f"{place.name}*"):  # its shared libraries too
+            (packages / item.name).symlink_to(item)
+    return folder, {**os.environ, "PYTHONPATH": str(packages)}
+
+
+@pytest.fixture(scope="module")
+def twin(tmp_path_factory):
+    return built(tmp_path_factory.mktemp("onboard"), "own_planner") / "own_planner"
+
+
+def in_python(stranger, *arguments):
+    folder, environment = stranger
+    command = (sys.executable, "-S", *arguments)
+    return run(*command, cwd=folder, env=environment).decode()
+
+
+def values(said):
+    """The ten values and the best of what a program prints."""
+    *lines, best = said.splitlines()
+    assert [line.split(":")[0] for line in lines] == [
+        f"candidate {k}" for k in range(10)
+    ]
+    found = np.array([float(line.split(":")[1]) for line in lines])
+    assert best == f"best: candidate {np.argmax(found)}"
+    return found
+
+
+@pytest.mark.parametrize("weights", WEIGHTS, ids=lambda path: path.stem)
+def test_both_programs_print_what_the_package_says(stranger, twin, weights):
+    shutil.copy(weights, stranger[0] / "weights.msgpack")
+    found = values(in_python(stranger, "own_planner.py", "weights.msgpack"))
+    assert np.ptp(found) > 0.1
+    assert error(values(run(twin, weights).decode()), found) <= TOLERANCE
+
+    a = -3.0 + 0.5 * np.arange(10)[:, None]
+    t = np.minimum(8.0 * np.arange(18) / 17.0, 12.0 / np.maximum(-a, 1e-9))
+    size = {"length": 4.5, "width": 1.8, "heading": 0.0}
+    scene = scene_from(
+        ego=Car(x=0.0, y=0.0, heading=0.0, speed=12.0, length=4.9, width=2.1),
+        centre_line=CentreLine(points=[[-50, 0], [300, 0]], speed_limit=13.9),
+        obstacles=[
+            Body(x=30.0, y=0.0, speed=8.0, **size),
+            Body(x=-15.0, y=3.6, speed=14.0, **size),
+        ],
+        predictions=[
+            [(0.0, 30.0, 0.0, 0.0), (8.0, 94.0, 0.0, 0.0)],
+            [(0.0, -15.0, 3.6, 0.0), (8.0, 97.0, 3.6, 0.0)],
+        ],
+    )
+    s = 12.0 * t + 0.5 * a * t * t
+    _, wanted = numpy_answers(load_weights(weights), plain_scene(scene), s)
+    assert error(found, wanted) <= TOLERANCE
+
+
+def test_the_stranger_has_numpy_and_msgpack_only(stranger):
+    for name in ("jax", "scipy", "rcirl_jax"):
+        with pytest.raises(AssertionError, match=f"No module named '{name}'"):
+            in_python(stranger, "-c", f"import {name}")
+
+
+def test_the_twin_names_what_is_wrong(twin):
+    done = subprocess.run([twin, "none"], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("none: ")
+
+
+def test_the_programs_are_short():
+    for name in ("own_planner.py", "own_planner.cpp"):
+        lines = (ONBOARD / "example" / name).read_text().splitlines()
+        assert len(lines) <= 60
