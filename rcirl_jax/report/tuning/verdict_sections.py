@@ -19,7 +19,7 @@ from rcirl_jax.simulation.metrics import COLUMNS
 
 SIGNIFICANT = 1.0 - CONFIDENCE
 LEVEL = f"{100.0 * CONFIDENCE:g} %"
-LOOKS = {  # classes of the decisions
+DECISIONS = {  # classes of the decisions
     "ship": "ship",
     "do not ship": "refused",
     "no difference": "refused",
@@ -32,7 +32,7 @@ KINDS = ("safety", "no loss", "nulls", "likeness", "gain")
 def verdict_view(verdict: Verdict) -> dict:
     """The decision and why, for the template."""
     return {
-        "kind": LOOKS[verdict.decision],
+        "kind": DECISIONS[verdict.decision],
         "decision": verdict.decision,
         "sentence": verdict.sentence,
         "reasons": verdict.reasons,
@@ -226,7 +226,7 @@ def cards(
             "title": "Verdict",
             "value": verdict.decision.capitalize(),
             "words": f"{verdict.cases:,} cases, {len(verdict.new_faults)} new faults",
-            "kind": LOOKS[verdict.decision],
+            "kind": DECISIONS[verdict.decision],
         },
         _amount(verdict, "Nearer to the human", ("likeness",), "on held-out drives"),
         _safety_card(verdict, suite, incumbent),
