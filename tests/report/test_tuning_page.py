@@ -10,9 +10,11 @@ import re
 import jax
 import numpy as np
 import pytest
+from markupsafe import Markup
 
 from rcirl_jax.evaluation.closed_loop.summary import PAPER
 from rcirl_jax.evaluation.ranking.score import candidates_key
+from rcirl_jax.report.glossary import TERMS, explained
 from rcirl_jax.report.pages import interval
 from rcirl_jax.report.ranking.frames import _sampled
 from rcirl_jax.report.tuning.contributions import NUM_CANDIDATES, contributions
@@ -138,9 +140,9 @@ def test_every_check_is_there_with_its_interval(page, report):
     found, families = forest_rows(page), rows(page, "families")
     for check in report.verdict.checks:
         if check.kind == "families":
-            cells = families[check.name.split(",")[0]]
+            cells = families[check.title.rpartition(": ")[0]]
         else:
-            cells = found[check.name.replace("_", " ")]
+            cells = found[check.title]
         if not check.measured:
             assert "not measured" in [row[1] for row in cells]
             continue
@@ -150,6 +152,34 @@ def test_every_check_is_there_with_its_interval(page, report):
         assert words in [row[1] for row in cells], check.name
         if check.outcome == "fail":
             assert "FAIL" in [row[3] for row in cells]
+
+
+def test_equal_numbers_have_equal_outcomes_and_open_ones_say_why(page, report):
+    said = {}
+    for cells in forest_rows(page).values():
+        for _, numbers, evidence, outcome in cells:
+            if "[" in numbers and outcome in ("ok", "open", "FAIL"):
+                said.setdefault((numbers, evidence), set()).add(outcome)
+    assert len(said) > 3
+    assert all(len(outcomes) == 1 for outcomes in said.values())
+    for check in report.verdict.checks:
+        if check.measured and check.note:
+            assert f'<abbr title="{check.note}">' in page
+
+
+def test_terms_are_explained_where_they_stand_and_in_a_list(page):
+    holm = TERMS["Holm"]
+    assert f'<abbr title="{holm}">Holm</abbr>' in section(page, "checks")
+    terms = section(page, "terms")
+    assert all(
+        f"<dt>{term}</dt><dd>{html.escape(x)}" in terms for term, x in TERMS.items()
+    )
+    assert explained("miss < dismissed, mRR") == (
+        f'<abbr title="{TERMS["miss"]}">miss</abbr> &lt; dismissed, '
+        f'<abbr title="{TERMS["MRR"]}">mRR</abbr>'
+    )
+    kept = Markup("<b>miss</b>")
+    assert explained(kept) == kept
 
 
 def test_a_loss_is_never_called_no_difference(report):

@@ -48,8 +48,7 @@ def checks_tables(verdict: Verdict) -> list[Table]:
     for kind in KINDS:
         checks = [check for check in verdict.checks if check.kind == kind]
         if checks:
-            names = [check.name.replace("_", " ") for check in checks]
-            tables.append(forest(TITLES[kind], checks, names))
+            tables.append(forest(TITLES[kind], checks, [c.title for c in checks]))
     return tables
 
 
@@ -76,7 +75,7 @@ def forest(title: str, checks: Sequence[Check], names: Sequence[str]) -> Table:
     failing = []
     for name, check in zip(names, checks, strict=True):
         word, kind = outcome_of(check)
-        said = part("outcome", kind, word)
+        said = part("outcome", kind, word, check.note if check.measured else "")
         if not check.measured:
             rows.append((name, "", "not measured", check.note, said))
             continue
@@ -92,7 +91,7 @@ def forest(title: str, checks: Sequence[Check], names: Sequence[str]) -> Table:
             words=f"{name}: {numbers}, {word}",
         )
         rows.append((name, cell, numbers, _evidence(check), said))
-    heads = ("", "", f"difference [{LEVEL}]", "cases, p", "")
+    heads = ("", "", f"difference [{LEVEL}]", "margin, cases, p", "")
     return Table(caption=title, heads=heads, rows=rows, kind="forest", marked=failing)
 
 
@@ -107,9 +106,11 @@ def outcome_of(check: Check) -> tuple[str, str]:
 
 
 def _evidence(check: Check) -> str:
-    """Cases that only one of them passes, and the p value."""
+    """Margin, cases that only one of them passes, and the p value."""
+    margin = "" if check.margin is None else f"−{100.0 * check.margin:g} %"
     pairs = "" if check.lost is None else f"+{check.gained} −{check.lost}"
-    return ", ".join(filter(None, (pairs, "" if check.p is None else _p(check.p))))
+    p = "" if check.p is None else _p(check.p)
+    return ", ".join(filter(None, (margin, pairs, p)))
 
 
 def _p(p: float) -> str:
@@ -127,7 +128,7 @@ def families_tables(verdict: Verdict) -> list[Table]:
         ]
         checks.sort(key=lambda c: (RANKS[c.outcome], c.difference))
         if checks:
-            names = [check.name.removesuffix(f", {kind}") for check in checks]
+            names = [check.title.removesuffix(f": {kind}") for check in checks]
             tables.append(forest(kind.capitalize(), checks, names))
     return tables
 
