@@ -1,5 +1,6 @@
 """Runs side by side: what differs, their numbers, folders that are no run."""
 
+import html
 import json
 import re
 
@@ -95,7 +96,7 @@ def test_numbers_of_the_runs_with_their_intervals(compared):
 
 def test_every_verdict_is_there(compared):
     page, verdict = compared
-    text = page.read_text()
+    text = html.unescape(page.read_text())
     assert text.count(verdict.sentence) == 2
     assert text.count('class="decision refused"') == 2
 
