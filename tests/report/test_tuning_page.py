@@ -18,7 +18,7 @@ from rcirl_jax.report.glossary import TERMS, explained
 from rcirl_jax.report.pages import interval
 from rcirl_jax.report.ranking.frames import _sampled
 from rcirl_jax.report.tuning.contributions import NUM_CANDIDATES, contributions
-from rcirl_jax.report.tuning.verdict_sections import outcome_of
+from rcirl_jax.report.tuning.verdict_sections import cards, outcome_of
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.simulation.metrics import COLUMNS
 from rcirl_jax.units import TIMES_S
@@ -122,12 +122,13 @@ def test_cases_are_those_of_the_suite_the_played_and_the_worst_first(page, repor
 
 def test_the_cards_say_what_the_checks_say(page, report):
     text = section(page, "verdict")
-    cards = re.findall(r"<h3>(.*?)</h3><b>(.*?)</b>", text)
-    found = dict(cards)
+    text = re.sub(r"</?abbr.*?>", "", text)
+    found = dict(re.findall(r"<h3>(.*?)</h3><b>(.*?)</b>", text))
     assert list(found) == [
         "Verdict", "Nearer to the human", "Safety", "Comfort", "Progress",
     ]  # fmt: skip
     assert found["Safety"] == "12 / 0"
+    assert 'class="card refused"><h3>Safety' in text
     gains = {c.name: c for c in report.verdict.checks if c.kind == "gain"}
     comfort = [number(x) for x in found["Comfort"].split(" / ")]
     wanted = [100.0 * gains[name].difference for name in ("a_station", "j_station")]
@@ -165,6 +166,19 @@ def test_equal_numbers_have_equal_outcomes_and_open_ones_say_why(page, report):
     for check in report.verdict.checks:
         if check.measured and check.note:
             assert f'<abbr title="{check.note}">' in page
+
+
+def test_safety_that_is_not_shown_is_no_green_card(report):
+    suite, kinds = report.suite.report(), {}
+    for outcome in ("pass", "open", "fail"):
+        checks = tuple(
+            dataclasses.replace(one, outcome=outcome) if one.name == "red_light" else
+            dataclasses.replace(one, outcome="pass")
+            for one in report.verdict.checks
+        )  # fmt: skip
+        verdict = dataclasses.replace(report.verdict, checks=checks)
+        kinds[outcome] = cards(verdict, suite, "hand-set")[2]["kind"]
+    assert kinds == {"pass": "ship", "open": "open", "fail": "refused"}
 
 
 def test_terms_are_explained_where_they_stand_and_in_a_list(page):

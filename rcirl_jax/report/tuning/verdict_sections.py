@@ -25,6 +25,7 @@ DECISIONS = {  # classes of the decisions
     "no difference": "refused",
     "could not judge": "open",
 }
+SAFETY = {"fail": "refused", "open": "open"}  # of the card, by the worst outcome
 # families have a section of their own
 KINDS = ("safety", "no loss", "nulls", "likeness", "gain")
 
@@ -279,13 +280,12 @@ def _safety_card(
 ) -> dict[str, object]:
     mine = next(iter(suite.rows.values()))
     theirs = suite.rows[incumbent]
-    failed = any(c.kind == "safety" and c.outcome == "fail" for c in verdict.checks)
-    fewer = mine.at_fault <= theirs.at_fault and mine.red_lights <= theirs.red_lights
+    outcomes = {c.outcome for c in verdict.checks if c.kind == "safety"}
     return {
         "title": "Safety",
         "value": f"{mine.at_fault} / {theirs.at_fault}",
         "words": "at-fault collisions, candidate / incumbent; red lights "
         f"{mine.red_lights} / {theirs.red_lights}, stop signs {mine.stop_signs} / "
         f"{theirs.stop_signs}",
-        "kind": "refused" if failed else "ship" if fewer else "open",
+        "kind": next((SAFETY[x] for x in ("fail", "open") if x in outcomes), "ship"),
     }
