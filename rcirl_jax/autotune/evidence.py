@@ -58,10 +58,15 @@ def _tune_idm(run: Run, dataset: Demonstrations) -> None:
     """The IDM tuned on the same training scenes, the strongest simple rival."""
     path = run.tuned_idm
     setup = RankingSetup(horizon_s=run.config.horizon_s)
-    inputs = {"dataset": dataset.hash, "evaluations": IDM_EVALUATIONS}
+    search = run.config.search
+    inputs = {
+        "dataset": dataset.hash,
+        "evaluations": IDM_EVALUATIONS,
+        "search": search,
+    }
 
     def work() -> None:
-        write_tuned_idm(path, tune_idm(dataset, setup, IDM_EVALUATIONS))
+        write_tuned_idm(path, tune_idm(dataset, setup, IDM_EVALUATIONS, search))
 
     run.stage("tune", inputs, [path], work)
 
