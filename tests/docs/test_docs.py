@@ -199,16 +199,23 @@ def test_the_gates_margins_and_exit_status_are_those_of_the_code():
     assert {row[0]: int(row[2]) for row in rows} == EXIT_CODES
 
 
-def test_the_site_builds_and_needs_no_network(tmp_path):
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The folder of the built site."""
     if importlib.util.find_spec("material") is None:
         pytest.skip("mkdocs-material not installed: pip install 'rcirl-jax[docs]'")
+    folder = tmp_path_factory.mktemp("site")
     done = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "-d", tmp_path],
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "-d", folder],
         capture_output=True, text=True, check=False, cwd=REPO,
         env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
-    pages = list(tmp_path.rglob("*.html"))
+    return folder
+
+
+def test_the_site_builds_and_needs_no_network(site):
+    pages = list(site.rglob("*.html"))
     assert len(pages) > len(PAGES)
     loaded = re.compile(r"<(?:script|img|iframe)[^>]+src=\"(?:https?:)?//")
     styles = re.compile(r"<link[^>]+rel=\"(?:stylesheet|preconnect)\"[^>]+//")
