@@ -4,6 +4,7 @@ import importlib.util
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -223,3 +224,31 @@ def test_the_site_builds_and_needs_no_network(site):
         text = page.read_text()
         assert not loaded.search(text), page
         assert not styles.search(text), page
+
+
+SEARCH = """word => {
+  document.getElementById("__search").click();
+  const input = document.querySelector("input[name=query]");
+  input.focus();
+  input.value = word;
+  input.dispatchEvent(new Event("keyup", { bubbles: true }));
+}"""
+
+
+@pytest.mark.browser
+def test_the_site_is_searched_from_the_disk(site):
+    playwright = pytest.importorskip("playwright.sync_api")
+    chromium = shutil.which("chromium") or shutil.which("google-chrome")
+    if chromium is None:
+        pytest.skip("no Chromium found: install chromium")
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(
+            executable_path=chromium, args=["--no-sandbox"]
+        )
+        page = browser.new_page()
+        page.goto((site / "index.html").as_uri())
+        page.evaluate(SEARCH, "decimal")
+        found = page.locator(".md-search-result__item").first
+        found.wait_for(state="attached", timeout=60_000)
+        assert "csv" in (found.text_content() or "")
+        browser.close()
