@@ -37,7 +37,7 @@ MEANS = {
 }
 # yes or no of an episode
 RATES = {
-    "at_fault": "crash, own fault",
+    "at_fault": "at-fault collision",
     "collisions": "crash",
     "red_lights": "red light run",
     "a_station": "|a| < 4 held",

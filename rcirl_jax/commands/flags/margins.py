@@ -15,7 +15,7 @@ _ACCEPT = flags.DEFINE_list(
 _MARGINS = {
     name: flags.DEFINE_float(f"{name}_margin", getattr(GateConfig(), name), text)
     for name, text in {
-        "collision": "more cases with a preventable collision of own fault, share",
+        "collision": "more cases with a preventable at-fault collision, share",
         "vulnerable": "with a pedestrian or cyclist hit",
         "red_light": "with a red light run",
         "stop_sign": "with a stop sign run",

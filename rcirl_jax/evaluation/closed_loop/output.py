@@ -55,7 +55,7 @@ def format_suite(report: SuiteReport) -> str:
         f"{report.trivial:,} trivial.",
         "Cells: % [exact 95 % interval]; (>=): rule of three where nothing failed.",
         "",
-        "Per case (every sample of a drive inside the bound, no crash of own fault)",
+        "Per case (every sample of a drive inside the bound, no at-fault collision)",
     ]
     header = ["", *(SHORT[c] for c in COLUMNS)]
     paper = [[name, *(f"{x:.2f}" for x in row)] for name, row in PAPER.items()]
