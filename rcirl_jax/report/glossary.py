@@ -7,8 +7,8 @@ from markupsafe import Markup, escape
 TERMS = {
     "at-fault": "caused by the ego: it runs into somebody, or moves into their way",
     "preventable": "one of two models of a careful driver avoids it",
-    "clean drives": "no at-fault collision, red light or stop sign run, always more than "
-    "0.95 s to a collision, within the limit and on the road",
+    "clean drives": "no at-fault collision, red light or stop sign run, always more "
+    "than 0.95 s to a collision, within the limit and on the road",
     "time to collision": "time until two bodies meet if both keep their speed",
     "nuPlan": "score of the nuPlan benchmark, 0 to 100 points: nothing with an own "
     "fault or off the road, else progress, time to collision, speed and comfort",

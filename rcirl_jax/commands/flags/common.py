@@ -63,13 +63,14 @@ def run(main: Callable[[], None]) -> None:
 
 def _take(words: list[str], main: Callable) -> None:
     """Arguments without a name: of the flag that a command calls `ARGUMENTS`."""
+    if not words:
+        return
     name = getattr(module_of(main), "ARGUMENTS", None)
-    if words and name is None:
+    if name is None:
         raise InputError(f"{words[0]}: unexpected argument: expected --flags")
-    if words and flags.FLAGS[name].present:
+    if flags.FLAGS[name].present:
         raise InputError(f"{words[0]}: unexpected argument beside --{name}")
-    if words:
-        setattr(flags.FLAGS, name, words)
+    setattr(flags.FLAGS, name, words)
 
 
 def _refuse(what: object, status: int = EXIT_BAD_INPUT) -> NoReturn:
