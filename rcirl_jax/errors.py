@@ -18,6 +18,7 @@ HEAD, TAIL = 1400, 400  # characters kept of the ends of a line too long
 EXTRAS = {
     **dict.fromkeys(("jinja2", "markupsafe", "matplotlib"), "report"),
     **dict.fromkeys(("defusedxml", "pyarrow", "pyproj", "shapely"), "logs"),
+    "optuna": "optuna",
 }
 
 

@@ -1,6 +1,7 @@
 """Everything that decides the outcome of a tuning run, besides the data."""
 
 import dataclasses
+import importlib
 from pathlib import Path
 
 from rcirl_jax.autotune.anchoring import Anchoring
@@ -24,6 +25,7 @@ class TuneConfig:
     data_weights: str = EQUAL  # of several sources, as `data.store.joined.shares_of`
     recipe: str = ""  # its name, for the report
     seeds: int = 1
+    search: str = "cma"  # of the tuned IDM: one of `rivals.tuned.SEARCHES`
     drives: int = 240  # held-out, for human-likeness
     horizon_s: float = 5.0
     suite: str = "full"
@@ -37,6 +39,8 @@ class TuneConfig:
         """Reject what would fail only after the training."""
         if self.sweep is not None:
             read_sweep(self.sweep)
+        if self.search == "optuna":
+            importlib.import_module("optuna")  # an extra
         if self.drives < 1:
             raise InputError(f"--drives: {self.drives}: expected at least 1")
         if self.seeds < 1:

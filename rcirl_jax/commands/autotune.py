@@ -27,6 +27,7 @@ from rcirl_jax.commands.flags.executor import executor
 from rcirl_jax.commands.flags.help import AS_SAID, also_named
 from rcirl_jax.commands.flags.horizon import HORIZON
 from rcirl_jax.commands.flags.importing import import_flags
+from rcirl_jax.commands.flags.search import SEARCH
 from rcirl_jax.commands.flags.signals import checked_signals, signals_asked
 from rcirl_jax.commands.flags.suite import suite
 from rcirl_jax.commands.flags.trackers import trackers
@@ -99,6 +100,7 @@ def made_run(folder: Path) -> Run:
         data_weights=training.DATA_WEIGHTS.value,
         recipe=recipe.name,
         seeds=recipe.seeds if _SEEDS.value is None else _SEEDS.value,
+        search=SEARCH.value,
         drives=_DRIVES.value,
         horizon_s=HORIZON.value,
         **suite(),

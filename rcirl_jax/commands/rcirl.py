@@ -23,6 +23,7 @@ COMMANDS = {
     "gate": ("gate", "may a candidate replace what drives today?"),
     "replay": ("replay", "drive one case again, as a page that plays it"),
     "report": ("report", "draw the page of an autotune run again"),
+    "compare": ("compare", "several autotune runs side by side, as a page"),
     "human-likeness": (
         "studies.human_likeness",
         "compare learners: who chooses most like a human?",

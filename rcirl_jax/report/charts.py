@@ -65,6 +65,27 @@ def forest_cell(
     return part("forest_cell", at, low, high, line, failed, words)
 
 
+def interval_cell(
+    found: tuple[float, float, float], ends: tuple[float, float], words: str
+) -> Markup:
+    """A row of intervals on an axis of their own, without a zero line.
+
+    Args:
+      found: a number, and the ends of its interval.
+      ends: of the axis.
+      words: the row in words.
+    """
+    middle, half = (ends[0] + ends[1]) / 2.0, max((ends[1] - ends[0]) / 2.0, 1e-12)
+    places = (_place(x - middle, half) for x in found)
+    return part("forest_cell", *places, None, False, words, False)
+
+
+def interval_axis(ends: tuple[float, float], digits: int, unit: str) -> Markup:
+    """The axis above `interval_cell`s: its two ends."""
+    low, high = (number(x, digits) for x in ends)
+    return part("forest_axis", low, high, unit, "")
+
+
 def forest_axis(limit: float, unit: str) -> Markup:
     """The axis above `forest_cell`s: -limit, 0, limit."""
     digits = 0 if limit >= 10 else 1

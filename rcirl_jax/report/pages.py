@@ -16,6 +16,7 @@ from pathlib import Path
 import jinja2
 from markupsafe import Markup
 
+from rcirl_jax.report.glossary import explained
 from rcirl_jax.runtime.atomic_files import plain, write_whole
 
 BROAD_PIXELS = 1000  # wider pictures are not shrunk to a phone's width
@@ -75,7 +76,7 @@ def _environment() -> jinja2.Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.filters |= {"number": number, "interval": interval}
+    made.filters |= {"number": number, "interval": interval, "explained": explained}
     made.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
     return made
 

@@ -74,10 +74,10 @@ def densities(
       valid: [T] bool, times that count.
     """
     # the human's own curve, the origin, stands last
-    away = [
+    s, l = (
         jnp.pad(a - b, ((0, 1), (0, 0))) for a, b in ((x.s, driven.s), (x.l, driven.l))
-    ]
-    squared = rms_squared(*away, valid)
+    )
+    squared = rms_squared(s, l, valid)
     others = counts & ~jnp.eye(counts.size, dtype=bool)
     human = log_density(squared[-1, :-1], counts)
     return human, log_density(squared[:-1, :-1], others)

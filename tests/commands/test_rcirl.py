@@ -38,7 +38,8 @@ from absl import flags
 from rcirl_jax.commands.rcirl import COMMANDS
 OPTIONAL = {
     "defusedxml", "flatbuffers", "google_crc32c", "jinja2", "markupsafe", "matplotlib",
-    "mcap", "mcap_ros2", "onnx", "pyarrow", "pyproj", "ray", "shapely", "tensorboardX",
+    "mcap", "mcap_ros2", "onnx", "optuna", "pyarrow", "pyproj", "ray", "shapely",
+    "tensorboardX",
 }
 class Without:
     def find_spec(self, name, path=None, target=None):

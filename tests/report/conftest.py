@@ -41,7 +41,7 @@ def hostile(report):
     change, suite = dataclasses.replace, report.suite
     rows = {HOSTILE if n == "hand-set" else n: row for n, row in suite.rows.items()}
     checks = tuple(
-        change(check, name=check.name.replace("stop_and_go", HOSTILE))
+        change(check, title=check.title.replace("Queue with stop and go", HOSTILE))
         for check in report.verdict.checks
     )
     words = {"row": HOSTILE, "events": [(1.0, f"</script>{HOSTILE}")]}

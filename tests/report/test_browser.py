@@ -5,6 +5,7 @@ import shutil
 
 import pytest
 
+from tests.report.test_compare import compared  # noqa: F401
 from tests.report.test_data_page import HOSTILE
 from tests.report.tuning_case import PLAYED, SECONDS
 
@@ -106,3 +107,12 @@ def test_a_phone_needs_no_sideways_scroll_and_markup_in_the_data_does_not_run(
             assert HOSTILE in view.inner_text("#clock") + view.inner_text("#events")
         assert wrong == []
         view.close()
+
+
+@pytest.mark.browser
+def test_runs_side_by_side_fit_a_phone(browser, compared):  # noqa: F811
+    view, wrong = opened(browser, compared[0], width=390, height=844)
+    assert view.evaluate("document.documentElement.scrollWidth") <= 390
+    assert view.locator("table.forest").count() == 6
+    assert wrong == []
+    view.close()

@@ -37,11 +37,13 @@ class Page(HTMLParser):
             self.in_cell = True
 
     def handle_endtag(self, tag):
-        self.in_cell &= tag not in ("td", "th")
+        if tag in ("td", "th"):
+            self.rows[-1][-1] = " ".join(self.rows[-1][-1].split())
+            self.in_cell = False
 
     def handle_data(self, data):
         if self.in_cell:
-            self.rows[-1][-1] += data.strip()
+            self.rows[-1][-1] += data
 
     def of(self, tag):
         return [attrs for name, attrs in self.tags if name == tag]

@@ -10,13 +10,15 @@ import re
 import jax
 import numpy as np
 import pytest
+from markupsafe import Markup
 
 from rcirl_jax.evaluation.closed_loop.summary import PAPER
 from rcirl_jax.evaluation.ranking.score import candidates_key
+from rcirl_jax.report.glossary import TERMS, explained
 from rcirl_jax.report.pages import interval
 from rcirl_jax.report.ranking.frames import _sampled
 from rcirl_jax.report.tuning.contributions import NUM_CANDIDATES, contributions
-from rcirl_jax.report.tuning.verdict_sections import outcome_of
+from rcirl_jax.report.tuning.verdict_sections import cards, outcome_of
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.simulation.metrics import COLUMNS
 from rcirl_jax.units import TIMES_S
@@ -120,12 +122,13 @@ def test_cases_are_those_of_the_suite_the_played_and_the_worst_first(page, repor
 
 def test_the_cards_say_what_the_checks_say(page, report):
     text = section(page, "verdict")
-    cards = re.findall(r"<h3>(.*?)</h3><b>(.*?)</b>", text)
-    found = dict(cards)
+    text = re.sub(r"</?abbr.*?>", "", text)
+    found = dict(re.findall(r"<h3>(.*?)</h3><b>(.*?)</b>", text))
     assert list(found) == [
         "Verdict", "Nearer to the human", "Safety", "Comfort", "Progress",
     ]  # fmt: skip
     assert found["Safety"] == "12 / 0"
+    assert 'class="card refused"><h3>Safety' in text
     gains = {c.name: c for c in report.verdict.checks if c.kind == "gain"}
     comfort = [number(x) for x in found["Comfort"].split(" / ")]
     wanted = [100.0 * gains[name].difference for name in ("a_station", "j_station")]
@@ -138,9 +141,9 @@ def test_every_check_is_there_with_its_interval(page, report):
     found, families = forest_rows(page), rows(page, "families")
     for check in report.verdict.checks:
         if check.kind == "families":
-            cells = families[check.name.split(",")[0]]
+            cells = families[check.title.rpartition(": ")[0]]
         else:
-            cells = found[check.name.replace("_", " ")]
+            cells = found[check.title]
         if not check.measured:
             assert "not measured" in [row[1] for row in cells]
             continue
@@ -150,6 +153,47 @@ def test_every_check_is_there_with_its_interval(page, report):
         assert words in [row[1] for row in cells], check.name
         if check.outcome == "fail":
             assert "FAIL" in [row[3] for row in cells]
+
+
+def test_equal_numbers_have_equal_outcomes_and_open_ones_say_why(page, report):
+    said = {}
+    for cells in forest_rows(page).values():
+        for _, numbers, evidence, outcome in cells:
+            if "[" in numbers and outcome in ("ok", "open", "FAIL"):
+                said.setdefault((numbers, evidence), set()).add(outcome)
+    assert len(said) > 3
+    assert all(len(outcomes) == 1 for outcomes in said.values())
+    for check in report.verdict.checks:
+        if check.measured and check.note:
+            assert f'<abbr title="{check.note}">' in page
+
+
+def test_safety_that_is_not_shown_is_no_green_card(report):
+    suite, kinds = report.suite.report(), {}
+    for outcome in ("pass", "open", "fail"):
+        checks = tuple(
+            dataclasses.replace(one, outcome=outcome) if one.name == "red_light" else
+            dataclasses.replace(one, outcome="pass")
+            for one in report.verdict.checks
+        )  # fmt: skip
+        verdict = dataclasses.replace(report.verdict, checks=checks)
+        kinds[outcome] = cards(verdict, suite, "hand-set")[2]["kind"]
+    assert kinds == {"pass": "ship", "open": "open", "fail": "refused"}
+
+
+def test_terms_are_explained_where_they_stand_and_in_a_list(page):
+    holm = TERMS["Holm"]
+    assert f'<abbr title="{holm}">Holm</abbr>' in section(page, "checks")
+    terms = section(page, "terms")
+    assert all(
+        f"<dt>{term}</dt><dd>{html.escape(x)}" in terms for term, x in TERMS.items()
+    )
+    assert explained("miss < dismissed, mRR") == (
+        f'<abbr title="{TERMS["miss"]}">miss</abbr> &lt; dismissed, '
+        f'<abbr title="{TERMS["MRR"]}">mRR</abbr>'
+    )
+    kept = Markup("<b>miss</b>")
+    assert explained(kept) == kept
 
 
 def test_a_loss_is_never_called_no_difference(report):

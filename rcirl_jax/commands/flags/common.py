@@ -39,8 +39,7 @@ def run(main: Callable[[], None]) -> None:
 
     def guarded(argv: list[str]) -> None:
         try:
-            if len(argv) > 1:
-                raise InputError(f"{argv[1]}: unexpected argument: expected --flags")
+            _take(argv[1:], main)
             main()
         except InputError as error:
             _refuse(error)
@@ -60,6 +59,17 @@ def run(main: Callable[[], None]) -> None:
 
     interrupts.install()
     app.run(guarded, flags_parser=functools.partial(_parse, main))
+
+
+def _take(words: list[str], main: Callable) -> None:
+    """Arguments without a name: of the flag that a command calls `ARGUMENTS`."""
+    name = getattr(module_of(main), "ARGUMENTS", None)
+    if words and name is None:
+        raise InputError(f"{words[0]}: unexpected argument: expected --flags")
+    if words and flags.FLAGS[name].present:
+        raise InputError(f"{words[0]}: unexpected argument beside --{name}")
+    if words:
+        setattr(flags.FLAGS, name, words)
 
 
 def _refuse(what: object, status: int = EXIT_BAD_INPUT) -> NoReturn:

@@ -26,6 +26,7 @@ from rcirl_jax.commands.flags import training
 from rcirl_jax.commands.flags.common import provenance, unread
 from rcirl_jax.commands.flags.holdout import splits
 from rcirl_jax.commands.flags.horizon import HORIZON
+from rcirl_jax.commands.flags.search import SEARCH
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.evaluation.ranking.evaluate import (
@@ -74,7 +75,14 @@ def _tuned(
     if not _TUNED.value:
         return {}
     seeds = range(_TUNED.value)
-    return tuned_rivals(part, setup, epochs=epochs, seeds=seeds, long=_LONG.value)
+    return tuned_rivals(
+        part,
+        setup,
+        epochs=epochs,
+        seeds=seeds,
+        long=_LONG.value,
+        search=SEARCH.value,
+    )
 
 
 def main() -> None:

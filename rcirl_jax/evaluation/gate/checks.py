@@ -19,6 +19,7 @@ from rcirl_jax.evaluation.statistics import (
     Difference,
     family_clusters,
 )
+from rcirl_jax.simulation.catalogue.families import family_title
 from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics, nuplan_score
 
 MIN_FAMILY = 10  # cases of a family below which its interval means nothing
@@ -126,25 +127,27 @@ def families(pair: Pair, config: GateConfig) -> list[Check]:
     rate_p, way_p = (holm(np.array([x.p for x in found])) for found in (rates, ways))
     found = []
     for i, name in enumerate(order):
-        few = totals[i] < MIN_FAMILY
+        few, words = totals[i] < MIN_FAMILY, family_title(name)
         note = f"{totals[i]} cases: expected at least {MIN_FAMILY}" if few else ""
         detected = rates[i].mean < 0.0 and rate_p[i] < LEVEL
         shown = rates[i].low > -config.family_clean
         clean: Outcome = "fail" if detected else "pass" if shown else "open"
-        title, p = f"{name}, clean drives", float(rate_p[i])
-        margin = config.family_clean
         found.append(
-            check_of("families", title, title, clean, rates[i], margin, pairs[i], p)
-        )
+            check_of(
+                "families", f"{name}, clean drives", f"{words}: clean drives", clean,
+                rates[i], config.family_clean, pairs[i], float(rate_p[i]),
+            )
+        )  # fmt: skip
         small = -MATERIAL * config.family_progress
         detected = ways[i].mean < small and way_p[i] < LEVEL and not few
         shown = ways[i].low > -config.family_progress and not few
         way: Outcome = "fail" if detected else "pass" if shown else "open"
-        title, p = f"{name}, progress", float(way_p[i])
-        margin = config.family_progress
         found.append(
-            check_of("families", title, title, way, ways[i], margin, p=p, note=note)
-        )
+            check_of(
+                "families", f"{name}, progress", f"{words}: progress", way, ways[i],
+                config.family_progress, p=float(way_p[i]), note=note,
+            )
+        )  # fmt: skip
     return found
 
 

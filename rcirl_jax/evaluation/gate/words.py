@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rcirl_jax.evaluation.gate.types import INCUMBENT, Check, NewFault, Pair, Verdict
+from rcirl_jax.simulation.catalogue.families import family_title
 
 WIDTH = 100  # columns of wrapped text
 MAX_LINES = 3  # of the sentence, in these columns
@@ -133,13 +134,19 @@ def _worse(check: Check, pair: Pair, crawling: bool) -> str:
     if family and check.lost is not None:
         net = check.lost - (check.gained or 0)
         cases = int(np.sum(np.asarray(pair.families) == family))
-        return f"has {net} fewer clean drives of {cases} in {family}"
+        return f"has {net} fewer clean drives of {cases} in {_quoted(family)}"
     if family:
         crawls = _crawls(pair, family) if crawling else ""
-        return f"{_less('progress', check)} in {family}{crawls}"
+        return f"{_less('progress', check)} in {_quoted(family)}{crawls}"
     if check.name in AMOUNTS:
         return _less(check.name, check)
     return f"keeps {HOLDS[check.name]} in {_net(check)} fewer drives"
+
+
+def _quoted(family: str) -> str:
+    """A family's title in a sentence."""
+    title = family_title(family)
+    return f'"{title[:1].lower()}{title[1:]}"'
 
 
 def _less(name: str, check: Check) -> str:

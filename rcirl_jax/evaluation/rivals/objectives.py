@@ -19,7 +19,7 @@ from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, covered_rows
 from rcirl_jax.evaluation.ranking.score import CHUNK, Rival, horizon_mask, measured
-from rcirl_jax.evaluation.rivals.cma_es import Objective
+from rcirl_jax.evaluation.rivals.counted import Objective
 from rcirl_jax.planner.baselines import Idm, closeness, idm_trajectory
 from rcirl_jax.planner.prediction import as_seen
 from rcirl_jax.reward import TUNABLE, lattice_terms, tuned, weighted_cost

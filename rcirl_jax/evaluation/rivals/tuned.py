@@ -1,6 +1,6 @@
-"""Rivals tuned on the learners' own training scenes, by the number that counts.
+"""Rivals tuned on the learners' own training scenes, by the compared metric.
 
-The hand-set cost and the Intelligent Driver Model have few parameters; CMA-ES
+The hand-set cost and the Intelligent Driver Model have few parameters; a search
 looks for those whose choices end nearest to the human. Rows:
 
     hand-set, tuned        eight weights, as many queries as a learner's training
@@ -17,7 +17,8 @@ import numpy as np
 from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup
 from rcirl_jax.evaluation.ranking.score import Rival
-from rcirl_jax.evaluation.rivals.cma_es import tune
+from rcirl_jax.evaluation.rivals import cma_es, tpe
+from rcirl_jax.evaluation.rivals.counted import Search
 from rcirl_jax.evaluation.rivals.objectives import (
     DRIVER,
     HAND_SET,
@@ -32,6 +33,7 @@ from rcirl_jax.reward import LONG_ROW, TUNED_ROW
 TUNING_SCENES = 256  # training scenes of a search with a learner's queries, at most
 LONG_SCENES = 1024  # of the long search
 SIGMA = 1.0  # first spread of the log-weights
+SEARCHES: dict[str, Search] = {"cma": cma_es.tune, "optuna": tpe.tune}
 
 
 def tuned_rivals(
@@ -41,6 +43,7 @@ def tuned_rivals(
     epochs: int,
     seeds: Sequence[int],
     long: int,
+    search: str = "cma",
 ) -> dict[str, list[Rival]]:
     """The three rows, one search per seed each.
 
@@ -50,6 +53,7 @@ def tuned_rivals(
       epochs: the learners'; their queries are the budget of the first and last row.
       seeds: of the searches and their drawn scenes.
       long: evaluations of the long row; 0 leaves it out.
+      search: one of `SEARCHES`.
     """
     own = dataclasses.replace(setup, split="train")
     # row -> what is tuned, scenes, evaluations
@@ -65,18 +69,22 @@ def tuned_rivals(
         for seed in seeds:
             made = problem(kind, dataset, own, scenes, seed)
             budget = evaluations or learner_budget(dataset, setup.sampler, epochs, made)
-            found[row].append(_best(kind, made, budget, seed))
+            found[row].append(_best(kind, made, budget, seed, search))
     return found
 
 
-def _best(kind: Tunable, made: Problem, budget: int, seed: int) -> Rival:
+def _best(kind: Tunable, made: Problem, budget: int, seed: int, search: str) -> Rival:
     """The rival that a search finds."""
-    best, _ = tune(made.objective, np.zeros(len(kind.names)), SIGMA, budget, seed)
+    start = np.zeros(len(kind.names))
+    best, _ = SEARCHES[search](made.objective, start, SIGMA, budget, seed)
     return kind.rival(jnp.asarray(best, jnp.float32))
 
 
 def tune_idm(
-    dataset: Demonstrations, setup: RankingSetup, evaluations: int = 300
+    dataset: Demonstrations,
+    setup: RankingSetup,
+    evaluations: int = 300,
+    search: str = "cma",
 ) -> Idm:
     """The driver model that ends nearest to the humans of the training split.
 
@@ -84,10 +92,11 @@ def tune_idm(
       dataset: only its training split is read.
       setup: sampler, horizon and what is seen of the others.
       evaluations: of the search.
+      search: one of `SEARCHES`.
     """
     own = dataclasses.replace(setup, split="train")
     made = problem(DRIVER, dataset, own, LONG_SCENES)
-    found = _best(DRIVER, made, evaluations, 0).fields()
+    found = _best(DRIVER, made, evaluations, 0, search).fields()
     return Idm(**{name: float(value) for name, value in found.items()})
 
 

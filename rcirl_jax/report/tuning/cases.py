@@ -12,6 +12,7 @@ from rcirl_jax.evaluation.closed_loop.files import SuiteRuns
 from rcirl_jax.report.pages import part
 from rcirl_jax.report.player.player import COLOURS, looks
 from rcirl_jax.report.player.replays import Replay, broken_bounds
+from rcirl_jax.simulation.catalogue.families import family_title
 from rcirl_jax.simulation.metrics import CaseMetrics, nuplan_score
 
 MOST = 300  # cases of a page
@@ -23,7 +24,7 @@ class CaseLine:
     """One row of the table of cases."""
 
     case: str
-    family: str
+    family: str  # its title
     candidate: str  # what it breaks; "" if nothing
     incumbent: str
     progress: float  # m, candidate minus incumbent
@@ -60,7 +61,7 @@ def case_lines(
         lines.append(
             CaseLine(
                 case=runs.ids[at],
-                family=runs.groups[at],
+                family=family_title(runs.groups[at]),
                 candidate=words[0],
                 incumbent=words[1],
                 progress=float(progress[at]),

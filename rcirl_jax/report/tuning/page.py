@@ -17,6 +17,7 @@ from rcirl_jax.evaluation.ranking.table import RankingReport
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.export.sweep.result import table as sweep_table
 from rcirl_jax.report.charts import time_curves
+from rcirl_jax.report.glossary import TERMS
 from rcirl_jax.report.pages import Table, facts_text, number, picture, write_page
 from rcirl_jax.report.player.player import SCRIPT, player_data
 from rcirl_jax.report.player.replays import Replay
@@ -52,6 +53,7 @@ CONTENTS = (
     ("data", "Data"),
     ("sweep", "Sweep"),
     ("provenance", "Provenance"),
+    ("terms", "Terms"),
 )
 
 
@@ -124,6 +126,7 @@ def write_tuning_page(path: Path, report: TuningReport) -> Path:
         title=f"Tuning report: {verdict.decision}",
         contents=shown,
         level=LEVEL,
+        terms=TERMS,
         runs=report.training_runs,
         incumbent=report.incumbent,
         **{name: make() for name, make in bar},

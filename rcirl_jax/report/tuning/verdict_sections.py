@@ -19,12 +19,13 @@ from rcirl_jax.simulation.metrics import COLUMNS
 
 SIGNIFICANT = 1.0 - CONFIDENCE
 LEVEL = f"{100.0 * CONFIDENCE:g} %"
-LOOKS = {  # classes of the decisions
+DECISIONS = {  # classes of the decisions
     "ship": "ship",
     "do not ship": "refused",
     "no difference": "refused",
     "could not judge": "open",
 }
+SAFETY = {"fail": "refused", "open": "open"}  # of the card, by the worst outcome
 # families have a section of their own
 KINDS = ("safety", "no loss", "nulls", "likeness", "gain")
 
@@ -32,7 +33,7 @@ KINDS = ("safety", "no loss", "nulls", "likeness", "gain")
 def verdict_view(verdict: Verdict) -> dict:
     """The decision and why, for the template."""
     return {
-        "kind": LOOKS[verdict.decision],
+        "kind": DECISIONS[verdict.decision],
         "decision": verdict.decision,
         "sentence": verdict.sentence,
         "reasons": verdict.reasons,
@@ -48,8 +49,7 @@ def checks_tables(verdict: Verdict) -> list[Table]:
     for kind in KINDS:
         checks = [check for check in verdict.checks if check.kind == kind]
         if checks:
-            names = [check.name.replace("_", " ") for check in checks]
-            tables.append(forest(TITLES[kind], checks, names))
+            tables.append(forest(TITLES[kind], checks, [c.title for c in checks]))
     return tables
 
 
@@ -76,7 +76,7 @@ def forest(title: str, checks: Sequence[Check], names: Sequence[str]) -> Table:
     failing = []
     for name, check in zip(names, checks, strict=True):
         word, kind = outcome_of(check)
-        said = part("outcome", kind, word)
+        said = part("outcome", kind, word, check.note if check.measured else "")
         if not check.measured:
             rows.append((name, "", "not measured", check.note, said))
             continue
@@ -92,7 +92,7 @@ def forest(title: str, checks: Sequence[Check], names: Sequence[str]) -> Table:
             words=f"{name}: {numbers}, {word}",
         )
         rows.append((name, cell, numbers, _evidence(check), said))
-    heads = ("", "", f"difference [{LEVEL}]", "cases, p", "")
+    heads = ("", "", f"difference [{LEVEL}]", "margin, cases, p", "")
     return Table(caption=title, heads=heads, rows=rows, kind="forest", marked=failing)
 
 
@@ -107,9 +107,11 @@ def outcome_of(check: Check) -> tuple[str, str]:
 
 
 def _evidence(check: Check) -> str:
-    """Cases that only one of them passes, and the p value."""
+    """Margin, cases that only one of them passes, and the p value."""
+    margin = "" if check.margin is None else f"−{100.0 * check.margin:g} %"
     pairs = "" if check.lost is None else f"+{check.gained} −{check.lost}"
-    return ", ".join(filter(None, (pairs, "" if check.p is None else _p(check.p))))
+    p = "" if check.p is None else _p(check.p)
+    return ", ".join(filter(None, (margin, pairs, p)))
 
 
 def _p(p: float) -> str:
@@ -127,7 +129,7 @@ def families_tables(verdict: Verdict) -> list[Table]:
         ]
         checks.sort(key=lambda c: (RANKS[c.outcome], c.difference))
         if checks:
-            names = [check.name.removesuffix(f", {kind}") for check in checks]
+            names = [check.title.removesuffix(f": {kind}") for check in checks]
             tables.append(forest(kind.capitalize(), checks, names))
     return tables
 
@@ -226,7 +228,7 @@ def cards(
             "title": "Verdict",
             "value": verdict.decision.capitalize(),
             "words": f"{verdict.cases:,} cases, {len(verdict.new_faults)} new faults",
-            "kind": LOOKS[verdict.decision],
+            "kind": DECISIONS[verdict.decision],
         },
         _amount(verdict, "Nearer to the human", ("likeness",), "on held-out drives"),
         _safety_card(verdict, suite, incumbent),
@@ -278,13 +280,12 @@ def _safety_card(
 ) -> dict[str, object]:
     mine = next(iter(suite.rows.values()))
     theirs = suite.rows[incumbent]
-    failed = any(c.kind == "safety" and c.outcome == "fail" for c in verdict.checks)
-    fewer = mine.at_fault <= theirs.at_fault and mine.red_lights <= theirs.red_lights
+    outcomes = {c.outcome for c in verdict.checks if c.kind == "safety"}
     return {
         "title": "Safety",
         "value": f"{mine.at_fault} / {theirs.at_fault}",
         "words": "at-fault collisions, candidate / incumbent; red lights "
         f"{mine.red_lights} / {theirs.red_lights}, stop signs {mine.stop_signs} / "
         f"{theirs.stop_signs}",
-        "kind": "refused" if failed else "ship" if fewer else "open",
+        "kind": next((SAFETY[x] for x in ("fail", "open") if x in outcomes), "ship"),
     }

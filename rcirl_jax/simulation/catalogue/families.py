@@ -180,6 +180,11 @@ def family_names() -> tuple[str, ...]:
     return tuple(sorted(p.stem for p in (spec_root() / "scenarios").glob("*.toml")))
 
 
+def family_title(name: str) -> str:
+    """What a family is about, in words; the name itself where it is none of ours."""
+    return load_family(name).title if name in family_names() else name
+
+
 @functools.lru_cache(maxsize=256)
 def load_family(name_or_path: str) -> Family:
     """A family by its name, or by the path of a TOML file.

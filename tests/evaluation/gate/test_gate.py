@@ -300,13 +300,25 @@ def test_sentences_fit_three_lines_however_much_is_wrong():
             assert "..." not in verdict.sentence
 
 
+def test_a_family_of_the_catalogue_is_called_by_its_title():
+    base, some = drives(), slice(3 * EACH, 4 * EACH)
+    made = pair(further(base, 0.8, some), base)
+    named = ["cut_in" if n == "family03" else n for n in made.families]
+    verdict = judge(dataclasses.replace(made, families=named), GateConfig())
+    assert 'less progress in "a car cuts in ahead"' in verdict.sentence
+    title = "A car cuts in ahead: progress"
+    assert check_of(verdict, "cut_in, progress").title == title
+    assert any(title in reason for reason in verdict.reasons)
+    assert title in format_verdict(verdict)
+
+
 def test_the_sentence_names_the_worst_family_and_the_json_says_the_same(tmp_path):
     config, some = GateConfig(), slice(3 * EACH, 4 * EACH)
     base = drives()
     mine = further(further(base, 0.8, some), 0.3, slice(3 * EACH, 3 * EACH + 12))
     verdict = judge(pair(mine, base), config)
     lost = 100.0 - 100.0 * mine.progress[some].sum() / np.sum(base.progress[some])
-    assert f"{lost:.1f} % less progress in family03" in verdict.sentence
+    assert f'{lost:.1f} % less progress in "family03"' in verdict.sentence
     assert verdict.sentence.endswith(f"Next: replay {verdict.look_at[0]}.")
     assert verdict.look_at[0].startswith("family03/")
     assert max(map(len, format_verdict(verdict).splitlines())) <= 132

@@ -1,0 +1,117 @@
+"""Runs side by side: what differs, their numbers, folders that are no run."""
+
+import html
+import json
+import re
+
+import pytest
+
+from rcirl_jax.evaluation.exact import clopper_pearson
+from rcirl_jax.evaluation.gate.output import write_verdict
+from rcirl_jax.evaluation.gate.types import GateConfig
+from tests.helpers.commands import refused, succeeded
+from tests.report.test_data_page import Page
+from tests.report.tuning_case import suite_and_verdict
+
+RATE = {"k": 80, "n": 120, "rate": 0.667, "low": 0.574, "high": 0.75, "bound": None}
+
+
+def write_run(folder, *, recipe="tuned", rate=0.01, data="ab" * 32, nuplan=0.9):
+    """A run folder with the files that a comparison reads, made up."""
+    _, verdict = suite_and_verdict()
+    (folder / "suite").mkdir(parents=True)
+    write_verdict(folder / "verdict.json", verdict, GateConfig(), {})
+    row = {
+        "per_case": {"j_station": RATE}, "at_fault": 12, "nuplan": nuplan,
+        "nuplan_low": nuplan - 0.02, "nuplan_high": nuplan + 0.01,
+    }  # fmt: skip
+    config = {"learning_rate": rate, "reward": {"hidden": [32, 16]}}
+    flags = {"recipe": recipe, "drives": 240, "output": str(folder)}
+    stage = {"key": "", "outputs": {}}
+    stages = {
+        "train 0": {**stage, "inputs": {"config": config, "dataset": data}},
+        "gate": {
+            **stage, "inputs": {"incumbent": "hand-set"},
+            "made_by": {"flags": flags, "git_commit": "c0ffee"},
+        },
+    }  # fmt: skip
+    top1 = {"value": 2.5, "low": 2.3, "high": 2.7}
+    for name, body in {
+        "stages.json": {"schema_version": 1, "stages": stages},
+        "suite/suite.json": {"report": {"rows": {"candidate": row}}},
+        "likeness.json": {
+            "rows": {"candidate": {"distance_m": {"mean": 1.6, "low": 1.2, "high": 2}}}
+        },
+        "ranking.json": {"rows": {"candidate": {"top1_fde": top1}}},
+    }.items():
+        (folder / name).write_text(json.dumps(body))
+    return folder, verdict
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory):
+    """The page of two runs, its path, and the verdict of both."""
+    folder = tmp_path_factory.mktemp("runs")
+    first, verdict = write_run(folder / "first")
+    second, _ = write_run(
+        folder / "second", recipe="paper", rate=0.02, data="cd" * 32, nuplan=0.8
+    )
+    (second / "likeness.json").unlink()
+    page = folder / "compare.html"
+    succeeded("rcirl_jax", "compare", str(first), str(second), f"--output={page}")
+    return page, verdict
+
+
+def rows(page):
+    return [row for row in Page(page.read_text()).rows if row]
+
+
+def test_settings_that_differ_and_no_others(compared):
+    found = {row[0]: row[1:] for row in rows(compared[0])}
+    assert found["recipe"] == ["tuned", "paper"]
+    assert found["data, sha256"] == ["ab" * 6, "cd" * 6]
+    assert found["commit"] == ["c0ffee", "c0ffee"]
+    assert found["training: learning_rate"] == ["0.01", "0.02"]
+    assert not any("hidden" in name or "drives" in name for name in found)
+
+
+def test_numbers_of_the_runs_with_their_intervals(compared):
+    page, verdict = compared
+    first, second = (
+        [row[-1] for row in rows(page) if row[0].endswith(name) and len(row) == 3]
+        for name in ("/first", "/second")
+    )
+    (way,) = [c for c in verdict.checks if (c.kind, c.name) == ("gain", "progress")]
+    low, high = (100.0 * x for x in clopper_pearson(12, 120))
+    assert first[0] == "90.0 [88.0, 91.0] points"
+    assert second[0] == "80.0 [78.0, 81.0] points"
+    assert first[1] == "66.7 [57.4, 75.0] %"
+    assert float(re.match(r"[+−][\d.]+", first[2])[0].replace("−", "-")) == (
+        pytest.approx(100.0 * way.difference, abs=0.051)
+    )
+    assert first[3] == f"10.00 [{low:.2f}, {high:.2f}] %"
+    assert first[4:] == ["1.60 [1.20, 2.00] m", "2.50 [2.30, 2.70] m"]
+    assert second[4] == "not measured"
+
+
+def test_every_verdict_is_there(compared):
+    page, verdict = compared
+    text = html.unescape(page.read_text())
+    assert text.count(verdict.sentence) == 2
+    assert text.count('class="decision refused"') == 2
+
+
+@pytest.mark.multiprocess
+def test_what_is_no_run_is_one_line(tmp_path):
+    run, _ = write_run(tmp_path / "run")
+    (tmp_path / "none").mkdir()
+    for words, message in (
+        ((str(run), str(tmp_path / "none")), f"{tmp_path}/none: no verdict in it"),
+        ((f"--runs={run},{tmp_path}/nowhere",), "nowhere: no verdict in it"),
+        ((str(run),), "--runs: 1 given: expected two folders"),
+        ((str(run), f"--runs={run}"), f"{run}: unexpected argument beside --runs"),
+    ):
+        page = tmp_path / "compare.html"
+        assert message in refused("rcirl_jax", "compare", *words, f"--output={page}")
+        assert not page.exists()
+    assert "unexpected argument" in refused("rcirl_jax", "report", str(run))
