@@ -114,4 +114,5 @@ def test_what_is_no_run_is_one_line(tmp_path):
         page = tmp_path / "compare.html"
         assert message in refused("rcirl_jax", "compare", *words, f"--output={page}")
         assert not page.exists()
-    assert "unexpected argument" in refused("rcirl_jax", "report", str(run))
+    line = refused("rcirl_jax", "report", f"--run={run}", "word")
+    assert "word: unexpected argument: expected --flags" in line
