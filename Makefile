@@ -5,8 +5,8 @@ BIN    := $(VENV)/bin
 OUT    ?= out/demo
 # parallel test workers
 WORKERS ?= 2
-# markers of those that `make test` runs
-MARKS = not slow and not dataset
+# markers of those that `make test` runs; tests/thorough.txt lists what takes long
+MARKS = not slow and not dataset and not thorough
 # folder of recordings for `make bench`; what is not there is left out
 RECORDINGS ?= ../shared/data
 # where `make reliability` writes its JSON
@@ -46,7 +46,7 @@ EXACT := $(addprefix tests/,evaluation/test_recorded_training.py \
 QUICK_XLA := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false
 TEST = $(BIN)/python -m pytest -q -n $(WORKERS) --dist worksteal -m "$(MARKS)"
 
-.PHONY: demo test test-slow test-long test-dataset test-floor test-ceiling lint bench docs notebooks onboard
+.PHONY: demo test test-all test-slow test-long test-dataset test-floor test-ceiling lint bench docs notebooks onboard
 .PHONY: setup
 .PHONY: lock audit wheel clean reliability fuzz accelerator
 
@@ -75,6 +75,10 @@ demo: $(VENV)/.all
 test: setup
 	$(TEST) $(EXACT)
 	XLA_FLAGS="$(QUICK_XLA) $(XLA_FLAGS)" $(TEST) $(addprefix --deselect=,$(EXACT))
+
+# All but `slow`, with those on recordings where they are
+test-all:
+	$(MAKE) test MARKS="not slow$(if $(RCIRL_DATA)$(wildcard ../shared/data),, and not dataset)"
 
 test-dataset: MARKS = dataset and not slow
 test-dataset: setup
@@ -130,6 +134,7 @@ wheel: setup
 lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/codespell
 	$(BIN)/pyright
 	$(BIN)/lint-imports
 

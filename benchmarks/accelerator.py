@@ -40,7 +40,7 @@ import numpy as np
 from absl import app, flags
 
 from benchmarks import roofline
-from benchmarks.common import dataset_or_synthetic, machine, untrained, write
+from benchmarks.common import dataset_or_synthetic, machine, timed, untrained, write
 from rcirl_jax.autotune.recipes import load_recipe
 from rcirl_jax.data.store.dataset import Dataset, open_dataset
 from rcirl_jax.evaluation.ranking.learners import normaliser_of
@@ -174,13 +174,7 @@ def equality(dataset: Dataset, sizes: Sizes) -> dict:
 
 def _rate(work: Callable[[], object], units: float, steps: int) -> dict:
     """Units per second of calls that are each waited for; medians."""
-    jax.block_until_ready(work())
-    taken = []
-    for _ in range(steps):
-        begin = time.perf_counter()
-        jax.block_until_ready(work())
-        taken.append(time.perf_counter() - begin)
-    median = float(np.median(taken))
+    median = float(np.median(timed(work, steps, warm_up=1)))
     return {"per_s": round(units / median), "ms": round(1e3 * median, 3)}
 
 

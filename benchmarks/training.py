@@ -6,9 +6,10 @@ From cached features: `make_train_step` with its defaults (21-15-1, rank loss, p
 Adam) and the same step in PyTorch, eager and compiled, in two forms each (see
 `benchmarks.torch_step`); it must first agree with ours within 1e-4. Then ours end to
 end, where candidates and features are made in the step, and candidates with features
-alone. Ways take turns in rounds. All of it on one core, then on all, each in a process
-of its own; all cores can be compared on a quiet machine only. Goals on two cores: 5
-times eager, 2 times compiled, 500,000 queries/s end to end, 1,000,000 candidates/s.
+alone, and the step of the recipe `tuned` in both forms. Ways take turns in rounds. All
+of it on one core, then on all, each in a process of its own; all cores can be compared
+on a quiet machine only. Goals on two cores: 5 times eager, 2 times compiled, 500,000
+queries/s end to end (400,000 for the recipe), 1,000,000 candidates/s.
 """
 
 import json
@@ -29,6 +30,7 @@ from absl import app, flags
 
 from benchmarks import roofline
 from benchmarks.common import dataset_or_synthetic, write
+from rcirl_jax.autotune.recipes import load_recipe
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.evaluation.ranking.learners import normaliser_of
 from rcirl_jax.features import feature_map
@@ -50,6 +52,7 @@ except ModuleNotFoundError:
 QUIET = 1.0  # load average up to which rows on all cores can be compared
 AGREE = 1e-4  # most that a step of theirs may differ from ours
 CONFIG = TrainConfig()
+RECIPE = load_recipe("tuned").train  # what drives; its rows begin with "recipe_"
 
 _DATA = flags.DEFINE_string("data", None, "dataset (default: synthetic traffic)")
 _SCENES = flags.DEFINE_integer("scenes", 512, "scenes, a multiple of 64; few repeat")
@@ -74,12 +77,16 @@ class Data(NamedTuple):
     pairs: float  # feasible pairs (queries) of a batch, on average
 
 
-def _data(path: str) -> Data:
-    dataset, size = open_dataset(path), CONFIG.batch_size
+def _scenes(path: str) -> tuple[Demonstration, np.ndarray]:
+    dataset = open_dataset(path)
     index = np.resize(dataset.indices("train"), _SCENES.value)
-    rows = dataset.read(index)
-    frozen = freeze(rows, index, CONFIG)
-    state = init_state(CONFIG, normaliser_of(frozen, CONFIG))
+    return dataset.read(index), index
+
+
+def _data(rows: Demonstration, index: np.ndarray, config: TrainConfig) -> Data:
+    size = config.batch_size
+    frozen = freeze(rows, index, config)
+    state = init_state(config, normaliser_of(frozen, config))
 
     def cut(tree: object) -> list:
         starts = range(0, index.size, size)
@@ -91,8 +98,14 @@ def _data(path: str) -> Data:
     return Data(raw, cut(frozen), state, pairs)
 
 
-def _ours(batches: list, state: TrainState, how: str, units: float) -> Way:
-    parallel = parallelise(make_train_step(CONFIG), how, CONFIG.batch_size)
+def _ours(
+    batches: list,
+    state: TrainState,
+    how: str,
+    units: float,
+    config: TrainConfig = CONFIG,
+) -> Way:
+    parallel = parallelise(make_train_step(config), how, config.batch_size)
     turn = cycle([parallel.place(batch) for batch in batches])
     held = [parallel.replicate(state)]
 
@@ -161,7 +174,7 @@ def _apart(data: Data, parameters: "list[torch.nn.Parameter]") -> float:
     return float(max(relative, np.max(np.abs(theirs - ours)[clear])))
 
 
-def _ways(data: Data, cores: int) -> dict[str, Way]:
+def _ways(data: Data, recipe: Data, cores: int) -> dict[str, Way]:
     made = CONFIG.batch_size * data.cached[0].feasible.shape[1]
     ways = {
         f"torch_{name}/{form}": _theirs(data, form, name == "compile")
@@ -172,6 +185,10 @@ def _ways(data: Data, cores: int) -> dict[str, Way]:
         ways[f"ours/{how}"] = _ours(data.cached, data.state, how, data.pairs)
         ways[f"end_to_end/{how}"] = _ours(data.raw, data.state, how, data.pairs)
         ways[f"candidates/{how}"] = _candidates(data.raw, how, made)
+        for form, batches in (("cached", recipe.cached), ("end_to_end", recipe.raw)):
+            ways[f"recipe_{form}/{how}"] = _ours(
+                batches, recipe.state, how, recipe.pairs, RECIPE
+            )
     return ways
 
 
@@ -224,8 +241,9 @@ def _here(path: str, cores: int) -> dict:
             "JAX_PLATFORMS=cpu"
         )
     torch.set_num_threads(cores)
-    data = _data(path)
-    rows = _timed(_ways(data, cores), len(data.raw))
+    scenes = _scenes(path)
+    data, recipe = (_data(*scenes, config) for config in (CONFIG, RECIPE))
+    rows = _timed(_ways(data, recipe, cores), len(data.raw))
     ratios = _ratios(rows)
     for name, row in rows.items():
         print(f"{cores} cores: {name}: {row}; to ours: {ratios.get(name, {})}")
@@ -272,6 +290,8 @@ def _roofline(data: Data, rows: dict[str, dict]) -> dict:
     }
     reached = {}
     for name, row in rows.items():
+        if name.startswith("recipe"):  # of another network
+            continue
         used, moved = parts.get(name.split("/")[0], parts["ours"])
         per_s = scenes * count / (1e-3 * row["wall_ms_best"])
         gflops = 1e-9 * per_s * sum(flops[part] for part in used)

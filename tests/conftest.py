@@ -37,6 +37,16 @@ settings.register_profile("nightly", max_examples=2000, deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 
 REPO = Path(__file__).resolve().parents[1]
+# tests, or whole files of them, that `make test` leaves to `make test-all`: a line each
+THOROUGH = frozenset((REPO / "tests" / "thorough.txt").read_text().split())
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what takes long; the slow ones have a marker of their own."""
+    for item in items:
+        name = item.nodeid.partition("[")[0]
+        if name in THOROUGH or name.partition("::")[0] in THOROUGH:
+            item.add_marker(pytest.mark.thorough)
 
 
 @pytest.fixture(scope="session")

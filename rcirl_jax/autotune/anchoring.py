@@ -91,7 +91,7 @@ def write_anchor(path: Path, anchor: Anchor) -> None:
 
 
 def read_anchor(path: Path) -> Anchor:
-    """As written by `write_anchor`.
+    """The anchor of a file that `write_anchor` wrote.
 
     Raises:
       InputError: it is not.

@@ -1,4 +1,4 @@
-"""What a run learns from: the stages import and rehearse."""
+"""Training data of a run: the stages import and rehearse."""
 
 import dataclasses
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""What is known of the candidate: the stages rank, simulate and gate.
+"""Evidence about the candidate: the stages rank, simulate and gate.
 
 Rivals are tuned on the same training scenes; held-out scenes and drives, the closed
 loop's cases and the margins are those of `evaluation`.
@@ -55,7 +55,7 @@ def rank(run: Run, dataset: Demonstrations) -> None:
 
 
 def _tune_idm(run: Run, dataset: Demonstrations) -> None:
-    """The rival that a sceptic names: IDM tuned on the same training scenes."""
+    """The IDM tuned on the same training scenes, the strongest simple rival."""
     path = run.tuned_idm
     setup = RankingSetup(horizon_s=run.config.horizon_s)
     search = run.config.search
@@ -152,7 +152,7 @@ def simulate(run: Run) -> None:
 
 
 def likeness(run: Run, sources: Sequence[Dataset]) -> None:
-    """Every row over held-out drives of all sources: how near to the human."""
+    """Distance of every row to the human over held-out drives of all sources."""
     job, _ = suite_job(run)
     paths = [run.folder / f"likeness.{kind}" for kind in ("npz", "json", "txt")]
 
@@ -173,12 +173,12 @@ def likeness(run: Run, sources: Sequence[Dataset]) -> None:
 
 
 def suite_runs(run: Run) -> SuiteRuns:
-    """Of the finished simulation."""
+    """The driven suite of the finished simulation."""
     return read_runs(run.folder / "suite" / "metrics.npz")
 
 
 def verdict_of(run: Run) -> Verdict:
-    """The gate's, of the finished simulation and held-out drives."""
+    """The gate's verdict on the finished simulation and held-out drives."""
     job, incumbent = suite_job(run)
     known = read_arrays(run.folder / "likeness.npz")
     gate = run.config.gate
@@ -188,7 +188,7 @@ def verdict_of(run: Run) -> Verdict:
 
 
 def gate(run: Run, verdict: Callable[[], Verdict]) -> None:
-    """Write the verdict; it is asked for where it is not written yet."""
+    """Write the verdict, computing it if there is none yet."""
     path = run.folder / "verdict.json"
     job, incumbent = suite_job(run)
     inputs = {

@@ -34,7 +34,7 @@ STAGES = ("import", "rehearse", "train", "rank", "simulate", "gate", "report")
 
 
 def tune(run: Run, given: Sequence[str | Logs], last: str = STAGES[-1]) -> None:
-    """Run the stages in order and say what comes of it.
+    """Run the stages in order and print their results.
 
     Args:
       run: folder and settings.

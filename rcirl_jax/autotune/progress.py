@@ -1,4 +1,4 @@
-"""How far a run is: which stage, how long so far, about how long it will go on.
+"""Progress of a run: its stage, the time so far, and about the time left.
 
 What is left is the work of the stages to come, counted in seconds of two usual cores,
 times how much longer this machine took for the stages that it has done. Compiling,
@@ -39,7 +39,7 @@ LAST = {
 def work_of(
     run: Run, job: SuiteJob, dataset: Demonstrations | None
 ) -> dict[str, float] | None:
-    """S of two usual cores for each stage but the import; None before the import.
+    """Seconds on two usual cores of each stage but import; None before the import.
 
     Args:
       run: its settings.
@@ -66,7 +66,7 @@ def work_of(
 
 
 class Clock:
-    """Says each stage as it begins; it hears what is compiled until it is closed."""
+    """Announces each stage; measures compilation until it is closed."""
 
     def __init__(self, run: Run, names: Sequence[str]) -> None:
         """Begin.
@@ -82,7 +82,7 @@ class Clock:
         self._lock = threading.Lock()
 
     def hear(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
-        """One measurement of JAX's."""
+        """Add one of JAX's measurements of compilation."""
         del kwargs
         if event == COMPILED:
             with self._lock:
@@ -107,7 +107,7 @@ class Clock:
             self._took += max(took, 0.0)
 
     def line(self, name: str, work: Mapping[str, float] | None) -> str:
-        """What is said when a stage begins."""
+        """The line printed when a stage begins."""
         number, count = self._names.index(name) + 1, len(self._names)
         so_far = f"{in_words(time.monotonic() - self._begin)} so far"
         text = f"stage {number} of {count}: {name}; {so_far}"

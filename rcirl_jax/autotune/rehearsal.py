@@ -1,4 +1,4 @@
-"""Rehearsal: a teacher shows the roads that nobody recorded, and how to come back.
+"""Rehearsal: a teacher drives what nobody recorded, and recovers from mistakes.
 
 A reward tuned on some roads must not unlearn the others. So the catalogue (other seeds
 than the suite's) is driven by a teacher, and in each further round by the reward
@@ -75,7 +75,7 @@ class Rehearsal:
 
     @property
     def datasets(self) -> int:
-        """How many datasets it makes: the teacher's drives and one of every round."""
+        """Number of datasets: the teacher's drives and one for each round."""
         return 0 if self.teacher == "none" else 1 + self.rounds
 
     @property

@@ -24,7 +24,7 @@ def fit_anchor(
     shares: Sequence[float],
     drives: Sequence[Dataset],
 ) -> Path | None:
-    """How far the recordings reach beside the rehearsed drives; None: no anchor."""
+    """The anchor, fitted on recordings against rehearsed drives; None: no anchor."""
     config, path = run.config, _anchor_file(run, len(drives))
     if path is None:
         return None
@@ -79,7 +79,7 @@ def workdir_of(run: Run, dataset: Demonstrations, seed: int) -> Path:
 
 
 def kept_workdir(run: Run, seed: int) -> Path:
-    """The folder of a finished training run, by what is noted of it."""
+    """The folder of a finished training run, from the notes of its stage."""
     noted = run.stages.read().get(f"train {seed}", {}).get("inputs", {})
     decided = ("config", "dataset", *run.code(__name__))
     key = digest({name: noted.get(name) for name in decided})[:8]

@@ -63,7 +63,7 @@ class Run:
 
     @property
     def stages(self) -> Stages:
-        """What has been done."""
+        """The record of finished stages."""
         return Stages(folder=self.folder)
 
     @property
@@ -118,7 +118,7 @@ class Run:
         return {"code": code_of([module]), "versions": self.facts["versions"]}
 
     def sign(self, dataset: Dataset) -> None:
-        """Say beside a dataset of this run what made it."""
+        """Write the provenance of a dataset of this run beside it."""
         dataset.write_facts({"data_hash": dataset.hash, "made_by": self.facts})
 
     def provenance(self) -> dict:
@@ -129,7 +129,7 @@ class Run:
         return {**self.facts, "weights_sha256": {r.file: r.sha256 for r in rewards}}
 
     def incumbent_reward(self) -> Reward | None:
-        """What drives today; None: a baseline."""
+        """The incumbent's reward; None: a baseline."""
         name = self.config.incumbent
         return None if name in BASELINES else open_reward(name)
 

@@ -1,8 +1,8 @@
 """What a recording says of its road users, checked against how they moved.
 
-Positions are hardest to get wrong, so they are the judge: recorded speeds, headings and
-box sizes that contradict them are refused, and the likely cause is named. A recording
-with few moving road users is not judged.
+Positions are rarely wrong. Recorded speeds, headings and box sizes that contradict them
+are refused, and the likely cause is named. A recording with few moving road users is
+not judged.
 """
 
 import dataclasses

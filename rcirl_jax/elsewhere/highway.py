@@ -9,6 +9,7 @@ lane, as ours do, and one that overtakes.
 import math
 import zlib
 from collections.abc import Sequence
+from typing import Any
 
 import gymnasium
 import highway_env
@@ -78,7 +79,7 @@ class HighwayEpisode:
 
     def __init__(self, name: str, own: str | None) -> None:
         environment, config, self._end = KINDS[name.split("/")[0]]
-        self.env = gymnasium.make(
+        self.env: Any = gymnasium.make(
             environment, config=config, disable_env_checker=True
         ).unwrapped
         self.env.reset(seed=zlib.crc32(name.encode()))
@@ -88,14 +89,15 @@ class HighwayEpisode:
         self._lane, self._driven = self.ego.lane_index, 0.0
         self._station = self.way().station(*self.ego.position)
 
-    def _take_over(self, own: str | None) -> Vehicle:
+    def _take_over(self, own: str | None) -> Any:  # noqa: ANN401
         """Put our ego, or an IDMVehicle, in the place of the environment's."""
         theirs = self.env.vehicle
-        kind = Planned if own is None else IDMVehicle
+        kind: Any = Planned if own is None else IDMVehicle
         ego = kind(self.road, theirs.position, theirs.heading, theirs.speed)
         if isinstance(ego, IDMVehicle):
             ego.enable_lane_change = own == CHANGES
-            ego.target_speed = float(ego.lane.speed_limit)
+            lane: Any = ego.lane
+            ego.target_speed = float(lane.speed_limit)
         self.road.vehicles[self.road.vehicles.index(theirs)] = ego
         return ego
 

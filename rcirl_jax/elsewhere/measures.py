@@ -7,6 +7,7 @@ are measured as ours are.
 import dataclasses
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -144,10 +145,11 @@ def record_of(drive: Drive, size: int) -> Record:
     nothing, never = fill(np.zeros(count)), np.full(size, np.inf, np.float32)
     closing = np.maximum(drive.v - drive.gap_speed, 1e-3)
     at_end = np.arange(size) == count - 1
-    hit, fault = drive.contact, drive.contact and drive.contact.at_fault
+    hit = drive.contact
+    fault = hit if hit is not None and hit.at_fault else None
     counted = lambda yes: (at_end & bool(yes)).astype(np.int32)  # noqa: E731
     is_true = lambda x: fill(x).astype(bool)  # noqa: E731
-    return Record(
+    leaves: dict[str, Any] = dict(
         valid=np.arange(size) < count,
         s=fill(drive.way),
         l=nothing,
@@ -167,8 +169,8 @@ def record_of(drive: Drive, size: int) -> Record:
         free_way=fill(np.minimum(drive.gap, drive.line), np.inf),
         collision=counted(hit),
         at_fault=counted(fault),
-        at_fault_vru=counted(fault and drive.contact.vulnerable),
-        at_fault_object=counted(fault and drive.contact.standing_object),
+        at_fault_vru=counted(fault and fault.vulnerable),
+        at_fault_object=counted(fault and fault.standing_object),
         impact_speed=np.float32(at_end * (hit.relative_speed if hit else 0.0)),
         red_light=is_true(drive.passed_red),
         stop_sign=np.zeros(size, bool),
@@ -177,6 +179,7 @@ def record_of(drive: Drive, size: int) -> Record:
         fallback=is_true(drive.fallback),
         command=nothing,
     )
+    return Record(**leaves)
 
 
 @jax.jit

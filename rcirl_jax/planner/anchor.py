@@ -1,12 +1,12 @@
-"""A learned score on top of the planner's own cost, as far as the recordings reach.
+"""A learned score added to the planner's own cost, with a gain for each scene.
 
     V = V_own + gain V_learned
     gain = low + (high - low) support              support as in `reward.support`
 
-A reward that people taught on some roads knows little of the others. There the
-planner's own cost decides and the learned value only tips the scales (`low`); in
-traffic as people were recorded in it, it has the last word (`high`). Gains are in units
-of the own cost per unit of V.
+A reward learned on some roads knows little of others. There the gain is `low`, and the
+learned value decides only between plans that the planner's own cost finds nearly equal.
+In traffic like the recorded traffic the gain is `high`. Gains are in units of the own
+cost per unit of V.
 """
 
 import functools
@@ -42,7 +42,7 @@ def gain(params: Anchored, rows: Sequence[jax.Array]) -> jax.Array:
 
 @functools.lru_cache(maxsize=16)
 def anchored_score(features: FeatureMap, activation: str, own: Score) -> Score:
-    """Score of `Anchored`; the equation stands above."""
+    """Score of `Anchored`, by the equation of the module."""
 
     def score(params: Anchored, scene: Scene, candidates: Candidates) -> jax.Array:
         rows, valid = features.rows(scene, candidates), scene.time_valid

@@ -57,7 +57,7 @@ def idm_acceleration(
 
 
 def idm_stations(scene: Scene, on_path: bool, idm: Idm) -> jax.Array:
-    """Stations [T] m of an IDM driver in the scene; leaders move as recorded."""
+    """Stations [T] m of an IDM driver in the scene; lead vehicles move as recorded."""
     obstacles, ego = scene.obstacles, scene.ego
 
     def follow(carry: tuple, now: jax.Array) -> tuple:

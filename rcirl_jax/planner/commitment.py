@@ -1,10 +1,11 @@
-"""A plan is kept for a while: planning anew only where it is due.
+"""Keep a plan for a while, and plan again only when that is necessary.
 
     kept while   admissible now,  chosen less than `commitment` ago
 
-Then the best of all candidates is chosen, the plan in force among them. Keeping costs
-the check of one trajectory, choosing the values of 65; `only_where` spares the lanes of
-a batch that keep their plan the work, which makes a closed loop several times faster.
+Otherwise the best of all candidates is chosen, the rest of the plan among them. Keeping
+a plan costs the check of one trajectory, choosing one the values of 65. `only_where`
+skips that work for the cases of a batch that keep their plan, which makes a closed loop
+several times faster.
 """
 
 from collections.abc import Callable
@@ -80,7 +81,7 @@ def _either(yes: jax.Array, one: Tree, other: Tree) -> Tree:
 
 
 def rest_of(scene: Scene, before: Plan, config: SamplerConfig) -> Candidates:
-    """The rest of the plan in force, the one candidate [1]; infeasible if none."""
+    """The rest of the plan in force as a candidate [1]; infeasible if there is none."""
     stations = running_max(scene.ego.s + stations_from_now(before))
     rest = trajectory_on_path(scene, stations)
     return Candidates(
@@ -96,7 +97,7 @@ def committed(
     safety: SafetyConfig,
     commitment: float,
 ) -> Callable[..., Plan]:
-    """A policy that plans by `anew` where the plan in force is not to be kept.
+    """A policy that keeps the plan in force while it may, and else plans by `anew`.
 
     Args:
       anew: `(params, scene, key, in_force) -> Plan`, `in_force` None before the first.

@@ -1,4 +1,4 @@
-"""Dynamic programming on the ST graph with state (s, v, a): Bellman holds.
+"""Dynamic programming on the ST graph with state (s, v, a), which is exact.
 
     V_i(n, m, k-) = max_k  gamma_i R(f_i(n, m, k, k-)) + V_{i+1}(n + m + k, m + k, k)
 
@@ -303,8 +303,8 @@ def plan_dp(
       config: static.
 
     Returns:
-      The plan; `feasible` is False where every plan breaks something, and the
-      trajectory then means nothing.
+      The plan; `feasible` is False if every plan breaks a limit; its trajectory is then
+      meaningless.
     """
     with jax.named_scope("dp"):
         lattice = make_lattice(scene, weights, features, config)

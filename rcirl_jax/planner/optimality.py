@@ -37,7 +37,7 @@ def optimality_gap(
     activation: str,
     lattice: DpConfig = FINE,
 ) -> dict[str, jax.Array]:
-    """How much the plan `trajectory` leaves on the table in this scene.
+    """How much less the plan `trajectory` is worth than the best plan of the scene.
 
     Args:
       scene: one scene.

@@ -1,8 +1,8 @@
 """What a planner answers to a scene, and how it is followed until the next plan.
 
-A plan is a curve s(t), v(t), a(t) on the time axis. Between two plans the ego follows
-that curve (`command`), and the next planning step sees it among its candidates, moved
-on in time (`stations_from_now`): what was valued is what is driven.
+A plan is s(t), v(t), a(t) on the time axis. Until the next planning step the ego
+follows it (`command`), and that step has the rest of it among its candidates
+(`stations_from_now`), so that the trajectory that was valued is the one that is driven.
 """
 
 import math
@@ -62,7 +62,7 @@ def plan_of(
 
 
 def no_plan() -> Plan:
-    """What is in force before the first plan: nothing to go on with."""
+    """The empty plan that is in force before the first one."""
     zero = jnp.zeros((NUM_TIMES,))
     nothing = Trajectory(**dict.fromkeys(Trajectory.__dataclass_fields__, zero))
     return plan_of(nothing)
@@ -91,8 +91,8 @@ def command(plan: Plan, v: jax.Array) -> jax.Array:
     The planned acceleration, linear between the times, led by the actuator's lag; an
     urgent plan asks for its braking at once. A plan that comes to rest within an
     interval shows only a part of its braking in second differences: there the braking
-    is the one that stops on the planned way, v^2 / 2s, eased off towards standstill
-    unless it is urgent.
+    is the one that stops within the planned distance, v^2 / 2s, eased off towards
+    standstill unless it is urgent.
 
     Args:
       plan: the plan in force.
@@ -112,7 +112,7 @@ def command(plan: Plan, v: jax.Array) -> jax.Array:
 
 
 def later(plan: Plan, seconds: float) -> Plan:
-    """The same plan, some time on."""
+    """The same plan after some time has passed."""
     return plan.replace(
         since=plan.since + seconds, since_choice=plan.since_choice + seconds
     )

@@ -1,4 +1,4 @@
-"""What the planner knows of the others: one prediction, offline and online.
+"""Prediction of the other road users, the same in training and in the planner.
 
 The simulator's observer and the training's scenes both describe the others by
 their state now (`Bodies`) and get their future from `obstacles_of`, so that a
@@ -57,7 +57,7 @@ class Bodies(flax.struct.PyTreeNode, kw_only=True):
 def most_relevant(bodies: Bodies, ego: Ego) -> jax.Array:
     """Places [NUM_BODIES] of the bodies that matter most, nearest first.
 
-    Absent ones fill up.
+    Absent ones fill the rest.
     """
     ds = bodies.s - ego.s
     ahead = jnp.where(ds < 0.0, -BEHIND_WEIGHT * ds, ds)
@@ -122,9 +122,9 @@ def predict(
 
         a(t) = w a_0 + (1 - w) a_IDM(t),   w = exp(-t / memory)
 
-    Without a leader only the first term acts, and who stands waits for the leader to
-    start. Hard braking goes on until standing;
-    what crosses or comes towards the ego keeps its speed. Speeds never change sign.
+    Without a lead vehicle only the first term acts. A standing vehicle waits for its
+    lead vehicle to start. Hard braking goes on until standing; what crosses or comes
+    towards the ego keeps its speed. Speeds never change sign.
     """
     how = Following()
     l, crosses = lateral_motion(bodies, path)
@@ -233,8 +233,8 @@ def bodies_now(obstacles: Obstacles) -> Bodies:
 def as_seen(scene: Scene) -> Scene:
     """A scene from a log as the planner would have seen it at t = 0.
 
-    Recorded futures give way to predicted ones, and lines to what they demand now;
-    everything else, the mask of the recorded future too, stays.
+    Recorded futures are replaced by predicted ones, and lines by what they demand now;
+    everything else stays, including the mask of the recorded future.
     """
     o = scene.obstacles
     front = scene.ego.s + 0.5 * scene.ego.length

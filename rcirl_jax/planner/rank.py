@@ -113,8 +113,8 @@ def hand_score(
 def constant_score(params: None, scene: Scene, candidates: Candidates) -> jax.Array:
     """V = 0, a null: the first admissible candidate is driven.
 
-    That is constant speed where it is admissible: what the filter, the sampler's order
-    and the given path do by themselves.
+    That is constant speed where it is admissible. It shows what filter, sampler and
+    given path achieve without a reward.
     """
     del params, scene
     return jnp.zeros(candidates.feasible.shape)
@@ -150,12 +150,11 @@ def best_plan(
 ) -> Plan:
     """The candidate that `safety.choose` takes, as a plan.
 
-    With a plan in force, the last candidate is its rest. Where that is
-    the best, it is confirmed: followed as it was made, not drawn again from its rest.
+    With a plan in force, the last candidate is its rest. If it is the best, the plan in
+    force is followed as before instead of a new plan made from its rest.
 
-    A feasible candidate whose score is not finite is a fault that no choice may hide:
-    the plan is NaN then, and so are the drive's numbers, by which a suite names
-    the case. (The guard of the onboard side answers it before; see `guard`.)
+    If the score of a feasible candidate is not finite, the plan is NaN, and so are the
+    metrics of the drive: the suite then names the case instead of hiding the fault.
 
     Args:
       scene: of the candidates.
@@ -235,6 +234,6 @@ def idm_policy(idm: Idm) -> Policy:
 def constant_speed_policy(
     params: Params, scene: Scene, key: jax.Array, before: Plan | None = None
 ) -> Plan:
-    """Nobody drives: the acceleration stays 0."""
+    """The acceleration stays 0."""
     del params, key, before
     return held(scene.ego.v, jnp.zeros(()))

@@ -1,6 +1,6 @@
-"""The safety filter: what the learned score never gets to choose.
+"""The safety filter: which candidates a score may choose from.
 
-It works on every candidate of every row alike, learned, hand-set or random:
+It is the same for learned, hand-set and random scores. For each candidate:
 
 1. swept boxes: between neighbouring times the ego's box and an obstacle's box
    slide linearly past each other in the Frenet frame; they must not touch;
@@ -10,8 +10,8 @@ It works on every candidate of every row alike, learned, hand-set or random:
 5. a distance from which braking still avoids the leader (RSS, Shalev-Shwartz
    et al. 2017), or at least a growing margin where another car took it away.
 
-The emergency stops stay available always: where nothing is admissible, the
-candidate that meets something last, and then most slowly, is driven.
+Emergency stops are always among the candidates. If no candidate is admissible, the one
+with the latest contact is driven (`choose`).
 """
 
 import dataclasses
@@ -102,8 +102,8 @@ def choose(
     A candidate whose score is not a number is not admissible.
 
     Without an admissible one, the latest contact with a body wins; among equals
-    the larger margin to the leader, then the lower speed at the contact, then
-    the shorter way: with nothing to gain, braking.
+    the larger margin to the leader, then the lower speed at the contact, then the
+    shorter distance, which is the harder braking.
     """
     admissible = verdict.admissible & ~jnp.isnan(scores)
     best = jnp.argmax(jnp.where(admissible, scores, -jnp.inf))
@@ -153,8 +153,8 @@ def first_contact(scene: Scene, x: Trajectory, config: SafetyConfig) -> jax.Arra
         |m_s h_l - m_l h_s| <= e_s |h_l| + e_l |h_s|
 
     Boxes that are tilted enter with their extents along the axes, which
-    contain them. A body that overlaps the ego's corridor from behind is not
-    the plan's to avoid. Every leaf of `x` is [T, K] here: long loops.
+    contain them. A body that overlaps the ego's corridor from behind does not count.
+    Every leaf of `x` is [T, K] here: long loops.
     """
     obstacles, ego = scene.obstacles, scene.ego
     extent = jax.vmap(jax.vmap(frenet_extent, (None, None, 0)), (None, None, 0))

@@ -92,7 +92,7 @@ def _leaders(scene: Scene, in_path: jax.Array, driver: Yielding) -> jax.Array:
 
 
 def acceleration(scene: Scene, driver: Yielding) -> jax.Array:
-    """The driver's acceleration [] m/s^2: the hardest of all its reasons."""
+    """The driver's acceleration [] m/s^2: the lowest that any reason demands."""
     o, ego = scene.obstacles, scene.ego
     in_path = _in_path(scene, driver.margin)
     sideways = jnp.abs(o.l_lower[:, 1] - o.l_lower[:, 0]) / DT_S

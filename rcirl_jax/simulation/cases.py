@@ -107,7 +107,7 @@ class Script(flax.struct.PyTreeNode, kw_only=True):
 
 
 class Agents(flax.struct.PyTreeNode, kw_only=True):
-    """Everybody else: who they are, where they appear, how they act.
+    """The other road users: kind and size, where they appear, how they act.
 
     An agent appears when the ego's station has reached `appear_s` and the
     clock `appear_t` (and, if it appears relative to the ego, its place is
@@ -190,7 +190,7 @@ class EgoState(flax.struct.PyTreeNode, kw_only=True):
 
 
 class AgentState(flax.struct.PyTreeNode, kw_only=True):
-    """All agents now."""
+    """The state of all agents at one time."""
 
     s: jax.Array  # [A] m, centre
     l: jax.Array  # [A] m

@@ -246,7 +246,7 @@ def _drives(
 
 
 def with_destinations(cases: Case, first: int, config: DriveConfig) -> Case:
-    """Cases [B] of which every `destination_every`-th ends at a place on the way.
+    """Cases [B]; every `destination_every`-th gets a destination along the road.
 
     So the teacher shows how to stop at a destination, which the suite's own cases
     have beyond their end.

@@ -1,10 +1,10 @@
-"""What a drive was like: one Record -> one CaseMetrics, pure and vmappable.
+"""Metrics of a drive: one Record -> one CaseMetrics, pure and vmappable.
 
 The paper's six columns are counted per case (every sample holds) and per
 sample, with raw jerk, the plain difference at 10 Hz, and with nuPlan's
 filtered jerk, which hides short pulses (a one-step pulse keeps 10 %). nuPlan's
 score follows its devkit's constants. Only `record.valid` samples count; a
-drive that ended in a collision of the ego's fault fails every per-case column.
+drive that ended in an at-fault collision fails every per-case column.
 """
 
 import dataclasses

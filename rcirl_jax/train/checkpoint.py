@@ -1,4 +1,4 @@
-"""Checkpoints: orbax behind three functions. Nobody else imports orbax.
+"""Checkpoints by orbax, which only this module imports.
 
     checkpoints/STEP/              as orbax writes it, under another name until whole
     checkpoints/STEP/position.json copy of the data position; by this module, then
@@ -42,8 +42,8 @@ class Checkpoints:
     """Saves and restores (TrainState, data position) under one folder.
 
     Saving is asynchronous; the data position travels as the checkpoint's own
-    metadata, so that a resumed run sees the same batches in the same order. A copy
-    lies beside the state: reading orbax's metadata costs memory for good.
+    metadata, so that a resumed run sees the same batches in the same order. A copy lies
+    beside the state, because orbax never frees the memory of metadata that it reads.
 
     `passed_over` has one line for each checkpoint that is newer than the newest
     whole one, which is the one to go on from.

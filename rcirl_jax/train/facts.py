@@ -21,7 +21,7 @@ def facts_of(
 ) -> Facts:
     """Distances, collisions and broken rules of one scene, leaves [K].
 
-    Over the times in `valid` [T]; the human's own are of the recorded curve.
+    Over the times in `valid` [T]; the human's own are of the recorded trajectory.
     `frames` are those of the candidates, [T, K].
     """
     x = candidates.trajectory
@@ -65,7 +65,7 @@ def admitted(scene: Scene, candidates: Candidates, config: TrainConfig) -> jax.A
 def densities(
     driven: Trajectory, x: Trajectory, counts: jax.Array, valid: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Log densities of the driven curve [] and of the candidates [K] (`log_density`).
+    """Log densities of the human [] and of the candidates [K] (`log_density`).
 
     Args:
       driven: the human's curve.
@@ -74,19 +74,19 @@ def densities(
       valid: [T] bool, times that count.
     """
     # the human's own curve, the origin, stands last
-    away = [
+    s, l = (
         jnp.pad(a - b, ((0, 1), (0, 0))) for a, b in ((x.s, driven.s), (x.l, driven.l))
-    ]
-    squared = rms_squared(*away, valid)
+    )
+    squared = rms_squared(s, l, valid)
     others = counts & ~jnp.eye(counts.size, dtype=bool)
     human = log_density(squared[-1, :-1], counts)
     return human, log_density(squared[:-1, :-1], others)
 
 
 def rms_squared(s: jax.Array, l: jax.Array, valid: jax.Array) -> jax.Array:
-    """Squared RMS distances [K, K] m^2 of K curves over valid times [T].
+    """Squared RMS distances [K, K] m^2 of K trajectories over valid times [T].
 
-    d_ij^2 = |p_i|^2 + |p_j|^2 - 2 p_i p_j with each curve as a vector p: a matrix
+    d_ij^2 = |p_i|^2 + |p_j|^2 - 2 p_i p_j with each trajectory as a vector p: a matrix
     product, where the differences of all pairs take twenty times as long.
 
     Args:

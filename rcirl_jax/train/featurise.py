@@ -71,9 +71,9 @@ def featurise(
 ) -> FeatureBatch:
     """Candidates and features of a batch; each scene's key comes from its row.
 
-    With `positive="nearest"` the feasible sampled candidate nearest to the human takes
-    the human's place: ranking it above the rest asks for what a planner can
-    choose, and leaves nothing to learn from how the human's curve was recorded.
+    With `positive="nearest"` the feasible sampled candidate nearest to the human
+    replaces the human's trajectory: training then asks for a trajectory that the
+    planner can choose, and errors of the recording teach nothing.
     """
     seen = jnp.asarray(TIMES_S) <= config.train_horizon + 1e-6
 

@@ -74,8 +74,8 @@ def all_stop_after(step: int) -> bool:
 def with_the_others(step: int) -> Iterator[None]:
     """What all processes do together; if one of them is lost, this one ends at once.
 
-    Without the others nothing can be saved or closed: each would be waited for, for
-    minutes. All that is needed to go on is in the checkpoints.
+    Without the others nothing can be saved or closed: each call would wait for them for
+    minutes. The checkpoints hold all that is needed to go on.
     """
     try:
         yield

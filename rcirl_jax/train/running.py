@@ -69,9 +69,9 @@ def check_run(workdir: Path, config: TrainConfig, dataset: Demonstrations) -> No
 
 
 def of_today(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of a run without those that are gone, where they decided nothing.
+    """Settings of a run without removed ones that had no effect.
 
-    A run that people's judgements taught as well keeps `preferences`, which is unknown.
+    A run that also learned from judgements keeps `preferences`, which is unknown.
     """
     gone = ["preference_weight"]
     if not settings.get("preferences"):

@@ -28,6 +28,7 @@ REQUIRED = {
     "report": "run",
     "human-likeness": "data",
     "gate-errors": "output",
+    "drive-elsewhere": "simulator, --weights, --output",
 }
 # Help of every command, and what it says where no flag is given, in one process that
 # has what an installation without extras has; absl knows one flag of a name

@@ -266,3 +266,10 @@ def test_bad_toml_is_one_clear_line(tmp_path, old, new, field):
     line = refused(synthetic.recordings, path, load_toml(path))
     assert str(path) in line
     assert field in line
+
+
+def test_position_noise_is_added_to_positions_only(tmp_path):
+    clean, noisy = make(tmp_path)[0], make(tmp_path, noise=0.05)[0]
+    assert np.std(positions(noisy) - positions(clean)) == pytest.approx(0.05, rel=0.1)
+    for a, b in zip(clean.tracks, noisy.tracks, strict=True):
+        np.testing.assert_array_equal(a.speed, b.speed)

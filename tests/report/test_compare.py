@@ -99,6 +99,7 @@ def test_every_verdict_is_there(compared):
     text = html.unescape(page.read_text())
     assert text.count(verdict.sentence) == 2
     assert text.count('class="decision refused"') == 2
+    assert '"git_commit":' in text[text.index("Made by") :]
 
 
 @pytest.mark.multiprocess

@@ -1,7 +1,6 @@
 """Drive a reward and its rivals in a simulator that somebody else wrote.
 
-    rcirl drive-elsewhere --simulator=highway_env|sumo|commonroad --weights=FILE \
-        --episodes=N --output=DIR
+    rcirl drive-elsewhere --simulator=sumo --weights=FILE --episodes=N --output=DIR
 
 The rows drive the same episodes, at 10 Hz behind the same safety filter; the last are
 the simulator's own drivers. Writes table.txt, episodes.csv and elsewhere.json:

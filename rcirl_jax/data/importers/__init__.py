@@ -1,9 +1,10 @@
 """Importers: one folder per log format, each yielding valid Recordings.
 
 A folder with a `reader` is a format; its `FORMAT` (see `format`) says how its files are
-told and how workers share them. The reader has `recordings`: (input path, source spec)
--> iterator of Recording. The spec is the TOML of data_specs/sources (or the user's
-own). Each passes its recordings through `validate_recording` with the file's name.
+recognised and how workers share them. The reader has `recordings`: (input path, source
+spec) -> iterator of Recording. The spec is the TOML of data_specs/sources (or the
+user's own). Each passes its recordings through `validate_recording` with the file's
+name.
 """
 
 import importlib

@@ -70,10 +70,10 @@ def given_map(spec: Mapping) -> Path | None:
 
 
 def is_input(folder: Path, file: Path) -> bool:
-    """Whether it is a file, not hidden in a folder, and no rest of unpacking.
+    """Whether it is a file that is neither hidden nor left over from unpacking.
 
-    Hidden are what a Mac wrote beside others (._NAME), copies of editors and the
-    invented scenario of INTERACTION's scripts (.TestScenarioForScripts).
+    Hidden are files of macOS (._NAME), backup copies of editors and the made-up
+    scenario of INTERACTION's scripts (.TestScenarioForScripts).
     """
     below = file.relative_to(folder).parts
     return file.is_file() and not any(p == "__MACOSX" or p[0] == "." for p in below)
@@ -133,7 +133,7 @@ def table_stem(path: Path) -> str:
 def is_long_file(path: Path, spec: dict) -> bool:
     """Whether a file is read in pieces; `long_bytes` of the TOML sets from where.
 
-    It is bytes of text: what is packed counts as so many times as long.
+    It counts bytes of text; a compressed file counts as several times its size.
     """
     limit = number(spec, "long_bytes", LONG_BYTES)
     if not path.is_file():

@@ -1,4 +1,4 @@
-"""What a format says of itself, in its folder, before its reader is loaded.
+"""What a format declares in its folder, without loading its reader.
 
 Each folder with a `reader` has a `FORMAT` in its `__init__`, which is cheap to import.
 """

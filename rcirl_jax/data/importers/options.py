@@ -58,7 +58,7 @@ def number(spec: Mapping, key: str, default: float = math.nan) -> float:
 def stated(spec: Mapping, key: str) -> float | None:
     """A number > 0 that the user's own TOML states; None where it is a default.
 
-    What somebody says of a site is known; what a packaged TOML says of all is a guess.
+    What a user's TOML says of a site counts as known, a packaged TOML's as a guess.
     """
     return positive(spec, key) if key in spec.get(STATED, ()) else None
 

@@ -222,8 +222,8 @@ def without_outliers(
 ) -> tuple[list[Track], list[str]]:
     """Tracks without the impossible ones, and a note of their number.
 
-    All of them where more than MAX_OUTLIERS are, and more than one of ONE_OF or more:
-    validation refuses them then.
+    All tracks, for validation to refuse, if more than MAX_OUTLIERS are impossible, and
+    more than one of ONE_OF or more.
 
     Args:
       tracks: of one recording.

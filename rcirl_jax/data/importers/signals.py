@@ -1,4 +1,4 @@
-"""Colours of lights, as seen now and then, to Signals."""
+"""Signals from the colours of lights at the times at which they were seen."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""XML from files that nobody vouches for: no entities, no DTD, bounded size.
+"""XML from untrusted files: no entities, no DTD, bounded size.
 
 Numbers out of its elements come with errors that name file and field.
 """

@@ -1,4 +1,4 @@
-"""Tracks of a perception that flickers, made fit to be obstacles, in any format.
+"""Clean the tracks of a flickering perception before they become obstacles.
 
 Perception loses a standing body and finds it again under another number, and sees
 bodies for a few frames that are none. Before scenes are cut, the fragments of a

@@ -129,8 +129,8 @@ def line_obstacles(
     (for another direction) is green: on the urban recordings that finds 78 % of the
     stands at red instead of 62 %, 96 % against 98 % precise. A stop sign does until a
     car that brakes evenly to the line has stood for a second. A car that stands
-    with its front over a light's line meets the line just before its front: going on
-    is what it waits to be allowed.
+    with its front over a light's line meets the line just before its front, because it
+    waits to be allowed to go.
     """
     rows = []
     front = 0.5 * track.length

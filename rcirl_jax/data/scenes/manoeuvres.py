@@ -242,8 +242,8 @@ def _drove(m: Meetings, passed: np.ndarray) -> np.ndarray:
 def follows(m: Meetings) -> np.ndarray:
     """[..., N] bool: ahead on the path or in the line for long enough, the same way.
 
-    A standing body goes the same way within the jitter of its positions. Who drives
-    out of view or of the recording does not end to be followed.
+    A standing body goes the same way within the jitter of its positions. An obstacle
+    that leaves the view or the recording still counts as followed.
     """
     there = m.on_path | (m.ahead & m.in_line(0.5))
     begin, end = first(there), last(there)

@@ -17,14 +17,14 @@ def distances(
     speed: float,
     path_l: np.ndarray,
 ) -> np.ndarray:
-    """[n] how far from mattering each body is, the least of all times; inf: unseen.
+    """[n] relevance of each body as a distance, the least of all times; inf: unseen.
 
         d(t) = along(t) + ASIDE_WEIGHT aside(t)
 
     along: metres ahead of the human that drives on at its speed, those behind count
     BEHIND_WEIGHT times; aside: metres between the bodies' side and the human's own
-    path, zero in it. So in one distance who is in the path comes before who is beside,
-    and who closes in before who drives off.
+    path, zero in it. Bodies in the path thus come before those beside it, and
+    approaching ones before departing ones.
 
     Args:
       s: [n, T] m, stations of the centres.

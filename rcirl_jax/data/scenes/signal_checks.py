@@ -25,7 +25,7 @@ class SignalChecks:
     def of_signals(self, recording: Recording) -> dict[str, bool]:
         """Whether to use each signal that a judged line of the recording has.
 
-        Of two lines with one light the one that bears it out counts.
+        Of two lines with one light the one that confirms it counts.
         """
         known = {signal.id for signal in recording.signals}
         found: dict[str, bool] = {}

@@ -1,8 +1,8 @@
 """Until when all that the human reacts to is recorded.
 
-A leader that leaves the recorded region, or whose track ends, is unseen from then
-on, and yet the human reacts to it: what follows is no demonstration of anything
-that the record shows. So the scene's mask ends there.
+A lead vehicle that leaves the recorded region, or whose track ends, is not recorded
+from then on, but the human still reacts to it. What the human does then cannot be
+learned from the recording, so the scene's mask ends there.
 """
 
 import numpy as np
@@ -26,8 +26,8 @@ def surroundings_end(row: dict, ends: np.ndarray) -> float:
 
     At the end of its track it matters if it is the nearest one ahead on the human's
     own path, or one beside it that the human is about to pass (`labels`: nudge).
-    Who was passed, drove off the path, or is shielded by a nearer one ends nothing,
-    nor does a track that another one goes on for in the same place.
+    Road users that were passed, left the path or are hidden by a nearer one do not
+    count, nor does a track that another one continues in the same place.
 
     Args:
       row: the scene's flat arrays, without labels.

@@ -21,7 +21,7 @@ JSON_BYTES = {MANIFEST: 2**30, MARK: 2**28, FACTS: 2**28}
 
 
 class Files:
-    """Named values below one URL: a thin skin over tensorstore's KvStore."""
+    """Named values below one URL, by tensorstore's KvStore."""
 
     def __init__(self, url: str | os.PathLike[str]) -> None:
         text = os.fspath(url)

@@ -1,4 +1,4 @@
-"""Several datasets as one: a reward that has to drive everywhere learns from all."""
+"""Several datasets as one, so that a reward learns from all of them."""
 
 import hashlib
 from collections.abc import Sequence

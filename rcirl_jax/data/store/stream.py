@@ -93,7 +93,7 @@ class RowStream:
 class Prefetch(Generic[T]):
     """Calls a function in a thread, a bounded number of results ahead.
 
-    `waited_s` is the time that `next` spent waiting: the caller starved.
+    `waited_s` is the time that `next` spent waiting for results.
     """
 
     def __init__(self, produce: Callable[[], T], depth: int) -> None:

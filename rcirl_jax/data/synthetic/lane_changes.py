@@ -1,4 +1,4 @@
-"""Lane changes: MOBIL, the way to the destination, pulling over."""
+"""Lane changes: MOBIL, towards the destination, and pulling over."""
 
 import numpy as np
 

@@ -51,7 +51,7 @@ class SuiteRuns:
 
 
 def runs_of(result: SuiteResult) -> SuiteRuns:
-    """What is kept of a suite just driven."""
+    """The part of a driven suite that is stored."""
     return SuiteRuns(
         rows=result.runs,
         ids=result.cases.ids,

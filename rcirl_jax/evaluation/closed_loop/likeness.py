@@ -59,13 +59,13 @@ REFERENCES = ("hand-set", "IDM", "IDM, tuned", "+velocity", "constant V")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Driven:
-    """What one row did in the D drives."""
+    """Distances and distributions of one row over the D drives."""
 
     distance: np.ndarray  # [D] m, see above
     at: np.ndarray  # [D, len(TIMES_SHOWN_S)] m; NaN where the record is shorter
     mean_speed: np.ndarray  # [D] m/s, over the same time as the human's
     induced_braking: np.ndarray  # [D] m/s^2, hardest that the ego caused
-    crashed: np.ndarray  # [D] bool, of its own fault
+    crashed: np.ndarray  # [D] bool, at fault
     samples: Mapping[str, np.ndarray]  # of HISTOGRAMS, all drives' in one
 
 
@@ -86,7 +86,7 @@ class LikenessReport:
 
     @property
     def likeness(self) -> Likeness:
-        """What the gate reads."""
+        """The distances in the form that the gate reads."""
         return Likeness(distance=self.distance, clusters=self.clusters)
 
     def unlikeness(self, name: str) -> dict[str, float]:

@@ -64,7 +64,7 @@ def check_array(
 
 
 def names_of_rows(found: np.ndarray) -> list[str]:
-    """Texts [rows], checked before they are listed: 2**40 times nothing is no byte.
+    """Texts [rows], checked first: a file may claim 2**40 empty ones in no bytes.
 
     Raises:
       ValueError: another array, or a name that is there twice.

@@ -1,4 +1,4 @@
-"""How optimal and how steady a planner is, as the paper names it, over many scenes.
+"""Optimality and robustness of a planner, in the paper's terms, over many scenes.
 
 Optimality: the value of the chosen plan against that of the best one that a finer
 solver finds (`planner.optimality`). Robustness: the variance of the plan where the

@@ -48,7 +48,7 @@ Drive = Callable[[Row, CaseSet, SuiteConfig], CaseMetrics]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SuiteResult:
-    """Everything a run of a suite leaves."""
+    """All results of a driven suite."""
 
     report: SuiteReport
     runs: Mapping[str, CaseMetrics]
@@ -64,7 +64,7 @@ class SuiteResult:
 
 
 def bar_of(row: Row, total: int) -> tqdm.tqdm:
-    """A bar of the cases that a row has driven."""
+    """A progress bar over the cases of a row."""
     return tqdm.tqdm(
         total=total, desc=f"drive the cases: {row.name}", unit="case", mininterval=0.5
     )

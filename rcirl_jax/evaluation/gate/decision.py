@@ -2,7 +2,7 @@
 
 Six kinds of check, none of them on a learned reward:
 
-    safety      not more cases with a preventable collision of its own fault, a
+    safety      not more cases with a preventable at-fault collision, a
                 collision with a pedestrian or cyclist, a red light or a stop sign run
                 than the incumbent, up to a declared margin (`gate_safety`)
     no loss     rates and progress over all cases are not worse than the incumbent's

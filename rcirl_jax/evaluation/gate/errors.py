@@ -1,4 +1,4 @@
-"""Drivers of known truth, all made of hand-set, and what the gate says of them.
+"""The gate's errors on drivers of known truth, all made from hand-set.
 
 What it refuses of the equal one is a false alarm, of the worse ones its power. Nobody
 is compared with recordings: likeness counts as equal, and there are no nulls.

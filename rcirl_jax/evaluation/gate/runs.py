@@ -1,4 +1,4 @@
-"""From a driven suite to what the gate compares."""
+"""From a driven suite to the rows that the gate compares."""
 
 from collections.abc import Sequence
 

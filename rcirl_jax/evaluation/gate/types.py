@@ -1,4 +1,4 @@
-"""What a gate is given and what it says: margins, drives, checks, a verdict.
+"""Types of the gate: margins, drives, checks and the verdict.
 
 Axes: `C` cases of the suite, `D` held-out recorded drives.
 """
@@ -32,19 +32,19 @@ NULLS = ("constant V", "+velocity")  # rewards that know nothing
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class GateConfig:
-    """Margins and primary metrics; what a team declares before it looks.
+    """Margins and primary metrics, declared before looking at results.
 
     docs/gate.md says how each margin was chosen and what it can detect.
     """
 
     # more cases with a fault than the incumbent that count as none: shares of all
     # cases. 0.0025 of 4,140 are ten
-    collision: float = 0.0025  # of its own fault, preventable
-    vulnerable: float = 0.002  # of its own fault, with a pedestrian or cyclist
+    collision: float = 0.0025  # at fault, preventable
+    vulnerable: float = 0.002  # at fault, with a pedestrian or cyclist
     red_light: float = 0.0025
     stop_sign: float = 0.0025
     # largest loss that counts as none: shares of all cases
-    collision_free: float = 0.005  # of its own fault, preventable or not
+    collision_free: float = 0.005  # at fault, preventable or not
     min_ttc: float = 0.01  # time to collision stays above 0.95 s
     speed_limit: float = 0.005
     on_road: float = 0.0025
@@ -187,7 +187,7 @@ class NewFault:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """What the gate says, and why."""
+    """The gate's decision with its checks and reasons."""
 
     decision: Decision
     sentence: str  # the decision in plain words

@@ -1,4 +1,4 @@
-"""Labels against verdicts of a person on recorded scenes.
+"""Labels compared with a person's verdicts on recorded scenes.
 
 The verdicts (data_specs/labels/judged_scenes.json) name a scene and one obstacle and
 say what happened. The recordings are read and cut anew, as an import does it, and

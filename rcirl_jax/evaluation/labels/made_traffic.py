@@ -1,4 +1,4 @@
-"""What simulated drivers did: decisions and tags from their own state.
+"""True decisions and tags of simulated drivers, from their own state.
 
 The drivers of `data.synthetic` follow, change lanes and stop by their own models. What
 they did is read from their lanes, stations and speeds without noise, never from

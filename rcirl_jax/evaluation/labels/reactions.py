@@ -24,7 +24,7 @@ LASTS_S = 1.5  # s of wanting to brake: a speed given up that can be seen
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Arrival:
-    """One that comes into the driver's lane, ahead of it."""
+    """A road user that enters the driver's lane ahead of it."""
 
     headway_s: float  # s, gap over the driver's speed when it comes
     is_nearest: bool  # nobody drives between them
@@ -34,7 +34,7 @@ class Arrival:
 def arrival(
     log: Log, own: int, number: int, window: slice, rate_hz: float
 ) -> Arrival | None:
-    """How `number` comes into the lane of the driver `own`; None if it does not.
+    """The entry of car `number` into the lane of the driver `own`; None if none.
 
     Both are there all the time.
     """

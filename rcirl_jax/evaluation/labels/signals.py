@@ -1,4 +1,4 @@
-"""Written traffic lights against what drivers did.
+"""Recorded signal phases checked against the drivers' behaviour.
 
 A converter's cycle is a claim. It is tested by turning it: the written phase is
 moved by every offset d of the cycle, and the agreement
@@ -68,7 +68,7 @@ class Event:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PhaseCheck:
-    """What the drivers say of one signal's written phase."""
+    """Agreement of the drivers with one signal's recorded phase."""
 
     name: str
     recordings: int
@@ -197,7 +197,7 @@ LineEvents = dict[str, list[tuple[str, Event]]]
 
 
 def line_events(recording: Recording) -> LineEvents:
-    """What a recording says of every line with signals, also if it is nothing."""
+    """Events of a recording at every line with signals; possibly none."""
     return {
         line_name(recording.name, ids): [(recording.name, event) for event in found]
         for ids, found in observe(recording).items()
@@ -225,7 +225,7 @@ def check_events(recorded: Iterable[LineEvents]) -> list[PhaseCheck]:
 def check_written(
     parts: Sequence[Part], *, executor: Executor | None = None
 ) -> list[PhaseCheck]:
-    """What all drivers of the logs say of the written signals, line by line.
+    """Recorded signals checked against all drivers of the logs, line by line.
 
     Args:
       parts: of `importers.parts`.

@@ -75,7 +75,7 @@ def covered_rows(
 
 
 def outcomes_of(scored: Scored, rows: Demonstration, setup: RankingSetup) -> Outcomes:
-    """What happens with each candidate, for metrics of the scored scenes."""
+    """Outcomes of all candidates, for the metrics of the scored scenes."""
     feasible = scored.feasible
     if setup.drop_collisions:
         feasible = feasible & ~scored.crash
@@ -111,7 +111,7 @@ def _temperatures(
 
 
 def numbered(rows: Mapping[str, Sequence[Run]]) -> dict[str, Run]:
-    """Each run by itself: row -> runs becomes "row#0" -> run, ..."""
+    """Every run as a row of its own: row -> runs becomes "row#0" -> run, ..."""
     return {f"{n}#{i}": x for n, runs in rows.items() for i, x in enumerate(runs)}
 
 

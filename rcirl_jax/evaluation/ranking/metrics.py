@@ -1,8 +1,7 @@
 """Ranking metrics of one scorer on held-out scenes, one number per scene.
 
 A scorer gives every candidate and the human a value (higher is better). All
-scorers are judged on the same candidates, held in `Outcomes`. The rules follow
-`peers.md` sections 1.6 and 4, where the defects of older protocols are listed:
+scorers are judged on the same candidates, held in `Outcomes`, by these rules:
 
 - No scene is dropped. Where no candidate is feasible the planner has failed:
   the scene is charged with candidate 0 and the worst value of every share.
@@ -67,7 +66,7 @@ METRICS: dict[str, Metric] = {
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Outcomes:
-    """What happens with each candidate; shared by all scorers.
+    """Outcome of each candidate; shared by all scorers.
 
     Distances are between the candidate and the recorded human.
     """
@@ -121,7 +120,7 @@ def scene_metrics(
     They differ in how scenes are pooled. The percentile rank weighs scenes
     alike; the pairwise accuracy weighs comparisons alike, that is, each scene
     by `num_pairs`. They agree where every scene has as many feasible
-    candidates. Neither says how well candidates are chosen (`peers.md` 1.7).
+    candidates. Neither says how well candidates are chosen.
 
     Args:
       values: [S, K] value of each candidate; read where feasible only.

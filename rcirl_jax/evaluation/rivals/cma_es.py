@@ -1,7 +1,7 @@
 """A black-box tuner with a counted budget: CMA-ES with restarts.
 
-The rival a sceptic names: tune a few parameters directly, on the number that counts,
-with as many queries as the learner had.
+A fair rival of a learner tunes a few parameters directly on the compared metric, with
+as many queries as the learner had.
 
 Source: Hansen, The CMA Evolution Strategy: A Tutorial (arXiv:1604.00772), by the
 package `cma`; restarts with twice the population of Auger and Hansen (CEC 2005).

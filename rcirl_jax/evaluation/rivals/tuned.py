@@ -1,4 +1,4 @@
-"""Rivals tuned on the learners' own training scenes, by the number that counts.
+"""Rivals tuned on the learners' own training scenes, by the compared metric.
 
 The hand-set cost and the Intelligent Driver Model have few parameters; a search
 looks for those whose choices end nearest to the human. Rows:

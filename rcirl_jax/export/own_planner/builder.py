@@ -14,7 +14,7 @@ frame, heading counter-clockwise from its x axis. In C++: rcirl/scene_builder.hp
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import flax.struct
@@ -119,9 +119,9 @@ class Parts(flax.struct.PyTreeNode, kw_only=True):
     ego: Ego
     path: Path
     bodies: Bodies
-    wall: np.ndarray  # [] m, the nearest line that demands a stop; inf
-    goal: np.ndarray  # [] m, where the front comes to rest; inf
-    station: np.ndarray  # [] m, of the ego on its line
+    wall: Any  # [] m, the nearest line that demands a stop; inf
+    goal: Any  # [] m, where the front comes to rest; inf
+    station: Any  # [] m, of the ego on its line
 
 
 def scene_of(parts: Parts) -> Scene:
@@ -231,12 +231,13 @@ class LineFrame:
         s, l = project_points(self.line, np.asarray(points, float) - self.origin)
         return s.astype(float), l.astype(float)
 
-    def table(self, name: str, s: np.ndarray) -> np.ndarray:
+    def table(self, name: str, s: np.ndarray | float) -> np.ndarray:
         """Heading or curvature of the line at stations; straight beyond its end."""
         values = self.tables[name]
-        return np.interp(s, self.grid, values, right=0.0 if name == "kappa" else None)
+        beyond = 0.0 if name == "kappa" else None
+        return np.asarray(np.interp(s, self.grid, values, right=beyond))
 
-    def tilt(self, s: np.ndarray, heading: np.ndarray | float) -> np.ndarray:
+    def tilt(self, s: np.ndarray | float, heading: np.ndarray | float) -> np.ndarray:
         """Headings against the line's, in (-pi, pi]."""
         apart = np.asarray(heading) - self.table("heading", s)
         return np.arctan2(np.sin(apart), np.cos(apart))
@@ -277,7 +278,7 @@ def _ego(frame: LineFrame, ego: Car, s0: float, l: float) -> Ego:
         "length": ego.length,
         "width": ego.width,
     }
-    return Ego(**{name: np.float32(x) for name, x in values.items()})
+    return Ego(**_floats(values))
 
 
 def _path(frame: LineFrame, path: Any, s0: float) -> Path:  # noqa: ANN401
@@ -307,7 +308,7 @@ def _path(frame: LineFrame, path: Any, s0: float) -> Path:  # noqa: ANN401
         "road_left": left * flat,
         "road_right": -right * flat,
     }
-    return Path(**{n: np.float32(x[:NUM_STATIONS]) for n, x in tables.items()})
+    return Path(**_floats({n: x[:NUM_STATIONS] for n, x in tables.items()}))
 
 
 def _posted_limits(frame: LineFrame) -> tuple[np.ndarray, np.ndarray]:
@@ -365,8 +366,13 @@ def _bodies(
         "half_s": half_s,
         "half_l": half_l,
     }
-    floats = {name: np.float32(x) for name, x in leaves.items()}
-    return Bodies(**floats, kind=kinds, present=np.arange(size) < len(others))
+    which: dict[str, Any] = {"kind": kinds, "present": np.arange(size) < len(others)}
+    return Bodies(**_floats(leaves), **which)
+
+
+def _floats(values: Mapping[str, Any]) -> dict[str, Any]:
+    """As numpy's float32, leaves of a tree that JAX is given."""
+    return {name: np.float32(x) for name, x in values.items()}
 
 
 def _extents(

@@ -1,4 +1,4 @@
-"""What the events of a case add up to, as the fixed arrays of a `Case`."""
+"""The events of a case, joined into the fixed arrays of a `Case`."""
 
 import dataclasses
 
@@ -29,7 +29,7 @@ STATIONS = np.arange(NUM_ROAD) * ROAD_STEP_M  # m, the road grid
 
 @dataclasses.dataclass
 class Parts:
-    """What the events of a case add up to."""
+    """The elements of all events of a case, joined."""
 
     kappa: np.ndarray
     limits: list[tuple[float, float]]

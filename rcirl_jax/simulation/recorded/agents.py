@@ -21,7 +21,7 @@ KEEPS_LANE = 0.17  # sin of 10 degrees; who heads so keeps a lane (agents.LANE_T
 
 
 def agents_of(tables: dict, limit: np.ndarray) -> Agents:
-    """Who the replayed agents are, and how they drive once they leave the log.
+    """The replayed agents, and their driver model once they leave the log.
 
     They never appear by themselves (`appear_s` = inf): the log brings them.
     """

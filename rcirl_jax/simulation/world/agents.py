@@ -1,4 +1,4 @@
-"""Everybody else on the road: IDM along the heading, MOBIL across lanes, scripts.
+"""The other road users: IDM along the heading, MOBIL across lanes, scripts.
 
 One rule finds what is in an agent's way whatever it is: a lane keeper, an
 oncoming car, a crossing car or a pedestrian looks along its own heading and
@@ -163,7 +163,7 @@ def _changing_aside(
 def accelerations(
     case: Case, bodies: Bodies, state: AgentState, pairs: Corridor, time: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """(own wish, limit set by others, the ego's part in that limit), [A] m/s^2.
+    """(desired, limit set by others, the ego's part in that limit), [A] m/s^2.
 
     The wish (free road or script) is the driver's own and acts at once; the
     limit is a reaction and acts after the reaction delay.
@@ -255,7 +255,7 @@ def _ratio_behind(
 
 
 def move(case: Case, state: AgentState, applied: jax.Array) -> AgentState:
-    """Everybody one step on, under the accelerations [A] that act now."""
+    """Agents after one step under their present accelerations [A], m/s^2."""
     agents, h = case.agents, STEP_S
     stands = agents.kind == Kind.STATIC
     runs = state.present & (state.clock >= 0.0) & ~stands

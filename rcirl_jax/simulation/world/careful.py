@@ -7,7 +7,7 @@ safety model of the JRC: brakes by how far the gap lies between a safe and an
 unsafe distance, before the conflict (PFS) and in it (CFS). Both otherwise
 drive like `planner.yielding` with wide margins.
 
-A case is preventable unless both have a collision of their own fault. Olleja
+A case is preventable unless both have an at-fault collision. Olleja
 et al. (2024) show that either alone misjudges cut-ins; as a bracket they serve.
 """
 
@@ -56,7 +56,7 @@ class Careful:
 def cc_braking(
     gap: jax.Array, v: jax.Array, v_lead: jax.Array, config: Careful
 ) -> jax.Array:
-    """Braking m/s^2 >= 0 of the CC driver: all of it at risk, else none."""
+    """Braking m/s^2 >= 0 of the CC driver: full at a risk, otherwise 0."""
     closing = jnp.maximum(v - v_lead, 1e-3)
     return jnp.where(gap / closing <= config.risk_ttc, config.braking, 0.0)
 
@@ -150,7 +150,7 @@ def judges(config: Careful = Careful()) -> tuple[Row, Row, Row, Row]:
 
 
 def preventable(careful: Sequence[CaseMetrics]) -> np.ndarray:
-    """[C] bool: at least one careful driver has no collision of its own fault."""
+    """[C] bool: at least one careful driver has no at-fault collision."""
     crashed = [np.asarray(metrics.at_fault) > 0 for metrics in careful]
     return ~np.logical_and.reduce(crashed)
 

@@ -1,4 +1,4 @@
-"""One step of the world: agents decide, everybody moves, the judge writes."""
+"""One step of the world: agents decide, all bodies move, the step is recorded."""
 
 import jax
 import jax.numpy as jnp
@@ -103,7 +103,7 @@ def _from_log(
 
 
 def _advance_agents(case: Case, world: World) -> tuple[AgentState, jax.Array]:
-    """Agents one step on, and the hardest braking [] that the ego induces."""
+    """Agents after one step, and the hardest braking [] that the ego causes."""
     time = world.step * STEP_S
     state = world.agents
     bodies = others.bodies_of(case, world.ego, state)

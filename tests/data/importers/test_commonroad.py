@@ -313,3 +313,20 @@ def test_reference_file_of_2018b(data_dir):
     assert [len(track.t) for track in recording.tracks] == [61, 61]
     assert len(recording.lanes) == 6
     assert sum(lane.left is not None for lane in recording.lanes) == 5
+
+
+def test_intervals_become_midpoints(tmp_path):
+    between = (
+        "<velocity><intervalStart>14</intervalStart><intervalEnd>16</intervalEnd>"
+        "</velocity></state>"
+    )
+    states = [
+        w.state(k, 1.5 * k, 0, drop=("velocity",)).replace("</state>", between)
+        for k in range(1, 5)
+    ]
+    made = scenario(tmp_path, w.lanelet(), w.car(states=states))
+    np.testing.assert_allclose(made.tracks[0].speed, 15.0)
+
+
+def test_inactive_light_is_off(tmp_path):
+    assert set(lit(tmp_path, [("red", 9)], active="false").state) == {"off"}

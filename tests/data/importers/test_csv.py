@@ -284,3 +284,21 @@ def test_straight_lanes_longer_than_roads_are_not_made(tmp_path):
     assert len(lanes[0].centre) > 1e5
     with pytest.raises(InputError, match=r"lanes: 1\.089e\+07 m long in all: expected"):
         straight_lanes(tmp_path, found, 4.0, None)
+
+
+def test_far_coordinates_get_a_local_origin(tmp_path):
+    rows = [
+        [r[0], r[1], r[2] + 691000.0, r[3] + 5334000.0, *r[4:]] for r in w.csv_rows()
+    ]
+    recording = only(log(tmp_path, rows), w.csv_spec(tmp_path / "s.toml"))
+    np.testing.assert_allclose(recording.tracks[0].x, 1.5 * np.arange(40))
+    assert any("local origin" in note for note in recording.notes)
+
+
+@pytest.mark.dataset
+def test_recorded_ngsim_subset_declared_as_feet(data_dir, tmp_path):
+    path = data_dir / "formats" / "ngsim_reference" / "ngsim_us101_subset_SIunits.csv"
+    units = 't = "ms"\nx = "ft"\ny = "ft"'
+    source = w.csv_spec(tmp_path / "s.toml", columns=SI_COLUMNS, units=units)
+    with pytest.raises(InputError, match="feet taken for metres"):
+        read(path, source)

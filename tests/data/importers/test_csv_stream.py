@@ -240,3 +240,16 @@ def test_settings_change_the_digest_of_a_piece(tmp_path):
     (first, *_) = read_part("csv", path, spec)
     other = dataclasses.replace(first, scenes_within=(0.0, 30.0))
     assert cut(first, CONFIG.collect).sha256 != cut(other, CONFIG.collect).sha256
+
+
+def test_windows_without_rows_are_no_pieces(tmp_path, monkeypatch):
+    """A last minute that ends early, cut into windows of which some are empty."""
+    path = tmp_path / "log.csv"
+    spec = {**write(path, rows_of(seconds=135.0)), "long_bytes": 1}
+    whole = scenes_by_name(cuts(path, spec))
+    monkeypatch.setattr(long_logs, "MAX_ROWS", 200)
+    windows = cuts(path, spec)
+    assert set(scenes_by_name(windows)) == set(whole)
+    last = max(float(made.name.rpartition("-")[2]) for made in windows)
+    assert int(last) == 2
+    assert len({made.name for made in windows}) == len(windows)

@@ -1,6 +1,7 @@
 """Files made to harm: pickles, paths that lead out, nesting, sizes that are claimed."""
 
 import io
+import json
 import os
 import pickle
 import re
@@ -14,12 +15,17 @@ import pytest
 
 from benchmarks.reliability.fuzz.forms import archive_of
 from benchmarks.reliability.fuzz.readers import suite
+from rcirl_jax.data.importers.interaction import reader as interaction
+from rcirl_jax.data.importers.l5 import map as l5_map
+from rcirl_jax.data.importers.levelx import map as levelx_lanes
+from rcirl_jax.data.importers.nuplan import map as nuplan_map
 from rcirl_jax.data.readers.sqlite import Database
 from rcirl_jax.data.readers.tables import table
 from rcirl_jax.data.readers.tables.ledger import Ledger
 from rcirl_jax.data.readers.xml import read_xml
 from rcirl_jax.evaluation.closed_loop.files import read_runs
 from rcirl_jax.runtime.specs import load_toml
+from rcirl_jax.train import checkpoint
 from tests.conftest import REPO
 from tests.data.importers import writers
 from tests.helpers.logs import read, refused
@@ -313,3 +319,56 @@ def test_no_module_runs_what_a_file_says():
             name = file.relative_to(REPO).as_posix()
             found = set(FORBIDDEN.findall(file.read_text()))
             assert found <= {CHECKED.get(name)}, f"{name}: {found}"
+
+
+def test_members_that_name_places_outside_are_not_unpacked(members, tmp_path):
+    file, content = members
+    for name in ("../odd.npy", f"{tmp_path}/odd.npy"):
+        file.write_bytes(archive_of({**content, name: content["way.npy"]}))
+        assert read_runs(file).ids == ("a", "b")
+    assert not list(tmp_path.rglob("odd.npy"))
+
+
+@pytest.mark.parametrize(
+    "find",
+    [
+        lambda log, path: l5_map.find_map(log, {"map": path}),
+        lambda log, path: interaction._find_map(log, {"map": path}),
+        lambda log, path: levelx_lanes.find_map(log, "1", {"map": path}),
+        lambda log, path: nuplan_map.find_map(log, ["x"], {"maps": path}),
+    ],
+)
+def test_a_map_whose_path_is_too_long(find, tmp_path):
+    line = refused(find, tmp_path / "log", "a/" * 3000 + "x")
+    assert re.search("map.*: a/a/.*: a path of 6001 bytes: expected at most", line)
+    assert "a path of" not in refused(find, tmp_path / "log", "a/" * 1023 + "x")
+
+
+def test_clocks_that_stand_still_or_would_fill_the_memory(tmp_path):
+    source = tmp_path / "source.toml"
+
+    def line_of(form, place, text):
+        source.write_text(text)
+        return refused(read, form, place, source)
+
+    log = writers.ngsim_csv(tmp_path / "log.csv", writers.ngsim_rows())
+    assert "frame_s: 0: expected > 0" in line_of("ngsim", log, "frame_s = 0")
+    rows = "".join(f"{k * 1e-5:.5f},a,{k * 1e-2:.4f},0\n" for k in range(200))
+    log.write_text(f"t,id,x,y\n{rows}")
+    columns = "\n".join(f'{name} = "{name}"' for name in ("t", "id", "x", "y"))
+    line = line_of("csv", log, f"rate_hz = 1e5\n[columns]\n{columns}\n")
+    assert "rate_hz: 100000: expected up to 1000" in line
+    source.write_text("rate_hz = 1" + "0" * 400)
+    line = refused(read, "synthetic", source)
+    assert "rate_hz: a number of 1329 bits: expected at most 63" in line
+
+
+def test_digests_of_a_checkpoint_that_are_no_table(tmp_path):
+    step = tmp_path / "3"
+    step.mkdir()
+    found = [[1, "a"], [2, "b"]]
+    noted = {"files": found, "sha256": checkpoint.digest(dict(found))}
+    for text in (json.dumps(noted), "[" * DEEP, '{"files": {}}'):
+        (step / checkpoint.DIGESTS).write_text(text)
+        line = refused(checkpoint._newest_whole, tmp_path)
+        assert f"checkpoint 3: {checkpoint.DIGESTS}: damaged" in line

@@ -133,3 +133,18 @@ def test_observations_and_submissions_are_left_out(cases):
         path.parent.mkdir(exist_ok=True)
         path.write_text("not read")
     assert len(read(cases.parent.parent)) == 2
+
+
+def test_pedestrians_head_where_they_walk(root):
+    (walker,) = [track for track in only(root).tracks if track.id == "P4"]
+    assert (walker.length, walker.width) == (0.5, 0.5)
+    np.testing.assert_allclose(walker.heading, 0.0, atol=1e-3)
+    np.testing.assert_allclose(walker.speed, 1.3, atol=1e-3)
+
+
+def test_unknown_agents_are_vehicles(scene, root):
+    path = scene / "vehicle_tracks_000.csv"
+    path.write_text(path.read_text().replace(",car,", ",tram,"))
+    recording = only(root)
+    assert recording.tracks[0].kind == Kind.VEHICLE
+    assert "agent types taken for vehicles: tram" in recording.notes

@@ -3,6 +3,7 @@
 import functools
 import json
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -265,3 +266,10 @@ def test_limits(folder, monkeypatch):
     monkeypatch.setattr(zarr2, "MAX_READ_BYTES", 1000)
     line = refused(read, folder)
     assert re.search(r"frames: records 0 to 100: .*at most 1000", line)
+
+
+def test_format_version_1_has_no_lights(folder):
+    shutil.rmtree(folder / "scenes" / "sample.zarr" / "traffic_light_faces")
+    recording = read(folder)[0]
+    assert recording.signals == ()
+    assert "no traffic lights recorded" in recording.notes

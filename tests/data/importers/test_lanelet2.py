@@ -260,3 +260,11 @@ def test_a_stop_line_keeps_no_others(tmp_path, monkeypatch):
     lane = read(metres(tmp_path))[0]["30004"]
     np.testing.assert_allclose(lane.stop_line, [[93.25, -78.0], [96.75, -78.0]])
     assert lane.stop_line.base is None
+
+
+def test_limit_of_the_last_rule_counts(tmp_path, monkeypatch):
+    slow = ({"subtype": "speed_limit", "sign_type": "de274-30"}, [])
+    monkeypatch.setitem(osm.RULES, "50002", slow)
+    both = {"1": (["middle_3"], ["border_3"], osm.ROAD, ["50000", "50002"])}
+    lanes, _ = read(metres(tmp_path, lanelets=both))
+    assert lanes["1"].speed_limit == pytest.approx(30 / 3.6)

@@ -289,3 +289,16 @@ def test_marked_lanes_longer_than_roads_are_not_made(tmp_path):
     assert len(marked_lanes(tmp_path, meta, (0.0, 400.0), None, rows)) == 12
     with pytest.raises(InputError, match=r"lanes: 1\.18812e\+07 m long in all"):
         marked_lanes(tmp_path, meta, (0.0, 9.9e5), None, rows)
+
+
+def test_many_markings_are_read_in_full(motorway):
+    marks = ";".join(f"{8.51 + 4.0 * k:.20f}" for k in range(4))
+    edit(motorway / "01_recordingMeta.csv", "8.51;12.59;16.43", marks)
+    assert len(only(motorway).lanes) == 5
+
+
+def test_sizes_of_the_source(junction, tmp_path):
+    source = tmp_path / "s.toml"
+    source.write_text("[sizes]\npedestrian = [0.6, 0.4]\n")
+    tracks = {track.id: track for track in only(junction, source).tracks}
+    assert (tracks["3"].length, tracks["3"].width) == (0.6, 0.4)

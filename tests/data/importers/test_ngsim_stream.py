@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from rcirl_jax.data.cut import cut
+from rcirl_jax.data.cut import cut, digest
 from rcirl_jax.data.importers import parts, read_part
+from rcirl_jax.data.readers.tables import streams
 from tests.data.importers import writers as w
 from tests.data.importers.test_csv_stream import scenes_by_name
 from tests.data.small_logs import CONFIG
@@ -105,3 +106,18 @@ def test_notes_name_what_is_left_out_and_repeated(tmp_path):
         "3 vehicles without length; default by class",
         "3 rows met twice, used once",
     )
+
+
+def native(path, stamp=BEGIN["i-80"][0]):
+    rows = [row for n in range(12) for row in vehicle(n, 60 * n, stamp)]
+    return w.ngsim_text(path, rows)
+
+
+def test_pieces_of_the_native_text_are_those_of_the_csv(tmp_path, monkeypatch):
+    monkeypatch.setattr(streams, "READ_BYTES", 10_000)
+    path = native(tmp_path / "native.txt")
+    rows = [line.split() for line in path.read_text().splitlines()]
+    table = w.ngsim_csv(tmp_path / "native.csv", rows)
+    texts, tables = read(path, 1), read(table, 1)
+    assert [made.name for made in texts] == [f"native-0000{k}" for k in range(3)]
+    assert [digest(made) for made in texts] == [digest(made) for made in tables]

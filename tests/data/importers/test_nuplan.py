@@ -285,3 +285,27 @@ def test_missing_velocity_comes_from_positions(log):
     tracks = tracks_of(only(log))
     for name in ("ego", fixture.TRACK["12"].hex()):
         np.testing.assert_allclose(tracks[name].speed, 8.0, atol=0.1)
+
+
+def test_ego_alone_on_its_path(log):
+    edit(log, "DELETE FROM lidar_box")
+    recording = only(log)
+    assert [track.id for track in recording.tracks] == ["ego"]
+    assert recording.lanes[0].id == "path-0"
+    for word in ("alone", "no map here"):
+        assert any(word in note for note in recording.notes)
+
+
+def test_maps_option(folder, tmp_path):
+    shutil.move(folder.parents[2] / "maps", tmp_path / "elsewhere")
+    assert only(folder).lanes[0].id == "path-0"
+    for place in ("../elsewhere", str(tmp_path / "elsewhere")):
+        assert "61" in lanes_of(only(folder, maps=place))
+    assert "source TOML: maps: gone: no map of" in refused(only, folder, maps="gone")
+
+
+def test_zone_of():
+    assert geopackage.zone_of("epsg:32648") == (48, False)
+    assert geopackage.zone_of(32719) == (19, True)
+    for bad in ("epsg:4326", None, "32661", "x32611"):
+        assert geopackage.zone_of(bad) is None

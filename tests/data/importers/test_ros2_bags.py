@@ -1,6 +1,8 @@
 """ROS 2 bags: lights, lanes, storages, windows, and files that are refused."""
 
+import contextlib
 import math
+import sqlite3
 import sys
 
 import numpy as np
@@ -284,3 +286,45 @@ def test_lights_of_the_older_package(tmp_path):
     signal, _ = of_light(tmp_path, light_messages(make, kind))
     assert signal.state == ("yellow", "off")
     np.testing.assert_allclose(signal.start, [0.0, 4.0], atol=1e-6)
+
+
+def test_lanes_of_a_table_beside_the_bag(tmp_path):
+    x, y = fixture.CENTRE
+    rows = [f"a,{x + k},{y},4.0" for k in (-10.0, 100.0)]
+    (tmp_path / "lanes.csv").write_text("\n".join(["id,x,y,width", *rows]) + "\n")
+    made = only(tmp_path, ego(), **ALONE, lanes={"file": "lanes.csv"})
+    (lane,) = made.lanes
+    np.testing.assert_allclose(lane.centre, [[-10.0, 0.0], [100.0, 0.0]])
+    np.testing.assert_allclose(lane.left_width, 2.0)
+    line = line_of(tmp_path, ego(), **ALONE, lanes={"file": "other.csv"})
+    assert "lanes.file: other.csv: expected this CSV beside the log" in line
+
+
+def test_a_topic_without_a_definition_is_noted(tmp_path):
+    """Where it need not be there; what says who drove is missed in words."""
+    bag = fixture.write(tmp_path).input / "drive" / "drive_0.mcap"
+    file = fixture.sqlite(tmp_path / "other.db3", bag)
+    with contextlib.closing(sqlite3.connect(file)) as database, database:
+        database.execute(
+            "DELETE FROM message_definitions WHERE topic_type LIKE '%ControlMode%'"
+        )
+    made = only(file)
+    assert {track.id for track in made.tracks} >= {"ego"}
+    (note,) = [note for note in made.notes if "not read" in note]
+    assert note.startswith("/vehicle/status/control_mode (autoware_vehicle_msgs/msg/")
+    assert note.endswith("who drove is not known")
+
+
+def test_metadata(tmp_path):
+    bag = fixture.write(tmp_path).input / "drive"
+    names = ["drive_0.mcap", "drive_1.mcap"]
+    (bag / names[1]).unlink()
+    line = line_of(tmp_path)
+    assert "metadata.yaml: relative_file_paths: drive_1.mcap: missing" in line
+    fixture.metadata(bag, names, compression_mode="MESSAGE")
+    assert "metadata.yaml: compression_mode: MESSAGE: expected" in line_of(tmp_path)
+    fixture.metadata(bag, [])
+    assert "metadata.yaml: relative_file_paths: none: expected" in line_of(tmp_path)
+    (bag / "drive_0.mcap.zstd").write_bytes(b"packed")
+    fixture.metadata(bag, ["drive_0.mcap.zstd"])
+    assert "drive_0.mcap.zstd: compressed as a whole: expected" in line_of(tmp_path)

@@ -308,3 +308,31 @@ def test_limits(tmp_path, monkeypatch, name, most, changes, words):
     assert words in refused(scenario, tmp_path, **changes)
     monkeypatch.setattr(f"rcirl_jax.data.importers.waymo.{name}", most * 50)
     assert scenario(tmp_path, **changes).tracks
+
+
+def test_history_only_as_in_the_testing_files(tmp_path):
+    """11 states, and dynamic map states of the same steps; late stamps."""
+    user = straight(w.T[:11], (w.EAST, w.NORTH), 0.0, 5.0)
+    recording = scenario(
+        tmp_path,
+        timestamps_seconds=w.STAMPS[:11] + 1e9,
+        tracks=[w.track(1, 1, user, range(11))],
+        dynamic_map_states=[w.signal_states(30)] * 11,
+    )
+    np.testing.assert_allclose(recording.tracks[0].t, w.T[:11], atol=1e-4)
+    assert not any("windows" in note for note in recording.notes)
+
+
+def test_notes_on_the_recording_car_and_shared_vehicles(whole):
+    assert (whole.name, whole.group, whole.rate_hz) == (w.SCENARIO, w.SCENARIO, 10.0)
+    assert "the recording car is track 2314" in whole.notes
+    assert {track.id for track in whole.tracks if track.automated} == {"2314"}
+    assert any("training_20s" in note for note in whole.notes)
+
+
+def test_two_heads_of_one_lane_and_a_lane_that_is_not_read(tmp_path):
+    """The first known one counts."""
+    row = w.shown(0, 3, 4)
+    row["lane_states"].append({"lane": 106, "state": 4, "stop_point": w.point(0, 0)})
+    signals = scenario(tmp_path, dynamic_map_states=[row] * 91).signals
+    assert {s.id: s.state for s in signals} == {"103": ("green",), "106": ("red",)}

@@ -1,4 +1,4 @@
-"""Tables as people have them: `reader` for tracks, `map` for lane files beside them."""
+"""Tables of any layout: `reader` for tracks, `map` for lane files beside them."""
 
 from rcirl_jax.data.importers.format import Format
 

@@ -23,8 +23,8 @@ OPTION = "automated_values"
 def flags_of(path: Path, texts: Iterable[str], spec: Mapping) -> dict[str, bool]:
     """Text -> whether an automation drives, or nobody knows who does.
 
-    An empty cell is unknown, unless no cell says no: then those that say yes are the
-    only ones that say anything.
+    An empty cell is unknown, which counts as automated. If all other cells say yes, an
+    empty one means no.
 
     Args:
       path: named in errors.

@@ -3,7 +3,7 @@
 Specification: www.geopackage.org/spec, clause 2.1.3: a blob is a head "GP",
 version, flags, srs_id and an optional envelope, then well-known binary. Numbers
 of points are checked against the blob's length before anything is read. By hand,
-because shapely's reader is no faster and 80 kB of nested lines end its process.
+because shapely's reader is no faster, and 80 kB of nested lines crash it.
 """
 
 import re

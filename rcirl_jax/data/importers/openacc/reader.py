@@ -46,7 +46,7 @@ DRIVERS = ("human", "all")  # whose drives are demonstrations
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
-    """The drives; specifications, notes and other tables beside them are none."""
+    """The drives, without specifications, notes and other tables beside them."""
     files = files_below(path, one_pattern(spec, "*.csv"))
     if path.is_dir():
         files = [file for file in files if not NOT_LOGS.fullmatch(file.name)] or files

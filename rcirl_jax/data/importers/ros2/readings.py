@@ -181,7 +181,7 @@ TYPES: dict[str, dict[str, Reader]] = {
 
 
 def stamp_of(stamp: Message) -> float:
-    """A builtin_interfaces/Time in s; 1e-7 s are resolved today."""
+    """A builtin_interfaces/Time in s, to about 1e-7 s."""
     return stamp.sec + 1e-9 * stamp.nanosec
 
 

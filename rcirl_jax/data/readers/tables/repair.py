@@ -1,4 +1,4 @@
-"""A road user is in one place at a time, and near where it was: rows are repaired."""
+"""Repair rows that put a road user in two places at once, or far from its track."""
 
 from collections.abc import Callable, Container, Mapping, Sequence
 from typing import Any

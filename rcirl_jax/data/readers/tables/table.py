@@ -1,4 +1,4 @@
-"""Tables as people have them: one reader of text, Parquet and Feather.
+"""One reader for tables of text, Parquet and Feather.
 
 `open_table` finds how a table is written, `batches` gives its columns in SI units a
 few MiB at a time, `read` all of them. A row that cannot be read, or lacks a needed
