@@ -12,6 +12,7 @@ from pathlib import Path
 
 from absl import flags
 
+from rcirl_jax.commands.flags.common import provenance
 from rcirl_jax.errors import InputError
 
 USUAL = ("runs", "output")
@@ -31,5 +32,6 @@ def main() -> None:
             f"--runs: {len(folders)} given: expected two folders of `rcirl autotune` "
             "or more"
         )
-    page = write_comparison(Path(_OUTPUT.value), [read_run(one) for one in folders])
+    runs = [read_run(one) for one in folders]
+    page = write_comparison(Path(_OUTPUT.value), runs, provenance())
     print(f"written: {page}")

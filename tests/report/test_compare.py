@@ -99,6 +99,7 @@ def test_every_verdict_is_there(compared):
     text = html.unescape(page.read_text())
     assert text.count(verdict.sentence) == 2
     assert text.count('class="decision refused"') == 2
+    assert '"git_commit":' in text[text.index("Made by") :]
 
 
 @pytest.mark.multiprocess
@@ -114,4 +115,5 @@ def test_what_is_no_run_is_one_line(tmp_path):
         page = tmp_path / "compare.html"
         assert message in refused("rcirl_jax", "compare", *words, f"--output={page}")
         assert not page.exists()
-    assert "unexpected argument" in refused("rcirl_jax", "report", str(run))
+    line = refused("rcirl_jax", "report", f"--run={run}", "word")
+    assert "word: unexpected argument: expected --flags" in line

@@ -1,13 +1,13 @@
 """The page that sets runs side by side: one HTML file that needs no other."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rcirl_jax.evaluation.exact import CONFIDENCE
 from rcirl_jax.report.charts import interval_axis, interval_cell
 from rcirl_jax.report.compare.runs import ComparedRun
-from rcirl_jax.report.pages import Table, interval, write_page
+from rcirl_jax.report.pages import Table, facts_text, interval, write_page
 from rcirl_jax.report.tuning.verdict_sections import DECISIONS
 
 ALWAYS = ("recipe", "data, sha256", "commit")  # settings shown also where all agree
@@ -50,12 +50,15 @@ METRICS = {
 }  # fmt: skip
 
 
-def write_comparison(path: Path, runs: Sequence[ComparedRun]) -> Path:
+def write_comparison(
+    path: Path, runs: Sequence[ComparedRun], facts: Mapping[str, object]
+) -> Path:
     """Write the page.
 
     Args:
       path: HTML file.
       runs: two or more, in the order in which they are shown.
+      facts: provenance of the page.
     """
     return write_page(
         path,
@@ -67,6 +70,7 @@ def write_comparison(path: Path, runs: Sequence[ComparedRun]) -> Path:
         settings=settings_table(runs),
         metrics=[metric_table(name, runs) for name in METRICS],
         level=f"{100.0 * CONFIDENCE:g} %",
+        facts=facts_text(facts),
         incumbents=len({run.incumbent for run in runs}),
     )
 

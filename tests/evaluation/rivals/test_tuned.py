@@ -12,11 +12,12 @@ from rcirl_jax.evaluation.rivals.cma_es import tune
 from rcirl_jax.evaluation.rivals.objectives import (
     DRIVER,
     TUNABLE_IDM,
+    Problem,
     idm_of,
     mean_fde,
     valued_scenes,
 )
-from rcirl_jax.evaluation.rivals.tuned import as_numbers
+from rcirl_jax.evaluation.rivals.tuned import SEARCHES, _best, as_numbers
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm, closeness, idm_trajectory
 from rcirl_jax.reward import LatticeCost
 from rcirl_jax.sampling import SamplerConfig
@@ -78,6 +79,20 @@ def test_the_search_comes_close_to_a_hidden_driver_by_what_the_report_measures()
     assert hidden < 0.05
     _, best = tune(lambda x: mean_fde(DRIVER, scenes, x), both[0], 1.0, 200, 0)
     assert best < 0.5 * usual
+
+
+def test_the_search_that_is_asked_for_is_taken(monkeypatch):
+    seen = []
+
+    def found(objective, start, sigma, budget, seed):
+        seen.append((start.size, budget, seed))
+        return HIDDEN, 0.0
+
+    monkeypatch.setitem(SEARCHES, "optuna", found)
+    made = Problem(objective=lambda vectors: np.zeros(len(vectors)), queries=1)
+    best = _best(DRIVER, made, 7, 3, "optuna")
+    assert seen == [(len(TUNABLE_IDM), 7, 3)]
+    assert best.fields() == idm_of(jnp.asarray(HIDDEN, jnp.float32)).fields()
 
 
 def test_candidates_are_those_of_the_evaluation():
