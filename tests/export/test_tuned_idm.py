@@ -68,8 +68,7 @@ def test_weights_of_one_shape_and_seed_are_told_apart_by_their_file(tmp_path):
 
 def test_seeds_of_one_shape_are_rows_of_the_closed_loop_and_one_of_a_ranking(tmp_path):
     files = [
-        str(random_weights(tmp_path / f"{seed}.msgpack", training_seed=seed))
-        for seed in (0, 1)
+        str(random_weights(tmp_path / f"{seed}.msgpack", seed=seed)) for seed in (0, 1)
     ]
     name = row_name(open_reward(files[0]))
     rows = [row.name for row in table_rows(files, [])]

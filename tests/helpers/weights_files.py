@@ -139,7 +139,7 @@ def of_the_preset(made, **changes):
     return dataclasses.replace(made, **{**own, **changes})
 
 
-def random_weights(path, seed=2, training_seed=7):
+def random_weights(path, draw=2, **provenance):
     """A file of the paper's shape, 21-15-1, that every main accepts."""
     made = example_weights(features=len(SPECS), times=TIMES_S.size, hidden=(15,))
     made = of_the_preset(
@@ -147,10 +147,10 @@ def random_weights(path, seed=2, training_seed=7):
         location=0.5 * (LOWER + UPPER),
         scale=0.3 * (UPPER - LOWER),
         biases=(*made.biases[:-1], np.zeros(1, np.float32)),  # as training leaves it
-        provenance={**made.provenance, "seed": training_seed},
+        provenance={**made.provenance, **provenance},
     )
     shape = (3, TIMES_S.size, len(SPECS))
-    x = np.random.default_rng(seed).normal(size=shape).astype(np.float32)
+    x = np.random.default_rng(draw).normal(size=shape).astype(np.float32)
     valid = np.ones(x.shape[:2], bool)
     values = [loop_value(made, *one) for one in zip(x, valid, strict=True)]
     save(path, made, x, valid, np.array(values))

@@ -153,7 +153,7 @@ def test_a_run_of_another_module_is_exported_as_stablehlo(dataset, tmp_path):
     other = RewardConfig(module="tests.reward.others:Residual")
     config = dataclasses.replace(CONFIG, epochs=1, reward=other)
     state = train(dataset, tmp_path, config).state
-    with pytest.raises(InputError, match=r"--module: .*export_weights --stablehlo"):
+    with pytest.raises(InputError, match=r"--module: .*rcirl export --stablehlo"):
         export_run(tmp_path, dataset, tmp_path / "weights.msgpack")
     with pytest.raises(InputError, match=r"expected none: weights\.msgpack"):
         train_learner(FrozenSets(dataset).of(config), config, [0])

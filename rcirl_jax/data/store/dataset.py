@@ -248,7 +248,7 @@ def open_dataset(url: str | os.PathLike[str], verify: bool = True) -> Dataset:
         reason = (
             "the import was interrupted: run import again to resume"
             if shards
-            else "no dataset here: expected a folder made by import_logs"
+            else "no dataset here: expected a folder made by `rcirl import`"
         )
         raise InputError(f"{files.path(MANIFEST)}: missing: {reason}")
     dataset = Dataset(files, parse_manifest(raw, files))

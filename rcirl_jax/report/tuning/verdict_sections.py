@@ -227,7 +227,7 @@ def cards(
         {
             "title": "Verdict",
             "value": verdict.decision.capitalize(),
-            "words": f"{verdict.cases:,} cases, {len(verdict.new_faults)} new faults",
+            "words": f"{verdict.cases:,} cases, cases with a new fault: {len(verdict.new_faults)}",
             "kind": DECISIONS[verdict.decision],
         },
         _amount(verdict, "Nearer to the human", ("likeness",), "on held-out drives"),
