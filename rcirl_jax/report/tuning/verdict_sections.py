@@ -223,11 +223,13 @@ def cards(
     verdict: Verdict, suite: SuiteReport, incumbent: str
 ) -> list[dict[str, object]]:
     """Five cards: decision, nearer to the human, safety, comfort, progress."""
+    new = len(verdict.new_faults)
+    faults = "new fault" if new == 1 else "new faults"
     return [
         {
             "title": "Verdict",
             "value": verdict.decision.capitalize(),
-            "words": f"{verdict.cases:,} cases, cases with a new fault: {len(verdict.new_faults)}",
+            "words": f"{verdict.cases:,} cases, {new} {faults}",
             "kind": DECISIONS[verdict.decision],
         },
         _amount(verdict, "Nearer to the human", ("likeness",), "on held-out drives"),
