@@ -6,18 +6,15 @@ which does not grow with the work, counts in neither.
 """
 
 import contextlib
-import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
-
-import jax
 
 from rcirl_jax.autotune.run import Run
 from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.export.spread import SuiteJob
+from rcirl_jax.runtime.compiling import compiles
 from rcirl_jax.simulation.suite import suite_refs
 
-COMPILED = "/jax/core/compile/backend_compile_duration"
 # s of two usual cores (docs/results.md): for a scene in an epoch, for a second that a
 # row drives, for a scene that is ranked, and for what hardly depends on the data
 TRAINED_S, DRIVEN_S, RANKED_S = 5e-4, 4.5e-4, 3e-3
@@ -66,27 +63,21 @@ def work_of(
 
 
 class Clock:
-    """Announces each stage; measures compilation until it is closed."""
+    """Announces each stage.
 
-    def __init__(self, run: Run, names: Sequence[str]) -> None:
-        """Begin.
+    Args:
+      run: whose stages they are.
+      names: of all stages, in their order.
+      compiled: s of each compilation so far; grows (`runtime.compiling`).
+    """
 
-        Args:
-          run: whose stages they are.
-          names: of all stages, in their order.
-        """
-        self._run, self._names = run, names
-        self._begin, self._compiled = time.monotonic(), 0.0
+    def __init__(
+        self, run: Run, names: Sequence[str], compiled: Sequence[float]
+    ) -> None:
+        self._run, self._names, self._compiled = run, names, compiled
+        self._begin = time.monotonic()
         self._worked, self._took = 0.0, 0.0  # s, of usual cores and of this machine
         self._known = {*run.stages.read()}  # stages of an earlier run
-        self._lock = threading.Lock()
-
-    def hear(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
-        """Add one of JAX's measurements of compilation."""
-        del kwargs
-        if event == COMPILED:
-            with self._lock:
-                self._compiled += duration_secs
 
     @contextlib.contextmanager
     def stage(self, name: str, work: Mapping[str, float] | None) -> Iterator[None]:
@@ -97,12 +88,12 @@ class Clock:
           work: of every stage (`work_of`).
         """
         self._run.say(self.line(name, work))
-        begin, compiled = time.monotonic(), self._compiled
+        begin, compiled = time.monotonic(), sum(self._compiled)
         done = len(self._run.done)
         yield
         expected = (work or {}).get(name, 0.0)
         if len(self._run.done) > done and expected:
-            took = time.monotonic() - begin - (self._compiled - compiled)
+            took = time.monotonic() - begin - (sum(self._compiled) - compiled)
             self._worked += expected
             self._took += max(took, 0.0)
 
@@ -132,12 +123,8 @@ class Clock:
 @contextlib.contextmanager
 def clock(run: Run, names: Sequence[str]) -> Iterator[Clock]:
     """A clock of a run; arguments as of `Clock`."""
-    made = Clock(run, names)
-    jax.monitoring.register_event_duration_secs_listener(made.hear)
-    try:
-        yield made
-    finally:
-        jax.monitoring.unregister_event_duration_listener(made.hear)
+    with compiles() as compiled:
+        yield Clock(run, names, compiled)
 
 
 def in_words(seconds: float) -> str:

@@ -38,7 +38,7 @@ MEANS = {
 # yes or no of an episode
 RATES = {
     "at_fault": "at-fault collision",
-    "collisions": "crash",
+    "collisions": "any collision",
     "red_lights": "red light run",
     "a_station": "|a| < 4 held",
     "j_station": "|jerk| < 6 held",

@@ -76,3 +76,14 @@ def _numbers(made: object) -> Iterator[float]:
     elif isinstance(made, tuple):
         for one in made:
             yield from _numbers(one)
+
+
+def leaves(tree: Mapping[str, Any], above: str = "") -> dict[str, Any]:
+    """Nested settings as one level: {"a.b": x} of {"a": {"b": x}}."""
+    found: dict[str, Any] = {}
+    for name, value in tree.items():
+        if isinstance(value, Mapping):
+            found |= leaves(value, f"{above}{name}.")
+        else:
+            found[above + name] = value
+    return found

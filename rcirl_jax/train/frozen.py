@@ -10,10 +10,9 @@ all members and stays in a CPU's cache while they use it; memory does not grow w
 batch size times members.
 """
 
-import contextlib
 import dataclasses
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import cast
 
 import flax.struct
@@ -38,7 +37,7 @@ ORDER_STREAM = 3  # fold_in number of the batch order's key
 # hidden values of all members in one piece of a batch, not on a CPU: 1 GB, for
 # large kernels in little memory
 PIECE_VALUES = 1 << 28
-COMPILED = "/jax/core/compile/backend_compile_duration"
+PROGRAM = "jit(_fit)"  # JAX's name of what `fit` compiles
 
 
 class Members(flax.struct.PyTreeNode, kw_only=True):
@@ -112,22 +111,6 @@ def fit(
     seen = np.flatnonzero(np.any(np.asarray(frozen.time_valid), axis=0))
     times = int(np.max(seen, initial=0)) + 1
     return _fit(frozen, normaliser, order, members, shared, times)
-
-
-@contextlib.contextmanager
-def compiles() -> Iterator[list[float]]:
-    """Seconds of each compile of the members' program inside the `with` block."""
-    found: list[float] = []
-
-    def listen(event: str, duration_secs: float, **kwargs: str | int) -> None:
-        if event == COMPILED and kwargs.get("fun_name") == "jit(_fit)":
-            found.append(duration_secs)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
-        yield found
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
 
 
 def _taken(frozen: FeatureBatch, part: tuple, times: int) -> FeatureBatch:

@@ -37,7 +37,7 @@ from rcirl_jax.train.processes import all_stop_after, is_first, with_the_others
 from rcirl_jax.train.running import Running, check_run, describe_run
 from rcirl_jax.train.state import Batch, FeatureBatch, TrainConfig, TrainState
 from rcirl_jax.train.step import StepMetrics, init_state, make_train_step
-from rcirl_jax.train.trackers import flat, time_weights, trackers
+from rcirl_jax.train.trackers import settings_of, time_weights, trackers
 from rcirl_jax.types import Demonstration, RewardParams
 
 CHUNK = 128  # scenes featurised per call where no batch sets their number
@@ -280,9 +280,8 @@ class _Run:
         self.trackers = (
             trackers(running.trackers, workdir, first_step) if is_first() else []
         )
-        settings = flat(dataclasses.asdict(config))
         for tracker in self.trackers:
-            tracker.settings(settings)
+            tracker.settings(settings_of(config))
         self.writer = (
             MetricsWriter(workdir, first_step, self.trackers) if is_first() else None
         )
@@ -319,7 +318,7 @@ class _Run:
                 if stop:
                     raise Interrupted(stop)
             self.summaries.append(_summary(epoch, sums))
-            self._draw_time_weights(step, state)
+        self._draw_time_weights(step, state)
         return state
 
     def _draw_time_weights(self, step: int, state: TrainState) -> None:

@@ -91,8 +91,8 @@ def share_cores(batch_size: int) -> None:
     Before JAX is first used; afterwards, or where XLA_FLAGS or JAX_NUM_CPU_DEVICES say
     how many there are, nothing happens. Other devices are not touched.
     """
-    flags = os.environ.get("XLA_FLAGS", "") + os.environ.get("JAX_NUM_CPU_DEVICES", "")
-    if "host_platform_device_count" in flags or flags.isdigit():
+    by_flag = "host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
+    if by_flag or "JAX_NUM_CPU_DEVICES" in os.environ:
         return
     most = min(processor()["cores"], batch_size // LEAST_SCENES)
     count = next((n for n in range(most, 1, -1) if batch_size % n == 0), 1)

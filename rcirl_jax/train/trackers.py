@@ -5,6 +5,7 @@ and its name in `TRACKERS`. Its package is imported when it is asked for.
 """
 
 import contextlib
+import dataclasses
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -15,6 +16,8 @@ import numpy as np
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.atomic_files import named
+from rcirl_jax.runtime.settings import leaves
+from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.units import TIMES_S
 
 if TYPE_CHECKING:
@@ -208,16 +211,11 @@ def trackers(
     return made
 
 
-def flat(settings: Mapping[str, Any], above: str = "") -> dict[str, Setting]:
-    """Nested settings as one level, `reward.hidden` for {"reward": {"hidden": ...}}."""
-    found: dict[str, Setting] = {}
-    for name, value in settings.items():
-        if isinstance(value, Mapping):
-            found |= flat(value, f"{above}{name}.")
-        else:
-            plain = isinstance(value, str | int | float)
-            found[above + name] = value if plain else str(value)
-    return found
+def settings_of(config: TrainConfig) -> dict[str, Setting]:
+    """All settings of a training as one level: `batch_size`, `reward.hidden`."""
+    found = leaves(dataclasses.asdict(config))
+    plain = (str, int, float)
+    return {n: x if isinstance(x, plain) else str(x) for n, x in found.items()}
 
 
 def time_weights(gamma: np.ndarray) -> "Figure | None":

@@ -16,7 +16,8 @@ SHOW = (
 
 def shown(batch: int, before: str = "", **env: str) -> list[str]:
     """Devices and way that a process takes for a batch."""
-    kept = {k: v for k, v in os.environ.items() if k not in {"XLA_FLAGS"}}
+    theirs = ("XLA_FLAGS", "JAX_NUM_CPU_DEVICES")
+    kept = {k: v for k, v in os.environ.items() if k not in theirs}
     done = subprocess.run(
         [sys.executable, "-c", SHOW.format(batch=batch, before=before)],
         env=kept | {"JAX_PLATFORMS": "cpu"} | env,
@@ -39,6 +40,8 @@ def test_every_core_is_a_device_where_they_share_the_batch():
         (64, {"XLA_FLAGS": "--xla_force_host_platform_device_count=4"},
          ["4", "shard_map"]),  # the user's word
         (66, {"XLA_FLAGS": "--xla_force_host_platform_device_count=4"}, ["4", "jit"]),
+        (64, {"JAX_NUM_CPU_DEVICES": "4",
+              "XLA_FLAGS": "--xla_cpu_enable_fast_math=false"}, ["4", "shard_map"]),
         (64, {"before": "jax.devices();"}, ["1", "jit"]),  # JAX is in use
     ],
 )  # fmt: skip

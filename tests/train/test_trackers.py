@@ -1,6 +1,5 @@
 """What trackers keep of a run, read back with their own readers."""
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +8,10 @@ import pytest
 from rcirl_jax.errors import InputError
 from rcirl_jax.train.metrics import MetricsWriter
 from rcirl_jax.train.state import TrainConfig
-from rcirl_jax.train.trackers import flat, time_weights, trackers
+from rcirl_jax.train.trackers import settings_of, time_weights, trackers
 from rcirl_jax.units import TIMES_S
 
-SETTINGS = flat(dataclasses.asdict(TrainConfig()))
+SETTINGS = settings_of(TrainConfig())
 
 
 def track(name: str, run: Path) -> None:

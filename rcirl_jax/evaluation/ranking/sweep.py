@@ -37,8 +37,9 @@ from rcirl_jax.evaluation.ranking.score import Scorer
 from rcirl_jax.evaluation.statistics import ClusterBootstrap, Estimate, combine_seeds
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import Normaliser, RewardParams, seen_range
+from rcirl_jax.runtime.compiling import compiles
 from rcirl_jax.runtime.executors import Executor
-from rcirl_jax.train.frozen import compiles, fit, freeze, members_of
+from rcirl_jax.train.frozen import PROGRAM, fit, freeze, members_of
 from rcirl_jax.train.state import FeatureBatch, TrainConfig
 
 MOST_MEMBERS = 100_000  # of a sweep
@@ -215,7 +216,7 @@ def train_group(hidden: Hidden, config: SweepConfig) -> Iterator[Part]:
         taken = members[start : start + size]
         filled = [*taken, *[taken[-1]] * (size - len(taken))]
         begin = time.perf_counter()
-        with compiles() as compiled:
+        with compiles(PROGRAM) as compiled:
             fitted = fit(frozen, normaliser, config.shared(hidden), members_of(filled))
             count = len(taken)
             fitted = jax.tree.map(lambda x, n=count: np.asarray(x)[:n], fitted)

@@ -12,6 +12,7 @@ from rcirl_jax.evaluation.gate.types import CANDIDATE
 from rcirl_jax.runtime.atomic_files import read_json
 from rcirl_jax.runtime.checked import checked
 from rcirl_jax.runtime.pipeline import Stages
+from rcirl_jax.runtime.settings import leaves
 
 Interval = tuple[float, float, float]  # value, low, high
 RUN = "a folder of `rcirl autotune`, finished up to its verdict"
@@ -138,14 +139,10 @@ def _settings(stages: Mapping[str, dict], verdict: _Verdict) -> dict[str, str]:
     return {name: _said(value) for name, value in found.items()}
 
 
-def _flat(tree: object, name: str, sign: str = ": ") -> dict[str, object]:
-    """Leaves of nested settings, by "name: field.field"."""
-    if not isinstance(tree, Mapping):
-        return {} if tree is None else {name: tree}
-    found: dict[str, object] = {}
-    for key, value in tree.items():
-        found |= _flat(value, f"{name}{sign}{key}", ".")
-    return found
+def _flat(tree: object, name: str) -> dict[str, object]:
+    """Leaves of nested settings, by "name: field.field"; {} where there are none."""
+    found = leaves(tree) if isinstance(tree, Mapping) else {}
+    return {f"{name}: {n}": x for n, x in found.items() if x is not None}
 
 
 def _said(value: object) -> str:
