@@ -208,8 +208,9 @@ def test_candidates_of_a_scene_do_not_depend_on_the_batch():
     state = init_state(CONFIG, normaliser())
     some = jax.tree.map(lambda x: x[4:8], batch())
     alone = featurised(state.key, some, CONFIG)
+    # jerk is a third difference of float32 positions: other rounding, 1e-3 m/s3
     np.testing.assert_allclose(
-        alone.candidates, cached().candidates[4:8], rtol=1e-5, atol=1e-4
+        alone.candidates, cached().candidates[4:8], rtol=1e-5, atol=1e-3
     )
 
 

@@ -12,12 +12,11 @@ from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, SuiteResult
 from rcirl_jax.evaluation.gate.types import (
     CANDIDATE,
     INCUMBENT,
-    NULLS,
     Likeness,
     Pair,
 )
 from rcirl_jax.simulation.rollout import LANES
-from rcirl_jax.simulation.rows import Row
+from rcirl_jax.simulation.rows import NULLS, Row
 from rcirl_jax.simulation.suite import drive_row, rollout_config
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.statistics import Difference
 from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics
+from rcirl_jax.simulation.rows import NULLS
 
 Kind = Literal["safety", "no loss", "families", "nulls", "likeness", "gain"]
 Outcome = Literal["pass", "fail", "open"]
@@ -27,7 +28,6 @@ EXIT_CODES: dict[Decision, int] = {
 
 
 CANDIDATE, INCUMBENT = "candidate", "incumbent"  # names of rows
-NULLS = ("constant V", "+velocity")  # rewards that know nothing
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

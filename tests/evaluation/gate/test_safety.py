@@ -18,7 +18,8 @@ from rcirl_jax.evaluation.exact import (
 )
 from rcirl_jax.evaluation.gate.decision import judge
 from rcirl_jax.evaluation.gate.output import format_verdict
-from rcirl_jax.evaluation.gate.types import NULLS, GateConfig, Likeness
+from rcirl_jax.evaluation.gate.types import GateConfig, Likeness
+from rcirl_jax.simulation.rows import NULLS
 from tests.evaluation.gate.test_gate import (
     CASES,
     broken,
