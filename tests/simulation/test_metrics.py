@@ -74,6 +74,32 @@ def test_a_calm_drive_holds_every_column():
     assert ratio == 1.0
 
 
+MIDDLE = np.arange(S) - 49.5  # samples from the middle of a record
+RAMP = np.clip(MIDDLE / 10.0, -0.9, 0.55)  # rises by 1 per s for 15 samples
+FLIP = np.sign(MIDDLE + 2.0)  # in their middle; the filter makes it 2 per s
+
+
+@pytest.mark.parametrize(
+    ("inside", "outside"),
+    [
+        ({"a": 2.39}, {"a": 2.41}),
+        ({"a": -4.04}, {"a": -4.06}),
+        ({"curvature": 0.0488}, {"curvature": 0.0490}),  # 4.89 m/s2 at 10 m/s
+        ({"a": 4.12 * RAMP}, {"a": 4.14 * RAMP}),
+        # 8.36 and 8.39 m/s3 in all
+        (
+            {"a": 4.0 * RAMP, "curvature": 0.0367 * FLIP},
+            {"a": 4.0 * RAMP, "curvature": 0.0369 * FLIP},
+        ),
+        ({"v": 1.0, "curvature": 0.94}, {"v": 1.0, "curvature": 0.96}),
+    ],
+)
+def test_comfort_ends_at_the_bounds_of_nuplan(inside, outside):
+    for changes, kept in ((inside, 1.0), (outside, 0.0)):
+        leaves = {k: np.broadcast_to(np.float32(v), S) for k, v in changes.items()}
+        assert measured(**leaves).comfort == kept
+
+
 @pytest.mark.parametrize(
     ("column", "changes"),
     [
