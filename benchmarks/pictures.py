@@ -139,7 +139,7 @@ PICTURES: Mapping[str, Callable[[Path], None]] = {
     "responses": responses,
     "../report": report_part("h1", "#verdict details", 560, width=1280),
     "cases": report_part("#cases-table", "#cases-table tr >> nth=6", 600, width=1150),
-    "player": report_part("#player", "#player .legend", 800, FIRST_EVENT),
+    "player": report_part("#player", "#player .legend >> nth=-1", 900, FIRST_EVENT),
     "checks": report_part("#checks", "#checks table >> nth=1", 800),
     "compare": compare,
     "inspect": inspect,

@@ -124,9 +124,12 @@ def family_views(path: Path) -> None:
 
 
 def _draw_moment(axis: Axes, replay: Replay) -> None:
-    """The moment of the hardest braking, turned so that the ego drives to the right."""
+    """Hardest braking, or without cause the closest; the ego drives to the right."""
     (drive,) = replay.drives
-    now = int(np.argmin(drive.a))  # what is met ahead matters, not who is beside
+    now = int(np.argmin(drive.a))
+    ahead = np.array(drive.agents[now][1::4]) - drive.s[now]
+    if not np.any((ahead > 0.0) & (ahead < 40.0)) and not drive.red[now]:
+        now = int(np.argmin(np.abs(np.array(drive.t) - drive.start)))
     stations = replay.road_step * np.arange(len(replay.x))
 
     def placed(s: np.ndarray, l: np.ndarray) -> np.ndarray:
