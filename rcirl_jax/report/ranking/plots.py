@@ -20,7 +20,7 @@ from rcirl_jax.report.style import (
     label,
     save,
 )
-from rcirl_jax.types import Candidates, Demonstration, Kind
+from rcirl_jax.types import Candidates, Demonstration, Kind, Scene
 from rcirl_jax.units import TIMES_S
 
 SHOWN_CANDIDATES = 120  # at most so many profiles are drawn
@@ -36,9 +36,8 @@ def _mask(trajectory_values: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return np.where(valid, trajectory_values, np.nan)
 
 
-def _draw_obstacles(axis: Axes, demonstration: Demonstration) -> None:
+def draw_obstacles(axis: Axes, scene: Scene) -> None:
     """Obstacles in the driver's way as bands on the station-time graph."""
-    scene = demonstration.scene
     obstacles, width = scene.obstacles, float(scene.ego.width)
     path_l = np.asarray(scene.path.l)
     grid = np.arange(path_l.size) * 2.0
@@ -80,7 +79,7 @@ def draw_st_graph(
         axis.plot(
             TIMES_S, _mask(stations[k], valid), color=CANDIDATE, lw=0.5, alpha=0.5
         )
-    _draw_obstacles(axis, demonstration)
+    draw_obstacles(axis, demonstration.scene)
     human = _mask(np.asarray(demonstration.human.s), valid)
     axis.plot(TIMES_S, human, color=HUMAN, lw=2, label="human")
     axis.plot(

@@ -1,0 +1,1 @@
+"""What `benchmarks.pictures` draws: ideas, drives, recorded scenes, numbers."""
