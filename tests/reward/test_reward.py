@@ -106,7 +106,10 @@ def test_normaliser_is_robust_and_never_divides_by_little():
     rows[:, 13] = 100.0  # nobody to overtake
     rows[:5, 13] = 3.0
     rows[0, 6] = 1e9  # an outlier, clipped by its cap
+    rows[:, 12] *= 1e-3
     made = fit_normaliser(rows, features)
+    narrow = features.specs[12]
+    assert float(made.scale[12]) == pytest.approx(0.03 * (narrow.upper - narrow.lower))
     assert (np.asarray(made.scale) > 0.0).all()
     assert float(made.location[13]) == 100.0
     assert float(made.scale[13]) > 1.0
