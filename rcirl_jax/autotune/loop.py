@@ -32,6 +32,8 @@ from rcirl_jax.export.loading import anchor_words, open_reward
 
 STAGES = ("import", "rehearse", "train", "rank", "simulate", "gate", "report")
 
+NO_REPORT = "no report: "  # begins the line on what it needs
+
 
 def tune(run: Run, given: Sequence[str | Logs], last: str = STAGES[-1]) -> None:
     """Run the stages in order and print their results.
@@ -98,7 +100,7 @@ def _drawn(
     except ImportError as error:
         if (missing := extra_of(error)) is None:
             raise
-        return f"no report: {missing}"
+        return f"{NO_REPORT}{missing}"
     return f"report to open: {run.page}"
 
 
@@ -115,9 +117,11 @@ def _ending(run: Run, verdict: Verdict, page: Sequence[str], first: str) -> str:
     lines += textwrap.wrap(verdict.sentence, WIDTH)
     lines += [f"weights: {run.weights}", f"all tables: {run.tables}", *page]
     case = (*verdict.look_at, first)[0]
-    replay = f"rcirl replay --weights={run.weights} --case={case}"
-    lines.append(f"next: {replay} --output={run.folder / 'case'}")
-    return "\n".join(lines)
+    step = f"rcirl replay --weights={run.weights} --case={case}"
+    step += f" --output={run.folder / 'case'}"
+    if any(line.startswith(NO_REPORT) for line in page):
+        step = f"install it, then rcirl report --run={run.folder}"
+    return "\n".join([*lines, f"next: {step}"])
 
 
 def draw_again(run: Run, given: Sequence[str | Logs]) -> None:

@@ -44,18 +44,28 @@ USUAL = (
     *("output", "data", "input", "format", "source", "synthetic", "recipe"),
     *("incumbent", "suite", "cases", "duration", "drives", "until", "workers"),
 )
-_OUTPUT = flags.DEFINE_string("output", None, "folder of the run", required=True)
-also_named("workdir", "output")
-_DATA = flags.DEFINE_list("data", None, "datasets of `rcirl import`")
-_SYNTHETIC = flags.DEFINE_bool(
-    "synthetic", False, "embedded synthetic traffic, instead of both"
+_OUTPUT = flags.DEFINE_string(
+    "output", None, "folder of the run; a run that is in it goes on", required=True
 )
-_FORMAT = flags.DEFINE_list("format", None, "of each --input, else recognised")
-_INPUT = flags.DEFINE_list("input", None, "instead: logs to import")
-_SOURCE = flags.DEFINE_list("source", None, "TOML of columns and units of each --input")
+also_named("workdir", "output")
+_DATA = flags.DEFINE_list("data", None, "datasets of `rcirl import`, with commas")
+_SYNTHETIC = flags.DEFINE_bool(
+    "synthetic", False, "instead: embedded synthetic traffic, to try things out"
+)
+_FORMAT = flags.DEFINE_list(
+    "format", None, "of each --input, where it is not recognised"
+)
+_INPUT = flags.DEFINE_list(
+    "input", None, "instead: logs to import first, files or folders"
+)
+_SOURCE = flags.DEFINE_list(
+    "source", None, "TOML of columns and units of each --input, for your own tables"
+)
 _IMPORT = import_flags()
 _INCUMBENT = flags.DEFINE_string(
-    "incumbent", "hand-set", "weights file that drives today, or a baseline"
+    "incumbent",
+    "hand-set",
+    "what drives today, to be compared with: a weights file or a baseline",
 )
 _SEEDS = flags.DEFINE_integer(
     "seeds", None, "training runs; the median one drives" + AS_SAID
@@ -64,7 +74,10 @@ _TEACHER = flags.DEFINE_enum(
     "teacher", None, TEACHERS, "who rehearses the catalogue" + AS_SAID
 )
 _DRIVES = flags.DEFINE_integer(
-    "drives", 240, "held-out recorded drives that measure human-likeness"
+    "drives",
+    240,
+    "held-out drives that measure nearness to the human, 1 or more: the more, the "
+    "narrower the interval",
 )
 _PARALLEL = flags.DEFINE_enum(
     "parallel", "auto", PARALLEL, "how devices share a batch: auto takes all of them"
@@ -72,7 +85,7 @@ _PARALLEL = flags.DEFINE_enum(
 _SWEEP = flags.DEFINE_string(
     "sweep", None, "folder of `rcirl sweep`, shown in the report"
 )
-_UNTIL = flags.DEFINE_enum("until", "report", STAGES, "last stage")
+_UNTIL = flags.DEFINE_enum("until", "report", STAGES, "last stage of this time")
 
 
 def main() -> None:

@@ -17,7 +17,11 @@ from rcirl_jax.errors import InputError
 
 USUAL = ("runs", "output")
 ARGUMENTS = "runs"  # the flag that takes arguments without a name
-_RUNS = flags.DEFINE_list("runs", None, "folders of `rcirl autotune`, at least two")
+_RUNS = flags.DEFINE_list(
+    "runs",
+    None,
+    "folders of `rcirl autotune`, two or more, with commas or without --runs",
+)
 _OUTPUT = flags.DEFINE_string("output", "compare.html", "page to write")
 
 

@@ -42,20 +42,36 @@ USUAL = (
     *("run", "weights", "output", "data", "onnx", "stablehlo", "jax_export", "yaml"),
     "ranges",
 )
-_RUN = flags.DEFINE_string("run", None, "folder of `rcirl train`")
+_RUN = flags.DEFINE_string("run", None, "run to export: a folder of `rcirl train`")
 also_named("workdir", "run")
-_WEIGHTS = flags.DEFINE_string("weights", None, "instead: a weights file")
+_WEIGHTS = flags.DEFINE_string(
+    "weights", None, "instead: a weights file, to write in other forms"
+)
 _DATA = flags.DEFINE_list(
-    "data", None, "dataset (default: the run's own); several are joined"
+    "data", None, "datasets, where they have moved (default: those of the run)"
 )
 _RANGES = flags.DEFINE_bool(
-    "ranges", True, "record what training saw of each feature (schema version 3)"
+    "ranges",
+    True,
+    "record what training saw of each feature, for the guard; none for old readers",
 )
-_OUTPUT = flags.DEFINE_string("output", None, "file (default: RUN/weights.msgpack)")
-_ONNX = flags.DEFINE_string("onnx", None, "ONNX model to write")
-_STABLEHLO = flags.DEFINE_string("stablehlo", None, "StableHLO bytecode to write")
-_JAX = flags.DEFINE_string("jax_export", None, "bytes of jax.export to write")
-_YAML = flags.DEFINE_string("yaml", None, "linear costs to write")
+_OUTPUT = flags.DEFINE_string(
+    "output", None, "weights file to write (default: RUN/weights.msgpack)"
+)
+_ONNX = flags.DEFINE_string(
+    "onnx", None, "file to write: an ONNX model, for onnxruntime and the like"
+)
+_STABLEHLO = flags.DEFINE_string(
+    "stablehlo", None, "file to write: StableHLO bytecode, for XLA without Python"
+)
+_JAX = flags.DEFINE_string(
+    "jax_export",
+    None,
+    "file to write: bytes of jax.export, for other programs with JAX",
+)
+_YAML = flags.DEFINE_string(
+    "yaml", None, "file to write: costs by name, of a linear reward"
+)
 FORMS: dict[str, Form] = {"stablehlo": "stablehlo", "jax_export": "jax"}
 
 

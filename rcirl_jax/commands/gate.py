@@ -32,16 +32,26 @@ USUAL = (
     *("candidate", "incumbent", "output", "data", "drives", "suite", "cases"),
     *("duration", "tuned_idm", "accept", "primary", "workers"),
 )
-_CANDIDATE = flags.DEFINE_string("candidate", None, "weights file", required=True)
+_CANDIDATE = flags.DEFINE_string(
+    "candidate", None, "weights file that may replace it", required=True
+)
 _INCUMBENT = flags.DEFINE_string(
-    "incumbent", "hand-set", "weights file, or a baseline: " + ", ".join(BASELINES)
+    "incumbent",
+    "hand-set",
+    "what drives today: a weights file, or a baseline: " + ", ".join(BASELINES),
 )
-_OUTPUT = flags.DEFINE_string("output", None, "JSON to write", required=True)
+_OUTPUT = flags.DEFINE_string(
+    "output", None, "JSON of the verdict to write", required=True
+)
 _DATA = flags.DEFINE_list(
-    "data", [], "datasets whose held-out drives measure human-likeness"
+    "data", [], "datasets whose held-out drives measure nearness to the human"
 )
-_DRIVES = flags.DEFINE_integer("drives", DRIVES, "of them, held-out drives in all")
-_IDM = flags.DEFINE_string("tuned_idm", None, "JSON of autotune: a further row")
+_DRIVES = flags.DEFINE_integer(
+    "drives", DRIVES, "of them in all, 1 or more: the more, the narrower the interval"
+)
+_IDM = flags.DEFINE_string(
+    "tuned_idm", None, "RUN/tuned_idm.json of autotune: a tuned IDM drives too"
+)
 _FILTER = flags.DEFINE_enum(
     "filter", "full", TRACKS, "full; collision: no verdict ships, the reward decides"
 )

@@ -45,19 +45,21 @@ USUAL = (
     *("stride", "test_fraction", "leave_out", "workers"),
 )
 _FORMAT = flags.DEFINE_enum(
-    "format", None, sorted(IMPORTERS), "log format to read, else recognised"
+    "format", None, sorted(IMPORTERS), "of the logs, where it is not recognised"
 )
 _SUGGEST = flags.DEFINE_string(
     "suggest", None, "table for which the TOML of --source is written; no import"
 )
 _INPUT = flags.DEFINE_string(
-    "input", None, "file or folder (synthetic: a TOML of recordings)"
+    "input", None, "logs: a file or folder (synthetic: a TOML of recordings)"
 )
 _SOURCE = flags.DEFINE_string(
     "source", None, "TOML that maps columns and units (default: data_specs/sources)"
 )
-_OUTPUT = flags.DEFINE_string("output", None, "dataset to write")
-_OVERWRITE = flags.DEFINE_bool("overwrite", False, "replace a finished dataset")
+_OUTPUT = flags.DEFINE_string("output", None, "folder of the dataset to write")
+_OVERWRITE = flags.DEFINE_bool(
+    "overwrite", False, "replace a finished dataset, or TOML"
+)
 _IMPORT = import_flags()
 
 

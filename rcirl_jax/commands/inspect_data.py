@@ -17,11 +17,15 @@ from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
 
 USUAL = ("data", "output", "scenes", "tags", "rows")
-_DATA = flags.DEFINE_string("data", None, "dataset", required=True)
+_DATA = flags.DEFINE_string("data", None, "dataset of `rcirl import`", required=True)
 _OUTPUT = flags.DEFINE_string("output", None, "folder to write", required=True)
-_SCENES = flags.DEFINE_integer("scenes", 24, "scenes to draw", lower_bound=1)
-_TAGS = flags.DEFINE_list("tags", [], "draw only scenes with one of these tags")
-_ROWS = flags.DEFINE_list("rows", [], "draw exactly these rows of the dataset")
+_SCENES = flags.DEFINE_integer("scenes", 24, "scenes to draw, 1 or more", 1)
+_TAGS = flags.DEFINE_list(
+    "tags", [], "draw only scenes with one of these tags, e.g. lane_change,cut_in"
+)
+_ROWS = flags.DEFINE_list(
+    "rows", [], "draw exactly these scenes, by their numbers from 0"
+)
 
 
 def main() -> None:

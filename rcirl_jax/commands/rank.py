@@ -21,11 +21,19 @@ from rcirl_jax.evaluation.ranking.table import to_json
 from rcirl_jax.runtime.atomic_files import write_json
 
 USUAL = ("weights", "data", "output", "horizon", "split", "tags", "workers")
-_WEIGHTS = flags.DEFINE_list("weights", None, "weights files", required=True)
-_DATA = flags.DEFINE_string("data", None, "dataset", required=True)
-_OUTPUT = flags.DEFINE_string("output", None, "JSON to write")
-_SPLIT = flags.DEFINE_string("split", "test", "split that is ranked")
-_TAGS = flags.DEFINE_list("tags", [], "only scenes with one of these tags")
+_WEIGHTS = flags.DEFINE_list(
+    "weights", None, "weights files, with commas", required=True
+)
+_DATA = flags.DEFINE_string("data", None, "dataset of `rcirl import`", required=True)
+_OUTPUT = flags.DEFINE_string(
+    "output", None, "JSON to write, beside the table that is printed"
+)
+_SPLIT = flags.DEFINE_string(
+    "split", "test", "test: the held-out scenes; train: those that were learned from"
+)
+_TAGS = flags.DEFINE_list(
+    "tags", [], "only scenes with one of these tags, e.g. lane_change,cut_in"
+)
 _FILTER = flags.DEFINE_bool(
     "drop_collisions", False, "rank only candidates that meet nothing, in every row"
 )

@@ -23,10 +23,14 @@ from rcirl_jax.simulation.suite import (
 )
 
 USUAL = ("weights", "case", "output", "row", "duration")
-_WEIGHTS = flags.DEFINE_string("weights", None, "weights file", required=True)
-_CASE = flags.DEFINE_string("case", None, "id, for example cut_in/017@0", required=True)
+_WEIGHTS = flags.DEFINE_string(
+    "weights", None, "weights file of the learned reward", required=True
+)
+_CASE = flags.DEFINE_string(
+    "case", None, "id in a report or cases.csv, as cut_in/017@0", required=True
+)
 _ROW = flags.DEFINE_enum("row", "learned", ["learned", "dp", *BASELINES], "who drives")
-_DURATION = flags.DEFINE_float("duration", FULL_S, "s of the drive")
+_DURATION = flags.DEFINE_float("duration", FULL_S, "s of the drive, 1 to 120")
 _EVERY = flags.DEFINE_integer("plan_every", 1, "steps of 0.1 s between two plans")
 _OUTPUT = flags.DEFINE_string("output", None, "folder to write", required=True)
 

@@ -22,9 +22,11 @@ from rcirl_jax.runtime.pipeline import FILE, Stages, only_one
 
 unread("output", "workdir")  # of autotune
 USUAL = ("run", "output")
-_RUN = flags.DEFINE_string("run", None, "folder of `rcirl autotune`", required=True)
+_RUN = flags.DEFINE_string(
+    "run", None, "folder of `rcirl autotune`, with its verdict", required=True
+)
 also_named("workdir", "run")
-_OUTPUT = flags.DEFINE_string("output", None, "copy of RUN/report.html to write")
+_OUTPUT = flags.DEFINE_string("output", None, "a copy of RUN/report.html to write")
 
 # what is noted of a run and is not set again; "workdir" is the output of older ones
 NOT_OF_A_RUN = ("output", "workdir", "executor", "workers", "ray_address")

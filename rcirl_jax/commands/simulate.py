@@ -38,12 +38,22 @@ USUAL = (
     *("weights", "output", "suite", "cases", "duration", "data", "baselines"),
     *("tuned_idm", "dp", "workers"),
 )
-_WEIGHTS = flags.DEFINE_list("weights", None, "weights files", required=True)
-_DATA = flags.DEFINE_list("data", [], "datasets of --suite=recorded, heldout")
+_WEIGHTS = flags.DEFINE_list(
+    "weights", None, "weights files, with commas", required=True
+)
+_DATA = flags.DEFINE_list(
+    "data", [], "datasets of --suite=recorded or heldout, with commas"
+)
 _OUTPUT = flags.DEFINE_string("output", None, "folder to write", required=True)
-_BASELINES = flags.DEFINE_list("baselines", ",".join(BASELINES), "rival rows, or empty")
-_IDM = flags.DEFINE_string("tuned_idm", None, "JSON of autotune: a further row")
-_DP = flags.DEFINE_bool("dp", False, "also drive the first weights by DP")
+_BASELINES = flags.DEFINE_list(
+    "baselines", ",".join(BASELINES), "rivals that drive too; fewer are quicker"
+)
+_IDM = flags.DEFINE_string(
+    "tuned_idm", None, "RUN/tuned_idm.json of autotune: a tuned IDM drives too"
+)
+_DP = flags.DEFINE_bool(
+    "dp", False, "the first weights also drive by dynamic programming"
+)
 _FILTER = flags.DEFINE_enum(
     "filter", "full", TRACKS, "full, or collision: the reward decides the rest"
 )

@@ -1,9 +1,11 @@
-r"""Train a grid of rewards side by side, choose by held-out scenes, export all.
+r"""Train many rewards side by side, choose by held-out scenes, export all.
 
     rcirl sweep --data=DATASET --output=DIR --recipe=paper \
         --leaky_rates=0.01,0.05,0.2 --hidden_sizes=15,32x16 --seeds=4
 
 What the grid leaves open is as the --recipe says; a flag given beside it wins.
+--search=optuna --trials=32 tries that many configurations within the grid's bounds
+instead, each proposed by what the validation scenes said of those before.
 Leaky rates, step sizes and seeds of one network shape train in one compiled program;
 shapes are spread by --executor. A part of the training scenes (other vehicles) is held
 out to choose by; the test split is scored once, for the chosen. Writes sweep.json,
@@ -23,6 +25,7 @@ from rcirl_jax.commands.flags.common import floats, hidden_sizes, provenance, un
 from rcirl_jax.commands.flags.executor import executor
 from rcirl_jax.commands.flags.help import AS_SAID
 from rcirl_jax.commands.flags.horizon import HORIZON
+from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.sweep import CHOICES, SweepConfig
 from rcirl_jax.export.sweep.result import table
 from rcirl_jax.export.sweep.run import run_sweep
@@ -31,22 +34,44 @@ from rcirl_jax.train.state import TrainConfig
 unread("leaky_rate", "learning_rate", "hidden_size")  # the grid
 unread("data_weights")
 LEAKY_RATES = (0.01, 0.05, 0.2)
+GRID = "grid"
 USUAL = (
     *("data", "output", "recipe", "leaky_rates", "learning_rates", "hidden_sizes"),
-    *("seeds", "seed", "validation", "choose_by", "quick", "workers"),
+    *("search", "trials", "seeds", "seed", "validation", "choose_by", "quick"),
+    "workers",
 )
-_DATA = flags.DEFINE_list("data", None, "datasets of `rcirl import`", required=True)
-_OUTPUT = flags.DEFINE_string("output", None, "folder to write", required=True)
+_DATA = flags.DEFINE_list(
+    "data", None, "datasets of `rcirl import`, with commas", required=True
+)
+_OUTPUT = flags.DEFINE_string(
+    "output", None, "folder to write; a sweep in it goes on", required=True
+)
 _LEAKY = flags.DEFINE_list(
-    "leaky_rates", None, "values of a; default: 0.01,0.05,0.2 with the rank loss"
+    "leaky_rates",
+    None,
+    "of the rank loss, between 0 and 1 (default: 0.01,0.05,0.2 with that loss)",
 )
-_RATES = flags.DEFINE_list("learning_rates", None, "step sizes" + AS_SAID)
-_HIDDEN = flags.DEFINE_list("hidden_sizes", ["15"], "networks: 15, 32x16; 0 is linear")
-_SEEDS = flags.DEFINE_integer("seeds", 4, "initial weights tried of each configuration")
-_SEED = flags.DEFINE_integer("seed", 0, "of splits, candidates and batches")
-_SHARE = flags.DEFINE_float("validation", 0.2, "share of training scenes to choose by")
+_RATES = flags.DEFINE_list(
+    "learning_rates", None, "step sizes, between 0 and 1" + AS_SAID
+)
+_HIDDEN = flags.DEFINE_list(
+    "hidden_sizes", ["15"], "networks, units per layer: 15,32x16; 0: linear"
+)
+_SEEDS = flags.DEFINE_integer(
+    "seeds", 4, "trainings of each configuration, 1 or more; more tell luck from merit"
+)
+_SEED = flags.DEFINE_integer("seed", 0, "of splits, candidates, batches and proposals")
+_SHARE = flags.DEFINE_float(
+    "validation", 0.2, "share of training scenes to choose by, above 0, at most 0.5"
+)
 _SCENES = flags.DEFINE_integer("scenes", 0, "training scenes at most; 0: all")
-_CHOOSE = flags.DEFINE_enum("choose_by", "top1_fde", CHOICES, "validation metric")
+_CHOOSE = flags.DEFINE_enum("choose_by", "top1_fde", CHOICES, "metric of the choice")
+_SEARCH = flags.DEFINE_enum(
+    "search", GRID, (GRID, "optuna"), "the whole grid, or proposals within its bounds"
+)
+_TRIALS = flags.DEFINE_integer(
+    "trials", 32, "configurations that optuna proposes, 1 or more", 1
+)
 _QUICK = flags.DEFINE_bool("quick", False, "128 scenes, 2 epochs, 2 seeds: a minute")
 
 
@@ -61,6 +86,10 @@ def main() -> None:
     """Flags -> one sweep."""
     from rcirl_jax.report.ranking.sweep_picture import sweep_picture
 
+    if _SEARCH.value == GRID and flags.FLAGS["trials"].present:
+        raise InputError(
+            f"--trials: {_TRIALS.value}: expected --search=optuna beside it"
+        )
     shapes = tuple(hidden_sizes(s.split("x"), "hidden_sizes") for s in _HIDDEN.value)
     base = training.training_config(
         seed=_SEED.value, hidden=shapes[0] if shapes else None
@@ -80,6 +109,7 @@ def main() -> None:
         scenes=128 if _QUICK.value else _SCENES.value,
         choose_by=_CHOOSE.value,
         horizon_s=HORIZON.value,
+        trials=0 if _SEARCH.value == GRID else _TRIALS.value,
     )
     folder = Path(_OUTPUT.value)
     report = run_sweep(config, folder, executor(), provenance())

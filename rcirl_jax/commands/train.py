@@ -32,16 +32,22 @@ USUAL = (
     *("learning_rate", "hidden_size", "data_weights", "parallel"),
 )
 _DATA = flags.DEFINE_list(
-    "data", None, "dataset of `rcirl import`; several are joined", required=True
+    "data", None, "datasets of `rcirl import`, with commas", required=True
 )
 _TAGS = flags.DEFINE_list(
     "tags", [], "only scenes with one of these tags, e.g. lane_change,cut_in"
 )
-_OUTPUT = flags.DEFINE_string("output", None, "folder of the run", required=True)
+_OUTPUT = flags.DEFINE_string(
+    "output", None, "folder of the run; a run that is in it goes on", required=True
+)
 also_named("workdir", "output")
-_SEED = flags.DEFINE_integer("seed", 0, "of initial weights, batches, candidates")
+_SEED = flags.DEFINE_integer(
+    "seed",
+    0,
+    "of initial weights, batches, candidates: train several to see the spread",
+)
 _PARALLEL = flags.DEFINE_enum(
-    "parallel", "auto", PARALLEL, "how devices share a batch: auto takes all of them"
+    "parallel", "auto", PARALLEL, "how devices share a batch; auto: all that are there"
 )
 _IN_MEMORY = flags.DEFINE_float(
     "in_memory_mb", 1024.0, "MiB up to which the split is loaded whole, else streamed"

@@ -37,6 +37,7 @@ def number(value: float, digits: int, signed: bool = False) -> str:
     """Fixed digits with a true minus; "none" for what is not finite."""
     if not math.isfinite(value):
         return "none"
+    value = round(value, digits) + 0.0  # no minus before a zero
     words = f"{value:+.{digits}f}" if signed else f"{value:.{digits}f}"
     return words.replace("-", "−")
 

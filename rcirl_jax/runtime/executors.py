@@ -191,7 +191,7 @@ class Ray:
             self._ray = importlib.import_module("ray")
         except ImportError as error:
             raise InputError(
-                "--executor: ray: not installed: expected the extra rcirl-jax[ray]"
+                "--executor: ray: not installed: expected pip install 'rcirl-jax[ray]'"
             ) from error
         if not self._ray.is_initialized():
             self._connect(address)

@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 import jax
 import numpy as np
 
-from rcirl_jax.errors import InputError
+from rcirl_jax.errors import InputError, did_you_mean
 from rcirl_jax.simulation.cases import STEP_S, Case, Record, Snapshot
 from rcirl_jax.simulation.catalogue.build import (
     build_cases,
@@ -87,6 +87,7 @@ def suite_refs(
         if name not in known:
             raise InputError(
                 f"--suite: {name}: expected full, smoke or some of {', '.join(known)}"
+                + did_you_mean(name, ("full", "smoke", *known))
             )
     if per_family is not None and per_family < 1:
         raise InputError(f"--cases: {per_family}: expected at least 1")

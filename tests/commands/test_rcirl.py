@@ -9,6 +9,7 @@ from importlib.metadata import entry_points
 import pytest
 
 from rcirl_jax import __version__
+from rcirl_jax.autotune.recipes import DEFAULT, load_recipe
 from rcirl_jax.commands.rcirl import COMMANDS, overview
 from tests.conftest import REPO
 from tests.helpers.commands import command, refused, succeeded
@@ -121,6 +122,17 @@ def test_flags_beyond_the_usual_stand_under_their_subject(every):
     assert gate not in text[: text.index(subject)]
 
 
+def test_defaults_are_those_of_the_recipe(every):
+    for name in ("train", "autotune", "import", "sweep", "human-likeness"):
+        assert "the recipe's" not in every[name][1]
+    full = " ".join(every["train"][1].split())
+    tuned = load_recipe(DEFAULT).train
+    hidden = ",".join(map(str, tuned.reward.hidden))
+    wanted = {"learning_rate": tuned.learning_rate, "hidden_size": hidden}
+    for flag, value in {**wanted, "loss": tuned.loss, "mode": "speed"}.items():
+        assert re.search(rf"--{flag} [^()]*\(default: {value}, of the recipe", full)
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_flag_that_is_missing_is_named_with_an_example(name, every):
     line = every[name][2]
@@ -141,6 +153,12 @@ def test_a_flag_that_is_missing_is_named_with_an_example(name, every):
         ("train --data=x", "error: --output: not given: expected folder of the run"),
         ("tune", "tune: unknown: expected one of autotune, "),
         ("autotun", "did you mean autotune?"),
+        ("import --format=cvs", "--format: cvs: expected one of apollo, "),
+        ("import --format=cvs", "did you mean csv?"),
+        ("import --stride=far", "--stride: far: expected a number"),
+        ("rank --horizon=9", "--horizon: 9: expected a number in the range [0.4"),
+        ("sweep --trials=0", "--trials: 0: expected a positive integer"),
+        ("sweep --trails=9", "Did you mean: trials"),
     ],
 )
 def test_a_wrong_command_is_one_line(words, message, tmp_path):

@@ -14,9 +14,12 @@ from markupsafe import Markup
 
 from rcirl_jax.evaluation.closed_loop.summary import PAPER
 from rcirl_jax.evaluation.ranking.score import candidates_key
+from rcirl_jax.report import pages
 from rcirl_jax.report.glossary import TERMS, explained
 from rcirl_jax.report.pages import interval
+from rcirl_jax.report.player.replays import _broken_words, goes_as
 from rcirl_jax.report.ranking.frames import _sampled
+from rcirl_jax.report.tuning.cases import case_lines
 from rcirl_jax.report.tuning.contributions import NUM_CANDIDATES, contributions
 from rcirl_jax.report.tuning.verdict_sections import cards, outcome_of
 from rcirl_jax.sampling import SamplerConfig
@@ -120,13 +123,36 @@ def test_cases_are_those_of_the_suite_the_played_and_the_worst_first(page, repor
     assert section(page, "cases").count('class="thumbnail"') == len(PLAYED)
 
 
+def test_a_drive_that_goes_otherwise_than_in_the_suite_is_named(report):
+    def otherwise(words):
+        drives = [
+            dataclasses.replace(drive, summary=drive.summary + words)
+            for drive in report.replays[0].drives
+        ]
+        replay = dataclasses.replace(report.replays[0], drives=tuple(drives))
+        lines = case_lines(report.suite, report.incumbent, [replay])
+        return [line.case for line in lines if line.otherwise]
+
+    assert otherwise(", never seen") == [report.replays[0].case]
+    metrics = jax.tree.map(lambda x: np.asarray(x)[0], report.suite.rows["hand-set"])
+    drive = report.replays[0].drives[0]
+    summary = f"9 m driven, nobody near, {_broken_words(metrics)}"
+    assert goes_as(dataclasses.replace(drive, summary=summary), metrics)
+
+
+def test_no_minus_stands_before_a_zero():
+    shown = [pages.number(x, 1, signed=True) for x in (-0.04, 0.04, -0.06)]
+    assert shown == ["+0.0", "+0.0", "−0.1"]
+
+
 def test_the_cards_say_what_the_checks_say(page, report):
     text = section(page, "verdict")
     text = re.sub(r"</?abbr.*?>", "", text)
     found = dict(re.findall(r"<h3>(.*?)</h3><b>(.*?)</b>", text))
     assert list(found) == [
-        "Verdict", "Nearer to the human", "Safety", "Comfort", "Progress",
+        "Cases driven", "Nearer to the human", "Safety", "Comfort", "Progress",
     ]  # fmt: skip
+    assert found["Cases driven"] == f"{report.verdict.cases:,}"
     assert found["Safety"] == "12 / 0"
     assert 'class="card refused"><h3>Safety' in text
     gains = {c.name: c for c in report.verdict.checks if c.kind == "gain"}

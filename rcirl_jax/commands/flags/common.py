@@ -15,7 +15,7 @@ from absl import app, flags, logging
 
 from rcirl_jax.commands.flags.help import asked_for, example, module_of, own_flags
 from rcirl_jax.data.store.dataset import Dataset
-from rcirl_jax.errors import InputError, extra_of
+from rcirl_jax.errors import InputError, did_you_mean, extra_of
 from rcirl_jax.export.reader import load_weights
 from rcirl_jax.runtime import provenance as made_by
 from rcirl_jax.runtime import signals as interrupts
@@ -123,7 +123,8 @@ def _parse(main: Callable, argv: list[str]) -> list[str]:
     try:
         return flags.FLAGS(argv)
     except flags.Error as error:
-        _refuse(_missing(str(error), main) or " ".join(str(error).split()))
+        said = str(error)
+        _refuse(_missing(said, main) or _unfit(said) or " ".join(said.split()))
 
 
 def _missing(complaint: str, main: Callable) -> str:
@@ -135,6 +136,21 @@ def _missing(complaint: str, main: Callable) -> str:
     shown = example(module_of(main))
     given = f"{', '.join(f'--{name}' for name in names)}: not given: expected {wanted}"
     return f"{given}; for example: {shown}" if shown else given
+
+
+def _unfit(complaint: str) -> str:
+    """One line on a value that a flag cannot have; "" if it is about others."""
+    unread = "value should|invalid literal|could not convert|.* is not a"
+    found = re.match(rf"flag --(\w+)=(.*?): ({unread})", complaint)
+    if not found:
+        return ""
+    name, value, _ = found.groups()
+    parser = flags.FLAGS[name].parser
+    if known := getattr(parser, "enum_values", ()):
+        return f"--{name}: {value}: expected one of {', '.join(known)}" + did_you_mean(
+            value, known
+        )
+    return f"--{name}: {value}: expected {parser.syntactic_help}"
 
 
 def alone(flag: str, *others: str) -> None:

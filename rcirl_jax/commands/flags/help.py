@@ -1,5 +1,6 @@
 """The help of a command: what it does, its usual flags, then all others by subject."""
 
+import functools
 import inspect
 import re
 import sys
@@ -17,7 +18,7 @@ SHORT, FULL = (
 )
 WIDTH, INDENT = 100, 20  # columns
 LONGEST = 40  # characters of a default
-AS_SAID = " (default: the recipe's)"  # end of the help of a flag beside a recipe
+AS_SAID = " (default: the recipe's)"  # of a flag beside a recipe; help shows its value
 FROM_FILE = "--flagfile=FILE reads flags from a file, one a line."
 
 
@@ -102,15 +103,28 @@ def _listed(heading: str, some: Iterable[flags.Flag]) -> str:
     return "\n".join([f"{heading}:", *map(_line, some)])
 
 
+@functools.cache
+def _of_recipe(name: str) -> str:
+    """What the default recipe says where a flag is not given."""
+    from rcirl_jax.commands.flags.recipe import DEFAULT, load_recipe, said_by
+
+    value = said_by(load_recipe(DEFAULT))[name]
+    if isinstance(value, bool):
+        value = str(value).lower()
+    if isinstance(value, tuple):
+        value = ",".join(map(str, value))
+    return f" (default: {value}, of the recipe)" if value != "" else ""
+
+
 def _line(flag: flags.Flag) -> str:
     """A flag, what it is and its default, in as few lines as it takes."""
     name = f"  --{'[no]' if flag.boolean else ''}{flag.name}"
     said = re.sub(r"^<.*?>: ", "", str(flag.help))  # absl's list of an enum's values
-    default = AS_SAID if said.endswith(AS_SAID) else ""
+    default = _of_recipe(flag.name) if said.endswith(AS_SAID) else ""
     said = said.removesuffix(AS_SAID)
     if values := getattr(flag.parser, "enum_values", None):
         said += f": {', '.join(values)}"
-    if flag.default not in (None, "", False, []):
+    if flag.default not in (None, "", []) and flag.default is not False:
         shown = str(flag.default_as_str)[1:-1]
         shown = shown if len(shown) <= LONGEST else f"{shown[:LONGEST]}..."
         default = f" (default: {shown})"

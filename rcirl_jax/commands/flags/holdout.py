@@ -7,12 +7,21 @@ from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.data.store.resplit import HOLDOUTS, folds_by_recording, held_out
 from rcirl_jax.errors import InputError
 
-_HOLDOUT = flags.DEFINE_enum("holdout", "groups", HOLDOUTS, "what is held out")
-_FOLDS = flags.DEFINE_integer(
-    "folds", 0, "instead: recordings in so many parts, each held out once", 0
+_HOLDOUT = flags.DEFINE_enum(
+    "holdout", "groups", HOLDOUTS, "what is held out, see above"
 )
-_SPLIT = flags.DEFINE_integer("split_seed", 0, "draws the vehicles held out", 0)
-_RECORDING = flags.DEFINE_list("recording", ["0"], "numbers of those held out")
+_FOLDS = flags.DEFINE_integer(
+    "folds",
+    0,
+    "instead: the recordings in so many parts, each held out once; 0: not",
+    0,
+)
+_SPLIT = flags.DEFINE_integer(
+    "split_seed", 0, "draws the vehicles of --holdout=vehicles or validation", 0
+)
+_RECORDING = flags.DEFINE_list(
+    "recording", ["0"], "numbers of those of --holdout=recording, from 0"
+)
 
 # what each of the other flags is read by
 _READ_BY = {"recording": ("recording",), "split_seed": ("vehicles", "validation")}

@@ -3,5 +3,9 @@
 from absl import flags
 
 HORIZON = flags.DEFINE_float(
-    "horizon", 5.0, "s at which distances are taken", lower_bound=0.4, upper_bound=8.0
+    "horizon",
+    5.0,
+    "s at which distances to the human are taken, 0.4 to 8",
+    lower_bound=0.4,
+    upper_bound=8.0,
 )

@@ -10,7 +10,11 @@ from rcirl_jax.data.importing import ImportConfig
 from rcirl_jax.errors import InputError
 
 NUMBERS = (
-    ("stride", "stride_s", "s between planning frames of a driver"),
+    (
+        "stride",
+        "stride_s",
+        "s between scenes of a driver, above 0; longer: fewer and less alike",
+    ),
     ("min_future", "min_future_s", "s of recording a scene needs"),
     ("min_history", "min_history_s", "s of recording before a planning frame"),
     (
@@ -46,13 +50,16 @@ def import_flags() -> Callable[[ImportConfig], ImportConfig]:
         for name, field, what in FILTERS
     }
     fraction = flags.DEFINE_float(
-        "test_fraction", 0.25, "share of scenes held out, by vehicle-disjoint group"
+        "test_fraction",
+        0.25,
+        "share of scenes held out to judge by, of other vehicles, 0 to below 1; 0: to "
+        "train only",
     )
     seed = flags.DEFINE_integer("split_seed", 0, "order in which groups are dealt")
     leave_out = flags.DEFINE_string(
         "leave_out",
         "0",
-        "recordings that may be refused and are left out, counted: 3, or 5% of all",
+        "recordings that may be refused, for large releases: a count such as 3, or 5%",
     )
 
     def applied(config: ImportConfig) -> ImportConfig:

@@ -7,10 +7,12 @@ from absl import flags
 from rcirl_jax.evaluation.gate.types import GateConfig
 
 _PRIMARY = flags.DEFINE_list(
-    "primary", list(GateConfig().primary), "metrics that may gain"
+    "primary",
+    list(GateConfig().primary),
+    "metrics of which one has to gain; docs/gate.md lists them",
 )
 _ACCEPT = flags.DEFINE_list(
-    "accept", [], "ids of cases with a new fault that a person has looked at"
+    "accept", [], "ids of cases whose new fault a person has looked at, as cut_in/017@0"
 )
 _MARGINS = {
     name: flags.DEFINE_float(f"{name}_margin", getattr(GateConfig(), name), text)

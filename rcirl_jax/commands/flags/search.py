@@ -5,5 +5,8 @@ from absl import flags
 from rcirl_jax.evaluation.rivals.tuned import SEARCHES
 
 SEARCH = flags.DEFINE_enum(
-    "search", "cma", list(SEARCHES), "search that tunes rivals; optuna is an extra"
+    "search",
+    "cma",
+    list(SEARCHES),
+    "search that tunes rivals; optuna needs the extra [optuna]",
 )

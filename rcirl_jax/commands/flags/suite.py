@@ -4,9 +4,18 @@ from typing import Any
 
 from absl import flags
 
-SUITE = flags.DEFINE_string("suite", "full", "full, smoke, or families with commas")
-CASES = flags.DEFINE_integer("cases", None, "cases per family")
-DURATION = flags.DEFINE_float("duration", None, "s per case at most (smoke 20)")
+SUITE = flags.DEFINE_string(
+    "suite", "full", "full, smoke (one case of each family), or families with commas"
+)
+CASES = flags.DEFINE_integer(
+    "cases",
+    None,
+    "cases per family, 1 or more; fewer are quicker and prove less (default: as the "
+    "suite says)",
+)
+DURATION = flags.DEFINE_float(
+    "duration", None, "s per case at most, 1 to 120 (default: 120, smoke 20)"
+)
 SEED = flags.DEFINE_integer("catalogue_seed", 0, "seed of the cases")
 EVERY = flags.DEFINE_integer("plan_every", 1, "steps of 0.1 s between two plans")
 

@@ -45,18 +45,25 @@ def _one_of(name: str, values: Sequence[str], text: str) -> flags.FlagHolder:
 # fields of TrainConfig by the flag of the same name
 _TRAIN = {
     "features": _text("features", "preset in data_specs/features"),
-    "loss": _one_of("loss", sorted(LOSSES), "loss on value differences"),
+    "loss": _one_of("loss", sorted(LOSSES), "what training minimises"),
     "soft_distance": _number("soft_distance", "m, temperature of soft labels"),
     "leaky_rate": _number("leaky_rate", "a of the rank loss"),
     "optimizer": _text("optimizer", "gradient method, by its name in optax"),
-    "learning_rate": _number("learning_rate", "step size"),
+    "learning_rate": _number(
+        "learning_rate", "step size, above 0, below 1; smaller if the loss jumps"
+    ),
     "halve_every": _count("halve_every", "steps per halving; 0: never"),
     "weight_decay": _number("weight_decay", "L2 pull on the weights"),
     "clip_norm": _number("clip_norm", "norm the gradient is cut down to; 0: none"),
     "batch_size": _count("batch_size", "scenes per step, all devices"),
-    "epochs": _count("epochs", "passes over the training scenes"),
+    "epochs": _count(
+        "epochs",
+        "passes over the training scenes, 1 or more; more if the loss still falls",
+    ),
     "positive": _one_of(
-        "positive", POSITIVES, "ranked first: the human curve or its nearest candidate"
+        "positive",
+        POSITIVES,
+        "ranked first: the human's trajectory, or the candidate nearest to it",
     ),
     "futures": _one_of(
         "futures", LEARNED_FUTURES, "of the others, as a learner sees them"
@@ -87,13 +94,17 @@ _MARGINS = flags.DEFINE_list(
     "margins", None, "hinge: per metre from the human, collision, rule" + AS_SAID
 )
 _HIDDEN = flags.DEFINE_list(
-    "hidden_size", None, "units per layer; 0 is linear" + AS_SAID
+    "hidden_size",
+    None,
+    "units per layer, 1 to 4096 each; 0: linear, easily read" + AS_SAID,
 )
 _BY_CONTEXT = flags.DEFINE_bool(
     "by_context", None, "scale features by what the scene is like at t = 0" + AS_SAID
 )
 DATA_WEIGHTS = flags.DEFINE_string(
-    "data_weights", EQUAL, "of several sources: equal, scenes, or a number for each"
+    "data_weights",
+    EQUAL,
+    "share of each of several --data: equal, scenes (as many as it has), or numbers",
 )
 
 

@@ -35,14 +35,22 @@ _SIMULATOR = flags.DEFINE_string(
     "simulator", None, f"one of {', '.join(SIMULATORS)}", required=True
 )
 _OPTIONS = flags.DEFINE_list("options", [], "NAME=VALUE of the simulator, several by ,")
-_WEIGHTS = flags.DEFINE_list("weights", None, "weights files", required=True)
+_WEIGHTS = flags.DEFINE_list(
+    "weights", None, "weights files, with commas", required=True
+)
 _OUTPUT = flags.DEFINE_string("output", None, "folder to write", required=True)
-_EPISODES = flags.DEFINE_integer("episodes", 500, "how many, 2 at least")
-_SECONDS = flags.DEFINE_float("seconds", 30.0, "s that an episode lasts")
+_EPISODES = flags.DEFINE_integer(
+    "episodes", 500, "how many, 2 or more: the more, the narrower the intervals"
+)
+_SECONDS = flags.DEFINE_float("seconds", 30.0, "s that an episode lasts, 1 to 600")
 _SEED = flags.DEFINE_integer("seed", 0, "of the episodes")
-_BASELINES = flags.DEFINE_list("baselines", ",".join(ROWS), "rival rows, or empty")
+_BASELINES = flags.DEFINE_list(
+    "baselines", ",".join(ROWS), "rivals that drive too, or empty"
+)
 _ALSO = flags.DEFINE_list(
-    "also", [], "outputs over the same episodes, whose rows are not driven again"
+    "also",
+    [],
+    "earlier outputs over the same episodes: their rows are not driven again",
 )
 
 

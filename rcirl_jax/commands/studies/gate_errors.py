@@ -22,10 +22,12 @@ from rcirl_jax.simulation.suite import catalogue_set, suite_refs
 
 USUAL = ("output", "seeds", "suite", "cases", "duration")
 _OUTPUT = flags.DEFINE_string("output", None, "JSON to write", required=True)
-_SEEDS = flags.DEFINE_integer("seeds", 20, "seeds of the catalogue", lower_bound=1)
+_SEEDS = flags.DEFINE_integer(
+    "seeds", 20, "drawings of all cases, 1 or more: the more, the surer the rates", 1
+)
 _SUITE = flags.DEFINE_string("suite", "full", "full, or families with commas")
-_CASES = flags.DEFINE_integer("cases", 10, "cases per family and seed")
-_DURATION = flags.DEFINE_float("duration", 30.0, "s per case", 1.0, 120.0)
+_CASES = flags.DEFINE_integer("cases", 10, "cases per family and seed, 1 or more")
+_DURATION = flags.DEFINE_float("duration", 30.0, "s per case, 1 to 120", 1.0, 120.0)
 
 
 def main() -> None:

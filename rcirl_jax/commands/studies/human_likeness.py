@@ -58,10 +58,14 @@ USUAL = (
 )
 _DATA = flags.DEFINE_string("data", None, "dataset of `rcirl import`", required=True)
 _OUTPUT = flags.DEFINE_string("output", "out/likeness", "folder to write")
-_LEARNERS = flags.DEFINE_list("learners", list(LEARNERS), "rows to train, else all")
-_SEEDS = flags.DEFINE_integer("seeds", 10, "training runs per learner", lower_bound=1)
+_LEARNERS = flags.DEFINE_list(
+    "learners", list(LEARNERS), "what to train; fewer are quicker; all by default"
+)
+_SEEDS = flags.DEFINE_integer(
+    "seeds", 10, "trainings of each, 1 or more; more tell luck from merit", 1
+)
 _TUNED = flags.DEFINE_integer(
-    "tuned", 0, "hand-set and IDM tuned so many times on each split", 0
+    "tuned", 0, "rivals tuned on the training scenes, so many times; 0: none", 0
 )
 _LONG = flags.DEFINE_integer(
     "tuned_long", 3000, "evaluations of the hand-set cost's long search, or 0", 0

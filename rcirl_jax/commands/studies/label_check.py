@@ -34,14 +34,24 @@ USUAL = (
     *("output", "traffic", "noise", "platoons", "judged", "sheets", "seed"),
     *("quick", "workers"),
 )
-_TRAFFIC = flags.DEFINE_integer("traffic", 4, "recordings of each road simulated")
-_NOISE = flags.DEFINE_list("noise", ["ngsim", "none"], "none, white, ngsim, rough")
-_PLATOONS = flags.DEFINE_integer("platoons", 0, "single-file platoons simulated", 0)
-_JUDGED = flags.DEFINE_string("judged", None, "folder of the judged recordings")
+_TRAFFIC = flags.DEFINE_integer(
+    "traffic", 4, "recordings of each simulated road, 1 or more"
+)
+_NOISE = flags.DEFINE_list(
+    "noise", ["ngsim", "none"], "of positions, one run each: none, white, ngsim, rough"
+)
+_PLATOONS = flags.DEFINE_integer(
+    "platoons", 0, "simulated single files of cars; 0: none", 0
+)
+_JUDGED = flags.DEFINE_string(
+    "judged", None, "folder of the recordings whose scenes a person has judged"
+)
 _SHEETS = flags.DEFINE_string("sheets", None, "folder for pictures of judged scenes")
 _SEED = flags.DEFINE_integer("seed", 0, "of the traffic and the noise")
 _OUTPUT = flags.DEFINE_string("output", "out/label_check", "folder to write")
-_QUICK = flags.DEFINE_bool("quick", False, "one recording of each road, one noise")
+_QUICK = flags.DEFINE_bool(
+    "quick", False, "one recording of each road, the first noise: to try it out"
+)
 
 
 def main() -> None:

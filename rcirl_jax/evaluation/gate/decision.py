@@ -106,7 +106,9 @@ def _decide(checks: Sequence[Check]) -> tuple[Decision, tuple[str, ...]]:
 def _reason(check: Check) -> str:
     if not check.measured:
         return f"{check.kind}: {check.title}: {check.note}"
-    pairs = "" if check.lost is None else f", +{check.gained} -{check.lost} cases"
+    pairs = ""
+    if check.lost is not None:
+        pairs = f", better in {check.gained} cases, worse in {check.lost}"
     return (
         f"{check.kind}: {check.title}: {100 * check.difference:+.2f} "
         f"[{100 * check.low:+.2f}, {100 * check.high:+.2f}] %{pairs}"

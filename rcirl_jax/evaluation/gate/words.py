@@ -82,7 +82,7 @@ def sentence(pair: Pair, verdict: Verdict) -> str:
             words = "But better" if worse else "Better"
             parts.append(f"{words}: {_listed(gains, details)}")
         if titles and not worse:
-            parts.append(f"Not shown: {_listed(titles, details)}")
+            parts.append(f"Undecided: {_listed(titles, details)}")
         said = ". ".join([*parts, after]) + "."
         if len(textwrap.wrap(said, WIDTH)) <= MAX_LINES:
             return said

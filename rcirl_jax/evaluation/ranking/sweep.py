@@ -1,4 +1,4 @@
-"""Batch sweeps: a grid of networks, leaky rates, step sizes and seeds.
+"""Batch sweeps: networks, leaky rates, step sizes and seeds, a grid or proposed ones.
 
 All members with one network shape are a group. A group trains side by side in one
 compiled program (`train.frozen`), `MEMBERS_AT_ONCE` at a time, and is the piece of
@@ -49,6 +49,7 @@ CHOICES = tuple(name for name, how in METRICS.items() if how.compared)
 REPORTED = tuple(name for name in METRICS if name != "nll")
 
 Hidden = tuple[int, ...]  # units of the hidden layers; () is linear
+Point = tuple[Hidden, float, float]  # network, leaky rate, step size
 
 
 def shape_name(hidden: Hidden) -> str:
@@ -56,10 +57,15 @@ def shape_name(hidden: Hidden) -> str:
     return "x".join(map(str, hidden)) or "linear"
 
 
-def row_name(config: TrainConfig) -> str:
+def point_name(point: Point) -> str:
     """A configuration without its seed, as in file names and tables."""
-    shape = shape_name(config.reward.hidden)
-    return f"h{shape}_a{config.leaky_rate:g}_r{config.learning_rate:g}"
+    hidden, leaky_rate, learning_rate = point
+    return f"h{shape_name(hidden)}_a{leaky_rate:g}_r{learning_rate:g}"
+
+
+def row_name(config: TrainConfig) -> str:
+    """The same of a member."""
+    return point_name((config.reward.hidden, config.leaky_rate, config.learning_rate))
 
 
 def member_name(config: TrainConfig) -> str:
@@ -88,6 +94,10 @@ class SweepConfig:
     choose_by: str = "top1_fde"
     # s at which distances are taken
     horizon_s: float = 5.0
+    # configurations that Optuna proposes within the grid's bounds (0: the whole grid)
+    trials: int = 0
+    # the configurations to train, instead of the grid
+    points: tuple[Point, ...] = ()
 
     def __post_init__(self) -> None:
         """Reject values out of range and what is no grid."""
@@ -101,7 +111,7 @@ class SweepConfig:
             raise InputError(
                 f"--horizon: {self.horizon_s}: expected above 0, at most 8 s"
             )
-        for name, low in (("seeds", 1), ("scenes", 0)):
+        for name, low in (("seeds", 1), ("scenes", 0), ("trials", 0)):
             if getattr(self, name) < low:
                 raise InputError(f"--{name}: {getattr(self, name)}: expected >= {low}")
         self._check_grid()
@@ -119,7 +129,12 @@ class SweepConfig:
             if not found:
                 raise InputError(f"--{name}: none: expected at least one value")
         grid = (self.hidden_sizes, self.leaky_rates, self.learning_rates)
-        if math.prod(map(len, grid)) * self.seeds > MOST_MEMBERS:
+        if self.trials and all(len(set(axis)) == 1 for axis in grid):
+            raise InputError(
+                "--search: optuna: expected two values or more of --leaky_rates, "
+                "--learning_rates or --hidden_sizes: bounds to search in"
+            )
+        if max(math.prod(map(len, grid)), self.trials) * self.seeds > MOST_MEMBERS:
             raise InputError(
                 f"--seeds: {self.seeds}: expected a sweep of at most {MOST_MEMBERS} "
                 "trainings"
@@ -136,19 +151,25 @@ class SweepConfig:
 
     def group(self, hidden: Hidden) -> list[TrainConfig]:
         """The members of one network shape."""
-        grid = itertools.product(
-            self.leaky_rates, self.learning_rates, range(self.seeds)
-        )
+        grid = itertools.product((hidden,), self.leaky_rates, self.learning_rates)
         return [
             dataclasses.replace(
                 self.shared(hidden), leaky_rate=a, learning_rate=rate, seed=seed
             )
-            for a, rate, seed in grid
+            for shape, a, rate in self.points or grid
+            for seed in range(self.seeds)
+            if shape == hidden
         ]
 
     def members(self) -> list[TrainConfig]:
         """All members, group by group."""
-        return [one for hidden in self.hidden_sizes for one in self.group(hidden)]
+        return [one for hidden in self.shapes for one in self.group(hidden)]
+
+    @property
+    def shapes(self) -> tuple[Hidden, ...]:
+        """The network shapes that are trained."""
+        proposed = tuple(dict.fromkeys(shape for shape, _, _ in self.points))
+        return proposed or self.hidden_sizes
 
     @property
     def setup(self) -> RankingSetup:
@@ -209,7 +230,7 @@ def train_group(hidden: Hidden, config: SweepConfig) -> Iterator[Part]:
     Yields:
       One part per chunk, in the order of `config.group(hidden)`.
     """
-    frozen, normaliser, seen = _scenes(config)
+    frozen, normaliser, seen = _scenes(dataclasses.replace(config, points=()))
     members = config.group(hidden)
     size = -(-len(members) // -(-len(members) // MEMBERS_AT_ONCE))
     for start in range(0, len(members), size):

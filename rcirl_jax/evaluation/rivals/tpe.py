@@ -5,13 +5,30 @@ Algorithms for Hyper-Parameter Optimization (NeurIPS 2011), by the package `optu
 """
 
 import warnings
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rcirl_jax.errors import extra_module
 from rcirl_jax.evaluation.rivals.counted import Counted, Objective, population
 
+if TYPE_CHECKING:
+    import optuna  # an extra
+
 REACH = 4.0  # standard deviations to either side that are searched
+
+
+def new_study(seed: int, direction: str = "minimize") -> "optuna.Study":
+    """A study in memory that may be asked for several trials before it is told."""
+    optuna = extra_module("optuna", "optuna")
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    with warnings.catch_warnings():  # of its options that may change
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        sampler = optuna.samplers.TPESampler(
+            seed=seed, multivariate=True, constant_liar=True
+        )
+    return optuna.create_study(sampler=sampler, direction=direction)
 
 
 def tune(
@@ -22,9 +39,9 @@ def tune(
     Arguments, result and errors as of `cma_es.tune`, but for `sigma`: the search is in
     a box of `REACH` times as much to either side of the start.
     """
-    import optuna  # an extra
+    study = new_study(seed)
+    import optuna
 
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
     evaluate = Counted(objective, start, budget)
     names = [f"x{i}" for i in range(evaluate.start.size)]
     space: dict[str, optuna.distributions.BaseDistribution] = {
@@ -33,12 +50,6 @@ def tune(
         )
         for name, at in zip(names, evaluate.start.tolist(), strict=True)
     }
-    with warnings.catch_warnings():  # of its options that may change
-        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-        sampler = optuna.samplers.TPESampler(
-            seed=seed, multivariate=True, constant_liar=True
-        )
-    study = optuna.create_study(sampler=sampler)
     first = dict(zip(names, evaluate.start.tolist(), strict=True))
     study.add_trial(
         optuna.trial.create_trial(

@@ -83,6 +83,7 @@ def write_stablehlo(path: Path, made: jax.export.Exported, form: Form) -> None:
             content = bytes(made.serialize())
         except ImportError as error:
             raise InputError(
-                "--jax_export: flatbuffers: not installed: expected the extra [export]"
+                "--jax_export: flatbuffers: not installed: "
+                "expected pip install 'rcirl-jax[export]'"
             ) from error
     write_whole(path, content)

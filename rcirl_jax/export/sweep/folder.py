@@ -2,7 +2,7 @@
 
 DIR/stages.json           the groups that are finished, and what they were made from
 DIR/weights/NAME.msgpack  every member
-DIR/groups/SHAPE.json     how the members of a group trained
+DIR/groups/SHAPE.json     how the members of a group trained (a search: of a round)
 DIR/sweep.json            all members with their metrics, and the choice
 DIR/best.msgpack          the chosen member, a copy of its file
 """
@@ -18,12 +18,17 @@ from rcirl_jax.runtime.pipeline import FILE, Stages
 from rcirl_jax.train.state import TrainConfig
 
 SWEEP = "sweep.json"  # in the sweep's folder
+ELSEWHERE = ("data", "trials", "points")  # fields that are no settings of a folder
 
 
 def grid_of(config: SweepConfig) -> dict:
-    """What decides the result, as JSON; where the data lie does not."""
+    """What decides the result, as JSON; where the data lie and how many trials do not.
+
+    More trials go on where fewer ended.
+    """
     made = json.loads(json.dumps(dataclasses.asdict(config)))
-    return {name: value for name, value in made.items() if name != "data"}
+    kept = {n: value for n, value in made.items() if n not in ELSEWHERE}
+    return {**kept, "search": "optuna" if config.trials else "grid"}
 
 
 def settings_of(config: SweepConfig) -> dict:

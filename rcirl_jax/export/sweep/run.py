@@ -19,16 +19,16 @@ from rcirl_jax.evaluation.ranking.evaluate import covered_rows
 from rcirl_jax.evaluation.ranking.sweep import (
     Hidden,
     Part,
+    Point,
     SweepConfig,
     member_name,
     open_split,
-    row_name,
     shape_name,
     train_group,
 )
 from rcirl_jax.evaluation.statistics import ClusterBootstrap
 from rcirl_jax.export.from_run import verification_samples, write_weights
-from rcirl_jax.export.sweep.choice import judged
+from rcirl_jax.export.sweep.choice import Found, choice, scores_of, validated
 from rcirl_jax.export.sweep.folder import (
     SWEEP,
     check_settings,
@@ -36,11 +36,11 @@ from rcirl_jax.export.sweep.folder import (
     settings_of,
     weights_file,
 )
+from rcirl_jax.export.sweep.search import searched
 from rcirl_jax.runtime.atomic_files import read_json, write_json, write_whole
 from rcirl_jax.runtime.code import code_of
 from rcirl_jax.runtime.executors import Executor
 from rcirl_jax.runtime.pipeline import Stages, only_one
-from rcirl_jax.train.state import TrainConfig
 
 
 def run_sweep(
@@ -83,16 +83,20 @@ def _sweep(
     for name in ("validation", "test"):  # what would fail only after the training
         held_out, _ = covered_rows(split, name, config.setup.horizon_s)
         ClusterBootstrap(np.asarray(held_out.vehicle))
-    groups = _train(config, folder, split, executor, made_by)
-    rows: dict[str, list[TrainConfig]] = collections.defaultdict(list)
-    for one in config.members():
-        rows[row_name(one)].append(one)
+    judge = functools.partial(scores_of, config, folder, split, executor)
+
+    def trained(points: tuple[Point, ...] = (), number: int = 0) -> Found:
+        part = dataclasses.replace(config, points=points)
+        groups = _train(part, folder, split, executor, made_by, number)
+        return validated(part, groups, judge)
+
+    found = searched(config, trained) if config.trials else trained()
     body = {
         "settings": settings_of(config),
+        "search": "optuna" if config.trials else "grid",
         "validation_by": by,
         "scenes": {n: split.indices(n).size for n in ("train", "validation", "test")},
-        "groups": {name: group["facts"] for name, group in groups.items()},
-        **judged(config, folder, split, rows, groups, executor),
+        **choice(config, found, judge),
         "peak_memory_gib": _peak_memory_gib(),
         "made_by": made_by,
     }
@@ -108,29 +112,36 @@ def _train(
     split: Demonstrations,
     executor: Executor,
     made_by: Mapping[str, object],
+    number: int,
 ) -> dict[str, dict]:
-    """The groups' files by shape, after training those that are missing."""
+    """The groups' files by name, after training those that are missing.
+
+    Groups of a search's round bear its number, from 1.
+    """
     stages, settings = Stages(folder=folder), settings_of(config)
     settings["dataset_sha256"] = made_by["dataset_sha256"]
     check_settings(stages, settings)
-    inputs = {**settings, "code": code_of([__name__])}
-    files = {
-        h: folder / "groups" / f"{shape_name(h)}.json" for h in config.hidden_sizes
+    inputs = {**settings, "points": config.points, "code": code_of([__name__])}
+    names = {
+        h: f"{number}_{shape_name(h)}" if number else shape_name(h)
+        for h in config.shapes
     }
+    files = {h: folder / "groups" / f"{name}.json" for h, name in names.items()}
 
     def outputs(hidden: Hidden) -> list[Path]:
         members = [weights_file(folder, member) for member in config.group(hidden)]
         return [*members, files[hidden]]
 
-    todo = [h for h in files if not stages.is_done(shape_name(h), inputs, outputs(h))]
+    todo = [h for h in files if not stages.is_done(names[h], inputs, outputs(h))]
     samples = functools.cache(lambda: verification_samples(split, config.base))
     total, missing = (
         sum(len(config.group(hidden)) for hidden in some) for some in (files, todo)
     )
     parts: dict[Hidden, list[Part]] = collections.defaultdict(list)
     members: dict[Hidden, dict[str, dict]] = collections.defaultdict(dict)
+    title = f"sweep, round {number}" if number else "sweep"
     with tqdm.tqdm(
-        total=total, initial=total - missing, desc="sweep", unit="member"
+        total=total, initial=total - missing, desc=title, unit="member"
     ) as bar:
         piece = functools.partial(train_group, config=config)
         for part in executor.stream(piece, todo):
@@ -142,8 +153,8 @@ def _train(
                 facts = _facts(parts[hidden])
                 write_json(files[hidden], {"facts": facts, "members": made})
                 of = (inputs, outputs(hidden), facts["seconds"])
-                stages.note(shape_name(hidden), *of)
-    return {shape_name(h): read_json(file, "a group") for h, file in files.items()}
+                stages.note(names[hidden], *of)
+    return {names[h]: read_json(file, "a group") for h, file in files.items()}
 
 
 def _facts(parts: Sequence[Part]) -> dict:

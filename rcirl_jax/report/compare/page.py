@@ -88,7 +88,7 @@ def settings_table(runs: Sequence[ComparedRun]) -> Table:
             marked.append(name)
     heads = ("", *(run.name for run in runs))
     return Table(
-        caption="Settings that differ",
+        caption="Recipe, data, commit, and settings that differ",
         heads=heads,
         rows=rows,
         kind="wrap",

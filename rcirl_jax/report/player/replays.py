@@ -257,11 +257,18 @@ def _apart(drives: Sequence[Drive]) -> float | None:
 
 def _summary(found: CaseMetrics) -> str:
     """The drive's own numbers in one line."""
-    failed = broken_bounds(found)
     gap = float(found.min_clearance)
     near = f"closest {max(gap, 0.0):.1f} m" if np.isfinite(gap) else "nobody near"
-    broken = ", ".join(failed) or "all bounds hold, no line run"
-    return f"{float(found.progress):.0f} m driven, {near}, {broken}"
+    return f"{float(found.progress):.0f} m driven, {near}, {_broken_words(found)}"
+
+
+def _broken_words(found: CaseMetrics) -> str:
+    return ", ".join(broken_bounds(found)) or "all bounds hold, no line run"
+
+
+def goes_as(drive: Drive, found: CaseMetrics) -> bool:
+    """Whether a drive breaks the bounds that it broke when `found` was measured."""
+    return drive.summary.endswith(f", {_broken_words(found)}")
 
 
 def _replay(

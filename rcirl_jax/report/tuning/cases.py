@@ -11,7 +11,7 @@ from markupsafe import Markup
 from rcirl_jax.evaluation.closed_loop.files import SuiteRuns
 from rcirl_jax.report.pages import part
 from rcirl_jax.report.player.player import COLOURS, looks
-from rcirl_jax.report.player.replays import Replay, broken_bounds
+from rcirl_jax.report.player.replays import Replay, broken_bounds, goes_as
 from rcirl_jax.simulation.catalogue.families import family_title
 from rcirl_jax.simulation.metrics import CaseMetrics, nuplan_score
 
@@ -32,6 +32,7 @@ class CaseLine:
     fault: bool  # the candidate's, where the incumbent has none
     place: int | None  # among the cases that the page plays
     thumbnail: Markup  # its worst moment, if it is played
+    otherwise: bool  # it is played, and breaks other bounds than in the suite
 
 
 def case_lines(
@@ -69,6 +70,8 @@ def case_lines(
                 fault=bool(fault[at]),
                 place=place,
                 thumbnail=Markup("") if place is None else thumbnail(replays[place]),
+                otherwise=place is not None
+                and not all(map(goes_as, replays[place].drives, drives)),
             )
         )
     return lines

@@ -43,7 +43,8 @@ def response_curves(rewards: Mapping[str, Reward], found: Contributions) -> Mark
             _density(axis, mine[..., names.index(row.feature)][found.valid], limit)
         _panel(axis, {name: each.get(row.feature) for name, each in curves.items()})
         axis.set_ylim(-limit, limit)
-        title = f"{row.feature.replace('_', ' ')}, {row.unit}"
+        unit = row.unit.replace("^2", "²").replace("^3", "³")
+        title = row.feature.replace("_", " ") + (f", {unit}" if unit != "1" else "")
         axis.set_title(title, fontsize=8, loc="left")
     axes[0, 0].legend(frameon=False, fontsize=7)
     axes[0, 0].set_ylabel("value", fontsize=8)

@@ -190,6 +190,6 @@ def _provenance(report: TuningReport) -> dict:
     ]
     heads = ("reward", "file", "seed", "commit", "sha256")
     return {
-        "table": Table(caption="Weights", heads=heads, rows=files),
+        "table": Table(caption="Weights", heads=heads, rows=files, kind="wrap"),
         "text": facts_text({"dataset_sha256": report.dataset.hash, **report.facts}),
     }

@@ -222,14 +222,13 @@ def _comparisons(comparisons: Sequence[Comparison]) -> Table:
 def cards(
     verdict: Verdict, suite: SuiteReport, incumbent: str
 ) -> list[dict[str, object]]:
-    """Five cards: decision, nearer to the human, safety, comfort, progress."""
+    """Five cards: cases, nearer to the human, safety, comfort, progress."""
     new = len(verdict.new_faults)
-    faults = "new fault" if new == 1 else "new faults"
     return [
         {
-            "title": "Verdict",
-            "value": verdict.decision.capitalize(),
-            "words": f"{verdict.cases:,} cases, {new} {faults}",
+            "title": "Cases driven",
+            "value": f"{verdict.cases:,}",
+            "words": f"of {verdict.families} families, {new} with a new fault",
             "kind": DECISIONS[verdict.decision],
         },
         _amount(verdict, "Nearer to the human", ("likeness",), "on held-out drives"),
@@ -238,7 +237,7 @@ def cards(
             verdict,
             "Comfort",
             ("a_station", "j_station"),
-            "points of drives within 4 m/s² and 6 m/s³",
+            "points of all drives: within 4 m/s² / 6 m/s³",
         ),
         _amount(verdict, "Progress", ("progress",), f"of {incumbent}'s"),
     ]
@@ -283,11 +282,12 @@ def _safety_card(
     mine = next(iter(suite.rows.values()))
     theirs = suite.rows[incumbent]
     outcomes = {c.outcome for c in verdict.checks if c.kind == "safety"}
+    more = mine.at_fault > theirs.at_fault and outcomes == {"pass"}
     return {
         "title": "Safety",
         "value": f"{mine.at_fault} / {theirs.at_fault}",
         "words": "at-fault collisions, candidate / incumbent; red lights "
         f"{mine.red_lights} / {theirs.red_lights}, stop signs {mine.stop_signs} / "
-        f"{theirs.stop_signs}",
+        f"{theirs.stop_signs}{'; no more than the margin allows' if more else ''}",
         "kind": next((SAFETY[x] for x in ("fail", "open") if x in outcomes), "ship"),
     }
