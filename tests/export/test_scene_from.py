@@ -196,7 +196,7 @@ def test_it_is_what_the_observer_sees():
         ),
         obstacles=[
             Body(
-                kind=Kind(case.agents.kind[i]).name.lower(),
+                kind=Kind(int(case.agents.kind[i])).name.lower(),
                 x=float(world.agents.s[i]), y=float(world.agents.l[i]),
                 heading=float(world.agents.heading[i]), speed=float(world.agents.v[i]),
                 length=4.6, width=1.9,
