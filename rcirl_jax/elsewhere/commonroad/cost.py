@@ -63,9 +63,7 @@ class RewardCost:
     def _costs(self, trajectories: Sequence[Any]) -> np.ndarray:
         """Minus the values of samples [K]."""
         assert self.scene is not None, "look at a scene before planning"
-        s, l = np.array([self._centre(x.curvilinear) for x in trajectories]).swapaxes(
-            0, 1
-        )
+        s, l = np.stack([self._centre(x.curvilinear) for x in trajectories], axis=1)
         features = self.columns(self.scene, s, l)
         return -self.reward.value(features, self.scene.time_valid)
 
