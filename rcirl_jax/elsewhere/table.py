@@ -51,7 +51,10 @@ Results = dict[str, dict[str, Numbers]]  # by driver and episode
 
 
 def numbers_of(drives: Sequence[Drive]) -> dict[str, Numbers]:
-    """The numbers of drives, by episode."""
+    """The numbers of drives, by episode; one that has no step has none."""
+    drives = [drive for drive in drives if drive.v.size]
+    if not drives:
+        return {}
     found = measure(drives)
     holds = dict(zip(COLUMNS, found.holds.T, strict=True))
     columns = {key: getattr(found, key) for key in MEANS} | {
@@ -109,7 +112,7 @@ class Entry:
 
 
 def table_of(simulator: str, results: Results, against: Sequence[str]) -> "Table":
-    """The table over the episodes that every driver has driven."""
+    """The table over the episodes that every driver has driven, a step at least."""
     first, *others = results.values()
     episodes = [name for name in first if all(name in other for other in others)]
     entries = []

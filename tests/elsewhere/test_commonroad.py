@@ -70,6 +70,23 @@ def test_the_cost_is_minus_the_value_of_the_centres_way():
     assert cost.evaluate(behind) == pytest.approx(wanted, abs=2e-2)
 
 
+def test_costs_that_were_worked_out_at_once_are_those_of_one_by_one():
+    """And they are forgotten with their scene."""
+    cost = RewardCost(WEIGHTS, dt=0.1, rear_axle=1.4)
+    cost.look(road(), station=0.0)
+    time = 0.1 * np.arange(81)
+    samples = [sample(a * time, 0.1 * a + 0 * time) for a in (8.0, 10.0, 13.0)]
+    alone = [cost.evaluate(x) for x in samples]
+    cost.evaluate_all(samples)
+    assert [cost.evaluate(x) for x in samples] == pytest.approx(alone, rel=1e-6)
+    cost.reward = None  # not asked again
+    assert [cost.evaluate(x) for x in samples] == pytest.approx(alone, rel=1e-6)
+    assert len(set(alone)) == 3
+    cost.evaluate_all([])
+    with pytest.raises(AttributeError):
+        cost.evaluate(samples[0])
+
+
 def test_a_known_future_is_a_box_along_the_road():
     """Abreast of the road it is as long as it is wide; gone after its last row."""
     rows = np.array([[0.0, 10.0, 3.0, np.pi / 2, 5.0], [4.0, 10.0, -5.0, np.pi / 2, 5]])

@@ -7,7 +7,7 @@ import pytest
 
 from rcirl_jax.elsewhere.drive import Entrant, drive, entrants, groups
 from rcirl_jax.elsewhere.drivers import Seen, follow
-from rcirl_jax.elsewhere.measures import measure
+from rcirl_jax.elsewhere.measures import Drive, measure
 from rcirl_jax.elsewhere.simulators import open_simulator
 from rcirl_jax.elsewhere.table import (
     numbers_of,
@@ -144,6 +144,17 @@ def test_a_table_has_a_row_per_driver_and_paired_differences(driven):
     assert set(body["groups"]) == {"all", "0", "5"}
     for name in driven:
         assert name in table.text(body)
+
+
+def test_an_episode_that_somebody_cannot_begin_is_left_out(driven):
+    results = {name: numbers_of(drives) for name, drives in driven.items()}
+    first, *others = driven["brakes"]
+    never = Drive.of(first.episode, [])
+    results["brakes"] = numbers_of([never, *others])
+    assert first.episode not in results["brakes"]
+    assert numbers_of([never]) == {}
+    table = table_of("straight", results, ["hand-set"])
+    assert table.episodes == [drive.episode for drive in others]
 
 
 def test_an_unknown_simulator_is_one_line():

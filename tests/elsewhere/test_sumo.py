@@ -73,11 +73,11 @@ def test_lights_lie_where_sumo_says_and_red_ones_are_walls(corridors):
     for n, view in enumerate(views):
         ahead = [x for x in libsumo.vehicle.getNextTLS(f"{n}.ego") if x[2] < 250.0]
         assert len(view.signals) == len(ahead)
-        red = [distance for *_, distance, state in ahead if state == "r"]
-        demands = [s for s in view.signals if s.state in ("red", "yellow")]
-        if red and view.signals[0].state == "red":
+        shown = zip(ahead, view.signals, strict=True)
+        red = [distance for (*_, distance, _), s in shown if s.state == "red"]
+        if red:
             assert float(free.line[n]) == pytest.approx(red[0], abs=0.2)
-        if not demands:
+        else:
             assert math.isinf(free.line[n])
 
 
@@ -90,6 +90,35 @@ def test_a_move_is_what_the_ego_does(corridors):
         assert now.way - then.way == pytest.approx(asked.way, abs=1e-2)
         assert now.ego.acceleration == -1.0
         assert now.centre_line is then.centre_line
+
+
+def test_yellow_stays_red_for_who_could_stop_when_it_began():
+    """At 3 m/s2, from v within v^2 / 6; green ends it, yellow from too near is none."""
+    running = Sumo().start(NAMES, None)
+    ahead = [libsumo.vehicle.getNextTLS(f"{n}.ego") for n in range(3)]
+    n, light = next((n, lights[0][0]) for n, lights in enumerate(ahead) if lights)
+    links = len(libsumo.trafficlight.getRedYellowGreenState(light))
+    go_on = lambda: running.step([view and move(view) for view in running.look()])  # noqa: E731
+
+    def shown(letter):
+        """What the ego sees when it shows a letter, and whether it can stop."""
+        libsumo.trafficlight.setRedYellowGreenState(light, letter * links)
+        go_on()
+        view = running.look()[n]
+        distance = libsumo.vehicle.getNextTLS(f"{n}.ego")[0][2]
+        return view.signals[0].state, view.ego.speed**2 / 6.0 < distance
+
+    while not running.look()[n].signals:
+        go_on()
+    assert shown("G") == ("green", True)
+    assert shown("y") == ("red", True)
+    while (seen := shown("y"))[1]:
+        assert seen[0] == "red"
+    assert seen == ("red", False)
+    assert shown("G") == ("green", False)
+    assert shown("y") == ("yellow", False)
+    assert shown("r") == ("red", False)
+    running.close()
 
 
 def test_who_keeps_its_speed_runs_red_lights_and_who_brakes_hits_nobody():

@@ -120,6 +120,16 @@ def size_of(body: Any) -> tuple[float, float]:  # noqa: ANN401
     return float(right - left), float(high - low)
 
 
+class RewardPlanner(ReactivePlanner):
+    """The reactive planner, whose feasible samples a `RewardCost` values at once."""
+
+    def _check_kinematics(self, *args: Any) -> Any:  # noqa: ANN401
+        found = super()._check_kinematics(*args)
+        if isinstance(self.cost_function, RewardCost):
+            self.cost_function.evaluate_all(found[0])
+        return found
+
+
 class Planned:
     """The reactive planner as the driver of a scenario's ego."""
 
@@ -129,7 +139,7 @@ class Planned:
         config.planning.dt = given.scenario.dt
         config.planning.time_steps_computation = round(HORIZON_S / given.scenario.dt)
         config.update(given.scenario, given.problem)
-        self.planner, self.car = ReactivePlanner(config), config.vehicle
+        self.planner, self.car = RewardPlanner(config), config.vehicle
         self.planner.set_reference_path(coordinate_system=given.system)
         self.cost: RewardCost | None = None
         if cost != "default":

@@ -20,6 +20,7 @@ from rcirl_jax.elsewhere.simulators import STEP_S, Move, Running, View
 from rcirl_jax.elsewhere.sumo.network import KINDS, WARM_UP_S, main_road, write
 from rcirl_jax.elsewhere.way import Way
 from rcirl_jax.export.own_planner.inputs import Body, Car, Signal
+from rcirl_jax.simulation.world.lines import YELLOW_BRAKING_MPS2
 from rcirl_jax.units import HORIZON_S
 
 KRAUSS = "Krauss"
@@ -142,6 +143,7 @@ class Ego:
         self._acceleration = 0.0
         self._start = self._front()
         self._next = self._light()
+        self._halts: set[tuple[str, int]] = set()  # lights that it stops for
         if own is None:
             libsumo.vehicle.setSpeedMode(name, FREE)
 
@@ -189,12 +191,23 @@ class Ego:
         return (ahead[0][0], ahead[0][1]) if ahead else None
 
     def _signals(self, front: float) -> list[Signal]:
-        """The lights ahead, each where its stop line is."""
-        found = []
-        for _, _, distance, state in libsumo.vehicle.getNextTLS(self.name):
+        """The lights ahead, each where its stop line is.
+
+        A yellow one that has demanded a stop is shown as red until it is green again,
+        as in our simulator: whoever brakes late by a little would else be let go on.
+        """
+        found, halts = [], set()
+        speed = libsumo.vehicle.getSpeed(self.name)
+        for *light, distance, shown in libsumo.vehicle.getNextTLS(self.name):
+            link, state = tuple(light), STATES.get(shown, "green")
+            can_stop = speed**2 <= 2.0 * YELLOW_BRAKING_MPS2 * distance
+            if state != "green" and (state == "red" or can_stop or link in self._halts):
+                halts.add(link)
+                state = "red"
             if distance < SIGNAL_M:
                 x, y, *_ = self._way.place(front + distance)
-                found.append(Signal(x=x, y=y, state=STATES.get(state, "green")))
+                found.append(Signal(x=x, y=y, state=state))
+        self._halts = halts
         return found
 
 
