@@ -1,15 +1,28 @@
-// choose WEIGHTS < CANDIDATES: the candidate that the learned reward likes best.
+// choose WEIGHTS [COSTS] < CANDIDATES: the candidate that the learned reward likes best.
 //
 // CANDIDATES is float32 numbers in this machine's byte order, [K, T, F] with the last
-// axis fastest; the sizes T and F are those of the weights file.
+// axis fastest; the sizes T and F are those of the weights file. COSTS is [K] alike, the
+// planner's own costs, lower is better: an anchored reward is added to them.
 #include <cstdio>
 #include <vector>
 
 #include "rcirl/reward.hpp"
 
+namespace {
+
+std::vector<float> numbers(std::FILE* file) {
+  std::vector<float> all, chunk(1 << 16);
+  for (std::size_t read; (read = std::fread(chunk.data(), 4, chunk.size(), file)) > 0;) {
+    all.insert(all.end(), chunk.begin(), chunk.begin() + static_cast<long>(read));
+  }
+  return all;
+}
+
+}  // namespace
+
 int main(int count, char** arguments) {
-  if (count != 2) {
-    std::fprintf(stderr, "choose: %d arguments: expected WEIGHTS\n", count - 1);
+  if (count != 2 && count != 3) {
+    std::fprintf(stderr, "choose: %d arguments: expected WEIGHTS [COSTS]\n", count - 1);
     return 2;
   }
   rcirl::Reward reward;
@@ -18,15 +31,14 @@ int main(int count, char** arguments) {
     std::fprintf(stderr, "%s\n", status.message().c_str());
     return 2;
   }
-  if (reward.anchored()) {
-    std::fprintf(stderr, "%s: anchor: %s: expected a reward that is not added to another\n",
-                 arguments[1], reward.incumbent().c_str());
+  if (reward.anchored() != (count == 3)) {
+    std::fprintf(stderr, "%s: anchor: %s: expected %s\n", arguments[1],
+                 reward.anchored() ? reward.incumbent().c_str() : "none",
+                 reward.anchored() ? "COSTS as a second argument, those of the planner"
+                                   : "no COSTS, for the reward decides alone");
     return 2;
   }
-  std::vector<float> features, chunk(1 << 16);
-  for (std::size_t read; (read = std::fread(chunk.data(), 4, chunk.size(), stdin)) > 0;) {
-    features.insert(features.end(), chunk.begin(), chunk.begin() + static_cast<long>(read));
-  }
+  const std::vector<float> features = numbers(stdin);
   const std::size_t row = reward.times().size() * reward.features().size();
   if (features.empty() || features.size() % row != 0) {
     std::fprintf(stderr, "stdin: candidates: %zu numbers: expected a multiple of %zu\n",
@@ -36,8 +48,21 @@ int main(int count, char** arguments) {
   const std::size_t candidates = features.size() / row;
   rcirl::Workspace workspace = reward.workspace();
   std::vector<float> values(candidates);
-  const std::size_t refused =
-      reward.score(features.data(), candidates, {}, &workspace, values.data());
+  std::size_t refused = 0;
+  if (reward.anchored()) {
+    std::FILE* file = std::fopen(arguments[2], "rb");
+    std::vector<float> own = file != nullptr ? numbers(file) : std::vector<float>();
+    if (file != nullptr) std::fclose(file);
+    if (own.size() != candidates) {
+      std::fprintf(stderr, "%s: costs: %zu numbers: expected %zu\n", arguments[2], own.size(),
+                   candidates);
+      return 2;
+    }
+    for (float& cost : own) cost = -cost;
+    refused = reward.total(features.data(), candidates, {}, own.data(), &workspace, values.data());
+  } else {
+    refused = reward.score(features.data(), candidates, {}, &workspace, values.data());
+  }
   const std::size_t best = rcirl::best(values.data(), candidates);
   if (best == candidates) {
     std::fprintf(stderr, "stdin: candidates: all %zu refused: expected finite features\n", refused);

@@ -1,6 +1,7 @@
 // Ten candidates beside two cars, judged by a learned reward: own_planner WEIGHTS.
 // The Python twin, own_planner.py, prints the same numbers.
 #include <algorithm>
+#include <cmath>
 #include <cstdio>
 #include <vector>
 
@@ -47,10 +48,16 @@ int main(int count, char** arguments) {
     return 2;
   }
   const std::vector<float> s = candidates();
-  std::vector<float> features(10 * rcirl::kTimes * columns.size()), values(10);
+  std::vector<float> features(10 * rcirl::kTimes * columns.size()), values(10), own;
+  for (int k = 0; k < 10; ++k) own.push_back(-std::abs(-3.0F + 0.5F * static_cast<float>(k)));
   rcirl::Workspace workspace = reward.workspace();
   columns.compute(scene, {s.data(), nullptr, 10}, features.data());
-  reward.score(features.data(), 10, columns.mask(scene), &workspace, values.data());
+  const rcirl::Mask valid = columns.mask(scene);
+  if (reward.anchored()) {  // own: your planner's own costs, negated
+    reward.total(features.data(), 10, valid, own.data(), &workspace, values.data());
+  } else {
+    reward.score(features.data(), 10, valid, &workspace, values.data());
+  }
   for (int k = 0; k < 10; ++k) {
     std::printf("candidate %d: %.9g\n", k, static_cast<double>(values[static_cast<std::size_t>(k)]));
   }

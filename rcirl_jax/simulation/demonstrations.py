@@ -22,7 +22,6 @@ from typing import Any
 
 import jax
 import numpy as np
-import tqdm
 
 from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.data.scenes.assemble import assemble
@@ -35,6 +34,7 @@ from rcirl_jax.data.store.writer import DatasetWriter
 from rcirl_jax.errors import InputError
 from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.planner.yielding import Yielding, yielding_policy
+from rcirl_jax.runtime.bars import CompilesFirst
 from rcirl_jax.simulation.cases import STEP_S, Case, Record
 from rcirl_jax.simulation.rollout import (
     Params,
@@ -194,7 +194,7 @@ def _drive_all(
     names: list[str] = []
     sizes: dict[str, int] = {}
     shard = 0
-    with tqdm.tqdm(total=len(refs), desc="drive the catalogue", unit="case") as bar:
+    with CompilesFirst(total=len(refs), desc="drive the catalogue", unit="case") as bar:
         for first in range(0, len(refs), CHUNK):
             part = refs[first : first + CHUNK]
             model = yielding_policy(DRIVERS[first // CHUNK % len(DRIVERS)]), None

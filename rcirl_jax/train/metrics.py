@@ -8,10 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import tqdm
-
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.atomic_files import named, parse_json, write_whole
+from rcirl_jax.runtime.bars import CompilesFirst
 from rcirl_jax.train.trackers import Writer
 
 MAX_STEP = 2**63 - 1  # what 64 bits hold
@@ -105,7 +104,7 @@ class Progress:
     def __init__(
         self, total: int, start: int, label: str, *, shown: bool = True
     ) -> None:
-        self._bar = tqdm.tqdm(
+        self._bar = CompilesFirst(
             total=total,
             initial=start,
             desc=label,

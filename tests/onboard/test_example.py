@@ -14,6 +14,7 @@ from rcirl_jax import Body, Car, CentreLine, load_weights, scene_from
 from rcirl_jax.export import reader
 from rcirl_jax.export.own_planner import features
 from rcirl_jax.export.own_planner.plain import plain_scene
+from tests.export.test_old_files import golden
 from tests.helpers.own_planner import TOLERANCE, error, numpy_answers
 from tests.onboard.programs import ONBOARD, built, run
 
@@ -95,7 +96,39 @@ def test_the_twin_names_what_is_wrong(twin):
     assert done.stderr.startswith("none: ")
 
 
+def test_choose_adds_an_anchored_reward_to_the_costs(tmp_path):
+    choose = built(tmp_path / "build", "choose") / "choose"
+    weights, features, _, _ = golden(4)
+    features = features.astype("<f4")
+    costs = np.linspace(2.0, -3.0, len(features), dtype="<f4")
+    (tmp_path / "costs.f32").write_bytes(costs.tobytes())
+    (tmp_path / "few.f32").write_bytes(costs[1:].tobytes())
+
+    def said(*arguments):
+        command = [choose, *arguments]
+        return subprocess.run(
+            command, input=features.tobytes(), capture_output=True, check=False
+        )
+
+    total = load_weights(weights).total(features, -costs)
+    done = said(weights, tmp_path / "costs.f32")
+    start = f"candidate {np.argmax(total)} of {len(total)}, value "
+    assert done.stdout.decode().startswith(start), done.stderr
+    value = float(done.stdout.decode().removeprefix(start).split(",")[0])
+    assert value == pytest.approx(total.max(), rel=1e-5)
+    alone = golden(3)[0]
+    for arguments, wanted in (
+        ((weights,), "COSTS as a second argument"),
+        ((weights, tmp_path / "few.f32"), f"expected {len(costs)}"),
+        ((weights, tmp_path / "none.f32"), "costs: 0 numbers"),
+        ((alone, tmp_path / "costs.f32"), "expected no COSTS"),
+    ):
+        done = said(*arguments)
+        assert done.returncode == 2
+        assert wanted in done.stderr.decode()
+
+
 def test_the_programs_are_short():
     for name in ("own_planner.py", "own_planner.cpp"):
         lines = (ONBOARD / "example" / name).read_text().splitlines()
-        assert len(lines) <= 60
+        assert len(lines) <= 66

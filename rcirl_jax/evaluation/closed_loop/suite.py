@@ -18,6 +18,7 @@ from rcirl_jax.evaluation.closed_loop.output import (
 )
 from rcirl_jax.evaluation.closed_loop.summary import SuiteReport, summarise
 from rcirl_jax.runtime.atomic_files import write_json, write_whole
+from rcirl_jax.runtime.bars import CompilesFirst
 from rcirl_jax.runtime.executors import two_at_a_time
 from rcirl_jax.simulation.cases import STEP_S
 from rcirl_jax.simulation.metrics import CaseMetrics
@@ -65,7 +66,7 @@ class SuiteResult:
 
 def bar_of(row: Row, total: int) -> tqdm.tqdm:
     """A progress bar over the cases of a row."""
-    return tqdm.tqdm(
+    return CompilesFirst(
         total=total, desc=f"drive the cases: {row.name}", unit="case", mininterval=0.5
     )
 

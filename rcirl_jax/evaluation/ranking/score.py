@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tqdm
 
 from rcirl_jax.data.store.rows import refuse_scenes
 from rcirl_jax.features import FeatureMap, feature_map
@@ -31,6 +30,7 @@ from rcirl_jax.reward import (
     lattice_cost,
     speed_dp_cost,
 )
+from rcirl_jax.runtime.bars import CompilesFirst
 from rcirl_jax.runtime.executors import Executor, Here
 from rcirl_jax.sampling import SamplerConfig, sample
 from rcirl_jax.train.featurise import human_of
@@ -227,7 +227,7 @@ def score_scenes(
         tuned=tuned or {},
     )
     parts = []
-    with tqdm.tqdm(total=len(index), desc="rank the scenes", unit="scene") as bar:
+    with CompilesFirst(total=len(index), desc="rank the scenes", unit="scene") as bar:
         for part in (executor or Here()).stream(piece, _chunks(rows, index)):
             parts.append(part)
             bar.update(len(part["fde"]))

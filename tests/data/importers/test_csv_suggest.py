@@ -203,6 +203,13 @@ def test_a_row_per_vehicle(tmp_path):
             dict(t="Timestamp", id="ObjectID", lat="Latitude", lon="Longitude",
                  speed="Speed(km/h)", heading="Course(deg)", kind="Class"),
         ),
+        (
+            "Zeitstempel Fahrzeug Rechtswert_m Hochwert_m Fahrzeuglänge Fahrzeugbreite "
+            "Fahrzeugklasse Fahrstreifen",
+            dict(t="Zeitstempel", id="Fahrzeug", x="Rechtswert_m", y="Hochwert_m",
+                 length="Fahrzeuglänge", width="Fahrzeugbreite",
+                 kind="Fahrzeugklasse", lane="Fahrstreifen"),
+        ),
     ],
 )  # fmt: skip
 def test_fields_by_names_of_known_tools(header, expected):

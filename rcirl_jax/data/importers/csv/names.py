@@ -30,9 +30,15 @@ WORDS: Mapping[str, tuple[str, ...]] = {
     "speed": (
         *("speed", "velocity", "v", "vel", "geschwindigkeit", "vitesse", "velocidad"),
     ),
-    "length": ("length", "len", "laenge", "länge", "longueur"),
-    "width": ("width", "breite", "largeur", "ancho"),
-    "kind": ("class", "type", "kind", "category", "klasse", "typ", "classe", "clase"),
+    "length": (
+        *("length", "len", "laenge", "länge", "longueur"),
+        *("fahrzeuglänge", "fahrzeuglaenge"),
+    ),
+    "width": ("width", "breite", "largeur", "ancho", "fahrzeugbreite"),
+    "kind": (
+        *("class", "type", "kind", "category", "klasse", "typ", "classe", "clase"),
+        *("fahrzeugklasse", "fahrzeugtyp", "fahrzeugart", "objektklasse", "objekttyp"),
+    ),
     "lane": ("lane", "spur", "fahrstreifen", "voie", "carril"),
     "recording": (
         *("recording", "run", "video", "drive", "flight", "scene", "session", "trip"),
@@ -42,6 +48,7 @@ WORDS: Mapping[str, tuple[str, ...]] = {
     "id": (
         *("id", "track", "trackid", "vehicleid", "objectid", "vehicle", "object"),
         *("veh", "agent", "uuid", "objekt", "fahrzeug", "car", "kennung", "nr", "name"),
+        *("fahrzeugnummer", "fahrzeugnr", "objektnummer"),
     ),
 }
 # words that make a name another thing

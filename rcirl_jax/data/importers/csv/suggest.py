@@ -199,7 +199,7 @@ def _clock(table: Table, raw: AnyMapping[str, np.ndarray], guess: Guess) -> None
     near = min(USUAL_RATES, key=lambda usual: abs(rate / usual - 1.0))
     guess.rate_hz = near if abs(rate / near - 1.0) < RATE_FITS else float(f"{rate:.4g}")
     guess.said.append(
-        f"rate_hz = {guess.rate_hz:g}: a row of a road user every {1 / rate:g} s"
+        f"rate_hz = {guess.rate_hz:g}: a row of a road user every {1 / rate:.4g} s"
     )
 
 
