@@ -1,7 +1,6 @@
 // Ten candidates beside two cars, judged by a learned reward: own_planner WEIGHTS.
 // The Python twin, own_planner.py, prints the same numbers.
 #include <algorithm>
-#include <cmath>
 #include <cstdio>
 #include <vector>
 
@@ -48,18 +47,14 @@ int main(int count, char** arguments) {
     return 2;
   }
   const std::vector<float> s = candidates();
-  std::vector<float> features(10 * rcirl::kTimes * columns.size()), values(10), own;
-  for (int k = 0; k < 10; ++k) own.push_back(-std::abs(-3.0F + 0.5F * static_cast<float>(k)));
+  std::vector<float> features(10 * rcirl::kTimes * columns.size()), values(10);
+  std::vector<float> own{-3, -2.5, -2, -1.5, -1, -0.5, 0, -0.5, -1, -1.5};  // -cost of your planner
   rcirl::Workspace workspace = reward.workspace();
   columns.compute(scene, {s.data(), nullptr, 10}, features.data());
   const rcirl::Mask valid = columns.mask(scene);
-  if (reward.anchored()) {  // own: your planner's own costs, negated
-    reward.total(features.data(), 10, valid, own.data(), &workspace, values.data());
-  } else {
-    reward.score(features.data(), 10, valid, &workspace, values.data());
-  }
-  for (int k = 0; k < 10; ++k) {
-    std::printf("candidate %d: %.9g\n", k, static_cast<double>(values[static_cast<std::size_t>(k)]));
-  }
+  float *const at = features.data(), *const to = values.data();
+  if (!reward.anchored()) reward.score(at, 10, valid, &workspace, to);
+  if (reward.anchored()) reward.total(at, 10, valid, own.data(), &workspace, to);
+  for (std::size_t k = 0; k < 10; ++k) std::printf("candidate %zu: %.9g\n", k, double{values[k]});
   std::printf("best: candidate %zu\n", rcirl::best(values.data(), 10));
 }

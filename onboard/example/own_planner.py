@@ -53,10 +53,8 @@ t = np.minimum(TIMES, SPEED / np.maximum(-a, 1e-9))
 s = SPEED * t + 0.5 * a * t * t  # [10, T] m along the given path
 found, valid = columns(scene, s), scene.time_valid
 own = -np.abs(a[:, 0])  # of an anchored reward: your planner's own costs, negated
-if reward.anchor:
-    values = reward.total(found, own, valid)
-else:
-    values = reward.value(found, valid)
+alone = reward.anchor is None
+values = reward.value(found, valid) if alone else reward.total(found, own, valid)
 for number, value in enumerate(values):
     print(f"candidate {number}: {value:.9g}")
 print(f"best: candidate {np.argmax(values)}")
