@@ -18,6 +18,7 @@ HEADWAY_STEP_S = 0.01  # s, to which headways are counted
 SPEED_STEP_MPS = 0.05  # m/s, likewise
 FUTURE_STEP_S = 0.05  # s, likewise
 HEADWAY_EDGES_S = (0.5, 1.0, 1.5, 2.0, 3.0)  # s, bins of the headway histogram
+NOTES_SHOWN = 3  # in the report that is printed; the manifest has more
 # what a log may leave to a guess
 LIMIT, WIDTH, SIZE = "speed limit", "width", "size"
 HOW_TO_POOL = (
@@ -320,8 +321,9 @@ def oddities(report: Mapping) -> list[str]:
         lines.append(f"{report['empty']} recordings without traffic skipped")
     if report.get("assumed"):
         lines.append(_assumed_line(report["assumed"]))
-    if report["num_notes"]:
-        lines.append(f"{report['num_notes']} notes; first: {report['notes'][0]}")
+    lines += [f"note: {note}" for note in report["notes"][:NOTES_SHOWN]]
+    if report["num_notes"] > NOTES_SHOWN:
+        lines.append(f"{report['num_notes']} notes in all: manifest.json")
     return lines
 
 
