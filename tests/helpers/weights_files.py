@@ -102,14 +102,21 @@ def loop_value(weights, features, valid):
     lower, upper, location, scale = (
         np.asarray(getattr(weights, name), np.float64) for name in reader.RANGES
     )
-    rows = (np.clip(np.float64(features), lower, upper) - location) / scale
+    rows = (np.clip(np.asarray(features, np.float64), lower, upper) - location) / scale
     if weights.context is not None:
-        rows = rows * 2.0 / (1.0 + np.exp(-rows[0] @ np.float64(weights.context)))
+        rows = (
+            rows
+            * 2.0
+            / (1.0 + np.exp(-rows[0] @ np.asarray(weights.context, np.float64)))
+        )
     total, last = 0.0, len(weights.kernels) - 1
     for t in np.flatnonzero(valid):
         x = rows[t]
         for layer in range(last + 1):
-            x = x @ np.float64(weights.kernels[layer]) + weights.biases[layer]
+            x = (
+                x @ np.asarray(weights.kernels[layer], np.float64)
+                + weights.biases[layer]
+            )
             x = x if layer == last else act(x)
         total += float(weights.gamma[t]) * x[0]
     return total
@@ -117,8 +124,12 @@ def loop_value(weights, features, valid):
 
 def loop_gain(anchor, first):
     """The gain of V in float64; `first` is [F]."""
-    z = np.clip((np.float64(first) - anchor.location) / anchor.scale, -5.0, 5.0)
-    x = np.tanh(z @ np.float64(anchor.kernel) + anchor.bias) @ np.float64(anchor.out)
+    z = np.clip(
+        (np.asarray(first, np.float64) - anchor.location) / anchor.scale, -5.0, 5.0
+    )
+    x = np.tanh(z @ np.asarray(anchor.kernel, np.float64) + anchor.bias) @ np.asarray(
+        anchor.out, np.float64
+    )
     return anchor.low + (anchor.high - anchor.low) / (
         1.0 + math.exp(-x - anchor.offset[0])
     )

@@ -283,7 +283,7 @@ def _bodies(
 
 def _floats(values: Mapping[str, Any]) -> dict[str, Any]:
     """As numpy's float32, leaves of a tree that JAX is given."""
-    return {name: np.float32(x) for name, x in values.items()}
+    return {name: np.asarray(x, np.float32) for name, x in values.items()}
 
 
 def extents(
