@@ -144,6 +144,11 @@ PICTURES: Mapping[str, Callable[[Path], None]] = {
     "compare": compare,
     "inspect": inspect,
 }
+flags.register_validator(
+    "only",
+    lambda names: set(names) <= set(PICTURES),
+    f"expected names among {', '.join(PICTURES)}",
+)
 
 
 def shrink(path: Path) -> None:
