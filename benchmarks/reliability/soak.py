@@ -19,7 +19,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import jax
@@ -40,6 +40,7 @@ from rcirl_jax.data.importing import ImportConfig
 from rcirl_jax.data.logs import Logs
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.evaluation.gate.types import GateConfig
+from rcirl_jax.runtime.compiling import compiles
 from rcirl_jax.runtime.executors import Here
 from rcirl_jax.train.running import Running
 from rcirl_jax.train.state import TrainConfig
@@ -51,7 +52,6 @@ _OUTPUT = flags.DEFINE_string("output", "benchmarks/results", "folder of the JSO
 STRIDE_S = 2.0  # s between planning frames
 BATCH, CHECKPOINT_EVERY, STOP_AT = 8, 3, 5  # the resume repeats two steps
 CASES, DURATION_S = 2, 2.0  # of every family, and s of each; the gate wants 30
-COMPILED = "/jax/core/compile/backend_compile_duration"
 LEAST_ROUNDS = 6  # so that enough of them are left after the warm-up
 # rise allowed: a share of resident memory, or so many MiB; a round for the others.
 # A fall of resident memory hides a leak, what malloc has in use does not fall.
@@ -82,22 +82,6 @@ def look() -> dict[str, float]:
         "python_threads": threading.active_count(),
         "live_arrays": len(jax.live_arrays()),
     }
-
-
-@contextlib.contextmanager
-def compiles() -> Iterator[list[float]]:
-    """Seconds of each program compiled inside the `with` block."""
-    found: list[float] = []
-
-    def listen(event: str, duration_secs: float, **_: str | int) -> None:
-        if event == COMPILED:
-            found.append(duration_secs)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
-        yield found
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
 
 
 def _stop(step: int) -> None:

@@ -42,7 +42,8 @@ class RewardCost:
         self.dt, self.rear_axle = dt, rear_axle
         self.scene: Scene | None = None
         self.station = 0.0
-        self._known: dict[int, float] = {}  # by a sample's identity
+        # (sample, cost) by the sample's identity, its own while it is kept here
+        self._known: dict[int, tuple[Any, float]] = {}
 
     def look(self, scene: Scene, station: float) -> None:
         """Take the present frame, and the station m of the ego's centre on the path."""
@@ -50,14 +51,15 @@ class RewardCost:
 
     def evaluate(self, trajectory: Any) -> float:  # noqa: ANN401
         """Cost of a `commonroad_rp.trajectories.TrajectorySample`; lower is better."""
-        known = self._known.get(id(trajectory))
-        return float(self._costs([trajectory])[0]) if known is None else known
+        if (known := self._known.get(id(trajectory))) is not None:
+            return known[1]
+        return float(self._costs([trajectory])[0])
 
     def evaluate_all(self, trajectories: Sequence[Any]) -> None:
         """Costs of samples that `evaluate` is asked for next, all of them at once."""
         costs = self._costs(trajectories) if trajectories else ()
         self._known = {
-            id(x): float(cost) for x, cost in zip(trajectories, costs, strict=True)
+            id(x): (x, float(cost)) for x, cost in zip(trajectories, costs, strict=True)
         }
 
     def _costs(self, trajectories: Sequence[Any]) -> np.ndarray:

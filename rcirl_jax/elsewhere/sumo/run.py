@@ -20,7 +20,7 @@ from rcirl_jax.elsewhere.simulators import STEP_S, Move, Running, View
 from rcirl_jax.elsewhere.sumo.network import KINDS, WARM_UP_S, main_road, write
 from rcirl_jax.elsewhere.way import Way
 from rcirl_jax.export.own_planner.inputs import Body, Car, Signal
-from rcirl_jax.simulation.world.lines import YELLOW_BRAKING_MPS2
+from rcirl_jax.simulation.world.lines import can_stop
 from rcirl_jax.units import HORIZON_S
 
 KRAUSS = "Krauss"
@@ -200,8 +200,8 @@ class Ego:
         speed = libsumo.vehicle.getSpeed(self.name)
         for *light, distance, shown in libsumo.vehicle.getNextTLS(self.name):
             link, state = tuple(light), STATES.get(shown, "green")
-            can_stop = speed**2 <= 2.0 * YELLOW_BRAKING_MPS2 * distance
-            if state != "green" and (state == "red" or can_stop or link in self._halts):
+            halt = state == "red" or link in self._halts or can_stop(speed, distance)
+            if halt and state != "green":
                 halts.add(link)
                 state = "red"
             if distance < SIGNAL_M:

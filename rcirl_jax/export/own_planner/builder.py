@@ -32,9 +32,7 @@ from rcirl_jax.export.own_planner.inputs import (
     table,
 )
 from rcirl_jax.export.own_planner.line_frame import LineFrame, Parts, extents
-from rcirl_jax.geometry.frenet import (
-    project_points,
-)
+from rcirl_jax.geometry.frenet import project_points
 from rcirl_jax.planner.prediction import most_relevant, obstacles_of
 from rcirl_jax.types import NUM_TAGS, Obstacles, Scene
 from rcirl_jax.units import NUM_TIMES, TIMES_S

@@ -32,7 +32,7 @@ from rcirl_jax.geometry.frenet import (
 )
 from rcirl_jax.geometry.limits import LOOK_AHEAD_M, planning_limit
 from rcirl_jax.planner.prediction import Bodies
-from rcirl_jax.simulation.world.lines import YELLOW_BRAKING_MPS2
+from rcirl_jax.simulation.world.lines import can_stop
 from rcirl_jax.types import Ego, Kind, Path
 from rcirl_jax.units import HORIZON_S, NUM_STATIONS, STATION_STEP_M
 
@@ -303,9 +303,8 @@ def _nearest_line(signals: Sequence[Signal], stations: np.ndarray, now: Ego) -> 
     nearest = math.inf
     for signal, s in zip(signals, stations, strict=True):
         way = float(s) - 0.5 * float(now.length)
-        can_stop = float(now.v) ** 2 <= 2.0 * YELLOW_BRAKING_MPS2 * way
         demands = signal.state in ("red", "stop") or (
-            signal.state == "yellow" and can_stop
+            signal.state == "yellow" and can_stop(float(now.v), way)
         )
         if demands and way >= 0.0:
             nearest = min(nearest, float(s))

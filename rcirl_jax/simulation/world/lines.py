@@ -1,5 +1,7 @@
 """Stop lines: what the light shows, and who has to stop."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -28,6 +30,14 @@ def colours(lines: Lines, time: jax.Array) -> tuple[jax.Array, jax.Array]:
     return yellow, red
 
 
+def can_stop(v: Any, distance: Any) -> Any:  # noqa: ANN401
+    """Whether 3 m/s^2 stop a driver at speed v m/s within distance m, elementwise.
+
+    Arguments are numbers or arrays, of numpy or JAX.
+    """
+    return v**2 <= 2.0 * YELLOW_BRAKING_MPS2 * distance
+
+
 def demands(
     lines: Lines, time: jax.Array, distance: jax.Array, v: jax.Array
 ) -> jax.Array:
@@ -42,8 +52,7 @@ def demands(
       v: [..., 1] m/s, the driver's speed.
     """
     yellow, red = colours(lines, time)
-    can_stop = v**2 <= 2.0 * YELLOW_BRAKING_MPS2 * jnp.maximum(distance, 0.0)
-    return red | (yellow & can_stop)
+    return red | (yellow & can_stop(v, jnp.maximum(distance, 0.0)))
 
 
 def halting(

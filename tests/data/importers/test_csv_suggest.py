@@ -210,6 +210,11 @@ def test_a_row_per_vehicle(tmp_path):
                  length="Fahrzeuglänge", width="Fahrzeugbreite",
                  kind="Fahrzeugklasse", lane="Fahrstreifen"),
         ),
+        (
+            "time objecttype objectnumber x y objectspeed",
+            dict(t="time", kind="objecttype", id="objectnumber", x="x", y="y",
+                 speed="objectspeed"),
+        ),
     ],
 )  # fmt: skip
 def test_fields_by_names_of_known_tools(header, expected):

@@ -30,14 +30,11 @@ WORDS: Mapping[str, tuple[str, ...]] = {
     "speed": (
         *("speed", "velocity", "v", "vel", "geschwindigkeit", "vitesse", "velocidad"),
     ),
-    "length": (
-        *("length", "len", "laenge", "länge", "longueur"),
-        *("fahrzeuglänge", "fahrzeuglaenge"),
-    ),
-    "width": ("width", "breite", "largeur", "ancho", "fahrzeugbreite"),
+    "length": ("length", "len", "laenge", "länge", "longueur"),
+    "width": ("width", "breite", "largeur", "ancho"),
     "kind": (
         *("class", "type", "kind", "category", "klasse", "typ", "classe", "clase"),
-        *("fahrzeugklasse", "fahrzeugtyp", "fahrzeugart", "objektklasse", "objekttyp"),
+        "art",
     ),
     "lane": ("lane", "spur", "fahrstreifen", "voie", "carril"),
     "recording": (
@@ -48,9 +45,11 @@ WORDS: Mapping[str, tuple[str, ...]] = {
     "id": (
         *("id", "track", "trackid", "vehicleid", "objectid", "vehicle", "object"),
         *("veh", "agent", "uuid", "objekt", "fahrzeug", "car", "kennung", "nr", "name"),
-        *("fahrzeugnummer", "fahrzeugnr", "objektnummer"),
+        "nummer",
     ),
 }
+# what names glue in front of the word that counts: Fahrzeugklasse, VehicleType
+OWNERS = ("fahrzeug", "objekt", "vehicle", "object")
 # words that make a name another thing
 OTHER = {
     *("acc", "accel", "acceleration", "beschleunigung", "jerk", "headway", "gap"),
@@ -96,8 +95,17 @@ def plain_words(name: str) -> list[str]:
     """Words of a column's name without those of a unit."""
     bare = re.sub(r"[\[(].*?[\])]", " ", name)
     units = {text for texts in UNITS.values() for text in texts if len(text) > 1}
-    words = [word.lower() for word in re.findall(rf"{WORD}|\d+", bare)]
+    found = (word.lower() for word in re.findall(rf"{WORD}|\d+", bare))
+    words = [word for glued in found for word in _apart(glued)]
     return [w for w in words if w not in units and w not in ("kf", "smoothed", "raw")]
+
+
+def _apart(word: str) -> list[str]:
+    """A word without its owner, and the owner; plurals stay whole."""
+    for owner in OWNERS:
+        if word.startswith(owner) and len(word) > len(owner) + 1:
+            return [owner, word.removeprefix(owner)]
+    return [word]
 
 
 def unit_of(name: str, allowed: Sequence[str]) -> str:
