@@ -176,8 +176,8 @@ def test_choose_takes_the_best_candidate_that_has_a_value(programs, tmp_path):
     for file, data, message, code in (
         (path, features[:1].tobytes()[4:], "stdin: candidates: 5 numbers: expected", 2),
         (path, np.full(6, np.nan, "f4").tobytes(), "stdin: candidates: all 1 ref", 1),
-        # a reward that is added to another
-        (anchored, b"", f"{anchored}: anchor: hand-set: expected a reward", 2),
+        # a reward that is added to the cost of a planner, whose costs are missing
+        (anchored, b"", f"{anchored}: anchor: hand-set: expected COSTS as a second", 2),
         (missing, b"", f"{python.value}\n", 2),
     ):
         done = subprocess.run(
