@@ -28,6 +28,10 @@ BARS = {
     "ours/": ("ours, cached features", CHOSEN),
     "end_to_end/": ("ours, end to end", CHOSEN),
     "candidates/": ("candidates with features", CLASS_COLOURS["follow"]),
+    "recipe_torch_eager/": ("recipe, PyTorch eager", CANDIDATE),
+    "recipe_torch_compile/": ("recipe, torch.compile", CANDIDATE),
+    "recipe_cached/": ("recipe, cached features", CHOSEN),
+    "recipe_end_to_end/": ("recipe, end to end", CHOSEN),
 }
 
 

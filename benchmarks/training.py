@@ -34,6 +34,7 @@ from rcirl_jax.autotune.recipes import load_recipe
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.evaluation.ranking.learners import normaliser_of
 from rcirl_jax.features import feature_map
+from rcirl_jax.runtime.compiling import wide_vectors
 from rcirl_jax.train.featurise import candidates_of
 from rcirl_jax.train.frozen import freeze
 from rcirl_jax.train.loop import host_batch
@@ -130,27 +131,28 @@ def _features(key: jax.Array, batch: Batch) -> tuple[jax.Array, jax.Array]:
 def _candidates(batches: list[Batch], how: str, units: float) -> Way:
     place = parallelise(_features, how, CONFIG.batch_size).place
     turn = cycle([place(batch) for batch in batches])
-    keys, make = cycle(jax.random.split(jax.random.key(1), 64)), jax.jit(_features)
+    keys = cycle(jax.random.split(jax.random.key(1), 64))
+    make = jax.jit(_features, compiler_options=wide_vectors())  # as in a step
     return Way(lambda: make(next(keys), next(turn)), units)
 
 
-def _theirs(data: Data, form: str, compiled: bool) -> Way:
+def _theirs(data: Data, form: str, compiled: bool, config: TrainConfig) -> Way:
     """PyTorch's step, after its first one has been compared with ours."""
     inputs = [torch_step.inputs_of(batch, form) for batch in data.cached]
-    parameters = torch_step.parameters_of(data.state.params)
-    loss = torch_step.loss_of(form, data.state.normaliser, CONFIG.leaky_rate)
+    weights = torch_step.parameters_of(data.state.params)
+    loss = torch_step.loss_of(form, data.state.normaliser, config)
     loss = torch_step.compiled(loss) if compiled else loss
-    step = torch_step.make_step(loss, parameters, CONFIG.learning_rate)
+    step = torch_step.make_step(loss, weights, config.learning_rate)
     step(inputs[0])
-    apart = _apart(data, parameters)
-    print(f"torch, {form}, compiled {compiled}: first step differs by {apart:.1e}")
+    apart = _apart(data, weights, config)
+    print(f"torch, {config.loss}, {form}, compiled {compiled}: differs by {apart:.1e}")
     if not apart <= AGREE:
         raise SystemExit(f"error: torch {form}: {apart:.1e}: expected <= {AGREE}")
     turn = cycle(inputs)
     return Way(lambda: step(next(turn)), data.pairs)
 
 
-def _apart(data: Data, parameters: "list[torch.nn.Parameter]") -> float:
+def _apart(data: Data, weights: "torch_step.Weights", config: TrainConfig) -> float:
     """Largest difference of the first step: of the gradient, and of parameters.
 
     The gradient's is relative to its largest entry; Adam's first step alone shows
@@ -158,16 +160,15 @@ def _apart(data: Data, parameters: "list[torch.nn.Parameter]") -> float:
     parameters are compared elsewhere.
     """
     state, batch = data.state, jax.device_put(data.cached[0])
-    sums_of = jax.jit(lambda s, b: gradient_sums(s.params, s.normaliser, b, CONFIG))
+    sums_of = jax.jit(lambda s, b: gradient_sums(s.params, s.normaliser, b, config))
     grads, sums = sums_of(state, batch)
-    after = jax.jit(make_train_step(CONFIG))(state, batch)[0].params
-    flat = lambda p: np.concatenate(  # noqa: E731
-        [np.ravel(x) for x in (p.gamma, p.kernels[0], p.biases[0], p.kernels[1])]
-    )
-    grad, ours = flat(grads) / float(sums.terms), flat(after)
-    made = [p.grad for p in parameters if p.grad is not None]
-    their_grad = np.concatenate([g.numpy().ravel() for g in made])
-    theirs = np.concatenate([p.detach().numpy().ravel() for p in parameters])
+    after = jax.jit(make_train_step(config))(state, batch)[0].params
+    flat = lambda leaves: np.concatenate([np.ravel(x) for x in leaves])  # noqa: E731
+    grad = flat(torch_step.leaves_of(grads)) / float(sums.terms)
+    ours = flat(torch_step.leaves_of(after))
+    made = [leaf.grad for leaf in weights.leaves if leaf.grad is not None]
+    their_grad = flat([g.numpy() for g in made])
+    theirs = flat([leaf.detach().numpy() for leaf in weights.leaves])
     largest = np.max(np.abs(grad))
     clear = np.abs(grad) > AGREE * largest
     relative = np.max(np.abs(their_grad - grad)) / largest
@@ -177,7 +178,8 @@ def _apart(data: Data, parameters: "list[torch.nn.Parameter]") -> float:
 def _ways(data: Data, recipe: Data, cores: int) -> dict[str, Way]:
     made = CONFIG.batch_size * data.cached[0].feasible.shape[1]
     ways = {
-        f"torch_{name}/{form}": _theirs(data, form, name == "compile")
+        f"{ours}torch_{name}/{form}": _theirs(scenes, form, name == "compile", config)
+        for ours, scenes, config in (("", data, CONFIG), ("recipe_", recipe, RECIPE))
         for name in ("eager", "compile")
         for form in torch_step.FORMS
     }
@@ -221,14 +223,16 @@ def _row(taken: np.ndarray, units: float) -> dict[str, float]:
 
 
 def _ratios(rows: dict[str, dict]) -> dict[str, dict]:
-    """Time of each PyTorch row over that of our faster one."""
-    ours = [row for name, row in rows.items() if name.startswith("ours")]
-    measures = [name for name in ours[0] if name.endswith(("_ms", "_best"))][1:]
-    return {
-        name: {m: round(row[m] / min(o[m] for o in ours), 2) for m in measures}
-        for name, row in rows.items()
-        if name.startswith("torch")
-    }
+    """Time of each PyTorch row over that of our faster one of the same network."""
+    measures = [name for name in next(iter(rows.values())) if "_ms" in name]
+    ratios = {}
+    for rival, own in (("torch", "ours"), ("recipe_torch", "recipe_cached")):
+        ours = [row for name, row in rows.items() if name.startswith(own)]
+        best = {m: min(row[m] for row in ours) for m in measures}
+        for name, row in rows.items():
+            if name.startswith(rival):
+                ratios[name] = {m: round(row[m] / best[m], 2) for m in measures}
+    return ratios
 
 
 def _here(path: str, cores: int) -> dict:

@@ -21,6 +21,7 @@ from rcirl_jax.train.state import Batch, Facts, FeatureBatch, TrainConfig
 from rcirl_jax.types import Candidates, Demonstration, Scene, Trajectory
 from rcirl_jax.units import TIMES_S
 
+LANES = 16  # float32 numbers of the widest vectors of a CPU
 SAMPLER_STREAM = 0  # fold_in number of the sampler's key
 NEGATIVE_STREAM = 1  # fold_in number of the hard negatives' key
 FUTURES_STREAM = 2  # fold_in number of the draw between futures
@@ -84,13 +85,19 @@ def featurise(
         valid = demonstration.scene.time_valid & seen
         candidates = candidates_of(own_key, demonstration, config)
         driven = human_of(demonstration, config.sampler)
-        # the human stands last among the candidates: one pass for all
-        join = lambda many, one: jnp.concatenate([many, one[None]])  # noqa: E731
+        # the human stands behind the candidates, as often as fills whole vectors of a
+        # processor: one pass for all
+        sampled = candidates.feasible.size
+        humans = LANES - sampled % LANES
+
+        def join(many: jax.Array, one: jax.Array) -> jax.Array:
+            return jnp.concatenate([many, jnp.tile(one, (humans, 1))])
+
         everyone = jax.tree.map(join, candidates.trajectory, driven)
         frames = candidate_frames(demonstration.scene, everyone)
         both = jnp.stack(features.of_frames(frames))
-        human, rows = both[:, :, -1].T, both[:, :, :-1]
-        frames = jax.tree.map(lambda x: x[:, :-1], frames)
+        human, rows = both[:, :, sampled].T, both[:, :, :sampled]
+        frames = jax.tree.map(lambda x: x[:, :sampled], frames)
 
         def with_densities(facts: Facts, counts: jax.Array) -> Facts:
             """Those of the candidates that count, where the loss asks for them."""

@@ -21,6 +21,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from rcirl_jax.errors import InputError
+from rcirl_jax.runtime.compiling import wide_vectors
 from rcirl_jax.runtime.provenance import processor
 
 AXIS = "data"  # the one mesh axis: data parallel
@@ -39,7 +40,7 @@ class Parallel:
 
 def single(step: Step) -> Step:
     """The step under jit on the default device."""
-    return jax.jit(step)
+    return jax.jit(step, compiler_options=wide_vectors())
 
 
 def pmapped(step: Step, num_devices: int) -> Step:
@@ -76,7 +77,8 @@ def sharded(step: Step, num_devices: int) -> Step:
             # With the check on, the gradient of a replicated input is summed
             # over the axis by itself, and the step's own psum would count twice.
             check_vma=False,
-        )
+        ),
+        compiler_options=wide_vectors(),
     )
 
 

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rcirl_jax.features import feature_map
+from rcirl_jax.features.relations import relate, slots
 from rcirl_jax.planner.rank import hand_score, learned_score
 from rcirl_jax.reward import LOSSES, RewardConfig, init_reward, pinned
 from rcirl_jax.sampling import SamplerConfig, trajectory_on_path
@@ -219,3 +220,13 @@ def driven(mode):
 
 
 KINEMATICS = {mode: driven(mode) for mode in ("speed", "path_speed")}
+
+
+def test_the_distance_to_bodies_from_nowhere_is_no_number():
+    """A comparison with NaN is false; it must not pass for free road."""
+    made = random_scene(3)
+    everyone = jax.tree.map(lambda x: x[0], slots(made.ego, made.obstacles))
+    zero, nowhere = jnp.zeros(()), jnp.asarray(jnp.nan)
+    for s, l in ((nowhere, zero), (zero, nowhere), (nowhere, nowhere)):
+        assert np.isnan(relate(everyone, s, l, zero, zero).body)
+    assert np.isfinite(relate(everyone, zero, zero, zero, zero).body)

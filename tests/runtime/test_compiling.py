@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 
+from rcirl_jax.runtime import compiling
 from rcirl_jax.runtime.compiling import compiles
 
 
@@ -26,3 +27,14 @@ def test_compilations_are_heard_inside_the_block_only():
     assert heard >= 2
     assert len(every) == heard
     assert all(seconds > 0.0 for seconds in every)
+
+
+def test_wide_vectors_are_asked_for_where_xla_knows_them(monkeypatch):
+    unknown = {"xla_cpu_no_such_option": 1}
+    for options, wanted in ((compiling.WIDE, compiling.WIDE), (unknown, None)):
+        monkeypatch.setattr(compiling, "WIDE", options)
+        compiling.wide_vectors.cache_clear()
+        try:
+            assert compiling.wide_vectors() == wanted
+        finally:
+            compiling.wide_vectors.cache_clear()
