@@ -34,7 +34,6 @@ def verdict_view(verdict: Verdict) -> dict:
     """The decision and why, for the template."""
     return {
         "kind": DECISIONS[verdict.decision],
-        "decision": verdict.decision,
         "sentence": verdict.sentence,
         "reasons": verdict.reasons,
         "cases": verdict.cases,
