@@ -30,6 +30,8 @@ QUICK := $(addprefix tests/train/test_loop.py::test_,resume_is_bitwise run_write
   tests/export/test_forms.py tests/export/test_reader.py tests/export/test_weights.py \
   tests/features/test_features.py::test_equals_the_oracle tests/report/test_data_page.py
 QUICKLY = -m pytest -q -m "not slow and not dataset" $(QUICK)
+# an environment that is used once: what is never imported need not be compiled
+ONCE := $(PIP) install --no-compile
 
 # Features, gradients, resume, recordings, and what rounds otherwise when compiled quickly, with
 # the compiler as users have it. For the rest XLA compiles in half the time to slower programs;
@@ -104,15 +106,15 @@ test-floor: build/floor/.installed
 build/floor/.installed: pyproject.toml requirements/floor.lock
 	rm -rf build/floor
 	$(PYTHON) -m venv build/floor
-	build/floor/bin/python $(PIP) install --require-hashes --requirement requirements/floor.lock
-	build/floor/bin/python $(PIP) install --no-deps --no-build-isolation --editable .
+	build/floor/bin/python $(ONCE) --require-hashes --requirement requirements/floor.lock
+	build/floor/bin/python $(ONCE) --no-deps --no-build-isolation --editable .
 	@touch $@
 
 # The quick tests with the newest versions allowed, whatever is locked
 test-ceiling:
 	rm -rf build/ceiling
 	$(PYTHON) -m venv build/ceiling
-	build/ceiling/bin/python $(PIP) install --editable '.[quick]'
+	build/ceiling/bin/python $(ONCE) --editable '.[quick]'
 	build/ceiling/bin/python $(QUICKLY)
 
 # Source distribution, a wheel made of it, and far from this folder, in an environment of what the

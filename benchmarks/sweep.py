@@ -31,7 +31,8 @@ from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.evaluation.ranking.learners import normaliser_of
 from rcirl_jax.evaluation.ranking.sweep import MEMBERS_AT_ONCE
 from rcirl_jax.reward import RewardConfig
-from rcirl_jax.train.frozen import Members, compiles, fit, freeze, members_of
+from rcirl_jax.runtime.compiling import compiles
+from rcirl_jax.train.frozen import Members, fit, freeze, members_of
 from rcirl_jax.train.loop import to_device_batch
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.train.step import init_state, make_train_step

@@ -7,7 +7,15 @@ import json
 
 import pytest
 
+from tests.conftest import REPO
+from tests.helpers.commands import command as forked
 from tests.helpers.commands import fresh as command
+
+PROGRAMS = sorted(
+    ".".join(file.relative_to(REPO).with_suffix("").parts)
+    for file in (REPO / "benchmarks").rglob("*.py")
+    if "run(main)" in file.read_text()
+)
 
 SMALL = {
     "paper_scale": ["--seconds=1"],
@@ -27,3 +35,9 @@ def test_benchmark_writes_its_result(name, tmp_path):
     for fact in ("git_commit", "code_sha256", "versions", "date"):
         assert made["made_by"][fact]
     assert made["made_by"]["flags"]["output"] == str(tmp_path)
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_every_program_finds_what_it_imports(name):
+    done = forked(name, "--help")
+    assert name.rpartition(".")[2] in done.stdout, done.stderr

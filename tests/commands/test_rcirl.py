@@ -1,7 +1,9 @@
 """The command `rcirl`: its sub-commands, their help, flags that are not given."""
 
 import json
+import os
 import re
+import signal
 import subprocess
 import sys
 from importlib.metadata import entry_points
@@ -10,6 +12,7 @@ import pytest
 
 from rcirl_jax import __version__
 from rcirl_jax.autotune.recipes import DEFAULT, load_recipe
+from rcirl_jax.commands.flags import common
 from rcirl_jax.commands.rcirl import COMMANDS, overview
 from tests.conftest import REPO
 from tests.helpers.commands import command, refused, succeeded
@@ -97,6 +100,30 @@ def test_every_module_of_the_room_is_a_command():
         if file.name not in ("__init__.py", "rcirl.py")
     }
     assert names == {module for module, _ in COMMANDS.values()}
+
+
+def test_output_that_nobody_reads_ends_without_a_word():
+    """As behind `| head`; what is written is more than a buffer holds."""
+    unread, output = os.pipe()
+    os.close(unread)
+    done = subprocess.run(
+        [sys.executable, "-m", "rcirl_jax", "train", "--helpfull"],
+        stdout=output, stderr=subprocess.PIPE, check=False,
+    )  # fmt: skip
+    os.close(output)
+    assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, b"")
+
+
+def test_another_broken_pipe_is_one_line(monkeypatch, capfd):
+    def broken():
+        raise BrokenPipeError(32, "Broken pipe", "worker")
+
+    monkeypatch.setattr(common.app, "run", lambda *_, **__: broken())
+    monkeypatch.setattr(common.interrupts, "install", lambda: None)
+    with pytest.raises(SystemExit) as stop:
+        common.run(broken)
+    assert stop.value.code == 2
+    assert capfd.readouterr().err == "error: worker: Broken pipe\n"
 
 
 @pytest.mark.parametrize("name", COMMANDS)

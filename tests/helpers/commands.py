@@ -15,10 +15,8 @@ import jax
 # Compiled in half the time, to slower programs: commands are run on little data to
 # see that they do what they say.
 QUICKLY = "--xla_backend_optimization_level=0"
-if jax.__version_info__ < (
-    0,
-    11,
-):  # later ones abort at a flag that they no longer have
+# later ones abort at a flag that they no longer have
+if jax.__version_info__ < (0, 11):
     QUICKLY += " --xla_cpu_use_fusion_emitters=false"
 LONGEST_S = 1800.0
 

@@ -1,12 +1,15 @@
 """What the commands share: running, reading flags, provenance."""
 
+import contextlib
 import functools
 import os
 import re
+import select
+import signal
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NoReturn
 
@@ -43,6 +46,8 @@ def run(main: Callable[[], None]) -> None:
             main()
         except InputError as error:
             _refuse(error)
+        except BrokenPipeError:
+            raise
         except OSError as error:
             _refuse(_about(error))
         except (MemoryError, jax.errors.JaxRuntimeError) as error:
@@ -58,7 +63,25 @@ def run(main: Callable[[], None]) -> None:
             _refuse(_fault(error), EXIT_FAULT)
 
     interrupts.install()
-    app.run(guarded, flags_parser=functools.partial(_parse, main))
+    with _while_read():
+        app.run(guarded, flags_parser=functools.partial(_parse, main))
+
+
+@contextlib.contextmanager
+def _while_read() -> Iterator[None]:
+    """End without a word where nobody reads the output any more, as behind `| head`."""
+    try:
+        try:
+            yield
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError as error:
+        output = select.poll()
+        output.register(sys.stdout.fileno(), 0)  # errors are told without asking
+        if not output.poll(0):
+            _refuse(_about(error))  # of another pipe
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(128 + signal.SIGPIPE)
 
 
 def _take(words: list[str], main: Callable) -> None:
