@@ -1,8 +1,8 @@
 """The scene's path at given stations, by few gathers.
 
 A table lookup costs a gather of two neighbours, and a CPU pays for every number that
-it gathers. What is needed together stands in one table; what nobody reads of the
-three is not gathered.
+it gathers. What is read together stands in one of three tables; XLA drops a table that
+nobody reads.
 """
 
 import flax.struct

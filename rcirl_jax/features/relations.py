@@ -74,15 +74,19 @@ def slots(ego: Ego, obstacles: Obstacles) -> tuple[Slot, ...]:
     line = obstacles.valid & (kind == Kind.STOP)
     end = obstacles.valid & (kind == Kind.VIRTUAL)
     lower = obstacles.s_lower - half_length
+    upper, left = obstacles.s_upper + half_length, obstacles.l_upper + half_width
+    # a body that lacks a number has no place: the distance to bodies is NaN then
+    numbers = lower + upper + obstacles.l_lower + left + obstacles.speed
+    lacking = body & ~jnp.isfinite(numbers)
     demanded = jnp.where(line, lower, -FAR_M)
     before = jnp.concatenate(
         [jnp.where(line[:, :1], FAR_M, -FAR_M), demanded[:, :-1]], axis=1
     )
     leaves = (
         jnp.where(body, lower, FAR_M),
-        jnp.where(body, obstacles.s_upper + half_length, -FAR_M),
+        jnp.where(body, jnp.where(lacking, jnp.nan, upper), -FAR_M),
         obstacles.l_lower - half_width,
-        obstacles.l_upper + half_width,
+        jnp.where(lacking, jnp.nan, left),
         obstacles.speed,
         jnp.where(line, lower, FAR_M),
         before,
@@ -112,21 +116,18 @@ def _larger(a: jax.Array | float, b: jax.Array) -> jax.Array:
     return jnp.where(a > b, a, b)
 
 
-def _smaller(a: jax.Array, b: jax.Array) -> jax.Array:
-    return jnp.where(a < b, a, b)
-
-
 def _gaps(o: Slot, s: jax.Array, l: jax.Array) -> tuple[jax.Array, jax.Array]:
     """(gap, lateral gap) m; negative where they overlap."""
     return _larger(o.lower - s, s - o.upper), _larger(o.right - l, l - o.left)
 
 
-def _memberships(o: Slot, s: jax.Array, l: jax.Array) -> dict[str, tuple]:
+def _memberships(
+    o: Slot, s: jax.Array, gap: jax.Array, aside: jax.Array
+) -> dict[str, tuple[jax.Array, jax.Array]]:
     """Of each class: whether the obstacle is a member, and what orders members.
 
     Ordering by an edge's station orders by the distance to it.
     """
-    gap, aside = _gaps(o, s, l)
     in_way = aside < LATERAL_BUFFER_M
     beside = ~in_way & (aside < NUDGE_RANGE_M)
     ahead, behind = s <= o.lower, (s >= o.upper) & (o.upper > -FAR_M)
@@ -142,25 +143,30 @@ def _memberships(o: Slot, s: jax.Array, l: jax.Array) -> dict[str, tuple]:
 
 
 def _nearest(
-    ego_slots: tuple[Slot, ...], s: jax.Array, l: jax.Array, v: jax.Array
+    met: list[dict[str, tuple[jax.Array, jax.Array]]],
+    speeds: list[jax.Array],
+    s: jax.Array,
+    v: jax.Array,
 ) -> dict[str, Nearest]:
     """The nearest of each class; of two at the very same place the slower."""
-    keys, speeds = (dict.fromkeys(CAPS_M, jnp.asarray(FAR_M)) for _ in range(2))
-    for o in ego_slots:
-        for name, (member, key) in _memberships(o, s, l).items():
-            keys[name] = _smaller(keys[name], jnp.where(member, key, FAR_M))
-    for o in ego_slots:
-        for name, (member, key) in _memberships(o, s, l).items():
-            speed = jnp.where(member & (key == keys[name]), o.speed, FAR_M)
-            speeds[name] = _smaller(speeds[name], speed)
     from_ego = {"overtake": -s, "sidepass_rear": -s, "nudge": jnp.zeros_like(s)}
     found = {}
     for name, cap in CAPS_M.items():
-        distance = keys[name] - from_ego.get(name, s)
+        edge = speed = jnp.asarray(FAR_M)
+        for classes in met:
+            member, key = classes[name]
+            key = jnp.where(member, key, FAR_M)
+            edge = jnp.where(edge < key, edge, key)  # no member's is NaN
+        for classes, own in zip(met, speeds, strict=True):
+            member, key = classes[name]
+            speed = jnp.where(member & (key == edge) & (own < speed), own, speed)
+        distance = edge - from_ego.get(name, s)
         known = distance < cap
+        # none is found where compiled code rounds a key differently in each loop
+        unknown = ~known | (speed >= FAR_M)
         found[name] = Nearest(
             distance=jnp.where(known, distance, cap),
-            speed=jnp.where(known, speeds[name] - v, 0.0),
+            speed=jnp.where(unknown, 0.0, speed - v),
         )
     return found
 
@@ -194,16 +200,18 @@ def relate(
       s_before: m, its station one time earlier; very negative at the first.
     """
     signed, overrun = jnp.asarray(FAR_M**2), jnp.zeros(())
+    met = []
     for o in ego_slots:
         gap, aside = _gaps(o, s, l)
+        met.append(_memberships(o, s, gap, aside))
         square = _larger(0.0, gap) ** 2 + _larger(0.0, aside) ** 2
-        depth = jnp.maximum(gap, aside)  # NaN if either is
-        signed = _smaller(signed, jnp.where(depth < 0.0, depth, square))
+        depth = jnp.maximum(gap, aside)
+        signed = jnp.minimum(signed, jnp.where(depth < 0.0, depth, square))
         crossed = (s > o.wall) & (s_before <= o.wall_before)
         overrun = jnp.where(crossed, jnp.maximum(overrun, s - o.wall), overrun)
     outside = jnp.sqrt(jnp.where(signed > 0.0, signed, 1.0))
     return Relations(
-        **_nearest(ego_slots, s, l, v),
+        **_nearest(met, [o.speed for o in ego_slots], s, v),
         body=jnp.where(signed > 0.0, outside, signed),
         line_overrun=overrun,
     )

@@ -44,7 +44,10 @@ def single(step: Step) -> Step:
 
 
 def pmapped(step: Step, num_devices: int) -> Step:
-    """The step under pmap, which takes this process's rows only."""
+    """The step under pmap, which takes this process's rows only.
+
+    It knows no compiler options; XLA chooses the width of vectors.
+    """
     here = len(_local(num_devices))
     everywhere, _ = _shardings(num_devices)
     mapped = jax.pmap(

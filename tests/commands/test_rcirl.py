@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from importlib.metadata import entry_points
+from pathlib import Path
 
 import pytest
 
@@ -102,23 +103,75 @@ def test_every_module_of_the_room_is_a_command():
     assert names == {module for module, _ in COMMANDS.values()}
 
 
-def test_output_that_nobody_reads_ends_without_a_word():
+# A command of our own that prints more than a buffer holds
+PRINTS = """
+from rcirl_jax.commands.flags import common
+def main():
+    print("x" * 100_000)
+common.run(main)
+"""
+
+
+@pytest.mark.parametrize("joined", [False, True], ids=["stdout", "both"])
+@pytest.mark.parametrize(
+    "words",
+    [["-m", "rcirl_jax", "train", "--helpfull"], ["-c", PRINTS]],
+    ids=["help", "main"],
+)
+def test_output_that_nobody_reads_ends_without_a_word(words, joined):
     """As behind `| head`; what is written is more than a buffer holds."""
     unread, output = os.pipe()
     os.close(unread)
     done = subprocess.run(
-        [sys.executable, "-m", "rcirl_jax", "train", "--helpfull"],
-        stdout=output, stderr=subprocess.PIPE, check=False,
+        [sys.executable, *words],
+        stdout=output, stderr=output if joined else subprocess.PIPE, check=False,
     )  # fmt: skip
     os.close(output)
-    assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, b"")
+    assert (done.returncode, done.stderr or b"") == (128 + signal.SIGPIPE, b"")
+
+
+def test_errors_that_nobody_reads_end_without_a_word():
+    unread, output = os.pipe()
+    os.close(unread)
+    done = subprocess.run(
+        [sys.executable, "-m", "rcirl_jax", "train"],
+        stdout=subprocess.PIPE, stderr=output, check=False,
+    )  # fmt: skip
+    os.close(output)
+    assert (done.returncode, done.stdout) == (128 + signal.SIGPIPE, b"")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["-m", "rcirl_jax", "train", "--helpfull"], ["-c", PRINTS]],
+    ids=["help", "main"],
+)
+def test_output_without_room_is_one_line(words):
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, *words],
+            stdout=full, stderr=subprocess.PIPE, text=True, check=False,
+        )  # fmt: skip
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: ")
+    assert "No space left on device" in line
+
+
+def test_without_any_output_a_command_runs():
+    """As after `>&-`: Python has no stdout then."""
+    done = subprocess.run(
+        [sys.executable, "-c", "import sys; sys.stdout = None\n" + PRINTS],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
 def test_another_broken_pipe_is_one_line(monkeypatch, capfd):
     def broken():
         raise BrokenPipeError(32, "Broken pipe", "worker")
 
-    monkeypatch.setattr(common.app, "run", lambda *_, **__: broken())
+    monkeypatch.setattr(common.app, "run", lambda main, **_: main(["rcirl"]))
     monkeypatch.setattr(common.interrupts, "install", lambda: None)
     with pytest.raises(SystemExit) as stop:
         common.run(broken)

@@ -230,3 +230,15 @@ def test_the_distance_to_bodies_from_nowhere_is_no_number():
     for s, l in ((nowhere, zero), (zero, nowhere), (nowhere, nowhere)):
         assert np.isnan(relate(everyone, s, l, zero, zero).body)
     assert np.isfinite(relate(everyone, zero, zero, zero, zero).body)
+
+
+@pytest.mark.parametrize("leaf", ["s_lower", "s_upper", "l_lower", "l_upper", "speed"])
+@pytest.mark.parametrize("which", [0, 1, 2])
+def test_a_number_that_a_car_lacks_is_not_forgotten(leaf, which):
+    """The others do not hide it, whether it is nearer than they are or not."""
+    made = scene(boxes=[{"s": 30.0, "speed": 5.0}, {"s": 20.0}, {"s": 40.0}])
+    odd = getattr(made.obstacles, leaf).at[which].set(jnp.nan)
+    everyone = slots(made.ego, made.obstacles.replace(**{leaf: odd}))
+    zero = jnp.zeros(())
+    at_start = jax.tree.map(lambda x: x[0], everyone)
+    assert np.isnan(relate(at_start, zero, zero, zero, zero).body)

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import pytest
 
 from rcirl_jax.runtime import compiling
 from rcirl_jax.runtime.compiling import compiles
@@ -29,12 +30,21 @@ def test_compilations_are_heard_inside_the_block_only():
     assert all(seconds > 0.0 for seconds in every)
 
 
-def test_wide_vectors_are_asked_for_where_xla_knows_them(monkeypatch):
-    unknown = {"xla_cpu_no_such_option": 1}
-    for options, wanted in ((compiling.WIDE, compiling.WIDE), (unknown, None)):
-        monkeypatch.setattr(compiling, "WIDE", options)
+@pytest.mark.parametrize(
+    ("backend", "options", "wanted"),
+    [
+        ("cpu", compiling.WIDE, compiling.WIDE),
+        ("cpu", {"xla_cpu_no_such_option": 1}, None),
+        ("gpu", compiling.WIDE, None),
+    ],
+)
+def test_wide_vectors_are_asked_for_where_xla_knows_them(
+    monkeypatch, backend, options, wanted
+):
+    monkeypatch.setattr(compiling, "WIDE", options)
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    compiling.wide_vectors.cache_clear()
+    try:
+        assert compiling.wide_vectors() == wanted
+    finally:
         compiling.wide_vectors.cache_clear()
-        try:
-            assert compiling.wide_vectors() == wanted
-        finally:
-            compiling.wide_vectors.cache_clear()

@@ -11,7 +11,7 @@ import tempfile
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import NoReturn, TextIO
 
 import jax
 from absl import app, flags, logging
@@ -73,15 +73,46 @@ def _while_read() -> Iterator[None]:
     try:
         try:
             yield
-        finally:
-            sys.stdout.flush()
+        except SystemExit as stop:
+            if sys.stdout is not None:
+                _flush(sys.stdout, stop.code)
+            raise
     except BrokenPipeError as error:
-        output = select.poll()
-        output.register(sys.stdout.fileno(), 0)  # errors are told without asking
-        if not output.poll(0):
+        unread = [x for x in (sys.stdout, sys.stderr) if x is not None and _unread(x)]
+        if not unread:
             _refuse(_about(error))  # of another pipe
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        for stream in unread:
+            _drop(stream)
         sys.exit(128 + signal.SIGPIPE)
+    except OSError as error:
+        _refuse(_about(error))
+
+
+def _flush(output: TextIO, status: object) -> None:
+    """Write what is left of the output; an OSError unless an error was said before."""
+    try:
+        output.flush()
+    except BrokenPipeError:
+        raise
+    except OSError:  # no room
+        _drop(output)
+        if not status:
+            raise
+
+
+def _unread(stream: TextIO) -> bool:
+    """Whether it is a pipe or socket whose other end is closed."""
+    poll = select.poll()
+    try:
+        poll.register(stream.fileno(), 0)  # errors are told without asking
+    except (OSError, ValueError):  # it is no file
+        return False
+    return bool(poll.poll(0))
+
+
+def _drop(stream: TextIO) -> None:
+    """Let what the stream still holds go nowhere when Python ends."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _take(words: list[str], main: Callable) -> None:
