@@ -44,6 +44,7 @@ EXACT := $(addprefix tests/,evaluation/test_recorded_training.py \
     loop.py::test_resume_is_bitwise \
     step.py::test_candidates_of_a_scene_do_not_depend_on_the_batch \
     step.py::test_either_future_is_learned_from \
+    step.py::test_densities_are_of_the_candidates_that_count \
     step.py::test_a_hard_negative_is_never_the_positive_nor_better_than_it))
 QUICK_XLA = --xla_backend_optimization_level=0 $(NO_EMITTERS)
 # halves the time of compiling; jaxlib from 0.11 on aborts at a flag that it no longer has
