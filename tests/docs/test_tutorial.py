@@ -39,7 +39,7 @@ def folder(tmp_path_factory):
 
 def command(line, folder):
     """Run one line of the page; returns what it printed."""
-    line = re.sub(r"^rcirl ", f"{sys.executable} -m rcirl_jax ", line)
+    line = re.sub(r"^rcirl ", ".venv/bin/python -m rcirl_jax ", line)
     done = subprocess.run(
         line.replace(".venv/bin/python", sys.executable),
         shell=True, capture_output=True, text=True, check=False, cwd=folder,
