@@ -45,10 +45,10 @@ def command(line, folder):
         shell=True, capture_output=True, text=True, check=False, cwd=folder,
         env={**os.environ, "JAX_PLATFORMS": "cpu"}, timeout=1800,
     )  # fmt: skip
-    # 40 cases prove no margin of the gate
-    expected = 2 if "rcirl_jax gate" in line else 0
+    # so little training and so few cases ship nothing
+    expected = (2, 3) if "rcirl_jax gate" in line else (0,)
     said = done.stdout + done.stderr
-    assert done.returncode == expected, f"{line}\n{said[-3000:]}"
+    assert done.returncode in expected, f"{line}\n{said[-3000:]}"
     return said
 
 
