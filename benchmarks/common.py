@@ -98,11 +98,18 @@ def write(
     """
     path = Path(folder) / f"{name}.json"
     made = {**provenance(weights), "date": datetime.date.today().isoformat()}
+    made["flags"] = {flag: _public(value) for flag, value in made["flags"].items()}
     if data:
         made["data_hash"] = open_dataset(data, verify=False).hash
     write_json(path, {**result, "made_by": made, "machine": machine()})
     print(f"written: {path}")
     return path
+
+
+def _public(value: object) -> object:
+    """A flag's value for others to read: of a path of this machine its name."""
+    here = isinstance(value, str) and Path(value).is_absolute()
+    return Path(value).name if here else value
 
 
 def resident_mb() -> float:

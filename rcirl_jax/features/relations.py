@@ -143,8 +143,8 @@ def _memberships(
 
 
 def _nearest(
+    ego_slots: tuple[Slot, ...],
     met: list[dict[str, tuple[jax.Array, jax.Array]]],
-    speeds: list[jax.Array],
     s: jax.Array,
     v: jax.Array,
 ) -> dict[str, Nearest]:
@@ -157,9 +157,10 @@ def _nearest(
             member, key = classes[name]
             key = jnp.where(member, key, FAR_M)
             edge = jnp.where(edge < key, edge, key)  # no member's is NaN
-        for classes, own in zip(met, speeds, strict=True):
+        for o, classes in zip(ego_slots, met, strict=True):
             member, key = classes[name]
-            speed = jnp.where(member & (key == edge) & (own < speed), own, speed)
+            slower = member & (key == edge) & (o.speed < speed)
+            speed = jnp.where(slower, o.speed, speed)
         distance = edge - from_ego.get(name, s)
         known = distance < cap
         # none is found where compiled code rounds a key differently in each loop
@@ -206,12 +207,13 @@ def relate(
         met.append(_memberships(o, s, gap, aside))
         square = _larger(0.0, gap) ** 2 + _larger(0.0, aside) ** 2
         depth = jnp.maximum(gap, aside)
+        # NaN of one body stays: a comparison would forget it at the next
         signed = jnp.minimum(signed, jnp.where(depth < 0.0, depth, square))
         crossed = (s > o.wall) & (s_before <= o.wall_before)
         overrun = jnp.where(crossed, jnp.maximum(overrun, s - o.wall), overrun)
     outside = jnp.sqrt(jnp.where(signed > 0.0, signed, 1.0))
     return Relations(
-        **_nearest(met, [o.speed for o in ego_slots], s, v),
+        **_nearest(ego_slots, met, s, v),
         body=jnp.where(signed > 0.0, outside, signed),
         line_overrun=overrun,
     )
