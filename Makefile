@@ -165,6 +165,8 @@ bench: $(VENV)/.bench
 # Everything that an accelerator is asked, in eight minutes, with the Python and JAX that are
 # there (`PYTHON=python3.12`): nothing is downloaded or built. `SMALL=--small` rehearses it on a CPU
 accelerator:
+	@$(PYTHON) -c 'import jax, flax, optax' 2>/dev/null || \
+	  { echo "error: $(PYTHON): no jax, flax or optax: expected PYTHON=.venv/bin/python or another with them"; exit 1; }
 	$(PYTHON) -m benchmarks.accelerator $(SMALL) --output=$(RESULTS)
 
 # Documentation as a site; warnings are errors
