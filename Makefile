@@ -24,7 +24,7 @@ install = $(if $(LOCK),\
 # Minutes; they touch every dependency: logs, store, two epochs, resume, export, readers, pages
 QUICK := $(addprefix tests/train/test_loop.py::test_,resume_is_bitwise run_writes_what_it_should \
   export_and_rank exported_values_are_the_trainers) \
-  tests/data/importers/test_conformance.py tests/data/store/test_dataset.py \
+  tests/data/formats/test_conformance.py tests/data/store/test_dataset.py \
   tests/data/test_import_elsewhere.py::test_no_cluster_is_one_line \
   tests/evaluation/rivals/test_cma_es.py::test_it_finds_the_minimum_of_a_shifted_sphere \
   tests/export/test_forms.py tests/export/test_reader.py tests/export/test_weights.py \
@@ -130,7 +130,7 @@ wheel: setup
 	  $(BIN)/python -m venv $$away/venv; cp -R tests pyproject.toml $$away; cd $$away; \
 	  sed -n 's/^\([a-z0-9].*[^ ]\) *\\$$/\1/p' $$lock > locked.txt; \
 	  venv/bin/python $(PIP) install --constraint locked.txt "$$wheel"; \
-	  for name in $$(venv/bin/python -c 'from rcirl_jax.commands.rcirl import COMMANDS as x; print(*x)'); do \
+	  for name in $$(venv/bin/python -c 'from rcirl_jax.cli.rcirl import COMMANDS as x; print(*x)'); do \
 	    venv/bin/rcirl $$name --help > $$name.txt; done; \
 	  venv/bin/python $(PIP) install --constraint locked.txt "$$wheel[quick]"; \
 	  venv/bin/python -m pip check; \

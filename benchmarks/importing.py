@@ -16,7 +16,7 @@ from pathlib import Path
 from absl import flags
 
 from benchmarks.common import write
-from rcirl_jax.commands.flags.common import run
+from rcirl_jax.cli.flags.common import run
 from rcirl_jax.data.cut import cut_item
 from rcirl_jax.data.parts import parts_of, recordings_of
 from rcirl_jax.data.quality import QualityReport

@@ -30,7 +30,6 @@ from absl import app, flags
 
 from benchmarks import roofline
 from benchmarks.common import dataset_or_synthetic, write
-from rcirl_jax.autotune.recipes import load_recipe
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.evaluation.ranking.learners import normaliser_of
 from rcirl_jax.features import feature_map
@@ -41,6 +40,7 @@ from rcirl_jax.train.loop import host_batch
 from rcirl_jax.train.parallel import parallelise
 from rcirl_jax.train.state import Batch, FeatureBatch, TrainConfig, TrainState
 from rcirl_jax.train.step import gradient_sums, init_state, make_train_step
+from rcirl_jax.tune.recipes import load_recipe
 from rcirl_jax.types import Demonstration
 
 try:  # the rival's extra; without it, one line from `main`

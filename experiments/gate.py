@@ -1,7 +1,7 @@
 """`rcirl gate` as `python -m` from a clone."""
 
-from rcirl_jax.commands.flags.common import run
-from rcirl_jax.commands.gate import main
+from rcirl_jax.cli.flags.common import run
+from rcirl_jax.cli.gate import main
 
 if __name__ == "__main__":
     run(main)

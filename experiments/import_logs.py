@@ -1,7 +1,7 @@
 """`rcirl import` as `python -m` from a clone."""
 
-from rcirl_jax.commands.flags.common import run
-from rcirl_jax.commands.import_logs import main
+from rcirl_jax.cli.flags.common import run
+from rcirl_jax.cli.import_logs import main
 
 if __name__ == "__main__":
     run(main)

@@ -1,7 +1,7 @@
 """`rcirl label-check` as `python -m` from a clone."""
 
-from rcirl_jax.commands.flags.common import run
-from rcirl_jax.commands.studies.label_check import main
+from rcirl_jax.cli.flags.common import run
+from rcirl_jax.cli.studies.label_check import main
 
 if __name__ == "__main__":
     run(main)

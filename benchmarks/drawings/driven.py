@@ -9,8 +9,6 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Polygon
 
 from benchmarks.drawings.ideas import OTHER, bare, rectangle
-from rcirl_jax.elsewhere.drivers import Driver, Seen
-from rcirl_jax.elsewhere.simulators import View, open_simulator
 from rcirl_jax.export.closed_loop import incumbent_score, table_rows
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.features import feature_map
@@ -32,6 +30,8 @@ from rcirl_jax.simulation.catalogue.build import family_names
 from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases
 from rcirl_jax.simulation.rows import baseline_row
 from rcirl_jax.simulation.suite import CaseRef, build, case_ref, catalogue_set
+from rcirl_jax.simulators.drivers import Driver, Seen
+from rcirl_jax.simulators.simulators import View, open_simulator
 from rcirl_jax.types import Scene
 from rcirl_jax.units import TIMES_S
 

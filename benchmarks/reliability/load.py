@@ -28,7 +28,7 @@ from absl import flags
 
 from benchmarks.common import LANE_TOML, untrained, write
 from benchmarks.reliability.memory import level, looking
-from rcirl_jax.commands.flags.common import run
+from rcirl_jax.cli.flags.common import run
 from rcirl_jax.data.store.files import MARK
 from rcirl_jax.data.store.shards import shard_key
 from rcirl_jax.errors import InputError

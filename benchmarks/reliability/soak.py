@@ -31,10 +31,7 @@ from benchmarks.common import resident_mb, write
 from benchmarks.reliability.jobs import Facts, different, jobs, write_logs
 from benchmarks.reliability.memory import in_use_mb, kept, rise, watched
 from benchmarks.reliability.small import SHARD_SCENES
-from rcirl_jax.autotune.config import TuneConfig
-from rcirl_jax.autotune.loop import tune
-from rcirl_jax.autotune.run import Run
-from rcirl_jax.commands.flags.common import provenance, run
+from rcirl_jax.cli.flags.common import provenance, run
 from rcirl_jax.data import importing
 from rcirl_jax.data.importing import ImportConfig
 from rcirl_jax.data.logs import Logs
@@ -44,6 +41,9 @@ from rcirl_jax.runtime.compiling import compiles
 from rcirl_jax.runtime.executors import Here
 from rcirl_jax.train.running import Running
 from rcirl_jax.train.state import TrainConfig
+from rcirl_jax.tune.config import TuneConfig
+from rcirl_jax.tune.loop import tune
+from rcirl_jax.tune.run import Run
 
 _SECONDS = flags.DEFINE_float("seconds", 1200.0, "of the whole soak")
 _LEAK = flags.DEFINE_float("leak", 0.0, "MiB kept of every round, to be found")

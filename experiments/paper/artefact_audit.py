@@ -23,7 +23,7 @@ from experiments.paper.common import (
     unread,
     write,
 )
-from rcirl_jax.commands.flags.common import run
+from rcirl_jax.cli.flags.common import run
 from rcirl_jax.evaluation.ranking.learners import FrozenSets, pair_wins, train_learner
 from rcirl_jax.evaluation.statistics import ClusterBootstrap, combine_seeds
 from rcirl_jax.features import feature_map

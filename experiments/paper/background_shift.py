@@ -18,7 +18,7 @@ import jax
 import numpy as np
 from absl import flags
 
-from rcirl_jax.commands.flags.common import provenance, run
+from rcirl_jax.cli.flags.common import provenance, run
 from rcirl_jax.evaluation.insight.background import (
     TwoFrames,
     draw_examples,

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from absl import flags
 
-from rcirl_jax.commands.flags.common import alone, made_by_file, provenance, unread
-from rcirl_jax.commands.flags.help import AS_SAID
-from rcirl_jax.commands.flags.recipe import recipe
-from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.cli.flags.common import alone, made_by_file, provenance, unread
+from rcirl_jax.cli.flags.help import AS_SAID
+from rcirl_jax.cli.flags.recipe import recipe
+from rcirl_jax.data.formats import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.data.store.dataset import Dataset, open_dataset

@@ -27,7 +27,7 @@ from experiments.paper.common import (
     unread,
     write,
 )
-from rcirl_jax.commands.flags.common import run
+from rcirl_jax.cli.flags.common import run
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.from_run import export_run
 from rcirl_jax.export.loading import open_reward

@@ -54,10 +54,7 @@ from experiments.paper.common import (
     seeds,
     write,
 )
-from rcirl_jax.autotune.anchoring import OWN_COST, Anchoring, fitted_anchor
-from rcirl_jax.autotune.recipes import DEFAULT, load_recipe
-from rcirl_jax.autotune.rehearsal import rehearse
-from rcirl_jax.commands.flags.common import made_by_file, provenance, run
+from rcirl_jax.cli.flags.common import made_by_file, provenance, run
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.data.store.joined import Demonstrations, JoinedDatasets, open_datasets
 from rcirl_jax.errors import InputError
@@ -90,6 +87,9 @@ from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics, nuplan_score
 from rcirl_jax.simulation.rows import NULLS
 from rcirl_jax.simulation.suite import FULL_S, catalogue_set, suite_refs
 from rcirl_jax.train.state import TrainConfig
+from rcirl_jax.tune.anchoring import OWN_COST, Anchoring, fitted_anchor
+from rcirl_jax.tune.recipes import DEFAULT, load_recipe
+from rcirl_jax.tune.rehearsal import rehearse
 from rcirl_jax.types import Scene
 
 _LOSSES = flags.DEFINE_list(

@@ -6,13 +6,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
-from rcirl_jax.autotune.recipes import (
-    DEFAULT,
-    NOT_OF_A_RECIPE,
-    PRESETS_OWN,
-    departing,
-    load_recipe,
-)
 from rcirl_jax.data.store.joined import Demonstrations, open_datasets
 from rcirl_jax.export.from_run import export_run
 from rcirl_jax.export.reader import Reward
@@ -21,6 +14,13 @@ from rcirl_jax.runtime.provenance import provenance
 from rcirl_jax.runtime.settings import typed_fields
 from rcirl_jax.train.loop import train
 from rcirl_jax.train.state import TrainConfig
+from rcirl_jax.tune.recipes import (
+    DEFAULT,
+    NOT_OF_A_RECIPE,
+    PRESETS_OWN,
+    departing,
+    load_recipe,
+)
 
 Place = str | os.PathLike[str]
 

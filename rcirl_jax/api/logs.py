@@ -5,8 +5,8 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from rcirl_jax.data.importers import read_recordings
-from rcirl_jax.data.importers.recognise import recognised_format
+from rcirl_jax.data.formats import read_recordings
+from rcirl_jax.data.formats.recognise import recognised_format
 from rcirl_jax.data.importing import ImportConfig, import_parts
 from rcirl_jax.data.parts import parts_of
 from rcirl_jax.data.scenes.config import CollectConfig

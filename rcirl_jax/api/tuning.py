@@ -6,16 +6,16 @@ from pathlib import Path
 from typing import Any
 
 from rcirl_jax.api.learning import Place, folders_of, training_of
-from rcirl_jax.autotune.config import TuneConfig
-from rcirl_jax.autotune.evidence import verdict_of
-from rcirl_jax.autotune.loop import tune as run_stages
-from rcirl_jax.autotune.recipes import DEFAULT, load_recipe
-from rcirl_jax.autotune.run import Run
 from rcirl_jax.evaluation.gate.types import GateConfig, Verdict
 from rcirl_jax.runtime.executors import Executor, Here
 from rcirl_jax.runtime.pipeline import only_one
 from rcirl_jax.runtime.provenance import provenance
 from rcirl_jax.train.running import Running
+from rcirl_jax.tune.config import TuneConfig
+from rcirl_jax.tune.evidence import verdict_of
+from rcirl_jax.tune.loop import tune as run_stages
+from rcirl_jax.tune.recipes import DEFAULT, load_recipe
+from rcirl_jax.tune.run import Run
 
 
 def tune(

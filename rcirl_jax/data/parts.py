@@ -4,14 +4,14 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from rcirl_jax.data.importers import (
+from rcirl_jax.data.formats import (
     files_of,
     format_of,
     pieces,
     read_part,
 )
-from rcirl_jax.data.importers import parts as inputs_of
-from rcirl_jax.data.importers.files import is_long_file
+from rcirl_jax.data.formats import parts as inputs_of
+from rcirl_jax.data.formats.files import is_long_file
 from rcirl_jax.data.recording import LEAVE_OUT, PIECE, refusal
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Recording

@@ -19,11 +19,11 @@ PACKAGE = Path(__file__).resolve().parents[1]
 READ = {
     "rcirl_jax.features": "features",
     "rcirl_jax.simulation.catalogue": "scenarios",
-    "rcirl_jax.data.importers": "sources",
+    "rcirl_jax.data.formats": "sources",
     "rcirl_jax.report": "report/templates",
 }
 # packages that import their parts by name
-BY_NAME = {"rcirl_jax.data.importers": "*/reader.py"}
+BY_NAME = {"rcirl_jax.data.formats": "*/reader.py"}
 
 
 def code_of(modules: Iterable[str], package: Path = PACKAGE) -> str:

@@ -7,14 +7,14 @@ import pytest
 
 from rcirl_jax.data import importing
 from rcirl_jax.data import parts as dealing
-from rcirl_jax.data.importers import parts
-from rcirl_jax.data.importers.format import Format
+from rcirl_jax.data.formats import parts
+from rcirl_jax.data.formats.format import Format
 from rcirl_jax.data.importing import ImportConfig, import_parts
 from rcirl_jax.data.parts import Part, is_long, recordings_of
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.errors import InputError, LostWorkError
 from rcirl_jax.runtime.executors import Here, Processes, Ray
-from tests.data.importers.formats import apollo, l5, nuplan, waymo
+from tests.data.formats.fixtures import apollo, l5, nuplan, waymo
 from tests.data.small_logs import CONFIG, files_of, write_logs
 
 ALL_SCENES = ImportConfig(

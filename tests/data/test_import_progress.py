@@ -7,10 +7,10 @@ import pytest
 
 from rcirl_jax.data import importing
 from rcirl_jax.data.cut import Cut
-from rcirl_jax.data.importers import parts, read_part
+from rcirl_jax.data.formats import parts, read_part
 from rcirl_jax.data.importing import Progress
 from rcirl_jax.data.quality import QualityReport
-from tests.data.importers.formats import l5, nuplan, waymo
+from tests.data.formats.fixtures import l5, nuplan, waymo
 
 
 class Clock:

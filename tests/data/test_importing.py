@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from rcirl_jax.data import importing
-from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.formats import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.data.quality import format_quality, format_splits
 from rcirl_jax.data.recording import validate_recording

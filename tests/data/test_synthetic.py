@@ -8,7 +8,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rcirl_jax.data.importers.synthetic import reader as synthetic
+from rcirl_jax.data.formats.synthetic import reader as synthetic
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.data.synthetic import ROADS
 from rcirl_jax.data.synthetic.drivers import DRIVER, idm_acceleration

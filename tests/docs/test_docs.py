@@ -11,7 +11,7 @@ import tomllib
 
 import pytest
 
-from rcirl_jax.commands.rcirl import COMMANDS
+from rcirl_jax.cli.rcirl import COMMANDS
 from rcirl_jax.evaluation.gate.types import EXIT_CODES, GateConfig
 from tests.docs.pages import (
     ALL,
@@ -90,7 +90,7 @@ def test_make_targets_exist(page):
 LIST_FLAGS = """
 import importlib, json, sys
 from absl import flags
-OURS = ("experiments", "benchmarks", "rcirl_jax.commands")
+OURS = ("experiments", "benchmarks", "rcirl_jax.cli")
 found, refused = {}, []
 given = json.load(sys.stdin)
 for name in sys.argv[1:]:
@@ -128,12 +128,12 @@ def module_of(name):
     """Of a command as a page names it: `rcirl rank`, `experiments.evaluate`."""
     name, _, command = name.partition(" ")
     module, _ = COMMANDS.get(command, (command, ""))
-    return f"rcirl_jax.commands.{module}" if command else name
+    return f"rcirl_jax.cli.{module}" if command else name
 
 
 def is_main(module):
     path = REPO / (module.replace(".", "/") + ".py")
-    ours = module.startswith("rcirl_jax.commands.")
+    ours = module.startswith("rcirl_jax.cli.")
     return path.is_file() and (ours or 'if __name__ == "__main__"' in path.read_text())
 
 

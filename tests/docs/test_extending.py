@@ -65,5 +65,5 @@ def test_all_four_at_once(tmp_path):
     folder = copied(tmp_path)
     for addition in ADDITIONS:
         assert len(changed(folder, addition)) == 1
-    names = "from rcirl_jax.data.importers import IMPORTERS; print(*IMPORTERS)"
+    names = "from rcirl_jax.data.formats import IMPORTERS; print(*IMPORTERS)"
     assert "jsonl" in run([sys.executable, "-c", names], folder).split()

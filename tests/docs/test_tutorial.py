@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.formats import read_recordings
 from rcirl_jax.types import Kind
 from tests.docs.pages import DOCS, REPO, fences
 

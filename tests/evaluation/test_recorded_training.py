@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 
-from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.formats import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.data.store.dataset import open_dataset

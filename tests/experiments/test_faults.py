@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 MAIN = """
-from rcirl_jax.commands.flags.common import run
+from rcirl_jax.cli.flags.common import run
 def main():
     raise ZeroDivisionError("scene\\n7")
 run(main)
@@ -31,7 +31,7 @@ def test_a_fault_is_one_line_and_leaves_its_traceback_in_a_file():
 
 
 WITHOUT = """
-from rcirl_jax.commands.flags.common import run
+from rcirl_jax.cli.flags.common import run
 def main():
     raise ModuleNotFoundError("none", name="matplotlib.axes")
 run(main)

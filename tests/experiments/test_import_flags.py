@@ -2,7 +2,7 @@
 
 import pytest
 
-from rcirl_jax.commands.flags.importing import left_out
+from rcirl_jax.cli.flags.importing import left_out
 from rcirl_jax.errors import InputError
 
 

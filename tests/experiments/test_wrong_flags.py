@@ -2,7 +2,7 @@
 
 import pytest
 
-from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.formats import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.data.scenes.config import CollectConfig
 from tests.helpers.commands import refused

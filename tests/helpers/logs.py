@@ -5,8 +5,8 @@ import importlib
 import pytest
 
 from rcirl_jax.data.cut import cut
-from rcirl_jax.data.importers import read_recordings
-from rcirl_jax.data.importers.options import STATED
+from rcirl_jax.data.formats import read_recordings
+from rcirl_jax.data.formats.options import STATED
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.specs import load_toml, spec_root
@@ -21,7 +21,7 @@ def read(form, path, source=None, **options):
     """All recordings of an input; `options` take the place of packaged ones."""
     if not options:
         return list(read_recordings(form, path, source))
-    reader = importlib.import_module(f"rcirl_jax.data.importers.{form}.reader")
+    reader = importlib.import_module(f"rcirl_jax.data.formats.{form}.reader")
     spec = {**packaged(form), **options, STATED: sorted(options)}
     return list(reader.recordings(path, spec))
 

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.formats import read_recordings
 from rcirl_jax.data.scenes.assemble import stack_scenes
 from rcirl_jax.data.scenes.collect import Collector
 from rcirl_jax.data.scenes.config import CollectConfig

@@ -54,12 +54,12 @@ def test_code_that_is_used_counts_and_words_do_not(package, name, text, counts):
 def test_the_report_decides_no_training_and_an_importer_no_suite():
     """What each group of stages uses of this package."""
     stages = {
-        name: set(used_by([f"rcirl_jax.autotune.{name}"]))
+        name: set(used_by([f"rcirl_jax.tune.{name}"]))
         for name in ("demonstrations", "rewards", "evidence", "report")
     }
     pages = "rcirl_jax.report.pages"
     assert [pages in used for used in stages.values()] == [False, False, False, True]
-    reader = "rcirl_jax.data.importers.ngsim.reader"
+    reader = "rcirl_jax.data.formats.ngsim.reader"
     assert reader in stages["demonstrations"]
     assert reader not in stages["rewards"] | stages["evidence"]
     assert "rcirl_jax.simulation.rollout" in stages["evidence"]

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.reliability.fuzz.forms import mutate, resealed
-from rcirl_jax.data.importers import read_recordings
-from rcirl_jax.data.importers.csv.suggest import suggested
-from rcirl_jax.data.importers.recognise import recognised_format
+from rcirl_jax.data.formats import read_recordings
+from rcirl_jax.data.formats.csv.suggest import suggested
+from rcirl_jax.data.formats.recognise import recognised_format
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.files import MANIFEST, MARK
 from rcirl_jax.data.store.shards import describe
@@ -44,7 +44,8 @@ from rcirl_jax.train import checkpoint
 from rcirl_jax.train.metrics import pairs_won
 from rcirl_jax.train.running import check_run, describe_run
 from rcirl_jax.train.state import TrainConfig
-from tests.data.importers import formats, people, test_csv_meaning, test_csv_ways
+from tests.data.formats import fixtures as formats
+from tests.data.formats import people, test_csv_meaning, test_csv_ways
 from tests.data.store import test_dataset as test_store
 from tests.helpers.stored import sweep_result
 from tests.helpers.weights_files import packed

@@ -9,7 +9,7 @@ import collections
 
 import numpy as np
 
-from rcirl_jax.data.importers.paths import path_lanes
+from rcirl_jax.data.formats.paths import path_lanes
 from rcirl_jax.data.scenes.collect import Collector
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.data.synthetic.drivers import free_acceleration, interaction

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.data.importers.synthetic.reader import (
+from rcirl_jax.data.formats.synthetic.reader import (
     SEEN_FROM_M,
     SEEN_UNTIL_M,
     driver_config,

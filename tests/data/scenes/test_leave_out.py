@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from rcirl_jax.data.importers import parts
+from rcirl_jax.data.formats import parts
 from rcirl_jax.data.importing import ImportConfig, import_parts
 from rcirl_jax.data.parts import Part, recordings_of
 from rcirl_jax.data.quality import format_quality
@@ -13,7 +13,7 @@ from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.provenance import git_commit
-from tests.data.importers.formats import waymo
+from tests.data.formats.fixtures import waymo
 from tests.data.small_logs import CONFIG, write_logs
 from tests.helpers import commands
 

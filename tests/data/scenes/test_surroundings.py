@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from rcirl_jax.data.importers import read_recordings
+from rcirl_jax.data.formats import read_recordings
 from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.data.scenes.assemble import assemble
@@ -13,7 +13,7 @@ from rcirl_jax.data.scenes.collect import Collector
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.types import Decision
 from rcirl_jax.units import TIMES_S
-from tests.data.importers import writers as w
+from tests.data.formats import writers as w
 from tests.helpers.logs import refused
 from tests.helpers.roads import (
     NO_FILTER,

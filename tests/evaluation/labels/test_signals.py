@@ -5,7 +5,7 @@ import pytest
 from absl import flags
 from absl.testing import flagsaver
 
-from rcirl_jax.commands.flags.signals import checked_signals, signals_asked
+from rcirl_jax.cli.flags.signals import checked_signals, signals_asked
 from rcirl_jax.data.parts import parts_of, recordings_of
 from rcirl_jax.data.scenes.collect import Collector
 from rcirl_jax.data.scenes.config import CollectConfig
@@ -22,7 +22,7 @@ from rcirl_jax.evaluation.labels.signals import (
 )
 from rcirl_jax.runtime.executors import Here, Processes
 from rcirl_jax.types import Kind, Lane, Recording, Signal, Track
-from tests.data.importers.formats import commonroad
+from tests.data.formats.fixtures import commonroad
 
 T = np.arange(0.0, 11.05, 0.1)  # s
 LENGTH_M, WIDTH_M, LANE_M = 4.6, 1.8, 3.6

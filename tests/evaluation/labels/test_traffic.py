@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from rcirl_jax.data.importers.synthetic.reader import driver_config
+from rcirl_jax.data.formats.synthetic.reader import driver_config
 from rcirl_jax.data.synthetic.drivers import sample_drivers
 from rcirl_jax.data.synthetic.roads import ROADS
 from rcirl_jax.data.synthetic.traffic import Log

@@ -1,0 +1,174 @@
+"""The whole tuning loop by one command, from logs to a verdict and its report.
+
+    rcirl autotune --data=DATASET[,DATASET] --output=RUN
+    rcirl autotune --input=LOGS --output=RUN
+    rcirl autotune --synthetic --recipe=quick --cases=4 --duration=20 --output=RUN
+
+import (unless there is --data) -> rehearse -> train -> rank -> simulate -> gate ->
+report, as the --recipe says; a flag given beside it wins. Every stage is kept until
+what it is made from changes; a killed run goes on where it was, also one ended by
+SIGTERM (exit status 143) or SIGINT (130), which save the training's step. The candidate
+is in RUN/weights.msgpack; open RUN/report.html. `--cases=3 --duration=30` is a look
+that can prove little. `rcirl gate` gives the verdict as its exit status.
+"""
+
+import dataclasses
+from pathlib import Path
+
+from absl import flags
+
+from rcirl_jax.cli.flags import margins, training
+from rcirl_jax.cli.flags.common import provenance
+from rcirl_jax.cli.flags.executor import executor
+from rcirl_jax.cli.flags.help import AS_SAID, also_named
+from rcirl_jax.cli.flags.horizon import HORIZON
+from rcirl_jax.cli.flags.importing import import_flags
+from rcirl_jax.cli.flags.search import SEARCH
+from rcirl_jax.cli.flags.signals import checked_signals, signals_asked
+from rcirl_jax.cli.flags.suite import suite
+from rcirl_jax.cli.flags.trackers import trackers
+from rcirl_jax.data.formats import IMPORTERS
+from rcirl_jax.data.formats.recognise import recognised_format
+from rcirl_jax.data.importing import ImportConfig
+from rcirl_jax.data.logs import Logs
+from rcirl_jax.errors import InputError, did_you_mean
+from rcirl_jax.runtime.pipeline import only_one
+from rcirl_jax.train.parallel import PARALLEL, share_cores
+from rcirl_jax.train.running import Running
+from rcirl_jax.tune.config import TuneConfig
+from rcirl_jax.tune.loop import STAGES, tune
+from rcirl_jax.tune.rehearsal import TEACHERS
+from rcirl_jax.tune.run import Run
+
+USUAL = (
+    *("output", "data", "input", "format", "source", "synthetic", "recipe"),
+    *("incumbent", "suite", "cases", "duration", "drives", "until", "workers"),
+)
+_OUTPUT = flags.DEFINE_string(
+    "output", None, "folder of the run; a run that is in it goes on", required=True
+)
+also_named("workdir", "output")
+_DATA = flags.DEFINE_list("data", None, "datasets of `rcirl import`, with commas")
+_SYNTHETIC = flags.DEFINE_bool(
+    "synthetic", False, "instead: embedded synthetic traffic, to try things out"
+)
+_FORMAT = flags.DEFINE_list(
+    "format", None, "of each --input, where it is not recognised"
+)
+_INPUT = flags.DEFINE_list(
+    "input", None, "instead: logs to import first, files or folders"
+)
+_SOURCE = flags.DEFINE_list(
+    "source", None, "TOML of columns and units of each --input, for your own tables"
+)
+_IMPORT = import_flags()
+_INCUMBENT = flags.DEFINE_string(
+    "incumbent",
+    "hand-set",
+    "what drives today, to be compared with: a weights file or a baseline",
+)
+_SEEDS = flags.DEFINE_integer(
+    "seeds", None, "training runs; the median one drives" + AS_SAID
+)
+_TEACHER = flags.DEFINE_enum(
+    "teacher", None, TEACHERS, "who rehearses the catalogue" + AS_SAID
+)
+_DRIVES = flags.DEFINE_integer(
+    "drives",
+    240,
+    "held-out drives that measure nearness to the human, 1 or more: the more, the "
+    "narrower the interval",
+)
+_PARALLEL = flags.DEFINE_enum(
+    "parallel", "auto", PARALLEL, "how devices share a batch: auto takes all of them"
+)
+_SWEEP = flags.DEFINE_string(
+    "sweep", None, "folder of `rcirl sweep`, shown in the report"
+)
+_UNTIL = flags.DEFINE_enum("until", "report", STAGES, "last stage of this time")
+
+
+def main() -> None:
+    """Flags -> one run of the loop."""
+    given, one = sources(), made_run(Path(_OUTPUT.value))
+    with only_one(one.folder):
+        tune(one, given, _UNTIL.value)
+
+
+def made_run(folder: Path) -> Run:
+    """The run in a folder that the flags describe."""
+    recipe = training.recipe()
+    rehearsal = recipe.rehearsal
+    if _TEACHER.value is not None:
+        rehearsal = dataclasses.replace(rehearsal, teacher=_TEACHER.value)
+    train = training.training_config()
+    if _PARALLEL.value == "auto":
+        share_cores(train.batch_size)
+    config = TuneConfig(
+        train=train,
+        gate=margins.gate_config(),
+        incumbent=_INCUMBENT.value,
+        rehearsal=rehearsal,
+        anchor=recipe.anchor,
+        data_weights=training.DATA_WEIGHTS.value,
+        recipe=recipe.name,
+        seeds=recipe.seeds if _SEEDS.value is None else _SEEDS.value,
+        search=SEARCH.value,
+        drives=_DRIVES.value,
+        horizon_s=HORIZON.value,
+        **suite(),
+        sweep=Path(_SWEEP.value) if _SWEEP.value else None,
+    )
+    return Run(
+        folder=folder,
+        config=config,
+        executor=executor(),
+        running=Running(parallel=_PARALLEL.value, trackers=trackers()),
+        facts=provenance(),
+    )
+
+
+def sources() -> list[str | Logs]:
+    """The sources: datasets, logs, or synthetic traffic."""
+    ways = [bool(_DATA.value), bool(_INPUT.value), _SYNTHETIC.value]
+    if sum(ways) != 1:
+        raise InputError(
+            "--data, --input, --synthetic: expected one of them: datasets of "
+            "`rcirl import`, logs, or the embedded synthetic traffic"
+        )
+    if not _INPUT.value and (_FORMAT.value or _SOURCE.value):
+        raise InputError("--input: not given: expected one for each --format")
+    if _DATA.value:
+        if signals_asked():
+            raise InputError("--signals: expected with --input, whose lights they are")
+        return list(_DATA.value)
+    if _SYNTHETIC.value:
+        return [_logs("synthetic", None, None)]
+    inputs = [Path(path) for path in _INPUT.value or []]
+    count = len(inputs)
+    named = _SOURCE.value or [""] * count
+    if len(named) != count or len(_FORMAT.value or inputs) != count:
+        raise InputError(
+            f"--format, --source: {len(_FORMAT.value or [])} and "
+            f"{len(_SOURCE.value or [])}: expected one for each of the {count} --input"
+        )
+    sources = [Path(source) if source else None for source in named]
+    for name in _FORMAT.value or []:
+        if name not in IMPORTERS:
+            known = ", ".join(sorted(IMPORTERS))
+            hint = did_you_mean(name, IMPORTERS)
+            raise InputError(f"--format: {name}: expected one of {known}{hint}")
+    formats = _FORMAT.value or map(recognised_format, inputs, sources)
+    return list(map(_logs, formats, inputs, sources))
+
+
+def _logs(name: str, path: Path | None, source: Path | None) -> Logs:
+    """One log to import, cut as the recipe and the flags say."""
+    return Logs(
+        format=name,
+        input=path,
+        source=source,
+        config=_IMPORT(ImportConfig(format=name, collect=training.recipe().collect)),
+        signals=signals_asked(),
+        checked=checked_signals,
+    )

@@ -1,0 +1,128 @@
+"""Export a trained run as weights.msgpack, and weights in other forms.
+
+    rcirl export --run=RUN --output=FILE
+    rcirl export --weights=FILE --onnx=FILE --stablehlo=FILE
+    rcirl export --weights=LINEAR --yaml=FILE
+    rcirl export --run=RUN --stablehlo=FILE
+
+The file carries verification samples from the dataset's training split; a reader
+recomputes them before it accepts the file. The ranges are for the guard
+(docs/guard.md); a reader that knows schema versions 1 and 2 only takes --noranges.
+
+Other forms are for planners that read neither it nor Python (--onnx and --jax_export
+need the extra [export]). Each scores as the file does, and FILE.json beside it says
+which weights it is of, what trained them and what wrote it. A run with --module has no
+weights.msgpack: --stablehlo and --jax_export write its scorer.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from absl import flags
+
+from rcirl_jax.cli.flags.common import provenance
+from rcirl_jax.cli.flags.help import also_named
+from rcirl_jax.data.store.joined import open_datasets
+from rcirl_jax.data.store.resplit import with_tags
+from rcirl_jax.errors import InputError
+from rcirl_jax.export.forms.linear_yaml import reward_yaml
+from rcirl_jax.export.forms.onnx_model import write_onnx
+from rcirl_jax.export.forms.stablehlo import (
+    Form,
+    exported,
+    exported_run,
+    write_stablehlo,
+)
+from rcirl_jax.export.from_run import datasets_of, export_run, tags_of
+from rcirl_jax.export.loading import open_reward
+from rcirl_jax.export.reader import Reward
+from rcirl_jax.runtime.atomic_files import write_json, write_whole
+
+USUAL = (
+    *("run", "weights", "output", "data", "onnx", "stablehlo", "jax_export", "yaml"),
+    "ranges",
+)
+_RUN = flags.DEFINE_string("run", None, "run to export: a folder of `rcirl train`")
+also_named("workdir", "run")
+_WEIGHTS = flags.DEFINE_string(
+    "weights", None, "instead: a weights file, to write in other forms"
+)
+_DATA = flags.DEFINE_list(
+    "data", None, "datasets, where they have moved (default: those of the run)"
+)
+_RANGES = flags.DEFINE_bool(
+    "ranges",
+    True,
+    "record what training saw of each feature, for the guard; none for old readers",
+)
+_OUTPUT = flags.DEFINE_string(
+    "output", None, "weights file to write (default: RUN/weights.msgpack)"
+)
+_ONNX = flags.DEFINE_string(
+    "onnx", None, "file to write: an ONNX model, for onnxruntime and the like"
+)
+_STABLEHLO = flags.DEFINE_string(
+    "stablehlo", None, "file to write: StableHLO bytecode, for XLA without Python"
+)
+_JAX = flags.DEFINE_string(
+    "jax_export",
+    None,
+    "file to write: bytes of jax.export, for other programs with JAX",
+)
+_YAML = flags.DEFINE_string(
+    "yaml", None, "file to write: costs by name, of a linear reward"
+)
+FORMS: dict[str, Form] = {"stablehlo": "stablehlo", "jax_export": "jax"}
+
+
+def main() -> None:
+    """Flags -> files."""
+    if bool(_RUN.value) == bool(_WEIGHTS.value):
+        raise InputError("--run, --weights: expected one of them")
+    files = {x.name: Path(x.value) for x in (_STABLEHLO, _JAX, _ONNX, _YAML) if x.value}
+    if _WEIGHTS.value:
+        _convert(open_reward(_WEIGHTS.value), files)
+    elif _ONNX.value or _YAML.value:
+        raise InputError("--onnx, --yaml: expected --weights with them")
+    elif files:
+        made = exported_run(Path(str(_RUN.value)))
+        for name, path in files.items():
+            write_stablehlo(path, made, FORMS[name])
+            print(f"written: {path}")
+    else:
+        workdir = Path(str(_RUN.value))
+        output = Path(_OUTPUT.value or workdir / "weights.msgpack")
+        dataset = open_datasets(_DATA.value or datasets_of(workdir))
+        dataset = with_tags(dataset, tags_of(workdir))
+        reward = export_run(workdir, dataset, output, ranges=_RANGES.value)
+        print(f"{output}: {len(reward.names)} features, sha256 {reward.sha256[:16]}...")
+
+
+def _convert(reward: Reward, files: Mapping[str, Path]) -> None:
+    """Other forms of a weights file by flag, each with its facts beside it."""
+    if not files:
+        raise InputError("--onnx, --stablehlo, --jax_export, --yaml: expected one")
+    if reward.anchor is not None:
+        raise InputError(
+            f"--weights: {reward.file}: expected a reward without an anchor: these "
+            "forms hold V alone, and the gain on top of the own cost would be lost"
+        )
+    text = reward_yaml(reward) if "yaml" in files else ""
+    for name, path in files.items():
+        if name == "yaml":
+            write_whole(path, text)
+        elif name == "onnx":
+            write_onnx(path, reward)
+        else:
+            write_stablehlo(path, exported(reward), FORMS[name])
+    facts = {
+        "weights_sha256": reward.sha256,
+        "features": reward.names,
+        "units": reward.units,
+        "times_s": [float(time) for time in reward.times],
+        "provenance": reward.provenance,
+    }
+    for name, path in files.items():
+        beside = path.with_name(f"{path.name}.json")
+        write_json(beside, {"form": name, **facts, "made_by": provenance()})
+        print(f"written: {path}, {beside}")

@@ -1,0 +1,87 @@
+"""May a candidate replace the incumbent? Exit status 0 only to ship.
+
+    rcirl gate --candidate=FILE --incumbent=FILE --data=DATASET --output=verdict.json
+    rcirl gate --candidate=FILE --incumbent=hand-set --output=verdict.json
+
+Both drive the same closed-loop cases; never is a learned reward the judge. Refused (3)
+if the candidate has more cases with a fault than the incumbent, if rates or progress
+are worse than the margins allow, if a family loses, if it is behind rewards that know
+nothing or farther from the human, or if nothing is better. 2: could not judge: bad
+input, too few cases, something not measured, or a part of the suite. docs/gate.md.
+"""
+
+import sys
+from pathlib import Path
+
+from absl import flags
+
+from rcirl_jax.cli.flags import margins
+from rcirl_jax.cli.flags.common import provenance
+from rcirl_jax.cli.flags.executor import executor
+from rcirl_jax.cli.flags.suite import suite
+from rcirl_jax.data.store.dataset import open_dataset
+from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.closed_loop.likeness import DRIVES
+from rcirl_jax.evaluation.gate.output import format_verdict, write_verdict
+from rcirl_jax.export.gate_job import gate_job, judged
+from rcirl_jax.export.tuned_idm import idm_left_out, read_tuned_idm
+from rcirl_jax.planner.safety import TRACKS
+from rcirl_jax.simulation.rows import BASELINES
+
+USUAL = (
+    *("candidate", "incumbent", "output", "data", "drives", "suite", "cases"),
+    *("duration", "tuned_idm", "accept", "primary", "workers"),
+)
+_CANDIDATE = flags.DEFINE_string(
+    "candidate", None, "weights file that may replace it", required=True
+)
+_INCUMBENT = flags.DEFINE_string(
+    "incumbent",
+    "hand-set",
+    "what drives today: a weights file, or a baseline: " + ", ".join(BASELINES),
+)
+_OUTPUT = flags.DEFINE_string(
+    "output", None, "JSON of the verdict to write", required=True
+)
+_DATA = flags.DEFINE_list(
+    "data", [], "datasets whose held-out drives measure nearness to the human"
+)
+_DRIVES = flags.DEFINE_integer(
+    "drives", DRIVES, "of them in all, 1 or more: the more, the narrower the interval"
+)
+_IDM = flags.DEFINE_string(
+    "tuned_idm", None, "RUN/tuned_idm.json of autotune: a tuned IDM drives too"
+)
+_FILTER = flags.DEFINE_enum(
+    "filter", "full", TRACKS, "full; collision: no verdict ships, the reward decides"
+)
+
+
+def main() -> None:
+    """Flags -> one verdict."""
+    output = Path(_OUTPUT.value)
+    if output.suffix != ".json":
+        raise InputError(f"--output: {output}: expected a name that ends in .json")
+    output.unlink(missing_ok=True)  # of another gate: not this verdict
+    config = margins.gate_config()
+    job, incumbent = gate_job(
+        _CANDIDATE.value,
+        _INCUMBENT.value,
+        **suite(),
+        rivals=("IDM", *(name for name in config.nulls if name in BASELINES)),
+        tuned_idm=read_tuned_idm(Path(_IDM.value)) if _IDM.value else None,
+        track=_FILTER.value,
+    )
+    if said := idm_left_out(_IDM.value):
+        print(said)
+    sources = [open_dataset(url) for url in _DATA.value]
+    found = judged(job, incumbent, config, executor(), sources, _DRIVES.value)
+    if found.likeness is not None:
+        print(found.likeness.text())
+    verdict = found.verdict
+    files = {"candidate": _CANDIDATE.value, "incumbent": _INCUMBENT.value}
+    facts = {"files": files, **found.facts, "made_by": provenance(job.weights)}
+    write_verdict(output, verdict, config, facts)
+    print(format_verdict(verdict))
+    print(f"written: {output}; exit status {verdict.exit_code}")
+    sys.exit(verdict.exit_code)

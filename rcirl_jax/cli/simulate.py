@@ -1,0 +1,139 @@
+"""Drive rewards and rivals through the closed-loop suite; print the paper's table.
+
+    rcirl simulate --weights=FILE[,FILE...] --suite=full|smoke|FAMILY --output=DIR
+    rcirl simulate --weights=FILE --suite=recorded|heldout --data=DATASET --output=DIR
+
+Every case is driven at 10 Hz; safety filter and candidates are the same for all
+rows. Writes table.txt, suite.json and cases.csv. A case is drawn by `rcirl replay`
+from its id. Held-out drives of datasets, up to 8 s among the recorded traffic, have the
+recorded human as one of the rows: `recorded` says the same of them as of the other
+suites, `heldout` how near to the human each row is (table.txt and likeness.json).
+"""
+
+from pathlib import Path
+
+from absl import flags
+
+from rcirl_jax.cli.flags.common import provenance
+from rcirl_jax.cli.flags.executor import executor
+from rcirl_jax.cli.flags.suite import CASES, DURATION, EVERY, SEED, SUITE
+from rcirl_jax.data.store.joined import JoinedDatasets, open_datasets
+from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.closed_loop.likeness import DRIVES, held_out_likeness
+from rcirl_jax.evaluation.closed_loop.suite import (
+    SuiteConfig,
+    run_suite,
+    worst_cases,
+    write_suite,
+)
+from rcirl_jax.export.spread import SuiteJob, drive_by
+from rcirl_jax.export.tuned_idm import idm_left_out, read_tuned_idm
+from rcirl_jax.planner.safety import TRACKS
+from rcirl_jax.runtime.atomic_files import write_json, write_whole
+from rcirl_jax.simulation.recorded.scenes import HeldOut, held_out
+from rcirl_jax.simulation.rows import BASELINES, human_row
+from rcirl_jax.simulation.suite import case_duration, recorded_set, suite_refs
+
+USUAL = (
+    *("weights", "output", "suite", "cases", "duration", "data", "baselines"),
+    *("tuned_idm", "dp", "workers"),
+)
+_WEIGHTS = flags.DEFINE_list(
+    "weights", None, "weights files, with commas", required=True
+)
+_DATA = flags.DEFINE_list(
+    "data", [], "datasets of --suite=recorded or heldout, with commas"
+)
+_OUTPUT = flags.DEFINE_string("output", None, "folder to write", required=True)
+_BASELINES = flags.DEFINE_list(
+    "baselines", ",".join(BASELINES), "rivals that drive too; fewer are quicker"
+)
+_IDM = flags.DEFINE_string(
+    "tuned_idm", None, "RUN/tuned_idm.json of autotune: a tuned IDM drives too"
+)
+_DP = flags.DEFINE_bool(
+    "dp", False, "the first weights also drive by dynamic programming"
+)
+_FILTER = flags.DEFINE_enum(
+    "filter", "full", TRACKS, "full, or collision: the reward decides the rest"
+)
+_CHUNK = flags.DEFINE_integer("chunk", 180, "cases driven together; bounds memory")
+
+flags.set_default(SUITE, "smoke")
+OF_DATA = ("recorded", "heldout")  # suites of --data
+
+
+def _job() -> SuiteJob:
+    """Rows and catalogue cases that the flags name."""
+    elsewhere = SUITE.value in OF_DATA
+    if elsewhere and CASES.value is not None and CASES.value < 1:
+        raise InputError(f"--cases: {CASES.value}: expected at least 1")
+    return SuiteJob(
+        weights=tuple(_WEIGHTS.value),
+        baselines=tuple(_BASELINES.value),
+        refs=() if elsewhere else suite_refs(SUITE.value, CASES.value, SEED.value),
+        duration_s=case_duration(SUITE.value, DURATION.value),
+        plan_every=EVERY.value,
+        dp=_DP.value,
+        tuned_idm=read_tuned_idm(Path(_IDM.value)) if _IDM.value else None,
+        track=_FILTER.value,
+    )
+
+
+def _drives() -> tuple[HeldOut, str]:
+    """Held-out drives of --data, and its hash."""
+    if DURATION.value:
+        raise InputError(
+            f"--duration: of --suite={SUITE.value}: drives last as their records"
+        )
+    data = open_datasets(_DATA.value)
+    sources = data.parts if isinstance(data, JoinedDatasets) else [data]
+    return held_out(sources, CASES.value or DRIVES, SEED.value), data.hash
+
+
+def _likeness(job: SuiteJob, drives: HeldOut, made_by: dict) -> None:
+    """Every row, and the recorded human, over held-out drives."""
+    report = held_out_likeness(drives, job.rows(), EVERY.value)
+    folder = Path(_OUTPUT.value)
+    write_whole(folder / "table.txt", report.text())
+    write_json(folder / "likeness.json", {**report.as_dict(), "made_by": made_by})
+    print(report.text())
+    print(f"written: {_OUTPUT.value}/table.txt, likeness.json")
+
+
+def main() -> None:
+    """Flags -> one suite."""
+    if _CHUNK.value < 1:
+        raise InputError(f"--chunk: {_CHUNK.value}: expected at least 1")
+    job, places = _job(), executor()
+    if said := idm_left_out(_IDM.value):
+        print(said)
+    if not job.refs and places.workers > 1:
+        raise InputError(
+            f"--suite: {SUITE.value}: expected --workers=1: drives run here"
+        )
+    if job.refs and _DATA.value:
+        raise InputError(
+            f"--data: with --suite={SUITE.value}: expected {' or '.join(OF_DATA)}"
+        )
+    # of the files as they are read, not hours later
+    made_by = provenance(_WEIGHTS.value)
+    rows = job.rows()
+    if job.refs:
+        cases = job.cases()
+    else:
+        drives, data_hash = _drives()
+        made_by["data_hash"] = data_hash
+        if SUITE.value == "heldout":
+            _likeness(job, drives, made_by)
+            return
+        cases = recorded_set(drives)
+        rows.append(human_row())
+    config = SuiteConfig(plan_every=EVERY.value, chunk=_CHUNK.value)
+    result = run_suite(rows, cases, config, drive_by(places, job))
+    print(write_suite(result, Path(_OUTPUT.value), made_by))
+    for name, facts in result.timings.items():
+        print(f"{name}: {facts['seconds']} s, {facts['plans_per_s']:,} plans/s")
+    print(f"peak memory: {result.facts['peak_memory_gib']} GiB")
+    print(f"look first at: {', '.join(worst_cases(result, rows[0].name, 5))}")
+    print(f"written: {_OUTPUT.value}/table.txt, suite.json, cases.csv")

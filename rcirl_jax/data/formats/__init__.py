@@ -1,0 +1,129 @@
+"""Importers: one folder per log format, each yielding valid Recordings.
+
+A folder with a `reader` is a format; its `FORMAT` (see `format`) says how its files are
+recognised and how workers share them. The reader has `recordings`: (input path, source
+spec) -> iterator of Recording. The spec is the TOML of data_specs/sources (or the
+user's own). Each passes its recordings through `validate_recording` with the file's
+name.
+"""
+
+import importlib
+import itertools
+import types
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from rcirl_jax.data.formats.declared import with_numbers_and_texts
+from rcirl_jax.data.formats.files import log_name, with_log_names
+from rcirl_jax.data.formats.format import Format
+from rcirl_jax.data.formats.options import STATED, check_options
+from rcirl_jax.data.readers.tables.ledger import NoRowsError
+from rcirl_jax.data.readers.tables.streams import refuse_pointer
+from rcirl_jax.data.recording import empty_recording
+from rcirl_jax.errors import InputError, as_input_error
+from rcirl_jax.runtime.atomic_files import is_text
+from rcirl_jax.runtime.specs import load_toml, spec_root
+from rcirl_jax.types import Recording
+
+Importer = Callable[[Path, dict], Iterator[Recording]]
+
+# a folder each, whose `reader` is loaded only when the format is asked for
+IMPORTERS = tuple(
+    sorted(file.parent.name for file in Path(__file__).parent.glob("*/reader.py"))
+)
+
+
+def read_part(name: str, path: Path, spec: dict) -> Iterator[Recording]:
+    """All recordings of one part, each validated; arguments as of `parts`."""
+    importer: Importer = module_of(name).recordings
+    for file in files_of(name, path):
+        refuse_pointer(file)
+    with as_input_error(str(path), f"a sound log of format {name}"):
+        try:
+            yield from importer(path, spec)
+        except NoRowsError as error:
+            if error.path != path:
+                raise  # a table beside the log
+            yield empty_recording(log_name(path, spec, path.name), str(error))
+
+
+def pieces(name: str, path: Path, spec: dict) -> list[dict]:
+    """Specs that each read a share of one part, in order; arguments as of `parts`.
+
+    A format whose module has no `pieces(path, spec)` reads a part as a whole.
+    """
+    split = getattr(module_of(name), "pieces", None)
+    return [spec] if split is None else split(path, spec)
+
+
+def files_of(name: str, path: Path) -> list[Path]:
+    """The files that one part is read from: itself, if its module says nothing."""
+    found = getattr(module_of(name), "files_of", None)
+    return [path] if found is None else found(path)
+
+
+def format_of(name: str) -> Format:
+    """What a format says of itself, without its reader."""
+    return importlib.import_module(f"{__name__}.{name}").FORMAT
+
+
+def module_of(name: str, module: str = "reader") -> types.ModuleType:
+    """A module of a format's folder."""
+    return importlib.import_module(f"{__name__}.{name}.{module}")
+
+
+def parts(
+    name: str, input_path: Path | None, source: Path | None = None
+) -> tuple[list[Path], dict]:
+    """Inputs that can be read apart from each other, in order, and the spec.
+
+    The recordings of all parts, one part after the other, are those of the whole
+    input. A format whose module has no `parts(path, spec)` is one part. Where it has
+    `own_name(file)`, logs that are called alike in several folders are told apart.
+
+    Args:
+      name: key of `IMPORTERS`.
+      input_path: file or folder; None is allowed for "synthetic" only.
+      source: TOML of columns, units and licence; default: the packaged one.
+
+    Raises:
+      InputError: unknown format, missing path, or nothing to read.
+    """
+    if name not in IMPORTERS:
+        raise InputError(f"--format: {name}: expected one of {sorted(IMPORTERS)}")
+    packaged = spec_root() / "sources" / f"{name}.toml"
+    spec_path = source or packaged
+    spec = load_toml(spec_path)
+    own = [] if source is None else sorted(spec)
+    options = f"options as in the TOML of format {name}"
+    if source is not None:
+        with as_input_error(str(source), options):
+            check_options(spec, load_toml(packaged), format_of(name))
+        if format_of(name).is_declared:
+            spec = with_numbers_and_texts(spec, load_toml(packaged))
+    spec = {**spec, STATED: own}
+    if input_path is None:
+        if name != "synthetic":
+            raise InputError("--input: not given: expected a file or folder")
+        input_path = spec_path
+    if not input_path.exists():
+        raise InputError(f"{input_path}: input: missing: expected a file or folder")
+    module = module_of(name)
+    split = getattr(module, "parts", None)
+    with as_input_error(str(input_path), f"logs of format {name}, and {options}"):
+        found = [input_path] if split is None else split(input_path, spec)
+        name_of = getattr(module, "own_name", None)
+        if name_of is not None:
+            spec = with_log_names(input_path, found, spec, name_of)
+    for path in found:
+        if not is_text(str(path)):
+            raise InputError(f"{path}: name: {path.name!a}: expected UTF-8; rename it")
+    return found, spec
+
+
+def read_recordings(
+    name: str, input_path: Path | None, source: Path | None = None
+) -> Iterator[Recording]:
+    """All recordings of an input, each validated; arguments and errors as `parts`."""
+    found, spec = parts(name, input_path, source)
+    return itertools.chain.from_iterable(read_part(name, path, spec) for path in found)

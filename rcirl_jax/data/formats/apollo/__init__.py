@@ -1,0 +1,13 @@
+"""Apollo cyber records: `records` is the file, `messages` its content.
+
+`descriptors` tells how messages are read. A new channel or message field is read in
+`messages`; `reader` makes recordings of it.
+"""
+
+from rcirl_jax.data.formats.format import Format
+
+FORMAT = Format(
+    names=("*.record", "*.record.*"),
+    shard_bytes=2**28,
+    checked=("pattern", "topics"),
+)

@@ -1,0 +1,261 @@
+"""Records of Apollo's middleware Cyber RT: sections, channels, messages.
+
+Layout: cyber/proto/record.proto and cyber/record/file in the Apollo sources. A
+file is a row of sections, each with a head of 16 bytes (type int32, 4 bytes
+unused, size int64). The header's section takes 2048 bytes, however short the
+header is. Channels bring the descriptors of their messages. Chunk bodies hold
+the messages. The index at the end is not needed: sections are walked from the
+start, so records that were never closed can be read as well.
+"""
+
+import contextlib
+import mmap
+import re
+import struct
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+from google.protobuf.message import DecodeError
+
+from rcirl_jax.data.formats.files import files_below
+from rcirl_jax.data.readers.protobuf import parser, table_of
+from rcirl_jax.errors import InputError
+
+HEAD = struct.Struct("<i4xq")  # type and size of a section
+HEADER_BYTES = 2048  # bytes that the header's section takes
+HEADER, CHUNK_HEADER, CHUNK_BODY, INDEX, CHANNEL = range(5)
+MAX_BYTES = 16 * 1024**2  # bytes of a message, or of a channel's descriptors
+VARINT, LENGTH = 0, 2  # wire types
+SIZES = {1: 8, 5: 4}  # bytes of those of one size
+# NAME.record, or a part .record.00000; some releases add when it began, .112907, and
+# cyber_recorder what it did to a copy
+NAME = re.compile(
+    r"[^/]+?\.record(?:\.(?P<part>\d{1,9})(?:\.\d{1,20})?)?(?:\.(?:split|recover))?"
+)
+
+CHANNEL_FIELDS = "name 1 string, message_type 2 string, proto_desc 3 bytes"
+read_header = parser(table_of("Header: compress 3 int64, is_complete 13 bool"))
+read_channel = parser(table_of(f"Channel: {CHANNEL_FIELDS}"))
+
+
+class Run:
+    """A record and, if it is a part, those that follow: .00000, .00001, ...
+
+    Args:
+      first: its first file.
+    """
+
+    def __init__(self, first: Path) -> None:
+        name, self._number = _drive_and_part(first)
+        self.first, self.drive = first, name.name
+        match = NAME.fullmatch(first.name)
+        is_part = match is not None and match["part"] is not None
+        beside = first.parent.glob("*.record.*") if is_part else ()
+        self._parts = _drives(beside).get(name, {})
+        self.files, number = [first], self._number + 1
+        while number in self._parts:
+            self.files.append(self._parts[number])
+            number += 1
+
+    @property
+    def name(self) -> str:
+        """Its drive's, and its part behind a missing one."""
+        is_first = self._number <= min(self._parts, default=0)
+        return self.drive if is_first else f"{self.drive}-{self._number:05d}"
+
+    @property
+    def is_cut(self) -> bool:
+        """Whether the drive has other parts, which do not follow."""
+        return len(self._parts) > len(self.files)
+
+
+def first_parts(folder: Path, pattern: str) -> list[Path]:
+    """The first file of each run of parts at any depth of a folder, sorted."""
+    drives = _drives(files_below(folder, pattern))
+    if not drives:
+        raise InputError(f"{folder}: no file matches {pattern}: expected cyber records")
+    return sorted(
+        file
+        for parts in drives.values()
+        for number, file in parts.items()
+        if number - 1 not in parts
+    )
+
+
+def _drives(files: Iterable[Path]) -> dict[Path, dict[int, Path]]:
+    """Parts by drive and number; of a file and its copies the shortest name counts."""
+    drives: dict[Path, dict[int, Path]] = {}
+    for file in sorted(files):
+        if NAME.fullmatch(file.name):
+            drive, number = _drive_and_part(file)
+            drives.setdefault(drive, {}).setdefault(number, file)
+    return drives
+
+
+def _drive_and_part(file: Path) -> tuple[Path, int]:
+    """Drive of a record, told from those of its name in other folders; its number."""
+    match = NAME.fullmatch(file.name)
+    number = int(match["part"] or 0) if match else 0
+    return file.parent / file.name.split(".record")[0], number
+
+
+class Record:
+    """One record file, mapped into memory; use as a context manager."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        # channel -> (message type, its descriptors: a ProtoDesc)
+        self.channels: dict[str, tuple[str, bytes]] = {}
+        self.is_complete = True
+
+    def __enter__(self) -> "Record":
+        try:
+            with self.path.open("rb") as handle:
+                self._map = mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ)
+        except (OSError, ValueError) as error:
+            raise InputError(
+                f"{self.path}: record: {error}: expected a cyber record"
+            ) from error
+        self._data = memoryview(self._map)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._data.release()
+        # an error's traceback may still hold a piece
+        with contextlib.suppress(BufferError):
+            self._map.close()
+
+    def messages(
+        self,
+        wanted: Callable[[str], bool],
+        show: Callable[[int], object] = lambda _: None,
+    ) -> Iterator[tuple[str, int, memoryview]]:
+        """(channel, time ns, content) of the messages on the wanted channels.
+
+        Args:
+          wanted: whether a channel is.
+          show: called with the bytes of each section that has been read.
+        """
+        try:
+            for kind, section in self._sections():
+                if kind == CHANNEL:
+                    check_size("descriptors", section)
+                    channel = read_channel(bytes(section))
+                    own = (channel.message_type, channel.proto_desc)
+                    self.channels[channel.name] = own
+                elif kind == CHUNK_BODY:
+                    parts = _fields(section)
+                    found = (_message(value) for number, value in parts if number == 1)
+                    yield from (message for message in found if wanted(message[0]))
+                show(len(section))
+        except DecodeError as error:
+            raise InputError(
+                f"{self.path}: {error}: expected a cyber record"
+            ) from error
+
+    def _sections(self) -> Iterator[tuple[int, memoryview]]:
+        at, end = 0, len(self._data)
+        while at < end:
+            if end - at < HEAD.size:
+                raise self._truncated(at)
+            kind, size = HEAD.unpack_from(self._data, at)
+            if at == 0:
+                self._read_header(kind, size)
+                at = HEAD.size + HEADER_BYTES
+                continue
+            at += HEAD.size
+            if not HEADER < kind <= CHANNEL or size < 0:
+                raise InputError(
+                    f"{self.path}: section at byte {at - HEAD.size}: type {kind}, "
+                    f"{size} bytes: expected type 1 to 4"
+                )
+            if size > end - at:
+                raise self._truncated(at)
+            yield kind, self._data[at : at + size]
+            at += size
+            if kind == INDEX:  # the last; the rest is of a file written over
+                return
+
+    def _truncated(self, at: int) -> InputError:
+        return InputError(
+            f"{self.path}: section at byte {at}: beyond the end at "
+            f"{len(self._data)}: expected a whole record; truncated?"
+        )
+
+    def _read_header(self, kind: int, size: int) -> None:
+        whole = HEAD.size + HEADER_BYTES <= len(self._data)
+        if kind != HEADER or not 0 <= size <= HEADER_BYTES or not whole:
+            raise InputError(
+                f"{self.path}: header: type {kind}, {size} bytes: "
+                "expected that of a cyber record"
+            )
+        header = read_header(bytes(self._data[HEAD.size : HEAD.size + size]))
+        if header.compress != 0:
+            raise InputError(
+                f"{self.path}: header: compress: {header.compress}: expected 0, none "
+                "(no Apollo release writes compressed chunks)"
+            )
+        self.is_complete = header.is_complete
+
+
+def check_size(what: str, content: memoryview) -> None:
+    """Parsed, a message takes many times its bytes."""
+    if len(content) > MAX_BYTES:
+        raise DecodeError(f"{what}: {len(content)} bytes of at most {MAX_BYTES}")
+
+
+def _message(single: int | memoryview) -> tuple[str, int, memoryview]:
+    """SingleMessage: channel_name 1, time 2, content 3."""
+    name, time, content = "", 0, memoryview(b"")
+    for number, value in _fields(_bytes(single)):
+        if number == 1:
+            name = bytes(_bytes(value)).decode(errors="replace")
+        elif number == 2 and isinstance(value, int):
+            time = value
+        elif number == 3:
+            content = _bytes(value)
+    return name, time, content
+
+
+def _fields(buffer: memoryview) -> Iterator[tuple[int, int | memoryview]]:
+    """(number, value) of a message's whole numbers and bytes; nothing is copied.
+
+    By hand: the library copies all pictures and point clouds, in eight times the time.
+    """
+    at, end = 0, len(buffer)
+    while at < end:
+        key, at = _varint(buffer, at)
+        number, wire = key >> 3, key & 7
+        if wire == VARINT:
+            value, at = _varint(buffer, at)
+            yield number, value
+            continue
+        if wire == LENGTH:
+            size, at = _varint(buffer, at)
+        elif wire in SIZES:
+            size = SIZES[wire]
+        else:
+            raise DecodeError(f"field {number}: wire type {wire}")
+        if size > end - at:
+            raise DecodeError(f"field {number}: {size} bytes of {end - at} left")
+        if wire == LENGTH:
+            yield number, buffer[at : at + size]
+        at += size
+
+
+def _varint(buffer: memoryview, at: int) -> tuple[int, int]:
+    """(value, place behind it) of a base-128 number of at most ten bytes."""
+    if at < len(buffer) and buffer[at] < 0x80:  # most are short
+        return buffer[at], at + 1
+    value = 0
+    for place, byte in enumerate(buffer[at : at + 10]):
+        value |= (byte & 0x7F) << (7 * place)
+        if byte < 0x80:
+            return value, at + place + 1
+    raise DecodeError("varint: no end within ten bytes")
+
+
+def _bytes(value: int | memoryview) -> memoryview:
+    if isinstance(value, int):
+        raise DecodeError("message: number: expected bytes")
+    return value

@@ -1,0 +1,245 @@
+"""Argoverse 2 motion forecasting: scenario_<id>.parquet with a map beside it.
+
+Layout of the data set (https://argoverse.github.io/user-guide, av2-api):
+`{train,val,test}/<id>/scenario_<id>.parquet` and, in the same folder,
+`log_map_archive_<id>.json`. A scenario lasts 11 s at 10 Hz (test: the first
+5 s), positions are box centres in metres of the city's frame, headings are
+radians counter-clockwise.
+
+Traps: the files hold no box sizes, so these come by type from the source TOML;
+`left_neighbor_id` of a map may name an oncoming lane; tracks of category
+"fragment" are of low quality; scenarios cut from one slice of a drive share
+vehicles, so the slice is the vehicle-disjoint group.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from rcirl_jax.data.formats.argoverse2.map import read_lanes
+from rcirl_jax.data.formats.files import files_matching
+from rcirl_jax.data.formats.options import (
+    kind_of,
+    number,
+    patterns,
+    recording_car,
+    section,
+)
+from rcirl_jax.data.formats.perception import (
+    has_possible_speed,
+    without_outliers,
+)
+from rcirl_jax.data.formats.shapes import (
+    check_coordinates,
+    local_origin,
+    origin_notes,
+)
+from rcirl_jax.data.formats.tracks import once_each, split_tracks
+from rcirl_jax.data.readers.tables.ledger import Ledger
+from rcirl_jax.data.readers.tables.table import fields_of, open_table, read
+from rcirl_jax.data.recording import MAX_SPEED_MPS, validate_recording
+from rcirl_jax.errors import InputError
+from rcirl_jax.types import Recording, Track
+
+NUMBERS = (
+    "object_category",
+    "timestep",
+    "position_x",
+    "position_y",
+    "heading",
+    "velocity_x",
+    "velocity_y",
+    "start_timestamp",
+    "end_timestamp",
+    "num_timestamps",
+)
+TEXT = ("track_id", "object_type", "scenario_id", "slice_id")
+OPTIONAL = ("slice_id",)
+PREFIX, SUFFIX = "scenario_", ".parquet"
+STEP_S = 0.1  # s, the data set's sampling interval
+STEP_TOLERANCE = 0.01  # relative; the stamps are rounded to 64 ns
+MAX_STEPS = 10_000  # 1000 s; a scenario has 110
+MAX_CATEGORY = 3  # 0 fragment, 1 unscored, 2 scored, 3 focal track
+RECORDER = "AV"  # id of the recording car
+FRAGMENT = 0
+MAX_GAP_STEPS = 5.5  # missing steps bridged inside one track
+LIMIT_MPS = 15.65  # m/s, 35 mph
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Clock:
+    """The scenario's time axis."""
+
+    step: float  # s
+    notes: tuple[str, ...]
+
+
+def parts(path: Path, spec: dict) -> list[Path]:
+    """The scenario files; each can be read alone."""
+    wanted = patterns(spec, [f"{PREFIX}*{SUFFIX}"])
+    return files_matching(path, wanted, "scenario files")
+
+
+def recordings(path: Path, spec: dict) -> Iterator[Recording]:
+    """One Recording per scenario file, of a file, its folder or a whole split."""
+    for file in parts(path, spec):
+        yield validate_recording(_read_scenario(file, spec), file)
+
+
+def _read_scenario(file: Path, spec: dict) -> Recording:
+    table = _read_rows(file)
+    name = _constant(file, table, "scenario_id")
+    group = _constant(file, table, "slice_id") if "slice_id" in table else name
+    clock = _clock(file, table)
+    fields = ("position_x", "position_y", "velocity_x", "velocity_y")
+    values = np.stack([table[field] for field in fields], axis=1)
+    check_coordinates(file, "rows", fields, values)
+    origin = local_origin(values[:, 0], values[:, 1])
+    table["position_x"] = values[:, 0] - origin[0]
+    table["position_y"] = values[:, 1] - origin[1]
+    tracks, notes = _read_tracks(file, table, clock, spec)
+    lanes, lane_notes = read_lanes(_map_file(file, name), origin, spec)
+    return Recording(
+        name=name,
+        source=str(spec.get("source", "Argoverse 2 Motion Forecasting")),
+        licence=str(spec.get("licence", "unknown")),
+        rate_hz=1.0 / clock.step,
+        tracks=tracks,
+        lanes=lanes,
+        group=group,
+        default_speed_limit=number(spec, "speed_limit", LIMIT_MPS),
+        notes=(*origin_notes(origin), *clock.notes, *notes, *lane_notes),
+    )
+
+
+def _read_rows(file: Path) -> dict[str, np.ndarray]:
+    """The columns of a scenario, none of whose cells is empty."""
+    source = open_table(file)
+    if source.layout is not None:
+        raise InputError(f"{file}: parquet: text: expected Parquet")
+    needed = [name for name in (*NUMBERS, *TEXT) if name not in OPTIONAL]
+    needed += [name for name in OPTIONAL if name in source.header]
+    ledger = Ledger(path=file, unit=source.unit, allowed=0.0)
+    return read(source, fields_of(source, needed, texts=TEXT), ledger)
+
+
+def _constant(file: Path, table: dict[str, np.ndarray], field: str) -> str:
+    """The one value of a column that says the same in every row."""
+    values = np.unique(table[field])
+    if values.size != 1 or not str(values[0]).strip():
+        raise InputError(
+            f"{file}: {field}: {list(map(str, values[:3]))}: expected one for all rows"
+        )
+    return str(values[0])
+
+
+def _clock(file: Path, table: dict[str, np.ndarray]) -> _Clock:
+    """Checks steps against their number; the stamps [ns] against 10 Hz."""
+    steps, count = table["timestep"], table["num_timestamps"][0]
+    if not 1 <= count <= MAX_STEPS:
+        raise InputError(
+            f"{file}: num_timestamps: {count:g}: expected 1 to {MAX_STEPS}"
+        )
+    bad = np.flatnonzero((steps < 0) | (steps >= count) | (steps % 1.0 != 0.0))
+    if bad.size:
+        raise InputError(
+            f"{file}: row {bad[0]}: timestep: {steps[bad[0]]:g}: "
+            f"expected a whole number from 0 to {count - 1:g}"
+        )
+    table["timestep"] = steps - steps.min()
+    span = (table["end_timestamp"][0] - table["start_timestamp"][0]) * 1e-9
+    step = span / max(count - 1, 1)
+    if count == 1 or abs(step / STEP_S - 1.0) <= STEP_TOLERANCE:
+        return _Clock(step=STEP_S, notes=())
+    note = f"timestamps {step:g} s apart; {STEP_S:g} s assumed, as specified"
+    return _Clock(step=STEP_S, notes=(note,))
+
+
+def _map_file(file: Path, name: str) -> Path:
+    """The map beside a scenario, named by the scenario file or its id."""
+    stem = file.name.removeprefix(PREFIX).removesuffix(SUFFIX)
+    names = [f"log_map_archive_{key}.json" for key in (stem, name)]
+    safe = [n for n in names if Path(n).name == n]
+    for place in (file.parent / n for n in safe):
+        if place.is_file():
+            return place
+    raise InputError(f"{file}: map: missing: expected {names[0]} beside it")
+
+
+def _read_tracks(
+    file: Path, table: dict[str, np.ndarray], clock: _Clock, spec: dict
+) -> tuple[tuple[Track, ...], list[str]]:
+    category = table["object_category"]
+    bad = np.flatnonzero(~np.isin(category, np.arange(MAX_CATEGORY + 1)))
+    if bad.size:
+        raise InputError(
+            f"{file}: row {bad[0]}: object_category: {category[bad[0]]:g}: "
+            f"expected 0 to {MAX_CATEGORY}"
+        )
+    users = np.unique(table["track_id"], return_inverse=True)[1]
+    kept, notes = once_each(users, table["timestep"])
+    table = {name: column[kept] for name, column in table.items()}
+    category = table["object_category"]
+    speed = np.hypot(table["velocity_x"], table["velocity_y"])
+    least = number(spec, "min_category", FRAGMENT)
+    tracks, low, wild = [], 0, 0
+    pieces = split_tracks(file, table["track_id"], table["timestep"], MAX_GAP_STEPS)
+    for name, rows in pieces:
+        if category[rows[0]] < least:
+            low += 1
+        elif category[rows[0]] == FRAGMENT and speed[rows].max() > MAX_SPEED_MPS:
+            wild += 1
+        else:
+            tracks.append(_track(file, name, table, rows, clock, spec))
+    # sizes are the source TOML's, so that a wrong one is no outlier
+    # the recording car's own speed is measured: if that is wrong, so is the file
+    tracks, outliers = without_outliers(
+        tracks, lambda track: track.id == RECORDER or has_possible_speed(track)
+    )
+    if low:
+        notes.append(f"{low} tracks below category {least:g} left out")
+    if wild:
+        notes.append(f"{wild} track fragments of impossible speed left out")
+    notes += [*outliers, "box sizes by object type: the log has none"]
+    return tuple(tracks), notes
+
+
+def _track(
+    file: Path,
+    name: str,
+    table: dict[str, np.ndarray],
+    rows: np.ndarray,
+    clock: _Clock,
+    spec: dict,
+) -> Track:
+    found = str(table["object_type"][rows[0]])
+    kind = kind_of(f"{file}: track {name}", found, section(spec, "kinds"))
+    length, width = _size(spec, name.partition("#")[0], found)
+    return Track(
+        id=name,
+        kind=kind,
+        length=length,
+        width=width,
+        size_assumed=True,
+        t=table["timestep"][rows] * clock.step,
+        x=table["position_x"][rows],
+        y=table["position_y"][rows],
+        heading=table["heading"][rows],
+        speed=np.hypot(table["velocity_x"][rows], table["velocity_y"][rows]),
+        automated=recording_car(spec) if name.partition("#")[0] == RECORDER else (),
+    )
+
+
+def _size(spec: dict, name: str, found: str) -> tuple[float, float]:
+    """Box [length, width] m by track id (the AV's), else by object type."""
+    sizes = section(spec, "sizes")
+    size = sizes.get(name, sizes.get(found))
+    try:
+        length, width = map(float, size or ())
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"source TOML: sizes.{found}: {size}: expected [length, width] in m"
+        ) from error
+    return length, width

@@ -1,0 +1,397 @@
+"""What the columns of a user's table mean: the source TOML, and what it leaves open.
+
+The TOML says which column is which field, in which unit, with which scale and offset.
+What it does not say is recognised by the columns' names and first cells: ISO times,
+latitude and longitude. A column name with {id} stands for one column per road user, of
+tables with one row per frame.
+"""
+
+import dataclasses
+import math
+import re
+from collections.abc import Mapping as AnyMapping
+from collections.abc import Sequence
+
+import numpy as np
+
+from rcirl_jax.data.formats.csv.dates import date_pattern
+from rcirl_jax.data.formats.options import (
+    UNITS,
+    number,
+    positive,
+    section,
+)
+from rcirl_jax.data.readers.tables.cells import EMPTY, ISO
+from rcirl_jax.data.readers.tables.layout import NUMBER
+from rcirl_jax.data.readers.tables.table import (
+    MAX_PLACE_M,
+    MAX_TIME,
+    MAX_VELOCITY_MPS,
+    Field,
+    Table,
+)
+from rcirl_jax.errors import InputError
+from rcirl_jax.runtime.settings import check_names
+
+NEEDED = ("t", "id", "x", "y")
+TEXT = ("id", "kind", "lane", "recording", "automated")
+OPTIONAL = (
+    *("heading", "speed", "vx", "vy", "length", "width"),
+    *("kind", "lane", "recording", "automated"),
+)
+EXPECTED = (*NEEDED, "automated")  # errors where they are named and not there
+EARTH = {"lat": "y", "lon": "x"}  # names of x and y in degrees
+CLOCKS = ("s", "ms", "us", "ns", "min", "h", "day", "frame")
+LENGTHS = ("m", "ft", "km", "cm", "mm")
+SPEEDS = ("m/s", "km/h", "mph", "ft/s", "kn")
+ANGLES = ("rad", "deg")
+ALLOWED_UNITS = {
+    "t": (*CLOCKS, ISO),
+    **dict.fromkeys(("x", "y"), (*LENGTHS, *ANGLES)),
+    **dict.fromkeys(("length", "width"), LENGTHS),
+    **dict.fromkeys(("speed", "vx", "vy"), SPEEDS),
+    "heading": ANGLES,
+}
+# in the file's unit: what no log can mean
+LIMITS = {
+    "t": MAX_TIME,
+    **dict.fromkeys(("x", "y"), MAX_PLACE_M),
+    **dict.fromkeys(("speed", "vx", "vy"), MAX_VELOCITY_MPS),
+    "heading": MAX_PLACE_M,
+}
+DEGREES = {"x": 360.0, "y": 90.0}  # longitude counts from -180 or from 0
+RATE_HZ = 10.0  # 1/s
+ISO_TIMES = r"\d{4}-\d\d-\d\d[T ]|\d{8}T\d|\d{4}/\d\d/\d\d |\d{1,2}:\d\d"  # as read
+WORD = r"[A-Z]+(?![^\W\d_A-Z])|[A-Z]?[^\W\d_A-Z]+"  # of a name in camel case too
+DEGREE_M = 111_320.0  # m of a degree of latitude
+MIDDLE_DIGITS = 2  # of latitude and longitude of the projection's middle
+HOLE = "{id}"  # in a column's name: which road user's it is
+WORDS = {
+    "x": {"lon", "lng", "long", "longitude", "längengrad", "laengengrad"},
+    "y": {"lat", "latitude", "breitengrad"},
+}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Mapping:
+    """The fields of one table, and how its positions and headings are meant."""
+
+    fields: tuple[Field, ...]
+    rate_hz: float
+    # latitude and longitude [deg] of the projection's middle; None: x and y are metres
+    middle: tuple[float, float] | None = None
+    degrees: float = 1.0  # of latitude and longitude in the file's unit
+    heading_unit: str = ""  # rad or deg; "": recognised
+    has_units: bool = True  # whether the TOML says the unit of x and y
+    is_clock: bool = False  # whether t is a time of day
+    notes: tuple[str, ...] = ()
+
+    def distance(self, dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
+        """Metres [n] of differences in x and y as rows have them, roughly on earth."""
+        if self.middle is None:
+            return np.hypot(dx, dy)
+        turn, north = 360.0 / self.degrees, self.degrees * DEGREE_M
+        east = north * math.cos(math.radians(self.middle[0]))
+        dx = (dx + 0.5 * turn) % turn - 0.5 * turn  # over the 180th meridian
+        return np.hypot(east * dx, north * dy)
+
+
+def mapping_of(table: Table, spec: AnyMapping) -> Mapping:
+    """The mapping of a table by its source TOML.
+
+    Raises:
+      InputError: an unknown field or unit, a needed column that is missing.
+    """
+    rate = positive({**spec, **section(spec, "defaults")}, "rate_hz", RATE_HZ)
+    columns, units, notes = _columns(table, spec)
+    _check_units(table, spec, units)
+    found, missing = _found(table, columns)
+    notes += missing
+    middle, degrees = None, 1.0
+    if units.get("x") in ANGLES:
+        degrees = 1.0 if units["x"] == "deg" else math.degrees(1.0)
+        middle = _middle(table, found, degrees, spec)
+        notes.append(
+            f"latitude, longitude projected about {middle[0]:g}, {middle[1]:g} degrees"
+        )
+    clock = next(name for field, name, _ in found if field == "t")
+    form, factor = _time(table, clock, units.get("t"), rate, notes)
+    limit = math.inf if form else LIMITS["t"] / min(factor, 1.0)
+    fields = [_field(field, name, user, units, spec) for field, name, user in found]
+    fields = [
+        dataclasses.replace(f, form=form, limit=limit, factor=f.factor * factor)
+        if f.name == "t"
+        else f
+        for f in fields
+    ]
+    return Mapping(
+        fields=tuple(fields),
+        rate_hz=rate,
+        middle=middle,
+        degrees=degrees,
+        heading_unit=units.get("heading", ""),
+        has_units="x" in section(spec, "units") or middle is not None,
+        is_clock=_is_clock(form, first_cell(table, clock.lstrip("-"))),
+        notes=tuple(notes),
+    )
+
+
+def _columns(
+    table: Table, spec: AnyMapping
+) -> tuple[dict[str, str], dict[str, str], list[str]]:
+    """(field -> column, field -> unit, notes), latitude and longitude as y and x."""
+    columns, units = dict(section(spec, "columns")), dict(section(spec, "units"))
+    where, every = f"{table.path}: columns.", (*NEEDED, *OPTIONAL, *EARTH)
+    for field, column in columns.items():
+        check_names(where, {field: column}, every)
+        if not isinstance(column, str) or not column:
+            raise InputError(f"{where}{field}: {column}: expected a name")
+    for name, field in EARTH.items():
+        if name in columns:
+            if field in columns:
+                raise InputError(
+                    f"{where}{name}: {columns[name]}: expected it, or "
+                    f"columns.{field}, not both"
+                )
+            columns[field] = columns.pop(name)
+            units[field] = units.pop(name, "deg")
+    is_wide = HOLE in columns.get("x", "")
+    for field in NEEDED:
+        if field not in columns and not (is_wide and field == "id"):
+            raise InputError(f"{where}{field}: missing: expected a column")
+    if is_wide and "id" in columns:
+        raise InputError(
+            f"{where}id: {columns['id']}: expected none beside "
+            f"columns.x = {columns['x']!r}, whose {HOLE} is the id"
+        )
+    _check_texts(where, columns)
+    notes: list[str] = []
+    if "x" not in units and "y" not in units and not is_wide:
+        columns, units = _recognised_earth(table, columns, units, notes)
+    return columns, units, notes
+
+
+def _check_texts(where: str, columns: AnyMapping[str, str]) -> None:
+    """No column of numbers is one that is read as text."""
+    texts = {columns[field] for field in TEXT if field in columns}
+    for field, column in columns.items():
+        if field not in TEXT and column in texts:
+            raise InputError(
+                f"{where}{field}: {column}: expected a column of "
+                "numbers, not one that is read as text"
+            )
+
+
+def words_of(name: str) -> set[str]:
+    """Words of a column's name, in small letters: gpsLon and GPS_Lon hold lon."""
+    return {word.lower() for word in re.findall(WORD, name)}
+
+
+def _recognised_earth(
+    table: Table, columns: dict[str, str], units: dict[str, str], notes: list[str]
+) -> tuple[dict[str, str], dict[str, str]]:
+    """The columns, with x and y in degrees where their names and cells say so."""
+    for x, y in (("x", "y"), ("y", "x")):
+        named = WORDS["x"] & words_of(columns[x]) and WORDS["y"] & words_of(columns[y])
+        if not named or not (table.has(columns["x"]) and table.has(columns["y"])):
+            continue
+        cells = {"x": columns[x], "y": columns[y]}
+        if all(_within(table, cells[axis], DEGREES[axis]) for axis in "xy"):
+            notes.append(f"columns {columns[x]}, {columns[y]}: longitude and latitude")
+            return {**columns, **cells}, {**units, "x": "deg", "y": "deg"}
+    return columns, units
+
+
+def known_cells(table: Table, column: str) -> list[str]:
+    """The first cells of a column that are not empty."""
+    return [cell for cell in table.samples(column) if cell.lower() not in EMPTY]
+
+
+def first_cell(table: Table, column: str) -> str:
+    """The first cell of a column that is not empty, "" without one."""
+    return next(iter(known_cells(table, column)), "")
+
+
+def sampled(table: Table, column: str) -> np.ndarray:
+    """The numbers among the first cells of a column."""
+    cells = table.samples(column)
+    if table.marks(column)[0] == ",":
+        cells = [cell.replace(",", ".") for cell in cells]
+    return np.array([float(cell) for cell in cells if NUMBER.fullmatch(cell)])
+
+
+def _scaled(field: str, spec: AnyMapping) -> tuple[float, float]:
+    """Scale and offset of a field, also under its name as latitude or longitude."""
+    alias = next((name for name, own in EARTH.items() if own == field), field)
+    scale, offset = section(spec, "scale"), section(spec, "offset")
+    return (
+        number(scale, field, number(scale, alias, 1.0)),
+        number(offset, field, number(offset, alias, 0.0)),
+    )
+
+
+def _within(table: Table, column: str, limit: float) -> bool:
+    found = sampled(table, column)
+    return bool(found.size) and bool(np.all(np.abs(found) <= limit))
+
+
+def _middle(
+    table: Table,
+    found: Sequence[tuple[str, str, str | None]],
+    degrees: float,
+    spec: AnyMapping,
+) -> tuple[float, float]:
+    """Latitude and longitude [deg] near the first rows, rounded."""
+    places = []
+    for axis in ("y", "x"):
+        names = [name.lstrip("-") for field, name, _ in found if field == axis]
+        values = np.concatenate([sampled(table, name) for name in names])
+        scale, offset = _scaled(axis, spec)
+        known = (values[values != 0.0] * scale + offset) * degrees
+        known = known[np.abs(known) <= DEGREES[axis]]
+        if axis == "x" and known.size:  # 179.9 and -179.9 are near each other
+            known = known[0] + (known - known[0] + 180.0) % 360.0 - 180.0
+        places.append(
+            round(float(np.median(known)), MIDDLE_DIGITS) if known.size else 0.0
+        )
+    return places[0], (places[1] + 180.0) % 360.0 - 180.0
+
+
+def _check_units(table: Table, spec: AnyMapping, units: dict[str, str]) -> None:
+    """Units are known; scales and offsets are numbers of fields that have a unit."""
+    fields = (*ALLOWED_UNITS, *EARTH)
+    scaled = {name: section(spec, name) for name in ("scale", "offset")}
+    for name, own in {"units": units, **scaled}.items():
+        known = ALLOWED_UNITS if name == "units" else fields
+        check_names(f"{table.path}: {name}.", own, [*known])
+    for field, unit in units.items():
+        is_pattern = field == "t" and "%" in str(unit)
+        if unit not in ALLOWED_UNITS[field] and not is_pattern:
+            raise InputError(
+                f"{table.path}: units.{field}: {unit}: "
+                f"expected one of {', '.join(ALLOWED_UNITS[field])}"
+            )
+    if (units.get("x") in ANGLES) != (units.get("y") in ANGLES):
+        raise InputError(
+            f"{table.path}: units.x, units.y: {units.get('x', 'm')} and "
+            f"{units.get('y', 'm')}: expected both in degrees or both in metres"
+        )
+
+
+def _found(
+    table: Table, columns: AnyMapping[str, str]
+) -> tuple[list[tuple[str, str, str | None]], list[str]]:
+    """(field, column with its sign, user) of all columns, and notes on missing ones."""
+    found: list[tuple[str, str, str | None]] = []
+    missing: list[str] = []
+    users = _users(table, columns) if HOLE in columns.get("x", "") else []
+    if not users:
+        _check_is_log(table, [columns[field] for field in NEEDED])
+    for field, name in columns.items():
+        plain = name.removeprefix("-") if field not in TEXT else name
+        sign = name[: len(name) - len(plain)]
+        for user in users if HOLE in name else [None]:
+            column = plain if user is None else plain.replace(HOLE, user)
+            if table.has(column):
+                found.append((field, sign + column, user))
+            elif field in EXPECTED:
+                table.place(column)  # says that it is missing
+            elif user is None:
+                missing.append(f"no column '{column}': {field} computed or by default")
+    return found, missing
+
+
+def _check_is_log(table: Table, needed: Sequence[str]) -> None:
+    """A table has some of the columns needed, or no header that names any.
+
+    Raises:
+      InputError: it is another table, as a list of files beside the logs is.
+    """
+    if any(table.has(name.lstrip("-")) for name in needed):
+        return
+    if not any(NUMBER.fullmatch(name) for name in table.header):
+        raise InputError(
+            f"{table.path}: header: {[*table.header[:20]]}: none of the columns "
+            f"{', '.join(needed)}: expected a log; `pattern` of the TOML leaves out "
+            "tables that are none"
+        )
+
+
+def _users(table: Table, columns: AnyMapping[str, str]) -> list[str]:
+    """Road users that have both an x and a y in a row per frame."""
+    own = []
+    for field in ("x", "y"):
+        name = columns[field].removeprefix("-")
+        before, _, after = name.partition(HOLE)
+        pattern = re.compile(f"{re.escape(before)}(.+){re.escape(after)}")
+        matches = (pattern.fullmatch(column) for column in table.header)
+        own.append([match[1] for match in matches if match])
+    both = set(own[1])
+    users = [user for user in own[0] if user in both]
+    numbered = [user for user in users if user.isdigit()]
+    if not users:
+        raise InputError(
+            f"{table.path}: columns.x: {columns['x']}: expected columns of this name "
+            f"and of {columns['y']} in the header, such as for {HOLE} = 1"
+        )
+    return numbered or users
+
+
+def _time(
+    table: Table, name: str, unit: str | None, rate: float, notes: list[str]
+) -> tuple[str, float]:
+    """(form, factor) of the clock; where nothing is said, as its first cells are."""
+    first = first_cell(table, name.lstrip("-"))
+    is_iso = re.match(ISO_TIMES, first) is not None
+    if unit is None and is_iso:
+        notes.append(f"column {name}: ISO times")
+        return ISO, 1.0
+    pattern = date_pattern(known_cells(table, name.lstrip("-")))
+    if unit is None and pattern:
+        notes.append(f"column {name}: times as {pattern}")
+        return pattern, 1.0
+    if unit == ISO or (unit is not None and "%" in unit):
+        return unit, 1.0
+    if is_iso or pattern:
+        raise InputError(
+            f"{table.path}: units.t: {unit}: the cells of {name} are such as "
+            f"'{first[:40]}': expected {pattern or ISO}"
+        )
+    return "", 1.0 / rate if unit == "frame" else UNITS[unit or "s"]
+
+
+def _is_clock(form: str, first: str) -> bool:
+    """Whether times are those of a day that nobody names."""
+    if form == ISO:
+        return re.match(r"\d{1,2}:\d", first) is not None
+    return bool(re.search("%[HI]", form)) and not re.search("%[djcxU]", form)
+
+
+def _field(
+    field: str,
+    name: str,
+    user: str | None,
+    units: AnyMapping[str, str],
+    spec: AnyMapping,
+) -> Field:
+    """One column as the reader takes it; "-name" turns an axis round."""
+    plain = name.removeprefix("-") if field not in TEXT else name
+    scale, offset = _scaled(field, spec)
+    unit, limit, factor = units.get(field, ""), LIMITS.get(field, np.inf), 1.0
+    is_place_on_earth = unit in ANGLES and field in DEGREES
+    if is_place_on_earth:
+        limit = DEGREES[field] * (UNITS["deg"] if unit == "rad" else 1.0)
+    elif unit in UNITS and field not in ("heading", "t"):
+        factor = UNITS[unit]
+    return Field(
+        name=field,
+        column=plain,
+        needed=field in (*NEEDED, "recording"),
+        text=field in TEXT,
+        scale=scale,
+        offset=offset,
+        factor=-factor if plain != name else factor,
+        limit=limit,
+        zero_is_empty=is_place_on_earth,
+        user=user,
+    )

@@ -1,0 +1,280 @@
+"""INTERACTION dataset: drone tracks of every kind of junction, with maps.
+
+Two layouts, told apart by the column case_id: the recordings of 2019
+(recorded_trackfiles/SCENE/vehicle_tracks_NNN.csv with pedestrian_tracks_NNN.csv
+beside it) and the prediction challenge of 2021 (train/SCENE_train.csv: cases of
+4 s, each a Recording here). Maps are Lanelet2 files, maps/SCENE.osm_xy in
+metres or maps/SCENE.osm in degrees about (0, 0). Specification: README.md of
+interaction-dataset/interaction-dataset and of
+INTERPRET_challenge_multi-agent.
+
+Traps: pedestrians have no heading and no size (columns missing or cells
+empty), their numbers are text ("P4"), "pedestrian/bicycle" is one class, frames
+may start at 0 or 1, challenge files hold what is asked for in SCENE_obs.csv.
+"""
+
+import contextlib
+import dataclasses
+import functools
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from rcirl_jax.data.formats.declared import (
+    KINDS,
+    Columns,
+    Rows,
+    open_log,
+    unknown_kinds,
+)
+from rcirl_jax.data.formats.files import (
+    given_map,
+    input_files,
+    is_input,
+    log_name,
+)
+from rcirl_jax.data.formats.lanelet2.map import read_lanelet2
+from rcirl_jax.data.formats.options import number
+from rcirl_jax.data.formats.paths import path_lanes
+from rcirl_jax.data.formats.perception import SIZES_M
+from rcirl_jax.data.formats.projection import utm, utm_zone
+from rcirl_jax.data.formats.tracks import split_tracks, travel_heading
+from rcirl_jax.data.readers.tables.ledger import LINE, Ledger, NoRowsError, with_news
+from rcirl_jax.data.readers.tables.repair import once
+from rcirl_jax.data.readers.tables.table import open_table, read
+from rcirl_jax.data.recording import accepted, validate_recording
+from rcirl_jax.errors import InputError
+from rcirl_jax.types import Kind, Lane, Recording, Track
+
+TABLE = Columns(
+    needed={
+        **{"track_id": "text", "timestamp_ms": "time", "agent_type": "text"},
+        **{"x": "place", "y": "place", "vx": "speed", "vy": "speed"},
+    },
+    optional=dict.fromkeys(("case_id", "psi_rad", "length", "width"), "number"),
+    t="timestamp_ms",
+)
+VEHICLES = "vehicle_tracks_"
+PEDESTRIANS = "pedestrian_tracks_"
+# files of a release that are no logs: predictions to hand in, 1 s observations
+LEFT_OUT = ("_sub.csv", "_obs.csv")
+SETS = ("_train", "_val", "_test", "_obs")
+# folders below a scene's, made by the data set's own split_train_val_script.py
+SPLITS = ("train", "val", "sorted")
+EITHER = "pedestrian/bicycle"
+MAPS_UP = 5  # folders above a log in which that of the maps is looked for
+MAX_GAP_MS = 550.0  # ms missing inside one track
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Scene:
+    """What recordings of one file share."""
+
+    path: Path
+    spec: dict
+    lanes: tuple[Lane, ...] | None  # None: fitted to the paths of each
+    limit: float  # m/s, of lanes without one
+    notes: tuple[str, ...]
+
+
+def recordings(path: Path, spec: dict) -> Iterator[Recording]:
+    """One Recording per vehicle file, or per case of a challenge file."""
+    for file in parts(path, spec):
+        rows, ledger = _read(file, spec)
+        scene, ledgers = _scene(file, spec), [ledger]
+        if np.isfinite(rows["case_id"]).any():
+            for made in _cases(rows, scene):
+                yield with_news(made, ledger)
+            continue
+        partner = file.with_name(file.name.replace(VEHICLES, PEDESTRIANS, 1))
+        if partner != file and partner.is_file():
+            with contextlib.suppress(NoRowsError):  # no pedestrians
+                others, ledger = _read(partner, spec)
+                rows = {k: np.concatenate([rows[k], others[k]]) for k in rows}
+                ledgers.append(ledger)
+        own = own_name(file)
+        name = log_name(file, spec, own)
+        # logs of one name may be copies of each other
+        group = None if name == own else own
+        made = _recording(name, rows, scene, group)
+        yield validate_recording(with_news(made, *ledgers), file)
+
+
+def parts(path: Path, spec: dict) -> list[Path]:
+    """The log files below a folder, no other tables; pedestrians with vehicles."""
+    if path.is_file():
+        return [path]
+    tables = sorted(file for file in path.rglob("*.csv") if is_input(path, file))
+    found = [file for file in tables if _is_log(file)]
+    names = set(found)
+    kept = [
+        file
+        for file in found
+        if not file.name.startswith(PEDESTRIANS)
+        or file.with_name(file.name.replace(PEDESTRIANS, VEHICLES, 1)) not in names
+    ]
+    return kept or input_files(path, "**/*.csv")
+
+
+def _is_log(path: Path) -> bool:
+    """Whether a file has a log's name, or its columns under another name."""
+    if path.name.endswith(LEFT_OUT):
+        return False
+    if path.name.startswith((VEHICLES, PEDESTRIANS)) or path.stem.endswith(SETS):
+        return True
+    try:
+        header = open_table(path).header
+    except InputError:
+        return False
+    return {"track_id", "timestamp_ms"} <= set(header)
+
+
+def own_name(file: Path) -> str:
+    """Name of a log, as long as no other folder has one called alike."""
+    if not file.name.startswith((VEHICLES, PEDESTRIANS)):
+        return file.stem
+    number_ = file.stem.removeprefix(VEHICLES).removeprefix(PEDESTRIANS)
+    return f"{_scene_name(file)}-{number_}"
+
+
+def _scene_name(path: Path) -> str:
+    """Name of the place: the folder, or the challenge file without its set."""
+    if path.name.startswith((VEHICLES, PEDESTRIANS)):
+        folders = [folder.name for folder in path.resolve().parents]
+        return next((name for name in folders if name not in SPLITS), folders[0])
+    return next(
+        (path.stem.removesuffix(s) for s in SETS if path.stem.endswith(s)), path.stem
+    )
+
+
+def _read(path: Path, spec: dict) -> tuple[Rows, Ledger]:
+    """All columns this module uses, and what became of the rows.
+
+    NaN where a file or a cell has none; a road user is one of a case.
+    """
+    table, ledger = open_log(path, spec)
+    rows = read(table, TABLE.fields(table), ledger)
+    rows = dict.fromkeys(TABLE.optional, np.full(rows[LINE].size, np.nan)) | rows
+    unknown = ~np.isfinite(rows["case_id"])
+    if table.has("case_id") and unknown.any():
+        line = rows[LINE][unknown][0]
+        raise InputError(f"{path}: line {line}: case_id: '': expected a number")
+    users, codes = np.unique(rows["track_id"], return_inverse=True)
+    cases = np.unique(rows["case_id"], return_inverse=True)[1]
+    rows["user"] = (cases * users.size + codes).astype(float)
+
+    def name_of(user: float) -> str:
+        return str(users[int(user) % users.size])
+
+    return once(rows, ledger, TABLE.t, "user", name_of=name_of), ledger
+
+
+def _scene(path: Path, spec: dict) -> _Scene:
+    place = _find_map(path, spec)
+    limit = number(spec, "default_speed_limit")
+    lanes, notes = None, ["no map found; lanes fitted to the longest paths"]
+    if place is not None:
+        zone = utm_zone(0.0)
+        origin = utm(np.zeros(1), np.zeros(1), zone)
+        lanes, notes = read_lanelet2(place, lambda a, b: utm(a, b, zone) - origin)
+        known = [lane.speed_limit for lane in lanes if lane.speed_limit is not None]
+        limit = float(np.median(known)) if known else limit
+    return _Scene(path=path, spec=spec, lanes=lanes, limit=limit, notes=tuple(notes))
+
+
+def _find_map(path: Path, spec: dict) -> Path | None:
+    """maps/SCENE.osm_xy or .osm in a folder above; the option `map` names one."""
+    folders = [folder / "maps" for folder in path.resolve().parents[:MAPS_UP]]
+    if (given := given_map(spec)) is not None:
+        if given.is_file():
+            return given
+        folders = [given]
+    name = _scene_name(path)
+    for folder in folders:
+        for ending in (".osm_xy", ".osm"):
+            exact = folder / f"{name}{ending}"
+            if exact.is_file():
+                return exact
+        # maps of ZS are called ZS0 and ZS2 in one release and ZS in another; EP0
+        # and EP1 are two places
+        near = [
+            file
+            for file in sorted(folder.glob("*.osm*"))
+            if is_input(folder, file) and _is_numbered(file.stem, name)
+        ]
+        if len({file.stem for file in near}) == 1:
+            return near[-1]
+    return None
+
+
+def _is_numbered(one: str, other: str) -> bool:
+    """Whether one of two names is the other with a number behind it."""
+    short, long = sorted((one, other), key=len)
+    return long.removeprefix(short).isdigit() and not short[-1:].isdigit()
+
+
+def _cases(table: Rows, scene: _Scene) -> Iterator[Recording]:
+    """One Recording per case; all of a file are one group, they share vehicles."""
+    order = np.argsort(table["case_id"], kind="stable")
+    case = table["case_id"][order]
+    for rows in np.split(order, np.flatnonzero(np.diff(case)) + 1):
+        part = {field: values[rows] for field, values in table.items()}
+        log = log_name(scene.path, scene.spec, scene.path.stem)
+        name = f"{log}-case{part['case_id'][0]:g}"
+        make = functools.partial(_recording, name, part, scene, scene.path.stem)
+        yield accepted(make, name, scene.path, scene.spec)
+
+
+def _recording(name: str, table: Rows, scene: _Scene, group: str | None) -> Recording:
+    stamps = table["timestamp_ms"]
+    table["t"] = (stamps - stamps.min()) / 1000.0
+    pieces = split_tracks(scene.path, table["track_id"], stamps, MAX_GAP_MS)
+    notes = list(scene.notes)
+    tracks = tuple(_track(label, rows, table, scene) for label, rows in pieces)
+    kinds = set(np.unique(table["agent_type"])) - {EITHER}
+    notes += unknown_kinds("agent types", kinds)
+    lanes = scene.lanes
+    if lanes is None:
+        width = number(scene.spec, "lane_width_m")
+        lanes = path_lanes(tracks, width, None)
+    return Recording(
+        name=name,
+        source=scene.spec["source"],
+        licence=scene.spec["licence"],
+        rate_hz=number(scene.spec, "rate_hz"),
+        tracks=tracks,
+        lanes=lanes,
+        group=group,
+        default_speed_limit=scene.limit,
+        notes=tuple(notes),
+    )
+
+
+def _track(name: str, rows: np.ndarray, table: Rows, scene: _Scene) -> Track:
+    t, x, y, psi = (table[field][rows] for field in ("t", "x", "y", "psi_rad"))
+    speed = np.hypot(table["vx"][rows], table["vy"][rows])
+    agent = str(table["agent_type"][rows[0]]).lower()
+    kind = KINDS.get(agent, Kind.VEHICLE)
+    if agent == EITHER:
+        fast = number(scene.spec, "cyclist_speed_mps")
+        rides = float(np.percentile(speed, 90.0)) > fast
+        kind = Kind.CYCLIST if rides else Kind.PEDESTRIAN
+    sizes, guessed = [], False
+    for field, default in zip(("length", "width"), SIZES_M[kind], strict=True):
+        known = table[field][rows]
+        known = known[np.isfinite(known) & (known > 0.0)]
+        sizes.append(float(np.median(known)) if known.size else default)
+        guessed |= not known.size
+    return Track(
+        id=name,
+        kind=kind,
+        length=sizes[0],
+        width=sizes[1],
+        size_assumed=guessed,
+        t=t,
+        x=x,
+        y=y,
+        heading=psi if np.isfinite(psi).all() else travel_heading(t, x, y),
+        speed=speed,
+    )

@@ -1,0 +1,273 @@
+"""Semantic map of the L5 data: lanes, speed limits, stop signs, light faces.
+
+Points are centimetres in a local frame of each lane (east, north, up at a latitude
+and longitude); meta.json holds the transform of the dataset's world to Earth-centred
+coordinates.
+"""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from google.protobuf.message import DecodeError
+
+from rcirl_jax.data.formats.l5.messages import COLOURS, read_message
+from rcirl_jax.data.formats.options import path_option
+from rcirl_jax.data.formats.projection import earth_centred
+from rcirl_jax.data.formats.shapes import (
+    Roads,
+    between_bounds,
+    check_coordinates,
+    moves,
+)
+from rcirl_jax.data.formats.signals import STATES, held, signal_of
+from rcirl_jax.data.readers.protobuf import Message
+from rcirl_jax.errors import InputError
+from rcirl_jax.runtime.atomic_files import read_json
+from rcirl_jax.runtime.checked import checked
+from rcirl_jax.types import Lane, Signal
+
+MAX_MAP_BYTES = 32 * 1024**2  # bytes; the public map has some 10 MB
+MAX_META_BYTES = 16 * 1024**2  # bytes of meta.json
+HOLD_S = 1.0  # s, a light unseen keeps its state this long
+MAX_LIMIT_MPS = 60.0  # m/s; faster "limits" are none
+ONLY_BIKE = 4  # AccessRestriction.Type
+BACKWARD = 3  # RoadNetworkSegment.TravelDirection
+
+
+def find_map(folder: Path, spec: dict) -> Path | None:
+    """semantic_map.pb as named in the TOML, or beside or above a dataset."""
+    name = path_option(spec, "map")
+    above = folder.resolve().parents
+    if name:
+        places = [place / name for place in (Path(), folder, *above[:3])]
+        found = next((place for place in places if place.is_file()), None)
+        if found is None:
+            raise InputError(f"source TOML: map: {name}: expected a semantic map")
+        return found
+    places = [
+        place / inner / "semantic_map.pb"
+        for place in (folder, *above[:2])
+        for inner in ("", "semantic_map")
+    ]
+    return next((place for place in places if place.is_file()), None)
+
+
+class SemanticMap:
+    """All lanes of a map in the dataset's world, and the lights' faces."""
+
+    def __init__(self, file: Path, to_ecef: np.ndarray) -> None:
+        """Reads the whole map once.
+
+        Args:
+          file: semantic_map.pb.
+          to_ecef: of `world_to_ecef`.
+
+        Raises:
+          InputError: no protocol buffer, coordinates off the Earth.
+        """
+        self.file = file
+        self._to_world = np.linalg.inv(to_ecef)
+        self._limits: dict[str, tuple[float, float]] = {}  # forward, backward
+        self._faces: dict[str, str] = {}  # id -> colour
+        self._lights: dict[str, tuple[str, ...]] = {}  # id -> ids of its faces
+        self._stop_signs: set[str] = set()
+        if file.stat().st_size > MAX_MAP_BYTES:
+            raise InputError(
+                f"{file}: size: {file.stat().st_size} bytes: "
+                f"expected at most {MAX_MAP_BYTES}"
+            )
+        try:
+            raw = dict(self._elements(read_message(file.read_bytes())))
+            found = (self._lane(name, lane) for name, lane in raw.items())
+            lanes = {lane.id: lane for lane in found if lane is not None}
+        except DecodeError as error:
+            raise InputError(f"{file}: {error}: expected a semantic map") from error
+        if not lanes:
+            raise InputError(f"{file}: lanes: none: expected a semantic map")
+        every = list(lanes.values())
+        self.roads = Roads([lane.centre for lane in every], every.__getitem__)
+
+    def signals(
+        self,
+        lanes: Sequence[Lane],
+        t: np.ndarray,
+        frame: np.ndarray,
+        face: np.ndarray,
+        is_active: np.ndarray,
+    ) -> tuple[Signal, ...]:
+        """One signal per set of faces that governs a lane and was seen.
+
+        The state of a frame is the colour that most lit faces of the set show;
+        a set unseen for a second is off.
+
+        Args:
+          lanes: of the scene.
+          t: [frames] s.
+          frame: [n] number of the frame in which a face was seen, ascending.
+          face: [n] its id, text.
+          is_active: [n] whether it was lit.
+        """
+        found = []
+        for name in dict.fromkeys(name for lane in lanes for name in lane.signal_ids):
+            members = np.array(name.split("|"))
+            colours = np.array([STATES.index(self._faces[one]) for one in members])
+            rows = np.flatnonzero(np.isin(face, members))
+            if rows.size == 0:
+                continue
+            order = np.argsort(members)
+            place = order[np.searchsorted(members[order], face[rows])]
+            votes = np.zeros((t.size, len(STATES)), np.int64)
+            np.add.at(votes, (frame[rows], colours[place]), is_active[rows])
+            frames = np.unique(frame[rows])
+            # without a vote it is off; ties go to the first
+            states = held(t, t[frames], votes[frames].argmax(axis=1), HOLD_S)
+            found.append(signal_of(name, t, states))
+        return tuple(found)
+
+    def _elements(self, fragment: Message) -> Iterator[tuple[str, Message]]:
+        """Lanes of a MapFragment by id; limits and controls are kept on the way.
+
+        Stubs without bounds and bicycle lanes are left out.
+        """
+        for entry in fragment.elements:
+            name, element = entry.id.id, entry.element
+            if element.HasField("segment"):
+                segment = element.segment
+                self._limits[name] = segment.limit, segment.limit_backward
+            if element.HasField("control"):
+                self._add_control(name, element.control)
+            if element.HasField("lane"):
+                lane = element.lane
+                is_whole = all(map(lane.HasField, ("frame", "left", "right")))
+                if is_whole and lane.access.type != ONLY_BIKE:
+                    yield name, lane
+
+    def _add_control(self, name: str, control: Message) -> None:
+        if control.HasField("stop_sign"):
+            self._stop_signs.add(name)
+        if control.HasField("light"):
+            self._lights[name] = tuple(face.id for face in control.light.faces)
+        for field, _ in control.ListFields():
+            if field.number in COLOURS:
+                self._faces[name] = COLOURS[field.number]
+
+    def _bound(self, name: str, bound: Message, frame: np.ndarray) -> np.ndarray:
+        """A lane bound [m, 2] m in the world; points that repeat are dropped."""
+        x, y, up = (np.array(steps, np.int64) for steps in (bound.x, bound.y, bound.z))
+        if x.size != y.size:
+            raise InputError(
+                f"{self.file}: lane {name}: {x.size} x for {y.size} y: expected as many"
+            )
+        up = up if up.size == x.size else np.zeros(x.size, np.int64)
+        local = 0.01 * np.cumsum(np.stack([x, y, up]), axis=1)  # cm to m
+        ones = np.ones((1, local.shape[1]))
+        world = (self._to_world @ frame @ np.concatenate([local, ones]))[:2].T
+        check_coordinates(self.file, f"lane {name}", ("x", "y"), world)
+        return world[moves(world)] if len(world) else world
+
+    def _faces_of(self, controls: tuple[str, ...]) -> list[str]:
+        """Faces that govern a lane: those it names; a light's, where it names none.
+
+        A light has faces for other lanes too, say an arrow to the left.
+        """
+        named, found = set(controls), []
+        for name in controls:
+            faces = self._lights.get(name, (name,))
+            found += faces if faces == (name,) or named.isdisjoint(faces) else ()
+        return found
+
+    def _lane(self, name: str, lane: Message) -> Lane | None:
+        frame = _frame(lane.frame)
+        left, right = (self._bound(name, b, frame) for b in (lane.left, lane.right))
+        if min(len(left), len(right)) < 2:
+            return None
+        centre, half = between_bounds(left, right)
+        if len(centre) < 2:
+            return None
+        # bounds may run against the traffic: then the left one lies to the right
+        along, across = centre[1] - centre[0], left[0] - right[0]
+        if along[0] * across[1] - along[1] * across[0] < 0.0:
+            left, right = left[::-1], right[::-1]
+            centre, half = centre[::-1], half[::-1]
+        parent = lane.parent.id
+        forward, back = self._limits.get(parent, (0.0, 0.0))
+        limit = back if lane.direction == BACKWARD and back > 0.0 else forward
+        controls = tuple(control.id for control in lane.controls)
+        faces = self._faces_of(controls)
+        governing = sorted({face for face in faces if face in self._faces})
+        stop_sign = any(control in self._stop_signs for control in controls)
+        # who is inside a junction was held at its edge: a parent that is no segment
+        at = 0 if parent and parent not in self._limits else -1
+        stops = np.stack([left[at], right[at]]) if governing or stop_sign else None
+        return Lane(
+            id=name,
+            centre=centre,
+            left_width=half,
+            right_width=half,
+            speed_limit=limit if 0.0 < limit <= MAX_LIMIT_MPS else None,
+            successors=tuple(other.id for other in lane.ahead),
+            left=lane.beside_left.id or None,
+            right=lane.beside_right.id or None,
+            stop_line=stops,
+            signal_ids=("|".join(governing),) if governing else (),
+            stop_sign=stop_sign,
+        )
+
+
+def _frame(geo: Message) -> np.ndarray:
+    """GeoFrame -> [4, 4] transform of local metres to Earth-centred ones.
+
+    Origin in 1e-7 degrees on the WGS84 ellipsoid; bearing in degrees clockwise from
+    north to the local y axis.
+    """
+    degrees = 1e-7 * geo.origin.latitude, 1e-7 * geo.origin.longitude
+    if abs(degrees[0]) > 90.0 or abs(degrees[1]) > 180.0:
+        raise DecodeError(f"frame at latitude, longitude {degrees}: not on Earth")
+    latitude, longitude = np.deg2rad(degrees)
+    turn = np.deg2rad(geo.bearing)
+    flat = np.array([np.cos(longitude), np.sin(longitude), 0.0])
+    east = np.array([-flat[1], flat[0], 0.0])
+    up = np.cos(latitude) * flat + np.array([0.0, 0.0, np.sin(latitude)])
+    north = np.cross(up, east)
+    frame = np.eye(4)
+    frame[:3, 0] = np.cos(turn) * east - np.sin(turn) * north
+    frame[:3, 1] = np.sin(turn) * east + np.cos(turn) * north
+    frame[:3, 2] = up
+    frame[:3, 3] = earth_centred(*degrees)
+    return frame
+
+
+def world_to_ecef(file: Path, spec: dict) -> np.ndarray:
+    """Rigid transform [4, 4] in m: of meta.json beside or above, or of the TOML.
+
+    Args:
+      file: semantic_map.pb.
+      spec: of the source; `world_to_ecef` counts where meta.json has none.
+
+    Raises:
+      InputError: no rigid transform.
+    """
+    places = [folder / "meta.json" for folder in file.resolve().parents[:2]]
+    meta = next((place for place in places if place.is_file()), None)
+    where, found = "source TOML", spec.get("world_to_ecef")
+    if meta is not None:
+        content = checked(read_json(meta, "an object", MAX_META_BYTES), dict, meta)
+        known = content.get("world_to_ecef", content.get("pose_to_ecef"))
+        if known is not None:
+            where, found = str(meta), known
+    try:
+        matrix = np.array(found, np.float64)
+    except (ValueError, TypeError, OverflowError):
+        matrix = np.zeros(0)
+    rigid = (
+        matrix.shape == (4, 4)
+        and np.isfinite(matrix).all()
+        and np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-3)
+        and np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0])
+    )
+    if not rigid:
+        raise InputError(
+            f"{where}: world_to_ecef: {str(found)[:60]}: expected a rigid 4 x 4 matrix"
+        )
+    return matrix

@@ -1,0 +1,307 @@
+"""Lyft / Woven Planet Level 5 prediction data: `sample.zarr`, `train.zarr`, ...
+
+Layout: "Dataset Formats" of the L5Kit documentation; zarr version 2, format
+version 2 (traffic lights may be missing, as in version 1). Four arrays: scenes
+point at intervals of frames, frames at intervals of agents and light faces. One
+scene of some 25 s is one Recording, read by its intervals only: the full set has
+hundreds of GB.
+
+Traps: times are ns since 1970; `extent` is length, width, height; ids are unique
+inside a scene only; most agents have the class "unknown" (clutter, left out by
+default); scenes that follow each other show the same vehicles, so that they
+share a group, also over datasets: several hold scenes of one drive. Colours of
+lights are in the semantic map alone.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from rcirl_jax.data.formats.l5.map import (
+    SemanticMap,
+    find_map,
+    world_to_ecef,
+)
+from rcirl_jax.data.formats.l5.scenes import (
+    beside,
+    groups_of,
+    parts,
+    scenes_of,
+    tables_of,
+)
+from rcirl_jax.data.formats.options import number, positive, recording_car
+from rcirl_jax.data.formats.perception import (
+    UNKNOWN,
+    Boxes,
+    ego_boxes,
+    fitted_lanes,
+    placed,
+    tracks_of,
+)
+from rcirl_jax.data.formats.shapes import (
+    check_coordinates,
+    origin_notes,
+)
+from rcirl_jax.data.readers.zarr2 import StructuredArray
+from rcirl_jax.data.recording import PIECE, accepted
+from rcirl_jax.errors import InputError
+from rcirl_jax.types import Kind, Lane, Recording, Signal, Track
+
+NUM_LABELS = 17
+# class of each label, in the order of L5Kit's PERCEPTION_LABELS
+KIND_OF_LABEL = np.array(
+    [UNKNOWN] * 3  # not set, unknown, don't care
+    + [Kind.VEHICLE] * 7  # car, van, tram, bus, truck, emergency, other vehicle
+    + [Kind.CYCLIST, Kind.VEHICLE] * 2  # bicycle, motorcycle and their riders
+    + [Kind.PEDESTRIAN] * 2  # pedestrian, animal
+    + [UNKNOWN]  # don't care
+)
+FRAMES = {
+    "timestamp": ("iu", ()),
+    "agent_index_interval": ("iu", (2,)),
+    "ego_translation": ("f", (3,)),
+    "ego_rotation": ("f", (3, 3)),
+}
+AGENTS = {
+    "centroid": ("f", (2,)),
+    "extent": ("f", (3,)),
+    "yaw": ("f", ()),
+    "velocity": ("f", (2,)),
+    "track_id": ("iu", ()),
+    "label_probabilities": ("f", (NUM_LABELS,)),
+}
+FACES = {
+    "face_id": ("U", ()),
+    "traffic_light_id": ("U", ()),
+    "traffic_light_face_status": ("f", (3,)),  # active, inactive, unknown
+}
+FACE_INTERVAL = "traffic_light_faces_index_interval"  # of frames
+RATE_HZ = 10.0  # 1/s
+MAX_GAP_S = 0.55  # s without a box inside one track
+PIECE_SCENES = 8  # scenes of a piece; their demonstrations are held at once
+MAX_FRAMES = 36_000  # frames of one scene: an hour
+MAX_AGENTS = 5_000_000  # agent records of one scene
+LIMIT_MPS = 15.65  # m/s, 35 mph: main roads of Palo Alto
+EGO = {"length": 4.87, "width": 1.85, "centre_ahead": 0.0}  # m
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Dataset:
+    path: Path
+    scenes: np.ndarray
+    frames: StructuredArray
+    agents: StructuredArray
+    faces: StructuredArray | None
+
+
+def recordings(path: Path, spec: dict) -> Iterator[Recording]:
+    """One Recording per scene of every dataset, or of the spec's piece of one."""
+    for folder in parts(path, spec):
+        dataset, road = _open(folder), _map_of(folder, spec)
+        others = tables_of(beside(folder, spec))
+        groups = groups_of(dataset.scenes, list(others.values()))
+        first, last = spec.get(PIECE, (0, len(groups)))
+        for index in range(first, last):
+            name = f"{folder.stem}-{index:06d}"
+            make = functools.partial(
+                _recording, dataset, name, dataset.scenes[index], road, spec
+            )
+            made = accepted(make, name, f"{folder}: scene {index}", spec)
+            yield dataclasses.replace(
+                made, group=groups[index], progress=(index + 1) / len(groups)
+            )
+
+
+def pieces(path: Path, spec: dict) -> list[dict]:
+    """Specs of a few scenes each: a dataset is the work of many processes."""
+    number = len(scenes_of(path))
+    return [
+        {**spec, PIECE: (first, min(first + PIECE_SCENES, number))}
+        for first in range(0, number, PIECE_SCENES)
+    ]
+
+
+def _map_of(folder: Path, spec: dict) -> SemanticMap | None:
+    file = find_map(folder, spec)
+    if file is None:
+        return None
+    about, to_ecef = file.stat(), world_to_ecef(file, spec)
+    return _map(file, about.st_mtime_ns, about.st_size, tuple(to_ecef.flat))
+
+
+@functools.lru_cache(maxsize=1)  # pieces of a dataset share it
+def _map(file: Path, changed_ns: int, size: int, to_ecef: tuple) -> SemanticMap:
+    """The map of a file as it was; all pieces of a dataset share it."""
+    del changed_ns, size  # they tell files of one name apart
+    return SemanticMap(file, np.array(to_ecef).reshape(4, 4))
+
+
+def _open(folder: Path) -> _Dataset:
+    frames = StructuredArray(folder / "frames", FRAMES)
+    lights = folder / "traffic_light_faces"  # missing in format version 1
+    has_lights = lights.is_dir() and FACE_INTERVAL in (frames.dtype.names or ())
+    return _Dataset(
+        path=folder,
+        scenes=scenes_of(folder),
+        frames=frames,
+        agents=StructuredArray(folder / "agents", AGENTS),
+        faces=StructuredArray(lights, FACES) if has_lights else None,
+    )
+
+
+def _interval(where: str, bounds: np.ndarray, size: int, most: int) -> tuple[int, int]:
+    start, stop = int(bounds[0]), int(bounds[1])
+    if not 0 <= start <= stop <= size or stop - start > most:
+        raise InputError(
+            f"{where}: [{start}, {stop}]: expected an interval within 0 to {size}, "
+            f"at most {most} long"
+        )
+    return start, stop
+
+
+def _recording(
+    dataset: _Dataset,
+    name: str,
+    scene: np.void,
+    semantic_map: SemanticMap | None,
+    spec: dict,
+) -> Recording:
+    where = f"{dataset.path}: {name}"
+    start, stop = _interval(
+        f"{where}: frame_index_interval",
+        scene["frame_index_interval"],
+        dataset.frames.size,
+        MAX_FRAMES,
+    )
+    if start == stop:
+        raise InputError(
+            f"{where}: frame_index_interval: [{start}, {stop}]: expected frames"
+        )
+    frames = dataset.frames.read(start, stop)
+    t = (frames["timestamp"] - frames["timestamp"][0]).astype(np.float64) * 1e-9
+    rate = positive(spec, "rate_hz", RATE_HZ)
+    step = float(np.median(np.diff(t))) if t.size > 1 else 1.0 / rate
+    if not 0.5 < step * rate < 2.0:
+        raise InputError(
+            f"{where}: timestamp: median step {step:g} s: expected {1.0 / rate:g} s, "
+            "in ns"
+        )
+    ego = _ego(Path(where), frames, t, spec)
+    others, notes = _others(Path(where), dataset, frames, t, spec)
+    tracks = [*ego, *others]
+    x, y, origin, tracks = placed(tracks)
+    lanes, signals, map_notes = (), (), []
+    if semantic_map is not None:
+        lanes = semantic_map.roads.around(x, y, origin)
+        signals, map_notes = _signals(where, dataset, frames, t, semantic_map, lanes)
+    if not lanes:
+        lanes, note = fitted_lanes(tracks, spec)
+        map_notes = [f"no map here; {note}"]
+    return Recording(
+        name=name,
+        source=str(spec.get("source", "L5 prediction dataset")),
+        licence=str(spec.get("licence", "unknown")),
+        rate_hz=rate,
+        tracks=tuple(tracks),
+        lanes=lanes,
+        signals=signals,
+        default_speed_limit=positive(spec, "speed_limit", LIMIT_MPS),
+        notes=(*notes, *origin_notes(origin), *map_notes),
+    )
+
+
+def _ego(path: Path, frames: np.ndarray, t: np.ndarray, spec: dict) -> list[Track]:
+    """The recording car; its speed comes from its positions."""
+    x, y, _ = frames["ego_translation"].astype(np.float64).T
+    check_coordinates(path, "ego_translation", ("x", "y"), np.stack([x, y], axis=1))
+    ahead = frames["ego_rotation"][:, :2, 0].astype(np.float64)  # [n, 2] unit
+    bad = np.flatnonzero(~(np.abs(np.hypot(*ahead.T) - 1.0) < 0.5))
+    if bad.size:
+        raise InputError(
+            f"{path}: frame {bad[0]}: ego_rotation: {ahead[bad[0]]}: "
+            "expected a rotation matrix"
+        )
+    heading = np.arctan2(ahead[:, 1], ahead[:, 0])
+    boxes = ego_boxes(spec, EGO, t, x, y, heading, np.full(t.size, np.nan))
+    return tracks_of(path, boxes, MAX_GAP_S, automated=recording_car(spec))[0]
+
+
+def _others(
+    path: Path, dataset: _Dataset, frames: np.ndarray, t: np.ndarray, spec: dict
+) -> tuple[list[Track], list[str]]:
+    agents, frame = _records(
+        f"{path}: agent_index_interval", dataset.agents, frames["agent_index_interval"]
+    )
+    labels = agents["label_probabilities"]
+    if not np.isfinite(labels).all():
+        row = int(np.flatnonzero(~np.isfinite(labels).all(axis=1))[0])
+        raise InputError(
+            f"{path}: agent {row}: label_probabilities: not finite: "
+            "expected probabilities"
+        )
+    likely = labels.max(axis=1, initial=0.0) >= number(spec, "min_probability", 0.5)
+    best = labels.argmax(axis=1) if agents.size else np.zeros(0, np.int64)
+    centre = agents["centroid"].astype(np.float64)
+    check_coordinates(path, "centroid", ("x", "y"), centre)
+    track_ids, ids = np.unique(agents["track_id"], return_inverse=True)
+    boxes = Boxes(
+        ids=ids,
+        names=tuple(str(track) for track in track_ids.tolist()),
+        t=t[frame],
+        x=centre[:, 0],
+        y=centre[:, 1],
+        heading=agents["yaw"].astype(np.float64),
+        speed=np.hypot(*agents["velocity"].astype(np.float64).T),
+        length=agents["extent"][:, 0].astype(np.float64),
+        width=agents["extent"][:, 1].astype(np.float64),
+        kind=np.where(likely, KIND_OF_LABEL[best], UNKNOWN),
+    )
+    return tracks_of(path, boxes, MAX_GAP_S, str(spec.get("unknown", "drop")))
+
+
+def _records(
+    where: str, array: StructuredArray, intervals: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Records of all frames' intervals, and the frame of each.
+
+    The intervals of a scene's frames follow each other in the public data;
+    others (subsets of frames) are read in one piece and picked.
+    """
+    counts = (intervals[:, 1] - intervals[:, 0]).astype(np.int64)
+    first, last = int(intervals[:, 0].min()), int(intervals[:, 1].max())
+    bad = np.flatnonzero((counts < 0) | (counts > MAX_AGENTS))
+    row = int(bad[0]) if bad.size else 0
+    if bad.size:
+        _interval(f"{where}: frame {row}", intervals[row], array.size, MAX_AGENTS)
+    _interval(where, np.array([first, last]), array.size, MAX_AGENTS)
+    if counts.sum() > MAX_AGENTS:
+        raise InputError(
+            f"{where}: {counts.sum()} records: expected at most {MAX_AGENTS}"
+        )
+    frame = np.repeat(np.arange(counts.size), counts)
+    inside = np.arange(frame.size) - np.repeat(np.cumsum(counts) - counts, counts)
+    pick = intervals[:, 0].astype(np.int64)[frame] - first + inside
+    records = array.read(first, last)
+    return records[pick], frame
+
+
+def _signals(
+    where: str,
+    dataset: _Dataset,
+    frames: np.ndarray,
+    t: np.ndarray,
+    semantic_map: SemanticMap,
+    lanes: tuple[Lane, ...],
+) -> tuple[tuple[Signal, ...], list[str]]:
+    """Lights of the lanes, from the faces seen in each frame."""
+    if dataset.faces is None:
+        return (), ["no traffic lights recorded"]
+    faces, frame = _records(
+        f"{where}: {FACE_INTERVAL}", dataset.faces, frames[FACE_INTERVAL]
+    )
+    status = faces["traffic_light_face_status"]
+    lit = status.argmax(axis=1) == 0 if faces.size else np.zeros(0, bool)
+    return semantic_map.signals(lanes, t, frame, faces["face_id"], lit), []

@@ -1,0 +1,11 @@
+"""levelXData (highD, inD, rounD, exiD, uniD): `reader` for tracks, `map` for lanes."""
+
+from rcirl_jax.data.formats.format import Format, of_columns
+
+FORMAT = Format(
+    columns=of_columns("frame id xvelocity", "frame trackid xcenter"),
+    is_small=True,
+    is_declared=True,
+    options={"map": "maps", "partial": True, "table": {}},
+    free=("sizes", "table"),
+)

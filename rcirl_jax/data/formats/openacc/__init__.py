@@ -1,0 +1,10 @@
+"""OpenACC platoon recordings (CSV): `reader`."""
+
+from rcirl_jax.data.formats.format import Format
+
+FORMAT = Format(
+    told_by="drive",
+    is_small=True,
+    is_declared=True,
+    free=("sizes",),
+)

@@ -1,0 +1,252 @@
+"""Synthetic human traffic as an importer: TOML of recordings -> Recordings.
+
+See data_specs/sources/synthetic.toml for every key. Each recording has its own
+random streams, made of its entry's seed and its number in the entry; it is a
+vehicle-disjoint group of its own.
+"""
+
+import dataclasses
+import math
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import numpy as np
+
+from rcirl_jax.data.formats.options import STATED
+from rcirl_jax.data.recording import LEAVE_OUT, validate_recording
+from rcirl_jax.data.synthetic import ROADS, DriverConfig, RunConfig, simulate
+from rcirl_jax.data.synthetic.roads import lanes, to_world
+from rcirl_jax.data.synthetic.stops import schedule
+from rcirl_jax.data.synthetic.traffic import Log
+from rcirl_jax.errors import InputError
+from rcirl_jax.runtime.checked import checked
+from rcirl_jax.runtime.settings import check_names
+from rcirl_jax.runtime.specs import load_toml
+from rcirl_jax.types import Kind, Recording, Signal, Track
+
+# driver settings that may be zero; all others are above it
+MAY_BE_ZERO = (
+    "delay_s",
+    "noise_mps2",
+    "politeness",
+    "threshold_mps2",
+    "change_pause_s",
+    "drift_m",
+    "sign_wait_s",
+    "destination_share",
+)
+MAX_RECORDINGS = 100_000  # of all entries
+BATCH = 32  # recordings simulated together, at most
+SEEN_FROM_M = 30.0  # m, tracks begin this far from the road's start
+SEEN_UNTIL_M = 60.0  # m, and end this far before its end
+MIN_TRACK_S = 1.0  # s, shorter tracks are dropped
+POSITION_STREAM = 1  # last part of a seed: the stream of the position noise
+TRAFFIC_STREAM = 0  # last part of a seed: the stream of the simulation
+
+Text = Annotated[str, msgspec.Meta(min_length=1)]
+
+
+class _File(msgspec.Struct, forbid_unknown_fields=True):
+    """The TOML as it is written."""
+
+    source: Text
+    licence: Text
+    rate_hz: Annotated[float, msgspec.Meta(ge=2.0, le=50.0)]
+    warmup_s: Annotated[float, msgspec.Meta(ge=0.0, le=600.0)]
+    position_noise_m: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
+    drivers: dict
+    recordings: Annotated[list[dict], msgspec.Meta(min_length=1)]
+
+
+class _Entry(msgspec.Struct, forbid_unknown_fields=True):
+    """One of [[recordings]]."""
+
+    road: str
+    count: Annotated[int, msgspec.Meta(ge=1, le=10_000)]
+    duration_s: Annotated[float, msgspec.Meta(ge=1.0, le=3600.0)]
+    density_veh_per_km: Annotated[float, msgspec.Meta(ge=1.0, le=60.0)]
+    seed: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+
+
+def recordings(path: Path, spec: dict) -> Iterator[Recording]:
+    """All recordings that a TOML file declares.
+
+    Args:
+      path: the file, like data_specs/sources/synthetic.toml.
+      spec: the packaged settings; what `path` does not set is taken from there.
+
+    Raises:
+      InputError: an unknown key or a bad value, before anything is simulated.
+    """
+    own = load_toml(path)
+    # what an import adds says nothing here: none of these is refused
+    packaged = {k: v for k, v in spec.items() if k not in (LEAVE_OUT, STATED)}
+    settings = {**packaged, **own}
+    settings["drivers"] = {**_table(spec, "drivers"), **_table(own, "drivers")}
+    checked(settings, _File, path)
+    drivers = driver_config(path, settings["drivers"])
+    jobs = _jobs(path, settings)
+    return (
+        dataclasses.replace(validate_recording(made), progress=number / len(jobs))
+        for number, made in enumerate(_simulated(jobs, drivers, settings), start=1)
+    )
+
+
+def _table(spec: dict, key: str) -> dict:
+    value = spec.get(key, {})
+    return value if isinstance(value, dict) else {key: value}
+
+
+def driver_config(path: Path, found: dict) -> DriverConfig:
+    """The drivers that a TOML's `drivers` table describes; InputError names a key."""
+    fields = [field.name for field in dataclasses.fields(DriverConfig)]
+    check_names(f"{path}: drivers: ", found, fields)
+    made = checked(found, DriverConfig, f"{path}: drivers")
+    for key, value in vars(made).items():
+        # a number, [low, high] or [mean, sd, low, high]; the sd may be zero
+        numbers = value if isinstance(value, tuple) else (value,)
+        bounds = numbers[-2:]
+        least = 0.0 if key in MAY_BE_ZERO else sys.float_info.min
+        most = 1.0 if key == "destination_share" else sys.float_info.max
+        good = least <= bounds[0] <= bounds[-1] <= most
+        if not good or not all(0.0 <= x <= most for x in numbers):
+            sign = ">= 0" if key in MAY_BE_ZERO else "> 0"
+            raise InputError(
+                f"{path}: drivers: {key}: {value}: expected {sign}, low <= high"
+                + (", at most 1" if most == 1.0 else "")
+            )
+    return made
+
+
+def _jobs(path: Path, settings: dict) -> list[tuple[str, RunConfig]]:
+    """(name, run) of every recording."""
+    jobs = []
+    for number, row in enumerate(settings["recordings"], start=1):
+        where = f"{path}: recordings[{number}]"
+        entry = checked(row, _Entry, where)
+        if entry.road not in ROADS:
+            raise InputError(
+                f"{where}: road: {entry.road}: expected one of {', '.join(ROADS)}"
+            )
+        if len(jobs) + entry.count > MAX_RECORDINGS:
+            raise InputError(
+                f"{where}: count: {entry.count} after {len(jobs)}: "
+                f"expected up to {MAX_RECORDINGS} of all entries"
+            )
+        for index in range(entry.count):
+            run = RunConfig(
+                road=entry.road,
+                duration_s=entry.duration_s,
+                density_veh_per_km=entry.density_veh_per_km,
+                seed=(entry.seed, index, TRAFFIC_STREAM),
+                rate_hz=float(settings["rate_hz"]),
+                warmup_s=float(settings["warmup_s"]),
+            )
+            jobs.append((f"{entry.road}-{number:02d}-{index:03d}", run))
+    return jobs
+
+
+def _simulated(
+    jobs: list[tuple[str, RunConfig]], drivers: DriverConfig, settings: dict
+) -> Iterator[Recording]:
+    """Simulate neighbours of equal duration together, in the declared order."""
+    start = 0
+    while start < len(jobs):
+        duration = jobs[start][1].duration_s
+        end = start
+        while (
+            end < min(len(jobs), start + BATCH) and jobs[end][1].duration_s == duration
+        ):
+            end += 1
+        batch = jobs[start:end]
+        logs = simulate([run for _, run in batch], drivers)
+        for (name, run), log in zip(batch, logs, strict=True):
+            yield to_recording(name, run, log, settings)
+        start = end
+
+
+def to_recording(name: str, run: RunConfig, log: Log, settings: dict) -> Recording:
+    """A simulated log as a Recording.
+
+    Args:
+      name: of the recording; also its group.
+      run: what was simulated.
+      log: the samples.
+      settings: `source`, `licence` and `position_noise_m` are used.
+    """
+    rng = np.random.default_rng((*run.seed[:-1], POSITION_STREAM))
+    seen = log.vehicle >= 0
+    seen &= (log.s > SEEN_FROM_M) & (log.s < log.road.length - SEEN_UNTIL_M)
+    numbers = np.unique(log.vehicle[seen])
+    noise = float(settings["position_noise_m"])
+    tracks = []
+    for number in numbers:
+        times, slots = np.nonzero(seen & (log.vehicle == number))
+        if times.size >= MIN_TRACK_S * run.rate_hz:
+            tracks.append(_track(int(number), times, slots, log, run, rng, noise))
+    return Recording(
+        name=name,
+        source=settings["source"],
+        licence=settings["licence"],
+        rate_hz=run.rate_hz,
+        tracks=tuple(tracks),
+        lanes=lanes(log.road),
+        signals=_signals(log, run),
+        group=name,
+        default_speed_limit=float(log.road.limit[0]),
+        notes=(f"simulated: {run.road}, seed {run.seed}",),
+    )
+
+
+def _track(
+    number: int,
+    times: np.ndarray,
+    slots: np.ndarray,
+    log: Log,
+    run: RunConfig,
+    rng: np.random.Generator,
+    noise: float,
+) -> Track:
+    driver = log.drivers[number]
+    s, l, slope, v = (
+        values[times, slots] for values in (log.s, log.l, log.slope, log.v)
+    )
+    x, y, heading = to_world(log.road, s, l, slope)
+    shift = noise * rng.standard_normal((2, times.size))
+    return Track(
+        id=f"v{number:04d}",
+        kind=Kind.VEHICLE,
+        length=float(driver["length"]),
+        width=float(driver["width"]),
+        t=times / run.rate_hz,
+        x=x + shift[0],
+        y=y + shift[1],
+        heading=heading,
+        speed=v,
+        destination=_destination(driver, log),
+    )
+
+
+def _destination(driver: np.void, log: Log) -> tuple[float, float] | None:
+    """Where the car stands, or wants to stand, on the strip."""
+    station = float(driver["destination"])
+    if not math.isfinite(station):
+        return None
+    road = log.road
+    offset = road.offset(road.num_lanes)
+    x, y, _ = to_world(road, np.array(station), offset, np.array(0.0))
+    return float(x), float(y)
+
+
+def _signals(log: Log, run: RunConfig) -> tuple[Signal, ...]:
+    signals = []
+    for index, stop in enumerate(log.road.stops):
+        if not stop.is_sign:
+            start, state = schedule(
+                log.road.cycle, float(log.signal_offset[index]), run.duration_s
+            )
+            signals.append(Signal(id=f"signal-{index}", start=start, state=state))
+    return tuple(signals)

@@ -1,0 +1,322 @@
+"""Map features and signal states of a Waymo scenario -> Lanes and Signals.
+
+A lane is a centre line; its width comes from the road lines and road edges that
+its boundary segments name. Signals are recorded per lane and step, with the
+point on that lane where cars have to stop. A lane that has a signal usually
+begins there: it is the path across the junction.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from rcirl_jax.data.formats.options import lane_types, number
+from rcirl_jax.data.formats.shapes import (
+    check_coordinates,
+    line_across,
+    moves,
+)
+from rcirl_jax.data.formats.signals import STATES, signal_of
+from rcirl_jax.data.formats.waymo.widths import MAX_POINTS, Segments, half_widths
+from rcirl_jax.data.readers.protobuf import Message, columns
+from rcirl_jax.data.recording import MAX_SPEED_MPS
+from rcirl_jax.errors import InputError
+from rcirl_jax.types import Lane, Signal
+from rcirl_jax.units import MPH_MPS
+
+NEIGHBOUR = ("feature_id", "self_start_index", "self_end_index")
+BOUNDARY = ("lane_start_index", "lane_end_index", "boundary_feature_id")
+LANE_TYPES = {0: "undefined", 1: "freeway", 2: "surface_street", 3: "bike_lane"}
+DRIVEN = ("undefined", "freeway", "surface_street")
+WIDTH_M = 3.5  # m, of lanes without boundaries
+# LANE_STATE_*: unknown, arrow stop/caution/go, stop/caution/go, flashing stop/caution
+OFF, RED, YELLOW, GREEN = range(len(STATES))
+COLOURS = np.array([OFF, RED, YELLOW, GREEN, RED, YELLOW, GREEN, OFF, OFF], np.int8)
+FLASHING_STOP = 7  # a stop sign, in effect
+MAX_COLOURS = 50_000_000  # lanes by steps; 1000 lanes over an hour take 36 million
+GAP_S = 2.0  # s, a signal unseen for so long kept its colour if it has it again
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Stop:
+    """What the map and the signals say about stopping on one lane."""
+
+    points: dict[int, np.ndarray]  # lane id -> [2] m
+    signals: frozenset[int]  # lane ids with a signal
+    signs: frozenset[int]  # lane ids that demand a stop at any time
+
+
+def read_map(
+    where: str, scenario: Message, t: np.ndarray, origin: np.ndarray, spec: dict
+) -> tuple[tuple[Lane, ...], tuple[Signal, ...], list[str]]:
+    """Lanes, signals and notes of one scenario.
+
+    Args:
+      where: names file and record in errors.
+      scenario: the message.
+      t: [T] s, times of the steps.
+      origin: [2] m, subtracted from all points.
+      spec: source TOML.
+    """
+    features = scenario.map_features
+    signals, points, flashing = _signals(
+        where, scenario.dynamic_map_states, t, origin, spec
+    )
+    signs = _stop_signs(where, features, origin)
+    stops = _Stop(
+        points={**signs, **points},
+        signals=frozenset(int(signal.id) for signal in signals),
+        signs=frozenset(signs) | flashing,
+    )
+    lanes, notes = _lanes(where, features, stops, origin, spec)
+    return lanes, signals, notes
+
+
+def _points(where: str, messages: Iterable[Message], origin: np.ndarray) -> np.ndarray:
+    """Map points [n, 2] m; heights are not read."""
+    points = columns(messages, "x", "y")
+    check_coordinates(where, "map points", ("x", "y"), points)
+    return points - origin
+
+
+def _by_id(where: str, features: Iterable[Message], kind: str) -> dict[int, Message]:
+    """Feature id -> its data, of all features of a kind."""
+    found = {}
+    for feature in features:
+        if feature.HasField(kind):
+            if feature.id in found:
+                raise InputError(
+                    f"{where}: map feature {feature.id}: met twice: expected once"
+                )
+            found[feature.id] = getattr(feature, kind)
+    return found
+
+
+def _polylines(
+    where: str, lines: Mapping[int, Message], origin: np.ndarray
+) -> dict[int, np.ndarray]:
+    """Feature id -> points [n, 2] m of its polyline."""
+    if not lines:
+        return {}
+    parts = [line.polyline for line in lines.values()]
+    points = _points(where, itertools.chain.from_iterable(parts), origin)
+    ends = np.cumsum([len(part) for part in parts])[:-1]
+    return dict(zip(lines, np.split(points, ends), strict=True))
+
+
+# ---------------------------------------------------------------------- lanes
+
+
+def _lanes(
+    where: str,
+    features: Sequence[Message],
+    stops: _Stop,
+    origin: np.ndarray,
+    spec: dict,
+) -> tuple[tuple[Lane, ...], list[str]]:
+    every = _by_id(where, features, "lane")
+    wanted = lane_types(spec, tuple(LANE_TYPES.values()), DRIVEN)
+    driven = {
+        key: lane
+        for key, lane in every.items()
+        if LANE_TYPES.get(lane.type, "undefined") in wanted
+    }
+    centres = _polylines(where, driven, origin)
+    heads = {key: driven[key] for key, line in centres.items() if moves(line).sum() > 1}
+    width = 0.5 * number(spec, "lane_width_m", WIDTH_M)
+    bounds = _bound_lines(where, features, origin)
+    lanes = _built(where, heads, centres, bounds, stops, width)
+    notes = []
+    if len(every) > len(driven):
+        notes.append(
+            f"{len(every) - len(driven)} lanes not of type {', '.join(wanted)} left out"
+        )
+    if len(driven) > len(heads):
+        notes.append(f"{len(driven) - len(heads)} lanes of one point left out")
+    return lanes, notes
+
+
+def _built(
+    where: str,
+    heads: Mapping[int, Message],
+    centres: dict[int, np.ndarray],
+    bounds: Mapping[int, np.ndarray],
+    stops: _Stop,
+    default: float,
+) -> tuple[Lane, ...]:
+    """Lanes of two or more points; `default` half width [m]."""
+    if not heads:
+        return ()
+    order, lines = list(heads.values()), [centres[key] for key in heads]
+    left, right = (
+        half_widths(lines, bounds, _segments(where, order, side))
+        for side in ("left", "right")
+    )
+    beside = [_neighbours(order, side) for side in ("left", "right")]
+    exits = {key: dict.fromkeys(head.exit_lanes) for key, head in heads.items()}
+    for key, head in heads.items():
+        for before in head.entry_lanes:
+            exits.get(before, {})[key] = None
+    lanes = []
+    for row, (key, head) in enumerate(heads.items()):
+        keep = moves(lines[row])
+        found = [side[row] for side in (left, right)]
+        line = lines[row][keep]
+        usual = np.full(len(line), default)
+        sides = [usual if half is None else half[keep] for half in found]
+        across = None
+        if (point := stops.points.get(key)) is not None:
+            across = line_across(line, sides[0], sides[1], point)
+        lane = Lane(
+            id=str(key),
+            centre=line,
+            left_width=sides[0],
+            right_width=sides[1],
+            speed_limit=_limit(where, key, head),
+            successors=tuple(map(str, exits[key])),
+            left=beside[0][row],
+            right=beside[1][row],
+            signal_ids=(str(key),) if key in stops.signals else (),
+            stop_sign=key in stops.signs,
+            stop_line=across,
+            width_assumed=any(half is None for half in found),
+        )
+        lanes.append(lane)
+    return tuple(lanes)
+
+
+def _bound_lines(
+    where: str, features: Sequence[Message], origin: np.ndarray
+) -> dict[int, np.ndarray]:
+    """Road lines and road edges as points [n, 2] m by feature id."""
+    both = [_by_id(where, features, kind) for kind in ("road_line", "road_edge")]
+    lines = {key: line for kind in both for key, line in kind.items() if line.polyline}
+    return _polylines(where, lines, origin)
+
+
+def _segments(where: str, heads: Sequence[Message], side: str) -> Segments:
+    """What bounds the lanes on one side."""
+    lane, table = _of_lanes(heads, f"{side}_boundaries", BOUNDARY)
+    first, last, line = table.T
+    size = max(len(head.polyline) for head in heads)  # no lane has more points
+    first, last = np.clip(first, 0, size), np.clip(last, -1, size)
+    total = int(np.maximum(last - first + 1, 0).sum())
+    if total > MAX_POINTS:
+        raise InputError(
+            f"{where}: {side}_boundaries: {total} points: expected at most {MAX_POINTS}"
+        )
+    return Segments(lane=lane, first=first, last=last, line=line)
+
+
+def _neighbours(heads: Sequence[Message], side: str) -> list[str | None]:
+    """Per lane the neighbour along its longest part; all go the same way."""
+    lane, table = _of_lanes(heads, f"{side}_neighbors", NEIGHBOUR)
+    key, first, last = table.T
+    found: list[str | None] = [None] * len(heads)
+    for row in np.argsort(last - first, kind="stable"):
+        found[lane[row]] = str(int(key[row]))
+    return found
+
+
+def _of_lanes(
+    heads: Sequence[Message], field: str, names: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """What lanes repeat in a field: numbers of the lanes [n], int64 [n, names]."""
+    parts = [getattr(head, field) for head in heads]
+    lane = np.repeat(np.arange(len(heads)), [len(part) for part in parts])
+    items = itertools.chain.from_iterable(parts)
+    return lane, columns(items, *names, dtype=np.int64)
+
+
+def _limit(where: str, key: int, head: Message) -> float | None:
+    """Speed limit m/s; zero stands for unknown."""
+    limit = head.speed_limit_mph
+    if not 0.0 <= limit * MPH_MPS < MAX_SPEED_MPS:
+        raise InputError(
+            f"{where}: lane {key}: speed_limit_mph: {limit:g}: "
+            f"expected 0 to {MAX_SPEED_MPS / MPH_MPS:.0f}"
+        )
+    return limit * MPH_MPS or None
+
+
+# -------------------------------------------------------------------- signals
+
+
+def _stop_signs(
+    where: str, features: Sequence[Message], origin: np.ndarray
+) -> dict[int, np.ndarray]:
+    """Lane id -> position [2] m of the sign that governs it."""
+    signs: dict[int, np.ndarray] = {}
+    for sign in _by_id(where, features, "stop_sign").values():
+        if sign.HasField("position"):
+            point = _points(where, [sign.position], origin)[0]
+            signs.update(dict.fromkeys(sign.lane, point))
+    return signs
+
+
+def _signals(
+    where: str,
+    steps: Sequence[Message],
+    t: np.ndarray,
+    origin: np.ndarray,
+    spec: dict,
+) -> tuple[tuple[Signal, ...], dict[int, np.ndarray], frozenset[int]]:
+    """Signals by the lane they govern, stop points, lanes of flashing red."""
+    if len(steps) not in (0, t.size):
+        raise InputError(
+            f"{where}: dynamic_map_states: {len(steps)}: "
+            f"expected {t.size}, one per timestamp"
+        )
+    heads = itertools.chain.from_iterable(step.lane_states for step in steps)
+    lane, state = columns(heads, "lane", "state", dtype=np.int64).T
+    if not lane.size:
+        return (), {}, frozenset()
+    bad = np.flatnonzero((state < 0) | (state >= len(COLOURS)))
+    if bad.size:
+        raise InputError(
+            f"{where}: lane {lane[bad[0]]}: signal state {state[bad[0]]}: "
+            f"expected 0 to {len(COLOURS) - 1}"
+        )
+    ids, rows = np.unique(lane, return_inverse=True)
+    if ids.size * t.size > MAX_COLOURS:
+        raise InputError(
+            f"{where}: dynamic_map_states: {ids.size} lanes over {t.size} steps: "
+            f"expected at most {MAX_COLOURS} states"
+        )
+    colours = np.full((ids.size, t.size), OFF, np.int8)
+    counts = [len(step.lane_states) for step in steps]
+    step = np.repeat(np.arange(len(steps)), counts)
+    # of two heads for one lane the first that is known counts: it is written last
+    known = np.flatnonzero(COLOURS[state] != OFF)[::-1]
+    colours[rows[known], step[known]] = COLOURS[state[known]]
+    gap = number(spec, "signal_gap_s", GAP_S)
+    signals = tuple(
+        signal_of(str(key), t, _bridged(row, t, gap))
+        for key, row in zip(ids, colours, strict=True)
+    )
+    stops = {
+        head.lane: head.stop_point
+        for step in reversed(steps)  # of two points of one lane the first counts
+        for head in reversed(step.lane_states)
+        if head.HasField("stop_point")
+    }
+    points = _points(where, stops.values(), origin)
+    flashing = np.bincount(rows, state == FLASHING_STOP) > 0.5 * np.bincount(rows)
+    return (
+        signals,
+        dict(zip(stops, points, strict=True)),
+        frozenset(ids[flashing].tolist()),
+    )
+
+
+def _bridged(colours: np.ndarray, t: np.ndarray, gap: float) -> np.ndarray:
+    """Colours [T] with short unseen times filled between equal colours."""
+    known = np.flatnonzero(colours != OFF)
+    filled = colours.copy()
+    before, after = known[:-1], known[1:]
+    fill = (colours[before] == colours[after]) & (t[after] - t[before] <= gap)
+    for first, last in zip(before[fill], after[fill], strict=True):
+        filled[first:last] = colours[first]
+    return filled

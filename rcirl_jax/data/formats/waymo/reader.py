@@ -1,0 +1,260 @@
+"""Waymo Open Motion Dataset: `Scenario` messages in TFRecord files.
+
+Read without TensorFlow and without the data set's package; `messages` has the fields
+of the public scenario.proto and map.proto
+(https://github.com/waymo-research/waymo-open-dataset, protos). Files are named
+`*.tfrecord` or `*.tfrecord-00000-of-01000`, in the folders `scenario/training`,
+`training_20s`, `validation`, `testing`, ...; the `tf_example` files hold
+another message and are refused.
+
+A scenario is 9.1 s at 10 Hz (`testing`: 1.1 s, `training_20s`: 20 s); states are
+box centres in metres about an arbitrary origin, headings radians
+counter-clockwise. Traps: every track has a state per step, `valid = false` where
+it was not seen; up to seven 9.1 s windows overlap inside one 20 s segment and
+cannot be told apart, so only `training_20s` is free of shared vehicles.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from google.protobuf.message import DecodeError
+
+from rcirl_jax.data.formats.files import files_matching
+from rcirl_jax.data.formats.options import (
+    kind_of,
+    number,
+    patterns,
+    recording_car,
+    section,
+)
+from rcirl_jax.data.formats.perception import without_outliers
+from rcirl_jax.data.formats.shapes import (
+    check_coordinates,
+    local_origin,
+    origin_notes,
+)
+from rcirl_jax.data.formats.tracks import of_one_name
+from rcirl_jax.data.formats.waymo.map import read_map
+from rcirl_jax.data.formats.waymo.messages import read_message
+from rcirl_jax.data.readers.protobuf import Message, columns
+from rcirl_jax.data.readers.tfrecord import FRAME_BYTES, read_records
+from rcirl_jax.data.recording import LENGTH_RANGE_M, WIDTH_RANGE_M, accepted
+from rcirl_jax.errors import InputError
+from rcirl_jax.types import Lane, Recording, Track
+
+# what is read of each state
+STATE = (
+    *("center_x", "center_y", "length", "width"),
+    *("heading", "velocity_x", "velocity_y", "valid"),
+)
+TYPES = {0: "unset", 1: "vehicle", 2: "pedestrian", 3: "cyclist", 4: "other"}
+RATE_HZ = 10.0  # 1/s, the data set's
+RATE_TOLERANCE = 0.05  # relative; real stamps jitter by less
+MAX_SPAN_S = 3600.0  # s of one scenario
+MAX_STATES = 2_000_000  # of all tracks; a scenario has some 1e5
+MAX_GAP_STEPS = 5.5  # invalid steps bridged inside one track
+LIMIT_MPS = 15.65  # m/s, 35 mph
+SMALL_M = 0.05  # m; smaller boxes are errors, larger ones are clipped
+PATTERNS = ("*.tfrecord", "*.tfrecord-*-of-*")
+WINDOW_S = (5.0, 12.0)  # s, scenarios of this length are overlapping windows
+MIB = 1024**2
+MAX_NAME = 100  # characters kept of a scenario id
+EXPECTED = (
+    "Scenario messages (the folder scenario/, not tf_example/ or lidar_and_camera/)"
+)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _States:
+    """All states of a scenario as arrays [tracks, steps]."""
+
+    t: np.ndarray  # [steps] s
+    values: dict[str, np.ndarray]  # by field of ObjectState
+    valid: np.ndarray  # bool
+
+
+def parts(path: Path, spec: dict) -> list[Path]:
+    """The TFRecord files; each can be read alone."""
+    return files_matching(path, patterns(spec, PATTERNS), "TFRecord files")
+
+
+def recordings(path: Path, spec: dict) -> Iterator[Recording]:
+    """One Recording per scenario, one record in memory at a time."""
+    limit = int(number(spec, "max_record_mib", 32) * MIB)
+    for file in parts(path, spec):
+        size, done = file.stat().st_size, 0
+        for count, data in enumerate(read_records(file, limit)):
+            where = f"{file}: record {count}"
+            name = f"{file.name}-{count}"
+            make = functools.partial(_read_scenario, where, name, data, spec)
+            made = accepted(make, name, where, spec)
+            done += FRAME_BYTES + len(data)
+            yield dataclasses.replace(made, progress=done / size)
+
+
+def _read_scenario(where: str, default: str, data: bytes, spec: dict) -> Recording:
+    try:
+        scenario = read_message(data)
+    except DecodeError as error:
+        raise InputError(f"{where}: {error}: expected {EXPECTED}") from error
+    if not scenario.tracks:
+        raise InputError(f"{where}: tracks: none: expected {EXPECTED}")
+    states = _states(where, scenario)
+    origin = local_origin(
+        states.values["center_x"][states.valid], states.values["center_y"][states.valid]
+    )
+    states.values["center_x"] -= origin[0]
+    states.values["center_y"] -= origin[1]
+    tracks, notes = _tracks(where, scenario, states, spec)
+    lanes, signals, map_notes = read_map(where, scenario, states.t, origin, spec)
+    name = scenario.scenario_id[:MAX_NAME] or default
+    return Recording(
+        name=name,
+        source=str(spec.get("source", "Waymo Open Motion Dataset")),
+        licence=str(spec.get("licence", "unknown")),
+        rate_hz=_rate(where, states.t),
+        tracks=tracks,
+        lanes=lanes,
+        signals=signals,
+        group=name,
+        default_speed_limit=_usual_limit(lanes, spec),
+        notes=(
+            *origin_notes(origin),
+            *_scenario_notes(scenario, states.t),
+            *notes,
+            *map_notes,
+        ),
+    )
+
+
+def _states(where: str, scenario: Message) -> _States:
+    t = np.array(scenario.timestamps_seconds, np.float64)
+    if not t.size or not np.isfinite(t).all() or np.any(np.diff(t) <= 0.0):
+        raise InputError(
+            f"{where}: timestamps_seconds: {t[:4].tolist()} ({t.size}): "
+            "expected increasing times"
+        )
+    if t[-1] - t[0] > MAX_SPAN_S:
+        raise InputError(
+            f"{where}: timestamps_seconds: {t[-1] - t[0]:g} s: "
+            f"expected at most {MAX_SPAN_S:g} s"
+        )
+    if len(scenario.tracks) * t.size > MAX_STATES:
+        raise InputError(
+            f"{where}: tracks: {len(scenario.tracks)} of {t.size} states: "
+            f"expected at most {MAX_STATES} states"
+        )
+    for track in scenario.tracks:
+        if len(track.states) != t.size:
+            raise InputError(
+                f"{where}: track {track.id}: {len(track.states)} states: "
+                f"expected {t.size}, one per timestamp"
+            )
+    rows = columns(
+        (state for track in scenario.tracks for state in track.states), *STATE
+    )
+    table = np.moveaxis(rows.reshape(len(scenario.tracks), t.size, len(STATE)), 2, 0)
+    values = dict(zip(STATE, np.ascontiguousarray(table), strict=True))
+    valid = values.pop("valid") != 0.0
+    for column in values.values():
+        column[~valid] = 0.0  # what an invalid state holds means nothing
+    names = ("center_x", "center_y", "velocity_x", "velocity_y")
+    seen = np.stack([values[name][valid] for name in names], axis=1)
+    check_coordinates(where, "states", names, seen)
+    return _States(t=t - t[0], values=values, valid=valid)
+
+
+def _rate(where: str, t: np.ndarray) -> float:
+    rate = 1.0 / float(np.median(np.diff(t))) if t.size > 1 else RATE_HZ
+    if abs(rate / RATE_HZ - 1.0) > RATE_TOLERANCE:
+        raise InputError(
+            f"{where}: timestamps_seconds: {rate:g} per second: "
+            f"expected {RATE_HZ:g} (unit s)"
+        )
+    return RATE_HZ
+
+
+def _usual_limit(lanes: tuple[Lane, ...], spec: dict) -> float:
+    """Limit [m/s] of lanes without one: the median of the scenario's, if any."""
+    limits = [lane.speed_limit for lane in lanes if lane.speed_limit is not None]
+    return (
+        float(np.median(limits)) if limits else number(spec, "speed_limit", LIMIT_MPS)
+    )
+
+
+def _recorder(scenario: Message) -> int | None:
+    """Number of the recording car's track."""
+    row = scenario.sdc_track_index
+    return row if 0 <= row < len(scenario.tracks) else None
+
+
+def _scenario_notes(scenario: Message, t: np.ndarray) -> Iterator[str]:
+    if (row := _recorder(scenario)) is not None:
+        yield f"the recording car is track {scenario.tracks[row].id}"
+    low, high = WINDOW_S
+    if low < t[-1] < high:
+        yield "9.1 s windows of one drive may share vehicles; training_20s has none"
+
+
+def _tracks(
+    where: str, scenario: Message, states: _States, spec: dict
+) -> tuple[tuple[Track, ...], list[str]]:
+    tracks: list[Track] = []
+    unset = unseen = 0
+    recorder = _recorder(scenario)
+    for row, track in enumerate(scenario.tracks):
+        seen = np.flatnonzero(states.valid[row])
+        if not seen.size:
+            unseen += 1
+        elif TYPES.get(track.object_type) == "unset":
+            unset += 1
+        else:
+            found = _pieces(where, track, states, row, seen, spec)
+            automated = recording_car(spec) if row == recorder else ()
+            tracks += [dataclasses.replace(t, automated=automated) for t in found]
+    tracks, doubled = of_one_name(tracks)
+    tracks, notes = without_outliers(tracks)
+    notes += doubled
+    if unset:
+        notes.append(f"{unset} tracks of unset type left out")
+    if unseen:
+        notes.append(f"{unseen} tracks without a valid state left out")
+    return tuple(tracks), notes
+
+
+def _pieces(
+    where: str,
+    track: Message,
+    states: _States,
+    row: int,
+    seen: np.ndarray,
+    spec: dict,
+) -> Iterator[Track]:
+    """The parts of a track between long gaps: "id", "id#2", ..."""
+    name, found = str(track.id), TYPES.get(track.object_type, str(track.object_type))
+    known = kind_of(f"{where}: track {name}", found, section(spec, "kinds"))
+    values = {field: column[row] for field, column in states.values.items()}
+    length = _size(values["length"][seen], LENGTH_RANGE_M)
+    width = _size(values["width"][seen], WIDTH_RANGE_M)
+    cuts = np.flatnonzero(np.diff(seen) > MAX_GAP_STEPS) + 1
+    for part, rows in enumerate(np.split(seen, cuts), start=1):
+        yield Track(
+            id=name if part == 1 else f"{name}#{part}",
+            kind=known,
+            length=length,
+            width=width,
+            t=states.t[rows],
+            x=values["center_x"][rows],
+            y=values["center_y"][rows],
+            heading=values["heading"][rows],
+            speed=np.hypot(values["velocity_x"][rows], values["velocity_y"][rows]),
+        )
+
+
+def _size(sizes: np.ndarray, allowed: tuple[float, float]) -> float:
+    """Median size [m]; estimates a little below the smallest are raised to it."""
+    size = float(np.median(sizes))
+    return max(size, allowed[0]) if size >= SMALL_M else size

@@ -1,8 +1,0 @@
-"""CommonRoad XML scenarios: `reader`, `map`, `signs` by country, `extras`."""
-
-from rcirl_jax.data.importers.format import Format
-
-FORMAT = Format(
-    names=("*.xml",),
-    is_small=True,
-)

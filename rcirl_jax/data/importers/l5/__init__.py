@@ -1,7 +1,0 @@
-"""Lyft Level 5 (zarr): `reader`, `map` for lanes, `scenes` for the tables."""
-
-from rcirl_jax.data.importers.format import Format
-
-FORMAT = Format(
-    names=("*.zarr",),
-)

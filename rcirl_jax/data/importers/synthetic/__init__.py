@@ -1,7 +1,0 @@
-"""Simulated traffic as a log of its own: `reader`."""
-
-from rcirl_jax.data.importers.format import Format
-
-FORMAT = Format(
-    names=("*.toml",),
-)

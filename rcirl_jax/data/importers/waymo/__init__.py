@@ -1,9 +1,0 @@
-"""Waymo Open Motion (TFRecord): `reader`, `map` for lanes, `widths` of lanes."""
-
-from rcirl_jax.data.importers.format import Format
-
-FORMAT = Format(
-    names=("*.tfrecord*",),
-    shard_bytes=2**30,
-    free=("kinds",),
-)

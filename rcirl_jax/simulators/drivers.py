@@ -1,0 +1,217 @@
+"""Who drives, and the step from what is seen to what the ego does next.
+
+A driver is a row of the closed-loop tables: a policy with its weights behind the same
+sampler and safety filter, planning at 10 Hz with plans that are kept. The ego follows
+its plan as the ego of our own simulator does, through a drive train with a lag.
+"""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.export.own_planner.builder import scene_of
+from rcirl_jax.export.own_planner.line_frame import LineFrame, Parts
+from rcirl_jax.geometry.frenet import ReferenceLine, project_lanes
+from rcirl_jax.planner.plan import Plan, command, later, no_plan, stations_from_now
+from rcirl_jax.planner.rank import Policy
+from rcirl_jax.simulation.rows import Row
+from rcirl_jax.simulation.world.vehicle import Vehicle
+from rcirl_jax.simulators.simulators import STEP_S, Move, View
+from rcirl_jax.types import Kind, Scene
+from rcirl_jax.units import STATION_STEP_M, TIMES_S
+
+SLOTS = 32  # bodies of a view that are looked at, the nearest ones
+MOST_LINES = 6  # signals likewise
+GRID = 1280  # points of a line's grid: 2.56 km
+CORRIDOR_MARGIN_M = 0.2  # m beside the ego's width within which a body is ahead of it
+
+
+class Free(flax.struct.PyTreeNode, kw_only=True):
+    """What is ahead of the front bumper in the ego's corridor; inf: nothing."""
+
+    body: jax.Array  # [] m, the rear of the nearest body
+    speed: jax.Array  # [] m/s of that body along the road; 0 without one
+    line: jax.Array  # [] m, a line that demands a stop
+
+
+class Seen:
+    """Views as planning frames in a batch; a line's frame is made once.
+
+    Args:
+      lanes: views in a batch.
+    """
+
+    def __init__(self, lanes: int) -> None:
+        self._frames: list[LineFrame | None] = [None] * lanes
+        self._last: list[View | None] = [None] * lanes
+        self._lines: ReferenceLine | None = None  # of all lanes
+
+    def scenes(self, views: Sequence[View | None]) -> tuple[Scene, Free]:
+        """Scenes [B] and what is ahead; an episode that is over keeps its last one."""
+        for n, view in enumerate(views):
+            if view is not None:
+                self._last[n] = _with_few(view)
+        some = next(view for view in self._last if view is not None)
+        every = [some if view is None else view for view in self._last]
+        frames = [self._frame(n, view) for n, view in enumerate(every)]
+        if self._lines is None:
+            lines = [frame.line for frame in frames]
+            self._lines = jax.tree.map(lambda *x: jnp.stack(x), *lines)
+        points = np.zeros((len(every), SLOTS + MOST_LINES + 2, 2), np.float32)
+        near, counts = np.zeros(points.shape[:2], np.int32), []
+        for n, (frame, view) in enumerate(zip(frames, every, strict=True)):
+            seen = view.ego, view.obstacles, view.signals, view.destination
+            given = frame.points(*seen)
+            counts.append(len(given))
+            points[n, : len(given)] = given
+            near[n, : len(given)] = frame.tree.query(given)[1]
+        placed = project_lanes(self._lines, points[..., 0], points[..., 1], near)
+        s, l = jax.device_get(placed)
+        parts = [
+            frame.parts(
+                s[n, : counts[n]],
+                l[n, : counts[n]],
+                view.ego,
+                view.obstacles,
+                view.signals,
+                slots=SLOTS,
+            )
+            for n, (frame, view) in enumerate(zip(frames, every, strict=True))
+        ]
+        scenes, free = _scenes(jax.tree.map(lambda *x: np.stack(x), *parts))
+        return scenes, jax.device_get(free)
+
+    def _frame(self, lane: int, view: View) -> LineFrame:
+        """The frame of a lane's line, made where it is another line than before."""
+        frame = self._frames[lane]
+        if frame is None or frame.road is not view.centre_line:
+            frame = LineFrame(view.centre_line, (view.ego.x, view.ego.y), GRID)
+            if frame.grid.size > GRID:
+                raise InputError(
+                    f"centre line: {frame.length:.0f} m long: expected at most "
+                    f"{GRID * STATION_STEP_M:.0f} m, the part that is driven"
+                )
+            self._frames[lane], self._lines = frame, None
+        return frame
+
+
+def _with_few(view: View) -> View:
+    """The view with its nearest bodies and signals, as many as a batch has room for."""
+    away = lambda b: math.hypot(b.x - view.ego.x, b.y - view.ego.y)  # noqa: E731
+    return dataclasses.replace(
+        view,
+        obstacles=sorted(view.obstacles, key=away)[:SLOTS],
+        signals=sorted(view.signals, key=away)[:MOST_LINES],
+    )
+
+
+@jax.jit
+@jax.vmap
+def _scenes(parts: Parts) -> tuple[Scene, Free]:
+    scene = scene_of(parts)
+    return scene, ahead(scene)
+
+
+def ahead(scene: Scene) -> Free:
+    """The nearest body, and line that demands a stop, in the ego's corridor now."""
+    obstacles, ego = scene.obstacles, scene.ego
+    aside = jnp.maximum(
+        obstacles.l_lower[:, 0] - ego.l, ego.l - obstacles.l_upper[:, 0]
+    )
+    known = obstacles.valid[:, 0] & (obstacles.kind != Kind.NONE)
+    in_way = known & (aside < 0.5 * ego.width + CORRIDOR_MARGIN_M)
+    in_way = in_way & (obstacles.s_upper[:, 0] > ego.s)
+    gap = obstacles.s_lower[:, 0] - ego.s - 0.5 * ego.length
+    is_line = obstacles.kind == Kind.STOP
+    nearest = lambda which: jnp.min(jnp.where(in_way & which, gap, jnp.inf))  # noqa: E731
+    is_body = ~is_line & (obstacles.kind != Kind.VIRTUAL)
+    first = jnp.argmin(jnp.where(in_way & is_body, gap, jnp.inf))
+    speed = jnp.where((in_way & is_body)[first], obstacles.speed[first, 0], 0.0)
+    return Free(body=nearest(is_body), speed=speed, line=nearest(is_line))
+
+
+class Next(flax.struct.PyTreeNode, kw_only=True):
+    """A step of the ego that follows its plan, and the plan from then on."""
+
+    way: jax.Array  # [] m
+    speed: jax.Array  # [] m/s
+    acceleration: jax.Array  # [] m/s^2
+    future: jax.Array  # [T, 3] t s, way m, speed m/s
+    fallback: jax.Array  # [] bool, no candidate was admissible
+
+
+@functools.lru_cache(maxsize=16)
+def _step_of(policy: Policy, vehicle: Vehicle) -> Callable[..., tuple[Next, Plan]]:
+    def step(
+        params: Any,  # noqa: ANN401
+        scene: Scene,
+        key: jax.Array,
+        before: Plan,
+    ) -> tuple[Next, Plan]:
+        plan = policy(params, scene, key, before)
+        return follow(plan, scene.ego.v, scene.ego.a, vehicle), later(plan, STEP_S)
+
+    return jax.jit(jax.vmap(step, in_axes=(None, 0, 0, 0)))
+
+
+def follow(plan: Plan, v: jax.Array, a: jax.Array, vehicle: Vehicle) -> Next:
+    """0.1 s of a plan through the drive train of `simulation.world.vehicle`."""
+    asked = command(plan, v)
+    asked = jnp.clip(asked, vehicle.min_acceleration, vehicle.max_acceleration)
+    took = a + (1.0 - math.exp(-STEP_S / vehicle.acceleration_lag)) * (asked - a)
+    speed = jnp.maximum(v + 0.5 * (a + took) * STEP_S, 0.0)
+    took = jnp.where(speed > 0.0, took, jnp.maximum(took, 0.0))
+    times = jnp.asarray(TIMES_S)
+    way = stations_from_now(plan)
+    rates = jnp.interp(times + plan.since, times, plan.v)
+    return Next(
+        way=0.5 * (v + speed) * STEP_S,
+        speed=speed,
+        acceleration=took,
+        future=jnp.stack([times, way, rates], axis=1),
+        fallback=plan.fallback,
+    )
+
+
+class Driver:
+    """A row that drives some episodes in lock step.
+
+    Args:
+      row: who.
+      seeds: of the sampler, one an episode.
+    """
+
+    def __init__(self, row: Row, seeds: Sequence[int]) -> None:
+        self._row, self._step = row, _step_of(row.policy, Vehicle())
+        spread = lambda x: jnp.broadcast_to(x, (len(seeds), *jnp.shape(x)))  # noqa: E731
+        self._plans = jax.tree.map(spread, no_plan())
+        self._keys = jax.vmap(jax.random.key)(np.asarray(seeds, np.uint32))
+        self._time = 0
+
+    def moves(self, scenes: Scene) -> tuple[list[Move], np.ndarray]:
+        """What each ego does next, and whether nothing was admissible [B]."""
+        keys = _at(self._keys, self._time)
+        self._time += 1
+        made, self._plans = self._step(self._row.params, scenes, keys, self._plans)
+        made = jax.device_get(made)
+        moves = [
+            Move(
+                way=float(made.way[n]),
+                speed=float(made.speed[n]),
+                acceleration=float(made.acceleration[n]),
+                future=made.future[n],
+            )
+            for n in range(len(made.way))
+        ]
+        return moves, made.fallback
+
+
+_at = jax.jit(jax.vmap(jax.random.fold_in, in_axes=(0, None)))

@@ -1,0 +1,199 @@
+"""highway-env (Leurent 2018), the gymnasium environments of others: two roads of it.
+
+The ego is put where its plan has it, along the middle of its lane (kinematically, at
+10 Hz); it never changes lanes. The others are highway-env's IDMVehicles, which do, and
+react to the ego. The own driver is an IDMVehicle in the ego's place: one that keeps its
+lane, as ours do, and one that overtakes.
+"""
+
+import math
+import zlib
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import highway_env
+import numpy as np
+from highway_env.vehicle.behavior import IDMVehicle
+from highway_env.vehicle.kinematics import Vehicle
+
+from rcirl_jax.export.own_planner.inputs import Body, Car
+from rcirl_jax.simulators.simulators import STEP_S, LockStep, Move, View
+from rcirl_jax.simulators.way import Way
+
+# kind: environment, what differs from its own configuration, x m where it ends
+KINDS = {
+    "highway": ("highway-v0", {"lanes_count": 3, "vehicles_count": 8}, math.inf),
+    "dense": (
+        "highway-v0",
+        {"lanes_count": 3, "vehicles_count": 8, "vehicles_density": 2},
+        math.inf,
+    ),
+    # its lanes say 20 m/s, which its IDMVehicles keep too; it ends behind the ramp
+    "merge": ("merge-v1", {}, 370.0),
+}
+KEEPS, CHANGES = "IDMVehicle in its lane", "IDMVehicle overtaking"
+POINT_STEP_M = 2.0  # m between points of a centre line
+BEHIND_M, AHEAD_M = 30.0, 1500.0  # m of a lane before and beyond the ego's first place
+NEAR_M = 200.0  # m within which others are shown
+LANE_END_M = 0.1  # m before its end, where a lane's successor is asked for
+
+gymnasium.register_envs(highway_env)
+
+
+class Planned(Vehicle):
+    """The ego: where a move puts it."""
+
+    def act(self, action: object = None) -> None:
+        """Nothing: `put` says it all."""
+
+    def step(self, dt: float) -> None:
+        """Nothing either."""
+
+    def put(self, position: np.ndarray, heading: float, move: Move) -> None:
+        """Where the ego is after a move."""
+        self.position, self.heading, self.speed = position, heading, move.speed
+        self.action = {"acceleration": move.acceleration, "steering": 0.0}
+        self.on_state_update()
+
+
+class HighwayEnv:
+    """Episodes of highway-v0 and merge-v1."""
+
+    name = "highway_env"
+    own_drivers = (KEEPS, CHANGES)
+    together = 25
+
+    def episodes(self, count: int, seed: int) -> list[str]:
+        """KIND/SEED/NUMBER, kinds in turn."""
+        kinds = list(KINDS)
+        return [f"{kinds[n % len(kinds)]}/{seed}/{n:04d}" for n in range(count)]
+
+    def start(self, episodes: Sequence[str], own: str | None) -> LockStep:
+        """Separate environments, stepped one after the other."""
+        return LockStep([HighwayEpisode(name, own) for name in episodes])
+
+
+class HighwayEpisode:
+    """One environment; see `simulators.Episode`."""
+
+    def __init__(self, name: str, own: str | None) -> None:
+        environment, config, self._end = KINDS[name.split("/")[0]]
+        self.env: Any = gymnasium.make(
+            environment, config=config, disable_env_checker=True
+        ).unwrapped
+        self.env.reset(seed=zlib.crc32(name.encode()))
+        self.road = self.env.road
+        self._ways: dict[tuple, Way] = {}
+        self.ego = self._take_over(own)
+        self._lane, self._driven = self.ego.lane_index, 0.0
+        self._station = self.way().station(*self.ego.position)
+
+    def _take_over(self, own: str | None) -> Any:  # noqa: ANN401
+        """Put our ego, or an IDMVehicle, in the place of the environment's."""
+        theirs = self.env.vehicle
+        kind: Any = Planned if own is None else IDMVehicle
+        ego = kind(self.road, theirs.position, theirs.heading, theirs.speed)
+        if isinstance(ego, IDMVehicle):
+            ego.enable_lane_change = own == CHANGES
+            lane: Any = ego.lane
+            ego.target_speed = float(lane.speed_limit)
+        self.road.vehicles[self.road.vehicles.index(theirs)] = ego
+        return ego
+
+    def way(self) -> Way:
+        """The way along the ego's lane and those that follow it."""
+        if self._lane not in self._ways:
+            lane = self.road.network.get_lane(self._lane)
+            self._ways[self._lane] = Way(
+                self._points(self._lane), lane.speed_limit, lane.width_at(0.0)
+            )
+        return self._ways[self._lane]
+
+    def _points(self, index: tuple) -> np.ndarray:
+        """Points of a lane and of those that follow it, straight beyond the last."""
+        network, points = self.road.network, []
+        lane = network.get_lane(index)
+        s = max(lane.local_coordinates(self.ego.position)[0] - BEHIND_M, 0.0)
+        for _ in range(int((BEHIND_M + AHEAD_M) / POINT_STEP_M)):
+            if s > lane.length and (after := self._after(index)) is not None:
+                s, index = s - lane.length, after
+                lane = network.get_lane(index)
+            points.append(lane.position(s, 0.0))
+            s += POINT_STEP_M
+        return np.array(points)
+
+    def _after(self, index: tuple) -> tuple | None:
+        """The lane that goes on from the end of another, None at the road's end."""
+        network = self.road.network
+        if index[1] not in network.graph:
+            return None
+        end = network.get_lane(index).position(
+            network.get_lane(index).length - LANE_END_M, 0.0
+        )
+        return network.next_lane(index, route=None, position=end)
+
+    def look(self) -> View | None:
+        """What is seen; None beyond the place where the kind ends."""
+        ego, way = self.ego, self.way()
+        if ego.position[0] > self._end:
+            return None
+        near = (
+            other
+            for other in (*self.road.vehicles, *self.road.objects)
+            if other is not ego
+            and math.hypot(*(other.position - ego.position)) < NEAR_M
+        )
+        action = getattr(ego, "action", {})
+        return View(
+            ego=Car(
+                x=float(ego.position[0]),
+                y=float(ego.position[1]),
+                heading=float(ego.heading),
+                speed=max(float(ego.speed), 0.0),
+                acceleration=float(action.get("acceleration", 0.0)),
+                length=float(ego.LENGTH),
+                width=float(ego.WIDTH),
+            ),
+            centre_line=way.centre_line,
+            obstacles=[_body(other) for other in near],
+            way=self._driven,
+            speed_limit=way.limit(0.0),
+        )
+
+    def step(self, move: Move | None) -> None:
+        """0.1 s on; the ego along its line, or as its own driver drives."""
+        before = np.array(self.ego.position)
+        if move is not None:
+            self._go_on(move)
+        self.road.act()
+        self.road.step(STEP_S)
+        self._lane = self.ego.lane_index if move is None else self._lane
+        gone = math.hypot(*(self.ego.position - before))
+        self._driven += move.way if move is not None else gone
+
+    def _go_on(self, move: Move) -> None:
+        """Put the ego a way farther on its line."""
+        self._station += move.way
+        x, y, heading, _ = self.way().place(self._station)
+        self.ego.put(np.array([x, y]), heading, move)
+
+    def close(self) -> None:
+        """Nothing runs on."""
+        self.env.close()
+
+
+def _body(other: Vehicle) -> Body:
+    """A vehicle or a standing object of the road."""
+    moves = isinstance(other, Vehicle)
+    action = getattr(other, "action", None) or {}
+    return Body(
+        kind="vehicle" if moves else "static",
+        x=float(other.position[0]),
+        y=float(other.position[1]),
+        heading=float(math.remainder(other.heading, math.tau)),
+        speed=float(other.speed) if moves else 0.0,
+        acceleration=float(action.get("acceleration", 0.0)),
+        length=float(other.LENGTH),
+        width=float(other.WIDTH),
+    )

@@ -1,0 +1,299 @@
+"""The command `rcirl`: its sub-commands, their help, flags that are not given."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import pytest
+
+from rcirl_jax import __version__
+from rcirl_jax.cli.flags import common
+from rcirl_jax.cli.rcirl import COMMANDS, overview
+from rcirl_jax.tune.recipes import DEFAULT, load_recipe
+from tests.conftest import REPO
+from tests.helpers.commands import command, refused, succeeded
+
+LINES, COLUMNS = 40, 100  # of a screen
+FLAG = re.compile(r"^  --(?:\[no\])?([a-z_0-9]+)", re.M)
+# a required flag by the command that wants it
+REQUIRED = {
+    "autotune": "output",
+    "inspect": "data, --output",
+    "train": "data, --output",
+    "sweep": "data, --output",
+    "rank": "weights, --data",
+    "simulate": "weights, --output",
+    "gate": "candidate, --output",
+    "replay": "weights, --case, --output",
+    "report": "run",
+    "human-likeness": "data",
+    "gate-errors": "output",
+    "drive-elsewhere": "simulator, --weights, --output",
+}
+# Help of every command, and what it says where no flag is given, in one process that
+# has what an installation without extras has; absl knows one flag of a name
+EVERY = """
+import importlib, json, sys
+from absl import flags
+from rcirl_jax.cli.rcirl import COMMANDS
+OPTIONAL = {
+    "defusedxml", "flatbuffers", "google_crc32c", "jinja2", "markupsafe", "matplotlib",
+    "mcap", "mcap_ros2", "onnx", "optuna", "pyarrow", "pyproj", "ray", "shapely",
+    "tensorboardX",
+}
+class Without:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in OPTIONAL:
+            raise ModuleNotFoundError(name, name=name)
+sys.meta_path.insert(0, Without())
+OURS, found = "rcirl_jax.cli", {}
+for name, (module, _) in COMMANDS.items():
+    for flag in list(flags.FLAGS):
+        if flags.FLAGS.find_module_defining_flag(flag, "").startswith(OURS):
+            delattr(flags.FLAGS, flag)
+    for old in [old for old in sys.modules if old.startswith(OURS)]:
+        del sys.modules[old]
+    main = importlib.import_module(f"{OURS}.{module}").main
+    common = importlib.import_module(f"{OURS}.flags.common")
+    helps = [common.asked_for(["rcirl", x], main) for x in ("--help", "--helpfull")]
+    try:
+        flags.FLAGS(["rcirl"])
+        missing = ""
+    except flags.Error as error:
+        missing = common._missing(str(error), main)
+    found[name] = [*helps, missing]
+print(json.dumps(found))
+"""
+
+
+@pytest.fixture(scope="module")
+def every():
+    """Command -> what --help and --helpfull say, and what is said without flags."""
+    done = subprocess.run(
+        [sys.executable, "-c", EVERY], capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def fits(text):
+    lines = text.splitlines()
+    return len(lines) <= LINES and all(len(line) <= COLUMNS for line in lines)
+
+
+def test_the_overview_fits_and_names_every_command():
+    assert fits(overview())
+    for name, (_, line) in COMMANDS.items():
+        assert f"  {name:16}{line}" in overview()
+
+
+def test_every_module_of_the_room_is_a_command():
+    room = REPO / "rcirl_jax" / "commands"
+    files = [*room.glob("*.py"), *(room / "studies").glob("*.py")]
+    names = {
+        ".".join(file.relative_to(room).with_suffix("").parts)
+        for file in files
+        if file.name not in ("__init__.py", "rcirl.py")
+    }
+    assert names == {module for module, _ in COMMANDS.values()}
+
+
+# A command of our own that prints more than a buffer holds
+PRINTS = """
+from rcirl_jax.cli.flags import common
+def main():
+    print("x" * 100_000)
+common.run(main)
+"""
+
+
+@pytest.mark.parametrize("joined", [False, True], ids=["stdout", "both"])
+@pytest.mark.parametrize(
+    "words",
+    [["-m", "rcirl_jax", "train", "--helpfull"], ["-c", PRINTS]],
+    ids=["help", "main"],
+)
+def test_output_that_nobody_reads_ends_without_a_word(words, joined):
+    """As behind `| head`; what is written is more than a buffer holds."""
+    unread, output = os.pipe()
+    os.close(unread)
+    done = subprocess.run(
+        [sys.executable, *words],
+        stdout=output, stderr=output if joined else subprocess.PIPE, check=False,
+    )  # fmt: skip
+    os.close(output)
+    assert (done.returncode, done.stderr or b"") == (128 + signal.SIGPIPE, b"")
+
+
+def test_errors_that_nobody_reads_end_without_a_word():
+    unread, output = os.pipe()
+    os.close(unread)
+    done = subprocess.run(
+        [sys.executable, "-m", "rcirl_jax", "train"],
+        stdout=subprocess.PIPE, stderr=output, check=False,
+    )  # fmt: skip
+    os.close(output)
+    assert (done.returncode, done.stdout) == (128 + signal.SIGPIPE, b"")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["-m", "rcirl_jax", "train", "--helpfull"], ["-c", PRINTS]],
+    ids=["help", "main"],
+)
+def test_output_without_room_is_one_line(words):
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, *words],
+            stdout=full, stderr=subprocess.PIPE, text=True, check=False,
+        )  # fmt: skip
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: ")
+    assert "No space left on device" in line
+
+
+def test_without_any_output_a_command_runs():
+    """As after `>&-`: Python has no stdout then."""
+    done = subprocess.run(
+        [sys.executable, "-c", "import sys; sys.stdout = None\n" + PRINTS],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_another_broken_pipe_is_one_line(monkeypatch, capfd):
+    def broken():
+        raise BrokenPipeError(32, "Broken pipe", "worker")
+
+    monkeypatch.setattr(common.app, "run", lambda main, **_: main(["rcirl"]))
+    monkeypatch.setattr(common.interrupts, "install", lambda: None)
+    with pytest.raises(SystemExit) as stop:
+        common.run(broken)
+    assert stop.value.code == 2
+    assert capfd.readouterr().err == "error: worker: Broken pipe\n"
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_fits_and_has_the_usual_flags_only(name, every):
+    short, full, _ = every[name]
+    assert fits(short), short
+    assert f"    rcirl {name} --" in short
+    usual, flags = FLAG.findall(short), FLAG.findall(full)
+    assert flags[: len(usual)] == usual
+    assert len(set(flags)) == len(flags)
+    (hidden,) = re.findall(r"--helpfull shows (\d+) more", short) or ["0"]
+    assert len(flags) == len(usual) + int(hidden)
+    assert "workdir" not in flags
+    assert "--flagfile=FILE" in short
+    assert "--flagfile=FILE" in full
+
+
+def test_flags_beyond_the_usual_stand_under_their_subject(every):
+    _, text, _ = every["autotune"]
+    subject = "The gate: what it takes for a loss and for a gain:"
+    gate = "min_ttc_margin"
+    assert gate in text[text.index(subject) :]
+    assert gate not in text[: text.index(subject)]
+
+
+def test_defaults_are_those_of_the_recipe(every):
+    for name in ("train", "autotune", "import", "sweep", "human-likeness"):
+        assert "the recipe's" not in every[name][1]
+    full = " ".join(every["train"][1].split())
+    tuned = load_recipe(DEFAULT).train
+    hidden = ",".join(map(str, tuned.reward.hidden))
+    wanted = {"learning_rate": tuned.learning_rate, "hidden_size": hidden}
+    for flag, value in {**wanted, "loss": tuned.loss, "mode": "speed"}.items():
+        assert re.search(rf"--{flag} [^()]*\(default: {value}, of the recipe", full)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_flag_that_is_missing_is_named_with_an_example(name, every):
+    line = every[name][2]
+    if name not in REQUIRED:
+        assert line == ""
+        return
+    assert line.startswith(f"--{REQUIRED[name]}: not given: expected ")
+    assert f"; for example: rcirl {name} --" in line
+    assert "\n" not in line
+
+
+@pytest.mark.multiprocess
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("import --output={out}", "--input: not given: expected a file or folder"),
+        ("import --input={out}", "--output: not given"),
+        ("train --data=x", "error: --output: not given: expected folder of the run"),
+        ("tune", "tune: unknown: expected one of autotune, "),
+        ("autotun", "did you mean autotune?"),
+        ("import --format=cvs", "--format: cvs: expected one of apollo, "),
+        ("import --format=cvs", "did you mean csv?"),
+        ("import --stride=far", "--stride: far: expected a number"),
+        ("rank --horizon=9", "--horizon: 9: expected a number in the range [0.4"),
+        ("sweep --trials=0", "--trials: 0: expected a positive integer"),
+        ("sweep --trails=9", "Did you mean: trials"),
+    ],
+)
+def test_a_wrong_command_is_one_line(words, message, tmp_path):
+    given = words.format(out=tmp_path / "out").split()
+    assert message in refused("rcirl_jax", *given)
+
+
+@pytest.mark.multiprocess
+def test_logs_of_no_known_format_are_one_line_with_the_formats(tmp_path):
+    (tmp_path / "drive.log").write_bytes(b"\x00\x01")
+    for words in ("import", "autotune"):
+        flags = (f"--input={tmp_path}", f"--output={tmp_path}/out")
+        line = refused("rcirl_jax", words, *flags)
+        assert f"{tmp_path}: --format: not given" in line
+        assert "apollo, argoverse2" in line
+
+
+@pytest.mark.multiprocess
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("train --workdir={out} --data=nowhere", "nowhere"),
+        ("autotune --workdir={out} --data=nowhere", "nowhere"),
+        ("export --workdir={out}", "{out}/run.json: missing"),
+        ("report --workdir={out}", "gate: missing"),
+    ],
+)
+def test_an_output_may_be_called_workdir(words, message, tmp_path):
+    """As it was in earlier versions; `refused` past the check of flags."""
+    given = words.format(out=tmp_path).split()
+    assert message.format(out=tmp_path) in refused("rcirl_jax", *given)
+
+
+@pytest.mark.multiprocess
+def test_flags_come_from_a_file(tmp_path):
+    file = tmp_path / "flags.txt"
+    file.write_text(f"--data=nowhere\n--output={tmp_path}/run\n")
+    assert "nowhere" in refused("rcirl_jax", "train", f"--flagfile={file}")
+
+
+@pytest.mark.multiprocess
+def test_the_package_and_a_file_of_experiments_are_the_same_command():
+    same = [
+        command("rcirl_jax", "rank", "--help").stdout,
+        command("experiments.evaluate", "--help").stdout,
+    ]
+    assert same[0] == same[1]
+    assert "rcirl rank" in same[0]
+    assert succeeded("rcirl_jax", "--help").stdout.strip() == overview()
+    assert succeeded("rcirl_jax", "--version").stdout.strip().endswith(__version__)
+
+
+def test_the_script_is_the_package():
+    scripts = entry_points(group="console_scripts", name="rcirl")
+    if not scripts:
+        pytest.skip("not installed: make setup")
+    (script,) = scripts
+    assert script.value == "rcirl_jax.cli.rcirl:main"

@@ -1,0 +1,156 @@
+"""Numbers in range for a parser and absurd for a road; faults no check foresaw."""
+
+import dataclasses
+import importlib
+import os
+import subprocess
+import sys
+
+import pytest
+
+from rcirl_jax.data import formats
+from rcirl_jax.data.formats import read_recordings
+from rcirl_jax.data.readers.tables import streams
+from rcirl_jax.data.recording import validate_recording
+from rcirl_jax.errors import InputError
+from tests.data.formats.fixtures import csv, levelx_highd, ngsim
+from tests.data.formats.writers import strict
+from tests.helpers.logs import read, refused
+
+
+def made(folder):
+    folder.mkdir(parents=True)
+    return folder
+
+
+def replace_cell(file, row, column, value, separator=","):
+    """Overwrites one cell of a text table; the column by name or number."""
+    lines = file.read_text().splitlines()
+    place = column
+    if isinstance(column, str):
+        place = lines[0].split(separator).index(column)
+    cells = lines[row].split(separator)
+    cells[place] = value
+    lines[row] = separator.join(cells)
+    file.write_text("\n".join(lines) + "\n")
+
+
+def test_one_wrong_cell_does_not_make_a_lane_across_the_globe(tmp_path):
+    fixture = levelx_highd.write(made(tmp_path / "highd"))
+    (tracks,) = [f for f in fixture.files if f.name.endswith("_tracks.csv")]
+    replace_cell(tracks, 50, "x", "9e7")
+    line = refused(read, "levelx", fixture.input)
+    assert "x: 9e+07 m, the median is " in line
+    fixture = ngsim.write(made(tmp_path / "ngsim"))
+    replace_cell(fixture.files[0], 50, 5, "1e12", " ")
+    source = strict(tmp_path / "strict.toml", "ngsim")
+    line = refused(read, "ngsim", fixture.input, source)
+    assert "line 51: Local_Y: 1e+12: expected within 1e+08" in line
+
+
+WHOLE = ["interaction", "levelx_highd", "ngsim_pairs", "openacc"]
+
+
+def first_file(name, folder):
+    """The first file of a sound log."""
+    module = importlib.import_module(f"tests.data.formats.fixtures.{name}")
+    return module.write(made(folder)).files[0]
+
+
+def importer_of(name):
+    return "levelx" if name.startswith("levelx") else name
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_a_log_that_is_held_whole_has_a_size(name, tmp_path):
+    file = first_file(name, tmp_path / "in")
+    with file.open("r+b") as opened:
+        opened.truncate(2**40)  # its rows, and a terabyte of nothing
+    line = refused(read, importer_of(name), tmp_path / "in")
+    assert f"{file.name}: size: {2**20} MiB: expected 1024 at most" in line
+
+
+@pytest.mark.parametrize("where", ["header", "rows", "cell"])
+@pytest.mark.parametrize("name", [*WHOLE, "csv", "ngsim"])
+def test_a_line_without_an_end_is_not_held(name, where, tmp_path, monkeypatch):
+    """All of it on one line; a sound head, then a line of cells, or of a wide one."""
+    monkeypatch.setattr(streams, "MAX_LINE", 2**14)
+    monkeypatch.setattr(streams, "READ_BYTES", 2**12)
+    monkeypatch.setattr(streams, "HEAD_BYTES", 2**12)
+    file = first_file(name, tmp_path / "in")
+    rows = file.read_text().splitlines(keepends=True)
+    end = rows[-1].rstrip("\n").replace(" ", ",")
+    text = "" if where == "header" else "".join(rows)
+    text += (end + ",") * (2**16 // len(end))
+    if where == "cell":
+        text = "".join(rows[:-1]) + 2**16 * " " + rows[-1]
+    file.write_text(text)
+    line = refused(read, importer_of(name), tmp_path / "in")
+    assert file.name in line
+    assert "a line of more than 16384 characters: expected one a row" in line
+
+
+def test_rows_that_go_on_in_quotes_have_an_end(tmp_path):
+    """A quote that nothing closes makes its own line unreadable, and no others."""
+    log = tmp_path / "log.csv"
+    rows = [f"{k / 10:.1f},a,{k}.0,0.0" for k in range(300)]
+    rows[100] = rows[100].replace("a", '"a')
+    log.write_text("\n".join(["t,id,x,y", *rows]) + "\n")
+    (found,) = read_recordings("csv", log)
+    assert (found.rows.read, found.rows.unreadable) == (300, 1)
+    assert "line 102: a quote without an end" in found.notes[-1]
+    rows[100] = '10.0,"a\nb\nc",100.0,0.0'
+    log.write_text("\n".join(["t,id,x,y", *rows]) + "\n")
+    (found,) = read_recordings("csv", log)
+    assert (found.rows.read, found.rows.unreadable) == (300, 0)
+    assert [track.id for track in found.tracks] == ["a", "a b c"]
+
+
+def test_what_no_check_foresaw_is_one_line_that_names_the_place(tmp_path, monkeypatch):
+    fixture = csv.write(tmp_path)
+
+    def broken(path, spec):
+        yield from ()
+        raise KeyError("stations")
+
+    module = formats.importlib.import_module("rcirl_jax.data.formats.csv.reader")
+    monkeypatch.setattr(module, "recordings", broken)
+    line = refused(read, "csv", fixture.input)
+    assert "KeyError: 'stations' (test_absurd.py:" in line
+    assert line.endswith("expected a sound log of format csv")
+
+
+@pytest.mark.multiprocess
+@pytest.mark.parametrize(
+    ("work", "said"),
+    [
+        ("import numpy; numpy.empty(2**62, numpy.uint8)", "Unable to allocate 4.00 Ei"),
+        ("import jax; jax.numpy.zeros(2**45)", "RESOURCE_EXHAUSTED: Out of memory"),
+    ],
+)
+def test_memory_that_is_not_given_is_one_line(work, said):
+    script = f"from rcirl_jax.cli.flags.common import run; run(lambda: exec({work!r}))"
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(f"error: memory: {said}")
+    assert line.endswith(": expected more for this work")
+
+
+def test_names_that_are_no_text(tmp_path):
+    """A file's name may be any bytes; what an import writes has to be text."""
+    odd = tmp_path / os.fsdecode(b"a\xff.csv")
+    odd.write_text("t,id,x,y\n")
+    with pytest.raises(InputError, match=r"name: 'a\\udcff\.csv': expected UTF-8"):
+        next(read_recordings("csv", odd))
+    (recording,) = read("csv", csv.write(made(tmp_path / "log")).input)
+    track = dataclasses.replace(recording.tracks[0], id="\ud800")
+    for field, value in (
+        *(("name", "\udcff"), ("group", "\udcff"), ("licence", "\udcff")),
+        *(("notes", ("\udcff",)), ("tracks", (track, *recording.tracks[1:]))),
+    ):
+        bad = dataclasses.replace(recording, **{field: value})
+        with pytest.raises(InputError, match=r"expected UTF-8 text"):
+            validate_recording(bad, "a.csv")

@@ -1,0 +1,351 @@
+"""Apollo cyber records: topics, clocks, parts of a drive, malformed records."""
+
+import functools
+import re
+import shutil
+
+import numpy as np
+import pytest
+
+from rcirl_jax.data.formats import parts, read_recordings
+from rcirl_jax.types import Kind
+from tests.data.formats.fixtures import apollo as fixture
+from tests.helpers import logs
+from tests.helpers.logs import refused, tracks_of
+
+LOCALIZATION = "/apollo/localization/pose"
+CHASSIS = "/apollo/canbus/chassis"
+PERCEPTION = fixture.OBSTACLES
+ROUTING = "/apollo/routing_response"
+read = functools.partial(logs.read, "apollo", rate_hz=10.0)
+
+
+def write(path, messages, **options):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(fixture.record(messages, **options))
+    return path
+
+
+def only(path, messages=None, *, channels=None, **options):
+    """The one recording of a path, or of messages written into a folder."""
+    if messages is not None:
+        path = write(path / "a.record", messages, channels=channels)
+    (recording,) = read(path, **options)
+    return recording
+
+
+def ego_only(seconds=2.0, **options):
+    return [
+        (LOCALIZATION, 0.1 * k, fixture.localization(0.1 * k, **options))
+        for k in range(round(10 * seconds) + 1)
+    ]
+
+
+def has_note(recording, words):
+    return any(words in note for note in recording.notes)
+
+
+# ---------------------------------------------------------------- well-formed
+
+
+def test_parts_are_drives(tmp_path):
+    """A part reads those that follow; behind a missing one another run begins."""
+    first, second = fixture.write(tmp_path).files
+    assert only(first).tracks[0].t.size == 81
+    assert only(second).tracks[0].t.size < 81
+    write(tmp_path / "demo_3.5.record", ego_only())
+    write(tmp_path / "x.record.00007", ego_only())
+    write(tmp_path / "x.record.00009", ego_only())  # a part is missing before it
+    (tmp_path / "notes.record.txt").write_text("not a record")
+    found, _ = parts("apollo", tmp_path)
+    assert [part.name for part in found] == [
+        *("20210723091215.record.00000", "demo_3.5.record"),
+        *("x.record.00007", "x.record.00009"),
+    ]
+    recordings = list(read_recordings("apollo", tmp_path))
+    assert {made.name: made.group for made in recordings} == {
+        **{"20210723091215": None, "demo_3.5": None},
+        **{"x": "x", "x-00009": "x"},  # they may show the same cars
+    }
+
+
+def test_parts_named_by_when_they_began_and_copies_of_them(tmp_path):
+    """As Apollo 10 and others name them; parts follow each other inside a folder."""
+    days = [tmp_path / f"2021-07-{day}" for day in (23, 24, 25)]
+    for day in days[:2]:
+        day.mkdir()
+        first, second = fixture.write(day).files
+        first.rename(day / f"{first.name}.091215")
+        second.rename(day / f"{second.name}.20210723091219")
+        shutil.copy(day / f"{first.name}.091215", f"{first}.091215.split")
+    write(days[2] / "demo_3.5.record.split", ego_only())
+    found = list(read_recordings("apollo", tmp_path))
+    drive = "20210723091215"
+    names = [f"2021-07-23/{drive}", f"2021-07-24/{drive}", "demo_3.5"]
+    assert [made.name for made in found] == names
+    np.testing.assert_allclose(found[0].tracks[0].t, fixture.GRID, atol=1e-9)
+
+
+def test_records_that_were_never_closed_or_left_more_behind(tmp_path):
+    """A record is written over without being emptied first; its index is its end.
+
+    Where the computer lost power there is no index, and the header not completed.
+    """
+    path = write(tmp_path / "a.record", ego_only())
+    path.write_bytes(path.read_bytes() + fixture.record(ego_only(8.0))[-3000:])
+    assert only(path).tracks[0].t.size == 21
+    content = write(path, ego_only(), complete=False).read_bytes()
+    path.write_bytes(content[: -len(fixture.INDEX)])
+    assert has_note(only(path), "never closed")
+
+
+def test_prediction_where_perception_is_missing(tmp_path):
+    found = only(tmp_path, fixture.drive(obstacles="/apollo/prediction"))
+    expected = fixture.expected()["15"]
+    np.testing.assert_allclose(tracks_of(found)["15"].x, expected.x, atol=5e-3)
+    assert has_note(found, "those of prediction")
+
+
+def test_heading_from_the_quaternion_and_speed_of_the_chassis(tmp_path):
+    """Speed where localization has none; else differences of positions."""
+    messages = ego_only(heading=False, velocity=False)
+    (ego,) = only(tmp_path, messages).tracks
+    np.testing.assert_allclose(ego.heading, 0.0, atol=1e-9)
+    np.testing.assert_allclose(ego.x, 0.8 * np.arange(21), atol=1e-3)
+    np.testing.assert_allclose(ego.speed, 8.0, atol=1e-3)
+    for k in range(0, 21, 5):
+        messages.append((CHASSIS, 0.1 * k, fixture.chassis(0.1 * k, speed=7.5)))
+    np.testing.assert_allclose(only(tmp_path, messages).tracks[0].speed, 7.5)
+
+
+def test_drive_of_the_planner_is_noted(tmp_path):
+    modes = [
+        (CHASSIS, 0.5 * k, fixture.chassis(0.5 * k, manual=k == 2)) for k in range(4)
+    ]
+    made = only(tmp_path, ego_only() + modes)
+    assert has_note(made, "75% of the time not in COMPLETE_MANUAL")
+    (ego,) = made.tracks
+    np.testing.assert_allclose(ego.automated, [(-np.inf, 1.0), (1.5, np.inf)])
+
+
+def perceived(count=11, **changes):
+    """The ego and one obstacle with other fields; None: not set."""
+    messages = ego_only()
+    for k in range(count):
+        t = 0.1 * k
+        item = {**fixture.seen_at(t)[0], **changes}
+        item = {name: value for name, value in item.items() if value is not None}
+        messages.append((PERCEPTION, t, fixture.perceived(t, [item], late=0.0)))
+    return messages
+
+
+@pytest.mark.parametrize(
+    ("choice", "number", "kind"),
+    [
+        *[("auto", number, Kind.VEHICLE) for number in (0, 1)],
+        *[("auto", 2, Kind.STATIC), ("static", 0, Kind.STATIC), ("drop", 0, None)],
+    ],
+)
+def test_unknown_class(tmp_path, choice, number, kind):
+    found = only(tmp_path, perceived(type=number), unknown=choice).tracks
+    assert [t.kind for t in found if t.id == "12"] == ([] if kind is None else [kind])
+
+
+def test_states_and_sizes_that_are_none(tmp_path):
+    found = tracks_of(only(tmp_path, perceived(length=None, width=0.0)))["12"]
+    assert (found.length, found.width) == (4.5, 1.8)
+    messages = perceived(id=-1) + perceived(position=None)[21:]
+    recording = only(tmp_path, messages)
+    assert [found.id for found in recording.tracks] == ["ego"]
+    assert has_note(recording, "22 obstacle states without")
+
+
+def test_messages_twice_and_out_of_order(tmp_path):
+    messages = ego_only()
+    found = only(tmp_path, [*messages[::-1], *messages[3:9]]).tracks[0]
+    np.testing.assert_allclose(found.x, 0.8 * np.arange(21), atol=1e-3)
+
+
+def test_heading_across_the_wrap(tmp_path):
+    """A pose every 0.1 s between the ticks of the clock."""
+    messages = []
+    for k in range(12):
+        t = 0.05 + 0.1 * k
+        pose = {"position": fixture.point(*fixture.CENTRE), "heading": (-1) ** k * 3.13}
+        messages.append((LOCALIZATION, t, fixture.localization(t, pose=pose)))
+    (ego,) = only(tmp_path, messages).tracks
+    np.testing.assert_allclose(np.cos(ego.heading), -1.0, atol=1e-4)
+
+
+def test_topics_stamped_on_different_clocks(tmp_path):
+    """Simulated and real time: the times of recording are common to both."""
+    messages = [
+        (name, t, fixture.localization(t, later=12.0) if name != PERCEPTION else made)
+        for name, t, made in perceived()
+    ]
+    recording = only(tmp_path, messages)
+    assert has_note(recording, "different clocks")
+    assert tracks_of(recording)["12"].t[0] == pytest.approx(0.0, abs=1e-6)
+
+
+# -------------------------------------------------------------------- routing
+
+
+def place(number):
+    """A destination, m from the local origin once it is read."""
+    return (fixture.CENTRE[0] + 200.0 + number, fixture.CENTRE[1] + 1.0)
+
+
+def destinations(recording):
+    """Of the ego's tracks, as in the messages."""
+    (note,) = [note for note in recording.notes if "local origin" in note]
+    origin = np.array(re.findall(r"= (\d+) m", note), float)
+    return {
+        found.id: found.destination
+        and tuple((np.array(found.destination) + origin).tolist())
+        for found in recording.tracks
+        if found.id.startswith("ego")
+    }
+
+
+CHANNELS_OF_ROUTES = [
+    *[
+        (name, fixture.CHANNELS[ROUTING], fixture.routing)
+        for name in (
+            *(ROUTING, f"{ROUTING}_history", "/apollo/raw_routing_response"),
+            "/apollo/raw_rrouting_response_history",
+        )
+    ],
+    # Apollo 9 and later; a record from the middle of a drive has the history alone
+    *[
+        (name, fixture.COMMANDS, fixture.command)
+        for name in ("/apollo/planning/command", "/apollo/planning_command_history")
+    ],
+]
+
+
+@pytest.mark.parametrize(("name", "channel", "make"), CHANNELS_OF_ROUTES)
+def test_routing_of_every_release(tmp_path, name, channel, make):
+    messages = [(name, 0.3, make(*place(0))), *ego_only(5.0)]
+    if make is fixture.command:
+        messages.append((name, 3.0, fixture.parking()))
+    channels = {**fixture.CHANNELS, name: channel}
+    recording = only(tmp_path, messages, channels=channels)
+    assert destinations(recording) == {"ego": place(0)}
+    assert not has_note(recording, "no routing")
+
+
+def test_each_routing_begins_a_leg(tmp_path):
+    """The same destination sent again does not; what comes later is not known."""
+    times = {0.5: 0, 1.0: 0, 2.04: 1, 3.0: 1, 3.7: 0}
+    routings = [(ROUTING, t, fixture.routing(*place(n))) for t, n in times.items()]
+    recording = only(tmp_path, ego_only(5.0) + routings)
+    names = ("ego", "ego-leg2", "ego-leg3")
+    assert list(destinations(recording).items()) == [
+        (name, place(number)) for name, number in zip(names, (0, 1, 0), strict=True)
+    ]
+    legs = [tracks_of(recording)[name] for name in names]
+    ends = [(round(leg.t[0], 6), round(leg.t[-1], 6)) for leg in legs]
+    assert ends == [(0.0, 2.0), (2.1, 3.6), (3.7, 5.0)]
+    whole = only(tmp_path, ego_only(5.0)).tracks[0]
+    np.testing.assert_array_equal(np.concatenate([leg.x for leg in legs]), whole.x)
+    # none before a late one
+    late = only(tmp_path, [*ego_only(5.0), (ROUTING, 3.0, fixture.routing(*place(0)))])
+    assert destinations(late) == {"ego": None, "ego-leg2": place(0)}
+
+
+def test_a_clock_of_another_rate(tmp_path):
+    assert only(tmp_path, ego_only(), rate_hz=5.0).tracks[0].t.size == 11
+
+
+@pytest.mark.dataset
+def test_example_record_of_apollo(data_dir):
+    """34 messages of a simulated car that stands; values read with cyber_record."""
+    recording = only(data_dir / "formats" / "apollo_record" / "example.record.00000")
+    (ego,) = recording.tracks
+    assert recording.name == "example"
+    assert ego.t.size == 2
+    heading = -2.25563014963147
+    x = 315323.44588835048 + fixture.AHEAD * np.cos(heading)
+    np.testing.assert_allclose(ego.x, x - 315000.0, atol=1e-6)
+    np.testing.assert_allclose(ego.heading, heading)
+    np.testing.assert_array_equal(ego.speed, 0.0)
+    assert ego.destination == pytest.approx((314.98923, 388.09329), abs=1e-4)
+    assert has_note(recording, "no obstacles")
+    assert has_note(recording, "100% of the time")
+
+
+# ---------------------------------------------------------------- descriptors
+
+ESTIMATE = "apollo.localization.LocalizationEstimate"
+ME = f"header 1 .{ESTIMATE}"  # the message itself, which has what a header needs
+
+
+def estimate(*fields):
+    """Descriptors with a LocalizationEstimate of other fields."""
+    text = f"LocalizationEstimate: {', '.join(['timestamp_sec 9 double', *fields])}"
+    return fixture.described("apollo.localization", text=text)
+
+
+def nested(depth):
+    inner = fixture.MESSAGES.ProtoDesc()
+    for _ in range(depth):
+        inner = fixture.MESSAGES.ProtoDesc(dependencies=[inner])
+    return inner.SerializeToString()
+
+
+BAD_DESCRIPTORS = [
+    (None, "no descriptors before its first message"),
+    (b"", "LocalizationEstimate: no descriptors"),
+    (b"\xff\xff", "Error parsing message"),
+    (nested(90) * 2, "LocalizationEstimate: no descriptors"),
+    (estimate(), "field header: not among the descriptors"),
+    (estimate("header 1 int32"), "Estimate.header: type int32: another is known"),
+    (estimate("header 1 .x.Y*"), "header: type message: another is known"),
+    (estimate("header 1 .x.Y"), "message type x.Y: not among the descriptors"),
+    (estimate(ME, "measurement_time 1 double"), "duplicate field number"),
+    # the depth of what is parsed is that of what is wanted
+    (estimate(ME), "pose: x: nan"),
+]
+
+
+@pytest.mark.parametrize(("desc", "words"), BAD_DESCRIPTORS)
+def test_hostile_descriptors(tmp_path, desc, words):
+    channels = {LOCALIZATION: (ESTIMATE, desc)} if desc is not None else {}
+    line = refused(only, tmp_path, ego_only(), channels=channels)
+    assert words in line
+    assert "a.record: " in line
+
+
+def test_a_channel_without_descriptors_is_noted(tmp_path):
+    """The others are read; of a record that holds no other one is named."""
+    at = 0.1
+    sent = [(CHASSIS, at, b"\x0d\0\0\0\0"), (CHASSIS, at, b""), *ego_only()]
+    described = fixture.CHANNELS | {CHASSIS: ("apollo.canbus.Chassis", b"")}
+    made = only(tmp_path, sent, channels=described)
+    assert made.tracks[0].t.size == 21
+    (note,) = [note for note in made.notes if CHASSIS in note]
+    assert note.endswith("no descriptors; who drove is not known")
+
+
+def test_messages_of_many_bytes(tmp_path, monkeypatch):
+    limit = "rcirl_jax.data.formats.apollo.records.MAX_BYTES"
+    monkeypatch.setattr(limit, 5000)
+    assert only(tmp_path, ego_only()).tracks  # beside larger ones that nobody reads
+    messages = ego_only()
+    messages[3] = (LOCALIZATION, 0.3, bytes(5001))
+    line = refused(only, tmp_path, messages)
+    assert "pose: message 3: message: 5001 bytes of" in line
+    monkeypatch.setattr(limit, 200)
+    line = refused(only, tmp_path, ego_only())
+    assert re.search(r"descriptors: \d+ bytes of at most 200", line)
+
+
+def test_of_a_silent_chassis_nobody_knows_the_mode(tmp_path):
+    """Before the first message its mode was in force."""
+    for manual, spans in ((True, [(1.2, np.inf)]), (False, [(-np.inf, np.inf)])):
+        messages = [*ego_only(), (CHASSIS, 0.2, fixture.chassis(0.2, manual=manual))]
+        (ego,) = only(tmp_path, messages).tracks
+        np.testing.assert_allclose(ego.automated, spans)
+    (ego,) = only(tmp_path, ego_only()).tracks
+    assert ego.automated == ()

@@ -1,0 +1,155 @@
+"""Argoverse 2: a scenario as published, the real files, hostile Parquet and JSON."""
+
+import functools
+import json
+import shutil
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from rcirl_jax.types import Kind
+from tests.data.formats.fixtures import argoverse2 as w
+from tests.helpers import logs
+from tests.helpers.logs import lanes_of, refused, tracks_of
+
+PACKAGED = logs.packaged("argoverse2")
+read = functools.partial(logs.read, "argoverse2")
+only = functools.partial(logs.only, "argoverse2")
+
+
+def scenario(folder, **options):
+    """The recording of one scenario; `table` and `lanes` of it may be given."""
+    made = {key: options.pop(key) for key in ("table", "lanes") if key in options}
+    return only(w.write_scenario(folder, **made)[0], **options)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The recording of the fixture."""
+    return only(w.write(tmp_path_factory.mktemp("argoverse2")).input)
+
+
+def test_lanes(whole):
+    assert (whole.rate_hz, whole.name, whole.group) == (10.0, w.SCENARIO, w.SLICE)
+    lanes = lanes_of(whole)
+    first = lanes["205119001"]
+    np.testing.assert_allclose(first.left_width, w.WIDTH / 2, atol=0.01)
+    np.testing.assert_allclose(first.centre[:, 0], w.EAST + w.WIDTH / 2, atol=0.01)
+    assert first.successors == ("205119003", "205119006")
+    # the oncoming lane is named as left neighbour in the file
+    assert (first.left, first.right) == (None, "205119002")
+    assert lanes["205119002"].left == "205119001"
+    # the bicycle lane is left out, and so is a successor that the map lacks
+    assert (lanes["205119002"].right, lanes["205119003"].successors) == (None, ())
+    assert any("1 lanes not of type" in note for note in whole.notes)
+    assert whole.signals == ()
+    oncoming, turn = lanes["205119005"].centre, lanes["205119006"].centre
+    assert oncoming[-1, 1] < oncoming[0, 1]
+    # a turning lane lies midway between its bounds
+    middle = np.array([w.EAST - 20.0 + w.WIDTH / 2, w.NORTH + 30.0])
+    np.testing.assert_allclose(np.hypot(*(turn - middle).T), 20.0, atol=0.1)
+
+
+def test_options(tmp_path):
+    assert len(scenario(tmp_path, lane_types=["VEHICLE", "BIKE"]).lanes) == 7
+    recording = scenario(tmp_path, min_category=1)
+    assert "138902" not in tracks_of(recording)
+    assert any("3 tracks below category 1" in note for note in recording.notes)
+    sizes = {**PACKAGED["sizes"], "bus": [18.0, 2.55]}
+    tracks = scenario(tmp_path, sizes=sizes).tracks
+    assert {track.length for track in tracks if "139400" in track.id} == {18.0}
+    kinds = {**PACKAGED["kinds"], "cyclist": "vehicle"}
+    tracks = tracks_of(scenario(tmp_path, kinds=kinds))
+    assert tracks["139408"].kind == Kind.VEHICLE
+
+
+def test_every_type_has_a_kind_and_a_size():
+    assert len(PACKAGED["kinds"]) == 10
+    assert set(PACKAGED["kinds"]) | {"AV"} == set(PACKAGED["sizes"])
+
+
+def test_columns_that_may_be_missing_and_the_test_split(tmp_path):
+    """The test split has the observed part only."""
+    table = w.columns()
+    for name in ("slice_id", "map_id", "city", "focal_track_id", "observed"):
+        del table[name]
+    keep = [row for row, step in enumerate(table["timestep"]) if step < w.OBSERVED]
+    table = {key: [values[row] for row in keep] for key, values in table.items()}
+    recording = scenario(tmp_path, table=table)
+    assert recording.group == w.SCENARIO
+    assert max(track.t[-1] for track in recording.tracks) == pytest.approx(4.9)
+
+
+def test_other_types_of_the_same_columns(tmp_path):
+    """Categories, float32 positions and whole-number ids are read alike."""
+    table = w.columns()
+    digits = [0 if name == "AV" else int(name) for name in table["track_id"]]
+    arrays = {name: pa.array(values) for name, values in table.items()}
+    arrays["track_id"] = pa.array(digits, pa.int32())
+    arrays["object_type"] = arrays["object_type"].dictionary_encode()
+    arrays["scenario_id"] = arrays["scenario_id"].cast(pa.large_string())
+    arrays["heading"] = arrays["heading"].cast(pa.float32())
+    path, _ = w.write_scenario(tmp_path)
+    pq.write_table(pa.table(arrays), path, row_group_size=100, compression="zstd")
+    tracks = tracks_of(only(path))
+    assert tracks["0"].kind == Kind.VEHICLE
+    assert tracks["139408"].kind == Kind.CYCLIST
+    assert tracks[w.FOCAL].t.size == w.NUM_STEPS
+
+
+def test_stamps_that_are_not_10_hz_are_noted(tmp_path):
+    table = w.columns()
+    table["end_timestamp"] = [w.START_NS + 4.9e9] * len(table["timestep"])
+    recording = scenario(tmp_path, table=table)
+    assert any("0.1 s assumed" in note for note in recording.notes)
+    assert recording.tracks[0].t[-1] > 5.0
+
+
+def test_lane_without_length_is_left_out(tmp_path):
+    lanes = w.vector_map()
+    for side in ("left", "right"):
+        lanes["lane_segments"]["205119002"][f"{side}_lane_boundary"] = [w.POINT] * 2
+    recording = scenario(tmp_path, lanes=lanes)
+    assert any("1 lanes without length" in note for note in recording.notes)
+
+
+def test_scenario_id_does_not_lead_out_of_the_folder(tmp_path):
+    table = w.columns()
+    table["scenario_id"] = ["/../../secret"] * len(table["timestep"])
+    path, map_file = w.write_scenario(tmp_path, table=table)
+    assert only(path).name == "/../../secret"
+    map_file.rename(tmp_path / "secret.json")
+    (path.parent / "log_map_archive_").mkdir()
+    assert "map: missing" in refused(read, path)
+
+
+# ----------------------------------------------------------------------- recorded
+
+
+@pytest.mark.dataset
+def test_recorded_scenario(data_dir):
+    recording = only(data_dir / "formats" / "argoverse2_motion")
+    assert (len(recording.tracks), recording.rate_hz) == (58, 10.0)
+    assert sum(track.t.size for track in recording.tracks) == 2434
+    tracks = tracks_of(recording)
+    assert tracks["AV"].length == 4.87
+    assert tracks["138951"].t.size == 110
+    assert len(recording.lanes) == 34
+    assert sum(lane.right is not None for lane in recording.lanes) == 7
+    for lane in recording.lanes:
+        assert 1.0 < np.median(lane.left_width) < 4.0
+    away = np.hypot(*(recording.lanes[0].centre - [-436.0, 1350.0]).T)
+    assert away.min() < 300.0
+
+
+@pytest.mark.dataset
+def test_recorded_map_without_centre_lines(data_dir, tmp_path):
+    """The map of a sensor log has no `centerline`; it is read alike."""
+    (real,) = (data_dir / "formats" / "argoverse2_motion").glob("*PIT*.json")
+    path, map_file = w.write_scenario(tmp_path)
+    shutil.copy(real, map_file)
+    content = json.loads(real.read_text())["lane_segments"].values()
+    driven = [lane for lane in content if lane["lane_type"] != "BIKE"]
+    assert len(only(path).lanes) == len(driven) == 180

@@ -1,0 +1,364 @@
+"""Every importer, one set of invariants: what is written is what is read.
+
+The formats are the modules of tests/data/formats/fixtures with a function `write`; a
+module named otherwise than its format says so by FORMAT.
+"""
+
+import numpy as np
+import pytest
+
+from rcirl_jax.data.cut import digest
+from rcirl_jax.data.formats import IMPORTERS, parts, read_part, read_recordings
+from rcirl_jax.data.importing import ImportConfig, import_parts
+from rcirl_jax.data.parts import parts_of
+from rcirl_jax.data.readers import long_logs
+from rcirl_jax.data.recording import validate_recording
+from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.errors import InputError
+from rcirl_jax.runtime.specs import load_toml, spec_root
+from rcirl_jax.types import Kind
+from tests.data.formats import fixtures as formats
+from tests.data.formats.damage import DAMAGES, text_of
+from tests.data.formats.fixtures import format_of
+from tests.helpers import logs
+from tests.helpers.logs import refused
+
+SPEED_TOLERANCE_MPS = 0.3  # m/s
+SIZE_TOLERANCE_M = 0.02  # m
+HEADING_TOLERANCE = 0.02  # rad
+TIME_TOLERANCE_S = 0.006  # s, stamps rounded to 10 ms
+
+
+MODULES = formats.modules()
+
+
+def write(name, folder):
+    folder.mkdir(parents=True, exist_ok=True)
+    return MODULES[name].write(folder)
+
+
+def read(name, fixture):
+    return list(read_recordings(format_of(name), fixture.input))
+
+
+@pytest.fixture(scope="module", params=sorted(MODULES))
+def name(request):
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def sound(name, tmp_path_factory):
+    """A fixture that nothing is done to, and its recordings."""
+    fixture = write(name, tmp_path_factory.mktemp("sound"))
+    return fixture, read(name, fixture)
+
+
+def find(recordings, label, expected):
+    """The track of this id, in the recording where it has as many samples."""
+    found = [t for r in recordings for t in r.tracks if t.id == label]
+    known = sorted({t.id for r in recordings for t in r.tracks})
+    assert found, f"no track {label} among {known}"
+    fitting = [track for track in found if track.t.size == expected.t.size]
+    sizes = [track.t.size for track in found]
+    assert fitting, f"track {label}: {sizes} samples, written {expected.t.size}"
+    return fitting[0]
+
+
+def test_every_format_has_a_fixture():
+    """A new importer comes with a fixture; synthetic traffic is its own."""
+    assert {format_of(name) for name in MODULES} == set(IMPORTERS) - {"synthetic"}
+
+
+def spec_of(name):
+    return load_toml(spec_root() / "sources" / f"{format_of(name)}.toml")
+
+
+def test_source_and_licence_are_named(name):
+    spec = spec_of(name)
+    every = [spec, *spec.get("provenance", [])]
+    assert any(entry.get("source") for entry in every)
+    assert spec["licence"].strip()
+
+
+def test_what_was_written_is_found(sound):
+    fixture, recordings = sound
+    for label, expected in fixture.tracks.items():
+        track = find(recordings, label, expected)
+        assert track.kind == expected.kind, label
+        for field in ("length", "width"):
+            found, meant = getattr(track, field), getattr(expected, field)
+            assert abs(found - meant) <= SIZE_TOLERANCE_M, (label, field, found, meant)
+        np.testing.assert_allclose(track.t, expected.t, atol=TIME_TOLERANCE_S)
+        apart = np.hypot(track.x - expected.x, track.y - expected.y)
+        assert apart.max() <= fixture.tolerance_m, (label, apart.max())
+        fast = np.abs(track.speed - expected.speed)
+        assert fast.max() <= SPEED_TOLERANCE_MPS, (label, fast.max())
+        if fixture.has_heading:
+            turn = np.angle(np.exp(1j * (track.heading - expected.heading)))
+            assert np.abs(turn).max() <= HEADING_TOLERANCE, (label, np.abs(turn).max())
+    assert max(len(r.lanes) for r in recordings) >= fixture.num_lanes
+    assert max(len(r.signals) for r in recordings) >= fixture.num_signals
+
+
+def test_every_recording_is_sound(sound):
+    fixture, recordings = sound
+    assert recordings
+    names = [recording.name for recording in recordings]
+    assert len(set(names)) == len(names)
+    for recording in recordings:
+        validate_recording(recording)
+        assert recording.rate_hz == pytest.approx(fixture.rate_hz, rel=1e-6)
+        for text in (recording.source, recording.licence):
+            assert text.strip()
+            assert not text.lower().startswith("unknown")
+        begin = min(track.t[0] for track in recording.tracks)
+        assert begin == pytest.approx(0.0, abs=1e-6)
+        for track in recording.tracks:
+            assert isinstance(track.kind, Kind)
+            for field in ("t", "x", "y", "heading", "speed"):
+                assert getattr(track, field).dtype == np.float64
+            assert np.all(np.diff(track.t) > 0.0)
+            # float32 on the device resolves a centimetre up to about 100 km
+            assert max(np.abs(track.x).max(), np.abs(track.y).max()) < 1e5
+        for lane in recording.lanes:
+            assert lane.centre.dtype == np.float64
+
+
+def test_lanes_lie_under_the_vehicles(sound):
+    """Tracks and lanes share one frame: most vehicles have a lane below them."""
+    fixture, recordings = sound
+    if fixture.num_lanes == 0:
+        assert not any(recording.lanes for recording in recordings)
+        return
+    shares = []
+    for recording in recordings:
+        centres = [lane.centre for lane in recording.lanes]
+        dense = np.concatenate([_dense(centre) for centre in centres])
+        for track in recording.tracks:
+            if track.kind == Kind.VEHICLE:
+                gap = np.hypot(
+                    track.x[:, None] - dense[:, 0], track.y[:, None] - dense[:, 1]
+                )
+                shares.append(np.mean(gap.min(axis=1) < 4.0))
+    assert np.median(shares) > 0.9, shares
+
+
+def _dense(line):
+    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    at = np.linspace(0.0, arc[-1], int(arc[-1]) + 2)
+    return np.stack([np.interp(at, arc, line[:, i]) for i in (0, 1)], axis=1)
+
+
+def digests(recordings):
+    return [(digest(r), r.group, r.notes, r.signals == ()) for r in recordings]
+
+
+def test_parts_read_apart_make_up_the_whole(name, sound):
+    """Read again, on other machines, every input gives the same to the bit."""
+    fixture, whole = sound
+    found, spec = parts(format_of(name), fixture.input)
+    apart = [r for part in found for r in read_part(format_of(name), part, spec)]
+    assert digests(apart) == digests(whole)
+    again = read_part(format_of(name), fixture.input, spec)
+    assert iter(again) is iter(again)  # one recording at a time
+    assert digests(again) == digests(whole)
+
+
+@pytest.mark.parametrize("name", ["apollo", "nuplan", "ros2"])
+def test_windows_hold_the_scenes_of_the_drive(name, tmp_path, monkeypatch):
+    """Road users keep their names; surroundings are shortened to those of 8 s."""
+    monkeypatch.setattr(long_logs, "BEFORE_S", 1.0)
+    monkeypatch.setattr(long_logs, "AFTER_S", 2.5)
+    place = write(name, tmp_path).input
+    whole = logs.only(name, place)
+    found = logs.read(name, place, window_s=3.0)
+    assert [one.name for one in found] == [f"{whole.name}-{k:03d}" for k in range(3)]
+    assert {one.piece_of for one in found} == {whole.name}
+    assert len({one.group for one in found}) == 1
+    begins = [one.scenes_within[0] for one in found]
+    np.testing.assert_allclose(begins, [0.0, 3.0, 6.0], atol=0.7)
+    shares = [one.progress for one in found]
+    assert 0.0 < shares[0] <= shares[1] <= shares[2] <= 1.0
+    users = logs.tracks_of(whole)
+    assert {track.id for one in found for track in one.tracks} == set(users)
+    for track in (track for one in found for track in one.tracks):
+        same = users[track.id]
+        rows = np.searchsorted(same.t, track.t - 1e-6)
+        np.testing.assert_allclose(same.t[rows], track.t, atol=1e-6)
+        own = np.hypot(*np.diff([track.x, track.y]))
+        moved = np.hypot(*np.diff([same.x[rows], same.y[rows]]))
+        np.testing.assert_allclose(own, moved, atol=1e-6)
+    if name == "nuplan":  # others fit their lanes to each window
+        one, apart = logs.scenes_of([whole], 1.5), logs.scenes_of(found, 1.5)
+        assert len(one) > 40
+        assert set(apart) == set(one)
+
+
+MAPS = {".osm", ".osm_xy", ".gpkg", ".pb"}  # of formats that may come without
+
+
+@pytest.mark.parametrize("name", ["interaction", "l5", "levelx", "nuplan"])
+def test_without_a_map_lanes_follow_the_paths(name, tmp_path):
+    fixture = write(name, tmp_path)
+    for file in tmp_path.rglob("*"):
+        if file.suffix in MAPS:
+            file.unlink()
+    made = read(name, fixture)[0]
+    assert made.lanes[0].id == "path-0"
+    assert any("no map" in note for note in made.notes)
+
+
+def imported(name, fixture, output):
+    """The manifest of an import as by its command; 3 s of future are enough."""
+    collect = CollectConfig(
+        require_obstacles=False, require_speed_change=False, min_future_s=3.0
+    )
+    config = ImportConfig(format=format_of(name), collect=collect, test_fraction=0.0)
+    return import_parts(parts_of(format_of(name), fixture.input), output, config)
+
+
+def test_imports_end_to_end(name, sound, tmp_path):
+    """Every fixture is long enough for a scene of 3 s."""
+    manifest = imported(name, sound[0], tmp_path / "dataset")
+    assert manifest.count > 0
+    assert manifest.sources
+    spec = spec_of(name)
+    known = [spec, *spec.get("provenance", [])]
+    licences = {entry.get("licence", spec["licence"]) for entry in known}
+    assert {entry["licence"] for entry in manifest.sources} <= licences
+
+
+# ---------------------------------------------------------------- damaged files
+
+
+@pytest.mark.parametrize("damage", sorted(DAMAGES))
+def test_damaged_files(name, sound, damage, tmp_path):
+    """One line that names the file, or (rows end cleanly, optional) a result.
+
+    An import says the same line and leaves nothing.
+    """
+    apply, may_pass = DAMAGES[damage]
+    target = tmp_path / "executed"
+    assert sound[0].files
+    for place in range(len(sound[0].files)):
+        fixture = write(name, tmp_path / str(place))
+        path = fixture.files[place]
+        if not apply(path, fixture, target):
+            continue
+        try:
+            recordings = read(name, fixture)
+        except InputError as error:
+            message = str(error)
+            assert "\n" not in message
+            assert len(message) < 1000
+            assert path.name in message or damage == "removed", message
+            assert message in refused(imported, name, fixture, tmp_path / "dataset")
+            assert not (tmp_path / "dataset").exists()
+        else:
+            assert may_pass(fixture), f"{damage}: {path.name} was read as if sound"
+            for recording in recordings:
+                validate_recording(recording)
+            if "number" in damage and fixture.drops_rows and not fixture.has_holes:
+                assert sum(made.rows.unreadable for made in recordings) == 1
+        assert not target.exists(), f"{path.name}: code was executed"
+
+
+def of_all(table):
+    """(name, number or words, what is done) of every entry of a table of fixtures."""
+    found = []
+    for name, module in sorted(MODULES.items()):
+        entries = getattr(module, table, {})
+        pairs = entries.items() if isinstance(entries, dict) else enumerate(entries)
+        found += [pytest.param(name, *pair, id=f"{name}: {pair[0]}") for pair in pairs]
+    return found
+
+
+@pytest.mark.parametrize(("name", "words", "harm"), of_all("HARMS"))
+def test_what_is_wrong_in_a_file_is_named(name, words, harm, tmp_path):
+    """Values that no road, clock or user has; tables and fields of another form."""
+    fixture = write(name, tmp_path)
+    harm(fixture)
+    line = refused(read, name, fixture)
+    assert words in line
+    assert "expected" in line
+    assert line.startswith(str(tmp_path))
+
+
+@pytest.mark.parametrize(("name", "number", "option"), of_all("OPTIONS"))
+def test_what_is_wrong_in_an_option_is_named(name, number, option, tmp_path):
+    (key,), place = option, write(name, tmp_path).input
+    line = refused(logs.read, format_of(name), place, **option)
+    assert line.startswith(f"source TOML: {key}")
+
+
+def test_options_of_the_recording_car_and_of_limits(name, sound):
+    """Where a format has them: its size, who drives it, the limit of other lanes."""
+    spec, place = spec_of(name), sound[0].input
+    if "ego" in spec:
+        size = {**spec["ego"], "length": 4.0, "width": 1.7}
+        made = logs.read(format_of(name), place, ego=size, speed_limit=9.0)[0]
+        ego = logs.tracks_of(made)["ego"]
+        assert (ego.length, ego.width, made.default_speed_limit) == (4.0, 1.7, 9.0)
+    if name in ("argoverse2", "l5", "waymo"):  # others record who drives
+        for driver, is_other in (("automated", True), ("human", False)):
+            found = logs.read(format_of(name), place, recording_car=driver)
+            assert any(t.automated for r in found for t in r.tracks) == is_other
+
+
+def test_options_of_another_type_are_named(name, sound, tmp_path):
+    """Every one that the packaged TOML has, but those whose readers take several."""
+    source = tmp_path / "source.toml"
+    for key, value in spec_of(name).items():
+        if key in ("pattern", "topics"):
+            continue
+        source.write_text(f"{key} = {3 if isinstance(value, str) else repr('x')}")
+        line = refused(read_recordings, format_of(name), sound[0].input, source)
+        assert line.startswith(f"source TOML: {key}: ")
+
+
+def damaged(content, rng, is_head_kept):
+    """The content with up to 30 bytes changed, or one; its head may be kept."""
+    start = len(content) // 10 if is_head_kept else 0
+    changed = bytearray(content)
+    for place in rng.integers(start, len(content), rng.choice([1, 4, 30])):
+        changed[place] = rng.integers(0, 256)
+    return bytes(changed)
+
+
+def test_changed_bytes_are_one_line_or_read(name, sound, tmp_path):
+    fixture, rng = write(name, tmp_path), np.random.default_rng(0)
+    for path in fixture.files:
+        content, refusals = path.read_bytes(), 0
+        for attempt in range(16):
+            path.write_bytes(damaged(content, rng, attempt % 2))
+            try:
+                recordings = read(name, fixture)
+            except InputError as error:
+                assert "\n" not in str(error)  # noqa: PT017
+                refusals += 1
+            else:
+                for recording in recordings:
+                    validate_recording(recording)
+                if path in fixture.checked:
+                    assert digests(recordings) == digests(sound[1])
+        path.write_bytes(content)
+        assert refusals > 4 or path not in fixture.checked
+
+
+def test_texts_say_where_a_number_is_and_their_last_line_needs_no_newline(
+    name, sound, tmp_path
+):
+    """So that the last three damages are done to all of them."""
+    fixture = write(name, tmp_path)
+    texts = {path for path in fixture.files if text_of(path) is not None}
+    assert texts == set(fixture.numbers)
+    for path in texts:
+        path.write_text(path.read_text().rstrip("\n"))
+    assert digests(read(name, fixture)) == digests(sound[1])
+
+
+def test_missing_and_empty_inputs_are_one_line(name, tmp_path):
+    form = format_of(name)
+    line = refused(read_recordings, form, tmp_path / "nowhere")
+    assert line.startswith(str(tmp_path / "nowhere"))
+    assert str(tmp_path) in refused(lambda: list(read_recordings(form, tmp_path)))

@@ -1,0 +1,304 @@
+"""The generic CSV importer: mapping, units, lanes, malformed tables."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rcirl_jax.data.formats.lanes import StraightLane, straight_lanes
+from rcirl_jax.errors import InputError
+from rcirl_jax.runtime.specs import spec_root
+from rcirl_jax.types import Kind
+from tests.data.formats import writers as w
+from tests.data.formats.people import only, read
+
+
+def log(folder, rows=None, header=w.CSV_COLUMNS):
+    return w.table(folder / "log.csv", header, w.csv_rows() if rows is None else rows)
+
+
+def test_rows_become_tracks_and_lanes(tmp_path):
+    recording = only(log(tmp_path), w.csv_spec(tmp_path / "s.toml"))
+    assert [track.id for track in recording.tracks] == ["car0", "car1", "car2"]
+    track = recording.tracks[1]
+    np.testing.assert_allclose(track.x, 10.0 + 1.5 * np.arange(40))
+    np.testing.assert_array_equal(track.speed, 15.0)
+    assert (track.kind, track.length, track.width) == (Kind.VEHICLE, 4.5, 1.8)
+    np.testing.assert_allclose(track.heading, 0.0, atol=1e-9)
+    lanes = {lane.id: lane for lane in recording.lanes}
+    assert (lanes["lane1"].left, lanes["lane1"].right) == ("lane0", "lane2")
+    np.testing.assert_allclose(lanes["lane1"].centre[:, 1], -3.5)
+    assert recording.group is None
+
+
+@given(
+    length=st.sampled_from([("m", 1.0), ("ft", 0.3048)]),
+    speed=st.sampled_from(
+        [
+            ("m/s", 1.0),
+            ("km/h", 1 / 3.6),
+            ("mph", 0.44704),
+            ("ft/s", 0.3048),
+            ("kn", 1852 / 3600),
+        ]
+    ),
+    clock=st.sampled_from(
+        [
+            *(("s", 1.0), ("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9), ("frame", 0.1)),
+            *(("min", 60.0), ("h", 3600.0), ("day", 86400.0)),
+        ]
+    ),
+    angle=st.sampled_from([("rad", 1.0), ("deg", np.pi / 180)]),
+    origin=st.sampled_from([0.0, 1.6e9]),
+)
+def test_units(tmp_path_factory, length, speed, clock, angle, origin):
+    """Every unit, and clocks since 1970, give the same recording in SI."""
+    folder = tmp_path_factory.mktemp("units")
+    rows = []
+    for row in w.csv_rows():
+        t, name, x, y, v, box_length, box_width, lane = row
+        k = round(t / 0.1)
+        time = origin + k if clock[0] == "frame" else (origin + 0.1 * k) / clock[1]
+        x, y, box_length, box_width = (
+            value / length[1] for value in (x, y, box_length, box_width)
+        )
+        rows.append([time, name, x, y, v / speed[1], box_length, box_width, lane])
+        rows[-1].append(0.02 / angle[1])
+    units = [f'{field} = "{length[0]}"' for field in ("x", "y", "length", "width")]
+    units += [f't = "{clock[0]}"', f'speed = "{speed[0]}"', f'heading = "{angle[0]}"']
+    columns = (*w.CSV_COLUMNS, "heading")
+    source = w.csv_spec(folder / "s.toml", columns=columns, units="\n".join(units))
+    track = only(log(folder, rows, columns), source).tracks[2]
+    # a float64 clock since 1970 in ms resolves 0.2 us
+    np.testing.assert_allclose(track.t, 0.1 * np.arange(40), atol=1e-6)
+    np.testing.assert_allclose(track.x, 20.0 + 1.5 * np.arange(40))
+    np.testing.assert_allclose(track.speed, 15.0)
+    np.testing.assert_allclose(track.heading, 0.02)
+    assert track.length == pytest.approx(4.5)
+
+
+def test_heading_and_speed_from_positions(tmp_path):
+    """A circle driven counter-clockwise: tangent and arc speed, then a stop."""
+    t = 0.1 * np.arange(100)
+    angle = np.minimum(0.3 * t, 1.5)  # rad; stands from t = 5 s
+    x, y = 50.0 * np.cos(angle), 50.0 * np.sin(angle)
+    rows = [[*row, "c"] for row in zip(t.round(3), x, y, strict=True)]
+    header = ("t", "x", "y", "id")
+    source = w.csv_spec(tmp_path / "s.toml", columns=header)
+    (track,) = only(log(tmp_path, rows, header), source).tracks
+    np.testing.assert_allclose(track.speed[5:45], 15.0, rtol=0.01)
+    np.testing.assert_allclose(track.heading[6:44], angle[6:44] + np.pi / 2, atol=0.01)
+    np.testing.assert_allclose(track.heading[60:], 1.5 + np.pi / 2, atol=0.08)
+    np.testing.assert_allclose(track.speed[60:], 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("point", "shift"), [("front", -2.25), ("rear", 2.25)])
+def test_reference_point(tmp_path, point, shift):
+    source = w.csv_spec(tmp_path / "s.toml")
+    source.write_text(f'reference_point = "{point}"\n' + source.read_text())
+    np.testing.assert_allclose(only(log(tmp_path), source).tracks[0].x[0], shift)
+
+
+def test_turned_axis_and_named_kinds(tmp_path):
+    rows = [[r[0], r[1], r[2], -r[3], "PKW"] for r in w.csv_rows()]
+    header = ("t", "id", "x", "right", "type")
+    columns = {"t": "t", "id": "id", "x": "x", "y": "-right", "kind": "type"}
+    extra = '[kinds]\nPKW = "vehicle"\n'
+    source = w.csv_spec(tmp_path / "s.toml", columns=columns, extra=extra)
+    track = only(log(tmp_path, rows, header), source).tracks[2]
+    np.testing.assert_allclose(track.y, -7.0)
+    assert track.kind == Kind.VEHICLE
+
+
+def test_oncoming_lanes_run_the_other_way(tmp_path):
+    rows = w.csv_rows()
+    for row in rows:
+        if row[1] == "car0":
+            row[2] = 60.0 - row[2]
+    lanes = only(log(tmp_path, rows), w.csv_spec(tmp_path / "s.toml")).lanes
+    first, second, _ = lanes
+    assert first.centre[0, 0] > first.centre[-1, 0]
+    assert (first.left, first.right, second.left) == (None, None, None)
+    # bounds of lanes that are not neighbours lie half a lane out
+    assert first.left_width[0] == pytest.approx(1.75)
+
+
+def test_lanes_along_paths_where_none_are_known(tmp_path):
+    header = w.CSV_COLUMNS[:-1]
+    rows = [row[:-1] for row in w.csv_rows()]
+    source = w.csv_spec(tmp_path / "s.toml", columns=header)
+    recording = only(log(tmp_path, rows, header), source)
+    assert sorted(lane.centre[0, 1] for lane in recording.lanes) == [-7.0, -3.5, 0.0]
+    assert any("fitted" in note for note in recording.notes)
+
+
+LANES = """
+[[lanes]]
+id = "1"
+points = [[0.0, 0.0], [90.0, 0.0]]
+width = 3.0
+speed_limit = 13.9
+right = "2"
+[[lanes]]
+id = "2"
+points = [[0.0, -3.5], [90.0, -3.5]]
+"""
+
+
+def test_lanes_of_the_mapping(tmp_path):
+    source = w.csv_spec(tmp_path / "s.toml", extra=LANES)
+    first, second = only(log(tmp_path), source).lanes
+    assert (first.speed_limit, first.right, second.speed_limit) == (13.9, "2", None)
+    np.testing.assert_array_equal(first.left_width, [1.5, 1.5])
+
+
+def test_lanes_of_a_file(tmp_path):
+    header = ("id", "x", "y", "width", "speed_limit", "successor")
+    rows = [("a", 0, 0, 3, 10, "b"), ("a", 50, 0, 4, 10, "b"), ("b", 50, 0, 3, 9, "")]
+    w.table(tmp_path / "lanes.csv", header, [*rows, ("b", 90, 5, 3, 9, "")])
+    source = w.csv_spec(tmp_path / "s.toml", extra='[lanes]\nfile = "lanes.csv"\n')
+    log(tmp_path)
+    first, second = only(tmp_path, source).lanes
+    np.testing.assert_array_equal(first.left_width, [1.5, 2.0])
+    assert (first.successors, second.speed_limit) == (("b",), 9.0)
+
+
+def test_example_mapping_reads_what_it_describes(tmp_path):
+    header = "timestamp object east north yaw velocity length width class lane drive"
+    rows = [
+        [round(1000 * t), name, x, y, 0.0, 3.6 * v, length, width, "car", lane, "d1"]
+        for t, name, x, y, v, length, width, lane in w.csv_rows()
+    ]
+    source = spec_root() / "sources" / "csv_example.toml"
+    recording = only(log(tmp_path, rows, header.split()), source)
+    np.testing.assert_allclose(recording.tracks[0].speed, 15.0)
+    assert [lane.id for lane in recording.lanes] == ["1", "2"]
+    assert recording.notes == ()
+
+
+def scaled(column, factor):
+    return [
+        [value * factor if i == column else value for i, value in enumerate(row)]
+        for row in w.csv_rows()
+    ]
+
+
+@pytest.mark.parametrize(
+    ("rows", "field"),
+    [
+        (w.csv_rows(feet=1 / 0.3048), "feet taken for metres"),
+        (scaled(5, 1 / 0.3048), "length: median 14.8 m"),
+        (scaled(5, 0.3048), "length: median 1.4 m: expected 2 to 9 m; metres taken"),
+        (scaled(4, 3.6), "km/h taken for m/s"),
+        (scaled(4, 1 / 0.44704), "mph taken for m/s"),
+        (scaled(4, 0.0), "speed: 0 times"),
+        (scaled(0, 10.0), "t: median step 1: expected at most 0.55"),
+        (scaled(0, 2.0), "t: median step 0.2 s: expected 0.1 s"),
+        (scaled(6, 10.0), "width: 18 m"),
+        (scaled(4, 10.0), "speed: 150 m/s"),
+    ],
+)
+def test_malformed_rows(tmp_path, rows, field):
+    path = log(tmp_path, rows)
+    with pytest.raises(InputError) as error:
+        read(path, w.csv_spec(tmp_path / "s.toml"))
+    message = str(error.value)
+    assert message.startswith(str(path))
+    assert field in message
+    assert "\n" not in message
+
+
+def test_buses_are_no_feet(tmp_path):
+    """Two of three are 12 m long, or all of two; three of three would be feet."""
+    rows, source = w.csv_rows(), w.csv_spec(tmp_path / "s.toml")
+    for row in rows:
+        row[5] = 4.5 if row[1] == "car0" else 12.0
+    found = only(log(tmp_path, rows), source)
+    assert [track.length for track in found.tracks] == [4.5, 12.0, 12.0]
+    found = only(log(tmp_path, [row for row in rows if row[1] != "car0"]), source)
+    assert [track.length for track in found.tracks] == [12.0, 12.0]
+
+
+@pytest.mark.parametrize(
+    ("columns", "units", "extra", "field"),
+    [
+        ({"t": "t", "id": "id", "x": "x"}, "", "", "columns.y: missing"),
+        ({"t": "t", "id": "id", "x": "x", "y": "up"}, "", "", "column up: missing"),
+        ({"z": "z"}, "", "", "columns.z: unknown"),
+        (w.CSV_COLUMNS, 'x = "yard"', "", "units.x: yard"),
+        (w.CSV_COLUMNS, 'kind = "m"', "", "units.kind: unknown"),
+        (w.CSV_COLUMNS, "", 'length = "long"', "length: long"),
+        (
+            w.CSV_COLUMNS,
+            "",
+            '[[lanes]]\nid = "1"\npoints = [[0, 0]]',
+            "lanes 1: points",
+        ),
+        (w.CSV_COLUMNS, "", '[[lanes]]\npoints = [["a", 0]]', "expected numbers"),
+        (w.CSV_COLUMNS, "", '[lanes]\nfile = "none.csv"', "lanes.file: none.csv"),
+    ],
+)
+def test_malformed_mapping(tmp_path, columns, units, extra, field):
+    source = w.csv_spec(tmp_path / "s.toml", columns=columns, units=units, extra=extra)
+    header = [c for c in w.CSV_COLUMNS if c not in ("length", "width")]
+    rows = [[*row[:5], row[7]] for row in w.csv_rows()]
+    with pytest.raises(InputError) as error:
+        read(log(tmp_path, rows, header), source)
+    assert field in str(error.value)
+
+
+SI_COLUMNS = {
+    "t": "Global_Time",
+    "id": "Vehicle_ID",
+    "x": "Local_Y",
+    "y": "-Local_X",
+    "speed": "v_Vel",
+    "length": "v_length",
+    "lane": "Lane_ID",
+    "recording": "Location",
+}
+
+
+@pytest.mark.dataset
+def test_recorded_ngsim_subset_in_si(data_dir, tmp_path):
+    path = data_dir / "formats" / "ngsim_reference" / "ngsim_us101_subset_SIunits.csv"
+    source = w.csv_spec(tmp_path / "s.toml", columns=SI_COLUMNS, units='t = "ms"')
+    source.write_text('reference_point = "front"\n' + source.read_text())
+    found = {recording.name[-5:]: recording for recording in read(path, source)}
+    assert len(found) == 2
+    tracks = [track for recording in found.values() for track in recording.tracks]
+    assert len({track.id.split("#")[0] for track in tracks}) == 9
+    assert sum(track.t.size for track in tracks) == 4366
+    for recording in found.values():
+        assert {lane.id for lane in recording.lanes} <= {"2", "3"}
+        for track in recording.tracks:
+            if track.t.size > 20:
+                assert np.median(np.abs(track.heading)) < 0.1
+
+
+def test_straight_lanes_longer_than_roads_are_not_made(tmp_path):
+    found = [
+        StraightLane(id=f"{k}", y=4.0 * k, lower=0.0, upper=9.9e5) for k in range(11)
+    ]
+    lanes = straight_lanes(tmp_path, found[:1], 4.0, None)
+    assert len(lanes[0].centre) > 1e5
+    with pytest.raises(InputError, match=r"lanes: 1\.089e\+07 m long in all: expected"):
+        straight_lanes(tmp_path, found, 4.0, None)
+
+
+def test_far_coordinates_get_a_local_origin(tmp_path):
+    rows = [
+        [r[0], r[1], r[2] + 691000.0, r[3] + 5334000.0, *r[4:]] for r in w.csv_rows()
+    ]
+    recording = only(log(tmp_path, rows), w.csv_spec(tmp_path / "s.toml"))
+    np.testing.assert_allclose(recording.tracks[0].x, 1.5 * np.arange(40))
+    assert any("local origin" in note for note in recording.notes)
+
+
+@pytest.mark.dataset
+def test_recorded_ngsim_subset_declared_as_feet(data_dir, tmp_path):
+    path = data_dir / "formats" / "ngsim_reference" / "ngsim_us101_subset_SIunits.csv"
+    units = 't = "ms"\nx = "ft"\ny = "ft"'
+    source = w.csv_spec(tmp_path / "s.toml", columns=SI_COLUMNS, units=units)
+    with pytest.raises(InputError, match="feet taken for metres"):
+        read(path, source)

@@ -1,0 +1,256 @@
+"""What a user's columns mean: times, places, headings, velocities, flags, wide rows."""
+
+import math
+
+import numpy as np
+import pyarrow.parquet as pq
+import pyproj
+import pytest
+
+from rcirl_jax.data.formats.projection import projected
+from tests.data.formats import people
+from tests.data.formats.people import LONG, Way, of, refused, write
+from tests.data.formats.test_csv_ways import MIDDLE, degrees, stored
+
+# ------------------------------------------------------------------------ places
+
+
+def test_a_receiver_without_a_fix(tmp_path):
+    """It is at (0, 0), in the gulf of Guinea."""
+    table = degrees(people.rows())
+    for k in (100, 101, 300):
+        table[k][2] = table[k][3] = "0.0"
+    source = people.spec(tmp_path, units='x = "deg"\ny = "deg"')
+    found = people.only(write(tmp_path, table), source)
+    assert people.rows_of(found) == (720, 3, 0, 0)
+    assert sum(track.t.size for track in found.tracks) == 717
+
+
+def test_lanes_in_degrees(tmp_path):
+    place = pyproj.Proj(proj="aeqd", ellps="WGS84", lat_0=MIDDLE[0], lon_0=MIDDLE[1])
+    points = [list(place(x, 0.0, inverse=True)) for x in (-200.0, 300.0)]
+    rest = f'[[lanes]]\nid = "1"\npoints = {points}'
+    source = people.spec(tmp_path, units='x = "deg"\ny = "deg"', rest=rest)
+    (lane,) = people.only(write(tmp_path, degrees(people.rows())), source).lanes
+    assert np.hypot(*(lane.centre[1] - lane.centre[0])) == pytest.approx(
+        500.0, abs=0.05
+    )
+
+
+def test_the_projection_is_true_to_length_and_north():
+    """Against geodesics on the ellipsoid: a kilometre in each direction."""
+    geod = pyproj.Geod(ellps="WGS84")
+    for lat, lon in ((37.97, 23.73), (-33.9, 151.2), (64.1, -21.9), (0.0, 0.0)):
+        x0, y0 = projected(np.array([lon]), np.array([lat]), (lat, lon))
+        np.testing.assert_allclose([x0, y0], 0.0, atol=1e-6)
+        for azimuth in (0.0, 60.0, 150.0, 270.0):
+            far_lon, far_lat, _ = geod.fwd(lon, lat, azimuth, 1000.0)
+            x, y = projected(np.array([far_lon]), np.array([far_lat]), (lat, lon))
+            assert np.hypot(x, y)[0] == pytest.approx(1000.0, abs=0.01)
+            compass = np.rad2deg(np.arctan2(x, y))[0] % 360.0
+            assert compass == pytest.approx(azimuth, abs=0.01)
+
+
+def test_headings_of_noise_keep_the_usual_convention(tmp_path):
+    rng = np.random.default_rng(0)
+    noisy = lambda heading: heading + rng.normal(0.0, 0.15)  # noqa: E731
+    path = write(tmp_path, people.column(people.rows(0.75), "heading", noisy))
+    found = people.only(path, people.spec(tmp_path, units='heading = "rad"'))
+    assert not any("headings" in note for note in found.notes)
+
+
+# ------------------------------------------------------------------------- flags
+
+FLAGS = [
+    ("yes", "no"), ("Yes", "No"), ("TRUE", "FALSE"), ("true", "false"), ("1", "0"),
+    ("1.0", "0.0"), ("2", "0"), ("on", "off"), ("Y", "N"), ("ja", "nein"), ("x", ""),
+    ("ACC", "human"), ("auto", "manual"), ("WAHR", "FALSCH"), ("an", "aus"),
+    ("vrai", "faux"), ("aktiv", "inaktiv"), ("Verdadero", "Falso"),
+]  # fmt: skip
+
+
+@LONG
+@pytest.mark.parametrize(("yes", "no"), FLAGS)
+def test_flags(tmp_path, yes, no, long_bytes):
+    """An automation drives car1 from 2 s on, and nobody else."""
+    table = [
+        [*row, yes if row[1] == "car1" and row[0] >= 2.0 else no]
+        for row in people.rows()
+    ]
+    header = (*people.HEADER, "automated")
+    source = people.spec(tmp_path, header, more=f"long_bytes = {long_bytes}")
+    found = people.only(write(tmp_path, table, header), source)
+    spans = {track.id: track.automated for track in found.tracks if track.automated}
+    assert spans == {"car1": ((2.0, math.inf),)}
+
+
+def test_flags_of_a_user_and_unknown_ones(tmp_path):
+    header = (*people.HEADER, "automated")
+    table = [
+        [*row, {"car1": "L2", "car2": ""}.get(row[1], "L0")] for row in people.rows()
+    ]
+    path = write(tmp_path, table, header)
+    line = refused(path, people.spec(tmp_path, header))
+    assert "automated: 'L0': expected yes or no; automated_values of the source" in line
+    source = people.spec(tmp_path, header, more='automated_values = ["L2", "L3"]')
+    found = people.only(path, source)
+    # nobody knows who drives car2, so it is no demonstration
+    automated = [track.id for track in found.tracks if track.automated]
+    assert automated == ["car1", "car2"]
+    line = refused(path, people.spec(tmp_path, header, more="automated_values = [1]"))
+    assert "automated_values: 1: expected a text" in line
+
+
+# -------------------------------------------------------------------------- wide
+
+
+def wide_frames(name, cars=people.CARS):
+    """(header, rows): one row per frame; car2 is not seen from 4 to 5 s."""
+    header, lines = ["time"], {}
+    for car in range(cars):
+        header += [name.format(axis=axis, car=car) for axis in ("x", "y", "v")]
+    for t, user, x, y, _, v, *_ in people.rows():
+        line = lines.setdefault(t, [t])
+        seen = not (user == "car2" and 4.0 <= t < 5.0)
+        line += [x, y, v] if seen else ["", "", ""]
+    return header, list(lines.values())
+
+
+def side_by_side(name="{axis}_{car}", columns="{axis}_{id}"):
+    """That table, and what its columns mean."""
+    header, table = wide_frames(name)
+    fields = {"x": "x", "y": "y", "speed": "v"}
+    named = {f: columns.replace("{axis}", axis) for f, axis in fields.items()}
+    return of(table, header, columns={"t": "time", **named})
+
+
+@LONG
+@pytest.mark.parametrize(
+    ("name", "columns"),
+    [
+        ("{axis}_{car}", "{axis}_{id}"),
+        ("car{car}.{axis}", "car{id}.{axis}"),
+        ("{axis}[{car}]", "{axis}[{id}]"),
+        ("obj {car} / {axis}", "obj {id} / {axis}"),
+    ],
+)
+def test_one_row_per_frame(tmp_path, name, columns, long_bytes):
+    way = side_by_side(name, columns)
+    found = people.only(*people.put(tmp_path, way, f"long_bytes = {long_bytes}"))
+    assert [t.id for t in found.tracks] == ["0", "1", "2", "2#2", "3", "4", "5"]
+    sizes = {track.id: track.t.size for track in found.tracks}
+    assert (sizes["0"], sizes["2"], sizes["2#2"]) == (120, 40, 70)
+    t, x, y = (
+        np.array([r[k] for r in people.rows() if r[1] == "car3"]) for k in (0, 2, 3)
+    )
+    track = found.tracks[4]
+    np.testing.assert_allclose(track.t, t, atol=1e-9)
+    np.testing.assert_allclose(track.x, x, atol=1e-3)
+    np.testing.assert_allclose(track.y, y, atol=1e-3)
+    # who is not there is no bad row
+    assert people.rows_of(found) == (710, 0, 0, 0)
+
+
+def test_wide_tables_whose_names_do_not_fit(tmp_path):
+    header, table = wide_frames("{axis}_{car}")
+    path = write(tmp_path, table, header)
+    columns = {"t": "time", "x": "px_{id}", "y": "y_{id}"}
+    line = refused(path, people.spec(tmp_path, columns))
+    assert "columns.x: px_{id}: expected columns of this name and of y_{id}" in line
+    columns = {"t": "time", "id": "x_1", "x": "x_{id}", "y": "y_{id}"}
+    line = refused(path, people.spec(tmp_path, columns))
+    assert "columns.id: x_1: expected none beside columns.x" in line
+
+
+def pneuma(form="{:.6f}"):
+    """The text of pNEUMA: a row per vehicle, whose last six columns go on repeating."""
+    head = (
+        "track_id; type; traveled_d; avg_speed; lat; lon; speed; lon_acc; lat_acc; time"
+    )
+    users: dict[str, list] = {}
+    for row in degrees(people.rows()):
+        users.setdefault(row[1], []).append(row)
+    lines = [head]
+    for name, own in users.items():
+        kind = "Heavy Vehicle" if name == "car5" else "Car"
+        cells = [name[3:], kind, "120.5", "54.1"]
+        # vehicles leave at different times
+        for t, _, lon, lat, _, v, *_ in own[: 120 - 10 * int(name[3:])]:
+            cells += [lat, lon, form.format(3.6 * v), "0.01", "-0.02", form.format(t)]
+        lines.append("; ".join(cells) + "; ")
+    return "\n".join(lines) + "\n"
+
+
+def a_row_per_vehicle():
+    """That text, and what its columns mean."""
+    columns = {
+        **{"t": "time", "id": "track_id", "y": "lat", "x": "lon", "speed": "speed"},
+        "kind": "type",
+    }
+    kinds = 'Car = "vehicle"\n"Heavy Vehicle" = "vehicle"'
+    return Way(content=pneuma(), columns=columns, units='speed = "km/h"', rest=kinds)
+
+
+@LONG
+def test_a_row_per_vehicle_as_in_pneuma(tmp_path, long_bytes):
+    way = a_row_per_vehicle()
+    found = people.only(*people.put(tmp_path, way, f"long_bytes = {long_bytes}"))
+    assert [track.id for track in found.tracks] == list("012345")
+    assert [t.t.size for t in found.tracks] == [120, 110, 100, 90, 80, 70]
+    for track in found.tracks:
+        real = 15.0 + 0.8 * np.cos(0.4 * track.t)
+        np.testing.assert_allclose(track.speed, real, atol=1e-3)
+        np.testing.assert_allclose(track.heading, 0.0, atol=0.01)
+        assert np.ptp(track.x) == pytest.approx(np.trapezoid(real, track.t), abs=0.1)
+    assert found.rows.read == 570
+
+
+def test_a_row_per_vehicle_that_breaks_off(tmp_path):
+    """The others say how many columns repeat."""
+    path, source = people.put(tmp_path, a_row_per_vehicle())
+    path.write_text(pneuma().replace("; \n", "; 37.97; 23.7; \n", 1))
+    found = people.only(path, source)
+    assert people.rows_of(found) == (571, 1, 0, 0)
+    assert any("first: line 2: 6 cells: expected 10" in note for note in found.notes)
+
+
+def test_a_cell_inside_of_a_long_row_is_named_by_its_line(tmp_path):
+    path, source = people.put(tmp_path, a_row_per_vehicle(), "max_bad_rows = 0.0")
+    path.write_text(pneuma().replace("; 55.0", "; fast", 1))
+    assert "line 2: speed: 'fast" in refused(path, source)
+
+
+# ---------------------------------------------------------------------- columns
+
+
+def test_whole_numbers_are_ids_without_a_point(tmp_path):
+    """A column with holes is one of floating point to pandas."""
+    ids = [float(row[1][3:]) for row in people.rows()]
+    path = tmp_path / "log.parquet"
+    path.write_bytes(stored(pq.write_table, id=ids))
+    found = people.only(path, people.spec(tmp_path))
+    assert [track.id for track in found.tracks] == ["0", "1", "2", "3", "4", "5"]
+    (tmp_path / "log.csv").write_text(
+        people.text(people.column(people.rows(), "id", lambda name: f"{name[3:]}.0"))
+    )
+    found = people.only(tmp_path / "log.csv", people.spec(tmp_path))
+    assert [track.id for track in found.tracks] == ["0", "1", "2", "3", "4", "5"]
+
+
+def test_a_log_that_lies_twice_in_a_folder_is_read_once(tmp_path):
+    (tmp_path / "log.csv").write_text(people.text(people.rows()))
+    (tmp_path / "log.parquet").write_bytes(stored(pq.write_table))
+    (tmp_path / "other.parquet").write_bytes(stored(pq.write_table))
+    more = 'pattern = ["*.csv", "*.parquet"]'
+    found = people.read(tmp_path, people.spec(tmp_path, more=more))
+    assert [made.name for made in found] == ["log", "other"]
+    np.testing.assert_allclose(found[0].tracks[0].x, found[1].tracks[0].x, atol=1e-3)
+
+
+def test_a_row_of_numbers_is_no_line_of_units(tmp_path):
+    """Nor is one in which the first cells are unknown."""
+    table = people.rows()
+    table[0][2:7] = ["NaN"] * 5
+    found = people.only(people.write(tmp_path, table), people.spec(tmp_path))
+    assert people.rows_of(found)[0] >= 719
+    assert [track.t.size for track in found.tracks] == [119, *[120] * 5]

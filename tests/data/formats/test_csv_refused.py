@@ -1,0 +1,150 @@
+"""Tables and source TOMLs that are wrong: one line each, with what to do."""
+
+import gzip
+
+import pyarrow.parquet as pq
+import pytest
+
+from tests.data.formats import people
+from tests.data.formats.people import HEADER, Way, column, of, refused, rows, text
+from tests.data.formats.test_csv_ways import (
+    ISO,
+    degrees,
+    heading_as,
+    stored,
+)
+
+
+def moved(**options):
+    """The drive with options that are wrong."""
+    return of(rows(), **options)
+
+
+def headed(change, **options):
+    return of(column(rows(0.5), "heading", change), **options)
+
+
+NUMBERED = [*enumerate(rows())]
+RAD, DEG = 'heading = "rad"', 'heading = "deg"'
+USUAL = 'heading_convention = "ccw_from_x"'
+LAB = (*HEADER[:2], "a", "b", *HEADER[4:])
+LANES = '[[lanes]]\nid = "a"\npoints = [[0.0, 0.0], [9.0, 0.0]]\nspeedlimit = 9.0'
+AUTOMATED = (*HEADER, "automated")
+REFUSED = {
+    "no header? name the columns by names in [table]": Way(
+        content=text(rows()).partition("\n")[2]
+    ),
+    "column x: type list<": Way(content=stored(pq.write_table, x=[[1.0]] * 720)),
+    # the layout
+    "table.separator: unknown: expected some of": moved(
+        rest='[table]\nseparator = ";"'
+    ),
+    "table.delimiter: ab: expected one of tab": moved(rest='[table]\ndelimiter = "ab"'),
+    "table.delimiter: 3: expected a text": moved(rest="[table]\ndelimiter = 3"),
+    "table.decimal: ;: expected one of . ,": moved(rest='[table]\ndecimal = ";"'),
+    "table.encoding: klingon: expected": moved(rest='[table]\nencoding = "klingon"'),
+    "table.skip: -1: expected a number": moved(rest="[table]\nskip = -1"),
+    "table.names: t: expected a list of names": moved(rest='[table]\nnames = "t"'),
+    "table.thousands: expected another": moved(
+        rest='[table]\ndecimal = ","\nthousands = ","'
+    ),
+    "table.repeating: 9: expected up to 8": moved(rest="[table]\nrepeating = 9"),
+    # times
+    "units.t: ms: the cells of t are such as '2024-05-20T10:00:00.000'": of(
+        column(rows(), "t", ISO["ISO"]), units='t = "ms"'
+    ),
+    "line 12: t: '2024-13-20T10:00:00': expected a time as iso": of(
+        [
+            [ISO["ISO"](row[0]) if k != 10 else "2024-13-20T10:00:00", *row[1:]]
+            for k, row in NUMBERED
+        ],
+        more="max_bad_rows = 0.0",
+    ),
+    # places
+    "columns.lon: a: expected it, or columns.x, not both": of(
+        degrees(rows()),
+        LAB,
+        columns={n: n for n in HEADER if n != "y"} | {"x": "a", "lon": "a", "lat": "b"},
+    ),
+    'longitude and latitude? say units.x = "deg", units.y = "deg"': of(
+        degrees(rows()), columns=HEADER[:4]
+    ),
+    "units.x, units.y: deg and m: expected both": of(
+        degrees(rows()), units='x = "deg"'
+    ),
+    # headings
+    "leave columns.heading out": headed(lambda h: h + 2.2, units=RAD),
+    'heading_convention = "ccw_from_x" with units.heading = "deg" fits': headed(
+        heading_as("ccw_from_x", "deg"), units=RAD
+    ),
+    'heading_convention = "cw_from_north" with units.heading = "deg" fits': headed(
+        heading_as("cw_from_north", "deg"), units=DEG, more=USUAL
+    ),
+    "heading_convention: north: expected one of": moved(
+        more='heading_convention = "north"'
+    ),
+    # options that nobody reads
+    "scale.kind: unknown: expected some of t, x, y": moved(rest="[scale]\nkind = 2.0"),
+    "did you mean speed_limit?": moved(more="speedlimit = 20.0"),
+    "did you mean heading?": moved(
+        columns={**{n: n for n in HEADER}, "heding": "heading"}
+    ),
+    "did you mean length?": moved(rest="[defaults]\nlenght = 4.2"),
+    "expected some of id, points": moved(rest=LANES),
+    "source TOML: lanes.fiel: unknown": moved(rest='[lanes]\nfiel = "lanes.csv"'),
+    # flags
+    "automated: 'L0': expected yes or no; automated_values of the source": of(
+        [[*row, "L0"] for row in rows()], AUTOMATED
+    ),
+    "automated_values: 1: expected a text": moved(more="automated_values = [1]"),
+    # bad rows
+    "11 of 720 rows are bad": of(
+        [
+            [*r[:2], 9999.0 if k % 71 == 0 else r[2], *r[3:]]
+            for k, r in enumerate(rows())
+        ]
+    ),
+    # two recordings in one file and no column that says so
+    "id car0: met twice in one frame; 720 of 1440 rows are bad": of(
+        [*rows(), *column(rows(), "y", lambda y: y + 40.0)]
+    ),
+    # files that are no tables
+    "git lfs pull": Way(
+        content=b"version https://git-lfs.github.com/spec/v1\noid sha256:1\n"
+    ),
+    "a spreadsheet or a zip archive": Way(content=b"PK\x03\x04" + bytes(60)),
+    "an old spreadsheet": Way(content=b"\xd0\xcf\x11\xe0" + bytes(60)),
+    "a database: expected a table": Way(content=b"SQLite format 3\0"),
+    "Feather version 1: expected version 2": Way(content=b"FEA1" + bytes(60)),
+    "expected Parquet": Way(content=b"PAR1" + bytes(60)),
+    "expected Feather": Way(content=b"ARROW1" + bytes(60)),
+    "10001 columns": Way(content=",".join(f"c{k}" for k in range(10_001))),
+    "rows: none": Way(content=b"\n \n\n"),
+    "header: empty: expected column names": Way(content='"'),
+    "header: hardly any ASCII as utf-16": Way(
+        content=b"\xff\xfe" + bytes(range(1, 255)) * 3
+    ),
+    "gzip: ": Way(content=gzip.compress(text(rows()).encode())[:-20]),
+    # packed bytes without an end are not held
+    "a line of more than 16777216 characters": Way(
+        content=gzip.compress(b"t,id,x,y\n" + bytes(2**26))
+    ),
+}
+
+
+@pytest.mark.parametrize("words", REFUSED)
+def test_what_is_wrong_is_one_line(tmp_path, words):
+    path, source = people.put(tmp_path, REFUSED[words])
+    line = refused(path, source)
+    assert words in line
+    assert line.startswith((f"{path}: ", "source TOML: ", f"{source}: "))
+
+
+def test_a_table_beside_the_logs_that_is_none(tmp_path):
+    people.write(tmp_path, rows())
+    (tmp_path / "README.csv").write_text("file,what\nlog.csv,the flight of monday\n")
+    line = refused(tmp_path, people.spec(tmp_path))
+    assert "README.csv: header: ['file', 'what']: none of the columns t, id, x" in line
+    assert "`pattern` of the TOML leaves out" in line
+    source = people.spec(tmp_path, more='pattern = "log*.csv"')
+    people.assert_same(people.only(tmp_path, source))

@@ -1,0 +1,136 @@
+"""Rows that are wrong: unknown cells, unreadable and repeated rows, how many may be."""
+
+import pytest
+
+from rcirl_jax.data.importing import import_parts
+from rcirl_jax.data.parts import parts_of
+from rcirl_jax.data.quality import format_quality
+from tests.data.formats import people
+from tests.data.formats.people import LONG, refused, write
+from tests.data.small_logs import CONFIG
+
+
+def with_cell(row, name, value):
+    table = people.rows()
+    table[row][people.HEADER.index(name)] = value
+    return table
+
+
+@LONG
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("x", "", "line 12: x: '': expected a finite number"),
+        ("x", "nan", "line 12: x: 'nan': expected a finite number"),
+        ("y", "inf", "line 12: y: 'inf': expected a finite number"),
+        ("y", "12..5", "line 12: y: '12..5': expected a finite number"),
+        ("y", "0x1F", "line 12: y: '0x1F': expected a finite number"),
+        ("speed", "quick", "line 12: speed: 'quick': expected a finite number"),
+        ("x", "1e30", "line 12: x: 1e+30: expected within 1e+08"),
+        ("t", "1e300", "line 12: t: 1e+300: expected within 1e+14"),
+        ("id", "", "line 12: id: '': expected a text"),
+        ("id", "c" * 65, "line 12: id: 'c" + "c" * 39 + "...': expected up to 64"),
+        ("kind", "car,car", "line 12: 9 cells: expected 8"),
+        ("kind", '"car', "line 12: a quote without an end"),
+    ],
+)
+def test_a_bad_row_is_dropped_or_named(tmp_path, name, value, words, long_bytes):
+    path = write(tmp_path, with_cell(10, name, value))
+    more = f"long_bytes = {long_bytes}\n"
+    found = people.only(path, people.spec(tmp_path, more=more))
+    assert people.rows_of(found) == (720, 1, 0, 0)
+    assert sum(track.t.size for track in found.tracks) == 719
+    assert any(f"1 unreadable rows dropped; first: {words}" in n for n in found.notes)
+    line = refused(path, people.spec(tmp_path, more=more + "max_bad_rows = 0.0"))
+    assert words in line
+    assert line.endswith(
+        "1 of 720 rows are bad: expected up to 0 % (max_bad_rows of the TOML)"
+    )
+
+
+@LONG
+def test_lines_are_those_of_the_file(tmp_path, long_bytes):
+    """With empty lines, remarks over several lines and bad rows before."""
+    header = (*people.HEADER, "remark")
+    table = [
+        [*row, '"two\nlines"' if k < 50 else ""] for k, row in enumerate(people.rows())
+    ]
+    table[60][2], table[700][3] = "west", "north"
+    lines = people.text(table, header).split("\n")
+    lines[20:20] = ["", ""]
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(lines))
+    west, north = (
+        1 + next(k for k, line in enumerate(lines) if word in line)
+        for word in ("west", "north")
+    )
+    more = f"long_bytes = {long_bytes}\nmax_bad_rows = 0.0"
+    line = refused(path, people.spec(tmp_path, more=more))
+    assert f"line {west}: x: 'west'" in line
+    assert north == 1 + 2 + 50 + 700 + 1
+    path.write_text(path.read_text().replace("west", "1.0"))
+    line = refused(path, people.spec(tmp_path, more=more))
+    assert f"line {north}: y: 'north'" in line
+
+
+@LONG
+def test_rows_that_are_met_again_are_used_once(tmp_path, long_bytes):
+    """Beside each other and far apart."""
+    table = people.rows()
+    table = [*table[:101], table[100], *table[101:], table[3], table[3]]
+    source = people.spec(tmp_path, more=f"long_bytes = {long_bytes}")
+    found = people.only(write(tmp_path, table), source)
+    people.assert_same(found)
+    assert people.rows_of(found) == (723, 0, 3, 0)
+    assert "3 rows met twice, used once" in found.notes
+    strict = people.spec(
+        tmp_path, more=f"long_bytes = {long_bytes}\nmax_bad_rows = 0.001"
+    )
+    line = refused(tmp_path / "log.csv", strict)
+    assert "line 103: id car4: the same row again; 3 of 723 rows are bad" in line
+
+
+@LONG
+def test_a_road_user_in_two_places_at_once(tmp_path, long_bytes):
+    """The row that continues the track is kept, whichever comes first."""
+    table = people.rows()
+    for at, first in ((300, True), (350, False), (1, True)):
+        odd = list(table[at])
+        odd[2] += 60.0
+        table.insert(at if first else at + 1, odd)
+    source = people.spec(tmp_path, more=f"long_bytes = {long_bytes}")
+    found = people.only(write(tmp_path, table), source)
+    people.assert_same(found)
+    assert people.rows_of(found) == (723, 0, 0, 3)
+    assert any(
+        "3 rows of a road user twice in one frame, one used; first: line" in note
+        for note in found.notes
+    )
+
+
+@LONG
+def test_a_share_of_bad_rows_is_allowed(tmp_path, long_bytes):
+    table = people.rows()
+    for row in table[:36]:
+        row[2] = "?"
+    path = write(tmp_path, table)
+    more = f"long_bytes = {long_bytes}\n"
+    line = refused(path, people.spec(tmp_path, more=more))
+    assert "line 2: x: '?'" in line
+    assert "36 of 720 rows are bad: expected up to 1 %" in line
+    found = people.only(path, people.spec(tmp_path, more=more + "max_bad_rows = 0.05"))
+    assert found.rows.unreadable == 36
+
+
+@LONG
+def test_an_import_counts_what_it_dropped(tmp_path, long_bytes):
+    table = people.rows()
+    table[5][2] = "west"
+    table.insert(100, table[100])
+    path = write(tmp_path, table)
+    source = people.spec(tmp_path, more=f"long_bytes = {long_bytes}")
+    manifest = import_parts(parts_of("csv", path, source), tmp_path / "data", CONFIG)
+    assert manifest.quality["rows"] == {"read": 721, "unreadable": 1, "repeated": 1}
+    said = format_quality(manifest.quality)
+    assert "rows dropped: 2 of 721 (0.28%): 1 unreadable, 1 repeated" in said
+    assert any("line 7: x: 'west'" in note for note in manifest.quality["notes"])

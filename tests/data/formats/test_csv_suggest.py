@@ -1,0 +1,242 @@
+"""A source TOML suggested for a table: what is recognised, and that it imports."""
+
+import gzip
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from rcirl_jax.data.formats.csv.names import fields_by_name
+from rcirl_jax.data.formats.csv.suggest import suggested
+from rcirl_jax.errors import InputError
+from rcirl_jax.runtime.specs import load_toml
+from tests.data.formats import people
+from tests.data.formats.people import column, of, rows
+from tests.data.formats.test_csv_meaning import pneuma, wide_frames
+from tests.data.formats.test_csv_ways import degrees
+from tests.helpers.commands import command
+
+
+def taken(path):
+    """(suggestion, its TOML's content, the recordings that it imports)."""
+    found = suggested(path)
+    source = path.parent / "suggested.toml"
+    source.write_text(found.toml)
+    return found, load_toml(source), people.read(path, source)
+
+
+GERMAN = ("Zeit_ms", "TrackID", "UTM_E", "UTM_N", "Richtung_deg", "Tempo_kmh", "Laenge",
+          "Klasse")  # fmt: skip
+
+
+def test_a_german_table_of_a_spreadsheet(tmp_path):
+    table = people.column(
+        people.rows(0.5), "t", lambda t: round(1000 * t) + 1716200000000
+    )
+    table = people.column(table, "x", lambda x: x + 588_000.0)
+    table = people.column(table, "heading", lambda h: 90.0 - h * 57.29578)
+    table = people.column(table, "speed", lambda v: 3.6 * v)
+    table = people.column(table, "kind", {"car": "Pkw", "truck": "Lkw"}.get)
+    header = [*GERMAN[:5], "Geschwindigkeit", *GERMAN[6:]]
+    path = tmp_path / "flug.csv"
+    path.write_bytes(
+        people.text(table, header, between=";", decimal=",").encode("utf-16")
+    )
+    found, toml, (made,) = taken(path)
+    people.assert_same(made, 0.5, place=0.01)
+    assert toml["columns"] == dict(
+        t="Zeit_ms", id="TrackID", x="UTM_E", y="UTM_N", heading="Richtung_deg",
+        speed="Geschwindigkeit", length="Laenge", kind="Klasse",
+    )  # fmt: skip
+    units = toml["units"]
+    assert (units["t"], units["speed"], units["heading"]) == ("ms", "km/h", "deg")
+    assert toml["defaults"]["rate_hz"] == 10.0
+    assert toml["heading_convention"] == "cw_from_north"
+    assert toml["kinds"] == {"Lkw": "vehicle", "Pkw": "vehicle"}
+    said = "\n".join(found.lines)
+    assert "text in utf-16, semicolon between cells, decimal comma" in said
+    assert "not known: width: no column" in said
+    shown = found.lines[found.lines.index("the first rows as understood:") + 1 :]
+    assert len(shown) == 6
+    heads = "t [s] id x [m] y [m] heading [deg] speed [m/s] length [m] kind"
+    assert " ".join(shown[0].split()) == heads
+    assert " ".join(shown[1].split()) == "0.00 car0 588000.00 0.00 28.65 15.80 4.50 Pkw"
+
+
+@pytest.mark.parametrize("rate", [10.0, 25.0, 30.0])
+@pytest.mark.parametrize(("unit", "factor"), [("m/s", 1.0), ("km/h", 3.6)])
+def test_the_rate_of_frames_by_the_speeds(tmp_path, rate, unit, factor):
+    table = []
+    for k in range(200):
+        for car in range(4):
+            x = 14.0 * k / rate - 30.0 * car
+            table.append([1000 + k, car, x, 0.0, 14.0 * factor])
+    path = people.write(tmp_path, table, ("frame", "id", "x", "y", "speed"))
+    _, toml, (made,) = taken(path)
+    assert (toml["units"]["t"], toml["defaults"]["rate_hz"]) == ("frame", rate)
+    assert toml["units"]["speed"] == unit
+    for track in made.tracks:
+        np.testing.assert_allclose(track.speed, 14.0, atol=0.01)
+        np.testing.assert_allclose(np.diff(track.t), 1.0 / rate, atol=1e-6)
+
+
+def test_raw_degrees_are_one_line(tmp_path):
+    header = [*people.HEADER[:2], "lon", "lat", *people.HEADER[4:]]
+    path = people.write(tmp_path, degrees(people.rows(), "{:.0f}", 1e7), header)
+    with pytest.raises(
+        InputError, match=r"lat: 3797\d+: expected degrees; .* \[scale\]"
+    ):
+        suggested(path)
+
+
+def test_units_in_a_line_below_the_header(tmp_path):
+    table = people.rows()
+    for name in ("x", "y", "length"):
+        table = people.column(table, name, lambda metres: metres / 0.3048)
+    table = [[*row[:5], *row[6:]] for row in table]  # no speed that tells
+    header = [name for name in people.HEADER if name != "speed"]
+    head, *rows = people.text(table, header).splitlines()
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join([head, "s,,ft,ft,rad,[ft],", *rows, ""]))
+    _, toml, (made,) = taken(path)
+    assert [toml["units"][name] for name in ("x", "y", "length")] == ["ft"] * 3
+    assert made.rows.unreadable == 0
+    ways = [abs(track.x[-1] - track.x[0]) for track in made.tracks]
+    np.testing.assert_allclose(ways, people.rows()[-6][2], atol=0.01)
+
+
+SPEEDS = {"m/s": 1.0, "km/h": 3.6, "mph": 2.23694, "ft/s": 3.28084}
+STEPS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+# by the positions, and by the step
+UNITS = [
+    *[
+        ("speed", unit, of(column(rows(), "speed", lambda v, f=factor: v * f)))
+        for unit, factor in SPEEDS.items()
+    ],
+    *[
+        (
+            "t",
+            unit,
+            of(
+                column(rows(), "t", lambda t, f=factor: f"{t * f:.3f}"),
+                ("time", *people.HEADER[1:]),
+            ),
+        )
+        for unit, factor in STEPS.items()
+    ],
+]
+
+
+@pytest.mark.parametrize(("field", "unit", "way"), UNITS)
+def test_units(tmp_path, field, unit, way):
+    path, _ = people.put(tmp_path, way)
+    _, toml, (made,) = taken(path)
+    assert toml["units"][field] == unit
+    people.assert_same(made, speed=0.01)
+
+
+def test_iso_times_and_degrees_in_parquet(tmp_path):
+    table = degrees(people.rows())
+    header = ("datetime", "vehicle_id", "longitude", "latitude", "course", "speed_mps",
+              "length", "vehicle_type")  # fmt: skip
+    columns = list(zip(*table, strict=True))
+    columns[0] = [f"2024-05-20T10:00:{t:06.3f}Z" for t in columns[0]]
+    columns[2:4] = [list(map(float, c)) for c in columns[2:4]]
+    path = tmp_path / "log.parquet"
+    made = dict(zip(header, map(list, columns), strict=True))
+    pq.write_table(pa.table(made), path)
+    found, toml, (read,) = taken(path)
+    people.assert_same(read, place=0.02)
+    assert toml["columns"]["lat"] == "latitude"
+    assert toml["units"]["t"] == "iso"
+    assert "recognised: t: column datetime, iso" in found.lines
+
+
+def test_a_row_per_frame(tmp_path):
+    header, table = wide_frames("{axis}_{car}")
+    path = tmp_path / "log.csv"
+    path.write_text(people.text(table, header))
+    found, toml, (made,) = taken(path)
+    assert toml["columns"] == {
+        "t": "time", "x": "x_{id}", "y": "y_{id}", "speed": "v_{id}"
+    }  # fmt: skip
+    assert len(made.tracks) == 7
+    assert any("a row per frame" in line for line in found.lines)
+
+
+def test_a_row_per_vehicle(tmp_path):
+    path = tmp_path / "pneuma.csv"
+    path.write_text(pneuma())
+    found, toml, (made,) = taken(path)
+    assert toml["columns"]["lon"] == "lon"
+    assert toml["units"]["speed"] == "km/h"
+    assert len(made.tracks) == 6
+    assert any("a row per road user, which repeats lat, lon" in x for x in found.lines)
+
+
+@pytest.mark.parametrize(
+    ("header", "expected"),
+    [
+        (
+            "timestep_time vehicle_angle vehicle_id vehicle_lane vehicle_pos "
+            "vehicle_speed vehicle_type vehicle_x vehicle_y",
+            dict(t="timestep_time", id="vehicle_id", x="vehicle_x", y="vehicle_y",
+                 heading="vehicle_angle", speed="vehicle_speed", kind="vehicle_type",
+                 lane="vehicle_lane"),
+        ),
+        (
+            "id time xloc_kf yloc_kf lane_kf speed_kf acceleration_kf length_smoothed "
+            "width_smoothed type_most_common av run_index",
+            dict(t="time", id="id", x="xloc_kf", y="yloc_kf", speed="speed_kf",
+                 length="length_smoothed", width="width_smoothed", lane="lane_kf",
+                 kind="type_most_common", automated="av", recording="run_index"),
+        ),
+        (
+            "frame trackId xCenter yCenter heading width length xVelocity yVelocity "
+            "xAcceleration yAcceleration lonVelocity latVelocity",
+            dict(t="frame", id="trackId", x="xCenter", y="yCenter", heading="heading",
+                 width="width", length="length", vx="xVelocity", vy="yVelocity"),
+        ),
+        (
+            "Timestamp ObjectID Latitude Longitude Speed(km/h) Course(deg) Class",
+            dict(t="Timestamp", id="ObjectID", lat="Latitude", lon="Longitude",
+                 speed="Speed(km/h)", heading="Course(deg)", kind="Class"),
+        ),
+        (
+            "Zeitstempel Fahrzeug Rechtswert_m Hochwert_m Fahrzeuglänge Fahrzeugbreite "
+            "Fahrzeugklasse Fahrstreifen",
+            dict(t="Zeitstempel", id="Fahrzeug", x="Rechtswert_m", y="Hochwert_m",
+                 length="Fahrzeuglänge", width="Fahrzeugbreite",
+                 kind="Fahrzeugklasse", lane="Fahrstreifen"),
+        ),
+        (
+            "time objecttype objectnumber x y objectspeed",
+            dict(t="time", kind="objecttype", id="objectnumber", x="x", y="y",
+                 speed="objectspeed"),
+        ),
+    ],
+)  # fmt: skip
+def test_fields_by_names_of_known_tools(header, expected):
+    found = fields_by_name(header.split())
+    assert {field: found.get(field) for field in expected} == expected
+
+
+def test_by_its_command(tmp_path):
+    log, target = tmp_path / "log.csv.gz", tmp_path / "mine.toml"
+    log.write_bytes(gzip.compress(people.text(people.rows(), between=";").encode()))
+    flags = (f"--suggest={log}", f"--output={target}")
+    done = command("rcirl_jax", "import", *flags)
+    assert done.returncode == 0, done.stderr
+    assert "recognised: text in utf-8, semicolon between cells" in done.stdout
+    assert f"--source={target} --input={log}" in done.stdout
+    people.assert_same(people.only(log, target))
+    again = command("rcirl_jax", "import", *flags)
+    assert again.returncode == 2
+    assert again.stderr.startswith(
+        f"error: {target}: there already: expected --overwrite"
+    )
+    done = command("rcirl_jax", "import", "--suggest=nowhere.csv")
+    assert done.stderr == "error: nowhere.csv: --suggest: missing: expected a table\n"
+    done = command("rcirl_jax", "import", "--format=csv")
+    assert done.stderr.startswith("error: --output: not given: expected")

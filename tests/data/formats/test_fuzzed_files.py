@@ -1,0 +1,374 @@
+"""Files made to harm: pickles, paths that lead out, nesting, sizes that are claimed."""
+
+import io
+import json
+import os
+import pickle
+import re
+import sqlite3
+import zipfile
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from benchmarks.reliability.fuzz.forms import archive_of
+from benchmarks.reliability.fuzz.readers import suite
+from rcirl_jax.data.formats.interaction import reader as interaction
+from rcirl_jax.data.formats.l5 import map as l5_map
+from rcirl_jax.data.formats.levelx import map as levelx_lanes
+from rcirl_jax.data.formats.nuplan import map as nuplan_map
+from rcirl_jax.data.readers.sqlite import Database
+from rcirl_jax.data.readers.tables import table
+from rcirl_jax.data.readers.tables.ledger import Ledger
+from rcirl_jax.data.readers.xml import read_xml
+from rcirl_jax.evaluation.closed_loop.files import read_runs
+from rcirl_jax.runtime.specs import load_toml
+from rcirl_jax.train import checkpoint
+from tests.conftest import REPO
+from tests.data.formats import writers
+from tests.helpers.logs import read, refused
+
+DEEP = 100_000  # levels
+
+
+class Bomb:
+    """Unpickling it makes a folder."""
+
+    def __init__(self, target):
+        self.target = str(target)
+
+    def __reduce__(self):
+        return os.mkdir, (self.target,)
+
+
+# ------------------------------------------------------------------- suites, npz
+
+
+@pytest.fixture
+def members(tmp_path):
+    """(file of a suite, its members)."""
+    (tmp_path / "made").mkdir()
+    suite(tmp_path / "made")
+    file = tmp_path / "made" / "suite.npz"
+    with zipfile.ZipFile(file) as archive:
+        return file, {name: archive.read(name) for name in archive.namelist()}
+
+
+def npy(array, **options):
+    out = io.BytesIO()
+    np.save(out, array, **options)
+    return out.getvalue()
+
+
+def head(shape, kind="<f8"):
+    text = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}"
+    text = text.encode().ljust(117) + b"\n"
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text
+
+
+def test_pickles_in_a_suite_are_not_loaded(members, tmp_path):
+    file, content = members
+    target = tmp_path / "executed"
+    objects = npy(np.array([Bomb(target)], dtype=object), allow_pickle=True)
+    for data in (
+        *(archive_of({**content, "ids.npy": objects}), objects),
+        pickle.dumps(Bomb(target)),
+    ):
+        file.write_bytes(data)
+        assert str(file) in refused(read_runs, file)
+    assert not target.exists()
+
+
+def texts(order, point):
+    return npy(np.array([point, 65], f"{order}u4").view(f"{order}U1"))
+
+
+NOTHING, BAD_TEXT = "(1099511627776, 0, 0), not", "ids: characters that are none"
+METRICS = "expected the metrics of a suite"
+BAD_MEMBERS = [
+    *[
+        ("way", head(shape) + bytes(64), "of float64 in 64 bytes: expected the")
+        for shape in ((2**62,), (10**30,), (-1,))
+    ],
+    # texts of no length take no room in the file, and as Python's some gigabytes
+    ("names", head((10**6,), "<U0"), "names: 1000000 values in 0 bytes"),
+    # a list of many times nothing would take terabytes
+    *[("ids", head((2**40, 0, 0), kind), NOTHING) for kind in ("<f8", "<U1")],
+    *[("way", head(2, kind), METRICS) for kind in ("(,)f8", "f8,(", "f9", "")],
+    *[("ids", texts("<", point), BAD_TEXT) for point in (0x110000, 0xD800)],
+    ("ids", texts(">", 2**32 - 1), BAD_TEXT),
+    *[
+        (name, npy(np.array(values)), METRICS)
+        for name, values in (
+            *[("way", ["far", "near"]), ("names", ["ours", "ours"])],
+            *[("groups", [1, 2]), ("row0.inside", np.ones((2, 5)))],
+        )
+    ],
+    ("row0.start_time", None, METRICS),
+]
+
+
+@pytest.mark.parametrize(("name", "data", "words"), BAD_MEMBERS)
+def test_members_of_a_suite_that_are_none(members, name, data, words):
+    file, content = members
+    content[f"{name}.npy"] = data
+    kept = {member: found for member, found in content.items() if found is not None}
+    file.write_bytes(archive_of(kept))
+    line = refused(read_runs, file)
+    assert words in line
+    assert data is not None or name in line
+
+
+@pytest.mark.parametrize("packing", [12, 14, 93, 97])
+def test_a_suite_packed_in_ways_that_are_not_ours(members, packing):
+    """bzip2, lzma (whose own error is no ValueError), zstd, and one that nobody has."""
+    file, content = members
+    whole = bytearray(archive_of(content))
+    first = whole.index(b"PK\1\2")  # of the directory at the end, which is believed
+    whole[first + 10 : first + 12] = packing.to_bytes(2, "little")
+    file.write_bytes(whole)
+    assert "packed in a way that numpy" in refused(read_runs, file)
+
+
+def test_a_suite_that_unpacks_to_gigabytes_is_refused(members, monkeypatch):
+    file, content = members
+    monkeypatch.setattr("rcirl_jax.evaluation.closed_loop.npz_files.MAX_BYTES", 2**20)
+    zeros = npy(np.zeros(2**18))
+    file.write_bytes(archive_of({**content, "way.npy": zeros}, zipfile.ZIP_DEFLATED))
+    assert file.stat().st_size < 2**20
+    assert "unpacked" in refused(read_runs, file)
+
+
+# ------------------------------------------------------------------- TOML and XML
+
+
+NESTED = [
+    *[
+        "a = " + begin * count + inner + end * count
+        for begin, inner, end in (("[", "", "]"), ("{a=", "1", "}"))
+        for count in (110, 1000)
+    ],
+    "a = " + "[" * DEEP + "]" * DEEP,
+]
+
+
+@pytest.mark.parametrize("text", NESTED)
+def test_deep_nesting_is_one_line(tmp_path, text):
+    (tmp_path / "deep.toml").write_text(text)
+    assert "nested too deeply" in refused(load_toml, tmp_path / "deep.toml")
+
+
+KEYS = [
+    *("{key} = 1", "[ {key} ]", "[[{key}]]", "b = [1,\n {{x = 1, {key} = 1}}]"),
+    'b = {{c = """\n """", {key} = 1}}',
+    "b = {{c = ''' ''''', {key} = 1}}",
+    "b = {{c = '''\n\" ''', {key} = 1}}",
+    'b = {{c = """\n\\""" # """, {key} = 1}}',
+    'b = {{c = "\\" # \' ", {key} = 1}}',
+]
+
+
+@pytest.mark.parametrize("text", KEYS)
+@pytest.mark.parametrize("joined", [".", " .\t"])
+@pytest.mark.parametrize("part", ["a", '"a.b"', "''"])
+def test_keys_of_many_parts(tmp_path, text, joined, part):
+    """The parser takes minutes for some thousands of them."""
+    file = tmp_path / "x.toml"
+    file.write_text(text.format(key=joined.join([part] * 33)))
+    assert re.search("x.toml: line [123]: .*32 parts", refused(load_toml, file))
+    file.write_text(text.format(key=joined.join([part] * 32)))
+    assert load_toml(file)
+
+
+def test_dots_that_are_no_key(tmp_path):
+    some = ["a." * 40, "..." * 40, "it's a.b"]
+    lines = [f'x{k} = "{text}" # {text}' for k, text in enumerate(some)]
+    lines += [f'y{k} = """\n{text}\n"""' for k, text in enumerate(some)]
+    lines += ["z = [" + "1.5," * 40 + "]"]
+    file = tmp_path / "x.toml"
+    file.write_text("\n".join(lines))
+    assert len(load_toml(file)) == 7
+
+
+def test_long_numbers_and_files_in_a_toml(tmp_path, monkeypatch):
+    file = tmp_path / "x.toml"
+    file.write_text("a = " + "9" * 5000)
+    assert "x.toml: " in refused(load_toml, file)
+    for number in ("0x" + "f" * 4000, "9" * 4000, "-9223372036854775809"):
+        file.write_text(f"[b]\na = [{{c = {number}}}]")
+        line = refused(load_toml, file)
+        assert re.search(r"b.a.c: a number of \d+ bits: expected at most 63", line)
+    file.write_text("a = [-9223372036854775808, 0x7fffffffffffffff]")
+    assert load_toml(file)["a"] == [-(2**63), 2**63 - 1]
+    monkeypatch.setattr("rcirl_jax.runtime.specs.MAX_BYTES", 10)
+    assert "size: expected at most" in refused(load_toml, file)
+
+
+def test_deep_xml_is_read_or_one_line(tmp_path):
+    inner = "<a>" * 3000 + "</a>" * 3000
+    writers.commonroad(tmp_path / "deep.xml", writers.lanelet(), writers.car(), inner)
+    assert len(read("commonroad", tmp_path)) == 1
+
+
+REPEATED = '<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;">'
+OUTSIDE = 'SYSTEM "file:///etc/hostname"'
+
+
+@pytest.mark.parametrize("name", ["commonRoad", "osm"])
+@pytest.mark.parametrize("dtd", [f"[{REPEATED}]", f"[<!ENTITY x {OUTSIDE}>]", OUTSIDE])
+def test_xml_of_entities_or_references_is_refused(tmp_path, name, dtd):
+    file = tmp_path / "x.xml"
+    file.write_text(f"<!DOCTYPE b {dtd}><{name}/>")
+    line = refused(read_xml, file, name, 10_000)
+    assert line.endswith("expected no DTD, entities or external references")
+    file.write_text(f"<{name}/>")
+    assert "size: " in refused(read_xml, file, name, 3)
+
+
+# ----------------------------------------------------------------------- options
+
+
+HEX = "0x" + "f" * 4000
+BAD_OPTIONS = [
+    *[
+        (f'pattern = "{bad}"', f"pattern: {bad}: expected file names")
+        for bad in ("../*.csv", "/etc/*", "", "a**", "**/**/x.csv")
+    ],
+    (f'pattern = "{"x" * 300}"', "expected file names"),
+    (f'pattern = "{"x/" * 600}x"', "/x: expected file names"),
+    ("rate_hz = [1]", "rate_hz: [1]: expected a number"),
+    ('long_bytes = "256MB"', "long_bytes: 256MB: expected a number"),
+    ("max_bad_rows = 1.0", "max_bad_rows: 1: expected a share from 0 to below 1"),
+    ("max_bad_rows = -0.1", "max_bad_rows: -0.1: expected a share"),
+    ("max_bad_rows = true", "max_bad_rows: True: expected"),
+    ("rate_hz = 5" + "0" * 18, "expected at most 1e+18"),
+    (f"rate_hz = {HEX}", "rate_hz: a number of 16000 bits: expected at most 63"),
+    ("units = 'm'", "units: m: expected a table"),
+    ("columns = {t = 3}", "columns.t: 3: expected a text"),
+    ("columns = 3", "columns: 3: expected a table"),
+    ("pattern = 3", "pattern: 3: expected file names"),
+    ("units = 3", "units: 3: expected a table"),
+    ("lanes = [3]", "lanes: [3]: expected tables"),
+    ("defaults = 3", "defaults: 3: expected a table"),
+    ("speed_limit = 1" + "0" * 400, "bits: expected at most 63"),
+    (
+        'columns = {t = "t", id = "id", x = "id", y = "y"}',
+        "columns.x: id: expected a column of numbers",
+    ),
+    ('lanes = {file = "a\\u0000b"}', "file: a?b: expected a path"),
+    (f'lanes = {{file = "{"a/" * 3000}x"}}', "a path of 6001 bytes: expected"),
+]
+
+
+@pytest.mark.parametrize(("text", "words"), BAD_OPTIONS)
+def test_options_that_lead_out_or_are_of_another_type(text, words, tmp_path):
+    log, source = tmp_path / "log.csv", tmp_path / "source.toml"
+    writers.table(log, writers.CSV_COLUMNS, writers.csv_rows())
+    columns = "\n".join(f'columns.{name} = "{name}"' for name in ("t", "id", "x", "y"))
+    source.write_text(f"{text}\n" + ("" if "columns" in text else columns))
+    assert words in refused(read, "csv", tmp_path, source)
+
+
+# ------------------------------------------------------------------------ readers
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("MAX_GROUP_BYTES", "row group: "), ("MAX_ROWS", "rows: 100")]
+)
+def test_row_groups_that_claim_too_much(tmp_path, monkeypatch, name, words):
+    file = tmp_path / "x.parquet"
+    pq.write_table(pa.table({"a": list(range(100))}), file)
+
+    def numbers():
+        opened = table.open_table(file)
+        return table.read(opened, table.fields_of(opened, ["a"]), Ledger(path=file))
+
+    np.testing.assert_array_equal(numbers()["a"], np.arange(100.0))
+    monkeypatch.setattr(f"rcirl_jax.data.readers.tables.columnar.{name}", 10)
+    assert f"x.parquet: {words}" in refused(numbers)
+
+
+def test_a_database_whose_errors_are_no_text(tmp_path):
+    file = tmp_path / "x.db"
+    with sqlite3.connect(file) as made:
+        made.execute("CREATE TABLE first (a)")
+        made.execute("CREATE TABLE other (b)")
+    made.close()
+    file.write_bytes(
+        file.read_bytes().replace(b"TABLE other (b)", b"TABLE\x88" * 2 + b"\x88" * 3)
+    )
+    with Database(file) as database:
+        assert "x.db: database: " in refused(database.columns, "first")
+
+
+# ------------------------------------------------------------------- no programs
+
+FORBIDDEN = re.compile(
+    r"os\.system|os\.popen|shell\s*=\s*True|\bimport pickle|from pickle|\bmarshal\b"
+    r"|(?<![\w.])eval\(|(?<![\w.])exec\(|yaml\.(?:unsafe_)?load\b|allow_pickle\s*=\s*True"
+)
+# arithmetic of scenario families, its syntax tree checked node by node before
+CHECKED = {"rcirl_jax/simulation/catalogue/expressions.py": "eval("}
+
+
+def test_no_module_runs_what_a_file_says():
+    for folder in ("rcirl_jax", "experiments"):
+        for file in sorted((REPO / folder).rglob("*.py")):
+            name = file.relative_to(REPO).as_posix()
+            found = set(FORBIDDEN.findall(file.read_text()))
+            assert found <= {CHECKED.get(name)}, f"{name}: {found}"
+
+
+def test_members_that_name_places_outside_are_not_unpacked(members, tmp_path):
+    file, content = members
+    for name in ("../odd.npy", f"{tmp_path}/odd.npy"):
+        file.write_bytes(archive_of({**content, name: content["way.npy"]}))
+        assert read_runs(file).ids == ("a", "b")
+    assert not list(tmp_path.rglob("odd.npy"))
+
+
+@pytest.mark.parametrize(
+    "find",
+    [
+        lambda log, path: l5_map.find_map(log, {"map": path}),
+        lambda log, path: interaction._find_map(log, {"map": path}),
+        lambda log, path: levelx_lanes.find_map(log, "1", {"map": path}),
+        lambda log, path: nuplan_map.find_map(log, ["x"], {"maps": path}),
+    ],
+)
+def test_a_map_whose_path_is_too_long(find, tmp_path):
+    line = refused(find, tmp_path / "log", "a/" * 3000 + "x")
+    assert re.search("map.*: a/a/.*: a path of 6001 bytes: expected at most", line)
+    assert "a path of" not in refused(find, tmp_path / "log", "a/" * 1023 + "x")
+
+
+def test_clocks_that_stand_still_or_would_fill_the_memory(tmp_path):
+    source = tmp_path / "source.toml"
+
+    def line_of(form, place, text):
+        source.write_text(text)
+        return refused(read, form, place, source)
+
+    log = writers.ngsim_csv(tmp_path / "log.csv", writers.ngsim_rows())
+    assert "frame_s: 0: expected > 0" in line_of("ngsim", log, "frame_s = 0")
+    rows = "".join(f"{k * 1e-5:.5f},a,{k * 1e-2:.4f},0\n" for k in range(200))
+    log.write_text(f"t,id,x,y\n{rows}")
+    columns = "\n".join(f'{name} = "{name}"' for name in ("t", "id", "x", "y"))
+    line = line_of("csv", log, f"rate_hz = 1e5\n[columns]\n{columns}\n")
+    assert "rate_hz: 100000: expected up to 1000" in line
+    source.write_text("rate_hz = 1" + "0" * 400)
+    line = refused(read, "synthetic", source)
+    assert "rate_hz: a number of 1329 bits: expected at most 63" in line
+
+
+def test_digests_of_a_checkpoint_that_are_no_table(tmp_path):
+    step = tmp_path / "3"
+    step.mkdir()
+    found = [[1, "a"], [2, "b"]]
+    noted = {"files": found, "sha256": checkpoint.digest(dict(found))}
+    for text in (json.dumps(noted), "[" * DEEP, '{"files": {}}'):
+        (step / checkpoint.DIGESTS).write_text(text)
+        line = refused(checkpoint._newest_whole, tmp_path)
+        assert f"checkpoint 3: {checkpoint.DIGESTS}: damaged" in line

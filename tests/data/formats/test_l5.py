@@ -1,0 +1,275 @@
+"""L5 prediction data: scenes, semantic map, lights, malformed arrays."""
+
+import functools
+import json
+import re
+import shutil
+
+import numpy as np
+import pytest
+
+from rcirl_jax.data.cut import digest
+from rcirl_jax.data.formats import parts, read_recordings
+from rcirl_jax.data.formats.l5 import map as l5_map
+from rcirl_jax.data.formats.l5 import reader as l5
+from rcirl_jax.data.formats.l5 import scenes as l5_scenes
+from rcirl_jax.data.readers import zarr2
+from tests.data.formats.fixtures import l5 as fixture
+from tests.helpers import logs
+from tests.helpers.logs import lanes_of, refused, tracks_of
+
+PACKAGED = logs.packaged("l5")
+read = functools.partial(logs.read, "l5", rate_hz=10.0)
+X, Y = fixture.CENTRE
+
+
+def map_of(file):
+    return l5_map.SemanticMap(file, l5_map.world_to_ecef(file, PACKAGED))
+
+
+def lanes_around(semantic_map):
+    return semantic_map.roads.around(*fixture.CENTRE[:, None], np.zeros(2))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The recordings of the fixture."""
+    return read(fixture.write(tmp_path_factory.mktemp("l5")).input)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return fixture.write(tmp_path).input
+
+
+@pytest.fixture
+def dataset(tmp_path):
+    """One scene without a map."""
+    fixture.write_zarr(tmp_path / "one.zarr", scenes=1)
+    return tmp_path / "one.zarr"
+
+
+# --------------------------------------------------------------------- scenes
+
+
+def test_groups_of_other_hosts_and_days():
+    scenes = np.zeros(4, fixture.SCENE_DTYPE)
+    scenes["host"] = ["a", "b", "a", "a"]
+    scenes["start_time"] = np.array([0, 0, 30, 300]) * 10**9
+    scenes["end_time"] = scenes["start_time"] + 25 * 10**9
+    expected = ["a-from-0", "b-from-0", "a-from-0", "a-from-300"]
+    assert l5_scenes.groups_of(scenes, []) == expected
+    # the third scene alone is still one of the drive that began with the first
+    assert l5_scenes.groups_of(scenes[2:], [scenes[:1]]) == ["a-from-0", "a-from-300"]
+
+
+def test_groups_over_datasets(folder):
+    """Scenes of one drive in several datasets, also if only one of them is read."""
+    scenes = folder / "scenes"
+    later = fixture.START_NS + 80 * 10**9
+    fixture.write_zarr(scenes / "train.zarr", start=later)
+    fixture.write_zarr(scenes / "validate.zarr", start=later, host="host-b")
+    found, _ = parts("l5", folder)
+    assert [p.name for p in found] == ["sample.zarr", "train.zarr", "validate.zarr"]
+    groups = [(one.name, one.group) for one in read_recordings("l5", folder)]
+    drive, other = "host-a013-from-1572643684", "host-b-from-1572643764"
+    assert groups == [
+        *[(f"sample-00000{k}", drive) for k in (0, 1)],
+        *[(f"train-00000{k}", drive) for k in (0, 1)],
+        *[(f"validate-00000{k}", other) for k in (0, 1)],
+    ]
+    assert {one.group for one in read(scenes / "train.zarr")} == {drive}
+    (scenes / "sample.zarr" / "scenes" / "0").unlink()  # of no use: not looked into
+    assert {one.group for one in read(scenes / "train.zarr")} == {
+        "host-a013-from-1572643764"
+    }
+
+
+def test_scene_in_two_datasets(folder):
+    scenes = folder / "scenes"
+    fixture.write_zarr(scenes / "train.zarr", scenes=1)
+    line = refused(read_recordings, "l5", folder)
+    words = "scene 0: host host-a013, start 1572643684801892606: met twice, also in"
+    assert f"train.zarr: {words} sample.zarr: expected once" in line
+    assert len(read(folder, pattern="sample.zarr")) == 2
+    assert len(read(scenes / "train.zarr")) == 1
+
+
+@pytest.mark.parametrize("few", [1, 2, 5])
+def test_pieces_make_up_the_dataset(folder, whole, few, monkeypatch):
+    monkeypatch.setattr(l5, "PIECE_SCENES", few)
+    (dataset,) = l5.parts(folder, PACKAGED)
+    specs = l5.pieces(dataset, PACKAGED)
+    apart = [one for spec in specs for one in l5.recordings(dataset, spec)]
+
+    def about(found):
+        return [(digest(one), one.group, one.progress) for one in found]
+
+    assert about(apart) == about(whole)
+
+
+def test_reads_only_the_scene_it_is_at(folder):
+    """Chunks of later scenes are not touched: the full set has 100s of GB."""
+    agents = folder / "scenes" / "sample.zarr" / "agents"
+    (agents / "2").unlink()  # of the second scene only
+    found = read_recordings("l5", folder)
+    assert next(found).name == "sample-000000"
+    assert "agents/2: chunk: No such file" in refused(next, found)
+
+
+# ------------------------------------------------------------------------ map
+
+
+@pytest.mark.parametrize(
+    ("controls", "governing"),
+    [
+        ((fixture.RED, fixture.GREEN), "gRN1|rED1"),
+        ((fixture.LIGHT,), "gRN1|rED1"),
+        # the light's other face is for another lane, say an arrow to the left
+        ((fixture.LIGHT, fixture.GREEN), "gRN1"),
+        ((fixture.RED, fixture.LIGHT), "rED1"),
+    ],
+)
+def test_a_lane_that_names_faces_has_only_those_of_its_light(
+    controls, governing, tmp_path
+):
+    made = fixture.write_map(tmp_path / "m.pb", controls)
+    by_name = {lane.id: lane.signal_ids for lane in lanes_around(map_of(made))}
+    assert by_name["a1"] == (governing,)
+    assert by_name["a2"] == ()
+
+
+EDGE = [[X + 60, Y + 1.75], [X + 60, Y - 1.75]]  # of the junction
+
+
+def test_lanes_of_the_semantic_map(whole):
+    lanes = lanes_of(whole[0])
+    assert set(lanes) == {"a1", "a2", "b1", "c1"}  # not the stub
+    # a2 is drawn against the traffic, and turned round: x grows
+    for name, y in (("a1", Y), ("a2", Y + 3.5)):
+        ends = lanes[name].centre[[0, -1]]
+        np.testing.assert_allclose(ends, [[X - 60, y], [X + 60, y]], atol=0.03)
+    np.testing.assert_allclose(lanes["a1"].left_width, 1.75, atol=0.02)
+    assert (lanes["a1"].left, lanes["a2"].right) == ("a2", "a1")
+    assert lanes["a1"].successors == ("b1", "c1")
+    assert lanes["a1"].speed_limit == pytest.approx(11.176, abs=1e-5)
+    assert lanes["b1"].speed_limit is None
+    np.testing.assert_allclose(lanes["a1"].stop_line, EDGE, atol=0.03)
+    assert lanes["c1"].stop_line is None
+
+
+def test_the_line_of_a_lane_inside_a_junction_is_at_its_start(tmp_path):
+    """Whoever is on it was held at the junction's edge."""
+    made = fixture.write_map(tmp_path / "m.pb", controls=(), inside=(fixture.RED,))
+    lanes = {lane.id: lane for lane in lanes_around(map_of(made))}
+    np.testing.assert_allclose(lanes["c1"].stop_line, EDGE, atol=0.03)
+    assert lanes["c1"].signal_ids == (fixture.RED,)
+    assert lanes["a1"].stop_line is None
+
+
+def test_light_of_a_lane(whole):
+    (signal,) = whole[0].signals
+    (lane,) = [lane for lane in whole[0].lanes if lane.signal_ids]
+    assert lane.signal_ids == (signal.id,)
+    assert (signal.state, signal.is_recorded) == (("red", "green"), True)
+    green = fixture.STAMPS[fixture.GREEN_FROM]
+    np.testing.assert_allclose(signal.start, [0.0, green], atol=1e-6)
+
+
+def test_without_a_map_of_the_place_lanes_are_paths(dataset):
+    (recording,) = read(dataset.parent)
+    assert recording.signals == ()
+    assert recording.lanes[0].id == "path-0"
+    assert any("fitted to the longest paths" in note for note in recording.notes)
+    matrix = fixture.WORLD_TO_ECEF.copy()
+    matrix[:3, 3] += 1e5
+    beside = dataset.with_name("meta.json")
+    beside.write_text(json.dumps({"pose_to_ecef": matrix.tolist()}))
+    fixture.write_map(beside.with_name("semantic_map.pb"))
+    assert read(dataset.parent)[0].lanes[0].id == "path-0"
+    beside.unlink()
+    beside.with_name("semantic_map.pb").rename(dataset.parent / "palo.pb")
+    assert len(read(dataset.parent, map="palo.pb")[0].lanes) == 4
+
+
+# ------------------------------------------------------------------- contents
+
+
+def test_older_number_types(dataset):
+    """Early releases had float32 positions and int32 ids."""
+    older = {"<f8": "<f4", "<u8": "<i4"}
+
+    def narrow(records):
+        kinds = [(n, np.dtype(d).str, *s) for n, d, *s in fixture.AGENT_DTYPE]
+        kinds = [(name, older.get(kind, kind), *s) for name, kind, *s in kinds]
+        return records.astype(kinds)
+
+    fixture.change(dataset, "agents", narrow)
+    found, expected = tracks_of(read(dataset)[0])["12"], fixture.road_users()["12"]
+    np.testing.assert_allclose(found.x, expected.x, atol=1e-3)
+
+
+# ------------------------------------------------------------------- arrays
+
+BAD_METADATA = [
+    ({"shape": [2, 3]}, "shape: [2, 3]: expected a list"),
+    ({"shape": [10**12]}, "shape[0]: 1000000000000: expected a whole number <= "),
+    ({"chunks": [0]}, "chunks: 0 records"),
+    ({"chunks": [10**9]}, "chunks: 1000000000 records: expected 1 to"),
+    ({"dtype": "<f8"}, "dtype: <f8: expected a list"),
+    ({"filters": [{"id": "pickle"}]}, "filters: "),
+    ({"compressor": {"id": "zlib"}}, "compressor.id: zlib: "),
+    (["centroid", "|O"], "dtype: ['centroid', '|O']: expected [name, little-endian"),
+    (["centroid", ">f8", [2]], "dtype: ['centroid', '>f8', [2]]: expected [name, "),
+    (["centroid", "<f8", [3]], "dtype: centroid: ('<f8', (3,)): expected shape (2,)"),
+    (["centroid", "<f8", [2**40]], "dtype"),
+    (["middle", "<f8", [2]], "dtype: centroid: missing"),
+    (["yaw", "<f8", [2]], "expected different names"),
+]
+
+
+@pytest.mark.parametrize(("change", "words"), BAD_METADATA)
+def test_malformed_metadata(dataset, change, words):
+    """Other fields, or another first field of a record."""
+    file = dataset / "agents" / ".zarray"
+    found = json.loads(file.read_text())
+    if isinstance(change, dict):
+        found.update(change)
+    else:
+        found["dtype"][0] = change
+    file.write_text(json.dumps(found))
+    line = refused(read, dataset)
+    assert line.startswith(f"{file}: ")
+    assert words in line
+
+
+@pytest.mark.parametrize(
+    ("place", "content", "words"),
+    [
+        # blosc's own size is compared with the metadata before it is unpacked
+        (4, b"\xff\xff\xff\x7f", "0: chunk: 2147483647 bytes decompressed"),
+        (16, b"\xff" * 184, ": records 0 to "),
+    ],
+)
+def test_damaged_chunk(dataset, place, content, words):
+    chunk = dataset / "agents" / "0"
+    changed = bytearray(chunk.read_bytes())
+    changed[place : place + len(content)] = content
+    chunk.write_bytes(changed)
+    assert words in refused(read, dataset)
+
+
+def test_limits(folder, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(l5_map, "MAX_MAP_BYTES", 500)
+        assert re.search(r"\.pb: size: \d+ bytes: .* 500", refused(read, folder))
+    monkeypatch.setattr(zarr2, "MAX_READ_BYTES", 1000)
+    line = refused(read, folder)
+    assert re.search(r"frames: records 0 to 100: .*at most 1000", line)
+
+
+def test_format_version_1_has_no_lights(folder):
+    shutil.rmtree(folder / "scenes" / "sample.zarr" / "traffic_light_faces")
+    recording = read(folder)[0]
+    assert recording.signals == ()
+    assert "no traffic lights recorded" in recording.notes

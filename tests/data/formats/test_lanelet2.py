@@ -1,0 +1,270 @@
+"""Lanelet2 maps: geometry, links, rules, positions; hostile and broken files."""
+
+import numpy as np
+import pytest
+
+from rcirl_jax.data.formats.lanelet2 import map as lanelet2
+from rcirl_jax.data.formats.lanelet2 import rules as lanelet2_rules
+from rcirl_jax.data.formats.lanelet2.map import read_lanelet2
+from rcirl_jax.data.formats.lanelet2.rules import members
+from rcirl_jax.data.formats.projection import utm, utm_zone
+from tests.data.formats.fixtures import osm
+from tests.helpers.logs import refused
+
+UTM_ORIGIN = np.array([297631.3187, 5629917.34465])
+
+
+def project(latitude, longitude):
+    return utm(latitude, longitude, 32) - UTM_ORIGIN
+
+
+def read(path):
+    lanes, notes = read_lanelet2(path, project)
+    return {lane.id: lane for lane in lanes}, notes
+
+
+def metres(folder, **options):
+    return osm.lanelet_map(folder / "m.osm_xy", osm.in_metres, **options)
+
+
+@pytest.fixture
+def lanes(tmp_path):
+    return read(metres(tmp_path))[0]
+
+
+@pytest.mark.parametrize(
+    ("latitude", "longitude", "zone", "expected"),
+    [
+        # PROJ 9, proj=utm ellps=WGS84
+        (50.78505, 6.13070, 32, (297750.42422433326, 5629847.200410632)),
+        (50.9907, 6.9001, 32, (352628.22689050355, 5650889.601443835)),
+        (0.0, 0.0, 31, (166021.44308054057, 0.0)),
+    ],
+)
+def test_utm_against_proj(latitude, longitude, zone, expected):
+    assert utm_zone(longitude) == zone
+    found = utm(np.array([latitude]), np.array([longitude]), zone)
+    np.testing.assert_allclose(found[0], expected, atol=1e-6)
+
+
+def test_the_other_side_of_the_globe_stays_finite():
+    """Lanes there are told apart by their distance, which has to be a number."""
+    places = utm(np.zeros(4), np.array([93.0, -87.0, 183.0, 3.0]), 31)
+    np.testing.assert_allclose(np.abs(places[:3]).max(axis=1), 2e7, rtol=1e-3)
+    np.testing.assert_allclose(places[3], (5e5, 0.0), atol=1e-6)
+    south = utm(np.array([-33.9]), np.array([18.4]), 34, south=True)
+    north = utm(np.array([-33.9]), np.array([18.4]), 34)
+    np.testing.assert_allclose(south - north, [[0.0, 1e7]])
+
+
+def test_geometry_and_direction(lanes):
+    """Bounds in two ways, or drawn backwards, give the lane as it is driven."""
+    east = lanes["30001"]
+    np.testing.assert_allclose(east.centre[[0, -1]], [[0.0, -1.75], [80.0, -1.75]])
+    np.testing.assert_allclose(east.left_width + east.right_width, 3.5)
+    assert np.all(np.diff(east.centre[:, 0]) > 0.0)
+    west = lanes["30005"]
+    np.testing.assert_allclose(west.centre[[0, -1]], [[160.0, 1.75], [0.0, 1.75]])
+    turn = lanes["30003"].centre
+    radii = np.hypot(turn[:, 0] - 80.0, turn[:, 1] + 1.75 + osm.RADIUS)
+    np.testing.assert_allclose(radii, osm.RADIUS, atol=0.05)
+    assert np.hypot(*np.diff(turn, axis=0).T).min() > 0.2
+
+
+def test_links(lanes):
+    assert lanes["30001"].successors == ("30002", "30003")
+    assert lanes["30003"].successors == ("30004",)
+    assert lanes["30004"].successors == ()
+    # the opposite lane shares a bound, but is no neighbour of the same direction
+    assert lanes["30001"].left is None
+    assert lanes["30005"].left is None
+
+
+def test_neighbours_of_the_same_direction(tmp_path):
+    one = (["path_north"], ["path_south"], osm.ROAD, [])
+    other = (["path_south"], ["middle_3"], osm.ROAD, [])
+    lanes, _ = read(metres(tmp_path, lanelets={"1": one, "2": other}))
+    assert (lanes["1"].left, lanes["1"].right) == (None, "2")
+    assert (lanes["2"].left, lanes["2"].right) == ("1", None)
+
+
+def test_two_way_lanes_and_those_of_others(lanes):
+    assert set(lanes) == {
+        *(f"3000{i}" for i in (1, 2, 3, 4, 5, 7)),
+        "30007-back",
+    }
+    there, back = lanes["30007"], lanes["30007-back"]
+    np.testing.assert_allclose(there.centre, back.centre[::-1])
+    assert back.id not in there.successors
+
+
+@pytest.mark.parametrize(
+    ("tags", "kept"),
+    [
+        ({"subtype": "bicycle_lane"}, False),
+        ({"subtype": "highway"}, True),
+        ({"subtype": "walkway", "participant:vehicle": "yes"}, True),
+        ({"subtype": "road", "participant:pedestrian": "yes"}, False),
+        ({"subtype": "bus_lane", "participant:vehicle:bus": "yes"}, True),
+        ({}, True),
+    ],
+)
+def test_participants(tmp_path, tags, kept):
+    both = {
+        "1": (["path_north"], ["path_south"], {"type": "lanelet", **tags}, []),
+        "2": (["middle_3"], ["border_3"], osm.ROAD, []),
+    }
+    assert ("1" in read(metres(tmp_path, lanelets=both))[0]) == kept
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("50 km/h", 50 / 3.6),
+        ("50", 50 / 3.6),
+        ("40mph", 40 * 0.44704),
+        ("de274-60", 60 / 3.6),
+        ("de274", None),
+        ("fast", None),
+        ("900 km/h", None),
+        # minutes, if the time were the square of the spaces
+        (f"50{300_000 * ' '}!", None),
+    ],
+)
+def test_speed_limits(tmp_path, monkeypatch, text, expected):
+    rule = ({"subtype": "speed_limit", "sign_type": text}, [])
+    monkeypatch.setitem(osm.RULES, "50000", rule)
+    lanes, _ = read(metres(tmp_path))
+    if expected is None:
+        assert lanes["30001"].speed_limit is None
+    else:
+        assert lanes["30001"].speed_limit == pytest.approx(expected)
+    assert lanes["30007"].speed_limit is None
+
+
+def test_speed_limit_of_the_lane_itself(tmp_path):
+    tags = {**osm.ROAD, "speed_limit": "30"}
+    one = {"1": (["middle_3"], ["border_3"], tags, [])}
+    lanes, _ = read(metres(tmp_path, lanelets=one))
+    assert lanes["1"].speed_limit == pytest.approx(30 / 3.6)
+
+
+def test_stop_sign_and_its_line(lanes):
+    lane = lanes["30004"]
+    assert lane.stop_sign
+    np.testing.assert_allclose(lane.stop_line, [[93.25, -78.0], [96.75, -78.0]])
+    assert lanes["30002"].stop_line is None
+
+
+@pytest.mark.parametrize(
+    ("rule", "line", "sign"),
+    [
+        (({"subtype": "traffic_light"}, []), "end", False),
+        (({"subtype": "all_way_stop"}, [("relation", "30004", "yield")]), "end", True),
+        (({"subtype": "right_of_way"}, [("relation", "30002", "yield")]), None, False),
+        (({"subtype": "right_of_way"}, [("relation", "30004", "yield")]), None, False),
+        (({"subtype": "traffic_sign"}, [("way", "sign", "refers")]), "end", True),
+        (({"subtype": "traffic_sign", "sign_type": "de205"}, []), None, False),
+    ],
+)
+def test_rules_about_stopping(tmp_path, monkeypatch, rule, line, sign):
+    monkeypatch.setitem(osm.RULES, "50001", rule)
+    lane = read(metres(tmp_path))[0]["30004"]
+    assert lane.stop_sign == sign
+    if line is None:
+        assert lane.stop_line is None
+    else:
+        np.testing.assert_allclose(lane.stop_line, [[96.75, -80.0], [93.25, -80.0]])
+
+
+def test_positions_in_degrees_and_in_local_tags(tmp_path, lanes):
+    place = osm.in_degrees(32, UTM_ORIGIN)
+    degrees, _ = read(osm.lanelet_map(tmp_path / "m.osm", place))
+    path = osm.lanelet_map(tmp_path / "local.osm", osm.in_metres)
+    text = path.read_text()
+    for x, y in {tuple(p) for points in osm.WAYS.values() for p in points}:
+        old = f"x='{x:.4f}' y='{y:.4f}' />"
+        tags = f"<tag k='local_x' v='{x:.4f}'/><tag k='local_y' v='{y:.4f}'/></node>"
+        text = text.replace(old, f"lat='0' lon='0'>{tags}")
+    path.write_text(text)
+    tagged, _ = read(path)
+    for name, lane in lanes.items():
+        np.testing.assert_allclose(degrees[name].centre, lane.centre, atol=1e-3)
+        np.testing.assert_allclose(tagged[name].centre, lane.centre, atol=1e-9)
+
+
+def test_lanelets_without_two_bounds_are_noted(tmp_path):
+    broken = {
+        "1": (["middle_3"], ["border_3"], osm.ROAD, []),
+        "2": (["middle_3"], [], osm.ROAD, []),
+        # ways that do not meet
+        "3": (["middle_1", "middle_3"], ["border_1"], osm.ROAD, []),
+        "4": (["middle_3"], ["middle_3"], osm.ROAD, []),
+    }
+    lanes, notes = read(metres(tmp_path, lanelets=broken))
+    assert set(lanes) == {"1", "4"}
+    assert notes == ["2 lanelets without two bounds left out"]
+
+
+MALFORMED = [
+    ("<osm><node", "well-formed"),
+    ("<osm/>", "lanelet: none"),
+    ("<osm><node id='1'/></osm>", "node 1: position"),
+    ("<osm><node id='1' lat='nan' lon='2'/></osm>", "node 1: position"),
+    ("<osm><node id='1' lat='90' lon='2'/></osm>", "expected at most 84, 180"),
+    ("<osm><node id='1' x='1e300' y='2'/></osm>", "expected at most 1e+08"),
+]
+
+
+@pytest.mark.parametrize(("text", "words"), MALFORMED)
+def test_malformed(tmp_path, text, words):
+    path = tmp_path / "bad.osm"
+    path.write_text(text)
+    line = refused(read, path)
+    assert line.startswith(str(path))
+    assert words in line
+
+
+def test_nodes_and_ways_of_bounds_are_limited(tmp_path, monkeypatch):
+    """Few bytes make many lanelets of one way, or one bound of many ways."""
+    bounds = (["path_north"] * 3, ["path_south"], osm.ROAD, [])
+    path = metres(tmp_path, lanelets={"1": bounds, "2": bounds})
+    points = len(osm.WAYS["path_north"]) + len(osm.WAYS["path_south"])
+    monkeypatch.setattr(lanelet2, "MAX_NODES", 2 * points)
+    assert set(read(path)[0]) == {"1", "2"}
+    monkeypatch.setattr(lanelet2, "MAX_NODES", 2 * points - 1)
+    assert f"lanelet 2: {2 * points} nodes" in refused(read, path)
+    monkeypatch.setattr(lanelet2_rules, "MAX_WAYS", 2)
+    assert "3 ways: expected up to 2" in refused(read, path)
+
+
+def test_rules_are_read_once(tmp_path, monkeypatch):
+    """However many lanelets name a rule, and however often."""
+    roles = []
+
+    def counted(element, role, kind):
+        roles.append(role)
+        return members(element, role, kind)
+
+    monkeypatch.setattr(lanelet2_rules, "members", counted)
+    lanelet = (["middle_3"], ["border_3"], osm.ROAD, ["50000", "50001"] * 20)
+    lanes, _ = read(metres(tmp_path, lanelets={"1": lanelet, "2": lanelet}))
+    assert lanes["2"].speed_limit == pytest.approx(50 / 3.6)
+    assert roles.count("yield") == len(osm.RULES)
+    assert roles.count("refers") == len(osm.RULES)
+
+
+def test_a_stop_line_keeps_no_others(tmp_path, monkeypatch):
+    rule = ({"subtype": "traffic_light"}, [("way", "line", "ref_line")] * 9)
+    monkeypatch.setitem(osm.RULES, "50001", rule)
+    lane = read(metres(tmp_path))[0]["30004"]
+    np.testing.assert_allclose(lane.stop_line, [[93.25, -78.0], [96.75, -78.0]])
+    assert lane.stop_line.base is None
+
+
+def test_limit_of_the_last_rule_counts(tmp_path, monkeypatch):
+    slow = ({"subtype": "speed_limit", "sign_type": "de274-30"}, [])
+    monkeypatch.setitem(osm.RULES, "50002", slow)
+    both = {"1": (["middle_3"], ["border_3"], osm.ROAD, ["50000", "50002"])}
+    lanes, _ = read(metres(tmp_path, lanelets=both))
+    assert lanes["1"].speed_limit == pytest.approx(30 / 3.6)

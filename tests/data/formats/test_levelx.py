@@ -1,0 +1,304 @@
+"""leveLXData: highD's boxes and markings, inD's centres and maps, traps."""
+
+import functools
+
+import numpy as np
+import pytest
+
+from rcirl_jax.data.formats.levelx.map import marked_lanes
+from rcirl_jax.data.scenes.collect import Collector
+from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.errors import InputError
+from rcirl_jax.types import Kind
+from tests.data.formats.fixtures import levelx as ind
+from tests.data.formats.fixtures import levelx_highd as highd
+from tests.data.formats.fixtures import osm
+from tests.data.formats.fixtures.drives import straight
+from tests.helpers import logs
+from tests.helpers.logs import edit
+
+read = functools.partial(logs.read, "levelx")
+only = functools.partial(logs.only, "levelx")
+
+
+@pytest.fixture
+def motorway(tmp_path):
+    highd.write(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def junction(tmp_path):
+    ind.write(tmp_path)
+    return tmp_path
+
+
+# ------------------------------------------------------------------------ highD
+
+
+def test_corner_and_downward_axis(motorway):
+    recording = only(motorway)
+    car = recording.tracks[0]
+    assert (recording.name, recording.rate_hz) == ("01", 25.0)
+    # x, y of the file is the corner: 5 - 4.85 / 2, 22.98 - 2.12 / 2
+    np.testing.assert_allclose((car.x[0], car.y[0]), (5.0, -22.98), atol=0.01)
+    assert (car.length, car.width) == (4.85, 2.12)
+    assert car.t[0] == 0.0
+    assert np.diff(car.t) == pytest.approx(0.04)
+
+
+def test_carriageways_and_lane_numbers(motorway):
+    lanes = {lane.id: lane for lane in only(motorway).lanes}
+    assert sorted(lanes) == ["2", "3", "5", "6"]
+    np.testing.assert_allclose(lanes["2"].centre[:, 1], -0.5 * (8.51 + 12.59))
+    np.testing.assert_allclose(lanes["6"].left_width, 0.5 * (28.8 - 24.96))
+    # the upper carriageway is driven towards -x: its left lane is the lower one
+    assert lanes["2"].centre[0, 0] > lanes["2"].centre[-1, 0]
+    assert (lanes["2"].left, lanes["2"].right) == ("3", None)
+    assert (lanes["5"].left, lanes["5"].right) == (None, "6")
+    assert lanes["6"].left == "5"
+
+
+def test_vehicles_are_on_the_lane_of_the_file(motorway):
+    recording = only(motorway)
+    centres = {lane.id: lane.centre[0, 1] for lane in recording.lanes}
+    for name, (_, _, lane, *_) in highd.road_users().items():
+        (track,) = [t for t in recording.tracks if t.id == name]
+        nearest = min(centres, key=lambda n: abs(centres[n] - track.y[0]))
+        assert nearest == str(lane)
+
+
+def test_direction_decides_the_heading_of_who_stands(motorway):
+    lines = (motorway / "01_tracks.csv").read_text().splitlines()
+    stopped = [lines[0]]
+    for line in lines[1:]:
+        cells = line.split(",")
+        if cells[1] == "3":
+            cells[2], cells[3], cells[6], cells[7] = "200", "9.4", "0.00", "0.00"
+        stopped.append(",".join(cells))
+    (motorway / "01_tracks.csv").write_text("\n".join(stopped) + "\n")
+    (truck,) = [t for t in only(motorway).tracks if t.id == "3"]
+    np.testing.assert_allclose(truck.heading, np.pi)
+
+
+@pytest.mark.parametrize(
+    ("text", "lane", "default"),
+    [("-1.00", None, 36.11), ("33.33", 33.33, 33.33), ("", None, 36.11)],
+)
+def test_speed_limit(motorway, text, lane, default):
+    edit(motorway / "01_recordingMeta.csv", ",-1.00,", f",{text},")
+    recording = only(motorway)
+    assert recording.lanes[0].speed_limit == lane
+    assert recording.default_speed_limit == default
+
+
+@pytest.mark.parametrize(
+    "marks", ["8.51", "8.51;x", "12.59;8.51", "", "8.51;8.51", "nan;1"]
+)
+def test_markings(motorway, marks):
+    edit(motorway / "01_recordingMeta.csv", "8.51;12.59;16.43", marks)
+    with pytest.raises(InputError, match=r"01_recordingMeta.csv: upperLaneMarkings: '"):
+        read(motorway)
+
+
+# -------------------------------------------------------------- inD and sisters
+
+
+def test_headings_in_degrees_and_sizes_of_zero(junction):
+    tracks = {track.id: track for track in only(junction).tracks}
+    assert tracks["2"].heading[0] == pytest.approx(np.pi)
+    assert (tracks["3"].kind, tracks["3"].length) == (Kind.PEDESTRIAN, 0.5)
+    assert (tracks["4"].kind, tracks["4"].length) == (Kind.CYCLIST, 1.8)
+    assert tracks["2"].length == 11.5
+
+
+def test_walkers_without_a_heading_get_that_of_their_path(tmp_path):
+    users = ind.road_users()
+    kind, walker, frames = users["3"]
+    turned = ind.straight(ind.T, (60.0, -40.0), np.pi / 2, 1.4, kind=walker.kind)
+    ind.write_tracks(tmp_path, "00", {"3": (kind, turned, frames)})
+    path = tmp_path / "00_tracks.csv"
+    path.write_text(path.read_text().replace(",90.00000,", ",0.00000,"))
+    ind.write_meta(tmp_path, "00")
+    (track,) = only(tmp_path).tracks
+    np.testing.assert_allclose(track.heading, np.pi / 2, atol=1e-3)
+
+
+EXID = {
+    **{"traveledDistance": "1.5", "latLaneCenterOffset": "0.1;-3.6"},
+    **{"laneWidth": "3.7;3.5", "laneletId": "1992;1996", "laneChange": 0},
+    **{"lonLaneletPos": "12.5;3.1", "laneletLength": "120.1;80.2"},
+    **{"leadDHW": "", "leadTHW": -1, "leadTTC": "nan", "leadId": -1, "rearId": 12},
+    **{"leftAlongsideId": "-1", "rightAlongsideId": "4;5", "odrRoadId": 0},
+}
+
+
+def test_exid_columns_with_lists_and_holes(tmp_path):
+    users = ind.road_users()
+    users["0"] = ("van", *users["0"][1:])
+    users["2"] = ("trailer", *users["2"][1:])
+    ind.write_tracks(tmp_path, "39", users, more=EXID)
+    ind.write_meta(tmp_path, "39", speedLimit=-1)
+    recording = only(tmp_path)
+    assert len(recording.tracks) == 6
+    assert recording.default_speed_limit == 36.11
+    assert "1 trailers are obstacles of kind cyclist, no experts" in recording.notes
+
+
+def test_a_trailer_is_an_obstacle_but_no_expert(tmp_path):
+    """It follows its tractor half a metre behind; a car follows the trailer."""
+    frames = np.arange(ind.FRAMES)
+    users = {
+        str(number): (kind, straight(ind.T, (x, -41.75), 0.0, 15.0, size=size), frames)
+        for number, (kind, x, size) in enumerate(
+            [
+                ("car", 60.0, (4.5, 1.9)),
+                ("trailer", 54.25, (6.0, 2.2)),
+                ("car", 20.0, (4.5, 1.9)),
+            ]
+        )
+    }
+    ind.write_tracks(tmp_path, "00", users)
+    ind.write_meta(tmp_path, "00")
+    recording = only(tmp_path)
+    collect = CollectConfig(require_speed_change=False)
+    scenes = list(Collector(recording, collect).scenes())
+    drivers = {recording.tracks[scene["track"]].id for scene in scenes}
+    assert drivers == {"0", "2"}
+    for scene in scenes:
+        if recording.tracks[scene["track"]].id == "2":
+            length = scene["obstacles.s_upper"] - scene["obstacles.s_lower"]
+            assert np.any(np.abs(length[:, 0] - 6.0) < 0.05)
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        "maps/lanelets/04_aseag/location4.osm",
+        "lanelets/location4.osm",
+        "data/location4.osm",
+        "maps/lanelets/4_somewhere/town.osm",
+        "maps/rounD_4.osm",
+        "maps/4_somewhere.osm",
+    ],
+)
+def test_where_maps_lie(junction, place):
+    found = junction / "maps" / "lanelets" / "04_aseag" / "location4.osm"
+    target = junction / place
+    target.parent.mkdir(parents=True, exist_ok=True)
+    found.rename(target)
+    # maps of other places and of building sites are not taken for it
+    other = target.parent / "location4_construction.osm"
+    other.write_text("not read")
+    (target.parent / "location14.osm").write_text("not read")
+    lanes = only(junction).lanes
+    assert {lane.id for lane in lanes} >= {"30001", "30003"}
+
+
+def test_map_of_the_source(junction, tmp_path):
+    found = junction / "maps" / "lanelets" / "04_aseag" / "location4.osm"
+    other = tmp_path / "elsewhere" / "any.osm"
+    other.parent.mkdir()
+    found.rename(other)
+    source = tmp_path / "s.toml"
+    source.write_text(f'map = "{other}"\n')
+    assert {lane.id for lane in only(junction, source).lanes} >= {"30001"}
+    source.write_text('map = "/nowhere/any.osm"\n')
+    with pytest.raises(InputError, match=r"/nowhere/any\.osm: map: missing"):
+        read(junction, source)
+
+
+def test_a_map_of_another_place_is_not_used(junction):
+    path = junction / "maps" / "lanelets" / "04_aseag" / "location4.osm"
+    osm.lanelet_map(path, osm.in_degrees(32, (0.0, 5.2e6)))
+    notes = only(junction).notes
+    assert any("location4.osm lies elsewhere" in note for note in notes)
+
+
+def rows_of(path, kept):
+    """Keep the lines of a table for which `kept(line number, cells)`."""
+    lines = path.read_text().splitlines()
+    found = [x for k, x in enumerate(lines) if k == 0 or kept(k, x.split(","))]
+    path.write_text("\n".join(found) + "\n")
+
+
+@pytest.mark.parametrize(
+    ("kept", "found"),
+    [
+        (lambda k, _: k < 400, "track 1: numFrames: 99: expected 235"),
+        (lambda k, _: k < 301, "track 1: numFrames: 0: expected 235"),
+        (lambda k, _: k != 50, "track 0: numFrames: 299: expected 300"),
+        (lambda _, cells: cells[1] != "5", "track 5: numFrames: 0: expected 300"),
+    ],
+)
+def test_truncated_at_the_border_of_lines(junction, kept, found):
+    path = junction / "data" / "07_tracks.csv"
+    rows_of(path, kept)
+    with pytest.raises(InputError) as error:
+        read(junction)
+    assert str(error.value) == (
+        f"{path}: {found} as in 07_tracksMeta.csv; truncated file? "
+        "(of a sample, set partial = true in the TOML of --source)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("row", "other", "found"),
+    [
+        ("0,299,300", "1,300,300", "track 0: initialFrame: 0: expected 1"),
+        ("0,299,300", "0,300,300", "track 0: finalFrame: 299: expected 300"),
+        ("0,299,300", "0,299,299", "track 0: numFrames: 300: expected 299"),
+    ],
+)
+def test_lives_of_tracks(junction, row, other, found):
+    edit(junction / "data" / "07_tracksMeta.csv", row, other)
+    with pytest.raises(InputError, match=found):
+        read(junction)
+
+
+def test_a_part_of_the_rows_on_request(junction, tmp_path):
+    """Published samples hold the first rows only, and all of the meta data."""
+    rows_of(junction / "data" / "07_tracks.csv", lambda k, _: k < 400)
+    source = tmp_path / "s.toml"
+    source.write_text("partial = true\n")
+    recording = only(junction, source)
+    assert len(recording.tracks) == 2
+    assert "4 tracks of tracksMeta have no rows" in recording.notes
+
+
+# ------------------------------------------------------------------------- both
+
+
+def test_classes(junction):
+    """A class that nobody knows is a vehicle, and a note says so."""
+    meta = junction / "data" / "07_tracksMeta.csv"
+    edit(meta, ",truck_bus", ",Truck_Bus")
+    assert not any("classes" in note for note in only(junction).notes)
+    edit(meta, ",car", ",animal")
+    edit(meta, ",car", ",tram")
+    recording = only(junction)
+    kinds = [track.kind for track in recording.tracks[:2]]
+    assert kinds == [Kind.PEDESTRIAN, Kind.VEHICLE]
+    assert "classes taken for vehicles: tram" in recording.notes
+
+
+def test_marked_lanes_longer_than_roads_are_not_made(tmp_path):
+    marks = [";".join(f"{4 * k}" for k in range(a, a + 7)) for a in (0, 7)]
+    meta = {"upperLaneMarkings": marks[0], "lowerLaneMarkings": marks[1]}
+    rows = (np.zeros(1), np.ones(1))
+    assert len(marked_lanes(tmp_path, meta, (0.0, 400.0), None, rows)) == 12
+    with pytest.raises(InputError, match=r"lanes: 1\.18812e\+07 m long in all"):
+        marked_lanes(tmp_path, meta, (0.0, 9.9e5), None, rows)
+
+
+def test_many_markings_are_read_in_full(motorway):
+    marks = ";".join(f"{8.51 + 4.0 * k:.20f}" for k in range(4))
+    edit(motorway / "01_recordingMeta.csv", "8.51;12.59;16.43", marks)
+    assert len(only(motorway).lanes) == 5
+
+
+def test_sizes_of_the_source(junction, tmp_path):
+    source = tmp_path / "s.toml"
+    source.write_text("[sizes]\npedestrian = [0.6, 0.4]\n")
+    tracks = {track.id: track for track in only(junction, source).tracks}
+    assert (tracks["3"].length, tracks["3"].width) == (0.6, 0.4)

@@ -1,0 +1,268 @@
+"""NGSIM: native text and portal CSV, with and without lateral positions."""
+
+import functools
+import time
+
+import numpy as np
+import pytest
+
+from rcirl_jax.data.cut import digest
+from rcirl_jax.errors import InputError
+from tests.data.formats import writers as w
+from tests.helpers import logs
+
+read = functools.partial(logs.read, "ngsim")
+only = functools.partial(logs.only, "ngsim")
+
+LANE_M = 3.6576  # m, 12 ft
+
+
+def test_native_text_in_metres_with_left_positive(tmp_path):
+    rows = w.ngsim_rows(vehicle=1, lane=2, local_x=18.0)
+    rows += w.ngsim_rows(vehicle=2, lane=1, local_x=6.0)
+    recording = only(w.ngsim_text(tmp_path / "a.txt", rows))
+    first, second = recording.tracks
+    assert (recording.rate_hz, recording.group) == (pytest.approx(10.0), None)
+    assert (first.length, first.width) == (15 * w.FOOT, 6 * w.FOOT)
+    # the front bumper is at 20 ft, the centre half a length behind
+    assert first.x[0] == pytest.approx((20.0 - 7.5) * w.FOOT)
+    np.testing.assert_allclose(np.diff(first.x), 1.5)
+    np.testing.assert_allclose(first.y, -18.0 * w.FOOT)
+    assert second.y[0] > first.y[0]
+    np.testing.assert_allclose(first.speed, 15.0)
+    np.testing.assert_allclose(first.heading, 0.0, atol=1e-9)
+    assert first.t[0] == 0.0
+
+
+def test_lanes_are_numbered_from_the_left(tmp_path):
+    rows = [
+        row
+        for lane in (1, 2, 3)
+        for row in w.ngsim_rows(vehicle=lane, lane=lane, local_x=12.0 * lane - 6.0)
+    ]
+    lanes = {r.id: r for r in only(w.ngsim_text(tmp_path / "a.txt", rows)).lanes}
+    assert (lanes["2"].left, lanes["2"].right) == ("1", "3")
+    assert (lanes["1"].left, lanes["3"].right) == (None, None)
+    np.testing.assert_allclose(lanes["2"].centre[:, 1], -1.5 * LANE_M)
+    np.testing.assert_allclose(lanes["2"].left_width, 0.5 * LANE_M)
+    fronts = np.array([row[5] for row in rows]) * w.FOOT
+    assert lanes["2"].centre[0, 0] == pytest.approx(fronts.min() - 50.0)
+    assert lanes["2"].centre[-1, 0] == pytest.approx(fronts.max() + 50.0)
+    assert lanes["2"].speed_limit == 29.06
+
+
+def test_bounds_lie_midway_between_unequal_lanes(tmp_path):
+    rows = [
+        row
+        for lane, x in {1: 6.0, 2: 18.0, 3: 31.0}.items()
+        for row in w.ngsim_rows(vehicle=lane, lane=lane, local_x=x)
+    ]
+    _, middle, last = only(w.ngsim_text(tmp_path / "a.txt", rows)).lanes
+    np.testing.assert_allclose(middle.left_width, 6.0 * w.FOOT)
+    np.testing.assert_allclose(middle.right_width, 6.5 * w.FOOT)
+    np.testing.assert_allclose(last.left_width, 6.5 * w.FOOT)
+    np.testing.assert_allclose(last.right_width, 0.5 * LANE_M)
+
+
+def test_ramps_at_one_place_are_no_neighbours(tmp_path):
+    places = {1: 6.0, 7: 78.0, 8: 79.0}
+    rows = [
+        row
+        for lane, x in places.items()
+        for row in w.ngsim_rows(vehicle=lane, lane=lane, local_x=x)
+    ]
+    lanes = only(w.ngsim_text(tmp_path / "a.txt", rows)).lanes
+    assert all(lane.left is None and lane.right is None for lane in lanes)
+
+
+def test_lateral_position_from_the_lane_number(tmp_path):
+    lane = np.where(np.arange(120) < 60, 2, 3)
+    rows = w.ngsim_rows(count=120, lane=lane, local_x=0, length=0)
+    recording = only(w.ngsim_text(tmp_path / "a.txt", rows))
+    (track,) = recording.tracks
+    assert (track.length, track.width) == (4.5, 6 * w.FOOT)
+    u = np.clip((np.arange(120) - 59.5) / 40.0 + 0.5, 0.0, 1.0)
+    expected = -LANE_M * (1.5 + 3.0 * u**2 - 2.0 * u**3)
+    np.testing.assert_allclose(track.y, expected, atol=1e-9)
+    assert any("lateral" in note for note in recording.notes)
+    assert any("length" in note for note in recording.notes)
+    # half a lane at the switch, which takes four seconds
+    assert np.mean(track.y[59:61]) == pytest.approx(-2.0 * LANE_M)
+    np.testing.assert_allclose(track.y[:40], -1.5 * LANE_M)
+    np.testing.assert_allclose(track.y[80:], -2.5 * LANE_M)
+
+
+def test_gaps_split_a_vehicle(tmp_path):
+    rows = w.ngsim_rows(first=100) + w.ngsim_rows(first=2000, start_ft=30.0)
+    del rows[20]
+    tracks = only(w.ngsim_text(tmp_path / "a.txt", rows)).tracks
+    assert [track.id for track in tracks] == ["1", "1#2", "1#3"]
+    assert [track.t.size for track in tracks] == [20, 19, 40]
+
+
+def test_csv_is_the_same_as_text(tmp_path):
+    rows = w.ngsim_rows() + w.ngsim_rows(vehicle=2, local_x=30.0, lane=3)
+    text = only(w.ngsim_text(tmp_path / "a.txt", rows))
+    order = np.random.default_rng(0).permutation(len(w.NGSIM_COLUMNS))
+    columns = [w.NGSIM_COLUMNS[i].upper() for i in order]
+    shuffled = [[row[i] for i in order] for row in rows]
+    table = only(w.ngsim_csv(tmp_path / "a.csv", shuffled, columns=columns))
+    for one, other in zip(text.tracks, table.tracks, strict=True):
+        np.testing.assert_allclose(one.x, other.x)
+        np.testing.assert_allclose(one.y, other.y)
+        assert (one.id, one.length, one.width) == (other.id, other.length, other.width)
+
+
+def stamped(rows, begin=8e11):
+    """Rows with Global_Time: 100 ms a frame."""
+    return [[*row[:3], begin + 100 * row[1], *row[4:]] for row in rows]
+
+
+def test_portal_sites_and_periods(tmp_path):
+    """Vehicle and frame numbers start anew in each period and at each site."""
+    begins = (9e11, 8e11, 7e11, 6e11)
+    rows = [row for begin in begins for row in stamped(w.ngsim_rows(), begin)]
+    sites = ["us-101"] * 80 + ["i-80"] * 40 + ["lankershim"] * 40
+    found = read(w.ngsim_csv(tmp_path / "all.csv", rows, sites=sites))
+    assert [recording.name for recording in found] == ["all-i-80", "all-us-101"]
+    assert [len(recording.tracks) for recording in found] == [1, 2]
+    assert all("lankershim" in recording.notes[0] for recording in found)
+
+
+def periods():
+    """Two periods an hour apart with the same vehicle and frame numbers."""
+    rows = []
+    for begin in (8e11, 8e11 + 3.6e6):
+        for vehicle in (1, 2, 3):
+            own = w.ngsim_rows(vehicle=vehicle, local_x=12.0 * vehicle)
+            rows += stamped(own[:20] + own[23:], begin)
+    return rows
+
+
+def test_columns_chosen_in_the_portal(tmp_path):
+    """Downloads by its interface hold what was asked for; 0 is the class of nobody."""
+    columns = [w.NGSIM_COLUMNS[i] for i in (0, 1, 5, 11, 13)]
+    rows = [[row[i] for i in (0, 1, 5, 11, 13)] for row in w.ngsim_rows()]
+    (track,) = only(w.ngsim_csv(tmp_path / "a.csv", rows, columns=columns)).tracks
+    assert (track.length, track.width) == (4.5, 1.8)
+
+
+def test_separators_between_thousands(tmp_path):
+    """A spreadsheet's export: "1,118,846,979,700" and "2,224"."""
+    rows = periods()
+    sites = ["us-101"] * len(rows)
+    plain = only(w.ngsim_csv(tmp_path / "a.csv", rows, sites=sites))
+    assert "800,003," in w.grouped(tmp_path / "a.csv").read_text()
+    assert digest(only(tmp_path / "a.csv")) == digest(plain)
+    text = (tmp_path / "a.csv").read_text()
+    (tmp_path / "a.csv").write_text(text.replace('"800,003,', '"800,03,', 1))
+    source = w.strict(tmp_path / "strict.toml", "ngsim")
+    with pytest.raises(InputError, match=r"a\.csv: line 113: Global_Time: '800,03,"):
+        read(tmp_path / "a.csv", source)
+
+
+def test_release_with_every_log_twice(tmp_path):
+    """Text and CSV of one name are one log; other tables are none."""
+    for site, period in (("us-101", "0750am-0805am"), ("i-80", "0400-0415")):
+        folder = tmp_path / site / "vehicle-trajectory-data" / period
+        folder.mkdir(parents=True)
+        w.ngsim_text(folder / f"trajectories-{period}.txt", w.ngsim_rows())
+        w.ngsim_csv(folder / f"trajectories-{period}.csv", w.ngsim_rows())
+        detectors = tmp_path / site / "detector-data"
+        detectors.mkdir()
+        (detectors / "detectors.csv").write_text("station,flow\n1,2\n")
+        (detectors / "readme.txt").write_text("see the report\n")
+    found = [recording.name for recording in read(tmp_path)]
+    assert found == ["trajectories-0400-0415", "trajectories-0750am-0805am"]
+    again = tmp_path / "copy" / "trajectories-0400-0415.csv"
+    again.parent.mkdir()
+    w.ngsim_csv(again, w.ngsim_rows())
+    assert [recording.name for recording in read(tmp_path)][:2] == [
+        "copy/trajectories-0400-0415",
+        "i-80/vehicle-trajectory-data/0400-0415/trajectories-0400-0415",
+    ]
+
+
+@pytest.mark.parametrize("writer", [w.ngsim_text, w.ngsim_csv])
+def test_arterials_without_a_location(tmp_path, writer):
+    """Lankershim's and Peachtree's own files: 24 columns, no straight lanes."""
+    rows = [[*row[:14], *(102, 205, 2, 3, 2, 1), *row[14:]] for row in w.ngsim_rows()]
+    zones = ("O_Zone", "D_Zone", "Int_ID", "Section_ID", "Direction", "Movement")
+    columns = (*w.NGSIM_COLUMNS[:14], *zones, *w.NGSIM_COLUMNS[14:])
+    options = {"columns": columns} if writer is w.ngsim_csv else {}
+    path = writer(tmp_path / "trajectories.dat", rows, **options)
+    with pytest.raises(InputError, match="arterials have no straight lanes"):
+        read(path)
+
+
+@pytest.mark.parametrize("writer", [w.ngsim_text, w.ngsim_csv])
+def test_stamped_rows_may_come_in_any_order(tmp_path, writer):
+    rows = periods()
+    rows += rows[7:9]  # repeated rows lie anywhere too
+    (tmp_path / "shuffled").mkdir()
+    order = np.random.default_rng(1).permutation(len(rows))
+    whole = only(writer(tmp_path / "a.csv", rows))
+    shuffled = only(writer(tmp_path / "shuffled" / "a.csv", [rows[k] for k in order]))
+    assert digest(shuffled) == digest(whole)
+    names = [f"{car}{piece}" for car in "123" for piece in ("", "#2", "#3", "#4")]
+    assert [track.id for track in whole.tracks] == names
+    assert whole.tracks[2].t[0] == 3600.0
+
+
+def bad_rows(place, column, value):
+    rows = w.ngsim_rows()
+    rows[place][column] = value
+    return rows
+
+
+def backwards():
+    rows = w.ngsim_rows()
+    return [*rows[:10], *rows[12:], *rows[10:12]]
+
+
+def conflicting():
+    rows = w.ngsim_rows()
+    return [*rows[:4], [*rows[3][:5], 99.0, *rows[3][6:]], *rows[4:]]
+
+
+@pytest.mark.parametrize(
+    ("rows", "line", "field"),
+    [
+        (bad_rows(4, 5, "nan"), 5, "Local_Y: 'nan'"),
+        (bad_rows(4, 11, "fast"), 5, "v_Vel: 'fast'"),
+        ([*w.ngsim_rows(), [1, 2, 3]], 41, "3 cells"),
+        ([row[:-1] for row in w.ngsim_rows()], 1, "17 cells"),
+        (backwards(), None, "id 1: t: 10 after 39"),
+        (conflicting(), 5, "id 1: met twice in one frame"),
+        ([[*r[:11], 9.9 * r[11], *r[12:]] for r in w.ngsim_rows()], None, "speed"),
+        ([[r[0], 3 * r[1], *r[2:]] for r in w.ngsim_rows()], None, "t: median step 3"),
+    ],
+)
+@pytest.mark.parametrize("writer", [w.ngsim_text, w.ngsim_csv])
+def test_malformed_rows(tmp_path, writer, rows, line, field):
+    path = writer(tmp_path / "bad.txt", rows)
+    header = writer is w.ngsim_csv
+    expected = field if line is None else f"line {line + header}: {field}"
+    with pytest.raises(InputError) as error:
+        read(path)
+    message = str(error.value)
+    assert message.startswith(str(path))
+    assert expected in message
+    assert "\n" not in message
+
+
+@pytest.mark.dataset
+def test_recorded_i80(data_dir):
+    path = data_dir / "ngsim_i80_native" / "trajectories-0400-0410.txt"
+    begin = time.process_time()
+    recording = only(path)
+    assert time.process_time() - begin < 4.0
+    raw = np.loadtxt(path)
+    assert len(recording.tracks) == 1382
+    assert sum(track.t.size for track in recording.tracks) == len(raw) == 121396
+    track = recording.tracks[0]
+    rows = raw[raw[:, 0] == float(track.id)]
+    np.testing.assert_allclose(track.x, rows[:, 5] * w.FOOT - 2.25)
+    np.testing.assert_allclose(track.speed, rows[:, 11] * w.FOOT)
+    assert [lane.id for lane in recording.lanes] == ["1", "2", "3", "4", "5", "6", "9"]
+    assert any("lateral" in note for note in recording.notes)

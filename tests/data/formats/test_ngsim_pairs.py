@@ -1,0 +1,106 @@
+"""NGSIM pairs: feet, bumpers, groups of pairs that share a car, real files."""
+
+import functools
+import time
+
+import numpy as np
+import pytest
+
+from rcirl_jax.data.importing import ImportConfig, import_logs
+from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.errors import InputError
+from tests.data.formats.fixtures import ngsim_pairs as fixture
+from tests.helpers import logs
+
+read = functools.partial(logs.read, "ngsim_pairs")
+
+FOOT = fixture.FOOT
+
+
+def test_front_bumpers_in_feet(tmp_path):
+    path = fixture.write_pair(tmp_path, "1032", "1025", "00046")
+    (recording,) = read(path)
+    follower, leader = recording.tracks
+    assert (follower.id, leader.id) == ("1032", "1025")
+    assert leader.length == pytest.approx(14.3 * FOOT)
+    assert follower.length == 4.5
+    fronts = fixture.stations()
+    np.testing.assert_allclose(follower.x + 2.25, fronts["1032"][0] * FOOT)
+    np.testing.assert_allclose(leader.speed, fronts["1025"][1] * FOOT)
+    # the spacing of the file is that between the boxes
+    gap = (leader.x - 0.5 * leader.length) - (follower.x + 0.5 * follower.length)
+    np.testing.assert_allclose(gap, (70.0 - 14.3) * FOOT)
+    np.testing.assert_allclose(leader.t, 0.1 * np.arange(250))
+    assert any("length of follower 1032 unknown" in note for note in recording.notes)
+
+
+def test_pairs_that_share_a_car_are_one_group(tmp_path):
+    for pair in (*fixture.PAIRS, ("1032", "1025", "00099")):
+        fixture.write_pair(tmp_path, *pair)
+    # another run: the same numbers are other cars
+    other = tmp_path / fixture.pair_name("1032", "1025", "1").replace(
+        "0400pm", "0515pm"
+    )
+    other.write_bytes(
+        (tmp_path / fixture.pair_name("1032", "1025", "00046")).read_bytes()
+    )
+    groups = {recording.name: recording.group for recording in read(tmp_path)}
+    assert len(groups) == 4
+    mine = {group for name, group in groups.items() if "0515pm" not in name}
+    assert len(mine) == 1
+    assert groups[other.stem] not in mine
+
+
+def test_file_of_another_name(tmp_path):
+    path = fixture.write_pair(tmp_path, "1032", "1025", "00046")
+    path = path.rename(tmp_path / "mine.csv")
+    (recording,) = read(path)
+    assert [track.id for track in recording.tracks] == ["follower", "leader"]
+    assert recording.group == "mine"
+
+
+def test_options(tmp_path):
+    path = fixture.write_pair(tmp_path, "1032", "1025", "00046")
+    source = tmp_path / "s.toml"
+    source.write_text("follower_length_m = 5.0\nwidth_m = 2.0\nspeed_limit = 30.0\n")
+    (recording,) = read(path, source)
+    assert recording.tracks[0].length == pytest.approx(5.0)
+    assert recording.tracks[0].width == 2.0
+    assert recording.lanes[0].speed_limit == 30.0
+    source.write_text('unit = "yard"\n')
+    with pytest.raises(InputError, match=r"units.unit: yard: expected one of ft, m"):
+        read(path, source)
+    source.write_text("rate_hz = 0\n")
+    with pytest.raises(InputError, match=r"source TOML: rate_hz: 0"):
+        read(path, source)
+
+
+def test_only_the_follower_is_an_expert(tmp_path):
+    """Whom the leader follows is not in the file: its scenes are dropped."""
+    path = fixture.write_pair(tmp_path, "1032", "1025", "00046")
+    (recording,) = read(path)
+    config = ImportConfig(
+        format="ngsim_pairs", collect=CollectConfig(), test_fraction=0.0
+    )
+    manifest = import_logs([recording], tmp_path / "out", config)
+    assert [name.rpartition(":")[2] for name in manifest.vehicles] == ["1032"]
+    assert manifest.quality["dropped"]["follows_missing_car"] > 0
+
+
+@pytest.mark.dataset
+def test_recorded_pairs(data_dir):
+    begin = time.process_time()
+    found = read(data_dir / "ngsim_i80_pairs")
+    seconds = time.process_time() - begin
+    assert len(found) == 123
+    assert len({recording.name for recording in found}) == 123
+    assert len({recording.group for recording in found}) == 96
+    states = sum(track.t.size for recording in found for track in recording.tracks)
+    assert states == 150756
+    assert states / seconds > 5e4
+    for recording in found:
+        follower, leader = recording.tracks
+        gap = leader.x - follower.x - 0.5 * (leader.length + follower.length)
+        assert gap.min() > 0.3
+        assert gap.max() < 100.0
+        assert 3.0 < leader.length < 22.0

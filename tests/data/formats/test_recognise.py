@@ -1,0 +1,95 @@
+"""Inputs whose format nobody says."""
+
+import importlib
+
+import pytest
+
+from rcirl_jax.data.formats import IMPORTERS, read_recordings
+from rcirl_jax.data.formats.recognise import recognised_format
+from rcirl_jax.errors import InputError
+from tests.data.formats import people
+from tests.data.formats import writers as w
+from tests.data.formats.test_conformance import MODULES, format_of
+from tests.helpers.commands import command
+
+
+@pytest.mark.parametrize("name", sorted(MODULES))
+def test_every_format_is_told_by_its_files(name, tmp_path):
+    module = importlib.import_module(f"tests.data.formats.fixtures.{name}")
+    fixture = module.write(tmp_path)
+    assert recognised_format(fixture.input) == format_of(name)
+
+
+def test_ngsim_in_both_forms(tmp_path):
+    text = w.ngsim_text(tmp_path / "a.txt", w.ngsim_rows())
+    table = w.ngsim_csv(tmp_path / "a.csv", w.ngsim_rows())
+    assert recognised_format(text) == recognised_format(table) == "ngsim"
+
+
+def test_a_table_of_ones_own_needs_a_source_or_the_usual_names(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text(people.text(people.rows()))
+    assert recognised_format(path) == "csv"
+    header = ["Zeit", *people.HEADER[1:]]
+    path.write_text(people.text(people.rows(), header, between=";"))
+    for place in (path, tmp_path):
+        with pytest.raises(InputError) as caught:
+            recognised_format(place)
+        line = str(caught.value)
+        assert line.startswith(f"{path}: --format: not given: a table of no known")
+        assert f"--suggest={path}" in line
+    source = people.spec(tmp_path)
+    assert recognised_format(path, source) == "csv"
+
+
+def test_what_is_nothing_or_several_is_one_line(tmp_path):
+    with pytest.raises(InputError, match="input: missing"):
+        recognised_format(tmp_path / "nowhere")
+    with pytest.raises(
+        InputError, match="no files of a known format: expected --format"
+    ):
+        recognised_format(tmp_path)
+    w.commonroad(tmp_path / "a.xml")
+    w.ngsim_text(tmp_path / "a.txt", w.ngsim_rows())
+    with pytest.raises(InputError, match=r"a\.xml of commonroad, a\.txt of ngsim"):
+        recognised_format(tmp_path)
+
+
+def test_an_import_says_what_it_recognised(tmp_path):
+    (tmp_path / "log").mkdir()
+    path = tmp_path / "log" / "log.csv"
+    path.write_text("a;b\n1;2\n")
+    flags = (f"--input={tmp_path / 'log'}", f"--output={tmp_path / 'out'}")
+    done = command("rcirl_jax", "import", *flags)
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"error: {path}: --format: not given: a table of no")
+    path.write_text(people.text([row[:7] for row in people.rows()], people.HEADER[:7]))
+    more = ("--keep_free_road", "--keep_steady", "--test_fraction=0")
+    done = command("rcirl_jax", "import", *flags, *more)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("--format=csv: recognised\n")
+
+
+POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:f30\nsize 129\n"
+
+
+@pytest.mark.parametrize("name", sorted(set(IMPORTERS) - {"synthetic", "l5", "nuplan"}))
+def test_git_lfs_pointers_are_called_by_their_name(name, tmp_path):
+    """In place of any of the files, whatever the format."""
+    modules = [module for module in MODULES if format_of(module) == name]
+    module = importlib.import_module(f"tests.data.formats.fixtures.{modules[0]}")
+    (tmp_path / "count").mkdir()
+    count = len(module.write(tmp_path / "count").files)
+    for place in range(count):
+        (tmp_path / str(place)).mkdir()
+        fixture = module.write(tmp_path / str(place))
+        file = fixture.files[place]
+        if file.suffix == ".json":
+            continue  # maps of Argoverse 2
+        file.write_text(POINTER)
+        with pytest.raises(InputError) as caught:
+            list(read_recordings(name, fixture.input))
+        assert str(caught.value).startswith(
+            f"{file}: Git LFS pointer: expected the data"
+        )
+        assert "git lfs pull" in str(caught.value)

@@ -1,0 +1,361 @@
+"""ROS 2 bags: conventions of messages, storages, topics, malformed files."""
+
+import functools
+import math
+
+import numpy as np
+import pytest
+
+from rcirl_jax.types import Kind
+from tests.data.formats.fixtures import ros2 as fixture
+from tests.data.formats.fixtures.drives import DURATION_S
+from tests.data.formats.fixtures.ros2 import (
+    OBJECTS,
+    ODOMETRY,
+    TRACKED,
+    ego,
+    seen,
+    times,
+    tracked_objects,
+)
+from tests.helpers import logs
+from tests.helpers.logs import refused, tracks_of
+
+read = functools.partial(logs.read, "ros2")
+PERCEPTION = "autoware_perception_msgs"
+ALONE = {"topics": {"ego": [ODOMETRY], "obstacles": []}}
+
+
+def only(path, messages=None, **options):
+    """The one recording of a bag, or of messages written into a folder."""
+    if messages is not None:
+        path = fixture.mcap(path / "a.mcap", messages)
+    (recording,) = read(path, **options) if options else read(path)
+    return recording
+
+
+def line_of(path, messages=None, **options):
+    return refused(only, path, messages, **options)
+
+
+def label(name):
+    return fixture.uuid(name).hex()
+
+
+def has_note(recording, words):
+    return any(words in note for note in recording.notes)
+
+
+def assert_as_driven(track, name):
+    """The track is that of the fixture's road user, whatever messages said it."""
+    user = fixture.road_users(track.t)[name]
+    np.testing.assert_allclose(track.x, user.x, atol=5e-3)
+    np.testing.assert_allclose(track.y, user.y, atol=5e-3)
+    np.testing.assert_allclose(track.speed, user.speed, atol=0.1)
+    turn = np.angle(np.exp(1j * (track.heading - user.heading)))
+    np.testing.assert_allclose(turn, 0.0, atol=5e-3)
+    assert track.length == pytest.approx(user.length)
+    assert track.width == pytest.approx(user.width)
+    assert track.kind == user.kind
+
+
+# --------------------------------------------------------------------- the ego
+
+
+def test_a_bag_of_two_files(tmp_path):
+    made = only(fixture.write(tmp_path).input)
+    assert (made.name, made.rate_hz, made.group) == ("drive", 10.0, None)
+    assert set(tracks_of(made)) == set(fixture.expected())
+    assert_as_driven(tracks_of(made)["ego"], "ego")
+    assert tracks_of(made)["ego"].is_human(0.0, DURATION_S)
+    assert has_note(made, "x = 81000 m, y = 50000 m")
+    assert has_note(made, "no map given")
+
+
+@pytest.mark.parametrize("frame", ["base_link", "map"])
+def test_the_frame_of_a_twist_does_not_matter(tmp_path, frame):
+    """Of a car that drives north: (8, 0) in its own frame is (0, 8) on the map."""
+
+    def north(message):
+        place = message["pose"]["pose"]
+        ahead = place["position"]["x"] - fixture.CENTRE[0]
+        place["position"] = fixture.point(*np.add(fixture.CENTRE, (0.0, ahead)))
+        place["orientation"] = fixture.turned(0.5 * math.pi)
+        message["child_frame_id"] = frame
+        speeds = (8.0, 0.0) if frame == "base_link" else (0.0, 8.0)
+        message["twist"]["twist"] = fixture.velocity(*speeds)
+
+    (track,) = only(tmp_path, ego(change=north), **ALONE).tracks
+    np.testing.assert_allclose(track.heading, 0.5 * math.pi, atol=1e-6)
+    np.testing.assert_allclose(track.speed, 8.0, atol=1e-6)
+    np.testing.assert_allclose(track.x, 0.0, atol=1e-6)
+    np.testing.assert_allclose(track.y, 8.0 * track.t, atol=1e-6)
+
+
+def test_headings_of_a_car_on_a_slope_by_quaternions_of_any_length(tmp_path):
+    """Yaw, then pitch, then roll, by matrices: where the x axis points."""
+    yaw, pitch, roll = 2.5, 0.3, -0.4
+
+    def half(angle):
+        return math.cos(0.5 * angle), math.sin(0.5 * angle)
+
+    (cy, sy), (cp, sp), (cr, sr) = half(yaw), half(pitch), half(roll)
+    q = {
+        "w": cr * cp * cy + sr * sp * sy,
+        "x": sr * cp * cy - cr * sp * sy,
+        "y": cr * sp * cy + sr * cp * sy,
+        "z": cr * cp * sy - sr * sp * cy,
+    }
+    q = {axis: 3.0 * value for axis, value in q.items()}
+
+    def turn(message):
+        message["pose"]["pose"]["orientation"] = q
+
+    (track,) = only(tmp_path, ego(change=turn), **ALONE).tracks
+    np.testing.assert_allclose(track.heading, yaw, atol=1e-9)
+
+
+def test_the_ego_by_poses_and_speeds(tmp_path):
+    """Poses without a speed: that of the topic of velocities, else of the places."""
+    poses, speeds = [], []
+    for t in times():
+        place, _ = fixture.rear_axle(t)
+        message = {"header": fixture.header(t), "pose": place}
+        poses.append(("/pose", "geometry_msgs/PoseStamped", t, message))
+        twist = {"header": fixture.header(t), "twist": fixture.velocity(3.0, 4.0)}
+        speeds.append(("/twist", "geometry_msgs/TwistStamped", t, twist))
+    topics = {"ego": "/pose", "velocity": "/twist", "obstacles": []}
+    (track,) = only(tmp_path, poses, topics=topics).tracks
+    assert_as_driven(track, "ego")
+    both = sorted([*poses, *speeds], key=lambda item: item[2])
+    (track,) = only(tmp_path, both, topics=topics).tracks
+    np.testing.assert_allclose(track.speed, 5.0)
+
+
+def test_the_ego_by_tf(tmp_path):
+    """Other transforms are passed over; frames may begin with a slash."""
+    messages = []
+    for t in times():
+        place, _ = fixture.rear_axle(t)
+        transforms = [
+            {
+                "header": fixture.header(t, frame),
+                "child_frame_id": child,
+                "transform": {
+                    "translation": place["position"],
+                    "rotation": place["orientation"],
+                },
+            }
+            for frame, child in (("/map", "base_link"), ("base_link", "camera"))
+        ]
+        messages.append(("/tf", "tf2_msgs/TFMessage", t, {"transforms": transforms}))
+    topics = {"ego": [ODOMETRY, "/tf"], "obstacles": []}
+    (track,) = only(tmp_path, messages, topics=topics).tracks
+    assert_as_driven(track, "ego")
+    frames = {"map": "map", "base": "rear_axle"}
+    line = line_of(tmp_path / "a.mcap", topics=topics, frames=frames)
+    assert "a.mcap: ego: no message says where rear_axle is in map: expected" in line
+
+
+def test_who_drives(tmp_path):
+    """Manual for a second, then not, then silent."""
+    kind = "autoware_vehicle_msgs/ControlModeReport"
+    messages = [
+        (fixture.MODE, kind, t, fixture.control_mode(t, mode=4 if t < 1.0 else 1))
+        for t in times(2.0)
+    ]
+    topics = {**ALONE["topics"], "driver": fixture.MODE}
+    both = sorted([*ego(6.0), *messages], key=lambda item: item[2])
+    made = only(tmp_path, both, topics=topics)
+    (track,) = made.tracks
+    assert track.automated == (pytest.approx((1.0, math.inf), abs=1e-6),)
+    assert has_note(made, "51% of the time not driven by hand")
+    (track,) = only(tmp_path, ego(), **ALONE, recording_car="automated").tracks
+    assert track.automated == ((-math.inf, math.inf),)
+
+
+# ------------------------------------------------------------------- obstacles
+
+
+def test_the_older_package_and_predicted_objects(tmp_path):
+    auto = TRACKED.replace("autoware_p", "autoware_auto_p")
+    messages = seen(tracked_objects(), auto)
+    assert_as_driven(tracks_of(only(tmp_path, [*ego(), *messages]))[label("12")], "12")
+
+    def predicted(found, user):
+        how = found["kinematics"]
+        found["kinematics"] = {
+            "initial_pose_with_covariance": how["pose_with_covariance"],
+            "initial_twist_with_covariance": how["twist_with_covariance"],
+            "predicted_paths": [{"path": [fixture.pose(1.0, 2.0, 0.0)] * 3}],
+        }
+
+    messages = seen(tracked_objects(predicted), f"{PERCEPTION}/PredictedObjects")
+    assert_as_driven(tracks_of(only(tmp_path, [*ego(), *messages]))[label("12")], "12")
+
+
+def shaped(shape):
+    def change(found, user):
+        found["shape"] = shape
+
+    return change
+
+
+def corners(*points):
+    return {"points": [fixture.point(x, y) for x, y in points]}
+
+
+def test_shapes(tmp_path):
+    """A cylinder's diameter, a polygon's box about its own middle, none measured."""
+    size = {"x": 0.7, "y": 0.0, "z": 1.0}
+    messages = seen(tracked_objects(shaped({"type": 1, "dimensions": size})))
+    track = tracks_of(only(tmp_path, [*ego(), *messages]))[label("12")]
+    assert (track.length, track.width) == pytest.approx((0.7, 0.7))
+    outline = corners((-1.0, -1.0), (5.0, -1.0), (5.0, 1.0), (2.0, 2.0), (-1.0, 1.0))
+    polygon = {"type": 2, "footprint": outline, "dimensions": {"z": 1.0}}
+    # 15 turns left: its box is 2 m ahead and 0.5 m to the left of its place
+    messages = seen(tracked_objects(shaped(polygon), names=["15"]))
+    track = tracks_of(only(tmp_path, [*ego(), *messages]))[label("15")]
+    assert (track.length, track.width) == pytest.approx((6.0, 3.0))
+    user = fixture.road_users(track.t)["15"]
+    cos, sin = np.cos(user.heading), np.sin(user.heading)
+    np.testing.assert_allclose(track.x, user.x + 2.0 * cos - 0.5 * sin, atol=5e-3)
+    np.testing.assert_allclose(track.y, user.y + 2.0 * sin + 0.5 * cos, atol=5e-3)
+    messages = seen(tracked_objects(shaped({"type": 0}), names=["27"]))
+    track = tracks_of(only(tmp_path, [*ego(), *messages]))[label("27")]
+    assert (track.length, track.width) == pytest.approx((1.8, 0.6))
+
+
+@pytest.mark.parametrize("availability", [0, 1])
+def test_headings_that_are_not_known(tmp_path, availability):
+    """None: the direction of travel. No sign: the twist says which end is ahead."""
+
+    def change(found, user):
+        how = found["kinematics"]
+        how["orientation_availability"] = availability
+        heading = user.heading[0] + math.pi if availability else 1.0
+        place = how["pose_with_covariance"]["pose"]
+        place["orientation"] = fixture.turned(heading)
+        how["twist_with_covariance"] = {"twist": fixture.velocity(-user.speed[0], 0.0)}
+
+    messages = seen(tracked_objects(change, names=["23"]))
+    track = tracks_of(only(tmp_path, [*ego(), *messages]))[label("23")]
+    assert_as_driven(track, "23")
+
+
+@pytest.mark.parametrize(
+    ("number", "kind"),
+    [
+        *(
+            (2, Kind.VEHICLE),
+            (5, Kind.VEHICLE),
+            (6, Kind.CYCLIST),
+            (8, Kind.PEDESTRIAN),
+        ),
+        *((9, Kind.STATIC), (0, Kind.VEHICLE), (10, None), (99, Kind.VEHICLE)),
+    ],
+)
+def test_classes_of_autoware(tmp_path, number, kind):
+    """Unknown ones move here; what may be driven over is no obstacle."""
+
+    def change(found, user):
+        found["classification"] = [{"label": number, "probability": 0.9}]
+
+    made = only(tmp_path, [*ego(), *seen(tracked_objects(change))])
+    found = tracks_of(made).get(label("12"))
+    assert (found and found.kind) == kind
+    note = "41 states of what is driven over or under left out"
+    assert has_note(made, note) == (found is None)
+
+
+def carla(t):
+    """An ObjectArray as CARLA's bridge sends it: twists on the map, itself as well."""
+    found = []
+    for name, number in (("15", 6), ("23", 4), ("31", 11), ("ego", 6)):
+        user = fixture.road_users(np.array([t]))[name]
+        x, y, heading = fixture.at(user)
+        speed = float(user.speed[0])
+        shape = {"type": 1, "dimensions": [user.length, user.width, 1.5]}
+        if name == "23":  # a cylinder: height, radius
+            shape = {"type": 3, "dimensions": [1.8, 0.3]}
+        twist = fixture.velocity(speed * math.cos(heading), speed * math.sin(heading))
+        found.append(
+            {
+                "header": fixture.header(t),
+                "id": 200 if name == "ego" else int(name),
+                "pose": fixture.pose(x, y, heading),
+                "twist": twist,
+                "shape": shape,
+                "classification": number,
+            }
+        )
+    return {"header": fixture.header(t), "objects": found}
+
+
+def test_derived_objects(tmp_path):
+    messages = seen(carla, "derived_object_msgs/ObjectArray")
+    made = only(tmp_path, [*ego(), *messages], ego_id="200")
+    assert set(tracks_of(made)) == {"ego", "15", "23", "31"}
+    for name in ("15", "23", "31"):
+        assert_as_driven(tracks_of(made)[name], name)
+    assert "200" in tracks_of(only(tmp_path / "a.mcap"))
+
+
+def detections(t, *, named="car", name="15", frame="map"):
+    """Tracked detections, which have no speed, on the map or as the ego sees them."""
+    user = fixture.road_users(np.array([t]))["15"]
+    place = fixture.pose(*fixture.at(user))
+    if frame == "base_link":
+        ego = fixture.road_users(np.array([t]))["ego"]
+        ahead = user.x[0] - ego.x[0] + fixture.AHEAD
+        place = fixture.pose(ahead, user.y[0] - ego.y[0], float(user.heading[0]))
+    results = [
+        {"hypothesis": {"class_id": "bicycle", "score": 0.1}},
+        {"hypothesis": {"class_id": named, "score": 0.8}},
+    ]
+    size = {"x": user.length, "y": user.width, "z": 1.5}
+    box = {"center": place, "size": size}
+    found = [{"results": results, "bbox": box, "id": name}]
+    return {"header": fixture.header(t, frame), "detections": found}
+
+
+@pytest.mark.parametrize("frame", ["map", "base_link"])
+def test_detections_of_vision(tmp_path, frame):
+    kind = "vision_msgs/Detection3DArray"
+    messages = seen(functools.partial(detections, frame=frame), kind)
+    made = only(tmp_path, [*ego(), *messages])
+    assert_as_driven(tracks_of(made)["15"], "15")
+
+
+def test_detections_seen_by_an_ego_that_turned(tmp_path):
+    """The ego at (10, 20) looks north: 30 m ahead, 5 m to the left is (5, 50)."""
+
+    def stand(message):
+        place = fixture.pose(*np.add(fixture.CENTRE, (10.0, 20.0)), 0.5 * math.pi)
+        message["pose"]["pose"] = place
+        message["twist"]["twist"] = fixture.velocity(0.0, 0.0)
+
+    def make(t):
+        message = detections(t, frame="base_link")
+        message["detections"][0]["bbox"]["center"] = fixture.pose(30.0, 5.0, 0.25)
+        return message
+
+    # the last second has no ego
+    messages = seen(make, "vision_msgs/Detection3DArray", 3.0)
+    made = only(tmp_path, [*ego(change=stand), *messages])
+    track = tracks_of(made)["15"]
+    np.testing.assert_allclose(track.x, 5.0, atol=1e-6)
+    np.testing.assert_allclose(track.y, 50.0, atol=1e-6)
+    np.testing.assert_allclose(track.heading, 0.5 * math.pi + 0.25, atol=1e-6)
+    assert has_note(made, "9 obstacle states left out, while the ego's place was")
+
+
+def test_detections_without_an_id_or_of_an_unknown_class(tmp_path):
+    kind = "vision_msgs/Detection3DArray"
+    where = f"{tmp_path / 'a.mcap'}: {OBJECTS}: message 0: detections[0]"
+    messages = seen(functools.partial(detections, name=""), kind)
+    line = line_of(tmp_path, [*ego(), *messages])
+    assert line.startswith(f"{where}.id: '': expected one that stays with a road user")
+    messages = seen(functools.partial(detections, named="zebra"), kind)
+    line = line_of(tmp_path, [*ego(), *messages])
+    assert line.startswith(f"{where}: object_type: zebra: expected one of car, truck")

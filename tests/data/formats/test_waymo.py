@@ -1,0 +1,338 @@
+"""Waymo scenarios: what messages say, limits, framing, hostile records."""
+
+import functools
+import gzip
+import struct
+
+import numpy as np
+import pytest
+
+from rcirl_jax.data.formats import shapes
+from rcirl_jax.data.readers.tfrecord import read_records
+from rcirl_jax.types import Kind
+from tests.data.formats.fixtures import waymo as w
+from tests.data.formats.fixtures.drives import straight
+from tests.helpers import logs
+from tests.helpers.logs import lanes_of, refused
+
+read = functools.partial(logs.read, "waymo")
+only = functools.partial(logs.only, "waymo")
+
+
+def put(folder, *records, name="a.tfrecord"):
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / name
+    path.write_bytes(w.tfrecord(records))
+    return path
+
+
+def scenario(folder, options=None, **changes):
+    """The recording of one scenario with some fields replaced."""
+    return only(put(folder, w.scenario(**changes)), **(options or {}))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The recording of the fixture."""
+    return only(w.write(tmp_path_factory.mktemp("waymo")).input)
+
+
+# --------------------------------------------------------------------- tracks
+
+
+def test_invalid_states_may_hold_anything(tmp_path):
+    """Published invalid states are empty or zero; their values never count."""
+    user = w.road_users()[2325][1]
+    bad = [{"center_x": float("nan"), "center_y": 1e300, "length": -1.0}, {}]
+    states = [
+        w.state(user, row) if 12 <= row < 60 else bad[row % 2]
+        for row in range(w.NUM_STEPS)
+    ]
+    tracks = [{"id": 7, "object_type": 1, "states": states}]
+    (track,) = scenario(tmp_path, tracks=tracks).tracks
+    np.testing.assert_array_equal(track.x, user.x[12:60])
+    assert track.length == pytest.approx(4.5)
+
+
+def test_kinds_and_what_is_left_out(tmp_path):
+    user = straight(w.T, (w.EAST, w.NORTH), 0.0, 3.0)
+    tracks = [w.track(key, key, user, range(91)) for key in range(5)]
+    tracks += [w.track(6, 1, user, []), w.track(7, 0, user, range(91))]
+    recording = scenario(tmp_path, tracks=tracks)
+    # 4 moves, but is nobody to learn from
+    kinds = (Kind.VEHICLE, Kind.PEDESTRIAN, Kind.CYCLIST, Kind.CYCLIST)
+    assert {track.id: track.kind for track in recording.tracks} == dict(
+        zip("1234", kinds, strict=True)
+    )
+    assert "2 tracks of unset type left out" in recording.notes
+    assert "1 tracks without a valid state left out" in recording.notes
+
+
+def car_with(rows=range(w.NUM_STEPS), key=7, user=None, **changes):
+    """A track with some fields of some states replaced."""
+    user = w.road_users()[2314][1] if user is None else user
+    track = w.track(key, 1, user, range(w.NUM_STEPS))
+    for row in rows:
+        track["states"][row] |= changes
+    return track
+
+
+def test_sizes_are_medians_and_small_ones_are_raised(tmp_path):
+    long = car_with(range(60, 91), length=9.0, width=0.15)
+    user = straight(w.T, (w.EAST, w.NORTH), 0.0, 1.0, size=(4.0, 0.15))
+    (one, other) = scenario(tmp_path, tracks=[long, car_with(key=8, user=user)]).tracks
+    assert (one.length, one.width) == (pytest.approx(4.5), pytest.approx(1.9))
+    assert (other.length, other.width) == (4.0, 0.2)
+
+
+@pytest.mark.parametrize(
+    ("change", "rows", "wrong"),
+    [
+        ({"width": 6.4}, range(91), "width: 6.4 m"),
+        ({"velocity_x": 95.0}, [40], "speed"),
+    ],
+)
+def test_up_to_a_tenth_of_the_tracks_may_be_impossible(tmp_path, change, rows, wrong):
+    """As from other trackers; more of them point at a wrong file."""
+
+    def traffic(cars, outliers):
+        """Cars side by side of which the first ones are outliers."""
+        users = [
+            straight(w.T, (w.EAST, w.NORTH + 4.0 * car), 0.0, 8.0)
+            for car in range(cars)
+        ]
+        return [
+            car_with(rows if car < outliers else (), 100 + car, user, **change)
+            for car, user in enumerate(users)
+        ]
+
+    few = scenario(tmp_path, tracks=traffic(20, 2))
+    assert [track.id for track in few.tracks] == [str(102 + k) for k in range(18)]
+    assert "2 tracks with an impossible size or speed left out" in few.notes
+    # one of few is no wrong file
+    assert len(scenario(tmp_path, tracks=traffic(5, 1)).tracks) == 4
+    many = refused(scenario, tmp_path, tracks=traffic(20, 3))
+    assert f"record 0: track 100: {wrong}" in many
+
+
+def test_far_coordinates_get_a_local_origin(whole, tmp_path, monkeypatch):
+    monkeypatch.setattr(w, "EAST", w.EAST + 50_000.0)
+    far = only(w.write(tmp_path).input)
+    assert "local origin at x = 58000 m, y = -3000 m" in far.notes
+    shift = np.array([-8000.0, 3000.0])
+    for a, b in zip(whole.tracks, far.tracks, strict=True):
+        np.testing.assert_allclose(a.x + shift[0], b.x, atol=1e-6)
+        np.testing.assert_allclose(a.y + shift[1], b.y, atol=1e-6)
+    for a, b in zip(whole.lanes, far.lanes, strict=True):
+        np.testing.assert_allclose(a.centre + shift, b.centre, atol=1e-6)
+        np.testing.assert_allclose(a.left_width, b.left_width, atol=1e-6)
+        if a.stop_line is not None:
+            np.testing.assert_allclose(a.stop_line + shift, b.stop_line, atol=1e-6)
+
+
+# ------------------------------------------------------------------------ map
+
+
+def test_lanes(whole):
+    lanes = lanes_of(whole)
+    assert set(lanes) == {"101", "102", "103", "104"}
+    south, north = lanes["101"], lanes["102"]
+    assert (south.left, south.right, south.successors) == ("102", None, ("103",))
+    assert (north.left, north.right, north.successors) == (None, "101", ("104",))
+    np.testing.assert_array_equal(south.centre, w.eastward(0.0, -60.0, 40.0))
+    assert south.speed_limit == pytest.approx(25 * w.MPH)
+    assert lanes["103"].speed_limit == pytest.approx(35 * w.MPH)
+    assert whole.default_speed_limit == pytest.approx(25 * w.MPH)
+    assert any("1 lanes not of type" in note for note in whole.notes)
+    assert any("1 lanes of one point" in note for note in whole.notes)
+
+
+def test_widths_come_from_lines_and_edges(whole, tmp_path):
+    lanes = lanes_of(whole)
+    np.testing.assert_allclose(lanes["101"].left_width, w.WIDTH / 2)
+    np.testing.assert_allclose(lanes["101"].right_width, 2.0)
+    np.testing.assert_allclose(lanes["102"].right_width, w.WIDTH / 2)
+    # no boundary is given
+    np.testing.assert_allclose(lanes["102"].left_width, 1.75)
+    lanes = lanes_of(scenario(tmp_path, {"lane_width_m": 3.0}))
+    np.testing.assert_allclose(lanes["102"].left_width, 1.5)
+
+
+def test_boundaries_of_a_part_far_ones_and_unknown_ones(tmp_path):
+    left = [
+        w.boundary(20, 40, 901),  # a part: held beyond it
+        w.boundary(-5, 10**6, 999),  # no such line
+    ]
+    right = [
+        w.boundary(0, 100, 902),  # too far away to bound the lane
+        w.boundary(90, 10, 901),  # ends before it starts
+    ]
+    sides = {"left_boundaries": left, "right_boundaries": right}
+    features = [
+        w.lane(1, w.eastward(0.0, 0.0, 50.0), **sides),
+        w.line(901, w.eastward(2.2, -10.0, 60.0, 70.0)),
+        w.line(902, w.eastward(-30.0, -10.0, 60.0), "road_edge"),
+        w.line(903, [(w.EAST, w.NORTH)]),
+        w.line(904, []),
+    ]
+    lane = lanes_of(scenario(tmp_path, map_features=features))["1"]
+    np.testing.assert_allclose(lane.left_width, 2.2)
+    np.testing.assert_allclose(lane.right_width, 1.75)
+
+
+def test_distances_from_a_bent_line_and_from_a_point(monkeypatch):
+    monkeypatch.setattr(shapes, "CHUNK", 4)
+    bent = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 5.0]]) + 4e6
+    points = np.array([[5.0, 2.0], [-3.0, 4.0], [12.0, 9.0], [10.0, 3.0]] * 2) + 4e6
+    lines, which = [bent, bent[:1]], np.repeat([0, 1], 4)
+    away = shapes.distances_to_lines(points, lines, which)
+    expected = [2.0, 5.0, 20**0.5, 0.0, 29**0.5, 5.0, 15.0, 109**0.5]
+    np.testing.assert_allclose(away, expected, atol=1e-9)
+
+
+def test_exits_entries_and_the_longest_neighbour(tmp_path):
+    rows = [w.eastward(0.0, 40.0 * k, 40.0 * k + 40.0) for k in range(3)]
+    beside = [w.neighbour(3, 0, 9), w.neighbour(2, 10, 60)]
+    doubled = [row for row in rows[0] for _ in (0, 1)]
+    features = [
+        w.lane(1, doubled, exit_lanes=[2], right_neighbors=beside),
+        w.lane(2, rows[1]),
+        w.lane(3, rows[2], entry_lanes=[2, 77]),
+    ]
+    lanes = lanes_of(scenario(tmp_path, map_features=features))
+    assert [lanes[key].successors for key in "123"] == [("2",), ("3",), ()]
+    assert lanes["1"].right == "2"
+    assert len(lanes["1"].centre) == len(lanes["1"].left_width) == 81
+
+
+def test_no_map_and_no_limits(tmp_path):
+    recording = scenario(tmp_path, map_features=[], dynamic_map_states=[])
+    assert (recording.lanes, recording.signals) == ((), ())
+    assert recording.default_speed_limit == 15.65
+    lane = w.lane(1, w.eastward(0.0, 0.0, 50.0), speed_limit_mph=0.0)
+    # without an id it is named by its place
+    recording = scenario(tmp_path, map_features=[lane], scenario_id=None)
+    assert recording.name == "a.tfrecord-0"
+    assert recording.lanes[0].speed_limit is None
+
+
+# -------------------------------------------------------------------- signals
+
+
+def test_signal_intervals_and_stop_lines(whole):
+    (signal,) = whole.signals
+    assert (signal.id, signal.is_recorded) == ("103", True)
+    # unseen first; half a second without a state between red and red is red
+    assert signal.state == ("off", "red", "green")
+    np.testing.assert_allclose(signal.start, [0.0, 0.3, 5.0], atol=1e-3)
+    lanes = lanes_of(whole)
+    assert (lanes["103"].signal_ids, lanes["103"].stop_sign) == (("103",), False)
+    line = lanes["103"].stop_line - [w.EAST, w.NORTH]
+    np.testing.assert_allclose(line, [[40.0, 1.75], [40.0, -1.75]], atol=1e-6)
+    assert (lanes["101"].stop_line, lanes["101"].signal_ids) == (None, ())
+    # the sign stands beside the start of the turn
+    assert lanes["104"].stop_sign
+    middle = lanes["104"].stop_line.mean(axis=0) - [w.EAST + 40.0, w.NORTH + w.WIDTH]
+    assert np.hypot(*middle) < 0.1
+
+
+def shown(folder, states, **options):
+    """A scenario whose step k shows states[k] on lane 103 (None: nothing)."""
+    rows = [{} if state is None else w.shown(state) for state in states]
+    return scenario(folder, options, dynamic_map_states=rows)
+
+
+COLOURS = ["off", *2 * ["red", "yellow", "green"], "off", "off"]
+
+
+@pytest.mark.parametrize(("state", "colour"), [*enumerate(COLOURS)])
+def test_every_state(tmp_path, state, colour):
+    recording = shown(tmp_path, [state] * 91)
+    assert recording.signals[0].state == (colour,)
+    lane = lanes_of(recording)["103"]
+    # flashing red is a stop sign in effect
+    assert lane.stop_sign == (state == 7)
+    assert lane.stop_line is None  # no stop point was given
+
+
+def test_short_gaps_between_equal_colours(tmp_path):
+    states = [4] * 20 + [0] * 10 + [4] * 10 + [None] * 30 + [4] * 10 + [0] * 5 + [6] * 6
+    (signal,) = shown(tmp_path, states).signals
+    assert signal.state == ("red", "off", "red", "off", "green")
+    np.testing.assert_allclose(signal.start, [0.0, 4.0, 7.0, 8.0, 8.5], atol=1e-3)
+    (signal,) = shown(tmp_path, states, signal_gap_s=0.0).signals
+    assert signal.state[:3] == ("red", "off", "red")
+
+
+# -------------------------------------------------------------------- framing
+
+
+def test_records_are_read_one_by_one_up_to_a_limit(tmp_path):
+    path = put(tmp_path, b"one", b"", b"three" * 1000)
+    assert list(read_records(path)) == [b"one", b"", b"three" * 1000]
+    assert "record 2: length: 5000 bytes" in refused(list, read_records(path, 4999))
+    header = struct.pack("<Q", 2**62)
+    path.write_bytes(header + w.masked_crc(header) + b"x" * 100)
+    assert "record 0: length: 4611686018427387904 bytes" in refused(read, path)
+    path = put(tmp_path, w.scenario())
+    assert "expected at most 10485" in refused(read, path, max_record_mib=0.01)
+    path.write_bytes(gzip.compress(path.read_bytes()))
+    assert "gzip data: expected an uncompressed TFRecord file" in refused(read, path)
+
+
+def test_other_messages_are_refused(tmp_path):
+    """Of tf_example files, and of lidar_and_camera files: an id and laser data."""
+    example = w.classes({"tf": "Feature: key 1 string\nExample: features 1 .Feature*"})
+    feature = w.written(example.Example, features=[{"key": "scenario/id"}])
+    sensors = w.written(w.MESSAGES.Scenario, scenario_id="id", lidar=[bytes(900)])
+    for data in (feature, b"", sensors):
+        line = refused(read, put(tmp_path, data))
+        assert "expected Scenario messages" in line
+        assert "not tf_example/ or lidar_and_camera/" in line
+
+
+WIDE = [w.boundary(-(2**31), 2**31 - 1, 9)] * 50
+ROAD = [w.lane(1, w.eastward(0, 0, 50), left_boundaries=WIDE)]
+TWO = [w.shown(4)] * 91
+TWO = [{"lane_states": [*row["lane_states"], {"lane": 106, "state": 4}]} for row in TWO]
+LIMITS = [
+    ("reader.MAX_STATES", 545, {}, "tracks: 6 of 91 states: expected at most 545"),
+    ("map.MAX_POINTS", 1000, {"map_features": ROAD}, "left_boundaries: "),
+    ("map.MAX_COLOURS", 181, {"dynamic_map_states": TWO}, "2 lanes over 91 steps"),
+]
+
+
+@pytest.mark.parametrize(("name", "most", "changes", "words"), LIMITS)
+def test_limits(tmp_path, monkeypatch, name, most, changes, words):
+    monkeypatch.setattr(f"rcirl_jax.data.formats.waymo.{name}", most)
+    assert words in refused(scenario, tmp_path, **changes)
+    monkeypatch.setattr(f"rcirl_jax.data.formats.waymo.{name}", most * 50)
+    assert scenario(tmp_path, **changes).tracks
+
+
+def test_history_only_as_in_the_testing_files(tmp_path):
+    """11 states, and dynamic map states of the same steps; late stamps."""
+    user = straight(w.T[:11], (w.EAST, w.NORTH), 0.0, 5.0)
+    recording = scenario(
+        tmp_path,
+        timestamps_seconds=w.STAMPS[:11] + 1e9,
+        tracks=[w.track(1, 1, user, range(11))],
+        dynamic_map_states=[w.signal_states(30)] * 11,
+    )
+    np.testing.assert_allclose(recording.tracks[0].t, w.T[:11], atol=1e-4)
+    assert not any("windows" in note for note in recording.notes)
+
+
+def test_notes_on_the_recording_car_and_shared_vehicles(whole):
+    assert (whole.name, whole.group, whole.rate_hz) == (w.SCENARIO, w.SCENARIO, 10.0)
+    assert "the recording car is track 2314" in whole.notes
+    assert {track.id for track in whole.tracks if track.automated} == {"2314"}
+    assert any("training_20s" in note for note in whole.notes)
+
+
+def test_two_heads_of_one_lane_and_a_lane_that_is_not_read(tmp_path):
+    """The first known one counts."""
+    row = w.shown(0, 3, 4)
+    row["lane_states"].append({"lane": 106, "state": 4, "stop_point": w.point(0, 0)})
+    signals = scenario(tmp_path, dynamic_map_states=[row] * 91).signals
+    assert {s.id: s.state for s in signals} == {"103": ("green",), "106": ("red",)}
