@@ -30,7 +30,7 @@ from rcirl_jax.simulation.catalogue.build import family_names
 from rcirl_jax.simulation.rollout import RolloutConfig, drive_cases
 from rcirl_jax.simulation.rows import baseline_row
 from rcirl_jax.simulation.suite import CaseRef, build, case_ref, catalogue_set
-from rcirl_jax.simulators.drivers import Driver, Seen
+from rcirl_jax.simulators.drive import Driver, Seen
 from rcirl_jax.simulators.simulators import View, open_simulator
 from rcirl_jax.types import Scene
 from rcirl_jax.units import TIMES_S

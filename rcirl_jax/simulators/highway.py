@@ -18,8 +18,14 @@ from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.kinematics import Vehicle
 
 from rcirl_jax.export.own_planner.inputs import Body, Car
-from rcirl_jax.simulators.simulators import STEP_S, LockStep, Move, View
-from rcirl_jax.simulators.way import Way
+from rcirl_jax.simulators.simulators import (
+    STEP_S,
+    LockStep,
+    Move,
+    View,
+    Way,
+    drawn_names,
+)
 
 # kind: environment, what differs from its own configuration, x m where it ends
 KINDS = {
@@ -45,14 +51,15 @@ class Planned(Vehicle):
     """The ego: where a move puts it."""
 
     def act(self, action: object = None) -> None:
-        """Nothing: `put` says it all."""
+        """Do nothing: `put` moves the ego."""
 
     def step(self, dt: float) -> None:
-        """Nothing either."""
+        """Do nothing."""
 
-    def put(self, position: np.ndarray, heading: float, move: Move) -> None:
-        """Where the ego is after a move."""
-        self.position, self.heading, self.speed = position, heading, move.speed
+    def put(self, x: float, y: float, heading: float, move: Move) -> None:
+        """Set where the ego is after a move."""
+        self.position = np.array([x, y])
+        self.heading, self.speed = heading, move.speed
         self.action = {"acceleration": move.acceleration, "steering": 0.0}
         self.on_state_update()
 
@@ -65,9 +72,8 @@ class HighwayEnv:
     together = 25
 
     def episodes(self, count: int, seed: int) -> list[str]:
-        """KIND/SEED/NUMBER, kinds in turn."""
-        kinds = list(KINDS)
-        return [f"{kinds[n % len(kinds)]}/{seed}/{n:04d}" for n in range(count)]
+        """Return KIND/SEED/NUMBER, the kinds in turn."""
+        return drawn_names(list(KINDS), count, seed)
 
     def start(self, episodes: Sequence[str], own: str | None) -> LockStep:
         """Separate environments, stepped one after the other."""
@@ -87,22 +93,21 @@ class HighwayEpisode:
         self._ways: dict[tuple, Way] = {}
         self.ego = self._take_over(own)
         self._lane, self._driven = self.ego.lane_index, 0.0
-        self._station = self.way().station(*self.ego.position)
+        self._station, _ = self.way().project(*self.ego.position)
 
     def _take_over(self, own: str | None) -> Any:  # noqa: ANN401
         """Put our ego, or an IDMVehicle, in the place of the environment's."""
         theirs = self.env.vehicle
         kind: Any = Planned if own is None else IDMVehicle
         ego = kind(self.road, theirs.position, theirs.heading, theirs.speed)
-        if isinstance(ego, IDMVehicle):
+        if own is not None:
             ego.enable_lane_change = own == CHANGES
-            lane: Any = ego.lane
-            ego.target_speed = float(lane.speed_limit)
+            ego.target_speed = float(ego.lane.speed_limit)
         self.road.vehicles[self.road.vehicles.index(theirs)] = ego
         return ego
 
     def way(self) -> Way:
-        """The way along the ego's lane and those that follow it."""
+        """Return the way along the ego's lane and those that follow it."""
         if self._lane not in self._ways:
             lane = self.road.network.get_lane(self._lane)
             self._ways[self._lane] = Way(
@@ -111,30 +116,21 @@ class HighwayEpisode:
         return self._ways[self._lane]
 
     def _points(self, index: tuple) -> np.ndarray:
-        """Points of a lane and of those that follow it, straight beyond the last."""
+        """Return points of a lane and of its followers, straight beyond the last."""
         network, points = self.road.network, []
         lane = network.get_lane(index)
         s = max(lane.local_coordinates(self.ego.position)[0] - BEHIND_M, 0.0)
         for _ in range(int((BEHIND_M + AHEAD_M) / POINT_STEP_M)):
-            if s > lane.length and (after := self._after(index)) is not None:
-                s, index = s - lane.length, after
+            if s > lane.length and index[1] in network.graph:
+                end = lane.position(lane.length - LANE_END_M, 0.0)
+                s, index = s - lane.length, network.next_lane(index, position=end)
                 lane = network.get_lane(index)
             points.append(lane.position(s, 0.0))
             s += POINT_STEP_M
         return np.array(points)
 
-    def _after(self, index: tuple) -> tuple | None:
-        """The lane that goes on from the end of another, None at the road's end."""
-        network = self.road.network
-        if index[1] not in network.graph:
-            return None
-        end = network.get_lane(index).position(
-            network.get_lane(index).length - LANE_END_M, 0.0
-        )
-        return network.next_lane(index, route=None, position=end)
-
     def look(self) -> View | None:
-        """What is seen; None beyond the place where the kind ends."""
+        """Return what is seen; None beyond the place where the kind ends."""
         ego, way = self.ego, self.way()
         if ego.position[0] > self._end:
             return None
@@ -162,29 +158,27 @@ class HighwayEpisode:
         )
 
     def step(self, move: Move | None) -> None:
-        """0.1 s on; the ego along its line, or as its own driver drives."""
+        """Advance 0.1 s, the ego along its line or as its own driver drives."""
         before = np.array(self.ego.position)
         if move is not None:
-            self._go_on(move)
+            self._station += move.way
+            x, y, heading, _ = self.way().place(self._station)
+            self.ego.put(x, y, heading, move)
         self.road.act()
         self.road.step(STEP_S)
-        self._lane = self.ego.lane_index if move is None else self._lane
-        gone = math.hypot(*(self.ego.position - before))
-        self._driven += move.way if move is not None else gone
-
-    def _go_on(self, move: Move) -> None:
-        """Put the ego a way farther on its line."""
-        self._station += move.way
-        x, y, heading, _ = self.way().place(self._station)
-        self.ego.put(np.array([x, y]), heading, move)
+        if move is not None:
+            self._driven += move.way
+        else:
+            self._lane = self.ego.lane_index
+            self._driven += math.hypot(*(self.ego.position - before))
 
     def close(self) -> None:
-        """Nothing runs on."""
+        """Close the environment."""
         self.env.close()
 
 
 def _body(other: Vehicle) -> Body:
-    """A vehicle or a standing object of the road."""
+    """Return a vehicle or a standing object of the road."""
     moves = isinstance(other, Vehicle)
     action = getattr(other, "action", None) or {}
     return Body(

@@ -1,13 +1,12 @@
-"""What a drive elsewhere was like, by the measures of our own closed loop.
+"""Numbers of a drive elsewhere, by the measures of the package's own closed loop.
 
 Speeds and accelerations are those that the simulator shows, so that its own drivers
-are measured as ours are.
+are measured as ours are. Nobody looks elsewhere at what is not logged: it is 0.
 """
 
 import dataclasses
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +20,12 @@ from rcirl_jax.simulation.world.judge import STOPPED_EGO_MPS
 from rcirl_jax.simulators.simulators import STEP_S, View
 
 LENGTHS = 100  # steps: records are filled up to a multiple, so that few compile
+EpisodeLog = dict[str, np.ndarray]  # [S] by leaf of `simulation.cases.Record`
+# leaves after a drive's end and where nobody logs them; the others are 0
+FAR = dict.fromkeys(("clearance", "ttc", "headway", "free_way"), math.inf)
+REST = {"speed_limit": 1.0, **FAR}
+COUNTS = ("collision", "at_fault", "at_fault_vru", "at_fault_object")  # int32
+MARKS = ("valid", "ttc_counts", "red_light", "stop_sign", "fallback")  # bool
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -29,70 +34,15 @@ class Contact:
 
     at_fault: bool
     relative_speed: float  # m/s
-    vulnerable: bool  # a pedestrian or a cyclist
-    standing_object: bool
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Sample:
-    """One step of one drive: what was ahead before it, what it came to."""
-
-    view: View  # before the step
-    way: float  # m driven since the start, after the step
-    speed: float  # m/s after the step
-    passed_red: int  # stop lines passed against red in this step
-    hit: Contact | None  # after the step
-    gap: float  # m to the rear of the body ahead, before the step; inf
-    gap_speed: float  # m/s, its speed along the road
-    line: float  # m to a line ahead that demands a stop; inf
-    fallback: bool  # no plan was admissible
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Drive:
-    """One episode driven by somebody; arrays [S]."""
-
-    episode: str
-    way: np.ndarray  # m
-    v: np.ndarray  # m/s
-    a: np.ndarray  # m/s^2, of the speed shown
-    curvature: np.ndarray  # 1/m
-    speed_limit: np.ndarray  # m/s
-    gap: np.ndarray  # m
-    gap_speed: np.ndarray  # m/s
-    line: np.ndarray  # m
-    passed_red: np.ndarray  # int
-    fallback: np.ndarray  # bool
-    contact: Contact | None  # that ended it
-
-    @classmethod
-    def of(cls, episode: str, log: Sequence[Sample]) -> "Drive":
-        """From the samples of an episode."""
-        get = lambda name: np.array([getattr(x, name) for x in log])  # noqa: E731
-        v = get("speed")
-        begin = np.array([x.view.ego.speed for x in log])
-        return cls(
-            episode=episode,
-            way=get("way"),
-            v=v,
-            a=(v - begin) / STEP_S,
-            curvature=np.array([x.view.ego.curvature for x in log]),
-            speed_limit=np.array([x.view.speed_limit for x in log]),
-            gap=get("gap"),
-            gap_speed=get("gap_speed"),
-            line=get("line"),
-            passed_red=get("passed_red"),
-            fallback=get("fallback"),
-            contact=log[-1].hit if log else None,
-        )
+    body: Body
 
 
 def contact(view: View) -> Contact | None:
-    """The body that the ego's box touches; the ego's fault where there are several.
+    """Return the contact of the ego's box; the ego's fault where there are several.
 
-    As in our simulator, after nuPlan: who stands is not at fault; who moves is, if what
-    it hits reaches beyond its front bumper from no farther back than its rear axle, or
-    stands. A body beside or behind it that drives into it is not its fault.
+    As in the package's own simulator, after nuPlan: who stands is not at fault; who
+    moves is, if what it hits reaches beyond its front bumper from no farther back than
+    its rear axle, or stands. A body beside or behind it that drives into it is not.
     """
     found = [_against(view.ego, body) for body in view.obstacles]
     return max(filter(None, found), key=lambda x: x.at_fault, default=None)
@@ -101,17 +51,13 @@ def contact(view: View) -> Contact | None:
 _separation = jax.jit(separation)
 
 
-def _box(body: Body | Car) -> Box:
-    return Box(
-        x=jnp.float32(body.x),
-        y=jnp.float32(body.y),
-        heading=jnp.float32(body.heading),
-        length=jnp.float32(body.length),
-        width=jnp.float32(body.width),
-    )
+def _box(body: Body | Car, x: float, y: float) -> Box:
+    leaves = dict(x=x, y=y, heading=body.heading, length=body.length, width=body.width)
+    return Box(**{name: jnp.float32(value) for name, value in leaves.items()})
 
 
 def _against(ego: Car, body: Body) -> Contact | None:
+    """Return the contact of the ego with one body, if they touch."""
     dx, dy = body.x - ego.x, body.y - ego.y
     turn = body.heading - ego.heading
     cosine, sine = math.cos(ego.heading), math.sin(ego.heading)
@@ -122,8 +68,7 @@ def _against(ego: Car, body: Body) -> Contact | None:
     # two of the axes that may separate them; the others are asked where these do not
     if abs(along) > 0.5 * ego.length + reach or abs(across) > 0.5 * ego.width + aside:
         return None
-    here = dataclasses.replace(ego, x=0.0, y=0.0)
-    if _separation(_box(here), _box(dataclasses.replace(body, x=dx, y=dy))) > 0.0:
+    if _separation(_box(ego, 0.0, 0.0), _box(body, dx, dy)) > 0.0:
         return None
     front = along >= -0.25 * ego.length and along + reach > 0.5 * ego.length
     stands = body.speed <= STOPPED_EGO_MPS
@@ -131,54 +76,61 @@ def _against(ego: Car, body: Body) -> Contact | None:
     return Contact(
         at_fault=ego.speed > STOPPED_EGO_MPS and (stands or front),
         relative_speed=math.hypot(vx, body.speed * math.sin(turn)),
-        vulnerable=body.kind in ("pedestrian", "cyclist"),
-        standing_object=body.kind == "static",
+        body=body,
     )
 
 
-def record_of(drive: Drive, size: int) -> Record:
-    """The drive as a record [size] of our closed loop; what nobody measures is 0."""
-    count = drive.v.size
-    fill = lambda x, rest=0.0: np.pad(  # noqa: E731
-        np.asarray(x, np.float32), (0, size - count), constant_values=rest
-    )
-    nothing, never = fill(np.zeros(count)), np.full(size, np.inf, np.float32)
-    closing = np.maximum(drive.v - drive.gap_speed, 1e-3)
-    at_end = np.arange(size) == count - 1
-    hit = drive.contact
-    fault = hit if hit is not None and hit.at_fault else None
-    counted = lambda yes: (at_end & bool(yes)).astype(np.int32)  # noqa: E731
-    is_true = lambda x: fill(x).astype(bool)  # noqa: E731
-    leaves: dict[str, Any] = dict(
-        valid=np.arange(size) < count,
-        s=fill(drive.way),
-        l=nothing,
-        heading=nothing,
-        v=fill(drive.v),
-        a=fill(drive.a),
-        curvature=fill(drive.curvature),
-        speed_limit=fill(drive.speed_limit, 1.0),
-        path_l=nothing,
-        clearance=never,
-        ttc=fill(np.maximum(drive.gap, 0.0) / closing, np.inf),
-        ttc_counts=fill(np.ones(count)).astype(bool),
-        headway=fill(
-            np.where(drive.v > 0.5, drive.gap / np.maximum(drive.v, 0.5), np.inf),
-            np.inf,
-        ),
-        free_way=fill(np.minimum(drive.gap, drive.line), np.inf),
-        collision=counted(hit),
-        at_fault=counted(fault),
-        at_fault_vru=counted(fault and fault.vulnerable),
-        at_fault_object=counted(fault and fault.standing_object),
-        impact_speed=np.float32(at_end * (hit.relative_speed if hit else 0.0)),
-        red_light=is_true(drive.passed_red),
-        stop_sign=np.zeros(size, bool),
-        off_road=nothing,
-        induced_braking=nothing,
-        fallback=is_true(drive.fallback),
-        command=nothing,
-    )
+def sample(
+    view: View, after: View, gap: float, gap_speed: float, line: float, fallback: bool
+) -> dict[str, float]:
+    """Return the record of one step, by leaf of `EpisodeLog`.
+
+    Args:
+      view: before the step.
+      after: after it.
+      gap: m to the rear of the body ahead before the step; inf without one.
+      gap_speed: m/s, that body's speed along the road.
+      line: m to a line ahead that demands a stop; inf without one.
+      fallback: no plan was admissible.
+    """
+    v, hit = after.ego.speed, contact(after)
+    fault = hit.body.kind if hit is not None and hit.at_fault else None
+    return {
+        "valid": True,
+        "s": after.way,
+        "v": v,
+        "a": (v - view.ego.speed) / STEP_S,
+        "curvature": view.ego.curvature,
+        "speed_limit": view.speed_limit,
+        "ttc": max(gap, 0.0) / max(v - gap_speed, 1e-3),
+        "ttc_counts": True,
+        "headway": gap / v if v > 0.5 else math.inf,
+        "free_way": min(gap, line),
+        "collision": hit is not None,
+        "at_fault": fault is not None,
+        "at_fault_vru": fault in ("pedestrian", "cyclist"),
+        "at_fault_object": fault == "static",
+        "impact_speed": hit.relative_speed if hit else 0.0,
+        "red_light": after.passed_red > 0,
+        "fallback": fallback,
+    }
+
+
+def log_of(samples: Sequence[Mapping[str, float]]) -> EpisodeLog:
+    """Stack the samples of an episode; one that never began has none."""
+    if not samples:
+        return {}
+    return {name: np.array([x[name] for x in samples]) for name in samples[0]}
+
+
+def _record(log: EpisodeLog, size: int) -> Record:
+    """Return a log as a record [size] of the closed loop."""
+    leaves = {}
+    for name in Record.__dataclass_fields__:
+        kind = np.int32 if name in COUNTS else bool if name in MARKS else np.float32
+        leaves[name] = np.full(size, REST.get(name, 0.0), kind)
+        if name in log:
+            leaves[name][: len(log[name])] = log[name]
     return Record(**leaves)
 
 
@@ -188,10 +140,9 @@ def _measured(record: Record) -> CaseMetrics:
     return case_metrics(record, MetricsConfig())
 
 
-def measure(drives: Sequence[Drive]) -> CaseMetrics:
-    """The closed loop's measures of drives, leaves [N, ...]; numpy."""
-    longest = max(drive.v.size for drive in drives)
-    size = -(-max(longest, 1) // LENGTHS) * LENGTHS
-    records = [record_of(drive, size) for drive in drives]
-    stacked = jax.tree.map(lambda *x: np.stack(x), *records)
-    return jax.device_get(_measured(stacked))
+def measure(logs: Sequence[EpisodeLog]) -> CaseMetrics:
+    """Return the closed loop's measures of drives, leaves [N, ...]; numpy."""
+    longest = max(len(log["v"]) for log in logs)
+    size = -(-longest // LENGTHS) * LENGTHS
+    records = [_record(log, size) for log in logs]
+    return jax.device_get(_measured(jax.tree.map(lambda *x: np.stack(x), *records)))

@@ -19,9 +19,8 @@ from scipy.interpolate import CubicHermiteSpline
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.closed_loop import table_rows
 from rcirl_jax.export.own_planner.inputs import STATES, Body, Car, Signal
-from rcirl_jax.simulators.drivers import Driver, Seen
-from rcirl_jax.simulators.simulators import STEP_S, Move, View
-from rcirl_jax.simulators.way import Way, fading
+from rcirl_jax.simulators.drive import Driver, Seen
+from rcirl_jax.simulators.simulators import STEP_S, Move, View, Way
 from rcirl_jax.units import HORIZON_S
 
 USUAL_LIMIT_MPS = 15.0  # m/s, where the map has none
@@ -44,7 +43,7 @@ THEIRS = {
 
 
 def reward_planner(weights: str, seed: int = 0) -> Any:  # noqa: ANN401
-    """An `AbstractPlanner` that drives by a weights file; nuPlan is imported here."""
+    """Return an `AbstractPlanner` that drives by a weights file; imports nuPlan."""
     of = {name: importlib.import_module(f"nuplan.{at}") for name, at in THEIRS.items()}
     theirs = {name: getattr(module, name) for name, module in of.items()}
     kind = type("RewardPlanner", (Planner, theirs["AbstractPlanner"]), {})
@@ -64,11 +63,11 @@ class Planner:
         self._row, self._seed, self._theirs = table_rows([weights], [])[0], seed, theirs
 
     def name(self) -> str:
-        """Name of the planner."""
+        """Return the planner's name."""
         return self._row.name
 
     def observation_type(self) -> Any:  # noqa: ANN401
-        """Tracked objects."""
+        """Return what the planner wants to see: tracked objects."""
         return self._theirs.DetectionsTracks
 
     def initialize(self, initialization: Any) -> None:  # noqa: ANN401
@@ -92,7 +91,7 @@ class Planner:
         self._seen, self._driver = Seen(1), Driver(self._row, [self._seed])
 
     def compute_planner_trajectory(self, current_input: Any) -> Any:  # noqa: ANN401
-        """The plan of one moment as an `InterpolatedTrajectory`."""
+        """Return the plan of one moment as an `InterpolatedTrajectory`."""
         ego, observation = current_input.history.current_state
         way = self._way or self._line(ego.center)
         view = self._view(way, ego, observation, current_input.traffic_light_data)
@@ -101,25 +100,28 @@ class Planner:
         return self._trajectory(way, ego, move)
 
     def _line(self, place: Any) -> Way:  # noqa: ANN401
-        """The lanes from the one that is nearest to a place on."""
-        away = lambda edge: np.min(np.hypot(*(_points(edge) - [place.x, place.y]).T))  # noqa: E731
-        edges = [edge for _, edge, _ in self._route.values()]
-        edge = min(edges, key=away)
+        """Return the lanes from the one that is nearest to a place on."""
+
+        def away(edge: Any) -> float:  # noqa: ANN401
+            return np.min(np.hypot(*(_points(edge) - [place.x, place.y]).T))
+
+        edge = min((edge for _, edge, _ in self._route.values()), key=away)
         chain = list(edge.incoming_edges[:1])
         while edge is not None:
             chain.append(edge)
             edge = self._route[edge.id][2]
-        self._stops = {str(edge.id): _points(edge)[0] for edge in chain}
-        points = np.concatenate([_points(edge) for edge in chain])
+        lanes = [_points(edge) for edge in chain]
+        self._stops = {str(e.id): l[0] for e, l in zip(chain, lanes, strict=True)}
         posted = [edge.speed_limit_mps or USUAL_LIMIT_MPS for edge in chain]
-        limits = np.repeat(posted, [len(_points(edge)) for edge in chain])
+        limits = np.repeat(posted, [len(lane) for lane in lanes])
+        points = np.concatenate(lanes)
         last = points[-1] - points[-2]
         points = np.vstack([points, points[-1] + BEYOND_M * last / np.hypot(*last)])
         self._way = Way(points, np.append(limits, limits[-1]), LANE_WIDTH_M)
         return self._way
 
     def _view(self, way: Way, ego: Any, observation: Any, lights: Any) -> View:  # noqa: ANN401
-        """What is seen at one moment."""
+        """Return what is seen at one moment."""
         car, state = ego.car_footprint, ego.dynamic_car_state
         turn = math.tan(ego.tire_steering_angle)
         return View(
@@ -136,34 +138,29 @@ class Planner:
             centre_line=way.centre_line,
             obstacles=[_body(x) for x in observation.tracked_objects.tracked_objects],
             signals=[
-                Signal(x=x, y=y, state=_state(light.status.name))
+                Signal(x=x, y=y, state=state if state in STATES else "off")
                 for light in lights or ()
                 if str(light.lane_connector_id) in self._stops
                 for x, y in [self._stops[str(light.lane_connector_id)].tolist()]
+                for state in [light.status.name.lower()]
             ],
             way=0.0,
-            speed_limit=way.limit(way.station(ego.center.x, ego.center.y)),
+            speed_limit=way.limit(way.project(ego.center.x, ego.center.y)[0]),
         )
 
     def _trajectory(self, way: Way, ego: Any, move: Move) -> Any:  # noqa: ANN401
-        """The present state, then the planned ones, 0.1 s apart for 8 s."""
+        """Return the present state, then the planned ones, 0.1 s apart for 8 s."""
         theirs, (time, s, v) = self._theirs, move.future.T
         curve = CubicHermiteSpline(time, s, v)
-        begin = way.station(ego.center.x, ego.center.y)
-        offset = way.offset(ego.center.x, ego.center.y)
+        begin, offset = way.project(ego.center.x, ego.center.y)
+        parameters = ego.car_footprint.vehicle_parameters
         states = [ego]
         for t in STEP_S * np.arange(1, round(HORIZON_S / STEP_S) + 1):
             gone = float(curve(t))
-            x, y, heading, curvature = way.place(begin + gone)
-            aside, slope = fading(offset, gone)
-            parameters = ego.car_footprint.vehicle_parameters
+            *place, curvature = way.place(begin + gone, offset, gone)
             at = ego.time_point.time_us + round(1e6 * t)
             state = theirs.EgoState.build_from_center(
-                center=theirs.StateSE2(
-                    x - aside * math.sin(heading),
-                    y + aside * math.cos(heading),
-                    heading + math.atan(slope),
-                ),
+                center=theirs.StateSE2(*place),
                 center_velocity_2d=theirs.StateVector2D(float(curve(t, 1)), 0.0),
                 center_acceleration_2d=theirs.StateVector2D(float(curve(t, 2)), 0.0),
                 tire_steering_angle=math.atan(curvature * parameters.wheel_base),
@@ -175,17 +172,12 @@ class Planner:
 
 
 def _points(edge: Any) -> np.ndarray:  # noqa: ANN401
-    """The middle of a lane [m, 2] m."""
+    """Return the middle of a lane [m, 2] m."""
     return np.array([(point.x, point.y) for point in edge.baseline_path.discrete_path])
 
 
-def _state(status: str) -> str:
-    """Of a traffic light; what nobody knows is off."""
-    return status.lower() if status.lower() in STATES else "off"
-
-
 def _body(tracked: Any) -> Body:  # noqa: ANN401
-    """A tracked object; what has no velocity stands."""
+    """Return a tracked object; what has no velocity stands."""
     velocity = getattr(tracked, "velocity", None)
     return Body(
         kind=KINDS.get(tracked.tracked_object_type.name, "static"),

@@ -1,4 +1,4 @@
-"""What a simulator gives and takes (metres, seconds, radians), and which there are.
+"""The interface of a simulator (metres, seconds, radians), and which there are.
 
 Episodes run in lock step, one ego each, so that all plans of a step are made at once:
 
@@ -10,6 +10,7 @@ Episodes run in lock step, one ego each, so that all plans of a step are made at
 import dataclasses
 import importlib
 import inspect
+import math
 from collections.abc import Sequence
 from typing import Any, Protocol
 
@@ -17,9 +18,12 @@ import numpy as np
 
 from rcirl_jax.errors import InputError, did_you_mean
 from rcirl_jax.export.own_planner.inputs import Body, Car, CentreLine, Signal
+from rcirl_jax.geometry.frenet import reference_line_from_polyline
 from rcirl_jax.planner.plan import COMMAND_STEP_S
+from rcirl_jax.units import STATION_STEP_M
 
 STEP_S = COMMAND_STEP_S  # s between two views of an episode
+FADING_M = 15.0  # m of way in which an offset from the line falls to 1 / e
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -58,11 +62,11 @@ class Running(Protocol):
     """Some episodes under way; lists have one entry an episode."""
 
     def look(self) -> list[View | None]:
-        """What is seen now; None: the episode is over."""
+        """Return what is seen now; None: the episode is over."""
         ...
 
     def step(self, moves: Sequence[Move | None]) -> None:
-        """Go on by 0.1 s; None: the own driver drives, or the episode is over."""
+        """Advance 0.1 s; None: the own driver drives, or the episode is over."""
         ...
 
     def close(self) -> None:
@@ -79,7 +83,7 @@ class Simulator(Protocol):
     together: int  # episodes that run in lock step at most
 
     def episodes(self, count: int, seed: int) -> list[str]:
-        """Names of different episodes, KIND/NUMBER; a name says all that makes it."""
+        """Return names of different episodes, KIND/NUMBER; a name says all of it."""
         ...
 
     def start(self, episodes: Sequence[str], own: str | None) -> Running:
@@ -91,11 +95,11 @@ class Episode(Protocol):
     """One episode of a simulator whose episodes know nothing of each other."""
 
     def look(self) -> View | None:
-        """What is seen now; None: it is over."""
+        """Return what is seen now; None: it is over."""
         ...
 
     def step(self, move: Move | None) -> None:
-        """Go on by 0.1 s; None: the own driver drives."""
+        """Advance 0.1 s; None: the own driver drives."""
         ...
 
     def close(self) -> None:
@@ -111,11 +115,11 @@ class LockStep:
         self.views = [episode.look() for episode in episodes]
 
     def look(self) -> list[View | None]:
-        """What each of them sees."""
+        """Return what each of them sees."""
         return self.views
 
     def step(self, moves: Sequence[Move | None]) -> None:
-        """Each of them that is not over goes on."""
+        """Advance each that is not over."""
         for n, (episode, move) in enumerate(zip(self.episodes, moves, strict=True)):
             if self.views[n] is not None:
                 episode.step(move)
@@ -127,16 +131,93 @@ class LockStep:
             episode.close()
 
 
+def drawn_names(kinds: Sequence[str], count: int, seed: int) -> list[str]:
+    """Return `count` names KIND/SEED/NUMBER, the kinds in turn."""
+    return [f"{kinds[n % len(kinds)]}/{seed}/{n:04d}" for n in range(count)]
+
+
+class Way:
+    """A lane's smoothed middle by station: the line that an ego is moved along.
+
+    Args:
+      points: [m, 2] m, in driving direction.
+      speed_limit: m/s, one, or one for each point from which it holds.
+      lane_width: m.
+    """
+
+    def __init__(
+        self, points: np.ndarray, speed_limit: float | np.ndarray, lane_width: float
+    ) -> None:
+        points = np.asarray(points, float)
+        arc = np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
+        size = int(arc[-1] / STATION_STEP_M) + 1
+        line = reference_line_from_polyline(
+            points - points[0], size=size, step=STATION_STEP_M
+        )
+        self.stations = np.arange(size) * STATION_STEP_M
+        self._x = np.asarray(line.x, float) + points[0, 0]
+        self._y = np.asarray(line.y, float) + points[0, 1]
+        self._heading = np.asarray(line.heading, float)
+        self._kappa = np.asarray(line.kappa, float)
+        limits = np.broadcast_to(speed_limit, arc.shape)
+        last = np.searchsorted(arc, self.stations, "right") - 1
+        self.limits = limits[np.clip(last, 0, None)]
+        self.centre_line = CentreLine(  # as the planner gets it
+            points=np.stack([self._x, self._y], axis=1),
+            speed_limit=self.limits,
+            lane_width=lane_width,
+        )
+
+    def place(
+        self, s: float, offset: float = 0.0, gone: float = 0.0
+    ) -> tuple[float, float, float, float]:
+        """Return (x, y) m, heading rad and curvature 1/m of a car at a station.
+
+        An offset fades to offset exp(-gone / FADING_M): planned anew on the way, it
+        goes on as before.
+
+        Args:
+          s: m, station.
+          offset: m to the left of the line at first.
+          gone: m that the car has driven since then.
+        """
+        x, y, heading, kappa = (
+            float(np.interp(s, self.stations, table))
+            for table in (self._x, self._y, self._heading, self._kappa)
+        )
+        left = offset * math.exp(-gone / FADING_M)
+        return (
+            x - left * math.sin(heading),
+            y + left * math.cos(heading),
+            heading + math.atan(-left / FADING_M),
+            kappa,
+        )
+
+    def project(self, x: float, y: float) -> tuple[float, float]:
+        """Return the station m of a place and how far m it lies left of the line."""
+        n = int(np.argmin((self._x - x) ** 2 + (self._y - y) ** 2))
+        h = self._heading[n]
+        dx, dy = x - self._x[n], y - self._y[n]
+        s = float(self.stations[n] + dx * np.cos(h) + dy * np.sin(h))
+        at, left, heading, _ = self.place(s)
+        return s, (y - left) * math.cos(heading) - (x - at) * math.sin(heading)
+
+    def limit(self, s: float) -> float:
+        """Return the posted limit m/s at a station."""
+        n = int(s / STATION_STEP_M)
+        return float(self.limits[min(max(n, 0), len(self.limits) - 1)])
+
+
 # name: (module, class, extra of pyproject.toml that it needs)
 SIMULATORS = {
     "highway_env": ("rcirl_jax.simulators.highway", "HighwayEnv", "highway"),
     "sumo": ("rcirl_jax.simulators.sumo", "Sumo", "sumo"),
-    "commonroad": ("rcirl_jax.simulators.commonroad.simulator", "CommonRoad", ""),
+    "commonroad": ("rcirl_jax.simulators.commonroad", "CommonRoad", ""),
 }
 
 
-def open_simulator(name: str, **options: Any) -> Simulator:  # noqa: ANN401
-    """The simulator of a name; its package is imported here and not before.
+def open_simulator(name: str, **options: str) -> Simulator:
+    """Return the simulator of a name; its package is imported here and not before.
 
     Args:
       name: of `SIMULATORS`.
@@ -147,24 +228,22 @@ def open_simulator(name: str, **options: Any) -> Simulator:  # noqa: ANN401
     """
     if name not in SIMULATORS:
         raise InputError(
-            f"--simulator: {name}: expected one of {', '.join(SIMULATORS)}"
+            f"simulator: {name}: expected one of {', '.join(SIMULATORS)}"
             f"{did_you_mean(name, list(SIMULATORS))}"
         )
     module, kind, extra = SIMULATORS[name]
     try:
-        simulator = getattr(importlib.import_module(module), kind)
+        simulator: Any = getattr(importlib.import_module(module), kind)
     except ModuleNotFoundError as error:
         if str(error.name).startswith("rcirl_jax"):
             raise
         raise InputError(
-            f"--simulator: {name}: {error.name} is not installed: "
+            f"simulator: {name}: {error.name} is not installed: "
             f"pip install 'rcirl-jax[{extra}]'"
         ) from None
     try:
         inspect.signature(simulator).bind(**options)
     except TypeError as error:
         known = ", ".join(inspect.signature(simulator).parameters) or "none"
-        raise InputError(
-            f"--options: {error}: expected NAME=VALUE of {known}"
-        ) from None
+        raise InputError(f"options: {error}: expected NAME=VALUE of {known}") from None
     return simulator(**options)

@@ -5,7 +5,6 @@ intervals resample episodes, differences are of the same episodes.
 """
 
 import csv
-import dataclasses
 import io
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -17,13 +16,12 @@ from rcirl_jax.evaluation.closed_loop.output import text_table
 from rcirl_jax.evaluation.exact import clopper_pearson, mcnemar_exact
 from rcirl_jax.evaluation.statistics import (
     ClusterBootstrap,
-    Difference,
     combine_seeds,
     paired_difference,
 )
 from rcirl_jax.runtime.atomic_files import write_json, write_whole
 from rcirl_jax.simulation.metrics import COLUMNS
-from rcirl_jax.simulators.measures import Drive, measure
+from rcirl_jax.simulators.measures import EpisodeLog, measure
 
 # number of an episode: its heading in the table
 MEANS = {
@@ -45,17 +43,16 @@ RATES = {
     "nuplan_comfort": "nuPlan comfort",
 }
 
-
 Numbers = dict[str, float]  # of one drive, keys of MEANS and RATES
 Results = dict[str, dict[str, Numbers]]  # by driver and episode
 
 
-def numbers_of(drives: Sequence[Drive]) -> dict[str, Numbers]:
-    """The numbers of drives, by episode; one that has no step has none."""
-    drives = [drive for drive in drives if drive.v.size]
-    if not drives:
+def numbers_of(logs: Mapping[str, EpisodeLog]) -> dict[str, Numbers]:
+    """Return the numbers of drives, by episode; one that has no step has none."""
+    logs = {name: log for name, log in logs.items() if log}
+    if not logs:
         return {}
-    found = measure(drives)
+    found = measure(list(logs.values()))
     holds = dict(zip(COLUMNS, found.holds.T, strict=True))
     columns = {key: getattr(found, key) for key in MEANS} | {
         "at_fault": found.at_fault > 0,
@@ -66,13 +63,13 @@ def numbers_of(drives: Sequence[Drive]) -> dict[str, Numbers]:
         "nuplan_comfort": found.comfort > 0.0,
     }
     return {
-        drive.episode: {key: float(values[n]) for key, values in columns.items()}
-        for n, drive in enumerate(drives)
+        name: {key: float(values[n]) for key, values in columns.items()}
+        for n, name in enumerate(logs)
     }
 
 
 def write_results(file: Path, results: Results) -> None:
-    """One line a driver and episode."""
+    """Write one line a driver and episode."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["driver", "episode", *MEANS, *RATES])
@@ -84,7 +81,7 @@ def write_results(file: Path, results: Results) -> None:
 
 
 def read_results(file: Path) -> Results:
-    """What `write_results` wrote.
+    """Read what `write_results` wrote.
 
     Raises:
       InputError: it did not.
@@ -102,134 +99,133 @@ def read_results(file: Path) -> Results:
     return found
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Entry:
-    """One driver's episodes; arrays [N]."""
+def table_of(simulator: str, results: Results, against: Sequence[str]) -> dict:
+    """Return the table over the episodes that every driver has driven, as JSON.
 
-    name: str
-    means: dict[str, np.ndarray]
-    rates: dict[str, np.ndarray]  # bool
+    Args:
+      simulator: its name.
+      results: of every driver.
+      against: drivers that the others are compared with, where they drove.
 
-
-def table_of(simulator: str, results: Results, against: Sequence[str]) -> "Table":
-    """The table over the episodes that every driver has driven, a step at least."""
+    Raises:
+      InputError: fewer than two such episodes.
+    """
     first, *others = results.values()
-    episodes = [name for name in first if all(name in other for other in others)]
-    entries = []
-    for name, drives in results.items():
-        column = lambda key, of=drives: np.array([of[e][key] for e in episodes])  # noqa: E731
-        means = {key: column(key) for key in MEANS}
-        rates = {key: column(key) > 0.0 for key in RATES}
-        entries.append(Entry(name=name, means=means, rates=rates))
-    known = [name for name in against if name in results]
-    return Table(simulator=simulator, episodes=episodes, entries=entries, against=known)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Table:
-    """Entries over the same episodes; differences are to the `against` ones."""
-
-    simulator: str
-    episodes: Sequence[str]
-    entries: Sequence[Entry]
-    against: Sequence[str]
-
-    def __post_init__(self) -> None:
-        """One episode says nothing about others."""
-        if len(self.episodes) < 2:
-            raise InputError(
-                f"--episodes: {len(self.episodes)}: expected at least 2, for intervals"
-            )
-
-    def groups(self) -> dict[str, np.ndarray]:
-        """Which episodes are of a kind [N] bool; all of them first."""
-        kinds = np.array([name.split("/")[0] for name in self.episodes])
-        every = {"all": np.ones(kinds.size, bool)}
-        found = {kind: kinds == kind for kind in dict.fromkeys(kinds.tolist())}
-        return every | {kind: which for kind, which in found.items() if which.sum() > 1}
-
-    def as_dict(self) -> dict:
-        """Everything, as JSON."""
-        return {
-            "simulator": self.simulator,
-            "episodes": len(self.episodes),
-            "groups": {
-                group: self._group(which) for group, which in self.groups().items()
-            },
+    names = [name for name in first if all(name in other for other in others)]
+    if len(names) < 2:
+        raise InputError(f"episodes: {len(names)}: expected at least 2, for intervals")
+    kinds = np.array([name.split("/")[0] for name in names])
+    groups = {"all": np.ones(kinds.size, bool)}
+    groups |= {kind: kinds == kind for kind in dict.fromkeys(kinds.tolist())}
+    values = {
+        driver: {
+            key: np.array([drives[name][key] for name in names])
+            for key in (*MEANS, *RATES)
         }
-
-    def _group(self, which: np.ndarray) -> dict:
-        bootstrap = ClusterBootstrap(np.arange(which.sum()))
-        return {
-            "episodes": int(which.sum()),
-            "rows": {e.name: _numbers(e, which, bootstrap) for e in self.entries},
-            "differences": {
-                f"{entry.name} - {other.name}": _apart(entry, other, which, bootstrap)
-                for entry in self.entries
-                for other in self.entries
-                if other.name in self.against and entry is not other
-            },
-        }
-
-    def text(self, body: Mapping) -> str:
-        """Of `as_dict`: rates and means of each kind, then the differences over all."""
-        lines = [f"{self.simulator}: {len(self.episodes)} episodes, 95 % intervals"]
-        for group, found in body["groups"].items():
-            rows = found["rows"]
-            lines += ["", f"{group}, {found['episodes']} episodes: % of them with"]
-            lines += _table(RATES, rows, lambda x: _cell(x["value"], x, 100.0, 1))
-            lines += ["", f"{group}: mean of the episodes"]
-            lines += _table(MEANS, rows, _mean)
-        for other in self.against:
-            pairs = body["groups"]["all"]["differences"]
-            rows = {
-                pair.removesuffix(f" - {other}"): numbers
-                for pair, numbers in pairs.items()
-                if pair.endswith(f" - {other}")
-            }
-            lines += ["", f"Less {other}, the same episodes; * leaves out 0"]
-            lines += _table(RATES, rows, _less(100.0, 1), "points of %")
-            lines += ["", *_table(MEANS, rows, _less(1.0, 2))]
-        return "\n".join(lines) + "\n"
-
-    def write(self, folder: Path, made_by: Mapping) -> str:
-        """table.txt and elsewhere.json; returns the table."""
-        body = self.as_dict()
-        text = self.text(body)
-        write_whole(folder / "table.txt", text)
-        write_json(folder / "elsewhere.json", {**body, "made_by": dict(made_by)})
-        return text
+        for driver, drives in results.items()
+    }
+    against = [driver for driver in against if driver in results]
+    return {
+        "simulator": simulator,
+        "episodes": len(names),
+        "against": against,
+        "groups": {
+            group: _group(values, which, against)
+            for group, which in groups.items()
+            if group == "all" or which.sum() > 1
+        },
+    }
 
 
-def _numbers(entry: Entry, which: np.ndarray, bootstrap: ClusterBootstrap) -> dict:
-    """Each number of one driver: value, low and high."""
+def _group(
+    values: Mapping[str, Mapping[str, np.ndarray]],
+    which: np.ndarray,
+    against: Sequence[str],
+) -> dict:
+    """Return the rows of a group of episodes and their differences to `against`."""
+    bootstrap = ClusterBootstrap(np.arange(which.sum()))
+    here = {
+        driver: {key: column[which] for key, column in columns.items()}
+        for driver, columns in values.items()
+    }
+    return {
+        "episodes": int(which.sum()),
+        "rows": {driver: _numbers(x, bootstrap) for driver, x in here.items()},
+        "differences": {
+            f"{driver} - {other}": _differences(here[driver], here[other], bootstrap)
+            for driver in here
+            for other in here
+            if other in against and driver != other
+        },
+    }
+
+
+def _numbers(values: Mapping[str, np.ndarray], bootstrap: ClusterBootstrap) -> dict:
+    """Return each number of one driver: value, low and high."""
     found = {}
-    for key, yes in entry.rates.items():
-        count, total = int(yes[which].sum()), int(which.sum())
+    for key in RATES:
+        count, total = int(np.sum(values[key] > 0.0)), values[key].size
         low, high = clopper_pearson(count, total)
         found[key] = {"value": count / total, "low": low, "high": high, "count": count}
-    for key, values in entry.means.items():
-        mean = combine_seeds(values[which], bootstrap)
+    for key in MEANS:
+        mean = combine_seeds(values[key], bootstrap)
         found[key] = {"value": mean.value, "low": mean.low, "high": mean.high}
     return found
 
 
-def _apart(
-    entry: Entry, other: Entry, which: np.ndarray, bootstrap: ClusterBootstrap
+def _differences(
+    first: Mapping[str, np.ndarray],
+    second: Mapping[str, np.ndarray],
+    bootstrap: ClusterBootstrap,
 ) -> dict:
-    """Each difference of two drivers over the same episodes."""
+    """Return each difference of two drivers over the same episodes."""
     found = {}
-    for key in (*entry.rates, *entry.means):
-        values = entry.rates | entry.means, other.rates | other.means
-        a, b = (np.asarray(v[key][which], float) for v in values)
-        apart: Difference = paired_difference(a, b, bootstrap)
-        found[key] = {"mean": apart.mean, "low": apart.low, "high": apart.high}
-        found[key]["p"] = apart.p
-        if key in entry.rates:
+    for key in (*RATES, *MEANS):
+        a, b = first[key], second[key]
+        if key in RATES:
+            a, b = (a > 0.0).astype(float), (b > 0.0).astype(float)
+        apart = paired_difference(a, b, bootstrap)
+        found[key] = {
+            "mean": apart.mean,
+            "low": apart.low,
+            "high": apart.high,
+            "p": apart.p,
+        }
+        if key in RATES:
             only = int(np.sum(a > b)), int(np.sum(b > a))
             found[key] |= {"only_first": only[0], "only_second": only[1]}
             found[key]["p"] = mcnemar_exact(*only)
     return found
+
+
+def text_of(body: Mapping) -> str:
+    """Return `table_of` as text: rates and means of each kind, then differences."""
+    lines = [f"{body['simulator']}: {body['episodes']} episodes, 95 % intervals"]
+    for group, found in body["groups"].items():
+        rows = found["rows"]
+        lines += ["", f"{group}, {found['episodes']} episodes: % of them with"]
+        lines += _table(RATES, rows, _interval("value", 100.0, 1))
+        lines += ["", f"{group}: mean of the episodes"]
+        lines += _table(MEANS, rows, _interval("value", 1.0, 2))
+    pairs = body["groups"]["all"]["differences"]
+    for other in body["against"]:
+        end = f" - {other}"
+        rows = {
+            pair.removesuffix(end): x for pair, x in pairs.items() if pair.endswith(end)
+        }
+        lines += ["", f"Less {other}, the same episodes; * leaves out 0"]
+        less = _interval("mean", 100.0, 1, star=True)
+        lines += _table(RATES, rows, less, "points of %")
+        lines += ["", *_table(MEANS, rows, _interval("mean", 1.0, 2, star=True))]
+    return "\n".join(lines) + "\n"
+
+
+def write_table(folder: Path, body: Mapping, made_by: Mapping) -> str:
+    """Write table.txt and elsewhere.json; return the text."""
+    text = text_of(body)
+    write_whole(folder / "table.txt", text)
+    write_json(folder / "elsewhere.json", {**body, "made_by": dict(made_by)})
+    return text
 
 
 def _table(
@@ -238,27 +234,21 @@ def _table(
     cell: Callable[[Mapping], str],
     corner: str = "",
 ) -> list[str]:
-    """Lines: a driver each, a column for each of its numbers."""
-    cells = [
-        [name, *(cell(found[key]) for key in columns)] for name, found in rows.items()
-    ]
+    """Return lines: a driver each, a column for each of its numbers."""
+    cells = [[name, *(cell(x[key]) for key in columns)] for name, x in rows.items()]
     return text_table([corner, *columns.values()], cells)
 
 
-def _cell(value: float, ends: Mapping, scale: float, digits: int) -> str:
-    low, high = (f"{scale * ends[end]:.{digits}f}" for end in ("low", "high"))
-    return f"{scale * value:.{digits}f} [{low},{high}]"
-
-
-def _mean(x: Mapping) -> str:
-    return _cell(x["value"], x, 1.0, 2)
-
-
-def _less(scale: float, digits: int) -> Callable[[Mapping], str]:
-    """Cells of differences."""
+def _interval(
+    of: str, scale: float, digits: int, *, star: bool = False
+) -> Callable[[Mapping], str]:
+    """Return the form of a cell: value [low,high], * where that leaves out 0."""
 
     def cell(x: Mapping) -> str:
-        star = " " if x["low"] <= 0.0 <= x["high"] else "*"
-        return _cell(x["mean"], x, scale, digits) + star
+        value, low, high = (
+            f"{scale * x[end]:.{digits}f}" for end in (of, "low", "high")
+        )
+        mark = (" " if x["low"] <= 0.0 <= x["high"] else "*") if star else ""
+        return f"{value} [{low},{high}]{mark}"
 
     return cell

@@ -15,13 +15,8 @@ import pytest
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.own_planner.features import Ego, FeatureMap, Path, Scene
 from rcirl_jax.export.reader import load_weights
-from rcirl_jax.simulators.commonroad.cost import RewardCost, obstacle
-from rcirl_jax.simulators.commonroad.simulator import (
-    BY_REWARD,
-    DEFAULT,
-    CommonRoad,
-    Replay,
-)
+from rcirl_jax.simulators.commonroad import BY_REWARD, DEFAULT, CommonRoad, Replay
+from rcirl_jax.simulators.commonroad_cost import RewardCost, obstacle
 from rcirl_jax.simulators.simulators import Move, open_simulator
 from rcirl_jax.units import TIMES_S
 from tests.data.formats import writers as w
@@ -181,16 +176,16 @@ def test_scenarios_are_drawn_without_repeating_one(tmp_path):
     assert sorted(names) == [f"ZAM_Test/ZAM_Test-{n}_1_T-1" for n in range(5)]
     assert names == simulator.episodes(5, seed=3)
     assert simulator.own_drivers == (DEFAULT,)
-    with pytest.raises(InputError, match="--episodes: 6: expected at most 5"):
+    with pytest.raises(InputError, match="episodes: 6: expected at most 5"):
         simulator.episodes(6, seed=3)
 
 
 @pytest.mark.parametrize(
     ("options", "line"),
     [
-        ({}, "--options: missing a required argument: 'scenarios': expected NAME="),
+        ({}, "options: missing a required argument: 'scenarios': expected NAME="),
         ({"scenarios": "/none", "python": "p"}, "scenarios: /none: none: expected XML"),
-        ({"scenario": "x"}, "--options: .*expected NAME=VALUE of scenarios, python"),
+        ({"scenario": "x"}, "options: .*expected NAME=VALUE of scenarios, python"),
     ],
 )
 def test_wrong_options_have_one_line(options, line):
@@ -265,7 +260,7 @@ def test_a_row_of_ours_goes_by_its_moves(tmp_path):
 @needs_commonroad
 def test_the_worker_needs_nothing_of_ours_but_numpy():
     program = (
-        "import rcirl_jax.simulators.commonroad.worker, sys;"
+        "import rcirl_jax.simulators.commonroad_worker, sys;"
         "print([m for m in ('jax', 'flax', 'msgspec') if m in sys.modules])"
     )
     done = subprocess.run([OTHER, "-c", program], capture_output=True, text=True)

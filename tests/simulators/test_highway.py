@@ -5,7 +5,7 @@ import pytest
 
 highway = pytest.importorskip("rcirl_jax.simulators.highway")
 
-from rcirl_jax.simulators.drivers import Seen  # noqa: E402
+from rcirl_jax.simulators.drive import Seen  # noqa: E402
 from rcirl_jax.simulators.simulators import Move  # noqa: E402
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rcirl_jax.export.own_planner.inputs import Body, Car, CentreLine
-from rcirl_jax.simulators.measures import Drive, contact, measure
+from rcirl_jax.simulators.measures import contact, log_of, measure, sample
 from rcirl_jax.simulators.simulators import View
 
 EGO = Car(x=100.0, y=50.0, heading=0.5 * math.pi, speed=10.0, length=5.0, width=2.0)
@@ -64,26 +64,21 @@ def test_relative_speed_and_the_worst_of_two():
     assert across.relative_speed == pytest.approx(math.hypot(10.0, 5.0))
 
 
-def drive(v, hit=None, passed_red=()):
-    v = np.asarray(v, float)
-    steps = v.size
-    red = np.zeros(steps, int)
-    red[list(passed_red)] = 1
-    far = np.full(steps, np.inf)
-    return Drive(
-        episode="x/0/0000",
-        way=np.cumsum(v) * 0.1,
-        v=v,
-        a=np.diff(v, prepend=v[0]) / 0.1,
-        curvature=np.zeros(steps),
-        speed_limit=np.full(steps, 15.0),
-        gap=far,
-        gap_speed=np.zeros(steps),
-        line=far,
-        passed_red=red,
-        fallback=np.zeros(steps, bool),
-        contact=hit,
-    )
+def drive(v, *bodies, passed_red=()):
+    """The log of a drive with speeds v [S] m/s that ends beside some bodies."""
+    samples, way, begin = [], 0.0, v[0]
+    for n, speed in enumerate(v):
+        way += speed * 0.1
+        ego = dataclasses.replace(EGO, speed=float(speed))
+        after = dataclasses.replace(
+            seen(ego, *(bodies if n == len(v) - 1 else ())),
+            way=way,
+            passed_red=int(n in passed_red),
+        )
+        before = seen(dataclasses.replace(EGO, speed=float(begin)))
+        samples.append(sample(before, after, math.inf, 0.0, math.inf, False))
+        begin = speed
+    return log_of(samples)
 
 
 def test_a_drive_made_by_hand():
@@ -101,10 +96,9 @@ def test_a_drive_made_by_hand():
 
 
 def test_a_crash_ends_the_record_and_is_counted_by_its_fault():
-    hit = contact(seen(EGO, other(4.4, 0.0)))
-    other_hit = contact(seen(EGO, other(-4.4, 0.0, speed=15.0)))
-    found = measure([drive(np.full(30, 10.0), hit), drive([9.0] * 7, other_hit)])
+    ahead, behind = other(4.4, 0.0), other(-4.4, 0.0, speed=15.0)
+    found = measure([drive([10.0] * 30, ahead), drive([9.0] * 7, behind)])
     np.testing.assert_array_equal(found.collisions, [1, 1])
     np.testing.assert_array_equal(found.at_fault, [1, 0])
     np.testing.assert_array_equal(found.samples, [30, 7])
-    assert found.impact_speed == pytest.approx([5.0, 5.0])
+    assert found.impact_speed == pytest.approx([5.0, 6.0])

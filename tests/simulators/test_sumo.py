@@ -9,10 +9,9 @@ pytest.importorskip("libsumo")
 
 import libsumo
 
-from rcirl_jax.simulators.drivers import Seen
+from rcirl_jax.simulators.drive import Seen
 from rcirl_jax.simulators.simulators import Move
-from rcirl_jax.simulators.sumo import Sumo
-from rcirl_jax.simulators.sumo.run import KRAUSS
+from rcirl_jax.simulators.sumo import KRAUSS, Sumo
 
 NAMES = ["dense/0/0000", "single/0/0001", "sparse/0/0002"]
 

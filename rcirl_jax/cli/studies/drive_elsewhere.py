@@ -19,7 +19,8 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.export.closed_loop import table_rows
 from rcirl_jax.runtime.atomic_files import read_json, write_json
 from rcirl_jax.runtime.checked import checked
-from rcirl_jax.simulators.drive import Entrant, drive, entrants, groups
+from rcirl_jax.simulation.rows import Row
+from rcirl_jax.simulators.drive import drive
 from rcirl_jax.simulators.simulators import SIMULATORS, Simulator, open_simulator
 from rcirl_jax.simulators.table import (
     Results,
@@ -27,6 +28,7 @@ from rcirl_jax.simulators.table import (
     read_results,
     table_of,
     write_results,
+    write_table,
 )
 
 ROWS = ("hand-set", "IDM", "constant V", "+velocity", "random weights")
@@ -84,16 +86,18 @@ def _driven_before(made_by: Mapping, fixed: Set[str]) -> Results:
     return results
 
 
-def _drive(simulator: Simulator, who: Sequence[Entrant], results: Results) -> Results:
-    """All episodes by everybody, group by group; what is known is not driven again."""
+def _drive(simulator: Simulator, who: Sequence[Row | str], results: Results) -> Results:
+    """Drive all episodes by everybody, group by group; what is known is kept."""
     names = simulator.episodes(_EPISODES.value, _SEED.value)
-    for group in groups(simulator, names):
-        for entrant in who:
-            known = results.setdefault(entrant.name, {})
-            if not all(name in known for name in group):
-                known |= numbers_of(drive(simulator, entrant, group, _SECONDS.value))
+    for first in range(0, len(names), simulator.together):
+        group = names[first : first + simulator.together]
+        for driver in who:
+            name = driver if isinstance(driver, str) else driver.name
+            known = results.setdefault(name, {})
+            if not all(episode in known for episode in group):
+                known |= numbers_of(drive(simulator, driver, group, _SECONDS.value))
         write_results(Path(_OUTPUT.value) / "episodes.csv", results)
-        print(f"driven: {names.index(group[-1]) + 1} of {len(names)}", flush=True)
+        print(f"driven: {first + len(group)} of {len(names)}", flush=True)
     return {
         name: {n: drives[n] for n in names if n in drives}
         for name, drives in results.items()
@@ -110,12 +114,13 @@ def main() -> None:
     options = {name: value for name, _, value in parts}
     simulator = open_simulator(_SIMULATOR.value, **options)
     made_by = provenance(_WEIGHTS.value)
-    who = entrants(simulator, table_rows(_WEIGHTS.value, _BASELINES.value))
+    rows = table_rows(_WEIGHTS.value, _BASELINES.value)
+    who = [*rows, *simulator.own_drivers]
     fixed = {*_BASELINES.value, *simulator.own_drivers} - {"random weights"}
     before = _driven_before(made_by, fixed)
     write_json(Path(_OUTPUT.value) / "made_by.json", made_by)
     results = _drive(simulator, who, before)
     against = ["hand-set", simulator.own_drivers[0]]
     table = table_of(simulator.name, results, against)
-    print(table.write(Path(_OUTPUT.value), made_by))
+    print(write_table(Path(_OUTPUT.value), table, made_by))
     print(f"written: {_OUTPUT.value}/table.txt, episodes.csv, elsewhere.json")

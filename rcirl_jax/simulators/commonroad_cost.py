@@ -7,8 +7,8 @@ It has the shape of `commonroad_rp.cost_function.CostFunction`:
     cost.look(scene, station)  # before each planner.plan()
 
 The planner's samples are those of the rear axle on its reference path, a scene's those
-of the centre, from the ego on. V alone is the cost, of a reward with an anchor too: its
-gain is the same for all samples of a scene. `evaluate_all` knows the costs of many
+of the centre, from the ego on. V alone is the cost, also of a reward with a prior cost:
+its gain is the same for all samples of a scene. `evaluate_all` knows the costs of many
 samples at once, in a fiftieth of the time; the planner asks for them one by one.
 """
 
@@ -50,27 +50,27 @@ class RewardCost:
         self.scene, self.station, self._known = scene, station, {}
 
     def evaluate(self, trajectory: Any) -> float:  # noqa: ANN401
-        """Cost of a `commonroad_rp.trajectories.TrajectorySample`; lower is better."""
+        """Return the cost of a `TrajectorySample` of theirs; lower is better."""
         if (known := self._known.get(id(trajectory))) is not None:
             return known[1]
         return float(self._costs([trajectory])[0])
 
     def evaluate_all(self, trajectories: Sequence[Any]) -> None:
-        """Costs of samples that `evaluate` is asked for next, all of them at once."""
+        """Work out at once the costs that `evaluate` is asked for next."""
         costs = self._costs(trajectories) if trajectories else ()
         self._known = {
             id(x): (x, float(cost)) for x, cost in zip(trajectories, costs, strict=True)
         }
 
     def _costs(self, trajectories: Sequence[Any]) -> np.ndarray:
-        """Minus the values of samples [K]."""
+        """Return minus the values of samples [K]."""
         assert self.scene is not None, "look at a scene before planning"
         s, l = np.stack([self._centre(x.curvilinear) for x in trajectories], axis=1)
         features = self.columns(self.scene, s, l)
         return -self.reward.value(features, self.scene.time_valid)
 
     def _centre(self, found: Any) -> list[np.ndarray]:  # noqa: ANN401
-        """The stations and offsets m of the ego's centre at `TIMES_S`."""
+        """Return stations and offsets m of the ego's centre at `TIMES_S`."""
         s = found.s + self.rear_axle * np.cos(found.theta) - self.station
         l = found.d + self.rear_axle * np.sin(found.theta)
         time = self.dt * np.arange(len(s))
@@ -78,7 +78,7 @@ class RewardCost:
 
 
 def obstacle(kind: str, size: tuple[float, float], track: np.ndarray) -> Obstacle:
-    """A body with a known future.
+    """Return a body with a known future.
 
     Args:
       kind: "vehicle", "cyclist", "pedestrian" or "static".

@@ -3,7 +3,8 @@
 The ego is put on the reference path where its plan has it; an offset that it has at
 first fades away. The others drive as they were recorded and react to nobody, so
 that a crash counts only where it is the ego's fault. The own drivers are the reactive
-planner by its own cost and, where weights are given, by the reward as its cost.
+planner by its own cost and, where weights are given, by the reward as its cost
+(`commonroad_cost.py`). `commonroad_worker.py` is what runs in the other environment.
 """
 
 import json
@@ -15,13 +16,11 @@ from pathlib import Path
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.own_planner.inputs import Body, Car
-from rcirl_jax.simulators.simulators import STEP_S, LockStep, Move, View
-from rcirl_jax.simulators.way import Way, fading
+from rcirl_jax.simulators.simulators import STEP_S, LockStep, Move, View, Way
 
 DEFAULT = "reactive planner"
 BY_REWARD = "reactive planner, reward as cost"
-WORKER = "rcirl_jax.simulators.commonroad.worker"
-PIPE = subprocess.PIPE
+WORKER = "rcirl_jax.simulators.commonroad_worker"
 LENGTH_M, WIDTH_M = 4.508, 1.61  # m, of the car that the reactive planner plans for
 LANE_WIDTH_M = 3.5  # m
 
@@ -47,19 +46,19 @@ class CommonRoad:
             raise InputError(f"scenarios: {scenarios}: none: expected XML files")
 
     def episodes(self, count: int, seed: int) -> list[str]:
-        """SITE/SCENARIO of different files, drawn."""
+        """Return SITE/SCENARIO of different files, drawn."""
         if count > len(self.files):
             raise InputError(
-                f"--episodes: {count}: expected at most {len(self.files)}, the "
+                f"episodes: {count}: expected at most {len(self.files)}, the "
                 "scenarios that there are"
             )
         drawn = random.Random(seed).sample(sorted(self.files), count)
         return [f"{name.split('-')[0]}/{name}" for name in drawn]
 
     def start(self, episodes: Sequence[str], own: str | None) -> LockStep:
-        """A process for each."""
+        """Begin a process for each."""
         cost = {None: [], DEFAULT: ["default"], BY_REWARD: [self.weights]}[own]
-        files = [self.files[name.split("/")[1]] for name in episodes]
+        files = [str(self.files[name.split("/")[1]]) for name in episodes]
         return LockStep([Replay([self.python, "-m", WORKER, f, *cost]) for f in files])
 
 
@@ -67,33 +66,32 @@ class Replay:
     """One scenario; see `simulators.Episode`.
 
     Args:
-      command: that begins its worker.
+      command: that begins its worker; the fourth word is the scenario's file.
     """
 
-    def __init__(self, command: Sequence[str | Path]) -> None:
-        words = [str(word) for word in command]
-        self.python = words[0]
+    def __init__(self, command: Sequence[str]) -> None:
+        self.python = command[0]
         try:
-            self.process = subprocess.Popen(words, stdin=PIPE, stdout=PIPE, text=True)
+            self.process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            )
         except OSError as error:
             raise InputError(
-                f"python: {words[0]}: {error.strerror}: expected an interpreter with "
-                "commonroad-reactive-planner"
+                f"python: {self.python}: {error.strerror}: expected an interpreter "
+                "with commonroad-reactive-planner"
             ) from None
         self.now = self._heard()
         if abs(self.now["dt"] - STEP_S) > 1e-6:
             self.close()
             raise InputError(
-                f"{words[3]}: timeStepSize: {self.now['dt']:g}: expected {STEP_S:g} s"
+                f"{command[3]}: timeStepSize: {self.now['dt']:g}: expected {STEP_S:g} s"
             )
         self.line = Way(self.now["line"], self.now["limit"], LANE_WIDTH_M)
-        x, y, *_ = self.now["ego"]
-        self.begin = self.station = self.line.station(x, y)
-        self.offset = self.line.offset(x, y)
-        self.way = 0.0
+        self.begin, self.offset = self.line.project(*self.now["ego"][:2])
+        self.station, self.way = self.begin, 0.0
 
     def _heard(self) -> dict:
-        """What the worker says; {} where the scenario is over."""
+        """Return what the worker says; {} where the scenario is over."""
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
         if not line:
@@ -102,7 +100,7 @@ class Replay:
         return json.loads(line) or {}
 
     def look(self) -> View | None:
-        """What is seen now."""
+        """Return what is seen now."""
         if not self.now:
             return None
         x, y, heading, speed, acceleration, curvature = self.now["ego"]
@@ -118,31 +116,26 @@ class Replay:
                 width=WIDTH_M,
             ),
             centre_line=self.line.centre_line,
-            obstacles=[_body(row) for row in self.now["others"]],
+            obstacles=[_body(*row) for row in self.now["others"]],
             way=self.way,
             speed_limit=self.now["limit"],
         )
 
     def step(self, move: Move | None) -> None:
-        """0.1 s on; an ego that nobody drives stays where it is."""
+        """Advance 0.1 s; without a move the ego does not move."""
         assert self.process.stdin is not None
         self.process.stdin.write("\n")
         self.process.stdin.flush()
-        x, y, *_ = self.now["ego"]
-        ego = self.now["ego"] if move is None else self._moved(move)
+        x, y, *_ = ego = self.now["ego"]
+        if move is not None:
+            self.station += move.way
+            gone = self.station - self.begin
+            *there, curvature = self.line.place(self.station, self.offset, gone)
+            ego = [*there, move.speed, move.acceleration, curvature]
         said, limit = self._heard(), self.now["limit"]
         self.now = {"ego": ego, "limit": limit, **said} if said else {}
         if said:
             self.way += math.hypot(self.now["ego"][0] - x, self.now["ego"][1] - y)
-
-    def _moved(self, move: Move) -> list[float]:
-        """The ego a way farther on its line."""
-        self.station += move.way
-        aside, slope = fading(self.offset, self.station - self.begin)
-        x, y, heading, curvature = self.line.place(self.station)
-        x, y = x - aside * math.sin(heading), y + aside * math.cos(heading)
-        turn = heading + math.atan(slope)
-        return [x, y, turn, move.speed, move.acceleration, curvature]
 
     def close(self) -> None:
         """End the process."""
@@ -150,9 +143,17 @@ class Replay:
         self.process.communicate()
 
 
-def _body(row: list) -> Body:
-    """One of the others."""
-    kind, x, y, heading, speed, acceleration, length, width = row
+def _body(
+    kind: str,
+    x: float,
+    y: float,
+    heading: float,
+    speed: float,
+    acceleration: float,
+    length: float,
+    width: float,
+) -> Body:
+    """Return one of the others, from what the worker says of it."""
     return Body(
         kind=kind,
         x=x,

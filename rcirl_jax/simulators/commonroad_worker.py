@@ -1,6 +1,6 @@
 """One CommonRoad scenario step by step, in the environment that has CommonRoad.
 
-    python -m rcirl_jax.simulators.commonroad.worker SCENARIO [default|WEIGHTS]
+    python -m rcirl_jax.simulators.commonroad_worker SCENARIO [default|WEIGHTS]
 
 Says what there is at first as a line of JSON, then, for every line that it reads, what
 there is a step later; `null` where the scenario is over. The others drive as recorded.
@@ -38,7 +38,7 @@ from rcirl_jax.export.own_planner.features import (
     Scene,
 )
 from rcirl_jax.geometry.limits import LOOK_AHEAD_M, planning_limit
-from rcirl_jax.simulators.commonroad.cost import RewardCost, obstacle
+from rcirl_jax.simulators.commonroad_cost import RewardCost, obstacle
 
 BEHIND_M, AHEAD_M = 60.0, 400.0  # m by which a reference path goes on straight
 USUAL_LIMIT_MPS = 29.06  # m/s, where no sign says another: 65 mph
@@ -63,13 +63,13 @@ class Scenario:
         self._signs = TrafficSignInterpreter(country, network)
 
     def limit(self, position: np.ndarray) -> float:
-        """Posted limit m/s at a place."""
+        """Return the posted limit m/s at a place."""
         network = self.scenario.lanelet_network
         lanelets = network.find_lanelet_by_position([position])[0]
         return float(self._signs.speed_limit(frozenset(lanelets)) or USUAL_LIMIT_MPS)
 
     def others(self, step: int) -> list[list]:
-        """[kind, x, y, heading, speed, acceleration, length, width] of each now."""
+        """Return [kind, x, y, heading, speed, acceleration, length, width] of each."""
         found = []
         for body in self.scenario.obstacles:
             state = body.state_at_time(step)
@@ -81,7 +81,7 @@ class Scenario:
         return found
 
     def projected(self, body: Any, first: int, last: int) -> np.ndarray:  # noqa: ANN401
-        """Rows (t s from the first step, s, l, heading against the road, speed)."""
+        """Return rows (t s from the first step, s, l, heading on the road, speed)."""
         rows = []
         for step in range(first, last + 1):
             state = body.state_at_time(step)
@@ -98,7 +98,7 @@ class Scenario:
 
 
 def longer(points: np.ndarray) -> np.ndarray:
-    """A path that goes on straight at both ends, as its last two metres do."""
+    """Extend a path straight at both ends, as its last two metres go."""
     arc = np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
     near = np.interp([2.0, arc[-1] - 2.0], arc, np.arange(len(points)))
     inner = points[near.round().astype(int)]
@@ -109,13 +109,13 @@ def longer(points: np.ndarray) -> np.ndarray:
 
 
 def kind_of(body: Any) -> str:  # noqa: ANN401
-    """One of our kinds of bodies."""
+    """Return the kind of a body, by our names."""
     moves = hasattr(body, "prediction")
     return KINDS.get(body.obstacle_type.value, "vehicle") if moves else "static"
 
 
 def size_of(body: Any) -> tuple[float, float]:  # noqa: ANN401
-    """Length and width m of the box around a body's shape."""
+    """Return length and width m of the box around a body's shape."""
     left, low, right, high = body.obstacle_shape.shapely_object.bounds
     return float(right - left), float(high - low)
 
@@ -149,7 +149,7 @@ class Planned:
         self.state, self.plan, self.at = self.planner.x_0, None, 0
 
     def step(self) -> bool:
-        """One step on; whether there is a plan to follow.
+        """Advance one step; return whether there is a plan to follow.
 
         A plan is made every third step; where none is found, the last is followed on.
         """
@@ -184,7 +184,7 @@ def scene_of(
     state: ReactivePlannerState,
     car: Any,  # noqa: ANN401
 ) -> tuple[Scene, float]:
-    """The frame that a reward reads, and the centre's station m on the path.
+    """Return the frame that a reward reads, and the centre's station m on the path.
 
     The others' future is the recorded one, which the planner checks collisions with;
     times beyond the record do not count.
@@ -232,7 +232,7 @@ def scene_of(
 
 
 def seen(given: Scenario, driver: Planned | None, step: int) -> dict:
-    """What there is at a step: the ego if it is driven here, and the others."""
+    """Return what there is at a step: the ego if driven here, and the others."""
     said: dict[str, Any] = {"others": given.others(step)}
     if driver is not None:
         state, car = driver.state, driver.car
@@ -245,7 +245,7 @@ def seen(given: Scenario, driver: Planned | None, step: int) -> dict:
 
 
 def steps(given: Scenario, driver: Planned | None) -> Iterator[dict | None]:
-    """What is said at first and after every line that is read."""
+    """Yield what is said at first and after every line that is read."""
     start = given.problem.initial_state
     ego = [*start.position, start.orientation, start.velocity, 0.0, 0.0]
     yield {
