@@ -53,7 +53,7 @@ def planner(path: Path, weights: str) -> None:
         candidates = sample(jax.random.key(0), scene, ONLINE)
         verdict = check(scene, candidates, RankConfig().safety)
         x = feature_map(reward.preset).of_candidates(scene, candidates)
-        own, fields = incumbent_score(reward.anchor.incumbent)
+        own, fields = incumbent_score(reward.prior_cost.incumbent)
         return candidates, verdict.admissible, x, own(fields, scene, candidates)
 
     found = look(frames)

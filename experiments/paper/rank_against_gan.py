@@ -11,12 +11,12 @@ drives catalogue cases and ranks the held-out scenes of every source, in two for
     alone      V
     anchored   V_own + gain V,   gain = g spread(V_own) / spread(V)
 
-g goes from --low_share to --high_share with the support, of recordings against drives
-of the own cost as the recipe `tuned` rehearses them. Losses leave V on scales of their
-own, so g counts in spreads of the own cost: spread(V) is the standard deviation of V
-over the feasible candidates of a scene as the planner sees it, averaged over training
-scenes, as many of every source. With the defaults of g the listwise loss has about the
-gains of `tuned`, 0.2 and 2.
+g goes from --low_share to --high_share with the familiarity, of recordings against
+drives of the own cost as the recipe `tuned` rehearses them. Losses leave V on scales of
+their own, so g counts in spreads of the own cost: spread(V) is the standard deviation
+of V over the feasible candidates of a scene as the planner sees it, averaged over
+training scenes, as many of every source. With the defaults of g the listwise loss has
+about the gains of `tuned`, 0.2 and 2.
 
 Differences are paired by case, or scene; their intervals resample families, or
 vehicles, and seeds together. "smooth" is |jerk| below 6 m/s^3 throughout, "at fault"
@@ -76,7 +76,7 @@ from rcirl_jax.evaluation.statistics import (
 from rcirl_jax.export.closed_loop import score_of, table_rows
 from rcirl_jax.export.from_run import verification_samples, write_weights
 from rcirl_jax.export.loading import open_reward, scorer_of
-from rcirl_jax.export.reader import Anchor
+from rcirl_jax.export.reader import PriorCost
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.prediction import as_seen
 from rcirl_jax.planner.rank import ONLINE, Params, Score, hand_score
@@ -87,7 +87,7 @@ from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics, nuplan_score
 from rcirl_jax.simulation.rows import NULLS
 from rcirl_jax.simulation.suite import FULL_S, catalogue_set, suite_refs
 from rcirl_jax.train.state import TrainConfig
-from rcirl_jax.tune.anchoring import OWN_COST, Anchoring, fitted_anchor
+from rcirl_jax.tune.prior_cost import OWN_COST, PriorCostConfig, fitted_prior_cost
 from rcirl_jax.tune.recipes import DEFAULT, load_recipe
 from rcirl_jax.tune.rehearsal import rehearse
 from rcirl_jax.types import Scene
@@ -158,8 +158,8 @@ def trained(
     return found, seen_range(fitting_rows(frozen, shared), features)
 
 
-def fitted(shares: Anchoring, sources: Sequence[Demonstrations]) -> Anchor:
-    """The anchor with g for gains, against drives of the own cost."""
+def fitted(shares: PriorCostConfig, sources: Sequence[Demonstrations]) -> PriorCost:
+    """The prior cost with g for gains, against drives of the own cost."""
     plan = load_recipe(DEFAULT).rehearsal
     if QUICK.value:
         plan = dataclasses.replace(plan, cases=1, duration_s=QUICK_REHEARSAL_S)
@@ -173,7 +173,7 @@ def fitted(shares: Anchoring, sources: Sequence[Demonstrations]) -> Anchor:
     )
     recorded = cast("Sequence[Dataset]", sources)  # only their scenes are asked for
     features = feature_map(recipe().train.features)
-    return fitted_anchor(shares, recorded, [1.0] * len(sources), [drives], features)
+    return fitted_prior_cost(shares, recorded, [1.0] * len(sources), [drives], features)
 
 
 def some_scenes(sources: Sequence[Demonstrations]) -> tuple[Scene, np.ndarray]:
@@ -202,7 +202,7 @@ def spread(scenes: Scene, rows: jax.Array, score: Score, params: Params) -> jax.
 
 def written(
     learned: Sequence[Learned],
-    anchor: Anchor,
+    prior_cost: PriorCost,
     data: Demonstrations,
     sources: Sequence[Demonstrations],
     seen: np.ndarray,
@@ -215,13 +215,13 @@ def written(
     spreads = {OWN_COST: float(spread(scenes, rows, hand_score, None))}
     files: dict[str, dict[str, str]] = {form: {} for form in FORMS}
 
-    def save(form: str, one: Learned, on: Anchor | None) -> str:
+    def save(form: str, one: Learned, on: PriorCost | None) -> str:
         name = f"{one.config.loss} {form} {one.config.seed}"
         path = Path(OUTPUT.value) / "weights" / f"{name.replace(' ', '-')}.msgpack"
         metrics = {"pair_accuracy": float(one.wins[-1])}
         own = {**made_by, "seed": one.config.seed, "metrics": metrics}
         of = (one.params, one.normaliser, one.config, samples, own, seen)
-        write_weights(path, *of, anchor=on)
+        write_weights(path, *of, prior_cost=on)
         files[form][name] = str(path)
         return str(path)
 
@@ -229,8 +229,8 @@ def written(
         file = save("alone", one, None)
         of = spreads[file] = float(spread(scenes, rows, *score_of(open_reward(file))))
         unit = spreads[OWN_COST] / of
-        gains = {"low": anchor.low * unit, "high": anchor.high * unit}
-        save("anchored", one, dataclasses.replace(anchor, **gains))
+        gains = {"low": prior_cost.low * unit, "high": prior_cost.high * unit}
+        save("anchored", one, dataclasses.replace(prior_cost, **gains))
     return {**files["alone"], **files["anchored"]}, spreads
 
 
@@ -326,7 +326,7 @@ def print_table(columns: Mapping[str, Column]) -> None:
 def main() -> None:
     """Train, drive, rank, compare, draw."""
     gains = {"low": _LOW.value, "high": _HIGH.value}
-    shares = dataclasses.replace(load_recipe(DEFAULT).anchor, **gains)
+    shares = dataclasses.replace(load_recipe(DEFAULT).prior_cost, **gains)
     learners, (data, sources) = configs(), opened()
     learned, seen = trained(data, learners)
     each = [*sources.values()]

@@ -83,9 +83,9 @@ def main() -> None:
     """Frames, gaps, steadiness; table on the terminal, numbers as JSON, pictures."""
     quick, folder = _QUICK.value, Path(_OUTPUT.value)
     reward = open_reward(_WEIGHTS.value)
-    if reward.anchor is not None:
+    if reward.prior_cost is not None:
         raise InputError(
-            f"--weights: {reward.file}: expected a reward without an anchor: the "
+            f"--weights: {reward.file}: expected a reward without a prior cost: the "
             "lattice of the DP has no own cost"
         )
     params, config = reward_params(reward), RankConfig()

@@ -6,9 +6,9 @@
 Without --weights rewards are trained as by `experiments.paper.rank_against_gan`, whose
 flags of training these are: every loss alone and on top of the own cost. Two seeds
 train, the first drives. OUTPUT/suite holds the table of every row, OUTPUT/dp that of
-the first file without an anchor by ranking and by dynamic programming on --dp_cases of
-each family. Expected: four hours of two cores, nearly all of it the suite, a quarter of
-an hour a row. `--quick`: three minutes, numbers without meaning.
+the first file without a prior cost by ranking and by dynamic programming on --dp_cases
+of each family. Expected: four hours of two cores, nearly all of it the suite, a quarter
+of an hour a row. `--quick`: three minutes, numbers without meaning.
 """
 
 import dataclasses
@@ -53,12 +53,12 @@ def trained() -> dict[str, str]:
         "low": flags.FLAGS["low_share"].value,
         "high": flags.FLAGS["high_share"].value,
     }
-    shares = dataclasses.replace(load_recipe(DEFAULT).anchor, **gains)
+    shares = dataclasses.replace(load_recipe(DEFAULT).prior_cost, **gains)
     data, sources = rank_against_gan.opened()
     learned, seen = rank_against_gan.trained(data, rank_against_gan.configs())
     each = [*sources.values()]
-    anchor = rank_against_gan.fitted(shares, each)
-    files, _ = rank_against_gan.written(learned, anchor, data, each, seen)
+    prior_cost = rank_against_gan.fitted(shares, each)
+    files, _ = rank_against_gan.written(learned, prior_cost, data, each, seen)
     first = f" {seeds()[0]}"
     names = [name for name in files if name.endswith(first)]
     return {name.removesuffix(first): files[name] for name in names}
@@ -87,7 +87,7 @@ def main() -> None:
     rows = table_rows(files, BASELINES, names=names)
     made_by = as_used(files)
     table("suite", rows, "full", None, made_by)
-    alone = [file for file in files if open_reward(file).anchor is None]
+    alone = [file for file in files if open_reward(file).prior_cost is None]
     if alone:
         rows = table_rows(alone[:1], ("hand-set", "IDM"), dp=True)
         which = "free_cruise,stopped_lead" if QUICK.value else "full"

@@ -41,7 +41,7 @@ def main(_: list[str]) -> None:
                 (folder / f"file_{name}").write_bytes(b"\0" + data)
                 (folder / f"body_{name}").write_bytes(bytes([version]) + outer["body"])
     keys = {*reader.OUTER_KEYS, *reader.BODY_KEYS, *reader.RANGES, *reader.ACTIVATIONS}
-    keys |= {"anchor", *reader.ANCHOR_KEYS, "hand-set"}
+    keys |= {"anchor", *reader.PRIOR_COST_KEYS, "hand-set"}
     keys |= {
         "context",
         "seen",

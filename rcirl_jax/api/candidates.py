@@ -146,7 +146,7 @@ def score_candidates(
     """Value candidates as a planner that drives by a reward does.
 
     Args:
-      reward: of `load_weights`; one with an anchor is added to the hand-set cost.
+      reward: of `load_weights`; one with a prior cost is added to the hand-set cost.
       scene: one scene, as the planner sees it (`as_seen`, `scene_from`).
       candidates: K of them, sampled or your own.
 

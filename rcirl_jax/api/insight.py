@@ -19,7 +19,7 @@ def response_curves(
     """Follow a reward over each feature, all others as people drove.
 
     Args:
-      reward: of `load_weights`; of one with an anchor, what is added to the own cost.
+      reward: of `load_weights`; of one with a prior cost, what is added to it.
       dataset: whose scenes are taken.
       split: "test" or "train".
       scenes: so many, spread over the split.

@@ -37,7 +37,7 @@ def train_reward(
 
     The weights are WORKDIR/weights.msgpack. A training that was interrupted goes on
     where it was when it is called again; one that is done is not done again. The reward
-    stands alone: what a recipe says of rehearsal and anchor, `tune` does.
+    stands alone: what a recipe says of rehearsal and prior cost, `tune` does.
 
     Args:
       data: a dataset, its folder, or the folders of several, which count alike.

@@ -63,7 +63,7 @@ def tune(
         gate=GateConfig(),
         incumbent=os.fspath(incumbent),
         rehearsal=chosen.rehearsal,
-        anchor=chosen.anchor,
+        prior_cost=chosen.prior_cost,
         recipe=chosen.name,
         seeds=chosen.seeds,
         drives=drives,

@@ -109,7 +109,7 @@ def made_run(folder: Path) -> Run:
         gate=margins.gate_config(),
         incumbent=_INCUMBENT.value,
         rehearsal=rehearsal,
-        anchor=recipe.anchor,
+        prior_cost=recipe.prior_cost,
         data_weights=training.DATA_WEIGHTS.value,
         recipe=recipe.name,
         seeds=recipe.seeds if _SEEDS.value is None else _SEEDS.value,

@@ -102,9 +102,9 @@ def _convert(reward: Reward, files: Mapping[str, Path]) -> None:
     """Other forms of a weights file by flag, each with its facts beside it."""
     if not files:
         raise InputError("--onnx, --stablehlo, --jax_export, --yaml: expected one")
-    if reward.anchor is not None:
+    if reward.prior_cost is not None:
         raise InputError(
-            f"--weights: {reward.file}: expected a reward without an anchor: these "
+            f"--weights: {reward.file}: expected a reward without a prior cost: these "
             "forms hold V alone, and the gain on top of the own cost would be lost"
         )
     text = reward_yaml(reward) if "yaml" in files else ""

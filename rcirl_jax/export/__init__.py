@@ -2,7 +2,7 @@
 
 from rcirl_jax.export.guard import Guard, Limits, Verdict
 from rcirl_jax.export.reader import (
-    Anchor,
+    PriorCost,
     Reward,
     WeightsError,
     decode_weights,
@@ -19,10 +19,10 @@ from rcirl_jax.export.weights import (
 
 __all__ = [
     "PROVENANCE_KEYS",
-    "Anchor",
     "FeatureSpec",
     "Guard",
     "Limits",
+    "PriorCost",
     "Reward",
     "RewardWeights",
     "Verdict",

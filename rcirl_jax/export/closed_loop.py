@@ -5,13 +5,18 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.export.loading import open_reward, reward_params, row_names, support_of
+from rcirl_jax.export.loading import (
+    familiarity_of,
+    open_reward,
+    reward_params,
+    row_names,
+)
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.features import feature_map
-from rcirl_jax.planner.anchor import Anchored, anchored_score
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm
 from rcirl_jax.planner.dp import dp_policy
 from rcirl_jax.planner.grid import DpConfig
+from rcirl_jax.planner.prior_cost import WithPriorCost, prior_cost_score
 from rcirl_jax.planner.rank import (
     Params,
     RankConfig,
@@ -31,25 +36,25 @@ DP_EVERY = 10  # steps between two plans of the DP row: it costs 1,000 rankings
 
 
 def score_of(reward: Reward) -> tuple[Score, Params]:
-    """What a weights file drives by: V, or the own cost and V where it is anchored."""
+    """What a weights file drives by: V, or its prior cost and V."""
     features, params = feature_map(str(reward.preset)), reward_params(reward)
-    anchor = reward.anchor
-    if anchor is None:
+    prior_cost = reward.prior_cost
+    if prior_cost is None:
         return learned_score(features, reward.activation), params
     known = {"hand-set": hand_score}
-    if anchor.incumbent not in known:
+    if prior_cost.incumbent not in known:
         raise InputError(
-            f"{reward.file}: anchor.incumbent: {anchor.incumbent}: expected one of "
-            f"{', '.join(known)}, whose cost is known here"
+            f"{reward.file}: prior_cost.incumbent: {prior_cost.incumbent}: expected "
+            f"one of {', '.join(known)}, whose cost is known here"
         )
-    score = anchored_score(features, reward.activation, known[anchor.incumbent])
+    score = prior_cost_score(features, reward.activation, known[prior_cost.incumbent])
     effective, normaliser = params
-    return score, Anchored(
+    return score, WithPriorCost(
         reward=effective,
         normaliser=normaliser,
-        support=support_of(anchor),
-        low=jnp.asarray(anchor.low, jnp.float32),
-        high=jnp.asarray(anchor.high, jnp.float32),
+        familiarity=familiarity_of(prior_cost),
+        low=jnp.asarray(prior_cost.low, jnp.float32),
+        high=jnp.asarray(prior_cost.high, jnp.float32),
         own=None,
     )
 
@@ -90,10 +95,10 @@ def table_rows(
     rows = _learned_rows(rewards, names, config)
     first = rewards[0]
     preset, params = str(first.preset), reward_params(first)
-    if dp and first.anchor is not None:
+    if dp and first.prior_cost is not None:
         raise InputError(
-            f"--dp: {first.file}: expected a reward without an anchor: the own cost is "
-            "no sum over points"
+            f"--dp: {first.file}: expected a reward without a prior cost: the own cost "
+            "is no sum over points"
         )
     if dp:
         policy = dp_policy(feature_map(preset), first.activation, config, DpConfig())

@@ -11,7 +11,7 @@ import numpy as np
 
 from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.errors import UNFORESEEN, InputError
-from rcirl_jax.export.reader import Anchor, Reward
+from rcirl_jax.export.reader import PriorCost, Reward
 from rcirl_jax.export.weights import FeatureSpec, RewardWeights, save
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import (
@@ -91,7 +91,7 @@ def reward_weights(
     provenance: dict,
     seen: np.ndarray | None = None,
     *,
-    anchor: Anchor | None = None,
+    prior_cost: PriorCost | None = None,
 ) -> RewardWeights:
     """The effective weights of trained parameters, as the file holds them."""
     features = feature_map(config.features)
@@ -111,7 +111,7 @@ def reward_weights(
         kernels=tuple(np.asarray(kernel) for kernel in effective.kernels),
         context=None if effective.context is None else np.asarray(effective.context),
         seen=seen,
-        anchor=anchor,
+        prior_cost=prior_cost,
         biases=(*(np.asarray(bias) for bias in effective.biases), np.zeros(1)),
         activation=config.reward.hidden_activation,
         leaky_slope=LEAKY_SLOPE,
@@ -129,7 +129,7 @@ def export_run(
     output: Path,
     *,
     ranges: bool = True,
-    anchor: Anchor | None = None,
+    prior_cost: PriorCost | None = None,
 ) -> Reward:
     """Write weights.msgpack from a run's newest checkpoint.
 
@@ -142,7 +142,7 @@ def export_run(
       output: file to write, atomically.
       ranges: record what the training saw of each feature (schema version 3), from
         the scenes that fitted the normaliser.
-      anchor: of a reward driven on top of an incumbent (version 4; needs the ranges).
+      prior_cost: of a reward driven on top of an incumbent (needs the ranges).
 
     Raises:
       InputError: no run, no checkpoint, another dataset, or another network than
@@ -167,7 +167,7 @@ def export_run(
         verification_samples(dataset, config),
         _provenance(workdir, state, config, run),
         seen,
-        anchor=anchor,
+        prior_cost=prior_cost,
     )
 
 
@@ -180,7 +180,7 @@ def write_weights(
     provenance: dict,
     seen: np.ndarray | None = None,
     *,
-    anchor: Anchor | None = None,
+    prior_cost: PriorCost | None = None,
 ) -> Reward:
     """Write trained parameters as weights.msgpack, atomically.
 
@@ -193,12 +193,12 @@ def write_weights(
         trainer computes them.
       provenance: `weights.PROVENANCE_KEYS` and more.
       seen: [2, F] of `seen_range`, if known.
-      anchor: of a reward driven on top of an incumbent.
+      prior_cost: of a reward driven on top of an incumbent.
     """
     x, valid = map(jnp.asarray, samples)
     values = value(params, normaliser, x, valid, config.reward)
     weights = reward_weights(
-        params, normaliser, config, provenance, seen, anchor=anchor
+        params, normaliser, config, provenance, seen, prior_cost=prior_cost
     )
     output.parent.mkdir(parents=True, exist_ok=True)
     return save(output, weights, *samples, np.asarray(values))

@@ -141,12 +141,12 @@ class Guard:
 
         Raises:
           ValueError: no candidate, values of other candidates, or none that is a
-            number where the incumbent has to choose; a reward with an anchor, which
+            number where the incumbent has to choose; a reward with a prior cost, which
             is added to the incumbent's value everywhere (`Reward.total`).
         """
-        if getattr(self.reward, "anchor", None) is not None:
+        if getattr(self.reward, "prior_cost", None) is not None:
             raise ValueError(
-                "guard: a reward with an anchor: expected one without: choose by "
+                "guard: a reward with a prior cost: expected one without: choose by "
                 "Reward.total, which leaves the choice to your own cost by itself"
             )
         values = np.asarray(incumbent, np.float64)

@@ -12,10 +12,10 @@ import numpy as np
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.score import OnTop
-from rcirl_jax.export.reader import Anchor, Reward, WeightsError, load_weights
+from rcirl_jax.export.reader import PriorCost, Reward, WeightsError, load_weights
 from rcirl_jax.features.mapping import FeatureMap, feature_map, known_presets
+from rcirl_jax.reward.familiarity import Familiarity
 from rcirl_jax.reward.module import LEAKY_SLOPE, module_value, network_of, variables_of
-from rcirl_jax.reward.support import Support
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.types import Normaliser, RewardParams
 
@@ -111,19 +111,19 @@ def reward_params(reward: Reward) -> tuple[RewardParams, Normaliser]:
     )
 
 
-def support_of(anchor: Anchor) -> Support:
-    """A weights file's anchor as the pytree that JAX code takes."""
+def familiarity_of(prior_cost: PriorCost) -> Familiarity:
+    """A weights file's prior cost as the pytree that JAX code takes."""
     names = ("location", "scale", "kernel", "bias", "out")
-    arrays = {n: jnp.asarray(getattr(anchor, n), jnp.float32) for n in names}
-    offset = jnp.asarray(np.ravel(anchor.offset)[0], jnp.float32)
-    return Support(**arrays, offset=offset)
+    arrays = {n: jnp.asarray(getattr(prior_cost, n), jnp.float32) for n in names}
+    offset = jnp.asarray(np.ravel(prior_cost.offset)[0], jnp.float32)
+    return Familiarity(**arrays, offset=offset)
 
 
 def scorer_of(reward: Reward) -> Scorer | OnTop:
-    """The reward as a row of ranking tables: V, on top of its anchor if it has one."""
-    if reward.anchor is None:
+    """The reward as a row of ranking tables: V, on top of its prior cost if any."""
+    if reward.prior_cost is None:
         return reward.value
-    return OnTop(incumbent=reward.anchor.incumbent, total=reward.total)
+    return OnTop(incumbent=reward.prior_cost.incumbent, total=reward.total)
 
 
 def compiled_scorer(reward: Reward) -> Scorer:
@@ -170,7 +170,7 @@ def row_name(reward: Reward) -> str:
     }
     loss = str(reward.loss.get("name"))
     by_scene = "" if reward.context is None else ", by context"
-    on = "" if reward.anchor is None else f", on {reward.anchor.incumbent}"
+    on = "" if reward.prior_cost is None else f", on {reward.prior_cost.incumbent}"
     words = name.get(loss, loss.replace("_", " "))
     return f"{words} {shape if hidden else 'linear'}{by_scene}{on}"
 
@@ -232,15 +232,16 @@ def _are_seeds(group: Sequence[Reward]) -> bool:
     return len(set(map(_seed, group))) == len(group)
 
 
-def anchor_words(name: str, reward: Reward) -> str:
-    """One sentence on what an anchored reward drives by; "" of another one."""
-    anchor = reward.anchor
-    if anchor is None:
+def prior_cost_words(name: str, reward: Reward) -> str:
+    """One sentence on what a reward with a prior cost drives by; "" of another one."""
+    prior_cost = reward.prior_cost
+    if prior_cost is None:
         return ""
     return (
-        f"The {name} is anchored: it drives by V_total = own cost ({anchor.incumbent}, "
-        f"negated) + gain V, with a gain from {anchor.low:g}, where nothing like the "
-        f"scene was recorded, to {anchor.high:g}, where all of it was."
+        f"The {name} has a prior cost: it drives by V_total = own cost "
+        f"({prior_cost.incumbent}, negated) + gain V, with a gain from "
+        f"{prior_cost.low:g}, where nothing like the scene was recorded, to "
+        f"{prior_cost.high:g}, where all of it was."
     )
 
 

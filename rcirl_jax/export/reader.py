@@ -8,7 +8,7 @@ gives the byte layout; the equation is
     r_t = act(... act(x_t W_1 + b_1) ...) W_L + b_L          last layer linear
     V   = sum_t gamma_t * time_valid_t * r_t                 higher is better
 
-An anchored reward (schema version 4) is driven on top of the planner's own cost:
+A reward with a prior cost (schema version 4) is driven on the planner's own cost:
 
     V_total = V_incumbent + gain V
     gain    = low + (high - low) sigmoid(out . tanh(z W + b) + c)
@@ -33,7 +33,7 @@ import numpy as np
 MAGIC = "RCIRLW"  # first value of the outer map
 SCHEMA_VERSIONS = (1, 2, 3, 4)  # the layouts this reader knows
 TOLERANCE = 1e-5  # of max(1, |V|), on a verification sample, float32; of gains too
-REACH = 5.0  # scales from the location beyond which an anchor's inputs are clipped
+REACH = 5.0  # scales from the location beyond which a prior cost's inputs are clipped
 
 # Limits, far above any sensible reward (the paper's network is 21 -> 15 -> 1).
 MAX_FILE_BYTES = 64 * 2**20  # bytes
@@ -52,9 +52,9 @@ OUTER_KEYS = ("magic", "schema_version", "body", "sha256")
 RANGES = ("lower", "upper", "location", "scale")
 GRID_KEYS = ("preset", "features", "normaliser", "times", "gamma")
 NETWORK_KEYS = ("layers", "activation", "leaky_slope")
-ANCHOR_NUMBERS = ("low", "high")
-ANCHOR_ARRAYS = ("location", "scale", "kernel", "bias", "out", "offset")
-ANCHOR_KEYS = ("incumbent", *ANCHOR_NUMBERS, *ANCHOR_ARRAYS, "gain")
+PRIOR_COST_NUMBERS = ("low", "high")
+PRIOR_COST_ARRAYS = ("location", "scale", "kernel", "bias", "out", "offset")
+PRIOR_COST_KEYS = ("incumbent", *PRIOR_COST_NUMBERS, *PRIOR_COST_ARRAYS, "gain")
 BODY_KEYS = (*GRID_KEYS, *NETWORK_KEYS, "loss", "provenance", "samples")
 ACTIVATIONS: dict[str, Callable[[np.ndarray, np.float32], np.ndarray]] = {
     "tanh": lambda x, slope: np.tanh(x),
@@ -73,7 +73,7 @@ class WeightsError(ValueError):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class Anchor:
+class PriorCost:
     """How much of V is added to the incumbent's value; the equation stands above."""
 
     incumbent: str  # whose value V is added to, at most 64 characters
@@ -125,7 +125,7 @@ class Reward:
     leaky_slope: float  # negative slope of "leaky_relu"
     context: np.ndarray | None  # [F, F] C, gains by the scene
     seen: np.ndarray | None  # [2, F] ends of the training's range, from version 3
-    anchor: Anchor | None  # version 4: drives on top of an incumbent, by `total`
+    prior_cost: PriorCost | None  # version 4: drives on top of an incumbent, by `total`
     loss: dict[str, Any]
     provenance: dict[str, Any]
 
@@ -165,19 +165,19 @@ class Reward:
         return self._finite("value", self._values(numbers, valid), "finite features")
 
     def gain(self, features: np.ndarray) -> np.ndarray:
-        """How much of V an anchored reward adds to the incumbent's value.
+        """How much of V a reward with a prior cost adds to the incumbent's value.
 
         Args:
           features: [..., T, F] raw features at `times`; the first time counts.
 
         Returns:
-          float32 [...] in [low, high]. A reward without an anchor raises, and a NaN
+          float32 [...] in [low, high]. A reward without a prior cost raises, and a NaN
           among the features that matter (whose row of the kernel is not 0).
         """
-        if self.anchor is None:
-            _fail(f"{self.file}: anchor", "missing", "an anchored reward")
+        if self.prior_cost is None:
+            _fail(f"{self.file}: anchor", "missing", "a reward with a prior cost")
         numbers = self._numbers(features, (len(self.times), len(self.names)))
-        gains = self.anchor.gain(numbers[..., 0, :])
+        gains = self.prior_cost.gain(numbers[..., 0, :])
         return self._finite("gain", gains, "finite features at the first time")
 
     def total(
@@ -348,7 +348,7 @@ def _fields(body: dict[str, Any]) -> dict[str, Any]:
     if "seen" in body:
         seen = _array("seen", seen, (2, size))
         _every("seen", seen[:1], seen[:1] <= seen[1:], "at most the highest")
-    anchor = read_anchor(body["anchor"], size) if "anchor" in body else None
+    prior_cost = read_prior_cost(body["anchor"], size) if "anchor" in body else None
     loss = _map("loss", body["loss"], ("name", "leaky_rate"))
     _text("loss.name", loss["name"])
     if loss["leaky_rate"] is not None:
@@ -364,7 +364,7 @@ def _fields(body: dict[str, Any]) -> dict[str, Any]:
         "leaky_slope": _number("leaky_slope", body["leaky_slope"]),
         "context": context,
         "seen": seen,
-        "anchor": anchor,
+        "prior_cost": prior_cost,
         "loss": loss,
         "provenance": _plain("provenance", body["provenance"], MAX_DEPTH),
     }
@@ -398,15 +398,15 @@ def _layers(value: object, width: int) -> dict[str, tuple[np.ndarray, ...]]:
     return {"kernels": tuple(kernels), "biases": tuple(biases)}
 
 
-def read_anchor(value: object, features: int) -> Anchor:
+def read_prior_cost(value: object, features: int) -> PriorCost:
     """The body's `anchor`, checked but for the gains of the samples.
 
     Raises:
       WeightsError: a field is wrong.
     """
-    box = _map("anchor", value, ANCHOR_KEYS)
+    box = _map("anchor", value, PRIOR_COST_KEYS)
     text = _text("anchor.incumbent", box["incumbent"])
-    low, high = (_number(f"anchor.{key}", box[key]) for key in ANCHOR_NUMBERS)
+    low, high = (_number(f"anchor.{key}", box[key]) for key in PRIOR_COST_NUMBERS)
     if low < 0.0:
         _fail("anchor.low", low, "at least 0")
     if high < low:
@@ -416,7 +416,7 @@ def read_anchor(value: object, features: int) -> Anchor:
     _every("anchor.scale", scale, scale > 0.0, "over 0")
     kernel = read("kernel", features, range(1, MAX_UNITS + 1))
     units = kernel.shape[1]
-    return Anchor(
+    return PriorCost(
         incumbent=text,
         low=low,
         high=high,
@@ -441,7 +441,7 @@ def _plain(field: str, value: Any, depth: int) -> Any:  # noqa: ANN401
     return value
 
 
-def _verify(reward: Reward, samples: object, anchor: Any) -> None:  # noqa: ANN401
+def _verify(reward: Reward, samples: object, prior_cost: Any) -> None:  # noqa: ANN401
     """The file's own samples must score, and have gains, as the file says."""
     found = _map("samples", samples, ("features", "valid", "value"))
     wanted = _array("samples.value", found["value"], (range(1, MAX_SAMPLES + 1),))
@@ -449,7 +449,7 @@ def _verify(reward: Reward, samples: object, anchor: Any) -> None:  # noqa: ANN4
     features = _array("samples.features", found["features"], shape)
     valid = _array("samples.valid", found["valid"], shape[:2])
     _every("samples.valid", valid, (valid == 0.0) | (valid == 1.0), "0 or 1")
-    if reward.context is not None or reward.anchor is not None:
+    if reward.context is not None or reward.prior_cost is not None:
         first = valid[:, :1]
         _every("samples.valid", first, first == 1.0, "1 at the first time")
     # One sample at a time: little memory, however wide the layers are.
@@ -458,10 +458,10 @@ def _verify(reward: Reward, samples: object, anchor: Any) -> None:  # noqa: ANN4
         if not abs(scored - want) <= TOLERANCE * max(1.0, abs(want)):
             need = f"{want:.9g} within {TOLERANCE:g} of max(1, |V|)"
             _fail(f"samples[{index}]", f"scored {scored:.9g}", need)
-    if reward.anchor is not None:
-        gains = _array("anchor.gain", anchor["gain"], (len(wanted),))
+    if reward.prior_cost is not None:
+        gains = _array("anchor.gain", prior_cost["gain"], (len(wanted),))
         with np.errstate(all="ignore"):
-            error = np.abs(reward.anchor.gain(features[:, 0]).astype(float) - gains)
+            error = np.abs(reward.prior_cost.gain(features[:, 0]).astype(float) - gains)
         good = error <= TOLERANCE * np.maximum(1.0, np.abs(gains))
         _every("anchor.gain", gains, good, "the gain of the sample")
 

@@ -38,7 +38,7 @@ def responses(
     """Curves of all features that the reward uses.
 
     Args:
-      reward: V is its `value`, also where it is anchored.
+      reward: V is its `value`, also where it has a prior cost.
       mine: [S, T, F] raw features of humans.
       theirs: [S, K, T, F] of candidates of the same scenes.
       valid: [S, T] bool; elsewhere features do not count.

@@ -66,7 +66,9 @@ class RewardWeights:
     biases: tuple[np.ndarray, ...]  # [H1], ..., [1]; one for every kernel
     context: np.ndarray | None = None  # [F, F], gains by scene; None: one reward
     seen: np.ndarray | None = None  # [2, F], ends of the training's range, or unknown
-    anchor: reader.Anchor | None = None  # of a reward driven on top of an incumbent
+    prior_cost: reader.PriorCost | None = (
+        None  # of a reward driven on top of an incumbent
+    )
     activation: str  # of the hidden layers: tanh, relu, leaky_relu, identity
     leaky_slope: float  # negative slope of the hidden leaky_relu
     loss: Mapping[str, Any]  # name; leaky_rate of the rank loss, or None
@@ -169,7 +171,7 @@ def _pack_checked(
 
 def _version(weights: RewardWeights) -> int:
     """The least that has all fields: who reads an older one goes on reading."""
-    if weights.anchor is not None:
+    if weights.prior_cost is not None:
         return 4
     if weights.seen is not None:
         return 3
@@ -193,10 +195,14 @@ def _body(weights: RewardWeights, samples: tuple[np.ndarray, ...]) -> dict[str, 
         for name, value in (("seen", weights.seen), ("context", weights.context))
         if value is not None
     }
-    if weights.anchor is not None:
+    if weights.prior_cost is not None:
         if weights.seen is None:
-            raise ValueError("seen: missing: expected ranges in an anchored reward")
-        more["anchor"] = _anchor(weights.anchor, len(weights.features), samples[0])
+            raise ValueError(
+                "seen: missing: expected ranges in a reward with a prior cost"
+            )
+        more["anchor"] = _prior_cost(
+            weights.prior_cost, len(weights.features), samples[0]
+        )
     layers = zip(weights.kernels, weights.biases, strict=True)
     names = ("features", "valid", "value")
     return {
@@ -227,18 +233,18 @@ def _body(weights: RewardWeights, samples: tuple[np.ndarray, ...]) -> dict[str, 
     }
 
 
-def _anchor(
-    anchor: reader.Anchor, features: int, samples_x: np.ndarray
+def _prior_cost(
+    prior_cost: reader.PriorCost, features: int, samples_x: np.ndarray
 ) -> dict[str, Any]:
     """The map `anchor`, with the gains of the samples as its reader has them."""
-    arrays = {key: getattr(anchor, key) for key in reader.ANCHOR_ARRAYS}
+    arrays = {key: getattr(prior_cost, key) for key in reader.PRIOR_COST_ARRAYS}
     box = {
-        "incumbent": anchor.incumbent,
-        **{key: _plain(getattr(anchor, key)) for key in reader.ANCHOR_NUMBERS},
+        "incumbent": prior_cost.incumbent,
+        **{key: _plain(getattr(prior_cost, key)) for key in reader.PRIOR_COST_NUMBERS},
         **{key: _array(f"anchor.{key}", item) for key, item in arrays.items()},
         "gain": None,
     }
-    read = reader.read_anchor(box, features)
+    read = reader.read_prior_cost(box, features)
     x = np.asarray(samples_x)
     # of another shape: the reader names the samples
     fits = x.dtype.kind in "fiub" and x.ndim == 3 and x.shape[-1] == features

@@ -9,7 +9,7 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.gate.types import GateConfig
 from rcirl_jax.export.sweep.result import read_sweep
 from rcirl_jax.train.state import TrainConfig
-from rcirl_jax.tune.anchoring import Anchoring
+from rcirl_jax.tune.prior_cost import PriorCostConfig
 from rcirl_jax.tune.rehearsal import Rehearsal
 
 
@@ -21,7 +21,7 @@ class TuneConfig:
     gate: GateConfig
     incumbent: str = "hand-set"  # weights file or baseline
     rehearsal: Rehearsal = dataclasses.field(default_factory=Rehearsal)
-    anchor: Anchoring = dataclasses.field(default_factory=Anchoring)
+    prior_cost: PriorCostConfig = dataclasses.field(default_factory=PriorCostConfig)
     data_weights: str = EQUAL  # of several sources, as `data.store.joined.shares_of`
     recipe: str = ""  # its name, for the report
     seeds: int = 1

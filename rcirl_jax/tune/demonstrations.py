@@ -13,7 +13,7 @@ from rcirl_jax.data.store.joined import Demonstrations, JoinedDatasets
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.pipeline import digest, file_sha256
 from rcirl_jax.tune.rehearsal import rehearse
-from rcirl_jax.tune.rewards import fit_anchor, train_round
+from rcirl_jax.tune.rewards import fit_prior_cost, train_round
 from rcirl_jax.tune.run import Run
 
 
@@ -72,14 +72,14 @@ def with_rehearsal(
         learner = None
         if number:
             learner = run.folder / "rounds" / f"{number}.msgpack"
-            anchor = fit_anchor(run, sources, given[: len(sources)], drives)
-            train_round(run, joined, number, learner, anchor)
+            prior_cost = fit_prior_cost(run, sources, given[: len(sources)], drives)
+            train_round(run, joined, number, learner, prior_cost)
         drives.append(_rehearsed(run, number, learner))
         if plan.weights[number] > 0.0:
             made.append(drives[-1])
             given.append(plan.weights[number])
             joined = _as_one(made, given)
-    fit_anchor(run, sources, given[: len(sources)], drives)
+    fit_prior_cost(run, sources, given[: len(sources)], drives)
     return joined
 
 

@@ -15,7 +15,7 @@ from rcirl_jax.errors import InputError, extra_of
 from rcirl_jax.evaluation.gate.runs import CANDIDATE
 from rcirl_jax.evaluation.gate.types import Verdict
 from rcirl_jax.evaluation.gate.words import WIDTH
-from rcirl_jax.export.loading import anchor_words, open_reward
+from rcirl_jax.export.loading import open_reward, prior_cost_words
 from rcirl_jax.tune.demonstrations import kept_source, source, with_rehearsal
 from rcirl_jax.tune.evidence import (
     gate,
@@ -152,9 +152,9 @@ def _check_incumbent(run: Run) -> None:
 
 
 def _said_of_weights(run: Run) -> str:
-    """Features that the training never saw vary; gains, if anchored; one a line."""
+    """Features that the training never saw vary; gains of a prior cost; one a line."""
     reward = open_reward(str(run.weights))
     silent = "features without effect, for they never vary in the training data: "
     silent += ", ".join(reward.unsupported) or "none"
-    anchored = anchor_words(CANDIDATE, reward)
-    return "\n".join(filter(None, (silent, anchored)))
+    prior = prior_cost_words(CANDIDATE, reward)
+    return "\n".join(filter(None, (silent, prior)))

@@ -6,10 +6,9 @@
 
 [train] are fields of `TrainConfig`, [train.reward] of `RewardConfig` (`by_context`
 stands for the preset's context columns), [train.sampler] of `SamplerConfig`, [collect]
-of `CollectConfig`, [rehearsal] of `Rehearsal`, [anchor] of `Anchoring`. What a file
-leaves out is the field's
-own default. Nothing else has a default of its own: commands take a recipe, and flags
-given beside it win.
+of `CollectConfig`, [rehearsal] of `Rehearsal`, [prior_cost] of `PriorCostConfig`.
+What a file leaves out is the field's own default. Nothing else has a default of
+its own: commands take a recipe, and flags given beside it win.
 """
 
 import dataclasses
@@ -25,11 +24,11 @@ from rcirl_jax.runtime.settings import check_names, typed_fields
 from rcirl_jax.runtime.specs import load_toml, spec_root
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train.state import TrainConfig
-from rcirl_jax.tune.anchoring import Anchoring
+from rcirl_jax.tune.prior_cost import PriorCostConfig
 from rcirl_jax.tune.rehearsal import Rehearsal
 
 DEFAULT = "tuned"
-TABLES = ("about", "train", "collect", "rehearsal", "anchor", "autotune")
+TABLES = ("about", "train", "collect", "rehearsal", "prior_cost", "autotune")
 # of a run, not of a recipe
 NOT_OF_A_RECIPE = ("seed", "reward", "sampler")
 PRESETS_OWN = ("context", "signs")  # of a reward, what its feature preset says
@@ -44,7 +43,7 @@ class Recipe:
     train: TrainConfig
     collect: CollectConfig
     rehearsal: Rehearsal
-    anchor: Anchoring
+    prior_cost: PriorCostConfig
     seeds: int  # training runs of which the median one drives
 
 
@@ -84,10 +83,12 @@ def load_recipe(name: str) -> Recipe:
     settings["reward"] = _reward(path, reward, settings.get("features", "paper21"))
     settings["sampler"] = _made(path, "train.sampler", SamplerConfig, sampler)
     rehearsal = _made(path, "rehearsal", Rehearsal, _table(path, "rehearsal", body))
-    anchor = _made(path, "anchor", Anchoring, _table(path, "anchor", body))
-    if anchor.wanted and not rehearsal.datasets:
+    prior_cost = _made(
+        path, "prior_cost", PriorCostConfig, _table(path, "prior_cost", body)
+    )
+    if prior_cost.wanted and not rehearsal.datasets:
         raise InputError(
-            f"{path}: [rehearsal] teacher: none: expected one with an [anchor]: its "
+            f"{path}: [rehearsal] teacher: none: expected one with a [prior_cost]: its "
             "drives show what was not recorded"
         )
     collect, none = _table(path, "collect", body), ("signal_checks",)
@@ -97,7 +98,7 @@ def load_recipe(name: str) -> Recipe:
         train=_built(path, "train", TrainConfig, settings),
         collect=_made(path, "collect", CollectConfig, collect, none),
         rehearsal=rehearsal,
-        anchor=anchor,
+        prior_cost=prior_cost,
         seeds=seeds,
     )
 

@@ -6,9 +6,9 @@ learned so far, which the teacher takes over from in turn: its way out of where 
 learner's own mistakes lead becomes a demonstration too (Ross et al. 2011, "DAgger",
 with takeovers). What is driven is a dataset like any other, with a weight of its own.
 
-Drives of weight 0 are not learned from. They show what an anchored reward
-(`autotune.anchoring`) has to leave to the planner's own cost; in further rounds the
-anchored reward drives alone, and shows where it gets to by itself.
+Drives of weight 0 are not learned from. They show what a reward with a prior cost
+(`tune.prior_cost`) has to leave to the planner's own cost; in further rounds the
+reward with a prior cost drives alone, and shows where it gets to by itself.
 """
 
 import dataclasses

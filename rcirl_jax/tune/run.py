@@ -3,7 +3,7 @@
 RUN/dataset-KEY/       the import of each log, unless datasets are given
 RUN/rehearsal-KEY/N/   the rehearsed catalogue: the teacher's drives, then each round's
 RUN/rounds/N.msgpack   the reward that the teacher of round N takes over from
-RUN/anchors/N.json     how far the recordings reach, against N sets of drives
+RUN/prior_costs/N.json how far the recordings reach, against N sets of drives
 RUN/train-KEY/seed-N/  training runs; KEY changes with what they are made from
 RUN/seeds/N.msgpack    every seed's reward
 RUN/weights.msgpack    the candidate: of the seeds the one with the median share of

@@ -40,7 +40,7 @@ def test_an_old_file_scores_as_it_did(version):
     reward = load_weights(path)
     assert (reward.context is None) == (version == 1)
     assert (reward.seen is None) == (version < 3)
-    assert (reward.anchor is None) == (version < 4)
+    assert (reward.prior_cost is None) == (version < 4)
     assert reward.names == ("feature0", "feature1", "feature2", "feature3")
     assert reward.provenance["git_commit"] == "2fe49aa"
     found = reward.value(features, valid)

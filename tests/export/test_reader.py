@@ -23,10 +23,10 @@ from rcirl_jax.export import (
     save,
 )
 from tests.export.wrong import (
-    ANCHORED,
     FIELDS,
     FILES,
     VALID,
+    WITH_PRIOR,
     array,
     body_of,
     flipped,
@@ -171,10 +171,10 @@ def test_wrong_arguments_are_one_line(features, time_valid, message):
 def test_the_total_is_the_incumbents_value_and_the_gained_one():
     weights = example_weights(anchored=True)
     features, valid, values = example_samples(weights, count=6, seed=4)
-    reward = decode_weights(ANCHORED)
+    reward = decode_weights(WITH_PRIOR)
     gains = reward.gain(features)
     assert gains.dtype == np.float32
-    expected = [loop_gain(weights.anchor, one[0]) for one in features]
+    expected = [loop_gain(weights.prior_cost, one[0]) for one in features]
     np.testing.assert_allclose(gains, expected, rtol=1e-6)
     assert np.ptp(gains) > 0.1
     own = np.linspace(-3.0, 50.0, 6)
@@ -190,7 +190,7 @@ def test_the_total_is_the_incumbents_value_and_the_gained_one():
 
 
 def test_a_gain_needs_the_features_that_matter_to_it():
-    reward = decode_weights(ANCHORED)
+    reward = decode_weights(WITH_PRIOR)
     features, *_ = example_samples(example_weights(anchored=True), count=3)
     expected = reward.gain(features)
     features[:, 0, 0] = np.nan  # its row of the kernel is 0
@@ -202,7 +202,11 @@ def test_a_gain_needs_the_features_that_matter_to_it():
     for found, x, message in (
         (reward, features, r"weights: gain\[1\]: not finite: expected f"),
         (reward, features[:, 1:], r"features: float32 \(3, 3, 3\): expected"),
-        (decode_weights(VALID), features, "anchor: missing: expected an anchored"),
+        (
+            decode_weights(VALID),
+            features,
+            "anchor: missing: expected a reward with a prior",
+        ),
     ):
         with pytest.raises(WeightsError, match=message):
             found.gain(x)
@@ -221,7 +225,7 @@ def test_a_gain_needs_the_features_that_matter_to_it():
 def test_what_has_no_total_is_one_line(own, late, message):
     features, valid, _ = example_samples(example_weights(anchored=True), count=3)
     with pytest.raises(WeightsError, match=message):
-        decode_weights(ANCHORED).total(
+        decode_weights(WITH_PRIOR).total(
             features, own, np.arange(4) > 0 if late else valid
         )
 
@@ -261,7 +265,7 @@ def test_a_wrong_file_is_refused(data, message):
     ("data", "path", "place"),
     [
         (VALID, ["samples", "value", "data"], "samples[0]: scored"),
-        (ANCHORED, ["anchor", "gain", "data"], "anchor.gain[0]: "),
+        (WITH_PRIOR, ["anchor", "gain", "data"], "anchor.gain[0]: "),
     ],
 )
 def test_samples_and_gains_are_met_to_one_part_in_a_hundred_thousand(data, path, place):
@@ -329,7 +333,7 @@ def only_weights_errors(data):
         # Harmless for the samples, such as another name: it scores, or says why not.
         zeros = np.zeros((len(reward.times), len(reward.names)))
         value = reward.value(zeros)
-        if reward.anchor is not None:
+        if reward.prior_cost is not None:
             value = reward.total(zeros, value)
     except WeightsError:
         return
@@ -359,7 +363,7 @@ def places(value, way=()):
 
 
 PLACES = [(VALID, way) for way in places(body_of())]
-PLACES += [(ANCHORED, ("anchor", *x)) for x in places(body_of(ANCHORED)["anchor"])]
+PLACES += [(WITH_PRIOR, ("anchor", *x)) for x in places(body_of(WITH_PRIOR)["anchor"])]
 
 
 @settings(max_examples=2 * CASES)

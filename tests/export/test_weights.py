@@ -27,7 +27,7 @@ from rcirl_jax.export import (
 from rcirl_jax.runtime.specs import spec_root
 from tests.helpers.weights_files import (
     ACTIVATIONS,
-    example_anchor,
+    example_prior_cost,
     example_samples,
     example_weights,
     loop_value,
@@ -93,13 +93,13 @@ def test_everything_comes_back_as_it_was_given():
     assert (reward.preset, reward.loss) == ("test", weights.loss)
     assert reward.provenance == provenance()
     assert type(reward.provenance["metrics"]["steps"]) is int
-    made, found = weights.anchor, reward.anchor
+    made, found = weights.prior_cost, reward.prior_cost
     assert made is not None
     assert found is not None
-    assert_back(found, made, reader.ANCHOR_ARRAYS)
+    assert_back(found, made, reader.PRIOR_COST_ARRAYS)
     for name in ("incumbent", "low", "high"):
         assert getattr(found, name) == getattr(made, name)
-    assert decode_weights(packed(seen=True)).anchor is None
+    assert decode_weights(packed(seen=True)).prior_cost is None
 
 
 def test_same_input_same_bytes_whatever_the_order_of_keys(tmp_path):
@@ -143,7 +143,7 @@ def test_layout_is_the_documented_one():
         assert other["schema_version"] == version
         found = msgpack.unpackb(other["body"])
         assert tuple(found) == (*reader.BODY_KEYS, *more)
-        assert version < 4 or tuple(found["anchor"]) == reader.ANCHOR_KEYS
+        assert version < 4 or tuple(found["anchor"]) == reader.PRIOR_COST_KEYS
     kernel = body["layers"][0]["kernel"]
     assert (kernel["shape"], kernel["dtype"]) == ([3, 5], "<f4")
     weights = example_weights()
@@ -192,11 +192,11 @@ def test_schema_describes_the_body_and_refuses_others():
         json.dumps(made, allow_nan=False)
     gamma = np.frombuffer(base64.b64decode(body["gamma"]["data"]), "<f4")
     np.testing.assert_array_equal(gamma, example_weights(hidden=(4, 2)).gamma)
-    found, anchor = schema["properties"], schema["properties"]["anchor"]
+    found, prior_cost = schema["properties"], schema["properties"]["anchor"]
     assert set(schema["required"]) == set(reader.BODY_KEYS)
     assert set(found) == {*reader.BODY_KEYS, "context", "seen", "anchor"}
-    assert set(anchor["required"]) == set(anchor["properties"])
-    assert set(anchor["required"]) == set(reader.ANCHOR_KEYS)
+    assert set(prior_cost["required"]) == set(prior_cost["properties"])
+    assert set(prior_cost["required"]) == set(reader.PRIOR_COST_KEYS)
     assert found["activation"]["enum"] == sorted(ACTIVATIONS)
 
     def less(made, key):
@@ -209,7 +209,7 @@ def test_schema_describes_the_body_and_refuses_others():
     ]  # fmt: skip
     for key in reader.BODY_KEYS:
         wrong += [less(body, key), {**body, key: True}]
-    for key in reader.ANCHOR_KEYS:
+    for key in reader.PRIOR_COST_KEYS:
         box = anchored["anchor"]
         others = (less(box, key), {**box, key: True}, {**box, "extra": 1})
         wrong += [{**anchored, "anchor": other} for other in others]
@@ -268,9 +268,12 @@ def test_what_a_reader_would_refuse_is_never_written(changes, message, tmp_path)
 )
 def test_an_anchor_that_a_reader_would_refuse_is_never_written(changes, message):
     weights = example_weights(anchored=True)
-    anchor = dataclasses.replace(example_anchor(), **changes)
+    prior_cost = dataclasses.replace(example_prior_cost(), **changes)
     with pytest.raises(InputError) as caught:
-        pack(dataclasses.replace(weights, anchor=anchor), *example_samples(weights))
+        pack(
+            dataclasses.replace(weights, prior_cost=prior_cost),
+            *example_samples(weights),
+        )
     assert f"weights: {message}" in str(caught.value)
 
 

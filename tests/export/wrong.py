@@ -13,7 +13,7 @@ import numpy as np
 from tests.helpers.weights_files import packed
 
 VALID = packed()
-ANCHORED = packed(anchored=True)
+WITH_PRIOR = packed(anchored=True)
 
 
 def dump(value) -> bytes:
@@ -45,7 +45,7 @@ def body_of(data=VALID):
 
 def tampered(path, value, data=None):
     """A valid file with one field of its body replaced, and hashed again."""
-    data = data or (ANCHORED if path[0] == "anchor" else VALID)
+    data = data or (WITH_PRIOR if path[0] == "anchor" else VALID)
     body = body_of(data)
     *way, last = path
     place = body
@@ -62,7 +62,7 @@ def flipped(data, bits):
     return bytes(changed)
 
 
-ANCHOR_FIELDS = (
+PRIOR_COST_FIELDS = (
     ([], None, "anchor: None: expected a map"),
     ([], {}, "anchor.incumbent: missing: expected the keys incumbent, low, high"),
     (["extra"], 1, "anchor.extra: unknown: expected the keys incumbent, low, high"),
@@ -151,7 +151,7 @@ FIELDS = (
     (["samples", "valid"], array(4, 4, fill=0.5), "samples.valid[0, 0]: 0.5"),
     (["samples", "features"], array(4, 4, 2), "features.shape: [4, 4, 2]: expe"),
     (["extra"], 1, "body.extra: unknown: expected the keys preset"),
-    *((["anchor", *path], value, line) for path, value, line in ANCHOR_FIELDS),
+    *((["anchor", *path], value, line) for path, value, line in PRIOR_COST_FIELDS),
 )
 
 
@@ -185,7 +185,7 @@ FILES = (
     _versioned(1, "body.context: unknown: expected", context=array(2, 2)),
     _versioned(2, "context.shape: [1, 2]: expected", context=array(1, 2)),
     (
-        tampered(["samples", "valid"], array(4, 4, fill=0.0), ANCHORED),
+        tampered(["samples", "valid"], array(4, 4, fill=0.0), WITH_PRIOR),
         "samples.valid[0, 0]: 0: expected 1 at the first time",
     ),
     (sealed(body_of(), schema_version=True), "schema_version: True: expected 1, 2"),

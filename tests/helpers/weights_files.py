@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rcirl_jax.export import Anchor, FeatureSpec, RewardWeights, pack, reader, save
+from rcirl_jax.export import FeatureSpec, PriorCost, RewardWeights, pack, reader, save
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import RewardConfig, init_reward, pinned
 from rcirl_jax.reward import value as trained_value
@@ -52,7 +52,7 @@ def example_weights(
         gamma=draw(times),
         context=draw(features, features) if by_context else None,
         seen=np.sort(draw(2, features), axis=0) if seen or anchored else None,
-        anchor=example_anchor(seed, features) if anchored else None,
+        prior_cost=example_prior_cost(seed, features) if anchored else None,
         kernels=tuple(draw(*pair) for pair in pairwise(sizes)),
         biases=tuple(draw(size) for size in sizes[1:]),
         activation=activation,
@@ -62,13 +62,13 @@ def example_weights(
     )
 
 
-def example_anchor(seed=0, features=3, units=4):
+def example_prior_cost(seed=0, features=3, units=4):
     """Its first feature does not matter, if there is another."""
     rng = np.random.default_rng(seed)
     draw = lambda *shape: rng.normal(size=shape).astype(np.float32)  # noqa: E731
     kernel = draw(features, units)
     kernel[: features - 1 and 1] = 0.0
-    return Anchor(
+    return PriorCost(
         incumbent="hand-set", low=0.25, high=1.5, location=draw(features),
         scale=0.2 + rng.random(features, np.float32), kernel=kernel,
         bias=draw(units), out=draw(units), offset=draw(1),
@@ -81,7 +81,7 @@ def example_samples(weights, count=4, seed=1):
     size = (count, len(weights.times), len(weights.features))
     features = rng.normal(scale=2.0, size=size).astype(np.float32)
     valid = rng.random(size[:2]) < 0.7
-    valid[:, 0] |= weights.context is not None or weights.anchor is not None
+    valid[:, 0] |= weights.context is not None or weights.prior_cost is not None
     values = [loop_value(weights, *one) for one in zip(features, valid, strict=True)]
     return features, valid, np.array(values)
 
@@ -122,16 +122,18 @@ def loop_value(weights, features, valid):
     return total
 
 
-def loop_gain(anchor, first):
+def loop_gain(prior_cost, first):
     """The gain of V in float64; `first` is [F]."""
     z = np.clip(
-        (np.asarray(first, np.float64) - anchor.location) / anchor.scale, -5.0, 5.0
+        (np.asarray(first, np.float64) - prior_cost.location) / prior_cost.scale,
+        -5.0,
+        5.0,
     )
-    x = np.tanh(z @ np.asarray(anchor.kernel, np.float64) + anchor.bias) @ np.asarray(
-        anchor.out, np.float64
-    )
-    return anchor.low + (anchor.high - anchor.low) / (
-        1.0 + math.exp(-x - anchor.offset[0])
+    x = np.tanh(
+        z @ np.asarray(prior_cost.kernel, np.float64) + prior_cost.bias
+    ) @ np.asarray(prior_cost.out, np.float64)
+    return prior_cost.low + (prior_cost.high - prior_cost.low) / (
+        1.0 + math.exp(-x - prior_cost.offset[0])
     )
 
 

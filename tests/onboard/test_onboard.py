@@ -29,7 +29,7 @@ VALID = packed(features=2, times=3, hidden=(4,))
 GATED = packed(features=2, times=3, hidden=(4,), by_context=True)
 RANGED = packed(features=2, times=3, hidden=(4,), seen=True)
 BOTH = packed(features=2, times=3, hidden=(4,), by_context=True, seen=True)
-ANCHORED = packed(features=2, times=3, hidden=(4,), by_context=True, anchored=True)
+WITH_PRIOR = packed(features=2, times=3, hidden=(4,), by_context=True, anchored=True)
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +120,7 @@ def test_an_old_file_scores_as_it_did(programs, tmp_path, version):
     assert_close(scores(programs, "score", path, features, valid == 1), expected)
 
 
-@pytest.mark.parametrize("data", [VALID, GATED, RANGED, BOTH, ANCHORED])
+@pytest.mark.parametrize("data", [VALID, GATED, RANGED, BOTH, WITH_PRIOR])
 def test_a_thousand_plans_get_the_guard_of_python(programs, tmp_path, data):
     """Four candidates, some beyond, at an open side, or not finite."""
     path, rng = tmp_path / "weights.msgpack", np.random.default_rng(4)
@@ -160,7 +160,7 @@ def test_choose_takes_the_best_candidate_that_has_a_value(programs, tmp_path):
     path, missing = tmp_path / "weights.msgpack", tmp_path / "missing"
     path.write_bytes(VALID)
     anchored = tmp_path / "anchored"
-    anchored.write_bytes(ANCHORED)
+    anchored.write_bytes(WITH_PRIOR)
     reward = load_weights(path)
     features = np.random.default_rng(0).normal(size=(50, 3, 2)).astype(np.float32)
     order = np.argsort(reward.value(features))
@@ -199,7 +199,7 @@ def test_damaged_files_are_refused_with_one_line(programs, tmp_path):
         assert line.startswith("w: ")
         assert ": expected " in line
         assert line.isprintable()
-    good = [VALID, GATED, RANGED, BOTH, ANCHORED]
+    good = [VALID, GATED, RANGED, BOTH, WITH_PRIOR]
     assert verdicts(programs, good, tmp_path) == ["ok"] * len(good)
 
 
@@ -219,7 +219,7 @@ def test_bodies_changed_and_hashed_again_get_the_verdict_of_the_python_reader(
     programs, tmp_path
 ):
     rng, files = np.random.default_rng(2), []
-    versions = ((1, VALID), (2, GATED), (3, RANGED), (3, BOTH), (4, ANCHORED))
+    versions = ((1, VALID), (2, GATED), (3, RANGED), (3, BOTH), (4, WITH_PRIOR))
     for version, data in versions:
         body = msgpack.unpackb(data)["body"]
         for _ in range(800):

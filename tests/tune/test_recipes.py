@@ -54,7 +54,10 @@ def test_the_papers_own_setting():
         ("[rehearsal]\nteacher = 'nobody'", r"teacher: nobody: expected one of"),
         ("[rehearsal]\ncatalogue_seed = 0", r"catalogue_seed: 0: expected above 0"),
         ("[collect]\nstride = 1.0", r"stride: unknown: .*did you mean stride_s\?"),
-        ("[anchor]\nslowed = [1.0]", r"slowed: \[1.0\]: expected shares of the speed"),
+        (
+            "[prior_cost]\nslowed = [1.0]",
+            r"slowed: \[1.0\]: expected shares of the speed",
+        ),
         ("[autotune]\nseeds = 0", r"seeds: 0: expected at least 1"),
         ("train = 3", r"train: 3: expected a table"),
     ],

@@ -123,7 +123,7 @@ def _settings(stages: Mapping[str, dict], verdict: _Verdict) -> dict[str, str]:
         "incumbent": (gate.get("inputs") or {}).get("incumbent"),
         "cases": verdict.cases,
         "training runs": sum(name.startswith("train ") for name in stages),
-        "anchor": str(inputs.get("anchor", ""))[:HEX],
+        "prior_cost": str(inputs.get("prior_cost", ""))[:HEX],
     }
     found |= _flat(inputs.get("config"), "training")
     rehearsal = (stages.get("rehearse 0", {}).get("inputs") or {}).get("rehearsal")

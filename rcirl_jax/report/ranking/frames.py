@@ -102,10 +102,10 @@ def _driven_by(
     x: np.ndarray,
     mask: np.ndarray,
 ) -> np.ndarray:
-    """[K] what the candidates are ranked by: V, on top of the own cost if anchored."""
-    if reward.anchor is None:
+    """[K] what the candidates are ranked by: V, on top of the prior cost if any."""
+    if reward.prior_cost is None:
         return reward.value(x, mask)
-    own, weights = incumbent_score(reward.anchor.incumbent)
+    own, weights = incumbent_score(reward.prior_cost.incumbent)
     return reward.total(x, np.asarray(own(weights, scene, candidates)), mask)
 
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.evaluation.statistics import Difference
-from rcirl_jax.export.loading import anchor_words
+from rcirl_jax.export.loading import prior_cost_words
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.report.pages import Table, interval, part
 from rcirl_jax.report.tuning.contributions import Contributions, contributions
@@ -29,7 +29,7 @@ def features_view(
                 f"Without effect in the {name}, because they never vary in its "
                 f"training data: {', '.join(reward.unsupported)}."
             )
-        if said := anchor_words(name, reward):
+        if said := prior_cost_words(name, reward):
             notes.append(f"{said} The curves show V.")
     if len(rewards) == 1:
         notes.append(

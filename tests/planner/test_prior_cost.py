@@ -11,22 +11,22 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.score import OnTop
 from rcirl_jax.export.closed_loop import score_of, table_rows
 from rcirl_jax.export.loading import open_reward, reward_params, scorer_of
-from rcirl_jax.export.reader import Anchor
+from rcirl_jax.export.reader import PriorCost
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.rank import ONLINE, hand_score, learned_score
-from rcirl_jax.reward.support import Support, support
+from rcirl_jax.reward.familiarity import Familiarity, familiarity
 from tests.helpers.scenes import random_scene, sampled
 from tests.helpers.weights_files import random_weights
 
 FEATURES = feature_map("paper21")
 
 
-def anchored(reward, offset, low=0.3, high=2.0):
-    """A reward whose support is sigmoid(offset) in every scene."""
+def with_prior_cost(reward, offset, low=0.3, high=2.0):
+    """A reward whose familiarity is sigmoid(offset) in every scene."""
     size = FEATURES.num_features
     return dataclasses.replace(
         reward,
-        anchor=Anchor(
+        prior_cost=PriorCost(
             incumbent="hand-set", low=low, high=high, location=np.zeros(size),
             scale=np.ones(size), kernel=np.zeros((size, 2)), bias=np.zeros(2),
             out=np.zeros(2), offset=np.array([offset]),
@@ -35,8 +35,10 @@ def anchored(reward, offset, low=0.3, high=2.0):
 
 
 @pytest.mark.parametrize(("offset", "gain"), [(-30.0, 0.3), (30.0, 2.0), (0.0, 1.15)])
-def test_the_gain_goes_from_low_to_high_with_the_support(tmp_path, offset, gain):
-    reward = anchored(open_reward(str(random_weights(tmp_path / "w.msgpack"))), offset)
+def test_the_gain_goes_from_low_to_high_with_the_familiarity(tmp_path, offset, gain):
+    reward = with_prior_cost(
+        open_reward(str(random_weights(tmp_path / "w.msgpack"))), offset
+    )
     scene = random_scene(3)
     candidates = sampled(jax.random.key(0), scene, ONLINE)
     score, params = score_of(reward)
@@ -58,10 +60,10 @@ def test_the_gain_goes_from_low_to_high_with_the_support(tmp_path, offset, gain)
     np.testing.assert_array_equal(ranked, total)
 
 
-def test_the_support_is_the_equation():
+def test_the_familiarity_is_the_equation():
     rng = np.random.default_rng(0)
     size, units = 3, 4
-    params = Support(
+    params = Familiarity(
         location=jnp.asarray(rng.normal(size=size), jnp.float32),
         scale=jnp.asarray(rng.uniform(0.5, 2.0, size), jnp.float32),
         kernel=jnp.asarray(rng.normal(size=(size, units)), jnp.float32),
@@ -73,19 +75,19 @@ def test_the_support_is_the_equation():
     z = np.clip((x - params.location) / params.scale, -5.0, 5.0)
     logit = np.tanh(z @ params.kernel + params.bias) @ params.out + 0.2
     wanted = 1.0 / (1.0 + np.exp(-logit))
-    np.testing.assert_allclose(support(params, jnp.asarray(x)), wanted, rtol=1e-4)
+    np.testing.assert_allclose(familiarity(params, jnp.asarray(x)), wanted, rtol=1e-4)
 
 
-def test_an_anchored_file_drives_anchored(tmp_path, monkeypatch):
+def test_a_file_with_a_prior_cost_drives_on_top_of_it(tmp_path, monkeypatch):
     path = str(random_weights(tmp_path / "w.msgpack"))
-    reward = anchored(open_reward(path), 0.0)
+    reward = with_prior_cost(open_reward(path), 0.0)
     monkeypatch.setattr("rcirl_jax.export.closed_loop.open_reward", lambda _: reward)
     rows = table_rows([path], ["IDM"])
     assert rows[0].name.endswith("on hand-set")
     assert float(rows[0].params.high) == 2.0
-    with pytest.raises(InputError, match="without an anchor"):
+    with pytest.raises(InputError, match="without a prior cost"):
         table_rows([path], [], dp=True)
-    assert reward.anchor is not None
-    other = dataclasses.replace(reward.anchor, incumbent="mine")
-    with pytest.raises(InputError, match=r"anchor\.incumbent: mine"):
-        score_of(dataclasses.replace(reward, anchor=other))
+    assert reward.prior_cost is not None
+    other = dataclasses.replace(reward.prior_cost, incumbent="mine")
+    with pytest.raises(InputError, match=r"prior_cost\.incumbent: mine"):
+        score_of(dataclasses.replace(reward, prior_cost=other))

@@ -1,13 +1,13 @@
-"""Fitting the support: recorded scenes against scenes of the catalogue.
+"""Fitting the familiarity: recorded scenes against scenes of the catalogue.
 
-Minimises the weighted binary cross entropy of `reward.support`; the catalogue weighs
-ELSEWHERE times as much as all recordings together, so that doubt leaves the choice to
-the own cost, and every recorded source weighs as its share says:
+Minimises the weighted binary cross entropy of `reward.familiarity`; the catalogue
+weighs ELSEWHERE times as much as all recordings together, so that doubt leaves the
+choice to the own cost, and every recorded source weighs as its share says:
 
-    loss = mean_i w_i BCE(support(x_i), y_i) + DECAY |weights|^2,   y = 1 recorded
+    loss = mean_i w_i BCE(familiarity(x_i), y_i) + DECAY |weights|^2,   y = 1 recorded
 
 with Adam over all scenes at once from a fixed seed: the same scenes give the same
-support. What never varies gets no weight.
+familiarity. What never varies gets no weight.
 """
 
 import functools
@@ -19,7 +19,7 @@ import optax
 
 from rcirl_jax.features import FeatureMap
 from rcirl_jax.planner.prediction import as_seen
-from rcirl_jax.reward.support import Support, support_logit
+from rcirl_jax.reward.familiarity import Familiarity, familiarity_logit
 from rcirl_jax.sampling import trajectory_on_path
 from rcirl_jax.types import Candidates, Scene
 from rcirl_jax.units import TIMES_S
@@ -53,10 +53,10 @@ def _scene_features(scenes: Scene, features: FeatureMap) -> jax.Array:
     return jax.lax.map(one, scenes, batch_size=LANES)
 
 
-def fit_support(
+def fit_familiarity(
     recorded: np.ndarray, weights: np.ndarray, elsewhere: np.ndarray, counts: np.ndarray
-) -> Support:
-    """The support of recorded scenes.
+) -> Familiarity:
+    """The familiarity of recorded scenes.
 
     Args:
       recorded: [n, F] of `scene_features`.
@@ -77,7 +77,7 @@ def fit_support(
     mask = jnp.asarray(varies, jnp.float32)[:, None]
     first, last = jax.random.split(jax.random.key(0))
     size = recorded.shape[1]
-    start = Support(
+    start = Familiarity(
         location=jnp.asarray(location, jnp.float32),
         scale=jnp.asarray(scale, jnp.float32),
         kernel=mask * jax.random.normal(first, (size, UNITS)) * size**-0.5,
@@ -97,13 +97,13 @@ def fit_support(
 
 @jax.jit
 def _fit(
-    start: Support, mask: jax.Array, x: jax.Array, y: jax.Array, share: jax.Array
-) -> Support:
+    start: Familiarity, mask: jax.Array, x: jax.Array, y: jax.Array, share: jax.Array
+) -> Familiarity:
     optimizer = optax.adam(STEP_SIZE)
     free = {name: getattr(start, name) for name in ("kernel", "bias", "out", "offset")}
 
     def loss(free: dict[str, jax.Array]) -> jax.Array:
-        logits = support_logit(start.replace(**free), x)
+        logits = familiarity_logit(start.replace(**free), x)
         fit = jnp.sum(share * optax.sigmoid_binary_cross_entropy(logits, y))
         return fit + DECAY * sum(jnp.sum(leaf**2) for leaf in free.values())
 

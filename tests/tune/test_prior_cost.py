@@ -6,8 +6,8 @@ import jax
 import numpy as np
 
 from rcirl_jax.features import feature_map
-from rcirl_jax.tune.anchoring import Anchoring, fitted_anchor
-from rcirl_jax.tune.support import scene_features
+from rcirl_jax.tune.familiarity import scene_features
+from rcirl_jax.tune.prior_cost import PriorCostConfig, fitted_prior_cost
 from tests.helpers.scenes import scene
 
 FEATURES = feature_map("paper21")
@@ -27,9 +27,9 @@ def test_who_is_slow_on_an_empty_road_is_not_taken_for_recorded_traffic():
     x = scene_features(slow, FEATURES)
 
     def gain(slowed):
-        config = Anchoring(low=0.0, high=1.0, slowed=slowed)
-        anchor = fitted_anchor(config, recorded, [1.0], driven, FEATURES)
-        return float(anchor.gain(x)[0])
+        config = PriorCostConfig(low=0.0, high=1.0, slowed=slowed)
+        prior_cost = fitted_prior_cost(config, recorded, [1.0], driven, FEATURES)
+        return float(prior_cost.gain(x)[0])
 
     assert gain(()) > 0.8
     assert gain((0.1, 0.2, 0.3)) < 0.4

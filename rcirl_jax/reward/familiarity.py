@@ -1,10 +1,10 @@
 """How far the recordings reach: a number in (0, 1) for every scene.
 
-    support = sigmoid(out . tanh(z W + b) + c)
+    familiarity = sigmoid(out . tanh(z W + b) + c)
     z = clip((f_0 - location) / scale, -5, 5)
 
 f_0 are the raw features at t = 0, which all candidates of a scene share. Fitted to tell
-recorded scenes from those of a catalogue (`autotune.support`), it is near 1 in traffic
+recorded scenes from those of a catalogue (`tune.familiarity`), it is near 1 in traffic
 as people were recorded in it and near 0 elsewhere.
 """
 
@@ -20,8 +20,8 @@ REACH = 5.0  # 1, |z| beyond which a feature counts as that far
 OF_THE_TRAJECTORY = ("station", "time")
 
 
-class Support(flax.struct.PyTreeNode, kw_only=True):
-    """Weights of the support; H hidden units."""
+class Familiarity(flax.struct.PyTreeNode, kw_only=True):
+    """Weights of the familiarity; H hidden units."""
 
     location: jax.Array  # [F] in the feature's unit
     scale: jax.Array  # [F] > 0
@@ -31,11 +31,13 @@ class Support(flax.struct.PyTreeNode, kw_only=True):
     offset: jax.Array  # [] c
 
 
-def support_logit(params: Support, x0: Float[Array, "*n f"]) -> Float[Array, "*n"]:
-    """The support before its sigmoid.
+def familiarity_logit(
+    params: Familiarity, x0: Float[Array, "*n f"]
+) -> Float[Array, "*n"]:
+    """The familiarity before its sigmoid.
 
     Args:
-      params: of `autotune.support.fit_support`.
+      params: of `tune.familiarity.fit_familiarity`.
       x0: [..., F] raw features at t = 0.
     """
     z = jnp.clip((x0 - params.location) / params.scale, -REACH, REACH)
@@ -43,9 +45,9 @@ def support_logit(params: Support, x0: Float[Array, "*n f"]) -> Float[Array, "*n
     return hidden @ params.out + params.offset
 
 
-def support(params: Support, x0: Float[Array, "*n f"]) -> Float[Array, "*n"]:
+def familiarity(params: Familiarity, x0: Float[Array, "*n f"]) -> Float[Array, "*n"]:
     """The equation above, [...] in (0, 1)."""
-    return jax.nn.sigmoid(support_logit(params, x0))
+    return jax.nn.sigmoid(familiarity_logit(params, x0))
 
 
 def of_the_scene(features: FeatureMap) -> tuple[bool, ...]:
