@@ -2,7 +2,7 @@
 
 `rcirl.py` has the list of all sub-commands. Each is a module: its docstring is its help
 and begins with examples, `USUAL` names the flags that `--help` shows, `main` is the
-call. `flags/` is what they share, `studies/` has the comparisons. The files of
+call. `flags/` is what they share. The files of
 `experiments/` run the same modules from a clone. A new command is a module here and its
 line in `rcirl.py`.
 """

@@ -25,15 +25,13 @@ COMMANDS = {
     "report": ("report", "draw the page of an autotune run again"),
     "compare": ("compare", "several autotune runs side by side, as a page"),
     "human-likeness": (
-        "studies.human_likeness",
+        "human_likeness",
         "compare learners: who chooses most like a human?",
     ),
     "drive-elsewhere": (
-        "studies.drive_elsewhere",
+        "drive_elsewhere",
         "drive in simulators that others wrote: highway-env, SUMO, CommonRoad",
     ),
-    "label-check": ("studies.label_check", "are the automatic labels right?"),
-    "gate-errors": ("studies.gate_errors", "how often is the gate wrong?"),
 }
 HEAD = """Learn a motion planner's reward from recorded human driving.
 

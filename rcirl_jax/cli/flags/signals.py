@@ -6,7 +6,7 @@ from absl import flags
 
 from rcirl_jax.data.parts import Part
 from rcirl_jax.data.scenes.signal_checks import SignalChecks, signal_checks
-from rcirl_jax.evaluation.labels.signals import check_written, format_phases
+from rcirl_jax.data.scenes.signal_phases import check_written, format_phases
 from rcirl_jax.runtime.executors import Executor
 
 POOLED = "pooled"

@@ -10,8 +10,8 @@ first of these that holds decides:
     follows             FOLLOW
     all else            IGNORE
 
-`manoeuvres` defines them. `evaluation.labels` measures them on drivers whose
-state is known, on platoons and on recorded scenes that were judged by hand.
+`manoeuvres` defines them; `benchmarks.labels` compares them with scenes that a person
+judged.
 
 Shapes: [S] scenes side by side, [N] obstacles, [T] times, [P] stations of the path.
 All functions work on any leading axes, so on one scene without [S] as well.

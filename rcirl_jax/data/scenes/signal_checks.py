@@ -1,8 +1,8 @@
 """What drivers, over many files, say of written traffic lights.
 
-One short file cannot confirm a cycle; `evaluation.labels.signals` pools the
-crossings and stands of all files of a place, and an import then uses the lights of the
-lines that they bear out.
+One short file cannot confirm a cycle; `signal_phases` pools the crossings and stands
+of all files of a place, and an import then uses the lights of the lines that they bear
+out.
 """
 
 import dataclasses

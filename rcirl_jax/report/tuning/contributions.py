@@ -1,7 +1,7 @@
 """What each feature contributes to a reward on held-out scenes.
 
 Contributions split V(human) - V(candidate) over features
-(`evaluation.insight.attribution`). A reward's scale is free, so contributions
+(`evaluation.attribution`). A reward's scale is free, so contributions
 are shares: per scene, the mean over candidates of |sum_t C_ti|, divided by its sum
 over the features.
 """
@@ -16,7 +16,7 @@ import numpy as np
 
 from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.insight.attribution import attribute
+from rcirl_jax.evaluation.attribution import attribute
 from rcirl_jax.evaluation.ranking.score import candidates_key
 from rcirl_jax.evaluation.statistics import (
     ClusterBootstrap,

@@ -1,15 +1,12 @@
 """Drivers of known truth: what the gate says of drives that are so by construction."""
 
-import dataclasses
 import json
 
 import jax
 import numpy as np
 import pytest
 
-from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.closed_loop.files import SuiteRuns
-from rcirl_jax.evaluation.gate.errors import (
+from experiments.known_drivers import (
     FAULTY,
     HAND_SET,
     IDM,
@@ -21,6 +18,7 @@ from rcirl_jax.evaluation.gate.errors import (
     tallied,
     with_faults,
 )
+from rcirl_jax.evaluation.closed_loop.files import SuiteRuns
 from rcirl_jax.evaluation.gate.types import GateConfig
 from tests.evaluation.gate.test_gate import CASES, broken, drives, pair
 from tests.helpers.commands import succeeded
@@ -71,14 +69,6 @@ def test_drivers_are_judged_by_what_they_are(suite):
     assert table([*found.values()])
 
 
-def test_a_suite_without_the_drivers_is_refused(suite):
-    rows = {name: drives for name, drives in suite.rows.items() if name != OTHER}
-    with pytest.raises(InputError, match=f"{OTHER}: expected a row of "):
-        tallied(dataclasses.replace(suite, rows=rows), 2, ALONE)
-    with pytest.raises(InputError, match="likeness: constant V: expected a row"):
-        tallied(suite, 2, GateConfig())
-
-
 def test_other_candidates_come_of_another_key_only(monkeypatch):
     monkeypatch.setattr(
         "rcirl_jax.planner.rank.rank_policy", lambda *_: lambda *seen: seen
@@ -97,7 +87,7 @@ def test_by_its_command(tmp_path):
     """Driven: other candidates drive otherwise and as far, slower ones less far."""
     out = tmp_path / "errors.json"
     short = ("--suite=free_cruise,curve_speed", "--cases=15", "--duration=10")
-    succeeded("rcirl_jax", "gate-errors", f"--output={out}", "--seeds=2", *short)
+    succeeded("experiments.gate_errors", f"--output={out}", "--seeds=2", *short)
     body = json.loads(out.read_text())
     assert (body["cases"], body["made_by"]["flags"]["seeds"]) == (60, 2)
     found = {one["candidate"]: one for one in body["kinds"]}

@@ -1,8 +1,4 @@
-"""The gate's errors on drivers of known truth, all made from hand-set.
-
-What it refuses of the equal one is a false alarm, of the worse ones its power. Nobody
-is compared with recordings: likeness counts as equal, and there are no nulls.
-"""
+"""Drivers of known truth, made from hand-set, and what the gate says of them."""
 
 import collections
 import dataclasses
@@ -38,7 +34,7 @@ KINDS = (
 
 
 def made_rows() -> list[Row]:
-    """Hand-set, itself with other random candidates, two slower ones, and IDM."""
+    """Returns hand-set, itself with other random candidates, two slower ones, IDM."""
     policy = rank.rank_policy(rank.hand_score, rank.RankConfig())
 
     def other(p: rank.Params, s: Scene, key: jax.Array, *before: Plan | None) -> Plan:
@@ -53,7 +49,7 @@ def made_rows() -> list[Row]:
 
 
 def with_faults(runs: SuiteRuns) -> SuiteRuns:
-    """The suite with the row `FAULTY`: IDM drives wherever it is at fault."""
+    """Adds the row `FAULTY`: IDM drives wherever it is at fault."""
     at_fault = np.asarray(runs.rows[IDM].at_fault) > 0
 
     def pick(idm: np.ndarray, hand: np.ndarray) -> np.ndarray:
@@ -64,7 +60,7 @@ def with_faults(runs: SuiteRuns) -> SuiteRuns:
 
 
 def tallied(runs: SuiteRuns, seeds: int, config: gate.GateConfig) -> list[dict]:
-    """What the gate says of `KINDS`: decisions on every seed, and that on all cases.
+    """Judges `KINDS`: on the cases of every seed, and on all.
 
     Args:
       runs: drives of `made_rows`, `with_faults`; as many cases of each seed in turn.
@@ -86,7 +82,6 @@ def tallied(runs: SuiteRuns, seeds: int, config: gate.GateConfig) -> list[dict]:
 
 
 def _part(pair: gate.Pair, at: slice) -> gate.Pair:
-    """Some of the cases."""
     names = ("families", "ids", "reference", "preventable")
     rest = {name: getattr(pair, name)[at] for name in names}
     for row in ("candidate", "incumbent"):
@@ -95,7 +90,7 @@ def _part(pair: gate.Pair, at: slice) -> gate.Pair:
 
 
 def table(found: Sequence[dict]) -> str:
-    """Share of the seeds by decision with 95 % intervals, and the verdict on all."""
+    """Formats the share of the seeds by decision with 95 % intervals."""
     head, lines = ["candidate", "incumbent", "truth"], []
     for one in found:
         total, cells = sum(one["each"].values()), []

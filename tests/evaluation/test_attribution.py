@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.insight.attribution import attribute
+from rcirl_jax.evaluation.attribution import attribute
 from rcirl_jax.reward import Normaliser, RewardConfig, RewardParams, normalise, value
 from rcirl_jax.units import NUM_TIMES
 

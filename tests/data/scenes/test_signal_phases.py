@@ -7,12 +7,12 @@ from absl.testing import flagsaver
 
 from rcirl_jax.cli.flags.signals import checked_signals, signals_asked
 from rcirl_jax.data.parts import parts_of, recordings_of
+from rcirl_jax.data.scenes import signal_phases
 from rcirl_jax.data.scenes.collect import Collector
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.data.scenes.lines import trusted_signals
 from rcirl_jax.data.scenes.signal_checks import SignalChecks, signal_checks
-from rcirl_jax.evaluation.labels import signals
-from rcirl_jax.evaluation.labels.signals import (
+from rcirl_jax.data.scenes.signal_phases import (
     check_events,
     check_written,
     first_stands,
@@ -153,8 +153,8 @@ def test_an_import_takes_the_word_of_many_files(turned, used):
 def test_an_import_can_ask_all_files_itself(monkeypatch, capsys):
     """`--signals=pooled`."""
     made = [drives_of(number, 0.0) for number in range(12)]
-    monkeypatch.setattr(signals, "recordings_in", lambda one: [(None, one)])
-    monkeypatch.setattr(signals, "items", lambda parts, _: iter(parts))
+    monkeypatch.setattr(signal_phases, "recordings_in", lambda one: [(None, one)])
+    monkeypatch.setattr(signal_phases, "items", lambda parts, _: iter(parts))
     flags.FLAGS.mark_as_parsed()
     for given, asked in (({"signals": "pooled"}, verdicts(made)), ({}, None)):
         with flagsaver.as_parsed(**given):

@@ -1,1 +1,0 @@
-"""Comparisons: learners with humans, labels and verdicts with the truth."""
