@@ -18,6 +18,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
+from rcirl_jax.geometry.relevance import relevance_distance
 from rcirl_jax.planner.baselines import Idm, idm_acceleration
 from rcirl_jax.types import Ego, Kind, Obstacles, Path, Scene
 from rcirl_jax.units import (
@@ -30,8 +31,6 @@ from rcirl_jax.units import (
 )
 
 NUM_BODIES = 8  # bodies handed to the planner, the most relevant first
-BEHIND_WEIGHT = 2.0  # 1, how much farther a body behind counts
-ASIDE_WEIGHT = 0.5  # 1, how much a metre aside counts
 LANE_CHANGE_MPS = 0.3  # m/s, lateral speed taken as a lane change
 CROSSING_SLOPE = 0.5  # 1, |l_dot| beyond this share of the speed crosses the road
 LINE_DEPTH_M = 0.1  # m, thickness of a stop wall (Apollo's virtual obstacle)
@@ -54,21 +53,27 @@ class Bodies(flax.struct.PyTreeNode, kw_only=True):
     present: jax.Array  # bool
 
 
-def most_relevant(bodies: Bodies, ego: Ego) -> jax.Array:
-    """Places [NUM_BODIES] of the bodies that matter most, nearest first.
+def most_relevant(bodies: Bodies, ego: Ego, path: Path) -> jax.Array:
+    """Places [NUM_BODIES] of the bodies that matter most (`geometry.relevance`).
 
-    Absent ones fill the rest.
+    Each keeps its speed, as the ego does; the nearest come first, absent ones last.
     """
-    ds = bodies.s - ego.s
-    ahead = jnp.where(ds < 0.0, -BEHIND_WEIGHT * ds, ds)
-    distance = ahead + ASIDE_WEIGHT * jnp.abs(bodies.l - ego.l)
-    _, index = jax.lax.top_k(jnp.where(bodies.present, -distance, -jnp.inf), NUM_BODIES)
-    return index
+    s = bodies.s[:, None] - ego.s + bodies.speed[:, None] * TIMES_S
+    distance = relevance_distance(
+        s,
+        lateral_motion(bodies, path)[0],
+        bodies.present[:, None],
+        bodies.half_l + 0.5 * ego.width,
+        ego.v,
+        path.l,
+        jnp,
+    )
+    return jax.lax.top_k(-distance, NUM_BODIES)[1]
 
 
-def relevant(bodies: Bodies, ego: Ego) -> Bodies:
+def relevant(bodies: Bodies, ego: Ego, path: Path) -> Bodies:
     """The `NUM_BODIES` bodies that matter most."""
-    index = most_relevant(bodies, ego)
+    index = most_relevant(bodies, ego, path)
     return jax.tree.map(lambda x: x[index], bodies)
 
 
@@ -189,7 +194,7 @@ def obstacles_of(
       ego: of the scene.
       path: of the scene.
     """
-    near = relevant(bodies, ego)
+    near = relevant(bodies, ego, path)
     s, l, speed = predict(near, ego, path)
     walls = jnp.stack([line, destination])
     known = walls < VIEW_M

@@ -77,8 +77,8 @@ def test_bodies_are_boxes_with_a_future():
         width=0.4,
     )  # fmt: skip
     made = built(obstacles=[LEAD, across])
-    walker, lead = made.obstacles
-    assert (walker.kind, lead.kind) == (Kind.PEDESTRIAN, Kind.VEHICLE)
+    lead, walker = made.obstacles
+    assert (lead.kind, walker.kind) == (Kind.VEHICLE, Kind.PEDESTRIAN)
     assert lead.s_lower[0] == pytest.approx(28.0, abs=1e-3)
     assert lead.s_upper[0] == pytest.approx(32.0, abs=1e-3)
     assert (lead.l_lower[0], lead.l_upper[0]) == pytest.approx((-0.9, 0.9), abs=1e-3)

@@ -100,7 +100,7 @@ def test_a_follower_slows_down_behind_its_leader_and_keeps_its_headway():
 def test_the_most_relevant_bodies_come_first():
     made = scene(v=0.0)
     rows = [{"s": float(s)} for s in (90, -20, 10, 70, 60, 50, 40, 30, 35, 80)]
-    near = relevant(bodies(*rows), made.ego)
+    near = relevant(bodies(*rows), made.ego, made.path)
     # 20 m behind count as 40 m ahead
     order = [10.0, 30.0, 35.0, -20.0, 40.0, 50.0, 60.0, 70.0]
     assert sorted(np.asarray(near.s).tolist()) == sorted(order)

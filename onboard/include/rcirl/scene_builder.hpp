@@ -184,12 +184,15 @@ class Builder {
 
   void bodies(Scene* scene) const {
     std::vector<Body> near;
-    for (std::size_t n = 0; n < now_.others.size(); ++n) near.push_back(body(n));
-    std::stable_sort(near.begin(), near.end(), [&](const Body& one, const Body& other) {
-      return one.relevance(scene->ego) < other.relevance(scene->ego);
+    for (std::size_t n = 0; n < now_.others.size(); ++n) {
+      near.push_back(body(n));
+      predict_offsets(now_.line.lane_width, &near.back());
+      near.back().distance = near.back().relevance(*scene);
+    }
+    std::stable_sort(near.begin(), near.end(), [](const Body& one, const Body& other) {
+      return one.distance < other.distance;
     });
     near.resize(std::min(near.size(), kMostBodies));
-    for (Body& one : near) predict_offsets(now_.line.lane_width, &one);
     predict(scene->ego, static_cast<double>(scene->path.speed_limit[0]), &near);
     for (const Body& one : near) {
       const bool given = !now_.others[one.given].prediction.empty();

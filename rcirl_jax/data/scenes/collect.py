@@ -27,10 +27,10 @@ from rcirl_jax.data.scenes.motion import (
     given_path,
     human_motion,
 )
-from rcirl_jax.data.scenes.relevance import distances
 from rcirl_jax.data.scenes.smoothing import SmoothTrack, smooth_track
 from rcirl_jax.data.scenes.surroundings import surroundings_end
 from rcirl_jax.geometry.limits import LOOK_AHEAD_M, planning_limit
+from rcirl_jax.geometry.relevance import relevance_distance
 from rcirl_jax.types import Ghost, Kind, Recording
 from rcirl_jax.units import (
     HORIZON_S,
@@ -331,7 +331,7 @@ class Collector:
         # where a road meets itself, the nearest station jumps
         seen &= np.abs(speed) < MAX_SPEED_MPS
         half = 0.5 * (self._size[others, 1] + row["ego.width"])
-        apart = distances(s, l, seen, half, motion.v0, row["path.l"])
+        apart = relevance_distance(s, l, seen, half, motion.v0, row["path.l"])
         order = np.argsort(apart, kind="stable")
         order = order[np.isfinite(apart[order])]
         most = order[:room]

@@ -86,7 +86,7 @@ def scene_from(
     if predictions is None:
         return scene
     futures = _futures(frame, obstacles, predictions, float(parts.station))
-    first = most_relevant(parts.bodies, parts.ego)
+    first = most_relevant(parts.bodies, parts.ego, parts.path)
     return scene.replace(obstacles=_with_futures(scene.obstacles, futures, first))
 
 

@@ -20,6 +20,16 @@ namespace rcirl::detail {
 constexpr std::size_t kMostBodies = 8;  // handed to the planner, the most relevant first
 constexpr double kStep = 8.0 / 17.0;    // s
 
+// The given path's offset at a station, linear between the stations of the grid.
+inline double path_offset(const Path& path, double s) {
+  const double place = std::clamp(s / static_cast<double>(kStationStepM), 0.0,
+                                  static_cast<double>(kStations - 1));
+  const std::size_t low = std::min(static_cast<std::size_t>(place), kStations - 2);
+  const double share = place - static_cast<double>(low);
+  return (1.0 - share) * static_cast<double>(path.l[low]) +
+         share * static_cast<double>(path.l[low + 1]);
+}
+
 // One of the others in the scene's frame, with its future.
 struct Body {
   double s = 0.0, l = 0.0;            // m
@@ -32,10 +42,21 @@ struct Body {
   std::array<double, kTimes> future_s{}, future_l{}, future_speed{};
   bool follows = false;    // a lane; else it keeps its speed
   double headway = 1.5;    // s
+  double distance = 0.0;   // m, `relevance`
 
-  double relevance(const Ego& ego) const {
-    const double ds = s - static_cast<double>(ego.s);
-    return (ds < 0.0 ? -2.0 * ds : ds) + 0.5 * std::abs(l - static_cast<double>(ego.l));
+  // How much it matters, as a distance in m; see `rcirl_jax/geometry/relevance.py`.
+  // Both keep their speed; `future_l` is known.
+  double relevance(const Scene& scene) const {
+    const double reach = half_l + 0.5 * static_cast<double>(scene.ego.width);
+    double least = std::numeric_limits<double>::infinity();
+    for (std::size_t t = 0; t < kTimes; ++t) {
+      const double way = kStep * static_cast<double>(t);
+      const double at = s + speed * way - static_cast<double>(scene.ego.s);
+      const double apart = at - static_cast<double>(scene.ego.v) * way;
+      const double aside = std::abs(future_l[t] - path_offset(scene.path, at)) - reach;
+      least = std::min(least, (apart < 0.0 ? -2.0 * apart : apart) + 16.0 * std::max(aside, 0.0));
+    }
+    return least;
   }
 };
 
