@@ -1,12 +1,12 @@
-"""What logs of a car's own perception share: boxes, gaps, outliers, windows.
+"""Boxes and lights that a car's own perception saw, as tracks and signals.
 
-L5, nuPlan and Apollo logs hold what one car saw while it drove: boxes with an
-id, a class that may be unknown, and gaps where the view was blocked. An importer
-gathers them as `Boxes`; this module makes tracks of them. Long drives are read in
-windows that overlap.
+L5, nuPlan, Apollo and ROS 2 logs hold what one car saw while it drove: boxes with an
+id, a class that may be unknown, and gaps where the view was blocked. A reader gathers
+them as `Boxes`; this module puts them onto a clock and makes tracks of them.
 """
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -16,18 +16,15 @@ from rcirl_jax.data.formats.options import STATED, number, positive, section, st
 from rcirl_jax.data.formats.paths import path_lanes
 from rcirl_jax.data.formats.shapes import local_origin
 from rcirl_jax.data.formats.tracks import once_each, split_tracks
-from rcirl_jax.data.readers import long_logs
 from rcirl_jax.data.recording import LENGTH_RANGE_M, MAX_SPEED_MPS, WIDTH_RANGE_M
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Kind, Lane, Recording, Track
+from rcirl_jax.types import Kind, Lane, Signal, Track
 
 UNKNOWN = -1  # kind of a box whose class the log does not know
 UNKNOWN_CHOICES = ("auto", "drop", "static", "vehicle")
 STANDING_M = 1.0  # m, an unknown object that moves less than this is static
 MAX_OUTLIERS = 0.1  # share of tracks dropped as outliers; more is an error
 ONE_OF = 5  # tracks of which one may always be an outlier
-WINDOW_S = 300.0  # s, longest window of a drive
-MIN_WINDOW_S = 1.0  # s that it may be; each window costs as much as its surroundings
 LANE_WIDTH_M = 3.5  # m, of lanes fitted to paths
 # m, [length, width] of road users of which none is known; others: 1 m
 SIZES_M = {
@@ -37,8 +34,9 @@ SIZES_M = {
 }
 OTHER_SIZE_M = (1.0, 1.0)  # m
 MAX_SIZE_M = 200.0  # m, of a box; beyond it the file is wrong, not the tracker
-ARRAYS = ("ids", "t", "x", "y", "heading", "speed", "length", "width", "kind")
-FIELDS = ("t", "x", "y", "heading", "length", "width")
+SERIES = ("x", "y", "heading", "speed", "length", "width")
+ARRAYS = ("ids", "t", *SERIES, "kind")
+STATES = ("off", "red", "yellow", "green")  # of lights, by their numbers
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -67,17 +65,17 @@ def ego_boxes(
     heading: np.ndarray,
     speed: np.ndarray,
 ) -> Boxes:
-    """Boxes of the recording car, id "ego", by its poses [n].
+    """Makes boxes of the recording car, id "ego", from its poses.
 
     Args:
       spec: source TOML; the table `ego` has the car's measures.
       usual: where it has not: length, width, and how far ahead of a pose's place the
         box's centre lies, m.
-      t: s.
-      x: m.
-      y: m.
-      heading: rad.
-      speed: m/s; NaN: from the positions.
+      t: [n] s.
+      x: [n] m.
+      y: [n] m.
+      heading: [n] rad.
+      speed: [n] m/s; NaN: from the positions.
     """
     own = section(spec, "ego")
     length, width, ahead = (number(own, name, m) for name, m in usual.items())
@@ -96,6 +94,41 @@ def ego_boxes(
     )
 
 
+def on_clock(boxes: Boxes, rate_hz: float, max_gap_s: float) -> Boxes:
+    """Resamples boxes at times k / rate_hz, within each gapless piece.
+
+    Linear interpolation; headings are unwrapped first, series of which some values are
+    not known are those of the row at or after the tick. A piece between two ticks of
+    the clock gives nothing. Of several rows of one road user and time the first counts.
+
+    Args:
+      boxes: in any order.
+      rate_hz: of the clock.
+      max_gap_s: s between two rows of one piece.
+    """
+    ids, t = boxes.ids, boxes.t
+    order = np.lexsort((t, ids))
+    step, same = np.diff(t[order]), np.diff(ids[order]) == 0
+    order = order[np.concatenate([[True], ~same | (step > 0.0)])[: order.size]]
+    step, same = np.diff(t[order]), np.diff(ids[order]) == 0
+    breaks = np.flatnonzero(~same | (step > max_gap_s)) + 1
+    parts = [{name: getattr(boxes, name)[:0] for name in ARRAYS}]
+    for rows in np.split(order, breaks) if order.size else []:
+        first = math.ceil(float(t[rows[0]]) * rate_hz - 1e-6)
+        last = math.floor(float(t[rows[-1]]) * rate_hz + 1e-6)
+        clock = np.arange(first, last + 1) / rate_hz
+        at = np.minimum(np.searchsorted(t[rows], clock), rows.size - 1)
+        part = {"ids": np.full(clock.size, ids[rows[0]]), "t": clock}
+        for name in SERIES:
+            values = getattr(boxes, name)[rows]
+            values = np.unwrap(values) if name == "heading" else values
+            known = not np.isnan(values).any()
+            part[name] = np.interp(clock, t[rows], values) if known else values[at]
+        parts.append({**part, "kind": boxes.kind[rows][at]})
+    merged = {name: np.concatenate([part[name] for part in parts]) for name in ARRAYS}
+    return dataclasses.replace(boxes, **merged)
+
+
 def tracks_of(
     path: Path,
     boxes: Boxes,
@@ -103,14 +136,13 @@ def tracks_of(
     unknown: str = "auto",
     automated: tuple[tuple[float, float], ...] = (),
 ) -> tuple[list[Track], list[str]]:
-    """Tracks of the boxes, in the order of their ids, and notes on what was left out.
+    """Makes tracks of boxes, in the order of their ids, and notes on what is left out.
 
-    A gap longer than `max_gap_s` starts another track, "id#2". Size and class
-    are the median and the most frequent of a track; where no size is known it is that
-    of its class. Trackers lose objects now
-    and then: tracks with an impossible size or speed are left out, unless they
-    are more than a tenth, which points at a wrong file. A box that is met twice at one
-    time counts once, likewise.
+    A gap longer than `max_gap_s` starts another track, "id#2". Size and class are the
+    median and the most frequent of a track; where no size is known it is that of its
+    class. Trackers lose objects now and then: tracks with an impossible size or speed
+    are left out, unless they are more than a tenth, which points at a wrong file. A box
+    that is met twice at one time counts once, likewise.
 
     Args:
       path: named in errors.
@@ -130,28 +162,7 @@ def tracks_of(
         )
     if boxes.t.size == 0:
         return [], []
-    _check(path, boxes)
-    kept, doubled = once_each(boxes.ids, boxes.t)
-    if doubled:
-        rows = {name: getattr(boxes, name)[kept] for name in ARRAYS}
-        boxes = dataclasses.replace(boxes, **rows)
-    tracks, dropped, seen = [], 0, {}
-    for _, rows in split_tracks(path, boxes.ids, boxes.t, max_gap_s):
-        name = boxes.names[int(boxes.ids[rows[0]])]
-        seen[name] = seen.get(name, 0) + 1
-        label = name if seen[name] == 1 else f"{name}#{seen[name]}"
-        track = _track(label, boxes, rows, unknown, automated)
-        dropped += track is None
-        tracks += [] if track is None else [track]
-    tracks, notes = without_outliers(tracks)
-    if dropped:
-        notes.append(f"{dropped} tracks of unknown class left out")
-    return tracks, [*doubled, *notes]
-
-
-def _check(path: Path, boxes: Boxes) -> None:
-    """Everything is finite, and no box is absurdly large."""
-    for field in FIELDS:
+    for field in ("t", "x", "y", "heading", "length", "width"):
         values = getattr(boxes, field)
         wrong, expected = ~np.isfinite(values), ": expected a finite number"
         if field in ("length", "width"):
@@ -161,6 +172,21 @@ def _check(path: Path, boxes: Boxes) -> None:
             row = np.flatnonzero(wrong)[0]
             name = boxes.names[int(boxes.ids[row])]
             raise InputError(f"{path}: id {name}: {field}: {values[row]:g}{expected}")
+    kept, notes = once_each(boxes.ids, boxes.t)
+    if notes:
+        once = {name: getattr(boxes, name)[kept] for name in ARRAYS}
+        boxes = dataclasses.replace(boxes, **once)
+    tracks, dropped, seen = [], 0, {}
+    for _, rows in split_tracks(path, boxes.ids, boxes.t, max_gap_s):
+        name = boxes.names[int(boxes.ids[rows[0]])]
+        seen[name] = seen.get(name, 0) + 1
+        label = name if seen[name] == 1 else f"{name}#{seen[name]}"
+        track = _track(label, boxes, rows, unknown, automated)
+        dropped += track is None
+        tracks += [] if track is None else [track]
+    tracks, outliers = without_outliers(tracks)
+    lost = [f"{dropped} tracks of unknown class left out"] if dropped else []
+    return tracks, [*notes, *outliers, *lost]
 
 
 def _track(
@@ -174,11 +200,12 @@ def _track(
     t, x, y = boxes.t[rows], boxes.x[rows], boxes.y[rows]
     # most frequent class; the shift makes UNKNOWN a count of its own
     kind = int(np.argmax(np.bincount(boxes.kind[rows] - UNKNOWN))) + UNKNOWN
+    size, assumed = [], boxes.size_assumed
     usual = SIZES_M.get(Kind(max(kind, 0)), OTHER_SIZE_M)
-    length, width = (
-        _median(sizes[rows], default)
-        for sizes, default in zip((boxes.length, boxes.width), usual, strict=True)
-    )
+    for sizes, default in zip((boxes.length, boxes.width), usual, strict=True):
+        known = sizes[rows][np.isfinite(sizes[rows])]
+        size.append(float(np.median(known)) if known.size else default)
+        assumed |= not known.size
     if kind == UNKNOWN:
         if unknown == "drop":
             return None
@@ -192,9 +219,9 @@ def _track(
     return Track(
         id=name,
         kind=Kind(kind),
-        length=max(length[0], LENGTH_RANGE_M[0]),
-        width=max(width[0], WIDTH_RANGE_M[0]),
-        size_assumed=boxes.size_assumed or length[1] or width[1],
+        length=max(size[0], LENGTH_RANGE_M[0]),
+        width=max(size[1], WIDTH_RANGE_M[0]),
+        size_assumed=assumed,
         t=t,
         x=x,
         y=y,
@@ -204,14 +231,8 @@ def _track(
     )
 
 
-def _median(sizes: np.ndarray, default: float) -> tuple[float, bool]:
-    """The median [m] of the known sizes, or the default; whether it is this one."""
-    known = sizes[np.isfinite(sizes)]
-    return (float(np.median(known)), False) if known.size else (default, True)
-
-
 def speed_of(t: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Speed [n] m/s from positions: central differences."""
+    """Computes speed [n] m/s from positions by central differences."""
     if t.size < 2:
         return np.zeros(t.shape)
     return np.hypot(np.gradient(x, t), np.gradient(y, t))
@@ -220,9 +241,9 @@ def speed_of(t: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def without_outliers(
     tracks: list[Track], is_possible: Callable[[Track], bool] | None = None
 ) -> tuple[list[Track], list[str]]:
-    """Tracks without the impossible ones, and a note of their number.
+    """Drops impossible tracks, with a note of their number.
 
-    All tracks, for validation to refuse, if more than MAX_OUTLIERS are impossible, and
+    Keeps all, for validation to refuse, if more than MAX_OUTLIERS are impossible, and
     more than one of ONE_OF or more.
 
     Args:
@@ -238,83 +259,26 @@ def without_outliers(
 
 
 def has_possible_speed(track: Track) -> bool:
-    """Whether no sample is faster than any road user."""
+    """True if no sample is faster than any road user."""
     return not np.max(np.abs(track.speed)) > MAX_SPEED_MPS
 
 
 def _is_possible(track: Track) -> bool:
-    if not has_possible_speed(track):
-        return False
-    if track.kind == Kind.STATIC:
-        return True
     sizes = ((track.length, LENGTH_RANGE_M), (track.width, WIDTH_RANGE_M))
-    return all(low <= size <= high for size, (low, high) in sizes)
-
-
-def longest_window(spec: Mapping) -> float:
-    """The option `window_s` of a source TOML, s."""
-    window = number(spec, "window_s", WINDOW_S)
-    if window < MIN_WINDOW_S:
-        raise InputError(
-            f"source TOML: window_s: {window:g}: expected at least {MIN_WINDOW_S:g} s"
-        )
-    return window
-
-
-def around(within: tuple[float, float]) -> tuple[float, float]:
-    """Times [s] that a window's scenes need: with their history and future."""
-    low, high = within
-    return low - long_logs.BEFORE_S, high + long_logs.AFTER_S
-
-
-class Windows:
-    """Windows of one long drive: each road user has one name in all of them.
-
-    Args:
-      drive: its name.
-      group: vehicle-disjoint group of all its windows.
-      max_gap_s: a road user unseen for longer is another track.
-    """
-
-    def __init__(self, drive: str, group: str, max_gap_s: float) -> None:
-        self.drive, self.group, self.max_gap_s = drive, group, max_gap_s
-        self._starts: dict[str, list[float]] = {}  # s, first seen, and after gaps
-        self._last: dict[str, float] = {}  # s
-
-    def recording(
-        self, made: Recording, number: int, within: tuple[float, float], progress: float
-    ) -> Recording:
-        """A window as a part of the drive; windows come in the order of time.
-
-        Args:
-          made: with `around(within)`, in seconds of the drive.
-          number: of the window.
-          within: s, when its scenes begin.
-          progress: share of the input read with it.
-        """
-        for track in made.tracks:
-            user, first = track.id.partition("#")[0], float(track.t[0])
-            last = self._last.get(user, -np.inf)
-            if first - last > self.max_gap_s:
-                self._starts.setdefault(user, []).append(first)
-            self._last[user] = max(last, float(track.t[-1]))
-        piece = long_logs.Piece(
-            recording=None,
-            number=number,
-            values={},
-            within=within,
-            fragments=self._starts,
-            progress=progress,
-        )
-        name = f"{self.drive}-{number:03d}"
-        made = dataclasses.replace(made, name=name, group=self.group)
-        return long_logs.piece_of(self.drive, made, piece)
+    return has_possible_speed(track) and (
+        track.kind == Kind.STATIC
+        or all(low <= size <= high for size, (low, high) in sizes)
+    )
 
 
 def placed(
     tracks: Sequence[Track],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Track]]:
-    """(x, y [n] m of all samples, local origin [2] m, tracks around it)."""
+    """Moves tracks to a local origin.
+
+    Returns:
+      x, y [n] m of all samples as they were, the origin [2] m, the tracks around it.
+    """
     x = np.concatenate([track.x for track in tracks])
     y = np.concatenate([track.y for track in tracks])
     origin = local_origin(x, y)
@@ -328,10 +292,34 @@ def placed(
 def fitted_lanes(
     tracks: Sequence[Track], spec: Mapping
 ) -> tuple[tuple[Lane, ...], str]:
-    """Lanes along the paths that were driven, and a note of their number.
+    """Fits lanes to the paths that were driven, with a note of their number.
 
     Their limit is what the user's own TOML states, if it does.
     """
     width = positive(spec, "lane_width_m", LANE_WIDTH_M)
     lanes = path_lanes(tracks, width, stated(spec, "speed_limit"))
     return lanes, f"{len(lanes)} lanes fitted to the longest paths"
+
+
+def held_states(
+    clock: np.ndarray, seen: np.ndarray, states: np.ndarray, hold: float
+) -> np.ndarray:
+    """Holds the last state seen of a light: [T] numbers of STATES.
+
+    Args:
+      clock: [T] times, increasing.
+      seen: [n] times, increasing, in the same unit.
+      states: [n] numbers of STATES.
+      hold: in the same unit; the light is off after it without any.
+    """
+    last = np.searchsorted(seen, clock, side="right") - 1
+    fresh = (last >= 0) & (clock - seen[np.maximum(last, 0)] <= hold)
+    return np.where(fresh, states[np.maximum(last, 0)], 0)
+
+
+def signal_of(name: str, t: np.ndarray, states: np.ndarray) -> Signal:
+    """Makes intervals of a light's states (numbers of STATES) at times t [T] s."""
+    first = np.flatnonzero(np.diff(states, prepend=-1))
+    return Signal(
+        id=name, start=t[first], state=tuple(STATES[state] for state in states[first])
+    )

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from rcirl_jax.data.formats import read_recordings
-from rcirl_jax.data.formats.clock import on_clock
-from rcirl_jax.data.formats.perception import Boxes, tracks_of
+from rcirl_jax.data.formats.perception import Boxes, on_clock, tracks_of
 from rcirl_jax.data.quality import assumed
 from rcirl_jax.types import Kind
 from tests.data.formats import people

@@ -1,7 +1,6 @@
 """Apollo cyber records: `records` is the file, `messages` its content.
 
-`descriptors` tells how messages are read. A new channel or message field is read in
-`messages`; `reader` makes recordings of it.
+A new channel or message field is read in `messages`; `reader` makes recordings of it.
 """
 
 from rcirl_jax.data.formats.format import Format

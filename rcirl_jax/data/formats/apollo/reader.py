@@ -16,36 +16,33 @@ and the ego is another track from each new one on.
 """
 
 import dataclasses
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
-from rcirl_jax.data.formats.apollo.held import Held, Leg
-from rcirl_jax.data.formats.apollo.messages import LOCALIZATION, MANUAL, read_drive
+from rcirl_jax.data.formats.apollo.messages import (
+    LOCALIZATION,
+    MANUAL,
+    OBSTACLES,
+    WIDTHS,
+    read_drive,
+)
 from rcirl_jax.data.formats.apollo.records import Run, first_parts
-from rcirl_jax.data.formats.clock import on_clock
 from rcirl_jax.data.formats.files import log_name
 from rcirl_jax.data.formats.messages import (
-    MAX_GAP_S,
-    automatic_notes,
-    automatic_spans,
+    Drive,
+    Windows,
     clock_rate,
     drive_windows,
     is_anybody,
+    longest_window,
     no_tracks,
-    speed_at,
 )
 from rcirl_jax.data.formats.options import one_pattern, positive
-from rcirl_jax.data.formats.perception import (
-    Boxes,
-    Windows,
-    ego_boxes,
-    fitted_lanes,
-    longest_window,
-    placed,
-    tracks_of,
-)
+from rcirl_jax.data.formats.perception import Boxes, fitted_lanes, placed
 from rcirl_jax.data.formats.shapes import check_coordinates, origin_notes
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
@@ -56,33 +53,44 @@ LIMIT_MPS = 29.06  # m/s, 65 mph
 EGO = {"length": 4.933, "width": 2.11, "rear_axle_to_centre": 1.4235}  # m
 # what is measured of a box
 MEASURED = ("x", "y", "heading", "speed", "length", "width")
+CLOCK_TOLERANCE_S = 1.0  # s, two topics' clocks differ by more: not one clock
+REPEAT_S = 1.5  # s; Apollo sends the routing in force again every second
+
+Leg = tuple[float, tuple[float, float] | None]  # s, from when on; destination, m
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
-    """The first file of each run of parts: runs can be read without the others."""
+    """Lists the first file of each run of parts: runs can be read alone."""
     if path.is_file():
         return [path]
     return first_parts(path, one_pattern(spec, "*.record*"))
 
 
 def files_of(first: Path) -> list[Path]:
-    """The files of a run, by its first one."""
+    """Lists the files of a run, by its first one."""
     return Run(first).files
 
 
 def own_name(first: Path) -> str:
-    """Name of a run, as long as no other folder has one called alike."""
+    """Returns the name of a run, as long as no other folder has one called alike."""
     return Run(first).name
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
-    """One Recording per drive, or per window of a long one, or run of its parts."""
+    """Yields one Recording per drive, or per window of a long one, or run of parts."""
     for first in parts(path, spec):
-        held, found = Held(first), False
-        for recording in _windows(held, spec):
+        run, drive, found = Run(first), ApolloDrive(first), False
+        windows = Windows(log_name(first, spec, run.name), run.drive)
+        for recording in drive_windows(
+            drive,
+            read_drive(run.files, spec),
+            windows,
+            longest_window(spec),
+            lambda view, within, run=run: _recording(view, within, run, spec),
+        ):
             found = True
             yield validate_recording(recording, first)
-        if held.is_empty:
+        if math.isnan(drive.start):
             raise InputError(
                 f"{first}: {LOCALIZATION}: no messages, nor obstacles: "
                 "expected at least one of them"
@@ -91,26 +99,103 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
             raise no_tracks(first, spec)
 
 
-def _windows(held: Held, spec: dict) -> Iterator[Recording]:
-    """Recordings of a drive."""
-    run = Run(held.path)
-    return drive_windows(
-        held,
-        read_drive(run.files, spec),
-        Windows(log_name(run.first, spec, run.name), run.drive, MAX_GAP_S),
-        longest_window(spec),
-        lambda view, within: _recording(view, within, spec),
-    )
+class ApolloDrive(Drive):
+    """Rows of a drive, put onto one clock: of measurement, or of recording.
+
+    Column 0 is the time of a message's header, column 1 of its recording; of poses and
+    obstacles column 2 is that of measurement. Where topics are stamped on different
+    clocks, the times of recording are common to all.
+    """
+
+    stamp_field = "timestamp_sec"
+    driver_role = "chassis"
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, WIDTHS, ("localization", *OBSTACLES))
+        self._offset = 0.0  # s, what the clock shows less the time of recording
+        self._is_one_clock = True
+
+    @property
+    def key(self) -> str:
+        """The role of the obstacles."""
+        return "perception" if len(self.tables["perception"]) else "prediction"
+
+    @property
+    def in_use(self) -> Sequence[str]:
+        """Roles whose rows become tracks."""
+        return "localization", self.key
+
+    @property
+    def now(self) -> float:
+        """Time [s] at which the last position was recorded; -inf without any held."""
+        tables = [self.tables[role] for role in self.in_use]
+        recorded = [table[-1, 1] for table in tables if len(table)]
+        return max(recorded, default=-math.inf) + self._offset - self.start
+
+    def settle(self) -> None:
+        """Chooses the clock, and where it starts."""
+        tables = [self.tables[role] for role in (*self.in_use, "chassis")]
+        offsets = [float(np.median(t[:, 0] - t[:, 1])) for t in tables if len(t)]
+        if offsets:
+            self._is_one_clock = max(offsets) - min(offsets) <= CLOCK_TOLERANCE_S
+        super().settle()
+        if not math.isnan(self.start):
+            ahead = [self.stamps(r) - self.tables[r][:, 1] for r in self.in_use]
+            self._offset = float(np.median(np.concatenate(ahead)))
+
+    def stamps(self, role: str) -> np.ndarray:
+        """Returns what the clock shows [s] at each row of a role."""
+        table = self.tables[role]
+        if not self._is_one_clock:
+            return table[:, 1]
+        own = table[:, 0 if role == "chassis" else 2]
+        near = np.abs(own - table[:, 0]) <= CLOCK_TOLERANCE_S
+        return np.where(near, own, table[:, 0])
+
+    def view(self, low: float, high: float) -> Self:
+        """Returns rows from one time [s] to before another, notes since the last."""
+        view = super().view(low, high)
+        if not self.is_cut and not self._is_one_clock:
+            note = "topics stamped on different clocks; times of recording used"
+            view.notes = [*view.notes, note]
+        return view
+
+    def _rows(self, role: str, low: float, high: float = math.inf) -> np.ndarray:
+        """Rows between two times [s]; all routings, which are in force for long."""
+        every = self.tables[role]
+        return every if role == "routing" else super()._rows(role, low, high)
+
+    def legs(self) -> list[Leg]:
+        """Returns destinations in the order of time, the first valid from the start.
+
+        A routing that came within REPEAT_S of the start was in force before.
+        """
+        legs: list[Leg] = [(-math.inf, None)]
+        for time, x, y in sorted(self.tables["routing"].tolist()):
+            if (x, y) != legs[-1][1]:
+                legs.append((time + self._offset - self.start, (x, y)))
+        while len(legs) > 1 and legs[1][0] <= (REPEAT_S if legs[0][1] is None else 0.0):
+            legs[:2] = [(-math.inf, legs[1][1])]
+        return legs
 
 
-def _recording(held: Held, within: tuple[float, float], spec: dict) -> Recording | None:
+def _recording(
+    drive: ApolloDrive, within: tuple[float, float], run: Run, spec: dict
+) -> Recording | None:
     """The tracks of the rows held, with notes on the time within; None: nothing."""
-    run, rate, notes = Run(held.path), clock_rate(spec), list(held.notes)
-    obstacles, obstacle_notes = _obstacles(held, spec, rate)
-    tracks = [*_ego(held, spec, rate), *obstacles]
+    obstacles, obstacle_notes = _obstacles(drive, spec)
+    tracks = [*_ego(drive, spec), *obstacles]
     if not is_anybody(tracks, within):
         return None
-    notes += _what_is_missing(held, within)
+    legs, missing = drive.legs(), []
+    if not len(drive.tables["localization"]):
+        missing.append("no localization recorded; no ego track")
+    elif not any(start < within[1] and place for start, place in legs):
+        missing.append("no routing recorded; the ego's destination is unknown")
+    if not len(drive.tables[drive.key]):
+        missing.append("no obstacles recorded; the ego is alone")
+    elif drive.key == "prediction":
+        missing.append("no perception recorded; obstacles are those of prediction")
     _, _, origin, tracks = placed(tracks)
     lanes, lanes_note = fitted_lanes(tracks, spec)
     return Recording(
@@ -118,12 +203,14 @@ def _recording(held: Held, within: tuple[float, float], spec: dict) -> Recording
         group=run.drive if run.is_cut else None,
         source=str(spec.get("source", "Apollo cyber record")),
         licence=str(spec.get("licence", "unknown")),
-        rate_hz=rate,
-        tracks=tuple(_with_destinations(tracks, held.legs(), origin)),
+        rate_hz=clock_rate(spec),
+        tracks=tuple(_with_destinations(tracks, legs, origin)),
         lanes=lanes,
         default_speed_limit=positive(spec, "speed_limit", LIMIT_MPS),
         notes=(
-            *notes,
+            *drive.notes,
+            *missing,
+            *drive.driver_notes(within, f"in {MANUAL}"),
             *obstacle_notes,
             *origin_notes(origin),
             f"records hold no map; {lanes_note}",
@@ -131,43 +218,22 @@ def _recording(held: Held, within: tuple[float, float], spec: dict) -> Recording
     )
 
 
-def _what_is_missing(held: Held, within: tuple[float, float]) -> list[str]:
-    """Notes on topics without messages, and on driving that is no human's."""
-    notes = []
-    if not len(held.tables["localization"]):
-        notes.append("no localization recorded; no ego track")
-    elif not any(start < within[1] and place for start, place in held.legs()):
-        notes.append("no routing recorded; the ego's destination is unknown")
-    if not len(held.tables[held.key]):
-        notes.append("no obstacles recorded; the ego is alone")
-    elif held.key == "prediction":
-        notes.append("no perception recorded; obstacles are those of prediction")
-    clock, by_hand = held.clock("chassis"), held.tables["chassis"][:, 3]
-    return notes + automatic_notes(clock, by_hand, within, f"in {MANUAL}")
+def _ego(drive: ApolloDrive, spec: dict) -> list[Track]:
+    """The ego's track; without a chassis channel a human drives."""
+    poses = drive.tables["localization"][:, 3:]
+    where = f"{drive.path}: {LOCALIZATION}"
+    check_coordinates(where, "pose", ("x", "y", "heading"), poses[:, :3])
+    velocity = drive.clock("chassis"), drive.tables["chassis"][:, 2]
+    return drive.ego_tracks(spec, EGO, poses, velocity, drive.driver_spans())
 
 
-def _ego(held: Held, spec: dict, rate: float) -> list[Track]:
-    """The recording car's box, moved from its rear axle to its centre."""
-    t, table = held.clock("localization"), held.tables["localization"]
-    x, y, heading, speed = table[:, 3:].T
-    where = f"{held.path}: {LOCALIZATION}"
-    check_coordinates(where, "pose", ("x", "y", "heading"), table[:, 3:6])
-    if t.size and not np.isfinite(speed).all():
-        speed = speed_at(t, held.clock("chassis"), held.tables["chassis"][:, 2])
-    boxes = ego_boxes(spec, EGO, t, x, y, heading, speed)
-    boxes = on_clock(boxes, rate, MAX_GAP_S)
-    # the first mode was in force before; without a chassis channel a human drives
-    automated = automatic_spans(held.clock("chassis"), held.tables["chassis"][:, 3])
-    return tracks_of(held.path, boxes, MAX_GAP_S, automated=automated)[0]
-
-
-def _obstacles(held: Held, spec: dict, rate: float) -> tuple[list[Track], list[str]]:
-    table, clock = held.tables[held.key], held.clock(held.key)
+def _obstacles(drive: ApolloDrive, spec: dict) -> tuple[list[Track], list[str]]:
+    table, clock = drive.tables[drive.key], drive.clock(drive.key)
     # a state without a position, or of the ego (negative id), is none
     seen = ~np.isnan(table[:, 4:6]).any(axis=1) & (table[:, 3] >= 0)
     lost = int(np.count_nonzero(~seen))
     table, clock = table[seen], clock[seen]
-    where = f"{held.path}: obstacles"
+    where = f"{drive.path}: obstacles"
     check_coordinates(where, "perception_obstacle", ("x", "y", "theta"), table[:, 4:7])
     number_of, ids = np.unique(table[:, 3].astype(np.int64), return_inverse=True)
     boxes = Boxes(
@@ -177,9 +243,7 @@ def _obstacles(held: Held, spec: dict, rate: float) -> tuple[list[Track], list[s
         kind=table[:, 10].astype(np.int64),
         **dict(zip(MEASURED, table[:, 4:10].T, strict=True)),
     )
-    unknown = str(spec.get("unknown", "auto"))
-    boxes = on_clock(boxes, rate, MAX_GAP_S)
-    tracks, notes = tracks_of(held.path, boxes, MAX_GAP_S, unknown)
+    tracks, notes = drive.tracks(boxes, spec)
     if lost:
         notes.append(f"{lost} obstacle states without position or id left out")
     return tracks, notes
@@ -187,34 +251,25 @@ def _obstacles(held: Held, spec: dict, rate: float) -> tuple[list[Track], list[s
 
 def _with_destinations(
     tracks: list[Track], legs: list[Leg], origin: np.ndarray
-) -> list[Track]:
+) -> Iterator[Track]:
     """The tracks, the ego's cut where a routing set another destination.
 
     The destination is the one valid at the time: the driver knew no later one.
     """
     changes = np.array([start for start, _ in legs[1:]])
-    found: list[Track] = []
     for track in tracks:
         user, *again = track.id.split("#")
         if user != "ego":
-            found.append(track)
+            yield track
             continue
         which = np.searchsorted(changes, track.t + 1e-6, side="right")
         for leg in np.unique(which).tolist():
             name = user if leg == 0 else f"{user}-leg{leg + 1}"
             rows, place = which == leg, legs[leg][1]
-            series = {
-                field: getattr(track, field)[rows]
-                for field in ("t", "x", "y", "heading", "speed")
-            }
-            found.append(
-                dataclasses.replace(
-                    track,
-                    id="#".join((name, *again)),
-                    destination=None
-                    if place is None
-                    else (place[0] - float(origin[0]), place[1] - float(origin[1])),
-                    **series,
-                )
+            series = ("t", "x", "y", "heading", "speed")
+            yield dataclasses.replace(
+                track,
+                id="#".join((name, *again)),
+                destination=place and tuple((np.array(place) - origin).tolist()),
+                **{field: getattr(track, field)[rows] for field in series},
             )
-    return found

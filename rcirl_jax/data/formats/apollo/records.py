@@ -1,4 +1,4 @@
-"""Records of Apollo's middleware Cyber RT: sections, channels, messages.
+"""Records of Apollo's middleware Cyber RT: files, sections, channels, messages.
 
 Layout: cyber/proto/record.proto and cyber/record/file in the Apollo sources. A
 file is a row of sections, each with a head of 16 bytes (type int32, 4 bytes
@@ -46,31 +46,23 @@ class Run:
     """
 
     def __init__(self, first: Path) -> None:
-        name, self._number = _drive_and_part(first)
-        self.first, self.drive = first, name.name
+        drive, number = _drive_and_part(first)
         match = NAME.fullmatch(first.name)
         is_part = match is not None and match["part"] is not None
         beside = first.parent.glob("*.record.*") if is_part else ()
-        self._parts = _drives(beside).get(name, {})
-        self.files, number = [first], self._number + 1
-        while number in self._parts:
-            self.files.append(self._parts[number])
-            number += 1
-
-    @property
-    def name(self) -> str:
-        """Its drive's, and its part behind a missing one."""
-        is_first = self._number <= min(self._parts, default=0)
-        return self.drive if is_first else f"{self.drive}-{self._number:05d}"
-
-    @property
-    def is_cut(self) -> bool:
-        """Whether the drive has other parts, which do not follow."""
-        return len(self._parts) > len(self.files)
+        known = _drives(beside).get(drive, {})
+        self.first, self.drive, self.files = first, drive.name, [first]
+        while (following := known.get(number + len(self.files))) is not None:
+            self.files.append(following)
+        # its drive's, and its part behind a missing one
+        is_first = number <= min(known, default=0)
+        self.name = self.drive if is_first else f"{self.drive}-{number:05d}"
+        # the drive has other parts, which do not follow
+        self.is_cut = len(known) > len(self.files)
 
 
 def first_parts(folder: Path, pattern: str) -> list[Path]:
-    """The first file of each run of parts at any depth of a folder, sorted."""
+    """Lists the first file of each run of parts at any depth of a folder, sorted."""
     drives = _drives(files_below(folder, pattern))
     if not drives:
         raise InputError(f"{folder}: no file matches {pattern}: expected cyber records")
@@ -113,9 +105,7 @@ class Record:
             with self.path.open("rb") as handle:
                 self._map = mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ)
         except (OSError, ValueError) as error:
-            raise InputError(
-                f"{self.path}: record: {error}: expected a cyber record"
-            ) from error
+            raise self._error("record", error, "a cyber record") from error
         self._data = memoryview(self._map)
         return self
 
@@ -125,12 +115,15 @@ class Record:
         with contextlib.suppress(BufferError):
             self._map.close()
 
+    def _error(self, field: str, found: object, expected: str) -> InputError:
+        return InputError(f"{self.path}: {field}: {found}: expected {expected}")
+
     def messages(
         self,
         wanted: Callable[[str], bool],
         show: Callable[[int], object] = lambda _: None,
     ) -> Iterator[tuple[str, int, memoryview]]:
-        """(channel, time ns, content) of the messages on the wanted channels.
+        """Yields (channel, time ns, content) of the messages on the wanted channels.
 
         Args:
           wanted: whether a channel is.
@@ -144,9 +137,9 @@ class Record:
                     own = (channel.message_type, channel.proto_desc)
                     self.channels[channel.name] = own
                 elif kind == CHUNK_BODY:
-                    parts = _fields(section)
-                    found = (_message(value) for number, value in parts if number == 1)
-                    yield from (message for message in found if wanted(message[0]))
+                    for number, value in _fields(section):
+                        if number == 1 and wanted((sent := _message(value))[0]):
+                            yield sent
                 show(len(section))
         except DecodeError as error:
             raise InputError(
@@ -156,50 +149,43 @@ class Record:
     def _sections(self) -> Iterator[tuple[int, memoryview]]:
         at, end = 0, len(self._data)
         while at < end:
-            if end - at < HEAD.size:
-                raise self._truncated(at)
-            kind, size = HEAD.unpack_from(self._data, at)
-            if at == 0:
-                self._read_header(kind, size)
-                at = HEAD.size + HEADER_BYTES
-                continue
-            at += HEAD.size
-            if not HEADER < kind <= CHANNEL or size < 0:
-                raise InputError(
-                    f"{self.path}: section at byte {at - HEAD.size}: type {kind}, "
-                    f"{size} bytes: expected type 1 to 4"
-                )
+            kind, size = -1, HEAD.size
+            if size <= end - at:
+                kind, size = HEAD.unpack_from(self._data, at)
+                if at == 0:
+                    self._read_header(kind, size)
+                    at = HEAD.size + HEADER_BYTES
+                    continue
+                at += HEAD.size
+                if not HEADER < kind <= CHANNEL or size < 0:
+                    raise self._error(
+                        f"section at byte {at - HEAD.size}",
+                        f"type {kind}, {size} bytes",
+                        "type 1 to 4",
+                    )
             if size > end - at:
-                raise self._truncated(at)
+                where = f"section at byte {at}: beyond the end at {end}"
+                expected = "expected a whole record; truncated?"
+                raise InputError(f"{self.path}: {where}: {expected}")
             yield kind, self._data[at : at + size]
             at += size
             if kind == INDEX:  # the last; the rest is of a file written over
                 return
 
-    def _truncated(self, at: int) -> InputError:
-        return InputError(
-            f"{self.path}: section at byte {at}: beyond the end at "
-            f"{len(self._data)}: expected a whole record; truncated?"
-        )
-
     def _read_header(self, kind: int, size: int) -> None:
         whole = HEAD.size + HEADER_BYTES <= len(self._data)
         if kind != HEADER or not 0 <= size <= HEADER_BYTES or not whole:
-            raise InputError(
-                f"{self.path}: header: type {kind}, {size} bytes: "
-                "expected that of a cyber record"
-            )
+            found = f"type {kind}, {size} bytes"
+            raise self._error("header", found, "that of a cyber record")
         header = read_header(bytes(self._data[HEAD.size : HEAD.size + size]))
         if header.compress != 0:
-            raise InputError(
-                f"{self.path}: header: compress: {header.compress}: expected 0, none "
-                "(no Apollo release writes compressed chunks)"
-            )
+            expected = "0, none (no Apollo release writes compressed chunks)"
+            raise self._error("header: compress", header.compress, expected)
         self.is_complete = header.is_complete
 
 
 def check_size(what: str, content: memoryview) -> None:
-    """Parsed, a message takes many times its bytes."""
+    """Refuses long content: parsed, a message takes many times its bytes."""
     if len(content) > MAX_BYTES:
         raise DecodeError(f"{what}: {len(content)} bytes of at most {MAX_BYTES}")
 

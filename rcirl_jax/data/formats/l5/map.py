@@ -13,6 +13,7 @@ from google.protobuf.message import DecodeError
 
 from rcirl_jax.data.formats.l5.messages import COLOURS, read_message
 from rcirl_jax.data.formats.options import path_option
+from rcirl_jax.data.formats.perception import STATES, held_states, signal_of
 from rcirl_jax.data.formats.projection import earth_centred
 from rcirl_jax.data.formats.shapes import (
     Roads,
@@ -20,7 +21,6 @@ from rcirl_jax.data.formats.shapes import (
     check_coordinates,
     moves,
 )
-from rcirl_jax.data.formats.signals import STATES, held, signal_of
 from rcirl_jax.data.readers.protobuf import Message
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.atomic_files import read_json
@@ -121,7 +121,7 @@ class SemanticMap:
             np.add.at(votes, (frame[rows], colours[place]), is_active[rows])
             frames = np.unique(frame[rows])
             # without a vote it is off; ties go to the first
-            states = held(t, t[frames], votes[frames].argmax(axis=1), HOLD_S)
+            states = held_states(t, t[frames], votes[frames].argmax(axis=1), HOLD_S)
             found.append(signal_of(name, t, states))
         return tuple(found)
 

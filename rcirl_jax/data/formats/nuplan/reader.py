@@ -19,23 +19,22 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.formats.files import files_below, log_name
+from rcirl_jax.data.formats.messages import Windows, around, longest_window
 from rcirl_jax.data.formats.nuplan.map import NuplanMap, find_map
 from rcirl_jax.data.formats.options import one_pattern, positive
 from rcirl_jax.data.formats.perception import (
     Boxes,
-    Windows,
-    around,
     ego_boxes,
     fitted_lanes,
-    longest_window,
+    held_states,
     placed,
+    signal_of,
     tracks_of,
 )
 from rcirl_jax.data.formats.shapes import (
     check_coordinates,
     origin_notes,
 )
-from rcirl_jax.data.formats.signals import held, signal_of
 from rcirl_jax.data.readers.sqlite import Database
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
@@ -302,6 +301,6 @@ def _signals(database: Database, clock: np.ndarray, start: float) -> tuple[Signa
     found = []
     for connector in np.unique(table[np.isfinite(table[:, 1]), 1]):
         seen, _, states = table[table[:, 1] == connector].T
-        shown = held(clock, seen, states.astype(np.int64), HOLD_S * 1e6)
+        shown = held_states(clock, seen, states.astype(np.int64), HOLD_S * 1e6)
         found.append(signal_of(str(int(connector)), (clock - start) * 1e-6, shown))
     return tuple(found)

@@ -1,9 +1,7 @@
-"""ROS 2 bags: `bags` finds the files, `mcap_file` and `sqlite_file` read messages.
+"""ROS 2 bags: `bag` finds and opens files, `messages` turns messages into rows.
 
-`messages` chooses topics, `readings` and `objects` turn messages into rows of numbers,
-`held` keeps the rows that windows still need, `lights` and `lanes` are what stands
-beside the road. A new type of message is a function in `readings.TYPES` or
-`objects.TYPES`; `reader` makes recordings.
+`reader` makes recordings of the rows, with lanes and lights by `map`. A new type of
+message is a function in `messages.TYPES`.
 """
 
 from rcirl_jax.data.formats.format import Format

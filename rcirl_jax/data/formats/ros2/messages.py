@@ -1,206 +1,353 @@
-"""Messages of a bag as rows of numbers, about a minute at a time.
+"""How a message of each type becomes rows of numbers, by the role of its topic.
 
-Which topics are read stands in the source TOML, by role; of which type they are says
-the file.
+A new type of message is a function in `TYPES`. Fields are found by name, as the
+definition in the file has them; covariances are not read. Numbers of classes, shapes
+and availabilities are those of the packages' .msg files: autoware_perception_msgs
+(ObjectClassification, Shape, TrackedObjectKinematics; those of
+autoware_auto_perception_msgs are the same), derived_object_msgs (Object), shape_msgs
+(SolidPrimitive). Names of classes in vision_msgs are whatever the detector calls them,
+so [kinds] of the source TOML says what they are.
 """
 
-import array
-import contextlib
-from collections.abc import Iterator, Mapping
-from itertools import accumulate
-from pathlib import Path
+import dataclasses
+import math
+from collections.abc import Callable, Iterator, Mapping
+from operator import attrgetter
 
-import numpy as np
-
-from rcirl_jax.data.formats.messages import check_held, topics_of
-from rcirl_jax.data.formats.options import section
-from rcirl_jax.data.formats.ros2.bag_file import Sent, Topic, decoder_of
-from rcirl_jax.data.formats.ros2.mcap_file import McapFile
-from rcirl_jax.data.formats.ros2.readings import COLUMNS, TYPES, Context, Row
-from rcirl_jax.data.formats.ros2.sqlite_file import SqliteFile
-from rcirl_jax.data.readers.reading import reading
+from rcirl_jax.data.formats.options import kind_of
+from rcirl_jax.data.formats.perception import STATES, UNKNOWN
+from rcirl_jax.data.formats.ros2.bag import Message
 from rcirl_jax.errors import InputError
+from rcirl_jax.types import Kind
 
-MAX_MESSAGE_BYTES = 16 * 2**20  # bytes; decoded, a message takes many times its bytes
-PIECE_S = 60.0  # s of recording after which rows are handed on
-NEEDED = ("ego", "obstacles")
+NAN = math.nan
+# role -> its columns; t is the header's stamp, s
+COLUMNS = {
+    "ego": ("t", "x", "y", "heading", "speed"),
+    "velocity": ("t", "speed"),
+    "obstacles": (
+        *("t", "id", "x", "y", "heading", "speed", "length", "width", "kind"),
+        "in_base",
+    ),
+    "lights": ("t", "group", "state"),
+    "driver": ("t", "is_manual"),
+}
+# autoware_vehicle_msgs/ControlModeReport, and autoware_auto_vehicle_msgs of before
+MANUAL = 4
+# colour and status of TrafficLightElement: those of autoware_perception_msgs, and of
+# autoware_auto_perception_msgs and its first versions, which have no number twice
+COLOURS = {1: "red", 2: "yellow", 3: "green"}
+OFF = (1, 13)  # SOLID_OFF
+CIRCLES = (1, 5)
+LEFT_OUT = -2  # kind of what a car drives over or under
+# ObjectClassification.label: CAR, TRUCK, BUS, TRAILER, MOTORCYCLE; BICYCLE;
+# PEDESTRIAN, ANIMAL; HAZARD; OVER_DRIVABLE, UNDER_DRIVABLE; 0 is UNKNOWN
+LABELS = {
+    **dict.fromkeys((1, 2, 3, 4, 5), int(Kind.VEHICLE)),
+    6: int(Kind.CYCLIST),
+    **dict.fromkeys((7, 8), int(Kind.PEDESTRIAN)),
+    9: int(Kind.STATIC),
+    **dict.fromkeys((10, 11), LEFT_OUT),
+}
+# Object.classification: PEDESTRIAN; BIKE; CAR, TRUCK, MOTORCYCLE, OTHER_VEHICLE;
+# BARRIER, SIGN; 0 to 3 are UNKNOWN of several sizes
+CLASSES = {
+    4: int(Kind.PEDESTRIAN),
+    5: int(Kind.CYCLIST),
+    **dict.fromkeys((6, 7, 8, 9), int(Kind.VEHICLE)),
+    **dict.fromkeys((10, 11), int(Kind.STATIC)),
+}
+CYLINDER, POLYGON = 1, 2  # Shape.type
+BOX, SPHERE, CONE = 1, 2, 4  # SolidPrimitive.type; 3 is CYLINDER
+HAS_NO_HEADING, HAS_NO_SIGN = 0, 1  # TrackedObjectKinematics.orientation_availability
 
-
-class Rows:
-    """Rows of each role of a piece of a drive."""
-
-    def __init__(self, names: dict[str, int]) -> None:
-        self.names = names  # of obstacles, with their numbers
-        self._values = {role: array.array("d") for role in COLUMNS}
-        self.progress = 1.0  # share of the bag, or of its file, that is read with them
-        self.notes: list[str] = []
-
-    def add(self, role: str, row: Row) -> None:
-        """One row, in the order of the role's columns."""
-        self._values[role].extend(row)
-
-    def table(self, role: str) -> np.ndarray:
-        """[n, columns] of a role."""
-        return np.array(self._values[role]).reshape(-1, len(COLUMNS[role]))
-
-    def count(self, role: str) -> int:
-        """Rows of a role."""
-        return len(self._values[role]) // len(COLUMNS[role])
-
-
-def open_file(path: Path) -> McapFile | SqliteFile:
-    """A file of either storage, by its ending."""
-    return SqliteFile(path) if path.suffix == ".db3" else McapFile(path)
-
-
-def read_bag(files: list[Path], spec: dict) -> Iterator[Rows]:
-    """All wanted messages of a bag, piece by piece in the order of recording."""
-    (roles, notes), names = _roles(files, spec), {}
-    sizes = [file.stat().st_size for file in files]
-    done = 0.0  # bytes
-    with reading(files[0], files) as show:
-        for file, before, size in zip(
-            files, accumulate(sizes, initial=0), sizes, strict=False
-        ):
-            for rows in _read_file(file, roles, spec, names):
-                read = before + rows.progress * size
-                show(int(read - done))
-                done, rows.progress = read, min(read / max(sum(sizes), 1), 1.0)
-                rows.notes, notes = notes, []
-                yield rows
+Row = tuple[float, ...]
+Reader = Callable[[Message, "Context"], Iterator[Row]]
+Pose = tuple[float, float, float]  # x, y [m], heading [rad]; NaN: quaternion not set
 
 
-def _roles(files: list[Path], spec: dict) -> tuple[dict[str, str], list[str]]:
-    """Topic -> role: of each role the first topic named that has messages.
+@dataclasses.dataclass(kw_only=True)
+class Context:
+    """What a message is read with."""
 
-    One that nobody can read is noted and passed over, unless it has to be there.
+    where: str = ""  # file, topic and number of the message, for errors
+    map_frame: str
+    base_frame: str
+    kinds: Mapping[str, str]  # [kinds] of the TOML
+    names: dict[str, int]  # name of an obstacle -> its number in the drive
 
-    Raises:
-      InputError: a needed role has none, or its type is unknown.
-    """
-    known: dict[str, Topic] = {}
-    for file in files:
-        with open_file(file) as opened:
-            for name, topic in opened.topics().items():
-                if topic.count != 0:
-                    known.setdefault(name, topic)
-    roles, notes = {}, []
-    # of each role the first topic that a bag has counts
-    for role, names in topics_of(spec, COLUMNS, dict.fromkeys(COLUMNS, ())).items():
-        met = [name for name in names if name in known]
-        found = next((name for name in met if _is_read(role, known[name])), None)
-        if found is not None:
-            roles[found] = role
-        elif met and role in NEEDED:
-            _check_type(files[0], role, met[0], known[met[0]])
-            roles[met[0]] = role  # says that it has no definition
-        elif role in NEEDED and names:
-            raise InputError(_missing(files[0], role, names, known))
-        elif met:
-            kind = known[met[0]].type
-            notes.append(
-                f"{met[0]} ({kind}): not read, of another type or without a definition"
-                + ("; who drove is not known" if role == "driver" else "")
+    def check_frame(self, frame: str) -> bool:
+        """Returns whether a frame is the ego's own; only the map's is allowed besides.
+
+        A frame that is not named is the map's.
+        """
+        found = frame.lstrip("/")
+        if found not in ("", self.map_frame, self.base_frame):
+            raise InputError(
+                f"{self.where}: header.frame_id: {found!a:.80}: expected "
+                f"{self.map_frame} or {self.base_frame} ([frames] of the source TOML)"
             )
-    return roles, notes
+        return found == self.base_frame
+
+    def pose(self, position: Message, orientation: Message) -> Pose:
+        """Returns a place from a point and a quaternion of any length.
+
+            heading = atan2(2 (w z + x y), w^2 + x^2 - y^2 - z^2)
+
+        Raises:
+          InputError: a number that is not finite.
+        """
+        x, y, q = position.x, position.y, orientation
+        for name, value in {"x": x, "y": y, "w": q.w, "z": q.z}.items():
+            if not math.isfinite(value):
+                field = "position" if name in "xy" else "orientation"
+                raise InputError(
+                    f"{self.where}: {field}.{name}: {value}: expected a finite number"
+                )
+        if not any((q.x, q.y, q.z, q.w)):
+            return x, y, NAN
+        ahead = q.w * q.w + q.x * q.x - q.y * q.y - q.z * q.z
+        return x, y, math.atan2(2.0 * (q.w * q.z + q.x * q.y), ahead)
+
+    def pose_of_ego(self, position: Message, orientation: Message) -> Pose:
+        """Returns a place whose heading has to be known."""
+        pose = self.pose(position, orientation)
+        if math.isnan(pose[2]):
+            raise InputError(
+                f"{self.where}: orientation: all zero: expected the ego's quaternion"
+            )
+        return pose
 
 
-def _is_read(role: str, topic: Topic) -> bool:
-    return topic.type in TYPES[role] and topic.is_described
+def _stamp(stamp: Message) -> float:
+    """A builtin_interfaces/Time in s, to about 1e-7 s."""
+    return stamp.sec + 1e-9 * stamp.nanosec
 
 
-def _missing(
-    path: Path, role: str, names: list[str], known: Mapping[str, Topic]
-) -> str:
-    """What is wrong with a bag without a needed topic, and which might be it."""
-    fit = [name for name, topic in known.items() if topic.type in TYPES[role]]
-    have = ", ".join(fit) or "none of a type that is read"
-    return (
-        f"{path}: {role}: no messages on {', '.join(names)}: expected one of them; "
-        f"topics.{role} of the source TOML names it (in this bag: {have}), or [] for "
-        "none"
+def _length(vector: Message) -> float:
+    return math.hypot(vector.x, vector.y)
+
+
+# ------------------------------------------------------------ the ego, lights
+
+
+def _ego(pose: str, speed: str = "") -> Reader:
+    """Messages of one pose; `speed` leads to a velocity whose length is the speed."""
+    pose_of = attrgetter(pose)
+
+    def rows(message: Message, context: Context) -> Iterator[Row]:
+        if context.check_frame(message.header.frame_id):
+            raise InputError(
+                f"{context.where}: header.frame_id: {context.base_frame}: expected the "
+                f"ego's place on the map, in {context.map_frame} ([frames] of the "
+                "source TOML)"
+            )
+        place = pose_of(message)
+        known = _length(attrgetter(speed)(message)) if speed else NAN
+        found = context.pose_of_ego(place.position, place.orientation)
+        yield _stamp(message.header.stamp), *found, known
+
+    return rows
+
+
+def _transforms(message: Message, context: Context) -> Iterator[Row]:
+    """tf2_msgs/TFMessage: where the base is on the map; others are passed over."""
+    for one in message.transforms:
+        frames = one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/")
+        if frames == (context.map_frame, context.base_frame):
+            place = one.transform
+            found = context.pose_of_ego(place.translation, place.rotation)
+            yield _stamp(one.header.stamp), *found, NAN
+
+
+def _velocity(velocity: str) -> Reader:
+    velocity_of = attrgetter(velocity)
+    return lambda message, context: iter(
+        [(_stamp(message.header.stamp), _length(velocity_of(message)))]
     )
 
 
-def _check_type(path: Path, role: str, name: str, topic: Topic) -> None:
-    if topic.type not in TYPES[role]:
-        raise InputError(
-            f"{path}: {name}: type {topic.type!a:.80}: expected for topics.{role} one "
-            f"of {', '.join(TYPES[role])}"
+def _control_mode(message: Message, context: Context) -> Iterator[Row]:
+    yield _stamp(message.stamp), float(message.mode == MANUAL)
+
+
+def _lights(stamp: str, groups: str, name: str, elements: str) -> Reader:
+    """Messages of lights: places of the time, the groups, and of each id and lamps."""
+    stamp_of, parts = attrgetter(stamp), attrgetter(name, elements)
+
+    def rows(message: Message, context: Context) -> Iterator[Row]:
+        t = _stamp(stamp_of(message))
+        for number, lamps in map(parts, getattr(message, groups)):
+            yield t, float(number), _state(lamps)
+
+    return rows
+
+
+def _state(elements: list) -> float:
+    """Place in STATES of the surest round light, else of the surest one; lit ones."""
+    lit = [e for e in elements if e.color in COLOURS and e.status not in OFF]
+    best = max(lit, key=lambda e: (e.shape in CIRCLES, e.confidence), default=None)
+    return float(0 if best is None else STATES.index(COLOURS[best.color]))
+
+
+# ------------------------------------------------------------------ obstacles
+
+
+def _obstacle(
+    message: Message,
+    context: Context,
+    name: str,
+    pose: Pose,
+    speed: float,
+    size: tuple[float, float],
+    kind: int,
+) -> Row:
+    """A row of an obstacle: of all in a message the header's time and frame.
+
+    Args:
+      message: with a header.
+      context: numbers its name.
+      name: the same in every message.
+      pose: of the box centre; heading NaN: by the direction of travel.
+      speed: m/s; NaN: from the positions.
+      size: m, length and width; 0: not known.
+      kind: `Kind`, UNKNOWN or LEFT_OUT.
+    """
+    in_base = float(context.check_frame(message.header.frame_id))
+    number = context.names.setdefault(name, len(context.names))
+    length, width = (one or NAN for one in size)
+    t = _stamp(message.header.stamp)
+    return (t, float(number), *pose, speed, length, width, float(kind), in_base)
+
+
+def _autoware(pose: str, twist: str) -> Reader:
+    """TrackedObjects and PredictedObjects of Autoware; paths are not read.
+
+    Args:
+      pose: leads from an object's kinematics to its pose.
+      twist: to its velocity in its own frame.
+    """
+    pose_of, twist_of = attrgetter(pose), attrgetter(twist)
+
+    def rows(message: Message, context: Context) -> Iterator[Row]:
+        for one in message.objects:
+            how = one.kinematics
+            place, velocity = pose_of(how), twist_of(how)
+            x, y, heading = context.pose(place.position, place.orientation)
+            known = getattr(how, "orientation_availability", None)
+            if known == HAS_NO_HEADING:
+                heading = NAN
+            elif known == HAS_NO_SIGN and velocity.x < 0.0:
+                heading += math.pi
+            yield _of_autoware(message, context, one, (x, y, heading), velocity)
+
+    return rows
+
+
+def _of_autoware(
+    message: Message, context: Context, one: Message, pose: Pose, twist: Message
+) -> Row:
+    best = max(one.classification, key=lambda c: c.probability, default=None)
+    kind = UNKNOWN if best is None else LABELS.get(best.label, UNKNOWN)
+    shape, size = one.shape, (one.shape.dimensions.x, one.shape.dimensions.y)
+    if shape.type == CYLINDER:
+        size = (shape.dimensions.x, shape.dimensions.x)
+    elif shape.type == POLYGON and shape.footprint.points:
+        # in the object's frame; its box need not have the object's place in its middle
+        ahead = [point.x for point in shape.footprint.points]
+        left = [point.y for point in shape.footprint.points]
+        size = (max(ahead) - min(ahead), max(left) - min(left))
+        u, v = 0.5 * (max(ahead) + min(ahead)), 0.5 * (max(left) + min(left))
+        x, y, heading = pose
+        turn = 0.0 if math.isnan(heading) else heading
+        cos, sin = math.cos(turn), math.sin(turn)
+        pose = x + cos * u - sin * v, y + sin * u + cos * v, heading
+    name, speed = bytes(one.object_id.uuid).hex(), _length(twist)
+    return _obstacle(message, context, name, pose, speed, size, kind)
+
+
+def _derived(message: Message, context: Context) -> Iterator[Row]:
+    """derived_object_msgs/ObjectArray, as CARLA's bridge publishes it."""
+    for one in message.objects:
+        pose = context.pose(one.pose.position, one.pose.orientation)
+        shape, sizes, size = one.shape.type, list(one.shape.dimensions), (0.0, 0.0)
+        # radius: the only number of a sphere, behind the height of the others
+        place = 0 if shape == SPHERE else 1
+        if shape == BOX and len(sizes) > 1:
+            size = sizes[0], sizes[1]
+        elif BOX < shape <= CONE and len(sizes) > place:
+            size = (2.0 * sizes[place],) * 2
+        speed, kind = (
+            _length(one.twist.linear),
+            CLASSES.get(one.classification, UNKNOWN),
         )
+        yield _obstacle(message, context, str(one.id), pose, speed, size, kind)
 
 
-def _read_file(
-    path: Path, roles: dict[str, str], spec: dict, names: dict[str, int]
-) -> Iterator[Rows]:
-    """Rows of a file; names of obstacles get their numbers."""
-    rows, began = Rows(names), None
-    readings: dict[str, _Reading] = {}
-    with open_file(path) as opened:
-        own, span = opened.topics(), opened.span()
-        for sent in opened.messages([name for name in roles if name in own]):
-            began = sent.logged if began is None else began
-            if abs(sent.logged - began) > PIECE_S * 1e9:
-                rows.progress = _share(sent.logged, span)
-                yield rows
-                rows, began = Rows(names), sent.logged
-            if sent.topic not in readings:
-                readings[sent.topic] = _Reading(
-                    path, sent.topic, own[sent.topic], roles[sent.topic], spec
-                )
-            readings[sent.topic].add(rows, sent)
-    yield rows
+def _detections(message: Message, context: Context) -> Iterator[Row]:
+    """vision_msgs/Detection3DArray; the speed comes from the positions.
+
+    The id is `id`, before ROS 2 Humble `tracking_id`; a class is `hypothesis.class_id`,
+    before Galactic `id`.
+    """
+    for place, one in enumerate(message.detections):
+        where = f"{context.where}: detections[{place}]"
+        name = one.id if hasattr(one, "id") else one.tracking_id
+        if not name:
+            raise InputError(
+                f"{where}.id: '': expected one that stays with a road user; name the "
+                "topic of a tracker in topics.obstacles of the source TOML"
+            )
+        sure = [getattr(result, "hypothesis", result) for result in one.results]
+        best = max(sure, key=lambda result: result.score, default=None)
+        kind = UNKNOWN
+        if best is not None:
+            label = best.class_id if hasattr(best, "class_id") else best.id
+            kind = int(kind_of(where, label, context.kinds))
+        box = one.bbox
+        pose = context.pose(box.center.position, box.center.orientation)
+        size = box.size.x, box.size.y
+        yield _obstacle(message, context, name, pose, NAN, size, kind)
 
 
-def _share(logged: int, span: tuple[int, int] | None) -> float:
-    """Share of a file's time that is over; none where its span is not known."""
-    first, last = span or (logged, logged + 1)
-    return min(max((logged - first) / max(last - first, 1), 0.0), 1.0)
-
-
-class _Reading:
-    """How messages of one topic of one file become rows."""
-
-    def __init__(
-        self, path: Path, name: str, topic: Topic, role: str, spec: dict
-    ) -> None:
-        _check_type(path, role, name, topic)
-        self._where, self._role, self._type = f"{path}: {name}", role, topic.type
-        self._decode = decoder_of(path, name, topic)
-        self._read = TYPES[role][topic.type]
-        self._frames, self._kinds = section(spec, "frames"), section(spec, "kinds")
-
-    def add(self, rows: Rows, sent: Sent) -> None:
-        """Append what a message says."""
-        context = Context(
-            where=f"{self._where}: message {sent.number}",
-            map_frame=str(self._frames.get("map", "map")),
-            base_frame=str(self._frames.get("base", "base_link")),
-            kinds=self._kinds,
-            names=rows.names,
-        )
-        with _readable(context.where, self._type):
-            if len(sent.data) > MAX_MESSAGE_BYTES:
-                size = len(sent.data)
-                raise ValueError(f"{size} bytes of at most {MAX_MESSAGE_BYTES}")
-            for row in self._read(self._decode(sent.data), context):
-                rows.add(self._role, row)
-        check_held(self._where, rows.count(self._role))
-
-
-@contextlib.contextmanager
-def _readable(where: str, kind: str) -> Iterator[None]:
-    """Bytes that are cut short, and definitions that lack a field, are one line."""
-    try:
-        yield
-    except InputError:
-        raise
-    except AttributeError as error:
-        raise InputError(
-            f"{where}: {error.name}: missing in the file's definition: expected a "
-            f"{kind} with it"
-        ) from error
-    except Exception as error:
-        raise InputError(
-            f"{where}: {type(error).__name__}: {str(error)[:200]}: expected a {kind}"
-        ) from error
+_tracked = _autoware("pose_with_covariance.pose", "twist_with_covariance.twist.linear")
+_predicted = _autoware(
+    "initial_pose_with_covariance.pose", "initial_twist_with_covariance.twist.linear"
+)
+# role -> type of message -> how it becomes rows
+TYPES: dict[str, dict[str, Reader]] = {
+    "ego": {
+        # the twist is in child_frame_id, its length in no frame
+        "nav_msgs/msg/Odometry": _ego("pose.pose", "twist.twist.linear"),
+        "geometry_msgs/msg/PoseStamped": _ego("pose"),
+        "geometry_msgs/msg/PoseWithCovarianceStamped": _ego("pose.pose"),
+        "tf2_msgs/msg/TFMessage": _transforms,
+    },
+    "velocity": {
+        "geometry_msgs/msg/TwistStamped": _velocity("twist.linear"),
+        "geometry_msgs/msg/TwistWithCovarianceStamped": _velocity("twist.twist.linear"),
+    },
+    "obstacles": {
+        "autoware_perception_msgs/msg/TrackedObjects": _tracked,
+        "autoware_auto_perception_msgs/msg/TrackedObjects": _tracked,
+        "autoware_perception_msgs/msg/PredictedObjects": _predicted,
+        "autoware_auto_perception_msgs/msg/PredictedObjects": _predicted,
+        "derived_object_msgs/msg/ObjectArray": _derived,
+        "vision_msgs/msg/Detection3DArray": _detections,
+    },
+    "lights": {
+        "autoware_perception_msgs/msg/TrafficLightGroupArray": _lights(
+            "stamp", "traffic_light_groups", "traffic_light_group_id", "elements"
+        ),
+        "autoware_perception_msgs/msg/TrafficSignalArray": _lights(  # before
+            "stamp", "signals", "traffic_signal_id", "elements"
+        ),
+        "autoware_auto_perception_msgs/msg/TrafficSignalArray": _lights(
+            "header.stamp", "signals", "map_primitive_id", "lights"
+        ),
+    },
+    "driver": {
+        "autoware_vehicle_msgs/msg/ControlModeReport": _control_mode,
+        "autoware_auto_vehicle_msgs/msg/ControlModeReport": _control_mode,
+    },
+}

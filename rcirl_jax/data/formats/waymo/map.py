@@ -13,12 +13,12 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from rcirl_jax.data.formats.options import lane_types, number
+from rcirl_jax.data.formats.perception import STATES, signal_of
 from rcirl_jax.data.formats.shapes import (
     check_coordinates,
     line_across,
     moves,
 )
-from rcirl_jax.data.formats.signals import STATES, signal_of
 from rcirl_jax.data.formats.waymo.widths import MAX_POINTS, Segments, half_widths
 from rcirl_jax.data.readers.protobuf import Message, columns
 from rcirl_jax.data.recording import MAX_SPEED_MPS

@@ -1,0 +1,339 @@
+"""Bags: which files are one, what topics they have, and their messages as bytes.
+
+A bag is a folder with metadata.yaml, or a file of its own. Of metadata.yaml only the
+list of files and the way of packing are read, line by line: rosbag2 writes one entry a
+line, and so no YAML library is needed. Files are MCAP (https://mcap.dev/spec, read by
+the library `mcap`; one that was never closed has no magic at its end and is refused,
+because nobody knows how much is missing) or rosbag2's SQLite storage. The definitions
+of messages are in the file; SQLite files from before ROS 2 Iron lack them.
+"""
+
+import contextlib
+import io
+import re
+from collections.abc import Callable, Collection, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import BinaryIO, NamedTuple
+
+from rcirl_jax.data.formats.files import is_input
+from rcirl_jax.data.formats.options import patterns
+from rcirl_jax.data.readers.sqlite import Database
+from rcirl_jax.errors import InputError, extra_module
+
+EXTRA = "ros2"
+METADATA = "metadata.yaml"
+PATTERNS = ("*.mcap", "*.db3")
+PACKED = (".zstd", ".lz4")  # endings of files that rosbag2 compressed as a whole
+MAGIC = b"\x89MCAP0\r\n"
+MAX_METADATA_BYTES = 64 * 2**20  # bytes; rosbag2 repeats the profiles of each topic
+MAX_CHUNK_BYTES = 2**30  # bytes of one chunk of MCAP, unpacked or not
+MAX_SCHEMA_BYTES = 2**20  # bytes of a message's definition; the longest have 50 kB
+MAX_TOPICS = 100_000
+MAX_MESSAGES = 100_000_000
+SOUND = "a sound MCAP file; `mcap doctor FILE` says what is damaged"
+TOPICS = ("id", "name", "type", "serialization_format")
+MESSAGES = ("topic_id", "timestamp", "data")
+DEFINITIONS = ("topic_type", "encoding", "encoded_message_definition")
+
+# what the library decodes: attributes named as the definition in the file names them
+Message = SimpleNamespace
+
+
+class Topic(NamedTuple):
+    """A topic of one file, as the file describes it."""
+
+    type: str  # pkg/msg/Name
+    encoding: str  # of its messages
+    schema_encoding: str  # of the definition, "" without one
+    schema: bytes  # the definition
+    messages: int | None  # their number; None: the file does not say it
+
+    @property
+    def is_described(self) -> bool:
+        """True if the file holds a definition of its messages."""
+        return self.schema_encoding == "ros2msg"
+
+
+# ------------------------------------------------------------------- folders
+
+
+def bags_of(path: Path, spec: dict) -> list[Path]:
+    """Lists the bags of an input: folders with metadata.yaml, files outside of them."""
+    if path.is_file() or (path / METADATA).is_file():
+        return [path]
+    wanted = patterns(spec, PATTERNS)
+    found = [file for pattern in (*wanted, METADATA) for file in path.rglob(pattern)]
+    files = {file for file in found if is_input(path, file)}
+    folders = {file.parent for file in files if file.name == METADATA}
+    bags = folders | {file for file in files if file.parent not in folders}
+    if not bags:
+        raise InputError(
+            f"{path}: no file matches {', '.join(wanted)}, nor {METADATA}: "
+            "expected ROS 2 bags"
+        )
+    return sorted(bags)
+
+
+def files_in(bag: Path) -> list[Path]:
+    """Lists the files of a bag, in the order of time.
+
+    Raises:
+      InputError: packed by rosbag2, no files, or one that is missing.
+    """
+    metadata = bag / METADATA
+    if bag.is_file() or not metadata.is_file():
+        return [_unpacked(bag)]
+    if (size := metadata.stat().st_size) > MAX_METADATA_BYTES:
+        raise InputError(
+            f"{metadata}: {size} bytes: expected at most {MAX_METADATA_BYTES}"
+        )
+    text = metadata.read_text(errors="replace")
+    mode = re.search(r"^ *compression_mode: *(.*)$", text, re.MULTILINE)
+    if mode and _entry(mode[1]).lower() == "message":
+        raise InputError(
+            f"{metadata}: compression_mode: MESSAGE: expected messages as they were "
+            "sent; unpack them with `ros2 bag convert`"
+        )
+    listed = re.search(r"^ *relative_file_paths: *\n((?: *- .*\n?)*)", text, re.M)
+    names = (
+        [_entry(line.strip()[2:]) for line in listed[1].splitlines()] if listed else []
+    )
+    if not names:
+        raise InputError(
+            f"{metadata}: relative_file_paths: none: expected the files of the bag; "
+            "write it anew with `ros2 bag reindex`"
+        )
+    files = []
+    for name in names:
+        # bags of Foxy name their folder as well; no file outside the bag is read
+        file = bag / Path(name).name
+        if not file.is_file():
+            raise InputError(
+                f"{metadata}: relative_file_paths: {name[:200]}: missing: expected "
+                "this file in the bag; `ros2 bag reindex` lists those that are there"
+            )
+        files.append(_unpacked(file))
+    return files
+
+
+def _entry(text: str) -> str:
+    """A value of YAML without its quotes."""
+    return text.strip().strip("\"'")
+
+
+def _unpacked(file: Path) -> Path:
+    if file.suffix in PACKED:
+        raise InputError(
+            f"{file}: compressed as a whole: expected .mcap or .db3; unpack it, for "
+            "example with `zstd -d`, and name the files so in metadata.yaml"
+        )
+    return file
+
+
+# ------------------------------------------------------------------- storages
+
+
+@contextlib.contextmanager
+def open_file(path: Path) -> Iterator["McapFile | SqliteFile"]:
+    """Opens a file of either storage, by its ending."""
+    if path.suffix == ".db3":
+        with Database(path) as database:
+            yield SqliteFile(database)
+    else:
+        with path.open("rb") as stream:
+            yield McapFile(path, stream)
+
+
+class McapFile:
+    """Topics and messages of an MCAP file, nothing decoded."""
+
+    def __init__(self, path: Path, stream: BinaryIO) -> None:
+        self.path = path
+        head = stream.read(len(MAGIC))
+        if head != MAGIC:
+            raise InputError(
+                f"{path}: begins with {head!r}: expected an MCAP file ({MAGIC!r})"
+            )
+        size = stream.seek(0, io.SEEK_END)
+        stream.seek(max(size - len(MAGIC), 0))
+        if size < 2 * len(MAGIC) or stream.read() != MAGIC:
+            raise InputError(
+                f"{path}: no end after {size} bytes: expected a whole MCAP file; "
+                "truncated, or never closed? `mcap recover FILE -o NEW` keeps what is "
+                "sound"
+            )
+        stream.seek(0)
+        with _damaged(str(path), SOUND):
+            self._reader = extra_module("mcap.reader", EXTRA).SeekingReader(
+                stream, validate_crcs=True, record_size_limit=MAX_CHUNK_BYTES
+            )
+            self._summary = self._reader.get_summary()
+        for chunk in self._summary.chunk_indexes if self._summary else ():
+            size = max(chunk.uncompressed_size, chunk.compressed_size)
+            if size > MAX_CHUNK_BYTES:
+                raise InputError(
+                    f"{path}: chunk at byte {chunk.chunk_start_offset}: {size} "
+                    f"bytes: expected at most {MAX_CHUNK_BYTES}"
+                )
+
+    def topics(self) -> dict[str, Topic]:
+        """Returns the topics by name.
+
+        Raises:
+          InputError: the file has no summary of them.
+        """
+        summary = self._summary
+        if summary is None or not summary.channels:
+            raise InputError(
+                f"{self.path}: summary: no channels: expected a file with a summary "
+                "section; `mcap recover FILE -o NEW` writes one"
+            )
+        counts = summary.statistics and summary.statistics.channel_message_counts
+        found: dict[str, Topic] = {}
+        for key, channel in summary.channels.items():
+            schema = summary.schemas.get(channel.schema_id)
+            topic = Topic(
+                type=schema.name if schema else "",
+                encoding=channel.message_encoding,
+                schema_encoding=schema.encoding if schema else "",
+                schema=schema.data if schema else b"",
+                messages=counts.get(key, 0) if counts else None,
+            )
+            # several publishers are several channels, of which some may be silent
+            if topic.messages != 0 or channel.topic not in found:
+                found[channel.topic] = topic
+        return found
+
+    def span(self) -> tuple[int, int] | None:
+        """Returns when the first and last message were recorded, ns; None: unknown."""
+        counted = self._summary and self._summary.statistics
+        return counted and (counted.message_start_time, counted.message_end_time)
+
+    def messages(self, wanted: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
+        """Yields (topic, ns of recording, bytes) in the order of recording."""
+        found = self._reader.iter_messages(topics=list(wanted))
+        while True:
+            with _damaged(str(self.path), SOUND):
+                item = next(found, None)
+            if item is None:
+                return
+            yield item[1].topic, item[2].log_time, item[2].data
+
+
+class SqliteFile:
+    """Topics and messages of a file of rosbag2's SQLite storage, nothing decoded."""
+
+    def __init__(self, database: Database) -> None:
+        self.path, self._database = database.path, database
+        database.need("topics", TOPICS)
+        database.need("messages", MESSAGES)
+
+    def topics(self) -> dict[str, Topic]:
+        """Returns the topics by name."""
+        definitions = {}
+        if self._database.columns("message_definitions"):
+            rows = self._texts("message_definitions", DEFINITIONS)
+            definitions = {kind: (encoding, text) for kind, encoding, text in rows}
+        sql = "SELECT DISTINCT topic_id FROM messages"
+        met = self._database.chunks(sql, ("messages.topic_id",), MAX_TOPICS)
+        used = {row[0] for rows in met for row in rows}
+        found = {}
+        for key, name, kind, encoding in self._texts("topics", TOPICS):
+            how, text = definitions.get(kind, ("", ""))
+            count = None if key in used else 0
+            found[name] = Topic(kind, encoding, how, text.encode(), count)
+        return found
+
+    def _texts(self, table: str, columns: tuple[str, ...]) -> list[tuple]:
+        """Rows of a table of texts, but for the column id."""
+        rows = self._database.table(table, columns, MAX_TOPICS)
+        for row in rows:
+            for name, cell in zip(columns, row, strict=True):
+                if name != "id" and not isinstance(cell, str):
+                    where = f"{table}.{name}"
+                    raise self._database.error(where, repr(cell)[:40], "a text")
+        return rows
+
+    def span(self) -> tuple[int, int] | None:
+        """Returns when the first and last message were recorded, ns; None: unknown."""
+        ends = []
+        for way in ("ASC", "DESC"):
+            sql = f"SELECT timestamp FROM messages ORDER BY timestamp {way} LIMIT 1"
+            found = self._database.chunks(sql, ("messages.timestamp",), 1)
+            ends += [row[0] for rows in found for row in rows]
+        if len(ends) != 2 or not all(isinstance(end, int) for end in ends):
+            return None
+        return ends[0], ends[1]
+
+    def messages(self, wanted: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
+        """Yields (topic, ns of recording, bytes) in the order of recording."""
+        names = {row[0]: row[1] for row in self._texts("topics", TOPICS)}
+        keys = tuple(key for key, name in names.items() if name in wanted)
+        sql = (
+            "SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN "
+            f"({', '.join('?' * len(keys))}) ORDER BY timestamp"
+        )
+        numbers = dict.fromkeys(wanted, 0)
+        for rows in self._database.chunks(sql, MESSAGES, MAX_MESSAGES, keys):
+            for key, logged, data in rows:
+                name = names[key]
+                if not isinstance(logged, int) or not isinstance(data, bytes):
+                    raise InputError(
+                        f"{self.path}: messages: message {numbers[name]} of {name}: "
+                        f"{type(logged).__name__}, {type(data).__name__}: expected "
+                        "a time in ns and bytes"
+                    )
+                numbers[name] += 1
+                yield name, logged, data
+
+
+# ------------------------------------------------------------------- decoding
+
+
+def decoder_of(path: Path, name: str, topic: Topic) -> Callable[[bytes], Message]:
+    """Makes what decodes a topic's messages, by the definition that the file holds.
+
+    Raises:
+      InputError: an encoding that is not ROS 2's, or no definition.
+    """
+    where = f"{path}: {name} ({topic.type})"
+    if topic.encoding != "cdr":
+        raise InputError(
+            f"{where}: message_encoding: {topic.encoding!r}: expected cdr, which ROS 2 "
+            "writes; convert the topic, or name another in [topics] of the source TOML"
+        )
+    if not topic.is_described:
+        raise InputError(
+            f"{where}: schema encoding: {topic.schema_encoding!r}: expected ros2msg, "
+            "the definition inside the file; record it anew with `ros2 bag convert` "
+            "where its package is installed"
+        )
+    if len(topic.schema) > MAX_SCHEMA_BYTES:
+        raise InputError(
+            f"{where}: schema: {len(topic.schema)} bytes: expected at most "
+            f"{MAX_SCHEMA_BYTES}"
+        )
+    decoders = extra_module("mcap_ros2.decoder", EXTRA)
+    schema = extra_module("mcap.records", EXTRA).Schema(
+        id=1, name=topic.type, encoding="ros2msg", data=topic.schema
+    )
+    # the parser prints the line that it cannot read, which the error says as well
+    quiet = contextlib.redirect_stderr(io.StringIO())
+    with _damaged(where, "a message definition of ROS 2"), quiet:
+        return decoders.DecoderFactory().decoder_for("cdr", schema)
+
+
+@contextlib.contextmanager
+def _damaged(where: str, expected: str) -> Iterator[None]:
+    """Turns whatever the libraries raise on bytes that they cannot read into one line.
+
+    They have no common error: struct, zstandard, lz4, the parser and mcap have theirs.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        found = f"{type(error).__name__}: {str(error)[:200]}".removesuffix(": ")
+        raise InputError(f"{where}: {found}: expected {expected}") from error
