@@ -1,4 +1,4 @@
-"""The training step in PyTorch: the rival of `benchmarks.training`.
+"""The training step in PyTorch: the baseline of `benchmarks.training`.
 
 Same network (tanh layers, gains of the context), normaliser, masks, pin, loss (rank or
 listwise) and Adam as `rcirl_jax.train.step`, in two forms:

@@ -43,7 +43,7 @@ from rcirl_jax.train.step import gradient_sums, init_state, make_train_step
 from rcirl_jax.tune.recipes import load_recipe
 from rcirl_jax.types import Demonstration
 
-try:  # the rival's extra; without it, one line from `main`
+try:  # the baseline's extra; without it, one line from `main`
     import torch
 
     from benchmarks import torch_step
@@ -226,11 +226,11 @@ def _ratios(rows: dict[str, dict]) -> dict[str, dict]:
     """Time of each PyTorch row over that of our faster one of the same network."""
     measures = [name for name in next(iter(rows.values())) if "_ms" in name]
     ratios = {}
-    for rival, own in (("torch", "ours"), ("recipe_torch", "recipe_cached")):
+    for baseline, own in (("torch", "ours"), ("recipe_torch", "recipe_cached")):
         ours = [row for name, row in rows.items() if name.startswith(own)]
         best = min(ours, key=lambda row: row["wall_ms"])
         for name, row in rows.items():
-            if name.startswith(rival):
+            if name.startswith(baseline):
                 ratios[name] = {m: round(row[m] / best[m], 2) for m in measures}
     return ratios
 

@@ -6,7 +6,8 @@ Hand-set and drivers made of it drive the catalogue with --seeds seeds, --cases 
 family. The gate judges the cases of every seed, too few to show that nothing got worse,
 and all as one suite; any size may ship (docs/gate.md). What it refuses of the equal
 driver is a false alarm, of the worse ones its power. Nobody is compared with
-recordings: likeness counts as equal, and there are no nulls.
+recordings: likeness counts as equal, and there are no trivial
+baselines.
 """
 
 import dataclasses
@@ -37,7 +38,9 @@ def main() -> None:
     refs = [ref for seed in range(seeds) for ref in suite_refs(*asked, seed)]
     cases = catalogue_set(refs, _DURATION.value)
     runs = with_faults(runs_of(run_suite(made_rows(), cases, SuiteConfig())))
-    config = dataclasses.replace(margins.gate_config(), nulls=())  # for recordings
+    config = dataclasses.replace(
+        margins.gate_config(), trivial_baselines=()
+    )  # for recordings
     found = tallied(runs, seeds, config)
     body = {"cases": len(refs), "seeds": seeds, "kinds": found, "config": config}
     write_json(Path(_OUTPUT.value), {**body, "made_by": provenance()})

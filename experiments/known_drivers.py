@@ -65,7 +65,7 @@ def tallied(runs: SuiteRuns, seeds: int, config: gate.GateConfig) -> list[dict]:
     Args:
       runs: drives of `made_rows`, `with_faults`; as many cases of each seed in turn.
       seeds: of the catalogue.
-      config: margins, without nulls.
+      config: margins, without trivial baselines.
     """
     found, size = [], len(runs.ids) // seeds
     for names in KINDS:

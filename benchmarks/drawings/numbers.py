@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.report.ranking.intervals import (
+    BASELINE,
     LEARNED,
-    RIVAL,
     curves_panel,
     interval_chart,
 )
@@ -47,7 +47,7 @@ def families(path: Path) -> None:
         rows = [of(kind)[i] for i in order]
         for place, row in enumerate(rows):
             value, low, high = (100.0 * row[x] for x in ("difference", "low", "high"))
-            colour = RIVAL if low < 0.0 < high else LEARNED if low > 0.0 else CHOSEN
+            colour = BASELINE if low < 0.0 < high else LEARNED if low > 0.0 else CHOSEN
             axis.plot([low, high], [place, place], color=colour, lw=2)
             axis.plot([value], [place], "o", color=colour, ms=4.5)
         margin = 100.0 * rows[0]["margin"]
@@ -85,7 +85,7 @@ def closed_loop(path: Path) -> None:
 
 
 def rankings(path: Path) -> None:
-    """Top-1 distance of some learners and rivals on three sites."""
+    """Top-1 distance of some learners and baselines on three sites."""
     rows: dict[str, dict[str, tuple]] = {name: {} for name in LEARNERS}
     for site, files in SITES.items():
         both = [results(f"human_likeness_{name}")["rows"] for name in files]
@@ -100,7 +100,7 @@ def sweep(path: Path) -> None:
     rows = results("leaky_rate_and_hidden_size")["ranking"]["rows"]
     made, axes = figure(1, 1, 5.6, 3.4)
     rates = (0.01, 0.05, 0.2, 0.5)
-    looks = (("5", RIVAL, ":"), ("15", LEARNED, "-"), ("45", CHOSEN, "--"))
+    looks = (("5", BASELINE, ":"), ("15", LEARNED, "-"), ("45", CHOSEN, "--"))
     for shift, (size, colour, dash) in zip((0.94, 1.0, 1.06), looks, strict=True):
         of = [rows[f"a {rate:g}, {size} hidden"]["top1_fde"] for rate in rates]
         value, low, high = (
@@ -113,7 +113,7 @@ def sweep(path: Path) -> None:
         )  # fmt: skip
     idm = rows["IDM"]["top1_fde"]["value"]
     axes[0, 0].axhline(idm, color=CANDIDATE, lw=1.0)
-    axes[0, 0].text(0.3, idm + 0.15, "IDM", fontsize=8, color=RIVAL)
+    axes[0, 0].text(0.3, idm + 0.15, "IDM", fontsize=8, color=BASELINE)
     axes[0, 0].set_xscale("log")
     axes[0, 0].set_xticks(rates, [f"{rate:g}" for rate in rates])
     axes[0, 0].minorticks_off()

@@ -84,7 +84,7 @@ from rcirl_jax.report.ranking.intervals import Interval, interval_chart
 from rcirl_jax.reward import LOSSES, seen_range
 from rcirl_jax.sampling import sample
 from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics, nuplan_score
-from rcirl_jax.simulation.rows import NULLS
+from rcirl_jax.simulation.rows import TRIVIAL_BASELINES
 from rcirl_jax.simulation.suite import FULL_S, catalogue_set, suite_refs
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.tune.prior_cost import OWN_COST, PriorCostConfig, fitted_prior_cost
@@ -103,8 +103,8 @@ _SEED = flags.DEFINE_integer("catalogue_seed", 0, "of the cases", lower_bound=0)
 fixed(horizon=5.0)  # of the ranking; learners compare as far as the recipe says
 
 FORMS = ("alone", "anchored")
-RIVALS = (OWN_COST, "IDM", *NULLS)
-RANKED_RIVALS = (OWN_COST, "IDM")
+BASELINES = (OWN_COST, "IDM", *TRIVIAL_BASELINES)
+RANKED_BASELINES = (OWN_COST, "IDM")
 SPREAD_SCENES = 256  # of each source
 QUICK_REHEARSAL_S = 12.0  # s of a drive; its scenes need 8 s of future
 
@@ -255,13 +255,13 @@ def column(found: Mapping[str, ArrayLike], cluster: np.ndarray) -> Column:
     """From [N] of every run, by name: those of a row are "ROW SEED"."""
     runs: dict[str, list[np.ndarray]] = {}
     for name, x in found.items():
-        row = name if name in RIVALS else name.rpartition(" ")[0]
+        row = name if name in BASELINES else name.rpartition(" ")[0]
         runs.setdefault(row, []).append(np.asarray(x, np.float64))
     return Column(runs={row: np.stack(x) for row, x in runs.items()}, cluster=cluster)
 
 
 def driven(files: Mapping[str, str], cases: int, duration: float) -> dict[str, Column]:
-    """What the cases say of every run and of the rivals.
+    """What the cases say of every run and of the baselines.
 
     Args:
       files: of `written`.
@@ -269,7 +269,7 @@ def driven(files: Mapping[str, str], cases: int, duration: float) -> dict[str, C
       duration: s of a case.
     """
     which = "free_cruise,stopped_lead" if QUICK.value else "full"
-    rows = table_rows([*files.values()], RIVALS, names=[*files])
+    rows = table_rows([*files.values()], BASELINES, names=[*files])
     refs = suite_refs(which, cases, _SEED.value)
     result = run_suite(rows, catalogue_set(refs, duration), SuiteConfig())
     count, own = len(refs), np.mean(result.runs[OWN_COST].progress)
@@ -300,7 +300,7 @@ def ranked(one: Demonstrations, files: Mapping[str, str]) -> Column:
     setup = RankingSetup(preset=told.features, sampler=sampler, horizon_s=horizon)
     scorers = {name: [scorer_of(open_reward(file))] for name, file in files.items()}
     made = rank_scenes(one, scorers, setup)
-    names = (*files, *RANKED_RIVALS)
+    names = (*files, *RANKED_BASELINES)
     errors = {name: made.table[name][0]["top1_fde"] for name in names}
     return column(errors, made.outcomes.cluster)
 
@@ -335,7 +335,7 @@ def main() -> None:
     cases, duration = (1, QUICK_S) if QUICK.value else (_CASES.value, _DURATION.value)
     columns = {**driven(files, cases, duration), **errors}
     print_table(columns)
-    rows = [row for row in columns["nuPlan"].runs if row not in RIVALS]
+    rows = [row for row in columns["nuPlan"].runs if row not in BASELINES]
     pairs = [(row, OWN_COST) for row in rows]
     pairs += [(f"rank {form}", f"gan {form}") for form in FORMS]
     tests = {
@@ -358,7 +358,7 @@ def main() -> None:
         {"nuPlan": ("nuPlan score", "of 100"), **panels},
         {
             row: {name: x.interval(row) for name, x in drawn.items()}
-            for row in (*rows, *RANKED_RIVALS)
+            for row in (*rows, *RANKED_BASELINES)
         },
         3.2,
     )

@@ -89,14 +89,14 @@ def simulate(
     output: Place | None = None,
     executor: Executor | None = None,
 ) -> SuiteResult:
-    """Drive rewards through the closed loop, beside rivals on the same cases.
+    """Drive rewards through the closed loop, beside baselines on the same cases.
 
     Args:
       weights: file, or files, a row each.
       suite: "smoke" (a case of each family), "full", or families with commas.
       cases: of each family; None: as declared.
       duration_s: s of a case; None: 120, of "smoke" 20.
-      baselines: rival rows; none are driven for ().
+      baselines: baseline rows; none are driven for ().
       plan_every: steps of 0.1 s between two plans.
       output: folder for table.txt, suite.json and cases.csv; None: nothing is written.
       executor: where cases are driven, of `rcirl_jax.runtime.executors`; None: here.
@@ -186,7 +186,10 @@ def gate(
         duration_s=duration_s,
         catalogue_seed=0,
         plan_every=1,
-        rivals=("IDM", *(name for name in config.nulls if name in BASELINES)),
+        baselines=(
+            "IDM",
+            *(name for name in config.trivial_baselines if name in BASELINES),
+        ),
     )
     sources = [
         one if isinstance(one, Dataset) else open_dataset(one) for one in _each(data)

@@ -1,4 +1,4 @@
-"""Drive a reward and its rivals in a simulator that somebody else wrote.
+"""Drive a reward and its baselines in a simulator that somebody else wrote.
 
     rcirl drive-elsewhere --simulator=sumo --weights=FILE --episodes=N --output=DIR
 
@@ -47,7 +47,7 @@ _EPISODES = flags.DEFINE_integer(
 _SECONDS = flags.DEFINE_float("seconds", 30.0, "s that an episode lasts, 1 to 600")
 _SEED = flags.DEFINE_integer("seed", 0, "of the episodes")
 _BASELINES = flags.DEFINE_list(
-    "baselines", ",".join(ROWS), "rivals that drive too, or empty"
+    "baselines", ",".join(ROWS), "baselines that drive too, or empty"
 )
 _ALSO = flags.DEFINE_list(
     "also",

@@ -68,7 +68,10 @@ def main() -> None:
         _CANDIDATE.value,
         _INCUMBENT.value,
         **suite(),
-        rivals=("IDM", *(name for name in config.nulls if name in BASELINES)),
+        baselines=(
+            "IDM",
+            *(name for name in config.trivial_baselines if name in BASELINES),
+        ),
         tuned_idm=read_tuned_idm(Path(_IDM.value)) if _IDM.value else None,
         track=_FILTER.value,
     )

@@ -29,6 +29,7 @@ from rcirl_jax.cli.flags.horizon import HORIZON
 from rcirl_jax.cli.flags.search import SEARCH
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.evaluation.baselines.tuned import as_numbers, tuned_baselines
 from rcirl_jax.evaluation.ranking.evaluate import (
     RankingSetup,
     pooled,
@@ -43,9 +44,8 @@ from rcirl_jax.evaluation.ranking.learners import (
     train_learners,
     untrained,
 )
-from rcirl_jax.evaluation.ranking.score import Rival
+from rcirl_jax.evaluation.ranking.score import Baseline
 from rcirl_jax.evaluation.ranking.table import UNTRAINED_ROW, to_json
-from rcirl_jax.evaluation.rivals.tuned import as_numbers, tuned_rivals
 from rcirl_jax.reward import RewardConfig
 from rcirl_jax.runtime.atomic_files import write_json, write_whole
 
@@ -65,7 +65,7 @@ _SEEDS = flags.DEFINE_integer(
     "seeds", 10, "trainings of each, 1 or more; more tell luck from merit", 1
 )
 _TUNED = flags.DEFINE_integer(
-    "tuned", 0, "rivals tuned on the training scenes, so many times; 0: none", 0
+    "tuned", 0, "baselines tuned on the training scenes, so many times; 0: none", 0
 )
 _LONG = flags.DEFINE_integer(
     "tuned_long", 3000, "evaluations of the hand-set cost's long search, or 0", 0
@@ -74,12 +74,12 @@ _LONG = flags.DEFINE_integer(
 
 def _tuned(
     part: Demonstrations, setup: RankingSetup, epochs: int
-) -> dict[str, list[Rival]]:
-    """The rows of the tuned rivals, if any; with the queries of a learner's epochs."""
+) -> dict[str, list[Baseline]]:
+    """Tunes baselines, if any, with the queries of a learner's epochs."""
     if not _TUNED.value:
         return {}
     seeds = range(_TUNED.value)
-    return tuned_rivals(
+    return tuned_baselines(
         part,
         setup,
         epochs=epochs,

@@ -19,7 +19,7 @@ COMMANDS = {
     "sweep": ("sweep", "train a grid of rewards, choose by held-out scenes"),
     "export": ("export_weights", "a trained run -> weights; ONNX, StableHLO, YAML"),
     "rank": ("rank", "rank held-out scenes, beside all baselines"),
-    "simulate": ("simulate", "drive the closed-loop suite, beside rivals"),
+    "simulate": ("simulate", "drive the closed-loop suite, beside baselines"),
     "gate": ("gate", "may a candidate replace what drives today?"),
     "replay": ("replay", "drive one case again, as a page that plays it"),
     "report": ("report", "draw the page of an autotune run again"),

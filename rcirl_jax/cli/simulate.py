@@ -1,4 +1,4 @@
-"""Drive rewards and rivals through the closed-loop suite; print the paper's table.
+"""Drive rewards and baselines through the closed-loop suite; print the paper's table.
 
     rcirl simulate --weights=FILE[,FILE...] --suite=full|smoke|FAMILY --output=DIR
     rcirl simulate --weights=FILE --suite=recorded|heldout --data=DATASET --output=DIR
@@ -46,7 +46,7 @@ _DATA = flags.DEFINE_list(
 )
 _OUTPUT = flags.DEFINE_string("output", None, "folder to write", required=True)
 _BASELINES = flags.DEFINE_list(
-    "baselines", ",".join(BASELINES), "rivals that drive too; fewer are quicker"
+    "baselines", ",".join(BASELINES), "baselines that drive too; fewer are quicker"
 )
 _IDM = flags.DEFINE_string(
     "tuned_idm", None, "RUN/tuned_idm.json of autotune: a tuned IDM drives too"

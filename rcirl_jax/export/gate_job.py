@@ -38,7 +38,7 @@ def gate_job(
     duration_s: float | None,
     catalogue_seed: int,
     plan_every: int,
-    rivals: Sequence[str] = ("IDM",),
+    baselines: Sequence[str] = ("IDM",),
     tuned_idm: Idm | None = None,
     track: str = "full",
 ) -> tuple[SuiteJob, str]:
@@ -52,7 +52,7 @@ def gate_job(
       duration_s: of a case; None: 120 s, smoke 20 s.
       catalogue_seed: of the cases.
       plan_every: steps of 0.1 s between two plans.
-      rivals: further baselines.
+      baselines: further baselines.
       tuned_idm: of a further row.
       track: of the safety filter, `SafetyConfig.track`.
 
@@ -66,7 +66,7 @@ def gate_job(
             f"--incumbent: {incumbent}: expected a weights file or one of "
             + ", ".join(BASELINES)
         )
-    names = [*rivals] if learned else [incumbent, *rivals]
+    names = [*baselines] if learned else [incumbent, *baselines]
     files = {CANDIDATE: candidate, **({INCUMBENT: incumbent} if learned else {})}
     job = SuiteJob(
         weights=tuple(files.values()),
@@ -128,7 +128,7 @@ def judged(
         recorded = held_out(sources, drives)
         report = held_out_likeness(recorded, job.rows(), job.plan_every)
     known = None if report is None else report.likeness
-    pair = pair_of(runs_of(result), incumbent, config.nulls, known)
+    pair = pair_of(runs_of(result), incumbent, config.trivial_baselines, known)
     verdict = judge(pair, config, left_out(job))
     return Judged(verdict=verdict, likeness=report, facts=result.facts)
 

@@ -1,4 +1,4 @@
-"""Rivals that drive instead of ranking: constant speed and IDM.
+"""Baselines that drive instead of ranking: constant speed and IDM.
 
 They produce one trajectory each; every candidate is then valued by how close
 it comes to that trajectory, so that all metrics are defined for them too.

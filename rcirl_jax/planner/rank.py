@@ -111,7 +111,7 @@ def hand_score(
 
 
 def constant_score(params: None, scene: Scene, candidates: Candidates) -> jax.Array:
-    """V = 0, a null: the first admissible candidate is driven.
+    """V = 0, a trivial baseline: the first admissible candidate is driven.
 
     That is constant speed where it is admissible. It shows what filter, sampler and
     given path achieve without a reward.
@@ -121,7 +121,7 @@ def constant_score(params: None, scene: Scene, candidates: Candidates) -> jax.Ar
 
 
 def velocity_score(params: None, scene: Scene, candidates: Candidates) -> jax.Array:
-    """V = mean of v over valid times, a null: as fast as the filter allows."""
+    """V = mean of v over valid times, a trivial baseline: the fastest is driven."""
     del params
     valid = scene.time_valid
     v = jnp.where(valid, candidates.trajectory.v, 0.0)

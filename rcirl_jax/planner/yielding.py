@@ -1,7 +1,7 @@
 """A driver model that follows, stops and gives way: IDM with gap acceptance.
 
 It stands in for a human where demonstrations are made rather than recorded,
-and is a rival row of its own. Along the path it is an IDM; a body that
+and is a baseline row of its own. Along the path it is an IDM; a body that
 crosses becomes a wall at its near edge while the ego would arrive within the
 time gap that the driver keeps (gap acceptance, HCM 2010 ch. 19).
 """

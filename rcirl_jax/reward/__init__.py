@@ -1,4 +1,4 @@
-"""The learned reward: network, normaliser, losses, and the hand-set rivals."""
+"""The learned reward: network, normaliser, losses, and the hand-set baselines."""
 
 from rcirl_jax.reward.config import RewardConfig
 from rcirl_jax.reward.constraints import pinned

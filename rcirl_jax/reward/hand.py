@@ -1,4 +1,4 @@
-"""The hand-set rival: Apollo's lattice cost with its published weights.
+"""The hand-set baseline: Apollo's lattice cost with its published weights.
 
 Source: Apollo's TrajectoryEvaluator; six terms whose weights have stood as
 command-line constants since 2018. It is a functional of the whole trajectory

@@ -1,4 +1,4 @@
-"""The second hand-set rival: the cost of Apollo's speed DP with its published weights.
+"""The second hand-set baseline: Apollo's speed DP cost with its published weights.
 
 Source: Apollo's path-time heuristic optimiser (default_speed_config, unchanged from
 5.5 to 10.0). There it is minimised on a grid of stations and times; here it values the

@@ -30,10 +30,10 @@ from rcirl_jax.reward.speed_dp import SPEED_DP_ROW
 from rcirl_jax.types import Normaliser, RewardParams
 
 RECORDED_HUMAN = "recorded human"
-NULLS = ("constant V", "+velocity")  # rewards that know nothing
+TRIVIAL_BASELINES = ("constant V", "+velocity")  # rewards that know nothing
 BASELINES = (
     *("hand-set", SPEED_DP_ROW, "IDM", "IDM yielding"),
-    *("constant speed", "random weights", *NULLS),
+    *("constant speed", "random weights", *TRIVIAL_BASELINES),
 )
 
 
@@ -87,9 +87,9 @@ def baseline_row(
         return Row(name=name, policy=rank_policy(hand_score, config))
     if name == SPEED_DP_ROW:
         return Row(name=name, policy=rank_policy(speed_dp_score, config))
-    if name in NULLS:
-        null = constant_score if name == "constant V" else velocity_score
-        return Row(name=name, policy=rank_policy(null, config))
+    if name in TRIVIAL_BASELINES:
+        trivial = constant_score if name == "constant V" else velocity_score
+        return Row(name=name, policy=rank_policy(trivial, config))
     if name == "IDM":
         return Row(name=name, policy=idm_policy(Idm()))
     if name == "IDM yielding":

@@ -1,6 +1,6 @@
 """Evidence about the candidate: the stages rank, simulate and gate.
 
-Rivals are tuned on the same training scenes; held-out scenes and drives, the closed
+Baselines are tuned on the same training scenes; held-out scenes and drives, the closed
 loop's cases and the margins are those of `evaluation`.
 """
 
@@ -10,6 +10,7 @@ from pathlib import Path
 
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.evaluation.baselines.tuned import tune_idm
 from rcirl_jax.evaluation.closed_loop.files import (
     SuiteRuns,
     read_runs,
@@ -29,7 +30,6 @@ from rcirl_jax.evaluation.gate.types import Verdict
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.evaluation.ranking.format import format_table
 from rcirl_jax.evaluation.ranking.table import to_json
-from rcirl_jax.evaluation.rivals.tuned import tune_idm
 from rcirl_jax.export.gate_job import drive_job, gate_job, left_out
 from rcirl_jax.export.loading import open_reward, scorer_of
 from rcirl_jax.export.spread import SuiteJob
@@ -39,23 +39,23 @@ from rcirl_jax.runtime.atomic_files import write_json, write_whole
 from rcirl_jax.runtime.pipeline import digest, file_sha256
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.simulation.recorded.scenes import held_out
-from rcirl_jax.simulation.rows import NULLS
+from rcirl_jax.simulation.rows import TRIVIAL_BASELINES
 from rcirl_jax.train.state import FUTURES
 from rcirl_jax.tune.run import Run
 
-RIVALS = ("hand-set", "IDM", "random weights", *NULLS)
+BASELINES = ("hand-set", "IDM", "random weights", *TRIVIAL_BASELINES)
 IDM_EVALUATIONS = 300  # of the search for the tuned IDM
 
 
 def rank(run: Run, dataset: Demonstrations) -> None:
-    """Held-out scenes in both forms, all seeds beside incumbent and rivals."""
+    """Held-out scenes in both forms, all seeds beside incumbent and baselines."""
     _tune_idm(run, dataset)
     for futures in FUTURES:
         _rank(run, dataset, futures)
 
 
 def _tune_idm(run: Run, dataset: Demonstrations) -> None:
-    """The IDM tuned on the same training scenes, the strongest simple rival."""
+    """The IDM tuned on the same training scenes, the strongest simple baseline."""
     path = run.tuned_idm
     setup = RankingSetup(horizon_s=run.config.horizon_s)
     search = run.config.search
@@ -122,7 +122,7 @@ def suite_job(run: Run, *, tuned: bool = True) -> tuple[SuiteJob, str]:
         duration_s=config.duration_s,
         catalogue_seed=config.catalogue_seed,
         plan_every=config.plan_every,
-        rivals=RIVALS,
+        baselines=BASELINES,
         tuned_idm=read_tuned_idm(run.tuned_idm) if tuned else None,
     )
 
@@ -137,7 +137,7 @@ def _inputs(job: SuiteJob) -> dict:
 
 
 def simulate(run: Run) -> None:
-    """Candidate, incumbent and rivals on the same closed-loop cases."""
+    """Candidate, incumbent and baselines on the same closed-loop cases."""
     job, _ = suite_job(run)
     folder = run.folder / "suite"
 
@@ -183,7 +183,9 @@ def verdict_of(run: Run) -> Verdict:
     known = read_arrays(run.folder / "likeness.npz")
     gate = run.config.gate
     return judge(
-        pair_of(suite_runs(run), incumbent, gate.nulls, known), gate, left_out(job)
+        pair_of(suite_runs(run), incumbent, gate.trivial_baselines, known),
+        gate,
+        left_out(job),
     )
 
 

@@ -8,8 +8,8 @@ RUN/train-KEY/seed-N/  training runs; KEY changes with what they are made from
 RUN/seeds/N.msgpack    every seed's reward
 RUN/weights.msgpack    the candidate: of the seeds the one with the median share of
                        training pairs won
-RUN/tuned_idm.json     the driver model tuned on the training scenes, a rival
-RUN/ranking.json       held-out scenes as the planner sees them, all seeds beside rivals
+RUN/tuned_idm.json     the driver model tuned on the training scenes, a baseline
+RUN/ranking.json       held-out scenes as the planner sees them, beside baselines
 RUN/ranking_recorded.json   the same with recorded futures
 RUN/likeness.json      held-out drives: how near to the human (and likeness.npz, .txt)
 RUN/suite/             metrics.npz, suite.json, cases.csv, table.txt

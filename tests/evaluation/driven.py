@@ -5,8 +5,8 @@ import numpy as np
 from rcirl_jax.evaluation.ranking.score import score_scenes
 
 
-def scored_rivals(rows, sampler, tuned):
-    """`score_scenes` of the rivals alone, at 8 s."""
+def scored_baselines(rows, sampler, tuned):
+    """`score_scenes` of the baselines alone, at 8 s."""
     return score_scenes(
         rows,
         np.arange(rows.future_s.size),

@@ -78,7 +78,7 @@ def test_a_small_loop(tmp_path):
     table = (run / "suite" / "table.txt").read_text()
     assert all(name in table for name in rows)
     kinds = {check["kind"] for check in verdict["checks"]}
-    assert {"safety", "nulls", "likeness", "gain"} <= kinds
+    assert {"safety", "trivial baselines", "likeness", "gain"} <= kinds
     noted = json.loads((run / "stages.json").read_text())["stages"]
     assert list(noted) == stages
     known = {"git_commit", "code_sha256", "versions", "flags"}

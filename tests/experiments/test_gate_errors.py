@@ -23,7 +23,7 @@ from rcirl_jax.evaluation.gate.types import GateConfig
 from tests.evaluation.gate.test_gate import CASES, broken, drives, pair
 from tests.helpers.commands import succeeded
 
-ALONE = GateConfig(nulls=())
+ALONE = GateConfig(trivial_baselines=())
 
 
 @pytest.fixture(scope="module")

@@ -154,7 +154,9 @@ def test_idm_policy_is_the_formula():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_nulls_drive_the_first_and_the_fastest_admissible_candidate(seed):
+def test_the_trivial_baselines_drive_the_first_and_the_fastest_admissible_candidate(
+    seed,
+):
     made, key = scene_of(seed), jax.random.key(seed)
     candidates = sampled(key, made, ONLINE)
     ok = np.asarray(judge(made, candidates).admissible)

@@ -140,8 +140,8 @@ def test_export_and_rank(dataset, run, tmp_path):
     learned, preset, _ = load_runs([reward.file])
     setup = RankingSetup(preset=preset, sampler=SMALL)
     report = evaluate_ranking(dataset, learned, setup)
-    rivals = ("constant speed", "IDM", "hand-set", "hand-set DP")
-    assert set(report.rows) == {"RC-IRL 21-15-1", "random", *rivals, "oracle"}
+    baselines = ("constant speed", "IDM", "hand-set", "hand-set DP")
+    assert set(report.rows) == {"RC-IRL 21-15-1", "random", *baselines, "oracle"}
     floor = report.rows["oracle"]["top1_fde"].value
     assert all(row["top1_fde"].value >= floor - 1e-6 for row in report.rows.values())
     # its scale is fitted as everybody's: random values must come to no preference

@@ -1,12 +1,12 @@
-"""How rivals are tuned."""
+"""How baselines are tuned."""
 
 from absl import flags
 
-from rcirl_jax.evaluation.rivals.tuned import SEARCHES
+from rcirl_jax.evaluation.baselines.tuned import SEARCHES
 
 SEARCH = flags.DEFINE_enum(
     "search",
     "cma",
     list(SEARCHES),
-    "search that tunes rivals; optuna needs the extra [optuna]",
+    "search that tunes baselines; optuna needs the extra [optuna]",
 )

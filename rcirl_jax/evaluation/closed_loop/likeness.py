@@ -234,7 +234,7 @@ def held_out_likeness(
 
     Args:
       drives: of `simulation.recorded.scenes.held_out`.
-      rows: learned rows, rivals, nulls; names are distinct.
+      rows: learned rows, baselines; names are distinct.
       plan_every: steps of 0.1 s between two plans, of rows that need no other.
 
     Raises:

@@ -11,7 +11,8 @@ Six kinds of check, none of them on a learned reward:
     families    in no family more clean drives or progress are lost than a margin. All
                 families have to show it, so none is adjusted; a loss is detected
                 (exact McNemar, t) only after Holm over families
-    nulls       nearer to the human than rewards that know nothing, and as safe
+    trivial baselines   nearer to the human than rewards that know nothing, and as
+                safe
     likeness    not farther from the human than the incumbent (`gate_likeness`)
     gain        better in one primary metric or in human-likeness, at least: McNemar
                 and families as clusters, Holm over them; and in no primary metric
@@ -38,7 +39,7 @@ from rcirl_jax.evaluation.gate.checks import (
     no_loss,
     passes_of,
 )
-from rcirl_jax.evaluation.gate.safety import new_faults, nulls_safety, safety
+from rcirl_jax.evaluation.gate.safety import new_faults, safety, trivial_safety
 from rcirl_jax.evaluation.gate.types import Check, Decision, GateConfig, Pair, Verdict
 from rcirl_jax.evaluation.gate.words import family_of, sentence
 
@@ -66,8 +67,8 @@ def judge(pair: Pair, config: GateConfig, part: str = "") -> Verdict:
         *safety(pair, config),
         *no_loss(pair, config),
         *families(pair, config),
-        *gate_likeness.against_nulls(pair, config),
-        *nulls_safety(pair, config),
+        *gate_likeness.against_trivial(pair, config),
+        *trivial_safety(pair, config),
         *gate_likeness.against_incumbent(pair),
         *gains(pair, config),
     )

@@ -1,4 +1,4 @@
-"""Human-likeness in the gate: nearer to held-out recorded drives than nulls.
+"""Human-likeness in the gate: how near to held-out recorded drives.
 
 Distances are paired by drive and clustered by vehicle. Differences are shares of the
 other row's mean distance, positive where the candidate is nearer. Host numpy. `D`
@@ -27,12 +27,14 @@ from rcirl_jax.evaluation.statistics import ClusterBootstrap, Difference
 TO_MEASURE = "measure human-likeness on held-out recordings (docs/gate.md)"
 
 
-def against_nulls(pair: Pair, config: GateConfig) -> list[Check]:
-    """Nearer to the human than every null passes, farther fails; else open."""
+def against_trivial(pair: Pair, config: GateConfig) -> list[Check]:
+    """Nearer to the human than each trivial baseline passes, farther fails."""
     return [
-        _check(pair, "nulls", f"likeness, {name}", f"nearer to the human than {name}",
-               name)
-        for name in config.nulls
+        _check(
+            pair, "trivial baselines", f"likeness, {name}",
+            f"nearer to the human than {name}", name,
+        )
+        for name in config.trivial_baselines
     ]  # fmt: skip
 
 
@@ -57,7 +59,7 @@ def _check(pair: Pair, kind: Kind, name: str, title: str, other: str) -> Check:
     if few := _few(pair.likeness):
         return unmeasured(kind, name, title, few)
     found = _nearer(pair.likeness, other)
-    outcome: Outcome = "open" if kind == "nulls" else "pass"
+    outcome: Outcome = "open" if kind == "trivial baselines" else "pass"
     if found.high < 0.0:
         outcome = "fail"
     elif found.low > 0.0:

@@ -42,7 +42,7 @@ TITLES = {
     "safety": "Not more cases with a fault (p: of as many more as the margin)",
     "no loss": "No loss beyond the margin, over all cases",
     "families": "No loss beyond the margin in any family (p: Holm; the ten worst)",
-    "nulls": "Ahead of rewards that know nothing",
+    "trivial baselines": "Ahead of rewards that know nothing",
     "likeness": "Not farther from the human",
     "gain": "Better somewhere, worse nowhere (Holm over the primary metrics)",
 }

@@ -16,24 +16,24 @@ from rcirl_jax.evaluation.gate.types import (
     Pair,
 )
 from rcirl_jax.simulation.rollout import LANES
-from rcirl_jax.simulation.rows import NULLS, Row
+from rcirl_jax.simulation.rows import TRIVIAL_BASELINES, Row
 from rcirl_jax.simulation.suite import drive_row, rollout_config
 
 
 def pair_of(
     runs: SuiteRuns,
     incumbent: str = INCUMBENT,
-    nulls: Sequence[str] = NULLS,
+    trivial: Sequence[str] = TRIVIAL_BASELINES,
     likeness: Likeness | None = None,
     *,
     candidate: str = CANDIDATE,
 ) -> Pair:
-    """Candidate, incumbent and nulls of a driven suite.
+    """Candidate, incumbent and trivial baselines of a driven suite.
 
     Args:
       runs: the drives.
       incumbent: name of its row.
-      nulls: names of rows that the candidate has to be ahead of; those that the suite
+      trivial: names of rows that the candidate has to be ahead of; those that the suite
         does not have are left out.
       likeness: distances to the human, where they were measured.
       candidate: name of its row.
@@ -52,7 +52,9 @@ def pair_of(
         reference=np.asarray(runs.way, np.float64),
         preventable=np.asarray(runs.preventable, bool),
         name=incumbent,
-        nulls={name: runs.rows[name] for name in nulls if name in runs.rows},
+        trivial_baselines={
+            name: runs.rows[name] for name in trivial if name in runs.rows
+        },
         likeness=likeness,
     )
 

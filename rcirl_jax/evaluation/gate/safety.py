@@ -88,21 +88,25 @@ def safety(pair: Pair, config: GateConfig) -> list[Check]:
     return _against("safety", pair, pair.incumbent, config, "")
 
 
-def nulls_safety(pair: Pair, config: GateConfig) -> list[Check]:
-    """Candidate against every null, every offence; open where a null was not driven."""
+def trivial_safety(pair: Pair, config: GateConfig) -> list[Check]:
+    """Compares each offence with each trivial baseline's; open where not driven."""
     found = []
-    for name in config.nulls:
-        if name in pair.nulls:
-            found += _against("nulls", pair, pair.nulls[name], config, name)
+    for name in config.trivial_baselines:
+        if name in pair.trivial_baselines:
+            found += _against(
+                "trivial baselines", pair, pair.trivial_baselines[name], config, name
+            )
         else:
             title = f"as safe as {name}"
             note = f"drive {name} on the same cases"
-            found.append(unmeasured("nulls", f"safety, {name}", title, note))
+            found.append(
+                unmeasured("trivial baselines", f"safety, {name}", title, note)
+            )
     return found
 
 
 def _against(
-    kind: Kind, pair: Pair, other: CaseMetrics, config: GateConfig, null: str
+    kind: Kind, pair: Pair, other: CaseMetrics, config: GateConfig, trivial: str
 ) -> list[Check]:
     mine = offences(pair.candidate, pair.preventable)
     theirs = offences(other, pair.preventable)
@@ -117,7 +121,7 @@ def _against(
             ),
             len(pair.ids),
             config.margins,
-            null,
+            trivial,
         )
         for name in mine
     ]
@@ -129,7 +133,7 @@ def _check(
     pairs: tuple[int, int],
     count: int,
     margins: Mapping[str, float],
-    null: str,
+    trivial: str,
 ) -> Check:
     """One offence with (gained, lost) of `count` cases."""
     margin, found = margins[name], counted(pairs, count)
@@ -141,6 +145,6 @@ def _check(
     if outcome == "open" and no_more_faults(0, 0, count, margin) > ALPHA:
         note = f"{count} cases can never prove a margin of {100 * margin:g} %"
     title = title_of(name)
-    if null:
-        name, title = f"{name}, {null}", f"as safe as {null}: {title}"
+    if trivial:
+        name, title = f"{name}, {trivial}", f"as safe as {trivial}: {title}"
     return check_of(kind, name, title, outcome, found, margin, pairs, p, note)

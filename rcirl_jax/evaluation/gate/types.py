@@ -12,9 +12,9 @@ import numpy as np
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.statistics import Difference
 from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics
-from rcirl_jax.simulation.rows import NULLS
+from rcirl_jax.simulation.rows import TRIVIAL_BASELINES
 
-Kind = Literal["safety", "no loss", "families", "nulls", "likeness", "gain"]
+Kind = Literal["safety", "no loss", "families", "trivial baselines", "likeness", "gain"]
 Outcome = Literal["pass", "fail", "open"]
 Decision = Literal["ship", "do not ship", "no difference", "could not judge"]
 
@@ -58,7 +58,7 @@ class GateConfig:
     gain: float = 0.02
     primary: tuple[str, ...] = ("a_station", "j_station", "progress", "nuplan")
     # rows that the candidate has to be ahead of
-    nulls: tuple[str, ...] = NULLS
+    trivial_baselines: tuple[str, ...] = TRIVIAL_BASELINES
     # cases with a new fault that a person has looked at and accepts
     accept: tuple[str, ...] = ()
 
@@ -80,7 +80,7 @@ class GateConfig:
                 )
         if not self.primary:
             raise InputError("--primary: none: expected at least one metric")
-        for flag in ("primary", "nulls", "accept"):
+        for flag in ("primary", "trivial_baselines", "accept"):
             names = getattr(self, flag)
             if len(set(names)) != len(names):
                 twice = next(name for name in names if names.count(name) > 1)
@@ -128,8 +128,8 @@ class Check:
     margin: float | None  # below which a loss is one; None: any
     gained: int | None  # cases that only the candidate passes
     lost: int | None  # cases that only the other passes
-    # safety and nulls: one-sided, of a loss as large as the margin; families and
-    # gain: two-sided, of no difference, Holm-adjusted within the kind
+    # safety and trivial baselines: one-sided, of a loss as large as the margin;
+    # families and gain: two-sided, of no difference, Holm-adjusted within the kind
     p: float | None
     note: str = ""
     measured: bool = True  # else the numbers say nothing: from -1 to 1
@@ -216,13 +216,21 @@ class Pair:
     reference: np.ndarray  # [C] m, way of the driver that nuPlan's score compares to
     preventable: np.ndarray  # [C] bool, `simulation.world.careful.preventable`
     name: str = INCUMBENT  # of the incumbent
-    nulls: Mapping[str, CaseMetrics] = dataclasses.field(default_factory=dict)
-    likeness: Likeness | None = None  # rows `CANDIDATE`, `name` and the nulls
+    trivial_baselines: Mapping[str, CaseMetrics] = dataclasses.field(
+        default_factory=dict
+    )
+    likeness: Likeness | None = (
+        None  # rows `CANDIDATE`, `name` and the trivial baselines
+    )
 
     def __post_init__(self) -> None:
         """Same cases, all finite where a drive has a number."""
         count = len(self.ids)
-        rows = {CANDIDATE: self.candidate, self.name: self.incumbent, **self.nulls}
+        rows = {
+            CANDIDATE: self.candidate,
+            self.name: self.incumbent,
+            **self.trivial_baselines,
+        }
         for name, metrics in rows.items():
             for field in ("progress", "at_fault", "holds", "max_j", "rms_a"):
                 values = np.asarray(getattr(metrics, field), np.float64)

@@ -110,8 +110,8 @@ def _head(verdict: Verdict, name: str, losses: str) -> str:
 
 
 def _rank(check: Check) -> tuple[int, float]:
-    """Faults first, then where most is lost; what is compared with nulls last."""
-    order = ("safety", "families", "no loss", "gain", "likeness", "nulls")
+    """Faults first, then where most is lost; trivial baselines last."""
+    order = ("safety", "families", "no loss", "gain", "likeness", "trivial baselines")
     return order.index(check.kind), check.difference
 
 
@@ -124,7 +124,7 @@ def _listed(said: Sequence[str], count: int) -> str:
 def _worse(check: Check, pair: Pair, crawling: bool) -> str:
     """A failed check as what the candidate does."""
     family = family_of(check)
-    if check.kind == "nulls":
+    if check.kind == "trivial baselines":
         return f"is not {check.title}"
     if check.kind == "safety":
         return (
@@ -195,7 +195,7 @@ def _next(verdict: Verdict, worse: Sequence[Check], unclear: Sequence[Check]) ->
         return "Next: look at the cases named below, then your own tests"
     if verdict.part:
         return "Next: drive the full suite"
-    if any(c.kind in ("safety", "nulls") for c in unclear) and new(verdict):
+    if any(c.kind in ("safety", "trivial baselines") for c in unclear) and new(verdict):
         return "Next: look at the new faults; --accept those that may stay"
     if unclear:
         return "Next: keep the incumbent, or drive more cases"

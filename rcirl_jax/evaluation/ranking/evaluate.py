@@ -19,8 +19,8 @@ from rcirl_jax.evaluation.ranking.metrics import (
 )
 from rcirl_jax.evaluation.ranking.score import (
     BASELINES,
+    Baseline,
     OnTop,
-    Rival,
     Scored,
     Scorer,
     covers,
@@ -52,7 +52,7 @@ class RankingSetup:
     # rank only among candidates that meet nothing: the same safety filter for all
     drop_collisions: bool = False
     # further hand-set costs and drivers that are ranked: row -> runs
-    tuned: Mapping[str, Sequence[Rival]] = dataclasses.field(default_factory=dict)
+    tuned: Mapping[str, Sequence[Baseline]] = dataclasses.field(default_factory=dict)
 
 
 def covered_rows(
@@ -122,7 +122,7 @@ def score_rows(
     scorers: Mapping[str, Scorer | OnTop],
     executor: Executor | None = None,
 ) -> Scored:
-    """`score_scenes` of a setup; its tuned rivals by the names of `numbered`."""
+    """`score_scenes` of a setup; its tuned baselines by the names of `numbered`."""
     return score_scenes(
         rows,
         index,
@@ -243,7 +243,7 @@ def evaluate_ranking(
       learned: as there.
       setup: as there.
       executor: as there.
-      references: rows that the others are compared with; default: the usual rivals.
+      references: rows that the others are compared with; default: the usual baselines.
 
     Raises:
       InputError: no scene of the split covers the horizon.

@@ -8,9 +8,9 @@ from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.output import text_table
 from rcirl_jax.evaluation.ranking.metrics import METRICS
 from rcirl_jax.evaluation.ranking.table import (
+    BASELINE_ROWS,
     FEW_VEHICLES,
     MIN_WIDTH,
-    RIVALS,
     SIGNIFICANT,
     Comparison,
     RankingReport,
@@ -34,7 +34,7 @@ def format_table(
 ) -> str:
     """The report as aligned plain text for a terminal.
 
-    Rows: learned scorers first, then the rivals; columns wrap into blocks that
+    Rows: learned scorers first, then the baselines; columns wrap into blocks that
     fit. A share of 0 or 100 % is printed with its exact bound. Below: learned
     rows minus each reference row (all rows, if none is learned).
 
@@ -46,7 +46,7 @@ def format_table(
     if width < MIN_WIDTH:
         raise InputError(f"format_table: width: {width}: expected at least {MIN_WIDTH}")
     names = _order(report)
-    learned = [name for name in names if name not in RIVALS]
+    learned = [name for name in names if name not in BASELINE_ROWS]
     lines = [line for text in _heading(report) for line in textwrap.wrap(text, width)]
     grid, block = _grid(report, names), [0]
     for column in range(1, len(grid[0])):
@@ -119,7 +119,7 @@ def markdown_table(report: RankingReport, against: str = "GAN") -> str:
 
     The last column is the paired difference in top-1 FDE to the row `against`, if
     there is one, with its p value by Holm's correction over the learned rows (the
-    rivals apart) and all compared metrics.
+    baselines apart) and all compared metrics.
     """
     titles = ["row", *(f"{METRICS[x].title}, {METRICS[x].unit}" for x in _IN_MARKDOWN)]
     apart = {
@@ -139,9 +139,9 @@ def markdown_table(report: RankingReport, against: str = "GAN") -> str:
 
 
 def _order(report: RankingReport) -> list[str]:
-    """Learned rows first, then the rivals in their order."""
-    learned = [name for name in report.rows if name not in RIVALS]
-    return [*learned, *(name for name in RIVALS if name in report.rows)]
+    """Learned rows first, then the baselines in their order."""
+    learned = [name for name in report.rows if name not in BASELINE_ROWS]
+    return [*learned, *(name for name in BASELINE_ROWS if name in report.rows)]
 
 
 def _heading(report: RankingReport) -> list[str]:

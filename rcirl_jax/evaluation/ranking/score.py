@@ -69,8 +69,8 @@ class OnTop:
     total: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
-# a rival with parameters; `fields()` is what may be traced of it
-Rival = LatticeCost | SpeedDpCost | Idm
+# a baseline with parameters; `fields()` is what may be traced of it
+Baseline = LatticeCost | SpeedDpCost | Idm
 COSTS: dict[type, Callable] = {
     LatticeCost: lattice_cost,
     SpeedDpCost: speed_dp_cost,
@@ -115,7 +115,7 @@ def _crashes(scene: Scene, trajectory: Trajectory, mask: jax.Array) -> jax.Array
 def _score_one(
     key: jax.Array,
     demonstration: Demonstration,
-    tuned: Mapping[str, Rival],
+    tuned: Mapping[str, Baseline],
     features: FeatureMap,
     sampler: SamplerConfig,
     horizon_s: float,
@@ -131,20 +131,22 @@ def _score_one(
         everyone
     )
     on_path = sampler.mode == "speed"
-    rivals: dict[str, Callable[[Trajectory], jax.Array]] = {
+    baselines: dict[str, Callable[[Trajectory], jax.Array]] = {
         "constant speed": lambda x: closeness(
             x, constant_speed_trajectory(scene, on_path), mask
         ),
     }
     cut = scene.replace(time_valid=mask)
     usual = {"IDM": Idm(), "hand-set": LatticeCost(), SPEED_DP_ROW: SpeedDpCost()}
-    for name, rival in {**usual, **tuned}.items():
-        if isinstance(rival, Idm):
-            way = idm_trajectory(scene, on_path, rival)
-            rivals[name] = lambda x, way=way: closeness(x, way, mask)
+    for name, baseline in {**usual, **tuned}.items():
+        if isinstance(baseline, Idm):
+            way = idm_trajectory(scene, on_path, baseline)
+            baselines[name] = lambda x, way=way: closeness(x, way, mask)
         else:
-            cost_of = COSTS[type(rival)]
-            rivals[name] = lambda x, f=cost_of, rival=rival: -f(cut, x, rival)
+            cost_of = COSTS[type(baseline)]
+            baselines[name] = lambda x, f=cost_of, baseline=baseline: (
+                -f(cut, x, baseline)
+            )
     return {
         "features_human": features(scene, human),
         "features": features.of_candidates(scene, candidates),
@@ -154,8 +156,8 @@ def _score_one(
         "crash": jax.vmap(lambda x: _crashes(recorded, x, mask))(everyone),
         "human_crash": _crashes(recorded, human, mask),
         "time_valid": mask,
-        "values": {name: jax.vmap(f)(everyone) for name, f in rivals.items()},
-        "human_values": {name: f(human) for name, f in rivals.items()},
+        "values": {name: jax.vmap(f)(everyone) for name, f in baselines.items()},
+        "human_values": {name: f(human) for name, f in baselines.items()},
     }
 
 
@@ -170,7 +172,7 @@ def _score_batch(
     sampler: SamplerConfig,
     horizon_s: float,
     futures: str,
-    kinds: tuple[tuple[str, type[Rival]], ...],
+    kinds: tuple[tuple[str, type[Baseline]], ...],
 ) -> Callable:
     features = feature_map(preset)
 
@@ -195,7 +197,7 @@ def score_scenes(
     horizon_s: float,
     scorers: Mapping[str, Scorer | OnTop],
     futures: str = "predicted",
-    tuned: Mapping[str, Rival] | None = None,
+    tuned: Mapping[str, Baseline] | None = None,
     executor: Executor | None = None,
 ) -> Scored:
     """Sample, featurise, measure and value S scenes, in chunks of bounded memory.
@@ -311,12 +313,12 @@ def _score_chunk(
     item: tuple[Demonstration, np.ndarray, int],
     shared: tuple[str, SamplerConfig, float, str],
     scorers: Mapping[str, Scorer | OnTop],
-    tuned: Mapping[str, Rival],
+    tuned: Mapping[str, Baseline],
 ) -> Iterator[dict]:
     """The arrays of one padded chunk; (rows, index, how many are real)."""
     rows, index, keep = item
-    kinds = tuple((name, type(rival)) for name, rival in tuned.items())
-    fields = {name: rival.fields() for name, rival in tuned.items()}
+    kinds = tuple((name, type(baseline)) for name, baseline in tuned.items())
+    fields = {name: baseline.fields() for name, baseline in tuned.items()}
     made = _score_batch(*shared, kinds)(fields, index, rows)
     made = jax.tree.map(lambda x: np.asarray(x[:keep]), made)
     both = (made["features"], made["features_human"])

@@ -1,7 +1,7 @@
-"""The ranking report: every scorer beside its rivals, as JSON and as a table.
+"""The ranking report: every scorer beside its baselines, as JSON and as a table.
 
 Each row is a scorer with one dictionary of `scene_metrics` per training run;
-rivals have one run. Intervals come from one shared bootstrap over vehicles (and
+baselines have one run. Intervals come from one shared bootstrap over vehicles (and
 runs), so rows can be compared; the comparison itself is the paired difference.
 """
 
@@ -40,7 +40,7 @@ SCHEMA_VERSION = 1
 UNTRAINED_ROW = "random weights"  # networks as they are before the first step
 
 # Rows that are not learned, in the order printed below the learned ones.
-RIVALS = (
+BASELINE_ROWS = (
     *("random", UNTRAINED_ROW, "constant speed", "IDM", TUNED_IDM_ROW),
     *(SPEED_DP_ROW, "hand-set", TUNED_ROW, LONG_ROW, "oracle"),
 )
@@ -236,10 +236,10 @@ def _estimate(resampled: _Resampled, row: str, metric: str) -> Estimate:
 
 
 def _families(names: Iterable[str], reference: str) -> list[list[str]]:
-    """Learned rows, then rivals, without the reference: one Holm family each."""
+    """Learned rows, then baselines, without the reference: one Holm family each."""
     others = [name for name in names if name != reference]
-    learned = [name for name in others if name not in RIVALS]
-    return [learned, [name for name in others if name in RIVALS]]
+    learned = [name for name in others if name not in BASELINE_ROWS]
+    return [learned, [name for name in others if name in BASELINE_ROWS]]
 
 
 def _enough_resamples(names: Iterable[str], references: Sequence[str]) -> int:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from rcirl_jax.errors import extra_module
+from rcirl_jax.evaluation.baselines.tpe import new_study
 from rcirl_jax.evaluation.ranking.metrics import METRICS
 from rcirl_jax.evaluation.ranking.sweep import (
     Point,
@@ -17,7 +18,6 @@ from rcirl_jax.evaluation.ranking.sweep import (
     point_name,
     shape_name,
 )
-from rcirl_jax.evaluation.rivals.tpe import new_study
 from rcirl_jax.export.sweep.choice import Found
 
 ROUND = 8  # configurations of a round

@@ -9,13 +9,13 @@ from numpy.typing import ArrayLike
 
 from rcirl_jax.evaluation.closed_loop.output import SHORT
 from rcirl_jax.evaluation.closed_loop.summary import SuiteReport
-from rcirl_jax.evaluation.ranking.table import RIVALS, RankingReport
+from rcirl_jax.evaluation.ranking.table import BASELINE_ROWS, RankingReport
 from rcirl_jax.report.style import CLASS_COLOURS, figure, label, save
 from rcirl_jax.simulation.metrics import COLUMNS
 from rcirl_jax.simulation.rows import BASELINES
 
 LEARNED = CLASS_COLOURS["follow"]
-RIVAL = "#777777"
+BASELINE = "#777777"
 CURVES = (
     CLASS_COLOURS["follow"],
     "#D55E00",
@@ -26,7 +26,7 @@ CURVES = (
     CLASS_COLOURS["other"],
     "#777777",
 )
-NOT_LEARNED = {*RIVALS, *BASELINES}
+NOT_LEARNED = {*BASELINE_ROWS, *BASELINES}
 PANELS = {
     "top1_fde": ("distance of the chosen at the horizon", "m, lower is better"),
     "top3_fde": ("best of the three highest", "m, lower is better"),
@@ -39,7 +39,7 @@ Interval = tuple[float, float, float]  # value, low, high
 def interval_panel(axis: Axes, rows: Mapping[str, Interval]) -> None:
     """One dot with its interval per row, first row on top, value written out."""
     for place, (name, (value, low, high)) in enumerate(rows.items()):
-        colour = RIVAL if name in NOT_LEARNED else LEARNED
+        colour = BASELINE if name in NOT_LEARNED else LEARNED
         axis.plot([low, high], [-place, -place], color=colour, lw=2)
         axis.plot([value], [-place], "o", color=colour, ms=5)
         axis.annotate(

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from rcirl_jax.evaluation.ranking.format import format_table
 from rcirl_jax.evaluation.ranking.metrics import METRICS
-from rcirl_jax.evaluation.ranking.table import RIVALS, SIGNIFICANT, RankingReport
+from rcirl_jax.evaluation.ranking.table import BASELINE_ROWS, SIGNIFICANT, RankingReport
 from rcirl_jax.report.pages import Table, interval
 
 RANKED = ("percentile_rank", "top1_fde", "top3_fde", "mrr", "crash_rate", "miss")
@@ -13,8 +13,8 @@ WIDTH = 118  # characters of preformatted tables
 
 def ranking_view(ranking: RankingReport) -> dict:
     """Rows and paired differences, and all columns as text."""
-    learned = [name for name in ranking.rows if name not in RIVALS]
-    names = [*learned, *(name for name in RIVALS if name in ranking.rows)]
+    learned = [name for name in ranking.rows if name not in BASELINE_ROWS]
+    names = [*learned, *(name for name in BASELINE_ROWS if name in ranking.rows)]
     heads = ["", "seeds"]
     for metric in RANKED:
         how = METRICS[metric]

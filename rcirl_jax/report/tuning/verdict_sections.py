@@ -27,7 +27,7 @@ DECISIONS = {  # classes of the decisions
 }
 SAFETY = {"fail": "refused", "open": "open"}  # of the card, by the worst outcome
 # families have a section of their own
-KINDS = ("safety", "no loss", "nulls", "likeness", "gain")
+KINDS = ("safety", "no loss", "trivial baselines", "likeness", "gain")
 
 
 def verdict_view(verdict: Verdict) -> dict:
@@ -246,7 +246,7 @@ def _amount(
     verdict: Verdict, title: str, names: Sequence[str], words: str
 ) -> dict[str, object]:
     """A card on checks that measure an amount; the worst outcome colours it."""
-    ranked = ("gain", "likeness", "no loss", "nulls")
+    ranked = ("gain", "likeness", "no loss", "trivial baselines")
     known = {
         name: [c for c in verdict.checks if c.name == name and c.measured]
         for name in names

@@ -12,7 +12,7 @@ from rcirl_jax.evaluation.gate.decision import judge
 from rcirl_jax.evaluation.gate.output import format_verdict, write_verdict
 from rcirl_jax.evaluation.gate.types import (
     EXIT_CODES,
-    NULLS,
+    TRIVIAL_BASELINES,
     GateConfig,
     Likeness,
     Pair,
@@ -40,11 +40,16 @@ def drives(seed=0, jerky=0.4, hard=0.15, way=1000.0):
 
 
 def likeness(seed=0, name="incumbent", **factors):
-    """Distances to the human: all alike, or times a factor; the nulls twice as far."""
+    """Distances to the human: alike, or times a factor; the trivial ones twice."""
     rng = np.random.default_rng(seed)
     clusters = np.arange(DRIVES) % RECORDINGS
     hard = rng.uniform(1.0, 3.0, size=DRIVES)  # how hard a drive is to foresee
-    rows = {"candidate": 1.0, name: 1.0, **dict.fromkeys(NULLS, 2.0), **factors}
+    rows = {
+        "candidate": 1.0,
+        name: 1.0,
+        **dict.fromkeys(TRIVIAL_BASELINES, 2.0),
+        **factors,
+    }
     distance = {
         row: factor * hard * rng.uniform(0.9, 1.1, size=DRIVES)
         for row, factor in rows.items()
@@ -56,7 +61,7 @@ def pair(candidate, incumbent, families=FAMILIES, **more):
     names = [f"family{i * families // CASES:02d}" for i in range(CASES)]
     values = {
         "preventable": np.ones(CASES, bool),
-        "nulls": dict.fromkeys(NULLS, incumbent),
+        "trivial_baselines": dict.fromkeys(TRIVIAL_BASELINES, incumbent),
         "likeness": likeness(),
     }
     return Pair(
@@ -236,7 +241,14 @@ def part_of(whole, keep):
             {k: cut(v) for k, v in one.items()} if isinstance(one, dict) else one[keep]
         )
 
-    names = ("candidate", "incumbent", "nulls", "families", "ids", "reference")
+    names = (
+        "candidate",
+        "incumbent",
+        "trivial_baselines",
+        "families",
+        "ids",
+        "reference",
+    )
     parts = {name: cut(getattr(whole, name)) for name in (*names, "preventable")}
     return dataclasses.replace(whole, **parts)
 
@@ -295,7 +307,9 @@ def test_sentences_fit_three_lines_however_much_is_wrong():
     bad = broken(bad, slice(0, 3000), at_fault=1, red_lights=1, drivable=0)
     for mine, theirs in ((bad, drives()), (drives(), bad), (drives(), drives())):
         for known in (None, likeness()):
-            verdict = judge(pair(mine, theirs, likeness=known, nulls={}), GateConfig())
+            verdict = judge(
+                pair(mine, theirs, likeness=known, trivial_baselines={}), GateConfig()
+            )
             assert len(textwrap.wrap(verdict.sentence, 100)) <= 3
             assert "..." not in verdict.sentence
 

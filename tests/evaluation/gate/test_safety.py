@@ -1,4 +1,4 @@
-"""Faults, accepted cases, nulls and human-likeness in the gate."""
+"""Faults, accepted cases, trivial baselines and human-likeness in the gate."""
 
 import dataclasses
 import math
@@ -19,7 +19,7 @@ from rcirl_jax.evaluation.exact import (
 from rcirl_jax.evaluation.gate.decision import judge
 from rcirl_jax.evaluation.gate.output import format_verdict
 from rcirl_jax.evaluation.gate.types import GateConfig, Likeness
-from rcirl_jax.simulation.rows import NULLS
+from rcirl_jax.simulation.rows import TRIVIAL_BASELINES
 from tests.evaluation.gate.test_gate import (
     CASES,
     broken,
@@ -111,12 +111,15 @@ def test_clearly_more_faults_are_refused_and_as_many_are_no_difference(field, na
     assert (check.outcome, check.gained, check.lost) == ("pass", 3, 3)
     assert verdict.decision == "no difference"
     assert len(verdict.new_faults) == 3
-    # McNemar, 8 against 1: p = 0.039; the nulls drive as the incumbent does here
+    # McNemar, 8 against 1: p = 0.039; the trivial ones drive as the incumbent does here
     mine = smoother(broken(drives(), spread(8), **{field: 1}))
     theirs = broken(drives(), spread(1, start=5), **{field: 1})
     verdict = decide(mine, theirs)
     assert verdict.decision == "do not ship"
-    assert failed(verdict) == {name, *(f"{name}, {null}" for null in NULLS)}
+    assert failed(verdict) == {
+        name,
+        *(f"{name}, {trivial}" for trivial in TRIVIAL_BASELINES),
+    }
     assert verdict.look_at[0] == "family00/000@0"
 
 
@@ -172,7 +175,7 @@ def test_an_accepted_case_does_not_count():
             decide(candidate, theirs, accept=("family01/000@1",))
 
 
-# ----------------------------------------------------------------- nulls and likeness
+# ------------------------------------------------ trivial baselines and likeness
 
 
 def test_what_was_not_measured_is_open_and_says_what_to_do():
@@ -180,10 +183,13 @@ def test_what_was_not_measured_is_open_and_says_what_to_do():
     verdict = judge(pair(mine, drives(), likeness=None), GateConfig())
     assert verdict.decision == "could not judge"
     unmeasured = [c.name for c in verdict.checks if not c.measured]
-    assert unmeasured == [*(f"likeness, {name}" for name in NULLS), "likeness"]
+    assert unmeasured == [
+        *(f"likeness, {name}" for name in TRIVIAL_BASELINES),
+        "likeness",
+    ]
     assert "Next: measure human-likeness" in verdict.sentence
     assert "not measured" in format_verdict(verdict)
-    verdict = judge(pair(mine, drives(), nulls={}), GateConfig())
+    verdict = judge(pair(mine, drives(), trivial_baselines={}), GateConfig())
     assert verdict.decision == "could not judge"
     assert "drive constant V on the same cases" in verdict.reasons[0]
     # where something is worse, that is said, not what is missing
@@ -192,10 +198,10 @@ def test_what_was_not_measured_is_open_and_says_what_to_do():
     assert verdict.decision == "do not ship"
 
 
-def test_behind_a_null_in_safety_is_refused():
+def test_behind_a_trivial_baseline_in_safety_is_refused():
     mine = smoother(broken(drives(), spread(12), red_lights=1))
-    null = {"constant V": mine, "+velocity": drives()}
-    verdict = judge(pair(mine, mine, nulls=null), GateConfig())
+    trivial = {"constant V": mine, "+velocity": drives()}
+    verdict = judge(pair(mine, mine, trivial_baselines=trivial), GateConfig())
     assert failed(verdict) == {"red_light, +velocity"}
     assert "is not as safe as +velocity: red lights run" in verdict.sentence
 
@@ -204,7 +210,7 @@ def test_behind_a_null_in_safety_is_refused():
     ("factors", "outcome"),
     [({}, "pass"), ({"+velocity": 1.0}, "open"), ({"+velocity": 0.9}, "fail")],
 )
-def test_the_candidate_is_nearer_than_every_null(factors, outcome):
+def test_the_candidate_is_nearer_than_every_trivial_baseline(factors, outcome):
     known = likeness(**factors)
     verdict = judge(pair(smoother(drives()), drives(), likeness=known), GateConfig())
     assert check_of(verdict, "likeness, +velocity").outcome == outcome

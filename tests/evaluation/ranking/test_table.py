@@ -19,7 +19,7 @@ from rcirl_jax.evaluation.ranking.metrics import (
     scene_metrics,
 )
 from rcirl_jax.evaluation.ranking.table import (
-    RIVALS,
+    BASELINE_ROWS,
     build_report,
     from_json,
     to_json,
@@ -200,14 +200,14 @@ def test_table_fits_lines_up_and_has_the_numbers_of_the_report(report, width):
     assert len(blocks) >= 3
     for at, end in itertools.pairwise(blocks):
         rows = [line for line in table[at + 3 : end] if not line.startswith("  sd")]
-        order = ("rc-irl", "twin", *(x for x in RIVALS if x in report.rows))
+        order = ("rc-irl", "twin", *(x for x in BASELINE_ROWS if x in report.rows))
         assert all(n.startswith(o) for n, o in zip(rows, order, strict=True))
         assert len({len(line) for line in (table[at + 1], *rows)}) == 1  # right-aligned
     text = "\n".join(lines)
     found = report.rows["hand-set"]["top1_fde"]
     assert f"{found.value:.2f} [{found.low:.2f}, {found.high:.2f}]" in text
     for c in report.comparisons:
-        if c.row not in RIVALS and c.metric == "top1_fde":
+        if c.row not in BASELINE_ROWS and c.metric == "top1_fde":
             assert f"{c.difference.mean:+.3f} [" in text
     bound = 100.0 - 100.0 * 0.05 ** (1.0 / VEHICLES)
     assert f"0 (<= {bound:.1f})" in text

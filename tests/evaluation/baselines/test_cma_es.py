@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.ranking.score import candidates_key
-from rcirl_jax.evaluation.rivals.cma_es import tune
-from rcirl_jax.evaluation.rivals.objectives import (
+from rcirl_jax.evaluation.baselines.cma_es import tune
+from rcirl_jax.evaluation.baselines.objectives import (
     HAND_SET,
     Problem,
     ValuedScenes,
@@ -18,6 +17,7 @@ from rcirl_jax.evaluation.rivals.objectives import (
     mean_fde,
     valued_scenes,
 )
+from rcirl_jax.evaluation.ranking.score import candidates_key
 from rcirl_jax.reward import (
     TUNABLE,
     TUNED_ROW,
@@ -28,7 +28,7 @@ from rcirl_jax.reward import (
 )
 from rcirl_jax.reward.hand import LatticeTerms
 from rcirl_jax.sampling import SamplerConfig, num_candidates, sample
-from tests.evaluation.driven import mean_chosen_fde, scored_rivals
+from tests.evaluation.driven import mean_chosen_fde, scored_baselines
 from tests.helpers.scenes import T, unfused
 from tests.helpers.stored import long_rows
 
@@ -175,7 +175,7 @@ def test_the_search_comes_close_to_a_hidden_cost_by_what_the_report_measures():
     assert hidden < 0.05  # near ties
     _, found = tune(lambda x: mean_fde(HAND_SET, scenes, x), np.zeros(D), 1.0, 400, 0)
     assert found < 0.2 * default
-    scored = scored_rivals(rows, SMALL, {TUNED_ROW: cost, "again": LatticeCost()})
+    scored = scored_baselines(rows, SMALL, {TUNED_ROW: cost, "again": LatticeCost()})
     np.testing.assert_allclose(
         scored.values["again"], scored.values["hand-set"], rtol=1e-5, atol=1e-3
     )

@@ -25,7 +25,7 @@ class Counted:
     def __init__(self, objective: Objective, start: ArrayLike, budget: int) -> None:
         """Evaluate `start` [d]; `budget` is at least 1."""
         self._objective = objective
-        self._bar = tqdm.tqdm(total=budget, desc="tune a rival", unit="try")
+        self._bar = tqdm.tqdm(total=budget, desc="tune a baseline", unit="try")
         self.left, self._lowest = budget, math.inf
         self.start = self._best = np.asarray(start, np.float64)
         self.at_start = float(self(self.start[None])[0])

@@ -1,8 +1,8 @@
-"""What a tuner of a rival minimises: the error of what the rival chooses.
+"""What a tuner of a baseline minimises: the error of what the baseline chooses.
 
-A rival is the hand-set cost or the IDM. A problem knows how many queries (candidates
+A baseline is the hand-set cost or the IDM. A problem knows how many queries (candidates
 looked at) one evaluation takes, so that budgets can be compared with a learner's. A
-vector of zeros is the usual rival.
+vector of zeros is the usual baseline.
 """
 
 import dataclasses
@@ -17,9 +17,9 @@ from jaxtyping import Array, Float
 
 from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.baselines.counted import Objective
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, covered_rows
-from rcirl_jax.evaluation.ranking.score import CHUNK, Rival, horizon_mask, measured
-from rcirl_jax.evaluation.rivals.counted import Objective
+from rcirl_jax.evaluation.ranking.score import CHUNK, Baseline, horizon_mask, measured
 from rcirl_jax.planner.baselines import Idm, closeness, idm_trajectory
 from rcirl_jax.planner.prediction import as_seen
 from rcirl_jax.reward import TUNABLE, lattice_terms, tuned, weighted_cost
@@ -40,19 +40,19 @@ LARGEST_IDM_LOG = 3.0  # a parameter is within a factor exp(3) = 20 of the usual
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Tunable:
-    """A kind of rival: its parameters, and how it values candidates."""
+    """A kind of baseline: its parameters, and how it values candidates."""
 
     names: tuple[str, ...]  # of the parameters, in the order of a vector
-    rival: Callable[[jax.Array], Rival]  # of a vector [d], which may be traced
+    baseline: Callable[[jax.Array], Baseline]  # of a vector [d], which may be traced
     # (scene, candidates [K, T], mask [T]) -> what the values need
     known: Callable[[Scene, Trajectory, jax.Array], Any]
-    # (that, a rival, whether candidates keep to the path) -> [K], higher is better
+    # (that, a baseline, whether candidates keep to the path) -> [K], higher is better
     values: Callable[[Any, Any, bool], jax.Array]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Problem:
-    """An objective of a rival's parameters."""
+    """An objective of a baseline's parameters."""
 
     objective: Objective  # [n, d] -> [n], lower is better
     queries: int  # candidates looked at in one evaluation of one vector
@@ -93,13 +93,13 @@ def _nearness(known: tuple, driver: Idm, on_path: bool) -> jax.Array:
 
 HAND_SET = Tunable(
     names=TUNABLE,
-    rival=tuned,
+    baseline=tuned,
     known=_cost_terms,
     values=lambda terms, cost, _: -jax.vmap(lambda x: weighted_cost(x, cost))(terms),
 )
 DRIVER = Tunable(
     names=TUNABLE_IDM,
-    rival=idm_of,
+    baseline=idm_of,
     known=lambda *known: known,
     values=_nearness,
 )
@@ -112,16 +112,16 @@ def problem(
     max_scenes: int,
     seed: int = 0,
 ) -> Problem:
-    """Mean FDE [m] of the candidate that a rival values most.
+    """Mean FDE [m] of the candidate that a baseline values most.
 
     The candidates and distances are those of `evaluate_ranking`; like there, a
     scene without a feasible candidate is charged with candidate 0.
 
     Args:
-      kind: of the rival.
+      kind: of the baseline.
       dataset: an open dataset.
       setup: sampler, horizon, split; tune on "train" only. With `futures` of
-        "predicted" rivals see what the planner sees.
+        "predicted" baselines see what the planner sees.
       max_scenes: at most so many, drawn by the seed.
       seed: of the draw.
 
@@ -150,10 +150,10 @@ def valued_scenes(
     sampler: SamplerConfig,
     horizon_s: float,
 ) -> ValuedScenes:
-    """Candidates, their distances and what a rival needs, made once, a few at a time.
+    """Makes candidates, their distances and what a baseline needs, a few at a time.
 
     Args:
-      kind: of the rival.
+      kind: of the baseline.
       rows: S demonstrations (numpy) whose recorded future covers the horizon.
       index: [S] dataset rows; they seed the candidates.
       sampler: sampler configuration.
@@ -187,10 +187,10 @@ def _make_scenes(kind: Tunable, sampler: SamplerConfig, horizon_s: float) -> Cal
 def mean_fde(
     kind: Tunable, scenes: ValuedScenes, vectors: np.ndarray, *, on_path: bool = True
 ) -> np.ndarray:
-    """[n] m, mean FDE of the feasible candidate that each rival [n, d] values most.
+    """[n] m, mean FDE of the feasible candidate that each baseline [n, d] values most.
 
     Args:
-      kind: of the rivals.
+      kind: of the baselines.
       scenes: of `valued_scenes`.
       vectors: their parameters, a few at a time.
       on_path: the candidates keep to the given path.
@@ -211,7 +211,7 @@ def _mean_fde(
 
     def of_scene(one: ValuedScenes) -> jax.Array:
         def of_vector(vector: jax.Array) -> jax.Array:
-            values = kind.values(one.known, kind.rival(vector), on_path)
+            values = kind.values(one.known, kind.baseline(vector), on_path)
             return one.fde[jnp.argmax(jnp.where(one.feasible, values, -jnp.inf))]
 
         return jax.vmap(of_vector)(vectors)

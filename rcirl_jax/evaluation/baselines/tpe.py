@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rcirl_jax.errors import extra_module
-from rcirl_jax.evaluation.rivals.counted import Counted, Objective, population
+from rcirl_jax.evaluation.baselines.counted import Counted, Objective, population
 
 if TYPE_CHECKING:
     import optuna  # an extra

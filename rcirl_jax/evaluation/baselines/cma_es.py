@@ -1,7 +1,7 @@
 """A black-box tuner with a counted budget: CMA-ES with restarts.
 
-A fair rival of a learner tunes a few parameters directly on the compared metric, with
-as many queries as the learner had.
+A fair baseline of a learner tunes a few parameters directly on the compared metric,
+with as many queries as the learner had.
 
 Source: Hansen, The CMA Evolution Strategy: A Tutorial (arXiv:1604.00772), by the
 package `cma`; restarts with twice the population of Auger and Hansen (CEC 2005).
@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rcirl_jax.evaluation.rivals.counted import Counted, Objective, population
+from rcirl_jax.evaluation.baselines.counted import Counted, Objective, population
 
 # quiet: no files, no output, no signals file; the only random numbers are ours
 _QUIET = {"verbose": -10, "verb_log": 0, "verb_disp": 0, "seed": math.nan}

@@ -7,9 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rcirl_jax.evaluation.ranking.score import candidates_key, measure_scenes
-from rcirl_jax.evaluation.rivals.cma_es import tune
-from rcirl_jax.evaluation.rivals.objectives import (
+from rcirl_jax.evaluation.baselines.cma_es import tune
+from rcirl_jax.evaluation.baselines.objectives import (
     DRIVER,
     TUNABLE_IDM,
     Problem,
@@ -17,11 +16,12 @@ from rcirl_jax.evaluation.rivals.objectives import (
     mean_fde,
     valued_scenes,
 )
-from rcirl_jax.evaluation.rivals.tuned import SEARCHES, _best, as_numbers
+from rcirl_jax.evaluation.baselines.tuned import SEARCHES, _best, as_numbers
+from rcirl_jax.evaluation.ranking.score import candidates_key, measure_scenes
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm, closeness, idm_trajectory
 from rcirl_jax.reward import LatticeCost
 from rcirl_jax.sampling import SamplerConfig
-from tests.evaluation.driven import mean_chosen_fde, scored_rivals
+from tests.evaluation.driven import mean_chosen_fde, scored_baselines
 from tests.helpers.scenes import sampled
 from tests.helpers.stored import long_rows
 
@@ -64,7 +64,7 @@ def test_zeros_are_the_usual_driver_and_bounds_hold():
 def test_the_search_comes_close_to_a_hidden_driver_by_what_the_report_measures():
     rows, hidden = driven_by_a_hidden_driver(), idm_of(jnp.asarray(HIDDEN, jnp.float32))
     tuned = {TUNED_IDM_ROW: hidden, "again": Idm(), "cost": LatticeCost()}
-    scored = scored_rivals(rows, SMALL, tuned)
+    scored = scored_baselines(rows, SMALL, tuned)
     np.testing.assert_allclose(
         scored.values["again"], scored.values["IDM"], rtol=1e-5, atol=1e-4
     )
@@ -106,7 +106,7 @@ def test_candidates_are_those_of_the_evaluation():
 def test_distances_alone_are_those_of_the_scores():
     """What an import's oracle floor measures, over a padded chunk."""
     rows = driven_by_a_hidden_driver()
-    scored = scored_rivals(rows, SMALL, {})
+    scored = scored_baselines(rows, SMALL, {})
     near = measure_scenes(rows, INDEX, sampler=SMALL, horizon_s=8.0, futures="recorded")
     for name in ("feasible", "fde", "ade"):
         found, wanted = getattr(near, name), getattr(scored, name)

@@ -1,4 +1,4 @@
-"""Rivals tuned on the learners' own training scenes, by the compared metric.
+"""Baselines tuned on the learners' own training scenes, by the compared metric.
 
 The hand-set cost and the Intelligent Driver Model have few parameters; a search
 looks for those whose choices end nearest to the human. Rows:
@@ -15,11 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.data.store.joined import Demonstrations
-from rcirl_jax.evaluation.ranking.evaluate import RankingSetup
-from rcirl_jax.evaluation.ranking.score import Rival
-from rcirl_jax.evaluation.rivals import cma_es, tpe
-from rcirl_jax.evaluation.rivals.counted import Search
-from rcirl_jax.evaluation.rivals.objectives import (
+from rcirl_jax.evaluation.baselines import cma_es, tpe
+from rcirl_jax.evaluation.baselines.counted import Search
+from rcirl_jax.evaluation.baselines.objectives import (
     DRIVER,
     HAND_SET,
     Problem,
@@ -27,6 +25,8 @@ from rcirl_jax.evaluation.rivals.objectives import (
     learner_budget,
     problem,
 )
+from rcirl_jax.evaluation.ranking.evaluate import RankingSetup
+from rcirl_jax.evaluation.ranking.score import Baseline
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW, Idm
 from rcirl_jax.reward import LONG_ROW, TUNED_ROW
 
@@ -36,7 +36,7 @@ SIGMA = 1.0  # first spread of the log-weights
 SEARCHES: dict[str, Search] = {"cma": cma_es.tune, "optuna": tpe.tune}
 
 
-def tuned_rivals(
+def tuned_baselines(
     dataset: Demonstrations,
     setup: RankingSetup,
     *,
@@ -44,7 +44,7 @@ def tuned_rivals(
     seeds: Sequence[int],
     long: int,
     search: str = "cma",
-) -> dict[str, list[Rival]]:
+) -> dict[str, list[Baseline]]:
     """The three rows, one search per seed each.
 
     Args:
@@ -64,7 +64,7 @@ def tuned_rivals(
     }
     if not long:
         del searches[LONG_ROW]
-    found: dict[str, list[Rival]] = {row: [] for row in searches}
+    found: dict[str, list[Baseline]] = {row: [] for row in searches}
     for row, (kind, scenes, evaluations) in searches.items():
         for seed in seeds:
             made = problem(kind, dataset, own, scenes, seed)
@@ -73,11 +73,13 @@ def tuned_rivals(
     return found
 
 
-def _best(kind: Tunable, made: Problem, budget: int, seed: int, search: str) -> Rival:
-    """The rival that a search finds."""
+def _best(
+    kind: Tunable, made: Problem, budget: int, seed: int, search: str
+) -> Baseline:
+    """The baseline that a search finds."""
     start = np.zeros(len(kind.names))
     best, _ = SEARCHES[search](made.objective, start, SIGMA, budget, seed)
-    return kind.rival(jnp.asarray(best, jnp.float32))
+    return kind.baseline(jnp.asarray(best, jnp.float32))
 
 
 def tune_idm(
@@ -100,6 +102,8 @@ def tune_idm(
     return Idm(**{name: float(value) for name, value in found.items()})
 
 
-def as_numbers(rivals: Iterable[Rival]) -> list[dict[str, float]]:
+def as_numbers(baselines: Iterable[Baseline]) -> list[dict[str, float]]:
     """The parameters of each, for a JSON file."""
-    return [{n: float(x) for n, x in rival.fields().items()} for rival in rivals]
+    return [
+        {n: float(x) for n, x in baseline.fields().items()} for baseline in baselines
+    ]

@@ -1,11 +1,11 @@
-"""Optuna's search as a rival's tuner: budget, seed, values that are not finite."""
+"""Optuna's search as a baseline's tuner: budget, seed, values that are not finite."""
 
 import numpy as np
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.rivals.tpe import REACH, tune
-from tests.evaluation.rivals.test_cma_es import Counted, sphere
+from rcirl_jax.evaluation.baselines.tpe import REACH, tune
+from tests.evaluation.baselines.test_cma_es import Counted, sphere
 
 pytest.importorskip("optuna")
 D = 3
