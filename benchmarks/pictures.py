@@ -25,11 +25,9 @@ from rcirl_jax.cli.flags.common import provenance
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.joined import open_datasets
 from rcirl_jax.export.loading import open_reward
-from rcirl_jax.report.compare.page import write_comparison
-from rcirl_jax.report.compare.runs import read_run
-from rcirl_jax.report.data.page import write_data_page
-from rcirl_jax.report.tuning.contributions import contributions
-from rcirl_jax.report.tuning.curves import response_curves
+from rcirl_jax.report.compare import read_run, write_comparison
+from rcirl_jax.report.data_page import write_data_page
+from rcirl_jax.report.features import contributions, response_curves
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page

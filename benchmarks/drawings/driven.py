@@ -14,9 +14,9 @@ from rcirl_jax.export.loading import open_reward
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.rank import ONLINE, RankConfig
 from rcirl_jax.planner.safety import check
-from rcirl_jax.report.player.player import COLOURS
-from rcirl_jax.report.player.replays import MAX_CASES, Replay, make_replays
-from rcirl_jax.report.ranking.plots import draw_obstacles
+from rcirl_jax.report.frames import draw_obstacles
+from rcirl_jax.report.player import COLOURS
+from rcirl_jax.report.replays import MAX_CASES, Replay, make_replays
 from rcirl_jax.report.style import (
     CANDIDATE,
     CHOSEN,

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rcirl_jax.report.ranking.intervals import (
+from rcirl_jax.report.charts import (
     BASELINE,
     LEARNED,
     curves_panel,

@@ -15,7 +15,7 @@ from rcirl_jax.export.guard import Guard
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.rank import ONLINE
-from rcirl_jax.report.data.scene_picture import GRAPH_INCHES, HEIGHT_INCHES, draw_scene
+from rcirl_jax.report.scene import GRAPH_INCHES, HEIGHT_INCHES, draw_scene
 from rcirl_jax.report.style import CHOSEN, CLASS_COLOURS, figure, label, save
 from rcirl_jax.sampling import sample
 from rcirl_jax.types import Decision, Scene, Tag

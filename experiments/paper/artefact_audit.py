@@ -27,7 +27,7 @@ from rcirl_jax.cli.flags.common import run
 from rcirl_jax.evaluation.ranking.learners import FrozenSets, pair_wins, train_learner
 from rcirl_jax.evaluation.statistics import ClusterBootstrap, combine_seeds
 from rcirl_jax.features import feature_map
-from rcirl_jax.report.ranking.intervals import interval_panel
+from rcirl_jax.report.charts import interval_panel
 from rcirl_jax.report.style import figure, label, save
 
 KEPT = {"a and j": ("acceleration", "jerk"), "all features": None}

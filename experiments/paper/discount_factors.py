@@ -25,7 +25,7 @@ from rcirl_jax.evaluation.ranking.learners import (
     learner_config,
     train_learners,
 )
-from rcirl_jax.report.ranking.intervals import curves_panel
+from rcirl_jax.report.charts import curves_panel
 from rcirl_jax.report.style import figure, label, save
 from rcirl_jax.reward import pinned
 from rcirl_jax.units import TIMES_S

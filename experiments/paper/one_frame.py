@@ -31,7 +31,7 @@ from rcirl_jax.cli.flags.common import run
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.from_run import export_run
 from rcirl_jax.export.loading import open_reward
-from rcirl_jax.report.ranking.frames import draw_frame, pick_frames
+from rcirl_jax.report.frames import draw_frame, pick_frames
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train.loop import train
 

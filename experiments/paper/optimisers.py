@@ -18,7 +18,7 @@ from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.evaluation.ranking.format import format_table
 from rcirl_jax.evaluation.ranking.learners import scorers, train_learners
 from rcirl_jax.evaluation.ranking.table import to_json
-from rcirl_jax.report.ranking.intervals import curves_panel, interval_panel
+from rcirl_jax.report.charts import curves_panel, interval_panel
 from rcirl_jax.report.style import figure, label, save
 
 RATES = {"adam": 3e-3, "rmsprop": 3e-3, "sgd": 3e-2}

@@ -80,7 +80,7 @@ from rcirl_jax.export.reader import PriorCost
 from rcirl_jax.features import feature_map
 from rcirl_jax.planner.prediction import as_seen
 from rcirl_jax.planner.rank import ONLINE, Params, Score, hand_score
-from rcirl_jax.report.ranking.intervals import Interval, interval_chart
+from rcirl_jax.report.charts import Interval, interval_chart
 from rcirl_jax.reward import LOSSES, seen_range
 from rcirl_jax.sampling import sample
 from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics, nuplan_score

@@ -39,7 +39,7 @@ from rcirl_jax.planner.rank import (
     learned_score,
     rank_policy,
 )
-from rcirl_jax.report.ranking.intervals import interval_chart
+from rcirl_jax.report.charts import interval_chart
 from rcirl_jax.runtime.atomic_files import write_json
 from rcirl_jax.simulation.suite import build, suite_refs
 

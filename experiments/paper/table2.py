@@ -32,7 +32,7 @@ from rcirl_jax.cli.flags.common import run
 from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, run_suite, write_suite
 from rcirl_jax.export.closed_loop import table_rows
 from rcirl_jax.export.loading import open_reward
-from rcirl_jax.report.ranking.intervals import suite_chart
+from rcirl_jax.report.charts import suite_chart
 from rcirl_jax.simulation.rows import BASELINES, Row
 from rcirl_jax.simulation.suite import FULL_S, catalogue_set, suite_refs
 from rcirl_jax.tune.recipes import DEFAULT, load_recipe

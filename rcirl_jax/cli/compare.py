@@ -27,8 +27,7 @@ _OUTPUT = flags.DEFINE_string("output", "compare.html", "page to write")
 
 def main() -> None:
     """Folders of runs -> one page."""
-    from rcirl_jax.report.compare.page import write_comparison
-    from rcirl_jax.report.compare.runs import read_run
+    from rcirl_jax.report.compare import read_run, write_comparison
 
     folders = [Path(name) for name in _RUNS.value or ()]
     if len(folders) < 2:

@@ -91,7 +91,7 @@ def _tuned(
 
 def main() -> None:
     """Flags -> one comparison."""
-    from rcirl_jax.report.ranking.intervals import ranking_chart
+    from rcirl_jax.report.charts import ranking_chart
 
     dataset = open_dataset(_DATA.value)
     parts, words = splits(dataset)

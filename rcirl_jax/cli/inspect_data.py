@@ -30,7 +30,7 @@ _ROWS = flags.DEFINE_list(
 
 def main() -> None:
     """Flags -> pictures and one page."""
-    from rcirl_jax.report.data.page import choose_rows, write_data_page
+    from rcirl_jax.report.data_page import choose_rows, write_data_page
 
     dataset = open_dataset(_DATA.value)
     if _ROWS.value and _TAGS.value:

@@ -13,7 +13,7 @@ from absl import flags
 
 from rcirl_jax.cli.flags.common import provenance
 from rcirl_jax.export.closed_loop import table_rows
-from rcirl_jax.report.player.replays import make_replays
+from rcirl_jax.report.replays import make_replays
 from rcirl_jax.simulation.rows import BASELINES, Row
 from rcirl_jax.simulation.suite import (
     FULL_S,
@@ -44,7 +44,7 @@ def _row() -> Row:
 
 def main() -> None:
     """Flags -> case.html."""
-    from rcirl_jax.report.player.player import write_replay_page
+    from rcirl_jax.report.player import write_replay_page
 
     duration = case_duration("", _DURATION.value)
     cases = catalogue_set([case_ref(_CASE.value)], duration)

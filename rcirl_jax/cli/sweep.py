@@ -84,7 +84,7 @@ def _leaky_rates(base: TrainConfig) -> tuple[float, ...]:
 
 def main() -> None:
     """Flags -> one sweep."""
-    from rcirl_jax.report.ranking.sweep_picture import sweep_picture
+    from rcirl_jax.report.charts import sweep_picture
 
     if _SEARCH.value == GRID and flags.FLAGS["trials"].present:
         raise InputError(

@@ -1,6 +1,7 @@
 """Pages as one HTML file: Jinja2 templates, in which every text is escaped.
 
 A page loads nothing from elsewhere and runs one script, which its policy names by hash.
+`TERMS` explains the words of all pages: the one place where they are.
 """
 
 import base64
@@ -10,16 +11,61 @@ import hashlib
 import importlib.resources
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import jinja2
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
-from rcirl_jax.report.glossary import explained
 from rcirl_jax.runtime.atomic_files import plain, write_whole
 
 BROAD_PIXELS = 1000  # wider pictures are not shrunk to a phone's width
+TERMS = {
+    "at-fault": "caused by the ego: it runs into somebody, or moves into their way",
+    "preventable": "one of two models of a careful driver avoids it",
+    "clean drives": "no at-fault collision, red light or stop sign run, always more "
+    "than 0.95 s to a collision, within the limit and on the road",
+    "time to collision": "time until two bodies meet if both keep their speed",
+    "nuPlan": "score of the nuPlan benchmark, 0 to 100 points: nothing with an own "
+    "fault or off the road, else progress, time to collision, speed and comfort",
+    "progress": "way along the road in the time of a case",
+    "jerk": "change of acceleration in a second; much of it feels rough",
+    "nearer to the human": "less distance along the road from what the recorded human "
+    "did, over held-out drives from the same start",
+    "baseline": "a driver or a score that learned nothing from these recordings",
+    "trivial baseline": "a score that knows nothing: any other should beat it",
+    "prior cost": "the planner's own cost, to which the learned value is added",
+    "familiarity": "how much a scene is like those recorded: the less, the smaller the "
+    "part of the learned value",
+    "simulated demonstrations": "drives of the own cost in the simulator, which the "
+    "training uses beside the recordings",
+    "hand-set": "the cost with weights set by hand that planners drive with today",
+    "constant V": "trivial baseline: a planner that likes all its plans alike",
+    "+velocity": "trivial baseline: a planner that likes nothing but speed",
+    "IDM": "Intelligent Driver Model: follows the car ahead by a formula",
+    "random": "candidates in random order, or weights that have learned nothing",
+    "oracle": "chooses the candidate nearest to the human: the best one can do",
+    "human rank": "share of the candidates that the human's own curve is ranked above",
+    "top-1 FDE": "distance of the candidate ranked first from the human at the end",
+    "top-3 FDE": "the least such distance among the three candidates ranked first",
+    "MRR": "mean of 1 / rank of the candidate nearest to the human; 1 is best",
+    "miss": "share of scenes whose first candidate ends far from the human",
+    "Holm": "p values made larger because several things are tested at once",
+    "margin": "largest loss that counts as none, declared before anything was driven",
+    "rule of three": "what never happened in n cases happens in at most 3 / n of them",
+    "gamma": "how much each time of a plan counts",
+    "p": "how often chance alone would make a difference as large",
+}
+# whole words, the longer of two that begin alike
+_WORDS = re.compile(
+    "|".join(
+        rf"(?<![\w+|-]){re.escape(term)}(?![\w-])"
+        for term in sorted(TERMS, key=len, reverse=True)
+    ),
+    re.IGNORECASE,
+)
+_MEANINGS = {term.lower(): meaning for term, meaning in TERMS.items()}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -34,7 +80,7 @@ class Table:
 
 
 def number(value: float, digits: int, signed: bool = False) -> str:
-    """Fixed digits with a true minus; "none" for what is not finite."""
+    """Format with fixed digits and a true minus; "none" for what is not finite."""
     if not math.isfinite(value):
         return "none"
     value = round(value, digits) + 0.0  # no minus before a zero
@@ -48,13 +94,27 @@ def interval(
     scale: float = 1.0,
     signed: bool = False,
 ) -> str:
-    """(value, low, high), each times `scale`, as value [low, high]."""
+    """Format (value, low, high), each times `scale`, as value [low, high]."""
     middle, *ends = (number(scale * x, digits, signed) for x in found)
     return f"{middle} [{ends[0]}, {ends[1]}]"
 
 
+def explained(text: object) -> Markup:
+    """Mark the terms of a text as `<abbr>`; leave `Markup` as it is."""
+    if isinstance(text, Markup):
+        return text
+    words, found, at = str(text), Markup(""), 0
+    for term in _WORDS.finditer(words):
+        found += escape(words[at : term.start()])
+        found += Markup('<abbr title="{}">{}</abbr>').format(
+            _MEANINGS[term[0].lower()], term[0]
+        )
+        at = term.end()
+    return found + escape(words[at:])
+
+
 def picture(path: Path, caption: str) -> dict:
-    """A PNG as the data of the template's `picture`."""
+    """Return a PNG as the data of the template's `picture`."""
     png = path.read_bytes()
     return {
         "data": base64.b64encode(png).decode(),
@@ -64,7 +124,7 @@ def picture(path: Path, caption: str) -> dict:
 
 
 def facts_text(facts: Mapping[str, object]) -> str:
-    """What made a page, as JSON."""
+    """Return what made a page, as JSON."""
     return json.dumps(plain(facts), indent=2, default=str, ensure_ascii=False)
 
 
@@ -83,12 +143,12 @@ def _environment() -> jinja2.Environment:
 
 
 def part(name: str, *values: object) -> Markup:
-    """A macro of parts.html, rendered."""
+    """Render a macro of parts.html."""
     return getattr(_environment().get_template("parts.html").module, name)(*values)
 
 
 def source(name: str) -> str:
-    """A file of the templates as it is."""
+    """Return a file of the templates as it is."""
     folder = importlib.resources.files("rcirl_jax.report") / "templates"
     return (folder / name).read_text(encoding="utf-8")
 

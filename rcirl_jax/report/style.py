@@ -1,5 +1,6 @@
 """One look for all pictures: colour-blind safe colours, names, sizes."""
 
+import dataclasses
 import io
 import re
 import sys
@@ -31,8 +32,30 @@ CLASS_COLOURS = {
 }
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Look:
+    """How one driver or reward is drawn everywhere in a page."""
+
+    colour: str
+    dash: tuple[int, ...]  # px on, px off; empty: solid
+
+
+LOOKS = (
+    Look(colour=CHOSEN, dash=()),
+    Look(colour=CLASS_COLOURS["follow"], dash=(7, 4)),
+    Look(colour=CLASS_COLOURS["overtake"], dash=(2, 3)),
+    Look(colour=CLASS_COLOURS["virtual"], dash=(9, 3, 2, 3)),
+)
+HUMAN_LOOK = Look(colour=HUMAN, dash=(2, 2))
+
+
+def style_of(look: Look) -> dict:
+    """Return the look as matplotlib's arguments."""
+    return {"color": look.colour, "linestyle": (0, look.dash) if look.dash else "-"}
+
+
 def figure(rows: int, columns: int, width: float, height: float) -> tuple:
-    """A figure and its axes (2-D array), with quiet grids."""
+    """Return a figure and its axes (2-D array), with quiet grids."""
     made, axes = plt.subplots(
         rows, columns, figsize=(width, height), squeeze=False, layout="constrained"
     )
@@ -43,7 +66,7 @@ def figure(rows: int, columns: int, width: float, height: float) -> tuple:
 
 
 def label(axis: Axes, title: str, x: str, y: str) -> None:
-    """Title and axis labels with units."""
+    """Set title and axis labels with units."""
     axis.set_title(title, fontsize=10, loc="left")
     axis.set_xlabel(x, fontsize=9)
     axis.set_ylabel(y, fontsize=9)
@@ -60,7 +83,7 @@ def save(made: Figure, path: Path) -> Path:
 
 
 def svg(made: Figure, name: str) -> Markup:
-    """The figure as inline SVG, and free it.
+    """Return the figure as inline SVG, and free it.
 
     Black takes the colour of the page's text. Ids are those that the drawing refers to,
     with its name before, so that several drawings stand in one page.

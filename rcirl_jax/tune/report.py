@@ -11,7 +11,7 @@ from rcirl_jax.evaluation.ranking.table import from_json
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.export.sweep.folder import SWEEP
 from rcirl_jax.export.sweep.result import read_sweep
-from rcirl_jax.report.player.replays import Replay, make_replays
+from rcirl_jax.report.replays import Replay, make_replays
 from rcirl_jax.runtime.atomic_files import read_json
 from rcirl_jax.runtime.pipeline import file_sha256
 from rcirl_jax.simulation.recorded.scenes import held_out
@@ -53,7 +53,7 @@ def _draw(
     sources: Sequence[Dataset],
 ) -> None:
     # of the extra [report], without which all before it can be done
-    from rcirl_jax.report.tuning.page import TuningReport, write_tuning_page
+    from rcirl_jax.report.tuning_page import TuningReport, write_tuning_page
 
     _, incumbent = suite_job(run)
     judged = verdict()

@@ -18,7 +18,7 @@ from rcirl_jax.errors import InputError, as_input_error
 from rcirl_jax.export.sweep.folder import SWEEP
 from rcirl_jax.export.sweep.result import read_sweep
 from rcirl_jax.features import mapping
-from rcirl_jax.report.ranking.sweep_picture import sweep_picture
+from rcirl_jax.report.charts import sweep_picture
 from rcirl_jax.runtime import pipeline
 
 LOGS, OTHERS = 16, 60  # inputs of a whole log, and of other readers

@@ -28,7 +28,7 @@ FORKING = """
 import gc, json, os, runpy, shutil, sys
 import matplotlib.pyplot
 import rcirl_jax.evaluation.ranking.evaluate, rcirl_jax.evaluation.ranking.learners
-import rcirl_jax.report.ranking.intervals, rcirl_jax.simulation.suite
+import rcirl_jax.report.charts, rcirl_jax.simulation.suite
 
 gc.freeze()
 for line in sys.stdin:

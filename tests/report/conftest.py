@@ -5,9 +5,9 @@ import dataclasses
 import pytest
 
 from rcirl_jax.data.store.joined import JoinedDatasets
-from rcirl_jax.report.player.replays import make_replays
-from rcirl_jax.report.tuning import page as tuning_page
-from rcirl_jax.report.tuning.page import write_tuning_page
+from rcirl_jax.report import tuning_page
+from rcirl_jax.report.replays import make_replays
+from rcirl_jax.report.tuning_page import write_tuning_page
 from tests.report.test_data_page import HOSTILE
 from tests.report.tuning_case import PLAYED, cheap_rows, small_cases
 from tests.report.tuning_case import small_report as build

@@ -11,7 +11,7 @@ from rcirl_jax.data.importing import import_parts
 from rcirl_jax.data.scenes.filters import REASONS
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
-from rcirl_jax.report.data.page import TAG_NAMES, choose_rows, write_data_page
+from rcirl_jax.report.data_page import TAG_NAMES, choose_rows, write_data_page
 from rcirl_jax.types import Tag
 from tests.data.small_logs import CONFIG, write_logs
 from tests.helpers.commands import refused, succeeded

@@ -7,7 +7,7 @@ import types
 import numpy as np
 import pytest
 
-from rcirl_jax.report.player.drive import plan_start, road_in_plane, worst_step
+from rcirl_jax.report.replays import plan_start, road_in_plane, worst_step
 from rcirl_jax.simulation.cases import STEP_S
 from rcirl_jax.units import TIMES_S
 from tests.helpers.commands import succeeded

@@ -6,8 +6,8 @@ import pytest
 from matplotlib import pyplot
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.report.data import scene_picture
-from rcirl_jax.report.data.scene_picture import draw_scene
+from rcirl_jax.report import scene as scene_module
+from rcirl_jax.report.scene import draw_scene
 from rcirl_jax.types import Decision, Kind
 from rcirl_jax.units import TIMES_S
 from tests.helpers import scenes
@@ -39,7 +39,7 @@ def scene(**changes):
 def drawn(tmp_path, monkeypatch):
     """The figure of a scene, before it is saved."""
     kept = []
-    monkeypatch.setattr(scene_picture, "save", lambda made, _: kept.append(made))
+    monkeypatch.setattr(scene_module, "save", lambda made, _: kept.append(made))
     yield lambda rows: (draw_scene(tmp_path / "a.png", rows, 7), kept[-1])[1]
     for made in kept:
         pyplot.close(made)

@@ -15,7 +15,7 @@ from rcirl_jax.evaluation.ranking.table import build_report
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.planner.rank import constant_speed_policy, idm_policy
-from rcirl_jax.report.tuning.page import TuningReport
+from rcirl_jax.report.tuning_page import TuningReport
 from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics
 from rcirl_jax.simulation.rows import Row
 from rcirl_jax.simulation.suite import catalogue_set, suite_refs

@@ -7,7 +7,7 @@ import pytest
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.from_run import last_metrics
-from rcirl_jax.report.ranking.frames import draw_training
+from rcirl_jax.report.frames import draw_training
 from rcirl_jax.train.metrics import MetricsWriter, pairs_won, read_metrics
 
 WHOLE = {"loss": 0.5, "pair_accuracy": 0.75, "pairs": 4.0, "queries_per_s": 1.0}

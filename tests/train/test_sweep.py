@@ -27,7 +27,7 @@ from rcirl_jax.export.loading import compiled_scorer, open_reward
 from rcirl_jax.export.sweep import run as folders
 from rcirl_jax.export.sweep.result import table
 from rcirl_jax.export.sweep.run import run_sweep
-from rcirl_jax.report.ranking.sweep_picture import sweep_picture
+from rcirl_jax.report.charts import sweep_picture
 from rcirl_jax.reward import RewardConfig
 from rcirl_jax.runtime.executors import Here, Processes
 from rcirl_jax.runtime.pipeline import only_one

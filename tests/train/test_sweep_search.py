@@ -13,7 +13,7 @@ from rcirl_jax.export.sweep.choice import Found
 from rcirl_jax.export.sweep.result import read_sweep, table
 from rcirl_jax.export.sweep.run import run_sweep
 from rcirl_jax.export.sweep.search import ROUND, searched
-from rcirl_jax.report.ranking.sweep_picture import sweep_picture
+from rcirl_jax.report.charts import sweep_picture
 from rcirl_jax.runtime.executors import Here
 from tests.helpers.commands import refused
 from tests.train.test_sweep import MADE_BY, config_of, data, untimed

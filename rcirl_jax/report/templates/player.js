@@ -1,5 +1,5 @@
 // Plays the drives of a case side by side: bird's eye and station-time graph.
-// Data: the JSON of `report.player.player`: replays, each drive with its `look`, and colours.
+// Data: the JSON of `report.player`: replays, each drive with its `look`, and colours.
 // `report.pages` puts drawing.js, this file and cases.js into one strict function.
 const at = (id) => document.getElementById(id);
 const root = at("player");

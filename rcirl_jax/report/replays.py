@@ -14,7 +14,6 @@ import tqdm
 from numpy.typing import ArrayLike
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.report.player.drive import plan_start, road_in_plane, worst_step
 from rcirl_jax.simulation.cases import (
     ROAD_STEP_M,
     STEP_S,
@@ -140,7 +139,7 @@ def make_replays(
 def thin(
     row: str, case: Case, metrics: CaseMetrics, record: Record, shot: Snapshot
 ) -> Drive:
-    """One drive's frames; unbatched numpy leaves, record and snapshots [S]."""
+    """Thin one drive to frames; unbatched numpy leaves, record and snapshots [S]."""
     last = int(np.flatnonzero(record.valid)[-1])
     steps = np.arange(FRAME_STEPS - 1, last + FRAME_STEPS, FRAME_STEPS)
     steps = np.minimum(steps, last)  # the end is a frame
@@ -175,7 +174,7 @@ def _rounded(values: ArrayLike, digits: int) -> list[float]:
 
 
 def _plan(record: Record, shot: Snapshot, step: int) -> list[float]:
-    """Stations of the plan in force, beyond the ego's, while the plan lasts."""
+    """Return stations of the plan in force, beyond the ego's, while it lasts."""
     now = (step + 1) * STEP_S
     ahead = now + PLAN_AHEAD_S - plan_start(record, shot, step)
     ahead = ahead[ahead <= TIMES_S[-1]]
@@ -184,7 +183,7 @@ def _plan(record: Record, shot: Snapshot, step: int) -> list[float]:
 
 
 def _agents(case: Case, record: Record, shot: Snapshot, step: int) -> list[float]:
-    """Who is there; whom the ego has hit since the last frame is shown once more."""
+    """Return who is there, once more whom the ego has hit since the last frame."""
     agents = shot.agents
     before = max(step - FRAME_STEPS, 0)
     present = np.asarray(agents.present[step], bool)
@@ -207,7 +206,7 @@ def _agents(case: Case, record: Record, shot: Snapshot, step: int) -> list[float
 def _events(
     case: Case, record: Record, last: int
 ) -> tuple[list[tuple[float, str]], float]:
-    """What happened and when, and the moment to look at first."""
+    """Return what happened and when, and the moment to look at first."""
     time = lambda step: round((int(step) + 1) * STEP_S, 1)  # noqa: E731
     found = []
     for name, happens in (
@@ -231,8 +230,38 @@ def _events(
     return sorted(found), start
 
 
+def worst_step(record: Record) -> int:
+    """Return the step to look at: an at-fault crash, a crash, the least clearance.
+
+    Without anybody near it is the hardest braking.
+    """
+    valid = np.asarray(record.valid, bool)
+    for hits in (record.at_fault, record.collision):
+        found = np.flatnonzero(valid & (np.asarray(hits) > 0))
+        if found.size:
+            return int(found[0])
+    clearance = np.where(valid, np.asarray(record.clearance), np.inf)
+    if np.isfinite(clearance).any():
+        return int(np.argmin(clearance))
+    return int(np.argmin(np.where(valid, np.asarray(record.a), np.inf)))
+
+
+def plan_start(record: Record, snapshot: Snapshot, step: int) -> float:
+    """Return the time [s] at which the plan in force at a step was made.
+
+    A held plan repeats; it begins where the ego was when it was made.
+    """
+    plans, s = np.asarray(snapshot.plan_s), np.append(0.0, np.asarray(record.s))
+    k = step
+    while k > 0 and abs(s[k] - plans[step, 0]) > 1e-3:
+        if not np.array_equal(plans[k - 1], plans[step]):
+            break
+        k -= 1
+    return k * STEP_S
+
+
 def broken_bounds(found: CaseMetrics) -> list[str]:
-    """What a drive breaks, in words; leaves are scalars, or [6] per column."""
+    """Return what a drive breaks, in words; leaves are scalars, or [6] per column."""
     broken = [
         words
         for words, holds in zip(BROKEN, found.holds, strict=True)
@@ -242,8 +271,24 @@ def broken_bounds(found: CaseMetrics) -> list[str]:
     return broken + [words for words, count in lines.items() if count > 0]
 
 
+def _broken_words(found: CaseMetrics) -> str:
+    return ", ".join(broken_bounds(found)) or "all bounds hold, no line run"
+
+
+def goes_as(drive: Drive, found: CaseMetrics) -> bool:
+    """Return whether a drive breaks the bounds that `found` breaks."""
+    return drive.summary.endswith(f", {_broken_words(found)}")
+
+
+def _summary(found: CaseMetrics) -> str:
+    """Return the drive's own numbers in one line."""
+    gap = float(found.min_clearance)
+    near = f"closest {max(gap, 0.0):.1f} m" if np.isfinite(gap) else "nobody near"
+    return f"{float(found.progress):.0f} m driven, {near}, {_broken_words(found)}"
+
+
 def _apart(drives: Sequence[Drive]) -> float | None:
-    """When the first two drives are `APART_M` or `APART_MPS` apart, or one ends."""
+    """Return when the first two drives are `APART_M` or `APART_MPS` apart."""
     if len(drives) < 2:
         return None
     one, two = drives[:2]
@@ -255,26 +300,10 @@ def _apart(drives: Sequence[Drive]) -> float | None:
     return None if len(one.s) == len(two.s) else one.t[count - 1]
 
 
-def _summary(found: CaseMetrics) -> str:
-    """The drive's own numbers in one line."""
-    gap = float(found.min_clearance)
-    near = f"closest {max(gap, 0.0):.1f} m" if np.isfinite(gap) else "nobody near"
-    return f"{float(found.progress):.0f} m driven, {near}, {_broken_words(found)}"
-
-
-def _broken_words(found: CaseMetrics) -> str:
-    return ", ".join(broken_bounds(found)) or "all bounds hold, no line run"
-
-
-def goes_as(drive: Drive, found: CaseMetrics) -> bool:
-    """Whether a drive breaks the bounds that it broke when `found` was measured."""
-    return drive.summary.endswith(f", {_broken_words(found)}")
-
-
 def _replay(
     name: str, cases: CaseSet, place: int, case: Case, drives: tuple[Drive, ...]
 ) -> Replay:
-    """The case's road up to where the drives have looked."""
+    """Return a case and its road up to where the drives have looked."""
     road = case.road
     reach = max(max(drive.s) for drive in drives) + AHEAD_M
     count = min(int(reach / ROAD_STEP_M) + 2, len(road.kappa))
@@ -309,3 +338,18 @@ def _replay(
         },
         drives=drives,
     )
+
+
+def road_in_plane(kappa: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return (x, y, heading) [R] of the reference line from its curvature [R] 1/m.
+
+    heading' = kappa, x' = cos(heading), y' = sin(heading); trapezoids on the
+    ROAD_STEP_M grid, chords at the mean heading.
+    """
+    kappa = np.asarray(kappa, np.float64)
+    turn = 0.5 * (kappa[1:] + kappa[:-1]) * ROAD_STEP_M
+    heading = np.append(0.0, np.cumsum(turn))
+    chord = ROAD_STEP_M * np.sinc(0.5 * turn / np.pi)
+    middle = heading[:-1] + 0.5 * turn
+    x = np.append(0.0, np.cumsum(chord * np.cos(middle)))
+    return x, np.append(0.0, np.cumsum(chord * np.sin(middle))), heading

@@ -6,30 +6,38 @@ decision; numbers are the slots of `Obstacles`, so that a box, its boundary on
 the graph and the row of the array can be told to be the same.
 """
 
+import dataclasses
 import itertools
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
+import jax
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import MaxNLocator
 
-from rcirl_jax.report.data.scene_view import (
-    KIND_WORDS,
-    LINE_KINDS,
-    View,
-    spoken,
-    tag_names,
-    view_of,
-)
+from rcirl_jax.data.scenes.manoeuvres import blocking
+from rcirl_jax.errors import InputError
 from rcirl_jax.report.style import CANDIDATE, CHOSEN, CLASS_COLOURS, HUMAN, label, save
 from rcirl_jax.report.style import plt as pyplot
-from rcirl_jax.types import Decision, Demonstration, Kind
+from rcirl_jax.types import Decision, Demonstration, Kind, Tag
 from rcirl_jax.units import DT_S, HORIZON_S, STATION_STEP_M, TIMES_S
 
+KIND_WORDS = {
+    Kind.VEHICLE: "vehicle",
+    Kind.CYCLIST: "cyclist",
+    Kind.PEDESTRIAN: "pedestrian",
+    Kind.STATIC: "standing object",
+    Kind.STOP: "stop line",
+    Kind.VIRTUAL: "destination",
+}
+LINE_KINDS = (Kind.STOP, Kind.VIRTUAL)
+BEHIND_M = (12.0, 40.0)  # m behind the ego, at least and at most
+AHEAD_M, SPARE_M = 15.0, 40.0  # m beyond the human's end; more for the ignored
+LEAST_VIEW_M = 60.0  # m of road that is shown at least
 DECISION_COLOURS = {
     Decision.FOLLOW: CLASS_COLOURS["follow"],
     Decision.YIELD: CLASS_COLOURS["virtual"],
@@ -53,8 +61,138 @@ SHORT_CHARS = 2  # letters of a slot number alone
 LEGEND_CHARS = 84  # letters in a line of the legend
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class View:
+    """One scene as numpy arrays, and the window that is drawn."""
+
+    rows: Demonstration
+    blocks: np.ndarray  # [N, T] bool, in the driver's path
+    slots: list[int]  # filled slots that are known at some time
+    low: float  # m, lowest station drawn
+    high: float  # m, highest
+
+    def first(self, slot: int) -> int:
+        """Index of the first time at which the slot is known."""
+        return int(np.argmax(self.rows.scene.obstacles.valid[slot]))
+
+    def decision(self, slot: int) -> Decision:
+        """The label of the slot."""
+        return Decision(int(self.rows.decisions[slot]))
+
+    def kind(self, slot: int) -> Kind:
+        """What is in the slot."""
+        return Kind(int(self.rows.scene.obstacles.kind[slot]))
+
+    def inside(self, slot: int) -> bool:
+        """Whether the first box, or a line, lies in the window."""
+        at, obstacles = self.first(slot), self.rows.scene.obstacles
+        ends = obstacles.s_lower[slot, at], obstacles.s_upper[slot, at]
+        return bool(ends[1] >= self.low and ends[0] <= self.high)
+
+
+def tag_names(demonstration: Demonstration) -> list[str]:
+    """Return the scene's tags in their order, lower case, as in the manifest."""
+    tags = np.asarray(demonstration.scene.tags)
+    return [tag.name.lower() for tag in Tag if bool(tags[tag])]
+
+
+def spoken(name: str) -> str:
+    """Return a name of a tag, a decision or a reason as words."""
+    return name.replace("_", " ").lower()
+
+
+def describe_scene(demonstration: Demonstration, row: int) -> str:
+    """Describe the scene in words, for those who do not see its picture."""
+    view = view_of(demonstration, row)
+    human, valid = view.rows.human, view.rows.scene.time_valid
+    words = [
+        f"Scene {row}, {', '.join(map(spoken, tag_names(view.rows))) or 'no tag'}: "
+        f"the human drives {float(human.s[valid][-1]):.0f} m in "
+        f"{float(TIMES_S[valid][-1]):.1f} s, from {float(human.v[0]):.1f} to "
+        f"{float(human.v[valid][-1]):.1f} m/s."
+    ]
+    ignored = 0
+    for slot in view.slots:
+        if view.decision(slot) == Decision.IGNORE:
+            ignored += 1
+        else:
+            name = spoken(view.decision(slot).name)
+            words.append(f"{_place(view, slot)}: {name}.")
+    words.append(f"{ignored} ignored." if ignored else "Nothing is ignored.")
+    return " ".join(words)
+
+
+def _place(view: View, slot: int) -> str:
+    """Return kind and place of an obstacle when it is first known."""
+    obstacles, at = view.rows.scene.obstacles, view.first(slot)
+    s = 0.5 * float(obstacles.s_lower[slot, at] + obstacles.s_upper[slot, at])
+    where = f"{abs(s):.0f} m {'ahead' if s >= 0.0 else 'behind'}"
+    if view.kind(slot) not in LINE_KINDS:
+        l = 0.5 * float(obstacles.l_lower[slot, at] + obstacles.l_upper[slot, at])
+        aside = l - float(view.rows.scene.ego.l)
+        if abs(aside) > 1.0:
+            where += f", {abs(aside):.0f} m to the {'left' if aside > 0 else 'right'}"
+    when = f" at {TIMES_S[at]:.1f} s" if at else ""
+    return f"{KIND_WORDS[view.kind(slot)].capitalize()} {slot}, {where}{when}"
+
+
+def view_of(demonstration: Demonstration, row: int) -> View:
+    """Return numpy arrays of an unbatched demonstration and what to show of it.
+
+    Args:
+      demonstration: unbatched.
+      row: its number in the dataset, for messages.
+
+    Raises:
+      InputError: it holds numbers that are not finite, or no valid time.
+    """
+    rows = jax.tree.map(np.asarray, demonstration)
+    _check(rows, row)
+    scene, obstacles = rows.scene, rows.scene.obstacles
+    known = (obstacles.kind != Kind.NONE) & obstacles.valid.any(axis=1)
+    flat = {f"obstacles.{k}": v for k, v in vars(obstacles).items()}
+    flat |= {"path.l": scene.path.l, "ego.width": scene.ego.width}
+    slots = np.flatnonzero(known).tolist()
+    low, high = _window(rows, slots)
+    return View(rows=rows, blocks=blocking(flat), slots=slots, low=low, high=high)
+
+
+def _check(rows: Demonstration, row: int) -> None:
+    """Refuse in one line what cannot be drawn."""
+    valid, obstacles = rows.scene.time_valid, rows.scene.obstacles
+    if valid.ndim != 1 or not valid.any():
+        raise InputError(
+            f"scene {row}: time_valid: {int(valid.sum())} valid times of shape "
+            f"{valid.shape}: expected one scene with at least one"
+        )
+    used = {f"human.{n}": getattr(rows.human, n)[valid] for n in "slva"}
+    known = obstacles.valid & (obstacles.kind != Kind.NONE)[:, None]
+    for name in ("s_lower", "s_upper", "l_lower", "l_upper"):
+        used[f"obstacles.{name}"] = getattr(obstacles, name)[known]
+    used |= {f"path.{name}": leaf for name, leaf in vars(rows.scene.path).items()}
+    for name, values in used.items():
+        if not np.isfinite(values).all():
+            raise InputError(f"scene {row}: {name}: not finite: expected numbers")
+
+
+def _window(rows: Demonstration, slots: Sequence[int]) -> tuple[float, float]:
+    """Return stations to draw: the human's way, all that mattered, what fits."""
+    obstacles = rows.scene.obstacles
+    first = np.argmax(obstacles.valid, axis=1)
+    number = np.arange(first.size)
+    rear, front = obstacles.s_lower[number, first], obstacles.s_upper[number, first]
+    matters = [k for k in slots if rows.decisions[k] != Decision.IGNORE]
+    end = float(rows.human.s[rows.scene.time_valid].max())
+    behind = min([0.0, *(float(rear[k]) - 3.0 for k in slots)])
+    low = -min(max(-behind, BEHIND_M[0]), BEHIND_M[1])
+    low = min([low, *(float(rear[k]) - 3.0 for k in matters)])
+    high = max([end + AHEAD_M, *(float(front[k]) + 5.0 for k in matters)])
+    others = max([high, *(float(front[k]) + 5.0 for k in slots)])
+    return low, max(min(others, high + SPARE_M), low + LEAST_VIEW_M)
+
+
 def draw_scene(path: Path, demonstration: Demonstration, row: int) -> Path:
-    """PNG of one scene.
+    """Draw one scene.
 
     Args:
       path: PNG to write.
@@ -94,7 +232,7 @@ def draw_scene(path: Path, demonstration: Demonstration, row: int) -> Path:
 
 
 def _heading(view: View, row: int) -> list[str]:
-    """Tags, speed, limit, bend and length of the recording."""
+    """Return tags, speed, limit, bend and length of the recording."""
     scene, valid = view.rows.scene, view.rows.scene.time_valid
     tags = ", ".join(map(spoken, tag_names(view.rows))) or "no tag"
     facts = [
@@ -110,11 +248,8 @@ def _heading(view: View, row: int) -> list[str]:
     return [f"scene {row}: {tags}", ", ".join(facts)]
 
 
-# ------------------------------------------------------------------- from above
-
-
 def _draw_above(axis: Axes, view: View) -> None:
-    """Road, path, human, ego and all obstacles; station up, left is left."""
+    """Draw road, path, human, ego and all obstacles; station up, left is left."""
     rows, path = view.rows, view.rows.scene.path
     grid = np.arange(path.l.size) * STATION_STEP_M
     axis.set_facecolor(OFF_ROAD_COLOUR)
@@ -145,7 +280,7 @@ def _draw_above(axis: Axes, view: View) -> None:
 
 
 def _aside(view: View) -> tuple[float, float]:
-    """Lateral offsets at the left and right edge of the view from above."""
+    """Return the offsets at the left and right edge of the view from above."""
     path, obstacles = view.rows.scene.path, view.rows.scene.obstacles
     grid = np.arange(path.l.size) * STATION_STEP_M
     shown = (grid <= view.high) & (grid >= view.low)
@@ -160,7 +295,7 @@ def _aside(view: View) -> tuple[float, float]:
 
 
 def _draw_body(axis: Axes, view: View, slot: int) -> None:
-    """Box when first known, trail over all known times, number."""
+    """Draw the box when first known, the trail over all known times, the number."""
     obstacles, at = view.rows.scene.obstacles, view.first(slot)
     colour, valid = DECISION_COLOURS[view.decision(slot)], obstacles.valid[slot]
     low, high = obstacles.s_lower[slot], obstacles.s_upper[slot]
@@ -195,7 +330,7 @@ def _draw_body(axis: Axes, view: View, slot: int) -> None:
 
 
 def _draw_line(axis: Axes, view: View, slot: int) -> None:
-    """A stop line or the destination across the road."""
+    """Draw a stop line or the destination across the road."""
     path, at = view.rows.scene.path, view.first(slot)
     s = float(view.rows.scene.obstacles.s_lower[slot, at])
     if not view.inside(slot):
@@ -214,11 +349,8 @@ def _draw_line(axis: Axes, view: View, slot: int) -> None:
     )
 
 
-# ----------------------------------------------------------- station-time graph
-
-
 def _draw_graph(axis: Axes, view: View) -> None:
-    """The human's s(t) between the boundaries of what blocks the driver's path."""
+    """Draw the human's s(t) between the boundaries of what blocks the path."""
     rows, valid = view.rows, view.rows.scene.time_valid
     end = float(TIMES_S[valid][-1])
     if end < HORIZON_S - 0.5 * DT_S:
@@ -247,7 +379,7 @@ def _draw_graph(axis: Axes, view: View) -> None:
 
 
 def _draw_boundary(axis: Axes, view: View, slot: int, shown: np.ndarray) -> None:
-    """Bars at the times themselves, filled between neighbours."""
+    """Draw bars at the times themselves, filled between neighbours."""
     obstacles = view.rows.scene.obstacles
     colour = DECISION_COLOURS[view.decision(slot)]
     low, high = obstacles.s_lower[slot], obstacles.s_upper[slot]
@@ -271,7 +403,7 @@ def _label_boundary(
     shown: np.ndarray,
     taken: list[tuple[float, float, float]],
 ) -> None:
-    """Number and decision at the first place along the boundary that is free.
+    """Write number and decision at the first free place along the boundary.
 
     Args:
       axis: the graph.
@@ -298,11 +430,8 @@ def _label_boundary(
             return
 
 
-# ------------------------------------------------------------ signals and words
-
-
 def _draw_motion(speed: Axes, acceleration: Axes, view: View) -> None:
-    """The human's speed beside the limit, and acceleration."""
+    """Draw the human's speed beside the limit, and acceleration."""
     rows, valid = view.rows, view.rows.scene.time_valid
     human, path, t = rows.human, rows.scene.path, TIMES_S[valid]
     grid = np.arange(path.l.size) * STATION_STEP_M
@@ -322,7 +451,7 @@ def _draw_motion(speed: Axes, acceleration: Axes, view: View) -> None:
 
 
 def _legend(view: View) -> list[Patch | Line2D]:
-    """Lines, and one row per decision with the slots that it was made for."""
+    """Return lines, and one row per decision with the slots that it was made for."""
     rows: list[Patch | Line2D] = [
         Line2D([], [], color=HUMAN, marker="o", ms=3, label="human; box: ego at t = 0"),
         Line2D([], [], color=CHOSEN, ls=":", label="given path"),
@@ -344,7 +473,7 @@ def _legend(view: View) -> list[Patch | Line2D]:
 
 
 def _runs(slots: Sequence[int]) -> str:
-    """Numbers with runs joined: 0, 2 to 5."""
+    """Join runs of numbers: 0, 2 to 5."""
     parts = []
     for _, group in itertools.groupby(enumerate(slots), lambda pair: pair[1] - pair[0]):
         run = [slot for _, slot in group]

@@ -1,7 +1,8 @@
-"""The cases in which candidate and incumbent drive most differently."""
+"""The player of replays, and the table of cases that starts it."""
 
 import dataclasses
 from collections.abc import Sequence
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -9,14 +10,70 @@ import numpy as np
 from markupsafe import Markup
 
 from rcirl_jax.evaluation.closed_loop.files import SuiteRuns
-from rcirl_jax.report.pages import part
-from rcirl_jax.report.player.player import COLOURS, looks
-from rcirl_jax.report.player.replays import Replay, broken_bounds, goes_as
+from rcirl_jax.report.pages import Table, facts_text, part, write_page
+from rcirl_jax.report.replays import Replay, broken_bounds, goes_as
+from rcirl_jax.report.style import CANDIDATE, CLASS_COLOURS, HUMAN_LOOK, LOOKS, Look
 from rcirl_jax.simulation.catalogue.families import family_title
 from rcirl_jax.simulation.metrics import CaseMetrics, nuplan_score
+from rcirl_jax.simulation.rows import RECORDED_HUMAN
 
+SCRIPT = ("drawing.js", "player.js", "cases.js")
+COLOURS = {  # of whoever is met, and of stop lines
+    "vehicle": CLASS_COLOURS["other"],
+    "cyclist": CLASS_COLOURS["nudge"],
+    "pedestrian": CLASS_COLOURS["virtual"],
+    "static": CANDIDATE,
+    "stop": CLASS_COLOURS["stop"],
+    "open": CLASS_COLOURS["overtake"],
+}
 MOST = 300  # cases of a page
 BEHIND_M, AHEAD_M, BESIDE_M = 20.0, 60.0, 8.0  # m around the ego in a thumbnail
+
+
+def looks(rows: Sequence[str]) -> dict[str, Look]:
+    """Return how each row is drawn; the order of the learned rows decides."""
+    driven = [name for name in rows if name != RECORDED_HUMAN]
+    found = {name: LOOKS[i % len(LOOKS)] for i, name in enumerate(driven)}
+    return {name: found.get(name, HUMAN_LOOK) for name in rows}
+
+
+def player_data(replays: Sequence[Replay]) -> dict:
+    """Return the variable `replays` of player.html."""
+    met = {kind for one in replays for kind, _, _ in one.bodies.values()}
+    return {
+        "cases": [_case(one) for one in replays],
+        "colours": COLOURS,
+        "legend": [(kind, colour) for kind, colour in COLOURS.items() if kind in met],
+    }
+
+
+def _case(replay: Replay) -> dict:
+    how = looks([drive.row for drive in replay.drives])
+    body = dataclasses.asdict(replay)
+    for drive in body["drives"]:
+        drive["look"] = dataclasses.asdict(how[drive["row"]])
+    return body
+
+
+def write_replay_page(path: Path, replay: Replay, facts: dict[str, object]) -> Path:
+    """Write one HTML file of a case's drives; it needs no other file.
+
+    Args:
+      path: HTML to write.
+      replay: of `make_replays`.
+      facts: what made the page: commit, versions, flags.
+    """
+    drivers = ", ".join(drive.row for drive in replay.drives)
+    rows = [(drive.row, drive.summary, drive.end) for drive in replay.drives]
+    return write_page(
+        path,
+        "replay.html",
+        SCRIPT,
+        title=f"{replay.case} driven by {drivers}",
+        replays=player_data([replay]),
+        drives=Table(caption="Drives", heads=("", "", ""), rows=rows),
+        facts=facts_text(facts),
+    )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -38,7 +95,7 @@ class CaseLine:
 def case_lines(
     runs: SuiteRuns, incumbent: str, replays: Sequence[Replay]
 ) -> list[CaseLine]:
-    """Cases that are played, then those that differ most; the worst first.
+    """Return cases that are played, then those that differ most; the worst first.
 
     Args:
       runs: the suite; its first row is the candidate.
@@ -83,7 +140,7 @@ def _drive(metrics: CaseMetrics, at: int) -> CaseMetrics:
 
 
 def thumbnail(replay: Replay) -> Markup:
-    """The candidate's moment to look at, from above, along the road, as a small SVG."""
+    """Draw the candidate's moment to look at from above, as a small SVG."""
     drive = replay.drives[0]
     frame = int(np.argmin(np.abs(np.asarray(drive.t) - drive.start)))
     here = drive.s[frame]
@@ -107,7 +164,7 @@ def thumbnail(replay: Replay) -> Markup:
 def _box(
     s: float, l: float, heading: float, length: float, width: float, colour: str
 ) -> dict:
-    """A body as the template draws it; y points to the right of the road."""
+    """Return a body as the template draws it; y points to the right of the road."""
     return {
         "x": round(s, 1),
         "y": round(-l, 1),

@@ -16,16 +16,15 @@ from rcirl_jax.data.quality import oddities
 from rcirl_jax.data.scenes.filters import REASONS
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.errors import InputError
-from rcirl_jax.report.data.scene_picture import draw_scene
-from rcirl_jax.report.data.scene_view import describe_scene, spoken, tag_names
 from rcirl_jax.report.pages import Table, facts_text, part, write_page
+from rcirl_jax.report.scene import describe_scene, draw_scene, spoken, tag_names
 from rcirl_jax.types import Tag
 
 TAG_NAMES = tuple(tag.name.lower() for tag in Tag)
 
 
 def choose_rows(tags: np.ndarray, count: int, wanted: Sequence[str] = ()) -> list[int]:
-    """Rows worth looking at: every tag in turn, spread over the dataset.
+    """Choose rows worth looking at: every tag in turn, spread over the dataset.
 
     Args:
       tags: [n, len(Tag)] bool, of all rows.
@@ -58,7 +57,7 @@ def choose_rows(tags: np.ndarray, count: int, wanted: Sequence[str] = ()) -> lis
 
 
 def _spread(rows: np.ndarray) -> list[int]:
-    """The rows so that each prefix is spread over all of them (bit reversal)."""
+    """Order rows so that each prefix is spread over all of them (bit reversal)."""
     bits = max(int(rows.size - 1).bit_length(), 1)
     order = [int(f"{number:0{bits}b}"[::-1], 2) for number in range(2**bits)]
     return [int(rows[at]) for at in order if at < rows.size]
@@ -118,7 +117,7 @@ def write_data_page(
 
 
 def _scenes(folder: Path, dataset: Dataset, rows: Sequence[int]) -> list[dict]:
-    """Each row drawn, with its tags and words."""
+    """Draw each row; return it with its tags and words."""
     manifest, loaded = dataset.manifest, dataset.read(np.asarray(rows, np.int64))
     found = []
     for place, row in enumerate(tqdm.tqdm(rows, desc="draw", unit=" scenes")):

@@ -1,24 +1,64 @@
-"""What a comparison takes from the folder of a tuning run: settings and numbers."""
+"""Several tuning runs on one page: settings that differ, numbers side by side."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import msgspec
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.exact import clopper_pearson
+from rcirl_jax.evaluation.exact import CONFIDENCE, clopper_pearson
 from rcirl_jax.evaluation.gate.types import CANDIDATE
+from rcirl_jax.report.charts import Interval, interval_axis, interval_cell
+from rcirl_jax.report.pages import Table, facts_text, interval, write_page
+from rcirl_jax.report.tuning_page import DECISIONS
 from rcirl_jax.runtime.atomic_files import read_json
 from rcirl_jax.runtime.checked import checked
 from rcirl_jax.runtime.pipeline import Stages
 from rcirl_jax.runtime.settings import leaves
 
-Interval = tuple[float, float, float]  # value, low, high
 RUN = "a folder of `rcirl autotune`, finished up to its verdict"
 HEX = 12  # digits of a hash that are shown
 # flags that say where a run was made, not what it is
 PLACES = ("output", "workdir", "run", "executor", "workers", "ray_address", "trackers")
+ALWAYS = ("recipe", "data, sha256", "commit")  # settings shown also where all agree
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Metric:
+    """How a number is shown."""
+
+    title: str
+    unit: str
+    scale: float = 1.0
+    digits: int = 1
+    signed: bool = False
+
+
+METRICS = {
+    "nuplan": Metric(
+        title="nuPlan's score, more is better", unit="points", scale=100.0
+    ),
+    "jerk": Metric(
+        title="Drives with raw |jerk| below 6 m/s³, more is better", unit="%",
+        scale=100.0,
+    ),
+    "progress": Metric(
+        title="Progress against the incumbent, more is better", unit="%",
+        scale=100.0, signed=True,
+    ),
+    "at_fault": Metric(
+        title="Cases with an at-fault collision, less is better", unit="%",
+        scale=100.0, digits=2,
+    ),
+    "distance": Metric(
+        title="Distance to the human on held-out drives, less is better", unit="m",
+        digits=2,
+    ),
+    "top1": Metric(
+        title="Top-1 distance on held-out scenes, less is better", unit="m", digits=2
+    ),
+}  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -78,7 +118,7 @@ class _Estimate(msgspec.Struct):
 
 
 def read_run(folder: Path) -> ComparedRun:
-    """The run in a folder.
+    """Read the run in a folder.
 
     Raises:
       InputError: it is no run, or has no verdict yet.
@@ -105,7 +145,7 @@ def read_run(folder: Path) -> ComparedRun:
 
 
 def _settings(stages: Mapping[str, dict], verdict: _Verdict) -> dict[str, str]:
-    """Recipe, data and commit first; then training, rehearsal, gate and other flags.
+    """Return recipe, data, commit; then training, simulated demonstrations, gate.
 
     A flag that says what the training's settings say too is left out.
     """
@@ -123,11 +163,13 @@ def _settings(stages: Mapping[str, dict], verdict: _Verdict) -> dict[str, str]:
         "incumbent": (gate.get("inputs") or {}).get("incumbent"),
         "cases": verdict.cases,
         "training runs": sum(name.startswith("train ") for name in stages),
-        "prior_cost": str(inputs.get("prior_cost", ""))[:HEX],
+        "prior cost": str(inputs.get("prior_cost", ""))[:HEX],
     }
     found |= _flat(inputs.get("config"), "training")
     rehearsal = (stages.get("rehearse 0", {}).get("inputs") or {}).get("rehearsal")
-    found |= _flat(rehearsal, "rehearsal") | _flat(verdict.config, "gate")
+    found |= _flat(rehearsal, "simulated demonstrations") | _flat(
+        verdict.config, "gate"
+    )
     said = {name.rpartition(": ")[2].rpartition(".")[2] for name in found}
     of_gate = {f"{name}_margin" for name in verdict.config}
     found |= {
@@ -140,20 +182,20 @@ def _settings(stages: Mapping[str, dict], verdict: _Verdict) -> dict[str, str]:
 
 
 def _flat(tree: object, name: str) -> dict[str, object]:
-    """Leaves of nested settings, by "name: field.field"; {} where there are none."""
+    """Return leaves of nested settings, by "name: field.field"."""
     found = leaves(tree) if isinstance(tree, Mapping) else {}
     return {f"{name}: {n}": x for n, x in found.items() if x is not None}
 
 
 def _said(value: object) -> str:
-    """A setting as text; "–" where it is none."""
+    """Return a setting as text; "–" where it is none."""
     if isinstance(value, list | tuple):
         value = ", ".join(map(str, value))
     return "–" if value is None or value == "" else str(value)
 
 
 def _of_verdict(verdict: _Verdict) -> dict[str, Interval]:
-    """Progress against the incumbent, as the report's card has it."""
+    """Return progress against the incumbent, as the report's card has it."""
     for kind in ("gain", "no loss"):
         for one in verdict.checks:
             if (one.kind, one.name) == (kind, "progress") and one.measured:
@@ -162,7 +204,7 @@ def _of_verdict(verdict: _Verdict) -> dict[str, Interval]:
 
 
 def _of_suite(path: Path, cases: int) -> dict[str, Interval]:
-    """Closed-loop numbers of the candidate."""
+    """Return closed-loop numbers of the candidate."""
     if (found := _candidate(path, "report")) is None:
         return {}
     row = checked(found, _Row, f"{path}: {CANDIDATE}")
@@ -176,7 +218,7 @@ def _of_suite(path: Path, cases: int) -> dict[str, Interval]:
 
 
 def _of_row(path: Path, field: str, name: str) -> dict[str, Interval]:
-    """One number of the candidate's row."""
+    """Return one number of the candidate's row."""
     found = _candidate(path)
     if found is None or field not in found:
         return {}
@@ -186,10 +228,83 @@ def _of_row(path: Path, field: str, name: str) -> dict[str, Interval]:
 
 
 def _candidate(path: Path, *inside: str) -> dict | None:
-    """The candidate's row of a table in a file; None where nothing was measured."""
+    """Return the candidate's row of a table in a file; None if nothing was measured."""
     if not path.is_file():
         return None
     found = read_json(path, "a table of a run")
     for key in (*inside, "rows", CANDIDATE):
         found = found.get(key) if isinstance(found, dict) else None
     return found if isinstance(found, dict) else None
+
+
+def write_comparison(
+    path: Path, runs: Sequence[ComparedRun], facts: Mapping[str, object]
+) -> Path:
+    """Write the page.
+
+    Args:
+      path: HTML file.
+      runs: two or more, in the order in which they are shown.
+      facts: provenance of the page.
+    """
+    return write_page(
+        path,
+        "compare.html",
+        title=f"{len(runs)} tuning runs",
+        runs=[
+            {"run": run, "kind": DECISIONS.get(run.decision, "open")} for run in runs
+        ],
+        settings=settings_table(runs),
+        metrics=[metric_table(name, runs) for name in METRICS],
+        level=f"{100.0 * CONFIDENCE:g} %",
+        facts=facts_text(facts),
+        incumbents=len({run.incumbent for run in runs}),
+    )
+
+
+def settings_table(runs: Sequence[ComparedRun]) -> Table:
+    """Return settings that differ, and those of `ALWAYS`."""
+    names = dict.fromkeys(name for run in runs for name in run.settings)
+    rows, marked = [], []
+    for name in names:
+        cells = [run.settings.get(name, "–") for run in runs]
+        differs = len(set(cells)) > 1
+        if differs or name in ALWAYS:
+            rows.append((name, *cells))
+        if differs and name in ALWAYS:
+            marked.append(name)
+    heads = ("", *(run.name for run in runs))
+    return Table(
+        caption="Recipe, data, commit, and settings that differ",
+        heads=heads,
+        rows=rows,
+        kind="wrap",
+        marked=marked,
+    )
+
+
+def metric_table(name: str, runs: Sequence[ComparedRun]) -> Table:
+    """Return one number of all runs on one axis, with its intervals."""
+    how = METRICS[name]
+    found = {
+        run.name: tuple(how.scale * x for x in run.numbers[name])
+        for run in runs
+        if name in run.numbers
+    }
+    ends = (
+        min((x[1] for x in found.values()), default=0.0),
+        max((x[2] for x in found.values()), default=1.0),
+    )
+    rows: list[Sequence[object]] = []
+    if found:
+        rows.append(("", interval_axis(ends, how.digits, how.unit), ""))
+    for run in runs:
+        if run.name not in found:
+            rows.append((run.name, "", "not measured"))
+            continue
+        value, low, high = found[run.name]
+        words = interval((value, low, high), how.digits, signed=how.signed)
+        said = f"{run.name}: {words} {how.unit}"
+        cell = interval_cell((value, low, high), ends, said)
+        rows.append((run.name, cell, f"{words} {how.unit}"))
+    return Table(caption=how.title, heads=("", "", ""), rows=rows, kind="forest")

@@ -1,1 +1,0 @@
-"""Pictures and the page of an import: scenes as they were cut."""

@@ -1,1 +1,0 @@
-"""Cases driven again for the report, and the player that shows them."""

@@ -1,1 +1,0 @@
-"""Pictures of ranking results: intervals, frames, sweeps."""

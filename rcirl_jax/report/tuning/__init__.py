@@ -1,1 +1,0 @@
-"""The report of a tuning run: verdict, tables, features."""
