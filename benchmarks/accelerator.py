@@ -55,7 +55,7 @@ from rcirl_jax.train.loop import host_batch
 from rcirl_jax.train.parallel import Parallel, parallelise
 from rcirl_jax.train.state import TrainConfig, TrainState
 from rcirl_jax.train.step import gradient_sums, init_state, make_train_step
-from rcirl_jax.tune.recipes import load_recipe
+from rcirl_jax.tuning.recipes import load_recipe
 
 _DATA = flags.DEFINE_string("data", None, "dataset (default: synthetic traffic)")
 _SECONDS = flags.DEFINE_float("seconds", 480.0, "s for everything")

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import psutil
 
-from rcirl_jax.cli.flags.common import provenance
+from rcirl_jax.cli.running import provenance
 from rcirl_jax.data.formats import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.data.scenes.config import CollectConfig

@@ -16,12 +16,12 @@ from pathlib import Path
 from absl import flags
 
 from benchmarks.common import write
-from rcirl_jax.cli.flags.common import run
+from rcirl_jax.cli.running import run
 from rcirl_jax.data.cut import cut_item
 from rcirl_jax.data.parts import parts_of, recordings_of
 from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.data.scenes.config import CollectConfig
-from rcirl_jax.runtime.executors import Executor, Here, Processes
+from rcirl_jax.runtime.executors import Executor, Processes, Serial
 from rcirl_jax.runtime.specs import spec_root
 
 _DATA = flags.DEFINE_string("data", "../shared/data", "folder of the recordings")
@@ -84,7 +84,7 @@ def main() -> None:
         parsing = time.perf_counter() - begin
         states = sum(t.t.size for _, made in items for t in made.tracks)
         row = {"states": states, "parsing_s": parsing, "states_per_s": states / parsing}
-        row["one_process"], quality = rate(Here(), items, CollectConfig())
+        row["one_process"], quality = rate(Serial(), items, CollectConfig())
         there = Processes(_PROCESSES.value)
         row["processes"], again = rate(there, items, CollectConfig())
         assert quality == again

@@ -26,7 +26,7 @@ import numpy as np
 from absl import flags
 
 from benchmarks.common import dataset_or_synthetic, write
-from rcirl_jax.cli.flags.common import run
+from rcirl_jax.cli.running import run
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.features import feature_map

@@ -21,7 +21,7 @@ from absl import app, flags
 from PIL import Image
 
 from benchmarks.drawings import driven, ideas, numbers, recorded
-from rcirl_jax.cli.flags.common import provenance
+from rcirl_jax.cli.running import provenance
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.joined import open_datasets
 from rcirl_jax.export.loading import open_reward

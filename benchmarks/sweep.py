@@ -4,12 +4,12 @@
 
 Members are leaky rates x seeds of the paper's network on the same candidates, made
 once. Per round, in turn: all members in the chunks of a sweep; a few single runs by
-`fit` with one member, already compiled; and a few steps as experiments.train takes
+`fit` with one member, already compiled; and a few steps as `rcirl train` takes
 them, which make candidates and features anew in every step. Single runs are scaled
 to 64; compiling is reported apart. Medians over the rounds.
 
-Then as commands, as a user has them: `experiments.sweep`, which also chooses by
-held-out scenes and exports every member, and a few runs of `experiments.train`, each of
+Then as commands, as a user has them: `rcirl sweep`, which also chooses by
+held-out scenes and exports every member, and a few runs of `rcirl train`, each of
 which starts, compiles and trains. Run in turn, scaled to 64.
 """
 
@@ -64,15 +64,15 @@ def _grid(config: TrainConfig) -> list[Members]:
     return [jax.tree.map(lambda x, at=at: x[at : at + size], every) for at in starts]
 
 
-def _command(module: str, data: str, folder: Path, *flags_: str) -> float:
+def _command(name: str, data: str, folder: Path, *flags_: str) -> float:
     """Seconds of one command."""
-    words = [sys.executable, "-m", module, f"--data={data}", *flags_]
+    words = [sys.executable, "-m", "rcirl_jax", name, f"--data={data}", *flags_]
     words += ["--recipe=paper", "--positive=nearest", "--train_horizon=5"]
     words += ["--futures=predicted", f"--epochs={_EPOCHS.value}"]
     begin = time.perf_counter()
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise SystemExit(f"error: {module}: {done.stderr[-300:]}")
+        raise SystemExit(f"error: {name}: {done.stderr[-300:]}")
     shutil.rmtree(folder)
     return time.perf_counter() - begin
 
@@ -89,10 +89,10 @@ def _commands() -> dict:
         for number in range(_COMMANDS.value):
             folder = Path(name) / "sweep"
             grid = (f"--leaky_rates={rates}", f"--seeds={seeds}", f"--output={folder}")
-            taken["sweep"].append(_command("experiments.sweep", data, folder, *grid))
+            taken["sweep"].append(_command("sweep", data, folder, *grid))
             folder = Path(name) / "train"
             one = (f"--seed={number}", f"--output={folder}")
-            taken["train"].append(_command("experiments.train", data, folder, *one))
+            taken["train"].append(_command("train", data, folder, *one))
         scenes = int(open_dataset(data).indices("train").size)
     sweep, alone = (float(np.median(taken[name])) for name in ("sweep", "train"))
     return {

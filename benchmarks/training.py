@@ -40,7 +40,7 @@ from rcirl_jax.train.loop import host_batch
 from rcirl_jax.train.parallel import parallelise
 from rcirl_jax.train.state import Batch, FeatureBatch, TrainConfig, TrainState
 from rcirl_jax.train.step import gradient_sums, init_state, make_train_step
-from rcirl_jax.tune.recipes import load_recipe
+from rcirl_jax.tuning.recipes import load_recipe
 from rcirl_jax.types import Demonstration
 
 try:  # the baseline's extra; without it, one line from `main`

@@ -16,8 +16,8 @@ from pathlib import Path
 from absl import flags
 
 from experiments.known_drivers import made_rows, table, tallied, with_faults
-from rcirl_jax.cli.flags import margins
-from rcirl_jax.cli.flags.common import provenance, run
+from rcirl_jax.cli import flags as shared
+from rcirl_jax.cli.running import provenance, run
 from rcirl_jax.evaluation.closed_loop.files import runs_of
 from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, run_suite
 from rcirl_jax.runtime.atomic_files import write_json
@@ -30,6 +30,7 @@ _SEEDS = flags.DEFINE_integer(
 _SUITE = flags.DEFINE_string("suite", "full", "full, or families with commas")
 _CASES = flags.DEFINE_integer("cases", 10, "cases per family and seed, 1 or more")
 _DURATION = flags.DEFINE_float("duration", 30.0, "s per case, 1 to 120", 1.0, 120.0)
+_MARGINS = shared.margins()
 
 
 def main() -> None:
@@ -38,9 +39,7 @@ def main() -> None:
     refs = [ref for seed in range(seeds) for ref in suite_refs(*asked, seed)]
     cases = catalogue_set(refs, _DURATION.value)
     runs = with_faults(runs_of(run_suite(made_rows(), cases, SuiteConfig())))
-    config = dataclasses.replace(
-        margins.gate_config(), trivial_baselines=()
-    )  # for recordings
+    config = dataclasses.replace(_MARGINS(), trivial_baselines=())  # for recordings
     found = tallied(runs, seeds, config)
     body = {"cases": len(refs), "seeds": seeds, "kinds": found, "config": config}
     write_json(Path(_OUTPUT.value), {**body, "made_by": provenance()})

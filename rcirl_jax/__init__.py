@@ -10,18 +10,25 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from rcirl_jax.api.candidates import (
+    from rcirl_jax.api.runs import (
+        format_report,
+        gate,
+        import_logs,
+        rank,
+        read_logs,
+        simulate,
+        train_reward,
+        tune,
+    )
+    from rcirl_jax.api.scenes import (
         as_seen,
         candidates_from,
         compute_features,
+        feature_prices,
+        response_curves,
         sample_candidates,
         score_candidates,
     )
-    from rcirl_jax.api.evidence import format_report, gate, rank, simulate
-    from rcirl_jax.api.insight import feature_prices, response_curves
-    from rcirl_jax.api.learning import train_reward
-    from rcirl_jax.api.logs import import_logs, read_logs
-    from rcirl_jax.api.tuning import tune
     from rcirl_jax.data.store.dataset import open_dataset
     from rcirl_jax.errors import InputError
     from rcirl_jax.export.own_planner.builder import scene_from
@@ -58,21 +65,23 @@ __all__ = [
 
 # name -> the module that has it
 _PLACES = {
-    **dict.fromkeys(("read_logs", "import_logs"), "api.logs"),
-    "open_dataset": "data.store.dataset",
-    "scene_from": "export.own_planner.builder",
-    **dict.fromkeys(
-        ("Body", "Car", "CentreLine", "Signal"), "export.own_planner.inputs"
-    ),
-    **dict.fromkeys(("as_seen", "sample_candidates"), "api.candidates"),
-    **dict.fromkeys(("candidates_from", "compute_features"), "api.candidates"),
-    "score_candidates": "api.candidates",
-    "train_reward": "api.learning",
-    "tune": "api.tuning",
-    **dict.fromkeys(("Reward", "WeightsError", "load_weights"), "export.reader"),
-    **dict.fromkeys(("feature_prices", "response_curves"), "api.insight"),
-    **dict.fromkeys(("format_report", "gate", "rank", "simulate"), "api.evidence"),
-    "InputError": "errors",
+    name: place
+    for place, names in {
+        "api.runs": (
+            *("read_logs", "import_logs", "train_reward", "rank", "simulate", "gate"),
+            *("format_report", "tune"),
+        ),
+        "api.scenes": (
+            *("as_seen", "sample_candidates", "candidates_from", "compute_features"),
+            *("score_candidates", "response_curves", "feature_prices"),
+        ),
+        "data.store.dataset": ("open_dataset",),
+        "errors": ("InputError",),
+        "export.own_planner.builder": ("scene_from",),
+        "export.own_planner.inputs": ("Body", "Car", "CentreLine", "Signal"),
+        "export.reader": ("Reward", "WeightsError", "load_weights"),
+    }.items()
+    for name in names
 }
 
 

@@ -1,16 +1,16 @@
 """One error type for bad input: it reads as one clear line, never a traceback.
 
-Library code raises `InputError("FILE: field: value: what was expected")`; the
-commands turn it into that line on stderr and exit status 2.
+Library code raises `InputError("FILE: field: value: what was expected")`, or with the
+name of an argument in place of the file. The command line puts the flag's dashes before
+such a name and ends with that line and exit status 2. Any other exception is a fault of
+this package.
 """
 
 import contextlib
 import difflib
 import importlib
 import struct
-import traceback
 from collections.abc import Iterable, Iterator
-from pathlib import Path
 from types import ModuleType
 
 HEAD, TAIL = 1400, 400  # characters kept of the ends of a line too long
@@ -20,13 +20,24 @@ EXTRAS = {
     **dict.fromkeys(("defusedxml", "pyarrow", "pyproj", "shapely"), "logs"),
     "optuna": "optuna",
 }
+# what libraries raise of bytes and numbers that are not what they should be
+BAD_DATA = (
+    ArithmeticError,
+    EOFError,
+    MemoryError,
+    RecursionError,
+    ValueError,
+    struct.error,
+)
+# and what reading a damaged file as plain dicts and lists raises besides
+MALFORMED = (*BAD_DATA, AttributeError, LookupError, TypeError)
 
 
 class InputError(ValueError):
-    """Something the user gave is wrong: file, field, value, expectation.
+    """Something the user gave is wrong: file or argument, field, value, expectation.
 
-    The message is a single printable line. It names the file first, then the field
-    and the value that was found, then what was expected instead.
+    The message is a single printable line. It begins with the file or the argument,
+    then names the field and the value that was found, then what was expected instead.
     """
 
     def __init__(self, message: str) -> None:
@@ -40,23 +51,8 @@ class LostWorkError(InputError):
     """Work cannot go on (lost memory, nodes; too many names); what is done stays."""
 
 
-# what reading an unforeseen file may end in; anything else is a fault of ours
-UNFORESEEN = (
-    ArithmeticError,
-    AttributeError,
-    EOFError,
-    LookupError,
-    MemoryError,
-    RecursionError,
-    SystemError,
-    TypeError,
-    ValueError,
-    struct.error,
-)
-
-
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """The end of a line on an unknown name: the nearest known one, "" if none is near.
+    """Returns the end of a line on an unknown name: the nearest known one, or "".
 
     Args:
       name: what was given.
@@ -68,31 +64,32 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 @contextlib.contextmanager
 def as_input_error(what: str, expected: str) -> Iterator[None]:
-    """A last net: errors that no check foresaw become one line as well.
+    """Turns what libraries raise of bad data (`BAD_DATA`) into one line.
 
-    The line names the place in the code, for a report of the fault.
+    Any other exception is a bug: it passes, with a note on what was read.
 
     Args:
       what: file or recording that is read, first in the line.
       expected: what was expected of it.
 
     Raises:
-      InputError: from one of `UNFORESEEN`.
+      InputError: from one of `BAD_DATA`.
     """
     try:
         yield
     except InputError:
         raise
-    except UNFORESEEN as error:
-        place = traceback.extract_tb(error.__traceback__)[-1]
+    except BAD_DATA as error:
         raise InputError(
-            f"{what}: {type(error).__name__}: {str(error)[:200]} "
-            f"({Path(place.filename).name}:{place.lineno}): expected {expected}"
+            f"{what}: {type(error).__name__}: {str(error)[:200]}: expected {expected}"
         ) from error
+    except Exception as error:
+        error.add_note(f"while reading {what}")
+        raise
 
 
 def extra_module(name: str, extra: str = "logs") -> ModuleType:
-    """A module of an extra; one clear line where it is not installed."""
+    """Imports a module of an extra; one clear line where it is not installed."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -103,15 +100,13 @@ def extra_module(name: str, extra: str = "logs") -> ModuleType:
 
 
 def extra_of(error: BaseException) -> InputError | None:
-    """What to install where an import failed for want of an extra; None: for another.
+    """Returns what to install where an import failed for want of an extra, or None.
 
     Args:
       error: what was raised.
     """
-    if not isinstance(error, ModuleNotFoundError):
-        return None
-    package = str(error.name).partition(".")[0]
-    if package not in EXTRAS:
+    package = str(getattr(error, "name", None)).partition(".")[0]
+    if not isinstance(error, ModuleNotFoundError) or package not in EXTRAS:
         return None
     return InputError(
         f"{package}: not installed: expected pip install 'rcirl-jax[{EXTRAS[package]}]'"

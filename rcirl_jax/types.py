@@ -62,7 +62,7 @@ class Tag(enum.IntEnum):
     CUT_IN = 9
     RED_LIGHT = 10
     STANDING = 11
-    REHEARSED = 12  # a teacher drove it in the simulator, not a person on a road
+    SIMULATED = 12  # an expert drove it in the simulator, not a person on a road
 
 
 NUM_TAGS = len(Tag)

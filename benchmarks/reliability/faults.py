@@ -29,7 +29,7 @@ from absl import flags
 from benchmarks.common import write
 from benchmarks.reliability.jobs import Facts, Job, different, jobs, write_logs
 from benchmarks.reliability.small import BROKEN
-from rcirl_jax.cli.flags.common import run
+from rcirl_jax.cli.running import run
 from rcirl_jax.errors import InputError
 
 SHARES = {"import": 15, "train": 15, "sweep": 10, "autotune": 10}  # of 50 kills

@@ -31,7 +31,7 @@ class Job:
     """A command and what it makes in its folder."""
 
     name: str
-    module: str
+    module = "rcirl_jax"
     flags: tuple[str, ...]
     outcome: Callable[[Path], Facts]
     finished: Callable[[Path], int]  # things in its folder that are finished
@@ -56,22 +56,20 @@ def jobs(root: Path) -> dict[str, Job]:
     made = [
         Job(
             name="import",
-            module="experiments.import_logs",
-            flags=(*logs, "--output=data", "--stride=1", "--workers=2"),
+            flags=("import", *logs, "--output=data", "--stride=1", "--workers=2"),
             outcome=lambda folder: _files(folder / "data"),
             finished=_files_like("data/shards/*/shard.json"),
         ),
         Job(
             name="train",
-            module="experiments.train",
-            flags=(data, "--output=run", *steps, "--checkpoint_every=3"),
+            flags=("train", data, "--output=run", *steps, "--checkpoint_every=3"),
             outcome=_of_training,
             finished=_files_like("run/checkpoints/*/sha256.json"),  # 3 are kept
         ),
         Job(
             name="sweep",
-            module="experiments.sweep",
             flags=(
+                "sweep",
                 *(data, "--output=sweep", "--quick", "--batch_size=8"),
                 *("--recipe=paper", "--hidden_sizes=6,0", "--leaky_rates=0.05,0.3"),
             ),
@@ -80,8 +78,8 @@ def jobs(root: Path) -> dict[str, Job]:
         ),
         Job(
             name="autotune",
-            module="experiments.autotune",
             flags=(
+                "autotune",
                 *(*logs, "--output=run", "--stride=2", "--batch_size=8"),
                 *("--epochs=1", "--suite=free_cruise,stopped_lead"),
                 *("--cases=15", "--duration=2"),  # the gate judges no fewer

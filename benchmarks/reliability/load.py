@@ -3,11 +3,11 @@
     python -m benchmarks.reliability.load --what=suite --what=import
 
 suite: `--cases` closed-loop cases, the whole catalogue of as many seeds as that takes,
-driven as `experiments.simulate` drives them: the four judges, then the baselines of
+driven as `rcirl simulate` drives them: the four judges, then the baselines of
 `--rows`. `--duration` below 120 s makes it another suite than the paper's.
 
 import: `--scenes` scenes of one generated log (2 GB for 10 million) by
-`experiments.import_logs` as a user calls it, onto the disk, which has to have room for
+`rcirl import` as a user calls it, onto the disk, which has to have room for
 the log and the dataset.
 
 Resident memory with all worker processes is looked at every second; its limits are
@@ -28,7 +28,7 @@ from absl import flags
 
 from benchmarks.common import LANE_TOML, untrained, write
 from benchmarks.reliability.memory import level, looking
-from rcirl_jax.cli.flags.common import run
+from rcirl_jax.cli.running import run
 from rcirl_jax.data.store.files import MARK
 from rcirl_jax.data.store.shards import shard_key
 from rcirl_jax.errors import InputError
@@ -131,7 +131,7 @@ def imports() -> list[str]:
         log, toml, data = (Path(place) / name for name in ("log.csv", "log.toml", "d"))
         toml.write_text(TOML)
         write_log(log, int(1.02 * _SCENES.value * CAR_ROWS / CAR_SCENES))
-        words = [sys.executable, "-m", "experiments.import_logs", "--format=csv"]
+        words = [sys.executable, "-m", "rcirl_jax", "import", "--format=csv"]
         words += [f"--input={log}", f"--source={toml}", f"--output={data}"]
         words += [f"--workers={_WORKERS.value}"]
         env = {**os.environ, "TMPDIR": place, "JAX_PLATFORMS": "cpu"}

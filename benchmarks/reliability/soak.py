@@ -31,19 +31,19 @@ from benchmarks.common import resident_mb, write
 from benchmarks.reliability.jobs import Facts, different, jobs, write_logs
 from benchmarks.reliability.memory import in_use_mb, kept, rise, watched
 from benchmarks.reliability.small import SHARD_SCENES
-from rcirl_jax.cli.flags.common import provenance, run
+from rcirl_jax.cli.running import provenance, run
 from rcirl_jax.data import importing
 from rcirl_jax.data.importing import ImportConfig
 from rcirl_jax.data.logs import Logs
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.evaluation.gate.types import GateConfig
 from rcirl_jax.runtime.compiling import compiles
-from rcirl_jax.runtime.executors import Here
+from rcirl_jax.runtime.executors import Serial
 from rcirl_jax.train.running import Running
 from rcirl_jax.train.state import TrainConfig
-from rcirl_jax.tune.config import TuneConfig
-from rcirl_jax.tune.loop import tune
-from rcirl_jax.tune.run import Run
+from rcirl_jax.tuning.loop import tune
+from rcirl_jax.tuning.recipes import TuneConfig
+from rcirl_jax.tuning.run import Run
 
 _SECONDS = flags.DEFINE_float("seconds", 1200.0, "of the whole soak")
 _LEAK = flags.DEFINE_float("leak", 0.0, "MiB kept of every round, to be found")
@@ -100,7 +100,7 @@ def _run(facts: Mapping[str, object], running: Running) -> Run:
             cases=CASES,
             duration_s=DURATION_S,
         ),
-        executor=Here(),
+        executor=Serial(),
         running=running,
         facts=facts,
         say=lambda line: None,

@@ -23,7 +23,7 @@ from pathlib import Path
 from absl import flags
 
 from benchmarks.common import write
-from rcirl_jax.cli.flags.common import run
+from rcirl_jax.cli.running import run
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.pipeline import digest, file_sha256
 from rcirl_jax.runtime.provenance import HOOK_VARIABLES

@@ -20,10 +20,10 @@ from experiments.paper.common import (
     fixed,
     picture,
     seeds,
-    unread,
+    undefine_flags,
     write,
 )
-from rcirl_jax.cli.flags.common import run
+from rcirl_jax.cli.running import run
 from rcirl_jax.evaluation.ranking.learners import FrozenSets, pair_wins, train_learner
 from rcirl_jax.evaluation.statistics import ClusterBootstrap, combine_seeds
 from rcirl_jax.features import feature_map
@@ -33,7 +33,7 @@ from rcirl_jax.report.style import figure, label, save
 KEPT = {"a and j": ("acceleration", "jerk"), "all features": None}
 NEAR = 24  # candidates per scene
 fixed(horizon=8.0)
-unread("positive")  # each in turn
+undefine_flags("positive")  # each in turn
 
 
 def main() -> None:

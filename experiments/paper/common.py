@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from absl import flags
 
-from rcirl_jax.cli.flags.common import alone, made_by_file, provenance, unread
-from rcirl_jax.cli.flags.help import AS_SAID
-from rcirl_jax.cli.flags.recipe import recipe
+from rcirl_jax.cli import flags as shared
+from rcirl_jax.cli.flags import AS_SAID, mutually_exclusive, undefine_flags
+from rcirl_jax.cli.running import made_by_file, provenance
 from rcirl_jax.data.formats import read_recordings
 from rcirl_jax.data.importing import ImportConfig, import_logs
 from rcirl_jax.data.scenes.config import CollectConfig
@@ -33,6 +33,8 @@ HORIZON = flags.DEFINE_float(
 POSITIVE = flags.DEFINE_enum("positive", None, POSITIVES, "trained on" + AS_SAID)
 QUICK = flags.DEFINE_bool("quick", False, "few scenes, two seeds, two epochs")
 
+recipe = shared.recipe()
+
 QUICK_S = 2.0  # s of a case of `--quick`: with one length a program serves all tables
 QUICK_STRIDE_S = 60.0  # s between planning frames of the small synthetic dataset
 QUICK_SCENES = 128  # of each split
@@ -40,9 +42,9 @@ QUICK_COUNTS = {"seeds": 2, "epochs": 2}  # whatever the flags say
 
 
 def instead(flag: str, *names: str) -> None:
-    """As `unread`, by an experiment that was given --flag."""
-    alone(flag, *names)
-    unread(*names)
+    """As `undefine_flags`, by an experiment that was given --flag."""
+    mutually_exclusive(flag, *names)
+    undefine_flags(*names)
 
 
 def fixed(**values: object) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.stats import ttest_ind
 
 from experiments.paper.common import base, dataset, fixed, picture, seeds, write
-from rcirl_jax.cli.flags.common import run
+from rcirl_jax.cli.running import run
 from rcirl_jax.evaluation.exact import holm
 from rcirl_jax.evaluation.ranking.learners import (
     Learned,

@@ -24,10 +24,10 @@ from experiments.paper.common import (
     fixed,
     instead,
     picture,
-    unread,
+    undefine_flags,
     write,
 )
-from rcirl_jax.cli.flags.common import run
+from rcirl_jax.cli.running import run
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.from_run import export_run
 from rcirl_jax.export.loading import open_reward
@@ -39,7 +39,7 @@ _WEIGHTS = flags.DEFINE_string("weights", None, "weights file instead of trainin
 _ROW = flags.DEFINE_integer("row", None, "dataset row of the scene")
 REASONS = 6  # features named on the terminal
 fixed(horizon=8.0)
-unread("seeds")
+undefine_flags("seeds")
 
 
 def main() -> None:

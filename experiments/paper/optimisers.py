@@ -13,7 +13,7 @@ mean nothing.
 import numpy as np
 
 from experiments.paper.common import HORIZON, base, dataset, picture, seeds, write
-from rcirl_jax.cli.flags.common import run
+from rcirl_jax.cli.running import run
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.evaluation.ranking.format import format_table
 from rcirl_jax.evaluation.ranking.learners import scorers, train_learners

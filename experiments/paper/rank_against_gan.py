@@ -12,7 +12,7 @@ drives catalogue cases and ranks the held-out scenes of every source, in two for
     anchored   V_own + gain V,   gain = g spread(V_own) / spread(V)
 
 g goes from --low_share to --high_share with the familiarity, of recordings against
-drives of the own cost as the recipe `tuned` rehearses them. Losses leave V on scales of
+drives of the own cost as the recipe `tuned` simulates them. Losses leave V on scales of
 their own, so g counts in spreads of the own cost: spread(V) is the standard deviation
 of V over the feasible candidates of a scene as the planner sees it, averaged over
 training scenes, as many of every source. With the defaults of g the listwise loss has
@@ -54,7 +54,7 @@ from experiments.paper.common import (
     seeds,
     write,
 )
-from rcirl_jax.cli.flags.common import made_by_file, provenance, run
+from rcirl_jax.cli.running import made_by_file, provenance, run
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.data.store.joined import Demonstrations, JoinedDatasets, open_datasets
 from rcirl_jax.errors import InputError
@@ -87,9 +87,9 @@ from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics, nuplan_score
 from rcirl_jax.simulation.rows import TRIVIAL_BASELINES
 from rcirl_jax.simulation.suite import FULL_S, catalogue_set, suite_refs
 from rcirl_jax.train.state import TrainConfig
-from rcirl_jax.tune.prior_cost import OWN_COST, PriorCostConfig, fitted_prior_cost
-from rcirl_jax.tune.recipes import DEFAULT, load_recipe
-from rcirl_jax.tune.rehearsal import rehearse
+from rcirl_jax.tuning.demonstrations import drive_round
+from rcirl_jax.tuning.prior_cost import OWN_COST, PriorCostConfig, fitted_prior_cost
+from rcirl_jax.tuning.recipes import DEFAULT, load_recipe
 from rcirl_jax.types import Scene
 
 _LOSSES = flags.DEFINE_list(
@@ -106,7 +106,7 @@ FORMS = ("alone", "anchored")
 BASELINES = (OWN_COST, "IDM", *TRIVIAL_BASELINES)
 RANKED_BASELINES = (OWN_COST, "IDM")
 SPREAD_SCENES = 256  # of each source
-QUICK_REHEARSAL_S = 12.0  # s of a drive; its scenes need 8 s of future
+QUICK_DRIVE_S = 12.0  # s of a drive; its scenes need 8 s of future
 
 
 def configs() -> dict[str, TrainConfig]:
@@ -160,13 +160,13 @@ def trained(
 
 def fitted(shares: PriorCostConfig, sources: Sequence[Demonstrations]) -> PriorCost:
     """The prior cost with g for gains, against drives of the own cost."""
-    plan = load_recipe(DEFAULT).rehearsal
+    plan = load_recipe(DEFAULT).simulated
     if QUICK.value:
-        plan = dataclasses.replace(plan, cases=1, duration_s=QUICK_REHEARSAL_S)
-    drives = rehearse(
+        plan = dataclasses.replace(plan, cases=1, duration_s=QUICK_DRIVE_S)
+    drives = drive_round(
         0,
         plan,
-        Path(OUTPUT.value) / "rehearsal",
+        Path(OUTPUT.value) / "demonstrations",
         incumbent=OWN_COST,
         learner=None,
         before_commit=made_by_file(),

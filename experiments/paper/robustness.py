@@ -17,7 +17,7 @@ from typing import Any
 
 from absl import flags
 
-from rcirl_jax.cli.flags.common import provenance, run
+from rcirl_jax.cli.running import provenance, run
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.robustness import (
     Disturbance,

@@ -26,20 +26,20 @@ from experiments.paper.common import (
     fixed,
     instead,
     seeds,
-    unread,
+    undefine_flags,
 )
-from rcirl_jax.cli.flags.common import run
+from rcirl_jax.cli.running import run
 from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, run_suite, write_suite
 from rcirl_jax.export.closed_loop import table_rows
 from rcirl_jax.export.loading import open_reward
 from rcirl_jax.report.charts import suite_chart
 from rcirl_jax.simulation.rows import BASELINES, Row
 from rcirl_jax.simulation.suite import FULL_S, catalogue_set, suite_refs
-from rcirl_jax.tune.recipes import DEFAULT, load_recipe
+from rcirl_jax.tuning.recipes import DEFAULT, load_recipe
 
 _WEIGHTS = flags.DEFINE_list("weights", None, "weights files instead of training")
 _DP_CASES = flags.DEFINE_integer("dp_cases", 2, "cases per family of the DP rows", 1)
-unread("cases", "duration", "catalogue_seed", "horizon")
+undefine_flags("cases", "duration", "catalogue_seed", "horizon")
 fixed(seeds=2)
 TRAINING = (
     *("data", "recipe", "losses", "low_share", "high_share"),

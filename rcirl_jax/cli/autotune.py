@@ -4,7 +4,7 @@
     rcirl autotune --input=LOGS --output=RUN
     rcirl autotune --synthetic --recipe=quick --cases=4 --duration=20 --output=RUN
 
-import (unless there is --data) -> rehearse -> train -> rank -> simulate -> gate ->
+import (unless there is --data) -> demonstrate -> train -> rank -> simulate -> gate ->
 report, as the --recipe says; a flag given beside it wins. Every stage is kept until
 what it is made from changes; a killed run goes on where it was, also one ended by
 SIGTERM (exit status 143) or SIGINT (130), which save the training's step. The candidate
@@ -17,16 +17,9 @@ from pathlib import Path
 
 from absl import flags
 
-from rcirl_jax.cli.flags import margins, training
-from rcirl_jax.cli.flags.common import provenance
-from rcirl_jax.cli.flags.executor import executor
-from rcirl_jax.cli.flags.help import AS_SAID, also_named
-from rcirl_jax.cli.flags.horizon import HORIZON
-from rcirl_jax.cli.flags.importing import import_flags
-from rcirl_jax.cli.flags.search import SEARCH
-from rcirl_jax.cli.flags.signals import checked_signals, signals_asked
-from rcirl_jax.cli.flags.suite import suite
-from rcirl_jax.cli.flags.trackers import trackers
+from rcirl_jax.cli import flags as shared
+from rcirl_jax.cli.flags import AS_SAID
+from rcirl_jax.cli.running import provenance
 from rcirl_jax.data.formats import IMPORTERS
 from rcirl_jax.data.formats.recognise import recognised_format
 from rcirl_jax.data.importing import ImportConfig
@@ -35,19 +28,15 @@ from rcirl_jax.errors import InputError, did_you_mean
 from rcirl_jax.runtime.pipeline import only_one
 from rcirl_jax.train.parallel import PARALLEL, share_cores
 from rcirl_jax.train.running import Running
-from rcirl_jax.tune.config import TuneConfig
-from rcirl_jax.tune.loop import STAGES, tune
-from rcirl_jax.tune.rehearsal import TEACHERS
-from rcirl_jax.tune.run import Run
+from rcirl_jax.tuning.loop import STAGES, tune
+from rcirl_jax.tuning.recipes import EXPERTS, TuneConfig
+from rcirl_jax.tuning.run import Run
 
 USUAL = (
     *("output", "data", "input", "format", "source", "synthetic", "recipe"),
     *("incumbent", "suite", "cases", "duration", "drives", "until", "workers"),
 )
-_OUTPUT = flags.DEFINE_string(
-    "output", None, "folder of the run; a run that is in it goes on", required=True
-)
-also_named("workdir", "output")
+_OUTPUT = flags.DEFINE_string("output", None, shared.OUTPUT, required=True)
 _DATA = flags.DEFINE_list("data", None, "datasets of `rcirl import`, with commas")
 _SYNTHETIC = flags.DEFINE_bool(
     "synthetic", False, "instead: embedded synthetic traffic, to try things out"
@@ -61,7 +50,6 @@ _INPUT = flags.DEFINE_list(
 _SOURCE = flags.DEFINE_list(
     "source", None, "TOML of columns and units of each --input, for your own tables"
 )
-_IMPORT = import_flags()
 _INCUMBENT = flags.DEFINE_string(
     "incumbent",
     "hand-set",
@@ -70,8 +58,8 @@ _INCUMBENT = flags.DEFINE_string(
 _SEEDS = flags.DEFINE_integer(
     "seeds", None, "training runs; the median one drives" + AS_SAID
 )
-_TEACHER = flags.DEFINE_enum(
-    "teacher", None, TEACHERS, "who rehearses the catalogue" + AS_SAID
+_EXPERT = flags.DEFINE_enum(
+    "expert", None, EXPERTS, "who drives simulated demonstrations" + AS_SAID
 )
 _DRIVES = flags.DEFINE_integer(
     "drives",
@@ -86,6 +74,15 @@ _SWEEP = flags.DEFINE_string(
     "sweep", None, "folder of `rcirl sweep`, shown in the report"
 )
 _UNTIL = flags.DEFINE_enum("until", "report", STAGES, "last stage of this time")
+_TRAINING = shared.training()
+_IMPORT = shared.importing()
+_SIGNALS = shared.signals()
+_SUITE = shared.suite()
+_MARGINS = shared.margins()
+_SEARCH = shared.search()
+_HORIZON = shared.horizon()
+_TRACKERS = shared.trackers()
+_EXECUTOR = shared.executor()
 
 
 def main() -> None:
@@ -97,33 +94,33 @@ def main() -> None:
 
 def made_run(folder: Path) -> Run:
     """The run in a folder that the flags describe."""
-    recipe = training.recipe()
-    rehearsal = recipe.rehearsal
-    if _TEACHER.value is not None:
-        rehearsal = dataclasses.replace(rehearsal, teacher=_TEACHER.value)
-    train = training.training_config()
+    recipe = _TRAINING.recipe()
+    simulated = recipe.simulated
+    if _EXPERT.value is not None:
+        simulated = dataclasses.replace(simulated, expert=_EXPERT.value)
+    train = _TRAINING.config()
     if _PARALLEL.value == "auto":
         share_cores(train.batch_size)
     config = TuneConfig(
         train=train,
-        gate=margins.gate_config(),
+        gate=_MARGINS(),
         incumbent=_INCUMBENT.value,
-        rehearsal=rehearsal,
+        simulated=simulated,
         prior_cost=recipe.prior_cost,
-        data_weights=training.DATA_WEIGHTS.value,
+        data_weights=_TRAINING.data_weights,
         recipe=recipe.name,
         seeds=recipe.seeds if _SEEDS.value is None else _SEEDS.value,
-        search=SEARCH.value,
+        search=_SEARCH.value,
         drives=_DRIVES.value,
-        horizon_s=HORIZON.value,
-        **suite(),
+        horizon_s=_HORIZON.value,
+        **_SUITE.settings(),
         sweep=Path(_SWEEP.value) if _SWEEP.value else None,
     )
     return Run(
         folder=folder,
         config=config,
-        executor=executor(),
-        running=Running(parallel=_PARALLEL.value, trackers=trackers()),
+        executor=_EXECUTOR(),
+        running=Running(parallel=_PARALLEL.value, trackers=_TRACKERS()),
         facts=provenance(),
     )
 
@@ -139,7 +136,7 @@ def sources() -> list[str | Logs]:
     if not _INPUT.value and (_FORMAT.value or _SOURCE.value):
         raise InputError("--input: not given: expected one for each --format")
     if _DATA.value:
-        if signals_asked():
+        if _SIGNALS.value:
             raise InputError("--signals: expected with --input, whose lights they are")
         return list(_DATA.value)
     if _SYNTHETIC.value:
@@ -168,7 +165,7 @@ def _logs(name: str, path: Path | None, source: Path | None) -> Logs:
         format=name,
         input=path,
         source=source,
-        config=_IMPORT(ImportConfig(format=name, collect=training.recipe().collect)),
-        signals=signals_asked(),
-        checked=checked_signals,
+        config=_IMPORT(ImportConfig(format=name, collect=_TRAINING.recipe().collect)),
+        signals=_SIGNALS.value or "",
+        checked=shared.pooled_signals if _SIGNALS.value else None,
     )

@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 from absl import flags
 
-from rcirl_jax.cli.flags.common import provenance
+from rcirl_jax.cli.running import provenance
 from rcirl_jax.errors import InputError
 from rcirl_jax.export.closed_loop import table_rows
 from rcirl_jax.runtime.atomic_files import read_json, write_json

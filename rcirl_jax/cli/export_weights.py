@@ -20,8 +20,7 @@ from pathlib import Path
 
 from absl import flags
 
-from rcirl_jax.cli.flags.common import provenance
-from rcirl_jax.cli.flags.help import also_named
+from rcirl_jax.cli.running import provenance
 from rcirl_jax.data.store.joined import open_datasets
 from rcirl_jax.data.store.resplit import with_tags
 from rcirl_jax.errors import InputError
@@ -43,7 +42,6 @@ USUAL = (
     "ranges",
 )
 _RUN = flags.DEFINE_string("run", None, "run to export: a folder of `rcirl train`")
-also_named("workdir", "run")
 _WEIGHTS = flags.DEFINE_string(
     "weights", None, "instead: a weights file, to write in other forms"
 )

@@ -15,16 +15,14 @@ from pathlib import Path
 
 from absl import flags
 
-from rcirl_jax.cli.flags import margins
-from rcirl_jax.cli.flags.common import provenance
-from rcirl_jax.cli.flags.executor import executor
-from rcirl_jax.cli.flags.suite import suite
+from rcirl_jax.cli import flags as shared
+from rcirl_jax.cli.running import provenance
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.likeness import DRIVES
 from rcirl_jax.evaluation.gate.output import format_verdict, write_verdict
+from rcirl_jax.export.closed_loop import read_tuned_idm
 from rcirl_jax.export.gate_job import gate_job, judged
-from rcirl_jax.export.tuned_idm import idm_left_out, read_tuned_idm
 from rcirl_jax.planner.safety import TRACKS
 from rcirl_jax.simulation.rows import BASELINES
 
@@ -55,6 +53,9 @@ _IDM = flags.DEFINE_string(
 _FILTER = flags.DEFINE_enum(
     "filter", "full", TRACKS, "full; collision: no verdict ships, the reward decides"
 )
+_EXECUTOR = shared.executor()
+_SUITE = shared.suite()
+_MARGINS = shared.margins()
 
 
 def main() -> None:
@@ -63,11 +64,11 @@ def main() -> None:
     if output.suffix != ".json":
         raise InputError(f"--output: {output}: expected a name that ends in .json")
     output.unlink(missing_ok=True)  # of another gate: not this verdict
-    config = margins.gate_config()
+    config = _MARGINS()
     job, incumbent = gate_job(
         _CANDIDATE.value,
         _INCUMBENT.value,
-        **suite(),
+        **_SUITE.settings(),
         baselines=(
             "IDM",
             *(name for name in config.trivial_baselines if name in BASELINES),
@@ -75,10 +76,10 @@ def main() -> None:
         tuned_idm=read_tuned_idm(Path(_IDM.value)) if _IDM.value else None,
         track=_FILTER.value,
     )
-    if said := idm_left_out(_IDM.value):
+    if said := shared.idm_left_out(_IDM.value):
         print(said)
     sources = [open_dataset(url) for url in _DATA.value]
-    found = judged(job, incumbent, config, executor(), sources, _DRIVES.value)
+    found = judged(job, incumbent, config, _EXECUTOR(), sources, _DRIVES.value)
     if found.likeness is not None:
         print(found.likeness.text())
     verdict = found.verdict

@@ -22,11 +22,8 @@ from pathlib import Path
 
 from absl import flags
 
-from rcirl_jax.cli.flags import training
-from rcirl_jax.cli.flags.common import provenance, unread
-from rcirl_jax.cli.flags.holdout import splits
-from rcirl_jax.cli.flags.horizon import HORIZON
-from rcirl_jax.cli.flags.search import SEARCH
+from rcirl_jax.cli import flags as shared
+from rcirl_jax.cli.running import provenance
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.joined import Demonstrations
 from rcirl_jax.evaluation.baselines.tuned import as_numbers, tuned_baselines
@@ -49,9 +46,6 @@ from rcirl_jax.evaluation.ranking.table import UNTRAINED_ROW, to_json
 from rcirl_jax.reward import RewardConfig
 from rcirl_jax.runtime.atomic_files import write_json, write_whole
 
-# the learners say
-unread("loss", "hidden_size", "activation", "constraint", "pin", "by_context")
-unread("data_weights")
 USUAL = (
     *("data", "output", "learners", "seeds", "recipe", "horizon", "holdout"),
     *("folds", "split_seed", "recording", "tuned"),
@@ -70,6 +64,11 @@ _TUNED = flags.DEFINE_integer(
 _LONG = flags.DEFINE_integer(
     "tuned_long", 3000, "evaluations of the hand-set cost's long search, or 0", 0
 )
+_LEARNERS_SAY = ("loss", "hidden_size", "activation", "constraint", "pin", "by_context")
+_TRAINING = shared.training(without=(*_LEARNERS_SAY, "data_weights"))
+_SPLITS = shared.holdout()
+_HORIZON = shared.horizon()
+_SEARCH = shared.search()
 
 
 def _tuned(
@@ -85,7 +84,7 @@ def _tuned(
         epochs=epochs,
         seeds=seeds,
         long=_LONG.value,
-        search=SEARCH.value,
+        search=_SEARCH.value,
     )
 
 
@@ -94,11 +93,11 @@ def main() -> None:
     from rcirl_jax.report.charts import ranking_chart
 
     dataset = open_dataset(_DATA.value)
-    parts, words = splits(dataset)
-    base = dataclasses.replace(training.training_config(), reward=RewardConfig())
+    parts, words = _SPLITS(dataset)
+    base = dataclasses.replace(_TRAINING.config(), reward=RewardConfig())
     configs = learner_configs(_LEARNERS.value, base)
     setup = RankingSetup(
-        preset=base.features, sampler=base.sampler, horizon_s=HORIZON.value
+        preset=base.features, sampler=base.sampler, horizon_s=_HORIZON.value
     )
     setups = [
         dataclasses.replace(setup, tuned=_tuned(x, setup, base.epochs)) for x in parts

@@ -20,12 +20,8 @@ from pathlib import Path
 
 from absl import flags
 
-from rcirl_jax.cli.flags.common import made_by_file
-from rcirl_jax.cli.flags.executor import executor
-from rcirl_jax.cli.flags.horizon import HORIZON
-from rcirl_jax.cli.flags.importing import import_flags
-from rcirl_jax.cli.flags.recipe import recipe
-from rcirl_jax.cli.flags.signals import checked_signals
+from rcirl_jax.cli import flags as shared
+from rcirl_jax.cli.running import made_by_file
 from rcirl_jax.data.formats import IMPORTERS
 from rcirl_jax.data.formats.csv.suggest import suggested
 from rcirl_jax.data.formats.files import table_stem
@@ -60,7 +56,11 @@ _OUTPUT = flags.DEFINE_string("output", None, "folder of the dataset to write")
 _OVERWRITE = flags.DEFINE_bool(
     "overwrite", False, "replace a finished dataset, or TOML"
 )
-_IMPORT = import_flags()
+_RECIPE = shared.recipe()
+_IMPORT = shared.importing()
+_SIGNALS = shared.signals()
+_HORIZON = shared.horizon()
+_EXECUTOR = shared.executor()
 
 
 def main() -> None:
@@ -75,19 +75,19 @@ def main() -> None:
             "--input: not given: expected a file or folder of logs, or "
             "--format=synthetic for the embedded traffic"
         )
-    places = executor()
+    places = _EXECUTOR()
     path = Path(_INPUT.value) if _INPUT.value else None
     source = Path(_SOURCE.value) if _SOURCE.value else None
     form = _FORMAT.value or recognised_format(path, source)
     if _FORMAT.value is None and path is not None:
         print(f"--format={form}: recognised", flush=True)
     parts = parts_of(form, path, source)
-    config = _IMPORT(ImportConfig(format=form, collect=recipe().collect))
-    signals = checked_signals(
-        leaving_out(parts) if config.leaves_out else parts, places
-    )
-    collect = dataclasses.replace(config.collect, signal_checks=signals)
-    config = dataclasses.replace(config, collect=collect)
+    config = _IMPORT(ImportConfig(format=form, collect=_RECIPE().collect))
+    if _SIGNALS.value:
+        read = leaving_out(parts) if config.leaves_out else parts
+        checks = shared.pooled_signals(read, places)
+        collect = dataclasses.replace(config.collect, signal_checks=checks)
+        config = dataclasses.replace(config, collect=collect)
     floors: list[dict] = []
     splits: list[str] = []
 
@@ -138,9 +138,9 @@ def _floors(dataset: Dataset) -> list[dict]:
     """The oracle floor of every mode of the sampler, also in the dataset's facts."""
     dataset.verify()
     setups = [
-        RankingSetup(sampler=SamplerConfig(mode=mode), horizon_s=HORIZON.value)
+        RankingSetup(sampler=SamplerConfig(mode=mode), horizon_s=_HORIZON.value)
         for mode in MODES
     ]
     floors = [oracle_floor(dataset, setup, max_scenes=512) for setup in setups]
-    made_by_file(more={"oracle_floor": floors})(dataset)
+    made_by_file(oracle_floor=floors)(dataset)
     return floors

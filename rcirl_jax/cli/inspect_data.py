@@ -12,7 +12,7 @@ from pathlib import Path
 
 from absl import flags
 
-from rcirl_jax.cli.flags.common import provenance
+from rcirl_jax.cli.running import provenance
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
 

@@ -10,10 +10,9 @@ from pathlib import Path
 
 from absl import flags
 
-from rcirl_jax.api.evidence import rank
-from rcirl_jax.cli.flags.common import provenance
-from rcirl_jax.cli.flags.executor import executor
-from rcirl_jax.cli.flags.horizon import HORIZON
+from rcirl_jax.api.runs import rank
+from rcirl_jax.cli import flags as shared
+from rcirl_jax.cli.running import provenance
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.resplit import with_tags
 from rcirl_jax.evaluation.ranking.format import format_table
@@ -38,6 +37,8 @@ _FILTER = flags.DEFINE_bool(
     "drop_collisions", False, "rank only candidates that meet nothing, in every row"
 )
 _WIDTH = flags.DEFINE_integer("width", 118, "columns of the printed table")
+_HORIZON = shared.horizon()
+_EXECUTOR = shared.executor()
 
 
 def main() -> None:
@@ -46,10 +47,10 @@ def main() -> None:
     report = rank(
         _WEIGHTS.value,
         dataset,
-        horizon_s=HORIZON.value,
+        horizon_s=_HORIZON.value,
         split=_SPLIT.value,
         drop_collisions=_FILTER.value,
-        executor=executor(),
+        executor=_EXECUTOR(),
     )
     print(format_table(report, _WIDTH.value))
     if _OUTPUT.value:

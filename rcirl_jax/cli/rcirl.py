@@ -1,4 +1,4 @@
-"""The command `rcirl`: a sub-command is a module of this room with a `main`.
+"""The command `rcirl`: a sub-command is a module of this package with a `main`.
 
 A module defines its flags with absl, which knows one flag of a name in a process: only
 the module that is asked for is imported. This one imports neither absl nor JAX.
@@ -10,7 +10,7 @@ import sys
 from rcirl_jax import __version__
 from rcirl_jax.errors import did_you_mean
 
-# sub-command -> module of this room, and what it does in a line
+# sub-command -> module of this package, one line of help
 COMMANDS = {
     "autotune": ("autotune", "the whole loop: from logs to a verdict and its report"),
     "import": ("import_logs", "recorded driving -> a dataset of scenes"),
@@ -46,7 +46,7 @@ HELP = ("help", "-h", "-help", "--help", "--helpfull", "--helpshort")
 
 
 def overview() -> str:
-    """What `rcirl --help` says."""
+    """The text of `rcirl --help`."""
     lines = [f"  {name:16}{line}" for name, (_, line) in COMMANDS.items()]
     return "\n".join([HEAD, "commands:", *lines, TAIL])
 
@@ -68,6 +68,6 @@ def main() -> None:
         )
         sys.exit(2)
     sys.argv[:] = [f"rcirl {name}", *rest]
-    running = importlib.import_module("rcirl_jax.cli.flags.common")
+    running = importlib.import_module("rcirl_jax.cli.running")
     module = importlib.import_module(f"rcirl_jax.cli.{COMMANDS[name][0]}")
     running.run(module.main)

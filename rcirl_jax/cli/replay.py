@@ -11,7 +11,7 @@ from pathlib import Path
 
 from absl import flags
 
-from rcirl_jax.cli.flags.common import provenance
+from rcirl_jax.cli.running import provenance
 from rcirl_jax.export.closed_loop import table_rows
 from rcirl_jax.report.replays import make_replays
 from rcirl_jax.simulation.rows import BASELINES, Row

@@ -13,23 +13,21 @@ from pathlib import Path
 from absl import flags
 
 from rcirl_jax.cli import autotune
-from rcirl_jax.cli.flags.common import unread
-from rcirl_jax.cli.flags.help import also_named
-from rcirl_jax.errors import UNFORESEEN, InputError
+from rcirl_jax.cli.flags import undefine_flags
+from rcirl_jax.errors import MALFORMED, InputError
 from rcirl_jax.runtime.atomic_files import write_whole
 from rcirl_jax.runtime.pipeline import FILE, Stages, only_one
-from rcirl_jax.tune.loop import draw_again
+from rcirl_jax.tuning.loop import draw_again
 
-unread("output", "workdir")  # of autotune
+undefine_flags("output")  # of autotune
 USUAL = ("run", "output")
 _RUN = flags.DEFINE_string(
     "run", None, "folder of `rcirl autotune`, with its verdict", required=True
 )
-also_named("workdir", "run")
 _OUTPUT = flags.DEFINE_string("output", None, "a copy of RUN/report.html to write")
 
-# what is noted of a run and is not set again; "workdir" is the output of older ones
-NOT_OF_A_RUN = ("output", "workdir", "executor", "workers", "ray_address")
+# what is noted of a run and is not set again
+NOT_OF_A_RUN = ("output", "executor", "workers", "ray_address")
 
 
 def recall(folder: Path) -> None:
@@ -54,7 +52,7 @@ def recall(folder: Path) -> None:
         try:
             own = None if value is None else flag.parser.parse(value)
             setattr(flags.FLAGS, name, own)
-        except (*UNFORESEEN, flags.Error) as error:
+        except (*MALFORMED, flags.Error) as error:
             raise InputError(f"{where}: gate: --{name}: {error}") from error
 
 

@@ -14,23 +14,25 @@ from pathlib import Path
 
 from absl import flags
 
-from rcirl_jax.cli.flags.common import provenance
-from rcirl_jax.cli.flags.executor import executor
-from rcirl_jax.cli.flags.suite import CASES, DURATION, EVERY, SEED, SUITE
+from rcirl_jax.cli import flags as shared
+from rcirl_jax.cli.running import provenance
 from rcirl_jax.data.store.joined import JoinedDatasets, open_datasets
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.closed_loop.likeness import DRIVES, held_out_likeness
+from rcirl_jax.evaluation.closed_loop.likeness import (
+    DRIVES,
+    LikenessReport,
+    held_out_likeness,
+)
 from rcirl_jax.evaluation.closed_loop.suite import (
     SuiteConfig,
     run_suite,
     worst_cases,
     write_suite,
 )
-from rcirl_jax.export.spread import SuiteJob, drive_by
-from rcirl_jax.export.tuned_idm import idm_left_out, read_tuned_idm
+from rcirl_jax.export.closed_loop import SuiteJob, drive_by, read_tuned_idm
 from rcirl_jax.planner.safety import TRACKS
 from rcirl_jax.runtime.atomic_files import write_json, write_whole
-from rcirl_jax.simulation.recorded.scenes import HeldOut, held_out
+from rcirl_jax.simulation.recorded.scenes import held_out
 from rcirl_jax.simulation.rows import BASELINES, human_row
 from rcirl_jax.simulation.suite import case_duration, recorded_set, suite_refs
 
@@ -58,82 +60,67 @@ _FILTER = flags.DEFINE_enum(
     "filter", "full", TRACKS, "full, or collision: the reward decides the rest"
 )
 _CHUNK = flags.DEFINE_integer("chunk", 180, "cases driven together; bounds memory")
-
-flags.set_default(SUITE, "smoke")
+_EXECUTOR = shared.executor()
+_CASES = shared.suite("smoke")
 OF_DATA = ("recorded", "heldout")  # suites of --data
-
-
-def _job() -> SuiteJob:
-    """Rows and catalogue cases that the flags name."""
-    elsewhere = SUITE.value in OF_DATA
-    if elsewhere and CASES.value is not None and CASES.value < 1:
-        raise InputError(f"--cases: {CASES.value}: expected at least 1")
-    return SuiteJob(
-        weights=tuple(_WEIGHTS.value),
-        baselines=tuple(_BASELINES.value),
-        refs=() if elsewhere else suite_refs(SUITE.value, CASES.value, SEED.value),
-        duration_s=case_duration(SUITE.value, DURATION.value),
-        plan_every=EVERY.value,
-        dp=_DP.value,
-        tuned_idm=read_tuned_idm(Path(_IDM.value)) if _IDM.value else None,
-        track=_FILTER.value,
-    )
-
-
-def _drives() -> tuple[HeldOut, str]:
-    """Held-out drives of --data, and its hash."""
-    if DURATION.value:
-        raise InputError(
-            f"--duration: of --suite={SUITE.value}: drives last as their records"
-        )
-    data = open_datasets(_DATA.value)
-    sources = data.parts if isinstance(data, JoinedDatasets) else [data]
-    return held_out(sources, CASES.value or DRIVES, SEED.value), data.hash
-
-
-def _likeness(job: SuiteJob, drives: HeldOut, made_by: dict) -> None:
-    """Every row, and the recorded human, over held-out drives."""
-    report = held_out_likeness(drives, job.rows(), EVERY.value)
-    folder = Path(_OUTPUT.value)
-    write_whole(folder / "table.txt", report.text())
-    write_json(folder / "likeness.json", {**report.as_dict(), "made_by": made_by})
-    print(report.text())
-    print(f"written: {_OUTPUT.value}/table.txt, likeness.json")
 
 
 def main() -> None:
     """Flags -> one suite."""
     if _CHUNK.value < 1:
         raise InputError(f"--chunk: {_CHUNK.value}: expected at least 1")
-    job, places = _job(), executor()
-    if said := idm_left_out(_IDM.value):
+    asked, places = _CASES.settings(), _EXECUTOR()
+    suite, cases, seed = asked["suite"], asked["cases"], asked["catalogue_seed"]
+    of_data = suite in OF_DATA
+    if of_data and cases is not None and cases < 1:
+        raise InputError(f"--cases: {cases}: expected at least 1")
+    job = SuiteJob(
+        weights=tuple(_WEIGHTS.value),
+        baselines=tuple(_BASELINES.value),
+        refs=() if of_data else suite_refs(suite, cases, seed),
+        duration_s=case_duration(suite, asked["duration_s"]),
+        plan_every=asked["plan_every"],
+        dp=_DP.value,
+        tuned_idm=read_tuned_idm(Path(_IDM.value)) if _IDM.value else None,
+        track=_FILTER.value,
+    )
+    if said := shared.idm_left_out(_IDM.value):
         print(said)
-    if not job.refs and places.workers > 1:
-        raise InputError(
-            f"--suite: {SUITE.value}: expected --workers=1: drives run here"
-        )
-    if job.refs and _DATA.value:
-        raise InputError(
-            f"--data: with --suite={SUITE.value}: expected {' or '.join(OF_DATA)}"
-        )
+    if of_data and places.workers > 1:
+        raise InputError(f"--suite: {suite}: expected --workers=1: drives run here")
+    if of_data and asked["duration_s"]:
+        raise InputError(f"--duration: of --suite={suite}: they last as their records")
+    if _DATA.value and not of_data:
+        known = " or ".join(OF_DATA)
+        raise InputError(f"--data: with --suite={suite}: expected {known}")
     # of the files as they are read, not hours later
-    made_by = provenance(_WEIGHTS.value)
-    rows = job.rows()
-    if job.refs:
-        cases = job.cases()
-    else:
-        drives, data_hash = _drives()
-        made_by["data_hash"] = data_hash
-        if SUITE.value == "heldout":
-            _likeness(job, drives, made_by)
+    made_by, rows = provenance(_WEIGHTS.value), job.rows()
+    if of_data:
+        data = open_datasets(_DATA.value)
+        made_by["data_hash"] = data.hash
+        parts = data.parts if isinstance(data, JoinedDatasets) else [data]
+        drives = held_out(parts, cases or DRIVES, seed)
+        if suite == "heldout":
+            _likeness(held_out_likeness(drives, rows, job.plan_every), made_by)
             return
-        cases = recorded_set(drives)
+        driven = recorded_set(drives)
         rows.append(human_row())
-    config = SuiteConfig(plan_every=EVERY.value, chunk=_CHUNK.value)
-    result = run_suite(rows, cases, config, drive_by(places, job))
+    else:
+        driven = job.cases()
+    config = SuiteConfig(plan_every=job.plan_every, chunk=_CHUNK.value)
+    result = run_suite(rows, driven, config, drive_by(places, job))
     print(write_suite(result, Path(_OUTPUT.value), made_by))
     for name, facts in result.timings.items():
         print(f"{name}: {facts['seconds']} s, {facts['plans_per_s']:,} plans/s")
     print(f"peak memory: {result.facts['peak_memory_gib']} GiB")
     print(f"look first at: {', '.join(worst_cases(result, rows[0].name, 5))}")
     print(f"written: {_OUTPUT.value}/table.txt, suite.json, cases.csv")
+
+
+def _likeness(report: LikenessReport, made_by: dict) -> None:
+    """Every row, and the recorded human, over held-out drives."""
+    folder = Path(_OUTPUT.value)
+    write_whole(folder / "table.txt", report.text())
+    write_json(folder / "likeness.json", {**report.as_dict(), "made_by": made_by})
+    print(report.text())
+    print(f"written: {_OUTPUT.value}/table.txt, likeness.json")

@@ -20,19 +20,15 @@ from pathlib import Path
 
 from absl import flags
 
-from rcirl_jax.cli.flags import training
-from rcirl_jax.cli.flags.common import floats, hidden_sizes, provenance, unread
-from rcirl_jax.cli.flags.executor import executor
-from rcirl_jax.cli.flags.help import AS_SAID
-from rcirl_jax.cli.flags.horizon import HORIZON
+from rcirl_jax.cli import flags as shared
+from rcirl_jax.cli.flags import AS_SAID, floats, hidden_sizes
+from rcirl_jax.cli.running import provenance
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.ranking.sweep import CHOICES, SweepConfig
 from rcirl_jax.export.sweep.result import table
 from rcirl_jax.export.sweep.run import run_sweep
 from rcirl_jax.train.state import TrainConfig
 
-unread("leaky_rate", "learning_rate", "hidden_size")  # the grid
-unread("data_weights")
 LEAKY_RATES = (0.01, 0.05, 0.2)
 GRID = "grid"
 USUAL = (
@@ -73,6 +69,11 @@ _TRIALS = flags.DEFINE_integer(
     "trials", 32, "configurations that optuna proposes, 1 or more", 1
 )
 _QUICK = flags.DEFINE_bool("quick", False, "128 scenes, 2 epochs, 2 seeds: a minute")
+_TRAINING = shared.training(
+    without=("leaky_rate", "learning_rate", "hidden_size", "data_weights")
+)
+_HORIZON = shared.horizon()
+_EXECUTOR = shared.executor()
 
 
 def _leaky_rates(base: TrainConfig) -> tuple[float, ...]:
@@ -91,9 +92,7 @@ def main() -> None:
             f"--trials: {_TRIALS.value}: expected --search=optuna beside it"
         )
     shapes = tuple(hidden_sizes(s.split("x"), "hidden_sizes") for s in _HIDDEN.value)
-    base = training.training_config(
-        seed=_SEED.value, hidden=shapes[0] if shapes else None
-    )
+    base = _TRAINING.config(seed=_SEED.value, hidden=shapes[0] if shapes else None)
     config = SweepConfig(
         data=tuple(_DATA.value),
         base=dataclasses.replace(base, epochs=2) if _QUICK.value else base,
@@ -108,11 +107,11 @@ def main() -> None:
         validation=_SHARE.value,
         scenes=128 if _QUICK.value else _SCENES.value,
         choose_by=_CHOOSE.value,
-        horizon_s=HORIZON.value,
+        horizon_s=_HORIZON.value,
         trials=0 if _SEARCH.value == GRID else _TRIALS.value,
     )
     folder = Path(_OUTPUT.value)
-    report = run_sweep(config, folder, executor(), provenance())
+    report = run_sweep(config, folder, _EXECUTOR(), provenance())
     picture = sweep_picture(folder / "sweep.png", report)
     print(table(report))
     best = f"best.msgpack ({report['chosen']['member']})"

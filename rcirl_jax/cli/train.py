@@ -16,10 +16,8 @@ from pathlib import Path
 
 from absl import flags
 
-from rcirl_jax.cli.flags import training
-from rcirl_jax.cli.flags.common import provenance
-from rcirl_jax.cli.flags.help import also_named
-from rcirl_jax.cli.flags.trackers import trackers
+from rcirl_jax.cli import flags as shared
+from rcirl_jax.cli.running import provenance
 from rcirl_jax.data.store.joined import open_datasets
 from rcirl_jax.data.store.resplit import with_tags
 from rcirl_jax.train.loop import train
@@ -37,10 +35,7 @@ _DATA = flags.DEFINE_list(
 _TAGS = flags.DEFINE_list(
     "tags", [], "only scenes with one of these tags, e.g. lane_change,cut_in"
 )
-_OUTPUT = flags.DEFINE_string(
-    "output", None, "folder of the run; a run that is in it goes on", required=True
-)
-also_named("workdir", "output")
+_OUTPUT = flags.DEFINE_string("output", None, shared.OUTPUT, required=True)
 _SEED = flags.DEFINE_integer(
     "seed",
     0,
@@ -64,22 +59,24 @@ _COORDINATOR = flags.DEFINE_string(
 )
 _PROCESSES = flags.DEFINE_integer("num_processes", None, "how many there are")
 _PROCESS = flags.DEFINE_integer("process_id", None, "number of this one")
+_TRAINING = shared.training()
+_TRACKERS = shared.trackers()
 
 
 def main() -> None:
     """Flags -> one training run."""
     join_processes(_COORDINATOR.value, _PROCESSES.value, _PROCESS.value)
-    config = training.training_config(seed=_SEED.value)
+    config = _TRAINING.config(seed=_SEED.value)
     if _PARALLEL.value == "auto" and _PROCESSES.value is None:
         share_cores(config.batch_size)
-    dataset = open_datasets(_DATA.value, _VERIFY.value, training.DATA_WEIGHTS.value)
+    dataset = open_datasets(_DATA.value, _VERIFY.value, _TRAINING.data_weights)
     dataset = with_tags(dataset, _TAGS.value)
     running = Running(
         parallel=_PARALLEL.value,
         in_memory_mb=_IN_MEMORY.value,
         prefetch=_PREFETCH.value,
         checkpoint_every=_SAVE.value,
-        trackers=trackers(),
+        trackers=_TRACKERS(),
     )
     result = train(
         dataset,

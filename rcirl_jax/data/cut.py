@@ -118,7 +118,7 @@ def cut(
         if done and done[recording.name] != sha256:
             raise InputError(
                 f"{recording.name}: input or settings changed since the interrupted "
-                "import: expected the same; use another --output"
+                "import: expected the same; use another output folder"
             )
         return Cut(**about, **nothing, known=True)
     if recording.refused:

@@ -29,7 +29,7 @@ from rcirl_jax.data.store.rows import check_finite
 from rcirl_jax.data.store.splits import split_wholes, time_blocks
 from rcirl_jax.data.store.writer import DatasetWriter
 from rcirl_jax.errors import InputError, LostWorkError
-from rcirl_jax.runtime.executors import Executor, Here
+from rcirl_jax.runtime.executors import Executor, Serial
 from rcirl_jax.types import Demonstration, Recording
 
 SHARD_SCENES = 4096  # scenes after which a shard is closed
@@ -198,7 +198,7 @@ class _Import:
         if entry["name"] != made.name:
             raise InputError(
                 f"{made.name}: input or settings changed since the interrupted "
-                "import: expected the same; use another --output"
+                "import: expected the same; use another output folder"
             )
         _numbers(self.vehicles, entry["vehicles"])
         _numbers(self.groups, entry["groups"])
@@ -228,8 +228,8 @@ class _Import:
             self._close_shard()
             raise LostWorkError(
                 f"splits: groups: 1 ({group}): expected at least two vehicle-disjoint "
-                f"groups for --test_fraction={self.config.test_fraction:g}; give more "
-                "recordings, or import with --test_fraction=0 for training scenes only"
+                f"groups for test_fraction={self.config.test_fraction:g}; give more "
+                "recordings, or import with test_fraction=0 for training scenes only"
             )
         blocks, self.split_by = time_blocks(
             first_seen, vehicles, self.config.test_fraction
@@ -250,7 +250,7 @@ class _Import:
         if self.done:
             raise InputError(
                 f"{self.done[0]['name']}: missing: expected all recordings of the "
-                "interrupted import; use another --output"
+                "interrupted import; use another output folder"
             )
         self._check_share_left_out()
         if self.quality.scenes == 0:
@@ -297,7 +297,7 @@ class _Import:
             raise InputError(
                 f"import: {refused} of {recordings} recordings refused, the first: "
                 f"{self.first_refused}: expected up to {100.0 * share:g} % "
-                "(--leave_out)"
+                "(leave_out)"
             )
 
     def _flags(self) -> dict:
@@ -363,7 +363,7 @@ def import_parts(
     Raises:
       InputError: as `import_logs`.
     """
-    places = executor or Here()
+    places = executor or Serial()
     if config.leaves_out:
         parts = leaving_out(parts)
 

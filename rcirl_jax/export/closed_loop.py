@@ -1,10 +1,31 @@
-"""Weights files and names -> the rows of a closed-loop table."""
+"""A closed-loop suite by the names of weights files and baselines.
 
-from collections.abc import Sequence
+Rows hold compiled functions and cases come from files, so neither is sent to other
+processes: a piece, a range of cases with one row, names them, and whoever drives it
+builds them again. The tuned driver model is a JSON file with one number for every field
+of `Idm`: {"headway": 1.1, "standstill_gap": 2.3, ...}.
+"""
 
+import dataclasses
+import functools
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import jax
 import jax.numpy as jnp
+import msgspec
+import numpy as np
 
 from rcirl_jax.errors import InputError
+from rcirl_jax.evaluation.closed_loop.suite import (
+    Drive,
+    SuiteConfig,
+    SuiteResult,
+    bar_of,
+    drive_here,
+    run_suite,
+)
 from rcirl_jax.export.loading import (
     familiarity_of,
     open_reward,
@@ -27,12 +48,30 @@ from rcirl_jax.planner.rank import (
     rank_policy,
 )
 from rcirl_jax.planner.safety import SafetyConfig
+from rcirl_jax.runtime.atomic_files import read_json, write_json
+from rcirl_jax.runtime.checked import checked
+from rcirl_jax.runtime.executors import Executor
+from rcirl_jax.simulation.metrics import CaseMetrics
+from rcirl_jax.simulation.rollout import LANES
 from rcirl_jax.simulation.rows import (
     Row,
     baseline_row,
 )
+from rcirl_jax.simulation.suite import (
+    CaseRef,
+    CaseSet,
+    catalogue_set,
+    drive_row,
+    rollout_config,
+)
+from rcirl_jax.simulation.world.careful import judges
 
 DP_EVERY = 10  # steps between two plans of the DP row: it costs 1,000 rankings
+FIELDS = tuple(field.name for field in dataclasses.fields(Idm))
+_POSITIVE = Annotated[float, msgspec.Meta(gt=0.0, lt=1e6)]
+_IDM = msgspec.defstruct(
+    "_IDM", [(name, _POSITIVE) for name in FIELDS], forbid_unknown_fields=True
+)
 
 
 def score_of(reward: Reward) -> tuple[Score, Params]:
@@ -89,7 +128,7 @@ def table_rows(
         weights, or an unknown baseline.
     """
     if not weights:
-        raise InputError("--weights: none: expected at least one file")
+        raise InputError("weights: none: expected at least one file")
     config = RankConfig(safety=SafetyConfig(track=track))
     rewards = [open_reward(path) for path in weights]
     rows = _learned_rows(rewards, names, config)
@@ -97,7 +136,7 @@ def table_rows(
     preset, params = str(first.preset), reward_params(first)
     if dp and first.prior_cost is not None:
         raise InputError(
-            f"--dp: {first.file}: expected a reward without a prior cost: the own cost "
+            f"dp: {first.file}: expected a reward without a prior cost: the own cost "
             "is no sum over points"
         )
     if dp:
@@ -127,3 +166,101 @@ def _learned_rows(
         policy = rank_policy(score, config)
         rows.append(Row(name=name, policy=policy, params=params, seed=seed))
     return rows
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SuiteJob:
+    """The rows and cases of a suite by name; hashable and small."""
+
+    weights: tuple[str, ...]
+    baselines: tuple[str, ...]
+    refs: tuple[CaseRef, ...]
+    duration_s: float
+    plan_every: int = 1
+    dp: bool = False
+    names: tuple[str, ...] = ()  # of the learned rows; else after loss and shape
+    tuned_idm: Idm | None = None  # of a further row
+    track: str = "full"  # of the safety filter
+
+    def rows(self) -> list[Row]:
+        """Learned rows, then the baselines."""
+        return table_rows(
+            self.weights,
+            self.baselines,
+            self.plan_every,
+            dp=self.dp,
+            names=self.names,
+            track=self.track,
+            tuned_idm=self.tuned_idm,
+        )
+
+    def cases(self) -> CaseSet:
+        """The cases of the catalogue."""
+        return catalogue_set(self.refs, self.duration_s)
+
+
+@functools.lru_cache(maxsize=2)
+def _made(job: SuiteJob) -> tuple[dict[str, Row], CaseSet]:
+    rows = {row.name: row for row in [*judges(), *job.rows()]}
+    return rows, job.cases()
+
+
+def drive_piece(
+    piece: tuple[str, int, int], job: SuiteJob, config: SuiteConfig
+) -> Iterator[CaseMetrics]:
+    """Metrics of the cases first .. last - 1 with the row of a name."""
+    name, first, last = piece
+    rows, cases = _made(job)
+    row = rows[name]
+    yield drive_row(
+        row,
+        lambda a, b: cases.build(first + a, first + b),
+        last - first,
+        rollout_config(row, cases.duration_s, config.plan_every),
+        chunk=config.chunk,
+    )
+
+
+def drive_by(executor: Executor, job: SuiteJob) -> Drive:
+    """Returns what drives a job's rows; the result does not depend on the executor."""
+    if executor.workers == 1:
+        return drive_here
+
+    def drive(row: Row, cases: CaseSet, config: SuiteConfig) -> CaseMetrics:
+        total, size = len(cases.ids), -(-config.chunk // LANES) * LANES
+        # a rest that is shorter would be another shape for the compiler
+        pieces = [
+            (row.name, first, min(first + size, total))
+            for first in range(0, total, size)
+        ]
+        piece = functools.partial(drive_piece, job=job, config=config)
+        parts = []
+        with bar_of(row, total) as bar:
+            for made in executor.stream(piece, pieces):
+                parts.append(made)
+                bar.update(len(np.asarray(jax.tree.leaves(made)[0])))
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+    return drive
+
+
+def run_job(job: SuiteJob, executor: Executor) -> SuiteResult:
+    """Drives a job's rows over its catalogue cases, wherever the executor runs them."""
+    config = SuiteConfig(plan_every=job.plan_every)
+    return run_suite(job.rows(), job.cases(), config, drive_by(executor, job))
+
+
+def write_tuned_idm(path: Path, idm: Idm) -> None:
+    """Write the file, whole or not at all."""
+    write_json(path, {name: float(getattr(idm, name)) for name in FIELDS})
+
+
+def read_tuned_idm(path: Path) -> Idm:
+    """The driver model of a file.
+
+    Raises:
+      InputError: unreadable, or a field that is missing, unknown, or not a finite
+        number above 0; one line naming it.
+    """
+    found = checked(read_json(path, "JSON, a tuned IDM"), _IDM, path)
+    return Idm(**msgspec.structs.asdict(found))

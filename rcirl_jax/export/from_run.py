@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from rcirl_jax.data.store.joined import Demonstrations
-from rcirl_jax.errors import UNFORESEEN, InputError
+from rcirl_jax.errors import MALFORMED, InputError
 from rcirl_jax.export.reader import PriorCost, Reward
 from rcirl_jax.export.weights import FeatureSpec, RewardWeights, save
 from rcirl_jax.features import feature_map
@@ -23,7 +23,7 @@ from rcirl_jax.reward import (
 )
 from rcirl_jax.reward.module import LEAKY_SLOPE
 from rcirl_jax.runtime.atomic_files import read_json
-from rcirl_jax.runtime.settings import typed_settings
+from rcirl_jax.runtime.checked import typed_settings
 from rcirl_jax.train.featurise import featurised
 from rcirl_jax.train.loop import normaliser_rows, restore_run, to_device_batch
 from rcirl_jax.train.metrics import read_metrics
@@ -57,7 +57,7 @@ def read_config(workdir: Path) -> tuple[TrainConfig, dict]:
         config = _config_of(run["config"])
         if not isinstance(run.get("flags", {}), dict):
             raise ValueError("flags: not a table")
-    except UNFORESEEN as error:
+    except MALFORMED as error:
         raise InputError(f"{path}: {error}: expected a run of this version") from error
     return config, run
 
@@ -74,7 +74,7 @@ def datasets_of(workdir: Path) -> list[str]:
         if not isinstance(name, str) or not name.strip("\0") or "\0" in name:
             raise InputError(
                 f"{workdir / 'run.json'}: flags.data: {found}: expected a dataset, or "
-                "a list of them; or give --data"
+                "a list of them; or give data"
             )
     return names
 

@@ -15,12 +15,11 @@ from rcirl_jax.evaluation.closed_loop.likeness import (
 from rcirl_jax.evaluation.closed_loop.suite import (
     SuiteConfig,
     SuiteResult,
-    run_suite,
 )
 from rcirl_jax.evaluation.gate.decision import judge
 from rcirl_jax.evaluation.gate.runs import CANDIDATE, INCUMBENT, pair_of, repeats
 from rcirl_jax.evaluation.gate.types import GateConfig, Verdict
-from rcirl_jax.export.spread import SuiteJob, drive_by
+from rcirl_jax.export.closed_loop import SuiteJob, run_job
 from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.runtime.executors import Executor
 from rcirl_jax.simulation.cases import STEP_S
@@ -63,7 +62,7 @@ def gate_job(
     duration = case_duration(suite, duration_s)
     if learned and not Path(incumbent).is_file():
         raise InputError(
-            f"--incumbent: {incumbent}: expected a weights file or one of "
+            f"incumbent: {incumbent}: expected a weights file or one of "
             + ", ".join(BASELINES)
         )
     names = [*baselines] if learned else [incumbent, *baselines]
@@ -87,9 +86,8 @@ def drive_job(job: SuiteJob, executor: Executor) -> SuiteResult:
     Raises:
       InputError: the candidate's drives do not repeat.
     """
-    rows, config = job.rows(), SuiteConfig(plan_every=job.plan_every)
-    result = run_suite(rows, job.cases(), config, drive_by(executor, job))
-    repeats(rows[0], result, config)
+    result = run_job(job, executor)
+    repeats(job.rows()[0], result, SuiteConfig(plan_every=job.plan_every))
     return result
 
 

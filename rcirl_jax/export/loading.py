@@ -206,7 +206,7 @@ def short_names(files: Sequence[str]) -> list[str]:
     for number, one in enumerate(parts):
         if one in parts[:number]:
             raise InputError(
-                f"--weights: {files[number]}: met twice: expected distinct files"
+                f"weights: {files[number]}: met twice: expected distinct files"
             )
     names, count = [one[-1] for one in parts], 1
     while len(set(names)) < len(names):
@@ -256,12 +256,12 @@ def load_runs(
       InputError: a file twice; files of different features or sampler modes.
     """
     if not paths:
-        raise InputError("--weights: none: expected at least one file")
+        raise InputError("weights: none: expected at least one file")
     rewards = [open_reward(path) for path in paths]
     settings = {(r.preset, str(r.provenance.get("mode", "speed"))) for r in rewards}
     if len(settings) > 1:
         raise InputError(
-            f"--weights: {sorted(settings)}: expected files of one preset and mode"
+            f"weights: {sorted(settings)}: expected files of one preset and mode"
         )
     preset, mode = settings.pop()
     runs: dict[str, list[Scorer | OnTop]] = {}

@@ -106,7 +106,7 @@ def feature_map(preset: str) -> FeatureMap:
     """
     known = known_presets()
     if preset not in known:
-        raise InputError(f"--features: {preset}: expected one of {', '.join(known)}")
+        raise InputError(f"preset: {preset}: expected one of {', '.join(known)}")
     path = spec_root() / "features" / f"{preset}.toml"
     table = load_toml(path)
     rows, safety = table.get("feature", []), table.get("safety", {})

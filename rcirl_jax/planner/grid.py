@@ -69,7 +69,7 @@ class DpConfig:
     def __post_init__(self) -> None:
         """Reject a lattice without room."""
         if not 0.05 <= self.step <= 4.0:
-            raise InputError(f"--dp_step: {self.step}: expected 0.05 to 4 m/s^2")
+            raise InputError(f"dp_step: {self.step}: expected 0.05 to 4 m/s^2")
 
     @property
     def speed_step(self) -> float:

@@ -72,7 +72,7 @@ class SafetyConfig:
     def __post_init__(self) -> None:
         """Reject an unknown track."""
         if self.track not in TRACKS:
-            raise InputError(f"--filter: {self.track}: expected one of {TRACKS}")
+            raise InputError(f"track: {self.track}: expected one of {TRACKS}")
 
 
 class Verdict(flax.struct.PyTreeNode, kw_only=True):

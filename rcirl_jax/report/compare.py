@@ -13,14 +13,13 @@ from rcirl_jax.report.charts import Interval, interval_axis, interval_cell
 from rcirl_jax.report.pages import Table, facts_text, interval, write_page
 from rcirl_jax.report.tuning_page import DECISIONS
 from rcirl_jax.runtime.atomic_files import read_json
-from rcirl_jax.runtime.checked import checked
+from rcirl_jax.runtime.checked import checked, leaves
 from rcirl_jax.runtime.pipeline import Stages
-from rcirl_jax.runtime.settings import leaves
 
 RUN = "a folder of `rcirl autotune`, finished up to its verdict"
 HEX = 12  # digits of a hash that are shown
 # flags that say where a run was made, not what it is
-PLACES = ("output", "workdir", "run", "executor", "workers", "ray_address", "trackers")
+PLACES = ("output", "run", "executor", "workers", "ray_address", "trackers")
 ALWAYS = ("recipe", "data, sha256", "commit")  # settings shown also where all agree
 
 
@@ -166,10 +165,9 @@ def _settings(stages: Mapping[str, dict], verdict: _Verdict) -> dict[str, str]:
         "prior cost": str(inputs.get("prior_cost", ""))[:HEX],
     }
     found |= _flat(inputs.get("config"), "training")
-    rehearsal = (stages.get("rehearse 0", {}).get("inputs") or {}).get("rehearsal")
-    found |= _flat(rehearsal, "simulated demonstrations") | _flat(
-        verdict.config, "gate"
-    )
+    driven = stages.get("demonstrate 0", {}).get("inputs") or {}
+    plan = driven.get("simulated_demonstrations")
+    found |= _flat(plan, "simulated demonstrations") | _flat(verdict.config, "gate")
     said = {name.rpartition(": ")[2].rpartition(".")[2] for name in found}
     of_gate = {f"{name}_margin" for name in verdict.config}
     found |= {

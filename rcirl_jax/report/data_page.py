@@ -39,7 +39,7 @@ def choose_rows(tags: np.ndarray, count: int, wanted: Sequence[str] = ()) -> lis
     """
     for name in wanted:
         if name not in TAG_NAMES:
-            raise InputError(f"--tags: {name}: expected {', '.join(TAG_NAMES)}")
+            raise InputError(f"tags: {name}: expected {', '.join(TAG_NAMES)}")
     names = tuple(wanted) or TAG_NAMES
     queues = [_spread(np.flatnonzero(tags[:, TAG_NAMES.index(n)])) for n in names]
     if not wanted:
@@ -52,7 +52,7 @@ def choose_rows(tags: np.ndarray, count: int, wanted: Sequence[str] = ()) -> lis
             if queue and len(chosen) < count:
                 chosen[queue.pop(0)] = None
     if not chosen:
-        raise InputError(f"--tags: {','.join(wanted)}: no such scene in the dataset")
+        raise InputError(f"tags: {','.join(wanted)}: no such scene in the dataset")
     return sorted(chosen)
 
 
@@ -84,7 +84,7 @@ def write_data_page(
     """
     missing = [row for row in rows if not 0 <= row < dataset.count]
     if missing:
-        raise InputError(f"--rows: {missing[0]}: expected 0 to {dataset.count - 1}")
+        raise InputError(f"rows: {missing[0]}: expected 0 to {dataset.count - 1}")
     quality = dataset.manifest.quality
     scenes = _scenes(output.parent / "scenes", dataset, rows)
     present = [

@@ -35,23 +35,22 @@ class RewardConfig:
         """Reject unknown names."""
         if self.activation not in ACTIVATIONS:
             raise InputError(
-                f"--activation: {self.activation}: expected one of "
-                f"{sorted(ACTIVATIONS)}"
+                f"activation: {self.activation}: expected one of {sorted(ACTIVATIONS)}"
             )
         if self.pin not in PINS:
-            raise InputError(f"--pin: {self.pin}: expected one of {PINS}")
+            raise InputError(f"pin: {self.pin}: expected one of {PINS}")
         if self.constraint not in CONSTRAINTS:
             raise InputError(
-                f"--constraint: {self.constraint}: expected one of {CONSTRAINTS}"
+                f"constraint: {self.constraint}: expected one of {CONSTRAINTS}"
             )
         if self.constraint == "nonnegative" and self.hidden:
             raise InputError(
-                f"--hidden_size: {self.hidden}: expected 0 under "
-                "--constraint=nonnegative, which is linear in its costs"
+                f"hidden: {self.hidden}: expected 0 under "
+                "constraint=nonnegative, which is linear in its costs"
             )
         if self.constraint != "none" and self.module:
             raise InputError(
-                f"--constraint: {self.constraint}: expected none with --module, of "
+                f"constraint: {self.constraint}: expected none with module, of "
                 "whose weights nothing is known"
             )
 
@@ -63,7 +62,7 @@ class RewardConfig:
         """
         if self.module:
             raise InputError(
-                f"--module: {self.module}: expected none: weights.msgpack, and all "
+                f"module: {self.module}: expected none: weights.msgpack, and all "
                 "that reads it, holds the package's own network; for others there are "
                 "`rcirl train` and `rcirl export --stablehlo`"
             )

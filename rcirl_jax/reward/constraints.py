@@ -55,7 +55,7 @@ def pinned_tree(tree: dict[str, Any], config: RewardConfig) -> dict[str, Any]:
     point = tree.get("point", {})
     if "kernel" not in point.get("out", {}):
         raise InputError(
-            f"--pin: {config.pin}: expected none with --module={config.module}, which "
+            f"pin: {config.pin}: expected none with module={config.module}, which "
             "has no last layer `out`"
         )
     out = {**point["out"], "kernel": _unit(point["out"]["kernel"])}

@@ -147,7 +147,7 @@ def point_module(name: str) -> nn.Module:
     except (ImportError, AttributeError, TypeError, ValueError) as error:
         reason = str(error)
     raise InputError(
-        f"--module: {name}: {reason}: expected package.module:Class of a linen module "
+        f"module: {name}: {reason}: expected package.module:Class of a linen module "
         "whose fields have defaults"
     )
 

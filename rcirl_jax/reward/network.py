@@ -63,10 +63,10 @@ def init_tree(
     try:
         rewards, made = jax.eval_shape(network.point.init_with_output, key, x)
     except (TypeError, ValueError) as error:
-        raise InputError(f"--module: {config.module}: {error}") from error
+        raise InputError(f"module: {config.module}: {error}") from error
     if set(made) != {"params"} or rewards.shape != x.shape[:-1]:
         raise InputError(
-            f"--module: {config.module}: {sorted(made)}, {rewards.shape} of {x.shape}: "
+            f"module: {config.module}: {sorted(made)}, {rewards.shape} of {x.shape}: "
             "expected parameters only, and a reward for each point"
         )
     tree = dict(network.init(key, x, jnp.ones(x.shape[:-1], bool))["params"])

@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all, and JSON of a bounded size."""
+"""Atomic writes, locks, and JSON of a bounded size."""
 
 import contextlib
 import dataclasses
@@ -27,9 +27,9 @@ NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP)
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
-    """Write a file; who reads it sees the old one or the new one, also after a crash.
+    """Writes a file atomically: temporary file, fsync, rename; its folder is made.
 
-    Its folder is made. What a kill leaves behind ends in ".tmp".
+    A killed write leaves a file that ends in ".tmp".
 
     Raises:
       OSError: it cannot be written (the disk is full); names the file.
@@ -58,7 +58,7 @@ def write_whole(path: Path, content: str | bytes) -> None:
 
 @contextlib.contextmanager
 def locked(path: Path, *, wait: bool = True) -> Iterator[IO[bytes]]:
-    """A file open for appending, held by this process alone; made if missing.
+    """Opens a file for appending, held by this process alone; made if missing.
 
     Where the file system has no locks, nobody is kept out. By hand, because filelock
     holds a file of its own, which would stay beside every file written.
@@ -91,12 +91,12 @@ def locked(path: Path, *, wait: bool = True) -> Iterator[IO[bytes]]:
 
 
 def named(error: OSError, path: Path) -> OSError:
-    """The same error with a file's name; writing to an open one has none."""
+    """Adds a file's name to an error; one of writing to an open file has none."""
     return OSError(error.errno, error.strerror or str(error), str(path))
 
 
 def plain(node: Any) -> Any:  # noqa: ANN401
-    """JSON-ready: dataclasses to dicts, numpy to Python, infinities and NaN to None."""
+    """Makes JSON-ready: dataclasses to dicts, numpy to Python, NaN, inf to None."""
     if dataclasses.is_dataclass(node) and not isinstance(node, type):
         return {f.name: plain(getattr(node, f.name)) for f in dataclasses.fields(node)}
     if isinstance(node, Mapping):
@@ -113,7 +113,7 @@ def plain(node: Any) -> Any:  # noqa: ANN401
 def write_json(
     path: Path, body: Mapping[str, object] | Sequence[object], indent: int = 2
 ) -> None:
-    """The body as JSON (see `plain`), whole."""
+    """Writes the body as JSON (see `plain`), atomically."""
     write_whole(path, json.dumps(plain(body), indent=indent, allow_nan=False) + "\n")
 
 
@@ -128,7 +128,7 @@ def _levels(body: object) -> int:
 
 
 def parse_json(text: bytes | str, *, finite: bool = False) -> Any:  # noqa: ANN401
-    """The body of JSON from outside; what it holds can be written again.
+    """Parses JSON from outside; the body can be written again.
 
     Args:
       text: where it is bytes, UTF-8, with or without a byte order mark.
@@ -168,7 +168,7 @@ def _finite(text: str) -> float:
 
 
 def is_text(texts: str | np.ndarray) -> bool:
-    """Whether it can be printed and stored: half a surrogate pair is no character.
+    """True if it can be printed and stored: half a surrogate pair is no character.
 
     Python makes them of bytes that are no UTF-8, as in names of files; numpy holds
     any 32 bits as a character.
@@ -181,7 +181,7 @@ def is_text(texts: str | np.ndarray) -> bool:
 
 
 def read_json(path: Path, expected: str, most: int = MAX_JSON_BYTES) -> Any:  # noqa: ANN401
-    """The body of a JSON file.
+    """Reads the body of a JSON file.
 
     Args:
       path: of the file.

@@ -1,4 +1,4 @@
-"""How XLA compiles long loops on a CPU, and how long it takes."""
+"""How XLA compiles long loops on a CPU, how long it takes, and a bar that says so."""
 
 import contextlib
 import functools
@@ -6,9 +6,11 @@ import threading
 from collections.abc import Iterator
 
 import jax
+import tqdm
 
 # XLA takes 256 bits by itself; a processor without wider vectors ignores it
 WIDE = {"xla_cpu_prefer_vector_width": 512}
+NOTE = "compiling first"
 COMPILED = "/jax/core/compile/backend_compile_duration"
 
 
@@ -30,7 +32,7 @@ def wide_vectors() -> dict[str, int] | None:
 
 @contextlib.contextmanager
 def compiles(name: str | None = None) -> Iterator[list[float]]:
-    """Seconds of each compilation inside the `with` block, in any thread.
+    """Yields the seconds of each compilation inside the block, in any thread.
 
     Args:
       name: of the one program that counts, as JAX has it: "jit(function)"; None: all.
@@ -48,3 +50,17 @@ def compiles(name: str | None = None) -> Iterator[list[float]]:
         yield found
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
+
+
+class CompilesFirst(tqdm.tqdm):
+    """A tqdm bar with a note that it compiles, until the first update."""
+
+    def __init__(self, **given) -> None:  # noqa: ANN003
+        super().__init__(**given)
+        self.set_postfix_str(NOTE)
+
+    def update(self, n: float | None = 1) -> bool | None:
+        """Counts, and removes the note."""
+        if self.postfix == NOTE:
+            self.set_postfix_str("", refresh=False)
+        return super().update(n)

@@ -6,21 +6,22 @@ on where it was made. Pieces have to be idempotent: one that is lost with its
 process or node is done again.
 
 Ray does the scheduling, the transport and the retries; this module only keeps
-the order and bounds what is in flight. Processes are the standard library's, because
-loky's outlive a killed parent, do no lost piece again and start a third slower.
+the order and bounds what is in flight. Processes are the standard library's: loky's,
+and so joblib's, outlive a killed parent, do no lost piece again and start a third
+slower.
 """
 
-import collections
 import concurrent.futures as futures
 import importlib
-import itertools
 import multiprocessing
 import os
 import signal
 import socket
 import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures.process import BrokenProcessPool
+from itertools import islice
 from multiprocessing.synchronize import Barrier
 from typing import Any, Protocol, TypeVar
 
@@ -47,11 +48,15 @@ class Executor(Protocol):
     def stream(
         self, function: Callable[[Item], Iterable[Result]], items: Iterable[Item]
     ) -> Iterator[Result]:
-        """Results of all items, in their order."""
+        """Yields the results of all items, in their order.
+
+        Raises:
+          LostWorkError: a piece was lost with its process or node again and again.
+        """
         ...
 
 
-class Here:
+class Serial:
     """In this process, one after the other; results as they come."""
 
     workers = 1
@@ -59,7 +64,7 @@ class Here:
     def stream(
         self, function: Callable[[Item], Iterable[Result]], items: Iterable[Item]
     ) -> Iterator[Result]:
-        """Results of all items, in their order."""
+        """Yields the results of all items, in their order."""
         for item in items:
             yield from function(item)
 
@@ -75,76 +80,64 @@ class Processes:
     def stream(
         self, function: Callable[[Item], Iterable[Result]], items: Iterable[Item]
     ) -> Iterator[Result]:
-        """Results of all items, in their order.
+        """Yields the results of all items, in their order.
 
         Raises:
           LostWorkError: a piece killed its process ATTEMPTS times (out of memory).
         """
-        rest: collections.deque[Item] = collections.deque()
         source, failures = iter(items), 0
-        while True:
-            # after a loss one piece at a time, so that the guilty one is known
-            width = self.workers * AHEAD if failures == 0 else 1
-            try:
-                for result in self._results(function, source, rest, width):
-                    failures = 0
-                    yield from result
-                    if width == 1:
-                        break
-                else:
-                    return
-            except BrokenProcessPool as error:
-                failures += 1
-                if failures >= ATTEMPTS:
-                    raise LostWorkError(
-                        f"{_name(rest[0])}: its process was killed {failures} times: "
-                        "expected enough memory; use fewer --workers"
-                    ) from error
-
-    def _results(
-        self,
-        function: Callable[[Item], Iterable[Result]],
-        source: Iterator[Item],
-        rest: "collections.deque[Item]",
-        width: int,
-    ) -> Iterator[list[Result]]:
-        """Work off `rest`, then `source`; `rest` keeps what has no result yet."""
-        if self._pool is None:
-            # forking a process that runs JAX's threads can hang
-            start = multiprocessing.get_context("spawn")
-            self._pool = futures.ProcessPoolExecutor(
-                self.workers,
-                mp_context=start,
-                initializer=_as_worker,
-                initargs=(start.Barrier(self.workers),),
-            )
-            # all processes before any piece: a pool (of Python 3.11) that starts one
-            # while it finds another killed loses its own thread
-            for _ in range(self.workers):
-                self._pool.submit(os.getpid)
-        pool = self._pool
-        running: collections.deque[futures.Future] = collections.deque()
+        waiting: deque[Item] = deque()  # items without a result
+        running: deque[futures.Future] = deque()  # of the first of them
         try:
             while True:
-                for item in itertools.islice(source, max(width - len(rest), 0)):
-                    rest.append(item)
-                for item in itertools.islice(rest, len(running), width):
-                    running.append(pool.submit(_listed, function, item))
-                if not running:
+                # after a loss one piece at a time, so that the guilty one is known
+                width = 1 if failures else self.workers * AHEAD
+                waiting.extend(islice(source, max(width - len(waiting), 0)))
+                if not waiting:
                     return
-                result = running.popleft().result()
-                rest.popleft()
-                yield result
-        except BrokenProcessPool:
-            self._pool = None
-            raise
+                self._pool = self._pool or _started(self.workers)
+                try:
+                    for item in islice(waiting, len(running), width):
+                        running.append(self._pool.submit(_listed, function, item))
+                    results = running.popleft().result()
+                except BrokenProcessPool as error:
+                    self._pool, failures = None, failures + 1
+                    running.clear()
+                    if failures < ATTEMPTS:
+                        continue
+                    raise LostWorkError(
+                        f"{_name(waiting[0])}: its process was killed {failures} "
+                        "times: expected enough memory; use fewer workers"
+                    ) from error
+                failures = 0
+                waiting.popleft()
+                yield from results
         finally:
             for future in running:
                 future.cancel()
 
 
+def _started(workers: int) -> futures.ProcessPoolExecutor:
+    """Starts a pool and all its processes.
+
+    Spawned, since a fork of a process that runs JAX's threads can hang. All of them
+    before any piece: a pool (of Python 3.11) that starts one while it finds another
+    killed loses its own thread.
+    """
+    spawn = multiprocessing.get_context("spawn")
+    pool = futures.ProcessPoolExecutor(
+        workers,
+        mp_context=spawn,
+        initializer=_as_worker,
+        initargs=(spawn.Barrier(workers),),
+    )
+    for _ in range(workers):
+        pool.submit(os.getpid)
+    return pool
+
+
 def _as_worker(all_started: Barrier) -> None:
-    """On the CPU, and no longer than the process that started this one.
+    """Computes on the CPU, and no longer than the process that started this one lives.
 
     Numbers must not depend on an accelerator, nor processes fight over one. A parent
     that is killed cannot tell its workers to end: each waits for that itself.
@@ -156,31 +149,13 @@ def _as_worker(all_started: Barrier) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a terminal: the parent decides
     parent = multiprocessing.parent_process()
 
-    def outlive_nobody() -> None:
+    def end_with_parent() -> None:
         if parent is not None:
             parent.join()
             os._exit(1)
 
-    threading.Thread(target=outlive_nobody, daemon=True).start()
+    threading.Thread(target=end_with_parent, daemon=True).start()
     all_started.wait()
-
-
-def _listed_in(
-    folder: str, function: Callable[[Item], Iterable[Result]], item: Item
-) -> list[Result]:
-    """As from `folder`, so that relative paths mean the same files on every node."""
-    os.chdir(folder)
-    return _listed(function, item)
-
-
-def _listed(function: Callable[[Item], Iterable[Result]], item: Item) -> list[Result]:
-    return list(function(item))
-
-
-def _name(item: object) -> str:
-    """A piece in a message: its input file, if it has one."""
-    first = item[0] if isinstance(item, tuple) and item else item
-    return str(getattr(first, "input", first))[:200]
 
 
 class Ray:
@@ -191,7 +166,7 @@ class Ray:
             self._ray = importlib.import_module("ray")
         except ImportError as error:
             raise InputError(
-                "--executor: ray: not installed: expected pip install 'rcirl-jax[ray]'"
+                "ray: not installed: expected pip install 'rcirl-jax[ray]'"
             ) from error
         if not self._ray.is_initialized():
             self._connect(address)
@@ -213,28 +188,32 @@ class Ray:
             )
         except (OSError, RuntimeError, ValueError) as error:
             raise InputError(
-                f"--ray_address: {address}: {error}: expected a running cluster"
+                f"ray_address: {address}: {error}: expected a running cluster"
             ) from error
 
     def stream(
         self, function: Callable[[Item], Iterable[Result]], items: Iterable[Item]
     ) -> Iterator[Result]:
-        """Results of all items, in their order; lost pieces are done again."""
+        """Yields the results of all items, in their order; lost pieces are done again.
+
+        Raises:
+          LostWorkError: a piece was lost RETRIES times.
+        """
         # where nodes or processes are lost; errors of the function, which would
         # come again, are not retried
-        remote = self._ray.remote(max_retries=RETRIES)(_listed_in)
+        remote = self._ray.remote(max_retries=RETRIES)(_listed)
         shared, folder = self._ray.put(function), os.getcwd()
-        source, running = iter(items), collections.deque()
+        source, running = iter(items), deque()
         while True:
             room = self.workers * AHEAD - len(running)
-            for item in itertools.islice(source, max(room, 0)):
-                running.append((_name(item), remote.remote(folder, shared, item)))
+            for item in islice(source, max(room, 0)):
+                running.append((_name(item), remote.remote(shared, item, folder)))
             if not running:
                 return
             yield from self._result(*running.popleft())
 
     def _result(self, name: str, reference: Any) -> list:  # noqa: ANN401
-        """The value, or the function's own error in place of Ray's."""
+        """Returns the value, or raises the function's own error in place of Ray's."""
         try:
             return self._ray.get(reference)
         except self._ray.exceptions.RayTaskError as error:
@@ -248,10 +227,25 @@ class Ray:
             ) from error
 
 
+def _listed(
+    function: Callable[[Item], Iterable[Result]], item: Item, folder: str | None = None
+) -> list[Result]:
+    """Runs a piece; from `folder`, relative paths mean the same files on every node."""
+    if folder is not None:
+        os.chdir(folder)
+    return list(function(item))
+
+
+def _name(item: object) -> str:
+    """A piece in a message: its input file, if it has one."""
+    first = item[0] if isinstance(item, tuple) and item else item
+    return str(getattr(first, "input", first))[:200]
+
+
 def two_at_a_time(
     work: Callable[[Item], Result], items: Iterable[Item]
 ) -> list[Result]:
-    """`work` of every item in their order, in two threads of this process.
+    """Does `work` of every item in two threads of this process; in their order.
 
     For work that compiles longer than it computes: one compiles, another computes.
     """
@@ -262,15 +256,20 @@ def two_at_a_time(
 def make_executor(
     name: str, *, workers: int = 1, ray_address: str = "auto"
 ) -> Executor:
-    """The executor of the flags --executor, --workers, --ray_address.
+    """Makes an executor.
+
+    Args:
+      name: one of EXECUTORS.
+      workers: processes at once, of "local".
+      ray_address: of the cluster's head, of "ray".
 
     Raises:
       InputError: unknown name, fewer than one worker, no Ray or no cluster.
     """
     if name not in EXECUTORS:
-        raise InputError(f"--executor: {name}: expected one of {EXECUTORS}")
+        raise InputError(f"executor: {name}: expected one of {EXECUTORS}")
     if workers < 1:
-        raise InputError(f"--workers: {workers}: expected at least 1")
+        raise InputError(f"workers: {workers}: expected at least 1")
     if name == "ray":
         return Ray(ray_address)
-    return Here() if workers == 1 else Processes(workers)
+    return Serial() if workers == 1 else Processes(workers)

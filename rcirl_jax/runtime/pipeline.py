@@ -27,11 +27,13 @@ from rcirl_jax.runtime.specs import spec_root
 FILE = "stages.json"
 LOCK = ".lock"  # in a folder that one process at a time works in
 SCHEMA_VERSION = 1
+PACKAGE = Path(__file__).resolve().parents[1]
+READ = ("features", "scenarios", "sources")  # of data_specs
 FileName = Annotated[str, msgspec.Meta(pattern=r"\A[^\0]*\Z")]
 
 
 def file_sha256(path: Path) -> str:
-    """Of a file's bytes."""
+    """Sha256 of a file's bytes."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -44,17 +46,24 @@ def digest(node: Any) -> str:  # noqa: ANN401
 
 @functools.cache
 def code_sha256() -> str:
-    """Of this package's sources and of the specs that users edit."""
-    package = Path(__file__).resolve().parents[1]
+    """Sha256 of all that decides a result besides settings and data.
+
+    The package's modules and page templates, and of data_specs what modules read by
+    themselves. Recipes are settings. Any change counts, also of a comment.
+    """
     found = {}
-    for root, pattern in ((package, "*.py"), (spec_root(), "*.toml")):
-        for file in sorted(root.rglob(pattern)):
-            found[f"{pattern} {file.relative_to(root)}"] = file_sha256(file)
+    for root, pattern in (
+        (PACKAGE, "**/*.py"),
+        (PACKAGE, "report/templates/*"),
+        *((spec_root(), f"{folder}/*.toml") for folder in READ),
+    ):
+        for file in sorted(root.glob(pattern)):
+            found[file.relative_to(root).as_posix()] = file_sha256(file)
     return digest(found)
 
 
 class _Record(msgspec.Struct):
-    """What is used of a stage's record."""
+    """The fields of a stage's record that are read."""
 
     key: str
     outputs: dict[FileName, str]  # sha256 of each
@@ -77,7 +86,7 @@ class Stages:
         stale: Sequence[str] = (),
         made_by: Mapping[str, Any] | None = None,
     ) -> bool:
-        """Do the work unless it has been done from these inputs.
+        """Does the work unless it has been done from these inputs.
 
         Args:
           name: of the stage.
@@ -106,7 +115,7 @@ class Stages:
     def is_done(
         self, name: str, inputs: Mapping[str, Any], outputs: Sequence[Path]
     ) -> bool:
-        """Whether a stage was done from these inputs and its outputs are whole."""
+        """True if a stage was done from these inputs and its outputs are whole."""
         known = self.read().get(name, {})
         return known.get("key") == digest(inputs) and self._intact(known, outputs)
 
@@ -118,7 +127,7 @@ class Stages:
         seconds: float,
         made_by: Mapping[str, Any] | None = None,
     ) -> None:
-        """Note that a stage has been done; arguments as of `run`.
+        """Notes that a stage has been done; arguments as of `run`.
 
         Raises:
           InputError: an output is missing.
@@ -138,7 +147,7 @@ class Stages:
         self._write({**self.read(), name: record})
 
     def _forget(self, names: Sequence[str]) -> None:
-        """Remove the outputs of stages, then their records."""
+        """Removes the outputs of stages, then their records."""
         known, inside = self.read(), self.folder.resolve()
         for name in names:
             for file in known.get(name, {}).get("outputs", {}):
@@ -169,7 +178,7 @@ class Stages:
         )
 
     def read(self) -> dict[str, Any]:
-        """Finished stages by name.
+        """Reads the finished stages by name.
 
         Raises:
           InputError: the file is not one of this version.
@@ -196,7 +205,7 @@ class Stages:
 
 @contextlib.contextmanager
 def only_one(folder: Path, *, leave_nothing: bool = False) -> Iterator[None]:
-    """Hold a folder for this process; it is made if missing.
+    """Holds a folder for this process; it is made if missing.
 
     The lock goes with the process, however that ends; its file means nothing.
 

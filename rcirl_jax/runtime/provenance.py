@@ -1,4 +1,4 @@
-"""What made an artefact: commit, code, versions and machine."""
+"""Provenance of an artefact: commit, code, versions and machine."""
 
 import os
 import platform

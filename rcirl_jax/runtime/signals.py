@@ -33,14 +33,14 @@ class Interrupted(BaseException):
 
 
 class _Heard:
-    """What this process has been told."""
+    """The signal this process was sent, and whether somebody asks for it later."""
 
     number: int | None = None
     waits: bool = False  # somebody asks for it at a better moment
 
 
 def install() -> None:
-    """Hear both signals from now on; in the main thread, once."""
+    """Handles both signals from now on; in the main thread, once."""
     read, write = os.pipe()
     os.set_blocking(write, False)
     for number in SIGNALS:
@@ -58,7 +58,7 @@ def _hear(number: int, _: FrameType | None) -> None:
 
 
 def _end_in_time(read: int) -> None:
-    """Wait for the first signal, give the main thread its time, end the process."""
+    """Waits for the first signal, gives the main thread its time, ends the process."""
     number = 0
     while number not in SIGNALS:
         number = os.read(read, 1)[0]
@@ -70,7 +70,7 @@ def _end_in_time(read: int) -> None:
 
 
 def leave(number: int, why: str = "") -> NoReturn:
-    """Say one line and end now; workers see their parent gone and end as well."""
+    """Prints one line and ends now; workers see their parent gone and end as well."""
     name = signal.Signals(number).name
     line = f"stopped by {name}: {why}run the same command again to go on\n"
     with contextlib.suppress(OSError, ValueError):
@@ -82,7 +82,7 @@ def leave(number: int, why: str = "") -> NoReturn:
 
 @contextlib.contextmanager
 def asked() -> Iterator[Callable[[], int | None]]:
-    """Inside, a signal waits until it is asked for: its number, or None.
+    """Defers signals inside the block; yields what asks for the number, or None.
 
     Raises:
       Interrupted: at the end, if nobody asked.

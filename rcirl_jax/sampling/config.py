@@ -78,4 +78,4 @@ class SamplerConfig:
     def __post_init__(self) -> None:
         """Reject an unknown mode."""
         if self.mode not in MODES:
-            raise InputError(f"--mode: {self.mode}: expected one of {MODES}")
+            raise InputError(f"mode: {self.mode}: expected one of {MODES}")

@@ -34,7 +34,7 @@ from rcirl_jax.data.store.writer import DatasetWriter
 from rcirl_jax.errors import InputError
 from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.planner.yielding import Yielding, yielding_policy
-from rcirl_jax.runtime.bars import CompilesFirst
+from rcirl_jax.runtime.compiling import CompilesFirst
 from rcirl_jax.simulation.cases import STEP_S, Case, Record
 from rcirl_jax.simulation.rollout import (
     Params,
@@ -111,7 +111,7 @@ def _rows(
         row["frame"] = round(now / STEP_S)
         add_labels([row])
         row["tags"] = row["tags"].copy()
-        row["tags"][Tag.REHEARSED] = True
+        row["tags"][Tag.SIMULATED] = True
         yield row
 
 
@@ -140,12 +140,12 @@ def drive_catalogue(
     output: str | Path,
     config: DriveConfig,
     *,
-    teacher: tuple[Policy, Params] | None = None,
+    expert: tuple[Policy, Params] | None = None,
     learner: tuple[Policy, Params] | None = None,
     overwrite: bool = False,
     before_commit: Callable[[Dataset], object] = lambda dataset: None,
 ) -> Manifest:
-    """Drive cases with a teacher and write the drives as a dataset.
+    """Drive cases with an expert and write the drives as a dataset.
 
     A case is a recording, a vehicle and a group of its own, so splits are by
     case. Drives with any collision are dropped and counted in the notes.
@@ -154,10 +154,10 @@ def drive_catalogue(
       refs: the cases, each driven by one driver in turn.
       output: dataset folder or tensorstore URL.
       config: duration, stride, split.
-      teacher: who shows how to drive, with its weights; None: the driver models of
+      expert: who shows how to drive, with its weights; None: the driver models of
         `DRIVERS` in turn.
       learner: a policy planning every `period_s`, and its weights, with which
-        the teacher takes turns.
+        the expert takes turns.
       overwrite: replace a finished dataset.
       before_commit: as `DatasetWriter.finish`.
 
@@ -169,7 +169,7 @@ def drive_catalogue(
         if writer.committed():  # of a killed run: drives are not taken up halfway
             writer = DatasetWriter(str(output), overwrite=True)
         try:
-            return _drive_all(refs, writer, config, (teacher, learner), before_commit)
+            return _drive_all(refs, writer, config, (expert, learner), before_commit)
         except InputError:
             writer.abort()
             raise
@@ -224,7 +224,7 @@ def _drive_all(
 def _drives(
     refs: Sequence[CaseRef],
     first: int,
-    teacher: tuple[Policy, Params],
+    expert: tuple[Policy, Params],
     learner: tuple[Policy, Params] | None,
     rollout: RolloutConfig,
     config: DriveConfig,
@@ -233,7 +233,7 @@ def _drives(
     cases = with_destinations(build(refs, config.duration_s), first, config)
     fill = np.minimum(np.arange(CHUNK), len(refs) - 1)
     full = jax.tree.map(lambda leaf: leaf[fill], cases)
-    (policy, params), relief = teacher, None
+    (policy, params), relief = expert, None
     if learner:
         policy, params, relief = learner[0], (learner[1], params), policy
     record, _, scenes = jax.tree.map(
@@ -248,7 +248,7 @@ def _drives(
 def with_destinations(cases: Case, first: int, config: DriveConfig) -> Case:
     """Cases [B]; every `destination_every`-th gets a destination along the road.
 
-    So the teacher shows how to stop at a destination, which the suite's own cases
+    So the expert shows how to stop at a destination, which the suite's own cases
     have beyond their end.
     """
     if not config.destination_every:

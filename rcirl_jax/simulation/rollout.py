@@ -59,11 +59,11 @@ class RolloutConfig:
         """Reject what does not divide."""
         if not 1 <= self.plan_every <= 50:
             raise InputError(
-                f"--plan_every: {self.plan_every}: expected 1 to 50 steps of 0.1 s"
+                f"plan_every: {self.plan_every}: expected 1 to 50 steps of 0.1 s"
             )
         if self.steps < 1 or self.steps % self.plan_every:
             raise InputError(
-                f"--plan_every: {self.plan_every}: expected a divisor of the "
+                f"plan_every: {self.plan_every}: expected a divisor of the "
                 f"{self.steps} steps"
             )
 

@@ -102,4 +102,4 @@ def baseline_row(
         params = init_reward(jax.random.key(0), count, shape)
         weights = (pinned(params, shape), normaliser)
         return learned_row(name, weights, preset, shape.activation, config)
-    raise InputError(f"--baselines: {name}: expected some of {', '.join(BASELINES)}")
+    raise InputError(f"baselines: {name}: expected some of {', '.join(BASELINES)}")

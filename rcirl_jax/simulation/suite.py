@@ -61,7 +61,7 @@ def case_ref(text: str) -> CaseRef:
     family, index, seed = parse_case_id(text)
     if family not in family_names():
         raise InputError(
-            f"--case: {text}: family: expected one of {', '.join(family_names())}"
+            f"case: {text}: family: expected one of {', '.join(family_names())}"
         )
     return CaseRef(family=family, index=index, seed=seed)
 
@@ -82,15 +82,15 @@ def suite_refs(
     known = family_names()
     names = known if suite in ("full", "smoke") else tuple(suite.split(","))
     if len(set(names)) < len(names):
-        raise InputError(f"--suite: {suite}: a family twice: expected distinct ones")
+        raise InputError(f"suite: {suite}: a family twice: expected distinct ones")
     for name in names:
         if name not in known:
             raise InputError(
-                f"--suite: {name}: expected full, smoke or some of {', '.join(known)}"
+                f"suite: {name}: expected full, smoke or some of {', '.join(known)}"
                 + did_you_mean(name, ("full", "smoke", *known))
             )
     if per_family is not None and per_family < 1:
-        raise InputError(f"--cases: {per_family}: expected at least 1")
+        raise InputError(f"cases: {per_family}: expected at least 1")
     refs = []
     for name in names:
         declared = 1 if suite == "smoke" else load_family(name).cases
@@ -107,7 +107,7 @@ def case_duration(suite: str, given: float | None) -> float:
     """
     duration = given or (SMOKE_S if suite == "smoke" else FULL_S)
     if not 1.0 <= duration <= FULL_S:
-        raise InputError(f"--duration: {duration}: expected 1 to {FULL_S:g} s")
+        raise InputError(f"duration_s: {duration}: expected 1 to {FULL_S:g} s")
     return duration
 
 

@@ -223,7 +223,7 @@ def _newest_whole(folder: Path) -> tuple[int | None, dict[int, str]]:
     reasons = "; ".join(f"{step}: {why}" for step, why in bad.items())
     raise InputError(
         f"{folder}: checkpoint {reasons}: expected one that is whole; use another "
-        "--output to start again"
+        "folder to start again"
     )
 
 

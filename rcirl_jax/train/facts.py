@@ -45,20 +45,20 @@ def facts_of(
 def admitted(scene: Scene, candidates: Candidates, config: TrainConfig) -> jax.Array:
     """[K] bool: candidates that the safety filter lets a planner choose.
 
-    A teacher in the simulator stops at a line and then drives over it; the planner's
+    An expert in the simulator stops at a line and then drives over it; the planner's
     view at the start of the scene forbids that for all its times.
 
     Args:
       scene: as the planner sees it.
       candidates: of it, K.
       config: `admissible_in` says in which scenes the filter is asked: in none, in
-        those that a teacher drove, or in all; elsewhere every candidate is admitted.
+        those that an expert drove, or in all; elsewhere every candidate is admitted.
     """
     if config.admissible_in == "none":
         return jnp.ones(candidates.feasible.shape, bool)
     passed = check(scene, candidates).admissible
-    if config.admissible_in == "rehearsed":
-        passed = passed | ~scene.tags[Tag.REHEARSED]
+    if config.admissible_in == "simulated":
+        passed = passed | ~scene.tags[Tag.SIMULATED]
     return passed
 
 

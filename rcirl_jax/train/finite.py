@@ -83,7 +83,7 @@ def check_step(
         )
     raise InputError(
         f"train: step {step}: loss or gradient: not finite: features are finite; "
-        "lower --learning_rate; the state before is kept"
+        "lower learning_rate; the state before is kept"
     )
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.atomic_files import named, parse_json, write_whole
-from rcirl_jax.runtime.bars import CompilesFirst
+from rcirl_jax.runtime.compiling import CompilesFirst
 from rcirl_jax.train.trackers import Writer
 
 MAX_STEP = 2**63 - 1  # what 64 bits hold

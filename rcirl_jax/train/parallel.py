@@ -119,19 +119,19 @@ def parallelise(step: Step, how: str, batch_size: int) -> Parallel:
         does not divide evenly.
     """
     if how not in PARALLEL:
-        raise InputError(f"--parallel: {how}: expected one of {', '.join(PARALLEL)}")
+        raise InputError(f"parallel: {how}: expected one of {', '.join(PARALLEL)}")
     how = chosen(batch_size) if how == "auto" else how
     if how == "jit":
         if jax.process_count() > 1:
             raise InputError(
-                f"--parallel: jit: {jax.process_count()} processes: "
+                f"parallel: jit: {jax.process_count()} processes: "
                 f"expected one of {', '.join(MANY)}"
             )
         return Parallel(step=single(step), place=jax.device_put, replicate=lambda x: x)
     count = jax.device_count()
     if batch_size % count:
         raise InputError(
-            f"--batch_size: {batch_size}: expected a multiple of {count} devices"
+            f"batch_size: {batch_size}: expected a multiple of {count} devices"
         )
     everywhere, rows = _shardings(count)
 

@@ -37,21 +37,19 @@ def join_processes(
         return
     if coordinator_address is None or num_processes is None or process_id is None:
         raise InputError(
-            f"--coordinator_address, --num_processes, --process_id: {given}: "
+            f"coordinator_address, num_processes, process_id: {given}: "
             "expected all three or none"
         )
     host, _, port = coordinator_address.rpartition(":")
     if not host or not port.isdecimal() or not 1 <= int(port) <= 65535:
         raise InputError(
-            f"--coordinator_address: {coordinator_address}: expected host:port, "
+            f"coordinator_address: {coordinator_address}: expected host:port, "
             "port 1 to 65535"
         )
     if num_processes < 1:
-        raise InputError(f"--num_processes: {num_processes}: expected >= 1")
+        raise InputError(f"num_processes: {num_processes}: expected >= 1")
     if not 0 <= process_id < num_processes:
-        raise InputError(
-            f"--process_id: {process_id}: expected 0 to {num_processes - 1}"
-        )
+        raise InputError(f"process_id: {process_id}: expected 0 to {num_processes - 1}")
     jax.distributed.initialize(coordinator_address, num_processes, process_id)
 
 

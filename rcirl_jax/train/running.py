@@ -36,7 +36,7 @@ class Running:
         for name, low in least.items():
             value = getattr(self, name)
             if not value >= low:
-                raise InputError(f"--{name}: {value}: expected >= {low}")
+                raise InputError(f"{name}: {value}: expected >= {low}")
 
 
 def check_run(workdir: Path, config: TrainConfig, dataset: Demonstrations) -> None:
@@ -64,7 +64,7 @@ def check_run(workdir: Path, config: TrainConfig, dataset: Demonstrations) -> No
         if before != setting and name != "epochs":
             raise InputError(
                 f"{path}: {name}: {before}: expected {setting} to resume; "
-                "use another --output for other settings"
+                "use another folder for other settings"
             )
 
 

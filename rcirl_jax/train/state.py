@@ -54,7 +54,7 @@ POSITIVES = ("human", "nearest")
 # what the learner sees of the others' future: the planner's prediction, or the record
 FUTURES = ("predicted", "recorded")
 LEARNED_FUTURES = (*FUTURES, "both")
-ADMISSIBLE_IN = ("none", "rehearsed", "all")
+ADMISSIBLE_IN = ("none", "simulated", "all")
 
 
 # least, most, in words; constants of losses are >= 0 unless they are named
@@ -110,8 +110,8 @@ class TrainConfig:
     # "nearest" feasible candidate to it (what a planner could have driven)
     positive: str = "human"
     # scenes in which the nearest candidate has to be one that the planner's safety
-    # filter admits: "none", "rehearsed" ones (a planner drove there), or "all"
-    admissible_in: str = "rehearsed"
+    # filter admits: "none", "simulated" ones (a planner drove there), or "all"
+    admissible_in: str = "simulated"
     # the others' future: "predicted" as in closed loop, "recorded" as in the paper, or
     # "both": drawn anew for each scene and step, so that V can be asked about either
     futures: str = "predicted"
@@ -127,21 +127,21 @@ class TrainConfig:
     sampler: SamplerConfig = dataclasses.field(default_factory=SamplerConfig)
 
     def __post_init__(self) -> None:
-        """Reject values out of range with the flag's name."""
+        """Reject values out of range."""
         known = {"loss": LOSSES, "optimizer": OPTIMIZERS, "positive": POSITIVES}
         known |= {"futures": LEARNED_FUTURES, "admissible_in": ADMISSIBLE_IN}
         for name, values in known.items():
             if getattr(self, name) not in values:
                 raise InputError(
-                    f"--{name}: {getattr(self, name)}: expected one of {sorted(values)}"
+                    f"{name}: {getattr(self, name)}: expected one of {sorted(values)}"
                     + did_you_mean(getattr(self, name), values)
                 )
         for name, (low, high, text) in RANGES.items():
             if not low <= getattr(self, name) <= high:
-                raise InputError(f"--{name}: {getattr(self, name)}: expected {text}")
+                raise InputError(f"{name}: {getattr(self, name)}: expected {text}")
         if self.loss == "listwise" and self.hard_negatives and self.hard_pool > 1:
             raise InputError(
-                f"--hard_pool: {self.hard_pool}: expected 1 with --loss=listwise: its "
+                f"hard_pool: {self.hard_pool}: expected 1 with loss=listwise: its "
                 "proposal density is that of all candidates drawn"
             )
 

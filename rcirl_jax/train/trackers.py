@@ -16,7 +16,7 @@ import numpy as np
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.atomic_files import named
-from rcirl_jax.runtime.settings import leaves
+from rcirl_jax.runtime.checked import leaves
 from rcirl_jax.train.state import TrainConfig
 from rcirl_jax.units import TIMES_S
 
@@ -198,14 +198,14 @@ def trackers(
     made = []
     for name in ("tensorboard",) if names is None else names:
         if name not in TRACKERS:
-            raise InputError(f"--trackers: {name}: expected some of {list(TRACKERS)}")
+            raise InputError(f"trackers: {name}: expected some of {list(TRACKERS)}")
         tracker, extra = TRACKERS[name]
         try:
             made.append(tracker(run, resume_step))
         except ImportError as error:
             if names is not None:
                 raise InputError(
-                    f"--trackers: {name}: not installed: expected the extra {extra}: "
+                    f"trackers: {name}: not installed: expected the extra {extra}: "
                     f"pip install 'rcirl-jax[{extra}]'"
                 ) from error
     return made

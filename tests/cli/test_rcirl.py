@@ -12,9 +12,11 @@ from pathlib import Path
 import pytest
 
 from rcirl_jax import __version__
-from rcirl_jax.cli.flags import common
+from rcirl_jax.cli import running
+from rcirl_jax.cli.flags import left_out
 from rcirl_jax.cli.rcirl import COMMANDS, overview
-from rcirl_jax.tune.recipes import DEFAULT, load_recipe
+from rcirl_jax.errors import InputError
+from rcirl_jax.tuning.recipes import DEFAULT, load_recipe
 from tests.conftest import REPO
 from tests.helpers.commands import command, refused, succeeded
 
@@ -58,13 +60,13 @@ for name, (module, _) in COMMANDS.items():
     for old in [old for old in sys.modules if old.startswith(OURS)]:
         del sys.modules[old]
     main = importlib.import_module(f"{OURS}.{module}").main
-    common = importlib.import_module(f"{OURS}.flags.common")
-    helps = [common.asked_for(["rcirl", x], main) for x in ("--help", "--helpfull")]
+    running = importlib.import_module(f"{OURS}.running")
+    helps = [running.asked_for(["rcirl", x], main) for x in ("--help", "--helpfull")]
     try:
         flags.FLAGS(["rcirl"])
         missing = ""
     except flags.Error as error:
-        missing = common._missing(str(error), main)
+        missing = running.complaint(error, main)
     found[name] = [*helps, missing]
 print(json.dumps(found))
 """
@@ -97,17 +99,17 @@ def test_every_module_of_the_room_is_a_command():
     names = {
         ".".join(file.relative_to(room).with_suffix("").parts)
         for file in files
-        if file.name not in ("__init__.py", "rcirl.py")
+        if file.name not in ("__init__.py", "flags.py", "rcirl.py", "running.py")
     }
     assert names == {module for module, _ in COMMANDS.values()}
 
 
 # A command of our own that prints more than a buffer holds
 PRINTS = """
-from rcirl_jax.cli.flags import common
+from rcirl_jax.cli import running
 def main():
     print("x" * 100_000)
-common.run(main)
+running.run(main)
 """
 
 
@@ -129,26 +131,10 @@ def test_output_that_nobody_reads_ends_without_a_word(words, joined):
     assert (done.returncode, done.stderr or b"") == (128 + signal.SIGPIPE, b"")
 
 
-def test_errors_that_nobody_reads_end_without_a_word():
-    unread, output = os.pipe()
-    os.close(unread)
-    done = subprocess.run(
-        [sys.executable, "-m", "rcirl_jax", "train"],
-        stdout=subprocess.PIPE, stderr=output, check=False,
-    )  # fmt: skip
-    os.close(output)
-    assert (done.returncode, done.stdout) == (128 + signal.SIGPIPE, b"")
-
-
-@pytest.mark.parametrize(
-    "words",
-    [["-m", "rcirl_jax", "train", "--helpfull"], ["-c", PRINTS]],
-    ids=["help", "main"],
-)
-def test_output_without_room_is_one_line(words):
+def test_output_without_room_is_one_line():
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
-            [sys.executable, *words],
+            [sys.executable, "-c", PRINTS],
             stdout=full, stderr=subprocess.PIPE, text=True, check=False,
         )  # fmt: skip
     assert done.returncode == 2
@@ -170,10 +156,10 @@ def test_another_broken_pipe_is_one_line(monkeypatch, capfd):
     def broken():
         raise BrokenPipeError(32, "Broken pipe", "worker")
 
-    monkeypatch.setattr(common.app, "run", lambda main, **_: main(["rcirl"]))
-    monkeypatch.setattr(common.interrupts, "install", lambda: None)
+    monkeypatch.setattr(running.app, "run", lambda main, **_: main(["rcirl"]))
+    monkeypatch.setattr(running.interrupts, "install", lambda: None)
     with pytest.raises(SystemExit) as stop:
-        common.run(broken)
+        running.run(broken)
     assert stop.value.code == 2
     assert capfd.readouterr().err == "error: worker: Broken pipe\n"
 
@@ -188,7 +174,6 @@ def test_help_fits_and_has_the_usual_flags_only(name, every):
     assert len(set(flags)) == len(flags)
     (hidden,) = re.findall(r"--helpfull shows (\d+) more", short) or ["0"]
     assert len(flags) == len(usual) + int(hidden)
-    assert "workdir" not in flags
     assert "--flagfile=FILE" in short
     assert "--flagfile=FILE" in full
 
@@ -228,11 +213,8 @@ def test_a_flag_that_is_missing_is_named_with_an_example(name, every):
     ("words", "message"),
     [
         ("import --output={out}", "--input: not given: expected a file or folder"),
-        ("import --input={out}", "--output: not given"),
         ("train --data=x", "error: --output: not given: expected folder of the run"),
         ("tune", "tune: unknown: expected one of autotune, "),
-        ("autotun", "did you mean autotune?"),
-        ("import --format=cvs", "--format: cvs: expected one of apollo, "),
         ("import --format=cvs", "did you mean csv?"),
         ("import --stride=far", "--stride: far: expected a number"),
         ("rank --horizon=9", "--horizon: 9: expected a number in the range [0.4"),
@@ -251,41 +233,13 @@ def test_logs_of_no_known_format_are_one_line_with_the_formats(tmp_path):
     for words in ("import", "autotune"):
         flags = (f"--input={tmp_path}", f"--output={tmp_path}/out")
         line = refused("rcirl_jax", words, *flags)
-        assert f"{tmp_path}: --format: not given" in line
+        assert f"{tmp_path}: format: not given" in line
         assert "apollo, argoverse2" in line
 
 
 @pytest.mark.multiprocess
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("train --workdir={out} --data=nowhere", "nowhere"),
-        ("autotune --workdir={out} --data=nowhere", "nowhere"),
-        ("export --workdir={out}", "{out}/run.json: missing"),
-        ("report --workdir={out}", "gate: missing"),
-    ],
-)
-def test_an_output_may_be_called_workdir(words, message, tmp_path):
-    """As it was in earlier versions; `refused` past the check of flags."""
-    given = words.format(out=tmp_path).split()
-    assert message.format(out=tmp_path) in refused("rcirl_jax", *given)
-
-
-@pytest.mark.multiprocess
-def test_flags_come_from_a_file(tmp_path):
-    file = tmp_path / "flags.txt"
-    file.write_text(f"--data=nowhere\n--output={tmp_path}/run\n")
-    assert "nowhere" in refused("rcirl_jax", "train", f"--flagfile={file}")
-
-
-@pytest.mark.multiprocess
-def test_the_package_and_a_file_of_experiments_are_the_same_command():
-    same = [
-        command("rcirl_jax", "rank", "--help").stdout,
-        command("experiments.evaluate", "--help").stdout,
-    ]
-    assert same[0] == same[1]
-    assert "rcirl rank" in same[0]
+def test_the_package_is_the_command():
+    assert "rcirl rank" in command("rcirl_jax", "rank", "--help").stdout
     assert succeeded("rcirl_jax", "--help").stdout.strip() == overview()
     assert succeeded("rcirl_jax", "--version").stdout.strip().endswith(__version__)
 
@@ -296,3 +250,52 @@ def test_the_script_is_the_package():
         pytest.skip("not installed: make setup")
     (script,) = scripts
     assert script.value == "rcirl_jax.cli.rcirl:main"
+
+
+MAIN = """
+from rcirl_jax.cli.running import run
+def main():
+    raise ZeroDivisionError("scene 7")
+run(main)
+"""
+
+
+def test_a_fault_is_a_traceback_and_a_line_on_reporting_it():
+    done = subprocess.run(
+        [sys.executable, "-c", MAIN], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 70
+    *above, said = done.stderr.splitlines()
+    assert above[0].startswith("Traceback")
+    assert above[-1] == "ZeroDivisionError: scene 7"
+    assert said.startswith("error: this is a fault of rcirl-jax, not of your input")
+
+
+WITHOUT = """
+from rcirl_jax.cli.running import run
+def main():
+    raise ModuleNotFoundError("none", name="matplotlib.axes")
+run(main)
+"""
+
+
+def test_a_missing_extra_is_one_line_that_names_it():
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    line = "error: matplotlib: not installed: expected pip install 'rcirl-jax[report]'"
+    assert done.stderr.strip() == line
+
+
+@pytest.mark.parametrize(
+    ("text", "found"), [("0", (0, 0.0)), ("3", (3, 0.0)), ("5%", (0, 0.05))]
+)
+def test_a_count_or_a_share_is_left_out(text, found):
+    assert left_out(text) == found
+
+
+@pytest.mark.parametrize("text", ["-1", "0.5", "100%", "-3%", "few", "nan%", ""])
+def test_other_words_are_refused(text):
+    with pytest.raises(InputError, match=r"--leave_out: .*expected a count"):
+        left_out(text)

@@ -13,7 +13,7 @@ from rcirl_jax.data.importing import ImportConfig, import_parts
 from rcirl_jax.data.parts import Part, is_long, recordings_of
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.errors import InputError, LostWorkError
-from rcirl_jax.runtime.executors import Here, Processes, Ray
+from rcirl_jax.runtime.executors import Processes, Ray, Serial
 from tests.data.formats.fixtures import apollo, l5, nuplan, waymo
 from tests.data.small_logs import CONFIG, files_of, write_logs
 
@@ -195,7 +195,7 @@ class Losing:
         self.before = before
 
     def stream(self, function, items):
-        for number, result in enumerate(Here().stream(function, items)):
+        for number, result in enumerate(Serial().stream(function, items)):
             if number == self.before:
                 raise LostWorkError("log: its process was killed: expected memory")
             yield result
@@ -216,5 +216,5 @@ def test_lost_workers_leave_what_is_finished(logs, local, tmp_path):
 @pytest.mark.ray
 def test_no_cluster_is_one_line():
     pytest.importorskip("ray")
-    with pytest.raises(InputError, match=r"--ray_address: 127\.0\.0\.1:1: "):
+    with pytest.raises(InputError, match=r"ray_address: 127\.0\.0\.1:1: "):
         Ray("127.0.0.1:1")

@@ -14,13 +14,13 @@ SMALL = (
     "--synthetic", "--recipe=quick", "--stride=60", "--epochs=1", "--drives=6",
     "--suite=free_cruise,stopped_lead", "--cases=15", "--duration=2",
 )  # fmt: skip
-REHEARSED = """
+DEMONSTRATED = """
 [train]
 epochs = 1
 loss = "listwise"
 positive = "nearest"
-[rehearsal]
-teacher = "hand-set"
+[simulated_demonstrations]
+expert = "hand-set"
 cases = 1
 takeover_cases = 1
 rounds = 1
@@ -39,11 +39,11 @@ def kept(done):
 @pytest.mark.multiprocess
 def test_a_small_loop(tmp_path):
     run, own = tmp_path / "run", tmp_path / "own.toml"
-    own.write_text(REHEARSED)
+    own.write_text(DEMONSTRATED)
     flags = (f"--output={run}", *SMALL, f"--recipe={own}")
     done = succeeded("rcirl_jax", "autotune", *flags)
     begun = [x for x in done.stdout.splitlines() if x.startswith("stage ")]
-    names = ("import", "rehearse", "train", "rank", "simulate", "gate", "report")
+    names = ("import", "demonstrate", "train", "rank", "simulate", "gate", "report")
     for number, (line, name) in enumerate(zip(begun, names, strict=True), 1):
         assert re.match(rf"stage {number} of 7: {name}; [\d hmins]+ so far", line), line
         assert number == 1 or line.endswith(" left, compiling not counted")
@@ -56,9 +56,9 @@ def test_a_small_loop(tmp_path):
     for bar in ("rank the scenes", "drive the cases: candidate", "draw the report"):
         assert bar in done.stderr
     stages = [
-        "import 0", "rehearse 0", "rehearse learner 1", "rehearse 1", "train 0",
-        "export", "tune", "rank predicted", "rank recorded", "simulate", "likeness",
-        "gate", "report",
+        "import 0", "demonstrate 0", "demonstrate learner 1", "demonstrate 1",
+        "train 0", "export", "tune", "rank predicted", "rank recorded", "simulate",
+        "likeness", "gate", "report",
     ]  # fmt: skip
     assert kept(done) == dict.fromkeys(stages, False)
     verdict = json.loads((run / "verdict.json").read_text())
@@ -113,7 +113,7 @@ def test_a_damaged_report_is_drawn_again_and_other_weights_leave_no_verdict(tmp_
     assert (run / "verdict.json").exists()
     changed = ("--learning_rate=2e-3", "--until=train")
     told = kept(succeeded("rcirl_jax", "autotune", *flags, *changed))
-    told = {name: was for name, was in told.items() if name[:8] != "rehearse"}
+    told = {name: was for name, was in told.items() if name[:8] != "demonstrate"}
     assert told == {"import 0": True, "train 0": False, "export": False}
     assert not (run / "verdict.json").exists()
     assert not (run / "report.html").exists()

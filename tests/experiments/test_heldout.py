@@ -6,7 +6,7 @@ import pytest
 
 from rcirl_jax.data.importing import import_parts
 from rcirl_jax.data.store.dataset import open_dataset
-from rcirl_jax.export.tuned_idm import write_tuned_idm
+from rcirl_jax.export.closed_loop import write_tuned_idm
 from rcirl_jax.planner.baselines import Idm
 from tests.data.small_logs import CONFIG, write_logs
 from tests.helpers.commands import succeeded

@@ -18,11 +18,11 @@ DATA = "--data={root}/data"
 WEIGHTS = "--weights={root}/w.msgpack"
 # command: what it is given, what it writes, and which hashes stand there
 ARTEFACTS = {
-    "evaluate": (
+    "rank": (
         (WEIGHTS, DATA, "--output={out}/ranking.json"),
         ("ranking.json",), ("weights_sha256", "data_hash"),
     ),
-    "inspect_data": (
+    "inspect": (
         (DATA, "--scenes=1", "--output={out}"), ("index.html",), (),
     ),
     "replay": (
@@ -62,7 +62,7 @@ def test_it_says_what_made_it(name, root, tmp_path):
     flags, files, hashes = ARTEFACTS[name]
     out = tmp_path / "out"
     given = [flag.format(root=root, out=out) for flag in flags]
-    succeeded(f"experiments.{name}", *given)
+    succeeded("rcirl_jax", name, *given)
     weights = root / "w.msgpack"
     expected = {
         "weights_sha256": {str(weights): load_weights(weights).sha256},

@@ -9,9 +9,9 @@ import pytest
 
 from rcirl_jax.evaluation.closed_loop.suite import SuiteConfig, run_suite
 from rcirl_jax.evaluation.ranking.score import score_scenes
+from rcirl_jax.export.closed_loop import SuiteJob, drive_by, drive_piece
 from rcirl_jax.export.loading import open_reward
-from rcirl_jax.export.spread import SuiteJob, drive_piece, spread
-from rcirl_jax.runtime.executors import Here, Processes
+from rcirl_jax.runtime.executors import Processes, Serial
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.simulation.suite import suite_refs
 from tests.conftest import REPO
@@ -40,7 +40,7 @@ def leaves(made):
 def driven(weights, executor):
     """What identifies the result of a small suite."""
     job, config = job_of(weights), SuiteConfig(chunk=1)
-    made = run_suite(job.rows(), job.cases(), config, spread(executor, job))
+    made = run_suite(job.rows(), job.cases(), config, drive_by(executor, job))
     return made.facts["result_sha256"]
 
 
@@ -68,8 +68,8 @@ def test_a_piece_is_its_part_of_the_whole(weights):
 
 
 def assert_same_as_here(weights, there):
-    assert driven(weights, there) == driven(weights, Here()), "suite"
-    for a, b in zip(scored(weights, there), scored(weights, Here()), strict=True):
+    assert driven(weights, there) == driven(weights, Serial()), "suite"
+    for a, b in zip(scored(weights, there), scored(weights, Serial()), strict=True):
         np.testing.assert_array_equal(a, b)
 
 

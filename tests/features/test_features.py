@@ -191,5 +191,5 @@ def test_compiles_once_for_many_scenes():
 
 
 def test_unknown_preset_is_one_line():
-    with pytest.raises(InputError, match=r"--features: nope: expected one of"):
+    with pytest.raises(InputError, match=r"preset: nope: expected one of"):
         feature_map("nope")

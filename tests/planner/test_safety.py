@@ -218,5 +218,5 @@ def test_the_collision_track_forbids_contacts_and_lines_only():
 
 
 def test_an_unknown_track_is_one_line():
-    with pytest.raises(InputError, match="--filter: rss: expected one of"):
+    with pytest.raises(InputError, match="track: rss: expected one of"):
         SafetyConfig(track="rss")

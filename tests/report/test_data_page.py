@@ -139,7 +139,7 @@ def test_what_there_is_not_is_one_line(dataset, tmp_path):
     for tag, line in (("turnig", "expected stopping, "), ("standing", "no such scene")):
         with pytest.raises(InputError, match=f"{tag}: {line}"):
             choose_rows(none, 5, [tag])
-    with pytest.raises(InputError, match=r"--rows: 1000000: expected 0 to \d+"):
+    with pytest.raises(InputError, match=r"rows: 1000000: expected 0 to \d+"):
         write_data_page(tmp_path / "a.html", dataset, [10**6], "a", FACTS)
     assert not list(tmp_path.iterdir())
 

@@ -108,7 +108,7 @@ def test_first_parameters_are_those_of_flax_but_for_the_draw(name, by_context):
     ],
 )
 def test_a_module_that_is_none_is_one_line(name, words):
-    with pytest.raises(InputError, match=rf"--module: {name}.*{words}"):
+    with pytest.raises(InputError, match=rf"module: {name}.*{words}"):
         point_module(name)
 
 
@@ -117,7 +117,7 @@ def test_a_module_that_is_none_is_one_line(name, words):
     [
         ("Wide", r"\(2, 18, 3\) of \(2, 18, 21\): expected parameters only"),
         ("Stateful", r"\['batch_stats', 'params'\]"),
-        ("Nameless", "--pin: unit: expected none .* no last layer `out`"),
+        ("Nameless", "pin: unit: expected none .* no last layer `out`"),
     ],
 )
 def test_a_module_of_another_signature_is_one_line(name, words):
@@ -127,5 +127,5 @@ def test_a_module_of_another_signature_is_one_line(name, words):
     if name == "Nameless":
         free = dataclasses.replace(made, pin="none")
         assert set(init_tree(jax.random.key(0), F, free)) == {"gamma", "point"}
-    with pytest.raises(InputError, match="--constraint: monotone: expected none"):
+    with pytest.raises(InputError, match="constraint: monotone: expected none"):
         dataclasses.replace(made, constraint="monotone")

@@ -139,9 +139,9 @@ def test_lattice_cost_prefers_what_it_should():
 @pytest.mark.parametrize(
     ("given", "says"),
     [
-        ({"activation": "step"}, "--activation: step: expected one of"),
-        ({"pin": "loose"}, "--pin: loose: expected one of"),
-        ({"hidden": (15,), "constraint": "nonnegative"}, "--hidden_size"),
+        ({"activation": "step"}, "activation: step: expected one of"),
+        ({"pin": "loose"}, "pin: loose: expected one of"),
+        ({"hidden": (15,), "constraint": "nonnegative"}, "hidden: "),
     ],
 )
 def test_unknown_names_are_one_line(given, says):

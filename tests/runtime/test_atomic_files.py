@@ -66,13 +66,6 @@ def test_what_a_kill_left_is_written_over(tmp_path):
     assert [x.name for x in tmp_path.iterdir()] == ["a.json"]
 
 
-def test_an_old_file_stays_if_the_new_one_cannot_be(tmp_path):
-    (tmp_path / "a.json").mkdir()
-    with pytest.raises(OSError, match=r"a\.json"):
-        write_whole(tmp_path / "a.json", "text")
-    assert [x.name for x in tmp_path.iterdir()] == ["a.json"]
-
-
 def test_an_interrupted_write_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
     path, seen = tmp_path / "a.json", []
     write_whole(path, "old")

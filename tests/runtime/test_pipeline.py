@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from rcirl_jax.errors import InputError
+from rcirl_jax.runtime import pipeline
 from rcirl_jax.runtime.pipeline import FILE, LOCK, Stages, only_one
 
 
@@ -49,15 +50,6 @@ def test_what_fails_is_not_noted(stages):
     assert step(stages, "a", {})
     with pytest.raises(InputError, match=r"two\.txt: missing after stage two"):
         stages.run("two", {}, [stages.folder / "two.txt"], lambda: None)
-
-
-def test_stages_do_not_disturb_each_other(stages):
-    step(stages, "a", {"x": 1}, "one")
-    step(stages, "b", {"x": 1}, "two")
-    assert not step(stages, "a", {"x": 1}, "one")
-    found = stages.read()
-    assert list(found) == ["one", "two"]
-    assert found["one"]["inputs"] == {"x": 1}
 
 
 def test_what_would_mislead_goes_before_the_work(stages):
@@ -175,3 +167,26 @@ def test_a_lock_that_leaves_nothing(tmp_path):
     with only_one(deep, leave_nothing=True):
         (deep / "kept").write_text("x")
     assert [x.name for x in deep.iterdir()] == ["kept"]
+
+
+@pytest.mark.parametrize(
+    ("name", "counts"),
+    [
+        ("pack/train/loop.py", True),
+        ("pack/report/templates/page.html", True),
+        ("specs/sources/csv.toml", True),
+        ("specs/recipes/own.toml", False),  # settings of a run
+        ("pack/notes.txt", False),
+    ],
+)
+def test_any_change_of_what_decides_results_is_other_code(
+    tmp_path, monkeypatch, name, counts
+):
+    monkeypatch.setattr(pipeline, "PACKAGE", tmp_path / "pack")
+    monkeypatch.setattr(pipeline, "spec_root", lambda: tmp_path / "specs")
+    file, found = tmp_path / name, []
+    file.parent.mkdir(parents=True)
+    for text in ("a = 1", "a = 2"):
+        file.write_text(text)
+        found.append(pipeline.code_sha256.__wrapped__())
+    assert (found[0] != found[1]) == counts

@@ -174,7 +174,7 @@ def test_some_hard_negatives_drift_aside_where_paths_may_be_chosen():
 
 
 def test_unknown_mode_is_one_line():
-    with pytest.raises(InputError, match="--mode: sideways: expected one of"):
+    with pytest.raises(InputError, match="mode: sideways: expected one of"):
         SamplerConfig(mode="sideways")
 
 

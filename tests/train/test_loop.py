@@ -153,7 +153,7 @@ def test_a_run_of_another_module_is_exported_as_stablehlo(dataset, tmp_path):
     other = RewardConfig(module="tests.reward.others:Residual")
     config = dataclasses.replace(CONFIG, epochs=1, reward=other)
     state = train(dataset, tmp_path, config).state
-    with pytest.raises(InputError, match=r"--module: .*rcirl export --stablehlo"):
+    with pytest.raises(InputError, match=r"module: .*rcirl export --stablehlo"):
         export_run(tmp_path, dataset, tmp_path / "weights.msgpack")
     with pytest.raises(InputError, match=r"expected none: weights\.msgpack"):
         train_learner(FrozenSets(dataset).of(config), config, [0])
@@ -192,7 +192,7 @@ def test_the_oracle_floor_is_of_scenes_that_cover_the_horizon(dataset):
     assert floor["scenes"] == 7
     assert 0.0 <= floor["best_fde_median_m"] <= floor["best_fde_mean_m"] + 5.0
     long = dataclasses.replace(setup, horizon_s=8.5)
-    with pytest.raises(InputError, match=r"--horizon: 8\.5: no scene is recorded"):
+    with pytest.raises(InputError, match=r"horizon_s: 8\.5: no scene is recorded"):
         oracle_floor(dataset, long, 64)
     with pytest.raises(InputError, match="nowhere"):
         evaluate_ranking(dataset, {}, dataclasses.replace(setup, split="nowhere"))

@@ -225,9 +225,9 @@ def test_another_way_of_sharing(data, undisturbed, tmp_path):
     [
         (("host:1", 2, None), "expected all three or none"),
         ((None, 2, 1), "expected all three or none"),
-        (("host", 2, 1), "--coordinator_address: host: expected host:port"),
-        (("host:1", 0, 0), "--num_processes: 0: expected >= 1"),
-        (("host:1", 2, 2), "--process_id: 2: expected 0 to 1"),
+        (("host", 2, 1), "coordinator_address: host: expected host:port"),
+        (("host:1", 0, 0), "num_processes: 0: expected >= 1"),
+        (("host:1", 2, 2), "process_id: 2: expected 0 to 1"),
     ],
 )
 def test_bad_flags_are_one_line(given, message):

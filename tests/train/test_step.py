@@ -265,21 +265,21 @@ def test_not_finite_features_are_named_and_the_state_is_kept():
     ("make", "message"),
     [
         (lambda: parallelise(make_train_step(CONFIG), "pmap", 12),
-         "--batch_size: 12: expected a multiple of 8"),
+         "batch_size: 12: expected a multiple of 8"),
         (lambda: parallelise(make_train_step(CONFIG), "ring", 16),
-         "--parallel: ring: expected one of"),
+         "parallel: ring: expected one of"),
         *(
             (lambda setting=setting: TrainConfig(**setting), message)
             for setting, message in (
-                ({"loss": "hope"}, "--loss: hope: expected one of"),
-                ({"leaky_rate": 2.0}, "--leaky_rate: 2.0: expected between 0 and 1"),
+                ({"loss": "hope"}, "loss: hope: expected one of"),
+                ({"leaky_rate": 2.0}, "leaky_rate: 2.0: expected between 0 and 1"),
                 ({"optimizer": "radom"}, "radom: .*; did you mean radam?"),
-                ({"clip_norm": -1.0}, "--clip_norm: -1.0: expected >= 0"),
-                ({"epochs": 0}, "--epochs: 0: expected >= 1"),
-                ({"seed": -1}, "--seed: .*: expected 0 to 2147483647"),
-                ({"seed": 2**31}, "--seed: .*: expected 0 to 2147483647"),
+                ({"clip_norm": -1.0}, "clip_norm: -1.0: expected >= 0"),
+                ({"epochs": 0}, "epochs: 0: expected >= 1"),
+                ({"seed": -1}, "seed: .*: expected 0 to 2147483647"),
+                ({"seed": 2**31}, "seed: .*: expected 0 to 2147483647"),
                 ({"loss": "listwise", "hard_negatives": 4, "hard_pool": 3},
-                 "--hard_pool: 3: expected 1 with"),
+                 "hard_pool: 3: expected 1 with"),
             )
         ),
     ],

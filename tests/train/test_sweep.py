@@ -29,7 +29,7 @@ from rcirl_jax.export.sweep.result import table
 from rcirl_jax.export.sweep.run import run_sweep
 from rcirl_jax.report.charts import sweep_picture
 from rcirl_jax.reward import RewardConfig
-from rcirl_jax.runtime.executors import Here, Processes
+from rcirl_jax.runtime.executors import Processes, Serial
 from rcirl_jax.runtime.pipeline import only_one
 from rcirl_jax.train import frozen
 from rcirl_jax.train.frozen import fit, freeze, members_of
@@ -71,7 +71,7 @@ def finished(data, tmp_path_factory):
     """(folder, report) of a sweep in this process."""
     folder = tmp_path_factory.mktemp("finished")
     frozen._fit.clear_cache()
-    return folder, run_sweep(config_of(data), folder, Here(), MADE_BY)
+    return folder, run_sweep(config_of(data), folder, Serial(), MADE_BY)
 
 
 def untimed(report):
@@ -219,7 +219,7 @@ def test_a_finished_group_is_not_trained_again(data, finished, tmp_path, monkeyp
 
     def again():
         trained.clear()
-        made = run_sweep(config_of(data), folder, Here(), MADE_BY)
+        made = run_sweep(config_of(data), folder, Serial(), MADE_BY)
         assert untimed(made) == untimed(report)
         return [*trained]
 
@@ -235,10 +235,10 @@ def test_a_finished_group_is_not_trained_again(data, finished, tmp_path, monkeyp
 def test_other_settings_or_data_in_the_folder_are_one_line(data, finished):
     folder = finished[0]
     with pytest.raises(InputError, match=r"stages\.json: leaky_rates: \[0\.05, 0\.3"):
-        run_sweep(config_of(data, leaky_rates=(0.05,)), folder, Here(), {})
+        run_sweep(config_of(data, leaky_rates=(0.05,)), folder, Serial(), {})
     longer = dataclasses.replace(BASE, epochs=9)
     with pytest.raises(InputError, match=r"stages\.json: epochs: 2: expected 9 to"):
-        run_sweep(config_of(data, base=longer), folder, Here(), {})
+        run_sweep(config_of(data, base=longer), folder, Serial(), {})
 
 
 def test_a_sweep_in_use_is_refused(data, finished):
@@ -246,7 +246,7 @@ def test_a_sweep_in_use_is_refused(data, finished):
     with only_one(folder):
         before = files_of(folder)
         with pytest.raises(InputError, match="in use by another proc"):
-            run_sweep(config_of(data), folder, Here(), MADE_BY)
+            run_sweep(config_of(data), folder, Serial(), MADE_BY)
         assert files_of(folder) == before
 
 
@@ -305,7 +305,7 @@ def test_the_choice_never_sees_the_test_split(data, finished, tmp_path, monkeypa
         return dataset, Resplit(dataset, {**splits, "test": tests}), by
 
     monkeypatch.setattr(folders, "open_split", fewer_tests)
-    other = untimed(run_sweep(config_of(data), tmp_path, Here(), MADE_BY))
+    other = untimed(run_sweep(config_of(data), tmp_path, Serial(), MADE_BY))
     first = untimed(finished[1])
     assert other["chosen"]["test"] != first["chosen"]["test"]
     for report in (other, first):
@@ -343,14 +343,14 @@ def test_validation_shares_no_vehicle_with_the_fit(data):
     ("changes", "message"),
     [
         ({"leaky_rates": (0.05, 0.05)}, "twice: expected distinct values"),
-        ({"leaky_rates": (1.5,)}, "--leaky_rate: 1.5: expected between 0 and 1"),
-        ({"hidden_sizes": ()}, "--hidden_sizes: none: expected at least one"),
-        ({"seeds": 0}, "--seeds: 0: expected >= 1"),
-        ({"validation": 0.9}, "--validation: 0.9: expected 0 to 0.5"),
-        ({"choose_by": "luck"}, "--choose_by: luck: expected one of"),
+        ({"leaky_rates": (1.5,)}, "leaky_rate: 1.5: expected between 0 and 1"),
+        ({"hidden_sizes": ()}, "hidden_sizes: none: expected at least one"),
+        ({"seeds": 0}, "seeds: 0: expected >= 1"),
+        ({"validation": 0.9}, "validation: 0.9: expected 0 to 0.5"),
+        ({"choose_by": "luck"}, "choose_by: luck: expected one of"),
         (
             {"base": dataclasses.replace(BASE, loss="logistic")},
-            "--leaky_rates: .* only --loss=rank has a leaky rate",
+            "leaky_rates: .* only loss=rank has a leaky rate",
         ),
     ],
 )

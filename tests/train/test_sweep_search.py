@@ -14,7 +14,7 @@ from rcirl_jax.export.sweep.result import read_sweep, table
 from rcirl_jax.export.sweep.run import run_sweep
 from rcirl_jax.export.sweep.search import ROUND, searched
 from rcirl_jax.report.charts import sweep_picture
-from rcirl_jax.runtime.executors import Here
+from rcirl_jax.runtime.executors import Serial
 from tests.helpers.commands import refused
 from tests.train.test_sweep import MADE_BY, config_of, data, untimed
 
@@ -80,7 +80,7 @@ def test_a_search_goes_on_and_more_trials_go_on_where_it_ended(
     def search(folder, trials):
         trained.clear()
         made = run_sweep(
-            config_of(data, trials=trials, **small), folder, Here(), MADE_BY
+            config_of(data, trials=trials, **small), folder, Serial(), MADE_BY
         )
         return untimed(made)
 
@@ -98,12 +98,12 @@ def test_a_search_goes_on_and_more_trials_go_on_where_it_ended(
     picture = sweep_picture(tmp_path / "sweep.png", report)
     assert picture.read_bytes()[:4] == b"\x89PNG"
     with pytest.raises(InputError, match="search: optuna: expected grid to resume"):
-        run_sweep(config_of(data, **small), tmp_path / "b", Here(), MADE_BY)
+        run_sweep(config_of(data, **small), tmp_path / "b", Serial(), MADE_BY)
 
 
 def test_nothing_to_search_is_one_line():
     one = {"hidden_sizes": ((),), "leaky_rates": (0.1,), "learning_rates": (0.01,)}
-    with pytest.raises(InputError, match=r"--search: optuna: expected two values"):
+    with pytest.raises(InputError, match=r"trials: .*: expected two values"):
         config(**one)
 
 

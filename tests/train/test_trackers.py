@@ -85,7 +85,7 @@ def test_wandb_stays_offline(tmp_path, monkeypatch):
 
 
 def test_an_unknown_or_missing_tracker_is_one_line(tmp_path, monkeypatch):
-    with pytest.raises(InputError, match=r"--trackers: comet: expected some of"):
+    with pytest.raises(InputError, match=r"trackers: comet: expected some of"):
         trackers(["comet"], tmp_path)
     monkeypatch.setitem(__import__("sys").modules, "wandb", None)
     with pytest.raises(InputError, match=r"pip install 'rcirl-jax\[wandb\]'"):

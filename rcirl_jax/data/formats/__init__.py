@@ -90,7 +90,7 @@ def parts(
       InputError: unknown format, missing path, or nothing to read.
     """
     if name not in IMPORTERS:
-        raise InputError(f"--format: {name}: expected one of {sorted(IMPORTERS)}")
+        raise InputError(f"format: {name}: expected one of {sorted(IMPORTERS)}")
     packaged = spec_root() / "sources" / f"{name}.toml"
     spec_path = source or packaged
     spec = load_toml(spec_path)
@@ -104,7 +104,7 @@ def parts(
     spec = {**spec, STATED: own}
     if input_path is None:
         if name != "synthetic":
-            raise InputError("--input: not given: expected a file or folder")
+            raise InputError("input: not given: expected a file or folder")
         input_path = spec_path
     if not input_path.exists():
         raise InputError(f"{input_path}: input: missing: expected a file or folder")

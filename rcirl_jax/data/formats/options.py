@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath
 
 from rcirl_jax.data.formats.format import Format
 from rcirl_jax.errors import InputError
-from rcirl_jax.runtime.settings import check_names
+from rcirl_jax.runtime.checked import check_names
 from rcirl_jax.types import Kind
 from rcirl_jax.units import FOOT_M, MPH_MPS
 

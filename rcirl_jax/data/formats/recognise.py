@@ -41,9 +41,7 @@ def recognised_format(path: Path | None, source: Path | None = None) -> str:
         return next(iter(found))
     if found:
         each = ", ".join(f"{file.name} of {name}" for name, file in found.items())
-        raise InputError(
-            f"{path}: --format: not given: expected one of them for {each}"
-        )
+        raise InputError(f"{path}: format: not given: expected one of them for {each}")
     raise InputError(_unknown(path))
 
 
@@ -103,11 +101,11 @@ def _unknown(path: Path) -> str:
     ]
     if tables:
         return (
-            f"{tables[0]}: --format: not given: a table of no known data set: expected "
-            "--format=csv with a --source that names its columns, which "
+            f"{tables[0]}: format: not given: a table of no known data set: expected "
+            "format csv with a source TOML that names its columns, which "
             f"`rcirl import --suggest={tables[0]}` writes"
         )
     return (
-        f"{path}: --format: not given: no files of a known format: expected "
-        f"--format=... with one of {', '.join(sorted(IMPORTERS))}"
+        f"{path}: format: not given: no files of a known format: expected "
+        f"one of {', '.join(sorted(IMPORTERS))}"
     )

@@ -33,7 +33,7 @@ from rcirl_jax.data.scenes.signal_checks import (
     TOGETHER,
     line_name,
 )
-from rcirl_jax.runtime.executors import Executor, Here
+from rcirl_jax.runtime.executors import Executor, Serial
 from rcirl_jax.types import Lane, Recording, Signal, Track
 
 ORDER = ("green", "yellow", "red", "off")
@@ -234,7 +234,7 @@ def check_written(
     Raises:
       InputError: logs that cannot be read.
     """
-    places = executor or Here()
+    places = executor or Serial()
     return check_events(places.stream(_line_events, items(parts, places.workers)))
 
 

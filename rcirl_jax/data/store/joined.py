@@ -74,7 +74,7 @@ class JoinedDatasets:
             given = np.asarray(shares, np.float64)
             if given.shape != (len(parts),) or not np.all(given > 0.0):
                 raise InputError(
-                    f"--data_weights: {list(shares)}: expected {len(parts)} numbers "
+                    f"data_weights: {list(shares)}: expected {len(parts)} numbers "
                     "> 0, one per source"
                 )
             sizes = np.array([part.indices("train").size for part in parts], float)
@@ -157,7 +157,7 @@ def shares_of(text: str, count: int) -> tuple[float, ...] | None:
         numbers = ()
     if len(numbers) != count or not all(0.0 < x < np.inf for x in numbers):
         raise InputError(
-            f"--data_weights: {text}: expected {EQUAL}, {SCENES} or {count} numbers "
+            f"data_weights: {text}: expected {EQUAL}, {SCENES} or {count} numbers "
             "> 0 with commas, one per source"
         )
     return numbers
@@ -177,7 +177,7 @@ def open_datasets(
       InputError: none named, one named twice, or one that does not open.
     """
     if not urls or len(set(urls)) != len(urls):
-        raise InputError(f"--data: {list(urls)}: expected distinct datasets")
+        raise InputError(f"data: {list(urls)}: expected distinct datasets")
     parts = [open_dataset(url, verify) for url in urls]
     shares = shares_of(weights, len(parts))
     return parts[0] if len(parts) == 1 else JoinedDatasets(parts, shares)

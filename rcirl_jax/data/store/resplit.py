@@ -100,7 +100,7 @@ def by_recording(dataset: Demonstrations, recordings: Sequence[int]) -> Resplit:
     found, named = np.unique(where), list(recordings)
     if not named or not np.isin(named, found).all():
         known = ", ".join(map(str, found))
-        raise InputError(f"--recording: {named}: expected of {known}")
+        raise InputError(f"recording: {named}: expected of {known}")
     held = np.isin(where, named)
     clear = ~np.isin(vehicle, vehicle[held])
     rows = dataset.indices(None)
@@ -126,7 +126,7 @@ def folds_by_recording(dataset: Demonstrations, count: int) -> list[Resplit]:
     names, sizes = np.unique(where, return_counts=True)
     if not 2 <= count <= names.size:
         raise InputError(
-            f"--folds: {count}: expected 2 to {names.size}, recordings with scenes"
+            f"folds: {count}: expected 2 to {names.size}, recordings with scenes"
         )
     parts: list[list[int]] = [[] for _ in range(count)]
     held = np.zeros(count, np.int64)
@@ -153,7 +153,7 @@ def with_tags(dataset: Demonstrations, names: Sequence[str]) -> Demonstrations:
     for name in names:
         if name not in known:
             raise InputError(
-                f"--tags: {name}: expected some of {', '.join(known)}"
+                f"tags: {name}: expected some of {', '.join(known)}"
                 + did_you_mean(name, known)
             )
     numbers = [known.index(name) for name in names]
@@ -164,7 +164,7 @@ def with_tags(dataset: Demonstrations, names: Sequence[str]) -> Demonstrations:
         splits[split] = dataset.indices(split)[chosen]
         if tags.size and not chosen.any():
             raise InputError(
-                f"--tags: {', '.join(names)}: none of {len(tags)} scenes of the split "
+                f"tags: {', '.join(names)}: none of {len(tags)} scenes of the split "
                 f"{split} has one: expected at least one"
             )
     return Resplit(dataset, {k: rows for k, rows in splits.items() if rows.size})

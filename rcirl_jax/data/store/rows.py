@@ -149,7 +149,7 @@ def check_finite(what: str, rows: Demonstration, index: np.ndarray) -> None:
     """`refuse_scenes` for what n scenes (numpy) hold themselves, or if n is 0."""
     if len(index) == 0:
         raise InputError(
-            f"{what}: 0 scenes: expected at least one; import with --test_fraction "
+            f"{what}: 0 scenes: expected at least one; import with test_fraction "
             "above 0, or more recordings"
         )
     bad = {

@@ -72,7 +72,7 @@ class DatasetWriter:
         if MANIFEST in keys and not overwrite:
             raise InputError(
                 f"{self._files.name}: holds a finished dataset: "
-                "expected a new folder, or --overwrite to replace it"
+                "expected a new folder, or overwrite to replace it"
             )
         # one `shard_entry` a shard: lineages of a long log would fill the memory
         self._shards = [] if overwrite or not shards else self._find_committed()

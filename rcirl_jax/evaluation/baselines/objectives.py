@@ -240,7 +240,7 @@ def learner_budget(
     queries = scenes * num_candidates(sampler) * epochs
     if queries < problem.queries:
         raise InputError(
-            f"--epochs: {epochs}: {queries:,} queries: expected at least the "
+            f"epochs: {epochs}: {queries:,} queries: expected at least the "
             f"{problem.queries:,} of one evaluation"
         )
     return queries // problem.queries

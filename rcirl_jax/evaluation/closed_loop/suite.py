@@ -18,7 +18,7 @@ from rcirl_jax.evaluation.closed_loop.output import (
 )
 from rcirl_jax.evaluation.closed_loop.summary import SuiteReport, summarise
 from rcirl_jax.runtime.atomic_files import write_json, write_whole
-from rcirl_jax.runtime.bars import CompilesFirst
+from rcirl_jax.runtime.compiling import CompilesFirst
 from rcirl_jax.runtime.executors import two_at_a_time
 from rcirl_jax.simulation.cases import STEP_S
 from rcirl_jax.simulation.metrics import CaseMetrics

@@ -77,7 +77,7 @@ def new_faults(pair: Pair, accept: tuple[str, ...] = ()) -> tuple[NewFault, ...]
         if name not in cases:
             some = ", ".join(cases[:NAMED]) + (", ..." if len(cases) > NAMED else "")
             raise InputError(
-                f"--accept: {name}: no case with a new fault: expected "
+                f"accept: {name}: no case with a new fault: expected "
                 + (f"some of {some}" if cases else "none, for there is none")
             )
     return found

@@ -71,20 +71,20 @@ class GateConfig:
         """Margins within (0, 1), known primary metrics, no name twice."""
         for name, margin in self.margins.items():
             if not 0.0 < margin < 1.0:
-                raise InputError(f"--{name}_margin: {margin}: expected within (0, 1)")
+                raise InputError(f"{name}: {margin}: expected within (0, 1)")
         known = (*COLUMNS, "progress", "nuplan")
         for name in self.primary:
             if name not in known:
                 raise InputError(
-                    f"--primary: {name}: expected some of {', '.join(known)}"
+                    f"primary: {name}: expected some of {', '.join(known)}"
                 )
         if not self.primary:
-            raise InputError("--primary: none: expected at least one metric")
+            raise InputError("primary: none: expected at least one metric")
         for flag in ("primary", "trivial_baselines", "accept"):
             names = getattr(self, flag)
             if len(set(names)) != len(names):
                 twice = next(name for name in names if names.count(name) > 1)
-                raise InputError(f"--{flag}: {twice}: met twice: expected it once")
+                raise InputError(f"{flag}: {twice}: met twice: expected it once")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -68,7 +68,7 @@ def covered_rows(
     keep = np.flatnonzero(covers(rows, horizon_s))
     if keep.size == 0:
         raise InputError(
-            f"--horizon: {horizon_s:g}: no scene of split {split} is recorded so "
+            f"horizon_s: {horizon_s:g}: no scene of split {split} is recorded so "
             "long: expected a shorter horizon"
         )
     return jax.tree.map(lambda x: x[keep], rows), index[keep]
@@ -271,7 +271,7 @@ def oracle_floor(dataset: Demonstrations, setup: RankingSetup, max_scenes: int) 
     keep = np.sort(np.concatenate(parts)[:max_scenes])
     if not keep.size:
         raise InputError(
-            f"--horizon: {setup.horizon_s}: no scene is recorded that long: "
+            f"horizon_s: {setup.horizon_s}: no scene is recorded that long: "
             "expected a shorter one"
         )
     near = measure_scenes(

@@ -117,7 +117,7 @@ def learner_config(name: str, base: TrainConfig) -> TrainConfig:
       InputError: no learner of that name.
     """
     if name not in LEARNERS:
-        raise InputError(f"--learners: {name}: expected some of {sorted(LEARNERS)}")
+        raise InputError(f"learners: {name}: expected some of {sorted(LEARNERS)}")
     loss, network, more = LEARNERS[name]
     config = dataclasses.replace(base, loss=loss, **more)
     features = feature_map(config.features)
@@ -136,7 +136,7 @@ def learner_configs(names: Sequence[str], base: TrainConfig) -> dict[str, TrainC
       InputError: no name, or one that is not known.
     """
     if not names:
-        raise InputError(f"--learners: none: expected some of {sorted(LEARNERS)}")
+        raise InputError(f"learners: none: expected some of {sorted(LEARNERS)}")
     return {name: learner_config(name, base) for name in names}
 
 

@@ -30,8 +30,8 @@ from rcirl_jax.reward import (
     lattice_cost,
     speed_dp_cost,
 )
-from rcirl_jax.runtime.bars import CompilesFirst
-from rcirl_jax.runtime.executors import Executor, Here
+from rcirl_jax.runtime.compiling import CompilesFirst
+from rcirl_jax.runtime.executors import Executor, Serial
 from rcirl_jax.sampling import SamplerConfig, sample
 from rcirl_jax.train.featurise import human_of
 from rcirl_jax.types import Candidates, Demonstration, Scene, Trajectory
@@ -230,7 +230,7 @@ def score_scenes(
     )
     parts = []
     with CompilesFirst(total=len(index), desc="rank the scenes", unit="scene") as bar:
-        for part in (executor or Here()).stream(piece, _chunks(rows, index)):
+        for part in (executor or Serial()).stream(piece, _chunks(rows, index)):
             parts.append(part)
             bar.update(len(part["fde"]))
     return Scored(**jax.tree.map(lambda *x: np.concatenate(x), *parts))

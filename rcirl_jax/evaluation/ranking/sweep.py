@@ -102,18 +102,16 @@ class SweepConfig:
     def __post_init__(self) -> None:
         """Reject values out of range and what is no grid."""
         if self.choose_by not in CHOICES:
-            raise InputError(
-                f"--choose_by: {self.choose_by}: expected one of {CHOICES}"
-            )
+            raise InputError(f"choose_by: {self.choose_by}: expected one of {CHOICES}")
         if not 0.0 < self.validation <= 0.5:
-            raise InputError(f"--validation: {self.validation}: expected 0 to 0.5")
+            raise InputError(f"validation: {self.validation}: expected 0 to 0.5")
         if not 0.0 < self.horizon_s <= 8.0:
             raise InputError(
-                f"--horizon: {self.horizon_s}: expected above 0, at most 8 s"
+                f"horizon_s: {self.horizon_s}: expected above 0, at most 8 s"
             )
         for name, low in (("seeds", 1), ("scenes", 0), ("trials", 0)):
             if getattr(self, name) < low:
-                raise InputError(f"--{name}: {getattr(self, name)}: expected >= {low}")
+                raise InputError(f"{name}: {getattr(self, name)}: expected >= {low}")
         self._check_grid()
 
     def _check_grid(self) -> None:
@@ -121,22 +119,22 @@ class SweepConfig:
         self.base.reward.check_own()
         if self.base.loss != "rank" and len(self.leaky_rates) > 1:
             raise InputError(
-                f"--leaky_rates: {list(self.leaky_rates)}: expected one value: only "
-                "--loss=rank has a leaky rate"
+                f"leaky_rates: {list(self.leaky_rates)}: expected one value: only "
+                "loss=rank has a leaky rate"
             )
         for name in ("hidden_sizes", "leaky_rates", "learning_rates"):
             found = getattr(self, name)
             if not found:
-                raise InputError(f"--{name}: none: expected at least one value")
+                raise InputError(f"{name}: none: expected at least one value")
         grid = (self.hidden_sizes, self.leaky_rates, self.learning_rates)
         if self.trials and all(len(set(axis)) == 1 for axis in grid):
             raise InputError(
-                "--search: optuna: expected two values or more of --leaky_rates, "
-                "--learning_rates or --hidden_sizes: bounds to search in"
+                f"trials: {self.trials}: expected two values or more of leaky_rates, "
+                "learning_rates or hidden_sizes: bounds to search in"
             )
         if max(math.prod(map(len, grid)), self.trials) * self.seeds > MOST_MEMBERS:
             raise InputError(
-                f"--seeds: {self.seeds}: expected a sweep of at most {MOST_MEMBERS} "
+                f"seeds: {self.seeds}: expected a sweep of at most {MOST_MEMBERS} "
                 "trainings"
             )
         names = [member_name(one) for one in self.members()]
@@ -323,7 +321,7 @@ def best(values: Mapping[str, float], metric: str) -> str:
     if not values:
         raise InputError(
             "sweep: members: NaN or infinity in every configuration: expected one "
-            "that trains; lower --learning_rates"
+            "that trains; lower learning_rates"
         )
     sign = -1.0 if METRICS[metric].higher_is_better else 1.0
     return min(values, key=lambda name: sign * values[name])

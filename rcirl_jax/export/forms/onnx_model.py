@@ -36,7 +36,7 @@ def write_onnx(path: Path, reward: Reward) -> None:
         import onnx
     except ImportError as error:
         raise InputError(
-            "--onnx: onnx: not installed: expected pip install 'rcirl-jax[export]'"
+            "onnx: not installed: expected pip install 'rcirl-jax[export]'"
         ) from error
     model = _model(onnx, reward)
     onnx.checker.check_model(model, full_check=True)

@@ -83,7 +83,6 @@ def write_stablehlo(path: Path, made: jax.export.Exported, form: Form) -> None:
             content = bytes(made.serialize())
         except ImportError as error:
             raise InputError(
-                "--jax_export: flatbuffers: not installed: "
-                "expected pip install 'rcirl-jax[export]'"
+                "flatbuffers: not installed: expected pip install 'rcirl-jax[export]'"
             ) from error
     write_whole(path, content)

@@ -48,7 +48,7 @@ def check_settings(stages: Stages, settings: Mapping[str, object]) -> None:
             if (found := record.get("inputs", {}).get(name)) != setting:
                 raise InputError(
                     f"{stages.folder / FILE}: {name}: {found}: expected {setting} to "
-                    "resume; use another --output for other settings"
+                    "resume; use another output folder for other settings"
                 )
 
 

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 
-from rcirl_jax.errors import UNFORESEEN, InputError
+from rcirl_jax.errors import MALFORMED, InputError
 from rcirl_jax.export.sweep.folder import SWEEP
 from rcirl_jax.runtime.atomic_files import read_json
 
@@ -20,7 +20,7 @@ def read_sweep(folder: Path) -> dict:
     try:
         table(report)
         _check_grid(report)
-    except UNFORESEEN as error:
+    except MALFORMED as error:
         raise InputError(
             f"{path}: {type(error).__name__}: expected the result of `rcirl sweep`"
         ) from error
@@ -33,7 +33,7 @@ def _check_grid(report: Mapping) -> None:
     Only a search's configurations are no grid.
 
     Raises:
-      One of `UNFORESEEN`.
+      One of `MALFORMED`.
     """
     metric, members = report["choose_by"]["metric"], report["members"]
     report["configurations"][report["chosen"]["configuration"]]

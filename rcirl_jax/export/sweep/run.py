@@ -38,9 +38,8 @@ from rcirl_jax.export.sweep.folder import (
 )
 from rcirl_jax.export.sweep.search import searched
 from rcirl_jax.runtime.atomic_files import read_json, write_json, write_whole
-from rcirl_jax.runtime.code import code_of
 from rcirl_jax.runtime.executors import Executor
-from rcirl_jax.runtime.pipeline import Stages, only_one
+from rcirl_jax.runtime.pipeline import Stages, code_sha256, only_one
 
 
 def run_sweep(
@@ -121,7 +120,7 @@ def _train(
     stages, settings = Stages(folder=folder), settings_of(config)
     settings["dataset_sha256"] = made_by["dataset_sha256"]
     check_settings(stages, settings)
-    inputs = {**settings, "points": config.points, "code": code_of([__name__])}
+    inputs = {**settings, "points": config.points, "code": code_sha256()}
     names = {
         h: f"{number}_{shape_name(h)}" if number else shape_name(h)
         for h in config.shapes

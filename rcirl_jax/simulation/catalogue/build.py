@@ -89,7 +89,7 @@ def parse_case_id(text: str) -> tuple[str, int, int]:
     """
     found = ID.match(text)
     if found is None:
-        raise InputError(f"--case: {text}: expected FAMILY/INDEX@SEED: cut_in/017@0")
+        raise InputError(f"case: {text}: expected FAMILY/INDEX@SEED: cut_in/017@0")
     return found[1], int(found[2]), int(found[3])
 
 

@@ -197,7 +197,7 @@ def load_family(name_or_path: str) -> Family:
         path = spec_root() / "scenarios" / f"{name_or_path}.toml"
     if not path.is_file():
         raise InputError(
-            f"--suite: {name_or_path}: expected one of {', '.join(family_names())}"
+            f"suite: {name_or_path}: expected one of {', '.join(family_names())}"
         )
     spec = load_toml(path)
     with as_input_error(str(path), "a family of scenarios"):

@@ -106,18 +106,25 @@ def test_rows_that_go_on_in_quotes_have_an_end(tmp_path):
     assert [track.id for track in found.tracks] == ["a", "a b c"]
 
 
-def test_what_no_check_foresaw_is_one_line_that_names_the_place(tmp_path, monkeypatch):
+def test_a_fault_of_ours_is_not_the_users(tmp_path, monkeypatch):
+    """Errors of bad data become one line; a bug passes, with a note on the file."""
     fixture = csv.write(tmp_path)
-
-    def broken(path, spec):
-        yield from ()
-        raise KeyError("stations")
-
     module = formats.importlib.import_module("rcirl_jax.data.formats.csv.reader")
-    monkeypatch.setattr(module, "recordings", broken)
+
+    def broken(error):
+        def recordings(path, spec):
+            yield from ()
+            raise error
+
+        monkeypatch.setattr(module, "recordings", recordings)
+
+    broken(ValueError("cannot convert"))
     line = refused(read, "csv", fixture.input)
-    assert "KeyError: 'stations' (test_absurd.py:" in line
-    assert line.endswith("expected a sound log of format csv")
+    assert "ValueError: cannot convert: expected a sound log of format csv" in line
+    broken(KeyError("stations"))
+    with pytest.raises(KeyError) as caught:
+        read("csv", fixture.input)
+    assert caught.value.__notes__ == [f"while reading {fixture.input}"]
 
 
 @pytest.mark.multiprocess
@@ -129,7 +136,7 @@ def test_what_no_check_foresaw_is_one_line_that_names_the_place(tmp_path, monkey
     ],
 )
 def test_memory_that_is_not_given_is_one_line(work, said):
-    script = f"from rcirl_jax.cli.flags.common import run; run(lambda: exec({work!r}))"
+    script = f"from rcirl_jax.cli.running import run; run(lambda: exec({work!r}))"
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=False
     )

@@ -36,7 +36,7 @@ def test_a_table_of_ones_own_needs_a_source_or_the_usual_names(tmp_path):
         with pytest.raises(InputError) as caught:
             recognised_format(place)
         line = str(caught.value)
-        assert line.startswith(f"{path}: --format: not given: a table of no known")
+        assert line.startswith(f"{path}: format: not given: a table of no known")
         assert f"--suggest={path}" in line
     source = people.spec(tmp_path)
     assert recognised_format(path, source) == "csv"
@@ -45,9 +45,7 @@ def test_a_table_of_ones_own_needs_a_source_or_the_usual_names(tmp_path):
 def test_what_is_nothing_or_several_is_one_line(tmp_path):
     with pytest.raises(InputError, match="input: missing"):
         recognised_format(tmp_path / "nowhere")
-    with pytest.raises(
-        InputError, match="no files of a known format: expected --format"
-    ):
+    with pytest.raises(InputError, match="no files of a known format: expected one of"):
         recognised_format(tmp_path)
     w.commonroad(tmp_path / "a.xml")
     w.ngsim_text(tmp_path / "a.txt", w.ngsim_rows())
@@ -62,7 +60,7 @@ def test_an_import_says_what_it_recognised(tmp_path):
     flags = (f"--input={tmp_path / 'log'}", f"--output={tmp_path / 'out'}")
     done = command("rcirl_jax", "import", *flags)
     assert done.returncode == 2
-    assert done.stderr.startswith(f"error: {path}: --format: not given: a table of no")
+    assert done.stderr.startswith(f"error: {path}: format: not given: a table of no")
     path.write_text(people.text([row[:7] for row in people.rows()], people.HEADER[:7]))
     more = ("--keep_free_road", "--keep_steady", "--test_fraction=0")
     done = command("rcirl_jax", "import", *flags, *more)

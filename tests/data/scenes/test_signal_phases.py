@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-from absl import flags
-from absl.testing import flagsaver
 
-from rcirl_jax.cli.flags.signals import checked_signals, signals_asked
+from rcirl_jax.cli.flags import pooled_signals
 from rcirl_jax.data.parts import parts_of, recordings_of
 from rcirl_jax.data.scenes import signal_phases
 from rcirl_jax.data.scenes.collect import Collector
@@ -20,7 +18,7 @@ from rcirl_jax.data.scenes.signal_phases import (
     line_events,
     period,
 )
-from rcirl_jax.runtime.executors import Here, Processes
+from rcirl_jax.runtime.executors import Processes, Serial
 from rcirl_jax.types import Kind, Lane, Recording, Signal, Track
 from tests.data.formats.fixtures import commonroad
 
@@ -127,7 +125,7 @@ def test_logs_are_checked_alike_wherever_they_are_read(tmp_path):
     logs = parts_of("commonroad", tmp_path)
     made = [recording for part in logs for recording in recordings_of(part)]
     assert len(made) == len(logs) == 3
-    for places in Here(), Processes(2):
+    for places in Serial(), Processes(2):
         found = check_written(logs, executor=places)
         assert repr(found) == repr(checked(made))  # a share of nothing is NaN
 
@@ -155,11 +153,7 @@ def test_an_import_can_ask_all_files_itself(monkeypatch, capsys):
     made = [drives_of(number, 0.0) for number in range(12)]
     monkeypatch.setattr(signal_phases, "recordings_in", lambda one: [(None, one)])
     monkeypatch.setattr(signal_phases, "items", lambda parts, _: iter(parts))
-    flags.FLAGS.mark_as_parsed()
-    for given, asked in (({"signals": "pooled"}, verdicts(made)), ({}, None)):
-        with flagsaver.as_parsed(**given):
-            assert signals_asked() == given.get("signals", "")
-            assert checked_signals(made, Here()) == asked
+    assert pooled_signals(made, Serial()) == verdicts(made)
     assert "confirmed" in capsys.readouterr().out
 
 

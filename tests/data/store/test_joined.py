@@ -71,7 +71,7 @@ def test_shares_from_a_flag():
     assert joined.shares_of("1,0.5,2", 3) == (1.0, 0.5, 2.0)
     assert joined.shares_of("equal", 1) is None
     for bad in ("1,2", "1,2,0", "1,2,x", "1,2,nan", "1,2,inf", "half"):
-        with pytest.raises(InputError, match="--data_weights"):
+        with pytest.raises(InputError, match="data_weights"):
             joined.shares_of(bad, 3)
 
 

@@ -120,7 +120,7 @@ def test_folds_hold_out_every_scene_once():
 
 @pytest.mark.parametrize("count", [1, 5])
 def test_folds_need_recordings(count):
-    with pytest.raises(InputError, match=f"--folds: {count}: expected 2 to 4"):
+    with pytest.raises(InputError, match=f"folds: {count}: expected 2 to 4"):
         folds_by_recording(Rows(), count)
 
 
@@ -156,5 +156,5 @@ def test_scenes_with_a_tag():
     ],
 )
 def test_tags_that_select_nothing_are_one_line(tag, words):
-    with pytest.raises(InputError, match=f"--tags: {words}"):
+    with pytest.raises(InputError, match=f"tags: {words}"):
         with_tags(Tagged(), [tag])

@@ -104,7 +104,7 @@ def test_an_equal_budget_is_in_queries():
     problem = Problem(objective=sphere, queries=256 * each)
     assert learner_budget(Scenes(), SMALL, 20, problem) == 2000 * 20 // 256
     much = Problem(objective=sphere, queries=40_000 * each + 1)
-    with pytest.raises(InputError, match=r"--epochs: 20: .* queries: expected"):
+    with pytest.raises(InputError, match=r"epochs: 20: .* queries: expected"):
         learner_budget(Scenes(), SMALL, 20, much)
 
 

@@ -294,9 +294,9 @@ def test_bad_input_is_one_line():
     for work, says in (
         (lambda: pair(nan, good), "family00/003@0: progress: not a finite"),
         (lambda: dataclasses.replace(both, ids=twice), "family00/003@0: met twice"),
-        (lambda: GateConfig(min_ttc=0), "--min_ttc_margin: 0: expected within"),
-        (lambda: GateConfig(primary=("reward",)), "--primary: reward: expected some"),
-        (lambda: GateConfig(accept=("a/1@0", "a/1@0")), "--accept: a/1@0: met twice"),
+        (lambda: GateConfig(min_ttc=0), "min_ttc: 0: expected within"),
+        (lambda: GateConfig(primary=("reward",)), "primary: reward: expected some"),
+        (lambda: GateConfig(accept=("a/1@0", "a/1@0")), "accept: a/1@0: met twice"),
     ):
         with pytest.raises(InputError, match=says):
             work()

@@ -171,7 +171,7 @@ def test_an_accepted_case_does_not_count():
     assert [fault.accepted for fault in verdict.new_faults] == [True] * 2 + [False] * 3
     some, none = f"expected some of {ids[0]}, ", "expected none, for there is none"
     for candidate, says in ((mine, some), (drives(), none)):
-        with pytest.raises(InputError, match=f"--accept: family01/000@1: .*{says}"):
+        with pytest.raises(InputError, match=f"accept: family01/000@1: .*{says}"):
             decide(candidate, theirs, accept=("family01/000@1",))
 
 

@@ -31,7 +31,7 @@ from rcirl_jax.data.readers.tables.table import (
     Table,
 )
 from rcirl_jax.errors import InputError
-from rcirl_jax.runtime.settings import check_names
+from rcirl_jax.runtime.checked import check_names
 
 NEEDED = ("t", "id", "x", "y")
 TEXT = ("id", "kind", "lane", "recording", "automated")

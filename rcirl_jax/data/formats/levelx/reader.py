@@ -292,7 +292,7 @@ def _check_whole(
                 raise InputError(
                     f"{path}: track {name}: {field}: {value:.12g}: expected "
                     f"{expected:.12g} as in {_other(path, USERS).name}; truncated "
-                    "file? (of a sample, set partial = true in the TOML of --source)"
+                    "file? (of a sample, set partial = true in the source TOML)"
                 )
 
 

@@ -22,8 +22,7 @@ from rcirl_jax.data.synthetic.roads import lanes, to_world
 from rcirl_jax.data.synthetic.stops import schedule
 from rcirl_jax.data.synthetic.traffic import Log
 from rcirl_jax.errors import InputError
-from rcirl_jax.runtime.checked import checked
-from rcirl_jax.runtime.settings import check_names
+from rcirl_jax.runtime.checked import check_names, checked
 from rcirl_jax.runtime.specs import load_toml
 from rcirl_jax.types import Kind, Recording, Signal, Track
 

@@ -18,7 +18,7 @@ from typing import Any
 
 from rcirl_jax.data.readers.tables.streams import head_of
 from rcirl_jax.errors import InputError
-from rcirl_jax.runtime.settings import check_names
+from rcirl_jax.runtime.checked import check_names
 
 MAX_COLUMNS = 10_000  # of a table; logs have some dozens
 MOST = 0.8  # share of a head's rows that repeat their last columns

@@ -1,7 +1,0 @@
-"""`rcirl inspect` as `python -m` from a clone."""
-
-from rcirl_jax.cli.flags.common import run
-from rcirl_jax.cli.inspect_data import main
-
-if __name__ == "__main__":
-    run(main)

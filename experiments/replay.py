@@ -1,7 +1,0 @@
-"""`rcirl replay` as `python -m` from a clone."""
-
-from rcirl_jax.cli.flags.common import run
-from rcirl_jax.cli.replay import main
-
-if __name__ == "__main__":
-    run(main)

@@ -1,0 +1,231 @@
+"""The learned value on top of the planner's own cost; see `planner.prior_cost`.
+
+The familiarity is fitted on recorded scenes against scenes of the catalogue, and
+stands in the weights file with the gains, so that a planner adds its own cost and
+nothing else. It minimises the weighted binary cross entropy of `reward.familiarity`;
+the catalogue weighs ELSEWHERE times as much as all recordings together, so that doubt
+leaves the choice to the own cost, and every recorded source weighs as its share says:
+
+    loss = mean_i w_i BCE(familiarity(x_i), y_i) + DECAY |weights|^2,   y = 1 recorded
+
+with Adam over all scenes at once from a fixed seed: the same scenes give the same
+familiarity. What never varies gets no weight.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from rcirl_jax.data.store.dataset import Dataset
+from rcirl_jax.errors import InputError
+from rcirl_jax.export.reader import PriorCost
+from rcirl_jax.features import FeatureMap, feature_map
+from rcirl_jax.planner.prediction import as_seen
+from rcirl_jax.reward.familiarity import (
+    Familiarity,
+    familiarity_logit,
+    of_the_scene,
+)
+from rcirl_jax.runtime.atomic_files import read_json, write_json
+from rcirl_jax.sampling import trajectory_on_path
+from rcirl_jax.tuning.recipes import PriorCostConfig
+from rcirl_jax.tuning.run import Run
+from rcirl_jax.types import Candidates, Scene
+from rcirl_jax.units import TIMES_S
+
+OWN_COST = "hand-set"  # what stands for the planner's own cost here
+UNITS = 16  # H
+STEPS = 1500
+STEP_SIZE = 1e-2
+DECAY = 1e-3
+ELSEWHERE = 3.0  # weight of the catalogue, where the recordings have 1
+STILL = 1e-3  # scale below which a feature does not vary
+LANES = 64  # scenes whose features are made together
+ARRAYS = ("location", "scale", "kernel", "bias", "out", "offset")
+
+
+def fitted_prior_cost(
+    config: PriorCostConfig,
+    recorded: Sequence[Dataset],
+    shares: Sequence[float],
+    elsewhere: Sequence[Dataset],
+    features: FeatureMap,
+) -> PriorCost:
+    """The prior cost of a weights file, from the training splits.
+
+    Args:
+      config: gains.
+      recorded: the sources.
+      shares: > 0, how much each of them counts.
+      elsewhere: simulated demonstrations.
+      features: of the reward.
+    """
+    mine = [_training_scenes(one, features) for one in recorded]
+    pairs = zip(mine, shares, strict=True)
+    weights = np.concatenate([np.full(len(x), share / len(x)) for x, share in pairs])
+    others = [_training_scenes(one, features, config.slowed) for one in elsewhere]
+    made = fit_familiarity(
+        np.concatenate(mine),
+        weights,
+        np.concatenate(others),
+        np.asarray(of_the_scene(features)),
+    )
+    arrays = {name: np.asarray(getattr(made, name)) for name in ARRAYS}
+    arrays["offset"] = arrays["offset"].reshape(1)
+    return PriorCost(incumbent=OWN_COST, low=config.low, high=config.high, **arrays)
+
+
+def write_prior_cost(path: Path, prior_cost: PriorCost) -> None:
+    """The prior cost as JSON; float32 survives it."""
+    fields = dataclasses.asdict(prior_cost)
+    as_lists = {n: x.tolist() for n, x in fields.items() if isinstance(x, np.ndarray)}
+    write_json(path, {**fields, **as_lists})
+
+
+def read_prior_cost(path: Path) -> PriorCost:
+    """The prior cost of a file that `write_prior_cost` wrote.
+
+    Raises:
+      InputError: it is not.
+    """
+    found = read_json(path, "a prior cost as written")
+    try:
+        arrays = {n: np.asarray(found[n], np.float32) for n in ARRAYS}
+        own = str(found["incumbent"]), float(found["low"]), float(found["high"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path}: {error}: expected a prior cost as written"
+        ) from error
+    return PriorCost(incumbent=own[0], low=own[1], high=own[2], **arrays)
+
+
+def _training_scenes(
+    dataset: Dataset, features: FeatureMap, slowed: Sequence[float] = ()
+) -> np.ndarray:
+    """Features of the training scenes, then of the same with a slower, steady ego."""
+    scene = dataset.load("train").scene
+    egos = [scene.ego.replace(v=x * scene.ego.v, a=0.0 * scene.ego.a) for x in slowed]
+    scenes = [scene, *[scene.replace(ego=ego) for ego in egos]]
+    return np.concatenate([scene_features(one, features) for one in scenes])
+
+
+def scene_features(scenes: Scene, features: FeatureMap) -> np.ndarray:
+    """[n, F] raw features of n scenes at t = 0, as the planner sees them."""
+    return np.asarray(_scene_features(scenes, features))
+
+
+@functools.partial(jax.jit, static_argnames="features")
+def _scene_features(scenes: Scene, features: FeatureMap) -> jax.Array:
+    def one(scene: Scene) -> jax.Array:
+        scene = as_seen(scene)
+        straight = trajectory_on_path(scene, scene.ego.v * jnp.asarray(TIMES_S))
+        only = Candidates(
+            trajectory=jax.tree.map(lambda x: x[None], straight),
+            feasible=jnp.ones(1, bool),
+            family=jnp.zeros(1, jnp.int32),
+        )
+        return jnp.stack([row[0, 0] for row in features.rows(scene, only)])
+
+    return jax.lax.map(one, scenes, batch_size=LANES)
+
+
+def fit_familiarity(
+    recorded: np.ndarray, weights: np.ndarray, elsewhere: np.ndarray, counts: np.ndarray
+) -> Familiarity:
+    """The familiarity of recorded scenes.
+
+    Args:
+      recorded: [n, F] of `scene_features`.
+      weights: [n] > 0, of the recorded scenes.
+      elsewhere: [m, F], of the catalogue's.
+      counts: [F] bool, of `of_the_scene`.
+    """
+    both = np.concatenate([recorded, elsewhere]).astype(np.float64)
+    location, spread = both.mean(axis=0), both.std(axis=0)
+    varies = counts & (spread > STILL)
+    scale = np.where(varies, spread, 1.0)
+    shares = np.concatenate(
+        [
+            weights / weights.sum(),
+            np.full(len(elsewhere), ELSEWHERE / len(elsewhere)),
+        ]
+    )
+    mask = jnp.asarray(varies, jnp.float32)[:, None]
+    first, last = jax.random.split(jax.random.key(0))
+    size = recorded.shape[1]
+    start = Familiarity(
+        location=jnp.asarray(location, jnp.float32),
+        scale=jnp.asarray(scale, jnp.float32),
+        kernel=mask * jax.random.normal(first, (size, UNITS)) * size**-0.5,
+        bias=jnp.zeros(UNITS),
+        out=jax.random.normal(last, (UNITS,)) * UNITS**-0.5,
+        offset=jnp.zeros(()),
+    )
+    labels = np.arange(len(both)) < len(recorded)
+    return _fit(
+        start,
+        mask,
+        jnp.asarray(both, jnp.float32),
+        jnp.asarray(labels, jnp.float32),
+        jnp.asarray(shares / (1.0 + ELSEWHERE), jnp.float32),
+    )
+
+
+@jax.jit
+def _fit(
+    start: Familiarity, mask: jax.Array, x: jax.Array, y: jax.Array, share: jax.Array
+) -> Familiarity:
+    optimizer = optax.adam(STEP_SIZE)
+    free = {name: getattr(start, name) for name in ("kernel", "bias", "out", "offset")}
+
+    def loss(free: dict[str, jax.Array]) -> jax.Array:
+        logits = familiarity_logit(start.replace(**free), x)
+        fit = jnp.sum(share * optax.sigmoid_binary_cross_entropy(logits, y))
+        return fit + DECAY * sum(jnp.sum(leaf**2) for leaf in free.values())
+
+    def step(_: int, carry: tuple) -> tuple:
+        free, state = carry
+        updates, state = optimizer.update(jax.grad(loss)(free), state)
+        return optax.apply_updates(free, updates), state
+
+    free, _ = jax.lax.fori_loop(0, STEPS, step, (free, optimizer.init(free)))
+    return start.replace(**free | {"kernel": mask * free["kernel"]})
+
+
+def fit_prior_cost(
+    run: Run,
+    sources: Sequence[Dataset],
+    shares: Sequence[float],
+    drives: Sequence[Dataset],
+) -> Path | None:
+    """The prior cost, fitted on recordings against simulated drives, if wanted."""
+    config, path = run.config, prior_cost_file(run, len(drives))
+    if path is None:
+        return None
+    inputs = {
+        "prior_cost": dataclasses.asdict(config.prior_cost),
+        "recorded": [one.hash for one in sources],
+        "shares": list(shares),
+        "drives": [one.hash for one in drives],
+        "features": config.train.features,
+    }
+
+    def work() -> None:
+        features = feature_map(config.train.features)
+        made = fitted_prior_cost(config.prior_cost, sources, shares, drives, features)
+        write_prior_cost(path, made)
+
+    run.stage(f"prior cost {len(drives)}", inputs, [path], work)
+    return path
+
+
+def prior_cost_file(run: Run, drives: int) -> Path | None:
+    """Where the prior cost against so many sets of drives lies; None: there is none."""
+    wanted = run.config.prior_cost.wanted
+    return run.folder / "prior_costs" / f"{drives}.json" if wanted else None

@@ -1,0 +1,312 @@
+"""Recipes: TOML files that hold everything that decides a run.
+
+    data_specs/recipes/tuned.toml   the default
+    data_specs/recipes/paper.toml   the paper's own setting
+    data_specs/recipes/quick.toml   for the demo
+
+[train] are fields of `TrainConfig`, [train.reward] of `RewardConfig` (`by_context`
+stands for the preset's context columns), [train.sampler] of `SamplerConfig`, [collect]
+of `CollectConfig`, [simulated_demonstrations] of `SimulatedDemonstrations`,
+[prior_cost] of `PriorCostConfig`. What a file leaves out is the field's own default.
+Nothing else has a default of its own: commands take a recipe, and flags given beside it
+win. `TuneConfig` is a recipe with the settings of one run.
+"""
+
+import dataclasses
+import importlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.data.store.joined import EQUAL
+from rcirl_jax.errors import InputError, did_you_mean
+from rcirl_jax.evaluation.gate.types import GateConfig
+from rcirl_jax.export.sweep.result import read_sweep
+from rcirl_jax.features import feature_map
+from rcirl_jax.reward import RewardConfig
+from rcirl_jax.runtime.checked import check_names, typed_fields
+from rcirl_jax.runtime.specs import load_toml, spec_root
+from rcirl_jax.sampling import SamplerConfig
+from rcirl_jax.train.state import TrainConfig
+
+DEFAULT = "tuned"
+SIMULATED = "simulated_demonstrations"
+TABLES = ("about", "train", "collect", SIMULATED, "prior_cost", "autotune")
+# of a run, not of a recipe
+NOT_OF_A_RECIPE = ("seed", "reward", "sampler")
+PRESETS_OWN = ("context", "signs")  # of a reward, what its feature preset says
+EXPERTS = ("none", "driver model", "hand-set", "incumbent")
+SUITE_SEED = 0  # of the catalogue that rewards are judged on
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SimulatedDemonstrations:
+    """How an expert drives the catalogue; [simulated_demonstrations] of a recipe."""
+
+    # who drives, one of EXPERTS
+    expert: str = "none"
+    # cases of each family that the expert drives, and those of a further round
+    cases: int = 12
+    takeover_cases: int = 16
+    # further rounds: the expert takes over from the reward learned so far, or (weight
+    # 0) that reward drives alone
+    rounds: int = 1
+    # seed of the cases; round r has this one plus r
+    catalogue_seed: int = 1000
+    # s of a drive, and between two scenes of the expert's drives and of takeovers
+    duration_s: float = 120.0
+    stride_s: float = 3.0
+    takeover_stride_s: float = 1.5
+    # weight of the expert's drives, and of each round, where a recorded source has 1;
+    # 0: not learned from
+    weight: float = 1.2
+    takeover_weight: float = 0.8
+
+    def __post_init__(self) -> None:
+        """Rejects values out of range."""
+        above = f"above {SUITE_SEED}, the suite's own"
+        for name, fits, expected in (
+            ("expert", self.expert in EXPERTS, f"one of {', '.join(EXPERTS)}"),
+            ("cases", self.cases >= 1, "at least 1"),
+            ("takeover_cases", self.takeover_cases >= 1, "at least 1"),
+            ("rounds", self.rounds >= 0, "at least 0"),
+            ("catalogue_seed", self.catalogue_seed > SUITE_SEED, above),
+            ("weight", self.weight >= 0.0, ">= 0"),
+            ("takeover_weight", self.takeover_weight > 0.0, "> 0"),
+        ):
+            if not fits:
+                value = getattr(self, name)
+                raise InputError(f"{SIMULATED}: {name}: {value}: expected {expected}")
+
+    @property
+    def datasets(self) -> int:
+        """Number of datasets: the expert's drives and one for each round."""
+        return 0 if self.expert == "none" else 1 + self.rounds
+
+    @property
+    def weights(self) -> tuple[float, ...]:
+        """Weight of each dataset, in their order."""
+        again = self.takeover_weight if self.weight else 0.0
+        return (self.weight, *[again] * self.rounds)[: self.datasets]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PriorCostConfig:
+    """[prior_cost] of a recipe; gains of V on top of the own cost."""
+
+    low: float = 0.0  # where nothing like the scene was recorded
+    high: float = 0.0  # where all of it was; 0: no prior cost, V drives alone
+    # shares of the ego's speed at which the simulated scenes are shown once more: who
+    # is slow on an empty road is not in recorded traffic for being slow
+    slowed: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        """0 <= low <= high, and 0 <= slowed < 1."""
+        if not 0.0 <= self.low <= self.high:
+            raise InputError(
+                f"prior_cost: low, high: {self.low}, {self.high}: expected "
+                "0 <= low <= high"
+            )
+
+        if not all(0.0 <= share < 1.0 for share in self.slowed):
+            raise InputError(
+                f"prior_cost: slowed: {list(self.slowed)}: expected shares of the "
+                "speed, each at least 0 and below 1"
+            )
+
+    @property
+    def wanted(self) -> bool:
+        """Whether there is a prior cost."""
+        return self.high > 0.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Recipe:
+    """Everything that decides a run but the data and the seed."""
+
+    name: str
+    about: str
+    train: TrainConfig
+    collect: CollectConfig
+    simulated: SimulatedDemonstrations
+    prior_cost: PriorCostConfig
+    seeds: int  # training runs of which the median one drives
+
+
+def recipe_names() -> list[str]:
+    """Lists those in data_specs/recipes."""
+    return sorted(path.stem for path in (spec_root() / "recipes").glob("*.toml"))
+
+
+def load_recipe(name: str) -> Recipe:
+    """Loads a recipe by its name or by its file.
+
+    Raises:
+      InputError: no such recipe; an unknown table or key (with the nearest known one);
+        a value of another type or out of range.
+    """
+    known = recipe_names()
+    if name in known:
+        path = spec_root() / "recipes" / f"{name}.toml"
+    elif name.endswith(".toml"):
+        path = Path(name)
+    else:
+        raise InputError(
+            f"recipe: {name}: expected one of {', '.join(known)}, or a .toml file"
+            + did_you_mean(name, known)
+        )
+    body = load_toml(path)
+    check_names(f"{path}: ", body, TABLES)
+    train = _table(path, "train", body)
+    reward = _table(path, "train.reward", train)
+    sampler = _table(path, "train.sampler", train)
+    tuning = _table(path, "autotune", body)
+    check_names(f"{path}: [autotune] ", tuning, ("seeds",))
+    seeds = tuning.get("seeds", 1)
+    if type(seeds) is not int or seeds < 1:
+        raise InputError(f"{path}: [autotune] seeds: {seeds}: expected at least 1")
+    settings = typed_fields(TrainConfig, train, f"{path}: [train] ", NOT_OF_A_RECIPE)
+    settings["reward"] = _reward(path, reward, settings.get("features", "paper21"))
+    settings["sampler"] = _made(path, "train.sampler", SamplerConfig, sampler)
+    simulated = _made(
+        path, SIMULATED, SimulatedDemonstrations, _table(path, SIMULATED, body)
+    )
+    prior_cost = _made(
+        path, "prior_cost", PriorCostConfig, _table(path, "prior_cost", body)
+    )
+    if prior_cost.wanted and not simulated.datasets:
+        raise InputError(
+            f"{path}: [{SIMULATED}] expert: none: expected one with a [prior_cost]: "
+            "its drives show what was not recorded"
+        )
+    collect, none = _table(path, "collect", body), ("signal_checks",)
+    return Recipe(
+        name=path.stem if name in known else name,
+        about=str(body.get("about", "")),
+        train=_built(path, "train", TrainConfig, settings),
+        collect=_made(path, "collect", CollectConfig, collect, none),
+        simulated=simulated,
+        prior_cost=prior_cost,
+        seeds=seeds,
+    )
+
+
+def reward_config(
+    features: str, settings: Mapping[str, Any], by_context: bool
+) -> RewardConfig:
+    """The network with the preset's context and signs where they are asked for."""
+    preset = feature_map(features)
+    monotone = settings.get("constraint") == "monotone"
+    return RewardConfig(
+        **settings,
+        context=preset.context if by_context else (),
+        signs=preset.signs if monotone else (),
+    )
+
+
+def override(
+    base: TrainConfig,
+    given: Mapping[str, Any],
+    *,
+    seed: int = 0,
+    by_context: bool | None = None,
+) -> TrainConfig:
+    """Overrides settings of a recipe's training.
+
+    Args:
+      base: the recipe's.
+      given: fields of `TrainConfig`, and of its `RewardConfig` beside them.
+      seed: of initial weights, batches, candidates.
+      by_context: whether the scene sets the gains; None: as in the recipe.
+
+    Raises:
+      InputError: a value that cannot be.
+    """
+    fields = [field.name for field in dataclasses.fields(RewardConfig)]
+    of_reward = [name for name in fields if name not in PRESETS_OWN]
+    settings = {name: getattr(base.reward, name) for name in of_reward}
+    settings |= {name: value for name, value in given.items() if name in of_reward}
+    rest = {name: value for name, value in given.items() if name not in of_reward}
+    reward = reward_config(
+        rest.get("features", base.features),
+        settings,
+        bool(base.reward.context) if by_context is None else by_context,
+    )
+    return dataclasses.replace(base, **rest, seed=seed, reward=reward)
+
+
+def _reward(path: Path, found: dict, features: str) -> RewardConfig:
+    where = "train.reward"
+    by_context = found.pop("by_context", False)
+    if not isinstance(by_context, bool):
+        raise InputError(
+            f"{path}: [{where}] by_context: {by_context}: expected true or false"
+        )
+    known = f"{path}: [{where}] "
+    typed = typed_fields(RewardConfig, found, known, PRESETS_OWN)
+    made = lambda **settings: reward_config(features, settings, by_context)  # noqa: E731
+    return _built(path, where, made, typed)
+
+
+def _made(
+    path: Path, where: str, kind: type, found: dict, without: tuple[str, ...] = ()
+) -> Any:  # noqa: ANN401
+    typed = typed_fields(kind, found, f"{path}: [{where}] ", without)
+    return _built(path, where, kind, typed)
+
+
+def _built(path: Path, where: str, kind: Callable, values: dict) -> Any:  # noqa: ANN401
+    try:
+        return kind(**values)
+    except (InputError, ValueError) as error:
+        raise InputError(f"{path}: [{where}] {error}") from error
+
+
+def _table(path: Path, where: str, body: dict) -> dict:
+    """The table [where], taken out of the one that holds it; empty without one."""
+    found = body.pop(where.rpartition(".")[2], {})
+    if not isinstance(found, dict):
+        raise InputError(f"{path}: {where}: {found}: expected a table [{where}]")
+    return dict(found)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TuneConfig:
+    """Everything that decides the outcome, besides the data."""
+
+    train: TrainConfig
+    gate: GateConfig
+    incumbent: str = "hand-set"  # weights file or baseline
+    simulated: SimulatedDemonstrations = dataclasses.field(
+        default_factory=SimulatedDemonstrations
+    )
+    prior_cost: PriorCostConfig = PriorCostConfig()
+    data_weights: str = EQUAL  # of several sources, as `data.store.joined.shares_of`
+    recipe: str = ""  # its name, for the report
+    seeds: int = 1
+    search: str = "cma"  # of the tuned IDM: one of `baselines.tuned.SEARCHES`
+    drives: int = 240  # held-out, for human-likeness
+    horizon_s: float = 5.0
+    suite: str = "full"
+    cases: int | None = None  # per family
+    duration_s: float | None = None
+    catalogue_seed: int = 0
+    plan_every: int = 1
+    sweep: Path | None = None  # of `rcirl sweep`, shown in the report
+
+    def __post_init__(self) -> None:
+        """Rejects settings that would fail only after the training."""
+        if self.sweep is not None:
+            read_sweep(self.sweep)
+        if self.search == "optuna":
+            importlib.import_module("optuna")  # an extra
+        if self.drives < 1:
+            raise InputError(f"drives: {self.drives}: expected at least 1")
+        if self.seeds < 1:
+            raise InputError(f"seeds: {self.seeds}: expected at least 1")
+        if self.train.sampler.mode != "speed":
+            raise InputError(
+                f"mode: {self.train.sampler.mode}: the closed loop plans speed"
+            )
+        self.train.reward.check_own()

@@ -1,0 +1,136 @@
+"""One tuning run: its folder, its stages, its incumbent, its provenance.
+
+RUN/dataset-KEY/       the import of each log, unless datasets are given
+RUN/demonstrations-KEY/N/   simulated: the expert's drives, then each round's
+RUN/rounds/N.msgpack   the reward that the expert of round N takes over from
+RUN/prior_costs/N.json how far the recordings reach, against N sets of drives
+RUN/train-KEY/seed-N/  training runs; KEY changes with what they are made from
+RUN/seeds/N.msgpack    every seed's reward
+RUN/weights.msgpack    the candidate: of the seeds the one with the median share of
+                       training pairs won
+RUN/tuned_idm.json     the driver model tuned on the training scenes, a baseline
+RUN/ranking.json       held-out scenes as the planner sees them, beside baselines
+RUN/ranking_recorded.json   the same with recorded futures
+RUN/likeness.json      held-out drives: how near to the human (and likeness.npz, .txt)
+RUN/suite/             metrics.npz, suite.json, cases.csv, table.txt
+RUN/verdict.json       of the gate
+RUN/verdict.txt        its checks and the held-out drives as tables
+RUN/report.html        all of it to look at
+RUN/stages.json        what made what (`stages`)
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from rcirl_jax.data.store.dataset import Dataset
+from rcirl_jax.export.loading import open_reward
+from rcirl_jax.export.reader import Reward
+from rcirl_jax.runtime.executors import Executor
+from rcirl_jax.runtime.pipeline import Stages, code_sha256, file_sha256
+from rcirl_jax.simulation.rows import BASELINES
+from rcirl_jax.train.running import Running
+from rcirl_jax.tuning.recipes import TuneConfig
+
+# what reads as permission to use weights that are no longer there
+STALE = {
+    **dict.fromkeys(("import", "demonstrate", "train"), ("export", "gate", "report")),
+    **dict.fromkeys(("export", "simulate", "likeness"), ("gate", "report")),
+    **dict.fromkeys(("rank", "gate"), ("report",)),
+}
+NOTED = ("git_commit", "code_sha256", "versions", "flags")  # of every stage
+
+
+def _say(line: str) -> None:
+    """A line that is seen at once, also where it goes into a file."""
+    print(line, flush=True)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Run:
+    """One run folder with its settings."""
+
+    folder: Path
+    config: TuneConfig
+    executor: Executor
+    running: Running
+    facts: Mapping[str, Any]  # provenance: commit, versions, flags
+    say: Callable[[str], object] = _say
+    done: list[str] = dataclasses.field(default_factory=list)  # stages, by this process
+
+    @property
+    def stages(self) -> Stages:
+        """The record of finished stages."""
+        return Stages(folder=self.folder)
+
+    @property
+    def weights(self) -> Path:
+        """The candidate."""
+        return self.folder / "weights.msgpack"
+
+    @property
+    def tables(self) -> Path:
+        """The verdict's checks and the held-out drives as text."""
+        return self.folder / "verdict.txt"
+
+    @property
+    def page(self) -> Path:
+        """The report to open."""
+        return self.folder / "report.html"
+
+    @property
+    def tuned_idm(self) -> Path:
+        """The driver model tuned on the training scenes."""
+        return self.folder / "tuned_idm.json"
+
+    @property
+    def seed_files(self) -> list[Path]:
+        """The weights of every seed."""
+        numbers = range(self.config.seeds)
+        return [self.folder / "seeds" / f"{number}.msgpack" for number in numbers]
+
+    def stage(
+        self,
+        name: str,
+        inputs: Mapping[str, Any],
+        outputs: list[Path],
+        work: Callable[[], object],
+    ) -> None:
+        """Do a stage's work unless it was done from these inputs by this code.
+
+        Arguments as of `Stages.run`; what the stage makes `STALE` is removed first.
+        """
+        facts = {**inputs, **self.code()}
+        kind = name.partition(" ")[0]
+        stale = STALE.get(kind, ())
+        made_by = {key: self.facts[key] for key in NOTED if key in self.facts}
+        done = self.stages.run(name, facts, outputs, work, stale, made_by)
+        if done:
+            self.done.append(name)
+        self.say(f"[{name}] {'done' if done else 'as before, kept'}")
+
+    def code(self) -> dict:
+        """The part of a stage's key besides its inputs: package and libraries."""
+        return {"code": code_sha256(), "versions": self.facts["versions"]}
+
+    def sign(self, dataset: Dataset) -> None:
+        """Write the provenance of a dataset of this run beside it."""
+        dataset.write_facts({"data_hash": dataset.hash, "made_by": self.facts})
+
+    def provenance(self) -> dict:
+        """Provenance of an output, with the hashes of the rewards."""
+        rewards = [open_reward(str(file)) for file in [*self.seed_files, self.weights]]
+        known = self.incumbent_reward()
+        rewards += [known] if known else []
+        return {**self.facts, "weights_sha256": {r.file: r.sha256 for r in rewards}}
+
+    def incumbent_reward(self) -> Reward | None:
+        """The incumbent's reward; None: a baseline."""
+        name = self.config.incumbent
+        return None if name in BASELINES else open_reward(name)
+
+    def incumbent_hash(self) -> str:
+        """The sha256 of the incumbent's file, or the baseline's name."""
+        name = self.config.incumbent
+        return name if name in BASELINES else file_sha256(Path(name))

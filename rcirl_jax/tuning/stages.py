@@ -1,0 +1,392 @@
+"""The work of the stages from training to the report; `loop` has their order.
+
+Baselines are tuned on the training scenes of the rewards; held-out scenes and drives,
+the closed loop's cases and the margins are those of `evaluation`.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from rcirl_jax.data.store.dataset import Dataset
+from rcirl_jax.data.store.joined import Demonstrations
+from rcirl_jax.evaluation.baselines.tuned import tune_idm
+from rcirl_jax.evaluation.closed_loop.files import (
+    SuiteRuns,
+    read_runs,
+    runs_of,
+    write_runs,
+)
+from rcirl_jax.evaluation.closed_loop.likeness import (
+    held_out_likeness,
+    read_arrays,
+    write_arrays,
+)
+from rcirl_jax.evaluation.closed_loop.suite import write_suite
+from rcirl_jax.evaluation.gate.decision import judge
+from rcirl_jax.evaluation.gate.output import format_verdict, write_verdict
+from rcirl_jax.evaluation.gate.runs import CANDIDATE, INCUMBENT, pair_of
+from rcirl_jax.evaluation.gate.types import Verdict
+from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
+from rcirl_jax.evaluation.ranking.format import format_table
+from rcirl_jax.evaluation.ranking.table import from_json, to_json
+from rcirl_jax.export.closed_loop import SuiteJob, read_tuned_idm, write_tuned_idm
+from rcirl_jax.export.from_run import export_run
+from rcirl_jax.export.gate_job import drive_job, gate_job, left_out
+from rcirl_jax.export.loading import open_reward, scorer_of
+from rcirl_jax.export.sweep.folder import SWEEP
+from rcirl_jax.export.sweep.result import read_sweep
+from rcirl_jax.planner.baselines import TUNED_IDM_ROW
+from rcirl_jax.report.replays import Replay, make_replays
+from rcirl_jax.runtime.atomic_files import read_json, write_json, write_whole
+from rcirl_jax.runtime.pipeline import digest, file_sha256
+from rcirl_jax.sampling import SamplerConfig
+from rcirl_jax.simulation.recorded.scenes import held_out
+from rcirl_jax.simulation.rows import TRIVIAL_BASELINES
+from rcirl_jax.simulation.suite import recorded_set
+from rcirl_jax.train.loop import train
+from rcirl_jax.train.metrics import pairs_won
+from rcirl_jax.train.state import FUTURES
+from rcirl_jax.tuning.prior_cost import prior_cost_file, read_prior_cost
+from rcirl_jax.tuning.run import Run
+
+BASELINES = ("hand-set", "IDM", "random weights", *TRIVIAL_BASELINES)
+IDM_EVALUATIONS = 300  # of the search for the tuned IDM
+REPLAYS = 6  # cases to play in the report
+RECORDED = 2  # held-out drives to play, of all sources
+
+
+# Training
+
+
+def train_round(
+    run: Run, dataset: Demonstrations, number: int, file: Path, prior: Path | None
+) -> None:
+    """Trains the learner of a round of simulated demonstrations.
+
+    Args:
+      run: folder and settings.
+      dataset: what there is to learn from by now.
+      number: of the round.
+      file: weights to write.
+      prior: of its prior cost, if it has one.
+    """
+    _train(run, f"demonstrate learner {number}", dataset, 0, file, prior)
+
+
+def train_seeds(run: Run, dataset: Demonstrations) -> None:
+    """Trains every seed, exports it; the median one becomes the candidate.
+
+    That is the seed with the median share of training pairs won.
+    """
+    files = run.seed_files
+    prior = prior_cost_file(run, run.config.simulated.datasets)
+    for number, file in enumerate(files):
+        _train(run, f"train {number}", dataset, number, file, prior)
+    steps = -(-dataset.indices("train").size // run.config.train.batch_size)
+
+    def won(number: int) -> float:
+        return pairs_won(_workdir(run, dataset, number) / "metrics.jsonl", steps)
+
+    def choose() -> None:
+        ranked = sorted(range(run.config.seeds), key=won)
+        median = files[ranked[(len(ranked) - 1) // 2]]
+        write_whole(run.weights, median.read_bytes())
+
+    hashes = [file_sha256(file) for file in files]
+    run.stage("export", {"seeds": hashes}, [run.weights], choose)
+
+
+def _train(
+    run: Run,
+    stage: str,
+    dataset: Demonstrations,
+    seed: int,
+    file: Path,
+    prior: Path | None,
+) -> None:
+    """Does one training as a stage, exported to a weights file."""
+    inputs = {**_decides_training(run, dataset), "seed": seed}
+    if prior:
+        inputs["prior_cost"] = file_sha256(prior)
+
+    def work() -> None:
+        config = dataclasses.replace(run.config.train, seed=seed)
+        workdir, facts = _workdir(run, dataset, seed), dict(run.facts)
+        train(dataset, workdir, config, running=run.running, provenance=facts)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        known = read_prior_cost(prior) if prior else None
+        export_run(workdir, dataset, file, prior_cost=known)
+
+    run.stage(stage, inputs, [file], work)
+
+
+def _decides_training(run: Run, dataset: Demonstrations) -> dict:
+    """The settings and data that decide a training, but its seed and prior cost."""
+    settings = dataclasses.asdict(run.config.train)
+    return {"config": settings, "dataset": dataset.hash, **run.code()}
+
+
+def _workdir(run: Run, dataset: Demonstrations, seed: int) -> Path:
+    """The folder of a training run."""
+    key = digest(_decides_training(run, dataset))[:8]
+    return run.folder / f"train-{key}" / f"seed-{seed}"
+
+
+def _kept_workdir(run: Run, seed: int) -> Path:
+    """The folder of a finished training run, from the notes of its stage."""
+    noted = run.stages.read().get(f"train {seed}", {}).get("inputs", {})
+    decided = ("config", "dataset", *run.code())
+    key = digest({name: noted.get(name) for name in decided})[:8]
+    return run.folder / f"train-{key}" / f"seed-{seed}"
+
+
+# Ranking of held-out scenes
+
+
+def rank(run: Run, dataset: Demonstrations) -> None:
+    """Ranks held-out scenes in both forms, all seeds beside incumbent and baselines.
+
+    The strongest simple baseline, an IDM, is tuned on the training scenes first.
+    """
+    config, path = run.config, run.tuned_idm
+    evaluations, search = IDM_EVALUATIONS, config.search
+    inputs = {"dataset": dataset.hash, "evaluations": evaluations, "search": search}
+
+    def work() -> None:
+        setup = RankingSetup(horizon_s=config.horizon_s)
+        write_tuned_idm(path, tune_idm(dataset, setup, evaluations, search))
+
+    run.stage("tune", inputs, [path], work)
+    for futures in FUTURES:
+        _rank(run, dataset, futures)
+
+
+def _rank(run: Run, dataset: Demonstrations, futures: str) -> None:
+    """Ranks held-out scenes with the others' `futures` (one of `FUTURES`)."""
+    config, tuned = run.config, read_tuned_idm(run.tuned_idm)
+    stem = "ranking" if futures == "predicted" else f"ranking_{futures}"
+    path, text = run.folder / f"{stem}.json", run.folder / f"{stem}.txt"
+    inputs = {
+        "dataset": dataset.hash,
+        "seeds": [file_sha256(file) for file in run.seed_files],
+        "incumbent": run.incumbent_hash(),
+        "horizon_s": config.horizon_s,
+        "futures": futures,
+        "tuned_idm": dataclasses.asdict(tuned),
+    }
+
+    def work() -> None:
+        rewards = [open_reward(str(file)) for file in run.seed_files]
+        learned = {CANDIDATE: [scorer_of(reward) for reward in rewards]}
+        known = run.incumbent_reward()
+        if known is not None:
+            learned[INCUMBENT] = [scorer_of(known)]
+        setup = RankingSetup(
+            preset=str(rewards[0].preset),
+            sampler=SamplerConfig(mode=config.train.sampler.mode),
+            horizon_s=config.horizon_s,
+            futures=futures,
+            tuned={TUNED_IDM_ROW: [tuned]},
+        )
+        own = [INCUMBENT] if known else []
+        references = [*own, "hand-set", TUNED_IDM_ROW, "random"]
+        report = evaluate_ranking(dataset, learned, setup, run.executor, references)
+        write_whole(text, format_table(report, 118) + "\n")
+        made_by = {**run.provenance(), "data_hash": dataset.hash}
+        write_json(path, {**to_json(report), "made_by": made_by})
+
+    run.stage(f"rank {futures}", inputs, [path, text], work)
+
+
+# Closed loop
+
+
+def suite_job(run: Run, *, tuned: bool = True) -> tuple[SuiteJob, str]:
+    """Returns the job of the suite, and the name of the incumbent's row.
+
+    Args:
+      run: folder and settings.
+      tuned: with the tuned IDM, once there is one.
+    """
+    config = run.config
+    return gate_job(
+        str(run.weights),
+        config.incumbent,
+        suite=config.suite,
+        cases=config.cases,
+        duration_s=config.duration_s,
+        catalogue_seed=config.catalogue_seed,
+        plan_every=config.plan_every,
+        baselines=BASELINES,
+        tuned_idm=read_tuned_idm(run.tuned_idm) if tuned else None,
+    )
+
+
+def simulate(run: Run, sources: Sequence[Dataset]) -> None:
+    """Drives candidate, incumbent and baselines: the suite, and held-out drives.
+
+    The held-out drives, of all sources, measure every row's distance to the human.
+    """
+    job, _ = suite_job(run)
+    decides = {
+        **dataclasses.asdict(job),
+        "refs": digest([ref.id for ref in job.refs]),
+        "weights": [file_sha256(Path(file)) for file in job.weights],
+    }
+    folder = run.folder / "suite"
+
+    def drive() -> None:
+        result = drive_job(job, run.executor)
+        write_suite(result, folder, run.provenance())
+        write_runs(folder / "metrics.npz", runs_of(result))
+
+    names = ("metrics.npz", "suite.json", "cases.csv", "table.txt")
+    run.stage("simulate", {"job": decides}, [folder / name for name in names], drive)
+
+    arrays, body, text = (
+        run.folder / f"likeness.{kind}" for kind in ("npz", "json", "txt")
+    )
+
+    def compare() -> None:
+        drives = held_out(sources, run.config.drives)
+        found = held_out_likeness(drives, job.rows(), job.plan_every)
+        write_arrays(arrays, found.likeness)
+        write_json(body, {**found.as_dict(), "made_by": run.provenance()})
+        write_whole(text, found.text())
+
+    inputs = {
+        "datasets": [source.hash for source in sources],
+        "drives": run.config.drives,
+        "job": decides,
+    }
+    run.stage("likeness", inputs, [arrays, body, text], compare)
+
+
+def _suite_runs(run: Run) -> SuiteRuns:
+    """The driven suite of the finished simulation."""
+    return read_runs(run.folder / "suite" / "metrics.npz")
+
+
+# Verdict and report
+
+
+def verdict_of(run: Run) -> Verdict:
+    """The gate's verdict on the finished simulation and held-out drives."""
+    job, incumbent = suite_job(run)
+    known, gate = read_arrays(run.folder / "likeness.npz"), run.config.gate
+    pair = pair_of(_suite_runs(run), incumbent, gate.trivial_baselines, known)
+    return judge(pair, gate, left_out(job))
+
+
+def gate(run: Run, verdict: Callable[[], Verdict]) -> None:
+    """Writes the verdict, computing it if there is none yet."""
+    path = run.folder / "verdict.json"
+    job, incumbent = suite_job(run)
+    inputs = {
+        "metrics": file_sha256(run.folder / "suite" / "metrics.npz"),
+        "likeness": file_sha256(run.folder / "likeness.npz"),
+        "gate": dataclasses.asdict(run.config.gate),
+        "incumbent": incumbent,
+        "left_out": left_out(job),
+    }
+
+    def work() -> None:
+        files = {"candidate": str(run.weights), "incumbent": run.config.incumbent}
+        runs = {"training_runs": run.config.seeds}
+        facts = {"files": files, **runs, "made_by": run.provenance()}
+        found = verdict()
+        write_verdict(path, found, run.config.gate, facts)
+        drives = (run.folder / "likeness.txt").read_text()
+        write_whole(run.tables, f"{drives}\n{format_verdict(found)}\n")
+
+    run.stage("gate", inputs, [path, run.tables], work)
+
+
+def report(
+    run: Run,
+    verdict: Callable[[], Verdict],
+    dataset: Demonstrations,
+    sources: Sequence[Dataset],
+) -> None:
+    """Draws report.html from everything before it."""
+    made_from = ("ranking.json", "suite/metrics.npz", "verdict.json")
+    inputs = {
+        "files": [file_sha256(run.folder / name) for name in made_from],
+        "weights": file_sha256(run.weights),
+        "incumbent": run.incumbent_hash(),
+        "dataset": dataset.hash,
+        "recipe": run.config.recipe,
+    }
+    if run.config.sweep:
+        inputs["sweep"] = file_sha256(run.config.sweep / SWEEP)
+    draw = functools.partial(_draw, run, verdict, dataset, sources)
+    run.stage("report", inputs, [run.page], draw)
+
+
+def _draw(
+    run: Run,
+    verdict: Callable[[], Verdict],
+    dataset: Demonstrations,
+    sources: Sequence[Dataset],
+) -> None:
+    # of the extra [report], without which all before it can be done
+    from rcirl_jax.report.tuning_page import TuningReport, write_tuning_page
+
+    _, incumbent = suite_job(run)
+    judged, config = verdict(), run.config
+    rewards = {CANDIDATE: open_reward(str(run.weights))}
+    if known := run.incumbent_reward():
+        rewards[INCUMBENT] = known
+    seed = int(rewards[CANDIDATE].provenance["seed"])
+    write_tuning_page(
+        run.page,
+        TuningReport(
+            verdict=judged,
+            gate=config.gate,
+            suite=_suite_runs(run),
+            incumbent=incumbent,
+            ranking=from_json(read_json(run.folder / "ranking.json", "a ranking")),
+            rewards=rewards,
+            dataset=dataset,
+            replays=_replays(run, judged, sources),
+            workdir=_kept_workdir(run, seed),
+            sweep=read_sweep(config.sweep) if config.sweep else None,
+            likeness=(run.folder / "likeness.txt").read_text(),
+            training_runs=config.seeds,
+            facts={
+                "recipe": config.recipe,
+                **run.facts,
+                "stages": _noted(run, len(sources)),
+            },
+        ),
+    )
+
+
+def _noted(run: Run, sources: int) -> dict:
+    """The stages' records without `made_by`, which the page says once."""
+    imports = [f"import {number}" for number in range(sources)]
+    trained = [f"train {number}" for number in range(run.config.seeds)]
+    ranks = [f"rank {futures}" for futures in FUTURES]
+    known = run.stages.read()
+    return {
+        name: {key: x for key, x in known[name].items() if key != "made_by"}
+        for name in (
+            *(*imports, *trained, "export"),
+            *(*ranks, "simulate", "likeness", "gate"),
+        )
+        if name in known
+    }
+
+
+def _replays(run: Run, verdict: Verdict, sources: Sequence[Dataset]) -> list[Replay]:
+    """Cases worth a look, then a few held-out drives beside the human."""
+    job, incumbent = suite_job(run)
+    drivers = [row for row in job.rows() if row.name in (CANDIDATE, incumbent)]
+    shown = verdict.look_at[:REPLAYS] or job.cases().ids[:2]
+    every, recorded = run.config.plan_every, recorded_set(held_out(sources, RECORDED))
+    return [
+        *make_replays(drivers, job.cases(), shown, every),
+        *make_replays(drivers, recorded, recorded.ids, every),
+    ]

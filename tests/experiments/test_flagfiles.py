@@ -1,0 +1,111 @@
+"""The experiments by their flag files, on little data; each is a complete program."""
+
+import json
+
+import pytest
+
+from rcirl_jax.data.importing import import_parts
+from rcirl_jax.export.reader import load_weights
+from tests.conftest import REPO
+from tests.data.small_logs import CONFIG, write_logs
+from tests.helpers.commands import command
+from tests.helpers.weights_files import random_weights
+
+FOLDER = REPO / "experiments" / "flagfiles"
+SHORT = ("--suite=free_cruise,stopped_lead", "--cases=15", "--duration=2", "--drives=4")
+# flag file: experiment, what makes it small, the file that it writes below OUT
+RUNS = {
+    "paper_import": (
+        "import_logs",
+        ("--input={root}/logs", "--output={out}/data", "--stride=2",
+         "--norequire_speed_change"),
+        "data/manifest.json",
+    ),
+    "paper_train": (
+        "train",
+        ("--data={root}/data", "--workdir={out}", "--epochs=1", "--batch_size=8"),
+        "weights.msgpack",
+    ),
+    "listwise_train": (
+        "train",
+        ("--data={root}/data", "--workdir={out}", "--epochs=1", "--batch_size=8"),
+        "weights.msgpack",
+    ),
+    "sweep_leaky_hidden": (
+        "sweep",
+        ("--data={root}/data", "--workdir={out}", "--epochs=1", "--batch_size=8",
+         "--leaky_rates=0.05", "--hidden_sizes=0", "--seeds=1"),
+        "best.msgpack",
+    ),
+    "paper_evaluate": (
+        "evaluate",
+        ("--weights={root}/w.msgpack", "--data={root}/data", "--output={out}/r.json"),
+        "r.json",
+    ),
+    "full_suite": (
+        "simulate",
+        ("--weights={root}/w.msgpack", "--output={out}", "--baselines=", *SHORT[:3]),
+        "suite.json",
+    ),
+    "gate_full": (
+        "gate",
+        ("--candidate={root}/w.msgpack", "--data={root}/data", "--output={out}/v.json",
+         "--incumbent={root}/w.msgpack", *SHORT),
+        "v.json",
+    ),
+    "quick_demo": (
+        "autotune",
+        ("--data={root}/data", "--workdir={out}", "--epochs=1", *SHORT),
+        "report.html",
+    ),
+    "tuned_three_sites": (
+        "autotune",
+        ("--data={root}/data", "--workdir={out}", "--epochs=1", "--recipe=quick",
+         *SHORT),
+        "verdict.json",
+    ),
+    "learners": (
+        "human_likeness",
+        ("--data={root}/data", "--output={out}", "--learners=logistic linear",
+         "--seeds=1", "--epochs=1"),
+        "ranking.json",
+    ),
+}  # fmt: skip
+# as long as the gate's own tests: not in each run of the tests
+LONG = ("quick_demo", "tuned_three_sites")
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    """Logs, the dataset of them, and weights."""
+    folder = tmp_path_factory.mktemp("flagfiles")
+    import_parts(write_logs(folder / "logs", 3), folder / "data", CONFIG)
+    random_weights(folder / "w.msgpack")
+    return folder
+
+
+def test_every_flag_file_has_its_run():
+    assert {file.stem for file in FOLDER.iterdir()} == set(RUNS)
+
+
+@pytest.mark.multiprocess
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(x, marks=pytest.mark.slow if x in LONG else ()) for x in RUNS],
+)
+def test_a_flag_file_runs(name, root, tmp_path):
+    module, small, written = RUNS[name]
+    given = [flag.format(root=root, out=tmp_path) for flag in small]
+    file = FOLDER / f"{name}.flags"
+    done = command(f"experiments.{module}", f"--flagfile={file}", *given)
+    judged = module in ("gate", "autotune")  # the status is the verdict's
+    assert done.returncode in ((0, 2, 3) if judged else (0,)), done.stderr[-2000:]
+    made = tmp_path / written
+    assert made.is_file(), done.stderr[-2000:]
+    if made.suffix == ".msgpack":
+        assert load_weights(made).names
+    if name == "gate_full":  # a reward against itself
+        body = json.loads(made.read_text())
+        assert (body["decision"], body["cases"]) == ("could not judge", 30)
+        hashes = body["result_sha256"]
+        assert hashes["candidate"] == hashes["incumbent"] != hashes["IDM"]

@@ -1,0 +1,103 @@
+"""What a run says of how far it is: the stages, the time so far and the time left."""
+
+import types
+
+import pytest
+
+from rcirl_jax.tuning import loop
+from rcirl_jax.tuning.recipes import SimulatedDemonstrations
+
+NAMES = ("import", "demonstrate", "train", "rank")
+WORK = {"demonstrate": 60.0, "train": 120.0, "rank": 60.0}
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [(4.4, "4 s"), (59.4, "59 s"), (59.6, "1 min"), (3599.0, "1 h 00 min"),
+     (3900.0, "1 h 05 min")],
+)  # fmt: skip
+def test_durations_in_words(seconds, words):
+    assert loop.in_words(seconds) == words
+
+
+class Time:
+    now = 100.0
+
+    def monotonic(self):
+        return self.now
+
+
+def a_run(*finished):
+    """What the clock reads of a run of which an earlier process has finished stages."""
+    simulated = SimulatedDemonstrations(expert="hand-set", rounds=1)
+    return types.SimpleNamespace(
+        said=[], done=[], config=types.SimpleNamespace(simulated=simulated),
+        stages=types.SimpleNamespace(read=lambda: dict.fromkeys(finished)),
+    )  # fmt: skip
+
+
+def begun(run, monkeypatch):
+    time = Time()
+    monkeypatch.setattr(loop, "time", time)
+    run.say = run.said.append
+    run.compiled = []
+    return time, loop.Clock(run, NAMES, run.compiled)
+
+
+def test_the_time_left_grows_with_what_is_not_compiled(monkeypatch):
+    run = a_run()
+    time, clock = begun(run, monkeypatch)
+    with clock.stage("import", None):
+        time.now += 30.0
+        run.done.append("import 0")
+    with clock.stage("demonstrate", WORK):
+        time.now += 300.0
+        run.compiled.append(120.0)  # of the rest 60 s are usual, 120 s more
+        run.done.append("demonstrate 0")
+    with clock.stage("train", WORK):
+        time.now += 240.0
+        run.done.append("train 0")
+    with clock.stage("rank", WORK):
+        pass
+    left = "left, compiling not counted"
+    assert run.said == [
+        "stage 1 of 4: import; 0 s so far",
+        f"stage 2 of 4: demonstrate; 30 s so far, about 4 min {left}",
+        f"stage 3 of 4: train; 6 min so far, about 6 min {left}",
+        f"stage 4 of 4: rank; 10 min so far, about 2 min {left}",
+    ]
+
+
+def test_stages_of_an_earlier_run_take_no_time_until_something_changes(monkeypatch):
+    run = a_run("demonstrate 1", "export")
+    _, clock = begun(run, monkeypatch)
+    with clock.stage("demonstrate", WORK):
+        pass
+    assert " about 1 min left" in run.said[-1]
+    run.done.append("demonstrate learner 1")
+    with clock.stage("train", WORK):
+        pass
+    assert " about 3 min left" in run.said[-1]
+
+
+def test_a_report_that_cannot_be_drawn_is_one_line(monkeypatch):
+    def without(name):
+        def report(*_):
+            raise ModuleNotFoundError(name, name=name)
+
+        monkeypatch.setattr(loop, "report", report)
+        return loop._drawn(types.SimpleNamespace(page="p"), None, None, ())
+
+    assert without("jinja2.sandbox") == (
+        "no report: jinja2: not installed: expected pip install 'rcirl-jax[report]'"
+    )
+    with pytest.raises(ModuleNotFoundError):
+        without("rcirl_jax.report.none")
+
+
+def test_what_to_do_next_without_a_report_is_to_have_one(tmp_path):
+    run = types.SimpleNamespace(weights="w", tables="t", folder=tmp_path)
+    verdict = types.SimpleNamespace(decision="ship", sentence="Ship.", look_at=("a@0",))
+    last = lambda *page: loop._ending(run, verdict, page, "b@0").splitlines()[-1]  # noqa: E731
+    assert "rcirl replay --weights=w --case=a@0" in last("report to open: r")
+    assert f"rcirl report --run={tmp_path}" in last(loop.NO_REPORT + "x")

@@ -1,0 +1,150 @@
+"""Recipes: complete, closed, typed; flags given beside one win."""
+
+import dataclasses
+import subprocess
+import sys
+
+import pytest
+
+from rcirl_jax.errors import InputError
+from rcirl_jax.runtime.specs import load_toml, spec_root
+from rcirl_jax.tuning.recipes import load_recipe, recipe_names
+
+SIMULATED = "[simulated_demonstrations]\n"
+PAPER = spec_root() / "recipes" / "paper.toml"
+
+
+def write(tmp_path, text):
+    path = tmp_path / "own.toml"
+    path.write_text(text)
+    return str(path)
+
+
+def test_the_three_recipes_say_what_decides_a_run():
+    assert recipe_names() == ["paper", "quick", "tuned"]
+    needed = {"loss", "positive", "futures", "admissible_in", "epochs", "learning_rate"}
+    for name in recipe_names():
+        body = load_toml(spec_root() / "recipes" / f"{name}.toml")
+        assert needed <= set(body["train"]), name
+        assert {"hidden", "pin", "by_context"} <= set(body["train"]["reward"]), name
+        assert "require_speed_change" in body["collect"], name
+        assert "expert" in body["simulated_demonstrations"], name
+
+
+def test_the_papers_own_setting():
+    recipe = load_recipe("paper")
+    train = recipe.train
+    assert (train.loss, train.leaky_rate, train.epochs) == ("rank", 0.05, 2)
+    assert (train.positive, train.futures) == ("human", "recorded")
+    assert train.reward.hidden == (15,)
+    assert not train.reward.context
+    assert recipe.simulated.expert == "none"
+    assert recipe.collect.require_obstacles
+    assert recipe.collect.require_speed_change
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("[train]\nlos = 'rank'", r"los: unknown: .*did you mean loss\?"),
+        ("[trains]\n", r"trains: unknown: .*did you mean train\?"),
+        ("[train]\nepochs = 'many'", r"epochs: many: expected a whole number"),
+        ("[train]\nepochs = 0", r"epochs: 0: expected >= 1"),
+        ("[train.reward]\nhidden = 15", r"hidden: 15: expected a list"),
+        ("[train.reward]\nby_context = 1", r"by_context: 1: expected true or false"),
+        (
+            "[simulated_demonstrations]\nexpert = 'nobody'",
+            r"expert: nobody: expected one of",
+        ),
+        (
+            "[simulated_demonstrations]\ncatalogue_seed = 0",
+            r"catalogue_seed: 0: expected above 0",
+        ),
+        ("[collect]\nstride = 1.0", r"stride: unknown: .*did you mean stride_s\?"),
+        (
+            "[prior_cost]\nslowed = [1.0]",
+            r"slowed: \[1.0\]: expected shares of the speed",
+        ),
+        ("[autotune]\nseeds = 0", r"seeds: 0: expected at least 1"),
+        ("train = 3", r"train: 3: expected a table"),
+    ],
+)
+def test_what_is_wrong_is_one_line(tmp_path, text, says):
+    path = write(tmp_path, text)
+    with pytest.raises(InputError, match=says) as caught:
+        load_recipe(path)
+    assert str(caught.value).startswith(path)
+
+
+def test_an_unknown_name_is_one_line():
+    with pytest.raises(
+        InputError, match=r"tunde: expected one of .*did you mean tuned"
+    ):
+        load_recipe("tunde")
+
+
+def test_a_file_of_ones_own(tmp_path):
+    own = load_recipe(write(tmp_path, PAPER.read_text().replace("0.05", "0.2")))
+    paper = load_recipe("paper")
+    assert own.train == dataclasses.replace(paper.train, leaky_rate=0.2)
+
+
+FLAGS = """
+from absl import flags
+from rcirl_jax.cli.flags import training
+asked = training()
+flags.FLAGS(["x", *{given}])
+c = asked.config()
+print(c.loss, c.reward.hidden, c.leaky_rate, c.futures, c.positive, c.reward.pin)
+"""
+
+
+def said(*given, code=FLAGS):
+    """What the flags make of the recipe, in an interpreter of its own."""
+    code = code.format(given=list(given))
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    return done.stdout.strip()
+
+
+def test_a_flag_given_beside_the_recipe_wins():
+    paper = "rank (15,) 0.05 recorded human unit"
+    assert said("--recipe=paper") == paper
+    changed = said("--recipe=paper", "--loss=hinge", "--hidden_size=8,4", "--pin=none")
+    assert changed == "hinge (8, 4) 0.05 recorded human none"
+    tuned = load_recipe("tuned").train
+    assert said() == (
+        f"{tuned.loss} {tuned.reward.hidden} {tuned.leaky_rate} {tuned.futures} "
+        f"{tuned.positive} {tuned.reward.pin}"
+    )
+
+
+SWEEP = """
+import sys
+from pathlib import Path
+from rcirl_jax.cli import sweep
+sweep.run_sweep = lambda config, *_: (print(config), sys.exit(0))
+sweep.flags.FLAGS(["x", "--data=d", "--output=o", *{given}])
+sweep.main()
+"""
+
+
+def test_a_sweep_trains_as_the_recipe_says(tmp_path):
+    own = write(
+        tmp_path,
+        "[train]\nloss = 'rank'\nepochs = 7\npositive = 'human'\n"
+        "learning_rate = 0.001\n[train.reward]\npin = 'none'",
+    )
+    made = said(f"--recipe={own}", "--positive=nearest", code=SWEEP)
+    for words in (
+        "epochs=7, positive='nearest'", "train_horizon=8.0", "pin='none'",
+        "leaky_rates=(0.01, 0.05, 0.2), learning_rates=(0.001,)", "horizon_s=5.0",
+    ):  # fmt: skip
+        assert words in made
+    plain = said(code=SWEEP)
+    rate = load_recipe("tuned").train.leaky_rate
+    assert f"leaky_rates=({rate},)" in plain  # no rate to look for
+    assert "hidden_sizes=((15,),)" in plain
+    few = ("--constraint=nonnegative", "--hidden_sizes=0", "--noby_context")
+    assert "constraint='nonnegative'" in said(*few, code=SWEEP)
