@@ -1,4 +1,4 @@
-"""SQLite files of others, opened for reading only and with bounded work.
+"""SQLite files of others, opened by Python's sqlite3 for reading only, in bounded work.
 
 A database can make its reader run code: views may recurse without end, generated
 columns and triggers call functions, and every cell may have any type. So the file is
@@ -33,17 +33,28 @@ class Database:
         self.path = path
 
     def __enter__(self) -> "Database":
-        self._check_head()
-        self._ticks = max(MIN_STEPS, STEPS_PER_BYTE * self.path.stat().st_size)
-        self._ticks //= CHECK_STEPS
-        uri = f"{self.path.resolve().as_uri()}?mode=ro&immutable=1"
         try:
+            with self.path.open("rb") as handle:
+                head = handle.read(100)
+            size = self.path.stat().st_size
+            if len(head) < 100 or not head.startswith(MAGIC):
+                raise self.error("database", f"{head[:16]!r}", "a SQLite file")
+            page, pages = (
+                int.from_bytes(head[k:n], "big") for k, n in [(16, 18), (28, 32)]
+            )
+            expected = pages * (65536 if page == 1 else page)
+            if head[24:28] == head[92:96] and size < expected:  # the head is valid
+                raise self.error(
+                    "size", f"{size} bytes", f"{expected} bytes; truncated file?"
+                )
+            uri = f"{self.path.resolve().as_uri()}?mode=ro&immutable=1"
             self._connection = sqlite3.connect(uri, uri=True, isolation_level=None)
-        except sqlite3.Error as error:
+        except (OSError, sqlite3.Error) as error:
             raise self.error("database", str(error), "a SQLite file") from error
+        self._ticks = max(MIN_STEPS, STEPS_PER_BYTE * size) // CHECK_STEPS
         try:
             for pragma in ("trusted_schema=OFF", "query_only=ON", "cell_size_check=ON"):
-                self._execute(f"PRAGMA {pragma}", ())
+                self._execute(f"PRAGMA {pragma}")
         except InputError:
             self._connection.close()
             raise
@@ -52,61 +63,47 @@ class Database:
         limit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
         limit(sqlite3.SQLITE_LIMIT_TRIGGER_DEPTH, 1)
         self._connection.set_progress_handler(self._tick, CHECK_STEPS)
-        self._connection.set_authorizer(_authorise)
+        self._connection.set_authorizer(
+            lambda action, *_: (
+                sqlite3.SQLITE_OK if action in ALLOWED else sqlite3.SQLITE_DENY
+            )
+        )
         return self
 
     def __exit__(self, *_: object) -> None:
         self._connection.close()
 
-    def error(self, field: str, found: str, expected: str) -> InputError:
-        """The line for something wrong in this file."""
-        return InputError(f"{self.path}: {field}: {found[:120]}: expected {expected}")
-
     def _tick(self) -> int:
         self._ticks -= 1
         return int(self._ticks < 0)  # not 0: interrupt
 
-    def _check_head(self) -> None:
-        """Magic and, where the head is valid, as many pages as it says."""
-        try:
-            with self.path.open("rb") as handle:
-                head = handle.read(100)
-            size = self.path.stat().st_size
-        except OSError as error:
-            raise self.error("database", str(error), "a SQLite file") from error
-        if len(head) < 100 or not head.startswith(MAGIC):
-            raise self.error("database", f"{head[:16]!r}", "a SQLite file")
-        page = int.from_bytes(head[16:18], "big")
-        pages = int.from_bytes(head[28:32], "big")
-        expected = pages * (65536 if page == 1 else page)
-        if head[24:28] == head[92:96] and size < expected:
-            raise self.error(
-                "size", f"{size} bytes", f"{expected} bytes; truncated file?"
-            )
+    def error(self, field: str, found: str, expected: str) -> InputError:
+        """Makes the line for something wrong in this file."""
+        return InputError(f"{self.path}: {field}: {found[:120]}: expected {expected}")
 
     def columns(self, table: str) -> tuple[str, ...]:
-        """Names of a table's columns; none if there is no such table.
+        """Returns the names of a table's columns; none if there is no such table.
 
         Raises:
           InputError: it is a view or a virtual table, or the schema is broken.
         """
-        found = self._rows(
-            "SELECT type, sql FROM sqlite_master WHERE name = ?", (table,)
-        )
-        kinds = [row for rows in found for row in rows if row[0] in ("table", "view")]
+        sql = "SELECT type, sql FROM sqlite_master WHERE name = ?"
+        found = [
+            row for rows in self.chunks(sql, (table,), values=(table,)) for row in rows
+        ]
+        kinds = [row for row in found if row[0] in ("table", "view")]
         if not kinds:
             return ()
-        kind, sql = kinds[0]
-        virtual = str(sql).split(maxsplit=2)[1:2] in (["VIRTUAL"], ["virtual"])
-        if kind != "table" or virtual:
-            raise self.error(
-                table, f"a {'virtual table' if virtual else kind}", "a table"
-            )
-        cursor = self._execute(f"SELECT * FROM {_quoted(table)} LIMIT 0", ())
+        kind, text = kinds[0]
+        if str(text).split(maxsplit=2)[1:2] in (["VIRTUAL"], ["virtual"]):
+            kind = "virtual table"
+        if kind != "table":
+            raise self.error(table, f"a {kind}", "a table")
+        cursor = self._execute(f"SELECT * FROM {_quoted(table)} LIMIT 0")
         return tuple(entry[0] for entry in cursor.description or ())
 
-    def need(self, table: str, columns: Sequence[str]) -> None:
-        """A table with these columns has to be there."""
+    def need(self, table: str, columns: Sequence[str]) -> tuple[str, ...]:
+        """Returns all columns of a table, among which these have to be."""
         found = self.columns(table)
         if not found:
             raise self.error(f"table {table}", "missing", "it in the database")
@@ -115,6 +112,7 @@ class Database:
                 raise self.error(
                     f"{table}.{column}", "missing", f"it among {', '.join(found)}"
                 )
+        return found
 
     def table(
         self,
@@ -123,7 +121,7 @@ class Database:
         most: int,
         optional: Sequence[str] = (),
     ) -> list[tuple]:
-        """All rows of a table: the columns, which have to be there, and optional ones.
+        """Returns all rows: the columns, which have to be there, and optional ones.
 
         Args:
           name: of the table.
@@ -131,8 +129,7 @@ class Database:
           most: rows allowed.
           optional: other columns, or NULL where there are none.
         """
-        self.need(name, columns)
-        known = self.columns(name)
+        known = self.need(name, columns)
         chosen = [_quoted(column) for column in columns]
         chosen += [_quoted(one) if one in known else "NULL" for one in optional]
         sql = f"SELECT {', '.join(chosen)} FROM {_quoted(name)}"
@@ -141,7 +138,7 @@ class Database:
     def numbers(
         self, sql: str, names: Sequence[str], most: int, values: tuple = ()
     ) -> np.ndarray:
-        """[rows, columns] float64 of a query of numbers; NULL is NaN.
+        """Returns [rows, columns] float64 of a query of numbers; NULL is NaN.
 
         Args:
           sql: a SELECT.
@@ -151,39 +148,30 @@ class Database:
         """
         parts = [np.zeros((0, len(names)))]
         for rows in self.chunks(sql, names, most, values):
-            parts.append(self.floats(rows, names))
+            for name, cells in zip(names, zip(*rows, strict=True), strict=True):
+                # numpy would read numbers out of text
+                wrong = set(map(type, cells)) - {int, float, type(None)}
+                if wrong:
+                    bad = next(cell for cell in cells if type(cell) in wrong)
+                    raise self.error(name, repr(bad)[:40], "a number")
+            parts.append(np.array(rows, np.float64))
         return np.concatenate(parts)
 
     def chunks(
-        self, sql: str, names: Sequence[str], most: int, values: tuple = ()
+        self, sql: str, names: Sequence[str], most: int = 10**9, values: tuple = ()
     ) -> Iterator[list[tuple]]:
-        """Rows of a query, many at a time."""
-        total = 0
-        for rows in self._rows(sql, values):
-            total += len(rows)
-            if total > most:
-                raise self.error(names[0], f"more than {most} rows", "fewer")
-            yield rows
-
-    def floats(self, rows: Sequence[tuple], names: Sequence[str]) -> np.ndarray:
-        """[rows, columns] float64; NULL is NaN, text and blobs are errors."""
-        for name, cells in zip(names, zip(*rows, strict=True), strict=True):
-            # numpy would read numbers out of text
-            wrong = set(map(type, cells)) - {int, float, type(None)}
-            if wrong:
-                bad = next(cell for cell in cells if type(cell) in wrong)
-                raise self.error(name, repr(bad)[:40], "a number")
-        return np.array(rows, np.float64)
-
-    def _rows(self, sql: str, values: tuple) -> Iterator[list[tuple]]:
-        cursor = self._execute(sql, values)
+        """Yields rows of a query, many at a time; arguments as of `numbers`."""
+        cursor, total = self._execute(sql, values), 0
         try:
             while rows := cursor.fetchmany(CHUNK_ROWS):
+                total += len(rows)
+                if total > most:
+                    raise self.error(names[0], f"more than {most} rows", "fewer")
                 yield rows
         except FAULTS as error:
             raise self._failed(error) from error
 
-    def _execute(self, sql: str, values: tuple) -> sqlite3.Cursor:
+    def _execute(self, sql: str, values: tuple = ()) -> sqlite3.Cursor:
         try:
             return self._connection.execute(sql, values)
         except FAULTS as error:
@@ -197,7 +185,3 @@ class Database:
 
 def _quoted(name: str) -> str:
     return '"' + name.replace('"', '""') + '"'
-
-
-def _authorise(action: int, *_: object) -> int:
-    return sqlite3.SQLITE_OK if action in ALLOWED else sqlite3.SQLITE_DENY

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import shapely
 
-from rcirl_jax.data.formats.nuplan import geopackage
+from rcirl_jax.data.formats.nuplan import map as geopackage
 from rcirl_jax.data.formats.nuplan import reader as nuplan
 from tests.data.formats.fixtures import nuplan as fixture
 from tests.data.formats.fixtures.nuplan import edit

@@ -19,7 +19,13 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.formats.files import files_below, log_name
-from rcirl_jax.data.formats.messages import Windows, around, longest_window
+from rcirl_jax.data.formats.messages import (
+    MAX_DURATION_S,
+    MAX_GAP_S,
+    Windows,
+    around,
+    longest_window,
+)
 from rcirl_jax.data.formats.nuplan.map import NuplanMap, find_map
 from rcirl_jax.data.formats.options import one_pattern, positive
 from rcirl_jax.data.formats.perception import (
@@ -79,11 +85,9 @@ LIGHT_SQL = """SELECT lp.timestamp, s.lane_connector_id, CASE s.status
 # of a release: DATE_veh-NN_START_END, the last two s of the drive
 DRIVE = re.compile(r"(?P<drive>.+_veh-\d+)_\d+_\d+")
 MAX_FRAMES = 10_000_000  # lidar_pc rows
-MAX_DURATION_S = 86400.0  # s, of one log
 MAX_TRACKS = 10_000_000
 MAX_BOXES = 20_000_000  # boxes of one window
 RATE_HZ = 20.0  # 1/s
-MAX_GAP_S = 0.55  # s without a box inside one track
 HOLD_S = 1.0  # s, a light without status keeps its state this long
 MAX_STAMP_GAP_S = 0.2  # s, between a lidar_pc and the pose linked to it
 LIMIT_MPS = 15.65  # m/s, 35 mph
@@ -105,29 +109,34 @@ class _Log:
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
-    """The databases: each can be read without the others."""
+    """Lists the databases: each can be read without the others."""
     return files_below(path, one_pattern(spec, "*.db"))
 
 
 def own_name(file: Path) -> str:
-    """Name of a log, as long as no other folder has one called alike."""
+    """Returns the name of a log, as long as no other folder has one called alike."""
     return file.stem
 
 
 def drive_of(name: str) -> str:
-    """The drive that a log is a part of, by its name in the release."""
+    """Returns the drive that a log is a part of, by its name in the release."""
     match = DRIVE.fullmatch(name)
     return match["drive"] if match else name
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
-    """One Recording per log, or per window of a long one."""
+    """Yields one Recording per log, or per window of a long one."""
     roads: dict[Path, NuplanMap] = {}
     for file in parts(path, spec):
         with Database(file) as database:
             for table, columns in TABLES.items():
                 database.need(table, columns)
-            map_file = find_map(file, _map_names(database), spec)
+            # names under which the log's map may be filed
+            names = database.table("log", ("map_version", "location"), 1000)
+            if not names:
+                raise database.error("table log", "no rows", "one")
+            cells = [cell for cell in names[0] if isinstance(cell, str)]
+            map_file = find_map(file, [c.removesuffix(".gpkg") for c in cells], spec)
             if map_file is not None and map_file not in roads:
                 roads = {map_file: NuplanMap(map_file)}  # one city at a time
             log = _Log(
@@ -141,15 +150,6 @@ def recordings(path: Path, spec: dict) -> Iterator[Recording]:
             )
             for recording in _windows(log):
                 yield validate_recording(recording, file)
-
-
-def _map_names(database: Database) -> list[str]:
-    """Names under which the log's map may be filed."""
-    sql = "SELECT map_version, location FROM log"
-    rows = [row for part in database.chunks(sql, ("log",), 1000) for row in part]
-    if not rows:
-        raise database.error("table log", "no rows", "one")
-    return [cell.removesuffix(".gpkg") for cell in rows[0] if isinstance(cell, str)]
 
 
 def _poses(database: Database) -> np.ndarray:
@@ -188,16 +188,14 @@ def _users(database: Database) -> dict[int, tuple[bytes, int]]:
 def _windows(log: _Log) -> Iterator[Recording]:
     """The whole log, or windows of equal length, none longer than allowed."""
     clock = (log.poses[:, 0] - log.poses[0, 0]) * 1e-6  # s
-    window = longest_window(log.spec)
-    count = max(int(np.ceil(clock[-1] / window)), 1)
+    count = max(int(np.ceil(clock[-1] / longest_window(log.spec))), 1)
     if count == 1:
         yield dataclasses.replace(_recording(log, log.poses), progress=1.0)
         return
     edges = np.linspace(0.0, clock[-1], count + 1)
     edges[-1] += 1.0  # the last pose is in the last window
-    windows = Windows(log.name, log.group, MAX_GAP_S)
-    filled = np.unique(np.searchsorted(edges, clock, side="right") - 1).tolist()
-    for index in filled:
+    windows = Windows(log.name, log.group)
+    for index in np.unique(np.searchsorted(edges, clock, side="right") - 1).tolist():
         within = (float(edges[index]), float(edges[index + 1]))
         low, high = around(within)
         made = _recording(log, log.poses[(clock >= low) & (clock < high)])
