@@ -6,6 +6,7 @@ blosc, bounded chunks. tensorstore decompresses; it knows no text fields ("<U16"
 so it is told that a record is plain bytes, and numpy gives them their meaning.
 """
 
+import functools
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -66,74 +67,80 @@ class StructuredArray:
         meta = checked(body, _Metadata, file)
         (self.size,), (self.chunk,) = meta.shape, meta.chunks
         self.dtype = _dtype(file, meta.dtype)
-        _check_fields(file, self.dtype, fields)
+        for name, (kinds, shape) in fields.items():
+            if name not in (self.dtype.names or ()):
+                raise InputError(
+                    f"{file}: dtype: {name}: missing: expected it among "
+                    f"{self.dtype.names}"
+                )
+            found = self.dtype[name]
+            if found.base.kind not in kinds or found.shape != shape:
+                raise InputError(
+                    f"{file}: dtype: {name}: {found}: expected shape {shape}, "
+                    f"kind {' or '.join(kinds)}"
+                )
         self._texts = [name for name in fields if self.dtype[name].base.kind == "U"]
-        if self.chunk < 1 or self.chunk * self.dtype.itemsize > MAX_CHUNK_BYTES:
+        most = MAX_CHUNK_BYTES // self.dtype.itemsize
+        if not 1 <= self.chunk <= most:
             raise InputError(
-                f"{file}: chunks: {self.chunk} records: expected 1 to "
-                f"{MAX_CHUNK_BYTES // self.dtype.itemsize}"
+                f"{file}: chunks: {self.chunk} records: expected 1 to {most}"
             )
         self._is_packed = meta.compressor is not None
-        self._store = None
         self._checked: set[int] = set()
 
     def read(self, start: int, stop: int) -> np.ndarray:
-        """Records start .. stop - 1."""
+        """Returns records start .. stop - 1."""
         if start >= stop:
             return np.zeros(0, self.dtype)
-        if (stop - start) * self.dtype.itemsize > MAX_READ_BYTES:
+        where, size = f"records {start} to {stop}", (stop - start) * self.dtype.itemsize
+        if size > MAX_READ_BYTES:
             raise InputError(
-                f"{self.path}: records {start} to {stop}: "
-                f"{(stop - start) * self.dtype.itemsize} bytes: "
-                f"expected at most {MAX_READ_BYTES}"
+                f"{self.path}: {where}: {size} bytes: expected at most {MAX_READ_BYTES}"
             )
         for number in range(start // self.chunk, (stop - 1) // self.chunk + 1):
             if number not in self._checked:
                 self._check_chunk(number)
         try:
-            raw = self._open()[start:stop].read().result()
+            raw = self._store[start:stop].read().result()
         except ValueError as error:
             raise InputError(
-                f"{self.path}: records {start} to {stop}: {_brief(error)}: "
-                "expected whole chunks"
+                f"{self.path}: {where}: {_brief(error)}: expected whole chunks"
             ) from error
         records = np.ascontiguousarray(raw).reshape(-1).view(self.dtype)
         for name in self._texts:
             if not is_text(records[name]):
                 raise InputError(
-                    f"{self.path}: records {start} to {stop}: {name}: characters that "
-                    "are none: expected text"
+                    f"{self.path}: {where}: {name}: characters that are none: "
+                    "expected text"
                 )
         return records
 
-    def _open(self) -> Any:  # noqa: ANN401 - tensorstore is imported when needed
-        if self._store is None:
-            import tensorstore
+    @functools.cached_property
+    def _store(self) -> Any:  # noqa: ANN401 - tensorstore is imported when needed
+        import tensorstore
 
-            # what decompresses is written in each chunk; here it only has to be valid
-            blosc = {"id": "blosc", "cname": "lz4", "clevel": 5, "shuffle": 1}
-            metadata = {
-                "zarr_format": 2,
-                "shape": [self.size],
-                "chunks": [self.chunk],
-                "dtype": [["record", "|u1", [self.dtype.itemsize]]],
-                "compressor": {**blosc, "blocksize": 0} if self._is_packed else None,
-                "filters": None,
-                "fill_value": None,
-                "order": "C",
-            }
-            spec = {
-                "driver": "zarr",
-                "kvstore": {"driver": "file", "path": str(self.path.resolve())},
-                "metadata": metadata,
-                "context": {"cache_pool": {"total_bytes_limit": CACHE_BYTES}},
-            }
-            found = tensorstore.open(spec, open=True, assume_metadata=True)
-            self._store = found.result()
-        return self._store
+        # what decompresses is written in each chunk; here it only has to be valid
+        blosc = {"id": "blosc", "cname": "lz4", "clevel": 5, "shuffle": 1}
+        metadata = {
+            "zarr_format": 2,
+            "shape": [self.size],
+            "chunks": [self.chunk],
+            "dtype": [["record", "|u1", [self.dtype.itemsize]]],
+            "compressor": {**blosc, "blocksize": 0} if self._is_packed else None,
+            "filters": None,
+            "fill_value": None,
+            "order": "C",
+        }
+        spec = {
+            "driver": "zarr",
+            "kvstore": {"driver": "file", "path": str(self.path.resolve())},
+            "metadata": metadata,
+            "context": {"cache_pool": {"total_bytes_limit": CACHE_BYTES}},
+        }
+        return tensorstore.open(spec, open=True, assume_metadata=True).result()
 
     def _check_chunk(self, number: int) -> None:
-        """The file is there and decompresses to a chunk; a missing one reads as 0."""
+        """Checks that a chunk is there (a missing one reads as 0) and its two sizes."""
         file = self.path / str(number)
         expected = self.chunk * self.dtype.itemsize
         try:
@@ -187,19 +194,3 @@ def _dtype(file: Path, fields: list[list]) -> np.dtype:
             f"{file}: dtype: {dtype.itemsize} bytes: expected 1 to {MAX_RECORD_BYTES}"
         )
     return dtype
-
-
-def _check_fields(
-    file: Path, dtype: np.dtype, fields: Mapping[str, tuple[str, tuple]]
-) -> None:
-    for name, (kinds, shape) in fields.items():
-        if name not in (dtype.names or ()):
-            raise InputError(
-                f"{file}: dtype: {name}: missing: expected it among {dtype.names}"
-            )
-        found = dtype[name]
-        if found.base.kind not in kinds or found.shape != shape:
-            raise InputError(
-                f"{file}: dtype: {name}: {found}: expected shape {shape}, "
-                f"kind {' or '.join(kinds)}"
-            )

@@ -12,7 +12,6 @@ from rcirl_jax.data.cut import digest
 from rcirl_jax.data.formats import parts, read_recordings
 from rcirl_jax.data.formats.l5 import map as l5_map
 from rcirl_jax.data.formats.l5 import reader as l5
-from rcirl_jax.data.formats.l5 import scenes as l5_scenes
 from rcirl_jax.data.readers import zarr2
 from tests.data.formats.fixtures import l5 as fixture
 from tests.helpers import logs
@@ -58,9 +57,9 @@ def test_groups_of_other_hosts_and_days():
     scenes["start_time"] = np.array([0, 0, 30, 300]) * 10**9
     scenes["end_time"] = scenes["start_time"] + 25 * 10**9
     expected = ["a-from-0", "b-from-0", "a-from-0", "a-from-300"]
-    assert l5_scenes.groups_of(scenes, []) == expected
+    assert l5.groups_of(scenes, []) == expected
     # the third scene alone is still one of the drive that began with the first
-    assert l5_scenes.groups_of(scenes[2:], [scenes[:1]]) == ["a-from-0", "a-from-300"]
+    assert l5.groups_of(scenes[2:], [scenes[:1]]) == ["a-from-0", "a-from-300"]
 
 
 def test_groups_over_datasets(folder):

@@ -1,4 +1,4 @@
-"""Lyft Level 5 (zarr): `reader`, `map` for lanes, `scenes` for the tables."""
+"""Lyft Level 5 (zarr): `reader`, `map` for lanes and lights."""
 
 from rcirl_jax.data.formats.format import Format
 

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from rcirl_jax.data.formats.l5.messages import COLOURS, read_message
 from rcirl_jax.data.formats.options import path_option
 from rcirl_jax.data.formats.perception import STATES, held_states, signal_of
 from rcirl_jax.data.formats.projection import earth_centred
@@ -21,7 +20,7 @@ from rcirl_jax.data.formats.shapes import (
     check_coordinates,
     moves,
 )
-from rcirl_jax.data.readers.protobuf import Message
+from rcirl_jax.data.readers.protobuf import Message, parser, table_of
 from rcirl_jax.errors import InputError
 from rcirl_jax.runtime.atomic_files import read_json
 from rcirl_jax.runtime.checked import checked
@@ -33,6 +32,33 @@ HOLD_S = 1.0  # s, a light unseen keeps its state this long
 MAX_LIMIT_MPS = 60.0  # m/s; faster "limits" are none
 ONLY_BIKE = 4  # AccessRestriction.Type
 BACKWARD = 3  # RoadNetworkSegment.TravelDirection
+# traffic controls that are faces of one colour: round, arrows, U-turn, flashing
+COLOURS = {
+    **dict.fromkeys((11, 30, 32, 38, 41, 44, 10), "red"),
+    **dict.fromkeys((12, 36, 37, 39, 42, 45, 9), "yellow"),
+    **dict.fromkeys((13, 31, 33, 40, 43, 46), "green"),
+}
+FACES = ", ".join(f"face_{number} {number} Nothing" for number in COLOURS)
+# the fields that are read of L5Kit's road_network.proto (package pb.lyft.maps)
+SCHEMA = f"""
+MapFragment: elements 2 MapElement*
+MapElement: id 1 GlobalId, element 2 Element
+GlobalId: id 1 string
+Element: segment 1 Segment, lane 3 Lane, control 4 Control
+Segment: limit 9 float, limit_backward 10 float
+Lane: parent 1 GlobalId, frame 2 GeoFrame, left 3 Bound, right 4 Bound,\
+ ahead 5 GlobalId*, beside_left 6 GlobalId, beside_right 7 GlobalId,\
+ controls 8 GlobalId*, access 11 Access, direction 12 int64
+GeoFrame: origin 1 GeoPoint, bearing 2 float
+GeoPoint: latitude 1 sfixed32, longitude 2 sfixed32
+Bound: x 1 sint32*, y 2 sint32*, z 3 sint32*
+Access: type 1 int64
+Control: stop_sign 7 Nothing, light 29 Light, {FACES}
+Light: faces 3 GlobalId*
+Nothing:
+"""
+
+read_message = parser(table_of(SCHEMA))
 
 
 def find_map(folder: Path, spec: dict) -> Path | None:
@@ -41,16 +67,13 @@ def find_map(folder: Path, spec: dict) -> Path | None:
     above = folder.resolve().parents
     if name:
         places = [place / name for place in (Path(), folder, *above[:3])]
-        found = next((place for place in places if place.is_file()), None)
-        if found is None:
-            raise InputError(f"source TOML: map: {name}: expected a semantic map")
-        return found
-    places = [
-        place / inner / "semantic_map.pb"
-        for place in (folder, *above[:2])
-        for inner in ("", "semantic_map")
-    ]
-    return next((place for place in places if place.is_file()), None)
+    else:
+        inner = ("semantic_map.pb", "semantic_map/semantic_map.pb")
+        places = [place / file for place in (folder, *above[:2]) for file in inner]
+    found = next((place for place in places if place.is_file()), None)
+    if name and found is None:
+        raise InputError(f"source TOML: map: {name}: expected a semantic map")
+    return found
 
 
 class SemanticMap:
@@ -135,22 +158,19 @@ class SemanticMap:
             if element.HasField("segment"):
                 segment = element.segment
                 self._limits[name] = segment.limit, segment.limit_backward
-            if element.HasField("control"):
-                self._add_control(name, element.control)
+            control = element.control
+            if control.HasField("stop_sign"):
+                self._stop_signs.add(name)
+            if control.HasField("light"):
+                self._lights[name] = tuple(face.id for face in control.light.faces)
+            for field, _ in control.ListFields():
+                if field.number in COLOURS:
+                    self._faces[name] = COLOURS[field.number]
             if element.HasField("lane"):
                 lane = element.lane
                 is_whole = all(map(lane.HasField, ("frame", "left", "right")))
                 if is_whole and lane.access.type != ONLY_BIKE:
                     yield name, lane
-
-    def _add_control(self, name: str, control: Message) -> None:
-        if control.HasField("stop_sign"):
-            self._stop_signs.add(name)
-        if control.HasField("light"):
-            self._lights[name] = tuple(face.id for face in control.light.faces)
-        for field, _ in control.ListFields():
-            if field.number in COLOURS:
-                self._faces[name] = COLOURS[field.number]
 
     def _bound(self, name: str, bound: Message, frame: np.ndarray) -> np.ndarray:
         """A lane bound [m, 2] m in the world; points that repeat are dropped."""
@@ -165,17 +185,6 @@ class SemanticMap:
         world = (self._to_world @ frame @ np.concatenate([local, ones]))[:2].T
         check_coordinates(self.file, f"lane {name}", ("x", "y"), world)
         return world[moves(world)] if len(world) else world
-
-    def _faces_of(self, controls: tuple[str, ...]) -> list[str]:
-        """Faces that govern a lane: those it names; a light's, where it names none.
-
-        A light has faces for other lanes too, say an arrow to the left.
-        """
-        named, found = set(controls), []
-        for name in controls:
-            faces = self._lights.get(name, (name,))
-            found += faces if faces == (name,) or named.isdisjoint(faces) else ()
-        return found
 
     def _lane(self, name: str, lane: Message) -> Lane | None:
         frame = _frame(lane.frame)
@@ -194,7 +203,12 @@ class SemanticMap:
         forward, back = self._limits.get(parent, (0.0, 0.0))
         limit = back if lane.direction == BACKWARD and back > 0.0 else forward
         controls = tuple(control.id for control in lane.controls)
-        faces = self._faces_of(controls)
+        faces = []
+        for control in controls:
+            # a light has faces for other lanes too, say an arrow to the left: those
+            # that the lane names count, all of them where it names none
+            own = self._lights.get(control, (control,))
+            faces += own if own == (control,) or set(own).isdisjoint(controls) else ()
         governing = sorted({face for face in faces if face in self._faces})
         stop_sign = any(control in self._stop_signs for control in controls)
         # who is inside a junction was held at its edge: a parent that is no segment

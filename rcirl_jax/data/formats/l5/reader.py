@@ -13,9 +13,10 @@ share a group, also over datasets: several hold scenes of one drive. Colours of
 lights are in the semantic map alone.
 """
 
+import contextlib
 import dataclasses
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,14 +26,13 @@ from rcirl_jax.data.formats.l5.map import (
     find_map,
     world_to_ecef,
 )
-from rcirl_jax.data.formats.l5.scenes import (
-    beside,
-    groups_of,
-    parts,
-    scenes_of,
-    tables_of,
+from rcirl_jax.data.formats.messages import MAX_GAP_S
+from rcirl_jax.data.formats.options import (
+    number,
+    one_pattern,
+    positive,
+    recording_car,
 )
-from rcirl_jax.data.formats.options import number, positive, recording_car
 from rcirl_jax.data.formats.perception import (
     UNKNOWN,
     Boxes,
@@ -59,6 +59,8 @@ KIND_OF_LABEL = np.array(
     + [Kind.PEDESTRIAN] * 2  # pedestrian, animal
     + [UNKNOWN]  # don't care
 )
+SCENES = {"frame_index_interval": ("iu", (2,)), "host": ("U", ())}
+SCENES |= dict.fromkeys(("start_time", "end_time"), ("iu", ()))
 FRAMES = {
     "timestamp": ("iu", ()),
     "agent_index_interval": ("iu", (2,)),
@@ -80,7 +82,8 @@ FACES = {
 }
 FACE_INTERVAL = "traffic_light_faces_index_interval"  # of frames
 RATE_HZ = 10.0  # 1/s
-MAX_GAP_S = 0.55  # s without a box inside one track
+SAME_DRIVE_S = 60.0  # s, a host's scenes closer than this may show the same cars
+MAX_SCENES = 1_000_000
 PIECE_SCENES = 8  # scenes of a piece; their demonstrations are held at once
 MAX_FRAMES = 36_000  # frames of one scene: an hour
 MAX_AGENTS = 5_000_000  # agent records of one scene
@@ -98,11 +101,12 @@ class _Dataset:
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
-    """One Recording per scene of every dataset, or of the spec's piece of one."""
+    """Yields one Recording per scene, of all datasets or of the spec's piece of one."""
     for folder in parts(path, spec):
-        dataset, road = _open(folder), _map_of(folder, spec)
-        others = tables_of(beside(folder, spec))
-        groups = groups_of(dataset.scenes, list(others.values()))
+        dataset, road, above = _open(folder), _map_of(folder, spec), folder.absolute()
+        home = above.parents[1 if above.parent.name == "scenes" else 0]
+        others = [other for other in _datasets(home, spec) if other != above]
+        groups = groups_of(dataset.scenes, [*tables_of(others).values()])
         first, last = spec.get(PIECE, (0, len(groups)))
         for index in range(first, last):
             name = f"{folder.stem}-{index:06d}"
@@ -121,6 +125,81 @@ def pieces(path: Path, spec: dict) -> list[dict]:
     return [
         {**spec, PIECE: (first, min(first + PIECE_SCENES, number))}
         for first in range(0, number, PIECE_SCENES)
+    ]
+
+
+def parts(path: Path, spec: dict) -> list[Path]:
+    """The dataset itself, or those in a folder or its scenes/."""
+    if (path / "scenes" / ".zarray").is_file():
+        return [path]
+    found = _datasets(path, spec)
+    if not found:
+        raise InputError(
+            f"{path}: no scenes/.zarray and no folder {one_pattern(spec, '*.zarr')}: "
+            "expected L5 data"
+        )
+    met: dict[tuple[str, ...], Path] = {}
+    for folder, table in tables_of(found).items():
+        for index, scene in enumerate(table):
+            key = tuple(str(scene[name]) for name in ("host", "start_time", "end_time"))
+            if met.setdefault(key, folder) != folder:
+                raise InputError(
+                    f"{folder}: scene {index}: host {key[0]}, start {key[1]}: met "
+                    f"twice, also in {met[key].name}: expected once; name one dataset"
+                )
+    return found
+
+
+def _datasets(path: Path, spec: dict) -> list[Path]:
+    """Datasets in a folder or its scenes/."""
+    pattern = one_pattern(spec, "*.zarr")
+    return sorted({*path.glob(pattern), *path.glob(f"scenes/{pattern}")})
+
+
+def tables_of(folders: Sequence[Path]) -> dict[Path, np.ndarray]:
+    """The scenes of each dataset; those of no use are named when they are opened."""
+    tables = {}
+    for folder in folders:
+        with contextlib.suppress(InputError):
+            tables[folder] = scenes_of(folder)
+    return tables
+
+
+def scenes_of(folder: Path) -> np.ndarray:
+    """All scenes of a dataset."""
+    scenes = StructuredArray(folder / "scenes", SCENES)
+    if not 0 < scenes.size <= MAX_SCENES:
+        raise InputError(
+            f"{scenes.path}: shape: {scenes.size} scenes: expected 1 to {MAX_SCENES}"
+        )
+    return scenes.read(0, scenes.size)
+
+
+def groups_of(scenes: np.ndarray, others: Sequence[np.ndarray]) -> list[str]:
+    """Vehicle-disjoint group of each scene: a host's drive without a long pause.
+
+    Named by the host and the drive's start, so that it is the same in every dataset.
+
+    Args:
+      scenes: of one dataset.
+      others: of those beside it, which may hold earlier scenes of its drives.
+    """
+    tables = [scenes, *others]
+    hosts = np.concatenate([table["host"] for table in tables])
+    start, end = (
+        np.concatenate([table[name].astype(np.int64) for table in tables])
+        for name in ("start_time", "end_time")
+    )
+    _, host = np.unique(hosts, return_inverse=True)
+    order = np.lexsort((start, host))
+    pause = start[order][1:] - end[order][:-1]  # ns
+    new = np.ones(order.size, bool)
+    new[1:] = (np.diff(host[order]) != 0) | (pause > SAME_DRIVE_S * 1e9)
+    first = np.empty(order.size, np.int64)
+    first[order] = order[np.flatnonzero(new)][np.cumsum(new) - 1]
+    return [
+        f"{hosts[drive]}-from-{start[drive] // 10**9}"
+        for drive in first[: len(scenes)].tolist()
     ]
 
 
