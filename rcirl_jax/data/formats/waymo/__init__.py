@@ -1,4 +1,4 @@
-"""Waymo Open Motion (TFRecord): `reader`, `map` for lanes, `widths` of lanes."""
+"""Waymo Open Motion (TFRecord): `reader`, `map` for lanes and signals."""
 
 from rcirl_jax.data.formats.format import Format
 

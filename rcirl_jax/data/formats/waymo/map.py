@@ -15,11 +15,12 @@ import numpy as np
 from rcirl_jax.data.formats.options import lane_types, number
 from rcirl_jax.data.formats.perception import STATES, signal_of
 from rcirl_jax.data.formats.shapes import (
+    MIN_HALF_WIDTH_M,
     check_coordinates,
+    distances_to_lines,
     line_across,
     moves,
 )
-from rcirl_jax.data.formats.waymo.widths import MAX_POINTS, Segments, half_widths
 from rcirl_jax.data.readers.protobuf import Message, columns
 from rcirl_jax.data.recording import MAX_SPEED_MPS
 from rcirl_jax.errors import InputError
@@ -28,9 +29,13 @@ from rcirl_jax.units import MPH_MPS
 
 NEIGHBOUR = ("feature_id", "self_start_index", "self_end_index")
 BOUNDARY = ("lane_start_index", "lane_end_index", "boundary_feature_id")
+SIDES = ("left", "right")
 LANE_TYPES = {0: "undefined", 1: "freeway", 2: "surface_street", 3: "bike_lane"}
 DRIVEN = ("undefined", "freeway", "surface_street")
 WIDTH_M = 3.5  # m, of lanes without boundaries
+MAX_HALF_WIDTH_M = 5.0  # m; a farther line does not bound the lane
+MEASURE_STEP = 4  # points (2 m) between those at which widths are measured
+MAX_POINTS = 5_000_000  # of all lanes; 10,000 km of them are no map
 # LANE_STATE_*: unknown, arrow stop/caution/go, stop/caution/go, flashing stop/caution
 OFF, RED, YELLOW, GREEN = range(len(STATES))
 COLOURS = np.array([OFF, RED, YELLOW, GREEN, RED, YELLOW, GREEN, OFF, OFF], np.int8)
@@ -116,6 +121,7 @@ def _lanes(
     origin: np.ndarray,
     spec: dict,
 ) -> tuple[tuple[Lane, ...], list[str]]:
+    """Lanes of the wanted types and of two or more points."""
     every = _by_id(where, features, "lane")
     wanted = lane_types(spec, tuple(LANE_TYPES.values()), DRIVEN)
     driven = {
@@ -125,89 +131,107 @@ def _lanes(
     }
     centres = _polylines(where, driven, origin)
     heads = {key: driven[key] for key, line in centres.items() if moves(line).sum() > 1}
-    width = 0.5 * number(spec, "lane_width_m", WIDTH_M)
-    bounds = _bound_lines(where, features, origin)
-    lanes = _built(where, heads, centres, bounds, stops, width)
-    notes = []
-    if len(every) > len(driven):
-        notes.append(
-            f"{len(every) - len(driven)} lanes not of type {', '.join(wanted)} left out"
-        )
-    if len(driven) > len(heads):
-        notes.append(f"{len(driven) - len(heads)} lanes of one point left out")
-    return lanes, notes
-
-
-def _built(
-    where: str,
-    heads: Mapping[int, Message],
-    centres: dict[int, np.ndarray],
-    bounds: Mapping[int, np.ndarray],
-    stops: _Stop,
-    default: float,
-) -> tuple[Lane, ...]:
-    """Lanes of two or more points; `default` half width [m]."""
-    if not heads:
-        return ()
-    order, lines = list(heads.values()), [centres[key] for key in heads]
-    left, right = (
-        half_widths(lines, bounds, _segments(where, order, side))
-        for side in ("left", "right")
-    )
-    beside = [_neighbours(order, side) for side in ("left", "right")]
+    both = [_by_id(where, features, kind) for kind in ("road_line", "road_edge")]
+    lines = {key: line for kind in both for key, line in kind.items() if line.polyline}
+    bounds = _polylines(where, lines, origin)
+    order, default = list(heads.values()), 0.5 * number(spec, "lane_width_m", WIDTH_M)
+    line_of = [centres[key] for key in heads]
+    widths = [_half_widths(where, side, order, line_of, bounds) for side in SIDES]
+    beside = [_neighbours(order, side) for side in SIDES]
     exits = {key: dict.fromkeys(head.exit_lanes) for key, head in heads.items()}
     for key, head in heads.items():
         for before in head.entry_lanes:
             exits.get(before, {})[key] = None
     lanes = []
     for row, (key, head) in enumerate(heads.items()):
-        keep = moves(lines[row])
-        found = [side[row] for side in (left, right)]
-        line = lines[row][keep]
+        keep = moves(line_of[row])
+        line = line_of[row][keep]
+        found = [side[row] for side in widths]
         usual = np.full(len(line), default)
         sides = [usual if half is None else half[keep] for half in found]
-        across = None
-        if (point := stops.points.get(key)) is not None:
-            across = line_across(line, sides[0], sides[1], point)
+        point, limit = stops.points.get(key), head.speed_limit_mph  # zero: unknown
+        if not 0.0 <= limit * MPH_MPS < MAX_SPEED_MPS:
+            raise InputError(
+                f"{where}: lane {key}: speed_limit_mph: {limit:g}: "
+                f"expected 0 to {MAX_SPEED_MPS / MPH_MPS:.0f}"
+            )
         lane = Lane(
             id=str(key),
             centre=line,
             left_width=sides[0],
             right_width=sides[1],
-            speed_limit=_limit(where, key, head),
+            speed_limit=limit * MPH_MPS or None,
             successors=tuple(map(str, exits[key])),
             left=beside[0][row],
             right=beside[1][row],
             signal_ids=(str(key),) if key in stops.signals else (),
             stop_sign=key in stops.signs,
-            stop_line=across,
+            stop_line=None if point is None else line_across(line, *sides, point),
             width_assumed=any(half is None for half in found),
         )
         lanes.append(lane)
-    return tuple(lanes)
+    notes = []
+    if others := len(every) - len(driven):
+        notes.append(f"{others} lanes not of type {', '.join(wanted)} left out")
+    if short := len(driven) - len(heads):
+        notes.append(f"{short} lanes of one point left out")
+    return tuple(lanes), notes
 
 
-def _bound_lines(
-    where: str, features: Sequence[Message], origin: np.ndarray
-) -> dict[int, np.ndarray]:
-    """Road lines and road edges as points [n, 2] m by feature id."""
-    both = [_by_id(where, features, kind) for kind in ("road_line", "road_edge")]
-    lines = {key: line for kind in both for key, line in kind.items() if line.polyline}
-    return _polylines(where, lines, origin)
+def _half_widths(
+    where: str,
+    side: str,
+    heads: Sequence[Message],
+    lanes: Sequence[np.ndarray],
+    lines: Mapping[int, np.ndarray],
+) -> list[np.ndarray | None]:
+    """Distance [n] m of each lane's points from what bounds them on one side.
 
+    A lane names the road lines and edges beside it, each for a range of its points.
+    Measured at every fourth point, interpolated between, held beyond; None of lanes
+    without a known bound.
 
-def _segments(where: str, heads: Sequence[Message], side: str) -> Segments:
-    """What bounds the lanes on one side."""
+    Args:
+      where: names file and record in errors.
+      side: left or right.
+      heads: of the lanes.
+      lanes: points [n, 2] m of each lane.
+      lines: feature id -> points [m >= 1, 2] m.
+    """
+    if not heads:
+        return []
     lane, table = _of_lanes(heads, f"{side}_boundaries", BOUNDARY)
-    first, last, line = table.T
-    size = max(len(head.polyline) for head in heads)  # no lane has more points
-    first, last = np.clip(first, 0, size), np.clip(last, -1, size)
+    first, last, bound = table.T
+    sizes = np.array([len(points) for points in lanes], np.int64)
+    longest = int(sizes.max())
+    first, last = np.clip(first, 0, longest), np.clip(last, -1, longest)
     total = int(np.maximum(last - first + 1, 0).sum())
     if total > MAX_POINTS:
         raise InputError(
             f"{where}: {side}_boundaries: {total} points: expected at most {MAX_POINTS}"
         )
-    return Segments(lane=lane, first=first, last=last, line=line)
+    begins = np.cumsum(sizes) - sizes
+    half = np.full(int(sizes.sum()), np.nan)
+    last = np.minimum(last, sizes[lane] - 1)
+    use = np.flatnonzero(np.isin(bound, [*lines]) & (first <= last))
+    if use.size:
+        count = (last[use] - first[use]) // MEASURE_STEP + 2
+        owner = np.repeat(use, count)
+        place = np.arange(owner.size) - np.repeat(np.cumsum(count) - count, count)
+        point = np.minimum(first[owner] + MEASURE_STEP * place, last[owner])
+        row = begins[lane[owner]] + point
+        keys, which = np.unique(bound[owner], return_inverse=True)
+        near = [lines[key] for key in keys.tolist()]
+        half[row] = distances_to_lines(np.concatenate(lanes)[row], near, which)
+    found: list[np.ndarray | None] = []
+    for part in np.split(half, begins[1:]):
+        known = np.flatnonzero(part <= MAX_HALF_WIDTH_M)  # NaN compares false
+        filled = None
+        if known.size:
+            filled = np.interp(np.arange(part.size), known, part[known])
+            filled = np.maximum(filled, MIN_HALF_WIDTH_M)
+        found.append(filled)
+    return found
 
 
 def _neighbours(heads: Sequence[Message], side: str) -> list[str | None]:
@@ -228,17 +252,6 @@ def _of_lanes(
     lane = np.repeat(np.arange(len(heads)), [len(part) for part in parts])
     items = itertools.chain.from_iterable(parts)
     return lane, columns(items, *names, dtype=np.int64)
-
-
-def _limit(where: str, key: int, head: Message) -> float | None:
-    """Speed limit m/s; zero stands for unknown."""
-    limit = head.speed_limit_mph
-    if not 0.0 <= limit * MPH_MPS < MAX_SPEED_MPS:
-        raise InputError(
-            f"{where}: lane {key}: speed_limit_mph: {limit:g}: "
-            f"expected 0 to {MAX_SPEED_MPS / MPH_MPS:.0f}"
-        )
-    return limit * MPH_MPS or None
 
 
 # -------------------------------------------------------------------- signals

@@ -1,7 +1,7 @@
 """Waymo Open Motion Dataset: `Scenario` messages in TFRecord files.
 
-Read without TensorFlow and without the data set's package; `messages` has the fields
-of the public scenario.proto and map.proto
+Read without TensorFlow and without the data set's package; SCHEMA has the fields
+that are read of the public scenario.proto and map.proto
 (https://github.com/waymo-research/waymo-open-dataset, protos). Files are named
 `*.tfrecord` or `*.tfrecord-00000-of-01000`, in the folders `scenario/training`,
 `training_20s`, `validation`, `testing`, ...; the `tf_example` files hold
@@ -38,13 +38,38 @@ from rcirl_jax.data.formats.shapes import (
 )
 from rcirl_jax.data.formats.tracks import of_one_name
 from rcirl_jax.data.formats.waymo.map import read_map
-from rcirl_jax.data.formats.waymo.messages import read_message
-from rcirl_jax.data.readers.protobuf import Message, columns
+from rcirl_jax.data.readers.protobuf import Message, columns, parser, table_of
 from rcirl_jax.data.readers.tfrecord import FRAME_BYTES, read_records
 from rcirl_jax.data.recording import LENGTH_RANGE_M, WIDTH_RANGE_M, accepted
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Lane, Recording, Track
+from rcirl_jax.types import Recording, Track
 
+# the fields that are read of scenario.proto and map.proto; whole numbers and enums are
+# all int64: as coded they are alike, and numbers that no release knows are seen rather
+# than dropped
+SCHEMA = """
+Scenario: timestamps_seconds 1 double*, tracks 2 Track*, scenario_id 5 string,\
+ sdc_track_index 6 int64=-1, dynamic_map_states 7 DynamicMapState*,\
+ map_features 8 MapFeature*
+Track: id 1 int64, object_type 2 int64, states 3 ObjectState*
+ObjectState: center_x 2 double, center_y 3 double, length 5 float, width 6 float,\
+ heading 8 float, velocity_x 9 float, velocity_y 10 float, valid 11 bool
+DynamicMapState: lane_states 1 LaneState*
+LaneState: lane 1 int64, state 2 int64, stop_point 3 MapPoint
+MapFeature: id 1 int64, lane 3 Lane, road_line 4 Line, road_edge 5 Line,\
+ stop_sign 7 StopSign
+MapPoint: x 1 double, y 2 double
+Lane: speed_limit_mph 1 double, type 2 int64, polyline 8 MapPoint*,\
+ entry_lanes 9 int64*, exit_lanes 10 int64*,\
+ left_neighbors 11 Neighbor*, right_neighbors 12 Neighbor*,\
+ left_boundaries 13 Boundary*, right_boundaries 14 Boundary*
+Neighbor: feature_id 1 int64, self_start_index 2 int64, self_end_index 3 int64
+Boundary: lane_start_index 1 int64, lane_end_index 2 int64, boundary_feature_id 3 int64
+Line: polyline 2 MapPoint*
+StopSign: lane 1 int64*, position 2 MapPoint
+"""
+
+read_message = parser(table_of(SCHEMA))
 # what is read of each state
 STATE = (
     *("center_x", "center_y", "length", "width"),
@@ -111,6 +136,7 @@ def _read_scenario(where: str, default: str, data: bytes, spec: dict) -> Recordi
     tracks, notes = _tracks(where, scenario, states, spec)
     lanes, signals, map_notes = read_map(where, scenario, states.t, origin, spec)
     name = scenario.scenario_id[:MAX_NAME] or default
+    limits = [lane.speed_limit for lane in lanes if lane.speed_limit is not None]
     return Recording(
         name=name,
         source=str(spec.get("source", "Waymo Open Motion Dataset")),
@@ -120,7 +146,10 @@ def _read_scenario(where: str, default: str, data: bytes, spec: dict) -> Recordi
         lanes=lanes,
         signals=signals,
         group=name,
-        default_speed_limit=_usual_limit(lanes, spec),
+        # of lanes without one: the median of the scenario's, if any
+        default_speed_limit=float(np.median(limits))
+        if limits
+        else number(spec, "speed_limit", LIMIT_MPS),
         notes=(
             *origin_notes(origin),
             *_scenario_notes(scenario, states.t),
@@ -175,14 +204,6 @@ def _rate(where: str, t: np.ndarray) -> float:
             f"expected {RATE_HZ:g} (unit s)"
         )
     return RATE_HZ
-
-
-def _usual_limit(lanes: tuple[Lane, ...], spec: dict) -> float:
-    """Limit [m/s] of lanes without one: the median of the scenario's, if any."""
-    limits = [lane.speed_limit for lane in lanes if lane.speed_limit is not None]
-    return (
-        float(np.median(limits)) if limits else number(spec, "speed_limit", LIMIT_MPS)
-    )
 
 
 def _recorder(scenario: Message) -> int | None:
