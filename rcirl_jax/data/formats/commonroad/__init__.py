@@ -1,4 +1,4 @@
-"""CommonRoad XML scenarios: `reader`, `map`, `signs` by country, `extras`."""
+"""CommonRoad XML scenarios: `reader`, and `map` for lanes and signs."""
 
 from rcirl_jax.data.formats.format import Format
 

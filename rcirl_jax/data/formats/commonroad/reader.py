@@ -15,19 +15,15 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from rcirl_jax.data.formats.commonroad.extras import (
-    position,
-    read_ghosts,
-    read_signals,
-)
 from rcirl_jax.data.formats.commonroad.map import read_lanes
 from rcirl_jax.data.formats.files import files_below, log_name
 from rcirl_jax.data.formats.options import is_file_name, one_pattern
+from rcirl_jax.data.formats.shapes import arc_length
 from rcirl_jax.data.formats.tracks import of_one_name
 from rcirl_jax.data.readers.xml import Fields, read_xml
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Kind, Lane, Recording, Track
+from rcirl_jax.types import Ghost, Kind, Recording, Signal, Track
 
 VERSIONS = ("2018b", "2020a")
 GROUPS_UP = 4  # folders above a file in which the table of groups is looked for
@@ -41,6 +37,16 @@ OTHER_ROOTS = (
     *("CommonRoadSolution", "osm", "OpenDRIVE", "OpenSCENARIO"),
 )
 HEAD_BYTES = 65536  # bytes in which a file's root is looked for
+COLOURS = {
+    "red": "red",
+    "redyellow": "red",
+    "yellow": "yellow",
+    "green": "green",
+    "inactive": "off",
+}
+MAX_DURATION = 1e9  # steps of one phase; sums of phases stay exact
+MAX_GOAL_M = 1e5  # m, all lanelets of one goal together
+MAX_INTERVALS = 5_000_000  # of all lights; 100 lights over a day take a tenth of it
 # obstacle types; any other type that moves is a vehicle
 KINDS = {
     "bicycle": Kind.CYCLIST,
@@ -124,7 +130,13 @@ def _read_file(path: Path, spec: dict, groups: dict[str, str]) -> Recording:
         raise InputError(
             f"{path}: commonRoadVersion: {version}: expected one of {VERSIONS}"
         )
-    dt = _time_step(path, root)
+    text = root.get("timeStepSize", "missing")
+    try:
+        dt = float(text)
+    except ValueError:
+        dt = -1.0
+    if not 0.001 <= dt <= 1.0:
+        raise InputError(f"{path}: timeStepSize: {text}: expected 0.001 to 1 s")
     tracks, notes = _read_tracks(root, fields, dt)
     last = max((float(track.t[-1]) for track in tracks), default=0.0)
     group = groups.get(path.name)
@@ -133,7 +145,15 @@ def _read_file(path: Path, spec: dict, groups: dict[str, str]) -> Recording:
         notes.append("no vehicle-disjoint group given; the file is its own group")
     lanes, lane_notes = read_lanes(root, fields, spec)
     centres = {lane.id: lane.centre for lane in lanes}
-    source, licence = _provenance(root.get("source", "CommonRoad"), spec)
+    limits = [lane.speed_limit for lane in lanes if lane.speed_limit is not None]
+    usual = float(spec.get("default_speed_limit", DEFAULT_LIMIT_MPS))
+    # source and licence by the file's own source attribute
+    source, licence = root.get("source", "CommonRoad"), spec.get("licence", "unknown")
+    for rule in spec.get("provenance", []):
+        if rule.get("match", "") in source:
+            licence = rule.get("licence", "unknown")
+            source = f"{source}: {rule['source']}" if "source" in rule else source
+            break
     return Recording(
         name=log_name(path, spec, own_name(path)),
         source=f"{source} (CommonRoad {version})",
@@ -141,40 +161,13 @@ def _read_file(path: Path, spec: dict, groups: dict[str, str]) -> Recording:
         rate_hz=1.0 / dt,
         tracks=tuple(tracks),
         lanes=lanes,
-        signals=tuple(read_signals(root, fields, dt, last)),
-        ghosts=tuple(read_ghosts(root, fields, dt, centres)),
+        signals=tuple(_signals(root, fields, dt, last)),
+        ghosts=tuple(_ghosts(root, fields, dt, centres)),
         group=group,
-        default_speed_limit=_usual_limit(lanes, spec),
+        # of lanes without one: the median of the file's, if any
+        default_speed_limit=float(np.median(limits)) if limits else usual,
         notes=tuple(notes + lane_notes),
     )
-
-
-def _provenance(attribute: str, spec: dict) -> tuple[str, str]:
-    """Source and licence texts by the file's own source attribute."""
-    for rule in spec.get("provenance", []):
-        if rule.get("match", "") in attribute:
-            source = f"{attribute}: {rule['source']}" if "source" in rule else attribute
-            return source, rule.get("licence", "unknown")
-    return attribute, spec.get("licence", "unknown")
-
-
-def _usual_limit(lanes: tuple[Lane, ...], spec: dict) -> float:
-    """Limit [m/s] of lanes without one: the median of the file's, if any."""
-    limits = [lane.speed_limit for lane in lanes if lane.speed_limit is not None]
-    if limits:
-        return float(np.median(limits))
-    return float(spec.get("default_speed_limit", DEFAULT_LIMIT_MPS))
-
-
-def _time_step(path: Path, root: Element) -> float:
-    text = root.get("timeStepSize", "missing")
-    try:
-        dt = float(text)
-    except ValueError:
-        dt = -1.0
-    if not 0.001 <= dt <= 1.0:
-        raise InputError(f"{path}: timeStepSize: {text}: expected 0.001 to 1 s")
-    return dt
 
 
 def _is_standing(element: Element, fields: Fields) -> bool | None:
@@ -220,18 +213,14 @@ def _read_tracks(
     tracks, notes = of_one_name(tracks)
     if doubled:
         notes.append(f"{doubled} states of a step met twice, one used")
-    if regions := _regions(root):
+    states = (state for tag in ("initialState", "state") for state in root.iter(tag))
+    places = (state.find("position") for state in states)
+    regions = sum(place is not None and place.find("point") is None for place in places)
+    if regions:
         notes.append(f"{regions} states in a region, taken to be in its middle")
     if unrecorded:
         notes.append(f"{unrecorded} obstacles without a trajectory left out")
     return tracks, notes
-
-
-def _regions(root: Element) -> int:
-    """How many states have a region for a place."""
-    states = (state for tag in ("initialState", "state") for state in root.iter(tag))
-    places = (state.find("position") for state in states)
-    return sum(place is not None and place.find("point") is None for place in places)
 
 
 def _read_moving(element: Element, fields: Fields, dt: float) -> tuple[Track, int]:
@@ -259,7 +248,7 @@ def _read_state(state: Element, fields: Fields, where: str, dt: float) -> tuple:
             f"{fields.path}: {where}: time: {step:g}: expected steps up to {MAX_STEP:g}"
         )
     where = f"{where}: state {step:g}"
-    x, y = position(state, fields, where)
+    x, y = _position(state, fields, where)
     heading = fields.scalar(state, "orientation", where)
     return step * dt, x, y, heading, fields.scalar(state, "velocity", where)
 
@@ -267,7 +256,7 @@ def _read_state(state: Element, fields: Fields, where: str, dt: float) -> tuple:
 def _read_standing(element: Element, fields: Fields, clock: np.ndarray) -> Track:
     where = f"obstacle {element.get('id')}"
     state = fields.child(element, "initialState", where)
-    x, y = position(state, fields, where)
+    x, y = _position(state, fields, where)
     heading = fields.scalar(state, "orientation", where)
     still = [np.full(clock.shape, value) for value in (x, y, heading, 0.0)]
     return _track(element, fields, Kind.STATIC, (clock, *still))
@@ -297,8 +286,10 @@ def _read_shape(element: Element, fields: Fields, where: str) -> _Box:
     where = f"{where}: shape"
     shape = fields.child(element, "shape", where)
     box, circle = shape.find("rectangle"), shape.find("circle")
+    found = circle if box is None else box
+    centre = None if found is None else found.find("center")
+    x, y = (0.0, 0.0) if centre is None else fields.point(centre, where)
     if box is not None:
-        x, y = _centre(box, fields, where)
         turn = box.find("orientation")
         return _Box(
             length=fields.number(fields.child(box, "length", where), where),
@@ -309,7 +300,6 @@ def _read_shape(element: Element, fields: Fields, where: str) -> _Box:
         )
     if circle is not None:
         size = 2.0 * fields.number(fields.child(circle, "radius", where), where)
-        x, y = _centre(circle, fields, where)
         return _Box(length=size, width=size, x=x, y=y)
     points = [fields.point(point, where) for point in shape.iterfind("polygon/point")]
     if not points:
@@ -322,6 +312,128 @@ def _read_shape(element: Element, fields: Fields, where: str) -> _Box:
     return _Box(length=float(length), width=float(width), x=float(x), y=float(y))
 
 
-def _centre(shape: Element, fields: Fields, where: str) -> tuple[float, float]:
-    centre = shape.find("center")
-    return (0.0, 0.0) if centre is None else fields.point(centre, where)
+# ----------------------------------------- places, signals and missing agents
+
+
+def _position(state: Element, fields: Fields, where: str) -> tuple[float, float]:
+    """(x, y) m of a state's point, or of the middle of its region."""
+    place = fields.child(state, "position", where)
+    point = place.find("point")
+    if point is None and (middle := _region_middle(place, fields, where)) is not None:
+        return middle
+    point = fields.child(place, "point", f"{where}: position")
+    return fields.point(point, where)
+
+
+def _region_middle(
+    place: Element, fields: Fields, where: str
+) -> tuple[float, float] | None:
+    """(x, y) m in the middle of the shapes of a position; None without any.
+
+    The mean of the centres of rectangles and circles, and of polygons' corners.
+    """
+    middles = [fields.point(centre, where) for centre in place.iterfind("*/center")]
+    for polygon in place.iterfind("polygon"):
+        corners = [fields.point(one, where) for one in polygon.iterfind("point")]
+        middles += [np.mean(corners, axis=0)] if corners else []
+    if not middles:
+        return None
+    x, y = np.mean(middles, axis=0).tolist()
+    return x, y
+
+
+def _signals(root: Element, fields: Fields, dt: float, last: float) -> Iterator[Signal]:
+    """Every traffic light's written cycle, unrolled from 0 to after `last` s."""
+    left = MAX_INTERVALS
+    for light in root.iterfind("trafficLight"):
+        name = light.get("id", "(no id)")
+        where = f"trafficLight {name}"
+        phases = []
+        for element in light.iterfind("cycle/cycleElement"):
+            colour = (element.findtext("color") or "none").strip()
+            duration = fields.number(fields.child(element, "duration", where), where)
+            if colour.lower() not in COLOURS or not 1.0 <= duration <= MAX_DURATION:
+                raise InputError(
+                    f"{fields.path}: {where}: cycleElement: {colour} for {duration:g}: "
+                    f"expected a colour of {sorted(COLOURS)} and a duration of 1 to "
+                    f"{MAX_DURATION:g} steps"
+                )
+            phases.append((COLOURS[colour.lower()], duration))
+        if not phases or (light.findtext("active") or "true").strip() == "false":
+            phases = [("off", max(last, 1.0) / dt)]
+        offset = light.find("cycle/timeOffset")
+        start = fields.number(offset, where) if offset is not None else 0.0
+        period = sum(duration for _, duration in phases)
+        begin = start % period - period  # steps; at or before 0
+        turns = max(int((last / dt - begin) // period) + 1, 1)
+        left -= turns * len(phases)
+        if left < 0:
+            raise InputError(
+                f"{fields.path}: {where}: cycle: {turns} turns of {len(phases)}: "
+                f"expected up to {MAX_INTERVALS} intervals of all lights"
+            )
+        states, durations = zip(*phases, strict=True)
+        ends = np.cumsum(durations)
+        within = np.concatenate([[0.0], ends[:-1]])
+        steps = begin + np.arange(turns)[:, None] * ends[-1] + within
+        yield Signal(
+            id=name, start=steps.ravel() * dt, state=states * turns, is_recorded=False
+        )
+
+
+def _ghosts(
+    root: Element, fields: Fields, dt: float, lanes: dict[str, np.ndarray]
+) -> Iterator[Ghost]:
+    """Every planning problem's car, which the converter took out of the traffic."""
+    for problem in root.iterfind("planningProblem"):
+        where = f"planningProblem {problem.get('id', '(no id)')}"
+        initial = fields.child(problem, "initialState", where)
+        start = _position(initial, fields, where)
+        t0 = fields.scalar(initial, "time", where) * dt
+        goals = problem.findall("goalState")
+        if not goals:
+            raise InputError(f"{fields.path}: {where}: goalState: missing: expected it")
+        placed = [goal for goal in goals if goal.find("position") is not None]
+        goal = (placed or goals)[0]
+        t1 = max(fields.scalar(goal, "time", where) * dt, t0 + dt)
+        speed = fields.scalar(initial, "velocity", where)
+        heading = fields.scalar(initial, "orientation", where)
+        ahead = speed * (t1 - t0) * np.array([np.cos(heading), np.sin(heading)])
+        end = _goal_point(goal, fields, where, np.array(start) + ahead, lanes)
+        yield Ghost(t0=t0, t1=t1, start=start, end=(float(end[0]), float(end[1])))
+
+
+def _goal_point(
+    goal: Element,
+    fields: Fields,
+    where: str,
+    coasted: np.ndarray,
+    lanes: dict[str, np.ndarray],
+) -> np.ndarray:
+    """[2] m, where the missing car is at the goal's time.
+
+    A goal shape's centre; inside goal lanelets the centre-line point nearest to
+    where the car gets at its initial speed (the lanelet's end would mean up to
+    75 m/s in the NGSIM files); without a position, the coasted point itself.
+    """
+    place = goal.find("position")
+    middle = None if place is None else _region_middle(place, fields, where)
+    if middle is not None:
+        return np.array(middle)
+    names = [ref.get("ref", "") for ref in goal.iterfind("position/lanelet")]
+    lines = [lanes[name] for name in dict.fromkeys(names) if name in lanes]
+    if not lines:
+        return coasted
+    total = sum(float(np.hypot(*np.diff(line, axis=0).T).sum()) for line in lines)
+    if not total <= MAX_GOAL_M:
+        raise InputError(
+            f"{fields.path}: {where}: goalState: lanelets of {total:.0f} m: "
+            f"expected up to {MAX_GOAL_M:.0f} m"
+        )
+    dense = []  # about one point a metre
+    for line in lines:
+        arc = arc_length(line)
+        at = np.linspace(0.0, arc[-1], int(arc[-1]) + 2)
+        dense.append(np.stack([np.interp(at, arc, line[:, i]) for i in (0, 1)], axis=1))
+    near = np.concatenate(dense)
+    return near[np.argmin(np.hypot(*(near - coasted).T))]
