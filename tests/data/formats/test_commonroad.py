@@ -9,8 +9,8 @@ from defusedxml import ElementTree
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rcirl_jax.data.formats.commonroad import reader as commonroad_extras
 from rcirl_jax.data.formats.commonroad import reader as commonroad
+from rcirl_jax.data.formats.commonroad import reader as commonroad_extras
 from rcirl_jax.data.quality import assumed
 from rcirl_jax.types import Kind
 from tests.data.formats import writers as w

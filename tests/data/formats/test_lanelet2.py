@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 
 from rcirl_jax.data.formats.lanelet2 import map as lanelet2
-from rcirl_jax.data.formats.lanelet2 import rules as lanelet2_rules
-from rcirl_jax.data.formats.lanelet2.map import read_lanelet2
-from rcirl_jax.data.formats.lanelet2.rules import members
+from rcirl_jax.data.formats.lanelet2.map import members, read_lanelet2
 from rcirl_jax.data.formats.projection import utm, utm_zone
 from tests.data.formats.fixtures import osm
 from tests.helpers.logs import refused
@@ -234,7 +232,7 @@ def test_nodes_and_ways_of_bounds_are_limited(tmp_path, monkeypatch):
     assert set(read(path)[0]) == {"1", "2"}
     monkeypatch.setattr(lanelet2, "MAX_NODES", 2 * points - 1)
     assert f"lanelet 2: {2 * points} nodes" in refused(read, path)
-    monkeypatch.setattr(lanelet2_rules, "MAX_WAYS", 2)
+    monkeypatch.setattr(lanelet2, "MAX_WAYS", 2)
     assert "3 ways: expected up to 2" in refused(read, path)
 
 
@@ -246,7 +244,7 @@ def test_rules_are_read_once(tmp_path, monkeypatch):
         roles.append(role)
         return members(element, role, kind)
 
-    monkeypatch.setattr(lanelet2_rules, "members", counted)
+    monkeypatch.setattr(lanelet2, "members", counted)
     lanelet = (["middle_3"], ["border_3"], osm.ROAD, ["50000", "50001"] * 20)
     lanes, _ = read(metres(tmp_path, lanelets={"1": lanelet, "2": lanelet}))
     assert lanes["2"].speed_limit == pytest.approx(50 / 3.6)

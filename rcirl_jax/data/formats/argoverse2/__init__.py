@@ -1,4 +1,4 @@
-"""Argoverse 2 motion forecasting: `reader` for scenarios, `map` for their lanes."""
+"""Argoverse 2 motion forecasting: scenarios and their maps."""
 
 from rcirl_jax.data.formats.format import Format
 

@@ -10,18 +10,26 @@ Traps: the files hold no box sizes, so these come by type from the source TOML;
 `left_neighbor_id` of a map may name an oncoming lane; tracks of category
 "fragment" are of low quality; scenarios cut from one slice of a drive share
 vehicles, so the slice is the vehicle-disjoint group.
+
+Every lane segment of a map has a left and a right boundary in driving direction; the
+centre line lies midway between them, as in the data set's own devkit. Maps of the
+motion data set also hold a `centerline`, those of the sensor data set do not; it is
+not read. There are no speed limits, signals or stop lines.
 """
 
+import collections
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Annotated, Literal
 
+import msgspec
 import numpy as np
 
-from rcirl_jax.data.formats.argoverse2.map import read_lanes
 from rcirl_jax.data.formats.files import files_matching
 from rcirl_jax.data.formats.options import (
     kind_of,
+    lane_types,
     number,
     patterns,
     recording_car,
@@ -32,6 +40,7 @@ from rcirl_jax.data.formats.perception import (
     without_outliers,
 )
 from rcirl_jax.data.formats.shapes import (
+    between_bounds,
     check_coordinates,
     local_origin,
     origin_notes,
@@ -41,7 +50,9 @@ from rcirl_jax.data.readers.tables.ledger import Ledger
 from rcirl_jax.data.readers.tables.table import fields_of, open_table, read
 from rcirl_jax.data.recording import MAX_SPEED_MPS, validate_recording
 from rcirl_jax.errors import InputError
-from rcirl_jax.types import Recording, Track
+from rcirl_jax.runtime.atomic_files import read_json
+from rcirl_jax.runtime.checked import checked
+from rcirl_jax.types import Lane, Recording, Track
 
 NUMBERS = (
     "object_category",
@@ -66,14 +77,9 @@ RECORDER = "AV"  # id of the recording car
 FRAGMENT = 0
 MAX_GAP_STEPS = 5.5  # missing steps bridged inside one track
 LIMIT_MPS = 15.65  # m/s, 35 mph
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _Clock:
-    """The scenario's time axis."""
-
-    step: float  # s
-    notes: tuple[str, ...]
+MAX_FILE_BYTES = 64 * 1024**2  # bytes of a map; published ones have 0.1 to 1 MB
+LANE_TYPES = ("VEHICLE", "BUS", "BIKE")
+DRIVEN = ("VEHICLE", "BUS")  # read unless the source TOML says otherwise
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
@@ -92,25 +98,25 @@ def _read_scenario(file: Path, spec: dict) -> Recording:
     table = _read_rows(file)
     name = _constant(file, table, "scenario_id")
     group = _constant(file, table, "slice_id") if "slice_id" in table else name
-    clock = _clock(file, table)
+    clock_notes = _check_clock(file, table)
     fields = ("position_x", "position_y", "velocity_x", "velocity_y")
     values = np.stack([table[field] for field in fields], axis=1)
     check_coordinates(file, "rows", fields, values)
     origin = local_origin(values[:, 0], values[:, 1])
     table["position_x"] = values[:, 0] - origin[0]
     table["position_y"] = values[:, 1] - origin[1]
-    tracks, notes = _read_tracks(file, table, clock, spec)
-    lanes, lane_notes = read_lanes(_map_file(file, name), origin, spec)
+    tracks, notes = _read_tracks(file, table, spec)
+    lanes, lane_notes = _lanes(_map_file(file, name), origin, spec)
     return Recording(
         name=name,
         source=str(spec.get("source", "Argoverse 2 Motion Forecasting")),
         licence=str(spec.get("licence", "unknown")),
-        rate_hz=1.0 / clock.step,
+        rate_hz=1.0 / STEP_S,
         tracks=tracks,
         lanes=lanes,
         group=group,
         default_speed_limit=number(spec, "speed_limit", LIMIT_MPS),
-        notes=(*origin_notes(origin), *clock.notes, *notes, *lane_notes),
+        notes=(*origin_notes(origin), *clock_notes, *notes, *lane_notes),
     )
 
 
@@ -135,8 +141,8 @@ def _constant(file: Path, table: dict[str, np.ndarray], field: str) -> str:
     return str(values[0])
 
 
-def _clock(file: Path, table: dict[str, np.ndarray]) -> _Clock:
-    """Checks steps against their number; the stamps [ns] against 10 Hz."""
+def _check_clock(file: Path, table: dict[str, np.ndarray]) -> list[str]:
+    """Checks steps against their number; notes stamps [ns] that are not at 10 Hz."""
     steps, count = table["timestep"], table["num_timestamps"][0]
     if not 1 <= count <= MAX_STEPS:
         raise InputError(
@@ -152,9 +158,8 @@ def _clock(file: Path, table: dict[str, np.ndarray]) -> _Clock:
     span = (table["end_timestamp"][0] - table["start_timestamp"][0]) * 1e-9
     step = span / max(count - 1, 1)
     if count == 1 or abs(step / STEP_S - 1.0) <= STEP_TOLERANCE:
-        return _Clock(step=STEP_S, notes=())
-    note = f"timestamps {step:g} s apart; {STEP_S:g} s assumed, as specified"
-    return _Clock(step=STEP_S, notes=(note,))
+        return []
+    return [f"timestamps {step:g} s apart; {STEP_S:g} s assumed, as specified"]
 
 
 def _map_file(file: Path, name: str) -> Path:
@@ -169,7 +174,7 @@ def _map_file(file: Path, name: str) -> Path:
 
 
 def _read_tracks(
-    file: Path, table: dict[str, np.ndarray], clock: _Clock, spec: dict
+    file: Path, table: dict[str, np.ndarray], spec: dict
 ) -> tuple[tuple[Track, ...], list[str]]:
     category = table["object_category"]
     bad = np.flatnonzero(~np.isin(category, np.arange(MAX_CATEGORY + 1)))
@@ -192,7 +197,7 @@ def _read_tracks(
         elif category[rows[0]] == FRAGMENT and speed[rows].max() > MAX_SPEED_MPS:
             wild += 1
         else:
-            tracks.append(_track(file, name, table, rows, clock, spec))
+            tracks.append(_track(file, name, table, rows, spec))
     # sizes are the source TOML's, so that a wrong one is no outlier
     # the recording car's own speed is measured: if that is wrong, so is the file
     tracks, outliers = without_outliers(
@@ -211,35 +216,125 @@ def _track(
     name: str,
     table: dict[str, np.ndarray],
     rows: np.ndarray,
-    clock: _Clock,
     spec: dict,
 ) -> Track:
     found = str(table["object_type"][rows[0]])
     kind = kind_of(f"{file}: track {name}", found, section(spec, "kinds"))
-    length, width = _size(spec, name.partition("#")[0], found)
-    return Track(
-        id=name,
-        kind=kind,
-        length=length,
-        width=width,
-        size_assumed=True,
-        t=table["timestep"][rows] * clock.step,
-        x=table["position_x"][rows],
-        y=table["position_y"][rows],
-        heading=table["heading"][rows],
-        speed=np.hypot(table["velocity_x"][rows], table["velocity_y"][rows]),
-        automated=recording_car(spec) if name.partition("#")[0] == RECORDER else (),
-    )
-
-
-def _size(spec: dict, name: str, found: str) -> tuple[float, float]:
-    """Box [length, width] m by track id (the AV's), else by object type."""
-    sizes = section(spec, "sizes")
-    size = sizes.get(name, sizes.get(found))
+    sizes, user = section(spec, "sizes"), name.partition("#")[0]
+    size = sizes.get(user, sizes.get(found))  # by id (the AV's), else by type
     try:
         length, width = map(float, size or ())
     except (TypeError, ValueError) as error:
         raise InputError(
             f"source TOML: sizes.{found}: {size}: expected [length, width] in m"
         ) from error
-    return length, width
+    return Track(
+        id=name,
+        kind=kind,
+        length=length,
+        width=width,
+        size_assumed=True,
+        t=table["timestep"][rows] * STEP_S,
+        x=table["position_x"][rows],
+        y=table["position_y"][rows],
+        heading=table["heading"][rows],
+        speed=np.hypot(table["velocity_x"][rows], table["velocity_y"][rows]),
+        automated=recording_car(spec) if user == RECORDER else (),
+    )
+
+
+# ------------------------------------------------------------------------ map
+
+
+class _Point(msgspec.Struct):
+    x: float
+    y: float
+
+
+_Bound = Annotated[list[_Point], msgspec.Meta(min_length=2)]
+
+
+class _Segment(msgspec.Struct):
+    """What is read of a lane segment."""
+
+    id: int
+    lane_type: Literal["VEHICLE", "BUS", "BIKE"]
+    left_lane_boundary: _Bound
+    right_lane_boundary: _Bound
+    successors: list[int]
+    left_neighbor_id: int | None = None
+    right_neighbor_id: int | None = None
+
+
+class _Map(msgspec.Struct):
+    lane_segments: dict[str, dict]
+
+
+def _lanes(
+    path: Path, origin: np.ndarray, spec: dict
+) -> tuple[tuple[Lane, ...], list[str]]:
+    """Reads lanes of the wanted types, with notes on what was left out.
+
+    Args:
+      path: the map.
+      origin: [2] m, subtracted from all points.
+      spec: source TOML; `lane_types` names the types that are read.
+    """
+    wanted = lane_types(spec, LANE_TYPES, DRIVEN)
+    content = read_json(path, "JSON", MAX_FILE_BYTES)
+    segments = [
+        checked(segment, _Segment, f"{path}: lane segment {key[:40]}")
+        for key, segment in checked(content, _Map, path).lane_segments.items()
+    ]
+    kept = [segment for segment in segments if segment.lane_type in wanted]
+    if not kept:
+        raise InputError(
+            f"{path}: lane_segments: {len(segments)}, none of type "
+            f"{', '.join(wanted)}: expected at least one"
+        )
+    found = [_lane(path, segment, origin) for segment in kept]
+    lanes = {lane.id: lane for lane in found}
+    if len(lanes) < len(found):
+        ((twice, _),) = collections.Counter(one.id for one in found).most_common(1)
+        raise InputError(f"{path}: lane segment {twice}: id: met twice: expected once")
+    whole = {name: lane for name, lane in lanes.items() if len(lane.centre) > 1}
+    notes = []
+    if others := len(segments) - len(kept):
+        notes.append(f"{others} lanes not of type {', '.join(wanted)} left out")
+    if empty := len(lanes) - len(whole):
+        notes.append(f"{empty} lanes without length left out")
+    return tuple(_same_way(lane, whole) for lane in whole.values()), notes
+
+
+def _lane(path: Path, segment: _Segment, origin: np.ndarray) -> Lane:
+    bounds = []
+    for side in ("left_lane_boundary", "right_lane_boundary"):
+        points = np.array([(point.x, point.y) for point in getattr(segment, side)])
+        where = f"lane segment {segment.id}: {side}"
+        check_coordinates(path, where, ("x", "y"), points)
+        bounds.append(points - origin)
+    centre, half = between_bounds(*bounds)
+    left, right = segment.left_neighbor_id, segment.right_neighbor_id
+    return Lane(
+        id=str(segment.id),
+        centre=centre,
+        left_width=half,
+        right_width=half,
+        speed_limit=None,
+        successors=tuple(map(str, segment.successors)),
+        left=None if left is None else str(left),
+        right=None if right is None else str(right),
+    )
+
+
+def _same_way(lane: Lane, lanes: dict[str, Lane]) -> Lane:
+    """The lane without neighbours that are driven the other way."""
+    chord = lane.centre[-1] - lane.centre[0]
+
+    def kept(name: str | None) -> str | None:
+        other = lanes.get(name or "")
+        if other is None or chord @ (other.centre[-1] - other.centre[0]) <= 0.0:
+            return None
+        return name
+
+    return dataclasses.replace(lane, left=kept(lane.left), right=kept(lane.right))
