@@ -176,11 +176,15 @@ class Roads:
         self._low, self._high = np.array(boxes).reshape(-1, 2, 2).swapaxes(0, 1)
 
     def around(
-        self, x: np.ndarray, y: np.ndarray, origin: np.ndarray
+        self,
+        x: np.ndarray,
+        y: np.ndarray,
+        origin: np.ndarray,
+        margin: float = MARGIN_M,
     ) -> tuple[Lane, ...]:
-        """Lanes around positions [m], less the origin."""
-        low = np.array([x.min(), y.min()]) - MARGIN_M
-        high = np.array([x.max(), y.max()]) + MARGIN_M
+        """Returns lanes within a margin of positions [m], less the origin."""
+        low = np.array([x.min(), y.min()]) - margin
+        high = np.array([x.max(), y.max()]) + margin
         near = (self._high >= low).all(axis=1) & (self._low <= high).all(axis=1)
         return tuple(
             dataclasses.replace(

@@ -254,10 +254,6 @@ def test_each_routing_begins_a_leg(tmp_path):
     assert destinations(late) == {"ego": None, "ego-leg2": place(0)}
 
 
-def test_a_clock_of_another_rate(tmp_path):
-    assert only(tmp_path, ego_only(), rate_hz=5.0).tracks[0].t.size == 11
-
-
 @pytest.mark.dataset
 def test_example_record_of_apollo(data_dir):
     """34 messages of a simulated car that stands; values read with cyber_record."""
@@ -287,18 +283,10 @@ def estimate(*fields):
     return fixture.described("apollo.localization", text=text)
 
 
-def nested(depth):
-    inner = fixture.MESSAGES.ProtoDesc()
-    for _ in range(depth):
-        inner = fixture.MESSAGES.ProtoDesc(dependencies=[inner])
-    return inner.SerializeToString()
-
-
 BAD_DESCRIPTORS = [
     (None, "no descriptors before its first message"),
     (b"", "LocalizationEstimate: no descriptors"),
     (b"\xff\xff", "Error parsing message"),
-    (nested(90) * 2, "LocalizationEstimate: no descriptors"),
     (estimate(), "field header: not among the descriptors"),
     (estimate("header 1 int32"), "Estimate.header: type int32: another is known"),
     (estimate("header 1 .x.Y*"), "header: type message: another is known"),
@@ -326,19 +314,6 @@ def test_a_channel_without_descriptors_is_noted(tmp_path):
     assert made.tracks[0].t.size == 21
     (note,) = [note for note in made.notes if CHASSIS in note]
     assert note.endswith("no descriptors; who drove is not known")
-
-
-def test_messages_of_many_bytes(tmp_path, monkeypatch):
-    limit = "rcirl_jax.data.formats.apollo.records.MAX_BYTES"
-    monkeypatch.setattr(limit, 5000)
-    assert only(tmp_path, ego_only()).tracks  # beside larger ones that nobody reads
-    messages = ego_only()
-    messages[3] = (LOCALIZATION, 0.3, bytes(5001))
-    line = refused(only, tmp_path, messages)
-    assert "pose: message 3: message: 5001 bytes of" in line
-    monkeypatch.setattr(limit, 200)
-    line = refused(only, tmp_path, ego_only())
-    assert re.search(r"descriptors: \d+ bytes of at most 200", line)
 
 
 def test_of_a_silent_chassis_nobody_knows_the_mode(tmp_path):

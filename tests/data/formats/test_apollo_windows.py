@@ -91,14 +91,6 @@ def test_windows_are_made_while_parts_are_read_in_order(tmp_path, long):
     assert re.search(r"timestamp_sec: .*: goes backwards", line)
 
 
-def test_short_drive_is_one_recording(tmp_path, long):
-    """Nothing is cut, whatever comes after the last position; groups are minutes."""
-    messages = [item for item in long if item[1] < 20.05]
-    (found,) = read(in_parts(tmp_path, messages, 2), window_s=20.1)
-    assert (found.name, found.group, found.piece_of) == ("a", None, None)
-    assert len(read(tmp_path, window_s=19.9)) == 2
-
-
 @pytest.mark.parametrize("silence", [300.0, 86300.0])
 @pytest.mark.parametrize("piece", [5.0, 1e9])
 def test_a_long_silence_is_stepped_over(tmp_path, monkeypatch, silence, piece):

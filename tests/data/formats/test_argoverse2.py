@@ -5,8 +5,6 @@ import json
 import shutil
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 from rcirl_jax.types import Kind
@@ -65,11 +63,6 @@ def test_options(tmp_path):
     assert tracks["139408"].kind == Kind.VEHICLE
 
 
-def test_every_type_has_a_kind_and_a_size():
-    assert len(PACKAGED["kinds"]) == 10
-    assert set(PACKAGED["kinds"]) | {"AV"} == set(PACKAGED["sizes"])
-
-
 def test_columns_that_may_be_missing_and_the_test_split(tmp_path):
     """The test split has the observed part only."""
     table = w.columns()
@@ -80,23 +73,6 @@ def test_columns_that_may_be_missing_and_the_test_split(tmp_path):
     recording = scenario(tmp_path, table=table)
     assert recording.group == w.SCENARIO
     assert max(track.t[-1] for track in recording.tracks) == pytest.approx(4.9)
-
-
-def test_other_types_of_the_same_columns(tmp_path):
-    """Categories, float32 positions and whole-number ids are read alike."""
-    table = w.columns()
-    digits = [0 if name == "AV" else int(name) for name in table["track_id"]]
-    arrays = {name: pa.array(values) for name, values in table.items()}
-    arrays["track_id"] = pa.array(digits, pa.int32())
-    arrays["object_type"] = arrays["object_type"].dictionary_encode()
-    arrays["scenario_id"] = arrays["scenario_id"].cast(pa.large_string())
-    arrays["heading"] = arrays["heading"].cast(pa.float32())
-    path, _ = w.write_scenario(tmp_path)
-    pq.write_table(pa.table(arrays), path, row_group_size=100, compression="zstd")
-    tracks = tracks_of(only(path))
-    assert tracks["0"].kind == Kind.VEHICLE
-    assert tracks["139408"].kind == Kind.CYCLIST
-    assert tracks[w.FOCAL].t.size == w.NUM_STEPS
 
 
 def test_stamps_that_are_not_10_hz_are_noted(tmp_path):

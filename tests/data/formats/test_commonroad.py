@@ -9,8 +9,6 @@ from defusedxml import ElementTree
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rcirl_jax.data.formats.commonroad import reader as commonroad
-from rcirl_jax.data.formats.commonroad import reader as commonroad_extras
 from rcirl_jax.data.quality import assumed
 from rcirl_jax.types import Kind
 from tests.data.formats import writers as w
@@ -55,15 +53,6 @@ def test_both_versions(tmp_path, version):
         np.testing.assert_allclose(one.t, track.t)
         assert np.ptp(one.x) == 0.0
         assert not one.speed.any()
-
-
-def test_samples_of_standing_things_are_limited(tmp_path, monkeypatch):
-    parts = (w.lanelet(), w.car(), w.standing())  # 40 steps
-    monkeypatch.setattr(commonroad, "MAX_STANDING", 40)
-    assert len(scenario(tmp_path, *parts).tracks) == 2
-    monkeypatch.setattr(commonroad, "MAX_STANDING", 39)
-    line = refused(scenario, tmp_path, *parts)
-    assert "obstacles: 1 static ones over 40 steps" in line
 
 
 def test_shapes_and_their_offsets(tmp_path):
@@ -198,24 +187,6 @@ def test_signal_cycle_against_modular_arithmetic(tmp_path_factory, durations, of
         assert signal.state[index] == shown.get(expected, expected)
 
 
-@pytest.mark.parametrize("offset", [1.149e34, -1e300, -1e-30, 1e9 + 5])
-def test_offset_of_any_size_begins_one_turn_early(tmp_path, offset):
-    signal = lit(tmp_path, [("red", 7), ("green", 5)], offset=offset)
-    assert -1.21 < signal.start[0] <= 0.0
-    assert signal.start[-1] >= 3.1
-    np.testing.assert_allclose(np.diff(signal.start)[::2], 0.7)
-
-
-def test_intervals_of_all_lights_are_limited(tmp_path, monkeypatch):
-    lights = [w.light(name, [("red", 1), ("green", 1)]) for name in "78"]
-    parts = (road(), *lights)
-    sizes = [signal.start.size for signal in scenario(tmp_path, *parts).signals]
-    assert sizes == [42, 42]  # steps 0 to 39 and a turn before
-    monkeypatch.setattr(commonroad_extras, "MAX_INTERVALS", sum(sizes) - 1)
-    line = refused(scenario, tmp_path, *parts)
-    assert "trafficLight 8: cycle: 21 turns" in line
-
-
 # --------------------------------------------------------- missing cars, groups, rest
 
 RECTANGLE = (
@@ -233,16 +204,6 @@ def test_ghost_reaches_the_goal(tmp_path, goal, end):
     (ghost,) = scenario(tmp_path, road(), w.problem(goal, speed=10.0)).ghosts
     assert (ghost.t0, ghost.t1, ghost.start) == (0.0, pytest.approx(3.0), (0.0, 0.0))
     np.testing.assert_allclose(ghost.end, end, atol=0.6)
-
-
-def test_lanelets_of_a_goal_are_limited_and_count_once(tmp_path, monkeypatch):
-    ends = {"left": [(0, 2), (200000, 2)], "right": [(0, -2), (200000, -2)]}
-    line = refused(scenario, tmp_path, road(**ends), w.problem(ON_LANELET))
-    assert "goalState: lanelets of 200000 m" in line
-    monkeypatch.setattr(commonroad_extras, "MAX_GOAL_M", 201)  # m, the lanelet has 200
-    goal = "<position>" + '<lanelet ref="1"/>' * 3 + "</position>"
-    (ghost,) = scenario(tmp_path, road(), w.problem(goal)).ghosts
-    np.testing.assert_allclose(ghost.end, (30.0, 0.0), atol=0.6)
 
 
 def test_groups_beside_and_above_the_folder(tmp_path):

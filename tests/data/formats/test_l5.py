@@ -2,7 +2,6 @@
 
 import functools
 import json
-import re
 import shutil
 
 import numpy as np
@@ -12,10 +11,9 @@ from rcirl_jax.data.cut import digest
 from rcirl_jax.data.formats import parts, read_recordings
 from rcirl_jax.data.formats.l5 import map as l5_map
 from rcirl_jax.data.formats.l5 import reader as l5
-from rcirl_jax.data.readers import zarr2
 from tests.data.formats.fixtures import l5 as fixture
 from tests.helpers import logs
-from tests.helpers.logs import lanes_of, refused, tracks_of
+from tests.helpers.logs import lanes_of, refused
 
 PACKAGED = logs.packaged("l5")
 read = functools.partial(logs.read, "l5", rate_hz=10.0)
@@ -194,20 +192,6 @@ def test_without_a_map_of_the_place_lanes_are_paths(dataset):
 # ------------------------------------------------------------------- contents
 
 
-def test_older_number_types(dataset):
-    """Early releases had float32 positions and int32 ids."""
-    older = {"<f8": "<f4", "<u8": "<i4"}
-
-    def narrow(records):
-        kinds = [(n, np.dtype(d).str, *s) for n, d, *s in fixture.AGENT_DTYPE]
-        kinds = [(name, older.get(kind, kind), *s) for name, kind, *s in kinds]
-        return records.astype(kinds)
-
-    fixture.change(dataset, "agents", narrow)
-    found, expected = tracks_of(read(dataset)[0])["12"], fixture.road_users()["12"]
-    np.testing.assert_allclose(found.x, expected.x, atol=1e-3)
-
-
 # ------------------------------------------------------------------- arrays
 
 BAD_METADATA = [
@@ -256,15 +240,6 @@ def test_damaged_chunk(dataset, place, content, words):
     changed[place : place + len(content)] = content
     chunk.write_bytes(changed)
     assert words in refused(read, dataset)
-
-
-def test_limits(folder, monkeypatch):
-    with monkeypatch.context() as patch:
-        patch.setattr(l5_map, "MAX_MAP_BYTES", 500)
-        assert re.search(r"\.pb: size: \d+ bytes: .* 500", refused(read, folder))
-    monkeypatch.setattr(zarr2, "MAX_READ_BYTES", 1000)
-    line = refused(read, folder)
-    assert re.search(r"frames: records 0 to 100: .*at most 1000", line)
 
 
 def test_format_version_1_has_no_lights(folder):

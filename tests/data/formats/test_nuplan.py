@@ -206,25 +206,6 @@ def test_optional_layers_and_columns(folder, city):
     assert lanes["connector-72"].stop_line is None
 
 
-@pytest.mark.parametrize("column", ["geometry", 'the "shape", or 1'])
-def test_names_of_geometry_columns(whole, folder, city, column):
-    """A GeoPackage says of each layer which column holds its geometries."""
-    quoted = column.replace('"', '""')
-    for layer in ("baseline_paths", "boundaries", "stop_polygons"):
-        edit(
-            city,
-            f'ALTER TABLE {layer} RENAME COLUMN geom TO "{quoted}"',
-            f"UPDATE gpkg_geometry_columns SET column_name = '{column}' "
-            f"WHERE table_name = '{layer}'",
-        )
-    found, expected = lanes_of(only(folder)), lanes_of(whole)
-    assert list(found) == list(expected)
-    for name, lane in expected.items():
-        np.testing.assert_array_equal(found[name].centre, lane.centre)
-        np.testing.assert_array_equal(found[name].left_width, lane.left_width)
-        np.testing.assert_equal(found[name].stop_line, lane.stop_line)
-
-
 def blob(*shapes, order=1, **dimensions):
     """A GeoPackage blob without an envelope, as shapely writes well-known binary."""
     made = shapely.to_wkb(shapes[0], byte_order=order, **dimensions)
@@ -270,16 +251,6 @@ def test_malformed_geometries(content):
         geopackage.points_of(content)
 
 
-def test_a_map_of_too_many_points(folder, monkeypatch):
-    monkeypatch.setattr(geopackage, "MAX_POINTS", 11)
-    assert "points: expected at most 11" in refused(only, folder)
-
-
-def test_rows_are_limited(log, monkeypatch):
-    monkeypatch.setattr(nuplan, "MAX_BOXES", 100)
-    assert "lidar_box.track_token: more than 100 rows" in refused(read, log)
-
-
 def test_missing_velocity_comes_from_positions(log):
     edit(log, "UPDATE lidar_box SET vx = NULL", "UPDATE ego_pose SET vy = NULL")
     tracks = tracks_of(only(log))
@@ -302,10 +273,3 @@ def test_maps_option(folder, tmp_path):
     for place in ("../elsewhere", str(tmp_path / "elsewhere")):
         assert "61" in lanes_of(only(folder, maps=place))
     assert "source TOML: maps: gone: no map of" in refused(only, folder, maps="gone")
-
-
-def test_zone_of():
-    assert geopackage.zone_of("epsg:32648") == (48, False)
-    assert geopackage.zone_of(32719) == (19, True)
-    for bad in ("epsg:4326", None, "32661", "x32611"):
-        assert geopackage.zone_of(bad) is None

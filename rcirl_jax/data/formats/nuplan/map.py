@@ -20,6 +20,7 @@ import re
 import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -239,7 +240,7 @@ class _Row:
     """A lane or connector as the map's tables have it."""
 
     id: str
-    limit: object
+    limit: Any  # m/s, if it is a number
     bounds: tuple[int, int]  # fids of left, right
     successors: tuple[str, ...]
     left: str | None = None
@@ -370,14 +371,15 @@ class NuplanMap:
             places = [self._stops[fid] for fid in row.stops if fid in self._stops]
             start = centre[0]
             near = min(places, key=lambda p: np.hypot(*(p - start)), default=start)
-            stop = line_across(centre, *sides, near)
-        is_limit = isinstance(limit, int | float) and 0.0 < limit <= MAX_LIMIT_MPS
+            stop = line_across(centre, sides[0], sides[1], near)
+        known = isinstance(limit, int | float) and 0.0 < limit <= MAX_LIMIT_MPS
+        speed_limit = float(limit) if known else None
         return Lane(
             id=row.id,
             centre=centre,
             left_width=sides[0],
             right_width=sides[1],
-            speed_limit=float(limit) if is_limit else None,
+            speed_limit=speed_limit,
             successors=row.successors,
             left=row.left,
             right=row.right,

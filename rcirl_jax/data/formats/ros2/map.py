@@ -15,7 +15,7 @@ from rcirl_jax.data.formats.lanelet2.map import read_lanelet2
 from rcirl_jax.data.formats.options import path_option, section
 from rcirl_jax.data.formats.perception import held_states, signal_of
 from rcirl_jax.data.formats.projection import utm, utm_zone
-from rcirl_jax.data.formats.shapes import distance_to_line, line_across
+from rcirl_jax.data.formats.shapes import Roads, distance_to_line, line_across
 from rcirl_jax.errors import InputError
 from rcirl_jax.types import Lane, Signal
 
@@ -69,18 +69,8 @@ def lanes_near(
     Raises:
       InputError: there are none.
     """
-    low = np.array([x.min(), y.min()]) - MARGIN_M
-    high = np.array([x.max(), y.max()]) + MARGIN_M
-    near = tuple(
-        dataclasses.replace(
-            lane,
-            centre=lane.centre - origin,
-            stop_line=None if lane.stop_line is None else lane.stop_line - origin,
-        )
-        for lane in lanes
-        if (lane.centre.max(axis=0) >= low).all()
-        and (lane.centre.min(axis=0) <= high).all()
-    )
+    roads = Roads([lane.centre for lane in lanes], lanes.__getitem__)
+    near = roads.around(x, y, origin, MARGIN_M)
     if not near:
         raise InputError(
             f"source TOML: map: no lane within {MARGIN_M:g} m of the tracks around "

@@ -149,7 +149,9 @@ def _lanes(
         found = [side[row] for side in widths]
         usual = np.full(len(line), default)
         sides = [usual if half is None else half[keep] for half in found]
-        point, limit = stops.points.get(key), head.speed_limit_mph  # zero: unknown
+        across, limit = None, head.speed_limit_mph  # zero: unknown
+        if (point := stops.points.get(key)) is not None:
+            across = line_across(line, sides[0], sides[1], point)
         if not 0.0 <= limit * MPH_MPS < MAX_SPEED_MPS:
             raise InputError(
                 f"{where}: lane {key}: speed_limit_mph: {limit:g}: "
@@ -166,7 +168,7 @@ def _lanes(
             right=beside[1][row],
             signal_ids=(str(key),) if key in stops.signals else (),
             stop_sign=key in stops.signs,
-            stop_line=None if point is None else line_across(line, *sides, point),
+            stop_line=across,
             width_assumed=any(half is None for half in found),
         )
         lanes.append(lane)
