@@ -89,7 +89,7 @@ class Drive:
 
     @property
     def now(self) -> float:
-        """Time [s] that the drive is read up to."""
+        """Returns the time [s] that the drive is read up to."""
         return self.end
 
     def settle(self) -> None:
@@ -254,7 +254,7 @@ def drive_windows(
             yield windows.recording(made, number, (low, high), drive.progress)
 
     def following(last: float) -> int:
-        """The next window near a place, or else the one at a time [s]."""
+        """Returns the next window near a place, or else the one at a time [s]."""
         gap = windows.max_gap_s
         near = drive.next_place((number + 1) * window - gap) - gap
         return max(number + 1, math.floor(min(near, last) / window))

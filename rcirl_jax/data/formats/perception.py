@@ -39,7 +39,7 @@ ARRAYS = ("ids", "t", *SERIES, "kind")
 STATES = ("off", "red", "yellow", "green")  # of lights, by their numbers
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True)
 class Boxes:
     """Boxes of all road users of one recording, in any order."""
 
@@ -78,19 +78,14 @@ def ego_boxes(
       speed: [n] m/s; NaN: from the positions.
     """
     own = section(spec, "ego")
-    length, width, ahead = (number(own, name, m) for name, m in usual.items())
+    length, width, ahead = (
+        np.full(t.size, number(own, name, m)) for name, m in usual.items()
+    )
+    x, y = x + ahead * np.cos(heading), y + ahead * np.sin(heading)
+    ids, kinds = np.zeros(t.size, np.int64), np.full(t.size, int(Kind.VEHICLE))
+    is_assumed = "ego" not in spec.get(STATED, ())
     return Boxes(
-        ids=np.zeros(t.size, np.int64),
-        names=("ego",),
-        t=t,
-        x=x + ahead * np.cos(heading),
-        y=y + ahead * np.sin(heading),
-        heading=heading,
-        speed=speed,
-        length=np.full(t.size, length),
-        width=np.full(t.size, width),
-        kind=np.full(t.size, int(Kind.VEHICLE)),
-        size_assumed="ego" not in spec.get(STATED, ()),
+        ids, ("ego",), t, x, y, heading, speed, length, width, kinds, is_assumed
     )
 
 

@@ -8,14 +8,14 @@ FARTHEST_M = 2e7  # m, half a circumference; keeps the far side of the globe fin
 
 
 def utm_zone(longitude: float) -> int:
-    """UTM zone, 1 to 60, of a longitude in degrees (Norway's exceptions left out)."""
+    """Returns the UTM zone, 1 to 60, of a longitude in degrees, without exceptions."""
     return int(np.floor((longitude + 180.0) / 6.0)) % 60 + 1
 
 
 def utm(
     latitude: np.ndarray, longitude: np.ndarray, zone: int, *, south: bool = False
 ) -> np.ndarray:
-    """Easting and northing [n, 2] m of positions in degrees.
+    """Returns easting and northing [n, 2] m of positions in degrees.
 
     Args:
       latitude: [n] degrees north.
@@ -30,7 +30,7 @@ def utm(
 
 
 def earth_centred(latitude: float, longitude: float) -> np.ndarray:
-    """Earth-centred x, y, z [3] m of a place in degrees on the ellipsoid."""
+    """Returns Earth-centred x, y, z [3] m of a place in degrees on the ellipsoid."""
     system = "+proj=cart +ellps=WGS84"
     project = extra_module("pyproj").Transformer.from_pipeline(system).transform
     return np.array(project(longitude, latitude, 0.0))
@@ -39,7 +39,7 @@ def earth_centred(latitude: float, longitude: float) -> np.ndarray:
 def projected(
     longitude: np.ndarray, latitude: np.ndarray, middle: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """East and north [n] m of a middle (latitude, longitude), all in degrees.
+    """Projects degrees to metres [n] east and north of a middle (latitude, longitude).
 
     A transverse Mercator projection of true scale through the middle: north is up
     there, so that compass headings are those of the positions.

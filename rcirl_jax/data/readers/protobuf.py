@@ -29,7 +29,7 @@ Types = Mapping[str, Mapping[str, Field]]  # message -> field -> what it is
 
 
 def table_of(schema: str) -> Types:
-    """A table from lines "MESSAGE: FIELD NUMBER KIND, ...", the first one's first.
+    """Makes a table of lines "MESSAGE: FIELD NUMBER KIND, ...", the first one's first.
 
     A star behind the kind says that it is repeated, "=5" that 5 is its default.
     """
@@ -46,7 +46,7 @@ def table_of(schema: str) -> Types:
 
 
 def parser(types: Types) -> Callable[[bytes], Message]:
-    """What parses the first message of a table; it raises `DecodeError`.
+    """Makes what parses the first message of a table; that raises `DecodeError`.
 
     Raises:
       TypeError: a number that no field may have, or one of two fields.

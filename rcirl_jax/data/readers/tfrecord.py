@@ -22,7 +22,7 @@ GZIP_MAGIC = b"\x1f\x8b"
 
 
 def read_records(path: Path, limit: int = MAX_RECORD_BYTES) -> Iterator[bytes]:
-    """Data of each record of an uncompressed TFRecord file.
+    """Yields the data of each record of an uncompressed TFRecord file.
 
     Args:
       path: file.
@@ -53,7 +53,7 @@ def read_records(path: Path, limit: int = MAX_RECORD_BYTES) -> Iterator[bytes]:
 
 
 def mask(crc: int) -> int:
-    """The masked form in which TFRecord stores a CRC32C."""
+    """Returns the masked form in which TFRecord stores a CRC32C."""
     return ((crc >> 15 | crc << 17) + MASK_DELTA) & 0xFFFFFFFF
 
 

@@ -13,7 +13,7 @@ from rcirl_jax.errors import InputError
 
 
 def read_xml(path: Path, tag: str, max_bytes: int) -> Element:
-    """The root element, which has to be called `tag`.
+    """Reads the root element, which has to be called `tag`.
 
     Args:
       path: of the file.
@@ -53,14 +53,14 @@ class Fields:
         self.path = path
 
     def child(self, parent: Element, tag: str, where: str) -> Element:
-        """A child element that has to be there."""
+        """Returns a child element that has to be there."""
         found = parent.find(tag)
         if found is None:
             raise InputError(f"{self.path}: {where}: {tag}: missing: expected it")
         return found
 
     def number(self, element: Element, where: str) -> float:
-        """A finite number from an element's text."""
+        """Reads a finite number from an element's text."""
         try:
             value = float(element.text or "")
         except ValueError:
@@ -74,7 +74,7 @@ class Fields:
         return value
 
     def scalar(self, parent: Element, tag: str, where: str) -> float:
-        """<tag><exact> or the middle of <tag><intervalStart>/<intervalEnd>."""
+        """Reads <tag><exact> or the middle of <tag><intervalStart>/<intervalEnd>."""
         node = self.child(parent, tag, where)
         exact = node.find("exact")
         if exact is not None:
@@ -84,6 +84,6 @@ class Fields:
         return 0.5 * (self.number(low, where) + self.number(high, where))
 
     def point(self, parent: Element, where: str) -> tuple[float, float]:
-        """<x>, <y> of a point-like element."""
+        """Reads <x>, <y> of a point-like element."""
         x = self.number(self.child(parent, "x", where), where)
         return x, self.number(self.child(parent, "y", where), where)

@@ -51,8 +51,6 @@ from rcirl_jax.types import Recording, Track
 LIMIT_MPS = 29.06  # m/s, 65 mph
 # Lincoln MKZ in Apollo's mkz_example: 3.89 m before, 1.043 m behind the rear axle
 EGO = {"length": 4.933, "width": 2.11, "rear_axle_to_centre": 1.4235}  # m
-# what is measured of a box
-MEASURED = ("x", "y", "heading", "speed", "length", "width")
 CLOCK_TOLERANCE_S = 1.0  # s, two topics' clocks differ by more: not one clock
 REPEAT_S = 1.5  # s; Apollo sends the routing in force again every second
 
@@ -117,7 +115,7 @@ class ApolloDrive(Drive):
 
     @property
     def key(self) -> str:
-        """The role of the obstacles."""
+        """Returns the role of the obstacles."""
         return "perception" if len(self.tables["perception"]) else "prediction"
 
     @property
@@ -127,7 +125,7 @@ class ApolloDrive(Drive):
 
     @property
     def now(self) -> float:
-        """Time [s] at which the last position was recorded; -inf without any held."""
+        """Returns when [s] the last position was recorded; -inf without any held."""
         tables = [self.tables[role] for role in self.in_use]
         recorded = [table[-1, 1] for table in tables if len(table)]
         return max(recorded, default=-math.inf) + self._offset - self.start
@@ -236,13 +234,9 @@ def _obstacles(drive: ApolloDrive, spec: dict) -> tuple[list[Track], list[str]]:
     where = f"{drive.path}: obstacles"
     check_coordinates(where, "perception_obstacle", ("x", "y", "theta"), table[:, 4:7])
     number_of, ids = np.unique(table[:, 3].astype(np.int64), return_inverse=True)
-    boxes = Boxes(
-        ids=ids,
-        names=tuple(map(str, number_of.tolist())),
-        t=clock,
-        kind=table[:, 10].astype(np.int64),
-        **dict(zip(MEASURED, table[:, 4:10].T, strict=True)),
-    )
+    names, kinds = [*map(str, number_of.tolist())], table[:, 10].astype(np.int64)
+    x, y, heading, speed, length, width = table[:, 4:10].T
+    boxes = Boxes(ids, names, clock, x, y, heading, speed, length, width, kinds)
     tracks, notes = drive.tracks(boxes, spec)
     if lost:
         notes.append(f"{lost} obstacle states without position or id left out")

@@ -83,13 +83,13 @@ DRIVEN = ("VEHICLE", "BUS")  # read unless the source TOML says otherwise
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
-    """The scenario files; each can be read alone."""
+    """Lists the scenario files; each can be read alone."""
     wanted = patterns(spec, [f"{PREFIX}*{SUFFIX}"])
     return files_matching(path, wanted, "scenario files")
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
-    """One Recording per scenario file, of a file, its folder or a whole split."""
+    """Yields one Recording per scenario file, of a file, a folder or a split."""
     for file in parts(path, spec):
         yield validate_recording(_read_scenario(file, spec), file)
 

@@ -72,7 +72,7 @@ class _Box:
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
-    """The XML files but those of other formats; each can be read alone."""
+    """Lists the XML files but those of other formats; each can be read alone."""
     files = files_below(path, one_pattern(spec, "*.xml"))
     if path.is_dir():
         files = [file for file in files if _root_of(file) not in OTHER_ROOTS] or files
@@ -88,12 +88,12 @@ def _root_of(path: Path) -> str:
 
 
 def own_name(file: Path) -> str:
-    """Name of a log, as long as no other folder has one called alike."""
+    """Returns the name of a log, as long as no other folder has one called alike."""
     return file.stem
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
-    """One Recording per XML file."""
+    """Yields one Recording per XML file."""
     groups = _read_groups(path, spec.get("groups", ""))
     for file in parts(path, spec):
         yield validate_recording(_read_file(file, spec, groups), file)

@@ -62,7 +62,7 @@ read_message = parser(table_of(SCHEMA))
 
 
 def find_map(folder: Path, spec: dict) -> Path | None:
-    """semantic_map.pb as named in the TOML, or beside or above a dataset."""
+    """Finds semantic_map.pb as named in the TOML, or beside or above a dataset."""
     name = path_option(spec, "map")
     above = folder.resolve().parents
     if name:
@@ -119,7 +119,7 @@ class SemanticMap:
         face: np.ndarray,
         is_active: np.ndarray,
     ) -> tuple[Signal, ...]:
-        """One signal per set of faces that governs a lane and was seen.
+        """Makes one signal per set of faces that governs a lane and was seen.
 
         The state of a frame is the colour that most lit faces of the set show;
         a set unseen for a second is off.
@@ -253,7 +253,7 @@ def _frame(geo: Message) -> np.ndarray:
 
 
 def world_to_ecef(file: Path, spec: dict) -> np.ndarray:
-    """Rigid transform [4, 4] in m: of meta.json beside or above, or of the TOML.
+    """Reads the rigid transform [4, 4] in m of meta.json beside or above, or the TOML.
 
     Args:
       file: semantic_map.pb.

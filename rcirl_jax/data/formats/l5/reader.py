@@ -129,7 +129,7 @@ def pieces(path: Path, spec: dict) -> list[dict]:
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
-    """The dataset itself, or those in a folder or its scenes/."""
+    """Returns the dataset itself, or those in a folder or its scenes/."""
     if (path / "scenes" / ".zarray").is_file():
         return [path]
     found = _datasets(path, spec)
@@ -157,7 +157,7 @@ def _datasets(path: Path, spec: dict) -> list[Path]:
 
 
 def tables_of(folders: Sequence[Path]) -> dict[Path, np.ndarray]:
-    """The scenes of each dataset; those of no use are named when they are opened."""
+    """Reads the scenes of each dataset; one of no use is refused when it is opened."""
     tables = {}
     for folder in folders:
         with contextlib.suppress(InputError):
@@ -166,7 +166,7 @@ def tables_of(folders: Sequence[Path]) -> dict[Path, np.ndarray]:
 
 
 def scenes_of(folder: Path) -> np.ndarray:
-    """All scenes of a dataset."""
+    """Reads all scenes of a dataset."""
     scenes = StructuredArray(folder / "scenes", SCENES)
     if not 0 < scenes.size <= MAX_SCENES:
         raise InputError(
@@ -176,7 +176,7 @@ def scenes_of(folder: Path) -> np.ndarray:
 
 
 def groups_of(scenes: np.ndarray, others: Sequence[np.ndarray]) -> list[str]:
-    """Vehicle-disjoint group of each scene: a host's drive without a long pause.
+    """Groups scenes by vehicles: a host's drive without a long pause is one group.
 
     Named by the host and the drive's start, so that it is the same in every dataset.
 

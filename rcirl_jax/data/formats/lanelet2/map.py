@@ -80,7 +80,7 @@ class OsmMap:
 
     @functools.cached_property
     def rules(self) -> dict[str, Rule]:
-        """Regulatory elements by id."""
+        """Reads regulatory elements, by id."""
         return _read_rules(self)
 
 
@@ -95,7 +95,7 @@ class _Lanelet:
 
 
 def read_lanelet2(path: Path, project: Projection) -> tuple[tuple[Lane, ...], list]:
-    """All lanes for vehicles of a map.
+    """Reads all lanes for vehicles of a map.
 
     Args:
       path: .osm or .osm_xy file.
@@ -268,7 +268,7 @@ def _gate(world: OsmMap, lanelet: _Lanelet, end: int) -> tuple:
 
 
 def tag_of(element: Element, key: str) -> str:
-    """Value of a tag, "" if the element has none."""
+    """Returns the value of a tag, "" if the element has none."""
     for tag in element.iterfind("tag"):
         if tag.get("k") == key:
             return (tag.get("v") or "").strip()
@@ -372,7 +372,7 @@ def _rules(world: OsmMap, relation: Element) -> list[Rule]:
 
 
 def speed_limit(world: OsmMap, relation: Element) -> float | None:
-    """m/s, of the last speed_limit rule, or of the lanelet's own tag."""
+    """Returns the limit [m/s] of the last rule, or of the lanelet's own tag."""
     limits = [rule.limit for rule in _rules(world, relation) if rule.limit is not None]
     return limits[-1] if limits else _first_speed([tag_of(relation, "speed_limit")])
 
@@ -391,7 +391,7 @@ def _first_speed(texts: list[str]) -> float | None:
 def stop_of(
     world: OsmMap, name: str, relation: Element, ends: np.ndarray
 ) -> tuple[np.ndarray | None, bool]:
-    """End points [2, 2] m of the stop line, and whether everybody has to stop.
+    """Returns end points [2, 2] m of the stop line; whether everybody has to stop.
 
     A rule without a line of its own stops traffic at the lanelet's end.
     """

@@ -270,18 +270,11 @@ def _others(log: _Log, first: float, last: float) -> tuple[list[Track], list[str
         raise database.error(where, "of no track", "a track with a category")
     users = [log.users[int(one)] for one in found]
     order = sorted(range(len(users)), key=lambda one: users[one])
-    boxes = Boxes(
-        ids=np.argsort(order)[ids],
-        names=[users[one][0].hex() for one in order],
-        t=(t - log.poses[0, 0]) * 1e-6,
-        x=x,
-        y=y,
-        heading=yaw,
-        speed=np.hypot(vx, vy),
-        length=length,
-        width=width,
-        kind=np.array([kind for _, kind in users])[ids],
-    )
+    names = [users[one][0].hex() for one in order]
+    kinds = np.array([kind for _, kind in users])[ids]
+    t, ids = (t - log.poses[0, 0]) * 1e-6, np.argsort(order)[ids]
+    speed = np.hypot(vx, vy)
+    boxes = Boxes(ids, names, t, x, y, yaw, speed, length, width, kinds)
     return tracks_of(database.path, boxes, MAX_GAP_S)
 
 

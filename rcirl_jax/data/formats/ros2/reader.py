@@ -322,18 +322,8 @@ class _Bag:
             mine = mine[np.argsort(t[mine], kind="stable")]
             travel = travel_heading(t[mine], x[mine], y[mine])
             heading[mine] = np.where(np.isnan(heading[mine]), travel, heading[mine])
-        boxes = Boxes(
-            ids=ids,
-            names=[names[k] for k in number_of.tolist()],
-            t=t,
-            x=x,
-            y=y,
-            heading=heading,
-            speed=speed,
-            length=length,
-            width=width,
-            kind=kind.astype(np.int64),
-        )
+        labels, kinds = [names[k] for k in number_of.tolist()], kind.astype(np.int64)
+        boxes = Boxes(ids, labels, t, x, y, heading, speed, length, width, kinds)
         tracks, left_out = drive.tracks(boxes, self.spec)
         return tracks, [*notes, *left_out]
 

@@ -56,7 +56,7 @@ class _Stop:
 def read_map(
     where: str, scenario: Message, t: np.ndarray, origin: np.ndarray, spec: dict
 ) -> tuple[tuple[Lane, ...], tuple[Signal, ...], list[str]]:
-    """Lanes, signals and notes of one scenario.
+    """Reads lanes, signals and notes of one scenario.
 
     Args:
       where: names file and record in errors.

@@ -102,12 +102,12 @@ class _States:
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
-    """The TFRecord files; each can be read alone."""
+    """Lists the TFRecord files; each can be read alone."""
     return files_matching(path, patterns(spec, PATTERNS), "TFRecord files")
 
 
 def recordings(path: Path, spec: dict) -> Iterator[Recording]:
-    """One Recording per scenario, one record in memory at a time."""
+    """Yields one Recording per scenario, one record in memory at a time."""
     limit = int(number(spec, "max_record_mib", 32) * MIB)
     for file in parts(path, spec):
         size, done = file.stat().st_size, 0
