@@ -115,6 +115,21 @@ def test_up_to_a_tenth_of_the_tracks_may_be_impossible(tmp_path, change, rows, w
     assert f"record 0: track 100: {wrong}" in many
 
 
+def test_far_coordinates_get_a_local_origin(whole, tmp_path, monkeypatch):
+    monkeypatch.setattr(w, "EAST", w.EAST + 50_000.0)
+    far = only(w.write(tmp_path).input)
+    assert "local origin at x = 58000 m, y = -3000 m" in far.notes
+    shift = np.array([-8000.0, 3000.0])
+    for a, b in zip(whole.tracks, far.tracks, strict=True):
+        np.testing.assert_allclose(a.x + shift[0], b.x, atol=1e-6)
+        np.testing.assert_allclose(a.y + shift[1], b.y, atol=1e-6)
+    for a, b in zip(whole.lanes, far.lanes, strict=True):
+        np.testing.assert_allclose(a.centre + shift, b.centre, atol=1e-6)
+        np.testing.assert_allclose(a.left_width, b.left_width, atol=1e-6)
+        if a.stop_line is not None:
+            np.testing.assert_allclose(a.stop_line + shift, b.stop_line, atol=1e-6)
+
+
 # ------------------------------------------------------------------------ map
 
 
@@ -289,3 +304,22 @@ def test_two_heads_of_one_lane_and_a_lane_that_is_not_read(tmp_path):
     row["lane_states"].append({"lane": 106, "state": 4, "stop_point": w.point(0, 0)})
     signals = scenario(tmp_path, dynamic_map_states=[row] * 91).signals
     assert {s.id: s.state for s in signals} == {"103": ("green",), "106": ("red",)}
+
+
+WIDE = [w.boundary(-(2**31), 2**31 - 1, 9)] * 50
+ROAD = [w.lane(1, w.eastward(0, 0, 50), left_boundaries=WIDE)]
+TWO = [w.shown(4)] * 91
+TWO = [{"lane_states": [*row["lane_states"], {"lane": 106, "state": 4}]} for row in TWO]
+LIMITS = [
+    ("reader.MAX_STATES", 545, {}, "tracks: 6 of 91 states: expected at most 545"),
+    ("map.MAX_POINTS", 1000, {"map_features": ROAD}, "left_boundaries: "),
+    ("map.MAX_COLOURS", 181, {"dynamic_map_states": TWO}, "2 lanes over 91 steps"),
+]
+
+
+@pytest.mark.parametrize(("name", "most", "changes", "words"), LIMITS)
+def test_limits(tmp_path, monkeypatch, name, most, changes, words):
+    monkeypatch.setattr(f"rcirl_jax.data.formats.waymo.{name}", most)
+    assert words in refused(scenario, tmp_path, **changes)
+    monkeypatch.setattr(f"rcirl_jax.data.formats.waymo.{name}", most * 50)
+    assert scenario(tmp_path, **changes).tracks
