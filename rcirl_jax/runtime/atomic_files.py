@@ -1,5 +1,6 @@
 """Atomic writes, locks, and JSON of a bounded size."""
 
+import codecs
 import contextlib
 import dataclasses
 import errno
@@ -13,6 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
+import msgspec
 import numpy as np
 
 from rcirl_jax.errors import InputError
@@ -20,7 +22,6 @@ from rcirl_jax.errors import InputError
 MAX_JSON_BYTES = 16 * 1024**2  # of a JSON file that is read
 MAX_DEPTH = 100  # levels of it
 HALVES = re.compile("[\ud800-\udfff]")  # of surrogate pairs
-ESCAPED = re.compile(r"\\u[dD][89a-fA-F]")  # in JSON: halves, or a whole pair
 
 # of file systems without locks, where two writers are not kept apart
 NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP)
@@ -127,44 +128,27 @@ def _levels(body: object) -> int:
     return depth
 
 
-def parse_json(text: bytes | str, *, finite: bool = False) -> Any:  # noqa: ANN401
-    """Parses JSON from outside; the body can be written again.
+def parse_json(text: bytes | str) -> Any:  # noqa: ANN401
+    """Parses JSON from outside, strictly; the body can be written again.
 
     Args:
       text: where it is bytes, UTF-8, with or without a byte order mark.
-      finite: infinities and NaN, which Python takes and JSON does not know, are none.
 
     Raises:
-      ValueError: no JSON, no UTF-8, nested deeper than MAX_DEPTH, half of a surrogate
-        pair (no text: it cannot be printed or stored).
+      ValueError: no JSON (NaN and infinities are none), no UTF-8, half of a surrogate
+        pair, or nested deeper than MAX_DEPTH.
     """
     if isinstance(text, bytes):
-        text = text.decode("utf-8-sig")
+        text = text.removeprefix(codecs.BOM_UTF8)
     try:
-        body = json.loads(
-            text,
-            parse_constant=_no_number if finite else None,
-            parse_float=_finite if finite else None,
-        )
+        body = msgspec.json.decode(text)
+    except msgspec.MsgspecError as error:
+        raise ValueError(str(error)) from error
     except RecursionError as error:
         raise ValueError("nested too deep") from error
-    opened = text.count("[") + text.count("{")
-    if opened > MAX_DEPTH and _levels(body) > MAX_DEPTH:
+    if _levels(body) > MAX_DEPTH:
         raise ValueError("nested too deep")
-    if not is_text(text) or ESCAPED.search(text):
-        json.dumps(body, ensure_ascii=False).encode()  # raises where one has no half
     return body
-
-
-def _no_number(text: str) -> float:
-    raise ValueError(f"{text} is no JSON number")
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
-        raise ValueError(f"{text} is no finite number")
-    return value
 
 
 def is_text(texts: str | np.ndarray) -> bool:

@@ -95,7 +95,7 @@ def seal(payload: Mapping, field: str) -> bytes:
 def unseal(raw: bytes, field: str, name: str) -> dict:
     """Parse `seal`'s bytes; InputError when they are not as written."""
     try:
-        payload = parse_json(raw, finite=True)
+        payload = parse_json(raw)
     except ValueError as error:
         raise InputError(
             f"{name}: not JSON ({error}): expected the file as written; truncated?"
