@@ -97,7 +97,8 @@ def tune(run: Run, given: Sequence[str | Logs], last: str = STAGES[-1]) -> None:
         "report": lambda: page.append(_drawn(run, verdict, everything[0], sources)),
     }
     names = STAGES[: STAGES.index(last) + 1]
-    with clock(run, names) as watch:
+    with compiles() as compiled:
+        watch = Clock(run, names, compiled)
         for name in names:
             known = everything[0] if everything else None
             with watch.stage(name, work_of(run, job, known)):
@@ -265,13 +266,6 @@ class Clock:
         last = f"demonstrate {self._run.config.simulated.datasets - 1}"
         ends = {"demonstrate": last, **LAST}
         return [name for name in names if ends.get(name) not in self._known]
-
-
-@contextlib.contextmanager
-def clock(run: Run, names: Sequence[str]) -> Iterator[Clock]:
-    """A clock of a run; arguments as of `Clock`."""
-    with compiles() as compiled:
-        yield Clock(run, names, compiled)
 
 
 def in_words(seconds: float) -> str:

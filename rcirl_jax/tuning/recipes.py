@@ -12,9 +12,10 @@ Nothing else has a default of its own: commands take a recipe, and flags given b
 win. `TuneConfig` is a recipe with the settings of one run.
 """
 
+import contextlib
 import dataclasses
 import importlib
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from rcirl_jax.evaluation.gate.types import GateConfig
 from rcirl_jax.export.sweep.result import read_sweep
 from rcirl_jax.features import feature_map
 from rcirl_jax.reward import RewardConfig
-from rcirl_jax.runtime.checked import check_names, typed_fields
+from rcirl_jax.runtime.checked import check_names, typed_fields, typed_settings
 from rcirl_jax.runtime.specs import load_toml, spec_root
 from rcirl_jax.sampling import SamplerConfig
 from rcirl_jax.train.state import TrainConfig
@@ -77,7 +78,7 @@ class SimulatedDemonstrations:
         ):
             if not fits:
                 value = getattr(self, name)
-                raise InputError(f"{SIMULATED}: {name}: {value}: expected {expected}")
+                raise InputError(f"{name}: {value}: expected {expected}")
 
     @property
     def datasets(self) -> int:
@@ -104,15 +105,12 @@ class PriorCostConfig:
     def __post_init__(self) -> None:
         """0 <= low <= high, and 0 <= slowed < 1."""
         if not 0.0 <= self.low <= self.high:
-            raise InputError(
-                f"prior_cost: low, high: {self.low}, {self.high}: expected "
-                "0 <= low <= high"
-            )
-
+            both = f"{self.low}, {self.high}"
+            raise InputError(f"low, high: {both}: expected 0 <= low <= high")
         if not all(0.0 <= share < 1.0 for share in self.slowed):
             raise InputError(
-                f"prior_cost: slowed: {list(self.slowed)}: expected shares of the "
-                "speed, each at least 0 and below 1"
+                f"slowed: {list(self.slowed)}: expected shares of the speed, each at "
+                "least 0 and below 1"
             )
 
     @property
@@ -159,37 +157,72 @@ def load_recipe(name: str) -> Recipe:
     body = load_toml(path)
     check_names(f"{path}: ", body, TABLES)
     train = _table(path, "train", body)
-    reward = _table(path, "train.reward", train)
+    network = _table(path, "train.reward", train)
+    by_context = network.pop("by_context", False)
+    if not isinstance(by_context, bool):
+        raise InputError(
+            f"{path}: [train.reward] by_context: {by_context}: expected true or false"
+        )
     sampler = _table(path, "train.sampler", train)
-    tuning = _table(path, "autotune", body)
-    check_names(f"{path}: [autotune] ", tuning, ("seeds",))
-    seeds = tuning.get("seeds", 1)
+    settings = typed_fields(TrainConfig, train, f"{path}: [train] ", NOT_OF_A_RECIPE)
+    features = settings.get("features", "paper21")
+    with _inside(path, "train.reward") as where:
+        of_reward = typed_fields(RewardConfig, network, where, PRESETS_OWN)
+        reward = reward_config(features, of_reward, by_context)
+    with _inside(path, "train.sampler") as where:
+        sampler = SamplerConfig(**typed_fields(SamplerConfig, sampler, where))
+    with _inside(path, "train"):
+        trained = TrainConfig(**settings, reward=reward, sampler=sampler)
+    with _inside(path, SIMULATED) as where:
+        found = _table(path, SIMULATED, body)
+        simulated = typed_settings(SimulatedDemonstrations, found, where)
+    with _inside(path, "prior_cost") as where:
+        found = _table(path, "prior_cost", body)
+        prior_cost = typed_settings(PriorCostConfig, found, where)
+    with _inside(path, "collect") as where:
+        found = _table(path, "collect", body)
+        kept = typed_fields(CollectConfig, found, where, ("signal_checks",))
+        collect = CollectConfig(**kept)
+    tuned = _table(path, "autotune", body)
+    check_names(f"{path}: [autotune] ", tuned, ("seeds",))
+    seeds = tuned.get("seeds", 1)
     if type(seeds) is not int or seeds < 1:
         raise InputError(f"{path}: [autotune] seeds: {seeds}: expected at least 1")
-    settings = typed_fields(TrainConfig, train, f"{path}: [train] ", NOT_OF_A_RECIPE)
-    settings["reward"] = _reward(path, reward, settings.get("features", "paper21"))
-    settings["sampler"] = _made(path, "train.sampler", SamplerConfig, sampler)
-    simulated = _made(
-        path, SIMULATED, SimulatedDemonstrations, _table(path, SIMULATED, body)
-    )
-    prior_cost = _made(
-        path, "prior_cost", PriorCostConfig, _table(path, "prior_cost", body)
-    )
     if prior_cost.wanted and not simulated.datasets:
         raise InputError(
             f"{path}: [{SIMULATED}] expert: none: expected one with a [prior_cost]: "
             "its drives show what was not recorded"
         )
-    collect, none = _table(path, "collect", body), ("signal_checks",)
     return Recipe(
         name=path.stem if name in known else name,
         about=str(body.get("about", "")),
-        train=_built(path, "train", TrainConfig, settings),
-        collect=_made(path, "collect", CollectConfig, collect, none),
+        train=trained,
+        collect=collect,
         simulated=simulated,
         prior_cost=prior_cost,
         seeds=seeds,
     )
+
+
+@contextlib.contextmanager
+def _inside(path: Path, table: str) -> Iterator[str]:
+    """Yields how messages about a table begin; puts it before errors without it."""
+    where = f"{path}: [{table}] "
+    try:
+        yield where
+    except ValueError as error:
+        said = str(error)
+        raise InputError(
+            said if said.startswith(str(path)) else where + said
+        ) from error
+
+
+def _table(path: Path, where: str, body: dict) -> dict:
+    """Takes the table [where] out of the one that holds it; empty without one."""
+    found = body.pop(where.rpartition(".")[2], {})
+    if not isinstance(found, dict):
+        raise InputError(f"{path}: {where}: {found}: expected a table [{where}]")
+    return dict(found)
 
 
 def reward_config(
@@ -234,41 +267,6 @@ def override(
         bool(base.reward.context) if by_context is None else by_context,
     )
     return dataclasses.replace(base, **rest, seed=seed, reward=reward)
-
-
-def _reward(path: Path, found: dict, features: str) -> RewardConfig:
-    where = "train.reward"
-    by_context = found.pop("by_context", False)
-    if not isinstance(by_context, bool):
-        raise InputError(
-            f"{path}: [{where}] by_context: {by_context}: expected true or false"
-        )
-    known = f"{path}: [{where}] "
-    typed = typed_fields(RewardConfig, found, known, PRESETS_OWN)
-    made = lambda **settings: reward_config(features, settings, by_context)  # noqa: E731
-    return _built(path, where, made, typed)
-
-
-def _made(
-    path: Path, where: str, kind: type, found: dict, without: tuple[str, ...] = ()
-) -> Any:  # noqa: ANN401
-    typed = typed_fields(kind, found, f"{path}: [{where}] ", without)
-    return _built(path, where, kind, typed)
-
-
-def _built(path: Path, where: str, kind: Callable, values: dict) -> Any:  # noqa: ANN401
-    try:
-        return kind(**values)
-    except (InputError, ValueError) as error:
-        raise InputError(f"{path}: [{where}] {error}") from error
-
-
-def _table(path: Path, where: str, body: dict) -> dict:
-    """The table [where], taken out of the one that holds it; empty without one."""
-    found = body.pop(where.rpartition(".")[2], {})
-    if not isinstance(found, dict):
-        raise InputError(f"{path}: {where}: {found}: expected a table [{where}]")
-    return dict(found)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
