@@ -176,8 +176,8 @@ def test_an_empty_split_is_refused_and_what_is_finished_stays(tmp_path):
     line = refused(import_logs, [alone], tmp_path / "data", CONFIG)
     assert line == (
         "splits: groups: 1 (hand/minute-0000): expected at least two vehicle-disjoint "
-        "groups for --test_fraction=0.4; give more recordings, or import with "
-        "--test_fraction=0 for training scenes only"
+        "groups for test_fraction=0.4; give more recordings, or import with "
+        "test_fraction=0 for training scenes only"
     )
     training = dataclasses.replace(CONFIG, test_fraction=0.0)
     import_logs([alone], tmp_path / "data", training)

@@ -238,7 +238,7 @@ def test_truncated_at_the_border_of_lines(junction, kept, found):
         read(junction)
     assert str(error.value) == (
         f"{path}: {found} as in 07_tracksMeta.csv; truncated file? "
-        "(of a sample, set partial = true in the TOML of --source)"
+        "(of a sample, set partial = true in the source TOML)"
     )
 
 

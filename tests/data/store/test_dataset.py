@@ -254,7 +254,7 @@ def test_abort_leaves_nothing(tmp_path, monkeypatch, existed, writes):
 
 
 def test_overwriting(made, copy):
-    assert "--overwrite" in refused(DatasetWriter, copy)
+    assert "or overwrite to replace" in refused(DatasetWriter, copy)
     writer = DatasetWriter(copy, overwrite=True)
     assert writer.committed() == []
     writer.abort()  # bad input before the first shard: the old dataset survives
