@@ -19,7 +19,7 @@ from rcirl_jax.data.scenes import manoeuvres
 from rcirl_jax.data.scenes.collect import Collector
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.exact import clopper_pearson
+from rcirl_jax.evaluation.statistics import clopper_pearson
 from rcirl_jax.types import Decision, Recording
 
 VERDICTS = Path(__file__).parent / "judged_scenes.json"

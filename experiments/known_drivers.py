@@ -9,11 +9,10 @@ import numpy as np
 
 from rcirl_jax.evaluation.closed_loop.files import SuiteRuns
 from rcirl_jax.evaluation.closed_loop.output import text_table
-from rcirl_jax.evaluation.exact import clopper_pearson
 from rcirl_jax.evaluation.gate import types as gate
-from rcirl_jax.evaluation.gate.decision import judge
-from rcirl_jax.evaluation.gate.runs import pair_of
-from rcirl_jax.evaluation.gate.stats import MIN_CLUSTERS
+from rcirl_jax.evaluation.gate.checks import MIN_CLUSTERS
+from rcirl_jax.evaluation.gate.verdict import judge, pair_of
+from rcirl_jax.evaluation.statistics import clopper_pearson
 from rcirl_jax.planner import rank
 from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.planner.plan import Plan

@@ -30,8 +30,7 @@ from absl import flags
 from matplotlib.axes import Axes
 
 from rcirl_jax.cli.running import provenance, run
-from rcirl_jax.evaluation.exact import clopper_pearson
-from rcirl_jax.evaluation.statistics import combine_seeds
+from rcirl_jax.evaluation.statistics import clopper_pearson, combine_seeds
 from rcirl_jax.report.style import (
     CANDIDATE,
     CHOSEN,

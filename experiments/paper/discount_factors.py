@@ -19,12 +19,12 @@ from scipy.stats import ttest_ind
 
 from experiments.paper.common import base, dataset, fixed, picture, seeds, write
 from rcirl_jax.cli.running import run
-from rcirl_jax.evaluation.exact import holm
 from rcirl_jax.evaluation.ranking.learners import (
     Learned,
     learner_config,
     train_learners,
 )
+from rcirl_jax.evaluation.statistics import holm
 from rcirl_jax.report.charts import curves_panel
 from rcirl_jax.report.style import figure, label, save
 from rcirl_jax.reward import pinned

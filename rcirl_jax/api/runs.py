@@ -20,8 +20,9 @@ from rcirl_jax.evaluation.closed_loop.suite import (
     SuiteResult,
     write_suite,
 )
-from rcirl_jax.evaluation.gate.output import format_verdict, write_verdict
 from rcirl_jax.evaluation.gate.types import GateConfig, Verdict
+from rcirl_jax.evaluation.gate.verdict import write_verdict
+from rcirl_jax.evaluation.gate.words import format_verdict
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.evaluation.ranking.format import format_table
 from rcirl_jax.evaluation.ranking.table import RankingReport

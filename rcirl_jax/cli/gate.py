@@ -20,7 +20,8 @@ from rcirl_jax.cli.running import provenance
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.likeness import DRIVES
-from rcirl_jax.evaluation.gate.output import format_verdict, write_verdict
+from rcirl_jax.evaluation.gate.verdict import write_verdict
+from rcirl_jax.evaluation.gate.words import format_verdict
 from rcirl_jax.export.closed_loop import read_tuned_idm
 from rcirl_jax.export.gate_job import gate_job, judged
 from rcirl_jax.planner.safety import TRACKS

@@ -1,4 +1,5 @@
-"""Tables, suites, the gate, labels: how good a reward is, with honest intervals.
+"""How good a reward is, with honest intervals: ranking, closed loop, gate, baselines.
 
-`statistics.py` has intervals over clusters, `exact.py` tests of counts.
+`statistics.py` has intervals over clusters and tests of counts, `attribution.py` why
+one trajectory is valued above another.
 """

@@ -16,9 +16,8 @@ from rcirl_jax.evaluation.closed_loop.suite import (
     SuiteConfig,
     SuiteResult,
 )
-from rcirl_jax.evaluation.gate.decision import judge
-from rcirl_jax.evaluation.gate.runs import CANDIDATE, INCUMBENT, pair_of, repeats
-from rcirl_jax.evaluation.gate.types import GateConfig, Verdict
+from rcirl_jax.evaluation.gate.types import CANDIDATE, INCUMBENT, GateConfig, Verdict
+from rcirl_jax.evaluation.gate.verdict import judge, pair_of, repeats
 from rcirl_jax.export.closed_loop import SuiteJob, run_job
 from rcirl_jax.planner.baselines import Idm
 from rcirl_jax.runtime.executors import Executor

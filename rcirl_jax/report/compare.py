@@ -7,8 +7,8 @@ from pathlib import Path
 import msgspec
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.exact import CONFIDENCE, clopper_pearson
 from rcirl_jax.evaluation.gate.types import CANDIDATE
+from rcirl_jax.evaluation.statistics import CONFIDENCE, clopper_pearson
 from rcirl_jax.report.charts import Interval, interval_axis, interval_cell
 from rcirl_jax.report.pages import Table, facts_text, interval, write_page
 from rcirl_jax.report.tuning_page import DECISIONS

@@ -20,12 +20,12 @@ from rcirl_jax.evaluation.closed_loop.summary import (
     RowSummary,
     SuiteReport,
 )
-from rcirl_jax.evaluation.exact import CONFIDENCE
-from rcirl_jax.evaluation.gate.output import OUTCOMES, RANKS, TITLES
 from rcirl_jax.evaluation.gate.types import Check, GateConfig, Verdict
+from rcirl_jax.evaluation.gate.words import OUTCOMES, RANKS, TITLES
 from rcirl_jax.evaluation.ranking.format import format_table
 from rcirl_jax.evaluation.ranking.metrics import METRICS
 from rcirl_jax.evaluation.ranking.table import BASELINE_ROWS, SIGNIFICANT, RankingReport
+from rcirl_jax.evaluation.statistics import CONFIDENCE
 from rcirl_jax.export.reader import Reward
 from rcirl_jax.export.sweep.result import table as sweep_table
 from rcirl_jax.report.charts import forest_axis, forest_cell, sweep_picture, time_curves

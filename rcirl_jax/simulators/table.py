@@ -13,10 +13,11 @@ import numpy as np
 
 from rcirl_jax.errors import InputError
 from rcirl_jax.evaluation.closed_loop.output import text_table
-from rcirl_jax.evaluation.exact import clopper_pearson, mcnemar_exact
 from rcirl_jax.evaluation.statistics import (
     ClusterBootstrap,
+    clopper_pearson,
     combine_seeds,
+    mcnemar_exact,
     paired_difference,
 )
 from rcirl_jax.runtime.atomic_files import write_json, write_whole

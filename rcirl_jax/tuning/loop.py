@@ -18,8 +18,7 @@ from rcirl_jax.data.logs import Logs
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.data.store.joined import Demonstrations, shares_of
 from rcirl_jax.errors import InputError, extra_of
-from rcirl_jax.evaluation.gate.runs import CANDIDATE
-from rcirl_jax.evaluation.gate.types import Verdict
+from rcirl_jax.evaluation.gate.types import CANDIDATE, Verdict
 from rcirl_jax.evaluation.gate.words import WIDTH
 from rcirl_jax.export.closed_loop import SuiteJob
 from rcirl_jax.export.loading import open_reward, prior_cost_words

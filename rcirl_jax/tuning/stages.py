@@ -24,10 +24,9 @@ from rcirl_jax.evaluation.closed_loop.likeness import (
     write_arrays,
 )
 from rcirl_jax.evaluation.closed_loop.suite import write_suite
-from rcirl_jax.evaluation.gate.decision import judge
-from rcirl_jax.evaluation.gate.output import format_verdict, write_verdict
-from rcirl_jax.evaluation.gate.runs import CANDIDATE, INCUMBENT, pair_of
-from rcirl_jax.evaluation.gate.types import Verdict
+from rcirl_jax.evaluation.gate.types import CANDIDATE, INCUMBENT, Verdict
+from rcirl_jax.evaluation.gate.verdict import judge, pair_of, write_verdict
+from rcirl_jax.evaluation.gate.words import format_verdict
 from rcirl_jax.evaluation.ranking.evaluate import RankingSetup, evaluate_ranking
 from rcirl_jax.evaluation.ranking.format import format_table
 from rcirl_jax.evaluation.ranking.table import from_json, to_json

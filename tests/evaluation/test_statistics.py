@@ -10,18 +10,16 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.exact import (
-    clopper_pearson,
-    holm,
-    mcnemar_exact,
-    rule_of_three,
-)
 from rcirl_jax.evaluation.statistics import (
     ClusterBootstrap,
     bootstrap_median,
+    clopper_pearson,
     cluster_t,
     combine_seeds,
+    holm,
+    mcnemar_exact,
     paired_difference,
+    rule_of_three,
 )
 
 

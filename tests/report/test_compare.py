@@ -5,9 +5,9 @@ import re
 
 import pytest
 
-from rcirl_jax.evaluation.exact import clopper_pearson
-from rcirl_jax.evaluation.gate.output import write_verdict
 from rcirl_jax.evaluation.gate.types import GateConfig
+from rcirl_jax.evaluation.gate.verdict import write_verdict
+from rcirl_jax.evaluation.statistics import clopper_pearson
 from tests.helpers.commands import refused, succeeded
 from tests.report.test_data_page import Page
 from tests.report.tuning_case import suite_and_verdict

@@ -8,8 +8,8 @@ import numpy as np
 from rcirl_jax.data.importing import import_parts
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.evaluation.closed_loop.files import SuiteRuns
-from rcirl_jax.evaluation.gate.decision import judge
 from rcirl_jax.evaluation.gate.types import GateConfig, Pair
+from rcirl_jax.evaluation.gate.verdict import judge
 from rcirl_jax.evaluation.ranking.metrics import Outcomes, random_scorer, scene_metrics
 from rcirl_jax.evaluation.ranking.table import build_report
 from rcirl_jax.export.loading import open_reward

@@ -13,17 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rcirl_jax.evaluation.exact import (
-    clopper_pearson,
-    holm,
-    mcnemar_exact,
-    rule_of_three,
-)
 from rcirl_jax.evaluation.statistics import (
     ClusterBootstrap,
     Difference,
+    clopper_pearson,
     cluster_t,
     family_clusters,
+    holm,
+    mcnemar_exact,
+    rule_of_three,
 )
 from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics, nuplan_score
 

@@ -1,5 +1,4 @@
-"""May this reward replace that driver? `decision` asks the checks and answers.
+"""May this reward replace that driver? `verdict.judge` asks the checks and answers.
 
-Margins and rules are in `types` and `checks`; `words` says the verdict in a sentence;
-`errors` measures how often the gate is wrong about the drivers of `pairs`.
+Margins and results are in `types`, the rules in `checks`, every word in `words`.
 """

@@ -10,7 +10,6 @@ from typing import Literal
 import numpy as np
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.statistics import Difference
 from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics
 from rcirl_jax.simulation.rows import TRIVIAL_BASELINES
 
@@ -25,8 +24,6 @@ EXIT_CODES: dict[Decision, int] = {
     "no difference": 3,
     "could not judge": 2,
 }
-
-
 CANDIDATE, INCUMBENT = "candidate", "incumbent"  # names of rows
 
 
@@ -113,6 +110,47 @@ class Likeness:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class Pair:
+    """Candidate and incumbent on the same C cases; numpy leaves [C]."""
+
+    candidate: CaseMetrics
+    incumbent: CaseMetrics
+    families: Sequence[str]
+    ids: Sequence[str]
+    reference: np.ndarray  # [C] m, way of the driver that nuPlan's score compares to
+    preventable: np.ndarray  # [C] bool, `simulation.world.careful.preventable`
+    name: str = INCUMBENT  # of the incumbent
+    trivial_baselines: Mapping[str, CaseMetrics] = dataclasses.field(
+        default_factory=dict
+    )
+    # rows `CANDIDATE`, `name` and the trivial baselines
+    likeness: Likeness | None = None
+
+    def __post_init__(self) -> None:
+        """Same cases, all finite where a drive has a number."""
+        count = len(self.ids)
+        rows = {CANDIDATE: self.candidate, self.name: self.incumbent}
+        for name, metrics in {**rows, **self.trivial_baselines}.items():
+            for field in ("progress", "at_fault", "holds", "max_j", "rms_a"):
+                values = np.asarray(getattr(metrics, field), np.float64)
+                if len(values) != count:
+                    raise InputError(
+                        f"gate: {name}: {len(values)} cases: expected {count}"
+                    )
+                if not np.isfinite(values).all():
+                    bad = self.ids[int(np.argwhere(~np.isfinite(values))[0, 0])]
+                    raise InputError(
+                        f"gate: {name}: {bad}: {field}: not a finite number"
+                    )
+        if len(set(self.ids)) != count:
+            twice = next(name for name in self.ids if self.ids.count(name) > 1)
+            raise InputError(f"gate: {twice}: met twice: expected distinct cases")
+        for name in ("families", "reference", "preventable"):
+            if len(getattr(self, name)) != count:
+                raise InputError(f"gate: {name}: expected {count} values")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Check:
     """One test with its numbers."""
 
@@ -133,46 +171,6 @@ class Check:
     p: float | None
     note: str = ""
     measured: bool = True  # else the numbers say nothing: from -1 to 1
-
-
-def check_of(
-    kind: Kind,
-    name: str,
-    title: str,
-    outcome: Outcome,
-    found: Difference,
-    margin: float | None = None,
-    pairs: tuple[int, int] | None = None,
-    p: float | None = None,
-    note: str = "",
-) -> Check:
-    """A check with the mean and interval of a difference, candidate minus the other.
-
-    The arguments are fields of `Check`; `pairs` are (gained, lost) cases where those
-    are counted, and the difference's own p is not the check's.
-    """
-    gained, lost = pairs or (None, None)
-    return Check(
-        kind=kind,
-        name=name,
-        title=title,
-        outcome=outcome,
-        difference=found.mean,
-        low=found.low,
-        high=found.high,
-        margin=margin,
-        gained=gained,
-        lost=lost,
-        p=p,
-        note=note,
-    )
-
-
-def unmeasured(kind: Kind, name: str, title: str, note: str) -> Check:
-    """A check that nothing was measured for; `note` says what to do."""
-    anything = Difference(mean=0.0, low=-1.0, high=1.0, se=np.nan, p=1.0)
-    check = check_of(kind, name, title, "open", anything, note=note)
-    return dataclasses.replace(check, measured=False)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -203,49 +201,3 @@ class Verdict:
     def exit_code(self) -> int:
         """0 only to ship."""
         return EXIT_CODES[self.decision]
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Pair:
-    """Candidate and incumbent on the same C cases; numpy leaves [C]."""
-
-    candidate: CaseMetrics
-    incumbent: CaseMetrics
-    families: Sequence[str]
-    ids: Sequence[str]
-    reference: np.ndarray  # [C] m, way of the driver that nuPlan's score compares to
-    preventable: np.ndarray  # [C] bool, `simulation.world.careful.preventable`
-    name: str = INCUMBENT  # of the incumbent
-    trivial_baselines: Mapping[str, CaseMetrics] = dataclasses.field(
-        default_factory=dict
-    )
-    likeness: Likeness | None = (
-        None  # rows `CANDIDATE`, `name` and the trivial baselines
-    )
-
-    def __post_init__(self) -> None:
-        """Same cases, all finite where a drive has a number."""
-        count = len(self.ids)
-        rows = {
-            CANDIDATE: self.candidate,
-            self.name: self.incumbent,
-            **self.trivial_baselines,
-        }
-        for name, metrics in rows.items():
-            for field in ("progress", "at_fault", "holds", "max_j", "rms_a"):
-                values = np.asarray(getattr(metrics, field), np.float64)
-                if len(values) != count:
-                    raise InputError(
-                        f"gate: {name}: {len(values)} cases: expected {count}"
-                    )
-                if not np.isfinite(values).all():
-                    bad = self.ids[int(np.argwhere(~np.isfinite(values))[0, 0])]
-                    raise InputError(
-                        f"gate: {name}: {bad}: {field}: not a finite number"
-                    )
-        if len(set(self.ids)) != count:
-            twice = next(name for name in self.ids if self.ids.count(name) > 1)
-            raise InputError(f"gate: {twice}: met twice: expected distinct cases")
-        for name in ("families", "reference", "preventable"):
-            if len(getattr(self, name)) != count:
-                raise InputError(f"gate: {name}: expected {count} values")

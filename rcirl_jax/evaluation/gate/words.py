@@ -1,10 +1,11 @@
-"""The gate in plain words: titles of checks, what got better or worse, what to do."""
+"""The gate in words: titles of checks, the sentence, reasons, the terminal table."""
 
 import textwrap
 from collections.abc import Sequence
 
 import numpy as np
 
+from rcirl_jax.evaluation.closed_loop.output import text_table
 from rcirl_jax.evaluation.gate.types import INCUMBENT, Check, NewFault, Pair, Verdict
 from rcirl_jax.simulation.catalogue.families import family_title
 
@@ -36,6 +37,8 @@ HOLDS = {  # what a drive holds, as "keeps ... in n drives"
     "min_ttc": "more than 0.95 s to a collision",
     "on_road": "on the road",
 }
+# what to do where human-likeness was not measured
+TO_MEASURE = "measure human-likeness on held-out recordings (docs/gate.md)"
 AMOUNTS = {
     "progress": "progress",
     "nuplan": "nuPlan's score",
@@ -87,6 +90,20 @@ def sentence(pair: Pair, verdict: Verdict) -> str:
         if len(textwrap.wrap(said, WIDTH)) <= MAX_LINES:
             return said
     return textwrap.shorten(said, (MAX_LINES - 1) * WIDTH, placeholder=" ...")
+
+
+def reason(check: Check) -> str:
+    """A check with its numbers, as a reason of the decision."""
+    if not check.measured:
+        return f"{check.kind}: {check.title}: {check.note}"
+    pairs = ""
+    if check.lost is not None:
+        pairs = f", better in {check.gained} cases, worse in {check.lost}"
+    return (
+        f"{check.kind}: {check.title}: {100 * check.difference:+.2f} "
+        f"[{100 * check.low:+.2f}, {100 * check.high:+.2f}] %{pairs}"
+        + (f"; {check.note}" if check.note else "")
+    )
 
 
 def name_of(pair: Pair) -> str:
@@ -217,3 +234,68 @@ def fault_words(fault: NewFault) -> str:
         said.append(words)
     accepted = " (accepted)" if fault.accepted else ""
     return f"{fault.case}: {', '.join(said)}{accepted}"
+
+
+# ---------------------------------------------------------------- the table
+
+RANKS = {"fail": 0, "open": 1, "pass": 2}  # the order in which they are shown
+OUTCOMES = {"pass": "ok", "fail": "FAIL", "open": "open"}
+OF_GAINS = {"pass": "better", "fail": "FAIL", "open": "-"}
+TITLES = {
+    "safety": "Not more cases with a fault (p: of as many more as the margin)",
+    "no loss": "No loss beyond the margin, over all cases",
+    "families": "No loss beyond the margin in any family (p: Holm; the ten worst)",
+    "trivial baselines": "Ahead of rewards that know nothing",
+    "likeness": "Not farther from the human",
+    "gain": "Better somewhere, worse nowhere (Holm over the primary metrics)",
+}
+WORST_FAMILIES = 10  # rows of the terminal table; the JSON has all
+
+
+def format_verdict(verdict: Verdict) -> str:
+    """The sentence and decision first, then every kind of check as a table."""
+    lines = textwrap.wrap(verdict.sentence, WIDTH)
+    lines += ["", f"verdict: {verdict.decision.upper()}"]
+    lines += [line for said in verdict.reasons for line in _item(said)]
+    lines += ["", f"{verdict.cases:,} cases of {verdict.families} families; % of cases"]
+    if verdict.part:
+        lines += textwrap.wrap(f"a part of the suite: {verdict.part}", WIDTH)
+    header = ["", "", "difference", "95 %", "margin", "cases", "p"]
+    for kind, title in TITLES.items():
+        checks = [check for check in verdict.checks if check.kind == kind]
+        if kind == "families":  # those that failed or lost most
+            checks.sort(key=lambda c: (RANKS[c.outcome], c.difference))
+            checks = checks[:WORST_FAMILIES]
+        if checks:
+            lines += ["", title, *text_table(header, [_cells(c) for c in checks])]
+    if verdict.new_faults:
+        lines += ["", "Cases with a new fault; --accept=ID,... of those that may stay"]
+        for fault in verdict.new_faults:
+            lines += _item(fault_words(fault))
+    if verdict.look_at:
+        named = ", ".join(verdict.look_at)
+        lines += ["", *textwrap.wrap(f"look first at: {named}", WIDTH)]
+    return "\n".join(lines) + "\n"
+
+
+def _cells(check: Check) -> list[str]:
+    """A line of the table."""
+    outcome = (OF_GAINS if check.kind == "gain" else OUTCOMES)[check.outcome]
+    if not check.measured:
+        return [check.title, outcome, "", "not measured", "", "", ""]
+    mean, low, high = (
+        f"{100.0 * x:+.2f}" for x in (check.difference, check.low, check.high)
+    )
+    return [
+        check.title,
+        outcome,
+        mean,
+        f"[{low}, {high}]",
+        "" if check.margin is None else f"-{100.0 * check.margin:g}",
+        "" if check.lost is None else f"+{check.gained} -{check.lost}",
+        "" if check.p is None else f"{check.p:.3f}",
+    ]
+
+
+def _item(said: str) -> list[str]:
+    return textwrap.wrap(said, WIDTH, initial_indent="  - ", subsequent_indent="    ")

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.exact import CONFIDENCE, clopper_pearson, holm
 from rcirl_jax.evaluation.ranking.metrics import (
     METRICS,
     Outcomes,
@@ -21,14 +20,17 @@ from rcirl_jax.evaluation.ranking.metrics import (
     oracle_fde,
 )
 from rcirl_jax.evaluation.statistics import (
+    CONFIDENCE,
     NUM_RESAMPLES,
     ClusterBootstrap,
     Difference,
     Estimate,
     bootstrap_median,
+    clopper_pearson,
     combine_seeds,
     difference_of,
     estimate_of,
+    holm,
 )
 from rcirl_jax.planner.baselines import TUNED_IDM_ROW
 from rcirl_jax.reward import LONG_ROW, SPEED_DP_ROW, TUNED_ROW

@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.gate.decision import judge
-from rcirl_jax.evaluation.gate.output import format_verdict, write_verdict
 from rcirl_jax.evaluation.gate.types import (
     EXIT_CODES,
     TRIVIAL_BASELINES,
@@ -17,6 +15,8 @@ from rcirl_jax.evaluation.gate.types import (
     Likeness,
     Pair,
 )
+from rcirl_jax.evaluation.gate.verdict import judge, write_verdict
+from rcirl_jax.evaluation.gate.words import format_verdict
 from rcirl_jax.simulation.metrics import COLUMNS, CaseMetrics
 
 FAMILIES, EACH = 20, 200  # 4,000 cases: about as many as the suite has

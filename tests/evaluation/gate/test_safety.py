@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from rcirl_jax.errors import InputError
-from rcirl_jax.evaluation.exact import (
+from rcirl_jax.evaluation.gate.types import GateConfig, Likeness
+from rcirl_jax.evaluation.gate.verdict import judge
+from rcirl_jax.evaluation.gate.words import format_verdict
+from rcirl_jax.evaluation.statistics import (
     ALPHA,
     NUISANCE_ALPHA,
     NUISANCE_STEPS,
     clopper_pearson,
     no_more_faults,
-    scores,
+    tango_score,
 )
-from rcirl_jax.evaluation.gate.decision import judge
-from rcirl_jax.evaluation.gate.output import format_verdict
-from rcirl_jax.evaluation.gate.types import GateConfig, Likeness
 from rcirl_jax.simulation.rows import TRIVIAL_BASELINES
 from tests.evaluation.gate.test_gate import (
     CASES,
@@ -54,7 +54,7 @@ def spread(count, start=0):
 )
 def test_the_tail_is_the_sum_over_all_outcomes(gained, lost, n, margin):
     """Every outcome of the trinomial listed, at the same nuisance values."""
-    seen = scores(np.array(gained), np.array(lost), n, margin)
+    seen = tango_score(gained, lost, n, -margin)
     low, high = clopper_pearson(gained, n, 1.0 - NUISANCE_ALPHA)
     worst = 0.0
     for q in np.linspace(low, min(high, 1.0 - margin), NUISANCE_STEPS):
@@ -63,7 +63,7 @@ def test_the_tail_is_the_sum_over_all_outcomes(gained, lost, n, margin):
         p, total = q + margin, 0.0
         for g in range(n + 1):
             for c in range(n + 1 - g):
-                if scores(np.array(g), np.array(c), n, margin) >= seen - 1e-9:
+                if tango_score(g, c, n, -margin) >= seen - 1e-9:
                     ways = math.comb(n, g) * math.comb(n - g, c)
                     total += ways * q**g * p**c * (1 - q - p) ** (n - g - c)
         worst = max(worst, total)
