@@ -91,43 +91,52 @@ def test_a_file_of_ones_own(tmp_path):
 
 FLAGS = """
 from absl import flags
+from absl.testing import flagsaver
 from rcirl_jax.cli.flags import training
 asked = training()
-flags.FLAGS(["x", *{given}])
-c = asked.config()
-print(c.loss, c.reward.hidden, c.leaky_rate, c.futures, c.positive, c.reward.pin)
+for given in {given}:
+    with flagsaver.flagsaver():
+        flags.FLAGS(["x", *given])
+        c, r = asked.config(), asked.config().reward
+        print(c.loss, r.hidden, c.leaky_rate, c.futures, c.positive, r.pin)
+"""
+SWEEP = """
+from pathlib import Path
+from absl.testing import flagsaver
+from rcirl_jax.cli import sweep
+class Stop(Exception): pass
+def shown(config, *_):
+    print(config)
+    raise Stop
+sweep.run_sweep = shown
+for given in {given}:
+    with flagsaver.flagsaver():
+        sweep.flags.FLAGS(["x", "--data=d", "--output=o", *given])
+        try:
+            sweep.main()
+        except Stop:
+            pass
 """
 
 
-def said(*given, code=FLAGS):
-    """What the flags make of the recipe, in an interpreter of its own."""
+def said(code, *given):
+    """What the flags make of the recipe, a line each, in an interpreter of its own."""
     code = code.format(given=list(given))
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
-    return done.stdout.strip()
+    return done.stdout.splitlines()
 
 
 def test_a_flag_given_beside_the_recipe_wins():
-    paper = "rank (15,) 0.05 recorded human unit"
-    assert said("--recipe=paper") == paper
-    changed = said("--recipe=paper", "--loss=hinge", "--hidden_size=8,4", "--pin=none")
-    assert changed == "hinge (8, 4) 0.05 recorded human none"
-    tuned = load_recipe("tuned").train
-    assert said() == (
-        f"{tuned.loss} {tuned.reward.hidden} {tuned.leaky_rate} {tuned.futures} "
-        f"{tuned.positive} {tuned.reward.pin}"
-    )
-
-
-SWEEP = """
-import sys
-from pathlib import Path
-from rcirl_jax.cli import sweep
-sweep.run_sweep = lambda config, *_: (print(config), sys.exit(0))
-sweep.flags.FLAGS(["x", "--data=d", "--output=o", *{given}])
-sweep.main()
-"""
+    paper, usual = ["--recipe=paper"], load_recipe("tuned").train
+    changed = [*paper, "--loss=hinge", "--hidden_size=8,4", "--pin=none"]
+    assert said(FLAGS, paper, changed, []) == [
+        "rank (15,) 0.05 recorded human unit",
+        "hinge (8, 4) 0.05 recorded human none",
+        f"{usual.loss} {usual.reward.hidden} {usual.leaky_rate} {usual.futures} "
+        f"{usual.positive} {usual.reward.pin}",
+    ]
 
 
 def test_a_sweep_trains_as_the_recipe_says(tmp_path):
@@ -136,15 +145,18 @@ def test_a_sweep_trains_as_the_recipe_says(tmp_path):
         "[train]\nloss = 'rank'\nepochs = 7\npositive = 'human'\n"
         "learning_rate = 0.001\n[train.reward]\npin = 'none'",
     )
-    made = said(f"--recipe={own}", "--positive=nearest", code=SWEEP)
+    made, plain, few = said(
+        SWEEP,
+        [f"--recipe={own}", "--positive=nearest"],
+        [],
+        ["--constraint=nonnegative", "--hidden_sizes=0", "--noby_context"],
+    )
     for words in (
         "epochs=7, positive='nearest'", "train_horizon=8.0", "pin='none'",
         "leaky_rates=(0.01, 0.05, 0.2), learning_rates=(0.001,)", "horizon_s=5.0",
     ):  # fmt: skip
         assert words in made
-    plain = said(code=SWEEP)
     rate = load_recipe("tuned").train.leaky_rate
     assert f"leaky_rates=({rate},)" in plain  # no rate to look for
     assert "hidden_sizes=((15,),)" in plain
-    few = ("--constraint=nonnegative", "--hidden_sizes=0", "--noby_context")
-    assert "constraint='nonnegative'" in said(*few, code=SWEEP)
+    assert "constraint='nonnegative'" in few
