@@ -45,7 +45,7 @@ def _subject(heading: str) -> Callable:
 
     def noted(define: Callable) -> Callable:
         @functools.wraps(define)
-        def defined(*args: Any, **options: Any) -> Any:  # noqa: ANN401
+        def defined(*args: object, **options: object) -> object:
             before = {*flags.FLAGS}
             made = define(*args, **options)
             HEADINGS.update(dict.fromkeys({*flags.FLAGS} - before, heading))

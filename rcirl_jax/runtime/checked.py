@@ -78,7 +78,7 @@ def _said(found: Any, kind: Any, message: str) -> str:  # noqa: ANN401
     return f"{place.lstrip('.')}: {value}" if place else value
 
 
-def typed_settings(kind: type, found: Mapping[str, Any], where: str = "") -> Any:  # noqa: ANN401
+def typed_settings(kind: type[Kind], found: Mapping[str, Any], where: str = "") -> Kind:
     """Makes a dataclass of values that are checked as in `typed_fields`.
 
     Raises:

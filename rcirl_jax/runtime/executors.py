@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from itertools import islice
 from multiprocessing.synchronize import Barrier
-from typing import Any, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 from rcirl_jax.errors import InputError, LostWorkError
 
@@ -212,7 +212,7 @@ class Ray:
                 return
             yield from self._result(*running.popleft())
 
-    def _result(self, name: str, reference: Any) -> list:  # noqa: ANN401
+    def _result(self, name: str, reference: object) -> list:
         """Returns the value, or raises the function's own error in place of Ray's."""
         try:
             return self._ray.get(reference)

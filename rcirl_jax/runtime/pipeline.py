@@ -38,7 +38,7 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def digest(node: Any) -> str:  # noqa: ANN401
+def digest(node: object) -> str:
     """Sha256 of anything that JSON can say."""
     text = json.dumps(node, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()

@@ -98,6 +98,9 @@ def test_a_report_that_cannot_be_drawn_is_one_line(monkeypatch):
 def test_what_to_do_next_without_a_report_is_to_have_one(tmp_path):
     run = types.SimpleNamespace(weights="w", tables="t", folder=tmp_path)
     verdict = types.SimpleNamespace(decision="ship", sentence="Ship.", look_at=("a@0",))
-    last = lambda *page: loop._ending(run, verdict, page, "b@0").splitlines()[-1]  # noqa: E731
+
+    def last(*page):
+        return loop._ending(run, verdict, page, "b@0").splitlines()[-1]
+
     assert "rcirl replay --weights=w --case=a@0" in last("report to open: r")
     assert f"rcirl report --run={tmp_path}" in last(loop.NO_REPORT + "x")
