@@ -7,9 +7,8 @@ A record is `length` (uint64), `masked_crc32c(length)`, the data and
 """
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
 
 from rcirl_jax.errors import InputError, extra_module
 
@@ -32,17 +31,37 @@ def read_records(path: Path, limit: int = MAX_RECORD_BYTES) -> Iterator[bytes]:
       InputError: damaged, truncated, compressed or empty file; a longer record.
     """
     crc32c = extra_module("google_crc32c").value
+
+    def check(where: str, field: str, content: bytes, stored: int) -> None:
+        if (crc := mask(crc32c(content))) != stored:
+            raise InputError(
+                f"{where}: {field} crc32c: {stored:#010x}: expected {crc:#010x}; "
+                "damaged, or no TFRecord file"
+            )
+
     try:
         left, count = path.stat().st_size, 0
         with path.open("rb") as handle:
             while left > 0:
-                where = f"{path}: record {count}"
-                length = _length(handle, where, left, limit, crc32c)
-                data = handle.read(length)
-                end = handle.read(FOOTER.size)
+                where, header = f"{path}: record {count}", handle.read(HEADER.size)
+                if header.startswith(GZIP_MAGIC):
+                    expected = "expected an uncompressed TFRecord file"
+                    raise InputError(f"{where}: gzip data: {expected}")
+                if len(header) < HEADER.size:
+                    found = f"{len(header)} bytes: expected {HEADER.size}; cut off?"
+                    raise InputError(f"{where}: header: {found}")
+                length, stored = HEADER.unpack(header)
+                check(where, "length", header[:8], stored)
+                rest = left - FRAME_BYTES
+                if length > min(rest, limit):  # before anything is allocated
+                    raise InputError(
+                        f"{where}: length: {length} bytes: expected at most {limit}, "
+                        f"and {max(rest, 0)} are left in the file; cut off?"
+                    )
+                data, end = handle.read(length), handle.read(FOOTER.size)
                 if len(data) + len(end) < length + FOOTER.size:
                     raise InputError(f"{where}: data: cut off: expected {length} bytes")
-                _check(where, "data", crc32c(data), *FOOTER.unpack(end))
+                check(where, "data", data, *FOOTER.unpack(end))
                 left -= FRAME_BYTES + length
                 count += 1
                 yield data
@@ -55,37 +74,3 @@ def read_records(path: Path, limit: int = MAX_RECORD_BYTES) -> Iterator[bytes]:
 def mask(crc: int) -> int:
     """Returns the masked form in which TFRecord stores a CRC32C."""
     return ((crc >> 15 | crc << 17) + MASK_DELTA) & 0xFFFFFFFF
-
-
-def _length(
-    handle: BinaryIO,
-    where: str,
-    left: int,
-    limit: int,
-    crc32c: Callable[[bytes], int],
-) -> int:
-    """Length of the next record, checked before anything is allocated."""
-    header = handle.read(HEADER.size)
-    if header.startswith(GZIP_MAGIC):
-        raise InputError(f"{where}: gzip data: expected an uncompressed TFRecord file")
-    if len(header) < HEADER.size:
-        raise InputError(
-            f"{where}: header: {len(header)} bytes: expected {HEADER.size}; cut off?"
-        )
-    length, stored = HEADER.unpack(header)
-    _check(where, "length", crc32c(header[:8]), stored)
-    rest = left - FRAME_BYTES
-    if length > min(rest, limit):
-        raise InputError(
-            f"{where}: length: {length} bytes: expected at most {limit}, and "
-            f"{max(rest, 0)} are left in the file; cut off?"
-        )
-    return length
-
-
-def _check(where: str, field: str, crc: int, stored: int) -> None:
-    if mask(crc) != stored:
-        raise InputError(
-            f"{where}: {field} crc32c: {stored:#010x}: expected {mask(crc):#010x}; "
-            "damaged, or no TFRecord file"
-        )

@@ -7,7 +7,6 @@ removed that car from the traffic).
 """
 
 import csv
-import dataclasses
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -58,17 +57,6 @@ KINDS = {
     "pillar": Kind.STATIC,
     "median_strip": Kind.STATIC,
 }
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _Box:
-    """A shape's box in the obstacle's own frame."""
-
-    length: float  # m
-    width: float  # m
-    x: float = 0.0  # m, of the box centre, ahead of the obstacle's position
-    y: float = 0.0  # m, to its left
-    turn: float = 0.0  # rad, of the box against the obstacle's heading
 
 
 def parts(path: Path, spec: dict) -> list[Path]:
@@ -267,22 +255,30 @@ def _track(element: Element, fields: Fields, kind: Kind, series: Iterable) -> Tr
     name = element.get("id")
     if name is None:
         raise InputError(f"{fields.path}: {element.tag}: id: missing: expected it")
-    box = _read_shape(element, fields, f"obstacle {name}")
     t, x, y, heading, speed = series
+    length, width, ahead, left, turn = _shape(element, fields, f"obstacle {name}")
     return Track(
         id=name,
         kind=kind,
-        length=box.length,
-        width=box.width,
+        length=length,
+        width=width,
         t=t,
-        x=x + box.x * np.cos(heading) - box.y * np.sin(heading),
-        y=y + box.x * np.sin(heading) + box.y * np.cos(heading),
-        heading=heading + box.turn,
+        x=x + ahead * np.cos(heading) - left * np.sin(heading),
+        y=y + ahead * np.sin(heading) + left * np.cos(heading),
+        heading=heading + turn,
         speed=speed,
     )
 
 
-def _read_shape(element: Element, fields: Fields, where: str) -> _Box:
+def _shape(
+    element: Element, fields: Fields, where: str
+) -> tuple[float, float, float, float, float]:
+    """A shape's box in the obstacle's own frame.
+
+    Returns:
+      Length and width [m], how far its centre lies ahead and to the left of the
+      obstacle's position [m], and its turn against the obstacle's heading [rad].
+    """
     where = f"{where}: shape"
     shape = fields.child(element, "shape", where)
     box, circle = shape.find("rectangle"), shape.find("circle")
@@ -290,26 +286,23 @@ def _read_shape(element: Element, fields: Fields, where: str) -> _Box:
     centre = None if found is None else found.find("center")
     x, y = (0.0, 0.0) if centre is None else fields.point(centre, where)
     if box is not None:
+        length = fields.number(fields.child(box, "length", where), where)
+        width = fields.number(fields.child(box, "width", where), where)
         turn = box.find("orientation")
-        return _Box(
-            length=fields.number(fields.child(box, "length", where), where),
-            width=fields.number(fields.child(box, "width", where), where),
-            x=x,
-            y=y,
-            turn=0.0 if turn is None else fields.number(turn, where),
-        )
+        return length, width, x, y, 0.0 if turn is None else fields.number(turn, where)
     if circle is not None:
         size = 2.0 * fields.number(fields.child(circle, "radius", where), where)
-        return _Box(length=size, width=size, x=x, y=y)
+        return size, size, x, y, 0.0
     points = [fields.point(point, where) for point in shape.iterfind("polygon/point")]
     if not points:
-        found = ", ".join(child.tag for child in shape) or "nothing"
+        tags = ", ".join(child.tag for child in shape) or "nothing"
         raise InputError(
-            f"{fields.path}: {where}: {found}: expected rectangle, circle or polygon"
+            f"{fields.path}: {where}: {tags}: expected rectangle, circle or polygon"
         )
     low, high = np.min(points, axis=0), np.max(points, axis=0)
-    (length, width), (x, y) = high - low, 0.5 * (high + low)
-    return _Box(length=float(length), width=float(width), x=float(x), y=float(y))
+    length, width = (high - low).tolist()
+    x, y = (0.5 * (high + low)).tolist()
+    return length, width, x, y, 0.0
 
 
 # ----------------------------------------- places, signals and missing agents

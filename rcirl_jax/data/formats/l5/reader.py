@@ -326,18 +326,12 @@ def _others(
     centre = agents["centroid"].astype(np.float64)
     check_coordinates(path, "centroid", ("x", "y"), centre)
     track_ids, ids = np.unique(agents["track_id"], return_inverse=True)
-    boxes = Boxes(
-        ids=ids,
-        names=tuple(str(track) for track in track_ids.tolist()),
-        t=t[frame],
-        x=centre[:, 0],
-        y=centre[:, 1],
-        heading=agents["yaw"].astype(np.float64),
-        speed=np.hypot(*agents["velocity"].astype(np.float64).T),
-        length=agents["extent"][:, 0].astype(np.float64),
-        width=agents["extent"][:, 1].astype(np.float64),
-        kind=np.where(likely, KIND_OF_LABEL[best], UNKNOWN),
-    )
+    names = [*map(str, track_ids.tolist())]
+    kinds = np.where(likely, KIND_OF_LABEL[best], UNKNOWN)
+    heading, (x, y) = agents["yaw"].astype(np.float64), centre.T
+    speed = np.hypot(*agents["velocity"].astype(np.float64).T)
+    length, width, _ = agents["extent"].astype(np.float64).T
+    boxes = Boxes(ids, names, t[frame], x, y, heading, speed, length, width, kinds)
     return tracks_of(path, boxes, MAX_GAP_S, str(spec.get("unknown", "drop")))
 
 

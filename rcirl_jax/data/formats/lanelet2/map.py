@@ -80,8 +80,39 @@ class OsmMap:
 
     @functools.cached_property
     def rules(self) -> dict[str, Rule]:
-        """Reads regulatory elements, by id."""
-        return _read_rules(self)
+        """Reads regulatory elements by id; a way that many of them name once."""
+
+        @functools.cache
+        def sign(name: str) -> str:
+            return tag_of(self.ways[name], "subtype") if name in self.ways else ""
+
+        @functools.cache
+        def ends(name: str) -> tuple[str, ...]:
+            nodes = bound(self, [name])
+            return nodes and (nodes[0], nodes[-1])
+
+        rules = {}
+        for key, element in self.relations.items():
+            if tag_of(element, "type") != "regulatory_element":
+                continue
+            subtype, text = tag_of(element, "subtype"), tag_of(element, "sign_type")
+            kinds = [sign(name) for name in members(element, "refers", "way")]
+            texts = []
+            if subtype == "speed_limit":
+                # German sign 274 carries its number: de274-60
+                numbers = [kind.rpartition("-")[2] for kind in kinds if "274-" in kind]
+                texts = [text.rpartition("274-")[2], *numbers]
+            own = dict.fromkeys(map(ends, members(element, "ref_line", "way")))
+            lines = [line_of(self, nodes) for nodes in own if nodes]
+            rules[key] = Rule(
+                subtype=subtype,
+                yields=frozenset(members(element, "yield", "relation")),
+                stops=subtype == "all_way_stop"
+                or any(kind.lower() in STOP_SIGNS for kind in (text, *kinds)),
+                lines=np.array(lines).reshape(-1, 2, 2),
+                limit=_first_speed(texts),
+            )
+        return rules
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,7 +182,14 @@ def _positions(
     else:
         pairs = [(node.get("lat"), node.get("lon")) for node in nodes.values()]
         degrees = True
-    values = np.array([[_number(text) for text in pair] for pair in pairs])
+
+    def number(text: str | None) -> float:
+        try:
+            return float(text or "nan")
+        except ValueError:
+            return float("nan")
+
+    values = np.array([[number(text) for text in pair] for pair in pairs])
     wrong = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if wrong.size:
         name, pair = list(nodes)[wrong[0]], pairs[wrong[0]]
@@ -169,13 +207,6 @@ def _positions(
     if degrees:
         values = project(values[:, 0], values[:, 1])
     return dict(zip(nodes, values, strict=True))
-
-
-def _number(text: str | None) -> float:
-    try:
-        return float(text or "nan")
-    except ValueError:
-        return float("nan")
 
 
 def _for_vehicles(relation: Element) -> bool:
@@ -323,42 +354,6 @@ def _extended(joined: list[str], parts: list[list[str]]) -> list[str]:
 def line_of(world: OsmMap, nodes: tuple[str, ...]) -> np.ndarray:
     """Positions [n, 2] m of nodes."""
     return np.array([world.points[node] for node in nodes])
-
-
-def _read_rules(world: OsmMap) -> dict[str, Rule]:
-    """All regulatory elements; a way that many of them name is looked at once."""
-
-    @functools.cache
-    def sign(name: str) -> str:
-        return tag_of(world.ways[name], "subtype") if name in world.ways else ""
-
-    @functools.cache
-    def ends(name: str) -> tuple[str, ...]:
-        nodes = bound(world, [name])
-        return nodes and (nodes[0], nodes[-1])
-
-    rules = {}
-    for key, element in world.relations.items():
-        if tag_of(element, "type") != "regulatory_element":
-            continue
-        subtype, text = tag_of(element, "subtype"), tag_of(element, "sign_type")
-        kinds = [sign(name) for name in members(element, "refers", "way")]
-        texts = []
-        if subtype == "speed_limit":
-            # German sign 274 carries its number: de274-60
-            numbers = [kind.rpartition("-")[2] for kind in kinds if "274-" in kind]
-            texts = [text.rpartition("274-")[2], *numbers]
-        own = dict.fromkeys(map(ends, members(element, "ref_line", "way")))
-        lines = [line_of(world, nodes) for nodes in own if nodes]
-        rules[key] = Rule(
-            subtype=subtype,
-            yields=frozenset(members(element, "yield", "relation")),
-            stops=subtype == "all_way_stop"
-            or any(kind.lower() in STOP_SIGNS for kind in (text, *kinds)),
-            lines=np.array(lines).reshape(-1, 2, 2),
-            limit=_first_speed(texts),
-        )
-    return rules
 
 
 def _rules(world: OsmMap, relation: Element) -> list[Rule]:

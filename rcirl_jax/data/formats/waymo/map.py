@@ -307,9 +307,14 @@ def _signals(
     known = np.flatnonzero(COLOURS[state] != OFF)[::-1]
     colours[rows[known], step[known]] = COLOURS[state[known]]
     gap = number(spec, "signal_gap_s", GAP_S)
+    for row in colours:  # fill short unseen times between equal colours
+        known = np.flatnonzero(row != OFF)
+        before, after = known[:-1], known[1:]
+        fill = (row[before] == row[after]) & (t[after] - t[before] <= gap)
+        for first, last in zip(before[fill], after[fill], strict=True):
+            row[first:last] = row[first]
     signals = tuple(
-        signal_of(str(key), t, _bridged(row, t, gap))
-        for key, row in zip(ids, colours, strict=True)
+        signal_of(str(key), t, row) for key, row in zip(ids, colours, strict=True)
     )
     stops = {
         head.lane: head.stop_point
@@ -324,14 +329,3 @@ def _signals(
         dict(zip(stops, points, strict=True)),
         frozenset(ids[flashing].tolist()),
     )
-
-
-def _bridged(colours: np.ndarray, t: np.ndarray, gap: float) -> np.ndarray:
-    """Colours [T] with short unseen times filled between equal colours."""
-    known = np.flatnonzero(colours != OFF)
-    filled = colours.copy()
-    before, after = known[:-1], known[1:]
-    fill = (colours[before] == colours[after]) & (t[after] - t[before] <= gap)
-    for first, last in zip(before[fill], after[fill], strict=True):
-        filled[first:last] = colours[first]
-    return filled
