@@ -17,8 +17,8 @@ from absl import flags
 
 from benchmarks.common import write
 from rcirl_jax.cli.running import run
-from rcirl_jax.data.cut import cut_item
-from rcirl_jax.data.parts import parts_of, recordings_of
+from rcirl_jax.data.importing import scenes_in
+from rcirl_jax.data.inputs import input_files, recordings_of
 from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.runtime.executors import Executor, Processes, Serial
@@ -50,7 +50,7 @@ def rate(executor: Executor, items: list, config: CollectConfig) -> tuple[dict, 
     A first pass compiles in every process and is not timed. It repeats the first
     recording that has scenes: one without compiles nothing.
     """
-    piece = functools.partial(cut_item, config=config)
+    piece = functools.partial(scenes_in, config=config)
     has_scenes = (item for item in items if any(x.vehicles for x in piece(item)))
     busy = list(itertools.islice(has_scenes, 1))
     for _ in executor.stream(piece, busy * 4 * executor.workers):
@@ -78,7 +78,7 @@ def main() -> None:
         begin = time.perf_counter()
         items = [
             (part, made)
-            for part in parts_of(format_, path, toml)
+            for part in input_files(format_, path, toml)
             for made in recordings_of(part)
         ]
         parsing = time.perf_counter() - begin

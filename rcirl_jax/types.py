@@ -213,18 +213,12 @@ class Track:
     # s, when the log first saw it, where that is before t[0] (a log read in pieces)
     seen_since: float | None = None
     # s, (begin, end) of times at which no human drove, or nobody knows who did
-    automated: tuple[tuple[float, float], ...] = dataclasses.field(
-        default=(), metadata={"in_digest": "unless default"}
-    )
+    automated: tuple[tuple[float, float], ...] = ()
     # the log does not say length and width, and what they are taken for is a guess
-    size_assumed: bool = dataclasses.field(
-        default=False, metadata={"in_digest": "unless default"}
-    )
+    size_assumed: bool = False
     # s, (begin, end) of times at which the log names a leader of this driver that it
     # does not hold
-    leader_missing: tuple[tuple[float, float], ...] = dataclasses.field(
-        default=(), metadata={"in_digest": "unless default"}
-    )
+    leader_missing: tuple[tuple[float, float], ...] = ()
 
     def is_human(self, begin: float, end: float) -> bool:
         """Whether a human drove all the time from begin to end [s]."""
@@ -252,9 +246,7 @@ class Lane:
     signal_ids: tuple[str, ...] = ()  # signals that govern the stop line
     stop_sign: bool = False  # the stop line demands a stop at any time
     # the log does not say the widths, and what they are taken for is a guess
-    width_assumed: bool = dataclasses.field(
-        default=False, metadata={"in_digest": "unless default"}
-    )
+    width_assumed: bool = False
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -320,4 +312,4 @@ class Recording:
     # for the progress bar only, no part of what was recorded
     progress: float | None = dataclasses.field(default=None, compare=False)
     # why nothing of it is read, where such recordings are left out; "" otherwise
-    refused: str = dataclasses.field(default="", metadata={"in_digest": True})
+    refused: str = ""

@@ -33,8 +33,7 @@ from benchmarks.reliability.memory import in_use_mb, kept, rise, watched
 from benchmarks.reliability.small import SHARD_SCENES
 from rcirl_jax.cli.running import provenance, run
 from rcirl_jax.data import importing
-from rcirl_jax.data.importing import ImportConfig
-from rcirl_jax.data.logs import Logs
+from rcirl_jax.data.importing import ImportConfig, Logs
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.evaluation.gate.types import GateConfig
 from rcirl_jax.runtime.compiling import compiles

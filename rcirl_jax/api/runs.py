@@ -6,10 +6,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
+from rcirl_jax.data import importing
 from rcirl_jax.data.formats import read_recordings
 from rcirl_jax.data.formats.recognise import recognised_format
-from rcirl_jax.data.importing import ImportConfig, import_parts
-from rcirl_jax.data.parts import parts_of
+from rcirl_jax.data.importing import ImportConfig
+from rcirl_jax.data.inputs import input_files
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.data.store.dataset import Dataset, open_dataset
 from rcirl_jax.data.store.joined import Demonstrations, open_datasets
@@ -142,8 +143,8 @@ def import_logs(
         made_by = {"flags": flags, **provenance()}
         dataset.write_facts({"data_hash": dataset.hash, "made_by": made_by})
 
-    import_parts(
-        parts_of(form, where, toml),
+    importing.import_logs(
+        input_files(form, where, toml),
         os.fspath(output),
         config,
         executor=executor,

@@ -22,8 +22,7 @@ from rcirl_jax.cli.flags import AS_SAID
 from rcirl_jax.cli.running import provenance
 from rcirl_jax.data.formats import IMPORTERS
 from rcirl_jax.data.formats.recognise import recognised_format
-from rcirl_jax.data.importing import ImportConfig
-from rcirl_jax.data.logs import Logs
+from rcirl_jax.data.importing import ImportConfig, Logs
 from rcirl_jax.errors import InputError, did_you_mean
 from rcirl_jax.runtime.pipeline import only_one
 from rcirl_jax.train.parallel import PARALLEL, share_cores

@@ -13,7 +13,7 @@ from typing import Any
 from absl import flags
 
 from rcirl_jax.data.importing import ImportConfig
-from rcirl_jax.data.parts import Part
+from rcirl_jax.data.inputs import InputFile
 from rcirl_jax.data.scenes.signal_checks import SignalChecks, signal_checks
 from rcirl_jax.data.scenes.signal_phases import check_written, format_phases
 from rcirl_jax.data.store.joined import EQUAL, Demonstrations
@@ -382,7 +382,7 @@ def signals() -> flags.FlagHolder[str | None]:
     )
 
 
-def pooled_signals(parts: Sequence[Part], places: Executor) -> SignalChecks:
+def pooled_signals(parts: Sequence[InputFile], places: Executor) -> SignalChecks:
     """Asks the drivers of all files about the lights; printed (--signals=pooled)."""
     phases = check_written(parts, executor=places)
     print(format_phases(phases))

@@ -26,8 +26,8 @@ from rcirl_jax.data.formats import IMPORTERS
 from rcirl_jax.data.formats.csv.suggest import suggested
 from rcirl_jax.data.formats.files import table_stem
 from rcirl_jax.data.formats.recognise import recognised_format
-from rcirl_jax.data.importing import ImportConfig, import_parts
-from rcirl_jax.data.parts import leaving_out, parts_of
+from rcirl_jax.data.importing import ImportConfig, import_logs
+from rcirl_jax.data.inputs import leaving_out
 from rcirl_jax.data.quality import format_quality, format_splits
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.errors import InputError
@@ -95,7 +95,7 @@ def main() -> None:
         floors.extend(_floors(dataset))
         splits.append(format_splits(dataset))
 
-    manifest = import_parts(
+    manifest = import_logs(
         parts,
         _OUTPUT.value,
         config,

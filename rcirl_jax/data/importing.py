@@ -1,27 +1,39 @@
 """Import: log files -> a dataset on disk; resumable; all or nothing on bad input.
 
+    input files --recordings_in--> Recording --scenes_of--> RecordingScenes --> shards
+
 Recordings are cut into scenes wherever the executor runs them, and arrive here in
-their order. Consecutive ones fill a shard. A shard's lineage holds what later
-recordings need to continue as if nothing had happened (names and quality sums),
-so an interrupted import resumes to the same bytes, and a parallel one writes the
-bytes of a local one.
+their order; numbers of vehicles, groups and recordings are given here, where all are
+seen. Consecutive recordings fill a shard. A shard's lineage holds what later ones need
+to continue as if nothing had happened (names and quality sums), so an interrupted
+import resumes to the same bytes, and a parallel one writes the bytes of a local one.
 """
 
 import collections
 import dataclasses
 import functools
+import hashlib
+import itertools
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import jax
 import numpy as np
 import tqdm
 
-from rcirl_jax.data.cut import Cut, cut, cut_item, whole_of
-from rcirl_jax.data.parts import Part, items, leaving_out
+from rcirl_jax.data.inputs import (
+    InputFile,
+    WorkUnit,
+    leaving_out,
+    recordings_in,
+    work_units,
+)
 from rcirl_jax.data.quality import QualityReport, remedies
+from rcirl_jax.data.scenes.assemble import CHUNK, assemble
+from rcirl_jax.data.scenes.collect import Collector
 from rcirl_jax.data.scenes.config import CollectConfig
+from rcirl_jax.data.scenes.signal_checks import SignalChecks
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.data.store.files import Files
 from rcirl_jax.data.store.manifest import Manifest
@@ -33,6 +45,12 @@ from rcirl_jax.runtime.executors import Executor, Serial
 from rcirl_jax.types import Demonstration, Recording
 
 SHARD_SCENES = 4096  # scenes after which a shard is closed
+GROUP_BLOCK_S = 60.0  # s; vehicles first seen in one block share a group
+MINUTE = "/minute-"  # between a recording's name and the number of a block
+CHANGED = (
+    "input or settings changed since the interrupted import: expected the same; use "
+    "another output folder"
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -54,24 +72,172 @@ class ImportConfig:
         """Whether any recording may be refused and left out."""
         return self.leave_out > 0 or self.leave_out_share > 0.0
 
+    def as_dict(self) -> dict:
+        """Return the settings for the manifest; what is left out only if set."""
+        found = dataclasses.asdict(self)
+        unused = {name for name in ("leave_out", "leave_out_share") if not found[name]}
+        return {name: value for name, value in found.items() if name not in unused}
 
-def _numbers(table: dict[str, int], names: Iterable[str]) -> np.ndarray:
-    """Numbers of names, in order of first appearance."""
-    return np.array([table.setdefault(name, len(table)) for name in names], np.int32)
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Logs:
+    """Recordings that are still to be imported, as `rcirl import` takes them."""
+
+    format: str
+    input: Path | None
+    source: Path | None
+    config: ImportConfig
+    # which written lights are used: what was asked for, and who finds it out
+    signals: str = ""
+    checked: Callable[[Sequence[InputFile], Executor], SignalChecks | None] | None = (
+        None
+    )
+
+    def import_config(
+        self, files: Sequence[InputFile], places: Executor
+    ) -> ImportConfig:
+        """Return the settings with the verdicts on the lights, which reads all logs."""
+        if self.checked is None:
+            return self.config
+        checks = self.checked(files, places)
+        collect = dataclasses.replace(self.config.collect, signal_checks=checks)
+        return dataclasses.replace(self.config, collect=collect)
+
+
+# --------------------------------------------------------- one recording's scenes
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class RecordingScenes:
+    """The scenes of one recording, numbered in no dataset yet."""
+
+    name: str
+    source: str
+    licence: str
+    rate_hz: float
+    sha256: str  # of the recording and of how it is cut
+    quality: dict = dataclasses.field(default_factory=dict)  # `QualityReport.state()`
+    # numbers of vehicle, group and recording are 0; None: no scene, or known
+    scenes: Demonstration | None = None
+    vehicles: Sequence[str] = ()  # name per scene
+    groups: Sequence[str] = ()  # vehicle-disjoint group per scene
+    first_seen: Sequence[float] = ()  # s, when the log first saw each scene's vehicle
+    log: str = ""  # of which the recording is a slice, or its own name
+    known: bool = False  # a committed shard holds it already
+    refused: str = ""  # why nothing of it was read, where it is left out
+    input: str = ""  # the file it was read from
+    progress: float | None = None  # share of that file read after it, if known
+
+
+def digest(recording: Recording) -> str:
+    """Return the sha256 of every compared field; equal inputs give equal datasets."""
+    total = hashlib.sha256()
+    _hash(total, recording)
+    return total.hexdigest()
+
+
+def _hash(total: "hashlib._Hash", value: object) -> None:
+    """Add type, length and content, so that no two values run into each other."""
+    if dataclasses.is_dataclass(value):
+        for field in filter(lambda field: field.compare, dataclasses.fields(value)):
+            total.update(f"{field.name}:".encode())
+            _hash(total, getattr(value, field.name))
+    elif isinstance(value, np.ndarray):
+        total.update(f"{value.dtype}{value.shape}".encode())
+        total.update(np.ascontiguousarray(value).tobytes())
+    elif isinstance(value, tuple | list):
+        total.update(f"({len(value)}".encode())
+        for item in value:
+            _hash(total, item)
+    else:
+        total.update(f"{type(value).__name__}={value!r};".encode())
+
+
+def scenes_of(
+    recording: Recording, config: CollectConfig, done: Mapping[str, str] | None = None
+) -> RecordingScenes:
+    """Cut a recording into scenes: a pure function, wherever it runs.
+
+    Args:
+      recording: validated.
+      config: what is collected.
+      done: sha256 by name of recordings that committed shards hold.
+
+    Raises:
+      InputError: `done` has a recording of this name cut from another input or
+        with other settings.
+    """
+    log = recording.piece_of or recording.name
+    made = RecordingScenes(
+        name=recording.name,
+        source=recording.source,
+        licence=recording.licence,
+        rate_hz=recording.rate_hz,
+        sha256=hashlib.sha256((digest(recording) + repr(config)).encode()).hexdigest(),
+        log=log,
+        refused=recording.refused,
+        progress=recording.progress,
+    )
+    if done and recording.name in done:
+        if done[recording.name] != made.sha256:
+            raise InputError(f"{recording.name}: {CHANGED}")
+        return dataclasses.replace(made, known=True)
+    report = QualityReport()
+    if recording.refused:
+        report.add_refusal(recording)
+    elif not recording.tracks:
+        report.add_empty(recording)
+    if recording.refused or not recording.tracks:
+        return dataclasses.replace(made, quality=report.state())
+    collector = Collector(recording, config)
+    # a few at a time: a row before it is assembled takes more than twice the memory
+    blocks, tracks, rows = [], [], collector.scenes()
+    while some := list(itertools.islice(rows, CHUNK)):
+        none = [0] * len(some)
+        blocks.append(assemble(some, vehicles=none, groups=none, recording=0))
+        tracks += [collector.recording.tracks[row["track"]] for row in some]
+    report.add_recording(collector)
+    if not tracks:
+        return dataclasses.replace(made, quality=report.state())
+    scenes = jax.tree.map(lambda *leaves: np.concatenate(leaves), *blocks)
+    report.add_scenes(scenes)
+    groups = [
+        recording.group or f"{log}{MINUTE}{int(x.first_seen_s // GROUP_BLOCK_S):04d}"
+        for x in tracks
+    ]
+    return dataclasses.replace(
+        made,
+        scenes=scenes,
+        vehicles=[f"{g}:{x.id}" for g, x in zip(groups, tracks, strict=True)],
+        groups=groups,
+        first_seen=[x.first_seen_s for x in tracks],
+        quality=report.state(),
+    )
+
+
+def scenes_in(
+    unit: WorkUnit, config: CollectConfig, done: Mapping[str, str] | None = None
+) -> Iterator[RecordingScenes]:
+    """Yield the scenes of each recording of a unit of work; see `scenes_of`."""
+    for file, recording in recordings_in(unit):
+        made = scenes_of(recording, config, done)
+        yield dataclasses.replace(made, input=str(file.input)) if file else made
+
+
+# ------------------------------------------------------------------ the import
 
 
 class Progress:
     """A bar of the share read: scenes, scenes/s, drop reasons, time left.
 
-    All parts count alike. Inside a part the bar moves as its recordings say how
+    All input files count alike. Inside one the bar moves as its recordings say how
     much of it is read.
 
     Args:
-      total: parts; None: unknown, recordings are counted then.
+      total: files; None: unknown, recordings are counted then.
     """
 
     NUM_REASONS = 2  # drop reasons shown, the most frequent ones
-    EVERY_S = 0.5  # s between two drawings
     FORMAT = "{desc}: {percentage:.0f}% [{elapsed}<{remaining}{postfix}]"
 
     def __init__(self, total: int | None) -> None:
@@ -79,12 +245,12 @@ class Progress:
             total=total,
             desc="import",
             unit=" recordings",
-            mininterval=self.EVERY_S,
+            mininterval=0.5,
             miniters=0,  # drawn by time alone
             bar_format=self.FORMAT if total else None,
         )
-        self._start, self._part = time.monotonic(), None
-        self._finished = 0  # parts
+        self._start, self._input = time.monotonic(), None
+        self._finished = 0  # files
         self._known = 0  # scenes taken over from an interrupted import
 
     def __enter__(self) -> "Progress":
@@ -98,12 +264,11 @@ class Progress:
     def _move(self, position: float) -> None:
         self._bar.update(max(position - self._bar.n, 0.0))
 
-    def show(self, made: Cut, quality: QualityReport) -> None:
-        """After a recording: its part and all scenes so far."""
-        part = made.part or made.name
-        if self._part is not None and part != self._part:
-            self._finished += 1
-        self._part = part
+    def show(self, made: RecordingScenes, quality: QualityReport) -> None:
+        """Draw after a recording: its file and all scenes so far."""
+        file = made.input or made.name
+        self._finished += self._input not in (None, file)
+        self._input = file
         if made.known:
             self._known = quality.scenes
         seconds = max(time.monotonic() - self._start, 1e-9)
@@ -119,6 +284,11 @@ class Progress:
         self._move(self._finished + share)
 
 
+def _numbers(table: dict[str, int], names: Iterable[str]) -> np.ndarray:
+    """Return numbers [n] of names, in order of first appearance."""
+    return np.array([table.setdefault(name, len(table)) for name in names], np.int32)
+
+
 class _Import:
     """State of one import: names, quality, the open shard."""
 
@@ -128,38 +298,36 @@ class _Import:
         self.recordings: dict[str, int] = {}
         self.groups: dict[str, int] = {}
         self.vehicles: dict[str, int] = {}
+        self.sizes: collections.Counter[str] = collections.Counter()  # by group
         self.quality = QualityReport()
+        self.sources: dict[str, str] = {}  # licence by source
+        self.rates: set[float] = set()
         self.first_refused = ""  # in words
-        self.sizes: dict[str, int] = {}
-        # of the scenes in `pending`: name and first sight of each one's vehicle
+        # of the open shard: scenes, name and first sight of each one's vehicle, lineage
         self.pending: list[Demonstration] = []
         self.drivers: list[tuple[str, float]] = []
-        self.logs: set[str] = set()  # that scenes come from
-        self.split_by = ""  # in words, what is kept on one side
         self.lineage: list[dict] = []
-        self.sources: dict[str, str] = {}
-        self.rates: set[float] = set()
-        self.next_shard = 0
-        self.done: collections.deque[dict] = collections.deque()
-        for self.next_shard, info in enumerate(writer.committed(), 1):
-            self.done += info.lineage
+        self.logs: set[str] = set()  # that scenes come from
+        committed = writer.committed()
+        self.next_shard = len(committed)
+        self.done = collections.deque(x for shard in committed for x in shard.lineage)
 
-    @property
-    def known(self) -> dict[str, str]:
-        """sha256 by name of the recordings that committed shards hold."""
-        return {entry["name"]: entry["sha256"] for entry in self.done}
-
-    def add(self, made: Cut) -> None:
-        """Take over one recording's scenes."""
+    def add(self, made: RecordingScenes) -> None:
+        """Take over one recording's scenes, or what a committed shard holds of it."""
         if made.name in self.recordings:
             raise InputError(f"{made.name}: name: met twice: expected once")
-        self.first_refused = self.first_refused or made.refused or ""
+        number = self.recordings.setdefault(made.name, len(self.recordings))
+        self.first_refused = self.first_refused or made.refused
         if made.rate_hz > 0.0:  # neither refused nor a file without rows
             self.sources[made.source] = made.licence
             self.rates.add(made.rate_hz)
-        number = self.recordings.setdefault(made.name, len(self.recordings))
         if self.done:
-            self._replay(self.done.popleft(), made)
+            entry = self.done.popleft()
+            if entry["name"] != made.name:
+                raise InputError(f"{made.name}: {CHANGED}")
+            _numbers(self.vehicles, entry["vehicles"])
+            _numbers(self.groups, entry["groups"])
+            self._count(entry)
             return
         entry = {
             "name": made.name,
@@ -185,44 +353,33 @@ class _Import:
                 f"{made.refused}; recordings left out before: {self.config.leave_out}"
             )
         self.lineage.append(entry)
-        if sum(block.vehicle.shape[0] for block in self.pending) >= SHARD_SCENES:
+        if len(self.drivers) >= SHARD_SCENES:
             self._close_shard()
 
     def _count(self, entry: dict) -> None:
         self.quality.merge(entry["quality"])
-        for name, scenes in entry["groups"].items():
-            self.sizes[name] = self.sizes.get(name, 0) + scenes
-
-    def _replay(self, entry: dict, made: Cut) -> None:
-        """Take over what a committed shard already holds of this recording."""
-        if entry["name"] != made.name:
-            raise InputError(
-                f"{made.name}: input or settings changed since the interrupted "
-                "import: expected the same; use another output folder"
-            )
-        _numbers(self.vehicles, entry["vehicles"])
-        _numbers(self.groups, entry["groups"])
-        self._count(entry)
+        self.sizes.update(entry["groups"])
 
     def _close_shard(self) -> None:
-        if not self.pending:
-            return
-        joined = jax.tree.map(lambda *x: np.concatenate(x), *self.pending)
-        self.writer.write_shard(self.next_shard, joined, self.lineage)
-        self.next_shard += 1
-        self.pending, self.drivers, self.lineage = [], [], []
+        if self.pending:
+            joined = jax.tree.map(lambda *x: np.concatenate(x), *self.pending)
+            self.writer.write_shard(self.next_shard, joined, self.lineage)
+            self.next_shard += 1
+            self.pending, self.drivers, self.lineage = [], [], []
 
-    def _split_one_group(self) -> None:
+    def _split_one_group(self) -> str:
         """Make groups of one that would leave the test split empty.
+
+        Returns:
+          What is kept on one side then, in words; "" where there are more groups.
 
         Raises:
           LostWorkError: it cannot be cut; finished shards stay for another share.
         """
         if len(self.sizes) != 1 or not self.config.test_fraction:
-            return
+            return ""
         (group,) = self.sizes
         vehicles = [name for name, _ in self.drivers]
-        first_seen = np.array([time for _, time in self.drivers])
         whole = len(vehicles) == self.quality.scenes and len(self.logs) == 1
         if not whole or len(set(vehicles)) == 1:
             self._close_shard()
@@ -231,48 +388,51 @@ class _Import:
                 f"groups for test_fraction={self.config.test_fraction:g}; give more "
                 "recordings, or import with test_fraction=0 for training scenes only"
             )
-        blocks, self.split_by = time_blocks(
-            first_seen, vehicles, self.config.test_fraction
+        blocks, words = time_blocks(
+            np.array([seen for _, seen in self.drivers]),
+            vehicles,
+            self.config.test_fraction,
         )
         names = [f"{group}/{block}" for block in blocks]
-        self.groups, start = {}, 0
-        numbers = _numbers(self.groups, names)
+        self.groups = {}
         joined = jax.tree.map(lambda *x: np.concatenate(x), *self.pending)
-        self.pending = [joined.replace(group=numbers)]
-        self.sizes = dict(collections.Counter(names))
+        self.pending = [joined.replace(group=_numbers(self.groups, names))]
+        self.sizes, rest = collections.Counter(names), iter(names)
         for entry in self.lineage:
-            end = start + sum(entry["groups"].values())
-            entry["groups"] = dict(collections.Counter(names[start:end]))
-            start = end
+            own = itertools.islice(rest, sum(entry["groups"].values()))
+            entry["groups"] = dict(collections.Counter(own))
+        return words
 
     def finish(self, before_commit: Callable[[Dataset], object]) -> Manifest:
         """Close the last shard and commit the dataset."""
+        quality, share = self.quality, self.config.leave_out_share
         if self.done:
             raise InputError(
                 f"{self.done[0]['name']}: missing: expected all recordings of the "
                 "interrupted import; use another output folder"
             )
-        self._check_share_left_out()
-        if self.quality.scenes == 0:
-            if self.quality.empty and not self.quality.recordings:
+        if share and quality.refused > share * len(self.recordings):
+            raise InputError(
+                f"import: {quality.refused} of {len(self.recordings)} recordings "
+                f"refused, the first: {self.first_refused}: expected up to "
+                f"{100.0 * share:g} % (leave_out)"
+            )
+        if quality.scenes == 0:
+            if quality.empty and not quality.recordings:
                 raise InputError(
-                    f"import: {self.quality.empty} recordings, none with traffic: "
+                    f"import: {quality.empty} recordings, none with traffic: "
                     "expected at least one road user"
                 )
-            why = remedies(self.quality.dropped) or "none was long enough"
-            raise InputError(
-                f"import: 0 scenes kept of {self.quality.tracks} tracks: {why}"
-            )
-        self._split_one_group()
+            why = remedies(quality.dropped) or "none was long enough"
+            raise InputError(f"import: 0 scenes kept of {quality.tracks} tracks: {why}")
+        cut_by = self._split_one_group()
         self._close_shard()
-        wholes = {group: whole_of(group) for group in self.sizes}
         splits, kept = split_wholes(
             self.sizes,
-            wholes,
+            {group: group.rpartition(MINUTE)[0] or group for group in self.sizes},
             test_fraction=self.config.test_fraction,
             seed=self.config.split_seed,
         )
-        self.split_by = self.split_by or kept
         return self.writer.finish(
             {
                 "rate_hz": sorted(self.rates),
@@ -284,62 +444,15 @@ class _Import:
                 "groups": list(self.groups),
                 "vehicles": list(self.vehicles),
                 "splits": splits,
-                "quality": self.quality.as_dict(),
-                "import": self._flags(),
+                "quality": quality.as_dict(),
+                "import": {**self.config.as_dict(), "split_by": cut_by or kept},
             },
             before_commit,
         )
 
-    def _check_share_left_out(self) -> None:
-        refused, share = self.quality.refused, self.config.leave_out_share
-        recordings = len(self.recordings)
-        if share and refused > share * recordings:
-            raise InputError(
-                f"import: {refused} of {recordings} recordings refused, the first: "
-                f"{self.first_refused}: expected up to {100.0 * share:g} % "
-                "(leave_out)"
-            )
-
-    def _flags(self) -> dict:
-        """What the manifest says of the settings; what is left out only where it is."""
-        found = dataclasses.asdict(self.config)
-        unused = {name for name in ("leave_out", "leave_out_share") if not found[name]}
-        kept = {name: value for name, value in found.items() if name not in unused}
-        return kept | {"split_by": self.split_by}
-
 
 def import_logs(
-    recordings: Iterable[Recording],
-    output: str | Path,
-    config: ImportConfig,
-    *,
-    before_commit: Callable[[Dataset], object] = lambda dataset: None,
-) -> Manifest:
-    """Import recordings into a dataset, one after the other; shows scenes/s.
-
-    Args:
-      recordings: from `importers.read_recordings`.
-      output: dataset folder or tensorstore URL.
-      config: collection and split settings.
-      before_commit: as `DatasetWriter.finish`.
-
-    Returns:
-      The manifest of the finished dataset.
-
-    Raises:
-      InputError: bad input. Nothing of this import stays on disk then; an
-        interrupt, and the loss of workers or nodes (LostWorkError), keeps finished
-        shards, and the next run resumes from them.
-    """
-
-    def cuts(known: dict[str, str]) -> Iterable[Cut]:
-        return (cut(recording, config.collect, known) for recording in recordings)
-
-    return _import(cuts, None, output, config, False, before_commit)
-
-
-def import_parts(
-    parts: Sequence[Part],
+    logs: Sequence[InputFile] | Iterable[Recording],
     output: str | Path,
     config: ImportConfig,
     *,
@@ -347,10 +460,11 @@ def import_parts(
     overwrite: bool = False,
     before_commit: Callable[[Dataset], object] = lambda dataset: None,
 ) -> Manifest:
-    """Import parts wherever the executor runs them; bytes do not depend on it.
+    """Import input files or recordings into a dataset; shows scenes/s.
 
     Args:
-      parts: of `importers.parts`, in order.
+      logs: of `inputs.input_files`, read wherever the executor runs them (the bytes do
+        not depend on it); or recordings, read already.
       output: dataset folder or tensorstore URL.
       config: collection and split settings.
       executor: default: this process.
@@ -361,37 +475,27 @@ def import_parts(
       The manifest of the finished dataset.
 
     Raises:
-      InputError: as `import_logs`.
+      InputError: bad input. Nothing of this import stays on disk then; an
+        interrupt, and the loss of workers or nodes (LostWorkError), keeps finished
+        shards, and the next run resumes from them.
     """
     places = executor or Serial()
-    if config.leaves_out:
-        parts = leaving_out(parts)
-
-    def cuts(known: dict[str, str]) -> Iterable[Cut]:
-        work = functools.partial(cut_item, config=config.collect, done=known)
-        return places.stream(work, items(parts, places.workers))
-
-    return _import(cuts, len(parts), output, config, overwrite, before_commit)
-
-
-def _import(
-    cuts: Callable[[dict[str, str]], Iterable[Cut]],
-    total: int | None,
-    output: str | Path,
-    config: ImportConfig,
-    overwrite: bool,
-    before_commit: Callable[[Dataset], object] = lambda dataset: None,
-) -> Manifest:
-    """Write the cuts in their order; `total` recordings or parts are expected."""
+    if isinstance(logs, list) and all(isinstance(x, InputFile) for x in logs):
+        files, total = leaving_out(logs) if config.leaves_out else logs, len(logs)
+        units: Iterable[WorkUnit] = work_units(files, places.workers)
+    else:
+        units, total = ((None, recording) for recording in logs), None
     with Files(str(output)).alone():
         writer = DatasetWriter(str(output), overwrite=overwrite)
         try:
-            work = _Import(writer, config)
+            state = _Import(writer, config)
+            known = {entry["name"]: entry["sha256"] for entry in state.done}
+            work = functools.partial(scenes_in, config=config.collect, done=known)
             with Progress(total) as progress:
-                for made in cuts(work.known):
-                    work.add(made)
-                    progress.show(made, work.quality)
-            return work.finish(before_commit)
+                for made in places.stream(work, units):
+                    state.add(made)
+                    progress.show(made, state.quality)
+            return state.finish(before_commit)
         except LostWorkError:
             raise  # as after an interrupt, the next run goes on from the shards
         except InputError:

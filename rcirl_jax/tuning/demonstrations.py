@@ -16,9 +16,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from rcirl_jax.data.formats.files import listing
-from rcirl_jax.data.importing import import_parts
-from rcirl_jax.data.logs import Logs
-from rcirl_jax.data.parts import parts_of
+from rcirl_jax.data.importing import Logs, import_logs
+from rcirl_jax.data.inputs import input_files
 from rcirl_jax.data.store.dataset import Dataset, open_dataset
 from rcirl_jax.data.store.joined import Demonstrations, JoinedDatasets
 from rcirl_jax.errors import InputError
@@ -37,7 +36,7 @@ def source(run: Run, given: str | Logs, number: int) -> Dataset:
     """Opens a source's dataset, or imports its logs."""
     if isinstance(given, str):
         return open_dataset(given)
-    found = parts_of(given.format, given.input, given.source)
+    found = input_files(given.format, given.input, given.source)
     inputs = {
         "config": dataclasses.asdict(given.config),
         "spec": digest(found[0].spec),
@@ -48,7 +47,7 @@ def source(run: Run, given: str | Logs, number: int) -> Dataset:
 
     def work() -> None:
         config = given.import_config(found, run.executor)
-        import_parts(
+        import_logs(
             found, folder, config, executor=run.executor, before_commit=run.sign
         )
 

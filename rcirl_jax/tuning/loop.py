@@ -14,7 +14,7 @@ import textwrap
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
-from rcirl_jax.data.logs import Logs
+from rcirl_jax.data.importing import Logs
 from rcirl_jax.data.store.dataset import Dataset
 from rcirl_jax.data.store.joined import Demonstrations, shares_of
 from rcirl_jax.errors import InputError, extra_of

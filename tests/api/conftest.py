@@ -2,8 +2,8 @@
 
 import pytest
 
-from rcirl_jax.data.importing import ImportConfig, import_parts
-from rcirl_jax.data.parts import parts_of
+from rcirl_jax.data.importing import ImportConfig, import_logs
+from rcirl_jax.data.inputs import input_files
 from rcirl_jax.data.scenes.config import CollectConfig
 from tests.helpers.weights_files import random_weights
 
@@ -24,7 +24,7 @@ def examples(tmp_path_factory):
     (folder / "traffic.toml").write_text(TRAFFIC)
     collect = CollectConfig(stride_s=2.0)
     config = ImportConfig(format="synthetic", collect=collect)
-    parts = parts_of("synthetic", folder / "traffic.toml")
-    import_parts(parts, folder / "data", config)
+    parts = input_files("synthetic", folder / "traffic.toml")
+    import_logs(parts, folder / "data", config)
     random_weights(folder / "weights.msgpack")
     return folder

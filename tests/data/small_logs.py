@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from rcirl_jax.data.importing import ImportConfig
-from rcirl_jax.data.parts import Part, parts_of
+from rcirl_jax.data.inputs import InputFile, input_files
 from rcirl_jax.data.scenes.config import CollectConfig
 
 CONFIG = ImportConfig(
@@ -15,7 +15,7 @@ CONFIG = ImportConfig(
 )
 
 
-def write_logs(folder: Path, files: int = 6, seconds: float = 16.0) -> list[Part]:
+def write_logs(folder: Path, files: int = 6, seconds: float = 16.0) -> list[InputFile]:
     """Platoons of four on a straight road, one file each; their parts."""
     folder.mkdir(parents=True, exist_ok=True)
     t = np.arange(0.0, seconds, 0.1)
@@ -30,7 +30,7 @@ def write_logs(folder: Path, files: int = 6, seconds: float = 16.0) -> list[Part
                 f"{a:.1f},{number}-{car},{b:.3f},0" for a, b in zip(t, x, strict=True)
             ]
         (folder / f"log{number:02d}.csv").write_text("\n".join(lines) + "\n")
-    return parts_of("csv", folder)
+    return input_files("csv", folder)
 
 
 def files_of(folder: Path) -> dict[Path, bytes]:

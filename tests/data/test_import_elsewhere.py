@@ -6,11 +6,11 @@ import sys
 import pytest
 
 from rcirl_jax.data import importing
-from rcirl_jax.data import parts as dealing
+from rcirl_jax.data import inputs as dealing
 from rcirl_jax.data.formats import parts
 from rcirl_jax.data.formats.format import Format
-from rcirl_jax.data.importing import ImportConfig, import_parts
-from rcirl_jax.data.parts import Part, is_long, recordings_of
+from rcirl_jax.data.importing import ImportConfig, import_logs
+from rcirl_jax.data.inputs import InputFile, is_long, recordings_of
 from rcirl_jax.data.scenes.config import CollectConfig
 from rcirl_jax.errors import InputError, LostWorkError
 from rcirl_jax.runtime.executors import Processes, Ray, Serial
@@ -40,14 +40,14 @@ def logs(tmp_path_factory):
 def local(logs, tmp_path_factory):
     """What an import in this process writes, in shards of few scenes."""
     folder = tmp_path_factory.mktemp("local") / "data"
-    import_parts(logs, folder, CONFIG)
+    import_logs(logs, folder, CONFIG)
     assert len(list(folder.rglob("shard.json"))) > 2
     return files_of(folder)
 
 
 @pytest.mark.multiprocess
 def test_two_processes_write_the_bytes_of_one(logs, local, tmp_path):
-    import_parts(logs, tmp_path / "data", CONFIG, executor=TWO)
+    import_logs(logs, tmp_path / "data", CONFIG, executor=TWO)
     assert files_of(tmp_path / "data") == local
 
 
@@ -77,7 +77,7 @@ def shards(tmp_path_factory):
     for name, place in places:
         found, spec = parts(name, place)
         spec = {**spec, "recording_car": "human"}  # the only one seen for long
-        made += [Part(format=name, input=path, spec=spec) for path in found]
+        made += [InputFile(format=name, input=path, spec=spec) for path in found]
     return made
 
 
@@ -85,7 +85,7 @@ def shards(tmp_path_factory):
 def here(shards, tmp_path_factory):
     """What an import of the shards in this process writes."""
     folder = tmp_path_factory.mktemp("here") / "data"
-    import_parts(shards, folder, ALL_SCENES)
+    import_logs(shards, folder, ALL_SCENES)
     return files_of(folder)
 
 
@@ -102,7 +102,7 @@ def test_shards_are_read_by_the_workers_but_long_ones_and_few(
         known = [inputs[number] for number in long]
         monkeypatch.setattr(dealing, "is_long", lambda part: part.input in known)
     read = reads_of_this_process(monkeypatch)
-    import_parts(shards[:count], tmp_path / "data", ALL_SCENES, executor=TWO)
+    import_logs(shards[:count], tmp_path / "data", ALL_SCENES, executor=TWO)
     assert read == [inputs[number].name for number in read_here]
     assert count or files_of(tmp_path / "data") == here
 
@@ -121,7 +121,7 @@ def test_a_shard_is_long_beyond_its_formats_limit(shards, monkeypatch):
             monkeypatch.setattr(dealing, "format_of", lambda _, form=form: form)
             assert is_long(part) == expected
         monkeypatch.undo()
-    folder = Part(format="waymo", input=shards[0].input.parent, spec={})
+    folder = InputFile(format="waymo", input=shards[0].input.parent, spec={})
     assert is_long(folder)  # any number of shards
 
 
@@ -131,7 +131,7 @@ def test_bad_input_elsewhere_is_the_same_line_and_leaves_nothing(logs, tmp_path)
     parts = write_logs(broken)
     (broken / "log03.csv").write_text("t,id,x,y\n0.0,a,far,0\n")
     with pytest.raises(InputError, match=r"log03\.csv: line 2: x: 'far': expected a"):
-        import_parts(parts, tmp_path / "data", CONFIG, executor=TWO)
+        import_logs(parts, tmp_path / "data", CONFIG, executor=TWO)
     assert not (tmp_path / "data").exists()
 
 
@@ -161,7 +161,7 @@ class Killing:
 
 os.chdir(sys.argv[1])  # the nodes were started elsewhere
 parts = write_logs(Path("logs"))
-importing.import_parts(parts, "data", CONFIG, executor=Killing())
+importing.import_logs(parts, "data", CONFIG, executor=Killing())
 deadline = time.monotonic() + 90.0  # the loss of a node is noticed late
 while sum(node["Alive"] for node in ray.nodes()) != 2:  # the head and the other
     assert time.monotonic() < deadline, "no node was lost"
@@ -204,11 +204,11 @@ class Losing:
 def test_lost_workers_leave_what_is_finished(logs, local, tmp_path):
     data = tmp_path / "data"
     with pytest.raises(LostWorkError):
-        import_parts(logs, data, CONFIG, executor=Losing(4))
+        import_logs(logs, data, CONFIG, executor=Losing(4))
     kept = {path: path.stat().st_mtime_ns for path in data.rglob("shard.json")}
     assert kept
     assert not (data / "manifest.json").exists()
-    import_parts(logs, data, CONFIG)
+    import_logs(logs, data, CONFIG)
     assert all(path.stat().st_mtime_ns == when for path, when in kept.items())
     assert files_of(data) == local
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from rcirl_jax.data import importing
-from rcirl_jax.data.cut import Cut
 from rcirl_jax.data.formats import parts, read_part
-from rcirl_jax.data.importing import Progress
+from rcirl_jax.data.importing import Progress, RecordingScenes
 from rcirl_jax.data.quality import QualityReport
 from tests.data.formats.fixtures import l5, nuplan, waymo
 
@@ -28,9 +27,9 @@ class Clock:
 
 
 def made(part, progress, scenes=None):
-    return Cut(
+    return RecordingScenes(
         name=f"{part} {progress}", source="", licence="", rate_hz=10.0, sha256="",
-        scenes=scenes, vehicles=[], groups=[], quality={}, part=part,
+        scenes=scenes, vehicles=[], groups=[], quality={}, input=part,
         progress=progress,
     )  # fmt: skip
 

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from rcirl_jax.data.importing import import_parts
+from rcirl_jax.data.importing import import_logs
 from rcirl_jax.export.reader import load_weights
 from tests.conftest import REPO
 from tests.data.small_logs import CONFIG, write_logs
@@ -79,7 +79,7 @@ LONG = ("quick_demo", "tuned_three_sites")
 def root(tmp_path_factory):
     """Logs, the dataset of them, and weights."""
     folder = tmp_path_factory.mktemp("flagfiles")
-    import_parts(write_logs(folder / "logs", 3), folder / "data", CONFIG)
+    import_logs(write_logs(folder / "logs", 3), folder / "data", CONFIG)
     random_weights(folder / "w.msgpack")
     return folder
 

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from rcirl_jax.data.importing import import_parts
+from rcirl_jax.data.importing import import_logs
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.export.closed_loop import write_tuned_idm
 from rcirl_jax.planner.baselines import Idm
@@ -16,7 +16,7 @@ from tests.helpers.weights_files import random_weights
 @pytest.mark.multiprocess
 def test_held_out_drives_are_measured_against_the_human(tmp_path):
     root = tmp_path
-    import_parts(write_logs(root / "logs", 3), root / "data", CONFIG)
+    import_logs(write_logs(root / "logs", 3), root / "data", CONFIG)
     random_weights(root / "w.msgpack")
     write_tuned_idm(root / "idm.json", Idm(headway=1.0))
     done = succeeded(

@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from rcirl_jax.data.importing import import_parts
+from rcirl_jax.data.importing import import_logs
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.export.reader import load_weights
 from tests.data.small_logs import CONFIG, write_logs
@@ -41,7 +41,7 @@ ARTEFACTS = {
 def root(tmp_path_factory):
     """Logs, the dataset of them, and weights."""
     folder = tmp_path_factory.mktemp("provenance")
-    import_parts(write_logs(folder / "logs", 2), folder / "data", CONFIG)
+    import_logs(write_logs(folder / "logs", 2), folder / "data", CONFIG)
     random_weights(folder / "w.msgpack")
     return folder
 

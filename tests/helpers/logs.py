@@ -4,7 +4,7 @@ import importlib
 
 import pytest
 
-from rcirl_jax.data.cut import cut
+from rcirl_jax.data import importing
 from rcirl_jax.data.formats import read_recordings
 from rcirl_jax.data.formats.options import STATED
 from rcirl_jax.data.scenes.config import CollectConfig
@@ -63,7 +63,7 @@ def scenes_of(recordings, min_future_s):
         require_obstacles=False, require_speed_change=False, min_future_s=min_future_s
     )
     found = {}
-    for made in (cut(recording, config) for recording in recordings):
+    for made in (importing.scenes_of(recording, config) for recording in recordings):
         for row, name in enumerate(made.vehicles):
             key = (name.rpartition(":")[2], int(made.scenes.frame[row]))
             assert key not in found, "one scene twice"

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from rcirl_jax.data.importing import import_parts
+from rcirl_jax.data.importing import import_logs
 from rcirl_jax.data.scenes.filters import REASONS
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
@@ -52,7 +52,7 @@ class Page(HTMLParser):
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     folder = tmp_path_factory.mktemp("data")
-    import_parts(write_logs(folder / "logs", 2), folder / "set", CONFIG)
+    import_logs(write_logs(folder / "logs", 2), folder / "set", CONFIG)
     return open_dataset(folder / "set")
 
 

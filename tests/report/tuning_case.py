@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 
-from rcirl_jax.data.importing import import_parts
+from rcirl_jax.data.importing import import_logs
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.evaluation.closed_loop.files import SuiteRuns
 from rcirl_jax.evaluation.gate.types import GateConfig, Pair
@@ -86,7 +86,7 @@ def ranking():
 
 def small_report(folder, replays):
     """The report; everything but the drives, the frames and the features is made up."""
-    import_parts(write_logs(folder / "logs", 4), folder / "set", CONFIG)
+    import_logs(write_logs(folder / "logs", 4), folder / "set", CONFIG)
     candidate = open_reward(str(random_weights(folder / "candidate.msgpack", 2)))
     kernels = (np.roll(candidate.kernels[0], 3, axis=0), *candidate.kernels[1:])
     incumbent = dataclasses.replace(

@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from rcirl_jax.data.importing import import_parts
+from rcirl_jax.data.importing import import_logs
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.data.store.writer import DatasetWriter
 from rcirl_jax.errors import InputError
@@ -170,7 +170,7 @@ def test_the_time_of_day_decides_nothing(dataset, undisturbed, tmp_path, monkeyp
 def test_the_time_of_day_decides_nothing_in_an_import(tmp_path, monkeypatch):
     logs = write_logs(tmp_path / "logs", files=3)
     monkeypatch.setattr("rcirl_jax.data.importing.SHARD_SCENES", 30)
-    import_parts(logs, tmp_path / "expected", IMPORT)
+    import_logs(logs, tmp_path / "expected", IMPORT)
     clock = Clock()
     monkeypatch.setattr(time, "time", clock)
     write = DatasetWriter.write_shard
@@ -183,10 +183,10 @@ def test_the_time_of_day_decides_nothing_in_an_import(tmp_path, monkeypatch):
 
     monkeypatch.setattr(DatasetWriter, "write_shard", jumping)
     with pytest.raises(StopError):
-        import_parts(logs, tmp_path / "d", IMPORT)
+        import_logs(logs, tmp_path / "d", IMPORT)
     assert len(list((tmp_path / "d").rglob("shard.json"))) == 1
     age(tmp_path, 86400.0)
-    import_parts(logs, tmp_path / "d", IMPORT)
+    import_logs(logs, tmp_path / "d", IMPORT)
     assert clock.jumps == SHARD_JUMPS
     assert files_of(tmp_path / "d") == files_of(tmp_path / "expected")
 
@@ -196,8 +196,8 @@ def test_a_dataset_being_written_is_refused_and_left_alone(tmp_path):
     data = tmp_path / "deep" / "d"
     with only_one(data):
         with pytest.raises(InputError, match=r"deep/d: in use by another process"):
-            import_parts(logs, data, IMPORT)
+            import_logs(logs, data, IMPORT)
         assert [x.name for x in data.iterdir()] == [".lock"]
     # the file of a killed import holds nobody up, and does not stay
-    import_parts(logs, data, IMPORT)
+    import_logs(logs, data, IMPORT)
     assert sorted(x.name for x in data.iterdir()) == ["manifest.json", "shards"]

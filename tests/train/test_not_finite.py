@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rcirl_jax.data import importing
-from rcirl_jax.data.cut import Cut
+from rcirl_jax.data.importing import RecordingScenes
 from rcirl_jax.data.store.rows import check_finite
 from rcirl_jax.data.store.writer import DatasetWriter
 from rcirl_jax.errors import InputError
@@ -145,12 +145,12 @@ def test_an_import_refuses_a_scene_that_is_not_finite(tmp_path):
     work = importing._Import(
         DatasetWriter(tmp_path / "d"), importing.ImportConfig(format="synthetic")
     )
-    known = {f.name: None for f in dataclasses.fields(Cut)}
-    known |= {"rate_hz": 10.0}
-    cut = Cut(**{**known, "name": "log", "scenes": made, "quality": {}, "refused": "",
-                 "vehicles": ["v"] * COUNT, "groups": ["g"] * COUNT})  # fmt: skip
+    found = RecordingScenes(
+        name="log", source="", licence="", rate_hz=10.0, sha256="", scenes=made,
+        vehicles=["v"] * COUNT, groups=["g"] * COUNT, first_seen=[0.0] * COUNT,
+    )  # fmt: skip
     with pytest.raises(InputError, match=r"^log: scene 5 \(.*\): scene\.ego\.v: not"):
-        work.add(cut)
+        work.add(found)
 
 
 def test_a_suite_names_row_and_case():

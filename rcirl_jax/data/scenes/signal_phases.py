@@ -18,7 +18,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from rcirl_jax.data.parts import Item, Part, items, recordings_in
+from rcirl_jax.data.inputs import InputFile, WorkUnit, recordings_in, work_units
 from rcirl_jax.data.scenes.lines import (
     MAX_RED_RUNNING,
     MIN_CROSSINGS,
@@ -223,7 +223,7 @@ def check_events(recorded: Iterable[LineEvents]) -> list[PhaseCheck]:
 
 
 def check_written(
-    parts: Sequence[Part], *, executor: Executor | None = None
+    parts: Sequence[InputFile], *, executor: Executor | None = None
 ) -> list[PhaseCheck]:
     """Recorded signals checked against all drivers of the logs, line by line.
 
@@ -235,11 +235,11 @@ def check_written(
       InputError: logs that cannot be read.
     """
     places = executor or Serial()
-    return check_events(places.stream(_line_events, items(parts, places.workers)))
+    return check_events(places.stream(_line_events, work_units(parts, places.workers)))
 
 
-def _line_events(item: Item) -> Iterator[LineEvents]:
-    for _, recording in recordings_in(item):
+def _line_events(unit: WorkUnit) -> Iterator[LineEvents]:
+    for _, recording in recordings_in(unit):
         yield line_events(recording)
 
 

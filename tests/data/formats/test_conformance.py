@@ -7,10 +7,9 @@ module named otherwise than its format says so by FORMAT.
 import numpy as np
 import pytest
 
-from rcirl_jax.data.cut import digest
 from rcirl_jax.data.formats import IMPORTERS, parts, read_part, read_recordings
-from rcirl_jax.data.importing import ImportConfig, import_parts
-from rcirl_jax.data.parts import parts_of
+from rcirl_jax.data.importing import ImportConfig, digest, import_logs
+from rcirl_jax.data.inputs import input_files
 from rcirl_jax.data.readers import long_logs
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.data.scenes.config import CollectConfig
@@ -214,7 +213,7 @@ def imported(name, fixture, output):
         require_obstacles=False, require_speed_change=False, min_future_s=3.0
     )
     config = ImportConfig(format=format_of(name), collect=collect, test_fraction=0.0)
-    return import_parts(parts_of(format_of(name), fixture.input), output, config)
+    return import_logs(input_files(format_of(name), fixture.input), output, config)
 
 
 def test_imports_end_to_end(name, sound, tmp_path):

@@ -2,8 +2,8 @@
 
 import pytest
 
-from rcirl_jax.data.importing import import_parts
-from rcirl_jax.data.parts import parts_of
+from rcirl_jax.data.importing import import_logs
+from rcirl_jax.data.inputs import input_files
 from rcirl_jax.data.quality import format_quality
 from tests.data.formats import people
 from tests.data.formats.people import LONG, refused, write
@@ -129,7 +129,7 @@ def test_an_import_counts_what_it_dropped(tmp_path, long_bytes):
     table.insert(100, table[100])
     path = write(tmp_path, table)
     source = people.spec(tmp_path, more=f"long_bytes = {long_bytes}")
-    manifest = import_parts(parts_of("csv", path, source), tmp_path / "data", CONFIG)
+    manifest = import_logs(input_files("csv", path, source), tmp_path / "data", CONFIG)
     assert manifest.quality["rows"] == {"read": 721, "unreadable": 1, "repeated": 1}
     said = format_quality(manifest.quality)
     assert "rows dropped: 2 of 721 (0.28%): 1 unreadable, 1 repeated" in said

@@ -6,10 +6,9 @@ import fcntl
 import numpy as np
 import pytest
 
-from rcirl_jax.data.cut import cut
 from rcirl_jax.data.formats import parts, read_part
-from rcirl_jax.data.importing import import_parts
-from rcirl_jax.data.parts import Part
+from rcirl_jax.data.importing import import_logs, scenes_of
+from rcirl_jax.data.inputs import InputFile
 from rcirl_jax.data.readers import long_logs
 from rcirl_jax.data.store.dataset import open_dataset
 from rcirl_jax.errors import InputError
@@ -49,7 +48,7 @@ def write(path, rows, extra=""):
 
 
 def cuts(path, spec):
-    return [cut(made, CONFIG.collect) for made in read_part("csv", path, spec)]
+    return [scenes_of(made, CONFIG.collect) for made in read_part("csv", path, spec)]
 
 
 def scenes_by_name(found):
@@ -73,10 +72,10 @@ def test_pieces_hold_the_scenes_of_the_whole(tmp_path, by_car):
     assert len(whole) > 500
     assert set(apart) == set(whole)
     assert any("#2" in name for name, _ in whole)
-    parts_of = lambda made: (made.quality["tracks"], made.quality["states"])  # noqa: E731
+    sums_of = lambda made: (made.quality["tracks"], made.quality["states"])  # noqa: E731
     (one,) = cuts(path, spec)
-    totals = np.sum([parts_of(made) for made in pieces], axis=0)
-    assert tuple(totals) == parts_of(one)
+    totals = np.sum([sums_of(made) for made in pieces], axis=0)
+    assert tuple(totals) == sums_of(one)
     for reason in ("future_too_short", "off_map"):
         found = sum(made.quality["dropped"].get(reason, 0) for made in pieces)
         assert found == one.quality["dropped"].get(reason, 0)
@@ -122,15 +121,15 @@ def test_a_crowded_minute_is_several_pieces(tmp_path, monkeypatch):
 def test_a_vehicle_is_in_one_group_whatever_the_piece(tmp_path):
     path = tmp_path / "log.csv"
     spec = {**write(path, rows_of()), "long_bytes": 1}
-    part = Part(format="csv", input=path, spec=spec)
-    import_parts([part], tmp_path / "data", CONFIG)
+    part = InputFile(format="csv", input=path, spec=spec)
+    import_logs([part], tmp_path / "data", CONFIG)
     dataset = open_dataset(tmp_path / "data")
     train, test = dataset.load("train"), dataset.load("test")
     assert not set(train.vehicle.tolist()) & set(test.vehicle.tolist())
     names = dataset.manifest.vehicles
     assert len({name.split(":")[1] for name in names}) == len(names)
-    whole = Part(format="csv", input=path, spec={**spec, "long_bytes": 10**9})
-    import_parts([whole], tmp_path / "whole", CONFIG)
+    whole = InputFile(format="csv", input=path, spec={**spec, "long_bytes": 10**9})
+    import_logs([whole], tmp_path / "whole", CONFIG)
     assert set(open_dataset(tmp_path / "whole").manifest.vehicles) == set(names)
 
 
@@ -166,7 +165,7 @@ def test_a_wrong_unit_of_time_is_found(tmp_path, monkeypatch):
 MEMORY = """
 import resource, sys
 from pathlib import Path
-from rcirl_jax.data.parts import Part
+from rcirl_jax.data.inputs import InputFile
 from rcirl_jax.data.formats import parts
 from rcirl_jax.data.readers import long_logs
 from rcirl_jax.data.readers.tables import streams
@@ -224,8 +223,8 @@ def test_a_recording_is_on_one_side_where_there_are_several(tmp_path):
     for name in ("one", "two", "three"):
         path = tmp_path / f"{name}.csv"
         spec = write(path, rows_of(seconds=140.0, cars=12))
-        found.append(Part(format="csv", input=path, spec=spec))
-    import_parts(found, tmp_path / "data", CONFIG)
+        found.append(InputFile(format="csv", input=path, spec=spec))
+    import_logs(found, tmp_path / "data", CONFIG)
     dataset = open_dataset(tmp_path / "data")
     assert len(dataset.manifest.groups) > 3
     train, test = (set(dataset.load(x).recording.tolist()) for x in ("train", "test"))
@@ -239,7 +238,10 @@ def test_settings_change_the_digest_of_a_piece(tmp_path):
     spec = {**write(path, rows_of(seconds=70.0, cars=4)), "long_bytes": 1}
     (first, *_) = read_part("csv", path, spec)
     other = dataclasses.replace(first, scenes_within=(0.0, 30.0))
-    assert cut(first, CONFIG.collect).sha256 != cut(other, CONFIG.collect).sha256
+    assert (
+        scenes_of(first, CONFIG.collect).sha256
+        != scenes_of(other, CONFIG.collect).sha256
+    )
 
 
 def test_windows_without_rows_are_no_pieces(tmp_path, monkeypatch):

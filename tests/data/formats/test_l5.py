@@ -7,7 +7,6 @@ import shutil
 import numpy as np
 import pytest
 
-from rcirl_jax.data.cut import digest
 from rcirl_jax.data.formats import parts, read_recordings
 from rcirl_jax.data.formats.l5 import map as l5_map
 from rcirl_jax.data.formats.l5 import reader as l5

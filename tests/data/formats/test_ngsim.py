@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from rcirl_jax.data.cut import digest
+from rcirl_jax.data.importing import digest
 from rcirl_jax.errors import InputError
 from tests.data.formats import writers as w
 from tests.helpers import logs

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from rcirl_jax.data.cut import cut, digest
 from rcirl_jax.data.formats import parts, read_part
+from rcirl_jax.data.importing import digest, scenes_of
 from rcirl_jax.data.readers.tables import streams
 from tests.data.formats import writers as w
 from tests.data.formats.test_csv_stream import scenes_by_name
@@ -82,7 +82,7 @@ def test_pieces_hold_the_scenes_of_the_whole(tmp_path, shuffled):
                 np.testing.assert_array_equal(lane.centre, other.centre)
                 np.testing.assert_array_equal(lane.left_width, other.left_width)
         one, apart = (
-            scenes_by_name([cut(made, CONFIG.collect) for made in group])
+            scenes_by_name([scenes_of(made, CONFIG.collect) for made in group])
             for group in ([whole], own)
         )
         assert len(one) > 100

@@ -4,8 +4,8 @@ import shutil
 
 import pytest
 
-from rcirl_jax.data.cut import digest
 from rcirl_jax.data.formats import parts, read_part, read_recordings
+from rcirl_jax.data.importing import digest
 from rcirl_jax.errors import InputError
 from tests.data.formats import writers as w
 from tests.data.formats.fixtures import (

@@ -6,9 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rcirl_jax.data.cut import cut
-from rcirl_jax.data.importing import ImportConfig, import_parts
-from rcirl_jax.data.parts import parts_of
+from rcirl_jax.data.importing import ImportConfig, import_logs, scenes_of
+from rcirl_jax.data.inputs import input_files
 from rcirl_jax.data.quality import assumed
 from rcirl_jax.data.scenes.config import CollectConfig
 from tests.conftest import REPO
@@ -30,7 +29,7 @@ def recordings(name, form="csv"):
 
 
 def scenes(recording):
-    return len(cut(recording, CollectConfig()).vehicles)
+    return len(scenes_of(recording, CollectConfig()).vehicles)
 
 
 # case -> tracks, heading [rad] of all of them, fewest and most scenes
@@ -100,6 +99,6 @@ def test_a_file_without_traffic_beside_another(tmp_path):
     recordings("18_empty_scenario", "commonroad")
     collect = CollectConfig(require_speed_change=False)
     config = ImportConfig(format="commonroad", collect=collect, test_fraction=0.0)
-    found = parts_of("commonroad", CASES / "18_empty_scenario")
-    made = import_parts(found, tmp_path / "out", config)
+    found = input_files("commonroad", CASES / "18_empty_scenario")
+    made = import_logs(found, tmp_path / "out", config)
     assert (made.count, made.quality["empty"]) == (10, 1)

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from rcirl_jax.data.cut import digest
+from rcirl_jax.data.importing import digest
 from rcirl_jax.data.quality import QualityReport
 from rcirl_jax.data.recording import validate_recording
 from rcirl_jax.data.scenes.assemble import assemble

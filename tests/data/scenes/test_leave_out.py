@@ -5,8 +5,8 @@ import dataclasses
 import pytest
 
 from rcirl_jax.data.formats import parts
-from rcirl_jax.data.importing import ImportConfig, import_parts
-from rcirl_jax.data.parts import Part, recordings_of
+from rcirl_jax.data.importing import ImportConfig, import_logs
+from rcirl_jax.data.inputs import InputFile, recordings_of
 from rcirl_jax.data.quality import format_quality
 from rcirl_jax.data.recording import LEAVE_OUT
 from rcirl_jax.data.scenes.config import CollectConfig
@@ -30,7 +30,7 @@ def shard(folder, *scenarios):
     (folder / "a.tfrecord").write_bytes(waymo.tfrecord(scenarios))
     found, spec = parts("waymo", folder)
     spec = {**spec, "recording_car": "human"}
-    return [Part(format="waymo", input=path, spec=spec) for path in found]
+    return [InputFile(format="waymo", input=path, spec=spec) for path in found]
 
 
 def good(name):
@@ -45,8 +45,8 @@ def test_one_scenario_of_a_file_is_left_out(tmp_path):
     mixed = shard(tmp_path / "mixed", good("a"), BAD, good("b"))
     lenient = dataclasses.replace(mixed[0], spec={**mixed[0].spec, LEAVE_OUT: True})
     assert [bool(x.refused) for x in recordings_of(lenient)] == [False, True, False]
-    made = import_parts(mixed, tmp_path / "data", LENIENT)
-    plain = import_parts(
+    made = import_logs(mixed, tmp_path / "data", LENIENT)
+    plain = import_logs(
         shard(tmp_path / "plain", good("a"), good("b")), tmp_path / "other", STRICT
     )
     assert made.count == plain.count > 0
@@ -64,14 +64,14 @@ def test_one_scenario_of_a_file_is_left_out(tmp_path):
 def test_a_share_is_judged_at_the_end(tmp_path):
     logs = shard(tmp_path / "logs", good("a"), BAD, good("b"))
     half = dataclasses.replace(STRICT, leave_out_share=0.5)
-    made = import_parts(logs, tmp_path / "data", half)
+    made = import_logs(logs, tmp_path / "data", half)
     assert made.quality["refused"] == 1
     assert made.import_flags["leave_out_share"] == 0.5
     few = dataclasses.replace(STRICT, leave_out_share=0.3)
     with pytest.raises(
         InputError, match=r"1 of 3 recordings refused, .*record 1: .*up to 30 %"
     ):
-        import_parts(logs, tmp_path / "other", few)
+        import_logs(logs, tmp_path / "other", few)
     assert not (tmp_path / "other").exists()
 
 
@@ -85,7 +85,7 @@ def test_one_too_many_ends_the_import(tmp_path, config, words):
     )
     logs = shard(tmp_path / "logs", good("a"), BAD, good("b"), other)
     with pytest.raises(InputError, match=words):
-        import_parts(logs, tmp_path / "data", config)
+        import_logs(logs, tmp_path / "data", config)
     assert not (tmp_path / "data").exists()
 
 
@@ -95,8 +95,8 @@ def test_a_file_that_breaks_off_gives_what_it_has(tmp_path):
     text = logs[1].input.read_text().splitlines()
     logs[1].input.write_text("\n".join([*text[:40], "1.0,x,not a number,0"]))
     config = dataclasses.replace(CONFIG, leave_out=2)
-    made = import_parts(logs, tmp_path / "data", config)
-    rest = import_parts([logs[0], logs[2]], tmp_path / "other", CONFIG)
+    made = import_logs(logs, tmp_path / "data", config)
+    rest = import_logs([logs[0], logs[2]], tmp_path / "other", CONFIG)
     assert made.count == rest.count > 0
     assert made.quality["refused"] == 1
     assert "logs/log01.csv, the rest" in made.recordings

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rcirl_jax.cli.flags import pooled_signals
-from rcirl_jax.data.parts import parts_of, recordings_of
+from rcirl_jax.data.inputs import input_files, recordings_of
 from rcirl_jax.data.scenes import signal_phases
 from rcirl_jax.data.scenes.collect import Collector
 from rcirl_jax.data.scenes.config import CollectConfig
@@ -122,7 +122,7 @@ def test_logs_are_checked_alike_wherever_they_are_read(tmp_path):
     for number in range(3):
         (tmp_path / str(number)).mkdir()
         commonroad.write(tmp_path / str(number))
-    logs = parts_of("commonroad", tmp_path)
+    logs = input_files("commonroad", tmp_path)
     made = [recording for part in logs for recording in recordings_of(part)]
     assert len(made) == len(logs) == 3
     for places in Serial(), Processes(2):
@@ -152,7 +152,7 @@ def test_an_import_can_ask_all_files_itself(monkeypatch, capsys):
     """`--signals=pooled`."""
     made = [drives_of(number, 0.0) for number in range(12)]
     monkeypatch.setattr(signal_phases, "recordings_in", lambda one: [(None, one)])
-    monkeypatch.setattr(signal_phases, "items", lambda parts, _: iter(parts))
+    monkeypatch.setattr(signal_phases, "work_units", lambda parts, _: iter(parts))
     assert pooled_signals(made, Serial()) == verdicts(made)
     assert "confirmed" in capsys.readouterr().out
 
@@ -178,7 +178,7 @@ def test_a_verdict_on_a_line_comes_before_all_rules():
 def test_urban_signals(data_dir):
     """The written cycles fit the drivers, over all files; one file proves little."""
     folder = data_dir / "ngsim_urban_commonroad" / "xml"
-    checks = check_written(parts_of("commonroad", folder), executor=Processes(2))
+    checks = check_written(input_files("commonroad", folder), executor=Processes(2))
     together = checks[-1]
     assert together.crossings > 150
     assert together.red_written < 0.1
